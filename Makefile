@@ -141,6 +141,8 @@ room:
 lint: init web
 	@echo "== format"
 	@cargo fmt --all --check
+	@echo "== the language of the code"
+	@scripts/language
 	@echo "== compiler and clippy, warnings denied"
 	@scripts/lint $(DEV)
 	@echo "== types of the page"

@@ -1,4 +1,4 @@
-//! The whole system, told as stories: each a user's errand from end to end with real parts. Run by
+//! End-to-end tests of the whole system, called stories: each covers a task of a user with real components. Run by
 //! `make stories`, as root.
 
 use std::process::ExitCode;
@@ -7,7 +7,7 @@ use std::time::Duration;
 use ros::bus::RosVersion;
 use support::Verdict;
 
-use runner::Story;
+use runner::RunnableStory;
 
 #[path = "stories/access.rs"]
 mod access;
@@ -144,42 +144,46 @@ mod viewers;
 #[path = "stories/warm_pool.rs"]
 mod warm_pool;
 
-/// A story under its function's name.
-fn story(name: &'static str, tell: fn() -> Verdict) -> Story {
+/// Creates a story with the name of its function.
+fn story(name: &'static str, tell: fn() -> Verdict) -> RunnableStory {
     let tell = Box::new(tell);
-    Story { name, tell }
+    RunnableStory { name, tell }
 }
 
-/// Names functions once.
+/// Lists the stories of a module, each with its function's name.
 macro_rules! stories {
     ($module:ident: $($name:ident),+ $(,)?) => {
         vec![$(story(concat!(stringify!($module), "::", stringify!($name)), $module::$name)),+]
     };
 }
 
-/// The same, of a robot of each ROS.
+/// Lists the stories of a module for robots of ROS 1 and of ROS 2.
 macro_rules! of_both {
     ($module:ident: $($name:ident),+ $(,)?) => {
         vec![$(
-            story_of(RosVersion::One, concat!(stringify!($module), "::", stringify!($name)), $module::$name),
-            story_of(RosVersion::Two, concat!(stringify!($module), "::ros2::", stringify!($name)), $module::$name),
+            story_for(RosVersion::One, concat!(stringify!($module), "::", stringify!($name)), $module::$name),
+            story_for(RosVersion::Two, concat!(stringify!($module), "::ros2::", stringify!($name)), $module::$name),
         )+]
     };
 }
 
-/// A story of a robot of this ROS.
-fn story_of(version: RosVersion, name: &'static str, tell: fn(RosVersion) -> Verdict) -> Story {
+/// Creates a story for robots of one version of ROS.
+fn story_for(
+    version: RosVersion,
+    name: &'static str,
+    tell: fn(RosVersion) -> Verdict,
+) -> RunnableStory {
     let tell = Box::new(move || tell(version));
-    Story { name, tell }
+    RunnableStory { name, tell }
 }
 
-/// Stories that compare times with each other: told while no other is.
+/// Stories that compare durations with each other; they run while no other story does.
 const ALONE: [&str; 2] = [
     "calibration::fewer_cores_take_longer_and_rows_say_how_long",
     "page::a_hundred_servants_stay_fluid_and_an_hour_leaves_nothing",
 ];
 
-/// A story that takes longer than this has no end; the longest takes two minutes.
+/// Time after which a story counts as hanging; the longest story takes two minutes.
 const LONGEST_STORY: Duration = Duration::from_secs(1200);
 
 fn main() -> ExitCode {
@@ -190,7 +194,7 @@ fn main() -> ExitCode {
     if let Some(limit) = rehearsal::limit() {
         return runner::run(rehearsal::stories(), &[], limit);
     }
-    // Their programs take minutes to build: make test-cross does, and says so.
+    // The programs of other architectures take minutes to build; make test-cross builds them and sets the variable.
     let built = std::env::var("CLOUDROID_CROSS").unwrap_or_default();
     let has = |architecture: &str| built.split_whitespace().any(|one| one == architecture);
     let mut cross = Vec::new();
@@ -200,7 +204,7 @@ fn main() -> ExitCode {
     if has("armv7") {
         cross.extend(stories![cross: an_armv7_robot_works]);
     }
-    let stories: Vec<Story> = [
+    let stories: Vec<RunnableStory> = [
         cross,
         stories![answer: a_robot_finds_people_in_real_pictures, the_interface_is_found_lazy_inputs_included],
         stories![burglary:

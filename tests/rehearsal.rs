@@ -1,4 +1,4 @@
-//! Small stories with known ends, by which the runner itself is tested (`stories/telling.rs`).
+//! Small stories with known results, for tests of the runner itself (`stories/telling.rs`).
 
 use std::time::Duration;
 
@@ -6,19 +6,20 @@ use anyhow::bail;
 use support::world::{GREETER, world};
 use support::{Verdict, story};
 
-use crate::runner::Story;
+use crate::runner::RunnableStory;
 
-/// The variable that asks for them; its value is the time after which one of them has no end, in seconds.
+/// Environment variable that selects these stories; its value is the number of seconds after which a story counts as
+/// hanging.
 pub const VARIABLE: &str = "CLOUDROID_REHEARSAL";
 
-/// Returns that time, if they are asked for.
+/// Returns that time, if these stories are selected.
 pub fn limit() -> Option<Duration> {
     let seconds = std::env::var(VARIABLE).ok()?;
     Some(Duration::from_secs(seconds.parse().unwrap_or(1200)))
 }
 
-/// All of them.
-pub fn stories() -> Vec<Story> {
+/// Returns all of these stories.
+pub fn stories() -> Vec<RunnableStory> {
     vec![
         crate::story("rehearsal::passes", || Ok(())),
         crate::story("rehearsal::fails", || bail!("it always fails")),
@@ -47,12 +48,12 @@ fn fail_once() -> Verdict {
 }
 
 fn fail_once_with_a_daemon() -> Verdict {
-    let daemon = world().own("rehearsal").start()?;
+    let daemon = world().setup("rehearsal").start()?;
     GREETER.push_to(&daemon)?;
     let directory = world().directory("rehearsed")?;
     std::fs::write(directory.path().join("note"), "kept")?;
     fail_once()?;
-    daemon.ends().map(drop)
+    daemon.stop().map(drop)
 }
 
 fn panic_once() -> Verdict {
@@ -60,9 +61,9 @@ fn panic_once() -> Verdict {
     Ok(())
 }
 
-/// Stays until the run is killed, with a servant at work.
+/// Keeps a servant working until the run is killed.
 fn wait_with_a_servant() -> Verdict {
-    let daemon = world().own("rehearsal-waits").start()?;
+    let daemon = world().setup("rehearsal-waits").start()?;
     GREETER.push_to(&daemon)?;
     let _robot = daemon.robot("greeter_cpp?robot=r1")?;
     println!("rehearsal: a servant is at work");

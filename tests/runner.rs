@@ -1,11 +1,12 @@
-//! Tells stories: many at a time, the longest first, those that need the machine alone last. One that fails is told once more, alone, at the end.
+//! Runs the stories: many at a time, the longest first, those that need the whole machine last. A story that fails is
+//! repeated once at the end, on its own.
 //!
 //! ```text
-//!   check the machine ─▶ remove what killed runs left ─▶ mount a disk ─▶ tell ─▶ tell alone ─▶ tell again ─▶ report
+//!   check the machine ─▶ clean up after killed runs ─▶ mount a disk ─▶ run ─▶ run alone ─▶ repeat failed ─▶ report
 //! ```
 //!
-//! No test harness of a library does this: stories share a daemon, so they are threads of one process, and how many of them run depends on what
-//! they do.
+//! Test harnesses of libraries do not support this: stories share a daemon, so they are threads of one process, and how
+//! many of them run at a time depends on what they do.
 
 mod machine;
 mod record;
@@ -20,50 +21,50 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use clap::Parser;
-use support::story::{self, Telling};
+use support::story::{self, StoryRun};
 use support::world::world;
 use support::{Verdict, binaries, claim, evidence};
 
-use record::Record;
-use report::Report;
+use record::StoryTimes;
+use report::RunReport;
 use watchdog::Watchdog;
 
-/// Stories told at a time for each core: most of a story is waiting. What compiles waits for a core besides (`support::cores`).
+/// Concurrent stories per core; stories mostly wait. Those that compile also wait for a core (`support::cores`).
 const AT_A_TIME: usize = 4;
-/// More stories than this that fail and then pass fail the run: that is no accident of the machine.
+/// If more stories than this fail and then pass, the run fails, because that is not an accident of the machine.
 const MOST_FLAKY: usize = 2;
-/// Where more than this many fail, the run is lost, and telling them again would only take time.
+/// If more stories than this fail, they are not repeated, because the run has failed anyway.
 const MOST_TOLD_AGAIN: usize = 6;
-/// The cases of what is random in a story, so that a failure can be repeated.
+/// Seed of the random cases in stories, so that a failure can be reproduced.
 const SEED: &str = "PROPTEST_RNG_SEED";
 
-/// A story under its function's name.
-pub struct Story {
-    /// Its module and function, such as `tls::a_robot_works_through_tls`.
+/// A story with the name of its function.
+pub struct RunnableStory {
+    /// Module and function, such as `tls::a_robot_works_through_tls`.
     pub name: &'static str,
-    /// Tells it.
+    /// Function that runs the story.
     pub tell: Box<dyn Fn() -> Verdict + Send + Sync>,
 }
 
-/// Tells the stories of Cloudroid.
+/// Run the stories of Cloudroid
 #[derive(Debug, Parser)]
 #[command(name = "stories")]
-struct Arguments {
-    /// Tell only stories whose names contain one of these.
+struct StoryArguments {
+    /// Run only stories whose names contain one of these
     names: Vec<String>,
-    /// Take the names as whole names.
+    /// Match whole names
     #[arg(long)]
     exact: bool,
-    /// List the stories and end.
+    /// List the stories and exit
     #[arg(long)]
     list: bool,
-    /// How many to tell at a time (default: four for each core).
+    /// Number of concurrent stories (default: four per core)
     #[arg(long, value_name = "NUMBER")]
     test_threads: Option<NonZero<usize>>,
 }
 
-impl Arguments {
-    fn wants(&self, story: &str) -> bool {
+impl StoryArguments {
+    fn is_selected(&self, story: &str) -> bool {
         let is_named = |name: &String| {
             if self.exact {
                 story == name
@@ -75,22 +76,22 @@ impl Arguments {
     }
 }
 
-/// One telling's end.
-struct Outcome {
+/// Result of one run of a story.
+struct StoryOutcome {
     name: &'static str,
     took: Duration,
-    /// For a core that others' work took up.
+    /// Time spent waiting for cores that other stories used.
     waited: Duration,
     failure: Option<String>,
 }
 
-/// Tells those of `stories` that the arguments name; `alone` lists those that compare times with each other, which are told while no other is. A
-/// story that takes longer than `limit` ends the run with a failure.
-pub fn run(stories: Vec<Story>, alone: &[&str], limit: Duration) -> ExitCode {
-    let arguments = Arguments::parse();
-    let stories: Vec<Story> = stories
+/// Runs those of `stories` that the arguments select; `alone` lists stories that compare durations with each other and
+/// therefore run on their own. A story that takes longer than `limit` ends the run with a failure.
+pub fn run(stories: Vec<RunnableStory>, alone: &[&str], limit: Duration) -> ExitCode {
+    let arguments = StoryArguments::parse();
+    let stories: Vec<RunnableStory> = stories
         .into_iter()
-        .filter(|story| arguments.wants(story.name))
+        .filter(|story| arguments.is_selected(story.name))
         .collect();
     if arguments.list {
         for story in &stories {
@@ -110,9 +111,9 @@ pub fn run(stories: Vec<Story>, alone: &[&str], limit: Duration) -> ExitCode {
         support::world::end();
         return ExitCode::FAILURE;
     }
-    let record = Record::read();
+    let record = StoryTimes::read();
     let is_strict = std::env::var("STRICT").is_ok_and(|strict| !strict.is_empty() && strict != "0");
-    let runner = Runner {
+    let runner = StoryRunner {
         is_strict,
         outcomes: Mutex::default(),
         watchdog: Watchdog::start(limit),
@@ -121,21 +122,21 @@ pub fn run(stories: Vec<Story>, alone: &[&str], limit: Duration) -> ExitCode {
     let at_a_time = arguments
         .test_threads
         .map_or(AT_A_TIME * cores, NonZero::get);
-    let (last, mut first): (Vec<&Story>, Vec<&Story>) = stories
+    let (last, mut first): (Vec<&RunnableStory>, Vec<&RunnableStory>) = stories
         .iter()
         .partition(|story| alone.contains(&story.name));
-    first.sort_by_key(|story| std::cmp::Reverse(record.expected(story.name)));
+    first.sort_by_key(|story| std::cmp::Reverse(record.expected_time(story.name)));
     println!("telling {} stories, {at_a_time} at a time", stories.len());
-    runner.tell_all(first, at_a_time);
-    runner.tell_all(last, 1);
-    let again = runner.tell_again(&stories);
+    runner.run_all(first, at_a_time);
+    runner.run_all(last, 1);
+    let again = runner.repeat_failed(&stories);
     let told = runner
         .outcomes
         .into_inner()
         .unwrap_or_else(PoisonError::into_inner);
-    record.write(&told);
+    record.update(&told);
     let left = support::world::end();
-    let report = Report::new(&stories, told, again, left, is_strict);
+    let report = RunReport::new(&stories, told, again, left, is_strict);
     report.print();
     if report.is_good() {
         ExitCode::SUCCESS
@@ -144,20 +145,20 @@ pub fn run(stories: Vec<Story>, alone: &[&str], limit: Duration) -> ExitCode {
     }
 }
 
-struct Runner {
+struct StoryRunner {
     is_strict: bool,
-    outcomes: Mutex<Vec<Outcome>>,
+    outcomes: Mutex<Vec<StoryOutcome>>,
     watchdog: Watchdog,
 }
 
-impl Runner {
-    fn tell_all(&self, stories: Vec<&Story>, at_a_time: usize) {
+impl StoryRunner {
+    fn run_all(&self, stories: Vec<&RunnableStory>, at_a_time: usize) {
         let pending = Mutex::new(VecDeque::from(stories));
         std::thread::scope(|scope| {
             for _ in 0..at_a_time {
                 scope.spawn(|| {
-                    while let Some(story) = self.next(&pending) {
-                        let outcome = self.tell(story, 1);
+                    while let Some(story) = self.next_story(&pending) {
+                        let outcome = self.run_story(story, 1);
                         self.outcomes().push(outcome);
                     }
                 });
@@ -165,9 +166,12 @@ impl Runner {
         });
     }
 
-    /// The next story, if there is a reason to tell one.
-    fn next<'a>(&self, pending: &Mutex<VecDeque<&'a Story>>) -> Option<&'a Story> {
-        if self.is_strict && self.failed() > 0 {
+    /// Returns the next story, unless the run has failed already.
+    fn next_story<'a>(
+        &self,
+        pending: &Mutex<VecDeque<&'a RunnableStory>>,
+    ) -> Option<&'a RunnableStory> {
+        if self.is_strict && self.failure_count() > 0 {
             return None;
         }
         pending
@@ -176,8 +180,8 @@ impl Runner {
             .pop_front()
     }
 
-    /// Tells what failed once more, one story at a time.
-    fn tell_again(&self, stories: &[Story]) -> Vec<Outcome> {
+    /// Repeats the failed stories, one at a time.
+    fn repeat_failed(&self, stories: &[RunnableStory]) -> Vec<StoryOutcome> {
         let failed: Vec<&'static str> = self
             .outcomes()
             .iter()
@@ -190,18 +194,18 @@ impl Runner {
         stories
             .iter()
             .filter(|story| failed.contains(&story.name))
-            .map(|story| self.tell(story, 2))
+            .map(|story| self.run_story(story, 2))
             .collect()
     }
 
-    fn tell(&self, story: &Story, attempt: usize) -> Outcome {
+    fn run_story(&self, story: &RunnableStory, attempt: usize) -> StoryOutcome {
         self.watchdog.begin(story.name);
-        let outcome = tell(story, attempt);
+        let outcome = run_once(story, attempt);
         self.watchdog.end(story.name);
         outcome
     }
 
-    fn failed(&self) -> usize {
+    fn failure_count(&self) -> usize {
         let outcomes = self.outcomes();
         outcomes
             .iter()
@@ -209,13 +213,13 @@ impl Runner {
             .count()
     }
 
-    fn outcomes(&self) -> std::sync::MutexGuard<'_, Vec<Outcome>> {
+    fn outcomes(&self) -> std::sync::MutexGuard<'_, Vec<StoryOutcome>> {
         self.outcomes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Where what a failed telling leaves is kept.
-fn evidence_of(story: &str, attempt: usize) -> std::path::PathBuf {
+/// Returns the directory for the evidence of a failed run of a story.
+fn evidence_directory(story: &str, attempt: usize) -> std::path::PathBuf {
     let place = binaries::target()
         .join("stories")
         .join(story.replace("::", "/"));
@@ -226,11 +230,11 @@ fn evidence_of(story: &str, attempt: usize) -> std::path::PathBuf {
     }
 }
 
-/// Tells one story in a thread of its own, and keeps what it made where it fails.
-fn tell(story: &Story, attempt: usize) -> Outcome {
-    let place = evidence_of(story.name, attempt);
+/// Runs one story on a thread of its own, and keeps its files if it fails.
+fn run_once(story: &RunnableStory, attempt: usize) -> StoryOutcome {
+    let place = evidence_directory(story.name, attempt);
     let _ = std::fs::remove_dir_all(&place);
-    let telling = Telling::new(story.name, attempt, place);
+    let telling = StoryRun::new(story.name, attempt, place);
     let began = Instant::now();
     let failure = std::thread::scope(|scope| {
         let teller = std::thread::Builder::new()
@@ -252,7 +256,7 @@ fn tell(story: &Story, attempt: usize) -> Outcome {
         if let Err(error) = evidence::keep(&telling, reason, &seed, shared.as_deref()) {
             eprintln!("nothing is kept of {}: {error}", story.name);
         }
-        // A daemon that was killed leaves servants, and the second telling is to find nothing of the first.
+        // A killed daemon leaves servants behind, and the second run should not find anything of the first.
         for home in telling.homes() {
             if let Err(error) = claim::end_users(&home) {
                 eprintln!("{}: {error:#}", story.name);
@@ -268,10 +272,10 @@ fn tell(story: &Story, attempt: usize) -> Outcome {
         story.name,
         took.as_secs_f64()
     );
-    Outcome {
+    StoryOutcome {
         name: story.name,
         took,
-        waited: telling.waited(),
+        waited: telling.waiting_time(),
         failure,
     }
 }

@@ -1,8 +1,9 @@
-//! What stories are about: `make check` (scripts/check) tells those of a crate that was changed. It reads this table as text; a test of
-//! `src/cloudroidd/tests/architecture.rs` holds it to what there is.
+//! Subjects of the stories: `make check` (scripts/check) runs those of a changed crate. The script reads this table as
+//! text; a test in `src/cloudroidd/tests/architecture.rs` keeps it up to date.
 
-/// A module of stories, and the crates of whose change its stories must be told. A crate is named where a module shows what that crate is
-/// for, not wherever it is used: it serves a few subjects, so that they are told within minutes. `make test` tells all.
+/// Modules of stories, each with the crates after whose change its stories must run. A module lists a crate if it
+/// covers the purpose of that crate, not whenever it uses it: every crate has few subjects, so that its stories take
+/// minutes. `make test` runs all stories.
 pub const SUBJECTS: &[(&str, &[&str])] = &[
     ("access", &["access", "portal"]),
     ("acme", &["cloudroidd", "outbound"]),

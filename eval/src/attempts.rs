@@ -1,19 +1,20 @@
-//! What failed in this run of the evaluation and would fail again: a push that takes minutes is not made once more for each run that needs
-//! its service.
+//! Remembers what has failed in this run of the evaluation: a push that takes minutes is not repeated for each run that
+//! needs its service.
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
 use anyhow::{Result, anyhow};
 
-/// Why each thing failed, by its name.
+/// Errors, by the name of what failed.
 static FAILED: Mutex<BTreeMap<String, String>> = Mutex::new(BTreeMap::new());
 
-/// Does it, unless it has failed before.
+/// Runs `does`, unless it has failed before under this name.
 ///
 /// # Errors
-/// It fails, or has failed before: why it did then is said again. The next run of the evaluation tries it anew.
-pub fn once(name: &str, does: impl FnOnce() -> Result<()>) -> Result<()> {
+/// If it fails, or has failed before: then the error repeats the earlier one. The next run of the evaluation tries
+/// again.
+pub fn try_once(name: &str, does: impl FnOnce() -> Result<()>) -> Result<()> {
     let failed = || FAILED.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(why) = failed().get(name) {
         return Err(anyhow!(
@@ -33,7 +34,7 @@ mod tests {
     fn what_failed_is_not_tried_again() {
         let mut tries = 0;
         let mut fails = || {
-            once("test: fails", || {
+            try_once("test: fails", || {
                 tries += 1;
                 Err(anyhow!("no compiler"))
             })
@@ -46,6 +47,6 @@ mod tests {
                 .starts_with("no compiler (it failed before")
         );
         assert_eq!(tries, 1);
-        once("test: another", || Ok(())).expect("it is another");
+        try_once("test: another", || Ok(())).expect("it is another");
     }
 }

@@ -1,4 +1,5 @@
-//! What all runs depend on beside their own plans: other packages, other programs or another network make them other runs.
+//! Inputs that all runs depend on besides their own plans: with other packages, programs or networks, earlier results
+//! are no longer valid.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -8,28 +9,28 @@ use sha2::{Digest, Sha256};
 use support::binaries;
 
 use crate::examples;
-use crate::place::Network;
+use crate::place::NetworkProfile;
 
-/// The programs that are measured, where the evaluation takes them from: the daemon, what begins each servant, and the robot's stub.
+/// The programs under measurement: the daemon, the init of each servant, and the robot's stub.
 const PROGRAMS: [&str; 3] = [
     "cloudroidd",
     "cloudroid-init",
     "stubs/x86_64/cloudroid-stub",
 ];
 
-/// The SHA-256 of all of it.
+/// Returns the SHA-256 of all these inputs.
 ///
 /// # Errors
-/// A program is not built, or a package cannot be read.
+/// If a program has not been built, or if a package cannot be read.
 pub fn basis() -> Result<String> {
-    of(
+    hash_inputs(
         &examples::fingerprint()?,
         &PROGRAMS.map(binaries::path),
-        &Network::ALL.map(|network| format!("{:?}", network.rules())),
+        &NetworkProfile::ALL.map(|network| format!("{:?}", network.rules())),
     )
 }
 
-fn of(packages: &str, programs: &[PathBuf], networks: &[String]) -> Result<String> {
+fn hash_inputs(packages: &str, programs: &[PathBuf], networks: &[String]) -> Result<String> {
     let mut whole = Sha256::new();
     whole.update(packages);
     for program in programs {
@@ -54,7 +55,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let program = place.path().join("cloudroidd");
         let programs = [program.clone()];
-        let now = |network: &str| of("packages", &programs, &[network.to_owned()]);
+        let now = |network: &str| hash_inputs("packages", &programs, &[network.to_owned()]);
         let error = now("1 ms").expect_err("there is no program");
         assert!(format!("{error:#}").contains("cloudroidd"), "{error:#}");
         std::fs::write(&program, "one").expect("ours");

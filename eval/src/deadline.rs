@@ -1,4 +1,4 @@
-//! Programs and threads that are waited for, no longer than they may take.
+//! Waiting for programs and threads with a time limit.
 
 use std::fs::File;
 use std::io::{Read, Seek};
@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 
-/// Between two looks at whether a program has ended.
+/// Polling interval for the end of a program.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// Waits until a program has ended.
+/// Waits until a program has exited.
 ///
 /// # Errors
-/// `what`, as which the program is named, has not ended after `longest`: it is killed.
-pub fn ends(child: &mut Child, what: &str, longest: Duration) -> Result<ExitStatus> {
+/// If the program, named `what` in the error, has not exited after `longest`: it is killed.
+pub fn wait_for_exit(child: &mut Child, what: &str, longest: Duration) -> Result<ExitStatus> {
     let begun = Instant::now();
     loop {
         if let Some(status) = child.try_wait()? {
@@ -33,10 +33,11 @@ pub fn ends(child: &mut Child, what: &str, longest: Duration) -> Result<ExitStat
     }
 }
 
-/// Runs a program to its end, and reads what it says then: files take it, so that nothing that the program has left behind is waited for.
+/// Runs a program to its end and returns its output. The output goes through files, so that background processes of the
+/// program are not waited for.
 ///
 /// # Errors
-/// It cannot be started, or has not ended after `longest`: it is killed.
+/// If it cannot be started, or has not exited after `longest`: it is killed.
 pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
     let what = command.get_program().to_string_lossy().into_owned();
     let (out, said) = (tempfile::tempfile()?, tempfile::tempfile()?);
@@ -46,7 +47,7 @@ pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
         .stderr(said.try_clone()?)
         .spawn()
         .with_context(|| what.clone())?;
-    let status = ends(&mut child, &what, longest)?;
+    let status = wait_for_exit(&mut child, &what, longest)?;
     let read = |mut file: File| -> Result<Vec<u8>> {
         let mut bytes = Vec::new();
         file.rewind()?;
@@ -60,16 +61,16 @@ pub fn output(command: &mut Command, longest: Duration) -> Result<Output> {
     })
 }
 
-/// Where threads wait for one another.
-pub struct Meeting {
+/// A barrier for threads with a time limit.
+pub struct TimedBarrier {
     members: usize,
     came: Mutex<usize>,
     changed: Condvar,
 }
 
-impl Meeting {
-    /// Of so many threads.
-    pub fn of(members: usize) -> Self {
+impl TimedBarrier {
+    /// Creates a barrier for `members` threads.
+    pub fn new(members: usize) -> Self {
         Self {
             members,
             came: Mutex::new(0),
@@ -77,11 +78,11 @@ impl Meeting {
         }
     }
 
-    /// Waits until all have come.
+    /// Waits until all threads have arrived.
     ///
     /// # Errors
-    /// After `longest` some have not: they broke, or hang.
-    pub fn waits(&self, longest: Duration) -> Result<()> {
+    /// If some have not arrived after `longest`, because they failed or hang.
+    pub fn wait(&self, longest: Duration) -> Result<()> {
         let mut came = self.came.lock().unwrap_or_else(PoisonError::into_inner);
         *came += 1;
         self.changed.notify_all();
@@ -108,7 +109,7 @@ mod tests {
     #[test]
     fn what_a_program_says_is_read() {
         let mut command = Command::new("sh");
-        // What is left in the background holds its output open, and is not waited for.
+        // The background process keeps the output open and is not waited for.
         command.args(["-c", "sleep 5 & echo out; echo said >&2; exit 3"]);
         let begun = Instant::now();
         let output = output(&mut command, Duration::from_secs(60)).expect("it ends");
@@ -122,21 +123,20 @@ mod tests {
 
     #[test]
     fn who_does_not_come_is_not_waited_for() {
-        let alone = Meeting::of(2);
-        let error = alone.waits(Duration::ZERO).expect_err("one is lacking");
+        let alone = TimedBarrier::new(2);
+        let error = alone.wait(Duration::ZERO).expect_err("one is lacking");
         assert!(error.to_string().starts_with("only 1 of 2"), "{error}");
-        alone
-            .waits(Duration::from_secs(60))
-            .expect("both have come");
+        alone.wait(Duration::from_secs(60)).expect("both have come");
     }
 
     #[test]
     fn a_program_that_takes_too_long_is_killed() {
         let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
-        let error = ends(&mut child, "sleep", Duration::ZERO).expect_err("it takes a minute");
+        let error =
+            wait_for_exit(&mut child, "sleep", Duration::ZERO).expect_err("it takes a minute");
         assert!(error.to_string().contains("sleep had not ended"), "{error}");
         let mut child = Command::new("false").spawn().expect("false");
-        let status = ends(&mut child, "false", Duration::from_secs(60)).expect("it ends");
+        let status = wait_for_exit(&mut child, "false", Duration::from_secs(60)).expect("it ends");
         assert_eq!(status.code(), Some(1));
     }
 }

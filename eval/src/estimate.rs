@@ -1,7 +1,7 @@
-//! How long an evaluation takes, said at its beginning: of a machine of two cores, packages compiled before. What was measured before takes
-//! no time.
+//! Estimate of an evaluation's duration, printed at its beginning: for a machine with two cores and packages compiled
+//! earlier. Stored results take no time.
 
-/// Experiments that are measured together, and seconds of a quick evaluation and of a whole one.
+/// Experiments that are measured together, and the seconds of a quick and of a full evaluation.
 const SECONDS: [(&[u8], u32, u32); 9] = [
     (&[1], 55, 300),
     (&[2, 4, 5], 20, 540),
@@ -14,8 +14,8 @@ const SECONDS: [(&[u8], u32, u32); 9] = [
     (&[11], 0, 300),
 ];
 
-/// Of these experiments, or of all where none is named; seconds.
-fn seconds(quick: bool, only: &[u8]) -> u32 {
+/// Returns the seconds of these experiments, or of all if `only` is empty.
+fn estimate_seconds(quick: bool, only: &[u8]) -> u32 {
     let wanted = SECONDS.iter().filter(|(numbers, _, _)| {
         only.is_empty() || numbers.iter().any(|number| only.contains(number))
     });
@@ -24,11 +24,12 @@ fn seconds(quick: bool, only: &[u8]) -> u32 {
         .sum()
 }
 
-/// Says it.
-pub fn tell(quick: bool, only: &[u8]) {
+/// Prints the estimate.
+pub fn print_estimate(quick: bool, only: &[u8]) {
     eprintln!(
-        "this takes about {} min on a machine of two cores, less what was measured before; packages that were never compiled take some minutes more",
-        seconds(quick, only).div_ceil(60)
+        "this takes about {} min on a machine of two cores, less what was measured before; packages that were never \
+         compiled take some minutes more",
+        estimate_seconds(quick, only).div_ceil(60)
     );
     eprintln!("min:s  run");
 }
@@ -39,9 +40,9 @@ mod tests {
 
     #[test]
     fn experiments_that_are_measured_together_count_once() {
-        assert_eq!(seconds(false, &[4, 5]), 540);
-        assert_eq!(seconds(true, &[2, 3]), 80);
-        assert!(seconds(false, &[]) < 75 * 60);
-        assert!(seconds(true, &[1, 2, 4, 5, 7, 8, 10]) <= 2 * 60);
+        assert_eq!(estimate_seconds(false, &[4, 5]), 540);
+        assert_eq!(estimate_seconds(true, &[2, 3]), 80);
+        assert!(estimate_seconds(false, &[]) < 75 * 60);
+        assert!(estimate_seconds(true, &[1, 2, 4, 5, 7, 8, 10]) <= 2 * 60);
     }
 }

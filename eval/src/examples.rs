@@ -1,4 +1,4 @@
-//! The packages that are evaluated, the services made of them, and the recordings that they are asked with.
+//! The packages under evaluation, the services created from them, and the recordings that they process.
 
 mod packages;
 
@@ -10,83 +10,83 @@ use anyhow::{Context, Result, ensure};
 use sha2::{Digest, Sha256};
 use support::binaries;
 use support::daemon::Daemon;
-use support::site::{image_config, in_image};
+use support::site::{image_config, image_shell};
 use tempfile::TempDir;
 
-use crate::robot::{Node, Pace, Plan};
+use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
 use crate::stereo;
 use crate::weights;
 use crate::{attempts, deadline};
 
 pub use packages::{
-    ALL, DETECTOR, DISPARITY, Example, GRAPH_SLAM, Input, LASER_SLAM, LASER_SLAM_SIMULATED, Origin,
-    PEOPLE,
+    ALL, DETECTOR, DISPARITY, EvalPackage, GRAPH_SLAM, InputRecording, LASER_SLAM,
+    LASER_SLAM_SIMULATED, Origin, PEOPLE,
 };
 use packages::{DATA, DRIVE, SIMULATED, VIDEO};
 
-/// Where packages that were compiled are, in images.
+/// Directory of compiled packages in images.
 const COMPILED: &str = "/opt/cloudroid/install/lib";
-/// Where those of Debian are.
+/// Directory of Debian's packages in images.
 const PACKAGED: &str = "/usr/lib";
-/// Seconds after which a request counts as not answered.
+/// Seconds after which a request counts as unanswered.
 const GIVE_UP: f64 = 30.0;
-/// For making one recording.
+/// Maximum time to create one recording.
 const CONVERTS: Duration = Duration::from_secs(300);
-/// The file that the converter writes.
+/// File that the converter writes.
 const BAG: &str = "recording.bag";
 
-/// Where an example answers.
+/// Place where an example runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Where {
+pub enum ExecutionSite {
     /// On the robot.
     Native,
-    /// In a servant, by the stub.
+    /// In a servant, through the stub.
     Outsourced,
 }
 
-/// What runs need that is made once: services, root file systems and recordings.
-pub struct Workshop<'a> {
-    /// Where services are.
+/// Services, root file systems and recordings that are created once and shared by runs.
+pub struct EvalFixtures<'a> {
+    /// The daemon that has the services.
     pub daemon: &'a Daemon,
     place: &'a Path,
 }
 
-impl<'a> Workshop<'a> {
-    /// With files below `place`.
+impl<'a> EvalFixtures<'a> {
+    /// Uses `place` for its files.
     pub fn new(daemon: &'a Daemon, place: &'a Path) -> Self {
         Self { daemon, place }
     }
 
-    /// Publishes an example, unless that was done before or has failed before.
-    pub fn publishes(&self, example: &Example) -> Result<()> {
-        let services = self.daemon.deployer().asks(&["services"])?;
+    /// Publishes an example, unless it has been published, or has failed, before.
+    pub fn publish(&self, example: &EvalPackage) -> Result<()> {
+        let services = self.daemon.deployer().run_json(&["services"])?;
         let known = services
             .as_array()
             .is_some_and(|all| all.iter().any(|service| service["name"] == example.name));
         if known {
             return Ok(());
         }
-        attempts::once(example.name, || self.pushes(example))
+        attempts::try_once(example.name, || self.push(example))
     }
 
-    fn pushes(&self, example: &Example) -> Result<()> {
+    fn push(&self, example: &EvalPackage) -> Result<()> {
         eprintln!(
             "pushing {}: the first time takes some minutes",
             example.name
         );
-        example.input.is_there()?;
+        example.input.check_files()?;
         let mut push = vec!["push".to_owned()];
         match example.origin {
             Origin::Checkout => {
                 let package = binaries::checkout().join("examples").join(example.name);
                 if example.name == DETECTOR.name {
-                    weights::put_into(&package)?;
+                    weights::install(&package)?;
                 }
                 push.push(package.to_str().context("a path of UTF-8")?.to_owned());
             }
             Origin::Debian => {
                 push.extend(["--apt", example.name].map(str::to_owned));
-                // What it says is learned from a start of it.
+                // The interface is determined by starting the node once.
                 for parameter in example.parameters {
                     let words = parameter.trim_start_matches('_').replace(":=", "=");
                     push.extend(["--param".to_owned(), words]);
@@ -96,19 +96,24 @@ impl<'a> Workshop<'a> {
         let limits = ["--node", example.executable, "--cpus", "1", "--memory"];
         push.extend(limits.into_iter().chain(["2G"]).map(str::to_owned));
         let push: Vec<&str> = push.iter().map(String::as_str).collect();
-        self.daemon.deployer().types(&push)?.succeeded()?;
+        self.daemon.deployer().run(&push)?.expect_success()?;
         Ok(())
     }
 
-    /// A directory that goes with the value, for one run.
+    /// Creates a temporary directory for one run.
     pub fn directory(&self) -> Result<TempDir> {
         Ok(tempfile::Builder::new()
             .prefix("run-")
             .tempdir_in(self.place)?)
     }
 
-    /// What the robot does, as one request after the other.
-    pub fn plan(&self, example: &Example, at: Where, directory: &Path) -> Result<Plan> {
+    /// Returns the plan of a robot that makes one request after the other.
+    pub fn plan(
+        &self,
+        example: &EvalPackage,
+        at: ExecutionSite,
+        directory: &Path,
+    ) -> Result<RobotPlan> {
         let (name, installed) = match example.origin {
             Origin::Checkout => (example.name, COMPILED),
             Origin::Debian => (example.executable, PACKAGED),
@@ -116,14 +121,14 @@ impl<'a> Workshop<'a> {
         let mut argv = vec![format!("__name:={name}")];
         argv.extend(example.parameters.iter().map(|word| (*word).to_owned()));
         let node = match at {
-            Where::Native => {
-                // As somebody who sourced its setup.sh.
+            ExecutionSite::Native => {
+                // The environment that setup.sh would set.
                 let config = image_config(self.daemon, example.name)?;
                 let environment = config["config"]["Env"].as_array();
                 let words = environment.into_iter().flatten();
                 let mut words: Vec<String> = words
                     .filter_map(|one| one.as_str().map(str::to_owned))
-                    // Where its Master is, the robot says.
+                    // The Master's address comes from the robot.
                     .filter(|one| {
                         !one.starts_with("ROS_MASTER_URI=") && !one.starts_with("ROS_HOSTNAME=")
                     })
@@ -133,13 +138,13 @@ impl<'a> Workshop<'a> {
                     example.name, example.executable
                 ));
                 words.extend(argv);
-                Node::Native {
-                    script: in_image(self.daemon, example.name, &directory.join("root"))?,
+                NodeUnderTest::Native {
+                    script: image_shell(self.daemon, example.name, &directory.join("root"))?,
                     program: "/usr/bin/env".to_owned(),
                     argv: words,
                 }
             }
-            Where::Outsourced => Node::Stub {
+            ExecutionSite::Outsourced => NodeUnderTest::Stub {
                 package: example.name.to_owned(),
                 executable: example.executable.to_owned(),
                 argv,
@@ -147,21 +152,24 @@ impl<'a> Workshop<'a> {
                 environment: Vec::new(),
             },
         };
-        Ok(Plan {
+        Ok(RobotPlan {
             server: String::new(),
             node,
             recording: self.recording(example.input)?,
             request: example.request.to_owned(),
             left_out: vec!["/ground_truth".to_owned()],
             besides: match example.input {
-                Input::Drive | Input::Simulated => vec!["/odom".to_owned()],
-                Input::Pictures | Input::Stereo => Vec::new(),
+                InputRecording::Drive | InputRecording::Simulated => vec!["/odom".to_owned()],
+                InputRecording::Pictures | InputRecording::Stereo => Vec::new(),
             },
             answer: example.answer.to_owned(),
-            tells_pose: matches!(example.input, Input::Drive | Input::Simulated),
+            tells_pose: matches!(
+                example.input,
+                InputRecording::Drive | InputRecording::Simulated
+            ),
             timing: example.timing.map(str::to_owned),
             map: example.map.map(str::to_owned),
-            pace: Pace::OneByOne,
+            pace: RequestPacing::OneByOne,
             every: 1,
             most: example.requests,
             give_up: GIVE_UP,
@@ -170,35 +178,35 @@ impl<'a> Workshop<'a> {
         })
     }
 
-    /// What it is asked with; made when it is first asked for.
-    pub fn recording(&self, input: Input) -> Result<PathBuf> {
+    /// Returns the file of a recording; it is created when it is first requested.
+    pub fn recording(&self, input: InputRecording) -> Result<PathBuf> {
         let path = self.place.join(match input {
-            Input::Drive => "drive.bag",
-            Input::Simulated => "simulated.bag",
-            Input::Pictures => "pedestrians.raw",
-            Input::Stereo => "plant.stereo",
+            InputRecording::Drive => "drive.bag",
+            InputRecording::Simulated => "simulated.bag",
+            InputRecording::Pictures => "pedestrians.raw",
+            InputRecording::Stereo => "plant.stereo",
         });
         if !path.exists() {
             let half = path.with_extension("half");
             match input {
-                Input::Drive => self.drive(DRIVE, &half)?,
-                Input::Simulated => self.drive(SIMULATED, &half)?,
-                Input::Pictures => pictures(&half)?,
-                Input::Stereo => stereo::write(&half)?,
+                InputRecording::Drive => self.convert_rawlog(DRIVE, &half)?,
+                InputRecording::Simulated => self.convert_rawlog(SIMULATED, &half)?,
+                InputRecording::Pictures => extract_pictures(&half)?,
+                InputRecording::Stereo => stereo::write(&half)?,
             }
             std::fs::rename(half, &path)?;
         }
         Ok(path)
     }
 
-    /// A recording of MRPT as a rosbag file: the converter is a program of the example package.
-    fn drive(&self, rawlog: &str, to: &Path) -> Result<()> {
-        self.publishes(&LASER_SLAM)?;
+    /// Converts a recording of MRPT to a rosbag file, with a program of the example package.
+    fn convert_rawlog(&self, rawlog: &str, to: &Path) -> Result<()> {
+        self.publish(&LASER_SLAM)?;
         let directory = self.directory()?;
         let root = directory.path().join("root");
-        let script = in_image(self.daemon, LASER_SLAM.name, &root)?;
+        let script = image_shell(self.daemon, LASER_SLAM.name, &root)?;
         let program = format!("{COMPILED}/{}/rawlog_to_bag", LASER_SLAM.name);
-        // What the converter reads and writes is on this machine.
+        // The converter reads and writes files of this machine.
         let bind = format!(
             "mount --bind {} {root}/mnt && mount --bind {DATA} {root}/media && exec chroot",
             directory.path().display(),
@@ -220,7 +228,8 @@ impl<'a> Workshop<'a> {
     }
 }
 
-/// What the packages are made of (SHA-256), so that runs of other ones are not taken for runs of these.
+/// Returns the SHA-256 of the packages' sources, so that results of other versions are not mistaken for results of
+/// these.
 pub fn fingerprint() -> Result<String> {
     let mut files = Vec::new();
     let directories = ["examples", "eval/packages", "tests/packages/receipts_py"];
@@ -241,7 +250,7 @@ pub fn fingerprint() -> Result<String> {
     files.sort();
     let mut whole = Sha256::new();
     for file in files {
-        // The weights are checked where they are fetched.
+        // The weights are checked when they are fetched.
         if file.extension().is_none_or(|ending| ending != "onnx") {
             whole.update(file.to_string_lossy().as_bytes());
             whole.update(std::fs::read(&file)?);
@@ -250,8 +259,8 @@ pub fn fingerprint() -> Result<String> {
     Ok(format!("{:x}", whole.finalize()))
 }
 
-/// Pedestrians of opencv-doc, 640x480, bgr8, one after the other.
-fn pictures(to: &Path) -> Result<()> {
+/// Extracts images of pedestrians from opencv-doc: 640x480, bgr8, concatenated.
+fn extract_pictures(to: &Path) -> Result<()> {
     let mut child = Command::new("ffmpeg")
         .args(["-v", "error", "-i", VIDEO, "-vf", "scale=640:480"])
         .args([
@@ -266,7 +275,7 @@ fn pictures(to: &Path) -> Result<()> {
         .arg(to)
         .spawn()
         .context("ffmpeg")?;
-    let status = deadline::ends(&mut child, "ffmpeg", CONVERTS)?;
+    let status = deadline::wait_for_exit(&mut child, "ffmpeg", CONVERTS)?;
     ensure!(status.success(), "ffmpeg ended with {status}");
     Ok(())
 }

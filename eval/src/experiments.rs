@@ -1,4 +1,4 @@
-//! The experiments, one file each: how it is measured, and what the report says of it.
+//! The experiments, one file each: how they are measured, and their sections of the report.
 
 pub mod benches;
 pub mod codecs;

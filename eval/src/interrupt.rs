@@ -1,5 +1,6 @@
-//! An evaluation that is asked to end (Ctrl-C, SIGTERM): nothing more is measured, places are taken down, and the report is written of what
-//! was measured until then. Asked again, it ends at once; what it leaves then, the next one takes away.
+//! Interruption of an evaluation (Ctrl-C, SIGTERM): nothing more is measured, the sandboxes are removed, and the report
+//! is written with the results so far. A second signal ends the evaluation at once; the next one removes what it
+//! leaves.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -7,10 +8,10 @@ use anyhow::{Result, ensure};
 use tokio::signal::unix::{SignalKind, signal};
 
 static ASKED: AtomicBool = AtomicBool::new(false);
-/// As a shell says it of a program that Ctrl-C has ended.
+/// Exit status of a program that was ended by Ctrl-C, as shells report it.
 const AT_ONCE: i32 = 130;
 
-/// Begins to listen for signals.
+/// Installs the signal handlers.
 pub fn listen() -> Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -41,18 +42,18 @@ pub fn listen() -> Result<()> {
     Ok(())
 }
 
-/// Whether it was asked to end.
-pub fn asked() -> bool {
+/// Returns whether the evaluation was interrupted.
+pub fn is_requested() -> bool {
     ASKED.load(Ordering::Relaxed)
 }
 
-/// That it was not.
+/// Checks that the evaluation was not interrupted.
 ///
 /// # Errors
-/// It was: nothing more is to be measured.
-pub fn none() -> Result<()> {
+/// If it was: nothing more is to be measured.
+pub fn ensure_not_requested() -> Result<()> {
     ensure!(
-        !asked(),
+        !is_requested(),
         "the evaluation was asked to end before this was measured"
     );
     Ok(())

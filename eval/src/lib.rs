@@ -1,12 +1,12 @@
-//! The published experiments on one machine, with real nodes, and a report of them.
+//! Runs the published experiments on one machine with real nodes and reports on them.
 //!
 //! ```text
-//!  experiments ── run ──▶ cells (target/eval/cells: raw, one file a run)
-//!                            │ computed, by functions that are tested on known input
+//!  experiments ── run ──▶ results (target/eval/cells: raw data, one file per run)
+//!                            │ evaluated by functions that are tested with known input
 //!                            ▼
-//!                         sections ──▶ report.html, report.json, one SVG a figure
+//!                         sections ──▶ report.html, report.json, one SVG per figure
 //! ```
-//! An evaluation that was cut off goes on where it stopped. What could not be measured is named in the report, with the reason.
+//! An interrupted evaluation continues where it stopped. The report lists what could not be measured, with the reason.
 
 #![forbid(unsafe_code)]
 

@@ -1,4 +1,4 @@
-//! `make eval`: the published experiments on one machine, with real nodes, and a report of them. Needs root.
+//! `make eval`: runs the published experiments on one machine with real nodes and writes a report. Needs root.
 
 #![forbid(unsafe_code)]
 
@@ -7,21 +7,22 @@ use std::process::ExitCode;
 
 use anyhow::{Result, ensure};
 use clap::{Parser, Subcommand};
-use support::daemon::Setup;
+use support::daemon::DaemonSetup;
 
-use eval::cells::Cells;
-use eval::examples::Workshop;
-use eval::experiments::crowd::Yard;
+use eval::cells::RunCache;
+use eval::examples::EvalFixtures;
+use eval::experiments::crowd::CrowdDaemon;
 use eval::experiments::{
     codecs, cores, failover, map, memory, neighbours, outsourcing, overhead, scale, transparency,
 };
-use eval::section::{Missing, Section};
+use eval::section::{MissingMeasurement, Section};
 use eval::{basis, estimate, interrupt, rehearsal, report, robot, sweep};
 
-/// Requests of each run of a quick evaluation.
+/// Requests per run of a quick evaluation.
 const QUICK: usize = 6;
 
-/// What a quick evaluation leaves out, unless it is named: with its title, and what shows the same of the programs.
+/// Experiments that a quick evaluation omits unless they are named: number, id, title, and the tests that cover the
+/// same.
 const LEFT_OUT: [(u8, &str, &str, &str); 4] = [
     (
         3,
@@ -49,47 +50,48 @@ const LEFT_OUT: [(u8, &str, &str, &str); 4] = [
     ),
 ];
 
-/// The published experiments on this machine: target/eval/report.html.
+/// Run the published experiments on this machine and write target/eval/report.html
 #[derive(Debug, Parser)]
-struct Arguments {
-    /// Only what takes two minutes: what no story shows, with few requests of each run; or what is named.
+struct EvalArguments {
+    /// Run a reduced evaluation of about two minutes: few requests per run, without the experiments that stories cover
+    /// (unless named by --only)
     #[arg(long)]
     quick: bool,
-    /// Only the experiments of these numbers.
+    /// Run only these experiments, such as 1,4,7 (default: all)
     #[arg(long, value_delimiter = ',', value_name = "NUMBERS", value_parser = clap::value_parser!(u8).range(1..=11))]
     only: Vec<u8>,
-    /// Measure again what was measured before.
+    /// Discard stored results and measure everything again
     #[arg(long)]
     fresh: bool,
-    /// Where the report is written, and what was measured is kept; without it below the checkout's `target`.
+    /// Directory for the report and the stored results (default: target/eval, or target/eval-quick with --quick)
     #[arg(long, global = true, value_name = "DIRECTORY")]
     target: Option<PathBuf>,
     #[command(subcommand)]
-    verb: Option<Verb>,
+    verb: Option<EvalCommand>,
 }
 
 #[derive(Debug, Subcommand)]
-enum Verb {
-    /// What runs in a robot's place.
+enum EvalCommand {
+    /// Run inside a robot's sandbox
     #[command(hide = true)]
     Robot {
-        /// Its plan.
+        /// File with the robot's plan
         order: PathBuf,
-        /// Where what it saw is written.
+        /// File to which the robot's trace is written
         answer: PathBuf,
     },
-    /// An evaluation of nothing, for tests.
+    /// Run an empty evaluation, for tests
     #[command(hide = true)]
     Rehearse {
-        /// How long its node is there.
+        /// Seconds for which its node runs
         seconds: f64,
     },
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = EvalArguments::parse();
     let done = match &arguments.verb {
-        Some(Verb::Robot { order, answer }) => robot::main(order, answer).map(|()| true),
+        Some(EvalCommand::Robot { order, answer }) => robot::main(order, answer).map(|()| true),
         _ => evaluate(&arguments),
     };
     match done {
@@ -102,8 +104,8 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether all was measured.
-fn evaluate(arguments: &Arguments) -> Result<bool> {
+/// Runs the evaluation; returns whether everything was measured.
+fn evaluate(arguments: &EvalArguments) -> Result<bool> {
     ensure!(
         nix::unistd::geteuid().is_root(),
         "robots' places and servants are made by root: sudo make eval"
@@ -116,39 +118,39 @@ fn evaluate(arguments: &Arguments) -> Result<bool> {
         };
         bench_report::root().join("target").join(name)
     });
-    let cells = Cells::new(target.join("cells"), arguments.fresh)?;
-    let cells = cells.based_on(basis::basis()?);
+    let cells = RunCache::new(target.join("cells"), arguments.fresh)?;
+    let cells = cells.with_basis(basis::basis()?);
     interrupt::listen()?;
-    for line in sweep::all() {
+    for line in sweep::remove_all() {
         eprintln!("left by an evaluation before: {line}");
     }
     let place = tempfile::Builder::new().prefix(sweep::PREFIX).tempdir()?;
     sweep::claim(place.path())?;
-    let daemon = Setup::new(&place.path().join("home")).start()?;
-    let workshop = Workshop::new(&daemon, place.path());
+    let daemon = DaemonSetup::new(&place.path().join("home")).start()?;
+    let workshop = EvalFixtures::new(&daemon, place.path());
     let sections = match &arguments.verb {
-        Some(Verb::Rehearse { seconds }) => {
+        Some(EvalCommand::Rehearse { seconds }) => {
             vec![rehearsal::section(&cells, &workshop, *seconds)?]
         }
         _ => {
-            let numbers = numbers(arguments);
-            estimate::tell(arguments.quick, &numbers);
-            let mut sections = sections(arguments.quick, &numbers, &cells, &workshop);
+            let numbers = selected_numbers(arguments);
+            estimate::print_estimate(arguments.quick, &numbers);
+            let mut sections = run_experiments(arguments.quick, &numbers, &cells, &workshop);
             if arguments.only.is_empty() {
-                sections.extend(left_out(&numbers));
+                sections.extend(left_out_sections(&numbers));
                 sections.sort_by_key(|section| section.number);
             }
             sections
         }
     };
-    // Before the daemon's end: whatever becomes of that, what was measured is told.
+    // Written before the daemon is stopped, so that a failure there does not lose the results.
     let complete = report::write(&target, &sections, &cells)?;
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(complete)
 }
 
-/// The experiments that are asked for.
-fn numbers(arguments: &Arguments) -> Vec<u8> {
+/// Returns the numbers of the selected experiments.
+fn selected_numbers(arguments: &EvalArguments) -> Vec<u8> {
     if !arguments.only.is_empty() {
         return arguments.only.clone();
     }
@@ -158,18 +160,23 @@ fn numbers(arguments: &Arguments) -> Vec<u8> {
         .collect()
 }
 
-fn sections(quick: bool, numbers: &[u8], cells: &Cells, workshop: &Workshop) -> Vec<Section> {
+fn run_experiments(
+    quick: bool,
+    numbers: &[u8],
+    cells: &RunCache,
+    workshop: &EvalFixtures,
+) -> Vec<Section> {
     let wanted = |number: u8| numbers.contains(&number);
     let most = quick.then_some(QUICK);
     let mut sections = Vec::new();
     if wanted(1) {
-        sections.extend(attempt(1, || {
+        sections.extend(run_experiment(1, || {
             let runs = transparency::measure(cells, workshop, most)?;
             Ok(vec![transparency::section(&runs)])
         }));
     }
     if [2, 4, 5].into_iter().any(wanted) {
-        sections.extend(attempt(2, || {
+        sections.extend(run_experiment(2, || {
             let runs = outsourcing::measure(cells, workshop, most)?;
             let mut made = vec![
                 outsourcing::response_times(&runs)?,
@@ -181,31 +188,31 @@ fn sections(quick: bool, numbers: &[u8], cells: &Cells, workshop: &Workshop) -> 
         }));
     }
     if wanted(2) {
-        sections.extend(attempt(2, || {
+        sections.extend(run_experiment(2, || {
             let studies = cores::measure(cells, workshop, quick)?;
             Ok(vec![cores::section(&studies)?])
         }));
     }
     if wanted(3) {
-        sections.extend(attempt(3, || {
+        sections.extend(run_experiment(3, || {
             let runs = memory::measure(cells, workshop)?;
             Ok(vec![memory::section(&runs)])
         }));
     }
     if wanted(6) {
-        sections.extend(attempt(6, || {
+        sections.extend(run_experiment(6, || {
             let runs = failover::measure(cells, workshop, quick)?;
             Ok(vec![failover::section(&runs)?])
         }));
     }
     if wanted(7) {
-        sections.extend(attempt(7, || {
+        sections.extend(run_experiment(7, || {
             let runs = map::measure(cells, workshop, most.map(|most| most * 5))?;
             Ok(vec![map::section(&runs)?])
         }));
     }
     if wanted(8) {
-        sections.extend(attempt(8, || {
+        sections.extend(run_experiment(8, || {
             let runs = codecs::measure(cells, workshop, quick)?;
             Ok(vec![codecs::section(&runs)?])
         }));
@@ -213,25 +220,25 @@ fn sections(quick: bool, numbers: &[u8], cells: &Cells, workshop: &Workshop) -> 
     if [9, 10].into_iter().any(wanted) {
         match workshop.directory() {
             Ok(place) => {
-                let mut yard = Yard::new(place.path());
+                let mut yard = CrowdDaemon::new(place.path());
                 if wanted(9) {
-                    sections.extend(attempt(9, || {
+                    sections.extend(run_experiment(9, || {
                         let runs = neighbours::measure(cells, &mut yard, quick)?;
                         Ok(vec![neighbours::section(&runs)?])
                     }));
                 }
                 if wanted(10) {
-                    sections.extend(attempt(10, || {
+                    sections.extend(run_experiment(10, || {
                         let runs = scale::measure(cells, &mut yard, quick)?;
                         Ok(vec![scale::section(&runs)?])
                     }));
                 }
             }
-            Err(error) => sections.push(failed(9, &error)),
+            Err(error) => sections.push(failure_section(9, &error)),
         }
     }
     if wanted(11) {
-        sections.extend(attempt(11, || {
+        sections.extend(run_experiment(11, || {
             let runs = overhead::measure(cells)?;
             Ok(vec![overhead::section(&runs)?])
         }));
@@ -240,24 +247,24 @@ fn sections(quick: bool, numbers: &[u8], cells: &Cells, workshop: &Workshop) -> 
     sections
 }
 
-/// What the report shows of an experiment, or why there is nothing: one that fails as a whole does not stop the others.
-fn attempt(number: u8, made: impl FnOnce() -> Result<Vec<Section>>) -> Vec<Section> {
-    made().unwrap_or_else(|error| vec![failed(number, &error)])
+/// Runs an experiment; if it fails as a whole, returns a section with the reason, so that the others continue.
+fn run_experiment(number: u8, made: impl FnOnce() -> Result<Vec<Section>>) -> Vec<Section> {
+    made().unwrap_or_else(|error| vec![failure_section(number, &error)])
 }
 
-/// An experiment that failed as a whole.
-fn failed(number: u8, error: &anyhow::Error) -> Section {
+/// Creates the section of an experiment that failed as a whole.
+fn failure_section(number: u8, error: &anyhow::Error) -> Section {
     let title = format!("Experiment {number}");
     let mut section = Section::new(number, format!("failed-{number}"), title);
     let why = format!("{error:#}");
     section
         .missing
-        .push(Missing::again("the whole experiment", why));
+        .push(MissingMeasurement::retryable("the whole experiment", why));
     section
 }
 
-/// What the report says of experiments that are not among these.
-fn left_out(numbers: &[u8]) -> Vec<Section> {
+/// Creates sections for the experiments that were omitted.
+fn left_out_sections(numbers: &[u8]) -> Vec<Section> {
     let left_out = LEFT_OUT
         .into_iter()
         .filter(|(number, ..)| !numbers.contains(number));

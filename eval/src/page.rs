@@ -1,4 +1,4 @@
-//! The report as one HTML file: nothing is fetched and nothing is run, so it can be sent as it is.
+//! The report as a single HTML file that loads nothing and runs nothing, so that it can be sent as it is.
 
 mod figures;
 mod style;
@@ -6,13 +6,13 @@ mod tables;
 
 use std::fmt::Write;
 
-use crate::section::{Missing, Section, Table};
-use figures::picture;
+use crate::section::{MissingMeasurement, Section, Table};
+use figures::render_figure;
 use style::STYLE;
-use tables::tabulate;
+use tables::render_table;
 
-/// The page. `machine` is where it was measured, `made` when; `reproduced` lists what could not be reproduced here, its
-/// stand-in, and the reason.
+/// Renders the page. `machine` describes where it was measured, `made` is the date; `reproduced` lists what could not
+/// be reproduced here, the substitute, and the reason.
 pub fn render(
     sections: &[Section],
     machine: &str,
@@ -27,14 +27,15 @@ pub fn render(
          <style>\n{STYLE}</style>\n</head>\n<body>\n<header>\n\
          <h1>Cloudroid: the published experiments on one machine</h1>\n\
          <p>Measured on {}.<br>Made on {}.</p>\n\
-         <p>Measured numbers are computed from what the experiments recorded. Ratios are those of this machine.</p>\n</header>\n",
-        escaped(machine),
-        escaped(made)
+         <p>Measured numbers are computed from what the experiments recorded. Ratios are those of this \
+         machine.</p>\n</header>\n",
+        escape(machine),
+        escape(made)
     );
-    contents(&mut page, sections, reproduced);
+    render_contents(&mut page, sections, reproduced);
     page.push_str("<main>\n");
     for section in sections {
-        show(&mut page, section);
+        render_section(&mut page, section);
     }
     if sections.is_empty() {
         page.push_str("<p>Nothing was measured.</p>\n");
@@ -48,20 +49,20 @@ pub fn render(
         for (what, instead, why) in reproduced {
             table.push([what, instead, why]);
         }
-        tabulate(&mut page, &table);
+        render_table(&mut page, &table);
         page.push_str("</section>\n");
     }
     page.push_str("</main>\n</body>\n</html>\n");
     page
 }
 
-fn put(page: &mut String, text: std::fmt::Arguments) {
-    // Writing to a String does not fail.
+fn append(page: &mut String, text: std::fmt::Arguments) {
+    // Writing to a String cannot fail.
     let _ = page.write_fmt(text);
 }
 
-/// Text as it may stand in an element or in a quoted attribute.
-fn escaped(text: &str) -> String {
+/// Escapes text for an element or a quoted attribute.
+fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {
         match character {
@@ -70,7 +71,7 @@ fn escaped(text: &str) -> String {
             '>' => out.push_str("&gt;"),
             '"' => out.push_str("&quot;"),
             '\'' => out.push_str("&#39;"),
-            // HTML has no way to write control characters.
+            // HTML cannot represent control characters.
             other if other.is_control() && !other.is_whitespace() => out.push('\u{fffd}'),
             other => out.push(other),
         }
@@ -78,7 +79,7 @@ fn escaped(text: &str) -> String {
     out
 }
 
-/// The anchor of a section, or of a figure: letters, digits and dashes.
+/// Returns the anchor of a section or figure: letters, digits and dashes.
 fn anchor(kind: &str, id: &str) -> String {
     let plain = id.chars().map(|character| {
         if character.is_ascii_alphanumeric() {
@@ -90,7 +91,11 @@ fn anchor(kind: &str, id: &str) -> String {
     format!("{kind}-{}", plain.collect::<String>())
 }
 
-fn contents(page: &mut String, sections: &[Section], reproduced: &[(String, String, String)]) {
+fn render_contents(
+    page: &mut String,
+    sections: &[Section],
+    reproduced: &[(String, String, String)],
+) {
     page.push_str("<nav aria-label=\"Contents\">\n<h2>Contents</h2>\n<ul>\n");
     for section in sections {
         let missing = match section.missing.len() {
@@ -98,13 +103,13 @@ fn contents(page: &mut String, sections: &[Section], reproduced: &[(String, Stri
             1 => " <small>(1 thing was not measured)</small>".to_owned(),
             more => format!(" <small>({more} things were not measured)</small>"),
         };
-        put(
+        append(
             page,
             format_args!(
                 "<li><a href=\"#{}\">{}. {}</a>{missing}</li>\n",
                 anchor("section", &section.id),
                 section.number,
-                escaped(&section.title)
+                escape(&section.title)
             ),
         );
     }
@@ -114,68 +119,68 @@ fn contents(page: &mut String, sections: &[Section], reproduced: &[(String, Stri
     page.push_str("</ul>\n</nav>\n");
 }
 
-fn show(page: &mut String, section: &Section) {
+fn render_section(page: &mut String, section: &Section) {
     let anchor = anchor("section", &section.id);
-    put(
+    append(
         page,
         format_args!(
             "<section id=\"{anchor}\" aria-labelledby=\"{anchor}-title\">\n<h2 id=\"{anchor}-title\">{}. {}</h2>\n",
             section.number,
-            escaped(&section.title)
+            escape(&section.title)
         ),
     );
     if !section.published.is_empty() {
-        put(
+        append(
             page,
             format_args!(
                 "<h3>Published</h3>\n<p>{}</p>\n",
-                escaped(&section.published)
+                escape(&section.published)
             ),
         );
     }
-    sentences(page, "What is different here", &section.differs);
+    render_sentences(page, "What is different here", &section.differs);
     let measured = !(section.tables.is_empty() && section.figures.is_empty());
     if measured {
         page.push_str("<h3>Measured</h3>\n");
     }
     for table in &section.tables {
-        tabulate(page, table);
+        render_table(page, table);
     }
     for figure in &section.figures {
-        picture(page, figure);
+        render_figure(page, figure);
     }
-    sentences(page, "Findings", &section.findings);
-    missing(page, &section.missing);
+    render_sentences(page, "Findings", &section.findings);
+    render_missing(page, &section.missing);
     if !measured && section.findings.is_empty() && section.missing.is_empty() {
         page.push_str("<p>Nothing was measured.</p>\n");
     }
     page.push_str("</section>\n");
 }
 
-fn sentences(page: &mut String, heading: &str, sentences: &[String]) {
+fn render_sentences(page: &mut String, heading: &str, sentences: &[String]) {
     if sentences.is_empty() {
         return;
     }
-    put(page, format_args!("<h3>{heading}</h3>\n<ul>\n"));
+    append(page, format_args!("<h3>{heading}</h3>\n<ul>\n"));
     for sentence in sentences {
-        put(page, format_args!("<li>{}</li>\n", escaped(sentence)));
+        append(page, format_args!("<li>{}</li>\n", escape(sentence)));
     }
     page.push_str("</ul>\n");
 }
 
-fn missing(page: &mut String, missing: &[Missing]) {
+fn render_missing(page: &mut String, missing: &[MissingMeasurement]) {
     if missing.is_empty() {
         return;
     }
     page.push_str("<div class=\"missing\">\n<h3>What was not measured</h3>\n<ul>\n");
-    for Missing { what, why, next } in missing {
-        put(
+    for MissingMeasurement { what, why, next } in missing {
+        append(
             page,
             format_args!(
                 "<li><strong>{}</strong><br>Why: {}<br>Next step: {}</li>\n",
-                escaped(what),
-                escaped(why),
-                escaped(next)
+                escape(what),
+                escape(why),
+                escape(next)
             ),
         );
     }
@@ -189,7 +194,7 @@ mod tests {
 
     const EVIL: &str = "<script>alert(\"1\")</script> & 'x'\u{0}";
 
-    fn evil() -> Section {
+    fn hostile_section() -> Section {
         let mut section = Section::new(3, EVIL, EVIL);
         section.published = EVIL.into();
         section.differs.push(EVIL.into());
@@ -212,14 +217,16 @@ mod tests {
         ] {
             section.figures.push(Figure::svg(EVIL, EVIL, svg));
         }
-        section.missing.push(Missing::new(EVIL, EVIL, EVIL));
+        section
+            .missing
+            .push(MissingMeasurement::new(EVIL, EVIL, EVIL));
         section
     }
 
     #[test]
     fn everything_is_escaped() {
         let row = (EVIL.to_owned(), EVIL.to_owned(), EVIL.to_owned());
-        let page = render(&[evil()], EVIL, EVIL, &[row]);
+        let page = render(&[hostile_section()], EVIL, EVIL, &[row]);
         assert!(
             !page.contains("<script") && !page.contains("onload"),
             "{page}"
@@ -233,7 +240,7 @@ mod tests {
 
     #[test]
     fn nothing_is_fetched() {
-        let page = render(&[evil()], "m", "d", &[]);
+        let page = render(&[hostile_section()], "m", "d", &[]);
         let sources = page.matches("src=").count();
         assert_eq!(page.matches("src=\"data:").count(), sources);
         for word in ["<link", "@import", "url("] {
@@ -280,9 +287,11 @@ mod tests {
         section
             .tables
             .push(Table::new("RRT", ["set-up", "RRT (s)", "note"]).row(["none", "0.20", "n"]));
-        section
-            .missing
-            .push(Missing::new("8 neighbours", "out of memory", "more memory"));
+        section.missing.push(MissingMeasurement::new(
+            "8 neighbours",
+            "out of memory",
+            "more memory",
+        ));
         let row = ("GPU".into(), "CPU".into(), "there is none".into());
         let page = render(&[section], "2 × some processor", "2026-11-25", &[row]);
         for wanted in [

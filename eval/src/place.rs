@@ -1,5 +1,6 @@
-//! The robot is a place on this machine: a control group with little processor time and memory, in a network namespace whose only way
-//! out is a cable with the delay, the rate and the losses of a network. The cloud is the rest of the machine.
+//! A robot is simulated by a sandbox on this machine: a cgroup with little processor time and memory, in a network
+//! namespace whose only connection is a cable with the delay, rate and loss of a network. The cloud is the rest of the
+//! machine.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -11,69 +12,69 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
-use servant::cgroup::{Cgroup, Parent};
+use servant::cgroup::{Cgroup, CgroupParent};
 use servant::container::{ContainerSpec, Profile};
-use servant::spec::Limits;
-use support::cable::{Badness, Cable};
+use servant::spec::ResourceLimits;
+use support::cable::{Cable, NetworkImpairment};
 
-use crate::robot::Plan;
+use crate::robot::RobotPlan;
 use crate::trace::Trace;
 use crate::{interrupt, sweep};
 
-/// How long the kernel may take to end what runs in a place.
+/// Maximum time for the kernel to end the processes of a sandbox.
 const END: Duration = Duration::from_secs(20);
-/// Between two looks at whether the robot has ended.
+/// Polling interval for the end of the robot.
 const LOOK: Duration = Duration::from_millis(50);
 const GIB: u64 = 1 << 30;
-/// The answer to a robot that asked for another network.
+/// Response to a robot that requested another network.
 const DONE: &str = "done";
 
-/// A kind of robot computer.
+/// A class of robot computers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Class {
+pub struct RobotHardware {
     /// Cores of this machine.
     pub cores: f64,
-    /// Bytes.
+    /// Memory in bytes.
     pub memory: u64,
 }
 
-impl Class {
-    /// A quarter of a core and 1 GiB.
+impl RobotHardware {
+    /// A Raspberry Pi: a quarter of a core and 1 GiB.
     pub const PI: Self = Self {
         cores: 0.25,
         memory: GIB,
     };
-    /// Half a core and 4 GiB.
+    /// An ultrabook: half a core and 4 GiB.
     pub const ULTRABOOK: Self = Self {
         cores: 0.5,
         memory: 4 * GIB,
     };
 
-    /// As tables name it.
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         if self == Self::PI { "Pi" } else { "ultrabook" }
     }
 }
 
-/// Between a robot and the server.
+/// Networks between a robot and the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Network {
+pub enum NetworkProfile {
     /// 1 ms each way, 100 Mbit/s.
     Lan,
     /// 30 ms each way, 20 Mbit/s.
     Wan,
-    /// 5 ms each way, more or less 4 ms, 40 Mbit/s, one packet in a hundred is lost.
+    /// 5 ms each way with a jitter of 4 ms, 40 Mbit/s, 1 % packet loss.
     Wifi,
-    /// 100 ms each way, 2 Mbit/s, one packet in a hundred is lost: what the benchmark `failover` calls bad.
+    /// 100 ms each way, 2 Mbit/s, 1 % packet loss: the degraded network of the benchmark `failover`.
     Bad,
 }
 
-impl Network {
-    /// Each of them.
+impl NetworkProfile {
+    /// All networks.
     pub const ALL: [Self; 4] = [Self::Lan, Self::Wan, Self::Wifi, Self::Bad];
 
-    /// As tables name it.
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Lan => "LAN",
@@ -83,15 +84,15 @@ impl Network {
         }
     }
 
-    /// In each direction.
-    pub fn rules(self) -> Badness {
+    /// Properties of the network, for each direction.
+    pub fn rules(self) -> NetworkImpairment {
         let (rate, delay, jitter, loss) = match self {
             Self::Lan => (100_000, 1, 0, 0.0),
             Self::Wan => (20_000, 30, 0, 0.0),
             Self::Wifi => (40_000, 5, 4, 0.01),
             Self::Bad => (2000, 100, 0, 0.01),
         };
-        Badness {
+        NetworkImpairment {
             rate,
             delay,
             jitter,
@@ -100,8 +101,8 @@ impl Network {
         }
     }
 
-    /// Its rules in words.
-    pub fn told(self) -> String {
+    /// Describes its properties in words.
+    pub fn describe(self) -> String {
         let rules = self.rules();
         let mut told = format!("{} ms each way", rules.delay);
         if rules.jitter > 0 {
@@ -114,67 +115,69 @@ impl Network {
         told
     }
 
-    /// Seconds that so many bytes take to be sent, at its rate.
-    pub fn takes(self, bytes: usize) -> f64 {
+    /// Returns the seconds that sending `bytes` takes at its rate.
+    pub fn transfer_time(self, bytes: usize) -> f64 {
         8.0 * bytes as f64 / (f64::from(self.rules().rate) * 1e3)
     }
 }
 
-/// What a run took beside what its robot saw.
+/// Resources used by a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Cost {
-    /// Processor time of everything on the robot, seconds.
+pub struct RunCost {
+    /// Processor time of all processes on the robot, in seconds.
     pub robot_cpu: f64,
     /// Bytes of packets from the robot.
     pub sent: u64,
-    /// Bytes of packets to it.
+    /// Bytes of packets to the robot.
     pub received: u64,
-    /// Processes of the robot that the kernel has ended for want of memory.
+    /// Number of the robot's processes that the kernel's OOM killer ended.
     pub killed_for_memory: u64,
-    /// What made the network what it was.
+    /// Mechanism that shapes the network.
     pub network: String,
 }
 
-/// A robot's place. What is in it ends with it.
-pub struct Place {
-    /// Where the server is reached from inside.
+/// The sandbox of a robot. Its processes end on drop.
+pub struct RobotSandbox {
+    /// Leads to the server from inside.
     cable: Cable,
     cgroup: Cgroup,
-    /// What runs in it: this very program, unless a test says otherwise.
+    /// Program of the robot: this executable, unless a test sets another one.
     pub program: PathBuf,
 }
 
-impl Place {
-    /// Makes one, and reads back that its limits are in force.
-    pub fn new(portal: &str, class: Class, network: Network) -> Result<Self> {
+impl RobotSandbox {
+    /// Creates a sandbox, and checks that its limits are in force.
+    pub fn new(portal: &str, class: RobotHardware, network: NetworkProfile) -> Result<Self> {
         let cable = Cable::with_robot_inside(portal).context("the robot's network")?;
         cable.degrade(network.rules())?;
-        let parent = Parent::find().context("control groups, which a robot's place needs")?;
+        let parent = CgroupParent::find().context("control groups, which a robot's place needs")?;
         ensure!(
             parent.version != 0,
-            "no control groups can be made here ({}): a robot's place needs their limits; run it as root where they are delegated",
+            "no control groups can be made here ({}): a robot's place needs their limits; run it as root where they \
+             are delegated",
             parent.reason
         );
-        let limits = Limits {
+        let limits = ResourceLimits {
             cpus: Some(class.cores),
             memory: Some(class.memory),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
         let name = cable.namespace();
         let name = name.file_name().and_then(|name| name.to_str());
-        let cgroup = Cgroup::planned(&parent, &spec(name.unwrap_or("robot"), &limits));
+        let cgroup = Cgroup::for_servant(&parent, &spec(name.unwrap_or("robot"), &limits));
         cgroup.create()?;
         let place = Self {
             cable,
             cgroup,
-            // By the process: the file may have been replaced meanwhile.
+            // Through the process, because the file may have been replaced meanwhile.
             program: format!("/proc/{}/exe", std::process::id()).into(),
         };
-        let now = place.cgroup.set(&limits).limits;
+        let now = place.cgroup.set_limits(&limits).limits;
         let cores = now.cpus.unwrap_or(f64::INFINITY);
         ensure!(
             (cores - class.cores).abs() < 0.01 && now.memory == Some(class.memory),
-            "the limits of a robot are not in force here: asked for {} cores and {} bytes, the kernel says {:?} and {:?}",
+            "the limits of a robot are not in force here: asked for {} cores and {} bytes, the kernel says {:?} and \
+             {:?}",
             class.cores,
             class.memory,
             now.cpus,
@@ -183,30 +186,30 @@ impl Place {
         Ok(place)
     }
 
-    /// Where a stub on this robot finds the server.
+    /// Returns the server's address for a stub on this robot.
     pub fn server(&self) -> String {
         format!("ws://{}", self.cable.server)
     }
 
-    /// Processes of the robot that the kernel has ended for want of memory.
+    /// Returns how many of the robot's processes the kernel's OOM killer has ended.
     pub fn killed_for_memory(&self) -> u64 {
         self.cgroup.oom_kills()
     }
 
-    /// Runs a robot in it to its end.
+    /// Runs a robot in the sandbox to its end.
     ///
     /// # Errors
-    /// The robot is lost (ended by a signal, or by the kernel for want of memory), says why it cannot go on, or takes longer than its
-    /// plan has patience for.
-    pub fn runs(&self, plan: &Plan, directory: &Path) -> Result<(Trace, Cost)> {
+    /// If the robot was killed (by a signal, or by the kernel for lack of memory), reports why it cannot continue, or
+    /// exceeds the time limit of its plan.
+    pub fn run(&self, plan: &RobotPlan, directory: &Path) -> Result<(Trace, RunCost)> {
         let [order, answer, log] =
             ["plan.json", "trace.json", "log"].map(|name| directory.join(name));
-        let plan = Plan {
+        let plan = RobotPlan {
             server: self.server(),
             ..plan.clone()
         };
         std::fs::write(&order, serde_json::to_vec(&(&plan, &self.cgroup))?)?;
-        let begun = (self.cgroup.usage(), self.cable.carried()?);
+        let begun = (self.cgroup.usage(), self.cable.transferred_bytes()?);
         let said = File::create(&log)?;
         let mut child = Command::new("nsenter")
             .arg(format!("--net={}", self.cable.namespace().display()))
@@ -214,7 +217,7 @@ impl Place {
             .arg(&self.program)
             .arg("robot")
             .args([&order, &answer])
-            // What a robot that is killed leaves goes with the run's directory.
+            // Leftovers of a killed robot are removed together with the run's directory.
             .env("TMPDIR", directory)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -224,14 +227,14 @@ impl Place {
         let (wishes, answers) = (child.stdout.take(), child.stdin.take());
         let ended = std::thread::scope(|scope| {
             if let (Some(wishes), Some(answers)) = (wishes, answers) {
-                scope.spawn(|| self.changes(BufReader::new(wishes), answers));
+                scope.spawn(|| self.serve_network_changes(BufReader::new(wishes), answers));
             }
-            waits(&mut child, Duration::from_secs_f64(plan.patience))
+            wait_for_robot(&mut child, Duration::from_secs_f64(plan.patience))
         });
         let killed = self.cgroup.oom_kills();
         if let Err(error) = ended {
             let said = std::fs::read_to_string(&log).unwrap_or_default();
-            // Whatever it had started.
+            // Also ends processes that the robot has started.
             for pid in self.cgroup.processes() {
                 let _ = nix::sys::signal::kill(
                     nix::unistd::Pid::from_raw(pid),
@@ -243,29 +246,29 @@ impl Place {
             } else {
                 ""
             };
-            bail!("{error:#}{memory}; its last words: {}", last_words(&said));
+            bail!("{error:#}{memory}; its last words: {}", output_tail(&said));
         }
         let trace = serde_json::from_slice(&std::fs::read(&answer)?)?;
-        let (usage, carried) = (self.cgroup.usage(), self.cable.carried()?);
-        let cost = Cost {
+        let (usage, carried) = (self.cgroup.usage(), self.cable.transferred_bytes()?);
+        let cost = RunCost {
             robot_cpu: (usage.cpu_usec - begun.0.cpu_usec) as f64 / 1e6,
             sent: carried.0 - begun.1.0,
             received: carried.1 - begun.1.1,
             killed_for_memory: killed,
-            network: self.cable.means().to_owned(),
+            network: self.cable.mechanism().to_owned(),
         };
         Ok((trace, cost))
     }
 
-    /// Makes the network what the robot asks for in lines of its output, until that ends, and answers each when it is done. A robot
-    /// that hears no answer goes no further.
-    fn changes(&self, wishes: impl BufRead, mut answers: impl Write) {
+    /// Changes the network as the robot requests in lines of its output, until that ends, and confirms each change. A
+    /// robot that gets no confirmation does not continue.
+    fn serve_network_changes(&self, wishes: impl BufRead, mut answers: impl Write) {
         for line in wishes.lines().map_while(Result::ok) {
-            let Ok(network) = serde_json::from_str::<Network>(&line) else {
+            let Ok(network) = serde_json::from_str::<NetworkProfile>(&line) else {
                 eprintln!("the robot said: {line}");
                 continue;
             };
-            // What waits in the network that was goes with it, as on a robot that changes its access point.
+            // Packets queued in the old network are lost with it, as when a robot changes its access point.
             let made = self.cable.restore();
             let made = made.and_then(|()| self.cable.degrade(network.rules()));
             if let Err(error) = made {
@@ -279,8 +282,8 @@ impl Place {
     }
 }
 
-/// The robot's side of a wish for another network: returns when it is there.
-pub fn asks_for(network: Network) -> Result<()> {
+/// Requests another network, on the robot's side; returns once it is in place.
+pub fn request_network(network: NetworkProfile) -> Result<()> {
     println!("{}", serde_json::to_string(&network)?);
     let mut answer = String::new();
     std::io::stdin().read_line(&mut answer)?;
@@ -288,7 +291,7 @@ pub fn asks_for(network: Network) -> Result<()> {
     Ok(())
 }
 
-impl Drop for Place {
+impl Drop for RobotSandbox {
     fn drop(&mut self) {
         if let Err(error) = self.cgroup.destroy(END) {
             eprintln!("the robot's control group is left: {error}");
@@ -296,9 +299,9 @@ impl Drop for Place {
     }
 }
 
-/// Takes away places of processes that are no more; tells which, each in a line.
-pub fn sweep() -> Vec<String> {
-    let Ok(parent) = Parent::find() else {
+/// Removes sandboxes of processes that no longer exist; returns a line for each.
+pub fn remove_abandoned() -> Vec<String> {
+    let Ok(parent) = CgroupParent::find() else {
         return Vec::new();
     };
     let entries = std::fs::read_dir("/run/netns").into_iter().flatten();
@@ -307,37 +310,37 @@ pub fn sweep() -> Vec<String> {
         .filter_map(|entry| entry.file_name().into_string().ok());
     let mut told = Vec::new();
     for name in names {
-        let Some((pid, number)) = owner(&name) else {
+        let Some((pid, number)) = parse_owner(&name) else {
             continue;
         };
         if Path::new(&format!("/proc/{pid}")).exists() {
             continue;
         }
-        let cgroup = Cgroup::planned(&parent, &spec(&name, &Limits::default()));
+        let cgroup = Cgroup::for_servant(&parent, &spec(&name, &ResourceLimits::default()));
         if let Err(error) = cgroup.destroy(END) {
             told.push(format!("the robot's place {name} is left: {error}"));
             continue;
         }
-        sweep::ip(&["link", "del", &format!("cr{pid}-{number}")]);
-        sweep::ip(&["netns", "del", &name]);
+        sweep::run_ip(&["link", "del", &format!("cr{pid}-{number}")]);
+        sweep::run_ip(&["netns", "del", &name]);
         told.push(format!("the robot's place {name}: taken away"));
     }
     told
 }
 
-/// Of which process a namespace is, by its name, and its number there.
-fn owner(name: &str) -> Option<(u32, u32)> {
+/// Parses the owner's pid and a number from the name of a namespace.
+fn parse_owner(name: &str) -> Option<(u32, u32)> {
     let (pid, number) = name.strip_prefix("cloudroid-cable-")?.split_once('-')?;
     Some((pid.parse().ok()?, number.parse().ok()?))
 }
 
-fn waits(child: &mut Child, patience: Duration) -> Result<()> {
+fn wait_for_robot(child: &mut Child, patience: Duration) -> Result<()> {
     let deadline = Instant::now() + patience;
     let status = loop {
         if let Some(status) = child.try_wait()? {
             break status;
         }
-        if interrupt::asked() {
+        if interrupt::is_requested() {
             let _ = child.kill();
             let _ = child.wait();
             bail!("the evaluation was asked to end while this was measured");
@@ -359,8 +362,8 @@ fn waits(child: &mut Child, patience: Duration) -> Result<()> {
     }
 }
 
-/// The end of what it printed, in one line.
-fn last_words(said: &str) -> String {
+/// Returns the end of the output in one line.
+fn output_tail(said: &str) -> String {
     let lines: Vec<&str> = said
         .lines()
         .filter(|line| !line.trim().is_empty())
@@ -369,7 +372,7 @@ fn last_words(said: &str) -> String {
     lines[from..].join(" | ")
 }
 
-fn spec(id: &str, limits: &Limits) -> ContainerSpec {
+fn spec(id: &str, limits: &ResourceLimits) -> ContainerSpec {
     ContainerSpec {
         id: id.to_owned(),
         layers: Vec::new(),
@@ -391,40 +394,40 @@ mod tests {
 
     #[test]
     fn a_network_is_told_by_its_rules() {
-        assert_eq!(Network::Lan.told(), "1 ms each way, 100 Mbit/s");
+        assert_eq!(NetworkProfile::Lan.describe(), "1 ms each way, 100 Mbit/s");
         assert_eq!(
-            Network::Wifi.told(),
+            NetworkProfile::Wifi.describe(),
             "5 ms each way, more or less 4 ms, 40 Mbit/s, 1 % of packets lost"
         );
-        assert!((Network::Bad.takes(250_000) - 1.0).abs() < 1e-9);
+        assert!((NetworkProfile::Bad.transfer_time(250_000) - 1.0).abs() < 1e-9);
     }
 
     #[test]
     fn a_robot_that_is_killed_is_named() {
         let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
         child.kill().expect("it is ours");
-        let error = waits(&mut child, END).expect_err("it was killed");
+        let error = wait_for_robot(&mut child, END).expect_err("it was killed");
         assert!(error.to_string().contains("signal 9"), "{error}");
     }
 
     #[test]
     fn a_robot_that_takes_too_long_is_ended() {
         let mut child = Command::new("sleep").arg("60").spawn().expect("sleep");
-        let error = waits(&mut child, Duration::ZERO).expect_err("it takes a minute");
+        let error = wait_for_robot(&mut child, Duration::ZERO).expect_err("it takes a minute");
         assert!(error.to_string().contains("not done"), "{error}");
         assert!(child.try_wait().expect("it was waited for").is_some());
     }
 
     #[test]
     fn a_place_is_of_the_process_in_its_name() {
-        assert_eq!(owner("cloudroid-cable-12-3"), Some((12, 3)));
-        assert_eq!(owner("cloudroid-cable-12"), None);
-        assert_eq!(owner("somebody's-12-3"), None);
+        assert_eq!(parse_owner("cloudroid-cable-12-3"), Some((12, 3)));
+        assert_eq!(parse_owner("cloudroid-cable-12"), None);
+        assert_eq!(parse_owner("somebody's-12-3"), None);
     }
 
     #[test]
     fn last_words_are_one_line() {
         let said = "1\n2\n\n3\n4\n5\n6\n7\n";
-        assert_eq!(last_words(said), "2 | 3 | 4 | 5 | 6 | 7");
+        assert_eq!(output_tail(said), "2 | 3 | 4 | 5 | 6 | 7");
     }
 }

@@ -1,9 +1,9 @@
-//! Plots as SVG, drawn by the crate plotters: measured numbers go in, the text of one document comes out.
+//! SVG plots, drawn with the crate plotters: each function turns numbers into the text of one document.
 //!
-//! Every plot has a white ground, so that it can be read in light and dark pages, and colours that colour-blind people
-//! tell apart (Okabe and Ito, "Color Universal Design", 2008); a series also has a marker of its own. Values that are
-//! not finite are left out, and so is what a logarithmic axis has no place for: the plot says how many. A plot of
-//! nothing says that nothing was measured.
+//! Every plot has a white background, so that it is readable on light and dark pages, and colours that colour-blind
+//! people can distinguish (Okabe and Ito, "Color Universal Design", 2008); each series also has a marker of its own.
+//! Values that are not finite, or that a logarithmic axis cannot show, are omitted; the plot says how many. An empty
+//! plot says that nothing was measured.
 
 mod axis;
 mod bars;
@@ -13,17 +13,17 @@ mod timeline;
 
 use anyhow::Result;
 
-/// Points that belong together.
+/// A series of points.
 #[derive(Debug, Clone)]
 pub struct Series {
-    /// Its name in the legend.
+    /// Name in the legend.
     pub name: String,
     /// (x, y), in the units of the axes.
     pub points: Vec<(f64, f64)>,
 }
 
 impl Series {
-    /// A series of these points.
+    /// Creates a series.
     pub fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
         Self {
             name: name.into(),
@@ -32,46 +32,46 @@ impl Series {
     }
 }
 
-/// One bar.
+/// A bar of a bar chart.
 #[derive(Debug, Clone)]
 pub struct Bar {
-    /// The bars beside which it stands; groups stand in the order in which they are first named.
+    /// Group of adjacent bars; groups are ordered by first occurrence.
     pub group: String,
-    /// Its name in the legend; one name has one colour.
+    /// Name in the legend; each name has one colour.
     pub name: String,
-    /// Its height, in the unit of the axis.
+    /// Height, in the unit of the axis.
     pub value: f64,
-    /// Where the whisker begins and ends, in the same unit.
+    /// Ends of the whisker, in the same unit.
     pub spread: Option<(f64, f64)>,
 }
 
-/// What [`timeline`] draws.
+/// Data of [`timeline`].
 #[derive(Debug, Clone, Default)]
-pub struct Banded {
+pub struct TimelineData {
     /// (x, y, class), in the units of the axes; the class is an index into `classes`.
     pub points: Vec<(f64, f64, usize)>,
-    /// The classes' names in the legend.
+    /// Names of the classes in the legend.
     pub classes: Vec<String>,
-    /// Ranges of x that are shaded.
+    /// Ranges of x to shade.
     pub bad: Vec<(f64, f64)>,
-    /// Horizontal lines, with what they mean.
+    /// Horizontal lines and their labels.
     pub levels: Vec<(f64, String)>,
-    /// (x, Q), drawn in a strip below; without any there is no strip.
+    /// (x, Q), drawn in a strip below the plot; without values there is no strip.
     pub q: Vec<(f64, f64)>,
 }
 
-/// Lines through the points, in their order; a value that is left out interrupts its line. `x` and `y` name the axes,
-/// with their units.
+/// Draws lines through the points in their order; an omitted value interrupts its line. `x` and `y` are the labels of
+/// the axes, with units.
 pub fn lines(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
     series::lines(title, (x, y), series, log_y)
 }
 
-/// Points without lines.
+/// Draws points without lines.
 pub fn points(title: &str, x: &str, y: &str, series: &[Series], log_y: bool) -> Result<String> {
     series::points(title, (x, y), series, log_y)
 }
 
-/// Curves such as a model's as lines, and what was measured as points.
+/// Draws curves, such as those of a model, as lines, and measurements as points.
 pub fn curves(
     title: &str,
     x: &str,
@@ -84,14 +84,14 @@ pub fn curves(
     series::curves(title, (x, y), &series, curves.len(), log_y)
 }
 
-/// Trajectories: lines, a metre of x as long as a metre of y.
+/// Draws trajectories as lines, with the same scale for x and y.
 pub fn map(title: &str, x: &str, y: &str, series: &[Series]) -> Result<String> {
     series::map(title, (x, y), series)
 }
 
-/// The empirical cumulative distribution of each series: for each value, the share of the series (%) that is at most as
-/// large. `x` names the axis, with its unit. Values that have no place on the axis, such as infinite ones, still count
-/// in the shares; those that are not numbers do not.
+/// Draws the empirical cumulative distribution of each series: for each value, the percentage of the series that is at
+/// most as large. `x` is the label of the axis, with its unit. Values that the axis cannot show, such as infinite ones,
+/// still count in the percentages; NaN does not.
 pub fn distribution(
     title: &str,
     x: &str,
@@ -101,14 +101,14 @@ pub fn distribution(
     series::distribution(title, x, series, log_x)
 }
 
-/// Bars in groups, with whiskers and their value above. `y` names the axis, with its unit.
+/// Draws grouped bars with whiskers and values. `y` is the label of the axis, with its unit.
 pub fn bars(title: &str, y: &str, bars: &[Bar], log_y: bool) -> Result<String> {
     bars::draw(title, y, bars, log_y)
 }
 
-/// Points by class over a shaded ground, on a logarithmic axis, with levels across and Q below. `x` and `y` name the
-/// axes, with their units.
-pub fn timeline(title: &str, x: &str, y: &str, banded: &Banded) -> Result<String> {
+/// Draws classified points over shaded ranges, on a logarithmic axis, with horizontal levels and Q below. `x` and `y`
+/// are the labels of the axes, with units.
+pub fn timeline(title: &str, x: &str, y: &str, banded: &TimelineData) -> Result<String> {
     timeline::draw(title, (x, y), banded)
 }
 
@@ -124,7 +124,7 @@ mod tests {
         vec![Series::new("one", points.to_vec())]
     }
 
-    /// Every kind, of nothing and of values that cannot be drawn.
+    /// Every kind of plot, without values and with values that cannot be drawn.
     #[test]
     fn nothing_measured_is_said() {
         let unusable = [
@@ -161,11 +161,11 @@ mod tests {
             let text = distribution("t", "x", &given, true).expect("it is drawn");
             assert!(text.contains("nothing was measured"), "{text}");
         }
-        let text = timeline("t", "x", "y", &Banded::default()).expect("it is drawn");
+        let text = timeline("t", "x", "y", &TimelineData::default()).expect("it is drawn");
         assert!(text.contains("nothing was measured"), "{text}");
     }
 
-    /// One point, equal points, huge and tiny numbers: ranges without a width must not stop a plot.
+    /// One point, equal points, huge and tiny numbers: ranges of zero width must not prevent a plot.
     #[test]
     fn degenerate_ranges_are_drawn() {
         for given in [
@@ -208,7 +208,7 @@ mod tests {
         );
     }
 
-    /// Three points, of which the middle one is not known: no line crosses the gap.
+    /// Three points, the middle one unknown: no line crosses the gap.
     #[test]
     fn a_line_stops_where_a_value_is_left_out() {
         let whole = lines(
@@ -230,7 +230,7 @@ mod tests {
         assert!(count(&whole, "stroke=\"#0072B2\"") > count(&broken, "stroke=\"#0072B2\""));
     }
 
-    /// A model's curve has no markers and is the first colour, what was measured has no line.
+    /// A model's curve has no markers and the first colour; measurements have no line.
     #[test]
     fn curves_are_lines_and_measurements_are_points() {
         let curve: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), f64::from(x * x))).collect();
@@ -306,7 +306,7 @@ mod tests {
 
     #[test]
     fn a_timeline_has_a_strip_only_for_q() {
-        let mut given = Banded {
+        let mut given = TimelineData {
             points: vec![(1.0, 0.2, 0), (2.0, 5.0, 1), (3.0, 0.3, 9)],
             classes: vec!["cloud".into(), "local".into()],
             bad: vec![(1.5, 2.5)],
@@ -320,15 +320,15 @@ mod tests {
         assert!(with.contains("\nQ\n"), "{with}");
     }
 
-    /// Of 1, 2, 2 and 4, three quarters are at most 2; of these and an unanswered one, three fifths are.
+    /// Among 1, 2, 2 and 4, three quarters are at most 2; together with an unanswered one, three fifths are.
     #[test]
     fn shares_are_of_all_values() {
         assert_eq!(
-            series::shares(&[4.0, 1.0, 2.0, 2.0]),
+            series::cumulative_shares(&[4.0, 1.0, 2.0, 2.0]),
             [(1.0, 25.0), (2.0, 75.0), (4.0, 100.0)]
         );
         assert_eq!(
-            series::shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
+            series::cumulative_shares(&[4.0, f64::INFINITY, f64::NAN, 1.0, 2.0, 2.0]),
             [(1.0, 20.0), (2.0, 60.0), (4.0, 80.0)]
         );
     }

@@ -1,47 +1,48 @@
-//! Recorded inputs, as a robot plays them: the messages of one topic are its requests, all others go with them.
+//! Recorded inputs that a robot plays: the messages of one topic are its requests, all others accompany them.
 
 use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use bytes::{Buf, Bytes};
-use ros::bag::{self, Recorded};
+use ros::bag::{self, BagMessage};
 
 use crate::{stereo, stream};
 
-/// Of pictures.
+/// Size of the images.
 const SIZE: (u32, u32) = (640, 480);
-/// Bytes of such a picture.
+/// Bytes of such an image.
 pub const PICTURE: usize = (SIZE.0 * SIZE.1 * 3) as usize;
-/// Between two pictures, nanoseconds.
+/// Interval between two images, in nanoseconds.
 const PERIOD: u64 = 100_000_000;
 const SECOND: u64 = 1_000_000_000;
 
-/// A recording.
+/// A recording in memory.
 #[derive(Debug, Clone)]
 pub struct Recording {
-    /// In the order of their times.
-    messages: Vec<Recorded>,
+    /// Messages in the order of their times.
+    messages: Vec<BagMessage>,
 }
 
-/// One request, and what was recorded before it since the one before.
-pub struct Step<'a> {
-    /// Other topics' messages.
-    pub before: Vec<&'a Recorded>,
+/// A request, and the other messages recorded since the previous request.
+pub struct RecordedStep<'a> {
+    /// Messages of other topics.
+    pub before: Vec<&'a BagMessage>,
     /// The request.
-    pub request: &'a Recorded,
-    /// Seconds from the recording's first message.
+    pub request: &'a BagMessage,
+    /// Seconds since the first message of the recording.
     pub at: f64,
 }
 
 impl Recording {
-    /// Reads a rosbag file that is not compressed, a file of [`stream`] that ends with `.messages`, one of [`stereo`] that ends with
-    /// `.stereo`, or a file that ends with `.raw`: pictures of 640x480, bgr8, one after the other, ten a second.
+    /// Reads an uncompressed rosbag file, a file of [`stream`] with the extension `.messages`, one of [`stereo`] with
+    /// the extension `.stereo`, or a file with the extension `.raw`: concatenated images of 640x480, bgr8, played at
+    /// ten per second.
     pub fn read(path: &Path) -> Result<Self> {
         let named = || path.display().to_string();
         let file = Bytes::from(std::fs::read(path).with_context(named)?);
         if path.extension().is_some_and(|ending| ending == "raw") {
-            return Ok(pictures(&file));
+            return Ok(from_pictures(&file));
         }
         if path.extension().is_some_and(|ending| ending == "messages") {
             let messages = stream::read(&file).with_context(named)?;
@@ -57,9 +58,9 @@ impl Recording {
         Ok(Self { messages })
     }
 
-    /// The types of its topics, each once, but of those named.
-    pub fn topics(&self, without: &[String]) -> Vec<&Recorded> {
-        let mut topics: Vec<&Recorded> = Vec::new();
+    /// Returns one message of each topic, for its type, except for the topics `without`.
+    pub fn topics(&self, without: &[String]) -> Vec<&BagMessage> {
+        let mut topics: Vec<&BagMessage> = Vec::new();
         for message in &self.messages {
             let known = topics.iter().any(|one| one.topic == message.topic);
             if !known && !without.iter().any(|name| **name == *message.topic) {
@@ -69,8 +70,8 @@ impl Recording {
         topics
     }
 
-    /// The messages of `topic` as requests; what follows the last of them is left out.
-    pub fn steps(&self, topic: &str) -> Vec<Step<'_>> {
+    /// Returns the messages of `topic` as requests; messages after the last one are omitted.
+    pub fn steps(&self, topic: &str) -> Vec<RecordedStep<'_>> {
         let first = self.messages[0].time;
         let mut steps = Vec::new();
         let mut before = Vec::new();
@@ -79,7 +80,7 @@ impl Recording {
                 before.push(message);
                 continue;
             }
-            steps.push(Step {
+            steps.push(RecordedStep {
                 before: std::mem::take(&mut before),
                 request: message,
                 at: (message.time - first) as f64 / 1e9,
@@ -88,31 +89,31 @@ impl Recording {
         steps
     }
 
-    /// Positions that were recorded on a topic of `geometry_msgs/PoseStamped`: seconds, x and y in metres.
+    /// Returns the recorded positions of a topic of `geometry_msgs/PoseStamped`: seconds, x and y in metres.
     pub fn positions(&self, topic: &str) -> Vec<(f64, f64, f64)> {
         let first = self.messages[0].time;
         let of = self.messages.iter().filter(|one| *one.topic == *topic);
-        let position = |one: &Recorded| {
+        let position = |one: &BagMessage| {
             let at = (one.time - first) as f64 / 1e9;
-            pose(&one.bytes).map(|[x, y, _]| (at, x, y))
+            read_pose(&one.bytes).map(|[x, y, _]| (at, x, y))
         };
         of.filter_map(position).collect()
     }
 
-    /// Made of these messages.
+    /// Creates a recording of these messages.
     #[cfg(test)]
-    pub fn of(messages: Vec<Recorded>) -> Self {
+    pub fn from_messages(messages: Vec<BagMessage>) -> Self {
         Self { messages }
     }
 }
 
-/// Pictures as messages.
-fn pictures(file: &Bytes) -> Recording {
+/// Creates a recording of images.
+fn from_pictures(file: &Bytes) -> Recording {
     let (width, height) = SIZE;
     let topic: Arc<str> = Arc::from("/image");
     let wire_type = Arc::new(support::people::image_type());
     let pictures = file.chunks_exact((width * height * 3) as usize);
-    let messages = pictures.zip(0..).map(|(pixels, number)| Recorded {
+    let messages = pictures.zip(0..).map(|(pixels, number)| BagMessage {
         topic: topic.clone(),
         wire_type: wire_type.clone(),
         time: u64::from(number) * PERIOD,
@@ -123,17 +124,17 @@ fn pictures(file: &Bytes) -> Recording {
     }
 }
 
-/// `std_msgs/Header` at the beginning of a serialized message.
+/// The `std_msgs/Header` at the beginning of a serialized message.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Header {
     /// Seconds and nanoseconds.
     pub stamp: (u32, u32),
-    /// Where what follows it begins, bytes.
+    /// Offset of the byte after the header.
     pub end: usize,
 }
 
-/// Reads it; none where the message is too short.
-pub fn header(bytes: &[u8]) -> Option<Header> {
+/// Reads the header; `None` if the message is too short.
+pub fn read_header(bytes: &[u8]) -> Option<Header> {
     let word = |at: usize| {
         let bytes = bytes.get(at..at + 4)?;
         Some(u32::from_le_bytes(bytes.try_into().ok()?))
@@ -145,9 +146,9 @@ pub fn header(bytes: &[u8]) -> Option<Header> {
     })
 }
 
-/// Of a `geometry_msgs/PoseStamped` or a message that begins like one: x, y (metres) and heading (radians).
-pub fn pose(bytes: &[u8]) -> Option<[f64; 3]> {
-    let numbers = numbers(bytes, header(bytes)?.end, 7)?;
+/// Reads x, y (metres) and heading (radians) of a `geometry_msgs/PoseStamped` or a message with the same beginning.
+pub fn read_pose(bytes: &[u8]) -> Option<[f64; 3]> {
+    let numbers = read_floats(bytes, read_header(bytes)?.end, 7)?;
     let [x, y, _, qx, qy, qz, qw] = numbers[..] else {
         return None;
     };
@@ -155,20 +156,20 @@ pub fn pose(bytes: &[u8]) -> Option<[f64; 3]> {
     Some([x, y, heading])
 }
 
-/// So many float64 from there on.
-pub fn numbers(bytes: &[u8], from: usize, count: usize) -> Option<Vec<f64>> {
+/// Reads `count` float64 values from an offset.
+pub fn read_floats(bytes: &[u8], from: usize, count: usize) -> Option<Vec<f64>> {
     let mut rest = bytes.get(from..from + count * 8)?;
     Some((0..count).map(|_| rest.get_f64_le()).collect())
 }
 
-/// A message whose header's stamp is `number` seconds, so that its answer can be told from others.
-pub fn restamped(bytes: &Bytes, number: u32) -> Option<Bytes> {
-    stamped_at(bytes, (number, 0))
+/// Sets the stamp of a message's header to `number` seconds, which identifies its answer.
+pub fn with_stamp(bytes: &Bytes, number: u32) -> Option<Bytes> {
+    set_stamp(bytes, (number, 0))
 }
 
-/// What was recorded before a request that is stamped with `number`, stamped as much earlier: what belongs to a request is told by that.
-/// Messages without a header are as they were.
-pub fn stamped_before(message: &Recorded, request: &Recorded, number: u32) -> Bytes {
+/// Stamps a message that was recorded before a request, relative to the stamp `number` of that request, because nodes
+/// match the two by their stamps. Messages without a header are unchanged.
+pub fn with_relative_stamp(message: &BagMessage, request: &BagMessage, number: u32) -> Bytes {
     let begins = |line: &str| matches!(line.trim(), "Header header" | "std_msgs/Header header");
     let fields = message.wire_type.definition.lines().map(str::trim);
     let first = fields
@@ -180,21 +181,21 @@ pub fn stamped_before(message: &Recorded, request: &Recorded, number: u32) -> By
     let earlier = request.time.saturating_sub(message.time);
     let stamp = (u64::from(number) * SECOND).saturating_sub(earlier);
     let stamp = ((stamp / SECOND) as u32, (stamp % SECOND) as u32);
-    stamped_at(&message.bytes, stamp).unwrap_or_else(|| message.bytes.clone())
+    set_stamp(&message.bytes, stamp).unwrap_or_else(|| message.bytes.clone())
 }
 
-fn stamped_at(bytes: &Bytes, (seconds, nanoseconds): (u32, u32)) -> Option<Bytes> {
-    header(bytes)?;
+fn set_stamp(bytes: &Bytes, (seconds, nanoseconds): (u32, u32)) -> Option<Bytes> {
+    read_header(bytes)?;
     let mut message = bytes.to_vec();
     message[4..8].copy_from_slice(&seconds.to_le_bytes());
     message[8..12].copy_from_slice(&nanoseconds.to_le_bytes());
     Some(message.into())
 }
 
-/// One message, for tests.
+/// Creates a message for tests.
 #[cfg(test)]
-pub fn recorded(topic: &str, seconds: u64, bytes: &[u8]) -> Recorded {
-    Recorded {
+pub fn test_message(topic: &str, seconds: u64, bytes: &[u8]) -> BagMessage {
+    BagMessage {
         topic: Arc::from(topic),
         wire_type: Arc::new(ros::bus::WireType::any()),
         time: seconds * 1_000_000_000,
@@ -206,7 +207,7 @@ pub fn recorded(topic: &str, seconds: u64, bytes: &[u8]) -> Recorded {
 mod tests {
     use super::*;
 
-    fn stamped(number: u32, rest: &[f64]) -> Vec<u8> {
+    fn stamped_bytes(number: u32, rest: &[f64]) -> Vec<u8> {
         let mut bytes = Vec::new();
         for word in [7, number, 5, 3] {
             bytes.extend(u32::to_le_bytes(word));
@@ -219,33 +220,33 @@ mod tests {
 
     #[test]
     fn a_header_is_read_up_to_its_end() {
-        let bytes = stamped(42, &[1.0]);
-        let header = header(&bytes).expect("a header");
+        let bytes = stamped_bytes(42, &[1.0]);
+        let header = read_header(&bytes).expect("a header");
         assert_eq!((header.stamp, header.end), ((42, 5), 19));
-        assert_eq!(super::header(&bytes[..18]), None);
-        assert_eq!(numbers(&bytes, header.end, 1), Some(vec![1.0]));
-        assert_eq!(numbers(&bytes, header.end, 2), None);
+        assert_eq!(super::read_header(&bytes[..18]), None);
+        assert_eq!(read_floats(&bytes, header.end, 1), Some(vec![1.0]));
+        assert_eq!(read_floats(&bytes, header.end, 2), None);
     }
 
     #[test]
     fn a_pose_is_a_position_and_a_heading() {
         // A quarter turn about the vertical axis.
         let half = std::f64::consts::FRAC_1_SQRT_2;
-        let bytes = stamped(1, &[1.0, 2.0, 3.0, 0.0, 0.0, half, half]);
-        let [x, y, heading] = pose(&bytes).expect("a pose");
+        let bytes = stamped_bytes(1, &[1.0, 2.0, 3.0, 0.0, 0.0, half, half]);
+        let [x, y, heading] = read_pose(&bytes).expect("a pose");
         assert_eq!((x, y), (1.0, 2.0));
         assert!((heading - std::f64::consts::FRAC_PI_2).abs() < 1e-9);
     }
 
     #[test]
     fn requests_have_what_was_recorded_before_them() {
-        let recording = Recording::of(vec![
-            recorded("/odom", 10, b"a"),
-            recorded("/scan", 11, b"b"),
-            recorded("/odom", 12, b"c"),
-            recorded("/odom", 13, b"d"),
-            recorded("/scan", 14, b"e"),
-            recorded("/odom", 15, b"f"),
+        let recording = Recording::from_messages(vec![
+            test_message("/odom", 10, b"a"),
+            test_message("/scan", 11, b"b"),
+            test_message("/odom", 12, b"c"),
+            test_message("/odom", 13, b"d"),
+            test_message("/scan", 14, b"e"),
+            test_message("/odom", 15, b"f"),
         ]);
         let steps = recording.steps("/scan");
         let told: Vec<_> = steps
@@ -258,25 +259,28 @@ mod tests {
 
     #[test]
     fn an_answer_is_told_by_the_stamp() {
-        let bytes = Bytes::from(stamped(42, &[]));
-        let again = restamped(&bytes, 1001).expect("it has a header");
-        assert_eq!(header(&again).map(|header| header.stamp), Some((1001, 0)));
-        assert_eq!(restamped(&Bytes::from_static(b"short"), 1), None);
+        let bytes = Bytes::from(stamped_bytes(42, &[]));
+        let again = with_stamp(&bytes, 1001).expect("it has a header");
+        assert_eq!(
+            read_header(&again).map(|header| header.stamp),
+            Some((1001, 0))
+        );
+        assert_eq!(with_stamp(&Bytes::from_static(b"short"), 1), None);
     }
 
     #[test]
     fn what_comes_before_a_request_stays_as_much_before_it() {
-        let typed = |definition: &str, time: u64| Recorded {
+        let typed = |definition: &str, time: u64| BagMessage {
             wire_type: Arc::new(ros::bus::WireType::new("a/B", "0", definition)),
             time,
-            ..recorded("/odom", 0, &stamped(42, &[]))
+            ..test_message("/odom", 0, &stamped_bytes(42, &[]))
         };
-        let request = recorded("/scan", 100, b"");
+        let request = test_message("/scan", 100, b"");
         let before = typed("# where it is\n\nHeader header\nfloat64 x", 99_999_000_000);
-        let again = stamped_before(&before, &request, 7);
-        let stamp = header(&again).map(|header| header.stamp);
+        let again = with_relative_stamp(&before, &request, 7);
+        let stamp = read_header(&again).map(|header| header.stamp);
         assert_eq!(stamp, Some((6, 999_000_000)));
         let plain = typed("float64 x\nHeader header", 99_999_000_000);
-        assert_eq!(stamped_before(&plain, &request, 7), plain.bytes);
+        assert_eq!(with_relative_stamp(&plain, &request, 7), plain.bytes);
     }
 }

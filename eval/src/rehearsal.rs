@@ -1,42 +1,50 @@
-//! An evaluation of nothing, for tests of what can go wrong with one: a place is made, then a robot in another one waits for a node that
-//! never answers.
+//! An evaluation without experiments, for tests of its failure handling: creates a sandbox, then a robot in another one
+//! that waits for a node which never answers.
 
 use std::path::Path;
 
 use anyhow::Result;
 
-use crate::cells::{Cells, Measured};
-use crate::examples::Workshop;
-use crate::place::{Class, Cost, Network, Place};
-use crate::robot::{Node, Pace, Plan};
-use crate::section::{Missing, Section, Table};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::EvalFixtures;
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
+use crate::section::{MissingMeasurement, Section, Table};
 use crate::trace::Trace;
 
-/// Pictures of zeros: as many as a robot needs to begin with, and one more.
+/// Images of zeros: one more than the warm-up of a robot needs.
 const PICTURES: usize = 4;
 const BYTES: usize = 640 * 480 * 3;
 
-/// Measures both; the node is there for so many seconds.
-pub fn section(cells: &Cells, workshop: &Workshop, seconds: f64) -> Result<Section> {
+/// Measures both; the node runs for `seconds`.
+pub fn section(cells: &RunCache, workshop: &EvalFixtures, seconds: f64) -> Result<Section> {
     let mut section = Section::new(0, "rehearsal", "Nothing");
     let place = cells.measure("rehearsal place", &(), || {
-        Place::new(&workshop.daemon.address, Class::PI, Network::Lan)?;
+        RobotSandbox::new(
+            &workshop.daemon.address,
+            RobotHardware::PI,
+            NetworkProfile::Lan,
+        )?;
         Ok("made".to_owned())
     })?;
-    // As for packages: another node is the same run.
+    // As for packages, another duration of the node does not make it another run.
     let robot = cells.measure("rehearsal robot", &(), || {
         let directory = workshop.directory()?;
         let plan = plan(directory.path(), seconds)?;
-        let place = Place::new(&workshop.daemon.address, Class::PI, Network::Lan)?;
-        let seen: (Trace, Cost) = place.runs(&plan, directory.path())?;
+        let place = RobotSandbox::new(
+            &workshop.daemon.address,
+            RobotHardware::PI,
+            NetworkProfile::Lan,
+        )?;
+        let seen: (Trace, RunCost) = place.run(&plan, directory.path())?;
         Ok(seen.0.node_ended.unwrap_or_default())
     })?;
     let mut table = Table::new("What came of it", ["what", "outcome"]);
     for (name, measured) in [("place", place), ("robot", robot)] {
         match measured {
-            Measured::Done(outcome) => table.push([name.to_owned(), outcome]),
-            Measured::Missing(why) => {
-                section.missing.push(Missing::new(
+            CachedResult::Done(outcome) => table.push([name.to_owned(), outcome]),
+            CachedResult::Missing(why) => {
+                section.missing.push(MissingMeasurement::new(
                     name,
                     why,
                     "run it again: what was measured stays",
@@ -48,13 +56,13 @@ pub fn section(cells: &Cells, workshop: &Workshop, seconds: f64) -> Result<Secti
     Ok(section)
 }
 
-/// What a robot does that asks `sleep`.
-pub fn plan(directory: &Path, seconds: f64) -> Result<Plan> {
+/// Returns the plan of a robot whose node is `sleep`.
+pub fn plan(directory: &Path, seconds: f64) -> Result<RobotPlan> {
     let recording = directory.join("zeros.raw");
     std::fs::write(&recording, vec![0; PICTURES * BYTES])?;
-    Ok(Plan {
+    Ok(RobotPlan {
         server: String::new(),
-        node: Node::Native {
+        node: NodeUnderTest::Native {
             script: "exec \"$@\"".to_owned(),
             program: "sleep".to_owned(),
             argv: vec![seconds.to_string()],
@@ -67,7 +75,7 @@ pub fn plan(directory: &Path, seconds: f64) -> Result<Plan> {
         tells_pose: false,
         timing: None,
         map: None,
-        pace: Pace::OneByOne,
+        pace: RequestPacing::OneByOne,
         every: 1,
         most: 1,
         give_up: 1.0,

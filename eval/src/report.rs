@@ -5,15 +5,15 @@ use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context, Result};
-use bench_report::Machine;
+use bench_report::MachineDescription;
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::cells::Cells;
+use crate::cells::RunCache;
 use crate::page;
-use crate::section::{Image, Section};
+use crate::section::{FigureImage, Section};
 
-/// What could not be had here: the published thing, what stands in for it, and why.
+/// Things that were not available: the published one, its substitute, and the reason.
 const STAND_INS: [(&str, &str, &str); 5] = [
     (
         "RGBD-SLAM, RTAB-Map, SSD",
@@ -43,33 +43,34 @@ const STAND_INS: [(&str, &str, &str); 5] = [
 ];
 
 #[derive(Serialize)]
-struct Whole<'a> {
+struct ReportFile<'a> {
     made: String,
-    machine: Machine,
+    machine: MachineDescription,
     sections: &'a [Section],
-    /// When the oldest and the newest of the runs were measured.
+    /// Times of the oldest and the newest run.
     measured: Option<(String, String)>,
-    /// What was measured, by the runs' names: numbers as they were recorded.
+    /// Raw results, by name of the run.
     runs: BTreeMap<String, Value>,
 }
 
-/// Writes report.html, report.json (with the raw figures of `cells`) and one file a figure into `target`; whether nothing is missing.
-pub fn write(target: &Path, sections: &[Section], cells: &Cells) -> Result<bool> {
+/// Writes report.html, report.json (with the raw results of `cells`) and one file per figure into `target`; returns
+/// whether nothing is missing.
+pub fn write(target: &Path, sections: &[Section], cells: &RunCache) -> Result<bool> {
     let figures = target.join("figures");
     std::fs::create_dir_all(&figures).with_context(|| figures.display().to_string())?;
     for figure in sections.iter().flat_map(|section| &section.figures) {
         let (ending, bytes) = match &figure.image {
-            Image::Svg(text) => ("svg", text.as_bytes()),
-            Image::Png(bytes) => ("png", &bytes[..]),
+            FigureImage::Svg(text) => ("svg", text.as_bytes()),
+            FigureImage::Png(bytes) => ("png", &bytes[..]),
         };
         std::fs::write(figures.join(format!("{}.{ending}", figure.id)), bytes)?;
     }
-    let machine = Machine::describe();
+    let machine = MachineDescription::describe();
     let told = format!(
         "{} × {}, {} GiB, {}, Linux {}",
         machine.processors, machine.processor, machine.memory_gib, machine.system, machine.kernel
     );
-    let (made, measured) = (date(), cells.dates());
+    let (made, measured) = (current_date(), cells.dates());
     let from_to = match &measured {
         Some((oldest, newest)) if oldest != newest => {
             format!("{made}, of what was measured from {oldest} to {newest}")
@@ -81,24 +82,24 @@ pub fn write(target: &Path, sections: &[Section], cells: &Cells) -> Result<bool>
         .map(|(thing, instead, why)| (thing.to_owned(), instead.to_owned(), why.to_owned()));
     let html = target.join("report.html");
     std::fs::write(&html, page::render(sections, &told, &from_to, &stand_ins))?;
-    let whole = Whole {
+    let whole = ReportFile {
         made,
         machine,
         sections,
         measured,
-        runs: cells.used(),
+        runs: cells.used_figures(),
     };
     std::fs::write(
         target.join("report.json"),
         serde_json::to_vec_pretty(&whole)?,
     )?;
-    summary(sections);
+    print_summary(sections);
     println!("the report is {}", html.display());
     Ok(sections.iter().all(|section| section.missing.is_empty()))
 }
 
-/// The findings, and what is missing.
-fn summary(sections: &[Section]) {
+/// Prints the findings, and what is missing.
+fn print_summary(sections: &[Section]) {
     for section in sections {
         println!("{}. {}", section.number, section.title);
         for finding in &section.findings {
@@ -113,8 +114,8 @@ fn summary(sections: &[Section]) {
     }
 }
 
-/// Now, by this machine's clock.
-pub fn date() -> String {
+/// Returns the current time by this machine's clock.
+pub fn current_date() -> String {
     let output = Command::new("date").arg("+%Y-%m-%d %H:%M").output();
     let said = output.map(|output| String::from_utf8_lossy(&output.stdout).trim().to_owned());
     said.unwrap_or_default()

@@ -1,5 +1,5 @@
-//! What runs in a robot's place: a ROS Master, the robot's own node, which plays a recording and hears the answers, and the package as it is
-//! installed there or its stub.
+//! The program in a robot's sandbox: a ROS Master, the robot's own node, which plays a recording and receives the
+//! answers, and the package itself or its stub.
 
 mod answers;
 mod asking;
@@ -14,38 +14,38 @@ use std::path::Path;
 use anyhow::{Context, Result, ensure};
 use nix::sys::signal::Signal;
 use servant::cgroup::Cgroup;
-use support::site::{Running, Site};
+use support::site::{NodeProcess, Site};
 
 use crate::application;
-use crate::recording::{Recording, Step};
+use crate::recording::{RecordedStep, Recording};
 use crate::trace::Trace;
 
-pub use answers::digest;
+pub use answers::digest_message;
 pub use asking::has_ended;
-pub use plan::{Node, Pace, Plan};
+pub use plan::{NodeUnderTest, RequestPacing, RobotPlan};
 
-/// Stamps of requests begin after this one.
+/// Stamps of measured requests are greater than this number.
 pub const FIRST: u32 = 1000;
-/// Requests whose answers are not counted: by then all are connected and awake.
+/// Warm-up requests, which are not counted: after them everything is connected and running.
 pub const WARM_UP: usize = 3;
 
-/// Runs the robot that `order` tells of, in this process, and writes what it saw to `answer`.
+/// Runs the robot with the plan in the file `order` in this process, and writes its trace to `answer`.
 pub fn main(order: &Path, answer: &Path) -> Result<()> {
-    let (plan, cgroup): (Plan, Cgroup) = serde_json::from_slice(&std::fs::read(order)?)?;
-    cgroup.enter(std::process::id())?;
+    let (plan, cgroup): (RobotPlan, Cgroup) = serde_json::from_slice(&std::fs::read(order)?)?;
+    cgroup.add_process(std::process::id())?;
     let trace = run(&plan)?;
     Ok(std::fs::write(answer, serde_json::to_vec(&trace)?)?)
 }
 
-fn run(plan: &Plan) -> Result<Trace> {
-    if let Pace::Played(seconds) = plan.pace {
+fn run(plan: &RobotPlan) -> Result<Trace> {
+    if let RequestPacing::Played(seconds) = plan.pace {
         let site = Site::new()?;
-        let node = start(&site, plan)?;
+        let node = start_node(&site, plan)?;
         let heard = application::run(&site, plan, seconds, &node);
-        return heard.with_context(|| format!("the node said: {}", node.said()));
+        return heard.with_context(|| format!("the node said: {}", node.output()));
     }
     let recording = Recording::read(&plan.recording)?;
-    let steps: Vec<Step> = recording.steps(&plan.request);
+    let steps: Vec<RecordedStep> = recording.steps(&plan.request);
     ensure!(
         steps.len() > WARM_UP,
         "{} has {} messages of {}",
@@ -54,37 +54,37 @@ fn run(plan: &Plan) -> Result<Trace> {
         plan.request
     );
     let site = Site::new()?;
-    let mut ends = ends::ends(&site, plan, &recording)?;
-    let mut node = start(&site, plan)?;
+    let mut ends = ends::create_endpoints(&site, plan, &recording)?;
+    let mut node = start_node(&site, plan)?;
     let asked = asking::ask(&site, &mut ends, plan, &steps, &mut node);
-    let mut trace = asked.with_context(|| format!("the node said: {}", node.said()))?;
-    if let Node::Stub { .. } = plan.node {
-        trace.answered_locally = node.said().matches("answer=Some((Local").count();
-        rate::told(&node.said(), &mut trace.requests);
+    let mut trace = asked.with_context(|| format!("the node said: {}", node.output()))?;
+    if let NodeUnderTest::Stub { .. } = plan.node {
+        trace.answered_locally = node.output().matches("answer=Some((Local").count();
+        rate::apply_stub_log(&node.output(), &mut trace.requests);
         let warns = |line: &&str| line.contains(" WARN ");
         trace.warnings = node
-            .said()
+            .output()
             .lines()
             .filter(warns)
             .map(str::to_owned)
             .collect();
     }
     if trace.node_ended.is_none() {
-        // As roslaunch would.
+        // SIGINT, as roslaunch sends it.
         node.signal(Signal::SIGINT)?;
-        node.ends()?;
+        node.wait_for_exit()?;
     }
     Ok(trace)
 }
 
-fn start(site: &Site, plan: &Plan) -> Result<Running> {
+fn start_node(site: &Site, plan: &RobotPlan) -> Result<NodeProcess> {
     match &plan.node {
-        Node::Native {
+        NodeUnderTest::Native {
             script,
             program,
             argv,
-        } => site.starts_in_image(script, program, argv),
-        Node::Stub {
+        } => site.start_in_image(script, program, argv),
+        NodeUnderTest::Stub {
             package,
             executable,
             argv,
@@ -99,7 +99,7 @@ fn start(site: &Site, plan: &Plan) -> Result<Running> {
                 ("CLOUDROID_LOG", "info,requests=debug"),
             ];
             environment.extend(besides.iter().map(|(name, value)| (&**name, &**value)));
-            site.stub_among(&environment, &toml, package, executable, &argv)
+            site.start_stub_with_environment(&environment, &toml, package, executable, &argv)
         }
     }
 }

@@ -1,32 +1,32 @@
-//! What the report shows of one experiment: kept as JSON beside its figures, so that a later run can show it again.
+//! Section of the report for one experiment: stored as JSON next to its figures, so that a later run can show it again.
 
 use serde::{Deserialize, Serialize};
 
-/// One experiment, in the order in which the report shows its parts.
+/// One experiment, in the order of the report.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Section {
-    /// Its row in the list of experiments.
+    /// Number of the experiment.
     pub number: u8,
-    /// Short, unique; the section's anchor in the page.
+    /// Short unique name; the section's anchor in the page.
     pub id: String,
-    /// What was asked.
+    /// Title.
     pub title: String,
-    /// What the publication reported.
+    /// Results of the publication.
     pub published: String,
-    /// What is different here, and why: one sentence each.
+    /// Differences to the publication with their reasons, one sentence each.
     pub differs: Vec<String>,
-    /// Sentences computed from the figures; those that are worse than hoped say why.
+    /// Sentences computed from the figures; disappointing ones include the reason.
     pub findings: Vec<String>,
-    /// The figures as numbers.
+    /// Figures as numbers.
     pub tables: Vec<Table>,
-    /// The figures as pictures.
+    /// Figures as images.
     pub figures: Vec<Figure>,
-    /// What was to be measured and was not.
-    pub missing: Vec<Missing>,
+    /// Measurements that could not be made.
+    pub missing: Vec<MissingMeasurement>,
 }
 
 impl Section {
-    /// A section that says nothing yet.
+    /// Creates an empty section.
     pub fn new(number: u8, id: impl Into<String>, title: impl Into<String>) -> Self {
         Self {
             number,
@@ -41,25 +41,25 @@ impl Section {
         }
     }
 
-    /// Adds a drawing.
-    pub fn drawing(&mut self, id: impl Into<String>, caption: impl Into<String>, svg: String) {
+    /// Adds an SVG figure.
+    pub fn add_drawing(&mut self, id: impl Into<String>, caption: impl Into<String>, svg: String) {
         self.figures.push(Figure::svg(id, caption, svg));
     }
 }
 
-/// A table whose cells are already text: units belong to its head.
+/// A table of formatted cells; units are part of the column heads.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Table {
-    /// What it shows.
+    /// Caption.
     pub caption: String,
-    /// The columns' names, with their units.
+    /// Column heads, with units.
     pub head: Vec<String>,
-    /// The first cell names the row.
+    /// Rows; the first cell is the name of the row.
     pub rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    /// A table without rows.
+    /// Creates a table without rows.
     pub fn new<T: Into<String>>(
         caption: impl Into<String>,
         head: impl IntoIterator<Item = T>,
@@ -71,7 +71,7 @@ impl Table {
         }
     }
 
-    /// The table with one more row.
+    /// Returns the table with one more row.
     pub fn row<T: Into<String>>(mut self, cells: impl IntoIterator<Item = T>) -> Self {
         self.push(cells);
         self
@@ -83,62 +83,62 @@ impl Table {
     }
 }
 
-/// A picture with its caption.
+/// A figure with its caption.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Figure {
-    /// The name of its file without the ending; unique in the report.
+    /// Name of its file without the extension; unique in the report.
     pub id: String,
-    /// What it shows.
+    /// Caption.
     pub caption: String,
-    /// The picture itself.
-    pub image: Image,
+    /// The image itself.
+    pub image: FigureImage,
 }
 
 impl Figure {
-    /// A drawing.
+    /// Creates a figure from an SVG document.
     pub fn svg(id: impl Into<String>, caption: impl Into<String>, text: impl Into<String>) -> Self {
         Self {
             id: id.into(),
             caption: caption.into(),
-            image: Image::Svg(text.into()),
+            image: FigureImage::Svg(text.into()),
         }
     }
 
-    /// A picture made of pixels.
+    /// Creates a figure from a PNG file.
     pub fn png(id: impl Into<String>, caption: impl Into<String>, bytes: Vec<u8>) -> Self {
         Self {
             id: id.into(),
             caption: caption.into(),
-            image: Image::Png(bytes),
+            image: FigureImage::Png(bytes),
         }
     }
 }
 
-/// A picture, as its file holds it.
+/// Content of an image file.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub enum Image {
-    /// The text of an SVG document.
+pub enum FigureImage {
+    /// Text of an SVG document.
     Svg(String),
-    /// The bytes of a PNG file; base64 in JSON.
+    /// Bytes of a PNG file; base64 in JSON.
     Png(#[serde(with = "as_base64")] Vec<u8>),
 }
 
-/// What helps where a run failed.
+/// Next step after a failed run.
 pub const AGAIN: &str = "run make eval again: what was measured stays";
 
-/// Something that was to be measured and was not.
+/// A measurement that could not be made.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Missing {
-    /// What was to be measured.
+pub struct MissingMeasurement {
+    /// Measurement that should have been made.
     pub what: String,
-    /// What prevented it.
+    /// Reason.
     pub why: String,
-    /// What would bring it.
+    /// Next step.
     pub next: String,
 }
 
-impl Missing {
-    /// The three sentences.
+impl MissingMeasurement {
+    /// Creates an entry from these three texts.
     pub fn new(what: impl Into<String>, why: impl Into<String>, next: impl Into<String>) -> Self {
         Self {
             what: what.into(),
@@ -147,8 +147,8 @@ impl Missing {
         }
     }
 
-    /// Something that another run may bring.
-    pub fn again(what: impl Into<String>, why: impl Into<String>) -> Self {
+    /// Creates an entry for something that may succeed in another run.
+    pub fn retryable(what: impl Into<String>, why: impl Into<String>) -> Self {
         Self::new(what, why, AGAIN)
     }
 }
@@ -184,13 +184,15 @@ mod tests {
         section
             .figures
             .push(Figure::png("map", "b", vec![0x89, b'P', 0, 255]));
-        section.missing.push(Missing::new("GPU", "none", "buy one"));
+        section
+            .missing
+            .push(MissingMeasurement::new("GPU", "none", "buy one"));
         let text = serde_json::to_string(&section).expect("it is plain data");
         assert!(text.contains(r#"{"Png":"iVAA/w=="}"#), "{text}");
         let again: Section = serde_json::from_str(&text).expect("it was just written");
         assert_eq!(again.tables[0].rows, section.tables[0].rows);
         assert_eq!(again.number, 7);
-        let Image::Png(bytes) = &again.figures[1].image else {
+        let FigureImage::Png(bytes) = &again.figures[1].image else {
             panic!("{:?}", again.figures[1]);
         };
         assert_eq!(bytes, &[0x89, b'P', 0, 255]);
@@ -198,6 +200,6 @@ mod tests {
 
     #[test]
     fn a_picture_that_is_not_base64_is_refused() {
-        assert!(serde_json::from_str::<Image>(r#"{"Png":"*"}"#).is_err());
+        assert!(serde_json::from_str::<FigureImage>(r#"{"Png":"*"}"#).is_err());
     }
 }

@@ -1,5 +1,5 @@
-//! Pictures of two cameras beside each other, for packages that look for disparities: a window that moves over the two photographs of a
-//! plant of Debian's opencv-doc (Middlebury's Aloe, which is rectified).
+//! Images of a stereo camera, for packages that compute disparities: a window that moves over the two photographs of a
+//! plant in Debian's opencv-doc (Middlebury's Aloe, which is rectified).
 
 use std::path::Path;
 use std::process::Command;
@@ -7,28 +7,28 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use bytes::{BufMut, Bytes, BytesMut};
-use ros::bag::Recorded;
+use ros::bag::BagMessage;
 use ros::bus::WireType;
 
-/// What the left camera sees, and the right one.
+/// Photographs of the left and of the right camera.
 pub const PICTURES: [&str; 2] = [
     "/usr/share/doc/opencv-doc/examples/data/aloeL.jpg",
     "/usr/share/doc/opencv-doc/examples/data/aloeR.jpg",
 ];
-/// The topic of the last of the messages of each moment.
+/// Topic of the last message of each moment.
 pub const LAST: &str = "/right/image_raw";
-/// Of a window, pixels.
+/// Size of a window, in pixels.
 const SIZE: (u32, u32) = (480, 400);
-/// Windows.
+/// Number of windows.
 const COUNT: usize = 44;
-/// Between two of them, nanoseconds.
+/// Interval between two windows, in nanoseconds.
 const PERIOD: u64 = 100_000_000;
-/// Of an ideal camera, pixels.
+/// Focal length of an ideal camera, in pixels.
 const FOCAL_LENGTH: f64 = 400.0;
-/// Between the cameras, metres.
+/// Distance between the cameras, in metres.
 const BASELINE: f64 = 0.1;
 
-/// Writes them: all pictures of the left camera, then all of the right one, one byte a pixel.
+/// Writes the images: all of the left camera, then all of the right one, one byte per pixel.
 pub fn write(to: &Path) -> Result<()> {
     let (width, height) = SIZE;
     // The photographs are of 1282x1110 pixels.
@@ -53,8 +53,8 @@ pub fn write(to: &Path) -> Result<()> {
     std::fs::write(to, whole).with_context(|| to.display().to_string())
 }
 
-/// Reads them, ten moments a second: four messages each, with equal stamps.
-pub fn read(file: &Bytes) -> Vec<Recorded> {
+/// Reads the images as ten moments per second: four messages each, with equal stamps.
+pub fn read(file: &Bytes) -> Vec<BagMessage> {
     let (width, height) = SIZE;
     let (left, right) = file.split_at(file.len() / 2);
     let size = (width * height) as usize;
@@ -68,12 +68,20 @@ pub fn read(file: &Bytes) -> Vec<Recorded> {
     let mut messages = Vec::new();
     for ((left, right), number) in pairs.zip(0..) {
         let all = [
-            ("/left/image_raw", &image, picture(number, left)),
-            ("/left/camera_info", &info, camera(number, 0.0)),
-            ("/right/camera_info", &info, camera(number, BASELINE)),
-            (LAST, &image, picture(number, right)),
+            ("/left/image_raw", &image, serialize_image(number, left)),
+            (
+                "/left/camera_info",
+                &info,
+                serialize_camera_info(number, 0.0),
+            ),
+            (
+                "/right/camera_info",
+                &info,
+                serialize_camera_info(number, BASELINE),
+            ),
+            (LAST, &image, serialize_image(number, right)),
         ];
-        messages.extend(all.map(|(topic, wire_type, bytes)| Recorded {
+        messages.extend(all.map(|(topic, wire_type, bytes)| BagMessage {
             topic: Arc::from(topic),
             wire_type: wire_type.clone(),
             time: u64::from(number) * PERIOD,
@@ -83,26 +91,26 @@ pub fn read(file: &Bytes) -> Vec<Recorded> {
     messages
 }
 
-fn text(out: &mut BytesMut, text: &str) {
+fn put_string(out: &mut BytesMut, text: &str) {
     out.put_u32_le(text.len() as u32);
     out.put_slice(text.as_bytes());
 }
 
-/// `std_msgs/Header`, stamped with its number.
-fn header(out: &mut BytesMut, number: u32) {
+/// Writes a `std_msgs/Header` whose stamp is its number.
+fn put_header(out: &mut BytesMut, number: u32) {
     [number, number, 0]
         .iter()
         .for_each(|word| out.put_u32_le(*word));
-    text(out, "camera");
+    put_string(out, "camera");
 }
 
-/// A `sensor_msgs/Image` in mono8.
-fn picture(number: u32, pixels: &[u8]) -> Bytes {
+/// Serializes a `sensor_msgs/Image` in mono8.
+fn serialize_image(number: u32, pixels: &[u8]) -> Bytes {
     let mut out = BytesMut::new();
-    header(&mut out, number);
+    put_header(&mut out, number);
     out.put_u32_le(SIZE.1);
     out.put_u32_le(SIZE.0);
-    text(&mut out, "mono8");
+    put_string(&mut out, "mono8");
     out.put_u8(0);
     out.put_u32_le(SIZE.0);
     out.put_u32_le(pixels.len() as u32);
@@ -110,8 +118,8 @@ fn picture(number: u32, pixels: &[u8]) -> Bytes {
     out.freeze()
 }
 
-/// A `sensor_msgs/CameraInfo` of an ideal camera, so many metres to the right of the left one.
-fn camera(number: u32, baseline: f64) -> Bytes {
+/// Serializes a `sensor_msgs/CameraInfo` of an ideal camera, `baseline` metres to the right of the left one.
+fn serialize_camera_info(number: u32, baseline: f64) -> Bytes {
     let (width, height) = SIZE;
     let (f, x, y) = (
         FOCAL_LENGTH,
@@ -119,10 +127,10 @@ fn camera(number: u32, baseline: f64) -> Bytes {
         f64::from(height) / 2.0,
     );
     let mut out = BytesMut::new();
-    header(&mut out, number);
+    put_header(&mut out, number);
     out.put_u32_le(height);
     out.put_u32_le(width);
-    text(&mut out, "plumb_bob");
+    put_string(&mut out, "plumb_bob");
     out.put_u32_le(5);
     let distortion = [0.0; 5];
     let intrinsic = [f, 0.0, x, 0.0, f, y, 0.0, 0.0, 1.0];
@@ -135,23 +143,25 @@ fn camera(number: u32, baseline: f64) -> Bytes {
     let numbers = distortion.iter().chain(&intrinsic).chain(&rectifying);
     let numbers = numbers.chain(projecting.as_flattened());
     numbers.for_each(|number| out.put_f64_le(*number));
-    // binning_x, binning_y, roi: the whole picture
+    // binning_x, binning_y, roi: the whole image
     out.put_bytes(0, 4 * 6 + 1);
     out.freeze()
 }
 
-/// `sensor_msgs/CameraInfo`.
-const CAMERA_INFO: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] D\nfloat64[9] K\n\
+/// Definition of `sensor_msgs/CameraInfo`.
+const CAMERA_INFO: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] \
+    D\nfloat64[9] K\n\
     float64[9] R\nfloat64[12] P\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi\n\
     ================================================================================\n\
     MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n\
     ================================================================================\n\
-    MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n";
+    MSG: sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool \
+    do_rectify\n";
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::recording::stamped_before;
+    use crate::recording::with_relative_stamp;
 
     #[test]
     fn a_moment_is_four_messages_of_one_stamp() {
@@ -164,15 +174,15 @@ mod tests {
         assert_eq!(request.bytes.last(), Some(&2));
         assert_eq!(messages[4].bytes.last(), Some(&1));
         for before in &messages[4..7] {
-            let again = stamped_before(before, request, 1001);
+            let again = with_relative_stamp(before, request, 1001);
             assert_eq!(again[4..12], [0xe9, 3, 0, 0, 0, 0, 0, 0]);
         }
     }
 
     #[test]
     fn a_camera_is_as_long_as_its_type() {
-        let told = camera(7, BASELINE);
-        // Header and frame, size, model, D with its length, K, R, P, binning, roi.
+        let told = serialize_camera_info(7, BASELINE);
+        // Header and frame id, size, model, D with its length, K, R, P, binning, roi.
         let length = (16 + 6) + 8 + (4 + 9) + (4 + 40) + 8 * (9 + 9 + 12) + 8 + 17;
         assert_eq!(told.len(), length);
     }

@@ -1,5 +1,5 @@
-//! Messages of one topic as a file, for robots that send what no recording holds: a line of JSON with the topic, its type and the messages'
-//! lengths, then the messages.
+//! Messages of one topic in a file, for robots that send data without a recording: a line of JSON with the topic, its
+//! type and the lengths of the messages, then the messages.
 
 use std::io::Write;
 use std::path::Path;
@@ -7,39 +7,39 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
 use bytes::Bytes;
-use ros::bag::Recorded;
+use ros::bag::BagMessage;
 use ros::bus::WireType;
 use serde::{Deserialize, Serialize};
 
-/// Between two messages, nanoseconds.
+/// Interval between two messages, in nanoseconds.
 const PERIOD: u64 = 100_000_000;
 
-/// What the first line says.
+/// Content of the first line.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Head {
-    /// Where they are published.
+pub struct StreamHeader {
+    /// Topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Type, as `package/Type`.
     pub of: String,
-    /// Of the type's definition (MD5, hexadecimal).
+    /// MD5 of the type's definition, in hexadecimal.
     pub digest: String,
-    /// The type's full text.
+    /// Full text of the type's definition.
     pub definition: String,
-    /// How often all messages are sent, one round after the other.
+    /// Number of times that all messages are sent.
     pub rounds: usize,
-    /// Bytes of each message.
+    /// Length of each message in bytes.
     #[serde(default)]
     lengths: Vec<usize>,
 }
 
-impl Head {
-    /// Of a topic of pictures.
-    pub fn of_pictures(rounds: usize) -> Self {
+impl StreamHeader {
+    /// Header for a topic of images.
+    pub fn for_pictures(rounds: usize) -> Self {
         Self::new("/image", &support::people::image_type(), rounds)
     }
 
-    /// Of a topic of maps.
-    pub fn of_maps(rounds: usize) -> Self {
+    /// Header for a topic of maps.
+    pub fn for_maps(rounds: usize) -> Self {
         let of = WireType::new(
             "nav_msgs/OccupancyGrid",
             "3381f2d731d4076ec5c71b0759edbe4e",
@@ -60,9 +60,9 @@ impl Head {
     }
 }
 
-/// Writes a file that ends with `.messages`.
-pub fn write(path: &Path, head: &Head, messages: &[Bytes]) -> Result<()> {
-    let head = Head {
+/// Writes a file, whose name ends with `.messages`.
+pub fn write(path: &Path, head: &StreamHeader, messages: &[Bytes]) -> Result<()> {
+    let head = StreamHeader {
         lengths: messages.iter().map(Bytes::len).collect(),
         ..head.clone()
     };
@@ -75,11 +75,11 @@ pub fn write(path: &Path, head: &Head, messages: &[Bytes]) -> Result<()> {
     Ok(())
 }
 
-/// Reads one, ten messages a second.
-pub fn read(file: &Bytes) -> Result<Vec<Recorded>> {
+/// Reads a file as ten messages per second.
+pub fn read(file: &Bytes) -> Result<Vec<BagMessage>> {
     let line = file.iter().position(|byte| *byte == b'\n');
     let line = line.context("the file has no first line")?;
-    let head: Head = serde_json::from_slice(&file[..line])?;
+    let head: StreamHeader = serde_json::from_slice(&file[..line])?;
     let (topic, wire_type) = (
         Arc::<str>::from(head.topic),
         Arc::new(WireType::new(
@@ -100,7 +100,7 @@ pub fn read(file: &Bytes) -> Result<Vec<Recorded>> {
         from += length;
     }
     let sent = messages.iter().cycle().take(messages.len() * head.rounds);
-    let recorded = (0..).zip(sent).map(|(number, bytes)| Recorded {
+    let recorded = (0..).zip(sent).map(|(number, bytes)| BagMessage {
         topic: topic.clone(),
         wire_type: wire_type.clone(),
         time: number * PERIOD,
@@ -109,12 +109,13 @@ pub fn read(file: &Bytes) -> Result<Vec<Recorded>> {
     Ok(recorded.collect())
 }
 
-/// `nav_msgs/OccupancyGrid`.
+/// Definition of `nav_msgs/OccupancyGrid`.
 const MAP: &str = "std_msgs/Header header\nMapMetaData info\nint8[] data\n\
     ================================================================================\n\
     MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n\
     ================================================================================\n\
-    MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin\n\
+    MSG: nav_msgs/MapMetaData\ntime map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose \
+    origin\n\
     ================================================================================\n\
     MSG: geometry_msgs/Pose\nPoint position\nQuaternion orientation\n\
     ================================================================================\n\
@@ -131,7 +132,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("a.messages");
         let messages = [Bytes::from_static(b"one\n"), Bytes::from_static(b"")];
-        write(&path, &Head::of_maps(2), &messages).expect("it is written");
+        write(&path, &StreamHeader::for_maps(2), &messages).expect("it is written");
         let file = Bytes::from(std::fs::read(&path).expect("a file"));
         let back = read(&file).expect("messages");
         let bytes: Vec<&[u8]> = back.iter().map(|one| &one.bytes[..]).collect();

@@ -1,5 +1,5 @@
-//! What evaluations have left that were ended by force: robots' places, daemons with their servants, files. A later one takes it away; what
-//! belongs to a process that is still there is left alone.
+//! Removes leftovers of evaluations that were killed: sandboxes, daemons with their servants, files. Those of a process
+//! that still runs are left alone.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,87 +9,87 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use support::daemon::Setup;
+use support::daemon::DaemonSetup;
 use support::procfs;
 
 use crate::place;
 
-/// Of the directories that evaluations work in, below the directory for temporary files.
+/// Prefix of the working directories of evaluations, below the directory for temporary files.
 pub const PREFIX: &str = "cloudroid-eval-";
-/// In each: whose it is.
+/// File with the owner of such a directory.
 const OWNER: &str = "owner";
-/// For a daemon to end with its servants.
+/// Maximum time for a daemon to stop together with its servants.
 const END: Duration = Duration::from_secs(60);
 
-/// Notes that a directory is this process's.
+/// Records this process as the owner of a directory.
 pub fn claim(directory: &Path) -> Result<()> {
     let own = std::process::id();
-    let text = format!("{own} {}", started(own as i32).unwrap_or_default());
+    let text = format!("{own} {}", start_time(own as i32).unwrap_or_default());
     Ok(fs::write(directory.join(OWNER), text)?)
 }
 
-/// Takes away what is left of evaluations that are over; tells what, each in a line. What cannot be taken away is told, too.
-pub fn all() -> Vec<String> {
-    let mut told: Vec<String> = abandoned(&std::env::temp_dir())
+/// Removes the leftovers of evaluations that are over; returns a line for each, also for what cannot be removed.
+pub fn remove_all() -> Vec<String> {
+    let mut told: Vec<String> = abandoned_directories(&std::env::temp_dir())
         .iter()
-        .map(|directory| match home(directory) {
+        .map(|directory| match remove_home(directory) {
             Ok(()) => format!("{}: taken away", directory.display()),
             Err(error) => format!("{} is left: {error:#}", directory.display()),
         })
         .collect();
-    told.extend(place::sweep());
+    told.extend(place::remove_abandoned());
     told
 }
 
-/// Directories of evaluations whose process is no more.
-fn abandoned(temporary: &Path) -> Vec<PathBuf> {
+/// Returns the directories of evaluations whose process no longer exists.
+fn abandoned_directories(temporary: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(temporary).into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX));
     let over = |directory: &PathBuf| {
         let text = fs::read_to_string(directory.join(OWNER)).ok();
-        text.is_some_and(|text| !is_there(&text))
+        text.is_some_and(|text| !is_running(&text))
     };
     named.map(|entry| entry.path()).filter(over).collect()
 }
 
-/// Whether the process that has written this is there.
-fn is_there(owner: &str) -> bool {
+/// Returns whether the process that wrote this note still exists.
+fn is_running(owner: &str) -> bool {
     let (pid, since) = owner.split_once(' ').unwrap_or((owner, ""));
     pid.parse()
-        .is_ok_and(|pid| started(pid).is_some_and(|now| now == since))
+        .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == since))
 }
 
-/// When a process started, in ticks since the machine did: pids come again (proc(5): field 22 of `stat`).
-fn started(pid: i32) -> Option<String> {
+/// Returns the start time of a process in ticks since boot, because pids are reused (proc(5): field 22 of `stat`).
+fn start_time(pid: i32) -> Option<String> {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     let rest = stat.rsplit_once(") ")?.1;
     rest.split(' ').nth(19).map(str::to_owned)
 }
 
-/// Ends the daemon of an evaluation, with its servants, and removes the directory.
-fn home(directory: &Path) -> Result<()> {
+/// Stops the daemon of an evaluation with its servants, and removes the directory.
+fn remove_home(directory: &Path) -> Result<()> {
     let home = directory.join("home");
     if home.exists() {
-        // One that has died has left its servants to the next of the same home.
-        match daemon_of(&home) {
-            Some(pid) => ends(pid)?,
-            None => drop(Setup::new(&home).start()?.ends()?),
+        // A daemon that has died has left its servants to the next daemon with the same home.
+        match find_daemon(&home) {
+            Some(pid) => stop_daemon(pid)?,
+            None => drop(DaemonSetup::new(&home).start()?.stop()?),
         }
     }
     fs::remove_dir_all(directory).with_context(|| directory.display().to_string())
 }
 
-fn daemon_of(home: &Path) -> Option<i32> {
+fn find_daemon(home: &Path) -> Option<i32> {
     let wanted = format!("cloudroidd --home {} ", home.display());
     let is = |pid: &i32| procfs::command_line(*pid).is_some_and(|line| line.contains(&wanted));
     procfs::pids().into_iter().find(is)
 }
 
-fn ends(pid: i32) -> Result<()> {
+fn stop_daemon(pid: i32) -> Result<()> {
     kill(Pid::from_raw(pid), Signal::SIGTERM)?;
     let begun = Instant::now();
     let is_there = || {
-        // Somebody else is to reap it.
+        // The process is reaped by another parent.
         let state = procfs::status(pid).and_then(|status| status.get("State").cloned());
         state.is_some_and(|state| !state.starts_with(['Z', 'X']))
     };
@@ -100,8 +100,8 @@ fn ends(pid: i32) -> Result<()> {
     Ok(())
 }
 
-/// Runs `ip`, whatever comes of it.
-pub(crate) fn ip(words: &[&str]) {
+/// Runs `ip`, ignoring failures.
+pub(crate) fn run_ip(words: &[&str]) {
     let _ = Command::new("ip").args(words).output();
 }
 
@@ -121,13 +121,13 @@ mod tests {
         made("unknown");
         let ended = made("ended");
         fs::write(ended.join(OWNER), "999999999 7").expect("a file");
-        // The same pid, but of a process that started at another time.
+        // The same pid, but of a process with another start time.
         let again = made("again");
         fs::write(again.join(OWNER), format!("{} 1", std::process::id())).expect("a file");
-        let mut found = abandoned(temporary.path());
+        let mut found = abandoned_directories(temporary.path());
         found.sort();
         assert_eq!(found, [again, ended.clone()]);
-        home(&ended).expect("there is no daemon");
+        remove_home(&ended).expect("there is no daemon");
         assert!(!ended.exists());
     }
 }

@@ -1,88 +1,88 @@
-//! What a robot has seen of one run: raw, request by request.
+//! A robot's raw observations of one run, request by request.
 
 use serde::{Deserialize, Serialize};
 
 /// One request and its answer.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Request {
-    /// When it was published, seconds from the run's beginning.
+pub struct RequestSample {
+    /// Seconds from the start of the run until it was published.
     pub at: f64,
-    /// When its message was recorded, seconds of the recording.
+    /// Time of its message in the recording, in seconds.
     pub stamp: f64,
-    /// Response time of the first answer, seconds; none where no answer came.
+    /// Response time of the first answer in seconds; `None` without an answer.
     pub response: Option<f64>,
-    /// What the node itself says that it took.
-    pub phases: Option<Phases>,
-    /// Where the robot is, by the answer: x and y in metres, heading in radians.
+    /// Durations that the node itself reports.
+    pub phases: Option<ComputationPhases>,
+    /// Pose of the robot in the answer: x and y in metres, heading in radians.
     pub pose: Option<[f64; 3]>,
-    /// Of the answer without its header's sequence number; equal for equal answers.
+    /// Hash of the answer without its header's sequence number; equal for equal answers.
     pub digest: Option<u64>,
-    /// The same of an answer that is a list of boxes, in whatever order they are.
+    /// Hash of an answer that is a list of boxes, independent of their order.
     #[serde(default)]
     pub boxes: Option<u64>,
-    /// Bytes of packets that had left the robot and had come to it when the answer was there, since its place was made.
+    /// Bytes of packets that the robot had sent and received since its sandbox was created, when the answer arrived.
     #[serde(default)]
     pub carried: Option<[u64; 2]>,
-    /// How many answers came, of requests at a rate.
+    /// Number of answers, for requests at a rate.
     #[serde(default)]
     pub answers: usize,
-    /// The first answer was that of the local original, as the stub tells.
+    /// True if the first answer came from the local original, according to the stub.
     #[serde(default)]
     pub local: bool,
-    /// The stub's satisfaction with the cloud, Q, once this request was counted.
+    /// The stub's satisfaction with the cloud, Q, after this request had been counted.
     #[serde(default)]
     pub satisfaction: Option<f64>,
 }
 
-/// Parts of one computation as SLAMBench divides them (Nardi et al., ICRA 2015), seconds.
+/// Parts of one computation as in SLAMBench (Nardi et al., ICRA 2015), in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Phases {
+pub struct ComputationPhases {
     /// Reading the input.
     pub acquisition: f64,
     /// The algorithm.
     pub computation: f64,
-    /// Making what is shown.
+    /// Preparing the output for display.
     pub rendering: f64,
 }
 
-/// A map that was published.
+/// A published map.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Grid {
-    /// Cells.
+pub struct MapGrid {
+    /// Width in cells.
     pub width: usize,
-    /// Cells.
+    /// Height in cells.
     pub height: usize,
-    /// Metres of a cell's side.
+    /// Side length of a cell in metres.
     pub resolution: f64,
-    /// Of the first cell's corner, metres.
+    /// Corner of the first cell, in metres.
     pub origin: [f64; 2],
-    /// By rows, from the first: -1 unknown, 0 free to 100 occupied.
+    /// Cells by rows, from the first: -1 unknown, 0 free to 100 occupied.
     pub cells: Vec<i8>,
 }
 
-/// All of a run.
+/// Observations of a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Trace {
-    /// In the order they were published.
-    pub requests: Vec<Request>,
+    /// Requests in the order in which they were published.
+    pub requests: Vec<RequestSample>,
     /// Seconds from the first request to the last answer.
     pub lasted: f64,
-    /// Of requests at a rate: answers were late already before the first that counts.
+    /// For requests at a rate: whether answers were late even before the first counted request.
     #[serde(default)]
     pub late_before: bool,
     /// The last map.
-    pub map: Option<Grid>,
-    /// Answers by the local original, where that is known.
+    pub map: Option<MapGrid>,
+    /// Number of answers by the local original, if known.
     pub answered_locally: usize,
-    /// What its log warns of.
+    /// Warnings in the node's log.
     #[serde(default)]
     pub warnings: Vec<String>,
-    /// How the node ended before its time; none where it went on to the end.
+    /// How the node ended prematurely; `None` if it ran to the end.
     pub node_ended: Option<String>,
 }
 
 impl Trace {
-    /// Response times of what was answered, seconds.
+    /// Response times of the answered requests, in seconds.
     pub fn responses(&self) -> Vec<f64> {
         self.requests
             .iter()
@@ -90,15 +90,15 @@ impl Trace {
             .collect()
     }
 
-    /// How many were answered.
-    pub fn answered(&self) -> usize {
+    /// Number of answered requests.
+    pub fn answered_count(&self) -> usize {
         self.responses().len()
     }
 
-    /// Bytes of packets for each request, to the server and back, without the first `from` requests: counted from one answer to the last
-    /// one. None without counters, or where too few were answered.
-    pub fn carried_each(&self, from: usize) -> Option<[f64; 2]> {
-        let known = |(index, request): (usize, &Request)| Some((index, request.carried?));
+    /// Returns the bytes of packets per request, to the server and back, without the first `from` requests: from one
+    /// answer to the last one. `None` without counters, or with too few answers.
+    pub fn bytes_per_request(&self, from: usize) -> Option<[f64; 2]> {
+        let known = |(index, request): (usize, &RequestSample)| Some((index, request.carried?));
         let all: Vec<(usize, [u64; 2])> =
             self.requests.iter().enumerate().filter_map(known).collect();
         let first = all.iter().rfind(|(index, _)| *index < from)?;
@@ -108,9 +108,9 @@ impl Trace {
         Some([bytes(0)? as f64 / requests, bytes(1)? as f64 / requests])
     }
 
-    /// Estimated positions: seconds of the recording, x and y in metres.
+    /// Returns the estimated positions: seconds of the recording, x and y in metres.
     pub fn trajectory(&self) -> Vec<(f64, f64, f64)> {
-        let pose = |one: &Request| one.pose.map(|[x, y, _]| (one.stamp, x, y));
+        let pose = |one: &RequestSample| one.pose.map(|[x, y, _]| (one.stamp, x, y));
         self.requests.iter().filter_map(pose).collect()
     }
 }

@@ -1,5 +1,5 @@
-//! What the detector has learned: fetched once, kept in the user's cache directory under the name of what was fetched, and put beside the
-//! package's sources of each checkout from there.
+//! The trained weights of the detector: fetched once, stored in the user's cache directory under their digest, and
+//! copied from there into each checkout's package sources.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -10,20 +10,20 @@ use sha2::{Digest, Sha256};
 
 use crate::deadline;
 
-/// Of a package's directory.
+/// Path in the package's directory.
 const FILE: &str = "models/centernet.onnx";
-/// In the script, before the SHA-256 that the file must have.
+/// Text of the script before the SHA-256 that the file must have.
 const EXPECTED: &str = "MODEL_SHA256 = \"";
 
-/// For fetching some tens of megabytes.
+/// Maximum time to fetch some tens of megabytes.
 const LONGEST: Duration = Duration::from_secs(600);
 
-/// Puts it into `package`, where it is not there yet.
-pub fn put_into(package: &Path) -> Result<()> {
-    put(package, &cache()?)
+/// Installs the weights in `package`, unless they are there.
+pub fn install(package: &Path) -> Result<()> {
+    install_from(package, &cache_directory()?)
 }
 
-fn put(package: &Path, cache: &Path) -> Result<()> {
+fn install_from(package: &Path, cache: &Path) -> Result<()> {
     let (script, file) = (package.join("fetch_weights"), package.join(FILE));
     let text = std::fs::read_to_string(&script).with_context(|| script.display().to_string())?;
     let expected = text
@@ -31,18 +31,18 @@ fn put(package: &Path, cache: &Path) -> Result<()> {
         .and_then(|(_, rest)| rest.get(..64));
     let expected = expected.with_context(|| format!("{} names no SHA-256", script.display()))?;
     let kept = cache.join(format!("{expected}.onnx"));
-    if !is(&file, expected) {
-        if is(&kept, expected) {
+    if !has_digest(&file, expected) {
+        if has_digest(&kept, expected) {
             copy(&kept, &file)?;
             return Ok(());
         }
-        let status = deadline::ends(
+        let status = deadline::wait_for_exit(
             &mut Command::new(&script).spawn()?,
             &script.display().to_string(),
             LONGEST,
         )?;
         ensure!(
-            status.success() && is(&file, expected),
+            status.success() && has_digest(&file, expected),
             "the detector's weights could not be fetched ({status}): run {}, which takes them from the registry of npm",
             script.display()
         );
@@ -53,11 +53,11 @@ fn put(package: &Path, cache: &Path) -> Result<()> {
     Ok(())
 }
 
-fn is(file: &Path, expected: &str) -> bool {
+fn has_digest(file: &Path, expected: &str) -> bool {
     std::fs::read(file).is_ok_and(|bytes| format!("{:x}", Sha256::digest(bytes)) == expected)
 }
 
-/// Under its name when it is whole.
+/// Copies a file atomically, by renaming a complete copy.
 fn copy(from: &Path, to: &Path) -> Result<()> {
     let directory = to.parent().context("a directory")?;
     std::fs::create_dir_all(directory)?;
@@ -67,7 +67,7 @@ fn copy(from: &Path, to: &Path) -> Result<()> {
     Ok(())
 }
 
-fn cache() -> Result<PathBuf> {
+fn cache_directory() -> Result<PathBuf> {
     let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     let caches = variable("XDG_CACHE_HOME").map(PathBuf::from);
     let caches = caches.or_else(|| Some(PathBuf::from(variable("HOME")?).join(".cache")));
@@ -81,7 +81,7 @@ mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
 
-    /// A package whose script writes "learned" and notes that it was run.
+    /// Creates a package whose script writes "learned" and records that it ran.
     fn package(place: &Path) -> PathBuf {
         let package = place.join("package");
         std::fs::create_dir_all(package.join("models")).expect("a directory");
@@ -99,13 +99,13 @@ mod tests {
     fn another_checkout_fetches_nothing() {
         let place = tempfile::tempdir().expect("a directory");
         let (package, cache) = (package(place.path()), place.path().join("cache"));
-        put(&package, &cache).expect("it is fetched");
+        install_from(&package, &cache).expect("it is fetched");
         // As in another checkout.
         std::fs::remove_file(package.join(FILE)).expect("it is there");
-        put(&package, &cache).expect("it is kept");
-        // What is damaged is not taken.
+        install_from(&package, &cache).expect("it is kept");
+        // A damaged file is not used.
         std::fs::write(package.join(FILE), "lear").expect("ours");
-        put(&package, &cache).expect("it is kept");
+        install_from(&package, &cache).expect("it is kept");
         let read = |name: &str| std::fs::read_to_string(package.join(name)).expect("a file");
         assert_eq!(
             (read(FILE), read("runs")),

@@ -1,26 +1,26 @@
-//! Numbers as the report has them.
+//! Formats numbers for the report.
 
-/// In words; a dash where it is not known.
-pub fn known<T>(value: Option<T>, says: impl FnOnce(T) -> String) -> String {
+/// Formats a value; a dash if it is unknown.
+pub fn or_dash<T>(value: Option<T>, says: impl FnOnce(T) -> String) -> String {
     value.map_or_else(|| "–".to_owned(), says)
 }
 
-/// A share, of which 1 is all, with one digit after the point; a dash where it is not known.
+/// Formats a fraction as a percentage with one decimal; a dash if it is unknown.
 pub fn percent(share: Option<f64>) -> String {
-    // Adding nothing makes zero of what is rounded to minus zero.
-    known(share, |share| {
+    // Adding zero turns a rounded minus zero into zero.
+    or_dash(share, |share| {
         format!("{:.1} %", (share * 1000.0).round() / 10.0 + 0.0)
     })
 }
 
-/// Seconds as milliseconds of three digits; a dash where there is none.
+/// Formats seconds as milliseconds with three digits; a dash if unknown.
 pub fn milliseconds(seconds: Option<f64>) -> String {
-    known(seconds, |seconds| digits(seconds * 1e3))
+    or_dash(seconds, |seconds| digits(seconds * 1e3))
 }
 
-/// How many times; a dash where it is not known.
+/// Formats a ratio; a dash if it is unknown.
 pub fn ratio(times: Option<f64>) -> String {
-    known(times, |times| {
+    or_dash(times, |times| {
         if times < 1.0 {
             format!("{times:.2}")
         } else {
@@ -29,7 +29,7 @@ pub fn ratio(times: Option<f64>) -> String {
     })
 }
 
-/// Three digits, or all of those before the point.
+/// Formats with three digits, or all digits before the point.
 pub fn digits(value: f64) -> String {
     match value.abs() {
         size if size >= 100.0 => format!("{value:.0}"),

@@ -1,4 +1,5 @@
-//! What can go wrong with an evaluation: each is named, costs nothing else, and leaves nothing for long. Needs root, as places do.
+//! Failures of an evaluation: each is reported, affects nothing else, and leaves nothing behind for long. Needs root,
+//! as sandboxes do.
 
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::ExitStatusExt;
@@ -6,26 +7,26 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Mutex;
 
-use eval::place::{Class, Network, Place};
+use eval::place::{NetworkProfile, RobotHardware, RobotSandbox};
 use eval::rehearsal;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 
-/// Whoever begins takes away what is left of others: one after the other.
+/// Serializes the tests, because each evaluation removes the leftovers of others when it starts.
 static ONE: Mutex<()> = Mutex::new(());
-/// Longer than any test waits.
+/// Longer than any test waits, in seconds.
 const LONG: f64 = 600.0;
 
-/// An evaluation of nothing, with a target of its own.
-struct Evaluation {
+/// A running evaluation without experiments, with a target directory of its own.
+struct RehearsedEvaluation {
     child: Child,
     said: BufReader<std::process::ChildStderr>,
     heard: String,
 }
 
-impl Evaluation {
-    fn begins(target: &Path, temporary: &Path, seconds: f64) -> Self {
-        Self::of(
+impl RehearsedEvaluation {
+    fn start(target: &Path, temporary: &Path, seconds: f64) -> Self {
+        Self::spawn(
             Command::new(env!("CARGO_BIN_EXE_eval")),
             target,
             temporary,
@@ -33,7 +34,7 @@ impl Evaluation {
         )
     }
 
-    fn of(mut command: Command, target: &Path, temporary: &Path, seconds: f64) -> Self {
+    fn spawn(mut command: Command, target: &Path, temporary: &Path, seconds: f64) -> Self {
         let mut child = command
             .arg("--target")
             .arg(target)
@@ -50,8 +51,8 @@ impl Evaluation {
         Self { child, said, heard }
     }
 
-    /// Waits until it says these words.
-    fn says(&mut self, words: &str) {
+    /// Waits until the output contains `words`.
+    fn wait_for_output(&mut self, words: &str) {
         while !self.heard.contains(words) {
             let read = self.said.read_line(&mut self.heard).expect("what it says");
             assert!(read > 0, "{words:?} was not said: {}", self.heard);
@@ -63,16 +64,16 @@ impl Evaluation {
         kill(pid, signal).expect("it is there");
     }
 
-    /// Its status, and all that it said.
-    fn ends(mut self) -> (ExitStatus, String) {
+    /// Waits for its end; returns its status and all output.
+    fn wait(mut self) -> (ExitStatus, String) {
         self.said
             .read_to_string(&mut self.heard)
             .expect("what it says");
         (self.child.wait().expect("its end"), self.heard)
     }
 
-    /// Places that it has made and that are there.
-    fn places(pid: u32) -> Vec<String> {
+    /// Returns the sandboxes that it has created and that exist.
+    fn sandboxes_of(pid: u32) -> Vec<String> {
         let prefix = format!("cloudroid-cable-{pid}-");
         let mut found = support::leftovers::cgroups(std::slice::from_ref(&prefix))
             .iter()
@@ -90,8 +91,8 @@ impl Evaluation {
     }
 }
 
-/// Where the daemon is: beside the evaluation, as cargo builds them.
-/// Where the programs are that are built for all tests, the robot's among them.
+/// Returns the directory of the daemon and the other programs: `CLOUDROID_BIN`, or the directory of the evaluation,
+/// into which cargo builds them.
 fn binaries() -> PathBuf {
     let beside = Path::new(env!("CARGO_BIN_EXE_eval")).parent();
     std::env::var_os("CLOUDROID_BIN")
@@ -109,34 +110,34 @@ fn report(target: &Path) -> String {
     std::fs::read_to_string(target.join("report.html")).expect("a report")
 }
 
-fn one_at_a_time() -> std::sync::MutexGuard<'static, ()> {
+fn serialize_tests() -> std::sync::MutexGuard<'static, ()> {
     ONE.lock()
         .unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
 #[test]
 fn asked_to_end_it_reports_what_it_has_and_goes_on_later() {
-    let _one = one_at_a_time();
+    let _one = serialize_tests();
     let (_place, target, temporary) = directories();
     for signal in [Signal::SIGINT, Signal::SIGTERM] {
-        let mut evaluation = Evaluation::begins(&target, &temporary, LONG);
+        let mut evaluation = RehearsedEvaluation::start(&target, &temporary, LONG);
         let pid = evaluation.child.id();
-        evaluation.says("rehearsal robot\n");
-        waits_for(|| robot_of(pid));
-        assert!(!Evaluation::places(pid).is_empty());
+        evaluation.wait_for_output("rehearsal robot\n");
+        wait_until_found(|| find_robot(pid));
+        assert!(!RehearsedEvaluation::sandboxes_of(pid).is_empty());
         evaluation.signal(signal);
-        let (status, said) = evaluation.ends();
+        let (status, said) = evaluation.wait();
         assert_eq!(status.code(), Some(1), "{said}");
         let report = report(&target);
         assert!(report.contains("made"), "{report}");
         assert!(report.contains("asked to end"), "{report}");
-        assert_eq!(Evaluation::places(pid), Vec::<String>::new());
+        assert_eq!(RehearsedEvaluation::sandboxes_of(pid), Vec::<String>::new());
         let left = std::fs::read_dir(&temporary).expect("a directory").count();
         assert_eq!(left, 0, "{said}");
     }
-    // What was half written counts as not measured.
+    // A partially written file counts as not measured.
     std::fs::write(target.join("cells/rehearsal-robot.json"), "{\"of\": [").expect("ours");
-    let (status, said) = Evaluation::begins(&target, &temporary, 0.0).ends();
+    let (status, said) = RehearsedEvaluation::start(&target, &temporary, 0.0).wait();
     assert!(status.success(), "{said}");
     assert!(said.contains("rehearsal place: measured before"), "{said}");
     let report = report(&target);
@@ -146,28 +147,32 @@ fn asked_to_end_it_reports_what_it_has_and_goes_on_later() {
 
 #[test]
 fn what_a_killed_evaluation_leaves_the_next_takes_away() {
-    let _one = one_at_a_time();
+    let _one = serialize_tests();
     let (_place, target, temporary) = directories();
     for with_daemon in [false, true] {
-        let mut evaluation = Evaluation::begins(&target, &temporary, LONG);
+        let mut evaluation = RehearsedEvaluation::start(&target, &temporary, LONG);
         let pid = evaluation.child.id();
-        evaluation.says("rehearsal robot\n");
-        // The place, once the robot is in it.
-        let robot = waits_for(|| robot_of(pid));
-        let daemon = daemon_below(&temporary).expect("its daemon");
+        evaluation.wait_for_output("rehearsal robot\n");
+        // The sandbox, once the robot runs in it.
+        let robot = wait_until_found(|| find_robot(pid));
+        let daemon = find_daemon(&temporary).expect("its daemon");
         evaluation.signal(Signal::SIGKILL);
-        let (status, _) = evaluation.ends();
+        let (status, _) = evaluation.wait();
         assert_eq!(status.signal(), Some(9));
         if with_daemon {
             kill(Pid::from_raw(daemon), Signal::SIGKILL).expect("it is there");
         }
-        assert!(!Evaluation::places(pid).is_empty());
-        let (status, said) = Evaluation::begins(&target, &temporary, 0.0).ends();
+        assert!(!RehearsedEvaluation::sandboxes_of(pid).is_empty());
+        let (status, said) = RehearsedEvaluation::start(&target, &temporary, 0.0).wait();
         assert!(status.success(), "{said}");
         assert!(said.contains("taken away"), "{said}");
-        assert_eq!(Evaluation::places(pid), Vec::<String>::new(), "{said}");
+        assert_eq!(
+            RehearsedEvaluation::sandboxes_of(pid),
+            Vec::<String>::new(),
+            "{said}"
+        );
         assert!(support::procfs::command_line(robot).is_none_or(|line| line.is_empty()));
-        assert_eq!(daemon_below(&temporary), None);
+        assert_eq!(find_daemon(&temporary), None);
         let left = std::fs::read_dir(&temporary).expect("a directory").count();
         assert_eq!(left, 0, "{said}");
         std::fs::remove_file(target.join("cells/rehearsal-robot.json")).expect("it is measured");
@@ -176,36 +181,36 @@ fn what_a_killed_evaluation_leaves_the_next_takes_away() {
 
 #[test]
 fn a_robot_or_a_node_that_is_killed_is_named_and_others_go_on() {
-    let _one = one_at_a_time();
-    let place = Place::new("127.0.0.1:9", Class::PI, Network::Lan);
+    let _one = serialize_tests();
+    let place = RobotSandbox::new("127.0.0.1:9", RobotHardware::PI, NetworkProfile::Lan);
     let mut place = place.expect("a place");
     place.program = env!("CARGO_BIN_EXE_eval").into();
     let directory = tempfile::tempdir().expect("a directory");
     let plan = rehearsal::plan(directory.path(), LONG).expect("a plan");
     let kills = |who: fn(u32) -> Option<i32>| {
         std::thread::scope(|scope| {
-            let run = scope.spawn(|| place.runs(&plan, directory.path()));
-            let pid = waits_for(|| who(std::process::id()));
+            let run = scope.spawn(|| place.run(&plan, directory.path()));
+            let pid = wait_until_found(|| who(std::process::id()));
             kill(Pid::from_raw(pid), Signal::SIGKILL).expect("it is there");
             run.join().expect("it does not panic")
         })
     };
-    let killed = kills(robot_of).expect_err("the robot was killed");
+    let killed = kills(find_robot).expect_err("the robot was killed");
     assert!(killed.to_string().contains("signal 9"), "{killed:#}");
-    let (trace, _) = kills(node_of).expect("the robot goes on");
+    let (trace, _) = kills(find_node).expect("the robot goes on");
     let ended = trace.node_ended.expect("the node was killed");
     assert!(ended.contains("the node has ended"), "{ended}");
 }
 
 #[test]
 fn without_control_groups_a_place_says_so() {
-    let _one = one_at_a_time();
+    let _one = serialize_tests();
     let (_place, target, temporary) = directories();
-    // As in a container that has none of its own; for this process alone.
+    // As in a container that has no cgroups of its own; for this process only.
     let mut command = Command::new("unshare");
     let script = "mount -t tmpfs -o ro none /sys/fs/cgroup && exec \"$0\" \"$@\"";
     command.args(["--mount", "sh", "-c", script, env!("CARGO_BIN_EXE_eval")]);
-    let (status, said) = Evaluation::of(command, &target, &temporary, 0.0).ends();
+    let (status, said) = RehearsedEvaluation::spawn(command, &target, &temporary, 0.0).wait();
     assert_eq!(status.code(), Some(1), "{said}");
     let report = report(&target);
     assert!(report.contains("control groups"), "{report}");
@@ -214,15 +219,15 @@ fn without_control_groups_a_place_says_so() {
 
 #[test]
 fn recordings_that_are_not_there_are_named() {
-    let _one = one_at_a_time();
+    let _one = serialize_tests();
     let (_place, target, temporary) = directories();
     let mut command = Command::new("unshare");
-    // Hidden from this process alone; on a fresh machine the first was never there.
+    // Hidden from this process only; on a fresh machine the first directory does not exist.
     let script = "for place in /usr/share/mrpt /usr/share/doc; do \
                       if [ -d $place ]; then mount -t tmpfs none $place || exit; fi; \
                   done; exec \"$0\" --quick --only 3,7 --target \"$2\"";
     command.args(["--mount", "sh", "-c", script, env!("CARGO_BIN_EXE_eval")]);
-    let (status, said) = Evaluation::of(command, &target, &temporary, 0.0).ends();
+    let (status, said) = RehearsedEvaluation::spawn(command, &target, &temporary, 0.0).wait();
     assert_eq!(status.code(), Some(1), "{said}");
     let report = report(&target);
     for package in ["mrpt-common", "opencv-doc"] {
@@ -231,16 +236,16 @@ fn recordings_that_are_not_there_are_named() {
     }
 }
 
-/// The child of a process that runs a robot, once it is one.
-fn robot_of(pid: u32) -> Option<i32> {
+/// Returns the child process that runs a robot, once there is one.
+fn find_robot(pid: u32) -> Option<i32> {
     children(pid as i32).into_iter().find(|child| {
         let line = support::procfs::command_line(*child).unwrap_or_default();
         line.contains(" robot ") && !line.starts_with("nsenter")
     })
 }
 
-fn node_of(pid: u32) -> Option<i32> {
-    children(robot_of(pid)?).into_iter().find(|child| {
+fn find_node(pid: u32) -> Option<i32> {
+    children(find_robot(pid)?).into_iter().find(|child| {
         let line = support::procfs::command_line(*child).unwrap_or_default();
         line.starts_with("sleep ")
     })
@@ -255,13 +260,13 @@ fn children(pid: i32) -> Vec<i32> {
     all.filter(|child| of(child) == Some(true)).collect()
 }
 
-fn daemon_below(temporary: &Path) -> Option<i32> {
+fn find_daemon(temporary: &Path) -> Option<i32> {
     let home = format!("cloudroidd --home {}", temporary.display());
     let is =
         |pid: &i32| support::procfs::command_line(*pid).is_some_and(|line| line.contains(&home));
     support::procfs::pids().into_iter().find(is)
 }
 
-fn waits_for<T>(mut find: impl FnMut() -> Option<T>) -> T {
-    support::until("it", || Ok(find().ok_or_else(String::new))).expect("it comes about")
+fn wait_until_found<T>(mut find: impl FnMut() -> Option<T>) -> T {
+    support::wait_until("it", || Ok(find().ok_or_else(String::new))).expect("it comes about")
 }

@@ -1,4 +1,4 @@
-//! Writes the seeds of the codec targets into `corpus/`: run it when a frame's layout has changed.
+//! Writes the seeds of the codec targets into `corpus/`. To be run whenever the layout of a frame has changed:
 //!
 //!     cargo run -p fuzz --features video --example codec_seeds
 
@@ -6,26 +6,26 @@ use codec::{Codec, Encoder, JpegOptions, Schema, VideoOptions};
 use std::fs;
 use std::path::Path;
 
-/// How messages are serialized: by ROS 1, or by ROS 2 (CDR, little endian).
+/// Serialization format: ROS 1, or ROS 2 (CDR, little endian).
 #[derive(Clone, Copy, PartialEq)]
-enum Format {
+enum SeedFormat {
     Ros1,
     Cdr,
 }
 
-/// A serialized message, field by field.
-struct Message {
+/// A serialized message, written field by field.
+struct SeedMessage {
     bytes: Vec<u8>,
-    format: Format,
+    format: SeedFormat,
 }
 
-impl Message {
-    /// Begins with a header.
-    fn stamped(format: Format) -> Self {
-        // What names CDR takes the room of `seq`; CDR counts from behind it.
+impl SeedMessage {
+    /// Starts a message with a header.
+    fn with_header(format: SeedFormat) -> Self {
+        // The CDR encapsulation header takes the place of `seq`; CDR aligns relative to its end.
         let seq = match format {
-            Format::Ros1 => [1, 0, 0, 0],
-            Format::Cdr => [0, 1, 0, 0],
+            SeedFormat::Ros1 => [1, 0, 0, 0],
+            SeedFormat::Cdr => [0, 1, 0, 0],
         };
         let message = Self {
             bytes: seq.to_vec(),
@@ -39,8 +39,8 @@ impl Message {
         self
     }
 
-    fn aligned(mut self, size: usize) -> Self {
-        if self.format == Format::Cdr {
+    fn align(mut self, size: usize) -> Self {
+        if self.format == SeedFormat::Cdr {
             let filled = (self.bytes.len() - 4).next_multiple_of(size) + 4;
             self.bytes.resize(filled, 0);
         }
@@ -48,15 +48,15 @@ impl Message {
     }
 
     fn u32(self, value: u32) -> Self {
-        self.aligned(4).raw(&value.to_le_bytes())
+        self.align(4).raw(&value.to_le_bytes())
     }
 
     fn f32(self, value: f32) -> Self {
-        self.aligned(4).raw(&value.to_le_bytes())
+        self.align(4).raw(&value.to_le_bytes())
     }
 
     fn doubles(self, values: &[f64]) -> Self {
-        values.iter().fold(self.aligned(8), |message, value| {
+        values.iter().fold(self.align(8), |message, value| {
             message.raw(&value.to_le_bytes())
         })
     }
@@ -67,8 +67,8 @@ impl Message {
 
     fn text(self, text: &str) -> Self {
         match self.format {
-            Format::Ros1 => self.bytes(text.as_bytes()),
-            Format::Cdr => self.bytes(&[text.as_bytes(), b"\0"].concat()),
+            SeedFormat::Ros1 => self.bytes(text.as_bytes()),
+            SeedFormat::Cdr => self.bytes(&[text.as_bytes(), b"\0"].concat()),
         }
     }
 
@@ -79,32 +79,37 @@ impl Message {
             .fold(message, |message, &value| message.f32(value))
     }
 
-    /// The last word is filled up.
-    fn end(self) -> Vec<u8> {
-        self.aligned(4).bytes
+    /// Returns the message, padded to a multiple of four bytes.
+    fn finish(self) -> Vec<u8> {
+        self.align(4).bytes
     }
 }
 
 fn image(
-    format: Format,
+    format: SeedFormat,
     encoding: &str,
     width: u32,
     height: u32,
     step: u32,
     data: &[u8],
 ) -> Vec<u8> {
-    let message = Message::stamped(format).u32(height).u32(width);
-    message.text(encoding).raw(&[0]).u32(step).bytes(data).end()
+    let message = SeedMessage::with_header(format).u32(height).u32(width);
+    message
+        .text(encoding)
+        .raw(&[0])
+        .u32(step)
+        .bytes(data)
+        .finish()
 }
 
-/// A slope with some noise.
-fn samples(count: usize) -> Vec<u8> {
+/// Returns a slope with some noise.
+fn slope_samples(count: usize) -> Vec<u8> {
     (0..count)
         .map(|index| (index / 5 + ((index * 7919) >> 4) % 3) as u8)
         .collect()
 }
 
-fn images(format: Format) -> Vec<Vec<u8>> {
+fn images(format: SeedFormat) -> Vec<Vec<u8>> {
     let depths: Vec<u8> = (0..40 * 36u16)
         .map(|at| if at % 11 == 0 { 0 } else { 900 + at % 40 * 3 })
         .flat_map(u16::to_le_bytes)
@@ -120,24 +125,24 @@ fn images(format: Format) -> Vec<Vec<u8>> {
         .flat_map(f32::to_le_bytes)
         .collect();
     vec![
-        image(format, "rgb8", 20, 18, 60, &samples(60 * 18)),
-        image(format, "bgra8", 8, 8, 35, &samples(35 * 8)),
-        image(format, "mono8", 30, 40, 33, &samples(33 * 40)),
-        image(format, "bayer_rggb8", 17, 15, 17, &samples(17 * 15)),
+        image(format, "rgb8", 20, 18, 60, &slope_samples(60 * 18)),
+        image(format, "bgra8", 8, 8, 35, &slope_samples(35 * 8)),
+        image(format, "mono8", 30, 40, 33, &slope_samples(33 * 40)),
+        image(format, "bayer_rggb8", 17, 15, 17, &slope_samples(17 * 15)),
         image(format, "16UC1", 40, 36, 80, &depths),
         image(format, "32FC1", 24, 24, 96, &metres),
     ]
 }
 
-/// Cells of half a metre.
-fn map(format: Format, side: u32, origin: f64, cells: &[u8]) -> Vec<u8> {
-    let message = Message::stamped(format).u32(0).u32(0).f32(0.5);
+/// A map with cells of half a metre.
+fn map(format: SeedFormat, side: u32, origin: f64, cells: &[u8]) -> Vec<u8> {
+    let message = SeedMessage::with_header(format).u32(0).u32(0).f32(0.5);
     let message = message.u32(side).u32(side);
     let pose = [origin, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-    message.doubles(&pose).bytes(cells).end()
+    message.doubles(&pose).bytes(cells).finish()
 }
 
-fn grid(format: Format, shift: u32, extra: usize) -> Vec<u8> {
+fn grid(format: SeedFormat, shift: u32, extra: usize) -> Vec<u8> {
     let cells: Vec<u8> = (0..70 * 70)
         .map(|at| match (at % 70 + extra, at / 70) {
             (x, 30) if x > 20 => 100,
@@ -148,12 +153,12 @@ fn grid(format: Format, shift: u32, extra: usize) -> Vec<u8> {
     map(format, 70, f64::from(shift) * 0.5, &cells)
 }
 
-fn shaded(format: Format) -> Vec<u8> {
-    map(format, 40, 0.0, &samples(1600))
+fn shaded_map(format: SeedFormat) -> Vec<u8> {
+    map(format, 40, 0.0, &slope_samples(1600))
 }
 
-/// In the few shades that a mapper leaves.
-fn laddered(format: Format) -> Vec<u8> {
+/// A map in the few shades that a mapper produces.
+fn stepped_map(format: SeedFormat) -> Vec<u8> {
     let cells: Vec<u8> = (0..60 * 60usize)
         .map(|at| match (at % 60, at / 60) {
             (x, y) if x < 20 || y < 10 => 255,
@@ -163,7 +168,7 @@ fn laddered(format: Format) -> Vec<u8> {
     map(format, 60, 0.0, &cells)
 }
 
-fn scan(format: Format, rough: bool) -> Vec<u8> {
+fn scan(format: SeedFormat, rough: bool) -> Vec<u8> {
     let ranges: Vec<f32> = (0..300)
         .map(|beam| match beam % 23 {
             0 => f32::INFINITY,
@@ -172,14 +177,14 @@ fn scan(format: Format, rough: bool) -> Vec<u8> {
         })
         .collect();
     let echoes: Vec<f32> = (0..300).map(|beam| (beam % 50) as f32).collect();
-    let message = Message::stamped(format);
+    let message = SeedMessage::with_header(format);
     let message = (0..7).fold(message, |message, _| message.f32(0.0));
-    message.floats(&ranges).floats(&echoes).end()
+    message.floats(&ranges).floats(&echoes).finish()
 }
 
-/// Fields of a cloud: name, offset, number.
+/// A point cloud; `fields` are name, offset and datatype.
 fn cloud(
-    format: Format,
+    format: SeedFormat,
     width: u32,
     height: u32,
     step: u32,
@@ -187,7 +192,7 @@ fn cloud(
     padding: u32,
     data: &[u8],
 ) -> Vec<u8> {
-    let message = Message::stamped(format)
+    let message = SeedMessage::with_header(format)
         .u32(height)
         .u32(width)
         .u32(fields.len() as u32);
@@ -199,10 +204,10 @@ fn cloud(
         .u32(step)
         .u32(step * width + padding)
         .bytes(data);
-    message.raw(&[1]).end()
+    message.raw(&[1]).finish()
 }
 
-fn clouds(format: Format) -> Vec<Vec<u8>> {
+fn clouds(format: SeedFormat) -> Vec<Vec<u8>> {
     let mut camera = Vec::new();
     let mut laser = Vec::new();
     for v in 0..12 {
@@ -259,7 +264,7 @@ fn clouds(format: Format) -> Vec<Vec<u8>> {
     ]
 }
 
-/// Frames as a list, each without its first `cut` bytes.
+/// Serializes a list of frames, each without its first `cut` bytes.
 fn list(frames: &[Vec<u8>], cut: usize) -> Vec<u8> {
     let mut bytes = Vec::new();
     for frame in frames {
@@ -269,7 +274,7 @@ fn list(frames: &[Vec<u8>], cut: usize) -> Vec<u8> {
     bytes
 }
 
-/// The frames of messages of one topic.
+/// Encodes messages of one topic.
 fn frames(schema: Schema, codec: Codec, messages: &[Vec<u8>]) -> Vec<Vec<u8>> {
     let mut encoder = Encoder::new(schema).allow_video(VideoOptions::default());
     encoder = encoder.allow_jpeg(JpegOptions::default());
@@ -291,20 +296,20 @@ fn write(target: &str, name: &str, bytes: &[u8]) {
     fs::write(folder.join(name), bytes).expect("the corpus can be written");
 }
 
-/// Seeds of all that knows a message's fields.
-fn known(format: Format) {
+/// Writes the seeds of all codecs that know the fields of a message.
+fn write_typed_seeds(format: SeedFormat) {
     let suffix = match format {
-        Format::Ros1 => "",
-        Format::Cdr => "_cdr",
+        SeedFormat::Ros1 => "",
+        SeedFormat::Cdr => "_cdr",
     };
     let grids = [grid(format, 0, 0), grid(format, 0, 3), grid(format, 4, 5)];
     let rgb: Vec<_> = (0..4)
         .map(|round| {
-            let data = &samples(96 * 24 + round * 5)[round * 5..];
+            let data = &slope_samples(96 * 24 + round * 5)[round * 5..];
             image(format, "rgb8", 32, 24, 96, data)
         })
         .collect();
-    let maps = vec![grids[0].clone(), shaded(format), laddered(format)];
+    let maps = vec![grids[0].clone(), shaded_map(format), stepped_map(format)];
     let kinds = [
         (Schema::Image, images(format)),
         (Schema::OccupancyGrid, maps),
@@ -316,7 +321,7 @@ fn known(format: Format) {
     ];
     let mut mixed = Vec::new();
     for (number, (schema, messages)) in kinds.iter().enumerate() {
-        let codec = Codec::made_for(*schema);
+        let codec = Codec::for_schema(*schema);
         for (index, message) in messages.iter().enumerate() {
             let frames = frames(*schema, codec, std::slice::from_ref(message));
             let target = format!("codec_{}", codec.name());
@@ -329,15 +334,15 @@ fn known(format: Format) {
             write("codec_message", &name, &message);
         }
     }
-    let other = Codec::made_for(Schema::Other);
-    mixed.extend(frames(Schema::Other, other, &[samples(700)]));
+    let other = Codec::for_schema(Schema::Other);
+    mixed.extend(frames(Schema::Other, other, &[slope_samples(700)]));
     let made = frames(Schema::OccupancyGrid, Codec::Grid, &grids);
     let name = format!("successors{suffix}");
     write("codec_grid", &name, &list(&made, 2));
     let made = frames(Schema::Image, Codec::Video, &rgb);
     write("codec_video", &format!("moving{suffix}"), &list(&made, 2));
     mixed.extend(made);
-    let grey = image(format, "mono8", 33, 25, 40, &samples(40 * 25));
+    let grey = image(format, "mono8", 33, 25, 40, &slope_samples(40 * 25));
     let made = [
         frames(Schema::Image, Codec::Jpeg, &rgb[..1]),
         frames(Schema::Image, Codec::Jpeg, &[grey]),
@@ -349,7 +354,7 @@ fn known(format: Format) {
 }
 
 fn main() {
-    let text = samples(700);
+    let text = slope_samples(700);
     for (target, codec) in [
         ("zlib", Codec::Zlib(6)),
         ("deflate", Codec::Deflate(9)),
@@ -358,8 +363,8 @@ fn main() {
         let frames = frames(Schema::Other, codec, &[text.clone(), vec![0; 5000]]);
         write(&format!("codec_{target}"), "two", &list(&frames, 2));
     }
-    // The fifth kind has no fields.
+    // Schema number 4 has no fields.
     write("codec_message", "zstd0", &[&[4], &text[..]].concat());
-    known(Format::Ros1);
-    known(Format::Cdr);
+    write_typed_seeds(SeedFormat::Ros1);
+    write_typed_seeds(SeedFormat::Cdr);
 }

@@ -1,3 +1,3 @@
-//! Certificates that connections have shown.
+//! Client certificates of connections.
 #![cfg_attr(fuzzing, no_main)]
 fuzz::target!(authority, certificate);

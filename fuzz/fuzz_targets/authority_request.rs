@@ -1,3 +1,3 @@
-//! Requests for robots' certificates (PKCS #10).
+//! Certificate requests of robots (PKCS #10).
 #![cfg_attr(fuzzing, no_main)]
 fuzz::target!(authority, request);

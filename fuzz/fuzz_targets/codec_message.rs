@@ -1,3 +1,3 @@
-//! Messages on their way in: whatever they hold, they come back from every codec. The first byte names the type.
+//! Messages to be encoded: whatever their content, every codec restores them. The first byte selects the type.
 #![cfg_attr(fuzzing, no_main)]
 fuzz::target!(codec, message);

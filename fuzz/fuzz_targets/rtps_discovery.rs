@@ -1,3 +1,3 @@
-//! The payload of a sample by which participants and their ends are discovered.
+//! Payloads of discovery samples for participants and endpoints.
 #![cfg_attr(fuzzing, no_main)]
 fuzz::target!(rtps, discovery);

@@ -1,3 +1,3 @@
-//! What comes over a WebSocket.
+//! Bytes received on a WebSocket.
 #![cfg_attr(fuzzing, no_main)]
 fuzz::target!(ws, frames);

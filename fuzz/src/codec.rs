@@ -1,13 +1,13 @@
-//! The link's frames. An input is a list of frames for one decoder, each `length (16 bits) · frame without its tag and
-//! version`; so video can refer to the picture before.
+//! Frames of the link's codecs. An input is a list of frames for one decoder, each `length (16 bits) · frame without
+//! its tag and version`, so that video frames can refer to the previous one.
 
 use ::codec::{Codec, Decoder, Encoder, Schema};
 
-/// Largest message a decoder may make here.
+/// Maximum size of a message that a decoder may produce here.
 pub const LIMIT: usize = 1 << 17;
 
-/// One frame of the list without its header's first bytes; what is cut short is taken as it is.
-fn next<'a>(data: &mut &'a [u8]) -> Option<&'a [u8]> {
+/// Returns the next frame of the list, without tag and version; a truncated one is returned as it is.
+fn next_frame<'a>(data: &mut &'a [u8]) -> Option<&'a [u8]> {
     let (length, rest) = data.split_first_chunk()?;
     let length = usize::from(u16::from_le_bytes(*length)).min(rest.len());
     let (frame, rest) = rest.split_at(length);
@@ -17,7 +17,7 @@ fn next<'a>(data: &mut &'a [u8]) -> Option<&'a [u8]> {
 
 fn decode(codec: Codec, mut data: &[u8]) {
     let mut decoder = Decoder::new(LIMIT);
-    while let Some(rest) = next(&mut data) {
+    while let Some(rest) = next_frame(&mut data) {
         let frame = [&[codec.tag(), codec.version()], rest].concat();
         let peeked = ::codec::peek(&frame);
         let mut out = b"before".to_vec();
@@ -84,7 +84,7 @@ pub fn jpeg(data: &[u8]) {
 /// Frames of any codec, tag and version included.
 pub fn frame(mut data: &[u8]) {
     let mut decoder = Decoder::new(LIMIT);
-    while let Some(frame) = next(&mut data) {
+    while let Some(frame) = next_frame(&mut data) {
         let mut out = Vec::new();
         match decoder.decode(frame, &mut out) {
             Ok(decoded) => assert_eq!(out.len(), decoded.bytes),
@@ -93,7 +93,7 @@ pub fn frame(mut data: &[u8]) {
     }
 }
 
-/// Messages on their way in: whatever they hold, they come back from every codec. The first byte names the type.
+/// Messages to be encoded: whatever their content, every codec restores them. The first byte selects the type.
 pub fn message(data: &[u8]) {
     let Some((first, message)) = data.split_first() else {
         return;
@@ -105,7 +105,7 @@ pub fn message(data: &[u8]) {
         3 => Schema::PointCloud2,
         _ => Schema::Other,
     };
-    for codec in [Codec::made_for(schema), Codec::Zlib(1), Codec::Zstd(1)] {
+    for codec in [Codec::for_schema(schema), Codec::Zlib(1), Codec::Zstd(1)] {
         let mut encoder = Encoder::new(schema);
         let mut decoder = Decoder::new(message.len());
         for _ in 0..2 {

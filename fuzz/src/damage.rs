@@ -1,9 +1,9 @@
-//! The kept corpus, and damage that is done to it.
+//! The stored corpus, and random modifications of it.
 
 use std::fs;
 use std::path::Path;
 
-/// Numbers that look random and are the same every time (xorshift64).
+/// A deterministic pseudorandom generator (xorshift64).
 #[derive(Debug)]
 pub struct Dice(u64);
 
@@ -14,7 +14,7 @@ impl Default for Dice {
 }
 
 impl Dice {
-    fn below(&mut self, limit: usize) -> usize {
+    fn next_below(&mut self, limit: usize) -> usize {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
         self.0 ^= self.0 << 17;
@@ -24,21 +24,21 @@ impl Dice {
     fn byte(&mut self) -> u8 {
         const LIKELY: &[u8] =
             b"{}[]\",:\\u0-1.eE+tfn \x00\x01\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xd8\xf9";
-        match self.below(3) {
-            0 => self.below(256) as u8,
-            _ => LIKELY[self.below(LIKELY.len())],
+        match self.next_below(3) {
+            0 => self.next_below(256) as u8,
+            _ => LIKELY[self.next_below(LIKELY.len())],
         }
     }
 
-    /// Changes, removes, repeats, inserts or exchanges a few bytes.
+    /// Changes, removes, repeats, inserts or swaps a few bytes.
     pub fn damage(&mut self, bytes: &mut Vec<u8>, other: &[u8]) {
-        for _ in 0..=self.below(4) {
-            let at = self.below(bytes.len() + 1);
+        for _ in 0..=self.next_below(4) {
+            let at = self.next_below(bytes.len() + 1);
             let piece = |dice: &mut Self, from: &[u8]| {
-                let begin = dice.below(from.len() + 1);
-                from[begin..(begin + dice.below(24)).min(from.len())].to_vec()
+                let begin = dice.next_below(from.len() + 1);
+                from[begin..(begin + dice.next_below(24)).min(from.len())].to_vec()
             };
-            match self.below(6) {
+            match self.next_below(6) {
                 0 if at < bytes.len() => bytes[at] = self.byte(),
                 1 if at < bytes.len() => drop(bytes.remove(at)),
                 2 => {
@@ -50,16 +50,16 @@ impl Dice {
                     let end = (at + piece.len()).min(bytes.len());
                     bytes.splice(at..end, piece);
                 }
-                4 if self.below(8) == 0 => bytes.truncate(at),
+                4 if self.next_below(8) == 0 => bytes.truncate(at),
                 _ => bytes.insert(at, self.byte()),
             }
         }
     }
 
-    /// Repeats a few bytes where they are, so that there are `size` bytes.
+    /// Repeats a few bytes in place until the length is `size`.
     pub fn repeat(&mut self, bytes: &mut Vec<u8>, size: usize) {
-        let begin = self.below(bytes.len());
-        let end = (begin + 1 + self.below(24)).min(bytes.len());
+        let begin = self.next_below(bytes.len());
+        let end = (begin + 1 + self.next_below(24)).min(bytes.len());
         let piece = bytes[begin..end].to_vec();
         if piece.is_empty() {
             return;
@@ -69,11 +69,11 @@ impl Dice {
     }
 }
 
-/// Seeds of a target.
+/// Returns the seeds of a target.
 ///
 /// # Panics
-/// There are none, or they cannot be read.
-pub fn corpus(name: &str) -> Vec<Vec<u8>> {
+/// If there are no seeds, or if they cannot be read.
+pub fn load_corpus(name: &str) -> Vec<Vec<u8>> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("corpus")
         .join(name);

@@ -1,7 +1,7 @@
-//! What each decoder of strangers' bytes may take in memory: so many times its input, and something fixed.
+//! Memory limits of the decoders of untrusted bytes: a multiple of the input, plus a constant.
 //!
-//! A target of the fuzzer reads, writes and compares; a decoder here only reads, as the daemon or a stub does, so that what it takes is
-//! its own. The tests compare it with what an allocator was asked for.
+//! A fuzz target reads, writes and compares; a decoder here only reads, as the daemon or a stub does, so that the
+//! measured memory is the decoder's own. The tests compare the limit with what was requested from the allocator.
 
 mod repeats;
 
@@ -23,7 +23,7 @@ use ::ros::schema::{InterfaceFile, MessageType, Registry};
 use ::rosbridge::{Fragment, FragmentLimits, Fragments, Id, Op, decode_png, unknown_fields};
 use ::rtps::wire::{self, ParticipantMessage};
 use ::rtps::{EndpointData, ParticipantData};
-use ::ws::{Message, WebSocket};
+use ::ws::{WebSocket, WsMessage};
 use budget::JsonWeight;
 use bytes::Bytes;
 use foxglove::ws_protocol::client::ClientMessage;
@@ -33,28 +33,28 @@ use crate::codec::LIMIT;
 pub use repeats::Repeat;
 use repeats::{DEFINITIONS, HELLO, ORDERS, ROSBRIDGE, VALUES, VIEWER, XML_RPC};
 
-/// Most bytes that a conversion may write here.
+/// Maximum number of bytes that a conversion may write here.
 const WRITTEN: usize = 1 << 14;
-/// What no decoder need account for: a name in an error, a buffer of the least size.
+/// Memory that no decoder need account for: a name in an error, a buffer of minimum size.
 const LITTLE: usize = 4 << 10;
 
-/// A decoder, and what it may take.
+/// A decoder and its memory limit.
 pub struct Decoder {
-    /// Its folder in `corpus/`, and the name of a target.
+    /// Name of its target and of its directory in `corpus/`.
     pub name: &'static str,
-    /// Reads, and drops what was read.
+    /// Reads an input and drops the result.
     pub decode: fn(&[u8]),
-    /// Bytes of memory for each byte of input, at most.
+    /// Maximum bytes of memory per byte of input.
     pub times: usize,
-    /// And so many for any input.
+    /// Maximum bytes of memory for any input, in addition.
     pub fixed: usize,
-    /// What is known of an input before it is read: the bytes of the permit that is taken for it.
+    /// Estimate of the memory of an input before it is read: the size of the permit that is acquired for it.
     pub weigh: Option<fn(&[u8]) -> usize>,
-    /// Inputs that take much for what they are: `{n}` becomes a number that counts.
+    /// Inputs that take much memory for their size; `{n}` becomes a counter.
     pub repeats: &'static [Repeat],
 }
 
-const fn of(name: &'static str, decode: fn(&[u8]), times: usize, fixed: usize) -> Decoder {
+const fn decoder(name: &'static str, decode: fn(&[u8]), times: usize, fixed: usize) -> Decoder {
     Decoder {
         name,
         decode,
@@ -66,11 +66,11 @@ const fn of(name: &'static str, decode: fn(&[u8]), times: usize, fixed: usize) -
 }
 
 impl Decoder {
-    const fn with(self, repeats: &'static [Repeat]) -> Self {
+    const fn with_repeats(self, repeats: &'static [Repeat]) -> Self {
         Self { repeats, ..self }
     }
 
-    const fn weighed(self, weigh: fn(&[u8]) -> usize) -> Self {
+    const fn with_weigh(self, weigh: fn(&[u8]) -> usize) -> Self {
         Self {
             weigh: Some(weigh),
             ..self
@@ -78,64 +78,64 @@ impl Decoder {
     }
 }
 
-/// All of them.
+/// All decoders.
 pub const DECODERS: &[Decoder] = &[
-    of("ros_parameter", read::<ParamValue>, TREE, LITTLE)
-        .with(VALUES)
-        .weighed(weigh),
-    of("link_hello", hello, TREE, LITTLE)
-        .with(HELLO)
-        .weighed(weigh),
-    of("link_orders", orders, TREE, LITTLE)
-        .with(ORDERS)
-        .weighed(weigh),
-    of("link_frame", frame, 4, LITTLE),
-    of("viewer_json", viewer, 4 * JsonWeight::MOST_TIMES, LITTLE)
-        .with(VIEWER)
-        .weighed(weigh_copied),
-    of("ws_frames", frames, 8, 64 << 10),
-    of("rosbridge_json", op_json, 4, LITTLE).with(ROSBRIDGE),
-    of("rosbridge_cbor", op_cbor, 4, LITTLE),
-    of("rosbridge_fragments", fragments, 8, LITTLE),
-    of("rosbridge_png", png, 8, 4 * LIMIT),
-    of("ros_json", json, 4, 4 * WRITTEN).with(VALUES),
-    of("ros_cbor", cbor, 4, 4 * WRITTEN),
-    of("ros_bytes", bytes, 96, 4 * WRITTEN),
-    of("ros_definition", definition, 64, 64 << 10).with(DEFINITIONS),
-    of("ros_tcpros", tcpros, 8, LITTLE),
-    of("ros_xmlrpc", xml_rpc, 16, LITTLE)
-        .with(XML_RPC)
-        .weighed(xmlrpc::weight),
-    of("ros2_json", json_2, 4, 4 * WRITTEN).with(VALUES),
-    of("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
-    of("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
-    of("ros2_definition", definition_2, 64, 64 << 10).with(DEFINITIONS),
-    of("rtps_datagram", datagram, 4, LITTLE),
-    of("rtps_discovery", discovery, 4, LITTLE),
-    of("codec_zlib", packed, 8, CODEC),
-    of("codec_deflate", packed, 8, CODEC),
-    of("codec_zstd", packed, 8, CODEC),
-    of("codec_image", packed, 8, CODEC),
-    of("codec_grid", packed, 8, CODEC),
-    of("codec_scan", packed, 8, CODEC),
-    of("codec_cloud", packed, 8, CODEC),
-    of("codec_jpeg", packed, 8, CODEC),
-    of("codec_frame", packed, 8, CODEC),
-    of("authority_request", request, 8, LITTLE),
-    of("authority_certificate", certificate, 8, LITTLE),
+    decoder("ros_parameter", read::<ParamValue>, TREE, LITTLE)
+        .with_repeats(VALUES)
+        .with_weigh(weigh),
+    decoder("link_hello", hello, TREE, LITTLE)
+        .with_repeats(HELLO)
+        .with_weigh(weigh),
+    decoder("link_orders", orders, TREE, LITTLE)
+        .with_repeats(ORDERS)
+        .with_weigh(weigh),
+    decoder("link_frame", frame, 4, LITTLE),
+    decoder("viewer_json", viewer, 4 * JsonWeight::MOST_TIMES, LITTLE)
+        .with_repeats(VIEWER)
+        .with_weigh(weigh_copied),
+    decoder("ws_frames", frames, 8, 64 << 10),
+    decoder("rosbridge_json", op_json, 4, LITTLE).with_repeats(ROSBRIDGE),
+    decoder("rosbridge_cbor", op_cbor, 4, LITTLE),
+    decoder("rosbridge_fragments", fragments, 8, LITTLE),
+    decoder("rosbridge_png", png, 8, 4 * LIMIT),
+    decoder("ros_json", json, 4, 4 * WRITTEN).with_repeats(VALUES),
+    decoder("ros_cbor", cbor, 4, 4 * WRITTEN),
+    decoder("ros_bytes", bytes, 96, 4 * WRITTEN),
+    decoder("ros_definition", definition, 64, 64 << 10).with_repeats(DEFINITIONS),
+    decoder("ros_tcpros", tcpros, 8, LITTLE),
+    decoder("ros_xmlrpc", xml_rpc, 16, LITTLE)
+        .with_repeats(XML_RPC)
+        .with_weigh(xmlrpc::weight),
+    decoder("ros2_json", json_2, 4, 4 * WRITTEN).with_repeats(VALUES),
+    decoder("ros2_cbor", cbor_2, 4, 4 * WRITTEN),
+    decoder("ros2_bytes", bytes_2, 96, 4 * WRITTEN),
+    decoder("ros2_definition", definition_2, 64, 64 << 10).with_repeats(DEFINITIONS),
+    decoder("rtps_datagram", datagram, 4, LITTLE),
+    decoder("rtps_discovery", discovery, 4, LITTLE),
+    decoder("codec_zlib", decode_packed, 8, CODEC),
+    decoder("codec_deflate", decode_packed, 8, CODEC),
+    decoder("codec_zstd", decode_packed, 8, CODEC),
+    decoder("codec_image", decode_packed, 8, CODEC),
+    decoder("codec_grid", decode_packed, 8, CODEC),
+    decoder("codec_scan", decode_packed, 8, CODEC),
+    decoder("codec_cloud", decode_packed, 8, CODEC),
+    decoder("codec_jpeg", decode_packed, 8, CODEC),
+    decoder("codec_frame", decode_packed, 8, CODEC),
+    decoder("authority_request", request, 8, LITTLE),
+    decoder("authority_certificate", certificate, 8, LITTLE),
 ];
 
-/// Of trees of values: a map of one member is eight bytes of text, and a node of eleven in memory.
+/// Factor for trees of values: a map with one member is eight bytes of text, and a node of eleven entries in memory.
 const TREE: usize = 128;
-/// Of codecs: a decoder keeps a picture, and tables of its own, beside the message that it makes.
+/// Constant for codecs: besides the message, a decoder keeps an image and tables of its own.
 const CODEC: usize = 8 * LIMIT + (1 << 20);
 
 fn weigh(input: &[u8]) -> usize {
-    JsonWeight::of(input).bytes
+    JsonWeight::estimate(input).bytes
 }
 
 fn weigh_copied(input: &[u8]) -> usize {
-    JsonWeight::of(input).bytes_if_copied()
+    JsonWeight::estimate(input).bytes_if_copied()
 }
 
 fn read<T: DeserializeOwned>(input: &[u8]) {
@@ -168,7 +168,7 @@ fn frames(input: &[u8]) {
         let next = poll_fn(|cx| socket.poll_next(cx));
         let next = pin!(next).poll(&mut Context::from_waker(Waker::noop()));
         if !matches!(next, Poll::Ready(Ok(_)))
-            || matches!(next, Poll::Ready(Ok(Message::Close(..))))
+            || matches!(next, Poll::Ready(Ok(WsMessage::Close(..))))
         {
             return;
         }
@@ -177,14 +177,14 @@ fn frames(input: &[u8]) {
 
 fn op_json(input: &[u8]) {
     if let Ok(text) = std::str::from_utf8(input) {
-        let _ = Op::parse(rosbridge::Frame::Text(text));
-        unknown_fields(rosbridge::Frame::Text(text));
+        let _ = Op::parse(rosbridge::ProtocolFrame::Text(text));
+        unknown_fields(rosbridge::ProtocolFrame::Text(text));
     }
 }
 
 fn op_cbor(input: &[u8]) {
-    let _ = Op::parse(rosbridge::Frame::Binary(input));
-    unknown_fields(rosbridge::Frame::Binary(input));
+    let _ = Op::parse(rosbridge::ProtocolFrame::Binary(input));
+    unknown_fields(rosbridge::ProtocolFrame::Binary(input));
 }
 
 fn fragments(input: &[u8]) {
@@ -211,9 +211,9 @@ fn png(input: &[u8]) {
     let _ = decode_png(&text, LIMIT);
 }
 
-/// Lists, texts, numbers, and messages without fields.
+/// Returns a type with lists, strings, numbers, and messages without fields.
 fn message_of(version: RosVersion) -> Arc<MessageType> {
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     for (key, text) in [
         ("a/msg/Nothing", ""),
         ("a/msg/Text", "string data\nuint8[] bytes\n"),
@@ -288,12 +288,12 @@ fn definition_of(version: RosVersion, input: &[u8]) {
         return;
     };
     {
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         for kind in ["msg", "srv", "action"] {
             let _ = registry.insert(&format!("b/{kind}/X"), text);
         }
     }
-    let _ = MessageType::of_full_text(version, "b/X", text);
+    let _ = MessageType::parse_full_text(version, "b/X", text);
 }
 
 fn definition(input: &[u8]) {
@@ -328,8 +328,8 @@ fn discovery(input: &[u8]) {
     let _ = ParticipantMessage::from_payload(&payload);
 }
 
-/// Seeds of codecs are lists of frames, whose codec the target's name says; here each input is a frame of every codec.
-fn packed(input: &[u8]) {
+/// Decodes the input as a frame of every codec. The seeds are lists of frames of the codec that the target names.
+fn decode_packed(input: &[u8]) {
     for tag in 0..16 {
         for version in 0..3 {
             let frame = [&[tag, version], input.get(2..).unwrap_or_default()].concat();
@@ -340,10 +340,10 @@ fn packed(input: &[u8]) {
 
 fn request(input: &[u8]) {
     let text = String::from_utf8_lossy(input);
-    let _ = ::authority::Request::read(&text, "r1");
+    let _ = ::authority::CertificateRequest::parse(&text, "r1");
 }
 
 fn certificate(input: &[u8]) {
     let certificate = tokio_rustls::rustls::pki_types::CertificateDer::from(input);
-    let _ = ::authority::read(&certificate);
+    let _ = ::authority::read_robot_certificate(&certificate);
 }

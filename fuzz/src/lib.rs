@@ -1,10 +1,10 @@
-//! One function per kind of bytes that strangers send. Each reads or refuses what it is given and then checks what
-//! must be true of what was read; a wrong answer is a panic, as a crash would be.
+//! One function per kind of untrusted input. Each reads or refuses its input and then checks properties of what was
+//! read; a wrong result is a panic, as a crash would be.
 //!
-//! The fuzzer calls them from `fuzz_targets/` (`make fuzz ONLY=ros_json`), the tests from `tests/replay.rs`, with the
-//! kept corpus and some damage done to it. A new target is a function here, an entry in [`TARGETS`], a program in
-//! `fuzz_targets/` with its `[[bin]]`, and a few seeds in `corpus/`; where it reads what strangers send, one in
-//! [`DECODERS`](decoders::DECODERS), too, whose memory `tests/memory.rs` measures.
+//! The fuzzer calls the functions through `fuzz_targets/` (`make fuzz ONLY=ros_json`), the tests through
+//! `tests/replay.rs`, with the stored corpus and modifications of it. A new target needs a function here, an entry in
+//! [`TARGETS`], a program in `fuzz_targets/` with its `[[bin]]`, and a few seeds in `corpus/`; if it reads untrusted
+//! bytes, also an entry in [`DECODERS`](decoders::DECODERS), whose memory `tests/memory.rs` measures.
 
 #![forbid(unsafe_code)]
 
@@ -20,10 +20,10 @@ pub mod rtps;
 pub mod viewer;
 pub mod ws;
 
-/// What takes the fuzzer's bytes.
+/// Function that takes the fuzzer's bytes.
 pub type Target = fn(&[u8]);
 
-/// Every target, by the name of its program and of its folder in `corpus/`.
+/// Every target, by the name of its program and of its directory in `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
     ("authority_request", authority::request),
     ("authority_certificate", authority::certificate),
@@ -62,7 +62,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("viewer_json", viewer::json),
 ];
 
-/// The program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzer's build it does nothing.
+/// Defines the program of a target: `fuzz::target!(ros, json);`. Outside of a fuzzing build the program does nothing.
 #[macro_export]
 macro_rules! target {
     ($module:ident, $function:ident) => {

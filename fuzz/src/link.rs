@@ -1,4 +1,4 @@
-//! The link between stubs and the cloud: its frames, the records in them, hellos and orders.
+//! The link between stubs and the cloud: its frames, their records, hellos and orders.
 
 use std::fmt::Debug;
 
@@ -9,7 +9,7 @@ use bytes::Bytes;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Frames, and the records in them. What is read of them is written again, and read as the same.
+/// Frames and their records. Whatever is read is written again and must be read as the same.
 pub fn frame(data: &[u8]) {
     let Ok(frame) = Frame::decode(Bytes::copy_from_slice(data)) else {
         return;
@@ -20,26 +20,26 @@ pub fn frame(data: &[u8]) {
         return;
     };
     if let Ok(record) = Record::decode(record) {
-        let (head, payload) = record.parts();
+        let (head, payload) = record.to_parts();
         let again = Record::decode([&head[..], &payload].concat().into());
         assert_eq!(again.expect("its own record"), record);
     }
 }
 
-/// Opening frames, of either end.
+/// Opening frames of either end.
 pub fn hello(data: &[u8]) {
-    comes_back::<Hello>(data);
-    comes_back::<Welcome>(data);
+    check_json_round_trip::<Hello>(data);
+    check_json_round_trip::<Welcome>(data);
 }
 
-/// Control records, of either end.
+/// Control records of either end.
 pub fn orders(data: &[u8]) {
-    comes_back::<FromRobot>(data);
-    comes_back::<FromCloud>(data);
+    check_json_round_trip::<FromRobot>(data);
+    check_json_round_trip::<FromCloud>(data);
 }
 
-/// What is read is written as JSON from which the same is read.
-fn comes_back<T: DeserializeOwned + Serialize + PartialEq + Debug>(data: &[u8]) {
+/// Checks that the JSON written from what was read is read as the same.
+fn check_json_round_trip<T: DeserializeOwned + Serialize + PartialEq + Debug>(data: &[u8]) {
     let Ok(told) = serde_json::from_slice::<T>(data) else {
         return;
     };

@@ -1,5 +1,5 @@
-//! ROS: definitions, serialized messages and their JSON and CBOR, TCPROS, XML-RPC. Messages are of ROS 1 here; those
-//! of ROS 2 go the same ways.
+//! ROS: definitions, serialized messages and their JSON and CBOR, TCPROS, XML-RPC. The messages here are of ROS 1;
+//! those of ROS 2 share the functions.
 
 use std::sync::{Arc, LazyLock};
 
@@ -13,10 +13,10 @@ use ::ros::ros1::xmlrpc::{self, parse_call, parse_response, print_call, print_re
 use ::ros::schema::{MessageType, Registry};
 use bytes::BytesMut;
 
-/// Most bytes that a conversion may write here.
+/// Maximum number of bytes that a conversion may write here.
 const MAX_BYTES: usize = 1 << 20;
 
-/// The types that the first byte of the input chooses from.
+/// Types from which the first byte of the input selects one.
 static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
     let registry = Registry::new();
     for (key, text) in [
@@ -75,7 +75,7 @@ fn choose<'a>(
     Some((&types[usize::from(*first) % types.len()], rest))
 }
 
-/// JSON for a message.
+/// JSON of a message.
 pub fn json(data: &[u8]) {
     json_of(&TYPES, data);
 }
@@ -95,7 +95,7 @@ pub(crate) fn json_of(types: &[Arc<MessageType>], data: &[u8]) {
     }
 }
 
-/// CBOR for a message.
+/// CBOR of a message.
 pub fn cbor(data: &[u8]) {
     cbor_of(&TYPES, data);
 }
@@ -128,7 +128,7 @@ pub(crate) fn bytes_of(types: &[Arc<MessageType>], data: &[u8]) {
 }
 
 fn message_of(message: &MessageType, bytes: &[u8]) {
-    if let Some(found) = Stamps::of(message).find(bytes) {
+    if let Some(found) = Stamps::for_type(message).find(bytes) {
         assert!(found.iter().all(|at| at + 8 <= bytes.len()));
     }
     let is_valid = codec::validate(message, bytes).is_ok();
@@ -139,7 +139,7 @@ fn message_of(message: &MessageType, bytes: &[u8]) {
         codec::to_cbor(message, bytes, &mut cbor, &CBOR).is_ok(),
     ];
     if is_valid {
-        // Texts grow by up to six bytes for one.
+        // A byte of text becomes up to six bytes.
         if bytes.len() < MAX_BYTES / 32 {
             assert_eq!(written, [true, true]);
             round_trip(message, bytes);
@@ -150,7 +150,7 @@ fn message_of(message: &MessageType, bytes: &[u8]) {
     }
 }
 
-/// A message becomes JSON and CBOR that others can read, and the same message again.
+/// Checks that a message becomes JSON and CBOR that other parsers can read, and from there the same message.
 fn round_trip(message: &MessageType, bytes: &[u8]) {
     let (mut json, mut cbor) = (Vec::new(), Vec::new());
     if codec::to_json(message, bytes, &mut json, &JSON).is_err() {
@@ -167,7 +167,7 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
     ] {
         match read.map_err(|error| error.kind) {
             Ok(()) => {}
-            // Only writers keep to bounds; and what ROS 2 pads may make its messages longer than the JSON.
+            // Only writing is limited; and padding may make a ROS 2 message longer than its JSON.
             Err(CodecErrorKind::TooMany { .. } | CodecErrorKind::TooLarge(_))
                 if message.version() == RosVersion::Two =>
             {
@@ -176,7 +176,7 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
             Err(kind) => panic!("its own JSON or CBOR: {kind}"),
         }
     }
-    // Compared as JSON: which NaN it was is not kept, nor which bytes were not UTF-8.
+    // Compared as JSON, because NaN payloads and invalid UTF-8 bytes are not preserved.
     for back in [from_json, from_cbor] {
         let mut again = Vec::new();
         codec::to_json(message, &back, &mut again, &JSON).expect("it is a message");
@@ -184,7 +184,7 @@ fn round_trip(message: &MessageType, bytes: &[u8]) {
     }
 }
 
-/// A definition, and after a zero byte a message of it.
+/// A definition, then a zero byte and a message of it.
 pub fn definition(data: &[u8]) {
     definition_of(RosVersion::One, data);
 }
@@ -198,13 +198,13 @@ pub(crate) fn definition_of(version: RosVersion, data: &[u8]) {
     let Ok(text) = std::str::from_utf8(text) else {
         return;
     };
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     for kind in ["msg", "srv", "action"] {
         let _ = registry.insert(&format!("b/{kind}/X"), text);
     }
     let _ = (registry.service("b/X"), registry.action("b/X"));
-    if let Ok(message) = MessageType::of_full_text(version, "b/X", text) {
-        let again = MessageType::of_full_text(version, "b/X", message.full_text());
+    if let Ok(message) = MessageType::parse_full_text(version, "b/X", text) {
+        let again = MessageType::parse_full_text(version, "b/X", message.full_text());
         assert_eq!(again.expect("its own text").digest(), message.digest());
         if message.min_size() < MAX_BYTES {
             codec::default_json(&message);
@@ -238,7 +238,7 @@ pub fn tcpros(data: &[u8]) {
         .block_on(read);
 }
 
-/// A document of XML-RPC.
+/// An XML-RPC document.
 pub fn xmlrpc(data: &[u8]) {
     if let Ok(call) = parse_call(data) {
         let printed = print_call(&call.method, &call.params);

@@ -7,9 +7,9 @@ use ::ros::schema::{InterfaceFile, MessageType, Registry};
 
 use crate::ros::{bytes_of, cbor_of, definition_of, json_of};
 
-/// The types that the first byte of the input chooses from.
+/// Types from which the first byte of the input selects one.
 static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in [
         ("a/msg/Text", "string data\nwstring wide\nuint8 last\n"),
         (
@@ -54,12 +54,12 @@ static TYPES: LazyLock<Vec<Arc<MessageType>>> = LazyLock::new(|| {
     names.into_iter().map(find).collect()
 });
 
-/// JSON for a message.
+/// JSON of a message.
 pub fn json(data: &[u8]) {
     json_of(&TYPES, data);
 }
 
-/// CBOR for a message.
+/// CBOR of a message.
 pub fn cbor(data: &[u8]) {
     cbor_of(&TYPES, data);
 }
@@ -69,7 +69,7 @@ pub fn bytes(data: &[u8]) {
     bytes_of(&TYPES, data);
 }
 
-/// A definition, and after a zero byte a message of it; or a file of the other forms that interfaces have.
+/// A definition, then a zero byte and a message of it; or a file of another interface format.
 pub fn definition(data: &[u8]) {
     if let Ok(text) = std::str::from_utf8(data) {
         for key in ["b/msg/X", "b/srv/X", "b/action/X"] {

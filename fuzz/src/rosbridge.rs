@@ -1,37 +1,41 @@
-//! rosbridge: frames, fragments, pictures.
+//! rosbridge: frames, fragments, PNG compression.
 
 use std::time::{Duration, Instant};
 
 use rosbridge::{
-    Format, Fragment, FragmentLimits, Fragments, Frame, Id, Op, Payload, decode_png, encode_png,
-    unknown_fields,
+    Format, Fragment, FragmentLimits, Fragments, Id, Op, Payload, ProtocolFrame, decode_png,
+    encode_png, unknown_fields,
 };
 
 /// A text frame.
 pub fn json(data: &[u8]) {
     if let Ok(text) = std::str::from_utf8(data) {
-        frame(Frame::Text(text));
+        frame(ProtocolFrame::Text(text));
     }
 }
 
 /// A binary frame.
 pub fn cbor(data: &[u8]) {
-    frame(Frame::Binary(data));
+    frame(ProtocolFrame::Binary(data));
 }
 
-fn frame(frame: Frame<'_>) {
+fn frame(frame: ProtocolFrame<'_>) {
     let Ok(op) = Op::parse(frame) else {
         return;
     };
     unknown_fields(frame);
     if let Some(payload) = payload(&op) {
-        let _ = (payload.raw(), payload.text(), payload.named(["a", "data"]));
+        let _ = (
+            payload.raw(),
+            payload.text(),
+            payload.to_named_object(["a", "data"]),
+        );
     }
     let mut printed = Vec::new();
     op.print(&mut printed, frame.format());
     let again = match frame.format() {
-        Format::Json => Frame::Text(std::str::from_utf8(&printed).expect("JSON is UTF-8")),
-        Format::Cbor => Frame::Binary(&printed),
+        Format::Json => ProtocolFrame::Text(std::str::from_utf8(&printed).expect("JSON is UTF-8")),
+        Format::Cbor => ProtocolFrame::Binary(&printed),
     };
     assert_eq!(Op::parse(again).as_ref(), Ok(&op), "{printed:?}");
 }
@@ -48,8 +52,8 @@ fn payload<'a>(op: &Op<'a>) -> Option<Payload<'a>> {
     }
 }
 
-/// Fragments of several messages, in any order: five bytes each say message, index, total, time since the last one and
-/// length; the text follows.
+/// Fragments of several messages, in any order: five bytes each give message, index, total, time since the previous one
+/// and length; the text follows.
 pub fn fragments(mut data: &[u8]) {
     let limits = FragmentLimits {
         messages: 4,
@@ -78,14 +82,14 @@ pub fn fragments(mut data: &[u8]) {
             Ok(None) => assert!(fragment.num < fragment.total),
             Err(_) => {}
         }
-        // One message's empty slots may come on top.
+        // The empty slots of one message may be added.
         assert!(fragments.bytes() <= limits.bytes + limits.parts * size_of::<Option<Box<str>>>());
     }
     fragments.forget_old(now + Duration::from_secs(1000));
     assert_eq!(fragments.bytes(), 0);
 }
 
-/// A message packed into a picture: the bytes as a PNG file, and as a text to be packed.
+/// A message compressed as PNG: the input is used as a PNG file, and as a text to compress.
 pub fn png(data: &[u8]) {
     const LIMIT: usize = 100_000;
     let text = base64_simd::STANDARD.encode_to_string(data);
@@ -97,7 +101,7 @@ pub fn png(data: &[u8]) {
         if let Ok(packed) = encode_png(data)
             && text.len() < LIMIT / 2
         {
-            // Pictures are padded with these.
+            // PNG compression pads with these characters.
             let text = text.trim_end_matches(['\n', '\0']);
             let unpacked = decode_png(&packed, LIMIT).expect("its own picture");
             assert_eq!(unpacked, text);

@@ -1,52 +1,52 @@
-//! Datagrams of RTPS, and what participants tell in them of themselves and of their ends.
+//! RTPS datagrams, and the discovery data of participants and endpoints.
 
 use std::fmt::Debug;
 
 use ::rtps::wire::{
-    self, Data, DatagramWriter, ParticipantMessage, Received, Submessage, WireError,
+    self, Data, DatagramWriter, ParticipantMessage, ReceivedSubmessage, Submessage, WireError,
 };
 use ::rtps::{EndpointData, ParticipantData};
 use bytes::Bytes;
 
-/// A datagram. What is read of it is written again, one submessage for each datagram, and read as the same.
+/// A datagram. Whatever is read is written again, one submessage per datagram, and must be read as the same.
 pub fn datagram(data: &[u8]) {
     let datagram = Bytes::copy_from_slice(data);
     let parsed = wire::parse(&datagram);
     assert!(parsed.received.len() <= wire::MOST_SUBMESSAGES);
-    let payloads: usize = parsed.received.iter().map(length).sum();
+    let payloads: usize = parsed.received.iter().map(payload_length).sum();
     assert!(
         payloads <= data.len(),
         "payloads that are not of the datagram"
     );
     for received in parsed.received {
-        let again = wire::parse(&written(&received).into());
+        let again = wire::parse(&encode_submessage(&received).into());
         assert_eq!(again.fault, None, "{received:?}");
-        let [again] = <[Received; 1]>::try_from(again.received).expect("one");
+        let [again] = <[ReceivedSubmessage; 1]>::try_from(again.received).expect("one");
         assert_eq!((again.to, again.written), (received.to, received.written));
-        assert_eq!(again.submessage, filled(received.submessage));
+        assert_eq!(again.submessage, pad_payload(received.submessage));
     }
 }
 
-/// The payload of a sample of discovery. What is read of it is written and read as the same.
+/// The payload of a discovery sample. Whatever is read is written again and must be read as the same.
 pub fn discovery(data: &[u8]) {
     let payload = Bytes::copy_from_slice(data);
-    comes_back(
+    check_round_trip(
         &payload,
         ParticipantData::from_payload,
         ParticipantData::to_bytes,
     );
-    comes_back(&payload, EndpointData::from_payload, EndpointData::to_bytes);
-    comes_back(
+    check_round_trip(&payload, EndpointData::from_payload, EndpointData::to_bytes);
+    check_round_trip(
         &payload,
         ParticipantMessage::from_payload,
         ParticipantMessage::to_bytes,
     );
 }
 
-/// Above this some of what was read can be too long for a parameter when it is written.
+/// Above this length a value that was read can be too long for a parameter when it is written.
 const MOST: usize = 16 << 10;
 
-fn comes_back<T: PartialEq + Debug>(
+fn check_round_trip<T: PartialEq + Debug>(
     payload: &Bytes,
     read: fn(&Bytes) -> Result<T, WireError>,
     write: fn(&T) -> Bytes,
@@ -58,7 +58,7 @@ fn comes_back<T: PartialEq + Debug>(
     }
 }
 
-fn length(received: &Received) -> usize {
+fn payload_length(received: &ReceivedSubmessage) -> usize {
     match &received.submessage {
         Submessage::Data(data) => data.payload.as_ref().map_or(0, Bytes::len),
         Submessage::DataFrag(frag) => frag.payload.len(),
@@ -66,7 +66,7 @@ fn length(received: &Received) -> usize {
     }
 }
 
-fn written(received: &Received) -> Vec<u8> {
+fn encode_submessage(received: &ReceivedSubmessage) -> Vec<u8> {
     let mut writer = DatagramWriter::new(received.from);
     if let Some(to) = received.to {
         writer.destination(to);
@@ -86,8 +86,8 @@ fn written(received: &Received) -> Vec<u8> {
     writer.finish()
 }
 
-/// The payload of a sample is filled up to a multiple of four bytes when it is written.
-fn filled(mut submessage: Submessage) -> Submessage {
+/// Pads the payload of a sample to a multiple of four bytes, as writing does.
+fn pad_payload(mut submessage: Submessage) -> Submessage {
     if let Submessage::Data(Data {
         payload: Some(payload),
         ..

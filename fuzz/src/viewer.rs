@@ -1,8 +1,8 @@
-//! Foxglove's protocol, whose messages a crate of others reads.
+//! Foxglove's protocol, whose messages an external crate parses.
 
 use foxglove::ws_protocol::client::ClientMessage;
 
-/// What a viewer says in JSON.
+/// JSON messages of a viewer.
 pub fn json(data: &[u8]) {
     if let Ok(text) = std::str::from_utf8(data) {
         let _ = ClientMessage::parse_json(text);

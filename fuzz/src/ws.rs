@@ -1,12 +1,12 @@
-//! What comes over a WebSocket.
+//! Bytes received on a WebSocket.
 
 use std::future::poll_fn;
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
 
-use ::ws::{Message, WebSocket};
+use ::ws::{WebSocket, WsMessage};
 
-/// The longest message and the longest frame here.
+/// Maximum length of a message and of a frame here.
 pub const MOST: usize = 1 << 16;
 
 /// Frames of a client.
@@ -17,17 +17,17 @@ pub fn frames(data: &[u8]) {
         let next = poll_fn(|cx| socket.poll_next(cx));
         let next = pin!(next).poll(&mut Context::from_waker(Waker::noop()));
         match next {
-            // Whether a text is one is looked at by whoever reads it.
+            // UTF-8 is checked by the reader of a text message.
             Poll::Ready(Ok(
-                Message::Text(bytes)
-                | Message::Binary(bytes)
-                | Message::Ping(bytes)
-                | Message::Pong(bytes),
+                WsMessage::Text(bytes)
+                | WsMessage::Binary(bytes)
+                | WsMessage::Ping(bytes)
+                | WsMessage::Pong(bytes),
             )) => {
                 assert!(bytes.len() <= MOST);
                 come += bytes.len();
             }
-            Poll::Ready(Ok(Message::Close(..)) | Err(_)) | Poll::Pending => break,
+            Poll::Ready(Ok(WsMessage::Close(..)) | Err(_)) | Poll::Pending => break,
         }
     }
     assert!(come <= data.len(), "more than was sent");

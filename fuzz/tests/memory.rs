@@ -1,34 +1,34 @@
-//! What decoders take in memory: an allocator counts it, for the kept corpus, for damage done to it, and for texts of which a part is
-//! repeated. `FUZZ_ROUNDS` sets how many damaged inputs each decoder is given.
+//! Memory that decoders allocate, as counted by an allocator: for the stored corpus, for modifications of it, and for
+//! texts with a repeated part. `FUZZ_ROUNDS` sets the number of modified inputs per decoder.
 
-use fuzz::damage::{Dice, corpus};
+use fuzz::damage::{Dice, load_corpus};
 use fuzz::decoders::{DECODERS, Decoder};
 use peak_alloc::PeakAlloc;
 
 #[global_allocator]
 static ALLOCATOR: PeakAlloc = PeakAlloc;
 
-/// Sizes of inputs that are made, in bytes.
+/// Sizes of generated inputs, in bytes.
 const SIZES: [usize; 3] = [512, 16 << 10, 256 << 10];
 
-/// Bytes that a decoder took at once. Nothing else allocates meanwhile.
-fn taken(decoder: &Decoder, input: &[u8]) -> usize {
+/// Returns the peak of the bytes that a decoder held. Nothing else allocates meanwhile.
+fn peak_bytes(decoder: &Decoder, input: &[u8]) -> usize {
     let before = ALLOCATOR.current_usage();
     ALLOCATOR.reset_peak_usage();
     (decoder.decode)(input);
     ALLOCATOR.peak_usage().saturating_sub(before)
 }
 
-/// The worst of a decoder's inputs.
+/// The worst input of a decoder.
 #[derive(Default)]
-struct Worst {
-    /// Bytes taken for each byte of input.
+struct WorstInput {
+    /// Bytes of memory per byte of input.
     times: f64,
     input: String,
 }
 
-fn measure(decoder: &Decoder, input: &[u8], worst: &mut Worst) {
-    let taken = taken(decoder, input);
+fn measure(decoder: &Decoder, input: &[u8], worst: &mut WorstInput) {
+    let taken = peak_bytes(decoder, input);
     let shown = || {
         let begin = String::from_utf8_lossy(&input[..input.len().min(120)]).into_owned();
         format!("{}, {} bytes: {begin:?}", decoder.name, input.len())
@@ -41,7 +41,7 @@ fn measure(decoder: &Decoder, input: &[u8], worst: &mut Worst) {
     );
     if let Some(weigh) = decoder.weigh {
         let weight = weigh(input);
-        // A message of an error is no part of the weight.
+        // The message of an error is not part of the estimate.
         let most = weight + (4 << 10);
         assert!(
             taken <= most,
@@ -51,7 +51,7 @@ fn measure(decoder: &Decoder, input: &[u8], worst: &mut Worst) {
     }
     let times = taken.saturating_sub(decoder.fixed) as f64 / input.len().max(1) as f64;
     if times > worst.times {
-        *worst = Worst {
+        *worst = WorstInput {
             times,
             input: shown(),
         };
@@ -62,9 +62,9 @@ fn measure(decoder: &Decoder, input: &[u8], worst: &mut Worst) {
 fn decoders_take_a_bounded_multiple_of_their_input() {
     let rounds = std::env::var("FUZZ_ROUNDS").map_or(300, |text| text.parse().expect("a number"));
     for decoder in DECODERS {
-        let mut worst = Worst::default();
-        let seeds = corpus(decoder.name);
-        // What is made once is made before.
+        let mut worst = WorstInput::default();
+        let seeds = load_corpus(decoder.name);
+        // One-time allocations are made beforehand.
         seeds.iter().for_each(|seed| (decoder.decode)(seed));
         for seed in &seeds {
             measure(decoder, seed, &mut worst);

@@ -1,11 +1,11 @@
-//! The kept corpus, whole and damaged, through every target: what the fuzzer once found stays found, and a little more
-//! is tried on every run. `FUZZ_ROUNDS` sets how many damaged inputs each target is given.
+//! Runs the stored corpus, unchanged and modified, through every target: what the fuzzer once found stays found, and a
+//! few new inputs are tried on every run. `FUZZ_ROUNDS` sets the number of modified inputs per target.
 
-use fuzz::damage::{Dice, corpus};
+use fuzz::damage::{Dice, load_corpus};
 use fuzz::{TARGETS, Target};
 
 fn replay(name: &str, target: Target) {
-    let seeds = corpus(name);
+    let seeds = load_corpus(name);
     for seed in &seeds {
         target(seed);
     }

@@ -1,4 +1,4 @@
-//! Finds in the output of a build or a node what is missing, and the option of `push` that adds it.
+//! Finds missing dependencies in the output of a build or a node, and advises the `push` option that adds them.
 
 use std::collections::BTreeSet;
 
@@ -10,94 +10,94 @@ use crate::contents::Contents;
 use crate::error::Error;
 use crate::keys;
 
-/// Something missing, under the name that the output gives it.
+/// A missing dependency, by the name in the output.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Missed<'a> {
-    /// CMake's `find_package(NAME)`.
+enum MissingDependency<'a> {
+    /// CMake: `find_package(NAME)`.
     Config(&'a str),
-    /// The same, by a module of CMake's own, `FindNAME.cmake`.
+    /// CMake: `find_package(NAME)` through CMake's own module `FindNAME.cmake`.
     Found(&'a str),
-    /// CMake's `pkg_check_modules(… NAME)`.
+    /// CMake: `pkg_check_modules(… NAME)`.
     PkgConfig(&'a str),
-    /// Python's `import NAME`.
+    /// Python: `import NAME`.
     Module(&'a str),
-    /// A shared library by its file name.
+    /// A shared library, by its file name.
     Library(String),
 }
 
-/// Where missing things are looked for.
+/// Index in which missing dependencies are looked up.
 #[derive(Clone, Copy)]
-pub(crate) struct Known<'a> {
+pub(crate) struct AdviceIndex<'a> {
     contents: &'a Contents,
-    /// Of a base of ROS 2, whose distribution has packages of ROS 1: those are not meant.
-    two: Option<Two<'a>>,
+    /// Set for a base of ROS 2, where the distribution's own ROS 1 packages must be ignored.
+    two: Option<Ros2Base<'a>>,
 }
 
 #[derive(Clone, Copy)]
-struct Two<'a> {
+struct Ros2Base<'a> {
     archive: &'a Archive,
     base: &'a Base,
 }
 
-impl<'a> Known<'a> {
-    /// To a base and its archive.
-    pub(crate) fn of(archive: &'a Archive, base: &'a Base) -> Self {
+impl<'a> AdviceIndex<'a> {
+    /// Returns the index of a base and its archive.
+    pub(crate) fn for_base(archive: &'a Archive, base: &'a Base) -> Self {
         Self {
             contents: &archive.contents,
-            two: (base.ros != Version::Ros1).then_some(Two { archive, base }),
+            two: (base.ros != Version::Ros1).then_some(Ros2Base { archive, base }),
         }
     }
 
-    /// To an archive for a base of ROS 1.
+    /// Returns the index of an archive for a base of ROS 1.
     #[cfg(test)]
-    pub(crate) fn of_one(contents: &'a Contents) -> Self {
+    pub(crate) fn for_ros1(contents: &'a Contents) -> Self {
         Self {
             contents,
             two: None,
         }
     }
 
-    /// The package to add for a missing configuration of CMake.
+    /// Returns the package that provides a CMake configuration.
     fn config(&self, name: &str) -> Option<String> {
         let mut debs = self.contents.cmake_config(name);
         match self.two {
-            // As a ROS package it comes whole: its definitions and plugins, too.
+            // As a ROS package it is installed completely, with definitions and plugins.
             None if !self.contents.ros_package(name).is_empty() => Some(name.to_owned()),
-            None => nearest(&debs, name).map(str::to_owned),
-            Some(two) => two.deb_of(name).or_else(|| {
-                debs.retain(|deb| two.fits(deb));
-                nearest(&debs, name).map(str::to_owned)
+            None => nearest_name(&debs, name).map(str::to_owned),
+            Some(two) => two.find_deb(name).or_else(|| {
+                debs.retain(|deb| two.matches_ros(deb));
+                nearest_name(&debs, name).map(str::to_owned)
             }),
         }
     }
 
-    /// The package to add for a missing module of pkg-config.
+    /// Returns the package that provides a pkg-config module.
     fn pkg_config(&self, name: &str) -> Option<String> {
         let mut debs = self.contents.pkg_config(name);
-        debs.retain(|deb| self.two.is_none_or(|two| two.fits(deb)));
-        nearest(&debs, name).map(str::to_owned)
+        debs.retain(|deb| self.two.is_none_or(|two| two.matches_ros(deb)));
+        nearest_name(&debs, name).map(str::to_owned)
     }
 
-    /// The package to add for a missing module of Python.
+    /// Returns the package that provides a Python module.
     pub(crate) fn module(&self, name: &str) -> Option<String> {
         let mut debs = self.contents.python_module(name);
         match self.two {
-            None => nearest(&debs, name).map(str::to_owned),
-            Some(two) => two.deb_of(name).or_else(|| {
-                debs.retain(|deb| two.fits(deb));
-                nearest(&debs, name).map(str::to_owned)
+            None => nearest_name(&debs, name).map(str::to_owned),
+            Some(two) => two.find_deb(name).or_else(|| {
+                debs.retain(|deb| two.matches_ros(deb));
+                nearest_name(&debs, name).map(str::to_owned)
             }),
         }
     }
 
-    /// The package to add for a missing library.
+    /// Returns the package that provides a library.
     fn library(&self, name: &str) -> Option<String> {
         let deb = self.contents.library(name)?;
-        let fits = self.two.is_none_or(|two| two.fits(deb));
+        let fits = self.two.is_none_or(|two| two.matches_ros(deb));
         fits.then(|| deb.to_owned())
     }
 
-    /// Where a program of another ROS package is.
+    /// Describes which other ROS packages contain a program.
     fn programs(&self, program: &str) -> String {
         if self.two.is_some() {
             return String::new();
@@ -115,45 +115,46 @@ impl<'a> Known<'a> {
     }
 }
 
-impl Two<'_> {
-    fn deb_of(&self, name: &str) -> Option<String> {
-        keys::deb_of(self.archive, self.base, name)
+impl Ros2Base<'_> {
+    fn find_deb(&self, name: &str) -> Option<String> {
+        keys::find_ros_deb(self.archive, self.base, name)
     }
 
-    fn fits(&self, deb: &str) -> bool {
+    fn matches_ros(&self, deb: &str) -> bool {
         !keys::is_of_other_ros(self.archive, self.base, deb)
     }
 }
 
-/// One line of advice for each missing thing that `words` names; empty if it names none.
-pub(crate) fn for_words(words: &str, known: Known<'_>) -> Vec<String> {
-    // What CMake looks for and does not find need not be required: what is, is named again (`inside/second_look.py`).
+/// Returns a line of advice for each missing dependency named in `words`; empty if there is none.
+pub(crate) fn advise_for_output(words: &str, known: AdviceIndex<'_>) -> Vec<String> {
+    // What CMake looks up without success may be optional; required dependencies are named again
+    // (`inside/second_look.py`).
     let lines = words.lines().filter(|line| !line.starts_with("-- "));
-    let missed: BTreeSet<Missed<'_>> = lines.filter_map(missed).collect();
+    let missed: BTreeSet<MissingDependency<'_>> = lines.filter_map(parse_missing).collect();
     missed
         .into_iter()
         .map(|missed| match missed {
-            Missed::Config(name) => told(&format!("the CMake package {name}"), known.config(name)),
-            Missed::Found(name) => match known.config(name) {
-                // Whether the archive has it nobody knows: such modules look for files.
+            MissingDependency::Config(name) => advise(&format!("the CMake package {name}"), known.config(name)),
+            MissingDependency::Found(name) => match known.config(name) {
+                // It is unknown whether the archive has it, since such modules search for files.
                 None => format!(
-                    "{name} is missing, which CMake looks for by Find{name}.cmake: push with `--with PACKAGE`, the Debian \
-                     package that has its files"
+                    "{name} is missing, which CMake searches with Find{name}.cmake: push with `--with PACKAGE`, the \
+                        Debian package with its files"
                 ),
-                found => told(&format!("the CMake package {name}"), found),
+                found => advise(&format!("the CMake package {name}"), found),
             },
-            Missed::PkgConfig(name) => told(
+            MissingDependency::PkgConfig(name) => advise(
                 &format!("the pkg-config module {name}"),
                 known.pkg_config(name),
             ),
-            Missed::Module(name) => told(&format!("the Python module {name}"), known.module(name)),
-            Missed::Library(name) => told(&format!("the library {name}"), known.library(&name)),
+            MissingDependency::Module(name) => advise(&format!("the Python module {name}"), known.module(name)),
+            MissingDependency::Library(name) => advise(&format!("the library {name}"), known.library(&name)),
         })
         .collect()
 }
 
-/// The error of a failed build with that advice.
-pub(crate) fn on(error: Error, known: Known<'_>) -> Error {
+/// Adds the advice to the error of a failed build.
+pub(crate) fn add_advice(error: Error, known: AdviceIndex<'_>) -> Error {
     match error {
         Error::BuildFailed {
             package,
@@ -161,7 +162,7 @@ pub(crate) fn on(error: Error, known: Known<'_>) -> Error {
             last_lines,
             ..
         } => Error::BuildFailed {
-            advice: for_words(&last_lines, known),
+            advice: advise_for_output(&last_lines, known),
             package,
             log,
             last_lines,
@@ -185,62 +186,62 @@ pub(crate) fn on(error: Error, known: Known<'_>) -> Error {
     }
 }
 
-fn told(what: &str, with: Option<String>) -> String {
+fn advise(what: &str, with: Option<String>) -> String {
     match with {
         Some(name) => format!("{what} is missing: push with `--with {name}`"),
         None => format!(
-            "{what} is missing, and no package of the archive has it: push a workspace that holds its source, too"
+            "{what} is missing, and no package of the archive has it: push a workspace that also contains its source"
         ),
     }
 }
 
-/// The Debian package whose name is nearest to what is looked for.
-pub(crate) fn nearest<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a str> {
+/// Returns the Debian package whose name is closest to what is looked for.
+pub(crate) fn nearest_name<'a>(debs: &BTreeSet<&'a str>, name: &str) -> Option<&'a str> {
     let plain = name.to_lowercase().replace('_', "-");
     debs.iter()
         .min_by_key(|deb| (!deb.contains(&plain), deb.len(), **deb))
         .copied()
 }
 
-/// Whether a line of output names something missing.
-pub(crate) fn names_missing(line: &str) -> bool {
-    missed(line).is_some()
+/// Returns whether a line of output names a missing dependency.
+pub(crate) fn mentions_missing(line: &str) -> bool {
+    parse_missing(line).is_some()
 }
 
-fn missed(line: &str) -> Option<Missed<'_>> {
+fn parse_missing(line: &str) -> Option<MissingDependency<'_>> {
     let after = |words: &str| line.split_once(words).map(|(_, rest)| rest);
     let until = |rest: &'_ str, ends: &[char]| rest.find(ends).unwrap_or(rest.len());
     if let Some(rest) = after("Could not find a package configuration file provided by \"") {
-        return Some(Missed::Config(&rest[..until(rest, &['"'])]));
+        return Some(MissingDependency::Config(&rest[..until(rest, &['"'])]));
     }
     if let Some(rest) = after("Could NOT find ")
         && let Some((name, _)) = rest.split_once(" (missing:")
         && !line.starts_with("-- ")
     {
-        return Some(Missed::Found(name));
+        return Some(MissingDependency::Found(name));
     }
     if let Some((name, _)) = after("No package '").and_then(|rest| rest.split_once("' found")) {
-        return Some(Missed::PkgConfig(name));
+        return Some(MissingDependency::PkgConfig(name));
     }
     if let Some((name, rest)) = after("Package '").and_then(|rest| rest.split_once("', "))
         && rest.ends_with("not found")
     {
-        return Some(Missed::PkgConfig(name));
+        return Some(MissingDependency::PkgConfig(name));
     }
     if let Some(rest) = after("No module named ") {
         let rest = rest.trim_start_matches(['\'', '"']);
         let name = &rest[..until(rest, &['\'', '"', '.', ';', ' '])];
-        return (!name.is_empty()).then_some(Missed::Module(name));
+        return (!name.is_empty()).then_some(MissingDependency::Module(name));
     }
     if let Some(rest) = after("cannot find -l") {
         let name = &rest[..until(rest, &[':', ' '])];
-        return Some(Missed::Library(format!("lib{name}.so")));
+        return Some(MissingDependency::Library(format!("lib{name}.so")));
     }
     if line.contains("cannot open shared object file") {
         let name = line
             .split([' ', ':'])
             .find(|word| word.starts_with("lib") && word.contains(".so"))?;
-        return Some(Missed::Library(name.to_owned()));
+        return Some(MissingDependency::Library(name.to_owned()));
     }
     None
 }
@@ -315,31 +316,31 @@ mod tests {
             ),
             (
                 "  Could NOT find GLUT (missing: GLUT_glut_LIBRARY)",
-                "GLUT is missing, which CMake looks for by FindGLUT.cmake: push with `--with PACKAGE`, the Debian package \
-                 that has its files",
+                "GLUT is missing, which CMake searches with FindGLUT.cmake: push with `--with PACKAGE`, the Debian \
+                    package with its files",
             ),
             (
                 "Could not find a package configuration file provided by \"warp\" with",
-                "the CMake package warp is missing, and no package of the archive has it: push a workspace that holds \
-                 its source, too",
+                "the CMake package warp is missing, and no package of the archive has it: push a workspace that also \
+                    contains its source",
             ),
         ] {
             assert_eq!(
-                for_words(words, Known::of_one(&contents)),
+                advise_for_output(words, AdviceIndex::for_ros1(&contents)),
                 [advice],
                 "{words}"
             );
         }
         for words in [
             "main.cpp:3: error: expected ;",
-            // Nobody said that they are required.
+            // Not stated to be required.
             "--   No package 'gsl' found",
             "--   Package 'gsl', required by 'virtual:world', not found\n\
              CMake Error at /usr/share/cmake-3.25/Modules/FindPkgConfig.cmake:607 (message):",
             "-- Could NOT find Eigen3 (missing: Eigen3_DIR)",
         ] {
             assert!(
-                for_words(words, Known::of_one(&contents)).is_empty(),
+                advise_for_output(words, AdviceIndex::for_ros1(&contents)).is_empty(),
                 "{words}"
             );
         }
@@ -354,9 +355,9 @@ mod tests {
             known: "none".into(),
             elsewhere: String::new(),
         };
-        let text = on(error, Known::of_one(&contents)).to_string();
+        let text = add_advice(error, AdviceIndex::for_ros1(&contents)).to_string();
         assert!(
-            text.contains("there are: none")
+            text.contains("available: none")
                 && text.contains("`--apt topic_tools`")
                 && !text.contains("gcc"),
             "{text}"
@@ -383,22 +384,25 @@ mod tests {
             contents: Contents::open(directory.path(), &lists)
                 .expect("read")
                 .into(),
-            candidates: crate::candidates::tests::named(&["python3-tf2-ros", "python3-joblib"]),
+            candidates: crate::candidates::tests::candidates_named(&[
+                "python3-tf2-ros",
+                "python3-joblib",
+            ]),
             stamp: String::new(),
             sources: String::new(),
         };
         let words = "ModuleNotFoundError: No module named 'tf2_ros'\n\
                      Could not find a package configuration file provided by \"tf2_ros\"\n\
                      ModuleNotFoundError: No module named 'joblib'";
-        let advice = for_words(words, Known::of(&archive, &base)).join("\n");
+        let advice = advise_for_output(words, AdviceIndex::for_base(&archive, &base)).join("\n");
         assert_eq!(
             advice.matches("no package of the archive has it").count(),
             2,
             "{advice}"
         );
         assert!(advice.contains("`--with python3-joblib`"), "{advice}");
-        archive.candidates = crate::candidates::tests::named(&["ros-jazzy-tf2-ros"]);
-        let advice = for_words(words, Known::of(&archive, &base)).join("\n");
+        archive.candidates = crate::candidates::tests::candidates_named(&["ros-jazzy-tf2-ros"]);
+        let advice = advise_for_output(words, AdviceIndex::for_base(&archive, &base)).join("\n");
         assert_eq!(
             advice.matches("`--with ros-jazzy-tf2-ros`").count(),
             2,

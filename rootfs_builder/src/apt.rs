@@ -1,7 +1,8 @@
-//! The distribution's archive, asked through apt with a state directory of its own: nothing of the host's apt is
-//! changed, and the host needs nothing installed but apt.
+//! Access to the distribution's archive through apt with a separate state directory: the host's apt is not changed, and
+//! the host needs only apt itself.
 //!
-//! In: names of Debian packages and the dpkg status of what is there already. Out: exact versions, and the files.
+//! Input: names of Debian packages, and the dpkg status of what is installed. Output: exact versions, and the package
+//! files.
 
 mod output;
 
@@ -15,40 +16,40 @@ use nix::fcntl::{Flock, FlockArg};
 use serde::{Deserialize, Serialize};
 use tokio::process::Command;
 
-use crate::cache::write_whole;
+use crate::cache::write_atomically;
 use crate::candidates::Candidates;
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::process::{self, Stream};
 use crate::unused;
-use output::{NAMING, after_no_lists, apts_words, parse_relations, parse_stanza, parse_uri};
+use output::{NAMING, extract_errors, parse_relations, parse_stanza, parse_uri, suggest_next_step};
 
-/// Where packages come from: lines of a sources.list for each base that is named. For others they are the host's own apt
-/// sources, where the host is of the same release; else mmdebstrap's default mirror.
+/// Package sources: lines of a sources.list for each base that is listed. Other bases use the host's own apt sources,
+/// if the host has the same release, and otherwise mmdebstrap's default mirror.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Sources(pub BTreeMap<String, Vec<String>>);
 
-/// One package at one version.
+/// A Debian package at a version.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Deb {
-    /// Without architecture.
+    /// Name, without architecture.
     pub name: String,
-    /// As in the archive.
+    /// Version as in the archive.
     pub version: String,
-    /// `amd64`, `all`.
+    /// Architecture, such as `amd64` or `all`.
     pub architecture: String,
 }
 
-/// How a package relates to others.
+/// Relations of a package to others.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Relations {
-    /// The source package it was made of.
+    /// Source package that it was built from.
     pub source: String,
-    /// Every package that its Depends and Pre-Depends name, alternatives too.
+    /// Packages named in Depends and Pre-Depends, including alternatives.
     pub needs: BTreeSet<String>,
-    /// Every package that its Pre-Depends name, alternatives too.
+    /// Packages named in Pre-Depends, including alternatives.
     pub before: BTreeSet<String>,
-    /// What it can stand for.
+    /// Virtual packages that it provides.
     pub provides: BTreeSet<String>,
 }
 
@@ -59,7 +60,7 @@ impl std::fmt::Display for Deb {
 }
 
 impl Deb {
-    /// The name apt gives the file: the epoch's colon is escaped.
+    /// Returns the file name that apt uses, in which the colon of the epoch is escaped.
     fn file_name(&self) -> String {
         format!(
             "{}_{}_{}.deb",
@@ -70,21 +71,21 @@ impl Deb {
     }
 }
 
-/// apt with a state of its own.
+/// apt with a separate state directory.
 #[derive(Debug, Clone)]
 pub struct Apt {
     root: PathBuf,
 }
 
-/// Lists older than this are fetched again before they are used.
+/// Age at which the package lists are fetched again before use.
 const FRESH: Duration = Duration::from_secs(24 * 3600);
 
 impl Apt {
-    /// Prepares the directory; asks the network nothing yet. `sources`: lines of a sources.list.
+    /// Prepares the state directory without network access. `sources` are lines of a sources.list.
     pub fn open(root: &Path, sources: &str) -> Result<Self, Error> {
         for directory in ["state/lists/partial", "cache", "archives", "parts"] {
             let path = root.join(directory);
-            fs::create_dir_all(&path).at("making", &path)?;
+            fs::create_dir_all(&path).io_context("making", &path)?;
         }
         let conf = CONFIGURATION.replace("@ROOT@", &root.display().to_string());
         for (name, text) in [
@@ -92,10 +93,10 @@ impl Apt {
             ("sources.list", sources),
             ("apt.conf", &conf),
         ] {
-            // Another daemon may be reading it: it is not touched when it is as it should be.
+            // Another daemon may be reading it, so a file with the right content is not touched.
             let path = root.join(name);
             if fs::read(&path).ok().as_deref() != Some(text.as_bytes()) {
-                write_whole(&path, text.as_bytes())?;
+                write_atomically(&path, text.as_bytes())?;
             }
         }
         Ok(Self {
@@ -105,24 +106,24 @@ impl Apt {
 
     fn command(&self, program: &str) -> Command {
         let mut command = process::command(program);
-        // Given as an option, it is read after the host's own files and so has the last word.
+        // As an option, it is read after the host's own files and takes precedence.
         command.arg("-c").arg(self.root.join("apt.conf"));
         command
     }
 
-    /// Fetches the lists (packages, and which file is in which) if they are missing or a day old, or when
-    /// `force`d. With old lists at hand a failure is only a warning, which is returned.
+    /// Fetches the package and Contents lists if they are missing or a day old, or if `force`d. If old lists exist, a
+    /// failure is only returned as a warning.
     pub async fn refresh(&self, force: bool, progress: &Progress) -> Result<Option<String>, Error> {
         let stamp = self.root.join("updated");
         if !force && self.is_fresh() && self.compressed_lists()?.is_empty() {
             return Ok(None);
         }
-        // One daemon at a time; the others then find the lists fresh.
+        // One daemon at a time; the others then find fresh lists.
         let path = self.root.join("lock");
-        let mut file = fs::File::create(&path).at("opening", &path)?;
-        // Whoever could open it could hold it.
+        let mut file = fs::File::create(&path).io_context("opening", &path)?;
+        // Whoever can open the file can hold the lock.
         crate::install::set_mode(&path, 0o600)?;
-        // Asked for again and again, not waited for on a thread: whoever gives up leaves no thread behind.
+        // Polls instead of blocking a thread, so that no thread is left behind on cancellation.
         let _lock = loop {
             match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
                 Ok(lock) => break lock,
@@ -131,10 +132,11 @@ impl Apt {
             }
             tokio::time::sleep(std::time::Duration::from_millis(50)).await;
         };
-        let age = age(&stamp);
-        let warning = match !force && self.is_fresh() {
-            true => None,
-            false => self.update(&stamp, age, progress).await?,
+        let age = file_age(&stamp);
+        let warning = if !force && self.is_fresh() {
+            None
+        } else {
+            self.update(&stamp, age, progress).await?
         };
         for list in self.compressed_lists()? {
             self.unpack_list(&list).await?;
@@ -142,7 +144,7 @@ impl Apt {
         Ok(warning)
     }
 
-    /// Fetches the lists; `age` is that of those at hand.
+    /// Fetches the lists; `age` is that of the existing ones.
     async fn update(
         &self,
         stamp: &Path,
@@ -156,8 +158,8 @@ impl Apt {
         let result = process::run(update, "apt", |_, line| lines.push(line.to_owned())).await;
         let result = result.map_err(|error| match error {
             Error::Program { last_lines, .. } => Error::Lists {
-                next: after_no_lists(&last_lines),
-                words: apts_words(&last_lines),
+                next: suggest_next_step(&last_lines),
+                words: extract_errors(&last_lines),
             },
             error => error,
         });
@@ -166,21 +168,23 @@ impl Apt {
         }
         match result {
             Ok(()) => {
-                fs::write(stamp, "").at("writing", stamp)?;
+                fs::write(stamp, "").io_context("writing", stamp)?;
                 Ok(None)
             }
-            Err(error) if age.is_some() => Ok(Some(format!("lists at hand are used: {error}"))),
+            Err(error) if age.is_some() => {
+                Ok(Some(format!("using the existing package lists: {error}")))
+            }
             Err(error) => Err(error),
         }
     }
 
-    /// Lists of packages that apt has kept compressed: it unpacks one from its beginning for every record that it looks
-    /// up. Where the host's apt keeps them so, those that have not changed stay so.
+    /// Returns the package lists that apt has stored compressed: apt decompresses such a list from its beginning for
+    /// every record that it looks up. If the host's apt stores them so, unchanged ones stay compressed.
     fn compressed_lists(&self) -> Result<Vec<PathBuf>, Error> {
         let lists = self.root.join("state/lists");
         let mut found = Vec::new();
-        for entry in fs::read_dir(&lists).at("reading", &lists)? {
-            let entry = entry.at("reading", &lists)?;
+        for entry in fs::read_dir(&lists).io_context("reading", &lists)? {
+            let entry = entry.io_context("reading", &lists)?;
             if entry.file_name().to_string_lossy().contains("Packages.") {
                 found.push(entry.path());
             }
@@ -188,15 +192,15 @@ impl Apt {
         Ok(found)
     }
 
-    /// Puts the plain list in the place of a compressed one; what apt cannot read stays as it is.
+    /// Replaces a compressed list by the uncompressed one; a list that apt cannot read is left as it is.
     async fn unpack_list(&self, list: &Path) -> Result<(), Error> {
         let directory = list.parent().unwrap_or(&self.root);
         let plain = tempfile::Builder::new()
             .prefix(".plain-")
             .permissions(fs::Permissions::from_mode(0o644))
             .tempfile_in(directory)
-            .at("making a file in", directory)?;
-        let out = plain.reopen().at("opening", plain.path())?;
+            .io_context("creating a file in", directory)?;
+        let out = plain.reopen().io_context("opening", plain.path())?;
         let mut unpack = self.command("/usr/lib/apt/apt-helper");
         unpack
             .arg("cat-file")
@@ -206,7 +210,8 @@ impl Apt {
         match unpack.status().await {
             Ok(status) if status.success() => {}
             result => {
-                tracing::warn!(path = %list.display(), ?result, "a package list stays compressed: lookups take longer");
+                tracing::warn!(path = %list.display(), ?result, "a package list stays compressed, so lookups take \
+                    longer");
                 return Ok(());
             }
         }
@@ -214,15 +219,15 @@ impl Apt {
         plain
             .persist(&to)
             .map_err(|error| Error::io("writing", &to, error.error))?;
-        fs::remove_file(list).at("removing", list)
+        fs::remove_file(list).io_context("removing", list)
     }
 
-    /// The lists that tell which file is in which package.
+    /// Returns the Contents lists, which map files to packages.
     pub fn contents_files(&self) -> Result<Vec<PathBuf>, Error> {
         let lists = self.root.join("state/lists");
         let mut files = Vec::new();
-        for entry in fs::read_dir(&lists).at("reading", &lists)? {
-            let path = entry.at("reading", &lists)?.path();
+        for entry in fs::read_dir(&lists).io_context("reading", &lists)? {
+            let path = entry.io_context("reading", &lists)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             if name.contains("_Contents-") && name.ends_with(".gz") {
                 files.push(path);
@@ -232,7 +237,7 @@ impl Apt {
         Ok(files)
     }
 
-    /// All packages that can be installed, at the versions apt would take. Kept beside the lists.
+    /// Returns all installable packages at the versions that apt would choose. Cached next to the lists.
     pub async fn candidates(&self) -> Result<Candidates, Error> {
         let path = self.root.join("candidates");
         let stamp = self.stamp();
@@ -258,13 +263,13 @@ impl Apt {
         .await?;
         debs.extend(parse_stanza(&stanza));
         let candidates: Candidates = debs.into_iter().collect();
-        let text = format!("{stamp}\n{}", candidates.lines());
-        write_whole(&path, text.as_bytes())?;
+        let text = format!("{stamp}\n{}", candidates.as_text());
+        write_atomically(&path, text.as_bytes())?;
         Ok(candidates)
     }
 
-    /// What must be installed, in an order that dpkg accepts, so that all of `names` are, given what `status`
-    /// (a dpkg status file; none for an empty system) says is there. Recommended packages are not.
+    /// Returns the packages to install, in an order accepted by dpkg, so that all of `names` are installed, given a
+    /// dpkg status file (none for an empty system). Recommended packages are not installed.
     pub async fn resolve(
         &self,
         status: Option<&Path>,
@@ -273,15 +278,15 @@ impl Apt {
         if names.is_empty() {
             return Ok(Vec::new());
         }
-        if let Some(name) = names.iter().find(|name| !may_be_asked(name)) {
+        if let Some(name) = names.iter().find(|name| !is_package_name(name)) {
             return Err(Error::Unsolvable {
                 wanted: name.clone(),
                 words: "it is not the name of a Debian package".to_owned(),
             });
         }
         let status = status.map_or_else(|| self.root.join("empty-status"), Path::to_owned);
-        // As told by what it would fetch, which is in the order of unpacking. A simulated installation tells the same and
-        // takes five times as long: it goes through all packages after each.
+        // Derived from what apt would fetch, which is in the order of unpacking. A simulated installation gives the
+        // same result but takes five times as long, since it goes through all packages after each one.
         let mut ask = self.command("apt-get");
         ask.arg("-o")
             .arg(format!("Dir::State::status={}", status.display()));
@@ -303,20 +308,20 @@ impl Apt {
                     .map(String::as_str)
                     .collect::<Vec<_>>()
                     .join(", "),
-                words: apts_words(&last_lines),
+                words: extract_errors(&last_lines),
             }),
             Err(error) => Err(error),
         }
     }
 
-    /// What is said of these packages besides their names, by name. `names` are as apt takes them: `NAME` for the
-    /// candidate, or `NAME=VERSION`; those that the lists do not have are left out.
+    /// Returns the relations of packages, by name. `names` are `NAME` for the candidate, or `NAME=VERSION`; packages
+    /// that are not in the lists are left out.
     pub async fn relations(
         &self,
         names: impl IntoIterator<Item = String>,
     ) -> Result<BTreeMap<String, Relations>, Error> {
         let mut names = names.into_iter().peekable();
-        // Asked about nothing, apt-cache fails.
+        // apt-cache fails without arguments.
         if names.peek().is_none() {
             return Ok(BTreeMap::new());
         }
@@ -325,7 +330,7 @@ impl Apt {
         let text = process::output(query, "apt").await?;
         let mut all: BTreeMap<String, Relations> = BTreeMap::new();
         for (name, about) in text.split("\n\n").filter_map(parse_relations) {
-            // One version from two places may be told twice.
+            // A version from two sources may be listed twice.
             let there = all.entry(name).or_default();
             there.source = about.source;
             there.needs.extend(about.needs);
@@ -335,7 +340,7 @@ impl Apt {
         Ok(all)
     }
 
-    /// Files of these packages, in the same order; those not in the cache are fetched and checked by apt.
+    /// Returns the files of packages, in the same order; those not in the cache are fetched and verified by apt.
     pub async fn download(&self, debs: &[Deb], progress: &Progress) -> Result<Vec<PathBuf>, Error> {
         let archives = self.root.join("archives");
         let missing: Vec<&Deb> = debs
@@ -347,11 +352,11 @@ impl Apt {
             progress
                 .step(&format!("downloading {total} packages"))
                 .await;
-            // Into a directory of its own, then renamed: what is in `archives` is whole.
+            // Downloaded into a separate directory and then renamed, so that files in `archives` are complete.
             let partial = tempfile::Builder::new()
                 .prefix(".partial-")
                 .tempdir_in(&archives)
-                .at("making a directory in", &archives)?;
+                .io_context("creating a directory in", &archives)?;
             let mut download = self.command("apt-get");
             download
                 .current_dir(partial.path())
@@ -372,17 +377,17 @@ impl Apt {
             match result {
                 Ok(()) => {}
                 Err(Error::Program { last_lines, .. }) => {
-                    // Most often the mirror has newer versions by now: the next push asks it.
+                    // Usually the mirror has newer versions by now: the next push fetches the lists again.
                     let _ = fs::remove_file(self.root.join("updated"));
                     return Err(Error::Download {
-                        words: apts_words(&last_lines),
+                        words: extract_errors(&last_lines),
                     });
                 }
                 Err(error) => return Err(error),
             }
             for deb in missing {
                 let from = partial.path().join(deb.file_name());
-                fs::rename(&from, archives.join(deb.file_name())).at("keeping", &from)?;
+                fs::rename(&from, archives.join(deb.file_name())).io_context("keeping", &from)?;
             }
         }
         let files: Vec<PathBuf> = debs
@@ -390,22 +395,22 @@ impl Apt {
             .map(|deb| archives.join(deb.file_name()))
             .collect();
         for file in &files {
-            unused::used(file);
+            unused::mark_used(file);
         }
         Ok(files)
     }
 
-    /// Whether the lists need not be fetched again yet.
+    /// Returns whether the lists are recent enough to be used.
     pub fn is_fresh(&self) -> bool {
-        age(&self.root.join("updated")).is_some_and(|age| age < FRESH)
+        file_age(&self.root.join("updated")).is_some_and(|age| age < FRESH)
     }
 
-    /// Where lists and packages are kept.
+    /// Returns the directory of lists and packages.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// Changes whenever the lists do.
+    /// Returns a fingerprint of the lists.
     pub fn stamp(&self) -> String {
         let mut parts = Vec::new();
         let lists = self.root.join("state/lists");
@@ -428,9 +433,10 @@ impl Apt {
     }
 }
 
-/// Whether apt, which runs with the rights of root, takes a word for a package of the archive (Debian policy, 5.6.1), and not for a file of
-/// this machine (`./x.deb`), a pattern, or another version or release. One pattern is this crate's own.
-fn may_be_asked(name: &str) -> bool {
+/// Returns whether a word is the name of a package in the archive (Debian policy, 5.6.1), as opposed to a local file
+/// (`./x.deb`), a pattern, or another version or release, which apt, running as root, would also accept. One pattern
+/// used by this crate is allowed.
+fn is_package_name(name: &str) -> bool {
     let fits = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit();
     let mut bytes = name.bytes();
     name == "?essential"
@@ -438,14 +444,14 @@ fn may_be_asked(name: &str) -> bool {
             && bytes.all(|byte| fits(byte) || matches!(byte, b'+' | b'-' | b'.'))
 }
 
-/// How long ago it was changed.
-fn age(path: &Path) -> Option<Duration> {
+/// Returns the time since a file was modified.
+fn file_age(path: &Path) -> Option<Duration> {
     let changed = path.metadata().and_then(|about| about.modified()).ok()?;
     SystemTime::now().duration_since(changed).ok()
 }
 
-/// What differs from the host's apt. Hooks of the host's configuration have no business here. Debian has lists of contents for each
-/// component, Ubuntu one for all.
+/// Differences from the host's apt. Hooks of the host's configuration are disabled. Debian has a Contents list for each
+/// component, Ubuntu a single one.
 const CONFIGURATION: &str = r#"
 Dir::State "@ROOT@/state";
 Dir::State::status "@ROOT@/empty-status";

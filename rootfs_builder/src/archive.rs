@@ -1,4 +1,4 @@
-//! The distribution's archive as one thing: versions and files by apt, names by the Contents index.
+//! The distribution's archive: versions and files through apt, names through the Contents index.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -6,24 +6,24 @@ use std::sync::Arc;
 
 use crate::apt::Apt;
 use crate::candidates::Candidates;
-use crate::contents::{Carriers, Contents, Part};
+use crate::contents::{Carriers, Contents, RosPackagePart};
 use crate::error::Error;
 use crate::event::Progress;
 
-/// One base's archive.
+/// The archive of a base.
 pub(crate) struct Archive {
     pub(crate) apt: Apt,
     pub(crate) contents: Arc<Contents>,
     /// All installable packages.
     pub(crate) candidates: Candidates,
-    /// Changes when the lists do.
+    /// Fingerprint of the lists.
     pub(crate) stamp: String,
-    /// For `sources.list`.
+    /// Lines of `sources.list`.
     pub(crate) sources: String,
 }
 
 impl Archive {
-    /// Opens it; fetches lists where they are missing or old (or `force`d).
+    /// Opens the archive; fetches the lists if they are missing or old (or if `force`d).
     pub(crate) async fn open(
         cache: &Path,
         sources: String,
@@ -52,12 +52,12 @@ impl Archive {
         })
     }
 
-    /// Whether its lists need not be fetched again yet.
+    /// Returns whether the lists are recent enough to be used.
     pub(crate) fn is_fresh(&self) -> bool {
         self.apt.is_fresh()
     }
 
-    /// Names that look like a key, the nearest first; at most three.
+    /// Returns names similar to a key, closest first; at most three.
     pub(crate) fn similar(&self, key: &str) -> Vec<String> {
         let plain = key.replace('_', "-").to_lowercase();
         let bare = plain
@@ -73,25 +73,33 @@ impl Archive {
         near.into_iter().take(3).map(str::to_owned).collect()
     }
 
-    /// What to install to run with a ROS package, and which development packages hold files of it besides.
-    pub(crate) fn to_run(&self, ros_package: &str, depth: Depth) -> Carried {
-        let mut carried = Carried::default();
+    /// Returns the packages to install to run with a ROS package, and the development packages that contain further
+    /// files of it.
+    pub(crate) fn runtime_packages(
+        &self,
+        ros_package: &str,
+        depth: DependencyDepth,
+    ) -> RosPackageDebs {
+        let mut carried = RosPackageDebs::default();
         for (deb, parts) in self.contents.ros_package(ros_package) {
             let wanted = match depth {
-                Depth::Itself { python } => {
-                    let only_python = parts.iter().all(|part| *part == Part::Python);
-                    parts.iter().any(|part| *part != Part::CMake) && (python || !only_python)
+                DependencyDepth::Itself { python } => {
+                    let only_python = parts.iter().all(|part| *part == RosPackagePart::Python);
+                    parts.iter().any(|part| *part != RosPackagePart::CMake)
+                        && (python || !only_python)
                 }
-                Depth::Needed => {
+                DependencyDepth::Needed => {
                     let useful = [
-                        Part::Manifest,
-                        Part::Programs,
-                        Part::Definitions,
-                        Part::Share,
+                        RosPackagePart::Manifest,
+                        RosPackagePart::Programs,
+                        RosPackagePart::Definitions,
+                        RosPackagePart::Share,
                     ];
                     useful.iter().any(|part| parts.contains(part)) && !deb.starts_with("python3-")
                 }
-                Depth::Beyond => parts.contains(&Part::Definitions) && !deb.ends_with("-dev"),
+                DependencyDepth::Beyond => {
+                    parts.contains(&RosPackagePart::Definitions) && !deb.ends_with("-dev")
+                }
             };
             match (wanted, deb.ends_with("-dev")) {
                 (true, true) => carried.unpack.insert(deb),
@@ -102,11 +110,17 @@ impl Archive {
         carried
     }
 
-    /// What to install to compile against a ROS package.
-    pub(crate) fn to_build(&self, ros_package: &str) -> BTreeSet<String> {
-        let needed = [Part::Manifest, Part::CMake, Part::Definitions, Part::Python];
+    /// Returns the packages to install to compile against a ROS package.
+    pub(crate) fn build_packages(&self, ros_package: &str) -> BTreeSet<String> {
+        let needed = [
+            RosPackagePart::Manifest,
+            RosPackagePart::CMake,
+            RosPackagePart::Definitions,
+            RosPackagePart::Python,
+        ];
         let carriers: Carriers = self.contents.ros_package(ros_package);
-        let wanted = |parts: &BTreeSet<Part>| needed.iter().any(|part| parts.contains(part));
+        let wanted =
+            |parts: &BTreeSet<RosPackagePart>| needed.iter().any(|part| parts.contains(part));
         carriers
             .into_iter()
             .filter(|(deb, parts)| wanted(parts) || deb.ends_with("-dev"))
@@ -114,7 +128,7 @@ impl Archive {
             .collect()
     }
 
-    /// Debian packages with these libraries; second, those that nothing has.
+    /// Returns the Debian packages that contain these libraries, and the libraries contained in none.
     pub(crate) fn libraries(
         &self,
         names: &BTreeSet<String>,
@@ -132,11 +146,11 @@ impl Archive {
     }
 }
 
-/// Names shorter than this are in many others by chance.
+/// Minimum length of a significant word; shorter ones occur in many names by chance.
 const TELLING: usize = 5;
 
-/// Whether a Debian package's name has these words from the beginning of one of its own: `libeigen3-dev` has `eigen`. Behind
-/// a short one, only a number may come.
+/// Returns whether a package name contains these words at a word boundary: `libeigen3-dev` contains `eigen`. A short
+/// word may only be followed by a number.
 fn has_word(name: &str, words: &str) -> bool {
     name.match_indices(words).any(|(at, _)| {
         let before = &name[..at];
@@ -148,27 +162,27 @@ fn has_word(name: &str, words: &str) -> bool {
     })
 }
 
-/// How far a ROS package is from what was asked for. The further, the more of it is left to the dependencies that
-/// Debian's maintainers wrote down.
+/// Distance of a ROS package from those requested. The larger it is, the more is left to the dependencies stated by
+/// Debian's maintainers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Depth {
-    /// Asked for: all of it, its Python module only if wanted.
+pub(crate) enum DependencyDepth {
+    /// Requested: all of it; its Python module only if needed.
     Itself {
-        /// Whether Python code uses it.
+        /// True if Python code uses it.
         python: bool,
     },
-    /// An exec dependency of that: what a launch file, a plugin loader or rospack may look for.
+    /// Exec dependency of a requested package: what a launch file, a plugin loader or rospack may look up.
     Needed,
-    /// Further away: the definitions of messages.
+    /// Further dependency: message definitions only.
     Beyond,
 }
 
-/// Debian packages of one ROS package.
+/// Debian packages of a ROS package.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct Carried {
-    /// With what they depend on.
+pub(crate) struct RosPackageDebs {
+    /// Packages to install with their dependencies.
     pub(crate) install: BTreeSet<String>,
-    /// For their files only.
+    /// Packages to unpack for their files only.
     pub(crate) unpack: BTreeSet<String>,
 }
 
@@ -193,16 +207,16 @@ mod tests {
         let archive = Archive {
             apt: Apt::open(directory.path(), "").expect("prepared"),
             contents: Contents::open(directory.path(), &[]).expect("read").into(),
-            candidates: crate::candidates::tests::named(&names),
+            candidates: crate::candidates::tests::candidates_named(&names),
             stamp: String::new(),
             sources: String::new(),
         };
         for (key, expected) in [
-            // Part of another word means nothing.
+            // Part of another word.
             ("libg2o", &[][..]),
             ("ceres-solver", &[]),
             ("ceres", &["libceres-dev"]),
-            // Short names have numbers behind them, and no letters.
+            // Short words are followed by numbers, not by letters.
             ("pcl", &["libpcl-dev", "libpcl1.13"]),
             ("eigen", &["libeigen3-dev"]),
             ("robot_localization", &["ros-robot-localization"]),

@@ -1,4 +1,4 @@
-//! Base definitions: what a distribution and its ROS are like, as data (`images/NAME.toml`).
+//! Base definitions: properties of a distribution and its ROS (`images/NAME.toml`).
 
 mod wheels;
 
@@ -9,24 +9,24 @@ use std::path::{Path, PathBuf};
 use ros::flavour::{Flavour, Version};
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 
-pub(crate) use wheels::Required;
+pub(crate) use wheels::RequiredWheels;
 pub use wheels::Wheels;
 
-/// A base image definition.
+/// A base image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Base {
-    /// The file's name without `.toml`.
+    /// File name without `.toml`.
     pub name: String,
-    /// All the rest.
+    /// Content of the definition.
     pub definition: Definition,
-    /// Of its wheels.
-    pub(crate) required: Required,
+    /// Requirements of its wheels.
+    pub(crate) required: RequiredWheels,
 }
 
 impl Base {
-    /// What a revision records of it.
+    /// Returns the ROS flavour recorded with revisions.
     pub fn flavour(&self) -> Flavour {
         Flavour {
             base: self.name.clone(),
@@ -35,13 +35,14 @@ impl Base {
         }
     }
 
-    /// What makes a difference to installed trees: part of their keys. A new rosdep key does not.
+    /// Returns the properties that affect installed trees, as a part of their cache keys. A new rosdep key does not
+    /// affect them.
     pub(crate) fn system_key(&self) -> String {
         let parts = (&self.distribution, &self.suite, &self.runtime, &self.strip);
         serde_json::to_string(&parts).unwrap_or_default()
     }
 
-    /// What makes a difference to compiled packages.
+    /// Returns the properties that affect compiled packages.
     pub(crate) fn build_key(&self) -> String {
         serde_json::to_string(&(&self.build, &self.environment)).unwrap_or_default()
     }
@@ -55,43 +56,43 @@ impl std::ops::Deref for Base {
     }
 }
 
-/// The content of a definition.
+/// Content of a base definition.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Definition {
-    /// One line for people.
+    /// One-line summary.
     pub summary: String,
-    /// As in os-release: `debian`.
+    /// Distribution, as in os-release: `debian`.
     pub distribution: String,
-    /// The archive's name of the release: `bookworm`.
+    /// Release name in the archive: `bookworm`.
     pub suite: String,
-    /// Which ROS its packages speak.
+    /// ROS version of its packages.
     pub ros: Version,
-    /// What `$ROS_DISTRO` stands for in the conditions of a package.xml: `noetic`.
+    /// ROS distribution, as in `$ROS_DISTRO` in the conditions of a package.xml: `noetic`.
     pub ros_distribution: String,
-    /// What every image has.
+    /// Content of every image.
     pub runtime: Runtime,
     /// Environment of every process.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,
-    /// What never gets into a layer.
+    /// Files left out of all layers.
     #[serde(default)]
     pub strip: Strip,
-    /// Python packages that bring ROS, where the distribution has none of this kind.
+    /// Python packages that provide ROS, if the distribution has no such packages.
     pub wheels: Option<Wheels>,
-    /// The toolchain.
+    /// Toolchain.
     pub build: Build,
-    /// What is particular to some ROS packages.
+    /// Settings for individual ROS packages.
     #[serde(default)]
     pub ros_packages: RosPackages,
-    /// The base whose `keys` this one has, too. Its own come before.
+    /// Another base whose `keys` are inherited; those of this base take precedence.
     pub keys_of: Option<String>,
     /// rosdep key → Debian packages.
     #[serde(default)]
     pub keys: BTreeMap<String, Vec<String>>,
 }
 
-/// What every image has.
+/// Content of every image.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Runtime {
@@ -99,44 +100,44 @@ pub struct Runtime {
     pub packages: Vec<String>,
 }
 
-/// What never gets into a layer.
+/// Files left out of all layers.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Strip {
-    /// dpkg's `path-exclude=` and `path-include=` lines.
+    /// `path-exclude=` and `path-include=` options of dpkg.
     pub unpacked: Vec<String>,
-    /// Globs of absolute paths, or bare names at any depth, left out of the finished tree.
+    /// Globs of absolute paths, or bare names at any depth, that are left out of the finished tree.
     pub paths: Vec<String>,
 }
 
-/// The toolchain.
+/// Toolchain.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Build {
     /// Debian packages, present only while a package is compiled.
     pub packages: Vec<String>,
-    /// Where compiled packages are installed.
+    /// Installation prefix of compiled packages.
     pub prefix: PathBuf,
-    /// Arguments of every cmake.
+    /// Arguments of every cmake call.
     #[serde(default)]
     pub cmake: Vec<String>,
-    /// Added to the environment while compiling.
+    /// Additional environment while compiling.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,
-    /// Files that are there while compiling: absolute path → content.
+    /// Additional files while compiling: absolute path → content.
     #[serde(default)]
     pub files: BTreeMap<PathBuf, String>,
 }
 
-/// What is particular to some ROS packages.
+/// Settings for individual ROS packages.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RosPackages {
-    /// Not needed at run time: neither installed for it nor missed.
+    /// Packages not needed at run time: neither installed nor reported as missing.
     pub ignore: BTreeSet<String>,
 }
 
-/// Reads the definition `name` of a directory, and the files that it names.
+/// Loads the definition `name` from a directory, and the files that it refers to.
 pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
     let mut definition = read(directory, name)?;
     if let Some(other) = &definition.keys_of {
@@ -145,8 +146,8 @@ pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
         }
     }
     let required = match &definition.wheels {
-        Some(wheels) => Required::read(directory, wheels)?,
-        None => Required::default(),
+        Some(wheels) => RequiredWheels::read(directory, wheels)?,
+        None => RequiredWheels::default(),
     };
     Ok(Base {
         name: name.to_owned(),
@@ -155,7 +156,7 @@ pub fn load(directory: &Path, name: &str) -> Result<Base, Error> {
     })
 }
 
-/// Reads one file.
+/// Reads a single definition file.
 fn read(directory: &Path, name: &str) -> Result<Definition, Error> {
     let plain = !name.is_empty()
         && name
@@ -174,15 +175,15 @@ fn read(directory: &Path, name: &str) -> Result<Definition, Error> {
             },
         });
     }
-    let text = fs::read_to_string(&path).at("reading", &path)?;
+    let text = fs::read_to_string(&path).io_context("reading", &path)?;
     parse(&text).map_err(|problem| Error::BadBase { path, problem })
 }
 
-/// Names of all definitions in a directory, sorted.
+/// Returns the names of all definitions in a directory, sorted.
 pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
     let mut names = Vec::new();
-    for entry in fs::read_dir(directory).at("reading", directory)? {
-        let path = entry.at("reading", directory)?.path();
+    for entry in fs::read_dir(directory).io_context("reading", directory)? {
+        let path = entry.io_context("reading", directory)?.path();
         if path.extension().is_some_and(|e| e == "toml")
             && let Some(stem) = path.file_stem().and_then(|s| s.to_str())
         {
@@ -193,7 +194,7 @@ pub fn names(directory: &Path) -> Result<Vec<String>, Error> {
     Ok(names)
 }
 
-/// Parses and validates; the error has no file name yet.
+/// Parses and validates a definition; the error does not contain the file name yet.
 fn parse(text: &str) -> Result<Definition, String> {
     let definition: Definition = toml::from_str(text).map_err(|error| {
         let line = error
@@ -223,7 +224,7 @@ fn parse(text: &str) -> Result<Definition, String> {
     }
     if definition.runtime.packages.is_empty() {
         return Err(format!(
-            "{}runtime.packages is empty: name what a node needs",
+            "{}runtime.packages is empty: list the packages that nodes need",
             line_of("[runtime]")
         ));
     }
@@ -260,7 +261,8 @@ fn parse(text: &str) -> Result<Definition, String> {
     Ok(definition)
 }
 
-/// Debian policy 5.6.1: lower-case letters, digits, `+-.`, at least two characters, beginning alphanumeric.
+/// Returns whether a text is the name of a Debian package (policy 5.6.1): lower-case letters, digits, `+-.`, at least
+/// two characters, beginning alphanumerically.
 pub(crate) fn is_debian_name(name: &str) -> bool {
     name.len() >= 2
         && name.as_bytes()[0].is_ascii_alphanumeric()

@@ -1,8 +1,8 @@
-//! Starts a build's blocking work, and cancels it when the build ends.
+//! Blocking work of a build, cancelled when the build ends.
 //!
-//! Dropping a build's future ends its containers, but not the threads that pack, hash and extract for it: those would
-//! go on for minutes, and keep the daemon from ending. So such work is started here, under the build's
-//! [`foreign::cancel::Cancel`], which its loops ask.
+//! Dropping the future of a build ends its containers, but not the threads that pack, hash and extract for it: those
+//! would continue for minutes and delay the daemon's shutdown. So such work is started here, under the build's
+//! [`foreign::cancel::Cancel`], which its loops check.
 
 use std::future::Future;
 
@@ -13,28 +13,28 @@ tokio::task_local! {
     static CANCEL: Cancel;
 }
 
-/// Awaits `future`. When it ends or is dropped, blocking work that it started is cancelled.
+/// Awaits `future`. When it completes or is dropped, the blocking work that it started is cancelled.
 pub async fn cancellable<F: Future>(future: F) -> F::Output {
     let cancel = Cancel::default();
-    let _ended = cancel.on_drop();
+    let _ended = cancel.drop_guard();
     CANCEL.scope(cancel.clone(), future).await
 }
 
-/// Runs `work` on a thread where it may block; it is cancelled with the [`cancellable`] future that calls this.
+/// Runs `work` on a blocking thread; cancelled with the [`cancellable`] future that calls this.
 pub fn spawn<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
-    tokio::task::spawn_blocking(cancelled_with_this(work))
+    tokio::task::spawn_blocking(cancel_with_caller(work))
 }
 
-/// The same for `work` that reads what strangers have written, on a thread that may read every file and do nothing else.
-pub fn reading<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
-    let work = cancelled_with_this(work);
-    tokio::task::spawn_blocking(move || privilege::reading(work))
+/// Runs `work`, which reads untrusted data, on a blocking thread with no other privileges than reading all files.
+pub fn spawn_reader<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> JoinHandle<T> {
+    let work = cancel_with_caller(work);
+    tokio::task::spawn_blocking(move || privilege::run_as_reader(work))
 }
 
-/// `work` that is cancelled with the [`cancellable`] future that calls this, wherever it is done.
-pub fn cancelled_with_this<T>(work: impl FnOnce() -> T) -> impl FnOnce() -> T {
+/// Wraps `work` so that it is cancelled with the [`cancellable`] future that calls this, wherever it runs.
+pub fn cancel_with_caller<T>(work: impl FnOnce() -> T) -> impl FnOnce() -> T {
     let cancel = CANCEL.try_with(Cancel::clone).unwrap_or_default();
-    move || cancel.during(work)
+    move || cancel.run(work)
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The base layer: mmdebstrap makes it, this makes it the same every time.
+//! The base layer: created by mmdebstrap and made reproducible here.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,18 +9,18 @@ use image::{Mtime, TreeOptions};
 use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
-use crate::cache::Entry;
-use crate::error::{Error, IoAt};
+use crate::cache::LayerEntry;
+use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::key::Key;
 use crate::process;
-use crate::workshop::Workshop;
+use crate::workshop::BuildContext;
 
-/// All times in layers are clamped to this moment, and programs that honour SOURCE_DATE_EPOCH believe it is now:
-/// 2023-11-14, after the release of every distribution with ROS 1.
+/// Time to which all times in layers are clamped, and which programs that honour SOURCE_DATE_EPOCH take as the current
+/// time: 2023-11-14, after the release of every distribution with ROS 1.
 pub(crate) const EPOCH: u64 = 1_700_000_000;
 
-/// What mmdebstrap copies from the host or leaves out, and every image should have the same.
+/// Files that mmdebstrap copies from the host or leaves out, and that must be equal in every image.
 const FILES: [(&str, &str); 4] = [
     ("etc/hosts", "127.0.0.1 localhost\n"),
     ("etc/hostname", "localhost\n"),
@@ -28,7 +28,7 @@ const FILES: [(&str, &str); 4] = [
     ("etc/machine-id", ""),
 ];
 
-/// How trees become layers here.
+/// Returns the options for packing trees into layers.
 pub(crate) fn tree_options(base: &Base) -> TreeOptions {
     TreeOptions {
         exclude: base
@@ -38,39 +38,39 @@ pub(crate) fn tree_options(base: &Base) -> TreeOptions {
             .map(|path| path.trim_start_matches('/').to_owned())
             .collect(),
         mtime: Mtime::Clamp(EPOCH),
-        // Hundreds of megabytes: four times as fast as the default level, and a fifth larger.
+        // For hundreds of megabytes: four times as fast as the default level, and 20 % larger.
         level: 1,
         ..TreeOptions::default()
     }
 }
 
-/// What the base will consist of, by the lists at hand. Remembered: apt takes seconds.
-pub(crate) async fn resolve(
-    shop: &Workshop,
+/// Resolves the packages of the base with the current lists. Cached, since apt takes seconds.
+pub(crate) async fn resolve_base(
+    shop: &BuildContext,
     archive: &Archive,
     base: &Base,
 ) -> Result<Vec<Deb>, Error> {
     let mut names: BTreeSet<String> = base.runtime.packages.iter().cloned().collect();
-    // What mmdebstrap's minbase adds.
+    // Added by mmdebstrap's minbase variant.
     names.extend(["?essential".to_owned(), "apt".to_owned()]);
     let note = Key::new("base-resolved")
-        .with("archive", &archive.stamp)
-        .with_all("package", &names)
+        .input("archive", &archive.stamp)
+        .inputs("package", &names)
         .finish();
-    if let Some(debs) = shop.layers.note(&note) {
+    if let Some(debs) = shop.layers.read_note(&note) {
         return Ok(debs);
     }
     let debs = archive
         .apt
         .resolve(None, &names)
         .await
-        .map_err(|error| lacking(error, archive, base))?;
-    shop.layers.keep_note(&note, &debs)?;
+        .map_err(|error| explain_missing_packages(error, archive, base))?;
+    shop.layers.write_note(&note, &debs)?;
     Ok(debs)
 }
 
-/// Where apt cannot install a base, most often the archive is another one than it is made of.
-fn lacking(error: Error, archive: &Archive, base: &Base) -> Error {
+/// Explains a failure to install a base: most often the archive is not the one that the base is made for.
+fn explain_missing_packages(error: Error, archive: &Archive, base: &Base) -> Error {
     let packages = base.runtime.packages.iter();
     let missing: Vec<&str> = packages
         .filter(|name| !archive.candidates.contains(name))
@@ -85,32 +85,32 @@ fn lacking(error: Error, archive: &Archive, base: &Base) -> Error {
     }
 }
 
-/// Names the layer by what goes into it.
-pub(crate) fn key(base: &Base, debs: &[Deb]) -> String {
+/// Returns the cache key of the base layer.
+pub(crate) fn base_key(base: &Base, debs: &[Deb]) -> String {
     let mut names: Vec<String> = debs.iter().map(Deb::to_string).collect();
     names.sort();
     Key::new("base")
-        .with("system", base.system_key())
-        .with_all("deb", names)
+        .input("system", base.system_key())
+        .inputs("deb", names)
         .finish()
 }
 
-/// Makes the base layer.
-pub(crate) async fn make(
-    shop: &Workshop,
+/// Creates the base layer.
+pub(crate) async fn make_base_layer(
+    shop: &BuildContext,
     base: &Base,
     sources: &str,
     progress: &Progress,
-) -> Result<Entry, Error> {
+) -> Result<LayerEntry, Error> {
     progress
         .step(&format!(
             "bootstrapping base {} (once; about a minute)",
             base.name
         ))
         .await;
-    let root = shop.site.fresh("base")?;
+    let root = shop.site.fresh_directory("base")?;
     let list = root.join("sources.list");
-    fs::write(&list, sources).at("writing", &list)?;
+    fs::write(&list, sources).io_context("writing", &list)?;
     let tree = root.join("tree");
     let mut command = process::command("mmdebstrap");
     command
@@ -145,25 +145,25 @@ pub(crate) async fn make(
     };
     let (result, ()) = tokio::join!(work, forward);
     result?;
-    let status = installed(&tree)?;
+    let status = installed_packages(&tree)?;
     progress.step("packing the base layer").await;
     let store = shop.layers.store().clone();
     let options = tree_options(base);
     let layer = crate::blocking::spawn(move || -> Result<_, Error> {
-        normalise(&tree)?;
+        normalize_tree(&tree)?;
         let layer = store.layer_from_tree(&tree, &options)?;
         foreign::remove(&root)?;
         Ok(layer)
     })
     .await??;
-    Ok(Entry {
+    Ok(LayerEntry {
         layer: Some(layer),
         made_from: status,
     })
 }
 
-/// The same content on every host.
-fn normalise(tree: &Path) -> Result<(), Error> {
+/// Makes the content independent of the host.
+fn normalize_tree(tree: &Path) -> Result<(), Error> {
     for (name, text) in FILES {
         let path = tree.join(name);
         // It may be a link to somewhere on the host.
@@ -173,21 +173,21 @@ fn normalise(tree: &Path) -> Result<(), Error> {
             }
             _ => {}
         }
-        fs::write(&path, text).at("writing", &path)?;
+        fs::write(&path, text).io_context("writing", &path)?;
     }
     Ok(())
 }
 
-/// `name=version:architecture` of every package that a tree's dpkg knows as installed, sorted.
-pub(crate) fn installed(tree: &Path) -> Result<Vec<String>, Error> {
+/// Returns `name=version:architecture` of every package installed in a tree according to dpkg, sorted.
+pub(crate) fn installed_packages(tree: &Path) -> Result<Vec<String>, Error> {
     let path = tree.join("var/lib/dpkg/status");
-    let text = fs::read_to_string(&path).at("reading", &path)?;
-    let mut all: Vec<String> = text.split("\n\n").filter_map(stanza).collect();
+    let text = fs::read_to_string(&path).io_context("reading", &path)?;
+    let mut all: Vec<String> = text.split("\n\n").filter_map(parse_installed).collect();
     all.sort();
     Ok(all)
 }
 
-fn stanza(text: &str) -> Option<String> {
+fn parse_installed(text: &str) -> Option<String> {
     let field = |name: &str| {
         text.lines()
             .find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
@@ -214,7 +214,7 @@ mod tests {
         fs::write(&outside, "the host's").expect("written");
         std::os::unix::fs::symlink(&outside, etc.join("resolv.conf")).expect("linked");
         fs::write(etc.join("hostname"), "build-host-7\n").expect("written");
-        normalise(tree.path()).expect("done");
+        normalize_tree(tree.path()).expect("done");
         assert_eq!(
             fs::read_to_string(etc.join("hosts")).expect("there"),
             "127.0.0.1 localhost\n"
@@ -243,7 +243,7 @@ mod tests {
         )
         .expect("written");
         assert_eq!(
-            installed(tree.path()).expect("read"),
+            installed_packages(tree.path()).expect("read"),
             ["a=1:1-1:amd64", "b=2:all"]
         );
     }

@@ -1,4 +1,4 @@
-//! What the three ways of pushing have in common: layers on layers, and the image at the end.
+//! Common steps of the three kinds of push: stacking layers and writing the image.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -6,80 +6,83 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use image::{Digest, ImageSpec};
-use package::inventory::{Inventory, Published};
+use package::inventory::{Inventory, SearchHints};
 use ros::flavour::Version;
 
-use crate::advice::{self, Known};
+use crate::advice::{self, AdviceIndex};
 use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::error::Error;
 use crate::event::Progress;
 use crate::indexed;
-use crate::install::{self, Addition, Made};
+use crate::install::{self, LayerAddition, LayerSet};
 use crate::key::Key;
 use crate::keys;
-use crate::launch::{self, Ask, LaunchPlan};
+use crate::launch::{self, LaunchPlan, LaunchQuery};
 use crate::pushed;
 use crate::request::{BuildOutcome, BuiltLayer, PushRequest};
 use crate::undeclared;
-use crate::workshop::{Layer, Workshop};
+use crate::workshop::{BuildContext, StagedLayer};
 
-/// Where dpkg writes down what is installed.
+/// Status file of dpkg.
 const STATUS: &str = "var/lib/dpkg/status";
 
-/// A push that is being built, its base layer made.
+/// A build in progress, whose base layer exists.
 pub(crate) struct Build<'a> {
-    pub(crate) shop: Workshop,
+    pub(crate) shop: BuildContext,
     pub(crate) base: Base,
     pub(crate) archive: Arc<Archive>,
-    pub(crate) base_layer: Made,
+    pub(crate) base_layer: LayerSet,
     pub(crate) request: &'a PushRequest,
     pub(crate) progress: &'a Progress,
     pub(crate) log: PathBuf,
 }
 
-/// What one of them found and made.
-pub(crate) struct Parts {
-    /// ROS packages that the push is about, most important first.
+/// Result of one kind of push.
+pub(crate) struct BuildParts {
+    /// ROS packages of the push, most important first.
     pub(crate) packages: Vec<String>,
-    /// Theirs, as far as they are known.
+    /// Versions of these packages, as far as known.
     pub(crate) versions: BTreeMap<String, String>,
-    pub(crate) dependencies: Made,
-    /// Nothing where the dependencies are all.
-    pub(crate) package: Made,
-    /// Its install space; none for one below `/usr`.
+    pub(crate) dependencies: LayerSet,
+    /// Empty if the dependencies are everything.
+    pub(crate) package: LayerSet,
+    /// Prefix of its install space; `None` for one below `/usr`.
     pub(crate) prefix: Option<PathBuf>,
 }
 
 impl Build<'_> {
-    /// The base layer alone, as what others are put on.
-    pub(crate) fn on_base(&self) -> Vec<Digest> {
+    /// Returns the base layers, on which others are stacked.
+    pub(crate) fn base_diff_ids(&self) -> Vec<Digest> {
         self.base_layer.diff_ids().collect()
     }
 
-    /// ROS packages of ROS 2 that are in these layers.
-    pub(crate) async fn indexed(&self, layers: &[Digest]) -> Result<BTreeSet<String>, Error> {
-        let trees = self.shop.extracted(layers).await?;
-        indexed::packages(&self.base, trees).await
+    /// Returns the ROS 2 packages in these layers.
+    pub(crate) async fn indexed_packages(
+        &self,
+        layers: &[Digest],
+    ) -> Result<BTreeSet<String>, Error> {
+        let trees = self.shop.extract_layers(layers).await?;
+        indexed::find_packages(&self.base, trees).await
     }
 
-    /// Layers with these Debian packages, and what they need, on top of `below`.
-    pub(crate) async fn add(
+    /// Adds layers with these Debian packages and their dependencies on top of `below`.
+    pub(crate) async fn add_packages(
         &self,
         name: &'static str,
         below: &[Digest],
         packages: &BTreeSet<String>,
-        extras: Vec<crate::deb::Member>,
-    ) -> Result<Made, Error> {
+        extras: Vec<crate::deb::DebMember>,
+    ) -> Result<LayerSet, Error> {
         let debs = self.resolve(below, packages).await?;
-        let addition = Addition {
+        let addition = LayerAddition {
             name,
             below,
             debs,
             extras,
         };
-        install::layers(
+        install::add_layers(
             &self.shop,
             &self.archive,
             &self.base,
@@ -89,7 +92,7 @@ impl Build<'_> {
         .await
     }
 
-    /// What is to be installed on top of `below`. Remembered: apt takes seconds.
+    /// Resolves the packages to install on top of `below`. Cached, since apt takes seconds.
     async fn resolve(
         &self,
         below: &[Digest],
@@ -99,18 +102,18 @@ impl Build<'_> {
             return Ok(Vec::new());
         }
         let key = Key::new("resolved")
-            .with("archive", &self.archive.stamp)
-            .with_all("below", below.iter().map(Digest::to_string))
-            .with_all("package", packages)
+            .input("archive", &self.archive.stamp)
+            .inputs("below", below.iter().map(Digest::to_string))
+            .inputs("package", packages)
             .finish();
-        if let Some(debs) = self.shop.layers.note(&key) {
+        if let Some(debs) = self.shop.layers.read_note(&key) {
             return Ok(debs);
         }
-        let trees = self.shop.extracted(below).await?;
+        let trees = self.shop.extract_layers(below).await?;
         let status = trees
             .iter()
             .rev()
-            // In the layer itself: apt, which reads it out here, would follow a link to the host.
+            // Looked up in the layer itself: apt, which runs on the host, would follow a link to the host.
             .find(|tree| foreign::Tree::open(tree).is_ok_and(|tree| tree.has_file(STATUS)))
             .map(|tree| tree.join(STATUS));
         let debs = self
@@ -118,16 +121,16 @@ impl Build<'_> {
             .apt
             .resolve(status.as_deref(), packages)
             .await?;
-        self.shop.layers.keep_note(&key, &debs)?;
+        self.shop.layers.write_note(&key, &debs)?;
         Ok(debs)
     }
 
-    /// Names given with `--with`: ROS packages first, then Debian ones.
+    /// Returns the names given with `--with`: first ROS packages, then Debian packages.
     pub(crate) async fn extra_packages(
         &self,
     ) -> Result<(BTreeSet<String>, BTreeSet<String>), Error> {
         if self.base.ros != Version::Ros1 {
-            return Ok((BTreeSet::new(), self.extra_of_two().await?));
+            return Ok((BTreeSet::new(), self.ros2_extra_packages().await?));
         }
         let (mut ros, mut debs) = (BTreeSet::new(), BTreeSet::new());
         let mut missing = Vec::new();
@@ -158,33 +161,40 @@ impl Build<'_> {
         }
     }
 
-    /// The same on a base of ROS 2: Debian packages, without ROS packages that are there already.
-    async fn extra_of_two(&self) -> Result<BTreeSet<String>, Error> {
+    /// Returns the names given with `--with` on a base of ROS 2: Debian packages, without ROS packages that are already
+    /// there.
+    async fn ros2_extra_packages(&self) -> Result<BTreeSet<String>, Error> {
         if self.request.with.is_empty() {
             return Ok(BTreeSet::new());
         }
-        let there = self.indexed(&self.on_base()).await?;
+        let there = self.indexed_packages(&self.base_diff_ids()).await?;
         let (mut debs, mut missing) = (BTreeSet::new(), Vec::new());
         let wanted = self.request.with.iter();
         for name in wanted.filter(|name| !there.contains(*name)) {
-            match keys::named(&self.archive, &self.base, name) {
+            match keys::find_named_deb(&self.archive, &self.base, name) {
                 Some(deb) => {
                     debs.insert(deb);
                 }
-                None => missing.push(keys::unresolved(&self.archive, &self.base, name, "--with")),
+                None => missing.push(keys::unresolved_name(
+                    &self.archive,
+                    &self.base,
+                    name,
+                    "--with",
+                )),
             }
         }
-        match missing.is_empty() {
-            true => Ok(debs),
-            false => Err(Error::Unresolved(missing)),
+        if missing.is_empty() {
+            Ok(debs)
+        } else {
+            Err(Error::Unresolved(missing))
         }
     }
 
     /// Resolves what to run and writes the image.
     pub(crate) async fn finish(
         &self,
-        made: Parts,
-        hold: image::Hold,
+        made: BuildParts,
+        hold: image::GcHold,
     ) -> Result<BuildOutcome, Error> {
         let parts = [
             ("base", &self.base_layer),
@@ -194,12 +204,12 @@ impl Build<'_> {
         let parts = parts
             .into_iter()
             .flat_map(|(name, part)| part.layers.iter().map(move |layer| (name, *layer)));
-        let parts: Vec<(&'static str, Layer)> = parts.collect();
+        let parts: Vec<(&'static str, StagedLayer)> = parts.collect();
         let diff_ids: Vec<Digest> = parts.iter().map(|(_, layer)| layer.diff_id).collect();
-        let trees = self.shop.extracted(&diff_ids).await?;
+        let trees = self.shop.extract_layers(&diff_ids).await?;
         self.progress.step("resolving what to run").await;
         let request = self.request;
-        let ask = Ask {
+        let ask = LaunchQuery {
             packages: made.packages.clone(),
             prefix: made
                 .prefix
@@ -211,7 +221,7 @@ impl Build<'_> {
             remaps: request.remaps.clone(),
             params: request.params.clone(),
         };
-        let answer = launch::ask(
+        let answer = launch::query_plan(
             &self.shop,
             self.base.ros,
             trees.clone(),
@@ -219,34 +229,40 @@ impl Build<'_> {
             &ask,
         )
         .await
-        .map_err(|error| advice::on(error, Known::of(&self.archive, &self.base)))?;
+        .map_err(|error| {
+            advice::add_advice(error, AdviceIndex::for_base(&self.archive, &self.base))
+        })?;
         for warning in &answer.warnings {
             self.progress.warn(warning.as_str()).await;
         }
         let mut environment = self.base.environment.clone();
         environment.extend(answer.environment);
-        // Where it works is made when it is run.
+        // The home directory is set when it is run.
         let flavour = self.base.flavour();
         for name in flavour.environment("").keys() {
             environment.remove(name);
         }
-        let package = pushed::subject(&made.packages, &answer.nodes);
+        let package = pushed::main_package(&made.packages, &answer.nodes);
         let version = made.versions.get(&package).cloned().unwrap_or_default();
         let of = (package.clone(), environment.clone(), answer.nodes.clone());
         let known = (self.archive.clone(), self.base.clone());
-        let (inventory, undeclared) = crate::blocking::reading(move || {
+        let (inventory, undeclared) = crate::blocking::spawn_reader(move || {
             let (package, environment, nodes) = of;
             let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
-            let of = Published {
+            let of = SearchHints {
                 package: &package,
                 environment: &environment,
                 commands: &commands,
             };
-            let inventory = Inventory::take(&trees, of)?;
+            let inventory = Inventory::scan(&trees, of)?;
             let (archive, base) = known;
             let undeclared = match base.ros {
-                Version::Ros1 => undeclared::advice(&trees, &inventory, Known::of(&archive, &base)),
-                // Its programs are made by setuptools, and import their packages by name.
+                Version::Ros1 => undeclared::missing_module_advice(
+                    &trees,
+                    &inventory,
+                    AdviceIndex::for_base(&archive, &base),
+                ),
+                // Its programs are created by setuptools and import their packages by name.
                 Version::Ros2 => Vec::new(),
             };
             Ok::<_, Error>((inventory, undeclared))
@@ -256,7 +272,7 @@ impl Build<'_> {
             self.progress.warn(words).await;
         }
         launch::check_composition(&answer.components, &inventory.definitions)?;
-        let layers = self.packed(parts).await?;
+        let layers = self.pack_layers(parts).await?;
         let spec = ImageSpec {
             layers: layers.iter().map(|layer| layer.info).collect(),
             env: environment.clone(),
@@ -275,7 +291,7 @@ impl Build<'_> {
         };
         let store = self.shop.layers.store().clone();
         let image = crate::blocking::spawn(move || store.put_image(&spec)).await??;
-        // A log that tells of no failure is of no use to anyone.
+        // The log of a successful build is not kept.
         let _ = fs::remove_file(&self.log);
         Ok(BuildOutcome {
             package,
@@ -294,12 +310,15 @@ impl Build<'_> {
         })
     }
 
-    /// The layers with their archives.
-    async fn packed(&self, parts: Vec<(&'static str, Layer)>) -> Result<Vec<BuiltLayer>, Error> {
+    /// Completes the layers with their archives.
+    async fn pack_layers(
+        &self,
+        parts: Vec<(&'static str, StagedLayer)>,
+    ) -> Result<Vec<BuiltLayer>, Error> {
         if self.shop.is_packing() {
             self.progress.step("packing the rest of the layers").await;
         }
-        self.shop.settled().await?;
+        self.shop.wait_until_packed().await?;
         let store = self.shop.layers.store().clone();
         tokio::task::spawn_blocking(move || {
             let whole = parts.into_iter().map(|(name, layer)| {

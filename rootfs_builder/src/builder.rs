@@ -1,4 +1,4 @@
-//! From a push to an image: which layers, in which order, from the cache or made now.
+//! The build pipeline from a push to an image: which layers, in which order, from the cache or built now.
 
 use std::collections::{BTreeSet, HashMap};
 use std::fs;
@@ -7,10 +7,10 @@ use std::sync::Arc;
 
 use image::{Digest, Store};
 use package::foreseen;
-use package::workspace::{Pushed, Workspace};
+use package::workspace::{PushedDirectory, Workspace};
 use ros::flavour::Version;
 use servant::sandbox::Sandbox;
-use servant::spec::Limits;
+use servant::spec::ResourceLimits;
 use tokio::sync::mpsc;
 
 use crate::apt::{Deb, Sources};
@@ -18,81 +18,81 @@ use crate::archive::Archive;
 use crate::base::{self, Base};
 use crate::bootstrap;
 use crate::build::Build;
-use crate::cache::{Entry, Layers};
-use crate::error::{Error, IoAt};
+use crate::cache::{LayerCache, LayerEntry};
+use crate::error::{Error, IoContext};
 use crate::event::{BuildEvent, Progress};
-use crate::indexed::Indexed;
-use crate::install::Made;
-use crate::removal::Removals;
-use crate::request::{BuildOutcome, PushRequest, Source};
-use crate::sandbox::{self, Site};
-use crate::workshop::{Push, Turns, Workshop};
+use crate::indexed::IndexedPackages;
+use crate::install::LayerSet;
+use crate::removal::PendingRemovals;
+use crate::request::{BuildOutcome, PushRequest, PushSource};
+use crate::sandbox::{self, BuildSite};
+use crate::workshop::{BuildContext, KeyLocks, PushLabel};
 use crate::{
     advice, blocking, choice, keys, launch, packaged, prebuilt, pushed, seal, source, sources,
     unused, wheels,
 };
 
-/// The base taken when none is named, for what can be built for ROS 1.
+/// Default base for packages that support ROS 1.
 pub const DEFAULT_BASE: &str = "bookworm-ros1";
 
-/// Logs of failed builds that are kept.
+/// Maximum number of logs of failed builds.
 const LOGS_KEPT: usize = 50;
 
-/// What a builder works with.
+/// Configuration of a builder.
 #[derive(Clone)]
 pub struct Config {
-    /// Shared between daemons: layers, downloaded packages, lists.
+    /// Cache shared between daemons: layers, downloaded packages, lists.
     pub cache_dir: PathBuf,
-    /// Bytes of layers and packages in it; beyond them those are removed that were not used for longest.
+    /// Maximum size of the layers and packages in the cache; those not used for longest are removed first.
     pub cache_bytes: u64,
-    /// Base definitions.
+    /// Directory of the base definitions.
     pub bases_dir: PathBuf,
-    /// Half-made things, one directory per build; swept by whoever starts the daemon.
+    /// Work directory, with a directory per build; cleaned up by the caller that starts the daemon.
     pub build_dir: PathBuf,
-    /// Complete logs of builds.
+    /// Directory of the complete build logs.
     pub logs_dir: PathBuf,
-    /// Where packages come from.
+    /// Package sources.
     pub sources: Sources,
-    /// Where images go.
+    /// Image store.
     pub store: Arc<Store>,
-    /// What runs programs of builds.
+    /// Runs the programs of builds.
     pub sandbox: Arc<dyn Sandbox>,
-    /// Limits of each sandbox. By default half of the machine's memory, 4096 processes and threads, and the cores that
-    /// servants leave.
-    pub limits: Limits,
+    /// Limits of each sandbox (default: half of the machine's memory, 4096 processes and threads, and the cores that
+    /// servants leave idle).
+    pub limits: ResourceLimits,
 }
 
-/// Makes images. Cheap to share in an `Arc`; several builds may run at once.
+/// Builds images. Cheap to share in an `Arc`; several builds may run concurrently.
 pub struct Builder {
     config: Config,
-    layers: Layers,
-    turns: Turns,
-    removals: Removals,
-    archives: tokio::sync::Mutex<HashMap<String, Opened>>,
+    layers: LayerCache,
+    turns: KeyLocks,
+    removals: PendingRemovals,
+    archives: tokio::sync::Mutex<HashMap<String, OpenedArchive>>,
 }
 
-/// A base with its archive, as the last push found them.
-struct Opened {
+/// A base with its archive, as of the last push.
+struct OpenedArchive {
     base: Base,
     archive: Arc<Archive>,
 }
 
-/// Where the layers to keep for a base are noted.
-pub(crate) fn kept(base: &str) -> String {
+/// Returns the key of the note with the layers to keep for a base.
+pub(crate) fn keep_note_key(base: &str) -> String {
     format!("keep-{base}")
 }
 
-enum What<'a> {
-    Tree(Pushed),
+enum PushContent<'a> {
+    Tree(PushedDirectory),
     Packaged(&'a str),
 }
 
-impl What<'_> {
-    /// The package that it is about, as far as that shows.
+impl PushContent<'_> {
+    /// Returns the main package, as far as known.
     fn name(&self) -> String {
         match self {
             Self::Tree(pushed) => {
-                let packages = pushed::by_importance(pushed.packages());
+                let packages = pushed::sort_by_importance(pushed.packages());
                 packages.into_iter().next().unwrap_or_default()
             }
             Self::Packaged(name) => (*name).to_owned(),
@@ -100,8 +100,8 @@ impl What<'_> {
     }
 }
 
-impl Opened {
-    fn of(base: &Base, archive: &Arc<Archive>) -> Self {
+impl OpenedArchive {
+    fn from_parts(base: &Base, archive: &Arc<Archive>) -> Self {
         Self {
             base: base.clone(),
             archive: archive.clone(),
@@ -113,20 +113,20 @@ impl Builder {
     /// Prepares the cache.
     pub fn new(config: Config) -> Result<Self, Error> {
         for path in [&config.cache_dir, &config.build_dir, &config.logs_dir] {
-            fs::create_dir_all(path).at("making", path)?;
+            fs::create_dir_all(path).io_context("making", path)?;
         }
-        let layers = Layers::new(&config.cache_dir, config.store.clone())?;
+        let layers = LayerCache::new(&config.cache_dir, config.store.clone())?;
         Ok(Self {
             config,
             layers,
-            turns: Turns::default(),
-            removals: Removals::default(),
+            turns: KeyLocks::default(),
+            removals: PendingRemovals::default(),
             archives: Default::default(),
         })
     }
 
-    /// Makes the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
-    /// directory is removed ([`Builder::removed`]). Nothing is tagged, so a failed build changes nothing for anyone.
+    /// Builds the image of a push. To cancel, drop the future: containers and blocking work are ended and the build's
+    /// directory is removed ([`Builder::wait_removed`]). Nothing is tagged, so a failed build has no effect on anyone.
     pub async fn build(
         &self,
         request: &PushRequest,
@@ -135,14 +135,14 @@ impl Builder {
         blocking::cancellable(self.make(request, events)).await
     }
 
-    /// Where layers and packages are kept.
+    /// Returns the directory of layers and packages.
     pub fn cache_dir(&self) -> &Path {
         &self.config.cache_dir
     }
 
-    /// Returns when the containers of a build have ended and its directory is removed.
-    pub async fn removed(&self, id: &str) {
-        self.removals.done(id).await;
+    /// Waits until the containers of a build have ended and its directory is removed.
+    pub async fn wait_removed(&self, id: &str) {
+        self.removals.wait(id).await;
     }
 
     async fn make(
@@ -153,8 +153,8 @@ impl Builder {
         let progress = &Progress::new(events);
         let store = self.config.store.clone();
         let hold = blocking::spawn(move || store.hold()).await??;
-        let choice::Chosen { base, note } = privilege::reading(|| {
-            choice::choose(
+        let choice::ChosenBase { base, note } = privilege::run_as_reader(|| {
+            choice::choose_base(
                 &self.config.bases_dir,
                 request.base.as_deref(),
                 &request.source,
@@ -163,7 +163,7 @@ impl Builder {
         if let Some(note) = note {
             progress.warn(note).await;
         }
-        let site = Site::new(
+        let site = BuildSite::new(
             &self.config.build_dir,
             &request.id,
             self.config.sandbox.clone(),
@@ -172,22 +172,22 @@ impl Builder {
         )?;
         // Before anything is downloaded: what was pushed may not be a package at all.
         let what = match &request.source {
-            Source::Tree(path) => {
-                let pushed = privilege::reading(|| pushed::inspect(path, &base))?;
-                if let Pushed::Source(workspace) = &pushed {
+            PushSource::Tree(path) => {
+                let pushed = privilege::run_as_reader(|| pushed::inspect_pushed(path, &base))?;
+                if let PushedDirectory::Source(workspace) = &pushed {
                     ask_what_to_run(request, workspace, &base)?;
                     let tree = path.clone();
                     blocking::spawn(move || seal::seal(&tree)).await??;
                 }
-                What::Tree(pushed)
+                PushContent::Tree(pushed)
             }
-            Source::Packaged(name) => What::Packaged(name),
+            PushSource::Packaged(name) => PushContent::Packaged(name),
         };
-        let push = Push {
+        let push = PushLabel {
             id: request.id.clone(),
             name: request.name.clone().unwrap_or_else(|| what.name()),
         };
-        let shop = Workshop::new(
+        let shop = BuildContext::new(
             site,
             self.layers.clone(),
             self.turns.clone(),
@@ -196,11 +196,11 @@ impl Builder {
         );
         let archive = self.archive(&shop, &base, progress).await?;
         match &what {
-            What::Tree(pushed) => early(&archive, &base, request, pushed)?,
-            What::Packaged(_) => drop(keys::mapped(&archive, &base, &request.map)?),
+            PushContent::Tree(pushed) => check_dependencies(&archive, &base, request, pushed)?,
+            PushContent::Packaged(_) => drop(keys::mapped_packages(&archive, &base, &request.map)?),
         }
         let (base_layer, archive) = self.base_layer(&shop, &base, archive, progress).await?;
-        let base_layer = wheels::on_base(&shop, &base, base_layer, progress).await?;
+        let base_layer = wheels::add_runtime_wheels(&shop, &base, base_layer, progress).await?;
         let log = self.config.logs_dir.join(format!("{}.log", request.id));
         let build = Build {
             shop,
@@ -217,16 +217,20 @@ impl Builder {
         blocking::spawn(move || unused::sweep(&swept)).await?;
         let work = async {
             let made = match what {
-                What::Tree(Pushed::Source(workspace)) => source::build(&build, workspace).await?,
-                What::Tree(Pushed::Installed(space)) => prebuilt::build(&build, space).await?,
-                What::Packaged(name) => packaged::build(&build, name).await?,
+                PushContent::Tree(PushedDirectory::Source(workspace)) => {
+                    source::build(&build, workspace).await?
+                }
+                PushContent::Tree(PushedDirectory::Installed(space)) => {
+                    prebuilt::build(&build, space).await?
+                }
+                PushContent::Packaged(name) => packaged::build(&build, name).await?,
             };
             build.finish(made, hold).await
         };
         let outcome = work.await;
-        // What was installed and compiled before something failed is not lost: the next push begins there.
-        let settled = build.shop.settled().await;
-        // A failed build leaves as much in the cache.
+        // What was installed and compiled before a failure is kept: the next push continues there.
+        let settled = build.shop.wait_until_packed().await;
+        // A failed build also fills the cache.
         let most = self.config.cache_bytes;
         blocking::spawn(move || unused::shrink(&cache, most)).await?;
         let outcome = outcome?;
@@ -234,32 +238,32 @@ impl Builder {
         Ok(outcome)
     }
 
-    /// Finds in `words`, output of a node of an image on this base, what is missing, and the options of `push` that add it.
-    /// Empty if the output names nothing missing.
+    /// Finds missing dependencies in `words`, output of a node of an image on this base, and returns the `push` options
+    /// that add them. Empty if there are none.
     pub async fn advice(&self, base: &str, words: &str) -> Vec<String> {
-        // Nothing is read here: whoever asks may have no right to.
+        // Nothing is read from disk, since the caller may not be allowed to.
         let archives = self.archives.lock().await;
         match archives.get(base) {
-            Some(Opened { base, archive }) => {
-                advice::for_words(words, advice::Known::of(archive, base))
+            Some(OpenedArchive { base, archive }) => {
+                advice::advise_for_output(words, advice::AdviceIndex::for_base(archive, base))
             }
             None => Vec::new(),
         }
     }
 
-    /// Layers that no image needs and the next build will: bases and toolchains, by diff-id. For the store's garbage
-    /// collector to keep; without them they are imported from the cache again.
-    pub fn keep(&self) -> BTreeSet<Digest> {
+    /// Returns the layers that no image needs but the next build will, by diff-id: bases and toolchains. To be kept by
+    /// the store's garbage collector; otherwise they are imported from the cache again.
+    pub fn layers_to_keep(&self) -> BTreeSet<Digest> {
         let names = base::names(&self.config.bases_dir).unwrap_or_default();
         let notes = names
             .iter()
-            .filter_map(|name| self.layers.note::<Vec<Digest>>(&kept(name)));
+            .filter_map(|name| self.layers.read_note::<Vec<Digest>>(&keep_note_key(name)));
         notes.flatten().collect()
     }
 
     async fn archive(
         &self,
-        shop: &Workshop,
+        shop: &BuildContext,
         base: &Base,
         progress: &Progress,
     ) -> Result<Arc<Archive>, Error> {
@@ -271,38 +275,38 @@ impl Builder {
             return Ok(opened.archive.clone());
         }
         let scratch = shop.site.directory("sources")?;
-        let sources = sources::lines(&self.config.sources, base, &scratch).await?;
+        let sources = sources::source_lines(&self.config.sources, base, &scratch).await?;
         let archive =
             Arc::new(Archive::open(&self.config.cache_dir, sources, false, progress).await?);
-        archives.insert(base.name.clone(), Opened::of(base, &archive));
+        archives.insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
         Ok(archive)
     }
 
     async fn base_layer(
         &self,
-        shop: &Workshop,
+        shop: &BuildContext,
         base: &Base,
         archive: Arc<Archive>,
         progress: &Progress,
-    ) -> Result<(Made, Arc<Archive>), Error> {
-        let resolved = bootstrap::resolve(shop, &archive, base).await?;
-        let key = bootstrap::key(base, &resolved);
-        let _turn = shop.turn(&key).await;
-        if let Some(entry) = shop.cached(&key).await? {
-            return Ok((made_of(&entry, true), archive));
+    ) -> Result<(LayerSet, Arc<Archive>), Error> {
+        let resolved = bootstrap::resolve_base(shop, &archive, base).await?;
+        let key = bootstrap::base_key(base, &resolved);
+        let _turn = shop.lock_key(&key).await;
+        if let Some(entry) = shop.get_cached(&key).await? {
+            return Ok((to_layer_set(&entry, true), archive));
         }
-        let entry = bootstrap::make(shop, base, &archive.sources, progress).await?;
-        let (made, layer) = (made_of(&entry, false), entry.layer);
+        let entry = bootstrap::make_base_layer(shop, base, &archive.sources, progress).await?;
+        let (made, layer) = (to_layer_set(&entry, false), entry.layer);
         let present: BTreeSet<&String> = entry.made_from.iter().collect();
         let all_there = resolved
             .iter()
             .all(|deb| present.contains(&deb.to_string()));
-        shop.keep(&key, entry).await?;
+        shop.put_cached(&key, entry).await?;
         if all_there {
             return Ok((made, archive));
         }
-        // The archive has moved on since the lists were fetched: fetch them, so that what is resolved from now on
-        // fits, and know the layer by what is in it.
+        // The archive has changed since the lists were fetched: fetch them again, so that what is resolved from now on
+        // is consistent, and store the layer under what it contains.
         let archive = Arc::new(
             Archive::open(
                 &self.config.cache_dir,
@@ -315,63 +319,67 @@ impl Builder {
         self.archives
             .lock()
             .await
-            .insert(base.name.clone(), Opened::of(base, &archive));
-        let resolved = bootstrap::resolve(shop, &archive, base).await?;
+            .insert(base.name.clone(), OpenedArchive::from_parts(base, &archive));
+        let resolved = bootstrap::resolve_base(shop, &archive, base).await?;
         if let Some(layer) = layer {
             let made_from = resolved.iter().map(Deb::to_string).collect();
-            let entry = Entry {
+            let entry = LayerEntry {
                 layer: Some(layer),
                 made_from,
             };
-            shop.keep(&bootstrap::key(base, &resolved), entry).await?;
+            shop.put_cached(&bootstrap::base_key(base, &resolved), entry)
+                .await?;
         }
         Ok((made, archive))
     }
 }
 
-/// Asks what to run before time is spent on compiling, where the sources show that it will have to be asked. Blocking.
+/// Fails before compiling if the sources show that the push must state what to run. Blocking.
 fn ask_what_to_run(request: &PushRequest, workspace: &Workspace, base: &Base) -> Result<(), Error> {
     if request.launch.is_some() || !request.nodes.is_empty() {
         return Ok(());
     }
-    let foreseen = privilege::reading(|| foreseen::foresee(workspace, base.ros.bus()));
+    let foreseen =
+        privilege::run_as_reader(|| foreseen::scan_sources(workspace, base.ros.ros_version()));
     if !foreseen.must_be_chosen() {
         return Ok(());
     }
     Err(Error::NothingToRun {
-        executables: launch::list(&foreseen.executables),
-        launch_files: launch::list(&foreseen.launch_files),
-        more: "; nothing is compiled yet, so there may be others",
+        executables: launch::join_names(&foreseen.executables),
+        launch_files: launch::join_names(&foreseen.launch_files),
+        more: "; nothing is compiled yet, so there may be more",
     })
 }
 
-/// Says what nothing provides now, and not after minutes of preparations. Of ROS 2 much may be in a base that is not made
-/// yet: there it is said once that can be looked at.
-fn early(
+/// Reports unresolvable dependencies now and not after minutes of preparation. In ROS 2 many may be in a base that does
+/// not exist yet; there they are reported once it can be inspected.
+fn check_dependencies(
     archive: &Archive,
     base: &Base,
     request: &PushRequest,
-    pushed: &Pushed,
+    pushed: &PushedDirectory,
 ) -> Result<(), Error> {
     if base.ros != Version::Ros1 {
         return Ok(());
     }
     let own = pushed::names(pushed.packages());
-    let mut asked = pushed::asked(pushed.packages());
-    if matches!(pushed, Pushed::Installed(_)) {
+    let mut asked = pushed::required_keys(pushed.packages());
+    if matches!(pushed, PushedDirectory::Installed(_)) {
         asked.build.clear();
     }
-    let there = Indexed::default();
-    keys::resolve(archive, base, &request.map, &own, &asked, &there)?;
+    let there = IndexedPackages::default();
+    keys::resolve_keys(archive, base, &request.map, &own, &asked, &there)?;
     Ok(())
 }
 
-fn made_of(entry: &Entry, cached: bool) -> Made {
-    let layer = entry.layer.map(|layer| Made::one(layer.diff_id, cached));
+fn to_layer_set(entry: &LayerEntry, cached: bool) -> LayerSet {
+    let layer = entry
+        .layer
+        .map(|layer| LayerSet::single(layer.diff_id, cached));
     layer.unwrap_or_default()
 }
 
-/// Keeps the newest logs. Best effort: a log too many hurts nobody.
+/// Keeps the latest logs. Best effort: an extra log does no harm.
 fn sweep_logs(directory: &Path) {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
     let mut logs: Vec<_> = entries
@@ -393,16 +401,19 @@ fn sweep_logs(directory: &Path) {
 mod tests {
     use async_trait::async_trait;
     use servant::container::ContainerSpec;
-    use servant::sandbox::Sandboxed;
+    use servant::sandbox::SandboxContainer;
 
     use super::*;
 
-    /// No container is to be started.
-    struct Unasked;
+    /// A sandbox that must not be used.
+    struct UnusedSandbox;
 
     #[async_trait]
-    impl Sandbox for Unasked {
-        async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, servant::Error> {
+    impl Sandbox for UnusedSandbox {
+        async fn start_sandbox(
+            &self,
+            spec: ContainerSpec,
+        ) -> Result<SandboxContainer, servant::Error> {
             panic!("container {} is started", spec.id)
         }
     }
@@ -420,8 +431,8 @@ mod tests {
             logs_dir: at("logs"),
             sources: Sources::default(),
             store: Arc::new(store),
-            sandbox: Arc::new(Unasked),
-            limits: Limits::default(),
+            sandbox: Arc::new(UnusedSandbox),
+            limits: ResourceLimits::default(),
         })
         .expect("prepared");
         let trees = [
@@ -442,7 +453,7 @@ mod tests {
                 fs::create_dir_all(&tree).expect("made");
                 let request = PushRequest {
                     id: "p1".to_owned(),
-                    source: Source::Tree(tree),
+                    source: PushSource::Tree(tree),
                     base: base.map(str::to_owned),
                     ..PushRequest::default()
                 };

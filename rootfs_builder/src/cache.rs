@@ -1,5 +1,5 @@
-//! Layers by what they were made from: a file per key that names the layer, and the layer itself as `tar.gz`, so
-//! that another daemon's store imports it instead of making it again.
+//! Cache of layers by their inputs: a file per key that names the layer, and the layer itself as `tar.gz`, which other
+//! daemons import into their store instead of building it again.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,31 +9,31 @@ use image::{LayerInfo, Store};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::unused;
 
-/// The cache and the store that it fills.
+/// The layer cache and its image store.
 #[derive(Clone)]
-pub(crate) struct Layers {
+pub(crate) struct LayerCache {
     directory: PathBuf,
     notes: PathBuf,
     store: Arc<Store>,
 }
 
-/// What is known of a layer besides its bytes.
+/// A cached layer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Entry {
-    /// The layer; none where its inputs make no difference to what is below.
+pub(crate) struct LayerEntry {
+    /// The layer; `None` if its inputs do not change what is below.
     pub(crate) layer: Option<LayerInfo>,
-    /// For people: what went in.
+    /// Human-readable list of the inputs.
     pub(crate) made_from: Vec<String>,
 }
 
-impl Layers {
+impl LayerCache {
     pub(crate) fn new(cache: &Path, store: Arc<Store>) -> Result<Self, Error> {
         let (directory, notes) = (cache.join("layers"), cache.join("notes"));
         for path in [&directory, &notes] {
-            fs::create_dir_all(path).at("making", path)?;
+            fs::create_dir_all(path).io_context("making", path)?;
         }
         Ok(Self {
             directory,
@@ -46,17 +46,17 @@ impl Layers {
         &self.store
     }
 
-    /// The directory of everything cached.
+    /// Returns the directory of the whole cache.
     pub(crate) fn cache(&self) -> &Path {
         self.directory.parent().unwrap_or(&self.directory)
     }
 
-    /// Whether [`Layers::get`] would find a layer, which then need not be in the store yet. Blocking.
-    pub(crate) fn has(&self, key: &str) -> bool {
+    /// Returns whether [`LayerCache::get`] would find a layer, which need not be in the store yet. Blocking.
+    pub(crate) fn contains(&self, key: &str) -> bool {
         let (about, archive) = self.paths(key);
         let entry = fs::read(&about)
             .ok()
-            .and_then(|text| serde_json::from_slice::<Entry>(&text).ok());
+            .and_then(|text| serde_json::from_slice::<LayerEntry>(&text).ok());
         match entry.map(|entry| entry.layer) {
             None => false,
             Some(None) => true,
@@ -73,20 +73,21 @@ impl Layers {
         )
     }
 
-    /// The layer of this key, in the store now. Damaged or half-removed entries count as absent. Blocking.
-    pub(crate) fn get(&self, key: &str) -> Result<Option<Entry>, Error> {
+    /// Returns the layer of a key, importing it into the store if needed. Damaged or incomplete entries count as
+    /// missing. Blocking.
+    pub(crate) fn get(&self, key: &str) -> Result<Option<LayerEntry>, Error> {
         let (about, archive) = self.paths(key);
         let Ok(text) = fs::read(&about) else {
             return Ok(None);
         };
-        let Ok(entry) = serde_json::from_slice::<Entry>(&text) else {
+        let Ok(entry) = serde_json::from_slice::<LayerEntry>(&text) else {
             return Ok(None);
         };
         let Some(layer) = entry.layer else {
             return Ok(Some(entry));
         };
-        unused::used(&about);
-        unused::used(&archive);
+        unused::mark_used(&about);
+        unused::mark_used(&archive);
         if self.store.layer(&layer.diff_id)?.is_some() {
             return Ok(Some(entry));
         }
@@ -94,48 +95,48 @@ impl Layers {
             return Ok(None);
         }
         match self.store.import_layer(&archive) {
-            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(Entry {
+            Ok(found) if found.diff_id == layer.diff_id => Ok(Some(LayerEntry {
                 layer: Some(found),
                 ..entry
             })),
             Ok(_) | Err(image::Error::Archive { .. }) => {
-                tracing::warn!(path = %archive.display(), "a cached layer is damaged and will be made again");
+                tracing::warn!(path = %archive.display(), "a cached layer is damaged and will be rebuilt");
                 Ok(None)
             }
             Err(error) => Err(error.into()),
         }
     }
 
-    /// A small result that took long to find.
-    pub(crate) fn note<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
+    /// Returns a cached note: a small result that is expensive to compute.
+    pub(crate) fn read_note<T: DeserializeOwned>(&self, key: &str) -> Option<T> {
         let path = self.notes.join(key);
         let value = serde_json::from_slice(&fs::read(&path).ok()?).ok()?;
-        unused::used(&path);
+        unused::mark_used(&path);
         Some(value)
     }
 
-    /// Keeps one.
-    pub(crate) fn keep_note<T: Serialize>(&self, key: &str, value: &T) -> Result<(), Error> {
-        write_whole(
+    /// Stores a note.
+    pub(crate) fn write_note<T: Serialize>(&self, key: &str, value: &T) -> Result<(), Error> {
+        write_atomically(
             &self.notes.join(key),
             &serde_json::to_vec(value).unwrap_or_default(),
         )
     }
 
-    /// Keeps a layer that is in the store. Blocking.
-    pub(crate) fn put(&self, key: &str, entry: &Entry) -> Result<(), Error> {
+    /// Stores a layer that is in the image store. Blocking.
+    pub(crate) fn insert(&self, key: &str, entry: &LayerEntry) -> Result<(), Error> {
         let (about, archive) = self.paths(key);
         if let Some(layer) = &entry.layer {
             self.store.export_layer(&layer.diff_id, &archive)?;
         }
-        write_whole(
+        write_atomically(
             &about,
             &serde_json::to_vec_pretty(entry).unwrap_or_default(),
         )
     }
 }
 
-/// Writes a file that appears whole or not at all.
-pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    Ok(image::write_whole(path, bytes)?)
+/// Writes a file atomically.
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), Error> {
+    Ok(image::write_atomically(path, bytes)?)
 }

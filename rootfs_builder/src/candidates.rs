@@ -1,20 +1,21 @@
-//! The packages that an archive offers: one version of each, the one that apt would take.
+//! Installable packages of an archive: one version of each, the one that apt would choose.
 
 use std::fmt::Write;
 
 use crate::apt::Deb;
 
-/// Sixty thousand of them, as sorted lines of one text: in memory once for as long as a daemon runs.
+/// About sixty thousand packages, stored as sorted lines of a single text, since they stay in memory as long as the
+/// daemon runs.
 #[derive(Debug, Clone, Default)]
 pub struct Candidates {
-    /// `NAME VERSION ARCHITECTURE`
+    /// Lines of `NAME VERSION ARCHITECTURE`.
     text: String,
-    /// Where each line begins.
+    /// Start of each line.
     starts: Vec<u32>,
 }
 
 impl Candidates {
-    /// From what [`Candidates::lines`] gave. Lines out of order are left out.
+    /// Parses the result of [`Candidates::as_text`]. Lines out of order are left out.
     pub(crate) fn from_lines(text: &str) -> Self {
         let mut candidates = Self::default();
         let mut before = "";
@@ -36,8 +37,8 @@ impl Candidates {
         }
     }
 
-    /// To be kept in a file.
-    pub(crate) fn lines(&self) -> &str {
+    /// Returns the text form, for a file.
+    pub(crate) fn as_text(&self) -> &str {
         &self.text
     }
 
@@ -50,7 +51,7 @@ impl Candidates {
         self.line(start).split(' ').next().unwrap_or_default()
     }
 
-    /// The candidate of this name.
+    /// Returns the candidate with this name.
     pub fn get(&self, name: &str) -> Option<Deb> {
         let found = self
             .starts
@@ -64,19 +65,19 @@ impl Candidates {
         })
     }
 
-    /// Whether there is one of this name.
+    /// Returns whether a candidate has this name.
     pub fn contains(&self, name: &str) -> bool {
         self.get(name).is_some()
     }
 
-    /// All names, sorted.
+    /// Returns all names, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.starts.iter().map(|start| self.name(*start))
     }
 }
 
 impl FromIterator<Deb> for Candidates {
-    /// Of several of one name the first is taken.
+    /// Collects candidates; of several with one name the first is used.
     fn from_iter<T: IntoIterator<Item = Deb>>(debs: T) -> Self {
         let mut debs: Vec<Deb> = debs.into_iter().collect();
         debs.sort_by(|a, b| a.name.cmp(&b.name));
@@ -97,8 +98,8 @@ impl FromIterator<Deb> for Candidates {
 pub(crate) mod tests {
     use super::*;
 
-    /// Candidates of these names.
-    pub(crate) fn named(names: &[&str]) -> Candidates {
+    /// Returns candidates with these names.
+    pub(crate) fn candidates_named(names: &[&str]) -> Candidates {
         let deb = |name: &&str| Deb {
             name: (*name).to_owned(),
             version: "1".into(),
@@ -109,10 +110,10 @@ pub(crate) mod tests {
 
     #[test]
     fn candidates_are_found_by_name_and_survive_a_file() {
-        // As strings, `a+b` and `a-b` lie on both sides of `a b`; as names they come after `a`.
+        // As strings, `a+b` and `a-b` sort on both sides of `a b`; as names they sort after `a`.
         let names = ["zlib1g", "a-b", "a", "a+b", "a.b", "a0"];
-        let made = named(&names);
-        let read = Candidates::from_lines(made.lines());
+        let made = candidates_named(&names);
+        let read = Candidates::from_lines(made.as_text());
         for candidates in [made, read] {
             for name in names {
                 assert_eq!(

@@ -1,13 +1,13 @@
-//! Layers of packages that stand on one another, and which of them a new set of packages can be put on.
+//! Chains of package layers, and the search for a chain that a new set of packages can extend.
 //!
 //! ```text
 //!    base ◀── link {a, b} ◀── link {c}          for {a, b, c, d}: the chain {a, b} {c}, and a new link {d} on it;
 //!                        ╰─── link {e}          for {a, b, d}:    the chain {a, b}, and a new link {d} on it
 //! ```
 //!
-//! A link's key is made of what it stands on (the key of the link below it, or the layers below the whole chain) and
-//! of exactly what it adds, so that one name never means two contents. Its record tells both and is believed only
-//! where it gives the key that it is named by.
+//! The key of a link is computed from what is below it (the key of the link below, or the layers below the whole chain)
+//! and from exactly what it adds, so that a name never has two meanings. Its record contains both and is trusted only
+//! if it yields the key that it is stored under.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -16,40 +16,40 @@ use std::path::{Path, PathBuf};
 use image::Digest;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::write_whole;
-use crate::error::{Error, IoAt};
+use crate::cache::write_atomically;
+use crate::error::{Error, IoContext};
 use crate::key::Key;
 use crate::unused;
 
-/// The most links that are put on each other: what an image has besides its base and package layers. Registries and
-/// the kernel allow more, but each costs every lookup of a file a little.
+/// Maximum number of links in a chain, in addition to the base and package layers of an image. Registries and the
+/// kernel allow more, but each link slows down file lookups a little.
 pub(crate) const MOST_LINKS: usize = 8;
 
-/// One layer of a chain.
+/// A layer in a chain.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Link {
-    /// Key of the link below; none for the first.
+    /// Key of the link below; `None` for the first.
     pub(crate) parent: Option<String>,
-    /// What it adds: packages at versions, and single files.
+    /// Items that it adds: packages at versions, and single files.
     pub(crate) items: BTreeSet<String>,
-    /// Bytes of the layer: what reusing it saves.
+    /// Size of the layer in bytes, which is saved by reusing it.
     pub(crate) bytes: u64,
 }
 
-/// All chains on the same layers below.
+/// All chains on the same layers.
 pub(crate) struct Chains {
     directory: PathBuf,
-    /// What all keys begin with.
+    /// Common prefix of all keys.
     ground: String,
 }
 
 impl Chains {
-    /// Chains of `kind` in a cache, on these layers below, in a system of this key.
+    /// Creates the chains of `kind` in a cache, on these layers, in a system with this key.
     pub(crate) fn new(cache: &Path, kind: &str, system: &str, below: &[Digest]) -> Self {
         let ground = Key::new("install")
-            .with("kind", kind)
-            .with("system", system)
-            .with_all("below", below.iter().map(Digest::to_string))
+            .input("kind", kind)
+            .input("system", system)
+            .inputs("below", below.iter().map(Digest::to_string))
             .finish();
         Self {
             directory: cache.join("chains").join(&ground),
@@ -57,38 +57,38 @@ impl Chains {
         }
     }
 
-    /// The key of a link.
+    /// Returns the key of a link.
     pub(crate) fn key(&self, parent: Option<&str>, items: &BTreeSet<String>) -> String {
         Key::new("link")
-            .with("ground", &self.ground)
-            .with("parent", parent.unwrap_or_default())
-            .with_all("item", items)
+            .input("ground", &self.ground)
+            .input("parent", parent.unwrap_or_default())
+            .inputs("item", items)
             .finish()
     }
 
-    /// Where it is remembered which chain a whole set got.
-    pub(crate) fn memo(&self, items: &BTreeSet<String>) -> String {
+    /// Returns the key of the note with the chain used for a whole set.
+    pub(crate) fn memo_key(&self, items: &BTreeSet<String>) -> String {
         Key::new("chain")
-            .with("ground", &self.ground)
-            .with_all("item", items)
+            .input("ground", &self.ground)
+            .inputs("item", items)
             .finish()
     }
 
-    /// Records a link whose layer is in the cache. Blocking.
-    pub(crate) fn keep(&self, key: &str, link: &Link) -> Result<(), Error> {
-        fs::create_dir_all(&self.directory).at("making", &self.directory)?;
+    /// Writes the record of a link whose layer is in the cache. Blocking.
+    pub(crate) fn write_link(&self, key: &str, link: &Link) -> Result<(), Error> {
+        fs::create_dir_all(&self.directory).io_context("making", &self.directory)?;
         let text = serde_json::to_vec(link).unwrap_or_default();
-        write_whole(&self.directory.join(format!("{key}.json")), &text)
+        write_atomically(&self.directory.join(format!("{key}.json")), &text)
     }
 
-    /// Notes that these links are in use.
-    pub(crate) fn used(&self, keys: &[String]) {
+    /// Marks links as used.
+    pub(crate) fn mark_used(&self, keys: &[String]) {
         for key in keys {
-            unused::used(&self.directory.join(format!("{key}.json")));
+            unused::mark_used(&self.directory.join(format!("{key}.json")));
         }
     }
 
-    /// All links there are, by key. Records that are damaged or do not fit their name count as absent.
+    /// Returns all links by key. Records that are damaged or inconsistent with their name count as missing.
     fn links(&self) -> BTreeMap<String, Link> {
         let mut links = BTreeMap::new();
         for entry in fs::read_dir(&self.directory)
@@ -108,22 +108,26 @@ impl Chains {
                     links.insert(key.to_owned(), link);
                 }
                 _ => {
-                    tracing::warn!(path = %entry.path().display(), "a record of a cached layer is damaged and not used");
+                    tracing::warn!(path = %entry.path().display(), "a record of a cached layer is \
+                                                                    damaged and not used");
                 }
             }
         }
         links
     }
 
-    /// Chains all of whose items are among `wanted`, as keys, lowest first: those with the most bytes first, then the
-    /// shorter ones. Blocking.
-    pub(crate) fn within(&self, wanted: &BTreeSet<String>) -> Vec<Found> {
+    /// Returns the chains whose items are all in `wanted`: those with the most bytes first, then the shorter ones.
+    /// Blocking.
+    pub(crate) fn find_subsets(&self, wanted: &BTreeSet<String>) -> Vec<FoundChain> {
         let links = self.links();
         let fits: BTreeMap<&String, &Link> = links
             .iter()
             .filter(|(_, link)| link.items.is_subset(wanted))
             .collect();
-        let mut found: Vec<Found> = fits.keys().filter_map(|tip| chain(&fits, tip)).collect();
+        let mut found: Vec<FoundChain> = fits
+            .keys()
+            .filter_map(|tip| collect_chain(&fits, tip))
+            .collect();
         found.sort_by(|a, b| {
             (b.bytes, a.keys.len(), &a.keys).cmp(&(a.bytes, b.keys.len(), &b.keys))
         });
@@ -131,20 +135,20 @@ impl Chains {
     }
 }
 
-/// A chain.
+/// A chain of links.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Found {
+pub(crate) struct FoundChain {
     /// Keys of its links, lowest first.
     pub(crate) keys: Vec<String>,
-    /// All that it holds.
+    /// All items that it contains.
     pub(crate) items: BTreeSet<String>,
-    /// Bytes of its layers.
+    /// Total size of its layers in bytes.
     pub(crate) bytes: u64,
 }
 
-/// The chain that ends in `tip`, if all of it is there and it is no longer than chains may be.
-fn chain(links: &BTreeMap<&String, &Link>, tip: &str) -> Option<Found> {
-    let mut found = Found::default();
+/// Collects the chain that ends in `tip`, if it is complete and not too long.
+fn collect_chain(links: &BTreeMap<&String, &Link>, tip: &str) -> Option<FoundChain> {
+    let mut found = FoundChain::default();
     let mut next = Some(tip.to_owned());
     while let Some(key) = next {
         let link = links.get(&key)?;
@@ -167,18 +171,18 @@ mod tests {
         items.iter().map(|&item| item.to_owned()).collect()
     }
 
-    struct Lab {
+    struct ChainFixture {
         directory: tempfile::TempDir,
         chains: Chains,
     }
 
-    fn lab() -> Lab {
+    fn new_fixture() -> ChainFixture {
         let directory = tempfile::tempdir().expect("a directory");
         let chains = Chains::new(directory.path(), "dependencies", "system", &[]);
-        Lab { directory, chains }
+        ChainFixture { directory, chains }
     }
 
-    impl Lab {
+    impl ChainFixture {
         fn add(&self, parent: Option<&str>, items: &[&str], bytes: u64) -> String {
             let link = Link {
                 parent: parent.map(str::to_owned),
@@ -186,32 +190,32 @@ mod tests {
                 bytes,
             };
             let key = self.chains.key(parent, &link.items);
-            self.chains.keep(&key, &link).expect("kept");
+            self.chains.write_link(&key, &link).expect("kept");
             key
         }
 
         fn best(&self, wanted: &[&str]) -> Vec<String> {
-            let found = self.chains.within(&set(wanted)).into_iter().next();
+            let found = self.chains.find_subsets(&set(wanted)).into_iter().next();
             found.map(|found| found.keys).unwrap_or_default()
         }
     }
 
     #[test]
     fn the_largest_set_that_holds_nothing_else_is_taken() {
-        let lab = lab();
+        let lab = new_fixture();
         let ab = lab.add(None, &["a", "b"], 100);
         let abc = lab.add(Some(&ab), &["c"], 1);
         lab.add(Some(&ab), &["e"], 50);
         assert_eq!(lab.best(&["a", "b", "c", "d"]), [ab.clone(), abc]);
         assert_eq!(lab.best(&["a", "b", "d"]), [ab]);
-        // Something in every chain is not wanted.
+        // Every chain contains something that is not wanted.
         assert!(lab.best(&["b", "c", "d"]).is_empty());
         assert!(lab.best(&[]).is_empty());
     }
 
     #[test]
     fn keys_hold_all_that_a_link_stands_on() {
-        let lab = lab();
+        let lab = new_fixture();
         let (first, second) = (lab.add(None, &["a"], 1), lab.add(None, &["b"], 1));
         let of = |parent: Option<&str>| lab.chains.key(parent, &set(&["c"]));
         assert_ne!(of(Some(&first)), of(Some(&second)));
@@ -224,11 +228,11 @@ mod tests {
                 root,
                 "dependencies",
                 "system",
-                &[Digest::of("another base")],
+                &[Digest::compute("another base")],
             ),
         ] {
             assert_ne!(other.key(None, &set(&["c"])), of(None));
-            assert!(other.within(&set(&["a", "b"])).is_empty());
+            assert!(other.find_subsets(&set(&["a", "b"])).is_empty());
         }
         assert_ne!(
             lab.chains.key(None, &set(&["ab"])),
@@ -238,11 +242,11 @@ mod tests {
 
     #[test]
     fn records_that_do_not_fit_their_name_are_not_believed() {
-        let lab = lab();
+        let lab = new_fixture();
         let key = lab.add(None, &["a", "evil"], 1000);
         let path = lab.chains.directory.join(format!("{key}.json"));
         for text in [
-            // Made to look as if it were a layer of `a` alone.
+            // Forged to look like a layer of `a` alone.
             r#"{"parent":null,"items":["a"],"bytes":1000}"#,
             "{\"parent\":null,\"items\":[\"a\"",
             "",
@@ -257,7 +261,7 @@ mod tests {
 
     #[test]
     fn a_chain_with_a_missing_link_or_too_many_is_left() {
-        let lab = lab();
+        let lab = new_fixture();
         let orphan = lab.add(Some("0123"), &["a"], 1000);
         assert!(lab.best(&["a"]).is_empty(), "{orphan} has nothing below it");
         let names: Vec<String> = (0..MOST_LINKS + 1).map(|n| format!("p{n}")).collect();

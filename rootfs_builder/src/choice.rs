@@ -1,51 +1,51 @@
-//! Which base a push is built upon: the one that was asked for, if what was pushed fits it, or else the first of our own
-//! that it fits.
+//! Choice of the base for a push: the requested one, if the packages support it, or else the first of the default bases
+//! that they support.
 
 use std::path::Path;
 
-use package::fits::{self, Distribution, Fits};
+use package::fits::{self, Distribution, RosSupport};
 use ros::bus::RosVersion;
 
 use crate::base::{self, Base};
 use crate::builder::DEFAULT_BASE;
 use crate::error::Error;
-use crate::request::Source;
+use crate::request::PushSource;
 
-/// Bases taken where none is named, the first that fits; then any other that does, by name. What fits either ROS is put on
-/// the first.
+/// Default bases in order of preference; then any other one, by name. Packages that support both ROS versions use the
+/// first.
 const DEFAULTS: [&str; 2] = [DEFAULT_BASE, "bookworm-jazzy-wheels"];
 
-/// What was chosen.
+/// The chosen base.
 #[derive(Debug)]
-pub(crate) struct Chosen {
+pub(crate) struct ChosenBase {
     pub(crate) base: Base,
-    /// Something to know about it.
+    /// Note about the choice.
     pub(crate) note: Option<String>,
 }
 
 /// Chooses among the definitions in a directory. Blocking; reads what was pushed.
-pub(crate) fn choose(
+pub(crate) fn choose_base(
     directory: &Path,
     asked: Option<&str>,
-    source: &Source,
-) -> Result<Chosen, Error> {
-    let Source::Tree(tree) = source else {
-        // Names of packaged ROS packages say nothing of their ROS.
+    source: &PushSource,
+) -> Result<ChosenBase, Error> {
+    let PushSource::Tree(tree) = source else {
+        // The name of a packaged ROS package does not reveal its ROS version.
         let base = base::load(directory, asked.unwrap_or(DEFAULT_BASE))?;
-        return Ok(Chosen { base, note: None });
+        return Ok(ChosenBase { base, note: None });
     };
-    // Of a name that is not there the deployer is told before anything else.
+    // An unknown base is reported before anything else.
     let asked = asked.map(|name| base::load(directory, name)).transpose()?;
-    let bases = all(directory, asked.as_ref())?;
-    let fits = fits::of(tree, &distributions(&bases))?;
+    let bases = load_usable_bases(directory, asked.as_ref())?;
+    let fits = fits::detect(tree, &distributions(&bases))?;
     match asked {
-        Some(base) => fitting(base, &bases, fits),
-        None => first(bases, fits),
+        Some(base) => check_requested_base(base, &bases, fits),
+        None => first_fitting_base(bases, fits),
     }
 }
 
-/// All definitions that can be used: one of an operator that cannot is no reason to refuse what fits another.
-fn all(directory: &Path, asked: Option<&Base>) -> Result<Vec<Base>, Error> {
+/// Returns all usable definitions; an unusable definition of an operator must not prevent the use of others.
+fn load_usable_bases(directory: &Path, asked: Option<&Base>) -> Result<Vec<Base>, Error> {
     let mut bases = Vec::new();
     for name in base::names(directory)? {
         match base::load(directory, &name) {
@@ -61,16 +61,16 @@ fn all(directory: &Path, asked: Option<&Base>) -> Result<Vec<Base>, Error> {
 
 fn distributions(bases: &[Base]) -> Vec<Distribution> {
     let of = |base: &Base| Distribution {
-        version: base.ros.bus(),
+        version: base.ros.ros_version(),
         name: base.ros_distribution.clone(),
     };
     bases.iter().map(of).collect()
 }
 
-fn fitting(base: Base, bases: &[Base], fits: Fits) -> Result<Chosen, Error> {
-    let given = base.ros.bus();
+fn check_requested_base(base: Base, bases: &[Base], fits: RosSupport) -> Result<ChosenBase, Error> {
+    let given = base.ros.ros_version();
     match fits {
-        Fits::Only {
+        RosSupport::Only {
             version,
             package,
             because,
@@ -80,40 +80,43 @@ fn fitting(base: Base, bases: &[Base], fits: Fits) -> Result<Chosen, Error> {
             version: version.number(),
             base: base.name.clone(),
             base_version: given.number(),
-            fitting: listed(bases, version),
+            fitting: list_bases(bases, version),
         }),
-        _ => Ok(Chosen { base, note: None }),
+        _ => Ok(ChosenBase { base, note: None }),
     }
 }
 
-fn first(mut bases: Vec<Base>, fits: Fits) -> Result<Chosen, Error> {
+fn first_fitting_base(mut bases: Vec<Base>, fits: RosSupport) -> Result<ChosenBase, Error> {
     let rank = |base: &Base| {
         let own = DEFAULTS.iter().position(|name| *name == base.name);
         (own.unwrap_or(DEFAULTS.len()), base.name.clone())
     };
     bases.sort_by_key(rank);
     let other = match &fits {
-        Fits::Either => bases
+        RosSupport::Either => bases
             .iter()
-            .find(|base| base.ros.bus() == RosVersion::Two)
+            .find(|base| base.ros.ros_version() == RosVersion::Two)
             .map(|base| base.name.clone()),
-        Fits::Only { .. } => None,
+        RosSupport::Only { .. } => None,
     };
-    let found = bases.into_iter().find(|base| fits.has(base.ros.bus()));
+    let found = bases
+        .into_iter()
+        .find(|base| fits.supports(base.ros.ros_version()));
     match (found, fits) {
         (Some(base), _) => {
             let note = other.filter(|name| *name != base.name).map(|other| {
                 format!(
-                    "it can be built for either ROS, and is built for ROS {} on {}; for the other push with `--base {other}`",
-                    base.ros.bus().number(),
+                    "it can be built for either ROS, and is built for ROS {} on {}; for the other push with \
+                     `--base {other}`",
+                    base.ros.ros_version().number(),
                     base.name
                 )
             });
-            Ok(Chosen { base, note })
+            Ok(ChosenBase { base, note })
         }
         (
             None,
-            Fits::Only {
+            RosSupport::Only {
                 version,
                 package,
                 because,
@@ -123,11 +126,11 @@ fn first(mut bases: Vec<Base>, fits: Fits) -> Result<Chosen, Error> {
             because,
             version: version.number(),
         }),
-        (None, Fits::Either) => base_missing(),
+        (None, RosSupport::Either) => no_base_error(),
     }
 }
 
-fn base_missing() -> Result<Chosen, Error> {
+fn no_base_error() -> Result<ChosenBase, Error> {
     Err(Error::NoBase {
         package: "it".to_owned(),
         because: "can be built for either ROS".to_owned(),
@@ -135,18 +138,21 @@ fn base_missing() -> Result<Chosen, Error> {
     })
 }
 
-/// Names of bases of a version, for people.
-fn listed(bases: &[Base], version: RosVersion) -> String {
-    let of_version = bases.iter().filter(|base| base.ros.bus() == version);
+/// Formats the names of the bases of a version.
+fn list_bases(bases: &[Base], version: RosVersion) -> String {
+    let of_version = bases
+        .iter()
+        .filter(|base| base.ros.ros_version() == version);
     let names: Vec<String> = of_version
         .map(|base| format!("--base {}", base.name))
         .collect();
-    match names.is_empty() {
-        true => format!(
+    if names.is_empty() {
+        format!(
             "a base of ROS {}, of which this server has none",
             version.number()
-        ),
-        false => names.join(" or "),
+        )
+    } else {
+        names.join(" or ")
     }
 }
 
@@ -154,7 +160,7 @@ fn listed(bases: &[Base], version: RosVersion) -> String {
 mod tests {
     use super::*;
 
-    /// Definitions with these names, and of these versions.
+    /// Creates definitions with these names and ROS versions.
     fn bases(definitions: &[(&str, &str)]) -> tempfile::TempDir {
         let directory = tempfile::tempdir().expect("a directory");
         for (name, ros) in definitions {
@@ -169,7 +175,7 @@ mod tests {
         directory
     }
 
-    fn pushed(exports: &[&str]) -> (tempfile::TempDir, Source) {
+    fn pushed_packages(exports: &[&str]) -> (tempfile::TempDir, PushSource) {
         let root = tempfile::tempdir().expect("a directory");
         for (number, export) in exports.iter().enumerate() {
             let directory = root.path().join(format!("src/p{number}"));
@@ -179,7 +185,7 @@ mod tests {
             );
             std::fs::write(directory.join("package.xml"), text).expect("written");
         }
-        let source = Source::Tree(root.path().to_owned());
+        let source = PushSource::Tree(root.path().to_owned());
         (root, source)
     }
 
@@ -195,13 +201,13 @@ mod tests {
         ("zesty", "ros1"),
     ];
 
-    fn chosen(
+    fn chosen_name(
         definitions: &[(&str, &str)],
         asked: Option<&str>,
         exports: &[&str],
-    ) -> Result<Chosen, Error> {
-        let (bases, (_root, source)) = (bases(definitions), pushed(exports));
-        choose(bases.path(), asked, &source)
+    ) -> Result<ChosenBase, Error> {
+        let (bases, (_root, source)) = (bases(definitions), pushed_packages(exports));
+        choose_base(bases.path(), asked, &source)
     }
 
     #[test]
@@ -215,18 +221,18 @@ mod tests {
             (&[CMAKE], "bookworm-ros1", true),
             (&[BOTH], "bookworm-ros1", true),
         ] {
-            let chosen = chosen(&ALL, None, exports).expect("there is one");
+            let chosen = chosen_name(&ALL, None, exports).expect("there is one");
             assert_eq!(chosen.base.name, base, "{exports:?}");
             assert_eq!(chosen.note.is_some(), is_noted, "{exports:?}");
         }
         let others = [("another", "ros2"), ("zesty", "ros1")];
-        let chosen = chosen(&others, None, &[AMENT]).expect("there is one");
+        let chosen = chosen_name(&others, None, &[AMENT]).expect("there is one");
         assert_eq!(chosen.base.name, "another");
     }
 
     #[test]
     fn a_package_of_the_other_ros_is_told_which_base_fits() {
-        let text = chosen(&ALL, Some("bookworm-ros1"), &[CMAKE, AMENT])
+        let text = chosen_name(&ALL, Some("bookworm-ros1"), &[CMAKE, AMENT])
             .expect_err("ROS 2")
             .to_string();
         for words in [
@@ -236,7 +242,7 @@ mod tests {
         ] {
             assert!(text.contains(words), "{text}");
         }
-        let text = chosen(&ALL, Some("another"), &[CATKIN])
+        let text = chosen_name(&ALL, Some("another"), &[CATKIN])
             .expect_err("ROS 1")
             .to_string();
         assert!(
@@ -246,7 +252,10 @@ mod tests {
         for exports in [&[BOTH][..], &[CMAKE]] {
             for base in ["another", "zesty"] {
                 assert_eq!(
-                    chosen(&ALL, Some(base), exports).expect("fits").base.name,
+                    chosen_name(&ALL, Some(base), exports)
+                        .expect("fits")
+                        .base
+                        .name,
                     base
                 );
             }
@@ -256,7 +265,7 @@ mod tests {
     #[test]
     fn two_flavours_are_refused_whatever_is_asked() {
         for asked in [None, Some("another"), Some("zesty")] {
-            let text = chosen(&ALL, asked, &[CATKIN, AMENT])
+            let text = chosen_name(&ALL, asked, &[CATKIN, AMENT])
                 .expect_err("two flavours")
                 .to_string();
             assert!(
@@ -269,17 +278,17 @@ mod tests {
 
     #[test]
     fn where_no_base_fits_it_is_said() {
-        let text = chosen(&[("zesty", "ros1")], None, &[AMENT]).expect_err("none");
+        let text = chosen_name(&[("zesty", "ros1")], None, &[AMENT]).expect_err("none");
         assert!(
             text.to_string()
-                .contains("ament_python is built by no base"),
+                .contains("no base supports build type ament_python"),
             "{text}"
         );
-        // A definition that cannot be read is no reason to refuse what fits another.
-        let (bases, (_root, source)) = (bases(&ALL), pushed(&[AMENT]));
+        // An unreadable definition does not prevent the use of others.
+        let (bases, (_root, source)) = (bases(&ALL), pushed_packages(&[AMENT]));
         std::fs::write(bases.path().join("broken.toml"), "ros = 7").expect("written");
-        let chosen = choose(bases.path(), None, &source).expect("there is one");
+        let chosen = choose_base(bases.path(), None, &source).expect("there is one");
         assert_eq!(chosen.base.name, "bookworm-jazzy-wheels");
-        assert!(choose(bases.path(), Some("broken"), &source).is_err());
+        assert!(choose_base(bases.path(), Some("broken"), &source).is_err());
     }
 }

@@ -1,4 +1,4 @@
-//! Compiles source packages in a container without network, as a user without rights.
+//! Compilation of source packages in a container without network, as an unprivileged user.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -15,41 +15,41 @@ use servant::container::{Mount, Profile};
 use crate::base::Base;
 use crate::blocking;
 use crate::bootstrap::{EPOCH, tree_options};
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::excerpt::Excerpt;
-use crate::install::{lay_out, set_mode};
-use crate::sandbox::Run;
-use crate::workshop::Workshop;
+use crate::install::{set_mode, write_tree};
+use crate::sandbox::SandboxRun;
+use crate::workshop::BuildContext;
 
-/// Bytes of a log that are kept.
+/// Maximum size of a stored log in bytes.
 const LOG_LIMIT: u64 = 64 << 20;
 
-/// One package to compile.
+/// A package to compile.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(crate) struct Unit {
-    /// Its ROS name.
+pub(crate) struct BuildUnit {
+    /// ROS name.
     pub(crate) name: String,
-    /// Its directory, relative to the pushed tree.
+    /// Directory, relative to the pushed tree.
     pub(crate) path: PathBuf,
-    /// `catkin`, `ament_cmake`, `ament_python` or `cmake`.
+    /// Build type: `catkin`, `ament_cmake`, `ament_python` or `cmake`.
     pub(crate) build_type: String,
 }
 
-/// What is done with packages.
+/// Task to perform with packages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Task {
-    /// They are looked at before time is spent on compiling any: most mistakes show in seconds. Those of ROS 1 are
-    /// configured, against stand-ins of those among them that they need; of ROS 2 the package.xml is read.
+    /// Check all packages before spending time on compiling any, since most errors show in seconds: ROS 1 packages are
+    /// configured, against stand-ins of those among them that they need; of ROS 2 packages the package.xml is read.
     Check,
-    /// They are compiled and installed.
+    /// Compile and install the packages.
     Compile,
 }
 
 #[derive(Serialize)]
 struct Job<'a> {
     check: bool,
-    packages: Vec<Given<'a>>,
+    packages: Vec<JobPackage<'a>>,
     workspace: Vec<&'a str>,
     prefix: &'a Path,
     cmake: &'a [String],
@@ -57,65 +57,65 @@ struct Job<'a> {
 }
 
 #[derive(Serialize)]
-struct Given<'a> {
+struct JobPackage<'a> {
     #[serde(flatten)]
-    unit: &'a Unit,
-    /// Those of the job that it needs, in the order of building.
+    unit: &'a BuildUnit,
+    /// Packages of the job that it needs, in build order.
     needs: Vec<&'a str>,
 }
 
-/// Packages to compile, and what they are compiled in.
-pub(crate) struct Order<'a> {
+/// Packages to compile, and their build environment.
+pub(crate) struct CompileOrder<'a> {
     pub(crate) base: &'a Base,
-    /// Base, toolchain, build dependencies, and packages that are compiled already; lowest first.
+    /// Trees of base, toolchain, build dependencies and packages compiled before; lowest first.
     pub(crate) layers: Vec<PathBuf>,
-    /// The sources that can be seen.
+    /// Directory of the visible sources.
     pub(crate) source: &'a Path,
-    /// What to do, in this order; and which of them each needs, by index.
-    pub(crate) units: Vec<(&'a Unit, Vec<usize>)>,
+    /// Packages in build order, each with the indexes of those that it needs.
+    pub(crate) units: Vec<(&'a BuildUnit, Vec<usize>)>,
     /// All packages of the push.
-    pub(crate) workspace: &'a [Unit],
+    pub(crate) workspace: &'a [BuildUnit],
 }
 
-/// What came of it: a tree with the prefix in it.
-pub(crate) struct Compiled {
-    /// Owned by the compiling user, whiteouts of the overlay included.
+/// Result of compiling: a tree that contains the prefix.
+pub(crate) struct CompileOutput {
+    /// Tree, owned by the compiling user, including whiteouts of the overlay.
     pub(crate) tree: PathBuf,
-    /// The directory that it is in.
+    /// Directory of the tree.
     pub(crate) directory: PathBuf,
     /// First host uid of the container.
     pub(crate) uid_offset: u32,
 }
 
-/// The complete log of a build. It stays whatever happens.
-pub(crate) struct Log {
+/// The complete log of a build, which is kept in any case.
+pub(crate) struct BuildLog {
     path: PathBuf,
     file: fs::File,
 }
 
-impl Log {
+impl BuildLog {
     pub(crate) fn create(path: &Path) -> Result<Self, Error> {
         let file = fs::File::options()
             .read(true)
             .append(true)
             .create(true)
             .open(path)
-            .at("making", path)?;
+            .io_context("making", path)?;
         crate::install::set_mode(path, 0o600)?;
-        file.set_len(0).at("emptying", path)?;
+        file.set_len(0).io_context("emptying", path)?;
         Ok(Self {
             path: path.to_owned(),
             file,
         })
     }
 
-    /// Bytes so far.
+    /// Returns the current size in bytes.
     pub(crate) fn len(&self) -> u64 {
         self.file.metadata().map_or(0, |about| about.len())
     }
 
-    /// The text from a position on, at most its last mebibyte.
-    pub(crate) fn since(&self, position: u64) -> String {
+    /// Returns the text from a position on, at most its last mebibyte.
+    pub(crate) fn text_since(&self, position: u64) -> String {
         use std::os::unix::fs::FileExt;
         let end = self.len();
         let start = position.max(end.saturating_sub(1 << 20));
@@ -127,28 +127,28 @@ impl Log {
     }
 }
 
-/// Runs a task in a container of its own.
-pub(crate) async fn run(
-    shop: &Workshop,
+/// Runs a task in a separate container.
+pub(crate) async fn run_task(
+    shop: &BuildContext,
     task: Task,
-    order: &Order<'_>,
-    log: &mut Log,
+    order: &CompileOrder<'_>,
+    log: &mut BuildLog,
     progress: &Progress,
-) -> Result<Compiled, Error> {
+) -> Result<CompileOutput, Error> {
     let base = order.base;
     let name = match task {
         Task::Check => "configure",
         Task::Compile => "compile",
     };
-    let directory = shop.site.fresh(name)?;
+    let directory = shop.site.fresh_directory(name)?;
     let (tools, upper) = (directory.join("tools"), directory.join("upper"));
-    fs::create_dir(&upper).at("making", &upper)?;
+    fs::create_dir(&upper).io_context("making", &upper)?;
     let job = Job {
         check: task == Task::Check,
         packages: order
             .units
             .iter()
-            .map(|(unit, needs)| Given {
+            .map(|(unit, needs)| JobPackage {
                 unit,
                 needs: needs
                     .iter()
@@ -168,7 +168,7 @@ pub(crate) async fn run(
     let mut files = BTreeMap::from([
         (
             PathBuf::from("cloudroid/compile.py"),
-            script(base.ros).as_bytes().to_vec(),
+            build_script(base.ros).as_bytes().to_vec(),
         ),
         (
             PathBuf::from("cloudroid/second_look.py"),
@@ -186,7 +186,7 @@ pub(crate) async fn run(
             .iter()
             .map(|(path, text)| (path.clone(), text.clone().into_bytes())),
     );
-    lay_out(&tools, &files)?;
+    write_tree(&tools, &files)?;
     let mut layers = order.layers.clone();
     layers.push(tools);
     let mut environment = base.environment.clone();
@@ -200,14 +200,14 @@ pub(crate) async fn run(
     ] {
         environment.insert(name.into(), value.into());
     }
-    for (name, value) in conditions(base) {
+    for (name, value) in condition_variables(base) {
         environment.entry(name.into()).or_insert(value);
     }
-    // Compiled Python is wanted here: it goes into the layer.
+    // Compiled Python files are needed here: they go into the layer.
     environment.remove("PYTHONDONTWRITEBYTECODE");
 
-    // The prefix may be there already, with packages that were compiled before; of each directory a user must be able
-    // to write in the one above all.
+    // The prefix may already exist, with packages compiled before; for each owned directory the user must be able to
+    // write in its parent.
     let owned = vec!["/build".into(), base.build.prefix.clone()];
     let (mut writing, mut logged) = (Ok(()), log.len());
     let mut failed: Vec<String> = Vec::new();
@@ -220,7 +220,7 @@ pub(crate) async fn run(
     let (mut lines, mut told) = crate::lines::channel();
     let forward = async {
         while let Some(line) = told.recv().await {
-            match title(&line, order.workspace) {
+            match step_title(&line, order.workspace) {
                 Some(step) => progress.step(&step).await,
                 None => progress.log(&line).await,
             }
@@ -230,7 +230,7 @@ pub(crate) async fn run(
         let result = shop
             .site
             .run(
-                Run {
+                SandboxRun {
                     name,
                     profile: Profile::Compile,
                     layers,
@@ -249,7 +249,7 @@ pub(crate) async fn run(
                         .into(),
                 },
                 |line| {
-                    // The beginning says most; a build that prints without end must not fill the disk.
+                    // Only the beginning is stored: a build that prints without end must not fill the disk.
                     if writing.is_ok() && logged < LOG_LIMIT {
                         logged += line.len() as u64 + 1;
                         writing = writeln!(log.file, "{line}");
@@ -274,10 +274,10 @@ pub(crate) async fn run(
     };
     let (finished, ()) = tokio::join!(work, forward);
     let finished = finished?;
-    writing.at("writing", &log.path)?;
+    writing.io_context("writing", &log.path)?;
     if task == Task::Check && failed.is_empty() {
-        // However it ended, it found nothing to blame on a package.
-        return Ok(Compiled {
+        // However it ended, it found no error in a package.
+        return Ok(CompileOutput {
             tree: upper,
             directory,
             uid_offset: finished.uid_offset,
@@ -286,7 +286,7 @@ pub(crate) async fn run(
     if !finished.success() {
         let mut last_lines = excerpt.text();
         if finished.exit.code != Some(1) {
-            last_lines = format!("{last_lines}\n{}", finished.last_words());
+            last_lines = format!("{last_lines}\n{}", finished.last_output());
         }
         let package = if failed.is_empty() {
             current
@@ -308,43 +308,43 @@ pub(crate) async fn run(
     }
     let (prefix, tree) = (base.build.prefix.clone(), directory.join("tree"));
     let result = tree.clone();
-    blocking::spawn(move || take_out(&upper, &prefix, &tree)).await??;
-    Ok(Compiled {
+    blocking::spawn(move || extract_prefix(&upper, &prefix, &tree)).await??;
+    Ok(CompileOutput {
         tree: result,
         directory,
         uid_offset: finished.uid_offset,
     })
 }
 
-/// What compiles packages of a ROS.
-fn script(ros: Version) -> &'static str {
+/// Returns the script that compiles packages of a ROS version.
+fn build_script(ros: Version) -> &'static str {
     match ros {
         Version::Ros1 => include_str!("inside/compile.py"),
         Version::Ros2 => include_str!("inside/colcon.py"),
     }
 }
 
-/// What conditions in a package.xml ask for, where a base does not say it itself: colcon reads them, too.
-fn conditions(base: &Base) -> Vec<(&'static str, String)> {
+/// Returns the variables of package.xml conditions that the base does not set itself; colcon evaluates them as well.
+fn condition_variables(base: &Base) -> Vec<(&'static str, String)> {
     match base.ros {
-        // To Debian's catkin ROS_DISTRO would mean a second ROS.
+        // For Debian's catkin, ROS_DISTRO would mean a second ROS.
         Version::Ros1 => Vec::new(),
         Version::Ros2 => vec![
-            ("ROS_VERSION", base.ros.bus().number().to_string()),
+            ("ROS_VERSION", base.ros.ros_version().number().to_string()),
             ("ROS_DISTRO", base.ros_distribution.clone()),
             ("ROS_PYTHON_VERSION", "3".to_owned()),
         ],
     }
 }
 
-fn title(line: &str, units: &[Unit]) -> Option<String> {
+fn step_title(line: &str, units: &[BuildUnit]) -> Option<String> {
     let name = line.strip_prefix("::package ")?;
     let at = units.iter().position(|unit| unit.name == name)? + 1;
     Some(format!("compiling {name} ({at} of {})", units.len()))
 }
 
-/// What was pushed may be readable by its owner alone; the compiling user is another.
-pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
+/// Makes the pushed files readable for the compiling user; they may be readable only by their owner.
+pub(crate) fn make_readable(source: &Path) -> Result<(), Error> {
     foreign::walk(source, |entry| {
         let mode = entry.stat.st_mode & 0o777;
         let run = if entry.kind() == FileType::Directory || mode & 0o100 != 0 {
@@ -353,21 +353,21 @@ pub(crate) fn open_up(source: &Path) -> Result<(), Error> {
             0
         };
         if entry.kind() != FileType::Symlink && mode != mode | 0o444 | run {
-            let (parent, name) = entry.place();
+            let (parent, name) = entry.parent_and_name();
             let mode = Mode::from_raw_mode(mode | 0o444 | run);
             rustix::fs::chmodat(parent, name, mode, AtFlags::empty())
-                .map_err(|error| Error::io("opening up", entry.shown(), error.into()))?;
+                .map_err(|error| Error::io("opening up", entry.display_path(), error.into()))?;
         }
         Ok::<_, Error>(Visit::Into)
     })
 }
 
-/// Moves the prefix out of the container's upper directory into a tree of its own.
-fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
+/// Moves the prefix from the container's upper directory to a separate tree.
+fn extract_prefix(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
     let inside = prefix.strip_prefix("/").unwrap_or(prefix);
     let target = tree.join(inside);
     let parent = target.parent().unwrap_or(tree);
-    fs::create_dir_all(parent).at("making", parent)?;
+    fs::create_dir_all(parent).io_context("making", parent)?;
     for directory in parent
         .ancestors()
         .take_while(|directory| directory.starts_with(tree))
@@ -375,10 +375,11 @@ fn take_out(upper: &Path, prefix: &Path, tree: &Path) -> Result<(), Error> {
         set_mode(directory, 0o755)?;
     }
     let from = upper.join(inside);
-    fs::rename(&from, &target).at("moving", &from)
+    fs::rename(&from, &target).io_context("moving", &from)
 }
 
-/// How what was compiled becomes a layer of the cache, its files the compiling user's as they were.
+/// Returns the options for packing compiled packages into a layer of the cache; files keep the compiling user as their
+/// owner.
 pub(crate) fn unit_options(base: &Base, uid_offset: u32) -> TreeOptions {
     TreeOptions {
         uid_offset,
@@ -388,7 +389,8 @@ pub(crate) fn unit_options(base: &Base, uid_offset: u32) -> TreeOptions {
     }
 }
 
-/// How an install space becomes a layer of an image, with all files root's. `owner`: whose they are now.
+/// Returns the options for packing an install space into a layer of an image, with all files owned by root. `owner` is
+/// their current owner.
 pub(crate) fn package_options(base: &Base, owner: u32) -> TreeOptions {
     TreeOptions {
         uid_offset: owner,
@@ -416,7 +418,7 @@ mod tests {
             set_mode(path, mode).expect("set");
         }
         set_mode(&root.path().join("d"), 0o700).expect("set");
-        open_up(root.path()).expect("done");
+        make_readable(root.path()).expect("done");
         let mode = |path: &Path| path.metadata().expect("there").permissions().mode() & 0o777;
         assert_eq!(
             (mode(&script), mode(&text), mode(&root.path().join("d"))),
@@ -426,16 +428,16 @@ mod tests {
 
     #[test]
     fn steps_count_packages() {
-        let unit = |name: &str| Unit {
+        let unit = |name: &str| BuildUnit {
             name: name.into(),
             path: name.into(),
             build_type: "catkin".into(),
         };
         let units = [unit("a"), unit("b")];
         assert_eq!(
-            title("::package b", &units).as_deref(),
+            step_title("::package b", &units).as_deref(),
             Some("compiling b (2 of 2)")
         );
-        assert_eq!(title("anything", &units), None);
+        assert_eq!(step_title("anything", &units), None);
     }
 }

@@ -1,20 +1,20 @@
-//! The first error of an installation: what comes after it are its consequences, and dpkg prints many.
+//! Captures the first error of an installation: dpkg prints many errors, most of them consequences of the first.
 
-/// At most so many lines of the package that failed.
+/// Maximum number of lines of the failed package.
 const MOST_LINES: usize = 12;
 
-/// Listens to dpkg until it complains for the first time.
+/// Listener for the first error in the output of dpkg.
 #[derive(Debug, Default)]
-pub(crate) struct Complaint {
+pub(crate) struct FirstError {
     lines: Vec<String>,
-    /// The error itself was heard; lines that belong to it begin with a space.
+    /// True once the error itself was seen; continuation lines begin with a space.
     heard: bool,
     over: bool,
 }
 
-impl Complaint {
-    /// One more line that dpkg printed.
-    pub(crate) fn hear(&mut self, line: &str) {
+impl FirstError {
+    /// Processes a line of dpkg's output.
+    pub(crate) fn push_line(&mut self, line: &str) {
         if self.over {
             return;
         }
@@ -44,7 +44,7 @@ impl Complaint {
         self.heard = line.starts_with("dpkg: error");
     }
 
-    /// The first error with what its package printed before it; none where dpkg complained of nothing.
+    /// Returns the first error, preceded by the output of its package; `None` if there was no error.
     pub(crate) fn text(&self) -> Option<String> {
         self.heard.then(|| self.lines.join("\n"))
     }
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn the_first_error_is_told_with_what_led_to_it() {
-        let mut complaint = Complaint::default();
+        let mut complaint = FirstError::default();
         for line in [
             "Setting up java-common (0.74) ...",
             "Setting up openjdk-17-jre-headless:amd64 (17.0.13) ...",
@@ -67,7 +67,7 @@ mod tests {
             " default-jre-headless depends on openjdk-17-jre-headless; however:",
             "Errors were encountered while processing:",
         ] {
-            complaint.hear(line);
+            complaint.push_line(line);
         }
         let text = complaint.text().expect("dpkg complained");
         let lines: Vec<&str> = text.lines().collect();
@@ -80,8 +80,8 @@ mod tests {
 
     #[test]
     fn what_went_well_is_no_complaint() {
-        let mut complaint = Complaint::default();
-        complaint.hear("Setting up libfoo1 (1.0) ...");
+        let mut complaint = FirstError::default();
+        complaint.push_line("Setting up libfoo1 (1.0) ...");
         assert_eq!(complaint.text(), None);
     }
 }

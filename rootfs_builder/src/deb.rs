@@ -1,4 +1,4 @@
-//! Looks into Debian packages without installing them.
+//! Reads Debian packages without installing them.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Write};
@@ -7,60 +7,65 @@ use std::process::{Command, Stdio};
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::unused;
 
 /// A file or link of a Debian package.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) struct Member {
-    /// Relative to the root, such as `usr/share/x/package.xml`.
+pub(crate) struct DebMember {
+    /// Path relative to the root, such as `usr/share/x/package.xml`.
     pub(crate) path: PathBuf,
     /// Permission bits.
     pub(crate) mode: u32,
-    /// Seconds since 1970.
+    /// Modification time in seconds since 1970.
     pub(crate) mtime: u64,
-    /// File, link or directory.
-    pub(crate) content: Content,
+    /// Content of the file, or target of the link.
+    pub(crate) content: MemberContent,
 }
 
-/// What a member is.
+/// Content of a member.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub(crate) enum Content {
+pub(crate) enum MemberContent {
     /// A regular file.
     File(#[serde(with = "hex")] Vec<u8>),
     /// A symbolic link.
     Link(PathBuf),
 }
 
-/// Raise it when [`wanted_of_development`] changes.
+/// Directory of the cache; to be changed when [`is_needed_at_runtime`] changes.
 const KEPT: &str = "members-1";
 
-/// Members that are [`wanted_of_development`], by path. They are kept below `cache`, named as the package's file is: most
-/// ROS packages are looked into again with every package that is near to them, and unpacking takes long. Blocking.
-pub(crate) fn at_run_time(deb: &Path, cache: &Path) -> Result<Vec<Member>, Error> {
+/// Returns the members that are needed at run time ([`is_needed_at_runtime`]), sorted by path. They are cached below
+/// `cache` under the name of the package's file, since most ROS packages are inspected repeatedly and unpacking takes
+/// long. Blocking.
+pub(crate) fn runtime_members(deb: &Path, cache: &Path) -> Result<Vec<DebMember>, Error> {
     let directory = cache.join(KEPT);
     let name = Path::new(deb.file_name().unwrap_or_default()).with_extension("tar");
     let path = directory.join(name);
     if let Ok(file) = File::open(&path)
-        && let Ok(found) = of_archive(BufReader::new(file), &path, |_| true)
+        && let Ok(found) = read_archive(BufReader::new(file), &path, |_| true)
     {
-        unused::used(&path);
+        unused::mark_used(&path);
         return Ok(found);
     }
-    let mut found = members(deb, wanted_of_development)?;
+    let mut found = read_members(deb, is_needed_at_runtime)?;
     found.sort_by(|a, b| a.path.cmp(&b.path));
     found.dedup_by(|later, first| later.path == first.path);
-    std::fs::create_dir_all(&directory).at("making", &directory)?;
-    let made = tempfile::NamedTempFile::new_in(&directory).at("making a file in", &directory)?;
+    std::fs::create_dir_all(&directory).io_context("making", &directory)?;
+    let made =
+        tempfile::NamedTempFile::new_in(&directory).io_context("creating a file in", &directory)?;
     write_tar(&found, made.path())?;
-    made.as_file().sync_data().at("writing", &path)?;
+    made.as_file().sync_data().io_context("writing", &path)?;
     made.persist(&path)
         .map_err(|error| Error::io("writing", &path, error.error))?;
     Ok(found)
 }
 
-/// Members that `keep` accepts. Blocking.
-pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Member>, Error> {
+/// Returns the members that `keep` accepts. Blocking.
+pub(crate) fn read_members(
+    deb: &Path,
+    keep: impl Fn(&Path) -> bool,
+) -> Result<Vec<DebMember>, Error> {
     let mut unpack = Command::new("dpkg-deb");
     unpack
         .arg("--fsys-tarfile")
@@ -76,10 +81,10 @@ pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Me
         _ => Error::io("reading", deb, error),
     })?;
     let found = match child.stdout.take() {
-        Some(stdout) => of_archive(BufReader::new(stdout), deb, keep)?,
+        Some(stdout) => read_archive(BufReader::new(stdout), deb, keep)?,
         None => Vec::new(),
     };
-    let status = child.wait().at("reading", deb)?;
+    let status = child.wait().io_context("reading", deb)?;
     if !status.success() {
         return Err(Error::Program {
             program: format!("dpkg-deb --fsys-tarfile {}", deb.display()),
@@ -90,19 +95,19 @@ pub(crate) fn members(deb: &Path, keep: impl Fn(&Path) -> bool) -> Result<Vec<Me
     Ok(found)
 }
 
-/// Files and links of a tar archive that is part of, or made of, the package `deb`.
-fn of_archive(
+/// Reads files and links of a tar archive that is part of, or derived from, the package `deb`.
+fn read_archive(
     archive: impl Read,
     deb: &Path,
     keep: impl Fn(&Path) -> bool,
-) -> Result<Vec<Member>, Error> {
+) -> Result<Vec<DebMember>, Error> {
     let mut found = Vec::new();
     let mut archive = tar::Archive::new(archive);
-    for entry in archive.entries().at("reading", deb)? {
-        let mut entry = entry.at("reading", deb)?;
+    for entry in archive.entries().io_context("reading", deb)? {
+        let mut entry = entry.io_context("reading", deb)?;
         let path: PathBuf = entry
             .path()
-            .at("reading", deb)?
+            .io_context("reading", deb)?
             .components()
             .filter(|part| matches!(part, Component::Normal(_)))
             .collect();
@@ -111,23 +116,23 @@ fn of_archive(
         }
         let header = entry.header();
         let (mode, mtime) = (
-            header.mode().at("reading", deb)?,
-            header.mtime().at("reading", deb)?,
+            header.mode().io_context("reading", deb)?,
+            header.mtime().io_context("reading", deb)?,
         );
         let kind = header.entry_type();
         let content = if kind.is_symlink() {
-            match entry.link_name().at("reading", deb)? {
-                Some(target) => Content::Link(target.into_owned()),
+            match entry.link_name().io_context("reading", deb)? {
+                Some(target) => MemberContent::Link(target.into_owned()),
                 None => continue,
             }
         } else if kind.is_file() {
             let mut bytes = Vec::new();
-            entry.read_to_end(&mut bytes).at("reading", deb)?;
-            Content::File(bytes)
+            entry.read_to_end(&mut bytes).io_context("reading", deb)?;
+            MemberContent::File(bytes)
         } else {
             continue;
         };
-        found.push(Member {
+        found.push(DebMember {
             path,
             mode: mode & 0o777,
             mtime,
@@ -137,9 +142,9 @@ fn of_archive(
     Ok(found)
 }
 
-/// What is wanted at run time of a development package: all of the ROS package's own directory but its CMake
-/// files, programs, and the unversioned names of libraries, by which plugins are loaded.
-pub(crate) fn wanted_of_development(path: &Path) -> bool {
+/// Returns whether a file of a development package is needed at run time: the ROS package's own directory except its
+/// CMake files, programs, and the unversioned names of libraries, by which plugins are loaded.
+pub(crate) fn is_needed_at_runtime(path: &Path) -> bool {
     let parts: Vec<&str> = path.iter().filter_map(|part| part.to_str()).collect();
     match parts.as_slice() {
         ["usr", "share", directory, inner, ..] => {
@@ -153,12 +158,12 @@ pub(crate) fn wanted_of_development(path: &Path) -> bool {
     }
 }
 
-/// Writes members as a tar archive, sorted by path, owned by root; of several with one path the first is taken.
+/// Writes members as a tar archive, sorted by path and owned by root; of several with the same path the first is used.
 /// Blocking.
-pub(crate) fn write_tar(members: &[Member], to: &Path) -> Result<(), Error> {
-    let file = File::create(to).at("writing", to)?;
+pub(crate) fn write_tar(members: &[DebMember], to: &Path) -> Result<(), Error> {
+    let file = File::create(to).io_context("writing", to)?;
     let mut archive = tar::Builder::new(std::io::BufWriter::new(file));
-    let mut sorted: Vec<&Member> = members.iter().collect();
+    let mut sorted: Vec<&DebMember> = members.iter().collect();
     sorted.sort_by(|a, b| a.path.cmp(&b.path));
     sorted.dedup_by(|later, first| later.path == first.path);
     for member in sorted {
@@ -168,26 +173,26 @@ pub(crate) fn write_tar(members: &[Member], to: &Path) -> Result<(), Error> {
         header.set_uid(0);
         header.set_gid(0);
         match &member.content {
-            Content::File(bytes) => {
+            MemberContent::File(bytes) => {
                 header.set_entry_type(tar::EntryType::Regular);
                 header.set_size(bytes.len() as u64);
                 archive
                     .append_data(&mut header, &member.path, bytes.as_slice())
-                    .at("writing", to)?;
+                    .io_context("writing", to)?;
             }
-            Content::Link(target) => {
+            MemberContent::Link(target) => {
                 header.set_entry_type(tar::EntryType::Symlink);
                 header.set_size(0);
                 archive
                     .append_link(&mut header, &member.path, target)
-                    .at("writing", to)?;
+                    .io_context("writing", to)?;
             }
         }
     }
     archive
         .into_inner()
         .and_then(|mut file| file.flush())
-        .at("writing", to)
+        .io_context("writing", to)
 }
 
 #[cfg(test)]
@@ -210,14 +215,14 @@ mod tests {
             "usr/lib/x86_64-linux-gnu/pkgconfig/x.pc",
         ];
         for path in wanted {
-            assert!(wanted_of_development(Path::new(path)), "{path}");
+            assert!(is_needed_at_runtime(Path::new(path)), "{path}");
         }
         for path in not {
-            assert!(!wanted_of_development(Path::new(path)), "{path}");
+            assert!(!is_needed_at_runtime(Path::new(path)), "{path}");
         }
     }
 
-    /// A package with these files.
+    /// Creates a package with these files.
     fn package(directory: &Path, files: &[(&str, &str)]) -> PathBuf {
         let tree = directory.join("tree");
         let control = "Package: robot-dev\nVersion: 1\nArchitecture: all\nMaintainer: a <a@b.invalid>\n\
@@ -248,7 +253,7 @@ mod tests {
             ("usr/include/robot.h", "not wanted"),
         ];
         let deb = package(directory.path(), &files);
-        let first = at_run_time(&deb, &cache).expect("unpacked");
+        let first = runtime_members(&deb, &cache).expect("unpacked");
         let paths: Vec<&str> = first
             .iter()
             .filter_map(|member| member.path.to_str())
@@ -261,24 +266,24 @@ mod tests {
             ]
         );
         std::fs::remove_file(&deb).expect("removed");
-        assert_eq!(at_run_time(&deb, &cache).expect("kept"), first);
-        // Nor is anything kept of one that cannot be unpacked.
+        assert_eq!(runtime_members(&deb, &cache).expect("kept"), first);
+        // Nothing is cached for a package that cannot be unpacked.
         let torn = directory.path().join("torn_1_all.deb");
         std::fs::write(&torn, "torn").expect("written");
-        at_run_time(&torn, &cache).expect_err("not a package");
+        runtime_members(&torn, &cache).expect_err("not a package");
         assert!(!cache.join(KEPT).join("torn_1_all.tar").exists());
     }
 
     #[test]
     fn members_become_the_same_archive_whatever_their_order() {
-        let member = |path: &str, content| Member {
+        let member = |path: &str, content| DebMember {
             path: path.into(),
             mode: 0o644,
             mtime: 5,
             content,
         };
-        let file = member("usr/share/x/a", Content::File(b"text".to_vec()));
-        let link = member("usr/lib/t/libx.so", Content::Link("libx.so.1".into()));
+        let file = member("usr/share/x/a", MemberContent::File(b"text".to_vec()));
+        let link = member("usr/lib/t/libx.so", MemberContent::Link("libx.so.1".into()));
         let directory = tempfile::tempdir().expect("a directory");
         let (one, two) = (directory.path().join("1"), directory.path().join("2"));
         write_tar(&[file.clone(), link.clone()], &one).expect("written");

@@ -1,4 +1,4 @@
-//! What a compiled file needs: the dynamic section of an ELF file (System V gABI, chapter 5), nothing else.
+//! Dependencies of compiled files: reads the dynamic section of ELF files (System V gABI, chapter 5).
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -8,12 +8,12 @@ use std::path::Path;
 use foreign::Visit;
 use rustix::fs::FileType;
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 
-/// The names in the dynamic section.
+/// Names in the dynamic section.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Dynamic {
-    /// Libraries to load with it (`DT_NEEDED`).
+    /// Required libraries (`DT_NEEDED`).
     pub(crate) needed: BTreeSet<String>,
 }
 
@@ -23,7 +23,7 @@ const DT_NULL: u64 = 0;
 const DT_NEEDED: u64 = 1;
 const DT_STRTAB: u64 = 5;
 const DT_STRSZ: u64 = 10;
-/// No dynamic section or string table is larger; a damaged header may say so.
+/// Maximum size of a dynamic section or string table; a damaged header may state more.
 const LARGEST: u64 = 64 << 20;
 
 struct Segment {
@@ -33,21 +33,21 @@ struct Segment {
     size: u64,
 }
 
-/// Reads a file; none where it is not a dynamically linked ELF file for little-endian machines.
-fn read_open(mut file: File, path: &Path) -> Result<Option<Dynamic>, Error> {
+/// Reads a file; `None` if it is not a dynamically linked, little-endian ELF file.
+fn read_dynamic(mut file: File, path: &Path) -> Result<Option<Dynamic>, Error> {
     let mut magic = Vec::new();
     (&mut file)
         .take(64)
         .read_to_end(&mut magic)
-        .at("reading", path)?;
+        .io_context("reading", path)?;
     if magic.len() < 52 || !magic.starts_with(b"\x7fELF") || magic[5] != 1 {
         return Ok(None);
     }
-    // A damaged file is none of ours to complain about: whoever loads it will.
-    Ok(dynamic(&mut file, &magic))
+    // A damaged file is not reported here: loading it will fail.
+    Ok(parse_dynamic(&mut file, &magic))
 }
 
-fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
+fn parse_dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     let wide = header[4] == 2;
     let (table, size, count) = if wide {
         (
@@ -62,13 +62,13 @@ fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
             u16_at(header, 44)?,
         )
     };
-    let headers = part(file, table, u64::from(size) * u64::from(count))?;
+    let headers = read_range(file, table, u64::from(size) * u64::from(count))?;
     let segments: Vec<Segment> = headers
         .chunks_exact(usize::from(size).max(1))
-        .filter_map(|raw| segment(raw, wide))
+        .filter_map(|raw| parse_segment(raw, wide))
         .collect();
     let place = segments.iter().find(|s| s.kind == PT_DYNAMIC)?;
-    let entries = part(file, place.offset, place.size)?;
+    let entries = read_range(file, place.offset, place.size)?;
     let mut names = Vec::new();
     let (mut strings, mut length) = (None, 0);
     for entry in entries.chunks_exact(if wide { 16 } else { 8 }) {
@@ -85,14 +85,14 @@ fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
             _ => {}
         }
     }
-    // The table's address is where it is loaded; the segment that covers it tells where it is in the file.
+    // The table's address is a memory address; the segment that contains it gives its offset in the file.
     let address = strings?;
     let mut loaded = segments.iter().filter(|s| s.kind == PT_LOAD);
     let place = loaded.find_map(|segment| {
         let inside = address.checked_sub(segment.address)?;
         (inside < segment.size).then(|| segment.offset.checked_add(inside))
     })??;
-    let table = part(file, place, length)?;
+    let table = read_range(file, place, length)?;
     let needed = names.into_iter().filter_map(|at| {
         let rest = table.get(usize::try_from(at).ok()?..)?;
         let end = rest.iter().position(|byte| *byte == 0)?;
@@ -104,7 +104,7 @@ fn dynamic(file: &mut File, header: &[u8]) -> Option<Dynamic> {
     })
 }
 
-fn segment(raw: &[u8], wide: bool) -> Option<Segment> {
+fn parse_segment(raw: &[u8], wide: bool) -> Option<Segment> {
     let kind = u32_at(raw, 0)?;
     Some(if wide {
         Segment {
@@ -124,7 +124,7 @@ fn segment(raw: &[u8], wide: bool) -> Option<Segment> {
     })
 }
 
-fn part(file: &mut File, offset: u64, size: u64) -> Option<Vec<u8>> {
+fn read_range(file: &mut File, offset: u64, size: u64) -> Option<Vec<u8>> {
     if size > LARGEST {
         return None;
     }
@@ -146,21 +146,21 @@ fn u64_at(bytes: &[u8], at: usize) -> Option<u64> {
     Some(u64::from_le_bytes(bytes.get(at..at + 8)?.try_into().ok()?))
 }
 
-/// Libraries that ELF files below `root` need and that are not below it themselves.
-pub(crate) fn needed_below(root: &Path) -> Result<BTreeSet<String>, Error> {
+/// Returns the libraries that ELF files below `root` need and that are not below it themselves.
+pub(crate) fn needed_libraries(root: &Path) -> Result<BTreeSet<String>, Error> {
     let (mut needed, mut present) = (BTreeSet::new(), BTreeSet::new());
     foreign::walk(root, |entry| {
         if entry.kind() != FileType::Directory {
             present.insert(entry.name().to_string_lossy().into_owned());
         }
         if entry.kind() == FileType::RegularFile
-            && let Some(dynamic) = read_open(entry.open()?, &entry.shown())?
+            && let Some(dynamic) = read_dynamic(entry.open()?, &entry.display_path())?
         {
             needed.extend(dynamic.needed);
         }
         Ok::<_, Error>(Visit::Into)
     })?;
-    // One with a slash is a path, not a library that a package could be looked up for.
+    // A name with a slash is a path, which cannot be looked up in packages.
     needed.retain(|name| !name.contains('/') && !present.contains(name));
     Ok(needed)
 }
@@ -170,7 +170,7 @@ mod tests {
     use super::*;
 
     fn read(path: &Path) -> Result<Option<Dynamic>, Error> {
-        read_open(File::open(path).at("reading", path)?, path)
+        read_dynamic(File::open(path).io_context("reading", path)?, path)
     }
 
     #[test]
@@ -198,8 +198,8 @@ mod tests {
         }
     }
 
-    /// A 64-bit file with one loaded segment and a dynamic section that names its string table by `address`.
-    fn file_of(segment: Segment, address: u64) -> Vec<u8> {
+    /// Creates a 64-bit file with one loaded segment and a dynamic section whose string table is at `address`.
+    fn elf_file(segment: Segment, address: u64) -> Vec<u8> {
         let entries = [
             (DT_NEEDED, 1),
             (DT_STRTAB, address),
@@ -247,7 +247,7 @@ mod tests {
                 address,
                 size,
             };
-            std::fs::write(&path, file_of(segment, table)).expect("written");
+            std::fs::write(&path, elf_file(segment, table)).expect("written");
             let dynamic = read(&path).expect("read")?;
             dynamic.needed.into_iter().next()
         };
@@ -278,7 +278,7 @@ mod tests {
             directory.path().join("x"),
         )
         .expect("copied");
-        let before = needed_below(directory.path()).expect("read");
+        let before = needed_libraries(directory.path()).expect("read");
         let libc = before
             .iter()
             .find(|name| name.starts_with("libc.so."))
@@ -286,7 +286,7 @@ mod tests {
             .clone();
         std::fs::write(directory.path().join(&libc), "").expect("written");
         assert!(
-            !needed_below(directory.path())
+            !needed_libraries(directory.path())
                 .expect("read")
                 .contains(&libc)
         );

@@ -1,344 +1,354 @@
-//! What can go wrong while a push becomes an image.
+//! Errors of building an image.
 
 use std::io;
 use std::path::PathBuf;
 
-/// Every way a build can fail. The text names the thing and what to do about it.
+/// Errors of a build. The message names the object and the next step.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No definition of that name.
-    #[error("there is no base {name:?} in {directory}; there are: {known}", directory = directory.display())]
+    /// The base does not exist.
+    #[error("no base {name:?} in {directory}; available: {known}", directory = directory.display())]
     UnknownBase {
-        /// What was asked for.
+        /// Name that was requested.
         name: String,
-        /// Where definitions are.
+        /// Directory of the definitions.
         directory: PathBuf,
-        /// Names that exist.
+        /// Names of existing bases.
         known: String,
     },
-    /// A base definition that cannot be used.
+    /// Invalid base definition.
     #[error("base definition {path}: {problem}", path = path.display())]
     BadBase {
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// What is wrong in it, with its line where that is known.
+        /// Description of the problem, with its line if known.
         problem: String,
     },
-    /// A program of the host is missing.
+    /// A program is not installed on the host.
     #[error("{program} is not installed: run `apt-get install {package}`")]
     MissingProgram {
-        /// The command.
+        /// Command.
         program: &'static str,
-        /// The Debian package that has it.
+        /// Debian package that contains it.
         package: &'static str,
     },
     /// A program of the host failed.
     #[error("{program} failed ({status}): {last_lines}")]
     Program {
-        /// The command.
+        /// Command.
         program: String,
-        /// How it ended.
+        /// Exit status.
         status: String,
-        /// The last lines it printed.
+        /// Last lines of its output.
         last_lines: String,
     },
-    /// `--apt` names something that is no ROS package.
-    #[error("the Debian package {name} holds no ROS package; `--with {name}` adds it to one")]
+    /// `--apt` names a Debian package without ROS packages.
+    #[error("the Debian package {name} contains no ROS package; `--with {name}` adds it to one")]
     NotRos {
-        /// What was asked for.
+        /// Name that was requested.
         name: String,
     },
-    /// apt knows no way to install these packages together.
+    /// apt cannot install these packages together.
     #[error("apt cannot install {wanted}: {words}")]
     Unsolvable {
-        /// What was to be installed.
+        /// Packages to install.
         wanted: String,
-        /// apt's own words.
+        /// Message of apt.
         words: String,
     },
-    /// Lists of packages that could not be had, or are not believed.
+    /// Package lists could not be fetched or verified.
     #[error("package lists could not be fetched: {words}; {next}")]
     Lists {
-        /// apt's own words.
+        /// Message of apt.
         words: String,
-        /// What to do.
+        /// Next step.
         next: &'static str,
     },
-    /// Packages that the mirror would not give.
+    /// Packages could not be downloaded.
     #[error(
-        "packages could not be downloaded: {words}; push again: the package lists will be fetched anew first"
+        "packages could not be downloaded: {words}; push again: the package lists are then fetched again first"
     )]
     Download {
-        /// apt's own words.
+        /// Message of apt.
         words: String,
     },
-    /// Python packages of a base that could not be had.
+    /// Python packages of a base could not be downloaded.
     #[error(
-        "Python packages could not be downloaded: {words}; they are fetched by this host's pip, from where that is configured to"
+        "Python packages could not be downloaded: {words}; check the configuration of this host's pip, which fetches \
+            them"
     )]
     Wheels {
-        /// pip's own words.
+        /// Message of pip.
         words: String,
     },
-    /// The archive is not the one that a base is made of.
+    /// The archive lacks packages of the base.
     #[error(
-        "the package archive has not what base {base} is made of: {missing}; its sources.list can be configured ([archives])"
+        "the package archive lacks packages of base {base}: {missing}; its sources.list can be configured ([archives])"
     )]
     BaseLacks {
-        /// The base.
+        /// Name of the base.
         base: String,
-        /// Debian packages that are not there.
+        /// Missing Debian packages.
         missing: String,
     },
-    /// Names that nothing provides.
+    /// Dependencies that nothing provides.
     #[error("{}", unresolved_text(.0))]
     Unresolved(Vec<Unresolved>),
-    /// `--apt` names something that is not there.
+    /// `--apt` names an unknown package.
     #[error(
-        "{name} is neither a ROS package nor a Debian package of {suite}{hint}; look for it with `apt-cache search {name}`"
+        "{name} is neither a ROS package nor a Debian package of {suite}{hint}; look for it with \
+         `apt-cache search {name}`"
     )]
     UnknownPackage {
-        /// What was asked for.
+        /// Name that was requested.
         name: String,
-        /// Of which distribution.
+        /// Release of the distribution.
         suite: String,
-        /// Names that look alike, or nothing.
+        /// Hint with similar names; may be empty.
         hint: String,
     },
-    /// The archive has no index of files.
+    /// The archive has no Contents index.
     #[error(
-        "the package archive has no Contents index, by which ROS packages are found; use a mirror that has one. Asked: {}",
+        "the package archive has no Contents index, which is needed to find ROS packages; use a mirror that has one. \
+            Tried: {}",
         sources.trim().replace('\n', "; ")
     )]
     NoContents {
         /// Lines of the sources.list.
         sources: String,
     },
-    /// The package's build failed.
+    /// The build of a package failed.
     #[error("the build of {package} failed; the complete log is {log}\n{last_lines}{advice}", log = log.display(),
         advice = advice.iter().map(|line| format!("\n{line}")).collect::<String>())]
     BuildFailed {
-        /// The ROS package that failed.
+        /// ROS package that failed.
         package: String,
-        /// The complete log.
+        /// Path of the complete log.
         log: PathBuf,
-        /// Its last lines, the compiler's own words among them.
+        /// Last lines of the log, including the compiler's errors.
         last_lines: String,
-        /// What is missing, and the options that add it.
+        /// Missing dependencies, with the options that add them.
         advice: Vec<String>,
     },
-    /// dpkg failed inside the sandbox.
+    /// dpkg failed in the sandbox.
     #[error("installing packages failed: {first_error}")]
     InstallFailed {
-        /// dpkg's first error and what led to it; its last lines where it named none.
+        /// First error of dpkg with its context, or its last lines if there is none.
         first_error: String,
     },
-    /// Something of ours that runs inside a container failed.
+    /// A helper script failed in a container.
     #[error("{what} failed: {last_lines}")]
     Inside {
-        /// The step that failed.
+        /// Step that failed.
         what: &'static str,
-        /// The last lines it printed.
+        /// Last lines of its output.
         last_lines: String,
     },
-    /// The launch plan is not one that the launch script writes; the package's code may have replaced it.
-    #[error("the launch plan that the container wrote is not valid: {problem}")]
+    /// The launch plan was not written by the launch script; the package's code may have replaced it.
+    #[error("the container's launch plan is invalid: {problem}")]
     BadPlan {
-        /// What is wrong with it.
+        /// Description of the problem.
         problem: String,
     },
-    /// The image's own launch program refused the launch file.
+    /// The image's own launch program rejected the launch file.
     #[error("{program} cannot load {file}: {words}")]
     Launch {
-        /// `roslaunch` or `ros2 launch`.
+        /// Program: `roslaunch` or `ros2 launch`.
         program: &'static str,
-        /// The launch file.
+        /// Launch file.
         file: String,
-        /// Its own words.
+        /// Message of the program.
         words: String,
     },
-    /// No such launch file or executable in the image.
-    #[error("there is no {what} {name:?} in the package; there are: {known}{elsewhere}")]
+    /// The launch file or executable does not exist in the image.
+    #[error("no {what} {name:?} in the package; available: {known}{elsewhere}")]
     NotInPackage {
         /// `launch file` or `executable`.
         what: &'static str,
-        /// What was asked for.
+        /// Name that was requested.
         name: String,
-        /// Names that exist.
+        /// Existing names.
         known: String,
-        /// Where it is instead, with the option that adds it.
+        /// Where it exists instead, with the option that adds it.
         elsewhere: String,
     },
-    /// Nothing says what to run.
+    /// The push does not state what to run.
     #[error(
-        "say what to run, with --node or --launch; executables: {executables}; launch files: {launch_files}{more}"
+        "choose what to run with --node or --launch; executables: {executables}; launch files: {launch_files}{more}"
     )]
     NothingToRun {
         /// Executables of the package.
         executables: String,
         /// Launch files of the package.
         launch_files: String,
-        /// What is to be said of these lists.
+        /// Note about these lists.
         more: &'static str,
     },
-    /// A package of the other ROS than the base's.
+    /// The package does not support the base's ROS version.
     #[error(
         "{package} {because}, which is ROS {version}, but base {base} is of ROS {base_version}; push it with {fitting}"
     )]
     WrongRos {
-        /// The package.
+        /// Name of the package.
         package: String,
-        /// Why it is of its ROS: `has build type catkin`.
+        /// Reason for its ROS version: `has build type catkin`.
         because: String,
-        /// Its ROS: 1 or 2.
+        /// ROS version of the package: 1 or 2.
         version: u8,
-        /// The base that was asked for.
+        /// Base that was requested.
         base: String,
-        /// The base's ROS.
+        /// ROS version of the base.
         base_version: u8,
-        /// Options that name bases which fit.
+        /// Options with suitable bases.
         fitting: String,
     },
-    /// No base of a package's ROS.
+    /// There is no base of the package's ROS version.
     #[error(
-        "{package} {because}, and this server has no base of ROS {version}; add a definition of one to the directory of base definitions"
+        "{package} {because}, and this server has no base of ROS {version}; add a definition of one to the directory \
+         of base definitions"
     )]
     NoBase {
-        /// The package.
+        /// Name of the package.
         package: String,
-        /// Why it is of its ROS.
+        /// Reason for its ROS version.
         because: String,
-        /// 1 or 2.
+        /// ROS version: 1 or 2.
         version: u8,
     },
-    /// `--apt` on a base that knows no archive of ROS packages.
+    /// `--apt` on a base without an archive of ROS packages.
     #[error(
-        "base {base} has no archive with a package {name} of ROS 2 {distribution}; push its source, or take a base with that archive (--base)"
+        "base {base} has no archive with a package {name} of ROS 2 {distribution}; push its source, or choose a base \
+            with that archive (--base)"
     )]
     NotInRosArchive {
-        /// What was asked for.
+        /// Name that was requested.
         name: String,
-        /// The base.
+        /// Name of the base.
         base: String,
-        /// Of which ROS.
+        /// ROS distribution.
         distribution: String,
     },
-    /// A launch file of ROS 2 in an image that cannot read any.
+    /// The image cannot read ROS 2 launch files.
     #[error(
-        "the image has no Python package {module}, without which launch files of ROS 2 cannot be read: name the nodes with --node, or {}",
-        with.as_ref().map_or_else(|| format!("push a workspace that also holds {module}"), |deb| format!("push with --with {deb}"))
+        "the image has no Python package {module}, without which launch files of ROS 2 cannot be read: name the nodes \
+         with --node, or {}",
+        with.as_ref().map_or_else(|| format!("push a workspace that also contains {module}"), |deb| format!("push with \
+            --with {deb}"))
     )]
     NoLaunch {
-        /// `launch` or `launch_ros`, or what they need themselves.
+        /// Missing module: `launch`, `launch_ros`, or a dependency of these.
         module: String,
-        /// The Debian package that has it.
+        /// Debian package that contains it.
         with: Option<String>,
     },
-    /// A class of a node is named, and nothing in the image could load it.
+    /// A component class was requested, but the image has no container to load it.
     #[error(
         "{plugin} is loaded into a component container, and the image has none: push with --with rclcpp_components"
     )]
     NoContainer {
-        /// The class.
+        /// Class.
         plugin: String,
     },
-    /// What a component is given cannot be given to it.
+    /// A component was given something that components do not support.
     #[error("{words}")]
     BadComponent {
-        /// What, and what can.
+        /// Description, with what is supported.
         words: String,
     },
-    /// Nodes are to be loaded, and nobody knows how to ask for that.
+    /// Components must be loaded, but the image lacks the definitions of the services for it.
     #[error(
-        "nodes are loaded into {container} by {what}, which the image does not define: push with --with composition_interfaces, or start programs of their own with --node"
+        "nodes are loaded into {container} with {what}, which the image does not define: push with --with \
+            composition_interfaces, or start separate programs with --node"
     )]
     NoComposition {
-        /// The container's name.
+        /// Name of the container.
         container: String,
-        /// The type of a service.
+        /// Type of the missing service.
         what: String,
     },
-    /// An install space that was made for another Python.
+    /// The install space was built for another Python version.
     #[error(
-        "the install space was made for {made_for}, and the base has {there}: push the workspace, or build it on the base's own distribution"
+        "the install space was built for {made_for}, but the base has {there}: push the workspace, or build it on the \
+            base's distribution"
     )]
     OtherPython {
-        /// Such as `python3.12`.
+        /// Python of the install space, such as `python3.12`.
         made_for: String,
-        /// Such as `python3.11`.
+        /// Python of the base, such as `python3.11`.
         there: String,
     },
-    /// A package this base cannot compile.
+    /// The base cannot build a package of this build type.
     #[error(
         "package {package} has build type {build_type}, which base {base} cannot build: it builds {builds}"
     )]
     BuildType {
-        /// The package.
+        /// Name of the package.
         package: String,
-        /// What its package.xml says.
+        /// Build type in its package.xml.
         build_type: String,
-        /// The base.
+        /// Name of the base.
         base: String,
-        /// The build types that it builds.
+        /// Build types supported by the base.
         builds: &'static str,
     },
-    /// The running package does not show what it should.
+    /// The interface of the running package could not be probed.
     #[error("{0}")]
     Probe(#[from] crate::probe::ProbeError),
-    /// The pushed tree is not what it should be.
+    /// The pushed tree is invalid.
     #[error(transparent)]
     Package(#[from] package::Error),
-    /// An install space that cannot be where it was built for.
+    /// The install space cannot be placed at its prefix.
     #[error(
         "the install space was built for {prefix}, where a servant has scratch space: build it with another prefix, \
          such as -DCMAKE_INSTALL_PREFIX=/opt/{package}", prefix = prefix.display()
     )]
     Prefix {
-        /// Where it wants to be.
+        /// Prefix for which it was built.
         prefix: PathBuf,
-        /// One of its packages.
+        /// Name of one of its packages.
         package: String,
     },
-    /// The image store.
+    /// Error of the image store.
     #[error(transparent)]
     Image(#[from] image::Error),
-    /// The container engine.
+    /// Error of the container engine.
     #[error(transparent)]
     Servant(#[from] servant::Error),
-    /// No space left.
-    #[error("no space left on the disk that holds {path} while {what}; free some (`cloudroidctl rm` removes services) and push again", path = path.display())]
+    /// The disk is full.
+    #[error("no space left on the disk of {path} while {what}; free some space (`cloudroidctl rm` removes services) \
+        and push again", path = path.display())]
     DiskFull {
-        /// A path on the full disk.
+        /// Path on the full disk.
         path: PathBuf,
-        /// What was being done.
+        /// Operation that failed.
         what: String,
     },
-    /// Some other input or output.
+    /// Other I/O error.
     #[error("{what} {path}: {source}", path = path.display())]
     Io {
-        /// What was being done.
+        /// Operation that failed.
         what: String,
-        /// With which file.
+        /// File.
         path: PathBuf,
-        /// Why it failed.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// What a sandbox left, or what was pushed, is not what is read.
+    /// Files of a sandbox or a push could not be read as expected.
     #[error(transparent)]
     Foreign(foreign::Error),
-    /// A thread of this process panicked.
+    /// A task of this process panicked.
     #[error("an internal task ended early: {0}")]
     Task(#[from] tokio::task::JoinError),
 }
 
-/// A name that nothing provides.
+/// A dependency that nothing provides.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Unresolved {
-    /// The rosdep key or ROS package.
+    /// rosdep key or ROS package.
     pub key: String,
-    /// Packages whose package.xml ask for it.
+    /// Packages whose package.xml depends on it.
     pub wanted_by: Vec<String>,
-    /// Debian packages whose names look alike.
+    /// Debian packages with similar names.
     pub similar: Vec<String>,
 }
 
@@ -354,12 +364,14 @@ fn unresolved_text(all: &[Unresolved]) -> String {
             text.push_str(&format!("; perhaps {}", one.similar.join(", ")));
         }
     }
-    text.push_str("\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also holds its source");
+    text.push_str(
+        "\nname the Debian package of each with `--map KEY=DEB`, or push a workspace that also contains its source",
+    );
     text
 }
 
 impl Error {
-    /// An input/output error, told apart from a full disk.
+    /// Creates an I/O error, or the error of a full disk.
     pub fn io(what: impl Into<String>, path: impl Into<PathBuf>, source: io::Error) -> Self {
         let (what, path) = (what.into(), path.into());
         if source.kind() == io::ErrorKind::StorageFull
@@ -385,14 +397,14 @@ impl From<foreign::Error> for Error {
     }
 }
 
-/// `map_err` for input and output: `.at("reading", path)`.
-pub(crate) trait IoAt<T> {
-    /// Names what was being done with which file.
-    fn at(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error>;
+/// Context for I/O results: `.io_context("reading", path)`.
+pub(crate) trait IoContext<T> {
+    /// Adds the operation and the file to the error.
+    fn io_context(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error>;
 }
 
-impl<T> IoAt<T> for io::Result<T> {
-    fn at(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error> {
+impl<T> IoContext<T> for io::Result<T> {
+    fn io_context(self, what: &str, path: impl Into<PathBuf>) -> Result<T, Error> {
         self.map_err(|source| Error::io(what, path, source))
     }
 }
@@ -427,15 +439,15 @@ mod tests {
     #[test]
     fn a_full_disk_is_told_apart() {
         let error = std::fs::write("/dev/full", "x")
-            .at("writing", "/dev/full")
+            .io_context("writing", "/dev/full")
             .expect_err("full");
         assert!(matches!(error, Error::DiskFull { .. }), "{error}");
         assert!(
-            error.to_string().contains("the disk that holds /dev/full"),
+            error.to_string().contains("the disk of /dev/full"),
             "{error}"
         );
         let error = std::fs::write("/nonexistent/x", "x")
-            .at("writing", "/nonexistent/x")
+            .io_context("writing", "/nonexistent/x")
             .expect_err("absent");
         assert!(matches!(error, Error::Io { .. }), "{error}");
     }

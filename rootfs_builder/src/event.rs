@@ -1,49 +1,49 @@
-//! What a build tells while it runs.
+//! Progress events of a build.
 
 use std::sync::Arc;
 
 use tokio::sync::mpsc;
 
-/// One thing told.
+/// A progress event.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum BuildEvent {
     /// A new step begins.
     Step {
-        /// What is done now.
+        /// Title of the step.
         title: String,
     },
-    /// One line of a program's output.
+    /// A line of a program's output.
     Log {
-        /// Without the line end.
+        /// The line, without its line terminator.
         line: String,
     },
-    /// How far the step is.
+    /// Progress of the current step.
     Progress {
-        /// What is counted.
+        /// Unit that is counted.
         unit: &'static str,
-        /// Number of those that are done.
+        /// Number of units done.
         done: u64,
-        /// Number of all, where it is known.
+        /// Total number of units, if known.
         total: Option<u64>,
     },
-    /// It waits until another push has made a layer that both need.
+    /// The build waits for another push to create a layer that both need.
     Waits {
-        /// The service of that push, or the package that becomes one.
+        /// Service of that push, or the package that becomes one.
         push: String,
     },
-    /// Something to know that is no failure.
+    /// A warning; the build continues.
     Warning {
-        /// The text, for people.
+        /// Human-readable text.
         message: String,
     },
 }
 
-/// The sending end. A listener that went away stops nothing; cancelling is dropping the build's future.
+/// Sender of progress events. A listener that has gone does not stop the build; to cancel it, drop its future.
 #[derive(Debug, Clone)]
 pub struct Progress(Arc<mpsc::Sender<BuildEvent>>);
 
 impl Progress {
-    /// Tells this listener.
+    /// Creates a sender to this listener.
     pub fn new(sender: mpsc::Sender<BuildEvent>) -> Self {
         Self(Arc::new(sender))
     }
@@ -79,7 +79,7 @@ impl Progress {
             .await;
     }
 
-    /// A number is worth something only now: dropped when the listener is busy.
+    /// Sends a progress count; dropped if the listener is busy, since only the latest one matters.
     pub(crate) fn count(&self, unit: &'static str, done: u64, total: Option<u64>) {
         let _ = self.0.try_send(BuildEvent::Progress { unit, done, total });
     }

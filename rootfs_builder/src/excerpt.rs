@@ -1,33 +1,33 @@
-//! What an error shows of a build's output.
+//! Excerpts of a build's output for error messages.
 
 use crate::advice;
-use crate::process::Tail;
+use crate::process::LastLines;
 
-/// What an error shows of a build's output: its last lines, and before them those that name something missing.
+/// Excerpt of a build's output: its last lines, preceded by those that name a missing dependency.
 #[derive(Debug, Default)]
 pub(crate) struct Excerpt {
     missing: Vec<String>,
-    last: Tail,
+    last: LastLines,
 }
 
 impl Excerpt {
-    /// More lines that name something are as many of one cause.
+    /// Maximum number of lines about missing dependencies; more usually have the same cause.
     const MOST: usize = 25;
 
-    /// Takes one more line; what nobody needs to see is left out.
+    /// Adds a line; irrelevant ones are left out.
     pub(crate) fn push(&mut self, line: &str) {
         if !is_worth_showing(line) {
             return;
         }
         if let Some(dropped) = self.last.push(line)
             && self.missing.len() < Self::MOST
-            && advice::names_missing(&dropped)
+            && advice::mentions_missing(&dropped)
         {
             self.missing.push(dropped);
         }
     }
 
-    /// Its lines.
+    /// Returns the lines of the excerpt.
     pub(crate) fn text(&self) -> String {
         let mut lines: Vec<&str> = self.missing.iter().map(String::as_str).collect();
         let last = self.last.text();
@@ -36,7 +36,8 @@ impl Excerpt {
     }
 }
 
-/// make's, Ninja's, CMake's and setuptools' own chatter pushes what the compiler said out of the last lines.
+/// Returns whether a line is relevant: progress messages of make, Ninja, CMake and setuptools would displace the
+/// compiler's errors.
 fn is_worth_showing(line: &str) -> bool {
     const CHATTER: [&str; 9] = [
         "make[",
@@ -51,10 +52,10 @@ fn is_worth_showing(line: &str) -> bool {
     ];
     let is_chatter = CHATTER.iter().any(|start| line.starts_with(start));
     let is_told = is_progress(line) && !line.contains("Error");
-    (!is_chatter || advice::names_missing(line)) && !is_told && !line.trim().is_empty()
+    (!is_chatter || advice::mentions_missing(line)) && !is_told && !line.trim().is_empty()
 }
 
-/// `[ 50%] …` as make says it, or `[3/12] …` as Ninja does.
+/// Returns whether a line is progress of make (`[ 50%] …`) or Ninja (`[3/12] …`).
 fn is_progress(line: &str) -> bool {
     let Some((inside, _)) = line.strip_prefix('[').and_then(|rest| rest.split_once(']')) else {
         return false;
@@ -81,7 +82,7 @@ mod tests {
             "  3 | y();",
             "[rosidl] cannot read Foo.msg",
             "FAILED: x.o",
-            // pkg-config's words, as CMake passes them on: the error after them names nothing.
+            // Output of pkg-config, as passed on by CMake: the error after it names nothing.
             "--   No package 'csm' found",
             "--   Package 'csm', required by 'virtual:world', not found",
         ] {

@@ -1,16 +1,16 @@
-//! All that a packaged ROS package needs to run, found by what it says of itself.
+//! Gathers everything that a packaged ROS package needs to run, based on its own metadata.
 //!
-//! Debian's own dependencies are not the whole story: a ROS package is cut into several Debian packages that do not
-//! depend on each other, plugin lists and launch files are in development packages, and libraries that are loaded
-//! by name at run time are nobody's dependency. So, starting from some ROS packages, three rules until nothing new
-//! comes:
+//! Debian's dependencies are not sufficient: a ROS package is split into several Debian packages that do not depend on
+//! each other, plugin lists and launch files are in development packages, and libraries loaded by name at run time are
+//! not declared as dependencies. So, starting from some ROS packages, these rules are applied until nothing new is
+//! found:
 //!
-//! 1. Every Debian package that holds a part of a ROS package is wanted: to be installed, or, if it is a development
-//!    package, to give its files without its dependencies.
-//! 2. Every ROS package that a `package.xml` so found names as an exec dependency is wanted, too, the less of it the
-//!    further away it is (see [`Depth`]).
-//! 3. Every library that a plugin list so found names is wanted, too.
-//! 4. Every Python module that programs to be run, and modules of the ROS packages asked for, import is wanted, too.
+//! 1. Every Debian package that contains a part of a ROS package is needed: installed or, if it is a development
+//!    package, unpacked for its files without its dependencies.
+//! 2. Every ROS package that a `package.xml` found this way names as an exec dependency is needed, with fewer parts the
+//!    further away it is (see [`DependencyDepth`]).
+//! 3. Every library named in a plugin list found this way is needed.
+//! 4. Every Python module imported by selected programs, and by modules of the requested ROS packages, is needed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -18,69 +18,71 @@ use std::path::{Path, PathBuf};
 use futures_util::{StreamExt, stream};
 
 use crate::apt::Deb;
-use crate::archive::{Archive, Depth};
+use crate::archive::{Archive, DependencyDepth};
 use crate::base::Base;
-use crate::contents::Part;
-use crate::deb::{self, Content, Member};
+use crate::contents::RosPackagePart;
+use crate::deb::{self, DebMember, MemberContent};
 use crate::error::Error;
 use crate::event::Progress;
-use crate::imports::{self, Programs};
+use crate::imports::{self, SelectedPrograms};
 use crate::manifest::{self, PluginLibrary};
 
-/// Packages that are unpacked at the same time, each by processes of its own.
+/// Number of packages that are unpacked concurrently, each by separate processes.
 const AT_ONCE: usize = 4;
 
-/// What is wanted.
+/// Packages and files to add.
 #[derive(Debug, Default, Clone, PartialEq)]
-pub(crate) struct Wanted {
-    /// Debian packages, to be installed with their dependencies.
+pub(crate) struct GatheredPackages {
+    /// Debian packages to install with their dependencies.
     pub(crate) install: BTreeSet<String>,
     /// Files of development packages.
-    pub(crate) extras: Vec<Member>,
-    /// Things to know.
+    pub(crate) extras: Vec<DebMember>,
+    /// Warnings for the deployer.
     pub(crate) warnings: Vec<String>,
-    /// What a package.xml asks for and nothing provides.
+    /// Dependencies in a package.xml that nothing provides.
     pub(crate) unknown: BTreeSet<String>,
 }
 
-/// Walks from `roots` (ROS packages). `python`: whether the roots' Python modules are wanted. `programs`: which of the
-/// roots' programs may be run.
-pub(crate) async fn gather(
+/// Gathers from `roots` (ROS packages). `python` is whether the Python modules of the roots are needed, `programs`
+/// which of their programs may be run.
+pub(crate) async fn gather_packages(
     archive: &Archive,
     base: &Base,
     roots: &BTreeSet<String>,
     python: bool,
-    programs: &Programs,
+    programs: &SelectedPrograms,
     progress: &Progress,
-) -> Result<Wanted, Error> {
-    let mut wanted = Wanted::default();
+) -> Result<GatheredPackages, Error> {
+    let mut wanted = GatheredPackages::default();
     let (mut seen, mut looked_into) = (BTreeSet::new(), BTreeSet::new());
     let mut next = roots.clone();
     let mut importing = BTreeSet::new();
-    let mut depth = Depth::Itself { python };
+    let mut depth = DependencyDepth::Itself { python };
     while !next.is_empty() {
-        // All of one depth in one go: one call of apt, not one for each.
+        // All packages of the same depth together: one call of apt instead of one for each.
         let mut round = BTreeSet::new();
         for name in std::mem::take(&mut next) {
             let ignored = base.ros_packages.ignore.contains(&name) && !roots.contains(&name);
             if ignored || !seen.insert(name.clone()) {
                 continue;
             }
-            let carried = archive.to_run(&name, depth);
-            if let Depth::Itself { python } = depth {
+            let carried = archive.runtime_packages(&name, depth);
+            if let DependencyDepth::Itself { python } = depth {
                 let carriers = archive.contents.ros_package(&name);
                 let imports = |deb: &&String| {
                     carriers.get(*deb).is_some_and(|parts| {
-                        parts.contains(&Part::Programs) || python && parts.contains(&Part::Python)
+                        parts.contains(&RosPackagePart::Programs)
+                            || python && parts.contains(&RosPackagePart::Python)
                     })
                 };
                 importing.extend(carried.install.iter().filter(imports).cloned());
             }
             wanted.install.extend(carried.install);
-            if depth != Depth::Beyond {
+            if depth != DependencyDepth::Beyond {
                 let tells = archive.contents.ros_package(&name).into_iter();
                 let tells = tells.filter(|(_, parts)| {
-                    parts.contains(&Part::Manifest) || parts.contains(&Part::Share)
+                    parts.contains(&RosPackagePart::Manifest)
+                        || parts.contains(&RosPackagePart::Share)
                 });
                 round.extend(tells.map(|(deb, _)| deb));
                 round.extend(carried.unpack);
@@ -91,48 +93,48 @@ pub(crate) async fn gather(
             .iter()
             .filter_map(|name| archive.candidates.get(name))
             .collect();
-        let of_round = looked_into_each(archive, &debs, progress, deb::at_run_time).await?;
+        let of_round = inspect_each(archive, &debs, progress, deb::runtime_members).await?;
         for (deb, members) in debs.iter().zip(of_round) {
-            let report = report(&members, base);
-            let itself = matches!(depth, Depth::Itself { .. });
+            let report = report_members(&members, base);
+            let itself = matches!(depth, DependencyDepth::Itself { .. });
             for name in report.needed {
-                match provided(archive, base, &name) {
-                    Provided::Ros => {
+                match find_provider(archive, base, &name) {
+                    NameProvider::Ros => {
                         next.insert(name);
                     }
-                    // Further away, Debian's own dependencies say it.
-                    Provided::Debs(debs) if itself => wanted.install.extend(debs),
-                    Provided::Nothing if itself => {
+                    // Further away, Debian's dependencies are relied on.
+                    NameProvider::Debs(debs) if itself => wanted.install.extend(debs),
+                    NameProvider::Nothing if itself => {
                         wanted.unknown.insert(name);
                     }
-                    Provided::Debs(_) | Provided::Nothing => {}
+                    NameProvider::Debs(_) | NameProvider::Nothing => {}
                 }
             }
             wanted.warnings.extend(report.warnings);
             for library in report.plugins {
-                want_plugin(archive, &library, &members, &mut wanted);
+                add_plugin_library(archive, &library, &members, &mut wanted);
             }
             if deb.name.ends_with("-dev") {
                 wanted.extras.extend(members);
             }
         }
         depth = match depth {
-            Depth::Itself { .. } => Depth::Needed,
-            Depth::Needed | Depth::Beyond => Depth::Beyond,
+            DependencyDepth::Itself { .. } => DependencyDepth::Needed,
+            DependencyDepth::Needed | DependencyDepth::Beyond => DependencyDepth::Beyond,
         };
     }
     wanted
         .install
-        .extend(imported(archive, &importing, programs, progress).await?);
+        .extend(imported_packages(archive, &importing, programs, progress).await?);
     wanted.extras.sort_by(|a, b| a.path.cmp(&b.path));
     wanted
         .extras
         .dedup_by(|later, first| later.path == first.path);
-    // Names of libraries that do not become present would be links to nothing.
+    // Library links whose target is not installed would be dangling.
     let plugin_targets = wanted.install.clone();
     wanted.extras.retain(|member| match &member.content {
-        Content::File(_) => true,
-        Content::Link(target) => target
+        MemberContent::File(_) => true,
+        MemberContent::Link(target) => target
             .file_name()
             .and_then(|name| archive.contents.library(&name.to_string_lossy()))
             .is_some_and(|deb| plugin_targets.contains(deb)),
@@ -140,9 +142,9 @@ pub(crate) async fn gather(
     Ok(wanted)
 }
 
-/// Downloads packages and has each looked into, some at the same time; `look` is given the package's file and the
-/// directory in which it may keep what it finds.
-async fn looked_into_each<T: Send + 'static>(
+/// Downloads packages and inspects several concurrently; `look` gets the package's file and the cache directory for its
+/// results.
+async fn inspect_each<T: Send + 'static>(
     archive: &Archive,
     debs: &[Deb],
     progress: &Progress,
@@ -162,69 +164,70 @@ async fn looked_into_each<T: Send + 'static>(
     Ok(found)
 }
 
-/// Debian packages with what Python files of these Debian packages import.
-async fn imported(
+/// Returns the Debian packages that provide what Python files of the given ones import.
+async fn imported_packages(
     archive: &Archive,
     importing: &BTreeSet<String>,
-    programs: &Programs,
+    programs: &SelectedPrograms,
     progress: &Progress,
 ) -> Result<BTreeSet<String>, Error> {
     let debs: Vec<Deb> = importing
         .iter()
         .filter_map(|name| archive.candidates.get(name))
         .collect();
-    let found = looked_into_each(archive, &debs, progress, imports::of_package).await?;
+    let found = inspect_each(archive, &debs, progress, imports::read_imports).await?;
     let modules: BTreeSet<String> = found
         .into_iter()
-        .flat_map(|imports| imports.of(programs))
+        .flat_map(|imports| imports.for_programs(programs))
         .collect();
     let debs = modules
         .iter()
-        .filter_map(|module| imports::provider(archive, module));
+        .filter_map(|module| imports::provider_package(archive, module));
     Ok(debs.map(str::to_owned).collect())
 }
 
-/// Where the name in an exec dependency leads.
+/// Provider of the name in an exec dependency.
 #[derive(Debug, PartialEq)]
-enum Provided {
+enum NameProvider {
     Ros,
     Debs(Vec<String>),
     Nothing,
 }
 
-/// A ROS package, or a rosdep key, or a Debian package of that name. Development packages are not for running.
-fn provided(archive: &Archive, base: &Base, name: &str) -> Provided {
+/// Finds the provider of a name: a ROS package, a rosdep key, or a Debian package of that name. Development packages
+/// are not used at run time.
+fn find_provider(archive: &Archive, base: &Base, name: &str) -> NameProvider {
     if !archive.contents.ros_package(name).is_empty() || base.ros_packages.ignore.contains(name) {
-        return Provided::Ros;
+        return NameProvider::Ros;
     }
     let debs = match base.keys.get(name) {
         Some(debs) => debs.clone(),
         None if archive.candidates.contains(name) => vec![name.to_owned()],
-        None => return Provided::Nothing,
+        None => return NameProvider::Nothing,
     };
-    Provided::Debs(
+    NameProvider::Debs(
         debs.into_iter()
             .filter(|deb| !deb.ends_with("-dev"))
             .collect(),
     )
 }
 
-/// What the package.xml files and plugin lists among these members say.
+/// Content of the package.xml files and plugin lists among some members.
 #[derive(Debug, Default, PartialEq)]
-struct Report {
+struct MemberReport {
     /// ROS packages and rosdep keys.
     needed: BTreeSet<String>,
     plugins: BTreeSet<PluginLibrary>,
     warnings: Vec<String>,
 }
 
-fn report(members: &[Member], base: &Base) -> Report {
-    let mut report = Report::default();
+fn report_members(members: &[DebMember], base: &Base) -> MemberReport {
+    let mut report = MemberReport::default();
     let texts: BTreeMap<&Path, &[u8]> = members
         .iter()
         .filter_map(|member| match &member.content {
-            Content::File(bytes) => Some((member.path.as_path(), bytes.as_slice())),
-            Content::Link(_) => None,
+            MemberContent::File(bytes) => Some((member.path.as_path(), bytes.as_slice())),
+            MemberContent::Link(_) => None,
         })
         .collect();
     for (path, bytes) in &texts {
@@ -239,21 +242,21 @@ fn report(members: &[Member], base: &Base) -> Report {
                 Err(problem) => report.warnings.push(format!("in the archive: {problem}")),
             }
         } else if path.extension().is_some_and(|extension| extension == "xml") {
-            // A plugin list may be exported by a package.xml of another Debian package; they all look alike.
+            // A plugin list may be exported by a package.xml of another Debian package; all have the same format.
             report.plugins.extend(manifest::plugin_libraries(text));
         }
     }
     report
 }
 
-/// A plugin list names `libx`; the file with that name is a link in a development package to `libx.so.1`, which is
-/// in another one. Where it says `lib/libx`, pluginlib looks in `/usr/lib` and not where Debian's libraries are: what
-/// works on other distributions fails there, so that it gets a link.
-fn want_plugin(
+/// Adds the library of a plugin list. The list names `libx`; the file with that name is a link in a development package
+/// to `libx.so.1`, which is in another package. If the list states `lib/libx`, pluginlib looks in `/usr/lib` and not in
+/// Debian's library directory; this works on other distributions but fails here, so a link is added.
+fn add_plugin_library(
     archive: &Archive,
     library: &PluginLibrary,
-    members: &[Member],
-    wanted: &mut Wanted,
+    members: &[DebMember],
+    wanted: &mut GatheredPackages,
 ) {
     let link = members.iter().find(|member| {
         member
@@ -262,8 +265,8 @@ fn want_plugin(
             .is_some_and(|name| name == library.name.as_str())
     });
     let target: Option<PathBuf> = link.and_then(|member| match &member.content {
-        Content::Link(target) => Some(target.clone()),
-        Content::File(_) => None,
+        MemberContent::Link(target) => Some(target.clone()),
+        MemberContent::File(_) => None,
     });
     let linked = target.as_deref().and_then(Path::file_name);
     let mut name = linked.map_or(library.name.clone(), |name| {
@@ -283,11 +286,11 @@ fn want_plugin(
     wanted.install.insert(deb.to_owned());
     let triplet = crate::contents::triplet();
     let mut link = |directory: &str, target: String| {
-        wanted.extras.push(Member {
+        wanted.extras.push(DebMember {
             path: Path::new(directory).join(&library.name),
             mode: 0o777,
             mtime: 0,
-            content: Content::Link(target.into()),
+            content: MemberContent::Link(target.into()),
         });
     };
     if library.in_directory {
@@ -299,12 +302,12 @@ fn want_plugin(
 mod tests {
     use super::*;
 
-    fn file(path: &str, text: &str) -> Member {
-        Member {
+    fn file(path: &str, text: &str) -> DebMember {
+        DebMember {
             path: path.into(),
             mode: 0o644,
             mtime: 0,
-            content: Content::File(text.into()),
+            content: MemberContent::File(text.into()),
         }
     }
 
@@ -325,7 +328,7 @@ mod tests {
             ),
             file("usr/share/x/launch/other.xml", "<launch/>"),
         ];
-        let report = report(&members, &base);
+        let report = report_members(&members, &base);
         assert!(
             report.needed.contains("nodelet") && !report.needed.contains("rostest"),
             "{report:?}"
@@ -343,7 +346,7 @@ mod tests {
         Archive {
             apt: crate::apt::Apt::open(directory, "").expect("prepared"),
             contents: std::sync::Arc::new(contents),
-            candidates: crate::candidates::tests::named(names),
+            candidates: crate::candidates::tests::candidates_named(names),
             stamp: String::new(),
             sources: String::new(),
         }
@@ -364,8 +367,8 @@ mod tests {
                 name: "libpcl_ros_filters.so".to_owned(),
                 in_directory,
             };
-            let mut wanted = Wanted::default();
-            want_plugin(&archive, &library, &[], &mut wanted);
+            let mut wanted = GatheredPackages::default();
+            add_plugin_library(&archive, &library, &[], &mut wanted);
             assert_eq!(wanted.install, ["libpcl-ros-filters0d".to_owned()].into());
             assert!(wanted.warnings.is_empty(), "{wanted:?}");
             let links: Vec<_> = wanted
@@ -374,7 +377,7 @@ mod tests {
                 .map(|member| (&member.path, &member.content))
                 .collect();
             let path = PathBuf::from("usr/lib/libpcl_ros_filters.so");
-            let content = Content::Link(format!("{triplet}/libpcl_ros_filters.so.0d").into());
+            let content = MemberContent::Link(format!("{triplet}/libpcl_ros_filters.so.0d").into());
             let expected = if in_directory {
                 vec![(&path, &content)]
             } else {
@@ -384,7 +387,7 @@ mod tests {
         }
     }
 
-    /// The file of a Debian package, where apt would put it.
+    /// Creates the file of a Debian package where apt would put it.
     fn package(archive: &Archive, name: &str, files: &[(&str, &str)]) {
         let place = tempfile::tempdir().expect("a directory");
         let control = format!(
@@ -448,14 +451,14 @@ mod tests {
         let progress = Progress::new(tokio::sync::mpsc::channel(1).0);
         let roots = ["monitor".to_owned()].into();
         let all = vec!["python3-monitor", "python3-numpy", "python3-updater"];
-        let named = |name: &str| Programs::Named([name.to_owned()].into());
+        let named = |name: &str| SelectedPrograms::Named([name.to_owned()].into());
         for (programs, expected) in [
             (named("cpu_monitor"), all.clone()),
-            // Now as it was kept.
-            (Programs::All, all),
+            // Now from the cache.
+            (SelectedPrograms::All, all),
             (named("other"), vec!["python3-monitor"]),
         ] {
-            let wanted = gather(&archive, &base, &roots, true, &programs, &progress)
+            let wanted = gather_packages(&archive, &base, &roots, true, &programs, &progress)
                 .await
                 .expect("gathered");
             let install: Vec<&str> = wanted.install.iter().map(String::as_str).collect();
@@ -474,17 +477,18 @@ mod tests {
         );
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let debs =
-            |names: &[&str]| Provided::Debs(names.iter().map(|&name| name.to_owned()).collect());
+        let debs = |names: &[&str]| {
+            NameProvider::Debs(names.iter().map(|&name| name.to_owned()).collect())
+        };
         for (name, expected) in [
-            ("tf", Provided::Ros),
+            ("tf", NameProvider::Ros),
             ("python-numpy", debs(&["python3-numpy"])),
             ("eigen", debs(&[])),
             ("opencv-data", debs(&["opencv-data"])),
-            ("rviz", Provided::Ros),
-            ("warp", Provided::Nothing),
+            ("rviz", NameProvider::Ros),
+            ("warp", NameProvider::Nothing),
         ] {
-            assert_eq!(provided(&archive, &base, name), expected, "{name}");
+            assert_eq!(find_provider(&archive, &base, name), expected, "{name}");
         }
     }
 }

@@ -1,6 +1,6 @@
-//! What Python files of Debian packages import. Debian's own dependencies leave some of it out: a package.xml names a
-//! ROS package, of which the Python module is in a Debian package of its own, and scripts are not looked into when a
-//! package is made.
+//! Imports of Python files in Debian packages. Debian's dependencies do not cover all of them: a package.xml names a
+//! ROS package whose Python module is in a separate Debian package, and scripts are not inspected when a package is
+//! built.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,38 +10,38 @@ use serde::{Deserialize, Serialize};
 
 use crate::advice;
 use crate::archive::Archive;
-use crate::cache::write_whole;
-use crate::deb::{self, Content};
-use crate::error::{Error, IoAt};
+use crate::cache::write_atomically;
+use crate::deb::{self, MemberContent};
+use crate::error::{Error, IoContext};
 use crate::unused;
 
-/// Below the cache; raise it when what is kept changes.
+/// Directory below the cache; to be changed when the cached content changes.
 const KEPT: &str = "imports-1";
 
-/// Modules that Python files of a Debian package import as soon as they are loaded, by the first part of their names.
+/// Top-level modules that the Python files of a Debian package import when they are loaded.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Imports {
-    /// By all modules that are in the package.
+    /// Imports of the modules in the package.
     pub(crate) modules: BTreeSet<String>,
-    /// By each program of a ROS package, by its name.
+    /// Imports of each program of a ROS package, by name.
     pub(crate) programs: BTreeMap<String, BTreeSet<String>>,
 }
 
 /// Programs that may be run.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Programs {
-    /// Those of these names.
+pub(crate) enum SelectedPrograms {
+    /// Programs with these names.
     Named(BTreeSet<String>),
-    /// Any: a launch file decides.
+    /// Any program: a launch file decides.
     All,
 }
 
 impl Imports {
-    /// What is imported if these programs are run, and the modules of the package are imported themselves.
-    pub(crate) fn of(self, programs: &Programs) -> BTreeSet<String> {
+    /// Returns the imports of the selected programs and of all modules of the package.
+    pub(crate) fn for_programs(self, programs: &SelectedPrograms) -> BTreeSet<String> {
         let runs = |name: &String| match programs {
-            Programs::Named(names) => names.contains(name),
-            Programs::All => true,
+            SelectedPrograms::Named(names) => names.contains(name),
+            SelectedPrograms::All => true,
         };
         let run = self.programs.into_iter().filter(|(name, _)| runs(name));
         run.flat_map(|(_, modules)| modules)
@@ -50,48 +50,48 @@ impl Imports {
     }
 }
 
-/// Looks into a Debian package. What is found is kept below `cache`, named as the package's file is. Blocking.
-pub(crate) fn of_package(deb: &Path, cache: &Path) -> Result<Imports, Error> {
+/// Inspects a Debian package. The result is cached below `cache` under the name of the package's file. Blocking.
+pub(crate) fn read_imports(deb: &Path, cache: &Path) -> Result<Imports, Error> {
     let directory = cache.join(KEPT);
     let path = directory.join(deb.file_name().unwrap_or_default());
     if let Some(found) = fs::read(&path)
         .ok()
         .and_then(|text| serde_json::from_slice(&text).ok())
     {
-        unused::used(&path);
+        unused::mark_used(&path);
         return Ok(found);
     }
     let mut found = Imports::default();
-    for member in deb::members(deb, wanted)? {
-        let Content::File(bytes) = &member.content else {
+    for member in deb::read_members(deb, is_relevant)? {
+        let MemberContent::File(bytes) = &member.content else {
             continue;
         };
         let name = member.path.file_name().unwrap_or_default();
         if member.path.starts_with(MODULES) {
             found
                 .modules
-                .extend(of_text(&String::from_utf8_lossy(bytes)));
-        } else if let Some(modules) = of_program(bytes) {
+                .extend(parse_imports(&String::from_utf8_lossy(bytes)));
+        } else if let Some(modules) = program_imports(bytes) {
             let name = name.to_string_lossy().into_owned();
             found.programs.insert(name, modules);
         }
     }
-    fs::create_dir_all(&directory).at("making", &directory)?;
-    write_whole(&path, &serde_json::to_vec(&found).unwrap_or_default())?;
+    fs::create_dir_all(&directory).io_context("making", &directory)?;
+    write_atomically(&path, &serde_json::to_vec(&found).unwrap_or_default())?;
     Ok(found)
 }
 
-/// The Debian package that is to be installed for an import; none for modules of Python itself.
-pub(crate) fn provider<'a>(archive: &'a Archive, module: &str) -> Option<&'a str> {
+/// Returns the Debian package to install for an import; `None` for modules of Python itself.
+pub(crate) fn provider_package<'a>(archive: &'a Archive, module: &str) -> Option<&'a str> {
     let mut debs = archive.contents.python_module(module);
     debs.retain(|deb| archive.candidates.contains(deb));
-    advice::nearest(&debs, module)
+    advice::nearest_name(&debs, module)
 }
 
 const MODULES: &str = "usr/lib/python3/dist-packages";
 
-/// Programs of ROS packages, and modules.
-fn wanted(path: &Path) -> bool {
+/// Returns whether a path is a program of a ROS package, or a Python module.
+fn is_relevant(path: &Path) -> bool {
     if path.starts_with(MODULES) {
         return path.extension().is_some_and(|extension| extension == "py");
     }
@@ -99,9 +99,9 @@ fn wanted(path: &Path) -> bool {
     matches!(parts.as_slice(), ["usr", "lib", _, program] if !program.contains(".so"))
 }
 
-/// What a program imports; none where it is not one of Python.
-pub(crate) fn of_program(bytes: &[u8]) -> Option<BTreeSet<String>> {
-    is_python_program(bytes).then(|| of_text(&String::from_utf8_lossy(bytes)))
+/// Returns the imports of a program; `None` if it is not a Python program.
+pub(crate) fn program_imports(bytes: &[u8]) -> Option<BTreeSet<String>> {
+    is_python_program(bytes).then(|| parse_imports(&String::from_utf8_lossy(bytes)))
 }
 
 fn is_python_program(bytes: &[u8]) -> bool {
@@ -112,8 +112,8 @@ fn is_python_program(bytes: &[u8]) -> bool {
     first.starts_with(b"#!") && String::from_utf8_lossy(first).contains("python")
 }
 
-/// Statements that are not indented: others are in functions, or in a `try` that can do without the module.
-fn of_text(text: &str) -> BTreeSet<String> {
+/// Parses the imports that are not indented: others are in functions, or in a `try` that handles a missing module.
+fn parse_imports(text: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for line in text.lines() {
         let names: Vec<&str> = if let Some(names) = line.strip_prefix("import ") {
@@ -157,7 +157,7 @@ mod tests {
                     import_name = 'import this'\n\
                     try:\n    import optional\nexcept ImportError:\n    pass\n\
                     def f():\n    import late\n";
-        assert_eq!(of_text(text), set(&["a", "numpy", "os", "tf"]));
+        assert_eq!(parse_imports(text), set(&["a", "numpy", "os", "tf"]));
     }
 
     #[test]
@@ -169,7 +169,7 @@ mod tests {
             ("usr/lib/x86_64-linux-gnu/librobot.so.1", false),
             ("usr/share/robot/x.py", false),
         ] {
-            assert_eq!(wanted(Path::new(path)), expected, "{path}");
+            assert_eq!(is_relevant(Path::new(path)), expected, "{path}");
         }
         assert!(is_python_program(b"#! /usr/bin/python3\nimport a"));
         assert!(!is_python_program(b"\x7fELF\x00python"));
@@ -184,11 +184,11 @@ mod tests {
                 .map(|(name, module)| (name.to_owned(), set(&[module])))
                 .into(),
         };
-        let named = |names: &[&str]| imports().of(&Programs::Named(set(names)));
+        let named = |names: &[&str]| imports().for_programs(&SelectedPrograms::Named(set(names)));
         assert_eq!(named(&[]), set(&["genpy"]));
         assert_eq!(named(&["a", "other"]), set(&["genpy", "numpy"]));
         assert_eq!(
-            imports().of(&Programs::All),
+            imports().for_programs(&SelectedPrograms::All),
             set(&["cv2", "genpy", "numpy"])
         );
     }

@@ -1,5 +1,5 @@
-//! Which ROS packages of ROS 2 are in layers already, as ament's index there says: what came with a base as wheels, or by
-//! apt, needs no list of ours.
+//! ROS 2 packages that are already in layers, according to ament's index: packages of a base, from wheels or apt, need
+//! not be listed anywhere else.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -10,18 +10,18 @@ use crate::base::Base;
 use crate::blocking;
 use crate::error::Error;
 
-/// Packages that are there.
+/// Existing packages.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Indexed {
-    /// While compiling.
+pub(crate) struct IndexedPackages {
+    /// Available while compiling.
     pub(crate) build: BTreeSet<String>,
-    /// At run time.
+    /// Available at run time.
     pub(crate) run: BTreeSet<String>,
 }
 
-/// Install spaces that a base has, absolute: as the environment names them that it gives to all processes, or to
-/// compilers. None where its ROS is not of ament.
-pub(crate) fn prefixes(base: &Base) -> Vec<String> {
+/// Returns the install spaces of a base as absolute paths: those in the environment of all processes and of compilers.
+/// Empty for ROS 1.
+pub(crate) fn install_prefixes(base: &Base) -> Vec<String> {
     if base.ros == Version::Ros1 {
         return Vec::new();
     }
@@ -40,9 +40,9 @@ pub(crate) fn prefixes(base: &Base) -> Vec<String> {
     named
 }
 
-/// Directories of shared libraries that a base's own programs find, below the root.
-pub(crate) fn libraries(base: &Base) -> Vec<String> {
-    let mut places: Vec<String> = prefixes(base)
+/// Returns the directories of shared libraries searched by a base's own programs, relative to the root.
+pub(crate) fn library_directories(base: &Base) -> Vec<String> {
+    let mut places: Vec<String> = install_prefixes(base)
         .iter()
         .map(|prefix| format!("{}/lib", prefix.trim_matches('/')))
         .collect();
@@ -55,14 +55,17 @@ pub(crate) fn libraries(base: &Base) -> Vec<String> {
     places
 }
 
-/// Packages in the index of these trees, lowest first.
-pub(crate) async fn packages(base: &Base, trees: Vec<PathBuf>) -> Result<BTreeSet<String>, Error> {
-    let prefixes = prefixes(base);
+/// Returns the packages in the indexes of trees, given lowest first.
+pub(crate) async fn find_packages(
+    base: &Base,
+    trees: Vec<PathBuf>,
+) -> Result<BTreeSet<String>, Error> {
+    let prefixes = install_prefixes(base);
     if prefixes.is_empty() {
         return Ok(BTreeSet::new());
     }
     let look = move || package::ament::packages(&trees, &prefixes);
-    Ok(blocking::reading(look).await??)
+    Ok(blocking::spawn_reader(look).await??)
 }
 
 #[cfg(test)]
@@ -94,11 +97,11 @@ mod tests {
     fn spaces_are_those_that_the_base_names() {
         let two = base(Version::Ros2);
         assert_eq!(
-            prefixes(&two),
+            install_prefixes(&two),
             ["/opt/wheels", "/opt/tools", "/opt/ros/jazzy"]
         );
         assert_eq!(
-            libraries(&two),
+            library_directories(&two),
             [
                 "opt/wheels/lib",
                 "opt/tools/lib",
@@ -108,7 +111,7 @@ mod tests {
             ]
         );
         let one = base(Version::Ros1);
-        assert!(prefixes(&one).is_empty() && libraries(&one).is_empty());
+        assert!(install_prefixes(&one).is_empty() && library_directories(&one).is_empty());
     }
 
     #[tokio::test]
@@ -127,13 +130,13 @@ mod tests {
             std::fs::write(index.join(name), "").expect("written");
         }
         let trees = vec![tree.path().to_owned()];
-        let found = packages(&base(Version::Ros2), trees.clone())
+        let found = find_packages(&base(Version::Ros2), trees.clone())
             .await
             .expect("read");
         let names: Vec<&str> = found.iter().map(String::as_str).collect();
         assert_eq!(names, ["rclpy", "std_msgs"]);
         assert!(
-            packages(&base(Version::Ros1), trees)
+            find_packages(&base(Version::Ros1), trees)
                 .await
                 .expect("read")
                 .is_empty()

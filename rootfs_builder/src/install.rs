@@ -13,39 +13,39 @@ use crate::apt::Deb;
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::bootstrap::{EPOCH, tree_options};
-use crate::chain::{Chains, Found, Link, MOST_LINKS};
-use crate::complaint::Complaint;
-use crate::deb::{self, Content, Member};
-use crate::error::{Error, IoAt};
+use crate::chain::{Chains, FoundChain, Link, MOST_LINKS};
+use crate::complaint::FirstError;
+use crate::deb::{self, DebMember, MemberContent};
+use crate::error::{Error, IoContext};
 use crate::event::Progress;
 use crate::key::{Key, sha256};
-use crate::sandbox::Run;
+use crate::sandbox::SandboxRun;
 use crate::split;
 use crate::steps;
-use crate::workshop::{Layer, Packing, Workshop};
+use crate::workshop::{BuildContext, PackJob, StagedLayer};
 
-/// What is put on top of some layers.
-pub(crate) struct Addition<'a> {
-    /// Short, for names of directories and steps.
+/// An addition on top of some layers.
+pub(crate) struct LayerAddition<'a> {
+    /// Short name, for directories and steps.
     pub(crate) name: &'static str,
     /// Layers below, lowest first.
     pub(crate) below: &'a [Digest],
-    /// Packages in the order of installation.
+    /// Packages in installation order.
     pub(crate) debs: Vec<Deb>,
     /// Files added without their package.
-    pub(crate) extras: Vec<Member>,
+    pub(crate) extras: Vec<DebMember>,
 }
 
-/// Layers, lowest first; none where nothing is added.
+/// Layers, lowest first; may be empty.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Made {
-    pub(crate) layers: Vec<Layer>,
+pub(crate) struct LayerSet {
+    pub(crate) layers: Vec<StagedLayer>,
 }
 
-impl Made {
-    pub(crate) fn one(diff_id: Digest, cached: bool) -> Self {
+impl LayerSet {
+    pub(crate) fn single(diff_id: Digest, cached: bool) -> Self {
         Self {
-            layers: vec![Layer { diff_id, cached }],
+            layers: vec![StagedLayer { diff_id, cached }],
         }
     }
 
@@ -54,25 +54,25 @@ impl Made {
     }
 }
 
-/// One link of a chain, before it is made.
+/// Content of a link of a chain, before it is created.
 #[derive(Default)]
-struct Part {
+struct LinkContents {
     debs: Vec<Deb>,
-    extras: Vec<Member>,
+    extras: Vec<DebMember>,
 }
 
-impl Part {
+impl LinkContents {
     fn items(&self) -> BTreeSet<String> {
         let debs = self.debs.iter().map(Deb::to_string);
-        debs.chain(self.extras.iter().map(item)).collect()
+        debs.chain(self.extras.iter().map(member_item)).collect()
     }
 }
 
-/// A file by all that makes a difference.
-fn item(member: &Member) -> String {
+/// Describes a file by everything that matters for its content.
+fn member_item(member: &DebMember) -> String {
     let content = match &member.content {
-        Content::File(bytes) => format!("file {}", sha256(bytes)),
-        Content::Link(target) => format!(
+        MemberContent::File(bytes) => format!("file {}", sha256(bytes)),
+        MemberContent::Link(target) => format!(
             "link {}",
             hex::encode(target.as_os_str().as_encoded_bytes())
         ),
@@ -81,22 +81,22 @@ fn item(member: &Member) -> String {
     format!("{path} {:o} {} {content}", member.mode, member.mtime)
 }
 
-/// The layers of an addition: those of the nearest chain there is, and new ones for what that lacks.
-pub(crate) async fn layers(
-    shop: &Workshop,
+/// Adds the layers of an addition: those of the best existing chain, and new ones for what it lacks.
+pub(crate) async fn add_layers(
+    shop: &BuildContext,
     archive: &Archive,
     base: &Base,
-    mut addition: Addition<'_>,
+    mut addition: LayerAddition<'_>,
     progress: &Progress,
-) -> Result<Made, Error> {
+) -> Result<LayerSet, Error> {
     if addition.debs.is_empty() && addition.extras.is_empty() {
-        return Ok(Made::default());
+        return Ok(LayerSet::default());
     }
     addition.extras.sort_by(|a, b| a.path.cmp(&b.path));
     addition
         .extras
         .dedup_by(|later, first| later.path == first.path);
-    let whole = Part {
+    let whole = LinkContents {
         debs: std::mem::take(&mut addition.debs),
         extras: std::mem::take(&mut addition.extras),
     };
@@ -107,32 +107,32 @@ pub(crate) async fn layers(
         &base.system_key(),
         addition.below,
     ));
-    let memo = chains.memo(&items);
-    let _turn = shop.turn(&memo).await;
-    // What was put together before is the same again, whatever has been cached since.
-    if let Some(keys) = shop.layers.note::<Vec<String>>(&memo)
-        && let Some(layers) = at_hand(shop, &keys).await?
+    let memo = chains.memo_key(&items);
+    let _turn = shop.lock_key(&memo).await;
+    // The same set gets the same chain again, even if better ones have been cached since.
+    if let Some(keys) = shop.layers.read_note::<Vec<String>>(&memo)
+        && let Some(layers) = cached_layers(shop, &keys).await?
     {
-        chains.used(&keys);
-        return Ok(Made { layers });
+        chains.mark_used(&keys);
+        return Ok(LayerSet { layers });
     }
     let (asked, wanted) = (chains.clone(), items.clone());
-    let candidates = crate::blocking::spawn(move || asked.within(&wanted)).await?;
-    let (mut found, mut made) = (Found::default(), Made::default());
+    let candidates = crate::blocking::spawn(move || asked.find_subsets(&wanted)).await?;
+    let (mut found, mut made) = (FoundChain::default(), LayerSet::default());
     for candidate in candidates {
-        // What is left takes a link or two.
+        // The remainder takes one or two links.
         let full = candidate.keys.len() == MOST_LINKS && candidate.items != items;
         if full {
             continue;
         }
-        if let Some(layers) = at_hand(shop, &candidate.keys).await? {
-            (found, made) = (candidate, Made { layers });
+        if let Some(layers) = cached_layers(shop, &candidate.keys).await? {
+            (found, made) = (candidate, LayerSet { layers });
             break;
         }
     }
     let mut keys = found.keys;
-    chains.used(&keys);
-    let parts = rest(archive, shop, whole, &found.items, MOST_LINKS - keys.len()).await?;
+    chains.mark_used(&keys);
+    let parts = missing_parts(archive, shop, whole, &found.items, MOST_LINKS - keys.len()).await?;
     for part in parts {
         let link = Link {
             parent: keys.last().cloned(),
@@ -140,8 +140,8 @@ pub(crate) async fn layers(
             bytes: 0,
         };
         let key = chains.key(link.parent.as_deref(), &link.items);
-        let turn = shop.turn(&key).await;
-        let layer = match at_hand(shop, std::slice::from_ref(&key)).await? {
+        let turn = shop.lock_key(&key).await;
+        let layer = match cached_layers(shop, std::slice::from_ref(&key)).await? {
             Some(mut layers) => layers.remove(0),
             None => {
                 let below: Vec<Digest> = addition
@@ -151,11 +151,12 @@ pub(crate) async fn layers(
                     .chain(made.diff_ids())
                     .collect();
                 let (upper, options) =
-                    install(shop, archive, base, addition.name, &below, &part, progress).await?;
+                    install_part(shop, archive, base, addition.name, &below, &part, progress)
+                        .await?;
                 progress
                     .step(&format!("packing the {}", addition.name))
                     .await;
-                let packing = Packing {
+                let packing = PackJob {
                     key: key.clone(),
                     made_from: link.items.iter().cloned().collect(),
                     directory: upper.parent().unwrap_or(&upper).to_owned(),
@@ -164,8 +165,8 @@ pub(crate) async fn layers(
                     turn,
                 };
                 let (chains, named) = (chains.clone(), key.clone());
-                let record = move |bytes| chains.keep(&named, &Link { bytes, ..link });
-                Layer {
+                let record = move |bytes| chains.write_link(&named, &Link { bytes, ..link });
+                StagedLayer {
                     diff_id: shop.pack(packing, record).await?,
                     cached: false,
                 }
@@ -174,16 +175,19 @@ pub(crate) async fn layers(
         made.layers.push(layer);
         keys.push(key);
     }
-    shop.layers.keep_note(&memo, &keys)?;
+    shop.layers.write_note(&memo, &keys)?;
     Ok(made)
 }
 
-/// The layers of these keys, if all of them are in the cache.
-async fn at_hand(shop: &Workshop, keys: &[String]) -> Result<Option<Vec<Layer>>, Error> {
+/// Returns the layers of these keys, if all of them are in the cache.
+async fn cached_layers(
+    shop: &BuildContext,
+    keys: &[String],
+) -> Result<Option<Vec<StagedLayer>>, Error> {
     let mut layers = Vec::new();
     for key in keys {
-        match shop.cached(key).await?.and_then(|entry| entry.layer) {
-            Some(layer) => layers.push(Layer {
+        match shop.get_cached(key).await?.and_then(|entry| entry.layer) {
+            Some(layer) => layers.push(StagedLayer {
                 diff_id: layer.diff_id,
                 cached: true,
             }),
@@ -193,27 +197,28 @@ async fn at_hand(shop: &Workshop, keys: &[String]) -> Result<Option<Vec<Layer>>,
     Ok(Some(layers))
 }
 
-/// What a chain lacks, in at most `most` links: see [`split::split`].
-async fn rest(
+/// Returns what a chain lacks, in at most `most` links; see [`split::split`].
+async fn missing_parts(
     archive: &Archive,
-    shop: &Workshop,
-    whole: Part,
+    shop: &BuildContext,
+    whole: LinkContents,
     there: &BTreeSet<String>,
     most: usize,
-) -> Result<Vec<Part>, Error> {
+) -> Result<Vec<LinkContents>, Error> {
     let mut left = whole;
     left.debs.retain(|deb| !there.contains(&deb.to_string()));
-    left.extras.retain(|member| !there.contains(&item(member)));
+    left.extras
+        .retain(|member| !there.contains(&member_item(member)));
     if left.debs.is_empty() && left.extras.is_empty() {
         return Ok(Vec::new());
     }
     let mut parts = Vec::new();
-    if most > 1 && split::may_cut(left.debs.len()) {
+    if most > 1 && split::is_worth_splitting(left.debs.len()) {
         let of_ros = ros_sources(archive, shop).await?;
-        let relations = archive.apt.relations(versions(&left.debs)).await?;
+        let relations = archive.apt.relations(versioned_names(&left.debs)).await?;
         let (first, last) = split::split(&left.debs, &relations, |source| of_ros.contains(source));
         if !first.is_empty() {
-            parts.push(Part {
+            parts.push(LinkContents {
                 debs: first,
                 extras: Vec::new(),
             });
@@ -224,18 +229,18 @@ async fn rest(
     Ok(parts)
 }
 
-/// Names of packages as apt takes them.
-fn versions(debs: &[Deb]) -> impl Iterator<Item = String> + '_ {
+/// Returns the names of packages as apt expects them.
+fn versioned_names(debs: &[Deb]) -> impl Iterator<Item = String> + '_ {
     debs.iter()
         .map(|deb| format!("{}={}", deb.name, deb.version))
 }
 
-/// Source packages that hold ROS packages. Remembered: it asks about a thousand packages.
-async fn ros_sources(archive: &Archive, shop: &Workshop) -> Result<BTreeSet<String>, Error> {
+/// Returns the source packages that contain ROS packages. Cached, since it queries about a thousand packages.
+async fn ros_sources(archive: &Archive, shop: &BuildContext) -> Result<BTreeSet<String>, Error> {
     let note = Key::new("ros-sources")
-        .with("archive", &archive.stamp)
+        .input("archive", &archive.stamp)
         .finish();
-    if let Some(sources) = shop.layers.note(&note) {
+    if let Some(sources) = shop.layers.read_note(&note) {
         return Ok(sources);
     }
     let mut carriers = archive.contents.ros_carriers();
@@ -246,19 +251,19 @@ async fn ros_sources(archive: &Archive, shop: &Workshop) -> Result<BTreeSet<Stri
         let relations = archive.apt.relations(carriers).await?;
         relations.into_values().map(|about| about.source).collect()
     };
-    shop.layers.keep_note(&note, &sources)?;
+    shop.layers.write_note(&note, &sources)?;
     Ok(sources)
 }
 
-/// Installs a part in a container on top of `below`; gives the container's upper directory, in a directory of its own, and how
-/// it is to be packed.
-async fn install(
-    shop: &Workshop,
+/// Installs a part in a container on top of `below`; returns the container's upper directory, in a separate directory,
+/// and the options for packing it.
+async fn install_part(
+    shop: &BuildContext,
     archive: &Archive,
     base: &Base,
     name: &'static str,
     below: &[Digest],
-    part: &Part,
+    part: &LinkContents,
     progress: &Progress,
 ) -> Result<(PathBuf, TreeOptions), Error> {
     let files = archive.apt.download(&part.debs, progress).await?;
@@ -268,14 +273,14 @@ async fn install(
             count => format!("installing {count} packages of the {name}"),
         })
         .await;
-    let directory = shop.site.fresh(name)?;
+    let directory = shop.site.fresh_directory(name)?;
     let (tools, debs, upper) = (
         directory.join("tools"),
         directory.join("debs"),
         directory.join("upper"),
     );
-    fs::create_dir(&debs).at("making", &debs)?;
-    fs::create_dir(&upper).at("making", &upper)?;
+    fs::create_dir(&debs).io_context("making", &debs)?;
+    fs::create_dir(&upper).io_context("making", &upper)?;
     set_mode(&debs, 0o755)?;
     let mut inside = Vec::new();
     for file in &files {
@@ -283,8 +288,8 @@ async fn install(
         link_or_copy(file, &debs.join(name.as_ref()))?;
         inside.push(format!("/cloudroid/debs/{name}"));
     }
-    let relations = archive.apt.relations(versions(&part.debs)).await?;
-    let steps = steps::written(&steps::steps(&part.debs, &relations), &inside);
+    let relations = archive.apt.relations(versioned_names(&part.debs)).await?;
+    let steps = steps::script_files(&steps::plan_steps(&part.debs, &relations), &inside);
     let mut given = BTreeMap::from([
         (
             PathBuf::from("cloudroid/install.sh"),
@@ -301,15 +306,16 @@ async fn install(
         deb::write_tar(&part.extras, &path)?;
         given.insert(
             "cloudroid/extras.tar".into(),
-            fs::read(&path).at("reading", &path)?,
+            fs::read(&path).io_context("reading", &path)?,
         );
     }
-    lay_out(&tools, &given)?;
-    // Nothing may be started by a package's scripts; the refusal is in a layer that does not become part of it.
+    write_tree(&tools, &given)?;
+    // Prevents services from being started by package scripts; this file is in a layer that does not become part of the
+    // image.
     let policy = tools.join("usr/sbin/policy-rc.d");
     write_file(&policy, b"#!/bin/sh\nexit 101\n", 0o755)?;
 
-    let mut layers = shop.extracted(below).await?;
+    let mut layers = shop.extract_layers(below).await?;
     layers.push(tools);
     let mut environment = BTreeMap::from([
         ("DEBIAN_FRONTEND".to_owned(), "noninteractive".to_owned()),
@@ -326,11 +332,11 @@ async fn install(
     );
     let total = part.debs.len() as u64;
     let mut done = 0;
-    let mut complaint = Complaint::default();
+    let mut complaint = FirstError::default();
     let finished = shop
         .site
         .run(
-            Run {
+            SandboxRun {
                 name,
                 profile: Profile::Install,
                 layers,
@@ -349,7 +355,7 @@ async fn install(
                     .into(),
             },
             |line| {
-                complaint.hear(line);
+                complaint.push_line(line);
                 if line.starts_with("Setting up ") {
                     done += 1;
                     progress.count("packages", done, Some(total));
@@ -359,7 +365,7 @@ async fn install(
         .await?;
     if !finished.success() {
         return Err(Error::InstallFailed {
-            first_error: complaint.text().unwrap_or_else(|| finished.last_words()),
+            first_error: complaint.text().unwrap_or_else(|| finished.last_output()),
         });
     }
     let options = TreeOptions {
@@ -372,9 +378,9 @@ async fn install(
 
 const INSTALL: &str = include_str!("inside/install.sh");
 
-/// Makes a tree of files that everybody may read.
-pub(crate) fn lay_out(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Result<(), Error> {
-    fs::create_dir_all(root).at("making", root)?;
+/// Writes a tree of files that everybody can read.
+pub(crate) fn write_tree(root: &Path, files: &BTreeMap<PathBuf, Vec<u8>>) -> Result<(), Error> {
+    fs::create_dir_all(root).io_context("making", root)?;
     set_mode(root, 0o755)?;
     for (path, bytes) in files {
         write_file(
@@ -395,23 +401,24 @@ fn write_file(path: &Path, bytes: &[u8], mode: u32) -> Result<(), Error> {
         {
             new.push(directory.to_owned());
         }
-        fs::create_dir_all(parent).at("making", parent)?;
+        fs::create_dir_all(parent).io_context("making", parent)?;
         for directory in new {
             set_mode(&directory, 0o755)?;
         }
     }
-    fs::write(path, bytes).at("writing", path)?;
+    fs::write(path, bytes).io_context("writing", path)?;
     set_mode(path, mode)
 }
 
-/// Whatever the umask.
+/// Sets the mode of a file regardless of the umask.
 pub(crate) fn set_mode(path: &Path, mode: u32) -> Result<(), Error> {
-    fs::set_permissions(path, fs::Permissions::from_mode(mode)).at("changing the mode of", path)
+    fs::set_permissions(path, fs::Permissions::from_mode(mode))
+        .io_context("changing the mode of", path)
 }
 
 pub(crate) fn link_or_copy(from: &Path, to: &Path) -> Result<(), Error> {
     if fs::hard_link(from, to).is_err() {
-        fs::copy(from, to).at("copying", from)?;
+        fs::copy(from, to).io_context("copying", from)?;
     }
     set_mode(to, 0o644)
 }
@@ -422,14 +429,14 @@ mod tests {
 
     #[test]
     fn items_tell_everything_that_makes_a_difference() {
-        let member = |path: &str, mode, mtime, content| Member {
+        let member = |path: &str, mode, mtime, content| DebMember {
             path: path.into(),
             mode,
             mtime,
             content,
         };
-        let text = |text: &str| Content::File(text.into());
-        let deb = |name: &str, version: &str, architecture: &str| Part {
+        let text = |text: &str| MemberContent::File(text.into());
+        let deb = |name: &str, version: &str, architecture: &str| LinkContents {
             debs: vec![Deb {
                 name: name.into(),
                 version: version.into(),
@@ -437,7 +444,7 @@ mod tests {
             }],
             extras: Vec::new(),
         };
-        let extra = |member| Part {
+        let extra = |member| LinkContents {
             debs: Vec::new(),
             extras: vec![member],
         };
@@ -450,11 +457,16 @@ mod tests {
             extra(member("usr/share/x", 0o755, 1, text("1"))),
             extra(member("usr/share/x", 0o644, 2, text("1"))),
             extra(member("usr/share/x", 0o644, 1, text("2"))),
-            extra(member("usr/share/x", 0o644, 1, Content::Link("1".into()))),
+            extra(member(
+                "usr/share/x",
+                0o644,
+                1,
+                MemberContent::Link("1".into()),
+            )),
             // A file whose name looks like a package.
             extra(member("a=1:amd64", 0o644, 1, text("1"))),
         ];
-        let all: BTreeSet<String> = parts.iter().flat_map(Part::items).collect();
+        let all: BTreeSet<String> = parts.iter().flat_map(LinkContents::items).collect();
         assert_eq!(all.len(), parts.len(), "{all:#?}");
     }
 
@@ -462,7 +474,7 @@ mod tests {
     fn what_the_sandbox_is_given_can_be_read_by_all() {
         let root = tempfile::tempdir().expect("a directory");
         let tree = root.path().join("t");
-        lay_out(
+        write_tree(
             &tree,
             &BTreeMap::from([(PathBuf::from("/a/b/c"), b"x".to_vec())]),
         )

@@ -1,4 +1,4 @@
-//! Keys: names of results by what they were made from.
+//! Cache keys: hashes of the inputs of a result.
 
 use std::io::Read;
 use std::os::unix::ffi::OsStrExt;
@@ -8,29 +8,29 @@ use foreign::Visit;
 use rustix::fs::FileType;
 use sha2::{Digest, Sha256};
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 
-/// Part of every key: raise it when the same inputs begin to give another result.
+/// Part of every key; to be changed when the same inputs give another result.
 const BUILDER: &str = "cloudroid-rootfs-1";
 
-/// SHA-256, hex.
+/// Returns the SHA-256 digest in hexadecimal.
 pub(crate) fn sha256(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
 }
 
-/// A key that grows by named inputs. Order matters; every part is delimited.
+/// Builder of a key from named inputs. The order matters; all parts are delimited.
 pub(crate) struct Key(Sha256);
 
 impl Key {
-    /// Of one kind of result, such as `base`.
+    /// Starts a key for a kind of result, such as `base`.
     pub(crate) fn new(kind: &str) -> Self {
         Self(Sha256::new())
-            .with("builder", BUILDER)
-            .with("kind", kind)
+            .input("builder", BUILDER)
+            .input("kind", kind)
     }
 
-    /// One more input.
-    pub(crate) fn with(mut self, name: &str, value: impl AsRef<[u8]>) -> Self {
+    /// Adds an input.
+    pub(crate) fn input(mut self, name: &str, value: impl AsRef<[u8]>) -> Self {
         for part in [name.as_bytes(), value.as_ref()] {
             self.0.update((part.len() as u64).to_le_bytes());
             self.0.update(part);
@@ -38,26 +38,26 @@ impl Key {
         self
     }
 
-    /// Several inputs of one name.
-    pub(crate) fn with_all<T: AsRef<[u8]>>(
+    /// Adds several inputs of the same name.
+    pub(crate) fn inputs<T: AsRef<[u8]>>(
         mut self,
         name: &str,
         values: impl IntoIterator<Item = T>,
     ) -> Self {
         for value in values {
-            self = self.with(name, value);
+            self = self.input(name, value);
         }
         self
     }
 
-    /// Hex.
+    /// Returns the key in hexadecimal.
     pub(crate) fn finish(self) -> String {
         hex::encode(self.0.finalize())
     }
 }
 
-/// A file tree's names, kinds, execute bits, links and contents. Owners and times do not matter.
-pub(crate) fn tree(root: &Path) -> Result<String, Error> {
+/// Hashes the names, types, execute bits, links and contents of a file tree. Owners and times are ignored.
+pub(crate) fn hash_tree(root: &Path) -> Result<String, Error> {
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 64 * 1024];
     let add = |hash: &mut Sha256, part: &[u8]| {
@@ -69,7 +69,7 @@ pub(crate) fn tree(root: &Path) -> Result<String, Error> {
         match entry.kind() {
             FileType::Symlink => {
                 add(&mut hash, b"link");
-                add(&mut hash, &entry.link()?);
+                add(&mut hash, &entry.read_link()?);
             }
             FileType::RegularFile => {
                 let runs = entry.stat.st_mode & 0o111 != 0;
@@ -78,7 +78,9 @@ pub(crate) fn tree(root: &Path) -> Result<String, Error> {
                 hash.update((entry.stat.st_size as u64).to_le_bytes());
                 loop {
                     foreign::cancel::check().map_err(foreign::Error::from)?;
-                    let read = file.read(&mut buffer).at("reading", entry.shown())?;
+                    let read = file
+                        .read(&mut buffer)
+                        .io_context("reading", entry.display_path())?;
                     if read == 0 {
                         break;
                     }
@@ -92,9 +94,9 @@ pub(crate) fn tree(root: &Path) -> Result<String, Error> {
     Ok(hex::encode(hash.finalize()))
 }
 
-/// The sources that a build sees: all of a tree that was sealed ([`crate::seal`]).
-pub(crate) fn sources(root: &Path) -> Result<String, Error> {
-    tree(root)
+/// Hashes the sources visible to a build: everything in a sealed tree ([`crate::seal`]).
+pub(crate) fn hash_sources(root: &Path) -> Result<String, Error> {
+    hash_tree(root)
 }
 
 #[cfg(test)]
@@ -104,9 +106,9 @@ mod tests {
 
     #[test]
     fn parts_do_not_run_into_each_other() {
-        let one = Key::new("x").with("a", "bc").finish();
-        assert_ne!(one, Key::new("x").with("ab", "c").finish());
-        assert_eq!(one, Key::new("x").with("a", "bc").finish());
+        let one = Key::new("x").input("a", "bc").finish();
+        assert_ne!(one, Key::new("x").input("ab", "c").finish());
+        assert_eq!(one, Key::new("x").input("a", "bc").finish());
         assert_ne!(Key::new("x").finish(), Key::new("y").finish());
     }
 
@@ -118,7 +120,7 @@ mod tests {
             std::fs::create_dir(root.path().join("d")).expect("made");
             std::fs::write(&file, text).expect("written");
             std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).expect("set");
-            tree(root.path()).expect("hashed")
+            hash_tree(root.path()).expect("hashed")
         };
         let first = make("x", 0o644);
         assert_eq!(first, make("x", 0o600));

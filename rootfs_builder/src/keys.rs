@@ -1,7 +1,7 @@
-//! From the names in a package.xml (rosdep keys and ROS packages) to Debian packages.
+//! Resolution of the names in a package.xml (rosdep keys and ROS packages) to Debian packages.
 //!
-//! In this order: what the deployer said (`--map`), what is in the same workspace, the base's table, ROS packages that are
-//! there already (of ROS 2), ROS packages of the archive, a Debian package of that very name.
+//! In this order: the deployer's mapping (`--map`), packages of the same workspace, the base's table, existing ROS
+//! packages (ROS 2), ROS packages of the archive, a Debian package of the same name.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,79 +10,81 @@ use ros::flavour::Version;
 use crate::archive::Archive;
 use crate::base::Base;
 use crate::error::{Error, Unresolved};
-use crate::indexed::Indexed;
+use crate::indexed::IndexedPackages;
 
-/// Who asks for what.
+/// Required keys and the packages that need them.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Needed {
-    /// Key → packages that ask for it while compiling.
+pub(crate) struct RequiredKeys {
+    /// Key → packages that need it while compiling.
     pub(crate) build: BTreeMap<String, BTreeSet<String>>,
-    /// Key → packages that ask for it at run time.
+    /// Key → packages that need it at run time.
     pub(crate) run: BTreeMap<String, BTreeSet<String>>,
 }
 
-/// What it comes to.
+/// Result of the resolution.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Resolved {
-    /// Debian packages to compile with.
+pub(crate) struct ResolvedKeys {
+    /// Debian packages for compiling.
     pub(crate) build: BTreeSet<String>,
-    /// Debian packages to run with.
+    /// Debian packages for running.
     pub(crate) run: BTreeSet<String>,
-    /// ROS packages to run with, to be gathered.
+    /// ROS packages for running, still to be gathered.
     pub(crate) run_ros: BTreeSet<String>,
-    /// Things to know.
+    /// Warnings for the deployer.
     pub(crate) warnings: Vec<String>,
 }
 
-enum Found {
+enum KeyProvider {
     Debs(Vec<String>),
     Ros,
     There,
     Nothing,
 }
 
-/// The package of an archive of ROS 2 that holds a ROS package (REP 2003: `ros-jazzy-std-msgs`).
-pub(crate) fn deb_of(archive: &Archive, base: &Base, name: &str) -> Option<String> {
+/// Returns the package of a ROS 2 archive that contains a ROS package (REP 2003: `ros-jazzy-std-msgs`).
+pub(crate) fn find_ros_deb(archive: &Archive, base: &Base, name: &str) -> Option<String> {
     let name = name.replace('_', "-");
     let deb = format!("ros-{}-{name}", base.ros_distribution);
     archive.candidates.contains(&deb).then_some(deb)
 }
 
-/// Resolves all keys, or names all that nothing provides. `own`: packages of the workspace itself. `there`: those in the
-/// layers.
-pub(crate) fn resolve(
+/// Resolves all keys; the error names all that nothing provides. `own` are the packages of the workspace itself,
+/// `there` those in the layers.
+pub(crate) fn resolve_keys(
     archive: &Archive,
     base: &Base,
     map: &BTreeMap<String, String>,
     own: &BTreeSet<String>,
-    asked: &Needed,
-    there: &Indexed,
-) -> Result<Resolved, Error> {
-    let find = |key: &str, there: &BTreeSet<String>| -> Found {
+    asked: &RequiredKeys,
+    there: &IndexedPackages,
+) -> Result<ResolvedKeys, Error> {
+    let find = |key: &str, there: &BTreeSet<String>| -> KeyProvider {
         if let Some(deb) = map.get(key) {
-            return Found::Debs(names_in(deb).map(str::to_owned).collect());
+            return KeyProvider::Debs(split_names(deb).map(str::to_owned).collect());
         }
         if let Some(debs) = base.keys.get(key) {
-            return Found::Debs(debs.clone());
+            return KeyProvider::Debs(debs.clone());
         }
         if there.contains(key) {
-            return Found::There;
+            return KeyProvider::There;
         }
         match base.ros {
-            Version::Ros1 if !archive.contents.ros_package(key).is_empty() => return Found::Ros,
+            Version::Ros1 if !archive.contents.ros_package(key).is_empty() => {
+                return KeyProvider::Ros;
+            }
             Version::Ros2 => {
-                if let Some(deb) = deb_of(archive, base, key) {
-                    return Found::Debs(vec![deb]);
+                if let Some(deb) = find_ros_deb(archive, base, key) {
+                    return KeyProvider::Debs(vec![deb]);
                 }
             }
             Version::Ros1 => {}
         }
         if archive.candidates.contains(key) && !is_of_other_ros(archive, base, key) {
-            return Found::Debs(vec![key.to_owned()]);
+            return KeyProvider::Debs(vec![key.to_owned()]);
         }
-        Found::Nothing
+        KeyProvider::Nothing
     };
-    let mut resolved = Resolved::default();
+    let mut resolved = ResolvedKeys::default();
     let mut missing: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
     let mut miss = |key: &str, by: &BTreeSet<String>| {
         missing
@@ -92,42 +94,42 @@ pub(crate) fn resolve(
     };
     for (key, by) in asked.build.iter().filter(|(key, _)| !own.contains(*key)) {
         match find(key, &there.build) {
-            Found::Debs(debs) => resolved.build.extend(debs),
-            Found::There => {}
-            Found::Ros => resolved.build.extend(archive.to_build(key)),
-            Found::Nothing if base.ros_packages.ignore.contains(key) => {}
-            Found::Nothing => miss(key, by),
+            KeyProvider::Debs(debs) => resolved.build.extend(debs),
+            KeyProvider::There => {}
+            KeyProvider::Ros => resolved.build.extend(archive.build_packages(key)),
+            KeyProvider::Nothing if base.ros_packages.ignore.contains(key) => {}
+            KeyProvider::Nothing => miss(key, by),
         }
     }
     for (key, by) in asked.run.iter().filter(|(key, _)| !own.contains(*key)) {
         match find(key, &there.run) {
-            // What is linked from a development package is found by what the result needs.
-            Found::Debs(debs) => resolved
+            // Libraries of a development package are found by what the compiled result needs.
+            KeyProvider::Debs(debs) => resolved
                 .run
                 .extend(debs.into_iter().filter(|deb| !deb.ends_with("-dev"))),
-            Found::Ros | Found::Nothing if base.ros_packages.ignore.contains(key) => {}
-            Found::Ros => {
+            KeyProvider::Ros | KeyProvider::Nothing if base.ros_packages.ignore.contains(key) => {}
+            KeyProvider::Ros => {
                 resolved.run_ros.insert(key.clone());
             }
-            Found::There => {}
-            // Often a tool that is named as <depend>: nothing of it runs.
-            Found::Nothing if there.build.contains(key) => resolved.warnings.push(format!(
-                "{} asks for {key} at run time, which base {} has for compiling alone; a node that uses it will fail",
+            KeyProvider::There => {}
+            // Often a build tool declared as <depend>, which is not needed at run time.
+            KeyProvider::Nothing if there.build.contains(key) => resolved.warnings.push(format!(
+                "{} needs {key} at run time, which base {} has only for compiling; a node that uses it will fail",
                 by.iter().cloned().collect::<Vec<_>>().join(", "),
                 base.name
             )),
-            Found::Nothing => miss(key, by),
+            KeyProvider::Nothing => miss(key, by),
         }
     }
-    // What the deployer wrote may be wrong as well.
+    // The deployer's mapping may be wrong as well.
     add_unknown(archive, map, &mut missing);
     refuse_missing(archive, base, missing)?;
     Ok(resolved)
 }
 
-/// The Debian packages that a deployer names with `--map`, of which each must be the archive's: apt would take other words for files of
-/// this machine, patterns, or packages to be removed.
-pub(crate) fn mapped(
+/// Returns the Debian packages named with `--map`. Each must be in the archive: apt would also accept local files,
+/// patterns, or packages to be removed.
+pub(crate) fn mapped_packages(
     archive: &Archive,
     base: &Base,
     map: &BTreeMap<String, String>,
@@ -135,30 +137,30 @@ pub(crate) fn mapped(
     let mut unknown = BTreeMap::new();
     add_unknown(archive, map, &mut unknown);
     refuse_missing(archive, base, unknown)?;
-    let names = map.values().flat_map(|debs| names_in(debs));
+    let names = map.values().flat_map(|debs| split_names(debs));
     Ok(names.map(str::to_owned).collect())
 }
 
-/// Names in one value of `--map`.
-fn names_in(debs: &str) -> impl Iterator<Item = &str> {
+/// Splits a value of `--map` into names.
+fn split_names(debs: &str) -> impl Iterator<Item = &str> {
     debs.split([',', ' ']).filter(|deb| !deb.is_empty())
 }
 
-/// Adds what `--map` names and the archive has not, with the option that names it.
+/// Adds the names in `--map` that are not in the archive, with the option that contains them.
 fn add_unknown(
     archive: &Archive,
     map: &BTreeMap<String, String>,
     missing: &mut BTreeMap<String, BTreeSet<String>>,
 ) {
     for (key, debs) in map {
-        for deb in names_in(debs).filter(|deb| !archive.candidates.contains(deb)) {
+        for deb in split_names(debs).filter(|deb| !archive.candidates.contains(deb)) {
             let by = missing.entry(deb.to_owned()).or_default();
             by.insert(format!("--map {key}={debs}"));
         }
     }
 }
 
-/// An error that names all that is missing, if anything is.
+/// Fails with all missing names, if there are any.
 fn refuse_missing(
     archive: &Archive,
     base: &Base,
@@ -179,7 +181,7 @@ fn refuse_missing(
     ))
 }
 
-/// Whether a Debian package, on a base of ROS 2, is of the ROS 1 that the distribution has itself.
+/// Returns whether, on a base of ROS 2, a Debian package belongs to the distribution's own ROS 1.
 pub(crate) fn is_of_other_ros(archive: &Archive, base: &Base, deb: &str) -> bool {
     let own = format!("ros-{}-", base.ros_distribution);
     base.ros != Version::Ros1
@@ -187,14 +189,14 @@ pub(crate) fn is_of_other_ros(archive: &Archive, base: &Base, deb: &str) -> bool
         && !archive.contents.ros_packages_in(deb).is_empty()
 }
 
-/// The Debian package that a name means which a deployer gives for a base of ROS 2: that of a ROS package, or its own.
-pub(crate) fn named(archive: &Archive, base: &Base, name: &str) -> Option<String> {
+/// Finds the Debian package for a name given on a base of ROS 2: that of a ROS package, or the package itself.
+pub(crate) fn find_named_deb(archive: &Archive, base: &Base, name: &str) -> Option<String> {
     let own = archive.candidates.contains(name) && !is_of_other_ros(archive, base, name);
-    deb_of(archive, base, name).or_else(|| own.then(|| name.to_owned()))
+    find_ros_deb(archive, base, name).or_else(|| own.then(|| name.to_owned()))
 }
 
-/// A name that nothing provides.
-pub(crate) fn unresolved(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
+/// Creates the error entry for a name that nothing provides.
+pub(crate) fn unresolved_name(archive: &Archive, base: &Base, name: &str, by: &str) -> Unresolved {
     Unresolved {
         key: name.to_owned(),
         wanted_by: vec![by.to_owned()],
@@ -202,7 +204,8 @@ pub(crate) fn unresolved(archive: &Archive, base: &Base, name: &str, by: &str) -
     }
 }
 
-/// Names that look like a key. What has the name of a package of the distribution's own ROS 1 looks like that one alone.
+/// Returns names similar to a key. A name of the distribution's own ROS 1 is similar only to packages of the base's
+/// ROS.
 fn similar(archive: &Archive, base: &Base, key: &str) -> Vec<String> {
     let mut similar = archive.similar(key);
     if base.ros != Version::Ros1 {
@@ -221,13 +224,13 @@ mod tests {
     use std::path::Path;
     use std::sync::Arc;
 
-    struct Lab {
+    struct KeysFixture {
         _directory: tempfile::TempDir,
         archive: Archive,
         base: Base,
     }
 
-    fn lab() -> Lab {
+    fn new_fixture() -> KeysFixture {
         let directory = tempfile::tempdir().expect("a directory");
         let text = "usr/share/tf/package.xml libdevel/libtf-dev\n\
                     usr/share/tf/msg/tfMessage.msg devel/ros-tf-msgs\n\
@@ -244,13 +247,13 @@ mod tests {
         let archive = Archive {
             apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
             contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
-            candidates: crate::candidates::tests::named(&names),
+            candidates: crate::candidates::tests::candidates_named(&names),
             stamp: String::new(),
             sources: String::new(),
         };
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        Lab {
+        KeysFixture {
             _directory: directory,
             archive,
             base,
@@ -261,13 +264,13 @@ mod tests {
         keys.iter().map(|&key| key.to_owned()).collect()
     }
 
-    fn asked(build: &[&str], run: &[&str]) -> Needed {
+    fn new_required_keys(build: &[&str], run: &[&str]) -> RequiredKeys {
         let by = |keys: &[&str]| {
             keys.iter()
                 .map(|&key| (key.to_owned(), set(&["app"])))
                 .collect()
         };
-        Needed {
+        RequiredKeys {
             build: by(build),
             run: by(run),
         }
@@ -275,7 +278,7 @@ mod tests {
 
     #[test]
     fn each_name_is_found_where_it_is_known() {
-        let lab = lab();
+        let lab = new_fixture();
         let map = BTreeMap::from([("frob".to_owned(), "libfrob3-dev libfrob3".to_owned())]);
         let keys = [
             "frob",
@@ -285,14 +288,14 @@ mod tests {
             "app_msgs",
             "message_generation",
         ];
-        let asked = asked(&keys, &keys);
-        let resolved = resolve(
+        let asked = new_required_keys(&keys, &keys);
+        let resolved = resolve_keys(
             &lab.archive,
             &lab.base,
             &map,
             &set(&["app_msgs"]),
             &asked,
-            &Indexed::default(),
+            &IndexedPackages::default(),
         )
         .expect("all known");
         assert_eq!(
@@ -307,19 +310,19 @@ mod tests {
                 "ros-message-generation"
             ])
         );
-        // No development packages at run time, and nothing that only builds.
+        // No development packages at run time, and no build tools.
         assert_eq!(resolved.run, set(&["libfrob3", "python3-six"]));
         assert_eq!(resolved.run_ros, set(&["tf"]));
     }
 
     #[test]
     fn nothing_is_mapped_but_to_packages_of_the_archive() {
-        let lab = lab();
+        let lab = new_fixture();
         let map = |debs: &str| BTreeMap::from([("frob".to_owned(), debs.to_owned())]);
-        let mapped = |debs: &str| mapped(&lab.archive, &lab.base, &map(debs));
+        let mapped = |debs: &str| mapped_packages(&lab.archive, &lab.base, &map(debs));
         let found = mapped("libfrob3, libtf-dev").expect("both are there");
         assert_eq!(found, set(&["libfrob3", "libtf-dev"]));
-        // Files of this machine, what apt would remove, other releases and versions, patterns, tasks.
+        // Local files, package removals, other releases and versions, patterns, tasks.
         for wrong in [
             "./own.deb",
             "/tmp/own.deb",
@@ -345,11 +348,11 @@ mod tests {
 
     #[test]
     fn all_that_nothing_provides_is_named_at_once() {
-        let lab = lab();
+        let lab = new_fixture();
         let map = BTreeMap::from([("frob".to_owned(), "libfrob9".to_owned())]);
-        let asked = asked(&["warp", "frob"], &["flux", "tf"]);
-        let (none, there) = (BTreeSet::new(), Indexed::default());
-        let error = resolve(&lab.archive, &lab.base, &map, &none, &asked, &there)
+        let asked = new_required_keys(&["warp", "frob"], &["flux", "tf"]);
+        let (none, there) = (BTreeSet::new(), IndexedPackages::default());
+        let error = resolve_keys(&lab.archive, &lab.base, &map, &none, &asked, &there)
             .expect_err("two are missing");
         let Error::Unresolved(missing) = error else {
             panic!("{error}")
@@ -360,9 +363,9 @@ mod tests {
         assert_eq!(missing[0].wanted_by, ["app"]);
     }
 
-    /// The same archive, and a base of ROS 2 that is as far as its keys go the same.
-    fn lab_of_two() -> Lab {
-        let mut lab = lab();
+    /// Creates the same archive with a base of ROS 2 that has the same keys.
+    fn new_ros2_fixture() -> KeysFixture {
+        let mut lab = new_fixture();
         lab.base.definition.ros = Version::Ros2;
         lab.base.definition.ros_distribution = "jazzy".to_owned();
         let more = [
@@ -371,15 +374,15 @@ mod tests {
             "ros-tf-msgs",
             "python3-six",
         ];
-        lab.archive.candidates = crate::candidates::tests::named(&more);
+        lab.archive.candidates = crate::candidates::tests::candidates_named(&more);
         lab
     }
 
     #[test]
     fn of_ros_2_is_what_the_index_and_its_own_archive_have() {
-        let lab = lab_of_two();
+        let lab = new_ros2_fixture();
         let (own, map) = (set(&["app_msgs"]), BTreeMap::new());
-        let there = Indexed {
+        let there = IndexedPackages {
             build: set(&["rclpy", "ament_cmake", "rosidl_default_generators"]),
             run: set(&["rclpy"]),
         };
@@ -390,18 +393,18 @@ mod tests {
             "python3-six",
             "ament_cmake",
         ];
-        let asked = asked(
+        let asked = new_required_keys(
             &["ament_cmake", "rosidl_default_generators", "nav_msgs"],
             &run,
         );
         let resolved =
-            resolve(&lab.archive, &lab.base, &map, &own, &asked, &there).expect("all known");
+            resolve_keys(&lab.archive, &lab.base, &map, &own, &asked, &there).expect("all known");
         assert_eq!(resolved.build, set(&["ros-jazzy-nav-msgs"]));
         assert_eq!(resolved.run, set(&["ros-jazzy-nav-msgs", "python3-six"]));
         assert!(resolved.run_ros.is_empty());
-        // A tool that is there to compile with, and was named for running, too.
+        // A build tool that was also declared for run time.
         assert!(
-            resolved.warnings.len() == 1 && resolved.warnings[0].contains("asks for ament_cmake"),
+            resolved.warnings.len() == 1 && resolved.warnings[0].contains("needs ament_cmake"),
             "{:?}",
             resolved.warnings
         );
@@ -409,16 +412,16 @@ mod tests {
 
     #[test]
     fn ros_1_of_the_distribution_satisfies_nothing_of_ros_2() {
-        let lab = lab_of_two();
+        let lab = new_ros2_fixture();
         let (own, map) = (BTreeSet::new(), BTreeMap::new());
-        let asked = asked(&["tf", "rclcpp"], &["libtf-dev", "rclcpp"]);
-        let error = resolve(
+        let asked = new_required_keys(&["tf", "rclcpp"], &["libtf-dev", "rclcpp"]);
+        let error = resolve_keys(
             &lab.archive,
             &lab.base,
             &map,
             &own,
             &asked,
-            &Indexed::default(),
+            &IndexedPackages::default(),
         )
         .expect_err("nothing of it is there");
         let Error::Unresolved(missing) = &error else {

@@ -1,4 +1,5 @@
-//! What is to run: nodes and parameters, as the image's own roslaunch, or launch of ROS 2, understands the launch file.
+//! Resolution of what to run: nodes and parameters, as the image's own roslaunch (or launch of ROS 2) interprets the
+//! launch file.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,49 +13,49 @@ use serde::{Deserialize, Serialize};
 use servant::container::{Mount, Profile};
 use servant::spec::NodeSpec;
 
-use crate::error::{Error, IoAt};
-use crate::install::{lay_out, set_mode};
-use crate::sandbox::Run;
-use crate::workshop::Workshop;
+use crate::error::{Error, IoContext};
+use crate::install::{set_mode, write_tree};
+use crate::sandbox::SandboxRun;
+use crate::workshop::BuildContext;
 use crate::{blocking, plan};
 
-/// What to run. Independent of how it was asked for.
+/// Launch plan of a service, regardless of how it was requested.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LaunchPlan {
     /// Nodes in the order in which roslaunch starts them.
     pub nodes: Vec<LaunchNode>,
     /// Parameters by absolute name, set before any node starts.
     pub parameters: BTreeMap<String, ParamValue>,
-    /// What is loaded into nodes that are component containers, by their names.
+    /// Components to load into nodes that are component containers, by node name.
     #[serde(default)]
     pub components: BTreeMap<String, Vec<Component>>,
 }
 
-/// One node.
+/// A node to run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LaunchNode {
     /// Absolute name, such as `/camera/people_detect`.
     pub name: String,
-    /// Its ROS package.
+    /// ROS package.
     pub package: String,
-    /// Its type: the executable's name in the package.
+    /// Name of the executable in the package.
     pub executable: String,
-    /// Launch prefix, path of the program, arguments, remaps, `__name:=`.
+    /// Launch prefix, path of the program, arguments, remappings, `__name:=`.
     pub argv: Vec<String>,
-    /// Remaps alone, from → to.
+    /// Remappings only, from → to.
     pub remaps: BTreeMap<String, String>,
-    /// Added to the image's environment (`<env>`, `ROS_NAMESPACE`).
+    /// Additional environment (`<env>`, `ROS_NAMESPACE`).
     pub environment: BTreeMap<String, String>,
-    /// Where it runs; none for ROS's own default, `ROS_HOME`.
+    /// Working directory; `None` for ROS's default, `ROS_HOME`.
     pub directory: Option<String>,
-    /// Started again whenever it ends.
+    /// True if it is restarted whenever it exits.
     pub respawn: bool,
-    /// Seconds before that.
+    /// Delay of a restart in seconds.
     pub respawn_delay: f64,
-    /// When it ends, all do.
+    /// True if all nodes are stopped when it exits.
     pub required: bool,
-    /// The program is told its name (`__name:=`). Otherwise it has the one that its author gave it, and `name` is a
-    /// guess by the executable's.
+    /// True if the name is passed to the program (`__name:=`). Otherwise the program chooses the name, and `name` is a
+    /// guess from the executable's.
     #[serde(default = "yes")]
     pub named: bool,
 }
@@ -64,8 +65,8 @@ fn yes() -> bool {
 }
 
 impl LaunchNode {
-    /// As an engine starts it; `ros_home` is where nodes run by default.
-    pub fn spec(&self, ros_home: &str) -> NodeSpec {
+    /// Converts to the specification for the engine; `ros_home` is the default working directory.
+    pub fn to_node_spec(&self, ros_home: &str) -> NodeSpec {
         NodeSpec {
             name: self.name.clone(),
             argv: self.argv.clone(),
@@ -81,12 +82,12 @@ impl LaunchNode {
     }
 }
 
-/// What is asked of the script inside.
+/// Query to the launch script in the container.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub(crate) struct Ask {
-    /// Pushed ROS packages; the one meant is the first that has what is asked for.
+pub(crate) struct LaunchQuery {
+    /// Pushed ROS packages; the first one that contains what is requested is used.
     pub(crate) packages: Vec<String>,
-    /// The install space whose setup.sh makes the environment; empty for none.
+    /// Install space whose setup.sh provides the environment; empty for none.
     pub(crate) prefix: String,
     /// Launch file, or empty.
     pub(crate) launch: String,
@@ -94,15 +95,15 @@ pub(crate) struct Ask {
     pub(crate) nodes: Vec<String>,
     /// Arguments of the launch file.
     pub(crate) args: BTreeMap<String, String>,
-    /// Remaps for every node.
+    /// Remappings for every node.
     pub(crate) remaps: BTreeMap<String, String>,
     /// Parameters: absolute ones, and private ones for every node.
     pub(crate) params: BTreeMap<String, serde_json::Value>,
 }
 
-/// What the script answers.
+/// Answer of the launch script.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Answer {
+pub(crate) struct LaunchAnswer {
     pub(crate) nodes: Vec<LaunchNode>,
     #[serde(default)]
     pub(crate) components: BTreeMap<String, Vec<Component>>,
@@ -113,7 +114,7 @@ pub(crate) struct Answer {
 
 #[derive(Debug, Deserialize)]
 #[serde(tag = "kind", rename_all = "snake_case")]
-enum Refusal {
+enum PlanRefusal {
     Launch {
         file: String,
         words: String,
@@ -148,13 +149,13 @@ enum Refusal {
 
 #[derive(Debug, Deserialize)]
 #[serde(untagged)]
-enum Reply {
-    Refused { error: Refusal },
-    Planned(Answer),
+enum PlanReply {
+    Refused { error: PlanRefusal },
+    Planned(LaunchAnswer),
 }
 
-/// What resolves launch files, by the image's own tools: the script that is started first.
-fn scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
+/// Returns the scripts that resolve launch files with the image's own tools; the first one is the entry point.
+fn plan_scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
     match ros {
         Version::Ros1 => vec![("launch_plan.py", include_str!("inside/launch_plan.py"))],
         Version::Ros2 => vec![
@@ -171,26 +172,26 @@ fn scripts(ros: Version) -> Vec<(&'static str, &'static str)> {
     }
 }
 
-/// What reads launch files, for people.
-fn launcher(ros: Version) -> &'static str {
+/// Returns the name of the program that reads launch files.
+fn launch_program(ros: Version) -> &'static str {
     match ros {
         Version::Ros1 => "roslaunch",
         Version::Ros2 => "ros2 launch",
     }
 }
 
-/// Asks, in a container of these trees.
-pub(crate) async fn ask(
-    shop: &Workshop,
+/// Runs the query in a container of these trees.
+pub(crate) async fn query_plan(
+    shop: &BuildContext,
     ros: Version,
     mut layers: Vec<PathBuf>,
     mut environment: BTreeMap<String, String>,
-    ask: &Ask,
-) -> Result<Answer, Error> {
-    let directory = shop.site.fresh("plan")?;
+    ask: &LaunchQuery,
+) -> Result<LaunchAnswer, Error> {
+    let directory = shop.site.fresh_directory("plan")?;
     let (tools, out) = (directory.join("tools"), directory.join("out"));
     let question = serde_json::to_vec(ask).unwrap_or_default();
-    let scripts = scripts(ros);
+    let scripts = plan_scripts(ros);
     let mut files = BTreeMap::from([
         (PathBuf::from("cloudroid/ask.json"), question),
         (PathBuf::from("cloudroid/out/.keep"), Vec::new()),
@@ -199,10 +200,10 @@ pub(crate) async fn ask(
     for (name, text) in &scripts {
         files.insert(place(name).into(), text.as_bytes().to_vec());
     }
-    lay_out(&tools, &files)?;
+    write_tree(&tools, &files)?;
     let first = scripts.first().map_or("", |(name, _)| *name);
-    fs::create_dir(&out).at("making", &out)?;
-    // The container's root is nobody in particular out here; the directories above let nobody else in.
+    fs::create_dir(&out).io_context("making", &out)?;
+    // The container's root is an unprivileged user on the host; nobody else can access the parent directories.
     set_mode(&out, 0o777)?;
     layers.push(tools);
     for (name, value) in [
@@ -215,7 +216,7 @@ pub(crate) async fn ask(
     let finished = shop
         .site
         .run(
-            Run {
+            SandboxRun {
                 name: "plan",
                 profile: Profile::Servant,
                 layers,
@@ -234,22 +235,23 @@ pub(crate) async fn ask(
             |_| {},
         )
         .await?;
-    let text = match finished.success() {
-        true => blocking::spawn(move || plan::read(&out)).await??,
-        false => None,
+    let text = if finished.success() {
+        blocking::spawn(move || plan::read_plan(&out)).await??
+    } else {
+        None
     };
     let Some(text) = text else {
         return Err(Error::Inside {
             what: "resolving what to run",
-            last_lines: finished.last_words(),
+            last_lines: finished.last_output(),
         });
     };
-    let answer = privilege::reading(|| understand(&text, ros))?;
-    plan::check(&answer)?;
+    let answer = privilege::run_as_reader(|| parse_reply(&text, ros))?;
+    plan::check_plan(&answer)?;
     Ok(answer)
 }
 
-/// Whoever loads nodes needs the definitions by which they are asked for, as the image has them.
+/// Checks that the image defines the services by which components are loaded.
 pub(crate) fn check_composition(
     components: &BTreeMap<String, Vec<Component>>,
     definitions: &Definitions,
@@ -269,8 +271,8 @@ pub(crate) fn check_composition(
     }
 }
 
-/// Names for people.
-pub(crate) fn list(names: &[String]) -> String {
+/// Formats names for a message.
+pub(crate) fn join_names(names: &[String]) -> String {
     if names.is_empty() {
         "none".to_owned()
     } else {
@@ -278,38 +280,38 @@ pub(crate) fn list(names: &[String]) -> String {
     }
 }
 
-fn understand(text: &[u8], ros: Version) -> Result<Answer, Error> {
-    match serde_json::from_slice::<Reply>(text) {
-        Ok(Reply::Planned(answer)) => Ok(answer),
-        Ok(Reply::Refused { error }) => Err(match error {
-            Refusal::Launch { file, words } => Error::Launch {
-                program: launcher(ros),
+fn parse_reply(text: &[u8], ros: Version) -> Result<LaunchAnswer, Error> {
+    match serde_json::from_slice::<PlanReply>(text) {
+        Ok(PlanReply::Planned(answer)) => Ok(answer),
+        Ok(PlanReply::Refused { error }) => Err(match error {
+            PlanRefusal::Launch { file, words } => Error::Launch {
+                program: launch_program(ros),
                 file,
                 words,
             },
-            Refusal::NoLaunch { module } => Error::NoLaunch { module, with: None },
-            Refusal::Python { made_for, there } => Error::OtherPython { made_for, there },
-            Refusal::NoContainer { plugin } => Error::NoContainer { plugin },
-            Refusal::Component { words } => Error::BadComponent { words },
-            Refusal::NotFound { what, name, known } => Error::NotInPackage {
+            PlanRefusal::NoLaunch { module } => Error::NoLaunch { module, with: None },
+            PlanRefusal::Python { made_for, there } => Error::OtherPython { made_for, there },
+            PlanRefusal::NoContainer { plugin } => Error::NoContainer { plugin },
+            PlanRefusal::Component { words } => Error::BadComponent { words },
+            PlanRefusal::NotFound { what, name, known } => Error::NotInPackage {
                 what: if what == "executable" {
                     "executable"
                 } else {
                     "launch file"
                 },
                 name,
-                known: list(&known),
+                known: join_names(&known),
                 elsewhere: String::new(),
             },
-            Refusal::Nothing {
+            PlanRefusal::Nothing {
                 executables,
                 launch_files,
             } => Error::NothingToRun {
-                executables: list(&executables),
-                launch_files: list(&launch_files),
+                executables: join_names(&executables),
+                launch_files: join_names(&launch_files),
                 more: "",
             },
-            Refusal::Setup { file, status } => Error::Inside {
+            PlanRefusal::Setup { file, status } => Error::Inside {
                 what: "sourcing the install space's setup script",
                 last_lines: format!("{file} ended with status {status}"),
             },
@@ -337,8 +339,8 @@ mod tests {
         let text = br#"{"nodes":[{"name":"/a","package":"p","executable":"x","argv":["/x","__name:=a"],"remaps":{},
             "environment":{},"directory":null,"respawn":true,"respawn_delay":1.5,"required":false}],
             "parameters":{"/a/k":[1,2.5,"x",true]},"environment":{},"warnings":[],"executables":[],"launch_files":[]}"#;
-        let answer = understand(text, Version::Ros1).expect("a plan");
-        let spec = answer.nodes[0].spec("/root/.ros");
+        let answer = parse_reply(text, Version::Ros1).expect("a plan");
+        let spec = answer.nodes[0].to_node_spec("/root/.ros");
         assert_eq!(
             (spec.directory.as_str(), spec.respawn, spec.respawn_delay),
             ("/root/.ros", true, 1.5)
@@ -352,7 +354,7 @@ mod tests {
     #[test]
     fn refusals_keep_roslaunchs_words_and_name_what_there_is() {
         let launch = br#"{"error":{"kind":"launch","file":"/x.launch","words":"requires the 'manager' arg to be set"}}"#;
-        let text = understand(launch, Version::Ros1)
+        let text = parse_reply(launch, Version::Ros1)
             .expect_err("refused")
             .to_string();
         assert_eq!(
@@ -361,15 +363,12 @@ mod tests {
         );
         let node =
             br#"{"error":{"kind":"not_found","what":"executable","name":"y","known":["a","b"]}}"#;
-        let text = understand(node, Version::Ros1)
+        let text = parse_reply(node, Version::Ros1)
             .expect_err("refused")
             .to_string();
-        assert_eq!(
-            text,
-            "there is no executable \"y\" in the package; there are: a, b"
-        );
+        assert_eq!(text, "no executable \"y\" in the package; available: a, b");
         let nothing = br#"{"error":{"kind":"nothing","executables":["a","b"],"launch_files":[]}}"#;
-        let text = understand(nothing, Version::Ros1)
+        let text = parse_reply(nothing, Version::Ros1)
             .expect_err("refused")
             .to_string();
         assert!(
@@ -381,7 +380,7 @@ mod tests {
     #[test]
     fn what_ros_2_cannot_resolve_names_the_reason_and_the_next_step() {
         let refused = |text: &[u8]| {
-            let error = understand(text, Version::Ros2).expect_err("refused");
+            let error = parse_reply(text, Version::Ros2).expect_err("refused");
             error.to_string()
         };
         let text = refused(br#"{"error":{"kind":"no_launch","module":"launch"}}"#);
@@ -392,7 +391,7 @@ mod tests {
         let text =
             refused(br#"{"error":{"kind":"python","made_for":"python3.12","there":"python3.11"}}"#);
         assert!(
-            text.contains("made for python3.12, and the base has python3.11"),
+            text.contains("built for python3.12, but the base has python3.11"),
             "{text}"
         );
         let launch =

@@ -1,4 +1,4 @@
-//! From a pushed package to an image.
+//! Build of an image from a pushed package.
 //!
 //! ```text
 //!              base definition (images/NAME.toml)
@@ -9,14 +9,14 @@
 //!                       │                                                             │
 //!  catkin, colcon ▶  package layer ◀────── sources, compiled in a sandbox ────────────┘
 //!                       │
-//!    launch     ──▶  what to run ──▶ started once by the caller ──▶ probe ──▶ interface
+//!    launch     ──▶  launch plan ──▶ started once by the caller ──▶ probe ──▶ interface
 //! ```
 //!
-//! In: a [`PushRequest`]. Out: a [`BuildOutcome`] with an untagged image in the store and a [`LaunchPlan`]; [`probe`]
-//! then finds the interface of the running thing. Everything foreign runs in containers without network; what needs
-//! the network is apt on the host. What is in the cache is not made again, part by part: dependency layers stand on each
-//! other, packages of a workspace are compiled one by one. The same inputs give the same layers; where some of their
-//! dependencies are cached, the same files, perhaps cut into other layers.
+//! Input: a [`PushRequest`]. Output: a [`BuildOutcome`] with an untagged image in the store and a [`LaunchPlan`];
+//! [`probe`] then finds the interface of the running image. All foreign code runs in containers without network; only
+//! apt on the host uses the network. Cached parts are not built again: dependency layers are stacked in chains, and
+//! packages of a workspace are compiled separately. The same inputs give the same layers; if some of the dependencies
+//! are cached, the same files, possibly divided into other layers.
 
 #![forbid(unsafe_code)]
 
@@ -76,5 +76,5 @@ pub use builder::{Builder, Config, DEFAULT_BASE};
 pub use error::{Error, Unresolved};
 pub use event::BuildEvent;
 pub use launch::{LaunchNode, LaunchPlan};
-pub use plan::wrong_with_components;
-pub use request::{BuildOutcome, BuiltLayer, PushRequest, Source};
+pub use plan::find_components_problem;
+pub use request::{BuildOutcome, BuiltLayer, PushRequest, PushSource};

@@ -1,32 +1,32 @@
-//! Lines on their way to whoever watches a build. A build may print faster than its watcher reads: then some are left
-//! out, and their number is told, instead of keeping them all in memory or holding the build up.
+//! Bounded queue of output lines for the watcher of a build. If a build prints faster than its watcher reads, lines are
+//! dropped and counted, instead of keeping them all in memory or blocking the build.
 
 use tokio::sync::mpsc;
 
-/// Lines that may wait.
+/// Capacity of the queue in lines.
 const AHEAD: usize = 4096;
 
-/// Where lines go in.
-pub(crate) struct Lines {
+/// Sending end of the queue.
+pub(crate) struct LineSender {
     sender: mpsc::Sender<String>,
     left_out: u64,
 }
 
-/// A pair of ends.
-pub(crate) fn channel() -> (Lines, mpsc::Receiver<String>) {
+/// Creates a queue.
+pub(crate) fn channel() -> (LineSender, mpsc::Receiver<String>) {
     let (sender, receiver) = mpsc::channel(AHEAD);
-    let lines = Lines {
+    let lines = LineSender {
         sender,
         left_out: 0,
     };
     (lines, receiver)
 }
 
-impl Lines {
-    /// Sends a line, if there is room. Never waits.
+impl LineSender {
+    /// Sends a line if there is room. Never blocks.
     pub(crate) fn send(&mut self, line: String) {
         if self.left_out > 0 {
-            let told = format!("({} lines are left out here)", self.left_out);
+            let told = format!("({} lines omitted)", self.left_out);
             match self.sender.try_send(told) {
                 Ok(()) => self.left_out = 0,
                 Err(_) => {
@@ -56,10 +56,7 @@ mod tests {
         }
         assert!(received.try_recv().is_err(), "more was kept than may wait");
         lines.send("after".into());
-        assert_eq!(
-            received.try_recv().expect("told"),
-            "(10 lines are left out here)"
-        );
+        assert_eq!(received.try_recv().expect("told"), "(10 lines omitted)");
         assert_eq!(received.try_recv().expect("sent"), "after");
     }
 }

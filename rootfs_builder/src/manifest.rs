@@ -1,4 +1,4 @@
-//! What `package.xml` files and plugin lists say, as far as a build asks.
+//! Content of `package.xml` files and plugin lists that is relevant to a build.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -8,7 +8,7 @@ use package::manifest::{Kind, Manifest};
 
 use crate::base::Base;
 
-/// rosdep keys and ROS packages that running the package of this package.xml needs.
+/// Returns the rosdep keys and ROS packages that the package needs at run time.
 pub(crate) fn run_dependencies(
     text: &str,
     path: &Path,
@@ -17,7 +17,7 @@ pub(crate) fn run_dependencies(
     let manifest = Manifest::parse(
         text,
         path,
-        &Variables::ros(base.ros.bus().number(), &base.ros_distribution),
+        &Variables::for_distribution(base.ros.ros_version().number(), &base.ros_distribution),
     )?;
     Ok(manifest
         .needs(&[Kind::Exec])
@@ -29,13 +29,14 @@ pub(crate) fn run_dependencies(
 /// A library of a plugin list.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct PluginLibrary {
-    /// `libx.so`
+    /// File name: `libx.so`.
     pub(crate) name: String,
-    /// The list says a directory (`lib/libx`), so pluginlib looks nowhere else.
+    /// True if the list states a directory (`lib/libx`), so that pluginlib looks nowhere else.
     pub(crate) in_directory: bool,
 }
 
-/// Libraries of a plugin list (pluginlib: one `library`, or several in `class_libraries`). Anything else names none.
+/// Returns the libraries of a plugin list (pluginlib: a single `library`, or several in `class_libraries`); empty for
+/// other files.
 pub(crate) fn plugin_libraries(text: &str) -> BTreeSet<PluginLibrary> {
     let Ok(document) = roxmltree::Document::parse(text) else {
         return BTreeSet::new();

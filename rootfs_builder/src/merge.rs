@@ -1,4 +1,4 @@
-//! Puts extracted layers over each other in a directory, as an overlay mount would show them.
+//! Merging of extracted layers into a directory, like an overlay mount.
 
 use std::fs;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
@@ -6,20 +6,20 @@ use std::path::Path;
 
 use foreign::Visit;
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::install::set_mode;
 
-/// Copies `tree` over what is below `target`: files by a link where that can be, so they must not be written to
-/// afterwards. What the tree deletes goes. Blocking.
-pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
+/// Copies `tree` over the content of `target`. Files are hard-linked if possible, so they must not be modified
+/// afterwards. Deletions of the tree are applied. Blocking.
+pub(crate) fn overlay_tree(tree: &Path, target: &Path) -> Result<(), Error> {
     let mut directories = Vec::new();
     foreign::walk(tree, |entry| {
         if entry.path.as_os_str().is_empty() {
             return Ok(Visit::Into);
         }
-        let (from, to) = (entry.shown(), target.join(entry.path));
+        let (from, to) = (entry.display_path(), target.join(entry.path));
         let from = from.as_path();
-        let about = from.symlink_metadata().at("reading", from)?;
+        let about = from.symlink_metadata().io_context("reading", from)?;
         let kind = about.file_type();
         let there = to.symlink_metadata().ok().map(|there| there.is_dir());
         if kind.is_dir() {
@@ -28,10 +28,10 @@ pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
                 remove(&to)?;
             }
             if hides || there != Some(true) {
-                fs::create_dir(&to).at("making", &to)?;
+                fs::create_dir(&to).io_context("making", &to)?;
             }
             std::os::unix::fs::lchown(&to, Some(about.uid()), Some(about.gid()))
-                .at("changing the owner of", &to)?;
+                .io_context("changing the owner of", &to)?;
             directories.push((to, about));
             return Ok(Visit::Into);
         }
@@ -42,21 +42,23 @@ pub(crate) fn lay_over(tree: &Path, target: &Path) -> Result<(), Error> {
             return Ok(Visit::Into);
         }
         if kind.is_symlink() {
-            let link = fs::read_link(from).at("reading", from)?;
-            std::os::unix::fs::symlink(link, &to).at("linking", &to)?;
+            let link = fs::read_link(from).io_context("reading", from)?;
+            std::os::unix::fs::symlink(link, &to).io_context("linking", &to)?;
             std::os::unix::fs::lchown(&to, Some(about.uid()), Some(about.gid()))
-                .at("changing the owner of", &to)?;
+                .io_context("changing the owner of", &to)?;
         } else if kind.is_file() {
             link(from, &to)?;
         }
         Ok::<_, Error>(Visit::Into)
     })?;
-    // Last, as writing into a directory changes its time and may need its rights.
+    // Last, since writing into a directory changes its time and may need its permissions.
     for (path, about) in directories.iter().rev() {
         set_mode(path, about.mode() & 0o7777)?;
-        let time = about.modified().at("reading", path)?;
-        let opened = fs::File::open(path).at("opening", path)?;
-        opened.set_modified(time).at("changing the time of", path)?;
+        let time = about.modified().io_context("reading", path)?;
+        let opened = fs::File::open(path).io_context("opening", path)?;
+        opened
+            .set_modified(time)
+            .io_context("changing the time of", path)?;
     }
     Ok(())
 }
@@ -65,14 +67,19 @@ fn link(from: &Path, to: &Path) -> Result<(), Error> {
     if fs::hard_link(from, to).is_ok() {
         return Ok(());
     }
-    let about = from.metadata().at("reading", from)?;
-    fs::copy(from, to).at("copying", from)?;
+    let about = from.metadata().io_context("reading", from)?;
+    fs::copy(from, to).io_context("copying", from)?;
     std::os::unix::fs::lchown(to, Some(about.uid()), Some(about.gid()))
-        .at("changing the owner of", to)?;
+        .io_context("changing the owner of", to)?;
     set_mode(to, about.mode() & 0o7777)?;
-    let time = about.modified().at("reading", from)?;
-    let opened = fs::File::options().write(true).open(to).at("opening", to)?;
-    opened.set_modified(time).at("changing the time of", to)
+    let time = about.modified().io_context("reading", from)?;
+    let opened = fs::File::options()
+        .write(true)
+        .open(to)
+        .io_context("opening", to)?;
+    opened
+        .set_modified(time)
+        .io_context("changing the time of", to)
 }
 
 fn remove(path: &Path) -> Result<(), Error> {
@@ -80,11 +87,11 @@ fn remove(path: &Path) -> Result<(), Error> {
     if directory {
         Ok(foreign::remove(path)?)
     } else {
-        fs::remove_file(path).at("removing", path)
+        fs::remove_file(path).io_context("removing", path)
     }
 }
 
-/// Whether a directory hides what is below it in lower layers.
+/// Returns whether a directory hides the lower layers.
 fn is_opaque(path: &Path) -> bool {
     ["trusted.overlay.opaque", "user.overlay.opaque"]
         .iter()
@@ -138,7 +145,7 @@ mod tests {
         opaque(&two.join("new_again"));
         set_mode(&two.join("a/same"), 0o755).expect("set");
         set_mode(&two.join("new_again"), 0o500).expect("set");
-        // Only root can make an overlay's mark for a deletion.
+        // Only root can create an overlay's deletion mark.
         let mark = rustix::fs::mknodat(
             rustix::fs::CWD,
             two.join("a/gone"),
@@ -148,7 +155,7 @@ mod tests {
         );
         fs::create_dir(&all).expect("made");
         for tree in [&one, &two] {
-            lay_over(tree, &all).expect("laid over");
+            overlay_tree(tree, &all).expect("laid over");
         }
         let read = |path: &str| fs::read_to_string(all.join(path)).ok();
         assert_eq!(read("a/same").as_deref(), Some("2"));
@@ -162,7 +169,7 @@ mod tests {
         assert_eq!(read("a/gone").is_some(), mark.is_err());
         let mode = |path: &str| all.join(path).metadata().expect("there").mode() & 0o777;
         assert_eq!((mode("a/same"), mode("new_again")), (0o755, 0o500));
-        // What was laid over is as it was.
+        // The source trees are unchanged.
         assert_eq!(fs::read_to_string(one.join("a/same")).expect("there"), "1");
     }
 }

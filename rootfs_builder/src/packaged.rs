@@ -1,4 +1,4 @@
-//! `--apt NAME`: a ROS package that the distribution has compiled already.
+//! `--apt NAME`: a ROS package that is already compiled in the distribution.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,23 +7,23 @@ use serde::{Deserialize, Serialize};
 
 use crate::archive::Archive;
 use crate::base::Base;
-use crate::build::{Build, Parts};
-use crate::deb::Member;
+use crate::build::{Build, BuildParts};
+use crate::deb::DebMember;
 use crate::error::Error;
-use crate::gather::{self, Wanted};
-use crate::imports::Programs;
-use crate::install::Made;
+use crate::gather::{self, GatheredPackages};
+use crate::imports::SelectedPrograms;
+use crate::install::LayerSet;
 use crate::key::Key;
 use crate::keys;
-use crate::request::{PushRequest, Source};
+use crate::request::{PushRequest, PushSource};
 
-/// `name`: a ROS package, or a Debian package that holds some.
-pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
+/// Builds from `name`: a ROS package, or a Debian package that contains some.
+pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> {
     if build.base.ros != Version::Ros1 {
-        return of_two(build, name).await;
+        return build_ros2(build, name).await;
     }
     let archive = &build.archive;
-    let mapped = keys::mapped(archive, &build.base, &build.request.map)?;
+    let mapped = keys::mapped_packages(archive, &build.base, &build.request.map)?;
     let (mut roots, mut debs) = build.extra_packages().await?;
     let packages: Vec<String> = if !archive.contents.ros_package(name).is_empty() {
         vec![name.to_owned()]
@@ -48,7 +48,7 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
         let hint = if similar.is_empty() {
             String::new()
         } else {
-            format!(" (there is {})", similar.join(", "))
+            format!(" (available: {})", similar.join(", "))
         };
         return Err(Error::UnknownPackage {
             name: name.to_owned(),
@@ -59,65 +59,65 @@ pub(crate) async fn build(build: &Build<'_>, name: &str) -> Result<Parts, Error>
     roots.extend(packages.iter().cloned());
     build
         .progress
-        .step(&format!("looking up what {name} needs"))
+        .step(&format!("looking up the dependencies of {name}"))
         .await;
-    let wanted = wanted(build, &roots, true).await?;
+    let wanted = gather_wanted(build, &roots, true).await?;
     debs.extend(wanted.install);
     debs.extend(mapped);
     let versions = packages.iter();
-    let versions = versions.map(|package| (package.clone(), version(build, package)));
+    let versions = versions.map(|package| (package.clone(), archive_version(build, package)));
     let versions = versions.collect();
     let dependencies = build
-        .add("dependencies", &build.on_base(), &debs, wanted.extras)
+        .add_packages("dependencies", &build.base_diff_ids(), &debs, wanted.extras)
         .await?;
-    Ok(Parts {
+    Ok(BuildParts {
         packages,
         versions,
         dependencies,
-        package: Made::default(),
+        package: LayerSet::default(),
         prefix: None,
     })
 }
 
-/// Of ROS 2, whose archive has one Debian package for each ROS package, with all that it needs.
-async fn of_two(build: &Build<'_>, name: &str) -> Result<Parts, Error> {
-    let InArchive { package, deb } = in_archive(&build.archive, &build.base, name)?;
+/// Builds on ROS 2, whose archive has a Debian package with all dependencies for each ROS package.
+async fn build_ros2(build: &Build<'_>, name: &str) -> Result<BuildParts, Error> {
+    let ArchivePackage { package, deb } = find_in_archive(&build.archive, &build.base, name)?;
     let (_, mut debs) = build.extra_packages().await?;
     let version = build.archive.candidates.get(&deb);
     debs.insert(deb);
-    debs.extend(keys::mapped(
+    debs.extend(keys::mapped_packages(
         &build.archive,
         &build.base,
         &build.request.map,
     )?);
     let dependencies = build
-        .add("dependencies", &build.on_base(), &debs, Vec::new())
+        .add_packages("dependencies", &build.base_diff_ids(), &debs, Vec::new())
         .await?;
-    Ok(Parts {
+    Ok(BuildParts {
         versions: BTreeMap::from([(
             package.clone(),
             version.map_or_else(String::new, |deb| deb.version),
         )]),
         packages: vec![package],
         dependencies,
-        package: Made::default(),
+        package: LayerSet::default(),
         prefix: None,
     })
 }
 
-/// A ROS package and the Debian package that holds it.
+/// A ROS package and the Debian package that contains it.
 #[derive(Debug, PartialEq)]
-struct InArchive {
+struct ArchivePackage {
     package: String,
     deb: String,
 }
 
-/// `name` is that of the ROS package, or of the Debian package, with or without what it begins with.
-fn in_archive(archive: &Archive, base: &Base, name: &str) -> Result<InArchive, Error> {
+/// Finds a package by the name of the ROS package, or of the Debian package with or without its prefix.
+fn find_in_archive(archive: &Archive, base: &Base, name: &str) -> Result<ArchivePackage, Error> {
     let own = format!("ros-{}-", base.ros_distribution);
     let package = name.strip_prefix(&own).unwrap_or(name).replace('-', "_");
-    match keys::deb_of(archive, base, &package) {
-        Some(deb) => Ok(InArchive { package, deb }),
+    match keys::find_ros_deb(archive, base, &package) {
+        Some(deb) => Ok(ArchivePackage { package, deb }),
         None => Err(Error::NotInRosArchive {
             name: name.to_owned(),
             base: base.name.clone(),
@@ -126,38 +126,38 @@ fn in_archive(archive: &Archive, base: &Base, name: &str) -> Result<InArchive, E
     }
 }
 
-/// Remembered: it downloads and looks into many packages.
+/// Cached result: gathering downloads and inspects many packages.
 #[derive(Serialize, Deserialize)]
-struct Note {
+struct GatherNote {
     install: BTreeSet<String>,
-    extras: Vec<Member>,
+    extras: Vec<DebMember>,
     warnings: Vec<String>,
     unknown: BTreeSet<String>,
 }
 
-/// Gathers from these ROS packages.
-pub(crate) async fn wanted(
+/// Gathers from ROS packages, with caching.
+pub(crate) async fn gather_wanted(
     build: &Build<'_>,
     roots: &BTreeSet<String>,
     python: bool,
-) -> Result<Wanted, Error> {
+) -> Result<GatheredPackages, Error> {
     if roots.is_empty() {
-        return Ok(Wanted::default());
+        return Ok(GatheredPackages::default());
     }
     let keys = serde_json::to_string(&build.base.keys).unwrap_or_default();
-    let programs = programs(build.request);
+    let programs = selected_programs(build.request);
     let key = Key::new("gathered with imports")
-        .with("archive", &build.archive.stamp)
-        .with("keys", keys)
-        .with_all("ignore", &build.base.ros_packages.ignore)
-        .with("python", [u8::from(python)])
-        .with("programs", format!("{programs:?}"))
-        .with_all("root", roots)
+        .input("archive", &build.archive.stamp)
+        .input("keys", keys)
+        .inputs("ignore", &build.base.ros_packages.ignore)
+        .input("python", [u8::from(python)])
+        .input("programs", format!("{programs:?}"))
+        .inputs("root", roots)
         .finish();
-    let note: Note = match build.shop.layers.note(&key) {
+    let note: GatherNote = match build.shop.layers.read_note(&key) {
         Some(note) => note,
         None => {
-            let found = gather::gather(
+            let found = gather::gather_packages(
                 &build.archive,
                 &build.base,
                 roots,
@@ -166,13 +166,13 @@ pub(crate) async fn wanted(
                 build.progress,
             )
             .await?;
-            let note = Note {
+            let note = GatherNote {
                 install: found.install,
                 extras: found.extras,
                 warnings: found.warnings,
                 unknown: found.unknown,
             };
-            build.shop.layers.keep_note(&key, &note)?;
+            build.shop.layers.write_note(&key, &note)?;
             note
         }
     };
@@ -182,12 +182,13 @@ pub(crate) async fn wanted(
     for name in &note.unknown {
         if !build.request.map.contains_key(name) {
             let text = format!(
-                "package.xml asks for {name}, which nothing provides; name its Debian package with `--map {name}=DEB`"
+                "package.xml needs {name}, which no known package provides; name its Debian package with `--map \
+                    {name}=DEB`"
             );
             build.progress.warn(text).await;
         }
     }
-    Ok(Wanted {
+    Ok(GatheredPackages {
         install: note.install,
         extras: note.extras,
         warnings: note.warnings,
@@ -195,21 +196,21 @@ pub(crate) async fn wanted(
     })
 }
 
-/// Programs of packages of the archive that a push runs, as far as it is known before.
-fn programs(request: &PushRequest) -> Programs {
-    if let (Source::Packaged(_), Some(_)) = (&request.source, &request.launch) {
-        return Programs::All;
+/// Returns the programs of the archive's packages that a push runs, as far as known in advance.
+fn selected_programs(request: &PushRequest) -> SelectedPrograms {
+    if let (PushSource::Packaged(_), Some(_)) = (&request.source, &request.launch) {
+        return SelectedPrograms::All;
     }
     // `PACKAGE/PROGRAM ARGUMENTS`
     let names = request.nodes.iter().filter_map(|node| {
         let path = node.split_whitespace().next()?;
         Some(path.rsplit('/').next().unwrap_or(path).to_owned())
     });
-    Programs::Named(names.collect())
+    SelectedPrograms::Named(names.collect())
 }
 
-/// The archive's version of the Debian package that holds a ROS package's programs, or its package.xml.
-fn version(build: &Build<'_>, package: &str) -> String {
+/// Returns the version of the Debian package that contains a ROS package's programs or its package.xml.
+fn archive_version(build: &Build<'_>, package: &str) -> String {
     let carriers = build.archive.contents.ros_package(package);
     let deb = carriers
         .keys()
@@ -234,7 +235,7 @@ mod tests {
         let archive = Archive {
             apt: crate::apt::Apt::open(directory.path(), "").expect("prepared"),
             contents: Arc::new(Contents::open(directory.path(), &lists).expect("read")),
-            candidates: crate::candidates::tests::named(&[
+            candidates: crate::candidates::tests::candidates_named(&[
                 "ros-jazzy-demo-nodes-py",
                 "ros-humble-turtlesim",
                 "python3-six",
@@ -245,16 +246,16 @@ mod tests {
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, "noble-jazzy").expect("valid");
         for name in ["demo_nodes_py", "demo-nodes-py", "ros-jazzy-demo-nodes-py"] {
-            let found = in_archive(&archive, &base, name);
-            let expected = InArchive {
+            let found = find_in_archive(&archive, &base, name);
+            let expected = ArchivePackage {
                 package: "demo_nodes_py".to_owned(),
                 deb: "ros-jazzy-demo-nodes-py".to_owned(),
             };
             assert_eq!(found.expect("it is there"), expected, "{name}");
         }
-        // Of another distribution, of no ROS, and of nobody.
+        // Of another distribution, without ROS packages, and unknown.
         for name in ["turtlesim", "ros-humble-turtlesim", "python3-six", "frob"] {
-            let refused = in_archive(&archive, &base, name).expect_err("it is not there");
+            let refused = find_in_archive(&archive, &base, name).expect_err("it is not there");
             let refused = refused.to_string();
             assert!(
                 refused.contains(name) && refused.contains("noble-jazzy"),

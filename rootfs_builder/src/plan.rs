@@ -1,8 +1,8 @@
-//! The plan of what to run, as it comes out of the package's own container.
+//! Validation of the launch plan that comes out of the package's own container.
 //!
-//! The script that resolves launch files runs beside the package's code, which can replace the script's answer. So the
-//! answer is read beneath a directory descriptor and up to a size, every value is checked, and an answer that the
-//! script could not have written is refused as a whole.
+//! The script that resolves launch files runs together with the package's code, which can replace its answer. So the
+//! answer is read below a directory descriptor and up to a size limit, every value is validated, and an answer that the
+//! script could not have written is rejected as a whole.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -11,28 +11,28 @@ use package::names;
 use ros::ros2::composition::Component;
 
 use crate::error::Error;
-use crate::launch::{Answer, LaunchNode};
+use crate::launch::{LaunchAnswer, LaunchNode};
 
-/// The answer's file, in the directory that the container may write.
+/// File with the answer, in the directory that the container can write to.
 pub(crate) const FILE: &str = "plan.json";
-/// The largest answer. Launch files with robot descriptions among their parameters have some megabytes.
+/// Maximum size of the answer. Launch files with robot descriptions in their parameters give some megabytes.
 const MAX_BYTES: u64 = 32 << 20;
 const MAX_NODES: usize = 256;
 const MAX_PARAMETERS: usize = 20_000;
 const MAX_WARNINGS: usize = 1000;
-/// Bytes of arguments, or of environment; `execve` takes 2 MiB of both together.
+/// Maximum size of arguments or environment in bytes; `execve` accepts 2 MiB of both together.
 const MAX_WORDS: usize = 1 << 20;
-/// Longest respawn_delay of a node: a day, in seconds.
+/// Maximum respawn_delay of a node in seconds: a day.
 const MAX_DELAY: f64 = 86_400.0;
 
-/// The bytes of the answer in `out`; none when there is none.
-pub(crate) fn read(out: &Path) -> Result<Option<Vec<u8>>, Error> {
-    let file = foreign::Tree::open(out)?.file(FILE, MAX_BYTES)?;
+/// Reads the answer in `out`; `None` if there is none.
+pub(crate) fn read_plan(out: &Path) -> Result<Option<Vec<u8>>, Error> {
+    let file = foreign::Tree::open(out)?.read_file(FILE, MAX_BYTES)?;
     Ok(file.map(|file| file.bytes))
 }
 
-/// Refuses an answer that the script could not have written.
-pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
+/// Rejects an answer that the script could not have written.
+pub(crate) fn check_plan(answer: &LaunchAnswer) -> Result<(), Error> {
     let refused = |problem: String| Err(Error::BadPlan { problem });
     for (what, count, limit) in [
         ("nodes", answer.nodes.len(), MAX_NODES),
@@ -40,45 +40,44 @@ pub(crate) fn check(answer: &Answer) -> Result<(), Error> {
         ("warnings", answer.warnings.len(), MAX_WARNINGS),
     ] {
         if count > limit {
-            return refused(format!(
-                "it has {count} {what}, and {limit} are allowed at most"
-            ));
+            return refused(format!("it has {count} {what}; the limit is {limit}"));
         }
     }
     let mut seen = BTreeSet::new();
     for node in &answer.nodes {
-        if let Some(problem) = wrong_with(node) {
+        if let Some(problem) = find_node_problem(node) {
             return refused(format!("node {:?} {problem}", node.name));
         }
         if !seen.insert(&node.name) {
             return refused(format!("two nodes are named {}", node.name));
         }
     }
-    if let Some(problem) = wrong_with_components(&answer.components, &|name| seen.contains(name)) {
+    if let Some(problem) = find_components_problem(&answer.components, &|name| seen.contains(name))
+    {
         return refused(problem);
     }
-    if let Some(problem) = wrong_with_environment(&answer.environment) {
+    if let Some(problem) = find_environment_problem(&answer.environment) {
         return refused(problem);
     }
     let bad = |name: &&String| !names::is_graph_name(name) && !is_parameter(name);
     if let Some(name) = answer.parameters.keys().find(bad) {
-        return refused(format!("{name:?} is not an absolute name of a parameter"));
+        return refused(format!("{name:?} is not an absolute parameter name"));
     }
     Ok(())
 }
 
-/// Parameters may have names that no topic can have, such as `/camera/1st`.
+/// Returns whether a text is the name of a parameter, which unlike a topic may be, for example, `/camera/1st`.
 fn is_parameter(name: &str) -> bool {
     name.len() <= 1024 && name.starts_with('/') && name.chars().all(|c| !c.is_control())
 }
 
-fn wrong_with(node: &LaunchNode) -> Option<String> {
+fn find_node_problem(node: &LaunchNode) -> Option<String> {
     if !names::is_graph_name(&node.name) {
-        return Some("has a name that is not valid for a ROS node".into());
+        return Some("does not have a valid ROS node name".into());
     }
     if !names::is_package(&node.package) {
         return Some(format!(
-            "names the package {:?}, which is not a valid name of a package",
+            "has the package {:?}, which is not a valid package name",
             node.package
         ));
     }
@@ -94,7 +93,7 @@ fn wrong_with(node: &LaunchNode) -> Option<String> {
     let words = node.argv.iter().map(String::len).sum::<usize>();
     if words > MAX_WORDS {
         return Some(format!(
-            "has {words} bytes of arguments, and {MAX_WORDS} are allowed at most"
+            "has {words} bytes of arguments; the limit is {MAX_WORDS}"
         ));
     }
     if node.argv.iter().any(|word| word.contains('\0')) {
@@ -109,23 +108,23 @@ fn wrong_with(node: &LaunchNode) -> Option<String> {
     }
     if !(0.0..=MAX_DELAY).contains(&node.respawn_delay) {
         return Some(format!(
-            "has a respawn_delay of {} s, and 0 to {MAX_DELAY} are allowed",
+            "has a respawn_delay of {} s; the range is 0 to {MAX_DELAY}",
             node.respawn_delay
         ));
     }
-    wrong_with_environment(&node.environment)
+    find_environment_problem(&node.environment)
         .map(|problem| format!("has an environment where {problem}"))
 }
 
-/// What is wrong with what is loaded into containers, which `is_node` knows by their names.
-pub fn wrong_with_components(
+/// Returns the first problem of the components; `is_node` tells whether a name is that of a node.
+pub fn find_components_problem(
     all: &BTreeMap<String, Vec<Component>>,
     is_node: &dyn Fn(&String) -> bool,
 ) -> Option<String> {
     let loaded = all.values().map(Vec::len).sum::<usize>();
     if loaded > MAX_NODES {
         return Some(format!(
-            "it loads {loaded} nodes into others, and {MAX_NODES} are allowed at most"
+            "it loads {loaded} nodes into others; the limit is {MAX_NODES}"
         ));
     }
     all.iter().find_map(|(container, components)| {
@@ -134,49 +133,49 @@ pub fn wrong_with_components(
                 "it loads nodes into {container:?}, which it does not start"
             ));
         }
-        let problem = components.iter().find_map(wrong_with_component)?;
-        Some(format!("what is loaded into {container} {problem}"))
+        let problem = components.iter().find_map(find_component_problem)?;
+        Some(format!("a component of {container} {problem}"))
     })
 }
 
-fn wrong_with_component(component: &Component) -> Option<String> {
+fn find_component_problem(component: &Component) -> Option<String> {
     if !names::is_package(&component.package) {
         return Some(format!(
-            "is of package {:?}, which is not a valid name of a package",
+            "is of package {:?}, which is not a valid package name",
             component.package
         ));
     }
     if !names::is_class(&component.plugin) {
         return Some(format!(
-            "is {:?}, which is not a valid name of a class",
+            "is {:?}, which is not a valid class name",
             component.plugin
         ));
     }
     let name = component.full_name();
     if name.is_some_and(|name| !names::is_graph_name(&name)) {
         return Some(format!(
-            "is named {:?} in {:?}, which are not valid for a ROS node",
+            "is named {:?} in {:?}, which is not a valid ROS node name",
             component.name, component.namespace
         ));
     }
     None
 }
 
-fn wrong_with_environment(environment: &BTreeMap<String, String>) -> Option<String> {
+fn find_environment_problem(environment: &BTreeMap<String, String>) -> Option<String> {
     let size: usize = environment
         .iter()
         .map(|(name, value)| name.len() + value.len() + 2)
         .sum();
     if size > MAX_WORDS {
         return Some(format!(
-            "the environment has {size} bytes, and {MAX_WORDS} are allowed at most"
+            "the environment has {size} bytes; the limit is {MAX_WORDS}"
         ));
     }
     environment.iter().find_map(|(name, value)| {
         if name.is_empty() || name.contains(['=', '\0']) {
-            Some(format!("{name:?} is not a name of a variable"))
+            Some(format!("{name:?} is not a valid variable name"))
         } else if value.contains('\0') {
-            Some(format!("{name} holds a NUL byte"))
+            Some(format!("{name} contains a NUL byte"))
         } else {
             None
         }
@@ -203,10 +202,10 @@ mod tests {
         }
     }
 
-    fn answer(nodes: Vec<LaunchNode>) -> Answer {
-        Answer {
+    fn answer(nodes: Vec<LaunchNode>) -> LaunchAnswer {
+        LaunchAnswer {
             nodes,
-            ..Answer::default()
+            ..LaunchAnswer::default()
         }
     }
 
@@ -217,7 +216,7 @@ mod tests {
             .insert("/camera/1st".into(), ros::bus::ParamValue::Bool(true));
         good.environment
             .insert("CMAKE_PREFIX_PATH".into(), "/opt/x:/usr".into());
-        check(&good).expect("a plan");
+        check_plan(&good).expect("a plan");
     }
 
     #[test]
@@ -236,12 +235,12 @@ mod tests {
         for (words, change) in changes {
             let mut bad = node();
             change(&mut bad);
-            let text = check(&answer(vec![node(), bad]))
+            let text = check_plan(&answer(vec![node(), bad]))
                 .expect_err(words)
                 .to_string();
             assert!(text.contains(words), "{text}");
         }
-        let twice = check(&answer(vec![node(), node()])).expect_err("twice");
+        let twice = check_plan(&answer(vec![node(), node()])).expect_err("twice");
         assert!(twice.to_string().contains("two nodes"), "{twice}");
         let mut many = answer(Vec::new());
         for number in 0..=MAX_NODES {
@@ -250,15 +249,15 @@ mod tests {
                 ..node()
             });
         }
-        assert!(check(&many).is_err());
+        assert!(check_plan(&many).is_err());
         let mut environment = answer(vec![node()]);
         environment.environment.insert("A=B".into(), String::new());
-        assert!(check(&environment).is_err());
+        assert!(check_plan(&environment).is_err());
         let mut parameter = answer(vec![node()]);
         parameter
             .parameters
             .insert("relative".into(), ros::bus::ParamValue::Bool(true));
-        assert!(check(&parameter).is_err());
+        assert!(check_plan(&parameter).is_err());
     }
 
     #[test]
@@ -270,11 +269,11 @@ mod tests {
             namespace: "/front".into(),
             ..Component::default()
         };
-        let loading = |container: &str, components: Vec<Component>| Answer {
+        let loading = |container: &str, components: Vec<Component>| LaunchAnswer {
             components: [(container.to_owned(), components)].into(),
             ..answer(vec![node()])
         };
-        check(&loading("/a", vec![component.clone()])).expect("a plan");
+        check_plan(&loading("/a", vec![component.clone()])).expect("a plan");
         type Change = fn(&mut Component);
         let changes: [(&str, Change); 4] = [
             ("package", |it| it.package = "../talk".into()),
@@ -285,15 +284,15 @@ mod tests {
         for (words, change) in changes {
             let mut bad = component.clone();
             change(&mut bad);
-            let text = check(&loading("/a", vec![bad]))
+            let text = check_plan(&loading("/a", vec![bad]))
                 .expect_err(words)
                 .to_string();
             assert!(text.contains(words), "{text}");
         }
-        let nowhere = check(&loading("/b", vec![component.clone()])).expect_err("nowhere");
+        let nowhere = check_plan(&loading("/b", vec![component.clone()])).expect_err("nowhere");
         assert!(nowhere.to_string().contains("does not start"), "{nowhere}");
         let many = vec![component; MAX_NODES + 1];
-        assert!(check(&loading("/a", many)).is_err());
+        assert!(check_plan(&loading("/a", many)).is_err());
     }
 
     #[test]
@@ -301,10 +300,10 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let out = place.path().join("out");
         std::fs::create_dir(&out).expect("made");
-        assert_eq!(read(&out).expect("looked"), None);
+        assert_eq!(read_plan(&out).expect("looked"), None);
         std::fs::write(place.path().join("secret"), "{\"nodes\":[]}").expect("written");
         std::os::unix::fs::symlink("../secret", out.join(FILE)).expect("linked");
-        let refused = read(&out).expect_err("a link").to_string();
+        let refused = read_plan(&out).expect_err("a link").to_string();
         assert!(refused.contains("is not a regular file"), "{refused}");
     }
 
@@ -313,7 +312,7 @@ mod tests {
         let out = tempfile::tempdir().expect("a directory");
         let file = std::fs::File::create(out.path().join(FILE)).expect("made");
         file.set_len(1 << 40).expect("set");
-        let refused = read(out.path()).expect_err("large").to_string();
+        let refused = read_plan(out.path()).expect_err("large").to_string();
         assert!(refused.contains("larger than"), "{refused}");
     }
 }

@@ -1,4 +1,4 @@
-//! An install space that was compiled elsewhere: placed where it was compiled for.
+//! Install spaces compiled elsewhere, which are placed at their original prefix.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -6,37 +6,37 @@ use std::path::{Path, PathBuf};
 
 use package::workspace::{InstallSpace, Layout};
 
-use crate::build::{Build, Parts};
+use crate::build::{Build, BuildParts};
 use crate::compile;
-use crate::error::{Error, IoAt};
-use crate::indexed::Indexed;
-use crate::install::{Made, set_mode};
+use crate::error::{Error, IoContext};
+use crate::indexed::IndexedPackages;
+use crate::install::{LayerSet, set_mode};
 use crate::key::{self, Key};
-use crate::keys::{self, Needed};
-use crate::workshop::Packing;
+use crate::keys::{self, RequiredKeys};
+use crate::workshop::PackJob;
 use crate::{pushed, source};
 
-/// Where a servant has scratch space: what an image holds there cannot be seen.
+/// Directories that are replaced by scratch space in a servant, so that files of the image there are not visible.
 const HIDDEN: [&str; 7] = ["/dev", "/proc", "/root", "/run", "/sys", "/tmp", "/var"];
 
-/// Packs it and finds what it needs.
-pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Parts, Error> {
-    let packages = pushed::by_importance(&space.packages);
-    let prefix = place(&space, &build.base.build.prefix, &packages)?;
+/// Packs the install space and finds its dependencies.
+pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<BuildParts, Error> {
+    let packages = pushed::sort_by_importance(&space.packages);
+    let prefix = choose_prefix(&space, &build.base.build.prefix, &packages)?;
     let (own, asked) = (
         pushed::names(&space.packages),
-        pushed::asked(&space.packages),
+        pushed::required_keys(&space.packages),
     );
-    // Compiled already: what it was compiled with is of no interest.
-    let asked = Needed {
+    // It is compiled already: its build dependencies do not matter.
+    let asked = RequiredKeys {
         build: BTreeMap::new(),
         ..asked
     };
-    let there = Indexed {
-        build: pushed::tools(&asked),
-        run: build.indexed(&build.on_base()).await?,
+    let there = IndexedPackages {
+        build: pushed::build_tools(&asked),
+        run: build.indexed_packages(&build.base_diff_ids()).await?,
     };
-    let resolved = keys::resolve(
+    let resolved = keys::resolve_keys(
         &build.archive,
         &build.base,
         &build.request.map,
@@ -48,10 +48,10 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
         build.progress.warn(warning.as_str()).await;
     }
     let python = pushed::has_python(&space.root);
-    let package = packed(build, &space, &prefix).await?;
-    let needed = source::needed_by(build, &package).await?;
+    let package = pack_space(build, &space, &prefix).await?;
+    let needed = source::needed_libraries(build, &package).await?;
     let dependencies = source::dependencies(build, &resolved, &needed, python).await?;
-    Ok(Parts {
+    Ok(BuildParts {
         packages,
         versions: pushed::versions(&space.packages),
         dependencies,
@@ -60,9 +60,13 @@ pub(crate) async fn build(build: &Build<'_>, space: InstallSpace) -> Result<Part
     })
 }
 
-/// Where it is put: where it was built for, if that can be seen. Without a prefix nothing in it cares where it is; scripts
-/// of ROS 2 can be told.
-fn place(space: &InstallSpace, otherwise: &Path, packages: &[String]) -> Result<PathBuf, Error> {
+/// Chooses the prefix: the original one, if it is visible. An install space without a prefix works anywhere; scripts of
+/// ROS 2 can be relocated.
+fn choose_prefix(
+    space: &InstallSpace,
+    otherwise: &Path,
+    packages: &[String],
+) -> Result<PathBuf, Error> {
     let Some(prefix) = &space.prefix else {
         return Ok(otherwise.to_owned());
     };
@@ -78,39 +82,43 @@ fn place(space: &InstallSpace, otherwise: &Path, packages: &[String]) -> Result<
     }
 }
 
-async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Result<Made, Error> {
+async fn pack_space(
+    build: &Build<'_>,
+    space: &InstallSpace,
+    prefix: &Path,
+) -> Result<LayerSet, Error> {
     let root = &space.root;
-    let root = root.canonicalize().at("opening", root)?;
+    let root = root.canonicalize().io_context("opening", root)?;
     let hashed = root.clone();
-    let content = crate::blocking::spawn(move || key::tree(&hashed)).await??;
+    let content = crate::blocking::spawn(move || key::hash_tree(&hashed)).await??;
     let key = Key::new("prebuilt")
-        .with("content", content)
-        .with("prefix", prefix.as_os_str().as_encoded_bytes())
+        .input("content", content)
+        .input("prefix", prefix.as_os_str().as_encoded_bytes())
         .finish();
     let shop = &build.shop;
-    let turn = shop.turn(&key).await;
-    if let Some(entry) = shop.cached(&key).await?
+    let turn = shop.lock_key(&key).await;
+    if let Some(entry) = shop.get_cached(&key).await?
         && let Some(layer) = entry.layer
     {
-        return Ok(Made::one(layer.diff_id, true));
+        return Ok(LayerSet::single(layer.diff_id, true));
     }
     build.progress.step("packing the install space").await;
-    let directory = shop.site.fresh("prebuilt")?;
+    let directory = shop.site.fresh_directory("prebuilt")?;
     let tree = directory.join("tree");
     let target = tree.join(prefix.strip_prefix("/").unwrap_or(prefix));
     let parent = target.parent().unwrap_or(&tree).to_owned();
-    fs::create_dir_all(&parent).at("making", &parent)?;
+    fs::create_dir_all(&parent).io_context("making", &parent)?;
     for directory in parent
         .ancestors()
         .take_while(|directory| directory.starts_with(&tree))
     {
         set_mode(directory, 0o755)?;
     }
-    // The pushed tree is this build's own: moving it costs nothing.
-    fs::rename(&root, &target).at("moving", &root)?;
+    // The pushed tree belongs to this build, so moving it is cheap.
+    fs::rename(&root, &target).io_context("moving", &root)?;
     let opened = target.clone();
-    crate::blocking::spawn(move || compile::open_up(&opened)).await??;
-    let packing = Packing {
+    crate::blocking::spawn(move || compile::make_readable(&opened)).await??;
+    let packing = PackJob {
         key,
         made_from: pushed::names(&space.packages).into_iter().collect(),
         tree,
@@ -118,7 +126,10 @@ async fn packed(build: &Build<'_>, space: &InstallSpace, prefix: &Path) -> Resul
         directory,
         turn,
     };
-    Ok(Made::one(shop.pack(packing, |_| Ok(())).await?, false))
+    Ok(LayerSet::single(
+        shop.pack(packing, |_| Ok(())).await?,
+        false,
+    ))
 }
 
 #[cfg(test)]
@@ -135,7 +146,7 @@ mod tests {
                 prefix: prefix.map(PathBuf::from),
                 packages: Vec::new(),
             };
-            place(&space, otherwise, &["p".to_owned()])
+            choose_prefix(&space, otherwise, &["p".to_owned()])
         };
         for layout in [Layout::Catkin, Layout::Merged, Layout::Isolated] {
             let ours = Path::new("/home/me/ws/install");

@@ -1,15 +1,15 @@
-//! Finds the interface of a running package by looking: no declaration is asked for.
+//! Discovery of the interface of a running package by observation, without any declaration.
 //!
 //! ```text
-//!   nodes register ──▶ graph still ──▶ subscribe to all that is published ──▶ graph still? ──▶ ask for types,
+//!   nodes register ──▶ graph stable ─▶ subscribe to all published topics ───▶ graph stable? ─▶ ask for types,
 //!        │ (or exit, or never)                    ▲                              │ no            parameters
 //!        ▼                                        ├──────────────────────────────┘                   │
-//!      error                                      └── graph changed? ◀── feed what is waited for ◀───┘
+//!      error                                      └── graph changed? ◀── feed the awaited inputs ◀────┘
 //! ```
 //!
-//! Many nodes register their inputs only while an output is subscribed to; those are the lazy ones. Others wait for
-//! transforms, time, services or messages before they register the rest: they are given all that. What appears only
-//! then is lazy as well, since a servant without a robot does not have it. An interface is described from the
+//! Many nodes register their inputs only while an output has subscribers; these are the lazy ones. Others wait for
+//! transforms, time, services or messages before they register the rest, so they are given all that. What appears only
+//! then is lazy as well, since a servant without a robot does not have it. The interface is described from the
 //! package's point of view: what it subscribes to is an input.
 
 mod describe;
@@ -28,76 +28,76 @@ use std::time::Duration;
 
 use futures_util::future::BoxFuture;
 use package::interface::Interface;
-use package::requests::Watched;
+use package::requests::ObservedAnswer;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, Qos, RosVersion, Subscription, TopicNodes, WireType};
+use ros::bus::{Bus, Graph, QosProfile, RosVersion, Subscription, TopicNodes, WireType};
 use ros::plumbing;
-use ros::ros2::composition::{Component, Container, NotLoaded};
-use ros::ros2::lifecycle::{self, Begun, NotBegun};
+use ros::ros2::composition::{Component, ComponentContainer, NotLoaded};
+use ros::ros2::lifecycle::{self, BeginError, BeginOutcome};
 use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::time::Instant;
 
-pub use settle::still;
+pub use settle::wait_until_still;
 
-use feed::Feed;
-use heard::Heard;
+use feed::InputFeed;
+use heard::OutputRecord;
 
-/// Messages of an output that are kept between two looks.
+/// Number of messages of an output kept between two observations.
 const KEPT: usize = 8;
-/// Each round gives what the one before has made a node ask for.
+/// Maximum number of rounds; each provides what the previous one made a node request.
 const MOST_ROUNDS: usize = 12;
 
-/// What can go wrong while looking.
+/// Errors of probing.
 #[derive(Debug, thiserror::Error)]
 pub enum ProbeError {
-    /// A node ended before anything could be seen of it.
+    /// A node exited before its interface could be observed.
     #[error("{0}")]
     Exited(String),
-    /// A node did not show up.
+    /// Nodes did not register.
     #[error(
-        "{} did not register with ROS within {after:?}: it may wait for something that is not there{} (see \
-         its log); a parameter (--param) or an argument (--arg) may help",
+        "{} did not register with ROS within {after:?}: it may be waiting for something that is missing{} (see its \
+            log); a parameter (--param) or an argument (--arg) may help",
         nodes.join(", "), services(sought)
     )]
     NeverRegistered {
-        /// Their names.
+        /// Names of the nodes.
         nodes: Vec<String>,
-        /// How long was waited.
+        /// Time waited.
         after: Duration,
-        /// Services that were looked for in vain.
+        /// Services that they looked up without success.
         sought: Vec<String>,
     },
-    /// The node was compiled with another definition than the image holds.
+    /// The node was compiled with another definition than that in the image.
     #[error(
-        "{what} has md5 {announced} on the wire, but {type_name} in the image gives {defined}: rebuild the package \
-         against the definitions of its base"
+        "{what} announces md5 {announced}, but {type_name} in the image has {defined}: rebuild the package against the \
+            definitions of its base"
     )]
     Mismatch {
         /// Topic, service or action.
         what: String,
-        /// Its type.
+        /// Type.
         type_name: String,
-        /// As the node announced it.
+        /// MD5 announced by the node.
         announced: String,
-        /// As the definition gives it.
+        /// MD5 of the definition.
         defined: String,
     },
-    /// A definition is not there.
-    #[error("{what}: {problem}; `--with DEB` adds a package that holds definitions")]
+    /// A definition is missing.
+    #[error("{what}: {problem}; `--with DEB` adds a package with message definitions")]
     NoDefinition {
         /// Topic, service or action.
         what: String,
-        /// What is missing.
+        /// Missing definition.
         problem: ros::schema::SchemaError,
     },
-    /// The graph could not be watched any longer.
-    #[error("the servant's ROS went away while its interface was looked at")]
+    /// The connection to the ROS graph was lost.
+    #[error("the servant's ROS Master or domain ended during the inspection of its interface")]
     MasterGone,
-    /// A node with a lifecycle does not begin its work.
+    /// A lifecycle node cannot be activated.
     #[error(transparent)]
-    Lifecycle(#[from] NotBegun),
-    /// A component container does not load a node.
+    Lifecycle(#[from] BeginError),
+    /// A component container cannot load a component.
     #[error(transparent)]
     Component(#[from] NotLoaded),
 }
@@ -109,64 +109,64 @@ fn services(sought: &[String]) -> String {
     }
 }
 
-/// How long to look.
+/// Options of a probe.
 #[derive(Debug, Clone)]
 pub struct ProbeOptions {
     /// Nodes that must register.
     pub nodes: Vec<String>,
-    /// Of those the ones that their programs may have put into a namespace (ROS 2), with the enclave by which they are known then.
+    /// Nodes whose programs may have chosen a namespace (ROS 2), with the enclave that identifies them.
     pub marks: BTreeMap<String, String>,
-    /// Which ROS it is; the bus knows.
+    /// ROS version; set from the bus.
     pub ros: RosVersion,
-    /// Name of the looking node, which is no part of what it sees.
+    /// Name of the observing node, which is ignored in the graph.
     pub own_name: String,
-    /// At most so long for nodes to register.
+    /// Maximum time for nodes to register.
     pub patience: Duration,
-    /// The graph is still when nothing changed for so long.
+    /// Time without changes after which the graph counts as settled.
     pub settle: Duration,
-    /// At most so long for it to become still, each time; time that the nodes waited for a core does not count, up to
+    /// Maximum time for the graph to settle, each time; time in which the nodes waited for a core does not count, up to
     /// `patience`.
     pub restless: Duration,
-    /// What is loaded into nodes that are component containers, by their names.
+    /// Components to load into nodes that are component containers, by node name.
     pub components: BTreeMap<String, Vec<Component>>,
-    /// Types of topics as the deployer states them, for inputs that take any.
+    /// Types stated by the deployer for topics of any type.
     pub types: BTreeMap<String, String>,
-    /// Tells how much the nodes have worked: those that work have not settled (they load models, say), and those that
-    /// wait for a core could not. None: not known.
-    pub work: Option<Work>,
+    /// Source of the nodes' CPU time: nodes that are busy (loading models, for example) have not settled, and nodes
+    /// that wait for a core cannot settle. `None` if unknown.
+    pub work: Option<CpuTimeSource>,
 }
 
-/// What nodes have had of the processors so far.
+/// Accumulated CPU time of nodes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Worked {
-    /// Time on a core, of all threads together.
+pub struct CpuTime {
+    /// Time running on a core, summed over all threads.
     pub ran: Duration,
-    /// Time in which a thread could have run and others had the cores, of all threads together.
+    /// Time runnable while waiting for a core, summed over all threads.
     pub waited: Duration,
 }
 
-/// Asks what the nodes have had of the processors; none where it cannot be told.
+/// Source of the nodes' CPU time; returns `None` if it cannot be determined.
 #[derive(Clone)]
-pub struct Work(Arc<dyn Fn() -> BoxFuture<'static, Option<Worked>> + Send + Sync>);
+pub struct CpuTimeSource(Arc<dyn Fn() -> BoxFuture<'static, Option<CpuTime>> + Send + Sync>);
 
-impl Work {
-    /// Asked several times a second at most.
+impl CpuTimeSource {
+    /// Creates a source from a function, which is called at most several times a second.
     pub fn new<F>(ask: impl Fn() -> F + Send + Sync + 'static) -> Self
     where
-        F: Future<Output = Option<Worked>> + Send + 'static,
+        F: Future<Output = Option<CpuTime>> + Send + 'static,
     {
         Self(Arc::new(move || Box::pin(ask())))
     }
 }
 
-impl std::fmt::Debug for Work {
+impl std::fmt::Debug for CpuTimeSource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str("Work")
     }
 }
 
 impl ProbeOptions {
-    /// With times that suit most packages.
+    /// Returns options with times that suit most packages.
     pub fn new(nodes: Vec<String>, own_name: &str) -> Self {
         Self {
             nodes,
@@ -182,7 +182,7 @@ impl ProbeOptions {
         }
     }
 
-    async fn worked(&self) -> Option<Worked> {
+    async fn cpu_time(&self) -> Option<CpuTime> {
         match &self.work {
             Some(work) => (work.0)().await,
             None => None,
@@ -190,54 +190,54 @@ impl ProbeOptions {
     }
 }
 
-/// What was found.
+/// Result of a probe.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Found {
-    /// The interface.
+pub struct ProbeResult {
+    /// Discovered interface.
     pub interface: Interface,
-    /// Things to know that are no failure.
+    /// Warnings for the deployer.
     pub warnings: Vec<String>,
-    /// Outputs whose messages became longer and longer.
+    /// Outputs whose messages grew steadily.
     pub growing: Vec<String>,
-    /// Outputs that carried the stamp of what an input was given.
-    pub watched: BTreeSet<Watched>,
-    /// Nodes that their programs have put into a namespace, with the names that they have there.
+    /// Observed answers: outputs that carried the stamp of a message sent to an input.
+    pub watched: BTreeSet<ObservedAnswer>,
+    /// Nodes that their programs moved to a namespace, with their names there.
     pub moved: BTreeMap<String, String>,
 }
 
-/// Looks. `exited` resolves when a node ends that should not, with what is to be said about it.
+/// Probes the interface. `exited` resolves with a description when a node exits unexpectedly.
 pub async fn probe(
     bus: &Arc<dyn Bus>,
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
     options: &ProbeOptions,
     exited: impl Future<Output = String> + Send,
-) -> Result<Found, ProbeError> {
+) -> Result<ProbeResult, ProbeError> {
     let unfed = Mutex::new(None);
     tokio::select! {
-        // First: of a node that ended, nothing else is worth saying.
+        // Polled first: if a node has exited, no other error matters.
         biased;
         words = exited => match unfed.into_inner() {
-            Some(found) => Ok(incomplete::ended(found, &words)),
+            Some(found) => Ok(incomplete::with_exit_warning(found, &words)),
             None => Err(ProbeError::Exited(words)),
         },
-        found = look(bus, registry, definitions, options, &unfed) => found,
+        found = observe(bus, registry, definitions, options, &unfed) => found,
     }
 }
 
-async fn look(
+async fn observe(
     bus: &Arc<dyn Bus>,
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
     options: &ProbeOptions,
-    unfed: &Mutex<Option<Found>>,
-) -> Result<Found, ProbeError> {
+    unfed: &Mutex<Option<ProbeResult>>,
+) -> Result<ProbeResult, ProbeError> {
     let options = &ProbeOptions {
         ros: bus.version(),
         ..options.clone()
     };
     let mut watch = bus.graph();
-    let moved = settle::registered(&mut watch, options).await?;
+    let moved = settle::wait_until_registered(&mut watch, options).await?;
     tracing::debug!(?moved, "probe: all nodes are registered");
     let loaded = load_components(bus, registry, options).await?;
     let options = &ProbeOptions {
@@ -247,11 +247,11 @@ async fn look(
         },
         ..options.clone()
     };
-    settle::registered(&mut watch, options).await?;
-    let idle = begin_lifecycles(bus, &mut watch, options).await?;
+    settle::wait_until_registered(&mut watch, options).await?;
+    let idle = activate_lifecycle_nodes(bus, &mut watch, options).await?;
     let bus = &**bus;
-    let mut feed = Feed::begin(bus, registry, options).await;
-    let mut look = Look {
+    let mut feed = InputFeed::start(bus, registry, options).await;
+    let mut look = ProbeRun {
         bus,
         registry,
         definitions,
@@ -261,16 +261,16 @@ async fn look(
         subscriptions: BTreeMap::new(),
         tried: BTreeSet::new(),
         eager: BTreeSet::new(),
-        heard: Heard::default(),
+        heard: OutputRecord::default(),
     };
-    if !settle::still(&mut look.watch, options).await? {
+    if !settle::wait_until_still(&mut look.watch, options).await? {
         look.warnings.push(format!(
-            "topics kept changing for {:?}: some may be missing",
+            "topics kept changing for {:?}, so some may be missing",
             options.restless
         ));
     }
     tracing::debug!("probe: nothing changes");
-    look.listen().await?;
+    look.subscribe_outputs().await?;
     tracing::debug!(
         outputs = look.tried.len(),
         "probe: all outputs are listened to"
@@ -278,12 +278,12 @@ async fn look(
     let mut bare = look.describe(&feed).await?;
     bare.moved = moved;
     tracing::debug!("probe: described as it is without a robot");
-    // From here on a node may end of what it is given; then this is what is known of it.
+    // From here on a node may exit because of what it is given; then this is the result.
     *unfed.lock() = Some(bare.clone());
     let mut found = bare.clone();
     for _ in 0..MOST_ROUNDS {
-        let before = settle::shape(&look.graph());
-        let Some(settle) = feed.give(&look.graph()).await else {
+        let before = settle::graph_shape(&look.graph());
+        let Some(settle) = feed.give_inputs(&look.graph()).await else {
             break;
         };
         let options = ProbeOptions {
@@ -291,13 +291,13 @@ async fn look(
             ..options.clone()
         };
         tracing::debug!(?settle, "probe: something is given");
-        settle::still(&mut look.watch, &options).await?;
-        let changed = settle::shape(&look.graph()) != before;
+        settle::wait_until_still(&mut look.watch, &options).await?;
+        let changed = settle::graph_shape(&look.graph()) != before;
         tracing::debug!(changed, "probe: nothing changes");
         if !changed {
             continue;
         }
-        look.listen().await?;
+        look.subscribe_outputs().await?;
         let before = std::mem::take(&mut found.interface);
         found = look.describe(&feed).await?;
         found.moved.clone_from(&bare.moved);
@@ -305,16 +305,18 @@ async fn look(
         incomplete::mark_late(&mut found.interface, &bare.interface);
         *unfed.lock() = Some(found.clone());
     }
-    look.hear();
-    found.watched = look.heard.answers(|stamp| feed.stamped(stamp));
-    incomplete::warn(&mut found, options, &mut feed);
+    look.read_messages();
+    found.watched = look
+        .heard
+        .observed_answers(|stamp| feed.input_with_stamp(stamp));
+    incomplete::add_warnings(&mut found, options, &mut feed);
     found.warnings.extend(idle);
     found.warnings.splice(..0, look.warnings);
-    found.growing = look.heard.growing();
+    found.growing = look.heard.growing_outputs();
     Ok(found)
 }
 
-/// Has containers load what is to be loaded into them, each its own and all at the same time: the names of those nodes.
+/// Loads the components into their containers, concurrently; returns the names of the nodes.
 async fn load_components(
     bus: &Arc<dyn Bus>,
     registry: &Registry,
@@ -329,19 +331,19 @@ async fn load_components(
                 problem,
             };
             let container =
-                Container::of(Arc::clone(bus), registry, name).map_err(no_definition)?;
+                ComponentContainer::new(Arc::clone(bus), registry, name).map_err(no_definition)?;
             let loaded = container.load_all(components, options.patience).await;
             loaded.map_err(ProbeError::from)
         });
     let loaded = futures_util::future::try_join_all(loading).await?;
     let names = loaded.into_iter().flatten();
-    // Containers of others need not tell them.
+    // Other implementations of containers may not return the names.
     Ok(names.filter(|name| !name.is_empty()).collect())
 }
 
-/// Has nodes configure and activate themselves that nobody else drives: before that they show nothing. What is to be said
-/// of those that are left as they are.
-async fn begin_lifecycles(
+/// Activates lifecycle nodes that nobody else manages, since they have no interface before. Returns warnings about
+/// those that are left in another state.
+async fn activate_lifecycle_nodes(
     bus: &Arc<dyn Bus>,
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
@@ -349,21 +351,21 @@ async fn begin_lifecycles(
     if bus.version() == RosVersion::One {
         return Ok(Vec::new());
     }
-    // Services of a node are seen a moment after the node itself.
-    settle::still(watch, options).await?;
+    // Services of a node are discovered a moment after the node itself.
+    settle::wait_until_still(watch, options).await?;
     let begun = lifecycle::begin_all(bus, options.patience).await?;
     let left = begun.into_iter().filter_map(|(node, begun)| match begun {
-        Begun::Left(state) if state != lifecycle::State::Active => Some(format!(
-            "the lifecycle node {node} was {state} when it was looked at: something else drives it, and what it shows \
-             later may be missing"
+        BeginOutcome::Left(state) if state != lifecycle::State::Active => Some(format!(
+            "the lifecycle node {node} was {state} during the inspection: another node manages it, and later topics \
+                may be missing"
         )),
         _ => None,
     });
     Ok(left.collect())
 }
 
-/// One look at a running package.
-struct Look<'a> {
+/// State of a probe of a running package.
+struct ProbeRun<'a> {
     bus: &'a dyn Bus,
     registry: &'a Registry,
     definitions: &'a BTreeMap<String, String>,
@@ -373,16 +375,16 @@ struct Look<'a> {
     subscriptions: BTreeMap<String, Subscription>,
     tried: BTreeSet<String>,
     eager: BTreeSet<String>,
-    heard: Heard,
+    heard: OutputRecord,
 }
 
-impl Look<'_> {
+impl ProbeRun<'_> {
     fn graph(&mut self) -> Arc<Graph> {
         self.watch.borrow_and_update().clone()
     }
 
-    /// Subscribes to everything that is published: that may wake inputs, and those may make the node publish more.
-    async fn listen(&mut self) -> Result<(), ProbeError> {
+    /// Subscribes to all outputs, which may activate inputs, which in turn may add outputs.
+    async fn subscribe_outputs(&mut self) -> Result<(), ProbeError> {
         let graph = self.graph();
         self.eager.extend(inputs(&graph, &self.options.own_name));
         loop {
@@ -396,7 +398,7 @@ impl Look<'_> {
             for topic in &new {
                 match self
                     .bus
-                    .subscribe(topic, WireType::any(), Qos::keep_last(KEPT))
+                    .subscribe(topic, WireType::any(), QosProfile::keep_last(KEPT))
                     .await
                 {
                     Ok(subscription) => {
@@ -407,8 +409,8 @@ impl Look<'_> {
                         .push(format!("{topic} cannot be subscribed to: {error}")),
                 }
             }
-            // A publisher that answers this has been connected to; what it then does takes about as long as it took
-            // to answer. On a busy machine that is more than usual.
+            // A publisher that answers this has processed the connection; its reaction takes about as long as the
+            // answer did. On a busy machine that is longer than usual.
             for topic in &new {
                 let _ = self.bus.topic_type(topic).await;
             }
@@ -417,52 +419,52 @@ impl Look<'_> {
                 settle,
                 ..self.options.clone()
             };
-            settle::still(&mut self.watch, &options).await?;
+            settle::wait_until_still(&mut self.watch, &options).await?;
         }
     }
 
-    /// Takes what outputs have said since.
-    fn hear(&mut self) {
+    /// Reads the messages received on outputs since the last call.
+    fn read_messages(&mut self) {
         for (topic, subscription) in &mut self.subscriptions {
             while let Some(message) = subscription.messages.try_recv() {
-                self.heard.note(topic, &message);
+                self.heard.record(topic, &message);
             }
         }
     }
 
-    async fn describe(&mut self, feed: &Feed<'_>) -> Result<Found, ProbeError> {
-        self.hear();
-        let seen = describe::Seen {
+    async fn describe(&mut self, feed: &InputFeed<'_>) -> Result<ProbeResult, ProbeError> {
+        self.read_messages();
+        let seen = describe::ObservedPackage {
             latched: self.heard.latched.clone(),
             eager: self.eager.clone(),
             graph: self.graph(),
             options: self.options,
-            asked: feed.asked(),
-            any: feed.any().clone(),
+            asked: feed.requested_services(),
+            any: feed.any_type_inputs().clone(),
         };
         describe::describe(self.bus, self.registry, self.definitions, &seen).await
     }
 }
 
-/// Topics that the package publishes.
+/// Returns the topics that the package publishes.
 fn outputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    ends(graph, |topic| {
+    topics_where(graph, |topic| {
         topic.publishers.iter().any(|node| node != own)
     })
 }
 
-/// Topics that the package subscribes to.
+/// Returns the topics that the package subscribes to.
 fn inputs(graph: &Graph, own: &str) -> BTreeSet<String> {
-    ends(graph, |topic| {
+    topics_where(graph, |topic| {
         topic.subscribers.iter().any(|node| node != own)
     })
 }
 
-fn ends(graph: &Graph, pick: impl Fn(&TopicNodes) -> bool) -> BTreeSet<String> {
+fn topics_where(graph: &Graph, pick: impl Fn(&TopicNodes) -> bool) -> BTreeSet<String> {
     let topics = graph
         .topics
         .iter()
-        .filter(|(name, topic)| !plumbing::topic(graph, name) && pick(topic));
+        .filter(|(name, topic)| !plumbing::is_builtin_topic(graph, name) && pick(topic));
     topics.map(|(name, _)| name.clone()).collect()
 }
 

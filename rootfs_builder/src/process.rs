@@ -1,5 +1,5 @@
-//! Programs of the host: started without a shell, killed when their future is dropped, their last words kept. Programs that mount have
-//! namespaces of their own.
+//! Programs of the host: started without a shell, killed when their future is dropped, with the last lines of their
+//! output kept. Programs that mount file systems run in separate namespaces.
 
 use std::collections::VecDeque;
 use std::ffi::OsStr;
@@ -13,22 +13,22 @@ use tokio::process::Command;
 
 use crate::error::Error;
 
-/// How many last lines an error carries.
+/// Number of last lines in an error.
 pub(crate) const LAST_LINES: usize = 25;
 
-/// The last lines of something that prints many.
+/// The last lines of an output.
 #[derive(Debug, Default)]
-pub(crate) struct Tail(VecDeque<String>);
+pub(crate) struct LastLines(VecDeque<String>);
 
-impl Tail {
-    /// Takes one more line; gives the one that is not among the last ones any more.
+impl LastLines {
+    /// Adds a line; returns the one that no longer is among the last.
     pub(crate) fn push(&mut self, line: &str) -> Option<String> {
         let is_full = self.0.len() == LAST_LINES;
         self.0.push_back(line.to_owned());
         if is_full { self.0.pop_front() } else { None }
     }
 
-    /// All of them, one per line.
+    /// Returns the lines, joined by newlines.
     pub(crate) fn text(&self) -> String {
         self.0
             .iter()
@@ -38,24 +38,24 @@ impl Tail {
     }
 }
 
-/// A command in the C locale with nothing on its standard input.
+/// Creates a command in the C locale with an empty standard input.
 pub(crate) fn command(program: &str) -> Command {
     let mut command = Command::new(program);
     command
         .env("LC_ALL", "C.UTF-8")
         .env("DEBIAN_FRONTEND", "noninteractive")
         .stdin(Stdio::null())
-        // Its own, so that all that it starts can be ended with it.
+        // A separate process group, so that all its descendants can be killed with it.
         .process_group(0)
         .kill_on_drop(true);
     command
 }
 
-/// A program and all that it has started, killed when this is dropped before it has ended: apt's methods and
-/// mmdebstrap's dpkg would go on for a build that nobody wants any more.
-struct Group(Option<Pid>);
+/// Process group of a program, killed if this is dropped before the program has ended: otherwise apt's methods and
+/// mmdebstrap's dpkg would continue for a cancelled build.
+struct ProcessGroup(Option<Pid>);
 
-impl Drop for Group {
+impl Drop for ProcessGroup {
     fn drop(&mut self) {
         if let Some(group) = self.0.take() {
             let _ = killpg(group, Signal::SIGKILL);
@@ -63,24 +63,25 @@ impl Drop for Group {
     }
 }
 
-/// Runs it to its end; every line of either stream goes to `on_line` as it comes. The error has the last lines,
-/// or says how to get the program.
+/// Runs a command to its end; each line of either stream is passed to `on_line`. The error contains the last lines, or
+/// how to install the program.
 pub(crate) async fn run(
     command: Command,
     package: &'static str,
     on_line: impl FnMut(Stream, &str),
 ) -> Result<(), Error> {
     let program = command.as_std().get_program().to_owned();
-    let ended = end_of(command, package, on_line).await?;
+    let ended = run_to_end(command, package, on_line).await?;
     ended.outcome(&program)
 }
 
-/// The options of unshare(1). What is mounted here is seen by nobody else, and is gone with the last process; all processes are killed when
-/// the first one ends, and that is killed with unshare itself.
+/// Options of unshare(1). Mounts are invisible to other processes and disappear with the last process of the namespace;
+/// all processes are killed when the first one ends, which is killed together with unshare itself.
 const NAMESPACES: [&str; 5] = ["--mount", "--pid", "--fork", "--kill-child", "--mount-proc"];
 
-/// The first process of the namespaces, which runs its arguments. It ends with them, or when the other end of its standard input is closed:
-/// that happens however the daemon ends, by SIGKILL too. The first process of a namespace is sent only signals that it handles.
+/// Init process of the namespaces, which runs its arguments. It ends with them, or when the other end of its standard
+/// input is closed, which happens however the daemon ends, even by SIGKILL. The init process of a namespace receives
+/// only signals that it handles.
 const FIRST_PROCESS: &str = r#"
 exec 3<&0
 trap 'exit 1' TERM
@@ -89,11 +90,11 @@ trap 'exit 1' TERM
 wait $!
 "#;
 
-/// The shell's status where there is no such program.
+/// Exit status of the shell if the program does not exist.
 const NOT_FOUND: i32 = 127;
 
-/// Runs a program that mounts, in a mount and a process namespace of its own: whatever looks through the file systems of this machine
-/// cannot keep its mounts busy, and none of them, nor a process that it started, outlives it or the daemon.
+/// Runs a program that mounts file systems, in separate mount and PID namespaces: no other process of this machine can
+/// keep its mounts busy, and neither mounts nor processes outlive it or the daemon.
 pub(crate) async fn run_in_namespaces(
     command: Command,
     package: &'static str,
@@ -114,51 +115,55 @@ pub(crate) async fn run_in_namespaces(
             None => inside.env_remove(name),
         };
     }
-    let ended = end_of(inside, "util-linux", on_line).await?;
+    let ended = run_to_end(inside, "util-linux", on_line).await?;
     if ended.status.code() == Some(NOT_FOUND) {
-        return Err(missing(program, package));
+        return Err(missing_program(program, package));
     }
     ended.outcome(program)
 }
 
-/// How a program has ended, and its last lines.
-struct Ended {
+/// Exit status of a program, and its last lines.
+struct ProcessExit {
     status: ExitStatus,
-    tail: Tail,
+    tail: LastLines,
 }
 
-impl Ended {
+impl ProcessExit {
     fn outcome(self, program: &OsStr) -> Result<(), Error> {
         if self.status.success() {
             return Ok(());
         }
-        Err(failed(program, &self.status.to_string(), self.tail.text()))
+        Err(exit_error(
+            program,
+            &self.status.to_string(),
+            self.tail.text(),
+        ))
     }
 }
 
-async fn end_of(
+async fn run_to_end(
     mut command: Command,
     package: &'static str,
     mut on_line: impl FnMut(Stream, &str),
-) -> Result<Ended, Error> {
+) -> Result<ProcessExit, Error> {
     let program = command.as_std().get_program().to_owned();
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command
         .spawn()
         .map_err(|error| spawn_error(&program, package, error))?;
     let id = child.id().and_then(|id| i32::try_from(id).ok());
-    let mut group = Group(id.map(Pid::from_raw));
-    // Where it is a pipe, it stays open until the program has ended; waiting alone would close it.
+    let mut group = ProcessGroup(id.map(Pid::from_raw));
+    // If it is a pipe, it stays open until the program has ended; `wait` alone would close it.
     let _input = child.stdin.take();
     let out = child.stdout.take().map(BufReader::new);
     let err = child.stderr.take().map(BufReader::new);
-    let mut tail = Tail::default();
-    let mut out = Lines::new(out);
-    let mut err = Lines::new(err);
-    while out.open() || err.open() {
+    let mut tail = LastLines::default();
+    let mut out = StreamLines::new(out);
+    let mut err = StreamLines::new(err);
+    while out.is_open() || err.is_open() {
         let (stream, line) = tokio::select! {
-            line = out.next(), if out.open() => (Stream::Out, line),
-            line = err.next(), if err.open() => (Stream::Err, line),
+            line = out.next(), if out.is_open() => (Stream::Out, line),
+            line = err.next(), if err.is_open() => (Stream::Err, line),
         };
         if let Some(line) = line {
             tail.push(&line);
@@ -170,10 +175,10 @@ async fn end_of(
         .await
         .map_err(|error| spawn_error(&program, package, error))?;
     group.0 = None;
-    Ok(Ended { status, tail })
+    Ok(ProcessExit { status, tail })
 }
 
-/// Runs it and gives its standard output.
+/// Runs a command and returns its standard output.
 pub(crate) async fn output(command: Command, package: &'static str) -> Result<String, Error> {
     let mut text = String::new();
     run(command, package, |stream, line| {
@@ -186,7 +191,7 @@ pub(crate) async fn output(command: Command, package: &'static str) -> Result<St
     Ok(text)
 }
 
-/// Which stream a line came from.
+/// Output stream of a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     /// Standard output.
@@ -195,7 +200,7 @@ pub(crate) enum Stream {
     Err,
 }
 
-fn failed(program: &OsStr, status: &str, last_lines: String) -> Error {
+fn exit_error(program: &OsStr, status: &str, last_lines: String) -> Error {
     if last_lines.contains("No space left on device") {
         return Error::DiskFull {
             path: Path::new(program).to_owned(),
@@ -211,13 +216,13 @@ fn failed(program: &OsStr, status: &str, last_lines: String) -> Error {
 
 fn spawn_error(program: &OsStr, package: &'static str, error: std::io::Error) -> Error {
     if error.kind() == std::io::ErrorKind::NotFound {
-        return missing(program, package);
+        return missing_program(program, package);
     }
     Error::io("starting", program, error)
 }
 
-fn missing(program: &OsStr, package: &'static str) -> Error {
-    // Programs are named by literals; the names below are those this crate runs.
+fn missing_program(program: &OsStr, package: &'static str) -> Error {
+    // Programs are named by literals; these are the ones that this crate runs.
     let program = match program.to_str() {
         Some("mmdebstrap") => "mmdebstrap",
         Some("unshare") => "unshare",
@@ -228,13 +233,13 @@ fn missing(program: &OsStr, package: &'static str) -> Error {
     Error::MissingProgram { program, package }
 }
 
-/// Lines of a stream that may not be UTF-8 and may end lines with a carriage return.
-struct Lines<R> {
+/// Lines of a stream that may not be UTF-8 and may end with a carriage return.
+struct StreamLines<R> {
     reader: Option<R>,
     buffer: Vec<u8>,
 }
 
-impl<R: AsyncRead + AsyncBufReadExt + Unpin> Lines<R> {
+impl<R: AsyncRead + AsyncBufReadExt + Unpin> StreamLines<R> {
     fn new(reader: Option<R>) -> Self {
         Self {
             reader,
@@ -242,11 +247,11 @@ impl<R: AsyncRead + AsyncBufReadExt + Unpin> Lines<R> {
         }
     }
 
-    fn open(&self) -> bool {
+    fn is_open(&self) -> bool {
         self.reader.is_some()
     }
 
-    /// Cancel safe: what was read stays in the buffer.
+    /// Cancel-safe: data read so far stays in the buffer.
     async fn next(&mut self) -> Option<String> {
         let reader = self.reader.as_mut()?;
         match reader.read_until(b'\n', &mut self.buffer).await {
@@ -299,7 +304,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let pipe = place.path().join("pipe");
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
-        // The grandchild holds the pipe open for writing as long as it lives.
+        // The grandchild keeps the pipe open for writing as long as it lives.
         let script = format!("(sleep 1000 > '{}') & wait", pipe.display());
         let running = tokio::spawn(run(shell(&script), "dash", |_, _| {}));
         let (opened, open) = tokio::sync::oneshot::channel();
@@ -317,7 +322,7 @@ mod tests {
         );
     }
 
-    /// Begins a script of a program that mounts; its last command opens `pipe` for writing.
+    /// Starts a script that mounts; its last command opens `pipe` for writing.
     async fn begin_mounting(script: &str, pipe: &Path) -> (tokio::task::JoinHandle<()>, File) {
         nix::unistd::mkfifo(pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
         let command = shell(script);
@@ -330,8 +335,8 @@ mod tests {
         (running, opening.await.expect("no panic"))
     }
 
-    /// Waits until nobody has the other end any more.
-    async fn closed(mut pipe: File) {
+    /// Waits until all writers have closed the pipe.
+    async fn wait_closed(mut pipe: File) {
         let read = tokio::task::spawn_blocking(move || pipe.read(&mut [0]).expect("read"));
         assert_eq!(read.await.expect("no panic"), 0, "the other end is closed");
     }
@@ -341,7 +346,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let (tree, pipe) = (place.path().join("tree"), place.path().join("pipe"));
         std::fs::create_dir(&tree).expect("made");
-        // One that leaves its session and its group of processes is ended, too.
+        // A process that leaves its session and process group is killed as well.
         let script = format!(
             "mount -t tmpfs none {tree} && touch {tree}/inside && setsid sleep 1000 >{pipe}",
             tree = tree.display(),
@@ -352,7 +357,7 @@ mod tests {
         assert!(!mounts.contains(&*tree.to_string_lossy()), "{mounts}");
         assert!(!tree.join("inside").exists());
         running.abort();
-        closed(pipe).await;
+        wait_closed(pipe).await;
         std::fs::remove_dir(&tree).expect("nothing is mounted there");
     }
 
@@ -361,7 +366,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let pipe = place.path().join("pipe");
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("made");
-        // What the kernel does for a process that is killed: its end of the pipe is closed, and nobody kills the group.
+        // Equivalent to killing the daemon: its end of the pipe is closed, and nobody kills the group.
         let mut first = command("unshare");
         first
             .args(NAMESPACES)
@@ -374,7 +379,7 @@ mod tests {
         let opening = tokio::task::spawn_blocking(move || File::open(pipe).expect("opened"));
         let pipe = opening.await.expect("no panic");
         drop(input);
-        closed(pipe).await;
+        wait_closed(pipe).await;
         child.wait().await.expect("it has ended");
     }
 

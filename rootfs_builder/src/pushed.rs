@@ -1,4 +1,4 @@
-//! What was pushed, as far as a build asks.
+//! Properties of the pushed packages that are relevant to a build.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -7,28 +7,28 @@ use std::path::Path;
 use foreign::Visit;
 use package::condition::Variables;
 use package::manifest::Kind;
-use package::workspace::{self, Package, Pushed};
+use package::workspace::{self, Package, PushedDirectory};
 use ros::bus::RosVersion;
 use rustix::fs::FileType;
 
 use crate::base::Base;
 use crate::error::Error;
-use crate::keys::Needed;
+use crate::keys::RequiredKeys;
 use crate::launch::LaunchNode;
 
-/// Looks at a pushed tree.
-pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
-    let version = base.ros.bus();
-    let variables = Variables::ros(version.number(), &base.ros_distribution);
+/// Inspects a pushed tree.
+pub(crate) fn inspect_pushed(root: &Path, base: &Base) -> Result<PushedDirectory, Error> {
+    let version = base.ros.ros_version();
+    let variables = Variables::for_distribution(version.number(), &base.ros_distribution);
     let pushed = workspace::inspect(root, &variables)?;
-    if let Pushed::Source(sources) = &pushed {
+    if let PushedDirectory::Source(sources) = &pushed {
         for Package { manifest, .. } in &sources.packages {
-            if !manifest.fits(version) {
+            if !manifest.supports_ros(version) {
                 return Err(Error::BuildType {
                     package: manifest.name.clone(),
                     build_type: manifest.build_type.clone(),
                     base: base.name.clone(),
-                    builds: builds(version),
+                    builds: supported_build_types(version),
                 });
             }
         }
@@ -36,17 +36,17 @@ pub(crate) fn inspect(root: &Path, base: &Base) -> Result<Pushed, Error> {
     Ok(pushed)
 }
 
-fn builds(version: RosVersion) -> &'static str {
+fn supported_build_types(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "catkin and cmake",
         RosVersion::Two => "ament_cmake, ament_python and cmake",
     }
 }
 
-/// What its packages need from elsewhere.
-pub(crate) fn asked(packages: &[Package]) -> Needed {
-    let mut asked = Needed::default();
-    for external in workspace::external(packages) {
+/// Returns the external dependencies of the packages.
+pub(crate) fn required_keys(packages: &[Package]) -> RequiredKeys {
+    let mut asked = RequiredKeys::default();
+    for external in workspace::external_dependencies(packages) {
         let needs = |kinds: &[Kind]| kinds.iter().any(|kind| external.kinds.contains(kind));
         if needs(&[
             Kind::Buildtool,
@@ -67,7 +67,7 @@ pub(crate) fn asked(packages: &[Package]) -> Needed {
     asked
 }
 
-/// Names of packages.
+/// Returns the names of packages.
 pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
     packages
         .iter()
@@ -75,8 +75,8 @@ pub(crate) fn names(packages: &[Package]) -> BTreeSet<String> {
         .collect()
 }
 
-/// Most important first: the one that none of the others needs, the last in the order of building when there are several.
-pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
+/// Sorts the names of packages by importance: first those that no other one needs; of several, the last in build order.
+pub(crate) fn sort_by_importance(packages: &[Package]) -> Vec<String> {
     let mut names: Vec<String> = packages
         .iter()
         .rev()
@@ -97,35 +97,35 @@ pub(crate) fn by_importance(packages: &[Package]) -> Vec<String> {
                 .any(|need| need.name == *name)
         })
     };
-    // Stable: within either kind the order stays.
+    // A stable sort keeps the order among equals.
     names.sort_by_key(needed);
     names
 }
 
-/// The package that a push is about, which gives its service the name and the stub: of `packages`, most important first, the first of which a program is
-/// run; else the first.
-pub(crate) fn subject(packages: &[String], nodes: &[LaunchNode]) -> String {
+/// Returns the main package of a push, which determines the names of the service and the stub: of `packages`, most
+/// important first, the first one of which a program is run, or else the first.
+pub(crate) fn main_package(packages: &[String], nodes: &[LaunchNode]) -> String {
     let runs = |package: &&String| nodes.iter().any(|node| node.package == **package);
     let first = packages.iter().find(runs).or(packages.first());
     first.cloned().unwrap_or_default()
 }
 
-/// Versions of packages, by name.
+/// Returns the versions of packages, by name.
 pub(crate) fn versions(packages: &[Package]) -> BTreeMap<String, String> {
     let all = packages.iter().map(|package| &package.manifest);
     all.map(|of| (of.name.clone(), of.version.clone()))
         .collect()
 }
 
-/// What installed packages name as `<depend>`, and were only compiled with: nothing of it runs.
-pub(crate) fn tools(asked: &Needed) -> BTreeSet<String> {
+/// Returns build tools that installed packages declare as `<depend>`, which are not needed at run time.
+pub(crate) fn build_tools(asked: &RequiredKeys) -> BTreeSet<String> {
     let is_tool =
         |name: &&String| name.starts_with("ament_cmake") || *name == "rosidl_default_generators";
     asked.run.keys().filter(is_tool).cloned().collect()
 }
 
-/// Whether anything in a tree is Python that runs: not what only builds (`setup.py`, dynamic_reconfigure's `.cfg`), nor
-/// the modules that catkin generates for messages.
+/// Returns whether a tree contains Python files that are used at run time, other than build files (`setup.py`,
+/// dynamic_reconfigure's `.cfg`) and the modules that catkin generates for messages.
 pub(crate) fn has_python(root: &Path) -> bool {
     let generated = |path: &Path| {
         let parent = path.parent().and_then(Path::file_name).unwrap_or_default();
@@ -137,7 +137,7 @@ pub(crate) fn has_python(root: &Path) -> bool {
                 .iter()
                 .any(|name| parent == *name)
     };
-    let runs = |entry: &foreign::Entry<'_>| {
+    let runs = |entry: &foreign::WalkEntry<'_>| {
         let extension = entry.path.extension().unwrap_or_default();
         if extension == "py" {
             return entry.stat.st_size > 0;
@@ -156,7 +156,7 @@ pub(crate) fn has_python(root: &Path) -> bool {
             && first.windows(6).any(|word| word == b"python")
     };
     let mut found = false;
-    // What cannot be read here is told by those who need it.
+    // Unreadable files are reported by those who need them.
     let _ = foreign::walk(root, |entry| {
         let regular = entry.kind() == FileType::RegularFile;
         found |= regular && !found && !generated(entry.path) && runs(entry);
@@ -169,7 +169,7 @@ pub(crate) fn has_python(root: &Path) -> bool {
 mod tests {
     use super::*;
 
-    fn workspace(packages: &[(&str, &str)]) -> (tempfile::TempDir, Pushed) {
+    fn workspace(packages: &[(&str, &str)]) -> (tempfile::TempDir, PushedDirectory) {
         let root = tempfile::tempdir().expect("a directory");
         for (name, rest) in packages {
             let directory = root.path().join("src").join(name);
@@ -182,7 +182,7 @@ mod tests {
         }
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let pushed = inspect(root.path(), &base).expect("a workspace");
+        let pushed = inspect_pushed(root.path(), &base).expect("a workspace");
         (root, pushed)
     }
 
@@ -195,7 +195,7 @@ mod tests {
             ),
             ("aa_msgs", "<depend>std_msgs</depend>"),
         ]);
-        assert_eq!(by_importance(pushed.packages()), ["app", "aa_msgs"]);
+        assert_eq!(sort_by_importance(pushed.packages()), ["app", "aa_msgs"]);
         let versions = versions(pushed.packages());
         assert_eq!(versions["app"], "1.2.3");
     }
@@ -216,9 +216,12 @@ mod tests {
             required: false,
             named: true,
         };
-        assert_eq!(subject(&packages, &[node("driver"), node("app")]), "app");
-        assert_eq!(subject(&packages, &[node("of_debian")]), "tools");
-        assert_eq!(subject(&[], &[node("app")]), "");
+        assert_eq!(
+            main_package(&packages, &[node("driver"), node("app")]),
+            "app"
+        );
+        assert_eq!(main_package(&packages, &[node("of_debian")]), "tools");
+        assert_eq!(main_package(&[], &[node("app")]), "");
     }
 
     #[test]
@@ -227,7 +230,7 @@ mod tests {
             "app",
             "<depend>ament_cmake</depend><depend>rosidl_default_generators</depend><depend>rclcpp</depend>",
         )]);
-        let tools = tools(&asked(pushed.packages()));
+        let tools = build_tools(&required_keys(pushed.packages()));
         let tools: Vec<&str> = tools.iter().map(String::as_str).collect();
         assert_eq!(tools, ["ament_cmake", "rosidl_default_generators"]);
     }
@@ -244,7 +247,7 @@ mod tests {
                 "<build_depend>message_generation</build_depend><depend>std_msgs</depend>",
             ),
         ]);
-        let asked = asked(pushed.packages());
+        let asked = required_keys(pushed.packages());
         assert_eq!(
             asked.build.keys().collect::<Vec<_>>(),
             ["message_generation", "std_msgs"]
@@ -268,7 +271,9 @@ mod tests {
         .expect("written");
         let images = Path::new(env!("CARGO_MANIFEST_DIR")).join("../images");
         let base = crate::base::load(&images, crate::DEFAULT_BASE).expect("valid");
-        let error = inspect(root.path(), &base).expect_err("ROS 2").to_string();
+        let error = inspect_pushed(root.path(), &base)
+            .expect_err("ROS 2")
+            .to_string();
         assert!(error.contains("build type ament_cmake"), "{error}");
     }
 

@@ -1,4 +1,4 @@
-//! The end of a build's directory: when its containers have ended, and in the background, because a big tree takes long.
+//! Removal of build directories, after their containers have ended, in the background because a large tree takes long.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -6,12 +6,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::task::JoinHandle;
 
-/// Directories that are being removed, by the id of their build.
+/// Directories being removed, by the id of their build.
 #[derive(Clone, Default)]
-pub(crate) struct Removals(Arc<Mutex<HashMap<String, JoinHandle<()>>>>);
+pub(crate) struct PendingRemovals(Arc<Mutex<HashMap<String, JoinHandle<()>>>>);
 
-impl Removals {
-    /// Removes `directory` after `containers` have ended.
+impl PendingRemovals {
+    /// Starts to remove `directory` when `containers` have ended.
     pub(crate) fn start(&self, id: String, containers: Vec<JoinHandle<()>>, directory: PathBuf) {
         let Ok(runtime) = tokio::runtime::Handle::try_current() else {
             return remove(&directory);
@@ -20,7 +20,7 @@ impl Removals {
             for container in containers {
                 let _ = container.await;
             }
-            // Not as a part of the build: that it was cancelled is the reason for this.
+            // Not as part of the build, since its cancellation is the reason for this.
             let _ = tokio::task::spawn_blocking(move || remove(&directory)).await;
         });
         let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -28,8 +28,8 @@ impl Removals {
         all.insert(id, removal);
     }
 
-    /// Comes back when nothing is being removed of this build.
-    pub(crate) async fn done(&self, id: &str) {
+    /// Waits until nothing of this build is being removed.
+    pub(crate) async fn wait(&self, id: &str) {
         let removal = {
             let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
             all.remove(id)

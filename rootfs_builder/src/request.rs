@@ -1,4 +1,4 @@
-//! What a build is asked, and what it gives.
+//! Input and output of a build.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -9,80 +9,80 @@ use ros::flavour::Flavour;
 
 use crate::launch::LaunchPlan;
 
-/// One push.
+/// A push to build.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PushRequest {
-    /// Names the build's directory and its containers: `[a-z0-9-]`, at most 24 characters, unique on this host.
+    /// Name of the build's directory and containers: `[a-z0-9-]`, at most 24 characters, unique on this host.
     pub id: String,
-    /// The service that it becomes, where that is known.
+    /// Name of the service, if known.
     pub name: Option<String>,
-    /// What is pushed.
-    pub source: Source,
-    /// Name of the base definition; [`crate::DEFAULT_BASE`] if none.
+    /// Content of the push.
+    pub source: PushSource,
+    /// Name of the base definition (default: [`crate::DEFAULT_BASE`]).
     pub base: Option<String>,
-    /// Launch file: relative to the package, or its bare name.
+    /// Launch file, relative to the package, or its bare name.
     pub launch: Option<String>,
-    /// Executables to run instead of, or beside, a launch file: `EXE` or `PACKAGE/EXE`, with arguments after it, as
-    /// a shell would split them.
+    /// Executables to run instead of or in addition to a launch file: `EXE` or `PACKAGE/EXE`, followed by arguments
+    /// that are split as by a shell.
     pub nodes: Vec<String>,
     /// Parameters: absolute ones begin with `/`, others are private to every node (`k`, `~k` or `_k`).
     pub params: BTreeMap<String, serde_json::Value>,
     /// Arguments of the launch file.
     pub args: BTreeMap<String, String>,
-    /// Names to remap, from → to, for every node.
+    /// Name remappings for every node, from → to.
     pub remaps: BTreeMap<String, String>,
-    /// Dependencies by hand: rosdep key or ROS package → Debian package.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian package.
     pub map: BTreeMap<String, String>,
-    /// More to have, while compiling and at run time: Debian or ROS packages.
+    /// Additional Debian or ROS packages, while compiling and at run time.
     pub with: Vec<String>,
 }
 
-/// What is pushed.
+/// Content of a push.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Source {
-    /// A directory, unpacked by the caller: a source package, a workspace, or an install space. It is read, and
-    /// the modes of its files may be widened.
+pub enum PushSource {
+    /// A directory, unpacked by the caller: a source package, a workspace, or an install space. It is read, and the
+    /// permissions of its files may be extended.
     Tree(PathBuf),
-    /// A ROS package of the distribution's archive (`opencv_apps`), or a Debian one (`ros-opencv-apps`).
+    /// A ROS package of the distribution's archive (`opencv_apps`), or a Debian package (`ros-opencv-apps`).
     Packaged(String),
 }
 
-impl Default for Source {
+impl Default for PushSource {
     fn default() -> Self {
         Self::Packaged(String::new())
     }
 }
 
-/// What became of it.
+/// Result of a build.
 #[derive(Debug)]
 pub struct BuildOutcome {
-    /// The ROS package that gives the service its name by default.
+    /// ROS package whose name is the default name of the service.
     pub package: String,
-    /// Its version, where its package.xml or the archive says one.
+    /// Version of the package, if stated in its package.xml or the archive.
     pub version: String,
-    /// The base it stands on, and its ROS.
+    /// Base and ROS flavour.
     pub flavour: Flavour,
-    /// The image in the store, untagged.
+    /// Digest of the image in the store, untagged.
     pub image: Digest,
-    /// Its layers, lowest first.
+    /// Layers of the image, lowest first.
     pub layers: Vec<BuiltLayer>,
-    /// Environment of every process of the image (nodes add theirs).
+    /// Environment of every process of the image (nodes may add to it).
     pub environment: BTreeMap<String, String>,
-    /// What to run.
+    /// Launch plan.
     pub plan: LaunchPlan,
-    /// What the image holds.
+    /// Inventory of the image.
     pub inventory: Inventory,
-    /// Keeps the garbage collector from the image until it is tagged.
-    pub hold: image::Hold,
+    /// Guard that protects the image from the garbage collector until it is tagged.
+    pub hold: image::GcHold,
 }
 
 /// A layer of the image.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BuiltLayer {
-    /// `base`, `dependencies` or `package`.
+    /// Name of the layer: `base`, `dependencies` or `package`.
     pub name: &'static str,
-    /// The layer.
+    /// Layer in the store.
     pub info: LayerInfo,
-    /// It was there already.
+    /// True if the layer already existed.
     pub cached: bool,
 }

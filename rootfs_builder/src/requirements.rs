@@ -1,31 +1,31 @@
-//! Pinned Python packages: a requirements file as pip reads it, of which only names, versions and hashes are allowed.
+//! Pinned Python packages: a pip requirements file in which only names, versions and hashes are allowed.
 //!
-//! Nothing in it says where packages come from: that is what the host's pip is configured for. Whatever it is, the bytes are
-//! those that the hashes name.
+//! The file does not state where packages come from: that is configured in the host's pip. In any case, the content is
+//! determined by the hashes.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::key::{self, Key};
 
-/// What a file asks for.
+/// Content of a requirements file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Requirements {
     text: String,
-    /// By name, normalised.
-    pinned: BTreeMap<String, Pinned>,
+    /// Packages by normalized name.
+    pinned: BTreeMap<String, PinnedPackage>,
 }
 
-/// One package.
+/// A pinned package.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Pinned {
+struct PinnedPackage {
     version: String,
-    /// SHA-256, hex, of each wheel that is good: one for every architecture, most often.
+    /// SHA-256 in hexadecimal of each acceptable wheel, usually one for each architecture.
     hashes: BTreeSet<String>,
 }
 
 impl Requirements {
-    /// Lines of `NAME==VERSION --hash=sha256:HEX…`, continued after a backslash; comments on lines of their own. The error
-    /// begins with the line.
+    /// Parses lines of `NAME==VERSION --hash=sha256:HEX…`, continued after a backslash; comments are on separate lines.
+    /// The error begins with the line number.
     pub(crate) fn parse(text: &str) -> Result<Self, String> {
         let mut pinned = BTreeMap::new();
         let mut lines = text.lines().enumerate();
@@ -39,9 +39,9 @@ impl Requirements {
                 continue;
             }
             let at = |problem: String| format!("line {}: {problem}", index + 1);
-            let (name, one) = Pinned::parse(&whole).map_err(at)?;
+            let (name, one) = PinnedPackage::parse(&whole).map_err(at)?;
             if pinned.insert(name.clone(), one).is_some() {
-                return Err(at(format!("{name} is there twice")));
+                return Err(at(format!("{name} appears twice")));
             }
         }
         Ok(Self {
@@ -50,42 +50,42 @@ impl Requirements {
         })
     }
 
-    /// As pip reads it.
+    /// Returns the text, for pip.
     pub(crate) fn text(&self) -> &str {
         &self.text
     }
 
-    /// Number of packages.
+    /// Returns the number of packages.
     pub(crate) fn len(&self) -> usize {
         self.pinned.len()
     }
 
-    /// Changes when what is asked for does; comments and the order do not matter.
+    /// Returns a fingerprint of the requirements that ignores comments and order.
     pub(crate) fn key(&self) -> String {
         let mut key = Key::new("requirements");
         for (name, one) in &self.pinned {
-            key = key.with("package", format!("{name}=={}", one.version));
-            key = key.with_all("hash", &one.hashes);
+            key = key.input("package", format!("{name}=={}", one.version));
+            key = key.inputs("hash", &one.hashes);
         }
         key.finish()
     }
 
-    /// `NAME==VERSION` of each, sorted.
+    /// Returns `NAME==VERSION` of each package, sorted.
     pub(crate) fn versions(&self) -> impl Iterator<Item = String> + '_ {
         let pinned = self.pinned.iter();
         pinned.map(|(name, one)| format!("{name}=={}", one.version))
     }
 
-    /// Whether the file of this name and content is what one of these asks for: its name, normalised.
-    pub(crate) fn asks_for(&self, file: &str, bytes: &[u8]) -> Option<&str> {
-        let (name, version) = wheel(file)?;
+    /// Returns the normalized name of the requirement that a file with this name and content satisfies.
+    pub(crate) fn matching_name(&self, file: &str, bytes: &[u8]) -> Option<&str> {
+        let (name, version) = parse_wheel_name(file)?;
         let (name, one) = self.pinned.get_key_value(&name)?;
         let same = one.version == version && one.hashes.contains(&key::sha256(bytes));
         same.then_some(name)
     }
 }
 
-impl Pinned {
+impl PinnedPackage {
     fn parse(line: &str) -> Result<(String, Self), String> {
         let mut words = line.split_whitespace();
         let first = words.next().unwrap_or_default();
@@ -112,22 +112,24 @@ impl Pinned {
             return Err(format!("{first} has no --hash=sha256:HEX"));
         }
         let version = version.to_owned();
-        Ok((normalised(name), Self { version, hashes }))
+        Ok((normalize_name(name), Self { version, hashes }))
     }
 }
 
-/// Name and version of a wheel's file: `NAME-VERSION[-BUILD]-PYTHON-ABI-PLATFORM.whl`
+/// Parses the name and version in the file name of a wheel: `NAME-VERSION[-BUILD]-PYTHON-ABI-PLATFORM.whl`
 /// (<https://packaging.python.org/en/latest/specifications/binary-distribution-format/>).
-fn wheel(file: &str) -> Option<(String, &str)> {
+fn parse_wheel_name(file: &str) -> Option<(String, &str)> {
     let parts: Vec<&str> = file.strip_suffix(".whl")?.split('-').collect();
     match *parts {
-        [name, version, _, _, _] | [name, version, _, _, _, _] => Some((normalised(name), version)),
+        [name, version, _, _, _] | [name, version, _, _, _, _] => {
+            Some((normalize_name(name), version))
+        }
         _ => None,
     }
 }
 
-/// One spelling of a name (<https://packaging.python.org/en/latest/specifications/name-normalization/>).
-fn normalised(name: &str) -> String {
+/// Normalizes a name (<https://packaging.python.org/en/latest/specifications/name-normalization/>).
+fn normalize_name(name: &str) -> String {
     let parts = name.split(['-', '_', '.']).filter(|part| !part.is_empty());
     let parts: Vec<String> = parts.map(str::to_ascii_lowercase).collect();
     parts.join("-")
@@ -151,13 +153,13 @@ mod tests {
         let asked = Requirements::parse(&text).expect("valid");
         assert_eq!(asked.len(), 2);
         let file = "ros_std_msgs-5.3.6-cp311-cp311-manylinux_2_28_x86_64.whl";
-        assert_eq!(asked.asks_for(file, b"one"), Some("ros-std-msgs"));
-        assert_eq!(asked.asks_for(file, b"other"), None);
+        assert_eq!(asked.matching_name(file, b"one"), Some("ros-std-msgs"));
+        assert_eq!(asked.matching_name(file, b"other"), None);
         let newer = "ros_std_msgs-5.5.1-cp311-cp311-manylinux_2_28_x86_64.whl";
-        assert_eq!(asked.asks_for(newer, b"one"), None);
+        assert_eq!(asked.matching_name(newer, b"one"), None);
         let yaml = "pyyaml-6.0.3-cp311-cp311-manylinux2014_x86_64.whl";
-        assert_eq!(asked.asks_for(yaml, b"two"), Some("pyyaml"));
-        assert_eq!(asked.asks_for("pyyaml-6.0.3.tar.gz", b"two"), None);
+        assert_eq!(asked.matching_name(yaml, b"two"), Some("pyyaml"));
+        assert_eq!(asked.matching_name("pyyaml-6.0.3.tar.gz", b"two"), None);
         let versions: Vec<String> = asked.versions().collect();
         assert_eq!(versions, ["pyyaml==6.0.3", "ros-std-msgs==5.3.6"]);
     }

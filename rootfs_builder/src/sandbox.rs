@@ -1,5 +1,5 @@
-//! Runs one program in a container and listens to it. Cancelled by dropping the future; what it leaves behind is
-//! ended and removed before the build's directory goes.
+//! Runs a program in a container and receives its output. To cancel, drop the future: the container is ended and
+//! removed before the build's directory is.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,66 +8,66 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use servant::container::{ContainerSpec, Mount, Profile};
 use servant::engine::{LogStart, NodeExit};
-use servant::sandbox::{Sandbox, Sandboxed};
-use servant::spec::{Limits, NodeSpec};
+use servant::sandbox::{Sandbox, SandboxContainer};
+use servant::spec::{NodeSpec, ResourceLimits};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
-use crate::error::{Error, IoAt};
-use crate::process::Tail;
-use crate::removal::Removals;
+use crate::error::{Error, IoContext};
+use crate::process::LastLines;
+use crate::removal::PendingRemovals;
 
-/// The directory of one build and the containers that run for it. Dropping it ends them and removes it.
-pub(crate) struct Site {
+/// Directory of a build and the containers that run for it, which are ended and removed on drop.
+pub(crate) struct BuildSite {
     id: String,
     directory: PathBuf,
     sandbox: Arc<dyn Sandbox>,
-    limits: Limits,
-    removals: Removals,
+    limits: ResourceLimits,
+    removals: PendingRemovals,
     running: Arc<Mutex<Vec<JoinHandle<()>>>>,
 }
 
-/// What to run.
-pub(crate) struct Run {
-    /// Tells this run from others of the same build: `[a-z0-9-]`, short.
+/// Program to run in a container.
+pub(crate) struct SandboxRun {
+    /// Name of this run, unique within the build: `[a-z0-9-]`, short.
     pub(crate) name: &'static str,
-    /// Which rights.
+    /// Security profile.
     pub(crate) profile: Profile,
     /// Trees, lowest first.
     pub(crate) layers: Vec<PathBuf>,
-    /// Where changes go.
+    /// Upper directory for changes.
     pub(crate) writable: Option<PathBuf>,
-    /// Directories made in `writable` for the compile user.
+    /// Directories created in `writable` for the compiling user.
     pub(crate) owned: Vec<PathBuf>,
-    /// Extra mounts.
+    /// Additional mounts.
     pub(crate) mounts: Vec<Mount>,
-    /// All of its environment.
+    /// Complete environment.
     pub(crate) environment: BTreeMap<String, String>,
-    /// The program.
+    /// Command line.
     pub(crate) argv: Vec<String>,
 }
 
-/// How it ended.
-pub(crate) struct Finished {
+/// Result of a run.
+pub(crate) struct RunResult {
     /// Exit code or signal.
     pub(crate) exit: NodeExit,
-    /// First host uid of its range: what uid 0 inside was outside.
+    /// First host uid of the container: the host uid of its root.
     pub(crate) uid_offset: u32,
-    /// The last lines it printed.
-    pub(crate) tail: Tail,
+    /// Last lines of its output.
+    pub(crate) tail: LastLines,
 }
 
-impl Finished {
-    /// Whether it ended well.
+impl RunResult {
+    /// Returns whether it exited successfully.
     pub(crate) fn success(&self) -> bool {
         self.exit.code == Some(0)
     }
 
-    /// Its last lines, and what is to be said about its end.
-    pub(crate) fn last_words(&self) -> String {
+    /// Returns its last lines, with a description of how it ended.
+    pub(crate) fn last_output(&self) -> String {
         let text = self.tail.text();
         let about = if self.exit.out_of_memory {
-            "it was killed for want of memory".to_owned()
+            "it was killed because it ran out of memory".to_owned()
         } else if let Some(reason) = &self.exit.exec_error {
             reason.clone()
         } else if let Some(signal) = self.exit.signal {
@@ -83,19 +83,19 @@ impl Finished {
     }
 }
 
-impl Site {
-    /// Makes the directory below `root`, named `id`. The caller may have put the pushed tree there already; it
-    /// goes with all the rest. `limits` are those of each container.
+impl BuildSite {
+    /// Creates the directory below `root`, named `id`. The caller may already have put the pushed tree there; it is
+    /// removed with the rest. `limits` apply to each container.
     pub(crate) fn new(
         root: &Path,
         id: &str,
         sandbox: Arc<dyn Sandbox>,
-        limits: Limits,
-        removals: Removals,
+        limits: ResourceLimits,
+        removals: PendingRemovals,
     ) -> Result<Self, Error> {
         let directory = root.join(id);
-        fs::create_dir_all(&directory).at("making", &directory)?;
-        // What others may read in it is nobody's business out here.
+        fs::create_dir_all(&directory).io_context("making", &directory)?;
+        // Files that are readable in the container must not be readable for others on the host.
         crate::install::set_mode(&directory, 0o700)?;
         Ok(Self {
             id: id.to_owned(),
@@ -107,15 +107,15 @@ impl Site {
         })
     }
 
-    /// A new directory below the build's own.
+    /// Creates a directory below the build's own.
     pub(crate) fn directory(&self, name: &str) -> Result<PathBuf, Error> {
         let path = self.directory.join(name);
-        fs::create_dir_all(&path).at("making", &path)?;
+        fs::create_dir_all(&path).io_context("making", &path)?;
         Ok(path)
     }
 
-    /// A new directory of this build, whatever else is called `name`.
-    pub(crate) fn fresh(&self, name: &str) -> Result<PathBuf, Error> {
+    /// Creates a new directory of this build, even if others are called `name`.
+    pub(crate) fn fresh_directory(&self, name: &str) -> Result<PathBuf, Error> {
         let mut number = 1;
         loop {
             let path = self.directory.join(format!("{name}-{number}"));
@@ -127,12 +127,12 @@ impl Site {
         }
     }
 
-    /// Runs it to its end; each line it prints goes to `lines` as it comes.
+    /// Runs a program to its end; each line of its output is passed to `on_line`.
     pub(crate) async fn run(
         &self,
-        run: Run,
+        run: SandboxRun,
         mut on_line: impl FnMut(&str),
-    ) -> Result<Finished, Error> {
+    ) -> Result<RunResult, Error> {
         let spec = ContainerSpec {
             id: format!("{}-{}", self.id, run.name),
             layers: run.layers,
@@ -156,9 +156,9 @@ impl Site {
         };
         let (line, mut lines) = mpsc::channel(256);
         let (result, finished) = oneshot::channel();
-        // Held by this future alone: when it is dropped, the task below sees it and ends the container.
+        // Held by this future only: when it is dropped, the task below notices and ends the container.
         let (_alive, cancelled) = oneshot::channel::<()>();
-        let task = tokio::spawn(to_its_end(
+        let task = tokio::spawn(run_to_end(
             self.sandbox.clone(),
             spec,
             run.name,
@@ -170,13 +170,13 @@ impl Site {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .push(task);
-        let mut tail = Tail::default();
+        let mut tail = LastLines::default();
         while let Some(line) = lines.recv().await {
             tail.push(&line);
             on_line(&line);
         }
         match finished.await {
-            Ok(Ok((exit, uid_offset))) => Ok(Finished {
+            Ok(Ok((exit, uid_offset))) => Ok(RunResult {
                 exit,
                 uid_offset,
                 tail,
@@ -192,7 +192,7 @@ impl Site {
 
 type Outcome = Result<(NodeExit, u32), servant::Error>;
 
-async fn to_its_end(
+async fn run_to_end(
     sandbox: Arc<dyn Sandbox>,
     spec: ContainerSpec,
     node: &'static str,
@@ -200,11 +200,11 @@ async fn to_its_end(
     cancelled: oneshot::Receiver<()>,
     result: oneshot::Sender<Outcome>,
 ) {
-    // Starting is not interrupted: a container half-started would have no handle to end it by.
-    let Sandboxed {
+    // The start is not interrupted: a half-started container has no handle to end it by.
+    let SandboxContainer {
         servant,
         uid_offset,
-    } = match sandbox.sandbox(spec).await {
+    } = match sandbox.start_sandbox(spec).await {
         Ok(sandboxed) => sandboxed,
         Err(error) => {
             let _ = result.send(Err(error));
@@ -214,7 +214,7 @@ async fn to_its_end(
     let mut log = servant.follow(LogStart::First);
     let listener = async {
         while let Some(entry) = log.recv().await {
-            // A listener that went away must not stop the reading: the program would block on a full pipe.
+            // Reading must continue without a listener: otherwise the program would block on a full pipe.
             let _ = line.send(entry.line).await;
         }
     };
@@ -231,18 +231,17 @@ async fn to_its_end(
     let _ = result.send(outcome);
 }
 
-/// What a container of a build gets where nothing else was configured: half of the machine's memory, and cores when
-/// servants leave some.
-pub(crate) fn default_limits() -> Limits {
-    Limits {
+/// Default limits of a build's container: half of the machine's memory, and the cores that servants leave idle.
+pub(crate) fn default_limits() -> ResourceLimits {
+    ResourceLimits {
         cpu_weight: Some(20),
-        memory: servant::host::memory().map(|bytes| bytes / 2),
+        memory: servant::host::total_memory().map(|bytes| bytes / 2),
         pids: Some(4096),
-        ..Limits::default()
+        ..ResourceLimits::default()
     }
 }
 
-impl Drop for Site {
+impl Drop for BuildSite {
     fn drop(&mut self) {
         let running =
             std::mem::take(&mut *self.running.lock().unwrap_or_else(PoisonError::into_inner));

@@ -1,9 +1,9 @@
-//! Changes a pushed tree so that a build sees only what its cache key covers.
+//! Sealing of a pushed tree, so that a build sees only what its cache key covers.
 //!
-//! A compiled layer is found again by a hash of the sources, by whoever pushes the same ones next. So whatever a build
-//! could see and the hash does not cover would let one deployer choose what another one gets. The hash covers names, contents,
-//! links and who may execute; the rest is made the same for everybody: rights, times, and the directories of version
-//! control, which change with every commit, and whose hooks and settings are programs, are taken away.
+//! A compiled layer is looked up by a hash of the sources, by anyone who pushes the same ones. So if a build could see
+//! anything that the hash does not cover, one deployer could influence what another one gets. The hash covers names,
+//! contents, links and execute bits; the rest is made uniform: permissions, times, and the directories of version
+//! control, which change with every commit and contain executable hooks and settings, are removed.
 
 use std::ffi::OsStr;
 use std::path::Path;
@@ -14,7 +14,7 @@ use rustix::fs::{AtFlags, FileType, Mode, Timespec, Timestamps};
 use crate::bootstrap::EPOCH;
 use crate::error::Error;
 
-/// Names of version control's directories, and of files that point to them.
+/// Names of version control directories, and of files that point to them.
 const LEFT_OUT: [&str; 4] = [".git", ".hg", ".svn", ".bzr"];
 
 /// Seals a pushed tree of sources. Blocking.
@@ -22,7 +22,7 @@ pub(crate) fn seal(root: &Path) -> Result<(), Error> {
     let mut left_out = Vec::new();
     foreign::walk(root, |entry| {
         if LEFT_OUT.iter().any(|name| entry.name() == OsStr::new(name)) {
-            left_out.push(entry.shown());
+            left_out.push(entry.display_path());
             return Ok(Visit::Skip);
         }
         Ok::<_, Error>(Visit::Into)
@@ -30,12 +30,12 @@ pub(crate) fn seal(root: &Path) -> Result<(), Error> {
     for path in left_out {
         foreign::remove(&path)?;
     }
-    same_for_all(root)
+    normalize_metadata(root)
 }
 
-/// Every time the same, and rights that differ in nothing but "executable". Files that a program makes in between get
-/// another time than these, so that tools which compare times see what was made as newer.
-fn same_for_all(root: &Path) -> Result<(), Error> {
+/// Sets all times to the same value, and permissions that depend on "executable" only. Files generated during the build
+/// get later times, so that tools which compare times treat them as newer.
+fn normalize_metadata(root: &Path) -> Result<(), Error> {
     let moment = Timespec {
         tv_sec: EPOCH as i64,
         tv_nsec: 0,
@@ -45,8 +45,9 @@ fn same_for_all(root: &Path) -> Result<(), Error> {
         last_modification: moment,
     };
     foreign::walk(root, |entry| {
-        let (parent, name) = entry.place();
-        let failed = |error: rustix::io::Errno| Error::io("sealing", entry.shown(), error.into());
+        let (parent, name) = entry.parent_and_name();
+        let failed =
+            |error: rustix::io::Errno| Error::io("sealing", entry.display_path(), error.into());
         let mode = entry.stat.st_mode;
         match entry.kind() {
             FileType::Symlink => {}
@@ -54,7 +55,7 @@ fn same_for_all(root: &Path) -> Result<(), Error> {
                 let runs = kind == FileType::Directory || mode & 0o111 != 0;
                 let wanted = if runs { 0o755 } else { 0o644 };
                 if mode & 0o7777 != wanted {
-                    // Of a link this would change what it points to; it is none, and nobody else changes this tree.
+                    // On a link this would change its target; it is not a link, and nobody else changes this tree.
                     rustix::fs::chmodat(
                         parent,
                         name,
@@ -78,20 +79,20 @@ mod tests {
     use super::*;
     use crate::key;
 
-    fn pushed() -> tempfile::TempDir {
+    fn pushed_tree() -> tempfile::TempDir {
         let root = tempfile::tempdir().expect("a directory");
         fs::create_dir_all(root.path().join("src/p")).expect("made");
         fs::write(root.path().join("src/p/CMakeLists.txt"), "project(p)").expect("written");
         root
     }
 
-    /// All properties of a tree that a program can see: names, kinds, modes, times, contents.
+    /// Returns all properties of a tree that a program can see: names, types, modes, times, contents.
     fn visible(root: &Path) -> Vec<String> {
         let mut all = Vec::new();
         foreign::walk(root, |entry| {
             let content = match entry.kind() {
-                FileType::RegularFile => fs::read_to_string(entry.shown()).expect("text"),
-                FileType::Symlink => format!("{:?}", entry.link().expect("a link")),
+                FileType::RegularFile => fs::read_to_string(entry.display_path()).expect("text"),
+                FileType::Symlink => format!("{:?}", entry.read_link().expect("a link")),
                 _ => String::new(),
             };
             all.push(format!(
@@ -108,7 +109,7 @@ mod tests {
 
     #[test]
     fn trees_of_one_key_look_the_same_to_a_build() {
-        let (clean, poisoned) = (pushed(), pushed());
+        let (clean, poisoned) = (pushed_tree(), pushed_tree());
         let inside = |path: &str| poisoned.path().join(path);
         fs::create_dir_all(inside(".git/hooks")).expect("made");
         fs::write(inside(".git/config"), "[core] fsmonitor = /bin/evil").expect("written");
@@ -125,27 +126,27 @@ mod tests {
             seal(root).expect("sealed");
         }
         assert_eq!(
-            key::sources(clean.path()).expect("hashed"),
-            key::sources(poisoned.path()).expect("hashed")
+            key::hash_sources(clean.path()).expect("hashed"),
+            key::hash_sources(poisoned.path()).expect("hashed")
         );
         assert_eq!(visible(clean.path()), visible(poisoned.path()));
     }
 
     #[test]
     fn what_a_build_can_see_is_in_its_key() {
-        let (clean, other) = (pushed(), pushed());
-        // Nothing is sealed here: whatever somebody forgets to take away is in the key all the same.
+        let (clean, other) = (pushed_tree(), pushed_tree());
+        // Not sealed here: whatever is not removed is part of the key anyway.
         fs::create_dir(other.path().join(".git")).expect("made");
         fs::write(other.path().join(".git/config"), "x").expect("written");
         assert_ne!(
-            key::sources(clean.path()).expect("hashed"),
-            key::sources(other.path()).expect("hashed")
+            key::hash_sources(clean.path()).expect("hashed"),
+            key::hash_sources(other.path()).expect("hashed")
         );
     }
 
     #[test]
     fn programs_stay_programs_and_links_are_not_followed() {
-        let (root, outside) = (pushed(), tempfile::tempdir().expect("a directory"));
+        let (root, outside) = (pushed_tree(), tempfile::tempdir().expect("a directory"));
         let target = outside.path().join("f");
         fs::write(&target, "").expect("written");
         fs::set_permissions(&target, fs::Permissions::from_mode(0o600)).expect("set");

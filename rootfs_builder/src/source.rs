@@ -1,12 +1,12 @@
-//! A source package or workspace: compiled in a sandbox, run on what its result needs.
+//! Source packages and workspaces: compiled in a sandbox, and run with what the result needs.
 //!
 //! ```text
 //!   compiled in:  base / toolchain / build dependencies / ▒ sources ▒ → install space
 //!   runs in:      base / dependencies / package  ◀──────────────────────┘
 //! ```
 //!
-//! The toolchain and the development packages are in no image. What the result needs at run time is asked of
-//! package.xml (exec dependencies) and of the result itself (the libraries its ELF files need).
+//! The toolchain and the development packages are not part of an image. Run-time dependencies are determined from
+//! package.xml (exec dependencies) and from the result itself (libraries needed by its ELF files).
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -15,31 +15,31 @@ use image::Digest;
 use package::workspace::Workspace;
 use ros::flavour::Version;
 
-use crate::build::{Build, Parts};
-use crate::builder::kept;
+use crate::build::{Build, BuildParts};
+use crate::builder::keep_note_key;
 use crate::error::Error;
-use crate::indexed::Indexed;
-use crate::install::Made;
-use crate::keys::{self, Resolved};
+use crate::indexed::IndexedPackages;
+use crate::install::LayerSet;
+use crate::keys::{self, ResolvedKeys};
 use crate::{advice, elf, indexed, packaged, pushed, units, wheels};
 
-/// Compiles and packs.
-pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Parts, Error> {
+/// Compiles and packs the workspace.
+pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<BuildParts, Error> {
     let (own, asked) = (
         pushed::names(&workspace.packages),
-        pushed::asked(&workspace.packages),
+        pushed::required_keys(&workspace.packages),
     );
     let (packages, versions, python) = (
-        pushed::by_importance(&workspace.packages),
+        pushed::sort_by_importance(&workspace.packages),
         pushed::versions(&workspace.packages),
         pushed::has_python(&workspace.root),
     );
     let tools = toolchain(build).await?;
-    let there = Indexed {
-        build: build.indexed(&tools).await?,
-        run: build.indexed(&build.on_base()).await?,
+    let there = IndexedPackages {
+        build: build.indexed_packages(&tools).await?,
+        run: build.indexed_packages(&build.base_diff_ids()).await?,
     };
-    let resolved = keys::resolve(
+    let resolved = keys::resolve_keys(
         &build.archive,
         &build.base,
         &build.request.map,
@@ -52,12 +52,17 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
     }
     let below = build_dependencies(build, tools, &resolved).await?;
     let workspace = check_interfaces(build, workspace, &below).await?;
-    let package = units::compiled(build, workspace, below)
+    let package = units::compile_workspace(build, workspace, below)
         .await
-        .map_err(|error| advice::on(error, advice::Known::of(&build.archive, &build.base)))?;
-    let needed = needed_by(build, &package).await?;
+        .map_err(|error| {
+            advice::add_advice(
+                error,
+                advice::AdviceIndex::for_base(&build.archive, &build.base),
+            )
+        })?;
+    let needed = needed_libraries(build, &package).await?;
     let dependencies = dependencies(build, &resolved, &needed, python).await?;
-    Ok(Parts {
+    Ok(BuildParts {
         packages,
         versions,
         dependencies,
@@ -66,41 +71,44 @@ pub(crate) async fn build(build: &Build<'_>, workspace: Workspace) -> Result<Par
     })
 }
 
-/// Base and toolchain.
+/// Returns the layers of base and toolchain.
 async fn toolchain(build: &Build<'_>) -> Result<Vec<Digest>, Error> {
-    let mut below = build.on_base();
+    let mut below = build.base_diff_ids();
     let toolchain = build.base.build.packages.iter().cloned().collect();
     let toolchain = build
-        .add("toolchain", &below, &toolchain, Vec::new())
+        .add_packages("toolchain", &below, &toolchain, Vec::new())
         .await?;
     below.extend(toolchain.diff_ids());
-    let tools = wheels::to_compile(&build.shop, &build.base, &below, build.progress).await?;
+    let tools = wheels::add_build_wheels(&build.shop, &build.base, &below, build.progress).await?;
     below.extend(tools.diff_ids());
     build
         .shop
         .layers
-        .keep_note(&kept(&build.base.name), &below)?;
+        .write_note(&keep_note_key(&build.base.name), &below)?;
     Ok(below)
 }
 
-/// What a package is compiled in: base, toolchain, build dependencies.
+/// Returns the layers in which packages are compiled: base, toolchain, build dependencies.
 async fn build_dependencies(
     build: &Build<'_>,
     mut below: Vec<Digest>,
-    resolved: &Resolved,
+    resolved: &ResolvedKeys,
 ) -> Result<Vec<Digest>, Error> {
-    // What the deployer adds may be what package.xml forgot, for compiling as well as for running.
+    // Packages added by the deployer may be missing in package.xml for compiling as well as for running.
     let (ros, mut wanted) = build.extra_packages().await?;
-    wanted.extend(ros.iter().flat_map(|name| build.archive.to_build(name)));
+    wanted.extend(
+        ros.iter()
+            .flat_map(|name| build.archive.build_packages(name)),
+    );
     wanted.extend(resolved.build.iter().cloned());
     let more = build
-        .add("build-dependencies", &below, &wanted, Vec::new())
+        .add_packages("build-dependencies", &below, &wanted, Vec::new())
         .await?;
     below.extend(more.diff_ids());
     Ok(below)
 }
 
-/// Says what is wrong with interfaces of ROS 2 before anything is compiled.
+/// Validates the interface files of ROS 2 packages before anything is compiled.
 async fn check_interfaces(
     build: &Build<'_>,
     workspace: Workspace,
@@ -109,12 +117,12 @@ async fn check_interfaces(
     if build.base.ros == Version::Ros1 {
         return Ok(workspace);
     }
-    let trees = build.shop.extracted(below).await?;
-    let shares: Vec<String> = indexed::prefixes(&build.base)
+    let trees = build.shop.extract_layers(below).await?;
+    let shares: Vec<String> = indexed::install_prefixes(&build.base)
         .iter()
         .map(|prefix| format!("{prefix}/share"))
         .collect();
-    crate::blocking::reading(move || {
+    crate::blocking::spawn_reader(move || {
         let known = package::definitions::read(&trees, &shares)?;
         package::interfaces::check(&workspace, &known)?;
         Ok(workspace)
@@ -122,52 +130,54 @@ async fn check_interfaces(
     .await?
 }
 
-/// Libraries that a package layer needs from elsewhere.
-pub(crate) async fn needed_by(
+/// Returns the libraries that a package layer needs from elsewhere.
+pub(crate) async fn needed_libraries(
     build: &Build<'_>,
-    package: &Made,
+    package: &LayerSet,
 ) -> Result<BTreeSet<String>, Error> {
     let layers: Vec<Digest> = package.diff_ids().collect();
-    let trees = build.shop.extracted(&layers).await?;
-    crate::blocking::reading(move || {
+    let trees = build.shop.extract_layers(&layers).await?;
+    crate::blocking::spawn_reader(move || {
         let mut needed = BTreeSet::new();
         for tree in &trees {
-            needed.extend(elf::needed_below(tree)?);
+            needed.extend(elf::needed_libraries(tree)?);
         }
         Ok(needed)
     })
     .await?
 }
 
-/// The layer of everything needed at run time.
+/// Adds the layer of all run-time dependencies.
 pub(crate) async fn dependencies(
     build: &Build<'_>,
-    resolved: &Resolved,
+    resolved: &ResolvedKeys,
     libraries: &BTreeSet<String>,
     python: bool,
-) -> Result<Made, Error> {
-    let below = build.on_base();
+) -> Result<LayerSet, Error> {
+    let below = build.base_diff_ids();
     let (mut roots, mut debs) = build.extra_packages().await?;
-    // Those are for compiling; the libraries that they bring are found by what the result needs.
+    // Those are for compiling; their libraries are found by what the result needs.
     debs.retain(|deb| !deb.ends_with("-dev"));
     roots.extend(resolved.run_ros.iter().cloned());
-    let wanted = packaged::wanted(build, &roots, python).await?;
+    let wanted = packaged::gather_wanted(build, &roots, python).await?;
     debs.extend(wanted.install);
     debs.extend(resolved.run.iter().cloned());
-    let trees = build.shop.extracted(&below).await?;
+    let trees = build.shop.extract_layers(&below).await?;
     let mut libraries = libraries.clone();
-    let own = indexed::libraries(&build.base);
-    libraries.retain(|name| !library_in(&trees, &own, name));
+    let own = indexed::library_directories(&build.base);
+    libraries.retain(|name| !has_library(&trees, &own, name));
     let (found, missing) = build.archive.libraries(&libraries);
     debs.extend(found.into_values());
     let made = build
-        .add("dependencies", &below, &debs, wanted.extras)
+        .add_packages("dependencies", &below, &debs, wanted.extras)
         .await?;
     let all: Vec<Digest> = below.into_iter().chain(made.diff_ids()).collect();
-    let trees = build.shop.extracted(&all).await?;
+    let trees = build.shop.extract_layers(&all).await?;
     for name in missing {
-        // Not in the index, perhaps in an image all the same: a link that a package's script made.
-        if !library_in(&trees, &places(), &name) && !library_in(&trees, &own, &name) {
+        // Not in the index, but perhaps in an image: a link created by a package's script.
+        if !has_library(&trees, &system_library_directories(), &name)
+            && !has_library(&trees, &own, &name)
+        {
             let text = format!(
                 "no package holds the library {name}, which the package needs; a node may fail to start"
             );
@@ -177,8 +187,8 @@ pub(crate) async fn dependencies(
     Ok(made)
 }
 
-/// Where a distribution has its libraries.
-fn places() -> [String; 5] {
+/// Returns the library directories of a distribution.
+fn system_library_directories() -> [String; 5] {
     let triplet = crate::contents::triplet();
     [
         format!("usr/lib/{triplet}"),
@@ -189,7 +199,7 @@ fn places() -> [String; 5] {
     ]
 }
 
-fn library_in(trees: &[PathBuf], places: &[String], name: &str) -> bool {
+fn has_library(trees: &[PathBuf], places: &[String], name: &str) -> bool {
     trees.iter().any(|tree| {
         places
             .iter()

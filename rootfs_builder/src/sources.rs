@@ -1,30 +1,34 @@
-//! Which archive packages come from. No mirror's address is written anywhere in this repository: it is the host's
-//! own, mmdebstrap's default, or the administrator's.
+//! Package sources. No mirror is hard-coded in this repository: the address is the host's own, mmdebstrap's default, or
+//! set by the administrator.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::apt::Sources;
 use crate::base::Base;
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::process;
 
-/// The sources.list for a base.
-pub(crate) async fn lines(sources: &Sources, base: &Base, scratch: &Path) -> Result<String, Error> {
+/// Returns the sources.list for a base.
+pub(crate) async fn source_lines(
+    sources: &Sources,
+    base: &Base,
+    scratch: &Path,
+) -> Result<String, Error> {
     if let Some(lines) = sources.0.get(&base.name) {
         return Ok(lines.join("\n") + "\n");
     }
-    let own = host(Path::new("/etc/apt"), &base.suite)?;
+    let own = host_sources(Path::new("/etc/apt"), &base.suite)?;
     if own.is_empty() {
-        mmdebstraps_default(&base.suite, scratch).await
+        mmdebstrap_default_sources(&base.suite, scratch).await
     } else {
         Ok(own)
     }
 }
 
-/// Those of the host's apt sources that are of this release (and its updates and security), as one-line entries.
-/// Empty where the host is of another one.
-fn host(etc: &Path, suite: &str) -> Result<String, Error> {
+/// Returns the host's apt sources of this release (and its updates and security), as one-line entries. Empty if the
+/// host has another release.
+fn host_sources(etc: &Path, suite: &str) -> Result<String, Error> {
     let mut files = vec![etc.join("sources.list")];
     let parts = etc.join("sources.list.d");
     let mut more: Vec<PathBuf> = fs::read_dir(&parts)
@@ -39,21 +43,21 @@ fn host(etc: &Path, suite: &str) -> Result<String, Error> {
     for file in files.iter().filter(|file| file.is_file()) {
         let of_kind = |kind: &str| file.extension().is_some_and(|extension| extension == kind);
         if of_kind("sources") {
-            let text = fs::read_to_string(file).at("reading", file)?;
+            let text = fs::read_to_string(file).io_context("reading", file)?;
             lines.extend(
                 text.split("\n\n")
                     .flat_map(|stanza| stanza_lines(stanza, suite)),
             );
         } else if of_kind("list") {
-            let text = fs::read_to_string(file).at("reading", file)?;
+            let text = fs::read_to_string(file).io_context("reading", file)?;
             lines.extend(
                 text.lines()
-                    .filter(|line| of_suite(line, suite))
+                    .filter(|line| is_entry_of_suite(line, suite))
                     .map(|line| line.trim().to_owned()),
             );
         }
     }
-    // Updates alone are of no use: the release itself must be among them.
+    // Updates alone are not sufficient: the release itself must be included.
     let release = lines
         .iter()
         .any(|line| line.split_whitespace().any(|word| word == suite));
@@ -64,15 +68,15 @@ fn host(etc: &Path, suite: &str) -> Result<String, Error> {
     })
 }
 
-fn belongs(word: &str, suite: &str) -> bool {
+fn is_suite_word(word: &str, suite: &str) -> bool {
     word == suite
         || word
             .strip_prefix(suite)
             .is_some_and(|rest| rest.starts_with(['-', '/']))
 }
 
-/// `deb [options] URI SUITE COMPONENT…`
-fn of_suite(line: &str, suite: &str) -> bool {
+/// Returns whether an entry `deb [options] URI SUITE COMPONENT…` is of this release.
+fn is_entry_of_suite(line: &str, suite: &str) -> bool {
     let line = line.split('#').next().unwrap_or("").trim();
     let Some(rest) = line.strip_prefix("deb ") else {
         return false;
@@ -83,10 +87,10 @@ fn of_suite(line: &str, suite: &str) -> bool {
     };
     rest.split_whitespace()
         .nth(1)
-        .is_some_and(|word| belongs(word, suite))
+        .is_some_and(|word| is_suite_word(word, suite))
 }
 
-/// A deb822 stanza as one-line entries (sources.list(5)).
+/// Converts a deb822 stanza to one-line entries (sources.list(5)).
 fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
     let field = |name: &str| -> String {
         let mut lines = stanza
@@ -113,7 +117,7 @@ fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
     }
     let mut options = Vec::new();
     let signed_by = field("Signed-By");
-    // A key can also stand in the file itself; the one-line form cannot say that.
+    // A key may also be embedded in the file; one-line entries cannot express that.
     if signed_by.trim_start().starts_with('/') {
         options.push(format!(
             "signed-by={}",
@@ -141,7 +145,7 @@ fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
     for uri in uris.split_whitespace() {
         for word in suites
             .split_whitespace()
-            .filter(|word| belongs(word, suite))
+            .filter(|word| is_suite_word(word, suite))
         {
             lines.push(
                 format!("deb {options}{uri} {word} {components}")
@@ -153,9 +157,9 @@ fn stanza_lines(stanza: &str, suite: &str) -> Vec<String> {
     lines
 }
 
-/// What mmdebstrap would use when told no mirror: it is asked to begin, and stopped once it has written its list.
-async fn mmdebstraps_default(suite: &str, scratch: &Path) -> Result<String, Error> {
-    let target = tempfile::tempdir_in(scratch).at("making a directory in", scratch)?;
+/// Returns the default sources of mmdebstrap: it is started, and stopped once it has written its list.
+async fn mmdebstrap_default_sources(suite: &str, scratch: &Path) -> Result<String, Error> {
+    let target = tempfile::tempdir_in(scratch).io_context("creating a directory in", scratch)?;
     let list = target.path().join("sources.list");
     let mut ask = process::command("mmdebstrap");
     ask.env("LIST", &list)
@@ -170,7 +174,7 @@ async fn mmdebstraps_default(suite: &str, scratch: &Path) -> Result<String, Erro
         (Ok(_), Ok(())) => Err(Error::Program {
             program: "mmdebstrap".into(),
             status: "done".into(),
-            last_lines: format!("it knows no mirror of {suite}: name one in the configuration"),
+            last_lines: format!("it has no mirror of {suite}: name one in the configuration"),
         }),
     }
 }
@@ -202,13 +206,13 @@ mod tests {
             "deb http://example.invalid bookworm main\n",
         )
         .expect("written");
-        let lines = host(etc.path(), "bookworm").expect("read");
+        let lines = host_sources(etc.path(), "bookworm").expect("read");
         assert_eq!(
             lines,
             "deb [signed-by=/usr/share/keyrings/x.gpg] http://example.invalid/debian bookworm main\n\
              deb [signed-by=/usr/share/keyrings/x.gpg] http://example.invalid/debian bookworm-updates main\n\
              deb [arch=amd64 signed-by=/k] http://example.invalid/sec bookworm-security main\n"
         );
-        assert_eq!(host(etc.path(), "noble").expect("read"), "");
+        assert_eq!(host_sources(etc.path(), "noble").expect("read"), "");
     }
 }

@@ -1,30 +1,30 @@
-//! Where a set of Debian packages is cut in two layers: first what other software stands on, then what belongs to ROS.
+//! Division of Debian packages into two layers: first packages that other software builds on, then those of ROS.
 //!
-//! Two ROS packages of one field share nearly all of their libraries (OpenCV, PCL, VTK: hundreds of megabytes) and
-//! differ in what is ROS's own (a few megabytes). As one layer nothing of it could serve both. The lower layer is
-//! closed: nothing in it needs anything of the upper one, so it is a complete system by itself.
+//! Two ROS packages of the same field share nearly all of their libraries (OpenCV, PCL, VTK: hundreds of megabytes) and
+//! differ in ROS packages (a few megabytes). A single layer could not be shared at all. The lower layer is closed: it
+//! depends on nothing in the upper one, so it is a complete system by itself.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::apt::{Deb, Relations};
 
-/// Fewer packages than this are not worth a layer of their own.
+/// Minimum number of packages worth a separate layer.
 const FEW: usize = 8;
 
-/// Whether as many packages as this can be worth a cut, whatever they are.
-pub(crate) fn may_cut(count: usize) -> bool {
+/// Returns whether this number of packages can be worth a division.
+pub(crate) fn is_worth_splitting(count: usize) -> bool {
     count > FEW
 }
 
-/// Cuts `debs`; both parts keep the order. The first part is empty where a cut is not worth it. `of_ros`: whether a
-/// source package is one of ROS.
+/// Divides `debs`; both parts keep the order. The first part is empty if a division is not worthwhile. `of_ros` tells
+/// whether a source package belongs to ROS.
 pub(crate) fn split(
     debs: &[Deb],
     relations: &BTreeMap<String, Relations>,
     of_ros: impl Fn(&str) -> bool,
 ) -> (Vec<Deb>, Vec<Deb>) {
     let mut late: BTreeSet<&str> = BTreeSet::new();
-    // Names by which a late package may be needed: its own and what it provides.
+    // Names by which a late package may be needed: its own and those it provides.
     let mut late_names: BTreeSet<&str> = BTreeSet::new();
     loop {
         let before = late.len();
@@ -33,7 +33,7 @@ pub(crate) fn split(
             if late.contains(name) {
                 continue;
             }
-            // What nothing is known of may need anything.
+            // A package with unknown relations may need anything.
             let is_late = match relations.get(name) {
                 None => true,
                 Some(about) => {
@@ -60,7 +60,7 @@ pub(crate) fn split(
         .iter()
         .cloned()
         .partition(|deb| late.contains(deb.name.as_str()));
-    if !may_cut(debs.len()) || first.len() < FEW || last.is_empty() {
+    if !is_worth_splitting(debs.len()) || first.len() < FEW || last.is_empty() {
         (Vec::new(), debs.to_vec())
     } else {
         (first, last)
@@ -79,8 +79,8 @@ mod tests {
         }
     }
 
-    /// `NAME SOURCE NEEDS… / PROVIDES…`
-    fn lab(lines: &[&str]) -> (Vec<Deb>, BTreeMap<String, Relations>) {
+    /// Parses lines of `NAME SOURCE NEEDS… / PROVIDES…`.
+    fn parse_packages(lines: &[&str]) -> (Vec<Deb>, BTreeMap<String, Relations>) {
         let mut debs = Vec::new();
         let mut relations = BTreeMap::new();
         for line in lines {
@@ -124,12 +124,12 @@ mod tests {
         let mut lines = LIBRARIES.to_vec();
         lines.extend([
             "libcv-bridge1d ros-vision liba2",
-            // Not of ROS, but of no use without it, by another name.
+            // Not a ROS package, but dependent on one by a virtual name.
             "tool other cv-plugin",
             "plugin ros-vision / cv-plugin",
             "ros-image-proc ros-image liba7 libcv-bridge1d",
         ]);
-        let (debs, relations) = lab(&lines);
+        let (debs, relations) = parse_packages(&lines);
         let (first, last) = split(&debs, &relations, |source| source.starts_with("ros-"));
         assert_eq!(first.len(), 8);
         assert_eq!(
@@ -148,10 +148,10 @@ mod tests {
 
     #[test]
     fn a_few_packages_are_not_cut_and_unknown_ones_are_never_below() {
-        let (debs, relations) = lab(&["liba0 a", "ros-x ros-x liba0"]);
+        let (debs, relations) = parse_packages(&["liba0 a", "ros-x ros-x liba0"]);
         let ros = |source: &str| source.starts_with("ros-");
         assert_eq!(split(&debs, &relations, ros), (Vec::new(), debs));
-        let (mut debs, relations) = lab(&LIBRARIES);
+        let (mut debs, relations) = parse_packages(&LIBRARIES);
         debs.insert(0, deb("strange"));
         let (first, last) = split(&debs, &relations, ros);
         assert_eq!((first.len(), names(&last)), (8, vec!["strange"]));

@@ -1,6 +1,6 @@
-//! In which steps packages are installed. dpkg unpacks all that it is given before it configures any of it, but
-//! refuses to unpack a package whose Pre-Depends are not configured yet (Debian Policy, section 7.2). apt therefore
-//! calls it several times; so does the script that these steps are written for.
+//! Installation steps. dpkg unpacks all given packages before it configures any, but refuses to unpack a package whose
+//! Pre-Depends are not configured yet (Debian Policy, section 7.2). apt therefore calls it several times, and so does
+//! the script for which these steps are written.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -8,17 +8,21 @@ use crate::apt::{Deb, Relations};
 
 /// Packages that are unpacked together.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(crate) struct Step {
-    /// The number of packages.
+pub(crate) struct InstallStep {
+    /// Number of packages.
     pub(crate) unpack: usize,
-    /// Names of packages to be configured, with what they need, before the next step.
+    /// Names of packages to configure, with their dependencies, before the next step.
     pub(crate) configure: BTreeSet<String>,
 }
 
-/// Cuts `debs`, given in the order of unpacking, into steps. The last one has nothing to configure: there all are.
-pub(crate) fn steps(debs: &[Deb], relations: &BTreeMap<String, Relations>) -> Vec<Step> {
-    let mut steps = vec![Step::default()];
-    // What is unpacked and perhaps not configured, by each name that it goes by.
+/// Divides `debs`, given in the order of unpacking, into steps. The last one has nothing to configure, since all
+/// packages are configured then.
+pub(crate) fn plan_steps(
+    debs: &[Deb],
+    relations: &BTreeMap<String, Relations>,
+) -> Vec<InstallStep> {
+    let mut steps = vec![InstallStep::default()];
+    // Packages that are unpacked and perhaps not configured, by each of their names.
     let mut waiting: BTreeMap<&str, &str> = BTreeMap::new();
     for deb in debs {
         let about = relations.get(&deb.name);
@@ -32,7 +36,7 @@ pub(crate) fn steps(debs: &[Deb], relations: &BTreeMap<String, Relations>) -> Ve
             if let Some(last) = steps.last_mut() {
                 last.configure = needed;
             }
-            steps.push(Step::default());
+            steps.push(InstallStep::default());
         }
         if let Some(last) = steps.last_mut() {
             last.unpack += 1;
@@ -44,9 +48,9 @@ pub(crate) fn steps(debs: &[Deb], relations: &BTreeMap<String, Relations>) -> Ve
     steps
 }
 
-/// As the script `inside/install.sh` reads them: a file of each kind for each step, by names that sort. `files`: where
-/// the packages are, in the order of unpacking.
-pub(crate) fn written(steps: &[Step], files: &[String]) -> BTreeMap<String, String> {
+/// Returns the step files read by the script `inside/install.sh`: a file of each kind for each step, with sortable
+/// names. `files` are the paths of the packages, in the order of unpacking.
+pub(crate) fn script_files(steps: &[InstallStep], files: &[String]) -> BTreeMap<String, String> {
     let mut written = BTreeMap::new();
     let mut rest = files;
     for (number, step) in steps.iter().enumerate() {
@@ -94,21 +98,21 @@ mod tests {
     #[test]
     fn what_must_be_configured_first_ends_a_step() {
         let debs = ["a", "b", "c", "d"].map(deb);
-        let step = |unpack, configure: &[&str]| Step {
+        let step = |unpack, configure: &[&str]| InstallStep {
             unpack,
             configure: configure.iter().map(|&name| name.to_owned()).collect(),
         };
-        assert_eq!(steps(&debs, &relations(&[])), [step(4, &[])]);
-        // What is there already needs no step, and what is configured needs it once.
+        assert_eq!(plan_steps(&debs, &relations(&[])), [step(4, &[])]);
+        // Installed packages need no step, and packages are configured only once.
         let all = relations(&[
             ("b", &[], &["virtual"]),
             ("c", &["virtual", "libc6"], &[]),
             ("d", &["b"], &[]),
         ]);
-        assert_eq!(steps(&debs, &all), [step(2, &["b"]), step(2, &[])]);
+        assert_eq!(plan_steps(&debs, &all), [step(2, &["b"]), step(2, &[])]);
     }
 
-    /// A package whose `preinst` looks for what its Pre-Depends leave when they are configured.
+    /// Creates a package whose `preinst` checks for files that its Pre-Depends create when they are configured.
     fn package(directory: &Path, name: &str, fields: &str) -> String {
         let tree = directory.join(name);
         let control = format!(
@@ -132,7 +136,7 @@ mod tests {
         fs::create_dir_all(root.join("var/lib/dpkg/info")).expect("made");
         fs::write(root.join("var/lib/dpkg/status"), "").expect("written");
         fs::create_dir_all(given.join("steps")).expect("made");
-        // As systemd-sysv needs systemd, which needs some others.
+        // As systemd-sysv needs systemd, which needs further packages.
         let files = [
             package(place.path(), "init", "Depends: bolt\n"),
             package(place.path(), "bolt", ""),
@@ -141,7 +145,7 @@ mod tests {
         ];
         let debs = ["init", "bolt", "init-sysv", "last"].map(deb);
         let all = relations(&[("init-sysv", &["init"], &[])]);
-        for (name, text) in written(&steps(&debs, &all), &files) {
+        for (name, text) in script_files(&plan_steps(&debs, &all), &files) {
             fs::write(given.join("steps").join(name), text).expect("written");
         }
         let script = include_str!("inside/install.sh")

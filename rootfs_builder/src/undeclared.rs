@@ -1,39 +1,46 @@
-//! Python modules that programs of an image import and that the image lacks. Each would end its node as it starts, one after
-//! the other; here all are told at once, before that.
+//! Finds Python modules that programs of an image import and the image lacks. Each would make its node exit at startup,
+//! one after the other; here all are reported at once in advance.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use foreign::{Found, Tree};
+use foreign::{DirectoryLookup, Tree};
 use package::inventory::Inventory;
 
-use crate::advice::Known;
+use crate::advice::AdviceIndex;
 use crate::imports;
 
-/// The largest program that is looked into.
+/// Maximum size of a program that is inspected, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
-/// Below an install space.
+/// Directory of modules in an install space.
 const MODULES: &str = "lib/python3/dist-packages";
 const LIBRARIES: &str = "usr/lib";
 
-/// Advice for each. `trees`: extracted layers, lowest first. What cannot be read is not judged. Blocking.
-pub(crate) fn advice(trees: &[PathBuf], inventory: &Inventory, known: Known<'_>) -> Vec<String> {
+/// Returns advice for each missing module. `trees` are extracted layers, lowest first. Unreadable files are ignored.
+/// Blocking.
+pub(crate) fn missing_module_advice(
+    trees: &[PathBuf],
+    inventory: &Inventory,
+    known: AdviceIndex<'_>,
+) -> Vec<String> {
     let trees: Vec<Tree> = trees
         .iter()
         .filter_map(|tree| Tree::open(tree).ok())
         .collect();
     let shared = inventory.prefixes.iter();
-    let mut shared: Vec<PathBuf> = shared.map(|prefix| inside(prefix).join(MODULES)).collect();
+    let mut shared: Vec<PathBuf> = shared
+        .map(|prefix| relative_to_root(prefix).join(MODULES))
+        .collect();
     shared.extend(trees.iter().flat_map(standard_library));
     let mut told = BTreeSet::new();
     for (name, path) in &inventory.programs {
-        let path = inside(path);
+        let path = relative_to_root(path);
         let text = trees.iter().rev().find_map(|tree| {
-            let file = tree.file(path, MAX_BYTES).ok()??;
-            imports::of_program(&file.bytes)
+            let file = tree.read_file(path, MAX_BYTES).ok()??;
+            imports::program_imports(&file.bytes)
         });
         for module in text.unwrap_or_default() {
-            // Beside the program it is found first.
+            // Modules in the program's own directory are found first.
             let own = path.parent().map(Path::to_owned);
             let mut places = shared.iter().chain(&own);
             if places.any(|place| trees.iter().any(|tree| has_module(tree, place, &module))) {
@@ -49,14 +56,14 @@ pub(crate) fn advice(trees: &[PathBuf], inventory: &Inventory, known: Known<'_>)
     told.into_iter().collect()
 }
 
-/// An absolute path of the image, as one in a tree.
-fn inside(path: &str) -> &Path {
+/// Converts an absolute path of the image to one relative to a tree.
+fn relative_to_root(path: &str) -> &Path {
     Path::new(path.trim_start_matches('/'))
 }
 
-/// Where Python's own modules are: `usr/lib/python3.11`.
+/// Returns the directories of Python's own modules: `usr/lib/python3.11`.
 fn standard_library(tree: &Tree) -> Vec<PathBuf> {
-    let Ok(Found::Directory(libraries)) = tree.directory(LIBRARIES) else {
+    let Ok(DirectoryLookup::Directory(libraries)) = tree.open_directory(LIBRARIES) else {
         return Vec::new();
     };
     let names = libraries.names().unwrap_or_default().into_iter();
@@ -67,15 +74,17 @@ fn standard_library(tree: &Tree) -> Vec<PathBuf> {
 }
 
 fn has_module(tree: &Tree, place: &Path, module: &str) -> bool {
-    // A link leads somewhere, and a directory without `__init__.py` is a package of Python, too.
-    !matches!(tree.directory(place.join(module)), Ok(Found::Nothing))
-        || tree.has_file(place.join(format!("{module}.py")))
+    // A link points to something, and a directory without `__init__.py` is a Python package as well.
+    !matches!(
+        tree.open_directory(place.join(module)),
+        Ok(DirectoryLookup::Nothing)
+    ) || tree.has_file(place.join(format!("{module}.py")))
         || has_extension(tree, place, module)
 }
 
-/// Whether it is there as a library, such as `yaml.cpython-311-x86_64-linux-gnu.so`.
+/// Returns whether a module exists as an extension, such as `yaml.cpython-311-x86_64-linux-gnu.so`.
 fn has_extension(tree: &Tree, place: &Path, module: &str) -> bool {
-    let Ok(Found::Directory(directory)) = tree.directory(place) else {
+    let Ok(DirectoryLookup::Directory(directory)) = tree.open_directory(place) else {
         return false;
     };
     let start = format!("{module}.");
@@ -137,7 +146,7 @@ mod tests {
             )
         };
         assert_eq!(
-            advice(&trees, &inventory, Known::of_one(&contents)),
+            missing_module_advice(&trees, &inventory, AdviceIndex::for_ros1(&contents)),
             [told("cv2"), told("numpy")]
         );
     }

@@ -1,12 +1,12 @@
-//! The packages of a workspace, each compiled by itself and kept by itself.
+//! Separate compilation and caching of the packages of a workspace.
 //!
-//! A package sees its own sources, what of the pushed tree is no package's, and the install spaces of the packages
-//! that its package.xml names (and of those that they name), put over each other like layers. That is all its key is
-//! made of, so a change costs the changed package and those that need it, and what was compiled before another
-//! package failed stays compiled.
+//! A package sees its own sources, the files of the pushed tree outside all packages, and the install spaces of the
+//! packages that its package.xml names (and of their dependencies), stacked like layers. Its key covers exactly that,
+//! so a change affects only the changed package and those that depend on it, and packages compiled before a failure
+//! stay compiled.
 //!
-//! Some packages use others that they do not name, because they happen to come earlier. Where one fails for want of
-//! something it was not shown, it is compiled again with everything in sight, and its key says so.
+//! Some packages use others without declaring it, which works because those happen to be built before. If such a
+//! package fails because something is missing, it is compiled again with everything visible, and its key covers that.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -23,14 +23,14 @@ use ros::flavour::Version;
 use rustix::fs::FileType;
 
 use crate::build::Build;
-use crate::compile::{self, Compiled, Log, Order, Task, Unit};
-use crate::error::{Error, IoAt};
-use crate::install::{Made, set_mode};
+use crate::compile::{self, BuildLog, BuildUnit, CompileOrder, CompileOutput, Task};
+use crate::error::{Error, IoContext};
+use crate::install::{LayerSet, set_mode};
 use crate::key::{self, Key};
-use crate::merge::lay_over;
-use crate::workshop::Packing;
+use crate::merge::overlay_tree;
+use crate::workshop::PackJob;
 
-/// What of a package.xml counts as needing another package of the workspace.
+/// Kinds of dependencies that make another package of the workspace visible.
 const NEEDS: [Kind; 5] = [
     Kind::Buildtool,
     Kind::BuildtoolExport,
@@ -39,10 +39,11 @@ const NEEDS: [Kind; 5] = [
     Kind::Exec,
 ];
 
-/// More install spaces than this are put into one directory for a container: the kernel mounts 500 layers at most.
+/// Maximum number of install spaces mounted separately in a container; more are merged into one directory, since the
+/// kernel mounts at most 500 layers.
 const MOST_SPACES: usize = 64;
 
-/// What compilers, linkers, CMake and Python say when something is not there.
+/// Messages of compilers, linkers, CMake and Python about missing files.
 const ABSENT: [&str; 7] = [
     "No such file or directory",
     "cannot find",
@@ -53,32 +54,32 @@ const ABSENT: [&str; 7] = [
     "does not exist",
 ];
 
-/// Packages with what their keys are made of.
-struct Units {
+/// Packages of a workspace, with the inputs of their keys.
+struct WorkspaceUnits {
     root: PathBuf,
-    units: Vec<Unit>,
-    /// Of each, those before it that it needs, directly or not.
+    units: Vec<BuildUnit>,
+    /// For each package, its direct and indirect dependencies among the earlier ones.
     needs: Vec<Vec<usize>>,
-    /// Of each, the hash of its own sources.
+    /// For each package, the hash of its own sources.
     sources: Vec<String>,
-    /// Of everything pushed.
+    /// Hash of everything that was pushed.
     all: String,
-    /// What no package holds, and its hash.
+    /// Directory with the files outside all packages; its hash is `rest_hash`.
     rest: PathBuf,
     rest_hash: String,
-    /// What all of them are compiled with.
+    /// Key of the common build environment.
     ground: String,
 }
 
-/// Whether a package sees all or only what it names.
+/// Visibility of the sources to a package: everything, or only its declared dependencies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Sight {
+enum SourceVisibility {
     Named,
     All,
 }
 
-impl Units {
-    /// Reads the sources of a workspace. `place`: an empty directory of this build. Blocking.
+impl WorkspaceUnits {
+    /// Reads the sources of a workspace. `place` is an empty directory of this build. Blocking.
     fn read(
         workspace: &Workspace,
         build_key: String,
@@ -87,69 +88,69 @@ impl Units {
     ) -> Result<Self, Error> {
         let packages = &workspace.packages;
         let root = workspace.root.clone();
-        compile::open_up(&root)?;
+        compile::make_readable(&root)?;
         let mut own = BTreeSet::new();
         let mut sources = Vec::new();
         for package in packages {
-            // It may stand behind a link that stays inside, as the workspace was searched.
+            // The package may be behind a link that stays inside, as in the search of the workspace.
             let directory = root.join(&package.path);
-            let directory = directory.canonicalize().at("opening", &directory)?;
-            sources.push(key::sources(&directory)?);
+            let directory = directory.canonicalize().io_context("opening", &directory)?;
+            sources.push(key::hash_sources(&directory)?);
             own.insert(directory);
         }
         let rest = place.join("rest");
-        fs::create_dir(&rest).at("making", &rest)?;
+        fs::create_dir(&rest).io_context("making", &rest)?;
         if !own.contains(&root) {
             link_tree(&root, &rest, &own)?;
         }
         Ok(Self {
-            units: packages.iter().map(unit).collect(),
-            needs: needs(packages),
+            units: packages.iter().map(unit_from_package).collect(),
+            needs: resolve_needs(packages),
             sources,
-            all: key::sources(&root)?,
-            rest_hash: key::sources(&rest)?,
+            all: key::hash_sources(&root)?,
+            rest_hash: key::hash_sources(&rest)?,
             rest,
             root,
             ground: Key::new("unit-ground")
-                .with("build", build_key)
-                .with_all("below", below.iter().map(Digest::to_string))
+                .input("build", build_key)
+                .inputs("below", below.iter().map(Digest::to_string))
                 .finish(),
         })
     }
 
-    /// The key of a package. `keys`: those of all before it.
-    fn key(&self, index: usize, sight: Sight, keys: &[String]) -> String {
+    /// Returns the key of a package; `keys` are those of all earlier packages.
+    fn key(&self, index: usize, sight: SourceVisibility, keys: &[String]) -> String {
         let unit = &self.units[index];
-        let key = Key::new("unit").with("ground", &self.ground).with(
+        let key = Key::new("unit").input("ground", &self.ground).input(
             "unit",
             format!("{} {} {}", unit.name, unit.path.display(), unit.build_type),
         );
         match sight {
-            Sight::Named => key
-                .with("sees", "named")
-                .with("sources", &self.sources[index])
-                .with("rest", &self.rest_hash)
-                .with_all("needs", self.needs[index].iter().map(|&need| &keys[need])),
-            Sight::All => key
-                .with("sees", "all")
-                .with("sources", &self.all)
-                .with_all("needs", &keys[..index]),
+            SourceVisibility::Named => key
+                .input("sees", "named")
+                .input("sources", &self.sources[index])
+                .input("rest", &self.rest_hash)
+                .inputs("needs", self.needs[index].iter().map(|&need| &keys[need])),
+            SourceVisibility::All => key
+                .input("sees", "all")
+                .input("sources", &self.all)
+                .inputs("needs", &keys[..index]),
         }
         .finish()
     }
 
-    /// Names of earlier packages that a package is not shown.
-    fn hidden(&self, index: usize) -> Vec<&str> {
+    /// Returns the names of earlier packages that are not visible to a package.
+    fn hidden_packages(&self, index: usize) -> Vec<&str> {
         (0..index)
             .filter(|earlier| !self.needs[index].contains(earlier))
             .map(|earlier| self.units[earlier].name.as_str())
             .collect()
     }
 
-    /// Whether what a build said may come from what it was not shown: it misses something, and that may be in a
-    /// package before it that it does not name, or is looked for among another package's sources.
+    /// Returns whether a failed build may be due to limited visibility: its output reports something missing that may
+    /// be in an earlier, undeclared package, or among another package's sources.
     fn misses_something(&self, index: usize, said: &str) -> bool {
-        let hidden = self.hidden(index);
+        let hidden = self.hidden_packages(index);
         let elsewhere = |line: &str| {
             let others = self.units.iter().enumerate();
             others
@@ -163,34 +164,34 @@ impl Units {
         })
     }
 
-    /// A directory with what a package may see of the sources. Blocking.
-    fn view(&self, index: usize, place: &Path) -> Result<PathBuf, Error> {
+    /// Creates a directory with the sources visible to a package. Blocking.
+    fn make_view(&self, index: usize, place: &Path) -> Result<PathBuf, Error> {
         let path = &self.units[index].path;
         if path.as_os_str().is_empty() {
             return Ok(self.root.clone());
         }
         let view = place.join(format!("view-{index}"));
-        fs::create_dir_all(view.join(path)).at("making", &view)?;
+        fs::create_dir_all(view.join(path)).io_context("making", &view)?;
         let from = self.root.join(path);
-        let from = from.canonicalize().at("opening", &from)?;
+        let from = from.canonicalize().io_context("opening", &from)?;
         link_tree(&from, &view.join(path), &BTreeSet::new())?;
         link_tree(&self.rest, &view, &BTreeSet::new())?;
-        // The directories are new, and the compiling user is another.
-        compile::open_up(&view)?;
+        // The directories are new, and the compiling user is a different one.
+        compile::make_readable(&view)?;
         Ok(view)
     }
 }
 
-fn unit(package: &Package) -> Unit {
-    Unit {
+fn unit_from_package(package: &Package) -> BuildUnit {
+    BuildUnit {
         name: package.manifest.name.clone(),
         path: package.path.clone(),
         build_type: package.manifest.build_type.clone(),
     }
 }
 
-/// Of each package, the earlier ones that it needs, and those that they need.
-fn needs(packages: &[Package]) -> Vec<Vec<usize>> {
+/// Returns, for each package, its direct and indirect dependencies among the earlier ones.
+fn resolve_needs(packages: &[Package]) -> Vec<Vec<usize>> {
     let mut all: Vec<Vec<usize>> = Vec::new();
     for (index, package) in packages.iter().enumerate() {
         let named = package.manifest.needs(&NEEDS);
@@ -208,26 +209,26 @@ fn needs(packages: &[Package]) -> Vec<Vec<usize>> {
     all
 }
 
-/// Links all files below `from` into `to`, without the directories in `skip` and what version control keeps at the
-/// top of a workspace; what is in `to` already stays. Blocking.
+/// Links all files below `from` into `to`, except the directories in `skip` and those of version control at the top of
+/// a workspace; existing files in `to` are kept. Blocking.
 fn link_tree(from: &Path, to: &Path, skip: &BTreeSet<PathBuf>) -> Result<(), Error> {
     foreign::walk(from, |entry| {
         if entry.path.as_os_str().is_empty() {
             return Ok(Visit::Into);
         }
-        let (path, target) = (entry.shown(), to.join(entry.path));
+        let (path, target) = (entry.display_path(), to.join(entry.path));
         match entry.kind() {
             FileType::Directory if skip.contains(&path) => return Ok(Visit::Skip),
             FileType::Directory if target.is_dir() => {}
-            FileType::Directory => fs::create_dir(&target).at("making", &target)?,
+            FileType::Directory => fs::create_dir(&target).io_context("making", &target)?,
             _ if target.symlink_metadata().is_ok() => {}
             FileType::Symlink => {
-                let link = OsString::from_vec(entry.link()?);
-                std::os::unix::fs::symlink(link, &target).at("linking", &target)?;
+                let link = OsString::from_vec(entry.read_link()?);
+                std::os::unix::fs::symlink(link, &target).io_context("linking", &target)?;
             }
             _ => {
                 if fs::hard_link(&path, &target).is_err() {
-                    fs::copy(&path, &target).at("copying", &path)?;
+                    fs::copy(&path, &target).io_context("copying", &path)?;
                 }
             }
         }
@@ -235,23 +236,23 @@ fn link_tree(from: &Path, to: &Path, skip: &BTreeSet<PathBuf>) -> Result<(), Err
     })
 }
 
-/// The package layer: of packages from the cache as far as they are there, and compiled now. `below`: base, toolchain
-/// and build dependencies.
-pub(crate) async fn compiled(
+/// Returns the package layer: packages from the cache as far as possible, and others compiled now. `below` are base,
+/// toolchain and build dependencies.
+pub(crate) async fn compile_workspace(
     build: &Build<'_>,
     workspace: Workspace,
     below: Vec<Digest>,
-) -> Result<Made, Error> {
+) -> Result<LayerSet, Error> {
     let shop = &build.shop;
-    let place = shop.site.fresh("sources")?;
+    let place = shop.site.fresh_directory("sources")?;
     let units = {
         let (below, place) = (below.clone(), place.clone());
         let key = build.base.build_key();
-        let read = move || Units::read(&workspace, key, &below, &place);
+        let read = move || WorkspaceUnits::read(&workspace, key, &below, &place);
         Arc::new(crate::blocking::spawn(read).await??)
     };
     let count = units.units.len();
-    let mut making = Making {
+    let mut making = WorkspaceBuild {
         build,
         units,
         below,
@@ -259,51 +260,51 @@ pub(crate) async fn compiled(
         keys: Vec::new(),
         diff_ids: Vec::new(),
     };
-    let missing = making.missing().await?;
+    let missing = making.find_missing().await?;
     if missing.is_empty()
-        && let Some(diff_id) = fetched(build, &making.whole_key()).await?
+        && let Some(diff_id) = cached_layer(build, &making.whole_key()).await?
     {
-        return Ok(Made::one(diff_id, true));
+        return Ok(LayerSet::single(diff_id, true));
     }
-    let mut log = Log::create(&build.log)?;
+    let mut log = BuildLog::create(&build.log)?;
     if missing.len() > 1 {
-        making.check(&missing, &mut log).await?;
+        making.check_packages(&missing, &mut log).await?;
     }
     for index in 0..count {
         if making.diff_ids[index].is_none() {
-            making.unit(index, &mut log).await?;
+            making.build_unit(index, &mut log).await?;
         }
     }
-    making.merged().await
+    making.merge_layers().await
 }
 
-/// The layer of a key in the cache.
-async fn fetched(build: &Build<'_>, key: &str) -> Result<Option<Digest>, Error> {
-    let entry = build.shop.cached(key).await?;
+/// Returns the cached layer of a key.
+async fn cached_layer(build: &Build<'_>, key: &str) -> Result<Option<Digest>, Error> {
+    let entry = build.shop.get_cached(key).await?;
     Ok(entry
         .and_then(|entry| entry.layer)
         .map(|layer| layer.diff_id))
 }
 
-/// A workspace while its packages become layers.
-struct Making<'a> {
+/// State of compiling a workspace.
+struct WorkspaceBuild<'a> {
     build: &'a Build<'a>,
-    units: Arc<Units>,
+    units: Arc<WorkspaceUnits>,
     below: Vec<Digest>,
-    /// For views of the sources.
+    /// Directory for the visible sources of each package.
     place: PathBuf,
-    /// Of each package: what it has in the cache, or would have if it is compiled with what it names.
+    /// For each package, its key in the cache, or the one it will have if it compiles with its declared dependencies.
     keys: Vec<String>,
-    /// Of each package that is compiled and at hand.
+    /// For each package, its layer if it is compiled and extracted.
     diff_ids: Vec<Option<Digest>>,
 }
 
-impl Making<'_> {
-    /// Finds all keys; gives the packages that are not in the cache.
-    async fn missing(&mut self) -> Result<Vec<usize>, Error> {
+impl WorkspaceBuild<'_> {
+    /// Computes all keys; returns the packages that are not in the cache.
+    async fn find_missing(&mut self) -> Result<Vec<usize>, Error> {
         let mut missing = Vec::new();
         for index in 0..self.units.units.len() {
-            let (key, found) = self.look(index).await?;
+            let (key, found) = self.find_key(index).await?;
             if !found {
                 missing.push(index);
             }
@@ -313,15 +314,15 @@ impl Making<'_> {
         Ok(missing)
     }
 
-    /// The key under which a package is in the cache, or the one it is to have.
-    async fn look(&self, index: usize) -> Result<(String, bool), Error> {
-        let named = self.units.key(index, Sight::Named, &self.keys);
-        let all = self.units.key(index, Sight::All, &self.keys);
+    /// Returns the key of a package, and whether it is in the cache.
+    async fn find_key(&self, index: usize) -> Result<(String, bool), Error> {
+        let named = self.units.key(index, SourceVisibility::Named, &self.keys);
+        let all = self.units.key(index, SourceVisibility::All, &self.keys);
         let layers = self.build.shop.layers.clone();
         Ok(crate::blocking::spawn(move || {
-            if layers.has(&named) {
+            if layers.contains(&named) {
                 (named, true)
-            } else if layers.has(&all) {
+            } else if layers.contains(&all) {
                 (all, true)
             } else {
                 (named, false)
@@ -330,12 +331,12 @@ impl Making<'_> {
         .await?)
     }
 
-    /// Looks at all packages that are not compiled yet, on those that are: see [`Task::Check`].
-    async fn check(&mut self, missing: &[usize], log: &mut Log) -> Result<(), Error> {
+    /// Checks all packages that are not compiled yet, on top of those that are; see [`Task::Check`].
+    async fn check_packages(&mut self, missing: &[usize], log: &mut BuildLog) -> Result<(), Error> {
         let build = self.build;
         for index in 0..self.keys.len() {
             if !missing.contains(&index) {
-                self.diff_ids[index] = fetched(build, &self.keys[index]).await?;
+                self.diff_ids[index] = cached_layer(build, &self.keys[index]).await?;
             }
         }
         let doing = match build.base.ros {
@@ -348,9 +349,9 @@ impl Making<'_> {
             .await;
         let there: Vec<usize> = (0..self.keys.len()).collect();
         let place = |need: &usize| missing.iter().position(|index| index == need);
-        let order = Order {
+        let order = CompileOrder {
             base: &build.base,
-            layers: self.trees(&there).await?,
+            layers: self.layer_trees(&there).await?,
             source: &self.units.root,
             units: missing
                 .iter()
@@ -361,40 +362,40 @@ impl Making<'_> {
                 .collect(),
             workspace: &self.units.units,
         };
-        let directory = compile::run(&build.shop, Task::Check, &order, log, build.progress)
+        let directory = compile::run_task(&build.shop, Task::Check, &order, log, build.progress)
             .await?
             .directory;
         crate::blocking::spawn(move || Ok(foreign::remove(&directory)?)).await?
     }
 
-    /// One package: from the cache, or compiled now.
-    async fn unit(&mut self, index: usize, log: &mut Log) -> Result<(), Error> {
+    /// Gets a package from the cache, or compiles it.
+    async fn build_unit(&mut self, index: usize, log: &mut BuildLog) -> Result<(), Error> {
         let build = self.build;
-        let named = self.units.key(index, Sight::Named, &self.keys);
-        let turn = build.shop.turn(&named).await;
-        let (key, found) = self.look(index).await?;
-        if found && let Some(diff_id) = fetched(build, &key).await? {
+        let named = self.units.key(index, SourceVisibility::Named, &self.keys);
+        let turn = build.shop.lock_key(&named).await;
+        let (key, found) = self.find_key(index).await?;
+        if found && let Some(diff_id) = cached_layer(build, &key).await? {
             (self.keys[index], self.diff_ids[index]) = (key, Some(diff_id));
             return Ok(());
         }
         let (units, place) = (self.units.clone(), self.place.clone());
-        let view = crate::blocking::spawn(move || units.view(index, &place)).await??;
+        let view = crate::blocking::spawn(move || units.make_view(index, &place)).await??;
         let begun = log.len();
         let needs = self.units.needs[index].clone();
-        let (key, made, turn) = match self.attempt(index, &needs, &view, log).await {
+        let (key, made, turn) = match self.compile_unit(index, &needs, &view, log).await {
             Ok(made) => (named, made, turn),
             Err(Error::BuildFailed { .. })
-                if self.units.misses_something(index, &log.since(begun)) =>
+                if self.units.misses_something(index, &log.text_since(begun)) =>
             {
                 drop(turn);
-                let key = self.units.key(index, Sight::All, &self.keys);
-                let turn = build.shop.turn(&key).await;
+                let key = self.units.key(index, SourceVisibility::All, &self.keys);
+                let turn = build.shop.lock_key(&key).await;
                 let earlier: Vec<usize> = (0..index).collect();
                 let root = self.units.root.clone();
-                let made = self.attempt(index, &earlier, &root, log).await?;
+                let made = self.compile_unit(index, &earlier, &root, log).await?;
                 let text = format!(
-                    "{} uses other packages of the workspace that its package.xml does not name: it is compiled \
-                     again whenever any of them changes",
+                    "{} uses packages of the workspace that its package.xml does not name, so it is recompiled when \
+                        any package changes",
                     self.units.units[index].name
                 );
                 build.progress.warn(text).await;
@@ -402,7 +403,7 @@ impl Making<'_> {
             }
             Err(error) => return Err(error),
         };
-        let packing = Packing {
+        let packing = PackJob {
             key: key.clone(),
             made_from: vec![self.units.units[index].name.clone()],
             tree: made.tree,
@@ -415,40 +416,42 @@ impl Making<'_> {
         Ok(())
     }
 
-    /// Compiles one package on some of those before it.
-    async fn attempt(
+    /// Compiles a package on top of some of the earlier ones.
+    async fn compile_unit(
         &self,
         index: usize,
         on: &[usize],
         source: &Path,
-        log: &mut Log,
-    ) -> Result<Compiled, Error> {
+        log: &mut BuildLog,
+    ) -> Result<CompileOutput, Error> {
         let build = self.build;
-        let order = Order {
+        let order = CompileOrder {
             base: &build.base,
-            layers: self.trees(on).await?,
+            layers: self.layer_trees(on).await?,
             source,
             units: vec![(&self.units.units[index], Vec::new())],
             workspace: &self.units.units,
         };
-        compile::run(&build.shop, Task::Compile, &order, log, build.progress).await
+        compile::run_task(&build.shop, Task::Compile, &order, log, build.progress).await
     }
 
-    /// Trees of what is below all, and of those of these packages that are at hand.
-    async fn trees(&self, packages: &[usize]) -> Result<Vec<PathBuf>, Error> {
+    /// Returns the trees of the common layers, and of those of these packages that are available.
+    async fn layer_trees(&self, packages: &[usize]) -> Result<Vec<PathBuf>, Error> {
         let shop = &self.build.shop;
-        let mut trees = shop.extracted(&self.below).await?;
+        let mut trees = shop.extract_layers(&self.below).await?;
         let packages = packages.iter().filter_map(|&index| self.diff_ids[index]);
         let packages: Vec<Digest> = packages.collect();
-        let spaces = shop.extracted(&packages).await?;
+        let spaces = shop.extract_layers(&packages).await?;
         if spaces.len() <= MOST_SPACES {
             trees.extend(spaces);
         } else {
-            let whole = shop.site.fresh("spaces")?;
+            let whole = shop.site.fresh_directory("spaces")?;
             set_mode(&whole, 0o755)?;
             let into = whole.clone();
             crate::blocking::spawn(move || {
-                spaces.iter().try_for_each(|space| lay_over(space, &into))
+                spaces
+                    .iter()
+                    .try_for_each(|space| overlay_tree(space, &into))
             })
             .await??;
             trees.push(whole);
@@ -457,27 +460,27 @@ impl Making<'_> {
     }
 
     fn whole_key(&self) -> String {
-        Key::new("workspace").with_all("unit", &self.keys).finish()
+        Key::new("workspace").inputs("unit", &self.keys).finish()
     }
 
-    /// The layer of the image: all packages over each other, as if they had been installed one after the other.
-    async fn merged(self) -> Result<Made, Error> {
+    /// Merges all packages into the layer of the image, as if they had been installed one after the other.
+    async fn merge_layers(self) -> Result<LayerSet, Error> {
         let shop = &self.build.shop;
         let key = self.whole_key();
-        let turn = shop.turn(&key).await;
-        if let Some(diff_id) = fetched(self.build, &key).await? {
-            return Ok(Made::one(diff_id, true));
+        let turn = shop.lock_key(&key).await;
+        if let Some(diff_id) = cached_layer(self.build, &key).await? {
+            return Ok(LayerSet::single(diff_id, true));
         }
         self.build.progress.step("packing the package").await;
-        let directory = shop.site.fresh("package")?;
+        let directory = shop.site.fresh_directory("package")?;
         let tree = directory.join("tree");
-        fs::create_dir(&tree).at("making", &tree)?;
+        fs::create_dir(&tree).io_context("making", &tree)?;
         let diff_ids: Vec<Digest> = self.diff_ids.iter().copied().flatten().collect();
-        let (trees, into) = (shop.extracted(&diff_ids).await?, tree.clone());
-        crate::blocking::spawn(move || trees.iter().try_for_each(|tree| lay_over(tree, &into)))
+        let (trees, into) = (shop.extract_layers(&diff_ids).await?, tree.clone());
+        crate::blocking::spawn(move || trees.iter().try_for_each(|tree| overlay_tree(tree, &into)))
             .await??;
         let made_from = self.units.units.iter().map(|unit| unit.name.clone());
-        let packing = Packing {
+        let packing = PackJob {
             key,
             made_from: made_from.collect(),
             tree,
@@ -486,7 +489,7 @@ impl Making<'_> {
             turn,
         };
         let diff_id = shop.pack(packing, |_| Ok(())).await?;
-        Ok(Made::one(diff_id, false))
+        Ok(LayerSet::single(diff_id, false))
     }
 }
 

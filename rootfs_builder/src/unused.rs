@@ -1,24 +1,24 @@
-//! Removes from the cache what has not been used for a long time, and beyond its size what was not used for longest. Everything there can
-//! be made or fetched again.
+//! Cleanup of the cache: removes what has not been used for a long time, and the least recently used files beyond its
+//! maximum size. Everything in the cache can be built or fetched again.
 
 use std::fs::{self, File};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-/// What was not used for so long is removed.
+/// Time after which unused files are removed.
 const KEEP: Duration = Duration::from_secs(90 * 24 * 3600);
-/// Uses within this time of each other are noted once.
+/// Interval within which repeated uses are recorded only once.
 const NOTED: Duration = Duration::from_secs(60);
-/// How often it is looked for what was not used for long.
+/// Interval of the search for unused files.
 const LOOKED_EVERY: Duration = Duration::from_secs(24 * 3600);
-/// What was used within this time stays, however much there is: a build may be about to read it.
+/// Files used within this time are kept regardless of the size, since a build may be about to read them.
 const IN_USE: Duration = Duration::from_secs(15 * 60);
-/// Tells when it was looked last.
+/// File whose time is that of the last search.
 const LOOKED: &str = "unused-looked-for";
 
-/// Notes that a file of the cache is in use: its time of modification is now.
-pub(crate) fn used(path: &Path) {
+/// Marks a file of the cache as used, by setting its modification time.
+pub(crate) fn mark_used(path: &Path) {
     let note = || {
         let file = File::open(path)?;
         let noted = file.metadata()?.modified()?;
@@ -27,11 +27,11 @@ pub(crate) fn used(path: &Path) {
         }
         Ok::<_, std::io::Error>(())
     };
-    // It may be gone; that costs making it again.
+    // It may have been removed; then it is built again.
     let _ = note();
 }
 
-/// Removes what was not used for long, once a day. Blocking.
+/// Removes files that have not been used for long, once a day. Blocking.
 pub(crate) fn sweep(cache: &Path) {
     let looked = cache.join(LOOKED);
     let lately = fs::metadata(&looked)
@@ -40,15 +40,19 @@ pub(crate) fn sweep(cache: &Path) {
     if lately || fs::write(&looked, "").is_err() {
         return;
     }
-    for file in files(cache).iter().filter(|file| age(file.used) > KEEP) {
-        // What is in use by now is made again. Directories stay: something may be about to be put into them.
+    for file in cache_files(cache)
+        .iter()
+        .filter(|file| age(file.used) > KEEP)
+    {
+        // A file that came into use meanwhile is built again. Directories are kept, since a file may be about to be
+        // created in them.
         let _ = fs::remove_file(&file.path);
     }
 }
 
-/// Removes files that were not used for longest, until those that are left take at most `most` bytes. Blocking.
+/// Removes the least recently used files until the rest takes at most `most` bytes. Blocking.
 pub(crate) fn shrink(cache: &Path, most: u64) {
-    let mut files = files(cache);
+    let mut files = cache_files(cache);
     let mut total: u64 = files.iter().map(|file| file.bytes).sum();
     if total <= most {
         return;
@@ -64,29 +68,29 @@ pub(crate) fn shrink(cache: &Path, most: u64) {
         }
     }
     tracing::info!(
-        "removed {} MB of the cache {}, of which {most} bytes are kept at most",
+        "removed {} MB of the cache {}; its limit is {most} bytes",
         (before - total) >> 20,
         cache.display()
     );
 }
 
 /// A file that may be removed.
-struct Cached {
+struct CachedFile {
     path: PathBuf,
-    /// When it was used last.
+    /// Time of the last use.
     used: SystemTime,
-    /// On the disk.
+    /// Disk usage in bytes.
     bytes: u64,
 }
 
-/// All files of the cache that can be made again one by one.
-fn files(cache: &Path) -> Vec<Cached> {
+/// Returns all files of the cache that can be rebuilt individually.
+fn cache_files(cache: &Path) -> Vec<CachedFile> {
     let mut directories: Vec<PathBuf> = ["layers", "notes"].map(|name| cache.join(name)).into();
     for name in ["chains", crate::wheels::DOWNLOADS] {
-        directories.extend(below(&cache.join(name)));
+        directories.extend(list_directory(&cache.join(name)));
     }
-    for archive in below(&cache.join("apt")) {
-        directories.extend(below(&archive).into_iter().filter(|path| {
+    for archive in list_directory(&cache.join("apt")) {
+        directories.extend(list_directory(&archive).into_iter().filter(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             name == "archives" || name.starts_with("members-") || name.starts_with("imports-")
         }));
@@ -94,22 +98,24 @@ fn files(cache: &Path) -> Vec<Cached> {
     let cached = |path: PathBuf| {
         let about = fs::symlink_metadata(&path).ok()?;
         about.is_file().then_some(())?;
-        Some(Cached {
+        Some(CachedFile {
             used: about.modified().ok()?,
             bytes: about.blocks() * 512,
             path,
         })
     };
-    let files = directories.iter().flat_map(|directory| below(directory));
+    let files = directories
+        .iter()
+        .flat_map(|directory| list_directory(directory));
     files.filter_map(cached).collect()
 }
 
-fn below(directory: &Path) -> Vec<PathBuf> {
+fn list_directory(directory: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
     entries.map(|entry| entry.path()).collect()
 }
 
-/// Nothing for a time in the future.
+/// Returns the age of a time; zero for a time in the future.
 fn age(time: SystemTime) -> Duration {
     time.elapsed().unwrap_or_default()
 }
@@ -142,9 +148,9 @@ mod tests {
         let old = kinds.map(|kind| file(&format!("{kind}/old")));
         let again = kinds.map(|kind| file(&format!("{kind}/used-again")));
         for path in &again {
-            used(path);
+            mark_used(path);
         }
-        // Not by itself, but as a part of what apt keeps.
+        // Not removed by itself, but as a part of apt's directory.
         let list = file("apt/lab/state/lists/list");
         let earlier = file("apt/lab/members-0/old");
         let lock = file("apt/lab/lock");
@@ -153,7 +159,7 @@ mod tests {
         assert!(again.iter().all(|path| path.exists()), "{again:?}");
         assert!(list.exists() && lock.exists());
         assert!(!earlier.exists());
-        // It is looked once a day.
+        // The search takes place once a day.
         let old = file("notes/old");
         sweep(cache.path());
         assert!(old.exists());
@@ -170,16 +176,16 @@ mod tests {
             let file = File::open(&path).expect("there");
             let time = now - Duration::from_secs(3600) * hours;
             file.set_modified(time).expect("set");
-            // Else its blocks may not be counted yet.
+            // Otherwise its blocks may not be counted yet.
             file.sync_all().expect("on the disk");
             path
         };
         let oldest = file("apt/lab/archives/oldest.deb", 30);
         let older = file("layers/older.tar.gz", 20);
         let newer = file("chains/ground/newer", 10);
-        // Used again since.
+        // Used again meanwhile.
         let again = file("layers/again.tar.gz", 40);
-        used(&again);
+        mark_used(&again);
         let all = [&oldest, &older, &newer, &again];
         let left = || all.map(|path| path.exists());
         shrink(cache.path(), 5 << 20);

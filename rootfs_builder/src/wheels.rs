@@ -1,5 +1,5 @@
-//! Layers of Python packages that bring ROS: downloaded by the host's pip, as pinned, and put below a prefix by the base's own
-//! Python in a container without network.
+//! Layers of Python packages that provide ROS: downloaded by the host's pip as pinned, and installed below a prefix by
+//! the base's own Python in a container without network.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,106 +11,106 @@ use servant::container::{Mount, Profile};
 
 use crate::base::{Base, Wheels};
 use crate::bootstrap::{EPOCH, tree_options};
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::event::Progress;
-use crate::install::{Made, lay_out, link_or_copy, set_mode};
+use crate::install::{LayerSet, link_or_copy, set_mode, write_tree};
 use crate::key::Key;
 use crate::process::{self, Stream};
 use crate::requirements::Requirements;
-use crate::sandbox::Run;
+use crate::sandbox::SandboxRun;
 use crate::unused;
-use crate::workshop::{Packing, Workshop};
+use crate::workshop::{BuildContext, PackJob};
 
 const INSTALL: &str = include_str!("inside/wheels.py");
 
-/// Where downloaded wheels are, below the cache: a directory for each list of requirements.
+/// Directory of downloaded wheels in the cache, with a subdirectory for each list of requirements.
 pub(crate) const DOWNLOADS: &str = "wheels";
 
-/// A base layer, and on top of it the one with the wheels that every image of this base has.
-pub(crate) async fn on_base(
-    shop: &Workshop,
+/// Adds the layer with the wheels of every image of this base to a base layer.
+pub(crate) async fn add_runtime_wheels(
+    shop: &BuildContext,
     base: &Base,
-    mut made: Made,
+    mut made: LayerSet,
     progress: &Progress,
-) -> Result<Made, Error> {
+) -> Result<LayerSet, Error> {
     if let Some(wheels) = &base.wheels {
         let below: Vec<Digest> = made.diff_ids().collect();
-        let part = Part {
+        let part = WheelSet {
             name: "base",
             wheels,
             wanted: &base.required.runtime,
             files: Some(&wheels.files),
         };
-        let more = layer(shop, base, &part, &below, progress).await?;
+        let more = wheel_layer(shop, base, &part, &below, progress).await?;
         made.layers.extend(more.layers);
     }
     Ok(made)
 }
 
-/// The layer with the wheels that are there while a package is compiled. `below`: base and toolchain.
-pub(crate) async fn to_compile(
-    shop: &Workshop,
+/// Returns the layer with the wheels present only while a package is compiled. `below` are base and toolchain.
+pub(crate) async fn add_build_wheels(
+    shop: &BuildContext,
     base: &Base,
     below: &[Digest],
     progress: &Progress,
-) -> Result<Made, Error> {
+) -> Result<LayerSet, Error> {
     let Some(wheels) = &base.wheels else {
-        return Ok(Made::default());
+        return Ok(LayerSet::default());
     };
-    let part = Part {
+    let part = WheelSet {
         name: "toolchain",
         wheels,
         wanted: &base.required.build,
         files: None,
     };
-    layer(shop, base, &part, below, progress).await
+    wheel_layer(shop, base, &part, below, progress).await
 }
 
-/// Packages that make one layer.
-struct Part<'a> {
-    /// Of what, for people.
+/// Python packages of one layer.
+struct WheelSet<'a> {
+    /// Name of the layer, for messages.
     name: &'static str,
     wheels: &'a Wheels,
     wanted: &'a Requirements,
-    /// Files that come with them.
+    /// Additional files.
     files: Option<&'a BTreeMap<PathBuf, String>>,
 }
 
-/// The layer of a part, on top of `below`, which has Python.
-async fn layer(
-    shop: &Workshop,
+/// Returns the layer of a set of wheels, on top of `below`, which contains Python.
+async fn wheel_layer(
+    shop: &BuildContext,
     base: &Base,
-    part: &Part<'_>,
+    part: &WheelSet<'_>,
     below: &[Digest],
     progress: &Progress,
-) -> Result<Made, Error> {
-    let Part {
+) -> Result<LayerSet, Error> {
+    let WheelSet {
         name,
         wheels,
         wanted,
         ..
     } = *part;
     if wanted.len() == 0 {
-        return Ok(Made::default());
+        return Ok(LayerSet::default());
     }
     let key = Key::new("wheels")
-        .with("script", INSTALL)
-        .with(
+        .input("script", INSTALL)
+        .input(
             "strip",
             serde_json::to_string(&base.strip).unwrap_or_default(),
         )
-        .with("wheels", serde_json::to_string(wheels).unwrap_or_default())
-        .with("requirements", wanted.key())
-        .with_all("below", below.iter().map(Digest::to_string))
+        .input("wheels", serde_json::to_string(wheels).unwrap_or_default())
+        .input("requirements", wanted.key())
+        .inputs("below", below.iter().map(Digest::to_string))
         .finish();
-    let turn = shop.turn(&key).await;
-    if let Some(layer) = shop.cached(&key).await?.and_then(|entry| entry.layer) {
-        return Ok(Made::one(layer.diff_id, true));
+    let turn = shop.lock_key(&key).await;
+    if let Some(layer) = shop.get_cached(&key).await?.and_then(|entry| entry.layer) {
+        return Ok(LayerSet::single(layer.diff_id, true));
     }
-    let files = downloaded(shop.layers.cache(), wheels, wanted, progress).await?;
-    let (upper, options) = install(shop, base, part, below, &files, progress).await?;
+    let files = download_wheels(shop.layers.cache(), wheels, wanted, progress).await?;
+    let (upper, options) = install_wheels(shop, base, part, below, &files, progress).await?;
     progress.step(&format!("packing the {name}")).await;
-    let packing = Packing {
+    let packing = PackJob {
         key,
         made_from: wanted.versions().collect(),
         directory: upper.parent().unwrap_or(&upper).to_owned(),
@@ -118,44 +118,49 @@ async fn layer(
         options,
         turn,
     };
-    Ok(Made::one(shop.pack(packing, |_| Ok(())).await?, false))
+    Ok(LayerSet::single(
+        shop.pack(packing, |_| Ok(())).await?,
+        false,
+    ))
 }
 
-/// The wheels, from the cache or fetched now; sorted by name.
-async fn downloaded(
+/// Returns the wheels, from the cache or downloaded now, sorted by name.
+async fn download_wheels(
     cache: &Path,
     wheels: &Wheels,
     wanted: &Requirements,
     progress: &Progress,
 ) -> Result<Vec<PathBuf>, Error> {
     let place = cache.join(DOWNLOADS).join(&wanted.key()[..16]);
-    if let Some(files) = at_hand(&place, wanted).await? {
+    if let Some(files) = cached_wheels(&place, wanted).await? {
         return Ok(files);
     }
     let parent = cache.join(DOWNLOADS);
-    fs::create_dir_all(&parent).at("making", &parent)?;
+    fs::create_dir_all(&parent).io_context("making", &parent)?;
     let partial = tempfile::Builder::new()
         .prefix(".partial-")
         .tempdir_in(&parent)
-        .at("making a directory in", &parent)?;
-    fetch(partial.path(), wheels, wanted, progress).await?;
+        .io_context("creating a directory in", &parent)?;
+    fetch_wheels(partial.path(), wheels, wanted, progress).await?;
     let fetched = partial.path().join("files");
-    // Another daemon may have been faster; what is there but not whole is of no use.
-    if at_hand(&place, wanted).await?.is_none() {
+    // Another daemon may have been faster; an incomplete directory is useless.
+    if cached_wheels(&place, wanted).await?.is_none() {
         match fs::remove_dir_all(&place) {
             Err(error) if error.kind() != ErrorKind::NotFound => {
                 return Err(Error::io("removing", &place, error));
             }
-            _ => fs::rename(&fetched, &place).at("keeping", &fetched)?,
+            _ => fs::rename(&fetched, &place).io_context("keeping", &fetched)?,
         }
     }
-    at_hand(&place, wanted).await?.ok_or_else(|| Error::Wheels {
-        words: "what pip fetched is not what the requirements name".to_owned(),
-    })
+    cached_wheels(&place, wanted)
+        .await?
+        .ok_or_else(|| Error::Wheels {
+            words: "pip's downloads do not match the requirements".to_owned(),
+        })
 }
 
-/// The files of a directory, if they are all that is wanted.
-async fn at_hand(place: &Path, wanted: &Requirements) -> Result<Option<Vec<PathBuf>>, Error> {
+/// Returns the files of a directory, if they satisfy all requirements.
+async fn cached_wheels(place: &Path, wanted: &Requirements) -> Result<Option<Vec<PathBuf>>, Error> {
     let (place, wanted) = (place.to_owned(), wanted.clone());
     crate::blocking::spawn(move || {
         let entries = match fs::read_dir(&place) {
@@ -165,22 +170,22 @@ async fn at_hand(place: &Path, wanted: &Requirements) -> Result<Option<Vec<PathB
         };
         let mut found = BTreeMap::new();
         for entry in entries {
-            let path = entry.at("reading", &place)?.path();
-            let bytes = fs::read(&path).at("reading", &path)?;
+            let path = entry.io_context("reading", &place)?.path();
+            let bytes = fs::read(&path).io_context("reading", &path)?;
             let name = path.file_name().unwrap_or_default().to_string_lossy();
-            if let Some(name) = wanted.asks_for(&name, &bytes) {
+            if let Some(name) = wanted.matching_name(&name, &bytes) {
                 found.insert(name.to_owned(), path.clone());
             }
         }
         let whole = found.len() == wanted.len();
-        found.values().for_each(|path| unused::used(path));
+        found.values().for_each(|path| unused::mark_used(path));
         Ok(whole.then(|| found.into_values().collect()))
     })
     .await?
 }
 
-/// Has the host's pip fetch them, from wherever it is configured to.
-async fn fetch(
+/// Downloads wheels with the host's pip, from its configured source.
+async fn fetch_wheels(
     place: &Path,
     wheels: &Wheels,
     wanted: &Requirements,
@@ -190,7 +195,7 @@ async fn fetch(
     let title = format!("downloading {total} Python packages");
     progress.step(&title).await;
     let list = place.join("requirements.txt");
-    fs::write(&list, wanted.text()).at("writing", &list)?;
+    fs::write(&list, wanted.text()).io_context("writing", &list)?;
     let mut pip = process::command("pip3");
     pip.args(["download", "--no-input", "--disable-pip-version-check"])
         .args(["--progress-bar", "off", "--no-deps", "--require-hashes"])
@@ -216,14 +221,14 @@ async fn fetch(
     .await;
     match result {
         Err(Error::Program { last_lines, .. }) => Err(Error::Wheels {
-            words: pips_words(&last_lines),
+            words: pip_errors(&last_lines),
         }),
         result => result,
     }
 }
 
-/// The part of what pip says that is about its failure.
-fn pips_words(lines: &str) -> String {
+/// Extracts the error messages from the output of pip.
+fn pip_errors(lines: &str) -> String {
     let errors = lines
         .lines()
         .filter_map(|line| line.strip_prefix("ERROR: "));
@@ -235,28 +240,28 @@ fn pips_words(lines: &str) -> String {
     }
 }
 
-/// Puts them in place in a container on top of `below`; gives the container's upper directory, in a directory of its own, and how
-/// it is to be packed.
-async fn install(
-    shop: &Workshop,
+/// Installs wheels in a container on top of `below`; returns the container's upper directory, in a separate directory,
+/// and the options for packing it.
+async fn install_wheels(
+    shop: &BuildContext,
     base: &Base,
-    part: &Part<'_>,
+    part: &WheelSet<'_>,
     below: &[Digest],
     files: &[PathBuf],
     progress: &Progress,
 ) -> Result<(PathBuf, TreeOptions), Error> {
-    let Part { name, wheels, .. } = *part;
+    let WheelSet { name, wheels, .. } = *part;
     let total = files.len() as u64;
     let title = format!("installing {total} Python packages of the {name}");
     progress.step(&title).await;
-    let directory = shop.site.fresh("wheels")?;
+    let directory = shop.site.fresh_directory("wheels")?;
     let (tools, given, upper) = (
         directory.join("tools"),
         directory.join("given"),
         directory.join("upper"),
     );
     for path in [&given, &upper] {
-        fs::create_dir(path).at("making", path)?;
+        fs::create_dir(path).io_context("making", path)?;
     }
     set_mode(&given, 0o755)?;
     let mut names = Vec::new();
@@ -276,8 +281,8 @@ async fn install(
         ("cloudroid/job.json".into(), job.to_string().into_bytes()),
         ("cloudroid/wheels/.keep".into(), Vec::new()),
     ]);
-    lay_out(&tools, &tools_of)?;
-    let mut layers = shop.extracted(below).await?;
+    write_tree(&tools, &tools_of)?;
+    let mut layers = shop.extract_layers(below).await?;
     layers.push(tools);
     let environment = [
         ("SOURCE_DATE_EPOCH", EPOCH.to_string()),
@@ -289,7 +294,7 @@ async fn install(
     let finished = shop
         .site
         .run(
-            Run {
+            SandboxRun {
                 name: "wheels",
                 profile: Profile::Install,
                 layers,
@@ -324,7 +329,7 @@ async fn install(
     if !finished.success() {
         return Err(Error::Inside {
             what: "installing Python packages",
-            last_lines: finished.last_words(),
+            last_lines: finished.last_output(),
         });
     }
     let options = TreeOptions {

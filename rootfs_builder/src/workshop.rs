@@ -1,7 +1,7 @@
-//! What every step of a build needs: the place to work in, the layers there are, and turns at making new ones.
+//! Shared context of the steps of a build: the work directory, the layer cache, and locks on keys.
 //!
-//! A new layer is made in two halves. First its extracted tree, on which the next step can stand at once; then, while
-//! that runs, the compressed archive for the image and the cache.
+//! A new layer is created in two stages: first its extracted tree, which the next step can use at once; then,
+//! concurrently, the compressed archive for the image and the cache.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -10,50 +10,50 @@ use std::sync::{Arc, Mutex, PoisonError};
 use image::{Digest, TreeOptions};
 use tokio::task::JoinHandle;
 
-use crate::cache::{Entry, Layers};
+use crate::cache::{LayerCache, LayerEntry};
 use crate::error::Error;
 use crate::event::Progress;
-use crate::sandbox::Site;
+use crate::sandbox::BuildSite;
 
-/// Lives as long as one build.
-pub(crate) struct Workshop {
-    pub(crate) site: Site,
-    pub(crate) layers: Layers,
-    turns: Turns,
-    push: Push,
+/// Context of a single build.
+pub(crate) struct BuildContext {
+    pub(crate) site: BuildSite,
+    pub(crate) layers: LayerCache,
+    turns: KeyLocks,
+    push: PushLabel,
     progress: Progress,
-    /// Archives that are being made.
+    /// Archives in progress.
     packing: Mutex<Vec<JoinHandle<Result<(), Error>>>>,
 }
 
-/// A layer whose tree is there.
+/// A layer whose extracted tree exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Layer {
+pub(crate) struct StagedLayer {
     pub(crate) diff_id: Digest,
-    /// It was there already.
+    /// True if the layer already existed.
     pub(crate) cached: bool,
 }
 
-/// A tree that becomes a layer in the cache.
-pub(crate) struct Packing {
-    /// Its key there.
+/// A tree to be packed into a cached layer.
+pub(crate) struct PackJob {
+    /// Cache key.
     pub(crate) key: String,
-    /// For people.
+    /// Human-readable list of the inputs.
     pub(crate) made_from: Vec<String>,
     pub(crate) tree: PathBuf,
     pub(crate) options: TreeOptions,
-    /// Removed when all is done: the tree's own directory.
+    /// Directory of the tree, removed at the end.
     pub(crate) directory: PathBuf,
-    /// The turn at this key; others wait until the layer is in the cache.
+    /// Lock on the key; others wait until the layer is in the cache.
     pub(crate) turn: tokio::sync::OwnedMutexGuard<()>,
 }
 
-impl Workshop {
+impl BuildContext {
     pub(crate) fn new(
-        site: Site,
-        layers: Layers,
-        turns: Turns,
-        push: Push,
+        site: BuildSite,
+        layers: LayerCache,
+        turns: KeyLocks,
+        push: PushLabel,
         progress: Progress,
     ) -> Self {
         Self {
@@ -66,16 +66,16 @@ impl Workshop {
         }
     }
 
-    /// Waits for the turn at a key, of a layer or of what is remembered; while another push has it, that is told.
-    pub(crate) async fn turn(&self, key: &str) -> tokio::sync::OwnedMutexGuard<()> {
-        self.turns.take(key, &self.push, &self.progress).await
+    /// Waits for the lock on a key of a layer or a note; reports when another push holds it.
+    pub(crate) async fn lock_key(&self, key: &str) -> tokio::sync::OwnedMutexGuard<()> {
+        self.turns.lock(key, &self.push, &self.progress).await
     }
 
-    /// Makes a layer's tree; the archive follows (see [`Workshop::settled`]). `record` is called with the bytes of
-    /// the layer when it is in the cache.
+    /// Creates a layer's tree; the archive follows (see [`BuildContext::wait_until_packed`]). `record` is called with
+    /// the size of the layer when it is in the cache.
     pub(crate) async fn pack(
         &self,
-        packing: Packing,
+        packing: PackJob,
         record: impl FnOnce(u64) -> Result<(), Error> + Send + 'static,
     ) -> Result<Digest, Error> {
         let store = self.layers.store().clone();
@@ -95,9 +95,9 @@ impl Workshop {
                 }
                 .into());
             }
-            layers.put(
+            layers.insert(
                 &packing.key,
-                &Entry {
+                &LayerEntry {
                     layer: Some(layer),
                     made_from: packing.made_from,
                 },
@@ -113,14 +113,14 @@ impl Workshop {
         Ok(diff_id)
     }
 
-    /// Whether archives are still being made.
+    /// Returns whether archives are still in progress.
     pub(crate) fn is_packing(&self) -> bool {
         let packing = self.packing.lock().unwrap_or_else(PoisonError::into_inner);
         packing.iter().any(|archive| !archive.is_finished())
     }
 
-    /// Waits until every layer that was packed is whole and in the cache.
-    pub(crate) async fn settled(&self) -> Result<(), Error> {
+    /// Waits until all packed layers are complete and in the cache.
+    pub(crate) async fn wait_until_packed(&self) -> Result<(), Error> {
         let packing =
             std::mem::take(&mut *self.packing.lock().unwrap_or_else(PoisonError::into_inner));
         let mut result = Ok(());
@@ -131,82 +131,82 @@ impl Workshop {
         result
     }
 
-    /// The cached layer of a key.
-    pub(crate) async fn cached(&self, key: &str) -> Result<Option<Entry>, Error> {
+    /// Returns the cached layer of a key.
+    pub(crate) async fn get_cached(&self, key: &str) -> Result<Option<LayerEntry>, Error> {
         let (layers, key) = (self.layers.clone(), key.to_owned());
         crate::blocking::spawn(move || layers.get(&key)).await?
     }
 
-    /// Keeps a layer under a key.
-    pub(crate) async fn keep(&self, key: &str, entry: Entry) -> Result<(), Error> {
+    /// Stores a layer under a key.
+    pub(crate) async fn put_cached(&self, key: &str, entry: LayerEntry) -> Result<(), Error> {
         let (layers, key) = (self.layers.clone(), key.to_owned());
-        crate::blocking::spawn(move || layers.put(&key, &entry)).await?
+        crate::blocking::spawn(move || layers.insert(&key, &entry)).await?
     }
 
-    /// Trees of these layers.
-    pub(crate) async fn extracted(&self, layers: &[Digest]) -> Result<Vec<PathBuf>, Error> {
+    /// Extracts layers and returns their trees.
+    pub(crate) async fn extract_layers(&self, layers: &[Digest]) -> Result<Vec<PathBuf>, Error> {
         let (store, layers) = (self.layers.store().clone(), layers.to_vec());
         crate::blocking::spawn(move || {
             layers
                 .iter()
-                .map(|layer| Ok(store.extracted(layer)?))
+                .map(|layer| Ok(store.ensure_extracted(layer)?))
                 .collect()
         })
         .await?
     }
 }
 
-/// A push, as others are told of it.
+/// A push, as reported to others.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Push {
-    /// Of the push: see [`crate::PushRequest::id`].
+pub(crate) struct PushLabel {
+    /// Id of the push; see [`crate::PushRequest::id`].
     pub(crate) id: String,
-    /// Of the service, or of the package that becomes one.
+    /// Name of the service, or of the package that becomes one.
     pub(crate) name: String,
 }
 
-/// One at a time per key: two pushes that need the same layer make it once.
+/// Locks by key, so that two pushes that need the same layer create it once.
 #[derive(Clone, Default)]
-pub(crate) struct Turns(Arc<Mutex<HashMap<String, Arc<Turn>>>>);
+pub(crate) struct KeyLocks(Arc<Mutex<HashMap<String, Arc<KeyLock>>>>);
 
 #[derive(Default)]
-struct Turn {
+struct KeyLock {
     taken: Arc<tokio::sync::Mutex<()>>,
-    /// Who had it last.
-    by: Mutex<Push>,
+    /// Last holder of the lock.
+    by: Mutex<PushLabel>,
 }
 
-impl Turns {
-    /// Waits for the turn; it ends when the guard is dropped. `progress` is told whom it waits for.
-    async fn take(
+impl KeyLocks {
+    /// Waits for a lock, which is released when the guard is dropped. `progress` receives the name of the lock holder.
+    async fn lock(
         &self,
         key: &str,
-        push: &Push,
+        push: &PushLabel,
         progress: &Progress,
     ) -> tokio::sync::OwnedMutexGuard<()> {
         let turn = {
-            let mut all = locked(&self.0);
-            // The guard of a turn holds the lock alone.
+            let mut all = lock_unpoisoned(&self.0);
+            // The guard of a lock holds only the inner mutex.
             all.retain(|_, turn| Arc::strong_count(turn) > 1 || Arc::strong_count(&turn.taken) > 1);
             Arc::clone(all.entry(key.to_owned()).or_default())
         };
         let guard = match Arc::clone(&turn.taken).try_lock_owned() {
             Ok(guard) => guard,
             Err(_) => {
-                let by = locked(&turn.by).clone();
-                // The layers of one push are not told to wait for each other.
+                let by = lock_unpoisoned(&turn.by).clone();
+                // Layers of one push waiting for each other are not reported.
                 if by.id != push.id {
                     progress.waits(by.name).await;
                 }
                 Arc::clone(&turn.taken).lock_owned().await
             }
         };
-        locked(&turn.by).clone_from(push);
+        lock_unpoisoned(&turn.by).clone_from(push);
         guard
     }
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+fn lock_unpoisoned<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -216,8 +216,8 @@ mod tests {
 
     use super::*;
 
-    fn push(name: &str) -> Push {
-        Push {
+    fn push(name: &str) -> PushLabel {
+        PushLabel {
             id: format!("push-{name}"),
             name: name.to_owned(),
         }
@@ -225,14 +225,14 @@ mod tests {
 
     #[tokio::test]
     async fn turns_are_per_key_and_who_waits_is_told_for_whom() {
-        let turns = Turns::default();
+        let turns = KeyLocks::default();
         let (sender, mut told) = tokio::sync::mpsc::channel(8);
         let progress = Progress::new(sender);
         let (lab, field) = (push("lab"), push("field"));
-        let first = turns.take("a", &lab, &progress).await;
-        let _other = turns.take("b", &field, &progress).await;
+        let first = turns.lock("a", &lab, &progress).await;
+        let _other = turns.lock("b", &field, &progress).await;
         let (again, by, telling) = (turns.clone(), field.clone(), progress.clone());
-        let waiting = tokio::spawn(async move { again.take("a", &by, &telling).await });
+        let waiting = tokio::spawn(async move { again.lock("a", &by, &telling).await });
         let waits = BuildEvent::Waits {
             push: "lab".to_owned(),
         };
@@ -240,17 +240,17 @@ mod tests {
         assert!(!waiting.is_finished());
         drop(first);
         let second = waiting.await.expect("it comes");
-        // Its own layers wait in silence.
+        // Its own layers wait without a report.
         let (again, by, telling) = (turns.clone(), field, progress.clone());
-        let own = tokio::spawn(async move { again.take("a", &by, &telling).await });
+        let own = tokio::spawn(async move { again.lock("a", &by, &telling).await });
         tokio::task::yield_now().await;
         drop(second);
         own.await.expect("it comes");
         assert!(told.try_recv().is_err());
-        // Turns that nobody has are forgotten; that of `b` is kept.
-        drop(turns.take("c", &lab, &progress).await);
-        drop(turns.take("d", &lab, &progress).await);
-        let kept: Vec<String> = locked(&turns.0).keys().cloned().collect();
+        // Locks that nobody holds are removed; that of `b` is kept.
+        drop(turns.lock("c", &lab, &progress).await);
+        drop(turns.lock("d", &lab, &progress).await);
+        let kept: Vec<String> = lock_unpoisoned(&turns.0).keys().cloned().collect();
         assert!(
             kept.contains(&"b".to_owned()) && !kept.contains(&"c".to_owned()),
             "{kept:?}"

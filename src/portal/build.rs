@@ -1,4 +1,4 @@
-//! The page is built in from `web/dist`: a page that is built anew is a reason to compile.
+//! The page is compiled in from `web/dist`, so a rebuilt page requires a rebuild.
 
 fn main() {
     println!("cargo::rerun-if-changed=../../web/dist");

@@ -47,7 +47,7 @@ async function main() {
     && graph.advertisedServices.some((one) => one.name === '/greet' && one.providerIds.includes('/herald')));
 
   viewer.client.advertise({ topic: '/name', encoding: 'ros1', schemaName: 'std_msgs/msg/String' });
-  await viewer.refused('written as cdr, not ros1');
+  await viewer.refused('encoded as cdr, not ros1');
   const greet = await viewer.service('/greet');
   check('its type', greet.type === 'herald_msgs/srv/Greet' && greet.request.schemaEncoding === 'ros2msg');
   const request = new MessageWriter(definition(greet.request.schema)).writeMessage({ name: 'viewer' });
@@ -69,9 +69,9 @@ async function main() {
     const answer = greeting((await viewer.calls(greet, request)).data);
     check('a call', answer.text === 'Hello, viewer');
     const torn = await viewer.calls(greet, new Uint8Array([0, 1, 0, 0, 9]));
-    check('a torn request', torn.message.includes('this is no request of herald_msgs/srv/Greet'));
+    check('a torn request', torn.message.includes('not a request of herald_msgs/srv/Greet'));
     viewer.client.sendMessage(saying, new Uint8Array([0, 1, 0, 0, 9, 0, 0, 0, 1]));
-    await viewer.refused('/name: this is no std_msgs/msg/String');
+    await viewer.refused('/name: not a std_msgs/msg/String');
     check('a text', (await viewer.parameter('/herald.salutation')).value === 'Hello');
     viewer.client.setParameters([{ name: '/herald.salutation', value: 'Hail' }, { name: '/herald.volumes', value: [4, 5] }], 'set');
     await viewer.parameterValues.next((one) => one.id === 'set');

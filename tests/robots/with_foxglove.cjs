@@ -39,7 +39,7 @@ async function main() {
   viewer.client.subscribe(4_000_000);
   await viewer.refused('there is no channel 4000000');
   viewer.client.advertise({ topic: '/sights/say', encoding: 'json', schemaName: 'std_msgs/String' });
-  await viewer.refused('written as ros1, not json');
+  await viewer.refused('encoded as ros1, not json');
   viewer.client.advertise({ topic: '/elsewhere', encoding: 'ros1', schemaName: 'no_such/Type' });
   await viewer.refused(part === 'looks' ? 'publish:/elsewhere is not granted' : 'no_such/Type');
   viewer.client.sendMessage(77, new Uint8Array(4));
@@ -49,7 +49,7 @@ async function main() {
   const nowhere = await viewer.calls({ id: 4_000_000 }, new Uint8Array(0));
   check('no such service', nowhere.message.includes('there is no service 4000000'));
   const json = await viewer.calls(ping, new Uint8Array(0), 'json');
-  check('requests in JSON', json.message.includes('written as ros1'));
+  check('requests in JSON', json.message.includes('encoded as ros1'));
 
   const say = new MessageWriter(parse('string data'));
   const saying = viewer.client.advertise({ topic: '/sights/say', encoding: 'ros1', schemaName: 'std_msgs/String' });
@@ -73,9 +73,9 @@ async function main() {
     const answer = new MessageReader(parse(ping.response.schema)).readMessage(response.data);
     check('a call', answer.success === true && answer.message === 'pong');
     const torn = await viewer.calls(ping, new Uint8Array([1, 2, 3]));
-    check('a torn request', torn.message.includes('this is no request of std_srvs/Trigger'));
+    check('a torn request', torn.message.includes('not a request of std_srvs/Trigger'));
     viewer.client.sendMessage(saying, new Uint8Array([9, 0, 0, 0, 1]));
-    await viewer.refused('/sights/say: this is no std_msgs/String');
+    await viewer.refused('/sights/say: not a std_msgs/String');
     check('a whole number', (await viewer.parameter('/sights/gain')).value === 2);
     const scale = await viewer.parameter('/sights/scale');
     check('a float that is whole', scale.value === 2 && scale.type === 'float64');

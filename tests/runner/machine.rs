@@ -1,4 +1,4 @@
-//! What the stories need of the machine. What is missing is told in one line, with what follows from it.
+//! Requirements of the stories for the machine. Anything missing is reported in one line, with its consequence.
 
 use std::path::Path;
 
@@ -7,19 +7,25 @@ use nix::mount::{MsFlags, mount, umount};
 use support::world::{self, world};
 use support::{binaries, claim, disk, procfs};
 
-/// Without a disk of their own, homes take this many bytes of that for temporary files.
+/// Space in bytes that homes take in the directory for temporary files if there is no separate disk.
 const ROOM: u64 = 12 << 30;
 
-/// Checks the machine, removes what killed runs have left, and gives this run a disk. To be called before this process has threads.
+/// Checks the machine, cleans up after killed runs, and mounts a disk for this run. Must be called before this process
+/// has threads.
 ///
 /// # Errors
-/// Tells what is missing, and what to do.
+/// If a requirement is not met: what is missing, and what to do.
 pub(super) fn prepare() -> Result<(), String> {
     if !nix::unistd::geteuid().is_root() {
         return Err("servants are started by root: sudo make stories".to_owned());
     }
     check_cgroups()?;
-    disk::enter_namespace().map_err(|error| format!("{error:#}, and robots' file systems are mounted: run the stories as root of the machine"))?;
+    disk::enter_namespace().map_err(|error| {
+        format!(
+            "{error:#}, and robots' file systems are mounted: run the stories \
+        as root of the machine"
+        )
+    })?;
     for place in claim::find_abandoned(&std::env::temp_dir(), world::PREFIX) {
         match claim::remove_abandoned(&place) {
             Ok(()) => println!(
@@ -43,7 +49,7 @@ pub(super) fn prepare() -> Result<(), String> {
     check_overlay(place)
 }
 
-/// A servant has a cgroup below the daemon's, with limits.
+/// Checks that cgroups with limits can be used: servants have one below the daemon's.
 fn check_cgroups() -> Result<(), String> {
     let mut is_there = false;
     for parent in procfs::cgroups(std::process::id() as i32) {
@@ -54,14 +60,16 @@ fn check_cgroups() -> Result<(), String> {
         is_there = true;
         let child = parent.join(format!("cloudroid-check-{}", std::process::id()));
         std::fs::create_dir(&child).map_err(|error| {
-            format!("cgroups cannot be made below {} ({error}), and servants have limits: run the stories where root may make them", parent.display())
+            format!("cgroups cannot be made below {} ({error}), and servants have limits: run the stories where root \
+                may make them", parent.display())
         })?;
         let _ = std::fs::remove_dir(child);
     }
     if is_there {
         return Ok(());
     }
-    Err("no cgroups with limits are mounted below /sys/fs/cgroup, and servants have limits: mount them, or run the stories elsewhere".to_owned())
+    Err("no cgroups with limits are mounted below /sys/fs/cgroup, and servants have limits: mount them, or run the \
+        stories elsewhere".to_owned())
 }
 
 fn check_room(place: &Path) -> Result<(), String> {
@@ -76,7 +84,8 @@ fn check_room(place: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// A servant's files are layers over each other, which an overlay of overlays, for example, cannot hold.
+/// Checks that overlays can be mounted: a servant's root is one, which is not possible on top of another overlay, for
+/// example.
 fn check_overlay(place: &Path) -> Result<(), String> {
     let trial = place.join("overlay");
     let names = ["lower", "upper", "work", "root"];
@@ -91,7 +100,7 @@ fn check_overlay(place: &Path) -> Result<(), String> {
         at("upper"),
         at("work")
     );
-    // Some file systems are refused only when something is renamed or removed there.
+    // Some file systems only fail when something is renamed or removed.
     let used = mount(
         Some("overlay"),
         trial.join("root").as_path(),
@@ -109,6 +118,7 @@ fn check_overlay(place: &Path) -> Result<(), String> {
     });
     let _ = std::fs::remove_dir_all(&trial);
     used.map_err(|error| {
-        format!("the file system of {} cannot hold the upper directories of overlays ({error}), which servants are made of: name another place by TMPDIR", place.display())
+        format!("the file system of {} cannot hold the upper directories of overlays ({error}), which servants are \
+            made of: name another place by TMPDIR", place.display())
     })
 }

@@ -1,4 +1,4 @@
-//! What is printed at the end of a run, and what it comes to.
+//! The report at the end of a run, and its result.
 
 use std::io::Write;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -6,37 +6,37 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use serde_json::json;
 use support::{binaries, patience};
 
-use super::{MOST_FLAKY, Outcome, Story, evidence_of};
+use super::{MOST_FLAKY, RunnableStory, StoryOutcome, evidence_directory};
 
-/// The longest stories are printed: who makes the tests faster begins with them.
+/// Number of longest stories to print, as candidates for faster tests.
 const LONGEST: usize = 20;
-/// How many characters of a reason are printed.
+/// Maximum number of characters printed of an error.
 const REASON: usize = 2000;
 
-/// How many characters of the reason of a flaky one are printed, in a line.
+/// Maximum number of characters in the line about a flaky story.
 const LINE: usize = 300;
 
-/// A run's end.
-pub(super) struct Report {
-    told: Vec<Outcome>,
+/// Result of a run.
+pub(super) struct RunReport {
+    told: Vec<StoryOutcome>,
     not_told: usize,
-    /// Stories that failed and then passed, with the first reason.
+    /// Stories that failed and then passed, with the first error.
     flaky: Vec<(&'static str, String)>,
-    /// Stories that failed for good, with the last reason.
+    /// Stories that failed twice, with the last error.
     failed: Vec<(&'static str, String)>,
     left: Vec<String>,
     is_strict: bool,
 }
 
-impl Report {
+impl RunReport {
     pub(super) fn new(
-        stories: &[Story],
-        told: Vec<Outcome>,
-        again: Vec<Outcome>,
+        stories: &[RunnableStory],
+        told: Vec<StoryOutcome>,
+        again: Vec<StoryOutcome>,
         left: Vec<String>,
         is_strict: bool,
-    ) -> Report {
-        let mut report = Report {
+    ) -> RunReport {
+        let mut report = RunReport {
             not_told: stories.len() - told.len(),
             flaky: Vec::new(),
             failed: Vec::new(),
@@ -59,7 +59,7 @@ impl Report {
         report
     }
 
-    /// Tells if the run is green.
+    /// Returns whether the run succeeded.
     pub(super) fn is_good(&self) -> bool {
         self.failed.is_empty()
             && self.left.is_empty()
@@ -68,9 +68,9 @@ impl Report {
             && (!self.is_strict || self.flaky.is_empty())
     }
 
-    /// Prints it, what matters last: of a long record the end is what is looked at, or kept.
+    /// Prints the report, most important part last, because that is what remains visible of a long log.
     pub(super) fn print(&self) {
-        let mut longest: Vec<&Outcome> = self.told.iter().collect();
+        let mut longest: Vec<&StoryOutcome> = self.told.iter().collect();
         longest.sort_by_key(|outcome| std::cmp::Reverse(outcome.took));
         println!("== the longest stories, in seconds, and how long of that they waited for a core");
         for outcome in longest.iter().take(LONGEST) {
@@ -91,7 +91,7 @@ impl Report {
             let words: Vec<&str> = reason.split_whitespace().collect();
             let first: String = words.join(" ").chars().take(LINE).collect();
             println!("FLAKY {name}: {first}");
-            println!("      kept below {}", evidence_of(name, 1).display());
+            println!("      kept below {}", evidence_directory(name, 1).display());
             note_flaky(name, reason);
         }
         if self.flaky.len() > MOST_FLAKY {
@@ -101,7 +101,7 @@ impl Report {
             println!(
                 "== failed: {name}\n{}\nkept below {}",
                 shorten(reason),
-                evidence_of(name, 1).display()
+                evidence_directory(name, 1).display()
             );
         }
         for thing in &self.left {
@@ -125,7 +125,7 @@ fn shorten(reason: &str) -> String {
     reason.chars().take(REASON).collect()
 }
 
-/// Adds a line to the list of stories that are to be mended.
+/// Adds a line to the list of flaky stories that need to be fixed.
 fn note_flaky(name: &str, reason: &str) {
     let time = SystemTime::now()
         .duration_since(UNIX_EPOCH)

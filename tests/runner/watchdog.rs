@@ -1,4 +1,4 @@
-//! Names stories that take long, and ends a run that hangs: by its name a story that never ends can be found, and nothing else would say it.
+//! Reports stories that take long, and ends a run that hangs, because nothing else would tell which story never ends.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -6,54 +6,54 @@ use std::time::{Duration, Instant};
 
 use support::patience;
 
-/// After this time a story is named, and again each time that it has passed once more.
+/// Time after which a story is reported, and the interval of further reports.
 const LONG: Duration = Duration::from_secs(300);
-/// On a machine that is slower than this, a story that takes as many times as long has no end all the same: a whole check has an hour and a half.
+/// Maximum factor by which a slow machine extends the time limit of a story: a complete check has an hour and a half.
 const SLOWEST: f64 = 2.0;
-/// Time between two looks.
+/// Interval between two checks.
 const PERIOD: Duration = Duration::from_secs(10);
-/// The stories that are being told, watched by a thread of its own until it is dropped.
+/// A thread that watches the running stories until drop.
 pub(super) struct Watchdog {
-    state: Arc<State>,
+    state: Arc<WatchdogState>,
 }
 
 #[derive(Default)]
-struct State {
-    under_way: Mutex<UnderWay>,
+struct WatchdogState {
+    under_way: Mutex<RunningStories>,
     ended: Condvar,
 }
 
 #[derive(Default)]
-struct UnderWay {
-    stories: BTreeMap<&'static str, Watched>,
+struct RunningStories {
+    stories: BTreeMap<&'static str, WatchedStory>,
     is_over: bool,
 }
 
-struct Watched {
+struct WatchedStory {
     since: Instant,
-    /// How often it was named.
+    /// Number of reports so far.
     named: u32,
 }
 
 impl Watchdog {
-    /// Begins to watch for stories that take longer than `limit` on a machine that is as fast as it can be.
+    /// Starts to watch for stories that take longer than `limit` on an unloaded machine.
     pub(super) fn start(limit: Duration) -> Watchdog {
-        let state = Arc::new(State::default());
+        let state = Arc::new(WatchdogState::default());
         let watching = state.clone();
         std::thread::spawn(move || watching.watch(limit));
         Watchdog { state }
     }
 
-    /// Tells that a story begins.
+    /// Records that a story has started.
     pub(super) fn begin(&self, story: &'static str) {
-        let watched = Watched {
+        let watched = WatchedStory {
             since: Instant::now(),
             named: 0,
         };
         self.state.lock().stories.insert(story, watched);
     }
 
-    /// Tells that a story has ended.
+    /// Records that a story has ended.
     pub(super) fn end(&self, story: &'static str) {
         self.state.lock().stories.remove(story);
     }
@@ -66,8 +66,8 @@ impl Drop for Watchdog {
     }
 }
 
-impl State {
-    fn lock(&self) -> std::sync::MutexGuard<'_, UnderWay> {
+impl WatchdogState {
+    fn lock(&self) -> std::sync::MutexGuard<'_, RunningStories> {
         self.under_way
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -77,7 +77,7 @@ impl State {
         let mut under_way = self.lock();
         while !under_way.is_over {
             let too_long = limit.mul_f64(patience::busiest().clamp(1.0, SLOWEST));
-            if let Some(story) = under_way.name_long_ones(Instant::now(), too_long) {
+            if let Some(story) = under_way.report_long_stories(Instant::now(), too_long) {
                 println!(
                     "== failed: {story} has no end: it is being told for more than {} s, and the run ends here",
                     too_long.as_secs()
@@ -90,9 +90,9 @@ impl State {
     }
 }
 
-impl UnderWay {
-    /// Prints the names of those that take long; returns one that takes too long.
-    fn name_long_ones(&mut self, now: Instant, too_long: Duration) -> Option<&'static str> {
+impl RunningStories {
+    /// Reports stories that take long; returns a story that takes too long.
+    fn report_long_stories(&mut self, now: Instant, too_long: Duration) -> Option<&'static str> {
         for (story, watched) in &mut self.stories {
             let time = now.duration_since(watched.since);
             if time > too_long {

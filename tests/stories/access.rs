@@ -7,59 +7,65 @@ use anyhow::{Context, ensure};
 use serde_json::json;
 use support::Verdict;
 use support::daemon::Daemon;
-use support::deployer::{Deployer, Outcome};
+use support::deployer::{CommandOutcome, Deployer};
 use support::robot::Robot;
 use support::world::world;
 
-/// It has a row for each address: a unit test of the portal says so.
+/// The document has a row for each route, which a unit test of the portal checks.
 const MATRIX: &str = include_str!("../../docs/access.md");
 
 pub fn daemon(name: &str) -> anyhow::Result<Daemon> {
-    world().own(name).start()
+    world().setup(name).start()
 }
 
-/// The secret of a token that is made for the story.
-pub fn token(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
+/// Creates a token and returns its secret.
+pub fn create_token(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
     let made = daemon
         .deployer()
-        .asks(&[&["token", "create"], arguments].concat())?;
+        .run_json(&[&["token", "create"], arguments].concat())?;
     let secret = made["secret"].as_str().context("a secret")?;
     Ok(secret.to_owned())
 }
 
-/// Types a command over TCP with a token.
-pub fn with_token(daemon: &Daemon, token: &str, arguments: &[&str]) -> anyhow::Result<Outcome> {
+/// Runs a command over TCP with a token.
+pub fn run_with_token(
+    daemon: &Daemon,
+    token: &str,
+    arguments: &[&str],
+) -> anyhow::Result<CommandOutcome> {
     let server = format!("http://{}", daemon.address);
     let deployer = Deployer {
         home: daemon.deployer().home,
     };
-    deployer.types(&[&["--server", &server, "--token", token], arguments].concat())
+    deployer.run(&[&["--server", &server, "--token", token], arguments].concat())
 }
 
-/// A row of the matrix in docs/access.md: who is answered at an address.
-struct Row {
+/// A row of the matrix in docs/access.md: who is answered on a route.
+struct AccessRow {
     method: String,
     path: String,
-    /// By the names of the columns.
+    /// Cells by column name.
     cells: Vec<(String, String)>,
 }
 
-impl Row {
+impl AccessRow {
     fn cell(&self, column: &str) -> anyhow::Result<&str> {
         let cell = self.cells.iter().find(|(name, _)| name == column);
         Ok(&cell.with_context(|| format!("no column {column}"))?.1)
     }
 
-    /// With what there is in the story in place of parameters.
-    fn address(&self, servant: &str, recording: &str) -> String {
-        let name = match self.path.contains("/robots/") {
-            true => "r1",
-            false => "adder_py",
+    /// Returns the path with parameters filled in from this story.
+    fn request_path(&self, servant: &str, recording: &str) -> String {
+        let name = if self.path.contains("/robots/") {
+            "r1"
+        } else {
+            "adder_py"
         };
         let of_servants = ["/servants/", "/foxglove/"];
-        let id = match of_servants.iter().any(|part| self.path.contains(part)) {
-            true => servant,
-            false => "x",
+        let id = if of_servants.iter().any(|part| self.path.contains(part)) {
+            servant
+        } else {
+            "x"
         };
         self.path
             .replace("{name}", name)
@@ -71,11 +77,11 @@ impl Row {
             .replace("{digest}", "x")
     }
 
-    /// The method to ask with: one that changes nothing where the row has all.
-    fn asks(&self) -> &str {
+    /// Returns the method to request with; where the row allows any, one that changes nothing.
+    fn request_method(&self) -> &str {
         match (&*self.method, &*self.path) {
             ("ANY", _) => "GET",
-            // The one is long, the others have no end.
+            // The first takes long, the others never end.
             (
                 _,
                 "/stubs/{file}"
@@ -87,8 +93,8 @@ impl Row {
         }
     }
 
-    fn reads(&self) -> bool {
-        matches!(self.asks(), "GET" | "HEAD")
+    fn is_read_only(&self) -> bool {
+        matches!(self.request_method(), "GET" | "HEAD")
     }
 
     fn is_of_robots(&self) -> bool {
@@ -96,8 +102,8 @@ impl Row {
     }
 }
 
-/// The matrix as the document has it, which a unit test holds to the portal's table.
-fn matrix() -> anyhow::Result<Vec<Row>> {
+/// Parses the matrix of the document, which a unit test compares with the portal's table.
+fn read_matrix() -> anyhow::Result<Vec<AccessRow>> {
     let (_, matrix) = MATRIX
         .split_once("| method | address |")
         .context("the matrix")?;
@@ -109,11 +115,11 @@ fn matrix() -> anyhow::Result<Vec<Row>> {
             .collect()
     };
     let columns = cells(lines.next().context("its head")?);
-    let rows: Vec<Row> = lines
+    let rows: Vec<AccessRow> = lines
         .skip(1)
         .map(|line| {
             let mut cells = cells(line).into_iter();
-            Row {
+            AccessRow {
                 method: cells.next().unwrap_or_default(),
                 path: cells.next().unwrap_or_default(),
                 cells: columns.iter().cloned().zip(cells).collect(),
@@ -124,11 +130,11 @@ fn matrix() -> anyhow::Result<Vec<Row>> {
     Ok(rows)
 }
 
-/// A token that has expired.
-pub fn expired(daemon: &Daemon) -> anyhow::Result<String> {
-    let short = token(daemon, &["short", "--role", "admin", "--expires", "1s"])?;
+/// Creates a token and waits until it has expired.
+pub fn expired_token(daemon: &Daemon) -> anyhow::Result<String> {
+    let short = create_token(daemon, &["short", "--role", "admin", "--expires", "1s"])?;
     let bearer = format!("Bearer {short}");
-    support::until("the token's end", || {
+    support::wait_until("the token's end", || {
         let asked = daemon.request("GET", "/api/v1/whoami", &[("Authorization", &bearer)])?;
         Ok(match asked.0 {
             401 => Ok(()),
@@ -139,24 +145,24 @@ pub fn expired(daemon: &Daemon) -> anyhow::Result<String> {
 }
 
 pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
-    let daemon = world().own("matrix");
+    let daemon = world().setup("matrix");
     let daemon = daemon.config("[black_box]\nseconds = \"1s\"\n").start()?;
-    let mut rows = matrix()?;
-    // Who shows a code is told by the stories of pairing.
+    let mut rows = read_matrix()?;
+    // Requests with a pairing code are covered by the stories of pairing.
     rows.retain(|row| row.path != "/api/v1/pair");
-    let asks = |row: &Row, address: &str, token: Option<&str>| {
+    let asks = |row: &AccessRow, address: &str, token: Option<&str>| {
         let bearer = token.map(|token| format!("Bearer {token}"));
         let headers = bearer.as_deref().map(|bearer| ("Authorization", bearer));
-        daemon.request(row.asks(), address, headers.as_slice())
+        daemon.request(row.request_method(), address, headers.as_slice())
     };
-    // While nobody was ever named.
+    // As long as there are no principals.
     let mut walked = 0;
     for row in rows.iter().filter(|row| !row.is_of_robots()) {
         let allowed = row.cell("local")? == "yes";
-        if allowed && !row.reads() {
+        if allowed && !row.is_read_only() {
             continue;
         }
-        let (status, body) = asks(row, &row.address("x", "1"), None)?;
+        let (status, body) = asks(row, &row.request_path("x", "1"), None)?;
         ensure!(
             (status != 403) == allowed && status != 401,
             "local {} {}: {status} {body}",
@@ -165,7 +171,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         );
         walked += 1;
     }
-    // Of each role one whose the service is, and one for which it is not.
+    // For each role, one principal whose scope includes the service, and one whose scope does not.
     let scoped = |name: &str, more: &[&str]| -> anyhow::Result<(String, String)> {
         let made = |name: &str, service: &str, robot: &str| {
             let given = [&[name, "--service", service], more].concat();
@@ -173,7 +179,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
                 .into_iter()
                 .map(|word| if word == "ROBOT" { robot } else { word })
                 .collect();
-            token(&daemon, &given)
+            create_token(&daemon, &given)
         };
         Ok((
             made(name, "adder*", "r1")?,
@@ -189,43 +195,42 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
         ("viewer", eve.clone(), oscar),
     ];
     for role in ["admin", "operator"] {
-        let one = token(&daemon, &[role, "--role", role])?;
+        let one = create_token(&daemon, &[role, "--role", role])?;
         principals.push((role, one.clone(), one));
     }
-    pushes_adder(&daemon, &alice, &[])?.succeeded()?;
+    push_adder(&daemon, &alice, &[])?.expect_success()?;
     let at_work = daemon.robot(&format!("adder_py?token={rover}"))?;
-    let servant = support::until("the robot's servant", || {
+    let servant = support::wait_until("the robot's servant", || {
         let servant = daemon.servant_of("adder_py", "r1");
         Ok(servant.map_err(|error| format!("{error:#}")))
     })?;
     let servant = servant["id"].as_str().context("an id")?.to_owned();
-    let recording = support::until("a recording", || {
-        let taken =
-            daemon
-                .deployer()
-                .types(&["--format", "json", "recordings", "take", &servant])?;
+    let recording = support::wait_until("a recording", || {
+        let taken = daemon
+            .deployer()
+            .run(&["--format", "json", "recordings", "take", &servant])?;
         let taken: Result<serde_json::Value, _> = serde_json::from_str(&taken.stdout);
         let number = taken.map(|taken| taken[0]["number"].to_string());
         Ok(number.map_err(|error| error.to_string()))
     })?;
-    let revoked = token(&daemon, &["over", "--role", "admin"])?;
+    let revoked = create_token(&daemon, &["over", "--role", "admin"])?;
     daemon
         .deployer()
-        .types(&["token", "revoke", "over"])?
-        .succeeded()?;
-    let expired = expired(&daemon)?;
+        .run(&["token", "revoke", "over"])?
+        .expect_success()?;
+    let expired = expired_token(&daemon)?;
     for row in &rows {
-        let address = row.address(&servant, &recording);
+        let address = row.request_path(&servant, &recording);
         for (role, own, foreign) in &principals {
             let cell = row.cell(role)?;
-            // Of what the query or the body names, each is asked about its own: there is none here.
+            // Routes that name their service in the query or the body check it later; these requests name none.
             let named_later = matches!(&*row.path, "/api/v1/push" | "/api/v1/servants");
             for (whose, token, allowed) in [
                 ("own", own, cell != "-"),
                 ("another's", foreign, cell == "yes"),
             ] {
                 if row.is_of_robots() {
-                    // Who is let in is told by the other stories.
+                    // Permitted connections are covered by the other stories.
                     if !allowed {
                         let path = format!("{}?token={token}", &address[1..]);
                         let Err(refusal) = Robot::try_connect(&daemon.url(&path)) else {
@@ -238,8 +243,8 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
                     }
                     continue;
                 }
-                // What changes something is not done here: only that it is refused.
-                if (allowed || named_later && cell == "own") && !row.reads() {
+                // Requests that would change something are only made if they are refused.
+                if (allowed || named_later && cell == "own") && !row.is_read_only() {
                     continue;
                 }
                 let (status, body) = asks(row, &address, Some(token))?;
@@ -267,10 +272,10 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
             ("guess", "not known"),
         ] {
             let (status, body) = asks(row, &address, Some(token))?;
-            // Whoever guesses is slowed after a while.
+            // Repeated guesses are slowed down after a while.
             let slowed = token == "guess" && status == 429;
             ensure!(
-                slowed || status == 401 && (row.asks() == "HEAD" || body.contains(words)),
+                slowed || status == 401 && (row.request_method() == "HEAD" || body.contains(words)),
                 "{} {address}: {status} {body}",
                 row.method
             );
@@ -278,7 +283,7 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
     }
     ensure!(walked > 300, "{walked} were walked");
     drop(at_work);
-    // Nobody is told what is not of its scope, nor whether it is there.
+    // Nobody is told about services outside their scope, nor whether they exist.
     let mut told = Vec::new();
     for name in ["hidden", "nothing_such"] {
         let path = format!("/api/v1/services/{name}");
@@ -290,16 +295,16 @@ pub fn every_route_answers_those_whom_the_table_allows() -> Verdict {
     Ok(())
 }
 
-pub fn pushes_adder(daemon: &Daemon, token: &str, more: &[&str]) -> anyhow::Result<Outcome> {
+pub fn push_adder(daemon: &Daemon, token: &str, more: &[&str]) -> anyhow::Result<CommandOutcome> {
     let package = support::binaries::package("adder_py");
     let path = support::deployer::path_str(&package);
     let push = [&["push", path, "--node", "adder.py"], more].concat();
-    with_token(daemon, token, &push)
+    run_with_token(daemon, token, &push)
 }
 
 pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
     let daemon = daemon("badly")?;
-    let admin = token(&daemon, &["chief", "--role", "admin"])?;
+    let admin = create_token(&daemon, &["chief", "--role", "admin"])?;
     let bearer = format!("Bearer {admin}");
     for (path, words) in [
         ("/api/v1/audit?limit=x", "limit: invalid digit"),
@@ -322,18 +327,24 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
         (&["policy", "rm", "9999"][..], "no rule \"9999\""),
         (
             &["policy", "allow", "role:fool", "call:/x"],
-            "no role \"fool\"",
+            "unknown role \"fool\"",
         ),
         (
             &["policy", "allow", "rover", "fly:/x"],
-            "\"fly:/x\" is no grant",
+            "\"fly:/x\" is not a grant",
         ),
-        (&["policy", "allow", "rover", "call:[/x"], "is no grant"),
-        (&["token", "revoke", "nobody"], "no token \"nobody\""),
-        (&["token", "rotate", "nobody"], "no token \"nobody\""),
+        (&["policy", "allow", "rover", "call:[/x"], "is not a grant"),
+        (
+            &["token", "revoke", "nobody"],
+            "there is no valid token \"nobody\"",
+        ),
+        (
+            &["token", "rotate", "nobody"],
+            "there is no valid token \"nobody\"",
+        ),
         (
             &["token", "create", "a b", "--role", "viewer"],
-            "no name of a principal",
+            "is not a valid name",
         ),
         (&["token", "create", "r", "--role", "robot"], "--service"),
         (&["token", "create", "k", "--role", "king"], "king"),
@@ -350,9 +361,9 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
             "chief",
         ),
     ] {
-        daemon.deployer().types(typed)?.failed_saying(&[words])?;
+        daemon.deployer().run(typed)?.expect_failure(&[words])?;
     }
-    let rules = daemon.deployer().asks(&["policy", "list"])?;
+    let rules = daemon.deployer().run_json(&["policy", "list"])?;
     ensure!(
         rules.as_array().is_some_and(|rules| rules.len() == 2),
         "{rules}"
@@ -362,22 +373,22 @@ pub fn what_is_asked_badly_is_refused_in_words() -> Verdict {
 
 pub fn a_deployer_changes_its_own_services_alone() -> Verdict {
     let daemon = daemon("owners")?;
-    let alice = token(
+    let alice = create_token(
         &daemon,
         &["alice", "--role", "deployer", "--service", "adder*"],
     )?;
-    let bob = token(&daemon, &["bob", "--role", "deployer", "--service", "*"])?;
-    pushes_adder(&daemon, &alice, &[])?.succeeded()?;
-    // Where it is published by its name alone, that is found out when it is built.
-    pushes_adder(&daemon, &bob, &[])?
-        .failed_saying(&["bob (deployer) may not deploy service adder_py"])?;
-    pushes_adder(&daemon, &alice, &["--name", "other"])?
-        .failed_saying(&["alice (deployer) may not deploy service other"])?;
-    with_token(&daemon, &bob, &["rm", "adder_py"])?.failed_saying(&["may not deploy"])?;
-    let seen = with_token(&daemon, &bob, &["services"])?.succeeded()?;
-    ensure!(seen.stdout.contains("adder_py"), "{}", seen.said());
-    pushes_adder(&daemon, &alice, &[])?.succeeded()?;
-    with_token(&daemon, &alice, &["rm", "adder_py"])?.succeeded()?;
+    let bob = create_token(&daemon, &["bob", "--role", "deployer", "--service", "*"])?;
+    push_adder(&daemon, &alice, &[])?.expect_success()?;
+    // If only the name is given, the owner is found out when the package is built.
+    push_adder(&daemon, &bob, &[])?
+        .expect_failure(&["bob (deployer) may not deploy service adder_py"])?;
+    push_adder(&daemon, &alice, &["--name", "other"])?
+        .expect_failure(&["alice (deployer) may not deploy service other"])?;
+    run_with_token(&daemon, &bob, &["rm", "adder_py"])?.expect_failure(&["may not deploy"])?;
+    let seen = run_with_token(&daemon, &bob, &["services"])?.expect_success()?;
+    ensure!(seen.stdout.contains("adder_py"), "{}", seen.output());
+    push_adder(&daemon, &alice, &[])?.expect_success()?;
+    run_with_token(&daemon, &alice, &["rm", "adder_py"])?.expect_success()?;
     Ok(())
 }
 
@@ -385,12 +396,12 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
     let daemon = daemon("policies")?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let robot = ["--role", "robot", "--service", "adder_py", "--robot"];
-    let rover = token(&daemon, &[&["rover"], &robot[..], &["r1"]].concat())?;
-    let other = token(&daemon, &[&["other"], &robot[..], &["r2"]].concat())?;
-    // Nobody is somebody else, and who names no robot is its token's.
+    let rover = create_token(&daemon, &[&["rover"], &robot[..], &["r1"]].concat())?;
+    let other = create_token(&daemon, &[&["other"], &robot[..], &["r2"]].concat())?;
+    // A token cannot be used for another robot, and a robot without a name gets that of its token.
     let refused = Robot::try_connect(&daemon.url(&format!("adder_py?robot=r1&token={other}")));
     let Err(refusal) = refused else {
         anyhow::bail!("one robot was let in as another")
@@ -409,14 +420,14 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
     );
     let mut at_work = daemon.robot(&format!("adder_py?token={rover}"))?;
     let mut beside = daemon.robot("adder_py?robot=r2")?;
-    beside.says(json!({"op": "auth", "mac": other}))?;
+    beside.send(json!({"op": "auth", "mac": other}))?;
     for robot in [&mut at_work, &mut beside] {
-        ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+        ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     }
     daemon.servant_of("adder_py", "r1")?;
-    at_work.says(json!({"op": "subscribe", "topic": "/rosout", "type": "rosgraph_msgs/Log"}))?;
+    at_work.send(json!({"op": "subscribe", "topic": "/rosout", "type": "rosgraph_msgs/Log"}))?;
     deployer
-        .types(&[
+        .run(&[
             "policy",
             "allow",
             "rover",
@@ -424,20 +435,22 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
             "--service",
             "adder_*",
         ])?
-        .succeeded()?;
-    at_work.hears_status("subscribe:/rosout is not granted to this client any more")?;
-    let refused = at_work.calls("/add_two", json!({"a": 1, "b": 2}))?;
+        .expect_success()?;
+    at_work.wait_for_status("subscribe:/rosout is no longer granted to this client")?;
+    let refused = at_work.call("/add_two", json!({"a": 1, "b": 2}))?;
     let reason = refused["values"].as_str().unwrap_or_default();
     ensure!(
         refused["result"] == false && reason.contains("call:/add_two is not granted"),
         "{refused}"
     );
-    let services = at_work.calls("/rosapi/services", json!({}))?.to_string();
+    let services = at_work.call("/rosapi/services", json!({}))?.to_string();
     ensure!(!services.contains("/add_two"), "{services}");
-    ensure!(beside.calls("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
-    // The connection of a revoked token ends; the other goes on.
-    deployer.types(&["token", "revoke", "rover"])?.succeeded()?;
-    let close = at_work.hears_close()?;
+    ensure!(beside.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
+    // The connection of a revoked token ends; the other one continues.
+    deployer
+        .run(&["token", "revoke", "rover"])?
+        .expect_success()?;
+    let close = at_work.wait_for_close()?;
     ensure!(
         u16::from(close.code) == 1008 && close.reason.contains("revoked"),
         "{close:?}"
@@ -446,7 +459,7 @@ pub fn what_robots_may_changes_while_they_are_connected() -> Verdict {
         anyhow::bail!("a revoked token let a robot in")
     };
     ensure!(refusal.status == 401, "{refusal}");
-    ensure!(beside.calls("/add_two", json!({"a": 3, "b": 2}))?["values"]["sum"] == 5);
+    ensure!(beside.call("/add_two", json!({"a": 3, "b": 2}))?["values"]["sum"] == 5);
     Ok(())
 }
 
@@ -454,10 +467,10 @@ pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
     let daemon = daemon("locals")?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=r1")?;
-    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     ensure!(daemon.get("/api/v1/services")?.0 == 200 && daemon.get("/metrics")?.0 == 200);
     for (method, path) in [
         ("DELETE", "/api/v1/services/adder_py"),
@@ -472,17 +485,19 @@ pub fn this_machines_users_see_and_are_robots_and_change_nothing() -> Verdict {
             "{method} {path}: {status} {body}"
         );
     }
-    // From the first token on everybody needs one, and who has none is not served any further.
-    token(&daemon, &["root2", "--role", "admin"])?;
-    let close = robot.hears_close()?;
+    // From the first token on everyone needs one, and a client without a token is disconnected.
+    create_token(&daemon, &["root2", "--role", "admin"])?;
+    let close = robot.wait_for_close()?;
     ensure!(u16::from(close.code) == 1008, "{close:?}");
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
-    deployer.types(&["token", "revoke", "root2"])?.succeeded()?;
+    deployer
+        .run(&["token", "revoke", "root2"])?
+        .expect_success()?;
     ensure!(
         daemon.get("/api/v1/services")?.0 == 401,
         "the door does not open again"
     );
-    deployer.types(&["services"])?.succeeded()?;
+    deployer.run(&["services"])?.expect_success()?;
     Ok(())
 }
 
@@ -490,10 +505,10 @@ pub fn what_was_begun_with_a_token_ends_with_it() -> Verdict {
     let daemon = daemon("access-revoked")?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
-    let secret = token(&daemon, &["watcher", "--role", "operator"])?;
-    // Nobody uses the service: it would wait for an hour.
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
+    let secret = create_token(&daemon, &["watcher", "--role", "operator"])?;
+    // Nobody uses the service, so it would wait for an hour.
     let mut going = Command::new(support::binaries::path("cloudroidctl"))
         .args(["--server", &format!("http://{}", daemon.address)])
         .args(["--token", &secret, "--format", "json"])
@@ -507,9 +522,9 @@ pub fn what_was_begun_with_a_token_ends_with_it() -> Verdict {
     ensure!(first.contains("waiting for a robot"), "{first}");
     daemon
         .deployer()
-        .types(&["token", "revoke", "watcher"])?
-        .succeeded()?;
-    let ended = support::until("its end", || {
+        .run(&["token", "revoke", "watcher"])?
+        .expect_success()?;
+    let ended = support::wait_until("its end", || {
         Ok(going.try_wait()?.ok_or_else(|| "it goes on".to_owned()))
     });
     let _ = going.kill();

@@ -1,16 +1,16 @@
-//! A certificate of an authority that is asked by ACME: Pebble.
+//! A certificate from an ACME server: Pebble.
 
 use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
 
 use anyhow::{Context, ensure};
-use support::acme::Directory;
+use support::acme::AcmeDirectory;
 use support::daemon::Daemon;
-use support::deployer::{Outcome, run};
+use support::deployer::{CommandOutcome, run};
 use support::machine::free_port;
 use support::patience::{patience, scale_seconds};
 use support::world::world;
-use support::{Verdict, until};
+use support::{Verdict, wait_until};
 
 const NAME: &str = "robots.lab.example";
 const LONG: u64 = 90 * 86_400;
@@ -21,8 +21,8 @@ fn port(daemon: &Daemon) -> anyhow::Result<u16> {
     Ok(port.parse()?)
 }
 
-/// curl at the daemon under its name in the DNS, whose certificate `authority` is to have signed.
-fn curl(daemon: &Daemon, authority: &std::path::Path) -> anyhow::Result<Outcome> {
+/// Requests the daemon with curl by its DNS name, trusting only certificates signed by `authority`.
+fn curl(daemon: &Daemon, authority: &std::path::Path) -> anyhow::Result<CommandOutcome> {
     let port = port(daemon)?;
     run(Command::new("curl")
         .args(["--silent", "--show-error", "--max-time"])
@@ -34,8 +34,8 @@ fn curl(daemon: &Daemon, authority: &std::path::Path) -> anyhow::Result<Outcome>
         .arg(format!("https://{NAME}:{port}/healthz")))
 }
 
-fn awaits_event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<String> {
-    let event = daemon.awaits_event(kind, |event| {
+fn wait_for_event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<String> {
+    let event = daemon.wait_for_event(kind, |event| {
         let message = event["message"].as_str().unwrap_or_default();
         event["kind"] == kind && words.iter().all(|word| message.contains(word))
     })?;
@@ -43,78 +43,78 @@ fn awaits_event(daemon: &Daemon, kind: &str, words: &[&str]) -> anyhow::Result<S
 }
 
 pub fn a_certificate_is_asked_for_and_renewed() -> Verdict {
-    let directory = Directory::new()?;
+    let directory = AcmeDirectory::new()?;
     let elsewhere = free_port()?;
-    let setup = world().own("named").config(&format!(
+    let setup = world().setup("named").config(&format!(
         "{TOKENS}{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n",
         directory.section(NAME)
     ));
     let daemon = setup.start()?;
-    // Nobody answers there. What the daemon has made itself is shown until then.
-    awaits_event(
+    // No ACME server is running yet; meanwhile the daemon uses its self-signed certificate.
+    wait_for_event(
         &daemon,
         "certificate-not-renewed",
         &[
             &directory.url(),
             NAME,
             "cannot be reached",
-            "asked again in",
+            "next attempt in",
         ],
     )?;
     ensure!(
         curl(&daemon, &daemon.home.join("tls/own.pem"))?
-            .said()
+            .output()
             .contains("no alternative certificate subject name"),
         "its own is for other names"
     );
-    // One that does not find this machine behind the name.
-    let lost = directory.opens(free_port()?, LONG)?;
-    awaits_event(
+    // A server that does not find this machine under the name.
+    let lost = directory.start(free_port()?, LONG)?;
+    wait_for_event(
         &daemon,
         "certificate-not-renewed",
         &[
-            "could not see that the names lead here",
+            "could not verify the names",
             NAME,
-            &format!("port 443 has to be led to port {elsewhere}"),
+            &format!("port 443 to port {elsewhere}"),
         ],
     )?;
     drop(lost);
-    // One that does, where it is told to look. The account with the one before is no account with this one.
-    let brief = directory.opens(elsewhere, scale_seconds(9))?;
-    let first = awaits_event(&daemon, "certificate-shown", &[NAME])?;
-    let answer = curl(&daemon, &brief.root())?.succeeded()?;
-    ensure!(answer.stdout.contains("200"), "{}", answer.said());
-    // It is renewed while it is good.
-    daemon.awaits_event("another certificate", |event| {
+    // A server that does, at the port that it is given. The account with the previous server is not valid here.
+    let brief = directory.start(elsewhere, scale_seconds(9))?;
+    let first = wait_for_event(&daemon, "certificate-shown", &[NAME])?;
+    let answer = curl(&daemon, &brief.root())?.expect_success()?;
+    ensure!(answer.stdout.contains("200"), "{}", answer.output());
+    // It is renewed before it expires.
+    daemon.wait_for_event("another certificate", |event| {
         event["kind"] == "certificate-shown" && event["message"] != *first
     })?;
     drop(brief);
-    // The portal's own port is another where it may look.
-    let lasting = directory.opens(port(&daemon)?, LONG)?;
+    // The server may also validate at the portal's own port.
+    let lasting = directory.start(port(&daemon)?, LONG)?;
     let root = lasting.root();
-    until("a certificate of the other authority", || {
+    wait_until("a certificate of the other authority", || {
         let answer = curl(&daemon, &root)?;
-        Ok((answer.status == 0).then_some(()).ok_or(answer.said()))
+        Ok((answer.status == 0).then_some(()).ok_or(answer.output()))
     })?;
     drop(lasting);
-    // It is kept, with its key, for a daemon that starts when nobody can be asked.
+    // Certificate and key are stored for a daemon that starts while no server is available.
     for file in ["acme.pem", "acme-account.json"] {
         let mode = std::fs::metadata(daemon.home.join("tls").join(file))?
             .permissions()
             .mode();
         ensure!(mode & 0o777 == 0o600, "{file}: {mode:o}");
     }
-    daemon.ends()?;
+    daemon.stop()?;
     let daemon = setup.start()?;
-    curl(&daemon, &root)?.succeeded()?;
+    curl(&daemon, &root)?.expect_success()?;
     Ok(())
 }
 
 pub fn who_comes_for_something_else_is_answered_no_challenge() -> Verdict {
-    let directory = Directory::new()?;
+    let directory = AcmeDirectory::new()?;
     let elsewhere = free_port()?;
     let daemon = world()
-        .own("unchallenged")
+        .setup("unchallenged")
         .config(&format!(
             "{}challenge_listen = \"127.0.0.1:{elsewhere}\"\n",
             directory.section(NAME)
@@ -131,15 +131,15 @@ pub fn who_comes_for_something_else_is_answered_no_challenge() -> Verdict {
         ensure!(
             unasked.status != 0 && !unasked.stdout.contains("BEGIN CERTIFICATE"),
             "no challenge is under way: {}",
-            unasked.said()
+            unasked.output()
         );
     }
-    // Where challenges alone are answered, nothing is.
+    // The port for challenges serves nothing else.
     let said = run(Command::new("curl")
         .args(["--silent", "--show-error", "--insecure", "--max-time"])
         .arg(patience().as_secs().to_string())
         .arg(format!("https://127.0.0.1:{elsewhere}/healthz")))?;
-    ensure!(said.status != 0, "{}", said.said());
+    ensure!(said.status != 0, "{}", said.output());
     Ok(())
 }
 
@@ -162,9 +162,9 @@ pub fn what_cannot_be_asked_for_is_said_at_the_start() -> Verdict {
         ),
     ] {
         let refused = world()
-            .own(own)
+            .setup(own)
             .config(&format!("[tls.acme]\n{section}\n"))
-            .refuses_to_start()?;
+            .expect_refusal()?;
         ensure!(refused.contains(words), "{words}: {refused}");
     }
     Ok(())

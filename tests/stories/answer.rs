@@ -1,4 +1,4 @@
-//! The main job: a package nobody changed, a client nobody here wrote, people found in real pictures.
+//! The main task: an unmodified package and an independent client find people in real images.
 
 use std::process::Command;
 
@@ -8,18 +8,18 @@ use support::world::{PEOPLE, world};
 use support::{Verdict, binaries};
 
 pub fn a_robot_finds_people_in_real_pictures() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let picture = daemon.home.join("people.png");
     let outcome = run(Command::new(binaries::python())
         .arg(binaries::checkout().join("demo/robot.py"))
         .arg(daemon.url("opencv_apps?robot=looker"))
         .args(["--frames", "4", "--picture"])
         .arg(&picture))?
-    .succeeded()?;
+    .expect_success()?;
     ensure!(
         outcome.stdout.contains("4 of 4 frames answered"),
         "{}",
-        outcome.said()
+        outcome.output()
     );
     let size = std::fs::metadata(&picture)
         .context("the annotated picture")?
@@ -29,7 +29,7 @@ pub fn a_robot_finds_people_in_real_pictures() -> Verdict {
 }
 
 pub fn the_interface_is_found_lazy_inputs_included() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let service = daemon.get_json("/api/v1/services/opencv_apps")?;
     let topics = service["interface"]["topics"]
         .as_array()
@@ -40,7 +40,7 @@ pub fn the_interface_is_found_lazy_inputs_included() -> Verdict {
             .find(|topic| topic["name"] == name)
             .with_context(|| format!("{name} among {topics:#?}"))
     };
-    // people_detect subscribes to `image` only while somebody wants `found`.
+    // people_detect subscribes to `image` only while `found` has subscribers.
     let image = topic("/image")?;
     ensure!(
         image["direction"] == "input" && image["lazy"] == true,

@@ -1,4 +1,4 @@
-//! What packages that nobody here wrote do differently, each shrunk to what mattered.
+//! Peculiarities of third-party packages, each reduced to its essence.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use support::deployer::path_str;
 use support::world::world;
 
 /// Writes files below a directory.
-fn write(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
+fn write_files(directory: &Path, files: &[(&str, String)]) -> anyhow::Result<()> {
     for (path, text) in files {
         let path = directory.join(path);
         std::fs::create_dir_all(path.parent().context("below")?)?;
@@ -27,9 +27,9 @@ fn manifest(name: &str, needs: &str) -> String {
 
 const OF_CATKIN: &str = "<buildtool_depend>catkin</buildtool_depend><depend>roscpp</depend>";
 
-/// As tf2_web_republisher has its services, and csm its module of pkg-config.
+/// Services defined in another place, as in tf2_web_republisher, and a pkg-config module, as in csm.
 pub fn services_elsewhere_and_modules_of_plain_packages_are_found() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let plain = "cmake_minimum_required(VERSION 3.0.2)\nproject(plain_matcher C)\n\
                  configure_file(matcher.pc.in matcher.pc @ONLY)\n\
@@ -69,26 +69,26 @@ pub fn services_elsewhere_and_modules_of_plain_packages_are_found() -> Verdict {
         ),
         ("src/asker/asker.cpp", program.to_owned()),
     ];
-    write(place.path(), &files)?;
+    write_files(place.path(), &files)?;
     let push = ["push", path_str(place.path()), "--name", "asker"];
-    daemon.deployer().types(&push)?.succeeded()?;
+    daemon.deployer().run(&push)?.expect_success()?;
     let answer = daemon
         .robot("asker")?
-        .calls("/ask", json!({"question": 40}))?;
+        .call("/ask", json!({"question": 40}))?;
     ensure!(answer["values"]["answer"] == 42, "{answer}");
     Ok(())
 }
 
-/// As A-LOAM forgot them.
+/// Missing dependencies like those of A-LOAM.
 pub fn all_that_a_package_forgot_is_named_at_once() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(forgetful)\n\
                  find_package(catkin REQUIRED COMPONENTS roscpp rosbag_storage tf)\n\
                  find_package(Eigen3 REQUIRED)\nfind_package(PkgConfig REQUIRED)\n\
                  pkg_check_modules(FROB frob)\npkg_check_modules(GSL REQUIRED gsl)\n\
                  find_package(no_such_package REQUIRED)\ncatkin_package()\n";
-    write(
+    write_files(
         place.path(),
         &[
             ("package.xml", manifest("forgetful", OF_CATKIN)),
@@ -96,7 +96,7 @@ pub fn all_that_a_package_forgot_is_named_at_once() -> Verdict {
         ],
     )?;
     let push = ["push", path_str(place.path()), "--node", "any"];
-    let outcome = daemon.deployer().types(&push)?.failed_saying(&[
+    let outcome = daemon.deployer().run(&push)?.expect_failure(&[
         "--with rosbag_storage",
         "--with tf",
         "--with libeigen3-dev",
@@ -104,20 +104,20 @@ pub fn all_that_a_package_forgot_is_named_at_once() -> Verdict {
         "the CMake package no_such_package is missing, and no package of the archive has it",
     ])?;
     let frob = "the pkg-config module frob is missing";
-    ensure!(!outcome.said().contains(frob), "{}", outcome.said());
+    ensure!(!outcome.output().contains(frob), "{}", outcome.output());
     Ok(())
 }
 
-/// As twist_mux forgot numpy.
+/// A missing numpy, as in twist_mux.
 pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(counts_py)\nfind_package(catkin REQUIRED)\n\
                  catkin_package()\n\
                  catkin_install_python(PROGRAMS counts.py DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
     let needs = "<buildtool_depend>catkin</buildtool_depend><exec_depend>rospy</exec_depend>";
     let program = "#!/usr/bin/env python3\nimport rospy\nimport scipy\nrospy.init_node('counts')\nrospy.spin()\n";
-    write(
+    write_files(
         place.path(),
         &[
             ("package.xml", manifest("counts_py", needs)),
@@ -129,20 +129,20 @@ pub fn a_python_module_that_a_package_forgot_is_named() -> Verdict {
     let missing = "the Python module scipy is missing: push with `--with python3-scipy`";
     daemon
         .deployer()
-        .types(&push)?
-        .failed_saying(&["exited with status 1", missing])?;
+        .run(&push)?
+        .expect_failure(&["exited with status 1", missing])?;
     Ok(())
 }
 
-/// As robot_pose_ekf was asked about after eleven minutes.
+/// robot_pose_ekf was only asked about after eleven minutes.
 pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let build = "cmake_minimum_required(VERSION 3.0.2)\nproject(choosy)\n\
                  find_package(catkin REQUIRED COMPONENTS roscpp)\ncatkin_package()\n\
                  add_executable(left it.cpp)\nadd_executable(${PROJECT_NAME}_right it.cpp)\n\
                  target_link_libraries(left ${catkin_LIBRARIES})\n";
-    write(
+    write_files(
         place.path(),
         &[
             ("package.xml", manifest("choosy", OF_CATKIN)),
@@ -151,8 +151,8 @@ pub fn what_to_run_is_asked_for_before_anything_is_compiled() -> Verdict {
         ],
     )?;
     let push = ["--format", "json", "push", path_str(place.path())];
-    let outcome = daemon.deployer().types(&push)?.failed_saying(&[
-        "say what to run, with --node or --launch; executables: choosy_right, left; launch files: none",
+    let outcome = daemon.deployer().run(&push)?.expect_failure(&[
+        "choose what to run with --node or --launch; executables: choosy_right, left; launch files: none",
         "nothing is compiled yet",
     ])?;
     let events = outcome.stdout.lines();

@@ -1,5 +1,5 @@
-//! Attempts to get further than one's position allows, from each position of docs/security.md but that within a servant
-//! (see burglary): what comes back is compared, and nothing of the server may have changed.
+//! Attempts to exceed the rights of each position in docs/security.md, except that of a servant (see burglary): the
+//! responses are checked, and nothing on the server may have changed.
 
 #[path = "breakin/local.rs"]
 mod local;

@@ -1,4 +1,4 @@
-//! A page in a real browser (Chromium), with roslib in it, that shows a token in each way that a page can.
+//! A page in a real browser (Chromium) that uses roslib and shows a token in every way that a page can.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -7,13 +7,13 @@ use std::sync::{Arc, mpsc};
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
-use support::patience::{self, Patient};
+use support::patience::{self, PatientStream};
 use support::world::world;
 use support::{Verdict, binaries};
 
-use crate::access::{daemon, pushes_adder, token};
+use crate::access::{create_token, daemon, push_adder};
 
-/// Adds two numbers over connections that show the token in the way that each is named by, and tells what came of it.
+/// Adds two numbers over connections named after the way in which they show the token, and reports the results.
 const PAGE: &str = r#"<!doctype html>
 <title>A robot's page</title>
 <script>
@@ -53,12 +53,16 @@ const adds = (url, prepare, protocols) => new Promise((resolve) => {
 </script>
 "#;
 
-/// A browser, which ends with this value.
-pub struct Browser(Child);
+/// A browser, which is killed on drop.
+pub struct ChromiumBrowser(Child);
 
-impl Browser {
-    /// Opens a page, with more words of its command line.
-    pub fn opens(url: &str, profile: &std::path::Path, more: &[&str]) -> anyhow::Result<Browser> {
+impl ChromiumBrowser {
+    /// Opens a page, with further command-line arguments.
+    pub fn open(
+        url: &str,
+        profile: &std::path::Path,
+        more: &[&str],
+    ) -> anyhow::Result<ChromiumBrowser> {
         let child = Command::new("chromium")
             .args([
                 "--headless",
@@ -74,27 +78,27 @@ impl Browser {
             .arg(format!("--user-data-dir={}", profile.display()))
             .args(more)
             .arg(url)
-            // What it leaves behind goes with the profile.
+            // Temporary files are removed together with the profile.
             .env("TMPDIR", profile)
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::null())
             .spawn()
             .context("chromium, which make deps installs")?;
-        Ok(Browser(child))
+        Ok(ChromiumBrowser(child))
     }
 }
 
-impl Drop for Browser {
+impl Drop for ChromiumBrowser {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// What a browser asks a site of a story for: the head of its request, and the body.
-pub fn request(stream: &TcpStream) -> anyhow::Result<(String, Vec<u8>)> {
-    let mut reader = BufReader::new(Patient::new(stream.try_clone()?)?);
+/// Reads a browser's request: the head and the body.
+pub fn read_request(stream: &TcpStream) -> anyhow::Result<(String, Vec<u8>)> {
+    let mut reader = BufReader::new(PatientStream::new(stream.try_clone()?)?);
     let (mut head, mut length) = (String::new(), 0);
     while reader.read_line(&mut head)? > 2 {
         let line = head.lines().last().unwrap_or_default().to_lowercase();
@@ -107,15 +111,15 @@ pub fn request(stream: &TcpStream) -> anyhow::Result<(String, Vec<u8>)> {
     Ok((head, body))
 }
 
-/// What the page asks for, and where what it says goes.
-struct Site {
+/// Files of the page, and the channel for its reports.
+struct PageSite {
     roslib: Vec<u8>,
     asked: String,
     said: mpsc::Sender<Value>,
 }
 
-impl Site {
-    /// Answers every connection by a thread of its own: browsers open some that they may not use.
+impl PageSite {
+    /// Answers every connection on a thread of its own, because browsers open connections that they may not use.
     fn serve(self, listener: TcpListener) {
         let site = Arc::new(self);
         std::thread::spawn(move || {
@@ -127,7 +131,7 @@ impl Site {
     }
 
     fn answer(&self, mut stream: TcpStream) -> anyhow::Result<()> {
-        let (head, body) = request(&stream)?;
+        let (head, body) = read_request(&stream)?;
         let path = head.split(' ').nth(1).unwrap_or_default();
         let (kind, answer) = match path {
             "/" => ("text/html", PAGE.as_bytes()),
@@ -149,8 +153,8 @@ impl Site {
 
 pub fn a_page_with_roslib_shows_its_token() -> Verdict {
     let daemon = daemon("browser")?;
-    let admin = token(&daemon, &["admin", "--role", "admin"])?;
-    pushes_adder(&daemon, &admin, &[])?.succeeded()?;
+    let admin = create_token(&daemon, &["admin", "--role", "admin"])?;
+    push_adder(&daemon, &admin, &[])?.expect_success()?;
     let robot = |name: &str, service: &str| {
         let words = [
             name,
@@ -161,7 +165,7 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
             "--service",
             service,
         ];
-        token(&daemon, &words)
+        create_token(&daemon, &words)
     };
     let (page, other) = (robot("page", "adder_py")?, robot("other", "other_*")?);
     let listener = TcpListener::bind("127.0.0.1:0")?;
@@ -171,14 +175,14 @@ pub fn a_page_with_roslib_shows_its_token() -> Verdict {
         "url": daemon.url("adder_py?robot=page"),
         "tokens": {"own": page, "another's": other, "unknown": "0".repeat(52)},
     });
-    let site = Site {
+    let site = PageSite {
         roslib: std::fs::read(binaries::node_modules().join("roslib/build/roslib.min.js"))?,
         asked: asked.to_string(),
         said: sender,
     };
     site.serve(listener);
     let profile = world().directory("profile")?;
-    let browser = Browser::opens(&format!("http://127.0.0.1:{port}/"), profile.path(), &[])?;
+    let browser = ChromiumBrowser::open(&format!("http://127.0.0.1:{port}/"), profile.path(), &[])?;
     let said = patience::receive(&said);
     drop(browser);
     let said = said.context("the page said nothing")?;

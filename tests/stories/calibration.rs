@@ -1,4 +1,4 @@
-//! What response times cost is measured, and a robot whose requests are taken for it notices nothing.
+//! Calibration measures the limits needed for response times, without affecting the robot whose requests are used.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -12,24 +12,24 @@ use support::deployer::{path_str, run};
 use support::robot::Robot;
 use support::world::{PEOPLE, TELLER, world};
 
-/// Of Debian's opencv-doc.
+/// Video of Debian's opencv-doc.
 pub const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
-/// people_detect under a name of its own.
+/// Separate service name for people_detect.
 const SERVICE: &str = "calibrated";
 
-/// Five pictures.
-fn frames(directory: &Path) -> Verdict {
+/// Extracts five images.
+fn extract_frames(directory: &Path) -> Verdict {
     run(Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", "5"])
         .args(["-s", "640x480"])
         .arg(directory.join("frame%02d.png")))?
-    .succeeded()?;
+    .expect_success()?;
     Ok(())
 }
 
-/// Servants that are measured, of a service.
-pub fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
+/// Returns the servants of a service that are being calibrated.
+pub fn measured_servants(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
     let servants = daemon.servants_of(service)?.into_iter();
     let measured = servants.filter(|servant| {
         let robot = servant["robot"].as_str().unwrap_or_default();
@@ -38,10 +38,10 @@ pub fn measured(daemon: &Daemon, service: &str) -> anyhow::Result<Vec<Value>> {
     Ok(measured.collect())
 }
 
-/// None is left, once those that end have ended.
-pub fn none_is_left(daemon: &Daemon, service: &str) -> Verdict {
-    support::until("the measured servant's end", || {
-        let left = measured(daemon, service)?;
+/// Waits until no such servant is left.
+pub fn wait_until_none_left(daemon: &Daemon, service: &str) -> Verdict {
+    support::wait_until("the measured servant's end", || {
+        let left = measured_servants(daemon, service)?;
         Ok(if left.is_empty() {
             Ok(())
         } else {
@@ -50,29 +50,29 @@ pub fn none_is_left(daemon: &Daemon, service: &str) -> Verdict {
     })
 }
 
-/// The last line of what is printed for programs.
-fn calibration(printed: &str) -> anyhow::Result<Value> {
+/// Parses the last line of the machine-readable output.
+fn parse_calibration(printed: &str) -> anyhow::Result<Value> {
     let last = printed.lines().last().context("nothing was printed")?;
     serde_json::from_str(last).with_context(|| last.to_owned())
 }
 
-fn time(point: &Value, name: &str) -> anyhow::Result<f64> {
+fn point_time(point: &Value, name: &str) -> anyhow::Result<f64> {
     point[name]
         .as_f64()
         .with_context(|| format!("{name} of {point}"))
 }
 
 pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
-    // Cores that it measures with are not promised to other stories' robots.
-    let daemon = world().own("calibrated").start()?;
+    // A separate daemon, because the cores for calibration are not available to the robots of other stories.
+    let daemon = world().setup("calibrated").start()?;
     let pushed = [&["push", "--name", SERVICE], PEOPLE.arguments].concat();
-    daemon.deployer().types(&pushed)?.succeeded()?;
+    daemon.deployer().run(&pushed)?.expect_success()?;
     let place = world().directory("frames")?;
-    frames(place.path())?;
+    extract_frames(place.path())?;
     let curve = place.path().join("curve.svg");
     let printed = daemon
         .deployer()
-        .types(&[
+        .run(&[
             "--format",
             "json",
             "calibrate",
@@ -91,9 +91,9 @@ pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
             "--curve",
             path_str(&curve),
         ])?
-        .succeeded()?;
-    none_is_left(&daemon, SERVICE)?;
-    let calibration = calibration(&printed.stdout)?;
+        .expect_success()?;
+    wait_until_none_left(&daemon, SERVICE)?;
+    let calibration = parse_calibration(&printed.stdout)?;
     let points = calibration["points"].as_array().context("points")?;
     ensure!(points.len() == 2, "{calibration:#}");
     let (tight, wide) = (&points[0], &points[1]);
@@ -101,12 +101,16 @@ pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
         tight["answered"] == 12 && tight["requests"] == 12,
         "{tight:#}"
     );
-    // A fifth of a core needs five times as long as the work; half of that stands even where a first tenth of a second is free.
-    let (running, took) = (time(tight, "running")?, time(&tight["compute"], "p50")?);
+    // With a fifth of a core the work takes five times as long; at least half of that remains even if the first tenth
+    // of a second is free.
+    let (running, took) = (
+        point_time(tight, "running")?,
+        point_time(&tight["compute"], "p50")?,
+    );
     ensure!(took > running * 2.5, "no limit was in force: {tight:#}");
-    ensure!(time(tight, "throttled")? > running, "{tight:#}");
+    ensure!(point_time(tight, "throttled")? > running, "{tight:#}");
     ensure!(
-        time(wide, "throttled")? < time(tight, "throttled")?,
+        point_time(wide, "throttled")? < point_time(tight, "throttled")?,
         "{calibration:#}"
     );
     let peak = calibration["memory_peak"].as_u64().context("a peak")?;
@@ -120,10 +124,10 @@ pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
         peak > 20 << 20,
         "people_detect has more than that: {calibration:#}"
     );
-    // The network's share is in the row.
-    let slowest = time(&tight["compute"], "p95")? + 10.0;
+    // The row includes the time on the network.
+    let slowest = point_time(&tight["compute"], "p95")? + 10.0;
     ensure!(
-        (time(&cheapest["spread"], "p95")? * 1000.0 - slowest).abs() < 1e-6,
+        (point_time(&cheapest["spread"], "p95")? * 1000.0 - slowest).abs() < 1e-6,
         "{calibration:#}"
     );
     let drawn = std::fs::read_to_string(&curve)?;
@@ -135,9 +139,9 @@ pub fn fewer_cores_take_longer_and_rows_say_how_long() -> Verdict {
     Ok(())
 }
 
-/// Rows that were written are what robots are given who wish for what they reach.
+/// Checks that the written rows determine the limits of robots with corresponding wishes.
 fn robots_get_what_was_measured(daemon: &Daemon, measured: &[Value]) -> Verdict {
-    let written = daemon.deployer().asks(&["sla", "list", SERVICE])?;
+    let written = daemon.deployer().run_json(&["sla", "list", SERVICE])?;
     let written = written.as_array().context("rows")?;
     ensure!(written.len() == measured.len(), "{written:#?}");
     for (number, row) in measured.iter().enumerate() {
@@ -155,19 +159,19 @@ fn robots_get_what_was_measured(daemon: &Daemon, measured: &[Value]) -> Verdict 
             );
         }
         let id = servant["id"].as_str().context("an id")?;
-        daemon.deployer().types(&["stop", id])?.succeeded()?;
+        daemon.deployer().run(&["stop", id])?.expect_success()?;
     }
     Ok(())
 }
 
 pub fn what_cannot_be_calibrated_is_said() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let place = world().directory("no-frames")?;
     let refused = |words: &[&str], saying: &[&str]| {
         let outcome = daemon
             .deployer()
-            .types(&[&["calibrate", "opencv_apps"], words].concat())?;
-        outcome.failed_saying(saying)
+            .run(&[&["calibrate", "opencv_apps"], words].concat())?;
+        outcome.expect_failure(saying)
     };
     refused(
         &["--frames", path_str(place.path())],
@@ -179,7 +183,7 @@ pub fn what_cannot_be_calibrated_is_said() -> Verdict {
         &["--frames", path_str(place.path())],
         &["cannot be read", "PNG"],
     )?;
-    refused(&["--bag", path_str(&bad)], &["no rosbag file"])?;
+    refused(&["--bag", path_str(&bad)], &["not a rosbag file"])?;
     refused(
         &["--live", "nobody"],
         &[
@@ -192,7 +196,7 @@ pub fn what_cannot_be_calibrated_is_said() -> Verdict {
         &["cpus = 0 is not between"],
     )?;
     let robot = daemon.robot("opencv_apps?robot=silent")?;
-    daemon.awaits_event("a ready servant", |event| {
+    daemon.wait_for_event("a ready servant", |event| {
         event["kind"] == "servant-ready" && event["robot"] == "silent"
     })?;
     refused(
@@ -200,16 +204,16 @@ pub fn what_cannot_be_calibrated_is_said() -> Verdict {
         &["robot silent sent nothing to opencv_apps within 0.2 s"],
     )?;
     drop(robot);
-    none_is_left(&daemon, "opencv_apps")
+    wait_until_none_left(&daemon, "opencv_apps")
 }
 
-/// Says so many words one after the other, each once the one before is answered.
-/// Both topics are connected, and nothing of that is on its way any more.
-fn hears_itself(robot: &mut Robot) -> Verdict {
+/// Publishes words until one of them is answered and all answers have arrived: then both topics are connected and no
+/// message is in flight.
+fn wait_until_echoed(robot: &mut Robot) -> Verdict {
     let say = |robot: &mut Robot, word: &str| {
-        robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))
+        robot.send(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))
     };
-    support::until("an answer", || {
+    support::wait_until("an answer", || {
         say(robot, "hello")?;
         let heard = !robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
         Ok(if heard {
@@ -219,41 +223,41 @@ fn hears_itself(robot: &mut Robot) -> Verdict {
         })
     })?;
     say(robot, "begin")?;
-    while robot.hears_on("/teller/said")?["data"] != "begin" {}
+    while robot.next_message_on("/teller/said")?["data"] != "begin" {}
     Ok(())
 }
 
-fn talks(robot: &mut Robot, told: &AtomicBool) -> anyhow::Result<(Vec<String>, Vec<String>)> {
+fn talk(robot: &mut Robot, told: &AtomicBool) -> anyhow::Result<(Vec<String>, Vec<String>)> {
     let (mut said, mut heard) = (Vec::new(), Vec::new());
     while !told.load(Ordering::SeqCst) {
         let word = format!("word {}", said.len());
-        robot.says(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))?;
+        robot.send(json!({"op": "publish", "topic": "/teller/say", "msg": {"data": word}}))?;
         said.push(word);
-        let answer = robot.hears_on("/teller/said")?;
+        let answer = robot.next_message_on("/teller/said")?;
         heard.push(answer["data"].as_str().unwrap_or_default().to_owned());
     }
-    // Whatever else is on its way arrives before this is answered.
+    // Everything in flight arrives before this call is answered.
     let more = !robot.has_not_heard(|value| value["topic"] == "/teller/said")?;
     ensure!(!more, "something was answered twice");
     Ok((said, heard))
 }
 
 pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> Verdict {
-    let daemon = world().own("calibrated-live").start()?;
+    let daemon = world().setup("calibrated-live").start()?;
     daemon
         .deployer()
-        .pushes("teller_py", TELLER.arguments)?
-        .succeeded()?;
+        .push("teller_py", TELLER.arguments)?
+        .expect_success()?;
     let mut robot = daemon.robot("teller_py?robot=talker")?;
-    robot.says(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
-    robot.subscribes("/teller/said")?;
-    robot.awaits_subscriber("/teller/say")?;
-    hears_itself(&mut robot)?;
+    robot.send(json!({"op": "advertise", "topic": "/teller/say", "type": "std_msgs/String"}))?;
+    robot.subscribe("/teller/said")?;
+    robot.wait_for_subscriber("/teller/say")?;
+    wait_until_echoed(&mut robot)?;
     let over = AtomicBool::new(false);
     let place = world().directory("live")?;
     let curve = place.path().join("curve.svg");
     let (calibrated, talked) = std::thread::scope(|scope| {
-        let talking = scope.spawn(|| talks(&mut robot, &over));
+        let talking = scope.spawn(|| talk(&mut robot, &over));
         let words = [
             "--format",
             "json",
@@ -271,13 +275,13 @@ pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> 
             "--curve",
             path_str(&curve),
         ];
-        let calibrated = daemon.deployer().types(&words);
+        let calibrated = daemon.deployer().run(&words);
         over.store(true, Ordering::SeqCst);
         (calibrated, talking.join())
     });
     let (said, heard) = talked.map_err(|_| anyhow::anyhow!("the robot panicked"))??;
     ensure!(said == heard, "the robot said {said:?} and heard {heard:?}");
-    let calibration = calibration(&calibrated?.succeeded()?.stdout)?;
+    let calibration = parse_calibration(&calibrated?.expect_success()?.stdout)?;
     ensure!(
         calibration["inputs"][0]["topic"] == "/teller/say",
         "{calibration:#}"
@@ -286,8 +290,8 @@ pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> 
         calibration["points"][1]["answered"] == 10,
         "{calibration:#}"
     );
-    none_is_left(&daemon, "teller_py")?;
-    // Its own servant is as it was.
+    wait_until_none_left(&daemon, "teller_py")?;
+    // The robot's own servant is unchanged.
     let servant = daemon.servant_of("teller_py", "talker")?;
     ensure!(
         servant["phase"] == "ready" && servant["connections"] == 1,
@@ -297,10 +301,10 @@ pub fn a_robots_own_requests_are_replayed_and_it_hears_none_of_the_answers() -> 
 }
 
 pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let place = world().directory("gone")?;
-    frames(place.path())?;
-    // Would take minutes.
+    extract_frames(place.path())?;
+    // This would take minutes.
     let mut going = Command::new(support::binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home)
         .env_remove("CLOUDROID_SERVER")
@@ -317,8 +321,8 @@ pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
         .stdout(Stdio::null())
         .stderr(Stdio::null())
         .spawn()?;
-    let seen = support::until("a servant that is measured", || {
-        let found = measured(&daemon, "opencv_apps")?;
+    let seen = support::wait_until("a servant that is measured", || {
+        let found = measured_servants(&daemon, "opencv_apps")?;
         Ok(if found.is_empty() {
             Err("none".to_owned())
         } else {
@@ -328,22 +332,22 @@ pub fn a_calibration_that_nobody_waits_for_leaves_nothing() -> Verdict {
     going.kill()?;
     going.wait()?;
     seen?;
-    none_is_left(&daemon, "opencv_apps")
+    wait_until_none_left(&daemon, "opencv_apps")
 }
 
 pub fn a_calibration_gives_way_to_a_robot() -> Verdict {
-    // Room for what is measured, or for a robot.
+    // Capacity for either a calibration or a robot.
     let setup = world()
-        .own("gives-way")
+        .setup("gives-way")
         .config("[capacity]\ncpus = 1.0\n[servant]\nwarm_pool = 0\nreserve_cpus = 0.1\n");
     let daemon = setup.start()?;
     daemon
         .deployer()
-        .types(&[&["push"], PEOPLE.arguments].concat())?
-        .succeeded()?;
+        .run(&[&["push"], PEOPLE.arguments].concat())?
+        .expect_success()?;
     let place = world().directory("given-up")?;
-    frames(place.path())?;
-    // Would take minutes.
+    extract_frames(place.path())?;
+    // This would take minutes.
     let going = Command::new(support::binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home)
         .env_remove("CLOUDROID_SERVER")
@@ -353,21 +357,21 @@ pub fn a_calibration_gives_way_to_a_robot() -> Verdict {
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()?;
-    support::until("a servant that is promised all", || {
+    support::wait_until("a servant that is promised all", || {
         let status = daemon.api("/api/v1/status")?;
         Ok((status["capacity"]["cpus_reserved"] == 1.0)
             .then_some(())
             .ok_or_else(|| status.to_string()))
     })?;
     let _robot = daemon.robot("opencv_apps?robot=needs&cpus=0.5")?;
-    daemon.awaits_event("the robot's servant", |event| {
+    daemon.wait_for_event("the robot's servant", |event| {
         event["kind"] == "servant-ready" && event["robot"] == "needs"
     })?;
     let outcome = going.wait_with_output()?;
     let said = String::from_utf8_lossy(&outcome.stderr);
     ensure!(
-        !outcome.status.success() && said.contains("a robot needs its room"),
+        !outcome.status.success() && said.contains("a robot needs this capacity"),
         "{said}"
     );
-    none_is_left(&daemon, "opencv_apps")
+    wait_until_none_left(&daemon, "opencv_apps")
 }

@@ -1,4 +1,4 @@
-//! What a node in the cloud calls that is served on its robot.
+//! Services that a node in the cloud calls and its robot provides.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,29 +13,29 @@ use ros::schema::Registry;
 use support::Verdict;
 use support::cutter::Cutter;
 use support::patience::{self, Deadline, patience, scale_seconds};
-use support::ros_system::Node;
-use support::site::{Running, Site};
-use support::twins::{self, Twin, answer_of, trigger};
+use support::ros_system::HasBus;
+use support::site::{NodeProcess, Site};
+use support::twins::{self, Twin, trigger_request, trigger_response};
 use support::world::{CALLER, world};
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
 const HOUR: i64 = 3600;
 const SECOND: i64 = 1_000_000_000;
-/// For a call that may never be answered, which nobody says in ROS 2; where nothing else runs.
+/// Maximum time for a call that may never be answered, which ROS 2 does not report; on an idle machine.
 const MEANWHILE: Duration = Duration::from_secs(5);
 
-/// Serves std_srvs/Trigger.
-struct Secret {
+/// A server of std_srvs/Trigger.
+struct TriggerService {
     ros: RosVersion,
     says: Mutex<Result<String, String>>,
-    /// So many have come.
+    /// Number of calls so far.
     calls: watch::Sender<u32>,
-    /// Calls that may be answered.
+    /// Permits to answer calls.
     answers: Semaphore,
 }
 
-impl Secret {
+impl TriggerService {
     fn new(ros: RosVersion, says: &str) -> Arc<Self> {
         Arc::new(Self {
             ros,
@@ -45,17 +45,17 @@ impl Secret {
         })
     }
 
-    /// From now on calls wait.
-    fn holds(&self) {
+    /// Makes calls wait from now on.
+    fn hold_calls(&self) {
         self.answers.forget_permits(Semaphore::MAX_PERMITS);
     }
 
-    fn calls(&self) -> u32 {
+    fn call_count(&self) -> u32 {
         *self.calls.borrow()
     }
 
-    /// Waits until so many calls have come.
-    fn is_called(&self, site: &Site, calls: u32) -> anyhow::Result<()> {
+    /// Waits until `calls` calls have arrived.
+    fn wait_for_calls(&self, site: &Site, calls: u32) -> anyhow::Result<()> {
         let mut now = self.calls.subscribe();
         let called = site.runtime.block_on(async {
             let called = now.wait_for(|now| *now >= calls);
@@ -67,35 +67,35 @@ impl Secret {
 }
 
 #[async_trait]
-impl ServiceHandler for Secret {
+impl ServiceHandler for TriggerService {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
         self.calls.send_modify(|calls| *calls += 1);
         let answer = self.answers.acquire().await.map_err(|_| "closed")?;
         answer.forget();
         let text = self.says.lock().clone()?;
-        Ok(answer_of(self.ros, true, &text))
+        Ok(trigger_response(self.ros, true, &text))
     }
 }
 
-/// A service of std_srvs.
-fn std_srvs(ros: RosVersion, name: &str, text: &str) -> anyhow::Result<ServiceType> {
-    let registry = Registry::of(ros);
+/// Returns a service type of std_srvs.
+fn std_srvs_type(ros: RosVersion, name: &str, text: &str) -> anyhow::Result<ServiceType> {
+    let registry = Registry::for_version(ros);
     registry.insert(&format!("std_srvs/srv/{name}"), text)?;
     let name = match ros {
         RosVersion::One => format!("std_srvs/{name}"),
         RosVersion::Two => format!("std_srvs/srv/{name}"),
     };
-    Ok(ServiceType::of(&*registry.service(&name)?))
+    Ok(ServiceType::from_service(&*registry.service(&name)?))
 }
 
 fn trigger_type(ros: RosVersion) -> anyhow::Result<ServiceType> {
-    std_srvs(ros, "Trigger", "---\nbool success\nstring message\n")
+    std_srvs_type(ros, "Trigger", "---\nbool success\nstring message\n")
 }
 
-/// Serves until it is dropped.
-fn serves(
+/// Serves a service until the returned value is dropped.
+fn serve(
     site: &Site,
-    node: &(impl Node + ?Sized),
+    node: &(impl HasBus + ?Sized),
     service: &str,
     of: ServiceType,
     handler: Arc<dyn ServiceHandler>,
@@ -105,57 +105,61 @@ fn serves(
 }
 
 /// Serves std_srvs/Trigger.
-fn serves_secret(
+fn serve_trigger(
     site: &Site,
-    node: &(impl Node + ?Sized),
+    node: &(impl HasBus + ?Sized),
     service: &str,
-    secret: Arc<Secret>,
+    secret: Arc<TriggerService>,
 ) -> anyhow::Result<Box<dyn Send + Sync>> {
-    serves(site, node, service, trigger_type(secret.ros)?, secret)
+    serve(site, node, service, trigger_type(secret.ros)?, secret)
 }
 
-fn triggers(site: &Site, app: &Arc<dyn Bus>, service: &str) -> anyhow::Result<(bool, String)> {
-    twins::triggered(site, app, service)
+fn call_trigger(site: &Site, app: &Arc<dyn Bus>, service: &str) -> anyhow::Result<(bool, String)> {
+    twins::call_trigger(site, app, service)
 }
 
-/// The words of what was answered; an error where that failed: in ROS 1 the call itself does, in ROS 2 the answer says so.
-fn succeeds(answer: anyhow::Result<(bool, String)>) -> anyhow::Result<String> {
+/// Returns the message of a response; fails if the call failed, which ROS 1 reports as an error of the call and ROS 2
+/// in the response.
+fn expect_success(answer: anyhow::Result<(bool, String)>) -> anyhow::Result<String> {
     match answer? {
         (true, words) => Ok(words),
         (false, words) => Err(anyhow::anyhow!(words)),
     }
 }
 
-/// Calls a std_srvs/Trigger, and does not wait.
-fn begins(
+/// Starts a call of std_srvs/Trigger without waiting.
+fn begin_call(
     site: &Site,
     app: &Arc<dyn Bus>,
     service: &'static str,
 ) -> JoinHandle<Result<Bytes, BusError>> {
-    begins_within(site, app, service, patience())
+    begin_call_with_timeout(site, app, service, patience())
 }
 
-/// The same, given up after so long.
-fn begins_within(
+/// Starts a call with a timeout.
+fn begin_call_with_timeout(
     site: &Site,
     app: &Arc<dyn Bus>,
     service: &'static str,
     time: Duration,
 ) -> JoinHandle<Result<Bytes, BusError>> {
     let app = Arc::clone(app);
-    let request = trigger(site.system.version());
+    let request = trigger_request(site.system.version());
     site.runtime
         .spawn(async move { app.call(service, request, time).await })
 }
 
-/// What came of it.
-fn ended(site: &Site, call: JoinHandle<Result<Bytes, BusError>>) -> anyhow::Result<(bool, String)> {
+/// Waits for the response to a call.
+fn finish_call(
+    site: &Site,
+    call: JoinHandle<Result<Bytes, BusError>>,
+) -> anyhow::Result<(bool, String)> {
     let answer = site.runtime.block_on(call)??;
-    twins::said(site.system.version(), &answer)
+    twins::parse_trigger_response(site.system.version(), &answer)
 }
 
-/// Calls until it fails with these words; other failures are none of those that `may` be.
-fn fails_at_last(
+/// Repeats a call until it fails with a message that contains `words`; other failures must be among `may`.
+fn wait_for_failure(
     ask: impl Fn() -> anyhow::Result<String>,
     words: &str,
     may: &[&str],
@@ -173,8 +177,8 @@ fn fails_at_last(
     }
 }
 
-/// Calls until it succeeds; no failures are others than those that `may` be.
-fn succeeds_at_last(
+/// Repeats a call until it succeeds; failures must be among `may`.
+fn wait_for_success(
     ask: impl Fn() -> anyhow::Result<String>,
     may: &[&str],
 ) -> anyhow::Result<String> {
@@ -191,38 +195,48 @@ fn succeeds_at_last(
     }
 }
 
-fn stub(
+fn start_stub(
     site: &Site,
     server: &str,
     (service, node): (&str, &str),
     robot: &str,
     argv: &[&str],
     ahead: i64,
-) -> anyhow::Result<Running> {
+) -> anyhow::Result<NodeProcess> {
     let toml = format!(
         "server = \"ws://{server}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n"
     );
     let ahead = ahead.to_string();
     let environment = [("CLOUDROID_TEST_CLOCK_SHIFT", ahead.as_str())];
-    site.stub_among(&environment, &toml, service, node, argv)
+    site.start_stub_with_environment(&environment, &toml, service, node, argv)
 }
 
-fn with_log<T>(outcome: anyhow::Result<T>, stub: &Running) -> anyhow::Result<T> {
-    outcome.with_context(|| format!("the stub said:\n{}", stub.said()))
+fn with_log<T>(outcome: anyhow::Result<T>, stub: &NodeProcess) -> anyhow::Result<T> {
+    outcome.with_context(|| format!("the stub said:\n{}", stub.output()))
 }
 
-fn is_there(site: &Site, app: &Arc<dyn Bus>, service: &str, stub: &Running) -> anyhow::Result<()> {
-    let there = site.until(app, service, |graph| graph.services.contains_key(service));
+fn wait_until_served(
+    site: &Site,
+    app: &Arc<dyn Bus>,
+    service: &str,
+    stub: &NodeProcess,
+) -> anyhow::Result<()> {
+    let there = site.wait_for_graph(app, service, |graph| graph.services.contains_key(service));
     with_log(there.map(drop), stub)
 }
 
-/// Waits until somebody has looked for a service at the robot's Master, in vain.
-fn is_sought(site: &Site, app: &Arc<dyn Bus>, service: &str, stub: &Running) -> anyhow::Result<()> {
-    let sought = site.until(app, service, |graph| graph.sought.contains_key(service));
+/// Waits until a service has been looked up at the robot's Master in vain.
+fn wait_until_sought(
+    site: &Site,
+    app: &Arc<dyn Bus>,
+    service: &str,
+    stub: &NodeProcess,
+) -> anyhow::Result<()> {
+    let sought = site.wait_for_graph(app, service, |graph| graph.sought.contains_key(service));
     with_log(sought.map(drop), stub)
 }
 
-/// The command line of a caller of ROS 2 that waits for an answer as long as takes so many seconds where nothing else runs.
+/// Extends the command line of a caller of ROS 2 to wait for an answer for `seconds` on an idle machine.
 fn with_patience(mut argv: Vec<String>, seconds: u64) -> Vec<String> {
     let seconds = scale_seconds(seconds);
     argv.extend(["-p".to_owned(), format!("patience:={seconds}.0")]);
@@ -233,39 +247,39 @@ const THE_CALLER: (&str, &str) = ("caller_cpp", "caller");
 
 pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
     let twin = Twin::caller(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
     let mut argv = twin.argv("crossing", &[]);
     if ros == RosVersion::Two {
         argv = with_patience(argv, 5);
     }
-    let robot = twin.robot("calls-python");
+    let robot = twin.robot_name("calls-python");
     let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
-    is_there(&site, &app, "/crossing/ask", &stub)?;
-    let ask = || succeeds(triggers(&site, &app, "/crossing/ask"));
-    // Nobody serves it: as with the original.
+    wait_until_served(&site, &app, "/crossing/ask", &stub)?;
+    let ask = || expect_success(call_trigger(&site, &app, "/crossing/ask"));
+    // No server exists: the same error as with the original.
     let error = format!("{:#}", ask().err().context("nobody is there")?);
     ensure!(
         error.contains("/robot/secret") && error.contains("unavailable"),
         "{error}"
     );
-    // Waiting for one that comes later.
-    let waits = begins(&site, &app, "/crossing/wait");
+    // Waits for a server that starts later.
+    let waits = begin_call(&site, &app, "/crossing/wait");
     if ros == RosVersion::One {
-        is_sought(&site, &app, "/robot/late", &stub)?;
+        wait_until_sought(&site, &app, "/robot/late", &stub)?;
     }
-    let late = Secret::new(ros, "late");
-    let other = site.joins("/other")?;
-    let _late = serves_secret(&site, &other, "/robot/late", late)?;
-    let waited = ended(&site, waits);
+    let late = TriggerService::new(ros, "late");
+    let other = site.join("/other")?;
+    let _late = serve_trigger(&site, &other, "/robot/late", late)?;
+    let waited = finish_call(&site, waits);
     ensure!(with_log(waited, &stub)? == (true, "it is there".into()));
-    // The first asked in vain a moment ago.
-    let secret = Secret::new(ros, "42");
-    let serving = serves_secret(&site, &other, "/robot/secret", secret.clone())?;
-    let told = with_log(succeeds_at_last(ask, &["unavailable", "no answer"]), &stub)?;
+    // The first call failed a moment ago.
+    let secret = TriggerService::new(ros, "42");
+    let serving = serve_trigger(&site, &other, "/robot/secret", secret.clone())?;
+    let told = with_log(wait_for_success(ask, &["unavailable", "no answer"]), &stub)?;
     ensure!(told == "the robot says 42", "{told:?}");
-    // Its reason for having no answer comes through, where there are reasons.
+    // The reason of a failure is transmitted, where ROS has reasons.
     *secret.says.lock() = Err("it is a secret".to_owned());
     let error = format!("{:#}", ask().err().context("it refuses")?);
     let reason = match ros {
@@ -273,44 +287,44 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
         RosVersion::Two => "no answer",
     };
     ensure!(error.contains(reason), "{error}");
-    // It ends in the midst of a call.
-    secret.holds();
-    let calls = secret.calls();
-    let asked = begins(&site, &app, "/crossing/ask");
-    secret.is_called(&site, calls + 1)?;
+    // The server ends during a call.
+    secret.hold_calls();
+    let calls = secret.call_count();
+    let asked = begin_call(&site, &app, "/crossing/ask");
+    secret.wait_for_calls(&site, calls + 1)?;
     drop((serving, other));
-    let error = succeeds(ended(&site, asked));
+    let error = expect_success(finish_call(&site, asked));
     let error = format!("{:#}", error.err().context("nobody answers")?);
     ensure!(error.contains("during the call"), "{error}");
-    // Gone, and another one comes: of a type that the node does not mean, then of the right one.
+    // No server, then one with another type, then one with the right type.
     let gone = [
         "has no server",
-        // The node had looked it up before.
+        // The node has looked it up before.
         "does not serve",
         "any more",
         "onnection refused",
         "no answer",
     ];
-    with_log(fails_at_last(ask, "unavailable", &gone), &stub)?;
-    let another = site.joins("/another")?;
-    let wrong = std_srvs(ros, "Empty", "---\n")?;
-    let serving = serves(
+    with_log(wait_for_failure(ask, "unavailable", &gone), &stub)?;
+    let another = site.join("/another")?;
+    let wrong = std_srvs_type(ros, "Empty", "---\n")?;
+    let serving = serve(
         &site,
         &another,
         "/robot/secret",
         wrong,
-        Secret::new(ros, "?"),
+        TriggerService::new(ros, "?"),
     )?;
-    // To a client of ROS 2, what has another type is not there.
+    // For a client of ROS 2 a service with another type does not exist.
     let another_type = match ros {
         RosVersion::One => "md5sum",
         RosVersion::Two => "unavailable",
     };
-    let fails = fails_at_last(ask, another_type, &["unavailable"]);
+    let fails = wait_for_failure(ask, another_type, &["unavailable"]);
     with_log(fails, &stub)?;
     drop(serving);
-    let secret = Secret::new(ros, "43");
-    let _serving = serves_secret(&site, &another, "/robot/secret", secret)?;
+    let secret = TriggerService::new(ros, "43");
+    let _serving = serve_trigger(&site, &another, "/robot/secret", secret)?;
     let may = [
         "unavailable",
         "md5sum",
@@ -318,18 +332,19 @@ pub fn a_python_node_calls_the_robot(ros: RosVersion) -> Verdict {
         "no answer",
         "does not serve",
     ];
-    let told = with_log(succeeds_at_last(ask, &may), &stub)?;
+    let told = with_log(wait_for_success(ask, &may), &stub)?;
     ensure!(told == "the robot says 43", "{told:?}");
     Ok(())
 }
 
-/// A robot's scale: it gives back what it is given, and tells the time, which is `ahead` nanoseconds ahead of ours.
-struct Scale {
+/// A service of the robot that returns its argument, and the time, which is `ahead` nanoseconds ahead of this
+/// machine's.
+struct RobotScale {
     ahead: i64,
 }
 
 #[async_trait]
-impl ServiceHandler for Scale {
+impl ServiceHandler for RobotScale {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let now = link::clock::now() + self.ahead;
         let number = |at: usize| -> i64 {
@@ -352,8 +367,8 @@ impl ServiceHandler for Scale {
 }
 
 pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
-    let daemon = world().with(CALLER)?;
-    // It was seen at push that it waits.
+    let daemon = world().daemon_with(CALLER)?;
+    // The push has detected that the node waits for a service.
     let service = daemon.get_json("/api/v1/services/caller_cpp")?;
     let needs = service["interface"]["needs"].to_string();
     ensure!(
@@ -362,29 +377,34 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     );
     let ros = RosVersion::One;
     let site = Site::new()?;
-    let app = site.joins("/app")?;
+    let app = site.join("/app")?;
     let argv = [
         "__name:=caller",
         "__ns:=/arm",
         "secret:=/vault/secret",
         "scale:=kitchen_scale",
     ];
-    let stub = stub(&site, &daemon.address, THE_CALLER, "calls-cpp", &argv, HOUR)?;
-    is_there(&site, &app, "/arm/caller/once", &stub)?;
-    // It waits for a service that comes later.
-    let mut told = site.hears(&app, "/arm/caller/told")?;
-    is_sought(&site, &app, "/arm/awaited", &stub)?;
-    let robot = site.joins("/robot")?;
-    let _awaited = serves_secret(&site, &robot, "/arm/awaited", Secret::new(ros, "!"))?;
-    let message = with_log(site.next(&mut told), &stub)?;
+    let stub = start_stub(&site, &daemon.address, THE_CALLER, "calls-cpp", &argv, HOUR)?;
+    wait_until_served(&site, &app, "/arm/caller/once", &stub)?;
+    // The node waits for a service that starts later.
+    let mut told = site.subscribe(&app, "/arm/caller/told")?;
+    wait_until_sought(&site, &app, "/arm/awaited", &stub)?;
+    let robot = site.join("/robot")?;
+    let _awaited = serve_trigger(&site, &robot, "/arm/awaited", TriggerService::new(ros, "!"))?;
+    let message = with_log(site.next_message(&mut told), &stub)?;
     let text = String::from_utf8_lossy(&message.bytes[4..]).into_owned();
     ensure!(text == "awaited is there", "{text}");
-    // Calls go to the names that the robot's command line gives.
-    let once = || with_log(triggers(&site, &app, "/arm/caller/once"), &stub);
-    let kept = || with_log(triggers(&site, &app, "/arm/caller/kept"), &stub);
+    // Calls use the names of the robot's command line.
+    let once = || with_log(call_trigger(&site, &app, "/arm/caller/once"), &stub);
+    let kept = || with_log(call_trigger(&site, &app, "/arm/caller/kept"), &stub);
     ensure!(once()? == (false, "it failed".into()));
-    is_sought(&site, &app, "/vault/secret", &stub)?;
-    let serving = serves_secret(&site, &robot, "/vault/secret", Secret::new(ros, "42"))?;
+    wait_until_sought(&site, &app, "/vault/secret", &stub)?;
+    let serving = serve_trigger(
+        &site,
+        &robot,
+        "/vault/secret",
+        TriggerService::new(ros, "42"),
+    )?;
     let first = loop {
         let told = once()?;
         if told.0 {
@@ -394,12 +414,17 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
     ensure!(first.1 == "42", "{first:?}");
     ensure!(kept()?.1 == "newly 42");
     ensure!(kept()?.1 == "still 42");
-    // The kept connection ends with its server, and another is made.
+    // The persistent connection ends with its server, and another one is opened.
     drop(serving);
     let gone = |graph: &ros::bus::Graph| !graph.services.contains_key("/vault/secret");
-    site.until(&app, "its end", gone)?;
+    site.wait_for_graph(&app, "its end", gone)?;
     while kept()?.0 {}
-    let _serving = serves_secret(&site, &robot, "/vault/secret", Secret::new(ros, "43"))?;
+    let _serving = serve_trigger(
+        &site,
+        &robot,
+        "/vault/secret",
+        TriggerService::new(ros, "43"),
+    )?;
     let again = loop {
         let told = kept()?;
         if told.0 {
@@ -407,7 +432,7 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
         }
     };
     ensure!(again.1 == "newly 43", "{again:?}");
-    // Stamps mean the same on both sides, whatever the clocks say, and three megabytes are as many.
+    // Stamps are converted between the clocks, and three megabytes are transmitted unchanged.
     let registry = Registry::new();
     registry.insert(
         "caller_cpp/srv/Measure",
@@ -417,11 +442,11 @@ pub fn a_cpp_node_waits_for_the_robot_and_calls_it() -> Verdict {
         "caller_cpp/Measure",
         registry.service("caller_cpp/Measure")?.md5.clone(),
     );
-    let scale = Arc::new(Scale {
+    let scale = Arc::new(RobotScale {
         ahead: HOUR * SECOND,
     });
-    let _scale = serves(&site, &robot, "/arm/kitchen_scale", measure, scale)?;
-    let measured = with_log(triggers(&site, &app, "/arm/caller/measure"), &stub)?;
+    let _scale = serve(&site, &robot, "/arm/kitchen_scale", measure, scale)?;
+    let measured = with_log(call_trigger(&site, &app, "/arm/caller/measure"), &stub)?;
     ensure!(measured == (true, String::new()), "{measured:?}");
     Ok(())
 }
@@ -439,105 +464,105 @@ pub fn a_call_of_the_robot_outlives_a_cut_and_fails_with_the_link(ros: RosVersio
             "the robot says 42",
         ),
     };
-    // Of its own: it is killed.
-    let setup = world().own(&twin.robot("calls-cut"));
+    // A separate daemon, because it is killed.
+    let setup = world().setup(&twin.robot_name("calls-cut"));
     let daemon = setup.start()?;
     let pushed = service.package.context("a package")?;
     daemon
         .deployer()
-        .pushes(pushed, service.arguments)?
-        .succeeded()?;
+        .push(pushed, service.arguments)?
+        .expect_success()?;
     let cutter = Cutter::new(&daemon.address, 0, 1, 0)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = site.joins("/robot")?;
-    let secret = Secret::new(ros, "42");
-    let _serving = serves_secret(&site, &robot, secrets, secret.clone())?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = site.join("/robot")?;
+    let secret = TriggerService::new(ros, "42");
+    let _serving = serve_trigger(&site, &robot, secrets, secret.clone())?;
     let server = cutter.server.to_string();
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
-    let stub = stub(&site, &server, package, "calls-cut", &argv, 0)?;
-    is_there(&site, &app, ask, &stub)?;
-    let asks = || succeeds(triggers(&site, &app, ask));
-    // Of what it may call, a node of ROS 2 is told in a moment.
-    let told = with_log(succeeds_at_last(asks, &["unavailable"]), &stub)?;
+    let stub = start_stub(&site, &server, package, "calls-cut", &argv, 0)?;
+    wait_until_served(&site, &app, ask, &stub)?;
+    let asks = || expect_success(call_trigger(&site, &app, ask));
+    // A node of ROS 2 learns of services within a moment.
+    let told = with_log(wait_for_success(asks, &["unavailable"]), &stub)?;
     ensure!(told == words, "{told:?}");
-    // The robot answers while there is no link; the answer comes with the next one, and nothing was asked twice.
-    secret.holds();
-    let calls = secret.calls();
-    let asked = begins(&site, &app, ask);
-    secret.is_called(&site, calls + 1)?;
+    // The robot answers while there is no link; the answer arrives with the next one, and nothing was called twice.
+    secret.hold_calls();
+    let calls = secret.call_count();
+    let asked = begin_call(&site, &app, ask);
+    secret.wait_for_calls(&site, calls + 1)?;
     cutter.cut(true);
-    stub.says("was lost")?;
+    stub.wait_for_output("was lost")?;
     secret.answers.add_permits(1);
     cutter.cut(false);
-    let told = with_log(ended(&site, asked), &stub)?;
+    let told = with_log(finish_call(&site, asked), &stub)?;
     ensure!(told == (true, words.into()), "{told:?}");
-    ensure!(secret.calls() == calls + 1);
-    // With the daemon the link is gone for good, and the node is told so; its next call is answered.
+    ensure!(secret.call_count() == calls + 1);
+    // Without the daemon the link is lost for good, and the node gets an error; its next call is answered.
     let time = match ros {
         RosVersion::One => patience(),
         RosVersion::Two => patience::scale(MEANWHILE),
     };
-    let asked = begins_within(&site, &app, ask, time);
-    secret.is_called(&site, calls + 2)?;
+    let asked = begin_call_with_timeout(&site, &app, ask, time);
+    secret.wait_for_calls(&site, calls + 2)?;
     let address = daemon.address.clone();
-    daemon.is_killed()?;
+    daemon.kill()?;
     let daemon = setup.listen(&address).start()?;
-    // The application's own call went the same way; DDS has no way to tell it.
-    let lost = ended(&site, asked);
+    // The application's own call was lost in the same way, which DDS cannot report.
+    let lost = finish_call(&site, asked);
     let lost = format!("{:#}", lost.err().context("it was lost with the daemon")?);
     let forgotten = match ros {
-        RosVersion::One => "forgotten this call",
+        RosVersion::One => "this call was lost",
         RosVersion::Two => "within",
     };
     ensure!(lost.contains(forgotten), "{lost}");
     secret.answers.add_permits(2);
-    // A node of ROS 2 may still take the killed daemon for one that answers.
+    // A node of ROS 2 may still regard the killed daemon as a server that answers.
     let may = ["unavailable", "no answer"];
-    let told = with_log(succeeds_at_last(asks, &may), &stub)?;
+    let told = with_log(wait_for_success(asks, &may), &stub)?;
     ensure!(told == words, "{told:?}");
-    ensure!(secret.calls() == calls + 3);
+    ensure!(secret.call_count() == calls + 3);
     drop(stub);
-    daemon.deployer().types(&["stop", "--all"])?;
-    daemon.ends()?;
+    daemon.deployer().run(&["stop", "--all"])?;
+    daemon.stop()?;
     Ok(())
 }
 
 pub fn siblings_come_first_and_other_robots_are_not_asked(ros: RosVersion) -> Verdict {
     let twin = Twin::caller(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = twin.robot("calls-two");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = twin.robot_name("calls-two");
     let start = |name: &str, secret: &str| {
         let argv = twin.argv(name, &[("/robot/secret", secret)]);
         twin.stub(&site, (&daemon.address, &robot), "", &argv)
     };
     let first = start("first", "/robot/secret")?;
     let second = start("second", "/first/now")?;
-    is_there(&site, &app, "/first/now", &first)?;
-    is_there(&site, &app, "/second/ask", &second)?;
-    // Were it asked by way of the robot, it would have to come back through the first's stub, which sleeps.
+    wait_until_served(&site, &app, "/first/now", &first)?;
+    wait_until_served(&site, &app, "/second/ask", &second)?;
+    // If the call went through the robot, it would need the first stub, which is stopped.
     first.signal(Signal::SIGSTOP)?;
-    let ask = || succeeds(triggers(&site, &app, "/second/ask"));
-    // Of its sibling a node of ROS 2 hears in a moment.
-    let told = succeeds_at_last(ask, &["unavailable"]);
+    let ask = || expect_success(call_trigger(&site, &app, "/second/ask"));
+    // A node of ROS 2 discovers its sibling within a moment.
+    let told = wait_for_success(ask, &["unavailable"]);
     first.signal(Signal::SIGCONT)?;
     let told = with_log(told, &second)?;
     ensure!(told.starts_with("the robot says "), "{told:?}");
-    // Another robot's service of the same name is its own.
-    let elsewhere = Site::of(ros)?;
-    let neighbour = elsewhere.joins("/neighbour")?;
-    let secret = Secret::new(ros, "the neighbour's");
-    let serving = serves_secret(&elsewhere, &neighbour, "/robot/secret", secret)?;
+    // A service of the same name belongs to another robot.
+    let elsewhere = Site::with_ros(ros)?;
+    let neighbour = elsewhere.join("/neighbour")?;
+    let secret = TriggerService::new(ros, "the neighbour's");
+    let serving = serve_trigger(&elsewhere, &neighbour, "/robot/secret", secret)?;
     let argv = twin.argv("crossing", &[]);
-    let robot = twin.robot("calls-three");
+    let robot = twin.robot_name("calls-three");
     let theirs = twin.stub(&elsewhere, (&daemon.address, &robot), "", &argv)?;
-    is_there(&elsewhere, &neighbour, "/crossing/ask", &theirs)?;
-    let ask = || succeeds(triggers(&elsewhere, &neighbour, "/crossing/ask"));
-    let told = with_log(succeeds_at_last(ask, &["unavailable"]), &theirs)?;
+    wait_until_served(&elsewhere, &neighbour, "/crossing/ask", &theirs)?;
+    let ask = || expect_success(call_trigger(&elsewhere, &neighbour, "/crossing/ask"));
+    let told = with_log(wait_for_success(ask, &["unavailable"]), &theirs)?;
     ensure!(told == "the robot says the neighbour's", "{told}");
-    let error = succeeds(triggers(&site, &app, "/first/ask")).err();
+    let error = expect_success(call_trigger(&site, &app, "/first/ask")).err();
     let error = format!("{:#}", error.context("nobody serves it on this robot")?);
     ensure!(error.contains("unavailable"), "{error}");
     drop(serving);

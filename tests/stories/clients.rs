@@ -1,5 +1,5 @@
-//! Clients of rosbridge that others wrote, against a real servant: topics, services both ways, actions, parameters, time,
-//! and a servant that ends under them.
+//! Independent rosbridge clients against a real servant: topics, services in both directions, actions, parameters,
+//! time, and the end of a servant.
 
 use std::io::{BufRead, BufReader};
 use std::path::PathBuf;
@@ -9,75 +9,75 @@ use anyhow::{Context, ensure};
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::patience::tell_patience;
-use support::world::{FIXTURE, Service, world};
+use support::world::{FIXTURE, StoryService, world};
 use support::{Verdict, binaries};
 
-use crate::access::{daemon, token};
+use crate::access::{create_token, daemon};
 
-/// The clients' programs.
+/// Programs of the clients.
 const ROSLIBPY: &str = "with_roslibpy.py";
 const ROSLIB: &str = "with_roslib.cjs";
 
 pub fn roslibpy_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(roslibpy(ROSLIBPY), "roslibpy")
+    run_client(roslibpy(ROSLIBPY), "roslibpy")
 }
 
 pub fn roslib_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(roslib(ROSLIB), "roslib")
+    run_client(roslib(ROSLIB), "roslib")
 }
 
 pub fn roslibrust_finds_nothing_missing() -> Verdict {
-    finds_nothing_missing(roslibrust(), "roslibrust")
+    run_client(roslibrust(), "roslibrust")
 }
 
 pub fn clients_with_tokens_find_nothing_missing() -> Verdict {
     let daemon = daemon("clients")?;
-    let package = package_of(FIXTURE)?;
+    let package = package_path(FIXTURE)?;
     let push = [&["push", package.as_str()], FIXTURE.arguments].concat();
-    daemon.deployer().types(&push)?.succeeded()?;
+    daemon.deployer().run(&push)?.expect_success()?;
     for (command, name) in [
         (roslibpy(ROSLIBPY), "roslibpy"),
         (roslib(ROSLIB), "roslib"),
         (roslibrust(), "roslibrust"),
     ] {
         let scope = ["--role", "robot", "--service", FIXTURE.name, "--robot"];
-        let token = token(&daemon, &[&[name], &scope[..], &[name]].concat())?;
+        let token = create_token(&daemon, &[&[name], &scope[..], &[name]].concat())?;
         let path = format!("{}?token={token}", FIXTURE.name);
-        does_all(&daemon, command, (FIXTURE, name), &[daemon.url(&path)])?;
+        run_with_servant(&daemon, command, (FIXTURE, name), &[daemon.url(&path)])?;
     }
     Ok(())
 }
 
 pub fn what_a_node_that_is_well_prints_is_in_its_log_at_once() -> Verdict {
-    let daemon = world().with(FIXTURE)?;
+    let daemon = world().daemon_with(FIXTURE)?;
     let _robot = daemon.robot(&format!("{}?robot=reader", FIXTURE.name))?;
     let id = daemon.servant_of(FIXTURE.name, "reader")?["id"].clone();
     let id = id.as_str().context("an id")?;
-    support::until("a line of ROS_INFO", || {
-        let log = daemon.deployer().types(&["logs", id])?.succeeded()?;
+    support::wait_until("a line of ROS_INFO", || {
+        let log = daemon.deployer().run(&["logs", id])?.expect_success()?;
         Ok(if log.stdout.contains("the fixture is ready") {
             Ok(())
         } else {
-            Err(log.said())
+            Err(log.output())
         })
     })
 }
 
-/// Where its sources are.
-fn package_of(service: Service) -> anyhow::Result<String> {
+/// Returns the directory of a service's package.
+fn package_path(service: StoryService) -> anyhow::Result<String> {
     let package = binaries::package(service.package.context("a package of the repository")?);
     Ok(path_str(&package).to_owned())
 }
 
 pub fn roslibpy(name: &str) -> Command {
     let mut command = Command::new(binaries::python());
-    command.arg(program(name));
+    command.arg(program_path(name));
     command
 }
 
 pub fn roslib(name: &str) -> Command {
     let mut command = Command::new("node");
-    command.arg(program(name));
+    command.arg(program_path(name));
     command.env("NODE_PATH", binaries::node_modules());
     command
 }
@@ -86,22 +86,22 @@ pub fn roslibrust() -> Command {
     Command::new(binaries::path("robot-with-roslibrust"))
 }
 
-fn program(name: &str) -> PathBuf {
+fn program_path(name: &str) -> PathBuf {
     binaries::checkout().join("tests/robots").join(name)
 }
 
-/// Runs a client's program for a robot of this name.
-fn finds_nothing_missing(command: Command, robot: &str) -> Verdict {
-    let daemon = world().with(FIXTURE)?;
+/// Runs the program of a client for a robot of this name.
+fn run_client(command: Command, robot: &str) -> Verdict {
+    let daemon = world().daemon_with(FIXTURE)?;
     let path = format!("{}?robot={robot}", FIXTURE.name);
-    does_all(&daemon, command, (FIXTURE, robot), &[daemon.url(&path)])
+    run_with_servant(&daemon, command, (FIXTURE, robot), &[daemon.url(&path)])
 }
 
-/// Runs a client's program with these words; when it asks for it, ends the robot's servant.
-pub fn does_all(
+/// Runs the program of a client with these arguments; when it asks for that, stops the robot's servant.
+pub fn run_with_servant(
     daemon: &Daemon,
     mut command: Command,
-    (service, robot): (Service, &str),
+    (service, robot): (StoryService, &str),
     words: &[String],
 ) -> Verdict {
     let mut child = tell_patience(&mut command)
@@ -116,7 +116,7 @@ pub fn does_all(
         if line == "end my servant" {
             let servant = daemon.servant_of(service.name, robot)?;
             let id = servant["id"].as_str().context("an id")?;
-            daemon.deployer().types(&["stop", id])?.succeeded()?;
+            daemon.deployer().run(&["stop", id])?.expect_success()?;
         }
         said.push(line);
     }
@@ -124,7 +124,7 @@ pub fn does_all(
     ensure!(
         status.success() && said.last().is_some_and(|line| line == "done"),
         "{robot} ended with {status} after {said:?}; the daemon said:\n{}",
-        daemon.last_words()
+        daemon.log_tail()
     );
     Ok(())
 }

@@ -1,4 +1,5 @@
-//! What others wrote for ROS 2, against a servant of ROS 2: clients of rosbridge, Foxglove's client, readers of recordings.
+//! Independent software for ROS 2 against a servant of ROS 2: rosbridge clients, Foxglove's client, readers of
+//! recordings.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -13,25 +14,25 @@ use support::patience::scale_seconds;
 use support::robot::Robot;
 use support::world::{HERALD, world};
 
-use crate::access::{daemon, token};
+use crate::access::{create_token, daemon};
 use crate::{clients, recordings, viewers};
 
-/// Of a robot by its name.
-fn address(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
+/// Returns the URL path for a robot, with a token.
+fn robot_address(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     let scope = ["--role", "robot", "--service", HERALD.name, "--robot"];
-    let secret = token(daemon, &[&[robot], &scope[..], &[robot]].concat())?;
+    let secret = create_token(daemon, &[&[robot], &scope[..], &[robot]].concat())?;
     Ok(format!("{}?token={secret}", HERALD.name))
 }
 
-/// Between two cries.
+/// Interval between publications.
 const PAUSE: Duration = Duration::from_millis(50);
-/// The type of what the robot shows.
+/// Type of the square.
 const SQUARE: &str = "geometry_msgs/msg/PolygonStamped";
 
-/// Does something while the robot says its name and shows a square, again and again.
-fn while_it_cries(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict {
+/// Runs `does` while the robot publishes its name and a square periodically.
+fn run_while_publishing(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict {
     for (topic, of) in [("/name", "std_msgs/msg/String"), ("/square", SQUARE)] {
-        robot.says(json!({"op": "advertise", "topic": topic, "type": of}))?;
+        robot.send(json!({"op": "advertise", "topic": topic, "type": of}))?;
     }
     let points = [[0.0, 0.0], [1.5, 0.0], [1.5, 1.5], [0.0, 1.5]];
     let points = points.map(|[x, y]| json!({"x": x, "y": y, "z": 0.0}));
@@ -42,8 +43,8 @@ fn while_it_cries(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict 
             let says =
                 |topic: &str, msg: &Value| json!({"op": "publish", "topic": topic, "msg": msg});
             while !over.load(Ordering::Relaxed) {
-                robot.says(says("/name", &json!({"data": "rover"})))?;
-                robot.says(says("/square", &square))?;
+                robot.send(says("/name", &json!({"data": "rover"})))?;
+                robot.send(says("/square", &square))?;
                 thread::sleep(PAUSE);
             }
             anyhow::Ok(())
@@ -55,10 +56,13 @@ fn while_it_cries(robot: &mut Robot, does: impl FnOnce() -> Verdict) -> Verdict 
     })
 }
 
-/// Nodes and clients that ask for different things are told so, with what both say.
-fn differences_are_told(robot: &mut Robot) -> Verdict {
-    robot.says(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String", "qos": {"reliability": "best_effort"}}))?;
-    let told = robot.hears_status("nothing passes between /herald and this client")?;
+/// Checks that nodes and clients with incompatible quality of service are told so, with that of both sides.
+fn expect_differences_reported(robot: &mut Robot) -> Verdict {
+    robot.send(
+        json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String",
+        "qos": {"reliability": "best_effort"}}),
+    )?;
+    let told = robot.wait_for_status("no messages pass between /herald and this client")?;
     let told = told["msg"].as_str().context("words")?;
     ensure!(
         told.contains(
@@ -66,11 +70,11 @@ fn differences_are_told(robot: &mut Robot) -> Verdict {
         ) && told.contains("(publisher: best_effort, volatile; subscriber: reliable, volatile)"),
         "{told}"
     );
-    robot.says(json!({"op": "unadvertise", "topic": "/name"}))
+    robot.send(json!({"op": "unadvertise", "topic": "/name"}))
 }
 
-/// What the robot says and hears is recorded, read by the format's own reader, and replayed.
-fn a_recording_is_read_and_replayed(daemon: &Daemon, servant: &str, robot: &mut Robot) -> Verdict {
+/// Records the robot's messages in both directions, reads them with the format's own reader, and replays them.
+fn check_recording(daemon: &Daemon, servant: &str, robot: &mut Robot) -> Verdict {
     let place = world().directory("recordings-2")?;
     let file = place.path().join("said.mcap");
     let of = ["/name", "/square", "/greeting"];
@@ -79,70 +83,70 @@ fn a_recording_is_read_and_replayed(daemon: &Daemon, servant: &str, robot: &mut 
     let duration = format!("{}s", scale_seconds(3));
     typed.extend(["--duration", &*duration]);
     let mut summary = Value::Null;
-    while_it_cries(robot, || {
-        let said = daemon.deployer().types(&typed)?.succeeded()?.stdout;
+    run_while_publishing(robot, || {
+        let said = daemon.deployer().run(&typed)?.expect_success()?.stdout;
         summary = serde_json::from_str(&said)?;
         Ok(())
     })?;
-    let read = recordings::reads(&file)?;
+    let read = recordings::read_recording(&file)?;
     ensure!(read["profile"] == "ros2", "{read}");
     let topics = json!({"/greeting": "herald_msgs/msg/Greeting", "/name": "std_msgs/msg/String", "/square": SQUARE});
     ensure!(read["topics"] == topics, "{read}");
     ensure!(read["messages"] == summary["messages"], "{read} {summary}");
-    let names = recordings::texts(&read, "/name")?;
+    let names = recordings::topic_texts(&read, "/name")?;
     ensure!(
         names.len() > 10 && names.iter().all(|name| name == "rover"),
         "{names:?}"
     );
 
-    // Replayed to another robot's servant, its node answers.
-    let mut other = daemon.robot(&address(daemon, "other")?)?;
-    other.subscribes("/greeting")?;
+    // Replayed to the servant of another robot, whose node answers.
+    let mut other = daemon.robot(&robot_address(daemon, "other")?)?;
+    other.subscribe("/greeting")?;
     let name = json!({"op": "publish", "topic": "/name", "type": "std_msgs/msg/String", "msg": {"data": "other"}});
     let is_greeted = |text: &'static str| {
         move |told: &Value| told["topic"] == "/greeting" && told["msg"]["text"] == text
     };
-    other.says_until(&name, "a greeting", is_greeted("Hello, other"))?;
+    other.send_until(&name, "a greeting", is_greeted("Hello, other"))?;
     let to = daemon.servant_of(HERALD.name, "other")?;
     let to = to["id"].as_str().context("an id")?.to_owned();
     let replay = ["replay", path_str(&file), "--to", &to, "--topic", "/name"];
-    daemon.deployer().types(&replay)?.succeeded()?;
-    other.hears("a greeting of what is replayed", is_greeted("Hello, rover"))?;
-    other.leaves()
+    daemon.deployer().run(&replay)?.expect_success()?;
+    other.wait_for("a greeting of what is replayed", is_greeted("Hello, rover"))?;
+    other.leave()
 }
 
 pub fn they_find_nothing_missing() -> Verdict {
     let daemon = daemon("clients-2")?;
     daemon
         .deployer()
-        .pushes("herald_ros2", HERALD.arguments)?
-        .succeeded()?;
+        .push("herald_ros2", HERALD.arguments)?
+        .expect_success()?;
     for (command, robot) in [
         (clients::roslibpy("ros2_with_roslibpy.py"), "roslibpy"),
         (clients::roslib("ros2_with_roslib.mjs"), "roslib"),
         (clients::roslibrust(), "roslibrust"),
     ] {
-        let mut words = vec![daemon.url(&address(&daemon, robot)?)];
-        // The others have a program for each ROS.
+        let mut words = vec![daemon.url(&robot_address(&daemon, robot)?)];
+        // The others have a separate program for each ROS.
         words.extend((robot == "roslibrust").then(|| "ros2".to_owned()));
-        clients::does_all(&daemon, command, (HERALD, robot), &words)?;
+        clients::run_with_servant(&daemon, command, (HERALD, robot), &words)?;
     }
 
-    let mut rover = daemon.robot(&address(&daemon, "rover")?)?;
-    rover.calls("/greet", json!({"name": "rover"}))?;
+    let mut rover = daemon.robot(&robot_address(&daemon, "rover")?)?;
+    rover.call("/greet", json!({"name": "rover"}))?;
     let servant = daemon.servant_of(HERALD.name, "rover")?;
     let servant = servant["id"].as_str().context("an id")?.to_owned();
-    differences_are_told(&mut rover)?;
-    let olga = token(&daemon, &["olga", "--role", "operator"])?;
-    let eve = token(&daemon, &["eve", "--role", "viewer", "--service", "herald"])?;
-    while_it_cries(&mut rover, || {
+    expect_differences_reported(&mut rover)?;
+    let olga = create_token(&daemon, &["olga", "--role", "operator"])?;
+    let eve = create_token(&daemon, &["eve", "--role", "viewer", "--service", "herald"])?;
+    run_while_publishing(&mut rover, || {
         for (token, part) in [(&olga, "acts"), (&eve, "looks")] {
             let url = daemon.url(&format!("foxglove/{servant}?token={token}"));
-            viewers::foxglove("ros2_with_foxglove.cjs", &url, part)?;
+            viewers::run_foxglove("ros2_with_foxglove.cjs", &url, part)?;
         }
         Ok(())
     })?;
-    a_recording_is_read_and_replayed(&daemon, &servant, &mut rover)?;
-    daemon.ends()?;
+    check_recording(&daemon, &servant, &mut rover)?;
+    daemon.stop()?;
     Ok(())
 }

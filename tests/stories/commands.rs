@@ -1,4 +1,4 @@
-//! The command line as scripts and shells use it.
+//! The command line as used by scripts and shells.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, Command, Stdio};
@@ -7,61 +7,65 @@ use std::sync::mpsc::{Receiver, channel};
 use anyhow::{Context, ensure};
 use serde_json::Value;
 use support::daemon::Daemon;
-use support::deployer::{Outcome, run};
+use support::deployer::{CommandOutcome, run};
 use support::patience;
 use support::world::{LOCALISER, world};
 use support::{Verdict, binaries};
 
-use crate::access::{token, with_token};
+use crate::access::{create_token, run_with_token};
 
 pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
-    let setup = world().own("exits");
+    let setup = world().setup("exits");
     let daemon = setup.start()?;
     let deployer = daemon.deployer();
-    let types = |arguments: &[&str]| deployer.types(arguments);
-    let viewer = token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
+    let types = |arguments: &[&str]| deployer.run(arguments);
+    let viewer = create_token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
     for revision in [&["--param", "offset=1"][..], &["--canary", "1"]] {
         let push = [&["--node", "adder.py"], revision].concat();
-        deployer.pushes("adder_py", &push)?.succeeded()?;
+        deployer.push("adder_py", &push)?.expect_success()?;
     }
-    let ends = |outcome: Outcome, status: i32, words: &str| -> Verdict {
+    let ends = |outcome: CommandOutcome, status: i32, words: &str| -> Verdict {
         ensure!(
-            outcome.status == status && outcome.said().contains(words),
+            outcome.status == status && outcome.output().contains(words),
             "{status} was to be: {outcome:#?}"
         );
         Ok(())
     };
     ends(types(&["services"])?, 0, "adder_py")?;
     ends(types(&["push"])?, 2, "Usage")?;
-    ends(types(&["rollback", "nothing"])?, 5, "there are: adder_py")?;
+    ends(types(&["rollback", "nothing"])?, 5, "available: adder_py")?;
     ends(types(&["explain", "nobody"])?, 5, "nobody")?;
     ends(
-        with_token(&daemon, &viewer, &["rm", "adder_py"])?,
+        run_with_token(&daemon, &viewer, &["rm", "adder_py"])?,
         4,
         "error",
     )?;
-    ends(with_token(&daemon, "wrong", &["status"])?, 4, "token")?;
-    let changed = deployer.asks(&["diff", "adder_py", "1", "2"])?;
+    ends(run_with_token(&daemon, "wrong", &["status"])?, 4, "token")?;
+    let changed = deployer.run_json(&["diff", "adder_py", "1", "2"])?;
     let differences = changed["differences"].as_array().context("differences")?;
     let offset = serde_json::json!({"part": "parameter", "name": "/adder/offset", "before": "1"});
     ensure!(differences.contains(&offset), "{changed:#}");
-    let back = types(&["diff", "adder_py", "2", "1"])?.succeeded()?;
+    let back = types(&["diff", "adder_py", "2", "1"])?.expect_success()?;
     ensure!(back.stdout.contains("REVISION 2"), "{back:#?}");
     ends(
         types(&["diff", "adder_py", "1", "7"])?,
         5,
-        "there are: 2, 1",
+        "available: 2, 1",
     )?;
     ends(types(&["diff", "adder_py"])?, 5, "no revision before 1")?;
-    // The canary serves nobody yet, so nothing decides of it.
+    // The canary has no robots yet, so no decision is made.
     let wait = ["rollout", "adder_py", "--wait=1s"];
     ends(types(&wait)?, 8, "adder_py is at canary")?;
     let abort = ["rollout", "adder_py", "--wait=30s", "abort"];
-    ends(types(&abort)?, 1, "has not become the current one: aborted")?;
-    ends(types(&["rollout", "adder_py", "promote"])?, 6, "no canary")?;
+    ends(types(&abort)?, 1, "was not promoted: aborted")?;
+    ends(
+        types(&["rollout", "adder_py", "promote"])?,
+        6,
+        "not a canary",
+    )?;
     let start = ["rollout", "adder_py", "--wait", "start", "2"];
     ends(types(&start)?, 0, "promoted")?;
-    // Whoever reads no more has had enough; that is no failure.
+    // A reader that closes the pipe early is not an error.
     let closed = "set -o pipefail; \"$0\" services | true";
     let shell = Command::new("bash")
         .args(["-c", closed])
@@ -69,7 +73,7 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
         .env("CLOUDROID_HOME", setup.home())
         .status()?;
     ensure!(shell.success(), "{shell}");
-    daemon.is_killed()?;
+    daemon.kill()?;
     ends(types(&["services"])?, 3, "no daemon answers")?;
     ends(types(&["status", "--wait=1s"])?, 8, "no daemon answers")?;
     let waiting = Command::new(binaries::path("cloudroidctl"))
@@ -85,14 +89,14 @@ pub fn a_script_can_tell_by_the_exit_status_what_to_do() -> Verdict {
     Ok(())
 }
 
-/// `cloudroidctl events --follow`.
-struct Follower {
+/// A running `cloudroidctl events --follow`.
+struct EventFollower {
     child: Child,
     lines: Receiver<String>,
 }
 
-impl Follower {
-    fn begin(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<Follower> {
+impl EventFollower {
+    fn begin(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<EventFollower> {
         let mut child = Command::new(binaries::path("cloudroidctl"))
             .args(["--format", "json", "events", "--follow"])
             .args(arguments)
@@ -109,11 +113,11 @@ impl Follower {
                 .map_while(Result::ok)
                 .all(|line| told.send(line).is_ok())
         });
-        Ok(Follower { child, lines })
+        Ok(EventFollower { child, lines })
     }
 
-    /// The numbers of events up to and with one of this kind.
-    fn until(&mut self, kind: &str) -> anyhow::Result<Vec<i64>> {
+    /// Returns the numbers of the events up to and including one of this kind.
+    fn wait_for_event(&mut self, kind: &str) -> anyhow::Result<Vec<i64>> {
         let mut numbers = Vec::new();
         loop {
             let line = patience::receive(&self.lines);
@@ -127,7 +131,7 @@ impl Follower {
     }
 }
 
-impl Drop for Follower {
+impl Drop for EventFollower {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -135,62 +139,68 @@ impl Drop for Follower {
 }
 
 pub fn a_servant_is_named_by_its_service_where_that_has_no_other() -> Verdict {
-    let daemon = world().own("by-name").start()?;
+    let daemon = world().setup("by-name").start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
-    let types = |words: &[&str]| deployer.types(words);
-    let never = types(&["fit", "adder_py", "--cpus", "4000"])?.succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
+    let types = |words: &[&str]| deployer.run(words);
+    let never = types(&["fit", "adder_py", "--cpus", "4000"])?.expect_success()?;
     ensure!(
         never
             .stdout
-            .contains("it would be refused, now and later: a servant of 4000 cores"),
+            .contains("it would always be refused: a servant of 4000 cores"),
         "{}",
-        never.said()
+        never.output()
     );
-    types(&["stop", "adder_py"])?.failed_saying(&["adder_py"])?;
+    types(&["stop", "adder_py"])?.expect_failure(&["adder_py"])?;
     let one = daemon.robot("adder_py?robot=one")?;
-    daemon.awaits_event("a ready servant", |event| {
+    daemon.wait_for_event("a ready servant", |event| {
         event["kind"] == "servant-ready" && event["robot"] == "one"
     })?;
-    types(&["set", "adder_py", "--cpus", "0.5"])?.succeeded()?;
+    types(&["set", "adder_py", "--cpus", "0.5"])?.expect_success()?;
     let servant = daemon.servant_of("adder_py", "one")?;
     ensure!(servant["limits"]["cpus"] == 0.5, "{servant:#}");
     let two = daemon.robot("adder_py?robot=two")?;
     let saying = ["adder_py has 2 servants; name one: "];
-    types(&["set", "adder_py", "--cpus", "1"])?.failed_saying(&saying)?;
-    types(&["stop", "adder_py"])?.failed_saying(&saying)?;
+    types(&["set", "adder_py", "--cpus", "1"])?.expect_failure(&saying)?;
+    types(&["stop", "adder_py"])?.expect_failure(&saying)?;
     drop(two);
     let id = daemon.servant_of("adder_py", "two")?["id"].clone();
-    // Who is named twice is ended once.
+    // A servant that is named twice is stopped once.
     let id = id.as_str().context("an id")?;
-    let stopped = types(&["stop", id, id])?.succeeded()?;
+    let stopped = types(&["stop", id, id])?.expect_success()?;
     ensure!(
         stopped.stdout.matches(id).count() == 1,
         "{}",
-        stopped.said()
+        stopped.output()
     );
-    let stopped = types(&["stop", "adder_py"])?.succeeded()?;
+    let stopped = types(&["stop", "adder_py"])?.expect_success()?;
     let id = servant["id"].as_str().context("an id")?;
-    ensure!(stopped.stdout.contains(id), "{}", stopped.said());
+    ensure!(stopped.stdout.contains(id), "{}", stopped.output());
     drop(one);
     Ok(())
 }
 
 pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verdict {
-    let setup = world().own("followed");
+    let setup = world().setup("followed");
     let daemon = setup.start()?;
-    let mut all = Follower::begin(&daemon, &["-n", "1000"])?;
-    let mut some = Follower::begin(&daemon, &["--kind", "removed"])?;
+    let mut all = EventFollower::begin(&daemon, &["-n", "1000"])?;
+    let mut some = EventFollower::begin(&daemon, &["--kind", "removed"])?;
     let push = ["--node", "adder.py"];
-    daemon.deployer().pushes("adder_py", &push)?.succeeded()?;
-    let mut numbers = all.until("published")?;
-    daemon.is_killed()?;
+    daemon
+        .deployer()
+        .push("adder_py", &push)?
+        .expect_success()?;
+    let mut numbers = all.wait_for_event("published")?;
+    daemon.kill()?;
     let daemon = setup.start()?;
-    daemon.deployer().types(&["rm", "adder_py"])?.succeeded()?;
-    numbers.extend(all.until("removed")?);
-    let kept = daemon.deployer().asks(&["events", "-n", "1000"])?;
+    daemon
+        .deployer()
+        .run(&["rm", "adder_py"])?
+        .expect_success()?;
+    numbers.extend(all.wait_for_event("removed")?);
+    let kept = daemon.deployer().run_json(&["events", "-n", "1000"])?;
     let kept = kept.as_array().context("events")?;
     let removed = kept.iter().position(|event| event["kind"] == "removed");
     let expected: Vec<i64> = kept[..=removed.context("it is removed")?]
@@ -198,27 +208,28 @@ pub fn who_follows_events_misses_none_when_the_daemon_is_started_again() -> Verd
         .filter_map(|event| event["id"].as_i64())
         .collect();
     ensure!(numbers == expected, "{numbers:?}, kept are {expected:?}");
-    // Who asks for a kind is told of that alone.
+    // A filter by kind applies to followed events as well.
     let last = expected.last().copied().context("one")?;
-    ensure!(some.until("removed")? == [last]);
-    // A follower ends with what it has shown.
-    let viewer = token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
+    ensure!(some.wait_for_event("removed")? == [last]);
+    // A follower ends when its token is revoked.
+    let viewer = create_token(&daemon, &["looks", "--role", "viewer", "--service", "*"])?;
     let server = format!("http://{}", daemon.address);
     let follow = ["--server", &server, "--token", &viewer];
-    let mut shown = Follower::begin(&daemon, &follow)?;
-    shown.until("removed")?;
+    let mut shown = EventFollower::begin(&daemon, &follow)?;
+    shown.wait_for_event("removed")?;
     let revoke = ["token", "revoke", "looks"];
-    daemon.deployer().types(&revoke)?.succeeded()?;
+    daemon.deployer().run(&revoke)?.expect_success()?;
     let ended = shown.child.wait()?;
     ensure!(ended.code() == Some(4), "{ended}");
     Ok(())
 }
 
 pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
+    let daemon = world().daemon_with(LOCALISER)?;
     let deployer = daemon.deployer();
-    let script = deployer.types(&["completions", "bash"])?.succeeded()?;
-    let completes = "source \"$0\"; COMP_WORDS=(cloudroidctl \"$@\"); COMP_CWORD=$#; _cloudroidctl cloudroidctl \"${@: -1}\" x; \
+    let script = deployer.run(&["completions", "bash"])?.expect_success()?;
+    let completes = "source \"$0\"; COMP_WORDS=(cloudroidctl \"$@\"); COMP_CWORD=$#; _cloudroidctl cloudroidctl \"${@: \
+        -1}\" x; \
                      echo \"${COMPREPLY[@]}\"";
     let pages = world().directory("pages")?;
     let file = pages.path().join("completions");
@@ -226,7 +237,7 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     let completed = |words: &[&str]| -> anyhow::Result<String> {
         let mut bash = Command::new("bash");
         bash.args(["-c", completes]).arg(&file).args(words);
-        Ok(run(&mut bash)?.succeeded()?.stdout)
+        Ok(run(&mut bash)?.expect_success()?.stdout)
     };
     for (words, expected) in [
         (&["roll"][..], "rollback rollout"),
@@ -237,15 +248,15 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
         ensure!(found.trim() == expected, "{words:?}: {found}");
     }
     for shell in ["zsh", "fish"] {
-        let script = deployer.types(&["completions", shell])?.succeeded()?;
+        let script = deployer.run(&["completions", shell])?.expect_success()?;
         ensure!(script.stdout.contains("rollback"), "{shell}");
     }
     let directory = pages.path().to_string_lossy().into_owned();
-    deployer.types(&["man", &directory])?.succeeded()?;
+    deployer.run(&["man", &directory])?.expect_success()?;
     let page = |name: &str| std::fs::read_to_string(pages.path().join(name));
     let own = page("cloudroidctl.1")?;
-    ensure!(own.contains("what is named is not there"), "{own}");
-    let help = deployer.types(&["--help"])?.succeeded()?.stdout;
+    ensure!(own.contains("invalid or refused request"), "{own}");
+    let help = deployer.run(&["--help"])?.expect_success()?.stdout;
     let verbs = help.split_once("Commands:").context("verbs")?.1;
     let verbs = verbs.split_once("Options:").context("options")?.0;
     let mut count = 0;
@@ -261,29 +272,29 @@ pub fn shells_complete_it_and_every_verb_has_a_page() -> Verdict {
     ensure!(count > 25, "{verbs}");
     let nowhere = format!("{directory}/cloudroidctl.1/below");
     deployer
-        .types(&["man", &nowhere])?
-        .failed_saying(&["cannot write the pages into"])?;
+        .run(&["man", &nowhere])?
+        .expect_failure(&["cannot write the manual pages to"])?;
     Ok(())
 }
 
 pub fn top_shows_who_uses_the_machine() -> Verdict {
-    let daemon = world().with(LOCALISER)?;
+    let daemon = world().daemon_with(LOCALISER)?;
     let deployer = daemon.deployer();
     let mut robot = daemon.robot("localiser_py?robot=watched")?;
-    robot.calls("/rosapi/nodes", serde_json::json!({}))?;
+    robot.call("/rosapi/nodes", serde_json::json!({}))?;
     let only = ["top", "--service", "localiser_py", "--sort", "name"];
-    let once = deployer.types(&only)?.succeeded()?.stdout;
+    let once = deployer.run(&only)?.expect_success()?.stdout;
     let row = once.lines().find(|line| line.contains("watched"));
     ensure!(row.is_some_and(|row| row.contains("ready")), "{once}");
     ensure!(once.contains("cores used"), "{once}");
     let other = ["top", "--once", "--service", "nobodys"];
-    let other = deployer.types(&other)?.succeeded()?.stdout;
+    let other = deployer.run(&other)?.expect_success()?.stdout;
     ensure!(other.contains("no servants"), "{other}");
-    let listed = deployer.asks(&only)?;
+    let listed = deployer.run_json(&only)?;
     let listed = listed.as_array().context("servants")?;
     let robots = listed.iter().map(|one| &one["servant"]["robot"]);
     ensure!(robots.clone().any(|robot| robot == "watched"), "{listed:?}");
-    // At a terminal, until somebody types q.
+    // In a terminal, until the user types q.
     let typed = format!("{} top", binaries::path("cloudroidctl").display());
     let mut terminal = Command::new("script")
         .args(["--quiet", "--flush", "--return", "--command", &typed])
@@ -305,7 +316,7 @@ pub fn top_shows_who_uses_the_machine() -> Verdict {
                 count => all.extend_from_slice(&more[..count]),
             }
             if String::from_utf8_lossy(&all).contains("watched") {
-                // Once is enough.
+                // One frame is enough.
                 let _ = drawn.send(());
             }
         }

@@ -1,4 +1,4 @@
-//! A link that is cut again and again while requests are under way.
+//! A link that is cut repeatedly while requests are in progress.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -11,20 +11,20 @@ use support::Verdict;
 use support::cutter::Cutter;
 use support::daemon::Daemon;
 use support::patience::{Deadline, patience, scale, wait_for};
-use support::site::{Site, string_of, text_of};
-use support::twins::{Twin, sum, sum_of};
+use support::site::{Site, string_in, string_text};
+use support::twins::{Twin, parse_sum, sum_request};
 use support::world::world;
 
-/// After which nothing more is expected to come for now; another call is made then. Where nothing else runs.
+/// Time after which no further message is expected and another call is made; on an idle machine.
 const PAUSE: Duration = Duration::from_millis(200);
-/// Callers at the same time.
+/// Number of concurrent callers.
 const CALLERS: usize = 4;
-/// The longest stretch between two cuts, bytes: some hundred calls. Many are in the midst of a handshake.
+/// Maximum number of bytes between two cuts: some hundred calls. Many cuts happen during a handshake.
 const STRETCH: usize = 20_000;
 
-/// How many messages of a topic either side of a robot's link tells to have dropped.
-fn told_as_dropped(daemon: &Daemon, robot: &str, topic: &str) -> anyhow::Result<u64> {
-    let told = daemon.deployer().asks(&["explain", robot])?;
+/// Returns how many messages of a topic both sides of a robot's link report as dropped.
+fn reported_drops(daemon: &Daemon, robot: &str, topic: &str) -> anyhow::Result<u64> {
+    let told = daemon.deployer().run_json(&["explain", robot])?;
     let servants = told["servants"].as_array().into_iter().flatten();
     let links = servants.flat_map(|servant| servant["links"].as_array().into_iter().flatten());
     let drops = links.flat_map(|link| link["drops"].as_array().into_iter().flatten());
@@ -36,8 +36,8 @@ fn told_as_dropped(daemon: &Daemon, robot: &str, topic: &str) -> anyhow::Result<
     Ok(counts.sum())
 }
 
-/// What a process holds: descriptors, threads, resident memory in kB.
-fn holds(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
+/// Returns the resources of a process: descriptors, threads, resident memory in kB.
+fn process_resources(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
     let count = |what: &str| -> anyhow::Result<usize> {
         Ok(std::fs::read_dir(format!("/proc/{pid}/{what}"))?.count())
     };
@@ -52,26 +52,29 @@ fn holds(pid: u32) -> anyhow::Result<(usize, usize, usize)> {
 pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
     ros: RosVersion,
 ) -> Verdict {
-    // A thousand: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
+    // A thousand cuts: `CLOUDROID_CUTS=1000 make stories ONLY=cuts`.
     let cuts = std::env::var("CLOUDROID_CUTS")
         .ok()
         .and_then(|cuts| cuts.parse().ok())
         .unwrap_or(60);
     let (adder, greeter) = (Twin::adder(ros), Twin::greeter(ros));
-    // Of its own: what it holds is looked at.
-    let daemon = world().own(&adder.robot("cuts")).start()?;
+    // A separate daemon, because its resources are measured.
+    let daemon = world().setup(&adder.robot_name("cuts")).start()?;
     let mut services = vec![adder.service, greeter.service];
     services.dedup_by_key(|service| service.name);
     for service in services {
         let package = service.package.context("a package")?;
-        let pushed = daemon.deployer().pushes(package, service.arguments)?;
-        pushed.succeeded()?;
+        let pushed = daemon.deployer().push(package, service.arguments)?;
+        pushed.expect_success()?;
     }
     let cutter = Cutter::new(&daemon.address, cuts, STRETCH, 0x5eed)?;
     let server = cutter.server.to_string();
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let (adds, greets) = (adder.robot("cut-adder"), greeter.robot("cut-greeter"));
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let (adds, greets) = (
+        adder.robot_name("cut-adder"),
+        greeter.robot_name("cut-greeter"),
+    );
     let argv = adder.argv("adder", &[]);
     let adder = adder.stub(&site, (&server, &adds), "", &argv)?;
     let argv = greeter.argv("greeter", &[("~name", "/who")]);
@@ -79,30 +82,34 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
     let said = || {
         format!(
             "the adder's:\n{}\nthe greeter's:\n{}",
-            adder.said(),
-            greeter.said()
+            adder.output(),
+            greeter.output()
         )
     };
     let is_there = |graph: &Graph| {
         graph.services.contains_key("/add_two") && graph.services.contains_key("/greeter/count")
     };
-    site.until(&app, "both", is_there).with_context(said)?;
-    let names = site.says(&app, "/who", false)?;
-    site.connected(&*names, 1)?;
-    let mut greetings = site.hears(&app, "/greeter/greeting")?;
-    site.fed(&greetings, 1)?;
-    let mut sums = site.hears(&app, "/sums")?;
-    // Both outputs are heard from here on.
-    let next = Arc::new(AtomicI64::new(1));
-    let ask = || site.calls(&app, "/add_two", &sum(ros, 0)).map(drop);
-    site.asks_until(&mut sums, ask, |_| Ok(true))
+    site.wait_for_graph(&app, "both", is_there)
         .with_context(said)?;
-    names.publish(string_of(WireFormat::of(ros), "0"));
-    site.next(&mut greetings).with_context(said)?;
+    let names = site.advertise_strings(&app, "/who", false)?;
+    site.wait_for_subscribers(&*names, 1)?;
+    let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
+    site.wait_for_publishers(&greetings, 1)?;
+    let mut sums = site.subscribe(&app, "/sums")?;
+    // From here on messages of both outputs arrive.
+    let next = Arc::new(AtomicI64::new(1));
+    let ask = || {
+        site.call_service(&app, "/add_two", &sum_request(ros, 0))
+            .map(drop)
+    };
+    site.ask_until(&mut sums, ask, |_| Ok(true))
+        .with_context(said)?;
+    names.publish(string_in(WireFormat::for_version(ros), "0"));
+    site.next_message(&mut greetings).with_context(said)?;
     let before = [
-        holds(adder.pid())?,
-        holds(greeter.pid())?,
-        holds(daemon.pid().unsigned_abs())?,
+        process_resources(adder.pid())?,
+        process_resources(greeter.pid())?,
+        process_resources(daemon.pid().unsigned_abs())?,
     ];
     cutter.begin();
     let over = || cutter.cuts() >= cuts;
@@ -114,13 +121,16 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
             let call = async || {
                 while !over() {
                     let number = next.fetch_add(1, Ordering::Relaxed);
-                    match app.call("/add_two", sum(ros, number), patience()).await {
+                    match app
+                        .call("/add_two", sum_request(ros, number), patience())
+                        .await
+                    {
                         Ok(response) => {
-                            let response = sum_of(ros, &response)?;
+                            let response = parse_sum(ros, &response)?;
                             ensure!(response == number, "{response} is not {number}");
                             answered.fetch_add(1, Ordering::Relaxed);
                         }
-                        // A reason is an answer; silence is none.
+                        // An error is an answer; a missing response is not.
                         Err(BusError::CallFailed { .. }) => {
                             failed.fetch_add(1, Ordering::Relaxed);
                         }
@@ -139,7 +149,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
                 let mut count = 0_u32;
                 while !over() {
                     count += 1;
-                    names.publish(string_of(WireFormat::of(ros), &count.to_string()));
+                    names.publish(string_in(WireFormat::for_version(ros), &count.to_string()));
                     let greeting = wait_for(greetings.messages.recv()).await;
                     let greeting = greeting
                         .ok()
@@ -158,19 +168,20 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
             };
             let hear = async {
                 let mut executed = BTreeSet::new();
-                // Each is heard in order: once a call that came after all others is heard, so were those.
+                // Messages of each topic arrive in order: once that of a later call has arrived, all earlier ones have.
                 let mut fence = None;
                 loop {
                     if over() && done.load(Ordering::Relaxed) == CALLERS {
                         let number = next.fetch_add(1, Ordering::Relaxed);
                         fence.get_or_insert(number);
-                        app.call("/add_two", sum(ros, number), patience()).await?;
+                        app.call("/add_two", sum_request(ros, number), patience())
+                            .await?;
                     }
                     let pause = scale(PAUSE);
                     while let Ok(Some(told)) =
                         tokio::time::timeout(pause, sums.messages.recv()).await
                     {
-                        let number: i64 = text_of(ros, &told.bytes, 0)?.parse()?;
+                        let number: i64 = string_text(ros, &told.bytes, 0)?.parse()?;
                         if fence.is_some_and(|fence| number >= fence) {
                             return anyhow::Ok(executed);
                         }
@@ -191,29 +202,34 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
         })
         .with_context(said)?;
     let after = [
-        holds(adder.pid())?,
-        holds(greeter.pid())?,
-        holds(daemon.pid().unsigned_abs())?,
+        process_resources(adder.pid())?,
+        process_resources(greeter.pid())?,
+        process_resources(daemon.pid().unsigned_abs())?,
     ];
     let (answered, failed) = (answered.into_inner(), failed.into_inner());
     println!(
-        "{cuts} cuts: {answered} calls answered, {failed} failed with a reason, {executed} executed, {greeted} names greeted; descriptors, threads, kB before {before:?}, after {after:?}"
+        "{cuts} cuts: {answered} calls answered, {failed} failed with a reason, {executed} executed, {greeted} names \
+         greeted; descriptors, threads, kB before {before:?}, after {after:?}"
     );
     ensure!(
         answered > 0 && greeted > 0,
         "{answered} answers, {greeted} greetings"
     );
-    // Each answered call has told its sum on a topic, too: it was heard once, or is told as dropped.
-    let all_known = support::until("each answered call's sum, heard or told as dropped", || {
-        let here = sums.dropped.get();
-        let dropped = here + told_as_dropped(&daemon, &adds, "/sums")?;
-        let known = executed as u64 + dropped;
-        let told = format!(
-            "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as dropped"
-        );
-        let all = (u64::from(answered)..=u64::from(answered + failed)).contains(&known);
-        Ok(if all { Ok(told) } else { Err(told) })
-    });
+    // Each answered call has also published its sum: it was received once, or is reported as dropped.
+    let all_known = support::wait_until(
+        "each answered call's sum, heard or told as dropped",
+        || {
+            let here = sums.dropped.get();
+            let dropped = here + reported_drops(&daemon, &adds, "/sums")?;
+            let known = executed as u64 + dropped;
+            let told = format!(
+                "{answered} calls were answered and {failed} failed, {executed} sums were heard, {dropped} told as \
+                    dropped"
+            );
+            let all = (u64::from(answered)..=u64::from(answered + failed)).contains(&known);
+            Ok(if all { Ok(told) } else { Err(told) })
+        },
+    );
     println!("{}", all_known.with_context(said)?);
     for ((fds, threads, memory), (fds_after, threads_after, memory_after)) in
         before.iter().zip(&after)
@@ -228,7 +244,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
         );
     }
     // The same nodes in the same servants.
-    let servants = daemon.deployer().asks(&["servants"])?;
+    let servants = daemon.deployer().run_json(&["servants"])?;
     let ours = servants
         .as_array()
         .context("a list")?
@@ -240,7 +256,7 @@ pub fn no_request_is_lost_or_answered_twice_however_often_the_link_is_cut(
         });
     ensure!(ours.count() == 2, "{servants:#}");
     drop((adder, greeter));
-    daemon.deployer().types(&["stop", "--all"])?;
-    daemon.ends()?;
+    daemon.deployer().run(&["stop", "--all"])?;
+    daemon.stop()?;
     Ok(())
 }

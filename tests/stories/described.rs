@@ -1,4 +1,4 @@
-//! The HTTP API beside its description, as a program sees it that nobody here wrote.
+//! The HTTP API compared with its OpenAPI description by an independent program.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -18,24 +18,26 @@ use support::robot::Robot;
 use support::world::{ADDER, world};
 use support::{Verdict, binaries};
 
-use crate::access::token;
+use crate::access::create_token;
 
-/// What is wrong anywhere: an answer of 500 and above, or a status, type or value that the document does not have.
+/// Checks for every response: no status of 500 or above, and no status, type or value that the document does not
+/// contain.
 const CHECKS: &str = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance";
-/// Between two requests of a robot at work.
+/// Interval between the requests of a working robot.
 const PAUSE: Duration = Duration::from_secs(1);
-/// Of the one who can sign in.
+/// Password of the user who can sign in.
 const PASSWORD: &str = "four words of no sense";
 const NDJSON: &str = "application/x-ndjson";
-/// Two go on for as long as somebody listens, whatever is asked; the third is the document, with which Schemathesis begins.
+/// Operations that run separately: two never end, whatever is requested; the third is the document, with which
+/// Schemathesis starts.
 const APART: &[&str] = &["stream", "followEvents", "openapi"];
-/// These do so for a servant or a service that there is, or become a WebSocket.
+/// Operations that never end for an existing servant or service, or become a WebSocket.
 const ASKED_HERE: &[&str] = &["inside", "shadow", "topics"];
-/// What all others need: asked last, in this order.
+/// Operations that remove what the others need: called last, in this order.
 const LAST: &[&str] = &["stopServants", "removeService"];
-/// Operations that do nothing here, and why.
+/// Operations that do nothing here, with the reason.
 const NOT_DONE: &[(&str, &str)] = &[
-    ("beginPairing", "robots are paired through TLS"),
+    ("beginPairing", "robots are paired over TLS"),
     ("pair", "the same"),
     ("renew", "the same"),
     ("unpair", "no robot is paired"),
@@ -46,11 +48,11 @@ const NOT_DONE: &[(&str, &str)] = &[
     ("trial", "the service listens to no topic"),
 ];
 
-/// What was answered to each operation, and how often.
-type Answers = BTreeMap<String, BTreeMap<u16, usize>>;
+/// Number of responses by operation and status.
+type AnswerCounts = BTreeMap<String, BTreeMap<u16, usize>>;
 
-/// What is asked about.
-struct Scene {
+/// Objects to which the operations refer.
+struct ApiScene {
     daemon: Daemon,
     admin: String,
     place: PathBuf,
@@ -58,16 +60,18 @@ struct Scene {
     spare: Value,
 }
 
-impl Scene {
-    /// With two robots at work, and all else that has a name.
-    fn new(daemon: Daemon, place: &Path) -> anyhow::Result<(Scene, [Robot; 2])> {
+impl ApiScene {
+    /// Creates two working robots, and everything else that operations refer to by name.
+    fn new(daemon: Daemon, place: &Path) -> anyhow::Result<(ApiScene, [Robot; 2])> {
         let deployer = daemon.deployer();
-        deployer.pushes("adder_py", ADDER.arguments)?.succeeded()?;
-        let admin = token(&daemon, &["chief", "--role", "admin"])?;
+        deployer
+            .push("adder_py", ADDER.arguments)?
+            .expect_success()?;
+        let admin = create_token(&daemon, &["chief", "--role", "admin"])?;
         let connect = |name: &str| -> anyhow::Result<(Robot, String)> {
             let path = format!("adder_py?robot={name}&token={admin}");
             let mut robot = daemon.robot(&path)?;
-            robot.calls("/add_two", json!({"a": 1, "b": 2}))?;
+            robot.call("/add_two", json!({"a": 1, "b": 2}))?;
             let servant = daemon.servant_of("adder_py", name)?;
             Ok((robot, servant["id"].as_str().context("an id")?.to_owned()))
         };
@@ -77,8 +81,8 @@ impl Scene {
             let bearer = format!("Bearer {admin}");
             let headers = [("Authorization", bearer.as_str())];
             let path = format!("/api/v1/servants/{servant}/recording");
-            support::until("a recording", || {
-                let (status, _, body) = daemon.sends("POST", &path, &headers, "")?;
+            support::wait_until("a recording", || {
+                let (status, _, body) = daemon.request_with_body("POST", &path, &headers, "")?;
                 let taken: Value = serde_json::from_str(&body)?;
                 Ok(match status {
                     200 => Ok(taken["number"].to_string()),
@@ -87,7 +91,7 @@ impl Scene {
             })
         };
         let (recording, recording_to_remove) = (take()?, take()?);
-        let scene = Scene {
+        let scene = ApiScene {
             names: json!({
                 "services": ["adder_py"],
                 "servants": [servant],
@@ -99,32 +103,40 @@ impl Scene {
             admin,
             place: place.to_owned(),
         };
-        scene.makes_person()?;
+        scene.create_person()?;
         Ok((scene, [rover, other]))
     }
 
-    /// Somebody who can sign in.
-    fn makes_person(&self) -> Verdict {
+    /// Creates a user who can sign in.
+    fn create_person(&self) -> Verdict {
         let person = json!({"name": "person", "password": PASSWORD, "role": "operator"});
         let bearer = format!("Bearer {}", self.admin);
         let headers = [("Authorization", bearer.as_str())];
-        let (status, _, body) =
-            self.daemon
-                .sends("POST", "/api/v1/accounts", &headers, &person.to_string())?;
+        let (status, _, body) = self.daemon.request_with_body(
+            "POST",
+            "/api/v1/accounts",
+            &headers,
+            &person.to_string(),
+        )?;
         ensure!(status == 200, "{status} {body}");
         Ok(())
     }
 
-    /// Where answers stand, a line each.
-    fn told(&self) -> PathBuf {
+    /// Returns the file of the responses, one per line.
+    fn answers_path(&self) -> PathBuf {
         self.place.join("answers")
     }
 
-    /// Has Schemathesis ask, with this token; gives how many operations it asked.
-    fn asked(&self, bearer: &str, last: bool, arguments: &[&str]) -> anyhow::Result<usize> {
+    /// Runs Schemathesis with this token; returns the number of operations that it called.
+    fn run_schemathesis(
+        &self,
+        bearer: &str,
+        last: bool,
+        arguments: &[&str],
+    ) -> anyhow::Result<usize> {
         let given = json!({
             "names": self.names, "spare": self.spare, "person": "person", "password": PASSWORD, "last": last,
-            "answers": path_str(&self.told()),
+            "answers": path_str(&self.answers_path()),
         });
         let mut schemathesis = Command::new(binaries::readers().join("schemathesis"));
         schemathesis
@@ -143,17 +155,17 @@ impl Scene {
             .args(["--request-timeout", &patience().as_secs().to_string()])
             .args(["--generation-database", "none", "--warnings", "off"])
             .args(arguments);
-        let said = run(&mut schemathesis)?.succeeded()?.stdout;
+        let said = run(&mut schemathesis)?.expect_success()?.stdout;
         let tested = said
             .lines()
             .find_map(|line| line.trim().strip_prefix("Tested: "));
         Ok(tested.context("a count")?.trim().parse()?)
     }
 
-    /// All that was answered until now.
-    fn answers(&self) -> anyhow::Result<Answers> {
-        let mut answers = Answers::new();
-        for line in fs::read_to_string(self.told())?.lines() {
+    /// Returns all responses so far.
+    fn read_answers(&self) -> anyhow::Result<AnswerCounts> {
+        let mut answers = AnswerCounts::new();
+        for line in fs::read_to_string(self.answers_path())?.lines() {
             let line: Value = serde_json::from_str(line)?;
             let operation = line["operation"].as_str().context("an operation")?;
             let status = u16::try_from(line["status"].as_u64().context("a status")?)?;
@@ -163,8 +175,8 @@ impl Scene {
         Ok(answers)
     }
 
-    /// What goes on without an end begins as the document says.
-    fn begins(&self, path: &str, media: &str, more: &[&str]) -> Verdict {
+    /// Checks that a streaming response starts as described.
+    fn expect_stream_starts(&self, path: &str, media: &str, more: &[&str]) -> Verdict {
         let mut curl = Command::new("curl")
             .args(["--silent", "--show-error", "--no-buffer", "--include"])
             .args(["--max-time", &patience().as_secs().to_string()])
@@ -176,7 +188,7 @@ impl Scene {
             .spawn()?;
         let mut out = BufReader::new(curl.stdout.take().context("piped")?);
         let mut head = String::new();
-        // An empty line ends it; nobody waits for what follows.
+        // The empty line ends the head; the rest is not read.
         while out.read_line(&mut head)? > 2 {}
         curl.kill()?;
         curl.wait()?;
@@ -186,45 +198,46 @@ impl Scene {
         Ok(())
     }
 
-    /// Asks what Schemathesis would wait for, or has no protocol for.
-    fn begins_what_goes_on(&self) -> Verdict {
+    /// Checks operations for which Schemathesis would wait, or whose protocol it lacks.
+    fn check_streams(&self) -> Verdict {
         let servant = self.names["servants"][0].as_str().context("an id")?;
         let topics = format!("/api/v1/servants/{servant}/topics");
-        self.begins("/api/v1/stream", "text/event-stream", &[])?;
-        self.begins("/api/v1/events/follow", NDJSON, &[])?;
-        self.begins(&topics, NDJSON, &[])?;
+        self.expect_stream_starts("/api/v1/stream", "text/event-stream", &[])?;
+        self.expect_stream_starts("/api/v1/events/follow", NDJSON, &[])?;
+        self.expect_stream_starts(&topics, NDJSON, &[])?;
         let options = json!({"revision": 1, "robot": "nobody"}).to_string();
         let shadow = "/api/v1/services/adder_py/shadow";
-        self.begins(shadow, NDJSON, &["--data", &options])?;
+        self.expect_stream_starts(shadow, NDJSON, &["--data", &options])?;
         let inside = format!("api/v1/servants/{servant}/inside?token={}", self.admin);
-        self.daemon.robot(&inside)?.leaves()
+        self.daemon.robot(&inside)?.leave()
     }
 
-    /// All of them, by a viewer and by an admin, and last what ends what the others are about.
-    fn asks_everything(&self) -> Verdict {
+    /// Calls all operations as a viewer and as an admin, and last those that remove what the others need.
+    fn check_everything(&self) -> Verdict {
         let looks = ["looks", "--role", "viewer", "--service", "*"];
-        let viewer = token(&self.daemon, &looks)?;
+        let viewer = create_token(&self.daemon, &looks)?;
         let mut later: Vec<&str> = Vec::new();
         for id in APART.iter().chain(LAST) {
             later.extend(["--exclude-operation-id", id]);
         }
         for (who, bearer, most) in [("viewer", &viewer, "1"), ("admin", &self.admin, "5")] {
             let arguments = [&["--max-examples", most], &*later].concat();
-            let tested = self.asked(bearer, false, &arguments);
+            let tested = self.run_schemathesis(bearer, false, &arguments);
             let tested = tested.with_context(|| who.to_owned())?;
             ensure!(tested > 50, "{who}: {tested} operations");
         }
-        self.begins_what_goes_on()?;
+        self.check_streams()?;
         for id in LAST {
             let arguments = ["--max-examples", "4", "--include-operation-id", id];
-            self.asked(&self.admin, true, &arguments).context(*id)?;
+            self.run_schemathesis(&self.admin, true, &arguments)
+                .context(*id)?;
         }
         Ok(())
     }
 
-    /// Compares what was answered with what the document says of each operation.
-    fn judged(&self) -> Verdict {
-        let (described, answers) = (described(&self.daemon)?, self.answers()?);
+    /// Compares the responses with the statuses in the document.
+    fn compare_with_document(&self) -> Verdict {
+        let (described, answers) = (documented_statuses(&self.daemon)?, self.read_answers()?);
         let not_done: Vec<&str> = NOT_DONE.iter().map(|(id, _)| *id).collect();
         for id in not_done.iter().chain(ASKED_HERE).chain(APART) {
             ensure!(described.contains_key(*id), "there is no operation {id}");
@@ -248,8 +261,8 @@ impl Scene {
     }
 }
 
-/// Statuses that the document has of each operation.
-fn described(daemon: &Daemon) -> anyhow::Result<BTreeMap<String, BTreeSet<u16>>> {
+/// Returns the documented statuses of each operation.
+fn documented_statuses(daemon: &Daemon) -> anyhow::Result<BTreeMap<String, BTreeSet<u16>>> {
     let document = daemon.api("/api/v1/openapi.json")?;
     let mut described = BTreeMap::new();
     let paths = document["paths"].as_object().context("paths")?;
@@ -266,31 +279,30 @@ fn described(daemon: &Daemon) -> anyhow::Result<BTreeMap<String, BTreeSet<u16>>>
     Ok(described)
 }
 
-/// Keeps a robot at work until all is over: a daemon lets those go that are silent.
-fn works(mut robot: Robot, over: &AtomicBool) {
-    // It ends when its servant does.
-    while !over.load(Ordering::Relaxed) && robot.calls("/add_two", json!({"a": 1, "b": 2})).is_ok()
-    {
+/// Keeps a robot working until the end, because a daemon disconnects silent robots.
+fn keep_working(mut robot: Robot, over: &AtomicBool) {
+    // Ends when its servant is stopped.
+    while !over.load(Ordering::Relaxed) && robot.call("/add_two", json!({"a": 1, "b": 2})).is_ok() {
         thread::sleep(PAUSE);
     }
 }
 
 pub fn every_answer_is_as_the_document_says() -> Verdict {
     let black_box = "[black_box]\nseconds = \"5s\"\n";
-    let daemon = world().own("described").config(black_box).start()?;
+    let daemon = world().setup("described").config(black_box).start()?;
     let place = world().directory("described")?;
-    let (scene, robots) = Scene::new(daemon, place.path())?;
+    let (scene, robots) = ApiScene::new(daemon, place.path())?;
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
         for robot in robots {
-            scope.spawn(|| works(robot, &over));
+            scope.spawn(|| keep_working(robot, &over));
         }
-        let asked = scene.asks_everything();
+        let asked = scene.check_everything();
         over.store(true, Ordering::Relaxed);
         asked
     })?;
-    scene.judged()?;
-    // It was not turned away half-way.
+    scene.compare_with_document()?;
+    // The token still works, so the requests were not refused halfway through.
     let bearer = format!("Bearer {}", scene.admin);
     let showing = [("Authorization", bearer.as_str())];
     let (status, _) = scene.daemon.request("GET", "/api/v1/status", &showing)?;

@@ -1,4 +1,4 @@
-//! A user evaluates a package of theirs: native as on a small robot, against outsourced over the network.
+//! A user evaluates a package of their own: native, as on a small robot, compared with outsourced over the network.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -15,15 +15,15 @@ use support::machine::Machine;
 use support::world::{ADDER, PEOPLE, TELLER, world};
 
 use crate::access;
-use crate::calibration::{PEDESTRIANS, none_is_left};
+use crate::calibration::{PEDESTRIANS, wait_until_none_left};
 
-/// Recordings in a machine with ROS: pictures of people, words, and an end.
-struct Recordings {
+/// Recordings in a machine with ROS: images of people, strings, and a message that makes a node exit.
+struct RobotRecordings {
     machine: Machine,
 }
 
-impl Recordings {
-    fn new() -> anyhow::Result<Recordings> {
+impl RobotRecordings {
+    fn new() -> anyhow::Result<RobotRecordings> {
         let machine = Machine::new()?;
         let place = world().directory("pictures")?;
         for (name, frames, size) in [("raw", "5", "640x480"), ("raw_large", "2", "768x576")] {
@@ -32,8 +32,8 @@ impl Recordings {
                 .args(["-loglevel", "error", "-i", PEDESTRIANS, "-frames:v", frames])
                 .args(["-s", size, "-pix_fmt", "rgb24", "-f", "rawvideo"])
                 .arg(&raw))?
-            .succeeded()?;
-            machine.puts(&raw, &format!("/root/{name}"), 0o644)?;
+            .expect_success()?;
+            machine.install_file(&raw, &format!("/root/{name}"), 0o644)?;
         }
         let records = r#"
 import rosbag, rospy, struct
@@ -69,39 +69,39 @@ with rosbag.Bag("/root/end.bag", "w") as bag:
         bag.write("/end", Int32(1), rospy.Time(1000, number * 50000000))
 "#;
         machine
-            .runs("sh", &format!("python3 - << 'END'\n{records}END"))?
-            .succeeded()?;
-        Ok(Recordings { machine })
+            .run_script("sh", &format!("python3 - << 'END'\n{records}END"))?
+            .expect_success()?;
+        Ok(RobotRecordings { machine })
     }
 
-    fn of(&self, what: &str) -> PathBuf {
-        self.machine.written(&format!("/root/{what}.bag"))
+    fn path(&self, what: &str) -> PathBuf {
+        self.machine.host_path(&format!("/root/{what}.bag"))
     }
 }
 
-fn number(value: &Value, path: &str) -> anyhow::Result<f64> {
+fn json_number(value: &Value, path: &str) -> anyhow::Result<f64> {
     value
         .pointer(path)
         .and_then(Value::as_f64)
         .with_context(|| format!("{path} of {value:#}"))
 }
 
-fn evaluates(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Value> {
+fn evaluate(daemon: &Daemon, bag: &Path, words: &[&str]) -> anyhow::Result<Value> {
     let bag = ["eval", PEOPLE.name, "--bag", path_str(bag), "--fast"];
-    daemon.deployer().asks(&[&bag, words].concat())
+    daemon.deployer().run_json(&[&bag, words].concat())
 }
 
 pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
-    // Cores that it measures with are not promised to other stories' robots. The recording alone is nearly all that a client may
-    // have held.
+    // A separate daemon, because the cores for the evaluation are not available to the robots of other stories. The
+    // recording alone needs nearly all memory of a client's budget.
     let setup = world()
-        .own("evaluated")
+        .setup("evaluated")
         .config("[memory]\nclient = \"5M\"\n");
     let daemon = setup.start()?;
-    // Robots may ask for less memory than native is measured with.
+    // Robots may request less memory than the native run has.
     let pushed = [&["push", "--max-memory", "512M"], PEOPLE.arguments].concat();
-    daemon.deployer().types(&pushed)?.succeeded()?;
-    let recordings = Recordings::new()?;
+    daemon.deployer().run(&pushed)?.expect_success()?;
+    let recordings = RobotRecordings::new()?;
     let place = world().directory("evaluation")?;
     let plot = place.path().join("plot.svg");
     let plot = ["--plot", path_str(&plot)];
@@ -114,12 +114,12 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
         "20",
         "--yes",
     ];
-    let found = evaluates(
+    let found = evaluate(
         &daemon,
-        &recordings.of("people"),
+        &recordings.path("people"),
         &[&words[..], &plot].concat(),
     )?;
-    none_is_left(&daemon, PEOPLE.name)?;
+    wait_until_none_left(&daemon, PEOPLE.name)?;
     for side in ["native", "outsourced"] {
         ensure!(found[side]["answered"] == 12, "{side}: {found:#}");
         ensure!(
@@ -132,20 +132,20 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
         "{found:#}"
     );
     ensure!(found["native"]["memory_limit"] == 1u64 << 30, "{found:#}");
-    // A quarter of a core takes longer than a whole one, and the limit says so.
-    let held_up = |side: &str| number(&found, &format!("/{side}/phases/held_up"));
+    // A quarter of a core takes longer than a whole one because of the limit.
+    let held_up = |side: &str| json_number(&found, &format!("/{side}/phases/held_up"));
     ensure!(held_up("native")? > held_up("outsourced")?, "{found:#}");
-    ensure!(number(&found, "/times_as_fast")? > 1.1, "{found:#}");
+    ensure!(json_number(&found, "/times_as_fast")? > 1.1, "{found:#}");
     let verdict = found["verdict"].as_str().unwrap_or_default();
     ensure!(verdict.starts_with("worth it: outsourced"), "{verdict}");
-    // Half of the network up, half down; and what was measured lies below.
+    // Half of the network's delay in each direction; the measured times are within the total.
     ensure!(
-        number(&found, "/outsourced/phases/up")? == 10.0,
+        json_number(&found, "/outsourced/phases/up")? == 10.0,
         "{found:#}"
     );
-    let part = |name: &str| number(&found, &format!("/outsourced/phases/{name}"));
-    let median = number(&found, "/outsourced/rrt/p50")?;
-    // Two runs: where nothing is over, nothing is said.
+    let part = |name: &str| json_number(&found, &format!("/outsourced/phases/{name}"));
+    let median = json_number(&found, "/outsourced/rrt/p50")?;
+    // Of only two runs some parts may be missing.
     if !found["outsourced"]["phases"]["transport"].is_null() {
         let parts = part("up")? + part("transport")? + part("compute")? + part("down")?;
         ensure!(
@@ -155,17 +155,17 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     }
     ensure!(found["native"]["phases"]["up"].is_null(), "{found:#}");
     ensure!(found["sla"]["network_added"] == 20.0, "{found:#}");
-    // The picture went over the network as it is.
+    // The image was sent unencoded.
     ensure!(
-        number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0,
+        json_number(&found, "/outsourced/bytes/0")? > 640.0 * 480.0 * 3.0,
         "{found:#}"
     );
     let (desire, p95) = (
-        number(&found, "/sla/desire")?,
-        number(&found, "/outsourced/rrt/p95")?,
+        json_number(&found, "/sla/desire")?,
+        json_number(&found, "/outsourced/rrt/p95")?,
     );
     ensure!((p95..p95 * 1.1).contains(&(desire * 1000.0)), "{found:#}");
-    let rows = daemon.deployer().asks(&["sla", "list", PEOPLE.name])?;
+    let rows = daemon.deployer().run_json(&["sla", "list", PEOPLE.name])?;
     ensure!(rows.as_array().map(Vec::len) == Some(1), "{rows:#}");
     ensure!(rows[0]["value"] == found["sla"]["desire"], "{rows:#}");
     ensure!(
@@ -176,132 +176,136 @@ pub fn a_package_is_evaluated_native_against_outsourced() -> Verdict {
     for class in ["class=\"native\"", "class=\"outsourced\""] {
         ensure!(drawn.contains(class), "{class}: {drawn}");
     }
-    large_pictures(&daemon, &recordings, plot[1])?;
-    too_little_memory(&daemon, &recordings, plot[1])?;
+    evaluate_large_pictures(&daemon, &recordings, plot[1])?;
+    evaluate_with_little_memory(&daemon, &recordings, plot[1])?;
     deployers_evaluate_what_is_theirs(&daemon, &recordings, plot[1])
 }
 
-/// Requests and answers of 1.3 MB that meet in the daemon's socket; and a second row for as many cores.
-fn large_pictures(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Verdict {
-    let bag = recordings.of("large");
+/// Requests and answers of 1.3 MB, which meet in the daemon's socket; and a second row for the same number of cores.
+fn evaluate_large_pictures(daemon: &Daemon, recordings: &RobotRecordings, plot: &str) -> Verdict {
+    let bag = recordings.path("large");
     let words = ["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"];
     let more = ["--requests", "10", "--cpus", "1", "--robot-cpus", "0.5"];
     let yes = ["--yes", "--plot", plot];
     let outcome = daemon
         .deployer()
-        .types(&[&words[..], &more, &yes].concat())?
-        .succeeded()?;
-    for words in ["10 of 10", "request: ", " 1.3M, answer: /", "HELD UP MS"] {
+        .run(&[&words[..], &more, &yes].concat())?
+        .expect_success()?;
+    for words in ["10 of 10", "request: ", " 1.3M, answer: /", "THROTTLED MS"] {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    // One that has the same desire as the first is written over it.
-    let rows = daemon.deployer().asks(&["sla", "list", PEOPLE.name])?;
+    // A row with the same desired time replaces the first one.
+    let rows = daemon.deployer().run_json(&["sla", "list", PEOPLE.name])?;
     if rows.as_array().is_some_and(|rows| rows.len() > 1) {
-        let words = "has had rows for as many cores before (";
+        let words = "already had entries for the same number of cores (";
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    none_is_left(daemon, PEOPLE.name)
+    wait_until_none_left(daemon, PEOPLE.name)
 }
 
-/// That is an answer, and robots are given servants as before.
-fn too_little_memory(daemon: &Daemon, recordings: &Recordings, plot: &str) -> Verdict {
+/// Checks that too little memory is a result, and that robots still get servants afterwards.
+fn evaluate_with_little_memory(
+    daemon: &Daemon,
+    recordings: &RobotRecordings,
+    plot: &str,
+) -> Verdict {
     let words = ["--requests", "12", "--robot-memory", "24M", "--plot", plot];
-    let found = evaluates(daemon, &recordings.of("people"), &words)?;
+    let found = evaluate(daemon, &recordings.path("people"), &words)?;
     let told = found["native"]["out_of_memory"]
         .as_str()
         .unwrap_or_default();
     ensure!(
-        told.contains("needs more than 24M of memory: the kernel has ended it"),
+        told.contains("needs more than 24M of memory: the kernel killed it"),
         "{found:#}"
     );
     let verdict = found["verdict"].as_str().unwrap_or_default();
     ensure!(verdict.starts_with("only outsourced: "), "{verdict}");
     ensure!(found["sla"]["has_local"] == false, "{found:#}");
-    // Where nobody names cores, no robot is promised all of the machine's.
+    // By default no robot is promised all cores of the machine.
     ensure!(found["outsourced"]["cpus"] == 1.0, "{found:#}");
     ensure!(found["sla"]["row"]["limits"]["cpus"] == 1.0, "{found:#}");
-    none_is_left(daemon, PEOPLE.name)?;
+    wait_until_none_left(daemon, PEOPLE.name)?;
     let status = daemon.api("/api/v1/status")?;
     let failing = status["back_offs"].as_array();
     ensure!(failing.is_none_or(Vec::is_empty), "{status:#}");
-    // For people.
-    let bag = recordings.of("people");
+    // Output for people.
+    let bag = recordings.path("people");
     let shown = daemon
         .deployer()
-        .types(
+        .run(
             &[
                 &["eval", PEOPLE.name, "--bag", path_str(&bag), "--fast"],
                 &words[..],
             ]
             .concat(),
         )?
-        .succeeded()?;
+        .expect_success()?;
     for words in [
         "out of memory",
         "answer: /",
         "local = \"none\"",
         "nothing was written; --yes",
     ] {
-        ensure!(shown.stdout.contains(words), "{words}: {}", shown.said());
+        ensure!(shown.stdout.contains(words), "{words}: {}", shown.output());
     }
     Ok(())
 }
 
-/// Over TCP, with a token of the role that calibrates; at the recording's own pace.
+/// Checks an evaluation over TCP with a token of the role that may calibrate, at the recording's own rate.
 fn deployers_evaluate_what_is_theirs(
     daemon: &Daemon,
-    recordings: &Recordings,
+    recordings: &RobotRecordings,
     plot: &str,
 ) -> Verdict {
     let named = ["theirs", "--role", "deployer", "--service", TELLER.name];
-    let token = access::token(daemon, &named)?;
+    let token = access::create_token(daemon, &named)?;
     let package = binaries::package("teller_py");
     let pushed = [&["push", path_str(&package)], TELLER.arguments].concat();
-    access::with_token(daemon, &token, &pushed)?.succeeded()?;
-    let bag = recordings.of("words");
+    access::run_with_token(daemon, &token, &pushed)?.expect_success()?;
+    let bag = recordings.path("words");
     let words = ["eval", TELLER.name, "--requests", "10", "--plot", plot];
     let words = [&words[..], &["--bag", path_str(&bag)]].concat();
-    let outcome = access::with_token(daemon, &token, &words)?.succeeded()?;
+    let outcome = access::run_with_token(daemon, &token, &words)?.expect_success()?;
     for words in [
         "10 of 10",
-        "/chatter of the recording went to /teller/say",
+        "/chatter of the recording was sent to /teller/say",
         "without a codec",
     ] {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     // It may be faster without a network, and then nothing is suggested.
-    let suggested = "in stub.toml (desire is what 95 % of 10 outsourced requests took";
+    let suggested = "in stub.toml (desire is p95 of 10 outsourced requests";
     let is_suggested = outcome.stdout.contains(suggested);
     ensure!(
         is_suggested != outcome.stdout.contains("it is faster on the robot"),
         "{}",
-        outcome.said()
+        outcome.output()
     );
-    none_is_left(daemon, TELLER.name)
+    wait_until_none_left(daemon, TELLER.name)
 }
 
 pub fn what_cannot_be_evaluated_is_said() -> Verdict {
-    let daemon = world().own("unevaluated").start()?;
+    let daemon = world().setup("unevaluated").start()?;
     for service in [ADDER, TELLER] {
         let package = service.package.context("a package")?;
         daemon
             .deployer()
-            .pushes(package, service.arguments)?
-            .succeeded()?;
+            .push(package, service.arguments)?
+            .expect_success()?;
     }
-    let recordings = Recordings::new()?;
+    let recordings = RobotRecordings::new()?;
     let place = world().directory("unevaluated")?;
     let plot = place.path().join("plot.svg");
     let refused = |service: &str, bag: &Path, more: &[&str], saying: &[&str]| {
@@ -313,10 +317,10 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
             "--plot",
             path_str(&plot),
         ];
-        let outcome = daemon.deployer().types(&[&words, more].concat())?;
-        outcome.failed_saying(saying)
+        let outcome = daemon.deployer().run(&[&words, more].concat())?;
+        outcome.expect_failure(saying)
     };
-    let words = recordings.of("words");
+    let words = recordings.path("words");
     let nowhere = place.path().join("nowhere.bag");
     refused(TELLER.name, &nowhere, &[], &["cannot read", "nowhere.bag"])?;
     let text = place.path().join("text.bag");
@@ -325,12 +329,12 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
         TELLER.name,
         &text,
         &[],
-        &["text.bag cannot be replayed", "no rosbag file"],
+        &["text.bag cannot be replayed", "not a rosbag file"],
     )?;
     let empty = place.path().join("empty.bag");
     std::fs::write(&empty, "")?;
     refused(TELLER.name, &empty, &[], &["the file is empty"])?;
-    let other = recordings.of("other");
+    let other = recordings.path("other");
     refused(
         TELLER.name,
         &other,
@@ -344,7 +348,7 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
         &output,
         &["has no output /nothing; its outputs are: "],
     )?;
-    let people = recordings.of("people");
+    let people = recordings.path("people");
     let saying = [
         "(it has /camera)",
         "its inputs are: ",
@@ -353,43 +357,39 @@ pub fn what_cannot_be_evaluated_is_said() -> Verdict {
     refused(TELLER.name, &people, &[], &saying)?;
     let saying = [
         "unheard_of",
-        "there are: ",
+        "available: ",
         TELLER.name,
         "cloudroidctl push",
     ];
     refused("unheard_of", &words, &[], &saying)?;
-    named_as_a_directory(&daemon, place.path(), &people)?;
+    expect_directory_name_errors(&daemon, place.path(), &people)?;
     let directory = binaries::package("teller_py");
     let saying = ["is a directory", "cloudroidctl push"];
     refused(path_str(&directory), &words, &[], &saying)?;
-    let saying = [
-        "/add_two",
-        "a recording holds messages of topics alone",
-        "explain",
-    ];
+    let saying = ["/add_two", "a recording has topic messages only", "explain"];
     refused(ADDER.name, &words, &[], &saying)?;
     refused(
         TELLER.name,
         &words,
         &["--robot-cpus", "0"],
-        &["--robot-cpus", "between 0.01 and 4096"],
+        &["--robot-cpus", "expected 0.01 to 4096"],
     )?;
     refused(TELLER.name, &words, &["--robot-memory", "64T"], &["64T"])?;
     refused(
         TELLER.name,
         &words,
         &["--cpus", "4000"],
-        &["--cpus 4000 cannot be measured", "4000 cores"],
+        &["--cpus 4000 can never be measured", "4000 cores"],
     )?;
-    // Its node ends at the first request.
+    // Its node exits at the first request.
     let saying = [TELLER.name, "exited with status 0"];
-    refused(TELLER.name, &recordings.of("end"), &[], &saying)?;
-    none_is_left(&daemon, TELLER.name)?;
-    interrupted(&daemon, &words, &plot)
+    refused(TELLER.name, &recordings.path("end"), &[], &saying)?;
+    wait_until_none_left(&daemon, TELLER.name)?;
+    expect_interruptible(&daemon, &words, &plot)
 }
 
-/// Services that have the names of directories where the command is typed.
-fn named_as_a_directory(daemon: &Daemon, place: &Path, bag: &Path) -> Verdict {
+/// Checks errors for services with the names of directories in the working directory.
+fn expect_directory_name_errors(daemon: &Daemon, place: &Path, bag: &Path) -> Verdict {
     for (name, saying) in [
         (TELLER.name, "(it has /camera)"),
         ("unheard_of", "unheard_of is a directory here"),
@@ -400,13 +400,13 @@ fn named_as_a_directory(daemon: &Daemon, place: &Path, bag: &Path) -> Verdict {
             .env("CLOUDROID_HOME", &daemon.home)
             .env_remove("CLOUDROID_SERVER")
             .args(["eval", name, "--bag", path_str(bag)]))?;
-        outcome.failed_saying(&[saying])?;
+        outcome.expect_failure(&[saying])?;
     }
     Ok(())
 }
 
-/// Nobody waits for the rest.
-fn interrupted(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
+/// Checks that Ctrl-C ends an evaluation early.
+fn expect_interruptible(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
     let going = Command::new(binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home)
         .env_remove("CLOUDROID_SERVER")
@@ -417,8 +417,8 @@ fn interrupted(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()?;
-    let seen = support::until("a servant that is measured", || {
-        let found = crate::calibration::measured(daemon, TELLER.name)?;
+    let seen = support::wait_until("a servant that is measured", || {
+        let found = crate::calibration::measured_servants(daemon, TELLER.name)?;
         Ok(found
             .iter()
             .any(|servant| servant["phase"] == "ready")
@@ -434,5 +434,5 @@ fn interrupted(daemon: &Daemon, bag: &Path, plot: &Path) -> Verdict {
         "{said}"
     );
     ensure!(!plot.exists(), "it drew what was not measured");
-    none_is_left(daemon, TELLER.name)
+    wait_until_none_left(daemon, TELLER.name)
 }

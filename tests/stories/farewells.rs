@@ -1,4 +1,4 @@
-//! A stub that is told to end, while what it stands for cannot be told.
+//! A stub that is asked to end while the server cannot be reached.
 
 use std::time::Duration;
 
@@ -11,10 +11,10 @@ use support::patience::Deadline;
 use support::site::Site;
 use support::world::{ADDER, HERALD, world};
 
-/// After which launch sends another signal, and this stub would end by that; where nothing else runs.
+/// Time after which launch sends another signal, which would kill this stub; on an idle machine.
 const LAUNCH: Duration = Duration::from_secs(5);
 
-/// With a T_max so long that the link itself would notice nothing for as long.
+/// With a T_max so long that the link does not notice anything before.
 const PATIENT: &str = "local = \"none\"\ndesire = 30.0\nmax = 60.0\n";
 
 pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> Verdict {
@@ -22,13 +22,13 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
         RosVersion::One => (ADDER, "adder.py", "/sums"),
         RosVersion::Two => (HERALD, "herald", "/greeting"),
     };
-    let setup = world().own(&format!("farewells-{}", ros.number()));
+    let setup = world().setup(&format!("farewells-{}", ros.number()));
     let daemon = setup.start()?;
     let package = service.package.context("one of ours")?;
-    let push = daemon.deployer().pushes(package, service.arguments)?;
-    push.succeeded()?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
+    let push = daemon.deployer().push(package, service.arguments)?;
+    push.expect_success()?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
     let pid = Pid::from_raw(daemon.pid());
     let begins = |robot: &str| {
         let toml = format!(
@@ -39,32 +39,32 @@ pub fn a_stub_ends_beside_a_daemon_that_is_frozen_or_killed(ros: RosVersion) -> 
             RosVersion::One => service.name,
             RosVersion::Two => "herald",
         };
-        let stub = site.stub_with(&toml, package, executable, &[])?;
-        site.until(&app, topic, |graph| graph.topics.contains_key(topic))
-            .with_context(|| stub.said())?;
+        let stub = site.start_stub_with_config(&toml, package, executable, &[])?;
+        site.wait_for_graph(&app, topic, |graph| graph.topics.contains_key(topic))
+            .with_context(|| stub.output())?;
         anyhow::Ok(stub)
     };
     let mut stub = begins("frozen")?;
     kill(pid, Signal::SIGSTOP)?;
     let deadline = Deadline::begin_for(LAUNCH);
     stub.signal(Signal::SIGTERM)?;
-    let ended = stub.ends();
+    let ended = stub.wait_for_exit();
     let is_late = deadline.is_over();
     kill(pid, Signal::SIGCONT)?;
     ended?;
-    ensure!(!is_late, "{}", stub.said());
-    site.until(&app, "nothing of it", |graph| {
+    ensure!(!is_late, "{}", stub.output());
+    site.wait_for_graph(&app, "nothing of it", |graph| {
         !graph.topics.contains_key(topic)
     })?;
     let mut stub = begins("killed")?;
-    daemon.is_killed()?;
+    daemon.kill()?;
     let deadline = Deadline::begin_for(LAUNCH);
     stub.signal(Signal::SIGTERM)?;
-    stub.ends()?;
+    stub.wait_for_exit()?;
     let is_late = deadline.is_over();
-    ensure!(!is_late, "{}", stub.said());
+    ensure!(!is_late, "{}", stub.output());
     let daemon = setup.start()?;
-    daemon.deployer().types(&["stop", "--all"])?;
-    daemon.ends()?;
+    daemon.deployer().run(&["stop", "--all"])?;
+    daemon.stop()?;
     Ok(())
 }

@@ -1,65 +1,67 @@
-//! Actions: carried out in the cloud, cancelled, and carried out by the original on the robot while the cloud is slow.
+//! Actions: executed in the cloud, cancelled, and executed by the original on the robot while the cloud is slow.
 
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, Outcome, RosVersion};
+use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, GoalOutcome, RosVersion};
 use support::Verdict;
-use support::cable::{Badness, Cable};
+use support::cable::{Cable, NetworkImpairment};
 use support::cutter::Cutter;
-use support::layout::Layout;
+use support::layout::MessageLayout;
 use support::patience::{Deadline, patience};
-use support::site::{Running, Site};
-use support::world::{Service, world};
+use support::site::{NodeProcess, Site};
+use support::world::{StoryService, world};
 
-use crate::crossing::{HOUR, argv, crossing, is_there, robot_of, service, types_of, with_log};
+use crate::crossing::{
+    HOUR, argv, crossing, message_types_for, robot_name, service, wait_until_ready, with_log,
+};
 
 const ACTION: &str = "/crossing/act";
 
-/// What came of a goal.
+/// Feedback and end of a goal.
 #[derive(Default)]
-struct Goal {
+struct GoalRecord {
     steps: Mutex<Vec<i32>>,
     end: Mutex<Option<Result<GoalEnd, String>>>,
 }
 
-impl GoalEvents for Goal {
-    fn feedback(&self, feedback: Bytes) {
-        self.steps.lock().extend(number(&feedback));
+impl GoalEvents for GoalRecord {
+    fn on_feedback(&self, feedback: Bytes) {
+        self.steps.lock().extend(last_number(&feedback));
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         *self.end.lock() = Some(end);
     }
 }
 
-/// Feedback and results end with a number.
-fn number(message: &[u8]) -> Option<i32> {
+/// Returns the number at the end of a feedback or result.
+fn last_number(message: &[u8]) -> Option<i32> {
     Some(i32::from_le_bytes(*message.last_chunk()?))
 }
 
 /// An application that sends goals to the crossing node of a stub.
-struct Sender<'a> {
+struct GoalApplication<'a> {
     client: Box<dyn ActionClient>,
     ros: RosVersion,
     site: &'a Site,
-    stub: &'a Running,
+    stub: &'a NodeProcess,
 }
 
-impl<'a> Sender<'a> {
-    fn new(site: &'a Site, app: &Arc<dyn Bus>, stub: &'a Running) -> anyhow::Result<Self> {
+impl<'a> GoalApplication<'a> {
+    fn new(site: &'a Site, app: &Arc<dyn Bus>, stub: &'a NodeProcess) -> anyhow::Result<Self> {
         let ros = site.system.version();
         let action = match ros {
             RosVersion::One => "actionlib/Test",
             RosVersion::Two => "test_msgs/action/Fibonacci",
         };
         let _runtime = site.runtime.enter();
-        let client = app.action_client(ACTION, &types_of(ros)?.action(action)?)?;
+        let client = app.action_client(ACTION, &message_types_for(ros)?.action(action)?)?;
         with_log(
             site.runtime
-                .block_on(client.ready(patience()))
+                .block_on(client.wait_for_server(patience()))
                 .map_err(Into::into),
             stub,
         )?;
@@ -71,37 +73,39 @@ impl<'a> Sender<'a> {
         })
     }
 
-    fn sends(&self, id: &str, steps: u32) -> Arc<Goal> {
+    fn send(&self, id: &str, steps: u32) -> Arc<GoalRecord> {
         let _runtime = self.site.runtime.enter();
-        let goal = Arc::new(Goal::default());
+        let goal = Arc::new(GoalRecord::default());
         let events = Arc::clone(&goal);
         self.client
-            .send(id, Layout::of(self.ros).u32(steps).finish(), events);
+            .send_goal(id, MessageLayout::new(self.ros).u32(steps).finish(), events);
         goal
     }
 
-    /// Waits until the goal has got on so far.
-    fn steps(&self, goal: &Goal, count: usize) -> anyhow::Result<Vec<i32>> {
-        let steps = support::until(&format!("{count} steps"), || {
+    /// Waits until a goal has sent `count` feedbacks.
+    fn wait_for_steps(&self, goal: &GoalRecord, count: usize) -> anyhow::Result<Vec<i32>> {
+        let steps = support::wait_until(&format!("{count} steps"), || {
             let steps = goal.steps.lock().clone();
-            Ok(match steps.len() >= count {
-                true => Ok(steps),
-                false => Err(format!("{steps:?}")),
+            Ok(if steps.len() >= count {
+                Ok(steps)
+            } else {
+                Err(format!("{steps:?}"))
             })
         });
         with_log(steps, self.stub)
     }
 
-    /// Sends goals of so many steps until all steps of one were told; how many goals that took. A result may overtake the last steps,
-    /// since it comes by a connection of its own, and who has the result hears of no more steps.
-    fn tells_all_steps(&self, id: &str, count: u32) -> anyhow::Result<usize> {
+    /// Sends goals with `count` steps until all steps of one were reported; returns the number of goals. A result may
+    /// overtake the last steps, because it arrives on a connection of its own, and a client with a result gets no
+    /// further steps.
+    fn send_until_all_steps(&self, id: &str, count: u32) -> anyhow::Result<usize> {
         let all: Vec<i32> = (0..i32::try_from(count)?).collect();
         let mut sent = 0;
-        support::until("all steps of a goal", || {
+        support::wait_until("all steps of a goal", || {
             sent += 1;
-            let goal = self.sends(&format!("{id}-{sent}"), count);
-            let end = self.ends(&goal)?;
-            let whole = end == (Outcome::Succeeded, i32::try_from(count)?);
+            let goal = self.send(&format!("{id}-{sent}"), count);
+            let end = self.wait_for_end(&goal)?;
+            let whole = end == (GoalOutcome::Succeeded, i32::try_from(count)?);
             let steps = goal.steps.lock().clone();
             ensure!(whole && all.starts_with(&steps), "{end:?} after {steps:?}");
             Ok((steps == all)
@@ -111,38 +115,38 @@ impl<'a> Sender<'a> {
         Ok(sent)
     }
 
-    /// Waits for its end: how it came about, and the number of its result.
-    fn ends(&self, goal: &Goal) -> anyhow::Result<(Outcome, i32)> {
-        let end = support::until("the end of a goal", || {
+    /// Waits for the end of a goal; returns the outcome and the number in its result.
+    fn wait_for_end(&self, goal: &GoalRecord) -> anyhow::Result<(GoalOutcome, i32)> {
+        let end = support::wait_until("the end of a goal", || {
             let end = goal.end.lock().clone();
             Ok(end.ok_or_else(|| format!("{:?}", goal.steps.lock())))
         });
         let end = with_log(end, self.stub)?;
         let end = with_log(end.map_err(anyhow::Error::msg), self.stub)?;
-        Ok((end.outcome, number(&end.result).context("a number")?))
+        Ok((end.outcome, last_number(&end.result).context("a number")?))
     }
 }
 
 pub fn an_action_is_carried_out_in_the_cloud(ros: RosVersion) -> Verdict {
-    let daemon = world().with(service(ros).0)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = robot_of(ros, "action");
+    let daemon = world().daemon_with(service(ros).0)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = robot_name(ros, "action");
     let stub = crossing(&site, &daemon.address, &robot, HOUR, "")?;
-    with_log(is_there(&site, &app), &stub)?;
-    let sender = Sender::new(&site, &app, &stub)?;
+    with_log(wait_until_ready(&site, &app), &stub)?;
+    let sender = GoalApplication::new(&site, &app, &stub)?;
     // header { seq, stamp … } · … in ROS 1; in ROS 2 the states of all goals: uuid, stamp, state of each.
     let (topic, stamp) = match ros {
         RosVersion::One => ("result", 4),
         RosVersion::Two => ("_action/status", 4 + 4 + 16),
     };
-    let mut stamped = site.hears_latched(&app, &format!("{ACTION}/{topic}"))?;
-    site.fed(&stamped, 1)?;
-    sender.tells_all_steps("three", 3)?;
-    // What the node stamps is the robot's time.
+    let mut stamped = site.subscribe_latched(&app, &format!("{ACTION}/{topic}"))?;
+    site.wait_for_publishers(&stamped, 1)?;
+    sender.send_until_all_steps("three", 3)?;
+    // Stamps of the node are in the robot's time.
     let now = link::clock::now() / 1_000_000_000 + HOUR;
     let seconds = loop {
-        let told = with_log(site.next(&mut stamped), &stub)?;
+        let told = with_log(site.next_message(&mut stamped), &stub)?;
         if let Some(word) = told.bytes.get(stamp..stamp + 4) {
             break i64::from(u32::from_le_bytes(word.try_into()?));
         }
@@ -151,53 +155,54 @@ pub fn an_action_is_carried_out_in_the_cloud(ros: RosVersion) -> Verdict {
         seconds.abs_diff(now) < HOUR.unsigned_abs() / 2,
         "{seconds} is not about {now}"
     );
-    // One without end is cancelled once it is under way.
-    let long = sender.sends("long", 1_000_000);
-    sender.steps(&long, 1)?;
-    sender.client.cancel("long");
-    let (outcome, steps) = sender.ends(&long)?;
-    ensure!(outcome == Outcome::Canceled && steps < 0, "{steps}");
+    // A goal that never ends is cancelled while it is in progress.
+    let long = sender.send("long", 1_000_000);
+    sender.wait_for_steps(&long, 1)?;
+    sender.client.cancel_goal("long");
+    let (outcome, steps) = sender.wait_for_end(&long)?;
+    ensure!(outcome == GoalOutcome::Canceled && steps < 0, "{steps}");
     Ok(())
 }
 
-/// How often the link is cut, and the longest stretch between two cuts, bytes: one or two goals.
+/// Number of cuts of the link, and maximum number of bytes between two: one or two goals.
 const CUTS: usize = 20;
 const STRETCH: usize = 6_000;
 
 pub fn a_goal_is_carried_out_once_however_often_the_link_is_cut(ros: RosVersion) -> Verdict {
     const STEPS: u32 = 5;
-    let daemon = world().with(service(ros).0)?;
+    let daemon = world().daemon_with(service(ros).0)?;
     let cutter = Cutter::new(&daemon.address, CUTS, STRETCH, 0x90a1)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = robot_of(ros, "cut-goals");
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = robot_name(ros, "cut-goals");
     let stub = crossing(&site, &cutter.server.to_string(), &robot, 0, "")?;
-    with_log(is_there(&site, &app), &stub)?;
-    let sender = Sender::new(&site, &app, &stub)?;
+    with_log(wait_until_ready(&site, &app), &stub)?;
+    let sender = GoalApplication::new(&site, &app, &stub)?;
     cutter.begin();
     let mut goals = Vec::new();
     while cutter.cuts() < CUTS {
-        let goal = sender.sends(&format!("goal-{}", goals.len()), STEPS);
-        let end = sender.ends(&goal)?;
+        let goal = sender.send(&format!("goal-{}", goals.len()), STEPS);
+        let end = sender.wait_for_end(&goal)?;
         let steps = i32::try_from(STEPS)?;
-        ensure!(end == (Outcome::Succeeded, steps), "{end:?}");
+        ensure!(end == (GoalOutcome::Succeeded, steps), "{end:?}");
         goals.push(goal);
     }
-    // What was said of earlier goals has come before this.
-    sender.ends(&sender.sends("last", 0))?;
+    // Messages about earlier goals have arrived before this result.
+    sender.wait_for_end(&sender.send("last", 0))?;
     let all: Vec<i32> = (0..i32::try_from(STEPS)?).collect();
     for (number, goal) in goals.iter().enumerate() {
-        // Nothing is told twice or left out; a result may overtake the last steps, since it comes by a connection of its own.
+        // No step is reported twice or left out; a result may overtake the last steps, because it arrives on a
+        // connection of its own.
         let steps = goal.steps.lock().clone();
-        let told = format!("{steps:?} of goal {number}\n{}", stub.said());
+        let told = format!("{steps:?} of goal {number}\n{}", stub.output());
         ensure!(all.starts_with(&steps), told);
     }
     println!("{CUTS} cuts: {} goals", goals.len());
     Ok(())
 }
 
-/// A network over which nothing comes in time.
-const LATE: Badness = Badness {
+/// A network on which nothing arrives in time.
+const LATE: NetworkImpairment = NetworkImpairment {
     rate: 100_000,
     delay: 15_000,
     jitter: 0,
@@ -209,18 +214,18 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
     ros: RosVersion,
 ) -> Verdict {
     let (crossing, executable) = service(ros);
-    let daemon = world().with(crossing)?;
+    let daemon = world().daemon_with(crossing)?;
     let cable = Cable::new(&daemon.address)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let Service { name, .. } = crossing;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let StoryService { name, .. } = crossing;
     let program = format!("/opt/cloudroid/install/lib/{name}/{executable}");
-    let workspace = site.installs_original(&daemon, name, (name, executable), &program)?;
+    let workspace = site.install_original(&daemon, name, (name, executable), &program)?;
     let toml = format!(
         "server = \"ws://{}\"\nservice = \"{name}\"\nrobot = \"{}\"\nlocal = \"cold\"\n\
          desire = 5.0\nmax = 5.0\nthreshold = 4.0\ninitial = 15.0\n",
         cable.server,
-        robot_of(ros, "late-action")
+        robot_name(ros, "late-action")
     );
     let workspace = workspace.to_string_lossy();
     let workspaces = match ros {
@@ -228,53 +233,54 @@ pub fn an_action_is_carried_out_by_the_original_while_the_cloud_is_slow(
         RosVersion::Two => "AMENT_PREFIX_PATH",
     };
     let environment = [(workspaces, &*workspace), ("NO_COLOR", "1")];
-    let stub = site.stub_among(&environment, &toml, name, executable, argv(ros))?;
-    with_log(is_there(&site, &app), &stub)?;
-    let sender = Sender::new(&site, &app, &stub)?;
-    // Results are a topic in ROS 1: two of a goal would be seen there.
+    let stub =
+        site.start_stub_with_environment(&environment, &toml, name, executable, argv(ros))?;
+    with_log(wait_until_ready(&site, &app), &stub)?;
+    let sender = GoalApplication::new(&site, &app, &stub)?;
+    // In ROS 1 results are published on a topic: two for one goal would be visible.
     let mut results = match ros {
-        RosVersion::One => Some(site.hears(&app, &format!("{ACTION}/result"))?),
+        RosVersion::One => Some(site.subscribe(&app, &format!("{ACTION}/result"))?),
         RosVersion::Two => None,
     };
-    let ends = |goal: &Goal, steps: i32| -> Verdict {
-        let end = sender.ends(goal)?;
-        let whole = end == (Outcome::Succeeded, steps);
-        ensure!(whole, "{end:?} after {steps} steps\n{}", stub.said());
+    let ends = |goal: &GoalRecord, steps: i32| -> Verdict {
+        let end = sender.wait_for_end(goal)?;
+        let whole = end == (GoalOutcome::Succeeded, steps);
+        ensure!(whole, "{end:?} after {steps} steps\n{}", stub.output());
         Ok(())
     };
-    ends(&sender.sends("quick", 2), 2)?;
+    ends(&sender.send("quick", 2), 2)?;
     cable.degrade(LATE)?;
-    // Two that are late, and it is started; it carries them out as well.
-    let late = ["late-1", "late-2"].map(|id| sender.sends(id, 1));
-    stub.says("the local original answers, too")?;
-    // Both come to it at once, and a simple action server of ROS 1 carries out the newest.
+    // Two late goals start the original, which executes them as well.
+    let late = ["late-1", "late-2"].map(|id| sender.send(id, 1));
+    stub.wait_for_output("the local original answers, too")?;
+    // Both arrive at the original at once, and a simple action server of ROS 1 executes the newest.
     let [first, second] = &late;
-    let end = sender.ends(first)?;
-    let is_preempted = ros == RosVersion::One && end.0 == Outcome::Canceled;
+    let end = sender.wait_for_end(first)?;
+    let is_preempted = ros == RosVersion::One && end.0 == GoalOutcome::Canceled;
     ensure!(
-        is_preempted || end == (Outcome::Succeeded, 1),
+        is_preempted || end == (GoalOutcome::Succeeded, 1),
         "{end:?}\n{}",
-        stub.said()
+        stub.output()
     );
     ends(second, 1)?;
-    // Whoever is first with a goal's feedback goes on with it.
-    let told = sender.tells_all_steps("steps", 3);
-    let told = told.with_context(|| stub.said())?;
-    ensure!(!stub.said().contains("is stopped"), "{}", stub.said());
+    // The first side to send feedback for a goal continues to send it.
+    let told = sender.send_until_all_steps("steps", 3);
+    let told = told.with_context(|| stub.output())?;
+    ensure!(!stub.output().contains("is stopped"), "{}", stub.output());
     cable.restore()?;
     let deadline = Deadline::begin();
     let mut asked = 0;
-    while !stub.said().contains("the local original is stopped") {
-        deadline.check(|| stub.said())?;
+    while !stub.output().contains("the local original is stopped") {
+        deadline.check(|| stub.output())?;
         asked += 1;
-        ends(&sender.sends(&format!("good-{asked}."), 0), 0)?;
+        ends(&sender.send(&format!("good-{asked}."), 0), 0)?;
     }
-    // What the cloud still owed has come before this.
-    ends(&sender.sends("last", 1), 1)?;
+    // All earlier messages of the cloud have arrived before this result.
+    ends(&sender.send("last", 1), 1)?;
     if let Some(results) = &mut results {
         let mut times = Vec::new();
         while times.last() != Some(&"last".to_owned()) {
-            let result = with_log(site.next(results), &stub)?;
+            let result = with_log(site.next_message(results), &stub)?;
             // header { seq, stamp, frame } · status { goal_id { stamp, id … } }
             let word = |at: usize| -> anyhow::Result<usize> {
                 let word = result.bytes.get(at..at + 4).context("too short")?;

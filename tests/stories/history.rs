@@ -1,23 +1,23 @@
-//! What servants and the machine did, asked for later.
+//! History of servants and the machine.
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::world::world;
 
-use crate::access::token;
+use crate::access::create_token;
 
 pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
-    let setup = world().own("history");
+    let setup = world().setup("history");
     let daemon = setup.start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=r1&rrt=100ms&max_rrt=2s")?;
-    // Requests again and again: a sample tells of the ten seconds before it.
-    let history = support::until("a sample with response times", || {
-        let sum = robot.calls("/add_two", json!({"a": 2, "b": 3}))?;
+    // Repeated calls, because a sample covers the ten seconds before it.
+    let history = support::wait_until("a sample with response times", || {
+        let sum = robot.call("/add_two", json!({"a": 2, "b": 3}))?;
         ensure!(sum["values"]["sum"] == 5, "{sum}");
         let history = daemon.api("/api/v1/history/servants?robot=r1&step=10")?;
         let answered = history[0]["figures"]["p50"]
@@ -53,11 +53,14 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
         "{machine:#}"
     );
 
-    // Killed, and started again: what was, is still told, and of a servant that has ended as well.
-    robot.leaves()?;
-    daemon.is_killed()?;
+    // After a kill and restart the history is still available, also for a servant that has ended.
+    robot.leave()?;
+    daemon.kill()?;
     let daemon = setup.start()?;
-    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+    daemon
+        .deployer()
+        .run(&["stop", "--all"])?
+        .expect_success()?;
     ensure!(daemon.servants_of("adder_py")?.is_empty());
     let id = one["servant"].as_str().context("an id")?;
     let later = daemon.api(&format!("/api/v1/history/servants?servant={id}&step=10"))?;
@@ -72,13 +75,13 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
     ))?;
     ensure!(none[0]["figures"]["time"] == json!([]), "{none:#}");
 
-    // Each sees what it may.
+    // Principals see the history that they may see.
     let viewer = ["looks", "--role", "viewer", "--service", "adder*"];
-    let viewer = token(&daemon, &viewer)?;
+    let viewer = create_token(&daemon, &viewer)?;
     let stranger = ["far", "--role", "viewer", "--service", "other*"];
-    let stranger = token(&daemon, &stranger)?;
+    let stranger = create_token(&daemon, &stranger)?;
     let another = ["r2", "--role", "robot", "--robot", "r2", "--service", "*"];
-    let another = token(&daemon, &another)?;
+    let another = create_token(&daemon, &another)?;
     for (token, count) in [(viewer, 1), (stranger, 0), (another, 0)] {
         let bearer = format!("Bearer {token}");
         let asks = |path: &str| daemon.request("GET", path, &[("Authorization", &bearer)]);
@@ -90,8 +93,8 @@ pub fn what_servants_did_outlives_them_and_the_daemon() -> Verdict {
         let (status, body) = asks("/api/v1/history/machine")?;
         ensure!(status == 403, "{status} {body}");
     }
-    // What is asked badly is refused by name.
-    let admin = token(&daemon, &["boss", "--role", "admin"])?;
+    // Invalid requests are refused with the name of the error.
+    let admin = create_token(&daemon, &["boss", "--role", "admin"])?;
     let bearer = format!("Bearer {admin}");
     for (asked, words) in [
         ("step=7", "step=10"),

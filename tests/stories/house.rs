@@ -1,4 +1,4 @@
-//! The daemon as a lodger of its machine.
+//! The daemon and the rest of its machine.
 
 use std::fs::Permissions;
 use std::net::TcpListener;
@@ -16,9 +16,9 @@ use support::world::{PEOPLE, SEER, world};
 use support::{Verdict, binaries, leftovers};
 
 pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
-    let setup = world().own("one");
+    let setup = world().setup("one");
     let daemon = setup.start()?;
-    let said = setup.refuses_to_start()?;
+    let said = setup.expect_refusal()?;
     ensure!(
         said.contains(&daemon.pid().to_string()),
         "the first is named: {said}"
@@ -27,15 +27,16 @@ pub fn a_second_daemon_on_the_same_home_is_refused() -> Verdict {
     Ok(())
 }
 
-/// What below a home others may read, write or enter, but for what layers hold: that has the rights of its image.
-fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Verdict {
+/// Finds everything below a home that other users may read, write or enter, except the content of layers, which has the
+/// permissions of its image.
+fn find_open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Verdict {
     let about = match path.symlink_metadata() {
         // Servants come and go.
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
         about => about?,
     };
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    // The story's own.
+    // These files belong to the story.
     if about.is_symlink() || ["daemon.log", "test-config.toml"].contains(&&*name) {
         return Ok(());
     }
@@ -45,20 +46,20 @@ fn open_to_others(path: &Path, found: &mut Vec<PathBuf>) -> Verdict {
     }
     if about.is_dir() && !root_of_servant && name != "layers" {
         for entry in std::fs::read_dir(path).into_iter().flatten() {
-            open_to_others(&entry?.path(), found)?;
+            find_open_to_others(&entry?.path(), found)?;
         }
     }
     Ok(())
 }
 
-fn is_closed(home: &Path) -> Verdict {
+fn expect_closed(home: &Path) -> Verdict {
     let mut found = Vec::new();
-    open_to_others(home, &mut found)?;
+    find_open_to_others(home, &mut found)?;
     ensure!(found.is_empty(), "open to others: {found:#?}");
     Ok(())
 }
 
-/// As earlier versions left it.
+/// Restores the permissions of earlier versions.
 fn open_up(path: &Path) -> Verdict {
     let about = path.symlink_metadata()?;
     if about.is_symlink()
@@ -79,20 +80,20 @@ fn open_up(path: &Path) -> Verdict {
 }
 
 pub fn the_state_is_closed_to_others() -> Verdict {
-    let setup = world().own("closed");
+    let setup = world().setup("closed");
     let daemon = setup.start()?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let adds = |daemon: &Daemon| -> Verdict {
         let mut robot = daemon.robot("adder_py?robot=r1")?;
-        let answer = robot.calls("/add_two", json!({"a": 1, "b": 2}))?;
+        let answer = robot.call("/add_two", json!({"a": 1, "b": 2}))?;
         ensure!(answer["values"]["sum"] == 3, "{answer}");
-        is_closed(&daemon.home)
+        expect_closed(&daemon.home)
     };
     adds(&daemon)?;
-    // Nobody else can hold what servants' user ids are counted by.
+    // Other users cannot lock the ranges of user ids.
     let held = Command::new("flock")
         .args([
             "--shared",
@@ -109,19 +110,19 @@ pub fn the_state_is_closed_to_others() -> Verdict {
         "{said}"
     );
     let home = daemon.home.clone();
-    daemon.ends()?;
+    daemon.stop()?;
     open_up(&home)?;
     let daemon = setup.start()?;
-    is_closed(&home)?;
+    expect_closed(&home)?;
     adds(&daemon)
 }
 
 pub fn a_taken_port_is_named() -> Verdict {
-    let daemon = world().own("port-owner").start()?;
+    let daemon = world().setup("port-owner").start()?;
     let said = world()
-        .own("port-wanter")
+        .setup("port-wanter")
         .listen(&daemon.address)
-        .refuses_to_start()?;
+        .expect_refusal()?;
     ensure!(
         said.contains(&daemon.address) && said.contains("--listen"),
         "{said}"
@@ -134,8 +135,8 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing(ros: RosVersion) -> Verdict {
         RosVersion::One => (PEOPLE, "people found", "people.png"),
         RosVersion::Two => (SEER, "14 of 14 pictures answered as recorded", "board.png"),
     };
-    // The demo's daemon finds in the cache what the shared one has fetched for its base.
-    world().with(service)?;
+    // The demo's daemon finds in the cache what the shared daemon has fetched for its base.
+    world().daemon_with(service)?;
     let home = world().home(&format!("demo{}", ros.number()));
     let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
     let binaries = binaries::path("cloudroidd")
@@ -148,17 +149,17 @@ pub fn the_demo_ends_by_itself_and_leaves_nothing(ros: RosVersion) -> Verdict {
         .env("ROS", ros.number().to_string())
         .env("CLOUDROID_HOME", &home)
         .env("CLOUDROID_LISTEN", format!("127.0.0.1:{port}")))?
-    .succeeded()?;
-    ensure!(outcome.stdout.contains(answered), "{}", outcome.said());
+    .expect_success()?;
+    ensure!(outcome.stdout.contains(answered), "{}", outcome.output());
     ensure!(home.join(picture).exists());
-    let left = leftovers::of(&home);
+    let left = leftovers::find_leftovers(&home);
     ensure!(left.is_empty(), "left behind: {left:#?}");
     Ok(())
 }
 
 pub fn doctor_names_each_need() -> Verdict {
-    let daemon = world().shared()?;
-    let outcome = daemon.deployer().types(&["doctor"])?;
+    let daemon = world().ensure_shared()?;
+    let outcome = daemon.deployer().run(&["doctor"])?;
     for need in [
         "root",
         "overlay",
@@ -171,33 +172,33 @@ pub fn doctor_names_each_need() -> Verdict {
         "cloudroid-init",
     ] {
         ensure!(
-            outcome.said().to_lowercase().contains(need),
+            outcome.output().to_lowercase().contains(need),
             "{need} in:\n{}",
-            outcome.said()
+            outcome.output()
         );
     }
-    let answer: Value = daemon.deployer().asks(&["doctor"])?;
+    let answer: Value = daemon.deployer().run_json(&["doctor"])?;
     ensure!(answer.to_string().contains("mmdebstrap"), "{answer}");
     Ok(())
 }
 
 pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Verdict {
     let daemon = world()
-        .own("grace")
+        .setup("grace")
         .config("[servant]\ngrace = \"1s\"\n")
         .start()?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let mut robot = daemon.robot("adder_py?robot=guest")?;
-    robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
+    robot.call("/add_two", json!({"a": 1, "b": 1}))?;
     let id = daemon.servant_of("adder_py", "guest")?["id"]
         .as_str()
         .unwrap_or_default()
         .to_owned();
-    robot.leaves()?;
-    support::until("the servant's end", || {
+    robot.leave()?;
+    support::wait_until("the servant's end", || {
         let left = daemon.servants_of("adder_py")?;
         Ok(if left.is_empty() {
             Ok(())
@@ -209,9 +210,9 @@ pub fn a_robot_that_stays_away_loses_its_servant_after_the_grace_time() -> Verdi
         leftovers::cgroups(std::slice::from_ref(&id)).is_empty(),
         "{id} left a cgroup"
     );
-    // And a robot that comes back is given a new one.
+    // A robot that returns later gets a new servant.
     let mut robot = daemon.robot("adder_py?robot=guest")?;
-    robot.calls("/add_two", json!({"a": 1, "b": 1}))?;
+    robot.call("/add_two", json!({"a": 1, "b": 1}))?;
     ensure!(daemon.servant_of("adder_py", "guest")?["id"] != id.as_str());
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The image store, judged by tools that are not ours.
+//! The image store, checked with independent tools.
 
 use std::process::Command;
 
@@ -8,15 +8,15 @@ use support::Verdict;
 use support::deployer::run;
 use support::world::{ADDER, world};
 
-use crate::access::token;
+use crate::access::create_token;
 
 pub fn skopeo_and_umoci_read_the_store() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let store = daemon.home.join("images");
     let inspected = run(Command::new("skopeo")
         .arg("inspect")
         .arg(format!("oci:{}:adder_py", store.display())))?;
-    let inspected: Value = serde_json::from_str(&inspected.succeeded()?.stdout)?;
+    let inspected: Value = serde_json::from_str(&inspected.expect_success()?.stdout)?;
     ensure!(
         inspected["Layers"]
             .as_array()
@@ -36,7 +36,7 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
             &format!("{}:adder_py", store.display()),
         ])
         .arg(&bundle))?
-    .succeeded()?;
+    .expect_success()?;
     ensure!(
         bundle
             .join("rootfs/usr/bin/python3")
@@ -44,7 +44,7 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
             .is_ok(),
         "the base is there"
     );
-    // What the registry interface serves is the same image.
+    // The registry API serves the same image.
     let (status, manifest) = daemon.get("/v2/adder_py/manifests/latest")?;
     ensure!(status == 200, "{status} {manifest}");
     let manifest: Value = serde_json::from_str(&manifest)?;
@@ -60,15 +60,15 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
         .flatten()
         .collect();
     ensure!(served == stored, "{served:?} against {stored:?}");
-    // So is what the command line writes into a file.
+    // The command line exports the same image to a file.
     let file = place.path().join("adder.tar").display().to_string();
     let deployer = daemon.deployer();
     deployer
-        .types(&["export", "adder_py", "-o", &file])?
-        .succeeded()?;
+        .run(&["export", "adder_py", "-o", &file])?
+        .expect_success()?;
     let archive = format!("oci-archive:{file}");
     let exported = run(Command::new("skopeo").args(["inspect", &archive]))?;
-    let exported: Value = serde_json::from_str(&exported.succeeded()?.stdout)?;
+    let exported: Value = serde_json::from_str(&exported.expect_success()?.stdout)?;
     for key in ["Digest", "Layers"] {
         ensure!(
             exported[key] == inspected[key],
@@ -76,14 +76,14 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
         );
     }
     let copied = format!("dir:{}", place.path().join("copied").display());
-    // Reads every blob, and compares its digest.
+    // Reads every blob and compares its digest.
     run(Command::new("skopeo").args(["--insecure-policy", "copy", &archive, &copied]))?
-        .succeeded()?;
-    // What is not there is told by the status, and writes nothing.
+        .expect_success()?;
+    // A missing image is reported by the exit status, and no file is written.
     let nowhere = place.path().join("nowhere.tar").display().to_string();
     for missing in [&["adder_py", "--revision", "9"][..], &["nobody"]] {
         let words = [&["export", "-o", nowhere.as_str()][..], missing].concat();
-        let refused = deployer.types(&words)?;
+        let refused = deployer.run(&words)?;
         ensure!(refused.status == 5, "{missing:?}: {}", refused.status);
     }
     let left = std::fs::read_dir(place.path())?.count();
@@ -92,7 +92,7 @@ pub fn skopeo_and_umoci_read_the_store() -> Verdict {
 }
 
 pub fn an_exported_service_is_published_on_another_server() -> Verdict {
-    let one = world().own("exporting").start()?;
+    let one = world().setup("exporting").start()?;
     let pushed = [
         "--name",
         "sevens",
@@ -108,26 +108,26 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
         "90ms",
         "--stateful",
     ];
-    one.deployer().pushes("adder_py", &pushed)?.succeeded()?;
+    one.deployer().push("adder_py", &pushed)?.expect_success()?;
     let row = ["sla", "set", "sevens", "--rrt", "50ms", "--cpus", "0.5"];
-    one.deployer().types(&row)?.succeeded()?;
+    one.deployer().run(&row)?.expect_success()?;
     let place = tempfile::tempdir()?;
     let at = |name: &str| place.path().join(name).display().to_string();
     let file = at("sevens.oci.tar");
     one.deployer()
-        .types(&["export", "sevens", "-o", &file])?
-        .succeeded()?;
+        .run(&["export", "sevens", "-o", &file])?
+        .expect_success()?;
     let before = one.get_json("/api/v1/services/sevens")?;
     let rows = one.get_json("/api/v1/services/sevens/sla")?;
-    one.ends()?;
+    one.stop()?;
 
-    let other = world().own("importing").start()?;
-    let types = |words: &[&str]| other.deployer().types(words);
-    let said = types(&["import", &file])?.succeeded()?;
+    let other = world().setup("importing").start()?;
+    let types = |words: &[&str]| other.deployer().run(words);
+    let said = types(&["import", &file])?.expect_success()?;
     ensure!(
-        said.said().contains("measured on another machine"),
+        said.output().contains("measured on another machine"),
         "{}",
-        said.said()
+        said.output()
     );
     let after = other.get_json("/api/v1/services/sevens")?;
     for key in [
@@ -149,22 +149,23 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     }
     let adds = |service: &str| -> Verdict {
         let mut robot = other.robot(service)?;
-        let answer = robot.calls("/add_two", json!({"a": 1, "b": 2}))?;
+        let answer = robot.call("/add_two", json!({"a": 1, "b": 2}))?;
         ensure!(answer["values"]["sum"] == 10, "{service}: {answer}");
         Ok(())
     };
     adds("sevens")?;
-    // Again, as another revision, and under another name; its own rows stay.
-    let again = types(&["import", &file])?.succeeded()?;
+    // Imported again it becomes another revision, or a service with another name; rows of the existing service are
+    // kept.
+    let again = types(&["import", &file])?.expect_success()?;
     ensure!(
-        again.said().contains("has a dictionary already"),
+        again.output().contains("keeps its existing SLA table"),
         "{}",
-        again.said()
+        again.output()
     );
-    types(&["import", &file, "--name", "sevens_too"])?.succeeded()?;
+    types(&["import", &file, "--name", "sevens_too"])?.expect_success()?;
     adds("sevens_too")?;
 
-    // What it says itself cannot be said again, and what is not such a file is told so; nothing of it is published.
+    // Properties of the image cannot be given again, and other files are rejected; nothing is published in these cases.
     let bytes = std::fs::read(&file)?;
     std::fs::write(at("torn.tar"), &bytes[..bytes.len() / 2])?;
     let record = bytes.windows(9).position(|part| part == b"\"format\":");
@@ -173,15 +174,16 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
     std::fs::write(at("changed.tar"), changed)?;
     let image = format!("oci:{}:sevens", other.home.join("images").display());
     let plain = format!("oci-archive:{}:plain", at("plain.tar"));
-    run(Command::new("skopeo").args(["--insecure-policy", "copy", &image, &plain]))?.succeeded()?;
+    run(Command::new("skopeo").args(["--insecure-policy", "copy", &image, &plain]))?
+        .expect_success()?;
     let rows: [(&[&str], &[&str]); 4] = [
         (
             &["push", &file, "--cpus", "2"],
-            &["says itself how it is started"],
+            &["includes its start commands"],
         ),
         (
             &["import", &at("torn.tar"), "--name", "torn"],
-            &["cut off", "copy the whole file"],
+            &["truncated", "copy the whole file"],
         ),
         (
             &["import", &at("changed.tar"), "--name", "changed"],
@@ -189,48 +191,48 @@ pub fn an_exported_service_is_published_on_another_server() -> Verdict {
         ),
         (
             &["import", &at("plain.tar"), "--name", "plain"],
-            &["was not exported from a service", "next:"],
+            &["is not an exported service", "next:"],
         ),
     ];
     for (words, expected) in rows {
-        types(words)?.failed_saying(expected)?;
+        types(words)?.expect_failure(expected)?;
     }
     let names = other.get_json("/api/v1/services")?;
     let names = names.as_array().map_or(0, Vec::len);
     ensure!(names == 2, "{names} services");
-    // Who may only see it exports the image, and is told that this cannot be imported.
-    let admin = token(&other, &["chief", "--role", "admin"])?;
-    let eve = token(&other, &["eve", "--role", "viewer", "--service", "sevens*"])?;
+    // A principal who may only view can export the image, and is told that the export cannot be imported.
+    let admin = create_token(&other, &["chief", "--role", "admin"])?;
+    let eve = create_token(&other, &["eve", "--role", "viewer", "--service", "sevens*"])?;
     let server = format!("http://{}", other.address);
     let hers = at("hers.tar");
     let typed = [
         "--server", &server, "--token", &eve, "export", "sevens", "-o", &hers,
     ];
-    let said = types(&typed)?.succeeded()?;
+    let said = types(&typed)?.expect_success()?;
     ensure!(
-        said.said().contains("only the image is exported"),
+        said.output().contains("only the image is exported"),
         "{}",
-        said.said()
+        said.output()
     );
     let typed = ["--server", &server, "--token", &admin, "import", &hers];
-    types(&typed)?.failed_saying(&["was not exported from a service"])?;
-    is_pulled_with_a_token(&other.address, &eve, &at("pulled"))?;
-    other.ends()?;
+    types(&typed)?.expect_failure(&["is not an exported service"])?;
+    pull_with_token(&other.address, &eve, &at("pulled"))?;
+    other.stop()?;
     Ok(())
 }
 
-/// What clients of registries do: they ask, are challenged, and ask again with a password, which is a token.
-fn is_pulled_with_a_token(address: &str, token: &str, to: &str) -> Verdict {
+/// Pulls as registry clients do: the first request is challenged, the second one has a token as password.
+fn pull_with_token(address: &str, token: &str, to: &str) -> Verdict {
     let image = format!("docker://{address}/sevens:latest");
     let pulls = |words: &[&str]| {
         let mut skopeo = Command::new("skopeo");
         skopeo.args(["--insecure-policy", "copy", "--src-tls-verify=false"]);
         run(skopeo.args(words).args([&image, &format!("dir:{to}")]))
     };
-    pulls(&["--src-creds", &format!("cluster:{token}")])?.succeeded()?;
+    pulls(&["--src-creds", &format!("cluster:{token}")])?.expect_success()?;
     for words in [&["--src-no-creds"][..], &["--src-creds", "cluster:guessed"]] {
         let refused = pulls(words)?;
-        let said = refused.said().to_lowercase();
+        let said = refused.output().to_lowercase();
         ensure!(
             refused.status != 0 && said.contains("auth"),
             "{words:?}: {said}"
@@ -240,16 +242,16 @@ fn is_pulled_with_a_token(address: &str, token: &str, to: &str) -> Verdict {
 }
 
 pub fn what_nobody_refers_to_is_collected() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(
+        .push(
             "adder_py",
             &[
                 "--name", "fleeting", "--node", "adder.py", "--param", "offset=7",
             ],
         )?
-        .succeeded()?;
+        .expect_success()?;
     let image = daemon.get_json("/api/v1/services/fleeting")?["image"]
         .as_str()
         .unwrap_or_default()
@@ -263,8 +265,8 @@ pub fn what_nobody_refers_to_is_collected() -> Verdict {
         "inspect",
         &format!("oci:{}:adder_py", daemon.home.join("images").display()),
     ]))?;
-    shared.succeeded()?;
-    deployer.types(&["rm", "fleeting"])?.succeeded()?;
+    shared.expect_success()?;
+    deployer.run(&["rm", "fleeting"])?.expect_success()?;
     ensure!(
         !blob.exists() || daemon.get_json("/api/v1/services/adder_py")?["image"] == image.as_str(),
         "the image of a removed service is collected"
@@ -273,6 +275,6 @@ pub fn what_nobody_refers_to_is_collected() -> Verdict {
         "inspect",
         &format!("oci:{}:adder_py", daemon.home.join("images").display()),
     ]))?
-    .succeeded()?;
+    .expect_success()?;
     Ok(())
 }

@@ -1,13 +1,13 @@
-//! What a lab trusts with other people's code.
+//! Isolation of untrusted code.
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
-use support::world::{ADDER, GREETER, PEOPLE, Service, world};
+use support::world::{ADDER, GREETER, PEOPLE, StoryService, world};
 use support::{Verdict, procfs};
 
-/// The host pids of a robot's node processes.
-fn pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>> {
+/// Returns the host pids of a robot's nodes.
+fn node_pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>> {
     let servant = daemon.servant_of(service, robot)?;
     let pids: Vec<i32> = servant["pids"]
         .as_array()
@@ -24,11 +24,11 @@ fn pids(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<Vec<i32>>
 
 pub fn every_node_process_is_confined() -> Verdict {
     for service in [PEOPLE, GREETER, ADDER] {
-        let daemon = world().with(service)?;
+        let daemon = world().daemon_with(service)?;
         let _robot = daemon
             .robot(&format!("{}?robot=confined", service.name))?
-            .calls("/rosapi/get_time", json!({}))?;
-        for pid in pids(&daemon, service.name, "confined")? {
+            .call("/rosapi/get_time", json!({}))?;
+        for pid in node_pids(&daemon, service.name, "confined")? {
             let status = procfs::status(pid).with_context(|| format!("process {pid}"))?;
             let field = |name: &str| status.get(name).map_or("missing", String::as_str);
             let who = format!("{} ({pid}) of {}", field("Name"), service.name);
@@ -74,11 +74,11 @@ pub fn every_node_process_is_confined() -> Verdict {
 }
 
 pub fn nothing_of_ours_but_init_runs_inside() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let _answer = daemon
         .robot("opencv_apps?robot=counted")?
-        .calls("/rosapi/get_time", json!({}))?;
-    let node = pids(&daemon, "opencv_apps", "counted")?[0];
+        .call("/rosapi/get_time", json!({}))?;
+    let node = node_pids(&daemon, "opencv_apps", "counted")?[0];
     let inside = procfs::namespace(node, "pid").context("the node's pid namespace")?;
     let mut commands: Vec<String> = procfs::pids()
         .into_iter()
@@ -106,10 +106,10 @@ pub fn nothing_of_ours_but_init_runs_inside() -> Verdict {
     Ok(())
 }
 
-/// Waits until all limits that were asked for are in force: while another robot waits too long, the controller gives it cores of those
-/// that have stated no time.
-fn has_its_limits(daemon: &Daemon, robot: &str) -> anyhow::Result<Value> {
-    support::until(&format!("the limits of {robot}"), || {
+/// Waits until all requested limits are in force: while another robot waits too long, the controller gives it cores of
+/// robots that have not stated a response time.
+fn wait_for_limits(daemon: &Daemon, robot: &str) -> anyhow::Result<Value> {
+    support::wait_until(&format!("the limits of {robot}"), || {
         let servant = daemon.servant_of("greeter_cpp", robot)?;
         let is = |limit: &&str| servant["enforced"][limit] == servant["limits"][limit];
         let are_in_force = ["cpus", "memory", "pids"].iter().all(is);
@@ -122,11 +122,11 @@ fn has_its_limits(daemon: &Daemon, robot: &str) -> anyhow::Result<Value> {
 }
 
 pub fn limits_are_set_and_read_back() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let _answer = daemon
         .robot("greeter_cpp?robot=limited")?
-        .calls("/rosapi/get_time", json!({}))?;
-    let servant = has_its_limits(&daemon, "limited")?;
+        .call("/rosapi/get_time", json!({}))?;
+    let servant = wait_for_limits(&daemon, "limited")?;
     let version = servant["cgroup_version"]
         .as_i64()
         .context("the cgroup version is told")?;
@@ -140,8 +140,8 @@ pub fn limits_are_set_and_read_back() -> Verdict {
             "{limit} is read back: {servant:#}"
         );
     }
-    // The kernel's own files say the same.
-    let pid = pids(&daemon, "greeter_cpp", "limited")?[0];
+    // The kernel's own files contain the same values.
+    let pid = node_pids(&daemon, "greeter_cpp", "limited")?[0];
     let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup"))?;
     let memory = if version == 1 {
         let path = groups
@@ -165,17 +165,17 @@ pub fn limits_are_set_and_read_back() -> Verdict {
 }
 
 pub fn limits_are_changed_while_it_works() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let mut robot = daemon.robot("greeter_cpp?robot=changed")?;
-    robot.calls("/rosapi/get_time", json!({}))?;
+    robot.call("/rosapi/get_time", json!({}))?;
     let before = daemon.servant_of("greeter_cpp", "changed")?;
     let id = before["id"].as_str().context("an id")?;
     let deployer = daemon.deployer();
     let said = deployer
-        .types(&["set", id, "--cpus", "0.5", "--memory", "256M"])?
-        .succeeded()?;
+        .run(&["set", id, "--cpus", "0.5", "--memory", "256M"])?
+        .expect_success()?;
     ensure!(said.stdout.contains("0.5 cpus, 256M"), "{}", said.stdout);
-    let after = has_its_limits(&daemon, "changed")?;
+    let after = wait_for_limits(&daemon, "changed")?;
     ensure!(
         after["enforced"]["cpus"] == 0.5 && after["enforced"]["memory"] == 256 << 20,
         "the kernel took them: {after:#}"
@@ -184,7 +184,7 @@ pub fn limits_are_changed_while_it_works() -> Verdict {
         after["enforced"]["pids"] == before["enforced"]["pids"],
         "what was not named stays: {after:#}"
     );
-    let status = deployer.asks(&["status"])?;
+    let status = deployer.run_json(&["status"])?;
     ensure!(
         status["capacity"]["cpus_reserved"].as_f64() >= Some(0.5),
         "what it has is promised to it: {status:#}"
@@ -195,45 +195,42 @@ pub fn limits_are_changed_while_it_works() -> Verdict {
         "what servants use is told: {status:#}"
     );
     for (verb, words) in [
-        (
-            "status",
-            ["used by servants", "throttled", "machine waits for"],
-        ),
+        ("status", ["used by servants", "throttled", "stalled (PSI)"]),
         ("servants", ["MEMORY", "THROTTLED", "PRESSURE"]),
     ] {
-        let said = deployer.types(&[verb])?.succeeded()?.stdout;
+        let said = deployer.run(&[verb])?.expect_success()?.stdout;
         for word in words {
             ensure!(said.contains(word), "{verb} does not tell {word}: {said}");
         }
     }
-    // The same nodes, still at work.
+    // The same nodes are still running.
     ensure!(after["pids"] == before["pids"]);
-    ensure!(robot.calls("/greeter/count", json!({"reset": false}))?["result"] == true);
+    ensure!(robot.call("/greeter/count", json!({"reset": false}))?["result"] == true);
     deployer
-        .types(&["set", id, "--memory", "900T"])?
-        .failed_saying(&["no room", "left for it"])?;
+        .run(&["set", id, "--memory", "900T"])?
+        .expect_failure(&["no capacity", "are available"])?;
     deployer
-        .types(&["set", id, "--cpus", "5000"])?
-        .failed_saying(&["between 0.01 and 4096"])?;
-    deployer.types(&["set", id])?.failed_saying(&["--cpus"])?;
-    ensure!(has_its_limits(&daemon, "changed")?["enforced"] == after["enforced"]);
+        .run(&["set", id, "--cpus", "5000"])?
+        .expect_failure(&["between 0.01 and 4096"])?;
+    deployer.run(&["set", id])?.expect_failure(&["--cpus"])?;
+    ensure!(wait_for_limits(&daemon, "changed")?["enforced"] == after["enforced"]);
     Ok(())
 }
 
-const HOG: Service = Service {
+const HOG: StoryService = StoryService {
     name: "hog_py",
     package: Some("hog_py"),
     arguments: &["--node", "hog.py", "--memory", "128M"],
 };
 
 pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Verdict {
-    let daemon = world().with(HOG)?;
+    let daemon = world().daemon_with(HOG)?;
     let mut robot = daemon.robot("hog_py?robot=greedy")?;
-    robot.says(json!({"op": "set_level", "level": "warning"}))?;
-    robot.says(json!({"op": "advertise", "topic": "/take", "type": "std_msgs/UInt32"}))?;
-    robot.awaits_subscriber("/take")?;
-    robot.says(json!({"op": "publish", "topic": "/take", "msg": {"data": 400}}))?;
-    let status = robot.hears_status("memory")?;
+    robot.send(json!({"op": "set_level", "level": "warning"}))?;
+    robot.send(json!({"op": "advertise", "topic": "/take", "type": "std_msgs/UInt32"}))?;
+    robot.wait_for_subscriber("/take")?;
+    robot.send(json!({"op": "publish", "topic": "/take", "msg": {"data": 400}}))?;
+    let status = robot.wait_for_status("memory")?;
     ensure!(
         status["msg"]
             .as_str()
@@ -244,22 +241,22 @@ pub fn a_node_that_takes_too_much_memory_is_killed_and_its_robot_told() -> Verdi
 }
 
 pub fn two_robots_see_nothing_of_each_other() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let (mut anna, mut bert) = (
         daemon.robot("greeter_cpp?robot=anna")?,
         daemon.robot("greeter_cpp?robot=bert")?,
     );
     for robot in [&mut anna, &mut bert] {
-        robot.subscribes("/greeter/greeting")?;
-        robot.says(
+        robot.subscribe("/greeter/greeting")?;
+        robot.send(
             json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}),
         )?;
-        robot.awaits_subscriber("/greeter/name")?;
+        robot.wait_for_subscriber("/greeter/name")?;
     }
-    anna.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Anna"}}))?;
-    ensure!(anna.hears_on("/greeter/greeting")?["text"] == "hi Anna");
-    bert.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Bert"}}))?;
-    let greeting = bert.hears_on("/greeter/greeting")?;
+    anna.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Anna"}}))?;
+    ensure!(anna.next_message_on("/greeter/greeting")?["text"] == "hi Anna");
+    bert.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Bert"}}))?;
+    let greeting = bert.next_message_on("/greeter/greeting")?;
     ensure!(
         greeting["text"] == "hi Bert" && greeting["count"] == 1,
         "Bert's node has greeted Bert alone: {greeting}"
@@ -278,10 +275,10 @@ pub fn two_robots_see_nothing_of_each_other() -> Verdict {
         .filter_map(|servant| procfs::namespace(servant["pids"][0].as_i64()? as i32, "net"))
         .collect();
     ensure!(nets.len() == 2 && nets[0] != nets[1], "{nets:?}");
-    // Anna goes and comes again within the grace time: the same servant, with its state.
-    anna.leaves()?;
+    // Anna leaves and returns within the grace time: the same servant, with its state.
+    anna.leave()?;
     let mut anna = daemon.robot("greeter_cpp?robot=anna")?;
-    let answer = anna.calls("/greeter/count", json!({"reset": false}))?;
+    let answer = anna.call("/greeter/count", json!({"reset": false}))?;
     ensure!(
         answer["values"]["count"] == 1,
         "the servant remembers: {answer}"

@@ -1,11 +1,12 @@
-//! A robot launches as ever: the real roslaunch, with the original and with its stub.
+//! Launching as usual: the real roslaunch, with the original and with its stub.
 
 use anyhow::{Context, ensure};
 use support::Verdict;
 use support::machine::{Machine, free_port};
 use support::world::{TELLER, world};
 
-/// What every script begins with: a Master's address, the overlay if it is to be used, and how to hear the node.
+/// Returns the beginning of every script: the Master's address, the overlay if it is to be used, and a subscription to
+/// the node.
 fn prelude(port: u16, setup: &str) -> String {
     format!(
         r#"set -u -m
@@ -85,13 +86,16 @@ pgrep -fa '[l]ib/teller_py'
 echo done
 "#;
 
-/// What the original does with it.
+/// Output of the original.
 const AS_EVER: &str = "\
-life 1 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+life 1 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, \
+file there
 rosnode kill
-life 2 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+life 2 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, \
+file there
 exit code 3
-life 3 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, file there
+life 3 of /front/teller in /front, directory ROS's, arguments ['one', 'two words', '--three'], word hello, number 4, \
+file there
 SIGINT to roslaunch
 roslaunch ended with 0
 has died [pid, exit code 3
@@ -108,23 +112,23 @@ done
 
 pub fn roslaunch_cannot_tell_the_stub_from_the_original() -> Verdict {
     for setup in ["", ". /opt/cloudroid/setup.sh"] {
-        let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
-        machine.has_teller()?;
+        let machine = Machine::with_stub(&*world().daemon_with(TELLER)?, "teller_py")?;
+        machine.install_teller()?;
         machine
-            .runs(
+            .run_script(
                 "sh",
                 "sh teller_py-stub/install.sh --robot launched-contract",
             )?
-            .succeeded()?;
+            .expect_success()?;
         let script = format!("{}{CONTRACT}", prelude(free_port()?, setup));
-        let outcome = machine.runs("bash", &script)?;
-        ensure!(outcome.stdout == AS_EVER, "{setup}: {}", outcome.said());
+        let outcome = machine.run_script("bash", &script)?;
+        ensure!(outcome.stdout == AS_EVER, "{setup}: {}", outcome.output());
     }
     Ok(())
 }
 
 pub fn rosrun_gives_the_node_the_name_that_the_original_has() -> Verdict {
-    let machine = Machine::with_stub(&*world().with(TELLER)?, "teller_py")?;
+    let machine = Machine::with_stub(&*world().daemon_with(TELLER)?, "teller_py")?;
     let script = format!(
         r#"{}
 sh teller_py-stub/install.sh --robot launched-name > /dev/null
@@ -138,18 +142,19 @@ find /opt/cloudroid -name teller.py -perm /111
 "#,
         prelude(free_port()?, "")
     );
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
-    // A source package's scripts are shared, too; of two executables roslaunch would not know which is meant.
+    let outcome = machine.run_script("bash", &script)?.expect_success()?;
+    // Scripts of a source package are shared as well; with two executables of the same name roslaunch would not know
+    // which to start.
     let found = outcome.stdout.matches("/teller.py\n").count();
     ensure!(
         outcome.stdout.contains("life 1 of /usual_name in") && found == 1,
         "{}",
-        outcome.said()
+        outcome.output()
     );
     Ok(())
 }
 
-/// What a robot is promised, where it is written as ever: in a launch file, for a node and for a namespace.
+/// Promises to a robot in a launch file as usual: for a node and for a namespace.
 const PROMISES: &str = r#"
 cat > /root/promises.launch << 'END'
 <launch>
@@ -191,7 +196,7 @@ python3 /root/explained.py http://SERVER/api/v1/robots/launched-promises/explain
 kill -INT $launched; wait $launched
 "#;
 
-/// Values that cannot be: each ends its own node.
+/// Invalid values: each ends its own node.
 const NONSENSE: &str = r#"
 cat > /root/nonsense.launch << 'END'
 <launch>
@@ -213,19 +218,19 @@ cat /root/log
 "#;
 
 pub fn a_launch_file_says_what_is_promised() -> Verdict {
-    let daemon = world().with(TELLER)?;
+    let daemon = world().daemon_with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     let installs = "sh teller_py-stub/install.sh --robot launched-promises";
-    machine.runs("sh", installs)?.succeeded()?;
+    machine.run_script("sh", installs)?.expect_success()?;
     let port = free_port()?;
     let promises = PROMISES
         .replace("PORT", &port.to_string())
         .replace("SERVER", &daemon.address);
     let setup = prelude(port, ". /opt/cloudroid/setup.sh");
-    let outcome = machine.runs("bash", &format!("{setup}{promises}"))?;
+    let outcome = machine.run_script("bash", &format!("{setup}{promises}"))?;
     let links = outcome.stdout.lines().find(|line| line.starts_with('['));
     let links: serde_json::Value =
-        serde_json::from_str(links.with_context(|| outcome.said())?).context(outcome.said())?;
+        serde_json::from_str(links.with_context(|| outcome.output())?).context(outcome.output())?;
     for (node, key, value) in [
         ("/front/teller", "desire", 250.0),
         ("/front/teller", "max", 2000.0),
@@ -242,7 +247,7 @@ pub fn a_launch_file_says_what_is_promised() -> Verdict {
     }
     let nonsense = NONSENSE.replace("PORT", &free_port()?.to_string());
     let setup = prelude(free_port()?, ". /opt/cloudroid/setup.sh");
-    let outcome = machine.runs("bash", &format!("{setup}{nonsense}"))?;
+    let outcome = machine.run_script("bash", &format!("{setup}{nonsense}"))?;
     for words in [
         "parameter /front/more/cloudroid/desire: desire (2 s) is greater than max (1 s); lower it, or raise max",
         "parameter /front/less/cloudroid/desire: desire is -0.5; it should be a number greater than 0",
@@ -254,10 +259,10 @@ pub fn a_launch_file_says_what_is_promised() -> Verdict {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     let died = outcome.stdout.matches("exit code 1").count();
-    ensure!(died == 5, "{died} died: {}", outcome.said());
+    ensure!(died == 5, "{died} died: {}", outcome.output());
     Ok(())
 }

@@ -1,5 +1,5 @@
-//! A servant of ROS 2 with several nodes: one with a lifecycle, which works for its robot once it is active, and two that pass pictures
-//! to each other by shared memory. All of it is one story, since a push of ROS 2 takes long.
+//! A servant of ROS 2 with several nodes: one with a lifecycle, which works for its robot once it is active, and two
+//! that exchange images through shared memory. A single story, because a push of ROS 2 takes long.
 
 use std::cell::Cell;
 use std::collections::BTreeSet;
@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 use nix::sys::stat::{major, minor};
-use ros::bus::{Bus, Message, Publisher, RosVersion, Subscription, WireFormat};
+use ros::bus::{Bus, Publisher, RosVersion, SerializedMessage, Subscription, WireFormat};
 use ros::ros2::lifecycle::{LifecycleNode, State, StateChange, Transition};
 use serde_json::{Value, json};
 use support::cutter::Cutter;
@@ -16,15 +16,15 @@ use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::patience::{patience, wait_for};
 use support::robot::Robot;
-use support::site::{Running, Site, string_of};
+use support::site::{NodeProcess, Site, string_in};
 use support::world::world;
 use support::{Verdict, procfs};
 
 const SERVICE: &str = "sentry_ros2";
 const SENTRY: &str = "/sentry";
-/// Of pictures, 1920 by 1080 in three colours.
+/// Size of the images: 1920 by 1080 in three colours.
 const SIZE: u64 = 1920 * 1080 * 3;
-/// Of what programs map that share memory by Fast DDS.
+/// Prefix of Fast DDS's files in shared memory.
 const SHARED: &str = "/dev/shm/fastrtps_";
 
 pub fn nodes_of_a_servant_become_active_and_share_their_memory() -> Verdict {
@@ -33,7 +33,7 @@ pub fn nodes_of_a_servant_become_active_and_share_their_memory() -> Verdict {
     std::fs::create_dir(&post)?;
     let closed = post.join("closed");
     let config = format!("[allow]\nvolumes = [{post:?}]\n");
-    let daemon = world().own("lifecycle").config(&config).start()?;
+    let daemon = world().setup("lifecycle").config(&config).start()?;
     let volume = format!("{}:/post", path_str(&post));
     let arguments = [
         "--node",
@@ -47,52 +47,55 @@ pub fn nodes_of_a_servant_become_active_and_share_their_memory() -> Verdict {
         "--volume",
         &volume,
     ];
-    let pushed = daemon.deployer().pushes(SERVICE, &arguments)?;
-    pushed.succeeded()?;
+    let pushed = daemon.deployer().push(SERVICE, &arguments)?;
+    pushed.expect_success()?;
     let service = daemon.api(&format!("/api/v1/services/{SERVICE}"))?;
     ensure!(
         service["interface"]["lifecycle"] == json!([SENTRY]),
         "{service:#}"
     );
 
-    let mut robot = who_connects_has_an_active_node(&daemon)?;
-    pictures_pass_by_memory_of_one_servant(&daemon, &mut robot)?;
-    robot.leaves()?;
+    let mut robot = expect_active_node(&daemon)?;
+    expect_shared_memory_used(&daemon, &mut robot)?;
+    robot.leave()?;
     std::fs::write(&closed, "")?;
-    a_node_that_does_not_activate_is_given_to_nobody(&daemon, &arguments)?;
+    expect_inactive_refused(&daemon, &arguments)?;
     std::fs::remove_file(&closed)?;
-    a_robot_drives_its_node_wherever_that_runs(&daemon)?;
-    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-    daemon.ends()?;
+    drive_across_failover(&daemon)?;
+    daemon
+        .deployer()
+        .run(&["stop", "--all"])?
+        .expect_success()?;
+    daemon.stop()?;
     Ok(())
 }
 
-/// The states that a robot's servant shows of its nodes.
-fn stages(daemon: &Daemon, robot: &str) -> anyhow::Result<Value> {
+/// Returns the lifecycle states that a robot's servant reports.
+fn lifecycle_states(daemon: &Daemon, robot: &str) -> anyhow::Result<Value> {
     Ok(daemon.servant_of(SERVICE, robot)?["lifecycle"].clone())
 }
 
-/// What is shown of the sentry in this state.
-fn in_state(state: &str) -> Value {
+/// Returns the report with the sentry in this state.
+fn sentry_in_state(state: &str) -> Value {
     json!([{"node": SENTRY, "state": state}])
 }
 
-fn who_connects_has_an_active_node(daemon: &Daemon) -> anyhow::Result<Robot> {
+fn expect_active_node(daemon: &Daemon) -> anyhow::Result<Robot> {
     let mut robot = daemon.robot(&format!("{SERVICE}?robot=asks"))?;
-    // What is said while the sentry wakes up is heard by it, since its servant is not ready before.
-    robot.says(json!({"op": "subscribe", "topic": "/alarm"}))?;
-    robot.says(json!({"op": "advertise", "topic": "/noise", "type": "std_msgs/msg/String"}))?;
-    robot.says(json!({"op": "publish", "topic": "/noise", "msg": {"data": "steps"}}))?;
-    let alarm = robot.hears_on("/alarm")?;
+    // Messages published while the sentry activates reach it, because its servant is not ready before.
+    robot.send(json!({"op": "subscribe", "topic": "/alarm"}))?;
+    robot.send(json!({"op": "advertise", "topic": "/noise", "type": "std_msgs/msg/String"}))?;
+    robot.send(json!({"op": "publish", "topic": "/noise", "msg": {"data": "steps"}}))?;
+    let alarm = robot.next_message_on("/alarm")?;
     let alarm = alarm["data"].as_str().context("a text")?;
     ensure!(alarm.starts_with("steps heard by "), "{alarm}");
-    let stages = stages(daemon, "asks")?;
-    ensure!(stages == in_state("active"), "{stages:#}");
+    let stages = lifecycle_states(daemon, "asks")?;
+    ensure!(stages == sentry_in_state("active"), "{stages:#}");
     Ok(robot)
 }
 
-/// Processes of a robot's servant that run these programs.
-fn processes(daemon: &Daemon, robot: &str, programs: [&str; 2]) -> anyhow::Result<[i32; 2]> {
+/// Returns the processes of a robot's servant that run these programs.
+fn find_processes(daemon: &Daemon, robot: &str, programs: [&str; 2]) -> anyhow::Result<[i32; 2]> {
     let servant = daemon.servant_of(SERVICE, robot)?;
     let pids = servant["pids"].as_array().context("pids")?;
     let pids = pids.iter().filter_map(|pid| Some(pid.as_i64()? as i32));
@@ -108,20 +111,20 @@ fn processes(daemon: &Daemon, robot: &str, programs: [&str; 2]) -> anyhow::Resul
     }
 }
 
-/// What a process has mapped of memory that Fast DDS shares: file system and file.
-fn shared_memory(pid: i32) -> anyhow::Result<BTreeSet<(String, String)>> {
+/// Returns the files of Fast DDS's shared memory that a process has mapped: file system and file.
+fn mapped_shared_memory(pid: i32) -> anyhow::Result<BTreeSet<(String, String)>> {
     let maps = std::fs::read_to_string(format!("/proc/{pid}/maps"))?;
     let lines = maps.lines().filter(|line| line.contains(SHARED));
     let files = lines.filter_map(|line| {
-        // Addresses, rights and offset stand before (proc_pid_maps(5)).
+        // Addresses, permissions and offset come before (proc_pid_maps(5)).
         let mut words = line.split_whitespace().skip(3);
         Some((words.next()?.to_owned(), words.next()?.to_owned()))
     });
     Ok(files.collect())
 }
 
-/// Bytes that have come over the loopback of a process's network.
-fn over_loopback(pid: i32) -> anyhow::Result<u64> {
+/// Returns the bytes received on the loopback device of a process's network.
+fn loopback_bytes(pid: i32) -> anyhow::Result<u64> {
     let devices = std::fs::read_to_string(format!("/proc/{pid}/net/dev"))?;
     let mut lines = devices.lines().map(str::trim);
     let counts = lines.find_map(|line| line.strip_prefix("lo:"));
@@ -129,33 +132,33 @@ fn over_loopback(pid: i32) -> anyhow::Result<u64> {
     Ok(received.context("a loopback")?.parse()?)
 }
 
-fn pictures_pass_by_memory_of_one_servant(daemon: &Daemon, robot: &mut Robot) -> Verdict {
+fn expect_shared_memory_used(daemon: &Daemon, robot: &mut Robot) -> Verdict {
     const PICTURES: u64 = 5;
     let mut other = daemon.robot(&format!("{SERVICE}?robot=beside"))?;
-    other.subscribes("/seen")?;
-    other.awaits_subscriber("/look")?;
-    robot.subscribes("/seen")?;
-    robot.says(json!({"op": "advertise", "topic": "/look", "type": "std_msgs/msg/UInt32"}))?;
-    robot.awaits_subscriber("/look")?;
-    let nodes = processes(daemon, "asks", ["eye", "reader"])?;
-    let before = over_loopback(nodes[0])?;
+    other.subscribe("/seen")?;
+    other.wait_for_subscriber("/look")?;
+    robot.subscribe("/seen")?;
+    robot.send(json!({"op": "advertise", "topic": "/look", "type": "std_msgs/msg/UInt32"}))?;
+    robot.wait_for_subscriber("/look")?;
+    let nodes = find_processes(daemon, "asks", ["eye", "reader"])?;
+    let before = loopback_bytes(nodes[0])?;
     for number in 1..=PICTURES {
-        robot.says(json!({"op": "publish", "topic": "/look", "msg": {"data": number}}))?;
-        let seen = robot.hears_on("/seen")?;
+        robot.send(json!({"op": "publish", "topic": "/look", "msg": {"data": number}}))?;
+        let seen = robot.next_message_on("/seen")?;
         let whole = format!("{number}: {SIZE} bytes, whole");
         ensure!(seen["data"] == whole, "{seen}");
     }
-    let carried = over_loopback(nodes[0])? - before;
+    let carried = loopback_bytes(nodes[0])? - before;
     ensure!(
         carried < SIZE,
         "{PICTURES} pictures of {SIZE} bytes took {carried} bytes of the network"
     );
-    let [eye, reader] = nodes.map(shared_memory);
+    let [eye, reader] = nodes.map(mapped_shared_memory);
     let (eye, reader) = (eye?, reader?);
     ensure!(!eye.is_disjoint(&reader), "{eye:?} and {reader:?}");
-    // Neither who is beside it nor this machine has any of that.
-    for node in processes(daemon, "beside", ["eye", "reader"])? {
-        let theirs = shared_memory(node)?;
+    // Neither the other servant nor this machine has any of these files.
+    for node in find_processes(daemon, "beside", ["eye", "reader"])? {
+        let theirs = mapped_shared_memory(node)?;
         let ours = eye.union(&reader);
         let systems: BTreeSet<&String> = ours.map(|(system, _)| system).collect();
         ensure!(!theirs.is_empty(), "they share memory, too");
@@ -172,33 +175,30 @@ fn pictures_pass_by_memory_of_one_servant(daemon: &Daemon, robot: &mut Robot) ->
     );
     let seen = |told: &Value| told["op"] == "publish" && told["topic"] == "/seen";
     ensure!(other.has_not_heard(seen)?, "it heard of another's pictures");
-    other.leaves()
+    other.leave()
 }
 
-fn a_node_that_does_not_activate_is_given_to_nobody(
-    daemon: &Daemon,
-    arguments: &[&str],
-) -> Verdict {
+fn expect_inactive_refused(daemon: &Daemon, arguments: &[&str]) -> Verdict {
     let words = [SENTRY, "does not activate", "inactive"];
     let mut refused = daemon.robot(&format!("{SERVICE}?robot=refused"))?;
-    let told = refused.hears_status("does not activate")?;
+    let told = refused.wait_for_status("does not activate")?;
     let said = told["msg"].as_str().unwrap_or_default();
     ensure!(words.iter().all(|word| said.contains(word)), "{told}");
-    refused.hears_close()?;
-    daemon.awaits_event("that it was refused", |event| {
+    refused.wait_for_close()?;
+    daemon.wait_for_event("that it was refused", |event| {
         let message = event["message"].to_string();
         event["kind"] == "lifecycle-refused" && words.iter().all(|word| message.contains(word))
     })?;
-    // Nor is it published.
+    // It is not published either.
     let again = [&["--name", "closed"], arguments].concat();
-    let pushed = daemon.deployer().pushes(SERVICE, &again)?;
-    pushed.failed_saying(&words)?;
+    let pushed = daemon.deployer().push(SERVICE, &again)?;
+    pushed.expect_failure(&words)?;
     Ok(())
 }
 
-/// A robot's nodes that make noise and hear alarms, and what drives the sentry.
-struct Guarded {
-    // In the order in which they end.
+/// A robot with a node that publishes noise and subscribes to alarms, and a client that drives the sentry's lifecycle.
+struct GuardedRobot {
+    // Fields are in the order in which they must be dropped.
     alarms: Subscription,
     noise: Box<dyn Publisher>,
     app: Arc<dyn Bus>,
@@ -206,15 +206,15 @@ struct Guarded {
     noises: u32,
 }
 
-impl Guarded {
-    /// The sentry is told to become this, and tells of it.
-    fn becomes(&self, way: &[(Transition, [State; 3])]) -> Verdict {
-        let node = LifecycleNode::of(Arc::clone(&self.app), SENTRY);
+impl GuardedRobot {
+    /// Makes transitions of the sentry and checks the published states.
+    fn transition_through(&self, way: &[(Transition, [State; 3])]) -> Verdict {
+        let node = LifecycleNode::new(Arc::clone(&self.app), SENTRY);
         self.site.runtime.block_on(async {
             let mut changes = node.watch().await?;
             for (transition, [from, by, to]) in way {
                 ensure!(node.state().await? == *from);
-                node.change(*transition, patience()).await?;
+                node.change_state(*transition, patience()).await?;
                 for (from, to) in [(*from, *by), (*by, *to)] {
                     let told = wait_for(changes.next()).await;
                     let told = told.context("its state's change should be told")?;
@@ -226,18 +226,18 @@ impl Guarded {
         })
     }
 
-    /// Makes noise until an alarm of it is heard: on which host it was raised.
-    fn alarmed(&mut self) -> anyhow::Result<String> {
+    /// Publishes noise until there is an alarm about it; returns the host that raised the alarm.
+    fn wait_for_alarm(&mut self) -> anyhow::Result<String> {
         let (noises, begun) = (Cell::new(self.noises), self.noises);
         let ask = || {
             noises.set(noises.get() + 1);
             let noise = format!("noise {}", noises.get());
-            self.noise.publish(string_of(WireFormat::Cdr, &noise));
+            self.noise.publish(string_in(WireFormat::Cdr, &noise));
             Ok(())
         };
         let mut raised = None;
-        // One of noise that was made before says nothing of who raises alarms now.
-        let is_of_now = |alarm: &Message| {
+        // An alarm about earlier noise does not show which host raises alarms now.
+        let is_of_now = |alarm: &SerializedMessage| {
             let said = String::from_utf8_lossy(&alarm.bytes).into_owned();
             raised = (begun + 1..=noises.get()).find_map(|number| {
                 let (_, host) = said.split_once(&format!("noise {number} heard by "))?;
@@ -245,19 +245,19 @@ impl Guarded {
             });
             Ok(raised.is_some())
         };
-        let heard = self.site.asks_until(&mut self.alarms, ask, is_of_now);
+        let heard = self.site.ask_until(&mut self.alarms, ask, is_of_now);
         heard.context("an alarm should be heard")?;
         self.noises = noises.get();
         raised.context("a host")
     }
 }
 
-/// The stub as its archive comes, before an original on the robot.
-fn stub(site: &Site, daemon: &Daemon, server: &str) -> anyhow::Result<Running> {
+/// Starts the stub from its archive, with an original on the robot.
+fn start_stub(site: &Site, daemon: &Daemon, server: &str) -> anyhow::Result<NodeProcess> {
     let settings = "robot = \"drives\"\nfallback_after = 1.0\n";
-    let overlay = site.installs(daemon, SERVICE, settings)?;
+    let overlay = site.install_stub(daemon, SERVICE, settings)?;
     let program = format!("/opt/cloudroid/install/lib/{SERVICE}/sentry");
-    let original = site.installs_original(daemon, SERVICE, (SERVICE, "sentry"), &program)?;
+    let original = site.install_original(daemon, SERVICE, (SERVICE, "sentry"), &program)?;
     let prefixes = format!("{}:{}", overlay.display(), original.display());
     let server = format!("ws://{server}");
     let variables = [
@@ -265,33 +265,33 @@ fn stub(site: &Site, daemon: &Daemon, server: &str) -> anyhow::Result<Running> {
         ("CLOUDROID_SERVER", server.as_str()),
         ("NO_COLOR", "1"),
     ];
-    site.runs_among(&variables, &overlay, SERVICE, "sentry", &[])
+    site.start_installed_with_environment(&variables, &overlay, SERVICE, "sentry", &[])
 }
 
-fn a_robot_drives_its_node_wherever_that_runs(daemon: &Daemon) -> Verdict {
+fn drive_across_failover(daemon: &Daemon) -> Verdict {
     let way = Cutter::new(&daemon.address, 0, 1, 1)?;
-    let site = Site::of(RosVersion::Two)?;
-    let app = site.joins("/app")?;
-    let stub = stub(&site, daemon, &way.server.to_string())?;
-    let driven = drive(site, app, daemon, (&way, &stub));
-    driven.with_context(|| format!("the stub said:\n{}", stub.said()))
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
+    let stub = start_stub(&site, daemon, &way.server.to_string())?;
+    let driven = drive_node(site, app, daemon, (&way, &stub));
+    driven.with_context(|| format!("the stub said:\n{}", stub.output()))
 }
 
-fn drive(
+fn drive_node(
     site: Site,
     app: Arc<dyn Bus>,
     daemon: &Daemon,
-    (way, stub): (&Cutter, &Running),
+    (way, stub): (&Cutter, &NodeProcess),
 ) -> Verdict {
-    site.until(&app, "the node", |graph| {
-        LifecycleNode::is_one(graph, SENTRY)
+    site.wait_for_graph(&app, "the node", |graph| {
+        LifecycleNode::has_lifecycle(graph, SENTRY)
     })?;
-    stub.says("linked to")?;
-    // It is the robot's to drive: nobody else has it begin.
+    stub.wait_for_output("linked to")?;
+    // The robot drives the lifecycle: the node does not activate by itself.
     let shows = |state: &str| {
-        let wanted = in_state(state);
-        support::until(&format!("a sentry that is {state}"), || {
-            let shown = stages(daemon, "drives")?;
+        let wanted = sentry_in_state(state);
+        support::wait_until(&format!("a sentry that is {state}"), || {
+            let shown = lifecycle_states(daemon, "drives")?;
             Ok(if shown == wanted {
                 Ok(())
             } else {
@@ -300,9 +300,9 @@ fn drive(
         })
     };
     shows("unconfigured")?;
-    let mut guarded = Guarded {
-        alarms: site.hears(&app, "/alarm")?,
-        noise: site.says(&app, "/noise", false)?,
+    let mut guarded = GuardedRobot {
+        alarms: site.subscribe(&app, "/alarm")?,
+        noise: site.advertise_strings(&app, "/noise", false)?,
         app,
         site,
         noises: 0,
@@ -313,27 +313,27 @@ fn drive(
         [unconfigured, State::Configuring, inactive],
     );
     let activates = (Transition::Activate, [inactive, State::Activating, active]);
-    guarded.becomes(&[configures])?;
+    guarded.transition_through(&[configures])?;
     shows("inactive")?;
-    guarded.becomes(&[activates])?;
+    guarded.transition_through(&[activates])?;
     shows("active")?;
     let here = nix::unistd::gethostname()?;
     let here = here.to_string_lossy();
-    let in_the_cloud = guarded.alarmed()?;
+    let in_the_cloud = guarded.wait_for_alarm()?;
     ensure!(in_the_cloud != here, "the servant has the name of its host");
 
-    // The original has to be what the robot has made of the node.
+    // The original has to get into the state that the robot has chosen.
     way.cut(true);
-    stub.says("the local original answers, too why=LinkDown")?;
-    let on_the_robot = guarded.alarmed()?;
+    stub.wait_for_output("the local original answers, too why=LinkDown")?;
+    let on_the_robot = guarded.wait_for_alarm()?;
     ensure!(on_the_robot == here, "{on_the_robot} raised it");
-    let node = LifecycleNode::of(Arc::clone(&guarded.app), SENTRY);
+    let node = LifecycleNode::new(Arc::clone(&guarded.app), SENTRY);
     let state = guarded.site.runtime.block_on(node.state())?;
     ensure!(state == active, "{state}");
     way.cut(false);
-    stub.says("the cloud answers alone why=LinkUp")?;
-    stub.says("the local original is stopped why=LinkUp")?;
-    let again = guarded.alarmed()?;
+    stub.wait_for_output("the cloud answers alone why=LinkUp")?;
+    stub.wait_for_output("the local original is stopped why=LinkUp")?;
+    let again = guarded.wait_for_alarm()?;
     ensure!(again == in_the_cloud, "{again} raised it");
     Ok(())
 }

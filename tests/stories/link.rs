@@ -1,4 +1,4 @@
-//! A robot's node in the cloud: the robot's side cannot tell it from the original.
+//! A robot's node in the cloud: the robot cannot distinguish it from the original.
 
 use std::collections::BTreeSet;
 
@@ -9,29 +9,29 @@ use ros::ros1::Ros1Bus;
 use support::Verdict;
 use support::freezer::Freezer;
 use support::patience::scale_seconds;
-use support::site::{Running, Site, registered, string, string_of, text_of};
-use support::twins::{Twin, count, sum};
+use support::site::{NodeProcess, Site, registrations, string, string_in, string_text};
+use support::twins::{Twin, greeting_count, sum_request};
 use support::world::{GREETER, PEOPLE, world};
 
 const THE_GREETER: (&str, &str, &str) = ("greeter_cpp", "greeter_cpp", "greeter");
 const PEOPLE_DETECT: (&str, &str, &str) = ("opencv_apps", "opencv_apps", "people_detect");
 
-fn serves(service: &str) -> impl Fn(&Graph) -> bool {
+fn has_service(service: &str) -> impl Fn(&Graph) -> bool {
     let service = service.to_owned();
     move |graph| graph.services.contains_key(&service)
 }
 
-fn text(message: &[u8]) -> String {
+fn to_text(message: &[u8]) -> String {
     String::from_utf8_lossy(message).into_owned()
 }
 
-/// The message with what the node said when it fails.
-fn with_log<T>(outcome: anyhow::Result<T>, node: &Running) -> anyhow::Result<T> {
-    outcome.with_context(|| format!("the stub said:\n{}", node.said()))
+/// Adds the node's output to an error.
+fn with_log<T>(outcome: anyhow::Result<T>, node: &NodeProcess) -> anyhow::Result<T> {
+    outcome.with_context(|| format!("the stub said:\n{}", node.output()))
 }
 
 pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
     let run = |future| site.runtime.block_on(future);
@@ -45,56 +45,61 @@ pub fn a_greeter_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
         "~name:=/who",
         "__log:=/nowhere/x.log",
     ];
-    let mut stub = site.stub(&daemon, THE_GREETER, "linked-greeter", &argv)?;
+    let mut stub = site.start_stub(&daemon, THE_GREETER, "linked-greeter", &argv)?;
     with_log(
-        site.until(&app, "the service", serves("/front/hello/count")),
+        site.wait_for_graph(&app, "the service", has_service("/front/hello/count")),
         &stub,
     )?;
-    // A topic in, remapped; a topic out; both with the original's names and types.
-    let names = site.says(&app, "/who", false)?;
-    site.connected(&*names, 1)?;
-    let mut greetings = site.hears(&app, "/front/hello/greeting")?;
+    // An input topic, remapped; an output topic; both with the original's names and types.
+    let names = site.advertise_strings(&app, "/who", false)?;
+    site.wait_for_subscribers(&*names, 1)?;
+    let mut greetings = site.subscribe(&app, "/front/hello/greeting")?;
     names.publish(string("robot"));
-    let greeting = with_log(site.next(&mut greetings), &stub)?;
-    ensure!(text(&greeting.bytes).contains("hi robot"), "{greeting:?}");
+    let greeting = with_log(site.next_message(&mut greetings), &stub)?;
+    ensure!(
+        to_text(&greeting.bytes).contains("hi robot"),
+        "{greeting:?}"
+    );
     ensure!(
         greeting.wire_type.name == "greeter_cpp/Greeting"
             && greeting.publisher.node() == "/front/hello",
         "{greeting:?}"
     );
-    // A newcomer is given the latched one.
+    // A late subscriber gets the latched message.
     let late = site.node("/late")?;
-    let mut again = site.hears(&late, "/front/hello/greeting")?;
-    ensure!(site.next(&mut again)?.bytes == greeting.bytes);
-    // A service, with a parameter of the robot behind it.
-    let response = site.calls(&app, "/front/hello/count", &[0])?;
+    let mut again = site.subscribe(&late, "/front/hello/greeting")?;
+    ensure!(site.next_message(&mut again)?.bytes == greeting.bytes);
+    // A service that uses a parameter of the robot.
+    let response = site.call_service(&app, "/front/hello/count", &[0])?;
     ensure!(
-        text(&response).contains("robot's") && response[0] == 1,
+        to_text(&response).contains("robot's") && response[0] == 1,
         "{response:?}"
     );
-    // The node's logger is the node's.
-    ensure!(text(&site.calls(&app, "/front/hello/get_loggers", &[])?).contains("ros.roscpp"));
-    // roslaunch's way to end it.
+    // The services of the node's logger are available.
+    ensure!(
+        to_text(&site.call_service(&app, "/front/hello/get_loggers", &[])?).contains("ros.roscpp")
+    );
+    // The signal with which roslaunch ends nodes.
     stub.signal(Signal::SIGINT)?;
-    let status = stub.ends()?;
-    // As the real node ended: in good order, or with whatever befalls it at its end.
+    let status = stub.wait_for_exit()?;
+    // The stub ends as the node did: successfully, or with its error.
     let crashed = std::os::unix::process::ExitStatusExt::signal(&status).is_some()
-        && stub.said().contains("was killed by");
+        && stub.output().contains("was killed by");
     ensure!(
         status.code() == Some(0) || crashed,
         "{status}: {}",
-        stub.said()
+        stub.output()
     );
-    site.until(&app, "an empty graph", |graph| {
-        registered(graph, "/front/hello").is_empty()
+    site.wait_for_graph(&app, "an empty graph", |graph| {
+        registrations(graph, "/front/hello").is_empty()
     })?;
     Ok(())
 }
 
-/// What a robot's user is told of a node: its registrations with their types, and its parameters with their values.
-fn told_of(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String> {
+/// Describes a node for a robot's user: its registrations with types, and its parameters with values.
+fn describe_node(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String> {
     let graph = watcher.graph().borrow().clone();
-    let mut lines = registered(&graph, node);
+    let mut lines = registrations(&graph, node);
     let services = graph.services.iter().filter(|(_, server)| *server == node);
     for (service, _) in services {
         if let Ok(kind) = site.runtime.block_on(watcher.service_type(service)) {
@@ -110,49 +115,55 @@ fn told_of(site: &Site, watcher: &Ros1Bus, node: &str) -> BTreeSet<String> {
     lines
 }
 
-/// Waits until what is told of a node satisfies `wanted`; what it was at last.
-fn comes_to(
+/// Waits until the description of a node satisfies `wanted`; returns the last description.
+fn wait_for_description(
     site: &Site,
     watcher: &Ros1Bus,
     node: &str,
     wanted: impl Fn(&BTreeSet<String>) -> bool,
 ) -> BTreeSet<String> {
     let mut last = BTreeSet::new();
-    // Who compares says better than this what is missing.
-    let _ = support::until(node, || {
-        last = told_of(site, watcher, node);
+    // The caller compares the description and reports the difference.
+    let _ = support::wait_until(node, || {
+        last = describe_node(site, watcher, node);
         Ok(wanted(&last).then_some(()).ok_or_else(String::new))
     });
     last
 }
 
-/// What is told of people_detect in three states: nobody listens, one does, it has left. In each, `arrived` decides
-/// whether it has come about.
-fn states(
+/// Describes people_detect in three states: without a subscriber, with one, and after it has left. `arrived` decides
+/// whether each state has been reached.
+fn describe_states(
     site: &Site,
     arrived: impl Fn(usize, &BTreeSet<String>) -> bool,
 ) -> anyhow::Result<Vec<BTreeSet<String>>> {
     let node = "/people_detect";
     let watcher = site.node("/watcher")?;
-    let mut states = vec![comes_to(site, &watcher, node, |lines| arrived(0, lines))];
+    let mut states = vec![wait_for_description(site, &watcher, node, |lines| {
+        arrived(0, lines)
+    })];
     let listener = site.node("/listener")?;
-    let found = site.hears(&listener, &format!("{node}/found"))?;
-    states.push(comes_to(site, &watcher, node, |lines| arrived(1, lines)));
+    let found = site.subscribe(&listener, &format!("{node}/found"))?;
+    states.push(wait_for_description(site, &watcher, node, |lines| {
+        arrived(1, lines)
+    }));
     drop(found);
-    states.push(comes_to(site, &watcher, node, |lines| arrived(2, lines)));
+    states.push(wait_for_description(site, &watcher, node, |lines| {
+        arrived(2, lines)
+    }));
     Ok(states)
 }
 
 pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let argv = ["__name:=people_detect", "_debug_view:=false"];
-    // What is always there, and the lazy input: so much is known of it without looking.
+    // Number of permanent registrations; the lazy input is not among them.
     let (outputs, services, parameters) = (5, 6, 8);
     let original = {
         let site = Site::new()?;
         let program = "/usr/lib/opencv_apps/people_detect";
-        let node = site.original(&daemon, "opencv_apps", program, &argv)?;
-        let states = states(&site, |state, lines| {
+        let node = site.start_original(&daemon, "opencv_apps", program, &argv)?;
+        let states = describe_states(&site, |state, lines| {
             let count = |word: &str| lines.iter().filter(|line| line.starts_with(word)).count();
             count("publishes") == outputs
                 && count("serves") == services
@@ -170,8 +181,8 @@ pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
         states
     };
     let site = Site::new()?;
-    let stub = site.stub(&daemon, PEOPLE_DETECT, "linked-people", &argv)?;
-    let linked = states(&site, |state, lines| *lines == original[state]);
+    let stub = site.start_stub(&daemon, PEOPLE_DETECT, "linked-people", &argv)?;
+    let linked = describe_states(&site, |state, lines| *lines == original[state]);
     let linked = with_log(linked, &stub)?;
     for (state, (theirs, ours)) in ["idle", "busy", "left"]
         .iter()
@@ -189,105 +200,111 @@ pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
 
 pub fn two_nodes_share_a_servant(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = &*twin.robot("linked-pair");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = &*twin.robot_name("linked-pair");
     let start = |node: &str| {
         let argv = twin.argv(node, &[("~name", "/who")]);
         twin.stub(&site, (&daemon.address, robot), "", &argv)
     };
     let (one, two) = (start("one")?, start("two")?);
-    with_log(site.until(&app, "the first", serves("/one/count")), &one)?;
-    with_log(site.until(&app, "the second", serves("/two/count")), &two)?;
-    let servants = daemon.deployer().asks(&["servants"])?;
+    with_log(
+        site.wait_for_graph(&app, "the first", has_service("/one/count")),
+        &one,
+    )?;
+    with_log(
+        site.wait_for_graph(&app, "the second", has_service("/two/count")),
+        &two,
+    )?;
+    let servants = daemon.deployer().run_json(&["servants"])?;
     let theirs = servants
         .as_array()
         .context("a list")?
         .iter()
         .filter(|servant| servant["robot"] == robot);
     ensure!(theirs.count() == 1, "{servants:#}");
-    let names = site.says(&app, "/who", false)?;
-    site.connected(&*names, 2)?;
-    let mut first = site.hears(&app, "/one/greeting")?;
-    let mut second = site.hears(&app, "/two/greeting")?;
-    site.fed(&first, 1)?;
-    site.fed(&second, 1)?;
-    names.publish(string_of(WireFormat::of(ros), "robot"));
-    // Each hears it once, though both listen.
-    with_log(site.next(&mut first), &one)?;
-    with_log(site.next(&mut second), &two)?;
+    let names = site.advertise_strings(&app, "/who", false)?;
+    site.wait_for_subscribers(&*names, 2)?;
+    let mut first = site.subscribe(&app, "/one/greeting")?;
+    let mut second = site.subscribe(&app, "/two/greeting")?;
+    site.wait_for_publishers(&first, 1)?;
+    site.wait_for_publishers(&second, 1)?;
+    names.publish(string_in(WireFormat::for_version(ros), "robot"));
+    // Each of them receives it once, although both subscribe.
+    with_log(site.next_message(&mut first), &one)?;
+    with_log(site.next_message(&mut second), &two)?;
     for node in ["/one", "/two"] {
-        let count = count(&site, &app, node)?;
+        let count = greeting_count(&site, &app, node)?;
         ensure!(count == 1, "{node}: {count}");
     }
     Ok(())
 }
 
 pub fn a_lost_link_is_taken_up_again() -> Verdict {
-    // Of its own: its end is the story.
+    // A separate daemon, because it is killed.
     let home = world().home("link-restarted");
-    let setup = world().own("link-restarted");
+    let setup = world().setup("link-restarted");
     let daemon = setup.start()?;
     daemon
         .deployer()
-        .pushes("greeter_cpp", GREETER.arguments)?
-        .succeeded()?;
+        .push("greeter_cpp", GREETER.arguments)?
+        .expect_success()?;
     let address = daemon.address.clone();
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let stub = site.stub(
+    let stub = site.start_stub(
         &daemon,
         THE_GREETER,
         "linked-again",
         &["__name:=greeter", "~name:=/who"],
     )?;
     with_log(
-        site.until(&app, "the service", serves("/greeter/count")),
+        site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
         &stub,
     )?;
-    let names = site.says(&app, "/who", false)?;
-    site.connected(&*names, 1)?;
-    let mut greetings = site.hears(&app, "/greeter/greeting")?;
+    let names = site.advertise_strings(&app, "/who", false)?;
+    site.wait_for_subscribers(&*names, 1)?;
+    let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
     names.publish(string("first"));
-    site.next(&mut greetings)?;
-    let before = registered(&app.graph().borrow(), "/greeter");
-    // The daemon goes and comes back; the servant lives on, and the node with all it knows.
-    daemon.is_killed()?;
+    site.next_message(&mut greetings)?;
+    let before = registrations(&app.graph().borrow(), "/greeter");
+    // The daemon ends and returns; the servant continues, and the node keeps its state.
+    daemon.kill()?;
     let daemon = setup.listen(&address).start()?;
     ensure!(daemon.home == home);
-    // A call made meanwhile is answered, or fails with a reason; the next one is answered.
-    if let Err(error) = site.calls(&app, "/greeter/count", &[0]) {
+    // A call made meanwhile is answered or fails with a reason; the next one is answered.
+    if let Err(error) = site.call_service(&app, "/greeter/count", &[0]) {
         ensure!(
-            format!("{error:#}").contains("forgotten this call"),
+            format!("{error:#}").contains("this call was lost"),
             "{error:#}"
         );
     }
-    let count = with_log(site.calls(&app, "/greeter/count", &[0]), &stub)?;
+    let count = with_log(site.call_service(&app, "/greeter/count", &[0]), &stub)?;
     ensure!(count[0] == 1, "it has forgotten what it did: {count:?}");
-    ensure!(registered(&app.graph().borrow(), "/greeter") == before);
+    ensure!(registrations(&app.graph().borrow(), "/greeter") == before);
     names.publish(string("second"));
-    let greeting = with_log(site.next(&mut greetings), &stub)?;
+    let greeting = with_log(site.next_message(&mut greetings), &stub)?;
     ensure!(
-        text(&greeting.bytes).contains("second") || text(&greeting.bytes).contains("first"),
+        to_text(&greeting.bytes).contains("second") || to_text(&greeting.bytes).contains("first"),
         "{greeting:?}"
     );
     drop(stub);
-    daemon.deployer().types(&["stop", "--all"])?;
-    daemon.ends()?;
+    daemon.deployer().run(&["stop", "--all"])?;
+    daemon.stop()?;
     Ok(())
 }
 
 pub fn what_a_stub_cannot_do_is_said(ros: RosVersion) -> Verdict {
     let (greeter, adder) = (Twin::greeter(ros), Twin::adder(ros));
-    let daemon = world().with(greeter.service)?;
-    world().with(adder.service)?;
-    let site = Site::of(ros)?;
+    let daemon = world().daemon_with(greeter.service)?;
+    world().daemon_with(adder.service)?;
+    let site = Site::with_ros(ros)?;
     let (service, package, executable) = greeter.names();
     let server = format!(
         "server = \"ws://{}\"\nrobot = \"{}\"\nlocal = \"none\"\n",
         daemon.address,
-        greeter.robot("linked-wrong")
+        greeter.robot_name("linked-wrong")
     );
     let cases = [
         (
@@ -314,52 +331,55 @@ pub fn what_a_stub_cannot_do_is_said(ros: RosVersion) -> Verdict {
     let argv = greeter.argv("wrong", &[]);
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
     for (toml, executable, said) in cases {
-        let mut stub = site.stub_with(&toml, package, executable, &argv)?;
-        let status = stub.ends()?;
+        let mut stub = site.start_stub_with_config(&toml, package, executable, &argv)?;
+        let status = stub.wait_for_exit()?;
         ensure!(
-            status.code() == Some(1) && stub.said().contains(said),
+            status.code() == Some(1) && stub.output().contains(said),
             "{said}: {status}\n{}",
-            stub.said()
+            stub.output()
         );
     }
-    // A node that ends takes its stub along, with its status.
-    let robot = &*adder.robot("linked-ended");
+    // The end of a node ends its stub, with its exit status.
+    let robot = &*adder.robot_name("linked-ended");
     let argv = adder.argv("adder", &[]);
     let mut stub = adder.stub(&site, (&daemon.address, robot), "", &argv)?;
-    let app = site.joins("/app")?;
-    with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
+    let app = site.join("/app")?;
+    with_log(
+        site.wait_for_graph(&app, "the service", has_service("/add_two")),
+        &stub,
+    )?;
     let servant = daemon.servant_of(adder.service.name, robot)?;
     let pid = servant["pids"][0].as_i64().context("its process")?;
     nix::sys::signal::kill(
         nix::unistd::Pid::from_raw(i32::try_from(pid)?),
         Signal::SIGKILL,
     )?;
-    let status = stub.ends()?;
+    let status = stub.wait_for_exit()?;
     ensure!(
         std::os::unix::process::ExitStatusExt::signal(&status) == Some(9),
         "{status}: {}",
-        stub.said()
+        stub.output()
     );
-    // With it goes all that it had.
-    site.until(&app, "its end", |graph| !serves("/add_two")(graph))?;
+    // All its registrations disappear with it.
+    site.wait_for_graph(&app, "its end", |graph| !has_service("/add_two")(graph))?;
     Ok(())
 }
 
 pub fn the_robot_s_master_starts_again() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let mut site = Site::new()?;
-    let stub = site.stub(&daemon, THE_GREETER, "linked-master", &["__name:=greeter"])?;
+    let stub = site.start_stub(&daemon, THE_GREETER, "linked-master", &["__name:=greeter"])?;
     let before = {
         let app = site.node("/app")?;
         let graph = with_log(
-            site.until(&app, "the service", serves("/greeter/count")),
+            site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
             &stub,
         )?;
-        site.until(&app, "all of it", |graph| {
-            registered(graph, "/greeter").len() == 6
+        site.wait_for_graph(&app, "all of it", |graph| {
+            registrations(graph, "/greeter").len() == 6
         })?;
-        registered(&app.graph().borrow(), "/greeter")
-            .union(&registered(&graph, "/greeter"))
+        registrations(&app.graph().borrow(), "/greeter")
+            .union(&registrations(&graph, "/greeter"))
             .cloned()
             .collect::<BTreeSet<_>>()
     };
@@ -367,8 +387,8 @@ pub fn the_robot_s_master_starts_again() -> Verdict {
     site.start_master()?;
     let app = site.node("/app")?;
     with_log(
-        site.until(&app, "the same graph", |graph| {
-            registered(graph, "/greeter") == before
+        site.wait_for_graph(&app, "the same graph", |graph| {
+            registrations(graph, "/greeter") == before
         }),
         &stub,
     )?;
@@ -377,97 +397,103 @@ pub fn the_robot_s_master_starts_again() -> Verdict {
 
 pub fn a_connection_that_falls_silent_is_replaced(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
-    let daemon = world().with(twin.service)?;
+    let daemon = world().daemon_with(twin.service)?;
     let freezer = Freezer::new(&daemon.address)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
     let server = freezer.server.to_string();
-    let robot = twin.robot("linked-silent");
+    let robot = twin.robot_name("linked-silent");
     let argv = twin.argv("greeter", &[("~name", "/who")]);
-    // It would be given up ten times T_max after it fell silent.
+    // The link is given up ten times T_max after it fell silent.
     let max = scale_seconds(2);
     let settings = format!("desire = 1.0\nmax = {max}.0\n");
     let stub = twin.stub(&site, (&server, &robot), &settings, &argv)?;
     with_log(
-        site.until(&app, "the service", serves("/greeter/count")),
+        site.wait_for_graph(&app, "the service", has_service("/greeter/count")),
         &stub,
     )?;
-    let names = site.says(&app, "/who", false)?;
-    let say = |name: &str| names.publish(string_of(WireFormat::of(ros), name));
-    site.connected(&*names, 1)?;
-    let mut greetings = site.hears(&app, "/greeter/greeting")?;
-    site.fed(&greetings, 1)?;
+    let names = site.advertise_strings(&app, "/who", false)?;
+    let say = |name: &str| names.publish(string_in(WireFormat::for_version(ros), name));
+    site.wait_for_subscribers(&*names, 1)?;
+    let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
+    site.wait_for_publishers(&greetings, 1)?;
     say("first");
-    with_log(site.next(&mut greetings), &stub)?;
+    with_log(site.next_message(&mut greetings), &stub)?;
     ensure!(freezer.freeze() == 1, "one connection carries it");
-    // What is sent meanwhile is not lost: the same node hears it.
+    // Messages sent meanwhile are not lost: the same node receives them.
     say("second");
-    // roscpp may give whoever has just connected the latched one twice.
-    while !text(&with_log(site.next(&mut greetings), &stub)?.bytes).contains("second") {}
-    let count = with_log(count(&site, &app, "/greeter"), &stub)?;
+    // roscpp may deliver the latched message twice to a late subscriber.
+    while !to_text(&with_log(site.next_message(&mut greetings), &stub)?.bytes).contains("second") {}
+    let count = with_log(greeting_count(&site, &app, "/greeter"), &stub)?;
     ensure!(count == 2, "{count}");
-    let said = stub.said();
+    let said = stub.output();
+    ensure!(said.contains("is silent, a new one replaces it"), "{said}");
     ensure!(
-        said.contains("is silent, another takes its place"),
+        !said.contains("nothing was received from the other end"),
         "{said}"
     );
-    ensure!(!said.contains("nothing came from the other end"), "{said}");
     Ok(())
 }
 
 pub fn one_message_right_after_connecting_is_not_lost(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
     for round in 0..5 {
-        // Each time another servant, whose node has heard nothing yet.
-        let robot = twin.robot(&format!("linked-once-{round}"));
+        // A new servant each time, whose node has not received anything yet.
+        let robot = twin.robot_name(&format!("linked-once-{round}"));
         let argv = twin.argv("greeter", &[("~name", "/who")]);
-        // The application is there first, as often; or it comes to a stub that is.
-        let early = site.says(&app, "/who", false)?;
+        // In half of the rounds the application starts first, in the others the stub does.
+        let early = site.advertise_strings(&app, "/who", false)?;
         let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
         let names = if round % 2 == 0 {
             early
         } else {
             drop(early);
-            site.until(&app, "the service", serves("/greeter/count"))?;
-            site.says(&app, "/who", false)?
+            site.wait_for_graph(&app, "the service", has_service("/greeter/count"))?;
+            site.advertise_strings(&app, "/who", false)?
         };
-        with_log(site.connected(&*names, 1), &stub)?;
-        names.publish(string_of(WireFormat::of(ros), "only"));
-        site.until(&app, "the service", serves("/greeter/count"))?;
-        support::until("a greeting of what was said at once", || {
-            let greeted = with_log(count(&site, &app, "/greeter"), &stub)?;
-            let lost = || format!("{greeted} in round {round}:\n{}", stub.said());
+        with_log(site.wait_for_subscribers(&*names, 1), &stub)?;
+        names.publish(string_in(WireFormat::for_version(ros), "only"));
+        site.wait_for_graph(&app, "the service", has_service("/greeter/count"))?;
+        support::wait_until("a greeting of what was said at once", || {
+            let greeted = with_log(greeting_count(&site, &app, "/greeter"), &stub)?;
+            let lost = || format!("{greeted} in round {round}:\n{}", stub.output());
             Ok((greeted == 1).then_some(()).ok_or_else(lost))
         })?;
         let mut stub = stub;
         stub.signal(Signal::SIGINT)?;
-        stub.ends()?;
+        stub.wait_for_exit()?;
     }
     Ok(())
 }
 
 pub fn who_has_just_connected_hears_what_the_node_answers(ros: RosVersion) -> Verdict {
     let twin = Twin::adder(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = twin.robot("linked-newcomer");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = twin.robot_name("linked-newcomer");
     let argv = twin.argv("adder", &[]);
     let stub = twin.stub(&site, (&daemon.address, &robot), "", &argv)?;
-    with_log(site.until(&app, "the service", serves("/add_two")), &stub)?;
+    with_log(
+        site.wait_for_graph(&app, "the service", has_service("/add_two")),
+        &stub,
+    )?;
     for number in 1..=10_i64 {
-        // Nobody listens yet: in the cloud the node is subscribed to from now on.
-        let app = site.joins(&format!("/app{number}"))?;
-        let mut sums = site.hears(&app, "/sums")?;
-        site.fed(&sums, 1)?;
-        with_log(site.calls(&app, "/add_two", &sum(ros, number)), &stub)?;
-        let told = with_log(site.next(&mut sums), &stub)
+        // Without subscribers on the robot: from now on the node in the cloud is subscribed.
+        let app = site.join(&format!("/app{number}"))?;
+        let mut sums = site.subscribe(&app, "/sums")?;
+        site.wait_for_publishers(&sums, 1)?;
+        with_log(
+            site.call_service(&app, "/add_two", &sum_request(ros, number)),
+            &stub,
+        )?;
+        let told = with_log(site.next_message(&mut sums), &stub)
             .with_context(|| format!("sum {number} was not heard"))?;
         ensure!(
-            text_of(ros, &told.bytes, 0)? == number.to_string(),
+            string_text(ros, &told.bytes, 0)? == number.to_string(),
             "{told:?}"
         );
         drop(sums);

@@ -1,4 +1,4 @@
-//! What a server of metrics reads.
+//! Metrics as monitoring servers read them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
@@ -13,7 +13,7 @@ use support::{Verdict, binaries};
 const LIST: &str = include_str!("../../docs/metrics.md");
 const DASHBOARD: &str = include_str!("../../grafana/cloudroid.json");
 
-/// Prints the families that Prometheus's own readers of both formats find, as JSON.
+/// Prints as JSON the metric families that Prometheus's own parsers of both formats find.
 const READER: &str = r#"
 import json, sys
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as open_metrics
@@ -25,20 +25,21 @@ print(json.dumps([
     for one in read(open(sys.argv[2]).read())]))
 "#;
 
-/// What a reader that is not ours understands.
-fn read(format: &str, text: &str) -> anyhow::Result<Vec<Value>> {
+/// Returns what an independent parser finds.
+fn read_with_parser(format: &str, text: &str) -> anyhow::Result<Vec<Value>> {
     let place = world().directory("metrics")?;
     let file = place.path().join("metrics");
     std::fs::write(&file, text)?;
     let mut reader = Command::new(binaries::readers().join("python"));
     reader.args(["-c", READER, format]).arg(&file);
     Ok(serde_json::from_str(
-        &run(&mut reader)?.succeeded()?.stdout,
+        &run(&mut reader)?.expect_success()?.stdout,
     )?)
 }
 
-/// Name, type, what it is, and labels, as the list has them.
-fn listed() -> BTreeMap<&'static str, (&'static str, &'static str, BTreeSet<&'static str>)> {
+/// Returns name, type, meaning and labels of the documented metrics.
+fn documented_metrics()
+-> BTreeMap<&'static str, (&'static str, &'static str, BTreeSet<&'static str>)> {
     let rows = LIST.lines().filter_map(|line| line.strip_prefix("| `"));
     rows.filter_map(|row| {
         let cells: Vec<&str> = row.trim_end_matches(" |").split(" | ").collect();
@@ -52,23 +53,23 @@ fn listed() -> BTreeMap<&'static str, (&'static str, &'static str, BTreeSet<&'st
     .collect()
 }
 
-fn asks(daemon: &Daemon, accept: &str) -> anyhow::Result<String> {
+fn get_metrics(daemon: &Daemon, accept: &str) -> anyhow::Result<String> {
     let (status, text) = daemon.request("GET", "/metrics", &[("Accept", accept)])?;
     ensure!(status == 200, "{text}");
     Ok(text)
 }
 
 pub fn every_metric_is_listed_and_read_by_others() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let mut robot = daemon.robot("adder_py?robot=counted")?;
-    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["result"] == true);
-    let open = asks(
+    ensure!(robot.call("/add_two", json!({"a": 1, "b": 1}))?["result"] == true);
+    let open = get_metrics(
         &daemon,
         "application/openmetrics-text;version=1.0.0,text/plain;q=0.5",
     )?;
     ensure!(open.ends_with("# EOF\n"), "it may be half of an answer");
-    let listed = listed();
-    let families = read("open", &open)?;
+    let listed = documented_metrics();
+    let families = read_with_parser("open", &open)?;
     ensure!(families.len() > 40, "{families:?}");
     for family in &families {
         let name = family["name"].as_str().context("a name")?;
@@ -89,7 +90,7 @@ pub fn every_metric_is_listed_and_read_by_others() -> Verdict {
         .iter()
         .filter_map(|family| family["name"].as_str())
         .collect();
-    // These are of a daemon that speaks TLS.
+    // Only a daemon with TLS has these.
     let of_tls = [
         "cloudroid_refused_handshakes",
         "cloudroid_certificate_end_seconds",
@@ -105,15 +106,15 @@ pub fn every_metric_is_listed_and_read_by_others() -> Verdict {
         found.and_then(|family| family["values"].as_u64())
     };
     ensure!(count(&families, "cloudroid_request_seconds") > Some(10));
-    // The same figures for those who know the older format alone.
-    let older = read("prometheus", &asks(&daemon, "text/plain")?)?;
+    // The same metrics in the older format.
+    let older = read_with_parser("prometheus", &get_metrics(&daemon, "text/plain")?)?;
     ensure!(older.len() == families.len(), "{older:?}");
     Ok(())
 }
 
 pub fn the_dashboard_asks_for_what_there_is() -> Verdict {
     let dashboard: Value = serde_json::from_str(DASHBOARD)?;
-    let listed = listed();
+    let listed = documented_metrics();
     let panels = dashboard["panels"].as_array().context("panels")?;
     let mut asked = BTreeSet::new();
     for panel in panels.iter().filter(|panel| panel["type"] != "row") {

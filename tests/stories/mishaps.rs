@@ -1,4 +1,4 @@
-//! What goes wrong on a robot: each thing is named, with its reason and what to do.
+//! Failures on a robot: each is reported with its reason and a remedy.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt;
@@ -11,15 +11,15 @@ use ros::bus::{Bus, RosVersion, WireFormat};
 use support::daemon::Daemon;
 use support::deployer::path_str;
 use support::machine::{Machine, free_port};
-use support::site::{Running, Site, string_of};
+use support::site::{NodeProcess, Site, string_in};
 use support::twins::Twin;
 use support::world::{TELLER, world};
 use support::{Verdict, binaries, procfs};
 
-/// The stub ends with status 1 and has said all of `words`.
-fn refused(mut stub: Running, words: &[&str]) -> Verdict {
-    let status = stub.ends()?;
-    let said = stub.said();
+/// Checks that the stub exits with status 1 and has printed all of `words`.
+fn expect_refused(mut stub: NodeProcess, words: &[&str]) -> Verdict {
+    let status = stub.wait_for_exit()?;
+    let said = stub.output();
     ensure!(status.code() == Some(1), "{status}: {said}");
     for word in words {
         ensure!(said.contains(word), "{word:?} was not said, but:\n{said}");
@@ -27,25 +27,25 @@ fn refused(mut stub: Running, words: &[&str]) -> Verdict {
     Ok(())
 }
 
-/// A package whose node latches what it says at its beginning, and how variants of it differ.
-struct Variants {
+/// A package whose node latches a message at startup, and changes that create variants of it.
+struct PackageVariants {
     package: &'static str,
-    /// The service that they are pushed as.
+    /// Service as which they are pushed.
     service: &'static str,
     executable: &'static str,
-    /// The node's text, and where it says it.
+    /// Source of the node, and the topic of the message.
     file: &'static str,
     topic: &'static str,
-    /// One parameter more.
+    /// A change that adds a parameter.
     another_parameter: &'static [(&'static str, &'static str)],
-    /// The topic has another type.
+    /// A change of the topic's type.
     another_type: &'static [(&'static str, &'static str)],
     /// The two types.
     types: [&'static str; 2],
 }
 
-impl Variants {
-    fn of(ros: RosVersion) -> Self {
+impl PackageVariants {
+    fn for_ros(ros: RosVersion) -> Self {
         match ros {
             RosVersion::One => Self {
                 package: "teller_py",
@@ -81,8 +81,8 @@ impl Variants {
         }
     }
 
-    /// Pushes the package with these changes of its node.
-    fn pushes(&self, daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
+    /// Pushes the package with these changes of its source.
+    fn push(&self, daemon: &Daemon, changes: &[(&str, &str)]) -> Verdict {
         let place = world().directory(self.package)?;
         let original = binaries::package(self.package);
         let copied = std::process::Command::new("cp")
@@ -105,12 +105,12 @@ impl Variants {
             "--node",
             self.executable,
         ];
-        daemon.deployer().types(&words)?.succeeded().map(drop)
+        daemon.deployer().run(&words)?.expect_success().map(drop)
     }
 }
 
-fn revision_of(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
-    let servants = daemon.deployer().asks(&["servants"])?;
+fn servant_revision(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
+    let servants = daemon.deployer().run_json(&["servants"])?;
     let all = servants.as_array().context("a list")?;
     let mut mine = all.iter().filter(|servant| servant["robot"] == robot);
     let revision = mine.find_map(|servant| servant["revision"].as_u64());
@@ -118,39 +118,41 @@ fn revision_of(daemon: &Daemon, robot: &str) -> anyhow::Result<u64> {
 }
 
 pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs(ros: RosVersion) -> Verdict {
-    let daemon = world().shared()?;
-    let variants = Variants::of(ros);
+    let daemon = world().ensure_shared()?;
+    let variants = PackageVariants::for_ros(ros);
     let service = variants.service;
-    variants.pushes(&daemon, &[])?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
+    variants.push(&daemon, &[])?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
     let robot = &*format!("mishap-revisions-{}", ros.number());
     let settings = format!("robot = \"{robot}\"\nlocal = \"none\"\n");
-    let overlay = site.installs(&daemon, service, &settings)?;
-    let start = || site.runs(&overlay, variants.package, variants.executable, &[]);
-    let speaks = |stub: &Running| -> Verdict {
-        let mut told = site.hears_latched(&app, variants.topic)?;
-        let told = site.next(&mut told).with_context(|| stub.said())?;
+    let overlay = site.install_stub(&daemon, service, &settings)?;
+    let start = || site.start_installed(&overlay, variants.package, variants.executable, &[]);
+    let speaks = |stub: &NodeProcess| -> Verdict {
+        let mut told = site.subscribe_latched(&app, variants.topic)?;
+        let told = site
+            .next_message(&mut told)
+            .with_context(|| stub.output())?;
         ensure!(told.wire_type.name == variants.types[0], "{told:?}");
         Ok(())
     };
     let stops = || -> Verdict {
         let words = ["stop", "--service", service];
-        daemon.deployer().types(&words)?.succeeded().map(drop)
+        daemon.deployer().run(&words)?.expect_success().map(drop)
     };
     let first = start()?;
     speaks(&first)?;
-    // Another parameter breaks nothing: whoever runs goes on, and whoever starts does so with the new revision.
-    variants.pushes(&daemon, variants.another_parameter)?;
+    // A further parameter is compatible: running stubs continue, and new ones use the new revision.
+    variants.push(&daemon, variants.another_parameter)?;
     speaks(&first)?;
-    ensure!(revision_of(&daemon, robot)? == 1);
+    ensure!(servant_revision(&daemon, robot)? == 1);
     drop(first);
     stops()?;
     let second = start()?;
     speaks(&second)?;
-    ensure!(revision_of(&daemon, robot)? == 2);
-    // Another type does.
-    variants.pushes(&daemon, variants.another_type)?;
+    ensure!(servant_revision(&daemon, robot)? == 2);
+    // Another type is incompatible.
+    variants.push(&daemon, variants.another_type)?;
     speaks(&second)?;
     drop(second);
     stops()?;
@@ -159,23 +161,23 @@ pub fn a_later_revision_is_gone_on_with_unless_its_interface_differs(ros: RosVer
         "output topic {} was a {before} and is a {after}",
         variants.topic
     );
-    refused(
+    expect_refused(
         start()?,
         &[
-            &format!("{service} is at revision 3, this robot's stub was made of revision 1"),
+            &format!("{service} is at revision 3, but this robot's stub was made from revision 1"),
             &differs,
             &format!("install the stub again from /stubs/{service}.tar.gz"),
         ],
     )?;
-    // Going back is the other way.
+    // A rollback is the other remedy.
     let back = ["rollback", service, "2"];
-    daemon.deployer().types(&back)?.succeeded()?;
+    daemon.deployer().run(&back)?.expect_success()?;
     speaks(&start()?)
 }
 
 pub fn another_version_of_the_protocol_is_named() -> Verdict {
-    let daemon = world().with(TELLER)?;
-    // One of a stub that was installed before, and one that does not exist yet.
+    let daemon = world().daemon_with(TELLER)?;
+    // A stub that was installed earlier, and one from the future.
     for version in ["cloudroid-link.v1", "cloudroid-link.v9"] {
         let (status, body) = daemon.request(
             "GET",
@@ -199,28 +201,28 @@ pub fn another_version_of_the_protocol_is_named() -> Verdict {
 
 pub fn a_wrong_token_is_named(ros: RosVersion) -> Verdict {
     let daemon = world()
-        .own(&format!("mishap-token-{}", ros.number()))
+        .setup(&format!("mishap-token-{}", ros.number()))
         .config("tokens = [\"open sesame\"]\n[tls]\nserve = \"plain-text-beyond-loopback\"\n")
         .listen("0.0.0.0:0")
         .start()?;
     let port = daemon.address.rsplit(':').next().context("a port")?;
-    let site = Site::of(ros)?;
+    let site = Site::with_ros(ros)?;
     let stub = |token: &str| {
         let toml = format!(
             "server = \"ws://127.0.0.1:{port}\"\nservice = \"any\"\nrobot = \"mishap\"\nlocal = \"none\"\n{token}"
         );
-        site.stub_with(&toml, "any", "node", &[])
+        site.start_stub_with_config(&toml, "any", "node", &[])
     };
-    refused(
+    expect_refused(
         stub("token = \"wrong\"\n")?,
         &["401", "token", "install.sh --token"],
     )?;
-    refused(stub("")?, &["401", "token", "install.sh --token"])?;
-    // The right one gets further.
-    refused(stub("token = \"open sesame\"\n")?, &["404", "any"])
+    expect_refused(stub("")?, &["401", "token", "install.sh --token"])?;
+    // With the right token it gets further.
+    expect_refused(stub("token = \"open sesame\"\n")?, &["404", "any"])
 }
 
-/// Runs a program as if this machine had been booted another time: by that it is known to be another.
+/// Runs a program as on another machine, which is identified by its boot id.
 const ELSEWHERE: &str = r#"#!/bin/sh
 exec unshare --mount --propagation private sh -ec '
   mount --bind "${0%/*}/boot_id" /proc/sys/kernel/random/boot_id
@@ -230,21 +232,21 @@ exec unshare --mount --propagation private sh -ec '
 pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
     let (service, package, executable) = twin.names();
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = &*twin.robot("mishap-duplicates");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = &*twin.robot_name("mishap-duplicates");
     let argv = twin.argv("greeter", &[("~name", "/who")]);
     let stub = twin.stub(&site, (&daemon.address, robot), "", &argv)?;
     let answers = || -> Verdict {
-        let names = site.says(&app, "/who", false)?;
-        site.connected(&*names, 1)?;
-        let mut greetings = site.hears(&app, "/greeter/greeting")?;
-        site.fed(&greetings, 1)?;
-        names.publish(string_of(WireFormat::of(ros), "robot"));
-        site.next(&mut greetings).map(drop)
+        let names = site.advertise_strings(&app, "/who", false)?;
+        site.wait_for_subscribers(&*names, 1)?;
+        let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
+        site.wait_for_publishers(&greetings, 1)?;
+        names.publish(string_in(WireFormat::for_version(ros), "robot"));
+        site.next_message(&mut greetings).map(drop)
     };
-    answers().with_context(|| stub.said())?;
+    answers().with_context(|| stub.output())?;
     // Another machine has another id, and a ROS system of its own.
     let place = world().directory("elsewhere")?;
     let elsewhere = place.path().join("run");
@@ -252,15 +254,15 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
     std::fs::set_permissions(&elsewhere, Permissions::from_mode(0o755))?;
     let boot = "01234567-89ab-4def-8123-456789abcdef\n";
     std::fs::write(place.path().join("boot_id"), boot)?;
-    let other = Site::of(ros)?;
+    let other = Site::with_ros(ros)?;
     let settings = format!("robot = \"{robot}\"\nlocal = \"none\"\n");
-    let overlay = other.installs(&daemon, service, &settings)?;
+    let overlay = other.install_stub(&daemon, service, &settings)?;
     let start = |node: &str| {
         let argv = twin.argv(node, &[("~name", "/who")]);
         let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
-        other.emulates(path_str(&elsewhere), &overlay, package, executable, &argv)
+        other.start_emulated(path_str(&elsewhere), &overlay, package, executable, &argv)
     };
-    refused(
+    expect_refused(
         start("greeter")?,
         &[
             ") is connected as this robot and runs /greeter; give one of them another id",
@@ -268,18 +270,18 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
         ],
     )?;
     answers().context("the first goes on")?;
-    // Another node of the package would share the servant: both sides and the server say so.
+    // Another node of the package would share the servant: both sides and the server report it.
     let neighbour = start("other")?;
     for stub in [&neighbour, &stub] {
-        stub.says("two machines are connected as this robot: ")?;
-        let said = stub.said();
+        stub.wait_for_output("two machines are connected as this robot: ")?;
+        let said = stub.output();
         ensure!(
             said.contains(" runs /other") && said.contains("CLOUDROID_ROBOT"),
             "{said}"
         );
     }
     let path = format!("/api/v1/robots/{robot}/explain");
-    daemon.awaits(&path, "an event of two robots", |told| {
+    daemon.wait_for(&path, "an event of two robots", |told| {
         let mut events = told["events"].as_array()?.iter();
         let told = events.any(|event| event["kind"] == "duplicate-robot");
         told.then_some(())
@@ -287,7 +289,7 @@ pub fn two_robots_with_one_id_are_told(ros: RosVersion) -> Verdict {
 }
 
 pub fn parameters_that_cannot_be_carried_are_named_and_the_others_arrive() -> Verdict {
-    let daemon = world().with(TELLER)?;
+    let daemon = world().daemon_with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
     let port = free_port()?;
     let script = format!(
@@ -318,20 +320,20 @@ until rosnode list 2> /dev/null | grep /teller; do kill -0 $node; sleep 0.1; don
 kill -INT $node; wait $node || true
 cat said"#
     );
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    let outcome = machine.run_script("bash", &script)?.expect_success()?;
     for words in [
         "word hello, number nan",
         ", key as bytes",
-        "parameter /teller/big has a value that XML-RPC cannot carry",
-        "parameter /odd/big has a value that XML-RPC cannot carry",
+        "parameter /teller/big has a value that XML-RPC cannot represent",
+        "parameter /odd/big has a value that XML-RPC cannot represent",
         "rosparam delete /odd/big",
-        "then start this node again",
+        "then restart this node",
         "\n/teller\n",
     ] {
         ensure!(
             outcome.stdout.contains(words),
             "{words:?}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(())
@@ -340,44 +342,47 @@ cat said"#
 pub fn a_missing_original_is_said_once_and_the_cloud_goes_on(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
     let (service, package, executable) = twin.names();
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    // No answer is as quick, so each counts as late and the local original is wanted.
-    let robot = twin.robot("mishap-missing");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    // No answer is fast enough, so each one counts as late and the local original is needed.
+    let robot = twin.robot_name("mishap-missing");
     let settings = format!("robot = \"{robot}\"\ndesire = 0.000001\nmax = 0.000002\n");
-    let overlay = site.installs(&daemon, service, &settings)?;
+    let overlay = site.install_stub(&daemon, service, &settings)?;
     let argv = twin.argv("greeter", &[("~name", "/who")]);
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
-    let stub = site.runs(&overlay, package, executable, &argv)?;
-    let names = site.says(&app, "/who", false)?;
-    site.connected(&*names, 1).with_context(|| stub.said())?;
-    let mut greetings = site.hears(&app, "/greeter/greeting")?;
-    site.fed(&greetings, 1).with_context(|| stub.said())?;
+    let stub = site.start_installed(&overlay, package, executable, &argv)?;
+    let names = site.advertise_strings(&app, "/who", false)?;
+    site.wait_for_subscribers(&*names, 1)
+        .with_context(|| stub.output())?;
+    let mut greetings = site.subscribe(&app, "/greeter/greeting")?;
+    site.wait_for_publishers(&greetings, 1)
+        .with_context(|| stub.output())?;
     for number in 0..8 {
-        let name = string_of(WireFormat::of(ros), &format!("robot {number}"));
+        let name = string_in(WireFormat::for_version(ros), &format!("robot {number}"));
         names.publish(name);
-        site.next(&mut greetings).with_context(|| stub.said())?;
+        site.next_message(&mut greetings)
+            .with_context(|| stub.output())?;
     }
-    stub.says("there is no local original")?;
-    let said = stub.said();
+    stub.wait_for_output("there is no local original")?;
+    let said = stub.output();
     let times = said.matches("there is no local original").count();
     ensure!(times == 1, "{times} times: {said}");
     Ok(())
 }
 
-/// A greeter and its original as they are installed on a robot, with these variables in their environment.
-fn installed(
+/// Starts a greeter and its original, as installed on a robot, with these environment variables.
+fn start_installed_greeter(
     site: &Site,
     daemon: &Daemon,
     twin: &Twin,
     settings: &str,
     variables: &[(&str, &str)],
-) -> anyhow::Result<Running> {
+) -> anyhow::Result<NodeProcess> {
     let (service, package, executable) = twin.names();
-    let overlay = site.installs(daemon, service, settings)?;
+    let overlay = site.install_stub(daemon, service, settings)?;
     let program = twin.program();
-    let workspace = site.installs_original(daemon, service, (package, executable), &program)?;
+    let workspace = site.install_original(daemon, service, (package, executable), &program)?;
     let prefixes = format!("{}:{}", overlay.display(), workspace.display());
     let workspaces = match twin.ros {
         RosVersion::One => "CMAKE_PREFIX_PATH",
@@ -390,26 +395,29 @@ fn installed(
     .concat();
     let argv = twin.argv("greeter", &[("~name", "/who")]);
     let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
-    site.runs_among(&variables, &overlay, package, executable, &argv)
+    site.start_installed_with_environment(&variables, &overlay, package, executable, &argv)
 }
 
-/// Names somebody until a greeter of whichever side answers.
-fn is_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &Running) -> Verdict {
-    let names = site.says(app, "/who", false)?;
-    let mut greetings = site.hears(app, "/greeter/greeting")?;
+/// Publishes names until a greeter on either side answers.
+fn wait_until_greeted(site: &Site, app: &Arc<dyn Bus>, stub: &NodeProcess) -> Verdict {
+    let names = site.advertise_strings(app, "/who", false)?;
+    let mut greetings = site.subscribe(app, "/greeter/greeting")?;
     let mut number = 0;
     let ask = || {
         number += 1;
         let name = format!("robot {number}");
-        names.publish(string_of(WireFormat::of(site.system.version()), &name));
+        names.publish(string_in(
+            WireFormat::for_version(site.system.version()),
+            &name,
+        ));
         Ok(())
     };
-    let greeted = site.asks_until(&mut greetings, ask, |_| Ok(true));
-    greeted.map(drop).with_context(|| stub.said())
+    let greeted = site.ask_until(&mut greetings, ask, |_| Ok(true));
+    greeted.map(drop).with_context(|| stub.output())
 }
 
-/// The original that a stub has started, once it is more than the shell that starts it.
-fn original_of(stub: &Running, program: &str) -> Option<i32> {
+/// Returns the original that a stub has started, once its shell has executed it.
+fn find_original(stub: &NodeProcess, program: &str) -> Option<i32> {
     let path = format!("/proc/{0}/task/{0}/children", stub.pid());
     let children = std::fs::read_to_string(path).ok()?;
     let mut children = children
@@ -417,39 +425,39 @@ fn original_of(stub: &Running, program: &str) -> Option<i32> {
         .filter_map(|pid| pid.parse().ok());
     children.find(|pid| {
         let line = procfs::command_line(*pid).unwrap_or_default();
-        // An interpreter may stand before it.
+        // It may be preceded by an interpreter.
         line.split(' ').take(2).any(|word| word == program)
     })
 }
 
 pub fn an_original_that_crashes_is_told_and_started_again(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let robot = twin.robot("mishap-crash-here");
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let robot = twin.robot_name("mishap-crash-here");
     let settings = format!("robot = \"{robot}\"\nlocal = \"warm\"\ndesire = 60.0\nmax = 60.0\n");
-    let stub = installed(&site, &daemon, &twin, &settings, &[])?;
-    is_greeted(&site, &app, &stub)?;
+    let stub = start_installed_greeter(&site, &daemon, &twin, &settings, &[])?;
+    wait_until_greeted(&site, &app, &stub)?;
     let program = twin.program();
     let runs = |but: i32| {
-        support::until("an original", || {
-            let runs = original_of(&stub, &program).filter(|pid| *pid != but);
-            Ok(runs.ok_or_else(|| stub.said()))
+        support::wait_until("an original", || {
+            let runs = find_original(&stub, &program).filter(|pid| *pid != but);
+            Ok(runs.ok_or_else(|| stub.output()))
         })
     };
     let first = runs(0)?;
     kill(Pid::from_raw(first), Signal::SIGKILL)?;
     let second = runs(first)?;
-    let said = stub.said();
+    let said = stub.output();
     ensure!(
         said.matches("the local original ended").count() == 1 && said.contains("signal: 9"),
         "{said}"
     );
-    is_greeted(&site, &app, &stub)?;
-    // It ends with a stub that is killed.
+    wait_until_greeted(&site, &app, &stub)?;
+    // The original ends if its stub is killed.
     stub.signal(Signal::SIGKILL)?;
-    support::until("its end", || {
+    support::wait_until("its end", || {
         let line = procfs::command_line(second).filter(|line| !line.is_empty());
         Ok(line.map_or(Ok(()), Err))
     })
@@ -488,11 +496,11 @@ echo "crashes: $(grep -c 'the local original ended' log)"
 "#;
 
 pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
-    let daemon = world().with(TELLER)?;
+    let daemon = world().daemon_with(TELLER)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
-    machine.has_teller()?;
+    machine.install_teller()?;
     let script = CRASH.replace("PORT", &free_port()?.to_string());
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    let outcome = machine.run_script("bash", &script)?.expect_success()?;
     for words in [
         "life 1 of /front/teller",
         "same group: yes",
@@ -500,13 +508,13 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
         "a Master of its own\n/front/teller\nanother",
         "another runs\nit ends with a stub that is killed\nnone is left\n",
         "signal: 9",
-        // That it ends with the launch is none.
+        // Its end with the launch is not a crash.
         "crashes: 1\n",
     ] {
         ensure!(
             outcome.stdout.contains(words),
             "{words:?}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(())
@@ -514,16 +522,16 @@ pub fn a_local_original_that_crashes_is_told_and_started_again() -> Verdict {
 
 pub fn a_service_that_is_gone_leaves_the_local_original(ros: RosVersion) -> Verdict {
     let twin = Twin::greeter(ros);
-    let daemon = world().with(twin.service)?;
-    let site = Site::of(ros)?;
-    let app = site.joins("/app")?;
-    let settings = format!("robot = \"{}\"\n", twin.robot("mishap-gone"));
+    let daemon = world().daemon_with(twin.service)?;
+    let site = Site::with_ros(ros)?;
+    let app = site.join("/app")?;
+    let settings = format!("robot = \"{}\"\n", twin.robot_name("mishap-gone"));
     let gone = [("CLOUDROID_SERVICE", "nobody")];
-    let stub = installed(&site, &daemon, &twin, &settings, &gone)?;
-    stub.says("running the local original instead")?;
-    ensure!(stub.said().contains("nobody"), "{}", stub.said());
-    is_greeted(&site, &app, &stub)?;
-    // What was the stub is the original now.
+    let stub = start_installed_greeter(&site, &daemon, &twin, &settings, &gone)?;
+    stub.wait_for_output("running the local original instead")?;
+    ensure!(stub.output().contains("nobody"), "{}", stub.output());
+    wait_until_greeted(&site, &app, &stub)?;
+    // The stub's process has become the original.
     let line = procfs::command_line(i32::try_from(stub.pid())?);
     let line = line.context("it runs")?;
     ensure!(line.contains(&twin.program()), "{line}");

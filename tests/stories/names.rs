@@ -1,11 +1,11 @@
-//! A robot finds its server by name: the stub's program is static, so it asks where the C library would.
+//! A robot finds its server by name: the stub's program is static, so it resolves names as the C library would.
 
 use anyhow::ensure;
 use support::Verdict;
 use support::machine::Machine;
 use support::world::{PEOPLE, world};
 
-/// A network of one machine: a card that exists as long as a program holds it, 10.9.8.7, with a web server there.
+/// A network with a single machine: a device that exists while a program holds it, 10.9.8.7, with a web server.
 const NETWORK: &str = r#"
 set -e
 PATH=$PATH:/usr/sbin:/sbin
@@ -34,16 +34,16 @@ asks() {
 mkdir /root/asked
 "#;
 
-/// What the doctor says of each name, asked in that network after `preparation`.
-fn said(preparation: &str, names: &[&str]) -> anyhow::Result<String> {
-    let machine = Machine::with_stub(&*world().with(PEOPLE)?, "opencv_apps")?;
+/// Returns the output of the doctor for each name in that network, after `preparation`.
+fn run_doctor(preparation: &str, names: &[&str]) -> anyhow::Result<String> {
+    let machine = Machine::with_stub(&*world().daemon_with(PEOPLE)?, "opencv_apps")?;
     let questions: Vec<String> = names.iter().map(|name| format!("asks {name}")).collect();
     let script = format!("{NETWORK}{preparation}\n{}", questions.join("\n"));
-    machine.puts_text("/root/inside.sh", &script)?;
+    machine.write_file("/root/inside.sh", &script)?;
     Ok(machine
-        .runs("sh", "unshare --net bash /root/inside.sh")?
-        .succeeded()?
-        .said())
+        .run_script("sh", "unshare --net bash /root/inside.sh")?
+        .expect_success()?
+        .output())
 }
 
 pub fn a_server_is_found_in_the_hosts_file_and_by_dns() -> Verdict {
@@ -55,7 +55,7 @@ dnsmasq --no-resolv --no-hosts --local=/#/ --host-record=brain.lab.example,10.9.
   --pid-file=/root/dnsmasq.pid --listen-address=127.0.0.1 --bind-interfaces
 "#;
     let names = ["byhand", "brain", "brain.lab.example", "alias", "nobody"];
-    let said = said(dns, &names)?;
+    let said = run_doctor(dns, &names)?;
     for name in &names[..4] {
         let fine = format!("{name}: ok    server     ws://{name}:9090 answers");
         ensure!(said.contains(&fine), "{name}: {said}");
@@ -75,11 +75,12 @@ avahi-daemon --file /root/avahi.conf --no-drop-root --no-chroot > /root/avahi.lo
 until grep -q 'startup complete' /root/avahi.log && grep -q 'record for 10.9.8.7' /root/avahi.log; do kill -0 $! || { cat /root/avahi.log; exit 1; }; sleep 0.1; done
 "#;
     let names = ["brain.local", "nobody.local", "nobody"];
-    let said = said(avahi, &names)?;
+    let said = run_doctor(avahi, &names)?;
     for words in [
         "brain.local: ok    server     ws://brain.local:9090 answers",
-        "nobody.local: FAIL  server     nobody.local is not found: host nobody.local has no address: nobody on this network",
-        "nobody: FAIL  server     nobody is not found: host nobody has no address: /etc/hosts does not name it",
+        "nobody.local: FAIL  server     nobody.local is not found: host nobody.local has no address: no host on this \
+            network",
+        "nobody: FAIL  server     nobody is not found: host nobody has no address: it is not in /etc/hosts",
     ] {
         ensure!(said.contains(words), "{words}: {said}");
     }

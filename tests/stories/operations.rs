@@ -1,4 +1,4 @@
-//! Every operation of rosbridge, with every grant: answered exactly where the table in docs/access.md says.
+//! Every operation of rosbridge with every grant: permitted exactly as the table in docs/access.md specifies.
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
@@ -6,14 +6,15 @@ use support::Verdict;
 use support::daemon::Daemon;
 use support::robot::Robot;
 
-use crate::access::{daemon, expired, pushes_adder, token};
+use crate::access::{create_token, daemon, expired_token, push_adder};
 
 const DOCUMENT: &str = include_str!("../../docs/access.md");
-/// What grants are for.
+/// Kinds of grants.
 const GRANTS: [&str; 4] = ["publish", "subscribe", "call", "advertise"];
 
-/// The operations, each with what it needs, as the document has it; a unit test holds it to those that are known.
-fn needs() -> anyhow::Result<Vec<(String, String)>> {
+/// Returns the operations and the grants that they need from the document, which a unit test compares with the known
+/// operations.
+fn documented_needs() -> anyhow::Result<Vec<(String, String)>> {
     let (_, table) = DOCUMENT
         .split_once("| operation | needs |\n")
         .context("the table of operations")?;
@@ -28,8 +29,8 @@ fn needs() -> anyhow::Result<Vec<(String, String)>> {
     Ok(rows)
 }
 
-/// A message of that operation which would be done where it is granted.
-fn message(operation: &str) -> anyhow::Result<Value> {
+/// Returns a message of an operation that would be executed if it is granted.
+fn sample_message(operation: &str) -> anyhow::Result<Value> {
     let names = match operation {
         "publish" => json!({"topic": "/said", "type": "std_msgs/String", "msg": {"data": "x"}}),
         "advertise" => json!({"topic": "/said", "type": "std_msgs/String"}),
@@ -62,30 +63,35 @@ fn message(operation: &str) -> anyhow::Result<Value> {
     Ok(message)
 }
 
-/// The same in the one fragment that it needs.
-fn fragmented(message: &Value) -> Value {
+/// Wraps a message in a single fragment.
+fn to_fragment(message: &Value) -> Value {
     json!({"op": "fragment", "id": "f", "num": 0, "total": 1, "data": message.to_string()})
 }
 
-/// Whether the message is refused to who sends it, for want of a grant.
+/// Returns whether the message is refused for lack of a grant.
 fn is_refused(robot: &mut Robot, message: Value) -> anyhow::Result<bool> {
-    robot.says(message)?;
+    robot.send(message)?;
     let not_heard = robot.has_not_heard(|said| said.to_string().contains("is not granted"))?;
     Ok(!not_heard)
 }
 
-/// Sends every operation over connections of their own, so that none depends on what was sent before it.
-fn walks(daemon: &Daemon, who: &str, path: &str, granted: &[&str]) -> anyhow::Result<usize> {
+/// Sends every operation on a connection of its own, so that none depends on earlier ones.
+fn try_operations(
+    daemon: &Daemon,
+    who: &str,
+    path: &str,
+    granted: &[&str],
+) -> anyhow::Result<usize> {
     let mut walked = 0;
-    for (operation, needs) in needs()? {
+    for (operation, needs) in documented_needs()? {
         if needs == "contents" {
             continue;
         }
-        let message = message(&operation)?;
+        let message = sample_message(&operation)?;
         let allowed = needs == "-" || granted.contains(&&*needs);
         for (message, form) in [
             (message.clone(), "bare"),
-            (fragmented(&message), "fragment"),
+            (to_fragment(&message), "fragment"),
         ] {
             let mut robot = daemon.robot(path)?;
             let refused = is_refused(&mut robot, message)
@@ -95,7 +101,7 @@ fn walks(daemon: &Daemon, who: &str, path: &str, granted: &[&str]) -> anyhow::Re
                 "{who}: {operation} ({form}), which needs {needs}, was {}",
                 if refused { "refused" } else { "done" }
             );
-            robot.leaves()?;
+            robot.leave()?;
             walked += 1;
         }
     }
@@ -108,20 +114,20 @@ pub fn every_operation_is_done_where_the_table_says() -> Verdict {
     let path = support::deployer::path_str(&adder);
     daemon
         .deployer()
-        .types(&["push", path, "--node", "adder.py"])?
-        .succeeded()?;
-    // On a machine whose configuration names nobody.
-    let mut walked = walks(&daemon, "local", "adder_py?robot=r0", &GRANTS)?;
-    let alice = token(
+        .run(&["push", path, "--node", "adder.py"])?
+        .expect_success()?;
+    // On a machine without principals.
+    let mut walked = try_operations(&daemon, "local", "adder_py?robot=r0", &GRANTS)?;
+    let alice = create_token(
         &daemon,
         &["alice", "--role", "deployer", "--service", "adder*"],
     )?;
-    pushes_adder(&daemon, &alice, &["--name", "adder_own"])?.succeeded()?;
+    push_adder(&daemon, &alice, &["--name", "adder_own"])?.expect_success()?;
     let own = format!("adder_own?robot=r3&token={alice}");
-    walked += walks(&daemon, "a deployer", &own, &GRANTS)?;
+    walked += try_operations(&daemon, "a deployer", &own, &GRANTS)?;
     for role in ["admin", "operator"] {
-        let token = token(&daemon, &[role, "--role", role])?;
-        walked += walks(
+        let token = create_token(&daemon, &[role, "--role", role])?;
+        walked += try_operations(
             &daemon,
             role,
             &format!("adder_py?robot={role}&token={token}"),
@@ -129,15 +135,15 @@ pub fn every_operation_is_done_where_the_table_says() -> Verdict {
         )?;
     }
     let robots = ["--role", "robot", "--service", "adder_py", "--robot"];
-    let named = |name: &str| token(&daemon, &[&[name], &robots[..], &[name]].concat());
+    let named = |name: &str| create_token(&daemon, &[&[name], &robots[..], &[name]].concat());
     let rover = named("rover")?;
-    walked += walks(
+    walked += try_operations(
         &daemon,
         "a robot",
         &format!("adder_py?token={rover}"),
         &GRANTS,
     )?;
-    // With one grant alone, with all but that, and for other names than those that are used.
+    // With a single grant, with all others, and with grants for other names.
     for one in GRANTS {
         let others: Vec<&str> = GRANTS.into_iter().filter(|other| *other != one).collect();
         for (name, granted, names) in [
@@ -151,14 +157,14 @@ pub fn every_operation_is_done_where_the_table_says() -> Verdict {
                 .collect();
             let mut allow = vec!["policy", "allow", &name];
             allow.extend(grants.iter().map(String::as_str));
-            daemon.deployer().types(&allow)?.succeeded()?;
-            walked += walks(&daemon, &name, &format!("adder_py?token={token}"), &granted)?;
+            daemon.deployer().run(&allow)?.expect_success()?;
+            walked += try_operations(&daemon, &name, &format!("adder_py?token={token}"), &granted)?;
         }
     }
     let elsewhere = named("elsewhere")?;
     let allow = ["policy", "allow", "elsewhere", "*:/other/**"];
-    daemon.deployer().types(&allow)?.succeeded()?;
-    walked += walks(
+    daemon.deployer().run(&allow)?.expect_success()?;
+    walked += try_operations(
         &daemon,
         "elsewhere",
         &format!("adder_py?token={elsewhere}"),
@@ -174,8 +180,8 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
     let path = support::deployer::path_str(&adder);
     daemon
         .deployer()
-        .types(&["push", path, "--node", "adder.py"])?
-        .succeeded()?;
+        .run(&["push", path, "--node", "adder.py"])?
+        .expect_success()?;
     let robot = |name: &str, robot: &str| {
         let words = [
             name,
@@ -186,20 +192,20 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
             "--robot",
             robot,
         ];
-        token(&daemon, &words)
+        create_token(&daemon, &words)
     };
     let another = robot("another", "r2")?;
     let over = robot("over", "r1")?;
     daemon
         .deployer()
-        .types(&["token", "revoke", "over"])?
-        .succeeded()?;
-    let expired = expired(&daemon)?;
-    let viewer = token(
+        .run(&["token", "revoke", "over"])?
+        .expect_success()?;
+    let expired = expired_token(&daemon)?;
+    let viewer = create_token(
         &daemon,
         &["eve", "--role", "viewer", "--service", "adder_py"],
     )?;
-    // At the door: as a query, which is checked as a header is.
+    // In the handshake, as a query, which is checked like a header.
     for (token, status) in [
         (&over, 401),
         (&expired, 401),
@@ -212,9 +218,9 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
         };
         ensure!(refusal.status == status, "{status}: {refusal}");
     }
-    // Within, where the first message is to say who it is: nothing else is.
-    for (operation, _) in needs()? {
-        let Ok(first) = message(&operation) else {
+    // On an open connection the first message must be auth, and all others are ignored.
+    for (operation, _) in documented_needs()? {
+        let Ok(first) = sample_message(&operation) else {
             continue;
         };
         let messages = match &*operation {
@@ -223,15 +229,15 @@ pub fn without_a_good_token_no_operation_is_heard() -> Verdict {
                 json!({"op": "auth", "mac": expired}),
                 json!({"op": "auth", "mac": another}),
                 json!({"op": "auth", "mac": viewer}),
-                fragmented(&json!({"op": "auth", "mac": another})),
+                to_fragment(&json!({"op": "auth", "mac": another})),
             ],
-            _ => vec![first.clone(), fragmented(&first)],
+            _ => vec![first.clone(), to_fragment(&first)],
         };
         for message in messages {
             let mut robot = daemon.robot("adder_py?robot=r1")?;
-            robot.says(message.clone())?;
+            robot.send(message.clone())?;
             let close = robot
-                .hears_close()
+                .wait_for_close()
                 .with_context(|| format!("after {message}"))?;
             ensure!(u16::from(close.code) == 1008, "{message}: {close:?}");
         }

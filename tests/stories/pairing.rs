@@ -1,4 +1,5 @@
-//! Robots with a key of their own: paired by a line, known by certificates that renew themselves, gone at a word.
+//! Robots with a key of their own: paired with a line of text, identified by certificates that renew themselves, and
+//! revoked with one command.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::PermissionsExt;
@@ -7,43 +8,45 @@ use std::process::{Command, Stdio};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, ensure};
-use support::daemon::{Daemon, Setup};
-use support::deployer::{Outcome, path_str, run};
+use support::daemon::{Daemon, DaemonSetup};
+use support::deployer::{CommandOutcome, path_str, run};
 use support::machine::Machine;
 use support::patience::{patience, scale_seconds};
-use support::site::{Running, Site};
+use support::site::{NodeProcess, Site};
 use support::world::{ADDER, TELLER, world};
-use support::{Verdict, binaries, until};
+use support::{Verdict, binaries, wait_until};
 
-/// On loopback, too, so that stories need no address of this machine.
+/// On loopback as well, so that stories need no other address of this machine.
 const TLS: &str = "[tls]\nserve = \"tls\"\n";
 
-fn secure(name: &str, more: &str) -> Setup {
-    world().own(name).config(&format!("{TLS}{more}"))
+fn secure_setup(name: &str, more: &str) -> DaemonSetup {
+    world().setup(name).config(&format!("{TLS}{more}"))
 }
 
-/// What `cloudroidctl pair` prints for a robot.
-fn line(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
-    let made = daemon.deployer().asks(&[&["pair"], arguments].concat())?;
+/// Returns the line that `cloudroidctl pair` prints for a robot.
+fn pairing_line(daemon: &Daemon, arguments: &[&str]) -> anyhow::Result<String> {
+    let made = daemon
+        .deployer()
+        .run_json(&[&["pair"], arguments].concat())?;
     Ok(made["line"].as_str().context("a line")?.to_owned())
 }
 
-/// A robot's directory, and what is typed there.
-struct Robot {
+/// A robot's identity directory, and the commands that use it.
+struct PairedRobot {
     own: support::world::Directory,
 }
 
-impl Robot {
-    fn new() -> anyhow::Result<Robot> {
+impl PairedRobot {
+    fn new() -> anyhow::Result<PairedRobot> {
         let own = world().directory("robot")?;
-        Ok(Robot { own })
+        Ok(PairedRobot { own })
     }
 
     fn directory(&self) -> PathBuf {
         self.own.path().join("own")
     }
 
-    fn pairs(&self, line: &str) -> anyhow::Result<Outcome> {
+    fn pair(&self, line: &str) -> anyhow::Result<CommandOutcome> {
         run(Command::new(binaries::path("stubs/x86_64/cloudroid-stub"))
             .args(["pair", line])
             .env("CLOUDROID_IDENTITY", self.directory()))
@@ -53,7 +56,7 @@ impl Robot {
         self.directory().join("robot.key")
     }
 
-    /// Its certificate for a server, as a file of its own.
+    /// Writes its certificate for a server to a separate file.
     fn certificate(&self, server: &str) -> anyhow::Result<PathBuf> {
         let kept = self.directory().join(format!("paired/{server}.toml"));
         let text = std::fs::read_to_string(&kept).with_context(|| kept.display().to_string())?;
@@ -68,25 +71,30 @@ impl Robot {
         Ok(path)
     }
 
-    /// A stub of it that is told nothing but where the server is.
-    fn stub(&self, site: &Site, daemon: &Daemon, service: (&str, &str)) -> anyhow::Result<Running> {
+    /// Starts a stub whose configuration contains nothing but the server's address.
+    fn start_stub(
+        &self,
+        site: &Site,
+        daemon: &Daemon,
+        service: (&str, &str),
+    ) -> anyhow::Result<NodeProcess> {
         let toml = format!(
             "server = \"wss://{}\"\nservice = \"{}\"\nlocal = \"none\"\nidentity = {:?}\n",
             daemon.address,
             service.0,
             self.directory()
         );
-        site.stub_with(&toml, service.0, service.1, &[])
+        site.start_stub_with_config(&toml, service.0, service.1, &[])
     }
 }
 
-/// curl, with a certificate and its key.
+/// Runs curl with a certificate and its key.
 fn curl(
     daemon: &Daemon,
     path: &str,
     pair: Option<(&Path, &Path)>,
     more: &[&str],
-) -> anyhow::Result<Outcome> {
+) -> anyhow::Result<CommandOutcome> {
     let mut command = Command::new("curl");
     command
         .args([
@@ -106,12 +114,12 @@ fn curl(
     run(command.arg(format!("https://{}{path}", daemon.address)))
 }
 
-fn mode(path: &Path) -> anyhow::Result<u32> {
+fn file_mode(path: &Path) -> anyhow::Result<u32> {
     Ok(path.metadata()?.permissions().mode() & 0o7777)
 }
 
-/// Milliseconds since 1970.
-fn now() -> anyhow::Result<u64> {
+/// Returns the time in milliseconds since 1970.
+fn unix_millis() -> anyhow::Result<u64> {
     Ok(u64::try_from(
         SystemTime::now().duration_since(UNIX_EPOCH)?.as_millis(),
     )?)
@@ -119,13 +127,14 @@ fn now() -> anyhow::Result<u64> {
 
 const AUDIT: [&str; 5] = ["audit", "-n", "1000", "--format", "json"];
 
-/// Waits until the audit log says it: some of it is written soon after.
-fn audited(daemon: &Daemon, words: &str) -> Verdict {
-    until(&format!("{words:?} in the audit log"), || {
-        let audit = daemon.deployer().types(&AUDIT)?.succeeded()?;
-        Ok(match audit.stdout.contains(words) {
-            true => Ok(()),
-            false => Err(audit.stdout),
+/// Waits until the audit log contains these words: some records are written with a delay.
+fn wait_for_audit(daemon: &Daemon, words: &str) -> Verdict {
+    wait_until(&format!("{words:?} in the audit log"), || {
+        let audit = daemon.deployer().run(&AUDIT)?.expect_success()?;
+        Ok(if audit.stdout.contains(words) {
+            Ok(())
+        } else {
+            Err(audit.stdout)
         })
     })
 }
@@ -133,36 +142,42 @@ fn audited(daemon: &Daemon, words: &str) -> Verdict {
 const NODE: (&str, &str) = ("teller_py", "teller.py");
 
 pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
-    let daemon = secure("paired", "").start()?;
+    let daemon = secure_setup("paired", "").start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(TELLER.name, TELLER.arguments)?
-        .succeeded()?;
-    deployer.pushes(ADDER.name, ADDER.arguments)?.succeeded()?;
-    // For people: the line alone on standard output, a picture of it beside it.
+        .push(TELLER.name, TELLER.arguments)?
+        .expect_success()?;
+    deployer
+        .push(ADDER.name, ADDER.arguments)?
+        .expect_success()?;
+    // For people: the line alone on standard output, a QR code on standard error.
     let printed = deployer
-        .types(&["pair", "rover1", "--services", "teller_py"])?
-        .succeeded()?;
+        .run(&["pair", "rover1", "--services", "teller_py"])?
+        .expect_success()?;
     ensure!(
         printed.stdout.trim().lines().count() == 1 && printed.stdout.starts_with("cloudroid://"),
         "{}",
-        printed.said()
+        printed.output()
     );
     for words in ["▀", "cloudroid-stub pair 'LINE'", "install.sh --pair"] {
         ensure!(
             printed.stderr.contains(words),
             "{words}: {}",
-            printed.said()
+            printed.output()
         );
     }
     let line = printed.stdout.trim();
-    let robot = Robot::new()?;
-    let paired = robot.pairs(line)?.succeeded()?;
+    let robot = PairedRobot::new()?;
+    let paired = robot.pair(line)?.expect_success()?;
     for words in ["paired with", "as rover1", "7 days"] {
-        ensure!(paired.stdout.contains(words), "{words}: {}", paired.said());
+        ensure!(
+            paired.stdout.contains(words),
+            "{words}: {}",
+            paired.output()
+        );
     }
-    ensure!(mode(&robot.key())? == 0o600 && mode(&robot.directory())? == 0o700);
-    ensure!(mode(&daemon.home.join("tls/authority.pem"))? == 0o600);
+    ensure!(file_mode(&robot.key())? == 0o600 && file_mode(&robot.directory())? == 0o700);
+    ensure!(file_mode(&daemon.home.join("tls/authority.pem"))? == 0o600);
     for (file, words) in [
         ("known_servers", daemon.address.as_str()),
         ("servers.pub", "cloudroid ssh-ed25519 AAAA"),
@@ -170,31 +185,39 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
         let text = std::fs::read_to_string(robot.directory().join(file))?;
         ensure!(text.contains(words), "{file}: {text}");
     }
-    // It needs no token, and no name.
+    // It needs neither a token nor a name.
     let site = Site::new()?;
-    let stub = robot.stub(&site, &daemon, NODE)?;
-    stub.says("linked to wss://")?;
+    let stub = robot.start_stub(&site, &daemon, NODE)?;
+    stub.wait_for_output("linked to wss://")?;
     daemon.servant_of("teller_py", "rover1")?;
     let certificate = robot.certificate(&daemon.address)?;
     let key = robot.key();
     let pair = Some((&*certificate, &*key));
-    let whoami = curl(&daemon, "/api/v1/whoami", pair, &[])?.succeeded()?;
+    let whoami = curl(&daemon, "/api/v1/whoami", pair, &[])?.expect_success()?;
     for words in ["\"name\":\"rover1\"", "\"robot\"", "\"teller_py\"", "\n200"] {
-        ensure!(whoami.stdout.contains(words), "{words}: {}", whoami.said());
+        ensure!(
+            whoami.stdout.contains(words),
+            "{words}: {}",
+            whoami.output()
+        );
     }
-    // Elsewhere it may nothing, and without its certificate nobody is it.
+    // It has no further rights, and without its certificate nobody has its identity.
     for (path, given, status) in [
         ("/api/v1/services/adder_py", pair, "403"),
         ("/api/v1/status", pair, "403"),
         ("/api/v1/pairings", pair, "403"),
         ("/api/v1/services", None, "401"),
     ] {
-        let answer = curl(&daemon, path, given, &[])?.succeeded()?;
-        ensure!(answer.stdout.ends_with(status), "{path}: {}", answer.said());
+        let answer = curl(&daemon, path, given, &[])?.expect_success()?;
+        ensure!(
+            answer.stdout.ends_with(status),
+            "{path}: {}",
+            answer.output()
+        );
     }
-    let other = robot.stub(&site, &daemon, ("adder_py", "adder.py"))?;
-    other.says("may not connect to service adder_py")?;
-    // Everything of it ends at a word.
+    let other = robot.start_stub(&site, &daemon, ("adder_py", "adder.py"))?;
+    other.wait_for_output("may not connect to service adder_py")?;
+    // Revocation ends everything of the robot.
     let mut watched = Command::new(binaries::python())
         .args([
             "-c",
@@ -209,8 +232,8 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
     let mut told = BufReader::new(watched.stdout.take().context("what it says")?).lines();
     let mut next = || -> anyhow::Result<String> { Ok(told.next().context("it ended")??) };
     ensure!(next()? == "open");
-    let began = now()?;
-    deployer.types(&["unpair", "rover1"])?.succeeded()?;
+    let began = unix_millis()?;
+    deployer.run(&["unpair", "rover1"])?.expect_success()?;
     let mut ends = Vec::new();
     for _ in 0..2 {
         let said = next()?;
@@ -227,8 +250,8 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
         "{all}"
     );
     watched.wait()?;
-    stub.says("robot rover1 was unpaired")?;
-    let refused = curl(&daemon, "/api/v1/whoami", pair, &[])?.succeeded()?;
+    stub.wait_for_output("robot rover1 was unpaired")?;
+    let refused = curl(&daemon, "/api/v1/whoami", pair, &[])?.expect_success()?;
     for words in [
         "robot rover1 was unpaired",
         "cloudroidctl pair ROBOT",
@@ -237,16 +260,16 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
         ensure!(
             refused.stdout.contains(words),
             "{words}: {}",
-            refused.said()
+            refused.output()
         );
     }
     let renewal = ["--data-binary", "{\"request\":\"x\"}"];
-    let refused = curl(&daemon, "/api/v1/renew", pair, &renewal)?.succeeded()?;
-    ensure!(refused.stdout.ends_with("\n401"), "{}", refused.said());
+    let refused = curl(&daemon, "/api/v1/renew", pair, &renewal)?.expect_success()?;
+    ensure!(refused.stdout.ends_with("\n401"), "{}", refused.output());
     deployer
-        .types(&["unpair", "rover1"])?
-        .failed_saying(&["no robot \"rover1\" is paired", "pair --list"])?;
-    // Who did it stands in the audit log, and no secret.
+        .run(&["unpair", "rover1"])?
+        .expect_failure(&["robot \"rover1\" is not paired", "pair --list"])?;
+    // The audit log contains who did it, and no secret.
     for words in [
         "POST /api/v1/pairings",
         "was paired by a code",
@@ -254,15 +277,15 @@ pub fn a_robot_is_paired_by_a_line_and_gone_at_a_word() -> Verdict {
         "DELETE /api/v1/pairings/rover1",
         "POST /api/v1/renew",
     ] {
-        audited(&daemon, words)?;
+        wait_for_audit(&daemon, words)?;
     }
     let code = line.rsplit('=').next().context("a code")?;
-    let audit = deployer.types(&AUDIT)?.succeeded()?.stdout;
-    ensure!(!audit.contains(code) && !daemon.last_words().contains(code));
+    let audit = deployer.run(&AUDIT)?.expect_success()?.stdout;
+    ensure!(!audit.contains(code) && !daemon.log_tail().contains(code));
     Ok(())
 }
 
-/// Opens an idle connection of the API and one of rosbridge with a certificate, and tells when each ends.
+/// Opens an idle connection of the API and one of rosbridge with a certificate, and reports when each ends.
 const WATCH: &str = r#"
 import base64, socket, ssl, struct, sys, threading, time
 address, certificate, key, patience = sys.argv[1:]
@@ -329,19 +352,21 @@ for thread in threads:
 
 pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict {
     let good_for = format!("robot_certificates = \"{}s\"\n", scale_seconds(6));
-    let daemon = secure("renewing", &good_for).start()?;
+    let daemon = secure_setup("renewing", &good_for).start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(TELLER.name, TELLER.arguments)?
-        .succeeded()?;
-    let robot = Robot::new()?;
-    robot.pairs(&line(&daemon, &["rover1"])?)?.succeeded()?;
+        .push(TELLER.name, TELLER.arguments)?
+        .expect_success()?;
+    let robot = PairedRobot::new()?;
+    robot
+        .pair(&pairing_line(&daemon, &["rover1"])?)?
+        .expect_success()?;
     let site = Site::new()?;
-    let mut stub = robot.stub(&site, &daemon, NODE)?;
-    stub.says("linked to wss://")?;
-    // Longer than the first one is good: the link goes on.
-    stub.says_times("was renewed", 2)?;
-    ensure!(!stub.said().contains("was lost"), "{}", stub.said());
+    let mut stub = robot.start_stub(&site, &daemon, NODE)?;
+    stub.wait_for_output("linked to wss://")?;
+    // After the first certificate has expired the link still works.
+    stub.wait_for_output_times("was renewed", 2)?;
+    ensure!(!stub.output().contains("was lost"), "{}", stub.output());
     let renewed = robot.certificate(&daemon.address)?;
     curl(
         &daemon,
@@ -349,44 +374,47 @@ pub fn certificates_renew_themselves_and_end_while_the_robot_is_off() -> Verdict
         Some((&renewed, &robot.key())),
         &[],
     )?
-    .succeeded()?;
-    audited(&daemon, "renewed its certificate")?;
-    // Off for longer than that.
+    .expect_success()?;
+    wait_for_audit(&daemon, "renewed its certificate")?;
+    // Switched off for longer than that.
     stub.signal(nix::sys::signal::Signal::SIGINT)?;
-    stub.ends()?;
-    until("the certificate's end", || {
-        let pairings = deployer.asks(&["pair", "--list"])?;
+    stub.wait_for_exit()?;
+    wait_until("the certificate's end", || {
+        let pairings = deployer.run_json(&["pair", "--list"])?;
         let end = pairings[0]["expires"].as_u64().context("an end")?;
-        Ok(match now()? >= end {
-            true => Ok(()),
-            false => Err(pairings.to_string()),
+        Ok(if unix_millis()? >= end {
+            Ok(())
+        } else {
+            Err(pairings.to_string())
         })
     })?;
-    let late = robot.stub(&site, &daemon, NODE)?;
-    late.says("certificate has expired")?;
-    late.says("cloudroidctl pair ROBOT")?;
-    // Who answers for the server is told of it.
-    audited(&daemon, "showed a certificate that was refused")?;
+    let late = robot.start_stub(&site, &daemon, NODE)?;
+    late.wait_for_output("certificate has expired")?;
+    late.wait_for_output("cloudroidctl pair ROBOT")?;
+    // The operator of the server is informed.
+    wait_for_audit(&daemon, "presented a certificate that was refused")?;
     // The same key is paired again, and the robot works.
     let key = std::fs::read(robot.key())?;
-    robot.pairs(&line(&daemon, &["rover1"])?)?.succeeded()?;
+    robot
+        .pair(&pairing_line(&daemon, &["rover1"])?)?
+        .expect_success()?;
     ensure!(std::fs::read(robot.key())? == key, "another key was made");
-    let stub = robot.stub(&site, &daemon, NODE)?;
-    stub.says("linked to wss://")?;
+    let stub = robot.start_stub(&site, &daemon, NODE)?;
+    stub.wait_for_output("linked to wss://")?;
     Ok(())
 }
 
 pub fn what_cannot_be_paired_is_said() -> Verdict {
-    let daemon = secure("unpaired", "").start()?;
+    let daemon = secure_setup("unpaired", "").start()?;
     let deployer = daemon.deployer();
-    let robot = Robot::new()?;
+    let robot = PairedRobot::new()?;
     let refused = |line: &str, words: &[&str]| -> Verdict {
-        robot.pairs(line)?.failed_saying(words)?;
+        robot.pair(line)?.expect_failure(words)?;
         Ok(())
     };
-    let good = line(&daemon, &["rover1"])?;
+    let good = pairing_line(&daemon, &["rover1"])?;
     let code = good.rsplit('=').next().context("a code")?.to_owned();
-    // Before anything is sent.
+    // Errors before anything is sent.
     for (wrong, words) in [
         (
             good.replace("robot=rover1", "robot=rover\u{7}1"),
@@ -397,55 +425,56 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
             "control characters",
         ),
         (good[..good.len() - 1].to_owned(), "25 characters"),
-        (good[..good.len() - 40].to_owned(), "no pairing line"),
+        (good[..good.len() - 40].to_owned(), "not a pairing line"),
     ] {
         refused(&wrong, &[words, "cloudroidctl pair ROBOT"])?;
     }
     ensure!(!robot.key().exists(), "a key was made for nothing");
-    // Somebody who stands between, or a server that was set up anew.
+    // A machine in the middle, or a server that was set up anew.
     let at = good.find("SHA256:").context("a fingerprint")? + 7;
     let digit = if &good[at..=at] == "0" { "1" } else { "0" };
     let other = format!("{}{digit}{}", &good[..at], &good[at + 1..]);
-    refused(&other, &["somebody may stand between", "SHA256:"])?;
-    // Codes.
+    refused(&other, &["the connection may be intercepted", "SHA256:"])?;
+    // Invalid codes.
     refused(&good.replace(&code, &"a".repeat(26)), &["not known", "401"])?;
     refused(
         &good.replace("robot=rover1", "robot=rover2"),
         &["for another robot"],
     )?;
-    // A key that is not the robot's alone.
+    // A key that others can read.
     let key = robot.key();
     std::fs::set_permissions(&key, PermissionsExt::from_mode(0o644))?;
     let command = format!("chmod 600 {}", key.display());
-    refused(&good, &["others can read", &command])?;
+    refused(&good, &["other users can read", &command])?;
     std::fs::set_permissions(&key, PermissionsExt::from_mode(0o600))?;
-    let second = line(&daemon, &["rover1"])?;
-    refused(&good, &["a newer one took its place"])?;
+    let second = pairing_line(&daemon, &["rover1"])?;
+    refused(&good, &["replaced by a newer one"])?;
     deployer
-        .types(&["pair", "rover1", "--cancel"])?
-        .succeeded()?;
+        .run(&["pair", "rover1", "--cancel"])?
+        .expect_success()?;
     refused(&second, &["cancelled"])?;
-    let short = line(&daemon, &["rover1", "--ttl", "1s"])?;
-    until("the code's end", || {
-        let left = deployer.asks(&["pair", "--list"])?;
-        Ok(match left.as_array().is_some_and(Vec::is_empty) {
-            true => Ok(()),
-            false => Err(left.to_string()),
+    let short = pairing_line(&daemon, &["rover1", "--ttl", "1s"])?;
+    wait_until("the code's end", || {
+        let left = deployer.run_json(&["pair", "--list"])?;
+        Ok(if left.as_array().is_some_and(Vec::is_empty) {
+            Ok(())
+        } else {
+            Err(left.to_string())
         })
     })?;
     refused(&short, &["has expired"])?;
-    let once = line(&daemon, &["rover1"])?;
-    robot.pairs(&once)?.succeeded()?;
-    refused(&once, &["used already"])?;
-    // Requests that are none, or for somebody else, with a code that is good: it stays good.
-    let code = line(&daemon, &["rover3"])?;
+    let once = pairing_line(&daemon, &["rover1"])?;
+    robot.pair(&once)?.expect_success()?;
+    refused(&once, &["already used"])?;
+    // Invalid requests, or requests for another name, with a valid code: the code stays valid.
+    let code = pairing_line(&daemon, &["rover3"])?;
     let code = code.rsplit('=').next().context("a code")?;
     let place = world().directory("requests")?;
     let made = run(Command::new("sh")
         .args(["-euc", REQUESTS])
         .current_dir(place.path()))?;
-    made.succeeded()?;
-    let asks = |file: &str, text: &str| -> anyhow::Result<Outcome> {
+    made.expect_success()?;
+    let asks = |file: &str, text: &str| -> anyhow::Result<CommandOutcome> {
         let body = place.path().join(file);
         let json = serde_json::json!({"robot": "rover3", "code": code, "request": text});
         std::fs::write(&body, json.to_string())?;
@@ -454,52 +483,52 @@ pub fn what_cannot_be_paired_is_said() -> Verdict {
     };
     let made = |name: &str| std::fs::read_to_string(place.path().join(name));
     for (text, words, status) in [
-        ("rubbish".to_owned(), "no request for a certificate", "400"),
-        (String::new(), "no request for a certificate", "400"),
+        ("rubbish".to_owned(), "not a certificate request", "400"),
+        (String::new(), "not a certificate request", "400"),
         ("A".repeat(5000), "at most 4096 bytes", "413"),
         (made("other.csr")?, "robot:rover4", "400"),
         (made("rsa.csr")?, "P-256 or Ed25519", "400"),
         (made("curve.csr")?, "P-256 or Ed25519", "400"),
-        (made("ca.pem")?, "no request for a certificate", "400"),
+        (made("ca.pem")?, "not a certificate request", "400"),
     ] {
-        let answer = asks("body", &text)?.succeeded()?;
+        let answer = asks("body", &text)?.expect_success()?;
         ensure!(
             answer.stdout.contains(words) && answer.stdout.ends_with(status),
             "{words}: {}",
-            answer.said()
+            answer.output()
         );
     }
-    let answer = asks("body", &made("good.csr")?)?.succeeded()?;
-    ensure!(answer.stdout.ends_with("200"), "{}", answer.said());
-    // Whom the daemon does not know, and what a robot is not for.
+    let answer = asks("body", &made("good.csr")?)?.expect_success()?;
+    ensure!(answer.stdout.ends_with("200"), "{}", answer.output());
+    // Unknown robots, and robots outside of their services.
     for (arguments, words) in [
         (&["pair", "a b"][..], "robot"),
-        (&["pair", "root"], "uses itself"),
-        (&["pair", "r", "--ttl", "8d"], "7d at most"),
+        (&["pair", "root"], "is a reserved name"),
+        (&["pair", "r", "--ttl", "8d"], "at most 7d"),
         (
             &["pair", "r", "--address", "nowhere"],
             "--address HOST:PORT",
         ),
         (&["pair", "r", "--own-certificate"], "client_authorities"),
-        (&["pair", "r", "--cancel"], "no pairing code waits"),
+        (&["pair", "r", "--cancel"], "no pending pairing code"),
     ] {
-        deployer.types(arguments)?.failed_saying(&[words])?;
+        deployer.run(arguments)?.expect_failure(&[words])?;
     }
-    // In plain text nobody is paired.
-    let plain = world().own("unpaired-plain").start()?;
+    // Pairing is not possible in plain text.
+    let plain = world().setup("unpaired-plain").start()?;
     plain
         .deployer()
-        .types(&["pair", "rover1"])?
-        .failed_saying(&["through TLS", "serve = \"tls\""])?;
+        .run(&["pair", "rover1"])?
+        .expect_failure(&["over TLS", "serve = \"tls\""])?;
     let (status, body) = plain.request("POST", "/api/v1/pair", &[])?;
     ensure!(
-        status == 400 && body.contains("through TLS"),
+        status == 400 && body.contains("over TLS"),
         "{status} {body}"
     );
     Ok(())
 }
 
-/// Requests by another program, and a certificate in place of one.
+/// Requests created by another program, and a certificate instead of one.
 const REQUESTS: &str = r#"
 ec="-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -keyout key"
 openssl req -new $ec -subj /CN=robot:rover3 -out good.csr
@@ -514,50 +543,50 @@ pub fn a_labs_own_authority_speaks_for_its_robots() -> Verdict {
     run(Command::new("sh")
         .args(["-euc", AUTHORITY])
         .current_dir(place.path()))?
-    .succeeded()?;
+    .expect_success()?;
     let at = |name: &str| place.path().join(name);
     let named = format!("client_authorities = {:?}\n", at("lab.pem"));
-    let daemon = secure("lab", &named).start()?;
+    let daemon = secure_setup("lab", &named).start()?;
     let deployer = daemon.deployer();
     let asks = |name: &str| {
         let (certificate, key) = (at(&format!("{name}.pem")), at(&format!("{name}.key")));
         curl(&daemon, "/api/v1/whoami", Some((&certificate, &key)), &[])
     };
     let says = |name: &str, words: &str, status: &str| -> Verdict {
-        let answer = asks(name)?.succeeded()?;
+        let answer = asks(name)?.expect_success()?;
         ensure!(
             answer.stdout.contains(words) && answer.stdout.ends_with(status),
             "{name}, {words}: {}",
-            answer.said()
+            answer.output()
         );
         Ok(())
     };
     says("r1", "robot r1 is not paired", "401")?;
     deployer
-        .types(&["pair", "r1", "--services", "det*", "--own-certificate"])?
-        .succeeded()?;
+        .run(&["pair", "r1", "--services", "det*", "--own-certificate"])?
+        .expect_success()?;
     says("r1", "\"robot\":\"r1\"", "200")?;
     says("person", "names no robot", "401")?;
-    // By the TLS alert that is for it (RFC 8446, section 6.2).
+    // With the corresponding TLS alert (RFC 8446, section 6.2).
     for (name, alert) in [("stranger", "unknown ca"), ("over", "certificate expired")] {
         let refused = asks(name)?;
         ensure!(
             refused.status != 0 && refused.stderr.to_lowercase().contains(alert),
             "{name}: {}",
-            refused.said()
+            refused.output()
         );
     }
-    let listed = deployer.types(&["pair", "--list"])?.succeeded()?;
+    let listed = deployer.run(&["pair", "--list"])?.expect_success()?;
     ensure!(
         listed.stdout.contains("own certificate"),
         "{}",
-        listed.said()
+        listed.output()
     );
-    deployer.types(&["unpair", "r1"])?.succeeded()?;
+    deployer.run(&["unpair", "r1"])?.expect_success()?;
     says("r1", "robot r1 was unpaired", "401")
 }
 
-/// Two authorities, the certificates of one of which are to count, and one that ended as it began.
+/// Creates two authorities, certificates of one of which are to be accepted, one of them expired from the start.
 const AUTHORITY: &str = r#"
 new="-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
 for name in lab foreign; do
@@ -578,30 +607,30 @@ while [ "$(date +%s)" -le "$end" ]; do sleep 0.1; done
 "#;
 
 pub fn a_stub_is_installed_and_paired_by_one_line() -> Verdict {
-    let daemon = secure("installed", "").start()?;
+    let daemon = secure_setup("installed", "").start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(TELLER.name, TELLER.arguments)?
-        .succeeded()?;
+        .push(TELLER.name, TELLER.arguments)?
+        .expect_success()?;
     let place = world().directory("stub")?;
     deployer
-        .types(&["stub", "teller_py", "-o", path_str(place.path())])?
-        .succeeded()?;
+        .run(&["stub", "teller_py", "-o", path_str(place.path())])?
+        .expect_success()?;
     let machine = Machine::new()?;
-    machine.unpacks(&place.path().join("teller_py.tar.gz"))?;
-    let line = line(&daemon, &["rover1"])?;
-    // By the key that the line names, before anything of the archive runs.
+    machine.unpack(&place.path().join("teller_py.tar.gz"))?;
+    let line = pairing_line(&daemon, &["rover1"])?;
+    // The key in the line is checked before anything from the archive is executed.
     let at = line.find("key=").context("a key")? + 30;
     let letter = if &line[at..=at] == "A" { "B" } else { "A" };
     let other = format!("{}{letter}{}", &line[..at], &line[at + 1..]);
     machine
-        .runs(
+        .run_script(
             "sh",
             &format!("sh teller_py-stub/install.sh --pair '{other}'"),
         )?
-        .failed_saying(&["another key than this robot knows"])?;
-    let unlike = machine.runs("sh", "sh teller_py-stub/install.sh --pair 'https://x'")?;
-    unlike.failed_saying(&["--pair", "cloudroid://"])?;
+        .expect_failure(&["another key than the one this robot knows"])?;
+    let unlike = machine.run_script("sh", "sh teller_py-stub/install.sh --pair 'https://x'")?;
+    unlike.expect_failure(&["--pair", "cloudroid://"])?;
     let script = format!(
         r#"set -e
 sh teller_py-stub/install.sh --pair '{line}'
@@ -610,7 +639,7 @@ cat /opt/cloudroid/share/teller_py/stub.toml
 . /opt/cloudroid/setup.sh
 /opt/cloudroid/lib/teller_py/cloudroid-stub doctor --only server"#
     );
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    let outcome = machine.run_script("bash", &script)?.expect_success()?;
     for words in [
         "This robot is paired with",
         "600 .config/cloudroid/robot.key",
@@ -620,14 +649,14 @@ cat /opt/cloudroid/share/teller_py/stub.toml
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    // No question about the key that came with the archive was left.
+    // The key from the archive was not asked about.
     ensure!(
         !outcome.stderr.contains("trusting the key that came"),
         "{}",
-        outcome.said()
+        outcome.output()
     );
     Ok(())
 }

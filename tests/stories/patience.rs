@@ -1,4 +1,4 @@
-//! Nodes that wait for their robot before they show all of themselves.
+//! Nodes that wait for their robot before they register everything.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,21 +6,25 @@ use std::time::Duration;
 use anyhow::{Context, ensure};
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, Message, Publisher, ServiceHandler, ServiceType, reaches};
+use ros::bus::{
+    Bus, Publisher, SerializedMessage, ServiceHandler, ServiceType, wait_for_connected,
+};
 use ros::ros1::Ros1Bus;
 use support::Verdict;
-use support::cable::{Badness, Cable};
+use support::cable::{Cable, NetworkImpairment};
 use support::patience::{Deadline, scale};
-use support::site::{Running, Site, string};
+use support::site::{NodeProcess, Site, string};
 use support::world::world;
 
-use crate::crossing::{Written, advertises, answers, listens, types, with_log};
+use crate::crossing::{
+    MessageBytes, advertise, message_types, subscribe, wait_for_answer, with_log,
+};
 
-/// The place that is reached when the robot says so.
+/// Number of the goal that is reached when the robot says so.
 const FAR: u32 = 1000;
-/// Between two looks.
+/// Polling interval.
 const MOMENT: Duration = Duration::from_millis(200);
-const SILENT: Badness = Badness {
+const SILENT: NetworkImpairment = NetworkImpairment {
     rate: 100_000,
     delay: 1,
     jitter: 0,
@@ -28,30 +32,30 @@ const SILENT: Badness = Badness {
     limit: 1000,
 };
 
-/// Always the same answer.
-struct Answer(&'static [u8]);
+/// A service with a constant response.
+struct FixedAnswer(&'static [u8]);
 
 #[async_trait]
-impl ServiceHandler for Answer {
+impl ServiceHandler for FixedAnswer {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
         Ok(Bytes::from_static(self.0))
     }
 }
 
-/// A robot around a node that waits as move_base does: it knows where it is, has a map and a scanner, and sends goals.
-struct Base<'a> {
+/// A robot around a node that waits as move_base does: it publishes its position, a map and scans, and sends goals.
+struct NavigationBase<'a> {
     site: &'a Site,
     app: Arc<Ros1Bus>,
     transforms: Box<dyn Publisher>,
     scans: Box<dyn Publisher>,
     goals: Box<dyn Publisher>,
-    /// A service.
+    /// Server of the map.
     _map: Box<dyn Send + Sync>,
 }
 
-impl<'a> Base<'a> {
+impl<'a> NavigationBase<'a> {
     fn new(site: &'a Site) -> anyhow::Result<Self> {
-        let types = types()?;
+        let types = message_types()?;
         types.insert(
             "sensor_msgs/LaserScan",
             "Header header\nfloat32 angle_min\nfloat32 angle_max\nfloat32 angle_increment\nfloat32 time_increment\n\
@@ -60,31 +64,35 @@ impl<'a> Base<'a> {
         let action = types.action("actionlib/Test")?;
         let app = site.node("/app")?;
         let trigger = ServiceType::new("std_srvs/Trigger", "937c9679a518e3a18d831e57125ea522");
-        let map = app.serve("/static_map", trigger, Arc::new(Answer(&[1, 0, 0, 0, 0])));
+        let map = app.serve(
+            "/static_map",
+            trigger,
+            Arc::new(FixedAnswer(&[1, 0, 0, 0, 0])),
+        );
         let map = site.runtime.block_on(map)?;
         let scans = types.message("sensor_msgs/LaserScan")?;
         let transforms = types.message("tf2_msgs/TFMessage")?;
         Ok(Self {
-            scans: advertises(site, &app, "/scan", &scans, false)?,
-            transforms: advertises(site, &app, "/tf", &transforms, false)?,
-            goals: advertises(site, &app, "/move_base/goal", &action.action_goal, false)?,
+            scans: advertise(site, &app, "/scan", &scans, false)?,
+            transforms: advertise(site, &app, "/tf", &transforms, false)?,
+            goals: advertise(site, &app, "/move_base/goal", &action.action_goal, false)?,
             site,
             app,
             _map: map,
         })
     }
 
-    /// Says where it is, and what it sees, as it does all the time.
-    fn gives(&self) {
+    /// Publishes its position and a scan, as it does continuously.
+    fn publish_state(&self) {
         let now = link::clock::now();
-        let transform = Written::default()
+        let transform = MessageBytes::default()
             .word(1)
             .word(0)
             .time(now)
             .text("map")
             .text("chassis");
         self.transforms.publish(transform.zeros(7 * 8).0.into());
-        let scan = Written::default()
+        let scan = MessageBytes::default()
             .word(0)
             .time(now)
             .text("chassis")
@@ -92,35 +100,35 @@ impl<'a> Base<'a> {
         self.scans.publish(scan.0.into());
     }
 
-    /// Goes on so until something is so.
-    fn gives_until(
+    /// Publishes until a condition is satisfied.
+    fn publish_until(
         &self,
         what: &str,
-        stub: &Running,
+        stub: &NodeProcess,
         mut is_so: impl FnMut() -> anyhow::Result<bool>,
     ) -> Verdict {
         let deadline = Deadline::begin();
         loop {
-            self.gives();
+            self.publish_state();
             if is_so()? {
                 return Ok(());
             }
-            deadline.check(|| format!("{what}: {}", stub.said()))?;
+            deadline.check(|| format!("{what}: {}", stub.output()))?;
         }
     }
 
-    /// Returns once somebody takes its goals.
-    fn is_driven(&self, stub: &Running) -> Verdict {
-        self.gives_until("no action came", stub, || {
-            let connected = reaches(self.goals.matched(), 1);
+    /// Waits until a node accepts its goals.
+    fn wait_until_driven(&self, stub: &NodeProcess) -> Verdict {
+        self.publish_until("no action came", stub, || {
+            let connected = wait_for_connected(self.goals.matched_subscribers(), 1);
             let wait = async { tokio::time::timeout(scale(MOMENT), connected).await };
             Ok(self.site.runtime.block_on(wait).is_ok())
         })
     }
 
-    fn sends(&self, id: &str, number: u32) {
+    fn send_goal(&self, id: &str, number: u32) {
         let now = link::clock::now();
-        let goal = Written::default()
+        let goal = MessageBytes::default()
             .word(0)
             .time(now)
             .text("")
@@ -131,25 +139,25 @@ impl<'a> Base<'a> {
     }
 }
 
-/// The number at the end of a result.
-fn number(result: &Message) -> anyhow::Result<u32> {
+/// Returns the number at the end of a result.
+fn result_number(result: &SerializedMessage) -> anyhow::Result<u32> {
     let number = result.bytes.last_chunk().context("a number")?;
     Ok(u32::from_le_bytes(*number))
 }
 
-/// Whether a message of an action is about this goal.
-fn is_of(message: &Message, id: &str) -> bool {
+/// Returns whether a message of an action is about this goal.
+fn is_about_goal(message: &SerializedMessage, id: &str) -> bool {
     String::from_utf8_lossy(&message.bytes).contains(id)
 }
 
 pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
-    let daemon = world().shared()?;
-    // Its frame is known by nothing but what it complains of, its name only when it runs.
+    let daemon = world().ensure_shared()?;
+    // Its frame is only known from its warnings, its name only when it runs.
     let pushed = daemon
         .deployer()
-        .pushes("patient_py", &["--node", "patient.py"])?
-        .succeeded()?;
-    let service = daemon.deployer().asks(&["services", "patient_py"])?;
+        .push("patient_py", &["--node", "patient.py"])?
+        .expect_success()?;
+    let service = daemon.deployer().run_json(&["services", "patient_py"])?;
     let interface = &service["interface"];
     let names = |kind: &str| -> Vec<String> {
         let all = interface[kind].as_array().into_iter().flatten();
@@ -159,7 +167,7 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
     ensure!(
         names("topics") == ["/arrived", "/scan", "/tf"] && names("actions") == ["/move_base"],
         "{interface:#}\n{}",
-        pushed.said()
+        pushed.output()
     );
     ensure!(names("needs") == ["/static_map"], "{interface:#}");
     ensure!(service["nodes"][0]["name"] == "/move_base", "{service:#}");
@@ -169,43 +177,43 @@ pub fn a_node_that_waits_is_seen_whole_and_driven_by_its_robot() -> Verdict {
         "server = \"ws://{}\"\nservice = \"patient_py\"\nrobot = \"patience\"\nlocal = \"none\"\n",
         daemon.address
     );
-    let stub = site.stub_with(
+    let stub = site.start_stub_with_config(
         &settings,
         "patient_py",
         "patient.py",
         &["__name:=move_base"],
     )?;
-    let base = Base::new(&site)?;
-    base.is_driven(&stub).with_context(|| {
-        match daemon.deployer().types(&["logs", "patient_py"]) {
-            Ok(node) => format!("the node said: {}", node.said()),
+    let base = NavigationBase::new(&site)?;
+    base.wait_until_driven(&stub).with_context(|| {
+        match daemon.deployer().run(&["logs", "patient_py"]) {
+            Ok(node) => format!("the node said: {}", node.output()),
             Err(error) => error.to_string(),
         }
     })?;
-    let mut results = listens(&site, &base.app, "/move_base/result")?;
+    let mut results = subscribe(&site, &base.app, "/move_base/result")?;
     let drives = || {
-        base.gives();
-        base.sends("there", 7);
+        base.publish_state();
+        base.send_goal("there", 7);
     };
-    let result = with_log(answers(&site, drives, &mut results), &stub)?;
-    ensure!(number(&result)? == 7, "{result:?}");
+    let result = with_log(wait_for_answer(&site, drives, &mut results), &stub)?;
+    ensure!(result_number(&result)? == 7, "{result:?}");
     Ok(())
 }
 
 pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let service = "patient_original";
     let pushed = ["--node", "patient.py", "--name", service];
     daemon
         .deployer()
-        .pushes("patient_py", &pushed)?
-        .succeeded()?;
+        .push("patient_py", &pushed)?
+        .expect_success()?;
     let cable = Cable::new(&daemon.address)?;
     let site = Site::new()?;
-    let overlay = site.installs(&daemon, service, "")?;
+    let overlay = site.install_stub(&daemon, service, "")?;
     let original = ("patient_py", "patient.py");
     let program = "/opt/cloudroid/install/lib/patient_py/patient.py";
-    let workspace = site.installs_original(&daemon, service, original, program)?;
+    let workspace = site.install_original(&daemon, service, original, program)?;
     let prefixes = format!("{}:{}", overlay.display(), workspace.display());
     let server = format!("ws://{}", cable.server);
     let variables = [
@@ -214,68 +222,71 @@ pub fn a_goal_is_reached_by_the_original_when_the_cable_is_cut_on_the_way() -> V
         ("CLOUDROID_ROBOT", "patience-cut"),
         ("NO_COLOR", "1"),
     ];
-    let stub = site.runs_among(
+    let stub = site.start_installed_with_environment(
         &variables,
         &overlay,
         original.0,
         original.1,
         &["__name:=move_base", "_keeps_scanning:=true"],
     )?;
-    let base = Base::new(&site)?;
-    base.is_driven(&stub)?;
-    let count = |words: &str| stub.said().matches(words).count();
+    let base = NavigationBase::new(&site)?;
+    base.wait_until_driven(&stub)?;
+    let count = |words: &str| stub.output().matches(words).count();
     let (over, back) = (
         "the local original answers, too why=LinkDown",
         "the cloud answers alone why=LinkUp",
     );
-    // A slow machine reaches the cloud late: the original may have stood in already.
-    base.gives_until("no link", &stub, || {
+    // On a slow machine the original may already have taken over before the first link.
+    base.publish_until("no link", &stub, || {
         std::thread::sleep(scale(MOMENT));
         Ok(count("linked to") > 0 && count(over) == count(back))
     })?;
     let before = count(over);
-    let mut feedback = listens(&site, &base.app, "/move_base/feedback")?;
-    let mut results = listens(&site, &base.app, "/move_base/result")?;
-    let arrivals = site.says(&base.app, "/arrived", false)?;
-    site.fed(&feedback, 1)?;
-    site.fed(&results, 1)?;
+    let mut feedback = subscribe(&site, &base.app, "/move_base/feedback")?;
+    let mut results = subscribe(&site, &base.app, "/move_base/result")?;
+    let arrivals = site.advertise_strings(&base.app, "/arrived", false)?;
+    site.wait_for_publishers(&feedback, 1)?;
+    site.wait_for_publishers(&results, 1)?;
     // On its way, in the cloud.
-    base.sends("far", FAR);
-    base.gives_until("it is not on its way", &stub, || {
-        let told = site.next_within(&mut feedback, scale(MOMENT))?;
-        Ok(told.is_some_and(|told| is_of(&told, "far")))
+    base.send_goal("far", FAR);
+    base.publish_until("it is not on its way", &stub, || {
+        let told = site.next_message_within(&mut feedback, scale(MOMENT))?;
+        Ok(told.is_some_and(|told| is_about_goal(&told, "far")))
     })?;
     cable.degrade(SILENT)?;
-    // The original waits for a transform, a service and a scan before it takes goals.
-    base.gives_until("the original does not take over", &stub, || {
+    // The original waits for a transform, a service and a scan before it accepts goals.
+    base.publish_until("the original does not take over", &stub, || {
         std::thread::sleep(scale(MOMENT));
         Ok(count(over) > before)
     })?;
     let mut arrived = None;
-    base.gives_until("nobody drives on", &stub, || {
+    base.publish_until("nobody drives on", &stub, || {
         arrivals.publish(string("there"));
-        arrived = site.next_within(&mut results, scale(MOMENT))?;
+        arrived = site.next_message_within(&mut results, scale(MOMENT))?;
         Ok(arrived.is_some())
     })?;
     let arrived = arrived.context("a result")?;
     ensure!(
-        is_of(&arrived, "far") && number(&arrived)? == FAR && count(back) == before,
+        is_about_goal(&arrived, "far") && result_number(&arrived)? == FAR && count(back) == before,
         "{arrived:?}\n{}",
-        stub.said()
+        stub.output()
     );
     cable.restore()?;
-    base.gives_until("the cloud does not come back", &stub, || {
+    base.publish_until("the cloud does not come back", &stub, || {
         std::thread::sleep(scale(MOMENT));
         Ok(count(back) > before)
     })?;
-    // The next goal is the cloud's, and the last one is not answered again.
+    // The next goal goes to the cloud, and the last one is not answered again.
     let mut near = None;
-    base.gives_until("no second result", &stub, || {
-        base.sends("near", 7);
-        near = site.next_within(&mut results, scale(MOMENT))?;
+    base.publish_until("no second result", &stub, || {
+        base.send_goal("near", 7);
+        near = site.next_message_within(&mut results, scale(MOMENT))?;
         Ok(near.is_some())
     })?;
     let near = near.context("a result")?;
-    ensure!(is_of(&near, "near") && number(&near)? == 7, "{near:?}");
+    ensure!(
+        is_about_goal(&near, "near") && result_number(&near)? == 7,
+        "{near:?}"
+    );
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! People with accounts: they sign in to the page, and what other pages do in their browsers comes to nothing.
+//! People with accounts: they sign in to the page, and attempts of other pages in their browsers fail.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -6,18 +6,22 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
-use support::deployer::{Outcome, path_str, run};
+use support::deployer::{CommandOutcome, path_str, run};
 use support::patience::patience;
 use support::robot::Robot;
 use support::world::world;
-use support::{Verdict, binaries, until};
+use support::{Verdict, binaries, wait_until};
 
 pub const PASSWORD: &str = "four quiet purple engines";
 const OTHER: &str = "nine loud yellow kettles";
 const PATH: &str = "/api/v1/session";
 
-/// Types a command of accounts, with a password on standard input.
-pub fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::Result<Outcome> {
+/// Runs a command for accounts, with a password on standard input.
+pub fn run_account(
+    daemon: &Daemon,
+    arguments: &[&str],
+    password: &str,
+) -> anyhow::Result<CommandOutcome> {
     let mut child = Command::new(binaries::path("cloudroidctl"))
         .arg("account")
         .args(arguments)
@@ -32,7 +36,7 @@ pub fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::R
     input.write_all(format!("{password}\n").as_bytes())?;
     drop(input);
     let output = child.wait_with_output()?;
-    Ok(Outcome {
+    Ok(CommandOutcome {
         command: format!("account {arguments:?}"),
         status: output.status.code().unwrap_or(-1),
         stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
@@ -40,25 +44,25 @@ pub fn account(daemon: &Daemon, arguments: &[&str], password: &str) -> anyhow::R
     })
 }
 
-/// A browser in which somebody has signed in.
-pub struct Browser<'a> {
+/// A browser with a signed-in user.
+pub struct SignedInBrowser<'a> {
     daemon: &'a Daemon,
     pub origin: String,
     pub cookie: String,
     pub csrf: String,
 }
 
-fn asks_in(
+fn request_sign_in(
     daemon: &Daemon,
     name: &str,
     password: &str,
     headers: &[(&str, &str)],
 ) -> anyhow::Result<(u16, String, String)> {
     let body = json!({"name": name, "password": password}).to_string();
-    daemon.sends("POST", PATH, headers, &body)
+    daemon.request_with_body("POST", PATH, headers, &body)
 }
 
-/// `NAME=VALUE` of the cookie that an answer sets, and the rest of its line.
+/// Returns `NAME=VALUE` of the cookie that a response sets, and its attributes.
 fn set_cookie(head: &str) -> anyhow::Result<(String, String)> {
     let lines = head.lines();
     let mut set = lines.filter_map(|line| {
@@ -70,20 +74,24 @@ fn set_cookie(head: &str) -> anyhow::Result<(String, String)> {
     Ok((cookie.to_owned(), rest.to_owned()))
 }
 
-impl<'a> Browser<'a> {
-    pub fn signs_in(daemon: &'a Daemon, name: &str, password: &str) -> anyhow::Result<Browser<'a>> {
-        Browser::signs_in_showing(daemon, name, password, &[])
+impl<'a> SignedInBrowser<'a> {
+    pub fn sign_in(
+        daemon: &'a Daemon,
+        name: &str,
+        password: &str,
+    ) -> anyhow::Result<SignedInBrowser<'a>> {
+        SignedInBrowser::sign_in_with_headers(daemon, name, password, &[])
     }
 
-    fn signs_in_showing(
+    fn sign_in_with_headers(
         daemon: &'a Daemon,
         name: &str,
         password: &str,
         headers: &[(&str, &str)],
-    ) -> anyhow::Result<Browser<'a>> {
+    ) -> anyhow::Result<SignedInBrowser<'a>> {
         let origin = format!("http://{}", daemon.address);
         let headers = [headers, &[("Origin", &*origin)]].concat();
-        let (status, head, body) = asks_in(daemon, name, password, &headers)?;
+        let (status, head, body) = request_sign_in(daemon, name, password, &headers)?;
         ensure!(status == 200, "{status} {body}");
         let (cookie, rest) = set_cookie(&head)?;
         for attribute in ["HttpOnly", "SameSite=Strict", "Path=/"] {
@@ -92,7 +100,7 @@ impl<'a> Browser<'a> {
         ensure!(!rest.contains("Domain"), "{rest}");
         let told: Value = serde_json::from_str(&body)?;
         ensure!(told["name"] == name, "{told}");
-        Ok(Browser {
+        Ok(SignedInBrowser {
             daemon,
             origin,
             cookie,
@@ -100,101 +108,109 @@ impl<'a> Browser<'a> {
         })
     }
 
-    fn secret(&self) -> &str {
+    fn session_secret(&self) -> &str {
         self.cookie.split_once('=').map_or("", |(_, secret)| secret)
     }
 
-    /// As the page asks.
-    pub fn asks(&self, method: &str, path: &str) -> anyhow::Result<(u16, String)> {
-        self.asks_with(
+    /// Sends a request as the page does.
+    pub fn request(&self, method: &str, path: &str) -> anyhow::Result<(u16, String)> {
+        self.request_with_headers(
             method,
             path,
             &[("Origin", &self.origin), ("X-CSRF-Token", &self.csrf)],
         )
     }
 
-    /// With the cookie and these headers alone.
-    pub fn asks_with(
+    /// Sends a request with the cookie and only these headers.
+    pub fn request_with_headers(
         &self,
         method: &str,
         path: &str,
         headers: &[(&str, &str)],
     ) -> anyhow::Result<(u16, String)> {
         let headers = [headers, &[("Cookie", &*self.cookie)]].concat();
-        let (status, _, body) = self.daemon.sends(method, path, &headers, "")?;
+        let (status, _, body) = self.daemon.request_with_body(method, path, &headers, "")?;
         Ok((status, body))
     }
 
     fn is_signed_in(&self) -> anyhow::Result<bool> {
-        let (status, body) = self.asks("GET", "/api/v1/whoami")?;
+        let (status, body) = self.request("GET", "/api/v1/whoami")?;
         ensure!(status == 200 || status == 401, "{status} {body}");
         Ok(status == 200)
     }
 }
 
 pub fn people_sign_in_and_out() -> Verdict {
-    let setup = world().own("people");
+    let setup = world().setup("people");
     let daemon = setup.start()?;
-    account(
+    run_account(
         &daemon,
         &["create", "alice", "--role", "operator"],
         PASSWORD,
     )?
-    .succeeded()?;
-    account(
+    .expect_success()?;
+    run_account(
         &daemon,
         &["create", "eve", "--role", "viewer", "--service", "adder*"],
         OTHER,
     )?
-    .succeeded()?;
-    // From the first account on nobody is served who says not who it is.
+    .expect_success()?;
+    // From the first account on unauthenticated requests are refused.
     ensure!(daemon.get("/api/v1/services")?.0 == 401);
     let open = daemon.get_json(PATH)?;
     ensure!(
         open["needed"] == true && open["accounts"] == true && open["name"].is_null(),
         "{open}"
     );
-    // What a browser was given by another is not what it is known by.
+    // A cookie that came from elsewhere is not adopted as the session.
     let invented = "cloudroid=abcdefghijklmnopqrstuvwxyz";
-    let alice = Browser::signs_in_showing(&daemon, "alice", PASSWORD, &[("Cookie", invented)])?;
+    let alice =
+        SignedInBrowser::sign_in_with_headers(&daemon, "alice", PASSWORD, &[("Cookie", invented)])?;
     ensure!(alice.cookie != invented && alice.cookie.starts_with("cloudroid="));
-    ensure!(alice.is_signed_in()? && alice.asks("GET", "/api/v1/services")?.0 == 200);
-    ensure!(alice.asks("GET", "/api/v1/tokens")?.0 == 403, "an operator");
-    let eve = Browser::signs_in(&daemon, "eve", OTHER)?;
+    ensure!(alice.is_signed_in()? && alice.request("GET", "/api/v1/services")?.0 == 200);
     ensure!(
-        eve.asks("GET", "/api/v1/status")?.0 == 403,
+        alice.request("GET", "/api/v1/tokens")?.0 == 403,
+        "an operator"
+    );
+    let eve = SignedInBrowser::sign_in(&daemon, "eve", OTHER)?;
+    ensure!(
+        eve.request("GET", "/api/v1/status")?.0 == 403,
         "a viewer of some"
     );
-    // Who signs in again has another session, and the one before is over.
-    let again =
-        Browser::signs_in_showing(&daemon, "alice", PASSWORD, &[("Cookie", &alice.cookie)])?;
+    // Signing in again creates a new session and ends the previous one.
+    let again = SignedInBrowser::sign_in_with_headers(
+        &daemon,
+        "alice",
+        PASSWORD,
+        &[("Cookie", &alice.cookie)],
+    )?;
     ensure!(again.cookie != alice.cookie && again.is_signed_in()?);
     ensure!(!alice.is_signed_in()?, "the one before");
-    // They are kept over a restart.
+    // Sessions survive a restart.
     let (cookie, csrf) = (again.cookie.clone(), again.csrf.clone());
     let address = daemon.address.clone();
-    daemon.ends()?;
+    daemon.stop()?;
     let daemon = setup.listen(&address).start()?;
-    let alice = Browser {
+    let alice = SignedInBrowser {
         daemon: &daemon,
         origin: format!("http://{address}"),
         cookie,
         csrf,
     };
     ensure!(alice.is_signed_in()?, "after the restart");
-    let listed = daemon.deployer().asks(&["account", "sessions"])?;
+    let listed = daemon.deployer().run_json(&["account", "sessions"])?;
     ensure!(
         listed.as_array().is_some_and(|all| all.len() == 2),
         "{listed}"
     );
-    let (status, body) = alice.asks("DELETE", PATH)?;
+    let (status, body) = alice.request("DELETE", PATH)?;
     ensure!(status == 204, "{status} {body}");
     ensure!(!alice.is_signed_in()?, "signed out");
-    // Nothing that anybody showed is written anywhere.
+    // No secret is written anywhere.
     let audited = daemon
         .deployer()
-        .types(&["--format", "json", "audit"])?
-        .succeeded()?
+        .run(&["--format", "json", "audit"])?
+        .expect_success()?
         .stdout;
     for words in [
         "account alice",
@@ -206,7 +222,7 @@ pub fn people_sign_in_and_out() -> Verdict {
     let log = std::fs::read_to_string(daemon.home.join("daemon.log"))?;
     let state =
         String::from_utf8_lossy(&std::fs::read(daemon.home.join("cloudroid.db"))?).into_owned();
-    for secret in [PASSWORD, OTHER, alice.secret(), &alice.csrf] {
+    for secret in [PASSWORD, OTHER, alice.session_secret(), &alice.csrf] {
         for (name, text) in [("audit log", &audited), ("log", &log), ("database", &state)] {
             ensure!(!text.contains(secret), "the {name} has a secret");
         }
@@ -215,40 +231,45 @@ pub fn people_sign_in_and_out() -> Verdict {
 }
 
 pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
-    let daemon = world().own("people-refused").start()?;
+    let daemon = world().setup("people-refused").start()?;
     let creates = |name: &str, role: &[&str], password: &str| {
-        account(&daemon, &[&["create", name], role].concat(), password)
+        run_account(&daemon, &[&["create", name], role].concat(), password)
     };
-    creates("alice", &["--role", "operator"], PASSWORD)?.succeeded()?;
+    creates("alice", &["--role", "operator"], PASSWORD)?.expect_success()?;
     for (name, role, password, words) in [
         ("bob", &["--role", "operator"][..], "short", "at least 12"),
         (
             "bob",
             &["--role", "operator"],
             "passwordpassword",
-            "first that are guessed",
+            "too easy to guess",
         ),
         (
             "bob",
             &["--role", "robot"],
             PASSWORD,
-            "people are no robots",
+            "cannot have the role robot",
         ),
         ("bob", &["--role", "viewer"], PASSWORD, "--service"),
-        ("b b", &["--role", "admin"], PASSWORD, "is no name"),
-        ("local", &["--role", "admin"], PASSWORD, "uses itself"),
+        ("b b", &["--role", "admin"], PASSWORD, "is not a valid name"),
+        (
+            "local",
+            &["--role", "admin"],
+            PASSWORD,
+            "is a reserved name",
+        ),
         ("alice", &["--role", "admin"], PASSWORD, "already"),
     ] {
-        creates(name, role, password)?.failed_saying(&[words])?;
+        creates(name, role, password)?.expect_failure(&[words])?;
     }
     let token = ["token", "create", "alice", "--role", "admin"];
     daemon
         .deployer()
-        .types(&token)?
-        .failed_saying(&["already"])?;
-    // Of a name that is nobody's nothing else is said.
-    let wrong = asks_in(&daemon, "alice", OTHER, &[])?;
-    let unknown = asks_in(&daemon, "nobody", OTHER, &[])?;
+        .run(&token)?
+        .expect_failure(&["already"])?;
+    // The response for an unknown name is the same.
+    let wrong = request_sign_in(&daemon, "alice", OTHER, &[])?;
+    let unknown = request_sign_in(&daemon, "nobody", OTHER, &[])?;
     ensure!(
         wrong.0 == 401 && wrong.2 == unknown.2,
         "{wrong:?} {unknown:?}"
@@ -269,66 +290,66 @@ pub fn whoever_cannot_sign_in_is_told_no_more_than_that() -> Verdict {
         (String::new(), 400),
         ("x".repeat(17 << 10), 413),
     ] {
-        let (found, _, said) = daemon.sends("POST", PATH, &[], &body)?;
+        let (found, _, said) = daemon.request_with_body("POST", PATH, &[], &body)?;
         ensure!(
             found == status && !said.contains(PASSWORD),
             "{found} {said}"
         );
     }
-    // Another site cannot sign anybody in.
+    // Another site cannot sign a user in.
     let evil = [("Origin", "https://evil.example")];
-    let (status, _, body) = asks_in(&daemon, "alice", PASSWORD, &evil)?;
+    let (status, _, body) = request_sign_in(&daemon, "alice", PASSWORD, &evil)?;
     ensure!(status == 403, "{status} {body}");
-    // Nobody signs in who may not any more.
+    // Users without access cannot sign in.
     daemon
         .deployer()
-        .types(&["account", "disable", "alice"])?
-        .succeeded()?;
-    let disabled = asks_in(&daemon, "alice", PASSWORD, &[])?;
+        .run(&["account", "disable", "alice"])?
+        .expect_success()?;
+    let disabled = request_sign_in(&daemon, "alice", PASSWORD, &[])?;
     ensure!(disabled.0 == 401 && disabled.2 == wrong.2, "{disabled:?}");
     daemon
         .deployer()
-        .types(&["account", "enable", "alice"])?
-        .succeeded()?;
-    Browser::signs_in(&daemon, "alice", PASSWORD)?;
-    account(&daemon, &["passwd", "alice"], OTHER)?.succeeded()?;
-    ensure!(asks_in(&daemon, "alice", PASSWORD, &[])?.0 == 401);
-    Browser::signs_in(&daemon, "alice", OTHER)?;
+        .run(&["account", "enable", "alice"])?
+        .expect_success()?;
+    SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
+    run_account(&daemon, &["passwd", "alice"], OTHER)?.expect_success()?;
+    ensure!(request_sign_in(&daemon, "alice", PASSWORD, &[])?.0 == 401);
+    SignedInBrowser::sign_in(&daemon, "alice", OTHER)?;
     daemon
         .deployer()
-        .types(&["account", "remove", "alice"])?
-        .succeeded()?;
-    ensure!(asks_in(&daemon, "alice", OTHER, &[])?.0 == 401);
+        .run(&["account", "remove", "alice"])?
+        .expect_success()?;
+    ensure!(request_sign_in(&daemon, "alice", OTHER, &[])?.0 == 401);
     ensure!(
         daemon.get("/api/v1/services")?.0 == 401,
         "the door does not open again"
     );
     for verb in ["remove", "disable", "enable"] {
-        let typed = daemon.deployer().types(&["account", verb, "alice"])?;
-        typed.failed_saying(&["there is no account", "account list"])?;
+        let typed = daemon.deployer().run(&["account", verb, "alice"])?;
+        typed.expect_failure(&["there is no account", "account list"])?;
     }
     Ok(())
 }
 
 pub fn who_guesses_passwords_is_slowed() -> Verdict {
-    let daemon = world().own("people-guessed").start()?;
-    account(
+    let daemon = world().setup("people-guessed").start()?;
+    run_account(
         &daemon,
         &["create", "alice", "--role", "operator"],
         PASSWORD,
     )?
-    .succeeded()?;
-    let alice = Browser::signs_in(&daemon, "alice", PASSWORD)?;
-    // Each guess makes the next wait longer: however slow this is, one comes too soon.
-    until("who guesses to be slowed", || {
-        let (status, head, body) = asks_in(&daemon, "alice", OTHER, &[])?;
+    .expect_success()?;
+    let alice = SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
+    // Each wrong attempt doubles the waiting time: however slow this machine is, one comes too early.
+    wait_until("who guesses to be slowed", || {
+        let (status, head, body) = request_sign_in(&daemon, "alice", OTHER, &[])?;
         ensure!(status == 401 || status == 429, "{status} {body}");
         Ok(match status {
             429 if head.to_ascii_lowercase().contains("retry-after") => Ok(()),
             _ => Err(body),
         })
     })?;
-    let metrics = alice.asks("GET", "/metrics")?;
+    let metrics = alice.request("GET", "/metrics")?;
     ensure!(
         metrics.0 == 200
             && metrics
@@ -340,20 +361,20 @@ pub fn who_guesses_passwords_is_slowed() -> Verdict {
 }
 
 pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
-    let daemon = world().own("people-sites").start()?;
+    let daemon = world().setup("people-sites").start()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
-    account(
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
+    run_account(
         &daemon,
         &["create", "alice", "--role", "operator"],
         PASSWORD,
     )?
-    .succeeded()?;
-    account(&daemon, &["create", "bob", "--role", "operator"], PASSWORD)?.succeeded()?;
-    let alice = Browser::signs_in(&daemon, "alice", PASSWORD)?;
-    let bob = Browser::signs_in(&daemon, "bob", PASSWORD)?;
+    .expect_success()?;
+    run_account(&daemon, &["create", "bob", "--role", "operator"], PASSWORD)?.expect_success()?;
+    let alice = SignedInBrowser::sign_in(&daemon, "alice", PASSWORD)?;
+    let bob = SignedInBrowser::sign_in(&daemon, "bob", PASSWORD)?;
     let (own, token) = (("Origin", &*alice.origin), ("X-CSRF-Token", &*alice.csrf));
     let stop = "/api/v1/services/none";
     for headers in [
@@ -367,21 +388,22 @@ pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
         &[("Sec-Fetch-Site", "same-site"), token],
         &[own, ("Sec-Fetch-Site", "cross-site"), token],
     ] {
-        let (status, body) = alice.asks_with("DELETE", stop, headers)?;
+        let (status, body) = alice.request_with_headers("DELETE", stop, headers)?;
         ensure!(status == 403, "{headers:?}: {status} {body}");
     }
-    let (status, body) = alice.asks("DELETE", stop)?;
+    let (status, body) = alice.request("DELETE", stop)?;
     ensure!(status == 404, "{status} {body}");
-    // Twice the cookie is nobody's.
+    // Two cookies are not accepted.
     let both = format!("{}; {}", alice.cookie, bob.cookie);
     let (status, body) = daemon.request("GET", "/api/v1/services", &[("Cookie", &both)])?;
     ensure!(status == 400 && body.contains("twice"), "{status} {body}");
-    // A token stands for itself, whatever the browser adds.
-    let secret = deployer.asks(&["token", "create", "tool", "--role", "operator"])?;
+    // A token is sufficient by itself, whatever the browser adds.
+    let secret = deployer.run_json(&["token", "create", "tool", "--role", "operator"])?;
     let bearer = format!("Bearer {}", secret["secret"].as_str().context("a secret")?);
-    let (status, body) = alice.asks_with("DELETE", stop, &[("Authorization", &bearer)])?;
+    let (status, body) =
+        alice.request_with_headers("DELETE", stop, &[("Authorization", &bearer)])?;
     ensure!(status == 404, "{status} {body}");
-    // A WebSocket of another page is refused before it is one.
+    // The WebSocket of another page is refused in the handshake.
     let url = daemon.url("adder_py?robot=r1");
     let shown = ("Cookie", &*alice.cookie);
     for headers in [
@@ -389,48 +411,51 @@ pub fn other_sites_pages_do_nothing_in_a_persons_browser() -> Verdict {
         &[shown, ("Origin", "https://evil.example")],
         &[shown, ("Origin", "null")],
     ] {
-        let Err(refusal) = Robot::try_connect_showing(&url, headers) else {
+        let Err(refusal) = Robot::try_connect_with_headers(&url, headers) else {
             bail!("a page of another site was let in: {headers:?}");
         };
         ensure!(refusal.status == 403, "{headers:?}: {refusal}");
     }
-    let connects = |browser: &Browser<'_>, robot: &str| {
+    let connects = |browser: &SignedInBrowser<'_>, robot: &str| {
         let headers = [("Cookie", &*browser.cookie), ("Origin", &*browser.origin)];
         let url = daemon.url(&format!("adder_py?robot={robot}"));
-        Robot::try_connect_showing(&url, &headers).map_err(|refusal| anyhow::anyhow!("{refusal}"))
+        Robot::try_connect_with_headers(&url, &headers)
+            .map_err(|refusal| anyhow::anyhow!("{refusal}"))
     };
     let mut page = connects(&alice, "r1")?;
     let mut beside = connects(&bob, "r2")?;
     for robot in [&mut page, &mut beside] {
-        ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+        ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     }
-    // Another role, and what was begun in the old one ends at once.
+    // When the role changes, connections opened with the old one end at once.
     deployer
-        .types(&["account", "role", "alice", "viewer", "--service", "*"])?
-        .succeeded()?;
-    let close = page.hears_close()?;
+        .run(&["account", "role", "alice", "viewer", "--service", "*"])?
+        .expect_success()?;
+    let close = page.wait_for_close()?;
     ensure!(
         u16::from(close.code) == 1008 && close.reason.contains("session"),
         "{close:?}"
     );
     ensure!(!alice.is_signed_in()?, "in another role");
-    ensure!(beside.calls("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
-    deployer.types(&["account", "logout", "bob"])?.succeeded()?;
-    ensure!(u16::from(beside.hears_close()?.code) == 1008 && !bob.is_signed_in()?);
+    ensure!(beside.call("/add_two", json!({"a": 2, "b": 2}))?["values"]["sum"] == 4);
+    deployer
+        .run(&["account", "logout", "bob"])?
+        .expect_success()?;
+    ensure!(u16::from(beside.wait_for_close()?.code) == 1008 && !bob.is_signed_in()?);
     Ok(())
 }
 
 pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
     let daemon = world()
-        .own("people-tls")
+        .setup("people-tls")
         .config("[tls]\nserve = \"tls\"\n")
         .start()?;
-    account(
+    run_account(
         &daemon,
         &["create", "alice", "--role", "operator"],
         PASSWORD,
     )?
-    .succeeded()?;
+    .expect_success()?;
     let port = daemon.address.rsplit(':').next().context("a port")?;
     let site = format!("https://localhost:{port}");
     let own = daemon.home.join("tls/own.pem");
@@ -441,7 +466,7 @@ pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
             .args(["--cacert", path_str(&own)])
             .args(more)
             .arg(format!("{site}{path}")))?
-        .succeeded()
+        .expect_success()
     };
     let body = json!({"name": "alice", "password": PASSWORD}).to_string();
     let origin = format!("Origin: {site}");
@@ -453,11 +478,11 @@ pub fn through_tls_the_cookie_is_shown_through_tls_alone() -> Verdict {
     );
     let known = asks(&["--cookie", &cookie], "/api/v1/whoami")?.stdout;
     ensure!(known.contains("alice"), "{known}");
-    // By another name anybody on the network could have set it.
+    // Without the `__Host-` prefix anyone in the network could have set it.
     let plain = cookie.replace("__Host-", "");
     let refused = asks(&["--cookie", &plain], "/api/v1/whoami")?.stdout;
     ensure!(refused.contains(" 401 "), "{refused}");
-    // What is told of plain text is another origin.
+    // The plain-text site is another origin.
     let origin = format!("Origin: http://localhost:{port}");
     let refused = asks(&["-H", &origin, "--data", &body], PATH)?.stdout;
     ensure!(refused.contains(" 403 "), "{refused}");

@@ -1,4 +1,4 @@
-//! What a deployer pushes, and what comes of it.
+//! Pushes of a deployer, and their results.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -11,23 +11,28 @@ use support::patience::tell_patience;
 use support::world::{ADDER, GREETER, world};
 use support::{Verdict, binaries};
 
-/// Asks the greeter of a service for a greeting.
-fn greeting(daemon: &Daemon, path: &str, input: &str, output: &str) -> anyhow::Result<Value> {
+/// Requests a greeting from the greeter of a service.
+fn request_greeting(
+    daemon: &Daemon,
+    path: &str,
+    input: &str,
+    output: &str,
+) -> anyhow::Result<Value> {
     let mut robot = daemon.robot(path)?;
-    robot.subscribes(output)?;
-    robot.says(json!({"op": "advertise", "topic": input, "type": "std_msgs/String"}))?;
-    robot.awaits_subscriber(input)?;
-    robot.says(json!({"op": "publish", "topic": input, "msg": {"data": "Ada"}}))?;
-    robot.hears_on(output)
+    robot.subscribe(output)?;
+    robot.send(json!({"op": "advertise", "topic": input, "type": "std_msgs/String"}))?;
+    robot.wait_for_subscriber(input)?;
+    robot.send(json!({"op": "publish", "topic": input, "msg": {"data": "Ada"}}))?;
+    robot.next_message_on(output)
 }
 
 pub fn a_cpp_package_is_compiled_and_greets() -> Verdict {
-    let daemon = world().with(GREETER)?;
-    let heard = greeting(&daemon, "greeter_cpp", "/greeter/name", "/greeter/greeting")?;
+    let daemon = world().daemon_with(GREETER)?;
+    let heard = request_greeting(&daemon, "greeter_cpp", "/greeter/name", "/greeter/greeting")?;
     ensure!(heard["text"] == "hi Ada" && heard["count"] == 1, "{heard}");
     let answer = daemon
         .robot("greeter_cpp")?
-        .calls("/greeter/count", json!({}))?;
+        .call("/greeter/count", json!({}))?;
     ensure!(
         answer["result"] == true && answer["values"]["style"] == "plain",
         "yaml-cpp was found: {answer}"
@@ -36,18 +41,17 @@ pub fn a_cpp_package_is_compiled_and_greets() -> Verdict {
 }
 
 pub fn which_output_answers_which_input_is_found_or_said() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let deployer = daemon.deployer();
     let pushes = |request: &str| {
         let options = ["--name", "asked", "--node", "greeter", "--request", request];
-        deployer.pushes("greeter_cpp", &options)
+        deployer.push("greeter_cpp", &options)
     };
-    let there = "/greeter/nme is no input of this service; its inputs are /greeter/name";
-    pushes("/greeter/nme=/greeter/greeting")?.failed_saying(&["--request", there])?;
-    let pushed = pushes("/greeter/name=/greeter/greeting")?.succeeded()?;
-    let words =
-        "an answer on /greeter/greeting is counted against /greeter/name, as --request says";
-    ensure!(pushed.said().contains(words), "{}", pushed.said());
+    let there = "/greeter/nme is not an input of this service; its inputs are /greeter/name";
+    pushes("/greeter/nme=/greeter/greeting")?.expect_failure(&["--request", there])?;
+    let pushed = pushes("/greeter/name=/greeter/greeting")?.expect_success()?;
+    let words = "answers on /greeter/greeting count for /greeter/name, as set by --request";
+    ensure!(pushed.output().contains(words), "{}", pushed.output());
     let about = daemon.get_json("/api/v1/services/asked")?;
     let said = &about["interface"]["requests"];
     ensure!(
@@ -58,10 +62,10 @@ pub fn which_output_answers_which_input_is_found_or_said() -> Verdict {
 }
 
 pub fn a_python_package_adds() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let mut robot = daemon.robot("adder_py")?;
-    robot.subscribes("/sums")?;
-    let answer = robot.calls("/add_two", json!({"a": 20, "b": 22}))?;
+    robot.subscribe("/sums")?;
+    let answer = robot.call("/add_two", json!({"a": 20, "b": 22}))?;
     ensure!(
         answer["result"] == true && answer["values"]["sum"] == 42,
         "{answer}"
@@ -70,10 +74,10 @@ pub fn a_python_package_adds() -> Verdict {
 }
 
 pub fn a_launch_file_is_resolved_by_roslaunch() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(
+        .push(
             "greeter_cpp",
             &[
                 "--name",
@@ -84,8 +88,8 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Verdict {
                 "word:=bonjour",
             ],
         )?
-        .succeeded()?;
-    let heard = greeting(
+        .expect_success()?;
+    let heard = request_greeting(
         &daemon,
         "launched",
         "/left/first/name",
@@ -95,23 +99,23 @@ pub fn a_launch_file_is_resolved_by_roslaunch() -> Verdict {
         heard["text"] == "bonjour Ada",
         "the argument and the private parameter arrived: {heard}"
     );
-    let heard = greeting(&daemon, "launched", "/names", "/second/greeting")?;
+    let heard = request_greeting(&daemon, "launched", "/names", "/second/greeting")?;
     ensure!(
         heard["text"] == "hello Ada",
         "the remapping arrived: {heard}"
     );
-    // What roslaunch refuses is refused in its own words.
+    // Errors of roslaunch are reported in its own words.
     deployer
-        .pushes(
+        .push(
             "greeter_cpp",
             &["--name", "unlaunched", "--launch", "needy.launch"],
         )?
-        .failed_saying(&["requires the 'who' arg to be set"])?;
+        .expect_failure(&["requires the 'who' arg to be set"])?;
     Ok(())
 }
 
 pub fn a_workspace_is_built_in_order() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let source = place.path().join("lab_ws/src");
     std::fs::create_dir_all(&source)?;
@@ -120,12 +124,12 @@ pub fn a_workspace_is_built_in_order() -> Verdict {
             .arg("-r")
             .arg(binaries::package(package))
             .arg(&source))?
-        .succeeded()?;
+        .expect_success()?;
     }
     let workspace = place.path().join("lab_ws");
     daemon
         .deployer()
-        .types(&[
+        .run(&[
             "push",
             path_str(&workspace),
             "--name",
@@ -135,16 +139,16 @@ pub fn a_workspace_is_built_in_order() -> Verdict {
             "--node",
             "adder_py/adder.py",
         ])?
-        .succeeded()?;
+        .expect_success()?;
     let mut robot = daemon.robot("lab?robot=both")?;
-    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
-    ensure!(robot.calls("/greeter/count", json!({}))?["result"] == true);
+    ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    ensure!(robot.call("/greeter/count", json!({}))?["result"] == true);
     Ok(())
 }
 
-/// A workspace of `aa_lib`, a library, and `bb_app`, a node that uses it, below `place`. `names` is what `bb_app`'s
-/// package.xml says of it.
-fn workspace_of_two(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
+/// Writes a workspace below `place` with a library, `aa_lib`, and a node that uses it, `bb_app`. `names` is inserted
+/// into the package.xml of `bb_app`.
+fn write_workspace(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
     let workspace = place.join("two_ws");
     let manifest = |name: &str, needs: &str| {
         format!(
@@ -168,7 +172,7 @@ fn workspace_of_two(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
     let node = "catkin_package()\ninclude_directories(${catkin_INCLUDE_DIRS})\nadd_executable(app src/app.cpp)\n\
                 target_link_libraries(app ${catkin_LIBRARIES})\n\
                 install(TARGETS app RUNTIME DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n";
-    // New to every cache: what this story says of compiling is true each time it is told.
+    // Unique, so that no cache contains it and the story's claims about compiling hold in every run.
     let unique = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)?
         .as_nanos();
@@ -201,13 +205,13 @@ fn workspace_of_two(place: &Path, names: &str) -> anyhow::Result<PathBuf> {
     Ok(workspace)
 }
 
-/// Pushes a workspace of two; its outcome, and the titles of its steps.
-fn push_of_two(
+/// Pushes such a workspace; returns the result and the titles of the steps.
+fn push_workspace(
     daemon: &Daemon,
     workspace: &Path,
     name: &str,
-) -> anyhow::Result<(support::deployer::Outcome, Vec<String>)> {
-    let outcome = daemon.deployer().types(&[
+) -> anyhow::Result<(support::deployer::CommandOutcome, Vec<String>)> {
+    let outcome = daemon.deployer().run(&[
         "--format",
         "json",
         "push",
@@ -225,7 +229,7 @@ fn push_of_two(
     Ok((outcome, titles))
 }
 
-fn compiled(steps: &[String]) -> Vec<&str> {
+fn compiled_packages(steps: &[String]) -> Vec<&str> {
     let titles = steps
         .iter()
         .filter_map(|step| step.strip_prefix("compiling "));
@@ -233,84 +237,90 @@ fn compiled(steps: &[String]) -> Vec<&str> {
 }
 
 pub fn what_was_compiled_before_a_failure_stays_compiled() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
-    let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
+    let workspace = write_workspace(place.path(), "<depend>aa_lib</depend>")?;
     let source = workspace.join("src/bb_app/src/app.cpp");
     let good = std::fs::read_to_string(&source)?;
     std::fs::write(
         &source,
         good.replace("ros::spin()", "ros::no_such_function()"),
     )?;
-    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
-    outcome.failed_saying(&["no_such_function"])?;
-    ensure!(compiled(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
+    outcome.expect_failure(&["no_such_function"])?;
+    ensure!(
+        compiled_packages(&steps) == ["aa_lib", "bb_app"],
+        "{steps:?}"
+    );
     std::fs::write(&source, &good)?;
-    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
-    outcome.succeeded()?;
-    ensure!(compiled(&steps) == ["bb_app"], "{steps:?}");
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
+    outcome.expect_success()?;
+    ensure!(compiled_packages(&steps) == ["bb_app"], "{steps:?}");
     let mut robot = daemon.robot("of_two")?;
-    robot.subscribes("/said")?;
-    ensure!(robot.hears_on("/said")?["data"] == "aa");
-    // A change of what is at the bottom reaches what stands on it.
+    robot.subscribe("/said")?;
+    ensure!(robot.next_message_on("/said")?["data"] == "aa");
+    // A change of the library also rebuilds the node.
     let library = workspace.join("src/aa_lib/src/aa.cpp");
     let text = std::fs::read_to_string(&library)?;
     std::fs::write(&library, text.replace("\"aa\"", "\"bb\""))?;
-    let (outcome, steps) = push_of_two(&daemon, &workspace, "of_two")?;
-    outcome.succeeded()?;
-    ensure!(compiled(&steps) == ["aa_lib", "bb_app"], "{steps:?}");
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "of_two")?;
+    outcome.expect_success()?;
+    ensure!(
+        compiled_packages(&steps) == ["aa_lib", "bb_app"],
+        "{steps:?}"
+    );
     let mut robot = daemon.robot("of_two?robot=later")?;
-    robot.subscribes("/said")?;
-    ensure!(robot.hears_on("/said")?["data"] == "bb");
+    robot.subscribe("/said")?;
+    ensure!(robot.next_message_on("/said")?["data"] == "bb");
     Ok(())
 }
 
 pub fn mistakes_in_cmake_are_told_before_anything_is_compiled() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
-    let workspace = workspace_of_two(place.path(), "<depend>aa_lib</depend>")?;
+    let workspace = write_workspace(place.path(), "<depend>aa_lib</depend>")?;
     let list = workspace.join("src/bb_app/CMakeLists.txt");
     let good = std::fs::read_to_string(&list)?;
     std::fs::write(
         &list,
         good.replace("std_msgs aa_lib", "std_msgs aa_lib no_such_package"),
     )?;
-    let (outcome, steps) = push_of_two(&daemon, &workspace, "unconfigured")?;
-    outcome.failed_saying(&["the build of bb_app failed", "no_such_package"])?;
-    ensure!(compiled(&steps).is_empty(), "{steps:?}");
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "unconfigured")?;
+    outcome.expect_failure(&["the build of bb_app failed", "no_such_package"])?;
+    ensure!(compiled_packages(&steps).is_empty(), "{steps:?}");
     Ok(())
 }
 
 pub fn a_package_may_use_others_that_it_does_not_name() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
-    let workspace = workspace_of_two(place.path(), "")?;
-    let (outcome, _) = push_of_two(&daemon, &workspace, "unnamed")?;
-    let outcome = outcome.succeeded()?;
+    let workspace = write_workspace(place.path(), "")?;
+    let (outcome, _) = push_workspace(&daemon, &workspace, "unnamed")?;
+    let outcome = outcome.expect_success()?;
     ensure!(
         outcome
             .stdout
-            .contains("bb_app uses other packages of the workspace"),
+            .contains("bb_app uses packages of the workspace"),
         "{}",
-        outcome.said()
+        outcome.output()
     );
     let mut robot = daemon.robot("unnamed")?;
-    robot.subscribes("/said")?;
-    ensure!(robot.hears_on("/said")?["data"] == "aa");
-    let (outcome, steps) = push_of_two(&daemon, &workspace, "unnamed")?;
-    outcome.succeeded()?;
-    ensure!(compiled(&steps).is_empty(), "{steps:?}");
+    robot.subscribe("/said")?;
+    ensure!(robot.next_message_on("/said")?["data"] == "aa");
+    let (outcome, steps) = push_workspace(&daemon, &workspace, "unnamed")?;
+    outcome.expect_success()?;
+    ensure!(compiled_packages(&steps).is_empty(), "{steps:?}");
     Ok(())
 }
 
 pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let mut images = Vec::new();
     for package in ["image_proc", "stereo_image_proc"] {
-        let outcome = daemon.deployer().types(&[
+        let outcome = daemon.deployer().run(&[
             "--format", "json", "push", "--apt", package, "--node", package,
         ])?;
-        let outcome = outcome.succeeded()?;
+        let outcome = outcome.expect_success()?;
         let events = outcome.stdout.lines();
         let mut events = events.filter_map(|line| serde_json::from_str::<Value>(line).ok());
         let done = events.find(|event| event["type"] == "done");
@@ -342,12 +352,12 @@ pub fn packages_with_the_same_libraries_share_their_layers() -> Verdict {
 }
 
 pub fn a_prebuilt_space_is_served() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let place = tempfile::tempdir()?;
     let space = extract_install_space(&daemon, "adder_py", place.path())?;
     daemon
         .deployer()
-        .types(&[
+        .run(&[
             "push",
             path_str(&space),
             "--name",
@@ -355,15 +365,15 @@ pub fn a_prebuilt_space_is_served() -> Verdict {
             "--node",
             "adder.py",
         ])?
-        .succeeded()?;
+        .expect_success()?;
     let answer = daemon
         .robot("prebuilt")?
-        .calls("/add_two", json!({"a": 2, "b": 3}))?;
+        .call("/add_two", json!({"a": 2, "b": 3}))?;
     ensure!(answer["values"]["sum"] == 5, "{answer}");
     Ok(())
 }
 
-/// The install space that a push has made, taken out of its image.
+/// Extracts the install space of a service from its image.
 pub fn extract_install_space(
     daemon: &Daemon,
     service: &str,
@@ -374,21 +384,21 @@ pub fn extract_install_space(
     run(Command::new("umoci")
         .args(["unpack", "--image", &image])
         .arg(&bundle))?
-    .succeeded()?;
+    .expect_success()?;
     let space = bundle.join("rootfs/opt/cloudroid/install");
     ensure!(space.is_dir(), "an install space in the image");
     Ok(space)
 }
 
 pub fn an_unchanged_push_builds_no_layer() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let outcome = daemon
         .deployer()
-        .pushes("greeter_cpp", &["--name", "again", "--node", "greeter"])?
-        .succeeded()?;
-    ensure!(outcome.stdout.contains("again"), "{}", outcome.said());
+        .push("greeter_cpp", &["--name", "again", "--node", "greeter"])?
+        .expect_success()?;
+    ensure!(outcome.stdout.contains("again"), "{}", outcome.output());
     let first = daemon.get_json("/api/v1/services/again")?;
-    let answer = daemon.deployer().types(&[
+    let answer = daemon.deployer().run(&[
         "--format",
         "json",
         "push",
@@ -398,7 +408,7 @@ pub fn an_unchanged_push_builds_no_layer() -> Verdict {
         "--node",
         "greeter",
     ])?;
-    let answer = answer.succeeded()?;
+    let answer = answer.expect_success()?;
     let done: Value = answer
         .stdout
         .lines()
@@ -419,13 +429,13 @@ pub fn an_unchanged_push_builds_no_layer() -> Verdict {
 }
 
 pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let place = tempfile::tempdir()?;
     run(Command::new("cp")
         .arg("-r")
         .arg(binaries::package("greeter_cpp"))
         .arg(place.path()))?
-    .succeeded()?;
+    .expect_success()?;
     let package = place.path().join("greeter_cpp");
     let push = [
         "push",
@@ -435,7 +445,7 @@ pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Verdict {
         "--node",
         "greeter",
     ];
-    daemon.deployer().types(&push)?.succeeded()?;
+    daemon.deployer().run(&push)?.expect_success()?;
     let source = package.join("src/greeter.cpp");
     let text = std::fs::read_to_string(&source)?;
     std::fs::write(
@@ -444,30 +454,30 @@ pub fn a_failed_build_leaves_the_earlier_revision_serving() -> Verdict {
     )?;
     daemon
         .deployer()
-        .types(&push)?
-        .failed_saying(&["no_such_function", "greeter.cpp:4"])?;
-    let answer = daemon.robot("steady")?.calls("/greeter/count", json!({}))?;
+        .run(&push)?
+        .expect_failure(&["no_such_function", "greeter.cpp:4"])?;
+    let answer = daemon.robot("steady")?.call("/greeter/count", json!({}))?;
     ensure!(answer["result"] == true, "{answer}");
     ensure!(daemon.get_json("/api/v1/services/steady")?["revision"] == 1);
     Ok(())
 }
 
 pub fn what_package_xml_forgot_is_named_and_added() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let deployer = daemon.deployer();
     let node = ["--node", "recorder", "--param", "file=/tmp/heard.bag"];
-    // CMake's question for roslint, which no package of the distribution has, is answered; this one is not.
-    deployer.pushes("undeclared_cpp", &node)?.failed_saying(&[
+    // CMake's search for roslint, which the distribution does not package, is satisfied; this one is not.
+    deployer.push("undeclared_cpp", &node)?.expect_failure(&[
         "the CMake package rosbag_storage is missing",
         "--with rosbag_storage",
     ])?;
     let missed = ["--param", "/recorder/file=/tmp/nobody.bag"];
     let added = ["--with", "rosbag_storage"];
     let pushed = deployer
-        .pushes("undeclared_cpp", &[&node[..], &missed, &added].concat())?
-        .succeeded()?;
-    // An anonymous node: its program's name without what makes it unique, and its parameters there.
-    let service = deployer.asks(&["services", "undeclared_cpp"])?;
+        .push("undeclared_cpp", &[&node[..], &missed, &added].concat())?
+        .expect_success()?;
+    // An anonymous node has its program's name without the unique suffix, also for its parameters.
+    let service = deployer.run_json(&["services", "undeclared_cpp"])?;
     ensure!(
         service["nodes"][0]["name"] == "/bag_recorder",
         "{service:#}"
@@ -483,27 +493,27 @@ pub fn what_package_xml_forgot_is_named_and_added() -> Verdict {
     );
     ensure!(
         pushed
-            .said()
-            .contains("parameter /recorder/file is given for a name that no node has"),
+            .output()
+            .contains("parameter /recorder/file matches no node"),
         "{}",
-        pushed.said()
+        pushed.output()
     );
     Ok(())
 }
 
 pub fn a_revision_is_rolled_back() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let deployer = daemon.deployer();
     deployer
-        .pushes(
+        .push(
             "adder_py",
             &[
                 "--name", "moody", "--node", "adder.py", "--param", "offset=1",
             ],
         )?
-        .succeeded()?;
+        .expect_success()?;
     deployer
-        .pushes(
+        .push(
             "adder_py",
             &[
                 "--name",
@@ -514,15 +524,15 @@ pub fn a_revision_is_rolled_back() -> Verdict {
                 "offset=100",
             ],
         )?
-        .succeeded()?;
+        .expect_success()?;
     let sum = |robot: &str| -> anyhow::Result<Value> {
         let mut robot = daemon.robot(&format!("moody?robot={robot}"))?;
-        Ok(robot.calls("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"].clone())
+        Ok(robot.call("/add_two", json!({"a": 1, "b": 1}))?["values"]["sum"].clone())
     };
     ensure!(sum("new")? == 102);
-    deployer.types(&["rollback", "moody"])?.succeeded()?;
+    deployer.run(&["rollback", "moody"])?.expect_success()?;
     ensure!(sum("old")? == 3);
-    deployer.types(&["rm", "moody"])?.succeeded()?;
+    deployer.run(&["rm", "moody"])?.expect_success()?;
     ensure!(
         daemon.servants_of("moody")?.is_empty(),
         "its servants went with it"
@@ -532,13 +542,13 @@ pub fn a_revision_is_rolled_back() -> Verdict {
 }
 
 pub fn five_packaged_nodes_answer() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let outcome = run(tell_patience(&mut Command::new(binaries::python()))
         .arg(binaries::checkout().join("tests/robots/packaged_nodes.py"))
         .arg(&daemon.address)
         .arg(binaries::path("cloudroidctl"))
         .env("CLOUDROID_HOME", &daemon.home))?;
-    let outcome = outcome.succeeded()?;
+    let outcome = outcome.expect_success()?;
     for node in [
         "people_detect",
         "face_detection",
@@ -549,7 +559,7 @@ pub fn five_packaged_nodes_answer() -> Verdict {
         ensure!(
             outcome.stdout.contains(&format!("{node}: answered")),
             "{}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(())

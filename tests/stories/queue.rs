@@ -1,4 +1,4 @@
-//! Robots before a machine that is full: who goes first, and what each is told.
+//! Robots waiting for a full machine: their order, and what each of them is told.
 
 use std::io::{Read, Write};
 use std::process::Command;
@@ -12,24 +12,27 @@ use support::deployer::run;
 use support::patience::{connect, scale_seconds};
 use support::world::{GREETER, world};
 
-/// Between looks at what a push has come to.
+/// Polling interval for the state of a push.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A daemon with room for one servant of the greeter.
-fn full(name: &str, config: &str) -> anyhow::Result<Daemon> {
+/// Starts a daemon with capacity for one servant of the greeter.
+fn start_full(name: &str, config: &str) -> anyhow::Result<Daemon> {
     let servant = "[servant]\nwarm_pool = 0\ngrace = \"0s\"\n";
     let daemon = world()
-        .own(name)
+        .setup(name)
         .config(&format!("[capacity]\ncpus = 1.0\n{config}\n{servant}"))
         .start()?;
     let package = GREETER.package.context("a package")?;
     let arguments = [GREETER.arguments, &["--cpus", "1"]].concat();
-    daemon.deployer().pushes(package, &arguments)?.succeeded()?;
+    daemon
+        .deployer()
+        .push(package, &arguments)?
+        .expect_success()?;
     Ok(daemon)
 }
 
-/// The status of the answer to a stub's handshake, and its head.
-fn stub_is_answered(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
+/// Returns the status line and headers of the response to a stub's handshake.
+fn stub_handshake(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     let mut stream = connect(&daemon.address)?;
     write!(
         stream,
@@ -51,77 +54,78 @@ fn stub_is_answered(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
 }
 
 pub fn who_finds_no_room_is_told_its_place_and_then_why_it_is_refused() -> Verdict {
-    // While the second waits, the third has to come.
+    // Enough time for the third robot to connect while the second one waits.
     let waits = scale_seconds(5);
-    let daemon = full("queue", &format!("queue = 1\ndeadline = \"{waits}s\""))?;
+    let daemon = start_full("queue", &format!("queue = 1\ndeadline = \"{waits}s\""))?;
     let mut first = daemon.robot("greeter_cpp?robot=first")?;
-    first.calls("/rosapi/get_time", json!({}))?;
-    // It speaks rosbridge alone.
+    first.call("/rosapi/get_time", json!({}))?;
+    // A client that speaks only rosbridge.
     let mut second = daemon.robot("greeter_cpp?robot=second")?;
-    let told = second.hears_status("this robot is number 1 of 1 that wait")?;
+    let told = second.wait_for_status("this robot is number 1 of 1 waiting")?;
     ensure!(told["level"] == "warning", "{told}");
     let mut third = daemon.robot("greeter_cpp?robot=third")?;
-    let told = third.hears_status("1 robots wait for room already")?;
+    let told = third.wait_for_status("1 robots are already waiting")?;
     ensure!(told["level"] == "error", "{told}");
-    ensure!(u16::from(third.hears_close()?.code) == 1013);
-    let words = format!("no room came free within {waits} s; it was number 1 of 1");
-    let told = second.hears_status(&words)?;
+    ensure!(u16::from(third.wait_for_close()?.code) == 1013);
+    let words = format!("no capacity became free within {waits} s; it was number 1 of 1");
+    let told = second.wait_for_status(&words)?;
     ensure!(told["level"] == "error", "{told}");
-    ensure!(u16::from(second.hears_close()?.code) == 1013);
+    ensure!(u16::from(second.wait_for_close()?.code) == 1013);
     // A stub reads the status of the handshake.
-    let answer = stub_is_answered(&daemon, "fourth")?;
+    let answer = stub_handshake(&daemon, "fourth")?;
     ensure!(answer.starts_with("HTTP/1.1 503"), "{answer}");
     let head = answer.to_lowercase();
     ensure!(head.contains("retry-after: 10"), "{answer}");
-    ensure!(answer.contains("number 1 of 1 that wait"), "{answer}");
-    // What they asked for is nobody's now.
-    first.leaves()?;
+    ensure!(answer.contains("number 1 of 1 waiting"), "{answer}");
+    // Their requests have been dropped.
+    first.leave()?;
     let mut fifth = daemon.robot("greeter_cpp?robot=fifth")?;
-    fifth.calls("/rosapi/get_time", json!({}))?;
-    // Names of robots for which there never was room are bound to nobody.
+    fifth.call("/rosapi/get_time", json!({}))?;
+    // Names of robots that were never served are not stored.
     let script = format!(
-        "import sqlite3\nfor name, in sqlite3.connect({:?}).execute('SELECT name FROM robots ORDER BY name'): print(name)",
+        "import sqlite3\nfor name, in sqlite3.connect({:?}).execute('SELECT name FROM robots ORDER BY name'): \
+         print(name)",
         daemon.home.join("cloudroid.db")
     );
-    let kept = run(Command::new("python3").args(["-c", &script]))?.succeeded()?;
+    let kept = run(Command::new("python3").args(["-c", &script]))?.expect_success()?;
     ensure!(kept.stdout == "fifth\nfirst\n", "{}", kept.stdout);
     Ok(())
 }
 
 pub fn robots_of_a_higher_class_go_first() -> Verdict {
     let classes = "deadline = \"10m\"\n[class.urgent]\npriority = 5";
-    let daemon = full("classes", classes)?;
+    let daemon = start_full("classes", classes)?;
     let mut first = daemon.robot("greeter_cpp?robot=first")?;
-    first.calls("/rosapi/get_time", json!({}))?;
+    first.call("/rosapi/get_time", json!({}))?;
     let mut second = daemon.robot("greeter_cpp?robot=second")?;
-    second.hears_status("number 1 of 1")?;
+    second.wait_for_status("number 1 of 1")?;
     let mut urgent = daemon.robot("greeter_cpp?robot=urgent&class=urgent")?;
-    urgent.hears_status("number 1 of 2")?;
-    second.hears_status("number 2 of 2")?;
+    urgent.wait_for_status("number 1 of 2")?;
+    second.wait_for_status("number 2 of 2")?;
     let fit = daemon
         .deployer()
-        .types(&["--format", "json", "fit", "greeter_cpp"])?
-        .succeeded()?;
+        .run(&["--format", "json", "fit", "greeter_cpp"])?
+        .expect_success()?;
     let fit: Value = serde_json::from_str(&fit.stdout)?;
     ensure!(
         fit["now"] == false && fit["more"] == 0 && fit["waiting"] == 2,
         "{fit}"
     );
-    first.leaves()?;
-    urgent.calls("/rosapi/get_time", json!({}))?;
-    second.hears_status("number 1 of 1")?;
-    urgent.leaves()?;
-    second.calls("/rosapi/get_time", json!({}))?;
+    first.leave()?;
+    urgent.call("/rosapi/get_time", json!({}))?;
+    second.wait_for_status("number 1 of 1")?;
+    urgent.leave()?;
+    second.call("/rosapi/get_time", json!({}))?;
     Ok(())
 }
 
-/// A package whose node never registers.
+/// A node that never registers.
 const SLEEPER: &str = "#!/usr/bin/env python3\nimport time\nwhile True: time.sleep(1)\n";
 
 pub fn a_probe_gives_way_to_a_robot() -> Verdict {
-    // Room for one servant whose push asked for nothing, and time enough to look at a node that never shows itself.
+    // Capacity for one servant with the default limits, and enough time to examine a node that never registers.
     let daemon = world()
-        .own("probe-gives-way")
+        .setup("probe-gives-way")
         .config(
             "[capacity]\nmemory = \"100M\"\n[servant]\nwarm_pool = 0\n[push]\nprobe = \"30m\"\n",
         )
@@ -129,8 +133,8 @@ pub fn a_probe_gives_way_to_a_robot() -> Verdict {
     let package = GREETER.package.context("a package")?;
     daemon
         .deployer()
-        .pushes(package, GREETER.arguments)?
-        .succeeded()?;
+        .push(package, GREETER.arguments)?
+        .expect_success()?;
     let place = world().directory("sleeper")?;
     let sleeper = place.path().join("sleeper_py");
     std::fs::create_dir_all(sleeper.join("scripts"))?;
@@ -149,9 +153,9 @@ pub fn a_probe_gives_way_to_a_robot() -> Verdict {
     let deployer = daemon.deployer();
     let path = sleeper.to_string_lossy().into_owned();
     let push = std::thread::spawn(move || {
-        deployer.types(&["push", &path, "--node", "sleeper.py", "--name", "sleeper"])
+        deployer.run(&["push", &path, "--node", "sleeper.py", "--name", "sleeper"])
     });
-    // However long it is built.
+    // However long the build takes.
     let until = |is: fn(&Value) -> bool| -> Verdict {
         while !is(&daemon.get_json("/api/v1/status")?["capacity"]) {
             ensure!(!push.is_finished(), "the push ended");
@@ -161,16 +165,13 @@ pub fn a_probe_gives_way_to_a_robot() -> Verdict {
     };
     until(|capacity| capacity["memory_reserved"].as_u64() > Some(0))?;
     let mut robot = daemon.robot("greeter_cpp?robot=first")?;
-    robot.calls("/rosapi/get_time", json!({}))?;
+    robot.call("/rosapi/get_time", json!({}))?;
     until(|capacity| capacity["waiting"] == 1)?;
-    daemon.ends()?;
+    daemon.stop()?;
     let Ok(outcome) = push.join() else {
         bail!("the deployer panicked");
     };
-    let said = outcome?.said();
-    ensure!(
-        said.contains("a robot needs its room: it is ended"),
-        "{said}"
-    );
+    let said = outcome?.output();
+    ensure!(said.contains("a robot needs this capacity"), "{said}");
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! A servant is ready when what its robot came for is there, not when its processes run.
+//! A servant is ready when its node has registered what its robot needs, not when its processes run.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
@@ -12,21 +12,21 @@ use support::robot::Robot;
 use support::world::world;
 use tokio_tungstenite::tungstenite::Message;
 
-/// Longer than nodes are given that were told to show less.
+/// Longer than the time given to nodes that register less than expected.
 const LONG: Duration = Duration::from_secs(7);
 
-/// A daemon with our slow package, whose node waits for `1` and then `2` from the address given back.
-fn slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
+/// Starts a daemon with our slow package, whose node waits for `1` and then `2` from the returned listener.
+fn start_slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
     let models = TcpListener::bind("127.0.0.1:0")?;
     let port = models.local_addr()?.port();
     let config = format!("[allow]\negress = [\"127.0.0.1:{port}\"]\n");
-    let daemon = world().own(name).config(&config).start()?;
-    // At the push it is served at once.
+    let daemon = world().setup(name).config(&config).start()?;
+    // During the push the node gets both at once.
     std::thread::scope(|scope| {
         let serving = scope.spawn(|| models.accept()?.0.write_all(b"12"));
         daemon
             .deployer()
-            .pushes(
+            .push(
                 "slow_py",
                 &[
                     "--node",
@@ -37,15 +37,15 @@ fn slow(name: &str) -> anyhow::Result<(Daemon, TcpListener)> {
                     &format!("127.0.0.1:{port}"),
                 ],
             )?
-            .succeeded()?;
+            .expect_success()?;
         serving.join().expect("a thread")?;
         anyhow::Ok(())
     })?;
     Ok((daemon, models))
 }
 
-/// Waits until the next node of it is registered, and goes on waiting for its `2`.
-fn registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
+/// Waits until the next node has registered and waits for its `2`.
+fn wait_until_registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
     let mut node = models.accept()?.0;
     node.write_all(b"1")?;
     let mut said = String::new();
@@ -55,46 +55,46 @@ fn registered(models: &TcpListener) -> anyhow::Result<TcpStream> {
 }
 
 pub fn who_leaves_while_its_servant_starts_is_let_go_at_once() -> Verdict {
-    let (daemon, models) = slow("leaving")?;
+    let (daemon, models) = start_slow("leaving")?;
     let mut robot = daemon.robot("slow_py")?;
-    let _node = registered(&models)?;
-    // There is nothing for it yet, and it is heard all the same.
-    robot.sends(Message::Ping("are you there".into()))?;
-    let pong = robot.frame()?;
+    let _node = wait_until_registered(&models)?;
+    // Nothing is ready yet, but its messages are received.
+    robot.send_frame(Message::Ping("are you there".into()))?;
+    let pong = robot.next_frame()?;
     ensure!(pong == Message::Pong("are you there".into()), "{pong:?}");
-    robot.sends(Message::Close(None))?;
-    let closed = robot.frame()?;
+    robot.send_frame(Message::Close(None))?;
+    let closed = robot.next_frame()?;
     ensure!(closed == Message::Close(None), "{closed:?}");
-    // Nobody can come back to its servant: it is not started to its end.
-    daemon.awaits_event("a servant's end before it was ready", |event| {
+    // Since the robot cannot return to its servant, the start is aborted.
+    daemon.wait_for_event("a servant's end before it was ready", |event| {
         event["message"]
             .as_str()
             .is_some_and(|text| text.contains("its robot left before it was ready"))
     })?;
 
-    // Who stays may say what it wants in the meantime, and gets it in order.
+    // A robot that stays may send messages meanwhile, and they are processed in order.
     let mut robot = daemon.robot("slow_py?robot=eager")?;
-    let mut node = registered(&models)?;
-    robot.says(json!({"op": "advertise", "topic": "/questions", "type": "std_msgs/String"}))?;
-    robot.says(json!({"op": "subscribe", "topic": "/answers", "type": "std_msgs/String"}))?;
-    robot.says(json!({"op": "publish", "topic": "/questions", "msg": {"data": "early"}}))?;
-    robot.sends(Message::Ping("still there".into()))?;
-    let pong = robot.frame()?;
+    let mut node = wait_until_registered(&models)?;
+    robot.send(json!({"op": "advertise", "topic": "/questions", "type": "std_msgs/String"}))?;
+    robot.send(json!({"op": "subscribe", "topic": "/answers", "type": "std_msgs/String"}))?;
+    robot.send(json!({"op": "publish", "topic": "/questions", "msg": {"data": "early"}}))?;
+    robot.send_frame(Message::Ping("still there".into()))?;
+    let pong = robot.next_frame()?;
     ensure!(pong == Message::Pong("still there".into()), "{pong:?}");
     ensure!(daemon.servant_of("slow_py", "eager")?["phase"] == "starting");
     node.write_all(b"2")?;
-    ensure!(robot.hears_on("/answers")?["data"] == "you asked early");
+    ensure!(robot.next_message_on("/answers")?["data"] == "you asked early");
     drop(robot);
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(())
 }
 
 pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdict {
-    let (daemon, models) = slow("slow")?;
+    let (daemon, models) = start_slow("slow")?;
     let url = daemon.url("slow_py?robot=patient");
     let coming = std::thread::spawn(move || Robot::connect(&url));
-    let mut node = registered(&models)?;
-    // It runs, the Master knows it, and yet there is nothing for a robot.
+    let mut node = wait_until_registered(&models)?;
+    // The node runs and has contacted the Master, but the servant is not ready.
     let began = Instant::now();
     while began.elapsed() < LONG {
         let servant = daemon.servant_of("slow_py", "patient")?;
@@ -107,13 +107,13 @@ pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdi
     }
     node.write_all(b"2")?;
     let mut robot = coming.join().expect("a thread")?;
-    robot.subscribes("/answers")?;
-    robot.says(json!({"op": "advertise", "topic": "/questions", "type": "std_msgs/String"}))?;
-    robot.awaits_subscriber("/questions")?;
-    robot.says(json!({"op": "publish", "topic": "/questions", "msg": {"data": "now"}}))?;
-    ensure!(robot.hears_on("/answers")?["data"] == "you asked now");
+    robot.subscribe("/answers")?;
+    robot.send(json!({"op": "advertise", "topic": "/questions", "type": "std_msgs/String"}))?;
+    robot.wait_for_subscriber("/questions")?;
+    robot.send(json!({"op": "publish", "topic": "/questions", "msg": {"data": "now"}}))?;
+    ensure!(robot.next_message_on("/answers")?["data"] == "you asked now");
     ensure!(daemon.servant_of("slow_py", "patient")?["phase"] == "ready");
-    let events = daemon.deployer().asks(&["events"])?;
+    let events = daemon.deployer().run_json(&["events"])?;
     let incomplete = events.as_array().context("events")?.iter();
     ensure!(
         incomplete
@@ -123,6 +123,6 @@ pub fn a_node_that_is_slow_is_waited_for_until_its_interface_is_there() -> Verdi
         "{events:#}"
     );
     drop(robot);
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! What flows in a servant is recorded, read by the format's own readers, and replayed.
+//! Recordings of a servant's topics, read with the format's own readers, and replayed.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -14,11 +14,11 @@ use support::deployer::{path_str, run};
 use support::patience::{scale_seconds, tell_patience};
 use support::world::world;
 
-use crate::access::token;
-use crate::inside::Scene;
+use crate::access::create_token;
+use crate::inside::InsideScene;
 
-/// What the format's own Python packages find in a file.
-pub fn reads(file: &Path) -> anyhow::Result<Value> {
+/// Returns what the format's own Python packages find in a file.
+pub fn read_recording(file: &Path) -> anyhow::Result<Value> {
     let said = with_python("read", file)?;
     Ok(serde_json::from_str(&said)?)
 }
@@ -27,15 +27,15 @@ fn with_python(verb: &str, file: &Path) -> anyhow::Result<String> {
     let program = binaries::checkout().join("tests/readers/recording.py");
     let mut reader = Command::new(binaries::readers().join("python"));
     reader.arg(program).arg(verb).arg(file);
-    Ok(run(&mut reader)?.succeeded()?.stdout)
+    Ok(run(&mut reader)?.expect_success()?.stdout)
 }
 
-/// A robot that talks with roslibpy.
-struct Talker(Child);
+/// A robot that publishes and subscribes with roslibpy.
+struct TalkingRobot(Child);
 
-impl Talker {
-    /// Returns once it is answered.
-    fn begins(scene: &Scene) -> anyhow::Result<Talker> {
+impl TalkingRobot {
+    /// Starts it; returns once its messages are answered.
+    fn start(scene: &InsideScene) -> anyhow::Result<TalkingRobot> {
         let url = scene
             .daemon
             .url(&format!("sights_py?token={}", scene.token));
@@ -51,11 +51,11 @@ impl Talker {
         let mut out = BufReader::with_capacity(1, child.stdout.as_mut().context("piped")?);
         out.read_line(&mut line)?;
         ensure!(line == "heard\n", "{line}");
-        Ok(Talker(child))
+        Ok(TalkingRobot(child))
     }
 
-    /// What it has heard, once it has heard its last word.
-    fn ends(mut self) -> anyhow::Result<Vec<String>> {
+    /// Returns the messages that it received up to its last one.
+    fn finish(mut self) -> anyhow::Result<Vec<String>> {
         drop(self.0.stdin.take());
         let mut heard = String::new();
         let out = self.0.stdout.as_mut().context("piped")?;
@@ -65,24 +65,24 @@ impl Talker {
     }
 }
 
-impl Drop for Talker {
+impl Drop for TalkingRobot {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// Those of a topic of strings in a file that was read.
-pub fn texts(file: &Value, topic: &str) -> anyhow::Result<Vec<String>> {
+/// Returns the strings of a topic in a file that was read.
+pub fn topic_texts(file: &Value, topic: &str) -> anyhow::Result<Vec<String>> {
     Ok(serde_json::from_value(file["texts"][topic].clone())?)
 }
 
 pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
-    let mut scene = Scene::new("recordings", "")?;
+    let mut scene = InsideScene::new("recordings", "")?;
     let place = world().directory("recordings")?;
     let file = place.path().join("said.mcap");
-    let talker = Talker::begins(&scene)?;
-    // Long enough for all topics to be connected, and for some words.
+    let talker = TalkingRobot::start(&scene)?;
+    // Long enough for all topics to be connected, and for some messages.
     let duration = format!("{}s", scale_seconds(3));
     let typed = [
         "--format",
@@ -98,20 +98,21 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
         "--duration",
         &duration,
     ];
-    let outcome = scene.daemon.deployer().types(&typed)?.succeeded()?;
+    let outcome = scene.daemon.deployer().run(&typed)?.expect_success()?;
     let summary: Value = serde_json::from_str(&outcome.stdout)?;
-    let heard = talker.ends()?;
+    let heard = talker.finish()?;
 
-    let read = reads(&file)?;
+    let read = read_recording(&file)?;
     ensure!(read["profile"] == "ros1", "{read}");
     ensure!(
         read["topics"]
-            == json!({"/sights/map": "nav_msgs/OccupancyGrid", "/sights/said": "std_msgs/String", "/sights/say": "std_msgs/String"}),
+            == json!({"/sights/map": "nav_msgs/OccupancyGrid", "/sights/said": "std_msgs/String",
+                "/sights/say": "std_msgs/String"}),
         "{read}"
     );
     ensure!(read["messages"] == summary["messages"], "{read} {summary}");
-    // All that roslibpy heard from the first to the last of them.
-    let said = texts(&read, "/sights/said")?;
+    // All messages that roslibpy received from the first to the last one in the file.
+    let said = topic_texts(&read, "/sights/said")?;
     let first = heard.iter().position(|word| Some(word) == said.first());
     let during = &heard[first.context("recorded and not heard")?..];
     ensure!(
@@ -119,12 +120,15 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
         "{said:?} {during:?}"
     );
 
-    // Replayed, the node answers as it did.
-    scene.rover.subscribes("/sights/said")?;
-    let say = |op: &str| json!({"op": op, "topic": "/sights/say", "type": "std_msgs/String", "msg": {"data": "heard?"}});
-    scene.rover.says(say("advertise"))?;
-    support::until("what it says itself comes back", || {
-        scene.rover.says(say("publish"))?;
+    // When the recording is replayed, the node gives the same answers.
+    scene.rover.subscribe("/sights/said")?;
+    let say = |op: &str| {
+        json!({"op": op, "topic": "/sights/say", "type": "std_msgs/String",
+        "msg": {"data": "heard?"}})
+    };
+    scene.rover.send(say("advertise"))?;
+    support::wait_until("what it says itself comes back", || {
+        scene.rover.send(say("publish"))?;
         let unheard = scene
             .rover
             .has_not_heard(|said| said["topic"] == "/sights/said")?;
@@ -134,19 +138,19 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
     })?;
     let replay = |more: &[&str]| {
         let typed = ["replay", path_str(&file), "--to", &scene.servant];
-        scene.daemon.deployer().types(&[&typed, more].concat())
+        scene.daemon.deployer().run(&[&typed, more].concat())
     };
-    replay(&["--topic", "/sights/say", "--rate", "4"])?.succeeded()?;
-    for word in &texts(&read, "/sights/say")? {
-        let mut again = scene.rover.hears_on("/sights/said")?;
+    replay(&["--topic", "/sights/say", "--rate", "4"])?.expect_success()?;
+    for word in &topic_texts(&read, "/sights/say")? {
+        let mut again = scene.rover.next_message_on("/sights/said")?;
         while again["data"] == "heard?" {
-            again = scene.rover.hears_on("/sights/said")?;
+            again = scene.rover.next_message_on("/sights/said")?;
         }
         ensure!(again["data"] == word.as_str(), "{again}, not {word}");
     }
-    replay(&["--topic", "/nothing"])?.failed_saying(&["no message of a wanted topic"])?;
-    // Who only looks may record, and publish nothing.
-    let eve = scene.viewer("eve", "sights*")?;
+    replay(&["--topic", "/nothing"])?.expect_failure(&["no messages on the selected topics"])?;
+    // A viewer may record, but not publish.
+    let eve = scene.viewer_token("eve", "sights*")?;
     let server = format!("http://{}", scene.daemon.address);
     let hers = [
         "--server",
@@ -156,19 +160,19 @@ pub fn a_recording_holds_what_a_robot_heard_and_is_replayed() -> Verdict {
         "--topic",
         "/sights/say",
     ];
-    replay(&hers)?.failed_saying(&["publish:/sights/say is not granted"])?;
-    scene.daemon.ends()?;
+    replay(&hers)?.expect_failure(&["publish:/sights/say is not granted"])?;
+    scene.daemon.stop()?;
     Ok(())
 }
 
 pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
-    let scene = Scene::new("recordings-bad", "")?;
+    let scene = InsideScene::new("recordings-bad", "")?;
     let place = world().directory("recordings-bad")?;
     let at = |name: &str| place.path().join(name);
-    let stranger = scene.viewer("stranger", "other*")?;
-    let types = |words: &[&str]| scene.daemon.deployer().types(words);
+    let stranger = scene.viewer_token("stranger", "other*")?;
+    let types = |words: &[&str]| scene.daemon.deployer().run(words);
 
-    // Ctrl-C ends a recording, and so does the servant's end: both leave a whole file.
+    // A recording ends with Ctrl-C or with its servant; both leave a complete file.
     let begins = |name: &str| -> anyhow::Result<Child> {
         let mut child = Command::new(binaries::path("cloudroidctl"))
             .args(["record", "sights_py", "-o", path_str(&at(name))])
@@ -180,9 +184,9 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
             .spawn()?;
         let mut line = String::new();
         BufReader::new(child.stderr.as_mut().context("piped")?).read_line(&mut line)?;
-        ensure!(line.contains("Ctrl-C ends it"), "{line}");
-        // Written out every second, whatever comes after.
-        support::until("something in the file", || {
+        ensure!(line.contains("stop with Ctrl-C"), "{line}");
+        // The file is flushed every second.
+        support::wait_until("something in the file", || {
             let size = std::fs::metadata(at(name))?.len();
             Ok((size > 2000).then_some(()).ok_or(size.to_string()))
         })?;
@@ -197,7 +201,7 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
     killed.kill()?;
     killed.wait()?;
     let served = begins("served.mcap")?;
-    types(&["stop", &scene.servant])?.succeeded()?;
+    types(&["stop", &scene.servant])?.expect_success()?;
     for child in [interrupted, served] {
         let ended = child.wait_with_output()?;
         let said = String::from_utf8_lossy(&ended.stdout).into_owned();
@@ -208,20 +212,20 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         );
     }
     for name in ["interrupted.mcap", "served.mcap"] {
-        let read = reads(&at(name))?;
+        let read = read_recording(&at(name))?;
         ensure!(
             read["topics"] == json!({"/sights/scan": "sensor_msgs/LaserScan"}),
             "{read}"
         );
     }
 
-    // Each in words, with the exit status that belongs to it.
+    // Errors with their message and exit status.
     std::fs::write(at("text.mcap"), "no recording")?;
     with_python("foreign", &at("foreign.mcap"))?;
     let mut rover = scene
         .daemon
         .robot(&format!("sights_py?token={}", scene.token))?;
-    rover.calls("/rosapi/get_time", json!({}))?;
+    rover.call("/rosapi/get_time", json!({}))?;
     let servant = scene.daemon.servant_of("sights_py", "rover")?;
     let servant = servant["id"].as_str().context("an id")?;
     let server = format!("http://{}", scene.daemon.address);
@@ -236,12 +240,12 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         (
             &["record", servant, "-o", path_str(&text)],
             1,
-            &["exists", "-o is to name a new file"],
+            &["exists", "-o must name a new file"],
         ),
         (
             &["record", servant, "-o", path_str(&nowhere)],
             1,
-            &["cannot be made"],
+            &["cannot create"],
         ),
         (
             &["record", "nothing", "-o", path_str(&new)],
@@ -277,7 +281,7 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         (
             &["replay", path_str(&text), "--to", servant],
             1,
-            &["is no MCAP file"],
+            &["is not an MCAP file"],
         ),
         (
             &["replay", path_str(&new), "--to", servant],
@@ -287,20 +291,20 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         (
             &["replay", path_str(&foreign), "--to", servant],
             1,
-            &["/chatter was left out", "this servant takes ros1"],
+            &["/chatter was skipped", "this servant expects ros1"],
         ),
         (
             &["replay", path_str(&text), "--to", servant, "--rate", "0"],
             2,
-            &["more than 0"],
+            &["greater than 0"],
         ),
     ];
     for (words, status, said) in rows {
-        let outcome = types(words)?.failed_saying(said)?;
+        let outcome = types(words)?.expect_failure(said)?;
         ensure!(outcome.status == status, "{words:?}: {}", outcome.status);
     }
     ensure!(!new.exists(), "what failed leaves no file");
-    // What was being written when its program was killed is played up to there.
+    // The file of a killed recorder is played up to its last complete part.
     let outcome = types(&[
         "replay",
         path_str(&killed),
@@ -309,45 +313,51 @@ pub fn what_cannot_be_recorded_or_replayed_is_said() -> Verdict {
         "--rate",
         "100",
     ])?;
-    let outcome = outcome.succeeded()?;
-    ensure!(outcome.stderr.contains("breaks off"), "{}", outcome.said());
-    scene.daemon.ends()?;
+    let outcome = outcome.expect_success()?;
+    ensure!(
+        outcome.stderr.contains("is truncated"),
+        "{}",
+        outcome.output()
+    );
+    scene.daemon.stop()?;
     Ok(())
 }
 
 pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     let config =
         "[black_box]\nseconds = \"20s\"\ntopics = [\"/sights/scan\", \"/tf*\"]\nfiles = 2\n";
-    let scene = Scene::new("black-box", config)?;
+    let scene = InsideScene::new("black-box", config)?;
     let place = world().directory("black-box")?;
-    let types = |words: &[&str]| scene.daemon.deployer().types(words);
+    let types = |words: &[&str]| scene.daemon.deployer().run(words);
     let listed = |words: &[&str]| -> anyhow::Result<Vec<Value>> {
         let typed = [&["--format", "json", "recordings", "list"], words].concat();
-        Ok(serde_json::from_str(&types(&typed)?.succeeded()?.stdout)?)
+        Ok(serde_json::from_str(
+            &types(&typed)?.expect_success()?.stdout,
+        )?)
     };
     ensure!(listed(&[])?.is_empty(), "nobody has waited yet");
 
-    // It has heard scans for a while.
-    support::until("some seconds in the box", || {
+    // Scans have been received for a while.
+    support::wait_until("some seconds in the box", || {
         let typed = ["--format", "json", "recordings", "take", &scene.servant];
         let outcome = types(&typed)?;
         if outcome.status != 0 {
-            return Ok(Err(outcome.said()));
+            return Ok(Err(outcome.output()));
         }
         let taken: Value = serde_json::from_str(&outcome.stdout)?;
         let number = taken[0]["number"].to_string();
-        types(&["recordings", "rm", &number])?.succeeded()?;
+        types(&["recordings", "rm", &number])?.expect_success()?;
         let enough = taken[0]["seconds"].as_f64() > Some(2.0);
         Ok(enough.then_some(()).ok_or_else(|| taken.to_string()))
     })?;
-    // No answer comes in twenty microseconds.
+    // No answer arrives within twenty microseconds.
     let path = format!(
         "sights_py?token={}&rrt=0.00001&max_rrt=0.00002",
         scene.token
     );
     let mut rover = scene.daemon.robot(&path)?;
-    let written = support::until("a recording", || {
-        rover.calls("/sights/ping", json!({}))?;
+    let written = support::wait_until("a recording", || {
+        rover.call("/sights/ping", json!({}))?;
         let all = listed(&["--robot", "rover"])?;
         Ok(all.first().cloned().ok_or_else(|| "none yet".to_owned()))
     })?;
@@ -356,11 +366,13 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         why.contains("a request took") && why.contains("its robot accepts"),
         "{why}"
     );
-    scene.daemon.awaits_event("that it is recorded", |event| {
-        event["kind"] == "recorded" && event["robot"] == "rover"
-    })?;
-    // Once in a minute, however often it waits.
-    rover.calls("/sights/ping", json!({}))?;
+    scene
+        .daemon
+        .wait_for_event("that it is recorded", |event| {
+            event["kind"] == "recorded" && event["robot"] == "rover"
+        })?;
+    // At most once per minute, however many answers are late.
+    rover.call("/sights/ping", json!({}))?;
     let times: Vec<u64> = listed(&[])?
         .iter()
         .filter_map(|one| one["time"].as_u64())
@@ -370,11 +382,11 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         "{times:?}"
     );
 
-    // It holds what was published before, what was latched long ago, and nothing else.
+    // It contains earlier messages, latched messages, and nothing else.
     let number = written["number"].to_string();
     let file = place.path().join("box.mcap");
-    types(&["recordings", "get", &number, "-o", path_str(&file)])?.succeeded()?;
-    let read = reads(&file)?;
+    types(&["recordings", "get", &number, "-o", path_str(&file)])?.expect_success()?;
+    let read = read_recording(&file)?;
     ensure!(read["messages"] == written["messages"], "{read} {written}");
     let size = std::fs::metadata(&file)?.len();
     ensure!(written["bytes"] == size, "{size} bytes: {written}");
@@ -395,9 +407,9 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         "--rate",
         "100",
     ])?
-    .succeeded()?;
+    .expect_success()?;
 
-    // Who sees the service sees it; who operates it takes one when it is wanted.
+    // Principals who may view the service may read recordings; those who may operate it may also take them.
     let server = format!("http://{}", scene.daemon.address);
     let typed_by = |token: &str, words: &[&str]| {
         types(
@@ -408,31 +420,32 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
             .concat(),
         )
     };
-    let eve = scene.viewer("eve", "sights*")?;
-    let stranger = scene.viewer("stranger", "other*")?;
+    let eve = scene.viewer_token("eve", "sights*")?;
+    let stranger = scene.viewer_token("stranger", "other*")?;
     let copy = place.path().join("copy.mcap");
-    typed_by(&eve, &["get", &number, "-o", path_str(&copy)])?.succeeded()?;
+    typed_by(&eve, &["get", &number, "-o", path_str(&copy)])?.expect_success()?;
     ensure!(
         std::fs::read(&copy)? == std::fs::read(&file)?,
         "another file"
     );
-    // As far as rules let her hear what is in it.
-    let refused = |who: &str| typed_by(who, &["get", &number])?.failed_saying(&["may not hear"]);
+    // As far as the rules permit her to receive the topics.
+    let refused =
+        |who: &str| typed_by(who, &["get", &number])?.expect_failure(&["may not subscribe to"]);
     let allow = |grant: &str| {
         let rule = ["policy", "allow", "narrow", grant, "--service", "sights*"];
-        types(&rule)?.succeeded()
+        types(&rule)?.expect_success()
     };
-    let narrow = scene.viewer("narrow", "sights*")?;
+    let narrow = scene.viewer_token("narrow", "sights*")?;
     allow("subscribe:/sights/scan")?;
     ensure!(refused(&narrow)?.status == 4, "another status");
-    let hidden = typed_by(&narrow, &["list"])?.succeeded()?;
+    let hidden = typed_by(&narrow, &["list"])?.expect_success()?;
     ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
     allow("subscribe:/tf*")?;
     let had = place.path().join("had.mcap");
-    typed_by(&narrow, &["get", &number, "-o", path_str(&had)])?.succeeded()?;
-    // A robot has its own, and no other's.
+    typed_by(&narrow, &["get", &number, "-o", path_str(&had)])?.expect_success()?;
+    // A robot may read its own recordings, and no others.
     let own = place.path().join("own.mcap");
-    typed_by(&scene.token, &["get", &number, "-o", path_str(&own)])?.succeeded()?;
+    typed_by(&scene.token, &["get", &number, "-o", path_str(&own)])?.expect_success()?;
     let other = [
         "other",
         "--role",
@@ -442,8 +455,8 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         "--service",
         "sights*",
     ];
-    let other = token(&scene.daemon, &other)?;
-    let hidden = typed_by(&other, &["list"])?.succeeded()?;
+    let other = create_token(&scene.daemon, &other)?;
+    let hidden = typed_by(&other, &["list"])?.expect_success()?;
     ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
     for (who, words, status) in [
         (&other, &["get", &number][..], 4),
@@ -455,23 +468,23 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
         let refused = typed_by(who, words)?;
         ensure!(refused.status == status, "{words:?}: {}", refused.status);
     }
-    let hidden = typed_by(&stranger, &["list"])?.succeeded()?;
+    let hidden = typed_by(&stranger, &["list"])?.expect_success()?;
     ensure!(hidden.stdout.is_empty(), "{}", hidden.stdout);
     types(&["recordings", "get", "99"])?
-        .failed_saying(&["there is no recording 99", "recordings list"])?;
+        .expect_failure(&["there is no recording 99", "recordings list"])?;
 
-    // Beyond two files the oldest goes.
+    // The oldest recording is deleted when there are more than two.
     let take = || types(&["recordings", "take", &scene.servant]);
     for _ in 0..2 {
-        support::until("another file", || {
+        support::wait_until("another file", || {
             let taken = take()?;
             Ok((taken.status == 0)
                 .then_some(())
-                .ok_or_else(|| taken.said()))
+                .ok_or_else(|| taken.output()))
         })?;
     }
-    // Nobody takes one after the other.
-    let soon = support::until("a refusal", || {
+    // Recordings cannot be taken in quick succession.
+    let soon = support::wait_until("a refusal", || {
         let taken = take()?;
         Ok(if taken.status == 0 {
             Err("this machine took its time to ask again".to_owned())
@@ -479,7 +492,7 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
             Ok(taken)
         })
     })?;
-    let soon = soon.failed_saying(&["a moment ago"])?;
+    let soon = soon.expect_failure(&["a moment ago"])?;
     ensure!(soon.status == 7, "{}", soon.status);
     let all = listed(&[])?;
     ensure!(
@@ -497,29 +510,29 @@ pub fn a_black_box_is_written_when_a_robot_waits_too_long() -> Verdict {
     };
     ensure!(files()? == 2, "{} files", files()?);
     let last = all[1]["number"].to_string();
-    types(&["recordings", "rm", &last])?.succeeded()?;
+    types(&["recordings", "rm", &last])?.expect_success()?;
     ensure!(
         (listed(&[])?.len(), files()?) == (1, 1),
         "{} files",
         files()?
     );
 
-    // They go with their service: the next of that name may be somebody else's.
-    types(&["rm", "sights_py"])?.succeeded()?;
+    // Recordings are removed with their service, because the next service of that name may have another owner.
+    types(&["rm", "sights_py"])?.expect_success()?;
     ensure!(
         (listed(&[])?.len(), files()?) == (0, 0),
         "{} files",
         files()?
     );
 
-    // Where nothing is kept, that is said.
-    scene.daemon.ends()?;
-    let scene = Scene::new("no-black-box", "")?;
+    // Without a black box that is reported.
+    scene.daemon.stop()?;
+    let scene = InsideScene::new("no-black-box", "")?;
     scene
         .daemon
         .deployer()
-        .types(&["recordings", "take", &scene.servant])?
-        .failed_saying(&["nothing of servant", "[black_box]"])?;
-    scene.daemon.ends()?;
+        .run(&["recordings", "take", &scene.servant])?
+        .expect_failure(&["has no ring-buffer recording", "[black_box]"])?;
+    scene.daemon.stop()?;
     Ok(())
 }

@@ -1,16 +1,16 @@
-//! What bad input gets: an error that names the thing and the next step, and nothing half-made.
+//! Invalid input: an error that names the problem and the next step, and no partial results.
 
 use std::path::Path;
 
 use anyhow::ensure;
 use support::Verdict;
-use support::daemon::{Daemon, Setup};
+use support::daemon::{Daemon, DaemonSetup};
 use support::deployer::path_str;
 use support::small_disk::SmallDisk;
 use support::world::{ADDER, world};
 
-/// No service of this name, no build directory, no servant of it.
-fn nothing_half_made(daemon: &Daemon, service: &str) -> Verdict {
+/// Checks that there is no service of this name, no build directory and no servant.
+fn expect_nothing_left(daemon: &Daemon, service: &str) -> Verdict {
     ensure!(
         daemon.get(&format!("/api/v1/services/{service}"))?.0 == 404,
         "{service} was published"
@@ -23,24 +23,24 @@ fn nothing_half_made(daemon: &Daemon, service: &str) -> Verdict {
 }
 
 pub fn a_directory_without_a_package() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let empty = place.path().join("empty_thing");
     std::fs::create_dir(&empty)?;
     daemon
         .deployer()
-        .types(&["push", path_str(&empty)])?
-        .failed_saying(&["package.xml", "empty_thing"])?;
+        .run(&["push", path_str(&empty)])?
+        .expect_failure(&["package.xml", "empty_thing"])?;
     let missing = place.path().join("not_there");
     daemon
         .deployer()
-        .types(&["push", path_str(&missing)])?
-        .failed_saying(&["not_there"])?;
-    nothing_half_made(&daemon, "empty_thing")
+        .run(&["push", path_str(&missing)])?
+        .expect_failure(&["not_there"])?;
+    expect_nothing_left(&daemon, "empty_thing")
 }
 
 pub fn malformed_xml() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     let package = place.path().join("torn");
     std::fs::create_dir(&package)?;
@@ -50,30 +50,30 @@ pub fn malformed_xml() -> Verdict {
     )?;
     daemon
         .deployer()
-        .types(&["push", path_str(&package)])?
-        .failed_saying(&["package.xml", "line 4"])?;
-    nothing_half_made(&daemon, "torn")
+        .run(&["push", path_str(&package)])?
+        .expect_failure(&["package.xml", "line 4"])?;
+    expect_nothing_left(&daemon, "torn")
 }
 
 pub fn dependencies_that_nothing_provides_are_listed_at_once() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     daemon
         .deployer()
-        .pushes("wants_the_impossible", &["--node", "any"])?
-        .failed_saying(&["warp_drive", "flux_capacitor_msgs", "--map"])?;
-    nothing_half_made(&daemon, "wants_the_impossible")
+        .push("wants_the_impossible", &["--node", "any"])?
+        .expect_failure(&["warp_drive", "flux_capacitor_msgs", "--map"])?;
+    expect_nothing_left(&daemon, "wants_the_impossible")
 }
 
 pub fn a_node_that_leaves_at_once() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     daemon
         .deployer()
-        .pushes("leaver_py", &["--node", "leaver.py"])?
-        .failed_saying(&["leaver", "3", "the map file is missing"])?;
-    nothing_half_made(&daemon, "leaver_py")
+        .push("leaver_py", &["--node", "leaver.py"])?
+        .expect_failure(&["leaver", "3", "the map file is missing"])?;
+    expect_nothing_left(&daemon, "leaver_py")
 }
 
-/// One entry of an archive, with a header as hostile as wanted.
+/// Creates an archive with an entry with an arbitrary, possibly hostile, header.
 fn archive_with(entry: impl Fn(&mut tar::Builder<Vec<u8>>)) -> anyhow::Result<Vec<u8>> {
     let mut builder = tar::Builder::new(Vec::new());
     let manifest = b"<package><name>sly</name><version>1.0.0</version><description>x</description>\
@@ -90,7 +90,7 @@ fn archive_with(entry: impl Fn(&mut tar::Builder<Vec<u8>>)) -> anyhow::Result<Ve
     Ok(builder.into_inner()?)
 }
 
-fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, link: &str) {
+fn append_raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, link: &str) {
     let mut header = tar::Header::new_ustar();
     let bytes = header.as_mut_bytes();
     bytes[..name.len()].copy_from_slice(name.as_bytes());
@@ -108,7 +108,7 @@ fn raw(builder: &mut tar::Builder<Vec<u8>>, name: &str, kind: tar::EntryType, li
 }
 
 pub fn archives_that_reach_out_of_their_tree() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let place = tempfile::tempdir()?;
     use tar::EntryType;
     let cases: [(&str, EntryType, &str); 6] = [
@@ -123,47 +123,47 @@ pub fn archives_that_reach_out_of_their_tree() -> Verdict {
         let archive = place.path().join(format!("sly{index}.tar"));
         std::fs::write(
             &archive,
-            archive_with(|builder| raw(builder, name, kind, link))?,
+            archive_with(|builder| append_raw(builder, name, kind, link))?,
         )?;
         daemon
             .deployer()
-            .types(&["push", path_str(&archive), "--name", "sly", "--node", "x"])?
-            .failed_saying(&[name])?;
+            .run(&["push", path_str(&archive), "--name", "sly", "--node", "x"])?
+            .expect_failure(&[name])?;
     }
     ensure!(!Path::new("/etc/escape").exists());
-    nothing_half_made(&daemon, "sly")
+    expect_nothing_left(&daemon, "sly")
 }
 
 pub fn reserved_and_taken_names() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     for name in ["api", "v2", "stubs", "metrics", "healthz", "assets"] {
         daemon
             .deployer()
-            .pushes("adder_py", &["--name", name, "--node", "adder.py"])?
-            .failed_saying(&[name, "reserved"])?;
+            .push("adder_py", &["--name", name, "--node", "adder.py"])?
+            .expect_failure(&[name, "reserved"])?;
     }
     for name in ["../up", "a b", "", "Ümlaut"] {
         daemon
             .deployer()
-            .pushes("adder_py", &["--name", name, "--node", "adder.py"])?
-            .failed_saying(&["name"])?;
+            .push("adder_py", &["--name", name, "--node", "adder.py"])?
+            .expect_failure(&["name"])?;
     }
-    // A service of another package does not lose its name to a newcomer unawares.
+    // The name of a service is not taken over by another package by accident.
     daemon
         .deployer()
-        .pushes("leaver_py", &["--name", "adder_py", "--node", "leaver.py"])?
-        .failed_saying(&["adder_py", "taken"])?;
+        .push("leaver_py", &["--name", "adder_py", "--node", "leaver.py"])?
+        .expect_failure(&["adder_py", "taken"])?;
     Ok(())
 }
 
 pub fn a_full_disk_ends_a_push_and_nothing_else() -> Verdict {
     let disk = SmallDisk::mount("small", "24M")?;
-    let daemon = Setup::new(&disk.home()).start()?;
+    let daemon = DaemonSetup::new(&disk.home()).start()?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .failed_saying(&["no space"])?;
-    nothing_half_made(&daemon, "adder_py")?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_failure(&["no space"])?;
+    expect_nothing_left(&daemon, "adder_py")?;
     ensure!(daemon.get("/healthz")?.0 == 200, "the daemon lives on");
     Ok(())
 }

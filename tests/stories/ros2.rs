@@ -1,5 +1,5 @@
-//! Packages of ROS 2, by rosbridge and by stubs. What a robot sees of a stub when the link is bad is told in [`crate::failover`] and
-//! [`crate::fallback`], for both ROSes.
+//! Packages of ROS 2 through rosbridge and through stubs. Bad links of stubs are covered in [`crate::failover`] and
+//! [`crate::fallback`], for both versions of ROS.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead, BufReader};
@@ -12,17 +12,17 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, BusError, GoalEnd, GoalEvents, Graph, NodeEnds, Outcome, ParamValue, RosVersion,
+    Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, Graph, NodeEntities, ParamValue, RosVersion,
     WireFormat,
 };
 use ros::schema::{ActionDef, Registry};
 use serde_json::{Value, json};
-use support::cable::{Badness, Cable};
+use support::cable::{Cable, NetworkImpairment};
 use support::daemon::Daemon;
-use support::layout::Layout;
+use support::layout::MessageLayout;
 use support::patience::{Deadline, scale, tell_patience, wait_for};
-use support::people::{self, Camera};
-use support::site::{Running, Site, string_of};
+use support::people::{self, PeopleCamera};
+use support::site::{NodeProcess, Site, string_in};
 use support::world::{ADDER, HERALD, SEER, world};
 use support::{Verdict, binaries};
 use tokio::sync::Notify;
@@ -30,18 +30,18 @@ use tokio::sync::Notify;
 use crate::crossing::{SETTLED, TRIED};
 use crate::push::extract_install_space;
 
-/// For an answer that may never come; where nothing else runs.
+/// Maximum time for an answer that may never arrive; on an idle machine.
 const MEANWHILE: Duration = Duration::from_secs(5);
 const THE_HERALD: (&str, &str, &str) = ("herald", "herald", "herald");
 
-fn serves(service: &str) -> impl Fn(&Graph) -> bool {
+fn has_service(service: &str) -> impl Fn(&Graph) -> bool {
     let service = service.to_owned();
     move |graph| graph.services.contains_key(&service)
 }
 
-/// The message with what the node said when it fails.
-fn with_log<T>(outcome: anyhow::Result<T>, node: &Running) -> anyhow::Result<T> {
-    outcome.with_context(|| format!("the stub said:\n{}", node.said()))
+/// Adds the node's output to an error.
+fn with_log<T>(outcome: anyhow::Result<T>, node: &NodeProcess) -> anyhow::Result<T> {
+    outcome.with_context(|| format!("the stub said:\n{}", node.output()))
 }
 
 fn contains(message: &[u8], text: &str) -> bool {
@@ -49,49 +49,49 @@ fn contains(message: &[u8], text: &str) -> bool {
 }
 
 pub fn a_workspace_is_pushed_and_asked_by_rosbridge() -> Verdict {
-    let daemon = world().with(HERALD)?;
+    let daemon = world().daemon_with(HERALD)?;
     let service = daemon.get_json("/api/v1/services/herald")?;
     let names = |what: &str| -> anyhow::Result<Vec<String>> {
         let all = service["interface"][what].as_array().context("a list")?;
         let names = all.iter().filter_map(|one| one["name"].as_str());
         Ok(names.map(str::to_owned).collect())
     };
-    // What every node has is not what a service is for.
+    // Registrations that every node has are not part of a service's interface.
     ensure!(
         names("topics")? == ["/greeting", "/name"] && names("services")? == ["/greet"],
         "{service:#}"
     );
     ensure!(names("actions")? == ["/count"], "{service:#}");
     let mut robot = daemon.robot("herald?robot=herald-asked")?;
-    let greeted = robot.calls("/greet", json!({"name": "robot"}))?;
+    let greeted = robot.call("/greet", json!({"name": "robot"}))?;
     let greeting = &greeted["values"]["greeting"];
     ensure!(
         greeting["text"] == "Hello, robot" && greeting["wide"] == "HELLO, ROBOT",
         "{greeted}"
     );
-    robot.says(json!({"op": "subscribe", "topic": "/greeting", "qos": {"reliability": "reliable", "depth": 5}}))?;
-    robot.says(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String"}))?;
+    robot.send(json!({"op": "subscribe", "topic": "/greeting", "qos": {"reliability": "reliable", "depth": 5}}))?;
+    robot.send(json!({"op": "advertise", "topic": "/name", "type": "std_msgs/msg/String"}))?;
     let crowd = json!({"op": "publish", "topic": "/name", "msg": {"data": "crowd"}});
-    let greeted = robot.says_until(&crowd, "a greeting", |told| told["topic"] == "/greeting")?;
+    let greeted = robot.send_until(&crowd, "a greeting", |told| told["topic"] == "/greeting")?;
     ensure!(greeted["msg"]["text"] == "Hello, crowd", "{greeted}");
-    robot.says(
+    robot.send(
         json!({"op": "send_action_goal", "id": "goal", "action": "/count",
         "action_type": "herald_msgs/action/Count", "args": {"to": 3}, "feedback": true}),
     )?;
     for at in 1..=3 {
-        let told = robot.hears("feedback", |told| told["op"] == "action_feedback")?;
+        let told = robot.wait_for("feedback", |told| told["op"] == "action_feedback")?;
         ensure!(told["values"]["at"] == at, "{told}");
     }
-    let told = robot.hears("a result", |told| told["op"] == "action_result")?;
+    let told = robot.wait_for("a result", |told| told["op"] == "action_result")?;
     ensure!(
         told["values"]["counted"] == json!([1, 2, 3]) && told["result"] == true,
         "{told}"
     );
-    robot.leaves()
+    robot.leave()
 }
 
 pub fn a_prebuilt_space_is_served_with_its_interfaces() -> Verdict {
-    let daemon = world().with(HERALD)?;
+    let daemon = world().daemon_with(HERALD)?;
     let place = tempfile::tempdir()?;
     let space = extract_install_space(&daemon, "herald", place.path())?;
     let space = space.to_string_lossy();
@@ -103,21 +103,21 @@ pub fn a_prebuilt_space_is_served_with_its_interfaces() -> Verdict {
         "--node",
         "herald/herald",
     ];
-    daemon.deployer().types(&words)?.succeeded()?;
+    daemon.deployer().run(&words)?.expect_success()?;
     let mut robot = daemon.robot("prebuilt-herald?robot=herald-of-a-space")?;
-    let greeted = robot.calls("/greet", json!({"name": "robot"}))?;
+    let greeted = robot.call("/greet", json!({"name": "robot"}))?;
     let text = &greeted["values"]["greeting"]["text"];
     ensure!(text == "Hello, robot", "{greeted}");
-    robot.leaves()
+    robot.leave()
 }
 
 pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let arguments = ["--name", "duets", "--node", "duet", "--node", "duet"];
     daemon
         .deployer()
-        .pushes("duet_ros2", &arguments)?
-        .succeeded()?;
+        .push("duet_ros2", &arguments)?
+        .expect_success()?;
     let service = daemon.get_json("/api/v1/services/duets")?;
     let topics = service["interface"]["topics"].as_array();
     let topics = topics.context("a list")?.iter();
@@ -126,32 +126,42 @@ pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict 
     let songs = ["/alto/song", "/alto_2/song", "/tenor/song", "/tenor_2/song"];
     ensure!(topics == songs, "{service:#}");
     let mut robot = daemon.robot("duets?robot=listener")?;
-    robot.subscribes("/tenor_2/song")?;
-    let heard = robot.hears_on("/tenor_2/song")?;
+    robot.subscribe("/tenor_2/song")?;
+    let heard = robot.next_message_on("/tenor_2/song")?;
     ensure!(heard["data"] == "tenor_2", "{heard}");
-    robot.leaves()?;
-    // On a robot: each is a node, as its program calls it, unless a rule for it alone says otherwise.
-    let site = Site::of(RosVersion::Two)?;
-    let app = site.joins("/app")?;
-    let overlay = site.installs(&daemon, "duets", "local = \"none\"\n")?;
+    robot.leave()?;
+    // On a robot each of them is a node with the name that its program gives, unless a remapping rule for that node
+    // sets another one.
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
+    let overlay = site.install_stub(&daemon, "duets", "local = \"none\"\n")?;
     let server = format!("ws://{}", daemon.address);
     let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "choir")];
     for (argv, second) in [
         (&[][..], "tenor"),
         (&["--ros-args", "-r", "tenor:__node:=bass"], "bass"),
     ] {
-        let mut stub = site.runs_among(&environment, &overlay, "duet_ros2", "duet", argv)?;
+        let mut stub = site.start_installed_with_environment(
+            &environment,
+            &overlay,
+            "duet_ros2",
+            "duet",
+            argv,
+        )?;
         for name in ["alto", second] {
             let node = format!("/{name}");
-            let mut songs = site.hears(&app, &format!("{node}/song"))?;
-            let song = with_log(site.next(&mut songs), &stub)?;
+            let mut songs = site.subscribe(&app, &format!("{node}/song"))?;
+            let song = with_log(site.next_message(&mut songs), &stub)?;
             ensure!(
                 contains(&song.bytes, name) && song.publisher.node() == node,
                 "{song:?}\n{}",
-                stub.said()
+                stub.output()
             );
             let parameters = format!("{node}/get_parameters");
-            let graph = with_log(site.until(&*app, &parameters, serves(&parameters)), &stub)?;
+            let graph = with_log(
+                site.wait_for_graph(&*app, &parameters, has_service(&parameters)),
+                &stub,
+            )?;
             ensure!(graph.services[&parameters] == node, "{graph:#?}");
             let asked = ["use_sim_time".to_owned()];
             let held = app.node_parameters()?.get(&node, &asked);
@@ -159,13 +169,13 @@ pub fn two_programs_of_several_nodes_have_nodes_of_their_own_names() -> Verdict 
             ensure!(held == [Some(ParamValue::Bool(false))], "{node}: {held:?}");
         }
         stub.signal(Signal::SIGINT)?;
-        stub.ends()?;
+        stub.wait_for_exit()?;
     }
     Ok(())
 }
 
 pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
-    let daemon = world().shared()?;
+    let daemon = world().ensure_shared()?;
     let arguments = [
         "--name",
         "spotters",
@@ -174,13 +184,13 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
         "--node",
         "spotters",
         "--node",
-        // As launch names a node.
+        // As launch sets the name of a node.
         "lookout --ros-args -r __node:=seeker",
         "--param",
         "~what=a cat",
     ];
-    let push = daemon.deployer().pushes("spotter_ros2", &arguments)?;
-    push.succeeded()?;
+    let push = daemon.deployer().push("spotter_ros2", &arguments)?;
+    push.expect_success()?;
     let service = daemon.get_json("/api/v1/services/spotters")?;
     let topics = service["interface"]["topics"].as_array();
     let topics = topics.context("a list")?.iter();
@@ -197,92 +207,98 @@ pub fn nodes_stay_in_the_namespaces_that_their_programs_give_them() -> Verdict {
     let mut robot = daemon.robot("spotters?robot=asked")?;
     for (above, name) in nodes {
         let (image, found) = (format!("{above}/image"), format!("{above}/found"));
-        robot.subscribes(&found)?;
-        robot.says(json!({"op": "advertise", "topic": image, "type": "std_msgs/msg/String"}))?;
+        robot.subscribe(&found)?;
+        robot.send(json!({"op": "advertise", "topic": image, "type": "std_msgs/msg/String"}))?;
         let view = json!({"op": "publish", "topic": image, "msg": {"data": "view"}});
-        let heard = robot.says_until(&view, "what it finds", |told| told["topic"] == *found)?;
+        let heard = robot.send_until(&view, "what it finds", |told| told["topic"] == *found)?;
         let expected = format!("a cat in view by {above}/{name}");
         ensure!(heard["msg"]["data"] == expected, "{heard}");
     }
-    robot.leaves()?;
-    // On a robot: where its program is, unless a rule says otherwise.
-    let site = Site::of(RosVersion::Two)?;
-    let app = site.joins("/app")?;
-    let overlay = site.installs(&daemon, "spotters", "local = \"none\"\n")?;
+    robot.leave()?;
+    // On a robot each of them is in the namespace of its program, unless a remapping rule sets another one.
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
+    let overlay = site.install_stub(&daemon, "spotters", "local = \"none\"\n")?;
     let server = format!("ws://{}", daemon.address);
     let environment = [("CLOUDROID_SERVER", &*server), ("CLOUDROID_ROBOT", "spots")];
     for (argv, above) in [
         (&[][..], "/camera"),
         (&["--ros-args", "-r", "__ns:=/front"], "/front"),
     ] {
-        let mut stub = site.runs_among(&environment, &overlay, "spotter_ros2", "spotter", argv)?;
+        let mut stub = site.start_installed_with_environment(
+            &environment,
+            &overlay,
+            "spotter_ros2",
+            "spotter",
+            argv,
+        )?;
         let node = format!("{above}/detector");
-        let images = site.says(&app, &format!("{above}/image"), false)?;
-        let mut finds = site.hears(&app, &format!("{above}/found"))?;
-        with_log(site.connected(&*images, 1), &stub)?;
-        with_log(site.fed(&finds, 1), &stub)?;
-        images.publish(string_of(WireFormat::Cdr, "view"));
-        let found = with_log(site.next(&mut finds), &stub)?;
+        let images = site.advertise_strings(&app, &format!("{above}/image"), false)?;
+        let mut finds = site.subscribe(&app, &format!("{above}/found"))?;
+        with_log(site.wait_for_subscribers(&*images, 1), &stub)?;
+        with_log(site.wait_for_publishers(&finds, 1), &stub)?;
+        images.publish(string_in(WireFormat::Cdr, "view"));
+        let found = with_log(site.next_message(&mut finds), &stub)?;
         let words = format!("a cat in view by {node}");
         ensure!(
             contains(&found.bytes, &words) && found.publisher.node() == node,
             "{found:?}\n{}",
-            stub.said()
+            stub.output()
         );
         stub.signal(Signal::SIGINT)?;
-        stub.ends()?;
+        stub.wait_for_exit()?;
     }
     Ok(())
 }
 
-/// The definition of the herald's action.
-fn count() -> anyhow::Result<Arc<ActionDef>> {
-    let registry = Registry::of(RosVersion::Two);
+/// Returns the definition of the herald's action.
+fn count_action() -> anyhow::Result<Arc<ActionDef>> {
+    let registry = Registry::for_version(RosVersion::Two);
     let text = "uint32 to\n---\nuint32[] counted\n---\nuint32 at\n";
     registry.insert("herald_msgs/action/Count", text)?;
     Ok(registry.action("herald_msgs/action/Count")?)
 }
 
-/// What came of a goal.
+/// Feedback and end of a goal.
 #[derive(Default)]
-struct Events {
+struct GoalEventRecorder {
     feedback: Mutex<usize>,
     end: Mutex<Option<Result<GoalEnd, String>>>,
     ended: Notify,
 }
 
-impl GoalEvents for Events {
-    fn feedback(&self, _feedback: Bytes) {
+impl GoalEvents for GoalEventRecorder {
+    fn on_feedback(&self, _feedback: Bytes) {
         *self.feedback.lock() += 1;
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         *self.end.lock() = Some(end);
         self.ended.notify_one();
     }
 }
 
-/// Sends the herald a goal; checks that it was counted up to there.
-fn counts(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
-    let events = Arc::new(Events::default());
+/// Sends the herald a goal and checks its result.
+fn expect_count(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
+    let events = Arc::new(GoalEventRecorder::default());
     let heard = Arc::clone(&events);
     let _runtime = site.runtime.enter();
-    let client = app.action_client(action, &count()?)?;
-    let goal = Layout::of(RosVersion::Two).u32(to).finish();
-    client.send("goal", goal, events);
+    let client = app.action_client(action, &count_action()?)?;
+    let goal = MessageLayout::new(RosVersion::Two).u32(to).finish();
+    client.send_goal("goal", goal, events);
     site.runtime.block_on(async {
         let ended = wait_for(heard.ended.notified());
         ended.await.context("a result should come")
     })?;
     let end = heard.end.lock().take().context("an end")?;
     let end = end.map_err(anyhow::Error::msg)?;
-    let mut expected = Layout::of(RosVersion::Two);
+    let mut expected = MessageLayout::new(RosVersion::Two);
     expected.u32(to);
     for number in 1..=to {
         expected.u32(number);
     }
     ensure!(
-        end.outcome == Outcome::Succeeded && end.result == expected.finish(),
+        end.outcome == GoalOutcome::Succeeded && end.result == expected.finish(),
         "{end:?}"
     );
     ensure!(*heard.feedback.lock() == to as usize);
@@ -290,9 +306,9 @@ fn counts(site: &Site, app: &dyn Bus, action: &str, to: u32) -> Verdict {
 }
 
 pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
-    let daemon = world().with(HERALD)?;
-    let site = Site::of(RosVersion::Two)?;
-    let app = site.joins("/app")?;
+    let daemon = world().daemon_with(HERALD)?;
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
     let argv = [
         "--ros-args",
         "-r",
@@ -304,25 +320,25 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
         "-p",
         "salutation:=Good day",
     ];
-    let mut stub = site.stub(&daemon, THE_HERALD, "ros2-herald", &argv)?;
+    let mut stub = site.start_stub(&daemon, THE_HERALD, "ros2-herald", &argv)?;
     with_log(
-        site.until(&app, "the service", serves("/front/greet")),
+        site.wait_for_graph(&app, "the service", has_service("/front/greet")),
         &stub,
     )?;
-    // A topic in, remapped; a topic out; both with the original's names and types.
-    let names = site.says(&app, "/who", false)?;
-    let mut greetings = site.hears(&app, "/front/greeting")?;
-    site.connected(&*names, 1)?;
-    site.fed(&greetings, 1)?;
-    names.publish(string_of(WireFormat::Cdr, "robot"));
-    let greeting = with_log(site.next(&mut greetings), &stub)?;
+    // An input topic, remapped; an output topic; both with the original's names and types.
+    let names = site.advertise_strings(&app, "/who", false)?;
+    let mut greetings = site.subscribe(&app, "/front/greeting")?;
+    site.wait_for_subscribers(&*names, 1)?;
+    site.wait_for_publishers(&greetings, 1)?;
+    names.publish(string_in(WireFormat::Cdr, "robot"));
+    let greeting = with_log(site.next_message(&mut greetings), &stub)?;
     ensure!(contains(&greeting.bytes, "Good day, robot"), "{greeting:?}");
     ensure!(
         greeting.wire_type.name == "herald_msgs/msg/Greeting"
             && greeting.publisher.node() == "/front/crier",
         "{greeting:?}"
     );
-    // A service and a parameter, which are the node's in the cloud.
+    // A service and a parameter of the node in the cloud.
     let run = |future| site.runtime.block_on(future);
     let parameters = app.node_parameters()?;
     let asked = ["salutation".to_owned()];
@@ -339,32 +355,32 @@ pub fn a_herald_in_the_cloud_is_a_node_of_the_robot() -> Verdict {
         .runtime
         .block_on(parameters.set("/front/crier", vec![change]))?;
     ensure!(set == [Ok(())], "{set:?}");
-    let request = Layout::of(RosVersion::Two).text("lab").finish();
-    let greeted = site.calls(&app, "/front/greet", &request)?;
+    let request = MessageLayout::new(RosVersion::Two).text("lab").finish();
+    let greeted = site.call_service(&app, "/front/greet", &request)?;
     ensure!(contains(&greeted, "Hi, lab"), "{greeted:?}");
-    with_log(counts(&site, &*app, "/front/count", 4), &stub)?;
-    // ros2 launch's way to end it.
+    with_log(expect_count(&site, &*app, "/front/count", 4), &stub)?;
+    // The signal with which ros2 launch ends nodes.
     stub.signal(Signal::SIGINT)?;
-    let status = stub.ends()?;
-    ensure!(status.code() == Some(0), "{status}: {}", stub.said());
-    site.until(&app, "an empty graph", |graph| {
+    let status = stub.wait_for_exit()?;
+    ensure!(status.code() == Some(0), "{status}: {}", stub.output());
+    site.wait_for_graph(&app, "an empty graph", |graph| {
         !graph.nodes.contains_key("/front/crier")
     })?;
     Ok(())
 }
 
-/// Waits until a node has what is wanted; all that it has then.
-fn ends_of(
+/// Waits until a node has the wanted endpoints; returns all of its endpoints.
+fn wait_for_ends(
     site: &Site,
     watcher: &Arc<dyn Bus>,
     node: &str,
-    wanted: impl Fn(&NodeEnds) -> bool,
-) -> anyhow::Result<NodeEnds> {
-    let graph = site.until(watcher, "the node's ends", |graph| {
+    wanted: impl Fn(&NodeEntities) -> bool,
+) -> anyhow::Result<NodeEntities> {
+    let graph = site.wait_for_graph(watcher, "the node's ends", |graph| {
         graph.ends.get(node).is_some_and(&wanted)
     })?;
     let mut ends = graph.ends[node].clone();
-    // How many messages are kept is each end's own affair, of which peers need not tell.
+    // The history depth is local to each endpoint, and discovery need not include it.
     for (_, qos) in ends
         .publishers
         .values_mut()
@@ -376,25 +392,25 @@ fn ends_of(
 }
 
 pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
-    let daemon = world().with(HERALD)?;
+    let daemon = world().daemon_with(HERALD)?;
     let node = "/herald";
     let original = {
-        let site = Site::of(RosVersion::Two)?;
+        let site = Site::with_ros(RosVersion::Two)?;
         let program = "/opt/cloudroid/install/lib/herald/herald";
-        let prefix = site.installs_original(&daemon, "herald", ("herald", "herald"), program)?;
-        let _original = site.runs(&prefix, "herald", "herald", &[])?;
-        let watcher = site.joins("/watcher")?;
-        // The last that it makes are the parts of its action.
-        ends_of(&site, &watcher, node, |ends| {
+        let prefix = site.install_original(&daemon, "herald", ("herald", "herald"), program)?;
+        let _original = site.start_installed(&prefix, "herald", "herald", &[])?;
+        let watcher = site.join("/watcher")?;
+        // The parts of its action are created last.
+        wait_for_ends(&site, &watcher, node, |ends| {
             ends.publishers.contains_key("/count/_action/status")
                 && ends.services.contains_key("/count/_action/get_result")
                 && ends.services.contains_key("/herald/get_parameters")
         })?
     };
-    let site = Site::of(RosVersion::Two)?;
-    let stub = site.stub(&daemon, THE_HERALD, "ros2-graph", &[])?;
-    let watcher = site.joins("/watcher")?;
-    let linked = ends_of(&site, &watcher, node, |ends| {
+    let site = Site::with_ros(RosVersion::Two)?;
+    let stub = site.start_stub(&daemon, THE_HERALD, "ros2-graph", &[])?;
+    let watcher = site.join("/watcher")?;
+    let linked = wait_for_ends(&site, &watcher, node, |ends| {
         ends.publishers.len() >= original.publishers.len()
             && ends.subscribers.len() >= original.subscribers.len()
             && ends.services.len() >= original.services.len()
@@ -410,8 +426,8 @@ pub fn the_robot_s_graph_is_the_original_s() -> Verdict {
 }
 
 pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
-    let daemon = world().with(SEER)?;
-    let site = Site::of(RosVersion::Two)?;
+    let daemon = world().daemon_with(SEER)?;
+    let site = Site::with_ros(RosVersion::Two)?;
     let cable = Cable::new(&daemon.address)?;
     let stub = people::installed_stub(
         &site,
@@ -422,14 +438,14 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     )?;
     let mut command = Command::new(binaries::ros2().join("bin/python"));
     command.arg(binaries::checkout().join("tests/robots/application_ros2.py"));
-    site.system.is_of(&mut command);
+    site.system.configure(&mut command);
     tell_patience(&mut command)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped());
     let mut application = command.spawn()?;
     let mut told = String::new();
     BufReader::new(application.stdout.as_mut().context("piped")?).read_line(&mut told)?;
-    let explained = support::until("whom the stub cannot reach", || {
+    let explained = support::wait_until("whom the stub cannot reach", || {
         let told = daemon.get_json("/api/v1/robots/ros2-rclpy/explain")?;
         let causes = told["causes"].to_string();
         Ok(causes
@@ -445,7 +461,8 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     let explained = explained?;
     ensure!(
         explained.contains(
-            "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: reliable, volatile; subscriber: reliable, transient_local)"
+            "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: reliable, \
+             volatile; subscriber: reliable, transient_local)"
         ),
         "{explained}"
     );
@@ -460,7 +477,7 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     );
     let image = json!(["sensor_msgs/msg/Image"]);
     ensure!(told["subscribes"]["/image"] == image, "{told:#}");
-    // As the original asks for pictures.
+    // The original requests images with this quality of service.
     ensure!(told["reliable"] == json!(["BEST_EFFORT"]), "{told:#}");
     let found = json!(["geometry_msgs/msg/PolygonStamped"]);
     ensure!(
@@ -470,13 +487,14 @@ pub fn an_application_of_rclpy_asks_the_cloud() -> Verdict {
     Ok(())
 }
 
-/// Whether the herald had greeted this name before: the last field of its answer, which CDR pads to four bytes.
-fn is_known(answer: &[u8]) -> Option<bool> {
+/// Returns whether the herald had greeted this name before: the last field of its response, which CDR pads to four
+/// bytes.
+fn was_greeted(answer: &[u8]) -> Option<bool> {
     let at = answer.len().checked_sub(4)?;
     answer.get(at).map(|known| *known == 1)
 }
 
-fn has_all(now: &NodeEnds, before: &NodeEnds) -> bool {
+fn has_all(now: &NodeEntities, before: &NodeEntities) -> bool {
     fn contains<T: PartialEq>(now: &BTreeMap<String, T>, before: &BTreeMap<String, T>) -> bool {
         before.iter().all(|(name, of)| now.get(name) == Some(of))
     }
@@ -487,18 +505,21 @@ fn has_all(now: &NodeEnds, before: &NodeEnds) -> bool {
 }
 
 pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
-    let setup = world().own("ros2-restarted");
+    let setup = world().setup("ros2-restarted");
     let daemon = setup.start()?;
-    let push = daemon.deployer().pushes("herald_ros2", HERALD.arguments)?;
-    push.succeeded()?;
+    let push = daemon.deployer().push("herald_ros2", HERALD.arguments)?;
+    push.expect_success()?;
     let address = daemon.address.clone();
-    let site = Site::of(RosVersion::Two)?;
-    let app = site.joins("/app")?;
-    let stub = site.stub(&daemon, THE_HERALD, "ros2-again", &[])?;
-    with_log(site.until(&app, "the service", serves("/greet")), &stub)?;
-    let request = Layout::of(RosVersion::Two).text("lab").finish();
-    let first = with_log(site.calls(&app, "/greet", &request), &stub)?;
-    ensure!(is_known(&first) == Some(false), "{first:?}");
+    let site = Site::with_ros(RosVersion::Two)?;
+    let app = site.join("/app")?;
+    let stub = site.start_stub(&daemon, THE_HERALD, "ros2-again", &[])?;
+    with_log(
+        site.wait_for_graph(&app, "the service", has_service("/greet")),
+        &stub,
+    )?;
+    let request = MessageLayout::new(RosVersion::Two).text("lab").finish();
+    let first = with_log(site.call_service(&app, "/greet", &request), &stub)?;
+    ensure!(was_greeted(&first) == Some(false), "{first:?}");
     let before = app.graph().borrow().ends.get("/herald").cloned();
     let before = before.context("the node")?;
     let participants = |daemon: &Daemon| -> anyhow::Result<BTreeSet<String>> {
@@ -511,42 +532,42 @@ pub fn a_node_lives_on_when_the_daemon_starts_again() -> Verdict {
         Ok(earlier.chain(own).map(Value::to_string).collect())
     };
     let earlier = participants(&daemon)?;
-    daemon.is_killed()?;
+    daemon.kill()?;
     let daemon = setup.listen(&address).start()?;
-    // A call made meanwhile is answered, or forgotten, of which DDS has no way to tell its caller; the next one is answered.
+    // A call made meanwhile is answered or lost, which DDS cannot report to the caller; the next one is answered.
     let meanwhile = app.call("/greet", request.clone(), scale(MEANWHILE));
     match site.runtime.block_on(meanwhile) {
         Ok(_) | Err(BusError::Timeout { .. }) => {}
         Err(other) => return Err(other.into()),
     }
-    let again = with_log(site.calls(&app, "/greet", &request), &stub)?;
+    let again = with_log(site.call_service(&app, "/greet", &request), &stub)?;
     ensure!(
-        is_known(&again) == Some(true),
+        was_greeted(&again) == Some(true),
         "it has forgotten what it did: {again:?}\n{}",
-        stub.said()
+        stub.output()
     );
-    // What was seen of it then, of which more may have been found since.
-    site.until(&app, "all that the node had", |graph| {
+    // The endpoints that had been discovered by then; more may have been discovered since.
+    site.wait_for_graph(&app, "all that the node had", |graph| {
         graph
             .ends
             .get("/herald")
             .is_some_and(|now| has_all(now, &before))
     })?;
-    // The node was told that the participants of the daemon before are gone, and can be told of these.
+    // The node was told that the participants of the previous daemon are gone, so it can discover the new ones.
     let now = participants(&daemon)?;
     ensure!(
         !earlier.is_empty() && earlier.is_subset(&now) && earlier != now,
         "{earlier:?} {now:?}"
     );
     drop(stub);
-    daemon.deployer().types(&["stop", "--all"])?;
-    daemon.ends()?;
+    daemon.deployer().run(&["stop", "--all"])?;
+    daemon.stop()?;
     Ok(())
 }
 
-/// The pixels of a wall with a shadow on it, which moves, as a camera sees them: with two bits of noise. What knows no pictures does not get them
-/// much smaller.
-fn wall(number: u32, (width, height): (u32, u32)) -> Vec<u8> {
+/// Returns the pixels of a wall with a moving shadow as a camera sees it, with two bits of noise. A codec without
+/// knowledge of images cannot compress them much.
+fn wall_pixels(number: u32, (width, height): (u32, u32)) -> Vec<u8> {
     let mut noise = number;
     let mut pixels = Vec::new();
     for row in 0..height {
@@ -566,16 +587,16 @@ fn wall(number: u32, (width, height): (u32, u32)) -> Vec<u8> {
 
 pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
     const SIZE: (u32, u32) = (320, 240);
-    let daemon = world().with(SEER)?;
+    let daemon = world().daemon_with(SEER)?;
     for (codec, smaller) in [("auto", true), ("none", false)] {
         let cable = Cable::new(&daemon.address)?;
-        cable.degrade(Badness::SLOW)?;
-        let site = Site::of(RosVersion::Two)?;
+        cable.degrade(NetworkImpairment::SLOW)?;
+        let site = Site::with_ros(RosVersion::Two)?;
         let robot = format!("ros2-pictures-{codec}");
         let settings = format!("local = \"none\"\ncodec = \"{codec}\"");
         let stub = people::stub(&site, &daemon, &cable, (SEER.name, &robot), &settings, &[])?;
-        let mut camera = with_log(Camera::new(&site, 10), &stub)?;
-        // The link has to be measured, and the codecs to be tried, before one is settled on.
+        let mut camera = with_log(PeopleCamera::new(&site, 10), &stub)?;
+        // The link first measures its rate and tries the codecs.
         let size = u64::from(SIZE.0 * SIZE.1 * 3);
         let mut carried: Vec<u64> = Vec::new();
         let settled = |carried: &[u64]| {
@@ -595,22 +616,22 @@ pub fn pictures_are_made_smaller_where_the_link_is_slow() -> Verdict {
             deadline
                 .check(|| format!("codec {codec}: pictures of {size} bytes took {carried:?}"))?;
             number += 1;
-            let before = cable.carried()?.0;
-            let pixels = wall(number, SIZE);
+            let before = cable.transferred_bytes()?.0;
+            let pixels = wall_pixels(number, SIZE);
             let picture = people::picture_of(RosVersion::Two, number, SIZE, &pixels);
             camera.image.publish(picture);
-            // The node looks at every pixel, and says where it is bright.
-            let found = with_log(site.next(&mut camera.found), &stub)?;
+            // The node examines every pixel and reports where it is bright.
+            let found = with_log(site.next_message(&mut camera.found), &stub)?;
             ensure!(people::number(&found) == Some(number), "{found:?}");
-            carried.push(cable.carried()?.0 - before);
+            carried.push(cable.transferred_bytes()?.0 - before);
         }
     }
     Ok(())
 }
 
 pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
-    let daemon = world().with(HERALD)?;
-    world().with(ADDER)?;
+    let daemon = world().daemon_with(HERALD)?;
+    world().daemon_with(ADDER)?;
     for (ros, (service, package, executable), words) in [
         (RosVersion::One, THE_HERALD, ["herald", "ROS 2"]),
         (
@@ -619,14 +640,14 @@ pub fn a_robot_of_the_other_ros_is_refused_by_name() -> Verdict {
             ["adder_py", "ROS 1"],
         ),
     ] {
-        let site = Site::of(ros)?;
+        let site = Site::with_ros(ros)?;
         let toml = format!(
             "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"ros2-other\"\nlocal = \"none\"\n",
             daemon.address
         );
-        let mut stub = site.stub_with(&toml, package, executable, &[])?;
-        let status = stub.ends()?;
-        let said = stub.said();
+        let mut stub = site.start_stub_with_config(&toml, package, executable, &[])?;
+        let status = stub.wait_for_exit()?;
+        let said = stub.output();
         ensure!(
             status.code() == Some(1) && words.iter().all(|word| said.contains(word)),
             "{status}\n{said}"

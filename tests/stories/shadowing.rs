@@ -1,4 +1,4 @@
-//! A robot installs a stub, and its own tools find it in the original's place.
+//! A robot installs a stub, and its own tools find the stub in place of the original.
 
 use anyhow::{Context, ensure};
 use support::Verdict;
@@ -24,7 +24,7 @@ python3 -c "import roslib.packages as p; print(p.find_node('opencv_apps', 'peopl
 rospack find roslaunch
 "#;
 
-fn found_in(prefix: &str) -> String {
+fn expected_paths(prefix: &str) -> String {
     format!(
         "{prefix}/share/opencv_apps\n{prefix}/lib/opencv_apps/people_detect\n\
          {prefix}/lib/opencv_apps/face_detection\n{prefix}/share/opencv_apps/launch/people_detect.launch\n\
@@ -32,44 +32,48 @@ fn found_in(prefix: &str) -> String {
     )
 }
 
-/// A machine with the stub of people_detect unpacked in /root.
-fn machine() -> anyhow::Result<Machine> {
-    Machine::with_stub(&*world().with(PEOPLE)?, "opencv_apps")
+/// Returns a machine with the stub of people_detect unpacked in /root.
+fn machine_with_stub() -> anyhow::Result<Machine> {
+    Machine::with_stub(&*world().daemon_with(PEOPLE)?, "opencv_apps")
 }
 
-fn installed() -> anyhow::Result<Machine> {
-    let machine = machine()?;
+fn machine_with_installed_stub() -> anyhow::Result<Machine> {
+    let machine = machine_with_stub()?;
     let outcome = machine
-        .runs("sh", "sh opencv_apps-stub/install.sh")?
-        .succeeded()?;
+        .run_script("sh", "sh opencv_apps-stub/install.sh")?
+        .expect_success()?;
     for words in [
         "ok    server",
         "ok    clock",
-        "the token is good",
+        "the token is valid",
         ". /opt/cloudroid/setup.sh",
     ] {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(machine)
 }
 
 pub fn on_debians_layout_every_tool_finds_the_stub() -> Verdict {
-    let machine = installed()?;
-    let before = machine.runs("sh", LOOK)?.succeeded()?;
-    ensure!(before.stdout == found_in("/usr"), "{}", before.said());
+    let machine = machine_with_installed_stub()?;
+    let before = machine.run_script("sh", LOOK)?.expect_success()?;
+    ensure!(
+        before.stdout == expected_paths("/usr"),
+        "{}",
+        before.output()
+    );
     for (shell, setup) in SHELLS {
-        // Twice, and with arguments that are the script's own, which a bare dot would hand on.
+        // Twice, and with arguments that belong to the script and that `.` would pass on.
         let script = format!(
             "set -- --extend x\n. {OVERLAY}/{setup}\n. {OVERLAY}/{setup}\n{LOOK}\necho $CMAKE_PREFIX_PATH $*"
         );
-        let found = machine.runs(shell, &script)?.succeeded()?;
-        let expected = format!("{}{OVERLAY}:/usr --extend x\n", found_in(OVERLAY));
-        ensure!(found.stdout == expected, "{shell}: {}", found.said());
-        let left = machine.runs(
+        let found = machine.run_script(shell, &script)?.expect_success()?;
+        let expected = format!("{}{OVERLAY}:/usr --extend x\n", expected_paths(OVERLAY));
+        ensure!(found.stdout == expected, "{shell}: {}", found.output());
+        let left = machine.run_script(
             shell,
             &format!(". {OVERLAY}/{setup}; set | grep ^_cloudroid"),
         )?;
@@ -79,55 +83,56 @@ pub fn on_debians_layout_every_tool_finds_the_stub() -> Verdict {
 }
 
 pub fn what_is_not_outsourced_becomes_the_original() -> Verdict {
-    let machine = installed()?;
+    let machine = machine_with_installed_stub()?;
     let script = format!(
         ". {OVERLAY}/setup.sh\n{OVERLAY}/lib/opencv_apps/face_detection __name:=y > /tmp/said 2>&1 &\n\
          until grep -q 'contact master' /tmp/said; do kill -0 $! || break; sleep 0.1; done\n\
          readlink /proc/$!/exe; tr '\\0' '\\n' < /proc/$!/environ | grep -c '{OVERLAY}'; cat /tmp/said >&2"
     );
-    let become_it = machine.runs("sh", &script)?;
+    let become_it = machine.run_script("sh", &script)?;
     ensure!(
         become_it.stdout == "/usr/lib/opencv_apps/face_detection\n0\n",
         "{}",
-        become_it.said()
+        become_it.output()
     );
     Ok(())
 }
 
 pub fn without_the_original_the_stub_stands_alone() -> Verdict {
-    let machine = installed()?;
+    let machine = machine_with_installed_stub()?;
     machine
-        .runs("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?
-        .succeeded()?;
+        .run_script("sh", "rm -r /usr/share/opencv_apps /usr/lib/opencv_apps")?
+        .expect_success()?;
     for (shell, setup) in SHELLS {
-        let found = machine.runs(shell, &format!(". {OVERLAY}/{setup}\n{LOOK}"))?;
+        let found = machine.run_script(shell, &format!(". {OVERLAY}/{setup}\n{LOOK}"))?;
         ensure!(
-            found.stdout == found_in(OVERLAY),
+            found.stdout == expected_paths(OVERLAY),
             "{shell}: {}",
-            found.said()
+            found.output()
         );
     }
     let source = format!(". {OVERLAY}/setup.sh\n");
     machine
-        .runs(
+        .run_script(
             "sh",
             &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
         )?
-        .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
-    let doctor = machine.runs(
+        .expect_failure(&["no original opencv_apps/face_detection is installed"])?;
+    let doctor = machine.run_script(
         "sh",
         &format!("{source}rosrun opencv_apps cloudroid-stub doctor"),
     )?;
-    let said = doctor.succeeded()?.stdout;
+    let said = doctor.expect_success()?.stdout;
     ensure!(
-        said.contains("people_detect is not installed on this robot: it runs in the cloud only")
+        said.contains("people_detect is not installed on this robot, so it runs in the cloud only")
             && said.contains("fix it:  install the package opencv_apps"),
         "{said}"
     );
     Ok(())
 }
 
-/// What upstream's packages install: catkin's own set-up files, made of its templates, below /opt/ros/noetic.
+/// Files installed by upstream's packages: catkin's own set-up files, generated from its templates, below
+/// /opt/ros/noetic.
 const OPT_ROS: &str = r#"
 set -e
 ros=/opt/ros/noetic templates=/usr/share/catkin/cmake/templates
@@ -144,120 +149,122 @@ cp /usr/share/ros_environment/catkin_env_hook/1.ros_package_path.sh $ros/etc/cat
 "#;
 
 pub fn on_an_opt_ros_layout_every_tool_finds_the_stub() -> Verdict {
-    let machine = installed()?;
-    machine.runs("bash", OPT_ROS)?.succeeded()?;
+    let machine = machine_with_installed_stub()?;
+    machine.run_script("bash", OPT_ROS)?.expect_success()?;
     for (shell, setup) in SHELLS {
         let upstream = format!(
             "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n"
         );
-        let before = machine.runs(shell, &format!("{upstream}{LOOK}"))?;
+        let before = machine.run_script(shell, &format!("{upstream}{LOOK}"))?;
         ensure!(
-            before.stdout == found_in("/opt/ros/noetic"),
+            before.stdout == expected_paths("/opt/ros/noetic"),
             "{shell}: {}",
-            before.said()
+            before.output()
         );
         let script = format!("{upstream}. {OVERLAY}/{setup}\n{LOOK}");
-        let found = machine.runs(shell, &script)?;
+        let found = machine.run_script(shell, &script)?;
         ensure!(
-            found.stdout == found_in(OVERLAY),
+            found.stdout == expected_paths(OVERLAY),
             "{shell}: {}",
-            found.said()
+            found.output()
         );
     }
-    // The original is found there, too; and sourcing upstream again puts the stub out of its place, which is told.
+    // The original is found there as well; sourcing upstream again takes precedence over the stub, which is reported.
     let source = format!(
-        "set --\n. /opt/ros/noetic/setup.sh\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. {OVERLAY}/setup.sh\n"
+        "set --\n. /opt/ros/noetic/setup.sh\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. \
+         {OVERLAY}/setup.sh\n"
     );
     let doctor = format!("{OVERLAY}/lib/opencv_apps/cloudroid-stub doctor");
     let good = machine
-        .runs("sh", &format!("{source}{doctor}"))?
-        .succeeded()?;
+        .run_script("sh", &format!("{source}{doctor}"))?
+        .expect_success()?;
     ensure!(
         good.stdout
             .contains("people_detect is /opt/ros/noetic/lib/opencv_apps/people_detect"),
         "{}",
-        good.said()
+        good.output()
     );
     machine
-        .runs(
+        .run_script(
             "sh",
             &format!("{source}. /opt/ros/noetic/setup.sh\n{doctor}"),
         )?
-        .failed_saying(&["FAIL  shadowing", "fix it:  . /opt/cloudroid/setup.sh"])?;
+        .expect_failure(&["FAIL  shadowing", "fix it:  . /opt/cloudroid/setup.sh"])?;
     Ok(())
 }
 
 pub fn on_an_opt_ros_layout_without_the_original_the_stub_stands_alone() -> Verdict {
-    let machine = installed()?;
-    machine.runs("bash", OPT_ROS)?.succeeded()?;
+    let machine = machine_with_installed_stub()?;
+    machine.run_script("bash", OPT_ROS)?.expect_success()?;
     machine
-        .runs(
+        .run_script(
             "sh",
             "rm -r /opt/ros/noetic/lib/opencv_apps /opt/ros/noetic/share/opencv_apps",
         )?
-        .succeeded()?;
+        .expect_success()?;
     for (shell, setup) in SHELLS {
         let source = format!(
-            "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. {OVERLAY}/{setup}\n"
+            "set --\n. /opt/ros/noetic/{setup}\nexport ROS_PACKAGE_PATH=$ROS_PACKAGE_PATH:/usr/share\n. \
+             {OVERLAY}/{setup}\n"
         );
-        let found = machine.runs(shell, &format!("{source}{LOOK}"))?;
+        let found = machine.run_script(shell, &format!("{source}{LOOK}"))?;
         ensure!(
-            found.stdout == found_in(OVERLAY),
+            found.stdout == expected_paths(OVERLAY),
             "{shell}: {}",
-            found.said()
+            found.output()
         );
         machine
-            .runs(
+            .run_script(
                 shell,
                 &format!("{source}timeout $PATIENCE rosrun opencv_apps face_detection"),
             )?
-            .failed_saying(&["no other opencv_apps/face_detection is installed"])?;
+            .expect_failure(&["no original opencv_apps/face_detection is installed"])?;
         let doctor = format!("{source}rosrun opencv_apps cloudroid-stub doctor");
-        let doctor = machine.runs(shell, &doctor)?.succeeded()?;
+        let doctor = machine.run_script(shell, &doctor)?.expect_success()?;
         ensure!(
             doctor.stdout.contains(
-                "people_detect is not installed on this robot: it runs in the cloud only"
+                "people_detect is not installed on this robot, so it runs in the cloud only"
             ),
             "{shell}: {}",
-            doctor.said()
+            doctor.output()
         );
     }
     Ok(())
 }
 
 pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
-    let machine = machine()?;
+    let machine = machine_with_stub()?;
     let nobody = "sh opencv_apps-stub/install.sh --server ws://127.0.0.1:9";
-    machine.runs("sh", nobody)?.failed_saying(&[
+    machine.run_script("sh", nobody)?.expect_failure(&[
         "FAIL  server",
-        "is not reached",
+        "cannot be reached",
         "nothing was installed",
     ])?;
-    let written = machine.runs("sh", &format!("ls -d {OVERLAY}"))?;
-    ensure!(written.status != 0, "{}", written.said());
+    let written = machine.run_script("sh", &format!("ls -d {OVERLAY}"))?;
+    ensure!(written.status != 0, "{}", written.output());
     machine
-        .runs(
+        .run_script(
             "sh",
             "sh opencv_apps-stub/setup.sh; sh -c '. opencv_apps-stub/setup.sh'",
         )?
-        .succeeded()
+        .expect_success()
         .and_then(|outcome| {
             ensure!(
                 outcome.stderr.contains("run install.sh"),
                 "{}",
-                outcome.said()
+                outcome.output()
             );
             Ok(())
         })?;
     machine
-        .runs(
+        .run_script(
             "sh",
             "sh opencv_apps-stub/install.sh --prefix /root/mine --robot rover --token secret",
         )?
-        .succeeded()?;
+        .expect_success()?;
     let settings = machine
-        .runs("sh", "cat /root/mine/share/opencv_apps/stub.toml; stat -c %a /root/mine/share/opencv_apps/token")?
-        .succeeded()?
+        .run_script("sh", "cat /root/mine/share/opencv_apps/stub.toml; stat -c %a /root/mine/share/opencv_apps/token")?
+        .expect_success()?
         .stdout;
     let sets = |key: &str| {
         let of = |line: &&str| line.starts_with(key);
@@ -267,52 +274,56 @@ pub fn the_installer_checks_before_it_writes_and_undoes_itself() -> Verdict {
         sets("robot") == ["robot = \"rover\""] && settings.ends_with("600\n"),
         "{settings}"
     );
-    // In the place where they are explained.
+    // At the place in the file where they are explained.
     ensure!(
         settings.starts_with("# How this robot uses") && !settings.contains("# robot"),
         "{settings}"
     );
-    // What the owner sets outlives another installation.
+    // Settings of the owner survive another installation.
     let again = "echo 'max = 0.4' >> /root/mine/share/opencv_apps/stub.toml\n\
                  sh opencv_apps-stub/install.sh --prefix /root/mine > /dev/null\n\
                  cat /root/mine/share/opencv_apps/stub.toml";
-    let kept = machine.runs("sh", again)?.succeeded()?.stdout;
+    let kept = machine.run_script("sh", again)?.expect_success()?.stdout;
     ensure!(
         kept.contains("max = 0.4") && kept.contains("robot = \"rover\""),
         "{kept}"
     );
     machine
-        .runs(
+        .run_script(
             "sh",
             "sh /root/mine/share/opencv_apps/install.sh --uninstall",
         )?
-        .succeeded()?;
-    let left = machine.runs("sh", "ls -A /root/mine; rospack find opencv_apps")?;
-    ensure!(left.stdout == "/usr/share/opencv_apps\n", "{}", left.said());
+        .expect_success()?;
+    let left = machine.run_script("sh", "ls -A /root/mine; rospack find opencv_apps")?;
+    ensure!(
+        left.stdout == "/usr/share/opencv_apps\n",
+        "{}",
+        left.output()
+    );
     Ok(())
 }
 
 pub fn a_stub_that_was_changed_on_its_way_is_not_installed() -> Verdict {
-    let machine = machine()?;
+    let machine = machine_with_stub()?;
     let program = "opencv_apps-stub/lib/opencv_apps/cloudroid-stub";
     let tampered = format!(
         "printf '#!/bin/sh\\ntouch /root/ran\\n' > {program}; sh opencv_apps-stub/install.sh"
     );
-    machine.runs("sh", &tampered)?.failed_saying(&[
+    machine.run_script("sh", &tampered)?.expect_failure(&[
         "./lib/opencv_apps/cloudroid-stub",
-        "not what the server signed",
+        "differ from what the server signed",
     ])?;
-    let left = machine.runs("sh", &format!("ls -d {OVERLAY} /root/ran"))?;
-    ensure!(left.stdout.is_empty(), "{}", left.said());
+    let left = machine.run_script("sh", &format!("ls -d {OVERLAY} /root/ran"))?;
+    ensure!(left.stdout.is_empty(), "{}", left.output());
     let unsigned = "rm opencv_apps-stub/MANIFEST.sig; sh opencv_apps-stub/install.sh";
     machine
-        .runs("sh", unsigned)?
-        .failed_saying(&["this archive is not signed"])?;
+        .run_script("sh", unsigned)?
+        .expect_failure(&["this archive is not signed"])?;
     Ok(())
 }
 
 pub fn its_nodelets_cannot_be_loaded_on_the_robot() -> Verdict {
-    let machine = installed()?;
+    let machine = machine_with_installed_stub()?;
     let port = free_port()?;
     let script = format!(
         r#"set -e
@@ -329,23 +340,23 @@ cat > load.launch << 'END'
 END
 timeout "$PATIENCE" roslaunch load.launch || echo "roslaunch: $?""#
     );
-    let refused = machine.runs("bash", &script)?.succeeded()?;
-    // In a process of its own, and in a manager that a launch file starts: there the loader ends, and is missed.
+    let refused = machine.run_script("bash", &script)?.expect_success()?;
+    // As a process of its own, and in a manager from a launch file, where the loader exits and is required.
     for words in ["standalone: ", "REQUIRED process [people"] {
         ensure!(
-            refused.said().contains(words),
+            refused.output().contains(words),
             "{words}: {}",
-            refused.said()
+            refused.output()
         );
     }
     let why = "opencv_apps runs in the cloud: its nodelets cannot be loaded";
-    let times = refused.said().matches(why).count();
-    ensure!(times >= 2, "{times} times: {}", refused.said());
+    let times = refused.output().matches(why).count();
+    ensure!(times >= 2, "{times} times: {}", refused.output());
     Ok(())
 }
 
 pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
-    let daemon = world().with(PEOPLE)?;
+    let daemon = world().daemon_with(PEOPLE)?;
     let (status, body) = daemon.get("/stubs/nobody.tar.gz")?;
     ensure!(
         status == 404 && body.contains("opencv_apps"),
@@ -356,9 +367,9 @@ pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
         status == 404 && body.contains("make stub-cross"),
         "{status} {body}"
     );
-    let stubs = daemon.deployer().asks(&["stub"])?;
+    let stubs = daemon.deployer().run_json(&["stub"])?;
     ensure!(stubs["architectures"][0] == "x86_64", "{stubs}");
-    // Which there are depends on what was built here; of each it is said.
+    // The available architectures depend on what was built; for each of them there is a response.
     for (list, expected) in [("architectures", 200), ("lacking", 404)] {
         for architecture in stubs[list].as_array().context("a list")? {
             let name = architecture.as_str().context("a name")?;
@@ -371,7 +382,7 @@ pub fn stubs_are_served_to_those_who_may_and_say_what_is_lacking() -> Verdict {
     let archive = |name: &str| -> anyhow::Result<Vec<u8>> {
         let directory = place.path().join(name);
         let words = ["stub", "opencv_apps", "-o", path_str(&directory)];
-        daemon.deployer().types(&words)?.succeeded()?;
+        daemon.deployer().run(&words)?.expect_success()?;
         std::fs::read(directory.join("opencv_apps.tar.gz")).context("the archive")
     };
     ensure!(

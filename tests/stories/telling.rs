@@ -1,4 +1,4 @@
-//! How stories are told: what happens when one fails by chance, when a run is killed, and where the machine lacks something.
+//! The runner of the stories: stories that fail by chance, runs that are killed, and machines that lack something.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -6,14 +6,14 @@ use std::process::{Child, Command, Stdio};
 
 use anyhow::{Context, ensure};
 use support::Verdict;
-use support::deployer::{Outcome, path_str, run};
+use support::deployer::{CommandOutcome, path_str, run};
 use support::leftovers;
 use support::world::{Directory, PREFIX, world};
 
 use crate::rehearsal;
 
-/// A run of rehearsals that keeps what it finds in a directory of its own.
-fn rehearse(place: &Directory, names: &[&str]) -> anyhow::Result<Command> {
+/// Returns the command of a rehearsal run with a target directory of its own.
+fn rehearse_command(place: &Directory, names: &[&str]) -> anyhow::Result<Command> {
     let mut command = Command::new(std::env::current_exe()?);
     command
         .args(names)
@@ -25,9 +25,9 @@ fn rehearse(place: &Directory, names: &[&str]) -> anyhow::Result<Command> {
     Ok(command)
 }
 
-/// Runs a shell script in a mount namespace of its own; `$@` is a run of rehearsals.
-fn rehearse_where(place: &Directory, script: &str) -> anyhow::Result<Outcome> {
-    let rehearsal = rehearse(place, &["rehearsal::passes"])?;
+/// Runs a shell script in a separate mount namespace; `$@` is a rehearsal run.
+fn rehearse_where(place: &Directory, script: &str) -> anyhow::Result<CommandOutcome> {
+    let rehearsal = rehearse_command(place, &["rehearsal::passes"])?;
     let script = format!("set -e\n{script}");
     let mut shell = Command::new("unshare");
     shell.args([
@@ -52,17 +52,17 @@ fn rehearse_where(place: &Directory, script: &str) -> anyhow::Result<Outcome> {
     run(&mut shell)
 }
 
-/// A directory for devices in which there are no loop devices.
+/// Mounts a /dev without loop devices.
 const WITHOUT_LOOP: &str =
     "mount -t tmpfs none /dev\nmknod -m 666 /dev/null c 1 3\nmknod -m 666 /dev/urandom c 1 9\n";
 
 pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
     let place = world().directory("telling")?;
-    let outcome = run(&mut rehearse(
+    let outcome = run(&mut rehearse_command(
         &place,
         &["rehearsal::passes", "fails_once", "panics_once"],
     )?)?
-    .succeeded()?;
+    .expect_success()?;
     for said in [
         "FLAKY rehearsal::fails_once: it fails the first time",
         "FLAKY rehearsal::panics_once: panicked: it panics the first time",
@@ -71,7 +71,7 @@ pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
         ensure!(
             outcome.stdout.contains(said),
             "{said:?} is not in {}",
-            outcome.said()
+            outcome.output()
         );
     }
     let target = place.path().join("target");
@@ -99,35 +99,36 @@ pub fn one_that_fails_once_is_told_again_and_its_world_is_kept() -> Verdict {
 pub fn more_than_two_by_chance_fail_the_run_and_strictly_the_first() -> Verdict {
     let place = world().directory("telling")?;
     let once = ["fails_once", "is_missed_once", "times_out_once"];
-    let outcome = run(&mut rehearse(&place, &once)?)?;
-    outcome.failed_saying(&[
+    let outcome = run(&mut rehearse_command(&place, &once)?)?;
+    outcome.expect_failure(&[
         "more than 2 stories failed and then passed",
         "3 passed, 0 failed",
     ])?;
-    let strictly = run(rehearse(&place, &["is_missed_once"])?.env("STRICT", "1"))?;
-    ensure!(strictly.status == 1, "{}", strictly.said());
+    let strictly = run(rehearse_command(&place, &["is_missed_once"])?.env("STRICT", "1"))?;
+    ensure!(strictly.status == 1, "{}", strictly.output());
     ensure!(
-        !strictly.said().contains("FLAKY"),
+        !strictly.output().contains("FLAKY"),
         "it is not told again: {}",
-        strictly.said()
+        strictly.output()
     );
-    let outcome = run(&mut rehearse(
+    let outcome = run(&mut rehearse_command(
         &place,
         &["rehearsal::fails", "rehearsal::passes", "--exact"],
     )?)?;
-    outcome.failed_saying(&[
+    outcome.expect_failure(&[
         "== failed: rehearsal::fails\nit always fails",
         "1 passed, 1 failed",
     ])?;
-    run(&mut rehearse(&place, &["nobody"])?)?.failed_saying(&["no story is called nobody"])?;
+    run(&mut rehearse_command(&place, &["nobody"])?)?
+        .expect_failure(&["no story is called nobody"])?;
     Ok(())
 }
 
 pub fn one_without_an_end_is_named_and_ends_the_run() -> Verdict {
     let place = world().directory("telling")?;
     let names = ["rehearsal::passes", "rehearsal::has_no_end"];
-    let outcome = run(rehearse(&place, &names)?.env(rehearsal::VARIABLE, "2"))?;
-    outcome.failed_saying(&[
+    let outcome = run(rehearse_command(&place, &names)?.env(rehearsal::VARIABLE, "2"))?;
+    outcome.expect_failure(&[
         "test rehearsal::passes ... ok",
         "== failed: rehearsal::has_no_end has no end",
     ])?;
@@ -136,42 +137,45 @@ pub fn one_without_an_end_is_named_and_ends_the_run() -> Verdict {
 
 pub fn what_the_machine_lacks_is_said_in_a_line() -> Verdict {
     let place = world().directory("telling")?;
-    // The program is below root's home, where others reach it by a descriptor alone.
+    // The program is below root's home, where others can only execute it through a descriptor.
     let by_nobody =
         "exec 3<\"$1\"; shift; exec setpriv --reuid=65534 --clear-groups /proc/self/fd/3 \"$@\"";
     rehearse_where(&place, by_nobody)?
-        .failed_saying(&["servants are started by root: sudo make stories"])?;
+        .expect_failure(&["servants are started by root: sudo make stories"])?;
     let without_cgroups = "mount -t tmpfs none /sys/fs/cgroup; \"$@\"";
     rehearse_where(&place, without_cgroups)?
-        .failed_saying(&["no cgroups with limits are mounted"])?;
+        .expect_failure(&["no cgroups with limits are mounted"])?;
     let without_loop = format!("{WITHOUT_LOOP}\"$@\"");
-    let outcome = rehearse_where(&place, &without_loop)?.succeeded()?;
+    let outcome = rehearse_where(&place, &without_loop)?.expect_success()?;
     ensure!(
         outcome
             .stdout
             .contains("no disk of their own for the stories' homes"),
         "{}",
-        outcome.said()
+        outcome.output()
     );
     let full = "mkdir full; mount -t tmpfs -o size=64M none full; TMPDIR=$PWD/full XDG_CACHE_HOME=$PWD/full \"$@\"";
     rehearse_where(&place, full)?
-        .failed_saying(&["GB free, and homes take 12 GB: make room there"])?;
+        .expect_failure(&["GB free, and homes take 12 GB: make room there"])?;
     let on_overlay = format!(
-        "{WITHOUT_LOOP}mkdir -p lower upper work over; mount -t overlay -o lowerdir=lower,upperdir=upper,workdir=work none over; TMPDIR=$PWD/over \"$@\""
+        "{WITHOUT_LOOP}mkdir -p lower upper work over; mount -t overlay -o lowerdir=lower,upperdir=upper,workdir=work \
+         none over; TMPDIR=$PWD/over \"$@\""
     );
     rehearse_where(&place, &on_overlay)?
-        .failed_saying(&["cannot hold the upper directories of overlays", "TMPDIR"])?;
+        .expect_failure(&["cannot hold the upper directories of overlays", "TMPDIR"])?;
     Ok(())
 }
 
-/// A run of rehearsals that is at work.
-struct Run(Child);
+/// A rehearsal run in progress.
+struct RehearsalRun(Child);
 
-impl Run {
-    fn with_a_servant(place: &Directory) -> anyhow::Result<Run> {
-        let mut run = Run(rehearse(place, &["waits"])?
-            .stdout(Stdio::piped())
-            .spawn()?);
+impl RehearsalRun {
+    fn start_with_servant(place: &Directory) -> anyhow::Result<RehearsalRun> {
+        let mut run = RehearsalRun(
+            rehearse_command(place, &["waits"])?
+                .stdout(Stdio::piped())
+                .spawn()?,
+        );
         let lines = BufReader::new(run.0.stdout.take().context("piped")?).lines();
         let mut said = Vec::new();
         for line in lines {
@@ -184,20 +188,20 @@ impl Run {
         anyhow::bail!("it ended: {said:#?}")
     }
 
-    fn is_killed(&mut self) -> Verdict {
+    fn kill(&mut self) -> Verdict {
         self.0.kill()?;
         self.0.wait()?;
         Ok(())
     }
 }
 
-impl Drop for Run {
+impl Drop for RehearsalRun {
     fn drop(&mut self) {
-        let _ = self.is_killed();
+        let _ = self.kill();
     }
 }
 
-fn places(parent: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
+fn run_directories(parent: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
     let entries = std::fs::read_dir(parent)?
         .flatten()
         .map(|entry| entry.path());
@@ -210,26 +214,26 @@ fn places(parent: &Path) -> anyhow::Result<Vec<std::path::PathBuf>> {
 
 pub fn what_a_killed_run_left_is_removed_by_the_next_and_a_living_one_is_left_alone() -> Verdict {
     let place = world().directory("telling")?;
-    let mut first = Run::with_a_servant(&place)?;
-    let passes = || run(&mut rehearse(&place, &["rehearsal::passes"])?)?.succeeded();
+    let mut first = RehearsalRun::start_with_servant(&place)?;
+    let passes = || run(&mut rehearse_command(&place, &["rehearsal::passes"])?)?.expect_success();
     let outcome = passes()?;
     ensure!(
         !outcome.stdout.contains("removed"),
         "the first is at work: {}",
-        outcome.said()
+        outcome.output()
     );
-    let [left] = &places(place.path())?[..] else {
-        anyhow::bail!("{:?}", places(place.path())?);
+    let [left] = &run_directories(place.path())?[..] else {
+        anyhow::bail!("{:?}", run_directories(place.path())?);
     };
-    first.is_killed()?;
+    first.kill()?;
     ensure!(
-        !leftovers::of(left).is_empty(),
+        !leftovers::find_leftovers(left).is_empty(),
         "its daemon and its servant are there"
     );
     let outcome = passes()?;
     let removed = format!("removed {}", path_str(left));
-    ensure!(outcome.stdout.contains(&removed), "{}", outcome.said());
-    let there = leftovers::of(left);
+    ensure!(outcome.stdout.contains(&removed), "{}", outcome.output());
+    let there = leftovers::find_leftovers(left);
     ensure!(there.is_empty() && !left.exists(), "{there:#?}");
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! TLS: the daemon's own, and that of a proxy in front, under an authority of its owner's.
+//! TLS: the daemon's own, and that of a proxy in front with an authority of the owner.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -7,26 +7,26 @@ use std::process::Command;
 
 use anyhow::{Context, ensure};
 use support::daemon::Daemon;
-use support::deployer::{Outcome, run};
+use support::deployer::{CommandOutcome, run};
 use support::machine::{Machine, free_port};
-use support::patience::{Patient, connect, patience};
+use support::patience::{PatientStream, connect, patience};
 use support::site::Site;
-use support::tls::Proxy;
+use support::tls::TlsProxy;
 use support::world::{ADDER, TELLER, world};
-use support::{Verdict, binaries, until};
+use support::{Verdict, binaries, wait_until};
 
 pub fn a_robot_works_through_tls() -> Verdict {
-    let daemon = world().with(TELLER)?;
-    let proxy = Proxy::of(&daemon.address)?;
+    let daemon = world().daemon_with(TELLER)?;
+    let proxy = TlsProxy::start(&daemon.address)?;
     let machine = Machine::with_stub(&daemon, "teller_py")?;
-    machine.puts(&proxy.authority(), "/root/authority.pem", 0o644)?;
+    machine.install_file(&proxy.authority(), "/root/authority.pem", 0o644)?;
     let install = format!(
         "sh teller_py-stub/install.sh --robot secure --server wss://localhost:{}",
         proxy.port
     );
-    // This machine came without any authority.
-    machine.runs("sh", &install)?.failed_saying(&[
-        "this robot trusts nobody yet",
+    // This machine has no certificate authorities installed.
+    machine.run_script("sh", &install)?.expect_failure(&[
+        "no certificate authorities are installed on this robot",
         "ca-certificates",
         "nothing was installed",
     ])?;
@@ -44,7 +44,7 @@ rosrun teller_py teller.py > said 2>&1 &
 timeout "$PATIENCE" rostopic echo -n 1 -p /teller/told
 cat said"#
     );
-    let outcome = machine.runs("bash", &script)?.succeeded()?;
+    let outcome = machine.run_script("bash", &script)?.expect_success()?;
     for words in [
         "ok    server     wss://localhost",
         "ok    service",
@@ -54,20 +54,20 @@ cat said"#
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(())
 }
 
 pub fn what_stands_against_tls_is_said() -> Verdict {
-    let daemon = world().with(TELLER)?;
-    let proxy = Proxy::of(&daemon.address)?;
+    let daemon = world().daemon_with(TELLER)?;
+    let proxy = TlsProxy::start(&daemon.address)?;
     let site = Site::new()?;
-    let other = Proxy::of(&daemon.address)?;
+    let other = TlsProxy::start(&daemon.address)?;
     let authority = format!("ca_file = {:?}\n", proxy.authority());
     let stranger = format!("ca_file = {:?}\n", other.authority());
-    let mistaken = Proxy::of_authority(&daemon.address)?;
+    let mistaken = TlsProxy::with_ca_certificate(&daemon.address)?;
     let itself = format!("ca_file = {:?}\n", mistaken.authority());
     let mistaken = format!("127.0.0.1:{}", mistaken.port);
     let plain = daemon.address.clone();
@@ -80,28 +80,28 @@ pub fn what_stands_against_tls_is_said() -> Verdict {
             "it should be a PEM file",
         ),
         (&secure, &*stranger, "install.sh --ca FILE"),
-        (&mistaken, &*itself, "have it sign one for the server"),
-        // Another name of the same machine, which the certificate does not have.
+        (&mistaken, &*itself, "issue a server certificate with it"),
+        // Another name of the same machine, which is not in the certificate.
         (
             &format!("127.0.0.2:{}", proxy.port),
             &*authority,
-            "it is another server's",
+            "it belongs to another server",
         ),
-        (&plain, &*authority, "try ws:// in place of wss://"),
+        (&plain, &*authority, "try ws:// instead of wss://"),
     ] {
         let toml = format!(
             "server = \"wss://{server}\"\nservice = \"teller_py\"\nrobot = \"insecure\"\nlocal = \"none\"\n{authority}"
         );
-        let stub = site.stub_with(&toml, "teller_py", "teller.py", &[])?;
-        stub.says(words)?;
+        let stub = site.start_stub_with_config(&toml, "teller_py", "teller.py", &[])?;
+        stub.wait_for_output(words)?;
     }
     Ok(())
 }
 
 const TOKENS: &str = "tokens = [\"open sesame\"]\n";
 
-/// curl at an address of a daemon that shows a certificate of its own.
-fn curl(daemon: &Daemon, url: &str) -> anyhow::Result<Outcome> {
+/// Requests a URL with curl, trusting the daemon's self-signed certificate.
+fn curl(daemon: &Daemon, url: &str) -> anyhow::Result<CommandOutcome> {
     let own = daemon.home.join("tls/own.pem");
     run(Command::new("curl")
         .args(["--silent", "--show-error", "--max-time"])
@@ -117,39 +117,39 @@ fn port(daemon: &Daemon) -> anyhow::Result<&str> {
 
 pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
     let daemon = world()
-        .own("secured")
+        .setup("secured")
         .config(TOKENS)
         .listen("0.0.0.0:0")
         .start()?;
     let port = port(&daemon)?;
     for (path, words) in [("/healthz", "ok"), ("/api/v1/services", "[]")] {
-        let answer = curl(&daemon, &format!("https://localhost:{port}{path}"))?.succeeded()?;
+        let answer = curl(&daemon, &format!("https://localhost:{port}{path}"))?.expect_success()?;
         ensure!(
             answer.stdout.contains(words) && answer.stdout.ends_with("\n200"),
             "{path}: {}",
-            answer.said()
+            answer.output()
         );
-        let refused = curl(&daemon, &format!("http://localhost:{port}{path}"))?.succeeded()?;
+        let refused = curl(&daemon, &format!("http://localhost:{port}{path}"))?.expect_success()?;
         let instead = format!("use https://localhost:{port}{path}");
         ensure!(
             refused.stdout.contains(&instead) && refused.stdout.ends_with("\n400"),
             "{path}: {}",
-            refused.said()
+            refused.output()
         );
     }
-    // Its fingerprint is told, and the key is nobody else's.
+    // Its fingerprint is printed, and others cannot read the key.
     let shown = fingerprint(&daemon.home.join("tls/own.pem"))?;
     ensure!(
-        daemon.last_words().contains(&shown),
+        daemon.log_tail().contains(&shown),
         "{shown}: {}",
-        daemon.last_words()
+        daemon.log_tail()
     );
-    let status = daemon.deployer().types(&["status"])?.succeeded()?;
+    let status = daemon.deployer().run(&["status"])?.expect_success()?;
     let words = format!("certificate {shown}");
-    ensure!(status.stdout.contains(&words), "{}", status.said());
-    // Who says nothing, or something else than both, is let go.
+    ensure!(status.stdout.contains(&words), "{}", status.output());
+    // Connections that send nothing, or neither TLS nor HTTP, are closed.
     let connects =
-        || -> anyhow::Result<Patient<TcpStream>> { connect(&format!("127.0.0.1:{port}")) };
+        || -> anyhow::Result<PatientStream<TcpStream>> { connect(&format!("127.0.0.1:{port}")) };
     let (mut silent, mut garbled) = (connects()?, connects()?);
     garbled.write_all(&[22, 3, 1, 0, 5, 255, 255, 255, 255, 255])?;
     garbled.read_to_end(&mut Vec::new())?;
@@ -159,27 +159,30 @@ pub fn beyond_loopback_nothing_is_answered_in_plain_text() -> Verdict {
 
 pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
     let daemon = world()
-        .own("secure-robots")
+        .setup("secure-robots")
         .config("[tls]\nserve = \"tls\"\n")
         .start()?;
     let deployer = daemon.deployer();
-    deployer.pushes("adder_py", ADDER.arguments)?.succeeded()?;
+    deployer
+        .push("adder_py", ADDER.arguments)?
+        .expect_success()?;
     let port = port(&daemon)?;
     let own = daemon.home.join("tls/own.pem");
     let url = format!("wss://localhost:{port}/{}?robot=secure", ADDER.name);
     let mut robot = Command::new(binaries::python());
     robot.arg("-c").arg(ROSLIBPY).arg(&url);
     robot.arg(patience().as_secs().to_string());
-    let outcome = run(&mut robot)?.succeeded()?;
-    ensure!(outcome.stdout.contains("42"), "{}", outcome.said());
+    let outcome = run(&mut robot)?.expect_success()?;
+    ensure!(outcome.stdout.contains("42"), "{}", outcome.output());
     let site = Site::new()?;
     let toml = format!(
-        "server = \"wss://localhost:{port}\"\nservice = \"no_such\"\nrobot = \"stub\"\nlocal = \"none\"\nca_file = {own:?}\n"
+        "server = \"wss://localhost:{port}\"\nservice = \"no_such\"\nrobot = \"stub\"\nlocal = \"none\"\nca_file = \
+         {own:?}\n"
     );
-    let stub = site.stub_with(&toml, "no_such", "node", &[])?;
-    // It got as far as the portal's own words.
-    stub.says("404")?;
-    // A stub's archive names the certificate: its robot needs no first use.
+    let stub = site.start_stub_with_config(&toml, "no_such", "node", &[])?;
+    // It got as far as an error of the portal.
+    stub.wait_for_output("404")?;
+    // The archive of a stub contains the certificate's fingerprint, so its robot need not trust on first use.
     let place = world().directory("archive")?;
     let archive = place.path().join("stub.tar.gz");
     let url = format!("https://localhost:{port}/stubs/{}.tar.gz", ADDER.name);
@@ -189,69 +192,74 @@ pub fn robots_of_all_kinds_come_through_the_daemons_tls() -> Verdict {
         .arg("--output")
         .arg(&archive)
         .arg(&url))?;
-    fetched.succeeded()?;
+    fetched.expect_success()?;
     let settings = run(Command::new("tar")
         .args(["--wildcards", "-xzOf"])
         .arg(&archive)
         .arg("*/stub.toml"))?
-    .succeeded()?;
+    .expect_success()?;
     let server = format!("server = \"wss://localhost:{port}\"");
     let fingerprint = format!("fingerprint = \"{}\"", fingerprint(&own)?);
     for line in [&server, &fingerprint] {
         ensure!(
             settings.stdout.contains(line),
             "{line}: {}",
-            settings.said()
+            settings.output()
         );
     }
-    // A robot that had installed it before the server spoke TLS, and one that knew another certificate, follow.
+    // A robot that was installed before the server had TLS, and one that trusted another certificate, follow the
+    // change.
     let machine = Machine::new()?;
-    machine.unpacks(&archive)?;
+    machine.unpack(&archive)?;
     let name = ADDER.name;
     let share = format!("/opt/cloudroid/share/{name}");
     let other = format!("SHA256:{}", "0".repeat(64));
     for (before, words) in [
         (
             format!("server = \"ws://localhost:9090\"\nservice = \"{name}\"\nmax = 0.4"),
-            format!("wss://localhost:{port} in place of ws://localhost:9090"),
+            format!("wss://localhost:{port} instead of ws://localhost:9090"),
         ),
         (
             format!(
                 "server = \"wss://localhost:{port}\"\nservice = \"{name}\"\nfingerprint = \"{other}\"\nmax = 0.4"
             ),
-            format!("in place of {other}"),
+            format!("instead of {other}"),
         ),
     ] {
         let script = format!(
             "set -e\nmkdir -p {share}\ntouch {share}/revision.toml\necho '{before}' > {share}/stub.toml\n\
              sh {name}-stub/install.sh\ncat {share}/stub.toml"
         );
-        let outcome = machine.runs("sh", &script)?.succeeded()?;
+        let outcome = machine.run_script("sh", &script)?.expect_success()?;
         for line in [&server, &fingerprint, "max = 0.4"] {
-            ensure!(outcome.stdout.contains(line), "{line}: {}", outcome.said());
+            ensure!(
+                outcome.stdout.contains(line),
+                "{line}: {}",
+                outcome.output()
+            );
         }
         ensure!(
             outcome.stderr.contains(&words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
     Ok(())
 }
 
-/// The fingerprint of a certificate, by openssl's word.
+/// Returns the fingerprint of a certificate, computed by openssl.
 fn fingerprint(certificate: &Path) -> anyhow::Result<String> {
     let shown = run(Command::new("openssl")
         .args(["x509", "-noout", "-fingerprint", "-sha256", "-in"])
         .arg(certificate))?
-    .succeeded()?;
+    .expect_success()?;
     let digits = shown.stdout.rsplit('=').next().unwrap_or_default();
     let digits = digits.trim().replace(':', "").to_lowercase();
     Ok(format!("SHA256:{digits}"))
 }
 
 pub fn a_certificate_is_remembered_and_no_other_is_taken_for_it() -> Verdict {
-    let setup = world().own("pinned").config(TOKENS);
+    let setup = world().setup("pinned").config(TOKENS);
     let daemon = setup.clone().listen("0.0.0.0:0").start()?;
     let port = port(&daemon)?.to_owned();
     let place = world().directory("user")?;
@@ -266,38 +274,42 @@ pub fn a_certificate_is_remembered_and_no_other_is_taken_for_it() -> Verdict {
     let known = place.path().join("stubs/known_servers");
     let stub = || {
         let toml = format!(
-            "server = \"wss://localhost:{port}\"\nservice = \"none\"\nrobot = \"pinned\"\nlocal = \"none\"\ntoken = \"open sesame\"\nknown_servers = {known:?}\n"
+            "server = \"wss://localhost:{port}\"\nservice = \"none\"\nrobot = \"pinned\"\nlocal = \"none\"\ntoken \
+             = \"open sesame\"\nknown_servers = {known:?}\n"
         );
-        site.stub_with(&toml, "none", "node", &[])
+        site.start_stub_with_config(&toml, "none", "node", &[])
     };
     let asks = ["--server", &server, "services"];
     let first = fingerprint(&daemon.home.join("tls/own.pem"))?;
-    let outcome = types(&asks)?.succeeded()?;
-    for words in ["is new here", &first, "cloudroid/known_servers"] {
+    let outcome = types(&asks)?.expect_success()?;
+    for words in ["first connection to", &first, "cloudroid/known_servers"] {
         ensure!(
             outcome.stderr.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    ensure!(types(&asks)?.succeeded()?.stderr.is_empty(), "known by now");
+    ensure!(
+        types(&asks)?.expect_success()?.stderr.is_empty(),
+        "known by now"
+    );
     let plain = format!("http://localhost:{port}");
     types(&["--server", &plain, "services"])?
-        .failed_saying(&["this port speaks https", &server])?;
-    stub()?.says("404")?;
+        .expect_failure(&["this port requires https", &server])?;
+    stub()?.wait_for_output("404")?;
     ensure!(std::fs::read_to_string(&known)?.contains(&first));
     let address = daemon.address.clone();
-    daemon.ends()?;
-    // Somebody else, or the same with another certificate: nobody can tell but the operator.
+    daemon.stop()?;
+    // Another server, or the same one with a new certificate: only the operator can tell.
     std::fs::remove_file(setup.home().join("tls/own.pem"))?;
     let daemon = setup.listen(&address).start()?;
     let other = fingerprint(&daemon.home.join("tls/own.pem"))?;
     ensure!(first != other);
     let accept = format!("cloudroidctl trust {server} {other}");
-    types(&asks)?.failed_saying(&[&first, &other, &accept])?;
-    stub()?.says(&format!("install.sh --fingerprint {other}"))?;
-    types(&["trust", &server, &other])?.succeeded()?;
-    types(&asks)?.succeeded()?;
+    types(&asks)?.expect_failure(&[&first, &other, &accept])?;
+    stub()?.wait_for_output(&format!("install.sh --fingerprint {other}"))?;
+    types(&["trust", &server, &other])?.expect_success()?;
+    types(&asks)?.expect_success()?;
     Ok(())
 }
 
@@ -321,7 +333,7 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
                 &format!("{name}.pem"),
             ])
             .current_dir(place.path()))?
-        .succeeded()
+        .expect_success()
     };
     makes("shown")?;
     makes("next")?;
@@ -330,7 +342,7 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
         at("shown.pem"),
         at("shown.key")
     );
-    let daemon = world().own("renewed").config(&config).start()?;
+    let daemon = world().setup("renewed").config(&config).start()?;
     let port = port(&daemon)?;
     let healthy = |authority: &str| {
         let url = format!("https://localhost:{port}/healthz");
@@ -347,9 +359,9 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
             .arg(url))
     };
     std::fs::copy(at("shown.pem"), at("first.pem"))?;
-    healthy("first.pem")?.succeeded()?;
+    healthy("first.pem")?.expect_success()?;
     std::fs::write(at("shown.pem"), "no certificate\n")?;
-    let refused = daemon.awaits_event("a word about what is there now", |event| {
+    let refused = daemon.wait_for_event("a word about what is there now", |event| {
         event["kind"] == "certificate-refused"
     })?;
     let message = refused["message"].as_str().unwrap_or_default();
@@ -357,16 +369,16 @@ pub fn a_certificate_is_read_again_when_it_changes() -> Verdict {
     for words in ["shown.pem", "PEM file", &kept] {
         ensure!(message.contains(words), "{words}: {message}");
     }
-    healthy("first.pem")?.succeeded()?;
+    healthy("first.pem")?.expect_success()?;
     for kind in ["key", "pem"] {
         std::fs::rename(at(&format!("next.{kind}")), at(&format!("shown.{kind}")))?;
     }
     let new = fingerprint(&at("shown.pem"))?;
-    daemon.awaits_event("the new one to be shown", |event| {
+    daemon.wait_for_event("the new one to be shown", |event| {
         let message = event["message"].as_str().unwrap_or_default();
         event["kind"] == "certificate-shown" && message.contains(&new)
     })?;
-    healthy("shown.pem")?.succeeded()?;
+    healthy("shown.pem")?.expect_success()?;
     ensure!(
         healthy("first.pem")?.status != 0,
         "the first is still shown"
@@ -388,7 +400,7 @@ ros.terminate()
 pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
     let named = "trusted_proxies = [\"127.0.0.1\"]\n";
     let daemon = world()
-        .own("proxied")
+        .setup("proxied")
         .config(&format!("{TOKENS}{named}"))
         .start()?;
     let asks = |method: &str, path: &str, token: &str, client: &str| {
@@ -400,8 +412,8 @@ pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
         ];
         daemon.request(method, path, &headers)
     };
-    // Each guess makes the next wait longer: however slow this is, one comes too soon.
-    until("who guesses to be slowed", || {
+    // Each wrong attempt doubles the waiting time: however slow this machine is, one comes too early.
+    wait_until("who guesses to be slowed", || {
         let (status, body) = asks("GET", "/api/v1/services", "guess", "192.0.2.1")?;
         ensure!(status == 401 || status == 429, "{status} {body}");
         Ok(match status {
@@ -409,7 +421,7 @@ pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
             _ => Err(body),
         })
     })?;
-    // It cannot pretend to be another, and others are not slowed.
+    // A client cannot pretend to have another address, and others are not slowed down.
     for client in ["192.0.2.2", "192.0.2.1, 192.0.2.3"] {
         let (status, body) = asks("GET", "/api/v1/services", "guess", client)?;
         ensure!(status == 401, "{client}: {status} {body}");
@@ -421,7 +433,7 @@ pub fn clients_of_a_named_proxy_are_told_apart() -> Verdict {
         "192.0.2.4",
     )?;
     ensure!(status == 404, "{status}");
-    daemon.awaits("/api/v1/audit", "the client's address", |records| {
+    daemon.wait_for("/api/v1/audit", "the client's address", |records| {
         let text = records.to_string();
         text.contains("192.0.2.4").then_some(())
     })?;

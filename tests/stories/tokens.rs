@@ -1,4 +1,4 @@
-//! Where tokens are configured nobody does anything without one, on loopback either.
+//! With configured tokens every request needs one, on loopback as well.
 
 use anyhow::{Context, ensure};
 use serde_json::json;
@@ -7,17 +7,17 @@ use support::daemon::Daemon;
 use support::robot::Robot;
 use support::world::{ADDER, world};
 
-/// The portal's own table, so that an address that is added to it is walked, too.
+/// The portal's own table, so that new routes are covered automatically.
 const TABLE: &str = include_str!("../../src/portal/src/routes.rs");
 const METHODS: [&str; 8] = [
     "GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE",
 ];
 
-/// Methods and addresses of the table, with a name in each place for one.
-pub fn routes() -> anyhow::Result<Vec<(String, String)>> {
+/// Returns methods and paths of the table, with parameters filled in.
+pub fn read_routes() -> anyhow::Result<Vec<(String, String)>> {
     let (_, rows) = TABLE.split_once("ROUTES: &[Route]").context("the table")?;
     let mut routes = Vec::new();
-    for row in rows.split("at(").skip(1) {
+    for row in rows.split("route(").skip(1) {
         let mut words = row.split('"').skip(1).step_by(2);
         let (method, path) = (words.next().context("a method")?, words.next());
         let path = path.context("a path")?;
@@ -31,14 +31,15 @@ pub fn routes() -> anyhow::Result<Vec<(String, String)>> {
     Ok(routes)
 }
 
-fn guarded(name: &str) -> anyhow::Result<Daemon> {
+fn start_guarded(name: &str) -> anyhow::Result<Daemon> {
     world()
-        .own(name)
+        .setup(name)
         .config("tokens = [\"open sesame\"]\n")
         .start()
 }
 
-/// `Sec-WebSocket-Key` is left out, so that what is let in by this is refused next, without a wait.
+/// Without `Sec-WebSocket-Key`, so that a request which passes the token check is refused by the next check without
+/// waiting.
 const UPGRADE: [(&str, &str); 3] = [
     ("Upgrade", "websocket"),
     ("Connection", "Upgrade, close"),
@@ -46,8 +47,8 @@ const UPGRADE: [(&str, &str); 3] = [
 ];
 
 pub fn no_route_answers_without_a_token() -> Verdict {
-    let daemon = guarded("walked")?;
-    let routes = routes()?;
+    let daemon = start_guarded("walked")?;
+    let routes = read_routes()?;
     for known in [
         ("POST", "/api/v1/push"),
         ("ANY", "/"),
@@ -77,8 +78,8 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         }
     }
     answered.dedup();
-    // A handshake is let in to show a token: this one is told that it is incomplete, by which nothing is learnt. There is no
-    // default service to connect to.
+    // A handshake without a token is admitted in order to authenticate later: this one is refused as incomplete, which
+    // reveals nothing. There is no default service to connect to.
     let open = [
         ("GET", "/", false, 200),
         ("HEAD", "/", false, 200),
@@ -94,7 +95,7 @@ pub fn no_route_answers_without_a_token() -> Verdict {
         ("HEAD", "/api/v1/oidc/callback", false, 404),
         ("GET", "/assets/x", false, 404),
         ("HEAD", "/assets/x", false, 404),
-        // Who shows a pairing code needs no token, but TLS.
+        // A pairing code needs no token, but TLS.
         ("POST", "/api/v1/pair", false, 400),
         ("GET", "/no_such_service", true, 400),
         ("GET", "/no_such_service/", true, 400),
@@ -113,20 +114,20 @@ pub fn no_route_answers_without_a_token() -> Verdict {
 }
 
 pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Verdict {
-    let daemon = guarded("told")?;
+    let daemon = start_guarded("told")?;
     let server = format!("http://{}", daemon.address);
     let deployer = daemon.deployer();
     deployer
-        .types(&["--server", &server, "services"])?
-        .failed_saying(&["--token", "CLOUDROID_TOKEN"])?;
+        .run(&["--server", &server, "services"])?
+        .expect_failure(&["--token", "CLOUDROID_TOKEN"])?;
     deployer
-        .types(&["--server", &server, "--token", "guess", "services"])?
-        .failed_saying(&["not known", "--token"])?;
+        .run(&["--server", &server, "--token", "guess", "services"])?
+        .expect_failure(&["not known", "--token"])?;
     deployer
-        .types(&["--server", &server, "--token", "open sesame", "services"])?
-        .succeeded()?;
-    // Root of this machine needs none at the socket.
-    deployer.types(&["services"])?.succeeded()?;
+        .run(&["--server", &server, "--token", "open sesame", "services"])?
+        .expect_success()?;
+    // Root of this machine needs none on the socket.
+    deployer.run(&["services"])?.expect_success()?;
     let (status, body) = daemon.get("/api/v1/services")?;
     ensure!(
         status == 401 && body.contains("Authorization: Bearer TOKEN") && body.contains("?token="),
@@ -137,7 +138,7 @@ pub fn whoever_lacks_a_token_is_told_how_to_give_one() -> Verdict {
 }
 
 pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let (status, body) = daemon.request(
         "GET",
         "/api/v1/services",
@@ -151,9 +152,9 @@ pub fn a_proxy_s_clients_are_told_from_this_machine_s() -> Verdict {
 }
 
 pub fn a_page_of_another_site_uses_nobodys_browser() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let evil = [
-        // A page that fetches, and one whose name was made to lead to this machine.
+        // A page that uses fetch, and one whose name was changed to resolve to this machine.
         ("Origin", "http://evil.example"),
         ("Origin", "null"),
         ("Host", "evil.example"),
@@ -175,11 +176,11 @@ pub fn a_page_of_another_site_uses_nobodys_browser() -> Verdict {
 }
 
 pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
-    let daemon = guarded("untold")?;
+    let daemon = start_guarded("untold")?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     for path in ["", "adder_py", "no_such_service"] {
         if let Err(refusal) = Robot::try_connect(&daemon.url(path)) {
             ensure!(refusal.status == 401, "{path:?}: {refusal}");
@@ -187,15 +188,15 @@ pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
         }
     }
     let mut guesser = daemon.robot("no_such_service")?;
-    guesser.says(json!({"op": "auth", "mac": "guess"}))?;
-    let close = guesser.hears_close()?;
+    guesser.send(json!({"op": "auth", "mac": "guess"}))?;
+    let close = guesser.wait_for_close()?;
     ensure!(
         u16::from(close.code) == 1008 && !close.reason.contains("service"),
         "{close:?}"
     );
     let mut known = daemon.robot("no_such_service")?;
-    known.says(json!({"op": "auth", "mac": "open sesame"}))?;
-    let close = known.hears_close()?;
+    known.send(json!({"op": "auth", "mac": "open sesame"}))?;
+    let close = known.wait_for_close()?;
     ensure!(close.reason.contains("no_such_service"), "{close:?}");
     let Err(refusal) = Robot::try_connect(&daemon.url("no_such_service?token=open%20sesame"))
     else {
@@ -205,22 +206,22 @@ pub fn services_are_told_to_those_who_have_shown_a_token() -> Verdict {
         refusal.status == 404 && refusal.body.contains("adder_py"),
         "{refusal}"
     );
-    // And the auth message of rosbridge opens what there is.
+    // The auth message of rosbridge gives access.
     let mut robot = daemon.robot("adder_py")?;
-    robot.says(json!({"op": "auth", "mac": "open sesame"}))?;
-    ensure!(robot.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    robot.send(json!({"op": "auth", "mac": "open sesame"}))?;
+    ensure!(robot.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     Ok(())
 }
 
 pub fn a_resume_token_is_no_way_into_another_s_servant() -> Verdict {
     let daemon = world()
-        .own("resumers")
+        .setup("resumers")
         .config("tokens = [\"open sesame\", \"rosebuds\"]\n[servant]\nanonymous_grace = \"60s\"\n")
         .start()?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let asks = |token: &str| daemon.robot(&format!("adder_py?resume=mine&token={token}"));
     let count = || Ok::<_, anyhow::Error>(daemon.servants_of("adder_py")?.len());
     let first = asks("open%20sesame")?;

@@ -1,4 +1,5 @@
-//! Before a robot is touched, and while it works: what a package makes of a recording, and why a robot is slow.
+//! Trials before a robot is involved, and diagnosis while it works: the output of a package for a recording, and why a
+//! robot is slow.
 
 use std::process::Command;
 
@@ -6,17 +7,17 @@ use anyhow::{Context, ensure};
 use support::Verdict;
 use support::binaries;
 use support::daemon::Daemon;
-use support::deployer::{Outcome, path_str, run};
+use support::deployer::{CommandOutcome, path_str, run};
 use support::machine::Machine;
 use support::site::{Site, string};
 use support::world::{TELLER, world};
 
-/// Of Debian's opencv-doc.
+/// Video of Debian's opencv-doc.
 const PEDESTRIANS: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
-/// Trials leave no service behind.
-fn nothing_is_left(daemon: &Daemon) -> Verdict {
-    let services = daemon.deployer().asks(&["services"])?;
+/// Checks that trials leave no service behind.
+fn expect_nothing_left(daemon: &Daemon) -> Verdict {
+    let services = daemon.deployer().run_json(&["services"])?;
     ensure!(
         services.as_array().is_some_and(Vec::is_empty),
         "{services:#}"
@@ -24,29 +25,29 @@ fn nothing_is_left(daemon: &Daemon) -> Verdict {
     Ok(())
 }
 
-fn suggests(daemon: &Daemon, outcome: &Outcome) -> Verdict {
-    for words in ["requests answered", "to begin with: desire = ", ", max = "] {
+fn expect_suggestions(daemon: &Daemon, outcome: &CommandOutcome) -> Verdict {
+    for words in ["requests answered", "initial values: desire = ", ", max = "] {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    nothing_is_left(daemon)
+    expect_nothing_left(daemon)
 }
 
 pub fn a_packaged_node_is_tried_on_a_picture() -> Verdict {
-    let daemon = world().own("tried-picture").start()?;
+    let daemon = world().setup("tried-picture").start()?;
     let place = world().directory("picture")?;
     let picture = place.path().join("people.png");
     run(Command::new("ffmpeg")
         .args(["-loglevel", "error", "-ss", "2", "-i", PEDESTRIANS])
         .args(["-frames:v", "1", "-s", "640x480"])
         .arg(&picture))?
-    .succeeded()?;
+    .expect_success()?;
     let outcome = daemon
         .deployer()
-        .types(&[
+        .run(&[
             "try",
             "--apt",
             "opencv_apps",
@@ -57,7 +58,7 @@ pub fn a_packaged_node_is_tried_on_a_picture() -> Verdict {
             "--image",
             path_str(&picture),
         ])?
-        .succeeded()?;
+        .expect_success()?;
     for words in [
         "/people_detect/found",
         "of 20 requests answered",
@@ -66,14 +67,14 @@ pub fn a_packaged_node_is_tried_on_a_picture() -> Verdict {
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    suggests(&daemon, &outcome)
+    expect_suggestions(&daemon, &outcome)
 }
 
 pub fn a_source_package_is_tried_on_a_recording() -> Verdict {
-    let daemon = world().own("tried-bag").start()?;
+    let daemon = world().setup("tried-bag").start()?;
     let machine = Machine::new()?;
     let recorded = r#"
 import rosbag
@@ -86,11 +87,11 @@ with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
     bag.write("/chatter", String("word"))
 "#;
     machine
-        .runs("sh", &format!("python3 - << 'END'\n{recorded}END"))?
-        .succeeded()?;
+        .run_script("sh", &format!("python3 - << 'END'\n{recorded}END"))?
+        .expect_success()?;
     let package = binaries::package("teller_py");
     let tried = |bag: &str| {
-        let bag = machine.written(bag);
+        let bag = machine.host_path(bag);
         let words = [
             "try",
             path_str(&package),
@@ -99,13 +100,13 @@ with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
             "--bag",
             path_str(&bag),
         ];
-        daemon.deployer().types(&words)
+        daemon.deployer().run(&words)
     };
-    let outcome = tried("/root/talk.bag")?.succeeded()?;
+    let outcome = tried("/root/talk.bag")?.expect_success()?;
     for words in [
         "/teller/say",
         "12 sent",
-        // The first goes unheard where rospy's publisher has not yet taken up the connection that it agreed to.
+        // The first message is lost if rospy's publisher has not yet accepted the connection that it agreed to.
         "word 11",
         "11 of 11 requests answered",
         "not used of",
@@ -114,35 +115,35 @@ with rosbag.Bag("/root/packed.bag", "w", compression="bz2") as bag:
         ensure!(
             outcome.stdout.contains(words),
             "{words}: {}",
-            outcome.said()
+            outcome.output()
         );
     }
-    suggests(&daemon, &outcome)?;
-    tried("/root/packed.bag")?.failed_saying(&["compressed (bz2)", "rosbag decompress"])?;
-    tried("/root/nowhere.bag")?.failed_saying(&["cannot read", "nowhere.bag"])?;
-    nothing_is_left(&daemon)
+    expect_suggestions(&daemon, &outcome)?;
+    tried("/root/packed.bag")?.expect_failure(&["compressed (bz2)", "rosbag decompress"])?;
+    tried("/root/nowhere.bag")?.expect_failure(&["cannot read", "nowhere.bag"])?;
+    expect_nothing_left(&daemon)
 }
 
 pub fn a_robot_is_explained() -> Verdict {
-    let daemon = world().with(TELLER)?;
+    let daemon = world().daemon_with(TELLER)?;
     let site = Site::new()?;
     let app = site.node("/app")?;
     let robot = "explained";
-    let explained = || daemon.deployer().types(&["explain", robot]);
-    explained()?.failed_saying(&["robot \"explained\" is not served"])?;
+    let explained = || daemon.deployer().run(&["explain", robot]);
+    explained()?.expect_failure(&["unknown robot \"explained\""])?;
     let of = ("teller_py", "teller_py", "teller.py");
-    let stub = site.stub(&daemon, of, robot, &[])?;
-    let mut said = site.hears(&app, "/teller/said")?;
-    let say = site.says(&app, "/elsewhere", false)?;
-    site.until(&app, "the node", |graph| {
+    let stub = site.start_stub(&daemon, of, robot, &[])?;
+    let mut said = site.subscribe(&app, "/teller/said")?;
+    let say = site.advertise_strings(&app, "/elsewhere", false)?;
+    site.wait_for_graph(&app, "the node", |graph| {
         graph.topics.contains_key("/teller/say")
     })
-    .with_context(|| stub.said())?;
-    // A remap that does not match: nobody publishes what the node listens to.
-    let screen = explained()?.succeeded()?.stdout;
+    .with_context(|| stub.output())?;
+    // A wrong remapping: nobody publishes the node's input.
+    let screen = explained()?.expect_success()?.stdout;
     for words in [
-        "BLOCKS  /teller listens to /teller/say, which nobody on the robot publishes",
-        "remap it to the topic that is meant: /teller/say:=/THE/TOPIC",
+        "BLOCKS  /teller subscribes to /teller/say, which no node on the robot publishes",
+        "remap it to the intended topic: /teller/say:=/THE/TOPIC",
         "of teller_py (revision 1): ready, 1 connections",
         "/teller: link up, round trip ",
     ] {
@@ -153,20 +154,23 @@ pub fn a_robot_is_explained() -> Verdict {
         "more than one screen: {screen}"
     );
     drop((say, stub));
-    site.fed(&said, 0)?;
-    // Remapped, it is fed.
-    let stub = site.stub(&daemon, of, robot, &["~say:=/elsewhere"])?;
-    let say = site.says(&app, "/elsewhere", false)?;
-    site.connected(&*say, 1).with_context(|| stub.said())?;
-    // An answer from before that is not heard, as it is not where the node itself runs.
-    site.fed(&said, 1).with_context(|| stub.said())?;
+    site.wait_for_publishers(&said, 0)?;
+    // With the right remapping it gets its input.
+    let stub = site.start_stub(&daemon, of, robot, &["~say:=/elsewhere"])?;
+    let say = site.advertise_strings(&app, "/elsewhere", false)?;
+    site.wait_for_subscribers(&*say, 1)
+        .with_context(|| stub.output())?;
+    // Earlier answers are lost, as they are where the node itself runs.
+    site.wait_for_publishers(&said, 1)
+        .with_context(|| stub.output())?;
     say.publish(string("hello"));
-    site.next(&mut said).with_context(|| stub.said())?;
-    let screen = explained()?.succeeded()?.stdout;
+    site.next_message(&mut said)
+        .with_context(|| stub.output())?;
+    let screen = explained()?.expect_success()?.stdout;
     ensure!(!screen.contains("listens to /elsewhere"), "{screen}");
-    // Gone, it says where to look.
+    // After its end the output says where to look.
     drop(stub);
-    let screen = explained()?.succeeded()?.stdout;
+    let screen = explained()?.expect_success()?.stdout;
     ensure!(screen.contains("cloudroid-stub doctor"), "{screen}");
     Ok(())
 }

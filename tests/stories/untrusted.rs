@@ -1,4 +1,4 @@
-//! Connections that stall, pretend or take their time, and those that must not suffer from them.
+//! Connections that stall, deceive or are slow, and their effect on others.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -14,10 +14,10 @@ use tokio_tungstenite::tungstenite::Message;
 
 pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
     let daemon = world()
-        .own("dribbled")
+        .setup("dribbled")
         .config("[portal]\nhandshake = \"1s\"\n")
         .start()?;
-    // Some say nothing, some begin a request and send another byte of it from time to time.
+    // Some send nothing, some start a request and send another byte of it from time to time.
     let mut dribblers: Vec<TcpStream> = (0..200)
         .map(|_| TcpStream::connect(&daemon.address))
         .collect::<Result<_, _>>()?;
@@ -29,7 +29,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
         daemon.get("/healthz")?.0 == 200,
         "others are answered meanwhile"
     );
-    // All are let go, and not before they were told why where there was something to answer.
+    // All are disconnected, after an error response if they had started a request.
     for (index, mut dribbler) in dribblers.into_iter().enumerate() {
         dribbler.set_nonblocking(true)?;
         let begun = index % 2 == 0;
@@ -37,7 +37,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
         let deadline = Deadline::begin();
         loop {
             deadline.check(|| format!("connection {index} is still open"))?;
-            // One byte more keeps nobody in: the time is for the whole header.
+            // Further bytes do not extend the time limit, which applies to the whole header.
             if begun {
                 let _ = dribbler.write(b"x");
             }
@@ -48,7 +48,7 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
                 Err(error) if error.kind() == std::io::ErrorKind::WouldBlock => {
                     std::thread::sleep(std::time::Duration::from_millis(10));
                 }
-                // What was written after the end was refused by the kernel.
+                // The kernel has refused data written after the end.
                 Err(_) => break,
             }
         }
@@ -58,8 +58,8 @@ pub fn who_dribbles_an_upgrade_is_let_go() -> Verdict {
 }
 
 pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
-    let daemon = world().own("crowded").start()?;
-    // As many descriptors as may be, whatever the shell gave.
+    let daemon = world().setup("crowded").start()?;
+    // As many descriptors as permitted, whatever the shell's limit.
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", daemon.pid()))?;
     let line = limits
         .lines()
@@ -91,12 +91,12 @@ pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
         "{dropped} dropped, {kept} kept"
     );
     drop(silent);
-    // A header is read again with each part of it that comes.
+    // A header is parsed again with each further part.
     for (length, status) in [(60_000, "HTTP/1.1 200"), (70_000, "HTTP/1.1 431")] {
         let mut connection = connect(&daemon.address)?;
         connection
             .write_all(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nX: ")?;
-        // Who is refused before the end is read no further.
+        // After the refusal the rest is not read.
         let _ = connection.write_all(&vec![b'x'; length]);
         let _ = connection.write_all(b"\r\n\r\n");
         let mut answer = String::new();
@@ -107,16 +107,16 @@ pub fn connections_that_say_nothing_keep_nobody_out() -> Verdict {
 }
 
 pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
-    let daemon = world().with(ADDER)?;
+    let daemon = world().daemon_with(ADDER)?;
     let mut connection = connect(&daemon.address)?;
     connection.write_all(&[
         0x16, 3, 1, 2, 0, 1, 0, 1, 0xfc, 3, 3, b'\r', b'\n', b'\r', b'\n',
     ])?;
     let mut answer = String::new();
-    // A reset behind the answer takes nothing from it.
+    // A reset after the response does not affect it.
     let _ = connection.read_to_string(&mut answer);
     ensure!(answer.starts_with("HTTP/1.1 400"), "{answer:?}");
-    // A handshake of another version is refused by what is wrong with it.
+    // A handshake with an unsupported version is refused with that reason.
     let (status, body) = daemon.request(
         "GET",
         "/adder_py",
@@ -134,44 +134,44 @@ pub fn rubbish_instead_of_an_upgrade_is_refused() -> Verdict {
 }
 
 pub fn two_sockets_of_one_robot_share_its_servant() -> Verdict {
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let mut stub = daemon.robot("greeter_cpp?robot=shared")?;
     let mut viewer = daemon.robot("greeter_cpp?robot=shared")?;
     for socket in [&mut stub, &mut viewer] {
-        socket.calls("/rosapi/get_time", json!({}))?;
+        socket.call("/rosapi/get_time", json!({}))?;
     }
     let servants = daemon.servants_of("greeter_cpp")?;
     let of_both = servants
         .iter()
         .filter(|servant| servant["robot"] == "shared");
     ensure!(of_both.count() == 1, "{servants:?}");
-    // What one leaves behind when it goes is its own; the other's stays.
-    viewer.says(
+    // Registrations of one connection are removed when it ends; those of the other remain.
+    viewer.send(
         json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}),
     )?;
-    stub.says(
+    stub.send(
         json!({"op": "subscribe", "topic": "/greeter/greeting", "type": "greeter_cpp/Greeting"}),
     )?;
-    stub.leaves()?;
-    viewer.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
-    viewer.awaits_subscriber("/greeter/name")?;
-    viewer.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Eve"}}))?;
-    ensure!(viewer.hears_on("/greeter/greeting")?["text"] == "hi Eve");
+    stub.leave()?;
+    viewer.send(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    viewer.wait_for_subscriber("/greeter/name")?;
+    viewer.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "Eve"}}))?;
+    ensure!(viewer.next_message_on("/greeter/greeting")?["text"] == "hi Eve");
     Ok(())
 }
 
 pub fn nobody_takes_over_anothers_robot() -> Verdict {
     let daemon = world()
-        .own("owned")
+        .setup("owned")
         .config("tokens = [\"open sesame\", \"rosebuds\"]\n")
         .start()?;
     daemon
         .deployer()
-        .pushes("adder_py", &["--node", "adder.py"])?
-        .succeeded()?;
+        .push("adder_py", &["--node", "adder.py"])?
+        .expect_success()?;
     let asks = |token: &str| Robot::try_connect(&daemon.url(&format!("adder_py?robot=r1{token}")));
     let mut owner = asks("&token=open%20sesame").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
-    ensure!(owner.calls("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
+    ensure!(owner.call("/add_two", json!({"a": 1, "b": 2}))?["values"]["sum"] == 3);
     for token in ["&token=rosebuds", "&token=guess"] {
         let Err(refusal) = asks(token) else {
             anyhow::bail!("{token:?} took over r1")
@@ -185,13 +185,13 @@ pub fn nobody_takes_over_anothers_robot() -> Verdict {
             ensure!(refusal.body.contains("r1"), "{token:?}: {refusal}");
         }
     }
-    // Who shows the other token later gets no further.
+    // Showing the other token later does not help either.
     let mut silent = asks("").map_err(|refusal| anyhow::anyhow!("{refusal}"))?;
-    silent.says(json!({"op": "auth", "mac": "rosebuds"}))?;
-    let close = silent.hears_close()?;
+    silent.send(json!({"op": "auth", "mac": "rosebuds"}))?;
+    let close = silent.wait_for_close()?;
     ensure!(close.reason.contains("r1"), "{close:?}");
-    // Not after the owner has gone, either.
-    owner.leaves()?;
+    // Not even after the owner has left.
+    owner.leave()?;
     ensure!(
         asks("&token=rosebuds").is_err(),
         "the name stays its owner's"
@@ -200,24 +200,24 @@ pub fn nobody_takes_over_anothers_robot() -> Verdict {
     Ok(())
 }
 
-/// A client on a slow line has pictures waiting; what it asks is answered behind one of them, not behind all.
+/// A client on a slow connection has images queued; answers to its calls are sent after one of them, not after all.
 pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     const SIZE: usize = 900_000;
-    let daemon = world().with(GREETER)?;
+    let daemon = world().daemon_with(GREETER)?;
     let mut speaker = daemon.robot("greeter_cpp?robot=backlog")?;
-    let mut slow = Robot::on_a_short_line(&daemon.url("greeter_cpp?robot=backlog"), &[])?;
+    let mut slow = Robot::connect_with_small_buffer(&daemon.url("greeter_cpp?robot=backlog"), &[])?;
     let topic = json!({"op": "subscribe", "topic": "/big", "type": "std_msgs/String", "compression": "cbor-raw"});
-    slow.says(topic)?;
-    slow.calls("/rosapi/get_time", json!({}))?;
-    speaker.says(json!({"op": "advertise", "topic": "/big", "type": "std_msgs/String"}))?;
+    slow.send(topic)?;
+    slow.call("/rosapi/get_time", json!({}))?;
+    speaker.send(json!({"op": "advertise", "topic": "/big", "type": "std_msgs/String"}))?;
     let text = "x".repeat(SIZE);
     for _ in 0..8 {
-        speaker.says(json!({"op": "publish", "topic": "/big", "msg": {"data": text}}))?;
+        speaker.send(json!({"op": "publish", "topic": "/big", "msg": {"data": text}}))?;
     }
-    // All of it has been taken up before the question comes.
-    speaker.calls("/rosapi/get_time", json!({}))?;
-    slow.says(json!({"op": "call_service", "id": "urgent", "service": "/rosapi/get_ros_version"}))?;
-    // Its answer waits in the queue when three answers have been put there.
+    // All messages have been queued before the call.
+    speaker.call("/rosapi/get_time", json!({}))?;
+    slow.send(json!({"op": "call_service", "id": "urgent", "service": "/rosapi/get_ros_version"}))?;
+    // Its answer is in the queue once three answers have been queued.
     let answered = || -> anyhow::Result<u64> {
         let metrics = daemon.get("/metrics")?.1;
         let counts = metrics.lines().filter(|line| {
@@ -227,7 +227,7 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
             .map(|line| Ok(line.rsplit(' ').next().context("a value")?.parse::<u64>()?))
             .sum()
     };
-    support::until("three answers in the queue", || {
+    support::wait_until("three answers in the queue", || {
         let count = answered()?;
         Ok(if count < 3 {
             Err(count.to_string())
@@ -237,7 +237,7 @@ pub fn an_answer_waits_for_one_big_message_at_most() -> Verdict {
     })?;
     let mut ahead = 0;
     loop {
-        match slow.frame()? {
+        match slow.next_frame()? {
             Message::Binary(bytes) if bytes.len() > SIZE => ahead += 1,
             Message::Text(text) if text.contains("urgent") => break,
             other => anyhow::bail!("{other:?}"),

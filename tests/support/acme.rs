@@ -1,4 +1,4 @@
-//! An authority that is asked by ACME (RFC 8555): Pebble, which Let's Encrypt tests clients with, and a DNS in which every name leads to
+//! An ACME server (RFC 8555): Pebble, with which Let's Encrypt tests clients, and a DNS in which every name resolves to
 //! this machine.
 
 use std::net::TcpStream;
@@ -12,48 +12,49 @@ use crate::machine::free_port;
 use crate::tls::make_certificates;
 use crate::world::{self, world};
 
-/// Where the authority is asked, whoever runs there.
-pub struct Directory {
+/// Address and certificates of an ACME server, whether or not it is running.
+pub struct AcmeDirectory {
     place: world::Directory,
     port: u16,
     management: u16,
 }
 
-/// The authority at work. Each has a key of its own, and knows no account of another.
-pub struct Authority {
+/// A running ACME server. Each has a key of its own, and does not know the accounts of another.
+pub struct PebbleServer {
     directory: u16,
     place: std::path::PathBuf,
     running: Vec<Child>,
 }
 
-impl Directory {
-    /// A place for one, where nobody answers yet.
-    pub fn new() -> anyhow::Result<Directory> {
+impl AcmeDirectory {
+    /// Creates an address at which no server runs yet.
+    pub fn new() -> anyhow::Result<AcmeDirectory> {
         let place = world().directory("acme")?;
         make_certificates(place.path())?;
-        Ok(Directory {
+        Ok(AcmeDirectory {
             place,
             port: free_port()?,
             management: free_port()?,
         })
     }
 
-    /// Its address.
+    /// Returns the URL of the ACME directory.
     pub fn url(&self) -> String {
         format!("https://localhost:{}/dir", self.port)
     }
 
-    /// `[tls.acme]` of a daemon that asks it for a certificate of `name`.
+    /// Returns the `[tls.acme]` section of a daemon that requests a certificate for `name`.
     pub fn section(&self, name: &str) -> String {
         format!(
-            "[tls.acme]\nnames = [{name:?}]\naccept_terms = true\ndirectory = {:?}\nauthorities = {:?}\nretry = \"1s\"\n",
+            "[tls.acme]\nnames = [{name:?}]\naccept_terms = true\ndirectory = {:?}\nauthorities = {:?}\nretry \
+             = \"1s\"\n",
             self.url(),
             self.place.path().join("ca.pem")
         )
     }
 
-    /// Starts one whose certificates are good for `seconds`, and which looks at `looked_at` whether a name leads here.
-    pub fn opens(&self, looked_at: u16, seconds: u64) -> anyhow::Result<Authority> {
+    /// Starts a server that issues certificates valid for `seconds`, and validates names at port `looked_at`.
+    pub fn start(&self, looked_at: u16, seconds: u64) -> anyhow::Result<PebbleServer> {
         let place = self.place.path();
         let config = json!({"pebble": {
             "listenAddress": format!("127.0.0.1:{}", self.port),
@@ -81,7 +82,7 @@ impl Directory {
                 .spawn();
             child.context("cannot start Pebble; the Debian package is pebble")
         };
-        let mut authority = Authority {
+        let mut authority = PebbleServer {
             directory: self.port,
             place: place.to_owned(),
             running: Vec::new(),
@@ -99,22 +100,22 @@ impl Directory {
                 .arg(&file)
                 .args(["-strict", "-dnsserver", &format!("127.0.0.1:{names}")]),
         )?);
-        authority.is_reached()?;
+        authority.wait_until_ready()?;
         let root = run(Command::new("curl")
             .args(["--silent", "--show-error", "--fail", "--cacert"])
             .arg(place.join("ca.pem"))
             .arg("--output")
             .arg(place.join("root.pem"))
             .arg(format!("https://localhost:{}/roots/0", self.management)))?;
-        root.succeeded()?;
+        root.expect_success()?;
         Ok(authority)
     }
 }
 
-impl Authority {
+impl PebbleServer {
     /// Waits until it listens.
-    fn is_reached(&mut self) -> anyhow::Result<()> {
-        crate::until("Pebble that listens", || {
+    fn wait_until_ready(&mut self) -> anyhow::Result<()> {
+        crate::wait_until("Pebble that listens", || {
             let reached = TcpStream::connect(("127.0.0.1", self.directory));
             for child in &mut self.running {
                 if let Some(status) = child.try_wait()? {
@@ -126,13 +127,13 @@ impl Authority {
         })
     }
 
-    /// The certificate by which those are known that it has signed.
+    /// Returns the root certificate of the issued certificates.
     pub fn root(&self) -> std::path::PathBuf {
         self.place.join("root.pem")
     }
 }
 
-impl Drop for Authority {
+impl Drop for PebbleServer {
     fn drop(&mut self) {
         for child in &mut self.running {
             let _ = child.kill();

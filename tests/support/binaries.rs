@@ -1,9 +1,9 @@
-//! Where the programs under test are: beside this test binary, as cargo and make built them, or where
-//! `CLOUDROID_BIN` says.
+//! Locations of the programs under test: next to this test executable, where cargo and make build them, or in
+//! `CLOUDROID_BIN`.
 
 use std::path::PathBuf;
 
-/// `name` in the directory that cargo builds into.
+/// Returns the path of the program `name`.
 pub fn path(name: &str) -> PathBuf {
     if let Some(installed) = std::env::var_os("CLOUDROID_BIN") {
         return PathBuf::from(installed).join(name);
@@ -22,7 +22,7 @@ pub fn path(name: &str) -> PathBuf {
     path
 }
 
-/// The checkout that these stories stand in.
+/// Returns the checkout of these stories.
 pub fn checkout() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
         .parent()
@@ -30,47 +30,47 @@ pub fn checkout() -> PathBuf {
         .to_owned()
 }
 
-/// A package below `tests/packages`.
+/// Returns a package below `tests/packages`.
 pub fn package(name: &str) -> PathBuf {
     checkout().join("tests/packages").join(name)
 }
 
-/// The Python that has roslibpy (see scripts/python).
+/// Returns the Python that has roslibpy (see scripts/python).
 pub fn python() -> PathBuf {
     std::env::var_os("CLOUDROID_PYTHON")
         .map(PathBuf::from)
         .expect("CLOUDROID_PYTHON names the Python environment; run the stories by make stories")
 }
 
-/// The environment with rclpy (see scripts/ros2-wheels).
+/// Returns the environment with rclpy (see scripts/ros2-wheels).
 pub fn ros2() -> PathBuf {
     std::env::var_os("CLOUDROID_ROS2_PREFIX")
         .map(PathBuf::from)
         .expect("CLOUDROID_ROS2_PREFIX names the environment with ROS 2; run the stories by make stories")
 }
 
-/// The programs of Python packages that read what the daemon answers by HTTP (see scripts/python).
+/// Returns the directory of Python programs that parse the daemon's HTTP responses (see scripts/python).
 pub fn readers() -> PathBuf {
     std::env::var_os("CLOUDROID_READERS")
         .map(PathBuf::from)
         .expect("CLOUDROID_READERS names programs that read HTTP; run the stories by make stories")
 }
 
-/// Where roslib and oidc-provider are (see scripts/node).
+/// Returns the directory of roslib and oidc-provider (see scripts/node).
 pub fn node_modules() -> PathBuf {
     std::env::var_os("CLOUDROID_NODE_MODULES")
         .map(PathBuf::from)
         .expect("CLOUDROID_NODE_MODULES names Node's packages; run the stories by make stories")
 }
 
-/// Where what drives a browser is (see scripts/node).
+/// Returns the directory of the browser automation (see scripts/node).
 pub fn web_modules() -> PathBuf {
     std::env::var_os("CLOUDROID_WEB_MODULES")
         .map(PathBuf::from)
         .expect("CLOUDROID_WEB_MODULES names Node's packages; run the stories by make stories or make test-web")
 }
 
-/// Where what is made once for all checkouts is kept.
+/// Returns the cache directory shared by all checkouts.
 pub fn cache() -> PathBuf {
     let caches = std::env::var_os("XDG_CACHE_HOME").map(PathBuf::from);
     let home = || PathBuf::from(std::env::var_os("HOME").unwrap_or_else(|| "/root".into()));
@@ -79,7 +79,8 @@ pub fn cache() -> PathBuf {
         .join("cloudroid")
 }
 
-/// Where what is found out in this checkout is kept: its `target`, or, for runs that are themselves tested, where `CLOUDROID_TARGET` says.
+/// Returns the directory for results of this checkout: its `target`, or `CLOUDROID_TARGET` for runs that are themselves
+/// under test.
 pub fn target() -> PathBuf {
     std::env::var_os("CLOUDROID_TARGET").map_or_else(|| checkout().join("target"), PathBuf::from)
 }

@@ -1,20 +1,20 @@
-//! The hostile package: what it is asked to try, and what came of it.
+//! The hostile package: what it can attempt, and the results.
 
 use anyhow::ensure;
 use serde_json::json;
 
 use crate::robot::Robot;
 
-/// What came of an attempt.
+/// Result of an attempt.
 #[derive(Debug, Clone)]
-pub struct Attempt {
-    /// The kernel let it happen.
+pub struct BurglarAttempt {
+    /// True if the kernel allowed it.
     pub succeeded: bool,
-    /// In the burglar's words.
+    /// Report of the package.
     pub report: String,
 }
 
-/// Attempts that are tried on something: what, and whatever they reached is told by their story.
+/// Attempts that need an argument; the stories that use them check the result.
 pub const WITH_ARGUMENT: [&str; 8] = [
     "abstract-socket",
     "connect",
@@ -26,14 +26,14 @@ pub const WITH_ARGUMENT: [&str; 8] = [
     "text-in-file",
 ];
 
-/// Tries everything that needs no argument, and gives what succeeded.
-pub fn breaks_out(robot: &mut Robot) -> anyhow::Result<Vec<String>> {
-    let names = tries(robot, "", "")?.report;
+/// Makes all attempts that need no argument; returns those that succeeded.
+pub fn try_all(robot: &mut Robot) -> anyhow::Result<Vec<String>> {
+    let names = try_attempt(robot, "", "")?.report;
     let names: Vec<&str> = names.lines().collect();
     ensure!(names.len() > 60, "the burglar knows only {names:?}");
     let mut broken = Vec::new();
     for name in names.iter().filter(|name| !WITH_ARGUMENT.contains(name)) {
-        let attempt = tries(robot, name, "")?;
+        let attempt = try_attempt(robot, name, "")?;
         if attempt.succeeded {
             broken.push(format!("{name}: {}", attempt.report));
         }
@@ -41,12 +41,16 @@ pub fn breaks_out(robot: &mut Robot) -> anyhow::Result<Vec<String>> {
     Ok(broken)
 }
 
-/// Asks the burglar to try something; with no name, for the list of what there is.
-pub fn tries(robot: &mut Robot, what: &str, argument: &str) -> anyhow::Result<Attempt> {
-    let answer = robot.calls("/burglar/try", json!({"what": what, "argument": argument}))?;
+/// Asks the package to make an attempt; with an empty name, for the list of attempts.
+pub fn try_attempt(
+    robot: &mut Robot,
+    what: &str,
+    argument: &str,
+) -> anyhow::Result<BurglarAttempt> {
+    let answer = robot.call("/burglar/try", json!({"what": what, "argument": argument}))?;
     ensure!(answer["result"] == true, "{what} {argument}: {answer}");
     let values = &answer["values"];
-    Ok(Attempt {
+    Ok(BurglarAttempt {
         succeeded: values["succeeded"] == true,
         report: values["report"].as_str().unwrap_or_default().to_owned(),
     })

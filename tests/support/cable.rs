@@ -1,11 +1,11 @@
-//! A network between a robot and a server that can be made bad: a network namespace for one of them, joined to this
-//! machine's own, where the other is.
+//! A network between a robot and a server that can be degraded: one of them is in a network namespace, which is
+//! connected to this machine's own network, where the other one is.
 //!
 //! ```text
-//!  robot ── its end ══ degraded, both ways ══ the server's end ── passed on ──▶ portal
+//!  robot ── its end ══ degraded, both ways ══ the server's end ── forwarded ──▶ portal
 //! ```
-//! Kernels with netem degrade it by themselves (a veth pair, `tc qdisc … netem`). Where netem was left out, both ends
-//! are TUN devices, and [`shaper`](crate::shaper) treats packets by the same rules between them.
+//! On kernels with netem the kernel degrades it (a veth pair, `tc qdisc … netem`). Without netem both ends are TUN
+//! devices, and [`shaper`](crate::shaper) applies the same rules to the packets between them.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -22,26 +22,26 @@ use nix::sched::CloneFlags;
 use crate::patience::scale;
 use crate::shaper::Shaper;
 
-/// Names and addresses of this process's cables.
+/// Number of the next cable of this process, for its name and addresses.
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
-/// How bad a network is, in each direction.
+/// Impairment of a network, in each direction.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Badness {
-    /// What it carries, kbit/s.
+pub struct NetworkImpairment {
+    /// Rate in kbit/s.
     pub rate: u32,
-    /// How long a packet is on the way, milliseconds.
+    /// Delay of a packet in milliseconds.
     pub delay: u32,
-    /// By how much that differs from packet to packet at most, milliseconds, evenly distributed; their order is kept.
+    /// Maximum deviation of the delay in milliseconds, evenly distributed; the order of packets is preserved.
     pub jitter: u32,
-    /// Share of packets that are lost.
+    /// Fraction of packets that are lost.
     pub loss: f64,
-    /// Packets that wait before others are dropped.
+    /// Maximum number of queued packets; further ones are dropped.
     pub limit: u32,
 }
 
-impl Badness {
-    /// A link that is slow, and nothing else: 20 Mbit/s.
+impl NetworkImpairment {
+    /// A slow network without other impairments: 20 Mbit/s.
     pub const SLOW: Self = Self {
         rate: 20_000,
         delay: 5,
@@ -50,8 +50,8 @@ impl Badness {
         limit: 10_000,
     };
 
-    /// As netem is told.
-    fn netem(self) -> Vec<String> {
+    /// Returns the arguments of netem.
+    fn netem_arguments(self) -> Vec<String> {
         [
             "netem".to_owned(),
             "limit".to_owned(),
@@ -68,37 +68,38 @@ impl Badness {
     }
 }
 
-/// It is taken down when dropped; connections over it end then.
+/// The network; removed on drop, which ends its connections.
 pub struct Cable {
-    /// Where the robot reaches the portal.
+    /// Address of the portal for the robot.
     pub server: SocketAddr,
     name: String,
-    /// In this machine's own network, and in the namespace.
+    /// Names of the devices in this machine's own network and in the namespace.
     ends: [String; 2],
-    /// The robot is in the namespace; else the server.
+    /// True if the robot is in the namespace, rather than the server.
     robot_inside: bool,
-    /// None where the kernel has netem.
+    /// `None` if the kernel has netem.
     shaper: Option<Shaper>,
     over: Arc<AtomicBool>,
 }
 
 impl Cable {
-    /// Joins both, the server in the namespace, and passes connections on to `portal`.
+    /// Creates a network with the server in the namespace, and forwards connections to `portal`.
     pub fn new(portal: &str) -> anyhow::Result<Self> {
-        Self::between(portal, false)
+        Self::create(portal, false)
     }
 
-    /// The same with the robot in the namespace ([`Cable::namespace`]), where there is nothing else but a loopback.
+    /// Creates a network with the robot in the namespace ([`Cable::namespace`]), which has no other device but the
+    /// loopback.
     pub fn with_robot_inside(portal: &str) -> anyhow::Result<Self> {
-        Self::between(portal, true)
+        Self::create(portal, true)
     }
 
-    fn between(portal: &str, robot_inside: bool) -> anyhow::Result<Self> {
+    fn create(portal: &str, robot_inside: bool) -> anyhow::Result<Self> {
         let id = std::process::id();
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = format!("cloudroid-cable-{id}-{number}");
         let ends = [format!("cr{id}-{number}"), format!("cs{id}-{number}")];
-        // Of the range for tests between networks (RFC 2544), four addresses each.
+        // From the range for benchmarks of networks (RFC 2544), four addresses each.
         let subnet = (id.wrapping_mul(8).wrapping_add(number) % (1 << 15)) * 4;
         let address = |host: u32| {
             let low = subnet + host;
@@ -118,27 +119,27 @@ impl Cable {
             shaper: None,
             over: Arc::default(),
         };
-        cable.lay()?;
+        cable.create_devices()?;
         let [ours, theirs] = &cable.ends;
         ip(&["addr", "add", &format!("{}/30", address(1)), "dev", ours])?;
         ip(&["link", "set", ours, "up"])?;
         let theirs_address = format!("{}/30", address(2));
-        cable.there(&["addr", "add", &theirs_address, "dev", theirs])?;
-        cable.there(&["link", "set", theirs, "up"])?;
+        cable.run_ip_at_server(&["addr", "add", &theirs_address, "dev", theirs])?;
+        cable.run_ip_at_server(&["link", "set", theirs, "up"])?;
         let listener = if robot_inside {
-            cable.there(&["link", "set", "lo", "up"])?;
+            cable.run_ip_at_server(&["link", "set", "lo", "up"])?;
             TcpListener::bind((address(1), 0))?
         } else {
             cable.listen(&address(2))?
         };
         cable.server = listener.local_addr()?;
         let (portal, over) = (portal.to_owned(), cable.over.clone());
-        std::thread::spawn(move || pass_on(&listener, &portal, &over));
+        std::thread::spawn(move || forward_connections(&listener, &portal, &over));
         Ok(cable)
     }
 
-    /// A veth pair if the kernel can degrade it, else TUN devices.
-    fn lay(&mut self) -> anyhow::Result<()> {
+    /// Creates a veth pair if the kernel can degrade it, otherwise TUN devices.
+    fn create_devices(&mut self) -> anyhow::Result<()> {
         let [ours, theirs] = &self.ends;
         ip(&[
             "link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", &self.name,
@@ -149,20 +150,20 @@ impl Cable {
             return tc(&["qdisc", "del", "dev", ours, "root"]);
         }
         ip(&["link", "del", ours])?;
-        self.shaper = Some(Shaper::between(ours, theirs)?);
+        self.shaper = Some(Shaper::join_devices(ours, theirs)?);
         ip(&["link", "set", theirs, "netns", &self.name])
     }
 
-    /// What degrades it, for reports.
-    pub fn means(&self) -> &'static str {
+    /// Returns the mechanism that degrades it, for reports.
+    pub fn mechanism(&self) -> &'static str {
         match self.shaper {
             None => "netem of this kernel",
             Some(_) => "netem's rules applied between two TUN devices (this kernel has no netem)",
         }
     }
 
-    /// Bytes that have left for the server so far, and that came from there.
-    pub fn carried(&self) -> anyhow::Result<(u64, u64)> {
+    /// Returns the bytes sent to the server so far, and those received from it.
+    pub fn transferred_bytes(&self) -> anyhow::Result<(u64, u64)> {
         let count = |what: &str| -> anyhow::Result<u64> {
             let path = format!("/sys/class/net/{}/statistics/{what}_bytes", self.ends[0]);
             let text = std::fs::read_to_string(&path).context(path)?;
@@ -176,30 +177,30 @@ impl Cable {
         })
     }
 
-    /// Of the end that is not this machine's own.
+    /// Returns the path of the namespace.
     pub fn namespace(&self) -> PathBuf {
         PathBuf::from("/run/netns").join(&self.name)
     }
 
-    /// Makes it bad, both ways.
-    pub fn degrade(&self, badness: Badness) -> anyhow::Result<()> {
+    /// Degrades the network in both directions.
+    pub fn degrade(&self, badness: NetworkImpairment) -> anyhow::Result<()> {
         match &self.shaper {
-            Some(shaper) => shaper.set(Some(badness)),
-            None => self.netem("replace", &badness.netem())?,
+            Some(shaper) => shaper.set_impairment(Some(badness)),
+            None => self.run_netem("replace", &badness.netem_arguments())?,
         }
         Ok(())
     }
 
-    /// Makes it good again.
+    /// Removes the impairment.
     pub fn restore(&self) -> anyhow::Result<()> {
         match &self.shaper {
-            Some(shaper) => shaper.set(None),
-            None => self.netem("del", &[])?,
+            Some(shaper) => shaper.set_impairment(None),
+            None => self.run_netem("del", &[])?,
         }
         Ok(())
     }
 
-    fn netem(&self, what: &str, rules: &[String]) -> anyhow::Result<()> {
+    fn run_netem(&self, what: &str, rules: &[String]) -> anyhow::Result<()> {
         let [ours, theirs] = &self.ends;
         let rules: Vec<&str> = rules.iter().map(String::as_str).collect();
         tc(&[&["qdisc", what, "dev", ours, "root"], &rules[..]].concat())?;
@@ -209,20 +210,25 @@ impl Cable {
         ip(&[&there[..], &rules[..]].concat())
     }
 
-    /// Runs `ip` at the server's end.
-    fn there(&self, arguments: &[&str]) -> anyhow::Result<()> {
+    /// Runs `ip` in the namespace.
+    fn run_ip_at_server(&self, arguments: &[&str]) -> anyhow::Result<()> {
         ip(&[&["-n", &self.name], arguments].concat())
     }
 
-    /// A socket of the server's end.
+    /// Opens a listening socket in the namespace.
     fn listen(&self, address: &str) -> anyhow::Result<TcpListener> {
         let address = format!("{address}:0");
-        Ok(within(&self.namespace(), || TcpListener::bind(address))??)
+        Ok(run_in_namespace(&self.namespace(), || {
+            TcpListener::bind(address)
+        })??)
     }
 }
 
-/// Does something in a network namespace: a thread enters it and ends there. What it starts stays there.
-pub fn within<T: Send>(namespace: &Path, act: impl FnOnce() -> T + Send) -> anyhow::Result<T> {
+/// Runs `act` in a network namespace, on a new thread. Processes that it starts stay in the namespace.
+pub fn run_in_namespace<T: Send>(
+    namespace: &Path,
+    act: impl FnOnce() -> T + Send,
+) -> anyhow::Result<T> {
     let place = File::open(namespace).with_context(|| namespace.display().to_string())?;
     std::thread::scope(|scope| {
         let acting = scope.spawn(move || {
@@ -236,7 +242,7 @@ pub fn within<T: Send>(namespace: &Path, act: impl FnOnce() -> T + Send) -> anyh
 impl Drop for Cable {
     fn drop(&mut self) {
         self.over.store(true, Ordering::Relaxed);
-        // Wakes whoever accepts.
+        // Wakes the accepting thread.
         let _ = self.restore();
         let _ = TcpStream::connect_timeout(&self.server, scale(Duration::from_secs(5)));
         let _ = ip(&["link", "del", &self.ends[0]]);
@@ -244,7 +250,7 @@ impl Drop for Cable {
     }
 }
 
-fn pass_on(listener: &TcpListener, portal: &str, over: &AtomicBool) {
+fn forward_connections(listener: &TcpListener, portal: &str, over: &AtomicBool) {
     for robot in listener.incoming().flatten() {
         if over.load(Ordering::Relaxed) {
             return;
@@ -261,15 +267,15 @@ fn pass_on(listener: &TcpListener, portal: &str, over: &AtomicBool) {
         let (from, to) = (robot.local_addr(), portal.to_owned());
         std::thread::spawn(move || {
             let host = from.map(|from| from.to_string()).unwrap_or_default();
-            let _ = announce(&robot, &server, &host, &to);
+            let _ = forward_request_head(&robot, &server, &host, &to);
             copy(robot, server);
         });
         std::thread::spawn(move || copy(server_too, robot_too));
     }
 }
 
-/// Passes the head of the first request on, with the portal's own name for the host, as a reverse proxy does.
-fn announce(
+/// Forwards the head of the first request, with the portal's own host name, as a reverse proxy does.
+fn forward_request_head(
     mut robot: &TcpStream,
     mut server: &TcpStream,
     host: &str,

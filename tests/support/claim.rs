@@ -1,5 +1,5 @@
-//! Directories that belong to a run: each names the process that made it, so that a later run can remove what a killed one has left, and
-//! leaves alone what belongs to a run that is still at work.
+//! Directories owned by a run: each names its owner process, so that a later run can remove the directories of a killed
+//! one and leaves those of a running one alone.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,22 +11,22 @@ use nix::unistd::Pid;
 
 use crate::{leftovers, procfs};
 
-/// The file in each directory that names its owner: a process id and when that process started.
+/// File in each directory that names its owner: a pid and the start time of that process.
 const OWNER: &str = "owner";
-/// How long killed processes may take to be gone.
+/// Maximum time for killed processes to disappear.
 const END: Duration = Duration::from_secs(60);
 
-/// Notes that a directory belongs to this process.
+/// Records this process as the owner of a directory.
 ///
 /// # Errors
-/// When the note cannot be written.
+/// If the file cannot be written.
 pub fn claim(directory: &Path) -> std::io::Result<()> {
     let own = std::process::id();
     let text = format!("{own} {}", start_time(own as i32).unwrap_or_default());
     fs::write(directory.join(OWNER), text)
 }
 
-/// Finds the directories in `parent` with names that begin with `prefix` whose owner is gone.
+/// Returns the directories in `parent` whose names start with `prefix` and whose owner no longer exists.
 pub fn find_abandoned(parent: &Path, prefix: &str) -> Vec<PathBuf> {
     let entries = fs::read_dir(parent).into_iter().flatten().flatten();
     let named = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix));
@@ -40,26 +40,28 @@ pub fn find_abandoned(parent: &Path, prefix: &str) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Ends the processes that an abandoned directory is used by, and removes their cgroups, their mounts here, and the directory.
+/// Ends the processes that use an abandoned directory, and removes their cgroups, their mounts in this namespace, and
+/// the directory.
 ///
 /// # Errors
-/// Names the first thing that could not be removed.
+/// With the first thing that could not be removed.
 pub fn remove_abandoned(directory: &Path) -> anyhow::Result<()> {
     end_users(directory)?;
     leftovers::unmount_below(directory);
     match fs::remove_dir_all(directory) {
-        // Two runs may begin at once.
+        // Another run may be doing the same.
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
         removed => removed.with_context(|| directory.display().to_string()),
     }
 }
 
-/// Ends the processes that use a directory, but for those that this one was started by, and removes their cgroups.
+/// Ends the processes that use a directory, except this process and its ancestors, and removes their cgroups.
 ///
 /// # Errors
-/// Names the first thing that stays.
+/// With the first thing that could not be removed.
 pub fn end_users(directory: &Path) -> anyhow::Result<()> {
-    // In a servant's mount namespace nothing of the directory needs to be seen: its processes are known by their parents.
+    // Processes in a servant's mount namespace need not refer to the directory visibly: they are found through their
+    // parents.
     let own = procfs::ancestors(std::process::id() as i32);
     let mut users = leftovers::processes_of(directory);
     users.retain(|pid| !own.contains(pid));
@@ -83,7 +85,7 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
         std::thread::sleep(Duration::from_millis(20));
     }
     for cgroup in &cgroups {
-        // A process that has just ended is charged there for a moment longer.
+        // A process that has just ended is charged to the cgroup for a moment longer.
         while fs::remove_dir(cgroup)
             .is_err_and(|error| error.kind() == std::io::ErrorKind::ResourceBusy)
         {
@@ -94,14 +96,14 @@ pub fn end_users(directory: &Path) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Tells if the process that wrote this note is still there.
+/// Returns whether the process that wrote this note still exists.
 fn is_alive(owner: &str) -> bool {
     let (pid, start) = owner.split_once(' ').unwrap_or((owner, ""));
     pid.parse()
         .is_ok_and(|pid| start_time(pid).is_some_and(|now| now == start))
 }
 
-/// When a process started, in ticks since the machine did: process ids are used again (proc(5), field 22 of `stat`).
+/// Returns the start time of a process in ticks since boot, because pids are reused (proc(5), field 22 of `stat`).
 fn start_time(pid: i32) -> Option<String> {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
     let rest = stat.rsplit_once(") ")?.1;

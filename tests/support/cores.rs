@@ -1,5 +1,5 @@
-//! Work that keeps a core busy, such as a push that compiles: as many at a time as the machine has cores. Stories mostly wait, so many of them are
-//! told at a time; what they compile would take each other's time.
+//! Permits for work that keeps a core busy, such as a push that compiles: there are as many as the machine has cores.
+//! Many stories run at a time because they mostly wait, but concurrent compilations would slow each other down.
 
 use std::num::NonZero;
 use std::sync::{Condvar, Mutex, PoisonError};
@@ -7,17 +7,17 @@ use std::time::{Duration, Instant};
 
 use crate::story;
 
-/// After this time work begins although no core is free: a story may itself have to end what takes one up.
+/// Time after which work starts even if no core is free, because a story may have to end the work that occupies one.
 const LONGEST_WAIT: Duration = Duration::from_secs(90);
 
 static TAKEN: Mutex<usize> = Mutex::new(0);
 static FREED: Condvar = Condvar::new();
 
-/// A core's worth of work, until it is dropped.
+/// A permit to keep one core busy, until drop.
 #[derive(Debug)]
 pub struct CorePermit(());
 
-/// Waits for a core that no other story's work takes up.
+/// Waits for a core that is not used by another story's work.
 pub fn acquire() -> CorePermit {
     let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     let began = Instant::now();

@@ -1,13 +1,13 @@
-//! A way to a portal that is cut again and again, wherever in the stream of bytes it happens to be.
+//! A proxy in front of a portal that cuts its connections repeatedly, at arbitrary positions in the byte stream.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Cuts; ends when dropped.
+/// The proxy; stops on drop.
 pub struct Cutter {
-    /// Where the robot reaches the portal.
+    /// Address of the portal for the robot.
     pub server: SocketAddr,
     shared: Arc<Shared>,
 }
@@ -20,7 +20,7 @@ struct Shared {
 }
 
 struct State {
-    /// Bytes that may pass before the next cut; none: no more cuts.
+    /// Bytes until the next cut; `None` if there are no more cuts.
     left: Option<usize>,
     remaining: usize,
     longest: usize,
@@ -29,7 +29,7 @@ struct State {
 }
 
 impl Cutter {
-    /// Cuts `cuts` times, each after 1 to `longest` bytes; the same ones for the same `seed`.
+    /// Creates a proxy that cuts `cuts` times, each after 1 to `longest` bytes, determined by `seed`.
     pub fn new(portal: &str, cuts: usize, longest: usize, seed: u64) -> anyhow::Result<Self> {
         let listener = TcpListener::bind("127.0.0.1:0")?;
         let server = listener.local_addr()?;
@@ -50,18 +50,18 @@ impl Cutter {
         Ok(Self { server, shared })
     }
 
-    /// From now on it cuts.
+    /// Starts to cut.
     pub fn begin(&self) {
         self.shared.state().draw();
     }
 
-    /// Cuts what is connected now; with `closed` nobody gets through from now on, without it whoever comes next does.
+    /// Cuts all current connections; with `closed` later connections are refused, otherwise they are forwarded.
     pub fn cut(&self, closed: bool) {
         self.shared.closed.store(closed, Ordering::Relaxed);
         self.shared.state().cut();
     }
 
-    /// Cuts so far.
+    /// Number of cuts so far.
     pub fn cuts(&self) -> usize {
         self.shared.cuts.load(Ordering::Relaxed)
     }
@@ -71,7 +71,7 @@ impl Drop for Cutter {
     fn drop(&mut self) {
         self.shared.over.store(true, Ordering::Relaxed);
         self.shared.state().cut();
-        // Wakes whoever accepts.
+        // Wakes the accepting thread.
         let _ = TcpStream::connect(self.server);
     }
 }
@@ -81,7 +81,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// How many of these bytes pass; fewer than all: then comes the cut.
+    /// Returns how many of `bytes` may pass; if fewer than all, the cut follows.
     fn pass(&self, bytes: usize) -> usize {
         let state = &mut *self.state();
         match &mut state.left {
@@ -97,7 +97,7 @@ impl Shared {
     fn cut(&self) {
         let state = &mut *self.state();
         state.cut();
-        // Both directions may have come to the same one.
+        // Both directions may have reached the same cut.
         if state.left.is_none() {
             return;
         }
@@ -111,7 +111,7 @@ impl Shared {
 }
 
 impl State {
-    /// Xorshift (Marsaglia, 2003).
+    /// Draws the number of bytes until the next cut, by xorshift (Marsaglia, 2003).
     fn draw(&mut self) {
         self.random ^= self.random << 13;
         self.random ^= self.random >> 7;
@@ -148,7 +148,7 @@ fn accept(listener: &TcpListener, server: SocketAddr, portal: &str, shared: &Arc
             .open
             .extend([robot.try_clone(), cloud.try_clone()].into_iter().flatten());
         let (up, down) = (Arc::clone(shared), Arc::clone(shared));
-        // The portal is told its own name, as a reverse proxy does.
+        // Replaces the host name by the portal's own, as a reverse proxy does.
         let names = (server.to_string(), portal.to_owned());
         std::thread::spawn(move || copy(robot, cloud, Some(names), &up));
         std::thread::spawn(move || copy(cloud_too, robot_too, None, &down));

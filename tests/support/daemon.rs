@@ -14,25 +14,26 @@ use serde_json::Value;
 
 use crate::binaries;
 use crate::deployer::Deployer;
-use crate::patience::{self, Patient};
+use crate::patience::{self, PatientStream};
 use crate::robot::Robot;
 
 /// A running `cloudroidd`.
 pub struct Daemon {
-    /// Its state directory.
+    /// State directory.
     pub home: PathBuf,
-    /// Where it listens, such as `127.0.0.1:40123`.
+    /// Listening address, such as `127.0.0.1:40123`.
     pub address: String,
-    /// None where another has started it, such as systemd.
+    /// `None` if it was started by another process, such as systemd.
     child: Option<Child>,
-    _space: Option<Arc<Space>>,
+    _space: Option<Arc<HomeSpace>>,
 }
 
-/// What a home takes on the disk. Some hundred megabytes each: all of a run together are more than many machines have free.
+/// The disk space of a home, freed on drop: some hundred megabytes each, and all homes of a run together would exceed
+/// the free space of many machines.
 #[derive(Debug)]
-struct Space(PathBuf);
+struct HomeSpace(PathBuf);
 
-impl Drop for Space {
+impl Drop for HomeSpace {
     fn drop(&mut self) {
         for heavy in ["layers", "images"] {
             let _ = std::fs::remove_dir_all(self.0.join(heavy));
@@ -40,21 +41,21 @@ impl Drop for Space {
     }
 }
 
-/// How to start one. Images are kept for as long as this, or a daemon that it has started, is there.
+/// Options to start a daemon. Images are kept until this value and all daemons started from it are dropped.
 #[derive(Debug, Clone)]
-pub struct Setup {
-    space: Arc<Space>,
+pub struct DaemonSetup {
+    space: Arc<HomeSpace>,
     home: PathBuf,
     config: String,
     listen: String,
     environment: Vec<(String, String)>,
 }
 
-impl Setup {
-    /// A daemon with its state in `home`, on a free port of loopback.
-    pub fn new(home: &Path) -> Setup {
-        Setup {
-            space: Arc::new(Space(home.to_owned())),
+impl DaemonSetup {
+    /// Creates options for a daemon with its state in `home`, on a free loopback port.
+    pub fn new(home: &Path) -> DaemonSetup {
+        DaemonSetup {
+            space: Arc::new(HomeSpace(home.to_owned())),
             home: home.to_owned(),
             config: String::new(),
             listen: "127.0.0.1:0".to_owned(),
@@ -62,25 +63,25 @@ impl Setup {
         }
     }
 
-    /// With these lines of configuration.
-    pub fn config(mut self, toml: &str) -> Setup {
+    /// Appends lines to the configuration.
+    pub fn config(mut self, toml: &str) -> DaemonSetup {
         self.config.push_str(toml);
         self
     }
 
-    /// Listening there.
-    pub fn listen(mut self, address: &str) -> Setup {
+    /// Sets the listening address.
+    pub fn listen(mut self, address: &str) -> DaemonSetup {
         self.listen = address.to_owned();
         self
     }
 
-    /// With this variable in its environment.
-    pub fn environment(mut self, key: &str, value: &str) -> Setup {
+    /// Sets an environment variable.
+    pub fn environment(mut self, key: &str, value: &str) -> DaemonSetup {
         self.environment.push((key.to_owned(), value.to_owned()));
         self
     }
 
-    /// The state directory.
+    /// Returns the state directory.
     pub fn home(&self) -> &Path {
         &self.home
     }
@@ -103,7 +104,7 @@ impl Setup {
         Ok(command)
     }
 
-    /// Starts it and waits until it answers.
+    /// Starts the daemon and waits until it answers.
     pub fn start(&self) -> anyhow::Result<Daemon> {
         let log = File::options()
             .create(true)
@@ -127,7 +128,7 @@ impl Setup {
             child: Some(child),
             _space: Some(Arc::clone(&self.space)),
         };
-        let answers = crate::until("a daemon that answers", || {
+        let answers = crate::wait_until("a daemon that answers", || {
             if let Some(child) = &mut daemon.child
                 && let Some(status) = child.try_wait()?
             {
@@ -144,8 +145,8 @@ impl Setup {
         Ok(daemon)
     }
 
-    /// Starts it where it must refuse, and gives its status and words.
-    pub fn refuses_to_start(&self) -> anyhow::Result<String> {
+    /// Starts the daemon, which must refuse to start; returns its exit status and output.
+    pub fn expect_refusal(&self) -> anyhow::Result<String> {
         let output = self
             .command()?
             .stdout(Stdio::piped())
@@ -166,7 +167,7 @@ impl Setup {
     }
 }
 
-/// Waits for its end, as long as a story waits.
+/// Waits for its end, within the time limit of a story.
 fn wait_with_output(mut child: Child) -> anyhow::Result<(ExitStatus, Vec<u8>, Vec<u8>)> {
     let pid = Pid::from_raw(child.id() as i32);
     let (mut out, mut err) = (
@@ -197,15 +198,16 @@ fn read_log(home: &Path) -> String {
 }
 
 impl Daemon {
-    /// The one that another has started with its state in `home`, once it answers; not the one with the pid `not`.
-    pub fn of_another(home: &Path, not: Option<i32>) -> anyhow::Result<Daemon> {
+    /// Attaches to a daemon with its state in `home` that another process has started, once it answers; `not` is the
+    /// pid of a daemon to ignore.
+    pub fn attach(home: &Path, not: Option<i32>) -> anyhow::Result<Daemon> {
         let mut daemon = Daemon {
             home: home.to_owned(),
             address: "localhost".to_owned(),
             child: None,
             _space: None,
         };
-        daemon.address = crate::until("a daemon that answers", || {
+        daemon.address = crate::wait_until("a daemon that answers", || {
             let listens = daemon.status().and_then(|status| {
                 ensure!(not.is_none_or(|pid| status["pid"] != pid), "{status:#}");
                 address_in(&status)
@@ -219,37 +221,37 @@ impl Daemon {
         self.api("/api/v1/status")
     }
 
-    /// A deployer at a shell of this machine.
+    /// Returns a deployer on this machine.
     pub fn deployer(&self) -> Deployer {
         Deployer {
             home: self.home.clone(),
         }
     }
 
-    /// A robot that connects to `path`, such as `opencv_apps?robot=r2`.
+    /// Connects a robot to `path`, such as `opencv_apps?robot=r2`.
     pub fn robot(&self, path: &str) -> anyhow::Result<Robot> {
         Robot::connect(&self.url(path))
-            .with_context(|| format!("the daemon said:\n{}", self.last_words()))
+            .with_context(|| format!("the daemon said:\n{}", self.log_tail()))
     }
 
-    /// The WebSocket address of `path`.
+    /// Returns the WebSocket URL of `path`.
     pub fn url(&self, path: &str) -> String {
         format!("ws://{}/{path}", self.address)
     }
 
-    /// `GET PATH`: status and body.
+    /// Sends `GET PATH`; returns status and body.
     pub fn get(&self, path: &str) -> anyhow::Result<(u16, String)> {
         self.request("GET", path, &[])
     }
 
-    /// `GET PATH` of JSON.
+    /// Sends `GET PATH`; returns the JSON body.
     pub fn get_json(&self, path: &str) -> anyhow::Result<Value> {
         let (status, body) = self.get(path)?;
         ensure!(status == 200, "GET {path}: {status} {body}");
         Ok(serde_json::from_str(&body)?)
     }
 
-    /// An HTTP/1.1 request by hand, so that headers are what the story says.
+    /// Sends an HTTP/1.1 request without a client library, so that the story controls the headers.
     pub fn request(
         &self,
         method: &str,
@@ -260,8 +262,8 @@ impl Daemon {
         self.exchange(stream, method, path, headers)
     }
 
-    /// The same with a body; also the answer's header lines.
-    pub fn sends(
+    /// Sends a request with a body; returns status, header lines and body.
+    pub fn request_with_body(
         &self,
         method: &str,
         path: &str,
@@ -292,30 +294,30 @@ impl Daemon {
         Ok((status, head.to_owned(), body.to_owned()))
     }
 
-    /// What the API answers to `GET PATH` over the daemon's own socket, where the caller is its operator.
+    /// Sends `GET PATH` through the daemon's own socket, where the caller is an operator; returns the JSON body.
     pub fn api(&self, path: &str) -> anyhow::Result<Value> {
         let stream = UnixStream::connect(self.home.join("run/daemon.sock"))?;
-        let (status, body) = self.exchange(Patient::new(stream)?, "GET", path, &[])?;
+        let (status, body) = self.exchange(PatientStream::new(stream)?, "GET", path, &[])?;
         ensure!(status == 200, "GET {path}: {status} {body}");
         Ok(serde_json::from_str(&body)?)
     }
 
-    /// Waits until there is something in what the API answers.
-    pub fn awaits<T>(
+    /// Polls the API until `find` returns a value for a response.
+    pub fn wait_for<T>(
         &self,
         path: &str,
         what: &str,
         mut find: impl FnMut(&Value) -> Option<T>,
     ) -> anyhow::Result<T> {
-        crate::until(what, || {
+        crate::wait_until(what, || {
             let answer = self.api(path)?;
             Ok(find(&answer).ok_or_else(|| format!("{answer:#}")))
         })
     }
 
     /// Waits for an event among the last 10000.
-    pub fn awaits_event(&self, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
-        self.awaits("/api/v1/events?limit=10000", what, |events| {
+    pub fn wait_for_event(&self, what: &str, is: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+        self.wait_for("/api/v1/events?limit=10000", what, |events| {
             events.as_array()?.iter().find(|event| is(event)).cloned()
         })
     }
@@ -341,7 +343,7 @@ impl Daemon {
         stream.write_all(text.as_bytes())?;
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer)?;
-        // Pieces of a body are cut by bytes, and an archive's are no text.
+        // Chunks of a body may split characters, and an archive is not text.
         let head = answer.windows(4).position(|end| end == b"\r\n\r\n");
         let (head, body) = answer.split_at(head.context("an HTTP answer")?);
         let (head, body) = (String::from_utf8_lossy(head), &body[4..]);
@@ -357,7 +359,7 @@ impl Daemon {
         Ok((status, String::from_utf8_lossy(&body).into_owned()))
     }
 
-    /// The servants of a service, as the API tells.
+    /// Returns the servants of a service, from the API.
     pub fn servants_of(&self, service: &str) -> anyhow::Result<Vec<Value>> {
         let all = self.api("/api/v1/servants")?;
         let list = all.as_array().context("servants is a list")?;
@@ -368,7 +370,7 @@ impl Daemon {
             .collect())
     }
 
-    /// The servant of one robot.
+    /// Returns the servant of a robot.
     pub fn servant_of(&self, service: &str, robot: &str) -> anyhow::Result<Value> {
         self.servants_of(service)?
             .into_iter()
@@ -376,27 +378,27 @@ impl Daemon {
             .with_context(|| format!("{robot} has no servant of {service}"))
     }
 
-    /// What it printed last.
-    pub fn last_words(&self) -> String {
+    /// Returns the last lines of its log.
+    pub fn log_tail(&self) -> String {
         let log = read_log(&self.home);
         let lines: Vec<&str> = log.lines().collect();
         lines[lines.len().saturating_sub(30)..].join("\n")
     }
 
-    /// Its process id; 0 where another has started it.
+    /// Returns its pid; 0 if another process started it.
     pub fn pid(&self) -> i32 {
         self.child.as_ref().map_or(0, |child| child.id() as i32)
     }
 
-    /// Ends it as an operator would and waits.
-    pub fn ends(mut self) -> anyhow::Result<ExitStatus> {
+    /// Stops it with SIGTERM and waits.
+    pub fn stop(mut self) -> anyhow::Result<ExitStatus> {
         let mut child = self.child.take().context("started by another")?;
         kill(Pid::from_raw(child.id() as i32), Signal::SIGTERM)?;
         Ok(child.wait()?)
     }
 
-    /// Ends it as a crash would and waits.
-    pub fn is_killed(mut self) -> anyhow::Result<()> {
+    /// Kills it with SIGKILL and waits.
+    pub fn kill(mut self) -> anyhow::Result<()> {
         let mut child = self.child.take().context("started by another")?;
         child.kill()?;
         child.wait()?;

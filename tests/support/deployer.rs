@@ -1,4 +1,4 @@
-//! A deployer at a shell: `cloudroidctl`, its exit status and its words.
+//! A deployer at a shell: runs `cloudroidctl` and checks exit status and output.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -9,53 +9,53 @@ use serde_json::Value;
 use crate::layer_pool::FirstPush;
 use crate::{binaries, cores};
 
-/// Types commands to one daemon.
+/// Runs commands against one daemon.
 #[derive(Debug, Clone)]
 pub struct Deployer {
-    /// The daemon's home, by whose socket it is reached.
+    /// Home of the daemon, which contains its socket.
     pub home: PathBuf,
 }
 
-/// What a command came to.
+/// Result of a command.
 #[derive(Debug)]
-pub struct Outcome {
-    /// The command as typed.
+pub struct CommandOutcome {
+    /// Command line.
     pub command: String,
-    /// Its exit status.
+    /// Exit status.
     pub status: i32,
-    /// What it printed.
+    /// Standard output.
     pub stdout: String,
-    /// What it complained of.
+    /// Standard error.
     pub stderr: String,
 }
 
-impl Outcome {
-    /// Both streams, for looking words up.
-    pub fn said(&self) -> String {
+impl CommandOutcome {
+    /// Returns both streams, for searching.
+    pub fn output(&self) -> String {
         format!("{}\n{}", self.stdout, self.stderr)
     }
 
-    /// The same, if it went well.
-    pub fn succeeded(self) -> anyhow::Result<Outcome> {
+    /// Returns the result if the command succeeded, otherwise an error.
+    pub fn expect_success(self) -> anyhow::Result<CommandOutcome> {
         ensure!(
             self.status == 0,
             "{} ended with {}:\n{}",
             self.command,
             self.status,
-            self.said()
+            self.output()
         );
         Ok(self)
     }
 
-    /// The same, if it failed and said all of `words` in doing so.
-    pub fn failed_saying(self, words: &[&str]) -> anyhow::Result<Outcome> {
+    /// Returns the result if the command failed and printed all of `words`, otherwise an error.
+    pub fn expect_failure(self, words: &[&str]) -> anyhow::Result<CommandOutcome> {
         ensure!(
             self.status != 0,
             "{} succeeded:\n{}",
             self.command,
-            self.said()
+            self.output()
         );
-        let said = self.said();
+        let said = self.output();
         for word in words {
             ensure!(
                 said.contains(word),
@@ -73,10 +73,10 @@ impl Outcome {
 }
 
 impl Deployer {
-    /// Types `cloudroidctl ARGUMENTS`.
-    pub fn types<S: AsRef<str>>(&self, arguments: &[S]) -> anyhow::Result<Outcome> {
+    /// Runs `cloudroidctl ARGUMENTS`.
+    pub fn run<S: AsRef<str>>(&self, arguments: &[S]) -> anyhow::Result<CommandOutcome> {
         let arguments: Vec<&str> = arguments.iter().map(AsRef::as_ref).collect();
-        // What unpacks, compiles or packs keeps a core busy.
+        // Commands that unpack, compile or pack keep a core busy.
         let is_work = arguments
             .iter()
             .any(|word| ["push", "import"].contains(word));
@@ -92,30 +92,30 @@ impl Deployer {
         Ok(outcome)
     }
 
-    /// Types it with `--format json` and reads the answer.
-    pub fn asks(&self, arguments: &[&str]) -> anyhow::Result<Value> {
+    /// Runs a command with `--format json` and parses its output.
+    pub fn run_json(&self, arguments: &[&str]) -> anyhow::Result<Value> {
         let outcome = self
-            .types(&[&["--format", "json"], arguments].concat())?
-            .succeeded()?;
+            .run(&[&["--format", "json"], arguments].concat())?
+            .expect_success()?;
         serde_json::from_str(&outcome.stdout)
             .with_context(|| format!("{} printed no JSON: {}", outcome.command, outcome.stdout))
     }
 
-    /// Pushes a package below `tests/packages` with more arguments.
-    pub fn pushes(&self, package: &str, arguments: &[&str]) -> anyhow::Result<Outcome> {
+    /// Pushes a package below `tests/packages`, with further arguments.
+    pub fn push(&self, package: &str, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
         let path = binaries::package(package);
-        self.types(&[&["push", path_str(&path)], arguments].concat())
+        self.run(&[&["push", path_str(&path)], arguments].concat())
     }
 }
 
 /// Runs a command to its end.
-pub fn run(command: &mut Command) -> anyhow::Result<Outcome> {
+pub fn run(command: &mut Command) -> anyhow::Result<CommandOutcome> {
     let typed = format!("{command:?}");
     let output = command
         .stdin(Stdio::null())
         .output()
         .with_context(|| format!("cannot run {typed}"))?;
-    Ok(Outcome {
+    Ok(CommandOutcome {
         command: typed,
         status: output.status.code().unwrap_or(-1),
         stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
@@ -123,7 +123,7 @@ pub fn run(command: &mut Command) -> anyhow::Result<Outcome> {
     })
 }
 
-/// A path of ours as text.
+/// Returns a path of ours as a string.
 pub fn path_str(path: &Path) -> &str {
     path.to_str().expect("paths of the stories are UTF-8")
 }

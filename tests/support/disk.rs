@@ -1,8 +1,9 @@
-//! The disk that homes of stories are on: an ext4 with a journal, in a sparse file that has no name once it is mounted, in a mount namespace of
-//! the run's own. Whatever ends the run, the kernel takes both away with its last process.
+//! The disk for the homes of stories: an ext4 with a journal in a sparse file, which is unlinked once it is mounted, in
+//! a mount namespace of the run. However the run ends, the kernel removes both with its last process.
 //!
-//! A file system of its own, because ext4 without a journal, which machines for tests often have, never takes an inode that was deleted in the
-//! last seconds: while homes come and go, half of the suite's processor time was its search for another one.
+//! A separate file system is used because ext4 without a journal, which test machines often have, does not reuse an
+//! inode that was deleted in the last seconds: while homes come and go, half of the suite's processor time was spent
+//! searching for free inodes.
 
 use std::fs::File;
 use std::path::Path;
@@ -15,21 +16,21 @@ use nix::sched::{CloneFlags, unshare};
 
 use crate::deployer::{path_str, run};
 
-/// Files' names begin with this.
+/// Prefix of the names of the files.
 const PREFIX: &str = "stories-disk-";
-/// A file that has had a name for longer was forgotten.
+/// Age after which a file with a name counts as a leftover.
 const FORGOTTEN: Duration = Duration::from_secs(600);
-/// As large as the file may grow, in GiB; homes of a run take up to 12 at a time.
+/// Maximum size of the file in GiB; homes of a run take up to 12 GiB at a time.
 const SIZE: u64 = 32;
-/// What must be left of the disk that the file is on, in GiB.
+/// Space to leave free on the underlying disk, in GiB.
 const RESERVE: u64 = 4;
-/// Less than this, in GiB, is too little for a run.
+/// Minimum size for a run, in GiB.
 const LEAST: u64 = 8;
 
-/// Gives this process, and those that it starts, mounts of their own. To be called before it has threads.
+/// Gives this process and its children a private mount namespace. Must be called before the process has threads.
 ///
 /// # Errors
-/// When this process may not mount.
+/// If this process may not mount.
 pub fn enter_namespace() -> anyhow::Result<()> {
     unshare(CloneFlags::CLONE_NEWNS).context("cannot make a mount namespace")?;
     let none: Option<&str> = None;
@@ -40,7 +41,7 @@ pub fn enter_namespace() -> anyhow::Result<()> {
 /// Mounts a new disk on `place`, from a file in the directory `parent`.
 ///
 /// # Errors
-/// When there is no room, or no loop device, or this process may not mount.
+/// If there is no space, no loop device, or no permission to mount.
 pub fn mount_on(place: &Path, parent: &Path) -> anyhow::Result<()> {
     std::fs::create_dir_all(parent)?;
     remove_forgotten(parent);
@@ -67,16 +68,16 @@ pub fn mount_on(place: &Path, parent: &Path) -> anyhow::Result<()> {
         "lazy_itable_init=1,lazy_journal_init=1,nodiscard",
         path,
     ];
-    run(Command::new("mke2fs").args(["-t", "ext4"]).args(format))?.succeeded()?;
-    // What is on it outlives no power cut, so nothing waits for the disk below.
+    run(Command::new("mke2fs").args(["-t", "ext4"]).args(format))?.expect_success()?;
+    // The content need not survive a power cut, so no write waits for the underlying disk.
     let options = "loop,noatime,nobarrier,data=writeback";
     run(Command::new("mount").args(["-t", "ext4", "-o", options, path, path_str(place)]))?
-        .succeeded()?;
+        .expect_success()?;
     let _ = std::fs::remove_dir(place.join("lost+found"));
     Ok(())
 }
 
-/// Removes files of runs that were killed before their disk was mounted: a file has a name for some seconds only.
+/// Removes files of runs that were killed before they could unlink them, which takes some seconds.
 fn remove_forgotten(parent: &Path) {
     let entries = std::fs::read_dir(parent).into_iter().flatten().flatten();
     for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX)) {
@@ -88,10 +89,10 @@ fn remove_forgotten(parent: &Path) {
     }
 }
 
-/// Bytes that are free on the disk of a directory.
+/// Returns the free space in bytes of the file system of a directory.
 ///
 /// # Errors
-/// When the kernel does not tell.
+/// If the kernel does not report it.
 pub fn free_bytes(directory: &Path) -> anyhow::Result<u64> {
     let about = nix::sys::statvfs::fstatvfs(File::open(directory)?)?;
     Ok(about.blocks_available() * about.fragment_size())

@@ -1,4 +1,5 @@
-//! What is kept of a story that failed: the words of its daemons and their servants, events, what ran on the machine, and the files it made.
+//! Evidence kept of a failed story: logs of its daemons and servants, events, processes of the machine, and the files
+//! that it created.
 
 use std::fs;
 use std::io::Write;
@@ -6,16 +7,17 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::daemon::Daemon;
-use crate::story::{self, Telling};
+use crate::story::{self, StoryRun};
 
-/// What of a home is left out: images and unpacked layers, which are the same for all.
+/// Parts of a home that are omitted: images and unpacked layers, which are the same for all.
 const HEAVY: [&str; 3] = ["images", "layers", "build"];
-/// Larger files are left out.
+/// Larger files are omitted.
 const LARGEST_FILE: u64 = 16 << 20;
-/// No more than this is kept of one story.
+/// Maximum size of the evidence of one story.
 const LARGEST: u64 = 256 << 20;
 
-/// Notes what runs on the machine, and how busy it is, for the story that this thread tells: when it gives up waiting, before it ends its daemons.
+/// Records the processes and the load of the machine for the story of this thread; called when the story stops waiting,
+/// before it stops its daemons.
 pub fn note_machine() {
     if let Some(telling) = story::current() {
         note_machine_in(&telling.evidence);
@@ -45,12 +47,13 @@ fn note_machine_in(directory: &Path) {
     let _ = fs::write(directory.join("machine"), text);
 }
 
-/// Keeps everything that a failed story has made, with its reason. `shared` is the daemon that it may have used with others.
+/// Keeps everything that a failed story has created, with the error. `shared` is the shared daemon, which it may have
+/// used.
 ///
 /// # Errors
-/// When nothing can be written.
+/// If nothing can be written.
 pub fn keep(
-    telling: &Telling,
+    telling: &StoryRun,
     reason: &str,
     seed: &str,
     shared: Option<&Daemon>,
@@ -95,7 +98,7 @@ pub fn keep(
     Ok(())
 }
 
-/// The events in a home's database, one a line. A daemon that has ended answers nobody.
+/// Writes the events of a home's database, one per line; a stopped daemon could not be asked for them.
 fn write_events(home: &Path, to: &Path) {
     const READ: &str = "import json, sqlite3, sys
 rows = sqlite3.connect(f'file:{sys.argv[1]}?mode=ro', uri=True)
@@ -117,7 +120,7 @@ for row in rows.execute('SELECT * FROM events ORDER BY id'):
     }
 }
 
-/// Copies directories and files, as far as there is room; what cannot be read is left out.
+/// Copies directories and files up to a maximum size; unreadable ones are omitted.
 fn copy(from: &Path, to: &Path, room: &mut u64) {
     let Ok(about) = from.symlink_metadata() else {
         return;

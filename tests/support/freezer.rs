@@ -1,27 +1,28 @@
-//! A way to a portal whose connections can fall silent: they stand, and carry nothing any more. Later ones do.
+//! A proxy in front of a portal that can freeze its connections: they stay established and carry nothing any more.
+//! Later connections work.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Ends, with all its connections, when dropped.
+/// The proxy; stops on drop, with all its connections.
 pub struct Freezer {
-    /// Where the robot reaches the portal.
+    /// Address of the portal for the robot.
     pub server: SocketAddr,
     shared: Arc<Shared>,
 }
 
 #[derive(Default)]
 struct Shared {
-    /// Connections up to this one are frozen.
+    /// Connections up to this number are frozen.
     frozen: AtomicUsize,
     over: AtomicBool,
     open: Mutex<Vec<TcpStream>>,
 }
 
 impl Freezer {
-    /// Passes connections on to `portal`.
+    /// Creates a proxy that forwards connections to `portal`.
     pub fn new(portal: &str) -> anyhow::Result<Self> {
         let listener = TcpListener::bind("127.0.0.1:0")?;
         let server = listener.local_addr()?;
@@ -31,7 +32,7 @@ impl Freezer {
         Ok(Self { server, shared })
     }
 
-    /// From now on nothing comes through the connections that there are; how many there were so far.
+    /// Freezes all current connections; returns how many there have been so far.
     pub fn freeze(&self) -> usize {
         let count = self.shared.open().len() / 2;
         self.shared.frozen.store(count, Ordering::Relaxed);
@@ -45,7 +46,7 @@ impl Drop for Freezer {
         for open in self.shared.open().drain(..) {
             let _ = open.shutdown(Shutdown::Both);
         }
-        // Wakes whoever accepts.
+        // Wakes the accepting thread.
         let _ = TcpStream::connect(self.server);
     }
 }
@@ -84,7 +85,7 @@ fn copy(mut from: TcpStream, mut to: TcpStream, number: usize, shared: &Shared) 
     let mut buffer = vec![0; 1 << 14];
     while let Ok(count) = from.read(&mut buffer) {
         let frozen = shared.frozen.load(Ordering::Relaxed) >= number;
-        // That one end has closed is not told to the other, either.
+        // The end of a connection is not forwarded either.
         if frozen && count > 0 {
             continue;
         }

@@ -1,4 +1,4 @@
-//! What a service is given beyond its container, seen from inside. Told on the host and in the virtual machine.
+//! Resources granted to a service beyond its container, seen from inside. Runs on the host and in the virtual machine.
 
 use std::io::ErrorKind;
 use std::net::TcpListener;
@@ -7,20 +7,20 @@ use std::path::{Path, PathBuf};
 use anyhow::ensure;
 
 use crate::Verdict;
-use crate::burglar::tries;
+use crate::burglar::try_attempt;
 use crate::robot::Robot;
 
-/// Harmless devices.
+/// Kind of the devices, which are harmless.
 pub const KIND: &str = "story.example.org/harmless";
-/// Where the nodes find the volume.
+/// Mount point of the volume for the nodes.
 pub const INSIDE: &str = "/models";
 
-/// A CDI specification in one of the standard's directories, while it lives.
-pub struct Specification(PathBuf);
+/// A CDI specification in one of the standard directories, until drop.
+pub struct CdiSpecification(PathBuf);
 
-impl Specification {
-    /// Of devices of this kind: one, `zero`, with a hook that must not be run.
-    pub fn write(kind: &str) -> anyhow::Result<Specification> {
+impl CdiSpecification {
+    /// Writes a specification of one device of this kind, `zero`, with a hook that must not be run.
+    pub fn write(kind: &str) -> anyhow::Result<CdiSpecification> {
         let directory = PathBuf::from("/var/run/cdi");
         let path = directory.join(format!("cloudroid-story-{}.json", std::process::id()));
         let hook = serde_json::json!({"hookName": "createRuntime", "path": "/bin/false", "args": ["false", "story"]});
@@ -35,12 +35,12 @@ impl Specification {
         });
         loop {
             std::fs::create_dir_all(&directory)?;
-            // Whole or not at all: other daemons of this machine read it, too.
+            // Atomically, because other daemons of this machine read it as well.
             let new = path.with_extension("new");
             let written = std::fs::write(&new, text.to_string());
             match written.and_then(|()| std::fs::rename(&new, &path)) {
-                Ok(()) => return Ok(Specification(path)),
-                // Somebody else's was the last in it, and has gone with the directory.
+                Ok(()) => return Ok(CdiSpecification(path)),
+                // Another process removed the last other file and the directory.
                 Err(error) if error.kind() == ErrorKind::NotFound => {}
                 Err(error) => return Err(error.into()),
             }
@@ -48,16 +48,16 @@ impl Specification {
     }
 }
 
-impl Drop for Specification {
+impl Drop for CdiSpecification {
     fn drop(&mut self) {
         let _ = std::fs::remove_file(&self.0);
-        // Only if nobody else's is there.
+        // Only if it is empty.
         let _ = std::fs::remove_dir("/var/run/cdi");
     }
 }
 
-/// Makes the directory `models`, with a link in it that leads to something beside it that is nobody's business.
-pub fn lay_out(models: &Path) -> Verdict {
+/// Creates the directory `models`, with a symbolic link to a file outside of it that must stay unreachable.
+pub fn create_models(models: &Path) -> Verdict {
     std::fs::create_dir_all(models)?;
     std::fs::write(models.join("net.bin"), "weights")?;
     let secret = models.with_file_name("secret");
@@ -66,12 +66,13 @@ pub fn lay_out(models: &Path) -> Verdict {
     Ok(())
 }
 
-/// The volume, the device and the way out are there, and no more than they. The way out is to this listener.
-pub fn are_there_and_no_more(robot: &mut Robot, listener: &TcpListener) -> Verdict {
+/// Checks that the volume, the device and the egress address can be used, and nothing beyond them. The egress address
+/// is that of `listener`.
+pub fn check_grants(robot: &mut Robot, listener: &TcpListener) -> Verdict {
     let port = listener.local_addr()?.port();
     let other = TcpListener::bind("127.0.0.1:0")?;
     let mut can = |what: &str, argument: &str| -> anyhow::Result<bool> {
-        Ok(tries(robot, what, argument)?.succeeded)
+        Ok(try_attempt(robot, what, argument)?.succeeded)
     };
     ensure!(
         can("text-in-file", "/models/net.bin weights")?,

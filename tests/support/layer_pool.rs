@@ -1,6 +1,6 @@
-//! Layers that one push of a run has made are linked into the homes of later ones: sixty stories push the same few packages into homes of
-//! their own, and unpacking half a gigabyte for each is most of what they would do. A push finds the layers in its store, as it does when
-//! something is pushed a second time; everything else about it is as it was.
+//! Shares layers between the homes of a run by hard links: sixty stories push the same few packages into homes of their
+//! own, and unpacking half a gigabyte each time would be most of their work. A push finds the layers in its store, as
+//! if the same package had been pushed before; everything else about it is unchanged.
 
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -11,10 +11,11 @@ use std::sync::{Mutex, PoisonError};
 use crate::story;
 use crate::world::world;
 
-/// Stories of these modules are about how layers are made, kept and removed, or about a disk with little room.
+/// Modules whose stories do without the pool, because they are about the creation, storage and removal of layers, or
+/// about small disks.
 const APART: [&str; 5] = ["bounds::", "images::", "push::", "refusals::", "survival::"];
 
-/// Layers by what was pushed, as names in the pool.
+/// Names of the layers in the pool, by what was pushed.
 static KNOWN: Mutex<Option<HashMap<String, HashSet<String>>>> = Mutex::new(None);
 
 /// A push into a home that has no layers yet.
@@ -25,7 +26,8 @@ pub(crate) struct FirstPush {
 }
 
 impl FirstPush {
-    /// Links what is known of such a push into the home. None where the home has layers, or the story does without.
+    /// Links the known layers of such a push into the home. Returns `None` if the home has layers, or if the story does
+    /// without the pool.
     pub(crate) fn begin(home: &Path, arguments: &[&str]) -> Option<FirstPush> {
         let telling = story::current()?;
         let is_apart = APART.iter().any(|module| telling.name.starts_with(module));
@@ -43,12 +45,12 @@ impl FirstPush {
             .cloned();
         drop(known);
         for layer in layers.into_iter().flatten() {
-            link_layer(&pool(), home, &layer);
+            link_layer(&pool_directory(), home, &layer);
         }
         Some(push)
     }
 
-    /// Keeps the layers of the home for the next push of the same.
+    /// Keeps the layers of the home for later pushes of the same package.
     pub(crate) fn keep(self) {
         let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
         let known = known.get_or_insert_default();
@@ -57,18 +59,18 @@ impl FirstPush {
         }
         let layers = list_layers(&self.home);
         for layer in &layers {
-            link_layer(&self.home, &pool(), layer);
+            link_layer(&self.home, &pool_directory(), layer);
         }
         known.insert(self.key, layers);
     }
 }
 
-/// A store's directories, laid out as in a home.
-fn pool() -> PathBuf {
+/// Returns the directory of the pool, which is laid out like the stores in a home.
+fn pool_directory() -> PathBuf {
     world().place().join("layer-pool")
 }
 
-/// What is pushed, without how: the package's directory, or the word behind `--apt`.
+/// Identifies what is pushed, independent of other arguments: the package's directory, or the word after `--apt`.
 fn find_key(arguments: &[&str]) -> Option<String> {
     let at = arguments.iter().position(|word| *word == "push")?;
     let apt = arguments.iter().position(|word| *word == "--apt");
@@ -77,19 +79,20 @@ fn find_key(arguments: &[&str]) -> Option<String> {
     Some(name.to_string_lossy().into_owned())
 }
 
-/// Names of extracted layers.
+/// Returns the names of extracted layers.
 fn list_layers(home: &Path) -> HashSet<String> {
     let entries = fs::read_dir(home.join("layers"))
         .into_iter()
         .flatten()
         .flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
-    // The digest of a layer, in hexadecimal; a tree that is being written has another name.
+    // The digest of a layer in hexadecimal; a tree that is being written has a longer name.
     let is_layer = |name: &String| name.len() == 64;
     names.filter(is_layer).collect()
 }
 
-/// Links a layer's blob, record and tree, in the order in which a store makes them. Where something is missing, the push makes the layer.
+/// Links a layer's blob, record and tree, in the order in which a store creates them. If anything is missing, the push
+/// creates the layer itself.
 fn link_layer(from: &Path, to: &Path, layer: &str) {
     let record = format!("layers/{layer}.json");
     let text = fs::read(from.join(&record)).unwrap_or_default();

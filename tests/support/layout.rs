@@ -1,21 +1,21 @@
-//! Messages written by hand in the format of either ROS.
+//! Messages serialized by hand in the format of either version of ROS.
 
 use bytes::{BufMut, Bytes, BytesMut};
 use ros::bus::{RosVersion, WireFormat};
 
-/// A message that is being written.
-pub struct Layout {
+/// A message under construction.
+pub struct MessageLayout {
     format: WireFormat,
     out: BytesMut,
 }
 
-/// In CDR, numbers are aligned from behind this header (little endian).
+/// CDR aligns numbers relative to the end of this header (little endian).
 const HEADER: [u8; 4] = [0, 1, 0, 0];
 
-impl Layout {
-    /// Of this ROS, empty.
-    pub fn of(version: RosVersion) -> Self {
-        let format = WireFormat::of(version);
+impl MessageLayout {
+    /// Creates an empty message for this version of ROS.
+    pub fn new(version: RosVersion) -> Self {
+        let format = WireFormat::for_version(version);
         let mut out = BytesMut::new();
         if format == WireFormat::Cdr {
             out.put_slice(&HEADER);
@@ -31,34 +31,34 @@ impl Layout {
         }
     }
 
-    /// A byte.
+    /// Appends a byte.
     pub fn u8(&mut self, value: u8) -> &mut Self {
         self.out.put_u8(value);
         self
     }
 
-    /// Four bytes.
+    /// Appends a 32-bit integer.
     pub fn u32(&mut self, value: u32) -> &mut Self {
         self.align(4);
         self.out.put_u32_le(value);
         self
     }
 
-    /// A float of four bytes.
+    /// Appends a 32-bit float.
     pub fn f32(&mut self, value: f32) -> &mut Self {
         self.align(4);
         self.out.put_f32_le(value);
         self
     }
 
-    /// A float of eight bytes.
+    /// Appends a 64-bit float.
     pub fn f64(&mut self, value: f64) -> &mut Self {
         self.align(8);
         self.out.put_f64_le(value);
         self
     }
 
-    /// A text.
+    /// Appends a string.
     pub fn text(&mut self, text: &str) -> &mut Self {
         let end = usize::from(self.format == WireFormat::Cdr);
         self.u32(length(text.len() + end));
@@ -67,14 +67,14 @@ impl Layout {
         self
     }
 
-    /// Bytes of which the number is told.
+    /// Appends bytes, preceded by their number.
     pub fn bytes(&mut self, bytes: &[u8]) -> &mut Self {
         self.u32(length(bytes.len()));
         self.out.put_slice(bytes);
         self
     }
 
-    /// A std_msgs/Header that is stamped with a number, in seconds.
+    /// Appends a std_msgs/Header whose stamp is `number` seconds.
     pub fn header(&mut self, number: u32, frame: &str) -> &mut Self {
         if self.format == WireFormat::Ros1 {
             self.u32(number);
@@ -82,22 +82,22 @@ impl Layout {
         self.u32(number).u32(0).text(frame)
     }
 
-    /// A moment, in nanoseconds since 1970.
+    /// Appends a time, given in nanoseconds since 1970.
     pub fn time(&mut self, at: i64) -> &mut Self {
         let part = |part: i64| u32::try_from(part).unwrap_or(0);
         self.u32(part(at / 1_000_000_000))
             .u32(part(at % 1_000_000_000))
     }
 
-    /// A std_msgs/Header of that moment.
-    pub fn header_of(&mut self, at: i64, frame: &str) -> &mut Self {
+    /// Appends a std_msgs/Header with this time.
+    pub fn header_at(&mut self, at: i64, frame: &str) -> &mut Self {
         if self.format == WireFormat::Ros1 {
             self.u32(0);
         }
         self.time(at).text(frame)
     }
 
-    /// What was written.
+    /// Returns the message.
     pub fn finish(&mut self) -> Bytes {
         std::mem::take(&mut self.out).freeze()
     }

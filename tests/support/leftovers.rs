@@ -1,4 +1,4 @@
-//! What stays behind when everything has ended: nothing may.
+//! Finds leftovers after everything has ended; there should be none.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,8 +7,8 @@ use nix::mount::{MntFlags, umount2};
 
 use crate::procfs;
 
-/// Describes processes and mounts that refer to what is in `home`. Empty when all is clean.
-pub fn of(home: &Path) -> Vec<String> {
+/// Describes processes and mounts that refer to files in `home`; empty if there are none.
+pub fn find_leftovers(home: &Path) -> Vec<String> {
     let mut found: Vec<String> = processes_of(home)
         .into_iter()
         .map(|pid| {
@@ -24,7 +24,7 @@ pub fn of(home: &Path) -> Vec<String> {
     found
 }
 
-/// Processes that were started with a path of `home`, work in it, or have something below it mounted.
+/// Returns processes that have a path below `home` in their command line, as working directory or as mount.
 pub fn processes_of(home: &Path) -> Vec<i32> {
     let own = std::process::id() as i32;
     let namespace = procfs::namespace(own, "mnt");
@@ -35,7 +35,7 @@ pub fn processes_of(home: &Path) -> Vec<i32> {
         let mounted = fs::read_to_string(format!("/proc/{pid}/mountinfo")).unwrap_or_default();
         command.contains(&home)
             || directory.starts_with(&home)
-            // Whoever shares this namespace sees the same mounts, and need not use them.
+            // Processes in this mount namespace see the same mounts without using them.
             || (procfs::namespace(*pid, "mnt") != namespace && mounted.contains(&format!("{home}/")))
     };
     procfs::pids()
@@ -45,14 +45,14 @@ pub fn processes_of(home: &Path) -> Vec<i32> {
         .collect()
 }
 
-/// Detaches what is mounted below a directory in this mount namespace, the innermost first.
+/// Detaches all mounts below a directory in this mount namespace, the innermost first.
 pub fn unmount_below(directory: &Path) {
     for mount in mounts_below(directory).iter().rev() {
         let _ = umount2(mount, MntFlags::MNT_DETACH);
     }
 }
 
-/// Mount points below `home` in this mount namespace, in the order in which they were mounted (proc(5), field 5 of `mountinfo`).
+/// Returns the mount points below `home` in this mount namespace, in mount order (proc(5), field 5 of `mountinfo`).
 fn mounts_below(home: &Path) -> Vec<PathBuf> {
     let mounts = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
     mounts
@@ -62,7 +62,7 @@ fn mounts_below(home: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Cgroup directories whose name says that they are a servant's.
+/// Returns the cgroup directories that are named after these servants.
 pub fn cgroups(ids: &[String]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut pending = vec![PathBuf::from("/sys/fs/cgroup")];

@@ -1,5 +1,5 @@
-//! What stories are told with: a daemon of their own or the one they share, a deployer who types commands, a
-//! robot on a WebSocket, and an eye for what is left behind.
+//! Tools of the stories: a daemon of their own or the shared one, a deployer who runs commands, a robot on a WebSocket,
+//! and checks for leftovers.
 
 pub mod acme;
 pub mod binaries;
@@ -41,18 +41,18 @@ use anyhow::bail;
 
 use crate::patience::{Deadline, describe_slowness};
 
-/// Between two looks at what no event tells of.
+/// Polling interval.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// What a story ends with: an error is told with all its causes.
+/// Result of a story; an error is printed with all its causes.
 pub type Verdict = anyhow::Result<()>;
 
-/// Looks again and again, with a pause, until there is a value. What is found instead becomes the story's failure after
+/// Polls `look` until it returns a value. What it returned instead becomes the story's error after
 /// [`patience::patience`].
 ///
 /// # Errors
-/// When looking fails, and when time is up.
-pub fn until<T>(
+/// If `look` fails, or if the time is up.
+pub fn wait_until<T>(
     what: &str,
     mut look: impl FnMut() -> anyhow::Result<Result<T, String>>,
 ) -> anyhow::Result<T> {

@@ -1,5 +1,5 @@
-//! A robot's own file system: Debian with its ROS, made once for all stories by mmdebstrap. Each machine writes to a
-//! layer of its own, and runs commands in a mount namespace that ends with them.
+//! File system of a robot: Debian with ROS, created once for all stories by mmdebstrap. Each machine writes to an
+//! overlay of its own, and runs commands in a mount namespace that ends with them.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -10,12 +10,12 @@ use nix::fcntl::{Flock, FlockArg};
 
 use crate::binaries;
 use crate::daemon::Daemon;
-use crate::deployer::{Outcome, path_str, run};
+use crate::deployer::{CommandOutcome, path_str, run};
 use crate::patience::patience;
 use crate::world::{Directory, world};
 
-/// What robots have: the tools that find and start nodes, three shells, a package with its original nodes, and what
-/// makes a network with names.
+/// Debian packages of a robot: tools that find and start nodes, three shells, a package with its original nodes, and
+/// tools for networks with name resolution.
 const PACKAGES: [&str; 18] = [
     "python3-roslaunch",
     "python3-rosmaster",
@@ -36,7 +36,7 @@ const PACKAGES: [&str; 18] = [
     "dnsmasq-base",
     "avahi-daemon",
 ];
-/// Launch files and package.xml are in this one; its dependencies are of no use here.
+/// Package with the launch files and package.xml; it is unpacked without its dependencies, which are of no use here.
 const UNPACKED: &str = "libopencv-apps-dev";
 const SUITE: &str = "bookworm";
 
@@ -47,7 +47,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// A new one, with ROS below `/usr` and `opencv_apps` installed.
+    /// Creates a machine with ROS below `/usr` and `opencv_apps` installed.
     pub fn new() -> anyhow::Result<Machine> {
         let own = world().directory("machine")?;
         for name in ["upper", "work", "root"] {
@@ -56,28 +56,28 @@ impl Machine {
         Ok(Machine { base: base()?, own })
     }
 
-    /// A new one with a stub of `service` unpacked in `/root`, fetched from where a robot would fetch it.
+    /// Creates a machine with a stub of `service` unpacked in `/root`, fetched as a robot would fetch it.
     pub fn with_stub(daemon: &Daemon, service: &str) -> anyhow::Result<Machine> {
         let machine = Machine::new()?;
         let place = world().directory("stub")?;
         let (address, directory) = (format!("http://{}", daemon.address), path_str(place.path()));
         let words = ["--server", &address, "stub", service, "-o", directory];
-        daemon.deployer().types(&words)?.succeeded()?;
-        machine.unpacks(&place.path().join(format!("{service}.tar.gz")))?;
+        daemon.deployer().run(&words)?.expect_success()?;
+        machine.unpack(&place.path().join(format!("{service}.tar.gz")))?;
         Ok(machine)
     }
 
-    /// Where a file that was written in it is, seen from here.
-    pub fn written(&self, path: &str) -> PathBuf {
+    /// Returns the host path of a file that was written in it.
+    pub fn host_path(&self, path: &str) -> PathBuf {
         self.own
             .path()
             .join("upper")
             .join(path.trim_start_matches('/'))
     }
 
-    /// Copies a file of this machine to an absolute path, with this mode.
-    pub fn puts(&self, file: &Path, to: &str, mode: u32) -> anyhow::Result<()> {
-        let to = self.written(to);
+    /// Copies a file of this host to an absolute path in the machine, with this mode.
+    pub fn install_file(&self, file: &Path, to: &str, mode: u32) -> anyhow::Result<()> {
+        let to = self.host_path(to);
         std::fs::create_dir_all(to.parent().context("a directory")?)?;
         std::fs::copy(file, &to)?;
         Ok(std::fs::set_permissions(
@@ -86,27 +86,27 @@ impl Machine {
         )?)
     }
 
-    /// Writes a file of this machine.
-    pub fn puts_text(&self, to: &str, text: &str) -> anyhow::Result<()> {
-        let to = self.written(to);
+    /// Writes a file in the machine.
+    pub fn write_file(&self, to: &str, text: &str) -> anyhow::Result<()> {
+        let to = self.host_path(to);
         std::fs::create_dir_all(to.parent().context("a directory")?)?;
         Ok(std::fs::write(to, text)?)
     }
 
     /// Installs the original of `teller_py` below `/usr`.
-    pub fn has_teller(&self) -> anyhow::Result<()> {
+    pub fn install_teller(&self) -> anyhow::Result<()> {
         let package = binaries::package("teller_py");
         for (file, to, mode) in [
             ("scripts/teller.py", "/usr/lib/teller_py/teller.py", 0o755),
             ("package.xml", "/usr/share/teller_py/package.xml", 0o644),
         ] {
-            self.puts(&package.join(file), to, mode)?;
+            self.install_file(&package.join(file), to, mode)?;
         }
         Ok(())
     }
 
-    /// Unpacks an archive of a stub in `/root`.
-    pub fn unpacks(&self, archive: &Path) -> anyhow::Result<()> {
+    /// Unpacks the archive of a stub in `/root`.
+    pub fn unpack(&self, archive: &Path) -> anyhow::Result<()> {
         let bytes = std::fs::read(archive)?;
         let home = self.own.path().join("upper/root");
         std::fs::create_dir_all(&home)?;
@@ -114,9 +114,9 @@ impl Machine {
         Ok(())
     }
 
-    /// Runs a script in a shell (`sh`, `bash` or `zsh`), as root at home. `$PATIENCE` says how many seconds it is to wait for what must
-    /// come.
-    pub fn runs(&self, shell: &str, script: &str) -> anyhow::Result<Outcome> {
+    /// Runs a script in a shell (`sh`, `bash` or `zsh`), as root in its home directory. `$PATIENCE` is the number of
+    /// seconds to wait for anything.
+    pub fn run_script(&self, shell: &str, script: &str) -> anyhow::Result<CommandOutcome> {
         let own = self.own.path();
         run(Command::new("unshare")
             .args(["--mount", "--propagation", "private", "sh", "-euc", INSIDE])
@@ -128,13 +128,13 @@ impl Machine {
     }
 }
 
-/// A port that nobody listens on now, for a Master of a script's own.
+/// Returns a port that is currently unused, for a Master of a script.
 pub fn free_port() -> anyhow::Result<u16> {
     let listener = std::net::TcpListener::bind(("127.0.0.1", 0))?;
     Ok(listener.local_addr()?.port())
 }
 
-/// Ends whatever the script started: its process namespace ends with it.
+/// Shell script that runs the command in a pid namespace, so that all its processes end with it.
 const INSIDE: &str = r#"
 mount -t overlay overlay -o "lowerdir=$BASE,upperdir=$OWN/upper,workdir=$OWN/work" "$OWN/root"
 mount --bind /dev "$OWN/root/dev"
@@ -146,7 +146,7 @@ exec unshare --pid --fork --kill-child sh -euc '
     sh -c "cd; exec \"\$@\"" sh "$1" -c "$2"' inside "$@"
 "#;
 
-/// The file system that all share, named by what it is made of.
+/// Returns the shared file system, named after a hash of its contents' description; it is created if missing.
 pub fn base() -> anyhow::Result<PathBuf> {
     let cache = std::env::var_os("XDG_CACHE_HOME")
         .map(PathBuf::from)
@@ -168,9 +168,10 @@ pub fn base() -> anyhow::Result<PathBuf> {
         std::fs::remove_dir_all(&half)?;
     }
     let unpack = format!(
-        "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED} && dpkg -x {UNPACKED}_*.deb / && rm {UNPACKED}_*.deb'"
+        "chroot \"$1\" sh -c 'cd /tmp && apt-get download -qq {UNPACKED} && dpkg -x {UNPACKED}_*.deb / && rm \
+         {UNPACKED}_*.deb'"
     );
-    // What mmdebstrap mounts is seen by nobody else, and gone when it is killed.
+    // Mounts of mmdebstrap are invisible to others, and disappear when it is killed.
     let made = run(Command::new("unshare")
         .args([
             "--mount",
@@ -189,7 +190,7 @@ pub fn base() -> anyhow::Result<PathBuf> {
         .arg(format!("--customize-hook={unpack}"))
         .arg(SUITE)
         .arg(&half))?;
-    ensure!(made.status == 0, "{}", made.said());
+    ensure!(made.status == 0, "{}", made.output());
     std::fs::rename(&half, &base)?;
     Ok(base)
 }

@@ -1,6 +1,6 @@
-//! A ROS system in memory that behaves as ROS 2 does: ends are matched by type and quality of service, definitions do not
-//! travel, actions are its own, parameters belong to nodes, and there are no services of other systems. Whoever uses a bus
-//! must not notice.
+//! A ROS system in memory that behaves like ROS 2: endpoints are matched by type and quality of service, definitions
+//! are not exchanged, actions are native, parameters belong to nodes, and there are no services of other systems. The
+//! users of a bus should not notice the difference.
 
 #[path = "memory_bus/parameters.rs"]
 mod parameters;
@@ -14,15 +14,16 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, ActionHandler, ActionNodes, ActionServer, Bus, BusError, CallFate, Digest,
-    GoalEnd, GoalEvents, Graph, Matched, Message, MessageSender, NodeEnds, NodeParameters, Outcome,
-    ParamValue, Peer, PeerId, Publisher, Qos, Refusal, Reliability, RosVersion, ServiceHandler,
-    ServiceType, Subscription, TopicNodes, WireFormat, WireType, message_queue,
+    GoalEnd, GoalEvents, GoalOutcome, Graph, IncompatiblePeer, MatchedPeers, MessageSender,
+    NodeEntities, NodeParameters, ParamValue, PeerId, Publisher, QosProfile, QosReliability,
+    RosVersion, SerializedMessage, ServiceHandler, ServiceType, Subscription, TopicNodes,
+    TopicPeer, WireFormat, WireType, message_queue,
 };
 use ros::schema::ActionDef;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-/// All nodes, and what they have registered.
+/// All nodes, and their registrations.
 #[derive(Default)]
 pub struct MemorySystem {
     state: Mutex<State>,
@@ -33,20 +34,20 @@ pub struct MemorySystem {
 struct State {
     numbers: u128,
     nodes: BTreeSet<String>,
-    /// Node → its parameters.
+    /// Parameters by node.
     parameters: BTreeMap<String, BTreeMap<String, ParamValue>>,
     topics: BTreeMap<String, Topic>,
     services: BTreeMap<String, Service>,
     actions: BTreeMap<String, Action>,
-    /// Services that nodes may call, by number: the node, the name and the type.
+    /// Clients of services, by number: node, service and type.
     clients: BTreeMap<u128, (String, String, ServiceType)>,
-    /// Who is told of changes of parameters.
+    /// Receivers of parameter events.
     watchers: parameters::Watchers,
 }
 
 #[derive(Default)]
 struct Topic {
-    /// Its ends are not the same any more, and have not been told.
+    /// True if its endpoints have changed since the last notification.
     changed: bool,
     publishers: Vec<Publication>,
     subscribers: Vec<Listener>,
@@ -55,18 +56,18 @@ struct Topic {
 struct Publication {
     id: PeerId,
     of: Arc<WireType>,
-    qos: Qos,
+    qos: QosProfile,
     last: Option<Bytes>,
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
 }
 
 struct Listener {
     id: PeerId,
     of: WireType,
-    /// What publishers must offer; of a bus it is a wish, of other nodes it is not.
-    demanded: Option<Qos>,
+    /// Quality of service that publishers must offer; `None` for a bus, for which it is only a preference.
+    demanded: Option<QosProfile>,
     messages: MessageSender,
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
 }
 
 struct Service {
@@ -79,62 +80,64 @@ struct Service {
 #[derive(Default)]
 struct Action {
     type_name: String,
-    /// Who serves it, if anybody does.
+    /// The server, if there is one.
     server: Option<(u128, String, Arc<dyn ActionHandler>)>,
     clients: BTreeMap<u128, String>,
-    /// Goals under way, with their client's number and who hears of them.
+    /// Goals in progress, with the number of their client and the receiver of their events.
     goals: HashMap<String, (u128, Arc<dyn GoalEvents>)>,
 }
 
-/// In the words of the real bus.
-fn profile(qos: &Qos) -> &'static str {
+/// Names the quality of service as the real bus does.
+fn profile(qos: &QosProfile) -> &'static str {
     match (qos.reliability, qos.is_latching()) {
-        (Reliability::Reliable, false) => "reliable, volatile",
-        (Reliability::Reliable, true) => "reliable, transient_local",
-        (Reliability::BestEffort, false) => "best_effort, volatile",
-        (Reliability::BestEffort, true) => "best_effort, transient_local",
+        (QosReliability::Reliable, false) => "reliable, volatile",
+        (QosReliability::Reliable, true) => "reliable, transient_local",
+        (QosReliability::BestEffort, false) => "best_effort, volatile",
+        (QosReliability::BestEffort, true) => "best_effort, transient_local",
     }
 }
 
 impl Publication {
-    /// What a node publishes itself is not brought back to it.
+    /// Returns whether the publisher belongs to another node: a node does not receive its own publications.
     fn is_beside(&self, listener: &Listener) -> bool {
         self.id.node() != listener.id.node()
     }
 
     fn is_of_type(&self, listener: &Listener) -> bool {
         let named = listener.of.name == "*" || listener.of.name == self.of.name;
-        named && self.of.agrees(&listener.of)
+        named && self.of.is_compatible_with(&listener.of)
     }
 
-    /// What a listener demands that is not offered.
+    /// Returns which demand of the listener the publisher does not meet.
     fn lacks(&self, listener: &Listener) -> Option<String> {
-        let demanded = listener.demanded.filter(Qos::is_latching)?;
+        let demanded = listener.demanded.filter(QosProfile::is_latching)?;
         let offers_less = demanded.durability != self.qos.durability;
         offers_less.then(|| {
             format!(
-                "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: {}; subscriber: {})",
+                "durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: {}; \
+                 subscriber: {})",
                 profile(&self.qos),
                 profile(&demanded)
             )
         })
     }
 
-    /// Why nothing passes to that listener, from the side of one of both.
+    /// Returns why nothing passes to the listener, as seen from one of both sides.
     fn refuses(&self, listener: &Listener, theirs: &WireType, ours: &WireType) -> Option<String> {
-        match self.is_of_type(listener) {
-            true => self.lacks(listener),
-            false => Some(format!("its type is {theirs} there and {ours} here")),
+        if self.is_of_type(listener) {
+            self.lacks(listener)
+        } else {
+            Some(format!("its type is {theirs} there and {ours} here"))
         }
     }
 
-    /// What of this end's goes to that one.
+    /// Returns whether publications of this endpoint reach the listener.
     fn reaches(&self, listener: &Listener) -> bool {
         self.is_beside(listener) && self.is_of_type(listener) && self.lacks(listener).is_none()
     }
 
-    fn message(&self, bytes: Bytes) -> Message {
-        Message {
+    fn message(&self, bytes: Bytes) -> SerializedMessage {
+        SerializedMessage {
             bytes,
             wire_type: self.of.clone(),
             publisher: self.id.clone(),
@@ -144,24 +147,24 @@ impl Publication {
 }
 
 impl Topic {
-    /// Tells all ends who is at the other.
+    /// Notifies all endpoints of their matches.
     fn show(&self) {
-        let tell = |end: &watch::Sender<Matched>, now: Matched| {
+        let tell = |end: &watch::Sender<MatchedPeers>, now: MatchedPeers| {
             end.send_if_modified(|before| std::mem::replace(before, now.clone()) != now);
         };
-        let add = |matched: &mut Matched, id: &PeerId, refusal: Option<String>| match refusal {
-            None => matched.peers.push(Peer {
+        let add = |matched: &mut MatchedPeers, id: &PeerId, refusal: Option<String>| match refusal {
+            None => matched.peers.push(TopicPeer {
                 id: id.clone(),
                 connected: true,
                 offer: None,
             }),
-            Some(why) => matched.refused.push(Refusal {
+            Some(why) => matched.refused.push(IncompatiblePeer {
                 peer: id.clone(),
                 why,
             }),
         };
         for publisher in &self.publishers {
-            let mut now = Matched::default();
+            let mut now = MatchedPeers::default();
             let others = self.subscribers.iter();
             for other in others.filter(|other| publisher.is_beside(other)) {
                 let refusal = publisher.refuses(other, &other.of, &publisher.of);
@@ -170,7 +173,7 @@ impl Topic {
             tell(&publisher.matched, now);
         }
         for listener in &self.subscribers {
-            let mut now = Matched::default();
+            let mut now = MatchedPeers::default();
             let others = self.publishers.iter();
             for other in others.filter(|other| other.is_beside(listener)) {
                 let refusal = other.refuses(listener, &other.of, &listener.of);
@@ -241,9 +244,9 @@ impl State {
 }
 
 impl State {
-    /// What each node has. What is no demand asks for nothing.
-    fn ends(&self) -> BTreeMap<String, NodeEnds> {
-        let mut all: BTreeMap<String, NodeEnds> = BTreeMap::new();
+    /// Returns the endpoints of each node. A quality of service that is not demanded counts as requesting nothing.
+    fn ends(&self) -> BTreeMap<String, NodeEntities> {
+        let mut all: BTreeMap<String, NodeEntities> = BTreeMap::new();
         for (name, topic) in &self.topics {
             for publisher in &topic.publishers {
                 let ends = all.entry(publisher.id.node().to_owned()).or_default();
@@ -252,9 +255,9 @@ impl State {
             }
             for listener in &topic.subscribers {
                 let ends = all.entry(listener.id.node().to_owned()).or_default();
-                let nothing = Qos {
-                    reliability: Reliability::BestEffort,
-                    ..Qos::keep_last(1)
+                let nothing = QosProfile {
+                    reliability: QosReliability::BestEffort,
+                    ..QosProfile::keep_last(1)
                 };
                 let end = (listener.of.clone(), listener.demanded.unwrap_or(nothing));
                 ends.subscribers.insert(name.clone(), end);
@@ -273,7 +276,7 @@ impl State {
 }
 
 impl MemorySystem {
-    /// A node of this name.
+    /// Joins as a node of this name.
     pub fn join(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
         self.change(|state| state.nodes.insert(node.to_owned()));
         Arc::new(MemoryBus {
@@ -283,7 +286,7 @@ impl MemorySystem {
         })
     }
 
-    /// A node that hears those publishers alone that offer what it asks for.
+    /// Joins as a node that only receives from publishers that offer the requested quality of service.
     #[allow(dead_code, reason = "who includes this file need not have such nodes")]
     pub fn join_demanding(self: &Arc<Self>, node: &str) -> Arc<MemoryBus> {
         self.change(|state| state.nodes.insert(node.to_owned()));
@@ -294,7 +297,7 @@ impl MemorySystem {
         })
     }
 
-    /// Changes what is registered, and tells it.
+    /// Changes the registrations and notifies the observers.
     fn change<T>(&self, by: impl FnOnce(&mut State) -> T) -> T {
         let mut state = self.state.lock();
         let done = by(&mut state);
@@ -316,7 +319,7 @@ impl MemorySystem {
 pub struct MemoryBus {
     system: Arc<MemorySystem>,
     node: String,
-    /// What it asks of publishers is no wish.
+    /// True if its requests to publishers are requirements.
     demands: bool,
 }
 
@@ -330,7 +333,7 @@ impl Drop for MemoryBus {
     }
 }
 
-/// Undoes a registration when it is dropped.
+/// Undoes a registration on drop.
 struct Guard(Option<Box<dyn FnOnce() + Send + Sync>>);
 
 impl Drop for Guard {
@@ -347,7 +350,7 @@ impl MemoryBus {
         Guard(Some(Box::new(move || drop(system.change(undo)))))
     }
 
-    /// From now on it is seen that this node may call a service, until the guard is dropped.
+    /// Registers that this node may call a service, until the guard is dropped.
     #[allow(dead_code, reason = "who includes this file need not have such nodes")]
     pub fn seek(&self, service: &str, of: ServiceType) -> Box<dyn Send + Sync> {
         let number = self.system.change(|state| {
@@ -372,7 +375,7 @@ struct MemoryPublisher {
     system: Arc<MemorySystem>,
     topic: String,
     id: PeerId,
-    matched: watch::Receiver<Matched>,
+    matched: watch::Receiver<MatchedPeers>,
     _guard: Guard,
 }
 
@@ -392,7 +395,7 @@ impl Publisher for MemoryPublisher {
         }
     }
 
-    fn matched(&self) -> watch::Receiver<Matched> {
+    fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
         self.matched.clone()
     }
 }
@@ -419,10 +422,10 @@ impl Bus for MemoryBus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
         let (sender, messages) = message_queue(qos.depth);
-        let (end, matched) = watch::channel(Matched::default());
+        let (end, matched) = watch::channel(MatchedPeers::default());
         let id = self.system.change(|state| {
             let id = PeerId::new(self.node.as_str(), state.number());
             let topic = state.topics.entry(topic.to_owned()).or_default();
@@ -451,7 +454,7 @@ impl Bus for MemoryBus {
             }
         });
         Ok(Subscription {
-            dropped: messages.dropped(),
+            dropped: messages.drop_counter(),
             messages,
             matched,
             guard: Box::new(guard),
@@ -462,9 +465,9 @@ impl Bus for MemoryBus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError> {
-        let (end, matched) = watch::channel(Matched::default());
+        let (end, matched) = watch::channel(MatchedPeers::default());
         let id = self.system.change(|state| {
             let id = PeerId::new(self.node.as_str(), state.number());
             let topic = state.topics.entry(topic.to_owned()).or_default();
@@ -505,7 +508,7 @@ impl Bus for MemoryBus {
         patience: Duration,
     ) -> Result<Bytes, BusError> {
         let (of, handler) = self.served(service)?;
-        if !of.digest.agrees(digest) {
+        if !of.digest.is_compatible_with(digest) {
             return Err(BusError::TypeMismatch {
                 what: format!("service {service}"),
                 theirs: format!("{} {}", of.name, of.digest),
@@ -583,7 +586,7 @@ impl Bus for MemoryBus {
         let number = self.system.change(|state| {
             let number = state.number();
             let known = state.actions.entry(action.to_owned()).or_default();
-            // What it is, its server says.
+            // The type is determined by the server.
             if known.server.is_none() {
                 known.type_name.clone_from(&of.name);
             }
@@ -640,14 +643,14 @@ impl MemoryClient {
 
 #[async_trait]
 impl ActionClient for MemoryClient {
-    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError> {
         let mut graph = self.system.graph.subscribe();
         let served = |graph: &Arc<Graph>| {
             let action = graph.actions.get(&self.action);
             action.is_some_and(|action| !action.servers.is_empty())
         };
         match timeout(patience, graph.wait_for(served)).await {
-            Ok(Ok(graph)) => match graph.other_action(&self.action, &self.type_name) {
+            Ok(Ok(graph)) => match graph.action_type_mismatch(&self.action, &self.type_name) {
                 Some(other) => Err(other),
                 None => Ok(()),
             },
@@ -659,9 +662,9 @@ impl ActionClient for MemoryClient {
         }
     }
 
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
         let Some(server) = self.server() else {
-            return events.ended(Err(format!("action server {} is gone", self.action)));
+            return events.on_ended(Err(format!("action server {} is gone", self.action)));
         };
         {
             let mut state = self.system.state.lock();
@@ -670,31 +673,31 @@ impl ActionClient for MemoryClient {
                 .goals
                 .insert(id.to_owned(), (self.number, events.clone()));
         }
-        let taken = server.goal(id, goal);
+        let taken = server.on_goal(id, goal);
         if let Err(text) = taken {
             let mut state = self.system.state.lock();
             let action = state.actions.entry(self.action.clone()).or_default();
             action.goals.remove(id);
             drop(state);
-            events.ended(Ok(GoalEnd {
-                outcome: Outcome::Rejected,
+            events.on_ended(Ok(GoalEnd {
+                outcome: GoalOutcome::Rejected,
                 text,
                 result: Bytes::new(),
             }));
         } else {
-            events.accepted();
+            events.on_accepted();
         }
     }
 
-    fn cancel(&self, id: &str) {
+    fn cancel_goal(&self, id: &str) {
         let under_way = {
             let state = self.system.state.lock();
             let action = state.actions.get(&self.action);
             action.and_then(|action| Some(action.goals.get(id)?.1.clone()))
         };
         if let Some((server, events)) = self.server().zip(under_way) {
-            events.cancel_answered(true);
-            server.cancel(id);
+            events.on_cancel_response(true);
+            server.on_cancel(id);
         }
     }
 }
@@ -713,7 +716,7 @@ impl Drop for MemoryClient {
         });
         for id in gone {
             if let Some(server) = &server {
-                server.cancel(&id);
+                server.on_cancel(&id);
             }
         }
     }
@@ -726,7 +729,7 @@ struct MemoryServer {
 }
 
 impl ActionServer for MemoryServer {
-    fn feedback(&self, id: &str, feedback: Bytes) -> bool {
+    fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
         let events = {
             let state = self.system.state.lock();
             let action = state.actions.get(&self.action);
@@ -734,14 +737,14 @@ impl ActionServer for MemoryServer {
         };
         match events {
             Some(events) => {
-                events.feedback(feedback);
+                events.on_feedback(feedback);
                 true
             }
             None => false,
         }
     }
 
-    fn end(&self, id: &str, end: GoalEnd) -> bool {
+    fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
         let goal = {
             let mut state = self.system.state.lock();
             let action = state.actions.get_mut(&self.action);
@@ -749,7 +752,7 @@ impl ActionServer for MemoryServer {
         };
         match goal {
             Some((_, events)) => {
-                events.ended(Ok(end));
+                events.on_ended(Ok(end));
                 true
             }
             None => false,
@@ -769,7 +772,7 @@ impl Drop for MemoryServer {
             Some(std::mem::take(&mut action.goals))
         });
         for (_, events) in left.unwrap_or_default().into_values() {
-            events.ended(Err(format!("action server {} is gone", self.action)));
+            events.on_ended(Err(format!("action server {} is gone", self.action)));
         }
     }
 }

@@ -1,4 +1,5 @@
-//! A component container in memory: it has some classes, and a node for each that it was asked to load.
+//! A component container in memory, with some classes, which creates a node for each component that it is asked to
+//! load.
 
 use std::sync::Arc;
 
@@ -12,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::memory_bus::{MemoryBus, MemorySystem};
 
-/// What an image has of `composition_interfaces`.
+/// Definitions of `composition_interfaces` from an image.
 pub const DEFINITIONS: [(&str, &str); 4] = [
     (
         "rcl_interfaces/msg/ParameterValue",
@@ -36,21 +37,21 @@ pub const DEFINITIONS: [(&str, &str); 4] = [
     ),
 ];
 
-/// Definitions by which nodes are loaded.
+/// Returns a registry with the definitions for loading components.
 pub fn registry() -> Arc<Registry> {
     let all = DEFINITIONS.map(|(key, text)| (key.to_owned(), text.to_owned()));
-    let registry = Registry::of_definitions(RosVersion::Two, &all.into());
+    let registry = Registry::with_definitions(RosVersion::Two, &all.into());
     Arc::new(registry.expect("valid"))
 }
 
-/// What was asked of it, as JSON, and which nodes it has.
+/// Requests that it received, as JSON, and its nodes.
 #[derive(Default)]
 pub struct Loaded {
     pub asked: Vec<Value>,
     pub nodes: Vec<(String, Arc<MemoryBus>)>,
 }
 
-/// A container that runs.
+/// A running container.
 pub struct MemoryContainer {
     pub loaded: Arc<Mutex<Loaded>>,
     _node: Arc<MemoryBus>,
@@ -58,7 +59,8 @@ pub struct MemoryContainer {
 }
 
 impl MemoryContainer {
-    /// The node `name`, which can load classes that end in `Talker`; a talker that is told no name is `/talker`.
+    /// Starts the container as the node `name`. It can load classes that end in `Talker`; a talker without a name
+    /// becomes `/talker`.
     pub async fn start(system: &Arc<MemorySystem>, name: &str) -> Self {
         let (node, registry) = (system.join(name), registry());
         let loaded = Arc::<Mutex<Loaded>>::default();
@@ -74,7 +76,7 @@ impl MemoryContainer {
                 loaded: Arc::clone(&loaded),
             };
             let service = format!("{name}/_container/{part}");
-            let served = node.serve(&service, ServiceType::of(&of), Arc::new(handler));
+            let served = node.serve(&service, ServiceType::from_service(&of), Arc::new(handler));
             serving.push(served.await.expect("served"));
         }
         Self {
@@ -84,7 +86,7 @@ impl MemoryContainer {
         }
     }
 
-    /// Names of the nodes that it has loaded.
+    /// Returns the names of the loaded nodes.
     pub fn names(&self) -> Vec<String> {
         let loaded = self.loaded.lock();
         loaded.nodes.iter().map(|(name, _)| name.clone()).collect()
@@ -93,7 +95,7 @@ impl MemoryContainer {
 
 impl Drop for MemoryContainer {
     fn drop(&mut self) {
-        // Nodes leave the system by themselves: not within what else leaves it.
+        // Nodes lock the system when they leave it, so they are dropped without holding a lock.
         let nodes = std::mem::take(&mut self.loaded.lock().nodes);
         drop(nodes);
     }

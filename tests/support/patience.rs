@@ -1,11 +1,11 @@
-//! How long stories wait: in working time, which passes the more slowly the busier the machine is. What would be there in
-//! a second where nothing else runs takes five where five threads want each core, or where somebody waits for the disk
-//! for four seconds of five; no story is to fail for that.
+//! Time limits of stories, in working time, which passes more slowly the busier the machine is. What takes a second on
+//! an idle machine takes five if five threads compete for each core, or if something waits for the disk four seconds
+//! out of five; stories should not fail because of that.
 //!
 //! ```text
-//!  /proc/loadavg      threads that run or want to, for each core ─┐
-//!  a thread that asks to be woken: how much later it is           ├─▶ how busy (1 to 8) ─▶ working time ─▶ deadlines
-//!  /proc/pressure     time that passed waiting for disk or memory ┘
+//!  /proc/loadavg      running and runnable threads per core       ─┐
+//!  a sleeping thread  how much later than requested it wakes up    ├─▶ busyness (1 to 8) ─▶ working time ─▶ deadlines
+//!  /proc/pressure     time spent waiting for disk or memory       ─┘
 //! ```
 
 use std::fs;
@@ -25,55 +25,56 @@ use anyhow::{Context, anyhow, bail};
 
 use crate::evidence;
 
-/// The working time that a story waits for what must come. Long: only a story that fails waits so long.
+/// Working time that a story waits for anything. Long, because only a failing story waits that long.
 const LONG: Duration = Duration::from_secs(120);
-/// No machine is taken for busier than this: else a story that fails would hold up all others for an hour.
+/// Upper limit of the busyness; otherwise a failing story would delay all others for an hour.
 const BUSIEST: f64 = 8.0;
-/// Between two looks at how busy the machine is.
+/// Sampling interval of the busyness.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// What one look counts beside all before it: threads come and go between two looks, and some twenty of these tell a load.
+/// Weight of a sample in the moving average: threads come and go between samples, and about twenty samples are
+/// representative of the load.
 const SHARE: f64 = 0.1;
-/// Calls that take no deadline wait so long at a time, so that a deadline is looked at in between.
+/// Maximum duration of a blocking call without a deadline, so that a deadline is checked in between.
 const SLICE: Duration = Duration::from_secs(1);
-/// Programs of the stories find here how many seconds they are to wait.
+/// Environment variable with the number of seconds that programs of the stories should wait.
 const VARIABLE: &str = "STORY_PATIENCE";
 
-static METER: LazyLock<&'static Meter> = LazyLock::new(Meter::begin);
+static METER: LazyLock<&'static LoadMeter> = LazyLock::new(LoadMeter::begin);
 
-/// What is known of the machine.
-struct Meter {
-    /// Working time since the first look, in nanoseconds.
+/// The measured load of the machine.
+struct LoadMeter {
+    /// Working time since the first sample, in nanoseconds.
     worked: AtomicU64,
-    /// How busy it is and was at most: the bits of a number from 1 on.
+    /// Current and maximum busyness: the bits of a number of at least 1.
     busy: AtomicU64,
     busiest: AtomicU64,
 }
 
-impl Meter {
-    /// Starts the thread that looks; it ends with the process.
-    fn begin() -> &'static Meter {
-        let meter: &Meter = Box::leak(Box::new(Meter {
+impl LoadMeter {
+    /// Starts the measuring thread; it ends with the process.
+    fn begin() -> &'static LoadMeter {
+        let meter: &LoadMeter = Box::leak(Box::new(LoadMeter {
             worked: AtomicU64::new(0),
             busy: AtomicU64::new(1_f64.to_bits()),
             busiest: AtomicU64::new(1_f64.to_bits()),
         }));
         thread::Builder::new()
             .name("patience".to_owned())
-            .spawn(|| meter.look_for_ever())
+            .spawn(|| meter.measure_forever())
             .expect("a thread");
         meter
     }
 
-    fn look_for_ever(&self) {
+    fn measure_forever(&self) {
         let cores = thread::available_parallelism().map_or(1, NonZero::get) as f64;
         let mut stalled = sum_stalls();
         let mut looked = Instant::now();
-        // What runs when the first story begins is known before that waits for anything.
+        // The load at the start of the first story is known before that story waits for anything.
         let mut busy =
             count_runnable().map_or(1.0, |threads| (threads / cores).clamp(1.0, BUSIEST));
         loop {
             self.busy.store(busy.to_bits(), Ordering::Relaxed);
-            // Numbers that are not negative are ordered as their bits are.
+            // Non-negative floats have the same order as their bits.
             self.busiest.fetch_max(busy.to_bits(), Ordering::Relaxed);
             thread::sleep(LOOK_EVERY);
             let passed = looked.elapsed();
@@ -85,7 +86,7 @@ impl Meter {
             let moved = 1.0 - (stood.as_secs_f64() / passed.as_secs_f64()).min(1.0);
             let now = (wanted.max(late).max(1.0) / moved.max(1.0 / BUSIEST)).min(BUSIEST);
             busy += (now - busy) * SHARE;
-            // A look that comes late, since this thread found no core either, counts at once.
+            // A late sample, which means that this thread lacked a core as well, counts immediately.
             let slowly = busy.max(late.min(BUSIEST));
             let worked = passed.as_secs_f64() / slowly;
             self.worked
@@ -93,20 +94,20 @@ impl Meter {
         }
     }
 
-    fn worked(&self) -> Duration {
+    fn working_time(&self) -> Duration {
         Duration::from_nanos(self.worked.load(Ordering::Relaxed))
     }
 }
 
-/// Returns how many threads of this machine run or want to, but for the one that asks (proc_loadavg(5)).
+/// Returns the number of running and runnable threads of this machine, except the calling one (proc_loadavg(5)).
 fn count_runnable() -> Option<f64> {
     let text = fs::read_to_string("/proc/loadavg").ok()?;
     let (running, _) = text.split_whitespace().nth(3)?.split_once('/')?;
     Some((running.parse::<f64>().ok()? - 1.0).max(0.0))
 }
 
-/// Returns for how long since the machine has started somebody waited for the disk, or all for memory
-/// (Documentation/accounting/psi.rst); of a kernel that does not count it, no time.
+/// Returns the time since boot during which some task waited for the disk, or all tasks for memory
+/// (Documentation/accounting/psi.rst); zero if the kernel does not count it.
 fn sum_stalls() -> Duration {
     let total = |what: &str, line: &str| -> Option<u64> {
         let text = fs::read_to_string(format!("/proc/pressure/{what}")).ok()?;
@@ -117,71 +118,71 @@ fn sum_stalls() -> Duration {
     Duration::from_micros(waited)
 }
 
-/// Returns how busy the machine is: 1 where whatever wants a core has one, 2 where it takes twice as long.
+/// Returns the busyness of the machine: 1 if every runnable thread has a core, 2 if everything takes twice as long.
 pub fn busyness() -> f64 {
     f64::from_bits(METER.busy.load(Ordering::Relaxed))
 }
 
-/// Returns how busy the machine was at most since somebody first waited.
+/// Returns the maximum busyness since the first wait.
 pub fn busiest() -> f64 {
     f64::from_bits(METER.busiest.load(Ordering::Relaxed))
 }
 
-/// Returns what takes `time` where nothing else runs, as long as it takes now.
+/// Scales a duration on an idle machine to the present load.
 pub fn scale(time: Duration) -> Duration {
     time.mul_f64(busyness())
 }
 
-/// Returns whole seconds as they are now, for settings of programs whose own times a busy machine would not keep.
+/// Scales whole seconds to the present load, for settings of programs that do not adapt to a busy machine themselves.
 pub fn scale_seconds(seconds: u64) -> u64 {
     scale(Duration::from_secs(seconds)).as_secs_f64().ceil() as u64
 }
 
-/// Returns how long a story waits, for calls that take one limit. Where there is a loop, a [`Deadline`] is better: it
-/// follows the machine while it waits.
+/// Returns how long a story waits, for calls with a fixed timeout. In a loop a [`Deadline`] is preferable, because it
+/// follows the load during the wait.
 pub fn patience() -> Duration {
     scale(LONG)
 }
 
-/// Tells a program of the stories how long it is to wait.
+/// Tells a program of the stories how long to wait, by an environment variable.
 pub fn tell_patience(command: &mut Command) -> &mut Command {
     command.env(VARIABLE, patience().as_secs().to_string())
 }
 
-/// An end of waiting.
+/// A deadline in working time.
 #[derive(Debug, Clone, Copy)]
 pub struct Deadline {
-    /// Of the working time.
+    /// Working time at the deadline.
     end: Duration,
 }
 
 impl Deadline {
-    /// Returns the one of whatever must come.
+    /// Returns the default deadline.
     pub fn begin() -> Self {
         Self::begin_for(LONG)
     }
 
-    /// Returns the one of something that takes so many times as long.
+    /// Returns a deadline for something that takes `times` times as long.
     pub fn begin_many(times: u32) -> Self {
         Self::begin_for(LONG * times)
     }
 
-    /// Returns one after so much working time.
+    /// Returns a deadline after this working time.
     pub fn begin_for(time: Duration) -> Self {
         Self {
-            end: METER.worked() + time,
+            end: METER.working_time() + time,
         }
     }
 
-    /// Says whether all the time is over.
+    /// Returns whether the deadline has passed.
     pub fn is_over(&self) -> bool {
-        METER.worked() >= self.end
+        METER.working_time() >= self.end
     }
 
-    /// Fails with these words once the time is over.
+    /// Fails with the message of `instead` if the deadline has passed.
     ///
     /// # Errors
-    /// Then.
+    /// If the deadline has passed.
     pub fn check(&self, instead: impl FnOnce() -> String) -> anyhow::Result<()> {
         if self.is_over() {
             evidence::note_machine();
@@ -190,10 +191,10 @@ impl Deadline {
         Ok(())
     }
 
-    /// Waits for something that is not waited for longer than this.
+    /// Awaits a future, but not beyond the deadline.
     ///
     /// # Errors
-    /// When the time is over.
+    /// If the deadline has passed.
     pub async fn limit<F: Future>(self, future: F) -> anyhow::Result<F::Output> {
         let mut future = std::pin::pin!(future);
         loop {
@@ -209,7 +210,7 @@ impl Deadline {
     }
 }
 
-/// Says how busy the machine is, for who reads that something did not come.
+/// Describes the load of the machine, for messages about timeouts.
 pub fn describe_slowness() -> String {
     format!(
         "the machine is {:.1} times as slow as it can be",
@@ -217,18 +218,18 @@ pub fn describe_slowness() -> String {
     )
 }
 
-/// Waits for something, as long as a story waits.
+/// Awaits a future, within the time limit of a story.
 ///
 /// # Errors
-/// When it does not come.
+/// If the time limit is exceeded.
 pub async fn wait_for<F: Future>(future: F) -> anyhow::Result<F::Output> {
     Deadline::begin().limit(future).await
 }
 
-/// Waits for the next of what another thread says.
+/// Waits for the next message of another thread.
 ///
 /// # Errors
-/// When nothing comes, and when the other thread has ended.
+/// If nothing arrives in time, or if the other thread has ended.
 pub fn receive<T>(said: &Receiver<T>) -> anyhow::Result<T> {
     let deadline = Deadline::begin();
     loop {
@@ -242,36 +243,36 @@ pub fn receive<T>(said: &Receiver<T>) -> anyhow::Result<T> {
     }
 }
 
-/// A connection that can be told when to stop waiting.
-pub trait Timed {
-    /// Sets how long one read waits.
+/// A connection with a read timeout.
+pub trait ReadTimeout {
+    /// Sets the timeout of a read.
     fn set_patience(&self, time: Option<Duration>) -> io::Result<()>;
 }
 
-impl Timed for TcpStream {
+impl ReadTimeout for TcpStream {
     fn set_patience(&self, time: Option<Duration>) -> io::Result<()> {
         self.set_read_timeout(time)
     }
 }
 
-impl Timed for UnixStream {
+impl ReadTimeout for UnixStream {
     fn set_patience(&self, time: Option<Duration>) -> io::Result<()> {
         self.set_read_timeout(time)
     }
 }
 
-/// A connection each read of which waits as long as a story does, unless it is told another time.
+/// A connection whose reads have the time limit of a story, unless another one is set.
 #[derive(Debug)]
-pub struct Patient<S> {
+pub struct PatientStream<S> {
     stream: S,
     is_limited: bool,
 }
 
-impl<S: Timed> Patient<S> {
-    /// Wraps one.
+impl<S: ReadTimeout> PatientStream<S> {
+    /// Wraps a connection.
     ///
     /// # Errors
-    /// Where the kernel sets no time.
+    /// If the timeout cannot be set.
     pub fn new(stream: S) -> io::Result<Self> {
         stream.set_patience(Some(SLICE))?;
         Ok(Self {
@@ -280,13 +281,13 @@ impl<S: Timed> Patient<S> {
         })
     }
 
-    /// Has reads wait no longer than this, or again as long as a story does.
+    /// Sets the time limit of reads; `None` restores the limit of a story.
     ///
     /// # Errors
-    /// Where the kernel sets no time.
+    /// If the timeout cannot be set.
     pub fn limit(&mut self, time: Option<Duration>) -> io::Result<()> {
         self.is_limited = time.is_some();
-        // No time at all would be time without an end.
+        // A timeout of zero would mean none.
         let time = time.map_or(SLICE, |time| time.max(Duration::from_millis(1)));
         self.stream.set_patience(Some(time))
     }
@@ -297,7 +298,7 @@ impl<S: Timed> Patient<S> {
     }
 }
 
-impl<S: Read> Read for Patient<S> {
+impl<S: Read> Read for PatientStream<S> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let deadline = Deadline::begin();
         loop {
@@ -309,7 +310,7 @@ impl<S: Read> Read for Patient<S> {
     }
 }
 
-impl<S: Write> Write for Patient<S> {
+impl<S: Write> Write for PatientStream<S> {
     fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
         self.stream.write(buffer)
     }
@@ -319,9 +320,9 @@ impl<S: Write> Write for Patient<S> {
     }
 }
 
-/// Says whether nothing came in time, which is all that it says of the connection.
+/// Returns whether an error only means that nothing arrived in time.
 pub(crate) fn is_slow(error: &io::Error) -> bool {
-    // A signal, such as a child's end, ends a read as well.
+    // A signal, such as SIGCHLD, interrupts a read as well.
     let of_waiting = [
         ErrorKind::WouldBlock,
         ErrorKind::TimedOut,
@@ -330,11 +331,11 @@ pub(crate) fn is_slow(error: &io::Error) -> bool {
     of_waiting.contains(&error.kind())
 }
 
-/// Connects to a server of this machine.
+/// Connects to a server on this machine.
 ///
 /// # Errors
-/// Where nobody listens.
-pub fn connect(address: &str) -> anyhow::Result<Patient<TcpStream>> {
+/// If nobody listens.
+pub fn connect(address: &str) -> anyhow::Result<PatientStream<TcpStream>> {
     let stream = TcpStream::connect(address).with_context(|| address.to_owned())?;
-    Patient::new(stream).map_err(|error| anyhow!("{address}: {error}"))
+    PatientStream::new(stream).map_err(|error| anyhow!("{address}: {error}"))
 }

@@ -1,26 +1,26 @@
-//! A robot whose camera asks people_detect, wherever that runs: in the cloud behind a cable, or on the robot. Of ROS 1 it is
-//! Debian's; of ROS 2 a package of ours does the same with pictures and stamps.
+//! A robot whose camera sends images to people_detect, wherever that runs: in the cloud behind a cable, or on the
+//! robot. For ROS 1 it is Debian's node; for ROS 2 a package of ours does the same with images and stamps.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros::bus::{Bus, Message, Publisher, Qos, RosVersion, Subscription, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, WireType};
 use ros::schema::MessageType;
 
 use crate::cable::Cable;
 use crate::daemon::Daemon;
-use crate::layout::Layout;
-use crate::site::{Running, Site};
-use crate::world::{PEOPLE, SEER, Service};
+use crate::layout::MessageLayout;
+use crate::site::{NodeProcess, Site};
+use crate::world::{PEOPLE, SEER, StoryService};
 
-/// What detects people in one ROS.
+/// The package that detects people in one version of ROS.
 struct Detector {
-    service: Service,
+    service: StoryService,
     package: &'static str,
     executable: &'static str,
     program: &'static str,
     argv: &'static [&'static str],
-    /// The variable on which workspaces stand.
+    /// Environment variable that lists workspaces.
     workspaces: &'static str,
 }
 
@@ -49,13 +49,13 @@ fn detector(version: RosVersion) -> &'static Detector {
     }
 }
 
-/// The service that is people_detect in this ROS.
-pub fn service(version: RosVersion) -> Service {
+/// Returns the service of people_detect for this version of ROS.
+pub fn service(version: RosVersion) -> StoryService {
     detector(version).service
 }
 
-/// Starts the stub of a service that is people_detect, with the original installed on the robot; `settings` are lines
-/// for `stub.toml`.
+/// Starts the stub of a people_detect service, with the original installed on the robot; `settings` are lines of
+/// `stub.toml`.
 pub fn stub(
     site: &Site,
     daemon: &Daemon,
@@ -63,10 +63,10 @@ pub fn stub(
     (service, robot): (&str, &str),
     settings: &str,
     environment: &[(&str, &str)],
-) -> anyhow::Result<Running> {
+) -> anyhow::Result<NodeProcess> {
     let of = detector(site.system.version());
     let original = (of.package, of.executable);
-    let workspace = site.installs_original(daemon, service, original, of.program)?;
+    let workspace = site.install_original(daemon, service, original, of.program)?;
     let workspace = workspace.to_string_lossy();
     let mut variables = vec![(of.workspaces, &*workspace), ("NO_COLOR", "1")];
     variables.extend(environment);
@@ -75,22 +75,22 @@ pub fn stub(
          request = \"/image -> /people_detect/found\"\n{settings}\n",
         cable.server
     );
-    site.stub_among(&variables, &toml, of.package, of.executable, of.argv)
+    site.start_stub_with_environment(&variables, &toml, of.package, of.executable, of.argv)
 }
 
-/// The same with a stub as its archive comes.
+/// Starts the stub installed from its archive.
 pub fn installed_stub(
     site: &Site,
     daemon: &Daemon,
     cable: &Cable,
     (service, robot): (&str, &str),
     settings: &str,
-) -> anyhow::Result<Running> {
+) -> anyhow::Result<NodeProcess> {
     let of = detector(site.system.version());
     let settings = format!("robot = \"{robot}\"\n{settings}\n");
-    let overlay = site.installs(daemon, service, &settings)?;
+    let overlay = site.install_stub(daemon, service, &settings)?;
     let original = (of.package, of.executable);
-    let workspace = site.installs_original(daemon, service, original, of.program)?;
+    let workspace = site.install_original(daemon, service, original, of.program)?;
     let server = format!("ws://{}", cable.server);
     let prefixes = format!("{}:{}", overlay.display(), workspace.display());
     let variables = [
@@ -98,39 +98,39 @@ pub fn installed_stub(
         ("CLOUDROID_SERVER", server.as_str()),
         ("NO_COLOR", "1"),
     ];
-    site.runs_among(&variables, &overlay, of.package, of.executable, of.argv)
+    site.start_installed_with_environment(&variables, &overlay, of.package, of.executable, of.argv)
 }
 
-/// Starts the original of ROS 1 alone.
-pub fn original(site: &Site, daemon: &Daemon, service: &str) -> anyhow::Result<Running> {
-    site.original(daemon, service, DEBIANS.program, DEBIANS.argv)
+/// Starts only the original, of ROS 1.
+pub fn original(site: &Site, daemon: &Daemon, service: &str) -> anyhow::Result<NodeProcess> {
+    site.start_original(daemon, service, DEBIANS.program, DEBIANS.argv)
 }
 
-/// The robot's camera, and who listens to what was found.
-pub struct Camera {
-    // In the order in which they end.
-    /// What people_detect says.
+/// The robot's camera, and the subscriber to the results.
+pub struct PeopleCamera {
+    // Fields are in the order in which they must be dropped.
+    /// Results of people_detect.
     pub found: Subscription,
-    /// Pictures.
+    /// Publisher of the images.
     pub image: Box<dyn Publisher>,
-    /// Their node.
+    /// Node of both.
     pub node: Arc<dyn Bus>,
 }
 
-impl Camera {
-    /// Before a node that was started, and that it waits for; so many pictures may wait for it.
+impl PeopleCamera {
+    /// Waits for a node that was started before; `queue` is the number of images that may be queued for it.
     pub fn new(site: &Site, queue: usize) -> anyhow::Result<Self> {
-        let node = site.joins("/camera")?;
-        let found = site.hears(&node, "/people_detect/found")?;
+        let node = site.join("/camera")?;
+        let found = site.subscribe(&node, "/people_detect/found")?;
         let of = image_type_of(site.system.version())?;
-        let image = node.advertise("/image", of, Qos::keep_last(queue));
+        let image = node.advertise("/image", of, QosProfile::keep_last(queue));
         let image = site.runtime.block_on(image)?;
-        site.connected(&*image, 1)?;
+        site.wait_for_subscribers(&*image, 1)?;
         Ok(Self { found, image, node })
     }
 }
 
-/// Of `sensor_msgs/Image`.
+/// Returns the type `sensor_msgs/Image`.
 pub fn image_type() -> WireType {
     WireType::new(
         "sensor_msgs/Image",
@@ -139,41 +139,41 @@ pub fn image_type() -> WireType {
     )
 }
 
-/// The same in either ROS.
+/// Returns the type `sensor_msgs/Image` for either version of ROS.
 pub fn image_type_of(version: RosVersion) -> anyhow::Result<WireType> {
     type_of(version, "sensor_msgs/Image", IMAGE)
 }
 
-/// A type whose first definition is `text`, and that contains a header and nothing else of others.
+/// Returns a type with the definition `text`, which may contain a header and no other types.
 pub fn type_of(version: RosVersion, name: &str, text: &str) -> anyhow::Result<WireType> {
     let (name, header) = match version {
         RosVersion::One => (name.to_owned(), HEADER),
         RosVersion::Two => (name.replacen('/', "/msg/", 1), HEADER_TWO),
     };
-    let of = MessageType::of_full_text(version, &name, &format!("{text}{header}"))?;
-    Ok(WireType::of(&of))
+    let of = MessageType::parse_full_text(version, &name, &format!("{text}{header}"))?;
+    Ok(WireType::from_message(&of))
 }
 
-/// A `sensor_msgs/Image` of ROS 1 in bgr8, stamped with its number.
+/// Serializes a `sensor_msgs/Image` of ROS 1 in bgr8, whose stamp is its number.
 pub fn picture(number: u32, size: (u32, u32), pixels: &[u8]) -> Bytes {
     picture_of(RosVersion::One, number, size, pixels)
 }
 
-/// The same of either ROS.
+/// Serializes a `sensor_msgs/Image` for either version of ROS.
 pub fn picture_of(
     version: RosVersion,
     number: u32,
     (width, height): (u32, u32),
     pixels: &[u8],
 ) -> Bytes {
-    let mut out = Layout::of(version);
+    let mut out = MessageLayout::new(version);
     out.header(number, "camera").u32(height).u32(width);
     out.text("bgr8").u8(0).u32(width * 3).bytes(pixels).finish()
 }
 
-/// The number of the picture that a message answers: of ROS 1 the stamp stands behind a number of four bytes, of ROS 2 behind
-/// CDR's header of as many.
-pub fn number(message: &Message) -> Option<u32> {
+/// Returns the number of the image that a message answers: the stamp follows a sequence number of four bytes in ROS 1,
+/// and the CDR header of four bytes in ROS 2.
+pub fn number(message: &SerializedMessage) -> Option<u32> {
     let word = message.bytes.get(4..8)?.try_into().ok()?;
     Some(u32::from_le_bytes(word))
 }

@@ -1,16 +1,16 @@
-//! What the kernel says of processes.
+//! Information about processes from the kernel.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::PathBuf;
 
-/// The fields of `/proc/PID/status`; none when the process is gone.
+/// Returns the fields of `/proc/PID/status`; `None` if the process is gone.
 pub fn status(pid: i32) -> Option<BTreeMap<String, String>> {
     let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     Some(fields(&text))
 }
 
-/// Fields of a `status`, each at a line of its own.
+/// Parses the fields of a `status` file, one per line.
 pub fn fields(status: &str) -> BTreeMap<String, String> {
     let fields = status.lines().filter_map(|line| line.split_once(':'));
     fields
@@ -18,7 +18,7 @@ pub fn fields(status: &str) -> BTreeMap<String, String> {
         .collect()
 }
 
-/// The command line, arguments separated by spaces.
+/// Returns the command line, with arguments separated by spaces.
 pub fn command_line(pid: i32) -> Option<String> {
     let bytes = fs::read(format!("/proc/{pid}/cmdline")).ok()?;
     Some(
@@ -29,7 +29,7 @@ pub fn command_line(pid: i32) -> Option<String> {
     )
 }
 
-/// All processes, by pid.
+/// Returns the pids of all processes.
 pub fn pids() -> Vec<i32> {
     fs::read_dir("/proc")
         .expect("/proc")
@@ -37,7 +37,7 @@ pub fn pids() -> Vec<i32> {
         .collect()
 }
 
-/// The identity of a namespace of a process, such as `net:[4026531840]`.
+/// Returns the identity of a namespace of a process, such as `net:[4026531840]`.
 pub fn namespace(pid: i32, kind: &str) -> Option<String> {
     Some(
         fs::read_link(format!("/proc/{pid}/ns/{kind}"))
@@ -47,13 +47,13 @@ pub fn namespace(pid: i32, kind: &str) -> Option<String> {
     )
 }
 
-/// Tells if a process is there and has not ended: one that nobody has reaped yet has.
+/// Returns whether a process exists and is not a zombie.
 pub fn is_running(pid: i32) -> bool {
     let state = status(pid).and_then(|status| status.get("State").cloned());
     state.is_some_and(|state| !state.starts_with(['Z', 'X']))
 }
 
-/// Directories of a process's cgroups, in the hierarchies as hybrid hosts mount them.
+/// Returns the directories of a process's cgroups, in the hierarchies as mounted on hybrid hosts.
 pub fn cgroups(pid: i32) -> Vec<PathBuf> {
     let text = fs::read_to_string(format!("/proc/{pid}/cgroup")).unwrap_or_default();
     text.lines()
@@ -76,7 +76,7 @@ pub fn cgroups(pid: i32) -> Vec<PathBuf> {
         .collect()
 }
 
-/// These processes with their children, the children's children, and so on.
+/// Returns these processes with all their descendants.
 pub fn with_descendants(pids: &[i32]) -> Vec<i32> {
     let parents: Vec<(i32, i32)> = self::pids()
         .into_iter()
@@ -97,7 +97,7 @@ pub fn with_descendants(pids: &[i32]) -> Vec<i32> {
     all
 }
 
-/// The process that started this one, the one that started that, and so on.
+/// Returns the parent of a process, its parent, and so on.
 pub fn ancestors(pid: i32) -> Vec<i32> {
     let parent = |pid: &i32| -> Option<i32> {
         let parent = status(*pid)?.get("PPid")?.parse().ok()?;

@@ -1,4 +1,5 @@
-//! An identity provider (npm `oidc-provider`, tests/robots/identity_provider.mjs), and browsers of people who sign in by it.
+//! An OpenID identity provider (npm `oidc-provider`, tests/robots/identity_provider.mjs), and browsers that sign in
+//! through it.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -9,61 +10,61 @@ use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 
 use crate::binaries;
-use crate::daemon::{Daemon, Setup};
+use crate::daemon::{Daemon, DaemonSetup};
 use crate::deployer::{path_str, run};
 use crate::machine::free_port;
 use crate::patience::patience;
 use crate::world::{Directory, world};
 
-/// What it shares with the daemon.
+/// Client secret shared with the daemon.
 pub const SECRET: &str = "forty-two-white-elephants-in-a-row";
 
-/// What its groups may do, unless a story says something else.
+/// Default roles of its groups.
 pub const ROLES: &str = "robot-admins = \"admin\", builders = { role = \"deployer\", services = [\"build_*\"] }, \
                          students = { role = \"viewer\", services = [\"lab_*\"] }";
 
-/// A provider for one daemon: the address of each is the other's configuration.
-pub struct Provider {
+/// A provider for one daemon; each is configured with the other's address.
+pub struct StoryIdentityProvider {
     port: u16,
     daemon: u16,
-    /// Where the portal answers.
+    /// URL of the portal.
     portal: String,
     place: Directory,
     running: Option<Child>,
-    /// Which key it signs by.
+    /// Number of its current signing key.
     key: u32,
     claims_in: &'static str,
     secrets: Arc<Mutex<Vec<String>>>,
 }
 
-impl Provider {
-    /// One that answers, and tells what it knows of people where it is asked for (userinfo).
-    pub fn start() -> anyhow::Result<Provider> {
-        let mut provider = Provider::that_is_down()?;
-        provider.comes_up()?;
+impl StoryIdentityProvider {
+    /// Starts a provider that returns claims from the userinfo endpoint.
+    pub fn start() -> anyhow::Result<StoryIdentityProvider> {
+        let mut provider = StoryIdentityProvider::new_stopped()?;
+        provider.bring_up()?;
         Ok(provider)
     }
 
-    /// One that tells it in the ID token.
-    pub fn with_claims_in_the_token() -> anyhow::Result<Provider> {
-        let mut provider = Provider::that_is_down()?;
+    /// Starts a provider that returns claims in the ID token.
+    pub fn with_token_claims() -> anyhow::Result<StoryIdentityProvider> {
+        let mut provider = StoryIdentityProvider::new_stopped()?;
         provider.claims_in = "token";
-        provider.comes_up()?;
+        provider.bring_up()?;
         Ok(provider)
     }
 
-    /// One of a portal that speaks TLS.
-    pub fn of_a_portal_with_tls() -> anyhow::Result<Provider> {
-        let mut provider = Provider::that_is_down()?;
+    /// Starts a provider for a portal with TLS.
+    pub fn for_tls_portal() -> anyhow::Result<StoryIdentityProvider> {
+        let mut provider = StoryIdentityProvider::new_stopped()?;
         provider.portal = format!("https://localhost:{}", provider.daemon);
-        provider.comes_up()?;
+        provider.bring_up()?;
         Ok(provider)
     }
 
-    /// One that is not there yet.
-    pub fn that_is_down() -> anyhow::Result<Provider> {
+    /// Creates a provider that is not running.
+    pub fn new_stopped() -> anyhow::Result<StoryIdentityProvider> {
         let daemon = free_port()?;
-        Ok(Provider {
+        Ok(StoryIdentityProvider {
             port: free_port()?,
             portal: format!("http://127.0.0.1:{daemon}"),
             daemon,
@@ -75,18 +76,18 @@ impl Provider {
         })
     }
 
-    /// Where it answers. By another name than the portal: to browsers they are two sites.
+    /// Returns its URL. The host name differs from the portal's, so that browsers treat them as two sites.
     pub fn issuer(&self) -> String {
         format!("http://localhost:{}", self.port)
     }
 
-    /// Where the portal answers.
+    /// Returns the URL of the portal.
     pub fn portal(&self) -> String {
         self.portal.clone()
     }
 
     /// Starts it.
-    pub fn comes_up(&mut self) -> anyhow::Result<()> {
+    pub fn bring_up(&mut self) -> anyhow::Result<()> {
         let mut child = Command::new("node")
             .arg(binaries::checkout().join("tests/robots/identity_provider.mjs"))
             .arg(self.port.to_string())
@@ -118,22 +119,22 @@ impl Provider {
         Ok(())
     }
 
-    /// Ends it.
-    pub fn goes_down(&mut self) {
+    /// Stops it.
+    pub fn shut_down(&mut self) {
         if let Some(mut child) = self.running.take() {
             let _ = child.kill();
             let _ = child.wait();
         }
     }
 
-    /// Comes up with another key.
-    pub fn signs_by_another_key(&mut self) -> anyhow::Result<()> {
-        self.goes_down();
+    /// Restarts it with another signing key.
+    pub fn restart_with_new_key(&mut self) -> anyhow::Result<()> {
+        self.shut_down();
         self.key += 1;
-        self.comes_up()
+        self.bring_up()
     }
 
-    fn turns(&self, knobs: &Value) -> anyhow::Result<()> {
+    fn set_knobs(&self, knobs: &Value) -> anyhow::Result<()> {
         let url = format!("{}/knobs", self.issuer());
         let turned = Command::new("curl")
             .args(["--silent", "--fail", "--data", &knobs.to_string(), &url])
@@ -142,17 +143,17 @@ impl Provider {
         Ok(())
     }
 
-    /// Who signs in next.
-    pub fn knows(&self, who: &str) -> anyhow::Result<()> {
-        self.turns(&json!({"who": who, "wrong": ""}))
+    /// Sets the user who signs in next.
+    pub fn set_user(&self, who: &str) -> anyhow::Result<()> {
+        self.set_knobs(&json!({"who": who, "wrong": ""}))
     }
 
-    /// What is wrong from now on.
-    pub fn does_wrong(&self, wrong: &str) -> anyhow::Result<()> {
-        self.turns(&json!({"wrong": wrong}))
+    /// Sets the fault that it shows from now on.
+    pub fn set_fault(&self, wrong: &str) -> anyhow::Result<()> {
+        self.set_knobs(&json!({"wrong": wrong}))
     }
 
-    /// Tokens that it has given out.
+    /// Returns the tokens that it has issued.
     pub fn secrets(&self) -> Vec<String> {
         self.secrets
             .lock()
@@ -160,13 +161,13 @@ impl Provider {
             .unwrap_or_default()
     }
 
-    /// A daemon whose people it knows, with these roles.
-    pub fn setup(&self, name: &str, roles: &str) -> anyhow::Result<Setup> {
-        self.setup_with(world().own(name), roles)
+    /// Returns a new daemon setup that uses this provider, with these roles.
+    pub fn setup(&self, name: &str, roles: &str) -> anyhow::Result<DaemonSetup> {
+        self.setup_with(world().setup(name), roles)
     }
 
-    /// The same, of a home that there is.
-    pub fn setup_with(&self, setup: Setup, roles: &str) -> anyhow::Result<Setup> {
+    /// Extends a daemon setup to use this provider, with these roles.
+    pub fn setup_with(&self, setup: DaemonSetup, roles: &str) -> anyhow::Result<DaemonSetup> {
         let secret = self.place.path().join("secret");
         std::fs::write(&secret, format!("{SECRET}\n"))?;
         let closed = std::os::unix::fs::PermissionsExt::from_mode(0o600);
@@ -174,7 +175,8 @@ impl Provider {
         Ok(setup
             .listen(&format!("127.0.0.1:{}", self.daemon))
             .config(&format!(
-                "[oidc]\nissuer = \"{}\"\nname = \"Lab login\"\nclient_id = \"cloudroid\"\nclient_secret_file = \"{}\"\n\
+                "[oidc]\nissuer = \"{}\"\nname = \"Lab login\"\nclient_id = \"cloudroid\"\nclient_secret_file \
+                 = \"{}\"\n\
                  redirect = \"{}\"\nscopes = [\"profile\", \"groups\"]\nroles = {{ {roles} }}\n",
                 self.issuer(),
                 path_str(&secret),
@@ -182,9 +184,9 @@ impl Provider {
             )))
     }
 
-    /// A browser that has been nowhere yet.
-    pub fn browser(&self, name: &str) -> Browser {
-        Browser {
+    /// Returns a browser without cookies.
+    pub fn browser(&self, name: &str) -> CookieBrowser {
+        CookieBrowser {
             jar: self.place.path().join(format!("jar-{name}")),
             portal: self.portal(),
             authority: None,
@@ -192,34 +194,34 @@ impl Provider {
     }
 }
 
-impl Drop for Provider {
+impl Drop for StoryIdentityProvider {
     fn drop(&mut self) {
-        self.goes_down();
+        self.shut_down();
     }
 }
 
-/// What keeps cookies and follows redirects (curl).
-pub struct Browser {
+/// A browser that keeps cookies and follows redirects (curl).
+pub struct CookieBrowser {
     jar: PathBuf,
     portal: String,
-    /// By which the portal's certificate is checked.
+    /// CA certificate for the portal.
     authority: Option<PathBuf>,
 }
 
-/// What a browser has come to.
+/// Response to a browser's request.
 #[derive(Debug)]
-pub struct Visit {
-    /// Status of the last answer.
+pub struct PageVisit {
+    /// Status of the last response.
     pub status: u16,
-    /// Where it would send the browser on.
+    /// Target of its redirect.
     pub onward: String,
-    /// Its text.
+    /// Body of the last response.
     pub body: String,
 }
 
-impl Visit {
-    /// The same, if it was refused with these words.
-    pub fn refused(self, status: u16, words: &[&str]) -> anyhow::Result<Visit> {
+impl PageVisit {
+    /// Returns the response if it was refused with this status and these words, otherwise an error.
+    pub fn expect_refusal(self, status: u16, words: &[&str]) -> anyhow::Result<PageVisit> {
         ensure!(self.status == status, "not {status}: {self:?}");
         for word in words {
             ensure!(self.body.contains(word), "{word:?} is not in {self:?}");
@@ -228,22 +230,22 @@ impl Visit {
     }
 }
 
-impl Browser {
-    /// The same, which trusts a certificate.
-    pub fn trusting(self, authority: &Path) -> Browser {
-        Browser {
+impl CookieBrowser {
+    /// Returns a browser that trusts a CA certificate.
+    pub fn with_authority(self, authority: &Path) -> CookieBrowser {
+        CookieBrowser {
             authority: Some(authority.to_owned()),
             ..self
         }
     }
 
-    /// What it keeps, as curl writes it.
+    /// Returns the cookies in curl's format.
     pub fn cookies(&self) -> anyhow::Result<String> {
         Ok(std::fs::read_to_string(&self.jar)?)
     }
 
-    /// Asks as a browser does.
-    pub fn asks(&self, more: &[&str], url: &str) -> anyhow::Result<Visit> {
+    /// Sends a request.
+    pub fn request(&self, more: &[&str], url: &str) -> anyhow::Result<PageVisit> {
         let jar = path_str(&self.jar);
         let authority = self.authority.as_deref().map(path_str);
         let trusts = authority.map(|path| ["--cacert", path]);
@@ -255,33 +257,33 @@ impl Browser {
             .args(trusts.iter().flatten())
             .args(more)
             .arg(url))?
-        .succeeded()?;
+        .expect_success()?;
         let (body, last) = outcome.stdout.rsplit_once('\n').context("a status")?;
         let (status, onward) = last.split_once(' ').context("an address")?;
-        Ok(Visit {
+        Ok(PageVisit {
             status: status.parse()?,
             onward: onward.to_owned(),
             body: body.to_owned(),
         })
     }
 
-    /// Goes somewhere, and on to where it is sent.
-    pub fn goes(&self, path: &str) -> anyhow::Result<Visit> {
+    /// Opens a path of the portal and follows redirects.
+    pub fn visit(&self, path: &str) -> anyhow::Result<PageVisit> {
         let html = "Accept: text/html,application/xhtml+xml";
         let url = format!("{}{path}", self.portal);
-        self.asks(&["--location", "-H", html], &url)
+        self.request(&["--location", "-H", html], &url)
     }
 
-    /// Signs in by the provider.
-    pub fn signs_in(&self) -> anyhow::Result<Visit> {
-        self.goes("/api/v1/oidc/login")
+    /// Signs in through the provider.
+    pub fn sign_in(&self) -> anyhow::Result<PageVisit> {
+        self.visit("/api/v1/oidc/login")
     }
 
-    /// Signs in, up to where the provider sends it back: that address, to which it does not go.
-    pub fn signs_in_half(&self) -> anyhow::Result<String> {
+    /// Signs in up to the redirect back to the portal; returns its URL without opening it.
+    pub fn sign_in_until_callback(&self) -> anyhow::Result<String> {
         let mut url = format!("{}/api/v1/oidc/login", self.portal);
         for _ in 0..10 {
-            let visit = self.asks(&[], &url)?;
+            let visit = self.request(&[], &url)?;
             ensure!(visit.status == 302 || visit.status == 303, "{visit:?}");
             url = visit.onward;
             if url.contains("/api/v1/oidc/callback") {
@@ -291,15 +293,15 @@ impl Browser {
         anyhow::bail!("the provider sends the browser to and fro: {url}")
     }
 
-    /// Who is signed in.
+    /// Returns the session.
     pub fn session(&self) -> anyhow::Result<Value> {
-        let visit = self.goes("/api/v1/session")?;
+        let visit = self.visit("/api/v1/session")?;
         ensure!(visit.status == 200, "{visit:?}");
         Ok(serde_json::from_str(&visit.body)?)
     }
 
-    /// Who is signed in, by name and role.
-    pub fn is(&self, name: &str, role: &str) -> anyhow::Result<Value> {
+    /// Returns the session if this user with this role is signed in, otherwise an error.
+    pub fn expect_user(&self, name: &str, role: &str) -> anyhow::Result<Value> {
         let session = self.session()?;
         ensure!(
             session["name"] == name && session["role"] == role,
@@ -308,13 +310,13 @@ impl Browser {
         Ok(session)
     }
 
-    /// Whether nobody is.
+    /// Returns whether nobody is signed in.
     pub fn is_signed_out(&self) -> anyhow::Result<bool> {
         Ok(self.session()?["name"].is_null())
     }
 
-    /// Changes something, as the page does.
-    pub fn changes(&self, method: &str, path: &str) -> anyhow::Result<Visit> {
+    /// Sends a request that changes something, as the page does.
+    pub fn send_change(&self, method: &str, path: &str) -> anyhow::Result<PageVisit> {
         let csrf = self.session()?["csrf"]
             .as_str()
             .unwrap_or_default()
@@ -322,10 +324,10 @@ impl Browser {
         let origin = format!("Origin: {}", self.portal);
         let csrf = format!("X-CSRF-Token: {csrf}");
         let url = format!("{}{path}", self.portal);
-        self.asks(&["-X", method, "-H", &origin, "-H", &csrf], &url)
+        self.request(&["-X", method, "-H", &origin, "-H", &csrf], &url)
     }
 
-    /// What of its cookies is secret.
+    /// Returns the secret values of its cookies.
     pub fn secrets(&self) -> anyhow::Result<Vec<String>> {
         let jar = self.cookies()?;
         let ours = jar.lines().filter(|line| line.contains("cloudroid"));
@@ -334,15 +336,15 @@ impl Browser {
     }
 }
 
-/// Whether any of these stands in what a daemon has written.
-pub fn finds_no_secret(daemon: &Daemon, secrets: &[String]) -> anyhow::Result<()> {
+/// Fails if any of the secrets occurs in files or output of a daemon.
+pub fn expect_no_secret(daemon: &Daemon, secrets: &[String]) -> anyhow::Result<()> {
     let read = |path: &Path| -> anyhow::Result<String> {
         Ok(String::from_utf8_lossy(&std::fs::read(path)?).into_owned())
     };
     let audited = daemon
         .deployer()
-        .types(&["--format", "json", "audit"])?
-        .succeeded()?
+        .run(&["--format", "json", "audit"])?
+        .expect_success()?
         .stdout;
     let texts = [
         ("audit log", audited),

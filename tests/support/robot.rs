@@ -1,4 +1,4 @@
-//! A robot: a WebSocket client that speaks rosbridge as its protocol document says, with nothing of ours in it.
+//! A robot: a WebSocket client of rosbridge, written from the protocol's documentation without any of our code.
 
 use std::collections::VecDeque;
 use std::net::TcpStream;
@@ -10,16 +10,16 @@ use tokio_tungstenite::tungstenite::http::Uri;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use tokio_tungstenite::tungstenite::{self, ClientRequestBuilder, Message, WebSocket};
 
-use crate::patience::{Deadline, Patient, describe_slowness, is_slow};
+use crate::patience::{Deadline, PatientStream, describe_slowness, is_slow};
 
 /// One connection.
 pub struct Robot {
-    socket: WebSocket<Patient<TcpStream>>,
+    socket: WebSocket<PatientStream<TcpStream>>,
     backlog: VecDeque<Value>,
     calls: u64,
 }
 
-fn offering(uri: Uri, protocols: &[&str]) -> ClientRequestBuilder {
+fn request_with_protocols(uri: Uri, protocols: &[&str]) -> ClientRequestBuilder {
     let request = ClientRequestBuilder::new(uri);
     protocols.iter().fold(request, |request, protocol| {
         request.with_sub_protocol(*protocol)
@@ -32,16 +32,16 @@ impl Robot {
         Robot::try_connect(url).map_err(|refusal| anyhow::anyhow!("{url}: {refusal}"))
     }
 
-    /// Connects with a socket of its own side that takes little before it is read.
-    pub fn on_a_short_line(url: &str, protocols: &[&str]) -> anyhow::Result<Robot> {
+    /// Connects with a small receive buffer.
+    pub fn connect_with_small_buffer(url: &str, protocols: &[&str]) -> anyhow::Result<Robot> {
         let address = url
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
             .context("a ws:// address")?;
         let stream = TcpStream::connect(address)?;
         nix::sys::socket::setsockopt(&stream, nix::sys::socket::sockopt::RcvBuf, &(64 * 1024))?;
-        let request = offering(url.parse()?, protocols);
-        let (socket, _) = tungstenite::client(request, Patient::new(stream)?)
+        let request = request_with_protocols(url.parse()?, protocols);
+        let (socket, _) = tungstenite::client(request, PatientStream::new(stream)?)
             .map_err(|error| anyhow::anyhow!("{url}: {error}"))?;
         Ok(Robot {
             socket,
@@ -50,21 +50,24 @@ impl Robot {
         })
     }
 
-    /// Connects, or says with which HTTP status and body it was refused.
-    pub fn try_connect(url: &str) -> Result<Robot, Refusal> {
-        Robot::try_connect_offering(url, &[]).map(|(robot, _)| robot)
+    /// Connects, or returns the HTTP status and body of the refusal.
+    pub fn try_connect(url: &str) -> Result<Robot, ConnectionRefusal> {
+        Robot::try_connect_with_protocols(url, &[]).map(|(robot, _)| robot)
     }
 
-    /// The same with these headers, such as a browser's.
-    pub fn try_connect_showing(url: &str, headers: &[(&str, &str)]) -> Result<Robot, Refusal> {
+    /// Connects with further headers, such as a browser's.
+    pub fn try_connect_with_headers(
+        url: &str,
+        headers: &[(&str, &str)],
+    ) -> Result<Robot, ConnectionRefusal> {
         Robot::try_connect_with(url, &[], headers).map(|(robot, _)| robot)
     }
 
-    /// The same with WebSocket subprotocols on offer; gives also the one that was chosen.
-    pub fn try_connect_offering(
+    /// Connects with an offer of WebSocket subprotocols; returns the selected one as well.
+    pub fn try_connect_with_protocols(
         url: &str,
         protocols: &[&str],
-    ) -> Result<(Robot, Option<String>), Refusal> {
+    ) -> Result<(Robot, Option<String>), ConnectionRefusal> {
         Robot::try_connect_with(url, protocols, &[])
     }
 
@@ -72,19 +75,20 @@ impl Robot {
         url: &str,
         protocols: &[&str],
         headers: &[(&str, &str)],
-    ) -> Result<(Robot, Option<String>), Refusal> {
+    ) -> Result<(Robot, Option<String>), ConnectionRefusal> {
         let address = url
             .strip_prefix("ws://")
             .and_then(|rest| rest.split('/').next())
-            .ok_or_else(|| Refusal::other("not a ws:// address"))?;
-        let stream =
-            TcpStream::connect(address).map_err(|error| Refusal::other(&error.to_string()))?;
+            .ok_or_else(|| ConnectionRefusal::without_status("not a ws:// address"))?;
+        let stream = TcpStream::connect(address)
+            .map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
         let _ = stream.set_nodelay(true);
-        let stream = Patient::new(stream).map_err(|error| Refusal::other(&error.to_string()))?;
+        let stream = PatientStream::new(stream)
+            .map_err(|error| ConnectionRefusal::without_status(&error.to_string()))?;
         let uri = url
             .parse()
-            .map_err(|error| Refusal::other(&format!("{error}")))?;
-        let request = offering(uri, protocols);
+            .map_err(|error| ConnectionRefusal::without_status(&format!("{error}")))?;
+        let request = request_with_protocols(uri, protocols);
         let request = headers.iter().fold(request, |request, (name, value)| {
             request.with_header(*name, *value)
         });
@@ -100,41 +104,41 @@ impl Robot {
                 Ok((robot, chosen))
             }
             Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(response))) => {
-                Err(Refusal {
+                Err(ConnectionRefusal {
                     status: response.status().as_u16(),
                     body: String::from_utf8_lossy(response.body().as_deref().unwrap_or_default())
                         .into_owned(),
                 })
             }
-            Err(error) => Err(Refusal::other(&error.to_string())),
+            Err(error) => Err(ConnectionRefusal::without_status(&error.to_string())),
         }
     }
 
-    /// Sends one operation.
-    pub fn says(&mut self, operation: Value) -> anyhow::Result<()> {
-        self.sends(Message::text(operation.to_string()))
+    /// Sends an operation.
+    pub fn send(&mut self, operation: Value) -> anyhow::Result<()> {
+        self.send_frame(Message::text(operation.to_string()))
     }
 
-    /// Sends a frame as it is.
-    pub fn sends(&mut self, frame: Message) -> anyhow::Result<()> {
+    /// Sends a frame unchanged.
+    pub fn send_frame(&mut self, frame: Message) -> anyhow::Result<()> {
         self.socket.send(frame).context("the connection is gone")
     }
 
-    /// The next frame, whatever it is.
-    pub fn frame(&mut self) -> anyhow::Result<Message> {
+    /// Returns the next frame of any kind.
+    pub fn next_frame(&mut self) -> anyhow::Result<Message> {
         Ok(self.socket.read()?)
     }
 
-    /// The same, if it comes in this time; for measurements.
-    pub fn frame_within(&mut self, time: Duration) -> anyhow::Result<Message> {
+    /// Returns the next frame if it arrives in time; for measurements.
+    pub fn next_frame_within(&mut self, time: Duration) -> anyhow::Result<Message> {
         self.socket.get_mut().limit(Some(time))?;
         let frame = self.socket.read();
         self.socket.get_mut().limit(None)?;
         Ok(frame?)
     }
 
-    /// Counts bytes that wait to be read, up to some thousand.
-    pub fn counts_waiting(&self) -> anyhow::Result<usize> {
+    /// Counts the bytes that are waiting to be read, up to some thousand.
+    pub fn count_waiting_bytes(&self) -> anyhow::Result<usize> {
         let mut bytes = vec![0; 64 << 10];
         match self.socket.get_ref().get().peek(&mut bytes) {
             Err(error) if is_slow(&error) => Ok(0),
@@ -142,8 +146,12 @@ impl Robot {
         }
     }
 
-    /// The first message that `wanted` accepts; others are kept for later.
-    pub fn hears(&mut self, what: &str, wanted: impl Fn(&Value) -> bool) -> anyhow::Result<Value> {
+    /// Returns the first message that `wanted` accepts; other messages are kept for later.
+    pub fn wait_for(
+        &mut self,
+        what: &str,
+        wanted: impl Fn(&Value) -> bool,
+    ) -> anyhow::Result<Value> {
         if let Some(index) = self.backlog.iter().position(&wanted) {
             return Ok(self.backlog.remove(index).expect("just found"));
         }
@@ -157,7 +165,7 @@ impl Robot {
                 )
             })?;
             let frame = self
-                .frame()
+                .next_frame()
                 .with_context(|| format!("waiting for {what}; heard so far: {:?}", self.backlog))?;
             let value = match frame {
                 Message::Text(text) => serde_json::from_str(text.as_str())?,
@@ -175,24 +183,24 @@ impl Robot {
         }
     }
 
-    /// Whether nothing that `unwanted` accepts comes before the answer to a call made now: messages keep their
-    /// order, so what has not come before that answer was not under way.
+    /// Returns whether no message that `unwanted` accepts arrives before the answer to a call made now: as messages are
+    /// ordered, anything sent earlier would have arrived by then.
     pub fn has_not_heard(&mut self, unwanted: impl Fn(&Value) -> bool) -> anyhow::Result<bool> {
-        self.calls("/rosapi/get_time", json!({}))?;
+        self.call("/rosapi/get_time", json!({}))?;
         Ok(!self.backlog.iter().any(unwanted))
     }
 
-    /// The message of the next publication on a topic.
-    pub fn hears_on(&mut self, topic: &str) -> anyhow::Result<Value> {
-        let heard = self.hears(&format!("a message on {topic}"), |value| {
+    /// Returns the message of the next publication on a topic.
+    pub fn next_message_on(&mut self, topic: &str) -> anyhow::Result<Value> {
+        let heard = self.wait_for(&format!("a message on {topic}"), |value| {
             value["op"] == "publish" && value["topic"] == topic
         })?;
         Ok(heard["msg"].clone())
     }
 
-    /// The next status message that mentions `word`.
-    pub fn hears_status(&mut self, word: &str) -> anyhow::Result<Value> {
-        self.hears(&format!("a status that mentions {word:?}"), |value| {
+    /// Returns the next status message that contains `word`.
+    pub fn wait_for_status(&mut self, word: &str) -> anyhow::Result<Value> {
+        self.wait_for(&format!("a status that mentions {word:?}"), |value| {
             value["op"] == "status"
                 && value["msg"]
                     .as_str()
@@ -200,52 +208,52 @@ impl Robot {
         })
     }
 
-    /// Calls a service and gives the whole response.
-    pub fn calls(&mut self, service: &str, arguments: Value) -> anyhow::Result<Value> {
+    /// Calls a service and returns the whole response.
+    pub fn call(&mut self, service: &str, arguments: Value) -> anyhow::Result<Value> {
         self.calls += 1;
         let id = format!("call:{}", self.calls);
-        self.says(json!({"op": "call_service", "id": id, "service": service, "args": arguments}))?;
-        self.hears(&format!("the answer of {service}"), |value| {
+        self.send(json!({"op": "call_service", "id": id, "service": service, "args": arguments}))?;
+        self.wait_for(&format!("the answer of {service}"), |value| {
             value["op"] == "service_response" && value["id"] == id.as_str()
         })
     }
 
-    /// Waits until a node listens to `topic`, by asking rosapi again and again.
-    pub fn awaits_subscriber(&mut self, topic: &str) -> anyhow::Result<()> {
-        crate::until(&format!("a subscriber of {topic}"), || {
-            let answer = self.calls("/rosapi/subscribers", json!({"topic": topic}))?;
+    /// Polls rosapi until a node subscribes to `topic`.
+    pub fn wait_for_subscriber(&mut self, topic: &str) -> anyhow::Result<()> {
+        crate::wait_until(&format!("a subscriber of {topic}"), || {
+            let answer = self.call("/rosapi/subscribers", json!({"topic": topic}))?;
             let nodes = answer["values"]["subscribers"].as_array();
             let is_heard = nodes.is_some_and(|nodes| !nodes.is_empty());
             Ok(is_heard.then_some(()).ok_or_else(|| answer.to_string()))
         })
     }
 
-    /// Says something again and again until it hears what comes of it: what is said, or answered, before both sides are
-    /// connected is lost, as in every ROS. More of what was asked for more than once may come later.
-    pub fn says_until(
+    /// Repeats a message until the wanted one arrives: as in every ROS, messages are lost until both sides are
+    /// connected. Further answers to the repetitions may arrive later.
+    pub fn send_until(
         &mut self,
         message: &Value,
         what: &str,
         wanted: impl Fn(&Value) -> bool,
     ) -> anyhow::Result<Value> {
-        crate::until(what, || {
-            self.says(message.clone())?;
+        crate::wait_until(what, || {
+            self.send(message.clone())?;
             if self.has_not_heard(&wanted)? {
                 return Ok(Err("it hears nothing yet".to_owned()));
             }
-            self.hears(what, &wanted).map(Ok)
+            self.wait_for(what, &wanted).map(Ok)
         })
     }
 
-    /// Subscribes and says so by nothing, as the protocol has it.
-    pub fn subscribes(&mut self, topic: &str) -> anyhow::Result<()> {
-        self.says(json!({"op": "subscribe", "topic": topic}))
+    /// Subscribes to a topic; the protocol has no confirmation.
+    pub fn subscribe(&mut self, topic: &str) -> anyhow::Result<()> {
+        self.send(json!({"op": "subscribe", "topic": topic}))
     }
 
-    /// Waits for the other side to close, and gives code and reason.
-    pub fn hears_close(&mut self) -> anyhow::Result<CloseFrame> {
+    /// Waits for a close frame of the other side and returns it.
+    pub fn wait_for_close(&mut self) -> anyhow::Result<CloseFrame> {
         loop {
-            match self.frame() {
+            match self.next_frame() {
                 Ok(Message::Close(Some(frame))) => return Ok(frame),
                 Ok(Message::Close(None)) => bail!("closed without a reason"),
                 Ok(_) => {}
@@ -256,35 +264,35 @@ impl Robot {
         }
     }
 
-    /// Says goodbye and waits for the answer.
-    pub fn leaves(mut self) -> anyhow::Result<()> {
+    /// Closes the connection and waits for the close frame.
+    pub fn leave(mut self) -> anyhow::Result<()> {
         self.socket.close(None)?;
-        while self.frame().is_ok() {}
+        while self.next_frame().is_ok() {}
         Ok(())
     }
 }
 
-/// Why a connection was refused.
+/// The refusal of a connection.
 #[derive(Debug)]
-pub struct Refusal {
-    /// HTTP status; 0 when it did not come to HTTP.
+pub struct ConnectionRefusal {
+    /// HTTP status; 0 without an HTTP response.
     pub status: u16,
-    /// The body.
+    /// Body of the response.
     pub body: String,
 }
 
-impl Refusal {
-    fn other(text: &str) -> Refusal {
-        Refusal {
+impl ConnectionRefusal {
+    fn without_status(text: &str) -> ConnectionRefusal {
+        ConnectionRefusal {
             status: 0,
             body: text.to_owned(),
         }
     }
 }
 
-impl std::error::Error for Refusal {}
+impl std::error::Error for ConnectionRefusal {}
 
-impl std::fmt::Display for Refusal {
+impl std::fmt::Display for ConnectionRefusal {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(formatter, "refused with {}: {}", self.status, self.body)
     }

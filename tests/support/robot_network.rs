@@ -1,9 +1,9 @@
-//! A robot's own network: its computer and another machine of its, on which its application runs.
+//! A robot's own network: its computer and a second machine that runs its application.
 //!
 //! ```text
-//!  portal ══ a cable ══ the robot's computer, 10.77.0.1 ── virtual cards ── the other machine, 10.77.0.2
+//!  portal ══ a cable ══ the robot's computer, 10.77.0.1 ── virtual network ── the other machine, 10.77.0.2
 //! ```
-//! Both are network namespaces.
+//! Both machines are network namespaces.
 
 use std::io::{BufRead, BufReader, Write};
 use std::net::{Ipv4Addr, SocketAddr};
@@ -15,23 +15,24 @@ use anyhow::{Context, ensure};
 use serde_json::Value;
 
 use crate::binaries;
-use crate::cable::{Cable, ip, within};
+use crate::cable::{Cable, ip, run_in_namespace};
 use crate::patience;
 use crate::ros_system::Domain;
 use crate::site::Site;
 
-/// The other machine.
+/// Address of the other machine.
 pub const OTHER: Ipv4Addr = Ipv4Addr::new(10, 77, 0, 2);
-/// `ROS_DOMAIN_ID` of all.
+/// `ROS_DOMAIN_ID` of all processes.
 const DOMAIN: u16 = 7;
-/// What the two are joined by is called so on both.
+/// Name of the device on both machines that connects them.
 const CARD: &str = "lan";
-/// A discovery server that is a node of Fast DDS.
+/// A discovery server that is a Fast DDS node.
 const SERVER: &str = "src/reach/tests/ros2/server.py";
-/// Programs of one machine have shared memory of their own, of which nothing stays: names of it are those of ports, which others have, too.
+/// Programs of a machine have a private /dev/shm, which disappears with them: names in it are derived from ports, which
+/// are the same on other machines.
 const WITHIN: &str = r#"mount -t tmpfs shm /dev/shm && exec "$@""#;
 
-/// It is taken down when dropped.
+/// The network; removed on drop.
 pub struct RobotNetwork {
     cable: Cable,
     robot: String,
@@ -40,17 +41,18 @@ pub struct RobotNetwork {
 }
 
 impl RobotNetwork {
-    /// One whose programs find each other by multicast.
+    /// Creates a network whose programs discover each other by multicast.
     pub fn new(portal: &str) -> anyhow::Result<Self> {
-        Self::with(portal, None)
+        Self::create(portal, None)
     }
 
-    /// One whose programs find each other by a discovery server, which is to be on the other machine.
-    pub fn of_server(portal: &str) -> anyhow::Result<Self> {
-        Self::with(portal, Some(format!("{OTHER}:11811")))
+    /// Creates a network whose programs discover each other through a discovery server, which is to run on the other
+    /// machine.
+    pub fn with_discovery_server(portal: &str) -> anyhow::Result<Self> {
+        Self::create(portal, Some(format!("{OTHER}:11811")))
     }
 
-    fn with(portal: &str, servers: Option<String>) -> anyhow::Result<Self> {
+    fn create(portal: &str, servers: Option<String>) -> anyhow::Result<Self> {
         let cable = Cable::with_robot_inside(portal)?;
         let robot = cable.namespace();
         let robot = robot.file_name().and_then(|name| name.to_str());
@@ -63,11 +65,11 @@ impl RobotNetwork {
             other,
             servers,
         };
-        network.lay()?;
+        network.create_links()?;
         Ok(network)
     }
 
-    fn lay(&self) -> anyhow::Result<()> {
+    fn create_links(&self) -> anyhow::Result<()> {
         let [robot, other] = [&*self.robot, &*self.other];
         ip(&[
             "-n", robot, "link", "add", CARD, "type", "veth", "peer", "name", CARD, "netns", other,
@@ -78,43 +80,47 @@ impl RobotNetwork {
             ip(&["-n", machine, "link", "set", CARD, "up"])?;
         }
         for machine in [robot, other] {
-            carries(machine)?;
+            wait_for_carrier(machine)?;
         }
         Ok(())
     }
 
-    /// Where the robot reaches the portal.
+    /// Returns the portal's address for the robot.
     pub fn portal(&self) -> SocketAddr {
         self.cable.server
     }
 
     fn domain(&self) -> Domain {
-        Domain::of_network(DOMAIN, self.servers.as_deref())
+        Domain::for_network(DOMAIN, self.servers.as_deref())
     }
 
-    /// The robot's computer.
+    /// Returns the robot's computer.
     pub fn robot(&self) -> anyhow::Result<Site> {
-        Site::inside(self.cable.namespace(), self.domain())
+        Site::in_namespace(self.cable.namespace(), self.domain())
     }
 
-    fn other(&self) -> PathBuf {
+    fn other_namespace(&self) -> PathBuf {
         Path::new("/run/netns").join(&self.other)
     }
 
     /// Starts a program of `tests/robots` on the other machine.
-    pub fn application(&self, program: &str, arguments: &[&str]) -> anyhow::Result<Application> {
+    pub fn start_application(
+        &self,
+        program: &str,
+        arguments: &[&str],
+    ) -> anyhow::Result<RobotProgram> {
         let mut command = python(&Path::new("tests/robots").join(program));
         command.args(arguments);
-        self.domain().is_of(&mut command);
-        Application::starts(command, &self.other())
+        self.domain().configure(&mut command);
+        RobotProgram::start(command, &self.other_namespace())
     }
 
     /// Starts the discovery server.
-    pub fn server(&self) -> anyhow::Result<Application> {
+    pub fn start_discovery_server(&self) -> anyhow::Result<RobotProgram> {
         let mut command = python(Path::new(SERVER));
         command.args(["0", &OTHER.to_string()]);
-        Domain::of_network(DOMAIN, None).is_of(&mut command);
-        Application::starts(command, &self.other())
+        Domain::for_network(DOMAIN, None).configure(&mut command);
+        RobotProgram::start(command, &self.other_namespace())
     }
 }
 
@@ -133,9 +139,10 @@ fn python(program: &Path) -> Command {
     command
 }
 
-/// Waits until the kernel says that a card carries, up to a second later: Fast DDS uses none for which it does not, and looks once.
-fn carries(machine: &str) -> anyhow::Result<()> {
-    crate::until("a network", || {
+/// Waits until the kernel reports the device as up, which takes up to a second: Fast DDS ignores devices that are down,
+/// and checks only once.
+fn wait_for_carrier(machine: &str) -> anyhow::Result<()> {
+    crate::wait_until("a network", || {
         let mut command = Command::new("ip");
         command.args(["-n", machine, "-brief", "link", "show", CARD]);
         let told = String::from_utf8(command.output()?.stdout)?;
@@ -144,20 +151,22 @@ fn carries(machine: &str) -> anyhow::Result<()> {
     })
 }
 
-/// A program that takes orders as lines and answers by lines of JSON, `[ORDER, ANSWER]`; the first is `["ready"]`.
-pub struct Application {
+/// A program that reads orders as lines and answers with lines of JSON, `[ORDER, ANSWER]`; the first answer is
+/// `["ready"]`.
+pub struct RobotProgram {
     child: Child,
     orders: ChildStdin,
     lines: Receiver<String>,
 }
 
-impl Application {
-    /// Starts it; returns when it says that it is ready.
-    fn starts(mut command: Command, namespace: &Path) -> anyhow::Result<Self> {
+impl RobotProgram {
+    /// Starts it and waits until it is ready.
+    fn start(mut command: Command, namespace: &Path) -> anyhow::Result<Self> {
         patience::tell_patience(&mut command)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped());
-        let mut child = within(namespace, || command.spawn())?.context("starting a program")?;
+        let mut child =
+            run_in_namespace(namespace, || command.spawn())?.context("starting a program")?;
         let (said, lines) = channel();
         let output = child.stdout.take().context("its output")?;
         std::thread::spawn(move || {
@@ -170,11 +179,11 @@ impl Application {
             child,
             lines,
         };
-        application.hears("ready")?;
+        application.read_answer("ready")?;
         Ok(application)
     }
 
-    fn hears(&self, what: &str) -> anyhow::Result<Value> {
+    fn read_answer(&self, what: &str) -> anyhow::Result<Value> {
         let line = patience::receive(&self.lines);
         let line = line.with_context(|| format!("an application should say {what}"))?;
         let words: Value = serde_json::from_str(&line).with_context(|| line.clone())?;
@@ -182,21 +191,21 @@ impl Application {
         Ok(words[1].clone())
     }
 
-    /// Has it do something; its answer.
-    pub fn does(&mut self, order: &str) -> anyhow::Result<Value> {
+    /// Sends an order and returns the answer.
+    pub fn send_order(&mut self, order: &str) -> anyhow::Result<Value> {
         writeln!(self.orders, "{order}")?;
-        self.hears(order.split(' ').next().unwrap_or_default())
+        self.read_answer(order.split(' ').next().unwrap_or_default())
     }
 
-    /// As by `kill -9`.
-    pub fn is_killed(mut self) -> anyhow::Result<()> {
+    /// Kills it with SIGKILL.
+    pub fn kill(mut self) -> anyhow::Result<()> {
         self.child.kill()?;
         self.child.wait()?;
         Ok(())
     }
 }
 
-impl Drop for Application {
+impl Drop for RobotProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();

@@ -1,4 +1,4 @@
-//! A robot's ROS system: a Master of ROS 1, or a domain of ROS 2, on loopback.
+//! A robot's ROS system on loopback: a Master of ROS 1, or a domain of ROS 2.
 
 use std::net::SocketAddr;
 use std::os::linux::net::SocketAddrExt;
@@ -16,99 +16,100 @@ use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tokio::task::JoinHandle;
 
-/// The domains whose ports are nobody else's: beyond them are those that the kernel gives away.
+/// Number of domains whose ports are not ephemeral ports of the kernel.
 const DOMAINS: u32 = 101;
 
-/// Something that is on a bus.
-pub trait Node {
-    /// Its bus.
+/// Something that has a bus.
+pub trait HasBus {
+    /// Returns its bus.
     fn bus(&self) -> &dyn Bus;
 }
 
-impl Node for Ros1Bus {
+impl HasBus for Ros1Bus {
     fn bus(&self) -> &dyn Bus {
         self
     }
 }
 
-impl Node for dyn Bus {
+impl HasBus for dyn Bus {
     fn bus(&self) -> &dyn Bus {
         self
     }
 }
 
-impl<N: Node + ?Sized> Node for Arc<N> {
+impl<N: HasBus + ?Sized> HasBus for Arc<N> {
     fn bus(&self) -> &dyn Bus {
         (**self).bus()
     }
 }
 
-/// A ROS system of one's own.
+/// A private ROS system.
 pub enum RosSystem {
     /// ROS 1.
     Master {
-        /// Where it listens.
+        /// Address of the Master.
         address: SocketAddr,
-        /// Serves it, unless it has been ended.
+        /// Task that serves the Master; `None` once it was stopped.
         serving: Option<JoinHandle<()>>,
     },
     /// ROS 2.
     Domain(Domain),
 }
 
-/// A domain of ROS 2 that no other test and no stub takes, until it is dropped.
+/// A domain of ROS 2 that no other test and no stub uses, until drop.
 pub struct Domain {
     /// `ROS_DOMAIN_ID`.
     pub id: u16,
-    range: Range,
-    /// Networks of a test's own need none.
+    range: DomainRange,
+    /// `None` for separate networks, which need no lock.
     _lock: Option<UnixListener>,
 }
 
-/// Whom a domain's nodes look for.
-enum Range {
-    /// Those of this machine.
+/// Discovery range of a domain's nodes.
+enum DomainRange {
+    /// Nodes of this machine.
     Machine,
-    /// Those of all networks, by these discovery servers, or by multicast.
+    /// Nodes of all networks, through these discovery servers, or by multicast.
     Network { servers: Option<String> },
 }
 
 impl Domain {
-    /// One that is free.
+    /// Reserves an unused domain.
     ///
     /// # Errors
-    /// All are taken.
+    /// If all domains are in use.
     pub fn take() -> anyhow::Result<Self> {
         let first = std::process::id().wrapping_mul(37) % DOMAINS;
         let ids = (0..DOMAINS).map(|number| (first + number) % DOMAINS + 1);
         let taken = ids.into_iter().find_map(|id| {
-            // As stubs take theirs.
+            // With the same lock as the stubs use.
             let name = format!("cloudroid-domain-{id}");
             let address = UnixAddress::from_abstract_name(name).ok()?;
             let lock = UnixListener::bind_addr(&address).ok()?;
             let id = u16::try_from(id).ok()?;
             Some(Self {
                 id,
-                range: Range::Machine,
+                range: DomainRange::Machine,
                 _lock: Some(lock),
             })
         });
         taken.context("all domains of ROS 2 are taken; end what is left of earlier runs")
     }
 
-    /// One of networks of a test's own, where processes find each other by these discovery servers, or by multicast.
-    pub fn of_network(id: u16, servers: Option<&str>) -> Self {
+    /// Returns a domain for separate networks, in which processes discover each other through these servers, or by
+    /// multicast.
+    pub fn for_network(id: u16, servers: Option<&str>) -> Self {
         Self {
             id,
-            range: Range::Network {
+            range: DomainRange::Network {
                 servers: servers.map(str::to_owned),
             },
             _lock: None,
         }
     }
 
-    /// Has a process join it.
-    pub fn is_of(&self, command: &mut Command) {
+    /// Makes a process join the domain.
+    pub fn configure(&self, command: &mut Command) {
         command
             .env("ROS_DOMAIN_ID", self.id.to_string())
             .env_remove("ROS_LOCALHOST_ONLY")
@@ -116,10 +117,10 @@ impl Domain {
             .env_remove("ROS_DISCOVERY_SERVER")
             .env_remove("ROS_STATIC_PEERS");
         match &self.range {
-            Range::Machine => {
+            DomainRange::Machine => {
                 command.env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
             }
-            Range::Network { servers } => {
+            DomainRange::Network { servers } => {
                 let servers = servers.iter();
                 command.envs(servers.map(|list| ("ROS_DISCOVERY_SERVER", list)));
             }
@@ -128,7 +129,7 @@ impl Domain {
 }
 
 impl RosSystem {
-    /// One with nobody in it.
+    /// Creates a system without nodes.
     pub fn new(version: RosVersion, runtime: &Runtime) -> anyhow::Result<Self> {
         match version {
             RosVersion::One => {
@@ -143,7 +144,7 @@ impl RosSystem {
         }
     }
 
-    /// Which ROS it is.
+    /// Returns its version of ROS.
     pub fn version(&self) -> RosVersion {
         match self {
             Self::Master { .. } => RosVersion::One,
@@ -151,7 +152,7 @@ impl RosSystem {
         }
     }
 
-    /// Starts a Master, where the last one was if there was one; a domain needs none.
+    /// Starts a Master, at the address of the previous one if there was one; a domain needs none.
     pub fn start_master(&mut self, runtime: &Runtime) -> anyhow::Result<()> {
         if let Self::Master { address, serving } = self {
             let listener = runtime.block_on(TcpListener::bind(*address))?;
@@ -163,7 +164,7 @@ impl RosSystem {
         Ok(())
     }
 
-    /// Ends the Master; what was registered there is forgotten.
+    /// Stops the Master, which loses all registrations.
     pub fn end_master(&mut self, runtime: &Runtime) {
         let serving = match self {
             Self::Master { serving, .. } => serving.take(),
@@ -175,7 +176,7 @@ impl RosSystem {
         }
     }
 
-    /// Where its Master listens; nowhere in ROS 2.
+    /// Returns the address of its Master; `None` in ROS 2.
     pub fn master(&self) -> Option<SocketAddr> {
         match self {
             Self::Master { address, .. } => Some(*address),
@@ -192,15 +193,15 @@ impl RosSystem {
         Ok(ros::connect(self.version(), Arc::new(HostSockets), options).await?)
     }
 
-    /// Has a process join it.
-    pub fn is_of(&self, command: &mut Command) {
+    /// Makes a process join the system.
+    pub fn configure(&self, command: &mut Command) {
         match self {
             Self::Master { address, .. } => {
                 command
                     .env("ROS_MASTER_URI", format!("http://{address}"))
                     .env_remove("ROS_NAMESPACE");
             }
-            Self::Domain(domain) => domain.is_of(command),
+            Self::Domain(domain) => domain.configure(command),
         }
     }
 }

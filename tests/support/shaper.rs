@@ -1,5 +1,5 @@
-//! What netem does, for kernels without it: packets between two TUN devices are delayed, lost and slowed down. The
-//! order of packets is kept, as netem keeps it without jitter, and as a rate makes it keep it with jitter.
+//! A replacement for netem on kernels without it: delays, drops and slows down packets between two TUN devices. The
+//! order of packets is preserved, as by netem without jitter, or with jitter and a rate.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -10,47 +10,50 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use crate::cable::Badness;
+use crate::cable::NetworkImpairment;
 
-/// Packets that may wait while the network is good.
+/// Maximum number of queued packets without an impairment.
 const GOOD_LIMIT: u32 = 1000;
-/// Larger than any packet of a device whose MTU is not changed.
+/// More than the size of any packet at the default MTU.
 const PACKET: usize = 4096;
 
-/// Ends with the devices: its threads stop once these are deleted.
+/// Shapes the traffic between two devices; its threads end once the devices are deleted.
 pub struct Shaper {
-    ways: [Arc<Way>; 2],
+    ways: [Arc<ShaperDirection>; 2],
 }
 
 /// One direction.
 #[derive(Default)]
-struct Way {
+struct ShaperDirection {
     state: Mutex<State>,
     changed: Condvar,
 }
 
 #[derive(Default)]
 struct State {
-    badness: Option<Badness>,
-    /// Packets, and when they arrive.
+    badness: Option<NetworkImpairment>,
+    /// Packets with their arrival times.
     under_way: VecDeque<(Instant, Vec<u8>)>,
-    /// When the last packet has left.
+    /// Time at which the last packet has been sent.
     free: Option<Instant>,
-    /// For losses, the same in each run.
+    /// State of the generator for losses, the same in each run.
     random: u64,
     over: bool,
 }
 
 impl Shaper {
-    /// Makes both devices and joins them.
-    pub fn between(one: &str, other: &str) -> anyhow::Result<Self> {
-        let (one, other) = (device(one)?, device(other)?);
-        let ways = [way(one.try_clone()?, other.try_clone()?), way(other, one)];
+    /// Creates both devices and connects them.
+    pub fn join_devices(one: &str, other: &str) -> anyhow::Result<Self> {
+        let (one, other) = (open_tun(one)?, open_tun(other)?);
+        let ways = [
+            spawn_direction(one.try_clone()?, other.try_clone()?),
+            spawn_direction(other, one),
+        ];
         Ok(Self { ways })
     }
 
-    /// From now on; what is under way and was slowed down arrives at once when the network is good again.
-    pub fn set(&self, badness: Option<Badness>) {
+    /// Sets the impairment; when it is removed, delayed packets arrive at once.
+    pub fn set_impairment(&self, badness: Option<NetworkImpairment>) {
         for way in &self.ways {
             let mut state = way.state();
             state.badness = badness;
@@ -66,15 +69,15 @@ impl Shaper {
     }
 }
 
-impl Way {
+impl ShaperDirection {
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl State {
-    /// A packet has come: it is lost, or it waits.
-    fn take(&mut self, packet: &[u8], now: Instant) {
+    /// Drops or queues an arrived packet.
+    fn enqueue(&mut self, packet: &[u8], now: Instant) {
         let badness = self.badness;
         let limit = badness.map_or(GOOD_LIMIT, |badness| badness.limit);
         if self.under_way.len() >= limit as usize {
@@ -87,7 +90,7 @@ impl State {
                 let takes = Duration::from_secs_f64(bits / (f64::from(badness.rate) * 1e3));
                 let left = self.free.unwrap_or(now).max(now) + takes;
                 self.free = Some(left);
-                left + self.on_the_way(&badness)
+                left + self.transit_delay(&badness)
             }
             None => now,
         };
@@ -98,8 +101,8 @@ impl State {
         self.under_way.push_back((after, packet.to_vec()));
     }
 
-    /// The delay, more or less as much as the jitter.
-    fn on_the_way(&mut self, badness: &Badness) -> Duration {
+    /// Returns the delay of a packet, including jitter.
+    fn transit_delay(&mut self, badness: &NetworkImpairment) -> Duration {
         let jitter = f64::from(badness.jitter);
         let more = if badness.jitter == 0 {
             0.0
@@ -113,7 +116,7 @@ impl State {
         self.random() < share
     }
 
-    /// From 0 to 1; xorshift (Marsaglia, 2003).
+    /// Returns a number from 0 to 1 by xorshift (Marsaglia, 2003).
     fn random(&mut self) -> f64 {
         let mut random = self.random | 1;
         random ^= random << 13;
@@ -124,14 +127,14 @@ impl State {
     }
 }
 
-fn way(mut from: File, mut to: File) -> Arc<Way> {
-    let way = Arc::new(Way::default());
+fn spawn_direction(mut from: File, mut to: File) -> Arc<ShaperDirection> {
+    let way = Arc::new(ShaperDirection::default());
     way.state().random = 0x9e37_79b9_7f4a_7c15;
     let taking = way.clone();
     std::thread::spawn(move || {
         let mut packet = [0; PACKET];
         while let Ok(length) = from.read(&mut packet) {
-            taking.state().take(&packet[..length], Instant::now());
+            taking.state().enqueue(&packet[..length], Instant::now());
             taking.changed.notify_one();
         }
         taking.state().over = true;
@@ -139,16 +142,16 @@ fn way(mut from: File, mut to: File) -> Arc<Way> {
     });
     let giving = way.clone();
     std::thread::spawn(move || {
-        while let Some(packet) = next(&giving) {
-            // What a device cannot take is lost.
+        while let Some(packet) = next_packet(&giving) {
+            // A packet that the device does not accept is lost.
             let _ = to.write(&packet);
         }
     });
     way
 }
 
-/// The next packet, when it is due; none once the device is gone.
-fn next(way: &Way) -> Option<Vec<u8>> {
+/// Waits for the next packet to be due and returns it; `None` once the device is deleted.
+fn next_packet(way: &ShaperDirection) -> Option<Vec<u8>> {
     let mut state = way.state();
     loop {
         if state.over {
@@ -176,13 +179,13 @@ mod request {
     nix::ioctl_write_ptr_bad!(
         tun_set_iff,
         nix::request_code_write!(b'T', 202, 4),
-        super::Request
+        super::TunRequest
     );
 }
 
 /// `struct ifreq` of linux/if.h, as TUNSETIFF takes it.
 #[repr(C)]
-pub struct Request {
+pub struct TunRequest {
     name: [u8; 16],
     flags: u16,
     rest: [u8; 22],
@@ -191,20 +194,20 @@ pub struct Request {
 /// IFF_TUN and IFF_NO_PI of linux/if_tun.h: bare IP packets.
 const TUN_WITHOUT_HEAD: u16 = 0x0001 | 0x1000;
 
-/// A TUN device of this namespace; it is gone when all who hold it are.
+/// Opens a TUN device of this namespace, which exists until all descriptors are closed.
 #[allow(unsafe_code)]
-fn device(name: &str) -> anyhow::Result<File> {
+fn open_tun(name: &str) -> anyhow::Result<File> {
     let path = "/dev/net/tun";
     let file = File::options().read(true).write(true).open(path);
     let file = file.context(path)?;
-    let mut request = Request {
+    let mut request = TunRequest {
         name: [0; 16],
         flags: TUN_WITHOUT_HEAD,
         rest: [0; 22],
     };
     anyhow::ensure!(name.len() < request.name.len(), "{name} is too long");
     request.name[..name.len()].copy_from_slice(name.as_bytes());
-    // SAFETY: the kernel reads and writes one ifreq, which `request` is and which outlives the call.
+    // SAFETY: the kernel reads and writes one ifreq, which is `request` and outlives the call.
     unsafe { request::tun_set_iff(file.as_raw_fd(), &request) }.with_context(|| name.to_owned())?;
     Ok(file)
 }

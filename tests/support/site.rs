@@ -1,4 +1,4 @@
-//! A robot's side of a link: a ROS system, the robot's own nodes, and stubs in place of what runs in the cloud.
+//! A robot's side of a link: a ROS system, the robot's own nodes, and stubs in place of nodes that run in the cloud.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -13,7 +13,8 @@ use bytes::Bytes;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use ros::bus::{
-    Bus, Graph, Message, Publisher, Qos, RosVersion, Subscription, WireFormat, WireType,
+    Bus, Graph, Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, WireFormat,
+    WireType,
 };
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -21,50 +22,50 @@ use ros::schema::MessageType;
 use tokio::runtime::Runtime;
 
 use crate::binaries;
-use crate::cable::within;
+use crate::cable::run_in_namespace;
 use crate::daemon::Daemon;
 use crate::deployer::path_str;
 use crate::patience::{self, Deadline, patience};
-use crate::ros_system::{Domain, Node, RosSystem};
+use crate::ros_system::{Domain, HasBus, RosSystem};
 use crate::world::Directory;
 
-/// A message that will come is nearly always there by then.
+/// Time within which an expected message nearly always arrives.
 const MOMENT: Duration = Duration::from_millis(200);
 
 /// A robot.
 pub struct Site {
-    /// Where its nodes of this process run.
+    /// Runtime of its nodes in this process.
     pub runtime: Runtime,
-    /// Its ROS.
+    /// ROS system of the robot.
     pub system: RosSystem,
-    /// Where its processes run, if not in this machine's own network.
+    /// Network namespace of its processes, if not this machine's own.
     namespace: Option<PathBuf>,
     place: Directory,
 }
 
 /// A node that runs as a process: a stub, or an original.
-pub struct Running {
+pub struct NodeProcess {
     child: Child,
     log: PathBuf,
 }
 
 impl Site {
-    /// A robot of ROS 1 with nothing but a Master.
+    /// Creates a robot of ROS 1 with nothing but a Master.
     pub fn new() -> anyhow::Result<Self> {
-        Self::of(RosVersion::One)
+        Self::with_ros(RosVersion::One)
     }
 
-    /// A robot of this ROS, without a node.
-    pub fn of(version: RosVersion) -> anyhow::Result<Self> {
-        Self::made(None, |runtime| RosSystem::new(version, runtime))
+    /// Creates a robot of this version of ROS, without nodes.
+    pub fn with_ros(version: RosVersion) -> anyhow::Result<Self> {
+        Self::build(None, |runtime| RosSystem::new(version, runtime))
     }
 
-    /// A robot of ROS 2 whose processes run in a network namespace; none of this process can join them.
-    pub fn inside(namespace: PathBuf, domain: Domain) -> anyhow::Result<Self> {
-        Self::made(Some(namespace), |_| Ok(RosSystem::Domain(domain)))
+    /// Creates a robot of ROS 2 whose processes run in a network namespace; nodes of this process cannot join them.
+    pub fn in_namespace(namespace: PathBuf, domain: Domain) -> anyhow::Result<Self> {
+        Self::build(Some(namespace), |_| Ok(RosSystem::Domain(domain)))
     }
 
-    fn made(
+    fn build(
         namespace: Option<PathBuf>,
         system: impl FnOnce(&Runtime) -> anyhow::Result<RosSystem>,
     ) -> anyhow::Result<Self> {
@@ -81,36 +82,36 @@ impl Site {
         })
     }
 
-    /// Where its Master listens.
+    /// Returns the address of its Master.
     pub fn master(&self) -> anyhow::Result<SocketAddr> {
         self.system.master().context("a robot of ROS 1")
     }
 
-    /// Starts a Master, where the last one was if there was one.
+    /// Starts a Master, at the address of the previous one if there was one.
     pub fn start_master(&mut self) -> anyhow::Result<()> {
         self.system.start_master(&self.runtime)
     }
 
-    /// Ends the Master; what was registered there is forgotten.
+    /// Stops the Master, which loses all registrations.
     pub fn end_master(&mut self) {
         self.system.end_master(&self.runtime);
     }
 
-    /// A node of this process, on a robot of ROS 1.
+    /// Creates a node in this process, on a robot of ROS 1.
     pub fn node(&self, name: &str) -> anyhow::Result<Arc<Ros1Bus>> {
         let joined = Ros1Bus::connect(Arc::new(HostSockets), self.master()?, name);
         Ok(self.runtime.block_on(joined)?)
     }
 
-    /// A node of this process, on a robot of either ROS.
-    pub fn joins(&self, name: &str) -> anyhow::Result<Arc<dyn Bus>> {
+    /// Creates a node in this process, on a robot of either version of ROS.
+    pub fn join(&self, name: &str) -> anyhow::Result<Arc<dyn Bus>> {
         self.runtime.block_on(self.system.join(name))
     }
 
-    /// Waits until the graph is as wanted.
-    pub fn until(
+    /// Waits until the graph satisfies `wanted`.
+    pub fn wait_for_graph(
         &self,
-        node: &(impl Node + ?Sized),
+        node: &(impl HasBus + ?Sized),
         what: &str,
         wanted: impl Fn(&Graph) -> bool,
     ) -> anyhow::Result<Graph> {
@@ -128,40 +129,47 @@ impl Site {
     }
 
     /// Advertises a topic of strings.
-    pub fn says(
+    pub fn advertise_strings(
         &self,
-        node: &(impl Node + ?Sized),
+        node: &(impl HasBus + ?Sized),
         topic: &str,
         latch: bool,
     ) -> anyhow::Result<Box<dyn Publisher>> {
         let of = string_type(self.system.version())?;
-        let qos = Qos::keep_last(100).latching(latch);
+        let qos = QosProfile::keep_last(100).latching(latch);
         Ok(self
             .runtime
             .block_on(node.bus().advertise(topic, of, qos))?)
     }
 
     /// Subscribes to a topic of any type.
-    pub fn hears(&self, node: &(impl Node + ?Sized), topic: &str) -> anyhow::Result<Subscription> {
+    pub fn subscribe(
+        &self,
+        node: &(impl HasBus + ?Sized),
+        topic: &str,
+    ) -> anyhow::Result<Subscription> {
         let subscribed = node
             .bus()
-            .subscribe(topic, WireType::any(), Qos::keep_last(100));
+            .subscribe(topic, WireType::any(), QosProfile::keep_last(100));
         Ok(self.runtime.block_on(subscribed)?)
     }
 
-    /// The same, with what publishers have latched, which a newcomer of ROS 2 has to ask for.
-    pub fn hears_latched(
+    /// Subscribes to a topic including latched messages, which a late subscriber of ROS 2 has to request.
+    pub fn subscribe_latched(
         &self,
-        node: &(impl Node + ?Sized),
+        node: &(impl HasBus + ?Sized),
         topic: &str,
     ) -> anyhow::Result<Subscription> {
-        let qos = Qos::keep_last(100).latching(true);
+        let qos = QosProfile::keep_last(100).latching(true);
         let subscribed = node.bus().subscribe(topic, WireType::any(), qos);
         Ok(self.runtime.block_on(subscribed)?)
     }
 
-    /// The next message.
-    pub fn next(&self, subscription: &mut Subscription) -> anyhow::Result<Message> {
+    /// Returns the next message.
+    pub fn next_message(
+        &self,
+        subscription: &mut Subscription,
+    ) -> anyhow::Result<SerializedMessage> {
         let next = self
             .runtime
             .block_on(patience::wait_for(subscription.messages.recv()));
@@ -169,12 +177,12 @@ impl Site {
             .context("the topic ended")
     }
 
-    /// The next message, if one comes in time.
-    pub fn next_within(
+    /// Returns the next message, if one arrives in time.
+    pub fn next_message_within(
         &self,
         subscription: &mut Subscription,
         time: Duration,
-    ) -> anyhow::Result<Option<Message>> {
+    ) -> anyhow::Result<Option<SerializedMessage>> {
         let next = async { tokio::time::timeout(time, subscription.messages.recv()).await };
         match self.runtime.block_on(next) {
             Ok(next) => Ok(Some(next.context("the topic ended")?)),
@@ -182,18 +190,20 @@ impl Site {
         }
     }
 
-    /// Asks again and again until a message comes that is wanted: as in every ROS, what is said before all are connected is lost.
-    /// Of those that were asked for more than once some may come later.
-    pub fn asks_until(
+    /// Repeats a request until a wanted message arrives: as in every ROS, messages are lost until both sides are
+    /// connected. Further answers may arrive later.
+    pub fn ask_until(
         &self,
         subscription: &mut Subscription,
         mut ask: impl FnMut() -> anyhow::Result<()>,
-        mut wanted: impl FnMut(&Message) -> anyhow::Result<bool>,
-    ) -> anyhow::Result<Message> {
+        mut wanted: impl FnMut(&SerializedMessage) -> anyhow::Result<bool>,
+    ) -> anyhow::Result<SerializedMessage> {
         let deadline = Deadline::begin();
         loop {
             ask()?;
-            while let Some(message) = self.next_within(subscription, patience::scale(MOMENT))? {
+            while let Some(message) =
+                self.next_message_within(subscription, patience::scale(MOMENT))?
+            {
                 if wanted(&message)? {
                     return Ok(message);
                 }
@@ -203,42 +213,50 @@ impl Site {
         }
     }
 
-    /// Waits until so many subscribers are connected.
-    pub fn connected(&self, publisher: &dyn Publisher, count: usize) -> anyhow::Result<()> {
-        let mut now = publisher.matched();
+    /// Waits until `count` subscribers are connected.
+    pub fn wait_for_subscribers(
+        &self,
+        publisher: &dyn Publisher,
+        count: usize,
+    ) -> anyhow::Result<()> {
+        let mut now = publisher.matched_subscribers();
         let reached = self.runtime.block_on(async {
-            patience::wait_for(now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected_count() == count))
                 .await
                 .is_ok()
         });
         ensure!(
             reached,
             "{count} subscribers should be connected, not {}",
-            publisher.matched().borrow().connected()
+            publisher.matched_subscribers().borrow().connected_count()
         );
         Ok(())
     }
 
-    /// Waits until so many publishers are connected.
-    pub fn fed(&self, subscription: &Subscription, count: usize) -> anyhow::Result<()> {
+    /// Waits until `count` publishers are connected.
+    pub fn wait_for_publishers(
+        &self,
+        subscription: &Subscription,
+        count: usize,
+    ) -> anyhow::Result<()> {
         let mut now = subscription.matched.clone();
         let reached = self.runtime.block_on(async {
-            patience::wait_for(now.wait_for(|now| now.connected() == count))
+            patience::wait_for(now.wait_for(|now| now.connected_count() == count))
                 .await
                 .is_ok()
         });
         ensure!(
             reached,
             "{count} publishers should be connected, not {}",
-            subscription.matched.borrow().connected()
+            subscription.matched.borrow().connected_count()
         );
         Ok(())
     }
 
     /// Calls a service.
-    pub fn calls(
+    pub fn call_service(
         &self,
-        node: &(impl Node + ?Sized),
+        node: &(impl HasBus + ?Sized),
         service: &str,
         request: &[u8],
     ) -> anyhow::Result<Bytes> {
@@ -248,40 +266,40 @@ impl Site {
     }
 
     /// Starts a stub for an executable of a service of the daemon, as robot `robot`.
-    pub fn stub(
+    pub fn start_stub(
         &self,
         daemon: &Daemon,
         (service, package, executable): (&str, &str, &str),
         robot: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let toml = format!(
             "server = \"ws://{}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n",
             daemon.address
         );
-        self.stub_with(&toml, package, executable, argv)
+        self.start_stub_with_config(&toml, package, executable, argv)
     }
 
-    /// The same with a `stub.toml` of one's own.
-    pub fn stub_with(
+    /// Starts a stub with this `stub.toml`.
+    pub fn start_stub_with_config(
         &self,
         toml: &str,
         package: &str,
         executable: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
-        self.stub_among(&[], toml, package, executable, argv)
+    ) -> anyhow::Result<NodeProcess> {
+        self.start_stub_with_environment(&[], toml, package, executable, argv)
     }
 
-    /// The same, with these variables in its environment.
-    pub fn stub_among(
+    /// Starts a stub with this `stub.toml` and these environment variables.
+    pub fn start_stub_with_environment(
         &self,
         environment: &[(&str, &str)],
         toml: &str,
         package: &str,
         executable: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let overlay = tempfile::Builder::new()
             .prefix("stub")
             .tempdir_in(self.place.path())?
@@ -301,18 +319,18 @@ impl Site {
         self.start(command, &overlay.join("log"))
     }
 
-    /// Installs a stub of a service as its archive comes, with `settings` added to its `stub.toml`; gives the overlay.
-    pub fn installs(
+    /// Installs a stub of a service from its archive, with `settings` appended to its `stub.toml`; returns the overlay.
+    pub fn install_stub(
         &self,
         daemon: &Daemon,
         service: &str,
         settings: &str,
     ) -> anyhow::Result<PathBuf> {
-        self.installs_for(daemon, service, std::env::consts::ARCH, settings)
+        self.install_stub_for(daemon, service, std::env::consts::ARCH, settings)
     }
 
-    /// The same for another architecture.
-    pub fn installs_for(
+    /// Installs a stub for another architecture.
+    pub fn install_stub_for(
         &self,
         daemon: &Daemon,
         service: &str,
@@ -325,13 +343,13 @@ impl Site {
             .keep();
         let directory = path_str(&place);
         let words = ["stub", service, "--arch", architecture, "-o", directory];
-        daemon.deployer().types(&words)?.succeeded()?;
+        daemon.deployer().run(&words)?.expect_success()?;
         let archive = File::open(place.join(format!("{service}.tar.gz")))?;
         tar::Archive::new(flate2::read::GzDecoder::new(archive)).unpack(&place)?;
         let overlay = place.join(format!("{service}-stub"));
         for package in std::fs::read_dir(overlay.join("share"))? {
             let path = package?.path().join("stub.toml");
-            // The index of ROS 2 stands beside the package.
+            // The resource index of ROS 2 is outside of the package's directory.
             if !path.exists() {
                 continue;
             }
@@ -342,40 +360,41 @@ impl Site {
     }
 
     /// Starts an executable of an installed stub.
-    pub fn runs(
+    pub fn start_installed(
         &self,
         overlay: &Path,
         package: &str,
         executable: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
-        self.runs_among(&[], overlay, package, executable, argv)
+    ) -> anyhow::Result<NodeProcess> {
+        self.start_installed_with_environment(&[], overlay, package, executable, argv)
     }
 
-    /// The same, with these variables in its environment.
-    pub fn runs_among(
+    /// Starts an executable of an installed stub with these environment variables.
+    pub fn start_installed_with_environment(
         &self,
         environment: &[(&str, &str)],
         overlay: &Path,
         package: &str,
         executable: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let mut command = Command::new(overlay.join("lib").join(package).join(executable));
         command.args(argv).envs(environment.iter().copied());
         let log = tempfile::Builder::new().tempfile_in(self.place.path())?;
         self.start(command, &log.into_temp_path().keep()?)
     }
 
-    /// The same by an emulator, which has to be told what a launcher would.
-    pub fn emulates(
+    /// Starts an executable of an installed stub with an emulator, which needs the arguments that a launcher would
+    /// pass.
+    pub fn start_emulated(
         &self,
         emulator: &str,
         overlay: &Path,
         package: &str,
         executable: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let mut command = Command::new(emulator);
         command
             .arg(overlay.join("lib").join(package).join("cloudroid-stub"))
@@ -388,21 +407,21 @@ impl Site {
     }
 
     /// Starts an original in the root file system of a service's image, in this machine's network.
-    pub fn original(
+    pub fn start_original(
         &self,
         daemon: &Daemon,
         service: &str,
         program: &str,
         argv: &[&str],
-    ) -> anyhow::Result<Running> {
-        let script = self.in_image(daemon, service)?;
+    ) -> anyhow::Result<NodeProcess> {
+        let script = self.image_shell(daemon, service)?;
         let argv: Vec<String> = argv.iter().map(|word| (*word).to_owned()).collect();
-        self.starts_in_image(&script, program, &argv)
+        self.start_in_image(&script, program, &argv)
     }
 
-    /// Installs an executable of a service's image on the robot: a workspace to stand on CMAKE_PREFIX_PATH, or of ROS 2 on
-    /// AMENT_PREFIX_PATH, whose program becomes the original in the image's root file system.
-    pub fn installs_original(
+    /// Installs an executable of a service's image on the robot: returns a workspace for CMAKE_PREFIX_PATH, or
+    /// AMENT_PREFIX_PATH in ROS 2, whose program runs the original in the image's root file system.
+    pub fn install_original(
         &self,
         daemon: &Daemon,
         service: &str,
@@ -412,7 +431,7 @@ impl Site {
         let prefix = self.place.path().join("installed").join(package);
         let launcher = prefix.join("lib").join(package).join(executable);
         std::fs::create_dir_all(launcher.parent().context("a directory")?)?;
-        let script = self.in_image(daemon, service)?;
+        let script = self.image_shell(daemon, service)?;
         let variables = match self.system.version() {
             RosVersion::One => {
                 std::fs::write(prefix.join(".catkin"), "")?;
@@ -434,18 +453,18 @@ impl Site {
         Ok(prefix)
     }
 
-    /// A shell's commands that execute their arguments in a service's root file system.
-    fn in_image(&self, daemon: &Daemon, service: &str) -> anyhow::Result<String> {
-        in_image(daemon, service, &self.place.path().join("root"))
+    /// Returns shell commands that execute their arguments in a service's root file system.
+    fn image_shell(&self, daemon: &Daemon, service: &str) -> anyhow::Result<String> {
+        image_shell(daemon, service, &self.place.path().join("root"))
     }
 
-    /// Starts a program in a root file system, by commands of [`in_image`].
-    pub fn starts_in_image(
+    /// Starts a program in a root file system, through the commands of [`image_shell`].
+    pub fn start_in_image(
         &self,
         script: &str,
         program: &str,
         argv: &[String],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let mut command = Command::new("unshare");
         command
             .args(["--mount", "sh", "-c", script, "sh", program])
@@ -454,54 +473,55 @@ impl Site {
         self.start(command, &self.place.path().join("original.log"))
     }
 
-    fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<Running> {
+    fn start(&self, mut command: Command, log: &Path) -> anyhow::Result<NodeProcess> {
         let file = File::create(log)?;
-        self.system.is_of(&mut command);
+        self.system.configure(&mut command);
         command
             .stdin(Stdio::null())
             .stdout(file.try_clone()?)
             .stderr(file);
         let spawned = match &self.namespace {
-            Some(namespace) => within(namespace, || command.spawn())?,
+            Some(namespace) => run_in_namespace(namespace, || command.spawn())?,
             None => command.spawn(),
         };
         let child = spawned.context("starting a node")?;
-        Ok(Running {
+        Ok(NodeProcess {
             child,
             log: log.to_owned(),
         })
     }
 }
 
-/// A shell's commands that execute their arguments in a service's root file system, which is mounted at `root`; for a mount namespace of
-/// its own.
-pub fn in_image(daemon: &Daemon, service: &str, root: &Path) -> anyhow::Result<String> {
+/// Returns shell commands that mount a service's root file system at `root` and execute their arguments in it; for a
+/// private mount namespace.
+pub fn image_shell(daemon: &Daemon, service: &str, root: &Path) -> anyhow::Result<String> {
     let config = image_config(daemon, service)?;
     let diffs = config["rootfs"]["diff_ids"].as_array().context("layers")?;
     std::fs::create_dir_all(root)?;
     let layers = diffs.iter().rev().filter_map(|diff| diff.as_str());
     let layers: Vec<PathBuf> = layers
-        .map(|diff| layer(&daemon.home, diff))
+        .map(|diff| layer_path(&daemon.home, diff))
         .collect::<anyhow::Result<_>>()?;
     let lowers: Vec<String> = layers
         .iter()
         .map(|layer| layer.display().to_string())
         .collect();
     Ok(format!(
-        "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
+        "mount -t overlay overlay -o lowerdir={} {root} && mount --rbind /dev {root}/dev && mount -t proc proc \
+         {root}/proc && mount -t tmpfs none {root}/root && mount -t tmpfs none {root}/tmp && exec chroot {root} \"$@\"",
         lowers.join(":"),
         root = root.display(),
     ))
 }
 
-/// The configuration of a service's image (OCI image specification, config.md).
+/// Returns the configuration of a service's image (OCI image specification, config.md).
 pub fn image_config(daemon: &Daemon, service: &str) -> anyhow::Result<serde_json::Value> {
     let manifest = daemon.get_json(&format!("/v2/{service}/manifests/latest"))?;
     let config = manifest["config"]["digest"].as_str().context("a config")?;
     daemon.get_json(&format!("/v2/{service}/blobs/{config}"))
 }
 
-/// The variables of a service's image as `env` takes them, but for those that say which ROS system is joined.
+/// Returns the environment of a service's image as arguments of `env`, without the variables that select a ROS system.
 fn image_environment(daemon: &Daemon, service: &str) -> anyhow::Result<String> {
     let config = image_config(daemon, service)?;
     let variables = config["config"]["Env"].as_array().context("variables")?;
@@ -515,8 +535,8 @@ fn image_environment(daemon: &Daemon, service: &str) -> anyhow::Result<String> {
     Ok(quoted.collect::<Vec<_>>().join(" "))
 }
 
-/// Where a layer is extracted.
-fn layer(home: &Path, diff: &str) -> anyhow::Result<PathBuf> {
+/// Returns the directory of an extracted layer.
+fn layer_path(home: &Path, diff: &str) -> anyhow::Result<PathBuf> {
     let layers = home.join("layers");
     let hex = diff.trim_start_matches("sha256:");
     [
@@ -529,26 +549,26 @@ fn layer(home: &Path, diff: &str) -> anyhow::Result<PathBuf> {
     .with_context(|| format!("layer {diff} below {}", layers.display()))
 }
 
-impl Running {
-    /// Its process.
+impl NodeProcess {
+    /// Returns its pid.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// What it printed.
-    pub fn said(&self) -> String {
+    /// Returns its output.
+    pub fn output(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
-    /// Waits until it has printed these words.
-    pub fn says(&self, words: &str) -> anyhow::Result<()> {
-        self.says_times(words, 1)
+    /// Waits until its output contains these words.
+    pub fn wait_for_output(&self, words: &str) -> anyhow::Result<()> {
+        self.wait_for_output_times(words, 1)
     }
 
-    /// Waits until it has printed these words so many times.
-    pub fn says_times(&self, words: &str, times: usize) -> anyhow::Result<()> {
-        crate::until(&format!("{words:?}, {times} times"), || {
-            let said = self.said();
+    /// Waits until its output contains these words a number of times.
+    pub fn wait_for_output_times(&self, words: &str, times: usize) -> anyhow::Result<()> {
+        crate::wait_until(&format!("{words:?}, {times} times"), || {
+            let said = self.output();
             let enough = said.matches(words).count() >= times;
             Ok(if enough { Ok(()) } else { Err(said) })
         })
@@ -563,26 +583,26 @@ impl Running {
     }
 
     /// Waits for its end.
-    pub fn ends(&mut self) -> anyhow::Result<ExitStatus> {
-        crate::until("its end", || {
+    pub fn wait_for_exit(&mut self) -> anyhow::Result<ExitStatus> {
+        crate::wait_until("its end", || {
             let ended = self.child.try_wait()?;
-            Ok(ended.ok_or_else(|| self.said()))
+            Ok(ended.ok_or_else(|| self.output()))
         })
     }
 }
 
-impl Drop for Running {
+impl Drop for NodeProcess {
     fn drop(&mut self) {
         if std::thread::panicking() {
-            eprintln!("{}", self.said());
+            eprintln!("{}", self.output());
         }
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// What `node` has registered, as lines that can be compared: names and types.
-pub fn registered(graph: &Graph, node: &str) -> BTreeSet<String> {
+/// Returns the registrations of `node` as comparable lines: names and types.
+pub fn registrations(graph: &Graph, node: &str) -> BTreeSet<String> {
     let node = node.to_owned();
     let mut lines = BTreeSet::new();
     for (topic, ends) in &graph.topics {
@@ -601,26 +621,26 @@ pub fn registered(graph: &Graph, node: &str) -> BTreeSet<String> {
     lines
 }
 
-/// The type of strings in either ROS.
+/// Returns the type of strings in either version of ROS.
 pub fn string_type(version: RosVersion) -> anyhow::Result<WireType> {
     let name = match version {
         RosVersion::One => "std_msgs/String",
         RosVersion::Two => "std_msgs/msg/String",
     };
-    let of = MessageType::of_full_text(version, name, "string data\n")?;
-    Ok(WireType::of(&of))
+    let of = MessageType::parse_full_text(version, name, "string data\n")?;
+    Ok(WireType::from_message(&of))
 }
 
-/// A serialized std_msgs/String of ROS 1.
+/// Serializes a std_msgs/String of ROS 1.
 pub fn string(text: &str) -> Bytes {
-    string_of(WireFormat::Ros1, text)
+    string_in(WireFormat::Ros1, text)
 }
 
-/// A serialized string in this format.
-pub fn string_of(format: WireFormat, text: &str) -> Bytes {
+/// Serializes a string in this format.
+pub fn string_in(format: WireFormat, text: &str) -> Bytes {
     let (header, end): (&[u8], &[u8]) = match format {
         WireFormat::Ros1 => (&[], &[]),
-        // Little endian, and strings that end with a zero.
+        // Little endian; strings end with a zero byte.
         WireFormat::Cdr => (&[0, 1, 0, 0], &[0]),
     };
     let length = u32::try_from(text.len() + end.len()).unwrap_or(0);
@@ -629,8 +649,8 @@ pub fn string_of(format: WireFormat, text: &str) -> Bytes {
         .into()
 }
 
-/// The text that a message ends with, behind so many bytes of flags.
-pub fn text_of(version: RosVersion, message: &[u8], flags: usize) -> anyhow::Result<String> {
+/// Returns the string at the end of a message, after `flags` bytes.
+pub fn string_text(version: RosVersion, message: &[u8], flags: usize) -> anyhow::Result<String> {
     let at = match version {
         RosVersion::One => flags + 4,
         RosVersion::Two => 4 + flags.next_multiple_of(4) + 4,

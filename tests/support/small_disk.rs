@@ -1,4 +1,4 @@
-//! A disk that a story can fill: a file system in memory, below the place of this run.
+//! A disk that a story can fill: a file system in memory, below the directory of this run.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -7,13 +7,13 @@ use nix::mount::{MntFlags, MsFlags, mount, umount2};
 
 use crate::world::{Directory, world};
 
-/// It is unmounted when it is dropped.
+/// The disk; unmounted on drop.
 pub struct SmallDisk {
     directory: Directory,
 }
 
 impl SmallDisk {
-    /// A disk of `size`, such as `64M`, in a directory of that name.
+    /// Mounts a disk of `size`, such as `64M`, in a directory named `name`.
     pub fn mount(name: &str, size: &str) -> anyhow::Result<SmallDisk> {
         let directory = world().directory(name)?;
         let options = format!("size={size}");
@@ -27,20 +27,20 @@ impl SmallDisk {
         Ok(SmallDisk { directory })
     }
 
-    /// A home on it for a daemon.
+    /// Returns a home for a daemon on it.
     pub fn home(&self) -> PathBuf {
         self.path().join("home")
     }
 
-    /// Writes until nothing more fits.
+    /// Fills it completely.
     pub fn fill(&self) -> anyhow::Result<()> {
         let mut filler = File::create(self.filler())?;
-        // It ends by an error: the disk is full.
+        // Ends with an error when the disk is full.
         let _ = std::io::copy(&mut std::io::repeat(1), &mut filler);
         Ok(())
     }
 
-    /// Removes what filled it.
+    /// Frees the filled space.
     pub fn make_room(&self) -> anyhow::Result<()> {
         Ok(std::fs::remove_file(self.filler())?)
     }

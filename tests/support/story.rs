@@ -1,37 +1,38 @@
-//! The story that a thread tells: what it has made, so that this can be kept when it fails, and how long it waited for others.
+//! The story that runs on a thread: the things it created, so that they can be kept when it fails, and how long it
+//! waited for others.
 
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// One telling of a story.
+/// One run of a story.
 #[derive(Debug)]
-pub struct Telling {
-    /// The story's name.
+pub struct StoryRun {
+    /// Name of the story.
     pub name: &'static str,
-    /// Where the evidence of a failure is kept.
+    /// Directory for the evidence of a failure.
     pub evidence: PathBuf,
     /// Counted from 1.
     pub attempt: usize,
-    made: Mutex<Made>,
+    made: Mutex<StoryArtifacts>,
 }
 
 #[derive(Debug, Default)]
-struct Made {
+struct StoryArtifacts {
     homes: Vec<PathBuf>,
     directories: Vec<PathBuf>,
     waited: Duration,
 }
 
 thread_local! {
-    static CURRENT: RefCell<Option<Arc<Telling>>> = const { RefCell::new(None) };
+    static CURRENT: RefCell<Option<Arc<StoryRun>>> = const { RefCell::new(None) };
 }
 
-impl Telling {
-    /// A telling whose evidence is kept in the directory `evidence`.
-    pub fn new(name: &'static str, attempt: usize, evidence: PathBuf) -> Arc<Telling> {
-        Arc::new(Telling {
+impl StoryRun {
+    /// Creates a run with the directory `evidence` for its evidence.
+    pub fn new(name: &'static str, attempt: usize, evidence: PathBuf) -> Arc<StoryRun> {
+        Arc::new(StoryRun {
             name,
             evidence,
             attempt,
@@ -39,53 +40,53 @@ impl Telling {
         })
     }
 
-    /// Homes of the daemons that the story started.
+    /// Returns the homes of the daemons that the story started.
     pub fn homes(&self) -> Vec<PathBuf> {
-        self.made().homes.clone()
+        self.artifacts().homes.clone()
     }
 
-    /// Directories that the story made.
+    /// Returns the directories that the story created.
     pub fn directories(&self) -> Vec<PathBuf> {
-        self.made().directories.clone()
+        self.artifacts().directories.clone()
     }
 
-    /// How long the story waited for cores that others' work took up.
-    pub fn waited(&self) -> Duration {
-        self.made().waited
+    /// Returns how long the story waited for cores that other stories used.
+    pub fn waiting_time(&self) -> Duration {
+        self.artifacts().waited
     }
 
-    fn made(&self) -> std::sync::MutexGuard<'_, Made> {
+    fn artifacts(&self) -> std::sync::MutexGuard<'_, StoryArtifacts> {
         self.made.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Makes this thread the one that tells a story.
-pub fn begin(telling: Arc<Telling>) {
+/// Makes this thread the one that runs a story.
+pub fn begin(telling: Arc<StoryRun>) {
     CURRENT.set(Some(telling));
 }
 
-/// The story that this thread tells; none in a thread that a story has started itself.
-pub fn current() -> Option<Arc<Telling>> {
+/// Returns the story of this thread; `None` on threads that a story has started itself.
+pub fn current() -> Option<Arc<StoryRun>> {
     CURRENT.with_borrow(Clone::clone)
 }
 
-/// Tells if this thread tells a story that has failed once.
-pub(crate) fn is_told_again() -> bool {
+/// Returns whether this thread repeats a story that has failed once.
+pub(crate) fn is_repeated() -> bool {
     current().is_some_and(|telling| telling.attempt > 1)
 }
 
-/// Notes a daemon's home.
+/// Records a daemon's home.
 pub(crate) fn add_home(home: &Path) {
     if let Some(telling) = current() {
-        telling.made().homes.push(home.to_owned());
+        telling.artifacts().homes.push(home.to_owned());
     }
 }
 
-/// Notes a directory. Returns if it is a story's, which is removed with it.
+/// Records a directory. Returns whether it belongs to a story, with which it is removed.
 pub(crate) fn add_directory(directory: &Path) -> bool {
     let telling = current();
     if let Some(telling) = &telling {
-        telling.made().directories.push(directory.to_owned());
+        telling.artifacts().directories.push(directory.to_owned());
     }
     telling.is_some()
 }
@@ -93,6 +94,6 @@ pub(crate) fn add_directory(directory: &Path) -> bool {
 /// Adds to the time that the story has waited for others.
 pub(crate) fn add_wait(time: Duration) {
     if let Some(telling) = current() {
-        telling.made().waited += time;
+        telling.artifacts().waited += time;
     }
 }

@@ -1,4 +1,4 @@
-//! A proxy that speaks TLS in front of a portal, with an authority of its own, as a robot's owner might have.
+//! A TLS proxy in front of a portal, with a certificate authority of its own, as a robot's owner might have.
 
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -10,9 +10,9 @@ use crate::deployer::run;
 use crate::machine::free_port;
 use crate::world::{Directory, world};
 
-/// Both, made by openssl and socat.
-pub struct Proxy {
-    /// Where it listens.
+/// Proxy and authority, implemented with socat and openssl.
+pub struct TlsProxy {
+    /// Listening port.
     pub port: u16,
     place: Directory,
     serving: Child,
@@ -26,27 +26,28 @@ echo 'subjectAltName=DNS:localhost,IP:127.0.0.1' > names
 openssl x509 -req -in server.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile names -out server.pem
 "#;
 
-/// Makes an authority (`ca.pem`, `ca.key`) and what it has signed for this machine (`server.pem`, `server.key`) in a directory.
+/// Creates an authority (`ca.pem`, `ca.key`) and a certificate for this machine (`server.pem`, `server.key`) in a
+/// directory.
 pub(crate) fn make_certificates(place: &Path) -> anyhow::Result<()> {
     let made = run(Command::new("sh")
         .args(["-euc", CERTIFICATES])
         .current_dir(place))?;
-    ensure!(made.status == 0, "{}", made.said());
+    ensure!(made.status == 0, "{}", made.output());
     Ok(())
 }
 
-impl Proxy {
-    /// In front of the portal at `address`, under the names `localhost` and 127.0.0.1.
-    pub fn of(address: &str) -> anyhow::Result<Self> {
-        Self::showing("server", address)
+impl TlsProxy {
+    /// Starts a proxy in front of the portal at `address`, for the names `localhost` and 127.0.0.1.
+    pub fn start(address: &str) -> anyhow::Result<Self> {
+        Self::with_certificate("server", address)
     }
 
-    /// One that shows its authority's own certificate.
-    pub fn of_authority(address: &str) -> anyhow::Result<Self> {
-        Self::showing("ca", address)
+    /// Starts a proxy that uses the authority's own certificate.
+    pub fn with_ca_certificate(address: &str) -> anyhow::Result<Self> {
+        Self::with_certificate("ca", address)
     }
 
-    fn showing(certificate: &str, address: &str) -> anyhow::Result<Self> {
+    fn with_certificate(certificate: &str, address: &str) -> anyhow::Result<Self> {
         let place = world().directory("tls")?;
         make_certificates(place.path())?;
         let port = free_port()?;
@@ -64,8 +65,8 @@ impl Proxy {
             place,
             serving,
         };
-        // It listens as soon as it is reached.
-        crate::until("a proxy that listens", || {
+        // It listens as soon as a connection succeeds.
+        crate::wait_until("a proxy that listens", || {
             let reached = TcpStream::connect(("127.0.0.1", port));
             let ended = proxy.serving.try_wait()?;
             ensure!(ended.is_none(), "socat ended: {ended:?}");
@@ -74,13 +75,13 @@ impl Proxy {
         Ok(proxy)
     }
 
-    /// The authority's certificate.
+    /// Returns the authority's certificate.
     pub fn authority(&self) -> PathBuf {
         self.place.path().join("ca.pem")
     }
 }
 
-impl Drop for Proxy {
+impl Drop for TlsProxy {
     fn drop(&mut self) {
         let _ = self.serving.kill();
         let _ = self.serving.wait();

@@ -1,51 +1,53 @@
-//! Nodes that do the same in either ROS, under the same names: who tells a story of both asks one of these.
+//! Nodes with the same behaviour and names in both versions of ROS, for stories that cover both.
 
 use anyhow::Context;
 use bytes::Bytes;
 use ros::bus::RosVersion;
 
-use crate::layout::Layout;
-use crate::ros_system::Node;
-use crate::site::{Running, Site, text_of};
-use crate::world::{ADDER, CROSSING, GREETER, Service};
+use crate::layout::MessageLayout;
+use crate::ros_system::HasBus;
+use crate::site::{NodeProcess, Site, string_text};
+use crate::world::{ADDER, CROSSING, GREETER, StoryService};
 
 /// The nodes of ROS 2.
-pub const TWINS: Service = Service {
+pub const TWINS: StoryService = StoryService {
     name: "twins_ros2",
     package: Some("twins_ros2"),
     arguments: &["--node", "greeter", "--node", "adder", "--node", "caller"],
 };
 
-/// One of them.
+/// One of these nodes.
 #[derive(Clone, Copy)]
 pub struct Twin {
-    /// In which ROS.
+    /// Version of ROS.
     pub ros: RosVersion,
-    /// What is pushed; the package has its name.
-    pub service: Service,
-    /// Its executable.
+    /// Service that is pushed; its package has the same name.
+    pub service: StoryService,
+    /// Executable.
     pub executable: &'static str,
 }
 
 impl Twin {
-    /// Greets on `~greeting` whoever is named on `~name`, the last one latched; `~count` says how many were named.
+    /// A node that greets the names published on `~name` on `~greeting`, which is latched; `~count` returns how many
+    /// names there were.
     pub fn greeter(ros: RosVersion) -> Self {
-        Self::of(ros, (GREETER, "greeter"), "greeter")
+        Self::new(ros, (GREETER, "greeter"), "greeter")
     }
 
-    /// Adds by `/add_two`, and says what came out on `/sums`.
+    /// A node that adds numbers by `/add_two`, and publishes the results on `/sums`.
     pub fn adder(ros: RosVersion) -> Self {
-        Self::of(ros, (ADDER, "adder.py"), "adder")
+        Self::new(ros, (ADDER, "adder.py"), "adder")
     }
 
-    /// Called `crossing`: by `~ask` it asks its robot's `/robot/secret`, by `~wait` it waits for `/robot/late`; `~now` tells the time.
+    /// A node named `crossing`: `~ask` calls the robot's `/robot/secret`, `~wait` waits for `/robot/late`, and `~now`
+    /// returns the time.
     pub fn caller(ros: RosVersion) -> Self {
-        Self::of(ros, (CROSSING, "crossing.py"), "caller")
+        Self::new(ros, (CROSSING, "crossing.py"), "caller")
     }
 
-    fn of(
+    fn new(
         ros: RosVersion,
-        (service, executable): (Service, &'static str),
+        (service, executable): (StoryService, &'static str),
         two: &'static str,
     ) -> Self {
         let (service, executable) = match ros {
@@ -59,18 +61,18 @@ impl Twin {
         }
     }
 
-    /// Service, package and executable, as [`Site::stub`] takes them.
+    /// Returns service, package and executable, as [`Site::start_stub`] takes them.
     pub fn names(&self) -> (&'static str, &'static str, &'static str) {
         (self.service.name, self.service.name, self.executable)
     }
 
-    /// Where its program is in an image.
+    /// Returns the path of its program in an image.
     pub fn program(&self) -> String {
         let (_, package, executable) = self.names();
         format!("/opt/cloudroid/install/lib/{package}/{executable}")
     }
 
-    /// A command line by which the node has this name, and names are others: `~NAME` is one of the node's own.
+    /// Returns a command line with the name of the node and remappings of names; `~NAME` is a private name.
     pub fn argv(&self, node: &str, remaps: &[(&str, &str)]) -> Vec<String> {
         match self.ros {
             RosVersion::One => {
@@ -92,85 +94,92 @@ impl Twin {
         }
     }
 
-    /// A stub of it, with a server and a `robot` of its own and further settings.
+    /// Starts a stub of it, with this server, robot and further settings.
     pub fn stub(
         &self,
         site: &Site,
         (server, robot): (&str, &str),
         settings: &str,
         argv: &[String],
-    ) -> anyhow::Result<Running> {
+    ) -> anyhow::Result<NodeProcess> {
         let (service, package, executable) = self.names();
         let toml = format!(
             "server = \"ws://{server}\"\nservice = \"{service}\"\nrobot = \"{robot}\"\nlocal = \"none\"\n{settings}\n"
         );
         let argv: Vec<&str> = argv.iter().map(String::as_str).collect();
-        site.stub_with(&toml, package, executable, &argv)
+        site.start_stub_with_config(&toml, package, executable, &argv)
     }
 
-    /// A robot's name in the story of this ROS.
-    pub fn robot(&self, name: &str) -> String {
+    /// Returns a robot's name that is unique for this version of ROS.
+    pub fn robot_name(&self, name: &str) -> String {
         format!("{name}-{}", self.ros.number())
     }
 }
 
-/// How many names a greeter has heard.
-pub fn count(site: &Site, app: &(impl Node + ?Sized), node: &str) -> anyhow::Result<u32> {
+/// Returns how many names a greeter has received.
+pub fn greeting_count(
+    site: &Site,
+    app: &(impl HasBus + ?Sized),
+    node: &str,
+) -> anyhow::Result<u32> {
     let service = format!("{node}/count");
     match site.system.version() {
         RosVersion::One => {
-            let answer = site.calls(app, &service, &[0])?;
+            let answer = site.call_service(app, &service, &[0])?;
             let number = answer.first_chunk().context("too short")?;
             Ok(u32::from_le_bytes(*number))
         }
-        RosVersion::Two => Ok(triggered(site, app, &service)?.1.parse()?),
+        RosVersion::Two => Ok(call_trigger(site, app, &service)?.1.parse()?),
     }
 }
 
-/// The request of a std_srvs/Trigger.
-pub fn trigger(ros: RosVersion) -> Bytes {
-    let mut request = Layout::of(ros);
+/// Serializes a request of std_srvs/Trigger.
+pub fn trigger_request(ros: RosVersion) -> Bytes {
+    let mut request = MessageLayout::new(ros);
     if ros == RosVersion::Two {
-        // An empty message is a byte.
+        // An empty message is serialized as one byte.
         request.u8(0);
     }
     request.finish()
 }
 
-/// What a std_srvs/Trigger answers.
-pub fn answer_of(ros: RosVersion, success: bool, message: &str) -> Bytes {
-    let mut answer = Layout::of(ros);
+/// Serializes a response of std_srvs/Trigger.
+pub fn trigger_response(ros: RosVersion, success: bool, message: &str) -> Bytes {
+    let mut answer = MessageLayout::new(ros);
     answer.u8(success.into()).text(message).finish()
 }
 
-/// Whether a std_srvs/Trigger succeeded, and its words.
-pub fn said(ros: RosVersion, answer: &[u8]) -> anyhow::Result<(bool, String)> {
+/// Parses a response of std_srvs/Trigger: success and message.
+pub fn parse_trigger_response(ros: RosVersion, answer: &[u8]) -> anyhow::Result<(bool, String)> {
     let at = match ros {
         RosVersion::One => 0,
         RosVersion::Two => 4,
     };
     let success = answer.get(at).context("too short")?;
-    Ok((*success == 1, text_of(ros, answer, 1)?))
+    Ok((*success == 1, string_text(ros, answer, 1)?))
 }
 
 /// Calls a std_srvs/Trigger.
-pub fn triggered(
+pub fn call_trigger(
     site: &Site,
-    app: &(impl Node + ?Sized),
+    app: &(impl HasBus + ?Sized),
     service: &str,
 ) -> anyhow::Result<(bool, String)> {
     let ros = site.system.version();
-    said(ros, &site.calls(app, service, &trigger(ros))?)
+    parse_trigger_response(
+        ros,
+        &site.call_service(app, service, &trigger_request(ros))?,
+    )
 }
 
-/// A call of an adder, with nothing to add to a number.
-pub fn sum(ros: RosVersion, number: i64) -> Bytes {
+/// Serializes a request to an adder: `number` and zero.
+pub fn sum_request(ros: RosVersion, number: i64) -> Bytes {
     let bytes = number.to_le_bytes();
     match ros {
         RosVersion::One => [bytes, [0; 8]].concat().into(),
         RosVersion::Two => {
-            // test_msgs/BasicTypes: other numbers, an int64, a uint64, a text.
-            let mut out = Layout::of(ros);
+            // test_msgs/BasicTypes: other numbers, an int64, a uint64, a string.
+            let mut out = MessageLayout::new(ros);
             for _ in 0..BEFORE / 4 {
                 out.u32(0);
             }
@@ -182,8 +191,8 @@ pub fn sum(ros: RosVersion, number: i64) -> Bytes {
     }
 }
 
-/// What an adder has answered.
-pub fn sum_of(ros: RosVersion, answer: &[u8]) -> anyhow::Result<i64> {
+/// Parses the response of an adder.
+pub fn parse_sum(ros: RosVersion, answer: &[u8]) -> anyhow::Result<i64> {
     let at = match ros {
         RosVersion::One => 0,
         RosVersion::Two => 4 + BEFORE,

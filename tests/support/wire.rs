@@ -1,4 +1,4 @@
-//! Bytes sent to a daemon as they are: requests that no client library would write.
+//! Raw bytes sent to a daemon: requests that no client library would write.
 
 use std::io::{Read, Write};
 
@@ -6,20 +6,20 @@ use anyhow::ensure;
 
 use crate::patience::{connect, is_slow};
 
-/// All that comes back for `sent` until the other side ends the connection. What is sent must ask for that.
+/// Sends `sent` and returns everything received until the other side closes the connection, which `sent` must request.
 ///
 /// # Errors
-/// Where nobody listens, and where the connection does not end within the time that a story waits.
-pub fn answers(address: &str, sent: &[u8]) -> anyhow::Result<String> {
+/// If nobody listens, or if the connection is not closed within the time limit of a story.
+pub fn exchange_with(address: &str, sent: &[u8]) -> anyhow::Result<String> {
     exchange(connect(address)?, sent)
 }
 
-/// The same over a connection that is there.
+/// Does the same on an established connection.
 ///
 /// # Errors
-/// Where the connection does not end in time.
+/// If the connection is not closed in time.
 pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<String> {
-    // Who is refused at the first line may be let go before the last one is written.
+    // A request that is refused at its first line may be cut off before the last line is written.
     let _ = stream.write_all(sent);
     let mut heard = Vec::new();
     let mut buffer = [0; 16 << 10];
@@ -40,7 +40,7 @@ pub fn exchange(mut stream: impl Read + Write, sent: &[u8]) -> anyhow::Result<St
     Ok(String::from_utf8_lossy(&heard).into_owned())
 }
 
-/// The statuses of all answers in what was heard.
+/// Returns the statuses of all responses.
 pub fn statuses(heard: &str) -> Vec<u16> {
     let lines = heard
         .split("HTTP/1.1 ")

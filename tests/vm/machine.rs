@@ -1,4 +1,4 @@
-//! The machine that the stories are told in, from inside.
+//! The virtual machine of the stories, from inside.
 
 use std::fs;
 use std::io::Write;
@@ -9,53 +9,53 @@ use anyhow::Context;
 use support::daemon::Daemon;
 use support::deployer::run;
 
-/// The package's state directory.
+/// State directory of the package.
 pub const HOME: &str = "/var/lib/cloudroid";
-/// The cgroup in which servants live.
+/// Parent cgroup of servants.
 pub const SERVANTS: &str = "/sys/fs/cgroup/system.slice/cloudroid-servants.service";
-/// Names of stories that failed, a line each, kept over cuts of the power.
+/// File with the names of failed stories, one per line, kept across power cuts.
 const FAILURES: &str = "/var/vm-failures";
 
-/// How often the machine has booted; none on any other machine.
-pub fn boot() -> Option<usize> {
+/// Returns how often the machine has booted; `None` on any other machine.
+pub fn boot_number() -> Option<usize> {
     std::env::var("VM_BOOT").ok()?.parse().ok()
 }
 
-/// The installed daemon, once it answers.
+/// Attaches to the installed daemon, once it answers.
 pub fn daemon() -> anyhow::Result<Daemon> {
-    Daemon::of_another(Path::new(HOME), None)
+    Daemon::attach(Path::new(HOME), None)
 }
 
-/// Its main process, as systemd knows it.
+/// Returns its main pid according to systemd.
 pub fn main_pid() -> anyhow::Result<i32> {
     property("cloudroid.service", "MainPID")?
         .parse()
         .context("a pid")
 }
 
-/// What systemd says of a unit.
+/// Returns a property of a systemd unit.
 pub fn property(unit: &str, name: &str) -> anyhow::Result<String> {
-    let outcome = types("systemctl", &["show", "--value", "-p", name, unit])?;
+    let outcome = run_program("systemctl", &["show", "--value", "-p", name, unit])?;
     Ok(outcome.trim().to_owned())
 }
 
-/// Runs a program that must go well, and gives what it printed.
-pub fn types(program: &str, arguments: &[&str]) -> anyhow::Result<String> {
+/// Runs a program that must succeed; returns its output.
+pub fn run_program(program: &str, arguments: &[&str]) -> anyhow::Result<String> {
     let outcome = run(Command::new(program)
         .args(arguments)
         .env("DEBIAN_FRONTEND", "noninteractive"))?;
-    Ok(outcome.succeeded()?.stdout)
+    Ok(outcome.expect_success()?.stdout)
 }
 
-/// A control file of a servant.
-pub fn control(id: &str, name: &str) -> anyhow::Result<String> {
+/// Reads a cgroup control file of a servant.
+pub fn read_control_file(id: &str, name: &str) -> anyhow::Result<String> {
     let path = Path::new(SERVANTS).join(id).join(name);
     let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
     Ok(text.trim().to_owned())
 }
 
-/// What the daemon and systemd said last.
-pub fn last_words() -> String {
+/// Returns the last log lines of the daemon and systemd.
+pub fn log_tail() -> String {
     let journal = Command::new("journalctl")
         .args(["-b", "--no-pager", "-o", "cat", "-n", "15"])
         .output();
@@ -65,8 +65,8 @@ pub fn last_words() -> String {
     )
 }
 
-/// Remembers a failure.
-pub fn failed(name: &str) {
+/// Records a failure.
+pub fn record_failure(name: &str) {
     let mut file = fs::File::options()
         .create(true)
         .append(true)
@@ -76,10 +76,10 @@ pub fn failed(name: &str) {
     file.sync_all().expect("the disk can be written");
 }
 
-/// As when a plug is pulled: nothing is written any more.
+/// Resets the machine without flushing anything to disk, like pulling the plug.
 pub fn cut_power() -> ! {
     let _ = std::io::stdout().flush();
-    // What was printed is in the serial line's buffer, which is no part of the story.
+    // The output is in the buffer of the serial line, which is not part of the story.
     let _ = nix::sys::termios::tcdrain(std::io::stdout());
     let _ = fs::write("/proc/sysrq-trigger", "b");
     loop {
@@ -87,7 +87,7 @@ pub fn cut_power() -> ! {
     }
 }
 
-/// How all of it went.
+/// Returns the result of all boots.
 pub fn verdict() -> ExitCode {
     match fs::read_to_string(FAILURES) {
         Ok(names) => {

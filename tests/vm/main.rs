@@ -1,11 +1,11 @@
-//! Stories that need a machine of their own: systemd, cgroup v2, a package to install and to remove, power that is cut.
-//! Told in the virtual machine that `make test-vm` starts (`tests/vm/run`), as root, over several boots:
+//! Stories that need a machine of their own: systemd, cgroup v2, installing and removing a package, power cuts. They
+//! run as root in the virtual machine that `make test-vm` starts (`tests/vm/run`), over several boots:
 //!
 //! ```text
-//!   boot 1   install the package ─▶ stories ─▶ first cut's beginning ─▶ power off
-//!   boot 2   what is left of the first cut ─▶ second cut's beginning ─▶ power off
+//!   boot 1   install the package ─▶ stories ─▶ first half of the first cut ─▶ power off
+//!   boot 2   second half of the first cut ─▶ first half of the second cut ─▶ power off
 //!   …
-//!   last     what is left of the last cut ─▶ remove the package ─▶ make install ─▶ make uninstall
+//!   last     second half of the last cut ─▶ remove the package ─▶ make install ─▶ make uninstall
 //! ```
 
 use std::process::ExitCode;
@@ -27,41 +27,42 @@ mod restarts;
 #[path = "stories/sla.rs"]
 mod sla;
 
-/// A story under its function's name.
-struct Story {
+/// A story with the name of its function.
+struct VmStory {
     name: &'static str,
     tell: fn() -> Verdict,
 }
 
-/// Something that a cut of the power comes into the middle of.
+/// A power cut during some operation.
 struct Cut {
     name: &'static str,
-    /// Comes back in the middle.
+    /// Runs before the cut, and returns in the middle of the operation.
     before: fn() -> Verdict,
-    /// At the next boot.
+    /// Runs at the next boot.
     after: fn() -> Verdict,
 }
 
 macro_rules! stories {
     ($module:ident: $($name:ident),+ $(,)?) => {
-        vec![$(Story { name: concat!(stringify!($module), "::", stringify!($name)), tell: $module::$name }),+]
+        vec![$(VmStory { name: concat!(stringify!($module), "::", stringify!($name)), tell: $module::$name }),+]
     };
 }
 
 macro_rules! cuts {
     ($($name:ident),+ $(,)?) => {
-        vec![$(Cut { name: concat!("cuts::", stringify!($name)), before: cuts::$name::before, after: cuts::$name::after }),+]
+        vec![$(Cut { name: concat!("cuts::", stringify!($name)), before: cuts::$name::before,
+            after: cuts::$name::after }),+]
     };
 }
 
 fn main() -> ExitCode {
-    let Some(boot) = machine::boot() else {
+    let Some(boot) = machine::boot_number() else {
         println!("told in a virtual machine only: make test-vm");
         return ExitCode::SUCCESS;
     };
     let wanted: Vec<String> = std::env::args().skip(1).collect();
     let chosen = |name: &str| wanted.is_empty() || wanted.iter().any(|word| name.contains(word));
-    let stories: Vec<Story> = [
+    let stories: Vec<VmStory> = [
         stories![limits:
             limits_are_in_the_kernels_own_files,
             cores_are_shared_out_as_asked,
@@ -99,7 +100,7 @@ fn main() -> ExitCode {
     .collect();
 
     if boot == 1 {
-        told(
+        run_story(
             "installation::a_package_leaves_a_running_service",
             installation::installs,
         );
@@ -107,24 +108,24 @@ fn main() -> ExitCode {
             return machine::verdict();
         }
         for story in stories {
-            told(story.name, story.tell);
+            run_story(story.name, story.tell);
         }
     } else {
         let cut = &cuts[boot - 2];
-        told(cut.name, cut.after);
+        run_story(cut.name, cut.after);
     }
     if let Some(cut) = cuts.get(boot - 1) {
         match (cut.before)() {
             Ok(()) => machine::cut_power(),
-            Err(error) => told(cut.name, move || Err(error)),
+            Err(error) => run_story(cut.name, move || Err(error)),
         }
     }
     const REMOVAL: &str = "installation::removal_leaves_the_state_alone";
     const BY_MAKE: &str = "installation::what_make_install_puts_there_runs_and_goes_again";
-    // The second takes over what the first leaves.
+    // The second starts from the state that the first leaves.
     if chosen(REMOVAL) || chosen(BY_MAKE) {
-        told(REMOVAL, installation::removes);
-        told(
+        run_story(REMOVAL, installation::removes);
+        run_story(
             BY_MAKE,
             installation::installs_and_removes_without_a_package,
         );
@@ -132,8 +133,8 @@ fn main() -> ExitCode {
     machine::verdict()
 }
 
-/// Tells one and says how it went.
-fn told(name: &str, tell: impl FnOnce() -> Verdict) {
+/// Runs a story and prints its result.
+fn run_story(name: &str, tell: impl FnOnce() -> Verdict) {
     let began = Instant::now();
     let outcome = tell();
     let took = began.elapsed().as_secs_f64();
@@ -142,9 +143,9 @@ fn told(name: &str, tell: impl FnOnce() -> Verdict) {
         Err(error) => {
             println!(
                 "FAILED  {name} ({took:.1} s)\n{error:#}\n{}",
-                machine::last_words()
+                machine::log_tail()
             );
-            machine::failed(name);
+            machine::record_failure(name);
         }
     }
 }

@@ -172,7 +172,7 @@ class Visitor {
 
   async signsIn() {
     await this.types('Token', token);
-    await this.clicks('Sign in by token');
+    await this.clicks('Sign in with a token');
     await this.page.waitForSelector('nav');
   }
 }
@@ -187,18 +187,18 @@ const STEPS = {
     await visitor.clicks('Sign in');
     await visitor.sees('name or password is wrong');
     await visitor.types('Token', 'nobody knows this one');
-    await visitor.clicks('Sign in by token');
+    await visitor.clicks('Sign in with a token');
     await visitor.sees('token is not known');
     await visitor.signsIn();
-    await visitor.sees('Nothing is published yet');
+    await visitor.sees('No service is published yet');
     await visitor.judges('overview-empty');
     await visitor.clicks('Services', 'link');
     await visitor.sees('cloudroidctl push --apt');
     await visitor.clicks('Robots and servants', 'link');
-    await visitor.sees('No robot is here');
+    await visitor.sees('No robots connected');
     await visitor.judges('servants-empty');
     await visitor.opens('#/nowhere');
-    await visitor.sees('There is no such page');
+    await visitor.sees('Page not found');
     await visitor.judges('not-found');
   },
 
@@ -207,19 +207,19 @@ const STEPS = {
     await visitor.signsIn();
     await visitor.clicks('Deploy', 'link');
     await visitor.clicks('Push');
-    await visitor.sees('nothing is chosen');
+    await visitor.sees('no package is chosen');
     const folder = await visitor.page.waitForSelector('input[webkitdirectory]');
     const file = await visitor.page.waitForSelector('input[type=file]:not([webkitdirectory])');
     await file.uploadFile(join(sources, 'package.xml'));
-    await visitor.sees('package.xml is no tar archive');
+    await visitor.sees('package.xml is not a tar archive');
     await folder.uploadFile(sources);
     await visitor.sees('Chosen: the folder adder_py');
-    await visitor.types('Programs, each with its arguments, one a line', 'nobody.py');
+    await visitor.types('Programs with their arguments, one per line', 'nobody.py');
     await visitor.clicks('Push');
     await visitor.sees('nobody.py');
     await visitor.page.waitForSelector('.trouble');
     await visitor.judges('deploy-failed');
-    await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
+    await visitor.types('Programs with their arguments, one per line', 'adder.py');
     // An archive is dropped, and the push of it cancelled while it is sent.
     const [published, cancelled] = [() => visitor.elsewhere('GET', '/services'), 'Cancelled: nothing was published.'];
     const large = join(pictures, 'large');
@@ -250,7 +250,7 @@ const STEPS = {
     await visitor.tabsTo('Push');
     await visitor.page.keyboard.press('Enter');
     await visitor.sees('Published: adder_py, revision 1');
-    await visitor.sees('The interface that was found');
+    await visitor.sees('Interface found');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="push"]').innerText.includes('adder_py/AddTwo'));
     await visitor.judges('deploy');
     const answered = visitor.page.waitForResponse((answer) => answer.url().endsWith('/stubs/adder_py.tar.gz'));
@@ -267,7 +267,7 @@ const STEPS = {
   // A robot is served by the second revision of adder_py.
   async operator(visitor) {
     await visitor.signsIn();
-    await visitor.sees('Cores promised');
+    await visitor.sees('Cores reserved');
     await visitor.sees('is ready for rover');
     await visitor.judges('overview');
 
@@ -283,19 +283,19 @@ const STEPS = {
     await visitor.sees('1 of 1');
     await visitor.judges('servants');
     await visitor.types('Find by robot, service or class', 'nobody');
-    await visitor.sees('None is like that');
+    await visitor.sees('No matches');
     await visitor.types('Find by robot, service or class', 'rover adder');
     await visitor.sees('1 of 1');
     await visitor.chooses('Show', 'services');
-    await visitor.sees('None is like that');
+    await visitor.sees('No matches');
     await visitor.chooses('Show', 'all');
     await visitor.clicks('Memory');
     assert.strictEqual(await visitor.page.$eval('th[aria-sort=descending]', (head) => head.innerText.trim().split(' ')[0]), 'Memory');
 
     await visitor.clicks('rover', 'link');
-    await visitor.sees('Limits in force, as the kernel says');
+    await visitor.sees('Limits in force (read from the kernel)');
     // Its response times are told, and drawn; what it has stated beside them.
-    await visitor.page.waitForFunction(() => /median\s*[\d.]+\s*ms/.test(document.body.innerText));
+    await visitor.page.waitForFunction(() => /p50\s*[\d.]+\s*ms/.test(document.body.innerText));
     await visitor.page.waitForFunction(() => /T_max\s*200\s*ms/.test(document.body.innerText));
     await visitor.drawn('Response time (RRT)');
     assert.strictEqual(await visitor.page.$$eval('canvas', (all) => all.length), 7);
@@ -321,7 +321,7 @@ const STEPS = {
     await visitor.sees('Cores: 0.1, in force');
     await visitor.tabsTo('Set limits');
     await visitor.page.keyboard.press('Enter');
-    await visitor.sees('In force, as the kernel says: 0.1 cores');
+    await visitor.sees('In force (read from the kernel): 0.1 cores');
     await visitor.seesNot('Cores: 0.1, in force');
     // But for the weight, which the controller moves by what the machine has to do.
     assert.deepStrictEqual({ ...await enforced(), cpu_weight: 0 }, { ...before, cpus: 0.1, cpu_weight: 0 });
@@ -329,12 +329,12 @@ const STEPS = {
     await visitor.page.keyboard.press('ArrowLeft');
     await visitor.tabsTo('Set limits');
     await visitor.page.keyboard.press('Enter');
-    await visitor.sees('In force, as the kernel says: 0.1 cores, 272\u00a0MB');
+    await visitor.sees('In force (read from the kernel): 0.1 cores, 272\u00a0MB');
     const { cpus, memory } = await enforced();
     assert.deepStrictEqual({ cpus, memory }, { cpus: 0.1, memory: 272 << 20 });
     await visitor.elsewhere('PATCH', servant, { cpus: 0.5 });
     await slider('Cores', '0.5');
-    await visitor.seesNot('In force, as the kernel says: 0.1 cores');
+    await visitor.seesNot('In force (read from the kernel): 0.1 cores');
     await slider('Memory', '272\u00a0MB');
     // What was moved is let go.
     await visitor.page.focus('h1');
@@ -342,7 +342,7 @@ const STEPS = {
     await visitor.page.keyboard.press('ArrowRight');
     await visitor.sees('Cores: 0.55, in force 0.5');
     await visitor.judges('servant');
-    await visitor.clicks('As it is');
+    await visitor.clicks('Reset');
     await slider('Cores', '0.5');
 
     await visitor.clicks('Log', 'link');
@@ -358,7 +358,7 @@ const STEPS = {
     await visitor.sees('is ready for rover');
     await visitor.judges('events');
     await visitor.types('Find', 'no such words');
-    await visitor.sees('None is like that');
+    await visitor.sees('No matches');
 
     // Back to the revision before.
     await visitor.opens('#/services/adder_py');
@@ -375,8 +375,8 @@ const STEPS = {
     // They were pushed in different ways, and nothing else: the newest beside the one before.
     const differing = await visitor.page.waitForSelector('section[aria-labelledby="differences"] tbody tr');
     assert.match(await differing.evaluate((row) => row.innerText), /push\s+source\s/);
-    await visitor.chooses('and revision', '1');
-    await visitor.sees('Nothing that is recorded differs');
+    await visitor.chooses('with revision', '1');
+    await visitor.sees('No differences');
     await visitor.judges('service-differences');
 
     // By the keyboard alone: the first stop of the tabulator skips what is on every page.
@@ -407,21 +407,21 @@ const STEPS = {
     }
     assert.strictEqual(jsQR(picture, size * scale, size * scale)?.data, line);
     console.log(line);
-    await visitor.clicks('Take the code of rover back…');
-    await visitor.sees('It is good for nothing then');
+    await visitor.clicks('Revoke the code of rover…');
+    await visitor.sees('It can no longer be used');
     await visitor.clicks('Cancel');
     // It stands in the list of all, too.
     await visitor.opens('#/servants');
-    await visitor.sees('its pairing code waits');
+    await visitor.sees('pairing code not used yet');
     // After a push one is paired there, for what was pushed.
     await visitor.opens('#/deploy');
     await (await visitor.page.waitForSelector('input[webkitdirectory]')).uploadFile(sources);
-    await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
+    await visitor.types('Programs with their arguments, one per line', 'adder.py');
     await visitor.clicks('Push');
     await visitor.sees('Published: adder_py, revision 1');
     await visitor.types("Robot's name", 'second');
     await visitor.clicks('Pair');
-    await visitor.sees('On second, until');
+    await visitor.sees('Run on second, before');
     await visitor.page.waitForSelector('svg[role=img]');
     await visitor.judges('deploy-pairing');
     const second = (await visitor.elsewhere('GET', '/pairings')).find((one) => one.robot === 'second');
@@ -432,9 +432,9 @@ const STEPS = {
     await visitor.sees('2 of 3');
     await visitor.judges('servants-paired');
     await visitor.opens('#/access');
-    await visitor.clicks('Take the code of second back…');
-    await visitor.clicks('Take it back');
-    await visitor.seesNot('Take the code of second back…');
+    await visitor.clicks('Revoke the code of second…');
+    await visitor.clicks('Revoke it');
+    await visitor.seesNot('Revoke the code of second…');
   },
 
   // Accounts, tokens, rules, and who did what.
@@ -446,7 +446,7 @@ const STEPS = {
     await visitor.clicks('People', 'tab');
     await visitor.types('Name', 'eve');
     await visitor.types('Password, at least 12 characters', 'nine loud yellow kettles');
-    await visitor.clicks('Make it');
+    await visitor.clicks('Create');
     await visitor.sees('Disable eve…');
     await visitor.judges('access-people');
     await visitor.clicks('Disable eve…');
@@ -454,11 +454,11 @@ const STEPS = {
     await visitor.sees('eve, disabled');
     await visitor.clicks('Tokens', 'tab');
     await visitor.types('Name', 'arm');
-    await visitor.types('Robot that it is for', 'arm');
-    await visitor.types('Classes that it may name, as patterns; none where it is not said', 'fast*');
-    await visitor.types('Good for days; without an end where it is not said', '1');
-    await visitor.clicks('Make it');
-    await visitor.sees('told here and never again');
+    await visitor.types('Robot name', 'arm');
+    await visitor.types('Allowed classes, as patterns (default: none)', 'fast*');
+    await visitor.types('Expires after (days; default: never)', '1');
+    await visitor.clicks('Create');
+    await visitor.sees('shown only once');
     await visitor.sees('Revoke arm…');
     await visitor.sees('classes fast*');
     await visitor.judges('access-tokens');
@@ -467,18 +467,18 @@ const STEPS = {
     await visitor.seesNot('Revoke arm…');
     await visitor.clicks('Policy', 'tab');
     await visitor.types('Who: a name, or a role such as role:robot', 'arm');
-    await visitor.types('May, with spaces between', 'subscribe:/sums nothing');
-    await visitor.clicks('Write it');
+    await visitor.types('Grants, separated by spaces', 'subscribe:/sums nothing');
+    await visitor.clicks('Add');
     await visitor.page.waitForSelector('.trouble');
-    await visitor.types('May, with spaces between', 'subscribe:/sums');
-    await visitor.clicks('Write it');
+    await visitor.types('Grants, separated by spaces', 'subscribe:/sums');
+    await visitor.clicks('Add');
     await visitor.sees('subscribe:/sums');
     await visitor.judges('access-policy');
-    await visitor.clicks('What was done', 'tab');
+    await visitor.clicks('Audit log', 'tab');
     await visitor.sees('POST /api/v1/tokens');
     await visitor.judges('access-audit');
     await visitor.types('Find', 'no such words');
-    await visitor.sees('None is like that');
+    await visitor.sees('No matches');
   },
 
   // Inside a servant of sights_py: what is drawn has the colours that its node gave it.
@@ -547,7 +547,7 @@ const STEPS = {
     await page.focus('canvas');
     for (let step = 0; step < 12; step += 1) await page.keyboard.press('ArrowRight');
     await pixel(0.25, 0.5, BLACK);
-    await visitor.clicks('All of it');
+    await visitor.clicks('Show all');
     await pixel(0.25, 0.5, [254, 254, 254]);
     await chooses('Topic', '/sights/scan');
     await visitor.sees('361 beams, 121 of them in range');
@@ -584,9 +584,9 @@ const STEPS = {
     await chooses('Topic', '');
     await visitor.clicks('Show the frames');
     await visitor.sees('base_link');
-    await visitor.sees('turned by 0, 0, 90°');
+    await visitor.sees('rotated by 0, 0, 90°');
     await visitor.sees('egg → chicken → egg is a loop');
-    await visitor.sees('torn is given the parents map and odom');
+    await visitor.sees('torn has the parents map and odom');
     await visitor.sees('at 0.25, 0, 0 m');
     // Parameters keep their types.
     await visitor.clicks('Show the parameters');
@@ -598,14 +598,14 @@ const STEPS = {
       await value.type(text);
     };
     await writes('3');
-    await visitor.sees('it is a number with a fraction now and would become a whole number');
+    await visitor.sees('it is a floating-point number now and would become an integer');
     await writes('left');
-    await visitor.sees('this is no JSON (a text stands in "quotes")');
+    await visitor.sees('not valid JSON (strings need "quotes")');
     await visitor.clicks('Set the parameter');
     await visitor.page.waitForSelector('.trouble');
     await writes('2.5');
     await visitor.clicks('Set the parameter');
-    await visitor.sees('/sights/scale is 2.5, as it was read back');
+    await visitor.sees('/sights/scale is 2.5 (read back)');
     await visitor.clicks('/sights/limits/speed');
     await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value === '0.5'));
     await visitor.clicks('Remove the parameter…');
@@ -626,10 +626,10 @@ const STEPS = {
     await otherView('Goal of /sights/count');
     await page.waitForFunction(() => [...document.querySelectorAll('textarea')].some((one) => one.value.includes('"goal": 3')));
     await json('Goal of /sights/count', 'Goal', '{"goal": 1000');
-    await visitor.sees('the goal is no JSON');
+    await visitor.sees('the goal is not valid JSON');
     await visitor.judges('inside-no-json');
     await json('Goal of /sights/count', 'Goal', '{"goal": 1000}');
-    await visitor.seesNot('the goal is no JSON');
+    await visitor.seesNot('the goal is not valid JSON');
     await otherView('Goal of /sights/count');
     await page.waitForFunction(() => document.querySelector('form[aria-label^="Goal"] input[type=number]').value === '1000');
     await visitor.clicks('Send the goal');
@@ -637,7 +637,7 @@ const STEPS = {
     await visitor.clicks('Cancel the goal');
     await visitor.sees('the goal was cancelled');
     await chooses('Service', '/sights/ping');
-    await visitor.sees('It has no fields.');
+    await visitor.sees('No fields.');
     await visitor.clicks('Call');
     await visitor.sees('pong');
     await chooses('Service', '/sights/set_logger_level');
@@ -675,16 +675,16 @@ const STEPS = {
     await page.waitForFunction(() => document.querySelector('form[aria-label="Publish"] input[readonly]').value.startsWith('921600 bytes'));
     await chooses('Topic', '');
     // How much flows on each topic, counted while it is asked for.
-    await visitor.clicks('Count what is published');
+    await visitor.clicks('Show rates');
     await page.waitForFunction(() => [...document.querySelectorAll('section[aria-labelledby="topics"] tr')].some((row) => /^\/sights\/scan[^]*\d\s(ms|s)\b/.test(row.innerText)));
     await visitor.judges('inside-counted');
-    await visitor.clicks('Count no more');
+    await visitor.clicks('Hide rates');
     // What became of the goals, and a recording of the last seconds.
-    await visitor.clicks('Servant', 'link');
-    await visitor.sees('Goals of its actions');
+    await visitor.clicks('Instance (servant)', 'link');
+    await visitor.sees('Action goals');
     await page.waitForFunction(() => ['succeeded', 'cancelled'].every((word) => document.querySelector('section[aria-labelledby="goals"]').innerText.includes(word)));
     await visitor.sees('somebody who looks inside');
-    await visitor.clicks('Record its last seconds now');
+    await visitor.clicks('Record the last seconds now');
     await visitor.sees('asked for it');
     await visitor.judges('servant-goals');
     const fetched = page.waitForResponse((answer) => answer.url().includes('/api/v1/recordings/'));
@@ -699,7 +699,7 @@ const STEPS = {
     await visitor.clicks('rover', 'link');
     await visitor.clicks('Remove 1…');
     await visitor.clicks('Remove it');
-    await visitor.sees('There is none.');
+    await visitor.sees('No recordings.');
   },
 
   // Inside a servant of ROS 2, whose types rosapi calls otherwise, and whose nodes may not have found each other when the page is opened.
@@ -724,7 +724,7 @@ const STEPS = {
     await visitor.sees('it is on');
     // Nobody publishes transforms, and that is no mistake of whoever asks.
     await visitor.clicks('Show the frames');
-    await visitor.sees('nothing was told yet');
+    await visitor.sees('no transforms yet');
     assert.strictEqual(await page.$('.trouble'), null);
     await visitor.judges('inside-ros2');
   },
@@ -741,17 +741,17 @@ const STEPS = {
     await padding.click({ count: 3 });
     await padding.type('16');
     await page.keyboard.press('Tab');
-    await visitor.sees('padding is 16, as /people_detect says');
+    await visitor.sees('padding is 16 (confirmed by /people_detect)');
     // The slider stands where the node said, and is moved by a key.
     const slider = await page.waitForSelector('input[type=range][aria-label^="padding"]');
     assert.strictEqual(await slider.evaluate((range) => range.value), '16');
     await slider.focus();
     await page.keyboard.press('ArrowRight');
-    await visitor.sees('padding is 17, as /people_detect says');
+    await visitor.sees('padding is 17 (confirmed by /people_detect)');
     assert.strictEqual(await padding.evaluate((box) => box.value), '17');
     const camera = await page.waitForSelector('::-p-aria([name="use_camera_info"][role="checkbox"])');
     await camera.click();
-    await visitor.sees('use_camera_info is true, as /people_detect says');
+    await visitor.sees('use_camera_info is true (confirmed by /people_detect)');
     await visitor.judges('inside-settings');
   },
 
@@ -781,8 +781,8 @@ const STEPS = {
     await visitor.isRefused('call:/rosapi/get_param_names is not granted');
     await visitor.judges('inside-refused');
     // Recordings are looked at, and neither made nor removed.
-    await visitor.clicks('Servant', 'link');
-    await visitor.clicks('Record its last seconds now');
+    await visitor.clicks('Instance (servant)', 'link');
+    await visitor.clicks('Record the last seconds now');
     await visitor.isRefused('may not');
     const removes = await page.waitForFunction(() => [...document.querySelectorAll('button')].find((one) => /^Remove \d+…$/.test(one.innerText)));
     await removes.click();
@@ -801,17 +801,17 @@ const STEPS = {
     await visitor.isRefused('may not');
     await visitor.judges('refused');
     await visitor.clicks('Cancel');
-    await visitor.clicks('Try revision 2 first…');
-    await visitor.types('To so many robots, or to a part of those that come', '1');
-    await visitor.clicks('Begin the canary');
+    await visitor.clicks('Start revision 2 as a canary…');
+    await visitor.types('Number of robots, or percentage of new robots', '1');
+    await visitor.clicks('Start the canary');
     await visitor.isRefused('may not');
     await visitor.clicks('Cancel');
     await visitor.clicks('Remove…');
     await visitor.clicks('Remove it');
     await visitor.isRefused('may not');
     await visitor.clicks('Cancel');
-    await visitor.clicks('Measure what response times cost', 'link');
-    await visitor.page.locator('::-p-aria([name="of a robot that works now"][role="radio"])').click();
+    await visitor.clicks('Measure response times', 'link');
+    await visitor.page.locator('::-p-aria([name="from a connected robot"][role="radio"])').click();
     await visitor.chooses('Robot', 'rover');
     await visitor.clicks('Calibrate');
     await visitor.isRefused('may not');
@@ -823,7 +823,7 @@ const STEPS = {
     await visitor.page.keyboard.press('Home');
     await visitor.clicks('Set limits');
     await visitor.isRefused('may not');
-    await visitor.clicks('Record its last seconds now');
+    await visitor.clicks('Record the last seconds now');
     await visitor.isRefused('may not');
     await visitor.clicks('Stop…');
     await visitor.clicks('Stop it');
@@ -834,7 +834,7 @@ const STEPS = {
     await visitor.isRefused('may not read the logs');
     await visitor.judges('log-refused');
     await visitor.opens('#/deploy');
-    await visitor.types('or a package of Debian', 'opencv_apps');
+    await visitor.types('or a Debian package', 'opencv_apps');
     await visitor.clicks('Push');
     await visitor.isRefused('may not');
     await visitor.judges('deploy-refused');
@@ -855,29 +855,29 @@ const STEPS = {
     await refused('People', async () => {
       await visitor.types('Name', 'mallory');
       await visitor.types('Password, at least 12 characters', 'nine loud yellow kettles');
-      await visitor.clicks('Make it');
+      await visitor.clicks('Create');
     });
     await refused('Tokens', async () => {
       await visitor.types('Name', 'mallory');
-      await visitor.types('Robot that it is for', 'thief');
-      await visitor.clicks('Make it');
+      await visitor.types('Robot name', 'thief');
+      await visitor.clicks('Create');
     });
     await refused('Policy', async () => {
       await visitor.types('Who: a name, or a role such as role:robot', 'role:viewer');
-      await visitor.types('May, with spaces between', 'call:**');
-      await visitor.clicks('Write it');
+      await visitor.types('Grants, separated by spaces', 'call:**');
+      await visitor.clicks('Add');
     });
-    await refused('What was done');
+    await refused('Audit log');
   },
 
   // Who may see other services alone.
   async stranger(visitor) {
     await visitor.signsIn();
-    await visitor.sees('Nothing is published yet');
-    await visitor.sees('Nothing yet that you may see');
-    await visitor.seesNot('Cores promised');
+    await visitor.sees('No service is published yet');
+    await visitor.sees('No events yet');
+    await visitor.seesNot('Cores reserved');
     await visitor.opens('#/servants');
-    await visitor.sees('No robot is here');
+    await visitor.sees('No robots connected');
     await visitor.opens('#/services/adder_py');
     await visitor.sees('may not see service adder_py');
     await visitor.judges('stranger');
@@ -958,7 +958,7 @@ const STEPS = {
 
     // An hour: half of it is what is kept at the most, the other must add nothing.
     await visitor.opens('#/servants/s1');
-    await visitor.sees('What it did');
+    await visitor.sees('Performance');
     const session = await page.createCDPSession();
     const passes = async (seconds) => {
       await page.evaluate(async (seconds) => {
@@ -981,7 +981,7 @@ const STEPS = {
     await growsBy(1800, 'one servant');
     // What is kept at the most is kept by now: on the other pages less time tells the same.
     await visitor.opens('#/');
-    await visitor.sees('Cores promised');
+    await visitor.sees('Cores reserved');
     await growsBy(300, 'overview');
     await visitor.opens('#/events');
     await page.waitForFunction(() => /the \d+th/.test(document.querySelector('main').innerText));
@@ -1025,19 +1025,19 @@ const STEPS = {
     await visitor.opens('#/deploy');
     await (await visitor.page.waitForSelector('input[webkitdirectory]')).uploadFile(sources);
     await visitor.sees('Chosen: the folder adder_py');
-    await visitor.types('Programs, each with its arguments, one a line', 'adder.py');
+    await visitor.types('Programs with their arguments, one per line', 'adder.py');
     await visitor.page.locator('details > summary').click();
-    await visitor.types('Robots that it serves first; all at once by default', '1');
-    await visitor.types('Time until servants of other revisions end; when their robots leave by default', 'soon');
+    await visitor.types('Robots served by it first (default: all at once)', '1');
+    await visitor.types('Stop servants of other revisions after (default: when their robots leave)', 'soon');
     await visitor.clicks('Push');
-    await visitor.sees('is no time');
-    await visitor.types('Time until servants of other revisions end; when their robots leave by default', '1s');
-    await visitor.types('Memory that a robot may ask for at most', '256M');
+    await visitor.sees('is not a time');
+    await visitor.types('Stop servants of other revisions after (default: when their robots leave)', '1s');
+    await visitor.types('Maximum memory that a robot may request', '256M');
     await visitor.judges('deploy-more');
     await visitor.clicks('Push');
     await visitor.sees('revision 2, as a canary beside revision 1');
     await visitor.opens('#/services/adder_py');
-    await visitor.sees('From revision 1 to 2');
+    await visitor.sees('Rollout from revision 1 to 2');
     await visitor.page.waitForFunction(() => document.querySelector('section[aria-labelledby="differences"]')?.innerText.includes('cap'));
     await visitor.judges('service-canary');
     await visitor.clicks('Promote…');
@@ -1054,8 +1054,8 @@ const STEPS = {
     await visitor.isRefused('may not');
     await visitor.judges('service-canary-refused');
     await visitor.clicks('Cancel');
-    await visitor.clicks('Take it back…');
-    await visitor.clicks('Take it back');
+    await visitor.clicks('Abort…');
+    await visitor.clicks('Abort the rollout');
     await visitor.isRefused('may not');
     await visitor.clicks('Cancel');
   },
@@ -1066,39 +1066,39 @@ const STEPS = {
     await visitor.opens('#/services/adder_py');
     const rollout = (words) => visitor.page.waitForFunction((words) => document.querySelector('section[aria-labelledby="rollout"]')?.innerText.includes(words), {}, words);
     // By another client: it is seen here without doing anything.
-    await visitor.sees('Take it back…');
+    await visitor.sees('Abort…');
     await visitor.elsewhere('POST', '/services/adder_py/rollout', { order: 'abort' });
     await rollout('aborted');
     // A revision that is there is tried again.
-    await visitor.clicks('Try revision 3 first…');
-    await visitor.types('To so many robots, or to a part of those that come', 'some');
-    await visitor.clicks('Begin the canary');
-    await visitor.sees('no share of robots');
+    await visitor.clicks('Start revision 3 as a canary…');
+    await visitor.types('Number of robots, or percentage of new robots', 'some');
+    await visitor.clicks('Start the canary');
+    await visitor.sees('not a share of robots');
     await visitor.judges('try-revision');
-    await visitor.types('To so many robots, or to a part of those that come', '25%');
-    await visitor.clicks('Begin the canary');
+    await visitor.types('Number of robots, or percentage of new robots', '25%');
+    await visitor.clicks('Start the canary');
     await rollout('25% of the robots');
-    await visitor.clicks('Take it back…');
-    await visitor.sees('Take revision 3 back?');
-    await visitor.clicks('Take it back');
+    await visitor.clicks('Abort…');
+    await visitor.sees('Abort the rollout of revision 3?');
+    await visitor.clicks('Abort the rollout');
     await rollout('aborted');
   },
 
-  // What response times cost, measured at the requests of a robot that works now.
+  // What response times cost, measured at the requests from a connected robot.
   async calibrator(visitor) {
     await visitor.signsIn();
     await visitor.opens('#/services/teller_py');
-    await visitor.clicks('Measure what response times cost', 'link');
-    await visitor.sees('Which requests');
+    await visitor.clicks('Measure response times', 'link');
+    await visitor.sees('Requests to replay');
     // A recording: cancelled while it is sent, and then measured.
     const file = await visitor.page.waitForSelector('input[type=file][accept=".bag"]');
     await file.uploadFile(process.env.RECORDING);
-    await visitor.types('At these cores; a ladder where it is not said', '1');
-    await visitor.types('Requests at each limit; 40 where it is not said', '5');
+    await visitor.types('CPU limits to test, in cores (default: automatic steps)', '1');
+    await visitor.types('Requests at each limit (default: 40)', '5');
     await visitor.clicks('Calibrate');
     await visitor.isRefused('requests = 5 is not between 10');
-    await visitor.types('Requests at each limit; 40 where it is not said', '10');
-    await visitor.page.locator('::-p-aria([name="the next follows each answer at once"][role="checkbox"])').click();
+    await visitor.types('Requests at each limit (default: 40)', '10');
+    await visitor.page.locator('::-p-aria([name="send the next request as soon as one is answered"][role="checkbox"])').click();
     const fast = await visitor.slowly(200_000);
     const sending = () => visitor.page.waitForFunction(() => /sending, [1-9]\d?\s% of/.test(document.body.innerText));
     await visitor.clicks('Calibrate');
@@ -1108,28 +1108,28 @@ const STEPS = {
     await visitor.clicks('Calibrate');
     await sending();
     await fast();
-    const measured = () => visitor.page.waitForFunction(() => /Rows that it proposes|proposes no row/.test(document.body.innerText), { timeout: 3 * PATIENCE });
+    const measured = () => visitor.page.waitForFunction(() => /Proposed SLA entries|No entries proposed/.test(document.body.innerText), { timeout: 3 * PATIENCE });
     await measured();
     await visitor.sees('10 of 10');
     await visitor.sees('that teller_py has no input for: /noise');
     await visitor.judges('calibrate-recording');
-    await visitor.page.locator('::-p-aria([name="of a robot that works now"][role="radio"])').click();
+    await visitor.page.locator('::-p-aria([name="from a connected robot"][role="radio"])').click();
     await visitor.chooses('Robot', 'talker');
-    await visitor.types('At these cores; a ladder where it is not said', '0.5, 1');
+    await visitor.types('CPU limits to test, in cores (default: automatic steps)', '0.5, 1');
     await visitor.clicks('Calibrate');
-    await visitor.seesNot('Rows that it proposes');
-    await visitor.seesNot('proposes no row');
-    await visitor.sees('What was measured');
+    await visitor.seesNot('Proposed SLA entries');
+    await visitor.seesNot('No entries proposed');
+    await visitor.sees('Measurements');
     // Its own patience: it listens for ten seconds, and then it measures.
     await measured();
     await visitor.judges('calibrate');
     // What it proposes stands with its curve beside the service then. A robot that is slowed by all that runs here may get no row.
     const rows = await visitor.page.$$eval('h3 + ul li', (all) => all.length);
     if (!rows) return;
-    await visitor.clicks('Write them into the dictionary');
-    await visitor.sees('Written: the dictionary has');
+    await visitor.clicks('Write them to the SLA table');
+    await visitor.sees('Written: the SLA table now has');
     await visitor.opens('#/services/teller_py');
-    await visitor.sees('What an SLA costs');
+    await visitor.sees('SLA table');
     await visitor.sees('Calibrate again');
     assert.equal((await visitor.page.$$('section[aria-labelledby="dictionary"] polyline')).length, rows > 1 ? 2 : 0, 'a curve of median and 95 %');
     await visitor.judges('dictionary');
@@ -1146,10 +1146,10 @@ const STEPS = {
     // What is recorded of it is there when the page is opened anew.
     const hash = await visitor.page.evaluate(() => location.hash);
     await visitor.page.reload();
-    await visitor.sees('It has ended. What is shown was recorded');
+    await visitor.sees('It has ended. The data below was recorded');
     assert.strictEqual(await visitor.page.evaluate(() => location.hash), hash);
     assert.strictEqual(await visitor.page.$$eval('canvas', (all) => all.length), 7);
-    const median = () => [...document.querySelectorAll('figure')].some((one) => one.innerText.startsWith('Response time') && /median\s*[\d.]+\sms/.test(one.innerText));
+    const median = () => [...document.querySelectorAll('figure')].some((one) => one.innerText.startsWith('Response time') && /p50\s*[\d.]+\sms/.test(one.innerText));
     await visitor.page.waitForFunction(median);
     await visitor.sees('is ready for rover');
     await visitor.judges('servant-ended');
@@ -1164,7 +1164,7 @@ const STEPS = {
     await visitor.opens('#/services/adder_py');
     await visitor.clicks('Remove…');
     await visitor.clicks('Remove it');
-    await visitor.sees('Nothing is published yet');
+    await visitor.sees('No service is published yet');
   },
 };
 

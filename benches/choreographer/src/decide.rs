@@ -1,30 +1,31 @@
-//! How long the controller takes for a thousand servants, beside one pass over the same facts.
+//! Time that the resource controller needs per decision for a thousand servants, compared with a single pass over the
+//! same facts.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_report::{Race, Report, Target};
-use choreographer::controller::{Facts, Goal, Measured, control};
+use bench_report::{BenchReport, Race, Target};
+use choreographer::controller::{ControlFacts, MeasuredTimes, ResponseGoal, control};
 
 const SERVANTS: u64 = 1000;
-/// Thousandths of a core: two for each servant would be far too few.
+/// Capacity in thousandths of a core; two cores per servant would leave far too few.
 const CORES: u64 = 256_000;
 const ROUNDS: usize = 200;
 
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
     let ids: Vec<String> = (0..SERVANTS)
         .map(|number| format!("servant-{number}"))
         .collect();
-    let mut facts: Vec<Facts<'_>> = ids
+    let mut facts: Vec<ControlFacts<'_>> = ids
         .iter()
         .zip(0..)
-        .map(|(id, number)| servant(id, number))
+        .map(|(id, number)| servant_facts(id, number))
         .collect();
     let began = Instant::now();
     let (pass, once) = (facts.clone(), facts.clone());
     let mut race = Race::new(ROUNDS);
-    // At first nearly every servant changes, later few do.
+    // In the first decision nearly every servant changes; in later ones few do.
     race.add("at first", || {
         black_box(control(CORES, black_box(&once), began));
     });
@@ -39,7 +40,7 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
         }
     });
     race.add("one pass", || {
-        let sum = |sum: u64, one: &Facts<'_>| {
+        let sum = |sum: u64, one: &ControlFacts<'_>| {
             sum + one.quota + one.weight + one.used.unwrap_or(0) + one.promised
         };
         black_box(black_box(&pass).iter().fold(0, sum));
@@ -53,21 +54,22 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
                 "ms",
                 milliseconds(index),
             )
-            .beside("one pass over the facts", milliseconds(2))
-            .reach(Target::AtMost(1.0));
+            .relative_to("one pass over the facts", milliseconds(2))
+            .require(Target::AtMost(1.0));
     }
     Ok(())
 }
 
-/// Of three, one is promised cores, one has robots that state times, and one just takes what it gets.
-fn servant(id: &str, number: u64) -> Facts<'_> {
+/// Facts of one servant. Of every three servants, one is promised cores, one has robots that state response times, and
+/// one is best effort.
+fn servant_facts(id: &str, number: u64) -> ControlFacts<'_> {
     let promised = if number % 3 == 2 {
         0
     } else {
         100 + number % 200
     };
     let limit = if promised == 0 { CORES } else { promised };
-    Facts {
+    ControlFacts {
         id,
         promised,
         limit,
@@ -79,11 +81,11 @@ fn servant(id: &str, number: u64) -> Facts<'_> {
         used: Some(number * 37 % 400),
         throttled: (number % 5) as f64 / 10.0,
         waited: 0.0,
-        goal: (number % 3 == 1).then_some(Goal {
+        goal: (number % 3 == 1).then_some(ResponseGoal {
             desire: Some(100.0),
             max: Some(300.0),
         }),
-        measured: (number % 2 == 0).then_some(Measured {
+        measured: (number % 2 == 0).then_some(MeasuredTimes {
             total: (number % 40) as f64 * 10.0,
             cloud: (number % 40) as f64 * 8.0,
         }),

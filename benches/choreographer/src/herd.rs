@@ -1,11 +1,12 @@
-//! Fifty robots at once before a machine for four: when each knows where it stands, and what becomes of all.
+//! Fifty robots that connect at once to a machine with room for four: the time until each learns its place in the
+//! queue, and whether all are served.
 
 use std::collections::HashMap;
 use std::sync::Barrier;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::robot::Robot;
@@ -15,33 +16,35 @@ use crate::worker;
 
 const ROBOTS: usize = 50;
 const PLACES: usize = 4;
-/// Robots wait as long as it takes, and leave room for the next as soon as they leave.
-const CONFIG: &str = "[capacity]\ncpus = 4.0\nmemory = \"64G\"\nqueue = 64\ndeadline = \"30m\"\n[servant]\ngrace = \"0s\"\nwarm_pool = 0\nstart = \"5m\"\n";
-/// For anything to be said.
+/// Robots wait without a limit, and a robot that leaves makes room for the next one immediately.
+const CONFIG: &str = "[capacity]\ncpus = 4.0\nmemory = \"64G\"\nqueue = 64\ndeadline = \"30m\"\n[servant]\ngrace \
+    = \"0s\"\nwarm_pool = 0\nstart = \"5m\"\n";
+/// Maximum time to wait for any message.
 const PATIENCE: Duration = Duration::from_secs(900);
-/// A second answer would have come within this time.
+/// Time within which a second answer would have arrived.
 const AGAIN: Duration = Duration::from_millis(200);
 
-/// How it went for one robot.
-struct Went {
+/// Measurements of one robot.
+struct QueueSample {
     told: Duration,
     waited: bool,
     answers: usize,
 }
 
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let place = worker::place()?;
-    let daemon = worker::daemon(place.path(), CONFIG)?;
-    worker::push(&daemon, "worker", &["--cpus", "1"])?;
-    let floor = at_once(|_| {
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    let place = worker::temporary_directory()?;
+    let daemon = worker::start_daemon(place.path(), CONFIG)?;
+    worker::push_worker(&daemon, "worker", &["--cpus", "1"])?;
+    let floor = run_concurrently(|_| {
         let asked = Instant::now();
         daemon.get("/healthz")?;
         Ok(asked.elapsed())
     })?;
-    let went = at_once(|number| robot(&daemon, number))?;
-    let told = |went: &[Went]| went.iter().map(|one| one.told).max().unwrap_or_default();
+    let went = run_concurrently(|number| run_robot(&daemon, number))?;
+    let told = |went: &[QueueSample]| went.iter().map(|one| one.told).max().unwrap_or_default();
     let lost = went.iter().filter(|one| one.answers == 0).count();
-    let twice = went.iter().filter(|one| one.answers > 1).count() + started_twice(&daemon)?;
+    let twice =
+        went.iter().filter(|one| one.answers > 1).count() + count_duplicate_starts(&daemon)?;
     let waited = went.iter().filter(|one| one.waited).count();
     report
         .figure(
@@ -49,7 +52,7 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
             "s",
             told(&went).as_secs_f64(),
         )
-        .beside(
+        .relative_to(
             "the last of as many HTTP answers",
             floor
                 .iter()
@@ -58,22 +61,22 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
                 .unwrap_or_default()
                 .as_secs_f64(),
         )
-        .reach(Target::AtMost(1.0))
+        .require(Target::AtMost(1.0))
         .note(format!(
             "{waited} were told their number in the queue, the others were served at once"
         ));
     report
         .figure("of them lost", "robots", lost as f64)
-        .reach(Target::AtMost(0.0));
+        .require(Target::AtMost(0.0));
     report
         .figure("served twice", "robots", twice as f64)
-        .reach(Target::AtMost(0.0));
-    daemon.ends()?;
+        .require(Target::AtMost(0.0));
+    daemon.stop()?;
     Ok(())
 }
 
-/// What so many do at the same time.
-fn at_once<T: Send>(each: impl Fn(usize) -> Result<T> + Sync) -> Result<Vec<T>> {
+/// Runs `each` in one thread per robot; all threads start at the same moment.
+fn run_concurrently<T: Send>(each: impl Fn(usize) -> Result<T> + Sync) -> Result<Vec<T>> {
     let together = Barrier::new(ROBOTS);
     std::thread::scope(|scope| {
         let all: Vec<_> = (0..ROBOTS)
@@ -92,21 +95,21 @@ fn at_once<T: Send>(each: impl Fn(usize) -> Result<T> + Sync) -> Result<Vec<T>> 
     })
 }
 
-/// Asks for something as soon as it is connected, and leaves when it has its answer.
-fn robot(daemon: &Daemon, number: usize) -> Result<Went> {
+/// Connects, calls a service immediately and leaves once the answer has arrived.
+fn run_robot(daemon: &Daemon, number: usize) -> Result<QueueSample> {
     let asked = Instant::now();
     let mut robot = Robot::connect(&daemon.url(&format!("worker?robot=r{number}")))?;
-    robot.says(
+    robot.send(
         json!({"op": "call_service", "id": "it", "service": "/rosapi/get_time", "args": {}}),
     )?;
-    let mut went = Went {
+    let mut went = QueueSample {
         told: Duration::MAX,
         waited: false,
         answers: 0,
     };
     loop {
         let patience = if went.answers == 0 { PATIENCE } else { AGAIN };
-        let Ok(frame) = robot.frame_within(patience) else {
+        let Ok(frame) = robot.next_frame_within(patience) else {
             break;
         };
         let Message::Text(text) = frame else {
@@ -128,13 +131,13 @@ fn robot(daemon: &Daemon, number: usize) -> Result<Went> {
         went.answers += usize::from(answer);
     }
     if went.answers > 0 {
-        let _ = robot.leaves();
+        let _ = robot.leave();
     }
     Ok(went)
 }
 
-/// Robots for which more than one servant became ready.
-fn started_twice(daemon: &Daemon) -> Result<usize> {
+/// Counts the robots for which more than one servant became ready.
+fn count_duplicate_starts(daemon: &Daemon) -> Result<usize> {
     let events = daemon.api("/api/v1/events?limit=10000")?;
     let mut ready: HashMap<String, usize> = HashMap::new();
     for event in events.as_array().context("a list of events")? {

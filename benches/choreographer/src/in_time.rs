@@ -1,27 +1,28 @@
-//! How many robots of a machine are answered in time, with limits as they were promised and with the controller. All are promised the
-//! same part of the machine. Every other one, beginning with the first, asks again as soon as it is answered, and accepts less than
-//! that part gives; the others ask seldom, and accept more.
+//! Number of a machine's robots that are answered in time, with fixed limits as promised and with the controller. All
+//! robots are promised an equal share of the machine. Every other robot, beginning with the first, calls again as soon
+//! as it is answered and accepts a shorter response time than its share allows; the others call rarely and accept a
+//! longer one.
 
 use std::sync::Barrier;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use support::daemon::Daemon;
 
-use crate::worker::{self, WORK, calls, cores, robot};
+use crate::worker::{self, WORK, connect_robot, cores, time_calls};
 
 const ROBOTS: [usize; 7] = [2, 3, 4, 5, 6, 7, 8];
 const LASTS: Duration = Duration::from_secs(15);
-/// Until the controller has come to rest.
+/// Time until the controller has settled.
 const SETTLES: Duration = Duration::from_secs(15);
-/// Part of its requests that must be in time for a robot to count.
+/// Fraction of a robot's requests that must be in time for the robot to count.
 const IN_TIME: f64 = 0.95;
 const CONFIG: &str = "[servant]\nwarm_pool = 0\nstart = \"5m\"\n";
 
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let fixed = counts("off")?;
-    let controlled = counts("on")?;
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    let fixed = count_by_fleet_size("off")?;
+    let controlled = count_by_fleet_size("on")?;
     for ((robots, controlled), fixed) in ROBOTS.iter().zip(&controlled).zip(&fixed) {
         report
             .figure(
@@ -29,7 +30,7 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
                 "robots",
                 *controlled as f64,
             )
-            .beside("fixed limits", *fixed as f64);
+            .relative_to("fixed limits", *fixed as f64);
     }
     let sum = |counts: &[usize]| counts.iter().sum::<usize>() as f64;
     report
@@ -38,39 +39,43 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
             "robots",
             sum(&controlled),
         )
-        .beside("fixed limits", sum(&fixed))
-        .reach(Target::RatioAtLeast(1.3))
+        .relative_to("fixed limits", sum(&fixed))
+        .require(Target::RatioAtLeast(1.3))
         .note(format!("of {}", ROBOTS.iter().sum::<usize>()));
     Ok(())
 }
 
-/// Robots in time, of so many each.
-fn counts(controller: &str) -> Result<Vec<usize>> {
-    let place = worker::place()?;
+/// Returns the number of robots in time for each fleet size.
+fn count_by_fleet_size(controller: &str) -> Result<Vec<usize>> {
+    let place = worker::temporary_directory()?;
     let config = format!("[capacity]\ncontroller = \"{controller}\"\n{CONFIG}");
-    let daemon = worker::daemon(place.path(), &config)?;
+    let daemon = worker::start_daemon(place.path(), &config)?;
     let mut counts = Vec::new();
     for robots in ROBOTS {
-        // Rounded down: together no more is promised than there is.
+        // Rounded down so that the promises never add up to more than the machine has.
         let part = format!("{:.3}", (cores() / robots as f64 * 1000.0).floor() / 1000.0);
-        worker::push(&daemon, &format!("worker{robots}"), &["--cpus", &part])?;
-        counts.push(count(&daemon, robots)?);
+        worker::push_worker(&daemon, &format!("worker{robots}"), &["--cpus", &part])?;
+        counts.push(count_in_time(&daemon, robots)?);
         eprintln!(
             "controller {controller}, {robots} robots: {} in time",
             counts[counts.len() - 1]
         );
-        daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
+        daemon
+            .deployer()
+            .run(&["stop", "--all"])?
+            .expect_success()?;
     }
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(counts)
 }
 
-fn count(daemon: &Daemon, robots: usize) -> Result<usize> {
+fn count_in_time(daemon: &Daemon, robots: usize) -> Result<usize> {
     let part = cores() / robots as f64;
-    // With twice its part an eager one is in time, if that is not more than its one thread can use.
+    // With twice its share an eager robot is in time, unless that is more than its single thread can use.
     let eager = (WORK / (2.0 * part) * 1.4).max(WORK * 1.6);
     let patient = WORK / part * 4.0 + 200.0;
-    // All begin together: one that is measured while another's servant still starts has its cores, or lacks them.
+    // All start together: a robot measured while another's servant is still starting would have that servant's cores,
+    // or lack them.
     let ready = Barrier::new(robots);
     let outcomes: Vec<Result<bool>> = std::thread::scope(|scope| {
         let all: Vec<_> = (0..robots)
@@ -82,11 +87,11 @@ fn count(daemon: &Daemon, robots: usize) -> Result<usize> {
                 let ready = &ready;
                 scope.spawn(move || {
                     let path = format!("worker{robots}?robot=r{number}&max_rrt={accepts:.0}ms");
-                    let robot = robot(daemon, &path);
+                    let robot = connect_robot(daemon, &path);
                     ready.wait();
                     let mut robot = robot?;
-                    calls(&mut robot, SETTLES, pause)?;
-                    let times = calls(&mut robot, LASTS, pause)?;
+                    time_calls(&mut robot, SETTLES, pause)?;
+                    let times = time_calls(&mut robot, LASTS, pause)?;
                     let within = times.iter().filter(|time| **time <= accepts).count();
                     let part = within as f64 / times.len() as f64;
                     let at = |part| bench_report::quantile(&times, part).unwrap_or(f64::NAN);

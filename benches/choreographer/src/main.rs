@@ -1,5 +1,6 @@
-//! `make bench ONLY=choreographer`: what the choreographer decides, how fast, and what robots have of it. Each group of rows
-//! is a file; `CLOUDROID_BENCH_RUN=herd` measures the groups whose name contains that alone. All but `decide` need root.
+//! `make bench ONLY=choreographer`: what the choreographer decides, how fast, and what robots gain from it. Each group
+//! of figures has a file of its own; `CLOUDROID_BENCH_RUN=herd` runs only the groups whose name contains that word. All
+//! groups except `decide` need root.
 
 #![forbid(unsafe_code)]
 
@@ -11,10 +12,10 @@ mod shared;
 mod worker;
 
 use anyhow::{Context, Result};
-use bench_report::Report;
+use bench_report::BenchReport;
 
-/// A group of rows.
-type Group = (&'static str, fn(&mut Report) -> Result<()>);
+/// A group of figures: its name and the function that measures it.
+type Group = (&'static str, fn(&mut BenchReport) -> Result<()>);
 
 /// All groups, in the order in which they are measured.
 const GROUPS: [Group; 5] = [
@@ -27,7 +28,7 @@ const GROUPS: [Group; 5] = [
 
 fn main() -> Result<()> {
     let only = std::env::var("CLOUDROID_BENCH_RUN").unwrap_or_default();
-    let mut report = Report::new("choreographer");
+    let mut report = BenchReport::new("choreographer");
     for (name, measure) in GROUPS {
         if name.contains(&only) {
             eprintln!("{name}");

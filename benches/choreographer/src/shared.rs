@@ -1,6 +1,7 @@
-//! Servants that robots share: calls a second of fifty robots, beside what one robot gets of a servant of its own, and beside
-//! a client in roscpp of the same node in the same container. Each call takes two milliseconds of waiting, as of a node
-//! whose work is elsewhere (a graphics card, a device), so that servants and not this machine's cores are what is shared.
+//! Servants that robots share: calls per second of fifty robots, compared with one robot that has a servant of its own,
+//! and with a roscpp client of the same node in the same container. Each call waits for two milliseconds, like a node
+//! whose work is done elsewhere (by a graphics card or a device), so that servants are the shared resource and not this
+//! machine's cores.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -8,9 +9,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::{Value, json};
-use support::daemon::{Daemon, Setup};
+use support::daemon::{Daemon, DaemonSetup};
 use support::robot::Robot;
 
 const PACKAGE: &str = "sharer_cpp";
@@ -18,7 +19,7 @@ const ROBOTS: usize = 50;
 const LASTS: Duration = Duration::from_secs(5);
 const WORK: f64 = 0.002;
 
-/// What is pushed: the name, and more arguments.
+/// Services to push: name and further arguments of the push.
 const PUSHED: [(&str, &[&str]); 4] = [
     ("own", &["--node", "sharer"]),
     ("one", &["--node", "sharer", "--shared", "--max", "1"]),
@@ -39,23 +40,26 @@ const PUSHED: [(&str, &[&str]); 4] = [
     ),
 ];
 
-pub fn measure(report: &mut Report) -> Result<()> {
+pub fn measure(report: &mut BenchReport) -> Result<()> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    let setup = Setup::new(&place.path().join("home"));
+    let setup = DaemonSetup::new(&place.path().join("home"));
     let daemon = setup.config("[capacity]\ncpus = 64\n").start()?;
     for (name, arguments) in PUSHED {
         let arguments = [&["--name", name, "--cpus", "0.5"], arguments].concat();
-        daemon.deployer().pushes(PACKAGE, &arguments)?.succeeded()?;
+        daemon
+            .deployer()
+            .push(PACKAGE, &arguments)?
+            .expect_success()?;
     }
-    let roscpp = of_roscpp(&daemon)?;
-    let single = calls(&daemon, "own", 1)?;
+    let roscpp = roscpp_call_rate(&daemon)?;
+    let single = measure_call_rate(&daemon, "own", 1)?;
     report
         .figure("one robot at a servant of its own", "calls/s", single)
-        .beside("roscpp in the same container", roscpp);
+        .relative_to("roscpp in the same container", roscpp);
     for (name, servants) in [("one", 1), ("two", 2)] {
-        let shared = calls(&daemon, name, ROBOTS)?;
+        let shared = measure_call_rate(&daemon, name, ROBOTS)?;
         let sum = single * f64::from(servants);
         report
             .figure(
@@ -63,26 +67,29 @@ pub fn measure(report: &mut Report) -> Result<()> {
                 "calls/s",
                 shared,
             )
-            .beside(format!("{servants} x one robot at its own"), sum)
-            .reach(Target::RatioAtLeast(0.9));
+            .relative_to(format!("{servants} x one robot at its own"), sum)
+            .require(Target::RatioAtLeast(0.9));
         report
             .figure(
                 format!("{ROBOTS} robots at {servants} shared"),
                 "calls/s",
                 shared,
             )
-            .beside(
+            .relative_to(
                 format!("{servants} x roscpp in the same container"),
                 roscpp * f64::from(servants),
             );
     }
-    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-    daemon.ends()?;
+    daemon
+        .deployer()
+        .run(&["stop", "--all"])?
+        .expect_success()?;
+    daemon.stop()?;
     Ok(())
 }
 
-/// Calls a second of so many robots, each with one call after the other.
-fn calls(daemon: &Daemon, service: &str, robots: usize) -> Result<f64> {
+/// Returns the calls per second of `robots` robots, each of which makes one call after the other.
+fn measure_call_rate(daemon: &Daemon, service: &str, robots: usize) -> Result<f64> {
     let mut ready = Vec::new();
     for number in 0..robots {
         let mut robot = daemon.robot(&format!("{service}?robot=r{number}"))?;
@@ -90,7 +97,7 @@ fn calls(daemon: &Daemon, service: &str, robots: usize) -> Result<f64> {
         ready.push(robot);
     }
     let wanted = if service == "two" { 2 } else { 1 };
-    daemon.awaits(
+    daemon.wait_for(
         &format!("/api/v1/services/{service}"),
         "its servants",
         |found| {
@@ -136,18 +143,18 @@ fn calls(daemon: &Daemon, service: &str, robots: usize) -> Result<f64> {
 }
 
 fn call(robot: &mut Robot) -> Result<()> {
-    let answer = robot.calls("/work", json!({ "who": "r", "seconds": WORK }))?;
+    let answer = robot.call("/work", json!({ "who": "r", "seconds": WORK }))?;
     ensure!(answer["result"] == true, "{answer}");
     Ok(())
 }
 
-/// What the client in roscpp prints.
-fn of_roscpp(daemon: &Daemon) -> Result<f64> {
+/// Returns the rate that the roscpp client prints, in calls per second.
+fn roscpp_call_rate(daemon: &Daemon) -> Result<f64> {
     let _robot = daemon.robot("roscpp?robot=r")?;
     let servant = daemon.servant_of("roscpp", "r")?;
     let id = servant["id"].as_str().context("an id")?.to_owned();
-    support::until("its figure", || {
-        let said = daemon.deployer().types(&["logs", &id])?.said();
+    support::wait_until("its figure", || {
+        let said = daemon.deployer().run(&["logs", &id])?.output();
         let figure = said.split("calls a second: ").nth(1);
         let figure = figure.and_then(|rest| rest.split_whitespace().next()?.parse().ok());
         Ok(figure.ok_or(said))

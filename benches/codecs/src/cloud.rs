@@ -1,43 +1,48 @@
-//! Laser scans and point clouds: smaller than zstd 19 makes them, as fast as zstd 3.
+//! Laser scans and point clouds: the link's codecs should produce less data than zstd 19, at the speed of zstd 3.
 
-use crate::contest::{Contest, find, print};
+use crate::contest::{CodecComparison, find_result, print_results};
 use crate::{samples, world};
 use anyhow::Result;
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use codec::{Codec, Schema};
 
-fn figures(report: &mut Report, title: &str, schema: Schema, messages: &[Vec<u8>]) -> Result<()> {
+fn report_figures(
+    report: &mut BenchReport,
+    title: &str,
+    schema: Schema,
+    messages: &[Vec<u8>],
+) -> Result<()> {
     // Scans are small and clouds are large.
     let rounds = if schema == Schema::LaserScan { 40 } else { 7 };
-    let ours = Codec::made_for(schema);
-    let outcomes = Contest {
+    let ours = Codec::for_schema(schema);
+    let outcomes = CodecComparison {
         schema,
         messages,
         rounds,
     }
     .run(&[ours], &[1, 3, 19])?;
-    print(title, &outcomes);
+    print_results(title, &outcomes);
     let (ours, fast, best) = (
-        find(&outcomes, ours.name())?,
-        find(&outcomes, "zstd 3")?,
-        find(&outcomes, "zstd 19")?,
+        find_result(&outcomes, ours.name())?,
+        find_result(&outcomes, "zstd 3")?,
+        find_result(&outcomes, "zstd 19")?,
     );
     report
         .figure(format!("{title}: saved"), "%", ours.saved)
-        .beside("zstd 19", best.saved)
-        .reach(Target::AboveFloor);
+        .relative_to("zstd 19", best.saved)
+        .require(Target::AboveFloor);
     let figure = report
         .figure(format!("{title}: encoding"), "MB/s", ours.encode)
-        .beside("zstd 3", fast.encode);
-    figure.reach(Target::RatioAtLeast(1.0));
+        .relative_to("zstd 3", fast.encode);
+    figure.require(Target::RatioAtLeast(1.0));
     report
         .figure(format!("{title}: decoding"), "MB/s", ours.decode)
-        .beside("zstd 3", fast.decode);
+        .relative_to("zstd 3", fast.decode);
     Ok(())
 }
 
-pub fn scans(report: &mut Report) -> Result<()> {
-    let office = samples::office()?;
+pub fn measure_scans(report: &mut BenchReport) -> Result<()> {
+    let office = samples::office_map()?;
     let millimetres = |metres: f64| {
         if metres.is_finite() {
             (metres * 1000.0).round() as f32 / 1000.0
@@ -60,29 +65,35 @@ pub fn scans(report: &mut Report) -> Result<()> {
         }
     };
     let cases = [
-        ("scan in mm", world::scanner(&office, millimetres, false)),
+        (
+            "scan in mm",
+            world::laser_scans(&office, millimetres, false),
+        ),
         (
             "scan in mm with intensities",
-            world::scanner(&office, millimetres, true),
+            world::laser_scans(&office, millimetres, true),
         ),
-        ("scan in 1/4 mm", world::scanner(&office, quarters, false)),
+        (
+            "scan in 1/4 mm",
+            world::laser_scans(&office, quarters, false),
+        ),
         (
             "scan, simulated floats",
-            world::scanner(&office, rough, false),
+            world::laser_scans(&office, rough, false),
         ),
         (
             "scan from a depth camera",
-            world::camera_scans(&samples::depths()?),
+            world::camera_scans(&samples::depth_frames()?),
         ),
     ];
     for (title, messages) in &cases {
-        figures(report, title, Schema::LaserScan, messages)?;
+        report_figures(report, title, Schema::LaserScan, messages)?;
     }
     Ok(())
 }
 
-pub fn clouds(report: &mut Report) -> Result<()> {
-    let (colours, depths) = (samples::colours()?, samples::depths()?);
+pub fn measure_clouds(report: &mut BenchReport) -> Result<()> {
+    let (colours, depths) = (samples::colour_frames()?, samples::depth_frames()?);
     let cases = [
         (
             "cloud of a depth camera, 32 B",
@@ -98,11 +109,11 @@ pub fn clouds(report: &mut Report) -> Result<()> {
         ),
         (
             "cloud of a spinning laser",
-            world::spinning_clouds(&samples::office()?),
+            world::spinning_clouds(&samples::office_map()?),
         ),
     ];
     for (title, messages) in cases.iter().filter(|(_, messages)| !messages.is_empty()) {
-        figures(report, title, Schema::PointCloud2, messages)?;
+        report_figures(report, title, Schema::PointCloud2, messages)?;
     }
     Ok(())
 }

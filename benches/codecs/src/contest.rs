@@ -1,4 +1,4 @@
-//! Our codecs and the usual ones on the same messages, in turns, on one core.
+//! The link's codecs and common general-purpose ones on the same messages, in turns, on one core.
 
 use crate::zlib;
 use anyhow::{Result, ensure};
@@ -7,34 +7,35 @@ use codec::{Codec, Decoder, Encoder, Schema};
 use std::cell::RefCell;
 use std::hint::black_box;
 
-/// Levels of zstd from here on take seconds a round and serve as a floor of size: they, and zlib, run only once.
+/// zstd levels from here on take seconds per round and only serve as a lower bound for the size: they, and zlib, run
+/// once.
 const SLOW: i32 = 10;
 
-/// How one contender did on all messages.
+/// Result of one codec for all messages.
 #[derive(Clone, Debug)]
-pub struct Outcome {
+pub struct CodecResult {
     pub name: String,
-    /// Space saved, the mean over the messages, in percent.
+    /// Space saved, in percent: mean over the messages.
     pub saved: f64,
     /// Megabytes of messages per second.
     pub encode: f64,
-    /// Zero where it was not measured.
+    /// Megabytes of messages per second; zero if not measured.
     pub decode: f64,
 }
 
-/// Messages of one kind.
-pub struct Contest<'a> {
+/// A comparison of codecs on messages of one type.
+pub struct CodecComparison<'a> {
     pub schema: Schema,
     pub messages: &'a [Vec<u8>],
     pub rounds: usize,
 }
 
-impl Contest<'_> {
-    fn bytes(&self) -> usize {
+impl CodecComparison<'_> {
+    fn total_bytes(&self) -> usize {
         self.messages.iter().map(Vec::len).sum()
     }
 
-    fn saved(&self, sizes: &[usize]) -> f64 {
+    fn space_saved(&self, sizes: &[usize]) -> f64 {
         let saved = sizes
             .iter()
             .zip(self.messages)
@@ -42,9 +43,9 @@ impl Contest<'_> {
         100.0 * saved.sum::<f64>() / sizes.len() as f64
     }
 
-    /// Runs `codecs` of ours and the generic peers; the first outcome is that of `memcpy`.
-    pub fn run(&self, codecs: &[Codec], levels: &[i32]) -> Result<Vec<Outcome>> {
-        let mut outcomes = vec![Outcome {
+    /// Runs our codecs `codecs` and the general-purpose ones; the first result is that of `memcpy`.
+    pub fn run(&self, codecs: &[Codec], levels: &[i32]) -> Result<Vec<CodecResult>> {
+        let mut outcomes = vec![CodecResult {
             name: "memcpy".into(),
             saved: 0.0,
             encode: 0.0,
@@ -55,9 +56,9 @@ impl Contest<'_> {
             let encoded = self.encode_all(codec);
             self.verify(codec, &encoded)?;
             let sizes: Vec<usize> = encoded.iter().map(Vec::len).collect();
-            outcomes.push(Outcome {
+            outcomes.push(CodecResult {
                 name: codec.to_string(),
-                saved: self.saved(&sizes),
+                saved: self.space_saved(&sizes),
                 encode: 0.0,
                 decode: 0.0,
             });
@@ -71,9 +72,9 @@ impl Contest<'_> {
                 .map(|message| zstd::bulk::compress(message, level))
                 .collect::<Result<_, _>>()?;
             let sizes: Vec<usize> = encoded.iter().map(Vec::len).collect();
-            outcomes.push(Outcome {
+            outcomes.push(CodecResult {
                 name: format!("zstd {level}"),
-                saved: self.saved(&sizes),
+                saved: self.space_saved(&sizes),
                 encode: 0.0,
                 decode: 0.0,
             });
@@ -85,9 +86,9 @@ impl Contest<'_> {
             .map(|message| zlib::compress(message, 6))
             .collect();
         let sizes: Vec<usize> = zlib_frames.iter().map(Vec::len).collect();
-        outcomes.push(Outcome {
+        outcomes.push(CodecResult {
             name: "zlib 6".into(),
-            saved: self.saved(&sizes),
+            saved: self.space_saved(&sizes),
             encode: 0.0,
             decode: 0.0,
         });
@@ -117,7 +118,8 @@ impl Contest<'_> {
             let mut runs = 0;
             race.add(format!("zstd {level}"), move || {
                 runs += 1;
-                // The high levels take seconds a round and serve as a floor of size, so two rounds of them will do.
+                // High levels take seconds per round and only serve as a lower bound for the size, so two rounds
+                // suffice.
                 for message in if level < 10 || runs <= 2 {
                     self.messages
                 } else {
@@ -143,13 +145,13 @@ impl Contest<'_> {
                 || levels
                     .iter()
                     .any(|&level| level >= SLOW && outcome.name == format!("zstd {level}"));
-            // The longest is the only counted one of a slow contender that did something.
+            // A slow codec that did some work is timed by its longest run alone.
             let took = if slow {
                 times.quantile(1.0)
             } else {
                 times.best()
             };
-            outcome.encode = self.bytes() as f64 / 1e6 / took.as_secs_f64();
+            outcome.encode = self.total_bytes() as f64 / 1e6 / took.as_secs_f64();
         }
 
         let mut race = Race::new(self.rounds);
@@ -187,7 +189,7 @@ impl Contest<'_> {
             }
         });
         for (outcome, times) in outcomes.iter_mut().zip(race.run()) {
-            outcome.decode = times.megabytes_per_second(self.bytes());
+            outcome.decode = times.megabytes_per_second(self.total_bytes());
         }
         Ok(outcomes)
     }
@@ -204,7 +206,7 @@ impl Contest<'_> {
             .collect()
     }
 
-    /// Bit by bit.
+    /// Checks that decoding `frames` gives back the messages bit by bit.
     fn verify(&self, codec: Codec, frames: &[Vec<u8>]) -> Result<()> {
         let mut decoder = Decoder::new(usize::MAX);
         for (frame, message) in frames.iter().zip(self.messages) {
@@ -221,14 +223,14 @@ impl Contest<'_> {
     }
 }
 
-/// The outcome of `name`.
-pub fn find<'a>(outcomes: &'a [Outcome], name: &str) -> Result<&'a Outcome> {
+/// Returns the result of the codec `name`.
+pub fn find_result<'a>(outcomes: &'a [CodecResult], name: &str) -> Result<&'a CodecResult> {
     let found = outcomes.iter().find(|outcome| outcome.name == name);
     found.ok_or_else(|| anyhow::anyhow!("{name} did not take part"))
 }
 
-/// Prints all outcomes, for the reader who wants more than the figures.
-pub fn print(title: &str, outcomes: &[Outcome]) {
+/// Prints all results, for readers who want more than the figures.
+pub fn print_results(title: &str, outcomes: &[CodecResult]) {
     println!("{title}");
     for outcome in outcomes {
         println!(

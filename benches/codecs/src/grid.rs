@@ -1,63 +1,66 @@
-//! Occupancy grids: small, large, and while they are made.
+//! Occupancy grids: small ones, large ones, and a sequence of grids while a map is being built.
 
-use crate::contest::{Contest, find, print};
+use crate::contest::{CodecComparison, find_result, print_results};
 use crate::{messages, samples, world};
 use anyhow::{Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use codec::{Codec, Decoder, Encoder, Schema};
 
 const SIZE: usize = 4000;
 
-pub fn grids(report: &mut Report) -> Result<()> {
-    let office = samples::office()?;
+pub fn measure_grids(report: &mut BenchReport) -> Result<()> {
+    let office = samples::office_map()?;
     let small = [messages::grid(office.width, office.height, &office.data)];
-    let outcomes = Contest {
+    let outcomes = CodecComparison {
         schema: Schema::OccupancyGrid,
         messages: &small,
         rounds: 15,
     }
     .run(&[Codec::Grid], &[1, 3, 19])?;
-    print("grid, 566×608", &outcomes);
-    let (ours, zstd) = (find(&outcomes, "grid")?, find(&outcomes, "zstd 19")?);
+    print_results("grid, 566×608", &outcomes);
+    let (ours, zstd) = (
+        find_result(&outcomes, "grid")?,
+        find_result(&outcomes, "zstd 19")?,
+    );
     report
         .figure("grid 566×608: saved", "%", ours.saved)
-        .beside("zstd 19", zstd.saved)
-        .reach(Target::AboveFloor);
+        .relative_to("zstd 19", zstd.saved)
+        .require(Target::AboveFloor);
 
     let large = [messages::grid(
         SIZE,
         SIZE,
-        &samples::in_the_middle(&office, SIZE),
+        &samples::centre_in_grid(&office, SIZE),
     )];
-    let outcomes = Contest {
+    let outcomes = CodecComparison {
         schema: Schema::OccupancyGrid,
         messages: &large,
         rounds: 15,
     }
     .run(&[Codec::Grid], &[1, 3])?;
-    print("grid, 4000×4000", &outcomes);
+    print_results("grid, 4000×4000", &outcomes);
     let (ours, zstd, copy) = (
-        find(&outcomes, "grid")?,
-        find(&outcomes, "zstd 1")?,
-        find(&outcomes, "memcpy")?,
+        find_result(&outcomes, "grid")?,
+        find_result(&outcomes, "zstd 1")?,
+        find_result(&outcomes, "memcpy")?,
     );
     let figure = report
         .figure("grid 4000×4000: saved", "%", ours.saved)
-        .beside("zstd 1", zstd.saved);
-    figure.reach(Target::AtLeast(99.9));
+        .relative_to("zstd 1", zstd.saved);
+    figure.require(Target::AtLeast(99.9));
     let figure = report
         .figure("grid 4000×4000: encoding", "MB/s", ours.encode)
-        .beside("memcpy", copy.encode);
-    figure.reach(Target::RatioAtLeast(0.3));
+        .relative_to("memcpy", copy.encode);
+    figure.require(Target::RatioAtLeast(0.3));
     report
         .figure("grid 4000×4000: decoding", "MB/s", ours.decode)
-        .beside("memcpy", copy.decode);
-    mapping(report, &office)
+        .relative_to("memcpy", copy.decode);
+    measure_mapping(report, &office)
 }
 
-/// A map being made: what each of its grids takes, all told whole.
-fn mapping(report: &mut Report, office: &samples::Picture) -> Result<()> {
-    let messages: Vec<_> = world::mapping(office, SIZE, 24)
+/// Measures a map that is being built: the size of each of its grids, all of which are sent in full.
+fn measure_mapping(report: &mut BenchReport, office: &samples::Picture) -> Result<()> {
+    let messages: Vec<_> = world::maps_in_progress(office, SIZE, 24)
         .iter()
         .map(|cells| messages::grid(SIZE, SIZE, cells))
         .collect();
@@ -84,8 +87,8 @@ fn mapping(report: &mut Report, office: &samples::Picture) -> Result<()> {
     for (name, size) in [("zstd 1", fast), ("zstd 9", best)] {
         let figure = report.figure("grid, a map being made: size", "B", mean(ours));
         figure
-            .beside(name, mean(size))
-            .reach(Target::RatioAtMost(1.0));
+            .relative_to(name, mean(size))
+            .require(Target::RatioAtMost(1.0));
     }
     Ok(())
 }

@@ -1,12 +1,12 @@
-//! ROS 1 messages as they lie on the wire.
+//! Serialized ROS 1 messages.
 
-/// A message's bytes, written field by field.
+/// A serialized message, written field by field.
 #[derive(Default)]
-pub struct Message(Vec<u8>);
+pub struct MessageWriter(Vec<u8>);
 
-impl Message {
-    /// Begins with `std_msgs/Header`.
-    fn stamped(sequence: u32, frame: &str) -> Self {
+impl MessageWriter {
+    /// Starts a message with a `std_msgs/Header`.
+    fn with_header(sequence: u32, frame: &str) -> Self {
         Self::default()
             .u32(sequence)
             .u32(1_700_000_000)
@@ -52,27 +52,30 @@ impl Message {
     }
 }
 
-/// `sensor_msgs/Image`; `step` is the data's length per row.
+/// Serializes a `sensor_msgs/Image`; `step` is the length of the data per row.
 pub fn image(encoding: &str, width: usize, height: usize, data: &[u8]) -> Vec<u8> {
     let step = (data.len() / height) as u32;
-    let message = Message::stamped(7, "camera_rgb_optical_frame")
+    let message = MessageWriter::with_header(7, "camera_rgb_optical_frame")
         .u32(height as u32)
         .u32(width as u32);
     message.text(encoding).u8(0).u32(step).bytes(data).0
 }
 
-/// `nav_msgs/OccupancyGrid` of 0.05 m cells around the origin.
+/// Serializes a `nav_msgs/OccupancyGrid` of 0.05 m cells around the origin.
 pub fn grid(width: usize, height: usize, cells: &[u8]) -> Vec<u8> {
-    let message = Message::stamped(1, "map")
+    let message = MessageWriter::with_header(1, "map")
         .u32(1_700_000_000)
         .u32(0)
         .f32(0.05);
     let message = message.u32(width as u32).u32(height as u32);
     let pose = [-100.0, -100.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-    pose.into_iter().fold(message, Message::f64).bytes(cells).0
+    pose.into_iter()
+        .fold(message, MessageWriter::f64)
+        .bytes(cells)
+        .0
 }
 
-/// `sensor_msgs/LaserScan` over 270 degrees.
+/// Serializes a `sensor_msgs/LaserScan` over 270 degrees.
 pub fn scan(ranges: &[f32], intensities: &[f32]) -> Vec<u8> {
     let increment = 1.5 * std::f32::consts::PI / ranges.len() as f32;
     let limits = [
@@ -86,26 +89,26 @@ pub fn scan(ranges: &[f32], intensities: &[f32]) -> Vec<u8> {
     ];
     let message = limits
         .into_iter()
-        .fold(Message::stamped(3, "laser"), Message::f32);
+        .fold(MessageWriter::with_header(3, "laser"), MessageWriter::f32);
     message.floats(ranges).floats(intensities).0
 }
 
-/// A point field's type, as `sensor_msgs/PointField` numbers it.
+/// Type of a point field, with the numbers of `sensor_msgs/PointField`.
 #[derive(Clone, Copy)]
-pub enum Number {
+pub enum PointFieldType {
     U16 = 4,
     F32 = 7,
 }
 
-/// `sensor_msgs/PointCloud2` without row padding.
+/// Serializes a `sensor_msgs/PointCloud2` without row padding.
 pub fn cloud(
     width: usize,
     height: usize,
     step: usize,
-    fields: &[(&str, usize, Number)],
+    fields: &[(&str, usize, PointFieldType)],
     data: &[u8],
 ) -> Vec<u8> {
-    let mut message = Message::stamped(9, "camera_depth_optical_frame")
+    let mut message = MessageWriter::with_header(9, "camera_depth_optical_frame")
         .u32(height as u32)
         .u32(width as u32);
     message = message.u32(fields.len() as u32);

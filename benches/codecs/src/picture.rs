@@ -1,54 +1,54 @@
-//! Pictures: colour, grey, Bayer, depth.
+//! Images: colour, grey, Bayer, depth.
 
-use crate::contest::{Contest, find, print};
+use crate::contest::{CodecComparison, find_result, print_results};
 use crate::messages::image;
 use crate::samples::{self, Noise, Picture};
 use anyhow::{Result, ensure};
-use bench_report::{Race, Report, Target};
+use bench_report::{BenchReport, Race, Target};
 use codec::{Codec, Decoder, Encoder, Schema};
 use std::hint::black_box;
 
 const ROUNDS: usize = 15;
 
-fn contest(messages: &[Vec<u8>]) -> Contest<'_> {
-    Contest {
+fn image_comparison(messages: &[Vec<u8>]) -> CodecComparison<'_> {
+    CodecComparison {
         schema: Schema::Image,
         messages,
         rounds: ROUNDS,
     }
 }
 
-/// The four figures of a lossless picture codec.
-fn figures(
-    report: &mut Report,
+/// Reports the four figures of a lossless image codec.
+fn report_lossless(
+    report: &mut BenchReport,
     title: &str,
     messages: &[Vec<u8>],
     saved: Option<f64>,
 ) -> Result<f64> {
-    let outcomes = contest(messages).run(&[Codec::Image], &[1, 3, 19])?;
-    print(title, &outcomes);
+    let outcomes = image_comparison(messages).run(&[Codec::Image], &[1, 3, 19])?;
+    print_results(title, &outcomes);
     let (ours, zstd, best) = (
-        find(&outcomes, "image")?,
-        find(&outcomes, "zstd 1")?,
-        find(&outcomes, "zstd 19")?,
+        find_result(&outcomes, "image")?,
+        find_result(&outcomes, "zstd 1")?,
+        find_result(&outcomes, "zstd 19")?,
     );
     let figure = report.figure(format!("{title}: saved"), "%", ours.saved);
     figure
-        .beside("zstd 19", best.saved)
-        .reach(saved.map_or(Target::AboveFloor, Target::AtLeast));
+        .relative_to("zstd 19", best.saved)
+        .require(saved.map_or(Target::AboveFloor, Target::AtLeast));
     let figure = report
         .figure(format!("{title}: encoding"), "MB/s", ours.encode)
-        .beside("zstd 1", zstd.encode);
+        .relative_to("zstd 1", zstd.encode);
     if saved.is_some() {
-        figure.reach(Target::RatioAtLeast(0.4));
+        figure.require(Target::RatioAtLeast(0.4));
     }
     report
         .figure(format!("{title}: decoding"), "MB/s", ours.decode)
-        .beside("zstd 1", zstd.decode);
+        .relative_to("zstd 1", zstd.decode);
     Ok(ours.encode)
 }
 
-/// PNG of one picture, as `image_transport`'s `compressed` makes it.
+/// Encodes one image as PNG, as `image_transport`'s `compressed` does.
 fn png(picture: &Picture) -> Result<Vec<u8>> {
     let mut out = Vec::new();
     let mut encoder = png::Encoder::new(&mut out, picture.width as u32, picture.height as u32);
@@ -84,44 +84,48 @@ fn jpeg(picture: &Picture) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-pub fn colours(report: &mut Report) -> Result<()> {
-    let pictures = samples::colours()?;
+pub fn measure_colour(report: &mut BenchReport) -> Result<()> {
+    let pictures = samples::colour_frames()?;
     let messages: Vec<_> = pictures
         .iter()
         .map(|p| image("rgb8", p.width, p.height, &p.data))
         .collect();
-    figures(report, "colour", &messages, Some(63.0))?;
-    peers(report, &pictures, &messages)?;
+    report_lossless(report, "colour", &messages, Some(63.0))?;
+    measure_peers(report, &pictures, &messages)?;
 
-    let packaged: Vec<_> = samples::packaged_colours()?
+    let packaged: Vec<_> = samples::packaged_photographs()?
         .iter()
         .map(|p| image("bgr8", p.width, p.height, &p.data))
         .collect();
-    figures(report, "colour, packaged photographs", &packaged, None)?;
+    report_lossless(report, "colour, packaged photographs", &packaged, None)?;
     let grey = |p: &Picture| -> Vec<u8> { p.data.chunks_exact(3).map(|pixel| pixel[1]).collect() };
     let messages: Vec<_> = pictures
         .iter()
         .map(|p| image("mono8", p.width, p.height, &grey(p)))
         .collect();
-    figures(report, "grey", &messages, None)?;
+    report_lossless(report, "grey", &messages, None)?;
     let messages: Vec<_> = pictures
         .iter()
-        .map(|p| image("bayer_rggb8", p.width, p.height, &bayer(p)))
+        .map(|p| image("bayer_rggb8", p.width, p.height, &to_bayer(p)))
         .collect();
-    figures(report, "Bayer", &messages, None)?;
+    report_lossless(report, "Bayer", &messages, None)?;
     Ok(())
 }
 
-/// What a camera with a colour filter array would have seen.
-fn bayer(picture: &Picture) -> Vec<u8> {
+/// Samples an image as a camera with a Bayer colour filter array would.
+fn to_bayer(picture: &Picture) -> Vec<u8> {
     let channel = |x: usize, y: usize| [[0, 1], [1, 2]][y % 2][x % 2];
     (0..picture.width * picture.height)
         .map(|at| picture.data[at * 3 + channel(at % picture.width, at / picture.width)])
         .collect()
 }
 
-/// PNG and JPEG, which need pictures rather than messages.
-fn peers(report: &mut Report, pictures: &[Picture], messages: &[Vec<u8>]) -> Result<()> {
+/// Measures PNG and JPEG, which encode images rather than messages.
+fn measure_peers(
+    report: &mut BenchReport,
+    pictures: &[Picture],
+    messages: &[Vec<u8>],
+) -> Result<()> {
     let bytes: usize = messages.iter().map(Vec::len).sum();
     let saved = |sizes: Vec<usize>| {
         let saved = sizes
@@ -172,19 +176,19 @@ fn peers(report: &mut Report, pictures: &[Picture], messages: &[Vec<u8>]) -> Res
     );
     let figure = report
         .figure("colour: encoding", "MB/s", speed[0])
-        .beside("PNG", speed[1]);
+        .relative_to("PNG", speed[1]);
     figure
-        .reach(Target::RatioAtLeast(5.0))
+        .require(Target::RatioAtLeast(5.0))
         .note(format!("PNG saves {png_saved:.1}%"));
     let figure = report
         .figure("colour: encoding", "MB/s", speed[0])
-        .beside("JPEG 95", speed[2]);
+        .relative_to("JPEG 95", speed[2]);
     figure.note(format!("JPEG saves {jpeg_saved:.1}%, lossy"));
     Ok(())
 }
 
-pub fn depths(report: &mut Report) -> Result<()> {
-    let pictures = samples::depths()?;
+pub fn measure_depth(report: &mut BenchReport) -> Result<()> {
+    let pictures = samples::depth_frames()?;
     ensure!(
         !pictures.is_empty(),
         "no depth image at hand: neither recordings nor scikit-image's samples"
@@ -193,30 +197,30 @@ pub fn depths(report: &mut Report) -> Result<()> {
         .iter()
         .map(|p| image("16UC1", p.width, p.height, &p.data))
         .collect();
-    figures(report, "depth", &messages, Some(83.0))?;
+    report_lossless(report, "depth", &messages, Some(83.0))?;
     let holes: Vec<_> = pictures
         .iter()
         .map(|p| image("16UC1", p.width, p.height, &with_holes(p)))
         .collect();
-    figures(report, "depth with holes", &holes, None)?;
+    report_lossless(report, "depth with holes", &holes, None)?;
     let metres: Vec<_> = pictures
         .iter()
-        .map(|p| image("32FC1", p.width, p.height, &in_metres(p)))
+        .map(|p| image("32FC1", p.width, p.height, &to_metres(p)))
         .collect();
-    figures(report, "float depth", &metres, None)?;
-    if let Some(disparity) = samples::motorcycle() {
+    report_lossless(report, "float depth", &metres, None)?;
+    if let Some(disparity) = samples::motorcycle_disparity() {
         let data: Vec<u8> = disparity
             .values
             .iter()
             .flat_map(|value| value.to_le_bytes())
             .collect();
         let message = image("32FC1", disparity.width, disparity.height, &data);
-        figures(report, "float disparity", &[message], None)?;
+        report_lossless(report, "float disparity", &[message], None)?;
     }
     Ok(())
 }
 
-/// Shadows beside edges, as structured light leaves them; the recordings were filled.
+/// Adds missing values along depth edges, as structured light produces them; the recordings had been filled.
 fn with_holes(picture: &Picture) -> Vec<u8> {
     let depth = |at: usize| u16::from_le_bytes([picture.data[at * 2], picture.data[at * 2 + 1]]);
     let mut data = picture.data.clone();
@@ -230,8 +234,8 @@ fn with_holes(picture: &Picture) -> Vec<u8> {
     data
 }
 
-/// As `depth_image_proc/convert_metric` publishes, NaN where nothing was measured.
-fn in_metres(picture: &Picture) -> Vec<u8> {
+/// Converts depth to metres as `depth_image_proc/convert_metric` does, with NaN where nothing was measured.
+fn to_metres(picture: &Picture) -> Vec<u8> {
     let metres = |pair: &[u8]| match u16::from_le_bytes([pair[0], pair[1]]) {
         0 => f32::NAN,
         depth => f32::from(depth) * 0.001,
@@ -243,8 +247,8 @@ fn in_metres(picture: &Picture) -> Vec<u8> {
         .collect()
 }
 
-/// Synthetic corner cases: all come back, none grows.
-pub fn corners(report: &mut Report) -> Result<()> {
+/// Checks synthetic corner cases: each one is decoded to the original, and none grows.
+pub fn measure_corner_cases(report: &mut BenchReport) -> Result<()> {
     let mut noise = Noise(3);
     let mut random = |count: usize| -> Vec<u8> { (0..count).map(|_| noise.next() as u8).collect() };
     let cases = [
@@ -292,6 +296,6 @@ pub fn corners(report: &mut Report) -> Result<()> {
     }
     report
         .figure("corner cases: growth at worst", "B", worst)
-        .reach(Target::AtMost(16.0));
+        .require(Target::AtMost(16.0));
     Ok(())
 }

@@ -1,5 +1,5 @@
-//! What is measured: the recordings beside the repository when they are there, packaged pictures otherwise, and
-//! synthetic corner cases.
+//! Input data: the recordings next to the repository if present, images from Debian packages otherwise, and synthetic
+//! corner cases.
 
 use anyhow::{Context, Result, bail};
 use std::fs::File;
@@ -7,28 +7,28 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A picture as decoded.
+/// A decoded image.
 pub struct Picture {
     pub width: usize,
     pub height: usize,
-    /// Bytes per pixel: 1 grey, 2 depth (little endian), 3 red, green, blue.
+    /// Bytes per pixel: 1 for grey, 2 for depth (little endian), 3 for red, green, blue.
     pub depth: usize,
     pub data: Vec<u8>,
 }
 
-/// Where the recordings are, if they are: in `CLOUDROID_RECORDINGS`, else in `../shared/data` beside the repository.
-pub fn recordings() -> Option<PathBuf> {
+/// Directory of the recordings, if they exist: `CLOUDROID_RECORDINGS`, or `../shared/data` next to the repository.
+pub fn recordings_directory() -> Option<PathBuf> {
     let beside = || bench_report::root().join("../shared/data");
     let path = std::env::var_os("CLOUDROID_RECORDINGS").map_or_else(beside, PathBuf::from);
     path.join("color1.png").exists().then_some(path)
 }
 
-/// Debian's `opencv-doc`.
-pub fn packaged() -> PathBuf {
+/// Directory of the samples of Debian's `opencv-doc`.
+pub fn opencv_samples_directory() -> PathBuf {
     PathBuf::from("/usr/share/doc/opencv-doc/examples/data")
 }
 
-fn picture(path: &Path) -> Result<Picture> {
+fn read_picture(path: &Path) -> Result<Picture> {
     let name = path
         .file_name()
         .unwrap_or_default()
@@ -72,19 +72,19 @@ fn picture(path: &Path) -> Result<Picture> {
     })
 }
 
-fn pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
+fn read_pictures(directory: &Path, names: &[&str]) -> Result<Vec<Picture>> {
     names
         .iter()
-        .map(|name| picture(&directory.join(name)))
+        .map(|name| read_picture(&directory.join(name)))
         .collect()
 }
 
-/// Colour frames of a camera: recorded, else of the packaged video.
-pub fn colours() -> Result<Vec<Picture>> {
-    if let Some(path) = recordings() {
-        return pictures(&path, &["color1.png", "color2.png", "color3.png"]);
+/// Colour frames of a camera: from the recordings, or from the packaged video.
+pub fn colour_frames() -> Result<Vec<Picture>> {
+    if let Some(path) = recordings_directory() {
+        return read_pictures(&path, &["color1.png", "color2.png", "color3.png"]);
     }
-    let (width, height, mut data) = video(150)?;
+    let (width, height, mut data) = decode_video(150)?;
     data.chunks_exact_mut(3).for_each(|pixel| pixel.swap(0, 2));
     let frames = data.chunks_exact(width * height * 3).step_by(60);
     let frames = frames.map(|frame| Picture {
@@ -96,24 +96,24 @@ pub fn colours() -> Result<Vec<Picture>> {
     Ok(frames.collect())
 }
 
-/// Photographs of packages: `opencv-doc`'s, and scikit-image's where they could be fetched.
-pub fn packaged_colours() -> Result<Vec<Picture>> {
-    let mut pictures = pictures(&packaged(), &["graf1.png", "graf3.png"])?;
-    if let Some(directory) = fetched() {
+/// Photographs from packages: those of `opencv-doc`, and scikit-image's if they could be fetched.
+pub fn packaged_photographs() -> Result<Vec<Picture>> {
+    let mut pictures = read_pictures(&opencv_samples_directory(), &["graf1.png", "graf3.png"])?;
+    if let Some(directory) = fetch_scikit_samples() {
         let names = [
             "astronaut.png",
             "chelsea.png",
             "coffee.png",
             "motorcycle_left.png",
         ];
-        pictures.extend(self::pictures(&directory, &names)?);
+        pictures.extend(self::read_pictures(&directory, &names)?);
     }
     pictures.retain(|picture| picture.depth == 3);
     Ok(pictures)
 }
 
-/// scikit-image's samples, if `samples.py` has fetched or can fetch them.
-fn fetched() -> Option<PathBuf> {
+/// Directory of scikit-image's samples; `None` if `samples.py` neither has fetched them nor can.
+fn fetch_scikit_samples() -> Option<PathBuf> {
     let directory = bench_report::root().join("target/bench/samples");
     if !directory.join("motorcycle_disp.f32").exists() {
         let script = bench_report::root().join("benches/codecs/samples.py");
@@ -126,15 +126,18 @@ fn fetched() -> Option<PathBuf> {
     Some(directory)
 }
 
-/// Depth frames; without recordings, the packaged disparity.
-pub fn depths() -> Result<Vec<Picture>> {
-    match recordings() {
-        Some(path) => pictures(&path, &["depth1.png", "depth2.png", "depth3.png"]),
-        None => Ok(motorcycle().iter().map(Disparity::depth).collect()),
+/// Depth frames: from the recordings, or from the packaged disparity image.
+pub fn depth_frames() -> Result<Vec<Picture>> {
+    match recordings_directory() {
+        Some(path) => read_pictures(&path, &["depth1.png", "depth2.png", "depth3.png"]),
+        None => Ok(motorcycle_disparity()
+            .iter()
+            .map(Disparity::to_depth)
+            .collect()),
     }
 }
 
-/// A disparity measured by structured light, one float per pixel, infinite where there is none.
+/// A disparity image measured by structured light: one float per pixel, infinite if unknown.
 pub struct Disparity {
     pub width: usize,
     pub height: usize,
@@ -142,8 +145,8 @@ pub struct Disparity {
 }
 
 impl Disparity {
-    /// As depth in millimetres, zero where there is none: for Middlebury's 2014 rig, scaled as the picture is.
-    fn depth(&self) -> Picture {
+    /// Converts to depth in millimetres, zero if unknown: for Middlebury's 2014 rig, scaled to the image's size.
+    fn to_depth(&self) -> Picture {
         let millimetre = |&disparity: &f32| {
             let depth = 193.001 * 994.978 / (disparity + 32.778);
             if depth.is_finite() && disparity.is_finite() {
@@ -167,9 +170,9 @@ impl Disparity {
     }
 }
 
-/// scikit-image's motorcycle: `height · width · floats`, little endian.
-pub fn motorcycle() -> Option<Disparity> {
-    let path = fetched()?.join("motorcycle_disp.f32");
+/// Disparity image of scikit-image's motorcycle; format: `height · width · floats`, little endian.
+pub fn motorcycle_disparity() -> Option<Disparity> {
+    let path = fetch_scikit_samples()?.join("motorcycle_disp.f32");
     let bytes = std::fs::read(path).ok()?;
     let size =
         |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize);
@@ -185,10 +188,10 @@ pub fn motorcycle() -> Option<Disparity> {
     })
 }
 
-/// An office floor of 566×608 cells as an occupancy grid: unknown, free, occupied.
-pub fn office() -> Result<Picture> {
-    let Some(path) = recordings() else {
-        return Ok(rooms());
+/// Floor plan of an office, 566×608 cells, as an occupancy grid: unknown, free, occupied.
+pub fn office_map() -> Result<Picture> {
+    let Some(path) = recordings_directory() else {
+        return Ok(synthetic_rooms());
     };
     let mut pgm = Vec::new();
     flate2::read::GzDecoder::new(File::open(path.join("willow.pgm.gz"))?).read_to_end(&mut pgm)?;
@@ -212,13 +215,13 @@ pub fn office() -> Result<Picture> {
     }
     let (width, height) = (numbers[0], numbers[1]);
     let pixels = &pgm[at + 1..at + 1 + width * height];
-    // As map_server does it, with its usual thresholds.
+    // Same conversion as map_server's, with its default thresholds.
     let cell = |&pixel: &u8| match (255.0 - f64::from(pixel)) / 255.0 {
         occupied if occupied > 0.65 => 100u8,
         occupied if occupied < 0.196 => 0,
         _ => 255,
     };
-    // A map begins at the bottom, a picture at the top.
+    // A map starts at the bottom, an image at the top.
     let data = pixels
         .chunks_exact(width)
         .rev()
@@ -233,8 +236,8 @@ pub fn office() -> Result<Picture> {
     })
 }
 
-/// Rooms and corridors, where there is no recording.
-fn rooms() -> Picture {
+/// Synthetic rooms and corridors, used without recordings.
+fn synthetic_rooms() -> Picture {
     let (width, height) = (566, 608);
     let mut data = vec![255u8; width * height];
     for y in 20..height - 20 {
@@ -252,8 +255,8 @@ fn rooms() -> Picture {
     }
 }
 
-/// A grid of `size`×`size` cells with `map` in its middle, as gmapping publishes.
-pub fn in_the_middle(map: &Picture, size: usize) -> Vec<u8> {
+/// Returns a grid of `size`×`size` cells with `map` at its centre, as gmapping publishes it.
+pub fn centre_in_grid(map: &Picture, size: usize) -> Vec<u8> {
     let mut cells = vec![255u8; size * size];
     let (left, top) = ((size - map.width) / 2, (size - map.height) / 2);
     for (y, row) in map.data.chunks_exact(map.width).enumerate() {
@@ -263,11 +266,11 @@ pub fn in_the_middle(map: &Picture, size: usize) -> Vec<u8> {
     cells
 }
 
-/// Frames of `vtest.avi` as blue, green, red.
-pub fn video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
+/// Decodes `frames` frames of `vtest.avi` as blue, green, red.
+pub fn decode_video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
     let output = Command::new("ffmpeg")
         .args(["-v", "error", "-i"])
-        .arg(packaged().join("vtest.avi"))
+        .arg(opencv_samples_directory().join("vtest.avi"))
         .args([
             "-frames:v",
             &frames.to_string(),
@@ -288,7 +291,7 @@ pub fn video(frames: usize) -> Result<(usize, usize, Vec<u8>)> {
     Ok((768, 576, output.stdout))
 }
 
-/// A small deterministic source of noise (xorshift).
+/// A small deterministic noise generator (xorshift).
 pub struct Noise(pub u64);
 
 impl Noise {
@@ -299,12 +302,12 @@ impl Noise {
         self.0
     }
 
-    /// Uniform in 0.0..1.0.
+    /// Returns a uniformly distributed number in 0.0..1.0.
     pub fn unit(&mut self) -> f64 {
         (self.next() >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// Normal, by the sum of twelve.
+    /// Returns a normally distributed number, computed as a sum of twelve uniform ones.
     pub fn normal(&mut self) -> f64 {
         (0..12).map(|_| self.unit()).sum::<f64>() - 6.0
     }

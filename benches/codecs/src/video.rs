@@ -1,10 +1,10 @@
-//! Colour video beside x264, in processor time: one core's, whatever else runs.
+//! Colour video compared with x264, by the processor time of one core, independent of other load.
 
 use crate::messages::image;
 use crate::psnr::Psnr;
 use crate::samples;
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target, children_time, thread_time};
+use bench_report::{BenchReport, Target, children_processor_time, thread_processor_time};
 use codec::{Codec, Decoder, Encoder, Schema, VideoOptions};
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -22,8 +22,8 @@ fn luma(pixels: &[u8]) -> Vec<u8> {
         .collect()
 }
 
-pub fn videos(report: &mut Report) -> Result<()> {
-    let (width, height, pixels) = samples::video(FRAMES)?;
+pub fn measure_video(report: &mut BenchReport) -> Result<()> {
+    let (width, height, pixels) = samples::decode_video(FRAMES)?;
     let frames: Vec<&[u8]> = pixels.chunks_exact(width * height * 3).collect();
     let messages: Vec<Vec<u8>> = frames
         .iter()
@@ -36,9 +36,9 @@ pub fn videos(report: &mut Report) -> Result<()> {
     let (mut colour, mut grey) = (Psnr::default(), Psnr::default());
     for (message, frame) in messages.iter().zip(&frames) {
         let mut out = Vec::new();
-        let start = thread_time();
+        let start = thread_processor_time();
         let encoded = encoder.encode(Codec::Video, message, &mut out);
-        encoding += thread_time() - start;
+        encoding += thread_processor_time() - start;
         ensure!(
             encoded.codec == Codec::Video,
             "video fell back to {}",
@@ -46,9 +46,9 @@ pub fn videos(report: &mut Report) -> Result<()> {
         );
         bytes += out.len();
         let mut back = Vec::new();
-        let start = thread_time();
+        let start = thread_processor_time();
         decoder.decode(&out, &mut back)?;
-        decoding += thread_time() - start;
+        decoding += thread_processor_time() - start;
         let head = message.len() - frame.len();
         ensure!(
             back[..head] == message[..head],
@@ -77,19 +77,19 @@ pub fn videos(report: &mut Report) -> Result<()> {
     let note = "of the 4:2:0 planes; of the message even more";
     report
         .figure("video: saved", "%", saved)
-        .beside("x264", peer.saved)
-        .reach(Target::AtLeast(98.5))
+        .relative_to("x264", peer.saved)
+        .require(Target::AtLeast(98.5))
         .note(note);
     report.figure("video: saved of the message", "%", saved_of_message);
     let figure = report
         .figure("video: PSNR of the colours", "dB", colour.decibels())
-        .beside("x264", peer.colour);
-    figure.reach(Target::AtLeast(36.0));
+        .relative_to("x264", peer.colour);
+    figure.require(Target::AtLeast(36.0));
     report.figure("video: PSNR of luma", "dB", grey.decibels());
     let figure = report
         .figure("video: encoding", "frames/s", speed)
-        .beside("x264", peer.speed);
-    figure.reach(Target::AtLeast(100.0));
+        .relative_to("x264", peer.speed);
+    figure.require(Target::AtLeast(100.0));
     report.figure(
         "video: decoding",
         "frames/s",
@@ -98,18 +98,19 @@ pub fn videos(report: &mut Report) -> Result<()> {
     Ok(())
 }
 
-struct Peer {
+struct X264Result {
     saved: f64,
     colour: f64,
     speed: f64,
 }
 
-/// x264 by ffmpeg, as for a live link, on one thread. Its time includes ffmpeg's colour conversion, as ours does.
-fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<Peer> {
+/// Encodes with x264 through ffmpeg, set up for a live link, on one thread. The time includes ffmpeg's colour
+/// conversion, as ours does.
+fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<X264Result> {
     let size = format!("{width}x{height}");
     let raw = ["-f", "rawvideo", "-pix_fmt", "bgr24"];
-    let start = children_time();
-    let stream = pipe(
+    let start = children_processor_time();
+    let stream = run_filter(
         Command::new("ffmpeg")
             .args(["-v", "error", "-threads", "1"])
             .args(raw)
@@ -130,8 +131,8 @@ fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<
             ]),
         pixels,
     )?;
-    let took = children_time() - start;
-    let back = pipe(
+    let took = children_processor_time() - start;
+    let back = run_filter(
         Command::new("ffmpeg")
             .args(["-v", "error", "-f", "h264", "-i", "-"])
             .args(raw)
@@ -145,15 +146,15 @@ fn x264(width: usize, height: usize, pixels: &[u8], frames: &[&[u8]]) -> Result<
     }
     let count = frames.len() as f64;
     let saved = 100.0 * (1.0 - stream.len() as f64 / count / (width * height * 3 / 2) as f64);
-    Ok(Peer {
+    Ok(X264Result {
         saved,
         colour: colour.decibels(),
         speed: count / took.as_secs_f64(),
     })
 }
 
-/// Runs a filter.
-fn pipe(command: &mut Command, input: &[u8]) -> Result<Vec<u8>> {
+/// Runs `command` as a filter: writes `input` to it and returns its output.
+fn run_filter(command: &mut Command, input: &[u8]) -> Result<Vec<u8>> {
     let mut child = command
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())

@@ -1,20 +1,21 @@
-//! Lasers and cameras looked through: scans and clouds made from the recordings, as drivers make them.
+//! Simulated lasers and cameras: scans and clouds derived from the recordings in the form in which drivers publish
+//! them.
 
-use crate::messages::{Number, cloud, scan};
+use crate::messages::{PointFieldType, cloud, scan};
 use crate::samples::{Noise, Picture};
 
 /// Metres per cell of the office floor.
 const CELL: f64 = 0.1;
 
-/// A place on the floor that is free, far from walls.
+/// A free position on the floor, far from walls, with a heading.
 pub struct Pose {
     pub x: f64,
     pub y: f64,
     pub heading: f64,
 }
 
-/// Places spread over the map.
-pub fn poses(map: &Picture, count: usize) -> Vec<Pose> {
+/// Returns positions spread over the map.
+pub fn sample_poses(map: &Picture, count: usize) -> Vec<Pose> {
     let free = |x: usize, y: usize| {
         (0..9).all(|at| {
             let (x, y) = (x + at % 3 * 4, y + at / 3 * 4);
@@ -40,8 +41,8 @@ pub fn poses(map: &Picture, count: usize) -> Vec<Pose> {
     poses
 }
 
-/// How far a ray goes before a wall, at most 30 m; `None` when it meets none.
-pub fn ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
+/// Returns the distance along a ray to the next wall, at most 30 m; `None` if there is no wall.
+pub fn cast_ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
     let (sin, cos) = (pose.heading + angle).sin_cos();
     let mut distance = 0.0;
     while distance < 30.0 {
@@ -60,11 +61,11 @@ pub fn ray(map: &Picture, pose: &Pose, angle: f64) -> Option<f64> {
     None
 }
 
-/// A scanner of 1081 beams over 270 degrees with 10 mm of noise; `float` turns a distance in metres (infinite where
-/// nothing was met) into what the driver publishes.
-pub fn scanner(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> Vec<Vec<u8>> {
+/// Scans of a laser with 1081 beams over 270 degrees and 10 mm of noise; `float` converts a distance in metres
+/// (infinite without an echo) into the value that the driver publishes.
+pub fn laser_scans(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> Vec<Vec<u8>> {
     let mut noise = Noise(7);
-    poses(map, 12)
+    sample_poses(map, 12)
         .iter()
         .map(|pose| {
             let mut ranges = Vec::new();
@@ -72,7 +73,7 @@ pub fn scanner(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> 
             for beam in 0..1081 {
                 let angle = (f64::from(beam) - 540.0) * 0.25_f64.to_radians();
                 let distance =
-                    ray(map, pose, angle).map(|distance| distance + 0.01 * noise.normal());
+                    cast_ray(map, pose, angle).map(|distance| distance + 0.01 * noise.normal());
                 ranges.push(float(distance.unwrap_or(f64::INFINITY)));
                 let echo = distance.map_or(0.0, |distance| {
                     3000.0 / (1.0 + distance) + 20.0 * noise.normal()
@@ -84,7 +85,7 @@ pub fn scanner(map: &Picture, float: impl Fn(f64) -> f32, intensities: bool) -> 
         .collect()
 }
 
-/// Scans cut out of depth frames, as `depthimage_to_laserscan` makes them.
+/// Scans cut out of depth frames, as `depthimage_to_laserscan` produces them.
 pub fn camera_scans(depths: &[Picture]) -> Vec<Vec<u8>> {
     let mut scans = Vec::new();
     for depth in depths {
@@ -92,7 +93,7 @@ pub fn camera_scans(depths: &[Picture]) -> Vec<Vec<u8>> {
             let ranges: Vec<f32> = (0..depth.width)
                 .rev()
                 .map(|u| {
-                    let z = metres(depth, u, row);
+                    let z = depth_metres(depth, u, row);
                     let x = (u as f32 - 319.5) * z / 525.0;
                     if z > 0.0 { x.hypot(z) } else { f32::NAN }
                 })
@@ -103,13 +104,13 @@ pub fn camera_scans(depths: &[Picture]) -> Vec<Vec<u8>> {
     scans
 }
 
-fn metres(depth: &Picture, u: usize, v: usize) -> f32 {
+fn depth_metres(depth: &Picture, u: usize, v: usize) -> f32 {
     let at = (v * depth.width + u) * 2;
     f32::from(u16::from_le_bytes([depth.data[at], depth.data[at + 1]])) / 5000.0
 }
 
-/// Coloured clouds of a depth camera, as `depth_image_proc` makes them: `step` bytes per point, padded as PCL does.
-/// `organised` keeps the picture, with NaN where nothing was measured; otherwise those points are left out.
+/// Coloured point clouds of a depth camera, as `depth_image_proc` produces them: `step` bytes per point, padded as PCL
+/// does. With `organised` the image layout is kept, with NaN for missing points; otherwise those points are dropped.
 pub fn camera_clouds(
     colours: &[Picture],
     depths: &[Picture],
@@ -128,8 +129,8 @@ pub fn camera_clouds(
             let mut noise = Noise(index as u64 + 1);
             for v in 0..depth.height {
                 for u in 0..depth.width {
-                    let z = metres(depth, u, v);
-                    // Real cameras miss a few per cent; these recordings were filled.
+                    let z = depth_metres(depth, u, v);
+                    // Real cameras miss a few per cent of the points; these recordings had been filled.
                     let missing = z == 0.0 || noise.next() % 40 == 0;
                     if missing && !organised {
                         continue;
@@ -150,10 +151,10 @@ pub fn camera_clouds(
                 }
             }
             let fields = [
-                ("x", 0, Number::F32),
-                ("y", 4, Number::F32),
-                ("z", 8, Number::F32),
-                ("rgb", rgb, Number::F32),
+                ("x", 0, PointFieldType::F32),
+                ("y", 4, PointFieldType::F32),
+                ("z", 8, PointFieldType::F32),
+                ("rgb", rgb, PointFieldType::F32),
             ];
             let count = data.len() / step;
             let (width, height) = if organised {
@@ -166,19 +167,19 @@ pub fn camera_clouds(
         .collect()
 }
 
-/// A laser of 16 rings spun once in the office, 2 mm resolution, 20 mm of noise; points without an echo are left out.
-/// The packed layout of 22 bytes is the driver's.
+/// One revolution each of a 16-ring laser in the office, with 2 mm resolution and 20 mm of noise; points without an
+/// echo are dropped. The packed layout of 22 bytes is the driver's.
 pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
     let mut noise = Noise(11);
-    poses(map, 4)
+    sample_poses(map, 4)
         .iter()
         .map(|pose| {
             let mut data = Vec::new();
             for shot in 0..1800u32 {
                 let azimuth = f64::from(shot) * 0.2_f64.to_radians();
-                let wall = ray(map, pose, -azimuth);
+                let wall = cast_ray(map, pose, -azimuth);
                 for laser in 0..16u32 {
-                    // Fired in the order -15, 1, -13, 3, …
+                    // The lasers fire in the order -15, 1, -13, 3, … degrees.
                     let degrees = if laser % 2 == 0 {
                         f64::from(laser) - 15.0
                     } else {
@@ -209,24 +210,24 @@ pub fn spinning_clouds(map: &Picture) -> Vec<Vec<u8>> {
                 }
             }
             let fields = [
-                ("x", 0, Number::F32),
-                ("y", 4, Number::F32),
-                ("z", 8, Number::F32),
-                ("intensity", 12, Number::F32),
-                ("ring", 16, Number::U16),
-                ("time", 18, Number::F32),
+                ("x", 0, PointFieldType::F32),
+                ("y", 4, PointFieldType::F32),
+                ("z", 8, PointFieldType::F32),
+                ("intensity", 12, PointFieldType::F32),
+                ("ring", 16, PointFieldType::U16),
+                ("time", 18, PointFieldType::F32),
             ];
             cloud(data.len() / 22, 1, 22, &fields, &data)
         })
         .collect()
 }
 
-/// A map being made: what has been seen after each of `count` stops, inside a grid of `size`×`size`.
-pub fn mapping(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>> {
+/// A map being built: the known cells after each of `count` stops, within a grid of `size`×`size` cells.
+pub fn maps_in_progress(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>> {
     let mut cells = vec![255u8; size * size];
     let (left, top) = ((size - map.width) / 2, (size - map.height) / 2);
-    let mut stops = poses(map, count);
-    // In the order of a robot that goes to the nearest next.
+    let mut stops = sample_poses(map, count);
+    // Ordered like the path of a robot that always drives to the nearest remaining stop.
     for index in 1..stops.len() {
         let (x, y) = (stops[index - 1].x, stops[index - 1].y);
         let distance = |pose: &Pose| (pose.x - x).powi(2) + (pose.y - y).powi(2);
@@ -238,7 +239,7 @@ pub fn mapping(map: &Picture, size: usize, count: usize) -> Vec<Vec<u8>> {
     for pose in &stops {
         for beam in 0..2000 {
             let angle = f64::from(beam) * std::f64::consts::TAU / 2000.0;
-            let end = ray(map, pose, angle);
+            let end = cast_ray(map, pose, angle);
             let (sin, cos) = (pose.heading + angle).sin_cos();
             let mut distance = 0.0;
             while distance < end.unwrap_or(12.0).min(12.0) {

@@ -1,8 +1,8 @@
-//! zlib itself, not a port: the peer most links use.
+//! Bindings to zlib itself rather than a port, because it is the codec that most links use.
 
 use libz_sys::{Z_OK, compress2, compressBound, uLong, uncompress as uncompress_c};
 
-/// One zlib stream.
+/// Compresses `message` into one zlib stream.
 pub fn compress(message: &[u8], level: i32) -> Vec<u8> {
     // SAFETY: a pure function of a number.
     let bound = unsafe { compressBound(message.len() as uLong) };
@@ -23,7 +23,7 @@ pub fn compress(message: &[u8], level: i32) -> Vec<u8> {
     out
 }
 
-/// Into `out`, which must be large enough; returns the message's length.
+/// Decompresses into `out`, which must be large enough; returns the length of the message.
 pub fn uncompress(stream: &[u8], out: &mut [u8]) -> usize {
     let mut length = out.len() as uLong;
     // SAFETY: both buffers are valid for the lengths given, and `length` is the output's capacity.

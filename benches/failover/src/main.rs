@@ -1,8 +1,9 @@
-//! `make bench ONLY=failover`: people_detect is asked 130 times while the robot's network is bad during requests
-//! 24-45, 75-96 and 111-122; through the stub, and beside it by the cloud alone and by the original alone. Needs root.
+//! `make bench ONLY=failover`: sends people_detect 130 requests while the robot's network is degraded during requests
+//! 24-45, 75-96 and 111-122: through the stub, and for comparison with the cloud alone and with the local original
+//! alone. Needs root.
 //!
-//! The robot's side is this machine's network, the server's a namespace behind a cable that can be degraded (see
-//! `support::cable`). Daemon, servant, stub and originals are the real ones.
+//! The robot uses this machine's network; the server is in a network namespace behind a cable that can be degraded (see
+//! `support::cable`). Daemon, servant, stub and originals are the real programs.
 
 #![forbid(unsafe_code)]
 
@@ -13,20 +14,20 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use robot::{Outcome, Plan};
-use support::cable::{Badness, Cable};
-use support::daemon::Setup;
+use bench_report::{BenchReport, Target};
+use robot::{FailoverPlan, FailoverResult};
+use support::cable::{Cable, NetworkImpairment};
+use support::daemon::DaemonSetup;
 use support::world::PEOPLE;
 
-/// Requests during which the network is bad, both ends included.
+/// Requests during which the network is degraded; both ends are included.
 pub const BAD: [(usize, usize); 3] = [(24, 45), (75, 96), (111, 122)];
-/// Requests of one run.
+/// Number of requests per run.
 pub const REQUESTS: usize = 130;
-/// Pictures that are asked about in turn.
+/// Number of different pictures, which are sent in rotation.
 const PICTURES: usize = 30;
-/// A picture takes 3.7 s at this rate.
-const BADNESS: Badness = Badness {
+/// At this rate a picture takes 3.7 s.
+const BADNESS: NetworkImpairment = NetworkImpairment {
     rate: 2000,
     delay: 100,
     jitter: 0,
@@ -35,19 +36,22 @@ const BADNESS: Badness = Badness {
 };
 
 fn main() -> Result<()> {
-    let _first = First::new();
+    let _first = RaisedPriority::new();
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    let daemon = Setup::new(&place.path().join("home")).start()?;
+    let daemon = DaemonSetup::new(&place.path().join("home")).start()?;
     eprintln!("pushing people_detect: base and dependencies are made now, if they are not cached");
-    // What else runs on this machine is not what is measured.
+    // Other load on this machine should not influence the measurement.
     let push = [&["push", "--cpu-weight", "10000"], PEOPLE.arguments].concat();
-    daemon.deployer().types(&push)?.succeeded()?;
-    let pictures = pictures(place.path())?;
+    daemon.deployer().run(&push)?.expect_success()?;
+    let pictures = extract_pictures(place.path())?;
     let cable = Cable::new(&daemon.address)?;
-    eprintln!("the network is degraded by {}: {BADNESS:?}", cable.means());
-    let mut report = Report::new("failover");
+    eprintln!(
+        "the network is degraded by {}: {BADNESS:?}",
+        cable.mechanism()
+    );
+    let mut report = BenchReport::new("failover");
     let mut runs = Vec::new();
     for (name, rate, times, local) in [
         ("5 Hz, warm local original", 5.0, (0.25, 0.5), "warm"),
@@ -60,30 +64,33 @@ fn main() -> Result<()> {
             continue;
         }
         eprintln!("{name}");
-        let plan = Plan {
+        let plan = FailoverPlan {
             rate,
             times,
             local,
             pictures: &pictures,
         };
         let outcome = robot::run(&daemon, &cable, &plan).with_context(|| name.to_owned())?;
-        daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-        figures(&mut report, name, local, &outcome);
+        daemon
+            .deployer()
+            .run(&["stop", "--all"])?
+            .expect_success()?;
+        report_figures(&mut report, name, local, &outcome);
         runs.push((name.to_owned(), outcome));
     }
     report.finish()?;
     let path = bench_report::root().join("target/bench/failover.svg");
     std::fs::write(&path, plot::draw(&runs))?;
     println!("the plot is {}", path.display());
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(())
 }
 
-/// This run's processes come before the machine's other ones. Where the scheduler groups processes by session
-/// (sched(7), autogroup), only the group's nice value counts between sessions; it is put back at the end.
-struct First;
+/// Raises the priority of this run's processes above all others of the machine. If the scheduler groups processes by
+/// session (sched(7), autogroup), only the group's nice value counts between sessions; it is reset on drop.
+struct RaisedPriority;
 
-impl First {
+impl RaisedPriority {
     fn new() -> Self {
         let own = std::process::id().to_string();
         let _ = Command::new("renice")
@@ -94,25 +101,25 @@ impl First {
     }
 }
 
-impl Drop for First {
+impl Drop for RaisedPriority {
     fn drop(&mut self) {
         let _ = std::fs::write("/proc/self/autogroup", "0");
     }
 }
 
-fn figures(report: &mut Report, name: &str, local: &str, outcome: &Outcome) {
+fn report_figures(report: &mut BenchReport, name: &str, local: &str, outcome: &FailoverResult) {
     let (within, late) = match local {
         "warm" => (Some(95.0), Some(2.0)),
         "cold" => (Some(93.0), Some(3.0)),
         _ => (None, None),
     };
-    let share = 100.0 * outcome.within() as f64 / REQUESTS as f64;
+    let share = 100.0 * outcome.count_in_time() as f64 / REQUESTS as f64;
     let figure = report.figure(format!("{name}: answered within T_max"), "%", share);
-    within.map(|within| figure.reach(Target::AtLeast(within)));
-    for (index, count) in outcome.late().into_iter().enumerate() {
+    within.map(|within| figure.require(Target::AtLeast(within)));
+    for (index, count) in outcome.count_late_by_onset().into_iter().enumerate() {
         let name = format!("{name}: late from onset {} on", index + 1);
         let figure = report.figure(name, "requests", count as f64);
-        late.map(|late| figure.reach(Target::AtMost(late)));
+        late.map(|late| figure.require(Target::AtMost(late)));
     }
     let times = |count: usize| {
         outcome
@@ -122,10 +129,10 @@ fn figures(report: &mut Report, name: &str, local: &str, outcome: &Outcome) {
     };
     let once = times(1).count() as f64;
     let figure = report.figure(format!("{name}: answered exactly once"), "of 130", once);
-    within.map(|_| figure.reach(Target::AtLeast(REQUESTS as f64)));
+    within.map(|_| figure.require(Target::AtLeast(REQUESTS as f64)));
     let never = times(0).count() as f64;
     report.figure(format!("{name}: never answered"), "of 130", never);
-    let median = outcome.median() * 1e3;
+    let median = outcome.median_response_time() * 1e3;
     report.figure(format!("{name}: response time, median"), "ms", median);
     if within.is_none() {
         return;
@@ -139,13 +146,13 @@ fn figures(report: &mut Report, name: &str, local: &str, outcome: &Outcome) {
         let figure = report.figure(format!("{name}: {what}"), "times", count as f64);
         let process = what.starts_with("process");
         if !process || local == "cold" {
-            figure.reach(Target::AtLeast(3.0));
+            figure.require(Target::AtLeast(3.0));
         }
     }
 }
 
-/// Pedestrians, 640x480, bgr8, one after the other.
-fn pictures(place: &Path) -> Result<PathBuf> {
+/// Extracts images of pedestrians: 640x480, bgr8, concatenated.
+fn extract_pictures(place: &Path) -> Result<PathBuf> {
     let path = place.join("pictures.raw");
     let status = Command::new("ffmpeg")
         .args(["-v", "error", "-i"])

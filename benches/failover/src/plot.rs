@@ -1,23 +1,24 @@
-//! Response times over requests, as SVG: one panel for each run, bad times shaded, who answered by colour, Q below.
+//! Plots response times over requests as SVG: one panel per run, degraded phases shaded, answers coloured by who gave
+//! them, Q below.
 
 use std::fmt::Write;
 
 use crate::BAD;
-use crate::robot::{Answer, Outcome};
+use crate::robot::{FailoverResult, FailoverSample};
 
 const WIDTH: f64 = 900.0;
 const HEIGHT: f64 = 170.0;
-/// Of the strip for Q, and what it shows.
+/// Height of the strip for Q; it shows values from 0 to `Q_MAX` and the threshold `Q_T`.
 const Q_HEIGHT: f64 = 40.0;
 const Q_MAX: f64 = 16.0;
 const Q_T: f64 = 4.0;
 const LEFT: f64 = 44.0;
-/// For the names of what was promised, beside the panels.
+/// Space for the labels of T_desire and T_max to the right of the panels.
 const RIGHT: f64 = 60.0;
-/// Where those names begin.
+/// Where these labels start.
 const BESIDE: f64 = LEFT + WIDTH + 6.0;
 const STEP: f64 = HEIGHT + Q_HEIGHT + 56.0;
-/// Of the logarithmic axis, seconds.
+/// Range of the logarithmic axis, in seconds.
 const RANGE: (f64, f64) = (0.05, 12.0);
 const COLOURS: [(&str, &str); 3] = [
     ("#0a6ebd", "answered by the cloud"),
@@ -25,17 +26,18 @@ const COLOURS: [(&str, &str); 3] = [
     ("#c1121f", "later than T_max, or never (at the top)"),
 ];
 
-/// One panel for each run.
-pub fn draw(runs: &[(String, Outcome)]) -> String {
+/// Draws one panel per run.
+pub fn draw(runs: &[(String, FailoverResult)]) -> String {
     let mut out = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{}\" height=\"{}\" font-family=\"sans-serif\" font-size=\"12\">\n\
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{}\" height=\"{}\" font-family=\"sans-serif\" \
+         font-size=\"12\">\n\
          <rect width=\"100%\" height=\"100%\" fill=\"white\"/>\n",
         LEFT + WIDTH + RIGHT,
         STEP * runs.len() as f64 + 40.0
     );
     for (index, (colour, what)) in COLOURS.iter().enumerate() {
         let x = LEFT + 250.0 * index as f64;
-        put(
+        write_line(
             &mut out,
             format_args!(
                 "<circle cx=\"{x}\" cy=\"16\" r=\"4\" fill=\"{colour}\"/><text x=\"{}\" y=\"20\">{what}</text>",
@@ -44,25 +46,25 @@ pub fn draw(runs: &[(String, Outcome)]) -> String {
         );
     }
     for (index, (name, outcome)) in runs.iter().enumerate() {
-        panel(&mut out, 56.0 + STEP * index as f64, name, outcome);
+        draw_panel(&mut out, 56.0 + STEP * index as f64, name, outcome);
     }
     out + "</svg>\n"
 }
 
-fn put(out: &mut String, line: std::fmt::Arguments) {
-    // Writing to a String does not fail.
+fn write_line(out: &mut String, line: std::fmt::Arguments) {
+    // Writing to a String cannot fail.
     let _ = writeln!(out, "{line}");
 }
 
-fn panel(out: &mut String, top: f64, name: &str, outcome: &Outcome) {
+fn draw_panel(out: &mut String, top: f64, name: &str, outcome: &FailoverResult) {
     let count = outcome.answers.len() as f64;
     let x = |number: f64| LEFT + WIDTH * number / (count + 1.0);
     let y = |seconds: f64| {
         let share = (seconds / RANGE.0).ln() / (RANGE.1 / RANGE.0).ln();
         top + HEIGHT * (1.0 - share.clamp(0.0, 1.0))
     };
-    let within = 100.0 * outcome.within() as f64 / count;
-    put(
+    let within = 100.0 * outcome.count_in_time() as f64 / count;
+    write_line(
         out,
         format_args!(
             "<text x=\"{LEFT}\" y=\"{}\" font-weight=\"bold\">{name}: {within:.1} % within T_max</text>",
@@ -71,7 +73,7 @@ fn panel(out: &mut String, top: f64, name: &str, outcome: &Outcome) {
     );
     for (first, last) in BAD {
         let (from, to) = (x(first as f64 - 0.5), x(last as f64 + 0.5));
-        put(
+        write_line(
             out,
             format_args!(
                 "<rect x=\"{from:.1}\" y=\"{top}\" width=\"{:.1}\" height=\"{}\" fill=\"#eee\"/>",
@@ -81,18 +83,18 @@ fn panel(out: &mut String, top: f64, name: &str, outcome: &Outcome) {
         );
     }
     for (seconds, label) in [(0.1, "0.1 s"), (1.0, "1 s"), (10.0, "10 s")] {
-        line(out, y(seconds), (4.0, label), "#ccc");
+        draw_line(out, y(seconds), (4.0, label), "#ccc");
     }
     for (seconds, label, colour) in [
         (outcome.times.0, "T_desire", "#2a9d4a"),
         (outcome.times.1, "T_max", "#c1121f"),
     ] {
-        line(out, y(seconds), (BESIDE, label), colour);
+        draw_line(out, y(seconds), (BESIDE, label), colour);
     }
     for (index, answer) in outcome.answers.iter().enumerate() {
         let at = answer.after.map_or(top, y);
         let colour = colour(outcome, answer);
-        put(
+        write_line(
             out,
             format_args!(
                 "<circle cx=\"{:.1}\" cy=\"{at:.1}\" r=\"2.6\" fill=\"{colour}\"/>",
@@ -100,11 +102,11 @@ fn panel(out: &mut String, top: f64, name: &str, outcome: &Outcome) {
             ),
         );
     }
-    satisfaction(out, top + HEIGHT + 8.0, &x, outcome);
+    draw_satisfaction(out, top + HEIGHT + 8.0, &x, outcome);
 }
 
-/// Q after each request, with its threshold.
-fn satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &Outcome) {
+/// Draws Q after each request, and its threshold.
+fn draw_satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &FailoverResult) {
     let y = |q: f64| top + Q_HEIGHT * (1.0 - q / Q_MAX);
     let known = outcome.answers.iter().enumerate();
     let points: Vec<String> = known
@@ -114,9 +116,9 @@ fn satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &Ou
     if points.is_empty() {
         return;
     }
-    line(out, y(Q_T), (BESIDE, "Q_t"), "#999");
-    line(out, y(0.0), (4.0, "Q = 0"), "#ccc");
-    put(
+    draw_line(out, y(Q_T), (BESIDE, "Q_t"), "#999");
+    draw_line(out, y(0.0), (4.0, "Q = 0"), "#ccc");
+    write_line(
         out,
         format_args!(
             "<polyline points=\"{}\" fill=\"none\" stroke=\"#444\"/>",
@@ -125,19 +127,20 @@ fn satisfaction(out: &mut String, top: f64, x: &dyn Fn(f64) -> f64, outcome: &Ou
     );
 }
 
-/// Across the panel, with a label that begins at its x.
-fn line(out: &mut String, at: f64, (x, label): (f64, &str), colour: &str) {
-    put(
+/// Draws a horizontal line across the panel, with a label that starts at its x.
+fn draw_line(out: &mut String, at: f64, (x, label): (f64, &str), colour: &str) {
+    write_line(
         out,
         format_args!(
-            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"{colour}\"/><text x=\"{x}\" y=\"{:.1}\">{label}</text>",
+            "<line x1=\"{LEFT}\" x2=\"{}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"{colour}\"/><text x=\"{x}\" \
+             y=\"{:.1}\">{label}</text>",
             LEFT + WIDTH,
             at + 4.0
         ),
     );
 }
 
-fn colour(outcome: &Outcome, answer: &Answer) -> &'static str {
+fn colour(outcome: &FailoverResult, answer: &FailoverSample) -> &'static str {
     match (outcome.is_late(answer), answer.local) {
         (true, _) => COLOURS[2].0,
         (false, true) => COLOURS[1].0,

@@ -1,4 +1,4 @@
-//! The robot's side of one run: a Master, a camera, the stub or the original.
+//! The robot's side of one run: a ROS Master, a camera, and the stub or the original.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -8,77 +8,77 @@ use nix::sys::signal::Signal;
 use ros::bus::{Publisher, Subscription};
 use support::cable::Cable;
 use support::daemon::Daemon;
-use support::people::{self, Camera, picture};
-use support::site::{Running, Site};
+use support::people::{self, PeopleCamera, picture};
+use support::site::{NodeProcess, Site};
 use tokio::time::{Instant as At, sleep_until, timeout};
 
 use crate::{BAD, BADNESS, REQUESTS};
 
-/// Anything that is waited for and not measured.
+/// Maximum time to wait for anything that is not measured.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// For answers that are still under way after the last request.
+/// Time to wait for late answers after the last request.
 const STRAGGLERS: Duration = Duration::from_secs(10);
 const SIZE: (u32, u32) = (640, 480);
-/// Stamps of measured requests begin after this one.
+/// Stamps of measured requests are greater than this number.
 const FIRST: u32 = 1000;
 
-/// The inputs that are sent, and when.
-pub struct Plan<'a> {
+/// Inputs of a run, and when to send them.
+pub struct FailoverPlan<'a> {
     /// Requests per second.
     pub rate: f64,
     /// T_desire and T_max, seconds.
     pub times: (f64, f64),
     /// `cold`, `warm`, `none`, or `alone`: the original without a stub.
     pub local: &'a str,
-    /// Raw bgr8 pictures.
+    /// File of raw bgr8 pictures.
     pub pictures: &'a Path,
 }
 
-/// How one request went.
+/// Measurements of one request.
 #[derive(Clone, Copy, Default)]
-pub struct Answer {
-    /// Seconds to the first answer.
+pub struct FailoverSample {
+    /// Seconds until the first answer; `None` if it was never answered.
     pub after: Option<f64>,
-    /// Answers.
+    /// Number of answers.
     pub count: usize,
-    /// The local original's was the first.
+    /// True if the first answer came from the local original.
     pub local: bool,
-    /// Q once it was counted.
+    /// Q after this request had been counted.
     pub q: Option<f64>,
 }
 
-/// How all went.
-pub struct Outcome {
-    /// By request.
-    pub answers: Vec<Answer>,
+/// Results of one run.
+pub struct FailoverResult {
+    /// One sample per request.
+    pub answers: Vec<FailoverSample>,
     /// T_desire and T_max, seconds.
     pub times: (f64, f64),
-    /// How often the local original was asked as well,
+    /// How often the local original was asked as well.
     pub fed: usize,
-    /// not asked any more,
+    /// How often it was no longer asked.
     pub unfed: usize,
-    /// its process started,
+    /// How often its process was started.
     pub started: usize,
-    /// and stopped.
+    /// How often its process was stopped.
     pub stopped: usize,
 }
 
-impl Outcome {
-    /// Requests answered within T_max.
-    pub fn within(&self) -> usize {
+impl FailoverResult {
+    /// Number of requests answered within T_max.
+    pub fn count_in_time(&self) -> usize {
         self.answers
             .iter()
             .filter(|answer| !self.is_late(answer))
             .count()
     }
 
-    /// Answered after T_max, or never.
-    pub fn is_late(&self, answer: &Answer) -> bool {
+    /// Returns whether a request was answered after T_max, or never.
+    pub fn is_late(&self, answer: &FailoverSample) -> bool {
         answer.after.is_none_or(|after| after > self.times.1)
     }
 
-    /// Late requests from each onset to the next.
-    pub fn late(&self) -> Vec<usize> {
+    /// Number of late requests from each onset of degradation to the next.
+    pub fn count_late_by_onset(&self) -> Vec<usize> {
         let ends = BAD.iter().skip(1).map(|(first, _)| first - 1);
         let ends = ends.chain([REQUESTS]);
         let late = |((first, _), end): (&(usize, usize), usize)| {
@@ -88,26 +88,26 @@ impl Outcome {
         BAD.iter().zip(ends).map(late).collect()
     }
 
-    /// Of those that were answered, seconds.
-    pub fn median(&self) -> f64 {
+    /// Median response time of the answered requests, in seconds.
+    pub fn median_response_time(&self) -> f64 {
         let times = self.answers.iter().filter_map(|answer| answer.after);
         bench_report::quantile(&times.collect::<Vec<f64>>(), 0.5).unwrap_or(f64::NAN)
     }
 }
 
-/// Runs it.
-pub fn run(daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Outcome> {
+/// Runs `plan`.
+pub fn run(daemon: &Daemon, cable: &Cable, plan: &FailoverPlan) -> Result<FailoverResult> {
     let site = Site::new()?;
-    let mut node = start(&site, daemon, cable, plan)?;
-    let outcome = ask(&site, cable, plan);
-    let mut outcome = outcome.with_context(|| format!("the node said:\n{}", node.said()))?;
-    // As roslaunch would: the stub ends its servant's node.
+    let mut node = start_node(&site, daemon, cable, plan)?;
+    let outcome = run_requests(&site, cable, plan);
+    let mut outcome = outcome.with_context(|| format!("the node said:\n{}", node.output()))?;
+    // SIGINT, as roslaunch sends it: the stub ends the servant's node.
     node.signal(Signal::SIGINT)?;
-    node.ends()?;
+    node.wait_for_exit()?;
     if std::env::var_os("CLOUDROID_BENCH_LOG").is_some() {
-        eprintln!("{}", node.said());
+        eprintln!("{}", node.output());
     }
-    read(&node.said(), &mut outcome);
+    parse_log(&node.output(), &mut outcome);
     if plan.local == "alone" {
         outcome
             .answers
@@ -117,7 +117,12 @@ pub fn run(daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Outcome> {
     Ok(outcome)
 }
 
-fn start(site: &Site, daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Running> {
+fn start_node(
+    site: &Site,
+    daemon: &Daemon,
+    cable: &Cable,
+    plan: &FailoverPlan,
+) -> Result<NodeProcess> {
     let service = "opencv_apps";
     if plan.local == "alone" {
         return people::original(site, daemon, service);
@@ -132,8 +137,8 @@ fn start(site: &Site, daemon: &Daemon, cable: &Cable, plan: &Plan) -> Result<Run
     people::stub(site, daemon, cable, who, &settings, &environment)
 }
 
-fn ask(site: &Site, cable: &Cable, plan: &Plan) -> Result<Outcome> {
-    let mut camera = Camera::new(site, 1)?;
+fn run_requests(site: &Site, cable: &Cable, plan: &FailoverPlan) -> Result<FailoverResult> {
+    let mut camera = PeopleCamera::new(site, 1)?;
     let (image, found) = (&*camera.image, &mut camera.found);
     let pictures = std::fs::read(plan.pictures)?;
     let pictures: Vec<&[u8]> = pictures
@@ -149,10 +154,10 @@ async fn measure(
     image: &dyn Publisher,
     found: &mut Subscription,
     cable: &Cable,
-    plan: &Plan<'_>,
+    plan: &FailoverPlan<'_>,
     pictures: &[&[u8]],
-) -> Result<Outcome> {
-    let mut answers = vec![Answer::default(); REQUESTS];
+) -> Result<FailoverResult> {
+    let mut answers = vec![FailoverSample::default(); REQUESTS];
     let mut sent = vec![Instant::now(); REQUESTS];
     let begun = At::now();
     for index in 0..REQUESTS {
@@ -170,7 +175,7 @@ async fn measure(
         image.publish(message);
     }
     collect(found, &mut answers, &sent, At::now() + STRAGGLERS).await;
-    Ok(Outcome {
+    Ok(FailoverResult {
         answers,
         times: plan.times,
         fed: 0,
@@ -180,7 +185,7 @@ async fn measure(
     })
 }
 
-/// Asks until ten answers in a row have come within `max` seconds: by then all are awake.
+/// Sends requests until ten answers in a row have arrived within `max` seconds: by then all parts are warmed up.
 async fn warm_up(
     image: &dyn Publisher,
     found: &mut Subscription,
@@ -202,14 +207,19 @@ async fn warm_up(
         answered = if in_time { answered + 1 } else { 0 };
         number += 1;
     }
-    // What is answered late must not be taken for an answer later.
+    // A late answer must not be mistaken for an answer to a measured request.
     tokio::time::sleep(Duration::from_secs(1)).await;
     while found.messages.try_recv().is_some() {}
     Ok(())
 }
 
-/// Notes answers until `until`.
-async fn collect(found: &mut Subscription, answers: &mut [Answer], sent: &[Instant], until: At) {
+/// Records answers until `until`.
+async fn collect(
+    found: &mut Subscription,
+    answers: &mut [FailoverSample],
+    sent: &[Instant],
+    until: At,
+) {
     loop {
         let message = tokio::select! {
             biased;
@@ -231,9 +241,9 @@ async fn collect(found: &mut Subscription, answers: &mut [Answer], sent: &[Insta
     }
 }
 
-/// What the stub's log tells of each request, and of the local original.
-fn read(log: &str, outcome: &mut Outcome) {
-    // Of the measured requests only: the robot has had others before.
+/// Reads from the stub's log what it says about each request and about the local original.
+fn parse_log(log: &str, outcome: &mut FailoverResult) {
+    // Only measured requests count; the warm-up requests come before them.
     let begins = log.find(&format!("stamp=Some(({FIRST},")).unwrap_or(0);
     let times = |words: &str| log[begins..].matches(words).count();
     outcome.fed = times("the local original answers, too");
@@ -250,7 +260,7 @@ fn read(log: &str, outcome: &mut Outcome) {
         };
         answer.local = line.contains("answer=Some((Local");
         let q = after(" q=").and_then(|text| text.split(' ').next()?.parse().ok());
-        // What is told later of a request does not change what Q was when it counted.
+        // Later log lines about a request do not change the value that Q had when it was counted.
         answer.q = answer.q.or(q);
     }
 }

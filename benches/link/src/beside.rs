@@ -1,52 +1,52 @@
-//! A small message's way there and back while pictures go the same way, over a network that carries two or three of
-//! them a second: what the link's pieces are for.
+//! Round-trip time of a small message while pictures are sent over the same link, on a network that can carry two or
+//! three pictures per second: the case for which the link splits messages into pieces.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::Report;
+use bench_report::BenchReport;
 use bytes::Bytes;
-use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, Subscription, WireType};
 use ros::ros1::Ros1Bus;
-use support::cable::{Badness, Cable};
+use support::cable::{Cable, NetworkImpairment};
 use support::daemon::Daemon;
 use support::site::{Site, string};
 
-/// What the network is like.
-const NETWORK: Badness = Badness {
+/// Properties of the network.
+const NETWORK: NetworkImpairment = NetworkImpairment {
     rate: 20_000,
     delay: 5,
     jitter: 0,
     loss: 0.0,
     limit: 1000,
 };
-/// Nothing in it can be made smaller.
+/// Size of a picture in bytes; its content cannot be compressed.
 const PICTURE: usize = 900_000;
-/// Between two pictures, and two small messages.
+/// Intervals between two pictures and between two small messages.
 const PICTURES: Duration = Duration::from_millis(100);
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Quantiles of the trips, ms.
-struct Trips {
+/// Quantiles of round-trip times, in milliseconds.
+struct RoundTripQuantiles {
     p50: f64,
     p99: f64,
 }
 
-fn quantiles(times: &[Duration]) -> Trips {
+fn quantiles(times: &[Duration]) -> RoundTripQuantiles {
     let milliseconds = |share| {
         let time = bench_report::quantile(times, share);
         time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
     };
-    Trips {
+    RoundTripQuantiles {
         p50: milliseconds(0.5),
         p99: milliseconds(0.99),
     }
 }
 
-/// A sensor_msgs/Image of noise.
-fn picture(number: u32) -> Bytes {
+/// Serializes a sensor_msgs/Image of noise.
+fn noise_image(number: u32) -> Bytes {
     let mut out = Vec::with_capacity(PICTURE + 64);
     for word in [number, 0, 0, 0, 480, 640, 4] {
         out.extend(u32::to_le_bytes(word));
@@ -64,7 +64,7 @@ fn picture(number: u32) -> Bytes {
     out.into()
 }
 
-fn advertises(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
+fn advertise_images(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
     Ok(site.runtime.block_on(app.advertise(
         "/meter/image_in",
         WireType::new(
@@ -72,32 +72,32 @@ fn advertises(site: &Site, app: &Ros1Bus) -> Result<Box<dyn Publisher>> {
             "060021388200f6f0f447d0fcd9c64743",
             crate::people::IMAGE,
         ),
-        Qos::keep_last(1),
+        QosProfile::keep_last(1),
     ))?)
 }
 
-/// One small message after the other through the stub.
-fn through_the_link(
+/// Measures small messages through the stub, one after the other.
+fn time_link_trips(
     site: &Site,
     pings: &dyn Publisher,
     pongs: &mut Subscription,
     trips: usize,
-) -> Result<Trips> {
+) -> Result<RoundTripQuantiles> {
     let mut times = Vec::with_capacity(trips);
     for number in 0..trips {
         let text = string(&number.to_string());
         let begun = Instant::now();
         pings.publish(text.clone());
-        while site.next(pongs)?.bytes != text {}
+        while site.next_message(pongs)?.bytes != text {}
         times.push(begun.elapsed());
         std::thread::sleep(PAUSE);
     }
     Ok(quantiles(&times))
 }
 
-/// Trips over the shaped network, alone and beside pictures.
-pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
-    let trips = if crate::full() { 1000 } else { 200 };
+/// Measures round trips over the shaped network, without and with pictures.
+pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
+    let trips = if crate::is_full_run() { 1000 } else { 200 };
     eprintln!("a small message beside pictures: {trips} trips each");
     let cable = Cable::new(&daemon.address)?;
     let site = Site::new()?;
@@ -106,26 +106,29 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
         "server = \"ws://{}\"\nservice = \"meter\"\nrobot = \"bench-beside\"\nlocal = \"none\"\n",
         cable.server
     );
-    let stub = site.stub_with(&toml, "rosbridge_fixture", "meter", &["__name:=meter"])?;
-    let pings = site.says(&app, "/meter/ping", false)?;
-    site.connected(&*pings, 1).with_context(|| stub.said())?;
-    let mut pongs = site.hears(&app, "/meter/pong")?;
+    let stub =
+        site.start_stub_with_config(&toml, "rosbridge_fixture", "meter", &["__name:=meter"])?;
+    let pings = site.advertise_strings(&app, "/meter/ping", false)?;
+    site.wait_for_subscribers(&*pings, 1)
+        .with_context(|| stub.output())?;
+    let mut pongs = site.subscribe(&app, "/meter/pong")?;
     site.runtime.block_on(async {
         let mut connected = pongs.matched.clone();
         connected
-            .wait_for(|now| now.connected() == 1)
+            .wait_for(|now| now.connected_count() == 1)
             .await
             .map(drop)
     })?;
-    let pictures: Arc<dyn Publisher> = advertises(&site, &app)?.into();
-    site.connected(&*pictures, 1).with_context(|| stub.said())?;
+    let pictures: Arc<dyn Publisher> = advertise_images(&site, &app)?.into();
+    site.wait_for_subscribers(&*pictures, 1)
+        .with_context(|| stub.output())?;
     cable.degrade(NETWORK)?;
-    let alone = through_the_link(&site, &*pings, &mut pongs, trips)?;
+    let alone = time_link_trips(&site, &*pings, &mut pongs, trips)?;
     let over = Arc::new(AtomicBool::new(false));
     let camera = {
         let (over, pictures) = (Arc::clone(&over), Arc::clone(&pictures));
         std::thread::spawn(move || {
-            let frames: Vec<Bytes> = (0..4).map(picture).collect();
+            let frames: Vec<Bytes> = (0..4).map(noise_image).collect();
             for frame in frames.iter().cycle() {
                 if over.load(Ordering::Relaxed) {
                     return;
@@ -135,13 +138,13 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
             }
         })
     };
-    let beside = through_the_link(&site, &*pings, &mut pongs, trips);
+    let beside = time_link_trips(&site, &*pings, &mut pongs, trips);
     over.store(true, Ordering::Relaxed);
     let _ = camera.join();
-    let beside = beside.with_context(|| stub.said())?;
+    let beside = beside.with_context(|| stub.output())?;
     drop((pictures, pings, pongs, stub));
     cable.restore()?;
-    // What a message waits for that comes behind a whole one.
+    // Time for which a message waits that is queued behind a whole picture.
     let picture = PICTURE as f64 * 8.0 / f64::from(NETWORK.rate);
     for (what, beside, alone) in [
         ("p50", beside.p50, alone.p50),
@@ -153,10 +156,10 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
                 "ms",
                 beside,
             )
-            .beside("the same without pictures", alone)
+            .relative_to("the same without pictures", alone)
             .note(format!(
                 "a picture takes {picture:.0} ms; {}",
-                cable.means()
+                cable.mechanism()
             ));
     }
     Ok(())

@@ -1,12 +1,12 @@
-//! What a stub takes while nothing happens.
+//! Resources that an idle stub uses.
 
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
-use support::site::Running;
+use bench_report::{BenchReport, Target};
+use support::site::NodeProcess;
 
-/// Its share of memory in megabytes (PSS).
+/// Returns the proportional set size (PSS) in megabytes.
 pub fn pss(pid: u32) -> Result<f64> {
     let path = format!("/proc/{pid}/smaps_rollup");
     let text = std::fs::read_to_string(&path).context(path)?;
@@ -18,7 +18,7 @@ pub fn pss(pid: u32) -> Result<f64> {
     Ok(kilobytes * 1024.0 / 1e6)
 }
 
-/// Processor time so far, of all its threads, in nanoseconds: `schedstat` tells it exactly, not in ticks.
+/// Returns the processor time of all threads so far, in nanoseconds; `schedstat` has the exact value, not ticks.
 fn processor_time(pid: u32) -> Result<u64> {
     let mut sum = 0;
     for task in std::fs::read_dir(format!("/proc/{pid}/task"))? {
@@ -29,10 +29,10 @@ fn processor_time(pid: u32) -> Result<u64> {
     Ok(sum)
 }
 
-/// Linked, and nobody asks anything.
-pub fn measure(report: &mut Report, stub: &Running) -> Result<()> {
-    let time = Duration::from_secs(if crate::full() { 60 } else { 15 });
-    // What ends with the last subscriber is over by then.
+/// Measures a connected stub without any requests.
+pub fn measure(report: &mut BenchReport, stub: &NodeProcess) -> Result<()> {
+    let time = Duration::from_secs(if crate::is_full_run() { 60 } else { 15 });
+    // Work that ends with the last subscriber has finished after this.
     std::thread::sleep(Duration::from_secs(2));
     let before = processor_time(stub.pid())?;
     std::thread::sleep(time);
@@ -40,7 +40,7 @@ pub fn measure(report: &mut Report, stub: &Running) -> Result<()> {
     let share = spent as f64 / time.as_nanos() as f64 * 100.0;
     report
         .figure("processor, linked and idle", "% of a core", share)
-        .reach(Target::AtMost(0.1))
+        .require(Target::AtMost(0.1))
         .note(format!("over {} s", time.as_secs()));
     Ok(())
 }

@@ -1,7 +1,6 @@
-//! `make bench ONLY=link`: a robot's node through stub, link, daemon and servant, beside the same node on the robot and
-//! beside a client of the portal, in turns; and what a stub takes of memory and processor. Needs root.
-//! `CLOUDROID_BENCH_FULL=1` measures longer; the word `strings` as an argument
-//! runs that part alone.
+//! `make bench ONLY=link`: a robot's node through stub, link, daemon and servant, compared in turns with the same node
+//! on the robot and with a client of the portal; and the memory and processor time of a stub. Needs root.
+//! `CLOUDROID_BENCH_FULL=1` measures longer; the argument `strings` runs that part alone.
 
 #![forbid(unsafe_code)]
 
@@ -11,12 +10,12 @@ mod people;
 mod strings;
 
 use anyhow::{Result, bail};
-use bench_report::Report;
-use support::daemon::Setup;
+use bench_report::BenchReport;
+use support::daemon::DaemonSetup;
 use support::world::{FIXTURE, PEOPLE};
 
-/// Longer measurements are wanted.
-fn full() -> bool {
+/// Returns whether longer measurements are requested (`CLOUDROID_BENCH_FULL=1`).
+fn is_full_run() -> bool {
     std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| value == "1")
 }
 
@@ -34,24 +33,24 @@ fn main() -> Result<()> {
     }
 }
 
-/// A String's way there and back; and `all` others.
+/// Measures the round trip of a String and, with `all`, all other figures.
 fn measure(all: bool) -> Result<()> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    let daemon = Setup::new(&place.path().join("home")).start()?;
+    let daemon = DaemonSetup::new(&place.path().join("home")).start()?;
     eprintln!("pushing people_detect and a relay: what they need is made now, if it is not cached");
     let deployer = daemon.deployer();
     if all {
         deployer
-            .types(&[&["push"], PEOPLE.arguments].concat())?
-            .succeeded()?;
+            .run(&[&["push"], PEOPLE.arguments].concat())?
+            .expect_success()?;
     }
     let relay = ["--name", "meter", "--node", "rosbridge_fixture/meter"];
     deployer
-        .pushes(FIXTURE.package.unwrap_or_default(), &relay)?
-        .succeeded()?;
-    let mut report = Report::new("link");
+        .push(FIXTURE.package.unwrap_or_default(), &relay)?
+        .expect_success()?;
+    let mut report = BenchReport::new("link");
     if all {
         people::measure(&mut report, &daemon)?;
     }
@@ -60,12 +59,15 @@ fn measure(all: bool) -> Result<()> {
         beside::measure(&mut report, &daemon)?;
     }
     report.finish()?;
-    daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-    daemon.ends()?;
+    daemon
+        .deployer()
+        .run(&["stop", "--all"])?
+        .expect_success()?;
+    daemon.stop()?;
     Ok(())
 }
 
-/// In seconds.
-fn median(times: &[std::time::Duration]) -> f64 {
+/// Median in seconds; NaN for an empty slice.
+fn median_seconds(times: &[std::time::Duration]) -> f64 {
     bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64())
 }

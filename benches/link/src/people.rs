@@ -1,11 +1,11 @@
-//! people_detect: a picture in, `found` out.
+//! people_detect: an image in, `found` out.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use bytes::Bytes;
-use ros::bus::{Bus, Publisher, Qos, Subscription, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, Subscription, WireType};
 use ros::ros1::Ros1Bus;
 use support::daemon::Daemon;
 use support::site::Site;
@@ -16,17 +16,17 @@ pub const IMAGE: &str = "std_msgs/Header header\nuint32 height\nuint32 width\nst
     ================================================================================\n\
     MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n";
 
-/// One way to send the same messages.
-struct Way {
+/// One path on which the same messages are sent.
+struct MessagePath {
     pictures: Box<dyn Publisher>,
     found: Subscription,
     times: Vec<Duration>,
     asked: u32,
 }
 
-impl Way {
+impl MessagePath {
     fn new(site: &Site, app: &Ros1Bus, node: &str) -> Result<Self> {
-        let found = site.hears(app, &format!("/{node}/found"))?;
+        let found = site.subscribe(app, &format!("/{node}/found"))?;
         let topic = format!("/{node}_camera");
         let pictures = site.runtime.block_on(app.advertise(
             &topic,
@@ -35,9 +35,9 @@ impl Way {
                 "060021388200f6f0f447d0fcd9c64743",
                 IMAGE,
             ),
-            Qos::keep_last(10),
+            QosProfile::keep_last(10),
         ))?;
-        site.connected(&*pictures, 1)?;
+        site.wait_for_subscribers(&*pictures, 1)?;
         Ok(Self {
             pictures,
             found,
@@ -46,15 +46,15 @@ impl Way {
         })
     }
 
-    /// One picture, and the time until its answer.
-    fn ask(&mut self, site: &Site) -> Result<Duration> {
+    /// Publishes one image and returns the time until its answer.
+    fn time_request(&mut self, site: &Site) -> Result<Duration> {
         self.asked += 1;
         let stamp = self.asked;
-        let picture = picture(stamp);
+        let picture = camera_image(stamp);
         let begun = Instant::now();
         self.pictures.publish(picture);
         loop {
-            let found = site.next(&mut self.found).context("found")?;
+            let found = site.next_message(&mut self.found).context("found")?;
             if found.bytes.get(4..8) == Some(&stamp.to_le_bytes()) {
                 return Ok(begun.elapsed());
             }
@@ -62,8 +62,8 @@ impl Way {
     }
 }
 
-/// Like a camera's: shapes with noise on them.
-fn picture(stamp: u32) -> Bytes {
+/// An image like a camera's: shapes with noise.
+fn camera_image(stamp: u32) -> Bytes {
     let mut out = Vec::new();
     let word = |out: &mut Vec<u8>, word: u32| out.extend(word.to_le_bytes());
     for part in [stamp, stamp, 0] {
@@ -89,12 +89,12 @@ fn picture(stamp: u32) -> Bytes {
     out.into()
 }
 
-/// Response times in turns, and what the stub takes.
-pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
-    let rounds = if crate::full() { 300 } else { 60 };
+/// Measures response times in turns, and the resources of the stub.
+pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
+    let rounds = if crate::is_full_run() { 300 } else { 60 };
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let native = site.original(
+    let native = site.start_original(
         daemon,
         "opencv_apps",
         "/usr/lib/opencv_apps/people_detect",
@@ -104,7 +104,7 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
             "image:=/native_camera",
         ],
     )?;
-    let stub = site.stub(
+    let stub = site.start_stub(
         daemon,
         ("opencv_apps", "opencv_apps", "people_detect"),
         "bench-link",
@@ -115,38 +115,38 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
         ],
     )?;
     let mut ways = [
-        Way::new(&site, &app, "native")?,
-        Way::new(&site, &app, "linked")?,
+        MessagePath::new(&site, &app, "native")?,
+        MessagePath::new(&site, &app, "linked")?,
     ];
     for way in &mut ways {
-        // The first may be lost while all are being connected.
-        way.pictures.publish(picture(0));
-        site.next(&mut way.found)?;
+        // The first image may be lost while connections are being established.
+        way.pictures.publish(camera_image(0));
+        site.next_message(&mut way.found)?;
         for _ in 0..5 {
-            way.ask(&site)?;
+            way.time_request(&site)?;
         }
     }
     for round in 0..rounds {
         let first = round % 2;
         for index in [first, 1 - first] {
-            let took = ways[index].ask(&site)?;
+            let took = ways[index].time_request(&site)?;
             ways[index].times.push(took);
         }
     }
     let [native_way, linked_way] = &mut ways;
     let (alone, linked) = (
-        crate::median(&native_way.times) * 1e3,
-        crate::median(&linked_way.times) * 1e3,
+        crate::median_seconds(&native_way.times) * 1e3,
+        crate::median_seconds(&linked_way.times) * 1e3,
     );
     report
         .figure("people_detect, picture in, found out: median", "ms", linked)
-        .beside("the same on the robot", alone)
-        .reach(Target::RatioAtMost(1.05))
+        .relative_to("the same on the robot", alone)
+        .require(Target::RatioAtMost(1.05))
         .note(format!("640x480, {rounds} pictures each, in turns"));
     let memory = crate::idle::pss(stub.pid())?;
     report
         .figure("memory of its stub, after that", "MB", memory)
-        .reach(Target::AtMost(15.0))
+        .require(Target::AtMost(15.0))
         .note("PSS");
     drop((ways, native));
     crate::idle::measure(report, &stub)?;

@@ -1,35 +1,36 @@
-//! A String through a relay in the servant and back: over the link, and by a client of the portal.
+//! Round trip of a String through a relay in the servant: over the link, and by a client of the portal.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::json;
 use support::daemon::Daemon;
 use support::robot::Robot;
 use support::site::{Site, string};
 
-/// Per turn; the first tenth does not count.
+/// Messages per turn; the first tenth is not counted.
 const TRIPS: usize = 1000;
 
-fn counted(times: &mut [Duration]) -> f64 {
-    crate::median(&times[TRIPS / 10..]) * 1e6
+fn warm_median_micros(times: &mut [Duration]) -> f64 {
+    crate::median_seconds(&times[TRIPS / 10..]) * 1e6
 }
 
-/// The best median of each one's turns.
-pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
-    let rounds = if crate::full() { 15 } else { 5 };
+/// Reports the best median of the turns of each path.
+pub fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
+    let rounds = if crate::is_full_run() { 15 } else { 5 };
     let site = Site::new()?;
     let app = site.node("/app")?;
-    let stub = site.stub(
+    let stub = site.start_stub(
         daemon,
         ("meter", "rosbridge_fixture", "meter"),
         "bench-strings",
         &["__name:=meter"],
     )?;
-    let pings = site.says(&app, "/meter/ping", false)?;
-    site.connected(&*pings, 1).with_context(|| stub.said())?;
-    let mut pongs = site.hears(&app, "/meter/pong")?;
+    let pings = site.advertise_strings(&app, "/meter/ping", false)?;
+    site.wait_for_subscribers(&*pings, 1)
+        .with_context(|| stub.output())?;
+    let mut pongs = site.subscribe(&app, "/meter/pong")?;
     loop {
         pings.publish(string("first"));
         let came = site.runtime.block_on(async {
@@ -39,18 +40,18 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
             break;
         }
     }
-    // Others of the first may be on their way: none is lost.
+    // Further copies of the first message may be in flight; none of them is lost.
     pings.publish(string("last of the first"));
-    while site.next(&mut pongs)?.bytes != string("last of the first") {}
+    while site.next_message(&mut pongs)?.bytes != string("last of the first") {}
     let mut client = Robot::connect(&format!("{}?robot=bench-client", daemon.url("meter")))?;
-    client.says(json!({"op": "advertise", "topic": "/meter/ping", "type": "std_msgs/String"}))?;
-    client.subscribes("/meter/pong")?;
-    client.awaits_subscriber("/meter/ping")?;
+    client.send(json!({"op": "advertise", "topic": "/meter/ping", "type": "std_msgs/String"}))?;
+    client.subscribe("/meter/pong")?;
+    client.wait_for_subscriber("/meter/ping")?;
     let (mut link, mut portal) = (f64::INFINITY, f64::INFINITY);
     for round in 1..=rounds {
         eprintln!("strings: round {round} of {rounds}");
         let mut times = Vec::with_capacity(TRIPS);
-        // All on the robot's runtime: waking another thread is not the link's.
+        // All in the robot's runtime: waking another thread is not part of the link's cost.
         site.runtime.block_on(async {
             for number in 0..TRIPS {
                 let text = string(&number.to_string());
@@ -62,23 +63,23 @@ pub fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
             }
             anyhow::Ok(())
         })?;
-        link = link.min(counted(&mut times));
+        link = link.min(warm_median_micros(&mut times));
         times.clear();
         for number in 0..TRIPS {
             let publication = json!({"op": "publish", "topic": "/meter/ping", "msg": {"data": number.to_string()}});
             let begun = Instant::now();
-            client.says(publication)?;
-            client.hears_on("/meter/pong")?;
+            client.send(publication)?;
+            client.next_message_on("/meter/pong")?;
             times.push(begun.elapsed());
         }
-        portal = portal.min(counted(&mut times));
+        portal = portal.min(warm_median_micros(&mut times));
     }
     report
         .figure("String there and back over the link: p50", "µs", link)
-        .beside("a client of the portal, JSON", portal);
+        .relative_to("a client of the portal, JSON", portal);
     report
         .figure("that is longer than the portal's by", "µs", link - portal)
-        .reach(Target::AtMost(100.0))
+        .require(Target::AtMost(100.0))
         .note("the link's way has two more connections: application and stub");
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! What a servant's nodes can do, from its network namespace.
+//! Attacks that a servant's nodes can make, from the servant's network namespace.
 
 use std::io::{Read, Write};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
@@ -9,9 +9,9 @@ use serde_json::json;
 use servant::netns::NetNs;
 use support::robot::Robot;
 
-/// Where every servant's Master listens.
+/// Address of the Master in every servant.
 const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
-/// How long anything may take that is not an attack.
+/// Timeout of everything that is not an attack.
 const PATIENCE: Duration = Duration::from_secs(60);
 const PARAMETERS: usize = 60;
 const READERS: usize = 30;
@@ -25,8 +25,8 @@ fn connect(to: SocketAddr) -> Result<TcpStream> {
     Ok(stream)
 }
 
-/// A call to the Master; its arguments are strings.
-fn request(method: &str, arguments: &[&str]) -> String {
+/// Builds an XML-RPC call to the Master with string arguments.
+fn xml_rpc_request(method: &str, arguments: &[&str]) -> String {
     let mut body =
         format!("<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>");
     for argument in arguments {
@@ -37,8 +37,8 @@ fn request(method: &str, arguments: &[&str]) -> String {
     format!("POST / HTTP/1.1\r\nHost: master\r\nContent-Length: {length}\r\n\r\n{body}")
 }
 
-/// Reads one answer of a connection that is kept.
-fn answer(stream: &mut TcpStream) -> Result<String> {
+/// Reads one response of a kept-alive connection.
+fn read_answer(stream: &mut TcpStream) -> Result<String> {
     let mut bytes = Vec::new();
     let mut some = [0; 4096];
     loop {
@@ -60,29 +60,29 @@ fn answer(stream: &mut TcpStream) -> Result<String> {
     }
 }
 
-fn call(method: &str, arguments: &[&str]) -> Result<String> {
+fn call_master(method: &str, arguments: &[&str]) -> Result<String> {
     let mut stream = connect(MASTER)?;
-    stream.write_all(request(method, arguments).as_bytes())?;
-    answer(&mut stream)
+    stream.write_all(xml_rpc_request(method, arguments).as_bytes())?;
+    read_answer(&mut stream)
 }
 
-/// Sets parameters, and asks for all of them over and over without reading the answers.
-pub(crate) fn parameters(network: &NetNs) -> Result<String> {
+/// Sets parameters and requests all of them repeatedly without reading the responses.
+pub(crate) fn flood_parameters(network: &NetNs) -> Result<String> {
     network.run(|| {
         let value = "x".repeat(1_000_000);
         let mut refused = 0;
         for number in 0..PARAMETERS {
             let name = format!("/attack/p{number}");
-            let told = call("setParam", &["/attacker", &name, &value]);
+            let told = call_master("setParam", &["/attacker", &name, &value]);
             refused += usize::from(told.is_err() || told.is_ok_and(|told| !told.contains(">1<")));
         }
         let mut unread = Vec::new();
         for _ in 0..READERS {
             let mut stream = connect(MASTER)?;
-            stream.write_all(request("getParam", &["/attacker", "/"]).as_bytes())?;
+            stream.write_all(xml_rpc_request("getParam", &["/attacker", "/"]).as_bytes())?;
             unread.push(stream);
         }
-        // Until one of them is being answered, and a little longer.
+        // Waits until one of the requests is being answered, and a little longer.
         let until = Instant::now() + PATIENCE;
         let answered = |stream: &TcpStream| stream.peek(&mut [0]).is_ok_and(|read| read > 0);
         for stream in &unread {
@@ -99,17 +99,17 @@ pub(crate) fn parameters(network: &NetNs) -> Result<String> {
     })?
 }
 
-/// Calls a service of the robot with requests that do not end.
-pub(crate) fn frames(network: &NetNs, robot: &mut Robot) -> Result<String> {
-    let service_type = robot.calls("/rosapi/service_type", json!({"service": "/add_two"}))?;
-    robot.says(json!({
+/// Calls a service of the robot with requests that never end.
+pub(crate) fn send_unfinished_requests(network: &NetNs, robot: &mut Robot) -> Result<String> {
+    let service_type = robot.call("/rosapi/service_type", json!({"service": "/add_two"}))?;
+    robot.send(json!({
         "op": "advertise_service", "service": "/attacked", "type": service_type["values"]["type"],
     }))?;
-    // It is registered by the time this is answered.
-    robot.calls("/rosapi/services", json!({}))?;
+    // The service is registered by the time this call is answered.
+    robot.call("/rosapi/services", json!({}))?;
     network.run(|| {
-        let told = call("lookupService", &["/attacker", "/attacked"])?;
-        // The answer names it twice, the first time within a sentence.
+        let told = call_master("lookupService", &["/attacker", "/attacked"])?;
+        // The response contains the URI twice, the first time within a sentence.
         let (_, rest) = told
             .rsplit_once("rosrpc://")
             .with_context(|| told.clone())?;
@@ -117,7 +117,7 @@ pub(crate) fn frames(network: &NetNs, robot: &mut Robot) -> Result<String> {
         let (_, port) = address.rsplit_once(':').context("a port")?;
         let to = SocketAddr::from((Ipv4Addr::LOCALHOST, port.parse()?));
         let results: Vec<_> = std::thread::scope(|scope| {
-            let frames = (0..FRAMES).map(|_| scope.spawn(move || frame(to)));
+            let frames = (0..FRAMES).map(|_| scope.spawn(move || send_unfinished_request(to)));
             let frames: Vec<_> = frames.collect();
             frames.into_iter().map(|frame| frame.join()).collect()
         });
@@ -133,8 +133,8 @@ pub(crate) fn frames(network: &NetNs, robot: &mut Robot) -> Result<String> {
     })?
 }
 
-/// All bytes of a request but the last; how many were taken, and the connection.
-fn frame(to: SocketAddr) -> Result<(u32, TcpStream)> {
+/// Sends all bytes of a request except the last; returns how many were accepted, and the connection.
+fn send_unfinished_request(to: SocketAddr) -> Result<(u32, TcpStream)> {
     let mut stream = connect(to)?;
     let mut header = Vec::new();
     for field in ["callerid=/attacker", "service=/attacked", "md5sum=*"] {
@@ -159,15 +159,15 @@ fn frame(to: SocketAddr) -> Result<(u32, TcpStream)> {
     Ok((sent, stream))
 }
 
-/// Asks the Master small things for so long, from four connections.
-pub(crate) fn drive(network: &NetNs, time: Duration) -> Result<()> {
+/// Sends small requests to the Master for `time` from four connections.
+pub(crate) fn drive_master(network: &NetNs, time: Duration) -> Result<()> {
     network.run(|| {
         let until = Instant::now() + time;
         let asks = || -> Result<()> {
             let mut stream = connect(MASTER)?;
             while Instant::now() < until {
-                stream.write_all(request("getPid", &["/attacker"]).as_bytes())?;
-                answer(&mut stream)?;
+                stream.write_all(xml_rpc_request("getPid", &["/attacker"]).as_bytes())?;
+                read_answer(&mut stream)?;
             }
             Ok(())
         };

@@ -1,4 +1,4 @@
-//! What robots can do.
+//! Attacks that robots can make.
 
 use std::io::Write;
 use std::os::unix::net::UnixStream;
@@ -19,8 +19,8 @@ const TRIALS: usize = 4;
 const TRIAL: usize = 330_000_000;
 const READERS: usize = 20;
 
-/// Does it from so many threads at once; those that end well.
-fn at_once<T: Send>(count: usize, work: impl Fn() -> Result<T> + Sync) -> Vec<T> {
+/// Runs `work` in `count` threads at once; returns the results of those that succeed.
+fn run_concurrently<T: Send>(count: usize, work: impl Fn() -> Result<T> + Sync) -> Vec<T> {
     std::thread::scope(|scope| {
         let all: Vec<_> = (0..count).map(|_| scope.spawn(&work)).collect();
         let all = all.into_iter().filter_map(|one| one.join().ok());
@@ -28,28 +28,28 @@ fn at_once<T: Send>(count: usize, work: impl Fn() -> Result<T> + Sync) -> Vec<T>
     })
 }
 
-/// Begins messages that do not end.
-pub(crate) fn messages(daemon: &Daemon) -> Result<String> {
-    // Its servant is there.
+/// Starts messages that never end.
+pub(crate) fn hold_unfinished_messages(daemon: &Daemon) -> Result<String> {
+    // Makes sure that the servant is running.
     daemon
         .robot("adder_py?robot=greedy")?
-        .calls("/rosapi/get_time", json!({}))?;
-    let held = at_once(MESSAGES, || {
+        .call("/rosapi/get_time", json!({}))?;
+    let held = run_concurrently(MESSAGES, || {
         let mut robot = daemon.robot("adder_py?robot=greedy")?;
         let frame = Frame::message(vec![7; MESSAGE], OpCode::Data(Data::Binary), false);
-        robot.sends(Message::Frame(frame))?;
-        // Refused, or not.
-        let closed = robot.frame_within(Duration::from_secs(2));
+        robot.send_frame(Message::Frame(frame))?;
+        // Either refused or still open.
+        let closed = robot.next_frame_within(Duration::from_secs(2));
         Ok((closed, robot))
     });
     let open = held.iter().filter(|(heard, _)| heard.is_err()).count();
     Ok(format!("{} of {MESSAGES} were refused", MESSAGES - open))
 }
 
-/// Begins bodies that do not end.
-pub(crate) fn trials(daemon: &Daemon) -> Result<String> {
-    let held = at_once(TRIALS, || {
-        // At the daemon's socket: a service is tried by its operators and its owner.
+/// Starts request bodies that never end.
+pub(crate) fn hold_unfinished_trials(daemon: &Daemon) -> Result<String> {
+    let held = run_concurrently(TRIALS, || {
+        // Uses the daemon's socket, because only operators and the owner of a service may start a trial.
         let mut stream = UnixStream::connect(daemon.home.join("run/daemon.sock"))?;
         stream.set_write_timeout(Some(Duration::from_secs(60)))?;
         let head = format!(
@@ -67,8 +67,8 @@ pub(crate) fn trials(daemon: &Daemon) -> Result<String> {
     Ok(format!("{} of {TRIALS} were refused", TRIALS - held.len()))
 }
 
-/// Publishes a std_msgs/Int8MultiArray of so many elements, as ROS bytes.
-fn publish(robot: &mut Robot, topic: &str, elements: usize, element: i8) -> Result<()> {
+/// Publishes a std_msgs/Int8MultiArray of `elements` elements in ROS serialization.
+fn publish_array(robot: &mut Robot, topic: &str, elements: usize, element: i8) -> Result<()> {
     // An empty layout: no dimensions, no offset.
     let mut bytes = vec![0; 8];
     bytes.extend_from_slice(&u32::try_from(elements)?.to_le_bytes());
@@ -88,25 +88,25 @@ fn publish(robot: &mut Robot, topic: &str, elements: usize, element: i8) -> Resu
     });
     let mut out = Vec::new();
     op.print(&mut out, Format::Cbor);
-    robot.sends(Message::binary(out))
+    robot.send_frame(Message::binary(out))
 }
 
-fn advertise(robot: &mut Robot, topic: &str) -> Result<()> {
+fn advertise_array(robot: &mut Robot, topic: &str) -> Result<()> {
     let message_type = "std_msgs/Int8MultiArray";
-    robot.says(json!({"op": "advertise", "topic": topic, "type": message_type}))?;
-    robot.calls("/rosapi/topic_type", json!({"topic": topic}))?;
+    robot.send(json!({"op": "advertise", "topic": topic, "type": message_type}))?;
+    robot.call("/rosapi/topic_type", json!({"topic": topic}))?;
     Ok(())
 }
 
-/// Subscribes as JSON to a message that becomes too long.
-pub(crate) fn json(daemon: &Daemon) -> Result<String> {
+/// Subscribes in JSON to a message that becomes too long in this encoding.
+pub(crate) fn subscribe_to_oversized_json(daemon: &Daemon) -> Result<String> {
     let mut publisher = daemon.robot("adder_py?robot=victim")?;
     let mut reader = daemon.robot("adder_py?robot=victim")?;
-    advertise(&mut publisher, "/big")?;
-    reader.subscribes("/big")?;
-    reader.calls("/rosapi/get_time", json!({}))?;
-    publish(&mut publisher, "/big", 60_000_000, -100)?;
-    let heard = reader.hears("what became of it", |heard| {
+    advertise_array(&mut publisher, "/big")?;
+    reader.subscribe("/big")?;
+    reader.call("/rosapi/get_time", json!({}))?;
+    publish_array(&mut publisher, "/big", 60_000_000, -100)?;
+    let heard = reader.wait_for("what became of it", |heard| {
         heard["op"] == "publish" || heard["op"] == "status"
     })?;
     Ok(match heard["op"].as_str() {
@@ -115,12 +115,12 @@ pub(crate) fn json(daemon: &Daemon) -> Result<String> {
     })
 }
 
-/// Subscribes and asks from many connections, and does not read.
-pub(crate) fn unread(daemon: &Daemon) -> Result<String> {
+/// Subscribes and sends requests on many connections, and never reads.
+pub(crate) fn leave_messages_unread(daemon: &Daemon) -> Result<String> {
     let mut publisher = daemon.robot("adder_py?robot=victim")?;
-    advertise(&mut publisher, "/unread")?;
+    advertise_array(&mut publisher, "/unread")?;
     let value = Value::from("x".repeat(5_000_000)).to_string();
-    let set = publisher.calls(
+    let set = publisher.call(
         "/rosapi/set_param",
         json!({"name": "/unread", "value": value}),
     )?;
@@ -128,23 +128,23 @@ pub(crate) fn unread(daemon: &Daemon) -> Result<String> {
     let url = daemon.url("adder_py?robot=victim");
     let mut slow = Vec::new();
     for _ in 0..READERS {
-        let mut robot = Robot::on_a_short_line(&url, &[])?;
-        robot.subscribes("/unread")?;
-        robot.calls("/rosapi/get_time", json!({}))?;
+        let mut robot = Robot::connect_with_small_buffer(&url, &[])?;
+        robot.subscribe("/unread")?;
+        robot.call("/rosapi/get_time", json!({}))?;
         slow.push(robot);
     }
-    // The publisher is of the same client: where its memory is used up by then, its next message is refused.
+    // The publisher is the same client: once its memory budget is used up, its next message is refused.
     let published = (0..10)
         .take_while(|_| {
-            publish(&mut publisher, "/unread", 4_000_000, -100).is_ok()
-                && publisher.calls("/rosapi/get_time", json!({})).is_ok()
+            publish_array(&mut publisher, "/unread", 4_000_000, -100).is_ok()
+                && publisher.call("/rosapi/get_time", json!({})).is_ok()
         })
         .count();
     for robot in &mut slow {
         for _ in 0..10 {
             let call = json!({"op": "call_service", "service": "/rosapi/get_param", "args": {"name": "/unread"}});
-            // Some are closed by now.
-            let _ = robot.says(call);
+            // Some of the connections have been closed by now.
+            let _ = robot.send(call);
         }
     }
     std::thread::sleep(Duration::from_secs(3));

@@ -1,32 +1,32 @@
-//! What a process takes, as the kernel counts it.
+//! Resources of a process, from the kernel's counters.
 
 use std::fs;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
 
-/// What is held is looked at so often.
+/// Sampling interval of the peak.
 const LOOK: Duration = Duration::from_millis(50);
-/// It has settled when its peak has not changed for so long; it is waited for at most so long.
+/// The process has settled when its peak has not changed for `SETTLED`; the wait ends after `PATIENCE` in any case.
 const SETTLED: Duration = Duration::from_secs(1);
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A running process, by its id.
+/// A running process, by its pid.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Process(pub(crate) i32);
 
 impl Process {
-    /// Resident megabytes (10⁶) now.
+    /// Resident memory in megabytes (10⁶).
     pub(crate) fn resident(self) -> Result<f64> {
-        self.of_status("VmRSS:")
+        self.status_field("VmRSS:")
     }
 
-    /// The most it has been since [`forget_peak`](Self::forget_peak).
+    /// Peak resident memory in megabytes since [`reset_peak`](Self::reset_peak).
     pub(crate) fn peak(self) -> Result<f64> {
-        self.of_status("VmHWM:")
+        self.status_field("VmHWM:")
     }
 
-    fn of_status(self, key: &str) -> Result<f64> {
+    fn status_field(self, key: &str) -> Result<f64> {
         let text = fs::read_to_string(format!("/proc/{}/status", self.0))?;
         let line = text.lines().find_map(|line| line.strip_prefix(key));
         let line = line.with_context(|| format!("{key} of process {}", self.0))?;
@@ -34,14 +34,14 @@ impl Process {
         Ok(kilobytes * 1024.0 / 1e6)
     }
 
-    pub(crate) fn forget_peak(self) -> Result<()> {
+    pub(crate) fn reset_peak(self) -> Result<()> {
         // 5 resets VmHWM (proc(5)).
         fs::write(format!("/proc/{}/clear_refs", self.0), "5")?;
         Ok(())
     }
 
-    /// Waits until it takes no more than it did a while ago.
-    pub(crate) fn settles(self) -> Result<()> {
+    /// Waits until the memory of the process no longer grows.
+    pub(crate) fn wait_until_settled(self) -> Result<()> {
         let began = Instant::now();
         let (mut peak, mut since) = (self.peak()?, Instant::now());
         while since.elapsed() < SETTLED && began.elapsed() < PATIENCE {
@@ -55,13 +55,13 @@ impl Process {
     }
 
     /// Processor time so far.
-    pub(crate) fn processor(self) -> Result<Duration> {
+    pub(crate) fn processor_time(self) -> Result<Duration> {
         let text = fs::read_to_string(format!("/proc/{}/stat", self.0))?;
-        // Behind the name, which may hold anything.
+        // The fields follow the name, which may contain any character.
         let (_, fields) = text.rsplit_once(')').context("a name in brackets")?;
         let fields: Vec<&str> = fields.split_whitespace().collect();
         let ticks = |at: usize| -> Result<u64> { Ok(fields.get(at).context("a field")?.parse()?) };
-        // utime and stime, in hundredths of a second on every Linux there is.
+        // utime and stime, in hundredths of a second on every Linux.
         Ok(Duration::from_millis(10 * (ticks(11)? + ticks(12)?)))
     }
 }

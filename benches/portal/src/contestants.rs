@@ -1,5 +1,5 @@
-//! Ways from a client to the node and back. Each is opened for its turn only: what another has subscribed to would be
-//! sent there too.
+//! Paths from a client to the node and back. Each path is open during its own turn only, because a subscription of one
+//! path would receive messages during the turns of the others.
 
 use std::fmt;
 
@@ -9,28 +9,28 @@ use bench_servant::Daemon;
 use rosbridge::{Format, Writer};
 use serde_json::Value;
 
-use crate::line::{self, Framing, Line};
-use crate::node::{IMAGE, Inside, Node, STRING, Type};
-use crate::raw::Raw;
-use crate::relay::{Hops, Relay};
+use crate::line::{self, BenchConnection, Framing};
+use crate::node::{IMAGE, MeterNode, MeterSockets, STRING, TypeDescription};
+use crate::raw::RawNode;
+use crate::relay::{Relay, RelayHops};
 use crate::suite;
 
-/// A way.
+/// A path between client and node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Way {
-    /// Through the daemon, with this encoding.
+pub(crate) enum ClientPath {
+    /// Through the daemon, in this encoding.
     Daemon(Encoding),
-    /// A process that moves bytes.
+    /// Through a process that copies bytes.
     Bytes,
-    /// A process that builds trees of values.
+    /// Through a process that builds trees of values.
     Values,
-    /// The node itself, by TCPROS.
+    /// Directly to the node, by TCPROS.
     Direct,
-    /// The server of rosbridge_suite in the same servant, JSON.
+    /// Through the server of rosbridge_suite in the same servant, in JSON.
     Suite,
 }
 
-/// rosbridge's names: `none`, `cbor`, `cbor-raw`.
+/// Encodings; rosbridge calls them `none`, `cbor` and `cbor-raw`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Encoding {
     Json,
@@ -38,89 +38,91 @@ pub(crate) enum Encoding {
     Raw,
 }
 
-impl fmt::Display for Way {
+impl fmt::Display for ClientPath {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
-            Way::Daemon(Encoding::Json) => "JSON",
-            Way::Daemon(Encoding::Cbor) => "cbor",
-            Way::Daemon(Encoding::Raw) => "cbor-raw",
-            Way::Bytes => "byte relay",
-            Way::Values => "serde_json::Value",
-            Way::Direct => "TCPROS, no hop between",
-            Way::Suite => suite::NAME,
+            ClientPath::Daemon(Encoding::Json) => "JSON",
+            ClientPath::Daemon(Encoding::Cbor) => "cbor",
+            ClientPath::Daemon(Encoding::Raw) => "cbor-raw",
+            ClientPath::Bytes => "byte relay",
+            ClientPath::Values => "serde_json::Value",
+            ClientPath::Direct => "TCPROS, no hop between",
+            ClientPath::Suite => suite::NAME,
         })
     }
 }
 
-/// A connection that is ready, and what is sent on it.
-pub(crate) struct Open {
-    pub(crate) line: Line,
-    /// One message or call, framed.
+/// An open path, and the message to send on it.
+pub(crate) struct OpenPath {
+    pub(crate) line: BenchConnection,
+    /// One framed message or call.
     pub(crate) message: Vec<u8>,
-    /// Ended after the line.
+    /// Dropped after the connection.
     _relay: Option<Relay>,
-    raw: Option<(Raw, Option<String>)>,
+    raw: Option<(RawNode, Option<String>)>,
 }
 
-/// What all ways lead to.
-pub(crate) struct Course<'a> {
+/// The daemon, the node and the topics or service that all paths are opened to.
+pub(crate) struct PathTarget<'a> {
     pub(crate) daemon: &'a Daemon,
-    pub(crate) node: &'a Node,
-    pub(crate) hops: Hops<'a>,
+    pub(crate) node: &'a MeterNode,
+    pub(crate) hops: RelayHops<'a>,
 }
 
-impl Course<'_> {
-    fn kind(&self) -> Type {
+impl PathTarget<'_> {
+    fn message_type(&self) -> TypeDescription {
         if self.hops.images { IMAGE } else { STRING }
     }
 
-    /// Opens a way; ready when the node is connected, and only with it.
-    pub(crate) fn open(&self, way: Way) -> Result<Open> {
+    /// Opens a path and waits until the node is connected to it, and to nothing else.
+    pub(crate) fn open(&self, way: ClientPath) -> Result<OpenPath> {
         let topics = [self.hops.inward, self.hops.outward];
         for topic in topics.into_iter().flatten() {
-            self.node.until_connected(topic, 0)?;
+            self.node.wait_until_connected(topic, 0)?;
         }
         let open = match way {
-            Way::Daemon(encoding) => self.daemon(encoding)?,
-            Way::Bytes | Way::Values => self.relay(way == Way::Values)?,
-            Way::Direct => self.direct()?,
-            Way::Suite => self.bridge(suite::client(self.node)?, Encoding::Json)?,
+            ClientPath::Daemon(encoding) => self.open_daemon(encoding)?,
+            ClientPath::Bytes | ClientPath::Values => self.open_relay(way == ClientPath::Values)?,
+            ClientPath::Direct => self.open_direct()?,
+            ClientPath::Suite => {
+                self.open_rosbridge(suite::connect_client(self.node)?, Encoding::Json)?
+            }
         };
         for topic in topics.into_iter().flatten() {
-            self.node.until_connected(topic, 1)?;
+            self.node.wait_until_connected(topic, 1)?;
         }
         Ok(open)
     }
 
-    fn daemon(&self, encoding: Encoding) -> Result<Open> {
-        self.bridge(Line::robot(self.daemon)?, encoding)
+    fn open_daemon(&self, encoding: Encoding) -> Result<OpenPath> {
+        self.open_rosbridge(BenchConnection::connect_robot(self.daemon)?, encoding)
     }
 
-    /// By rosbridge's protocol, on a line to whoever speaks it.
-    fn bridge(&self, mut line: Line, encoding: Encoding) -> Result<Open> {
-        let (kind, mut message) = (self.kind(), Vec::new());
+    /// Sets up rosbridge on a connection to a server that speaks its protocol.
+    fn open_rosbridge(&self, mut line: BenchConnection, encoding: Encoding) -> Result<OpenPath> {
+        let (kind, mut message) = (self.message_type(), Vec::new());
         if let Some(topic) = self.hops.outward {
             let compression = match encoding {
                 Encoding::Json => "none",
                 Encoding::Cbor => "cbor",
                 Encoding::Raw => "cbor-raw",
             };
-            line.say(&format!(
+            line.send_text(&format!(
                 r#"{{"op":"subscribe","topic":"{topic}","type":"{}","compression":"{compression}"}}"#,
                 kind.name
             ))?;
         }
         if let Some(topic) = self.hops.inward {
-            line.say(&format!(
+            line.send_text(&format!(
                 r#"{{"op":"advertise","topic":"{topic}","type":"{}","queue_size":1000}}"#,
                 kind.name
             ))?;
-            message = publish(topic, self.hops.images, encoding);
+            message = publish_op(topic, self.hops.images, encoding);
         }
         if let Some(service) = self.hops.service {
-            message = line::frame(line::TEXT, call(service).as_bytes());
+            message = line::frame(line::TEXT, call_op(service).as_bytes());
         }
-        Ok(Open {
+        Ok(OpenPath {
             line,
             message,
             _relay: None,
@@ -128,23 +130,26 @@ impl Course<'_> {
         })
     }
 
-    fn relay(&self, values: bool) -> Result<Open> {
-        let hops = Hops {
+    fn open_relay(&self, values: bool) -> Result<OpenPath> {
+        let hops = RelayHops {
             values,
             ..self.hops
         };
         let relay = Relay::start(self.node.pid, hops)?;
         let (line, message) = if values {
-            let line = Line::websocket(&relay.address, "")?;
+            let line = BenchConnection::connect_websocket(&relay.address, "")?;
             let message = hops.inward.map_or_else(Vec::new, |topic| {
-                publish(topic, hops.images, Encoding::Json)
+                publish_op(topic, hops.images, Encoding::Json)
             });
             (line, message)
         } else {
             let stream = std::net::TcpStream::connect(&relay.address)?;
-            (Line::new(stream, self.framing())?, self.bare())
+            (
+                BenchConnection::new(stream, self.framing())?,
+                self.framed_message(),
+            )
         };
-        Ok(Open {
+        Ok(OpenPath {
             line,
             message,
             _relay: Some(relay),
@@ -152,10 +157,10 @@ impl Course<'_> {
         })
     }
 
-    fn direct(&self) -> Result<Open> {
-        let (node, kind) = (self.node, self.kind());
-        let inside = Inside::of(node.pid)?;
-        let start = Raw::start(inside, "/bench_direct");
+    fn open_direct(&self) -> Result<OpenPath> {
+        let (node, kind) = (self.node, self.message_type());
+        let inside = MeterSockets::for_process(node.pid)?;
+        let start = RawNode::start(inside, "/bench_direct");
         let raw = node.runtime.block_on(start)?;
         let sender = match self.hops.inward {
             Some(topic) => Some(node.runtime.block_on(raw.publish(topic, kind))?),
@@ -163,16 +168,16 @@ impl Course<'_> {
         };
         let receiver = match (self.hops.outward, self.hops.service) {
             (Some(topic), _) => node.runtime.block_on(raw.subscribe(topic, kind))?,
-            (None, Some(service)) => node.runtime.block_on(raw.service(service))?,
+            (None, Some(service)) => node.runtime.block_on(raw.connect_service(service))?,
             (None, None) => sender.as_ref().context("a topic")?.try_clone()?,
         };
-        let mut line = Line::new(receiver, self.framing())?;
+        let mut line = BenchConnection::new(receiver, self.framing())?;
         if let Some(sender) = sender {
-            line = line.sending_on(sender)?;
+            line = line.with_sender(sender)?;
         }
-        Ok(Open {
+        Ok(OpenPath {
             line,
-            message: self.bare(),
+            message: self.framed_message(),
             _relay: None,
             raw: Some((raw, self.hops.inward.map(str::to_owned))),
         })
@@ -185,16 +190,16 @@ impl Course<'_> {
         }
     }
 
-    /// What is sent as ROS bytes.
-    fn bare(&self) -> Vec<u8> {
+    /// Returns the message or request in ROS serialization, framed for TCPROS.
+    fn framed_message(&self) -> Vec<u8> {
         match self.hops.service {
-            Some(_) => line::tcpros(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]),
-            None => line::tcpros(&message(self.hops.images)),
+            Some(_) => line::tcpros_frame(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]),
+            None => line::tcpros_frame(&serialize_message(self.hops.images)),
         }
     }
 
-    /// Ends a way in good order.
-    pub(crate) fn close(&self, open: Open) -> Result<()> {
+    /// Closes a path and unregisters its topics.
+    pub(crate) fn close(&self, open: OpenPath) -> Result<()> {
         drop(open.line);
         if let Some((raw, Some(topic))) = &open.raw {
             self.node.runtime.block_on(raw.unpublish(topic))?;
@@ -203,11 +208,11 @@ impl Course<'_> {
     }
 }
 
-/// A message that came is the one that the node publishes.
-pub(crate) fn check(way: Way, images: bool, message: &[u8]) -> Result<()> {
-    let expected = self::message(images);
+/// Checks that a received message is the one that the node publishes.
+pub(crate) fn check_message(way: ClientPath, images: bool, message: &[u8]) -> Result<()> {
+    let expected = self::serialize_message(images);
     match way {
-        Way::Daemon(Encoding::Json) | Way::Values | Way::Suite => {
+        ClientPath::Daemon(Encoding::Json) | ClientPath::Values | ClientPath::Suite => {
             let op: Value = serde_json::from_slice(message)?;
             let data = op["msg"]["data"].as_str().context("data")?;
             let length = if images {
@@ -229,15 +234,15 @@ pub(crate) fn check(way: Way, images: bool, message: &[u8]) -> Result<()> {
 
 const TEXT: &str = "a message of a usual size";
 
-/// A message, serialized.
-pub(crate) fn message(images: bool) -> Vec<u8> {
+/// Returns the serialized message.
+pub(crate) fn serialize_message(images: bool) -> Vec<u8> {
     let mut out = Vec::new();
     let text = |out: &mut Vec<u8>, text: &[u8]| {
         out.extend_from_slice(&(text.len() as u32).to_le_bytes());
         out.extend_from_slice(text);
     };
     if images {
-        // seq and stamp, then the frame.
+        // seq and stamp; the frame id follows.
         out.extend_from_slice(&[0; 12]);
         text(&mut out, b"camera");
         out.extend_from_slice(&480u32.to_le_bytes());
@@ -252,7 +257,7 @@ pub(crate) fn message(images: bool) -> Vec<u8> {
     out
 }
 
-/// Every byte different from its neighbours.
+/// Returns pseudorandom pixels, which cannot be compressed.
 fn pixels() -> Vec<u8> {
     let mut state = 1u32;
     let next = |_| {
@@ -262,8 +267,8 @@ fn pixels() -> Vec<u8> {
     (0..921_600).map(next).collect()
 }
 
-fn publish(topic: &str, images: bool, encoding: Encoding) -> Vec<u8> {
-    let (mut out, message) = (Vec::new(), message(images));
+fn publish_op(topic: &str, images: bool, encoding: Encoding) -> Vec<u8> {
+    let (mut out, message) = (Vec::new(), serialize_message(images));
     let (format, opcode) = match encoding {
         Encoding::Json => (Format::Json, line::TEXT),
         Encoding::Cbor | Encoding::Raw => (Format::Cbor, line::BINARY),
@@ -274,7 +279,7 @@ fn publish(topic: &str, images: bool, encoding: Encoding) -> Vec<u8> {
         writer.text("compression", "cbor-raw");
         writer.raw("msg", None, &message);
     } else {
-        // The bench's client is another's: what it sends was made once, beforehand.
+        // The client is not part of the measurement: its message is built once, in advance.
         let kind = if images { IMAGE } else { STRING };
         let kind = ros::schema::MessageType::from_full_text(kind.name, kind.definition);
         let kind = kind.expect("a definition of ours");
@@ -289,7 +294,7 @@ fn publish(topic: &str, images: bool, encoding: Encoding) -> Vec<u8> {
     line::frame(opcode, &out)
 }
 
-/// A call, in JSON.
-fn call(service: &str) -> String {
+/// Returns a service call in JSON.
+fn call_op(service: &str) -> String {
     format!(r#"{{"op":"call_service","id":"1","service":"{service}","args":{{"a":1,"b":2}}}}"#)
 }

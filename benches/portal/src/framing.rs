@@ -1,7 +1,9 @@
-//! WebSocket framing alone, server side: the crate `ws` beside tokio-tungstenite, fastwebsockets and the bare socket.
+//! WebSocket framing on the server side alone: the crate `ws` compared with tokio-tungstenite, fastwebsockets and a
+//! bare socket.
 //!
-//! One connection on loopback; the other end is a thread that writes frames made ahead, or reads and forgets. A figure is
-//! the processor time of the server's thread per message, system calls included: the best of [`ROUNDS`], taken in turns.
+//! One connection on loopback; the peer is a thread that writes prepared frames, or reads and discards. Each figure is
+//! the processor time of the server's thread per message, including system calls: the best of [`ROUNDS`] rounds, taken
+//! in turns.
 
 use std::future::poll_fn;
 use std::io::{Read, Write};
@@ -10,7 +12,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail, ensure};
-use bench_report::{Report, Target, thread_time};
+use bench_report::{BenchReport, Target, thread_processor_time};
 use bytes::Bytes;
 use fastwebsockets::{FragmentCollector, Frame, OpCode, Payload, Role};
 use futures_util::{SinkExt, StreamExt};
@@ -19,51 +21,51 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::{self, WebSocketConfig};
 
-/// So many count, after one that does not.
+/// Number of counted rounds; one warm-up round comes before them.
 const ROUNDS: usize = 7;
 
-/// Name, bytes and messages of a round: a state, a scan, and a picture of 640x480 in RGB.
+/// Name, size in bytes and number of messages of a round: a state, a scan, and a 640x480 RGB image.
 const SIZES: [(&str, usize, usize); 3] = [
     ("64 B", 64, 40_000),
     ("4 KiB", 4096, 10_000),
     ("0.9 MB", 921_600, 100),
 ];
 
-/// Bytes that are gathered before they are written, and tokio-tungstenite's own default for its buffers.
+/// Bytes that are collected before a write; tokio-tungstenite's default buffer size.
 const BATCH: usize = 128 * 1024;
 
-/// The longest frame and message, in bytes.
+/// Maximum length of a frame and of a message, in bytes.
 const LIMIT: usize = 16 << 20;
 
-/// A mask that changes something.
+/// A mask that changes the payload.
 const MASK: [u8; 4] = [0x5a, 0xc3, 0x17, 0x99];
 
 #[derive(Clone, Copy)]
-enum Framing {
+enum WebSocketLibrary {
     Ours,
     Tungstenite,
     Fast,
-    /// The same bytes without a look at them.
+    /// A bare socket with the same bytes, without parsing.
     Socket,
 }
 
-const FRAMINGS: [Framing; 4] = [
-    Framing::Ours,
-    Framing::Tungstenite,
-    Framing::Fast,
-    Framing::Socket,
+const FRAMINGS: [WebSocketLibrary; 4] = [
+    WebSocketLibrary::Ours,
+    WebSocketLibrary::Tungstenite,
+    WebSocketLibrary::Fast,
+    WebSocketLibrary::Socket,
 ];
 
-/// Messages of one size, from the client (`inward`) or to it.
+/// Messages of one size, from the client to the server (`inward`) or the other way.
 #[derive(Clone, Copy)]
-struct Load {
+struct FramingLoad {
     inward: bool,
     bytes: usize,
     count: usize,
 }
 
-/// A figure per direction and size.
-pub fn measure(report: &mut Report, only: &str) -> Result<()> {
+/// Reports a figure for each direction and size.
+pub fn measure(report: &mut BenchReport, only: &str) -> Result<()> {
     for inward in [true, false] {
         for (size, bytes, count) in SIZES {
             let way = if inward { "in" } else { "out" };
@@ -71,7 +73,7 @@ pub fn measure(report: &mut Report, only: &str) -> Result<()> {
             if !name.contains(only) {
                 continue;
             }
-            let load = Load {
+            let load = FramingLoad {
                 inward,
                 bytes,
                 count,
@@ -79,7 +81,7 @@ pub fn measure(report: &mut Report, only: &str) -> Result<()> {
             let mut best = [Duration::MAX; FRAMINGS.len()];
             for number in 0..=ROUNDS {
                 for (framing, best) in FRAMINGS.into_iter().zip(&mut best) {
-                    let took = round(framing, load)?;
+                    let took = measure_round(framing, load)?;
                     *best = if number == 0 { *best } else { took.min(*best) };
                 }
             }
@@ -87,8 +89,8 @@ pub fn measure(report: &mut Report, only: &str) -> Result<()> {
                 best.map(|best| best.as_secs_f64() * 1e6 / count as f64);
             report
                 .figure(name, "µs", ours)
-                .beside("tokio-tungstenite", tungstenite)
-                .reach(Target::RatioAtMost(1.0))
+                .relative_to("tokio-tungstenite", tungstenite)
+                .require(Target::RatioAtMost(1.0))
                 .note(format!(
                     "fastwebsockets {fast:.2} µs (ratio {:.2}); the socket alone {socket:.2} µs (ratio {:.2})",
                     ours / fast,
@@ -99,33 +101,33 @@ pub fn measure(report: &mut Report, only: &str) -> Result<()> {
     Ok(())
 }
 
-/// The processor time of a server's thread for one load.
-fn round(framing: Framing, load: Load) -> Result<Duration> {
+/// Returns the processor time of the server's thread for one load.
+fn measure_round(framing: WebSocketLibrary, load: FramingLoad) -> Result<Duration> {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0))?;
     let client = TcpStream::connect(listener.local_addr()?)?;
     let (server, _) = listener.accept()?;
     server.set_nodelay(true)?;
     server.set_nonblocking(true)?;
-    let other = thread::spawn(move || client_end(client, load));
+    let other = thread::spawn(move || run_client(client, load));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .enable_time()
         .build()?;
-    let start = thread_time();
+    let start = thread_processor_time();
     runtime.block_on(async {
         let server = tokio::net::TcpStream::from_std(server)?;
         match (framing, load.inward) {
-            (Framing::Ours, true) => ours_in(server, load).await,
-            (Framing::Ours, false) => ours_out(server, load).await,
-            (Framing::Tungstenite, true) => tungstenite_in(server, load).await,
-            (Framing::Tungstenite, false) => tungstenite_out(server, load).await,
-            (Framing::Fast, true) => fast_in(server, load).await,
-            (Framing::Fast, false) => fast_out(server, load).await,
-            (Framing::Socket, true) => socket_in(server, load).await,
-            (Framing::Socket, false) => socket_out(server, load).await,
+            (WebSocketLibrary::Ours, true) => read_with_ws(server, load).await,
+            (WebSocketLibrary::Ours, false) => write_with_ws(server, load).await,
+            (WebSocketLibrary::Tungstenite, true) => read_with_tungstenite(server, load).await,
+            (WebSocketLibrary::Tungstenite, false) => write_with_tungstenite(server, load).await,
+            (WebSocketLibrary::Fast, true) => read_with_fastwebsockets(server, load).await,
+            (WebSocketLibrary::Fast, false) => write_with_fastwebsockets(server, load).await,
+            (WebSocketLibrary::Socket, true) => read_from_socket(server, load).await,
+            (WebSocketLibrary::Socket, false) => write_to_socket(server, load).await,
         }
     })?;
-    let took = thread_time() - start;
+    let took = thread_processor_time() - start;
     let transferred = other
         .join()
         .ok()
@@ -138,8 +140,8 @@ fn round(framing: Framing, load: Load) -> Result<Duration> {
     Ok(took)
 }
 
-/// What precedes a message's payload: the mask is a client's.
-fn header(load: Load) -> Vec<u8> {
+/// Returns the header of a message; frames of clients are masked.
+fn header(load: FramingLoad) -> Vec<u8> {
     let mut header = vec![0x82];
     let mask = if load.inward { 0x80 } else { 0 };
     match load.bytes {
@@ -159,12 +161,12 @@ fn header(load: Load) -> Vec<u8> {
     header
 }
 
-fn payload(load: Load) -> Vec<u8> {
+fn payload(load: FramingLoad) -> Vec<u8> {
     (0..load.bytes).map(|index| (index * 7) as u8).collect()
 }
 
-/// Writes what is for the server, or reads what is from it; bytes.
-fn client_end(mut client: TcpStream, load: Load) -> Result<usize> {
+/// Writes the frames for the server, or reads those from it; returns the number of bytes.
+fn run_client(mut client: TcpStream, load: FramingLoad) -> Result<usize> {
     if !load.inward {
         let mut buffer = vec![0; 1 << 20];
         let mut total = 0;
@@ -189,23 +191,23 @@ fn client_end(mut client: TcpStream, load: Load) -> Result<usize> {
     Ok(load.count * frame.len())
 }
 
-async fn ours_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn read_with_ws(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let mut socket = ws::WebSocket::new(server, &[], LIMIT, LIMIT);
     for _ in 0..load.count {
         match poll_fn(|cx| socket.poll_next(cx)).await? {
-            ws::Message::Binary(payload) if payload.len() == load.bytes => {}
+            ws::WsMessage::Binary(payload) if payload.len() == load.bytes => {}
             other => bail!("not the message that was sent: {other:?}"),
         }
     }
     Ok(())
 }
 
-async fn ours_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn write_with_ws(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let mut socket = ws::WebSocket::new(server, &[], LIMIT, LIMIT);
     let payload = Bytes::from(payload(load));
     for _ in 0..load.count {
         socket.queue(ws::frame::BINARY, payload.clone());
-        if socket.queued() >= BATCH {
+        if socket.bytes_queued() >= BATCH {
             poll_fn(|cx| socket.poll_flush(cx)).await?;
         }
     }
@@ -213,7 +215,9 @@ async fn ours_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
     Ok(())
 }
 
-async fn tungstenite(server: tokio::net::TcpStream) -> WebSocketStream<tokio::net::TcpStream> {
+async fn tungstenite_socket(
+    server: tokio::net::TcpStream,
+) -> WebSocketStream<tokio::net::TcpStream> {
     let config = WebSocketConfig::default()
         .read_buffer_size(BATCH)
         .write_buffer_size(BATCH)
@@ -222,8 +226,8 @@ async fn tungstenite(server: tokio::net::TcpStream) -> WebSocketStream<tokio::ne
     WebSocketStream::from_raw_socket(server, protocol::Role::Server, Some(config)).await
 }
 
-async fn tungstenite_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
-    let mut socket = tungstenite(server).await;
+async fn read_with_tungstenite(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
+    let mut socket = tungstenite_socket(server).await;
     for _ in 0..load.count {
         match socket.next().await.context("the connection ended")?? {
             Message::Binary(payload) if payload.len() == load.bytes => {}
@@ -233,8 +237,8 @@ async fn tungstenite_in(server: tokio::net::TcpStream, load: Load) -> Result<()>
     Ok(())
 }
 
-async fn tungstenite_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
-    let mut socket = tungstenite(server).await;
+async fn write_with_tungstenite(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
+    let mut socket = tungstenite_socket(server).await;
     let payload = Bytes::from(payload(load));
     for _ in 0..load.count {
         socket.feed(Message::Binary(payload.clone())).await?;
@@ -243,7 +247,7 @@ async fn tungstenite_out(server: tokio::net::TcpStream, load: Load) -> Result<()
     Ok(())
 }
 
-async fn fast_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn read_with_fastwebsockets(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let mut socket = fastwebsockets::WebSocket::after_handshake(server, Role::Server);
     socket.set_max_message_size(LIMIT);
     let mut socket = FragmentCollector::new(socket);
@@ -257,7 +261,7 @@ async fn fast_in(server: tokio::net::TcpStream, load: Load) -> Result<()> {
     Ok(())
 }
 
-async fn fast_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn write_with_fastwebsockets(server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let mut socket = fastwebsockets::WebSocket::after_handshake(server, Role::Server);
     socket.set_writev(true);
     let payload = payload(load);
@@ -270,7 +274,7 @@ async fn fast_out(server: tokio::net::TcpStream, load: Load) -> Result<()> {
     Ok(())
 }
 
-async fn socket_in(mut server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn read_from_socket(mut server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let mut buffer = vec![0; BATCH];
     let mut left = load.count * (load.bytes + header(load).len());
     while left > 0 {
@@ -282,7 +286,7 @@ async fn socket_in(mut server: tokio::net::TcpStream, load: Load) -> Result<()> 
     Ok(())
 }
 
-async fn socket_out(mut server: tokio::net::TcpStream, load: Load) -> Result<()> {
+async fn write_to_socket(mut server: tokio::net::TcpStream, load: FramingLoad) -> Result<()> {
     let buffer = vec![0; BATCH];
     let mut left = load.count * (load.bytes + header(load).len());
     while left > 0 {

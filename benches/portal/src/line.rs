@@ -1,5 +1,5 @@
-//! A client's end of a connection: sends prepared messages, counts the frames that arrive. As little work as there can
-//! be, the same for all contestants; so what is measured is between the ends.
+//! The client's end of a connection: sends prepared messages and counts the frames that arrive. It does as little work
+//! as possible, the same for all contestants, so that the measurement covers what lies between the ends.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -9,51 +9,51 @@ use bench_servant::Daemon;
 use tokio_tungstenite::tungstenite;
 
 use crate::node::PATIENCE;
-use crate::secure::{self, Secure};
+use crate::secure::{self, BenchTlsStream};
 
-/// The path of the robot that everything is measured with.
+/// URL path of the robot that all measurements use.
 pub(crate) const ROBOT: &str = "meter?robot=bench";
 
-/// How messages follow one another.
+/// Framing of the received messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Framing {
-    /// The length before each.
+    /// A length before each message.
     Tcpros,
-    /// A byte that says "good", then the length.
+    /// A byte for success, then the length.
     Response,
     /// Frames of a WebSocket server.
     WebSocket,
 }
 
-/// With or without TLS.
-enum Stream {
+/// A socket with or without TLS.
+enum LineStream {
     Plain(TcpStream),
-    Tls(Box<Secure>),
+    Tls(Box<BenchTlsStream>),
 }
 
-/// A connection.
-pub(crate) struct Line {
-    /// Where messages are sent, where that is another connection.
+/// A client's connection.
+pub(crate) struct BenchConnection {
+    /// Connection to send on, if it is not the one that is read.
     sender: Option<TcpStream>,
-    stream: Stream,
+    stream: LineStream,
     framing: Framing,
-    /// Read and not looked at: `buffer[at..filled]`.
+    /// `buffer[at..filled]` has been read and not yet parsed.
     buffer: Vec<u8>,
     at: usize,
     filled: usize,
-    /// Inside a frame: how many of its bytes are still to come.
+    /// Number of bytes of the current frame that have not arrived yet; `None` between frames.
     missing: Option<u64>,
 }
 
-impl Line {
-    /// Over a connection that is ready for messages.
+impl BenchConnection {
+    /// Wraps a connection on which the handshake is complete.
     pub(crate) fn new(stream: TcpStream, framing: Framing) -> Result<Self> {
         stream.set_nodelay(true)?;
         stream.set_read_timeout(Some(PATIENCE))?;
-        Ok(Self::over(Stream::Plain(stream), framing))
+        Ok(Self::with_stream(LineStream::Plain(stream), framing))
     }
 
-    fn over(stream: Stream, framing: Framing) -> Self {
+    fn with_stream(stream: LineStream, framing: Framing) -> Self {
         Self {
             sender: None,
             stream,
@@ -65,50 +65,50 @@ impl Line {
         }
     }
 
-    /// The robot at a daemon, through TLS where the daemon speaks it.
-    pub(crate) fn robot(daemon: &Daemon) -> Result<Self> {
-        let Some(token) = secure::token(daemon)? else {
-            return Self::websocket(&daemon.address, ROBOT);
+    /// Connects as the robot to a daemon, through TLS if the daemon uses it.
+    pub(crate) fn connect_robot(daemon: &Daemon) -> Result<Self> {
+        let Some(token) = secure::robot_token(daemon)? else {
+            return Self::connect_websocket(&daemon.address, ROBOT);
         };
         let stream = secure::connect(daemon)?;
         let url = format!("wss://localhost/{ROBOT}&token={token}");
         match tungstenite::client(url, stream) {
             Ok((socket, _)) => {
-                let stream = Stream::Tls(Box::new(socket.into_inner()));
-                Ok(Self::over(stream, Framing::WebSocket))
+                let stream = LineStream::Tls(Box::new(socket.into_inner()));
+                Ok(Self::with_stream(stream, Framing::WebSocket))
             }
             Err(error) => bail!("no WebSocket through TLS: {error}"),
         }
     }
 
-    /// With another connection to send on.
-    pub(crate) fn sending_on(mut self, sender: TcpStream) -> Result<Self> {
+    /// Uses another connection for sending.
+    pub(crate) fn with_sender(mut self, sender: TcpStream) -> Result<Self> {
         sender.set_nodelay(true)?;
         self.sender = Some(sender);
         Ok(self)
     }
 
-    /// A WebSocket at `ws://ADDRESS/PATH`.
-    pub(crate) fn websocket(address: &str, path: &str) -> Result<Self> {
-        Self::websocket_over(TcpStream::connect(address)?, address, path)
+    /// Opens a WebSocket at `ws://ADDRESS/PATH`.
+    pub(crate) fn connect_websocket(address: &str, path: &str) -> Result<Self> {
+        Self::upgrade(TcpStream::connect(address)?, address, path)
     }
 
-    /// The same over a connection that is there.
-    pub(crate) fn websocket_over(stream: TcpStream, address: &str, path: &str) -> Result<Self> {
+    /// Opens a WebSocket on an established connection.
+    pub(crate) fn upgrade(stream: TcpStream, address: &str, path: &str) -> Result<Self> {
         let kept = stream.try_clone()?;
         match tungstenite::client(format!("ws://{address}/{path}"), stream) {
-            // A server that is not spoken to says nothing: there is nothing in its buffer.
+            // The server only speaks when spoken to, so tungstenite's buffer is empty here.
             Ok(_) => Self::new(kept, Framing::WebSocket),
             Err(tungstenite::HandshakeError::Failure(error)) => Err(error).context(path.to_owned()),
             Err(tungstenite::HandshakeError::Interrupted(_)) => bail!("{path}: no answer"),
         }
     }
 
-    /// Sends bytes that are framed already.
+    /// Sends bytes that are already framed.
     pub(crate) fn send(&mut self, framed: &[u8]) -> Result<()> {
         match (&mut self.sender, &mut self.stream) {
-            (Some(stream), _) | (None, Stream::Plain(stream)) => stream.write_all(framed)?,
-            (None, Stream::Tls(stream)) => {
+            (Some(stream), _) | (None, LineStream::Plain(stream)) => stream.write_all(framed)?,
+            (None, LineStream::Tls(stream)) => {
                 stream.write_all(framed)?;
                 stream.flush()?;
             }
@@ -116,21 +116,21 @@ impl Line {
         Ok(())
     }
 
-    /// Sends a text.
-    pub(crate) fn say(&mut self, text: &str) -> Result<()> {
+    /// Sends a text message.
+    pub(crate) fn send_text(&mut self, text: &str) -> Result<()> {
         self.send(&frame(TEXT, text.as_bytes()))
     }
 
-    /// Sends a text and gives the next message.
-    pub(crate) fn ask(&mut self, text: &str) -> Result<Vec<u8>> {
-        self.say(text)?;
-        self.whole()
+    /// Sends a text message and returns the next message received.
+    pub(crate) fn request(&mut self, text: &str) -> Result<Vec<u8>> {
+        self.send_text(text)?;
+        self.read_message()
     }
 
-    /// Waits for messages; gives how many have come to their end.
-    pub(crate) fn receive(&mut self) -> Result<u64> {
+    /// Waits for messages; returns how many have been received completely.
+    pub(crate) fn receive_messages(&mut self) -> Result<u64> {
         loop {
-            let ended = self.skim();
+            let ended = self.skip_received();
             if ended > 0 {
                 return Ok(ended);
             }
@@ -138,11 +138,11 @@ impl Line {
         }
     }
 
-    /// The next message.
-    pub(crate) fn whole(&mut self) -> Result<Vec<u8>> {
+    /// Returns the next message.
+    pub(crate) fn read_message(&mut self) -> Result<Vec<u8>> {
         ensure!(self.missing.is_none(), "inside a message");
         let length = loop {
-            if let Some((header, length)) = self.header() {
+            if let Some((header, length)) = self.parse_header() {
                 self.at += header;
                 break length as usize;
             }
@@ -160,8 +160,8 @@ impl Line {
         }
     }
 
-    /// Passes over what was read; gives how many messages ended in it.
-    fn skim(&mut self) -> u64 {
+    /// Skips over the buffered bytes; returns how many messages ended in them.
+    fn skip_received(&mut self) -> u64 {
         let mut ended = 0;
         loop {
             if let Some(missing) = &mut self.missing {
@@ -174,7 +174,7 @@ impl Line {
                 self.missing = None;
                 ended += 1;
             }
-            let Some((header, length)) = self.header() else {
+            let Some((header, length)) = self.parse_header() else {
                 return ended;
             };
             self.at += header;
@@ -182,8 +182,8 @@ impl Line {
         }
     }
 
-    /// Size of the next frame's header, and what it says of the frame's length.
-    fn header(&self) -> Option<(usize, u64)> {
+    /// Returns the size of the next frame's header and the payload length that it states.
+    fn parse_header(&self) -> Option<(usize, u64)> {
         let bytes = &self.buffer[self.at..self.filled];
         let little = |at: usize| {
             let word = bytes.get(at..at + 4)?.try_into().ok()?;
@@ -217,8 +217,8 @@ impl Line {
         }
         let space = &mut self.buffer[self.filled..];
         let read = match &mut self.stream {
-            Stream::Plain(stream) => stream.read(space)?,
-            Stream::Tls(stream) => stream.read(space)?,
+            LineStream::Plain(stream) => stream.read(space)?,
+            LineStream::Tls(stream) => stream.read(space)?,
         };
         ensure!(read > 0, "the connection was closed");
         self.filled += read;
@@ -226,12 +226,13 @@ impl Line {
     }
 }
 
-/// Opcode of a text.
+/// Opcode of a text frame.
 pub(crate) const TEXT: u8 = 1;
-/// Opcode of bytes.
+/// Opcode of a binary frame.
 pub(crate) const BINARY: u8 = 2;
 
-/// A WebSocket client's frame. Its mask is zero: the server has to take it off all the same, the client is spared it.
+/// Builds a frame of a WebSocket client. The mask is zero: the server has to remove it all the same, while the client
+/// need not apply it.
 pub(crate) fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
     let mut out = vec![0x80 | opcode];
     match payload.len() {
@@ -250,7 +251,7 @@ pub(crate) fn frame(opcode: u8, payload: &[u8]) -> Vec<u8> {
     out
 }
 
-/// A TCPROS message.
-pub(crate) fn tcpros(message: &[u8]) -> Vec<u8> {
+/// Frames a message for TCPROS.
+pub(crate) fn tcpros_frame(message: &[u8]) -> Vec<u8> {
     [&(message.len() as u32).to_le_bytes(), message].concat()
 }

@@ -1,9 +1,9 @@
-//! `make bench ONLY=portal`: how fast messages and calls pass the daemon, between a client on loopback and a roscpp node
-//! in a servant. Beside it, in turns: the same node by raw TCPROS; a process that moves the bytes over the same hops;
-//! one that converts them by way of a tree of values; rosbridge_suite, where its sources are named; and another daemon that speaks TLS and holds a robot to its token and
-//! the policy. Before that, WebSocket framing alone, beside other libraries of it
-//! (`make bench ONLY=portal`; the words `framing of` as an argument run that part alone). Needs root. The program calls itself for the relays
-//! (`relay PID HOW …`).
+//! `make bench ONLY=portal`: throughput and latency of messages and calls through the daemon, between a client on
+//! loopback and a roscpp node in a servant. Compared in turns: raw TCPROS to the same node; a process that copies the
+//! bytes over the same hops; a process that converts them through a tree of values; rosbridge_suite, if its sources are
+//! configured; and a second daemon with TLS, a robot's token and the policy. Before that, WebSocket framing alone,
+//! compared with other libraries (the argument `framing of` runs only this part). Needs root. The program runs itself
+//! as the relays (`relay PID HOW …`).
 
 #![forbid(unsafe_code)]
 
@@ -24,17 +24,17 @@ mod watch;
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use bench_servant::Daemon;
 
-use crate::node::Node;
-use crate::watch::Watch;
+use crate::node::MeterNode;
+use crate::watch::MemoryWatch;
 
-/// One servant, which stays.
+/// A single servant, which is kept.
 const CONFIG: &str =
     "[capacity]\ncpus = 64.0\nmemory = \"64G\"\n[servant]\nreserve_cpus = 0.1\ngrace = \"1h\"\n";
 
-/// What the daemon may need, in megabytes.
+/// Memory that the daemon may use, in megabytes.
 const MEMORY: f64 = 60.0;
 
 fn main() -> Result<()> {
@@ -50,11 +50,11 @@ fn main() -> Result<()> {
     }
 }
 
-/// Publishes the node that everything is measured with, and nothing else.
-fn push(daemon: &Daemon) -> Result<()> {
+/// Publishes the node that all measurements use, and nothing else.
+fn push_meter(daemon: &Daemon) -> Result<()> {
     eprintln!("pushing rosbridge_fixture");
     daemon.push(&[
-        fixture().to_str().context("UTF-8")?,
+        fixture_path().to_str().context("UTF-8")?,
         "--name",
         "meter",
         "--node",
@@ -63,23 +63,24 @@ fn push(daemon: &Daemon) -> Result<()> {
     Ok(())
 }
 
-fn fixture() -> PathBuf {
+fn fixture_path() -> PathBuf {
     bench_report::root().join("tests/packages/rosbridge_fixture")
 }
 
-/// Publishes it with rosbridge_suite beside it, or alone; whether that is there.
-fn push_with_suite(report: &mut Report, daemon: &Daemon) -> Result<bool> {
-    let Err(why) = suite::push(daemon, &fixture()) else {
+/// Publishes the node together with rosbridge_suite, or alone if that fails; returns whether rosbridge_suite is
+/// available.
+fn push_with_suite(report: &mut BenchReport, daemon: &Daemon) -> Result<bool> {
+    let Err(why) = suite::push_with_fixture(daemon, &fixture_path()) else {
         return Ok(true);
     };
-    report.left_out(suite::NAME, format!("{why:#}"));
-    push(daemon)?;
+    report.skip(suite::NAME, format!("{why:#}"));
+    push_meter(daemon)?;
     Ok(false)
 }
 
-/// All figures whose names contain `only`.
+/// Measures all figures whose names contain `only`.
 fn measure(only: &str) -> Result<()> {
-    let mut report = Report::new("portal");
+    let mut report = BenchReport::new("portal");
     framing::measure(&mut report, only)?;
     if only.starts_with("framing") {
         report.finish()?;
@@ -95,17 +96,17 @@ fn measure(only: &str) -> Result<()> {
         .tempdir()?;
     let daemon = Daemon::start(place, CONFIG, &[])?;
     let suite = push_with_suite(&mut report, &daemon)?;
-    let node = Node::find(&daemon)?;
-    let watch = Watch::over(daemon.pid());
+    let node = MeterNode::find(&daemon)?;
+    let watch = MemoryWatch::start(daemon.pid());
     trips::measure(&mut report, &daemon, &node, only, suite)?;
     rates::measure(&mut report, &daemon, &node, only)?;
     secure::measure(&mut report, &daemon, &node, only)?;
-    // The node may still owe messages afterwards, which nobody counts.
+    // Last, because the node may still have messages to publish afterwards, which would be counted elsewhere.
     slow_reader::measure(&mut report, &daemon, &node, only)?;
-    let memory = watch.end()?;
+    let memory = watch.stop()?;
     report
         .figure("memory of the daemon, at its peak", "MB", memory.rss)
-        .reach(Target::AtMost(MEMORY))
+        .require(Target::AtMost(MEMORY))
         .note(format!(
             "resident, during all this; {:.1} MB of it in proportion (PSS)",
             memory.pss

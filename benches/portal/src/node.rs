@@ -1,4 +1,5 @@
-//! The meter: where it runs, and how it is given credit and asked for counts, past the daemon.
+//! The node `meter`: finds its servant, and exchanges publishing credit and message counts with it, bypassing the
+//! daemon.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -10,37 +11,37 @@ use anyhow::{Context, Result, ensure};
 use async_trait::async_trait;
 use bench_servant::Daemon;
 use bytes::Bytes;
-use ros::bus::{Bus, Publisher, Qos, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, WireType};
 use ros::net::Sockets;
 use ros::ros1::Ros1Bus;
-use ros::ros1::xmlrpc::{Client, Value};
-use servant::launch::{self, Runtime as Record};
+use ros::ros1::xmlrpc::{Value, XmlRpcClient};
+use servant::launch::{self, RuntimeRecord as Record};
 use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
 
-use crate::line::Line;
+use crate::line::BenchConnection;
 
-/// Where every servant's Master listens.
+/// Address of the Master in every servant.
 pub(crate) const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
-/// How long anything may take that is waited for.
+/// Timeout of everything that is waited for.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 
 const NODE: &str = "/meter";
 
-/// Sockets inside the servant.
+/// Sockets in the servant's network namespace.
 #[derive(Clone)]
-pub(crate) struct Inside(Arc<NetNs>);
+pub(crate) struct MeterSockets(Arc<NetNs>);
 
-impl Inside {
-    /// Where that process is.
-    pub(crate) fn of(pid: i32) -> Result<Self> {
+impl MeterSockets {
+    /// Opens the network namespace of a process.
+    pub(crate) fn for_process(pid: i32) -> Result<Self> {
         Ok(Self(Arc::new(NetNs::from_pid(pid)?)))
     }
 }
 
 #[async_trait]
-impl Sockets for Inside {
+impl Sockets for MeterSockets {
     async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
         self.0.connect(address).await
     }
@@ -50,9 +51,9 @@ impl Sockets for Inside {
     }
 }
 
-/// The address of a node's own XML-RPC server.
-pub(crate) async fn address_of(inside: &Inside, name: &str) -> Result<String> {
-    let master = Client::new(Arc::new(inside.clone()), &format!("http://{MASTER}/"))?;
+/// Returns the address of a node's XML-RPC server.
+pub(crate) async fn look_up_node(inside: &MeterSockets, name: &str) -> Result<String> {
+    let master = XmlRpcClient::new(Arc::new(inside.clone()), &format!("http://{MASTER}/"))?;
     let found = master
         .call("lookupNode", &["/bench".into(), name.into()], PATIENCE)
         .await?;
@@ -64,27 +65,27 @@ pub(crate) async fn address_of(inside: &Inside, name: &str) -> Result<String> {
         .to_owned())
 }
 
-/// The node.
-pub(crate) struct Node {
+/// The node under measurement.
+pub(crate) struct MeterNode {
     /// PID 1 of its servant.
     pub(crate) pid: i32,
     pub(crate) runtime: Runtime,
-    slave: Client,
+    slave: XmlRpcClient,
     bus: Arc<Ros1Bus>,
 }
 
-impl Node {
-    /// Has a servant started, which stays for its grace time.
+impl MeterNode {
+    /// Has a servant started, which is kept for its grace time, and finds the node in it.
     pub(crate) fn find(daemon: &Daemon) -> Result<Self> {
-        let mut robot = Line::robot(daemon)?;
-        robot.ask(r#"{"op":"call_service","service":"/rosapi/nodes"}"#)?;
+        let mut robot = BenchConnection::connect_robot(daemon)?;
+        robot.request(r#"{"op":"call_service","service":"/rosapi/nodes"}"#)?;
         let id = daemon.servants()?.into_iter().next().context("a servant")?;
         let path = daemon
             .home()
             .join("servants")
             .join(id)
             .join(launch::RUNTIME);
-        let record: Record = launch::read(&path)?.context("its record")?;
+        let record: Record = launch::read_record(&path)?.context("its record")?;
         let shim = record.shim.pid;
         let children = std::fs::read_to_string(format!("/proc/{shim}/task/{shim}/children"))?;
         let pid = children
@@ -96,10 +97,13 @@ impl Node {
             .worker_threads(1)
             .enable_all()
             .build()?;
-        let inside = Inside::of(pid)?;
+        let inside = MeterSockets::for_process(pid)?;
         let (bus, slave) = runtime.block_on(async {
             let bus = Ros1Bus::connect(Arc::new(inside.clone()), MASTER, "/bench_control").await?;
-            let slave = Client::new(Arc::new(inside.clone()), &address_of(&inside, NODE).await?)?;
+            let slave = XmlRpcClient::new(
+                Arc::new(inside.clone()),
+                &look_up_node(&inside, NODE).await?,
+            )?;
             anyhow::Ok((bus, slave))
         })?;
         Ok(Self {
@@ -110,11 +114,11 @@ impl Node {
         })
     }
 
-    /// Waits until the node has so many connections for a topic.
-    pub(crate) fn until_connected(&self, topic: &str, count: usize) -> Result<()> {
+    /// Waits until the node has `count` connections for a topic.
+    pub(crate) fn wait_until_connected(&self, topic: &str, count: usize) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         loop {
-            let found = self.connections(topic)?;
+            let found = self.count_connections(topic)?;
             if found == count {
                 return Ok(());
             }
@@ -126,7 +130,7 @@ impl Node {
         }
     }
 
-    fn connections(&self, topic: &str) -> Result<usize> {
+    fn count_connections(&self, topic: &str) -> Result<usize> {
         let caller = ["/bench".into()];
         let call = self.slave.call("getBusInfo", &caller, PATIENCE);
         let answer = self.runtime.block_on(call)?;
@@ -141,20 +145,20 @@ impl Node {
         Ok(rows.context("rows")?.iter().filter(about).count())
     }
 
-    /// Credit for one of the node's sources: it publishes as many messages as it is told.
-    pub(crate) fn credit(&self, topic: &str) -> Result<Credit> {
+    /// Returns the credit of one of the node's sources: the source publishes as many messages as it is granted.
+    pub(crate) fn credit(&self, topic: &str) -> Result<PublishCredit> {
         let topic = format!("{topic}_credit");
         let publisher = self.runtime.block_on(self.bus.advertise(
             &topic,
             UINT32.into(),
-            Qos::keep_last(1000),
+            QosProfile::keep_last(1000),
         ))?;
-        self.until_connected(&topic, 1)?;
-        Ok(Credit(publisher))
+        self.wait_until_connected(&topic, 1)?;
+        Ok(PublishCredit(publisher))
     }
 
-    /// How many messages one of the node's sinks has counted; the thread that asks is woken when there are more.
-    pub(crate) fn count(&self, topic: &str) -> Result<Count> {
+    /// Returns the message count of one of the node's sinks; the calling thread is unparked whenever it grows.
+    pub(crate) fn message_count(&self, topic: &str) -> Result<MessageCount> {
         let count = Arc::new(AtomicU64::new(0));
         let counted = count.clone();
         let asking = std::thread::current();
@@ -162,7 +166,7 @@ impl Node {
         let mut subscription = self.runtime.block_on(self.bus.subscribe(
             &topic,
             UINT32.into(),
-            Qos::keep_last(1000),
+            QosProfile::keep_last(1000),
         ))?;
         self.runtime.spawn(async move {
             let _subscribed = &subscription.guard;
@@ -173,64 +177,65 @@ impl Node {
                 }
             }
         });
-        self.until_connected(&topic, 1)?;
-        Ok(Count { count })
+        self.wait_until_connected(&topic, 1)?;
+        Ok(MessageCount { count })
     }
 }
 
-const UINT32: Type = Type {
+const UINT32: TypeDescription = TypeDescription {
     name: "std_msgs/UInt32",
     md5: "304a39449588c7f8ce2df6e8001c5fce",
     definition: "uint32 data\n",
 };
 
-/// A type, and what a header says of it.
+/// A message type, as connection headers describe it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Type {
+pub(crate) struct TypeDescription {
     pub(crate) name: &'static str,
     pub(crate) md5: &'static str,
     pub(crate) definition: &'static str,
 }
 
-/// The small message.
-pub(crate) const STRING: Type = Type {
+/// Type of the small message.
+pub(crate) const STRING: TypeDescription = TypeDescription {
     name: "std_msgs/String",
     md5: "992ce8a1687cec8c8bd883ec73ca41d1",
     definition: "string data\n",
 };
 
-/// The big one.
-pub(crate) const IMAGE: Type = Type {
+/// Type of the large message.
+pub(crate) const IMAGE: TypeDescription = TypeDescription {
     name: "sensor_msgs/Image",
     md5: "060021388200f6f0f447d0fcd9c64743",
-    definition: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+    definition: "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 \
+        step\n\
         uint8[] data\n\
         ================================================================================\nMSG: std_msgs/Header\n\
         uint32 seq\ntime stamp\nstring frame_id\n",
 };
 
-impl From<Type> for WireType {
-    fn from(from: Type) -> Self {
+impl From<TypeDescription> for WireType {
+    fn from(from: TypeDescription) -> Self {
         Self::new(from.name, from.md5, from.definition)
     }
 }
 
-/// See [`Node::credit`].
-pub(crate) struct Credit(Box<dyn Publisher>);
+/// See [`MeterNode::credit`].
+pub(crate) struct PublishCredit(Box<dyn Publisher>);
 
-impl Credit {
-    pub(crate) fn pay(&self, messages: u32) {
+impl PublishCredit {
+    pub(crate) fn grant(&self, messages: u32) {
         self.0
             .publish(Bytes::copy_from_slice(&messages.to_le_bytes()));
     }
 }
 
-/// See [`Node::count`].
-pub(crate) struct Count {
+/// See [`MeterNode::message_count`].
+pub(crate) struct MessageCount {
     count: Arc<AtomicU64>,
 }
 
-impl Count {
+impl MessageCount {
     pub(crate) fn get(&self) -> u64 {
         self.count.load(Ordering::Relaxed)
     }

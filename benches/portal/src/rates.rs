@@ -1,30 +1,30 @@
-//! How many messages pass in a second. A window of messages is under way, so nothing is dropped and the slowest hop
-//! decides.
+//! Throughput in messages per second. A fixed window of messages is in flight, so that none is dropped and the slowest
+//! hop determines the rate.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, full};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, is_full_run};
 
-use crate::contestants::{Course, Encoding, Way, check};
-use crate::node::{Count, Credit, Node, PATIENCE};
-use crate::relay::Hops;
-use crate::watch::processor;
+use crate::contestants::{ClientPath, Encoding, PathTarget, check_message};
+use crate::node::{MessageCount, MeterNode, PATIENCE, PublishCredit};
+use crate::relay::RelayHops;
+use crate::watch::processor_time;
 
-/// One turn. Its first fifth does not count.
+/// Duration of a turn; its first fifth is not counted.
 const TURN: Duration = Duration::from_millis(700);
-/// Small messages under way: fewer than any queue on the way holds.
+/// Number of small messages in flight: fewer than any queue on the path holds.
 const SMALL: u64 = 192;
-/// Pictures under way.
+/// Number of images in flight.
 const BIG: u64 = 4;
 
-const JSON: Way = Way::Daemon(Encoding::Json);
-const CBOR: Way = Way::Daemon(Encoding::Cbor);
-const RAW: Way = Way::Daemon(Encoding::Raw);
+const JSON: ClientPath = ClientPath::Daemon(Encoding::Json);
+const CBOR: ClientPath = ClientPath::Daemon(Encoding::Cbor);
+const RAW: ClientPath = ClientPath::Daemon(Encoding::Raw);
 
-/// What rosbridge_suite (Python) did on a machine like this, per second; it kept one processor busy.
-const ROSBRIDGE: [(&str, Way, f64); 6] = [
+/// Throughput of rosbridge_suite (Python) on a comparable machine, per second; it kept one processor busy.
+const ROSBRIDGE: [(&str, ClientPath, f64); 6] = [
     ("small messages out", JSON, 10_454.0),
     ("small messages in", JSON, 8_181.0),
     ("640x480 RGB out", JSON, 292.0),
@@ -33,17 +33,18 @@ const ROSBRIDGE: [(&str, Way, f64); 6] = [
     ("640x480 RGB in", JSON, 12.5),
 ];
 
-/// What is to be reached: of the floor, or of rosbridge_suite (per second of processor time where it says so).
-struct Goal {
-    way: Way,
-    floor: Way,
+/// A required rate: as a fraction of the floor, or as a multiple of rosbridge_suite's (per second of processor time
+/// with `per_processor`).
+struct RateTarget {
+    way: ClientPath,
+    floor: ClientPath,
     share: f64,
     times_rosbridge: Option<f64>,
     per_processor: bool,
 }
 
-impl Goal {
-    fn of(way: Way, share: f64, floor: Way) -> Self {
+impl RateTarget {
+    fn share_of_floor(way: ClientPath, share: f64, floor: ClientPath) -> Self {
         Self {
             way,
             floor,
@@ -54,112 +55,148 @@ impl Goal {
     }
 }
 
-/// All rates.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &str) -> Result<()> {
-    let topic = |images, inward, outward| Hops {
+/// Measures all rates.
+pub(crate) fn measure(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    node: &MeterNode,
+    only: &str,
+) -> Result<()> {
+    let topic = |images, inward, outward| RelayHops {
         images,
         inward,
         outward,
-        ..Hops::default()
+        ..RelayHops::default()
     };
-    let tenfold = |share| Goal {
+    let tenfold = |share| RateTarget {
         times_rosbridge: Some(10.0),
         per_processor: true,
-        ..Goal::of(JSON, share, Way::Direct)
+        ..RateTarget::share_of_floor(JSON, share, ClientPath::Direct)
     };
-    let many = Goal {
+    let many = RateTarget {
         times_rosbridge: Some(25.0),
-        ..Goal::of(JSON, 0.2, Way::Bytes)
+        ..RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes)
     };
     for (what, hops, ways, goals) in [
         (
             "small messages out",
             topic(false, None, Some("/meter/small_out")),
-            vec![JSON, Way::Direct, Way::Bytes, Way::Values],
+            vec![
+                JSON,
+                ClientPath::Direct,
+                ClientPath::Bytes,
+                ClientPath::Values,
+            ],
             vec![tenfold(0.7)],
         ),
         (
             "small messages in",
             topic(false, Some("/meter/small_in"), None),
-            vec![JSON, Way::Direct, Way::Bytes, Way::Values],
+            vec![
+                JSON,
+                ClientPath::Direct,
+                ClientPath::Bytes,
+                ClientPath::Values,
+            ],
             vec![tenfold(0.7)],
         ),
         (
             "640x480 RGB out",
             topic(true, None, Some("/meter/image_out")),
-            vec![JSON, CBOR, RAW, Way::Direct, Way::Bytes, Way::Values],
             vec![
-                Goal::of(JSON, 0.2, Way::Bytes),
-                Goal::of(CBOR, 0.5, Way::Bytes),
-                Goal::of(RAW, 0.6, Way::Bytes),
+                JSON,
+                CBOR,
+                RAW,
+                ClientPath::Direct,
+                ClientPath::Bytes,
+                ClientPath::Values,
+            ],
+            vec![
+                RateTarget::share_of_floor(JSON, 0.2, ClientPath::Bytes),
+                RateTarget::share_of_floor(CBOR, 0.5, ClientPath::Bytes),
+                RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes),
             ],
         ),
         (
             "640x480 RGB in",
             topic(true, Some("/meter/image_in"), None),
-            vec![JSON, CBOR, RAW, Way::Direct, Way::Bytes, Way::Values],
-            vec![many, Goal::of(RAW, 0.6, Way::Bytes)],
+            vec![
+                JSON,
+                CBOR,
+                RAW,
+                ClientPath::Direct,
+                ClientPath::Bytes,
+                ClientPath::Values,
+            ],
+            vec![
+                many,
+                RateTarget::share_of_floor(RAW, 0.6, ClientPath::Bytes),
+            ],
         ),
     ] {
         if what.contains(only) {
-            let course = Course { daemon, node, hops };
-            let found = race(&course, &ways, what)?;
-            tell(report, what, &ways, &found, &goals);
+            let course = PathTarget { daemon, node, hops };
+            let found = measure_in_turns(&course, &ways, what)?;
+            report_rates(report, what, &ways, &found, &goals);
         }
     }
     Ok(())
 }
 
-/// Messages per second, and per second of the daemon's processor time.
+/// Messages per second, and messages per second of the daemon's processor time.
 #[derive(Debug, Clone, Copy, Default)]
-struct Rate {
+struct MessageRate {
     best: f64,
     messages: u64,
     processor: Duration,
 }
 
-fn race(course: &Course<'_>, ways: &[Way], what: &str) -> Result<Vec<Rate>> {
-    let rounds = if full() { 20 } else { 6 };
-    let mut found = vec![Rate::default(); ways.len()];
-    // The same for all turns: to come and go takes a node a while.
+fn measure_in_turns(
+    course: &PathTarget<'_>,
+    ways: &[ClientPath],
+    what: &str,
+) -> Result<Vec<MessageRate>> {
+    let rounds = if is_full_run() { 20 } else { 6 };
+    let mut found = vec![MessageRate::default(); ways.len()];
+    // One for all turns, because it takes the node a while to connect and disconnect.
     let counter = match (course.hops.outward, course.hops.inward) {
         (Some(topic), _) => Counter::Credit(course.node.credit(topic)?),
-        (None, topic) => Counter::Count(course.node.count(topic.unwrap_or_default())?),
+        (None, topic) => Counter::Count(course.node.message_count(topic.unwrap_or_default())?),
     };
     for round in 1..=rounds {
         eprintln!("{what}: round {round} of {rounds}");
         for (way, rate) in ways.iter().zip(&mut found) {
-            let before = processor(course.daemon.pid())?;
+            let before = processor_time(course.daemon.pid())?;
             let (per_second, messages) = match &counter {
-                Counter::Credit(credit) => outward(course, *way, credit),
-                Counter::Count(count) => inward(course, *way, count),
+                Counter::Credit(credit) => measure_outward(course, *way, credit),
+                Counter::Count(count) => measure_inward(course, *way, count),
             }
             .with_context(|| format!("{what}, {way}"))?;
             rate.best = rate.best.max(per_second);
             rate.messages += messages;
-            rate.processor += processor(course.daemon.pid())? - before;
+            rate.processor += processor_time(course.daemon.pid())? - before;
         }
     }
     Ok(found)
 }
 
-/// What keeps the window.
+/// Source of the flow control that keeps the window full.
 enum Counter {
-    Credit(Credit),
-    Count(Count),
+    Credit(PublishCredit),
+    Count(MessageCount),
 }
 
-fn window(course: &Course<'_>) -> u64 {
+fn window_size(course: &PathTarget<'_>) -> u64 {
     if course.hops.images { BIG } else { SMALL }
 }
 
-/// Counts from the end of the first fifth.
-struct Clock {
+/// Measures the rate from the end of a turn's first fifth.
+struct RateTimer {
     begun: Instant,
     counted: Option<(Instant, u64)>,
 }
 
-impl Clock {
+impl RateTimer {
     fn start() -> Self {
         Self {
             begun: Instant::now(),
@@ -167,7 +204,7 @@ impl Clock {
         }
     }
 
-    /// The rate, once the turn is over.
+    /// Returns the rate once the turn is over.
     fn rate(&mut self, messages: u64) -> Option<f64> {
         let elapsed = self.begun.elapsed();
         if elapsed < TURN / 5 {
@@ -178,31 +215,35 @@ impl Clock {
     }
 }
 
-/// The node publishes what it has credit for.
-pub(crate) fn outward(course: &Course<'_>, way: Way, credit: &Credit) -> Result<(f64, u64)> {
+/// Measures messages from the node, which publishes as many as it has credit for.
+pub(crate) fn measure_outward(
+    course: &PathTarget<'_>,
+    way: ClientPath,
+    credit: &PublishCredit,
+) -> Result<(f64, u64)> {
     let mut open = course.open(way)?;
-    credit.pay(1);
-    check(way, course.hops.images, &open.line.whole()?)?;
-    let window = window(course);
-    credit.pay(window as u32);
-    let (mut owed, mut messages, mut clock) = (0, 0, Clock::start());
+    credit.grant(1);
+    check_message(way, course.hops.images, &open.line.read_message()?)?;
+    let window = window_size(course);
+    credit.grant(window as u32);
+    let (mut owed, mut messages, mut clock) = (0, 0, RateTimer::start());
     let rate = loop {
-        let got = open.line.receive()?;
+        let got = open.line.receive_messages()?;
         messages += got;
         if let Some(rate) = clock.rate(messages) {
             owed += got;
             break rate;
         }
         owed += got;
-        // Not for every message: credit costs the node time too.
+        // Not for every message: processing credit costs the node time as well.
         if owed >= window / 4 {
-            credit.pay(owed as u32);
+            credit.grant(owed as u32);
             owed = 0;
         }
     };
     let mut under_way = window - owed;
     while under_way > 0 {
-        let got = open.line.receive()?;
+        let got = open.line.receive_messages()?;
         ensure!(got <= under_way, "more came than was asked for");
         under_way -= got;
         messages += got;
@@ -211,23 +252,28 @@ pub(crate) fn outward(course: &Course<'_>, way: Way, credit: &Credit) -> Result<
     Ok((rate, messages + 1))
 }
 
-/// The node tells how many it has received.
-fn inward(course: &Course<'_>, way: Way, count: &Count) -> Result<(f64, u64)> {
+/// Measures messages to the node, which reports how many it has received.
+fn measure_inward(
+    course: &PathTarget<'_>,
+    way: ClientPath,
+    count: &MessageCount,
+) -> Result<(f64, u64)> {
     let mut open = course.open(way)?;
-    let window = window(course);
-    // The node counts on: what it says first tells where this turn begins, to the step that it tells in.
+    let window = window_size(course);
+    // The node keeps counting across turns: its first report shows where this turn starts, to the precision of its
+    // reporting interval.
     let batch = if course.hops.images { 1 } else { 16 };
     let group = open.message.repeat(batch as usize);
     let before = count.get();
     open.line.send(&group)?;
-    let base = wait(count, before)?;
-    let (mut sent, mut clock) = (0, Clock::start());
+    let base = wait_for_change(count, before)?;
+    let (mut sent, mut clock) = (0, RateTimer::start());
     loop {
         let received = count.get() - base;
         if let Some(rate) = clock.rate(received) {
             let mut now = count.get();
             while now - base < sent {
-                now = wait(count, now)?;
+                now = wait_for_change(count, now)?;
             }
             course.close(open)?;
             return Ok((rate, sent + batch));
@@ -245,7 +291,7 @@ fn inward(course: &Course<'_>, way: Way, count: &Count) -> Result<(f64, u64)> {
     }
 }
 
-fn wait(count: &Count, before: u64) -> Result<u64> {
+fn wait_for_change(count: &MessageCount, before: u64) -> Result<u64> {
     let begun = Instant::now();
     loop {
         let now = count.get();
@@ -260,20 +306,32 @@ fn wait(count: &Count, before: u64) -> Result<u64> {
     }
 }
 
-fn tell(report: &mut Report, what: &str, ways: &[Way], found: &[Rate], goals: &[Goal]) {
-    let rate = |way: Way| {
+fn report_rates(
+    report: &mut BenchReport,
+    what: &str,
+    ways: &[ClientPath],
+    found: &[MessageRate],
+    goals: &[RateTarget],
+) {
+    let rate = |way: ClientPath| {
         let at = ways.iter().position(|other| *other == way);
-        at.map_or_else(Rate::default, |at| found[at])
+        at.map_or_else(MessageRate::default, |at| found[at])
     };
-    for way in ways.iter().filter(|way| matches!(way, Way::Daemon(_))) {
+    for way in ways
+        .iter()
+        .filter(|way| matches!(way, ClientPath::Daemon(_)))
+    {
         let ours = rate(*way);
         let goal = goals.iter().find(|goal| goal.way == *way);
         let name = format!("{what}, {way}");
-        for floor in ways.iter().filter(|way| !matches!(way, Way::Daemon(_))) {
+        for floor in ways
+            .iter()
+            .filter(|way| !matches!(way, ClientPath::Daemon(_)))
+        {
             let figure = report.figure(name.clone(), "/s", ours.best);
-            figure.beside(floor.to_string(), rate(*floor).best);
+            figure.relative_to(floor.to_string(), rate(*floor).best);
             if let Some(goal) = goal.filter(|goal| goal.floor == *floor) {
-                figure.reach(Target::RatioAtLeast(goal.share));
+                figure.require(Target::RatioAtLeast(goal.share));
             }
         }
         let per_processor = ours.messages as f64 / ours.processor.as_secs_f64().max(0.01);
@@ -288,9 +346,9 @@ fn tell(report: &mut Report, what: &str, ways: &[Way], found: &[Rate], goals: &[
         }
         let figure = report.figure(per_second, "/s", value);
         if let Some((.., theirs)) = suite {
-            figure.beside("rosbridge_suite, elsewhere", *theirs);
+            figure.relative_to("rosbridge_suite, elsewhere", *theirs);
             if let Some(times) = goal.and_then(|goal| goal.times_rosbridge) {
-                figure.reach(Target::RatioAtLeast(times));
+                figure.require(Target::RatioAtLeast(times));
             }
         }
     }

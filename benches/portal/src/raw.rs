@@ -1,4 +1,4 @@
-//! Raw TCPROS: connections to the node, negotiated as any ROS node does, then bare sockets.
+//! Raw TCPROS: connections to the node that are negotiated like those of any ROS node and then used as bare sockets.
 
 use std::collections::HashMap;
 use std::net::{SocketAddr, TcpStream};
@@ -9,18 +9,18 @@ use async_trait::async_trait;
 use bytes::BytesMut;
 use ros::net::Sockets;
 use ros::ros1::tcpros::Header;
-use ros::ros1::xmlrpc::{self, Client, Fault, Handler, Limits, Value};
+use ros::ros1::xmlrpc::{self, Fault, ServerLimits, Value, XmlRpcClient, XmlRpcHandler};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
-use crate::node::{Inside, MASTER, PATIENCE, Type, address_of};
+use crate::node::{MASTER, MeterSockets, PATIENCE, TypeDescription, look_up_node};
 
-/// Where each of our topics is served.
+/// Port of each topic that this node publishes.
 type Ports = Arc<Mutex<HashMap<String, u16>>>;
 
-/// A node with as little in it as will do.
-pub(crate) struct Raw {
-    inside: Inside,
+/// A minimal ROS node.
+pub(crate) struct RawNode {
+    inside: MeterSockets,
     name: String,
     uri: String,
     ports: Ports,
@@ -30,7 +30,7 @@ pub(crate) struct Raw {
 struct Slave(Ports);
 
 #[async_trait]
-impl Handler for Slave {
+impl XmlRpcHandler for Slave {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         let topic = params.get(1).and_then(Value::as_str).unwrap_or_default();
         let ports = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -46,9 +46,9 @@ impl Handler for Slave {
     }
 }
 
-impl Raw {
-    /// A node of this name inside the servant.
-    pub(crate) async fn start(inside: Inside, name: &str) -> Result<Self> {
+impl RawNode {
+    /// Starts a node `name` inside the servant.
+    pub(crate) async fn start(inside: MeterSockets, name: &str) -> Result<Self> {
         let listener = inside.listen("127.0.0.1:0".parse()?).await?;
         let uri = format!("http://{}/", listener.local_addr()?);
         let ports = Ports::default();
@@ -58,15 +58,15 @@ impl Raw {
             name: name.to_owned(),
             uri,
             ports,
-            serving: tokio::spawn(xmlrpc::serve(listener, handler, Limits::default())),
+            serving: tokio::spawn(xmlrpc::serve(listener, handler, ServerLimits::default())),
         })
     }
 
-    /// A connection on which the node's messages come.
-    pub(crate) async fn subscribe(&self, topic: &str, kind: Type) -> Result<TcpStream> {
+    /// Opens a connection that receives messages of a topic of the node.
+    pub(crate) async fn subscribe(&self, topic: &str, kind: TypeDescription) -> Result<TcpStream> {
         let node = topic.rsplit_once('/').context("NODE/TOPIC")?.0;
-        let slave = address_of(&self.inside, node).await?;
-        let slave = Client::new(Arc::new(self.inside.clone()), &slave)?;
+        let slave = look_up_node(&self.inside, node).await?;
+        let slave = XmlRpcClient::new(Arc::new(self.inside.clone()), &slave)?;
         let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
         let arguments = [self.name.as_str().into(), topic.into(), protocols];
         let answer = slave.call("requestTopic", &arguments, PATIENCE).await?;
@@ -86,9 +86,9 @@ impl Raw {
         self.connect(port.try_into()?, &header).await
     }
 
-    /// A connection for calls of one of the node's services.
-    pub(crate) async fn service(&self, service: &str) -> Result<TcpStream> {
-        let answer = self.master("lookupService", &[service.into()]).await?;
+    /// Opens a connection for calls of a service of the node.
+    pub(crate) async fn connect_service(&self, service: &str) -> Result<TcpStream> {
+        let answer = self.call_master("lookupService", &[service.into()]).await?;
         let uri = answer.as_str().context("an address")?;
         let port = uri
             .trim_end_matches('/')
@@ -112,11 +112,11 @@ impl Raw {
         let mut buffer = BytesMut::new();
         header.exchange(&mut stream, &mut buffer).await?;
         ensure!(buffer.is_empty(), "nothing was asked for yet");
-        blocking(stream)
+        into_blocking(stream)
     }
 
-    /// A connection on which the node waits for messages.
-    pub(crate) async fn publish(&self, topic: &str, kind: Type) -> Result<TcpStream> {
+    /// Advertises a topic and returns the connection on which the node receives its messages.
+    pub(crate) async fn publish(&self, topic: &str, kind: TypeDescription) -> Result<TcpStream> {
         let listener = self.inside.listen("127.0.0.1:0".parse()?).await?;
         let port = listener.local_addr()?.port();
         self.ports
@@ -124,7 +124,7 @@ impl Raw {
             .unwrap_or_else(PoisonError::into_inner)
             .insert(topic.to_owned(), port);
         let registration = [topic.into(), kind.name.into(), self.uri.as_str().into()];
-        self.master("registerPublisher", &registration).await?;
+        self.call_master("registerPublisher", &registration).await?;
         let (mut stream, _) = timeout(PATIENCE, listener.accept()).await??;
         stream.set_nodelay(true)?;
         Header::read(&mut stream, &mut BytesMut::new()).await?;
@@ -137,18 +137,19 @@ impl Raw {
             ("latching", "0"),
         ]);
         answer.write(&mut stream).await?;
-        blocking(stream)
+        into_blocking(stream)
     }
 
-    /// Takes a topic back from the Master.
+    /// Unregisters a topic from the Master.
     pub(crate) async fn unpublish(&self, topic: &str) -> Result<()> {
         let arguments = [topic.into(), self.uri.as_str().into()];
-        self.master("unregisterPublisher", &arguments).await?;
+        self.call_master("unregisterPublisher", &arguments).await?;
         Ok(())
     }
 
-    async fn master(&self, method: &str, arguments: &[Value]) -> Result<Value> {
-        let master = Client::new(Arc::new(self.inside.clone()), &format!("http://{MASTER}/"))?;
+    async fn call_master(&self, method: &str, arguments: &[Value]) -> Result<Value> {
+        let master =
+            XmlRpcClient::new(Arc::new(self.inside.clone()), &format!("http://{MASTER}/"))?;
         let arguments = [&[self.name.as_str().into()], arguments].concat();
         let answer = master.call(method, &arguments, PATIENCE).await?;
         let answer = answer.as_array().context("an answer")?;
@@ -160,13 +161,13 @@ impl Raw {
     }
 }
 
-impl Drop for Raw {
+impl Drop for RawNode {
     fn drop(&mut self) {
         self.serving.abort();
     }
 }
 
-fn blocking(stream: tokio::net::TcpStream) -> Result<TcpStream> {
+fn into_blocking(stream: tokio::net::TcpStream) -> Result<TcpStream> {
     let stream = stream.into_std()?;
     stream.set_nonblocking(false)?;
     Ok(stream)

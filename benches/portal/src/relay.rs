@@ -1,5 +1,5 @@
-//! A process between client and node, as the daemon is one: it either moves bytes, or converts messages by way of
-//! `serde_json::Value`. It prints where it listens, serves one client and ends with it.
+//! A process between client and node, in the place of the daemon: it either copies bytes, or converts messages through
+//! `serde_json::Value`. It prints its address, serves one client and ends with it.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -8,37 +8,37 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
 
-use crate::node::{IMAGE, Inside, PATIENCE, STRING};
-use crate::raw::Raw;
+use crate::node::{IMAGE, MeterSockets, PATIENCE, STRING};
+use crate::raw::RawNode;
 use crate::value;
 
-/// How much is moved at a time.
+/// Number of bytes that are copied at a time.
 const CHUNK: usize = 256 << 10;
 
-/// What a relay is between.
+/// The topics or the service between which a relay sits.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Hops<'a> {
-    /// The topic that the client publishes.
+pub(crate) struct RelayHops<'a> {
+    /// Topic that the client publishes.
     pub(crate) inward: Option<&'a str>,
-    /// The topic that it listens to.
+    /// Topic that the client subscribes to.
     pub(crate) outward: Option<&'a str>,
-    /// The service that it calls, instead of topics.
+    /// Service that the client calls, instead of topics.
     pub(crate) service: Option<&'a str>,
-    /// Of the topics: the big type or the small one.
+    /// True if the topics have the large type rather than the small one.
     pub(crate) images: bool,
-    /// By way of values, for a WebSocket.
+    /// True to convert through values, for a WebSocket.
     pub(crate) values: bool,
 }
 
-/// A relay in a process of its own, until it is dropped.
+/// A relay in a child process, which ends on drop.
 pub(crate) struct Relay {
     child: Child,
-    /// Where its client connects.
+    /// Address for its client.
     pub(crate) address: String,
 }
 
 impl Relay {
-    pub(crate) fn start(pid: i32, hops: Hops<'_>) -> Result<Self> {
+    pub(crate) fn start(pid: i32, hops: RelayHops<'_>) -> Result<Self> {
         let mut command = Command::new(std::env::current_exe()?);
         command.arg("relay").arg(pid.to_string());
         command.arg(if hops.values { "values" } else { "bytes" });
@@ -62,7 +62,7 @@ impl Relay {
 
 impl Drop for Relay {
     fn drop(&mut self) {
-        // It ends when its client has gone, and takes its topics back first.
+        // The process ends once its client has gone, after it has unregistered its topics.
         let patience = Instant::now() + PATIENCE;
         while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < patience {
             std::thread::sleep(Duration::from_millis(2));
@@ -72,7 +72,7 @@ impl Drop for Relay {
     }
 }
 
-/// The process.
+/// Runs the relay; called in the child process.
 pub(crate) fn run(words: &[&str]) -> Result<()> {
     let [pid, how, messages, connections @ ..] = words else {
         bail!("relay PID HOW MESSAGES [in=TOPIC] [out=TOPIC] [call=SERVICE]")
@@ -90,13 +90,13 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
         .enable_all()
         .build()?;
     let (inside, name) = (
-        Inside::of(pid.parse()?)?,
+        MeterSockets::for_process(pid.parse()?)?,
         format!("/relay_{}", std::process::id()),
     );
-    let raw = runtime.block_on(Raw::start(inside, &name))?;
+    let raw = runtime.block_on(RawNode::start(inside, &name))?;
     let (mut there, mut back) = (None, None);
     if let Some(service) = service {
-        let stream = runtime.block_on(raw.service(service))?;
+        let stream = runtime.block_on(raw.connect_service(service))?;
         there = Some(stream.try_clone()?);
         back = Some(stream);
     }
@@ -112,7 +112,7 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     client.set_nodelay(true)?;
     match *how {
         "values" => value::serve(client, (inward, there), (outward, back), kind)?,
-        _ => serve(&client, there, back)?,
+        _ => relay_client(&client, there, back)?,
     }
     if let Some(topic) = inward {
         runtime.block_on(raw.unpublish(topic))?;
@@ -120,7 +120,11 @@ pub(crate) fn run(words: &[&str]) -> Result<()> {
     Ok(())
 }
 
-fn serve(client: &TcpStream, there: Option<TcpStream>, back: Option<TcpStream>) -> Result<()> {
+fn relay_client(
+    client: &TcpStream,
+    there: Option<TcpStream>,
+    back: Option<TcpStream>,
+) -> Result<()> {
     let (reader, writer) = (client.try_clone()?, client.try_clone()?);
     let answering = back.map(|back| {
         let kept = back.try_clone();
@@ -128,7 +132,7 @@ fn serve(client: &TcpStream, there: Option<TcpStream>, back: Option<TcpStream>) 
     });
     match there {
         Some(there) => pump(reader, there)?,
-        // It says nothing; wait until it goes.
+        // The client sends nothing; wait until it disconnects.
         None => drop({ reader }.read(&mut [0])?),
     }
     if let Some((kept, thread)) = answering {

@@ -1,42 +1,42 @@
-//! What TLS and the policy cost: a second daemon that speaks TLS, with a robot's token and the rules that are there from the
-//! beginning, in turns with the first one, which has neither. The client encrypts and decrypts, too, on the same machine.
+//! Cost of TLS and the policy: a second daemon with TLS, a robot's token and the default rules, measured in turns with
+//! the first daemon, which has neither. The client's encryption and decryption run on the same machine.
 
 use std::net::TcpStream;
 use std::process::Command;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, full};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, is_full_run};
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::{ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 
-use crate::contestants::{Course, Encoding, Way, message};
-use crate::node::{Node, PATIENCE};
-use crate::relay::Hops;
+use crate::contestants::{ClientPath, Encoding, PathTarget, serialize_message};
+use crate::node::{MeterNode, PATIENCE};
+use crate::relay::RelayHops;
 use crate::{CONFIG, rates, trips};
 
-/// A client's end of TLS.
-pub(crate) type Secure = StreamOwned<ClientConnection, TcpStream>;
+/// Client side of a TLS connection.
+pub(crate) type BenchTlsStream = StreamOwned<ClientConnection, TcpStream>;
 
-/// What p50 may become.
+/// Limit for p50, as a multiple of the plain daemon's.
 const TIMES: f64 = 1.1;
 const STRING: &str = "String there and back, TLS and policy";
 const PICTURES: &str = "640x480 RGB out, cbor-raw, TLS and policy";
 
-/// The token of the robot, where the daemon asks for one.
-pub(crate) fn token(daemon: &Daemon) -> Result<Option<String>> {
-    match std::fs::read_to_string(daemon.place().join("token")) {
+/// Returns the robot's token if the daemon requires one.
+pub(crate) fn robot_token(daemon: &Daemon) -> Result<Option<String>> {
+    match std::fs::read_to_string(daemon.directory().join("token")) {
         Ok(token) => Ok(Some(token.trim().to_owned())),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(error) => Err(error.into()),
     }
 }
 
-/// TLS to a daemon, which shows the certificate in its home.
-pub(crate) fn connect(daemon: &Daemon) -> Result<Secure> {
+/// Connects by TLS to a daemon, trusting the certificate in its home.
+pub(crate) fn connect(daemon: &Daemon) -> Result<BenchTlsStream> {
     let stream = TcpStream::connect(&daemon.address)?;
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(PATIENCE))?;
@@ -52,13 +52,13 @@ pub(crate) fn connect(daemon: &Daemon) -> Result<Secure> {
     Ok(StreamOwned::new(connection, stream))
 }
 
-fn start() -> Result<(Daemon, Node)> {
+fn start_tls_daemon() -> Result<(Daemon, MeterNode)> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
     let config = format!("{CONFIG}[tls]\nserve = \"tls\"\n");
     let daemon = Daemon::start(place, &config, &[])?;
-    crate::push(&daemon)?;
+    crate::push_meter(&daemon)?;
     let made = daemon
         .ctl()?
         .args(["--format", "json", "token", "create", "bench"])
@@ -67,51 +67,56 @@ fn start() -> Result<(Daemon, Node)> {
     let answer: serde_json::Value = serde_json::from_slice(&made.stdout)
         .with_context(|| String::from_utf8_lossy(&made.stderr).into_owned())?;
     let token = answer["secret"].as_str().context("a secret")?;
-    std::fs::write(daemon.place().join("token"), token)?;
-    let node = Node::find(&daemon)?;
+    std::fs::write(daemon.directory().join("token"), token)?;
+    let node = MeterNode::find(&daemon)?;
     Ok((daemon, node))
 }
 
-/// Both figures.
-pub(crate) fn measure(report: &mut Report, plain: &Daemon, node: &Node, only: &str) -> Result<()> {
+/// Measures both figures.
+pub(crate) fn measure(
+    report: &mut BenchReport,
+    plain: &Daemon,
+    node: &MeterNode,
+    only: &str,
+) -> Result<()> {
     let (strings, pictures) = (STRING.contains(only), PICTURES.contains(only));
     if !strings && !pictures {
         return Ok(());
     }
-    let (secure, behind) = start()?;
-    let suite = suite(&secure)?;
+    let (secure, behind) = start_tls_daemon()?;
+    let suite = negotiated_suite(&secure)?;
     if strings {
-        trip(report, [(plain, node), (&secure, &behind)], &suite)?;
+        measure_trips(report, [(plain, node), (&secure, &behind)], &suite)?;
     }
     if pictures {
-        rate(report, [(plain, node), (&secure, &behind)], &suite)?;
+        measure_rate(report, [(plain, node), (&secure, &behind)], &suite)?;
     }
     Ok(())
 }
 
-/// The cipher suite that is agreed on.
-fn suite(daemon: &Daemon) -> Result<String> {
+/// Returns the negotiated cipher suite.
+fn negotiated_suite(daemon: &Daemon) -> Result<String> {
     let mut stream = connect(daemon)?;
     stream.conn.complete_io(&mut stream.sock)?;
     let suite = stream.conn.negotiated_cipher_suite().context("a suite")?;
     Ok(format!("{:?}", suite.suite()))
 }
 
-type Ends<'a> = [(&'a Daemon, &'a Node); 2];
+type DaemonPair<'a> = [(&'a Daemon, &'a MeterNode); 2];
 
-fn trip(report: &mut Report, ends: Ends<'_>, suite: &str) -> Result<()> {
-    let hops = Hops {
+fn measure_trips(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
+    let hops = RelayHops {
         inward: Some("/meter/ping"),
         outward: Some("/meter/pong"),
-        ..Hops::default()
+        ..RelayHops::default()
     };
     let mut best = [[f64::MAX; 2]; 2];
-    let rounds = if full() { 30 } else { 10 };
+    let rounds = if is_full_run() { 30 } else { 10 };
     for round in 1..=rounds {
         eprintln!("{STRING}: round {round} of {rounds}");
         for ((daemon, node), best) in ends.iter().zip(&mut best) {
-            let course = Course { daemon, node, hops };
-            let found = trips::turn(&course, Way::Daemon(Encoding::Json))?;
+            let course = PathTarget { daemon, node, hops };
+            let found = trips::measure_turn(&course, ClientPath::Daemon(Encoding::Json))?;
             for (best, found) in best.iter_mut().zip(found) {
                 *best = best.min(found.as_secs_f64() * 1e6);
             }
@@ -119,49 +124,53 @@ fn trip(report: &mut Report, ends: Ends<'_>, suite: &str) -> Result<()> {
     }
     for (at, name) in ["p50", "p99"].iter().enumerate() {
         let figure = report.figure(format!("{STRING}, {name}"), "µs", best[1][at]);
-        figure.beside("without both", best[0][at]);
+        figure.relative_to("without both", best[0][at]);
         figure.note(format!("{suite}, at both ends"));
         if at == 0 {
-            figure.reach(Target::RatioAtMost(TIMES));
+            figure.require(Target::RatioAtMost(TIMES));
         }
     }
     Ok(())
 }
 
-fn rate(report: &mut Report, ends: Ends<'_>, suite: &str) -> Result<()> {
+fn measure_rate(report: &mut BenchReport, ends: DaemonPair<'_>, suite: &str) -> Result<()> {
     let topic = "/meter/image_out";
-    let hops = Hops {
+    let hops = RelayHops {
         images: true,
         outward: Some(topic),
-        ..Hops::default()
+        ..RelayHops::default()
     };
     let credits = [ends[0].1.credit(topic)?, ends[1].1.credit(topic)?];
     let mut best = [0.0_f64; 2];
-    let rounds = if full() { 20 } else { 6 };
+    let rounds = if is_full_run() { 20 } else { 6 };
     let mut limit = 0.0_f64;
     for round in 1..=rounds {
         eprintln!("{PICTURES}: round {round} of {rounds}");
-        limit = limit.max(openssl(suite)?);
+        limit = limit.max(openssl_speed(suite)?);
         for (((daemon, node), credit), best) in ends.iter().zip(&credits).zip(&mut best) {
-            let course = Course { daemon, node, hops };
-            let (rate, _) = rates::outward(&course, Way::Daemon(Encoding::Raw), credit)?;
+            let course = PathTarget { daemon, node, hops };
+            let (rate, _) =
+                rates::measure_outward(&course, ClientPath::Daemon(Encoding::Raw), credit)?;
             *best = best.max(rate);
         }
     }
     let figure = report.figure(PICTURES, "/s", best[1]);
-    figure.beside("without both", best[0]);
+    figure.relative_to("without both", best[0]);
     // Bytes are encrypted at one end and decrypted at the other.
-    let ciphers = 2e6 * message(true).len() as f64 / limit;
+    let ciphers = 2e6 * serialize_message(true).len() as f64 / limit;
     let added = 1e6 / best[1] - 1e6 / best[0];
     let figure = report.figure(format!("{PICTURES}, added to each"), "µs", added);
-    figure.beside(format!("openssl speed, {}, twice", cipher(suite)), ciphers);
+    figure.relative_to(
+        format!("openssl speed, {}, twice", openssl_cipher(suite)),
+        ciphers,
+    );
     figure.note(format!("both ends are on this machine; {suite}"));
-    figure.reach(Target::RatioAtMost(1.0));
+    figure.require(Target::RatioAtMost(1.0));
     Ok(())
 }
 
-/// openssl's name of what a suite encrypts with.
-fn cipher(suite: &str) -> &'static str {
+/// Returns openssl's name of the cipher of a suite.
+fn openssl_cipher(suite: &str) -> &'static str {
     match suite {
         suite if suite.contains("AES_128") => "aes-128-gcm",
         suite if suite.contains("AES_256") => "aes-256-gcm",
@@ -169,11 +178,11 @@ fn cipher(suite: &str) -> &'static str {
     }
 }
 
-/// Bytes that openssl encrypts in a second on one core, in records of TLS's greatest size.
-fn openssl(suite: &str) -> Result<f64> {
+/// Returns the bytes per second that openssl encrypts on one core, in TLS records of maximum size.
+fn openssl_speed(suite: &str) -> Result<f64> {
     let said = Command::new("openssl")
         .args(["speed", "-elapsed", "-seconds", "1", "-bytes", "16384"])
-        .args(["-evp", cipher(suite)])
+        .args(["-evp", openssl_cipher(suite)])
         .output()
         .context("openssl speed")?;
     ensure!(

@@ -1,53 +1,58 @@
-//! A client that subscribes to pictures and does not read, while 100 MB of them are published a second: what that costs
-//! another client of the same servant, and the daemon.
+//! A client that subscribes to images and never reads, while 100 MB of images are published per second: the effect on
+//! another client of the same servant, and on the daemon.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, full};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, is_full_run};
 
-use crate::contestants::{Course, Encoding, Way};
-use crate::line::Line;
-use crate::node::{Credit, Node};
-use crate::relay::Hops;
+use crate::contestants::{ClientPath, Encoding, PathTarget};
+use crate::line::BenchConnection;
+use crate::node::{MeterNode, PublishCredit};
+use crate::relay::RelayHops;
 use crate::watch::resident;
 
 const PICTURES: &str = "/meter/image_out";
-/// Pictures of 0.92 MB per second.
+/// Images per second, 0.92 MB each.
 const PER_SECOND: u32 = 108;
 
-/// The same load with and without a slow reader.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &str) -> Result<()> {
+/// Measures the same load with and without a slow reader.
+pub(crate) fn measure(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    node: &MeterNode,
+    only: &str,
+) -> Result<()> {
     if !"slow reader".contains(only) {
         return Ok(());
     }
-    let time = Duration::from_secs(if full() { 60 } else { 8 });
-    let hops = Hops {
+    let time = Duration::from_secs(if is_full_run() { 60 } else { 8 });
+    let hops = RelayHops {
         inward: Some("/meter/ping"),
         outward: Some("/meter/pong"),
-        ..Hops::default()
+        ..RelayHops::default()
     };
-    let course = Course { daemon, node, hops };
+    let course = PathTarget { daemon, node, hops };
     let credit = node.credit(PICTURES)?;
     eprintln!("slow reader: {} s without, {0} s with", time.as_secs());
-    // A reader that reads: the same pictures cross the same hops.
+    // A reader that does read, so that the same images cross the same hops.
     let reading = Arc::new(AtomicBool::new(true));
-    let reader = subscribe(daemon)?;
+    let reader = subscribe_to_pictures(daemon)?;
     let thread = std::thread::spawn({
         let reading = reading.clone();
         move || drain(reader, &reading)
     });
-    let without = under_load(&course, &credit, time)?;
+    let without = measure_under_load(&course, &credit, time)?;
     reading.store(false, Ordering::Relaxed);
     thread
         .join()
         .map_err(|_| anyhow!("the reader panicked"))??;
-    let slow = subscribe(daemon)?;
+    let slow = subscribe_to_pictures(daemon)?;
     let before = resident(daemon.pid())?;
-    let with = under_load(&course, &credit, time)?;
+    let with = measure_under_load(&course, &credit, time)?;
     let grown = resident(daemon.pid())? - before;
     drop(slow);
     for (at, name) in [(0, "p50"), (1, "p99")] {
@@ -57,44 +62,49 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon, node: &Node, only: &
                 "µs",
                 with[at],
             )
-            .beside("beside one that reads", without[at])
-            .reach(Target::RatioAtMost(1.5));
+            .relative_to("beside one that reads", without[at])
+            .require(Target::RatioAtMost(1.5));
     }
     report
         .figure("memory for a slow reader", "MB", grown)
-        .reach(Target::AtMost(20.0))
+        .require(Target::AtMost(20.0))
         .note(format!("{} s at 100 MB/s", time.as_secs()));
     Ok(())
 }
 
-fn subscribe(daemon: &Daemon) -> Result<Line> {
-    let mut line = Line::robot(daemon)?;
-    line.say(&format!(
+fn subscribe_to_pictures(daemon: &Daemon) -> Result<BenchConnection> {
+    let mut line = BenchConnection::connect_robot(daemon)?;
+    line.send_text(&format!(
         r#"{{"op":"subscribe","topic":"{PICTURES}","type":"sensor_msgs/Image"}}"#
     ))?;
     Ok(line)
 }
 
-fn drain(mut line: Line, reading: &AtomicBool) -> Result<()> {
+fn drain(mut line: BenchConnection, reading: &AtomicBool) -> Result<()> {
     while reading.load(Ordering::Relaxed) {
-        line.receive()?;
+        line.receive_messages()?;
     }
     Ok(())
 }
 
-/// p50 and p99 of Strings there and back, in µs, one every few milliseconds while pictures are published.
-fn under_load(course: &Course<'_>, credit: &Credit, time: Duration) -> Result<[f64; 2]> {
-    let mut open = course.open(Way::Daemon(Encoding::Json))?;
+/// Returns p50 and p99 of the round trip of a String in µs, with one String every few milliseconds while images are
+/// published.
+fn measure_under_load(
+    course: &PathTarget<'_>,
+    credit: &PublishCredit,
+    time: Duration,
+) -> Result<[f64; 2]> {
+    let mut open = course.open(ClientPath::Daemon(Encoding::Json))?;
     let (begun, mut paid, mut times) = (Instant::now(), 0, Vec::new());
     while begun.elapsed() < time {
         let due = (begun.elapsed().as_secs_f64() * f64::from(PER_SECOND)) as u32;
         if due > paid {
-            credit.pay(due - paid);
+            credit.grant(due - paid);
             paid = due;
         }
         let asked = Instant::now();
         open.line.send(&open.message)?;
-        open.line.receive()?;
+        open.line.receive_messages()?;
         times.push(asked.elapsed());
         std::thread::sleep(Duration::from_millis(3));
     }

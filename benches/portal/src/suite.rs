@@ -1,5 +1,5 @@
-//! rosbridge_suite, which Debian does not package: where `CLOUDROID_ROSBRIDGE_SUITE` names a directory with the sources of its packages for ROS 1,
-//! and of rosauth, which they need, its server runs in the servant beside the node.
+//! rosbridge_suite, which Debian does not package: if `CLOUDROID_ROSBRIDGE_SUITE` names a directory with the sources of
+//! its packages for ROS 1 and of rosauth, which they need, its server runs in the servant next to the node.
 
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
@@ -9,19 +9,20 @@ use anyhow::{Context, Result, ensure};
 use bench_servant::Daemon;
 use ros::net::Sockets;
 
-use crate::line::Line;
-use crate::node::{Inside, Node};
+use crate::line::BenchConnection;
+use crate::node::{MeterNode, MeterSockets};
 
-/// What reports call it.
+/// Name in reports.
 pub(crate) const NAME: &str = "rosbridge_suite";
 const SOURCES: &str = "CLOUDROID_ROSBRIDGE_SUITE";
-/// Where its server listens, inside the servant.
+/// Address of its server, inside the servant.
 const ADDRESS: &str = "127.0.0.1:9090";
-/// The server; publishers of clients that have left are taken back at once.
+/// Command of the server; it unregisters publishers as soon as their clients have left.
 const SERVER: &str = "rosbridge_server/rosbridge_websocket.py _port:=9090 _address:=127.0.0.1 _unregister_timeout:=0.1";
 
-/// Publishes the fixture's node and the server as one service; without the sources, says why not.
-pub(crate) fn push(daemon: &Daemon, fixture: &Path) -> Result<()> {
+/// Publishes the fixture's node and the server as one service; the error says why that is not possible, such as missing
+/// sources.
+pub(crate) fn push_with_fixture(daemon: &Daemon, fixture: &Path) -> Result<()> {
     let sources = std::env::var_os(SOURCES).map(PathBuf::from);
     let sources = sources.with_context(|| {
         format!(
@@ -29,11 +30,11 @@ pub(crate) fn push(daemon: &Daemon, fixture: &Path) -> Result<()> {
         )
     })?;
     eprintln!("pushing rosbridge_fixture with {NAME}: it is compiled");
-    let workspace = daemon.place().join("with_suite");
+    let workspace = daemon.directory().join("with_suite");
     let packages = workspace.join("src");
     std::fs::create_dir_all(&packages)?;
     for from in [&fixture.join("src"), &sources] {
-        // With what is in it, not with its own name.
+        // Copies the directory's content without the directory itself.
         let status = Command::new("cp")
             .arg("-rT")
             .args([from, &packages])
@@ -52,14 +53,14 @@ pub(crate) fn push(daemon: &Daemon, fixture: &Path) -> Result<()> {
     Ok(())
 }
 
-/// A client of it.
-pub(crate) fn client(node: &Node) -> Result<Line> {
-    let inside = Inside::of(node.pid)?;
+/// Connects a client to the server.
+pub(crate) fn connect_client(node: &MeterNode) -> Result<BenchConnection> {
+    let inside = MeterSockets::for_process(node.pid)?;
     let address: SocketAddr = ADDRESS.parse()?;
     let stream = node.runtime.block_on(async {
         let stream: TcpStream = inside.connect(address).await?.into_std()?;
         stream.set_nonblocking(false)?;
         std::io::Result::Ok(stream)
     })?;
-    Line::websocket_over(stream, ADDRESS, "")
+    BenchConnection::upgrade(stream, ADDRESS, "")
 }

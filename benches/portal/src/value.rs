@@ -1,5 +1,5 @@
-//! The plain way: every message becomes a tree of `serde_json::Value`, by walking its type's fields, and then text; and
-//! back. WebSockets by tungstenite.
+//! The straightforward implementation: every message becomes a tree of `serde_json::Value` by walking the fields of its
+//! type, then text; and back. WebSockets are tungstenite's.
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -12,14 +12,14 @@ use serde_json::{Map, Number, Value, json};
 use tokio_tungstenite::tungstenite::protocol::Role;
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
 
-use crate::node::Type;
+use crate::node::TypeDescription;
 
-/// Serves one client of the WebSocket: what it publishes goes `there`, what comes `back` it is sent.
+/// Serves one WebSocket client: forwards its publications to `there` and sends it what arrives on `back`.
 pub(crate) fn serve(
     client: TcpStream,
     there: (Option<&str>, Option<TcpStream>),
     back: (Option<&str>, Option<TcpStream>),
-    kind: Type,
+    kind: TypeDescription,
 ) -> Result<()> {
     let kind = MessageType::from_full_text(kind.name, kind.definition)?;
     let writer = client.try_clone()?;
@@ -27,8 +27,8 @@ pub(crate) fn serve(
     if let (Some(topic), Some(back)) = back {
         let (topic, kind) = (topic.to_owned(), kind.clone());
         let socket = WebSocket::from_raw_socket(writer, Role::Server, None);
-        // It ends with the process.
-        std::thread::spawn(move || outward(back, socket, &topic, &kind));
+        // The thread ends with the process.
+        std::thread::spawn(move || forward_messages(back, socket, &topic, &kind));
     }
     let mut there = there.1;
     loop {
@@ -47,7 +47,7 @@ pub(crate) fn serve(
     }
 }
 
-fn outward(
+fn forward_messages(
     mut node: TcpStream,
     mut socket: WebSocket<TcpStream>,
     topic: &str,

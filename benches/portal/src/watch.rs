@@ -1,4 +1,4 @@
-//! What a process needs, as the kernel counts it.
+//! Resources of a process, from the kernel's counters.
 
 use std::fs;
 use std::sync::Arc;
@@ -8,33 +8,33 @@ use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
 
-/// Between two looks at the memory.
+/// Sampling interval of the memory.
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Megabytes (10⁶).
+/// Memory in megabytes (10⁶).
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Memory {
-    /// Resident.
+pub(crate) struct PeakMemory {
+    /// Resident set size.
     pub(crate) rss: f64,
-    /// What is shared counted in proportion.
+    /// Proportional set size: shared pages are divided among their users.
     pub(crate) pss: f64,
 }
 
-/// Keeps the most that was seen.
-pub(crate) struct Watch {
+/// A thread that records the peak memory of a process.
+pub(crate) struct MemoryWatch {
     over: Arc<AtomicBool>,
-    thread: JoinHandle<Result<Memory>>,
+    thread: JoinHandle<Result<PeakMemory>>,
 }
 
-impl Watch {
-    /// Watches the process from now on.
-    pub(crate) fn over(pid: i32) -> Self {
+impl MemoryWatch {
+    /// Starts to watch a process.
+    pub(crate) fn start(pid: i32) -> Self {
         let over = Arc::new(AtomicBool::new(false));
         let ended = over.clone();
-        // The kernel's own high-water mark begins anew; where it may not be written, it stays what it is.
+        // Resets the kernel's own high-water mark; without permission it keeps its value.
         let _ = fs::write(format!("/proc/{pid}/clear_refs"), "5");
         let thread = std::thread::spawn(move || {
-            let mut most = Memory::default();
+            let mut most = PeakMemory::default();
             while !ended.load(Ordering::Relaxed) {
                 most.pss = most.pss.max(field(pid, "smaps_rollup", "Pss:")?);
                 std::thread::sleep(PAUSE);
@@ -45,8 +45,8 @@ impl Watch {
         Self { over, thread }
     }
 
-    /// The most since.
-    pub(crate) fn end(self) -> Result<Memory> {
+    /// Stops watching and returns the peak since the start.
+    pub(crate) fn stop(self) -> Result<PeakMemory> {
         self.over.store(true, Ordering::Relaxed);
         self.thread
             .join()
@@ -54,7 +54,7 @@ impl Watch {
     }
 }
 
-/// Megabytes now.
+/// Returns the resident memory in megabytes.
 pub(crate) fn resident(pid: i32) -> Result<f64> {
     field(pid, "status", "VmRSS:")
 }
@@ -70,11 +70,11 @@ fn field(pid: i32, file: &str, name: &str) -> Result<f64> {
     Ok(kilobytes.trim().parse::<f64>()? * 1024.0 / 1e6)
 }
 
-/// Time on a processor so far, of all threads, in steps of 10 ms.
-pub(crate) fn processor(pid: i32) -> Result<Duration> {
+/// Returns the processor time of all threads so far, in steps of 10 ms.
+pub(crate) fn processor_time(pid: i32) -> Result<Duration> {
     let path = format!("/proc/{pid}/stat");
     let text = fs::read_to_string(&path).with_context(|| path.clone())?;
-    // After the name in parentheses: state is field 3; utime and stime are 14 and 15.
+    // The fields after the name in parentheses start with state, field 3; utime and stime are 14 and 15.
     let fields = text
         .rsplit(')')
         .next()

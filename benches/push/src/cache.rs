@@ -1,12 +1,12 @@
-//! A cache of this bench's own that begins with what the user's holds.
+//! A separate cache for this benchmark, filled from the user's.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-/// Fills `place/cache` with the user's cached layers, notes and lists, and gives its path for `XDG_CACHE_HOME`.
-pub(crate) fn copy(place: &Path) -> Result<PathBuf> {
+/// Fills `place/cache` with the user's cached layers, notes and lists; returns its path for `XDG_CACHE_HOME`.
+pub(crate) fn copy_user_cache(place: &Path) -> Result<PathBuf> {
     let variable = |name| {
         std::env::var_os(name)
             .filter(|value| !value.is_empty())
@@ -19,21 +19,22 @@ pub(crate) fn copy(place: &Path) -> Result<PathBuf> {
         .join("cloudroid");
     let cache = place.join("cache");
     for part in ["layers", "chains", "notes", "apt"] {
-        fill(&users.join(part), &cache.join("cloudroid").join(part))?;
+        copy_tree(&users.join(part), &cache.join("cloudroid").join(part))?;
     }
     Ok(cache)
 }
 
-/// Fills `to` with what `from` has of the base layer (by its digest) and of downloads, and nothing else.
-pub(crate) fn base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<()> {
+/// Copies the base layer (with digest `base`) and the downloads from the cache `from` to the cache `to`, and nothing
+/// else.
+pub(crate) fn copy_base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<()> {
     let (from, to) = (from.join("cloudroid"), to.join("cloudroid"));
-    fill(&from.join("apt"), &to.join("apt"))?;
+    copy_tree(&from.join("apt"), &to.join("apt"))?;
     let (layers, kept) = (from.join("layers"), to.join("layers"));
     fs::create_dir_all(&kept)?;
     for entry in fs::read_dir(&layers)? {
         let record = entry?.path();
         let archive = record.with_extension("tar.gz");
-        if crate::packages::is_of(&record, base) && archive.exists() {
+        if crate::packages::is_record_of_layer(&record, base) && archive.exists() {
             for path in [&record, &archive] {
                 let name = path.file_name().unwrap_or_default();
                 fs::copy(path, kept.join(name))?;
@@ -43,9 +44,9 @@ pub(crate) fn base_and_downloads(from: &Path, to: &Path, base: &str) -> Result<(
     Ok(())
 }
 
-/// Copies what is below `from`, where there is anything; layers, packages and lists of files, which are replaced and never
-/// written to, by a link. What is copied keeps its time: by it lists are known, and found to be old.
-fn fill(from: &Path, to: &Path) -> Result<()> {
+/// Copies the tree below `from`, if it exists; layers, packages and lists of files, which are replaced and never
+/// modified, are hard-linked. Copies keep their modification times, which decide whether lists are up to date.
+fn copy_tree(from: &Path, to: &Path) -> Result<()> {
     let Ok(entries) = fs::read_dir(from) else {
         return Ok(());
     };
@@ -55,12 +56,12 @@ fn fill(from: &Path, to: &Path) -> Result<()> {
         let (source, target) = (entry.path(), to.join(entry.file_name()));
         let kind = entry.file_type()?;
         if kind.is_dir() {
-            fill(&source, &target)?;
+            copy_tree(&source, &target)?;
             continue;
         }
         let name = entry.file_name().to_string_lossy().into_owned();
         let whole = [".gz", ".deb"].iter().any(|ending| name.ends_with(ending));
-        // A link fails on another filesystem; a copy may fail because another daemon has tidied up meanwhile.
+        // Linking fails across file systems; copying may fail because another daemon has cleaned up meanwhile.
         let linked = whole && fs::hard_link(&source, &target).is_ok();
         if kind.is_file() && !linked && source.exists() {
             let copying = || format!("copying {}", source.display());

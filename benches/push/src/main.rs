@@ -1,5 +1,5 @@
-//! `make bench ONLY=push`: what a push costs beside one that it shares something with: a package that needs nearly the
-//! same, a workspace of which one package changed, an install space that has not changed. Needs root.
+//! `make bench ONLY=push`: cost of a push that shares something with an earlier one: a package with nearly the same
+//! dependencies, a workspace in which one package changed, an install space without changes. Needs root.
 
 #![forbid(unsafe_code)]
 
@@ -13,37 +13,37 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, Pushed, full, space};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, TimedPush, is_full_run, write_install_space};
 use rand::{RngCore, SeedableRng, rngs::StdRng};
 
 /// Title of the step in which the image is started once (`cloudroidd`'s push).
 const PROBE: &str = "starting it once";
-/// What a push without changes may take besides, in seconds.
+/// Time that a push without changes may take besides that step, in seconds.
 const BOUND: f64 = 2.0;
-/// Bytes of data in the bigger space: a model, say. Noise, so that no compressor makes it small.
+/// Bytes of data in the larger space, such as a model; noise, so that it cannot be compressed.
 const MODEL: usize = 64 << 20;
 
 fn main() -> Result<()> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    // Base and dependencies are as cached on this machine; what is pushed here must be new to it, every time.
-    let cache = cache::copy(place.path())?;
+    // Base and dependencies may be cached on this machine; what is pushed here must be new to it every time.
+    let cache = cache::copy_user_cache(place.path())?;
     let daemon = Daemon::start(place, "", &[("XDG_CACHE_HOME", &cache)])?;
     eprintln!(
         "pushing a launch file for topic_tools/relay: base and dependencies are made now, if they are not cached"
     );
-    let first = space(daemon.place(), "launch_only", None)?;
-    push(&daemon, &first)?;
-    let relay = relay_of(&daemon)?;
-    let mut report = Report::new("push");
+    let first = write_install_space(daemon.directory(), "launch_only", None)?;
+    push_launch_file(&daemon, &first)?;
+    let relay = find_relay(&daemon)?;
+    let mut report = BenchReport::new("push");
     workspace::measure(&mut report, &daemon)?;
     for (package, size, data) in [
         ("small_space", "one node", 0),
         ("big_space", "one node and 64 MiB of data", MODEL),
     ] {
-        let space = space(daemon.place(), package, Some(&relay))?;
+        let space = write_install_space(daemon.directory(), package, Some(&relay))?;
         if data > 0 {
             let mut model = vec![0; data];
             StdRng::seed_from_u64(1).fill_bytes(&mut model);
@@ -57,12 +57,12 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-fn push(daemon: &Daemon, space: &Path) -> Result<Pushed> {
+fn push_launch_file(daemon: &Daemon, space: &Path) -> Result<TimedPush> {
     daemon.push(&[space.to_str().context("UTF-8")?, "--launch", "relay.launch"])
 }
 
-/// The node's program, out of the image.
-fn relay_of(daemon: &Daemon) -> Result<PathBuf> {
+/// Returns the node's executable from the image.
+fn find_relay(daemon: &Daemon) -> Result<PathBuf> {
     let layers = fs::read_dir(daemon.home().join("layers"))?;
     let mut found =
         layers.filter_map(|layer| Some(layer.ok()?.path().join("usr/lib/topic_tools/relay")));
@@ -71,21 +71,23 @@ fn relay_of(daemon: &Daemon) -> Result<PathBuf> {
         .context("topic_tools/relay in a layer")
 }
 
-fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Result<()> {
+fn measure(report: &mut BenchReport, daemon: &Daemon, space: &Path, size: &str) -> Result<()> {
     eprintln!("pushing {size}");
-    let first = push(daemon, space)?;
-    let made = first.layers_made()?;
+    let first = push_launch_file(daemon, space)?;
+    let made = first.built_layers()?;
     ensure!(
         made == ["package"],
         "only the package is new at the first push, and not {made:?}"
     );
-    let rounds = if full() { 15 } else { 5 };
+    let rounds = if is_full_run() { 15 } else { 5 };
     let (mut rebuilt, mut rests, mut probes, mut totals) = (0, vec![], vec![], vec![]);
     for round in 1..=rounds {
         eprintln!("again, {round} of {rounds}");
-        let again = push(daemon, space)?;
-        let probe = again.step(PROBE).context("a push tells of its probe")?;
-        rebuilt += again.layers_made()?.len();
+        let again = push_launch_file(daemon, space)?;
+        let probe = again
+            .step_duration(PROBE)
+            .context("a push tells of its probe")?;
+        rebuilt += again.built_layers()?.len();
         rests.push(again.total - probe);
         probes.push(probe);
         totals.push(again.total);
@@ -93,7 +95,9 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
     let median = |times: &[Duration]| {
         bench_report::quantile(times, 0.5).map_or(f64::NAN, |time| time.as_secs_f64())
     };
-    let first_probe = first.step(PROBE).context("a push tells of its probe")?;
+    let first_probe = first
+        .step_duration(PROBE)
+        .context("a push tells of its probe")?;
     let probe = median(&probes);
     report
         .figure(
@@ -101,15 +105,15 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
             "layers",
             rebuilt as f64,
         )
-        .reach(Target::AtMost(0.0));
+        .require(Target::AtMost(0.0));
     report
         .figure(
             format!("{size}, again: without the probe"),
             "s",
             median(&rests),
         )
-        .beside("first push", (first.total - first_probe).as_secs_f64())
-        .reach(Target::AtMost(BOUND))
+        .relative_to("first push", (first.total - first_probe).as_secs_f64())
+        .require(Target::AtMost(BOUND))
         .note(format!("median of {rounds}; the probe {probe:.2} s"));
     report
         .figure(
@@ -117,6 +121,6 @@ fn measure(report: &mut Report, daemon: &Daemon, space: &Path, size: &str) -> Re
             "s",
             median(&totals),
         )
-        .beside("first push", first.total.as_secs_f64());
+        .relative_to("first push", first.total.as_secs_f64());
     Ok(())
 }

@@ -1,45 +1,48 @@
-//! Two packages of the distribution that share nearly all that they need: what the second one costs beside the first.
+//! Two packages of the distribution that share nearly all of their dependencies: cost of the second push compared with
+//! the first.
 
 use std::fs;
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, Pushed};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, TimedPush};
 use serde_json::Value;
 
 use crate::{PROBE, cache, steps};
 
-/// What the second may cost, of what the first did.
+/// Limit for the cost of the second push, as a fraction of the first.
 const BOUND: f64 = 0.2;
-/// The first, and one whose dependencies are those of the first and itself.
+/// The first package, and one whose dependencies are the first and those of the first.
 const PACKAGES: [&str; 2] = ["image_proc", "stereo_image_proc"];
 
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let place = place()?;
-    // Once with whatever this user has cached, for the base and the downloads.
-    let begun = cache::copy(place.path())?;
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    let place = temporary_directory()?;
+    // A first run with whatever this user has cached, for the base and the downloads.
+    let begun = cache::copy_user_cache(place.path())?;
     let daemon = Daemon::start(place, "", &[("XDG_CACHE_HOME", &begun)])?;
     let mut base = None;
     for package in PACKAGES {
         eprintln!("pushing {package} for what it downloads");
-        base = Some(base_of(&push(&daemon, package)?)?);
+        base = Some(base_digest(&push_package(&daemon, package)?)?);
     }
-    let second = self::place()?;
+    let second = self::temporary_directory()?;
     let fresh = second.path().join("cache");
-    cache::base_and_downloads(&begun, &fresh, &base.context("two packages")?)?;
+    cache::copy_base_and_downloads(&begun, &fresh, &base.context("two packages")?)?;
     drop(daemon);
     let daemon = Daemon::start(second, "", &[("XDG_CACHE_HOME", &fresh)])?;
     let mut costs = Vec::new();
     for package in PACKAGES {
         eprintln!("pushing {package} with the base and all downloads in the cache");
-        let pushed = push(&daemon, package)?;
-        steps::tell(report, package, &pushed);
-        let probe = pushed.step(PROBE).context("a push tells of its probe")?;
+        let pushed = push_package(&daemon, package)?;
+        steps::report_steps(report, package, &pushed);
+        let probe = pushed
+            .step_duration(PROBE)
+            .context("a push tells of its probe")?;
         costs.push((
-            (pushed.total - probe - pushed.opening()).as_secs_f64(),
+            (pushed.total - probe - pushed.time_to_first_step()).as_secs_f64(),
             pushed.total.as_secs_f64(),
-            pushed.layers_made()?.len(),
+            pushed.built_layers()?.len(),
         ));
     }
     let [first, second] = costs[..] else {
@@ -51,8 +54,8 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
             "s",
             second.0,
         )
-        .beside("image_proc", first.0)
-        .reach(Target::RatioAtMost(BOUND))
+        .relative_to("image_proc", first.0)
+        .require(Target::RatioAtMost(BOUND))
         .note(format!("layers made: {} and {}", second.2, first.2));
     report
         .figure(
@@ -60,23 +63,23 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
             "s",
             second.1,
         )
-        .beside("image_proc", first.1);
+        .relative_to("image_proc", first.1);
     Ok(())
 }
 
-fn place() -> Result<tempfile::TempDir> {
+fn temporary_directory() -> Result<tempfile::TempDir> {
     Ok(tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?)
 }
 
-fn push(daemon: &Daemon, package: &str) -> Result<Pushed> {
+fn push_package(daemon: &Daemon, package: &str) -> Result<TimedPush> {
     daemon.push(&["--apt", package, "--node", package])
 }
 
-/// The digest of the base layer.
-fn base_of(pushed: &Pushed) -> Result<String> {
-    let layers = pushed.done()?["layers"]
+/// Returns the digest of the base layer.
+fn base_digest(pushed: &TimedPush) -> Result<String> {
+    let layers = pushed.done_event()?["layers"]
         .as_array()
         .context("done names the layers")?;
     let base = layers.iter().find(|layer| layer["name"] == "base");
@@ -84,8 +87,8 @@ fn base_of(pushed: &Pushed) -> Result<String> {
     Ok(digest.context("an image has a base")?.to_owned())
 }
 
-/// Whether a record of the cache is that of a layer.
-pub(crate) fn is_of(record: &Path, digest: &str) -> bool {
+/// Returns whether a record of the cache belongs to the layer with this digest.
+pub(crate) fn is_record_of_layer(record: &Path, digest: &str) -> bool {
     let record: Option<Value> = fs::read(record)
         .ok()
         .and_then(|text| serde_json::from_slice(&text).ok());

@@ -1,9 +1,9 @@
-//! Where the time of a push goes.
+//! Time spent in each kind of step of a push.
 
-use bench_report::Report;
-use bench_servant::Pushed;
+use bench_report::BenchReport;
+use bench_servant::TimedPush;
 
-/// Titles that mean one kind of step, whatever they count.
+/// Titles of steps, and the kind of step that each belongs to.
 const KINDS: [(&str, &str); 10] = [
     ("fetching package lists", "lists"),
     ("downloading", "downloading"),
@@ -17,11 +17,11 @@ const KINDS: [(&str, &str); 10] = [
     ("starting it once", "probe"),
 ];
 
-/// Adds the seconds of each kind of step that a push had.
-pub(crate) fn tell(report: &mut Report, name: &str, pushed: &Pushed) {
+/// Adds a figure, in seconds, for each kind of step that the push had.
+pub(crate) fn report_steps(report: &mut BenchReport, name: &str, pushed: &TimedPush) {
     let mut told = Vec::new();
     for (title, kind) in KINDS {
-        let Some(time) = pushed.step(title) else {
+        let Some(time) = pushed.step_duration(title) else {
             continue;
         };
         match told.iter_mut().find(|(known, _)| *known == kind) {

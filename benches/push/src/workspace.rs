@@ -1,44 +1,46 @@
-//! A workspace of three packages, each of which needs the one before: what it costs to compile all of them, one again, none
-//! again, and the rest after one of them failed.
+//! A workspace of three packages, each of which depends on the one before: cost of compiling all of them, one again,
+//! none again, and the rest after one of them failed.
 
 use std::fs;
 use std::path::Path;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, Pushed};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, TimedPush};
 
 use crate::{PROBE, steps};
 
-/// Sources of a library that take a while: as many as this.
+/// Number of source files of a library, so that compiling takes a while.
 const SOURCES: usize = 6;
-/// What a push with one of three packages changed may cost, of what compiling all cost.
+/// Limit for a push in which one of three packages changed, as a fraction of a push that compiles all.
 const BOUND: f64 = 0.7;
 
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
-    let workspace = daemon.place().join("bench_ws");
-    lay_out(&workspace)?;
+pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon) -> Result<()> {
+    let workspace = daemon.directory().join("bench_ws");
+    write_workspace(&workspace)?;
     eprintln!("pushing a workspace whose last package cannot be compiled");
     let app = workspace.join("src/bench_app/src/app.cpp");
     let good = fs::read_to_string(&app)?;
     fs::write(&app, good.replace("ros::spin()", "ros::no_such_function()"))?;
     ensure!(
-        push(daemon, &workspace).is_err(),
+        push_workspace(daemon, &workspace).is_err(),
         "a push that cannot be compiled fails"
     );
     fs::write(&app, &good)?;
     eprintln!("pushing it fixed");
-    let fixed = push(daemon, &workspace)?;
+    let fixed = push_workspace(daemon, &workspace)?;
     eprintln!("pushing it unchanged");
-    let unchanged = push(daemon, &workspace)?;
+    let unchanged = push_workspace(daemon, &workspace)?;
     eprintln!("pushing it with all packages changed");
     for package in ["bench_msgs", "bench_lib", "bench_app"] {
         fs::write(workspace.join("src").join(package).join("NOTE"), "changed")?;
     }
-    let all = push(daemon, &workspace)?;
-    steps::tell(report, "workspace of three", &all);
-    let cost = |pushed: &Pushed| -> Result<f64> {
-        let probe = pushed.step(PROBE).context("a push tells of its probe")?;
+    let all = push_workspace(daemon, &workspace)?;
+    steps::report_steps(report, "workspace of three", &all);
+    let cost = |pushed: &TimedPush| -> Result<f64> {
+        let probe = pushed
+            .step_duration(PROBE)
+            .context("a push tells of its probe")?;
         Ok((pushed.total - probe).as_secs_f64())
     };
     for (name, pushed, bound) in [
@@ -51,8 +53,8 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
                 "s",
                 cost(pushed)?,
             )
-            .beside("all changed", cost(&all)?)
-            .reach(Target::RatioAtMost(bound));
+            .relative_to("all changed", cost(&all)?)
+            .require(Target::RatioAtMost(bound));
     }
     eprintln!("pushing it with a mistake in the last CMakeLists.txt");
     let list = workspace.join("src/bench_app/CMakeLists.txt");
@@ -61,7 +63,7 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
     fs::write(workspace.join("src/bench_lib/NOTE"), "changed again")?;
     let begun = std::time::Instant::now();
     ensure!(
-        push(daemon, &workspace).is_err(),
+        push_workspace(daemon, &workspace).is_err(),
         "a push that cannot be configured fails"
     );
     report
@@ -70,17 +72,17 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon) -> Result<()> {
             "s",
             begun.elapsed().as_secs_f64(),
         )
-        .beside("all changed", cost(&all)?)
-        .reach(Target::BelowFloor);
+        .relative_to("all changed", cost(&all)?)
+        .require(Target::BelowFloor);
     Ok(())
 }
 
-fn push(daemon: &Daemon, workspace: &Path) -> Result<Pushed> {
+fn push_workspace(daemon: &Daemon, workspace: &Path) -> Result<TimedPush> {
     let path = workspace.to_str().context("UTF-8")?;
     daemon.push(&[path, "--node", "bench_app/app"])
 }
 
-fn lay_out(workspace: &Path) -> Result<()> {
+fn write_workspace(workspace: &Path) -> Result<()> {
     let write = |path: &str, text: &str| -> Result<()> {
         let path = workspace.join("src").join(path);
         fs::create_dir_all(path.parent().context("below the workspace")?)?;

@@ -1,23 +1,23 @@
-//! What every bench reports: a figure, the floor or peer it was measured beside in the same run, and what was to be
-//! reached.
+//! Report format of all benchmarks: figures, each with the floor or peer measured in the same run and the required
+//! target.
 //!
 //! ```text
-//! use bench_report::{Race, Report, Target};
+//! use bench_report::{BenchReport, Race, Target};
 //!
 //! # fn ours() {} fn theirs() {}
-//! let mut report = Report::new("queue");
+//! let mut report = BenchReport::new("queue");
 //! let mut race = Race::new(20);
 //! race.add("ours", ours);
 //! race.add("theirs", theirs);
 //! let times = race.run();
 //! report
 //!     .figure("hand-over", "µs", times[0].best_micros())
-//!     .beside("theirs", times[1].best_micros())
-//!     .reach(Target::RatioAtMost(1.0));
+//!     .relative_to("theirs", times[1].best_micros())
+//!     .require(Target::RatioAtMost(1.0));
 //! report.finish().unwrap();
 //! ```
-//! Absolute numbers belong to the machine they were measured on, so its description is part of the report, and
-//! targets are best given as ratios.
+//! Absolute numbers are specific to a machine, so the report contains a description of the machine; targets are best
+//! given as ratios.
 
 #![forbid(unsafe_code)]
 
@@ -25,32 +25,32 @@ mod machine;
 mod race;
 mod table;
 
-pub use machine::Machine;
-pub use race::{Race, Times, children_time, quantile, thread_time};
+pub use machine::MachineDescription;
+pub use race::{Race, Times, children_processor_time, quantile, thread_processor_time};
 
 use serde::Serialize;
 use std::io;
 use std::path::PathBuf;
 
-/// What a figure has to reach.
+/// A requirement for a figure.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Target {
-    /// The value itself.
+    /// The value is at least this.
     AtLeast(f64),
-    /// The value itself.
+    /// The value is at most this.
     AtMost(f64),
-    /// The value divided by the floor's.
+    /// The value divided by the floor is at least this.
     RatioAtLeast(f64),
-    /// The value divided by the floor's.
+    /// The value divided by the floor is at most this.
     RatioAtMost(f64),
-    /// More than the floor.
+    /// The value is greater than the floor.
     AboveFloor,
-    /// Less than the floor.
+    /// The value is less than the floor.
     BelowFloor,
 }
 
 impl Target {
-    fn met(self, value: f64, floor: Option<f64>) -> bool {
+    fn is_met(self, value: f64, floor: Option<f64>) -> bool {
         let floor = floor.unwrap_or(f64::NAN);
         match self {
             Self::AtLeast(bound) => value >= bound,
@@ -77,77 +77,77 @@ impl Target {
 /// One measured number.
 #[derive(Clone, Debug, Serialize)]
 pub struct Figure {
-    /// What was measured.
+    /// Name of the figure.
     pub figure: String,
-    /// In what unit.
+    /// Unit.
     pub unit: String,
-    /// The number.
+    /// Value.
     pub value: f64,
-    /// What it was measured beside.
+    /// Name of the peer or floor.
     pub peer: Option<String>,
-    /// The peer's number, in the same unit.
+    /// The peer's value, in the same unit.
     pub floor: Option<f64>,
     /// `value / floor`
     pub ratio: Option<f64>,
-    /// What was to be reached.
+    /// Target, in words.
     pub to_reach: Option<String>,
-    /// Whether it was.
+    /// True if the target was met; `None` without a target.
     pub met: Option<bool>,
-    /// What one must know to read the number.
+    /// Remark that is needed to interpret the number.
     pub note: Option<String>,
 }
 
 impl Figure {
-    /// Names the peer or floor measured in the same run, and its number.
-    pub fn beside(&mut self, peer: impl Into<String>, floor: f64) -> &mut Self {
+    /// Sets the peer or floor that was measured in the same run, and its value.
+    pub fn relative_to(&mut self, peer: impl Into<String>, floor: f64) -> &mut Self {
         self.peer = Some(peer.into());
         self.floor = Some(floor);
         self.ratio = (floor != 0.0).then(|| self.value / floor);
         self
     }
 
-    /// Says what is to be reached; call it after [`Figure::beside`].
-    pub fn reach(&mut self, target: Target) -> &mut Self {
+    /// Sets the target; call it after [`Figure::relative_to`].
+    pub fn require(&mut self, target: Target) -> &mut Self {
         self.to_reach = Some(target.describe());
-        self.met = Some(target.met(self.value, self.floor));
+        self.met = Some(target.is_met(self.value, self.floor));
         self
     }
 
-    /// Adds what one must know to read the number.
+    /// Adds a remark that is needed to interpret the number.
     pub fn note(&mut self, note: impl Into<String>) -> &mut Self {
         self.note = Some(note.into());
         self
     }
 }
 
-/// All figures of one bench.
+/// All figures of one benchmark.
 #[derive(Debug, Serialize)]
-pub struct Report {
-    /// The bench's name, and its file's.
+pub struct BenchReport {
+    /// Name of the benchmark and of its file.
     pub bench: String,
-    /// Where it ran.
-    pub machine: Machine,
-    /// In the order they were measured.
+    /// Machine on which it ran.
+    pub machine: MachineDescription,
+    /// Figures in the order in which they were measured.
     pub figures: Vec<Figure>,
-    /// What was to be measured and was not.
-    pub left_out: Vec<LeftOut>,
+    /// Measurements that could not be made.
+    pub left_out: Vec<SkippedMeasurement>,
 }
 
 /// Something that could not be measured on this machine.
 #[derive(Clone, Debug, Serialize)]
-pub struct LeftOut {
-    /// What it is.
+pub struct SkippedMeasurement {
+    /// Name of the measurement.
     pub what: String,
-    /// Why.
+    /// Reason.
     pub why: String,
 }
 
-impl Report {
-    /// A report that will be written to `target/bench/NAME.json`.
+impl BenchReport {
+    /// Creates a report that will be written to `target/bench/NAME.json`.
     pub fn new(name: &str) -> Self {
         Self {
             bench: name.to_owned(),
-            machine: Machine::describe(),
+            machine: MachineDescription::describe(),
             figures: Vec::new(),
             left_out: Vec::new(),
         }
@@ -170,19 +170,19 @@ impl Report {
         &mut self.figures[last]
     }
 
-    /// Names what could not be measured, and why.
-    pub fn left_out(&mut self, what: impl Into<String>, why: impl Into<String>) {
+    /// Records what could not be measured, and why.
+    pub fn skip(&mut self, what: impl Into<String>, why: impl Into<String>) {
         let (what, why) = (what.into(), why.into());
         eprintln!("{what} is left out: {why}");
-        self.left_out.push(LeftOut { what, why });
+        self.left_out.push(SkippedMeasurement { what, why });
     }
 
-    /// Whether every figure that had something to reach reached it.
-    pub fn all_met(&self) -> bool {
+    /// Returns whether every figure with a target met it.
+    pub fn meets_targets(&self) -> bool {
         self.figures.iter().all(|figure| figure.met != Some(false))
     }
 
-    /// Prints the table and writes the file; returns where.
+    /// Prints the table and writes the file; returns its path.
     pub fn finish(&self) -> io::Result<PathBuf> {
         print!("{}", table::render(self));
         let directory = root().join("target/bench");
@@ -196,7 +196,7 @@ impl Report {
     }
 }
 
-/// The repository: the nearest directory upwards that holds a `Cargo.lock`, else the current one.
+/// Returns the repository: the nearest ancestor directory with a `Cargo.lock`, or else the current directory.
 pub fn root() -> PathBuf {
     let here = std::env::current_dir().unwrap_or_default();
     here.ancestors()
@@ -211,18 +211,18 @@ mod tests {
 
     #[test]
     fn a_figure_knows_whether_it_was_met() {
-        let mut report = Report::new("test");
+        let mut report = BenchReport::new("test");
         report
             .figure("speed", "MB/s", 30.0)
-            .beside("peer", 100.0)
-            .reach(Target::RatioAtLeast(0.3));
+            .relative_to("peer", 100.0)
+            .require(Target::RatioAtLeast(0.3));
         report
             .figure("size", "B", 120.0)
-            .beside("peer", 100.0)
-            .reach(Target::RatioAtMost(1.2));
+            .relative_to("peer", 100.0)
+            .require(Target::RatioAtMost(1.2));
         report
             .figure("saved", "%", 50.0)
-            .reach(Target::AtMost(40.0));
+            .require(Target::AtMost(40.0));
         assert_eq!(
             report
                 .figures
@@ -232,25 +232,25 @@ mod tests {
             [Some(true), Some(true), Some(false)]
         );
         assert_eq!(report.figures[0].ratio, Some(0.3));
-        assert!(!report.all_met());
+        assert!(!report.meets_targets());
     }
 
     #[test]
     fn a_target_without_its_floor_is_not_met() {
-        let mut report = Report::new("test");
+        let mut report = BenchReport::new("test");
         report
             .figure("speed", "MB/s", 30.0)
-            .reach(Target::RatioAtLeast(0.3));
-        assert!(!report.all_met());
+            .require(Target::RatioAtLeast(0.3));
+        assert!(!report.meets_targets());
     }
 
     #[test]
     fn the_table_shows_every_figure() {
-        let mut report = Report::new("test");
+        let mut report = BenchReport::new("test");
         report
             .figure("speed", "MB/s", 30.0)
-            .beside("peer", 100.0)
-            .reach(Target::AboveFloor)
+            .relative_to("peer", 100.0)
+            .require(Target::AboveFloor)
             .note("cold");
         let table = table::render(&report);
         assert!(
@@ -261,8 +261,8 @@ mod tests {
 
     #[test]
     fn what_is_left_out_is_in_table_and_file() {
-        let mut report = Report::new("test");
-        report.left_out("a peer", "it is not installed");
+        let mut report = BenchReport::new("test");
+        report.skip("a peer", "it is not installed");
         assert!(table::render(&report).contains("a peer is left out: it is not installed"));
         let text = serde_json::to_string(&report).expect("JSON");
         assert!(

@@ -1,27 +1,27 @@
-//! Where a bench ran.
+//! Description of the machine on which a benchmark ran.
 
 use serde::Serialize;
 use std::fs;
 
-/// The machine's description, from `/proc`.
+/// A machine, described from `/proc`.
 #[derive(Clone, Debug, Serialize)]
-pub struct Machine {
-    /// The processor's model.
+pub struct MachineDescription {
+    /// Processor model.
     pub processor: String,
-    /// How many processors the bench may use.
+    /// Number of processors that the benchmark may use.
     pub processors: usize,
     /// Memory, in GiB.
     pub memory_gib: f64,
-    /// The kernel's release.
+    /// Kernel release.
     pub kernel: String,
-    /// The distribution.
+    /// Distribution.
     pub system: String,
-    /// The load when the bench began: other work makes times longer and ratios noisier.
+    /// Load average at the start: other work makes times longer and ratios noisier.
     pub load: f64,
 }
 
-impl Machine {
-    /// Describes this machine; what cannot be read is left empty.
+impl MachineDescription {
+    /// Describes this machine; values that cannot be read are left empty.
     pub fn describe() -> Self {
         let read = |path: &str| fs::read_to_string(path).unwrap_or_default();
         let field = |text: &str, key: &str, separator: char| -> String {

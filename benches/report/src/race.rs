@@ -1,25 +1,25 @@
-//! Peers measured in turns, so that what disturbs one disturbs all, and in processor time, so that little does.
+//! Compares runners in turns, so that disturbances affect all of them, and by processor time, so that few do.
 
 use rustix::time::{ClockId, clock_gettime};
 use std::time::Duration;
 
-/// The times of one runner.
+/// Run times of one runner.
 #[derive(Clone, Debug)]
 pub struct Times {
-    /// Its name.
+    /// Name of the runner.
     pub name: String,
-    /// Sorted, shortest first.
+    /// Times, shortest first.
     pub sorted: Vec<Duration>,
 }
 
-/// The value that a fraction `0.0..=1.0` of `values` stays below; none of none.
+/// Returns the quantile of `values` at a fraction `0.0..=1.0`; `None` for an empty slice.
 pub fn quantile<T: Copy + PartialOrd>(values: &[T], fraction: f64) -> Option<T> {
     let mut sorted = values.to_vec();
     sorted.sort_by(|one, other| one.partial_cmp(other).unwrap_or(std::cmp::Ordering::Equal));
-    of_sorted(&sorted, fraction)
+    quantile_of_sorted(&sorted, fraction)
 }
 
-fn of_sorted<T: Copy>(sorted: &[T], fraction: f64) -> Option<T> {
+fn quantile_of_sorted<T: Copy>(sorted: &[T], fraction: f64) -> Option<T> {
     let last = sorted.len().checked_sub(1)?;
     sorted
         .get((fraction * last as f64).round() as usize)
@@ -27,19 +27,19 @@ fn of_sorted<T: Copy>(sorted: &[T], fraction: f64) -> Option<T> {
 }
 
 impl Times {
-    /// The shortest: what the code takes when nothing disturbs it.
+    /// Shortest time: the cost of the code without disturbances.
     pub fn best(&self) -> Duration {
         self.quantile(0.0)
     }
 
-    /// The middle one.
+    /// Median time.
     pub fn median(&self) -> Duration {
         self.quantile(0.5)
     }
 
-    /// The time that a fraction `0.0..=1.0` of the runs stays below.
+    /// Quantile of the times at a fraction `0.0..=1.0`.
     pub fn quantile(&self, fraction: f64) -> Duration {
-        of_sorted(&self.sorted, fraction).unwrap_or_default()
+        quantile_of_sorted(&self.sorted, fraction).unwrap_or_default()
     }
 
     /// [`Times::best`] in microseconds.
@@ -47,22 +47,23 @@ impl Times {
         self.best().as_secs_f64() * 1e6
     }
 
-    /// Megabytes (10⁶) per second at the best time, for `bytes` per run.
+    /// Throughput in megabytes (10⁶) per second at the best time, for `bytes` per run.
     pub fn megabytes_per_second(&self, bytes: usize) -> f64 {
         bytes as f64 / 1e6 / self.best().as_secs_f64().max(1e-12)
     }
 }
 
-/// Processor time of this thread so far: what is left of a measurement when other work takes the processor away.
-pub fn thread_time() -> Duration {
+/// Returns the processor time of this thread so far, which does not include time taken by other work.
+pub fn thread_processor_time() -> Duration {
     let time = clock_gettime(ClockId::ThreadCPUTime);
     Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
 }
 
-/// Processor time of the child processes that have ended and were waited for.
-pub fn children_time() -> Duration {
+/// Returns the processor time of the child processes that have ended and been waited for.
+pub fn children_processor_time() -> Duration {
     let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // After the name in parentheses: state is field 3; cutime and cstime are 16 and 17, in hundredths of a second.
+    // The fields after the name in parentheses start with state, field 3; cutime and cstime are 16 and 17, in
+    // hundredths of a second.
     let fields = text
         .rsplit(')')
         .next()
@@ -76,14 +77,14 @@ pub fn children_time() -> Duration {
     Duration::from_millis(ticks * 10)
 }
 
-/// Runs several things in turns, each on this thread alone: what counts is the thread's processor time.
+/// Runs several functions in turns on this thread and measures the thread's processor time.
 pub struct Race<'a> {
     rounds: usize,
     runners: Vec<(String, Box<dyn FnMut() + 'a>)>,
 }
 
 impl<'a> Race<'a> {
-    /// A race of so many rounds, after one that does not count.
+    /// Creates a race of `rounds` counted rounds, preceded by one warm-up round.
     pub fn new(rounds: usize) -> Self {
         Self {
             rounds,
@@ -91,13 +92,13 @@ impl<'a> Race<'a> {
         }
     }
 
-    /// Adds a runner. What it computes should go through [`std::hint::black_box`].
+    /// Adds a runner. Results of the computation should go through [`std::hint::black_box`].
     pub fn add(&mut self, name: impl Into<String>, runner: impl FnMut() + 'a) -> &mut Self {
         self.runners.push((name.into(), Box::new(runner)));
         self
     }
 
-    /// Runs, and returns the times in the order the runners were added.
+    /// Runs all runners; returns their times in the order in which they were added.
     pub fn run(mut self) -> Vec<Times> {
         let mut times: Vec<Times> = self
             .runners
@@ -109,9 +110,9 @@ impl<'a> Race<'a> {
             .collect();
         for round in 0..=self.rounds {
             for ((_, runner), times) in self.runners.iter_mut().zip(&mut times) {
-                let start = thread_time();
+                let start = thread_processor_time();
                 runner();
-                let took = thread_time() - start;
+                let took = thread_processor_time() - start;
                 if round > 0 {
                     times.sorted.push(took);
                 }

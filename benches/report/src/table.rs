@@ -1,10 +1,10 @@
-//! The table people read.
+//! The table that is printed for readers.
 
-use crate::{Figure, Report};
+use crate::{BenchReport, Figure};
 use std::fmt::Write as _;
 
-/// Three significant digits, without an exponent.
-fn number(value: f64) -> String {
+/// Formats with three significant digits, without an exponent.
+fn format_number(value: f64) -> String {
     match value.abs() {
         size if size >= 100.0 => format!("{value:.0}"),
         size if size >= 10.0 => format!("{value:.1}"),
@@ -12,12 +12,12 @@ fn number(value: f64) -> String {
     }
 }
 
-/// Percentages near a hundred differ in their decimals.
-fn value(figure: &Figure) -> String {
+/// Formats the value of a figure; percentages get two decimals, because those near a hundred differ only there.
+fn format_value(figure: &Figure) -> String {
     if figure.unit == "%" {
         format!("{:.2}", figure.value)
     } else {
-        number(figure.value)
+        format_number(figure.value)
     }
 }
 
@@ -29,7 +29,7 @@ fn verdict(figure: &Figure) -> &'static str {
     }
 }
 
-pub(crate) fn render(report: &Report) -> String {
+pub(crate) fn render(report: &BenchReport) -> String {
     let machine = &report.machine;
     let mut text = format!(
         "{}: {} × {}, {} GiB, {}, Linux {}, load {}\n",
@@ -46,12 +46,12 @@ pub(crate) fn render(report: &Report) -> String {
         .iter()
         .map(|figure| {
             let floor = match (figure.floor, &figure.peer) {
-                (Some(floor), Some(peer)) => format!("{} {peer}", number(floor)),
+                (Some(floor), Some(peer)) => format!("{} {peer}", format_number(floor)),
                 _ => String::new(),
             };
             [
                 figure.figure.clone(),
-                format!("{} {}", value(figure), figure.unit),
+                format!("{} {}", format_value(figure), figure.unit),
                 floor,
                 figure
                     .ratio

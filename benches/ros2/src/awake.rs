@@ -1,22 +1,23 @@
-//! Keeps the processors awake while times of microseconds are measured. A core that has nothing to do is halted; on a virtual machine, to wake one
-//! takes longer than all else that is measured, and whether a process meets a core that is awake is chance: medians of the same way differ
-//! by three times. A loop that gives way to everybody (`SCHED_IDLE`) on each core takes that out.
+//! Keeps the processors awake while durations of microseconds are measured. An idle core is halted; on a virtual
+//! machine, waking it takes longer than everything that is measured, and whether a process meets a core that is awake
+//! is a matter of chance: medians of the same path differ by a factor of three. A loop of the lowest priority
+//! (`SCHED_IDLE`) on each core removes this effect.
 
 use std::io;
 use std::process::Command;
 
 use anyhow::Result;
 
-use crate::world::Program;
+use crate::world::BenchProgram;
 
-/// Until this is dropped.
-pub(crate) struct Awake {
-    _loops: Vec<Program>,
+/// Keeps all cores awake until drop.
+pub(crate) struct AwakeCores {
+    _loops: Vec<BenchProgram>,
 }
 
-impl Awake {
-    /// One loop for each core.
-    pub(crate) fn all() -> Result<Self> {
+impl AwakeCores {
+    /// Starts one loop per core.
+    pub(crate) fn start() -> Result<Self> {
         let cores = std::thread::available_parallelism()?.get();
         let one = |core: usize| {
             let mut command = Command::new("chrt");
@@ -24,15 +25,15 @@ impl Awake {
                 .args(["--idle", "0"])
                 .arg(std::env::current_exe()?)
                 .args(["inside", "awake"]);
-            Program::start_quietly(command, &format!("what keeps core {core} awake"))
+            BenchProgram::start_quietly(command, &format!("what keeps core {core} awake"))
         };
         let loops = (0..cores).map(one).collect::<Result<_>>()?;
         Ok(Self { _loops: loops })
     }
 }
 
-/// Plays the role: until its standard input ends, so that it does not outlive who started it.
-pub(crate) fn play() -> Result<()> {
+/// Runs the role until its standard input ends, so that it does not outlive its parent.
+pub(crate) fn run() -> Result<()> {
     std::thread::spawn(|| {
         loop {
             std::hint::spin_loop();

@@ -1,5 +1,5 @@
-//! The roles of `roles.rs` once more, played by a bus (`ros::bus`), which is what the portal and the stub hold; and actions, which only a
-//! bus has.
+//! The roles of `roles.rs` on a bus (`ros::bus`), which is the interface that portal and stub use; and actions, which
+//! only a bus provides.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,8 +9,8 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, Bus, GoalEnd, GoalEvents, Outcome, Publisher, Qos, RosVersion, ServiceHandler,
-    ServiceType, Subscription, WireType, reaches,
+    ActionHandler, Bus, GoalEnd, GoalEvents, GoalOutcome, Publisher, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType, wait_for_connected,
 };
 use ros::net::HostSockets;
 use ros::schema::ActionDef;
@@ -18,94 +18,96 @@ use serde_json::json;
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 
 use crate::message::{self, TEXT};
-use crate::roles::{PATIENCE, WARM, quantiles, say, until_asked};
+use crate::roles::{PATIENCE, WARM, print_json, quantiles, wait_for_request};
 use crate::types;
 
-/// As rclpy's nodes have it that these roles meet.
-const QUALITY: Qos = Qos::keep_last(10);
-/// Discovery takes no longer.
+/// Quality of service of the rclpy nodes that these roles communicate with.
+const QUALITY: QosProfile = QosProfile::keep_last(10);
+/// Maximum time for discovery.
 const LONG: Duration = Duration::from_secs(15);
 
-/// Plays the role.
-pub(crate) async fn play(words: &[&str]) -> Result<()> {
+/// Runs the role that `words` names.
+pub(crate) async fn run(words: &[&str]) -> Result<()> {
     match words {
-        ["relay"] => relay().await,
-        ["trips", count] => trips(count.parse()?).await,
-        ["calls", count] => calls(count.parse()?).await,
-        ["goals", count] => goals(count.parse()?).await,
+        ["relay"] => run_relay().await,
+        ["trips", count] => time_trips(count.parse()?).await,
+        ["calls", count] => time_calls(count.parse()?).await,
+        ["goals", count] => time_goals(count.parse()?).await,
         _ => bail!("no role of a bus is called {words:?}"),
     }
 }
 
-/// What the types are.
-struct Types {
+/// The types of the benchmark's topics, services and actions.
+struct BenchTypes {
     string: WireType,
     call: ServiceType,
     goal: Arc<ActionDef>,
 }
 
-impl Types {
+impl BenchTypes {
     fn new() -> Result<Self> {
         let known = types::registry()?;
         Ok(Self {
-            string: WireType::of(&*known.message(types::STRING)?),
-            call: ServiceType::of(&*known.service(types::CALL)?),
+            string: WireType::from_message(&*known.message(types::STRING)?),
+            call: ServiceType::from_service(&*known.service(types::CALL)?),
             goal: known.action(types::GOAL)?,
         })
     }
 }
 
-async fn join(node: &str) -> Result<Arc<dyn Bus>> {
+async fn join_bus(node: &str) -> Result<Arc<dyn Bus>> {
     let options = JoinOptions::in_domain(0, node);
     Ok(ros::connect(RosVersion::Two, Arc::new(HostSockets), options).await?)
 }
 
-struct Answers;
+struct EchoService;
 
 #[async_trait]
-impl ServiceHandler for Answers {
+impl ServiceHandler for EchoService {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        Ok(message::response(&request))
+        Ok(message::set_bool_response(&request))
     }
 }
 
-struct Takes(UnboundedSender<String>);
+struct GoalQueue(UnboundedSender<String>);
 
-impl ActionHandler for Takes {
-    fn goal(&self, id: &str, _goal: Bytes) -> Result<(), String> {
+impl ActionHandler for GoalQueue {
+    fn on_goal(&self, id: &str, _goal: Bytes) -> Result<(), String> {
         self.0
             .send(id.to_owned())
             .map_err(|_| "nobody carries it out".to_owned())
     }
 
-    fn cancel(&self, _id: &str) {}
+    fn on_cancel(&self, _id: &str) {}
 
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         eprintln!("the action is not served: {reason}");
     }
 }
 
-/// Brings every ping back, answers calls, and ends each goal after one feedback.
-async fn relay() -> Result<()> {
-    let (types, bus) = (Types::new()?, join("/relay").await?);
+/// Runs the role `relay`: returns every ping, answers calls, and ends each goal after one feedback.
+async fn run_relay() -> Result<()> {
+    let (types, bus) = (BenchTypes::new()?, join_bus("/relay").await?);
     let mut pings = bus
         .subscribe("/ping", types.string.clone(), QUALITY)
         .await?;
     let pong = bus.advertise("/pong", types.string, QUALITY).await?;
-    let _served = bus.serve("/setbool", types.call, Arc::new(Answers)).await?;
+    let _served = bus
+        .serve("/setbool", types.call, Arc::new(EchoService))
+        .await?;
     let (sender, mut ids) = unbounded_channel();
-    let server = bus.serve_action("/fibonacci", &types.goal, Arc::new(Takes(sender)))?;
-    say(&json!({}));
+    let server = bus.serve_action("/fibonacci", &types.goal, Arc::new(GoalQueue(sender)))?;
+    print_json(&json!({}));
     let work = async {
         loop {
             tokio::select! {
                 Some(ping) = pings.messages.recv() => pong.publish(ping.bytes),
                 Some(id) = ids.recv() => {
-                    server.feedback(&id, message::numbers());
-                    server.end(&id, GoalEnd {
-                        outcome: Outcome::Succeeded,
+                    server.publish_feedback(&id, message::fibonacci_sequence());
+                    server.end_goal(&id, GoalEnd {
+                        outcome: GoalOutcome::Succeeded,
                         text: String::new(),
-                        result: message::numbers(),
+                        result: message::fibonacci_sequence(),
                     });
                 }
             }
@@ -113,19 +115,19 @@ async fn relay() -> Result<()> {
     };
     tokio::select! {
         () = work => {}
-        asked = until_asked() => drop(asked?),
+        asked = wait_for_request() => drop(asked?),
     }
     bus.close().await;
     Ok(())
 }
 
-/// The other side of [`relay`]'s topics, connected in both directions.
-async fn connected(bus: &dyn Bus, of: WireType) -> Result<(Box<dyn Publisher>, Subscription)> {
+/// Connects to the topics of [`run_relay`] in both directions.
+async fn connect_topics(bus: &dyn Bus, of: WireType) -> Result<(Box<dyn Publisher>, Subscription)> {
     let pongs = bus.subscribe("/pong", of.clone(), QUALITY).await?;
     let pings = bus.advertise("/ping", of, QUALITY).await?;
     let both = async {
-        reaches(pings.matched(), 1).await;
-        reaches(pongs.matched.clone(), 1).await;
+        wait_for_connected(pings.matched_subscribers(), 1).await;
+        wait_for_connected(pongs.matched.clone(), 1).await;
     };
     tokio::time::timeout(LONG, both)
         .await
@@ -133,11 +135,11 @@ async fn connected(bus: &dyn Bus, of: WireType) -> Result<(Box<dyn Publisher>, S
     Ok((pings, pongs))
 }
 
-/// Strings there and back, one at a time.
-async fn trips(count: usize) -> Result<()> {
-    let (types, bus) = (Types::new()?, join("/asks").await?);
-    let (pings, mut pongs) = connected(&*bus, types.string).await?;
-    say(&json!({}));
+/// Measures round trips of Strings, one at a time.
+async fn time_trips(count: usize) -> Result<()> {
+    let (types, bus) = (BenchTypes::new()?, join_bus("/asks").await?);
+    let (pings, mut pongs) = connect_topics(&*bus, types.string).await?;
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let text = message::string(&format!("{TEXT}, {number}"));
@@ -150,78 +152,83 @@ async fn trips(count: usize) -> Result<()> {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-/// Calls, one at a time.
-async fn calls(count: usize) -> Result<()> {
-    let bus = join("/asks").await?;
+/// Measures calls, one at a time.
+async fn time_calls(count: usize) -> Result<()> {
+    let bus = join_bus("/asks").await?;
     let mut graph = bus.graph();
     let known = graph.wait_for(|graph| graph.services.contains_key("/setbool"));
     tokio::time::timeout(LONG, known)
         .await
         .context("no server")??;
-    // The first call waits until the server knows of our ends.
-    bus.call("/setbool", message::request(true), LONG).await?;
-    say(&json!({}));
+    // The first call waits until the server has discovered our endpoints.
+    bus.call("/setbool", message::set_bool_request(true), LONG)
+        .await?;
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
-        bus.call("/setbool", message::request(true), PATIENCE)
+        bus.call("/setbool", message::set_bool_request(true), PATIENCE)
             .await?;
         if number >= WARM {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-struct Hears {
+struct GoalListener {
     ends: UnboundedSender<Result<GoalEnd, String>>,
     feedbacks: UnboundedSender<()>,
 }
 
-impl GoalEvents for Hears {
-    fn feedback(&self, _feedback: Bytes) {
-        // Counted where the goal has not been given up.
+impl GoalEvents for GoalListener {
+    fn on_feedback(&self, _feedback: Bytes) {
+        // The receiver is gone if the goal has been given up.
         let _ = self.feedbacks.send(());
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let _ = self.ends.send(end);
     }
 }
 
-/// Goals from their sending to their result, one at a time.
-async fn goals(count: usize) -> Result<()> {
-    let (types, bus) = (Types::new()?, join("/asks").await?);
+/// Measures goals from sending to result, one at a time.
+async fn time_goals(count: usize) -> Result<()> {
+    let (types, bus) = (BenchTypes::new()?, join_bus("/asks").await?);
     let client = bus.action_client("/fibonacci", &types.goal)?;
-    client.ready(LONG).await?;
+    client.wait_for_server(LONG).await?;
     let (ends, mut ended) = unbounded_channel();
     let (feedbacks, mut fed) = unbounded_channel();
-    let events: Arc<dyn GoalEvents> = Arc::new(Hears { ends, feedbacks });
-    say(&json!({}));
+    let events: Arc<dyn GoalEvents> = Arc::new(GoalListener { ends, feedbacks });
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
-        client.send(&number.to_string(), message::order(), events.clone());
-        let end = next(&mut ended).await?.map_err(anyhow::Error::msg)?;
-        ensure!(end.outcome == Outcome::Succeeded, "{end:?}");
+        client.send_goal(
+            &number.to_string(),
+            message::fibonacci_goal(),
+            events.clone(),
+        );
+        let end = next_event(&mut ended).await?.map_err(anyhow::Error::msg)?;
+        ensure!(end.outcome == GoalOutcome::Succeeded, "{end:?}");
         if number >= WARM {
             times.push(begun.elapsed());
         }
     }
-    // Each was told once how it gets on.
+    // Every goal has had one feedback.
     for _ in 0..count + WARM {
-        next(&mut fed).await.context("a feedback")?;
+        next_event(&mut fed).await.context("a feedback")?;
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-async fn next<T>(events: &mut UnboundedReceiver<T>) -> Result<T> {
+async fn next_event<T>(events: &mut UnboundedReceiver<T>) -> Result<T> {
     tokio::time::timeout(PATIENCE, events.recv())
         .await?
         .context("the bus is closed")

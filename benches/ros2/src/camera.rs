@@ -1,25 +1,25 @@
-//! The roles that send pictures and take them.
+//! The roles that send and receive images.
 
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use rtps::Sample;
+use rtps::ReceivedSample;
 use serde_json::{Value, json};
 use tokio::sync::mpsc::UnboundedReceiver;
 
-use crate::ends::{join, matched, quality, reads, writes};
+use crate::ends::{create_reader, create_writer, join, qos_profile, wait_until_matched};
 use crate::message::{self, IMAGE, Size};
 use crate::process::Process;
-use crate::roles::{say, until_asked};
+use crate::roles::{print_json, wait_for_request};
 
 const PICTURES: (&str, &str) = ("rt/pictures", IMAGE);
-/// As often each second.
+/// Images per second.
 pub(crate) const RATE: f64 = 30.0;
-/// Both sides know of each other after that.
+/// Time until both sides have discovered each other.
 pub(crate) const SETTLED: Duration = Duration::from_millis(500);
 
-/// `sends WIDTH HEIGHT FRAMES RELIABLE`: what it took of the processor, and how many frames were late.
-pub(crate) async fn sends(words: &[&str]) -> Result<()> {
+/// Runs the role `sends WIDTH HEIGHT FRAMES RELIABLE`; prints its processor time and how many frames were late.
+pub(crate) async fn send_pictures(words: &[&str]) -> Result<()> {
     let [width, height, frames, reliable] = words else {
         anyhow::bail!("it takes width, height, frames, reliable");
     };
@@ -29,68 +29,68 @@ pub(crate) async fn sends(words: &[&str]) -> Result<()> {
     };
     let frames: u32 = frames.parse()?;
     let participant = join().await?;
-    let writer = writes(&participant, PICTURES, quality(*reliable == "1"));
-    say(&json!({}));
-    matched(writer.ends()).await?;
+    let writer = create_writer(&participant, PICTURES, qos_profile(*reliable == "1"));
+    print_json(&json!({}));
+    wait_until_matched(writer.watch_matches()).await?;
     tokio::time::sleep(SETTLED).await;
-    let this = Process::this();
-    let (before, mut due, mut late) = (this.processor("")?, Instant::now(), 0);
+    let this = Process::current();
+    let (before, mut due, mut late) = (this.live_thread_time("")?, Instant::now(), 0);
     for number in 0..frames {
         writer.write(message::picture(number, size));
         due += Duration::from_secs_f64(1.0 / RATE);
         late += u32::from(Instant::now() > due);
         tokio::time::sleep_until(due.into()).await;
     }
-    // What is still being sent again.
+    // Time for retransmissions.
     tokio::time::sleep(Duration::from_secs(2)).await;
-    let spent = (this.processor("")? - before).as_secs_f64() * 1e3;
-    say(&json!({
-        "processor": spent, "late": late, "dropped": writer.dropped(), "peak": this.peak()?,
+    let spent = (this.live_thread_time("")? - before).as_secs_f64() * 1e3;
+    print_json(&json!({
+        "processor": spent, "late": late, "dropped": writer.dropped_samples(), "peak": this.peak()?,
     }));
-    until_asked().await.map(drop)
+    wait_for_request().await.map(drop)
 }
 
-/// `takes RELIABLE`: what came, when asked.
-pub(crate) async fn takes(words: &[&str]) -> Result<()> {
+/// Runs the role `takes RELIABLE`; prints what was received when asked.
+pub(crate) async fn receive_pictures(words: &[&str]) -> Result<()> {
     let participant = join().await?;
-    let (_reader, mut samples) = reads(&participant, PICTURES, quality(words == ["1"]));
-    let this = Process::this();
-    let before = this.processor("")?;
-    say(&json!({}));
-    let mut seen = Seen::default();
+    let (_reader, mut samples) = create_reader(&participant, PICTURES, qos_profile(words == ["1"]));
+    let this = Process::current();
+    let before = this.live_thread_time("")?;
+    print_json(&json!({}));
+    let mut seen = FrameStatistics::default();
     tokio::select! {
         () = seen.watch(&mut samples) => {}
-        asked = until_asked() => drop(asked?),
+        asked = wait_for_request() => drop(asked?),
     }
-    let spent = (this.processor("")? - before).as_secs_f64() * 1e3;
-    let mut told = seen.told();
+    let spent = (this.live_thread_time("")? - before).as_secs_f64() * 1e3;
+    let mut told = seen.to_json();
     told["processor"] = spent.into();
     told["peak"] = this.peak()?.into();
     told["after"] = this.resident()?.into();
-    say(&told);
+    print_json(&told);
     Ok(())
 }
 
-/// What has come.
+/// Statistics of the received frames.
 #[derive(Default)]
-pub(crate) struct Seen {
+pub(crate) struct FrameStatistics {
     came: u32,
     reordered: u32,
     last: Option<u32>,
     ages: Vec<Duration>,
 }
 
-impl Seen {
-    async fn watch(&mut self, samples: &mut UnboundedReceiver<Sample>) {
+impl FrameStatistics {
+    async fn watch(&mut self, samples: &mut UnboundedReceiver<ReceivedSample>) {
         while let Some(sample) = samples.recv().await {
-            if self.take(&sample.payload).is_none() {
+            if self.record(&sample.payload).is_none() {
                 eprintln!("a sample of {} bytes is no picture", sample.payload.len());
             }
         }
     }
 
-    /// As an answer to whoever asks.
-    pub(crate) fn told(&self) -> Value {
+    /// Returns the statistics in the form in which a role prints them.
+    pub(crate) fn to_json(&self) -> Value {
         let milliseconds = |share| {
             let age = bench_report::quantile(&self.ages, share);
             age.map_or(f64::NAN, |age| age.as_secs_f64() * 1e3)
@@ -100,9 +100,9 @@ impl Seen {
         })
     }
 
-    /// Counts a picture; none where it is no picture.
-    pub(crate) fn take(&mut self, payload: &[u8]) -> Option<()> {
-        let (number, age) = message::of_picture(payload)?;
+    /// Records an image; returns `None` if the payload is not one.
+    pub(crate) fn record(&mut self, payload: &[u8]) -> Option<()> {
+        let (number, age) = message::parse_picture(payload)?;
         self.came += 1;
         self.reordered += u32::from(self.last.is_some_and(|last| number <= last));
         self.last = self.last.max(Some(number));
@@ -111,8 +111,8 @@ impl Seen {
     }
 }
 
-/// Widths, heights and frames as words for either side's role.
-pub(crate) fn words(size: Size, frames: u32, reliable: bool) -> [String; 4] {
+/// Width, height, number of frames and reliability as arguments of the role of either side.
+pub(crate) fn role_arguments(size: Size, frames: u32, reliable: bool) -> [String; 4] {
     let reliable = u8::from(reliable).to_string();
     [
         size.width.to_string(),
@@ -122,8 +122,8 @@ pub(crate) fn words(size: Size, frames: u32, reliable: bool) -> [String; 4] {
     ]
 }
 
-/// So many frames take so long, and what is sent again.
-pub(crate) fn patience(frames: u32) -> Duration {
+/// Maximum duration of a transfer of `frames` frames, including retransmissions.
+pub(crate) fn transfer_timeout(frames: u32) -> Duration {
     Duration::from_secs_f64(f64::from(frames) / RATE * 1.5) + Duration::from_secs(30)
 }
 
@@ -133,9 +133,9 @@ mod tests {
 
     #[test]
     fn what_comes_after_a_later_one_is_out_of_order() {
-        let mut seen = Seen::default();
+        let mut seen = FrameStatistics::default();
         for number in [0, 1, 3, 2, 4] {
-            seen.take(&message::picture(
+            seen.record(&message::picture(
                 number,
                 Size {
                     width: 2,
@@ -145,6 +145,6 @@ mod tests {
             .expect("a picture");
         }
         assert_eq!((seen.came, seen.reordered), (5, 1));
-        assert!(seen.take(b"no picture").is_none());
+        assert!(seen.record(b"no picture").is_none());
     }
 }

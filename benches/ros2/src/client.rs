@@ -1,5 +1,5 @@
-//! A client of rosbridge in the same network as the server, whoever's that is: `bench-ros2 inside client ROLE …`. It does little
-//! besides waiting, and the same for every server.
+//! A rosbridge client in the same network as the server under measurement: `bench-ros2 inside client ROLE …`. It does
+//! little besides waiting, and the same for every server.
 
 use std::io::ErrorKind;
 use std::net::TcpStream;
@@ -7,50 +7,50 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail, ensure};
-use rosbridge::{Format, Frame, Op, Writer};
+use rosbridge::{Format, Op, ProtocolFrame, Writer};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::{self, Error, Message, WebSocket};
 
-use crate::camera::{self, RATE, Seen};
+use crate::camera::{self, FrameStatistics, RATE};
 use crate::message::{self, Size, TEXT};
 use crate::portal::ADDRESS;
-use crate::roles::{WARM, quantiles, say};
+use crate::roles::{WARM, print_json, quantiles};
 use crate::types;
 
-/// A server starts and discovers nodes within this.
+/// Maximum time for a server to start and to discover nodes.
 const LONG: Duration = Duration::from_secs(15);
-/// What takes longer does not come.
+/// Time after which an answer counts as missing.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// What is said again until it is answered, so often.
+/// Interval at which a message is repeated until it is answered.
 const AGAIN: Duration = Duration::from_millis(20);
-/// The first call or goal waits so long for its server to be discovered before another one is sent, under another name: servers refuse a
-/// goal whose name is under way.
+/// Time that the first call or goal has for its server to be discovered before another one is sent, under another id:
+/// servers refuse a goal whose id is in use.
 const FIRST: Duration = Duration::from_secs(1);
-/// A picture of 6 MB and what is around it.
+/// Limit of a message: more than an image of 6 MB with its envelope.
 const LARGEST: usize = 32 << 20;
 
-/// Plays the role.
-pub(crate) fn play(words: &[&str]) -> Result<()> {
+/// Runs the role that `words` names.
+pub(crate) fn run(words: &[&str]) -> Result<()> {
     match words {
-        ["trips", count] => trips(count.parse()?),
-        ["calls", count] => calls(count.parse()?),
-        ["goals", count] => goals(count.parse()?),
-        ["joins"] => joins(),
+        ["trips", count] => time_trips(count.parse()?),
+        ["calls", count] => time_calls(count.parse()?),
+        ["goals", count] => time_goals(count.parse()?),
+        ["joins"] => time_join(),
         ["sends", width, height, frames, reliable] => {
             let (width, height) = (width.parse()?, height.parse()?);
-            sends(Size { width, height }, frames.parse()?, reliable)
+            send_pictures(Size { width, height }, frames.parse()?, reliable)
         }
-        ["takes", reliable] => takes(reliable),
+        ["takes", reliable] => receive_pictures(reliable),
         _ => bail!("no role of a client is called {words:?}"),
     }
 }
 
-/// One connection.
-struct Client(WebSocket<TcpStream>);
+/// A connection to the server.
+struct BenchClient(WebSocket<TcpStream>);
 
-impl Client {
-    /// Connects, once the server listens.
+impl BenchClient {
+    /// Connects as soon as the server listens.
     fn connect() -> Result<Self> {
         let limit = Instant::now() + LONG;
         let stream = loop {
@@ -74,7 +74,7 @@ impl Client {
         }
     }
 
-    fn say(&mut self, op: &Value) -> Result<()> {
+    fn send_op(&mut self, op: &Value) -> Result<()> {
         self.send(Message::text(op.to_string()))
     }
 
@@ -82,8 +82,8 @@ impl Client {
         self.0.send(message).context("the connection is gone")
     }
 
-    /// The next message, if one comes.
-    fn hear(&mut self, patience: Duration) -> Result<Option<Message>> {
+    /// Returns the next message, or `None` if none arrives in time.
+    fn receive(&mut self, patience: Duration) -> Result<Option<Message>> {
         self.0.get_ref().set_read_timeout(Some(patience))?;
         loop {
             match self.0.read() {
@@ -100,9 +100,9 @@ impl Client {
         }
     }
 
-    /// Waits for a text with these words.
-    fn text_with(&mut self, words: &str, patience: Duration) -> Result<Option<String>> {
-        while let Some(message) = self.hear(patience)? {
+    /// Waits for a text message that contains `words`.
+    fn receive_text_with(&mut self, words: &str, patience: Duration) -> Result<Option<String>> {
+        while let Some(message) = self.receive(patience)? {
             if let Message::Text(text) = message
                 && text.contains(words)
             {
@@ -112,8 +112,8 @@ impl Client {
         Ok(None)
     }
 
-    /// Says what `op` gives for each attempt until what is wanted comes.
-    fn until(
+    /// Sends what `op` returns for each attempt until `wanted` accepts a message.
+    fn repeat_until(
         &mut self,
         op: impl Fn(usize) -> Value,
         patience: Duration,
@@ -122,9 +122,9 @@ impl Client {
         let limit = Instant::now() + LONG;
         let mut last = Value::Null;
         for attempt in 0.. {
-            self.say(&op(attempt))?;
+            self.send_op(&op(attempt))?;
             let again = Instant::now() + patience;
-            while let Some(message) = self.hear(patience)? {
+            while let Some(message) = self.receive(patience)? {
                 if let Message::Text(text) = message {
                     last = serde_json::from_str(&text)?;
                     if wanted(&last) {
@@ -143,7 +143,7 @@ impl Client {
     }
 }
 
-fn quality(reliable: &str) -> Value {
+fn qos_json(reliable: &str) -> Value {
     let reliability = match reliable {
         "1" => "reliable",
         _ => "best_effort",
@@ -151,10 +151,10 @@ fn quality(reliable: &str) -> Value {
     json!({"reliability": reliability, "history": "keep_last", "depth": 5})
 }
 
-/// `count` times what `op` gives for a number, until the text with the words that it gives has come, which must be an `answer`; one at a
-/// time.
-fn timed(
-    client: &mut Client,
+/// Sends what `op` returns for each number and waits for a text that contains the words which `op` returns with it;
+/// `answer` must accept that text. Makes `count` such exchanges, one at a time.
+fn time_exchanges(
+    client: &mut BenchClient,
     count: usize,
     op: impl Fn(usize) -> (Value, String),
     answer: impl Fn(&Value) -> bool,
@@ -165,10 +165,10 @@ fn timed(
         let message = Message::text(op.to_string());
         let begun = Instant::now();
         client.send(message)?;
-        let text = client.text_with(&words, PATIENCE)?;
+        let text = client.receive_text_with(&words, PATIENCE)?;
         let took = begun.elapsed();
         let text = text.with_context(|| format!("no answer to {op}"))?;
-        // Not a status that tells why there is none.
+        // The text could also be a status that says why there is no answer.
         ensure!(answer(&serde_json::from_str(&text)?), "{op} brings {text}");
         if number >= WARM {
             times.push(took);
@@ -177,81 +177,84 @@ fn timed(
     Ok(times)
 }
 
-/// Strings there and back, one at a time.
-fn trips(count: usize) -> Result<()> {
-    let mut client = Client::connect()?;
-    client.say(&json!({"op": "subscribe", "topic": "/pong", "type": types::STRING}))?;
-    client.say(&json!({"op": "advertise", "topic": "/ping", "type": types::STRING}))?;
+/// Measures round trips of Strings, one at a time.
+fn time_trips(count: usize) -> Result<()> {
+    let mut client = BenchClient::connect()?;
+    client.send_op(&json!({"op": "subscribe", "topic": "/pong", "type": types::STRING}))?;
+    client.send_op(&json!({"op": "advertise", "topic": "/ping", "type": types::STRING}))?;
     let publish = |text: &str| json!({"op": "publish", "topic": "/ping", "msg": {"data": text}});
-    client.until(
+    client.repeat_until(
         |_| publish("first"),
         AGAIN,
         |heard| heard["msg"]["data"] == "first",
     )?;
-    say(&json!({}));
+    print_json(&json!({}));
     let op = |number| {
         let text = format!("{TEXT}, {number}");
         (publish(&text), format!("{text}\""))
     };
-    let times = timed(&mut client, count, op, |heard| heard["topic"] == "/pong")?;
-    say(&quantiles(&times));
+    let times = time_exchanges(&mut client, count, op, |heard| heard["topic"] == "/pong")?;
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-/// Calls, one at a time.
-fn calls(count: usize) -> Result<()> {
-    let mut client = Client::connect()?;
-    let call = |id: &str| json!({"op": "call_service", "id": id, "service": "/setbool", "type": types::CALL, "args": {"data": true}});
+/// Measures calls, one at a time.
+fn time_calls(count: usize) -> Result<()> {
+    let mut client = BenchClient::connect()?;
+    let call = |id: &str| {
+        json!({"op": "call_service", "id": id, "service": "/setbool", "type": types::CALL,
+        "args": {"data": true}})
+    };
     let answer = |heard: &Value| heard["values"]["success"] == true;
-    client.until(|attempt| call(&format!("first-{attempt}")), FIRST, answer)?;
-    say(&json!({}));
+    client.repeat_until(|attempt| call(&format!("first-{attempt}")), FIRST, answer)?;
+    print_json(&json!({}));
     let op = |number| {
         let id = format!("call-{number}");
         (call(&id), format!("\"{id}\""))
     };
-    say(&quantiles(&timed(&mut client, count, op, answer)?));
+    print_json(&quantiles(&time_exchanges(&mut client, count, op, answer)?));
     Ok(())
 }
 
-/// Goals from their sending to their result, one at a time.
-fn goals(count: usize) -> Result<()> {
-    let mut client = Client::connect()?;
+/// Measures goals from sending to result, one at a time.
+fn time_goals(count: usize) -> Result<()> {
+    let mut client = BenchClient::connect()?;
     let goal = |id: &str| {
         json!({"op": "send_action_goal", "id": id, "action": "/fibonacci", "action_type": types::GOAL,
             "args": {"order": 2}, "feedback": false})
     };
     let answer = |heard: &Value| heard["values"]["sequence"] == json!([0, 1]);
-    client.until(|attempt| goal(&format!("first-{attempt}")), FIRST, answer)?;
-    say(&json!({}));
+    client.repeat_until(|attempt| goal(&format!("first-{attempt}")), FIRST, answer)?;
+    print_json(&json!({}));
     let op = |number| {
         let id = format!("goal-{number}");
         (goal(&id), format!("\"{id}\""))
     };
-    say(&quantiles(&timed(&mut client, count, op, answer)?));
+    print_json(&quantiles(&time_exchanges(&mut client, count, op, answer)?));
     Ok(())
 }
 
-/// From connecting to the first message of a node that runs.
-fn joins() -> Result<()> {
-    say(&json!({}));
+/// Measures from connecting to the first message of a running node.
+fn time_join() -> Result<()> {
+    print_json(&json!({}));
     let begun = Instant::now();
-    let mut client = Client::connect()?;
-    client.say(&json!({"op": "subscribe", "topic": "/beat", "type": types::STRING}))?;
-    let beat = client.text_with("/beat", LONG)?;
+    let mut client = BenchClient::connect()?;
+    client.send_op(&json!({"op": "subscribe", "topic": "/beat", "type": types::STRING}))?;
+    let beat = client.receive_text_with("/beat", LONG)?;
     let took = begun.elapsed().as_secs_f64() * 1e3;
     beat.context("no beat")?;
-    say(&json!({"beat": took}));
+    print_json(&json!({"beat": took}));
     Ok(())
 }
 
-/// Sends pictures once somebody takes them: how many were late. What it takes itself is not told, because a robot is no part of
-/// the server.
-fn sends(size: Size, frames: u32, reliable: &str) -> Result<()> {
-    let mut client = Client::connect()?;
-    client.say(&json!({"op": "advertise", "topic": "/pictures", "type": types::IMAGE, "qos": quality(reliable)}))?;
-    say(&json!({}));
+/// Sends images as soon as there is a subscriber, and counts how many were late. The resources of this process are not
+/// reported, because a robot is not part of the server.
+fn send_pictures(size: Size, frames: u32, reliable: &str) -> Result<()> {
+    let mut client = BenchClient::connect()?;
+    client.send_op(&json!({"op": "advertise", "topic": "/pictures", "type": types::IMAGE, "qos": qos_json(reliable)}))?;
+    print_json(&json!({}));
     let asks = json!({"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": "/pictures"}});
-    client.until(
+    client.repeat_until(
         |_| asks.clone(),
         AGAIN,
         |heard| heard["values"]["subscribers"][0].is_string(),
@@ -259,22 +262,24 @@ fn sends(size: Size, frames: u32, reliable: &str) -> Result<()> {
     std::thread::sleep(camera::SETTLED);
     let (mut due, mut late) = (Instant::now(), 0);
     for number in 0..frames {
-        client.send(Message::binary(publish(&message::picture(number, size))))?;
+        client.send(Message::binary(encode_picture(&message::picture(
+            number, size,
+        ))))?;
         due += Duration::from_secs_f64(1.0 / RATE);
         let now = Instant::now();
         late += u32::from(now > due);
         std::thread::sleep(due.saturating_duration_since(now));
     }
-    // What is still on its way, and being sent again.
+    // Time for frames in flight and retransmissions.
     std::thread::sleep(Duration::from_secs(2));
-    say(&json!({"late": late}));
-    // The session stays until the taker has been asked.
+    print_json(&json!({"late": late}));
+    // The session stays open until the receiver has been asked for its results.
     std::io::copy(&mut std::io::stdin(), &mut std::io::sink())?;
     Ok(())
 }
 
-/// A picture as `cbor-raw`.
-fn publish(picture: &[u8]) -> Vec<u8> {
+/// Encodes a publication of an image as `cbor-raw`.
+fn encode_picture(picture: &[u8]) -> Vec<u8> {
     let mut out = Vec::with_capacity(picture.len() + 128);
     let mut writer = Writer::op(&mut out, Format::Cbor, "publish", None);
     writer.text("topic", "/pictures");
@@ -284,40 +289,40 @@ fn publish(picture: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Takes pictures: what came, when asked.
-fn takes(reliable: &str) -> Result<()> {
-    let mut client = Client::connect()?;
-    client.say(
+/// Receives images; prints what was received when asked.
+fn receive_pictures(reliable: &str) -> Result<()> {
+    let mut client = BenchClient::connect()?;
+    client.send_op(
         &json!({"op": "subscribe", "topic": "/pictures", "type": types::IMAGE,
-        "compression": "cbor-raw", "qos": quality(reliable)}),
+        "compression": "cbor-raw", "qos": qos_json(reliable)}),
     )?;
-    // The server knows of it when it answers what is asked after it.
+    // Once the server answers this call, it has processed the subscription.
     let asks = json!({"op": "call_service", "service": "/rosapi/get_time"});
-    client.until(|_| asks.clone(), AGAIN, |heard| heard["result"] == true)?;
-    say(&json!({}));
-    let seen = Arc::new(Mutex::new(Seen::default()));
+    client.repeat_until(|_| asks.clone(), AGAIN, |heard| heard["result"] == true)?;
+    print_json(&json!({}));
+    let seen = Arc::new(Mutex::new(FrameStatistics::default()));
     let watched = seen.clone();
     std::thread::spawn(move || {
-        if let Err(error) = watch(&mut client, &watched) {
+        if let Err(error) = count_pictures(&mut client, &watched) {
             eprintln!("a client that takes pictures: {error:#}");
         }
     });
     std::io::Read::read(&mut std::io::stdin(), &mut [0])?;
     let seen = seen.lock().ok().context("the other thread panicked")?;
-    say(&seen.told());
+    print_json(&seen.to_json());
     Ok(())
 }
 
-fn watch(client: &mut Client, seen: &Mutex<Seen>) -> Result<()> {
+fn count_pictures(client: &mut BenchClient, seen: &Mutex<FrameStatistics>) -> Result<()> {
     loop {
-        let Some(Message::Binary(frame)) = client.hear(LONG)? else {
+        let Some(Message::Binary(frame)) = client.receive(LONG)? else {
             continue;
         };
-        let Op::Publish(publish) = Op::parse(Frame::Binary(&frame))? else {
+        let Op::Publish(publish) = Op::parse(ProtocolFrame::Binary(&frame))? else {
             continue;
         };
         let raw = publish.msg.raw()?;
         let mut seen = seen.lock().ok().context("the other thread panicked")?;
-        seen.take(&raw.bytes).context("it is no picture")?;
+        seen.record(&raw.bytes).context("it is no picture")?;
     }
 }

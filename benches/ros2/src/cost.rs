@@ -1,83 +1,86 @@
-//! What a participant takes: memory, descriptors, and the processor while nothing happens.
+//! Resources of a participant: memory, descriptors, and processor time while idle.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 
 use crate::process::Process;
-use crate::world::{Program, Transport, World, number};
+use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
-/// In megabytes: of a servant, beyond its nodes.
+/// Limit for the memory of a servant beyond its nodes, in megabytes.
 const MEMORY: f64 = 8.0;
-/// In percent of a core.
+/// Limit for the processor time while idle, in percent of a core.
 const IDLE: f64 = 0.1;
-/// Discovery is over by then.
+/// Time until discovery has finished.
 const SETTLED: Duration = Duration::from_secs(5);
 
-/// One beside a node of rclpy, then many beside nodes of our making.
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    one(report)?;
-    many(report)
+/// Measures one participant next to an rclpy node, then many next to nodes of our own.
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    measure_one(report)?;
+    measure_many(report)
 }
 
-/// The share of a core that a process takes, in percent.
-fn share(program: &Program, time: Duration) -> Result<f64> {
-    let process = Process::of(program.pid());
-    let (before, begun) = (process.processor("")?, Instant::now());
+/// Returns the processor time of a process in percent of a core, over `time`.
+fn core_share(program: &BenchProgram, time: Duration) -> Result<f64> {
+    let process = Process::from_pid(program.pid());
+    let (before, begun) = (process.live_thread_time("")?, Instant::now());
     std::thread::sleep(time);
     let spent = process
-        .processor("")?
+        .live_thread_time("")?
         .checked_sub(before)
         .context("a thread has ended")?;
     Ok(spent.as_secs_f64() / begun.elapsed().as_secs_f64() * 100.0)
 }
 
-fn one(report: &mut Report) -> Result<()> {
-    let time = Duration::from_secs(if crate::full() { 120 } else { 30 });
+fn measure_one(report: &mut BenchReport) -> Result<()> {
+    let time = Duration::from_secs(if crate::is_full_run() { 120 } else { 30 });
     eprintln!("a participant at rest, for {} s", time.as_secs());
-    let world = World::new()?;
-    let node = world.rclpy(Transport::Udp, &["relay"])?;
-    let mut ours = world.ours(&["rests"])?;
+    let world = BenchNetwork::new()?;
+    let node = world.start_rclpy(Transport::Udp, &["relay"])?;
+    let mut ours = world.start_role(&["rests"])?;
     std::thread::sleep(SETTLED);
-    let idle = share(&ours, time)?;
-    let found = ours.tell()?;
-    // The same share of the same time is the node's own, which hears as much as we do.
-    let theirs = share(&node, time)?;
+    let idle = core_share(&ours, time)?;
+    let found = ours.request_answer()?;
+    // Over another period of the same length, the node's own share; it receives as much as we do.
+    let theirs = core_share(&node, time)?;
     report
         .figure(
             "a participant at rest beside a node of rclpy",
             "% of a core",
             idle,
         )
-        .beside("that node", theirs)
-        .reach(Target::AtMost(IDLE))
+        .relative_to("that node", theirs)
+        .require(Target::AtMost(IDLE))
         .note(format!("over {} s", time.as_secs()));
-    let resident = Process::of(node.pid()).resident()?;
+    let resident = Process::from_pid(node.pid()).resident()?;
     report
         .figure(
             "memory of that participant",
             "MB",
-            number(&found, "memory")?,
+            json_number(&found, "memory")?,
         )
-        .beside("that node", resident)
-        .reach(Target::AtMost(MEMORY))
+        .relative_to("that node", resident)
+        .require(Target::AtMost(MEMORY))
         .note(format!(
             "resident, beyond its process without it; {:.1} with it",
-            number(&found, "process")?
+            json_number(&found, "process")?
         ));
     report
         .figure(
             "descriptors of that participant",
             "",
-            number(&found, "descriptors")?,
+            json_number(&found, "descriptors")?,
         )
-        .beside("that node", Process::of(node.pid()).descriptors()? as f64)
-        .note(format!("and {} threads", number(&found, "threads")?));
+        .relative_to(
+            "that node",
+            Process::from_pid(node.pid()).descriptors()? as f64,
+        )
+        .note(format!("and {} threads", json_number(&found, "threads")?));
     Ok(())
 }
 
-/// What a crowd is of, as its role and as figures call it.
+/// Kinds of crowds: the role, its name in figures, and a note.
 const CROWDS: [(&str, &str, &str); 2] = [
     (
         "participants",
@@ -87,36 +90,38 @@ const CROWDS: [(&str, &str, &str); 2] = [
     (
         "servants",
         "servants, each with bus, bridge and a robot's session",
-        "each in a namespace with a node of our making; the robots' ends of the sessions are in the same process, and not in the time",
+        "each in a namespace with a node of our making; the robots' ends of the sessions are in the same process, and \
+         not in the time",
     ),
 ];
 
-fn many(report: &mut Report) -> Result<()> {
-    let (count, seconds) = (50, if crate::full() { 120 } else { 30 });
+fn measure_many(report: &mut BenchReport) -> Result<()> {
+    let (count, seconds) = (50, if crate::is_full_run() { 120 } else { 30 });
     for (role, what, note) in CROWDS {
         eprintln!("{count} {role} at rest, for {seconds} s");
-        let world = World::new()?;
-        let mut crowd = world.ours(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
+        let world = BenchNetwork::new()?;
+        let mut crowd =
+            world.start_role(&["crowd", role, &count.to_string(), &seconds.to_string()])?;
         let found = crowd.answer_within(Duration::from_secs(seconds + 60))?;
         report
             .figure(
                 format!("each of {count} {what}, at rest"),
                 "% of a core",
-                number(&found, "share")?,
+                json_number(&found, "share")?,
             )
-            .reach(Target::AtMost(IDLE))
+            .require(Target::AtMost(IDLE))
             .note(format!("over {seconds} s, {note}"));
         report
             .figure(
                 format!("memory of each of {count} {what}"),
                 "MB",
-                number(&found, "memory")?,
+                json_number(&found, "memory")?,
             )
-            .reach(Target::AtMost(MEMORY))
+            .require(Target::AtMost(MEMORY))
             .note(format!(
                 "resident; {:.1} descriptors each, {} threads in all",
-                number(&found, "descriptors")?,
-                number(&found, "threads")?
+                json_number(&found, "descriptors")?,
+                json_number(&found, "threads")?
             ));
     }
     Ok(())

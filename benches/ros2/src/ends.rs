@@ -1,98 +1,101 @@
-//! Participants and their ends, as the roles use them.
+//! Participants and their endpoints, for the roles.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
 use rtps::{
-    Config, EndpointQos, Ends, Participant, Reader, Reliability, Sample, Sink, Topic, Writer,
+    Config, DataReader, DataWriter, EndpointMatches, EndpointQos, Participant, ReceivedSample,
+    ReliabilityKind, Sink, TopicDescription,
 };
 use servant::netns::NetNs;
 use tokio::sync::mpsc::{UnboundedReceiver, unbounded_channel};
 use tokio::sync::watch;
 
-use crate::place::Within;
+use crate::place::NamespaceSockets;
 
-/// The longest that discovery may take.
+/// Maximum time for discovery.
 const PATIENCE: Duration = Duration::from_secs(15);
 
-/// A participant in the namespace that this process is in.
+/// Creates a participant in this process's network namespace.
 pub(crate) async fn join() -> Result<Participant> {
-    join_in(NetNs::current()?).await
+    join_namespace(NetNs::current()?).await
 }
 
-/// A participant in this namespace.
-pub(crate) async fn join_in(network: NetNs) -> Result<Participant> {
+/// Creates a participant in a network namespace.
+pub(crate) async fn join_namespace(network: NetNs) -> Result<Participant> {
     let mut config = Config::new(0, "bench");
     config.user_data = "enclave=/;".into();
-    Ok(Participant::join(Arc::new(Within(network)), config).await?)
+    Ok(Participant::join(Arc::new(NamespaceSockets(network)), config).await?)
 }
 
-/// The quality of service that a ROS node asks for by `QoSProfile(depth=5)`.
-pub(crate) fn quality(reliable: bool) -> EndpointQos {
+/// Returns the quality of service that a ROS node requests with `QoSProfile(depth=5)`.
+pub(crate) fn qos_profile(reliable: bool) -> EndpointQos {
     let reliability = if reliable {
-        Reliability::Reliable
+        ReliabilityKind::Reliable
     } else {
-        Reliability::BestEffort
+        ReliabilityKind::BestEffort
     };
     EndpointQos {
         reliability,
-        history: rtps::History::KeepLast(5),
+        history: rtps::HistoryKind::KeepLast(5),
         ..EndpointQos::default()
     }
 }
 
-fn topic(name: &str, kind: &str) -> Topic {
-    Topic {
+fn topic(name: &str, kind: &str) -> TopicDescription {
+    TopicDescription {
         name: name.to_owned(),
         type_name: kind.to_owned(),
-        ..Topic::default()
+        ..TopicDescription::default()
     }
 }
 
-struct Call<F>(F);
+struct CallbackSink<F>(F);
 
-impl<F: Fn(Sample) + Send + Sync + 'static> Sink for Call<F> {
-    fn sample(&self, sample: Sample) {
+impl<F: Fn(ReceivedSample) + Send + Sync + 'static> Sink for CallbackSink<F> {
+    fn on_sample(&self, sample: ReceivedSample) {
         self.0(sample);
     }
 }
 
-/// A reader that calls `take` with each sample.
-pub(crate) fn hears(
+/// Creates a reader that calls `take` with each sample.
+pub(crate) fn create_listener(
     participant: &Participant,
     (name, kind): (&str, &str),
     qos: EndpointQos,
-    take: impl Fn(Sample) + Send + Sync + 'static,
-) -> Reader {
-    participant.reader(topic(name, kind), qos, Arc::new(Call(take)))
+    take: impl Fn(ReceivedSample) + Send + Sync + 'static,
+) -> DataReader {
+    participant.reader(topic(name, kind), qos, Arc::new(CallbackSink(take)))
 }
 
-/// A reader whose samples wait.
-pub(crate) fn reads(
+/// Creates a reader that queues its samples.
+pub(crate) fn create_reader(
     participant: &Participant,
     topic: (&str, &str),
     qos: EndpointQos,
-) -> (Reader, UnboundedReceiver<Sample>) {
+) -> (DataReader, UnboundedReceiver<ReceivedSample>) {
     let (sender, samples) = unbounded_channel();
     let take = move |sample| {
-        // Nobody waits any more where the role has ended.
+        // The receiver is gone once the role has ended.
         let _ = sender.send(sample);
     };
-    (hears(participant, topic, qos, take), samples)
+    (create_listener(participant, topic, qos, take), samples)
 }
 
-/// A writer.
-pub(crate) fn writes(
+/// Creates a writer.
+pub(crate) fn create_writer(
     participant: &Participant,
     (name, kind): (&str, &str),
     qos: EndpointQos,
-) -> Writer {
+) -> DataWriter {
     participant.writer(topic(name, kind), qos)
 }
 
-/// Waits until samples pass.
-pub(crate) async fn matched(mut ends: watch::Receiver<Arc<Ends>>) -> Result<()> {
+/// Waits until an endpoint is matched, so that samples pass.
+pub(crate) async fn wait_until_matched(
+    mut ends: watch::Receiver<Arc<EndpointMatches>>,
+) -> Result<()> {
     let some = ends.wait_for(|ends| !ends.matched.is_empty());
     tokio::time::timeout(PATIENCE, some)
         .await

@@ -1,5 +1,5 @@
-//! A process between a client and a datagram's echo that moves bytes and nothing else: what any server between a client and a node adds, if it
-//! had nothing to do.
+//! A process between a client and a datagram echo that copies bytes and does nothing else: the minimum that any server
+//! between a client and a node adds.
 
 use std::io::{Read as _, Write as _};
 use std::net::{TcpListener, TcpStream, UdpSocket};
@@ -9,14 +9,14 @@ use anyhow::{Context as _, Result};
 use serde_json::json;
 
 use crate::portal::ADDRESS;
-use crate::roles::{DATAGRAM, ECHO, PATIENCE, WARM, quantiles, say};
+use crate::roles::{DATAGRAM, ECHO, PATIENCE, WARM, print_json, quantiles};
 
-/// Serves one client, from its connection to the echo and back.
-pub(crate) fn serve() -> Result<()> {
+/// Serves one client, copying between its connection and the echo.
+pub(crate) fn run_relay() -> Result<()> {
     let listener = TcpListener::bind(ADDRESS)?;
     let echo = UdpSocket::bind("127.0.0.1:0")?;
     echo.connect(ECHO)?;
-    say(&json!({}));
+    print_json(&json!({}));
     let (mut client, _) = listener.accept()?;
     client.set_nodelay(true)?;
     let mut bytes = [0; 2048];
@@ -31,12 +31,12 @@ pub(crate) fn serve() -> Result<()> {
     }
 }
 
-/// As many bytes as a String takes with what RTPS puts around it, through [`serve`] and back; one at a time.
-pub(crate) fn trips(count: usize) -> Result<()> {
+/// Measures round trips through [`run_relay`] of as many bytes as a String takes within RTPS, one at a time.
+pub(crate) fn time_trips(count: usize) -> Result<()> {
     let mut relay = TcpStream::connect(ADDRESS).context(ADDRESS)?;
     relay.set_nodelay(true)?;
     relay.set_read_timeout(Some(PATIENCE))?;
-    say(&json!({}));
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
@@ -46,6 +46,6 @@ pub(crate) fn trips(count: usize) -> Result<()> {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }

@@ -1,55 +1,55 @@
-//! How long it takes from coming to a node that runs until its messages are heard, and until ours have come back.
+//! Time from joining a running node until its messages arrive, and until ours have been returned.
 
 use anyhow::Result;
-use bench_report::{Report, Target, quantile};
+use bench_report::{BenchReport, Target, quantile};
 
-use crate::world::{Program, Transport, World, number};
+use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
-/// What is to be reached, in milliseconds.
+/// Limit in milliseconds.
 const JOINED: f64 = 150.0;
-/// Beats of the node each second: the first is not waited for much longer than it takes to be heard.
+/// Messages of the node per second: many, so that the wait for the next one hardly counts.
 const BEATS: &str = "200";
 
-/// Who comes to the node.
+/// Participant that joins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Newcomer {
     Ours,
     Rclpy,
-    /// A robot, with which the portal comes; from its connecting on.
+    /// A robot for which the portal is created; measured from its connection.
     Robot,
-    /// A robot after another, before which the portal is there.
+    /// A robot that follows another one, for which the portal exists already.
     AnotherRobot,
 }
 
 impl Newcomer {
-    /// Milliseconds until the first beat, and until the first pong where it sends pings.
-    fn joins(self, world: &World) -> Result<(f64, Option<f64>)> {
+    /// Returns the milliseconds until the first beat, and until the first pong if the newcomer sends pings.
+    fn time_join(self, world: &BenchNetwork) -> Result<(f64, Option<f64>)> {
         let portal = match self {
-            Self::Robot => Some(world.ours(&["portal", "fresh"])?),
-            Self::AnotherRobot => Some(world.ours(&["portal", "kept"])?),
+            Self::Robot => Some(world.start_role(&["portal", "fresh"])?),
+            Self::AnotherRobot => Some(world.start_role(&["portal", "kept"])?),
             Self::Ours | Self::Rclpy => None,
         };
         if self == Self::AnotherRobot {
-            world.ours(&["client", "joins"])?.answer()?;
+            world.start_role(&["client", "joins"])?.answer()?;
         }
-        let mut newcomer: Program = match self {
-            Self::Ours => world.ours(&["joins"])?,
-            Self::Rclpy => world.rclpy(Transport::Udp, &["joins"])?,
-            Self::Robot | Self::AnotherRobot => world.ours(&["client", "joins"])?,
+        let mut newcomer: BenchProgram = match self {
+            Self::Ours => world.start_role(&["joins"])?,
+            Self::Rclpy => world.start_rclpy(Transport::Udp, &["joins"])?,
+            Self::Robot | Self::AnotherRobot => world.start_role(&["client", "joins"])?,
         };
         let found = newcomer.answer()?;
-        // It goes before the portal does.
+        // The client is dropped before the portal.
         drop((newcomer, portal));
-        Ok((number(&found, "beat")?, found["pong"].as_f64()))
+        Ok((json_number(&found, "beat")?, found["pong"].as_f64()))
     }
 }
 
-/// Medians of the first beat and of the first pong; the node stays, newcomers come and go.
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let rounds = if crate::full() { 31 } else { 9 };
+/// Reports the medians of the first beat and of the first pong; the node stays, newcomers come and go.
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    let rounds = if crate::is_full_run() { 31 } else { 9 };
     eprintln!("joining: {rounds} times each");
-    let world = World::new()?;
-    let _node = world.rclpy(Transport::Udp, &["relay", BEATS])?;
+    let world = BenchNetwork::new()?;
+    let _node = world.start_rclpy(Transport::Udp, &["relay", BEATS])?;
     let newcomers = [
         Newcomer::Ours,
         Newcomer::Robot,
@@ -59,7 +59,7 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
     let mut found = vec![(Vec::new(), Vec::new()); newcomers.len()];
     for _ in 0..rounds {
         for (newcomer, (beats, pongs)) in newcomers.iter().zip(&mut found) {
-            let (beat, pong) = newcomer.joins(&world)?;
+            let (beat, pong) = newcomer.time_join(&world)?;
             beats.push(beat);
             pongs.extend(pong);
         }
@@ -88,11 +88,11 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
         let of = |share| quantile(times, share).unwrap_or(f64::NAN);
         let figure = report.figure(what, "ms", of(0.5));
         figure
-            .beside(
+            .relative_to(
                 "a participant of rclpy that joins",
                 quantile(floor, 0.5).unwrap_or(f64::NAN),
             )
-            .reach(Target::AtMost(JOINED));
+            .require(Target::AtMost(JOINED));
         figure.note(format!(
             "median of {rounds}, at most {:.0}; rclpy is imported already",
             of(1.0)

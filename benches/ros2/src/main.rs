@@ -1,8 +1,9 @@
-//! `make bench ONLY=ros2`: a participant of crate `rtps` beside rclpy's, and a robot of the portal beside the direct way and beside other
-//! servers of rosbridge: Strings, calls and goals there and back, pictures in both directions, joining a node that runs, and what it takes to be
-//! there. Needs root, and the Python with rclpy below `CLOUDROID_ROS2_PREFIX`. `CLOUDROID_BENCH_FULL=1` measures longer,
-//! `CLOUDROID_BENCH_SECONDS` says how long pictures are watched; names of parts as arguments run those alone. The program calls itself for the participants
-//! (`inside ROLE …`), so that each is a process of its own.
+//! `make bench ONLY=ros2`: a participant of the crate `rtps` compared with rclpy's, and a robot of the portal compared
+//! with the direct path and with other rosbridge servers: round trips of Strings, calls and goals, images in both
+//! directions, joining a running node, and idle resources. Needs root, and the Python with rclpy below
+//! `CLOUDROID_ROS2_PREFIX`. `CLOUDROID_BENCH_FULL=1` measures longer, `CLOUDROID_BENCH_SECONDS` sets how many seconds
+//! images are sent; arguments name the parts to run. The program runs itself as the participants (`inside ROLE …`), so
+//! that each is a separate process.
 
 #![forbid(unsafe_code)]
 
@@ -28,20 +29,20 @@ mod types;
 mod world;
 
 use anyhow::{Result, ensure};
-use bench_report::Report;
+use bench_report::BenchReport;
 
-/// Longer measurements are wanted.
-fn full() -> bool {
+/// Returns whether longer measurements are requested (`CLOUDROID_BENCH_FULL=1`).
+fn is_full_run() -> bool {
     std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| value == "1")
 }
 
-type Part = fn(&mut Report) -> Result<()>;
+type Part = fn(&mut BenchReport) -> Result<()>;
 
-/// What is measured, in this order.
+/// Parts of the benchmark, in the order in which they run.
 const PARTS: [(&str, Part); 6] = [
-    ("trips", trips::strings),
-    ("calls", trips::calls),
-    ("goals", trips::goals),
+    ("trips", trips::measure_strings),
+    ("calls", trips::measure_calls),
+    ("goals", trips::measure_goals),
     ("joins", joins::measure),
     ("cost", cost::measure),
     ("pictures", pictures::measure),
@@ -51,7 +52,7 @@ fn main() -> Result<()> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     if let ["inside", role @ ..] = words.as_slice() {
-        return roles::play(role);
+        return roles::run(role);
     }
     let unknown = words
         .iter()
@@ -60,17 +61,17 @@ fn main() -> Result<()> {
         unknown.is_none(),
         "no part is called {unknown:?}: there are trips, calls, goals, joins, cost, pictures"
     );
-    // Before an hour has gone.
-    world::python()?;
-    let mut report = Report::new("ros2");
+    // Fails early rather than after an hour.
+    world::python_path()?;
+    let mut report = BenchReport::new("ros2");
     let mut failed = Vec::new();
     for (name, part) in PARTS {
         if !words.is_empty() && !words.contains(&name) {
             continue;
         }
-        // What was measured before is told all the same.
+        // Earlier figures are reported all the same.
         if let Err(why) = part(&mut report) {
-            report.left_out(format!("what {name} has not come to"), format!("{why:#}"));
+            report.skip(format!("what {name} has not come to"), format!("{why:#}"));
             failed.push(name);
         }
     }

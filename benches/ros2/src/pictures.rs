@@ -1,21 +1,21 @@
-//! Pictures at 30 Hz between ours and a node of rclpy with the buffers it comes with, in both directions and both reliabilities; and between that
-//! node and a robot of the portal.
+//! Images at 30 Hz between our participant and an rclpy node with its default buffers, in both directions and with both
+//! reliabilities; and between that node and a robot of the portal.
 
 use std::fmt;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::Value;
 
 use crate::camera::{self, RATE};
-use crate::lost::Lost;
+use crate::lost::PictureLosses;
 use crate::message::Size;
 use crate::process::Process;
-use crate::world::{Program, Transport, World, number};
+use crate::world::{BenchNetwork, BenchProgram, Transport, json_number};
 
-/// Whose camera, and whose eye.
+/// Sender and receiver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Way {
+enum PicturePath {
     In,
     Out,
     /// From a node to a robot.
@@ -25,7 +25,7 @@ enum Way {
     Rclpy(Transport),
 }
 
-impl fmt::Display for Way {
+impl fmt::Display for PicturePath {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
             Self::In => "rclpy to ours",
@@ -38,42 +38,43 @@ impl fmt::Display for Way {
     }
 }
 
-/// What either side tells.
-struct Found {
+/// Results of both sides of a transfer.
+struct TransferResult {
     sent: u32,
     sender: Value,
     taker: Value,
-    /// What was between both.
-    portal: Option<Portal>,
+    /// The portal between both sides.
+    portal: Option<PortalUsage>,
 }
 
-/// A portal when pictures have passed it.
-struct Portal {
-    /// What it took of a processor, in milliseconds.
+/// Resources of a portal after a transfer.
+struct PortalUsage {
+    /// Processor time in milliseconds.
     processor: f64,
-    /// The peak of its memory.
+    /// Peak memory.
     peak: f64,
-    /// Pictures that were lost, by place.
-    lost: Lost,
+    /// Lost images, by stage.
+    lost: PictureLosses,
 }
 
-impl Found {
-    fn lost(&self) -> Result<f64> {
-        Ok(f64::from(self.sent) - number(&self.taker, "came")?)
+impl TransferResult {
+    fn lost_count(&self) -> Result<f64> {
+        Ok(f64::from(self.sent) - json_number(&self.taker, "came")?)
     }
 
-    /// Milliseconds of a processor for a frame, of the sender and of the taker; of the portal instead of its robot.
-    fn processor(&self) -> Result<[f64; 2]> {
+    /// Returns the processor time per frame of sender and receiver, in milliseconds; the portal's takes the place of
+    /// its robot's.
+    fn processor_per_frame(&self) -> Result<[f64; 2]> {
         let of = |side: &Value| match (&side["processor"], &self.portal) {
             (Value::Null, Some(portal)) => anyhow::Ok(portal.processor),
-            _ => number(side, "processor"),
+            _ => json_number(side, "processor"),
         };
         let each = |side| anyhow::Ok(of(side)? / f64::from(self.sent));
         Ok([each(&self.sender)?, each(&self.taker)?])
     }
 
-    /// The peak of our process's memory, if one was there.
-    fn peak(&self) -> Option<f64> {
+    /// Returns the peak memory of our process, if one took part.
+    fn peak_memory(&self) -> Option<f64> {
         let of = |side: &Value| side["peak"].as_f64();
         let portal = self.portal.as_ref().map(|portal| portal.peak);
         portal
@@ -81,54 +82,69 @@ impl Found {
             .or_else(|| of(&self.taker))
     }
 
-    /// Whether so much came that what it took can be compared.
-    fn is_peer(&self) -> Result<bool> {
-        Ok(self.lost()? < f64::from(self.sent) / 10.0)
+    /// Returns whether enough images arrived to compare the resources.
+    fn is_comparable(&self) -> Result<bool> {
+        Ok(self.lost_count()? < f64::from(self.sent) / 10.0)
     }
 }
 
-fn run(way: Way, size: Size, reliable: bool, seconds: u32) -> Result<Found> {
+fn run_transfer(
+    way: PicturePath,
+    size: Size,
+    reliable: bool,
+    seconds: u32,
+) -> Result<TransferResult> {
     let frames = seconds * RATE as u32;
-    let words = camera::words(size, frames, reliable);
+    let words = camera::role_arguments(size, frames, reliable);
     let [width, height, count, quality] = words.each_ref().map(String::as_str);
     let (taking, sending) = (["takes", quality], ["sends", width, height, count, quality]);
-    let world = World::new()?;
+    let world = BenchNetwork::new()?;
     let of_rclpy = match way {
-        Way::Rclpy(transport) => transport,
+        PicturePath::Rclpy(transport) => transport,
         _ => Transport::Stock,
     };
     let mut portal = match way {
-        Way::ToRobot | Way::FromRobot => Some(world.ours(&["portal", "kept"])?),
+        PicturePath::ToRobot | PicturePath::FromRobot => {
+            Some(world.start_role(&["portal", "kept"])?)
+        }
         _ => None,
     };
-    let as_client = |words: &[&str]| world.ours(&[&["client"], words].concat());
-    let mut taker: Program = match way {
-        Way::In => world.ours(&taking)?,
-        Way::ToRobot => as_client(&taking)?,
-        Way::Out | Way::FromRobot | Way::Rclpy(_) => world.rclpy(of_rclpy, &taking)?,
+    let as_client = |words: &[&str]| world.start_role(&[&["client"], words].concat());
+    let mut taker: BenchProgram = match way {
+        PicturePath::In => world.start_role(&taking)?,
+        PicturePath::ToRobot => as_client(&taking)?,
+        PicturePath::Out | PicturePath::FromRobot | PicturePath::Rclpy(_) => {
+            world.start_rclpy(of_rclpy, &taking)?
+        }
     };
-    let process = portal.as_ref().map(|portal| Process::of(portal.pid()));
-    let before = process.as_ref().map(Process::processor_in_all);
-    let mut sender: Program = match way {
-        Way::Out => world.ours(&sending)?,
-        Way::FromRobot => as_client(&sending)?,
-        Way::In | Way::ToRobot | Way::Rclpy(_) => world.rclpy(of_rclpy, &sending)?,
+    let process = portal
+        .as_ref()
+        .map(|portal| Process::from_pid(portal.pid()));
+    let before = process.as_ref().map(Process::total_processor_time);
+    let mut sender: BenchProgram = match way {
+        PicturePath::Out => world.start_role(&sending)?,
+        PicturePath::FromRobot => as_client(&sending)?,
+        PicturePath::In | PicturePath::ToRobot | PicturePath::Rclpy(_) => {
+            world.start_rclpy(of_rclpy, &sending)?
+        }
     };
-    let told = sender.answer_within(camera::patience(frames))?;
-    let took = taker.tell()?;
+    let told = sender.answer_within(camera::transfer_timeout(frames))?;
+    let took = taker.request_answer()?;
     let lost = |counts: &Value| match way {
-        Way::ToRobot => Lost::to_robot(frames, number(&took, "came")?, counts),
-        _ => Lost::from_robot(frames, number(&took, "came")?, counts),
+        PicturePath::ToRobot => {
+            PictureLosses::to_robot(frames, json_number(&took, "came")?, counts)
+        }
+        _ => PictureLosses::from_robot(frames, json_number(&took, "came")?, counts),
     };
     let portal = match (&mut portal, process, before) {
-        (Some(program), Some(process), Some(before)) => Some(Portal {
-            processor: (process.processor_in_all()? - before?).as_secs_f64() * 1e3,
+        (Some(program), Some(process), Some(before)) => Some(PortalUsage {
+            processor: (process.total_processor_time()? - before?).as_secs_f64() * 1e3,
             peak: process.peak()?,
-            lost: lost(&program.tell()?)?,
+            lost: lost(&program.request_answer()?)?,
         }),
         _ => None,
     };
-    Ok(Found {
+    Ok(TransferResult {
         sent: frames,
         sender: told,
         taker: took,
@@ -136,9 +152,9 @@ fn run(way: Way, size: Size, reliable: bool, seconds: u32) -> Result<Found> {
     })
 }
 
-/// Seconds of what must not be lost, and of the rest.
-fn lengths() -> Result<(u32, u32)> {
-    let brief = if crate::full() { 60 } else { 20 };
+/// Returns the duration in seconds of reliable transfers and of the others.
+fn transfer_seconds() -> Result<(u32, u32)> {
+    let brief = if crate::is_full_run() { 60 } else { 20 };
     match std::env::var("CLOUDROID_BENCH_SECONDS") {
         Ok(all) => all
             .parse()
@@ -148,9 +164,9 @@ fn lengths() -> Result<(u32, u32)> {
     }
 }
 
-/// What must not be lost is watched for a minute.
-pub(crate) fn measure(report: &mut Report) -> Result<()> {
-    let (long, brief) = lengths()?;
+/// Measures all transfers; reliable ones, which must not lose images, run for a minute.
+pub(crate) fn measure(report: &mut BenchReport) -> Result<()> {
+    let (long, brief) = transfer_seconds()?;
     let mut failed = Vec::new();
     for size in [Size::SMALL, Size::LARGE] {
         for reliable in [true, false] {
@@ -158,28 +174,31 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
             let quality = if reliable { "reliable" } else { "best effort" };
             let what = format!(
                 "{:.1} MB pictures, {quality}",
-                f64::from(size.bytes()) / 1e6
+                f64::from(size.byte_count()) / 1e6
             );
-            let peers = [Transport::Stock, Transport::Udp].map(Way::Rclpy);
+            let peers = [Transport::Stock, Transport::Udp].map(PicturePath::Rclpy);
             let mut floors = Vec::new();
             for peer in peers {
                 eprintln!("{what}, {peer}: {brief} s");
-                match run(peer, size, reliable, brief) {
+                match run_transfer(peer, size, reliable, brief) {
                     Ok(found) => floors.push((peer, found)),
-                    // Others are measured all the same.
-                    Err(why) => report.left_out(format!("{what}, {peer}"), format!("{why:#}")),
+                    // The other peers are measured all the same.
+                    Err(why) => report.skip(format!("{what}, {peer}"), format!("{why:#}")),
                 }
             }
-            let robots = [Way::FromRobot, Way::ToRobot]
+            let robots = [PicturePath::FromRobot, PicturePath::ToRobot]
                 .into_iter()
                 .filter(|_| reliable);
-            for way in [Way::Out, Way::In].into_iter().chain(robots) {
+            for way in [PicturePath::Out, PicturePath::In]
+                .into_iter()
+                .chain(robots)
+            {
                 eprintln!("{what}, {way}: {seconds} s");
                 let of = format!("{what}, {way}");
-                let told = run(way, size, reliable, seconds)
-                    .and_then(|found| tell(report, &of, &found, &floors));
+                let told = run_transfer(way, size, reliable, seconds)
+                    .and_then(|found| report_transfer(report, &of, &found, &floors));
                 if let Err(why) = told {
-                    report.left_out(&of, format!("{why:#}"));
+                    report.skip(&of, format!("{why:#}"));
                     failed.push(of);
                 }
             }
@@ -189,7 +208,12 @@ pub(crate) fn measure(report: &mut Report) -> Result<()> {
     Ok(())
 }
 
-fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)]) -> Result<()> {
+fn report_transfer(
+    report: &mut BenchReport,
+    what: &str,
+    found: &TransferResult,
+    floors: &[(PicturePath, TransferResult)],
+) -> Result<()> {
     let mut note = format!(
         "of {}, {} late to be sent",
         found.sent, found.sender["late"]
@@ -205,11 +229,11 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
         None => "",
     };
     for (peer, floor) in floors {
-        note += &format!("; {peer} lost {} of {}", floor.lost()?, floor.sent);
+        note += &format!("; {peer} lost {} of {}", floor.lost_count()?, floor.sent);
     }
     report
-        .figure(format!("{what}: lost"), "", found.lost()?)
-        .reach(Target::AtMost(0.0))
+        .figure(format!("{what}: lost"), "", found.lost_count()?)
+        .require(Target::AtMost(0.0))
         .note(note);
     if let Some(portal) = &found.portal {
         report
@@ -218,27 +242,28 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
                 "",
                 portal.lost.portal as f64,
             )
-            .reach(Target::AtMost(0.0));
+            .require(Target::AtMost(0.0));
     }
     report
         .figure(
             format!("{what}: reordered"),
             "",
-            number(&found.taker, "reordered")?,
+            json_number(&found.taker, "reordered")?,
         )
-        .reach(Target::AtMost(0.0));
+        .require(Target::AtMost(0.0));
     for (peer, floor) in floors {
-        if !floor.is_peer()? {
+        if !floor.is_comparable()? {
             continue;
         }
-        let ([sender, taker], [sends, takes]) = (found.processor()?, floor.processor()?);
+        let ([sender, taker], [sends, takes]) =
+            (found.processor_per_frame()?, floor.processor_per_frame()?);
         report
             .figure(
                 format!("{what}: processor for a frame, both sides"),
                 "ms",
                 sender + taker,
             )
-            .beside(peer.to_string(), sends + takes)
+            .relative_to(peer.to_string(), sends + takes)
             .note(format!(
                 "sender {sender:.2} and taker {taker:.2}{portal}; {sends:.2} and {takes:.2}"
             ));
@@ -246,12 +271,12 @@ fn tell(report: &mut Report, what: &str, found: &Found, floors: &[(Way, Found)])
             .figure(
                 format!("{what}: age when taken, p50"),
                 "ms",
-                number(&found.taker, "p50")?,
+                json_number(&found.taker, "p50")?,
             )
-            .beside(peer.to_string(), number(&floor.taker, "p50")?)
-            .note(format!("p99 {:.1}", number(&found.taker, "p99")?));
+            .relative_to(peer.to_string(), json_number(&floor.taker, "p50")?)
+            .note(format!("p99 {:.1}", json_number(&found.taker, "p99")?));
     }
-    if let Some(peak) = found.peak() {
+    if let Some(peak) = found.peak_memory() {
         report
             .figure(format!("{what}: memory of ours, at its peak"), "MB", peak)
             .note("resident, of the whole process");

@@ -1,4 +1,4 @@
-//! A network namespace as the place of a participant, and of a bus.
+//! A network namespace as the network of a participant and of a bus.
 
 use std::io;
 use std::net::SocketAddr;
@@ -6,27 +6,27 @@ use std::os::fd::OwnedFd;
 
 use async_trait::async_trait;
 use ros::net::Sockets;
-use rtps::Place;
+use rtps::NetworkNamespace;
 use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 
-/// That namespace.
-pub(crate) struct Within(pub(crate) NetNs);
+/// Sockets in a network namespace.
+pub(crate) struct NamespaceSockets(pub(crate) NetNs);
 
 #[async_trait]
-impl Place for Within {
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        self.0.datagrams(address, shared).await
+impl NetworkNamespace for NamespaceSockets {
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        self.0.bind_udp(address, shared).await
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        self.0.diagnostics().await.map(Some)
+    async fn open_diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+        self.0.open_sock_diag().await.map(Some)
     }
 }
 
-/// As a daemon's are in a servant.
+/// Like the sockets of a daemon in a servant.
 #[async_trait]
-impl Sockets for Within {
+impl Sockets for NamespaceSockets {
     async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
         self.0.connect(address).await
     }
@@ -35,11 +35,11 @@ impl Sockets for Within {
         self.0.listen(address).await
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        self.0.datagrams(address, shared).await
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        self.0.bind_udp(address, shared).await
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        self.0.diagnostics().await.map(Some)
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
+        self.0.open_sock_diag().await.map(Some)
     }
 }

@@ -1,4 +1,4 @@
-//! What a process takes, as the kernel counts it.
+//! Resources of a process, from the kernel's counters.
 
 use std::fs;
 use std::path::PathBuf;
@@ -11,18 +11,18 @@ use anyhow::{Context, Result};
 pub(crate) struct Process(PathBuf);
 
 impl Process {
-    /// This one.
-    pub(crate) fn this() -> Self {
+    /// This process.
+    pub(crate) fn current() -> Self {
         Self(PathBuf::from("/proc/self"))
     }
 
-    /// The one with this number.
-    pub(crate) fn of(pid: u32) -> Self {
+    /// The process with this pid.
+    pub(crate) fn from_pid(pid: u32) -> Self {
         Self(PathBuf::from(format!("/proc/{pid}")))
     }
 
-    /// Time on a processor so far, of the threads that have not ended and whose names begin so; exactly, not in ticks.
-    pub(crate) fn processor(&self, threads: &str) -> Result<Duration> {
+    /// Returns the processor time of live threads whose names start with `threads`; exact, not in ticks.
+    pub(crate) fn live_thread_time(&self, threads: &str) -> Result<Duration> {
         let mut nanoseconds = 0;
         for task in fs::read_dir(self.0.join("task"))? {
             let task = task?.path();
@@ -36,32 +36,32 @@ impl Process {
         Ok(Duration::from_nanos(nanoseconds))
     }
 
-    /// Time on a processor so far, of threads that have ended, too; in ticks of 10 ms.
-    pub(crate) fn processor_in_all(&self) -> Result<Duration> {
+    /// Returns the processor time of all threads, including those that have ended; in ticks of 10 ms.
+    pub(crate) fn total_processor_time(&self) -> Result<Duration> {
         let text = fs::read_to_string(self.0.join("stat"))?;
-        // Behind the name, which may hold anything: utime and stime are fields 14 and 15 (proc(5)).
+        // The fields follow the name, which may contain any character: utime and stime are fields 14 and 15 (proc(5)).
         let (_, fields) = text.rsplit_once(')').context("a name in brackets")?;
         let ticks = fields.split_whitespace().skip(11).take(2);
         let ticks: u64 = ticks.filter_map(|ticks| ticks.parse::<u64>().ok()).sum();
         Ok(Duration::from_millis(ticks * 10))
     }
 
-    /// Resident megabytes (10⁶) now.
+    /// Resident memory in megabytes (10⁶).
     pub(crate) fn resident(&self) -> Result<f64> {
         self.megabytes("status", "VmRSS:")
     }
 
-    /// The most it has been.
+    /// Peak resident memory in megabytes.
     pub(crate) fn peak(&self) -> Result<f64> {
         self.megabytes("status", "VmHWM:")
     }
 
-    /// How many descriptors are open.
+    /// Number of open descriptors.
     pub(crate) fn descriptors(&self) -> Result<usize> {
         Ok(fs::read_dir(self.0.join("fd"))?.count())
     }
 
-    /// How many threads there are.
+    /// Number of threads.
     pub(crate) fn threads(&self) -> Result<usize> {
         Ok(fs::read_dir(self.0.join("task"))?.count())
     }

@@ -1,7 +1,8 @@
-//! Other servers of rosbridge, in the network of the nodes that our portal is measured with.
+//! Other rosbridge servers, in the network of the nodes with which our portal is measured.
 //!
-//! rosbridge-server-rs is a wheel, which pip fetches into `target/bench` (`rivals.requirements.txt`). rosbridge_suite is no package of any
-//! registry: `CLOUDROID_ROSBRIDGE_SUITE` may name an install space of its branch `ros2`, as colcon leaves it with `--merge-install`.
+//! rosbridge-server-rs is a wheel, which pip installs into `target/bench` (`rivals.requirements.txt`). rosbridge_suite
+//! is not in any registry: `CLOUDROID_ROSBRIDGE_SUITE` may name an install space of its branch `ros2`, as colcon
+//! creates it with `--merge-install`.
 
 use std::fmt;
 use std::os::unix::fs::symlink;
@@ -9,20 +10,20 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use anyhow::{Context, Result, ensure};
-use bench_report::Report;
+use bench_report::BenchReport;
 
 use crate::portal::ADDRESS;
-use crate::world::{self, Program, World};
+use crate::world::{self, BenchNetwork, BenchProgram};
 
-/// Where the install space is said to be.
+/// Environment variable that names the install space.
 const SUITE: &str = "CLOUDROID_ROSBRIDGE_SUITE";
-/// Its server, below that.
+/// Path of its server in the install space.
 const SUITE_SERVER: &str = "lib/rosbridge_server/rosbridge_websocket.py";
 
 /// A server that can be started.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Rival {
-    /// The wheel, unpacked there.
+    /// Directory into which the wheel is installed.
     ServerRs(PathBuf),
     /// The install space.
     Suite(PathBuf),
@@ -38,26 +39,26 @@ impl fmt::Display for Rival {
 }
 
 impl Rival {
-    /// Those that are there; of others the report says why they are not.
-    pub(crate) fn all(report: &mut Report) -> Vec<Self> {
+    /// Returns the available servers; the others are reported as skipped, with the reason.
+    pub(crate) fn find_available(report: &mut BenchReport) -> Vec<Self> {
         let mut all = Vec::new();
         for (name, found) in [
-            ("rosbridge-server-rs", server_rs()),
-            ("rosbridge_suite", suite()),
+            ("rosbridge-server-rs", install_server_rs()),
+            ("rosbridge_suite", find_suite()),
         ] {
             match found {
                 Ok(rival) => all.push(rival),
-                Err(why) => report.left_out(name, format!("{why:#}")),
+                Err(why) => report.skip(name, format!("{why:#}")),
             }
         }
         all
     }
 
-    /// Starts it in this network; it listens a moment later.
-    pub(crate) fn start(&self, world: &World) -> Result<Program> {
-        let prefix = world::prefix()?;
-        let mut command = world.inside();
-        // What it finds and writes at home is of this network alone.
+    /// Starts the server in this network; it listens a moment later.
+    pub(crate) fn start(&self, world: &BenchNetwork) -> Result<BenchProgram> {
+        let prefix = world::wheels_prefix()?;
+        let mut command = world.command();
+        // Its home directory is private to this network.
         command.args([
             "env",
             "HOME=/dev/shm",
@@ -66,14 +67,18 @@ impl Rival {
         ]);
         match self {
             Self::ServerRs(place) => {
-                let libraries = format!("{}:{}", place.join("lib").display(), libraries(&prefix)?);
+                let libraries = format!(
+                    "{}:{}",
+                    place.join("lib").display(),
+                    library_paths(&prefix)?
+                );
                 command
                     .arg(format!("LD_LIBRARY_PATH={libraries}"))
                     .arg(format!("AMENT_PREFIX_PATH={}", prefix.display()))
-                    // Libraries of the wheels use symbols of the Python that loads them.
+                    // The wheels' libraries use symbols of the Python that loads them.
                     .arg("LD_PRELOAD=libpython3.11.so.1.0")
                     .arg(place.join("rosbridge_server_rs/rosbridge_server_rs_jazzy"))
-                    // Its own services are of types that no wheel has.
+                    // Its own services have types that no wheel contains.
                     .args(["--no-rosapi", "--log-level", "error", "--bind", ADDRESS]);
             }
             Self::Suite(place) => {
@@ -82,19 +87,19 @@ impl Rival {
                     .arg("sh")
                     .args(["-c", r#". "$0/local_setup.sh" && exec "$@""#])
                     .arg(place)
-                    .arg(world::python()?)
+                    .arg(world::python_path()?)
                     .arg(place.join(SUITE_SERVER))
                     .args(["--ros-args", "--log-level", "error"])
                     .args(["-p", "address:=127.0.0.1", "-p"])
                     .arg(format!("port:={port}"));
             }
         }
-        Program::start_quietly(command, &self.to_string())
+        BenchProgram::start_quietly(command, &self.to_string())
     }
 }
 
-/// Directories of the wheels' libraries, as the wheels' own module names them for Python.
-fn libraries(prefix: &Path) -> Result<String> {
+/// Returns the library directories of the wheels, like the wheels' own Python module.
+fn library_paths(prefix: &Path) -> Result<String> {
     let mut all = vec![prefix.join("lib")];
     for entry in std::fs::read_dir(prefix.join("lib/python3.11/site-packages"))? {
         let path = entry?.path();
@@ -109,14 +114,14 @@ fn libraries(prefix: &Path) -> Result<String> {
     Ok(all.join(":"))
 }
 
-fn server_rs() -> Result<Rival> {
+fn install_server_rs() -> Result<Rival> {
     let list = bench_report::root().join("benches/ros2/rivals.requirements.txt");
     let place = bench_report::root().join("target/bench/rosbridge-server-rs");
     let program = place.join("rosbridge_server_rs/rosbridge_server_rs_jazzy");
     let done = place.join("complete");
     if !done.exists() {
         std::fs::create_dir_all(place.join("lib"))?;
-        let output = Command::new(world::python()?)
+        let output = Command::new(world::python_path()?)
             .args(["-m", "pip", "install", "--quiet", "--no-deps"])
             .args([
                 "--disable-pip-version-check",
@@ -138,11 +143,11 @@ fn server_rs() -> Result<Rival> {
             "{} is not in its wheel",
             program.display()
         );
-        // It asks for the library that chooses an implementation of rmw; the wheels have the one that is chosen.
+        // It needs the library that selects an rmw implementation; the wheels contain the selected one.
         let library = place.join("lib/librmw_implementation.so");
         if !library.is_symlink() {
             symlink(
-                world::prefix()?.join("lib/librmw_fastrtps_cpp.so"),
+                world::wheels_prefix()?.join("lib/librmw_fastrtps_cpp.so"),
                 &library,
             )?;
         }
@@ -153,11 +158,12 @@ fn server_rs() -> Result<Rival> {
     Ok(Rival::ServerRs(place))
 }
 
-fn suite() -> Result<Rival> {
+fn find_suite() -> Result<Rival> {
     let place = std::env::var_os(SUITE).map(PathBuf::from);
     let place = place.with_context(|| {
         format!(
-            "no registry has it; {SUITE} may name an install space of its branch ros2, compiled against the wheels of {}",
+            "no registry has it; {SUITE} may name an install space of its branch ros2, compiled against the wheels of \
+             {}",
             world::PREFIX
         )
     })?;

@@ -1,5 +1,5 @@
-//! What this program does within a [`World`](crate::world::World): `bench-ros2 inside ROLE …`. Each role says `{}` when it is
-//! ready, then lines of JSON.
+//! The roles of this program inside a [`BenchNetwork`](crate::world::BenchNetwork): `bench-ros2 inside ROLE …`. Each
+//! role prints `{}` when it is ready, then lines of JSON.
 
 use std::io::Read;
 use std::net::UdpSocket;
@@ -7,11 +7,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use rtps::{EndpointQos, Sample, SampleIdentity, SequenceNumber};
+use rtps::{EndpointQos, ReceivedSample, SampleIdentity, SequenceNumber};
 use serde_json::{Value, json};
 use tokio::sync::mpsc::UnboundedReceiver;
 
-use crate::ends::{hears, join, matched, reads, writes};
+use crate::ends::{create_listener, create_reader, create_writer, join, wait_until_matched};
 use crate::message::{self, REQUEST, RESPONSE, STRING, TEXT};
 use crate::process::Process;
 use crate::{awake, bus, camera, client, crowd, hop, portal};
@@ -21,33 +21,33 @@ const PONG: (&str, &str) = ("rt/pong", STRING);
 const BEAT: (&str, &str) = ("rt/beat", STRING);
 const ASKED: (&str, &str) = ("rq/setboolRequest", REQUEST);
 const ANSWERED: (&str, &str) = ("rr/setboolReply", RESPONSE);
-/// Where datagrams alone are echoed.
+/// Address of the plain datagram echo.
 pub(crate) const ECHO: &str = "127.0.0.1:20000";
-/// One as long as a String with what RTPS puts around it.
+/// A datagram of the length of a String within RTPS.
 pub(crate) const DATAGRAM: [u8; 128] = [7; 128];
-/// An answer that takes longer does not come.
+/// Time after which an answer counts as missing.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(2);
-/// The first of so many do not count.
+/// Number of warm-up exchanges, which are not counted.
 pub(crate) const WARM: usize = 10;
 
-/// Says a line.
-pub(crate) fn say(line: &Value) {
+/// Prints a line of JSON.
+pub(crate) fn print_json(line: &Value) {
     println!("{line}");
 }
 
-/// Plays the role.
-pub(crate) fn play(words: &[&str]) -> Result<()> {
+/// Runs the role that `words` names.
+pub(crate) fn run(words: &[&str]) -> Result<()> {
     match words {
-        ["awake"] => return awake::play(),
-        ["datagrams"] => return datagrams(),
-        ["datagram-trips", count] => return datagram_trips(count.parse()?),
-        ["hop"] => return hop::serve(),
-        ["hop-trips", count] => return hop::trips(count.parse()?),
+        ["awake"] => return awake::run(),
+        ["datagrams"] => return echo_datagrams(),
+        ["datagram-trips", count] => return time_datagrams(count.parse()?),
+        ["hop"] => return hop::run_relay(),
+        ["hop-trips", count] => return hop::time_trips(count.parse()?),
         ["crowd", what, count, seconds] => {
-            return crowd::play(what, count.parse()?, seconds.parse()?);
+            return crowd::run(what, count.parse()?, seconds.parse()?);
         }
-        ["portal", rest @ ..] => return portal::play(rest),
-        ["client", rest @ ..] => return client::play(rest),
+        ["portal", rest @ ..] => return portal::run(rest),
+        ["client", rest @ ..] => return client::run(rest),
         _ => {}
     }
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -55,36 +55,36 @@ pub(crate) fn play(words: &[&str]) -> Result<()> {
         .build()?;
     runtime.block_on(async {
         match words {
-            ["relay"] => relay().await,
-            ["trips", count] => trips(count.parse()?).await,
-            ["calls", count] => calls(count.parse()?).await,
-            ["joins"] => joins().await,
-            ["rests"] => rests().await,
-            ["sends", rest @ ..] => camera::sends(rest).await,
-            ["takes", rest @ ..] => camera::takes(rest).await,
-            ["bus", rest @ ..] => bus::play(rest).await,
+            ["relay"] => run_relay().await,
+            ["trips", count] => time_trips(count.parse()?).await,
+            ["calls", count] => time_calls(count.parse()?).await,
+            ["joins"] => time_join().await,
+            ["rests"] => measure_idle().await,
+            ["sends", rest @ ..] => camera::send_pictures(rest).await,
+            ["takes", rest @ ..] => camera::receive_pictures(rest).await,
+            ["bus", rest @ ..] => bus::run(rest).await,
             _ => bail!("no role is called {words:?}"),
         }
     })
 }
 
-/// Ends when whoever started this does, or says so.
-pub(crate) async fn until_asked() -> Result<bool> {
+/// Waits for a request of the parent, or for its end; returns whether it was a request.
+pub(crate) async fn wait_for_request() -> Result<bool> {
     let ask = || std::io::stdin().read(&mut [0]);
     Ok(tokio::task::spawn_blocking(ask).await?? > 0)
 }
 
-/// Brings every ping back, and answers calls.
-async fn relay() -> Result<()> {
+/// Runs the role `relay`: returns every ping and answers calls.
+async fn run_relay() -> Result<()> {
     let participant = join().await?;
     let qos = EndpointQos::default();
-    let pong = writes(&participant, PONG, qos);
-    let _pings = hears(&participant, PING, qos, move |ping| {
+    let pong = create_writer(&participant, PONG, qos);
+    let _pings = create_listener(&participant, PING, qos, move |ping| {
         pong.write(ping.payload);
     });
-    let answers = writes(&participant, ANSWERED, qos);
-    let _requests = hears(&participant, ASKED, qos, move |request| {
-        // Fast DDS's clients ask to be answered at their reader.
+    let answers = create_writer(&participant, ANSWERED, qos);
+    let _requests = create_listener(&participant, ASKED, qos, move |request| {
+        // Clients of Fast DDS request the answer at their reader.
         let to = request
             .related
             .map_or(request.writer, |related| related.writer);
@@ -92,10 +92,10 @@ async fn relay() -> Result<()> {
             writer: to,
             number: request.number,
         };
-        answers.write_related(message::response(&request.payload), related);
+        answers.write_related(message::set_bool_response(&request.payload), related);
     });
-    say(&json!({}));
-    until_asked().await.map(drop)
+    print_json(&json!({}));
+    wait_for_request().await.map(drop)
 }
 
 pub(crate) fn quantiles(times: &[Duration]) -> Value {
@@ -106,62 +106,70 @@ pub(crate) fn quantiles(times: &[Duration]) -> Value {
     json!({"p50": micros(0.5), "p99": micros(0.99)})
 }
 
-/// The next sample; none when it does not come.
-async fn next(samples: &mut UnboundedReceiver<Sample>, patience: Duration) -> Option<Sample> {
+/// Returns the next sample, or `None` if none arrives in time.
+async fn next_sample(
+    samples: &mut UnboundedReceiver<ReceivedSample>,
+    patience: Duration,
+) -> Option<ReceivedSample> {
     tokio::time::timeout(patience, samples.recv())
         .await
         .ok()
         .flatten()
 }
 
-/// Strings there and back, one at a time.
-async fn trips(count: usize) -> Result<()> {
+/// Measures round trips of Strings, one at a time.
+async fn time_trips(count: usize) -> Result<()> {
     let participant = join().await?;
     let qos = EndpointQos::default();
-    let (_reader, mut pongs) = reads(&participant, PONG, qos);
-    let pings = writes(&participant, PING, qos);
-    matched(pings.ends()).await?;
-    // The other side may not know of both ends yet.
+    let (_reader, mut pongs) = create_reader(&participant, PONG, qos);
+    let pings = create_writer(&participant, PING, qos);
+    wait_until_matched(pings.watch_matches()).await?;
+    // The other side may not have discovered both endpoints yet.
     let brief = Duration::from_millis(20);
     let first = message::string("first");
     for _ in 0..500 {
         pings.write(first.clone());
-        if next(&mut pongs, brief).await.is_some() {
+        if next_sample(&mut pongs, brief).await.is_some() {
             break;
         }
     }
-    say(&json!({}));
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let text = message::string(&format!("{TEXT}, {number}"));
         let begun = Instant::now();
         pings.write(text.clone());
-        // Others of the first may still be on their way.
-        while next(&mut pongs, PATIENCE).await.context("a pong")?.payload != text {}
+        // Further copies of the first message may still be in flight.
+        while next_sample(&mut pongs, PATIENCE)
+            .await
+            .context("a pong")?
+            .payload
+            != text
+        {}
         if number >= WARM {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-/// Calls, one at a time.
-async fn calls(count: usize) -> Result<()> {
+/// Measures calls, one at a time.
+async fn time_calls(count: usize) -> Result<()> {
     let participant = join().await?;
     let qos = EndpointQos::default();
-    let (reader, mut answers) = reads(&participant, ANSWERED, qos);
-    let requests = writes(&participant, ASKED, qos);
-    matched(requests.ends()).await?;
-    matched(reader.ends()).await?;
+    let (reader, mut answers) = create_reader(&participant, ANSWERED, qos);
+    let requests = create_writer(&participant, ASKED, qos);
+    wait_until_matched(requests.watch_matches()).await?;
+    wait_until_matched(reader.watch_matches()).await?;
     let related = SampleIdentity {
         writer: reader.guid(),
         number: SequenceNumber::UNKNOWN,
     };
     let mut call = async |patience| {
-        let number = requests.write_related(message::request(true), related);
+        let number = requests.write_related(message::set_bool_request(true), related);
         loop {
-            let answer = next(&mut answers, patience).await?;
+            let answer = next_sample(&mut answers, patience).await?;
             if answer
                 .related
                 .is_some_and(|related| related.number == number)
@@ -170,13 +178,13 @@ async fn calls(count: usize) -> Result<()> {
             }
         }
     };
-    // A server that does not know of our reader yet has nobody to answer.
+    // A server that has not discovered our reader cannot answer.
     for _ in 0..500 {
         if call(Duration::from_millis(20)).await.is_some() {
             break;
         }
     }
-    say(&json!({}));
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
@@ -185,19 +193,19 @@ async fn calls(count: usize) -> Result<()> {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }
 
-/// Comes to a node that runs: until its first message is here, and until one of ours has come back.
-async fn joins() -> Result<()> {
-    say(&json!({}));
+/// Joins a running node; measures until its first message arrives, and until one of ours has been returned.
+async fn time_join() -> Result<()> {
+    print_json(&json!({}));
     let begun = Instant::now();
     let participant = join().await?;
     let qos = EndpointQos::default();
-    let (_beats, mut beats) = reads(&participant, BEAT, qos);
-    let (_pongs, mut pongs) = reads(&participant, PONG, qos);
-    let pings = Arc::new(writes(&participant, PING, qos));
+    let (_beats, mut beats) = create_reader(&participant, BEAT, qos);
+    let (_pongs, mut pongs) = create_reader(&participant, PONG, qos);
+    let pings = Arc::new(create_writer(&participant, PING, qos));
     let pinging = {
         let pings = pings.clone();
         tokio::spawn(async move {
@@ -208,30 +216,30 @@ async fn joins() -> Result<()> {
         })
     };
     let long = Duration::from_secs(10);
-    let since = async |samples: &mut UnboundedReceiver<Sample>| {
-        let came = next(samples, long).await;
+    let since = async |samples: &mut UnboundedReceiver<ReceivedSample>| {
+        let came = next_sample(samples, long).await;
         came.map(|_| begun.elapsed().as_secs_f64() * 1e3)
     };
     let (beat, pong) = tokio::join!(since(&mut beats), since(&mut pongs));
     pinging.abort();
-    say(&json!({"beat": beat.context("a beat")?, "pong": pong.context("a pong")?}));
+    print_json(&json!({"beat": beat.context("a beat")?, "pong": pong.context("a pong")?}));
     Ok(())
 }
 
-/// Is there, matched, and does nothing: what that takes.
-async fn rests() -> Result<()> {
-    let this = Process::this();
+/// Measures the resources of a matched and idle participant.
+async fn measure_idle() -> Result<()> {
+    let this = Process::current();
     // The runtime's own threads and descriptors are not the participant's.
     tokio::task::spawn_blocking(|| ()).await?;
     let before = (this.resident()?, this.descriptors()?, this.threads()?);
     let participant = join().await?;
     let qos = EndpointQos::default();
-    let (_pongs, _samples) = reads(&participant, PONG, qos);
-    let pings = writes(&participant, PING, qos);
-    matched(pings.ends()).await?;
-    say(&json!({}));
-    while until_asked().await? {
-        say(&json!({
+    let (_pongs, _samples) = create_reader(&participant, PONG, qos);
+    let pings = create_writer(&participant, PING, qos);
+    wait_until_matched(pings.watch_matches()).await?;
+    print_json(&json!({}));
+    while wait_for_request().await? {
+        print_json(&json!({
             "memory": this.resident()? - before.0, "process": this.resident()?,
             "descriptors": this.descriptors()? - before.1, "threads": this.threads()? - before.2,
         }));
@@ -239,10 +247,10 @@ async fn rests() -> Result<()> {
     Ok(())
 }
 
-/// Brings every datagram back.
-fn datagrams() -> Result<()> {
+/// Runs the role `datagrams`: returns every datagram.
+fn echo_datagrams() -> Result<()> {
     let socket = UdpSocket::bind(ECHO)?;
-    say(&json!({}));
+    print_json(&json!({}));
     let mut datagram = [0; 2048];
     loop {
         let (length, from) = socket.recv_from(&mut datagram)?;
@@ -250,12 +258,12 @@ fn datagrams() -> Result<()> {
     }
 }
 
-/// [`DATAGRAM`]s there and back, one at a time.
-fn datagram_trips(count: usize) -> Result<()> {
+/// Measures round trips of [`DATAGRAM`], one at a time.
+fn time_datagrams(count: usize) -> Result<()> {
     let socket = UdpSocket::bind("127.0.0.1:0")?;
     socket.connect(ECHO)?;
     socket.set_read_timeout(Some(PATIENCE))?;
-    say(&json!({}));
+    print_json(&json!({}));
     let mut times = Vec::with_capacity(count);
     for number in 0..count + WARM {
         let begun = Instant::now();
@@ -265,6 +273,6 @@ fn datagram_trips(count: usize) -> Result<()> {
             times.push(begun.elapsed());
         }
     }
-    say(&quantiles(&times));
+    print_json(&quantiles(&times));
     Ok(())
 }

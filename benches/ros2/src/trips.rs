@@ -1,54 +1,55 @@
-//! How long a String is under way to another participant and back, a call, and an action's goal; one at a time, without and through the portal,
-//! and through other servers of rosbridge.
+//! Round-trip times of a String to another participant and back, of a call, and of an action's goal; one at a time,
+//! directly, through the portal, and through other rosbridge servers.
 
 use std::time::Duration;
 
 use anyhow::{Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::Value;
 
-use crate::awake::Awake;
+use crate::awake::AwakeCores;
 use crate::rivals::Rival;
-use crate::world::{Host, Program, Transport, World, number};
+use crate::world::{BenchNetwork, BenchProgram, Host, Transport, json_number};
 
-/// Per turn. A server of rclpy tells of all goals of the last fifteen minutes whenever one changes: of few there is little to tell.
+/// Exchanges per turn. An rclpy server publishes the status of all goals of the last fifteen minutes whenever one
+/// changes, so there are fewer goals.
 const TRIPS: &str = "2000";
 const GOALS: &str = "200";
-/// A turn takes seconds.
+/// Maximum duration of a turn, which takes seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// What the portal may add to the way to the same node.
+/// Limit for the portal, relative to the direct path to the same node.
 const THROUGH: Target = Target::RatioAtMost(1.5);
 
-/// Who asks, and who answers.
+/// Client and server of a measurement.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Way {
-    /// A client of the portal asks the bus of `Bus`.
+enum TripPath {
+    /// A client of the portal and the bus of `Bus`.
     Portal,
-    /// A client of the portal asks a node.
+    /// A client of the portal and a node.
     PortalToRclpy,
-    /// A client of another server asks the bus of `Bus`.
+    /// A client of another server and the bus of `Bus`.
     ByRival(Rival),
-    /// A client of another server asks a node.
+    /// A client of another server and a node.
     ByRivalToRclpy(Rival),
-    /// Ours, both.
+    /// Our participants on both sides.
     Ours,
-    /// Buses over them, both: the direct way to the node that clients of the portal ask.
+    /// Buses on both sides: the direct path to the node that clients of the portal call.
     Bus,
-    /// A bus asks a node.
+    /// A bus and a node.
     BusToRclpy,
-    /// A node asks a bus.
+    /// A node and a bus.
     RclpyToBus,
-    /// Nodes, both, by UDP.
+    /// Nodes on both sides, by UDP.
     Rclpy,
-    /// Nodes, both, as they come.
+    /// Nodes on both sides, with default settings.
     Stock,
-    /// Sockets alone.
+    /// Plain sockets.
     Datagrams,
-    /// The same with a process between that moves the bytes.
+    /// Plain sockets with a process in between that copies the bytes.
     Hop,
 }
 
-impl Way {
+impl TripPath {
     fn name(&self) -> String {
         let name = match self {
             Self::Portal => "portal to bus",
@@ -67,55 +68,55 @@ impl Way {
         name.to_owned()
     }
 
-    /// The server between asker and answerer.
-    fn server(&self, world: &World) -> Result<Option<Program>> {
+    /// Starts the server between client and answerer, if there is one.
+    fn start_server(&self, world: &BenchNetwork) -> Result<Option<BenchProgram>> {
         match self {
-            Self::Portal | Self::PortalToRclpy => world.ours(&["portal", "kept"]).map(Some),
+            Self::Portal | Self::PortalToRclpy => world.start_role(&["portal", "kept"]).map(Some),
             Self::ByRival(rival) | Self::ByRivalToRclpy(rival) => rival.start(world).map(Some),
-            Self::Hop => world.ours(&["hop"]).map(Some),
+            Self::Hop => world.start_role(&["hop"]).map(Some),
             _ => Ok(None),
         }
     }
 
-    fn answers(&self, world: &World) -> Result<Program> {
+    fn start_answerer(&self, world: &BenchNetwork) -> Result<BenchProgram> {
         match self {
-            Self::Ours => world.ours(&["relay"]),
+            Self::Ours => world.start_role(&["relay"]),
             Self::Bus | Self::RclpyToBus | Self::Portal | Self::ByRival(_) => {
-                world.ours(&["bus", "relay"])
+                world.start_role(&["bus", "relay"])
             }
-            Self::BusToRclpy | Self::Rclpy => world.rclpy(Transport::Udp, &["relay"]),
-            // As nodes come: another's server may reach it by shared memory.
+            Self::BusToRclpy | Self::Rclpy => world.start_rclpy(Transport::Udp, &["relay"]),
+            // Nodes with default settings, because another server may reach them through shared memory.
             Self::Stock | Self::PortalToRclpy | Self::ByRivalToRclpy(_) => {
-                world.rclpy(Transport::Stock, &["relay"])
+                world.start_rclpy(Transport::Stock, &["relay"])
             }
-            Self::Datagrams | Self::Hop => world.ours(&["datagrams"]),
+            Self::Datagrams | Self::Hop => world.start_role(&["datagrams"]),
         }
     }
 
-    fn asks(&self, world: &World, role: &str) -> Result<Program> {
+    fn start_asker(&self, world: &BenchNetwork, role: &str) -> Result<BenchProgram> {
         let count = if role == "goals" { GOALS } else { TRIPS };
         match self {
-            Self::Ours => world.ours(&[role, count]),
-            Self::Bus | Self::BusToRclpy => world.ours(&["bus", role, count]),
+            Self::Ours => world.start_role(&[role, count]),
+            Self::Bus | Self::BusToRclpy => world.start_role(&["bus", role, count]),
             Self::Portal | Self::PortalToRclpy | Self::ByRival(_) | Self::ByRivalToRclpy(_) => {
-                world.ours(&["client", role, count])
+                world.start_role(&["client", role, count])
             }
-            Self::RclpyToBus | Self::Rclpy => world.rclpy(Transport::Udp, &[role, count]),
-            Self::Stock => world.rclpy(Transport::Stock, &[role, count]),
-            Self::Datagrams => world.ours(&["datagram-trips", TRIPS]),
-            Self::Hop => world.ours(&["hop-trips", TRIPS]),
+            Self::RclpyToBus | Self::Rclpy => world.start_rclpy(Transport::Udp, &[role, count]),
+            Self::Stock => world.start_rclpy(Transport::Stock, &[role, count]),
+            Self::Datagrams => world.start_role(&["datagram-trips", TRIPS]),
+            Self::Hop => world.start_role(&["hop-trips", TRIPS]),
         }
     }
 
-    /// p50 and p99 of one turn, in microseconds.
-    fn turn(&self, role: &str) -> Result<[f64; 2]> {
-        let mut world = World::new()?;
-        world.place(Host::Server)?;
-        let _answers = self.answers(&world)?;
-        let _server = self.server(&world)?;
-        world.place(Host::Robot)?;
-        let found: Value = self.asks(&world, role)?.answer_within(PATIENCE)?;
-        let times = [number(&found, "p50")?, number(&found, "p99")?];
+    /// Returns p50 and p99 of one turn, in microseconds.
+    fn measure_turn(&self, role: &str) -> Result<[f64; 2]> {
+        let mut world = BenchNetwork::new()?;
+        world.pin_to(Host::Server)?;
+        let _answers = self.start_answerer(&world)?;
+        let _server = self.start_server(&world)?;
+        world.pin_to(Host::Robot)?;
+        let found: Value = self.start_asker(&world, role)?.answer_within(PATIENCE)?;
+        let times = [json_number(&found, "p50")?, json_number(&found, "p99")?];
         ensure!(
             times.iter().all(|time| time.is_finite()),
             "{}: {found}",
@@ -125,28 +126,28 @@ impl Way {
     }
 }
 
-/// The best p50 and the best p99 of each way's turns, which alternate; none of another's server that does not do it.
-fn race(
-    report: &mut Report,
+/// Returns the best p50 and the best p99 of each path's turns, which alternate; `None` for another server that fails.
+fn measure_in_turns(
+    report: &mut BenchReport,
     what: &str,
     role: &str,
-    ways: &[Way],
+    ways: &[TripPath],
 ) -> Result<Vec<Option<[f64; 2]>>> {
-    let rounds = if crate::full() { 15 } else { 5 };
-    let _awake = Awake::all()?;
+    let rounds = if crate::is_full_run() { 15 } else { 5 };
+    let _awake = AwakeCores::start()?;
     let mut best = vec![Some([f64::INFINITY; 2]); ways.len()];
     for round in 1..=rounds {
         eprintln!("{what}: round {round} of {rounds}");
         for (way, best) in ways.iter().zip(&mut best) {
             let Some(times) = best else { continue };
-            match (way.turn(role), way) {
+            match (way.measure_turn(role), way) {
                 (Ok(found), _) => {
                     for (best, found) in times.iter_mut().zip(found) {
                         *best = best.min(found);
                     }
                 }
-                (Err(why), Way::ByRival(_) | Way::ByRivalToRclpy(_)) => {
-                    report.left_out(format!("{what}, {}", way.name()), format!("{why:#}"));
+                (Err(why), TripPath::ByRival(_) | TripPath::ByRivalToRclpy(_)) => {
+                    report.skip(format!("{what}, {}", way.name()), format!("{why:#}"));
                     *best = None;
                 }
                 (Err(why), _) => return Err(why),
@@ -156,78 +157,94 @@ fn race(
     Ok(best)
 }
 
-/// Ways, and what each stands beside.
-type Beside = Vec<(Way, Vec<Way>)>;
+/// Paths, each with the paths that it is compared with.
+type PathComparisons = Vec<(TripPath, Vec<TripPath>)>;
 
-/// Through the portal, beside the direct way and beside other servers.
-fn through(rivals: &[Rival]) -> Beside {
-    let beside = |direct: &[Way], rival: fn(Rival) -> Way| {
+/// Paths through the portal, compared with the direct path and with other servers.
+fn portal_comparisons(rivals: &[Rival]) -> PathComparisons {
+    let beside = |direct: &[TripPath], rival: fn(Rival) -> TripPath| {
         let rivals = rivals.iter().cloned().map(rival);
         direct.iter().cloned().chain(rivals).collect()
     };
-    let nodes = [Way::BusToRclpy, Way::Rclpy, Way::Stock];
+    let nodes = [TripPath::BusToRclpy, TripPath::Rclpy, TripPath::Stock];
     vec![
-        (Way::Portal, beside(&[Way::Bus], Way::ByRival)),
-        (Way::PortalToRclpy, beside(&nodes, Way::ByRivalToRclpy)),
+        (
+            TripPath::Portal,
+            beside(&[TripPath::Bus], TripPath::ByRival),
+        ),
+        (
+            TripPath::PortalToRclpy,
+            beside(&nodes, TripPath::ByRivalToRclpy),
+        ),
     ]
 }
 
-/// Between a bus and a node, in both directions.
-fn with_nodes() -> Beside {
+/// Paths between a bus and a node, in both directions.
+fn node_comparisons() -> PathComparisons {
     vec![
-        (Way::BusToRclpy, vec![Way::Rclpy]),
-        (Way::RclpyToBus, vec![Way::Rclpy]),
+        (TripPath::BusToRclpy, vec![TripPath::Rclpy]),
+        (TripPath::RclpyToBus, vec![TripPath::Rclpy]),
     ]
 }
 
-/// Strings.
-pub(crate) fn strings(report: &mut Report) -> Result<()> {
+/// Measures Strings.
+pub(crate) fn measure_strings(report: &mut BenchReport) -> Result<()> {
     let mut ways = vec![
-        (Way::Ours, vec![Way::Datagrams, Way::Rclpy, Way::Stock]),
-        (Way::Bus, vec![Way::Ours]),
-        (Way::Hop, vec![Way::Datagrams]),
+        (
+            TripPath::Ours,
+            vec![TripPath::Datagrams, TripPath::Rclpy, TripPath::Stock],
+        ),
+        (TripPath::Bus, vec![TripPath::Ours]),
+        (TripPath::Hop, vec![TripPath::Datagrams]),
     ];
-    ways.extend(with_nodes());
-    ways.extend(through(&Rival::all(report)));
-    ways.push((Way::Portal, vec![Way::Hop]));
+    ways.extend(node_comparisons());
+    ways.extend(portal_comparisons(&Rival::find_available(report)));
+    ways.push((TripPath::Portal, vec![TripPath::Hop]));
     measure(report, "String there and back", "trips", &ways)
 }
 
-/// Calls.
-pub(crate) fn calls(report: &mut Report) -> Result<()> {
+/// Measures calls.
+pub(crate) fn measure_calls(report: &mut BenchReport) -> Result<()> {
     let mut ways = vec![
-        (Way::Ours, vec![Way::Datagrams, Way::Rclpy, Way::Stock]),
-        (Way::Bus, vec![Way::Ours]),
-        (Way::Hop, vec![Way::Datagrams]),
+        (
+            TripPath::Ours,
+            vec![TripPath::Datagrams, TripPath::Rclpy, TripPath::Stock],
+        ),
+        (TripPath::Bus, vec![TripPath::Ours]),
+        (TripPath::Hop, vec![TripPath::Datagrams]),
     ];
-    ways.extend(with_nodes());
-    ways.extend(through(&Rival::all(report)));
-    // A call is one message there and one back, as a String is.
-    ways.push((Way::Portal, vec![Way::Hop]));
+    ways.extend(node_comparisons());
+    ways.extend(portal_comparisons(&Rival::find_available(report)));
+    // A call is one message in each direction, as a String is.
+    ways.push((TripPath::Portal, vec![TripPath::Hop]));
     measure(report, "service call", "calls", &ways)
 }
 
-/// Goals.
-pub(crate) fn goals(report: &mut Report) -> Result<()> {
-    let mut ways = vec![(Way::Bus, vec![Way::Rclpy, Way::Stock])];
-    ways.extend(with_nodes());
-    ways.extend(through(&Rival::all(report)));
+/// Measures goals.
+pub(crate) fn measure_goals(report: &mut BenchReport) -> Result<()> {
+    let mut ways = vec![(TripPath::Bus, vec![TripPath::Rclpy, TripPath::Stock])];
+    ways.extend(node_comparisons());
+    ways.extend(portal_comparisons(&Rival::find_available(report)));
     measure(report, "goal of an action until its result", "goals", &ways)
 }
 
-/// What is to be reached, of a way beside another.
-fn target(way: &Way, floor: &Way) -> Option<Target> {
+/// Returns the target of a path relative to another, if there is one.
+fn target(way: &TripPath, floor: &TripPath) -> Option<Target> {
     match (way, floor) {
-        (Way::Portal, Way::Bus) => Some(THROUGH),
-        (Way::Portal, Way::ByRival(_)) | (Way::PortalToRclpy, Way::ByRivalToRclpy(_)) => {
-            Some(Target::BelowFloor)
-        }
+        (TripPath::Portal, TripPath::Bus) => Some(THROUGH),
+        (TripPath::Portal, TripPath::ByRival(_))
+        | (TripPath::PortalToRclpy, TripPath::ByRivalToRclpy(_)) => Some(Target::BelowFloor),
         _ => None,
     }
 }
 
-fn measure(report: &mut Report, what: &str, role: &str, beside: &[(Way, Vec<Way>)]) -> Result<()> {
-    let mut ways: Vec<Way> = Vec::new();
+fn measure(
+    report: &mut BenchReport,
+    what: &str,
+    role: &str,
+    beside: &[(TripPath, Vec<TripPath>)],
+) -> Result<()> {
+    let mut ways: Vec<TripPath> = Vec::new();
     for (way, floors) in beside {
         for way in [way].into_iter().chain(floors) {
             if !ways.contains(way) {
@@ -235,8 +252,8 @@ fn measure(report: &mut Report, what: &str, role: &str, beside: &[(Way, Vec<Way>
             }
         }
     }
-    let found = race(report, what, role, &ways)?;
-    let of = |way: &Way| {
+    let found = measure_in_turns(report, what, role, &ways)?;
+    let of = |way: &TripPath| {
         let at = ways.iter().position(|other| other == way);
         at.and_then(|at| found[at])
     };
@@ -250,9 +267,9 @@ fn measure(report: &mut Report, what: &str, role: &str, beside: &[(Way, Vec<Way>
         for (at, name) in ["p50", "p99"].into_iter().enumerate() {
             let what = format!("{what}, {}: {name}", way.name());
             let figure = report.figure(what, "µs", value[at]);
-            figure.beside(floor.name(), beside[at]);
+            figure.relative_to(floor.name(), beside[at]);
             if let Some(target) = target(way, floor).filter(|_| name == "p50") {
-                figure.reach(target);
+                figure.require(target);
             }
         }
     }

@@ -1,16 +1,16 @@
-//! The definitions of what is measured with, as a daemon has them of an image.
+//! Definitions of the types in use, as a daemon gets them from an image.
 
 use anyhow::Result;
 use ros::bus::RosVersion;
 use ros::schema::Registry;
 
-/// Types as clients of rosbridge name them.
+/// Type names in the form that rosbridge clients use.
 pub(crate) const STRING: &str = "std_msgs/msg/String";
 pub(crate) const IMAGE: &str = "sensor_msgs/msg/Image";
 pub(crate) const CALL: &str = "std_srvs/srv/SetBool";
 pub(crate) const GOAL: &str = "test_msgs/action/Fibonacci";
 
-/// Word for word what the packages of ROS say, without comments: types are told apart by a hash of it.
+/// Definitions exactly as in the ROS packages, without comments: types are identified by a hash of them.
 const DEFINITIONS: [(&str, &str); 6] = [
     (STRING, "string data\n"),
     ("builtin_interfaces/msg/Time", "int32 sec\nuint32 nanosec\n"),
@@ -20,7 +20,8 @@ const DEFINITIONS: [(&str, &str); 6] = [
     ),
     (
         IMAGE,
-        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n",
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 \
+         step\nuint8[] data\n",
     ),
     (CALL, "bool data\n---\nbool success\nstring message\n"),
     (
@@ -29,9 +30,9 @@ const DEFINITIONS: [(&str, &str); 6] = [
     ),
 ];
 
-/// All of them.
+/// Returns a registry of all definitions.
 pub(crate) fn registry() -> Result<Registry> {
-    let known = Registry::of(RosVersion::Two);
+    let known = Registry::for_version(RosVersion::Two);
     for (name, text) in DEFINITIONS {
         known.insert(name, text)?;
     }

@@ -1,4 +1,4 @@
-//! A network that nobody else is in, with a /dev/shm of its own, as a servant has it; and the programs that are run there.
+//! A private network with a /dev/shm of its own, like a servant's; and the programs that run in it.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
@@ -9,34 +9,35 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail, ensure};
 use serde_json::Value;
 
-/// What holds the namespaces; it ends when its standard input does, so that none outlives this program.
+/// Script that holds the namespaces; it ends with its standard input, so that it does not outlive this program.
 const HOLD: &str = "ip link set lo up && mount -t tmpfs none /dev/shm && echo '{}' && exec cat";
-/// Where rclpy is.
+/// Environment variable with the location of rclpy.
 pub(crate) const PREFIX: &str = "CLOUDROID_ROS2_PREFIX";
-/// Most that is asked for takes milliseconds; what takes longer says how long.
+/// Default timeout; most requests take milliseconds, and slower ones pass a timeout of their own.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// How rclpy's nodes reach each other.
+/// Transport between rclpy nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Transport {
-    /// As they come: by shared memory where they can, else by UDP.
+    /// Default settings: shared memory if possible, otherwise UDP.
     Stock,
-    /// By UDP alone.
+    /// UDP only.
     Udp,
 }
 
-/// On which cores programs run. A robot and a server are two machines, whose programs never share a core. Where the kernel chooses, two
-/// programs that answer each other are on one core or on two by chance, and a way then takes twice or half of what it took before.
+/// Cores on which programs run. Robot and server represent two machines, whose programs never share a core. If the
+/// kernel chose, two communicating programs would share a core or not by chance, and the same path would take twice or
+/// half as long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Host {
     /// The first core that this program may use.
     Robot,
-    /// All others.
+    /// All other cores.
     Server,
 }
 
 impl Host {
-    /// As `taskset` takes them; none where there is only one.
+    /// Returns a CPU list for `taskset`; `None` if there is only one core.
     fn cores(self) -> Result<Option<String>> {
         let allowed = nix::sched::sched_getaffinity(nix::unistd::Pid::from_raw(0))?;
         let is_allowed = |core: &usize| allowed.is_set(*core).unwrap_or_default();
@@ -51,31 +52,31 @@ impl Host {
     }
 }
 
-/// Both namespaces.
-pub(crate) struct World {
-    holder: Program,
+/// A network and a mount namespace.
+pub(crate) struct BenchNetwork {
+    holder: BenchProgram,
     cores: Option<String>,
 }
 
-impl World {
-    /// New ones, with `lo` up.
+impl BenchNetwork {
+    /// Creates the namespaces, with `lo` up.
     pub(crate) fn new() -> Result<Self> {
         let mut holder = Command::new("unshare");
         holder.args(["--net", "--mount", "sh", "-c", HOLD]);
         Ok(Self {
-            holder: Program::start(holder, "a network namespace")?,
+            holder: BenchProgram::start(holder, "a network namespace")?,
             cores: None,
         })
     }
 
-    /// Where what is started from now on runs.
-    pub(crate) fn place(&mut self, host: Host) -> Result<()> {
+    /// Selects the cores for the programs that are started from now on.
+    pub(crate) fn pin_to(&mut self, host: Host) -> Result<()> {
         self.cores = host.cores()?;
         Ok(())
     }
 
-    /// What a program's words are added to that is to run there.
-    pub(crate) fn inside(&self) -> Command {
+    /// Returns a command that runs a program in the namespaces; its words are appended.
+    pub(crate) fn command(&self) -> Command {
         let mut command = Command::new("nsenter");
         for (option, file) in [("net", "net"), ("mount", "mnt")] {
             command.arg(format!("--{option}=/proc/{}/ns/{file}", self.holder.pid()));
@@ -87,43 +88,43 @@ impl World {
         command
     }
 
-    /// Runs a role of this program (see `roles.rs`).
-    pub(crate) fn ours(&self, words: &[&str]) -> Result<Program> {
-        let mut command = self.inside();
+    /// Starts a role of this program (see `roles.rs`).
+    pub(crate) fn start_role(&self, words: &[&str]) -> Result<BenchProgram> {
+        let mut command = self.command();
         command
             .arg(std::env::current_exe()?)
             .arg("inside")
             .args(words);
-        Program::start(command, &format!("ours, {}", words.join(" ")))
+        BenchProgram::start(command, &format!("ours, {}", words.join(" ")))
     }
 
-    /// Runs a role of `peer.py`.
-    pub(crate) fn rclpy(&self, transport: Transport, words: &[&str]) -> Result<Program> {
-        let mut command = self.inside();
+    /// Starts a role of `peer.py`.
+    pub(crate) fn start_rclpy(&self, transport: Transport, words: &[&str]) -> Result<BenchProgram> {
+        let mut command = self.command();
         command
-            .arg(python()?)
+            .arg(python_path()?)
             .arg(bench_report::root().join("benches/ros2/peer.py"))
             .args(words);
-        // Only its errors: a node that starts warns of what is left of others.
+        // Errors only: a starting node warns about the leftovers of others.
         command
             .env("RCUTILS_LOGGING_SEVERITY_THRESHOLD", "40")
             .env("ROS_DOMAIN_ID", "0");
         if transport == Transport::Udp {
             command.env("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4");
         }
-        Program::start(command, &format!("rclpy, {}", words.join(" ")))
+        BenchProgram::start(command, &format!("rclpy, {}", words.join(" ")))
     }
 }
 
-/// Where the wheels are (`scripts/ros2-wheels`).
-pub(crate) fn prefix() -> Result<PathBuf> {
+/// Returns the directory of the wheels (`scripts/ros2-wheels`).
+pub(crate) fn wheels_prefix() -> Result<PathBuf> {
     let prefix = std::env::var_os(PREFIX).map(PathBuf::from);
     prefix.with_context(|| format!("{PREFIX} is not set; make bench sets it"))
 }
 
-/// The Python that has rclpy.
-pub(crate) fn python() -> Result<PathBuf> {
-    let python = prefix()?.join("bin/python");
+/// Returns the path of the Python that has rclpy.
+pub(crate) fn python_path() -> Result<PathBuf> {
+    let python = wheels_prefix()?.join("bin/python");
     ensure!(
         python.exists(),
         "{} is missing: run scripts/ros2-wheels",
@@ -132,14 +133,14 @@ pub(crate) fn python() -> Result<PathBuf> {
     Ok(python)
 }
 
-/// A program that answers in lines of JSON; the first says that it is ready. It is killed when this is dropped.
-pub(crate) struct Program {
+/// A program that prints lines of JSON; the first line says that it is ready. It is killed on drop.
+pub(crate) struct BenchProgram {
     name: String,
     child: Child,
     lines: Receiver<String>,
 }
 
-impl Program {
+impl BenchProgram {
     fn start(mut command: Command, name: &str) -> Result<Self> {
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = command
@@ -163,7 +164,7 @@ impl Program {
         Ok(program)
     }
 
-    /// A program that says nothing that is for us.
+    /// Starts a program whose output is ignored.
     pub(crate) fn start_quietly(mut command: Command, name: &str) -> Result<Self> {
         command.stdin(Stdio::piped()).stdout(Stdio::null());
         let child = command
@@ -181,12 +182,12 @@ impl Program {
         self.child.id()
     }
 
-    /// Its next line.
+    /// Returns its next line.
     pub(crate) fn answer(&mut self) -> Result<Value> {
         self.answer_within(PATIENCE)
     }
 
-    /// Its next line, which may take so long.
+    /// Returns its next line, waiting for at most `patience`.
     pub(crate) fn answer_within(&mut self, patience: Duration) -> Result<Value> {
         let name = &self.name;
         match self.lines.recv_timeout(patience) {
@@ -198,8 +199,8 @@ impl Program {
         }
     }
 
-    /// Asks it what it has found so far.
-    pub(crate) fn tell(&mut self) -> Result<Value> {
+    /// Asks it for its results so far.
+    pub(crate) fn request_answer(&mut self) -> Result<Value> {
         let input = self.child.stdin.as_mut().context("its input")?;
         input
             .write_all(b"\n")
@@ -208,15 +209,15 @@ impl Program {
     }
 }
 
-impl Drop for Program {
+impl Drop for BenchProgram {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
 }
 
-/// A number of an answer.
-pub(crate) fn number(answer: &Value, name: &str) -> Result<f64> {
+/// Returns a number of an answer.
+pub(crate) fn json_number(answer: &Value, name: &str) -> Result<f64> {
     answer[name]
         .as_f64()
         .with_context(|| format!("{name} is no number in {answer}"))

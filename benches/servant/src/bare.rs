@@ -1,6 +1,6 @@
-//! libcontainer alone: the same container made by a program with one thread that does nothing else. Either with the whole
-//! spec, limits included; or without any cgroup, which is the floor of our own creator. What the engine does besides
-//! (shim, Master, log, init, node) is not there.
+//! libcontainer alone: the same container created by a single-threaded program that does nothing else. Either with the
+//! whole spec including limits, or without any cgroup, which is the lower bound for our own container creation. The
+//! other work of the engine (shim, Master, log, init, node) is not included.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -20,24 +20,24 @@ use servant::uids;
 
 use crate::bundle::{self, Bundle};
 
-/// With limits, in a process of its own; from the call of libcontainer to its return.
-pub(crate) fn limited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
+/// Measures with limits, in a separate process; from the call of libcontainer to its return.
+pub(crate) fn time_limited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
     let bundle = Bundle::make(place, spec, |_| {})?;
-    let took = time(place, "limited", spec);
+    let took = time_in_process(place, "limited", spec);
     drop(bundle);
     fs::remove_dir_all(place)?;
     took
 }
 
-/// The same without limits, and without any cgroup in sight.
-pub(crate) fn unlimited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
+/// Measures without limits and without a visible cgroup hierarchy.
+pub(crate) fn time_unlimited(place: &Path, spec: &ContainerSpec) -> Result<Duration> {
     fs::create_dir_all(place)?;
-    let took = time(place, "unlimited", spec);
+    let took = time_in_process(place, "unlimited", spec);
     fs::remove_dir_all(place)?;
     took
 }
 
-fn time(place: &Path, how: &str, spec: &ContainerSpec) -> Result<Duration> {
+fn time_in_process(place: &Path, how: &str, spec: &ContainerSpec) -> Result<Duration> {
     fs::write(place.join("spec.json"), serde_json::to_vec(spec)?)?;
     let mut command = Command::new(std::env::current_exe()?);
     let output = command.args(["bare", how]).arg(place).output()?;
@@ -47,11 +47,11 @@ fn time(place: &Path, how: &str, spec: &ContainerSpec) -> Result<Duration> {
     Ok(Duration::from_secs_f64(seconds))
 }
 
-/// The process: prints the seconds.
-pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
+/// Runs in the child process; prints the seconds.
+pub(crate) fn run_process(how: &str, place: &Path) -> Result<()> {
     let spec: ContainerSpec = serde_json::from_slice(&fs::read(place.join("spec.json"))?)?;
     if how == "unlimited" {
-        stage(place, &spec)?;
+        stage_root(place, &spec)?;
     }
     let null = || File::options().read(true).write(true).open("/dev/null");
     let begun = Instant::now();
@@ -69,7 +69,7 @@ pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
     println!("{}", begun.elapsed().as_secs_f64());
     let pid = Pid::from_raw(container.pid().context("the container's pid")?.as_raw());
     kill(pid, Signal::SIGKILL)?;
-    // Ours to reap, or already reaped by whoever adopted it.
+    // Either our child, or already reaped by the process that adopted it.
     let _ = waitpid(pid, None);
     if how == "limited" {
         container.delete(true)?;
@@ -77,8 +77,8 @@ pub(crate) fn run(how: &str, place: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Root and configuration as our own creator makes them. From here on no cgroup of the host is seen.
-fn stage(place: &Path, spec: &ContainerSpec) -> Result<()> {
+/// Prepares root and configuration as our own container creation does. From here on no cgroup of the host is visible.
+fn stage_root(place: &Path, spec: &ContainerSpec) -> Result<()> {
     let uid_range = (DEFAULT_UID_BASE, uids::RANGE);
     let skeleton = place.join("skeleton");
     make_skeleton(&skeleton, &spec.id, &spec.layers, &spec.mounts, &spec.hosts)?;

@@ -1,5 +1,5 @@
-//! A bundle for the peers: a servant's configuration, with the network namespace and the limits in it that our engine
-//! makes itself, and the image's root.
+//! OCI bundles for the peers: the configuration of a servant, with the network namespace and the limits that our engine
+//! sets up itself, and the root of the image.
 
 use std::fs;
 use std::path::Path;
@@ -8,41 +8,41 @@ use anyhow::{Context, Result};
 use serde_json::{Value, json};
 use servant::container::ContainerSpec;
 use servant::local::DEFAULT_UID_BASE;
-use servant::rootfs::Staged;
+use servant::rootfs::StagedRoot;
 use servant::uids;
 
-use crate::cgroups::Cgroups;
-use crate::root::Root;
+use crate::cgroups::BenchCgroup;
+use crate::root::ImageRoot;
 
-/// What the container runs, and stays.
+/// Program that the container runs; it does not exit by itself.
 pub(crate) const PROGRAM: [&str; 2] = ["/bin/sleep", "60"];
-/// Microseconds; the kernel's default.
+/// CPU period in microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
 
-/// A bundle, ready to be made a container of. Everything is gone when it is dropped.
+/// A bundle from which a container can be created. Everything is removed on drop.
 pub(crate) struct Bundle {
-    _root: Root,
-    _cgroups: Cgroups,
+    _root: ImageRoot,
+    _cgroups: BenchCgroup,
 }
 
 impl Bundle {
-    /// In `place`, which is made.
+    /// Creates a bundle in `place`, which is created.
     pub(crate) fn make(
         place: &Path,
         spec: &ContainerSpec,
         seccomp: fn(&mut Value),
     ) -> Result<Self> {
         fs::create_dir_all(place)?;
-        let (root, cgroups) = (Root::mount(place, spec)?, Cgroups::place()?);
-        let staged = Staged {
+        let (root, cgroups) = (ImageRoot::mount(place, spec)?, BenchCgroup::reserve()?);
+        let staged = StagedRoot {
             root: root.path().to_owned(),
             volumes: Vec::new(),
             user_namespace: fs::File::open("/proc/self/ns/user")?.into(),
         };
-        // Two containers may have the same ids; no servant runs meanwhile.
+        // The ids may be used twice, because no servant runs meanwhile.
         let mut config = configuration(spec, &staged, (DEFAULT_UID_BASE, uids::RANGE))?;
         let limits = &spec.limits;
-        config["linux"]["cgroupsPath"] = cgroups.of(&spec.id).into();
+        config["linux"]["cgroupsPath"] = cgroups.container_path(&spec.id).into();
         config["linux"]["resources"] = json!({
             "memory": { "limit": limits.memory },
             "cpu": { "quota": limits.cpus.map(|cpus| (cpus * PERIOD) as i64), "period": PERIOD as u64 },
@@ -57,10 +57,10 @@ impl Bundle {
     }
 }
 
-/// A servant's configuration, with a network namespace.
+/// Returns the configuration of a servant, with a network namespace.
 pub(crate) fn configuration(
     spec: &ContainerSpec,
-    staged: &Staged,
+    staged: &StagedRoot,
     uid_range: (u32, u32),
 ) -> Result<Value> {
     let mut config = serde_json::to_value(servant::bundle::config(
@@ -74,7 +74,8 @@ pub(crate) fn configuration(
         .as_array_mut()
         .context("namespaces")?;
     namespaces.push(json!({ "type": "network" }));
-    // Ours is made before the container, with limits of what the kernel counts by user; peers make it by its maps.
+    // We create the user namespace before the container, limited by what the kernel counts per user; peers create it
+    // from its mappings.
     namespaces.retain(|namespace| namespace["type"] != "user");
     namespaces.push(json!({ "type": "user" }));
     let (first, count) = uid_range;

@@ -1,4 +1,4 @@
-//! Where the peers' containers are counted and limited: below our own cgroup, so that our limits are theirs.
+//! Cgroups of the peers' containers: below our own cgroup, so that our limits apply to them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,46 +7,46 @@ use anyhow::{Context, Result, anyhow};
 use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 
-/// A place for one container's cgroup. What is made on the way to it goes when this is dropped.
-pub(crate) struct Cgroups {
+/// A path for one container's cgroup. Parent cgroups that are created for it are removed on drop.
+pub(crate) struct BenchCgroup {
     path: String,
     missing: Vec<PathBuf>,
 }
 
-impl Cgroups {
-    /// A place that nobody else uses.
-    pub(crate) fn place() -> Result<Self> {
-        let path = format!("{}/cloudroid-bench-{}", own()?, std::process::id());
-        let missing = missing(Path::new(&path))?;
+impl BenchCgroup {
+    /// Reserves a path that is not in use.
+    pub(crate) fn reserve() -> Result<Self> {
+        let path = format!("{}/cloudroid-bench-{}", own_cgroup()?, std::process::id());
+        let missing = missing_directories(Path::new(&path))?;
         Ok(Self { path, missing })
     }
 
-    /// The cgroup that is above the container's.
+    /// Returns the parent cgroup of the container.
     pub(crate) fn parent(&self) -> &str {
         &self.path
     }
 
-    /// The `cgroupsPath` of a container.
-    pub(crate) fn of(&self, id: &str) -> String {
+    /// Returns the `cgroupsPath` of a container.
+    pub(crate) fn container_path(&self, id: &str) -> String {
         format!("{}/{id}", self.path)
     }
 }
 
-impl Drop for Cgroups {
+impl Drop for BenchCgroup {
     fn drop(&mut self) {
         for directory in &self.missing {
-            // What is not empty is somebody else's by now.
+            // A cgroup that is not empty is in use by others by now.
             let _ = fs::remove_dir(directory);
         }
     }
 }
 
-/// Where hosts with both versions have version 2.
+/// Mount point of cgroup version 2 on hosts with both versions.
 const UNIFIED: &str = "/sys/fs/cgroup/unified";
 
-/// Does something in a thread for which a host with both versions of cgroups has version 1 alone: crun refuses others ("cgroups in hybrid mode
-/// not supported"). The mounts are this thread's, and of what it starts.
-pub(crate) fn as_of_one_version<T: Send>(work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
+/// Runs `work` in a thread that sees only version 1 on a host with both versions of cgroups, because crun refuses to
+/// run there ("cgroups in hybrid mode not supported"). The mounts are visible to this thread and its child processes.
+pub(crate) fn with_only_version_1<T: Send>(work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
     let covered = || {
         unshare(CloneFlags::CLONE_NEWNS).context("a mount namespace for a peer")?;
         if Path::new(UNIFIED).join("cgroup.procs").exists() {
@@ -60,8 +60,8 @@ pub(crate) fn as_of_one_version<T: Send>(work: impl FnOnce() -> Result<T> + Send
         .map_err(|_| anyhow!("the thread that starts a peer has panicked"))?
 }
 
-/// The directories, the deepest first, that will be made in the hierarchies.
-fn missing(path: &Path) -> Result<Vec<PathBuf>> {
+/// Returns the directories to be created in the hierarchies, the deepest first.
+fn missing_directories(path: &Path) -> Result<Vec<PathBuf>> {
     let mut missing = Vec::new();
     let hierarchies = fs::read_dir("/sys/fs/cgroup")?.filter_map(|entry| Some(entry.ok()?.path()));
     for root in hierarchies.chain([PathBuf::from("/sys/fs/cgroup")]) {
@@ -75,8 +75,8 @@ fn missing(path: &Path) -> Result<Vec<PathBuf>> {
     Ok(missing)
 }
 
-/// Where we are in the hierarchy that counts memory.
-fn own() -> Result<String> {
+/// Returns our own cgroup in the hierarchy of the memory controller.
+fn own_cgroup() -> Result<String> {
     let text = fs::read_to_string("/proc/self/cgroup")?;
     let fields = text
         .lines()

@@ -1,39 +1,39 @@
-//! What processes cost, as the kernel counts it.
+//! Resources of processes, from the kernel's counters.
 
 use std::fs;
 use std::time::Duration;
 
 use anyhow::{Context, Result, ensure};
 use bench_servant::Daemon;
-use servant::launch::{self, Runtime};
+use servant::launch::{self, RuntimeRecord};
 
-/// The processes of one servant that are not its nodes.
+/// The processes of a servant other than its nodes.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Overhead {
-    /// The shim.
+pub(crate) struct ServantOverhead {
+    /// Pid of the shim.
     pub(crate) shim: i32,
-    /// PID 1 of the container, the shim's child.
+    /// Pid of the container's PID 1, a child of the shim.
     pub(crate) init: i32,
 }
 
-impl Overhead {
-    /// Those of every servant.
-    pub(crate) fn all(daemon: &Daemon) -> Result<Vec<Self>> {
+impl ServantOverhead {
+    /// Returns the processes of every servant.
+    pub(crate) fn for_all_servants(daemon: &Daemon) -> Result<Vec<Self>> {
         daemon
             .servants()?
             .iter()
-            .map(|id| Self::of(daemon, id))
+            .map(|id| Self::for_servant(daemon, id))
             .collect()
     }
 
-    fn of(daemon: &Daemon, id: &str) -> Result<Self> {
+    fn for_servant(daemon: &Daemon, id: &str) -> Result<Self> {
         let path = daemon
             .home()
             .join("servants")
             .join(id)
             .join(launch::RUNTIME);
-        let runtime: Runtime =
-            launch::read(&path)?.with_context(|| format!("{} is missing", path.display()))?;
+        let runtime: RuntimeRecord = launch::read_record(&path)?
+            .with_context(|| format!("{} is missing", path.display()))?;
         let shim = runtime.shim.pid;
         let children = fs::read_to_string(format!("/proc/{shim}/task/{shim}/children"))?;
         let init = children
@@ -46,14 +46,14 @@ impl Overhead {
         })
     }
 
-    /// Megabytes (10⁶) of both.
+    /// Returns the memory of both in megabytes (10⁶).
     pub(crate) fn memory(self) -> Result<f64> {
-        Ok(memory(self.shim)? + memory(self.init)?)
+        Ok(proportional_memory(self.shim)? + proportional_memory(self.init)?)
     }
 }
 
-/// Megabytes (10⁶) of a process, what it shares counted in proportion (PSS).
-pub(crate) fn memory(pid: i32) -> Result<f64> {
+/// Returns the proportional set size of a process in megabytes (10⁶).
+pub(crate) fn proportional_memory(pid: i32) -> Result<f64> {
     let path = format!("/proc/{pid}/smaps_rollup");
     let text = fs::read_to_string(&path).with_context(|| path.clone())?;
     let line = text
@@ -64,9 +64,9 @@ pub(crate) fn memory(pid: i32) -> Result<f64> {
     Ok(kilobytes * 1024.0 / 1e6)
 }
 
-/// Time on a processor so far, of all threads, those that have ended included.
+/// Returns the processor time of all threads so far, including those that have ended.
 #[allow(unsafe_code)]
-pub(crate) fn processor(pid: i32) -> Result<Duration> {
+pub(crate) fn processor_time(pid: i32) -> Result<Duration> {
     let (mut clock, mut time) = (
         0,
         libc::timespec {
@@ -74,7 +74,7 @@ pub(crate) fn processor(pid: i32) -> Result<Duration> {
             tv_nsec: 0,
         },
     );
-    // SAFETY: both write to what their last argument points to, which is ours and of the right type.
+    // SAFETY: both write through their last argument, which points to a live local variable of the right type.
     let told = unsafe {
         libc::clock_getcpuclockid(pid, &mut clock) == 0
             && libc::clock_gettime(clock, &mut time) == 0

@@ -1,64 +1,70 @@
-//! Many servants at once: what each costs while it idles, and whether the next one starts as fast as the first.
+//! Many servants at once: cost of each while idle, and whether the next one starts as fast as the first.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
-use bench_servant::{Daemon, full};
+use bench_report::{BenchReport, Target};
+use bench_servant::{Daemon, is_full_run};
 
-use crate::cost::{Overhead, memory, processor};
-use crate::image::Image;
-use crate::robot::Robot;
-use crate::starts::{median, robot, times};
+use crate::cost::{ServantOverhead, processor_time, proportional_memory};
+use crate::image::ServiceImage;
+use crate::robot::BenchRobot;
+use crate::starts::{median_milliseconds, sorted_times, time_robot_start};
 
-/// Starts per side when the first and the last are compared.
+/// Number of starts on either side of the comparison.
 const STARTS: usize = 7;
-/// What one servant may cost, in megabytes.
+/// Limit for the memory of a servant's own processes, in megabytes.
 const MEMORY: f64 = 4.0;
-/// What all idle processes of ours may use, in percent of a core.
+/// Limit for the processor time of all our idle processes, in percent of a core.
 const IDLE: f64 = 0.1;
 
-/// From one servant to many and back.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, image: &Image) -> Result<()> {
-    let (crowd, watch) = if full() { (100, 60) } else { (30, 35) };
+/// Measures from one servant to many and back.
+pub(crate) fn measure(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    image: &ServiceImage,
+) -> Result<()> {
+    let (crowd, watch) = if is_full_run() { (100, 60) } else { (30, 35) };
     let starts = |what: &str| -> Result<Vec<Duration>> {
         eprintln!("{STARTS} starts {what}");
-        (0..STARTS).map(|_| robot(daemon, image)).collect()
+        (0..STARTS)
+            .map(|_| time_robot_start(daemon, image))
+            .collect()
     };
     let mut first = starts("on an idle host")?;
     for count in [1, 20] {
-        grow(daemon, image, count)?;
-        footprint(report, daemon, count)?;
+        start_servants(daemon, image, count)?;
+        report_overhead(report, daemon, count)?;
     }
     if crowd > 20 {
-        grow(daemon, image, crowd)?;
+        start_servants(daemon, image, crowd)?;
     }
-    together(report, daemon, crowd, Duration::from_secs(watch))?;
+    report_total(report, daemon, crowd, Duration::from_secs(watch))?;
     let last = starts(&format!("beside {crowd} servants"))?;
     daemon.stop_servants()?;
-    // Again: a machine that others use has changed meanwhile.
+    // Once more, because the load on a shared machine may have changed meanwhile.
     first.extend(starts("on an idle host")?);
     report
         .figure(
             format!("start of servant {}", crowd + 1),
             "ms",
-            median(&times("last", last)),
+            median_milliseconds(&sorted_times("last", last)),
         )
-        .beside(
+        .relative_to(
             "the first, before and after",
-            median(&times("first", first)),
+            median_milliseconds(&sorted_times("first", first)),
         )
-        .reach(Target::RatioAtMost(1.5))
+        .require(Target::RatioAtMost(1.5))
         .note(format!("medians of {STARTS} and {}", 2 * STARTS));
     Ok(())
 }
 
-/// Until there are `count`: each asked for by a robot of its own, which then leaves.
-fn grow(daemon: &Daemon, image: &Image, count: usize) -> Result<()> {
+/// Starts servants until there are `count`: each for a robot of its own, which then leaves.
+fn start_servants(daemon: &Daemon, image: &ServiceImage, count: usize) -> Result<()> {
     eprintln!("{count} servants");
     for number in daemon.servants()?.len()..count {
         let path = format!("{}?robot=r{number}", image.service);
-        let mut robot = Robot::connect(&daemon.address, &path)?;
+        let mut robot = BenchRobot::connect(&daemon.address, &path)?;
         robot
             .nodes()
             .with_context(|| format!("the servant of {path}"))?;
@@ -68,14 +74,14 @@ fn grow(daemon: &Daemon, image: &Image, count: usize) -> Result<()> {
     Ok(())
 }
 
-/// Lets what was started come to rest.
+/// Waits until newly started processes have settled.
 fn settle() {
     std::thread::sleep(Duration::from_secs(3));
 }
 
-/// Shim and init, of each.
-fn footprint(report: &mut Report, daemon: &Daemon, count: usize) -> Result<()> {
-    let all = Overhead::all(daemon)?;
+/// Reports the memory of shim and init per servant.
+fn report_overhead(report: &mut BenchReport, daemon: &Daemon, count: usize) -> Result<()> {
+    let all = ServantOverhead::for_all_servants(daemon)?;
     let costs = all
         .iter()
         .map(|one| one.memory())
@@ -83,12 +89,12 @@ fn footprint(report: &mut Report, daemon: &Daemon, count: usize) -> Result<()> {
     let mean = costs.iter().sum::<f64>() / costs.len() as f64;
     let inits = all
         .iter()
-        .map(|one| memory(one.init))
+        .map(|one| proportional_memory(one.init))
         .collect::<Result<Vec<_>>>()?;
     let init = inits.iter().sum::<f64>() / inits.len() as f64;
     report
         .figure(format!("shim + init, each of {count} idle"), "MB", mean)
-        .reach(Target::AtMost(MEMORY))
+        .require(Target::AtMost(MEMORY))
         .note(format!(
             "PSS; most {:.2}, init {init:.2}",
             costs.iter().copied().fold(0.0, f64::max)
@@ -96,10 +102,15 @@ fn footprint(report: &mut Report, daemon: &Daemon, count: usize) -> Result<()> {
     Ok(())
 }
 
-/// Everything of ours: memory per servant, and the processor while nothing happens.
-fn together(report: &mut Report, daemon: &Daemon, count: usize, watch: Duration) -> Result<()> {
-    let all = Overhead::all(daemon)?;
-    let of_daemon = memory(daemon.pid())?;
+/// Reports our processes together: memory per servant, and processor time while idle.
+fn report_total(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    count: usize,
+    watch: Duration,
+) -> Result<()> {
+    let all = ServantOverhead::for_all_servants(daemon)?;
+    let of_daemon = proportional_memory(daemon.pid())?;
     let of_servants = all.iter().map(|one| one.memory()).sum::<Result<f64>>()?;
     report
         .figure(
@@ -107,16 +118,16 @@ fn together(report: &mut Report, daemon: &Daemon, count: usize, watch: Duration)
             "MB",
             (of_daemon + of_servants) / count as f64,
         )
-        .reach(Target::AtMost(MEMORY))
+        .require(Target::AtMost(MEMORY))
         .note(format!("PSS; the daemon {of_daemon:.1}"));
-    let sum = |pick: fn(&Overhead) -> i32| {
+    let sum = |pick: fn(&ServantOverhead) -> i32| {
         all.iter()
-            .map(|one| processor(pick(one)))
+            .map(|one| processor_time(pick(one)))
             .sum::<Result<Duration>>()
     };
     let used = || -> Result<[Duration; 3]> {
         Ok([
-            processor(daemon.pid())?,
+            processor_time(daemon.pid())?,
             sum(|one| one.shim)?,
             sum(|one| one.init)?,
         ])
@@ -134,7 +145,7 @@ fn together(report: &mut Report, daemon: &Daemon, count: usize, watch: Duration)
             "%",
             daemon + shims + inits,
         )
-        .reach(Target::AtMost(IDLE))
+        .require(Target::AtMost(IDLE))
         .note(format!(
             "of a core over {} s; daemon {daemon:.3}, shims {shims:.3}, inits {inits:.3}",
             watch.as_secs()

@@ -1,4 +1,4 @@
-//! A daemon to measure.
+//! A daemon to be measured.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -14,10 +14,10 @@ use nix::unistd::Pid;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// How long anything may take that is waited for and not measured. Long: it may be a slow and busy machine.
+/// Timeout of everything that is waited for and not measured; long, because the machine may be slow and busy.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// A built program: in the directory that BIN names, as `make bench` does, else beside this one.
+/// Returns the path of a program: in the directory `BIN`, which `make bench` sets, or else next to this executable.
 pub fn binary(name: &str) -> Result<PathBuf> {
     let directory = match std::env::var_os("BIN") {
         Some(directory) => PathBuf::from(directory),
@@ -35,18 +35,18 @@ pub fn binary(name: &str) -> Result<PathBuf> {
     Ok(path)
 }
 
-/// A running `cloudroidd`. It ends, with its servants and its home, when this is dropped.
+/// A running `cloudroidd`. It ends on drop, together with its servants, and its home is removed.
 pub struct Daemon {
-    /// Where it listens, such as `127.0.0.1:40123`.
+    /// Listening address, such as `127.0.0.1:40123`.
     pub address: String,
     child: Child,
     place: TempDir,
 }
 
 impl Daemon {
-    /// Starts it with this configuration and these variables in its environment, and waits until it answers.
+    /// Starts the daemon with this configuration and these environment variables, and waits until it answers.
     pub fn start(place: TempDir, config: &str, environment: &[(&str, &Path)]) -> Result<Self> {
-        // Containers reach their roots through it.
+        // Containers reach their root file systems through this directory.
         fs::set_permissions(place.path(), fs::Permissions::from_mode(0o755))?;
         let file = place.path().join("config.toml");
         fs::write(&file, config)?;
@@ -70,11 +70,11 @@ impl Daemon {
             child,
             place,
         };
-        daemon.address = daemon.until_it_answers()?;
+        daemon.address = daemon.wait_until_ready()?;
         Ok(daemon)
     }
 
-    fn until_it_answers(&mut self) -> Result<String> {
+    fn wait_until_ready(&mut self) -> Result<String> {
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Ok(status) = self.get("/api/v1/status") {
@@ -84,51 +84,51 @@ impl Daemon {
                     .to_owned());
             }
             if let Some(status) = self.child.try_wait()? {
-                bail!("cloudroidd ended with {status}:\n{}", self.last_words());
+                bail!("cloudroidd ended with {status}:\n{}", self.log_tail());
             }
             ensure!(
                 Instant::now() < deadline,
                 "cloudroidd does not answer:\n{}",
-                self.last_words()
+                self.log_tail()
             );
             std::thread::sleep(Duration::from_millis(20));
         }
     }
 
-    /// Its state directory.
+    /// Returns its state directory.
     pub fn home(&self) -> PathBuf {
         self.place.path().join("home")
     }
 
-    /// Its process.
+    /// Returns its pid.
     pub fn pid(&self) -> i32 {
         self.child.id() as i32
     }
 
-    /// Where else things may be put that are to go with it.
-    pub fn place(&self) -> &Path {
+    /// Returns a directory for other files, which is removed together with the daemon.
+    pub fn directory(&self) -> &Path {
         self.place.path()
     }
 
-    /// What it printed last.
-    pub fn last_words(&self) -> String {
+    /// Returns the last lines of its log.
+    pub fn log_tail(&self) -> String {
         let log = fs::read_to_string(self.place.path().join("daemon.log")).unwrap_or_default();
         let lines: Vec<&str> = log.lines().collect();
         lines[lines.len().saturating_sub(20)..].join("\n")
     }
 
-    /// Asks its HTTP API.
+    /// Sends a GET request to its HTTP API.
     pub fn get(&self, path: &str) -> Result<Value> {
-        self.ask("GET", path)
+        self.request("GET", path)
     }
 
-    /// Ends all its servants.
+    /// Stops all its servants.
     pub fn stop_servants(&self) -> Result<()> {
-        self.ask("DELETE", "/api/v1/servants")?;
-        self.until_servants(0)
+        self.request("DELETE", "/api/v1/servants")?;
+        self.wait_for_servants(0)
     }
 
-    fn ask(&self, method: &str, path: &str) -> Result<Value> {
+    fn request(&self, method: &str, path: &str) -> Result<Value> {
         let mut stream = UnixStream::connect(self.home().join("run/daemon.sock"))?;
         write!(
             stream,
@@ -144,7 +144,7 @@ impl Daemon {
         serde_json::from_str(body).with_context(|| format!("{method} {path}: {body}"))
     }
 
-    /// Ids of its servants.
+    /// Returns the ids of its servants.
     pub fn servants(&self) -> Result<Vec<String>> {
         let servants = self.get("/api/v1/servants")?;
         let servants = servants.as_array().context("a list of servants")?;
@@ -154,21 +154,21 @@ impl Daemon {
             .collect())
     }
 
-    /// Waits until it has so many servants: one that ends is counted until nothing is left of it.
-    pub fn until_servants(&self, count: usize) -> Result<()> {
+    /// Waits until it has `count` servants; a servant that is stopping counts until it has been removed completely.
+    pub fn wait_for_servants(&self, count: usize) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         while self.servants()?.len() != count {
             ensure!(
                 Instant::now() < deadline,
                 "waited in vain for {count} servants:\n{}",
-                self.last_words()
+                self.log_tail()
             );
             std::thread::sleep(Duration::from_millis(20));
         }
         Ok(())
     }
 
-    /// `cloudroidctl` for this daemon.
+    /// Returns a `cloudroidctl` command for this daemon.
     pub fn ctl(&self) -> Result<Command> {
         let mut command = Command::new(binary("cloudroidctl")?);
         command
@@ -182,7 +182,7 @@ impl Daemon {
 impl Drop for Daemon {
     fn drop(&mut self) {
         if let Ok(None) = self.child.try_wait() {
-            // Asked like this it ends its servants first.
+            // On SIGTERM the daemon stops its servants first.
             let _ = kill(Pid::from_raw(self.pid()), Signal::SIGTERM);
             let _ = self.child.wait();
         }

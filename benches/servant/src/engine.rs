@@ -1,4 +1,4 @@
-//! Our engine alone: from `start` to a container whose init runs, with the shim and the Master that the daemon has.
+//! Our engine alone: from `start` to a container whose init runs, including the shim and the Master, as in the daemon.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -6,18 +6,18 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use bench_servant::binary;
 use servant::container::ContainerSpec;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::local::{Isolation, LocalEngine, LocalEngineConfig};
 use tokio::runtime::Handle;
 
-/// An engine of this program.
-pub(crate) struct Ours<'a> {
+/// An engine inside this program.
+pub(crate) struct BenchEngine<'a> {
     engine: LocalEngine,
     runtime: &'a Handle,
 }
 
-impl<'a> Ours<'a> {
-    /// With its servants below `place`.
+impl<'a> BenchEngine<'a> {
+    /// Creates an engine with its servants below `place`.
     pub(crate) fn prepare(place: &Path, runtime: &'a Handle) -> Result<Self> {
         let shim = vec![binary("cloudroidd")?.into_os_string(), "shim".into()];
         let mut config =
@@ -28,8 +28,8 @@ impl<'a> Ours<'a> {
         Ok(Self { engine, runtime })
     }
 
-    /// Starts one, and ends it.
-    pub(crate) fn time(&self, spec: ContainerSpec) -> Result<Duration> {
+    /// Starts a servant, measures the time, and stops it.
+    pub(crate) fn time_start(&self, spec: ContainerSpec) -> Result<Duration> {
         self.runtime.block_on(async {
             let begun = Instant::now();
             let servant = self.engine.start_container(spec).await?;

@@ -1,4 +1,4 @@
-//! The service's image as its servants run it: what the daemon told their shims.
+//! The image of a service as its servants run it, from the specification that the daemon gives to their shims.
 
 use std::time::{Duration, Instant};
 
@@ -6,34 +6,35 @@ use anyhow::{Context, Result, ensure};
 use package::interface::{Direction, Interface};
 use ros::bus::Graph;
 use servant::container::ContainerSpec;
-use servant::launch::{self, Launch};
+use servant::launch::{self, LaunchRecord};
 use servant::spec::NodeSpec;
 
 use bench_servant::Daemon;
 
-use crate::robot::Robot;
+use crate::robot::BenchRobot;
 
-/// How long the record of a servant's nodes may take.
+/// Maximum time until the record of a servant's nodes exists.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A service of one node.
-pub(crate) struct Image {
-    /// Its name.
+/// A service with one node.
+pub(crate) struct ServiceImage {
+    /// Name of the service.
     pub(crate) service: String,
-    /// The spec of its servants: layers, environment, node, limits.
+    /// Specification of its servants: layers, environment, node, limits.
     pub(crate) spec: ContainerSpec,
-    /// What its node registers.
+    /// Topics and services that its node registers.
     interface: Interface,
 }
 
-impl Image {
-    /// Looks at a servant of the service; the daemon has none before and after.
-    pub(crate) fn of(daemon: &Daemon, service: &str) -> Result<Self> {
-        let mut robot = Robot::connect(&daemon.address, service)?;
+impl ServiceImage {
+    /// Starts a servant of the service and reads its specification; the daemon must have no other servants, and has
+    /// none afterwards.
+    pub(crate) fn inspect(daemon: &Daemon, service: &str) -> Result<Self> {
+        let mut robot = BenchRobot::connect(&daemon.address, service)?;
         robot.nodes()?;
-        let launch = started(daemon)?;
+        let launch = find_started(daemon)?;
         robot.leave()?;
-        daemon.until_servants(0)?;
+        daemon.wait_for_servants(0)?;
         let interface = daemon.get(&format!("/api/v1/services/{service}/interface"))?;
         Ok(Self {
             service: service.to_owned(),
@@ -42,13 +43,13 @@ impl Image {
         })
     }
 
-    /// Its node.
+    /// Returns its node.
     pub(crate) fn node(&self) -> Result<&NodeSpec> {
         self.spec.nodes.first().context("a service with a node")
     }
 
-    /// Whether the node has registered everything that a servant's readiness is told by.
-    pub(crate) fn registered(&self, graph: &Graph) -> bool {
+    /// Returns whether the node has registered everything that makes a servant ready.
+    pub(crate) fn is_registered(&self, graph: &Graph) -> bool {
         let topic = |topic: &package::interface::Topic| {
             let ends = graph.topics.get(&topic.name);
             let there = ends.map(|ends| match topic.direction {
@@ -76,14 +77,14 @@ impl Image {
     }
 }
 
-/// The record of the servant whose nodes were started. A container that was made ahead has one, too, without nodes; on a busy machine it is
-/// the one that is seen first.
-fn started(daemon: &Daemon) -> Result<Launch> {
+/// Returns the record of the servant whose nodes were started. A container of the warm pool has a record as well,
+/// without nodes; on a busy machine that one may be seen first.
+fn find_started(daemon: &Daemon) -> Result<LaunchRecord> {
     let deadline = Instant::now() + PATIENCE;
     loop {
         for id in daemon.servants()? {
             let path = daemon.home().join("servants").join(id).join(launch::SPEC);
-            let record: Option<Launch> = launch::read(&path)?;
+            let record: Option<LaunchRecord> = launch::read_record(&path)?;
             if let Some(launch) = record.filter(|launch| !launch.spec.nodes.is_empty()) {
                 return Ok(launch);
             }

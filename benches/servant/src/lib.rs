@@ -1,5 +1,4 @@
-//! What benches of the whole running system share: a daemon with a home of its own, and pushes to it whose events are
-//! timed as they arrive.
+//! Common parts of benchmarks of the whole system: a daemon with a home of its own, and pushes to it with timed events.
 
 #![forbid(unsafe_code)]
 
@@ -8,10 +7,10 @@ mod push;
 mod space;
 
 pub use daemon::{Daemon, binary};
-pub use push::Pushed;
-pub use space::space;
+pub use push::TimedPush;
+pub use space::write_install_space;
 
-/// Whether there is time for the long form: `CLOUDROID_BENCH_FULL=1`.
-pub fn full() -> bool {
+/// Returns whether longer measurements are requested (`CLOUDROID_BENCH_FULL=1`).
+pub fn is_full_run() -> bool {
     std::env::var_os("CLOUDROID_BENCH_FULL").is_some_and(|value| !value.is_empty() && value != "0")
 }

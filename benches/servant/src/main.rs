@@ -1,6 +1,6 @@
-//! `make bench ONLY=servant`: what a servant costs, beside the same node started alone, libcontainer called from a bare
-//! program, and the runtimes and the engine of others that are installed (runc, crun, podman). The word `starts` as an argument runs that part alone.
-//! Needs root. The program calls itself for the bare container (`bare HOW DIRECTORY`).
+//! `make bench ONLY=servant`: cost of a servant, compared with the same node started alone, with libcontainer called
+//! from a minimal program, and with other installed runtimes and engines (runc, crun, podman). The argument `starts`
+//! runs that part alone. Needs root. The program runs itself as the minimal program (`bare HOW DIRECTORY`).
 
 #![deny(unsafe_code)]
 
@@ -21,14 +21,14 @@ mod upgrade;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
-use bench_report::Report;
-use bench_servant::{Daemon, space};
+use bench_report::BenchReport;
+use bench_servant::{Daemon, write_install_space};
 use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 
-use image::Image;
+use image::ServiceImage;
 
-/// Room is not what is measured; servants stay until they are ended.
+/// Capacity should not limit the measurement; servants are kept until they are stopped.
 const CONFIG: &str = "[capacity]\ncpus = 4096.0\nmemory = \"4096G\"\n\
     [servant]\nreserve_cpus = 0.01\ngrace = \"1h\"\nanonymous_grace = \"0s\"\n";
 
@@ -42,19 +42,19 @@ fn main() -> Result<()> {
     {
         [] => measure(true),
         ["starts"] => measure(false),
-        ["bare", how, directory] => bare::run(how, Path::new(directory)),
+        ["bare", how, directory] => bare::run_process(how, Path::new(directory)),
         _ => bail!("it takes the word starts, or nothing; CLOUDROID_BENCH_FULL=1 measures longer"),
     }
 }
 
-/// A daemon with the relay published; `servants` is added to the configuration's `[servant]`.
-fn serving(servants: &str) -> Result<Daemon> {
+/// Starts a daemon and publishes the relay; `servants` is appended to the `[servant]` section of the configuration.
+fn start_daemon(servants: &str) -> Result<Daemon> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
     let daemon = Daemon::start(place, &format!("{CONFIG}{servants}"), &[])?;
     eprintln!("pushing a launch file for topic_tools/relay");
-    let space = space(daemon.place(), "relay_only", None)?;
+    let space = write_install_space(daemon.directory(), "relay_only", None)?;
     daemon.push(&[
         space.to_str().context("UTF-8")?,
         "--name",
@@ -65,13 +65,13 @@ fn serving(servants: &str) -> Result<Daemon> {
     Ok(daemon)
 }
 
-/// How servants start; and how many there can be, if there is time for a `crowd`.
+/// Measures how servants start and, with `crowd`, how many of them fit.
 fn measure(crowd: bool) -> Result<()> {
     ensure!(
         nix::unistd::geteuid().is_root(),
         "servants are made by root: sudo make bench"
     );
-    // While there is one thread: whatever is mounted from here on is gone when we are, however we end.
+    // Before there are threads: mounts made from here on disappear with this process, however it ends.
     unshare(CloneFlags::CLONE_NEWNS).context("a mount namespace of our own")?;
     let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
     mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
@@ -80,11 +80,11 @@ fn measure(crowd: bool) -> Result<()> {
         .worker_threads(2)
         .enable_all()
         .build()?;
-    let daemon = serving("")?;
-    let image = Image::of(&daemon, "relay")?;
-    let mut report = Report::new("servant");
-    let without_warm_pool = serving("warm_pool = 0\n")?;
-    let warm_nodes = serving("warm_nodes = 1\n")?;
+    let daemon = start_daemon("")?;
+    let image = ServiceImage::inspect(&daemon, "relay")?;
+    let mut report = BenchReport::new("servant");
+    let without_warm_pool = start_daemon("warm_pool = 0\n")?;
+    let warm_nodes = start_daemon("warm_nodes = 1\n")?;
     starts::measure(
         &mut report,
         &daemon,

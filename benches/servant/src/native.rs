@@ -1,5 +1,5 @@
-//! The node alone: executed in a chroot of the same layers, in a network namespace that is there already, until it has
-//! registered with the same Master that servants have.
+//! The node alone: executed in a chroot of the same layers and in an existing network namespace, until it has
+//! registered with a Master like that of a servant.
 
 #![allow(unsafe_code)]
 
@@ -22,26 +22,26 @@ use servant::netns::NetNs;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 
-use crate::image::Image;
-use crate::root::Root;
+use crate::image::ServiceImage;
+use crate::root::ImageRoot;
 
-/// Where every servant's Master listens.
+/// Address of the Master in every servant.
 const MASTER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
-/// How long the node may take.
+/// Maximum time until the node has registered.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Everything that is ready before the node starts.
-pub(crate) struct Native<'a> {
-    image: &'a Image,
-    root: Root,
+/// Everything that exists before the node starts.
+pub(crate) struct NativeNode<'a> {
+    image: &'a ServiceImage,
+    root: ImageRoot,
     network: Arc<NetNs>,
     runtime: &'a Handle,
 }
 
-struct Inside(Arc<NetNs>);
+struct NativeSockets(Arc<NetNs>);
 
 #[async_trait]
-impl Sockets for Inside {
+impl Sockets for NativeSockets {
     async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
         self.0.connect(address).await
     }
@@ -51,11 +51,15 @@ impl Sockets for Inside {
     }
 }
 
-impl<'a> Native<'a> {
+impl<'a> NativeNode<'a> {
     /// Mounts the image below `place`.
-    pub(crate) fn prepare(place: &Path, image: &'a Image, runtime: &'a Handle) -> Result<Self> {
-        let root = Root::mount(place, &image.spec)?;
-        root.furnish()?;
+    pub(crate) fn prepare(
+        place: &Path,
+        image: &'a ServiceImage,
+        runtime: &'a Handle,
+    ) -> Result<Self> {
+        let root = ImageRoot::mount(place, &image.spec)?;
+        root.mount_system()?;
         Ok(Self {
             image,
             root,
@@ -64,11 +68,11 @@ impl<'a> Native<'a> {
         })
     }
 
-    /// From exec to registered.
-    pub(crate) fn time(&self) -> Result<Duration> {
+    /// Measures the time from exec until the node has registered.
+    pub(crate) fn time_start(&self) -> Result<Duration> {
         let listener = self.runtime.block_on(self.network.listen(MASTER))?;
         let master = Master::new(MasterOptions::default());
-        let sockets = Arc::new(Inside(self.network.clone()));
+        let sockets = Arc::new(NativeSockets(self.network.clone()));
         let serving = {
             let master = master.clone();
             self.runtime
@@ -79,7 +83,7 @@ impl<'a> Native<'a> {
         let outcome = self.runtime.block_on(async {
             let registered = async {
                 let mut changes = master.generation();
-                while !self.image.registered(&master.graph()) {
+                while !self.image.is_registered(&master.graph()) {
                     changes.changed().await?;
                 }
                 anyhow::Ok(begun.elapsed())
@@ -91,7 +95,7 @@ impl<'a> Native<'a> {
         let _ = child.kill();
         child.wait()?;
         serving.abort();
-        // Its end frees the port for the next.
+        // Frees the port for the next run.
         let _ = self.runtime.block_on(serving);
         outcome
     }
@@ -122,7 +126,7 @@ impl<'a> Native<'a> {
             nix::unistd::chdir(directory.as_c_str())?;
             Ok(())
         };
-        // SAFETY: between fork and exec it makes three system calls and allocates nothing.
+        // SAFETY: between fork and exec it makes three system calls and does not allocate.
         unsafe { command.pre_exec(enter) };
         command
             .spawn()

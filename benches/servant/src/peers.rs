@@ -1,4 +1,4 @@
-//! Runtimes and engines of others, where they are installed: a container created and started as their command lines do it.
+//! Other runtimes and engines, if installed: a container is created and started through their command lines.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -11,25 +11,26 @@ use servant::container::ContainerSpec;
 use tempfile::TempDir;
 
 use crate::bundle::{Bundle, PROGRAM};
-use crate::cgroups::{self, Cgroups};
-use crate::root::Root;
+use crate::cgroups::{self, BenchCgroup};
+use crate::root::ImageRoot;
 
 /// Runtimes with the command line of runc.
 const RUNTIMES: [&str; 2] = ["runc", "crun"];
-/// A container engine, which calls one of them.
+/// A container engine, which calls a runtime.
 const ENGINE: &str = "podman";
 
-/// A program that is measured beside ours.
-pub(crate) struct Peer {
-    /// Its program.
+/// A program that is compared with ours.
+pub(crate) struct PeerRuntime {
+    /// Name of the program.
     pub(crate) name: &'static str,
-    /// Where an engine keeps what it knows, from one container to the next. A short path: podman refuses more than 50 characters.
+    /// State directory of an engine, kept from one container to the next. Its path is short, because podman refuses
+    /// more than 50 characters.
     store: Option<TempDir>,
 }
 
-impl Peer {
-    /// All that are looked for, and why those that are not there are not.
-    pub(crate) fn looked_for() -> Result<Vec<(Self, Result<()>)>> {
+impl PeerRuntime {
+    /// Returns all known peers, each with the reason if it is not available.
+    pub(crate) fn find_peers() -> Result<Vec<(Self, Result<()>)>> {
         let store = tempfile::Builder::new()
             .prefix("peer-")
             .tempdir_in("/tmp")?;
@@ -39,39 +40,40 @@ impl Peer {
             store: Some(store),
         };
         let with = |peer: Self| {
-            let there = there(peer.name);
+            let there = check_installed(peer.name);
             (peer, there)
         };
         Ok(runtimes.into_iter().chain([engine]).map(with).collect())
     }
 
-    /// From the first command to the end of the last; what the container needs is in `place`.
-    pub(crate) fn time(&self, place: &Path, spec: &ContainerSpec) -> Result<Duration> {
-        let took = cgroups::as_of_one_version(|| match &self.store {
-            None => self.runtime(place, spec),
-            Some(store) => self.engine(place, store.path(), spec),
+    /// Measures from the first command to the end of the last; files of the container are in `place`.
+    pub(crate) fn time_container(&self, place: &Path, spec: &ContainerSpec) -> Result<Duration> {
+        let took = cgroups::with_only_version_1(|| match &self.store {
+            None => self.time_runtime(place, spec),
+            Some(store) => self.time_engine(place, store.path(), spec),
         });
         fs::remove_dir_all(place)?;
         took
     }
 
-    fn runtime(&self, place: &Path, spec: &ContainerSpec) -> Result<Duration> {
-        let bundle = Bundle::make(place, spec, put_operands_right)?;
+    fn time_runtime(&self, place: &Path, spec: &ContainerSpec) -> Result<Duration> {
+        let bundle = Bundle::make(place, spec, swap_masked_operands)?;
         let path = place.to_str().context("UTF-8")?;
         let state = place.join("state");
         let global = ["--root", state.to_str().context("UTF-8")?];
         let begun = Instant::now();
-        let made = self.run(place, &global, &["create", "--bundle", path, &spec.id]);
-        let started = made.and_then(|()| self.run(place, &global, &["start", &spec.id]));
+        let made = self.run_command(place, &global, &["create", "--bundle", path, &spec.id]);
+        let started = made.and_then(|()| self.run_command(place, &global, &["start", &spec.id]));
         let took = begun.elapsed();
-        let removed = self.run(place, &global, &["delete", "--force", &spec.id]);
+        let removed = self.run_command(place, &global, &["delete", "--force", &spec.id]);
         drop(bundle);
         started.and(removed).map(|()| took)
     }
 
-    /// The same root under a layer that can be written, as an engine's containers have one, the same limits, no network.
-    fn engine(&self, place: &Path, store: &Path, spec: &ContainerSpec) -> Result<Duration> {
-        let (root, cgroups) = (Root::mount(place, spec)?, Cgroups::place()?);
+    /// Measures an engine: the same root below a writable layer, which engines give their containers, the same limits,
+    /// no network.
+    fn time_engine(&self, place: &Path, store: &Path, spec: &ContainerSpec) -> Result<Duration> {
+        let (root, cgroups) = (ImageRoot::mount(place, spec)?, BenchCgroup::reserve()?);
         let [images, run, temporary] =
             ["images", "run", "tmp"].map(|name| store.join(name).display().to_string());
         let global = [
@@ -96,9 +98,9 @@ impl Peer {
             "--network=none".to_owned(),
             "--log-driver=none".to_owned(),
             format!("--cgroup-parent={}", cgroups.parent()),
-            // The process that watches over it stays where we are.
+            // The monitor process stays in our cgroup.
             "--cgroups=no-conmon".to_owned(),
-            // Without CAP_SYS_RESOURCE, what it takes by default is more than may be set.
+            // Without CAP_SYS_RESOURCE, its default exceeds the permitted maximum.
             "--ulimit=nofile=1024:1024".to_owned(),
             "--ulimit=nproc=4096:4096".to_owned(),
         ];
@@ -116,17 +118,17 @@ impl Peer {
         words.extend(PROGRAM.map(str::to_owned));
         let words: Vec<&str> = words.iter().map(String::as_str).collect();
         let begun = Instant::now();
-        let started = self.run(place, &global, &words);
+        let started = self.run_command(place, &global, &words);
         let took = begun.elapsed();
-        let removed = self.run(place, &global, &["rm", "--force", "--time", "0", &spec.id]);
+        let removed = self.run_command(place, &global, &["rm", "--force", "--time", "0", &spec.id]);
         started.and(removed).map(|()| took)
     }
 
-    fn run(&self, place: &Path, global: &[&str], words: &[&str]) -> Result<()> {
+    fn run_command(&self, place: &Path, global: &[&str], words: &[&str]) -> Result<()> {
         let log = place.join("log");
         let mut command = Command::new(self.name);
         command.args(global).args(words);
-        // A file, not a pipe: the container inherits it.
+        // A file rather than a pipe, because the container inherits it.
         command
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -144,8 +146,8 @@ impl Peer {
     }
 }
 
-/// Why a program cannot be called, if it cannot.
-fn there(name: &str) -> Result<()> {
+/// Checks that a program can be executed; the error says why not.
+fn check_installed(name: &str) -> Result<()> {
     let version = Command::new(name).arg("--version").output();
     let output = version.context("it is not installed")?;
     ensure!(
@@ -156,8 +158,8 @@ fn there(name: &str) -> Result<()> {
     Ok(())
 }
 
-/// They know the operands of a masked comparison the right way round; libcontainer does not.
-fn put_operands_right(seccomp: &mut Value) {
+/// Swaps the operands of masked comparisons: the peers take them in the specified order, libcontainer does not.
+fn swap_masked_operands(seccomp: &mut Value) {
     for rule in seccomp["syscalls"].as_array_mut().into_iter().flatten() {
         for argument in rule["args"].as_array_mut().into_iter().flatten() {
             let (value, mask) = (argument["value"].clone(), argument["valueTwo"].clone());

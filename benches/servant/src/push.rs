@@ -1,4 +1,4 @@
-//! A push as a deployer sees it: `cloudroidctl push`, its events, and when they came.
+//! A push as a deployer sees it: `cloudroidctl push`, its events, and the times at which they arrived.
 
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
@@ -9,18 +9,18 @@ use serde_json::Value;
 
 use crate::Daemon;
 
-/// What a push came to.
+/// Events and duration of a push.
 #[derive(Debug)]
-pub struct Pushed {
-    /// Each event of the answer (`api::PushEvent`), and how long after the command was typed it came.
+pub struct TimedPush {
+    /// Events of the response (`api::PushEvent`), each with the time since the command was started.
     pub events: Vec<(Duration, Value)>,
-    /// From the command to its end.
+    /// Duration of the command.
     pub total: Duration,
 }
 
 impl Daemon {
-    /// Types `cloudroidctl push ARGUMENTS` and waits for its end.
-    pub fn push(&self, arguments: &[&str]) -> Result<Pushed> {
+    /// Runs `cloudroidctl push ARGUMENTS` to its end.
+    pub fn push(&self, arguments: &[&str]) -> Result<TimedPush> {
         let mut command = self.ctl()?;
         command.args(["--format", "json", "push"]).args(arguments);
         let begun = Instant::now();
@@ -48,13 +48,13 @@ impl Daemon {
             "the push of {} ended with {status}",
             arguments.join(" ")
         );
-        Ok(Pushed { events, total })
+        Ok(TimedPush { events, total })
     }
 }
 
-impl Pushed {
-    /// Its last event.
-    pub fn done(&self) -> Result<&Value> {
+impl TimedPush {
+    /// Returns the final event.
+    pub fn done_event(&self) -> Result<&Value> {
         let done = self
             .events
             .iter()
@@ -63,9 +63,9 @@ impl Pushed {
         done.context("a push that succeeded ends with done")
     }
 
-    /// Names of the layers that were made anew.
-    pub fn layers_made(&self) -> Result<Vec<String>> {
-        let layers = self.done()?["layers"]
+    /// Returns the names of the layers that were built rather than taken from the cache.
+    pub fn built_layers(&self) -> Result<Vec<String>> {
+        let layers = self.done_event()?["layers"]
             .as_array()
             .context("done names the layers")?;
         ensure!(!layers.is_empty(), "an image has layers");
@@ -75,8 +75,8 @@ impl Pushed {
             .collect())
     }
 
-    /// How long it took until the first step began: the daemon opens the archive's index and the base, once.
-    pub fn opening(&self) -> Duration {
+    /// Returns the time until the first step began: the daemon opens the archive's index and the base, once.
+    pub fn time_to_first_step(&self) -> Duration {
         let first = self
             .events
             .iter()
@@ -84,8 +84,9 @@ impl Pushed {
         first.map_or(Duration::ZERO, |(time, _)| *time)
     }
 
-    /// How long the steps took whose titles begin like this: each lasts until the next, or to the end.
-    pub fn step(&self, title: &str) -> Option<Duration> {
+    /// Returns the total time of the steps whose titles start with `title`; a step lasts until the next one, or until
+    /// the end.
+    pub fn step_duration(&self, title: &str) -> Option<Duration> {
         let ends = |event: &Value| event["type"] == "step" || event["type"] == "done";
         let marks: Vec<_> = self
             .events

@@ -1,4 +1,4 @@
-//! A robot: a WebSocket client of the rosbridge protocol with nothing of ours in it.
+//! A robot: a WebSocket client of the rosbridge protocol that uses none of our code.
 
 use std::net::TcpStream;
 use std::time::Duration;
@@ -7,13 +7,13 @@ use anyhow::{Context, Result, bail};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket};
 
-/// How long an answer may take.
+/// Maximum time to wait for an answer.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// One connection.
-pub(crate) struct Robot(WebSocket<TcpStream>);
+pub(crate) struct BenchRobot(WebSocket<TcpStream>);
 
-impl Robot {
+impl BenchRobot {
     /// Connects to `ws://ADDRESS/PATH`.
     pub(crate) fn connect(address: &str, path: &str) -> Result<Self> {
         let stream = TcpStream::connect(address)?;
@@ -28,7 +28,7 @@ impl Robot {
         }
     }
 
-    /// The nodes that rosapi names: answered once the servant is there.
+    /// Returns the nodes that rosapi reports; the call is answered once the servant is ready.
     pub(crate) fn nodes(&mut self) -> Result<Vec<String>> {
         let call =
             json!({"op": "call_service", "id": "nodes", "service": "/rosapi/nodes", "args": {}});
@@ -53,7 +53,7 @@ impl Robot {
         }
     }
 
-    /// Says goodbye and waits for the answer.
+    /// Closes the connection and waits for the close frame.
     pub(crate) fn leave(mut self) -> Result<()> {
         self.0.close(None)?;
         while self.0.read().is_ok() {}

@@ -1,4 +1,4 @@
-//! The image's root for the peers: its layers under an overlay, as they are, without shifted ids.
+//! Root file system of the image for the peers: its layers below an overlay, without shifted ids.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -9,18 +9,18 @@ use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use servant::container::ContainerSpec;
 use servant::rootfs::make_skeleton;
 
-/// A mounted root; unmounted when dropped.
-pub(crate) struct Root {
+/// A mounted root; unmounted on drop.
+pub(crate) struct ImageRoot {
     path: PathBuf,
 }
 
-impl Root {
+impl ImageRoot {
     /// Mounts it below `place`, read-only.
     pub(crate) fn mount(place: &Path, spec: &ContainerSpec) -> Result<Self> {
         let (skeleton, path) = (place.join("skeleton"), place.join("root"));
         fs::create_dir_all(&path)?;
         make_skeleton(&skeleton, &spec.id, &[], &[], &[])?;
-        // Not shifted, it belongs to a stranger, and only who may enter it can mount on it.
+        // Without shifted ids it belongs to another user, and only a user who may enter it can mount on it.
         fs::set_permissions(skeleton.join("root"), fs::Permissions::from_mode(0o755))?;
         let lowers = [&skeleton].into_iter().chain(spec.layers.iter().rev());
         let lowers: Vec<&str> = lowers
@@ -39,13 +39,13 @@ impl Root {
         Ok(Self { path })
     }
 
-    /// Its path.
+    /// Returns its path.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Adds what a process needs that is run in it by chroot: /proc, /dev, and the tmpfs that a servant has.
-    pub(crate) fn furnish(&self) -> Result<()> {
+    /// Mounts what a chrooted process needs: /proc, /dev, and the tmpfs of a servant.
+    pub(crate) fn mount_system(&self) -> Result<()> {
         let place = |name: &str| self.path.join(name);
         let nothing = MsFlags::empty();
         mount(
@@ -78,9 +78,9 @@ impl Root {
     }
 }
 
-impl Drop for Root {
+impl Drop for ImageRoot {
     fn drop(&mut self) {
-        // Recursive by detaching; what fails here goes with our mount namespace.
+        // MNT_DETACH unmounts recursively; anything left disappears with our mount namespace.
         let _ = umount2(&self.path, MntFlags::MNT_DETACH);
     }
 }

@@ -1,14 +1,18 @@
-//! A prebuilt install space: one launch file that starts `relay /in /out`, a roscpp node that registers at once and then
-//! waits.
+//! A prebuilt install space: one launch file that starts `relay /in /out`, a roscpp node that registers at once and
+//! then waits.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 
-/// Makes the install space of `package` in `place`. The node is `executable`, which becomes part of it, or the one of
-/// `topic_tools`.
-pub fn space(place: &Path, package: &str, executable: Option<&Path>) -> Result<PathBuf> {
+/// Writes the install space of `package` in `place`. The node is `executable`, which is copied into the space, or that
+/// of `topic_tools`.
+pub fn write_install_space(
+    place: &Path,
+    package: &str,
+    executable: Option<&Path>,
+) -> Result<PathBuf> {
     let space = place.join(package);
     let share = space.join("share").join(package);
     fs::create_dir_all(share.join("launch"))?;

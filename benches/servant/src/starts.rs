@@ -1,26 +1,26 @@
-//! How long a start takes: a robot's, the node's alone, the container's alone, in turns.
+//! Start times: of a robot's servant, of the node alone and of the container alone, in turns.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target, Times};
-use bench_servant::{Daemon, full};
+use bench_report::{BenchReport, Target, Times};
+use bench_servant::{Daemon, is_full_run};
 use servant::container::ContainerSpec;
 use tokio::runtime::Handle;
 
 use crate::bare;
-use crate::engine::Ours;
-use crate::image::Image;
-use crate::native::Native;
-use crate::peers::Peer;
-use crate::robot::Robot;
+use crate::engine::BenchEngine;
+use crate::image::ServiceImage;
+use crate::native::NativeNode;
+use crate::peers::PeerRuntime;
+use crate::robot::BenchRobot;
 use crate::upgrade;
 
-/// A robot connects; until rosapi tells it of its node. Then it leaves, and its servant ends.
-pub(crate) fn robot(daemon: &Daemon, image: &Image) -> Result<Duration> {
+/// Measures from a robot's connection until rosapi reports its node. Then the robot leaves, and its servant ends.
+pub(crate) fn time_robot_start(daemon: &Daemon, image: &ServiceImage) -> Result<Duration> {
     let before = daemon.servants()?.len();
     let begun = Instant::now();
-    let mut robot = Robot::connect(&daemon.address, &image.service)?;
+    let mut robot = BenchRobot::connect(&daemon.address, &image.service)?;
     let nodes = robot.nodes()?;
     let took = begun.elapsed();
     let node = &image.node()?.name;
@@ -29,12 +29,12 @@ pub(crate) fn robot(daemon: &Daemon, image: &Image) -> Result<Duration> {
         "the servant was there without {node}: {nodes:?}"
     );
     robot.leave()?;
-    daemon.until_servants(before)?;
+    daemon.wait_for_servants(before)?;
     Ok(took)
 }
 
-/// Waits until the nodes run in a container of the warm pool. They have registered long before the next turn.
-fn until_warm(daemon: &Daemon) -> Result<()> {
+/// Waits until the nodes run in a container of the warm pool; they have registered long before the next turn.
+fn wait_until_warm(daemon: &Daemon) -> Result<()> {
     let deadline = Instant::now() + Duration::from_secs(60);
     while daemon.get("/api/v1/status")?["warm_nodes"] == 0 {
         ensure!(Instant::now() < deadline, "no nodes run ahead");
@@ -44,8 +44,8 @@ fn until_warm(daemon: &Daemon) -> Result<()> {
     Ok(())
 }
 
-/// Sorted and named.
-pub(crate) fn times(name: &str, mut list: Vec<Duration>) -> Times {
+/// Sorts the times of a contestant.
+pub(crate) fn sorted_times(name: &str, mut list: Vec<Duration>) -> Times {
     list.sort_unstable();
     Times {
         name: name.to_owned(),
@@ -53,23 +53,23 @@ pub(crate) fn times(name: &str, mut list: Vec<Duration>) -> Times {
     }
 }
 
-/// The middle one, in milliseconds.
-pub(crate) fn median(times: &Times) -> f64 {
+/// Median in milliseconds.
+pub(crate) fn median_milliseconds(times: &Times) -> f64 {
     times.median().as_secs_f64() * 1e3
 }
 
-/// For nodes that were started just now to register.
+/// Time for nodes that were started just now to register.
 const SETTLES: Duration = Duration::from_millis(500);
-/// Between two contestants, for what the one before left running in the kernel.
+/// Pause between two contestants, for work that the previous one has left to the kernel.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Starts something once, and ends it.
+/// A function that starts something once, measures the time, and stops it.
 type Start<'a> = Box<dyn Fn(&ContainerSpec) -> Result<Duration> + 'a>;
 
 /// One way to start something.
 struct Contestant<'a> {
     name: &'static str,
-    /// One that does not work on this host is told and left out; ours must.
+    /// True if a failure on this host is reported and skipped; our own starts must succeed.
     optional: bool,
     start: Start<'a>,
     times: Vec<Duration>,
@@ -102,46 +102,46 @@ const ENGINE: &str = "engine";
 const LIMITED: &str = "libcontainer alone, the same spec";
 const UNLIMITED: &str = "libcontainer alone, without cgroups";
 
-/// All starts in turns, so that what disturbs one disturbs all.
+/// Measures all starts in turns, so that disturbances affect all of them.
 pub(crate) fn measure(
-    report: &mut Report,
+    report: &mut BenchReport,
     daemon: &Daemon,
     without_warm_pool: &Daemon,
     warm_nodes: &Daemon,
-    image: &Image,
+    image: &ServiceImage,
     runtime: &Handle,
 ) -> Result<()> {
-    let rounds = if full() { 40 } else { 15 };
-    let place = daemon.place().join("starts");
+    let rounds = if is_full_run() { 40 } else { 15 };
+    let place = daemon.directory().join("starts");
     std::fs::create_dir_all(&place)?;
-    let native = Native::prepare(&place, image, runtime)?;
-    let ours = Ours::prepare(&place, runtime)?;
-    let plain = upgrade::server()?;
+    let native = NativeNode::prepare(&place, image, runtime)?;
+    let ours = BenchEngine::prepare(&place, runtime)?;
+    let plain = upgrade::start_server()?;
     let bundle = place.join("bundle");
     let mut contestants = vec![
-        Contestant::ours(ROBOT, |_| robot(daemon, image)),
-        Contestant::ours(COLD, |_| robot(without_warm_pool, image)),
+        Contestant::ours(ROBOT, |_| time_robot_start(daemon, image)),
+        Contestant::ours(COLD, |_| time_robot_start(without_warm_pool, image)),
         Contestant::ours(READY, |_| {
-            until_warm(warm_nodes)?;
-            robot(warm_nodes, image)
+            wait_until_warm(warm_nodes)?;
+            time_robot_start(warm_nodes, image)
         }),
-        Contestant::ours(UPGRADE, |_| upgrade::time(&plain)),
-        Contestant::ours(NODE, |_| native.time()),
-        Contestant::ours(ENGINE, |spec| ours.time(spec.clone())),
-        Contestant::peer(LIMITED, |spec| bare::limited(&bundle, spec)),
-        Contestant::ours(UNLIMITED, |spec| bare::unlimited(&bundle, spec)),
+        Contestant::ours(UPGRADE, |_| upgrade::time_upgrade(&plain)),
+        Contestant::ours(NODE, |_| native.time_start()),
+        Contestant::ours(ENGINE, |spec| ours.time_start(spec.clone())),
+        Contestant::peer(LIMITED, |spec| bare::time_limited(&bundle, spec)),
+        Contestant::ours(UNLIMITED, |spec| bare::time_unlimited(&bundle, spec)),
     ];
-    for (peer, there) in Peer::looked_for()? {
+    for (peer, there) in PeerRuntime::find_peers()? {
         if let Err(why) = there {
-            report.left_out(peer.name, format!("{why:#}"));
+            report.skip(peer.name, format!("{why:#}"));
             continue;
         }
         let bundle = place.join(peer.name);
         contestants.push(Contestant::peer(peer.name, move |spec| {
-            peer.time(&bundle, spec)
+            peer.time_container(&bundle, spec)
         }));
     }
-    // The first round warms up.
+    // The first round is a warm-up.
     for round in 0..=rounds {
         eprintln!("starts: round {round} of {rounds}");
         for index in (0..contestants.len()).rev() {
@@ -155,7 +155,7 @@ pub(crate) fn measure(
             match (one.start)(&spec) {
                 Ok(time) => one.times.extend((round > 0).then_some(time)),
                 Err(error) if one.optional => {
-                    report.left_out(one.name, format!("{error:#}"));
+                    report.skip(one.name, format!("{error:#}"));
                     contestants.remove(index);
                 }
                 Err(error) => return Err(error.context(one.name)),
@@ -164,30 +164,30 @@ pub(crate) fn measure(
     }
     let all: Vec<Times> = contestants
         .into_iter()
-        .map(|one| times(one.name, one.times))
+        .map(|one| sorted_times(one.name, one.times))
         .collect();
-    tell(report, &all, rounds)
+    report_starts(report, &all, rounds)
 }
 
-fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
+fn report_starts(report: &mut BenchReport, all: &[Times], rounds: usize) -> Result<()> {
     let of = |name: &str| all.iter().find(|times| times.name == name);
     let needed = |name: &str| of(name).with_context(|| name.to_owned());
-    let (robots, node) = (needed(ROBOT)?, median(needed(NODE)?));
-    let engine = median(needed(ENGINE)?);
+    let (robots, node) = (needed(ROBOT)?, median_milliseconds(needed(NODE)?));
+    let engine = median_milliseconds(needed(ENGINE)?);
     let unlimited = needed(UNLIMITED)?;
-    // Where libcontainer cannot set limits the container without them stands for it.
+    // If libcontainer cannot set limits, the container without limits is the reference.
     let bare = of(LIMITED).unwrap_or(unlimited);
     report
         .figure(
             "robot connects → node registered, bridged",
             "ms",
-            median(robots),
+            median_milliseconds(robots),
         )
-        .beside(
+        .relative_to(
             "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * median(bare),
+            node + 1.5 * median_milliseconds(bare),
         )
-        .reach(Target::RatioAtMost(1.0))
+        .require(Target::RatioAtMost(1.0))
         .note(format!(
             "medians of {rounds}, in turns; best {:.1} ms",
             robots.best().as_secs_f64() * 1e3
@@ -196,30 +196,30 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         .figure(
             "robot connects → node registered, bridged, without a container made ahead",
             "ms",
-            median(needed(COLD)?),
+            median_milliseconds(needed(COLD)?),
         )
-        .beside(
+        .relative_to(
             "node alone + 1.5 × libcontainer alone",
-            node + 1.5 * median(bare),
+            node + 1.5 * median_milliseconds(bare),
         )
         .note("the first robot of a service, and robots that come faster than containers are made");
     report
         .figure(
             "robot connects → node registered, bridged, in a container made ahead",
             "ms",
-            median(robots),
+            median_milliseconds(robots),
         )
-        .beside("node alone", node)
-        .reach(Target::RatioAtMost(1.2));
+        .relative_to("node alone", node)
+        .require(Target::RatioAtMost(1.2));
     let ready = needed(READY)?;
     report
         .figure(
             "robot connects → first answer, nodes running already",
             "ms",
-            median(ready),
+            median_milliseconds(ready),
         )
-        .beside(UPGRADE, median(needed(UPGRADE)?))
-        .reach(Target::RatioAtMost(10.0))
+        .relative_to(UPGRADE, median_milliseconds(needed(UPGRADE)?))
+        .require(Target::RatioAtMost(10.0))
         .note(format!(
             "warm_nodes = 1; the answer names the node; best {:.2} ms",
             ready.best().as_secs_f64() * 1e3
@@ -229,8 +229,8 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         .note("in a chroot of the same layers, namespaces ready, the same Master");
     report
         .figure("create → running", "ms", engine)
-        .beside(bare.name.clone(), median(bare))
-        .reach(Target::RatioAtMost(1.5))
+        .relative_to(bare.name.clone(), median_milliseconds(bare))
+        .require(Target::RatioAtMost(1.5))
         .note("ours with limits read back, shim, Master and init");
     for other in all
         .iter()
@@ -239,7 +239,7 @@ fn tell(report: &mut Report, all: &[Times], rounds: usize) -> Result<()> {
         if other.name != bare.name {
             report
                 .figure("create → running", "ms", engine)
-                .beside(other.name.clone(), median(other));
+                .relative_to(other.name.clone(), median_milliseconds(other));
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! What reaching anything by WebSocket costs at the least: an upgrade on a connection of its own, and nothing behind it.
+//! Lower bound of any WebSocket request: an upgrade on a new connection, with nothing behind it.
 
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::{Duration, Instant};
@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use anyhow::{Result, bail};
 use tokio_tungstenite::tungstenite;
 
-/// Accepts upgrades, and nothing else, until this program ends.
-pub(crate) fn server() -> Result<SocketAddr> {
+/// Starts a server that accepts upgrades, and nothing else, until this program ends.
+pub(crate) fn start_server() -> Result<SocketAddr> {
     let listener = TcpListener::bind("127.0.0.1:0")?;
     let address = listener.local_addr()?;
     std::thread::spawn(move || {
@@ -21,8 +21,8 @@ pub(crate) fn server() -> Result<SocketAddr> {
     Ok(address)
 }
 
-/// One upgrade.
-pub(crate) fn time(address: &SocketAddr) -> Result<Duration> {
+/// Measures one upgrade.
+pub(crate) fn time_upgrade(address: &SocketAddr) -> Result<Duration> {
     let begun = Instant::now();
     let stream = TcpStream::connect(address)?;
     stream.set_nodelay(true)?;

@@ -1,4 +1,4 @@
-//! Clients that are there and say nothing.
+//! Clients that stay connected and send nothing.
 
 use std::thread::JoinHandle;
 
@@ -8,14 +8,14 @@ use serde_json::json;
 use tokio::sync::watch;
 use tokio_tungstenite::tungstenite::Message;
 
-/// Clients that answer pings and say nothing else, in a thread of their own.
-pub(crate) struct Crowd {
+/// Clients that answer pings and send nothing else, on a thread of their own.
+pub(crate) struct IdleCrowd {
     ask: watch::Sender<bool>,
     thread: JoinHandle<usize>,
 }
 
-impl Crowd {
-    /// Connects so many, one after the other.
+impl IdleCrowd {
+    /// Connects `count` clients, one after the other.
     pub(crate) fn connect(url: &str, count: usize) -> Result<Self> {
         let (ask, asked) = watch::channel(false);
         let (connected, are_connected) = std::sync::mpsc::channel();
@@ -30,8 +30,8 @@ impl Crowd {
             runtime.block_on(async {
                 let mut all = tokio::task::JoinSet::new();
                 for number in 0..count {
-                    match client(&url).await {
-                        Ok(socket) => drop(all.spawn(stay(socket, asked.clone()))),
+                    match connect_client(&url).await {
+                        Ok(socket) => drop(all.spawn(stay_connected(socket, asked.clone()))),
                         Err(error) => eprintln!("connection {number}: {error:#}"),
                     }
                 }
@@ -47,9 +47,9 @@ impl Crowd {
         Ok(Self { ask, thread })
     }
 
-    /// Has each that is still connected ask its servant something, and leave; returns how many were answered.
-    pub(crate) fn ask(self) -> Result<usize> {
-        // Fails where all connections have ended.
+    /// Has every client that is still connected call its servant and leave; returns how many were answered.
+    pub(crate) fn ask_and_leave(self) -> Result<usize> {
+        // Fails if all connections have ended.
         let _ = self.ask.send(true);
         self.thread
             .join()
@@ -59,7 +59,7 @@ impl Crowd {
 
 type Socket = tokio_tungstenite::WebSocketStream<tokio::net::TcpStream>;
 
-async fn client(url: &str) -> Result<Socket> {
+async fn connect_client(url: &str) -> Result<Socket> {
     let address = url
         .strip_prefix("ws://")
         .and_then(|rest| rest.split('/').next());
@@ -67,8 +67,8 @@ async fn client(url: &str) -> Result<Socket> {
     Ok(tokio_tungstenite::client_async(url, stream).await?.0)
 }
 
-/// Reads, and so answers pings, until it is to ask; says whether it was answered.
-async fn stay(mut socket: Socket, mut asked: watch::Receiver<bool>) -> bool {
+/// Reads, and so answers pings, until the client is to make its call; returns whether it was answered.
+async fn stay_connected(mut socket: Socket, mut asked: watch::Receiver<bool>) -> bool {
     let call = json!({"op": "call_service", "id": "idle", "service": "/greeter/count", "args": {"reset": false}});
     let mut is_asked = false;
     loop {

@@ -1,31 +1,32 @@
-//! Many connections: robots that come and go, a thousand that say nothing, and a hundred that never read what is published.
+//! Many connections: robots that come and go, a thousand that send nothing, and a hundred that never read what is
+//! published.
 
 mod coming;
 mod idle;
 mod unread;
 
 use anyhow::{Context, Result, anyhow};
-use bench_report::Report;
+use bench_report::BenchReport;
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 use support::daemon::Daemon;
 
 use crate::greeters;
 
-/// What came of all of it.
+/// Results of all parts.
 #[derive(Debug)]
-pub(crate) struct Crowds {
-    coming: coming::Coming,
-    idle: idle::Idle,
-    unread: unread::Unread,
+pub(crate) struct CrowdResults {
+    coming: coming::ConnectResult,
+    idle: idle::IdleResult,
+    unread: unread::UnreadResult,
 }
 
-/// Does all of it to one daemon.
-pub(crate) fn measure(daemon: &Daemon) -> Result<Crowds> {
-    allow_many_descriptors()?;
+/// Runs all parts against one daemon.
+pub(crate) fn measure(daemon: &Daemon) -> Result<CrowdResults> {
+    raise_descriptor_limit()?;
     for robot in ["crowd", "polite"] {
-        greeters::ask_again(daemon, robot)?;
+        greeters::ask_until_answered(daemon, robot)?;
     }
-    let crowds = Crowds {
+    let crowds = CrowdResults {
         coming: coming::measure(daemon)?,
         idle: idle::measure(daemon)?,
         unread: unread::measure(daemon)?,
@@ -34,22 +35,23 @@ pub(crate) fn measure(daemon: &Daemon) -> Result<Crowds> {
     Ok(crowds)
 }
 
-impl Crowds {
-    /// Adds their figures.
-    pub(crate) fn tell(&self, report: &mut Report) {
-        self.coming.tell(report);
-        self.idle.tell(report);
-        self.unread.tell(report);
+impl CrowdResults {
+    /// Adds the figures to the report.
+    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
+        self.coming.add_figures(report);
+        self.idle.add_figures(report);
+        self.unread.add_figures(report);
     }
 }
 
-/// The daemon under test was started with fewer, as it is by a service manager.
-fn allow_many_descriptors() -> Result<()> {
+/// Raises the limit of open files for this program. The daemon under test was started with a lower one, as by a service
+/// manager.
+fn raise_descriptor_limit() -> Result<()> {
     let (_, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
     setrlimit(Resource::RLIMIT_NOFILE, most, most).context("more descriptors for this program")
 }
 
-/// Waits for a thread.
-fn joined<T>(thread: std::thread::ScopedJoinHandle<'_, Result<T>>) -> Result<T> {
+/// Joins a thread and returns its result.
+fn join_thread<T>(thread: std::thread::ScopedJoinHandle<'_, Result<T>>) -> Result<T> {
     thread.join().map_err(|_| anyhow!("a robot panicked"))?
 }

@@ -1,12 +1,12 @@
-//! A full disk: robots at work work on, whoever is new is refused and let in once there is room, and what was answered with success is there
-//! after a restart.
+//! A full disk: working robots continue, new ones are refused and admitted once there is space again, and every change
+//! that was confirmed is still there after a restart.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use support::daemon::Daemon;
 use support::robot::Robot;
@@ -14,15 +14,15 @@ use support::robot::Robot;
 use crate::greeters;
 use crate::milliseconds::{median, worst};
 
-/// As large as the service and some servants need.
+/// Enough for the service and some servants.
 const SIZE: &str = "size=1500M";
-/// Robots at work, and calls of each while the disk is full.
+/// Working robots, and calls of each while the disk is full.
 const ROBOTS: usize = 5;
 const CALLS: usize = 100;
-/// Changes that are asked for while it is full, of each kind.
+/// Changes of each kind that are requested while the disk is full.
 const CHANGES: u32 = 5;
 
-/// A disk of memory, mounted for as long as this is there.
+/// A file system in memory, mounted until drop.
 struct Disk(PathBuf);
 
 impl Disk {
@@ -42,9 +42,9 @@ impl Disk {
         self.0.join("filler")
     }
 
-    /// Leaves no room on it.
+    /// Fills it completely.
     fn fill(&self) -> Result<()> {
-        // Ends when nothing more fits.
+        // Ends with an error when the disk is full.
         let _ = std::io::copy(&mut std::io::repeat(1), &mut File::create(self.filler())?);
         Ok(())
     }
@@ -61,35 +61,35 @@ impl Drop for Disk {
 }
 
 #[derive(Debug, Default)]
-struct Outcome {
+struct FullDiskResult {
     asked: usize,
     failed: usize,
     refused: u32,
     recovered: u32,
-    /// First answers to robots before the disk was ever full, and to new ones after there was room again.
+    /// First answers to robots before the disk was ever full, and to new robots after space was freed.
     first: Vec<Duration>,
     again: Vec<Duration>,
     confirmed: usize,
     gone: Vec<String>,
 }
 
-/// Fills the disk of a daemon of its own in so many rounds.
-pub(crate) fn measure(report: &mut Report, place: &Path, rounds: u32) -> Result<()> {
+/// Fills the disk of a separate daemon `rounds` times.
+pub(crate) fn measure(report: &mut BenchReport, place: &Path, rounds: u32) -> Result<()> {
     let disk = Disk::mount(&place.join("small"))?;
     let home = disk.0.join("home");
-    let measured = measure_on(&disk, &home, rounds);
-    greeters::end_left(&home)?;
-    measured?.tell(report, rounds);
+    let measured = run_rounds(&disk, &home, rounds);
+    greeters::end_leftovers(&home)?;
+    measured?.add_figures(report, rounds);
     Ok(())
 }
 
-fn measure_on(disk: &Disk, home: &Path, rounds: u32) -> Result<Outcome> {
+fn run_rounds(disk: &Disk, home: &Path, rounds: u32) -> Result<FullDiskResult> {
     let setup = greeters::publish(home)?;
     let mut daemon = setup.start()?;
-    let mut outcome = Outcome::default();
+    let mut outcome = FullDiskResult::default();
     let mut robots = Vec::new();
     for number in 0..ROBOTS {
-        let (robot, took) = first_answer(&daemon, &format!("early-{number}"))?;
+        let (robot, took) = time_first_answer(&daemon, &format!("early-{number}"))?;
         robots.push(robot);
         outcome.first.push(took);
     }
@@ -98,14 +98,14 @@ fn measure_on(disk: &Disk, home: &Path, rounds: u32) -> Result<Outcome> {
         for robot in &mut robots {
             for _ in 0..CALLS {
                 outcome.asked += 1;
-                outcome.failed += usize::from(greeters::count(robot).is_err());
+                outcome.failed += usize::from(greeters::greeting_count(robot).is_err());
             }
         }
         let late = format!("late-{round}");
-        outcome.refused += u32::from(first_answer(&daemon, &late).is_err());
+        outcome.refused += u32::from(time_first_answer(&daemon, &late).is_err());
         disk.free()?;
         let began = Instant::now();
-        match greeters::ask_again(&daemon, &late) {
+        match greeters::ask_until_answered(&daemon, &late) {
             Ok(_) => {
                 outcome.recovered += 1;
                 outcome.again.push(began.elapsed());
@@ -115,10 +115,10 @@ fn measure_on(disk: &Disk, home: &Path, rounds: u32) -> Result<Outcome> {
     }
     drop(robots);
     disk.fill()?;
-    let confirmed = change(&daemon)?;
+    let confirmed = apply_changes(&daemon)?;
     disk.free()?;
     greeters::stop_all(&daemon)?;
-    daemon.ends()?;
+    daemon.stop()?;
     daemon = setup.start()?;
     let kept =
         daemon.api("/api/v1/policy")?.to_string() + &daemon.api("/api/v1/tokens")?.to_string();
@@ -127,19 +127,19 @@ fn measure_on(disk: &Disk, home: &Path, rounds: u32) -> Result<Outcome> {
         .into_iter()
         .filter(|name| !kept.contains(&format!("\"{name}\"")))
         .collect();
-    daemon.ends()?;
+    daemon.stop()?;
     Ok(outcome)
 }
 
-fn first_answer(daemon: &Daemon, robot: &str) -> Result<(Robot, Duration)> {
+fn time_first_answer(daemon: &Daemon, robot: &str) -> Result<(Robot, Duration)> {
     let began = Instant::now();
-    let mut connection = Robot::connect(&daemon.url(&greeters::path(robot)))?;
-    greeters::count(&mut connection).context("no answer")?;
+    let mut connection = Robot::connect(&daemon.url(&greeters::robot_path(robot)))?;
+    greeters::greeting_count(&mut connection).context("no answer")?;
     Ok((connection, began.elapsed()))
 }
 
-/// Asks for changes, each about a name of its own; returns the names of those that were answered with success.
-fn change(daemon: &Daemon) -> Result<Vec<String>> {
+/// Requests changes, each with a different name; returns the names of those that were confirmed.
+fn apply_changes(daemon: &Daemon) -> Result<Vec<String>> {
     let mut confirmed = Vec::new();
     for number in 0..CHANGES {
         let rule = format!("ruled-{number}");
@@ -148,7 +148,7 @@ fn change(daemon: &Daemon) -> Result<Vec<String>> {
             (&rule, ["policy", "allow", &rule, "call:/detect"]),
             (&token, ["token", "create", &token, "--role=viewer"]),
         ] {
-            if daemon.deployer().types(&words)?.status == 0 {
+            if daemon.deployer().run(&words)?.status == 0 {
                 confirmed.push(name.clone());
             }
         }
@@ -156,15 +156,15 @@ fn change(daemon: &Daemon) -> Result<Vec<String>> {
     Ok(confirmed)
 }
 
-impl Outcome {
-    fn tell(&self, report: &mut Report, rounds: u32) {
+impl FullDiskResult {
+    fn add_figures(&self, report: &mut BenchReport, rounds: u32) {
         report
             .figure(
                 "calls of robots at work that fail while the disk is full",
                 "",
                 self.failed as f64,
             )
-            .reach(Target::AtMost(0.0))
+            .require(Target::AtMost(0.0))
             .note(format!(
                 "of {}, by {ROBOTS} robots in {rounds} rounds",
                 self.asked
@@ -175,11 +175,11 @@ impl Outcome {
                 "",
                 f64::from(self.recovered),
             )
-            .reach(Target::AtLeast(f64::from(rounds)))
+            .require(Target::AtLeast(f64::from(rounds)))
             .note(format!("{} of them were refused before", self.refused));
         report
             .figure("until they are", "ms", median(&self.again))
-            .beside("a robot's first answer", median(&self.first))
+            .relative_to("a robot's first answer", median(&self.first))
             .note(format!("medians; at worst {:.0} ms", worst(&self.again)));
         report
             .figure(
@@ -187,7 +187,7 @@ impl Outcome {
                 "",
                 self.gone.len() as f64,
             )
-            .reach(Target::AtMost(0.0))
+            .require(Target::AtMost(0.0))
             .note(format!(
                 "of {} that were confirmed, of {} that were asked for; gone: {:?}",
                 self.confirmed,

@@ -1,43 +1,43 @@
-//! Half-open connections: they stand, and nothing comes through them any more, as after a robot has lost its network. Clients that were there
-//! are let go, and links are replaced.
+//! Half-open connections: they stay established, but nothing passes any more, as after a robot has lost its network.
+//! Clients are disconnected, and links are replaced.
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use ros::bus::RosVersion;
 use support::daemon::Daemon;
 use support::freezer::Freezer;
-use support::site::{Running, Site};
+use support::site::{NodeProcess, Site};
 use support::twins::{self, Twin};
 
-use crate::crowd::Crowd;
+use crate::crowd::IdleCrowd;
 use crate::greeters;
 use crate::milliseconds::{median, worst};
 use crate::resources::Resources;
 
-/// Clients of rosbridge.
+/// Number of rosbridge clients.
 const CLIENTS: usize = 100;
-/// Stubs of one robot, each with a servant of its own.
+/// Number of stubs of one robot, each with a servant of its own.
 const LINKS: usize = 5;
-/// What their SLA accepts: a link is silent after that.
+/// Response time that their SLA accepts: after that a link counts as silent.
 const ACCEPTED: Duration = Duration::from_secs(1);
 
-/// What came of it.
+/// Results.
 #[derive(Debug)]
-pub(crate) struct HalfOpen {
-    /// Until the daemon had let all clients go.
+pub(crate) struct HalfOpenResult {
+    /// Time until the daemon had disconnected all clients.
     let_go: Duration,
     rounds: u32,
-    /// Times of calls by links that stand, and of the first after each fell silent.
+    /// Durations of calls over working links, and of the first call after each link fell silent.
     standing: Vec<Duration>,
     silent: Vec<Duration>,
 }
 
-/// Does it to one daemon; links fall silent in so many rounds.
-pub(crate) fn measure(daemon: &Daemon, rounds: u32) -> Result<HalfOpen> {
+/// Runs both parts against one daemon; links fall silent `rounds` times.
+pub(crate) fn measure(daemon: &Daemon, rounds: u32) -> Result<HalfOpenResult> {
     let let_go = lose_clients(daemon)?;
-    let mut outcome = HalfOpen {
+    let mut outcome = HalfOpenResult {
         let_go,
         rounds,
         standing: Vec::new(),
@@ -48,43 +48,47 @@ pub(crate) fn measure(daemon: &Daemon, rounds: u32) -> Result<HalfOpen> {
     Ok(outcome)
 }
 
-/// Clients that fall silent: how long the daemon has descriptors for them.
+/// Makes clients fall silent; returns how long the daemon keeps their descriptors.
 fn lose_clients(daemon: &Daemon) -> Result<Duration> {
-    // The servant stays, and what is open for it.
-    let mut first = daemon.robot(&greeters::path("half-open"))?;
-    greeters::count(&mut first)?;
-    first.leaves()?;
-    let before = Resources::of(daemon.pid())?.descriptors;
+    // Has the servant started, so that the descriptors that are open for it are not counted.
+    let mut first = daemon.robot(&greeters::robot_path("half-open"))?;
+    greeters::greeting_count(&mut first)?;
+    first.leave()?;
+    let before = Resources::read(daemon.pid())?.descriptors;
     let freezer = Freezer::new(&daemon.address)?;
-    let url = format!("ws://{}/{}", freezer.server, greeters::path("half-open"));
-    let crowd = Crowd::connect(&url, CLIENTS)?;
+    let url = format!(
+        "ws://{}/{}",
+        freezer.server,
+        greeters::robot_path("half-open")
+    );
+    let crowd = IdleCrowd::connect(&url, CLIENTS)?;
     let silent = freezer.freeze();
     ensure!(
         silent == CLIENTS,
         "{silent} of {CLIENTS} connections are there"
     );
     let began = Instant::now();
-    support::until("the end of connections that carry nothing", || {
-        let now = Resources::of(daemon.pid())?.descriptors;
+    support::wait_until("the end of connections that carry nothing", || {
+        let now = Resources::read(daemon.pid())?.descriptors;
         Ok((now <= before)
             .then_some(())
             .ok_or_else(|| format!("{now} descriptors, {before} before")))
     })?;
     let took = began.elapsed();
     drop(freezer);
-    // Their own ends are told only now.
-    crowd.ask()?;
+    // The clients notice only now that their connections have ended.
+    crowd.ask_and_leave()?;
     Ok(took)
 }
 
-/// Links that fall silent: how long until the node behind each is heard again.
-fn silence_links(daemon: &Daemon, outcome: &mut HalfOpen) -> Result<()> {
+/// Makes links fall silent and measures the time until the node behind each is heard again.
+fn silence_links(daemon: &Daemon, outcome: &mut HalfOpenResult) -> Result<()> {
     let freezer = Freezer::new(&daemon.address)?;
     let (site, twin) = (Site::new()?, Twin::greeter(RosVersion::One));
     let app = site.node("/app")?;
     let server = freezer.server.to_string();
     let settings = format!("desire = {0}.0\nmax = {0}.0\n", ACCEPTED.as_secs());
-    let mut stubs: Vec<Running> = Vec::new();
+    let mut stubs: Vec<NodeProcess> = Vec::new();
     for number in 0..LINKS {
         let argv = twin.argv(&format!("link{number}"), &[]);
         let robot = format!("linked-{number}");
@@ -92,14 +96,14 @@ fn silence_links(daemon: &Daemon, outcome: &mut HalfOpen) -> Result<()> {
     }
     let ask = |number: usize| -> Result<Duration> {
         let began = Instant::now();
-        support::until(&format!("an answer of link{number}"), || {
-            let answer = twins::count(&site, &app, &format!("/link{number}"));
+        support::wait_until(&format!("an answer of link{number}"), || {
+            let answer = twins::greeting_count(&site, &app, &format!("/link{number}"));
             Ok(answer.map_err(|error| format!("{error:#}")))
         })?;
         Ok(began.elapsed())
     };
     for (number, stub) in stubs.iter().enumerate() {
-        ask(number).with_context(|| stub.said())?;
+        ask(number).with_context(|| stub.output())?;
     }
     for _ in 0..outcome.rounds {
         for number in 0..LINKS {
@@ -111,7 +115,7 @@ fn silence_links(daemon: &Daemon, outcome: &mut HalfOpen) -> Result<()> {
             match ask(number) {
                 Ok(_) => outcome.silent.push(began.elapsed()),
                 Err(error) => {
-                    eprintln!("link{number}: {error:#}; it said:\n{}", stub.said());
+                    eprintln!("link{number}: {error:#}; it said:\n{}", stub.output());
                 }
             }
         }
@@ -119,20 +123,20 @@ fn silence_links(daemon: &Daemon, outcome: &mut HalfOpen) -> Result<()> {
     Ok(())
 }
 
-impl HalfOpen {
-    /// Adds their figures.
-    pub(crate) fn tell(&self, report: &mut Report) {
+impl HalfOpenResult {
+    /// Adds the figures to the report.
+    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
         report
             .figure(
                 format!("until {CLIENTS} half-open WebSockets are let go"),
                 "s",
                 self.let_go.as_secs_f64(),
             )
-            .beside(
+            .relative_to(
                 "the time without data that is configured",
                 greeters::SILENCE.as_secs_f64(),
             )
-            .reach(Target::RatioAtMost(1.5));
+            .require(Target::RatioAtMost(1.5));
         let all = self.rounds as usize * LINKS;
         report
             .figure(
@@ -140,10 +144,10 @@ impl HalfOpen {
                 "",
                 self.silent.len() as f64,
             )
-            .reach(Target::AtLeast(all as f64));
+            .require(Target::AtLeast(all as f64));
         report
             .figure("until that is answered", "ms", median(&self.silent))
-            .beside(
+            .relative_to(
                 "what the robot accepts (T_max)",
                 ACCEPTED.as_secs_f64() * 1e3,
             )

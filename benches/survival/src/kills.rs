@@ -1,66 +1,71 @@
-//! `kill -9` of the daemon, and of a servant's shim, init and node: whether those come back who worked, and how long it takes at worst.
+//! `kill -9` of the daemon, and of a servant's shim, init and node: whether working robots recover, and the longest
+//! time that takes.
 
 use std::fmt;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::json;
-use support::daemon::{Daemon, Setup};
+use support::daemon::{Daemon, DaemonSetup};
 use support::procfs;
 
-use crate::greeters::{self, Processes};
+use crate::greeters::{self, ServantProcesses};
 use crate::milliseconds::{median, worst};
 
-/// Starts of a daemon that has nothing to find.
+/// Starts of a daemon that has no servants to take over.
 const STARTS_ALONE: usize = 5;
 
-/// Kills daemons under traffic, and starts others in their place.
-pub(crate) fn of_daemons(report: &mut Report, setup: &Setup, rounds: u32) -> Result<()> {
+/// Kills daemons under load and starts new ones in their place.
+pub(crate) fn kill_daemons(
+    report: &mut BenchReport,
+    setup: &DaemonSetup,
+    rounds: u32,
+) -> Result<()> {
     let mut alone = Vec::new();
     for _ in 0..STARTS_ALONE {
         let (daemon, took) = greeters::start(setup)?;
         alone.push(took);
-        daemon.is_killed()?;
+        daemon.kill()?;
     }
     let robots = ["r1", "r2", "r3"].map(str::to_owned);
     let mut daemon = setup.start()?;
     for robot in &robots {
-        greeters::greet(&mut daemon.robot(&greeters::path(robot))?)?;
+        greeters::greet(&mut daemon.robot(&greeters::robot_path(robot))?)?;
     }
-    let before = greeters::identities(&daemon, &robots)?;
+    let before = greeters::servant_identities(&daemon, &robots)?;
     let (mut recovered, mut lost, mut forgotten, mut found) = (0, 0, 0, Vec::new());
     for round in 0..rounds {
-        // One of them is at work when it happens.
+        // One of the robots has a call in progress at that moment.
         let at_work = &robots[round as usize % robots.len()];
-        let mut robot = daemon.robot(&greeters::path(at_work))?;
+        let mut robot = daemon.robot(&greeters::robot_path(at_work))?;
         let counted = greeters::greet(&mut robot)?;
-        robot.says(json!({"op": "call_service", "service": "/greeter/count", "args": {}}))?;
-        daemon.is_killed()?;
+        robot.send(json!({"op": "call_service", "service": "/greeter/count", "args": {}}))?;
+        daemon.kill()?;
         let (next, took) = greeters::start(setup)?;
         daemon = next;
         found.push(took);
-        let after = greeters::identities(&daemon, &robots);
+        let after = greeters::servant_identities(&daemon, &robots);
         let lost_now = greeters::count_lost(&before, &after);
         lost += lost_now;
-        // More than was heard back may have been on its way.
-        let is_forgotten = greeters::ask_again(&daemon, at_work)? < counted;
+        // The node may have received more than the robot got answers for.
+        let is_forgotten = greeters::ask_until_answered(&daemon, at_work)? < counted;
         forgotten += u32::from(is_forgotten);
         if lost_now == 0 && !is_forgotten {
             recovered += 1;
         } else {
             eprintln!("round {round}: {before:?} became {after:?}; forgotten: {is_forgotten}");
         }
-        // Whoever was lost once differs from then on, and would be counted again.
+        // A servant that was lost once would differ from the reference in every later round and be counted again.
         if lost > 0 {
             break;
         }
     }
     greeters::stop_all(&daemon)?;
-    daemon.ends()?;
-    tell_recovered(report, "the daemon", recovered, rounds).note(format!(
+    daemon.stop()?;
+    report_recovered(report, "the daemon", recovered, rounds).note(format!(
         "{lost} servants of {} lost, {forgotten} nodes that had forgotten what they knew",
         robots.len()
     ));
@@ -70,15 +75,15 @@ pub(crate) fn of_daemons(report: &mut Report, setup: &Setup, rounds: u32) -> Res
             "ms",
             median(&found),
         )
-        .beside("with none", median(&alone))
+        .relative_to("with none", median(&alone))
         .note("medians");
     report
         .figure("the same, the worst", "ms", worst(&found))
-        .beside("with none, the worst", worst(&alone));
+        .relative_to("with none, the worst", worst(&alone));
     Ok(())
 }
 
-/// Who is killed of a servant.
+/// Process of a servant that is killed.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Victim {
     Shim,
@@ -89,7 +94,7 @@ pub(crate) enum Victim {
 impl Victim {
     pub(crate) const ALL: [Self; 3] = [Self::Shim, Self::Init, Self::Node];
 
-    fn pid(self, processes: Processes) -> i32 {
+    fn pid(self, processes: ServantProcesses) -> i32 {
         match self {
             Self::Shim => processes.shim,
             Self::Init => processes.init,
@@ -108,44 +113,45 @@ impl fmt::Display for Victim {
     }
 }
 
-/// What came of killing one of these again and again.
+/// Results of killing this process repeatedly.
 #[derive(Debug)]
-pub(crate) struct Kills {
+pub(crate) struct KillResult {
     victim: Victim,
     rounds: u32,
-    /// From a robot's first connection to its first answer.
+    /// Times from a robot's first connection to its first answer.
     first: Vec<Duration>,
-    /// From the kill to its next answer, of those that came.
+    /// Times from the kill to the next answer, for those robots that were answered.
     again: Vec<Duration>,
 }
 
-/// Kills the victim in servants of robots that are new each time: whose servants fail again and again has to wait for the next one.
-pub(crate) fn in_servants(daemon: &Daemon, victim: Victim, rounds: u32) -> Result<Kills> {
+/// Kills the process in servants of a new robot each time, because a robot whose servants fail repeatedly has to wait
+/// before the next start.
+pub(crate) fn kill_in_servants(daemon: &Daemon, victim: Victim, rounds: u32) -> Result<KillResult> {
     let (mut first, mut again) = (Vec::new(), Vec::new());
     for round in 0..rounds {
         let name = format!("{victim}-{round}");
         let began = Instant::now();
-        let mut robot = daemon.robot(&greeters::path(&name))?;
-        greeters::count(&mut robot)?;
+        let mut robot = daemon.robot(&greeters::robot_path(&name))?;
+        greeters::greeting_count(&mut robot)?;
         first.push(began.elapsed());
-        let processes = Processes::of(daemon, &name)?;
+        let processes = ServantProcesses::for_robot(daemon, &name)?;
         let began = Instant::now();
         kill(Pid::from_raw(victim.pid(processes)), Signal::SIGKILL)?;
-        // Whoever of them is killed, the node ends with it. Until then it may answer.
-        support::until("the end of the node", || {
+        // The node ends whichever of the processes is killed; until then it may still answer.
+        support::wait_until("the end of the node", || {
             let is_there = procfs::is_running(processes.node);
             Ok((!is_there)
                 .then_some(())
                 .ok_or_else(|| "it runs".to_owned()))
         })?;
-        match greeters::ask_again(daemon, &name) {
+        match greeters::ask_until_answered(daemon, &name) {
             Ok(_) => again.push(began.elapsed()),
             Err(error) => eprintln!("{name} was not answered again: {error:#}"),
         }
         drop(robot);
         greeters::stop_all(daemon)?;
     }
-    Ok(Kills {
+    Ok(KillResult {
         victim,
         rounds,
         first,
@@ -153,12 +159,12 @@ pub(crate) fn in_servants(daemon: &Daemon, victim: Victim, rounds: u32) -> Resul
     })
 }
 
-impl Kills {
-    /// Adds their figures.
-    pub(crate) fn tell(&self, report: &mut Report) {
+impl KillResult {
+    /// Adds the figures to the report.
+    pub(crate) fn add_figures(&self, report: &mut BenchReport) {
         let victim = self.victim;
         let recovered = u32::try_from(self.again.len()).unwrap_or(u32::MAX);
-        tell_recovered(
+        report_recovered(
             report,
             &format!("a servant's {victim}"),
             recovered,
@@ -170,7 +176,7 @@ impl Kills {
                 "ms",
                 median(&self.again),
             )
-            .beside("a robot's first answer", median(&self.first))
+            .relative_to("a robot's first answer", median(&self.first))
             .note(format!(
                 "medians; at worst {:.0} ms beside {:.0} ms",
                 worst(&self.again),
@@ -179,8 +185,8 @@ impl Kills {
     }
 }
 
-fn tell_recovered<'a>(
-    report: &'a mut Report,
+fn report_recovered<'a>(
+    report: &'a mut BenchReport,
     victim: &str,
     recovered: u32,
     rounds: u32,
@@ -191,5 +197,5 @@ fn tell_recovered<'a>(
             "",
             f64::from(recovered),
         )
-        .reach(Target::AtLeast(f64::from(rounds)))
+        .require(Target::AtLeast(f64::from(rounds)))
 }

@@ -1,14 +1,16 @@
-//! `make bench ONLY=survival`: what a daemon and its robots live through. Needs root.
+//! `make bench ONLY=survival`: failures and load that a daemon and its robots survive. Needs root.
 //!
 //! ```text
-//!  daemons    kill -9 of the daemon under traffic: servants that are lost, time until the next one answers
-//!  upgrade    26 servants at work, and the daemon replaced: servants that are lost, the longest gap a robot sees
-//!  wear       one daemon: kill -9 of shims, inits and nodes, crowds, half-open connections, all of it twice; what its process holds
-//!             after the second time beside the first
-//!  soak       the same daemon: mixed load by 20 robots, for three minutes or what CLOUDROID_BENCH_SOAK says (1h); what its process holds
-//!  disk       a full disk: robots at work, robots that are new, changes that were confirmed
+//!  daemons    kill -9 of the daemon under load: servants lost, time until the next daemon answers
+//!  upgrade    26 working servants while the daemon is replaced: servants lost, longest gap that a robot sees
+//!  wear       one daemon, twice: kill -9 of shims, inits and nodes, crowds, half-open connections; resources of its
+//!             process after the second time compared with the first
+//!  soak       the same daemon: mixed load of 20 robots for CLOUDROID_BENCH_SOAK (default: 3m), such as 1h;
+//!             resources of its process
+//!  disk       a full disk: working robots, new robots, changes that were confirmed
 //! ```
-//! One of these words as an argument runs that part alone. `CLOUDROID_BENCH_ROUNDS` says how often each is killed.
+//! One of these words as an argument runs that part alone. `CLOUDROID_BENCH_ROUNDS` sets the number of kills of each
+//! kind (default: 50).
 
 #![forbid(unsafe_code)]
 
@@ -27,19 +29,19 @@ mod wear;
 use std::path::Path;
 
 use anyhow::{Context, Result, bail};
-use bench_report::Report;
-/// How often each is killed.
+use bench_report::BenchReport;
+/// Kills of each kind.
 const ROUNDS: u32 = 50;
-/// Of that, how often where it takes longer, at most.
+/// Upper limit of the kills of kinds that take longer.
 const FEW: u32 = 5;
 
-/// In the directory of this run.
+/// Name of the home in the directory of this run.
 const HOME: &str = "home";
 
 const PARTS: [&str; 5] = ["daemons", "upgrade", "wear", "soak", "disk"];
 
 fn main() -> Result<()> {
-    // While there is one thread: whatever is mounted from here on is gone when this program is, however it ends.
+    // Before there are threads: mounts made from here on disappear with this program, however it ends.
     support::disk::enter_namespace()?;
     let words: Vec<String> = std::env::args().skip(1).collect();
     let parts: Vec<&str> = match words.as_slice() {
@@ -57,20 +59,20 @@ fn main() -> Result<()> {
     let place = tempfile::Builder::new()
         .prefix("cloudroid-bench-")
         .tempdir()?;
-    let mut report = Report::new("survival");
+    let mut report = BenchReport::new("survival");
     let measured = measure(&mut report, place.path(), &parts, rounds);
-    greeters::end_left(&place.path().join(HOME))?;
+    greeters::end_leftovers(&place.path().join(HOME))?;
     measured?;
     report.finish()?;
     Ok(())
 }
 
-fn measure(report: &mut Report, place: &Path, parts: &[&str], rounds: u32) -> Result<()> {
+fn measure(report: &mut BenchReport, place: &Path, parts: &[&str], rounds: u32) -> Result<()> {
     let time = soak::duration()?;
     let few = rounds.min(FEW);
     let setup = greeters::publish(&place.join(HOME))?;
     if parts.contains(&"daemons") {
-        kills::of_daemons(report, &setup, rounds)?;
+        kills::kill_daemons(report, &setup, rounds)?;
     }
     if parts.contains(&"upgrade") {
         upgrade::measure(report, &setup, few)?;
@@ -83,7 +85,7 @@ fn measure(report: &mut Report, place: &Path, parts: &[&str], rounds: u32) -> Re
         if parts.contains(&"soak") {
             soak::measure(report, &daemon, time)?;
         }
-        daemon.ends()?;
+        daemon.stop()?;
     }
     if parts.contains(&"disk") {
         disk::measure(report, place, few)?;

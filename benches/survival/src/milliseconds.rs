@@ -1,18 +1,18 @@
-//! Times as figures.
+//! Durations as figures in milliseconds.
 
 use std::time::Duration;
 
-/// The middle one.
+/// Median.
 pub(crate) fn median(times: &[Duration]) -> f64 {
-    part(times, 0.5)
+    quantile(times, 0.5)
 }
 
-/// The longest.
+/// Maximum.
 pub(crate) fn worst(times: &[Duration]) -> f64 {
-    part(times, 1.0)
+    quantile(times, 1.0)
 }
 
-/// The one that this fraction of them stays below.
-pub(crate) fn part(times: &[Duration], fraction: f64) -> f64 {
+/// Quantile at `fraction`.
+pub(crate) fn quantile(times: &[Duration], fraction: f64) -> f64 {
     bench_report::quantile(times, fraction).map_or(f64::NAN, |time| time.as_secs_f64() * 1e3)
 }

@@ -1,27 +1,27 @@
-//! What the daemon's process holds, as the kernel counts it: whether that stays the same however long it works.
+//! Resources of the daemon's process, from the kernel's counters: they should not grow, however long it works.
 
 use std::fs;
 use std::time::Duration;
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 
-/// Threads that wait for more of their work end after 10 s; what was freed is given back every 30 s.
+/// Idle threads of a pool end after 10 s, and freed memory is returned every 30 s.
 const REST: Duration = Duration::from_secs(45);
-/// Looks that make one figure, and the pause between them.
+/// Number of samples per figure, and the pause between them.
 const LOOKS: usize = 9;
 const PAUSE: Duration = Duration::from_millis(250);
-/// What counts as the same.
+/// Ratio up to which two values count as equal.
 const FLAT: f64 = 1.02;
 
-/// At one time.
+/// Resources at one moment.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Resources {
-    /// Resident megabytes (10⁶).
+    /// Resident memory in megabytes (10⁶).
     pub(crate) resident: f64,
-    /// Those of them that are no file's: what it allocated.
+    /// Anonymous resident memory, which excludes files: what the process has allocated.
     pub(crate) anonymous: f64,
-    /// Resident ones, what is shared counted in proportion (PSS): fewer where more processes of the program run.
+    /// Proportional set size: less the more processes of the program run.
     pub(crate) proportional: f64,
     /// Open descriptors.
     pub(crate) descriptors: f64,
@@ -30,8 +30,8 @@ pub(crate) struct Resources {
 }
 
 impl Resources {
-    /// Those of a process now.
-    pub(crate) fn of(pid: i32) -> Result<Self> {
+    /// Reads the resources of a process.
+    pub(crate) fn read(pid: i32) -> Result<Self> {
         let megabytes =
             |file, name| Ok::<f64, anyhow::Error>(field(pid, file, name)? * 1024.0 / 1e6);
         Ok(Self {
@@ -43,18 +43,18 @@ impl Resources {
         })
     }
 
-    /// Those of a process that was left alone for a while.
-    pub(crate) fn at_rest(pid: i32) -> Result<Self> {
+    /// Reads the resources of a process after an idle period.
+    pub(crate) fn read_at_rest(pid: i32) -> Result<Self> {
         std::thread::sleep(REST);
         let mut looks = Vec::new();
         for _ in 0..LOOKS {
-            looks.push(Self::of(pid)?);
+            looks.push(Self::read(pid)?);
             std::thread::sleep(PAUSE);
         }
         Ok(Self::median(&looks))
     }
 
-    /// The middle of many looks, each number by itself.
+    /// Returns the median of each number over several samples.
     pub(crate) fn median(looks: &[Self]) -> Self {
         let middle = |pick: fn(&Self) -> f64| {
             let all: Vec<f64> = looks.iter().map(pick).collect();
@@ -69,16 +69,21 @@ impl Resources {
         }
     }
 
-    /// Adds figures of what it is now, after `what`, beside what it was `before`.
-    pub(crate) fn tell(self, report: &mut Report, what: &str, (when, before): (&str, Self)) {
+    /// Adds figures for the current values, after `what`, compared with those from `before`.
+    pub(crate) fn add_figures(
+        self,
+        report: &mut BenchReport,
+        what: &str,
+        (when, before): (&str, Self),
+    ) {
         report
             .figure(
                 format!("memory of the daemon after {what}, resident"),
                 "MB",
                 self.resident,
             )
-            .beside(when, before.resident)
-            .reach(Target::RatioAtMost(FLAT))
+            .relative_to(when, before.resident)
+            .require(Target::RatioAtMost(FLAT))
             .note(format!(
                 "allocated {:.1} MB after {:.1} MB; PSS {:.1} MB after {:.1} MB",
                 self.anonymous, before.anonymous, self.proportional, before.proportional
@@ -89,13 +94,13 @@ impl Resources {
                 "",
                 self.descriptors,
             )
-            .beside(when, before.descriptors)
-            .reach(Target::RatioAtMost(FLAT))
+            .relative_to(when, before.descriptors)
+            .require(Target::RatioAtMost(FLAT))
             .note(format!("{} threads after {}", self.threads, before.threads));
     }
 }
 
-/// A number of a file below `/proc/PID`.
+/// Reads a number from a file below `/proc/PID`.
 fn field(pid: i32, file: &str, name: &str) -> Result<f64> {
     let path = format!("/proc/{pid}/{file}");
     let text = fs::read_to_string(&path).with_context(|| path.clone())?;

@@ -1,25 +1,25 @@
-//! Mixed load by twenty robots for as long as one likes to wait: nothing fails, and the daemon holds no more, and answers no later, in its
-//! last quarter than in its second.
+//! Mixed load of twenty robots for an arbitrary time: nothing fails, and in its last quarter the daemon neither uses
+//! more resources nor answers later than in its second.
 
 mod load;
 
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use support::daemon::Daemon;
 
 use crate::greeters;
-use crate::milliseconds::part;
+use crate::milliseconds::quantile;
 use crate::resources::Resources;
-use load::{Load, Tally};
+use load::{MixedLoad, Tally};
 
-/// How long, where nobody says otherwise.
+/// Default duration.
 const USUALLY: Duration = Duration::from_secs(180);
-/// Between two looks at the daemon's process.
+/// Sampling interval of the daemon's process.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// As long as `CLOUDROID_BENCH_SOAK` says, such as `90s`, `30m` or `1h`.
+/// Returns the duration `CLOUDROID_BENCH_SOAK`, such as `90s`, `30m` or `1h`.
 pub(crate) fn duration() -> Result<Duration> {
     match std::env::var("CLOUDROID_BENCH_SOAK") {
         Ok(text) => parse(&text).with_context(|| {
@@ -40,28 +40,28 @@ fn parse(text: &str) -> Option<Duration> {
     Some(Duration::from_secs(number * seconds))
 }
 
-/// Twenty robots at one daemon for this time.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, time: Duration) -> Result<()> {
+/// Runs twenty robots against one daemon for `time`.
+pub(crate) fn measure(report: &mut BenchReport, daemon: &Daemon, time: Duration) -> Result<()> {
     eprintln!("20 robots for {time:?}");
-    let load = Load::of(daemon);
+    let load = MixedLoad::new(daemon);
     let mut looks = Vec::new();
     std::thread::scope(|scope| -> Result<()> {
         load.start(scope);
-        let looked = watch(daemon.pid(), time, &mut looks);
+        let looked = sample_resources(daemon.pid(), time, &mut looks);
         load.end();
         looked
     })?;
     greeters::stop_all(daemon)?;
-    tell(report, &load.into_tally()?, &looks, time);
+    report_soak(report, &load.into_tally()?, &looks, time);
     Ok(())
 }
 
-/// Looks at the process again and again.
-fn watch(pid: i32, time: Duration, looks: &mut Vec<(Instant, Resources)>) -> Result<()> {
+/// Samples the process periodically.
+fn sample_resources(pid: i32, time: Duration, looks: &mut Vec<(Instant, Resources)>) -> Result<()> {
     let began = Instant::now();
     let mut told = began;
     while began.elapsed() < time {
-        let now = Resources::of(pid)?;
+        let now = Resources::read(pid)?;
         looks.push((Instant::now(), now));
         if told.elapsed() >= time / 12 {
             told = Instant::now();
@@ -72,7 +72,12 @@ fn watch(pid: i32, time: Duration, looks: &mut Vec<(Instant, Resources)>) -> Res
     Ok(())
 }
 
-fn tell(report: &mut Report, tally: &Tally, looks: &[(Instant, Resources)], time: Duration) {
+fn report_soak(
+    report: &mut BenchReport,
+    tally: &Tally,
+    looks: &[(Instant, Resources)],
+    time: Duration,
+) {
     let first = tally.failures.first().map_or("none", String::as_str);
     report
         .figure(
@@ -83,9 +88,9 @@ fn tell(report: &mut Report, tally: &Tally, looks: &[(Instant, Resources)], time
             "",
             tally.failures.len() as f64,
         )
-        .reach(Target::AtMost(0.0))
+        .require(Target::AtMost(0.0))
         .note(format!("of {}; {first}", tally.done));
-    // What is made once is made in the first quarter.
+    // Allocations that are made once happen in the first quarter.
     let began = looks.first().map_or_else(Instant::now, |(at, _)| *at);
     let is_in = |number: u32, at: Instant| {
         let since = at.saturating_duration_since(began);
@@ -96,18 +101,22 @@ fn tell(report: &mut Report, tally: &Tally, looks: &[(Instant, Resources)], time
         Resources::median(&some.map(|(_, look)| *look).collect::<Vec<_>>())
     };
     let second = ("in its second quarter", held_in(2));
-    held_in(4).tell(report, "that, in its last quarter", second);
+    held_in(4).add_figures(report, "that, in its last quarter", second);
     let calls_in = |number: u32| -> Vec<Duration> {
         let some = tally.calls.iter().filter(|call| is_in(number, call.made));
         some.map(|call| call.took).collect()
     };
     let (second, last) = (calls_in(2), calls_in(4));
     report
-        .figure("a call in its last quarter, p99", "ms", part(&last, 0.99))
-        .beside("in its second quarter", part(&second, 0.99))
+        .figure(
+            "a call in its last quarter, p99",
+            "ms",
+            quantile(&last, 0.99),
+        )
+        .relative_to("in its second quarter", quantile(&second, 0.99))
         .note(format!(
             "p50 {:.2} ms beside {:.2} ms",
-            part(&last, 0.5),
-            part(&second, 0.5)
+            quantile(&last, 0.5),
+            quantile(&second, 0.5)
         ));
 }

@@ -1,57 +1,60 @@
-//! An upgrade: the daemon is ended, and another started in its place, while many robots are at work. Their connections end; their servants
-//! do not.
+//! An upgrade: the daemon is stopped and another one started in its place while many robots work. Their connections
+//! end; their servants do not.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow};
-use bench_report::{Report, Target};
-use support::daemon::Setup;
+use bench_report::{BenchReport, Target};
+use support::daemon::DaemonSetup;
 use support::robot::Robot;
 
 use crate::greeters;
 use crate::milliseconds::{median, worst};
 
-/// Servants at work.
+/// Number of working servants.
 const SERVANTS: usize = 26;
-/// Between a robot's calls.
+/// Interval between a robot's calls.
 const PACE: Duration = Duration::from_millis(100);
 
-/// Replaces the daemon so many times.
-pub(crate) fn measure(report: &mut Report, setup: &Setup, rounds: u32) -> Result<()> {
+/// Replaces the daemon `rounds` times.
+pub(crate) fn measure(report: &mut BenchReport, setup: &DaemonSetup, rounds: u32) -> Result<()> {
     let mut alone = Vec::new();
     for _ in 0..rounds {
         let daemon = setup.start()?;
         let began = Instant::now();
-        daemon.ends()?;
+        daemon.stop()?;
         let (daemon, _) = greeters::start(setup)?;
         alone.push(began.elapsed());
-        daemon.ends()?;
+        daemon.stop()?;
     }
     let mut daemon = setup.start()?;
     let robots: Vec<String> = (0..SERVANTS)
         .map(|number| format!("upgraded-{number}"))
         .collect();
     for robot in &robots {
-        greeters::greet(&mut daemon.robot(&greeters::path(robot))?)?;
+        greeters::greet(&mut daemon.robot(&greeters::robot_path(robot))?)?;
     }
-    let before = greeters::identities(&daemon, &robots)?;
+    let before = greeters::servant_identities(&daemon, &robots)?;
     let (mut lost, mut forgotten, mut gaps) = (0, 0, Vec::new());
     for _ in 0..rounds {
         let address = daemon.address.clone();
         let over = AtomicBool::new(false);
         daemon = std::thread::scope(|scope| -> Result<_> {
             let work = |robot: &String| {
-                let (url, over) = (format!("ws://{address}/{}", greeters::path(robot)), &over);
+                let (url, over) = (
+                    format!("ws://{address}/{}", greeters::robot_path(robot)),
+                    &over,
+                );
                 scope.spawn(move || work_until(&url, over))
             };
             let at_work: Vec<_> = robots.iter().map(work).collect();
             let next = (|| {
-                daemon.ends()?;
+                daemon.stop()?;
                 let (next, _) = greeters::start(setup)?;
                 for robot in &robots {
-                    // Each was greeted once.
-                    forgotten += u32::from(greeters::ask_again(&next, robot)? < 1);
+                    // Every robot had one name greeted before.
+                    forgotten += u32::from(greeters::ask_until_answered(&next, robot)? < 1);
                 }
                 Ok(next)
             })();
@@ -61,31 +64,31 @@ pub(crate) fn measure(report: &mut Report, setup: &Setup, rounds: u32) -> Result
             }
             next
         })?;
-        lost += greeters::count_lost(&before, &greeters::identities(&daemon, &robots));
+        lost += greeters::count_lost(&before, &greeters::servant_identities(&daemon, &robots));
     }
     greeters::stop_all(&daemon)?;
-    daemon.ends()?;
+    daemon.stop()?;
     report
         .figure(
             format!("{rounds} upgrades with {SERVANTS} servants at work, servants lost"),
             "",
             lost as f64,
         )
-        .reach(Target::AtMost(0.0));
+        .require(Target::AtMost(0.0));
     report
         .figure(
             "nodes that had forgotten what they knew by then",
             "",
             f64::from(forgotten),
         )
-        .reach(Target::AtMost(0.0));
+        .require(Target::AtMost(0.0));
     report
         .figure(
             "longest time between two answers to a robot",
             "ms",
             median(&gaps),
         )
-        .beside("end and start of a daemon with no servants", median(&alone))
+        .relative_to("end and start of a daemon with no servants", median(&alone))
         .note(format!(
             "medians; at worst {:.0} ms beside {:.0} ms",
             worst(&gaps),
@@ -94,19 +97,20 @@ pub(crate) fn measure(report: &mut Report, setup: &Setup, rounds: u32) -> Result
     Ok(())
 }
 
-/// Asks a servant again and again, and connects again where it has to, until it is over; returns the longest time between two answers.
+/// Calls a servant repeatedly, reconnecting if necessary, until `over` is set; returns the longest time between two
+/// answers.
 fn work_until(url: &str, over: &AtomicBool) -> Duration {
     let (mut longest, mut answered) = (Duration::ZERO, Instant::now());
     let mut connection = None;
     loop {
-        // Looked at before it asks: a gap that is open at the end is counted, too.
+        // Read before the call, so that a gap which is still open at the end is counted.
         let is_last = over.load(Ordering::Relaxed);
         if connection.is_none() {
             connection = Robot::connect(url).ok();
         }
         if connection
             .as_mut()
-            .is_some_and(|robot| greeters::count(robot).is_ok())
+            .is_some_and(|robot| greeters::greeting_count(robot).is_ok())
         {
             longest = longest.max(answered.elapsed());
             answered = Instant::now();

@@ -1,34 +1,40 @@
-//! What one daemon lives through, twice: what it holds afterwards must not have grown by the second time. By the first it may: what is made
-//! once, and kept as large as it was ever needed, is made then.
+//! Repeated failures and load on one daemon, in two passes: the resources after the second must not exceed those after
+//! the first. They may grow in the first, because that is when one-time allocations are made and buffers reach the size
+//! that they ever need.
 
 use anyhow::Result;
-use bench_report::Report;
+use bench_report::BenchReport;
 use support::daemon::Daemon;
 
-use crate::crowds::{self, Crowds};
-use crate::half_open::{self, HalfOpen};
-use crate::kills::{self, Kills, Victim};
+use crate::crowds::{self, CrowdResults};
+use crate::half_open::{self, HalfOpenResult};
+use crate::kills::{self, KillResult, Victim};
 use crate::resources::Resources;
 
-/// One time.
-struct Wear {
-    kills: Vec<Kills>,
-    crowds: Crowds,
-    half_open: HalfOpen,
+/// Results of one pass.
+struct WearRun {
+    kills: Vec<KillResult>,
+    crowds: CrowdResults,
+    half_open: HalfOpenResult,
 }
 
-/// Does all of it twice, the second time with so many kills of each; few of what takes longer.
-pub(crate) fn measure(report: &mut Report, daemon: &Daemon, kills: u32, few: u32) -> Result<()> {
-    Wear::of(daemon, few, few)?;
-    let before = Resources::at_rest(daemon.pid())?;
-    let wear = Wear::of(daemon, kills, few)?;
-    let after = Resources::at_rest(daemon.pid())?;
+/// Makes both passes, the second with `kills` kills of each kind; kinds that take longer are limited to `few`.
+pub(crate) fn measure(
+    report: &mut BenchReport,
+    daemon: &Daemon,
+    kills: u32,
+    few: u32,
+) -> Result<()> {
+    WearRun::run(daemon, few, few)?;
+    let before = Resources::read_at_rest(daemon.pid())?;
+    let wear = WearRun::run(daemon, kills, few)?;
+    let after = Resources::read_at_rest(daemon.pid())?;
     for kills in &wear.kills {
-        kills.tell(report);
+        kills.add_figures(report);
     }
-    wear.crowds.tell(report);
-    wear.half_open.tell(report);
-    after.tell(
+    wear.crowds.add_figures(report);
+    wear.half_open.add_figures(report);
+    after.add_figures(
         report,
         "all this a second time",
         ("after the first time", before),
@@ -36,18 +42,18 @@ pub(crate) fn measure(report: &mut Report, daemon: &Daemon, kills: u32, few: u32
     Ok(())
 }
 
-impl Wear {
-    fn of(daemon: &Daemon, kills: u32, few: u32) -> Result<Self> {
-        say(daemon, "before")?;
+impl WearRun {
+    fn run(daemon: &Daemon, kills: u32, few: u32) -> Result<Self> {
+        print_resources(daemon, "before")?;
         let mut all = Vec::new();
         for victim in Victim::ALL {
-            all.push(kills::in_servants(daemon, victim, kills)?);
-            say(daemon, &format!("{kills} kills of a servant's {victim}"))?;
+            all.push(kills::kill_in_servants(daemon, victim, kills)?);
+            print_resources(daemon, &format!("{kills} kills of a servant's {victim}"))?;
         }
         let crowds = crowds::measure(daemon)?;
-        say(daemon, "crowds")?;
+        print_resources(daemon, "crowds")?;
         let half_open = half_open::measure(daemon, few)?;
-        say(daemon, "half-open connections")?;
+        print_resources(daemon, "half-open connections")?;
         Ok(Self {
             kills: all,
             crowds,
@@ -56,8 +62,8 @@ impl Wear {
     }
 }
 
-/// Says which part made the daemon hold more.
-fn say(daemon: &Daemon, after: &str) -> Result<()> {
-    eprintln!("{after}: {:?}", Resources::of(daemon.pid())?);
+/// Prints the resources, to show which part made them grow.
+fn print_resources(daemon: &Daemon, after: &str) -> Result<()> {
+    eprintln!("{after}: {:?}", Resources::read(daemon.pid())?);
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The packages, what they speak, and what they are asked with.
+//! The packages, their topics, and their inputs.
 
 use std::path::{Path, PathBuf};
 
@@ -6,71 +6,71 @@ use anyhow::{Result, ensure};
 
 use crate::stereo;
 
-/// Recordings of MRPT, of Debian's mrpt-common.
+/// Recordings of MRPT, from Debian's mrpt-common.
 pub const DATA: &str = "/usr/share/mrpt/datasets";
-/// A real drive of 76 m through a floor of a faculty, with a SICK laser.
+/// A real drive of 76 m through one floor of a faculty building, with a SICK laser.
 pub const DRIVE: &str = "2006-01ENE-21-SENA_Telecom Faculty_one_loop_only.rawlog";
 
-/// A simulated drive of 200 m, with the simulator's own path of it beside it.
+/// A simulated drive of 200 m, together with the simulator's true path.
 pub const SIMULATED: &str = "graphslam-engine-demos/action_observations_map/simul.rawlog";
-/// Pedestrians, of Debian's opencv-doc.
+/// Video of pedestrians, from Debian's opencv-doc.
 pub const VIDEO: &str = "/usr/share/doc/opencv-doc/examples/data/vtest.avi";
 
-/// A package that is evaluated, and what it speaks.
+/// A package under evaluation, and its topics.
 #[derive(Debug, Clone, Copy)]
-pub struct Example {
-    /// Of the package and the service.
+pub struct EvalPackage {
+    /// Name of the package and of the service.
     pub name: &'static str,
-    /// Whose it is.
+    /// Origin of the package.
     pub origin: Origin,
-    /// Of which published package it stands in.
+    /// The published package that it stands in for.
     pub stands_for: &'static str,
-    /// Its node.
+    /// Executable of its node.
     pub executable: &'static str,
-    /// The topic whose messages it is asked by.
+    /// Topic of the requests.
     pub request: &'static str,
-    /// The topic of its answers.
+    /// Topic of the answers.
     pub answer: &'static str,
-    /// The topic on which it tells how long it took, if it does.
+    /// Topic on which the node publishes its own timing, if it does.
     pub timing: Option<&'static str>,
-    /// The topic of its map.
+    /// Topic of its map.
     pub map: Option<&'static str>,
     /// Parameters of its node.
     pub parameters: &'static [&'static str],
-    /// Lasers, or pictures.
-    pub input: Input,
-    /// Requests of one run.
+    /// Kind of its input.
+    pub input: InputRecording,
+    /// Requests per run.
     pub requests: usize,
 }
 
-/// Whose a package is.
+/// Origin of a package.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
-    /// Of `examples/`, compiled when it is pushed.
+    /// A package in `examples/`, compiled when it is pushed.
     Checkout,
-    /// Of Debian, as it is installed from there.
+    /// A package of Debian, as installed.
     Debian,
 }
 
-/// What a package is asked with.
+/// Input of a package.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Input {
-    /// A robot's drive: scans and odometry.
+pub enum InputRecording {
+    /// A robot's drive: laser scans and odometry.
     Drive,
-    /// The same by a simulator, with the true path.
+    /// A simulated drive, with the true path.
     Simulated,
-    /// Pedestrians.
+    /// Images of pedestrians.
     Pictures,
-    /// Pictures of two cameras beside each other.
+    /// Images of a stereo camera.
     Stereo,
 }
 
-impl Input {
-    /// Whether the files that it is made of are there, so that nothing is built for a recording that cannot be had.
+impl InputRecording {
+    /// Checks that the source files exist, so that nothing is built for a recording that cannot be created.
     ///
     /// # Errors
-    /// Says which is missing, and which package brings it.
-    pub fn is_there(self) -> Result<()> {
+    /// If a file is missing; the error names the Debian package that contains it.
+    pub fn check_files(self) -> Result<()> {
         let (file, package) = match self {
             Self::Drive => (Path::new(DATA).join(DRIVE), "mrpt-common"),
             Self::Simulated => (Path::new(DATA).join(SIMULATED), "mrpt-common"),
@@ -86,8 +86,8 @@ impl Input {
     }
 }
 
-/// Scans are matched with the map that was made of those before.
-pub const LASER_SLAM: Example = Example {
+/// Matches scans with the map built from the earlier ones.
+pub const LASER_SLAM: EvalPackage = EvalPackage {
     name: "laser_slam",
     origin: Origin::Checkout,
     stands_for: "RGBD-SLAM",
@@ -97,12 +97,12 @@ pub const LASER_SLAM: Example = Example {
     timing: Some("/laser_slam/timing"),
     map: Some("/map"),
     parameters: &["_laser_x:=0.78"],
-    input: Input::Drive,
+    input: InputRecording::Drive,
     requests: 150,
 };
 
-/// Each scan is matched with all earlier ones nearby, and the graph of all poses is made to agree.
-pub const GRAPH_SLAM: Example = Example {
+/// Matches each scan with all earlier ones nearby, and optimizes the graph of all poses.
+pub const GRAPH_SLAM: EvalPackage = EvalPackage {
     name: "graph_slam",
     origin: Origin::Checkout,
     stands_for: "RTAB-Map",
@@ -112,12 +112,12 @@ pub const GRAPH_SLAM: Example = Example {
     timing: Some("/graph_slam/timing"),
     map: None,
     parameters: &["_laser_x:=0.78"],
-    input: Input::Drive,
+    input: InputRecording::Drive,
     requests: 150,
 };
 
-/// A neural network looks for objects in pictures.
-pub const DETECTOR: Example = Example {
+/// Detects objects in images with a neural network.
+pub const DETECTOR: EvalPackage = EvalPackage {
     name: "object_detector",
     origin: Origin::Checkout,
     stands_for: "SSD",
@@ -127,20 +127,20 @@ pub const DETECTOR: Example = Example {
     timing: Some("/object_detector/timing"),
     map: None,
     parameters: &[],
-    input: Input::Pictures,
+    input: InputRecording::Pictures,
     requests: 40,
 };
 
-/// The first 78 s of the simulated drive: 80 m that end close to where they began.
-pub const LASER_SLAM_SIMULATED: Example = Example {
+/// The first 78 s of the simulated drive: 80 m that end close to their start.
+pub const LASER_SLAM_SIMULATED: EvalPackage = EvalPackage {
     parameters: &["_laser_x:=0.2"],
-    input: Input::Simulated,
+    input: InputRecording::Simulated,
     requests: 760,
     ..LASER_SLAM
 };
 
-/// Boxes around pedestrians: histograms of gradients (OpenCV), as Debian packages the node.
-pub const PEOPLE: Example = Example {
+/// Finds pedestrians by histograms of gradients (OpenCV), as Debian packages the node.
+pub const PEOPLE: EvalPackage = EvalPackage {
     name: "opencv_apps",
     origin: Origin::Debian,
     stands_for: "",
@@ -150,12 +150,13 @@ pub const PEOPLE: Example = Example {
     timing: None,
     map: None,
     parameters: &["_debug_view:=false"],
-    input: Input::Pictures,
+    input: InputRecording::Pictures,
     requests: 40,
 };
 
-/// Disparities by block matching (OpenCV), as Debian packages the node. The last of four messages that it needs counts as the request.
-pub const DISPARITY: Example = Example {
+/// Computes disparities by block matching (OpenCV), as Debian packages the node. The last of the four messages that it
+/// needs counts as the request.
+pub const DISPARITY: EvalPackage = EvalPackage {
     name: "stereo_image_proc",
     origin: Origin::Debian,
     stands_for: "",
@@ -165,9 +166,9 @@ pub const DISPARITY: Example = Example {
     timing: None,
     map: None,
     parameters: &[],
-    input: Input::Stereo,
+    input: InputRecording::Stereo,
     requests: 40,
 };
 
-/// All of `examples/`, as the published figures have them.
-pub const ALL: [Example; 3] = [LASER_SLAM, GRAPH_SLAM, DETECTOR];
+/// All packages of `examples/`, as in the published figures.
+pub const ALL: [EvalPackage; 3] = [LASER_SLAM, GRAPH_SLAM, DETECTOR];

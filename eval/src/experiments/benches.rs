@@ -1,4 +1,4 @@
-//! Parts of the project's benchmarks that an experiment needs: their programs are run, and what they write is read.
+//! Parts of the project's benchmarks that an experiment needs: runs the benchmark programs and reads their output.
 
 use std::process::Command;
 use std::time::Duration;
@@ -7,35 +7,35 @@ use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 use support::binaries;
 
-use crate::cells::{Cells, Measured};
+use crate::cells::{CachedResult, RunCache};
 use crate::deadline;
 use crate::words::digits;
 
-/// For one part of a benchmark, which takes some minutes.
+/// Maximum time for one part of a benchmark, which takes some minutes.
 const LONGEST: Duration = Duration::from_secs(900);
 
-/// What a benchmark writes: `bench_report::Report`.
+/// Output of a benchmark: `bench_report::BenchReport`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
-pub struct Written {
-    /// In the order in which they were measured.
+pub struct BenchOutput {
+    /// Figures in the order in which they were measured.
     pub figures: Vec<Figure>,
-    /// What could not be measured.
+    /// Measurements that could not be made.
     #[serde(default)]
-    pub left_out: Vec<LeftOut>,
+    pub left_out: Vec<SkippedFigure>,
 }
 
 /// One measured number: `bench_report::Figure`.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Figure {
-    /// What was measured.
+    /// Name of the figure.
     pub figure: String,
-    /// In what unit.
+    /// Unit.
     pub unit: String,
-    /// The number.
+    /// Value.
     pub value: Option<f64>,
-    /// What it was measured beside.
+    /// Name of the peer or floor.
     pub peer: Option<String>,
-    /// The peer's number, in the same unit.
+    /// The peer's value, in the same unit.
     pub floor: Option<f64>,
     ratio: Option<f64>,
     to_reach: Option<String>,
@@ -43,17 +43,17 @@ pub struct Figure {
     note: Option<String>,
 }
 
-/// Something that could not be measured on this machine: `bench_report::LeftOut`.
+/// Something that could not be measured on this machine: `bench_report::SkippedMeasurement`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct LeftOut {
-    /// What it is.
+pub struct SkippedFigure {
+    /// Name of the measurement.
     pub what: String,
-    /// Why.
+    /// Reason.
     pub why: String,
 }
 
-impl Written {
-    /// Sentences about what was to be reached and was not.
+impl BenchOutput {
+    /// Returns a sentence for each target that was not met.
     pub fn unmet(&self) -> Vec<String> {
         let unmet = self
             .figures
@@ -72,8 +72,12 @@ impl Written {
     }
 }
 
-/// Runs what `arguments` choose of a benchmark, unless that was done before.
-pub fn part(cells: &Cells, name: &str, arguments: &[&str]) -> Result<Measured<Written>> {
+/// Runs the part of a benchmark that `arguments` select, unless there is a stored result.
+pub fn run_part(
+    cells: &RunCache,
+    name: &str,
+    arguments: &[&str],
+) -> Result<CachedResult<BenchOutput>> {
     let cell = [&["bench", name], arguments].concat().join(" ");
     cells.measure(&cell, &name, || {
         let program = binaries::path(&format!("bench-{name}"));
@@ -83,7 +87,7 @@ pub fn part(cells: &Cells, name: &str, arguments: &[&str]) -> Result<Measured<Wr
             program.display()
         );
         let mut child = Command::new(&program).args(arguments).spawn()?;
-        let status = deadline::ends(&mut child, &program.display().to_string(), LONGEST)?;
+        let status = deadline::wait_for_exit(&mut child, &program.display().to_string(), LONGEST)?;
         ensure!(
             status.success(),
             "{} ended with {status}",
@@ -101,13 +105,15 @@ mod tests {
 
     #[test]
     fn what_was_not_reached_is_a_finding() {
-        let mut report = bench_report::Report::new("codecs");
+        let mut report = bench_report::BenchReport::new("codecs");
         report
             .figure("saved", "%", 50.0)
-            .reach(bench_report::Target::AtLeast(70.0));
-        report.figure("fast", "MB/s", 50.0).beside("zlib", 25.0);
+            .require(bench_report::Target::AtLeast(70.0));
+        report
+            .figure("fast", "MB/s", 50.0)
+            .relative_to("zlib", 25.0);
         let text = serde_json::to_string(&report).expect("JSON");
-        let written: Written = serde_json::from_str(&text).expect("what a benchmark writes");
+        let written: BenchOutput = serde_json::from_str(&text).expect("what a benchmark writes");
         assert_eq!(written.unmet(), ["saved: 50.0 %, which is not ≥ 70."]);
     }
 }

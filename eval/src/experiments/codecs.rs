@@ -1,5 +1,5 @@
-//! Experiment 8: pictures and maps go from a robot to a servant with each codec that `stub.toml` can name: bytes on the cable, response times
-//! on each network, and what lossy codecs lose.
+//! Experiment 8: images and maps are sent from a robot to a servant with each codec that `stub.toml` offers: bytes on
+//! the cable, response times on each network, and the distortion of lossy codecs.
 
 mod findings;
 mod received;
@@ -10,38 +10,39 @@ use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 
 use crate::attempts;
-use crate::cells::{Cells, Measured};
-use crate::examples::{DETECTOR, Where, Workshop};
-use crate::place::{Class, Network, Place};
-use crate::robot::{Node, Plan};
-use crate::trace::{Request, Trace};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{DETECTOR, EvalFixtures, ExecutionSite};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox};
+use crate::robot::{NodeUnderTest, RobotPlan};
+use crate::trace::{RequestSample, Trace};
 
-use received::Received;
-use sources::{Alone, Sources};
+use received::ReceivedPictures;
+use sources::{OfflineResult, StreamSources};
 pub use told::section;
 
-/// A node that answers each message by its header.
+/// A node that answers each message with its header.
 const PACKAGE: &str = "receipts_py";
 const EXECUTABLE: &str = "receipts.py";
-const CLASS: Class = Class::ULTRABOOK;
-/// T_desire and T_max (seconds) where a lossy codec is to be used: no lossless one brings a picture over in a quarter of that.
+const CLASS: RobotHardware = RobotHardware::ULTRABOOK;
+/// T_desire and T_max (seconds) that make the link choose a lossy codec: no lossless one transfers an image in a
+/// quarter of that time.
 const HURRY: (f64, f64) = (0.04, 0.08);
 
-/// What is sent.
+/// Data that is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Kind {
-    /// Frames of a video, one after the other.
+    /// Consecutive frames of a video.
     Video,
-    /// Photographs that have nothing to do with one another.
+    /// Unrelated photographs.
     Pictures,
     /// The map of a drive.
     Map,
-    /// The same in the middle of 4000 x 4000 cells.
+    /// The map at the centre of 4000 x 4000 cells.
     LargeMap,
 }
 
 impl Kind {
-    /// As tables name it.
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Video => "video, 640x480",
@@ -51,8 +52,8 @@ impl Kind {
         }
     }
 
-    /// The published row, and the share that was saved there (Table I), percent.
-    pub fn published(self) -> (&'static str, f64) {
+    /// Returns the row of the publication (Table I), and the space saved there in percent.
+    pub fn published_saving(self) -> (&'static str, f64) {
         match self {
             Self::Video => ("video, libav", 75.4),
             Self::Pictures => ("image, deflate", 96.1),
@@ -69,21 +70,21 @@ impl Kind {
     }
 }
 
-/// What `codec` is in `stub.toml`.
+/// Values of `codec` in `stub.toml`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Setting {
-    /// Nothing is encoded: the base of what others save.
+    /// No encoding: the reference for the savings of the others.
     None,
-    /// Without loss.
+    /// Lossless.
     Auto,
-    /// JPEG of the usual quality, 80.
+    /// JPEG with the default quality, 80.
     Jpeg,
     /// H.264, in programs that are built with it.
     Video,
 }
 
 impl Setting {
-    /// As `stub.toml` has it.
+    /// Name in `stub.toml`.
     pub fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -98,18 +99,18 @@ impl Setting {
     }
 }
 
-/// How many messages are sent.
+/// Number of messages to send.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct Length {
-    /// By then the link knows how fast it is, and has chosen.
+struct StreamLength {
+    /// Messages after which the link has measured its rate and chosen a codec.
     settle: usize,
     counted: usize,
 }
 
-impl Length {
-    fn of(kind: Kind, setting: Setting, quick: bool) -> Self {
+impl StreamLength {
+    fn for_stream(kind: Kind, setting: Setting, quick: bool) -> Self {
         let settle = match setting {
-            // There is nothing to choose.
+            // There is no codec to choose.
             Setting::None => 3,
             _ if kind == Kind::LargeMap => 12,
             _ => 24,
@@ -122,67 +123,67 @@ impl Length {
         Self { settle, counted }
     }
 
-    fn all(self) -> usize {
+    fn total(self) -> usize {
         self.settle + self.counted
     }
 }
 
-/// One stream.
+/// Parameters of one stream.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct What {
+pub struct StreamSpec {
     kind: Kind,
     setting: Setting,
-    network: Network,
-    length: Length,
+    network: NetworkProfile,
+    length: StreamLength,
 }
 
-/// What one stream took.
+/// Measurements of one stream.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Sent {
+pub struct StreamResult {
     /// Seconds from publishing a message to its receipt.
     responses: Vec<f64>,
     /// Messages without a receipt.
     lost: usize,
-    /// Bytes of packets on the cable for each message, to the servant and back.
+    /// Bytes of packets on the cable per message, to the servant and back.
     carried: Option<[f64; 2]>,
-    /// Those to the servant, message by message.
+    /// Bytes to the servant, message by message.
     each: Vec<u64>,
-    /// What the stub had to say of the codec.
+    /// Warning of the stub about the codec.
     warning: Option<String>,
 }
 
-/// All that was measured.
-pub struct Runs {
-    streams: Vec<(What, Measured<Sent>)>,
-    received: Vec<(What, Measured<Received>)>,
-    alone: Vec<(Kind, Measured<Alone>)>,
+/// Results of all streams.
+pub struct CodecRuns {
+    streams: Vec<(StreamSpec, CachedResult<StreamResult>)>,
+    received: Vec<(StreamSpec, CachedResult<ReceivedPictures>)>,
+    alone: Vec<(Kind, CachedResult<OfflineResult>)>,
     quick: bool,
 }
 
-/// Measures all; a quick evaluation sends a video over the LAN, as it is and as JPEG.
-pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Runs> {
-    let sources = Sources { cells, workshop };
-    let mut runs = Runs {
+/// Measures all streams; a quick evaluation sends a video over the LAN, without a codec and as JPEG.
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<CodecRuns> {
+    let sources = StreamSources { cells, workshop };
+    let mut runs = CodecRuns {
         streams: Vec::new(),
         received: Vec::new(),
         alone: Vec::new(),
         quick,
     };
-    for what in wanted(quick) {
-        // What is not built into the programs is missing on every network.
-        let lacks = |(other, sent): &(What, Measured<Sent>)| {
-            other.setting == what.setting && sent.done().is_some_and(|sent| sent.warning.is_some())
+    for what in streams_to_measure(quick) {
+        // A codec that is not built into the programs is missing on every network.
+        let lacks = |(other, sent): &(StreamSpec, CachedResult<StreamResult>)| {
+            other.setting == what.setting && sent.value().is_some_and(|sent| sent.warning.is_some())
         };
         if runs.streams.iter().any(lacks) {
             continue;
         }
-        let Length { settle, counted } = what.length;
-        let name = format!("codecs {}", title(&what));
+        let StreamLength { settle, counted } = what.length;
+        let name = format!("codecs {}", stream_title(&what));
         let sent = cells.measure(&name, &(&what, CLASS), || {
             let directory = workshop.directory()?;
-            let plan = plan(&sources, &what, directory.path())?;
-            let place = Place::new(&workshop.daemon.address, CLASS, what.network)?;
-            let (trace, _) = place.runs(&plan, directory.path())?;
+            let plan = robot_plan(&sources, &what, directory.path())?;
+            let place = RobotSandbox::new(&workshop.daemon.address, CLASS, what.network)?;
+            let (trace, _) = place.run(&plan, directory.path())?;
             ensure!(
                 trace.requests.len() == settle + counted,
                 "only {} of {} messages were sent: {}",
@@ -190,13 +191,13 @@ pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Runs> 
                 settle + counted,
                 trace.node_ended.as_deref().unwrap_or("nobody knows why")
             );
-            Ok(sent(&trace, settle))
+            Ok(stream_result(&trace, settle))
         })?;
-        // Without the codec nothing is to be seen of it.
-        let lacks = sent.done().is_some_and(|sent| sent.warning.is_some());
+        // Without the codec there is no distortion to measure.
+        let lacks = sent.value().is_some_and(|sent| sent.warning.is_some());
         runs.streams.push((what, sent));
-        if what.setting.is_lossy() && what.network == Network::Lan && !lacks {
-            let name = format!("codecs received {}", title(&what));
+        if what.setting.is_lossy() && what.network == NetworkProfile::Lan && !lacks {
+            let name = format!("codecs received {}", stream_title(&what));
             let received = cells.measure(&name, &(&what, CLASS), || {
                 received::measure(&sources, &what)
             })?;
@@ -206,14 +207,14 @@ pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Runs> 
     for kind in [Kind::Video, Kind::Pictures, Kind::Map, Kind::LargeMap] {
         if runs.streams.iter().any(|(what, _)| what.kind == kind) {
             let name = format!("codecs alone {}", kind.name());
-            let alone = cells.measure(&name, &kind, || sources.alone(kind))?;
+            let alone = cells.measure(&name, &kind, || sources.encode_offline(kind))?;
             runs.alone.push((kind, alone));
         }
     }
     Ok(runs)
 }
 
-fn title(what: &What) -> String {
+fn stream_title(what: &StreamSpec) -> String {
     format!(
         "{} {} {}",
         what.kind.name(),
@@ -222,18 +223,18 @@ fn title(what: &What) -> String {
     )
 }
 
-/// In the order of the published table.
-fn wanted(quick: bool) -> Vec<What> {
-    use {Kind::*, Network::*};
-    let networks: &[Network] = if quick { &[Lan] } else { &[Lan, Wan, Wifi] };
+/// Streams in the order of the published table.
+fn streams_to_measure(quick: bool) -> Vec<StreamSpec> {
+    use {Kind::*, NetworkProfile::*};
+    let networks: &[NetworkProfile] = if quick { &[Lan] } else { &[Lan, Wan, Wifi] };
     let mut wanted = Vec::new();
-    let mut add = |kind: Kind, settings: &[Setting], networks: &[Network]| {
+    let mut add = |kind: Kind, settings: &[Setting], networks: &[NetworkProfile]| {
         for network in networks {
-            wanted.extend(settings.iter().map(|setting| What {
+            wanted.extend(settings.iter().map(|setting| StreamSpec {
                 kind,
                 setting: *setting,
                 network: *network,
-                length: Length::of(kind, *setting, quick),
+                length: StreamLength::for_stream(kind, *setting, quick),
             }));
         }
     };
@@ -249,10 +250,14 @@ fn wanted(quick: bool) -> Vec<What> {
     wanted
 }
 
-/// What the robot does.
-fn plan(sources: &Sources, what: &What, directory: &std::path::Path) -> Result<Plan> {
+/// Returns the robot's plan for a stream.
+fn robot_plan(
+    sources: &StreamSources,
+    what: &StreamSpec,
+    directory: &std::path::Path,
+) -> Result<RobotPlan> {
     let workshop = sources.workshop;
-    publishes(workshop)?;
+    publish_receipts(workshop)?;
     let (topic, answer) = (what.kind.topic(), format!("/{PACKAGE}/receipt"));
     let mut settings = format!(
         "service = \"{PACKAGE}\"\nlocal = \"none\"\ncodec = \"{}\"\nrequest = \"{topic} -> {answer}\"",
@@ -261,9 +266,9 @@ fn plan(sources: &Sources, what: &What, directory: &std::path::Path) -> Result<P
     if what.setting.is_lossy() {
         settings += &format!("\ndesire = {:?}\nmax = {:?}", HURRY.0, HURRY.1);
     }
-    let base = workshop.plan(&DETECTOR, Where::Outsourced, directory)?;
-    Ok(Plan {
-        node: Node::Stub {
+    let base = workshop.plan(&DETECTOR, ExecutionSite::Outsourced, directory)?;
+    Ok(RobotPlan {
+        node: NodeUnderTest::Stub {
             package: PACKAGE.to_owned(),
             executable: EXECUTABLE.to_owned(),
             argv: vec![format!("__name:={PACKAGE}")],
@@ -274,40 +279,40 @@ fn plan(sources: &Sources, what: &What, directory: &std::path::Path) -> Result<P
         request: topic.to_owned(),
         answer,
         timing: None,
-        most: what.length.all(),
+        most: what.length.total(),
         patience: 240.0,
         ..base
     })
 }
 
-/// Publishes the node that answers, unless that was done before or has failed before.
-fn publishes(workshop: &Workshop) -> Result<()> {
-    let services = workshop.daemon.deployer().asks(&["services"])?;
+/// Publishes the node that sends receipts, unless it has been published, or has failed, before.
+fn publish_receipts(workshop: &EvalFixtures) -> Result<()> {
+    let services = workshop.daemon.deployer().run_json(&["services"])?;
     let known = services
         .as_array()
         .is_some_and(|all| all.iter().any(|service| service["name"] == PACKAGE));
     if known {
         return Ok(());
     }
-    attempts::once(PACKAGE, || {
+    attempts::try_once(PACKAGE, || {
         eprintln!("pushing {PACKAGE}");
         let with = ["--node", EXECUTABLE, "--cpus", "1", "--memory", "1G"];
-        let pushed = workshop.daemon.deployer().pushes(PACKAGE, &with);
+        let pushed = workshop.daemon.deployer().push(PACKAGE, &with);
         pushed?
-            .succeeded()
+            .expect_success()
             .context("pushing the node that answers")?;
         Ok(())
     })
 }
 
-fn sent(trace: &Trace, settle: usize) -> Sent {
+fn stream_result(trace: &Trace, settle: usize) -> StreamResult {
     let counted = trace.requests.get(settle..).unwrap_or_default();
-    Sent {
+    StreamResult {
         responses: counted.iter().filter_map(|one| one.response).collect(),
         lost: counted.iter().filter(|one| one.response.is_none()).count(),
-        carried: trace.carried_each(settle),
-        each: each(&trace.requests, settle),
-        // Without the time and the place in the program that the log puts before it.
+        carried: trace.bytes_per_request(settle),
+        each: bytes_per_message(&trace.requests, settle),
+        // Without the timestamp and the target that the log puts before the message.
         warning: trace.warnings.iter().find_map(|line| {
             let words = line.find("codec = ").map(|begin| &line[begin..]);
             words.map(str::to_owned)
@@ -315,9 +320,10 @@ fn sent(trace: &Trace, settle: usize) -> Sent {
     }
 }
 
-/// Bytes to the servant of each message after the first ones, where its answer and that of the one before came.
-fn each(requests: &[Request], settle: usize) -> Vec<u64> {
-    let sent = |request: &Request| request.carried.map(|carried| carried[0]);
+/// Bytes to the servant of each message after the first `settle` ones, for which its answer and the previous one
+/// arrived.
+fn bytes_per_message(requests: &[RequestSample], settle: usize) -> Vec<u64> {
+    let sent = |request: &RequestSample| request.carried.map(|carried| carried[0]);
     let pairs = requests.windows(2).skip(settle.saturating_sub(1));
     let between = pairs.filter_map(|pair| sent(&pair[1])?.checked_sub(sent(&pair[0])?));
     between.collect()
@@ -329,10 +335,10 @@ mod tests {
 
     #[test]
     fn bytes_are_counted_from_answer_to_answer() {
-        let one = |carried: Option<[u64; 2]>| Request {
+        let one = |carried: Option<[u64; 2]>| RequestSample {
             carried,
             response: carried.map(|_| 0.1),
-            ..Request::default()
+            ..RequestSample::default()
         };
         let requests = [
             one(Some([900, 90])),
@@ -341,22 +347,22 @@ mod tests {
             one(None),
             one(Some([1900, 130])),
         ];
-        assert_eq!(each(&requests, 2), [300]);
-        let trace = |requests: &[Request]| Trace {
+        assert_eq!(bytes_per_message(&requests, 2), [300]);
+        let trace = |requests: &[RequestSample]| Trace {
             requests: requests.to_vec(),
             ..Trace::default()
         };
-        assert_eq!(trace(&requests).carried_each(2), Some([300.0, 10.0]));
-        assert_eq!(trace(&requests).carried_each(0), None);
-        assert_eq!(trace(&requests[..2]).carried_each(2), None);
-        let sent = sent(&trace(&requests), 2);
+        assert_eq!(trace(&requests).bytes_per_request(2), Some([300.0, 10.0]));
+        assert_eq!(trace(&requests).bytes_per_request(0), None);
+        assert_eq!(trace(&requests[..2]).bytes_per_request(2), None);
+        let sent = stream_result(&trace(&requests), 2);
         assert_eq!((sent.lost, sent.responses.len()), (1, 2));
     }
 
     #[test]
     fn every_stream_has_a_base() {
         for quick in [true, false] {
-            let all = wanted(quick);
+            let all = streams_to_measure(quick);
             for what in &all {
                 let base = all.iter().any(|base| {
                     base.setting == Setting::None

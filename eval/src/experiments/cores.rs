@@ -1,5 +1,5 @@
-//! A part of experiment 2: packages in the cloud with several limits of cores, a model of their response times that is fitted to some of these,
-//! its error at the others, and what it says of clouds with more cores than this machine has.
+//! Part of experiment 2: packages in the cloud with several limits of cores, a model of their response times that is
+//! fitted to some of them, its error at the others, and its predictions for clouds with more cores than this machine.
 
 mod drawn;
 mod model;
@@ -8,30 +8,30 @@ mod told;
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{Cells, Measured};
-use crate::examples::{DETECTOR, Example, LASER_SLAM, Where, Workshop};
-use crate::place::{Class, Cost, Network, Place};
-use crate::robot::Node;
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{DETECTOR, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::robot::NodeUnderTest;
 use crate::trace::Trace;
 
-use model::{Model, Parts, parts};
+use model::{Model, ResponseParts, mean_parts};
 pub use told::section;
 
-/// Where the servant's robot is.
-const NETWORK: Network = Network::Lan;
+/// Network between robot and servant.
+const NETWORK: NetworkProfile = NetworkProfile::Lan;
 
-/// One program, with the limits that it is measured at.
+/// A program, and the limits at which it is measured.
 #[derive(Debug, Clone, Copy)]
 pub struct Subject {
-    example: Example,
-    /// What it is called here.
+    example: EvalPackage,
+    /// Name in the report.
     name: &'static str,
-    /// Arguments of its node beside the example's own.
+    /// Arguments of its node in addition to the example's own.
     arguments: &'static [&'static str],
-    /// Threads that it computes with.
+    /// Number of threads of its computation.
     threads: usize,
     fitted: &'static [f64],
-    /// Some between those, and one beyond the greatest of them: what is predicted lies beyond, too.
+    /// Some limits between the fitted ones, and one above them, because the predictions lie above them as well.
     held_back: &'static [f64],
     requests: usize,
 }
@@ -66,7 +66,7 @@ const SUBJECTS: [Subject; 3] = [
     },
 ];
 
-/// What a quick evaluation measures.
+/// Program of a quick evaluation.
 const QUICK: Subject = Subject {
     fitted: &[0.25, 0.5, 1.0],
     held_back: &[0.75],
@@ -76,24 +76,28 @@ const QUICK: Subject = Subject {
 
 /// One run in the cloud.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Reading {
-    /// Cores of the servant, as the kernel has them.
+pub struct CoreLimitRun {
+    /// Cores of the servant that the kernel enforces.
     enforced: f64,
     trace: Trace,
-    cost: Cost,
+    cost: RunCost,
 }
 
 /// All runs of one program.
-pub struct Study {
+pub struct ProgramStudy {
     subject: Subject,
-    /// On the robot itself, which is of the class Pi.
-    native: Measured<Trace>,
-    /// By the limit that was asked for.
-    runs: Vec<(f64, Measured<Reading>)>,
+    /// Run on the robot itself, a Raspberry Pi in this evaluation.
+    native: CachedResult<Trace>,
+    /// Runs in the cloud, by the requested limit.
+    runs: Vec<(f64, CachedResult<CoreLimitRun>)>,
 }
 
-/// Measures all programs; of a quick evaluation, one at few limits.
-pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Vec<Study>> {
+/// Measures all programs; a quick evaluation measures one at few limits.
+pub fn measure(
+    cells: &RunCache,
+    workshop: &EvalFixtures,
+    quick: bool,
+) -> Result<Vec<ProgramStudy>> {
     let subjects = if quick {
         vec![QUICK]
     } else {
@@ -101,14 +105,18 @@ pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Vec<St
     };
     subjects
         .into_iter()
-        .map(|subject| study(cells, workshop, subject))
+        .map(|subject| measure_study(cells, workshop, subject))
         .collect()
 }
 
-fn study(cells: &Cells, workshop: &Workshop, subject: Subject) -> Result<Study> {
+fn measure_study(
+    cells: &RunCache,
+    workshop: &EvalFixtures,
+    subject: Subject,
+) -> Result<ProgramStudy> {
     let name = format!("cores {}", subject.name);
     let native = cells.measure(&format!("{name} native"), &subject.requests, || {
-        native(workshop, &subject)
+        measure_native(workshop, &subject)
     })?;
     let mut limits = [subject.fitted, subject.held_back].concat();
     limits.sort_by(f64::total_cmp);
@@ -116,75 +124,84 @@ fn study(cells: &Cells, workshop: &Workshop, subject: Subject) -> Result<Study> 
     for cores in limits {
         let of = (cores, subject.requests, subject.arguments);
         let measured = cells.measure(&format!("{name} {cores}"), &of, || {
-            outsourced(workshop, &subject, cores)
+            measure_outsourced(workshop, &subject, cores)
         })?;
         runs.push((cores, measured));
     }
-    Ok(Study {
+    Ok(ProgramStudy {
         subject,
         native,
         runs,
     })
 }
 
-fn native(workshop: &Workshop, subject: &Subject) -> Result<Trace> {
-    workshop.publishes(&subject.example)?;
+fn measure_native(workshop: &EvalFixtures, subject: &Subject) -> Result<Trace> {
+    workshop.publish(&subject.example)?;
     let directory = workshop.directory()?;
-    let mut plan = workshop.plan(&subject.example, Where::Native, directory.path())?;
+    let mut plan = workshop.plan(&subject.example, ExecutionSite::Native, directory.path())?;
     plan.most = subject.requests;
-    let place = Place::new(&workshop.daemon.address, Class::PI, NETWORK)?;
-    Ok(place.runs(&plan, directory.path())?.0)
+    let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NETWORK)?;
+    Ok(place.run(&plan, directory.path())?.0)
 }
 
-/// The robot's stub states the servant's cores; what the kernel made of it is read from the daemon, whose servant waits for the robot a while.
-fn outsourced(workshop: &Workshop, subject: &Subject, cores: f64) -> Result<Reading> {
-    workshop.publishes(&subject.example)?;
+/// Measures in the cloud. The robot's stub states the servant's cores; the enforced limit is read from the daemon while
+/// the servant is kept for the robot.
+fn measure_outsourced(
+    workshop: &EvalFixtures,
+    subject: &Subject,
+    cores: f64,
+) -> Result<CoreLimitRun> {
+    workshop.publish(&subject.example)?;
     let directory = workshop.directory()?;
-    let mut plan = workshop.plan(&subject.example, Where::Outsourced, directory.path())?;
+    let mut plan = workshop.plan(
+        &subject.example,
+        ExecutionSite::Outsourced,
+        directory.path(),
+    )?;
     plan.most = subject.requests;
     let robot = format!("cores-{}-{cores}-{}", subject.threads, std::process::id());
-    let Node::Stub { argv, settings, .. } = &mut plan.node else {
+    let NodeUnderTest::Stub { argv, settings, .. } = &mut plan.node else {
         bail!("a robot that asks the cloud has a stub");
     };
     argv.extend(subject.arguments.iter().map(|word| (*word).to_owned()));
     settings.push_str(&format!("\nrobot = \"{robot}\"\ncpus = {cores:?}"));
-    let place = Place::new(&workshop.daemon.address, Class::PI, NETWORK)?;
-    let (trace, cost) = place.runs(&plan, directory.path())?;
+    let place = RobotSandbox::new(&workshop.daemon.address, RobotHardware::PI, NETWORK)?;
+    let (trace, cost) = place.run(&plan, directory.path())?;
     let servant = workshop.daemon.servant_of(subject.example.name, &robot)?;
     let enforced = servant["enforced"]["cpus"].as_f64();
     let enforced = enforced.context("the servant's cores are not limited")?;
     let id = servant["id"].as_str().context("a servant's id")?;
-    // Its cores are promised until it ends.
+    // The servant's cores stay promised until it ends.
     workshop
         .daemon
         .deployer()
-        .types(&["stop", id])?
-        .succeeded()?;
+        .run(&["stop", id])?
+        .expect_success()?;
     ensure!(
         (enforced - cores).abs() < 0.01,
         "the servant was to have {cores} cores and had {enforced}"
     );
-    ensure!(trace.answered() > 0, "no request was answered");
-    Ok(Reading {
+    ensure!(trace.answered_count() > 0, "no request was answered");
+    Ok(CoreLimitRun {
         enforced,
         trace,
         cost,
     })
 }
 
-/// What a limit is for.
+/// Use of a limit in the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Use {
+enum LimitUse {
     /// The model is fitted to it.
     Fitted,
-    /// The model has not seen it, but smaller ones and greater ones.
+    /// Not used for fitting, but between limits that were.
     Inside,
-    /// The model has seen only smaller ones.
+    /// Not used for fitting, and above all limits that were.
     Beyond,
 }
 
-impl Use {
-    /// As tables name it.
+impl LimitUse {
+    /// Name in tables.
     fn name(self) -> &'static str {
         match self {
             Self::Fitted => "fitting",
@@ -195,43 +212,44 @@ impl Use {
 }
 
 impl Subject {
-    fn uses(&self, cores: f64) -> Use {
+    fn use_of_limit(&self, cores: f64) -> LimitUse {
         if self.fitted.contains(&cores) {
-            Use::Fitted
+            LimitUse::Fitted
         } else if self.fitted.iter().all(|fitted| *fitted < cores) {
-            Use::Beyond
+            LimitUse::Beyond
         } else {
-            Use::Inside
+            LimitUse::Inside
         }
     }
 }
 
-/// What one program's runs come to.
-struct Found<'a> {
-    study: &'a Study,
-    /// Cores, parts, what they are for.
-    points: Vec<(f64, Parts, Use)>,
+/// Model and measurements of one program.
+struct ProgramFit<'a> {
+    study: &'a ProgramStudy,
+    /// Cores, parts of the response time, and use in the model.
+    points: Vec<(f64, ResponseParts, LimitUse)>,
     model: Option<Model>,
-    /// Mean response time on the robot itself, seconds.
+    /// Mean response time on the robot itself, in seconds.
     native: Option<f64>,
 }
 
-impl<'a> Found<'a> {
-    fn of(study: &'a Study) -> Self {
+impl<'a> ProgramFit<'a> {
+    fn from_study(study: &'a ProgramStudy) -> Self {
         let mut points = Vec::new();
         for (cores, measured) in &study.runs {
-            let parts = measured.done().and_then(|run| parts(&run.trace));
-            let of = study.subject.uses(*cores);
+            let parts = measured.value().and_then(|run| mean_parts(&run.trace));
+            let of = study.subject.use_of_limit(*cores);
             points.extend(parts.map(|parts| (*cores, parts, of)));
         }
-        let fitted = points.iter().filter(|point| point.2 == Use::Fitted);
-        let fitted: Vec<(f64, Parts)> = fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
-        let native = study.native.done().and_then(parts);
+        let fitted = points.iter().filter(|point| point.2 == LimitUse::Fitted);
+        let fitted: Vec<(f64, ResponseParts)> =
+            fitted.map(|(cores, parts, _)| (*cores, *parts)).collect();
+        let native = study.native.value().and_then(mean_parts);
         Self {
             study,
             points,
             model: Model::fit(&fitted, study.subject.threads),
-            native: native.map(total),
+            native: native.map(total_time),
         }
     }
 
@@ -239,16 +257,16 @@ impl<'a> Found<'a> {
         self.study.subject.name
     }
 
-    /// (predicted, measured) at the points that are for this, by this prediction of the model.
-    fn pairs(&self, of: Use, predict: fn(&Model, f64) -> f64) -> Vec<(f64, f64)> {
+    /// Returns (predicted, measured) at the points with this use, for one of the model's predictions.
+    fn pairs(&self, of: LimitUse, predict: fn(&Model, f64) -> f64) -> Vec<(f64, f64)> {
         let those = self.points.iter().filter(|point| point.2 == of);
-        let pair = |(cores, parts, _): &(f64, Parts, Use)| {
-            Some((predict(&self.model?, *cores), total(*parts)))
+        let pair = |(cores, parts, _): &(f64, ResponseParts, LimitUse)| {
+            Some((predict(&self.model?, *cores), total_time(*parts)))
         };
         those.filter_map(pair).collect()
     }
 }
 
-fn total(parts: Parts) -> f64 {
+fn total_time(parts: ResponseParts) -> f64 {
     parts.iter().sum()
 }

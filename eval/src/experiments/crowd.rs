@@ -1,5 +1,5 @@
-//! Robots of this process, and the services that they ask: what experiments 9 and 10 share. A service computes for a known time of a
-//! core at each call; each robot is a WebSocket connection of its own, with a servant of its own, as any robot's.
+//! Robots in this process and the services that they call, shared by experiments 9 and 10. A service computes for a
+//! known core time per call; each robot is a WebSocket connection with a servant of its own, as any robot.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -8,55 +8,55 @@ use anyhow::{Context, Result, ensure};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use support::binaries;
-use support::daemon::{Daemon, Setup};
+use support::daemon::{Daemon, DaemonSetup};
 use support::robot::Robot;
 
 use crate::attempts;
 
-/// Below the checkout.
+/// Directory below the checkout.
 const PACKAGE: &str = "eval/packages/worker_cpp";
-/// Of its node.
+/// Executable of its node.
 const EXECUTABLE: &str = "worker";
-/// What both daemons have: servants that start beside others that work may take longer than by default.
+/// Configuration of all daemons: a servant that starts next to busy ones may take longer than by default.
 const CONFIG: &str = "[servant]\nstart = \"2m\"\n";
 
-/// A service of a node that computes for so long at each call of `/work`, on one core.
+/// A service whose node computes on one core for a fixed time at each call of `/work`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Service {
-    /// Its name.
+pub struct WorkerService {
+    /// Name of the service.
     pub name: &'static str,
-    /// Of a core, for each call.
+    /// Core time per call, in milliseconds.
     pub milliseconds: u32,
 }
 
-/// Calls are short.
-pub const SHORT: Service = Service {
+/// A service with short calls.
+pub const SHORT: WorkerService = WorkerService {
     name: "short_work",
     milliseconds: 8,
 };
-/// Calls are as long as those of a detector.
-pub const LONG: Service = Service {
+/// A service whose calls are as long as a detector's.
+pub const LONG: WorkerService = WorkerService {
     name: "long_work",
     milliseconds: 50,
 };
-/// One call lasts longer than any measurement: whoever makes it takes a core for as long as it can get one.
-pub const ENDLESS: Service = Service {
+/// A service whose call lasts longer than any measurement: its robot uses all the core time that it can get.
+pub const ENDLESS: WorkerService = WorkerService {
     name: "endless_work",
     milliseconds: 3_600_000,
 };
 
-/// Whether cores are moved to robots that stated what they accept.
+/// True if cores are moved to robots that stated which response time they accept.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Controller {
-    /// As the daemon does by default.
+    /// The daemon's default.
     On,
-    /// Limits stay as they were asked for.
+    /// Limits stay as requested.
     Off,
 }
 
 impl Controller {
-    /// As tables name it.
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::On => "on",
@@ -65,37 +65,41 @@ impl Controller {
     }
 }
 
-/// A daemon for crowds, started when it is first needed: what is published stays when it is started with another configuration.
-pub struct Yard {
-    setup: Setup,
+/// A daemon for many robots, started on first use; its services remain published when it is restarted with another
+/// configuration.
+pub struct CrowdDaemon {
+    setup: DaemonSetup,
     open: Option<(Controller, Daemon)>,
 }
 
-impl Yard {
-    /// With its state below `place`.
+impl CrowdDaemon {
+    /// Keeps its state below `place`.
     pub fn new(place: &Path) -> Self {
         Self {
-            setup: Setup::new(&place.join("yard")).config(CONFIG),
+            setup: DaemonSetup::new(&place.join("yard")).config(CONFIG),
             open: None,
         }
     }
 
-    /// The daemon with this configuration, where nobody is served.
-    pub fn cleared(&mut self, controller: Controller) -> Result<&Daemon> {
+    /// Returns the daemon with this configuration and without servants.
+    pub fn without_servants(&mut self, controller: Controller) -> Result<&Daemon> {
         let daemon = self.open(controller)?;
         let nobody = |all: &Value| all.as_array().is_some_and(Vec::is_empty).then_some(());
         if nobody(&daemon.api("/api/v1/servants")?).is_none() {
-            daemon.deployer().types(&["stop", "--all"])?.succeeded()?;
-            daemon.awaits("/api/v1/servants", "the end of all servants", nobody)?;
+            daemon
+                .deployer()
+                .run(&["stop", "--all"])?
+                .expect_success()?;
+            daemon.wait_for("/api/v1/servants", "the end of all servants", nobody)?;
         }
         Ok(daemon)
     }
 
-    /// The daemon with this configuration, with whoever is served there.
+    /// Returns the daemon with this configuration, with the servants it has.
     pub fn open(&mut self, controller: Controller) -> Result<&Daemon> {
         if self.open.as_ref().is_none_or(|open| open.0 != controller) {
             if let Some((_, before)) = self.open.take() {
-                before.ends()?;
+                before.stop()?;
             }
             let lines = format!("[capacity]\ncontroller = \"{}\"\n", controller.name());
             let daemon = self.setup.clone().config(&lines).start()?;
@@ -106,17 +110,17 @@ impl Yard {
     }
 }
 
-/// Publishes a service, unless that was done before or has failed before.
-pub fn publishes(daemon: &Daemon, service: Service) -> Result<()> {
-    let services = daemon.deployer().asks(&["services"])?;
+/// Publishes a service, unless it has been published, or has failed, before.
+pub fn publish(daemon: &Daemon, service: WorkerService) -> Result<()> {
+    let services = daemon.deployer().run_json(&["services"])?;
     let known = |all: &Vec<Value>| all.iter().any(|one| one["name"] == service.name);
     if services.as_array().is_some_and(known) {
         return Ok(());
     }
-    attempts::once(service.name, || pushes(daemon, service))
+    attempts::try_once(service.name, || push(daemon, service))
 }
 
-fn pushes(daemon: &Daemon, service: Service) -> Result<()> {
+fn push(daemon: &Daemon, service: WorkerService) -> Result<()> {
     let package = binaries::checkout().join(PACKAGE);
     let package = package.to_str().context("a path of UTF-8")?;
     let milliseconds = format!("milliseconds={}", service.milliseconds);
@@ -129,33 +133,34 @@ fn pushes(daemon: &Daemon, service: Service) -> Result<()> {
         EXECUTABLE,
     ];
     let push = [&push[..], &["--param", &milliseconds]].concat();
-    daemon.deployer().types(&push)?.succeeded()?;
+    daemon.deployer().run(&push)?.expect_success()?;
     Ok(())
 }
 
-/// A robot that has a servant. `states` is the rest of its query, such as `&cpus=0.5`.
-pub fn joins(daemon: &Daemon, service: Service, name: &str, states: &str) -> Result<Robot> {
+/// Connects a robot and waits for its servant. `states` is appended to its query, such as `&cpus=0.5`.
+pub fn join(daemon: &Daemon, service: WorkerService, name: &str, states: &str) -> Result<Robot> {
     let mut robot = daemon.robot(&format!("{}?robot={name}{states}", service.name))?;
-    robot.calls("/rosapi/get_time", json!({}))?;
+    robot.call("/rosapi/get_time", json!({}))?;
     Ok(robot)
 }
 
-/// One call: the seconds until its answer.
-pub fn call(robot: &mut Robot) -> Result<f64> {
+/// Makes one call; returns its duration in seconds.
+pub fn time_call(robot: &mut Robot) -> Result<f64> {
     let asked = Instant::now();
-    let answer = robot.calls("/work", json!({}))?;
+    let answer = robot.call("/work", json!({}))?;
     let took = asked.elapsed().as_secs_f64();
     ensure!(answer["result"] == true, "a call failed: {answer}");
     Ok(took)
 }
 
-/// Begins a call whose answer is not waited for.
-pub fn begins(robot: &mut Robot) -> Result<()> {
-    robot.says(json!({"op": "call_service", "service": "/work", "args": {}}))
+/// Starts a call without waiting for the answer.
+pub fn begin_call(robot: &mut Robot) -> Result<()> {
+    robot.send(json!({"op": "call_service", "service": "/work", "args": {}}))
 }
 
-/// One call after the other, each after a pause, until `to`: the seconds that those took which were made after `from`.
-pub fn calls(
+/// Makes one call after the other, each after a pause, until `to`; returns the durations in seconds of those started
+/// after `from`.
+pub fn time_calls(
     robot: &mut Robot,
     (from, to): (Instant, Instant),
     mut pause: impl FnMut() -> f64,
@@ -168,15 +173,16 @@ pub fn calls(
         }
         std::thread::sleep(next.saturating_duration_since(Instant::now()));
         let asked = Instant::now();
-        let took = call(robot)?;
+        let took = time_call(robot)?;
         if asked >= from {
             times.push(took);
         }
     }
 }
 
-/// Seconds of processor time that the servants of a service used so far, and the bytes that they have now.
-pub fn usage(daemon: &Daemon, service: Service) -> Result<(f64, f64)> {
+/// Returns the processor time in seconds that the servants of a service have used so far, and their current memory in
+/// bytes.
+pub fn usage(daemon: &Daemon, service: WorkerService) -> Result<(f64, f64)> {
     let mut sum = (0.0, 0.0);
     for servant in daemon.servants_of(service.name)? {
         let number = |key: &str| servant["usage"][key].as_f64();
@@ -186,7 +192,7 @@ pub fn usage(daemon: &Daemon, service: Service) -> Result<(f64, f64)> {
     Ok(sum)
 }
 
-/// Cores of this machine.
+/// Number of cores of this machine.
 pub fn cores() -> f64 {
     std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)
 }

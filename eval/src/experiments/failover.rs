@@ -1,5 +1,5 @@
-//! Experiment 6: the detector is asked at a rate while the robot's network becomes bad and good again: through the stub with a local original
-//! that is kept ready, by the cloud alone, and by the original alone.
+//! Experiment 6: the detector gets requests at a fixed rate while the robot's network is degraded at times: through the
+//! stub with a warm local original, from the cloud alone, and from the original alone.
 
 mod told;
 
@@ -11,36 +11,36 @@ use anyhow::{Context, Result};
 use qos::Satisfaction;
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{Cells, Measured};
-use crate::examples::{DETECTOR, Where, Workshop};
-use crate::place::{Class, Cost, Network, Place};
-use crate::robot::{Node, Pace, Plan};
-use crate::trace::{Request, Trace};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{DETECTOR, EvalFixtures, ExecutionSite};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::robot::{NodeUnderTest, RequestPacing, RobotPlan};
+use crate::trace::{RequestSample, Trace};
 
 pub use told::section;
 
 /// Requests per second: half of what the detector can answer on half a core.
 const HERTZ: f64 = 2.0;
-/// T_desire and T_max, seconds.
+/// T_desire and T_max, in seconds.
 const TIMES: (f64, f64) = (0.4, 0.8);
-/// Q at the beginning, Q_t, and the cap of Q.
+/// Initial value of Q, Q_t, and the maximum of Q.
 const Q: (f64, f64, f64) = (15.0, 4.0, 16.0);
-/// The robot: on a quarter of a core the detector takes 0.4 to 0.5 s, on half of one 0.2 s.
-const CLASS: Class = Class::ULTRABOOK;
+/// The robot: on a quarter of a core the detector takes 0.4 to 0.5 s, on half a core 0.2 s.
+const CLASS: RobotHardware = RobotHardware::ULTRABOOK;
 
-/// How many requests there are, and during which the network is bad.
+/// Number of requests, and the phases in which the network is degraded.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Course {
+pub struct FaultSchedule {
     requests: usize,
-    /// First and last ones, counted from 1.
+    /// First and last request of each phase, counted from 1.
     bad: Vec<(usize, usize)>,
-    /// Seconds that answers are waited for after the last request.
+    /// Seconds to wait for answers after the last request.
     stragglers: f64,
 }
 
-impl Course {
-    /// The published one.
-    pub fn published() -> Self {
+impl FaultSchedule {
+    /// Schedule of the publication.
+    pub fn from_publication() -> Self {
         Self {
             requests: 130,
             bad: vec![(24, 45), (75, 96), (111, 122)],
@@ -48,7 +48,7 @@ impl Course {
         }
     }
 
-    /// One bad time.
+    /// Schedule with a single phase.
     pub fn quick() -> Self {
         Self {
             requests: 18,
@@ -57,18 +57,22 @@ impl Course {
         }
     }
 
-    /// Before which requests the network becomes another one.
-    fn changes(&self) -> Vec<(usize, Network)> {
-        let both =
-            |(first, last): &(usize, usize)| [(*first, Network::Bad), (last + 1, Network::Lan)];
+    /// Requests before which the network changes.
+    fn network_changes(&self) -> Vec<(usize, NetworkProfile)> {
+        let both = |(first, last): &(usize, usize)| {
+            [
+                (*first, NetworkProfile::Bad),
+                (last + 1, NetworkProfile::Lan),
+            ]
+        };
         self.bad.iter().flat_map(both).collect()
     }
 }
 
-/// Who may answer.
+/// Programs that may answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum SetUp {
-    /// The cloud, and an original on the robot that is kept ready.
+pub enum FailoverSetUp {
+    /// The cloud, and a warm original on the robot.
     Stub,
     /// The cloud.
     Cloud,
@@ -76,8 +80,8 @@ pub enum SetUp {
     Local,
 }
 
-impl SetUp {
-    /// As tables name it.
+impl FailoverSetUp {
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Stub => "stub, warm local original",
@@ -87,84 +91,101 @@ impl SetUp {
     }
 }
 
-/// One set-up, and what came out.
-pub struct Run {
-    set_up: SetUp,
-    measured: Measured<(Trace, Cost)>,
+/// One set-up and its result.
+pub struct FailoverRun {
+    set_up: FailoverSetUp,
+    measured: CachedResult<(Trace, RunCost)>,
 }
 
-/// All set-ups.
-pub struct Runs {
-    course: Course,
-    runs: Vec<Run>,
+/// Results of all set-ups.
+pub struct FailoverRuns {
+    course: FaultSchedule,
+    runs: Vec<FailoverRun>,
 }
 
-/// Measures them; a quick evaluation has one bad time, and no run of the original alone.
-pub fn measure(cells: &Cells, workshop: &Workshop, quick: bool) -> Result<Runs> {
+/// Measures all set-ups; a quick evaluation has one degraded phase and no run of the original alone.
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, quick: bool) -> Result<FailoverRuns> {
     let (course, set_ups) = if quick {
-        (Course::quick(), &[SetUp::Stub, SetUp::Cloud][..])
+        (
+            FaultSchedule::quick(),
+            &[FailoverSetUp::Stub, FailoverSetUp::Cloud][..],
+        )
     } else {
-        let all = &[SetUp::Stub, SetUp::Cloud, SetUp::Local][..];
-        (Course::published(), all)
+        let all = &[
+            FailoverSetUp::Stub,
+            FailoverSetUp::Cloud,
+            FailoverSetUp::Local,
+        ][..];
+        (FaultSchedule::from_publication(), all)
     };
     let mut runs = Vec::new();
     for set_up in set_ups {
         let name = format!("failover {}", set_up.name());
         let of = (&course, CLASS, HERTZ, TIMES);
-        let measured = cells.measure(&name, &of, || one(workshop, *set_up, &course))?;
-        runs.push(Run {
+        let measured = cells.measure(&name, &of, || run_once(workshop, *set_up, &course))?;
+        runs.push(FailoverRun {
             set_up: *set_up,
             measured,
         });
     }
-    Ok(Runs { course, runs })
+    Ok(FailoverRuns { course, runs })
 }
 
-fn one(workshop: &Workshop, set_up: SetUp, course: &Course) -> Result<(Trace, Cost)> {
-    workshop.publishes(&DETECTOR)?;
+fn run_once(
+    workshop: &EvalFixtures,
+    set_up: FailoverSetUp,
+    course: &FaultSchedule,
+) -> Result<(Trace, RunCost)> {
+    workshop.publish(&DETECTOR)?;
     let directory = workshop.directory()?;
-    let native = workshop.plan(&DETECTOR, Where::Native, directory.path())?;
+    let native = workshop.plan(&DETECTOR, ExecutionSite::Native, directory.path())?;
     let mut plan = match set_up {
-        SetUp::Local => native,
-        SetUp::Stub => stub(workshop, "warm", Some(&native), directory.path())?,
-        SetUp::Cloud => stub(workshop, "none", None, directory.path())?,
+        FailoverSetUp::Local => native,
+        FailoverSetUp::Stub => stub_plan(workshop, "warm", Some(&native), directory.path())?,
+        FailoverSetUp::Cloud => stub_plan(workshop, "none", None, directory.path())?,
     };
-    plan.pace = Pace::Rate {
+    plan.pace = RequestPacing::Rate {
         hertz: HERTZ,
         in_time: 2.0 * TIMES.1,
     };
     plan.most = course.requests;
     plan.give_up = course.stragglers;
-    plan.changes = course.changes();
+    plan.changes = course.network_changes();
     plan.patience = 300.0;
-    let place = Place::new(&workshop.daemon.address, CLASS, Network::Lan)?;
-    place.runs(&plan, directory.path())
+    let place = RobotSandbox::new(&workshop.daemon.address, CLASS, NetworkProfile::Lan)?;
+    place.run(&plan, directory.path())
 }
 
-/// The stub's plan; with the original of `native` installed on the robot.
-fn stub(workshop: &Workshop, local: &str, native: Option<&Plan>, directory: &Path) -> Result<Plan> {
-    let mut plan = workshop.plan(&DETECTOR, Where::Outsourced, directory)?;
-    if let Node::Stub {
+/// Returns the plan of the stub; the original of `native` is installed on the robot.
+fn stub_plan(
+    workshop: &EvalFixtures,
+    local: &str,
+    native: Option<&RobotPlan>,
+    directory: &Path,
+) -> Result<RobotPlan> {
+    let mut plan = workshop.plan(&DETECTOR, ExecutionSite::Outsourced, directory)?;
+    if let NodeUnderTest::Stub {
         settings,
         environment,
         ..
     } = &mut plan.node
     {
         *settings = format!(
-            "service = \"{}\"\nrequest = \"{} -> {}\"\nlocal = \"{local}\"\ndesire = {:?}\nmax = {:?}\nthreshold = {:?}\ninitial = {:?}\ncap = {:?}\nfallback_after = 300.0",
+            "service = \"{}\"\nrequest = \"{} -> {}\"\nlocal = \"{local}\"\ndesire = {:?}\nmax = {:?}\nthreshold = \
+             {:?}\ninitial = {:?}\ncap = {:?}\nfallback_after = 300.0",
             DETECTOR.name, DETECTOR.request, DETECTOR.answer, TIMES.0, TIMES.1, Q.1, Q.0, Q.2
         );
         if let Some(native) = native {
-            let workspace = installs(native, directory)?;
+            let workspace = install_original(native, directory)?;
             environment.push(("CMAKE_PREFIX_PATH".to_owned(), workspace));
         }
     }
     Ok(plan)
 }
 
-/// Makes a workspace whose program is the original in its image's file system; where it is.
-fn installs(native: &Plan, directory: &Path) -> Result<String> {
-    let Node::Native {
+/// Creates a workspace whose program runs the original in its image's file system; returns its path.
+fn install_original(native: &RobotPlan, directory: &Path) -> Result<String> {
+    let NodeUnderTest::Native {
         script,
         program,
         argv,
@@ -172,7 +193,7 @@ fn installs(native: &Plan, directory: &Path) -> Result<String> {
     else {
         anyhow::bail!("the plan of the original runs a stub");
     };
-    // What comes after the node's program is given by the stub.
+    // Arguments after the node's program come from the stub.
     let ends = argv
         .iter()
         .position(|word| word.ends_with(DETECTOR.executable));
@@ -185,7 +206,7 @@ fn installs(native: &Plan, directory: &Path) -> Result<String> {
         .join(DETECTOR.executable);
     std::fs::create_dir_all(launcher.parent().context("a directory")?)?;
     std::fs::write(workspace.join(".catkin"), "")?;
-    // Where its Master is, the stub says in variables of the environment, which `env` adds to.
+    // The stub sets the Master's address in environment variables, which `env` extends.
     let text = format!(
         "#!/bin/sh\nexport HOME=/root\nexec unshare --mount sh -c '{script}' sh {program} {} \"$@\"\n",
         quoted.join(" ")
@@ -195,11 +216,12 @@ fn installs(native: &Plan, directory: &Path) -> Result<String> {
     Ok(workspace.to_string_lossy().into_owned())
 }
 
-/// Q after each request by the algorithm of the crate `qos`, of the times of the robot's first answers, whoever gave them.
-fn satisfaction(requests: &[Request]) -> Vec<f64> {
+/// Computes Q after each request with the algorithm of the crate `qos`, from the times of the robot's first answers,
+/// whoever gave them.
+fn replay_satisfaction(requests: &[RequestSample]) -> Vec<f64> {
     let mut satisfaction = Satisfaction::new(Q.0, Q.1, Q.2);
     let [desire, max] = [TIMES.0, TIMES.1].map(Duration::from_secs_f64);
-    let mut after = |request: &Request| {
+    let mut after = |request: &RequestSample| {
         let time = request.response.map(Duration::from_secs_f64);
         satisfaction.observe(time, desire, max);
         satisfaction.q()
@@ -207,13 +229,13 @@ fn satisfaction(requests: &[Request]) -> Vec<f64> {
     requests.iter().map(&mut after).collect()
 }
 
-/// Answered after T_max, or never.
-fn is_late(request: &Request) -> bool {
+/// Returns whether a request was answered after T_max, or never.
+fn is_late(request: &RequestSample) -> bool {
     request.response.is_none_or(|response| response > TIMES.1)
 }
 
-/// Late requests from each time that the network becomes bad to the next.
-fn late(course: &Course, requests: &[Request]) -> Vec<usize> {
+/// Counts the late requests from each onset of degradation to the next.
+fn count_late(course: &FaultSchedule, requests: &[RequestSample]) -> Vec<usize> {
     let starts = course.bad.iter().map(|(first, _)| first - 1);
     let ends = starts.clone().skip(1).chain([requests.len()]);
     let during = starts.zip(ends).map(|(start, end)| {
@@ -227,38 +249,38 @@ fn late(course: &Course, requests: &[Request]) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    fn requests(responses: &[Option<f64>]) -> Vec<Request> {
-        let one = |response: &Option<f64>| Request {
+    fn test_requests(responses: &[Option<f64>]) -> Vec<RequestSample> {
+        let one = |response: &Option<f64>| RequestSample {
             response: *response,
-            ..Request::default()
+            ..RequestSample::default()
         };
         responses.iter().map(one).collect()
     }
 
     #[test]
     fn q_rises_by_two_or_one_and_is_halved() {
-        let all = requests(&[Some(0.9), Some(0.8), Some(0.4), None, Some(0.1)]);
-        assert_eq!(satisfaction(&all), [7.5, 8.5, 10.5, 5.25, 7.25]);
+        let all = test_requests(&[Some(0.9), Some(0.8), Some(0.4), None, Some(0.1)]);
+        assert_eq!(replay_satisfaction(&all), [7.5, 8.5, 10.5, 5.25, 7.25]);
     }
 
     #[test]
     fn late_requests_are_counted_from_onset_to_onset() {
-        let course = Course {
+        let course = FaultSchedule {
             requests: 6,
             bad: vec![(2, 3), (5, 5)],
             stragglers: 1.0,
         };
-        let all = requests(&[None, Some(0.9), Some(0.1), None, Some(0.1), Some(2.0)]);
-        assert_eq!(late(&course, &all), [2, 1]);
+        let all = test_requests(&[None, Some(0.9), Some(0.1), None, Some(0.1), Some(2.0)]);
+        assert_eq!(count_late(&course, &all), [2, 1]);
     }
 
     #[test]
     fn the_network_is_good_again_after_the_last_bad_request() {
         assert_eq!(
-            Course::quick().changes(),
-            [(5, Network::Bad), (13, Network::Lan)]
+            FaultSchedule::quick().network_changes(),
+            [(5, NetworkProfile::Bad), (13, NetworkProfile::Lan)]
         );
-        assert_eq!(Course::published().changes().len(), 6);
+        assert_eq!(FaultSchedule::from_publication().network_changes().len(), 6);
     }
 
     #[test]
@@ -269,7 +291,7 @@ mod tests {
             "/opt/lib/object_detector/object_detector_node",
             "__name:=x",
         ];
-        let node = Node::Native {
+        let node = NodeUnderTest::Native {
             script: "exec chroot /root \"$@\"".to_owned(),
             program: "/usr/bin/env".to_owned(),
             argv: words.map(str::to_owned).to_vec(),
@@ -281,12 +303,13 @@ mod tests {
         assert!(!workspace.contains("__name"), "{workspace}");
     }
 
-    fn launcher(node: Node, directory: &Path) -> Result<String> {
+    fn launcher(node: NodeUnderTest, directory: &Path) -> Result<String> {
         let plan = serde_json::json!({
-            "server": "", "node": node, "recording": "", "request": "", "left_out": [], "answer": "", "tells_pose": false,
+            "server": "", "node": node, "recording": "", "request": "", "left_out": [], "answer": "",
+                "tells_pose": false,
             "timing": null, "map": null, "pace": "one_by_one", "every": 1, "most": 1, "give_up": 1.0, "patience": 1.0,
         });
-        let workspace = installs(&serde_json::from_value(plan)?, directory)?;
+        let workspace = install_original(&serde_json::from_value(plan)?, directory)?;
         let path = Path::new(&workspace).join("lib/object_detector/object_detector_node");
         Ok(std::fs::read_to_string(path)?)
     }

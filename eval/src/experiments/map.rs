@@ -1,47 +1,49 @@
-//! Experiment 7: a drive is played at its own rate to a small robot, and at a third of it as in the publication: the maps, how far they are
-//! from a reference, and how many scans were worked at. A simulated drive beside it has a true path.
+//! Experiment 7: a drive is played to a small robot at its own rate and, as in the publication, at a third of it: the
+//! maps, their errors against a reference, and the number of processed scans. A simulated drive adds a true path.
 
 mod picture;
 
 use anyhow::{Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{Cells, Measured};
-use crate::examples::{Example, Input, LASER_SLAM, LASER_SLAM_SIMULATED, Where, Workshop};
-use crate::place::{Class, Cost, Network, Place};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{
+    EvalFixtures, EvalPackage, ExecutionSite, InputRecording, LASER_SLAM, LASER_SLAM_SIMULATED,
+};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
 use crate::plots::{self, Series};
 use crate::recording::Recording;
-use crate::robot::Pace;
-use crate::section::{Figure, Missing, Section, Table};
+use crate::robot::RequestPacing;
+use crate::section::{Figure, MissingMeasurement, Section, Table};
 use crate::statistics::trajectory_error;
-use crate::trace::{Grid, Trace};
+use crate::trace::{MapGrid, Trace};
 use crate::words::{digits, percent};
 
-/// Where the reference is, in the recording.
+/// Topic of the reference in the recording.
 const REFERENCE: &str = "/ground_truth";
-/// As in the publication.
+/// Rate of the publication.
 const SLOWLY: f64 = 0.33;
 
-/// Distances that are not this many times as great count as alike.
+/// Ratio of distances up to which they count as equal.
 const ALIKE: f64 = 1.2;
 
-/// A drive, and what its errors are measured by.
+/// A drive, and the reference for its errors.
 struct Drive {
-    /// Of figures.
+    /// Prefix of figure ids.
     id: &'static str,
-    /// With its recording.
-    example: Example,
-    /// In tables and captions.
+    /// Package, with its recording.
+    example: EvalPackage,
+    /// Title in tables and captions.
     title: &'static str,
-    /// What is at [`REFERENCE`].
+    /// Origin of the path on [`REFERENCE`].
     whose: &'static str,
-    /// Short, in sentences and heads of columns.
+    /// Short form for sentences and column heads.
     reference: &'static str,
-    /// How fast it is played, and what the runs on the robot and through the stub are called.
+    /// Rates at which the drive is played, and the names of the runs on the robot and through the stub.
     plays: &'static [(f64, &'static str, &'static str)],
 }
 
-/// There is no independent ground truth of the real one.
+/// The real drive has no independent ground truth.
 const DRIVES: [Drive; 2] = [
     Drive {
         id: "real",
@@ -64,23 +66,26 @@ const DRIVES: [Drive; 2] = [
     },
 ];
 
-/// One play of the drive.
+/// One play of a drive.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Play {
+pub struct MapPlay {
     trace: Trace,
-    cost: Cost,
-    /// Seconds of the recording, x and y in metres, by the drive's reference.
+    cost: RunCost,
+    /// Path of the drive's reference: seconds of the recording, x and y in metres.
     truth: Vec<(f64, f64, f64)>,
 }
 
-/// All of them.
-pub struct Runs {
-    plays: Vec<(String, Measured<Play>)>,
+/// Results of all plays.
+pub struct MapRuns {
+    plays: Vec<(String, CachedResult<MapPlay>)>,
 }
 
-impl Runs {
-    /// Those of one drive, as far as they were tried.
-    fn of<'a>(&'a self, drive: &Drive) -> impl Iterator<Item = &'a (String, Measured<Play>)> {
+impl MapRuns {
+    /// Returns the plays of one drive that were attempted.
+    fn for_drive<'a>(
+        &'a self,
+        drive: &Drive,
+    ) -> impl Iterator<Item = &'a (String, CachedResult<MapPlay>)> {
         let plays = drive.plays;
         self.plays.iter().filter(move |(name, _)| {
             plays
@@ -90,8 +95,8 @@ impl Runs {
     }
 }
 
-/// Measures them; a quick evaluation the real drive at its own rate, at most so many scans of it.
-pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Result<Runs> {
+/// Measures all drives; a quick evaluation plays the real drive at its own rate, at most `most` scans of it.
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures, most: Option<usize>) -> Result<MapRuns> {
     let mut plays = Vec::new();
     let drives = if most.is_some() {
         &DRIVES[..1]
@@ -99,25 +104,27 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
         &DRIVES
     };
     for drive in drives {
-        // What both need is made before both need it.
+        // Created first, because both runs need it at the same time.
         if let Err(error) = workshop.recording(drive.example.input) {
             let why = format!("{error:#}");
             let names = drive
                 .plays
                 .iter()
                 .flat_map(|(_, native, stub)| [native, stub]);
-            plays.extend(names.map(|name| ((*name).to_owned(), Measured::Missing(why.clone()))));
+            plays
+                .extend(names.map(|name| ((*name).to_owned(), CachedResult::Missing(why.clone()))));
             continue;
         }
         let all = if most.is_some() { 1 } else { drive.plays.len() };
         for (speed, native, stub) in &drive.plays[..all] {
-            // The two robots drive at the same time: each has its own part of the processor, and together with the cloud they need less
-            // than two cores.
-            let play =
-                |name: &str, at: Where| one(cells, workshop, drive, (name, at), *speed, most);
+            // Both robots drive at the same time: each has its own share of the processor, and together with the cloud
+            // they need less than two cores.
+            let play = |name: &str, at: ExecutionSite| {
+                measure_play(cells, workshop, drive, (name, at), *speed, most)
+            };
             let both = std::thread::scope(|scope| {
-                let beside = scope.spawn(|| play(stub, Where::Outsourced));
-                let native = play(native, Where::Native);
+                let beside = scope.spawn(|| play(stub, ExecutionSite::Outsourced));
+                let native = play(native, ExecutionSite::Native);
                 let stub = beside
                     .join()
                     .unwrap_or_else(|_| Err(anyhow!("the stub's robot panicked")));
@@ -128,56 +135,71 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
             }
         }
     }
-    Ok(Runs { plays })
+    Ok(MapRuns { plays })
 }
 
-fn one(
-    cells: &Cells,
-    workshop: &Workshop,
+fn measure_play(
+    cells: &RunCache,
+    workshop: &EvalFixtures,
     drive: &Drive,
-    (name, at): (&str, Where),
+    (name, at): (&str, ExecutionSite),
     speed: f64,
     most: Option<usize>,
-) -> Result<Measured<Play>> {
-    cells.measure(&format!("map {name}"), &(Class::PI, speed, most), || {
-        let directory = workshop.directory()?;
-        let mut plan = workshop.plan(&drive.example, at, directory.path())?;
-        plan.pace = Pace::Recorded(speed);
-        plan.most = most.unwrap_or(match drive.example.input {
-            Input::Simulated => drive.example.requests,
-            _ => usize::MAX,
-        });
-        plan.patience = 1200.0;
-        let truth = Recording::read(&plan.recording)?.positions(REFERENCE);
-        let place = Place::new(&workshop.daemon.address, Class::PI, Network::Wifi)?;
-        let (trace, cost) = place.runs(&plan, directory.path())?;
-        Ok(Play { trace, cost, truth })
-    })
+) -> Result<CachedResult<MapPlay>> {
+    cells.measure(
+        &format!("map {name}"),
+        &(RobotHardware::PI, speed, most),
+        || {
+            let directory = workshop.directory()?;
+            let mut plan = workshop.plan(&drive.example, at, directory.path())?;
+            plan.pace = RequestPacing::Recorded(speed);
+            plan.most = most.unwrap_or(match drive.example.input {
+                InputRecording::Simulated => drive.example.requests,
+                _ => usize::MAX,
+            });
+            plan.patience = 1200.0;
+            let truth = Recording::read(&plan.recording)?.positions(REFERENCE);
+            let place = RobotSandbox::new(
+                &workshop.daemon.address,
+                RobotHardware::PI,
+                NetworkProfile::Wifi,
+            )?;
+            let (trace, cost) = place.run(&plan, directory.path())?;
+            Ok(MapPlay { trace, cost, truth })
+        },
+    )
 }
 
-/// What the report says.
-pub fn section(runs: &Runs) -> Result<Section> {
+/// Creates the section of the report.
+pub fn section(runs: &MapRuns) -> Result<Section> {
     let mut section = Section::new(7, "map", "The map of a drive");
-    section.published = "Fig. 8 of the publication: a real robot drives, and its map is made on the robot and in the cloud; the recording was also played at 0.33 of its rate.".to_owned();
+    section.published = "Fig. 8 of the publication: a real robot drives, and its map is made on the robot and in the \
+        cloud; the recording was also played at 0.33 of its rate.".to_owned();
     section.differs = vec![
-        format!("The reference of all errors of the real drive is the path by {}, of the same recording: there is no independent ground truth of this drive, so that what both get wrong is not seen.", DRIVES[0].whose),
-        format!("The simulated drive is there for an error against a true path: {}. It is no robot's, its scans and odometry are a simulator's (MRPT's simul.rawlog, the first {} scans, 80 m that end close to where they began), played once at its own rate.", DRIVES[1].whose, DRIVES[1].example.requests),
-        "Paths are compared after one is turned and moved onto the other, as they begin nowhere in common (absolute trajectory error).".to_owned(),
-        "The robot is a recording of MRPT, played at its own rate to a robot of the class Pi, by Wi-Fi (5 ms each way, more or less 4 ms, 40 Mbit/s, one packet in a hundred lost). The native robot and the stub's drive at the same time, in places of their own.".to_owned(),
+        format!("The reference of all errors of the real drive is the path by {}, of the same recording: there is no \
+            independent ground truth of this drive, so that what both get wrong is not seen.", DRIVES[0].whose),
+        format!("The simulated drive is there for an error against a true path: {}. It is no robot's, its scans and \
+            odometry are a simulator's (MRPT's simul.rawlog, the first {} scans, 80 m that end close to where they \
+            began), played once at its own rate.", DRIVES[1].whose, DRIVES[1].example.requests),
+        "Paths are compared after one is turned and moved onto the other, as they begin nowhere in common (absolute \
+         trajectory error).".to_owned(),
+        "The robot is a recording of MRPT, played at its own rate to a robot of the class Pi, by Wi-Fi (5 ms each way, \
+         more or less 4 ms, 40 Mbit/s, one packet in a hundred lost). The native robot and the stub's drive at the \
+         same time, in places of their own.".to_owned(),
     ];
     for drive in &DRIVES {
         // A quick evaluation does not play every drive.
-        if runs.of(drive).next().is_none() {
+        if runs.for_drive(drive).next().is_none() {
             continue;
         }
-        told(&mut section, runs, drive)?;
-        findings(&mut section, runs, drive);
+        add_drive(&mut section, runs, drive)?;
+        add_findings(&mut section, runs, drive);
     }
     Ok(section)
 }
 
-/// A drive's table, its paths and its maps.
-fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
+/// Adds a drive's table, paths and maps.
+fn add_drive(section: &mut Section, runs: &MapRuns, drive: &Drive) -> Result<()> {
     let mut table = Table::new(
         format!("laser_slam on a robot of the class Pi: {}", drive.title),
         [
@@ -191,12 +213,12 @@ fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
         ],
     );
     let mut paths = Vec::new();
-    let mut maps: Vec<(&str, &Grid)> = Vec::new();
-    for (name, play) in runs.of(drive) {
+    let mut maps: Vec<(&str, &MapGrid)> = Vec::new();
+    for (name, play) in runs.for_drive(drive) {
         let play = match play {
-            Measured::Done(play) => play,
-            Measured::Missing(why) => {
-                section.missing.push(Missing {
+            CachedResult::Done(play) => play,
+            CachedResult::Missing(why) => {
+                section.missing.push(MissingMeasurement {
                     what: name.clone(),
                     why: why.clone(),
                     next: "run make eval again: what was measured stays".to_owned(),
@@ -210,17 +232,17 @@ fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
         table.push([
             name.clone(),
             trace.requests.len().to_string(),
-            trace.answered().to_string(),
-            percent(Some(share(trace))),
+            trace.answered_count().to_string(),
+            percent(Some(processed_share(trace))),
             metres(error.as_ref().map(|error| error.rmse)),
             metres(error.as_ref().map(|error| error.max)),
             match drive.example.input {
-                Input::Simulated => "none".to_owned(),
+                InputRecording::Simulated => "none".to_owned(),
                 _ => "drawn only".to_owned(),
             },
         ]);
         if let Some(why) = &trace.node_ended {
-            section.missing.push(Missing::new(
+            section.missing.push(MissingMeasurement::new(
                 format!("{name}: to its end"),
                 why,
                 "look at what the node printed",
@@ -229,32 +251,35 @@ fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
         if paths.is_empty() && !play.truth.is_empty() {
             let last = trace.requests.last().map_or(0.0, |last| last.stamp);
             let driven = play.truth.iter().filter(|(at, _, _)| *at <= last);
-            paths.push(series(drive.whose, &driven.copied().collect::<Vec<_>>()));
+            paths.push(path_series(
+                drive.whose,
+                &driven.copied().collect::<Vec<_>>(),
+            ));
         }
-        paths.push(series(name, &estimate));
+        paths.push(path_series(name, &estimate));
         maps.extend(trace.map.as_ref().map(|map| (name.as_str(), map)));
     }
     section.tables.push(table);
-    section.drawing(
+    section.add_drawing(
         format!("paths-{}", drive.id),
         format!("Where the robot was, by each: {}", drive.title),
         plots::map("laser_slam", "x, m", "y, m", &paths)?,
     );
     if !maps.is_empty() {
-        let (names, grids): (Vec<&str>, Vec<&Grid>) = maps.into_iter().unzip();
+        let (names, grids): (Vec<&str>, Vec<&MapGrid>) = maps.into_iter().unzip();
         let caption = format!(
             "The maps of {}, two in a row: {}. All show the same place; the bars are {} m long.",
             drive.title,
             names.join("; "),
             picture::BAR
         );
-        match picture::maps(&grids) {
+        match picture::draw_maps(&grids) {
             Ok(drawn) => {
                 section
                     .figures
                     .push(Figure::png(format!("maps-{}", drive.id), caption, drawn))
             }
-            Err(error) => section.missing.push(Missing::new(
+            Err(error) => section.missing.push(MissingMeasurement::new(
                 format!("the maps of {}", drive.title),
                 format!("{error:#}"),
                 "look at what the node printed",
@@ -264,10 +289,10 @@ fn told(section: &mut Section, runs: &Runs, drive: &Drive) -> Result<()> {
     Ok(())
 }
 
-fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
+fn add_findings(section: &mut Section, runs: &MapRuns, drive: &Drive) {
     let of = |name: &str| {
         let (_, play) = runs.plays.iter().find(|(one, _)| one == name)?;
-        let play = play.done()?;
+        let play = play.value()?;
         let error = trajectory_error(&play.trace.trajectory(), &play.truth);
         Some((&play.trace, error.map(|error| error.rmse)))
     };
@@ -284,10 +309,12 @@ fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
         let farther = error
             .zip(stubs_error)
             .is_some_and(|(alone, stub)| stub > alone * ALIKE);
-        let worse = if fewer(through, alone) {
-            "; fewer through the stub is worse than hoped: what the network loses and delays comes to more than what its processor saves"
+        let worse = if has_fewer_scans(through, alone) {
+            "; fewer through the stub is worse than hoped: what the network loses and delays comes to more than what \
+             its processor saves"
         } else if farther {
-            "; the greater distance through the stub is worse than hoped, and not explained by the share: of one run each, it may be the package's own difference between one choice of scans and another"
+            "; the greater distance through the stub is worse than hoped, and not explained by the share: of one run \
+             each, it may be the package's own difference between one choice of scans and another"
         } else {
             ""
         };
@@ -296,26 +323,27 @@ fn findings(section: &mut Section, runs: &Runs, drive: &Drive) {
             1.0 => "its own rate".to_owned(),
             speed => format!("{speed} of its own rate"),
         };
-        let [alone, through] = [alone, through].map(|trace| percent(Some(share(trace))));
+        let [alone, through] = [alone, through].map(|trace| percent(Some(processed_share(trace))));
         section.findings.push(format!(
-            "Of {}, at {rate}, the robot works at {alone} of the scans by itself ({error}), and at {through} through the stub ({stubs_error}){worse}.",
+            "Of {}, at {rate}, the robot works at {alone} of the scans by itself ({error}), and at {through} through \
+             the stub ({stubs_error}){worse}.",
             drive.title
         ));
     }
 }
 
-/// The share of scans that were worked at.
-fn share(trace: &Trace) -> f64 {
-    trace.answered() as f64 / trace.requests.len().max(1) as f64
+/// Returns the fraction of scans that were processed.
+fn processed_share(trace: &Trace) -> f64 {
+    trace.answered_count() as f64 / trace.requests.len().max(1) as f64
 }
 
-/// Whether fewer scans were worked at through the stub, by more than one and more than one in a hundred.
-fn fewer(through: &Trace, alone: &Trace) -> bool {
+/// Returns whether fewer scans were processed through the stub, by more than one scan and by more than one per cent.
+fn has_fewer_scans(through: &Trace, alone: &Trace) -> bool {
     let all = alone.requests.len().max(through.requests.len()) as f64;
-    all * (share(alone) - share(through)) > f64::max(1.5, all / 100.0)
+    all * (processed_share(alone) - processed_share(through)) > f64::max(1.5, all / 100.0)
 }
 
-fn series(name: &str, path: &[(f64, f64, f64)]) -> Series {
+fn path_series(name: &str, path: &[(f64, f64, f64)]) -> Series {
     Series {
         name: name.to_owned(),
         points: path.iter().map(|(_, x, y)| (*x, *y)).collect(),
@@ -325,21 +353,21 @@ fn series(name: &str, path: &[(f64, f64, f64)]) -> Series {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trace::Request;
+    use crate::trace::RequestSample;
 
-    fn play(poses: &[Option<[f64; 3]>]) -> Play {
-        let request = |(number, pose): (u32, &Option<[f64; 3]>)| Request {
+    fn play(poses: &[Option<[f64; 3]>]) -> MapPlay {
+        let request = |(number, pose): (u32, &Option<[f64; 3]>)| RequestSample {
             stamp: number.into(),
             response: pose.map(|_| 0.1),
             pose: *pose,
-            ..Request::default()
+            ..RequestSample::default()
         };
-        Play {
+        MapPlay {
             trace: Trace {
                 requests: (0..).zip(poses).map(request).collect(),
                 ..Trace::default()
             },
-            cost: Cost::default(),
+            cost: RunCost::default(),
             truth: (0..4)
                 .map(|at| (f64::from(at), f64::from(at), 0.0))
                 .collect(),
@@ -349,8 +377,8 @@ mod tests {
     #[test]
     fn scans_that_were_not_worked_at_are_counted() {
         let half = play(&[Some([0.0, 0.0, 0.0]), None, Some([2.0, 0.0, 0.0]), None]);
-        let runs = Runs {
-            plays: vec![("native, own rate".to_owned(), Measured::Done(half))],
+        let runs = MapRuns {
+            plays: vec![("native, own rate".to_owned(), CachedResult::Done(half))],
         };
         let section = section(&runs).expect("a section");
         assert_eq!(
@@ -365,10 +393,10 @@ mod tests {
         let whole = play(&[here, Some([1.0, 0.0, 0.0]), here, here]);
         let half = play(&[here, None, here, None]);
         let [native, stub] = [DRIVES[0].plays[1].1, DRIVES[0].plays[1].2].map(str::to_owned);
-        let runs = Runs {
+        let runs = MapRuns {
             plays: vec![
-                (native, Measured::Done(whole)),
-                (stub, Measured::Done(half)),
+                (native, CachedResult::Done(whole)),
+                (stub, CachedResult::Done(half)),
             ],
         };
         let section = section(&runs).expect("a section");
@@ -391,12 +419,12 @@ mod tests {
             poses.resize(all, None);
             play(&poses).trace
         };
-        assert!(!fewer(&of(221, 222), &of(222, 222)));
-        assert!(!fewer(&of(3, 4), &of(4, 4)));
-        assert!(!fewer(&of(997, 1000), &of(1000, 1000)));
-        assert!(fewer(&of(219, 222), &of(222, 222)));
-        assert!(!fewer(&of(222, 222), &of(150, 222)));
-        assert_eq!(percent(Some(share(&of(221, 222)))), "99.5 %");
+        assert!(!has_fewer_scans(&of(221, 222), &of(222, 222)));
+        assert!(!has_fewer_scans(&of(3, 4), &of(4, 4)));
+        assert!(!has_fewer_scans(&of(997, 1000), &of(1000, 1000)));
+        assert!(has_fewer_scans(&of(219, 222), &of(222, 222)));
+        assert!(!has_fewer_scans(&of(222, 222), &of(150, 222)));
+        assert_eq!(percent(Some(processed_share(&of(221, 222)))), "99.5 %");
     }
 
     #[test]
@@ -404,11 +432,11 @@ mod tests {
         let straight = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
         let stretched = play(&[Some([0.0, 0.0, 0.0]), Some([3.0, 0.0, 0.0])]);
         let (_, native, stub) = DRIVES[1].plays[0];
-        let told = |native_run: &Play, stub_run: &Play| {
+        let told = |native_run: &MapPlay, stub_run: &MapPlay| {
             let runs = [(native, native_run), (stub, stub_run)];
-            let runs = runs.map(|(name, run)| (name.to_owned(), Measured::Done(run.clone())));
+            let runs = runs.map(|(name, run)| (name.to_owned(), CachedResult::Done(run.clone())));
             let plays = runs.to_vec();
-            section(&Runs { plays }).expect("a section").findings[0].clone()
+            section(&MapRuns { plays }).expect("a section").findings[0].clone()
         };
         assert!(told(&straight, &stretched).contains("worse than hoped"));
         assert!(!told(&stretched, &straight).contains("worse than hoped"));
@@ -418,13 +446,13 @@ mod tests {
     fn an_error_against_a_true_path_is_told_as_such() {
         let whole = play(&[Some([0.0, 0.0, 0.0]), Some([1.0, 0.0, 0.0])]);
         let (_, native, stub) = DRIVES[1].plays[0];
-        let runs = Runs {
+        let runs = MapRuns {
             plays: [native, stub]
-                .map(|name| (name.to_owned(), Measured::Done(whole.clone())))
+                .map(|name| (name.to_owned(), CachedResult::Done(whole.clone())))
                 .to_vec(),
         };
         let section = section(&runs).expect("a section");
-        // Nothing is told of a drive that was not played.
+        // A drive that was not played does not appear.
         assert_eq!(section.tables.len(), 1);
         assert_eq!(section.tables[0].rows.len(), 2);
         let told = &section.findings[0];

@@ -1,57 +1,62 @@
-//! Experiment 3: a package that needs more memory than a robot has.
+//! Experiment 3: a package that needs more memory than the robot has.
 
 use anyhow::Result;
 
-use crate::cells::{Cells, Measured};
-use crate::examples::{DETECTOR, Example, Where, Workshop};
-use crate::place::{Class, Cost, Network, Place};
-use crate::robot::Node;
-use crate::section::{Missing, Section, Table};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{DETECTOR, EvalFixtures, EvalPackage, ExecutionSite};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::robot::NodeUnderTest;
+use crate::section::{MissingMeasurement, Section, Table};
 use crate::statistics::quantile;
 use crate::trace::Trace;
 use crate::words::milliseconds;
 
-/// The detector with pictures of this size in its network needs more than a gigabyte.
+/// With images of this size in its network the detector needs more than a gigabyte.
 const LARGE: [&str; 2] = ["_width:=2048", "_height:=2048"];
-/// Requests of each run.
+/// Requests per run.
 const REQUESTS: usize = 5;
 
-/// The detector on that robot, and its stub there.
-pub struct Runs {
-    /// On the robot.
-    pub native: Measured<(Trace, Cost)>,
-    /// In the cloud.
-    pub outsourced: Measured<(Trace, Cost)>,
+/// Results of the detector on the robot, and of its stub there.
+pub struct MemoryRuns {
+    /// Run on the robot.
+    pub native: CachedResult<(Trace, RunCost)>,
+    /// Run in the cloud.
+    pub outsourced: CachedResult<(Trace, RunCost)>,
 }
 
-/// Measures both.
-pub fn measure(cells: &Cells, workshop: &Workshop) -> Result<Runs> {
-    let run = |name: &str, at: Where| {
-        cells.measure(name, &(Class::PI, LARGE, REQUESTS), || {
-            let detector = Example {
+/// Measures both runs.
+pub fn measure(cells: &RunCache, workshop: &EvalFixtures) -> Result<MemoryRuns> {
+    let run = |name: &str, at: ExecutionSite| {
+        cells.measure(name, &(RobotHardware::PI, LARGE, REQUESTS), || {
+            let detector = EvalPackage {
                 parameters: &LARGE,
                 ..DETECTOR
             };
-            workshop.publishes(&detector)?;
+            workshop.publish(&detector)?;
             let directory = workshop.directory()?;
             let mut plan = workshop.plan(&detector, at, directory.path())?;
-            if let Node::Stub { settings, .. } = &mut plan.node {
-                // A robot of its own: parameters that a node has set stay with its robot's servant, as they stay with a ROS Master.
+            if let NodeUnderTest::Stub { settings, .. } = &mut plan.node {
+                // A robot of its own: parameters that a node sets stay with the robot's servant, as they stay with a
+                // ROS Master.
                 settings.push_str("\nrobot = \"large-pictures\"");
             }
             plan.most = REQUESTS;
             plan.patience = 240.0;
-            let place = Place::new(&workshop.daemon.address, Class::PI, Network::Lan)?;
-            match place.runs(&plan, directory.path()) {
-                // What is to be shown: not a run that failed to be measured.
+            let place = RobotSandbox::new(
+                &workshop.daemon.address,
+                RobotHardware::PI,
+                NetworkProfile::Lan,
+            )?;
+            match place.run(&plan, directory.path()) {
+                // The expected result, not a failed measurement.
                 Err(error) if place.killed_for_memory() > 0 => {
                     let trace = Trace {
                         node_ended: Some(format!("{error:#}")),
                         ..Trace::default()
                     };
-                    let cost = Cost {
+                    let cost = RunCost {
                         killed_for_memory: place.killed_for_memory(),
-                        ..Cost::default()
+                        ..RunCost::default()
                     };
                     Ok((trace, cost))
                 }
@@ -59,22 +64,26 @@ pub fn measure(cells: &Cells, workshop: &Workshop) -> Result<Runs> {
             }
         })
     };
-    Ok(Runs {
-        native: run("memory native", Where::Native)?,
-        outsourced: run("memory outsourced", Where::Outsourced)?,
+    Ok(MemoryRuns {
+        native: run("memory native", ExecutionSite::Native)?,
+        outsourced: run("memory outsourced", ExecutionSite::Outsourced)?,
     })
 }
 
-/// What the report says.
-pub fn section(runs: &Runs) -> Section {
+/// Creates the section of the report.
+pub fn section(runs: &MemoryRuns) -> Section {
     let mut section = Section::new(
         3,
         "memory",
         "A package that needs more memory than the robot has",
     );
-    section.published = "The publication could not run SSD on the Raspberry Pi, whose memory does not hold it; outsourced it answered.".to_owned();
+    section.published =
+        "The publication could not run SSD on the Raspberry Pi, whose memory does not hold it; \
+        outsourced it answered."
+            .to_owned();
     section.differs = vec![
-        "object_detector with pictures of 2048x2048 in its network stands in for SSD; the robot has 1 GiB. The limit is the kernel's, as on a robot without swap."
+        "object_detector with pictures of 2048x2048 in its network stands in for SSD; the robot has 1 GiB. The limit \
+         is the kernel's, as on a robot without swap."
             .to_owned(),
     ];
     let mut table = Table::new(
@@ -92,30 +101,32 @@ pub fn section(runs: &Runs) -> Section {
         ("outsourced, LAN", "SSD answered", &runs.outsourced),
     ] {
         match run {
-            Measured::Done((trace, cost)) => table.push([
+            CachedResult::Done((trace, cost)) => table.push([
                 name.to_owned(),
-                format!("{} of {REQUESTS}", trace.answered()),
+                format!("{} of {REQUESTS}", trace.answered_count()),
                 published.to_owned(),
                 cost.killed_for_memory.to_string(),
                 milliseconds(quantile(&trace.responses(), 0.5)),
             ]),
-            Measured::Missing(why) => section.missing.push(Missing::again(name, why)),
+            CachedResult::Missing(why) => section
+                .missing
+                .push(MissingMeasurement::retryable(name, why)),
         }
     }
     section.tables.push(table);
     if let (Some((native, cost)), Some((outsourced, _))) =
-        (runs.native.done(), runs.outsourced.done())
+        (runs.native.value(), runs.outsourced.value())
     {
         let killed = if cost.killed_for_memory > 0 {
             "is ended by the kernel for want of memory"
-        } else if native.answered() == 0 {
+        } else if native.answered_count() == 0 {
             "answers nothing"
         } else {
             "answers: this limit is too high to show what was published"
         };
         section.findings.push(format!(
             "On the robot the detector {killed}; outsourced {} of {REQUESTS} requests are answered.",
-            outsourced.answered()
+            outsourced.answered_count()
         ));
     }
     section
@@ -124,25 +135,25 @@ pub fn section(runs: &Runs) -> Section {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trace::Request;
+    use crate::trace::RequestSample;
 
     #[test]
     fn who_was_killed_is_told() {
-        let killed = Cost {
+        let killed = RunCost {
             killed_for_memory: 1,
-            ..Cost::default()
+            ..RunCost::default()
         };
-        let answer = Request {
+        let answer = RequestSample {
             response: Some(0.2),
-            ..Request::default()
+            ..RequestSample::default()
         };
         let outsourced = Trace {
             requests: vec![answer; REQUESTS],
             ..Trace::default()
         };
-        let section = section(&Runs {
-            native: Measured::Done((Trace::default(), killed)),
-            outsourced: Measured::Done((outsourced, Cost::default())),
+        let section = section(&MemoryRuns {
+            native: CachedResult::Done((Trace::default(), killed)),
+            outsourced: CachedResult::Done((outsourced, RunCost::default())),
         });
         assert_eq!(
             section.tables[0].rows[0][1..4],

@@ -1,5 +1,5 @@
-//! Experiments 2, 4 and 5: packages on two kinds of robots, there and in the cloud: response times, their parts, and how much they differ
-//! from request to request.
+//! Experiments 2, 4 and 5: packages on two kinds of robots, run on the robot and in the cloud: response times, their
+//! parts, and their variation.
 
 mod jitter;
 mod phases;
@@ -8,27 +8,27 @@ mod response_times;
 use anyhow::Result;
 use serde::{Deserialize, Serialize};
 
-use crate::cells::{Cells, Measured};
-use crate::examples::{ALL, Example, LASER_SLAM, Where, Workshop};
-use crate::place::{Class, Cost, Network, Place};
-use crate::section::{Missing, Section};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{ALL, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox, RunCost};
+use crate::section::{MissingMeasurement, Section};
 use crate::trace::Trace;
 
 pub use jitter::jitter;
 pub use phases::phases;
 pub use response_times::response_times;
 
-/// Where one package ran.
+/// Place where a package ran.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub enum SetUp {
+pub enum OutsourcingSetUp {
     /// On the robot.
     Native,
-    /// In the cloud, behind this network.
-    Behind(Network),
+    /// In the cloud, over this network.
+    Behind(NetworkProfile),
 }
 
-impl SetUp {
-    /// As tables name it.
+impl OutsourcingSetUp {
+    /// Name in tables.
     pub fn name(self) -> &'static str {
         match self {
             Self::Native => "native",
@@ -37,32 +37,36 @@ impl SetUp {
     }
 }
 
-/// The set-ups of the published figure.
-pub const SET_UPS: [SetUp; 3] = [
-    SetUp::Native,
-    SetUp::Behind(Network::Lan),
-    SetUp::Behind(Network::Wan),
+/// Set-ups of the published figure.
+pub const SET_UPS: [OutsourcingSetUp; 3] = [
+    OutsourcingSetUp::Native,
+    OutsourcingSetUp::Behind(NetworkProfile::Lan),
+    OutsourcingSetUp::Behind(NetworkProfile::Wan),
 ];
 
 /// One package on one robot in one set-up.
-pub struct Run {
+pub struct OutsourcingRun {
     /// The package.
-    pub example: Example,
+    pub example: EvalPackage,
     /// The robot.
-    pub class: Class,
-    /// Where it answered.
-    pub set_up: SetUp,
-    /// What came out.
-    pub measured: Measured<(Trace, Cost)>,
+    pub class: RobotHardware,
+    /// Place where it ran.
+    pub set_up: OutsourcingSetUp,
+    /// Result.
+    pub measured: CachedResult<(Trace, RunCost)>,
 }
 
-/// Measures all; so many requests each, or as many as the example says.
-pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Result<Vec<Run>> {
-    // A quick evaluation shows that it works, which one package on one kind of robots does.
+/// Measures all runs with `most` requests each, or as many as the example specifies.
+pub fn measure(
+    cells: &RunCache,
+    workshop: &EvalFixtures,
+    most: Option<usize>,
+) -> Result<Vec<OutsourcingRun>> {
+    // A quick evaluation shows that everything works, for which one package on one kind of robot suffices.
     let (examples, classes) = if most.is_some() {
-        (&[LASER_SLAM][..], &[Class::PI][..])
+        (&[LASER_SLAM][..], &[RobotHardware::PI][..])
     } else {
-        (&ALL[..], &[Class::PI, Class::ULTRABOOK][..])
+        (&ALL[..], &[RobotHardware::PI, RobotHardware::ULTRABOOK][..])
     };
     let mut runs = Vec::new();
     for &example in examples {
@@ -71,9 +75,9 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
                 let name = format!("{} {} {}", example.name, class.name(), set_up.name());
                 let most = most.unwrap_or(example.requests).min(example.requests);
                 let measured = cells.measure(&name, &(class, set_up, most), || {
-                    one(workshop, &example, class, set_up, most)
+                    run_once(workshop, &example, class, set_up, most)
                 })?;
-                runs.push(Run {
+                runs.push(OutsourcingRun {
                     example,
                     class,
                     set_up,
@@ -85,45 +89,46 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
     Ok(runs)
 }
 
-fn one(
-    workshop: &Workshop,
-    example: &Example,
-    class: Class,
-    set_up: SetUp,
+fn run_once(
+    workshop: &EvalFixtures,
+    example: &EvalPackage,
+    class: RobotHardware,
+    set_up: OutsourcingSetUp,
     most: usize,
-) -> Result<(Trace, Cost)> {
-    workshop.publishes(example)?;
+) -> Result<(Trace, RunCost)> {
+    workshop.publish(example)?;
     let (at, network) = match set_up {
-        SetUp::Native => (Where::Native, Network::Lan),
-        SetUp::Behind(network) => (Where::Outsourced, network),
+        OutsourcingSetUp::Native => (ExecutionSite::Native, NetworkProfile::Lan),
+        OutsourcingSetUp::Behind(network) => (ExecutionSite::Outsourced, network),
     };
     let directory = workshop.directory()?;
     let mut plan = workshop.plan(example, at, directory.path())?;
     plan.most = most;
-    let place = Place::new(&workshop.daemon.address, class, network)?;
-    place.runs(&plan, directory.path())
+    let place = RobotSandbox::new(&workshop.daemon.address, class, network)?;
+    place.run(&plan, directory.path())
 }
 
-/// What was measured of one package, robot and set-up.
-fn find<'a>(
-    runs: &'a [Run],
+/// Returns the result of one package, robot and set-up.
+fn find_run<'a>(
+    runs: &'a [OutsourcingRun],
     example: &str,
-    class: Class,
-    set_up: SetUp,
-) -> Option<&'a (Trace, Cost)> {
-    let wanted =
-        |run: &&Run| run.example.name == example && run.class == class && run.set_up == set_up;
-    runs.iter().find(wanted)?.measured.done()
+    class: RobotHardware,
+    set_up: OutsourcingSetUp,
+) -> Option<&'a (Trace, RunCost)> {
+    let wanted = |run: &&OutsourcingRun| {
+        run.example.name == example && run.class == class && run.set_up == set_up
+    };
+    runs.iter().find(wanted)?.measured.value()
 }
 
-/// The packages of these runs.
-fn examples(runs: &[Run]) -> impl Iterator<Item = Example> {
-    let tried = |example: &Example| runs.iter().any(|run| run.example.name == example.name);
+/// Returns the packages of these runs.
+fn examples(runs: &[OutsourcingRun]) -> impl Iterator<Item = EvalPackage> {
+    let tried = |example: &EvalPackage| runs.iter().any(|run| run.example.name == example.name);
     ALL.into_iter().filter(tried)
 }
 
-/// Names what was not measured.
-fn missing<R: std::borrow::Borrow<Run>>(section: &mut Section, runs: &[R]) {
+/// Lists the runs without a result.
+fn add_missing<R: std::borrow::Borrow<OutsourcingRun>>(section: &mut Section, runs: &[R]) {
     for run in runs.iter().map(std::borrow::Borrow::borrow) {
         let what = format!(
             "{}, {}, {}",
@@ -132,10 +137,12 @@ fn missing<R: std::borrow::Borrow<Run>>(section: &mut Section, runs: &[R]) {
             run.set_up.name()
         );
         match &run.measured {
-            Measured::Missing(why) => section.missing.push(Missing::again(what, why)),
-            Measured::Done((trace, _)) => {
+            CachedResult::Missing(why) => section
+                .missing
+                .push(MissingMeasurement::retryable(what, why)),
+            CachedResult::Done((trace, _)) => {
                 if let Some(why) = &trace.node_ended {
-                    section.missing.push(Missing {
+                    section.missing.push(MissingMeasurement {
                         what: format!("{what}: after request {}", trace.requests.len()),
                         why: why.clone(),
                         next: "look at what the node printed".to_owned(),
@@ -150,36 +157,36 @@ fn missing<R: std::borrow::Borrow<Run>>(section: &mut Section, runs: &[R]) {
 mod tests {
     use super::*;
     use crate::examples::LASER_SLAM;
-    use crate::trace::{Phases, Request};
+    use crate::trace::{ComputationPhases, RequestSample};
 
-    /// A run of one package on the smaller robot, with these response times in seconds.
-    pub(super) fn run(set_up: SetUp, responses: &[f64]) -> Run {
-        let request = |response: &f64| Request {
+    /// Creates a run of one package on the smaller robot with these response times, in seconds.
+    pub(super) fn test_run(set_up: OutsourcingSetUp, responses: &[f64]) -> OutsourcingRun {
+        let request = |response: &f64| RequestSample {
             response: Some(*response),
-            phases: Some(Phases {
+            phases: Some(ComputationPhases {
                 acquisition: response * 0.1,
                 computation: response * 0.5,
                 rendering: response * 0.2,
             }),
-            ..Request::default()
+            ..RequestSample::default()
         };
         let trace = Trace {
             requests: responses.iter().map(request).collect(),
             ..Trace::default()
         };
-        Run {
+        OutsourcingRun {
             example: LASER_SLAM,
-            class: Class::PI,
+            class: RobotHardware::PI,
             set_up,
-            measured: Measured::Done((trace, Cost::default())),
+            measured: CachedResult::Done((trace, RunCost::default())),
         }
     }
 
     #[test]
     fn what_was_not_measured_is_named() {
-        let lost = Run {
-            measured: Measured::Missing("the robot's place was ended by signal 9".to_owned()),
-            ..run(SetUp::Native, &[])
+        let lost = OutsourcingRun {
+            measured: CachedResult::Missing("the robot's place was ended by signal 9".to_owned()),
+            ..test_run(OutsourcingSetUp::Native, &[])
         };
         let section = jitter(&[lost]).expect("a section");
         assert!(section.missing[0].why.contains("signal 9"));

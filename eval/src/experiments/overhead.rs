@@ -1,66 +1,74 @@
-//! Experiment 11: what portal and link add to raw TCPROS, and how servants start beside runtimes and a container engine of this distribution. The
-//! parts of the project's benchmarks that measure it are run.
+//! Experiment 11: overhead of portal and link over raw TCPROS, and start times of servants compared with runtimes and a
+//! container engine of this distribution. Runs the relevant parts of the project's benchmarks.
 
 use anyhow::Result;
 
-use crate::cells::{Cells, Measured};
+use crate::cells::{CachedResult, RunCache};
 use crate::plots::{self, Bar};
-use crate::section::{Missing, Section, Table};
-use crate::words::{digits, known, ratio};
+use crate::section::{MissingMeasurement, Section, Table};
+use crate::words::{digits, or_dash, ratio};
 
-use super::benches::{self, Written};
+use super::benches::{self, BenchOutput};
 
-/// What the publication says of starting a servant: more than so many milliseconds.
+/// Start time of a servant in the publication: more than this, in milliseconds.
 const PUBLISHED: f64 = 5000.0;
-/// What must be installed, or be there, to be measured beside ours; no run lacks anything where it is not.
+/// Peer that is optional: without it no measurement counts as missing.
 const SUITE: &str = "rosbridge_suite";
 
-/// What the benchmarks wrote.
-pub struct Runs {
-    /// `bench-servant starts`
-    starts: Measured<Written>,
-    /// `bench-portal`, trips alone
-    portal: Measured<Written>,
-    /// `bench-link strings`
-    link: Measured<Written>,
+/// Output of the benchmarks.
+pub struct OverheadRuns {
+    /// Output of `bench-servant starts`.
+    starts: CachedResult<BenchOutput>,
+    /// Output of `bench-portal`, restricted to round trips.
+    portal: CachedResult<BenchOutput>,
+    /// Output of `bench-link strings`.
+    link: CachedResult<BenchOutput>,
 }
 
-/// Runs what is needed of the benchmarks, unless that was done before.
-pub fn measure(cells: &Cells) -> Result<Runs> {
-    Ok(Runs {
-        starts: benches::part(cells, "servant", &["starts"])?,
-        portal: benches::part(cells, "portal", &["String there and back"])?,
-        link: benches::part(cells, "link", &["strings"])?,
+/// Runs the benchmarks, unless there are stored results.
+pub fn measure(cells: &RunCache) -> Result<OverheadRuns> {
+    Ok(OverheadRuns {
+        starts: benches::run_part(cells, "servant", &["starts"])?,
+        portal: benches::run_part(cells, "portal", &["String there and back"])?,
+        link: benches::run_part(cells, "link", &["strings"])?,
     })
 }
 
-/// What the report says.
-pub fn section(runs: &Runs) -> Result<Section> {
+/// Creates the section of the report.
+pub fn section(runs: &OverheadRuns) -> Result<Section> {
     let mut section = Section::new(11, "overhead", "What the system itself adds");
-    section.published = "Starting a servant took over 5 s in the publication. It has no figure of what its portal adds to a message's way."
+    section.published = "Starting a servant took over 5 s in the publication. It has no figure of what its portal adds \
+        to a message's way."
         .to_owned();
     section.differs = [
-        "Start times: cloudroid, libcontainer called from a bare program, and what Debian has (crun, runc, podman) start containers of the same root file system with the same limits, in turns in the same run; the peers run /bin/sleep, podman adds a layer that can be written, none has a network. What the publication timed is not said in parts; its number stands beside the time until a robot's node is registered and bridged.",
-        "crun refuses a host that has both versions of cgroups. There, all peers are given a mount namespace in which version 2 is covered.",
-        "Round trips: one String at a time to a roscpp node in a servant and back, on loopback; the best of the turns' medians. The client of raw TCPROS has its connections inside the servant's network namespace. The link is measured in a run of its own, from a publisher of the robot's ROS through its stub; its client of the portal writes and reads JSON itself, the other one sends prepared bytes.",
+        "Start times: cloudroid, libcontainer called from a bare program, and what Debian has (crun, runc, podman) \
+         start containers of the same root file system with the same limits, in turns in the same run; the peers run \
+         /bin/sleep, podman adds a layer that can be written, none has a network. What the publication timed is not \
+         said in parts; its number stands beside the time until a robot's node is registered and bridged.",
+        "crun refuses a host that has both versions of cgroups. There, all peers are given a mount namespace in which \
+         version 2 is covered.",
+        "Round trips: one String at a time to a roscpp node in a servant and back, on loopback; the best of the turns' \
+         medians. The client of raw TCPROS has its connections inside the servant's network namespace. The link is \
+         measured in a run of its own, from a publisher of the robot's ROS through its stub; its client of the portal \
+         writes and reads JSON itself, the other one sends prepared bytes.",
     ]
     .map(str::to_owned)
     .to_vec();
-    starts(&mut section, &runs.starts)?;
-    trips(&mut section, &runs.portal, &runs.link);
+    add_start_times(&mut section, &runs.starts)?;
+    add_round_trips(&mut section, &runs.portal, &runs.link);
     Ok(section)
 }
 
-/// What a benchmark wrote, or why not.
-fn needed<'a>(
+/// Returns the output of a benchmark, or reports why it is missing.
+fn require_measured<'a>(
     section: &mut Section,
     what: &str,
-    measured: &'a Measured<Written>,
-) -> Option<&'a Written> {
+    measured: &'a CachedResult<BenchOutput>,
+) -> Option<&'a BenchOutput> {
     match measured {
-        Measured::Done(written) => {
+        CachedResult::Done(written) => {
             for one in written.left_out.iter().filter(|one| one.what != SUITE) {
-                section.missing.push(Missing::new(
+                section.missing.push(MissingMeasurement::new(
                     &one.what,
                     &one.why,
                     "scripts/deps engines installs it",
@@ -69,20 +77,25 @@ fn needed<'a>(
             section.findings.extend(written.unmet());
             Some(written)
         }
-        Measured::Missing(why) => {
-            section.missing.push(Missing::again(what, why));
+        CachedResult::Missing(why) => {
+            section
+                .missing
+                .push(MissingMeasurement::retryable(what, why));
             None
         }
     }
 }
 
-fn value(written: &Written, figure: &str) -> Option<f64> {
+fn find_value(written: &BenchOutput, figure: &str) -> Option<f64> {
     let mut all = written.figures.iter();
     all.find(|one| one.figure == figure)?.value
 }
 
-/// What a figure was measured beside, with its number.
-fn beside<'a>(written: &'a Written, figure: &'a str) -> impl Iterator<Item = (&'a str, f64)> + 'a {
+/// Returns the peers of a figure with their values.
+fn find_floors<'a>(
+    written: &'a BenchOutput,
+    figure: &'a str,
+) -> impl Iterator<Item = (&'a str, f64)> + 'a {
     let all = written
         .figures
         .iter()
@@ -90,7 +103,7 @@ fn beside<'a>(written: &'a Written, figure: &'a str) -> impl Iterator<Item = (&'
     all.filter_map(|one| Some((one.peer.as_deref()?, one.floor?)))
 }
 
-/// How the benchmark calls the time until a robot is served, and what it is here.
+/// Names of the benchmark for the time until a robot is served, and their names in this report.
 const SERVED: [(&str, &str); 3] = [
     (
         "robot connects → node registered, bridged",
@@ -108,8 +121,8 @@ const SERVED: [(&str, &str); 3] = [
 const NODE: &str = "node alone: exec → registered";
 const RUNNING: &str = "create → running";
 
-fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
-    let Some(written) = needed(section, "start times", measured) else {
+fn add_start_times(section: &mut Section, measured: &CachedResult<BenchOutput>) -> Result<()> {
+    let Some(written) = require_measured(section, "start times", measured) else {
         return Ok(());
     };
     let mut table = Table::new(
@@ -133,42 +146,42 @@ fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
     };
     let served = "a robot connects, its node is registered and bridged";
     for (figure, name) in SERVED {
-        let Some(time) = value(written, figure) else {
-            lacks(section, figure);
+        let Some(time) = find_value(written, figure) else {
+            add_missing_figure(section, figure);
             continue;
         };
         let faster = format!("more than {}", digits(PUBLISHED / time));
         table.push([served, name, &digits(time), "> 5000", &faster]);
         bar("robot served", name, time);
     }
-    if let Some(time) = value(written, NODE) {
+    if let Some(time) = find_value(written, NODE) {
         let floor = "the node alone in a chroot, the floor";
         table.push(["exec, registered", floor, &digits(time), "", ""]);
         bar("robot served", floor, time);
     }
     bar("robot served", "published, at least", PUBLISHED);
     let ours = "cloudroid's engine: shim, Master, init, limits read back";
-    match value(written, RUNNING) {
+    match find_value(written, RUNNING) {
         Some(time) => {
             table.push(["create, container runs", ours, &digits(time), "", ""]);
             bar("container runs", "cloudroid's engine", time);
-            for (peer, other) in beside(written, RUNNING) {
+            for (peer, other) in find_floors(written, RUNNING) {
                 table.push(["create, container runs", peer, &digits(other), "", ""]);
                 bar("container runs", peer, other);
-                section.findings.push(compared(peer, time, other));
+                section.findings.push(comparison_finding(peer, time, other));
             }
         }
-        None => lacks(section, RUNNING),
+        None => add_missing_figure(section, RUNNING),
     }
     section.tables.push(table);
-    // One each: together they are more than there are colours.
+    // Two figures, because one would need more colours than there are.
     for (id, group) in [
         ("overhead-served", "robot served"),
         ("overhead-starts", "container runs"),
     ] {
         let of = bars.iter().filter(|bar| bar.group == group);
         let of: Vec<Bar> = of.cloned().collect();
-        section.drawing(
+        section.add_drawing(
             id,
             format!("Start times: {group}"),
             plots::bars("start times", "start time (ms)", &of, true)?,
@@ -177,15 +190,15 @@ fn starts(section: &mut Section, measured: &Measured<Written>) -> Result<()> {
     Ok(())
 }
 
-fn lacks(section: &mut Section, figure: &str) {
-    section.missing.push(Missing::new(
+fn add_missing_figure(section: &mut Section, figure: &str) {
+    section.missing.push(MissingMeasurement::new(
         figure,
         "the benchmark did not write it",
         "look at what it printed",
     ));
 }
 
-fn compared(peer: &str, ours: f64, theirs: f64) -> String {
+fn comparison_finding(peer: &str, ours: f64, theirs: f64) -> String {
     let times = ratio(Some(ours / theirs));
     let (ours_told, theirs_told) = (digits(ours), digits(theirs));
     let why = if ours > theirs {
@@ -194,7 +207,8 @@ fn compared(peer: &str, ours: f64, theirs: f64) -> String {
         ""
     };
     format!(
-        "cloudroid's engine has a container running in {ours_told} ms, {times} times as long as {peer} ({theirs_told} ms){why}."
+        "cloudroid's engine has a container running in {ours_told} ms, {times} times as long as {peer} ({theirs_told} \
+         ms){why}."
     )
 }
 
@@ -203,14 +217,18 @@ const LINK: &str = "String there and back over the link: p50";
 const SECURE: &str = "String there and back, TLS and policy";
 const DIRECT: &str = "TCPROS, no hop between";
 
-fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Written>) {
-    let portal = needed(section, "round trips by the portal", portal);
-    let link = needed(section, "round trips by the link", link);
+fn add_round_trips(
+    section: &mut Section,
+    portal: &CachedResult<BenchOutput>,
+    link: &CachedResult<BenchOutput>,
+) {
+    let portal = require_measured(section, "round trips by the portal", portal);
+    let link = require_measured(section, "round trips by the link", link);
     let [p50, p99] = ["p50", "p99"].map(|quantile| format!("{TRIP}, {quantile}"));
-    let none = Written::default();
+    let none = BenchOutput::default();
     let written = portal.unwrap_or(&none);
     let other = |figure: &str, way: &str| {
-        let mut all = beside(written, figure);
+        let mut all = find_floors(written, figure);
         all.find(|(peer, _)| *peer == way).map(|(_, time)| time)
     };
     let direct = other(&p50, DIRECT);
@@ -225,7 +243,7 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
         ],
     );
     let mut row = |way: &str, median: Option<f64>, late: Option<f64>| {
-        let told = |time: Option<f64>| known(time, digits);
+        let told = |time: Option<f64>| or_dash(time, digits);
         let both = median.zip(direct);
         table.push([
             way.to_owned(),
@@ -246,12 +264,16 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
         ] {
             row(name, other(&p50, way), other(&p99, way));
         }
-        row("portal, JSON", value(written, &p50), value(written, &p99));
+        row(
+            "portal, JSON",
+            find_value(written, &p50),
+            find_value(written, &p99),
+        );
         let secure = ["p50", "p99"].map(|quantile| format!("{SECURE}, {quantile}"));
         row(
             "portal, JSON, TLS, a robot's token and its rights",
-            value(written, &secure[0]),
-            value(written, &secure[1]),
+            find_value(written, &secure[0]),
+            find_value(written, &secure[1]),
         );
         row(
             "rosbridge_suite, JSON",
@@ -260,8 +282,8 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
         );
     }
     if let Some(link) = link {
-        row("stub and link", value(link, LINK), None);
-        for (peer, time) in beside(link, LINK) {
+        row("stub and link", find_value(link, LINK), None);
+        for (peer, time) in find_floors(link, LINK) {
             row(&format!("{peer}, in the link's run"), Some(time), None);
         }
     }
@@ -271,7 +293,7 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
             .differs
             .push(format!("{SUITE} was not measured: {}.", one.why));
     }
-    if let Some((ours, direct)) = value(written, &p50).zip(direct) {
+    if let Some((ours, direct)) = find_value(written, &p50).zip(direct) {
         let relay = other(&p50, "byte relay").map_or_else(String::new, |relay| {
             format!(
                 "; a process that only moves the bytes adds {} µs",
@@ -284,9 +306,10 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
             digits(direct)
         ));
     }
-    if let Some((ours, direct)) = link.and_then(|link| value(link, LINK)).zip(direct) {
+    if let Some((ours, direct)) = link.and_then(|link| find_value(link, LINK)).zip(direct) {
         section.findings.push(format!(
-            "Stub and link add {} µs: two connections more, from the robot's node to the stub and from there to the server.",
+            "Stub and link add {} µs: two connections more, from the robot's node to the stub and from there to the \
+             server.",
             digits(ours - direct)
         ));
     }
@@ -295,42 +318,44 @@ fn trips(section: &mut Section, portal: &Measured<Written>, link: &Measured<Writ
 #[cfg(test)]
 mod tests {
     use super::*;
-    use bench_report::Report;
+    use bench_report::BenchReport;
 
-    fn written(report: &Report) -> Measured<Written> {
+    fn bench_output(report: &BenchReport) -> CachedResult<BenchOutput> {
         let text = serde_json::to_string(report).expect("JSON");
-        Measured::Done(serde_json::from_str(&text).expect("what a benchmark writes"))
+        CachedResult::Done(serde_json::from_str(&text).expect("what a benchmark writes"))
     }
 
-    fn runs() -> Runs {
-        let mut starts = Report::new("servant");
+    fn test_runs() -> OverheadRuns {
+        let mut starts = BenchReport::new("servant");
         for (figure, time) in SERVED.map(|one| one.0).into_iter().zip([10.0, 40.0, 2.0]) {
             starts.figure(figure, "ms", time);
         }
         starts.figure(NODE, "ms", 8.0);
         for (peer, time) in [("crun", 20.0), ("podman", 100.0)] {
-            starts.figure(RUNNING, "ms", 25.0).beside(peer, time);
+            starts.figure(RUNNING, "ms", 25.0).relative_to(peer, time);
         }
-        let mut portal = Report::new("portal");
+        let mut portal = BenchReport::new("portal");
         for (quantile, time) in [("p50", 60.0), ("p99", 90.0)] {
             let name = format!("{TRIP}, {quantile}");
-            portal.figure(&name, "µs", time).beside("byte relay", 50.0);
-            portal.figure(&name, "µs", time).beside(DIRECT, 40.0);
+            portal
+                .figure(&name, "µs", time)
+                .relative_to("byte relay", 50.0);
+            portal.figure(&name, "µs", time).relative_to(DIRECT, 40.0);
         }
-        portal.left_out(SUITE, "it is not packaged");
-        let mut link = Report::new("link");
+        portal.skip(SUITE, "it is not packaged");
+        let mut link = BenchReport::new("link");
         let portals = "a client of the portal, JSON";
-        link.figure(LINK, "µs", 80.0).beside(portals, 64.0);
-        Runs {
-            starts: written(&starts),
-            portal: written(&portal),
-            link: written(&link),
+        link.figure(LINK, "µs", 80.0).relative_to(portals, 64.0);
+        OverheadRuns {
+            starts: bench_output(&starts),
+            portal: bench_output(&portal),
+            link: bench_output(&link),
         }
     }
 
     #[test]
     fn start_times_stand_beside_the_published_one_and_the_peers() {
-        let section = section(&runs()).expect("it is drawn");
+        let section = section(&test_runs()).expect("it is drawn");
         assert!(section.missing.is_empty(), "{:?}", section.missing);
         let rows = &section.tables[0].rows;
         assert_eq!(rows[0][2..], ["10.0", "> 5000", "more than 500"]);
@@ -344,7 +369,7 @@ mod tests {
 
     #[test]
     fn what_is_added_is_the_difference_to_raw_tcpros() {
-        let section = section(&runs()).expect("it is drawn");
+        let section = section(&test_runs()).expect("it is drawn");
         let rows = &section.tables[1].rows;
         assert_eq!(rows[0], ["raw TCPROS", "40.0", "40.0", "0.00", "1.0"]);
         assert_eq!(rows[3], ["portal, JSON", "60.0", "90.0", "20.0", "1.5"]);
@@ -356,12 +381,12 @@ mod tests {
 
     #[test]
     fn what_did_not_run_is_named() {
-        let mut runs = runs();
-        runs.starts = Measured::Missing("it is not built".to_owned());
-        runs.portal = written(&Report::new("portal"));
-        let mut link = Report::new("link");
-        link.left_out("a part", "no time");
-        runs.link = written(&link);
+        let mut runs = test_runs();
+        runs.starts = CachedResult::Missing("it is not built".to_owned());
+        runs.portal = bench_output(&BenchReport::new("portal"));
+        let mut link = BenchReport::new("link");
+        link.skip("a part", "no time");
+        runs.link = bench_output(&link);
         let section = section(&runs).expect("it is drawn");
         let missing: Vec<&str> = section
             .missing

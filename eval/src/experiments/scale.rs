@@ -1,5 +1,6 @@
-//! Experiment 10: one robot to a hundred on one node, each with a servant of its own: how long servants take to start, response times,
-//! what each robot costs, where it bends, and how many nodes more robots would need.
+//! Experiment 10: one to a hundred robots on one node, each with a servant of its own: start times of servants,
+//! response times, cost per robot, the load at which response times rise, and the number of nodes that more robots
+//! would need.
 
 mod counters;
 mod tell;
@@ -11,20 +12,20 @@ use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 use support::robot::Robot;
 
-use crate::cells::{Cells, Measured};
-use crate::experiments::crowd::{self, Controller, SHORT, Yard};
+use crate::cells::{CachedResult, RunCache};
+use crate::experiments::crowd::{self, Controller, CrowdDaemon, SHORT};
 use crate::statistics::Xorshift;
-use counters::{Cores, Counters, available_memory};
+use counters::{CoreUsage, TimeCounters, available_memory};
 
 pub use tell::section;
 
-/// Seconds for which a robot pauses between an answer and its next request, on average; the pauses are exponentially distributed, so
-/// that robots do not keep step.
+/// Mean pause in seconds between an answer and the robot's next request; pauses are exponentially distributed, so that
+/// robots do not synchronize.
 const THINK: f64 = 0.2;
 
-/// What a point depends on.
+/// Inputs of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-struct Plan {
+struct ScalePlan {
     robots: usize,
     settles: f64,
     lasts: f64,
@@ -33,39 +34,39 @@ struct Plan {
     cores: f64,
 }
 
-/// So many robots at once.
+/// Measurements with a number of robots.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-struct Point {
-    /// The how many-th robot of the node, and the seconds from connecting until its servant had answered a first call; none of the
-    /// others asked meanwhile.
+struct ScalePoint {
+    /// Number of each robot that was added, and the seconds from its connection until its servant had answered a first
+    /// call, without calls of the others meanwhile.
     starts: Vec<(usize, f64)>,
-    /// Of all requests, seconds.
+    /// Response times of all requests, in seconds.
     times: Vec<f64>,
     /// Seconds in which they were made.
     lasted: f64,
     /// Cores that were used meanwhile.
-    used: Cores,
-    /// Memory of the servants' control groups, bytes.
+    used: CoreUsage,
+    /// Memory of the servants' cgroups, in bytes.
     servants_memory: f64,
-    /// Memory that the machine has less than before the first robot, bytes.
+    /// Decrease of the machine's available memory since before the first robot, in bytes.
     taken: f64,
-    /// Memory that is left, and all, bytes.
+    /// Available memory and total memory, in bytes.
     left: (f64, f64),
-    /// Servants of this kind for which the daemon makes room on this machine.
+    /// Number of such servants that the daemon admits on this machine.
     admits: u64,
 }
 
-/// All points, in the order of their robots.
-pub struct Runs(Vec<(Plan, Measured<Point>)>);
+/// Results of all points, ordered by number of robots.
+pub struct ScaleRuns(Vec<(ScalePlan, CachedResult<ScalePoint>)>);
 
-/// Robots that are connected, and what the machine had before they came.
-struct Crowd {
+/// Connected robots, and the machine's state before they connected.
+struct ConnectedRobots {
     robots: Vec<Robot>,
     available: f64,
 }
 
-/// Measures it; few robots for a short time where `quick`.
-pub fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
+/// Measures all points; with `quick`, few robots for a short time.
+pub fn measure(cells: &RunCache, yard: &mut CrowdDaemon, quick: bool) -> Result<ScaleRuns> {
     let numbers: &[usize] = if quick {
         &[1, 2, 4]
     } else {
@@ -75,7 +76,7 @@ pub fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
     let mut crowd = None;
     let mut points = Vec::new();
     for robots in numbers.iter().copied() {
-        let plan = Plan {
+        let plan = ScalePlan {
             robots,
             settles,
             lasts,
@@ -84,37 +85,41 @@ pub fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
             cores: crowd::cores(),
         };
         let measured = cells.measure(&format!("scale {robots}"), &plan, || {
-            // Robots of the point before stay; where it failed, all come anew.
+            // Robots of the previous point stay; after a failure all of them reconnect.
             let mut here = match crowd.take() {
                 Some(here) => here,
-                None => gathers(yard)?,
+                None => gather(yard)?,
             };
-            let point = point(yard.open(Controller::Off)?, &mut here, &plan)?;
+            let point = measure_point(yard.open(Controller::Off)?, &mut here, &plan)?;
             crowd = Some(here);
             Ok(point)
         })?;
         points.push((plan, measured));
     }
-    Ok(Runs(points))
+    Ok(ScaleRuns(points))
 }
 
-fn gathers(yard: &mut Yard) -> Result<Crowd> {
-    let daemon = yard.cleared(Controller::Off)?;
-    crowd::publishes(daemon, SHORT)?;
-    Ok(Crowd {
+fn gather(yard: &mut CrowdDaemon) -> Result<ConnectedRobots> {
+    let daemon = yard.without_servants(Controller::Off)?;
+    crowd::publish(daemon, SHORT)?;
+    Ok(ConnectedRobots {
         robots: Vec::new(),
         available: available_memory()?.0,
     })
 }
 
-fn point(daemon: &Daemon, crowd: &mut Crowd, plan: &Plan) -> Result<Point> {
+fn measure_point(
+    daemon: &Daemon,
+    crowd: &mut ConnectedRobots,
+    plan: &ScalePlan,
+) -> Result<ScalePoint> {
     let mut starts = Vec::new();
     while crowd.robots.len() < plan.robots {
         let number = crowd.robots.len() + 1;
         let asked = Instant::now();
         let answered = || -> Result<Robot> {
-            let mut robot = crowd::joins(daemon, SHORT, &format!("r{number}"), "")?;
-            crowd::call(&mut robot)?;
+            let mut robot = crowd::join(daemon, SHORT, &format!("r{number}"), "")?;
+            crowd::time_call(&mut robot)?;
             Ok(robot)
         };
         let robot = answered().with_context(|| format!("the servant of robot {number}"))?;
@@ -123,9 +128,9 @@ fn point(daemon: &Daemon, crowd: &mut Crowd, plan: &Plan) -> Result<Point> {
     }
     let left = available_memory()?;
     let servants_memory = crowd::usage(daemon, SHORT)?.1;
-    let (times, used, lasted) = asks(daemon, &mut crowd.robots, plan)?;
+    let (times, used, lasted) = ask(daemon, &mut crowd.robots, plan)?;
     ensure!(!times.is_empty(), "no request was answered in time");
-    Ok(Point {
+    Ok(ScalePoint {
         starts,
         times,
         lasted,
@@ -133,12 +138,17 @@ fn point(daemon: &Daemon, crowd: &mut Crowd, plan: &Plan) -> Result<Point> {
         servants_memory,
         taken: crowd.available - left.0,
         left,
-        admits: admits(daemon, plan.robots)?,
+        admits: admission_limit(daemon, plan.robots)?,
     })
 }
 
-/// All robots ask, each in a thread that mostly sleeps: times of the requests, cores that were used, and seconds in which that was.
-fn asks(daemon: &Daemon, robots: &mut [Robot], plan: &Plan) -> Result<(Vec<f64>, Cores, f64)> {
+/// Has all robots make calls, each on a thread that mostly sleeps; returns the response times, the cores used, and the
+/// duration in seconds.
+fn ask(
+    daemon: &Daemon,
+    robots: &mut [Robot],
+    plan: &ScalePlan,
+) -> Result<(Vec<f64>, CoreUsage, f64)> {
     let from = Instant::now() + Duration::from_secs_f64(plan.settles);
     let to = from + Duration::from_secs_f64(plan.lasts);
     std::thread::scope(|scope| {
@@ -148,24 +158,24 @@ fn asks(daemon: &Daemon, robots: &mut [Robot], plan: &Plan) -> Result<(Vec<f64>,
             .map(|(robot, seed)| {
                 scope.spawn(move || {
                     let mut random = Xorshift::new(seed);
-                    crowd::calls(robot, (from, to), || random.exponential(plan.think))
+                    crowd::time_calls(robot, (from, to), || random.exponential(plan.think))
                 })
             })
             .collect();
         std::thread::sleep(from.saturating_duration_since(Instant::now()));
-        let (before, begun) = (Counters::now(daemon)?, Instant::now());
+        let (before, begun) = (TimeCounters::read(daemon)?, Instant::now());
         std::thread::sleep(to.saturating_duration_since(Instant::now()));
-        let (after, lasted) = (Counters::now(daemon)?, begun.elapsed().as_secs_f64());
+        let (after, lasted) = (TimeCounters::read(daemon)?, begun.elapsed().as_secs_f64());
         let mut times = Vec::new();
         for robot in asking {
             times.extend(robot.join().ok().context("a robot's thread broke")??);
         }
-        Ok((times, after.since(&before, lasted), plan.lasts))
+        Ok((times, after.cores_since(&before, lasted), plan.lasts))
     })
 }
 
-/// How many servants like these the daemon promises room, by what it reserves for each.
-fn admits(daemon: &Daemon, robots: usize) -> Result<u64> {
+/// Returns how many servants of this kind the daemon admits, given what it reserves for each.
+fn admission_limit(daemon: &Daemon, robots: usize) -> Result<u64> {
     let status = daemon.api("/api/v1/status")?;
     let number = |key: &str| {
         let value = status["capacity"][key].as_f64();

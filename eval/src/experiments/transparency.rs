@@ -1,4 +1,5 @@
-//! Experiment 1: packages answer the same on the robot and through the stub, and nothing of the robot's application is changed for it.
+//! Experiment 1: packages give the same answers on the robot and through the stub, and the robot's application is not
+//! modified.
 
 use std::collections::BTreeMap;
 
@@ -7,55 +8,58 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::application;
-use crate::cells::{Cells, Measured};
-use crate::examples::{ALL, DISPARITY, Example, LASER_SLAM, Origin, PEOPLE, Where, Workshop};
-use crate::place::{Class, Network, Place};
-use crate::robot::Pace;
-use crate::section::{Missing, Section, Table};
-use crate::trace::{Grid, Trace};
+use crate::cells::{CachedResult, RunCache};
+use crate::examples::{
+    ALL, DISPARITY, EvalFixtures, EvalPackage, ExecutionSite, LASER_SLAM, Origin, PEOPLE,
+};
+use crate::place::{NetworkProfile, RobotHardware, RobotSandbox};
+use crate::robot::RequestPacing;
+use crate::section::{MissingMeasurement, Section, Table};
+use crate::trace::{MapGrid, Trace};
 use crate::words::digits;
 
-/// A robot that is not slowed down: what is compared is what is answered, not when.
-const FAST: Class = Class {
+/// A fast robot, because answers are compared and not times.
+const FAST: RobotHardware = RobotHardware {
     cores: 1.0,
     memory: 4 << 30,
 };
-/// Runs on the robot, which tell how much a package differs from run to run by itself, and those of a quick evaluation.
+/// Number of runs on the robot, which show the variation of a package between its own runs; and that of a quick
+/// evaluation.
 const NATIVES: [usize; 2] = [3, 2];
-/// Seconds of the drive that `rosbag play` plays, and of a quick evaluation.
+/// Seconds of the drive that `rosbag play` plays; and those of a quick evaluation.
 const PLAYED: [f64; 2] = [20.0, 4.0];
 
-/// One package, some times on the robot and once through the stub.
+/// Runs of one package: several on the robot and one through the stub.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Compared {
+pub struct ComparedRuns {
     natives: Vec<Trace>,
     outsourced: Trace,
     /// Files of the robot's application, with their SHA-256 before and after.
     application: Vec<(String, String, String)>,
 }
 
-/// By package, and by application.
-pub struct Runs {
-    compared: Vec<(Pair, Measured<Compared>)>,
+/// Results by package and application.
+pub struct TransparencyRuns {
+    compared: Vec<(ComparedPair, CachedResult<ComparedRuns>)>,
 }
 
-/// What asks what.
+/// A package, and the application that uses it.
 #[derive(Debug, Clone, PartialEq)]
-struct Pair {
+struct ComparedPair {
     package: String,
-    application: Application,
+    application: RobotApplication,
 }
 
-/// The robot's own program.
+/// Application of the robot.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Application {
-    /// Of this evaluation.
+enum RobotApplication {
+    /// The node of this evaluation.
     Own,
-    /// `rosbag play` and `rosbag record`, as Debian packages them.
+    /// `rosbag play` and `rosbag record` of Debian.
     Rosbag,
 }
 
-impl Application {
+impl RobotApplication {
     fn name(self) -> &'static str {
         match self {
             Self::Own => "the evaluation's node",
@@ -63,7 +67,7 @@ impl Application {
         }
     }
 
-    /// Files, and their SHA-256.
+    /// Returns its files with their SHA-256.
     fn checksums(self) -> Result<Vec<(String, String)>> {
         match self {
             Self::Rosbag => application::checksums(),
@@ -76,18 +80,24 @@ impl Application {
     }
 }
 
-/// Measures them; a quick evaluation two packages, with so many requests each at the most.
-pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Result<Runs> {
+/// Measures all packages; a quick evaluation measures two, with at most `most` requests each.
+pub fn measure(
+    cells: &RunCache,
+    workshop: &EvalFixtures,
+    most: Option<usize>,
+) -> Result<TransparencyRuns> {
     let mut compared = Vec::new();
-    // Of each origin one shows that it works.
+    // One package of each origin shows that everything works.
     let own = match most {
         Some(_) => vec![LASER_SLAM, DISPARITY],
         None => [&ALL[..], &[PEOPLE, DISPARITY]].concat(),
     };
-    let own = own.into_iter().map(|example| (example, Application::Own));
-    for (example, application) in own.chain([(LASER_SLAM, Application::Rosbag)]) {
-        let pair = Pair {
-            package: title(&example),
+    let own = own
+        .into_iter()
+        .map(|example| (example, RobotApplication::Own));
+    for (example, application) in own.chain([(LASER_SLAM, RobotApplication::Rosbag)]) {
+        let pair = ComparedPair {
+            package: package_title(&example),
             application,
         };
         let name = format!("transparency {} {}", example.name, application.name());
@@ -95,15 +105,17 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
         let seconds = PLAYED[usize::from(most.is_some())];
         let times = NATIVES[usize::from(most.is_some())];
         let measured = cells.measure(&name, &(requests, seconds, times), || {
-            workshop.publishes(&example)?;
+            workshop.publish(&example)?;
             let before = application.checksums()?;
-            let run = |at: Where| one(workshop, &example, at, application, (requests, seconds));
-            let natives = (0..times).map(|_| run(Where::Native));
+            let run = |at: ExecutionSite| {
+                run_once(workshop, &example, at, application, (requests, seconds))
+            };
+            let natives = (0..times).map(|_| run(ExecutionSite::Native));
             let natives = natives.collect::<Result<_>>()?;
-            let outsourced = run(Where::Outsourced)?;
+            let outsourced = run(ExecutionSite::Outsourced)?;
             let after = application.checksums()?.into_iter();
             let application = before.into_iter().zip(after);
-            Ok(Compared {
+            Ok(ComparedRuns {
                 natives,
                 outsourced,
                 application: application
@@ -113,52 +125,52 @@ pub fn measure(cells: &Cells, workshop: &Workshop, most: Option<usize>) -> Resul
         })?;
         compared.push((pair, measured));
     }
-    Ok(Runs { compared })
+    Ok(TransparencyRuns { compared })
 }
 
-/// What the report calls a package.
-fn title(example: &Example) -> String {
+/// Returns a package's name in the report.
+fn package_title(example: &EvalPackage) -> String {
     match example.origin {
         Origin::Checkout => example.name.to_owned(),
         Origin::Debian => format!("{}/{} of Debian", example.name, example.executable),
     }
 }
 
-fn one(
-    workshop: &Workshop,
-    example: &Example,
-    at: Where,
-    application: Application,
+fn run_once(
+    workshop: &EvalFixtures,
+    example: &EvalPackage,
+    at: ExecutionSite,
+    application: RobotApplication,
     (requests, seconds): (usize, f64),
 ) -> Result<Trace> {
     let directory = workshop.directory()?;
     let mut plan = workshop.plan(example, at, directory.path())?;
     plan.most = requests;
-    if application == Application::Rosbag {
-        plan.pace = Pace::Played(seconds);
+    if application == RobotApplication::Rosbag {
+        plan.pace = RequestPacing::Played(seconds);
     }
-    let place = Place::new(&workshop.daemon.address, FAST, Network::Lan)?;
-    Ok(place.runs(&plan, directory.path())?.0)
+    let place = RobotSandbox::new(&workshop.daemon.address, FAST, NetworkProfile::Lan)?;
+    Ok(place.run(&plan, directory.path())?.0)
 }
 
-/// How much runs differ.
+/// Differences between runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Difference {
-    /// Requests that both of two runs answered.
+    /// Requests that both runs answered.
     both: usize,
-    /// Those of them whose answers were equal to the byte.
+    /// Answers among them that are equal byte by byte.
     equal: usize,
-    /// Those of lists of boxes whose boxes were equal, in whatever order; none of other answers.
+    /// Answers among them with equal boxes in any order, for answers that are lists of boxes; `None` for other answers.
     boxes: Option<usize>,
-    /// The largest distance of positions, metres.
+    /// Largest distance between positions, in metres.
     distance: Option<f64>,
-    /// The largest share of a map's cells that differ.
+    /// Largest fraction of a map's cells that differ.
     map: Option<f64>,
 }
 
 impl Difference {
-    fn of(one: &Trace, other: &Trace) -> Self {
-        // By the stamps: a robot that plays by itself need not hear every answer.
+    fn compare(one: &Trace, other: &Trace) -> Self {
+        // Matched by stamp, because a robot that plays at its own rate may not get every answer.
         let key = |stamp: f64| (stamp * 1e6).round() as i64;
         let others: BTreeMap<i64, _> = other
             .requests
@@ -166,7 +178,11 @@ impl Difference {
             .map(|one| (key(one.stamp), one))
             .collect();
         let mut found = Self {
-            map: one.map.as_ref().zip(other.map.as_ref()).map(cells_differ),
+            map: one
+                .map
+                .as_ref()
+                .zip(other.map.as_ref())
+                .map(differing_cells),
             ..Self::default()
         };
         for one in &one.requests {
@@ -189,8 +205,8 @@ impl Difference {
         found
     }
 
-    /// Of all these together.
-    fn sum(all: impl Iterator<Item = Self>) -> Self {
+    /// Combines several comparisons.
+    fn combine(all: impl Iterator<Item = Self>) -> Self {
         all.fold(Self::default(), |sum, one| Self {
             both: sum.both + one.both,
             equal: sum.equal + one.equal,
@@ -203,17 +219,18 @@ impl Difference {
         })
     }
 
-    /// Of pairs of these runs.
-    fn among(runs: &[Trace]) -> Self {
+    /// Compares all pairs of runs.
+    fn compare_pairs(runs: &[Trace]) -> Self {
         let pairs = runs.iter().enumerate();
-        Self::sum(
-            pairs
-                .flat_map(|(at, one)| runs[at + 1..].iter().map(move |other| Self::of(one, other))),
-        )
+        Self::combine(pairs.flat_map(|(at, one)| {
+            runs[at + 1..]
+                .iter()
+                .map(move |other| Self::compare(one, other))
+        }))
     }
 
-    /// No more than that.
-    fn within(self, own: Self) -> bool {
+    /// Returns whether these differences do not exceed `own`.
+    fn is_within(self, own: Self) -> bool {
         let share = |of: Self| of.equal as f64 / of.both.max(1) as f64;
         share(self) >= share(own)
             && self.distance.unwrap_or(0.0) <= own.distance.unwrap_or(0.0)
@@ -228,8 +245,8 @@ fn largest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
     }
 }
 
-/// The share of cells that differ; all of them where the maps are of different places or sizes.
-fn cells_differ((one, other): (&Grid, &Grid)) -> f64 {
+/// Returns the fraction of cells that differ; 1 if the maps differ in position or size.
+fn differing_cells((one, other): (&MapGrid, &MapGrid)) -> f64 {
     let same = (one.width, one.height, one.origin) == (other.width, other.height, other.origin);
     if !same || one.cells.is_empty() {
         return 1.0;
@@ -239,23 +256,32 @@ fn cells_differ((one, other): (&Grid, &Grid)) -> f64 {
     differ as f64 / one.cells.len() as f64
 }
 
-/// What the report says.
-pub fn section(runs: &Runs) -> Section {
+/// Creates the section of the report.
+pub fn section(runs: &TransparencyRuns) -> Section {
     let mut section = Section::new(1, "transparency", "Unmodified packages answer the same");
-    section.published = "The publication's packages and robot applications were not modified; their results are said to be the same.".to_owned();
+    section.published = "The publication's packages and robot applications were not modified; their results are said \
+        to be the same.".to_owned();
     let done = runs
         .compared
         .iter()
-        .filter_map(|(_, compared)| compared.done());
+        .filter_map(|(_, compared)| compared.value());
     let times = done
         .map(|compared| compared.natives.len())
         .max()
         .unwrap_or(0);
     section.differs = vec![
-        format!("Each package is asked the same requests {times} times on the robot, and through the stub: what the runs on the robot differ by is the package's own difference from run to run."),
-        "Two packages are Debian's own, as they are installed from there: people_detect of opencv_apps looks for pedestrians in a video of opencv-doc and answers with boxes, stereo_image_proc looks for disparities in a window that moves over a photographed plant of opencv-doc (Middlebury's Aloe). The others are those of examples/, compiled when they are pushed.".to_owned(),
-        "The robot's application is once the evaluation's own node, and once rosbag play and rosbag record as Debian packages them, which play the drive at its own rate and write the answers down; the same files run in both set-ups.".to_owned(),
-        "The order of messages of different topics is not kept by the stub's link (small ones go in turns), as ROS does not keep it: each topic has a connection of its own. A node that takes whatever odometry came last answers differently from run to run; these take that which was stamped with the scan's time.".to_owned(),
+        format!("Each package is asked the same requests {times} times on the robot, and through the stub: what the \
+            runs on the robot differ by is the package's own difference from run to run."),
+        "Two packages are Debian's own, as they are installed from there: people_detect of opencv_apps looks for \
+         pedestrians in a video of opencv-doc and answers with boxes, stereo_image_proc looks for disparities in a \
+         window that moves over a photographed plant of opencv-doc (Middlebury's Aloe). The others are those of \
+         examples/, compiled when they are pushed.".to_owned(),
+        "The robot's application is once the evaluation's own node, and once rosbag play and rosbag record as Debian \
+         packages them, which play the drive at its own rate and write the answers down; the same files run in both \
+         set-ups.".to_owned(),
+        "The order of messages of different topics is not kept by the stub's link (small ones go in turns), as ROS \
+         does not keep it: each topic has a connection of its own. A node that takes whatever odometry came last \
+         answers differently from run to run; these take that which was stamped with the scan's time.".to_owned(),
     ];
     let mut answers = Table::new(
         "Answers to the same requests",
@@ -276,9 +302,9 @@ pub fn section(runs: &Runs) -> Section {
     );
     for (pair, measured) in &runs.compared {
         let compared = match measured {
-            Measured::Done(compared) => compared,
-            Measured::Missing(why) => {
-                section.missing.push(Missing {
+            CachedResult::Done(compared) => compared,
+            CachedResult::Missing(why) => {
+                section.missing.push(MissingMeasurement {
                     what: format!("{}, asked by {}", pair.package, pair.application.name()),
                     why: why.clone(),
                     next: "run make eval again: what was measured stays".to_owned(),
@@ -288,7 +314,7 @@ pub fn section(runs: &Runs) -> Section {
         };
         let ended = compared.natives.iter().chain([&compared.outsourced]);
         for why in ended.filter_map(|trace| trace.node_ended.as_ref()) {
-            section.missing.push(Missing::new(
+            section.missing.push(MissingMeasurement::new(
                 format!(
                     "{}, asked by {}: a run to its end",
                     pair.package,
@@ -298,10 +324,11 @@ pub fn section(runs: &Runs) -> Section {
                 "look at what the node printed",
             ));
         }
-        let own = Difference::among(&compared.natives);
+        let own = Difference::compare_pairs(&compared.natives);
         let natives = compared.natives.iter();
-        let through =
-            Difference::sum(natives.map(|native| Difference::of(native, &compared.outsourced)));
+        let through = Difference::combine(
+            natives.map(|native| Difference::compare(native, &compared.outsourced)),
+        );
         let published = "published: the same, without figures".to_owned();
         for (name, difference) in [("native runs", own), ("native and stub", through)] {
             let said = |value: Option<f64>| value.map_or_else(|| "–".to_owned(), digits);
@@ -322,10 +349,11 @@ pub fn section(runs: &Runs) -> Section {
             row[2] = format!("{} ({published})", row[2]);
         });
         section.findings.push(finding(pair, own, through));
-        let late = late(&compared.natives[0], &compared.outsourced);
+        let late = count_late_answers(&compared.natives[0], &compared.outsourced);
         section.findings.extend((late > 0 && through.equal < through.both).then(|| {
             format!(
-                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. A package whose answers build on those before begins elsewhere then, and its later answers differ, too.",
+                "{}: messages at the beginning that were answered on the robot and not through the stub: {late}. A \
+                 package whose answers build on those before begins elsewhere then, and its later answers differ, too.",
                 pair.package
             )
         }));
@@ -360,8 +388,8 @@ pub fn section(runs: &Runs) -> Section {
     section
 }
 
-/// How many requests at the beginning were answered on the robot alone.
-fn late(native: &Trace, outsourced: &Trace) -> usize {
+/// Counts the requests at the beginning that were answered on the robot only.
+fn count_late_answers(native: &Trace, outsourced: &Trace) -> usize {
     let answered = outsourced.requests.iter().find(|one| one.digest.is_some());
     let Some(first) = answered.map(|one| one.stamp) else {
         return 0;
@@ -372,30 +400,34 @@ fn late(native: &Trace, outsourced: &Trace) -> usize {
         .count()
 }
 
-fn finding(pair: &Pair, own: Difference, through: Difference) -> String {
+fn finding(pair: &ComparedPair, own: Difference, through: Difference) -> String {
     let name = format!("{}, asked by {}", pair.package, pair.application.name());
     if through.both == 0 {
         return format!("{name}: nothing was answered both on the robot and through the stub.");
     }
     if through.both == through.equal {
         return format!(
-            "{name}: all {} answers that both gave, in comparisons with each run on the robot, are the same through the stub, to the byte.",
+            "{name}: all {} answers that both gave, in comparisons with each run on the robot, are the same through \
+             the stub, to the byte.",
             through.both
         );
     }
     if through.boxes == Some(through.both) {
         return format!(
-            "{name}: all {} answers that both gave, in comparisons with each run on the robot, hold the same boxes through the stub. {} of them are equal to the byte; the others have the boxes in another order, as some runs on the robot have ({} of {} equal to the byte): the package's threads find them in whatever order.",
+            "{name}: all {} answers that both gave, in comparisons with each run on the robot, hold the same boxes \
+             through the stub. {} of them are equal to the byte; the others have the boxes in another order, as some \
+             runs on the robot have ({} of {} equal to the byte): the package's threads find them in whatever order.",
             through.both, through.equal, own.equal, own.both
         );
     }
-    let words = if through.within(own) {
+    let words = if through.is_within(own) {
         "within"
     } else {
         "NOT within"
     };
     format!(
-        "{name}: {} of {} answers through the stub are equal to the byte, which is {words} what runs on the robot differ by ({} of {}).",
+        "{name}: {} of {} answers through the stub are equal to the byte, which is {words} what runs on the robot \
+         differ by ({} of {}).",
         through.equal, through.both, own.equal, own.both
     )
 }
@@ -403,14 +435,14 @@ fn finding(pair: &Pair, own: Difference, through: Difference) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trace::Request;
+    use crate::trace::RequestSample;
 
     fn trace(answers: &[(u64, f64)]) -> Trace {
-        let request = |(number, (digest, x)): (u32, &(u64, f64))| Request {
+        let request = |(number, (digest, x)): (u32, &(u64, f64))| RequestSample {
             stamp: number.into(),
             digest: Some(*digest),
             pose: Some([*x, 0.0, 0.0]),
-            ..Request::default()
+            ..RequestSample::default()
         };
         Trace {
             requests: (0..).zip(answers).map(request).collect(),
@@ -428,10 +460,10 @@ mod tests {
         }
     }
 
-    fn pair() -> Pair {
-        Pair {
+    fn pair() -> ComparedPair {
+        ComparedPair {
             package: "a".to_owned(),
-            application: Application::Rosbag,
+            application: RobotApplication::Rosbag,
         }
     }
 
@@ -439,8 +471,8 @@ mod tests {
     fn differences_are_counted_and_measured() {
         let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
         let other = trace(&[(1, 0.0), (5, 1.5), (3, 2.0)]);
-        assert_eq!(Difference::of(&one, &other), difference(3, 2, 0.5));
-        let all = Difference::among(&[one.clone(), other, one]);
+        assert_eq!(Difference::compare(&one, &other), difference(3, 2, 0.5));
+        let all = Difference::compare_pairs(&[one.clone(), other, one]);
         assert_eq!(all, difference(9, 7, 0.5));
     }
 
@@ -454,9 +486,9 @@ mod tests {
         other.requests[1].digest = Some(5);
         other.requests[2].digest = Some(6);
         other.requests[2].boxes = Some(10);
-        let found = Difference::of(&one, &other);
+        let found = Difference::compare(&one, &other);
         assert_eq!((found.both, found.equal, found.boxes), (3, 1, Some(2)));
-        let sum = Difference::sum([found, found].into_iter());
+        let sum = Difference::combine([found, found].into_iter());
         assert_eq!(sum.boxes, Some(4));
     }
 
@@ -465,23 +497,23 @@ mod tests {
         let one = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
         let mut other = one.clone();
         other.requests.remove(1);
-        assert_eq!(Difference::of(&one, &other), difference(2, 2, 0.0));
+        assert_eq!(Difference::compare(&one, &other), difference(2, 2, 0.0));
     }
 
     #[test]
     fn requests_that_only_the_robot_answered_at_first_are_counted() {
         let native = trace(&[(1, 0.0), (2, 1.0), (3, 2.0)]);
         let mut outsourced = native.clone();
-        assert_eq!(late(&native, &outsourced), 0);
+        assert_eq!(count_late_answers(&native, &outsourced), 0);
         outsourced.requests.remove(0);
-        assert_eq!(late(&native, &outsourced), 1);
+        assert_eq!(count_late_answers(&native, &outsourced), 1);
         outsourced.requests[0].digest = None;
-        assert_eq!(late(&native, &outsourced), 2);
+        assert_eq!(count_late_answers(&native, &outsourced), 2);
     }
 
     #[test]
     fn cells_that_differ_are_a_share_of_all() {
-        let map = |cells: &[i8]| Grid {
+        let map = |cells: &[i8]| MapGrid {
             width: 2,
             height: 2,
             resolution: 0.1,
@@ -489,12 +521,12 @@ mod tests {
             cells: cells.to_vec(),
         };
         let (one, other) = (map(&[0, 100, -1, 0]), map(&[0, 100, 0, 0]));
-        assert_eq!(cells_differ((&one, &other)), 0.25);
-        let elsewhere = Grid {
+        assert_eq!(differing_cells((&one, &other)), 0.25);
+        let elsewhere = MapGrid {
             origin: [1.0, 0.0],
             ..one.clone()
         };
-        assert_eq!(cells_differ((&one, &elsewhere)), 1.0);
+        assert_eq!(differing_cells((&one, &elsewhere)), 1.0);
     }
 
     #[test]
@@ -516,14 +548,14 @@ mod tests {
 
     #[test]
     fn a_changed_application_is_told() {
-        let compared = |after: &str| Compared {
+        let compared = |after: &str| ComparedRuns {
             natives: vec![trace(&[(1, 0.0)]); 2],
             outsourced: trace(&[(1, 0.0)]),
             application: vec![("/play".to_owned(), "12".to_owned(), after.to_owned())],
         };
         let told = |after: &str| {
-            let compared = vec![(pair(), Measured::Done(compared(after)))];
-            section(&Runs { compared }).findings[1].clone()
+            let compared = vec![(pair(), CachedResult::Done(compared(after)))];
+            section(&TransparencyRuns { compared }).findings[1].clone()
         };
         assert!(told("12").contains("Not one byte"));
         assert!(told("13").contains("CHANGED"), "{}", told("13"));

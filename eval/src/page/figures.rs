@@ -1,40 +1,40 @@
-//! Figures of the page: drawings that consist of shapes stand in it as they are, all others as images.
+//! Figures of the page: drawings that consist of shapes are inlined, all others become images.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use super::{anchor, escaped, put};
-use crate::section::{Figure, Image};
+use super::{anchor, append, escape};
+use crate::section::{Figure, FigureImage};
 
-pub(super) fn picture(page: &mut String, figure: &Figure) {
+pub(super) fn render_figure(page: &mut String, figure: &Figure) {
     let anchor = anchor("figure", &figure.id);
-    let caption = escaped(&figure.caption);
-    // Maps stand side by side.
+    let caption = escape(&figure.caption);
+    // Maps are placed side by side.
     let class = match figure.image {
-        Image::Svg(_) => "",
-        Image::Png(_) => " class=\"pixels\"",
+        FigureImage::Svg(_) => "",
+        FigureImage::Png(_) => " class=\"pixels\"",
     };
-    put(page, format_args!("<figure id=\"{anchor}\"{class}>\n"));
+    append(page, format_args!("<figure id=\"{anchor}\"{class}>\n"));
     match &figure.image {
-        Image::Svg(text) => match drawing(text) {
-            Some(svg) => put(
+        FigureImage::Svg(text) => match inline_svg(text) {
+            Some(svg) => append(
                 page,
                 format_args!(
                     "<div class=\"drawing\" role=\"img\" aria-label=\"{caption}\">{svg}</div>\n"
                 ),
             ),
-            None => embed(page, "image/svg+xml", text.as_bytes(), &caption),
+            None => embed_image(page, "image/svg+xml", text.as_bytes(), &caption),
         },
-        Image::Png(bytes) => embed(page, "image/png", bytes, &caption),
+        FigureImage::Png(bytes) => embed_image(page, "image/png", bytes, &caption),
     }
-    put(
+    append(
         page,
         format_args!("<figcaption>{caption}</figcaption>\n</figure>\n"),
     );
 }
 
-fn embed(page: &mut String, kind: &str, bytes: &[u8], caption: &str) {
-    put(
+fn embed_image(page: &mut String, kind: &str, bytes: &[u8], caption: &str) {
+    append(
         page,
         format_args!(
             "<img src=\"data:{kind};base64,{}\" alt=\"{caption}\">\n",
@@ -43,9 +43,9 @@ fn embed(page: &mut String, kind: &str, bytes: &[u8], caption: &str) {
     );
 }
 
-/// The element of an SVG document that consists of shapes and text alone, as ours do. Any other becomes an image, in
-/// which a browser runs and fetches nothing.
-fn drawing(text: &str) -> Option<&str> {
+/// Returns the `svg` element of a document that consists of shapes and text only, as ours do. Any other document
+/// becomes an image, in which a browser neither runs nor loads anything.
+fn inline_svg(text: &str) -> Option<&str> {
     const SHAPES: [&str; 11] = [
         "svg", "g", "rect", "circle", "ellipse", "line", "polyline", "polygon", "path", "text",
         "tspan",
@@ -60,7 +60,7 @@ fn drawing(text: &str) -> Option<&str> {
         let name = tag.trim_matches('/').split_whitespace().next()?;
         let whole = !tag.contains('\'') && tag.matches('"').count() % 2 == 0;
         let outside = number > 0 && depth == 0;
-        if !SHAPES.contains(&name) || !whole || outside || tag.split('=').any(acts) {
+        if !SHAPES.contains(&name) || !whole || outside || tag.split('=').any(is_active_attribute) {
             return None;
         }
         if tag.starts_with('/') {
@@ -72,8 +72,8 @@ fn drawing(text: &str) -> Option<&str> {
     (depth == 0).then_some(svg)
 }
 
-/// Whether what stands before a `=` ends with the name of an attribute that runs or fetches something.
-fn acts(before: &str) -> bool {
+/// Returns whether the text before a `=` ends with the name of an attribute that runs or loads something.
+fn is_active_attribute(before: &str) -> bool {
     let name = before
         .trim_end()
         .rsplit(|character: char| !character.is_ascii_alphanumeric())

@@ -1,13 +1,16 @@
-//! How the page looks.
+//! Style sheet of the page.
 
-/// Light and dark as the reader's system is. Drawings keep their white ground.
+/// Light or dark, following the reader's system. Drawings keep a white background.
 pub(super) const STYLE: &str = "\
-:root { color-scheme: light dark; --ground: #fff; --ink: #1b1f24; --quiet: #57606a; --line: #d0d7de; --box: #f6f8fa; --link: #0550ae; --warn: #b35900; }
+:root { color-scheme: light dark; --ground: #fff; --ink: #1b1f24; --quiet: #57606a; --line: #d0d7de; --box: #f6f8fa; \
+--link: #0550ae; --warn: #b35900; }
 @media (prefers-color-scheme: dark) {
-  :root { --ground: #14171c; --ink: #e6e8eb; --quiet: #9aa4b0; --line: #3a424c; --box: #1d2229; --link: #7db8ff; --warn: #e69f00; }
+  :root { --ground: #14171c; --ink: #e6e8eb; --quiet: #9aa4b0; --line: #3a424c; --box: #1d2229; --link: #7db8ff; \
+  --warn: #e69f00; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 64rem; padding: 1rem; background: var(--ground); color: var(--ink); font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: break-word; }
+body { margin: 0 auto; max-width: 64rem; padding: 1rem; background: var(--ground); color: var(--ink); font: 1rem/1.5 \
+system-ui, sans-serif; overflow-wrap: break-word; }
 h1 { font-size: 1.6rem; line-height: 1.25; }
 h2 { font-size: 1.3rem; line-height: 1.3; margin-top: 2.5rem; }
 h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
@@ -22,7 +25,8 @@ main > section { border-top: 1px solid var(--line); }
 .table { overflow-x: auto; margin: 0.75rem 0 1.25rem; }
 table { border-collapse: collapse; font-size: 0.9rem; }
 caption { text-align: left; padding-bottom: 0.25rem; }
-th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.75rem 0.3rem 0; text-align: left; vertical-align: top; min-width: 4rem; overflow-wrap: normal; }
+th, td { border-bottom: 1px solid var(--line); padding: 0.3rem 0.75rem 0.3rem 0; text-align: left; vertical-align: \
+top; min-width: 4rem; overflow-wrap: normal; }
 thead th { background: var(--box); }
 tbody th { font-weight: normal; }
 .number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }

@@ -1,24 +1,25 @@
-//! Tables of the page, whose columns of numbers are aligned to the right.
+//! Tables of the page, with columns of numbers aligned to the right.
 
-use super::{escaped, put};
+use super::{append, escape};
 use crate::section::Table;
 
-/// A cell that is read as a number.
+/// Returns whether a cell is a number.
 fn is_number(cell: &str) -> bool {
     let digits = cell.trim_start_matches(['-', '−', '+', '<', '>', '≤', '≥', '~', ' ']);
     digits.starts_with(|first: char| first.is_ascii_digit())
 }
 
-/// The box can be scrolled by keyboard, too, because it can have the focus.
-pub(super) fn tabulate(page: &mut String, table: &Table) {
-    put(
+/// Renders a table. Its box can receive the focus, so that it can be scrolled by keyboard.
+pub(super) fn render_table(page: &mut String, table: &Table) {
+    append(
         page,
         format_args!(
-            "<div class=\"table\" role=\"region\" tabindex=\"0\" aria-label=\"{caption}\">\n<table>\n<caption>{caption}</caption>\n<thead><tr>",
-            caption = escaped(&table.caption)
+            "<div class=\"table\" role=\"region\" tabindex=\"0\" \
+             aria-label=\"{caption}\">\n<table>\n<caption>{caption}</caption>\n<thead><tr>",
+            caption = escape(&table.caption)
         ),
     );
-    // A column is aligned to the right if every cell that says something is a number.
+    // A column is right-aligned if all its non-empty cells are numbers.
     let numbers: Vec<bool> = (0..table.head.len())
         .map(|column| {
             let cells = table.rows.iter().filter_map(|row| row.get(column));
@@ -31,26 +32,26 @@ pub(super) fn tabulate(page: &mut String, table: &Table) {
         _ => "",
     };
     for (column, name) in table.head.iter().enumerate() {
-        put(
+        append(
             page,
-            format_args!("<th scope=\"col\"{}>{}</th>", class(column), escaped(name)),
+            format_args!("<th scope=\"col\"{}>{}</th>", class(column), escape(name)),
         );
     }
     page.push_str("</tr></thead>\n<tbody>\n");
     for row in &table.rows {
         page.push_str("<tr>");
         for (column, cell) in row.iter().enumerate() {
-            let cell = escaped(cell);
+            let cell = escape(cell);
             if column == 0 {
-                put(page, format_args!("<th scope=\"row\">{cell}</th>"));
+                append(page, format_args!("<th scope=\"row\">{cell}</th>"));
             } else {
-                put(page, format_args!("<td{}>{cell}</td>", class(column)));
+                append(page, format_args!("<td{}>{cell}</td>", class(column)));
             }
         }
         page.push_str("</tr>\n");
     }
     if table.rows.is_empty() {
-        put(
+        append(
             page,
             format_args!(
                 "<tr><td colspan=\"{}\">nothing was measured</td></tr>\n",

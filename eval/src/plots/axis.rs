@@ -1,30 +1,30 @@
-//! An axis: where a value stands, and which values are marked.
+//! An axis: positions of values, and tick marks.
 
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 use std::ops::Range;
 
-/// Marks on an axis, about.
+/// Approximate number of marks on an axis.
 const MARKS: f64 = 6.0;
-/// Of the range, empty on both sides.
+/// Margin on both sides, as a fraction of the range.
 const MARGIN: f64 = 0.04;
 
-/// A linear or logarithmic axis. Positions are values, or their decimal logarithms.
+/// A linear or logarithmic axis. Positions are values or their decimal logarithms.
 #[derive(Clone)]
 pub(super) struct Axis {
     log: bool,
-    /// Position of the beginning.
+    /// Position of the start.
     pub low: f64,
     /// Position of the end.
     pub high: f64,
     /// Positions of the marks.
     pub marks: Vec<f64>,
-    /// Digits after the point, of a linear axis.
+    /// Decimals of the labels on a linear axis.
     decimals: usize,
 }
 
 impl Axis {
-    /// An axis for these values; none if none of them has a place on it.
-    pub fn over(values: impl IntoIterator<Item = f64>, log: bool) -> Option<Self> {
+    /// Creates an axis for these values; `None` if it can show none of them.
+    pub fn for_values(values: impl IntoIterator<Item = f64>, log: bool) -> Option<Self> {
         let mut axis = Self {
             log,
             low: f64::INFINITY,
@@ -42,11 +42,11 @@ impl Axis {
             return None;
         }
         axis.widen();
-        Some(axis.marked())
+        Some(axis.with_marks())
     }
 
-    /// The axis, with its marks, from `low` to `high` exactly.
-    pub fn between(low: f64, high: f64) -> Self {
+    /// Creates a linear axis exactly from `low` to `high`, with marks.
+    pub fn with_bounds(low: f64, high: f64) -> Self {
         Self {
             log: false,
             low,
@@ -54,17 +54,17 @@ impl Axis {
             marks: Vec::new(),
             decimals: 0,
         }
-        .marked()
+        .with_marks()
     }
 
-    /// Where a value stands; none if it has no place on such an axis. Numbers so large that their differences
-    /// overflow have none either.
+    /// Returns the position of a value; `None` if the axis cannot show it, or if it is so large that differences would
+    /// overflow.
     pub fn position(&self, value: f64) -> Option<f64> {
         let usable = value.is_finite() && value.abs() < 1e300 && (!self.log || value > 0.0);
         usable.then(|| if self.log { value.log10() } else { value })
     }
 
-    /// A margin on both sides; a range of one value becomes one around it.
+    /// Adds a margin on both sides; a range of zero width is extended around its value.
     fn widen(&mut self) {
         let size = self.low.abs().max(self.high.abs());
         let least = if self.log {
@@ -82,7 +82,7 @@ impl Axis {
         } else {
             (size * 0.1).max(least)
         };
-        // An axis of values from nothing upwards begins at nothing.
+        // An axis of non-negative values starts at zero if that is near.
         self.low = if !self.log && self.low >= 0.0 && self.low < span * 0.3 {
             0.0
         } else {
@@ -91,22 +91,22 @@ impl Axis {
         self.high += by;
     }
 
-    /// The axis with nothing on it; on a logarithmic one there is no place for that.
+    /// Extends the axis to zero, unless it is logarithmic.
     pub fn with_zero(mut self) -> Self {
         if !self.log {
             self.low = self.low.min(0.0);
             self.high = self.high.max(0.0);
         }
-        self.marked()
+        self.with_marks()
     }
 
-    /// The axis with more room at its end: a share of its length.
+    /// Extends the axis at its end by a fraction of its length.
     pub fn with_room(mut self, share: f64) -> Self {
         self.high += (self.high - self.low) * share;
-        self.marked()
+        self.with_marks()
     }
 
-    /// The axis with half of its marks, for where there is little room.
+    /// Removes every other mark, for small plots.
     pub fn sparse(mut self) -> Self {
         let mut index = 0;
         self.marks.retain(|_| {
@@ -116,28 +116,28 @@ impl Axis {
         self
     }
 
-    fn marked(mut self) -> Self {
+    fn with_marks(mut self) -> Self {
         let span = self.high - self.low;
         if self.log {
             self.marks = self.decades(span);
             if self.marks.len() >= 2 {
                 return self;
             }
-            // Less than a decade: marks as on a linear axis, at their logarithms.
+            // Less than a decade: the marks of a linear axis, at their logarithms.
             let (low, high) = (10f64.powf(self.low), 10f64.powf(self.high));
-            self.marks = even(low, high)
+            self.marks = even_marks(low, high)
                 .0
                 .into_iter()
                 .filter(|mark| *mark > 0.0)
                 .map(f64::log10)
                 .collect();
         } else {
-            (self.marks, self.decimals) = even(self.low, self.high);
+            (self.marks, self.decimals) = even_marks(self.low, self.high);
         }
         self
     }
 
-    /// Powers of ten, and between them two and five if there is room.
+    /// Returns powers of ten and, if there is room, their multiples by two and five.
     fn decades(&self, span: f64) -> Vec<f64> {
         let every = (span / (MARKS + 2.0)).ceil().max(1.0);
         let between: &[f64] = if span <= 3.0 {
@@ -160,16 +160,16 @@ impl Axis {
         marks
     }
 
-    /// What is written at a mark.
+    /// Returns the label of a mark.
     pub fn label(&self, position: f64) -> String {
         if self.log {
-            return plain(10f64.powf(position));
+            return format_plain(10f64.powf(position));
         }
         if position.abs() >= 1e6 || self.decimals > 6 {
-            return plain(position);
+            return format_plain(position);
         }
         let text = format!("{position:.*}", self.decimals);
-        // A mark that is nothing but for the last bits.
+        // Zero except for rounding errors.
         if text.trim_start_matches('-').parse() == Ok(0.0) {
             text.trim_start_matches('-').to_owned()
         } else {
@@ -177,8 +177,8 @@ impl Axis {
         }
     }
 
-    /// Characters of the longest label.
-    pub fn widest(&self) -> usize {
+    /// Returns the length of the longest label in characters.
+    pub fn longest_label(&self) -> usize {
         let lengths = self
             .marks
             .iter()
@@ -197,7 +197,7 @@ impl Ranged for Axis {
     }
 
     fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
-        // No lines but those at marks.
+        // Grid lines at marks only.
         if hint.weight().allow_light_points() {
             Vec::new()
         } else {
@@ -216,8 +216,8 @@ impl ValueFormatter<f64> for Axis {
     }
 }
 
-/// Multiples of 1, 2 or 5 times a power of ten within a range, and how many digits they have after the point.
-fn even(low: f64, high: f64) -> (Vec<f64>, usize) {
+/// Returns multiples of 1, 2 or 5 times a power of ten within a range, and their number of decimals.
+fn even_marks(low: f64, high: f64) -> (Vec<f64>, usize) {
     let rough = (high - low) / MARKS;
     let power = 10f64.powf(rough.log10().floor());
     if !(power.is_finite() && power > 0.0) {
@@ -238,8 +238,8 @@ fn even(low: f64, high: f64) -> (Vec<f64>, usize) {
     (marks, decimals)
 }
 
-/// At most four significant digits, without trailing zeros; very large and small numbers by their power of ten.
-fn plain(value: f64) -> String {
+/// Formats with at most four significant digits, without trailing zeros; very large and small numbers with an exponent.
+fn format_plain(value: f64) -> String {
     let size = value.abs();
     if size != 0.0 && !(1e-3..1e6).contains(&size) {
         let text = format!("{value:.3e}");
@@ -260,7 +260,7 @@ fn plain(value: f64) -> String {
     }
 }
 
-/// Three significant digits, as the value of a bar is written.
+/// Formats with three significant digits, as for the value of a bar.
 pub(super) fn three_digits(value: f64) -> String {
     let size = value.abs();
     match size {
@@ -284,18 +284,18 @@ mod tests {
     #[test]
     fn a_linear_axis_has_round_marks() {
         assert_eq!(
-            labels(&Axis::between(0.0, 10.0)),
+            labels(&Axis::with_bounds(0.0, 10.0)),
             ["0", "2", "4", "6", "8", "10"]
         );
         assert_eq!(
-            labels(&Axis::between(-0.3, 0.3)),
+            labels(&Axis::with_bounds(-0.3, 0.3)),
             ["-0.3", "-0.2", "-0.1", "0.0", "0.1", "0.2", "0.3"]
         );
     }
 
     #[test]
     fn a_logarithmic_axis_marks_decades() {
-        let axis = Axis::over([0.01, 100_000.0], true).expect("it has values");
+        let axis = Axis::for_values([0.01, 100_000.0], true).expect("it has values");
         let labels = labels(&axis);
         assert_eq!(labels.first().map(String::as_str), Some("0.01"));
         assert_eq!(labels.last().map(String::as_str), Some("100000"));
@@ -305,15 +305,15 @@ mod tests {
     #[test]
     fn a_logarithmic_axis_of_less_than_a_decade_still_has_marks() {
         for range in [[1.1, 1.2], [3.0, 4.5], [0.11, 0.18], [7.0, 7.0]] {
-            let axis = Axis::over(range, true).expect("it has values");
+            let axis = Axis::for_values(range, true).expect("it has values");
             assert!(axis.marks.len() >= 2, "{range:?}: {:?}", labels(&axis));
         }
     }
 
     #[test]
     fn what_has_no_place_makes_no_axis() {
-        assert!(Axis::over([f64::NAN, f64::INFINITY], false).is_none());
-        assert!(Axis::over([0.0, -1.0], true).is_none());
+        assert!(Axis::for_values([f64::NAN, f64::INFINITY], false).is_none());
+        assert!(Axis::for_values([0.0, -1.0], true).is_none());
     }
 
     #[test]

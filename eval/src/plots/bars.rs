@@ -1,36 +1,36 @@
-//! Bars in groups.
+//! Grouped bar charts.
 
 use super::Bar;
 use super::axis::{Axis, three_digits};
 use super::canvas::{
-    Anchor, HEIGHT, Head, SCALE, Sides, Sign, TEXT, WIDTH, chart, colour, document, entries,
-    left_out, nothing, stroke, text_width, wrap, write,
+    Anchor, HEIGHT, LegendSymbol, PlotHeader, PlotMargins, SCALE, TEXT, WIDTH, chart, colour,
+    document, draw_line, empty_plot, entries, omission_note, text_width, wrap, write_text,
 };
 use anyhow::Result;
 use plotters::prelude::*;
 
-/// Of a group's width, its bars.
+/// Fraction of a group's width that its bars fill.
 const FILLED: f64 = 0.84;
-/// Of the value above a bar, in shown pixels.
+/// Font size of the value above a bar, in shown pixels.
 const VALUE: i32 = 11;
-/// A bar is at least so wide, in shown pixels.
+/// Minimum width of a bar, in shown pixels.
 const NARROW: i32 = 20;
-/// A bar is at most so wide, in shown pixels.
+/// Maximum width of a bar, in shown pixels.
 const WIDE: f64 = 72.0;
 const LINE: i32 = TEXT + 3;
 const WHISKER: RGBColor = RGBColor(0x22, 0x22, 0x22);
 
-/// Bars of one group, with the index of their name.
-struct Group<'a> {
+/// Bars of one group, each with the index of its name.
+struct BarGroup<'a> {
     name: &'a str,
     bars: Vec<(usize, &'a Bar)>,
 }
 
 pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<String> {
-    // A bar of nothing on a logarithmic axis has no height, but its value is known and written.
+    // A zero has no height on a logarithmic axis, but its value is known and written.
     let known: Vec<&Bar> = bars
         .iter()
-        .filter(|bar| Axis::over([bar.value], false).is_some())
+        .filter(|bar| Axis::for_values([bar.value], false).is_some())
         .collect();
     let omitted = bars.len() - known.len();
     let log = log && known.iter().any(|bar| bar.value > 0.0);
@@ -38,10 +38,10 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
         let spread = bar.spread.unwrap_or((bar.value, bar.value));
         [bar.value, spread.0, spread.1]
     });
-    let Some(y) = Axis::over(ends, log) else {
-        return nothing(title, omitted);
+    let Some(y) = Axis::for_values(ends, log) else {
+        return empty_plot(title, omitted);
     };
-    let (names, groups) = grouped(&known);
+    let (names, groups) = group_bars(&known);
     let most = groups.iter().map(|group| group.bars.len()).max();
     let most = most.unwrap_or(1) as f64;
 
@@ -52,7 +52,7 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
         .max();
     let least = text_width(longest.unwrap_or(0), TEXT) + 10;
     let least = least.max((f64::from(NARROW) * most / FILLED) as i32) as u32;
-    let left = Sides::of(&y).left;
+    let left = PlotMargins::for_axis(&y).left;
     let width = WIDTH.max(least * groups.len() as u32 + left + 24);
     let group_width = f64::from(width - left - 24) / groups.len() as f64;
     let bar_width = (group_width * FILLED / most).min(WIDE);
@@ -74,16 +74,16 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
     let lines = labels.iter().map(Vec::len).max().unwrap_or(0) as u32;
     let below = 12 + LINE as u32 * lines;
 
-    let head = Head::new(title, entries(names, Sign::Patch), width);
+    let head = PlotHeader::new(title, entries(names, LegendSymbol::Patch), width);
     document(
         &head,
         (width, HEIGHT - 48 + below),
-        left_out(omitted),
+        omission_note(omitted),
         |area| {
             let rows = (head.height, head.height + HEIGHT - 48);
-            let mut x = Axis::between(0.0, groups.len() as f64);
+            let mut x = Axis::with_bounds(0.0, groups.len() as f64);
             x.marks.clear();
-            let sides = Sides {
+            let sides = PlotMargins {
                 left,
                 right: 24,
                 below: false,
@@ -106,15 +106,15 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
                     let (centre, mut top) = (at(x, height).0, from.1.min(to.1));
                     if let Some((low, high)) = bar.spread {
                         let ends = (y.position(low), y.position(high));
-                        // On a logarithmic axis a whisker that reaches nothing begins at the bottom.
+                        // On a logarithmic axis a whisker down to zero starts at the bottom.
                         let low_end = ends.0.or((log && low <= 0.0).then_some(y.low));
                         if let (Some(low), Some(high)) = (low_end, ends.1) {
                             let (low, high) = (at(x, low).1, at(x, high).1);
                             let wide = (bar_width * 0.18) as i32 * SCALE;
-                            stroke(area, &[(centre, low), (centre, high)], WHISKER, 1)?;
+                            draw_line(area, &[(centre, low), (centre, high)], WHISKER, 1)?;
                             for end in [low, high] {
                                 let cap = [(centre - wide, end), (centre + wide, end)];
-                                stroke(area, &cap, WHISKER, 1)?;
+                                draw_line(area, &cap, WHISKER, 1)?;
                             }
                             top = top.min(high);
                         }
@@ -125,7 +125,7 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
                         (Anchor::Above, 1)
                     };
                     let place = (centre, top - gap * SCALE);
-                    write(area, &three_digits(bar.value), place, VALUE, anchor)?;
+                    write_text(area, &three_digits(bar.value), place, VALUE, anchor)?;
                 }
             }
             let (_, base) = at(0.0, y.low);
@@ -133,7 +133,7 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
                 let centre = at(index as f64 + 0.5, y.low).0;
                 for (line, text) in lines.iter().enumerate() {
                     let below = base + (8 + LINE * line as i32) * SCALE;
-                    write(area, text, (centre, below), TEXT, Anchor::Below)?;
+                    write_text(area, text, (centre, below), TEXT, Anchor::Below)?;
                 }
             }
             Ok(())
@@ -141,10 +141,10 @@ pub(super) fn draw(title: &str, name: &str, bars: &[Bar], log: bool) -> Result<S
     )
 }
 
-/// Names and groups, each in the order in which they first come.
-fn grouped<'a>(bars: &[&'a Bar]) -> (Vec<&'a str>, Vec<Group<'a>>) {
+/// Returns names and groups in the order of first occurrence.
+fn group_bars<'a>(bars: &[&'a Bar]) -> (Vec<&'a str>, Vec<BarGroup<'a>>) {
     let mut names: Vec<&str> = Vec::new();
-    let mut groups: Vec<Group> = Vec::new();
+    let mut groups: Vec<BarGroup> = Vec::new();
     for bar in bars {
         let known = names.iter().position(|name| *name == bar.name);
         let index = known.unwrap_or_else(|| {
@@ -153,7 +153,7 @@ fn grouped<'a>(bars: &[&'a Bar]) -> (Vec<&'a str>, Vec<Group<'a>>) {
         });
         match groups.iter_mut().find(|group| group.name == bar.group) {
             Some(group) => group.bars.push((index, bar)),
-            None => groups.push(Group {
+            None => groups.push(BarGroup {
                 name: &bar.group,
                 bars: vec![(index, bar)],
             }),

@@ -1,6 +1,6 @@
-//! What all plots share: the ground, title, legend, axes and markers.
+//! Common parts of all plots: background, title, legend, axes and markers.
 //!
-//! Everything is drawn at [`SCALE`] times its size, because plotters puts everything on whole pixels.
+//! Everything is drawn at [`SCALE`] times its size, because plotters rounds to whole pixels.
 
 use super::axis::Axis;
 use anyhow::Result;
@@ -8,14 +8,14 @@ use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-/// Drawn pixels for each one shown.
+/// Drawn pixels per shown pixel.
 pub(super) const SCALE: i32 = 2;
-/// Shown pixels.
+/// Width in shown pixels.
 pub(super) const WIDTH: u32 = 860;
-/// Shown pixels of the part below title and legend.
+/// Height in shown pixels below title and legend.
 pub(super) const HEIGHT: u32 = 380;
 const TITLE: i32 = 15;
-/// Shown pixels of most letters.
+/// Default font size in shown pixels.
 pub(super) const TEXT: i32 = 12;
 const SMALL: i32 = 11;
 const GREY: RGBColor = RGBColor(0x55, 0x55, 0x55);
@@ -23,14 +23,14 @@ const GRID: RGBColor = RGBColor(0xdd, 0xdd, 0xdd);
 const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 const LEGEND_ROW: i32 = 20;
 const LEGEND_LEFT: i32 = 16;
-/// Of the note below the plot.
+/// Height of the note below the plot.
 const NOTE: u32 = 14;
-/// Left of the vertical axis' name.
+/// Space to the left of the vertical axis' name.
 const EDGE: u32 = 8;
-/// Below the axis: its labels and its name.
+/// Space below the axis for its labels and name.
 const BELOW: i32 = 48;
 
-/// Of Okabe and Ito; yellow, which white hides, comes last.
+/// Palette of Okabe and Ito; yellow comes last because it is hard to see on white.
 const PALETTE: [RGBColor; 8] = [
     RGBColor(0x00, 0x72, 0xb2),
     RGBColor(0xd5, 0x5e, 0x00),
@@ -45,9 +45,9 @@ const PALETTE: [RGBColor; 8] = [
 pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 pub(super) type Chart<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<Axis, Axis>>;
 
-/// How the legend shows a series.
+/// Symbol of a series in the legend.
 #[derive(Clone, Copy)]
-pub(super) enum Sign {
+pub(super) enum LegendSymbol {
     Line,
     Point,
     Patch,
@@ -55,18 +55,21 @@ pub(super) enum Sign {
     Shade,
 }
 
-/// An entry of the legend: the series' index decides on colour and marker.
-pub(super) struct Entry<'a> {
+/// An entry of the legend; the index of the series determines colour and marker.
+pub(super) struct LegendEntry<'a> {
     pub index: usize,
     pub name: &'a str,
-    pub sign: Sign,
+    pub sign: LegendSymbol,
 }
 
-/// Legend entries of series in their order.
-pub(super) fn entries<'a>(names: impl IntoIterator<Item = &'a str>, sign: Sign) -> Vec<Entry<'a>> {
+/// Returns legend entries for series in their order.
+pub(super) fn entries<'a>(
+    names: impl IntoIterator<Item = &'a str>,
+    sign: LegendSymbol,
+) -> Vec<LegendEntry<'a>> {
     let numbered = names.into_iter().enumerate();
     numbered
-        .map(|(index, name)| Entry { index, name, sign })
+        .map(|(index, name)| LegendEntry { index, name, sign })
         .collect()
 }
 
@@ -74,36 +77,36 @@ pub(super) fn colour(index: usize) -> RGBColor {
     PALETTE[index % PALETTE.len()]
 }
 
-/// The colour of shaded ranges.
+/// Colour of shaded ranges.
 pub(super) fn shade() -> RGBColor {
     RGBColor(0xec, 0xec, 0xec)
 }
 
-/// Shown pixels that so many letters take, about.
+/// Estimates the width of a text in shown pixels.
 pub(super) fn text_width(letters: usize, size: i32) -> i32 {
     (letters as f64 * f64::from(size) * 0.58).ceil() as i32
 }
 
-/// Plotters divides the sizes of letters by 1.24.
+/// plotters divides font sizes by 1.24.
 fn font(size: i32) -> FontDesc<'static> {
     ("sans-serif", f64::from(size * SCALE) * 1.24).into_font()
 }
 
-/// Where a text stands at its point.
+/// Placement of a text relative to its point.
 #[derive(Clone, Copy)]
 pub(super) enum Anchor {
-    /// The point is left of it.
+    /// To the right of the point.
     Left,
-    /// The point is below its middle.
+    /// Centred above the point.
     Above,
-    /// The point is above its middle.
+    /// Centred below the point.
     Below,
-    /// The point is below it, and it reads upwards.
+    /// Above the point, reading upwards.
     Upwards,
 }
 
 /// Writes a text at a drawn pixel.
-pub(super) fn write(
+pub(super) fn write_text(
     area: &Area,
     text: &str,
     at: (i32, i32),
@@ -124,7 +127,7 @@ pub(super) fn write(
     Ok(())
 }
 
-/// Words in lines of at most so many letters; a longer word has a line of its own.
+/// Breaks a text into lines of at most `letters` characters; a longer word gets a line of its own.
 pub(super) fn wrap(text: &str, letters: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
@@ -139,22 +142,22 @@ pub(super) fn wrap(text: &str, letters: usize) -> Vec<String> {
     lines
 }
 
-/// The parts of a document above the plot, measured before they are drawn.
-pub(super) struct Head<'a> {
+/// Title and legend of a document, measured before they are drawn.
+pub(super) struct PlotHeader<'a> {
     title: Vec<String>,
-    /// Rows of the legend; each entry with its place, in shown pixels from the left.
-    legend: Vec<Vec<(i32, Entry<'a>)>>,
+    /// Rows of the legend; each entry with its distance from the left in shown pixels.
+    legend: Vec<Vec<(i32, LegendEntry<'a>)>>,
     /// Shown pixels from the top of the document to the plot.
     pub height: u32,
 }
 
-impl<'a> Head<'a> {
-    pub fn new(title: &str, legend: Vec<Entry<'a>>, width: u32) -> Self {
+impl<'a> PlotHeader<'a> {
+    pub fn new(title: &str, legend: Vec<LegendEntry<'a>>, width: u32) -> Self {
         let title = wrap(
             title,
             (f64::from(width) / (f64::from(TITLE) * 0.6)) as usize,
         );
-        let mut rows: Vec<Vec<(i32, Entry)>> = Vec::new();
+        let mut rows: Vec<Vec<(i32, LegendEntry)>> = Vec::new();
         let mut next = LEGEND_LEFT;
         for entry in legend {
             let wide = text_width(entry.name.chars().count(), TEXT) + 46;
@@ -185,9 +188,9 @@ impl<'a> Head<'a> {
         y += LEGEND_ROW / 2;
         for row in &self.legend {
             for (x, entry) in row {
-                sign(area, (*x * SCALE, y * SCALE), entry)?;
+                draw_symbol(area, (*x * SCALE, y * SCALE), entry)?;
                 let beside = ((*x + 28) * SCALE, y * SCALE);
-                write(area, entry.name, beside, TEXT, Anchor::Left)?;
+                write_text(area, entry.name, beside, TEXT, Anchor::Left)?;
             }
             y += LEGEND_ROW;
         }
@@ -195,17 +198,17 @@ impl<'a> Head<'a> {
     }
 }
 
-fn sign(area: &Area, (x, y): (i32, i32), entry: &Entry) -> Result<()> {
+fn draw_symbol(area: &Area, (x, y): (i32, i32), entry: &LegendEntry) -> Result<()> {
     let (middle, end) = (x + 11 * SCALE, x + 22 * SCALE);
     match entry.sign {
-        Sign::Line => {
-            stroke(area, &[(x, y), (end, y)], colour(entry.index), 2)?;
-            mark(area, (middle, y), entry.index, 4)?;
+        LegendSymbol::Line => {
+            draw_line(area, &[(x, y), (end, y)], colour(entry.index), 2)?;
+            draw_marker(area, (middle, y), entry.index, 4)?;
         }
-        Sign::Point => mark(area, (middle, y), entry.index, 4)?,
-        Sign::Patch | Sign::Shade => {
+        LegendSymbol::Point => draw_marker(area, (middle, y), entry.index, 4)?,
+        LegendSymbol::Patch | LegendSymbol::Shade => {
             let colour = match entry.sign {
-                Sign::Shade => shade(),
+                LegendSymbol::Shade => shade(),
                 _ => colour(entry.index),
             };
             let half = 6 * SCALE;
@@ -216,10 +219,10 @@ fn sign(area: &Area, (x, y): (i32, i32), entry: &Entry) -> Result<()> {
     Ok(())
 }
 
-/// A document of a head, what `draw` adds below it, and a note in the lowest corner. The size is that of the part below
-/// the head, in shown pixels; `draw` is given the whole document.
+/// Creates a document with title and legend, the drawing of `draw` below them, and a note in the bottom corner. The
+/// size is that of the part below the legend, in shown pixels; `draw` gets the whole document.
 pub(super) fn document(
-    head: &Head,
+    head: &PlotHeader,
     (width, height): (u32, u32),
     note: Option<String>,
     draw: impl FnOnce(&Area) -> Result<()>,
@@ -249,8 +252,8 @@ pub(super) fn document(
     ))
 }
 
-/// The note on values that are not drawn.
-pub(super) fn left_out(count: usize) -> Option<String> {
+/// Returns the note on omitted values.
+pub(super) fn omission_note(count: usize) -> Option<String> {
     match count {
         0 => None,
         1 => Some("1 value is left out: not finite, or no place on the axis".to_owned()),
@@ -260,40 +263,40 @@ pub(super) fn left_out(count: usize) -> Option<String> {
     }
 }
 
-/// A document that says that nothing was measured.
-pub(super) fn nothing(title: &str, omitted: usize) -> Result<String> {
-    let head = Head::new(title, Vec::new(), WIDTH);
-    document(&head, (WIDTH, 90), left_out(omitted), |area| {
+/// Creates a document that says that nothing was measured.
+pub(super) fn empty_plot(title: &str, omitted: usize) -> Result<String> {
+    let head = PlotHeader::new(title, Vec::new(), WIDTH);
+    document(&head, (WIDTH, 90), omission_note(omitted), |area| {
         let (width, height) = area.dim_in_pixel();
         let at = (width as i32 / 2, height as i32 / 2 + 10 * SCALE);
-        write(area, "nothing was measured", at, TITLE, Anchor::Above)
+        write_text(area, "nothing was measured", at, TITLE, Anchor::Above)
     })
 }
 
-/// The sides of a plot, in shown pixels.
-pub(super) struct Sides {
+/// Margins of a plot, in shown pixels.
+pub(super) struct PlotMargins {
     pub left: u32,
     pub right: u32,
-    /// Whether the horizontal axis has its labels here.
+    /// True if the labels of the horizontal axis are drawn here.
     pub below: bool,
 }
 
-impl Sides {
-    /// With room for the vertical axis' labels and name.
-    pub fn of(y: &Axis) -> Self {
+impl PlotMargins {
+    /// Leaves room for the labels and the name of the vertical axis.
+    pub fn for_axis(y: &Axis) -> Self {
         Self {
-            left: (text_width(y.widest(), TEXT) + 36) as u32 + EDGE,
+            left: (text_width(y.longest_label(), TEXT) + 36) as u32 + EDGE,
             right: 24,
             below: true,
         }
     }
 }
 
-/// Axes and grid on the rows `rows` (shown pixels, from the top of the document) of an area.
+/// Draws axes and grid between two rows of an area (in shown pixels from the top of the document).
 pub(super) fn chart<'a, 'b>(
     area: &'a Area<'b>,
     (top, bottom): (u32, u32),
-    sides: &Sides,
+    sides: &PlotMargins,
     (x, x_name): (&Axis, &str),
     (y, y_name): (&Axis, &str),
 ) -> Result<Chart<'a, 'b>> {
@@ -327,8 +330,13 @@ pub(super) fn chart<'a, 'b>(
     Ok(chart)
 }
 
-/// A line through drawn pixels; `width` in shown pixels.
-pub(super) fn stroke(area: &Area, path: &[(i32, i32)], colour: RGBColor, width: u32) -> Result<()> {
+/// Draws a line through drawn pixels; `width` is in shown pixels.
+pub(super) fn draw_line(
+    area: &Area,
+    path: &[(i32, i32)],
+    colour: RGBColor,
+    width: u32,
+) -> Result<()> {
     if path.len() > 1 {
         let style = colour.stroke_width(width * SCALE as u32);
         area.draw(&PathElement::new(path.to_vec(), style))?;
@@ -336,8 +344,8 @@ pub(super) fn stroke(area: &Area, path: &[(i32, i32)], colour: RGBColor, width: 
     Ok(())
 }
 
-/// The marker of a series at a drawn pixel; `size` is its radius, in shown pixels.
-pub(super) fn mark(area: &Area, (x, y): (i32, i32), index: usize, size: i32) -> Result<()> {
+/// Draws the marker of a series at a drawn pixel; `size` is its radius in shown pixels.
+pub(super) fn draw_marker(area: &Area, (x, y): (i32, i32), index: usize, size: i32) -> Result<()> {
     let colour = colour(index);
     let r = size * SCALE;
     let polygon = |points: &[(i32, i32)]| {
@@ -356,7 +364,7 @@ pub(super) fn mark(area: &Area, (x, y): (i32, i32), index: usize, size: i32) -> 
         ))
     };
     let s = r * 4 / 5;
-    // When the colours begin again, their markers are others.
+    // When colours repeat, the markers differ.
     match (index + index / PALETTE.len()) % 8 {
         0 => area.draw(&Circle::new((x, y), r * 9 / 10, colour.filled()))?,
         1 => polygon(&[(0, -r), (r, s), (-r, s)])?,

@@ -3,32 +3,32 @@
 use super::Series;
 use super::axis::Axis;
 use super::canvas::{
-    Area, Chart, Entry, HEIGHT, Head, Sides, Sign, WIDTH, chart, colour, document, entries,
-    left_out, mark, nothing, stroke,
+    Area, Chart, HEIGHT, LegendEntry, LegendSymbol, PlotHeader, PlotMargins, WIDTH, chart, colour,
+    document, draw_line, draw_marker, empty_plot, entries, omission_note,
 };
 use anyhow::Result;
 use std::collections::HashSet;
 
-/// Up to so many points of a line, all have markers.
+/// Up to this number of points all points of a line have markers.
 const FEW: usize = 30;
-/// Of a line of more points, so many have.
+/// Number of markers on a longer line.
 const MARKERS: usize = 10;
-/// Shown pixels below the plot that [`chart`] takes for the horizontal axis.
+/// Shown pixels below the plot that [`chart`] uses for the horizontal axis.
 const AXIS: f64 = 48.0;
-/// Of a map's plot, in shown pixels.
+/// Minimum and maximum height of a map's plot, in shown pixels.
 const MAP_HEIGHT: (f64, f64) = (220.0, 640.0);
 
 #[derive(Clone, Copy, PartialEq)]
-enum Shape {
+enum SeriesShape {
     Lines,
     Points,
-    /// So many lines, then points.
+    /// This number of lines, then points.
     Curves(usize),
 }
 
-impl Shape {
-    /// Of a single series.
-    fn of(self, index: usize) -> Self {
+impl SeriesShape {
+    /// Returns the shape of a single series.
+    fn for_series(self, index: usize) -> Self {
         match self {
             Self::Curves(lines) if index < lines => Self::Lines,
             Self::Curves(_) => Self::Points,
@@ -37,8 +37,8 @@ impl Shape {
     }
 }
 
-/// Positions on both axes; none for what has no place.
-type Placed = Vec<Option<(f64, f64)>>;
+/// Positions on both axes; `None` for points that cannot be shown.
+type AxisPositions = Vec<Option<(f64, f64)>>;
 
 pub(super) fn lines(
     title: &str,
@@ -46,7 +46,7 @@ pub(super) fn lines(
     series: &[Series],
     log: bool,
 ) -> Result<String> {
-    plain(title, names, series, log, Shape::Lines)
+    plot(title, names, series, log, SeriesShape::Lines)
 }
 
 pub(super) fn points(
@@ -55,10 +55,10 @@ pub(super) fn points(
     series: &[Series],
     log: bool,
 ) -> Result<String> {
-    plain(title, names, series, log, Shape::Points)
+    plot(title, names, series, log, SeriesShape::Points)
 }
 
-/// The first `curves` series as lines, the others as points.
+/// Draws the first `curves` series as lines, the others as points.
 pub(super) fn curves(
     title: &str,
     names: (&str, &str),
@@ -66,73 +66,79 @@ pub(super) fn curves(
     curves: usize,
     log: bool,
 ) -> Result<String> {
-    plain(title, names, series, log, Shape::Curves(curves))
+    plot(title, names, series, log, SeriesShape::Curves(curves))
 }
 
-fn plain(
+fn plot(
     title: &str,
     names: (&str, &str),
     series: &[Series],
     log: bool,
-    shape: Shape,
+    shape: SeriesShape,
 ) -> Result<String> {
-    let usable = usable(series, log);
-    let x = Axis::over(usable.iter().map(|point| point.0), false);
-    let y = Axis::over(usable.iter().map(|point| point.1), log);
+    let usable = usable_points(series, log);
+    let x = Axis::for_values(usable.iter().map(|point| point.0), false);
+    let y = Axis::for_values(usable.iter().map(|point| point.1), log);
     let omitted = count(series) - usable.len();
     let (Some(x), Some(y)) = (x, y) else {
-        return nothing(title, omitted);
+        return empty_plot(title, omitted);
     };
-    let placed: Vec<Placed> = series
+    let placed: Vec<AxisPositions> = series
         .iter()
-        .map(|one| place(&one.points, &x, &y))
+        .map(|one| to_positions(&one.points, &x, &y))
         .collect();
-    let mut legend = legend(series, Sign::Line);
+    let mut legend = legend(series, LegendSymbol::Line);
     for entry in &mut legend {
-        entry.sign = match shape.of(entry.index) {
-            Shape::Points => Sign::Point,
-            _ => Sign::Line,
+        entry.sign = match shape.for_series(entry.index) {
+            SeriesShape::Points => LegendSymbol::Point,
+            _ => LegendSymbol::Line,
         };
     }
-    let head = Head::new(title, legend, WIDTH);
-    document(&head, (WIDTH, HEIGHT), left_out(omitted), |area| {
+    let head = PlotHeader::new(title, legend, WIDTH);
+    document(&head, (WIDTH, HEIGHT), omission_note(omitted), |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
-        let chart = chart(area, rows, &Sides::of(&y), (&x, names.0), (&y, names.1))?;
+        let chart = chart(
+            area,
+            rows,
+            &PlotMargins::for_axis(&y),
+            (&x, names.0),
+            (&y, names.1),
+        )?;
         draw(area, &chart, &placed, shape)
     })
 }
 
 pub(super) fn map(title: &str, names: (&str, &str), series: &[Series]) -> Result<String> {
-    let usable = usable(series, false);
-    let x = Axis::over(usable.iter().map(|point| point.0), false);
-    let y = Axis::over(usable.iter().map(|point| point.1), false);
+    let usable = usable_points(series, false);
+    let x = Axis::for_values(usable.iter().map(|point| point.0), false);
+    let y = Axis::for_values(usable.iter().map(|point| point.1), false);
     let omitted = count(series) - usable.len();
     let (Some(x), Some(y)) = (x, y) else {
-        return nothing(title, omitted);
+        return empty_plot(title, omitted);
     };
-    let sides = Sides::of(&y);
+    let sides = PlotMargins::for_axis(&y);
     let width = f64::from(WIDTH - sides.left - sides.right);
     let height = (width * (y.high - y.low) / (x.high - x.low)).clamp(MAP_HEIGHT.0, MAP_HEIGHT.1);
-    // Metres for each pixel: of the direction that needs more.
+    // Metres per pixel in the direction that needs more.
     let metres = ((x.high - x.low) / width).max((y.high - y.low) / height);
     let around = |axis: &Axis, pixels: f64| {
         let middle = axis.low / 2.0 + axis.high / 2.0;
-        Axis::between(
+        Axis::with_bounds(
             middle - metres * pixels / 2.0,
             middle + metres * pixels / 2.0,
         )
     };
     let (x, y) = (around(&x, width), around(&y, height));
-    let placed: Vec<Placed> = series
+    let placed: Vec<AxisPositions> = series
         .iter()
-        .map(|one| place(&one.points, &x, &y))
+        .map(|one| to_positions(&one.points, &x, &y))
         .collect();
-    let head = Head::new(title, legend(series, Sign::Line), WIDTH);
+    let head = PlotHeader::new(title, legend(series, LegendSymbol::Line), WIDTH);
     let plot = (height + AXIS) as u32;
-    document(&head, (WIDTH, plot + 12), left_out(omitted), |area| {
+    document(&head, (WIDTH, plot + 12), omission_note(omitted), |area| {
         let rows = (head.height, head.height + plot);
         let chart = chart(area, rows, &sides, (&x, names.0), (&y, names.1))?;
-        draw(area, &chart, &placed, Shape::Lines)
+        draw(area, &chart, &placed, SeriesShape::Lines)
     })
 }
 
@@ -143,29 +149,29 @@ pub(super) fn distribution(
     log: bool,
 ) -> Result<String> {
     let values = || series.iter().flat_map(|one| one.1.iter().copied());
-    let y = Axis::between(0.0, 102.0);
-    let Some(x) = Axis::over(values(), log) else {
-        return nothing(title, values().count());
+    let y = Axis::with_bounds(0.0, 102.0);
+    let Some(x) = Axis::for_values(values(), log) else {
+        return empty_plot(title, values().count());
     };
     let omitted = values().filter(|value| x.position(*value).is_none());
     let omitted = omitted.count();
     let unknown = values().filter(|value| value.is_nan()).count();
-    let note = left_out(unknown).or((omitted > 0).then(|| {
+    let note = omission_note(unknown).or((omitted > 0).then(|| {
         format!("{omitted} of the values have no place on the axis, but count in the shares")
     }));
-    let placed: Vec<Placed> = series.iter().map(|one| steps(&one.1, &x)).collect();
+    let placed: Vec<AxisPositions> = series.iter().map(|one| steps(&one.1, &x)).collect();
     let names = series.iter().map(|one| one.0.as_str());
-    let head = Head::new(title, entries(names, Sign::Line), WIDTH);
+    let head = PlotHeader::new(title, entries(names, LegendSymbol::Line), WIDTH);
     document(&head, (WIDTH, HEIGHT), note, |area| {
         let rows = (head.height, head.height + HEIGHT - 12);
         let vertical = (&y, "share of values at most as large (%)");
-        let chart = chart(area, rows, &Sides::of(&y), (&x, name), vertical)?;
-        draw(area, &chart, &placed, Shape::Lines)
+        let chart = chart(area, rows, &PlotMargins::for_axis(&y), (&x, name), vertical)?;
+        draw(area, &chart, &placed, SeriesShape::Lines)
     })
 }
 
-/// Each finite value once, with the share (%) of all numbers that is at most as large.
-pub(super) fn shares(values: &[f64]) -> Vec<(f64, f64)> {
+/// Returns each finite value once, with the percentage of all numbers that is at most as large.
+pub(super) fn cumulative_shares(values: &[f64]) -> Vec<(f64, f64)> {
     let mut sorted: Vec<f64> = values
         .iter()
         .copied()
@@ -185,11 +191,11 @@ pub(super) fn shares(values: &[f64]) -> Vec<(f64, f64)> {
     shares
 }
 
-/// The distribution as a line that rises at each value.
-fn steps(values: &[f64], x: &Axis) -> Placed {
+/// Returns the distribution as a line that rises at each value.
+fn steps(values: &[f64], x: &Axis) -> AxisPositions {
     let mut below = 0.0;
     let mut placed = Vec::new();
-    for (value, share) in shares(values) {
+    for (value, share) in cumulative_shares(values) {
         if let Some(position) = x.position(value) {
             placed.push(Some((position, below)));
             placed.push(Some((position, share)));
@@ -199,8 +205,8 @@ fn steps(values: &[f64], x: &Axis) -> Placed {
     placed
 }
 
-/// A single series needs no legend unless it has a name.
-fn legend(series: &[Series], sign: Sign) -> Vec<Entry<'_>> {
+/// Returns the legend; a single series without a name needs none.
+fn legend(series: &[Series], sign: LegendSymbol) -> Vec<LegendEntry<'_>> {
     let mut entries = entries(series.iter().map(|one| one.name.as_str()), sign);
     entries.retain(|entry| !entry.name.is_empty());
     entries
@@ -210,9 +216,9 @@ fn count(series: &[Series]) -> usize {
     series.iter().map(|one| one.points.len()).sum()
 }
 
-/// The points whose both coordinates have a place.
-fn usable(series: &[Series], log: bool) -> Vec<(f64, f64)> {
-    let fits = |value: f64, log| Axis::over([value], log).is_some();
+/// Returns the points whose coordinates can both be shown.
+fn usable_points(series: &[Series], log: bool) -> Vec<(f64, f64)> {
+    let fits = |value: f64, log| Axis::for_values([value], log).is_some();
     series
         .iter()
         .flat_map(|one| one.points.iter().copied())
@@ -220,26 +226,28 @@ fn usable(series: &[Series], log: bool) -> Vec<(f64, f64)> {
         .collect()
 }
 
-fn place(points: &[(f64, f64)], x: &Axis, y: &Axis) -> Placed {
+fn to_positions(points: &[(f64, f64)], x: &Axis, y: &Axis) -> AxisPositions {
     points
         .iter()
         .map(|point| Some((x.position(point.0)?, y.position(point.1)?)))
         .collect()
 }
 
-fn draw(area: &Area, chart: &Chart, placed: &[Placed], shape: Shape) -> Result<()> {
+fn draw(area: &Area, chart: &Chart, placed: &[AxisPositions], shape: SeriesShape) -> Result<()> {
     for (index, points) in placed.iter().enumerate() {
         let pixels: Vec<Option<(i32, i32)>> = points
             .iter()
             .map(|point| point.map(|at| chart.backend_coord(&at)))
             .collect();
-        match shape.of(index) {
-            Shape::Lines | Shape::Curves(_) => line(area, &pixels, index, placed.len())?,
-            Shape::Points => {
+        match shape.for_series(index) {
+            SeriesShape::Lines | SeriesShape::Curves(_) => {
+                draw_series_line(area, &pixels, index, placed.len())?
+            }
+            SeriesShape::Points => {
                 let mut drawn = HashSet::new();
                 for at in pixels.into_iter().flatten() {
                     if drawn.insert(at) {
-                        mark(area, at, index, 3)?;
+                        draw_marker(area, at, index, 3)?;
                     }
                 }
             }
@@ -248,15 +256,20 @@ fn draw(area: &Area, chart: &Chart, placed: &[Placed], shape: Shape) -> Result<(
     Ok(())
 }
 
-fn line(area: &Area, pixels: &[Option<(i32, i32)>], index: usize, of: usize) -> Result<()> {
+fn draw_series_line(
+    area: &Area,
+    pixels: &[Option<(i32, i32)>],
+    index: usize,
+    of: usize,
+) -> Result<()> {
     for part in pixels.split(Option::is_none) {
         let mut path: Vec<(i32, i32)> = part.iter().copied().flatten().collect();
         path.dedup();
-        stroke(area, &path, colour(index), 2)?;
+        draw_line(area, &path, colour(index), 2)?;
     }
     let known: Vec<(i32, i32)> = pixels.iter().copied().flatten().collect();
     let (every, first) = match known.len() {
-        // Markers of several lines stand at different places, so that lines that coincide are still seen.
+        // Markers of different lines are offset, so that coinciding lines remain visible.
         count if count > FEW => {
             let every = (count / MARKERS).max(1);
             (every, every * index / of.max(1))
@@ -265,7 +278,7 @@ fn line(area: &Area, pixels: &[Option<(i32, i32)>], index: usize, of: usize) -> 
     };
     if known.len() <= FEW || of > 1 {
         for at in known.into_iter().skip(first).step_by(every) {
-            mark(area, at, index, 4)?;
+            draw_marker(area, at, index, 4)?;
         }
     }
     Ok(())

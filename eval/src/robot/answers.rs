@@ -1,56 +1,64 @@
-//! What answers and maps say, read from their bytes.
+//! Reads answers and maps from their serialized form.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::Duration;
 
-use ros::bus::Message;
+use ros::bus::SerializedMessage;
 use tokio::time::Instant as At;
 
 use super::{FIRST, boxes};
-use crate::recording::{header, numbers, pose};
-use crate::trace::{Grid, Request};
+use crate::recording::{read_floats, read_header, read_pose};
+use crate::trace::{MapGrid, RequestSample};
 
-pub(super) fn number_of(message: &Message) -> Option<u32> {
-    header(&message.bytes).map(|header| header.stamp.0)
+pub(super) fn request_number(message: &SerializedMessage) -> Option<u32> {
+    read_header(&message.bytes).map(|header| header.stamp.0)
 }
 
-pub(super) fn answered(request: &mut Request, message: &Message, after: Duration) {
+pub(super) fn fill_answer(
+    request: &mut RequestSample,
+    message: &SerializedMessage,
+    after: Duration,
+) {
     request.response = Some(after.as_secs_f64());
-    request.digest = Some(digest(&message.bytes));
-    request.boxes = boxes::digest(message);
-    request.pose = pose(&message.bytes);
+    request.digest = Some(digest_message(&message.bytes));
+    request.boxes = boxes::digest_sorted(message);
+    request.pose = read_pose(&message.bytes);
 }
 
-/// Puts an answer to its request, of those that were `sent` then; the first one counts.
-pub(super) fn note(requests: &mut [Request], sent: &[At], message: &Message) {
-    let index = number_of(message).and_then(|number| number.checked_sub(FIRST));
+/// Assigns an answer to its request, given the times at which requests were `sent`; the first answer counts.
+pub(super) fn record_answer(
+    requests: &mut [RequestSample],
+    sent: &[At],
+    message: &SerializedMessage,
+) {
+    let index = request_number(message).and_then(|number| number.checked_sub(FIRST));
     let index = index.map_or(usize::MAX, |index| index as usize);
     if let (Some(request), Some(sent)) = (requests.get_mut(index), sent.get(index)) {
         request.answers += 1;
         if request.response.is_none() {
-            answered(request, message, sent.elapsed());
+            fill_answer(request, message, sent.elapsed());
         }
     }
 }
 
-/// Of a message without its header's sequence number.
-pub fn digest(bytes: &[u8]) -> u64 {
+/// Hashes a message without its header's sequence number.
+pub fn digest_message(bytes: &[u8]) -> u64 {
     let mut hasher = DefaultHasher::new();
     bytes.get(4..).hash(&mut hasher);
     hasher.finish()
 }
 
-/// A serialized `nav_msgs/OccupancyGrid`.
-pub(super) fn grid(bytes: &[u8]) -> Option<Grid> {
-    let at = header(bytes)?.end;
+/// Reads a serialized `nav_msgs/OccupancyGrid`.
+pub(super) fn read_grid(bytes: &[u8]) -> Option<MapGrid> {
+    let at = read_header(bytes)?.end;
     let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?));
     // map_load_time, resolution, width, height, origin (seven float64), data
     let resolution = f32::from_le_bytes(bytes.get(at + 8..at + 12)?.try_into().ok()?);
     let (width, height) = (word(at + 12)? as usize, word(at + 16)? as usize);
-    let origin = numbers(bytes, at + 20, 2)?;
+    let origin = read_floats(bytes, at + 20, 2)?;
     let count = word(at + 76)? as usize;
     let cells = bytes.get(at + 80..at + 80 + count)?;
-    (count == width * height).then(|| Grid {
+    (count == width * height).then(|| MapGrid {
         width,
         height,
         resolution: resolution.into(),
@@ -79,9 +87,9 @@ mod tests {
             .for_each(|number| bytes.extend(number.to_le_bytes()));
         bytes.extend(6_u32.to_le_bytes());
         bytes.extend([255, 0, 100, 0, 0, 0]);
-        let map = grid(&bytes).expect("a map");
+        let map = read_grid(&bytes).expect("a map");
         assert_eq!((map.width, map.height, map.origin), (2, 3, [-1.0, -2.0]));
         assert_eq!(map.cells, [-1, 0, 100, 0, 0, 0]);
-        assert_eq!(grid(&bytes[..bytes.len() - 1]), None);
+        assert_eq!(read_grid(&bytes[..bytes.len() - 1]), None);
     }
 }

@@ -1,25 +1,26 @@
-//! Answers that are lists of boxes: threads of a node find them in whatever order, so that two equal answers may differ in it.
+//! Answers that are lists of boxes: the threads of a node find them in any order, so that equal answers may differ in
+//! their order.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 
-use ros::bus::Message;
+use ros::bus::SerializedMessage;
 
-use crate::recording::header;
+use crate::recording::read_header;
 
 /// A header and an array of boxes.
 const LIST: &str = "opencv_apps/RectArrayStamped";
-/// Of a box: x, y, width and height as float64.
+/// Bytes of a box: x, y, width and height as float64.
 const BOX: usize = 32;
 
-/// Of the header without its sequence number and of the boxes in order of size; none of other answers.
-pub fn digest(message: &Message) -> Option<u64> {
+/// Hashes the header without its sequence number and the sorted boxes; `None` for other answers.
+pub fn digest_sorted(message: &SerializedMessage) -> Option<u64> {
     (message.wire_type.name == LIST)
-        .then(|| of(&message.bytes))
+        .then(|| digest_boxes(&message.bytes))
         .flatten()
 }
 
-fn of(bytes: &[u8]) -> Option<u64> {
-    let from = header(bytes)?.end;
+fn digest_boxes(bytes: &[u8]) -> Option<u64> {
+    let from = read_header(bytes)?.end;
     let count = u32::from_le_bytes(bytes.get(from..from + 4)?.try_into().ok()?);
     let rest = &bytes[from + 4..];
     if rest.len() != count as usize * BOX {
@@ -50,18 +51,18 @@ mod tests {
     #[test]
     fn boxes_are_equal_in_any_order() {
         let (one, other) = ([1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]);
-        let told = of(&list(&[one, other]));
+        let told = digest_boxes(&list(&[one, other]));
         assert!(told.is_some());
-        assert_eq!(told, of(&list(&[other, one])));
-        assert_ne!(told, of(&list(&[one, one])));
-        assert_ne!(told, of(&list(&[one])));
+        assert_eq!(told, digest_boxes(&list(&[other, one])));
+        assert_ne!(told, digest_boxes(&list(&[one, one])));
+        assert_ne!(told, digest_boxes(&list(&[one])));
     }
 
     #[test]
     fn what_is_no_list_is_not_taken_for_one() {
         let mut bytes = list(&[[1.0; 4]]);
         bytes.pop();
-        assert_eq!(of(&bytes), None);
-        assert_eq!(of(b"short"), None);
+        assert_eq!(digest_boxes(&bytes), None);
+        assert_eq!(digest_boxes(b"short"), None);
     }
 }

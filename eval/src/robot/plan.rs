@@ -1,93 +1,93 @@
-//! What a robot is to do: whom it asks what, when, and for how long.
+//! The plan of a robot: what it sends to whom, when, and for how long.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::place::Network;
+use crate::place::NetworkProfile;
 
-/// What a robot does.
+/// A robot's plan.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Plan {
-    /// Where its stub finds the server; the place says it.
+pub struct RobotPlan {
+    /// Address of the server for its stub; set by the sandbox.
     pub server: String,
-    /// Who answers.
-    pub node: Node,
+    /// The node that answers.
+    pub node: NodeUnderTest,
     /// A rosbag file.
     pub recording: PathBuf,
-    /// The topic whose messages are requests; they begin with a header.
+    /// Topic of the requests; its messages begin with a header.
     pub request: String,
-    /// Recorded topics that are no inputs.
+    /// Recorded topics that are not inputs.
     pub left_out: Vec<String>,
-    /// Recorded topics that `rosbag play` plays beside the requests.
+    /// Recorded topics that `rosbag play` plays in addition to the requests.
     #[serde(default)]
     pub besides: Vec<String>,
-    /// The topic of answers, with the header of what they answer.
+    /// Topic of the answers, each with the header of its request.
     pub answer: String,
-    /// Answers begin like a `geometry_msgs/PoseStamped`.
+    /// True if answers begin like a `geometry_msgs/PoseStamped`.
     pub tells_pose: bool,
-    /// A topic with a header and three float64, seconds: acquisition, computation, rendering.
+    /// A topic with a header and three float64 in seconds: acquisition, computation, rendering.
     pub timing: Option<String>,
     /// A topic of `nav_msgs/OccupancyGrid`.
     pub map: Option<String>,
-    /// One request after the other's answer, or as they were recorded.
-    pub pace: Pace,
-    /// Every so many of the recorded requests is asked.
+    /// When requests are published.
+    pub pace: RequestPacing,
+    /// Interval at which recorded requests are used: every n-th one.
     pub every: usize,
-    /// Requests at the most, without the first ones, which are not counted.
+    /// Maximum number of requests, without the warm-up.
     pub most: usize,
-    /// Seconds after which a request counts as not answered.
+    /// Seconds after which a request counts as unanswered.
     pub give_up: f64,
-    /// Seconds after which the whole run does.
+    /// Seconds after which the whole run counts as failed.
     pub patience: f64,
-    /// Of requests at a rate: before this one, counted from 1, the network becomes that one.
+    /// For requests at a rate: before which request, counted from 1, the network changes, and to which one.
     #[serde(default)]
-    pub changes: Vec<(usize, Network)>,
+    pub changes: Vec<(usize, NetworkProfile)>,
 }
 
-/// When requests are published.
+/// Pacing of the requests.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Pace {
-    /// After the answer to the one before.
+pub enum RequestPacing {
+    /// Each request after the answer to the previous one.
     OneByOne,
-    /// At their recorded times, so much faster.
+    /// At the recorded times, divided by this factor.
     Recorded(f64),
-    /// At a rate, all again from the first after the last, once some were answered in time.
+    /// At a fixed rate, repeating the recording, once some warm-up requests were answered in time.
     Rate {
         /// Requests per second.
         hertz: f64,
         /// Seconds within which an answer is in time.
         in_time: f64,
     },
-    /// By `rosbag play`, at its own rate and with its own stamps, so many seconds of the recording.
+    /// By `rosbag play`, at its own rate and with its own stamps, for this number of seconds of the recording.
     Played(f64),
 }
 
-/// Who answers on the robot.
+/// The node that answers on the robot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Node {
-    /// The package itself, in the file system that was made of it.
+pub enum NodeUnderTest {
+    /// The package itself, in the file system of its image.
     Native {
         /// Shell commands that execute their arguments there.
         script: String,
-        /// The node's program in it.
+        /// The node's program in that file system.
         program: String,
-        /// Its arguments.
+        /// Arguments of the program.
         argv: Vec<String>,
     },
-    /// Its stub.
+    /// A stub of the package.
     Stub {
-        /// The package.
+        /// Name of the package.
         package: String,
-        /// The node's program.
+        /// The node's executable.
         executable: String,
-        /// Its arguments.
+        /// Arguments of the executable.
         argv: Vec<String>,
-        /// Lines of `stub.toml` beside the server's address.
+        /// Lines of `stub.toml` besides the server's address.
         settings: String,
-        /// Variables in its environment.
+        /// Environment variables.
         #[serde(default)]
         environment: Vec<(String, String)>,
     },

@@ -1,4 +1,4 @@
-//! What describes values: means, deviations, quantiles, and lines through them.
+//! Descriptive statistics: means, deviations, quantiles, and linear regression.
 
 use std::iter::repeat_n;
 
@@ -7,13 +7,13 @@ use super::random::Xorshift;
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
 
-/// The arithmetic mean.
+/// Arithmetic mean.
 pub fn mean(values: &[f64]) -> Option<f64> {
     let sum: f64 = values.iter().sum();
     (!values.is_empty() && !sum.is_nan()).then(|| sum / values.len() as f64)
 }
 
-/// The standard deviation of a sample: the sum of squares is divided by n − 1 (Bessel's correction). None of fewer than
+/// Standard deviation of a sample: the sum of squares is divided by n − 1 (Bessel's correction). `None` for fewer than
 /// two values.
 pub fn standard_deviation(values: &[f64]) -> Option<f64> {
     let mean = mean(values).filter(|mean| mean.is_finite())?;
@@ -21,30 +21,30 @@ pub fn standard_deviation(values: &[f64]) -> Option<f64> {
     (values.len() > 1).then(|| (squares / (values.len() - 1) as f64).sqrt())
 }
 
-/// The value that a fraction `0.0..=1.0` of the values stays below, between two values by linear interpolation: type 7
-/// of Hyndman and Fan, "Sample Quantiles in Statistical Packages", The American Statistician 50 (1996).
+/// Quantile at a fraction `0.0..=1.0`, linearly interpolated between two values: type 7 of Hyndman and Fan, "Sample
+/// Quantiles in Statistical Packages", The American Statistician 50 (1996).
 pub fn quantile(values: &[f64], fraction: f64) -> Option<f64> {
-    of_sorted(&sorted(values)?, fraction)
+    quantile_of_sorted(&sort_values(values)?, fraction)
 }
 
-/// The quantile of one half.
+/// The quantile at one half.
 pub fn median(values: &[f64]) -> Option<f64> {
     quantile(values, 0.5)
 }
 
-/// The values in ascending order; none if one is not a number.
-fn sorted(values: &[f64]) -> Option<Vec<f64>> {
+/// Returns the values in ascending order; `None` if one is NaN.
+fn sort_values(values: &[f64]) -> Option<Vec<f64>> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     (!sorted.iter().any(|value| value.is_nan())).then_some(sorted)
 }
 
-fn of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
+fn quantile_of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     let place = fraction.clamp(0.0, 1.0) * last as f64;
     let lower = *sorted.get(place.floor() as usize)?;
     let upper = *sorted.get(place.ceil() as usize)?;
-    // The difference of two infinite values is not a number.
+    // The difference of two infinite values would be NaN.
     Some(if lower == upper || place.fract() == 0.0 {
         lower
     } else {
@@ -52,23 +52,23 @@ fn of_sorted(sorted: &[f64], fraction: f64) -> Option<f64> {
     })
 }
 
-/// The confidence interval of the median, low and high, by the percentile bootstrap (Efron and Tibshirani, "An
-/// Introduction to the Bootstrap", 1993, chapter 13). `confidence` is between 0 and 1, such as 0.95. The same values
-/// give the same interval.
+/// Confidence interval of the median, low and high, by the percentile bootstrap (Efron and Tibshirani, "An Introduction
+/// to the Bootstrap", 1993, chapter 13). `confidence` is between 0 and 1, such as 0.95. The same values give the same
+/// interval.
 pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
-    let values = sorted(values)?;
+    let values = sort_values(values)?;
     let mut random = Xorshift::new(0);
     let mut medians = Vec::with_capacity(RESAMPLES);
     for _ in 0..RESAMPLES {
         let mut drawn = vec![0; values.len()];
         for _ in 0..values.len() {
-            drawn[random.below(values.len())] += 1;
+            drawn[random.index_below(values.len())] += 1;
         }
         let times = values.iter().zip(drawn);
         let resample: Vec<f64> = times
             .flat_map(|(value, times)| repeat_n(*value, times))
             .collect();
-        medians.push(of_sorted(&resample, 0.5)?);
+        medians.push(quantile_of_sorted(&resample, 0.5)?);
     }
     let outside = (1.0 - confidence) / 2.0;
     Some((
@@ -77,19 +77,19 @@ pub fn median_interval(values: &[f64], confidence: f64) -> Option<(f64, f64)> {
     ))
 }
 
-/// A straight line, and how well it describes the points.
+/// A straight line, and how well it fits the points.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Line {
-    /// Units of y for each unit of x.
+pub struct FittedLine {
+    /// Change of y per unit of x.
     pub slope: f64,
-    /// y where x is nothing.
+    /// y at x = 0.
     pub intercept: f64,
-    /// The share of the variance of y that the line explains, 0 to 1 (coefficient of determination).
+    /// Fraction of the variance of y that the line explains, 0 to 1 (coefficient of determination).
     pub r2: f64,
 }
 
-/// The line through (x, y) with the least sum of squared vertical distances. None unless there are two different x.
-pub fn least_squares(points: &[(f64, f64)]) -> Option<Line> {
+/// Fits a line through (x, y) by least squares of vertical distances. `None` unless there are two different x.
+pub fn least_squares(points: &[(f64, f64)]) -> Option<FittedLine> {
     let of = |which: fn(&(f64, f64)) -> f64| mean(&points.iter().map(which).collect::<Vec<_>>());
     let (x, y) = (of(|point| point.0)?, of(|point| point.1)?);
     let sum = |term: &dyn Fn(f64, f64) -> f64| -> f64 {
@@ -103,15 +103,15 @@ pub fn least_squares(points: &[(f64, f64)]) -> Option<Line> {
         sum(&|dx, dy| dx * dy),
         sum(&|_, dy| dy * dy),
     );
-    (xx > 0.0 && yy.is_finite()).then(|| Line {
+    (xx > 0.0 && yy.is_finite()).then(|| FittedLine {
         slope: xy / xx,
         intercept: y - xy / xx * x,
-        // A line through points of one height leaves nothing unexplained.
+        // A line through points of equal y leaves no variance unexplained.
         r2: if yy > 0.0 { xy * xy / (xx * yy) } else { 1.0 },
     })
 }
 
-/// The root of the mean squared difference of pairs, such as (predicted, measured), in their unit.
+/// Root mean square difference of pairs, such as (predicted, measured), in their unit.
 pub fn root_mean_square_error(pairs: &[(f64, f64)]) -> Option<f64> {
     let squares: Vec<f64> = pairs.iter().map(|pair| (pair.0 - pair.1).powi(2)).collect();
     mean(&squares).map(f64::sqrt)
@@ -119,7 +119,7 @@ pub fn root_mean_square_error(pairs: &[(f64, f64)]) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::near;
+    use super::super::assert_near;
     use super::*;
 
     #[test]
@@ -127,7 +127,7 @@ mod tests {
         // 2, 4, 4, 4, 5, 5, 7, 9: mean 5, sum of squares 32.
         let values = [2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0];
         assert_eq!(mean(&values), Some(5.0));
-        near(
+        assert_near(
             standard_deviation(&values).expect("values"),
             (32.0f64 / 7.0).sqrt(),
         );
@@ -142,7 +142,7 @@ mod tests {
         let values = [40.0, 10.0, 30.0, 20.0];
         assert_eq!(median(&values), Some(25.0));
         // (4 − 1) · 0.9 = 2.7: seven tenths of the way from 30 to 40.
-        near(quantile(&values, 0.9).expect("values"), 37.0);
+        assert_near(quantile(&values, 0.9).expect("values"), 37.0);
         assert_eq!(quantile(&values, 0.0), Some(10.0));
         assert_eq!(quantile(&values, 1.0), Some(40.0));
         assert_eq!(quantile(&[7.0], 0.3), Some(7.0));
@@ -174,9 +174,9 @@ mod tests {
     fn a_line_is_fitted() {
         // Means 2 and 4: Σdx² = 2, Σdx·dy = 3, Σdy² = 6.
         let line = least_squares(&[(1.0, 2.0), (2.0, 5.0), (3.0, 5.0)]).expect("two x");
-        near(line.slope, 1.5);
-        near(line.intercept, 1.0);
-        near(line.r2, 9.0 / (2.0 * 6.0));
+        assert_near(line.slope, 1.5);
+        assert_near(line.intercept, 1.0);
+        assert_near(line.r2, 9.0 / (2.0 * 6.0));
         assert_eq!(least_squares(&[(1.0, 2.0), (1.0, 3.0)]), None);
         assert_eq!(least_squares(&[]), None);
         let level = least_squares(&[(0.0, 3.0), (1.0, 3.0)]).expect("two x");
@@ -187,7 +187,7 @@ mod tests {
     fn errors_are_squared() {
         // Differences 3 and −4: √(25 / 2).
         let error = root_mean_square_error(&[(5.0, 2.0), (1.0, 5.0)]).expect("pairs");
-        near(error, 12.5f64.sqrt());
+        assert_near(error, 12.5f64.sqrt());
         assert_eq!(root_mean_square_error(&[]), None);
     }
 }

@@ -1,24 +1,24 @@
-//! Response times by cores and network.
+//! Model of response times by cores and network.
 
 use super::figures::{least_squares, mean};
 
-/// Geometric steps in which [`RrtModel::fit`] looks for the number of useful cores.
+/// Geometric steps in which [`RrtModel::fit`] searches for the number of useful cores.
 const STEPS: u32 = 400;
 
-/// Where a response time was measured, and what it was.
+/// A measured response time, and its conditions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Cores that the computation may use.
+    /// Cores available to the computation.
     pub cores: f64,
-    /// Round trip of the network, seconds.
+    /// Round-trip time of the network, in seconds.
     pub round_trip: f64,
     /// Bytes of a request on the network.
     pub bytes_up: f64,
     /// Bytes of its answer on the network.
     pub bytes_down: f64,
-    /// Rate of the network, bit/s; infinite where there is none.
+    /// Rate of the network in bit/s; infinite without a network.
     pub rate: f64,
-    /// The response time that was measured, seconds; [`RrtModel::predict`] does not look at it.
+    /// Measured response time in seconds; [`RrtModel::predict`] ignores it.
     pub rrt: f64,
 }
 
@@ -29,26 +29,26 @@ impl Point {
     }
 }
 
-/// What a request takes: `overhead` + round trip + bytes / rate + `work` / min(cores, `parallel`).
+/// Model of a request's duration: `overhead` + round trip + bytes / rate + `work` / min(cores, `parallel`).
 ///
-/// The computation's term is the greater of the two bounds on parallel work, its sum over the cores and its longest chain
-/// (Cormen et al., "Introduction to Algorithms", third edition, 2009, section 27.1). A model is that of one program;
-/// another program has other work.
+/// The term of the computation is the greater of two lower bounds of parallel work, its sum divided by the cores and
+/// its longest chain (Cormen et al., "Introduction to Algorithms", third edition, 2009, section 27.1). A model
+/// describes one program; another program has other work.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RrtModel {
-    /// Seconds that neither the network nor more cores change.
+    /// Seconds that depend neither on the network nor on the cores.
     pub overhead: f64,
-    /// Core seconds of computation for each request.
+    /// Core seconds of computation per request.
     pub work: f64,
-    /// Cores at which more cores give nothing. At most the greatest number that was measured, because no measurement
-    /// tells what more would give: then predictions for more cores are cautious.
+    /// Number of cores above which more cores do not help. It is at most the greatest measured number, because no
+    /// measurement shows the effect of more: predictions for more cores are therefore cautious.
     pub parallel: f64,
 }
 
 impl RrtModel {
-    /// The model with the least sum of squared differences to the measured times, over a grid of `parallel`; overhead
-    /// and work are not negative. Of equally good ones, that with the greatest `parallel`. None unless three usable
-    /// points with at least two numbers of cores are given: otherwise overhead and work cannot be told apart.
+    /// Fits the model by least squares of the measured times over a grid of `parallel`; overhead and work are not
+    /// negative. Of equally good models the one with the greatest `parallel` is returned. `None` unless there are three
+    /// usable points with at least two numbers of cores, because otherwise overhead and work cannot be distinguished.
     pub fn fit(points: &[Point]) -> Option<Self> {
         let usable: Vec<&Point> = points
             .iter()
@@ -91,13 +91,13 @@ impl RrtModel {
         best.map(|(_, model)| model)
     }
 
-    /// The response time at a point, seconds.
+    /// Predicts the response time at a point, in seconds.
     pub fn predict(&self, point: &Point) -> f64 {
         self.overhead + point.network() + self.work / point.cores.min(self.parallel)
     }
 }
 
-/// Intercept and slope of least squares that are not negative: the free optimum if it is one, else the better edge
+/// Intercept and slope of non-negative least squares: the unconstrained optimum if it is one, otherwise the better edge
 /// (Lawson and Hanson, "Solving Least Squares Problems", 1974, chapter 23, for two unknowns).
 fn not_negative(samples: &[(f64, f64)]) -> Option<(f64, f64)> {
     let free = least_squares(samples)?;
@@ -117,7 +117,7 @@ fn not_negative(samples: &[(f64, f64)]) -> Option<(f64, f64)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::near;
+    use super::super::assert_near;
     use super::*;
 
     fn point(cores: f64, rate: f64, rrt: f64) -> Point {
@@ -139,7 +139,7 @@ mod tests {
             work: 2.0,
             parallel: 3.0,
         };
-        near(
+        assert_near(
             true_model.predict(&point(1.0, 8e6, 0.0)),
             0.05 + 0.03 + 0.1 + 2.0,
         );
@@ -164,9 +164,9 @@ mod tests {
             .map(|cores| point(cores, 8e6, rrt(cores)))
             .collect();
         let model = RrtModel::fit(&points).expect("four numbers of cores");
-        near(model.parallel, 2.0);
-        near(model.work, 1.0);
-        near(model.predict(&point(16.0, 8e6, 0.0)), rrt(2.0));
+        assert_near(model.parallel, 2.0);
+        assert_near(model.work, 1.0);
+        assert_near(model.predict(&point(16.0, 8e6, 0.0)), rrt(2.0));
     }
 
     #[test]

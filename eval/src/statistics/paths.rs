@@ -2,22 +2,22 @@
 
 use super::figures::mean;
 
-/// How far an estimated trajectory is from the true one.
+/// Distance of an estimated trajectory from the true one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TrajectoryError {
-    /// Root of the mean squared distance, metres.
+    /// Root mean square distance, in metres.
     pub rmse: f64,
-    /// The greatest distance, metres.
+    /// Greatest distance, in metres.
     pub max: f64,
-    /// Poses of the estimate that could be compared.
+    /// Number of poses of the estimate that could be compared.
     pub count: usize,
 }
 
-/// The absolute trajectory error of poses (seconds, x, y in metres), as Sturm et al., "A Benchmark for the Evaluation of
-/// RGB-D SLAM Systems", IROS 2012, define it. The truth is interpolated linearly at the times of the estimate, poses
-/// outside its time are not compared; the estimate is then turned and moved, without scale, so that the squares of the
-/// distances are least (Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two Point Patterns",
-/// IEEE PAMI 13, 1991, in the plane). None of fewer than two poses.
+/// Absolute trajectory error of poses (seconds, x, y in metres), as defined by Sturm et al., "A Benchmark for the
+/// Evaluation of RGB-D SLAM Systems", IROS 2012. The truth is interpolated linearly at the times of the estimate; poses
+/// outside its time range are not compared. The estimate is then rotated and translated, without scaling, so that the
+/// sum of squared distances is minimal (Umeyama, "Least-Squares Estimation of Transformation Parameters Between Two
+/// Point Patterns", IEEE PAMI 13, 1991, in the plane). `None` for fewer than two poses.
 pub fn trajectory_error(
     estimate: &[(f64, f64, f64)],
     truth: &[(f64, f64, f64)],
@@ -29,7 +29,7 @@ pub fn trajectory_error(
     let pairs: Vec<[(f64, f64); 2]> = estimate
         .iter()
         .filter(finite)
-        .filter_map(|pose| Some([(pose.1, pose.2), interpolated(&truth, pose.0)?]))
+        .filter_map(|pose| Some([(pose.1, pose.2), interpolate(&truth, pose.0)?]))
         .collect();
     if pairs.len() < 2 {
         return None;
@@ -70,8 +70,8 @@ pub fn trajectory_error(
     })
 }
 
-/// Where a trajectory, sorted by time, is at a time within it.
-fn interpolated(truth: &[(f64, f64, f64)], time: f64) -> Option<(f64, f64)> {
+/// Interpolates a trajectory, sorted by time, at a time within its range.
+fn interpolate(truth: &[(f64, f64, f64)], time: f64) -> Option<(f64, f64)> {
     let after = truth.partition_point(|pose| pose.0 < time);
     let next = truth.get(after)?;
     if next.0 == time {
@@ -87,10 +87,10 @@ fn interpolated(truth: &[(f64, f64, f64)], time: f64) -> Option<(f64, f64)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::near;
+    use super::super::assert_near;
     use super::*;
 
-    /// A path like an eight, not symmetrical.
+    /// An asymmetric figure of eight.
     fn path() -> Vec<(f64, f64, f64)> {
         (0..200)
             .map(|index| {
@@ -114,7 +114,7 @@ mod tests {
         }
     }
 
-    /// A square of 2 m whose estimate is a square of 4 m: no turn or move helps, each corner is √2 m away.
+    /// A square of 2 m whose estimate is a square of 4 m: no rotation or translation helps, each corner is √2 m away.
     #[test]
     fn scale_is_an_error() {
         let square = |half: f64| {
@@ -126,8 +126,8 @@ mod tests {
             ]
         };
         let error = trajectory_error(&square(2.0), &square(1.0)).expect("poses");
-        near(error.rmse, 2.0f64.sqrt());
-        near(error.max, 2.0f64.sqrt());
+        assert_near(error.rmse, 2.0f64.sqrt());
+        assert_near(error.max, 2.0f64.sqrt());
         assert_eq!(error.count, 4);
     }
 

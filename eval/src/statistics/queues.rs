@@ -1,33 +1,34 @@
-//! Queues: how long robots wait for each other, and how many of them a node serves in time.
+//! Queueing models: how long robots wait for each other, and how many of them a node serves in time.
 
-/// How a node serves robots that each have one request at a time.
+/// Predicted state of a node that serves robots with one request at a time each.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Closed {
+pub struct QueuePrediction {
     /// Seconds from a request to its answer, without the network.
     pub response: f64,
     /// Requests per second of all robots together.
     pub throughput: f64,
-    /// The share of the cores' time that is used, 0 to 1.
+    /// Fraction of core time in use, 0 to 1.
     pub busy: f64,
 }
 
-/// The closed queue of `robots` that each wait for their answer, pause for `think` seconds on average and ask again, at a
-/// node of `cores` where a request takes `service` core seconds on average ("machine repair"). A request uses one core at
-/// most; less than one core is a slower server. Without robots nothing is used, and a request takes `service`.
+/// Solves the closed queue of `robots` that each wait for their answer, pause for `think` seconds on average and send
+/// the next request, at a node of `cores` where a request takes `service` core seconds on average ("machine repair"). A
+/// request uses at most one core; less than one core is a slower server. Without robots nothing is used, and a request
+/// takes `service`.
 ///
-/// Solved exactly, by the probabilities of each number of requests at the node: the finite source queue M/M/c//N
-/// (Kleinrock, "Queueing Systems", volume 1, 1975, section 3.10). As a scheduler shares the cores among all requests, the
-/// distributions of service and pause do not matter, only their means (Cohen, "The Multiple Phase Service Network with
-/// Generalized Processor Sharing", Acta Informatica 12, 1979).
-pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> Closed {
+/// The solution is exact, from the probabilities of each number of requests at the node: the finite source queue
+/// M/M/c//N (Kleinrock, "Queueing Systems", volume 1, 1975, section 3.10). As a scheduler shares the cores among all
+/// requests, only the means of service and pause matter, not their distributions (Cohen, "The Multiple Phase Service
+/// Network with Generalized Processor Sharing", Acta Informatica 12, 1979).
+pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> QueuePrediction {
     if robots == 0 {
-        return Closed {
+        return QueuePrediction {
             response: service / cores.min(1.0),
             throughput: 0.0,
             busy: 0.0,
         };
     }
-    // Logarithms of the weights of 0, 1, 2, ... requests at the node: the weights themselves leave the range of numbers.
+    // Logarithms of the weights of 0, 1, 2, ... requests at the node, because the weights themselves would overflow.
     let think = think.max(1e-12);
     let mut weights = vec![0.0f64];
     let mut weight = 0.0;
@@ -45,22 +46,22 @@ pub fn machine_repair(robots: u64, cores: f64, service: f64, think: f64) -> Clos
     }
     let used = used / all;
     let throughput = used / service;
-    Closed {
+    QueuePrediction {
         response: robots as f64 / throughput - think,
         throughput,
         busy: used / cores,
     }
 }
 
-/// The response time of [`machine_repair`], seconds.
-pub fn response(robots: u64, cores: f64, service: f64, think: f64) -> f64 {
+/// Returns the response time of [`machine_repair`], in seconds.
+pub fn response_time(robots: u64, cores: f64, service: f64, think: f64) -> f64 {
     machine_repair(robots, cores, service, think).response
 }
 
-/// How many robots a node can serve, of `robots`, so that their mean response time is at most `t_max` seconds.
+/// Returns how many of `robots` a node can serve with a mean response time of at most `t_max` seconds.
 pub fn robots_per_node(robots: u64, cores: f64, service: f64, think: f64, t_max: f64) -> u64 {
-    // The more robots, the longer each waits.
-    let in_time = |robots: u64| response(robots, cores, service, think) <= t_max;
+    // The response time grows with the number of robots.
+    let in_time = |robots: u64| response_time(robots, cores, service, think) <= t_max;
     let (mut enough, mut beyond) = (0, 1);
     while beyond <= robots && in_time(beyond) {
         enough = beyond;
@@ -78,40 +79,42 @@ pub fn robots_per_node(robots: u64, cores: f64, service: f64, think: f64, t_max:
     enough
 }
 
-/// What was measured of robots at a node.
+/// Measurements of robots at a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Observed {
-    /// How many asked.
+pub struct QueueObservation {
+    /// Number of robots.
     pub robots: u64,
-    /// The mean of their response times, seconds.
+    /// Mean of their response times, in seconds.
     pub response: f64,
-    /// The share of the cores' time that their requests used, 0 to 1.
+    /// Fraction of core time that their requests used, 0 to 1.
     pub busy: f64,
 }
 
-/// A node whose robots wait in the queue of [`machine_repair`] and, beside it, for what uses no core of the node.
+/// Model of a node whose robots wait in the queue of [`machine_repair`] and, in addition, for a delay that uses no core
+/// of the node.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Node {
-    /// Its cores.
+pub struct NodeModel {
+    /// Number of cores.
     pub cores: f64,
-    /// Seconds for which a robot pauses between an answer and its next request, on average.
+    /// Mean pause in seconds between an answer and the robot's next request.
     pub think: f64,
-    /// Core seconds of each request.
+    /// Core seconds per request.
     pub service: f64,
-    /// Seconds of each response that use no core, such as those on a network.
+    /// Seconds per response that use no core, such as those on a network.
     pub delay: f64,
 }
 
-/// Points on each axis of the grid in which [`Node::fit`] looks, rounds, and how much smaller the grid is in each.
+/// Points on each axis of the grid that [`NodeModel::fit`] searches, number of rounds, and the factor by which the grid
+/// shrinks in each round.
 const GRID: (i32, u32, f64) = (10, 9, 0.4);
 
-impl Node {
-    /// The `service` and `delay` whose response times and use of cores are nearest to what was observed: the sum of
-    /// squared logarithms of the ratios is least. None of observations that are not positive numbers, or of fewer than two.
-    pub fn fit(observed: &[Observed], cores: f64, think: f64) -> Option<Self> {
+impl NodeModel {
+    /// Fits `service` and `delay` to the observed response times and core use: the sum of squared logarithms of the
+    /// ratios is minimal. `None` if an observation is not positive, or for fewer than two observations.
+    pub fn fit(observed: &[QueueObservation], cores: f64, think: f64) -> Option<Self> {
         let positive = |value: f64| value.is_finite() && value > 0.0;
         let usable =
-            |one: &Observed| one.robots > 0 && positive(one.response) && positive(one.busy);
+            |one: &QueueObservation| one.robots > 0 && positive(one.response) && positive(one.busy);
         if observed.len() < 2 || !observed.iter().all(usable) {
             return None;
         }
@@ -123,7 +126,7 @@ impl Node {
             service,
             delay,
         };
-        // From the logarithm of the service time and the delay, half as wide as the range in which they can be.
+        // Starts from the logarithm of the service time and the delay, with half the width of their possible range.
         let (mut service, mut width) = ((quickest * 0.05).ln(), 40f64.ln());
         let (mut delay, mut height) = (quickest / 2.0, quickest / 2.0);
         let mut least = f64::INFINITY;
@@ -149,27 +152,27 @@ impl Node {
         Some(node(service.exp(), delay))
     }
 
-    /// The sum of squared logarithms of what it predicts, divided by what was observed.
-    fn distance(&self, observed: &[Observed]) -> f64 {
+    /// Returns the sum of squared logarithms of the ratios of prediction and observation.
+    fn distance(&self, observed: &[QueueObservation]) -> f64 {
         let terms = observed.iter().map(|one| {
-            let closed = self.at(one.robots);
+            let closed = self.predict(one.robots);
             let times = (closed.response / one.response).ln();
             times.powi(2) + (closed.busy / one.busy).ln().powi(2)
         });
         terms.sum()
     }
 
-    /// What it is like with so many robots; the response time includes the delay.
-    pub fn at(&self, robots: u64) -> Closed {
+    /// Predicts the state with `robots` robots; the response time includes the delay.
+    pub fn predict(&self, robots: u64) -> QueuePrediction {
         let closed = machine_repair(robots, self.cores, self.service, self.think + self.delay);
-        Closed {
+        QueuePrediction {
             response: closed.response + self.delay,
             ..closed
         }
     }
 
-    /// How many of so many robots it serves with a mean response time of at most `t_max` seconds.
-    pub fn serves(&self, robots: u64, t_max: f64) -> u64 {
+    /// Returns how many of `robots` it serves with a mean response time of at most `t_max` seconds.
+    pub fn robots_served(&self, robots: u64, t_max: f64) -> u64 {
         robots_per_node(
             robots,
             self.cores,
@@ -179,9 +182,9 @@ impl Node {
         )
     }
 
-    /// The number of robots from which on they wait for one another rather than for their own requests: where the
-    /// bounds of few and of many robots meet (Denning and Buzen, "The Operational Analysis of Queueing Network Models",
-    /// ACM Computing Surveys 10, 1978).
+    /// Returns the number of robots above which they wait for one another rather than for their own requests: the
+    /// intersection of the bounds for few and for many robots (Denning and Buzen, "The Operational Analysis of Queueing
+    /// Network Models", ACM Computing Surveys 10, 1978).
     pub fn knee(&self) -> f64 {
         self.cores * (self.think + self.delay + self.service) / self.service
     }
@@ -189,10 +192,11 @@ impl Node {
 
 #[cfg(test)]
 mod tests {
-    use super::super::near;
+    use super::super::assert_near;
     use super::*;
 
-    /// Exact Mean Value Analysis of one core (Reiser and Lavenberg, 1980): who arrives finds what the queue is without them.
+    /// Exact Mean Value Analysis of one core (Reiser and Lavenberg, 1980): an arriving robot sees the queue as it is
+    /// without that robot.
     fn one_core(robots: u64, service: f64, think: f64) -> f64 {
         let (mut response, mut length) = (0.0, 0.0);
         for robots in 1..=robots {
@@ -202,16 +206,19 @@ mod tests {
         response
     }
 
-    /// Two robots, service and pause of 1 s, one core: the states' weights are 1, 2, 2, so four fifths of a request
-    /// per second are answered and 2 / 0.8 − 1 = 1.5 s pass.
+    /// Two robots, service and pause of 1 s, one core: the states' weights are 1, 2, 2, so four fifths of a request per
+    /// second are answered, and the response time is 2 / 0.8 − 1 = 1.5 s.
     #[test]
     fn one_core_is_exact() {
         let closed = machine_repair(2, 1.0, 1.0, 1.0);
-        near(closed.response, 1.5);
-        near(closed.throughput, 0.8);
-        near(closed.busy, 0.8);
+        assert_near(closed.response, 1.5);
+        assert_near(closed.throughput, 0.8);
+        assert_near(closed.busy, 0.8);
         for robots in [1, 3, 10, 40] {
-            near(response(robots, 1.0, 0.2, 3.0), one_core(robots, 0.2, 3.0));
+            assert_near(
+                response_time(robots, 1.0, 0.2, 3.0),
+                one_core(robots, 0.2, 3.0),
+            );
         }
     }
 
@@ -220,37 +227,37 @@ mod tests {
     #[test]
     fn several_cores_are_exact() {
         let closed = machine_repair(3, 2.0, 1.0, 1.0);
-        near(closed.throughput, 12.0 / 8.5);
-        near(closed.response, 3.0 * 8.5 / 12.0 - 1.0);
-        near(closed.busy, 6.0 / 8.5);
-        near(response(1, 4.0, 0.5, 2.0), 0.5);
-        // All busy: 200 robots share what 4 cores answer.
-        near(response(200, 4.0, 0.5, 2.0), 200.0 * 0.5 / 4.0 - 2.0);
-        near(response(1, 0.25, 0.5, 2.0), 2.0);
-        near(machine_repair(0, 2.0, 0.5, 2.0).response, 0.5);
-        // Nobody pauses: three at two cores.
-        near(response(3, 2.0, 1.0, 0.0), 1.5);
-        assert!(response(5000, 2.0, 0.01, 0.2).is_finite());
+        assert_near(closed.throughput, 12.0 / 8.5);
+        assert_near(closed.response, 3.0 * 8.5 / 12.0 - 1.0);
+        assert_near(closed.busy, 6.0 / 8.5);
+        assert_near(response_time(1, 4.0, 0.5, 2.0), 0.5);
+        // Saturated: 200 robots share the throughput of 4 cores.
+        assert_near(response_time(200, 4.0, 0.5, 2.0), 200.0 * 0.5 / 4.0 - 2.0);
+        assert_near(response_time(1, 0.25, 0.5, 2.0), 2.0);
+        assert_near(machine_repair(0, 2.0, 0.5, 2.0).response, 0.5);
+        // Without pauses: three robots at two cores.
+        assert_near(response_time(3, 2.0, 1.0, 0.0), 1.5);
+        assert!(response_time(5000, 2.0, 0.01, 0.2).is_finite());
     }
 
     /// One core, 1 s of service, 1 s of pause: one robot waits 1 s, two wait 1.5 s, three wait 1 + 0.8 · 1.5 = 2.2 s.
     #[test]
     fn robots_that_are_served_in_time_are_counted() {
-        near(response(3, 1.0, 1.0, 1.0), 2.2);
+        assert_near(response_time(3, 1.0, 1.0, 1.0), 2.2);
         assert_eq!(robots_per_node(100, 1.0, 1.0, 1.0, 1.6), 2);
     }
 
-    const NODE: Node = Node {
+    const NODE: NodeModel = NodeModel {
         cores: 2.0,
         think: 0.2,
         service: 0.01,
         delay: 0.003,
     };
 
-    fn observed(robots: &[u64], as_if: impl Fn(u64) -> f64) -> Vec<Observed> {
+    fn observations(robots: &[u64], as_if: impl Fn(u64) -> f64) -> Vec<QueueObservation> {
         let all = robots.iter().map(|robots| {
-            let closed = NODE.at(*robots);
-            Observed {
+            let closed = NODE.predict(*robots);
+            QueueObservation {
                 robots: *robots,
                 response: closed.response * as_if(*robots),
                 busy: closed.busy,
@@ -261,36 +268,40 @@ mod tests {
 
     #[test]
     fn a_nodes_parameters_are_found() {
-        let node = Node::fit(&observed(&[1, 4, 16, 64], |_| 1.0), 2.0, 0.2).expect("four points");
+        let node =
+            NodeModel::fit(&observations(&[1, 4, 16, 64], |_| 1.0), 2.0, 0.2).expect("four points");
         assert!((node.service / 0.01 - 1.0).abs() < 0.01, "{node:?}");
         assert!((node.delay - 0.003).abs() < 0.0003, "{node:?}");
         for robots in [2, 8, 32, 100] {
-            let (predicted, real) = (node.at(robots).response, NODE.at(robots).response);
+            let (predicted, real) = (node.predict(robots).response, NODE.predict(robots).response);
             assert!((predicted / real - 1.0).abs() < 0.03, "{predicted} {real}");
         }
-        // Of measurements that are a tenth too long or too short.
-        let noisy = observed(
+        // Observations that are a tenth too long or too short.
+        let noisy = observations(
             &[1, 4, 16, 64],
             |robots| if robots == 4 { 1.1 } else { 0.9 },
         );
-        let node = Node::fit(&noisy, 2.0, 0.2).expect("four points");
+        let node = NodeModel::fit(&noisy, 2.0, 0.2).expect("four points");
         assert!((node.service / 0.01 - 1.0).abs() < 0.1, "{node:?}");
     }
 
     #[test]
     fn nothing_is_fitted_to_what_is_not_there() {
-        assert_eq!(Node::fit(&observed(&[4], |_| 1.0), 2.0, 0.2), None);
-        assert_eq!(Node::fit(&observed(&[1, 4], |_| f64::NAN), 2.0, 0.2), None);
-        assert_eq!(Node::fit(&[], 2.0, 0.2), None);
+        assert_eq!(NodeModel::fit(&observations(&[4], |_| 1.0), 2.0, 0.2), None);
+        assert_eq!(
+            NodeModel::fit(&observations(&[1, 4], |_| f64::NAN), 2.0, 0.2),
+            None
+        );
+        assert_eq!(NodeModel::fit(&[], 2.0, 0.2), None);
     }
 
-    /// 2 cores answer 200 requests a second; one robot asks 1 / 0.213 s.
+    /// 2 cores answer 200 requests per second; one robot sends 1 / 0.213 s.
     #[test]
     fn bounds_meet_at_the_knee() {
-        near(NODE.knee(), 200.0 * 0.213);
-        let most = NODE.serves(1000, 0.1);
-        assert!(NODE.at(most).response <= 0.1 && NODE.at(most + 1).response > 0.1);
-        assert_eq!(NODE.serves(7, 0.1), 7);
-        assert_eq!(NODE.serves(7, 0.012), 0);
+        assert_near(NODE.knee(), 200.0 * 0.213);
+        let most = NODE.robots_served(1000, 0.1);
+        assert!(NODE.predict(most).response <= 0.1 && NODE.predict(most + 1).response > 0.1);
+        assert_eq!(NODE.robots_served(7, 0.1), 7);
+        assert_eq!(NODE.robots_served(7, 0.012), 0);
     }
 }

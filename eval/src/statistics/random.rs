@@ -1,14 +1,14 @@
-//! Numbers that look random and are the same each time.
+//! A deterministic pseudorandom generator.
 
-/// The generator xorshift64* of Vigna, "An experimental exploration of Marsaglia's xorshift generators, scrambled",
-/// ACM Transactions on Mathematical Software 42 (2016).
+/// The generator xorshift64* of Vigna, "An experimental exploration of Marsaglia's xorshift generators, scrambled", ACM
+/// Transactions on Mathematical Software 42 (2016).
 #[derive(Debug, Clone)]
 pub struct Xorshift(u64);
 
 impl Xorshift {
-    /// Another sequence for each seed.
+    /// Creates a generator; each seed gives another sequence.
     pub fn new(seed: u64) -> Self {
-        // Its state must not be nothing, and neighbouring seeds must not have neighbouring states.
+        // The state must not be zero, and adjacent seeds must not have adjacent states.
         Self((seed + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1)
     }
 
@@ -19,14 +19,14 @@ impl Xorshift {
         self.0.wrapping_mul(0x2545_f491_4f6c_dd1d)
     }
 
-    /// A number below `limit`, which is small: its bias is not noticed.
-    pub fn below(&mut self, limit: usize) -> usize {
+    /// Returns a number below `limit`; the bias is negligible for small limits.
+    pub fn index_below(&mut self, limit: usize) -> usize {
         ((u128::from(self.next()) * limit as u128) >> 64) as usize
     }
 
-    /// A number of the exponential distribution with this mean, such as a pause between requests.
+    /// Returns an exponentially distributed number with this mean, such as a pause between requests.
     pub fn exponential(&mut self, mean: f64) -> f64 {
-        // More than 0 and at most 1, in steps that a number of 64 bits tells apart.
+        // More than 0 and at most 1, in steps that 64 bits can distinguish.
         let share = ((self.next() >> 11) + 1) as f64 / (1u64 << 53) as f64;
         -mean * share.ln()
     }
@@ -36,7 +36,7 @@ impl Xorshift {
 mod tests {
     use super::*;
 
-    /// Of the exponential distribution the mean and the standard deviation are equal, and a part of 1/e is above them.
+    /// An exponential distribution has equal mean and standard deviation, and a fraction of 1/e of it lies above them.
     #[test]
     fn pauses_are_exponential() {
         let mut random = Xorshift::new(7);

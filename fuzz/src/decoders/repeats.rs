@@ -1,13 +1,13 @@
-//! Texts that take much memory for what they are.
+//! Texts that take much memory for their size.
 
-/// A text of which one part is repeated.
+/// A text with a repeated part.
 #[derive(Clone, Copy)]
 pub struct Repeat {
-    /// Stands before.
+    /// Text before the repeated part.
     pub before: &'static str,
-    /// Is repeated.
+    /// Repeated part.
     pub part: &'static str,
-    /// Stands behind.
+    /// Text after the repeated part.
     pub after: &'static str,
 }
 
@@ -20,7 +20,7 @@ const fn repeat(before: &'static str, part: &'static str, after: &'static str) -
 }
 
 impl Repeat {
-    /// The text, with as many parts as fit into `bytes` bytes.
+    /// Returns the text, with as many repetitions as fit into `bytes` bytes.
     pub fn text(&self, bytes: usize) -> String {
         let mut text = self.before.to_owned();
         let mut count = 0;
@@ -32,7 +32,7 @@ impl Repeat {
     }
 }
 
-/// Fifty lists, opened and closed.
+/// Fifty nested lists.
 macro_rules! fifty {
     ("[") => {
         "[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[["

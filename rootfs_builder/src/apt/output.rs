@@ -1,10 +1,10 @@
-//! What apt prints, parsed.
+//! Parsers for the output of apt.
 
 use std::collections::BTreeSet;
 
 use super::{Deb, Relations};
 
-/// `'https://…/libfoo1_1.2-3_amd64.deb' libfoo1_1%3a1.2-3_amd64.deb 12345 SHA256:…`
+/// Parses a line `'https://…/libfoo1_1.2-3_amd64.deb' libfoo1_1%3a1.2-3_amd64.deb 12345 SHA256:…`.
 pub(super) fn parse_uri(line: &str) -> Option<Deb> {
     let (_, rest) = line.strip_prefix('\'')?.split_once("' ")?;
     let file = rest.split(' ').next()?.strip_suffix(".deb")?;
@@ -24,7 +24,7 @@ pub(super) fn field(stanza: &str, name: &str) -> Option<String> {
     })
 }
 
-/// A stanza's name, and what it says of others.
+/// Parses the name and the relations of a stanza.
 pub(super) fn parse_relations(stanza: &str) -> Option<(String, Relations)> {
     let names = |name: &str| -> BTreeSet<String> {
         let text = field(stanza, name).unwrap_or_default();
@@ -48,10 +48,10 @@ pub(super) fn parse_relations(stanza: &str) -> Option<(String, Relations)> {
     Some((name, about))
 }
 
-/// Fields of a stanza that name a package.
+/// Fields of a stanza that identify a package.
 pub(super) const NAMING: [&str; 3] = ["Package: ", "Version: ", "Architecture: "];
 
-/// A stanza of `apt-cache dumpavail`.
+/// Parses a stanza of `apt-cache dumpavail`.
 pub(super) fn parse_stanza(stanza: &str) -> Option<Deb> {
     let field = |name: &str| field(stanza, name);
     Some(Deb {
@@ -61,8 +61,8 @@ pub(super) fn parse_stanza(stanza: &str) -> Option<Deb> {
     })
 }
 
-/// The part of apt's refusal that says why: its errors, what is wrong with a signature, and the table of what does not fit together.
-pub(super) fn apts_words(lines: &str) -> String {
+/// Extracts the explanation from a failure of apt: its errors, signature problems, and the table of unmet dependencies.
+pub(super) fn extract_errors(lines: &str) -> String {
     let mut table = false;
     let mut words = Vec::new();
     for line in lines.lines() {
@@ -82,26 +82,27 @@ pub(super) fn apts_words(lines: &str) -> String {
     }
 }
 
-/// What to do where apt could not fetch lists, or does not believe them.
-pub(super) fn after_no_lists(words: &str) -> &'static str {
+/// Returns the next step after a failure to fetch or verify the lists.
+pub(super) fn suggest_next_step(words: &str) -> &'static str {
     let reasons = [
         (
             "NO_PUBKEY",
-            "the archive is signed by a key that is not known here: if that key is the right one, save its key ring as a file and name it by \
-             [signed-by=FILE] under [archives] in the configuration",
+            "the archive is signed by an unknown key: if the key is right, save its key ring as a file and name it \
+                with [signed-by=FILE] under [archives] in the configuration",
         ),
         (
             "is not signed",
-            "packages that nobody has signed are not installed: take a mirror that has the distribution's InRelease",
+            "unsigned packages are not installed: take a mirror that has the distribution's InRelease",
         ),
         (
             "Hash Sum mismatch",
-            "the lists are not those that were signed: the mirror is being updated, or somebody has changed them; push again later, or take another mirror",
+            "the lists do not match their signature: the mirror is being updated, or they were tampered with; push \
+                again later, or take another mirror",
         ),
     ];
     let known = reasons.iter().find(|(part, _)| words.contains(part));
     known.map_or(
-        "push again once this host reaches the archive",
+        "push again when this host can reach the archive",
         |(_, next)| next,
     )
 }

@@ -1,4 +1,5 @@
-//! An archive is believed by its signature alone: real archives, signed by real keys made here, read by the real apt.
+//! Tests that archives are verified by their signatures: real archives, signed by real keys that are generated here,
+//! read by the real apt.
 
 use std::process::Command;
 
@@ -7,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::tests::progress;
 use super::*;
 
-/// A key and its ring, as who keeps an archive has it.
+/// A key of an archive's maintainer, and its key ring.
 struct Key {
     home: tempfile::TempDir,
 }
@@ -33,14 +34,14 @@ impl Key {
         assert!(done.status.success(), "gpg {arguments:?}: {complaint}");
     }
 
-    /// The file that `signed-by` names.
+    /// Returns the file for `signed-by`.
     fn ring(&self) -> String {
         self.home.path().join("ring.gpg").display().to_string()
     }
 }
 
 impl Drop for Key {
-    /// gpg leaves an agent behind.
+    /// gpg leaves an agent process behind.
     fn drop(&mut self) {
         let _ = Command::new("gpgconf")
             .arg("--homedir")
@@ -98,7 +99,7 @@ impl Mirror {
         self.dist().join("main/binary-all/Packages")
     }
 
-    /// What apt says to its lists, where it is to know a ring; then what it would install.
+    /// Fetches the lists with a known key ring, and returns what would be installed.
     async fn read(&self, ring: &str) -> Result<Vec<String>, Error> {
         let state = tempfile::tempdir().expect("a directory");
         let at = self.root.path().display();
@@ -110,7 +111,7 @@ impl Mirror {
     }
 }
 
-fn says(error: &Error, words: &[&str]) {
+fn assert_mentions(error: &Error, words: &[&str]) {
     let text = error.to_string();
     for words in words {
         assert!(text.contains(words), "{words:?} is not in: {text}");
@@ -130,14 +131,14 @@ async fn an_archive_that_somebody_else_has_signed_is_refused_by_name() {
     let (key, other) = (Key::new(), Key::new());
     let mirror = Mirror::signed_by(&other);
     let error = mirror.read(&key.ring()).await.expect_err("refused");
-    says(&error, &["NO_PUBKEY", "[signed-by=FILE]"]);
+    assert_mentions(&error, &["NO_PUBKEY", "[signed-by=FILE]"]);
 }
 
 #[tokio::test]
 async fn an_archive_that_nobody_has_signed_is_refused() {
     let key = Key::new();
     let error = Mirror::new().read(&key.ring()).await.expect_err("refused");
-    says(&error, &["is not signed", "take a mirror"]);
+    assert_mentions(&error, &["is not signed", "take a mirror"]);
 }
 
 #[tokio::test]
@@ -146,5 +147,5 @@ async fn lists_that_were_changed_after_the_signature_are_refused() {
     let mirror = Mirror::signed_by(&key);
     fs::write(mirror.lists(), PACKAGES.replace("1.5", "6.6")).expect("written");
     let error = mirror.read(&key.ring()).await.expect_err("refused");
-    says(&error, &["Hash Sum mismatch", "push again later"]);
+    assert_mentions(&error, &["Hash Sum mismatch", "push again later"]);
 }

@@ -19,8 +19,8 @@ fn what_apt_would_fetch_is_understood() {
     );
 }
 
-/// Lists as apt keeps them, of an archive that is never asked for anything.
-fn listed(root: &Path, packages: &str) -> Apt {
+/// Creates the lists of an archive that is never contacted.
+fn apt_with_lists(root: &Path, packages: &str) -> Apt {
     let sources = "deb [trusted=yes] https://m.invalid/debian stable main\n";
     let apt = Apt::open(root, sources).expect("prepared");
     let lists = root.join("state/lists");
@@ -49,7 +49,7 @@ const LAB: &str = "Package: robot\nVersion: 1:2.0-1\nArchitecture: all\nDepends:
 #[tokio::test]
 async fn lists_are_plain_whatever_the_hosts_apt_does() {
     let root = tempfile::tempdir().expect("a directory");
-    let apt = listed(root.path(), LAB);
+    let apt = apt_with_lists(root.path(), LAB);
     let before = apt.stamp();
     let warning = apt
         .refresh(false, &progress())
@@ -61,7 +61,7 @@ async fn lists_are_plain_whatever_the_hosts_apt_does() {
     let plain = lists.join("m.invalid_debian_dists_stable_main_binary-amd64_Packages");
     assert_eq!(fs::read_to_string(plain).expect("there"), LAB);
     assert_ne!(apt.stamp(), before);
-    // A list that cannot be read is apt's to complain about.
+    // An unreadable list is reported by apt itself.
     fs::write(lists.join("other_Packages.xz"), "torn").expect("written");
     apt.refresh(false, &progress()).await.expect("not needed");
     assert!(lists.join("other_Packages.xz").exists() && !lists.join("other_Packages").exists());
@@ -70,7 +70,7 @@ async fn lists_are_plain_whatever_the_hosts_apt_does() {
 #[tokio::test]
 async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
     let root = tempfile::tempdir().expect("a directory");
-    let apt = listed(root.path(), LAB);
+    let apt = apt_with_lists(root.path(), LAB);
     let names = BTreeSet::from(["robot".to_owned()]);
     let debs = apt.resolve(None, &names).await.expect("resolved");
     let told: Vec<String> = debs.iter().map(Deb::to_string).collect();
@@ -79,7 +79,7 @@ async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
     assert!(place("bolt=4:all") < place("arm=1.5:all"), "{told:?}");
     place("robot=1:2.0-1:all");
     place("wheel=1:all");
-    // What is there already is not installed again.
+    // Installed packages are not installed again.
     let status = root.path().join("status");
     let there = "Package: bolt\nStatus: install ok installed\nVersion: 4\nArchitecture: all\n";
     fs::write(&status, there).expect("written");
@@ -93,7 +93,7 @@ async fn what_is_to_be_installed_comes_in_an_order_that_dpkg_accepts() {
 #[tokio::test]
 async fn relations_are_those_of_the_lists() {
     let root = tempfile::tempdir().expect("a directory");
-    let apt = listed(root.path(), LAB);
+    let apt = apt_with_lists(root.path(), LAB);
     let asked = ["robot=1:2.0-1", "arm=1.5"].map(str::to_owned);
     let relations = apt.relations(asked).await.expect("told");
     let names = |names: &BTreeSet<String>| names.iter().cloned().collect::<Vec<_>>().join(" ");
@@ -108,14 +108,14 @@ async fn relations_are_those_of_the_lists() {
             ("robot", "arm leg wheel".to_owned(), String::new()),
         ]
     );
-    // Of a part that brings files alone: its packages are there already.
+    // For a part that only adds files: its packages are already installed.
     assert_eq!(apt.relations([]).await.expect("nothing asked").len(), 0);
 }
 
 #[tokio::test]
 async fn candidates_are_those_that_apt_would_take() {
     let root = tempfile::tempdir().expect("a directory");
-    let apt = listed(root.path(), LAB);
+    let apt = apt_with_lists(root.path(), LAB);
     for from in ["apt", "the file"] {
         let candidates = apt.candidates().await.expect(from);
         let names: Vec<&str> = candidates.names().collect();
@@ -145,7 +145,7 @@ fn what_a_package_says_of_others_is_understood() {
         about.provides,
         ["cv-plugin".to_owned(), "other".to_owned()].into()
     );
-    // A source package of the same name is not told.
+    // A source package of the same name is not listed.
     let (_, about) = parse_relations("Package: zlib1g\nVersion: 1").expect("a stanza");
     assert_eq!((about.source.as_str(), about.needs.len()), ("zlib1g", 0));
     assert_eq!(parse_relations("N: no such package"), None);
@@ -164,15 +164,18 @@ fn epochs_are_escaped_in_file_names() {
 #[test]
 fn the_reason_is_taken_from_apts_refusal() {
     let lines = "Reading package lists...\nE: Unable to locate package nonesuch\nBuilding dependency tree...";
-    assert_eq!(apts_words(lines), "E: Unable to locate package nonesuch");
+    assert_eq!(
+        extract_errors(lines),
+        "E: Unable to locate package nonesuch"
+    );
     let lines = "Some packages could not be installed.\n\nThe following packages have unmet dependencies:\n \
                  a : Depends: b but it is not installable\nE: Unable to correct problems";
     assert_eq!(
-        apts_words(lines),
+        extract_errors(lines),
         "The following packages have unmet dependencies:; a : Depends: b but it is not installable; \
          E: Unable to correct problems"
     );
-    assert_eq!(apts_words("something else"), "something else");
+    assert_eq!(extract_errors("something else"), "something else");
 }
 
 #[test]
@@ -192,7 +195,7 @@ fn the_state_directory_is_its_own() {
 }
 
 pub(super) fn progress() -> Progress {
-    // Nobody listens.
+    // Nobody receives the events.
     Progress::new(tokio::sync::mpsc::channel(1).0)
 }
 
@@ -289,5 +292,5 @@ async fn apt_is_asked_for_names_alone() {
         );
     }
     let good = ["libstdc++6", "libfoo2.0-dev", "0ad", "?essential"];
-    assert!(good.into_iter().all(may_be_asked));
+    assert!(good.into_iter().all(is_package_name));
 }

@@ -1,26 +1,27 @@
 use super::*;
 
-const SMALLEST: &str = "summary = \"x\"\ndistribution = \"debian\"\nsuite = \"bookworm\"\nros = \"ros1\"\nros_distribution = \"noetic\"\n\
+const SMALLEST: &str = "summary = \"x\"\ndistribution = \"debian\"\nsuite = \"bookworm\"\nros = \"ros1\"\n\
+    ros_distribution = \"noetic\"\n\
     [runtime]\npackages = [\"libroscpp4d\"]\n[build]\npackages = []\nprefix = \"/opt/x\"\n";
 
-fn ours() -> PathBuf {
+fn repository_bases() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../images")
 }
 
 #[test]
 fn every_definition_of_the_repository_is_valid() {
-    let names = names(&ours()).expect("the directory is there");
+    let names = names(&repository_bases()).expect("the directory is there");
     assert!(names.contains(&"bookworm-ros1".to_owned()), "{names:?}");
     for name in names {
-        let base = load(&ours(), &name).expect("valid");
+        let base = load(&repository_bases(), &name).expect("valid");
         assert!(base.keys.contains_key("eigen"), "{name} knows rosdep keys");
     }
 }
 
 #[test]
 fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
-    let base = load(&ours(), "bookworm-ros1").expect("valid");
-    // As dpkg matches (fnmatch without flags): a star goes over slashes.
+    let base = load(&repository_bases(), "bookworm-ros1").expect("valid");
+    // Matches like dpkg (fnmatch without flags): a star also matches slashes.
     fn matches(pattern: &[u8], path: &[u8]) -> bool {
         match (pattern.first(), path.first()) {
             (None, None) => true,
@@ -44,7 +45,7 @@ fn directories_of_man_pages_stay_for_the_links_that_scripts_make_in_them() {
 
 #[test]
 fn what_packages_of_strangers_asked_for_is_known() {
-    let base = load(&ours(), "bookworm-ros1").expect("valid");
+    let base = load(&repository_bases(), "bookworm-ros1").expect("valid");
     for key in [
         "bfl",
         "liborocos-bfl-dev",
@@ -60,7 +61,7 @@ fn what_packages_of_strangers_asked_for_is_known() {
 
 #[test]
 fn tools_that_only_check_have_a_stand_in_and_are_not_missed() {
-    let base = load(&ours(), "bookworm-ros1").expect("valid");
+    let base = load(&repository_bases(), "bookworm-ros1").expect("valid");
     for tool in ["roslint", "code_coverage", "ros_pytest"] {
         let config = format!("/usr/share/{tool}/cmake/{tool}Config.cmake");
         assert!(base.build.files.contains_key(Path::new(&config)), "{tool}");
@@ -71,7 +72,9 @@ fn tools_that_only_check_have_a_stand_in_and_are_not_missed() {
 #[test]
 fn an_unknown_base_is_answered_with_those_known() {
     for name in ["nonesuch", "../images/bookworm-ros1", ""] {
-        let error = load(&ours(), name).expect_err("not there").to_string();
+        let error = load(&repository_bases(), name)
+            .expect_err("not there")
+            .to_string();
         assert!(error.contains("bookworm-ros1"), "{error}");
     }
 }
@@ -108,13 +111,13 @@ fn there_are_bases_of_both_versions_of_ros() {
         ("noble-jazzy", Version::Ros2, "jazzy"),
         ("jammy-humble", Version::Ros2, "humble"),
     ] {
-        let flavour = load(&ours(), name).expect("valid").flavour();
+        let flavour = load(&repository_bases(), name).expect("valid").flavour();
         assert_eq!((flavour.ros, &*flavour.distribution), (ros, distribution));
     }
 }
 
-/// A directory with these files.
-fn lab(files: &[(&str, &str)]) -> tempfile::TempDir {
+/// Creates a directory with these files.
+fn write_definitions(files: &[(&str, &str)]) -> tempfile::TempDir {
     let directory = tempfile::tempdir().expect("a directory");
     for (name, text) in files {
         fs::write(directory.path().join(name), text).expect("written");
@@ -126,11 +129,11 @@ fn lab(files: &[(&str, &str)]) -> tempfile::TempDir {
 fn a_base_may_have_the_keys_of_another_and_its_own_come_before() {
     let one = format!("{SMALLEST}[keys]\neigen = [\"libeigen3-dev\"]\nfmt = [\"libfmt-dev\"]\n");
     let two = format!("keys_of = \"one\"\n{SMALLEST}[keys]\nfmt = [\"libfmt9-dev\"]\n");
-    let lab = lab(&[("one.toml", &one), ("two.toml", &two)]);
+    let lab = write_definitions(&[("one.toml", &one), ("two.toml", &two)]);
     let base = load(lab.path(), "two").expect("valid");
     assert_eq!(base.keys["eigen"], ["libeigen3-dev"]);
     assert_eq!(base.keys["fmt"], ["libfmt9-dev"]);
-    let alone = self::lab(&[("two.toml", &two)]);
+    let alone = self::write_definitions(&[("two.toml", &two)]);
     let error = load(alone.path(), "two").expect_err("it names another");
     assert!(error.to_string().contains("\"one\""), "{error}");
 }
@@ -143,7 +146,7 @@ fn wheels_are_those_of_the_lists_beside_a_definition() {
     );
     let pinned = format!("ros-x==1.0 --hash=sha256:{}\n", "0".repeat(64));
     let a = ("a.requirements.txt", &*pinned);
-    let lab = |b: (&str, &str)| lab(&[("x.toml", &text), a, b]);
+    let lab = |b: (&str, &str)| write_definitions(&[("x.toml", &text), a, b]);
     let base = load(lab(("b.requirements.txt", "")).path(), "x").expect("valid");
     assert_eq!(
         (base.required.runtime.len(), base.required.build.len()),

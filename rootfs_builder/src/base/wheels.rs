@@ -1,50 +1,52 @@
-//! A base's ROS that comes as wheels of Python.
+//! Bases whose ROS comes as Python wheels.
 
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::error::{Error, IoAt};
+use crate::error::{Error, IoContext};
 use crate::requirements::Requirements;
 
-/// Python packages that bring ROS.
+/// Python packages that provide ROS.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Wheels {
-    /// The version of the base's Python: `3.11`.
+    /// Python version of the base: `3.11`.
     pub python: String,
-    /// That of its C library, by which wheels are chosen: `2.36`.
+    /// C library version of the base, by which wheels are selected: `2.36`.
     pub glibc: String,
-    /// Where they are put.
+    /// Installation prefix.
     pub prefix: PathBuf,
-    /// Requirements with hashes, a file beside the definition: what every image has.
+    /// Name of a requirements file with hashes next to the definition: packages of every image.
     pub runtime: String,
-    /// The same, present only while a package is compiled.
+    /// Name of a requirements file with hashes next to the definition: packages present only while a package is
+    /// compiled.
     pub build: String,
-    /// Files that are put there besides, of what every image has: path below the prefix → content.
+    /// Additional files in every image: path below the prefix → content.
     #[serde(default)]
     pub files: BTreeMap<PathBuf, String>,
-    /// In files of CMake: what the wheels' builder had elsewhere → where it is here.
+    /// Replacements in CMake files: path on the wheels' build machine → path here.
     #[serde(default)]
     pub rewrite: BTreeMap<String, String>,
 }
 
 impl Wheels {
-    /// Interfaces of Python that wheels may be compiled for (PEP 425).
+    /// Returns the Python ABIs that wheels may be compiled for (PEP 425).
     pub(crate) fn abis(&self) -> impl Iterator<Item = String> {
         let own = format!("cp{}", self.python.replace('.', ""));
         [own, "abi3".to_owned(), "none".to_owned()].into_iter()
     }
 
-    /// Platforms that wheels may be compiled for (PEP 600), the newest first. `machine`: `x86_64`.
+    /// Returns the platforms that wheels may be compiled for (PEP 600), newest first. `machine` is a name such as
+    /// `x86_64`.
     pub(crate) fn platforms(&self, machine: &str) -> impl Iterator<Item = String> {
         let minor = self.glibc.rsplit('.').next().unwrap_or_default();
         let newest: u32 = minor.parse().unwrap_or_default();
         let numbered = (5..=newest)
             .rev()
             .map(|minor| format!("manylinux_2_{minor}"));
-        // Names of 2.17, 2.12 and 2.5 that came before the numbers.
+        // Legacy names of 2.17, 2.12 and 2.5.
         let named = ["manylinux2014", "manylinux2010", "manylinux1"];
         let all: Vec<String> = numbered
             .chain(named.map(str::to_owned))
@@ -82,18 +84,18 @@ impl Wheels {
     }
 }
 
-/// What its files of requirements say.
+/// Content of the requirements files.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Required {
+pub(crate) struct RequiredWheels {
     pub(crate) runtime: Requirements,
     pub(crate) build: Requirements,
 }
 
-impl Required {
+impl RequiredWheels {
     pub(super) fn read(directory: &Path, wheels: &Wheels) -> Result<Self, Error> {
         let read = |file: &String| {
             let path = directory.join(file);
-            let text = std::fs::read_to_string(&path).at("reading", &path)?;
+            let text = std::fs::read_to_string(&path).io_context("reading", &path)?;
             Requirements::parse(&text).map_err(|problem| Error::BadBase { path, problem })
         };
         Ok(Self {

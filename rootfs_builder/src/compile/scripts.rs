@@ -1,5 +1,5 @@
-//! `inside/compile.py`, run as it is, with a directory in the place of a container's root and a shell script in that of
-//! CMake.
+//! Tests of `inside/compile.py` in its original form, with a directory in place of the container's root and a shell
+//! script in place of CMake.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
@@ -7,8 +7,8 @@ use std::process::{Command, Output};
 
 use super::*;
 
-/// Configures a package by its own files: `packages` and `modules` name what it requires, `optional` a module that it does
-/// not. Installs what is in `install`.
+/// Stand-in for CMake. Configures a package according to its own files: `packages` and `modules` list what it requires,
+/// `optional` a module that it does not require. Installs the content of `install`.
 const CMAKE: &str = r#"#!/bin/sh
 if [ "$1" = --build ]; then exit 0; fi
 if [ "$1" = --install ]; then
@@ -46,10 +46,10 @@ for name in $(lists optional) $(lists modules); do
 done
 "#;
 
-struct Lab(tempfile::TempDir);
+struct ScriptFixture(tempfile::TempDir);
 
-impl Lab {
-    /// With these files below the pushed packages.
+impl ScriptFixture {
+    /// Creates a fixture with these files below the pushed packages.
     fn new(files: &[(&str, &str)]) -> Self {
         let lab = Self(tempfile::tempdir().expect("a directory"));
         lab.write("bin/cmake", CMAKE);
@@ -82,20 +82,20 @@ impl Lab {
         fs::write(path, text).expect("written");
     }
 
-    /// Does a task with packages of these names and build types.
+    /// Performs a task with packages of these names and build types.
     fn run(&self, task: Task, packages: &[(&str, &str)]) -> Output {
-        let unit = |(name, build_type): &(&str, &str)| Unit {
+        let unit = |(name, build_type): &(&str, &str)| BuildUnit {
             name: (*name).to_owned(),
             path: (*name).into(),
             build_type: (*build_type).to_owned(),
         };
-        let units: Vec<Unit> = packages.iter().map(unit).collect();
+        let units: Vec<BuildUnit> = packages.iter().map(unit).collect();
         let prefix = self.path("prefix");
         let job = Job {
             check: task == Task::Check,
             packages: units
                 .iter()
-                .map(|unit| Given {
+                .map(|unit| JobPackage {
                     unit,
                     needs: Vec::new(),
                 })
@@ -121,11 +121,11 @@ impl Lab {
     }
 }
 
-fn said(output: &Output) -> String {
+fn stdout_text(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// A plain CMake package that installs a module of pkg-config, and one of catkin that requires it.
+/// A plain CMake package that installs a pkg-config module, and a catkin package that requires it.
 const OF_MODULES: [(&str, &str); 4] = [
     ("csm/csm.pc.in", ""),
     ("csm/install/lib/pkgconfig/csm.pc", ""),
@@ -136,22 +136,22 @@ const PACKAGES: [(&str, &str); 2] = [("csm", "cmake"), ("matcher", "catkin")];
 
 #[test]
 fn pkg_config_finds_plain_packages_before_any_of_catkin_is_installed() {
-    let lab = Lab::new(&OF_MODULES);
+    let lab = ScriptFixture::new(&OF_MODULES);
     let output = lab.run(Task::Compile, &PACKAGES);
-    assert!(output.status.success(), "{}", said(&output));
+    assert!(output.status.success(), "{}", stdout_text(&output));
     assert!(lab.path("prefix/lib/pkgconfig/csm.pc").exists());
 }
 
 #[test]
 fn a_module_that_another_package_may_bring_is_not_missed() {
-    let lab = Lab::new(&OF_MODULES);
+    let lab = ScriptFixture::new(&OF_MODULES);
     let output = lab.run(Task::Check, &PACKAGES);
-    assert!(output.status.success(), "{}", said(&output));
-    assert_eq!(said(&output).matches("::configured ").count(), 2);
-    // Where none does, that is told before anything is compiled.
-    let alone = Lab::new(&OF_MODULES[2..]);
+    assert!(output.status.success(), "{}", stdout_text(&output));
+    assert_eq!(stdout_text(&output).matches("::configured ").count(), 2);
+    // If no package provides it, the error is reported before anything is compiled.
+    let alone = ScriptFixture::new(&OF_MODULES[2..]);
     let output = alone.run(Task::Check, &PACKAGES[1..]);
-    let text = said(&output);
+    let text = stdout_text(&output);
     assert!(!output.status.success());
     assert!(
         text.contains("::failed matcher") && text.contains("\nNo package 'csm' found"),
@@ -167,11 +167,11 @@ fn all_that_is_missing_is_named_in_one_round() {
         ("loam/optional", "frob\n"),
     ];
     for task in [Task::Check, Task::Compile] {
-        let output = Lab::new(&files).run(task, &[("loam", "catkin")]);
-        let text = said(&output);
+        let output = ScriptFixture::new(&files).run(task, &[("loam", "catkin")]);
+        let text = stdout_text(&output);
         assert_eq!(output.status.code(), Some(1), "{text}");
         let (_, told) = text
-            .split_once("All that is required and not there:\n")
+            .split_once("Missing requirements:\n")
             .expect("a summary");
         for words in ["\"cv_bridge\"", "\"PCL\"", "\"Ceres\"", "'csm'"] {
             assert!(told.contains(words), "{text}");
@@ -183,13 +183,13 @@ fn all_that_is_missing_is_named_in_one_round() {
 #[test]
 fn what_is_wrong_otherwise_is_not_looked_at_again() {
     let files = [("loam/optional", "frob\n"), ("loam/modules", "")];
-    let lab = Lab::new(&files);
+    let lab = ScriptFixture::new(&files);
     lab.write(
         "bin/cmake",
         "#!/bin/sh\necho 'CMake Error: syntax'\nexit 1\n",
     );
     let output = lab.run(Task::Compile, &[("loam", "catkin")]);
-    let text = said(&output);
+    let text = stdout_text(&output);
     assert!(
         !text.contains("not there") && !lab.path("build/build/loam-again").exists(),
         "{text}"

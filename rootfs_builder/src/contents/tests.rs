@@ -2,7 +2,7 @@ use super::*;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-/// A list as the archive has it.
+/// Writes a list as in the archive.
 pub(crate) fn list(directory: &Path, name: &str, text: &str) -> PathBuf {
     let path = directory.join(name);
     let mut gz = GzEncoder::new(File::create(&path).expect("made"), Compression::fast());
@@ -47,11 +47,14 @@ fn libraries_and_ros_packages_are_found() {
     let nodelet = contents.ros_package("nodelet");
     assert_eq!(
         nodelet["nodelet-tools"],
-        [Part::Manifest, Part::Programs].into()
+        [RosPackagePart::Manifest, RosPackagePart::Programs].into()
     );
-    assert_eq!(nodelet["ros-nodelet-srvs"], [Part::Definitions].into());
-    assert_eq!(nodelet["python3-nodelet"], [Part::Python].into());
-    assert_eq!(nodelet["libnodelet-dev"], [Part::CMake].into());
+    assert_eq!(
+        nodelet["ros-nodelet-srvs"],
+        [RosPackagePart::Definitions].into()
+    );
+    assert_eq!(nodelet["python3-nodelet"], [RosPackagePart::Python].into());
+    assert_eq!(nodelet["libnodelet-dev"], [RosPackagePart::CMake].into());
     assert!(contents.ros_package("nodele").is_empty());
     assert_eq!(contents.ros_packages_in("python3-nodelet"), ["nodelet"]);
 }

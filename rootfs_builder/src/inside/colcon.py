@@ -53,7 +53,7 @@ def environment_of(prefix, given):
 def colcon(environment):
     program = shutil.which("colcon", path=environment.get("PATH"))
     if program is None:
-        print("the base has no colcon in its PATH, with which packages of ROS 2 are built", flush=True)
+        print("the base has no colcon in its PATH, which builds packages of ROS 2", flush=True)
         sys.exit(1)
     return program
 
@@ -78,7 +78,7 @@ def invalid(packages, given):
     argv = [python_of(colcon(given), given), "-c", READ_MANIFESTS] + list(paths)
     result = subprocess.run(argv, env=given, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, check=False)
     if result.returncode != 0:
-        print("package.xml files cannot be read as colcon reads them", flush=True)
+        print("cannot read the package.xml files with colcon's parser", flush=True)
         sys.exit(1)
     problems = json.loads(result.stdout.decode("utf-8"))
     return {paths[path]: "%s: %s" % (path, words) for path, words in problems.items()}

@@ -111,7 +111,7 @@ def plain(value, where, warnings):
     if isinstance(value, float):
         if math.isfinite(value):
             return value
-        warnings.append("parameter %s is %r, which cannot be kept: it is left out" % (where, value))
+        warnings.append("parameter %s is %r, which is not a finite number, so it is omitted" % (where, value))
         return None
     if isinstance(value, dict):
         return {str(k): plain(v, "%s/%s" % (where, k), warnings) for k, v in value.items()}
@@ -119,7 +119,7 @@ def plain(value, where, warnings):
         return [plain(v, where, warnings) for v in value]
     data = getattr(value, "data", value)
     if isinstance(data, (bytes, bytearray)):
-        warnings.append("parameter %s is binary: kept as base64 text" % where)
+        warnings.append("parameter %s is binary and is stored as base64 text" % where)
         return base64.b64encode(bytes(data)).decode("ascii")
     return str(value)
 
@@ -160,7 +160,7 @@ def from_launch_file(ask, rospack, plan):
         declared = arguments.root_context.resolve_dict.get("arg_doc", {})
         unknown = [name for name in ask["args"] if name not in declared]
         if unknown:
-            words = "it has no argument %s; it has: %s" % (", ".join(unknown), ", ".join(declared) or "none")
+            words = "it has no argument %s; available: %s" % (", ".join(unknown), ", ".join(declared) or "none")
             raise Refused("launch", file=path, words=words)
         loader = roslaunch.xmlloader.XmlLoader(resolve_anon=True)
         # Read by the loader but set only by roslaunch's own callers of it.
@@ -188,7 +188,7 @@ def describe(node, rospack):
     from roslaunch.core import is_machine_local
 
     if node.machine is not None and not is_machine_local(node.machine):
-        words = "node %s is to run on machine %s; a servant is one machine" % (node.name, node.machine.address)
+        words = "node %s is assigned to machine %s, but a servant is one machine" % (node.name, node.machine.address)
         raise Refused("launch", file=node.filename, words=words)
     argv = roslaunch.node_args.create_local_process_args(node, node.machine)
     program = argv[len(shlex.split(node.launch_prefix)) if node.launch_prefix else 0]
@@ -282,12 +282,12 @@ def make_plan(ask):
         if len(executables) == 1:
             from_executables(ask, rospack, plan, executables)
             if launch_files:
-                words = "%s is run by itself, the only executable; for remappings and parameters of a launch file push with --launch: %s"
+                words = "%s is run directly, as the only executable; for remappings and parameters of a launch file push with --launch: %s"
                 plan["warnings"].append(words % (executables[0], ", ".join(launch_files)))
         elif len(launch_files) == 1:
             from_launch_file(dict(ask, launch=launch_files[0]), rospack, plan)
             if executables:
-                words = "%s is run, the only launch file; for an executable by itself push with --node: %s"
+                words = "%s is run, as the only launch file; for a single executable push with --node: %s"
                 plan["warnings"].append(words % (launch_files[0], ", ".join(executables)))
         else:
             raise Refused("nothing", executables=plan["executables"], launch_files=plan["launch_files"])

@@ -91,7 +91,7 @@ def kind_of(value):
 def parameter(name, value, refused):
     kind = kind_of(value)
     if kind is None:
-        words = "the parameter %s of a component cannot be %s: it is true or false, a number, a text, or a list of one of them"
+        words = "parameter %s of a component cannot be %s; allowed: true or false, a number, a text, or a list of one of these"
         raise refused("component", words=words % (name, json.dumps(value)))
     if kind in (3, 8):
         value = [float(one) for one in value] if kind == 8 else float(value)
@@ -120,7 +120,7 @@ def of_command_line(package, plugin, arguments, refused):
         rule = words.pop(0) if word in ("-r", "--remap") and words else word
         source, equals, target = rule.partition(":=")
         if not equals or source.startswith("-"):
-            said = "a component takes no argument %r: names are remapped by FROM:=TO, and parameters are -p NAME:=VALUE"
+            said = "a component has no argument %r; remap names with FROM:=TO, and set parameters with -p NAME:=VALUE"
             raise refused("component", words=said % rule)
         if source in ("__node", "__name"):
             component["node_name"] = target

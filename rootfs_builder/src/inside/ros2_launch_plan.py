@@ -64,7 +64,7 @@ def resolve(path, ask, plan, refused, give_up):
     unknown = [name for name in ask["args"] if name not in declared]
     if unknown:
         # Functions in it may ask for arguments that it does not declare.
-        words_of = "the launch file declares no argument %s; it has: %s"
+        words_of = "the launch file declares no argument %s; available: %s"
         plan["warnings"].append(words_of % (", ".join(unknown), ", ".join(declared) or "none"))
     service = launch.LaunchService(noninteractive=True)
     include = launch.actions.IncludeLaunchDescription(source, launch_arguments=list(ask["args"].items()))
@@ -105,7 +105,7 @@ class Recorder:
             recorder.load(action, context)
 
         def at_once(action, _context):
-            recorder.plan["warnings"].append("what the launch file starts after a while is started with the rest")
+            recorder.plan["warnings"].append("delayed actions of the launch file are executed at once")
             return list(getattr(action, "_TimerAction__actions"))
 
         ExecuteLocal.execute = execute
@@ -139,7 +139,7 @@ class Recorder:
             if name in names:
                 self.plan["components"].setdefault(name, []).extend(requests)
             elif requests:
-                words = "it loads %s into %s, and starts no container of that name (it starts %s)"
+                words = "it loads %s into %s, but starts no container of that name (it starts %s)"
                 plugins = ", ".join(one["plugin_name"] for one in requests)
                 return words % (plugins, name, ", ".join(names) or "none")
         return None
@@ -150,7 +150,7 @@ class Recorder:
         if isinstance(action, self.launch_ros.actions.Node):
             self.plan["nodes"].append(self.node(action, context, command))
         else:
-            words = "the launch file also runs %r, which is no ROS node: it is left out"
+            words = "the launch file also runs %r, which is not a ROS node, so it is omitted"
             self.plan["warnings"].append(words % " ".join(command)[:200])
         # Those that wait for it to be started go on.
         started = self.launch.events.process.ProcessStarted(
@@ -222,7 +222,7 @@ class Recorder:
     def tell_what_is_left(self, service):
         handlers = getattr(service.context, "_event_handlers", [])
         if any(isinstance(one, self.launch.event_handlers.OnProcessExit) for one in handlers):
-            words = "what the launch file does when a process ends is not done, but for respawn and shutdown"
+            words = "actions of the launch file on the exit of a process are ignored, except respawn and shutdown"
             self.plan["warnings"].append(words)
         self.plan["warnings"] = list(dict.fromkeys(self.plan["warnings"]))
 

@@ -307,12 +307,12 @@ def make_plan(ask):
         if len(plan["executables"]) == 1:
             nodes = plan["executables"]
             if plan["launch_files"]:
-                words = "%s is run by itself, the only executable; for remappings and parameters of a launch file push with --launch: %s"
+                words = "%s is run directly, as the only executable; for remappings and parameters of a launch file push with --launch: %s"
                 plan["warnings"].append(words % (nodes[0], ", ".join(plan["launch_files"])))
         elif len(plan["launch_files"]) == 1 and can_launch():
             launch = plan["launch_files"][0]
             if plan["executables"]:
-                words = "%s is run, the only launch file; for an executable by itself push with --node: %s"
+                words = "%s is run, as the only launch file; for a single executable push with --node: %s"
                 plan["warnings"].append(words % (launch, ", ".join(plan["executables"])))
         elif not plan["executables"] and len(plan["components_known"]) == 1:
             nodes = plan["components_known"]

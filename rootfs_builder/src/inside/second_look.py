@@ -104,4 +104,4 @@ def lines(packages, libraries, modules):
     found = ['Could not find a package configuration file provided by "%s"' % name for name in packages]
     found += ["Could NOT find %s (missing: what its files are)" % name for name in libraries]
     found += ["No package '%s' found, for pkg-config" % name for name in modules]
-    return (["All that is required and not there:"] if found else []) + found
+    return (["Missing requirements:"] if found else []) + found

@@ -55,7 +55,7 @@ class Prefix:
             # Otherwise the one that comes last would count, whichever that is.
             with open(place, "rb") as file:
                 if file.read() != data:
-                    sys.exit("two wheels have %s, and not the same" % place)
+                    sys.exit("two wheels contain different versions of %s" % place)
         with open(place, "wb") as file:
             file.write(data)
         os.chmod(place, 0o755 if runs else 0o644)

@@ -1,17 +1,18 @@
-//! Nodes that are loaded into component containers: plans of them.
+//! Tests of plans with components.
 
 use serde_json::{Value, json};
 
-use super::of_two::{Lab, argv, evaluated};
+use super::of_two::{Ros2Fixture, argv, evaluate};
 use super::*;
 
-/// What the scripts wrote for a launch file with two containers, and launch_ros 0.26 beneath them. Of the first one's nodes one is
-/// loaded by an action of its own, which stands before it, and one has a condition that is not met; the second one is in a group.
+/// Recorded output of the scripts for a launch file with two containers, with launch_ros 0.26. Of the components of the
+/// first container one is loaded by a separate action before it, and one has a condition that is false; the second
+/// container is in a group.
 const RECORDED: &[u8] = include_bytes!("composed.json");
 
-fn understood(text: &[u8]) -> Answer {
-    let answer = understand(text, Version::Ros2).expect("a plan");
-    plan::check(&answer).expect("a plan that the script could have written");
+fn parse_plan(text: &[u8]) -> LaunchAnswer {
+    let answer = parse_reply(text, Version::Ros2).expect("a plan");
+    plan::check_plan(&answer).expect("a plan that the script could have written");
     answer
 }
 
@@ -23,7 +24,7 @@ fn value(component: &Component, name: &str) -> Value {
 
 #[test]
 fn a_plan_says_what_is_loaded_into_which_container() {
-    let answer = understood(RECORDED);
+    let answer = parse_plan(RECORDED);
     let nodes: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(nodes, ["/box", "/deep/two"]);
     let [listener, talker] = &answer.components["/box"][..] else {
@@ -63,12 +64,12 @@ fn a_plan_says_what_is_loaded_into_which_container() {
 
 #[test]
 fn what_is_loaded_must_be_defined_in_the_image() {
-    let answer = understood(RECORDED);
+    let answer = parse_plan(RECORDED);
     let mut definitions = Definitions::new();
     let refused = check_composition(&answer.components, &definitions).expect_err("no definition");
     let words = refused.to_string();
     assert!(
-        words.contains("into /box by composition_interfaces/srv/LoadNode")
+        words.contains("into /box with composition_interfaces/srv/LoadNode")
             && words.contains("--with composition_interfaces"),
         "{words}"
     );
@@ -79,8 +80,8 @@ fn what_is_loaded_must_be_defined_in_the_image() {
     check_composition(&BTreeMap::new(), &Definitions::new()).expect("nothing is loaded");
 }
 
-/// A package that has registered these classes.
-fn registered(lab: &Lab, classes: &[&str]) {
+/// Creates a package that has registered these classes.
+fn register_classes(lab: &Ros2Fixture, classes: &[&str]) {
     let lines = classes
         .iter()
         .map(|class| format!("{class};lib/libtalk.so\n"));
@@ -90,16 +91,16 @@ fn registered(lab: &Lab, classes: &[&str]) {
 
 #[test]
 fn a_class_that_is_named_gets_a_container_of_its_own() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("base", "rclcpp_components", &["component_container"]);
     lab.package("space", "talk", &[]);
-    registered(&lab, &["talk::Talker", "talk::Listener"]);
+    register_classes(&lab, &["talk::Talker", "talk::Listener"]);
     let asked = [
         "talk::Talker chatter:=said -p rate:=2.5 -p 'names:=[a, b]' __node:=one __ns:=/below",
         "talk/talk::Listener",
         "talk::Talker --ros-args -r __node:=two --",
     ];
-    let mut ask = lab.of("space", &asked);
+    let mut ask = lab.query("space", &asked);
     ask.remaps = [("in".to_owned(), "out".to_owned())].into();
     ask.params = [
         ("rate", json!(7)),
@@ -139,7 +140,7 @@ fn a_class_that_is_named_gets_a_container_of_its_own() {
     );
     assert_eq!(one.remap_rules, ["chatter:=said", "in:=out"]);
     let integer = |value: i64| json!({"type": 2, "integer_value": value});
-    // What the push says for all nodes counts more than what stands behind the class.
+    // Settings of the push for all nodes take precedence over those after the class.
     assert_eq!(value(one, "rate"), integer(7));
     assert_eq!(
         value(one, "names"),
@@ -152,9 +153,9 @@ fn a_class_that_is_named_gets_a_container_of_its_own() {
     assert_eq!(listener.full_name(), None);
     assert_eq!(value(listener, "gains.p"), Value::Null);
 
-    // The only one that there is is meant where no program is.
-    registered(&lab, &["talk::Talker"]);
-    let answer = lab.ask(&lab.of("space", &[])).expect("a plan");
+    // The only class is used if there is no executable.
+    register_classes(&lab, &["talk::Talker"]);
+    let answer = lab.ask(&lab.query("space", &[])).expect("a plan");
     assert_eq!(
         answer.components["/Talker_container"][0].plugin,
         "talk::Talker"
@@ -163,11 +164,11 @@ fn a_class_that_is_named_gets_a_container_of_its_own() {
 
 #[test]
 fn a_class_that_cannot_be_loaded_is_refused_with_what_can() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker"]);
-    registered(&lab, &["talk::Talker", "talk::Listener"]);
+    register_classes(&lab, &["talk::Talker", "talk::Listener"]);
     let refused = |node: &str| {
-        let error = lab.ask(&lab.of("space", &[node])).expect_err("refused");
+        let error = lab.ask(&lab.query("space", &[node])).expect_err("refused");
         error.to_string()
     };
     let text = refused("talk::Talker");
@@ -185,12 +186,12 @@ fn a_class_that_cannot_be_loaded_is_refused_with_what_can() {
     let text = refused("talk::Talker --loud");
     assert!(text.contains("no argument '--loud'"), "{text}");
     let text = refused("talk::Talker -p list:=[]");
-    assert!(text.contains("the parameter list of a component"), "{text}");
+    assert!(text.contains("parameter list of a component"), "{text}");
 }
 
 #[test]
 fn values_of_requests_become_json() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     for (value, expected) in [
         ("float('inf')", "Infinity"),
         ("[1.5, float('nan')]", "[1.5, 'NaN']"),
@@ -198,7 +199,7 @@ fn values_of_requests_become_json() {
         ("True", "True"),
     ] {
         assert_eq!(
-            evaluated(&lab, &format!("components.plain({value})")),
+            evaluate(&lab, &format!("components.plain({value})")),
             expected
         );
     }
@@ -213,7 +214,7 @@ fn values_of_requests_become_json() {
         ("{}", "None"),
     ] {
         assert_eq!(
-            evaluated(&lab, &format!("components.kind_of({value})")),
+            evaluate(&lab, &format!("components.kind_of({value})")),
             expected,
             "{value}"
         );

@@ -1,5 +1,5 @@
-//! The script for ROS 1, run as it is, with a directory in the place of a container's root and stand-ins for rospkg and
-//! roslib, which this machine need not have.
+//! Tests of the script for ROS 1 in its original form, with a directory in place of the container's root, and stand-ins
+//! for rospkg and roslib, which need not be installed.
 
 use std::os::unix::fs::PermissionsExt;
 use std::process::Command;
@@ -20,7 +20,7 @@ class RosPack:
         raise ResourceNotFound(name)
 ";
 
-/// Finds what `rosrun` would.
+/// Stand-in that finds what `rosrun` would find.
 const ROSLIB: &str = "
 import os
 
@@ -32,13 +32,13 @@ def find_node(package, name, rospack):
     return [path for path in paths if os.access(path, os.X_OK)]
 ";
 
-struct Lab(tempfile::TempDir);
+struct Ros1Fixture(tempfile::TempDir);
 
-impl Lab {
-    /// A package `p` with these files, below its install space: their text and mode.
+impl Ros1Fixture {
+    /// Creates a package `p` with these files below its install space: path, text and mode.
     fn new(files: &[(&str, &str, u32)]) -> Self {
         let lab = Self(tempfile::tempdir().expect("a directory"));
-        let (_, script) = scripts(Version::Ros1)[0];
+        let (_, script) = plan_scripts(Version::Ros1)[0];
         let inside = format!("{}/cloudroid/", lab.0.path().display());
         for (path, text, mode) in [
             ("cloudroid/out/.keep", "", 0o644),
@@ -67,11 +67,11 @@ impl Lab {
         fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("set");
     }
 
-    fn ask(&self) -> Result<Answer, Error> {
-        let ask = Ask {
+    fn ask(&self) -> Result<LaunchAnswer, Error> {
+        let ask = LaunchQuery {
             packages: vec!["p".to_owned()],
             prefix: self.0.path().join("space").display().to_string(),
-            ..Ask::default()
+            ..LaunchQuery::default()
         };
         let question = serde_json::to_string(&ask).expect("JSON");
         self.write("cloudroid/ask.json", &question, 0o644);
@@ -85,7 +85,7 @@ impl Lab {
             .expect("run");
         assert!(said.status.success(), "{said:?}");
         let text = fs::read(self.0.path().join("cloudroid/out/plan.json")).expect("a plan");
-        understand(&text, Version::Ros1)
+        parse_reply(&text, Version::Ros1)
     }
 }
 
@@ -95,13 +95,13 @@ const SCRIPT: &str = "#!/usr/bin/env python3\n";
 fn what_builds_read_is_no_executable() {
     for (place, program) in [("lib/p", "lib/p/node"), ("share/p", "share/p/scripts/node")] {
         let planner = format!("{place}/cfg/Planner.cfg").replace("lib/p/cfg", "lib/p");
-        let lab = Lab::new(&[(program, SCRIPT, 0o755), (&planner, SCRIPT, 0o755)]);
+        let lab = Ros1Fixture::new(&[(program, SCRIPT, 0o755), (&planner, SCRIPT, 0o755)]);
         let answer = lab.ask().expect("a plan");
         assert_eq!(answer.nodes[0].executable, "node");
         assert!(answer.warnings.is_empty(), "{:?}", answer.warnings);
     }
-    // Everything of some archives is executable.
-    let lab = Lab::new(&[
+    // In some archives all files are executable.
+    let lab = Ros1Fixture::new(&[
         ("share/p/scripts/one", SCRIPT, 0o755),
         ("share/p/scripts/two", "\u{7f}ELF", 0o755),
         ("share/p/README.md", "# p", 0o755),
@@ -116,7 +116,7 @@ fn what_builds_read_is_no_executable() {
 
 #[test]
 fn of_an_executable_and_launch_files_it_is_told_which_is_taken() {
-    let lab = Lab::new(&[
+    let lab = Ros1Fixture::new(&[
         ("lib/p/node", SCRIPT, 0o755),
         ("share/p/launch/demo.launch", "", 0o644),
     ]);
@@ -124,7 +124,7 @@ fn of_an_executable_and_launch_files_it_is_told_which_is_taken() {
     assert_eq!(
         answer.warnings,
         [
-            "node is run by itself, the only executable; for remappings and parameters of a launch file push with \
+            "node is run directly, as the only executable; for remappings and parameters of a launch file push with \
           --launch: launch/demo.launch"
         ]
     );

@@ -1,4 +1,4 @@
-//! The scripts for ROS 2, run as they are, with a directory in the place of a container's root.
+//! Tests of the scripts for ROS 2 in their original form, with a directory in place of the container's root.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
@@ -6,18 +6,18 @@ use std::process::Command;
 
 use super::*;
 
-/// What an image holds, and what is asked.
-pub(super) struct Lab {
+/// Directory with the content of an image, and the queries to it.
+pub(super) struct Ros2Fixture {
     root: tempfile::TempDir,
 }
 
-impl Lab {
+impl Ros2Fixture {
     pub(super) fn new() -> Self {
         let lab = Self {
             root: tempfile::tempdir().expect("a directory"),
         };
         lab.write("cloudroid/out/.keep", "", 0o644);
-        for (name, text) in scripts(Version::Ros2) {
+        for (name, text) in plan_scripts(Version::Ros2) {
             let inside = format!("{}/cloudroid/", lab.root.path().display());
             let text = text.replace("/cloudroid/", &inside);
             lab.write(&format!("cloudroid/{name}"), &text, 0o644);
@@ -38,7 +38,7 @@ impl Lab {
         fs::set_permissions(path, fs::Permissions::from_mode(mode)).expect("set");
     }
 
-    /// An installed package with these programs.
+    /// Installs a package with these programs.
     pub(super) fn package(&self, prefix: &str, name: &str, programs: &[&str]) {
         let index = format!("{prefix}/share/ament_index/resource_index/packages/{name}");
         self.write(&index, "", 0o644);
@@ -52,10 +52,10 @@ impl Lab {
         }
     }
 
-    pub(super) fn ask(&self, ask: &Ask) -> Result<Answer, Error> {
+    pub(super) fn ask(&self, ask: &LaunchQuery) -> Result<LaunchAnswer, Error> {
         let question = serde_json::to_string(ask).expect("JSON");
         self.write("cloudroid/ask.json", &question, 0o644);
-        let (first, _) = scripts(Version::Ros2)[0];
+        let (first, _) = plan_scripts(Version::Ros2)[0];
         let said = Command::new("/usr/bin/python3")
             .arg(self.path("cloudroid").join(first))
             .env_clear()
@@ -66,37 +66,37 @@ impl Lab {
             .expect("run");
         assert!(said.status.success(), "{said:?}");
         let text = fs::read(self.path("cloudroid/out/plan.json")).expect("a plan");
-        let answer = understand(&text, Version::Ros2)?;
-        plan::check(&answer)?;
+        let answer = parse_reply(&text, Version::Ros2)?;
+        plan::check_plan(&answer)?;
         Ok(answer)
     }
 
-    pub(super) fn of(&self, prefix: &str, nodes: &[&str]) -> Ask {
-        Ask {
+    pub(super) fn query(&self, prefix: &str, nodes: &[&str]) -> LaunchQuery {
+        LaunchQuery {
             packages: vec!["talk".to_owned()],
             prefix: self.path(prefix).display().to_string(),
             nodes: nodes.iter().map(|&node| node.to_owned()).collect(),
-            ..Ask::default()
+            ..LaunchQuery::default()
         }
     }
 }
 
-pub(super) fn argv(answer: &Answer, index: usize) -> Vec<&str> {
+pub(super) fn argv(answer: &LaunchAnswer, index: usize) -> Vec<&str> {
     let words = answer.nodes[index].argv.iter().skip(1);
     words.map(String::as_str).collect()
 }
 
 #[test]
 fn programs_of_an_installed_package_are_nodes() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker", "listener"]);
-    // What colcon writes there: the space is where it is told that it is.
+    // Written there by colcon: the space is relocatable by an environment variable.
     lab.write(
         "space/local_setup.sh",
         "export AMENT_PREFIX_PATH=\"$COLCON_CURRENT_PREFIX:$AMENT_PREFIX_PATH\" HOOKED=1\n",
         0o644,
     );
-    let mut ask = lab.of("space", &["talker --loud", "talker", "turtle/swim"]);
+    let mut ask = lab.query("space", &["talker --loud", "talker", "turtle/swim"]);
     ask.params = [
         ("rate".to_owned(), serde_json::json!(2)),
         ("/all".to_owned(), serde_json::json!("x")),
@@ -138,7 +138,7 @@ fn programs_of_an_installed_package_are_nodes() {
 
 #[test]
 fn a_space_without_scripts_gets_what_it_needs() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     for (prefix, name, programs) in [
         ("space/talk", "talk", &["talker"][..]),
         ("space/msgs", "msgs", &[]),
@@ -150,8 +150,8 @@ fn a_space_without_scripts_gets_what_it_needs() {
             0o644,
         );
     }
-    // One program, so it is the one that is meant.
-    let answer = lab.ask(&lab.of("space", &[])).expect("a plan");
+    // A single program is the default.
+    let answer = lab.ask(&lab.query("space", &[])).expect("a plan");
     assert_eq!(answer.nodes[0].name, "/talker");
     for (variable, below) in [
         ("AMENT_PREFIX_PATH", ""),
@@ -172,14 +172,14 @@ fn a_space_without_scripts_gets_what_it_needs() {
 
 #[test]
 fn nodes_are_named_as_on_either_command_line() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker"]);
     let asked = [
         "talker __name:=one",
         "talker --loud __node:=two __ns:=/below",
         "talker --ros-args -r __node:=three -p rate:=1",
     ];
-    let answer = lab.ask(&lab.of("space", &asked)).expect("a plan");
+    let answer = lab.ask(&lab.query("space", &asked)).expect("a plan");
     let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(names, ["/one", "/below/two", "/three"]);
     assert!(answer.nodes.iter().all(|node| node.named));
@@ -195,13 +195,14 @@ fn nodes_are_named_as_on_either_command_line() {
     assert_eq!(argv(&answer, 1), words);
     let words = ["--ros-args", "-r", "__node:=three", "-p", "rate:=1"];
     assert_eq!(argv(&answer, 2), words);
-    // A name that is taken gets a number, before the rule that asks for it; in another namespace it is another one.
+    // A name that is taken gets a number, in a rule before the one that requests it; in another namespace it is not
+    // taken.
     let asked = [
         "talker __node:=one",
         "talker __node:=one",
         "talker __node:=one __ns:=/below",
     ];
-    let answer = lab.ask(&lab.of("space", &asked)).expect("a plan");
+    let answer = lab.ask(&lab.query("space", &asked)).expect("a plan");
     let names: Vec<&str> = answer.nodes.iter().map(|node| &*node.name).collect();
     assert_eq!(names, ["/one", "/one_2", "/below/one"]);
     let rules = [
@@ -218,29 +219,29 @@ fn nodes_are_named_as_on_either_command_line() {
 
 #[test]
 fn what_cannot_be_run_is_told_with_what_there_is() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker", "listener"]);
     lab.write("space/share/talk/launch/both.launch.py", "", 0o644);
     lab.write("space/share/talk/config/all.yaml", "", 0o644);
-    let refused = |ask: &Ask| lab.ask(ask).expect_err("refused").to_string();
-    let text = refused(&lab.of("space", &[]));
+    let refused = |ask: &LaunchQuery| lab.ask(ask).expect_err("refused").to_string();
+    let text = refused(&lab.query("space", &[]));
     assert!(
         text.contains("executables: listener, talker; launch files: launch/both.launch.py"),
         "{text}"
     );
-    let text = refused(&lab.of("space", &["walker"]));
+    let text = refused(&lab.query("space", &["walker"]));
     assert!(
         text.contains("no executable \"walker\"") && text.contains("listener, talker"),
         "{text}"
     );
-    let mut ask = lab.of("space", &[]);
+    let mut ask = lab.query("space", &[]);
     ask.launch = "none.launch.py".to_owned();
     let text = refused(&ask);
     assert!(
         text.contains("no launch file \"none.launch.py\"") && text.contains("both.launch.py"),
         "{text}"
     );
-    // This Python has no launch, as the base of wheels has none.
+    // This Python has no launch, like the base with wheels.
     ask.launch = "both.launch.py".to_owned();
     let text = refused(&ask);
     assert!(
@@ -251,7 +252,7 @@ fn what_cannot_be_run_is_told_with_what_there_is() {
 
 #[test]
 fn a_space_for_another_python_is_refused() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.package("space", "talk", &["talker"]);
     lab.write(
         "space/lib/python3.2/site-packages/talk/__init__.py",
@@ -259,24 +260,24 @@ fn a_space_for_another_python_is_refused() {
         0o644,
     );
     let text = lab
-        .ask(&lab.of("space", &["talker"]))
+        .ask(&lab.query("space", &["talker"]))
         .expect_err("another")
         .to_string();
     assert!(
-        text.contains("made for python3.2, and the base has python3."),
+        text.contains("built for python3.2, but the base has python3."),
         "{text}"
     );
     lab.write("space/local_setup.sh", "return 3\n", 0o644);
     fs::remove_dir_all(lab.path("space/lib/python3.2")).expect("removed");
     let text = lab
-        .ask(&lab.of("space", &["talker"]))
+        .ask(&lab.query("space", &["talker"]))
         .expect_err("it fails")
         .to_string();
     assert!(text.contains("ended with status 3"), "{text}");
 }
 
-/// What an expression of the second script's module is.
-pub(super) fn evaluated(lab: &Lab, expression: &str) -> String {
+/// Evaluates a Python expression in the second script's module.
+pub(super) fn evaluate(lab: &Ros2Fixture, expression: &str) -> String {
     let code = format!(
         "from ros2_launch_plan import *; import ros2_components as components; print({expression})"
     );
@@ -291,7 +292,7 @@ pub(super) fn evaluated(lab: &Lab, expression: &str) -> String {
 
 #[test]
 fn parameters_of_launch_files_keep_their_types() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     for (value, expected) in [
         ("True", "true"),
         ("7", "7"),
@@ -305,21 +306,21 @@ fn parameters_of_launch_files_keep_their_types() {
         ("[]", "[]"),
     ] {
         assert_eq!(
-            evaluated(&lab, &format!("written({value})")),
+            evaluate(&lab, &format!("written({value})")),
             expected,
             "{value}"
         );
     }
     let nested = "sorted(flattened({'a': {'b': 1, 'c': {'d': 2}}, 'e': 3}, '').items())";
     assert_eq!(
-        evaluated(&lab, nested),
+        evaluate(&lab, nested),
         "[('a.b', 1), ('a.c.d', 2), ('e', 3)]"
     );
 }
 
 #[test]
 fn sections_of_parameter_files_apply_by_name() {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     for (pattern, node, expected) in [
         ("/**", "'/a/b'", "True"),
         ("/**", "None", "True"),
@@ -332,18 +333,19 @@ fn sections_of_parameter_files_apply_by_name() {
         ("/**/b", "'/a/c/b'", "True"),
     ] {
         let expression = format!("applies('{pattern}', {node})");
-        assert_eq!(evaluated(&lab, &expression), expected, "{pattern} {node}");
+        assert_eq!(evaluate(&lab, &expression), expected, "{pattern} {node}");
     }
     let tree = "{'/ns': {'n': {'ros__parameters': {'k': 1}}}, '/**': {'ros__parameters': None}}";
     assert_eq!(
-        evaluated(&lab, &format!("list(sections({tree}, ''))")),
+        evaluate(&lab, &format!("list(sections({tree}, ''))")),
         "[('/ns/n', {'k': 1}), ('/**', {})]"
     );
 }
 
-/// What a launch file's own parameters become behind a parameters file, in a command line of a node whose name is known.
+/// Returns the arguments that result from a parameters file followed by a launch file's own parameters, for a node
+/// whose name is known.
 fn arguments_behind(file: &str, own: &str, given: &[&str]) -> String {
-    let lab = Lab::new();
+    let lab = Ros2Fixture::new();
     lab.write("board.yaml", file, 0o644);
     lab.write("launch_params_1", own, 0o644);
     let (file, own) = (lab.path("board.yaml"), lab.path("launch_params_1"));
@@ -370,21 +372,22 @@ fn arguments_behind(file: &str, own: &str, given: &[&str]) -> String {
 
 #[test]
 fn what_a_launch_file_changes_of_a_parameters_file_counts() {
-    let file = "/front/board:\n  ros__parameters:\n    f: 2.0\n    gains: {p: 1e3, words: [1, 'a, b', c]}\n    on: yes\n";
+    let file = "/front/board:\n  ros__parameters:\n    f: 2.0\n    gains: \
+                {p: 1e3, words: [1, 'a, b', c]}\n    on: yes\n";
     let own = |text: &str| format!("/front/board:\n  ros__parameters:\n    {text}\n");
-    // Nothing of the file is changed: it stays, and is read when the node runs.
+    // Nothing in the file is overridden: it is kept and read when the node runs.
     let other = arguments_behind(file, &own("g: 1.0"), &[]);
     assert_eq!(other, "--params-file FILE -p g:=1.0 -r a:=b");
-    // Numbers are written as there, so that they are of the same types.
+    // Numbers keep their notation, so that they keep their types.
     let all = "-p f:=2.0 -p gains.p:=1e3 -p gains.words:=[1, \"a, b\", c] -p on:=yes";
     let changed = arguments_behind(file, &own("f: 1.0"), &[]);
     assert_eq!(changed, format!("{all} -p f:=1.0 -r a:=b"));
-    // So does what the deployer gives.
+    // The same holds for parameters given by the deployer.
     for given in ["f", "~gains/p", "/front/board/on"] {
         let changed = arguments_behind(file, &own("g: 1.0"), &[given]);
         assert_eq!(changed, format!("{all} -p g:=1.0 -r a:=b"), "{given}");
     }
-    // One for others, and none at all.
+    // A file for other nodes, and an invalid one.
     let others = arguments_behind(
         "/back/board:\n  ros__parameters: {f: 2.0}\n",
         &own("f: 1.0"),

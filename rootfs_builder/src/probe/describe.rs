@@ -1,4 +1,4 @@
-//! From what was seen to the interface: types asked for and compared with their definitions.
+//! Description of the interface from observations: types are queried and compared with their definitions.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -7,43 +7,43 @@ use std::time::Duration;
 use package::interface::{Action, Direction, Interface, Need, Parameter, Qos, Service, Topic};
 use package::names;
 use ros::bus::{
-    Bus, BusError, Digest, Graph, NodeEnds, ParamValue, RosVersion, ServiceType, WireFormat,
+    Bus, BusError, Digest, Graph, NodeEntities, ParamValue, RosVersion, ServiceType, WireFormat,
     WireType,
 };
 use ros::plumbing;
 use ros::ros2::lifecycle::LifecycleNode;
 use ros::schema::{Base, MessageType, Registry};
 
-use super::{Found, ProbeError, ProbeOptions, inputs, outputs, settle};
+use super::{ProbeError, ProbeOptions, ProbeResult, inputs, outputs, settle};
 
-/// What does not say its type in this time of its node's own is left out with a warning.
+/// Time limit, in the node's own time, for reporting a type; what exceeds it is left out with a warning.
 const ANSWER: Duration = Duration::from_secs(5);
 
-/// What looking gave.
-pub(super) struct Seen<'a> {
-    /// Outputs whose publisher is latching.
+/// Observations of a package.
+pub(super) struct ObservedPackage<'a> {
+    /// Outputs with a latching publisher.
     pub(super) latched: BTreeSet<String>,
     /// Inputs registered before anything was subscribed to.
     pub(super) eager: BTreeSet<String>,
-    /// The graph at the end.
+    /// Graph at the end.
     pub(super) graph: Arc<Graph>,
-    /// Who looked, and how long answers are waited for.
+    /// Options: the observing node, and time limits.
     pub(super) options: &'a ProbeOptions,
-    /// Services that were looked for and lent, with the nodes that did.
+    /// Services that were looked up and provided by the probe, with the nodes that did.
     pub(super) asked: BTreeMap<String, BTreeSet<String>>,
     /// Inputs of any type.
     pub(super) any: BTreeSet<String>,
 }
 
-/// Asks and compares.
+/// Queries types and compares them with the definitions.
 pub(super) async fn describe(
     bus: &dyn Bus,
     registry: &Registry,
     definitions: &BTreeMap<String, String>,
-    seen: &Seen<'_>,
-) -> Result<Found, ProbeError> {
-    let mut found = Found::default();
-    let mut texts = Texts {
+    seen: &ObservedPackage<'_>,
+) -> Result<ProbeResult, ProbeError> {
+    let mut found = ProbeResult::default();
+    let mut texts = DefinitionTexts {
         definitions,
         used: BTreeMap::new(),
     };
@@ -54,20 +54,22 @@ pub(super) async fn describe(
         (Direction::Output, outputs(graph, &seen.options.own_name)),
     ] {
         for name in names {
-            match ask(&name, seen, bus.topic_type(&name)).await {
+            match ask_type(&name, seen, bus.topic_type(&name)).await {
                 Ok(wire) => {
                     let wire = if follows_any(seen, &name, direction, &wire) {
                         WireType::any()
                     } else {
                         wire
                     };
-                    topics.push(topic(registry, seen, name, direction, wire, &mut texts)?);
+                    topics.push(describe_topic(
+                        registry, seen, name, direction, wire, &mut texts,
+                    )?);
                 }
                 Err(problem) => found.warnings.push(problem),
             }
         }
     }
-    let actions = take_actions(&mut topics, seen, registry, &mut texts)?;
+    let actions = extract_actions(&mut topics, seen, registry, &mut texts)?;
     topics.sort_by(|a, b| {
         (&a.name, a.direction == Direction::Output)
             .cmp(&(&b.name, b.direction == Direction::Output))
@@ -78,10 +80,10 @@ pub(super) async fn describe(
         .iter()
         .filter(|(_, node)| **node != seen.options.own_name)
     {
-        if plumbing::service(seen.options.ros, graph, name) {
+        if plumbing::is_builtin_service(seen.options.ros, graph, name) {
             continue;
         }
-        match ask(name, seen, bus.service_type(name)).await {
+        match ask_type(name, seen, bus.service_type(name)).await {
             Ok(wire) => {
                 let service =
                     registry
@@ -90,9 +92,9 @@ pub(super) async fn describe(
                             what: format!("service {name}"),
                             problem,
                         })?;
-                let defined = ServiceType::of(&service);
-                if !wire.agrees(&defined) {
-                    let (announced, defined) = differing(&wire, &defined);
+                let defined = ServiceType::from_service(&service);
+                if !wire.is_compatible_with(&defined) {
+                    let (announced, defined) = differing_digests(&wire, &defined);
                     return Err(mismatch(
                         &format!("service {name}"),
                         &wire.name,
@@ -104,7 +106,7 @@ pub(super) async fn describe(
                 services.push(Service {
                     name: name.clone(),
                     type_name: wire.name,
-                    // Nodes of ROS 2 may tell those of its parts alone.
+                    // ROS 2 nodes may report only the digests of request and response.
                     md5: service.md5.clone(),
                     node: node.clone(),
                 });
@@ -112,7 +114,7 @@ pub(super) async fn describe(
             Err(problem) => found.warnings.push(problem),
         }
     }
-    let mut parameters = parameters(bus, graph, &seen.options.own_name).await;
+    let mut parameters = shared_parameters(bus, graph, &seen.options.own_name).await;
     own_parameters(bus, seen, &mut parameters, &mut found.warnings).await;
     let lifecycle = LifecycleNode::all(graph).into_iter();
     found.interface = Interface {
@@ -120,7 +122,7 @@ pub(super) async fn describe(
         services,
         actions,
         parameters,
-        needs: needs_of(seen),
+        needs: all_needs(seen),
         lifecycle: lifecycle
             .filter(|node| *node != seen.options.own_name)
             .collect(),
@@ -131,14 +133,14 @@ pub(super) async fn describe(
     for need in &found.interface.needs {
         let (name, nodes) = (&need.name, need.nodes.join(", "));
         found.warnings.push(format!(
-            "{nodes} looks for {name}, which nobody serves here: on a robot it is looked for there"
+            "{nodes} needs {name}, which no node serves here: it must be served on the robot"
         ));
     }
     Ok(found)
 }
 
-/// Services that were looked for, and are not there yet.
-pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
+/// Returns the services that were looked up and do not exist yet.
+pub(super) fn missing_needs(graph: &Graph, own_name: &str) -> Vec<Need> {
     let sought = graph.sought.iter();
     let missing = sought.filter(|(name, _)| !graph.services.contains_key(*name));
     let needs = missing.map(|(name, nodes)| Need {
@@ -152,10 +154,11 @@ pub(super) fn needs(graph: &Graph, own_name: &str) -> Vec<Need> {
     needs.filter(|need| !need.nodes.is_empty()).collect()
 }
 
-/// Those, actions that goals would be sent to (ROS 2, where no topics tell of them), and the services that were lent.
-fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
+/// Returns all needs: missing services, actions without a server (ROS 2, where no topics reveal them), and services
+/// provided by the probe.
+fn all_needs(seen: &ObservedPackage<'_>) -> Vec<Need> {
     let own_name = &seen.options.own_name;
-    let mut needs = needs(&seen.graph, own_name);
+    let mut needs = missing_needs(&seen.graph, own_name);
     let actions = seen.graph.actions.iter();
     let others = |nodes: &[String]| -> Vec<String> {
         let nodes = nodes.iter().filter(|node| *node != own_name);
@@ -189,8 +192,13 @@ fn needs_of(seen: &Seen<'_>) -> Vec<Need> {
     needs
 }
 
-/// Whether an output has its type only because an input that takes any was given a message of that type.
-fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireType) -> bool {
+/// Returns whether an output has its type only because an input of any type was given a message of that type.
+fn follows_any(
+    seen: &ObservedPackage<'_>,
+    name: &str,
+    direction: Direction,
+    wire: &WireType,
+) -> bool {
     let fed = |topic: &String| {
         let ends = (seen.graph.topics.get(topic), seen.graph.topics.get(name));
         let (Some(input), Some(output)) = ends else {
@@ -207,33 +215,35 @@ fn follows_any(seen: &Seen<'_>, name: &str, direction: Direction, wire: &WireTyp
     }
 }
 
-async fn ask<T>(
+async fn ask_type<T>(
     name: &str,
-    seen: &Seen<'_>,
+    seen: &ObservedPackage<'_>,
     answer: impl Future<Output = Result<T, BusError>>,
 ) -> Result<T, String> {
-    match settle::answered(ANSWER, seen.options, answer).await {
+    match settle::await_answer(ANSWER, seen.options, answer).await {
         Some(Ok(value)) => Ok(value),
-        Some(Err(error)) => Err(format!("{name} does not tell its type: {error}")),
-        None => Err(format!("{name} does not tell its type within {ANSWER:?}")),
+        Some(Err(error)) => Err(format!("cannot get the type of {name}: {error}")),
+        None => Err(format!(
+            "no response about the type of {name} within {ANSWER:?}"
+        )),
     }
 }
 
-fn topic(
+fn describe_topic(
     registry: &Registry,
-    seen: &Seen<'_>,
+    seen: &ObservedPackage<'_>,
     name: String,
     direction: Direction,
     wire: WireType,
-    texts: &mut Texts<'_>,
+    texts: &mut DefinitionTexts<'_>,
 ) -> Result<Topic, ProbeError> {
-    // Some nodes take any type; nothing is to be compared.
+    // Some nodes accept any type; there is nothing to compare.
     let untold = wire.format == WireFormat::Ros1 && wire.digest.is_any();
     let mut md5 = wire.digest.to_string();
     if wire.name != "*" && !untold {
         let message = match registry.message(&wire.name) {
             Ok(message) => message,
-            // No definition in the image, but the publisher sent its own.
+            // The image has no definition, but the publisher sent its own.
             Err(_) if !wire.definition.is_empty() => {
                 let added = registry.insert_full_text(&wire.name, &wire.definition);
                 added
@@ -250,14 +260,14 @@ fn topic(
                 });
             }
         };
-        compare(
+        compare_digests(
             &format!("topic {name}"),
             &wire.name,
             wire.digest.as_str(),
             message.md5(),
         )?;
         texts.message(&message);
-        // Before Iron nodes of ROS 2 tell no digests.
+        // ROS 2 nodes before Iron report no digests.
         md5 = message.digest().to_owned();
     }
     let ends = seen.graph.topics.get(&name);
@@ -271,8 +281,8 @@ fn topic(
         .filter(|node| **node != seen.options.own_name)
         .cloned()
         .collect();
-    let qos = qos(&seen.graph, &name, direction, &nodes);
-    let keeps = qos.is_some_and(|qos| qos.on_bus(1).is_latching());
+    let qos = combined_qos(&seen.graph, &name, direction, &nodes);
+    let keeps = qos.is_some_and(|qos| qos.to_bus_qos(1).is_latching());
     Ok(Topic {
         latched: direction == Direction::Output && (keeps || seen.latched.contains(&name)),
         qos,
@@ -285,10 +295,10 @@ fn topic(
     })
 }
 
-/// What these nodes offer or ask for together, where ends tell it.
-fn qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[String]) -> Option<Qos> {
+/// Returns the QoS that is compatible with all of these nodes, if known.
+fn combined_qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[String]) -> Option<Qos> {
     let ends = nodes.iter().filter_map(|node| {
-        let NodeEnds {
+        let NodeEntities {
             publishers,
             subscribers,
             ..
@@ -300,24 +310,31 @@ fn qos(graph: &Graph, topic: &str, direction: Direction, nodes: &[String]) -> Op
         ends.get(topic).map(|(_, qos)| Qos::from(qos))
     });
     ends.reduce(|all, one| match direction {
-        Direction::Output => all.least(one),
-        Direction::Input => all.most(one),
+        Direction::Output => all.common_offer(one),
+        Direction::Input => all.common_request(one),
     })
 }
 
-/// Of what both tell: that in which they differ.
-fn differing(announced: &ServiceType, defined: &ServiceType) -> (String, String) {
+/// Returns the first pair of digests that differ, of those that both report.
+fn differing_digests(announced: &ServiceType, defined: &ServiceType) -> (String, String) {
     let parts = [
         (&announced.digest, &defined.digest),
         (&announced.request, &defined.request),
         (&announced.response, &defined.response),
     ];
-    let pair = parts.into_iter().find(|(one, other)| !one.agrees(other));
+    let pair = parts
+        .into_iter()
+        .find(|(one, other)| !one.is_compatible_with(other));
     let (one, other) = pair.unwrap_or(parts[0]);
     (Digest::to_string(one), Digest::to_string(other))
 }
 
-fn compare(what: &str, type_name: &str, announced: &str, defined: &str) -> Result<(), ProbeError> {
+fn compare_digests(
+    what: &str,
+    type_name: &str,
+    announced: &str,
+    defined: &str,
+) -> Result<(), ProbeError> {
     if announced == "*" || announced == defined {
         return Ok(());
     }
@@ -333,12 +350,12 @@ fn mismatch(what: &str, type_name: &str, announced: &str, defined: &str) -> Prob
     }
 }
 
-/// Actions that the package serves; topics that they are made of are no part of the interface.
-fn take_actions(
+/// Returns the actions provided by the package, and removes their topics.
+fn extract_actions(
     topics: &mut Vec<Topic>,
-    seen: &Seen<'_>,
+    seen: &ObservedPackage<'_>,
     registry: &Registry,
-    texts: &mut Texts<'_>,
+    texts: &mut DefinitionTexts<'_>,
 ) -> Result<Vec<Action>, ProbeError> {
     let mut actions = Vec::new();
     for (name, ends) in &seen.graph.actions {
@@ -355,7 +372,7 @@ fn take_actions(
                 ends.topics.contains(&topic.name) && topic.type_name == goal.name()
             });
             for topic in of_goals {
-                compare(
+                compare_digests(
                     &format!("action {name}"),
                     &topic.type_name,
                     &topic.md5,
@@ -367,7 +384,7 @@ fn take_actions(
                 [&action.goal, &action.result, &action.feedback],
             );
         }
-        // In either direction: a server may well be its own client (move_base is).
+        // In both directions: a server may also be its own client (move_base is).
         topics.retain(|topic| !ends.topics.contains(&topic.name));
         actions.push(Action {
             name: name.clone(),
@@ -378,17 +395,17 @@ fn take_actions(
     Ok(actions)
 }
 
-async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
+async fn shared_parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
     let mut parameters = Vec::new();
     for (name, uses) in &graph.parameters {
         let others = |nodes: &[String]| -> Vec<String> {
             nodes.iter().filter(|node| *node != own).cloned().collect()
         };
         let (read_by, written_by) = (others(&uses.read_by), others(&uses.written_by));
-        if plumbing::parameter(name) || (read_by.is_empty() && written_by.is_empty()) {
+        if plumbing::is_builtin_parameter(name) || (read_by.is_empty() && written_by.is_empty()) {
             continue;
         }
-        let value = bus.parameter(name).await.ok().map(|value| json(&value));
+        let value = bus.parameter(name).await.ok().map(|value| to_json(&value));
         parameters.push(Parameter {
             name: name.clone(),
             value,
@@ -400,10 +417,10 @@ async fn parameters(bus: &dyn Bus, graph: &Graph, own: &str) -> Vec<Parameter> {
     parameters
 }
 
-/// Adds parameters that nodes have of their own, with what they say of them.
+/// Adds the nodes' own parameters with their descriptors.
 async fn own_parameters(
     bus: &dyn Bus,
-    seen: &Seen<'_>,
+    seen: &ObservedPackage<'_>,
     all: &mut Vec<Parameter>,
     warnings: &mut Vec<String>,
 ) {
@@ -416,53 +433,54 @@ async fn own_parameters(
         list == Some(*node) && *node != own_name
     });
     for node in nodes {
-        match settle::answered(ANSWER, seen.options, parameters_of(bus, node)).await {
+        match settle::await_answer(ANSWER, seen.options, node_parameters(bus, node)).await {
             Some(Ok(parameters)) => all.extend(parameters),
             Some(Err(error)) => {
-                warnings.push(format!("{node} does not tell its parameters: {error}"));
+                warnings.push(format!("cannot get the parameters of {node}: {error}"));
             }
             None => warnings.push(format!(
-                "{node} does not tell its parameters within {ANSWER:?}"
+                "no response about the parameters of {node} within {ANSWER:?}"
             )),
         }
     }
 }
 
-async fn parameters_of(bus: &dyn Bus, node: &str) -> Result<Vec<Parameter>, BusError> {
+async fn node_parameters(bus: &dyn Bus, node: &str) -> Result<Vec<Parameter>, BusError> {
     let parameters = bus.node_parameters()?;
     let mut names = parameters.list(node, &[], 0).await?.names;
-    names.retain(|name| !plumbing::parameter(name));
+    names.retain(|name| !plumbing::is_builtin_parameter(name));
     names.sort();
-    let descriptions = match names.is_empty() {
-        true => return Ok(Vec::new()),
-        false => parameters.describe(node, &names).await?,
+    let descriptions = if names.is_empty() {
+        return Ok(Vec::new());
+    } else {
+        parameters.describe(node, &names).await?
     };
     let values = parameters.get(node, &names).await?;
     let told = names.into_iter().zip(descriptions).zip(values);
     let parameter = |((name, description), value)| Parameter {
         name: format!("{node}/{name}"),
         node: node.to_owned(),
-        value: Option::map(value, |value| json(&value)),
+        value: Option::map(value, |value| to_json(&value)),
         descriptor: Option::map(description, Into::into),
         ..Parameter::default()
     };
     Ok(told.map(parameter).collect())
 }
 
-fn json(value: &ParamValue) -> serde_json::Value {
+fn to_json(value: &ParamValue) -> serde_json::Value {
     serde_json::to_value(value).unwrap_or(serde_json::Value::Null)
 }
 
-/// Definition texts of what is used and all it refers to.
-struct Texts<'a> {
+/// Collects the definition texts that are used, with all that they refer to.
+struct DefinitionTexts<'a> {
     definitions: &'a BTreeMap<String, String>,
     used: BTreeMap<String, String>,
 }
 
-impl Texts<'_> {
+impl DefinitionTexts<'_> {
     fn message(&mut self, message: &Arc<MessageType>) {
-        let key = names::key(message.name(), "msg");
-        // Requests, goals and the like have no text of their own: the service's or the action's is theirs.
+        let key = names::definition_key(message.name(), "msg");
+        // Requests, goals and the like have no text of their own; it is part of the service or action.
         let text = self
             .definitions
             .get(&key)
@@ -492,7 +510,7 @@ impl Texts<'_> {
     }
 
     fn copy(&mut self, name: &str, kind: &str) {
-        let key = names::key(name, kind);
+        let key = names::definition_key(name, kind);
         if let Some(text) = self.definitions.get(&key) {
             self.used.insert(key, text.clone());
         }

@@ -1,14 +1,14 @@
-//! Gives nodes the input that they may be waiting for before they register all of their interface.
+//! Feeds nodes the input that they may be waiting for before they register their complete interface.
 //!
 //! ```text
-//!   surroundings:  transforms (an identity tree), /clock, services that are looked for
-//!        │ nothing new of these is asked for any more
+//!   surroundings:  transforms (an identity tree), /clock, services that nodes wait for
+//!        │ no new requests for these
 //!        ▼
 //!   inputs:        one default message each
 //! ```
 //!
-//! What nodes register after that may need input in turn, in the next round. Goals of actions are not sent, so that no
-//! server begins anything.
+//! What nodes register after that may need input as well, in the next round. Goals of actions are not sent, so that no
+//! server begins to act.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -16,7 +16,8 @@ use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
 use ros::bus::{
-    Bus, Graph, ParamValue, Publisher, Qos, RosVersion, Subscription, WireType, reaches,
+    Bus, Graph, ParamValue, Publisher, QosProfile, RosVersion, Subscription, WireType,
+    wait_for_connected,
 };
 use ros::codec::{self, FillOptions, JsonOptions, Time};
 use ros::plumbing;
@@ -24,68 +25,68 @@ use ros::schema::{MessageType, Registry};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::frames::{self, Frames};
-use super::heard::{Stamp, stamp};
-use super::lender::AnyService;
+use super::frames::{self, FrameSet};
+use super::heard::{Stamp, read_stamp};
+use super::lender::AnyServiceLender;
 use super::{ProbeOptions, plausible, settle};
 
-/// How long a node may take to tell the type of an input, and to connect: of its own time.
+/// Time limit for a node to report the type of an input, and to connect, in its own time.
 const ANSWER: Duration = Duration::from_secs(5);
-/// Time between two messages of transforms, and of `/clock`.
+/// Interval of transforms and of `/clock`.
 const BEAT: Duration = Duration::from_millis(50);
-/// How far in the future transforms are stamped, so that a lookup for the present finds them.
+/// Offset of the stamps of transforms into the future, so that lookups of the current time succeed.
 const AHEAD: Duration = Duration::from_millis(100);
-/// Most inputs that get a message.
+/// Maximum number of inputs that get a message.
 const MOST_INPUTS: usize = 200;
-/// The type of message for an input that takes any type, unless `--interface` gives one.
+/// Message type for inputs of any type, unless `--interface` gives one.
 pub(super) const ANY: &str = "std_msgs/Empty";
 
 const TRANSFORMS: [&str; 2] = ["/tf", "/tf_static"];
 const CLOCK: &str = "/clock";
 const LOG: &str = "/rosout";
 
-/// What has been published and lent so far; it is taken back when this is dropped.
-pub(super) struct Feed<'a> {
+/// Publishers and services provided so far; removed on drop.
+pub(super) struct InputFeed<'a> {
     bus: &'a dyn Bus,
     registry: &'a Registry,
     options: &'a ProbeOptions,
-    frames: Arc<Mutex<Frames>>,
+    frames: Arc<Mutex<FrameSet>>,
     parameters: BTreeSet<String>,
     log: Option<Subscription>,
-    /// What nodes said last, at level WARN and above.
+    /// Latest log message of each node, at level WARN or above.
     said: BTreeMap<String, String>,
-    lender: Option<Arc<AnyService>>,
-    /// Services that were looked for and are served here (ROS 2).
+    lender: Option<Arc<AnyServiceLender>>,
+    /// Services that were looked up and are provided here (ROS 2).
     served: BTreeMap<String, Box<dyn Send + Sync>>,
-    beats: BTreeMap<&'static str, Beat>,
+    beats: BTreeMap<&'static str, PeriodicPublisher>,
     given: BTreeMap<String, Box<dyn Publisher>>,
-    /// Whose message had this stamp, where messages have one.
+    /// Input whose message had this stamp, for messages with stamps.
     stamps: BTreeMap<Stamp, String>,
     refused: BTreeMap<String, String>,
     goals: BTreeSet<String>,
     any: BTreeSet<String>,
 }
 
-/// A topic that is published to again and again.
-struct Beat(JoinHandle<()>);
+/// A topic with periodic messages.
+struct PeriodicPublisher(JoinHandle<()>);
 
-impl Drop for Beat {
+impl Drop for PeriodicPublisher {
     fn drop(&mut self) {
         self.0.abort();
     }
 }
 
-impl Drop for Feed<'_> {
+impl Drop for InputFeed<'_> {
     fn drop(&mut self) {
         if let Some(lender) = &self.lender {
-            lender.end();
+            lender.revoke();
         }
     }
 }
 
-impl<'a> Feed<'a> {
-    /// Listens to what nodes say from now on.
-    pub(super) async fn begin(
+impl<'a> InputFeed<'a> {
+    /// Starts to listen to the log of the nodes.
+    pub(super) async fn start(
         bus: &'a dyn Bus,
         registry: &'a Registry,
         options: &'a ProbeOptions,
@@ -97,7 +98,7 @@ impl<'a> Feed<'a> {
             frames: Arc::default(),
             parameters: BTreeSet::new(),
             log: bus
-                .subscribe(LOG, WireType::any(), Qos::keep_last(200))
+                .subscribe(LOG, WireType::any(), QosProfile::keep_last(200))
                 .await
                 .ok(),
             said: BTreeMap::new(),
@@ -112,62 +113,71 @@ impl<'a> Feed<'a> {
         }
     }
 
-    /// Gives what the nodes of this graph ask for and have not been given; how long they may take to make something
-    /// of it, or none if there was nothing to give.
-    pub(super) async fn give(&mut self, graph: &Graph) -> Option<Duration> {
+    /// Provides what the nodes of this graph wait for and have not been given; returns how long they may take to react,
+    /// or `None` if there was nothing to provide.
+    pub(super) async fn give_inputs(&mut self, graph: &Graph) -> Option<Duration> {
         let began = Instant::now();
-        let (patience, longest) = if self.surroundings(graph).await {
-            // Whoever waits for these asks again now and then.
+        let (patience, longest) = if self.give_surroundings(graph).await {
+            // Nodes that wait for these retry from time to time.
             (self.options.settle * 3, began.elapsed())
         } else {
-            (self.options.settle * 2, self.inputs(graph).await?)
+            (
+                self.options.settle * 2,
+                self.give_default_messages(graph).await?,
+            )
         };
-        // On a busy machine everything takes longer. How long one of them took tells that; all together they only tell how
-        // many they are.
+        // On a busy machine everything takes longer. The duration for one of them measures that; the total only depends
+        // on their number.
         Some(patience.max(longest * 6).min(self.options.restless))
     }
 
-    /// Services that were looked for since, with the nodes that did.
-    pub(super) fn asked(&self) -> BTreeMap<String, BTreeSet<String>> {
+    /// Returns the services looked up so far, with the nodes that did.
+    pub(super) fn requested_services(&self) -> BTreeMap<String, BTreeSet<String>> {
         self.lender
             .as_ref()
-            .map(|lender| lender.asked())
+            .map(|lender| lender.requested_services())
             .unwrap_or_default()
     }
 
-    /// Inputs that take any type, of which nobody said which.
-    pub(super) fn any(&self) -> &BTreeSet<String> {
+    /// Returns the inputs of any type without a stated type.
+    pub(super) fn any_type_inputs(&self) -> &BTreeSet<String> {
         &self.any
     }
 
-    /// The input whose message had this stamp.
-    pub(super) fn stamped(&self, stamp: &Stamp) -> Option<&String> {
+    /// Returns the input whose message had this stamp.
+    pub(super) fn input_with_stamp(&self, stamp: &Stamp) -> Option<&String> {
         self.stamps.get(stamp)
     }
 
-    /// Inputs that could not be fed, with the reason.
-    pub(super) fn refused(&self) -> &BTreeMap<String, String> {
+    /// Returns the inputs that could not be fed, with the reason.
+    pub(super) fn failed_inputs(&self) -> &BTreeMap<String, String> {
         &self.refused
     }
 
-    /// What each node said last of waiting for something.
-    pub(super) fn said(&mut self) -> BTreeMap<String, String> {
-        self.listen();
+    /// Returns the latest message of each node about waiting for something.
+    pub(super) fn wait_messages(&mut self) -> BTreeMap<String, String> {
+        self.read_log_messages();
         self.said.clone()
     }
 
-    async fn surroundings(&mut self, graph: &Graph) -> bool {
-        let told = self.frames_of_parameters(graph).await | self.frames_of_nodes(graph).await;
-        let heard = self.listen() | told;
-        let (clock, timed) = ends(graph, CLOCK, &self.options.own_name);
-        let listens = |topic: &&str| ends(graph, topic, &self.options.own_name).0;
+    async fn give_surroundings(&mut self, graph: &Graph) -> bool {
+        let told =
+            self.collect_parameter_frames(graph).await | self.collect_node_frames(graph).await;
+        let heard = self.read_log_messages() | told;
+        let (clock, timed) = has_other_ends(graph, CLOCK, &self.options.own_name);
+        let listens = |topic: &&str| has_other_ends(graph, topic, &self.options.own_name).0;
         let mut new = false;
         if clock && !timed {
-            new |= self.beat(CLOCK, "rosgraph_msgs/Clock").await;
+            new |= self
+                .publish_periodically(CLOCK, "rosgraph_msgs/Clock")
+                .await;
         }
         if TRANSFORMS.iter().any(listens) {
-            // Transforms that move: a node may well look at how old one is.
-            new |= heard | self.beat(TRANSFORMS[0], "tf2_msgs/TFMessage").await;
+            // Moving transforms, since a node may check their age.
+            new |= heard
+                | self
+                    .publish_periodically(TRANSFORMS[0], "tf2_msgs/TFMessage")
+                    .await;
         }
         let looked_for = graph.sought.iter().any(|(name, nodes)| {
             !graph.services.contains_key(name)
@@ -179,28 +189,28 @@ impl<'a> Feed<'a> {
         let lender = match &self.lender {
             Some(lender) => Arc::clone(lender),
             None => {
-                let lender = AnyService::new(self.registry, &self.options.own_name);
+                let lender = AnyServiceLender::new(self.registry, &self.options.own_name);
                 if self.options.ros == RosVersion::One {
                     let lent = async { self.bus.lending()?.lend(lender.clone()).await };
                     match lent.await {
                         Ok(()) => new = true,
                         Err(error) => {
-                            tracing::warn!("services cannot be lent to a package: {error}");
+                            tracing::warn!("cannot provide services to the package: {error}");
                         }
                     }
                 }
                 Arc::clone(self.lender.insert(lender))
             }
         };
-        // Clients of ROS 2 tell of which type they look for a service.
+        // ROS 2 clients announce the type of the service that they look up.
         if self.options.ros == RosVersion::Two {
-            new |= self.serve(graph, &lender).await;
+            new |= self.serve_sought(graph, &lender).await;
         }
         new
     }
 
-    /// Serves what is looked for, of the types that its clients tell; whether any of it is new.
-    async fn serve(&mut self, graph: &Graph, lender: &Arc<AnyService>) -> bool {
+    /// Provides the services that are looked up, with the types announced by their clients; returns whether any is new.
+    async fn serve_sought(&mut self, graph: &Graph, lender: &Arc<AnyServiceLender>) -> bool {
         let mut new = false;
         for (name, nodes) in &graph.sought {
             let mut clients = nodes.iter().filter(|node| **node != self.options.own_name);
@@ -209,7 +219,8 @@ impl<'a> Feed<'a> {
             let Some((of, false)) = of.map(|of| (of, known)) else {
                 continue;
             };
-            let Some((of, handler)) = lender.serves(self.registry, name, &of.name, nodes) else {
+            let Some((of, handler)) = lender.handler_for(self.registry, name, &of.name, nodes)
+            else {
                 continue;
             };
             match self.bus.serve(name, of, handler).await {
@@ -217,14 +228,14 @@ impl<'a> Feed<'a> {
                     self.served.insert(name.clone(), guard);
                     new = true;
                 }
-                Err(error) => tracing::warn!("{name} cannot be served to a package: {error}"),
+                Err(error) => tracing::warn!("cannot provide {name} to the package: {error}"),
             }
         }
         new
     }
 
-    /// Hears frames in what nodes say; whether there are new ones.
-    fn listen(&mut self) -> bool {
+    /// Collects frames from the nodes' log; returns whether there are new ones.
+    fn read_log_messages(&mut self) -> bool {
         let Some(log) = &mut self.log else {
             return false;
         };
@@ -238,15 +249,15 @@ impl<'a> Feed<'a> {
             if node == self.options.own_name {
                 continue;
             }
-            new |= self.frames.lock().hear(&text);
-            if level >= warning(self.options.ros) && text.to_lowercase().contains("wait") {
+            new |= self.frames.lock().add_from_log(&text);
+            if level >= warning_level(self.options.ros) && text.to_lowercase().contains("wait") {
                 self.said.insert(node, text);
             }
         }
         new
     }
 
-    async fn frames_of_parameters(&mut self, graph: &Graph) -> bool {
+    async fn collect_parameter_frames(&mut self, graph: &Graph) -> bool {
         let mut new = false;
         for key in graph
             .parameters
@@ -263,8 +274,8 @@ impl<'a> Feed<'a> {
         new
     }
 
-    /// The same of parameters that nodes have of their own.
-    async fn frames_of_nodes(&mut self, graph: &Graph) -> bool {
+    /// Collects frames from the nodes' own parameters; returns whether there are new ones.
+    async fn collect_node_frames(&mut self, graph: &Graph) -> bool {
         let Ok(parameters) = self.bus.node_parameters() else {
             return false;
         };
@@ -278,12 +289,13 @@ impl<'a> Feed<'a> {
             let asked = async {
                 let mut names = parameters.list(node, &[], 0).await?.names;
                 names.retain(|name| frames::is_parameter(&name.replace('.', "/")));
-                match names.is_empty() {
-                    true => Ok(Vec::new()),
-                    false => parameters.get(node, &names).await,
+                if names.is_empty() {
+                    Ok(Vec::new())
+                } else {
+                    parameters.get(node, &names).await
                 }
             };
-            let values = self.answered(asked).await;
+            let values = self.await_answer(asked).await;
             for value in values.and_then(Result::ok).into_iter().flatten() {
                 if let Some(ParamValue::String(name)) = value {
                     new |= self.frames.lock().add(&name);
@@ -293,8 +305,8 @@ impl<'a> Feed<'a> {
         new
     }
 
-    /// Publishes again and again; whether that is new.
-    async fn beat(&mut self, topic: &'static str, usual: &str) -> bool {
+    /// Starts periodic messages on a topic; returns whether that is new.
+    async fn publish_periodically(&mut self, topic: &'static str, usual: &str) -> bool {
         if self.beats.contains_key(topic) || self.refused.contains_key(topic) {
             return false;
         }
@@ -306,8 +318,10 @@ impl<'a> Feed<'a> {
                 return false;
             }
         };
-        // How long that takes on a busy machine tells how long the nodes will take.
-        let _ = self.answered(reaches(publisher.matched(), 1)).await;
+        // The duration of this on a busy machine shows how long the nodes will take.
+        let _ = self
+            .await_answer(wait_for_connected(publisher.matched_subscribers(), 1))
+            .await;
         let frames = self.frames.clone();
         let beating = tokio::spawn(async move {
             let mut beats = tokio::time::interval(BEAT);
@@ -331,19 +345,19 @@ impl<'a> Feed<'a> {
                 }
             }
         });
-        self.beats.insert(topic, Beat(beating));
+        self.beats.insert(topic, PeriodicPublisher(beating));
         true
     }
 
-    /// One default message for each input that the package itself does not feed. How long the slowest of them took; none
-    /// if there was none.
-    async fn inputs(&mut self, graph: &Graph) -> Option<Duration> {
+    /// Sends a default message to each input that the package does not feed itself. Returns the duration for the
+    /// slowest one, or `None` if there was none.
+    async fn give_default_messages(&mut self, graph: &Graph) -> Option<Duration> {
         let mut longest = None;
         for name in graph.topics.keys() {
-            let (subscribed, published) = ends(graph, name, &self.options.own_name);
+            let (subscribed, published) = has_other_ends(graph, name, &self.options.own_name);
             let apart = name == CLOCK
                 || TRANSFORMS.contains(&name.as_str())
-                || plumbing::topic(graph, name);
+                || plumbing::is_builtin_topic(graph, name);
             let known = self.given.contains_key(name)
                 || self.refused.contains_key(name)
                 || self.goals.contains(name);
@@ -351,24 +365,32 @@ impl<'a> Feed<'a> {
                 continue;
             }
             let began = Instant::now();
-            let demanded = demands_latched(graph, name);
+            let demanded = requires_latched(graph, name);
             match self.advertise(name, None, demanded).await {
-                Ok(Some((message, publisher))) => match plausible::message(&message, Time::now()) {
-                    Ok(bytes) => {
-                        // Not latched unless it is asked for, which would reach whoever is late, too: relays latch what
-                        // was latched.
-                        let _ = self.answered(reaches(publisher.matched(), 1)).await;
-                        if let Some(stamp) = stamp(&bytes).filter(|_| message.has_header()) {
-                            self.stamps.insert(stamp, name.clone());
+                Ok(Some((message, publisher))) => {
+                    match plausible::default_message(&message, Time::now()) {
+                        Ok(bytes) => {
+                            // Not latched unless required, which would also reach later subscribers: relays latch
+                            // what was latched.
+                            let _ = self
+                                .await_answer(wait_for_connected(
+                                    publisher.matched_subscribers(),
+                                    1,
+                                ))
+                                .await;
+                            if let Some(stamp) = read_stamp(&bytes).filter(|_| message.has_header())
+                            {
+                                self.stamps.insert(stamp, name.clone());
+                            }
+                            publisher.publish(bytes);
+                            self.given.insert(name.clone(), publisher);
+                            longest = longest.max(Some(began.elapsed()));
                         }
-                        publisher.publish(bytes);
-                        self.given.insert(name.clone(), publisher);
-                        longest = longest.max(Some(began.elapsed()));
+                        Err(error) => {
+                            self.refused.insert(name.clone(), error.to_string());
+                        }
                     }
-                    Err(error) => {
-                        self.refused.insert(name.clone(), error.to_string());
-                    }
-                },
+                }
                 Ok(None) => {
                     self.goals.insert(name.clone());
                 }
@@ -380,22 +402,22 @@ impl<'a> Feed<'a> {
         longest
     }
 
-    async fn answered<T>(&self, answer: impl Future<Output = T>) -> Option<T> {
-        settle::answered(ANSWER, self.options, answer).await
+    async fn await_answer<T>(&self, answer: impl Future<Output = T>) -> Option<T> {
+        settle::await_answer(ANSWER, self.options, answer).await
     }
 
-    /// Advertises a topic with the type that its subscribers ask for, or `usual` where they ask for none; nothing
-    /// where that would begin an action.
+    /// Advertises a topic with the type requested by its subscribers, or `usual` if they accept any; returns `None` if
+    /// a message would start an action.
     async fn advertise(
         &mut self,
         topic: &str,
         usual: Option<&str>,
         latching: bool,
     ) -> Result<Option<(Arc<MessageType>, Box<dyn Publisher>)>, String> {
-        let asked = match self.answered(self.bus.topic_type(topic)).await {
+        let asked = match self.await_answer(self.bus.topic_type(topic)).await {
             Some(Ok(wire)) => wire.name,
             Some(Err(error)) => return Err(error.to_string()),
-            None => return Err(format!("its type was not told within {ANSWER:?}")),
+            None => return Err(format!("no response about its type within {ANSWER:?}")),
         };
         let stated = self.options.types.get(topic).map(String::as_str);
         let name = match asked.as_str() {
@@ -405,7 +427,7 @@ impl<'a> Feed<'a> {
             }),
             asked => asked,
         };
-        if ros::ros1::actions::commands(name) {
+        if ros::ros1::actions::is_command_type(name) {
             return Ok(None);
         }
         let message = self
@@ -416,8 +438,8 @@ impl<'a> Feed<'a> {
             .bus
             .advertise(
                 topic,
-                WireType::of(&message),
-                Qos::keep_last(10).latching(latching),
+                WireType::from_message(&message),
+                QosProfile::keep_last(10).latching(latching),
             )
             .await;
         Ok(Some((
@@ -427,16 +449,16 @@ impl<'a> Feed<'a> {
     }
 }
 
-/// Whether anybody but the looking node subscribes to a topic, and publishes on it.
-fn ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
+/// Returns whether anybody but the observing node subscribes to a topic, and publishes on it.
+fn has_other_ends(graph: &Graph, topic: &str, own: &str) -> (bool, bool) {
     let others = |nodes: &[String]| nodes.iter().any(|node| node != own);
     graph.topics.get(topic).map_or((false, false), |topic| {
         (others(&topic.subscribers), others(&topic.publishers))
     })
 }
 
-/// Whether a subscriber hears those publishers alone that keep their last message for it.
-fn demands_latched(graph: &Graph, topic: &str) -> bool {
+/// Returns whether a subscriber requires publishers that keep their last message for it.
+fn requires_latched(graph: &Graph, topic: &str) -> bool {
     let mut ends = graph.ends.values();
     ends.any(|ends| {
         let end = ends.subscribers.get(topic);
@@ -444,8 +466,8 @@ fn demands_latched(graph: &Graph, topic: &str) -> bool {
     })
 }
 
-/// From which level on a node warns.
-fn warning(ros: RosVersion) -> u64 {
+/// Returns the log level of warnings.
+fn warning_level(ros: RosVersion) -> u64 {
     match ros {
         // WARN of rosgraph_msgs/Log is a bit.
         RosVersion::One => 4,
@@ -453,8 +475,8 @@ fn warning(ros: RosVersion) -> u64 {
     }
 }
 
-/// Level, node and text of a line of a node's log. (`rosgraph_msgs/Log`, of ROS 2 `rcl_interfaces/msg/Log`, which has the
-/// logger's name, dots for slashes.)
+/// Parses the level, node and text of a log message (`rosgraph_msgs/Log`, or in ROS 2 `rcl_interfaces/msg/Log`, which
+/// has the logger's name with dots for slashes).
 fn read_log(registry: &Registry, ros: RosVersion, bytes: &[u8]) -> Option<(u64, String, String)> {
     let log = registry.message(match ros {
         RosVersion::One => "rosgraph_msgs/Log",

@@ -1,17 +1,17 @@
-//! Coordinate frames that nodes ask for, and an identity tree of them.
+//! Coordinate frames that nodes look up, and an identity tree of them.
 //!
-//! A lookup of a transform leaves no trace in the graph. The names of frames are in parameters (`~base_frame`), in
-//! what nodes complain of (`/rosout`), and, where a node keeps to its defaults, those of REP 105. A name too many does
-//! no harm: it is one more leaf of the tree.
+//! Transform lookups leave no trace in the graph. The names of frames are found in parameters (`~base_frame`), in
+//! complaints of nodes (`/rosout`) and, for nodes with default settings, in REP 105. An unnecessary name does no harm:
+//! it is another leaf of the tree.
 
 use std::collections::BTreeSet;
 
 use ros::codec::Time;
 use serde_json::{Value, json};
 
-/// The root of the tree.
+/// Root of the tree.
 const ROOT: &str = "map";
-/// Names that nodes use unless they are told others (REP 105, and what drivers call their sensors).
+/// Common default names (REP 105, and the names that drivers give their sensors).
 const USUAL: [&str; 13] = [
     "map",
     "odom",
@@ -27,35 +27,35 @@ const USUAL: [&str; 13] = [
     "camera_link",
     "imu_link",
 ];
-/// A tree of more is of no use, and a node could make it as large as it likes.
+/// Maximum number of frames, since a node could name arbitrarily many.
 const MOST: usize = 256;
 
-/// Frames known so far.
+/// Known frames.
 #[derive(Debug, Clone)]
-pub(super) struct Frames(BTreeSet<String>);
+pub(super) struct FrameSet(BTreeSet<String>);
 
-impl Default for Frames {
+impl Default for FrameSet {
     fn default() -> Self {
         Self(USUAL.map(str::to_owned).into())
     }
 }
 
-impl Frames {
-    /// Adds a frame; whether it is new.
+impl FrameSet {
+    /// Adds a frame; returns whether it is new.
     pub(super) fn add(&mut self, name: &str) -> bool {
         let name = name.trim_start_matches('/');
         self.0.len() < MOST && is_name(name) && self.0.insert(name.to_owned())
     }
 
-    /// Adds what a line of a node's log names; whether any of it is new.
-    pub(super) fn hear(&mut self, line: &str) -> bool {
-        let named = named(line);
+    /// Adds the frames named in a log line; returns whether any is new.
+    pub(super) fn add_from_log(&mut self, line: &str) -> bool {
+        let named = parse_frame_names(line);
         named
             .into_iter()
             .fold(false, |new, name| self.add(&name) | new)
     }
 
-    /// A `tf2_msgs/TFMessage` as JSON: every frame where its parent is.
+    /// Returns a `tf2_msgs/TFMessage` as JSON with an identity transform for every frame.
     pub(super) fn tree(&self, stamp: Time) -> Value {
         let leaf = |name: &String| {
             json!({
@@ -74,7 +74,7 @@ impl Frames {
     }
 }
 
-/// Whether a parameter's key says that its value is a frame.
+/// Returns whether a parameter is likely to contain the name of a frame, judging by its key.
 pub(super) fn is_parameter(key: &str) -> bool {
     let last = key.rsplit('/').next().unwrap_or_default();
     ["frame", "frame_id", "frame_name"].iter().any(|end| {
@@ -93,9 +93,9 @@ fn is_name(text: &str) -> bool {
             .all(|char| char.is_ascii_alphanumeric() || "_/.-".contains(char))
 }
 
-/// Words that a line about transforms uses for frames: quoted ones, those with an underscore, and those after `from`,
-/// `to`, `frame` and the like.
-fn named(line: &str) -> BTreeSet<String> {
+/// Returns the likely frame names in a line about transforms: words in quotes, words with an underscore, and words
+/// after `from`, `to`, `frame` and the like.
+fn parse_frame_names(line: &str) -> BTreeSet<String> {
     const BEFORE: [&str; 9] = [
         "from",
         "to",
@@ -150,7 +150,8 @@ mod tests {
         for (line, frames) in [
             (
                 "Timed out waiting for transform from chassis to hall to become available before running costmap, tf \
-                 error: canTransform: target_frame hall does not exist. canTransform: source_frame chassis does not exist.",
+                 error: canTransform: target_frame hall does not exist. canTransform: source_frame chassis \
+                 does not exist.",
                 &["chassis", "hall"][..],
             ),
             (
@@ -161,8 +162,8 @@ mod tests {
             ("Could not transform from 'a/b' to [c]", &["a/b", "c"]),
             ("waiting for the map from nowhere", &[]),
         ] {
-            let mut known = Frames::default();
-            known.hear(line);
+            let mut known = FrameSet::default();
+            known.add_from_log(line);
             for frame in frames {
                 assert!(known.0.contains(*frame), "{frame} in {line:?}: {known:?}");
             }
@@ -176,7 +177,7 @@ mod tests {
 
     #[test]
     fn every_frame_hangs_below_one_root() {
-        let mut frames = Frames::default();
+        let mut frames = FrameSet::default();
         assert!(frames.add("/chassis"));
         assert!(!frames.add("chassis") && !frames.add("no name"));
         let tree = frames.tree(Time { secs: 1, nsecs: 2 });

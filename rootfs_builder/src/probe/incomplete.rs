@@ -1,16 +1,16 @@
-//! Marks and warnings for an interface that may be incomplete.
+//! Marks and warnings for interfaces that may be incomplete.
 
 use std::collections::BTreeSet;
 
 use package::interface::{Direction, Interface};
 
-use super::feed::Feed;
-use super::{Found, ProbeOptions};
+use super::feed::InputFeed;
+use super::{ProbeOptions, ProbeResult};
 
 const ACTION_ENDS: [&str; 5] = ["/goal", "/cancel", "/status", "/feedback", "/result"];
-const STATE: &str = "state what is missing with --interface FILE";
+const STATE: &str = "add what is missing with --interface FILE";
 
-/// Marks what is not in `bare`, the interface before anything was given: a servant has it only once its robot gives
+/// Marks what is not in `bare`, the interface before any input was given: a servant has it only once its robot provides
 /// what the nodes wait for.
 pub(super) fn mark_late(interface: &mut Interface, bare: &Interface) {
     for topic in &mut interface.topics {
@@ -33,8 +33,8 @@ pub(super) fn mark_late(interface: &mut Interface, bare: &Interface) {
     interface.late = late;
 }
 
-/// Keeps inputs that were there before and are no more: a node that waits for one message listens no longer once it
-/// has come, and waits for it anew in every servant.
+/// Keeps inputs that have disappeared: a node that waits for a single message unsubscribes once it has arrived, and
+/// waits for it again in every servant.
 pub(super) fn keep_inputs(interface: &mut Interface, before: Interface) {
     let gone = before.topics.into_iter().filter(|topic| {
         let same = |other: &package::interface::Topic| {
@@ -59,17 +59,21 @@ pub(super) fn keep_inputs(interface: &mut Interface, before: Interface) {
     interface.sort();
 }
 
-/// The interface of a package of which a node ended because of the messages that it was given.
-pub(super) fn ended(mut found: Found, words: &str) -> Found {
+/// Adds a warning to the interface of a package of which a node exited because of the messages it was given.
+pub(super) fn with_exit_warning(mut found: ProbeResult, words: &str) -> ProbeResult {
     found.warnings.push(format!(
-        "{words}, while it was given default messages to find the rest of its interface; the interface found until \
-         then is published; if it is incomplete, {STATE}"
+        "{words} when it got default messages to find the rest of its interface; the interface found until then is \
+            published; if it is incomplete, {STATE}"
     ));
     found
 }
 
 /// Adds warnings about what may be missing.
-pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_>) {
+pub(super) fn add_warnings(
+    found: &mut ProbeResult,
+    options: &ProbeOptions,
+    feed: &mut InputFeed<'_>,
+) {
     let interface = &found.interface;
     let outputs = |interface: &Interface| {
         let topics = interface.topics.iter();
@@ -80,7 +84,7 @@ pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_
             + interface.actions.len()
     };
     let nodes = options.nodes.join(", ");
-    let said = feed.said();
+    let said = feed.wait_messages();
     let words = said
         .iter()
         .map(|(node, text)| format!("; {node} says: {text}"));
@@ -112,7 +116,7 @@ pub(super) fn warn(found: &mut Found, options: &ProbeOptions, feed: &mut Feed<'_
             any.join(", ")
         ));
     }
-    for (topic, reason) in feed.refused() {
+    for (topic, reason) in feed.failed_inputs() {
         found.warnings.push(format!(
             "no test message could be sent to {topic}: {reason}; {STATE}"
         ));

@@ -1,4 +1,4 @@
-//! Services that nodes look for and nobody serves: lent with default answers, whatever their type.
+//! Stand-ins for services that nodes look up and nobody provides: default answers for any type.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -6,23 +6,23 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Lender, Lent, ServiceHandler, ServiceType};
+use ros::bus::{Digest, Lender, LentService, ServiceHandler, ServiceType};
 use ros::codec::Time;
 use ros::schema::{Registry, ServiceDef};
 use tokio::sync::watch;
 
 use super::plausible;
 
-/// Answers every service that is looked for, and remembers which were.
-pub(super) struct AnyService {
+/// Answers all services that are looked up, and records them.
+pub(super) struct AnyServiceLender {
     by_digest: Arc<BTreeMap<Digest, Arc<ServiceDef>>>,
     asked: Mutex<BTreeMap<String, BTreeSet<String>>>,
     own_name: String,
     ending: watch::Sender<bool>,
 }
 
-impl AnyService {
-    /// Knows the service types of the image; `own_name` is the looking node, whose questions do not count.
+impl AnyServiceLender {
+    /// Creates a lender for the service types of the image; lookups by `own_name`, the observing node, are ignored.
     pub(super) fn new(registry: &Registry, own_name: &str) -> Arc<Self> {
         let mut by_digest = BTreeMap::new();
         for key in registry.keys() {
@@ -42,9 +42,9 @@ impl AnyService {
         })
     }
 
-    /// What answers the service of this name and type in the place of its server, and the type as it is defined; none of
-    /// a type that the image does not define.
-    pub(super) fn serves(
+    /// Returns a handler for the service of this name and type, and the type as defined; `None` if the image does not
+    /// define it.
+    pub(super) fn handler_for(
         &self,
         registry: &Registry,
         service: &str,
@@ -58,28 +58,28 @@ impl AnyService {
             .entry(service.to_owned())
             .or_default()
             .extend(nodes.cloned());
-        let of = ServiceType::of(&found);
-        let answers = Answers {
+        let of = ServiceType::from_service(&found);
+        let answers = DefaultAnswers {
             by_digest: self.by_digest.clone(),
             service: Some(found),
         };
         Some((of, Arc::new(answers)))
     }
 
-    /// Services that were looked for, with the nodes that did.
-    pub(super) fn asked(&self) -> BTreeMap<String, BTreeSet<String>> {
+    /// Returns the services looked up so far, with the nodes that did.
+    pub(super) fn requested_services(&self) -> BTreeMap<String, BTreeSet<String>> {
         self.asked.lock().clone()
     }
 
-    /// Takes everything back.
-    pub(super) fn end(&self) {
+    /// Revokes all services.
+    pub(super) fn revoke(&self) {
         self.ending.send_replace(true);
     }
 }
 
 #[async_trait]
-impl Lender for AnyService {
-    async fn find(&self, service: &str, node: &str) -> Option<Lent> {
+impl Lender for AnyServiceLender {
+    async fn find_service(&self, service: &str, node: &str) -> Option<LentService> {
         if node == self.own_name || *self.ending.borrow() {
             return None;
         }
@@ -88,9 +88,9 @@ impl Lender for AnyService {
             .entry(service.to_owned())
             .or_default()
             .insert(node.to_owned());
-        Some(Lent {
+        Some(LentService {
             service_type: ServiceType::new("*", "*"),
-            handler: Arc::new(Answers {
+            handler: Arc::new(DefaultAnswers {
                 by_digest: self.by_digest.clone(),
                 service: None,
             }),
@@ -99,23 +99,24 @@ impl Lender for AnyService {
     }
 }
 
-/// Answers calls of one type, or of none yet.
-struct Answers {
+/// Handler with default answers for one type, or for a type that is not known yet.
+struct DefaultAnswers {
     by_digest: Arc<BTreeMap<Digest, Arc<ServiceDef>>>,
     service: Option<Arc<ServiceDef>>,
 }
 
 #[async_trait]
-impl ServiceHandler for Answers {
+impl ServiceHandler for DefaultAnswers {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let unknown = || "the image holds no definition of this service".to_owned();
+        let unknown = || "the image has no definition of this service".to_owned();
         let service = self.service.as_ref().ok_or_else(unknown)?;
-        plausible::message(&service.response, Time::now()).map_err(|error| error.to_string())
+        plausible::default_message(&service.response, Time::now())
+            .map_err(|error| error.to_string())
     }
 
     fn for_type(&self, digest: &Digest) -> Option<Arc<dyn ServiceHandler>> {
         let service = Some(self.by_digest.get(digest)?.clone());
-        Some(Arc::new(Answers {
+        Some(Arc::new(DefaultAnswers {
             by_digest: self.by_digest.clone(),
             service,
         }))
@@ -132,18 +133,18 @@ mod tests {
     async fn a_server_of_ros_2_is_stood_in_for() {
         let text = "---\nbool success\nstring message\n".to_owned();
         let definitions = [("lab/srv/Do".to_owned(), text)].into();
-        let registry = Registry::of_definitions(RosVersion::Two, &definitions).expect("valid");
-        let any = AnyService::new(&registry, "/looker");
+        let registry = Registry::with_definitions(RosVersion::Two, &definitions).expect("valid");
+        let any = AnyServiceLender::new(&registry, "/looker");
         let nodes = ["/node".to_owned(), "/looker".to_owned()];
-        let served = any.serves(&registry, "/do", "lab/srv/Do", &nodes);
+        let served = any.handler_for(&registry, "/do", "lab/srv/Do", &nodes);
         let (of, handler) = served.expect("defined");
         assert_eq!(of.name, "lab/srv/Do");
         let answer = handler.call(Bytes::new(), "/node").await.expect("answered");
-        // The header of CDR, false, and an empty text with its length.
+        // CDR header, false, and an empty string with its length.
         assert_eq!(answer[..], [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0]);
-        assert_eq!(any.asked()["/do"], ["/node".to_owned()].into());
+        assert_eq!(any.requested_services()["/do"], ["/node".to_owned()].into());
         assert!(
-            any.serves(&registry, "/x", "lab/srv/None", &nodes)
+            any.handler_for(&registry, "/x", "lab/srv/None", &nodes)
                 .is_none()
         );
     }
@@ -154,12 +155,12 @@ mod tests {
         let definitions = [("lab/srv/Add".to_owned(), text)].into();
         let registry = Registry::from_definitions(&definitions).expect("valid");
         let add = registry.service("lab/Add").expect("defined");
-        let any = AnyService::new(&registry, "/looker");
+        let any = AnyServiceLender::new(&registry, "/looker");
         assert!(
-            any.find("/add", "/looker").await.is_none(),
+            any.find_service("/add", "/looker").await.is_none(),
             "its own questions"
         );
-        let lent = any.find("/add", "/node").await.expect("lent");
+        let lent = any.find_service("/add", "/node").await.expect("lent");
         let handler = lent
             .handler
             .for_type(&Digest::from(&add.md5))
@@ -170,8 +171,8 @@ mod tests {
             lent.handler.call(Bytes::new(), "/node").await.is_err(),
             "of no type"
         );
-        assert!(any.asked()["/add"].contains("/node"));
-        any.end();
-        assert!(any.find("/add", "/node").await.is_none());
+        assert!(any.requested_services()["/add"].contains("/node"));
+        any.revoke();
+        assert!(any.find_service("/add", "/node").await.is_none());
     }
 }

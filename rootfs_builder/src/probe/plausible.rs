@@ -1,5 +1,5 @@
-//! Default messages that a node can work with: zeros, except where zeros make no sense (a rotation of length zero, a
-//! map whose cells have no size). Which those are is data: `plausible.json`, by message type.
+//! Plausible default messages: zeros, except where zeros make no sense (a rotation of length zero, a map with cells of
+//! size zero). The exceptions are data: `plausible.json`, by message type.
 
 use std::sync::LazyLock;
 
@@ -8,13 +8,13 @@ use ros::codec::{self, CodecError, FillOptions, Time};
 use ros::schema::{Arity, Base, MessageType};
 use serde_json::{Map, Value};
 
-/// Type → the fields that are not zero. `{"repeat": value, "times": n}` stands for an array.
+/// Type → its nonzero fields. `{"repeat": value, "times": n}` represents an array.
 static VALUES: LazyLock<Map<String, Value>> =
     LazyLock::new(|| serde_json::from_str(include_str!("plausible.json")).unwrap_or_default());
 
-/// The default message of a type, serialized; headers are stamped with `now`.
-pub(super) fn message(message: &MessageType, now: Time) -> Result<Bytes, CodecError> {
-    let json = Value::Object(fields(message)).to_string();
+/// Returns the serialized default message of a type; headers are stamped with `now`.
+pub(super) fn default_message(message: &MessageType, now: Time) -> Result<Bytes, CodecError> {
+    let json = Value::Object(nonzero_fields(message)).to_string();
     let mut bytes = Vec::new();
     let options = FillOptions {
         now: Some(now),
@@ -24,18 +24,18 @@ pub(super) fn message(message: &MessageType, now: Time) -> Result<Bytes, CodecEr
     Ok(bytes.into())
 }
 
-/// Those that are not zero.
-fn fields(message: &MessageType) -> Map<String, Value> {
+/// Returns the nonzero fields.
+fn nonzero_fields(message: &MessageType) -> Map<String, Value> {
     let mut object = Map::new();
     for field in message.fields() {
         if let (Arity::One, Base::Message(inner)) = (field.arity, &field.base) {
-            let inner = fields(inner);
+            let inner = nonzero_fields(inner);
             if !inner.is_empty() {
                 object.insert(field.name.to_string(), Value::Object(inner));
             }
         }
     }
-    // ROS 2 has a kind in its names, and no capitals in those of fields.
+    // ROS 2 type names contain a kind, and its field names contain no capitals.
     let name = message.name().replacen("/msg/", "/", 1);
     if let Some(Value::Object(values)) = VALUES.get(&name) {
         let known = values.iter().filter_map(|(key, value)| {
@@ -43,23 +43,23 @@ fn fields(message: &MessageType) -> Map<String, Value> {
             let field = fields.find(|field| field.name.eq_ignore_ascii_case(key))?;
             Some((field.name.to_string(), value.clone()))
         });
-        merge(&mut object, &known.collect());
+        merge_values(&mut object, &known.collect());
     }
     object
 }
 
-fn merge(into: &mut Map<String, Value>, values: &Map<String, Value>) {
+fn merge_values(into: &mut Map<String, Value>, values: &Map<String, Value>) {
     for (name, value) in values {
         match (into.get_mut(name), value) {
-            (Some(Value::Object(below)), Value::Object(value)) => merge(below, value),
+            (Some(Value::Object(below)), Value::Object(value)) => merge_values(below, value),
             _ => {
-                into.insert(name.clone(), expanded(value));
+                into.insert(name.clone(), expand_repeats(value));
             }
         }
     }
 }
 
-fn expanded(value: &Value) -> Value {
+fn expand_repeats(value: &Value) -> Value {
     match (
         value.get("repeat"),
         value.get("times").and_then(Value::as_u64),
@@ -93,7 +93,7 @@ mod tests {
         .expect("valid");
         let log = registry.message("lab/Log").expect("defined");
         let now = Time { secs: 7, nsecs: 8 };
-        let bytes = message(&log, now).expect("a message");
+        let bytes = default_message(&log, now).expect("a message");
         let mut json = Vec::new();
         codec::to_json(&log, &bytes, &mut json, &codec::JsonOptions::default()).expect("valid");
         let seen: Value = serde_json::from_slice(&json).expect("JSON");
@@ -110,12 +110,12 @@ mod tests {
             "sensor_msgs/msg/CameraInfo".to_owned(),
             "uint32 height\nfloat64[] d\nfloat64[9] k\n".to_owned(),
         )];
-        let registry = Registry::of_definitions(ros::bus::RosVersion::Two, &definitions.into())
+        let registry = Registry::with_definitions(ros::bus::RosVersion::Two, &definitions.into())
             .expect("valid");
         let info = registry
             .message("sensor_msgs/msg/CameraInfo")
             .expect("defined");
-        let bytes = message(&info, Time::default()).expect("a message");
+        let bytes = default_message(&info, Time::default()).expect("a message");
         let mut json = Vec::new();
         codec::to_json(&info, &bytes, &mut json, &codec::JsonOptions::default()).expect("valid");
         let seen: Value = serde_json::from_slice(&json).expect("JSON");
@@ -126,7 +126,7 @@ mod tests {
     #[test]
     fn arrays_are_written_out() {
         let three = serde_json::json!({"repeat": 1.5, "times": 3});
-        assert_eq!(expanded(&three), serde_json::json!([1.5, 1.5, 1.5]));
+        assert_eq!(expand_repeats(&three), serde_json::json!([1.5, 1.5, 1.5]));
         assert!(!VALUES.is_empty(), "plausible.json is JSON");
     }
 }

@@ -1,4 +1,4 @@
-//! Waiting: until nodes have registered, and until nothing changes any more.
+//! Waiting until nodes have registered, and until the graph has settled.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -9,14 +9,15 @@ use ros::plumbing;
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
-use super::{ProbeError, ProbeOptions, Worked, describe};
+use super::{CpuTime, ProbeError, ProbeOptions, describe};
 
-async fn changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeError> {
+async fn graph_changed(watch: &mut watch::Receiver<Arc<Graph>>) -> Result<(), ProbeError> {
     watch.changed().await.map_err(|_| ProbeError::MasterGone)
 }
 
-/// Waits until all nodes that must register have; those that are elsewhere, with their names there.
-pub(super) async fn registered(
+/// Waits until all required nodes have registered; returns those that have moved to a namespace, with their names
+/// there.
+pub(super) async fn wait_until_registered(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
 ) -> Result<BTreeMap<String, String>, ProbeError> {
@@ -27,7 +28,7 @@ pub(super) async fn registered(
             let graph = watch.borrow_and_update();
             let nodes = options.nodes.iter();
             for node in nodes.filter(|node| !graph.nodes.contains_key(*node)) {
-                match elsewhere(&graph, node, options) {
+                match find_moved_node(&graph, node, options) {
                     Some(there) => drop(moved.insert(node.clone(), there.clone())),
                     None => missing.push(node.clone()),
                 }
@@ -36,14 +37,14 @@ pub(super) async fn registered(
         if missing.is_empty() {
             return Ok(moved);
         }
-        match timeout_at(deadline, changed(watch)).await {
+        match timeout_at(deadline, graph_changed(watch)).await {
             Ok(result) => result?,
             Err(_) => {
                 return Err(ProbeError::NeverRegistered {
                     nodes: missing,
                     after: options.patience,
                     sought: {
-                        let needs = describe::needs(&watch.borrow(), &options.own_name);
+                        let needs = describe::missing_needs(&watch.borrow(), &options.own_name);
                         needs.into_iter().map(|need| need.name).collect()
                     },
                 });
@@ -52,64 +53,64 @@ pub(super) async fn registered(
     }
 }
 
-/// Where a node is that its program has put into a namespace: the one of its name among those of its mark.
-fn elsewhere<'a>(graph: &'a Graph, node: &str, options: &ProbeOptions) -> Option<&'a String> {
+/// Finds a node that its program has moved to a namespace: the node of the same base name with its mark.
+fn find_moved_node<'a>(graph: &'a Graph, node: &str, options: &ProbeOptions) -> Option<&'a String> {
     let last = |name: &str| name.rsplit('/').next().map(str::to_owned);
     let nodes = graph.enclaves.get(options.marks.get(node)?)?;
     nodes.iter().find(|other| last(other) == last(node))
 }
 
-/// Time as nodes have it: while they wait for a core it stands still, nearly.
-struct Clock {
-    /// When it was read last.
+/// Clock of the nodes' own time, which nearly stands still while they wait for a core.
+struct NodeClock {
+    /// Time of the last reading.
     at: Instant,
-    worked: Option<Worked>,
+    worked: Option<CpuTime>,
 }
 
-/// What happened between two readings of a [`Clock`].
-struct Past {
-    /// As nodes have it.
+/// Time between two readings of a [`NodeClock`].
+struct ClockReading {
+    /// Elapsed time as seen by the nodes.
     time: Duration,
-    /// Of that on a core, of all threads together.
+    /// Time running on a core, summed over all threads.
     ran: Duration,
 }
 
-/// Threads that wait together may wait longer than time passes: a part of it counts always.
+/// Threads that wait together may wait longer than time elapses: at least 1/20 of the elapsed time always counts.
 const LEAST: u32 = 20;
 
-impl Clock {
-    async fn begin(options: &ProbeOptions) -> Self {
+impl NodeClock {
+    async fn start(options: &ProbeOptions) -> Self {
         Self {
             at: Instant::now(),
-            worked: options.worked().await,
+            worked: options.cpu_time().await,
         }
     }
 
-    async fn read(&mut self, options: &ProbeOptions) -> Past {
-        let (at, worked) = (Instant::now(), options.worked().await);
+    async fn read(&mut self, options: &ProbeOptions) -> ClockReading {
+        let (at, worked) = (Instant::now(), options.cpu_time().await);
         let elapsed = at - self.at;
         let (ran, waited) = match (self.worked, worked) {
             (Some(before), Some(after)) => (
                 after.ran.saturating_sub(before.ran),
-                // Threads that have ended are not counted any more.
+                // Threads that have ended are no longer included.
                 after.waited.saturating_sub(before.waited),
             ),
             _ => Default::default(),
         };
         *self = Self { at, worked };
         let time = elapsed.saturating_sub(waited).max(elapsed / LEAST);
-        Past { time, ran }
+        ClockReading { time, ran }
     }
 }
 
-/// What a node answers; none where it does not within `limit` of its own time, or within `patience`.
-pub(super) async fn answered<T>(
+/// Awaits a node's answer; `None` if it takes longer than `limit` of its own time, or than `patience`.
+pub(super) async fn await_answer<T>(
     limit: Duration,
     options: &ProbeOptions,
     answer: impl Future<Output = T>,
 ) -> Option<T> {
     let latest = Instant::now() + options.patience.max(limit);
-    let mut clock = Clock::begin(options).await;
+    let mut clock = NodeClock::start(options).await;
     let mut left = limit;
     tokio::pin!(answer);
     loop {
@@ -124,26 +125,26 @@ pub(super) async fn answered<T>(
     }
 }
 
-/// Waits until nothing changes any more; false when it did not come to rest in time.
+/// Waits until the graph has settled; returns false if it did not in time.
 ///
-/// Rest is more than silence: a node that shows nothing yet but itself, or that works hard, is still about to. A node
-/// that waits for a core is, too: all times are the nodes' own, but for `patience`.
-pub async fn still(
+/// Settled means more than unchanged: a node that has registered nothing but itself, or that is busy, has not settled.
+/// Neither has a node that waits for a core: all times except `patience` are the nodes' own.
+pub async fn wait_until_still(
     watch: &mut watch::Receiver<Arc<Graph>>,
     options: &ProbeOptions,
 ) -> Result<bool, ProbeError> {
     let latest = Instant::now() + options.patience.max(options.restless);
-    // Some nodes work all the time; that alone is not worth the whole wait.
+    // Some nodes are always busy; that alone does not justify the whole wait.
     let working_limit = options.restless / 3;
-    let mut clock = Clock::begin(options).await;
-    let mut shape = shape(&watch.borrow_and_update());
+    let mut clock = NodeClock::start(options).await;
+    let mut shape = graph_shape(&watch.borrow_and_update());
     let mut total = Duration::ZERO;
     // Since the last change.
     let (mut silent, mut ran) = (Duration::ZERO, Duration::ZERO);
     loop {
         let pause = options.settle.saturating_sub(silent);
         let until = Instant::now() + pause.max(options.settle / LEAST);
-        let changed = differs(watch, &mut shape, until.min(latest)).await?;
+        let changed = wait_for_difference(watch, &mut shape, until.min(latest)).await?;
         let past = clock.read(options).await;
         total += past.time;
         if changed {
@@ -167,16 +168,16 @@ pub async fn still(
     }
 }
 
-/// Waits until the graph differs from `shape`, which then is the new one; false if it does not until then.
-async fn differs(
+/// Waits until the graph differs from `shape`, and updates that; returns false if it does not in time.
+async fn wait_for_difference(
     watch: &mut watch::Receiver<Arc<Graph>>,
-    shape: &mut Shape,
+    shape: &mut GraphShape,
     until: Instant,
 ) -> Result<bool, ProbeError> {
-    while let Ok(changed) = timeout_at(until, changed(watch)).await {
+    while let Ok(changed) = timeout_at(until, graph_changed(watch)).await {
         changed?;
-        // Parameters that a node reads again and again change the graph's generation and nothing here.
-        let now = self::shape(&watch.borrow_and_update());
+        // A parameter that is read repeatedly changes the graph's generation, but nothing relevant here.
+        let now = self::graph_shape(&watch.borrow_and_update());
         if now != *shape {
             *shape = now;
             return Ok(true);
@@ -188,14 +189,14 @@ async fn differs(
     Ok(false)
 }
 
-/// Whether nobody has registered anything yet but what every node has. (Of several nodes some may never show
-/// anything, such as those that load nodelets into others.)
+/// Returns whether only what every node has is registered so far. (Of several nodes some may never have anything else,
+/// such as those that load nodelets into others.)
 fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
     const NODELETS: [&str; 3] = ["load_nodelet", "unload_nodelet", "list"];
     let own = |node: &String| *node == options.own_name;
     let topics = graph.topics.iter().any(|(name, topic)| {
         let mut ends = topic.publishers.iter().chain(&topic.subscribers);
-        !plumbing::topic(graph, name) && ends.any(|node| !own(node))
+        !plumbing::is_builtin_topic(graph, name) && ends.any(|node| !own(node))
     });
     let services = graph.services.iter().any(|(name, server)| {
         !own(server)
@@ -203,15 +204,15 @@ fn shows_nothing(graph: &Graph, options: &ProbeOptions) -> bool {
                 .rsplit('/')
                 .next()
                 .is_some_and(|last| !NODELETS.contains(&last))
-            && !plumbing::service(options.ros, graph, name)
+            && !plumbing::is_builtin_service(options.ros, graph, name)
     });
     let actions = graph.actions.values();
     let served = actions.flat_map(|action| &action.servers);
     !topics && !services && !served.into_iter().any(|node| !own(node))
 }
 
-/// What of a graph is looked at for changes.
-pub(super) type Shape = (
+/// Parts of a graph that are watched for changes.
+pub(super) type GraphShape = (
     BTreeMap<String, TopicNodes>,
     BTreeMap<String, String>,
     BTreeMap<String, ActionNodes>,
@@ -220,7 +221,7 @@ pub(super) type Shape = (
     usize,
 );
 
-pub(super) fn shape(graph: &Graph) -> Shape {
+pub(super) fn graph_shape(graph: &Graph) -> GraphShape {
     let nodes = graph.nodes.keys().cloned().collect();
     (
         graph.topics.clone(),
@@ -256,7 +257,9 @@ mod tests {
             marks: [("/see".to_owned(), "/mark".to_owned())].into(),
             ..ProbeOptions::new(vec!["/see".to_owned(), "/hear".to_owned()], "/probe")
         };
-        let error = registered(&mut watch, &options).await.expect_err("no /see");
+        let error = wait_until_registered(&mut watch, &options)
+            .await
+            .expect_err("no /see");
         assert!(error.to_string().starts_with("/see did not"), "{error}");
         let of_mark = ["/camera/help".to_owned(), "/camera/see".to_owned()];
         sender.send_replace(Arc::new(Graph {
@@ -264,7 +267,9 @@ mod tests {
             enclaves: [("/mark".to_owned(), of_mark.into())].into(),
             ..graph
         }));
-        let moved = registered(&mut watch, &options).await.expect("both");
+        let moved = wait_until_registered(&mut watch, &options)
+            .await
+            .expect("both");
         let expected = ("/see".to_owned(), "/camera/see".to_owned());
         assert_eq!(moved, [expected].into());
     }

@@ -1,9 +1,9 @@
-//! Against a real Master and real nodes on loopback.
+//! Tests with a real Master and real nodes on loopback.
 
 use std::net::SocketAddr;
 
 use package::interface::Direction;
-use ros::bus::{Publisher, Qos, ServiceHandler, ServiceType, WireType};
+use ros::bus::{Publisher, QosProfile, ServiceHandler, ServiceType, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -27,7 +27,7 @@ const TURN: (&str, &str) = (
 );
 
 /// A Master on loopback, the definitions of an image, and a node of its package.
-struct Lab {
+struct MasterFixture {
     address: SocketAddr,
     definitions: BTreeMap<String, String>,
     registry: Arc<Registry>,
@@ -35,7 +35,7 @@ struct Lab {
     serving: tokio::task::JoinHandle<()>,
 }
 
-impl Lab {
+impl MasterFixture {
     async fn new() -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
@@ -60,7 +60,7 @@ impl Lab {
 
     fn wire(&self, name: &str) -> WireType {
         let message = self.registry.message(name).expect("defined");
-        WireType::of(&message)
+        WireType::from_message(&message)
     }
 
     async fn advertises(
@@ -70,14 +70,14 @@ impl Lab {
         latch: bool,
     ) -> Box<dyn Publisher> {
         self.node
-            .advertise(topic, wire_type, Qos::keep_last(1).latching(latch))
+            .advertise(topic, wire_type, QosProfile::keep_last(1).latching(latch))
             .await
             .expect("advertised")
     }
 
     async fn subscribes(&self, topic: &str, wire_type: WireType) -> Subscription {
         self.node
-            .subscribe(topic, wire_type, Qos::keep_last(1))
+            .subscribe(topic, wire_type, QosProfile::keep_last(1))
             .await
             .expect("subscribed")
     }
@@ -101,19 +101,19 @@ impl Lab {
         }
     }
 
-    async fn probed(
+    async fn run_probe(
         &self,
         nodes: &[&str],
         exited: impl Future<Output = String> + Send,
-    ) -> Result<Found, ProbeError> {
-        self.probed_with(&self.options(nodes), exited).await
+    ) -> Result<ProbeResult, ProbeError> {
+        self.run_probe_with(&self.options(nodes), exited).await
     }
 
-    async fn probed_with(
+    async fn run_probe_with(
         &self,
         options: &ProbeOptions,
         exited: impl Future<Output = String> + Send,
-    ) -> Result<Found, ProbeError> {
+    ) -> Result<ProbeResult, ProbeError> {
         let bus: Arc<dyn Bus> = Ros1Bus::connect(Arc::new(HostSockets), self.address, "/looker")
             .await
             .expect("joined");
@@ -139,7 +139,7 @@ impl ServiceHandler for Sum {
 
 #[tokio::test]
 async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let string = lab.wire("std_msgs/String");
     let _input = lab.subscribes("/eager", string.clone()).await;
     let latched = lab.advertises("/latched", string.clone(), true).await;
@@ -152,21 +152,21 @@ async fn lazy_inputs_latched_outputs_services_and_parameters_are_found() {
         .set("/package/gain", ros::bus::ParamValue::Double(0.5))
         .await
         .expect("set");
-    // Wakes as real nodes do: with the first subscriber of its output.
-    let mut listeners = output.matched();
+    // Activated as in real nodes, by the first subscriber of its output.
+    let mut listeners = output.matched_subscribers();
     let node = lab.node.clone();
     let waking = tokio::spawn(async move {
         listeners
-            .wait_for(|now| now.connected() > 0)
+            .wait_for(|now| now.connected_count() > 0)
             .await
             .expect("alive");
-        node.subscribe("/sleepy", string, Qos::keep_last(1))
+        node.subscribe("/sleepy", string, QosProfile::keep_last(1))
             .await
             .expect("subscribed")
     });
 
     let found = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect("found");
     let interface = found.interface;
@@ -225,12 +225,12 @@ async fn a_node_that_waits_for_a_core_is_waited_for() {
         })
     };
     let (graph, mut watch) = tokio::sync::watch::channel(shows(&["/first"]));
-    // Of five seconds it has a fortieth. Then it shows the rest of itself, and rests.
+    // It gets 1/40 of five seconds. Then it registers its remaining interface and settles.
     let begun = Instant::now();
     let crowded = Duration::from_secs(5);
-    let work = Work::new(move || async move {
+    let work = CpuTimeSource::new(move || async move {
         let elapsed = begun.elapsed().min(crowded);
-        Some(Worked {
+        Some(CpuTime {
             ran: elapsed / 40,
             waited: elapsed - elapsed / 40,
         })
@@ -244,13 +244,17 @@ async fn a_node_that_waits_for_a_core_is_waited_for() {
         tokio::time::sleep_until(begun + crowded).await;
         let _ = shown.send(all);
     });
-    assert!(settle::still(&mut watch, &options).await.expect("watched"));
+    assert!(
+        settle::wait_until_still(&mut watch, &options)
+            .await
+            .expect("watched")
+    );
     assert!(watch.borrow().topics.contains_key("/last"));
     let took = begun.elapsed() - crowded;
     assert!(took < 2 * options.settle, "{took:?}");
-    // For ever is too long, as [push] says.
-    let work = Work::new(move || async move {
-        Some(Worked {
+    // Too long in any case, according to [push].
+    let work = CpuTimeSource::new(move || async move {
+        Some(CpuTime {
             ran: Duration::ZERO,
             waited: begun.elapsed(),
         })
@@ -262,7 +266,9 @@ async fn a_node_that_waits_for_a_core_is_waited_for() {
         ..options
     };
     let began = Instant::now();
-    settle::still(&mut watch, &options).await.expect("watched");
+    settle::wait_until_still(&mut watch, &options)
+        .await
+        .expect("watched");
     let took = began.elapsed();
     assert!(
         took >= 5 * options.settle && took < 7 * options.settle,
@@ -275,11 +281,15 @@ async fn an_answer_is_waited_for_in_the_nodes_own_time() {
     let options = ProbeOptions::new(Vec::new(), "/looker");
     let limit = Duration::from_secs(5);
     let late = || tokio::time::sleep(2 * limit);
-    assert!(settle::answered(limit, &options, late()).await.is_none());
+    assert!(
+        settle::await_answer(limit, &options, late())
+            .await
+            .is_none()
+    );
     // It waits for a core for nine of ten seconds.
     let begun = Instant::now();
-    let work = Work::new(move || async move {
-        Some(Worked {
+    let work = CpuTimeSource::new(move || async move {
+        Some(CpuTime {
             ran: Duration::ZERO,
             waited: begun.elapsed().mul_f64(0.9),
         })
@@ -288,43 +298,47 @@ async fn an_answer_is_waited_for_in_the_nodes_own_time() {
         work: Some(work),
         ..options
     };
-    assert!(settle::answered(limit, &crowded, late()).await.is_some());
+    assert!(
+        settle::await_answer(limit, &crowded, late())
+            .await
+            .is_some()
+    );
     let began = Instant::now();
     let never = std::future::pending::<()>();
-    assert!(settle::answered(limit, &crowded, never).await.is_none());
+    assert!(settle::await_answer(limit, &crowded, never).await.is_none());
     let took = began.elapsed();
     assert!(took > 9 * limit && took <= crowded.patience, "{took:?}");
 }
 
 #[tokio::test]
 async fn a_node_that_still_works_is_waited_for() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let _first = lab
         .advertises("/first", lab.wire("std_msgs/String"), false)
         .await;
     let bus: Arc<dyn Bus> = Ros1Bus::connect(Arc::new(HostSockets), lab.address, "/looker")
         .await
         .expect("joined");
-    // Asked a third time it is done, and only then has its input. Were it not waited for, what it does then would
-    // look like the answer to being subscribed to.
+    // At the third query it is done, and only then registers its input. Without waiting for it, its later activity
+    // would look like a reaction to the subscription.
     let (node, wire) = (lab.node.clone(), lab.wire("std_msgs/String"));
     let asked = Arc::new(std::sync::atomic::AtomicU32::new(0));
     let late = Arc::new(tokio::sync::Mutex::new(None));
     let kept = late.clone();
-    let work = Work::new(move || {
+    let work = CpuTimeSource::new(move || {
         let (node, wire, late) = (node.clone(), wire.clone(), late.clone());
         let times = asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
         async move {
             if times == 2 {
                 *late.lock().await = Some(
-                    node.subscribe("/late", wire, Qos::keep_last(1))
+                    node.subscribe("/late", wire, QosProfile::keep_last(1))
                         .await
                         .expect("subscribed"),
                 );
             }
-            Some(Worked {
+            Some(CpuTime {
                 ran: Duration::from_secs(times.min(2).into()),
-                ..Worked::default()
+                ..CpuTime::default()
             })
         }
     });
@@ -355,18 +369,18 @@ async fn a_node_that_still_works_is_waited_for() {
 
 #[tokio::test]
 async fn a_node_that_shows_nothing_yet_is_waited_for() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let (node, wire_type) = (lab.node.clone(), lab.wire("std_msgs/String"));
     let _rosout = lab.advertises("/rosout", wire_type.clone(), false).await;
     let showing = tokio::spawn(async move {
-        // Slow: long after the graph was still for a while.
+        // Slow: long after the graph seemed to have settled.
         tokio::time::sleep(Duration::from_millis(600)).await;
-        node.advertise("/late", wire_type, Qos::keep_last(1))
+        node.advertise("/late", wire_type, QosProfile::keep_last(1))
             .await
             .expect("advertised")
     });
     let found = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect("found");
     assert_eq!(found.interface.topics[0].name, "/late");
@@ -376,9 +390,9 @@ async fn a_node_that_shows_nothing_yet_is_waited_for() {
 
 #[tokio::test]
 async fn five_topics_are_an_action() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let turn = lab.registry.action("lab/Turn").expect("defined");
-    let wire = |message: &Arc<ros::schema::MessageType>| WireType::of(message);
+    let wire = |message: &Arc<ros::schema::MessageType>| WireType::from_message(message);
     let _goal = lab.subscribes("/turn/goal", wire(&turn.action_goal)).await;
     let _cancel = lab
         .subscribes("/turn/cancel", lab.wire("actionlib_msgs/GoalID"))
@@ -397,7 +411,7 @@ async fn five_topics_are_an_action() {
         .advertises("/turn/result", wire(&turn.action_result), false)
         .await;
     let found = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect("found");
     assert_eq!(found.interface.topics, []);
@@ -414,14 +428,14 @@ async fn five_topics_are_an_action() {
 
 #[tokio::test]
 async fn a_node_compiled_with_another_definition_is_refused() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let other = WireType {
         digest: "0".repeat(32).into(),
         ..lab.wire("std_msgs/String")
     };
     let _input = lab.subscribes("/in", other).await;
     let error = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect_err("refused")
         .to_string();
@@ -434,12 +448,12 @@ async fn a_node_compiled_with_another_definition_is_refused() {
 
 #[tokio::test]
 async fn a_node_that_never_registers_is_named() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let _output = lab
         .advertises("/out", lab.wire("std_msgs/String"), false)
         .await;
     let error = lab
-        .probed(&["/package", "/absent"], std::future::pending())
+        .run_probe(&["/package", "/absent"], std::future::pending())
         .await
         .expect_err("absent")
         .to_string();
@@ -449,10 +463,10 @@ async fn a_node_that_never_registers_is_named() {
 
 #[tokio::test]
 async fn a_node_that_ends_is_told_before_anything_else() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let exited = async { "/package exited with 3".to_owned() };
     let error = lab
-        .probed(&["/absent"], exited)
+        .run_probe(&["/absent"], exited)
         .await
         .expect_err("ended")
         .to_string();
@@ -462,22 +476,22 @@ async fn a_node_that_ends_is_told_before_anything_else() {
 
 #[tokio::test]
 async fn services_that_are_missed_are_named() {
-    let lab = Lab::new().await;
+    let lab = MasterFixture::new().await;
     let text = lab.wire("std_msgs/String");
     let _topic = lab.advertises("/said", text, false).await;
     for missing in ["/static_map", "/add"] {
         let called = lab.node.service_type(missing).await;
         assert!(called.is_err(), "{called:?}");
     }
-    let never = lab.probed(&["/late"], std::future::pending()).await;
+    let never = lab.run_probe(&["/late"], std::future::pending()).await;
     let error = never.expect_err("it does not come").to_string();
     assert!(
         error.contains("such as the service /add or /static_map"),
         "{error}"
     );
-    // One of them comes after all, before the end.
+    // One of them appears before the end.
     let _add = lab.serves("/add").await;
-    let found = lab.probed(&["/package"], std::future::pending()).await;
+    let found = lab.run_probe(&["/package"], std::future::pending()).await;
     let found = found.expect("an interface");
     let needs = found.interface.needs;
     assert_eq!(needs.len(), 1, "{needs:?}");

@@ -1,4 +1,4 @@
-//! What a site does with containers, told with an engine in memory. Real containers are run by the stories.
+//! Tests of a build site with an engine in memory. Real containers are covered by the story tests.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -10,18 +10,18 @@ use tokio::sync::Notify;
 
 use super::*;
 
-/// Its program prints a line and then runs until it is stopped, or ends by itself with `code`.
+/// Fake sandbox whose program prints a line and then runs until it is stopped, or exits by itself with `code`.
 #[derive(Default)]
-struct Pretended {
+struct FakeSandbox {
     code: Option<i32>,
     engine: MemoryEngine,
     started: Arc<Notify>,
-    /// The build's directory, and whether it was still there when the program had ended.
+    /// Directory of the build, and whether it still existed when the program had ended.
     saw: Arc<Mutex<Option<(PathBuf, bool)>>>,
     stopped: Arc<AtomicBool>,
 }
 
-/// What a program leaves behind.
+/// Guard that is dropped when the program has ended.
 struct Last {
     stopped: Arc<AtomicBool>,
     saw: Arc<Mutex<Option<(PathBuf, bool)>>>,
@@ -37,8 +37,8 @@ impl Drop for Last {
 }
 
 #[async_trait]
-impl Sandbox for Pretended {
-    async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, servant::Error> {
+impl Sandbox for FakeSandbox {
+    async fn start_sandbox(&self, spec: ContainerSpec) -> Result<SandboxContainer, servant::Error> {
         let (code, started) = (self.code, Arc::clone(&self.started));
         let (stopped, saw) = (Arc::clone(&self.stopped), Arc::clone(&self.saw));
         self.engine.program("/bin/true", move |process| {
@@ -63,15 +63,15 @@ impl Sandbox for Pretended {
             grants: Default::default(),
             resident: spec.resident,
         };
-        Ok(Sandboxed {
+        Ok(SandboxContainer {
             servant: self.engine.start(spec).await?,
             uid_offset: 700_000,
         })
     }
 }
 
-fn run() -> Run {
-    Run {
+fn run() -> SandboxRun {
+    SandboxRun {
         name: "x",
         profile: Profile::Compile,
         layers: Vec::new(),
@@ -83,14 +83,14 @@ fn run() -> Run {
     }
 }
 
-fn site(root: &Path, id: &str, engine: &Arc<Pretended>, removals: &Removals) -> Site {
-    Site::new(root, id, engine.clone(), default_limits(), removals.clone()).expect("made")
+fn site(root: &Path, id: &str, engine: &Arc<FakeSandbox>, removals: &PendingRemovals) -> BuildSite {
+    BuildSite::new(root, id, engine.clone(), default_limits(), removals.clone()).expect("made")
 }
 
 #[tokio::test]
 async fn a_build_as_deep_as_can_be_is_removed() {
     let root = tempfile::tempdir().expect("a directory");
-    let (engine, removals) = (Arc::new(Pretended::default()), Removals::default());
+    let (engine, removals) = (Arc::new(FakeSandbox::default()), PendingRemovals::default());
     let site = site(root.path(), "b3", &engine, &removals);
     let directory = root.path().join("b3");
     tokio::task::spawn_blocking(move || {
@@ -105,18 +105,18 @@ async fn a_build_as_deep_as_can_be_is_removed() {
     .await
     .expect("nested");
     drop(site);
-    removals.done("b3").await;
+    removals.wait("b3").await;
     assert!(!root.path().join("b3").exists());
 }
 
 #[tokio::test]
 async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
     let root = tempfile::tempdir().expect("a directory");
-    let engine = Arc::new(Pretended {
+    let engine = Arc::new(FakeSandbox {
         code: Some(3),
-        ..Pretended::default()
+        ..FakeSandbox::default()
     });
-    let removals = Removals::default();
+    let removals = PendingRemovals::default();
     let site = site(root.path(), "b1", &engine, &removals);
     let mut heard = Vec::new();
     let finished = site
@@ -130,7 +130,7 @@ async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
     );
     assert!(engine.stopped.load(Ordering::SeqCst));
     drop(site);
-    removals.done("b1").await;
+    removals.wait("b1").await;
     assert!(!root.path().join("b1").exists());
 }
 
@@ -138,9 +138,9 @@ async fn lines_are_heard_and_the_container_is_gone_at_the_end() {
 async fn a_dropped_build_ends_its_container_before_its_directory_goes() {
     let root = tempfile::tempdir().expect("a directory");
     let directory = root.path().join("b2");
-    let engine = Arc::new(Pretended::default());
+    let engine = Arc::new(FakeSandbox::default());
     *engine.saw.lock().expect("not poisoned") = Some((directory.clone(), false));
-    let removals = Removals::default();
+    let removals = PendingRemovals::default();
     let site = site(root.path(), "b2", &engine, &removals);
     tokio::select! {
         _ = site.run(run(), |_| {}) => panic!("it runs until it is stopped"),
@@ -150,7 +150,7 @@ async fn a_dropped_build_ends_its_container_before_its_directory_goes() {
     let running = site.running.clone();
     assert_eq!(running.lock().expect("not poisoned").len(), 1);
     drop(site);
-    removals.done("b2").await;
+    removals.wait("b2").await;
     assert!(engine.stopped.load(Ordering::SeqCst));
     assert!(!directory.exists(), "the directory is removed");
     assert_eq!(

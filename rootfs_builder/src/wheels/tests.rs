@@ -1,7 +1,7 @@
 use super::*;
 use crate::key::sha256;
 
-fn wanted(bytes: &[u8]) -> Requirements {
+fn requirements_for(bytes: &[u8]) -> Requirements {
     let text = format!("ros-x==1.0 --hash=sha256:{}\n", sha256(bytes));
     Requirements::parse(&text).expect("valid")
 }
@@ -9,14 +9,17 @@ fn wanted(bytes: &[u8]) -> Requirements {
 #[tokio::test]
 async fn only_what_is_whole_is_taken_from_the_cache() {
     let cache = tempfile::tempdir().expect("a directory");
-    let wanted = wanted(b"good");
-    let missing = at_hand(&cache.path().join("none"), &wanted).await;
+    let wanted = requirements_for(b"good");
+    let missing = cached_wheels(&cache.path().join("none"), &wanted).await;
     assert_eq!(missing.expect("looked"), None);
     let file = cache.path().join("ros_x-1.0-py3-none-any.whl");
     fs::write(&file, "damaged").expect("written");
-    assert_eq!(at_hand(cache.path(), &wanted).await.expect("looked"), None);
+    assert_eq!(
+        cached_wheels(cache.path(), &wanted).await.expect("looked"),
+        None
+    );
     fs::write(&file, "good").expect("written");
-    let found = at_hand(cache.path(), &wanted).await.expect("looked");
+    let found = cached_wheels(cache.path(), &wanted).await.expect("looked");
     assert_eq!(found, Some(vec![file]));
 }
 
@@ -24,11 +27,11 @@ async fn only_what_is_whole_is_taken_from_the_cache() {
 fn pips_errors_are_told_without_its_chatter() {
     let lines =
         "Looking in indexes: x\nCollecting a\nERROR: No matching distribution found for a==9\n";
-    assert_eq!(pips_words(lines), "No matching distribution found for a==9");
-    assert_eq!(pips_words("boom"), "boom");
+    assert_eq!(pip_errors(lines), "No matching distribution found for a==9");
+    assert_eq!(pip_errors("boom"), "boom");
 }
 
-/// Makes a wheel of these files: names and contents, and whether they run.
+/// Creates a wheel of these files: names, contents, and whether they are executable.
 const MAKE: &str = "import json, sys, zipfile
 with zipfile.ZipFile(sys.argv[1], 'w') as archive:
     for name, text, runs in json.loads(sys.argv[2]):
@@ -43,16 +46,16 @@ fn python(arguments: &[&std::ffi::OsStr]) -> std::process::Output {
     python.output().expect("Python runs")
 }
 
-/// A place with wheels, and a prefix.
-struct Lab {
+/// A directory with wheels, and a prefix.
+struct WheelFixture {
     place: tempfile::TempDir,
     wheels: Vec<&'static str>,
 }
 
-/// A file in a wheel: its path, its text, and whether it is a program.
+/// A file in a wheel: path, text, and whether it is a program.
 type Packed<'a> = (&'a str, &'a str, bool);
 
-impl Lab {
+impl WheelFixture {
     fn new(wheels: &[(&'static str, &[Packed<'_>])]) -> Self {
         let place = tempfile::tempdir().expect("a directory");
         for (name, files) in wheels {
@@ -99,7 +102,7 @@ impl Lab {
 #[test]
 fn the_files_of_wheels_go_where_ros_looks_for_them() {
     use std::os::unix::fs::{MetadataExt, PermissionsExt};
-    let lab = Lab::new(&[
+    let lab = WheelFixture::new(&[
         (
             "ros_a-1.0-py3-none-any.whl",
             &[
@@ -150,7 +153,7 @@ fn the_files_of_wheels_go_where_ros_looks_for_them() {
         let about = lab.prefix().join(path).metadata().expect(path);
         assert_eq!(about.permissions().mode() & 0o111 != 0, runs, "{path}");
     }
-    // One library, under three names.
+    // One library with three names.
     let inode = |path: &str| lab.prefix().join(path).metadata().expect("there").ino();
     let (first, second) = (
         format!("{site}/ros_a.libs/libz-0a.so"),
@@ -177,7 +180,7 @@ fn wheels_that_contradict_each_other_or_leave_the_prefix_are_refused() {
         (
             ("x/y.py", "1", false),
             ("x/y.py", "2", false),
-            "not the same",
+            "different versions of",
         ),
         (
             ("x/y.py", "1", false),
@@ -190,11 +193,11 @@ fn wheels_that_contradict_each_other_or_leave_the_prefix_are_refused() {
             "outside of the prefix",
         ),
     ] {
-        let said = Lab::new(&[(one, &[first]), (two, &[second])]).install();
+        let said = WheelFixture::new(&[(one, &[first]), (two, &[second])]).install();
         let error = String::from_utf8_lossy(&said.stderr).into_owned();
         assert!(!said.status.success() && error.contains(words), "{said:?}");
     }
     let same = ("x/y.py", "1", false);
-    let said = Lab::new(&[(one, &[same]), (two, &[same])]).install();
+    let said = WheelFixture::new(&[(one, &[same]), (two, &[same])]).install();
     assert!(said.status.success(), "{said:?}");
 }

@@ -1,107 +1,107 @@
-//! Whether a principal may do something to an object. `docs/access.md` has the table of roles and actions; a test compares it
-//! with what is decided here.
+//! Decides whether a principal may perform an action on an object. `docs/access.md` has the table of roles and
+//! actions; a test compares it with the decisions made here.
 
 use std::fmt;
 
 use crate::principal::{Principal, Role};
 
-/// What is to be done.
+/// An action that needs permission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Action {
-    /// Ask what every principal is told, each in its scope: lists, the clock, who one is.
+pub enum AccessAction {
+    /// Query what every principal may read, each within its scope: lists, the clock, its own identity.
     Enter,
-    /// See the whole machine: its state, its journal, its figures.
+    /// View the whole machine: its state, journal and metrics.
     Look,
-    /// See a service: interface, revisions, servants, figures, images, its stub.
+    /// View a service: interface, revisions, servants, metrics, images and stub.
     See,
-    /// Try a service with a recording, or measure it.
+    /// Run a service on a recording, or measure it.
     Try,
-    /// Read what a service's nodes print.
+    /// Read the output of a service's nodes.
     Logs,
-    /// Publish, roll back, remove a service; write its dictionary.
+    /// Publish, roll back or remove a service; write its dictionary.
     Deploy,
-    /// Stop a service's servants, and change their limits.
+    /// Stop a service's servants and change their limits.
     Operate,
-    /// Be a robot at a service.
+    /// Connect to a service as a robot.
     Connect,
-    /// Pair robots, and end that.
+    /// Pair and unpair robots.
     Pair,
-    /// Tokens and policy.
+    /// Manage tokens and policy.
     Administer,
 }
 
-impl Action {
-    /// All of them.
-    pub const ALL: [Action; 10] = [
-        Action::Enter,
-        Action::Look,
-        Action::See,
-        Action::Try,
-        Action::Logs,
-        Action::Deploy,
-        Action::Operate,
-        Action::Connect,
-        Action::Pair,
-        Action::Administer,
+impl AccessAction {
+    /// All actions.
+    pub const ALL: [AccessAction; 10] = [
+        AccessAction::Enter,
+        AccessAction::Look,
+        AccessAction::See,
+        AccessAction::Try,
+        AccessAction::Logs,
+        AccessAction::Deploy,
+        AccessAction::Operate,
+        AccessAction::Connect,
+        AccessAction::Pair,
+        AccessAction::Administer,
     ];
 
-    /// As the documents name it.
+    /// Returns the name used in the documentation.
     pub fn name(self) -> &'static str {
         match self {
-            Action::Enter => "enter",
-            Action::Look => "look",
-            Action::See => "see",
-            Action::Try => "try",
-            Action::Logs => "logs",
-            Action::Deploy => "deploy",
-            Action::Operate => "operate",
-            Action::Connect => "connect",
-            Action::Pair => "pair",
-            Action::Administer => "administer",
+            AccessAction::Enter => "enter",
+            AccessAction::Look => "look",
+            AccessAction::See => "see",
+            AccessAction::Try => "try",
+            AccessAction::Logs => "logs",
+            AccessAction::Deploy => "deploy",
+            AccessAction::Operate => "operate",
+            AccessAction::Connect => "connect",
+            AccessAction::Pair => "pair",
+            AccessAction::Administer => "administer",
         }
     }
 
-    /// In a sentence: may not … the object.
+    /// Returns the verb for a sentence of the form "may not … the object".
     fn verb(self) -> &'static str {
         match self {
-            Action::Enter => "ask",
-            Action::Look | Action::See => "see",
-            Action::Try => "try",
-            Action::Logs => "read the logs of",
-            Action::Deploy => "deploy",
-            Action::Operate => "operate",
-            Action::Connect => "connect to",
-            Action::Pair => "pair robots with",
-            Action::Administer => "administer",
+            AccessAction::Enter => "ask",
+            AccessAction::Look | AccessAction::See => "see",
+            AccessAction::Try => "try",
+            AccessAction::Logs => "read the logs of",
+            AccessAction::Deploy => "deploy",
+            AccessAction::Operate => "operate",
+            AccessAction::Connect => "connect to",
+            AccessAction::Pair => "pair robots with",
+            AccessAction::Administer => "administer",
         }
     }
 }
 
-/// What an action is done to.
+/// The object of an action.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Object<'a> {
-    /// The service; none: the machine, or all services.
+pub struct AccessObject<'a> {
+    /// The service; `None` for the machine or all services.
     pub service: Option<&'a str>,
-    /// Whether the service is published.
+    /// True if the service is published.
     pub exists: bool,
-    /// Who published it first, where that was a deployer.
+    /// The deployer that first published the service, if it was a deployer.
     pub owner: Option<&'a str>,
-    /// As which robot, where one is named.
+    /// The robot to act as, if one is named.
     pub robot: Option<&'a str>,
 }
 
-impl<'a> Object<'a> {
+impl<'a> AccessObject<'a> {
     /// The machine, or all services.
-    pub const MACHINE: Object<'static> = Object {
+    pub const MACHINE: AccessObject<'static> = AccessObject {
         service: None,
         exists: true,
         owner: None,
         robot: None,
     };
 
-    /// A service that is published.
-    pub fn service(name: &'a str, owner: Option<&'a str>) -> Object<'a> {
-        Object {
+    /// Creates the object for a published service.
+    pub fn service(name: &'a str, owner: Option<&'a str>) -> AccessObject<'a> {
+        AccessObject {
             service: Some(name),
             exists: true,
             owner,
@@ -110,22 +110,26 @@ impl<'a> Object<'a> {
     }
 }
 
-/// Why something may not be done.
+/// Refusal of an action.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{who} may not {} {object}", action.verb())]
-pub struct Refusal {
-    /// The principal, with its roles.
+pub struct AccessDenied {
+    /// The principal with its roles.
     pub who: String,
-    /// The action that was refused.
-    pub action: Action,
-    /// The object, in words.
+    /// The refused action.
+    pub action: AccessAction,
+    /// Description of the object.
     pub object: String,
 }
 
-impl Refusal {
-    /// Of this principal.
-    pub fn new(principal: &Principal, action: Action, object: impl fmt::Display) -> Refusal {
-        Refusal {
+impl AccessDenied {
+    /// Creates the refusal of an action to a principal.
+    pub fn new(
+        principal: &Principal,
+        action: AccessAction,
+        object: impl fmt::Display,
+    ) -> AccessDenied {
+        AccessDenied {
             who: principal.to_string(),
             action,
             object: object.to_string(),
@@ -133,21 +137,26 @@ impl Refusal {
     }
 }
 
-/// Whether `principal` may do `action` to `object`.
-pub fn decide(principal: &Principal, action: Action, object: &Object<'_>) -> Result<(), Refusal> {
+/// Checks whether `principal` may perform `action` on `object`.
+pub fn decide(
+    principal: &Principal,
+    action: AccessAction,
+    object: &AccessObject<'_>,
+) -> Result<(), AccessDenied> {
     let allowed = principal
         .roles
         .iter()
-        .any(|role| allows(*role, principal, action, object));
-    match allowed {
-        true => Ok(()),
-        false => Err(Refusal::new(principal, action, describe(object))),
+        .any(|role| role_allows(*role, principal, action, object));
+    if allowed {
+        Ok(())
+    } else {
+        Err(AccessDenied::new(principal, action, describe(object)))
     }
 }
 
-fn describe(object: &Object<'_>) -> String {
+fn describe(object: &AccessObject<'_>) -> String {
     match (object.service, object.robot) {
-        // Of none in particular: not even of one that were its own.
+        // Any service, even one that the principal owns.
         (Some(""), _) => "any service".to_owned(),
         (Some(service), Some(robot)) => format!("service {service} as robot {robot}"),
         (Some(service), None) => format!("service {service}"),
@@ -156,33 +165,44 @@ fn describe(object: &Object<'_>) -> String {
 }
 
 /// One row of the table above.
-fn allows(role: Role, principal: &Principal, action: Action, object: &Object<'_>) -> bool {
+fn role_allows(
+    role: Role,
+    principal: &Principal,
+    action: AccessAction,
+    object: &AccessObject<'_>,
+) -> bool {
     let owned = object.owner == Some(principal.name.as_str());
     let scoped = object
         .service
-        .is_some_and(|service| principal.scope.has(service));
+        .is_some_and(|service| principal.scope.includes(service));
     match (role, action) {
         (Role::Admin, _) => true,
-        (Role::Operator, action) => action != Action::Administer,
-        (_, Action::Pair | Action::Administer) => false,
-        (_, Action::Enter) => true,
-        (Role::Viewer, Action::Look) => principal.scope.has_all(),
-        (_, Action::Look) => false,
-        (Role::Deployer, Action::See) => owned || scoped,
-        (Role::Deployer, Action::Deploy) => owned || (!object.exists && scoped),
-        (Role::Deployer, Action::Try | Action::Logs | Action::Operate | Action::Connect) => owned,
-        (Role::Robot | Role::Viewer, Action::See) => scoped,
-        (Role::Robot, Action::Connect) => {
+        (Role::Operator, action) => action != AccessAction::Administer,
+        (_, AccessAction::Pair | AccessAction::Administer) => false,
+        (_, AccessAction::Enter) => true,
+        (Role::Viewer, AccessAction::Look) => principal.scope.includes_all(),
+        (_, AccessAction::Look) => false,
+        (Role::Deployer, AccessAction::See) => owned || scoped,
+        (Role::Deployer, AccessAction::Deploy) => owned || (!object.exists && scoped),
+        (
+            Role::Deployer,
+            AccessAction::Try | AccessAction::Logs | AccessAction::Operate | AccessAction::Connect,
+        ) => owned,
+        (Role::Robot | Role::Viewer, AccessAction::See) => scoped,
+        (Role::Robot, AccessAction::Connect) => {
             let own = principal.scope.robot.as_deref();
             scoped && own.is_none_or(|own| object.robot == Some(own))
         }
-        (Role::Robot, Action::Try | Action::Logs | Action::Deploy | Action::Operate) => false,
+        (
+            Role::Robot,
+            AccessAction::Try | AccessAction::Logs | AccessAction::Deploy | AccessAction::Operate,
+        ) => false,
         (Role::Viewer, _) => false,
     }
 }
 
-/// Whether a principal may name a class of the configuration.
-pub fn may_use_class(principal: &Principal, class: &str) -> bool {
+/// Returns true if the principal may use a class of the configuration.
+pub fn can_use_class(principal: &Principal, class: &str) -> bool {
     principal.is_unscoped()
         || principal
             .scope
@@ -210,25 +230,25 @@ mod tests {
         }
     }
 
-    /// Objects by the words of the table.
-    fn objects() -> [(&'static str, Object<'static>); 7] {
-        let service = |name, owner| Object::service(name, owner);
+    /// Objects, by their names in the table.
+    fn objects() -> [(&'static str, AccessObject<'static>); 7] {
+        let service = |name, owner| AccessObject::service(name, owner);
         [
-            ("machine", Object::MACHINE),
+            ("machine", AccessObject::MACHINE),
             ("own", service("out_a", Some("me"))),
             ("scope", service("in_a", Some("other"))),
             ("other", service("out_a", Some("other"))),
             ("nobody's", service("out_a", None)),
             (
                 "new in scope",
-                Object {
+                AccessObject {
                     exists: false,
                     ..service("in_new", None)
                 },
             ),
             (
                 "new elsewhere",
-                Object {
+                AccessObject {
                     exists: false,
                     ..service("out_new", None)
                 },
@@ -238,9 +258,9 @@ mod tests {
 
     #[test]
     fn each_role_may_what_its_column_says() {
-        use Action as A;
-        // What is allowed to whom, beside admin and operator, and to which object.
-        let table: &[(Role, Action, &[&str])] = &[
+        use AccessAction as A;
+        // What roles other than admin and operator may do, and on which objects.
+        let table: &[(Role, AccessAction, &[&str])] = &[
             (Role::Deployer, A::See, &["own", "scope", "new in scope"]),
             (Role::Deployer, A::Try, &["own"]),
             (Role::Deployer, A::Logs, &["own"]),
@@ -251,7 +271,7 @@ mod tests {
             (Role::Viewer, A::See, &["scope", "new in scope"]),
         ];
         for role in Role::ALL {
-            for action in Action::ALL {
+            for action in AccessAction::ALL {
                 for (word, object) in objects() {
                     let listed = table
                         .iter()
@@ -269,12 +289,12 @@ mod tests {
         }
     }
 
-    /// The table, as it is decided: a line for each action, a cell for each role.
+    /// Renders the table from the decisions: a line for each action, a cell for each role.
     fn table() -> String {
         let mut lines = String::new();
-        for action in Action::ALL {
+        for action in AccessAction::ALL {
             let cells = Role::ALL.map(|role| {
-                let at = |object| Object {
+                let at = |object| AccessObject {
                     robot: Some("r1"),
                     ..object
                 };
@@ -308,63 +328,71 @@ mod tests {
     #[test]
     fn a_robot_is_itself_alone() {
         let robot = principal(Role::Robot);
-        let at = |service, robot| Object {
+        let at = |service, robot| AccessObject {
             robot,
-            ..Object::service(service, None)
+            ..AccessObject::service(service, None)
         };
-        decide(&robot, Action::Connect, &at("in_a", Some("r1"))).expect("its own");
+        decide(&robot, AccessAction::Connect, &at("in_a", Some("r1"))).expect("its own");
         for (service, name) in [("in_a", Some("r2")), ("in_a", None), ("out_a", Some("r1"))] {
-            decide(&robot, Action::Connect, &at(service, name)).expect_err(service);
+            decide(&robot, AccessAction::Connect, &at(service, name)).expect_err(service);
         }
         let any = Principal::local();
         for name in [Some("r1"), None] {
-            decide(&any, Action::Connect, &at("in_a", name)).expect("any robot");
+            decide(&any, AccessAction::Connect, &at("in_a", name)).expect("any robot");
         }
     }
 
     #[test]
     fn a_viewer_of_everything_sees_the_machine_and_changes_nothing() {
         let local = Principal::local();
-        decide(&local, Action::Look, &Object::MACHINE).expect("sees all");
+        decide(&local, AccessAction::Look, &AccessObject::MACHINE).expect("sees all");
         for action in [A::Try, A::Logs, A::Deploy, A::Operate, A::Administer] {
             for (word, object) in objects() {
                 decide(&local, action, &object).expect_err(word);
             }
         }
-        use Action as A;
+        use AccessAction as A;
     }
 
     #[test]
     fn classes_are_for_those_who_are_given_them() {
         for role in [Role::Deployer, Role::Robot, Role::Viewer] {
-            assert!(may_use_class(&principal(role), "fast"));
-            assert!(!may_use_class(&principal(role), "gold"));
+            assert!(can_use_class(&principal(role), "fast"));
+            assert!(!can_use_class(&principal(role), "gold"));
         }
         for role in [Role::Admin, Role::Operator] {
-            assert!(may_use_class(&principal(role), "gold"));
+            assert!(can_use_class(&principal(role), "gold"));
         }
-        assert!(may_use_class(&Principal::local(), "gold"));
-        assert!(!may_use_class(&Principal::nobody(), "gold"));
+        assert!(can_use_class(&Principal::local(), "gold"));
+        assert!(!can_use_class(&Principal::nobody(), "gold"));
     }
 
     #[test]
     fn a_refusal_says_who_what_and_to_what() {
-        let refused = decide(&principal(Role::Viewer), Action::Deploy, &objects()[2].1);
+        let refused = decide(
+            &principal(Role::Viewer),
+            AccessAction::Deploy,
+            &objects()[2].1,
+        );
         assert_eq!(
             refused.expect_err("read only").to_string(),
             "me (viewer) may not deploy service in_a"
         );
-        let any = Object::service("", Some("me"));
-        let refused = decide(&principal(Role::Viewer), Action::Operate, &any);
+        let any = AccessObject::service("", Some("me"));
+        let refused = decide(&principal(Role::Viewer), AccessAction::Operate, &any);
         assert_eq!(
             refused.expect_err("read only").to_string(),
             "me (viewer) may not operate any service"
         );
-        let refused = decide(&Principal::nobody(), Action::Enter, &Object::MACHINE);
+        let refused = decide(
+            &Principal::nobody(),
+            AccessAction::Enter,
+            &AccessObject::MACHINE,
+        );
         let refused = refused.expect_err("nobody").to_string();
         assert_eq!(
             refused,
-            "who shows no token may not ask this server as a whole"
+            "a client without a token may not ask this server as a whole"
         );
     }
 
@@ -390,31 +418,32 @@ mod tests {
     }
 
     proptest! {
-        /// What no role allows is refused, a further role takes nothing away, and administration is the admin's alone.
+        /// No role, no permission; an additional role never takes a permission away; only admins administer.
         #[test]
         fn rights_only_come_from_roles(
             principal in some_principal(),
-            action in prop::sample::select(Action::ALL.to_vec()),
+            action in prop::sample::select(AccessAction::ALL.to_vec()),
             service in prop::option::of(prop::sample::select(vec!["ab", "a", "b", "c"])),
             exists: bool,
             owner in prop::option::of(prop::sample::select(vec!["me", "you"])),
             robot in prop::option::of(prop::sample::select(vec!["r1", "r2"])),
             further in prop::sample::select(Role::ALL.to_vec()),
         ) {
-            let object = Object { service, exists, owner, robot };
+            let object = AccessObject { service, exists, owner, robot };
             let allowed = decide(&principal, action, &object).is_ok();
             if principal.roles.is_empty() {
                 prop_assert!(!allowed);
             }
-            if action == Action::Administer {
-                prop_assert_eq!(allowed, principal.is(Role::Admin));
+            if action == AccessAction::Administer {
+                prop_assert_eq!(allowed, principal.has_role(Role::Admin));
             }
-            if action == Action::Pair {
+            if action == AccessAction::Pair {
                 prop_assert_eq!(allowed, principal.is_unscoped());
             }
-            let changes = matches!(action, Action::Deploy | Action::Operate | Action::Logs | Action::Try);
+            let changes = matches!(action,
+                AccessAction::Deploy | AccessAction::Operate | AccessAction::Logs | AccessAction::Try);
             if changes && allowed && !principal.is_unscoped() {
-                prop_assert!(principal.is(Role::Deployer));
+                prop_assert!(principal.has_role(Role::Deployer));
                 prop_assert!(owner == Some("me") || !exists);
             }
             let mut more = principal.clone();

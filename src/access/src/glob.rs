@@ -5,26 +5,27 @@ use std::str::FromStr;
 
 use crate::{Error, as_text};
 
-/// Longest pattern, in bytes.
+/// Maximum length of a pattern in bytes.
 const LONGEST: usize = 255;
 
-/// A pattern: `*` stands for any characters but `/`, `**` for any at all, everything else for itself. `/camera/**` holds what is
-/// below `/camera`, not `/camera` itself.
+/// A glob pattern: `*` matches any characters except `/`, `**` matches any characters, everything else matches
+/// itself. `/camera/**` matches everything below `/camera`, but not `/camera` itself.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Glob(String);
 
 as_text!(Glob);
 
 impl Glob {
-    /// All absolute names.
+    /// Creates the pattern of all absolute names.
     pub(crate) fn everything() -> Glob {
         Glob("/**".to_owned())
     }
 
-    /// Whether a name is one of the pattern. Time is at most the product of both lengths, whatever the pattern.
+    /// Returns true if the name matches. Takes at most time proportional to the product of both lengths, whatever the
+    /// pattern.
     pub fn matches(&self, name: &str) -> bool {
         let name = name.as_bytes();
-        // `reached[i]`: the pattern so far stands for the first i bytes.
+        // `reached[i]`: the pattern so far matches the first i bytes.
         let mut reached = vec![false; name.len() + 1];
         reached[0] = true;
         let mut pattern = self.0.as_bytes();
@@ -46,12 +47,12 @@ impl Glob {
         reached[name.len()]
     }
 
-    /// Whether it holds every name that has no `/`, as names of services have none.
+    /// Returns true if every name without `/` matches, as service names are.
     pub fn is_everything(&self) -> bool {
         self.0.bytes().all(|byte| byte == b'*')
     }
 
-    /// As it was written.
+    /// Returns the pattern as written.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -62,9 +63,10 @@ impl FromStr for Glob {
 
     fn from_str(text: &str) -> Result<Glob, Error> {
         let plain = |c: char| !c.is_whitespace() && !c.is_control();
-        match (1..=LONGEST).contains(&text.len()) && text.chars().all(plain) {
-            true => Ok(Glob(text.to_owned())),
-            false => Err(Error::Glob(text.to_owned())),
+        if (1..=LONGEST).contains(&text.len()) && text.chars().all(plain) {
+            Ok(Glob(text.to_owned()))
+        } else {
+            Err(Error::Glob(text.to_owned()))
         }
     }
 }
@@ -119,11 +121,11 @@ mod tests {
     fn what_is_no_pattern_is_refused_by_name() {
         for text in ["", "a b", "a\n", &"x".repeat(256)] {
             let refused = text.parse::<Glob>().expect_err(text).to_string();
-            assert!(refused.contains("is no pattern"), "{refused}");
+            assert!(refused.contains("is not a pattern"), "{refused}");
         }
     }
 
-    /// By definition, without regard to time.
+    /// The definition, implemented without regard to speed.
     fn reference(pattern: &[u8], name: &[u8]) -> bool {
         match pattern {
             [] => name.is_empty(),

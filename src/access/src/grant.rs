@@ -1,25 +1,25 @@
-//! Grants: `subscribe:/camera/**`, `call:/detect`.
+//! Grants, such as `subscribe:/camera/**` or `call:/detect`.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::{Error, Glob, as_text};
 
-/// What a client does to a topic, a service or an action.
+/// An operation of a client on a topic, service or action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Operation {
-    /// Sends messages on a topic, or advertises it.
+    /// Publish or advertise a topic.
     Publish,
-    /// Receives a topic's messages.
+    /// Subscribe to a topic.
     Subscribe,
-    /// Calls a service, or sends goals to an action.
+    /// Call a service, or send goals to an action.
     Call,
-    /// Serves a service or an action.
+    /// Serve a service or an action.
     Advertise,
 }
 
 impl Operation {
-    /// All of them.
+    /// All operations.
     pub const ALL: [Operation; 4] = [
         Operation::Publish,
         Operation::Subscribe,
@@ -27,7 +27,7 @@ impl Operation {
         Operation::Advertise,
     ];
 
-    /// As grants name it.
+    /// Returns the name used in grants.
     pub fn name(self) -> &'static str {
         match self {
             Operation::Publish => "publish",
@@ -38,10 +38,10 @@ impl Operation {
     }
 }
 
-/// The right to one operation, or all, on names of a pattern.
+/// Permission for one operation, or all, on the names matching a pattern.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Grant {
-    /// None: all.
+    /// The operation; `None` for all.
     operation: Option<Operation>,
     names: Glob,
 }
@@ -49,12 +49,12 @@ pub struct Grant {
 as_text!(Grant);
 
 impl Grant {
-    /// Whether it holds an operation on an absolute name.
+    /// Returns true if the grant covers the operation on an absolute name.
     pub fn permits(&self, operation: Operation, name: &str) -> bool {
         self.operation.is_none_or(|granted| granted == operation) && self.names.matches(name)
     }
 
-    /// One operation on all names.
+    /// Creates a grant of one operation on all names.
     pub(crate) fn all(operation: Operation) -> Grant {
         Grant {
             operation: Some(operation),
@@ -62,8 +62,8 @@ impl Grant {
         }
     }
 
-    /// What is left of it where one operation alone may be granted.
-    pub(crate) fn only(&self, operation: Operation) -> Option<Grant> {
+    /// Returns the part of the grant that covers `operation`, if any.
+    pub(crate) fn restrict_to(&self, operation: Operation) -> Option<Grant> {
         let has = self.operation.is_none_or(|granted| granted == operation);
         has.then(|| Grant {
             operation: Some(operation),
@@ -71,7 +71,7 @@ impl Grant {
         })
     }
 
-    /// Whether nothing is left out.
+    /// Returns true if the grant covers all operations on all names.
     pub fn is_everything(&self) -> bool {
         let names = self.names.as_str();
         self.operation.is_none() && (names == "**" || names == "/**")
@@ -93,7 +93,7 @@ impl FromStr for Grant {
                 Some(known.ok_or_else(bad)?)
             }
         };
-        // Names are absolute when they are compared; another pattern would never hold one.
+        // Compared names are absolute, so another pattern would never match.
         if !names.starts_with('/') && !names.starts_with("**") {
             return Err(bad());
         }

@@ -1,11 +1,13 @@
-//! Guesses at tokens and passwords: counted by address, or by account, and slowed. Pure: the time is given.
+//! Rate limiting of guessed tokens and passwords, by address or by account. Pure: the time is passed in.
 //!
-//! An address may send some tokens that are not known; after each further one it waits, twice as long each time up to a bound,
-//! and what it sends meanwhile is not looked at. A good token makes nobody a better guesser: only time forgets.
+//! An address may send a number of unknown tokens for free; each further one makes it wait, twice as long each time
+//! up to a limit, and what it sends meanwhile is not looked at. A valid token does not reset this: failures only
+//! expire.
 //!
-//! An address of IPv6 is one of as many as its owner likes: its networks are counted beside it, of a host (/64), of a site (/48) and of a
-//! provider (/32), each of which may guess sixteen times as often as the one within. So nobody fills the table with addresses of one network.
-//! Whoever has a great many networks gets the table full, and that holds up nobody: then who has not guessed for the longest time is forgotten.
+//! The owner of an IPv6 address can use many others, so its networks are counted as well: the host (/64), the site
+//! (/48) and the provider (/32), each of which may fail sixteen times as often as the one within it. So nobody can
+//! fill the table with addresses of one network. Somebody with very many networks can, but locks nobody out: the
+//! entry whose last failure is oldest is replaced.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -13,35 +15,35 @@ use std::hash::Hash;
 use crate::Host;
 use crate::host::{OF_PROVIDER, OF_SITE};
 
-/// Milliseconds since any beginning.
+/// Milliseconds since an arbitrary epoch.
 type Millis = u64;
 
-/// Tokens that are not known before an address waits.
+/// Number of failures before an address has to wait.
 pub const FREE: u32 = 10;
-/// How many times as many a network may send as one of those within.
+/// Factor by which a network's allowance exceeds that of a network within it.
 const WIDER: u32 = 16;
-/// The first wait, and the longest.
+/// Shortest and longest wait.
 const SHORTEST: Millis = 1_000;
 const LONGEST: Millis = 60_000;
-/// What an address has guessed is forgotten so long after its last guess.
+/// Time after the last failure when an entry expires.
 const FORGOTTEN: Millis = 600_000;
-/// Addresses and networks, or accounts, that are remembered.
+/// Maximum number of entries: addresses and networks, or accounts.
 pub const REMEMBERED: usize = 8_192;
 
-/// What came from one address or network.
+/// Failures of one address, network or account.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-struct Guessed {
+struct FailureRecord {
     times: u32,
     last: Millis,
 }
 
-impl Guessed {
+impl FailureRecord {
     fn is_forgotten(&self, now: Millis) -> bool {
         now.saturating_sub(self.last) >= FORGOTTEN
     }
 
-    /// How long it still waits that may send `free` of them before.
-    fn wait(&self, free: u32, now: Millis) -> Option<Millis> {
+    /// Returns the remaining wait, given that `free` failures are allowed.
+    fn remaining_wait(&self, free: u32, now: Millis) -> Option<Millis> {
         let beyond = self.times.checked_sub(free)?;
         let whole = SHORTEST
             .checked_shl(beyond.min(32))
@@ -60,41 +62,41 @@ impl Guessed {
     }
 }
 
-/// By what guesses are counted.
-pub trait Guesser: Eq + Hash + Clone {
-    /// Itself, and those of which it is a part, each with how many guesses it may make before it waits.
+/// Source of guesses, by which they are counted.
+pub trait GuessSource: Eq + Hash + Clone {
+    /// Returns this source and those that contain it, each with the number of failures allowed before it waits.
     fn allowances(&self) -> Vec<(Self, u32)>;
 }
 
-/// By an account's name.
-impl Guesser for String {
+/// By account name.
+impl GuessSource for String {
     fn allowances(&self) -> Vec<(String, u32)> {
         vec![(self.clone(), FREE)]
     }
 }
 
-impl Guesser for Host {
+impl GuessSource for Host {
     fn allowances(&self) -> Vec<(Host, u32)> {
         let mut allowances = vec![(*self, FREE)];
-        if self.is_wide() {
-            allowances.push((self.within(OF_SITE), FREE * WIDER));
-            allowances.push((self.within(OF_PROVIDER), FREE * WIDER * WIDER));
+        if self.is_ipv6() {
+            allowances.push((self.network_with_prefix(OF_SITE), FREE * WIDER));
+            allowances.push((self.network_with_prefix(OF_PROVIDER), FREE * WIDER * WIDER));
         }
         allowances
     }
 }
 
-/// What came from all addresses, or at all accounts.
+/// Rate limiter for guesses, over all addresses or all accounts.
 #[derive(Debug)]
-pub struct Guesses<Of: Guesser = Host> {
-    remembered: HashMap<Of, Guessed>,
+pub struct GuessLimiter<S: GuessSource = Host> {
+    remembered: HashMap<S, FailureRecord>,
     unknown: u64,
     slowed: u64,
 }
 
-impl<Of: Guesser> Default for Guesses<Of> {
+impl<S: GuessSource> Default for GuessLimiter<S> {
     fn default() -> Self {
-        Guesses {
+        GuessLimiter {
             remembered: HashMap::new(),
             unknown: 0,
             slowed: 0,
@@ -102,14 +104,15 @@ impl<Of: Guesser> Default for Guesses<Of> {
     }
 }
 
-impl<Of: Guesser> Guesses<Of> {
-    /// Whether a token from `address` may be looked at; else for how many milliseconds not, and it is counted as slowed.
-    pub fn ask(&mut self, address: impl Into<Of>, now: Millis) -> Result<(), Millis> {
+impl<S: GuessSource> GuessLimiter<S> {
+    /// Checks whether a token from `address` may be looked at; otherwise returns the milliseconds to wait and counts
+    /// the token as slowed.
+    pub fn check(&mut self, address: impl Into<S>, now: Millis) -> Result<(), Millis> {
         let waits = address
             .into()
             .allowances()
             .into_iter()
-            .filter_map(|(of, free)| self.remembered.get(&of)?.wait(free, now));
+            .filter_map(|(of, free)| self.remembered.get(&of)?.remaining_wait(free, now));
         match waits.max() {
             None => Ok(()),
             Some(left) => {
@@ -119,21 +122,21 @@ impl<Of: Guesser> Guesses<Of> {
         }
     }
 
-    /// Counts a token from `address` that was looked at and is not known; how long the address waits now.
-    pub fn failed(&mut self, address: impl Into<Of>, now: Millis) -> Option<Millis> {
+    /// Records an unknown token from `address` and returns how long that address has to wait now.
+    pub fn record_failure(&mut self, address: impl Into<S>, now: Millis) -> Option<Millis> {
         self.unknown += 1;
         let counted = address.into().allowances().into_iter();
         let waits = counted.map(|(of, free)| {
             self.make_room(&of);
             let guessed = self.remembered.entry(of).or_default();
             guessed.add(now);
-            guessed.wait(free, now)
+            guessed.remaining_wait(free, now)
         });
         waits.max().flatten()
     }
 
-    /// Forgets who has not guessed for the longest time, where there is no room for another.
-    fn make_room(&mut self, newcomer: &Of) {
+    /// Removes the entry whose last failure is oldest if the table is full.
+    fn make_room(&mut self, newcomer: &S) {
         if self.remembered.len() < REMEMBERED || self.remembered.contains_key(newcomer) {
             return;
         }
@@ -146,7 +149,7 @@ impl<Of: Guesser> Guesses<Of> {
         }
     }
 
-    /// Tokens that were not known, and those that were not looked at.
+    /// Returns the number of unknown tokens and of tokens not looked at.
     pub fn counts(&self) -> (u64, u64) {
         (self.unknown, self.slowed)
     }
@@ -164,29 +167,29 @@ mod tests {
         text.parse().expect("an address")
     }
 
-    /// As many as are free.
-    fn guess_freely(guesses: &mut Guesses, from: &str, now: Millis) {
+    /// Fails as often as allowed, less once.
+    fn guess_freely(guesses: &mut GuessLimiter, from: &str, now: Millis) {
         for _ in 1..FREE {
-            assert_eq!(guesses.failed(address(from), now), None);
+            assert_eq!(guesses.record_failure(address(from), now), None);
         }
     }
 
     #[test]
     fn waits_grow_up_to_a_bound_and_are_forgotten() {
-        let mut guesses = Guesses::<Host>::default();
+        let mut guesses = GuessLimiter::<Host>::default();
         let from = address("10.0.0.7");
         guess_freely(&mut guesses, "10.0.0.7", 0);
         let mut now = 0;
         for wait in [
             1_000, 2_000, 4_000, 8_000, 16_000, 32_000, 60_000, 60_000, 60_000,
         ] {
-            assert_eq!(guesses.ask(from, now), Ok(()), "{now}");
-            assert_eq!(guesses.failed(from, now), Some(wait));
-            assert_eq!(guesses.ask(from, now + wait - 1), Err(1));
+            assert_eq!(guesses.check(from, now), Ok(()), "{now}");
+            assert_eq!(guesses.record_failure(from, now), Some(wait));
+            assert_eq!(guesses.check(from, now + wait - 1), Err(1));
             now += wait;
         }
-        assert_eq!(guesses.ask(from, now), Ok(()));
-        assert_eq!(guesses.failed(from, now - 60_000 + FORGOTTEN), None);
+        assert_eq!(guesses.check(from, now), Ok(()));
+        assert_eq!(guesses.record_failure(from, now - 60_000 + FORGOTTEN), None);
         assert_eq!(guesses.counts(), (u64::from(FREE) + 9, 9));
     }
 
@@ -198,10 +201,10 @@ mod tests {
             ("2001:db8::1", "2001:db8::ffff:1", true),
             ("2001:db8::1", "2001:db8:0:1::1", false),
         ] {
-            let mut guesses = Guesses::<Host>::default();
+            let mut guesses = GuessLimiter::<Host>::default();
             guess_freely(&mut guesses, one, 0);
-            guesses.failed(address(one), 0);
-            let waits = guesses.ask(address(other), 0).is_err();
+            guesses.record_failure(address(one), 0);
+            let waits = guesses.check(address(other), 0).is_err();
             assert_eq!(waits, same, "{one} {other}");
         }
     }
@@ -209,16 +212,16 @@ mod tests {
     #[test]
     fn who_has_a_network_of_ipv6_is_slowed_and_nobody_else() {
         for (bits, hosts) in [(12, 4_096_u128), (32, 1 << 14)] {
-            let mut guesses = Guesses::<Host>::default();
+            let mut guesses = GuessLimiter::<Host>::default();
             let base = u128::from("2001:db8::".parse::<Ipv6Addr>().expect("an address"));
             let mut looked_at = 0;
             for number in 0..hosts {
-                // As far apart as the network has room for: /52, and all of the provider's /32.
+                // Spread over the whole network: /52, or the provider's entire /32.
                 let from = base + ((number << 64) << (bits - hosts.ilog2()));
                 let from = IpAddr::V6(Ipv6Addr::from(from));
-                if guesses.ask(from, 1).is_ok() {
+                if guesses.check(from, 1).is_ok() {
                     looked_at += 1;
-                    guesses.failed(from, 1);
+                    guesses.record_failure(from, 1);
                 }
             }
             let most = if bits == 12 {
@@ -229,51 +232,50 @@ mod tests {
             assert_eq!(looked_at, most, "{bits}");
             assert!(guesses.remembered.len() < REMEMBERED);
             for other in ["2001:db9::1", "192.0.2.1"] {
-                assert_eq!(guesses.ask(address(other), 2), Ok(()), "{other}");
-                assert_eq!(guesses.failed(address(other), 2), None, "{other}");
+                assert_eq!(guesses.check(address(other), 2), Ok(()), "{other}");
+                assert_eq!(guesses.record_failure(address(other), 2), None, "{other}");
             }
         }
     }
 
     #[test]
     fn a_great_many_addresses_hold_up_nobody_and_the_longest_quiet_are_forgotten() {
-        let mut guesses = Guesses::<Host>::default();
+        let mut guesses = GuessLimiter::<Host>::default();
         let many = |number: u32| IpAddr::V4((0x0b00_0000 + number).into());
         for number in 0..REMEMBERED as u32 {
-            guesses.failed(many(number), 1);
+            guesses.record_failure(many(number), 1);
         }
         guess_freely(&mut guesses, "10.0.0.7", 2);
-        guesses.failed(address("10.0.0.7"), 2);
+        guesses.record_failure(address("10.0.0.7"), 2);
         for number in 0..REMEMBERED as u32 - 1 {
-            guesses.failed(many(1 << 20 | number), 3);
+            guesses.record_failure(many(1 << 20 | number), 3);
         }
         assert_eq!(guesses.remembered.len(), REMEMBERED);
         assert!(
-            guesses.ask(address("10.0.0.7"), 3).is_err(),
+            guesses.check(address("10.0.0.7"), 3).is_err(),
             "it has a place"
         );
-        // Who was never there is looked at as ever, and slowed as soon as any.
-        assert_eq!(guesses.ask(address("192.0.2.1"), 3), Ok(()));
+        // A new address is looked at immediately and slowed as soon as any other.
+        assert_eq!(guesses.check(address("192.0.2.1"), 3), Ok(()));
         guess_freely(&mut guesses, "192.0.2.1", 3);
-        assert!(guesses.failed(address("192.0.2.1"), 3).is_some());
+        assert!(guesses.record_failure(address("192.0.2.1"), 3).is_some());
         assert_eq!(guesses.remembered.len(), REMEMBERED);
     }
 
     proptest! {
-        /// However guesses come, of one address at most so many are looked at as waits leave room for, and nothing is kept beyond
-        /// the bound.
+        /// Whatever the timing, an address gets no more guesses than its waits allow, and the table stays bounded.
         #[test]
         fn no_address_has_more_looked_at_than_its_waits_leave(steps in prop::collection::vec(0u64..5_000, 1..300)) {
-            let mut guesses = Guesses::<Host>::default();
+            let mut guesses = GuessLimiter::<Host>::default();
             let (mut now, mut looked_at) = (0, 0);
             for step in &steps {
                 now += step;
-                if guesses.ask(address("10.0.0.7"), now).is_ok() {
-                    guesses.failed(address("10.0.0.7"), now);
+                if guesses.check(address("10.0.0.7"), now).is_ok() {
+                    guesses.record_failure(address("10.0.0.7"), now);
                     looked_at += 1;
                 }
             }
-            // 1 + 2 + … + 32 s, then 60 s each; the span here is too short for them to be forgotten.
+            // 1 + 2 + … + 32 s, then 60 s each; the span is too short for failures to expire.
             let slow = now / LONGEST + 7;
             prop_assert!(looked_at <= u64::from(FREE) + slow || now >= FORGOTTEN, "{} in {} ms", looked_at, now);
             let (unknown, slowed) = guesses.counts();

@@ -1,18 +1,18 @@
-//! Who is at an address: what is counted by it counts for whoever can choose other addresses as freely.
+//! Hosts behind addresses: limits count by host, because one host can use many addresses.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::net::{IpAddr, Ipv6Addr};
 
-/// What one host has: an IPv4 address, or a network of IPv6, of which it can choose any. Or a wider network, of many hosts.
+/// Addresses that belong together: an IPv4 address, an IPv6 network of one host, or a wider network of many hosts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Host {
     address: IpAddr,
-    /// Bits that its addresses share.
+    /// Length of the prefix in bits.
     prefix: u32,
 }
 
-/// Bits that the addresses of a host share in IPv6, those of a site (RFC 6177), and those of a provider.
+/// IPv6 prefix lengths in bits of a host, a site (RFC 6177) and a provider.
 pub(crate) const OF_HOST: u32 = 64;
 pub(crate) const OF_SITE: u32 = 48;
 pub(crate) const OF_PROVIDER: u32 = 32;
@@ -23,13 +23,13 @@ impl From<IpAddr> for Host {
             address: address.to_canonical(),
             prefix: 0,
         };
-        host.within(OF_HOST)
+        host.network_with_prefix(OF_HOST)
     }
 }
 
 impl Host {
-    /// The network of this prefix that it is in; itself in IPv4, where addresses are few.
-    pub(crate) fn within(self, prefix: u32) -> Host {
+    /// Returns the enclosing network with this prefix length; for IPv4, where addresses are scarce, the host itself.
+    pub(crate) fn network_with_prefix(self, prefix: u32) -> Host {
         match self.address {
             IpAddr::V4(_) => Host { prefix: 32, ..self },
             IpAddr::V6(address) => {
@@ -42,18 +42,18 @@ impl Host {
         }
     }
 
-    /// Whether it is of IPv6, in which one owner has a great many.
-    pub(crate) fn is_wide(self) -> bool {
+    /// Returns true for IPv6, where one owner has very many addresses.
+    pub(crate) fn is_ipv6(self) -> bool {
         self.address.is_ipv6()
     }
 
-    /// The network that its owner was given: a site's in IPv6, the address itself in IPv4.
+    /// Returns the network assigned to the host's owner: a site for IPv6, the address itself for IPv4.
     pub fn network(self) -> Host {
-        self.within(OF_SITE)
+        self.network_with_prefix(OF_SITE)
     }
 }
 
-/// The network of which there are the most hosts; of as many, the one that comes first.
+/// Returns the network with the most hosts; among equals, the first.
 pub fn largest_network(hosts: impl Iterator<Item = Host>) -> Option<Host> {
     let mut counts: HashMap<Host, (usize, Reverse<usize>)> = HashMap::new();
     for (place, host) in hosts.enumerate() {

@@ -1,13 +1,13 @@
-//! Who may do what: one policy, pure functions over plain data. In: a principal, and what it wants to do to which object.
-//! Out: yes, or a refusal in words. What no role allows is refused.
+//! Access control: one policy, as pure functions over plain data. Input: a principal and the action it wants to
+//! perform on an object. Output: permission, or a refusal with a message. What no role allows is refused.
 //!
 //! ```text
 //!  Principal (roles, scope) ──┬─ decide(action, object) ─▶ may the request be answered?     HTTP, links, connections
-//!                             └─ Policy::grants(service) ─▶ Grants::permits(operation, name)  each rosbridge operation
+//!                             └─ AccessPolicy::grants(service) ─▶ Grants::permits(operation, name)  rosbridge
 //! ```
 //!
-//! Actions are decided by role and scope alone ([`decide`]). Within a service that a principal may connect to, the rules of
-//! the policy say which topics, services and actions it may use ([`policy`]).
+//! Actions are decided by role and scope alone ([`decide`]). For services that a principal may connect to, the
+//! policy's rules determine which topics, services and actions it may use ([`policy`]).
 
 #![forbid(unsafe_code)]
 
@@ -20,40 +20,41 @@ pub mod policy;
 pub mod principal;
 pub mod sparing;
 
-pub use decide::{Action, Object, Refusal, decide};
+pub use decide::{AccessAction, AccessDenied, AccessObject, decide};
 pub use glob::Glob;
 pub use grant::{Grant, Operation};
-pub use guesses::{Guesser, Guesses};
+pub use guesses::{GuessLimiter, GuessSource};
 pub use host::{Host, largest_network};
-pub use policy::{Grants, Policy, Rule, Standing, Who};
+pub use policy::{AccessPolicy, AccessRule, ConnectionAccess, Grants, RuleSubject};
 pub use principal::{Principal, Role, Scope};
-pub use sparing::Sparing;
+pub use sparing::NoticeThrottle;
 
-/// A text that is none of what it should be.
+/// Error for text that cannot be parsed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Error {
-    /// A pattern.
+    /// Invalid name pattern.
     #[error(
-        "{0:?} is no pattern of names; use 1 to 255 characters, with * for any characters within a segment and ** for any at all"
+        "{0:?} is not a pattern; use 1 to 255 characters, with * for any characters within a segment and ** for any at \
+            all"
     )]
     Glob(String),
-    /// A grant.
+    /// Invalid grant.
     #[error(
-        "{0:?} is no grant; write OPERATION:NAME, such as subscribe:/camera/** or call:/detect, with publish, subscribe, call, \
-         advertise or * as the operation"
+        "{0:?} is not a grant; write OPERATION:NAME, such as subscribe:/camera/** or call:/detect, with publish, \
+            subscribe, call, advertise or * as the operation"
     )]
     Grant(String),
-    /// A role.
-    #[error("there is no role {0:?}; there are admin, operator, deployer, robot and viewer")]
+    /// Unknown role.
+    #[error("unknown role {0:?}; the roles are admin, operator, deployer, robot and viewer")]
     Role(String),
-    /// A principal's name.
+    /// Invalid name of a principal.
     #[error(
-        "{0:?} is no name of a principal; use 1 to 64 letters, digits, '.', '_' or '-', beginning with a letter or digit"
+        "{0:?} is not a valid name; use 1 to 64 letters, digits, '.', '_' or '-', beginning with a letter or digit"
     )]
     Name(String),
 }
 
-/// Reads and writes a type as its text.
+/// Implements serde traits for a type by its text form.
 macro_rules! as_text {
     ($type:ty) => {
         impl serde::Serialize for $type {

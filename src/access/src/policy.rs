@@ -1,5 +1,6 @@
-//! The policy: rules that say what principals may use of a service. A rule that names a principal stands in place of those of
-//! its roles, so that one robot can be given less than the others; where no rule is, nothing is granted.
+//! The policy: rules that grant principals the use of a service's topics, services and actions. Rules that name a
+//! principal replace those of its roles, so that one robot can be given less than others; without a rule, nothing is
+//! granted.
 
 use std::fmt;
 use std::str::FromStr;
@@ -8,58 +9,58 @@ use std::sync::Arc;
 use crate::principal::check_any_name;
 use crate::{Error, Glob, Grant, Operation, Principal, Role, as_text};
 
-/// For whom a rule is.
+/// Subject of a rule.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Who {
-    /// One principal, by its name.
+pub enum RuleSubject {
+    /// One principal, by name.
     Principal(String),
-    /// All principals of a role.
+    /// All principals with a role.
     Role(Role),
 }
 
-as_text!(Who);
+as_text!(RuleSubject);
 
-impl FromStr for Who {
+impl FromStr for RuleSubject {
     type Err = Error;
 
-    fn from_str(text: &str) -> Result<Who, Error> {
+    fn from_str(text: &str) -> Result<RuleSubject, Error> {
         if let Some(role) = text.strip_prefix("role:") {
-            return Ok(Who::Role(role.parse()?));
+            return Ok(RuleSubject::Role(role.parse()?));
         }
         check_any_name(text)?;
-        Ok(Who::Principal(text.to_owned()))
+        Ok(RuleSubject::Principal(text.to_owned()))
     }
 }
 
-impl fmt::Display for Who {
+impl fmt::Display for RuleSubject {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Who::Principal(name) => out.write_str(name),
-            Who::Role(role) => write!(out, "role:{role}"),
+            RuleSubject::Principal(name) => out.write_str(name),
+            RuleSubject::Role(role) => write!(out, "role:{role}"),
         }
     }
 }
 
-/// What somebody may use of services.
+/// A rule of the policy.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Rule {
-    /// The principals that it is for.
-    pub who: Who,
-    /// The services that it is for.
+pub struct AccessRule {
+    /// Principals to which the rule applies.
+    pub who: RuleSubject,
+    /// Services to which the rule applies.
     pub services: Glob,
-    /// The operations on names that it allows.
+    /// Granted operations on names.
     pub allow: Vec<Grant>,
 }
 
-/// All rules.
+/// All rules of the policy.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Policy {
-    /// In any order: it does not matter.
-    pub rules: Vec<Rule>,
+pub struct AccessPolicy {
+    /// Rules, in any order.
+    pub rules: Vec<AccessRule>,
 }
 
-impl Policy {
-    /// What a principal may use of a service that it may connect to.
+impl AccessPolicy {
+    /// Returns what a principal may use of a service to which it may connect.
     pub fn grants(&self, principal: &Principal, service: &str) -> Grants {
         if principal.is_unscoped() {
             return Grants::everything();
@@ -72,35 +73,37 @@ impl Policy {
         )
     }
 
-    /// What a principal may hear in a service's servants that it sees, and may not connect to: of what its rules grant it,
-    /// subscriptions alone. A viewer for whom there is no rule hears everything.
-    pub fn hearing(&self, principal: &Principal, service: &str) -> Grants {
-        let unruled = principal.is(Role::Viewer) && self.rules_for(principal, service).is_empty();
-        let grants = match unruled {
-            true => Grants::everything(),
-            false => self.grants(principal, service),
+    /// Returns what a principal may subscribe to inside a service's servants that it may view but not connect to: the
+    /// subscriptions among its grants. A viewer without any rule may subscribe to everything.
+    pub fn observer_grants(&self, principal: &Principal, service: &str) -> Grants {
+        let unruled =
+            principal.has_role(Role::Viewer) && self.rules_for(principal, service).is_empty();
+        let grants = if unruled {
+            Grants::everything()
+        } else {
+            self.grants(principal, service)
         };
-        grants.only(Operation::Subscribe)
+        grants.restrict_to(Operation::Subscribe)
     }
 
-    /// The rules that are for a principal at a service.
-    fn rules_for(&self, principal: &Principal, service: &str) -> Vec<&Rule> {
+    /// Returns the rules that apply to a principal at a service.
+    fn rules_for(&self, principal: &Principal, service: &str) -> Vec<&AccessRule> {
         let here = || {
             self.rules
                 .iter()
                 .filter(|rule| rule.services.matches(service))
         };
-        let named =
-            |rule: &&Rule| matches!(&rule.who, Who::Principal(name) if *name == principal.name);
-        let of_role = |rule: &&Rule| matches!(rule.who, Who::Role(role) if principal.is(role));
-        match here().any(|rule| named(&rule)) {
-            true => here().filter(named).collect(),
-            false => here().filter(of_role).collect(),
+        let named = |rule: &&AccessRule| matches!(&rule.who, RuleSubject::Principal(name) if *name == principal.name);
+        let of_role = |rule: &&AccessRule| matches!(rule.who, RuleSubject::Role(role) if principal.has_role(role));
+        if here().any(|rule| named(&rule)) {
+            here().filter(named).collect()
+        } else {
+            here().filter(of_role).collect()
         }
     }
 }
 
-/// What a client may do to topics, services and actions.
+/// Set of grants of a client.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Grants {
     everything: bool,
@@ -108,7 +111,7 @@ pub struct Grants {
 }
 
 impl Grants {
-    /// These.
+    /// Creates a set of these grants.
     pub fn new(grants: impl IntoIterator<Item = Grant>) -> Grants {
         let list: Vec<Grant> = grants.into_iter().collect();
         Grants {
@@ -117,7 +120,7 @@ impl Grants {
         }
     }
 
-    /// All operations on all names.
+    /// Creates the grant of all operations on all names.
     pub fn everything() -> Grants {
         Grants {
             everything: true,
@@ -125,26 +128,31 @@ impl Grants {
         }
     }
 
-    /// Whether nothing is left out.
+    /// Returns true if everything is granted.
     pub fn is_everything(&self) -> bool {
         self.everything
     }
 
-    /// What is left of them where one operation alone may be granted.
-    fn only(&self, operation: Operation) -> Grants {
-        match self.everything {
-            true => Grants::new([Grant::all(operation)]),
-            false => Grants::new(self.list.iter().filter_map(|grant| grant.only(operation))),
+    /// Returns the part of the grants that covers `operation`.
+    fn restrict_to(&self, operation: Operation) -> Grants {
+        if self.everything {
+            Grants::new([Grant::all(operation)])
+        } else {
+            Grants::new(
+                self.list
+                    .iter()
+                    .filter_map(|grant| grant.restrict_to(operation)),
+            )
         }
     }
 
-    /// Whether an operation on an absolute name is granted.
+    /// Returns true if the operation on an absolute name is granted.
     pub fn permits(&self, operation: Operation, name: &str) -> bool {
         self.everything || self.list.iter().any(|grant| grant.permits(operation, name))
     }
 
-    /// Whether any operation on a name is granted: then it may be told that the name is there.
-    pub fn shows(&self, name: &str) -> bool {
+    /// Returns true if any operation on the name is granted, so that its existence may be revealed.
+    pub fn permits_any(&self, name: &str) -> bool {
         Operation::ALL
             .into_iter()
             .any(|operation| self.permits(operation, name))
@@ -164,12 +172,12 @@ impl fmt::Display for Grants {
     }
 }
 
-/// How a connection stands: what it may do now, or why it ends.
+/// Access of an open connection: its current grants, or the reason to close it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Standing {
-    /// It may do this.
+pub enum ConnectionAccess {
+    /// The connection has these grants.
     Granted(Arc<Grants>),
-    /// It ends, for this reason.
+    /// The connection must be closed for this reason.
     Ended(String),
 }
 
@@ -180,8 +188,8 @@ mod tests {
     use super::*;
     use crate::principal::Scope;
 
-    fn rule(who: &str, services: &str, allow: &[&str]) -> Rule {
-        Rule {
+    fn rule(who: &str, services: &str, allow: &[&str]) -> AccessRule {
+        AccessRule {
             who: who.parse().expect("a principal or a role"),
             services: services.parse().expect("a pattern"),
             allow: allow
@@ -201,22 +209,22 @@ mod tests {
 
     #[test]
     fn nothing_is_granted_where_no_rule_is() {
-        let grants = Policy::default().grants(&robot("r1"), "detector");
+        let grants = AccessPolicy::default().grants(&robot("r1"), "detector");
         assert_eq!(grants.to_string(), "nothing");
         for operation in Operation::ALL {
             assert!(!grants.permits(operation, "/x"));
         }
-        assert!(!grants.shows("/x"));
+        assert!(!grants.permits_any("/x"));
     }
 
     #[test]
-    fn who_may_only_look_hears_and_does_nothing() {
+    fn a_viewer_subscribes_and_does_nothing_else() {
         let viewer = Principal {
             roles: vec![Role::Viewer],
             ..robot("eve")
         };
-        let is = |policy: &Policy, principal: &Principal, said: &str| {
-            let grants = policy.hearing(principal, "detector");
+        let is = |policy: &AccessPolicy, principal: &Principal, said: &str| {
+            let grants = policy.observer_grants(principal, "detector");
             assert_eq!(grants.to_string(), said);
             for operation in Operation::ALL {
                 let heard = operation == Operation::Subscribe && said != "nothing";
@@ -227,12 +235,12 @@ mod tests {
                 );
             }
         };
-        let none = Policy::default();
+        let none = AccessPolicy::default();
         is(&none, &viewer, "subscribe:/**");
         is(&none, &Principal::admin("root"), "subscribe:/**");
-        // A deployer of another's service, for example: what no rule grants, it does not hear.
+        // For example, a deployer of another service may not subscribe to what no rule grants.
         is(&none, &robot("r1"), "nothing");
-        let ruled = Policy {
+        let ruled = AccessPolicy {
             rules: vec![
                 rule("role:robot", "*", &["*:**"]),
                 rule("role:viewer", "*", &["*:/camera/**", "call:/detect"]),
@@ -250,7 +258,7 @@ mod tests {
 
     #[test]
     fn a_rule_for_a_principal_stands_in_place_of_those_of_its_role() {
-        let policy = Policy {
+        let policy = AccessPolicy {
             rules: vec![
                 rule("role:robot", "*", &["*:**"]),
                 rule("r1", "detector", &["subscribe:/camera/**"]),
@@ -264,11 +272,11 @@ mod tests {
                 && narrow.permits(Operation::Call, "/detect")
         );
         assert!(!narrow.permits(Operation::Publish, "/cmd_vel") && !narrow.is_everything());
-        assert!(narrow.shows("/detect") && !narrow.shows("/cmd_vel"));
+        assert!(narrow.permits_any("/detect") && !narrow.permits_any("/cmd_vel"));
         assert!(policy.grants(&robot("r1"), "mapper").is_everything());
         assert!(policy.grants(&robot("r2"), "detector").is_everything());
         assert!(
-            Policy::default()
+            AccessPolicy::default()
                 .grants(&Principal::admin("root"), "detector")
                 .is_everything()
         );
@@ -277,20 +285,20 @@ mod tests {
     #[test]
     fn who_is_read_as_it_is_written() {
         for text in ["r1", "role:robot", "role:viewer"] {
-            assert_eq!(text.parse::<Who>().expect(text).to_string(), text);
+            assert_eq!(text.parse::<RuleSubject>().expect(text).to_string(), text);
         }
         for text in ["", "role:", "role:root", "a b", "*"] {
-            text.parse::<Who>().expect_err(text);
+            text.parse::<RuleSubject>().expect_err(text);
         }
-        let json = serde_json::to_string(&Who::Role(Role::Robot)).expect("JSON");
+        let json = serde_json::to_string(&RuleSubject::Role(Role::Robot)).expect("JSON");
         assert_eq!(json, "\"role:robot\"");
         assert_eq!(
-            serde_json::from_str::<Who>(&json).expect("read back"),
-            Who::Role(Role::Robot)
+            serde_json::from_str::<RuleSubject>(&json).expect("read back"),
+            RuleSubject::Role(Role::Robot)
         );
     }
 
-    fn some_rule() -> impl Strategy<Value = Rule> {
+    fn some_rule() -> impl Strategy<Value = AccessRule> {
         let who = prop::sample::select(vec!["r1", "r2", "role:robot", "role:viewer"]);
         let services = prop::sample::select(vec!["*", "a", "b"]);
         let grant = prop::sample::select(vec![
@@ -305,8 +313,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever is granted stands in a rule for this principal, or for its role where none names it; the order of rules
-        /// does not matter.
+        /// Everything granted comes from a rule for this principal or, if none names it, for its role; the order of
+        /// rules does not matter.
         #[test]
         fn what_is_granted_stands_in_a_rule(
             rules in prop::collection::vec(some_rule(), 0..6),
@@ -314,13 +322,16 @@ mod tests {
             operation in prop::sample::select(Operation::ALL.to_vec()),
             name in prop::sample::select(vec!["/x", "/y", "/z"]),
         ) {
-            let here = |rule: &&Rule| rule.services.matches(service);
-            let own: Vec<&Rule> = rules.iter().filter(here).filter(|rule| rule.who.to_string() == "r1").collect();
-            let role: Vec<&Rule> = rules.iter().filter(here).filter(|rule| rule.who.to_string() == "role:robot").collect();
+            let here = |rule: &&AccessRule| rule.services.matches(service);
+            let own: Vec<&AccessRule> = rules.iter().filter(here).filter(|rule| rule.who.to_string() == "r1").collect();
+            let of_role = |rule: &&AccessRule| rule.who.to_string() == "role:robot";
+            let role: Vec<&AccessRule> = rules.iter().filter(here).filter(of_role).collect();
             let counted = if own.is_empty() { role } else { own };
             let expected = counted.iter().flat_map(|rule| &rule.allow).any(|grant| grant.permits(operation, name));
-            let granted = |rules: Vec<Rule>| Policy { rules }.grants(&robot("r1"), service).permits(operation, name);
-            let turned: Vec<Rule> = rules.iter().rev().cloned().collect();
+            let granted = |rules: Vec<AccessRule>| {
+                AccessPolicy { rules }.grants(&robot("r1"), service).permits(operation, name)
+            };
+            let turned: Vec<AccessRule> = rules.iter().rev().cloned().collect();
             prop_assert_eq!(granted(rules.clone()), expected);
             prop_assert_eq!(granted(turned), expected);
         }

@@ -1,29 +1,29 @@
-//! Principals: who asks, in which roles, and for which services.
+//! Principals: callers, their roles and the services they may use.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::{Error, Glob, as_text};
 
-/// What a principal is for.
+/// Role of a principal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Role {
-    /// Everything, tokens and policy included.
+    /// Everything, including tokens and policy.
     Admin,
-    /// Everything but tokens and policy.
+    /// Everything except tokens and policy.
     Operator,
-    /// Publishes services, and does with them what it likes.
+    /// Publishes services and manages its own.
     Deployer,
-    /// Is one robot, and connects to services.
+    /// Acts as one robot and connects to services.
     Robot,
-    /// Reads.
+    /// Read-only access.
     Viewer,
 }
 
 as_text!(Role);
 
 impl Role {
-    /// All of them.
+    /// All roles.
     pub const ALL: [Role; 5] = [
         Role::Admin,
         Role::Operator,
@@ -32,7 +32,7 @@ impl Role {
         Role::Viewer,
     ];
 
-    /// As it is written.
+    /// Returns the name of the role.
     pub fn name(self) -> &'static str {
         match self {
             Role::Admin => "admin",
@@ -43,7 +43,7 @@ impl Role {
         }
     }
 
-    /// Whether services are named that a principal of this role is for; the others are for all.
+    /// Returns true if principals of this role are limited to named services.
     pub fn is_scoped(self) -> bool {
         matches!(self, Role::Deployer | Role::Robot | Role::Viewer)
     }
@@ -64,19 +64,19 @@ impl fmt::Display for Role {
     }
 }
 
-/// What a principal is for.
+/// Scope of a principal.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Scope {
-    /// Services, by name.
+    /// Services, as name patterns.
     pub services: Vec<Glob>,
-    /// The one robot that it is; none: any.
+    /// The robot that the principal is; `None` for any robot.
     pub robot: Option<String>,
-    /// Classes of the configuration that it may name.
+    /// Classes of the configuration that it may use.
     pub classes: Vec<Glob>,
 }
 
 impl Scope {
-    /// All services, any robot, every class.
+    /// Creates the scope of all services, any robot and every class.
     pub fn everything() -> Scope {
         let all = || "*".parse().into_iter().collect();
         Scope {
@@ -86,30 +86,30 @@ impl Scope {
         }
     }
 
-    /// Whether a service is of it.
-    pub fn has(&self, service: &str) -> bool {
+    /// Returns true if the scope includes the service.
+    pub fn includes(&self, service: &str) -> bool {
         self.services.iter().any(|pattern| pattern.matches(service))
     }
 
-    /// Whether every service is of it.
-    pub fn has_all(&self) -> bool {
+    /// Returns true if the scope includes every service.
+    pub fn includes_all(&self) -> bool {
         self.services.iter().any(Glob::is_everything)
     }
 }
 
-/// Who asks.
+/// An authenticated caller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Principal {
-    /// By which rules of the policy and the records of services know it.
+    /// Name, as used in rules of the policy and as owner of services.
     pub name: String,
-    /// It may what any of them allows.
+    /// Roles; the principal may do whatever any of them allows.
     pub roles: Vec<Role>,
-    /// For what.
+    /// Services, robot and classes to which the roles apply.
     pub scope: Scope,
 }
 
 impl Principal {
-    /// Somebody who may do everything.
+    /// Creates a principal with all permissions.
     pub fn admin(name: &str) -> Principal {
         Principal {
             name: name.to_owned(),
@@ -118,7 +118,7 @@ impl Principal {
         }
     }
 
-    /// Somebody who has not said who it is: nothing is allowed.
+    /// Creates the unauthenticated principal, which has no permissions.
     pub fn nobody() -> Principal {
         Principal {
             name: String::new(),
@@ -127,7 +127,8 @@ impl Principal {
         }
     }
 
-    /// Whoever asks over loopback on a machine whose operator has named nobody: sees everything, and is any robot.
+    /// Creates the principal of loopback callers on a machine where no credentials exist: it views everything and may
+    /// act as any robot.
     pub fn local() -> Principal {
         Principal {
             name: "local".to_owned(),
@@ -136,19 +137,19 @@ impl Principal {
         }
     }
 
-    /// Whether it has a role.
-    pub fn is(&self, role: Role) -> bool {
+    /// Returns true if the principal has the role.
+    pub fn has_role(&self, role: Role) -> bool {
         self.roles.contains(&role)
     }
 
-    /// Whether it has a role that is for everything.
+    /// Returns true if any of its roles applies to all services.
     pub fn is_unscoped(&self) -> bool {
         self.roles.iter().any(|role| !role.is_scoped())
     }
 
-    /// Whether it is told of every service, and of the machine.
+    /// Returns true if it may see every service and the machine.
     pub fn sees_all(&self) -> bool {
-        self.is_unscoped() || (self.is(Role::Viewer) && self.scope.has_all())
+        self.is_unscoped() || (self.has_role(Role::Viewer) && self.scope.includes_all())
     }
 }
 
@@ -156,53 +157,59 @@ impl fmt::Display for Principal {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let roles: Vec<_> = self.roles.iter().map(|role| role.name()).collect();
         match roles.as_slice() {
-            [] => out.write_str("who shows no token"),
+            [] => out.write_str("a client without a token"),
             roles => write!(out, "{} ({})", self.name, roles.join(", ")),
         }
     }
 }
 
-/// What names of people begin with whom an identity provider knows: accounts and tokens have no such names.
+/// Name prefix of people known to the identity provider; accounts and tokens cannot have such names.
 pub const PROVIDED: &str = "oidc:";
 
-/// Longest name of somebody whom a provider knows, without what it begins with.
+/// Maximum length of such a name without the prefix.
 const LONGEST_PROVIDED: usize = 48;
 
-/// The name of somebody whom an identity provider calls so. Letters and digits that look like others (of other alphabets) are
-/// not kept: nobody is to be taken for somebody else.
-pub fn provided_name(called: &str) -> String {
+/// Returns the principal name for a name given by the identity provider. Characters outside ASCII letters, digits and
+/// `._-@+` are replaced, so that nobody can impersonate somebody else with similar letters of another alphabet.
+pub fn oidc_principal_name(called: &str) -> String {
     let kept = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-' | '@' | '+');
     let plain = called.chars().map(|c| if kept(c) { c } else { '-' });
     let name: String = plain.take(LONGEST_PROVIDED).collect();
-    match name.is_empty() {
-        true => format!("{PROVIDED}-"),
-        false => format!("{PROVIDED}{name}"),
+    if name.is_empty() {
+        format!("{PROVIDED}-")
+    } else {
+        format!("{PROVIDED}{name}")
     }
 }
 
-/// Refuses what is the name of nobody: of no account or token, and of nobody whom a provider knows.
+/// Checks that a name can belong to an account, a token or a person of the identity provider.
 pub(crate) fn check_any_name(name: &str) -> Result<(), Error> {
     let Some(called) = name.strip_prefix(PROVIDED) else {
         return check_name(name);
     };
-    // Of those that are called alike all but the first have a number.
+    // Of people with the same name, all but the first have a number.
     let (called, number) = called.split_once('~').unwrap_or((called, "2"));
     let numbered = number.bytes().all(|byte| byte.is_ascii_digit()) && !number.is_empty();
-    match numbered && !called.is_empty() && provided_name(called) == format!("{PROVIDED}{called}") {
-        true => Ok(()),
-        false => Err(Error::Name(name.to_owned())),
+    if numbered
+        && !called.is_empty()
+        && oidc_principal_name(called) == format!("{PROVIDED}{called}")
+    {
+        Ok(())
+    } else {
+        Err(Error::Name(name.to_owned()))
     }
 }
 
-/// Refuses what cannot be the name of a principal.
+/// Checks that a name is a valid name of a principal.
 pub fn check_name(name: &str) -> Result<(), Error> {
     let inner = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     let well_formed = (1..=64).contains(&name.len())
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
         && name.chars().all(inner);
-    match well_formed {
-        true => Ok(()),
-        false => Err(Error::Name(name.to_owned())),
+    if well_formed {
+        Ok(())
+    } else {
+        Err(Error::Name(name.to_owned()))
     }
 }
 
@@ -229,11 +236,11 @@ mod tests {
             ("a~2", "oidc:a-2"),
             ("", "oidc:-"),
         ] {
-            assert_eq!(provided_name(called), name);
+            assert_eq!(oidc_principal_name(called), name);
             check_any_name(name).expect(name);
             check_name(name).expect_err(name);
         }
-        assert_eq!(provided_name(&"x".repeat(99)).len(), 53);
+        assert_eq!(oidc_principal_name(&"x".repeat(99)).len(), 53);
         check_any_name("oidc:alice~2").expect("the second");
         for name in [
             "oidc:",
@@ -259,12 +266,12 @@ mod tests {
 
     #[test]
     fn a_scope_of_all_services_is_told_from_one_that_names_them() {
-        assert!(Scope::everything().has_all());
-        assert!(!Scope::default().has_all());
+        assert!(Scope::everything().includes_all());
+        assert!(!Scope::default().includes_all());
         let some = Scope {
             services: vec!["det*".parse().expect("a pattern")],
             ..Scope::default()
         };
-        assert!(some.has("detector") && !some.has("mapper") && !some.has_all());
+        assert!(some.includes("detector") && !some.includes("mapper") && !some.includes_all());
     }
 }

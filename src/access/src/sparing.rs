@@ -1,32 +1,33 @@
-//! What is told again and again is told once a minute. Pure: the time is given.
+//! Throttle for repeated notices: equal ones are admitted once a minute. Pure: the time is passed in.
 
 use std::collections::HashMap;
 
-/// Milliseconds since any beginning.
+/// Milliseconds since an arbitrary epoch.
 type Millis = u64;
 
-/// What is alike within that time is not told again.
+/// Interval between equal notices.
 const AGAIN: Millis = 60_000;
-/// Different things that are remembered. While there are as many, others are not told either, and counted.
+/// Limit on the distinct notices remembered. While it is reached, further ones are only counted.
 const DIFFERENT: usize = 256;
 
-/// What was told lately.
+/// Throttle for repeated notices.
 #[derive(Debug, Default)]
-pub struct Sparing {
-    told: HashMap<String, Told>,
-    /// For which there was no room.
+pub struct NoticeThrottle {
+    told: HashMap<String, RecentNotice>,
+    /// Number of notices omitted because the table was full.
     others: u64,
 }
 
 #[derive(Debug)]
-struct Told {
+struct RecentNotice {
     at: Millis,
     omitted: u64,
 }
 
-impl Sparing {
-    /// Whether `what` is to be told now: then how many alike were not since the last time, or for which there was no room.
-    pub fn ask(&mut self, what: &str, now: Millis) -> Option<u64> {
+impl NoticeThrottle {
+    /// Returns `Some` if the notice is admitted now, with the number of equal ones omitted since the last, or of
+    /// those omitted because the table was full.
+    pub fn admit(&mut self, what: &str, now: Millis) -> Option<u64> {
         if let Some(told) = self.told.get_mut(what) {
             if now.saturating_sub(told.at) < AGAIN {
                 told.omitted += 1;
@@ -36,7 +37,7 @@ impl Sparing {
             return Some(std::mem::take(&mut told.omitted));
         }
         if self.told.len() >= DIFFERENT {
-            // With what was omitted of those that nobody has asked about since.
+            // Includes the omissions of expired entries that were never admitted again.
             let mut omitted = 0;
             self.told.retain(|_, told| {
                 let stays = now.saturating_sub(told.at) < AGAIN;
@@ -49,7 +50,7 @@ impl Sparing {
             self.others += 1;
             return None;
         }
-        let told = Told {
+        let told = RecentNotice {
             at: now,
             omitted: 0,
         };
@@ -65,8 +66,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_alike_is_told_once_a_minute_with_how_often_it_was() {
-        let mut sparing = Sparing::default();
+    fn equal_notices_are_admitted_once_a_minute_with_a_count() {
+        let mut sparing = NoticeThrottle::default();
         for (what, at, told) in [
             ("a", 0, Some(0)),
             ("a", 1, None),
@@ -75,31 +76,31 @@ mod tests {
             ("a", AGAIN, Some(2)),
             ("a", 2 * AGAIN, Some(0)),
         ] {
-            assert_eq!(sparing.ask(what, at), told, "{what} {at}");
+            assert_eq!(sparing.admit(what, at), told, "{what} {at}");
         }
     }
 
     #[test]
     fn a_great_many_different_things_are_counted() {
-        let mut sparing = Sparing::default();
+        let mut sparing = NoticeThrottle::default();
         for number in 0..DIFFERENT {
-            assert_eq!(sparing.ask(&number.to_string(), 0), Some(0));
+            assert_eq!(sparing.admit(&number.to_string(), 0), Some(0));
         }
-        assert_eq!(sparing.ask("x", 1), None);
-        assert_eq!(sparing.ask("0", 1), None);
-        assert_eq!(sparing.ask("x", AGAIN), Some(2));
+        assert_eq!(sparing.admit("x", 1), None);
+        assert_eq!(sparing.admit("0", 1), None);
+        assert_eq!(sparing.admit("x", AGAIN), Some(2));
         assert_eq!(sparing.told.len(), 1);
     }
 
     proptest! {
-        /// Nothing is lost: what was told, with what was said to be omitted and is still to be said, is what came.
+        /// Nothing is lost: admitted notices plus reported and pending omissions equal the notices that came.
         #[test]
         fn everything_is_told_or_counted(steps in prop::collection::vec((0u64..30_000, 0usize..500), 1..3_000)) {
-            let mut sparing = Sparing::default();
+            let mut sparing = NoticeThrottle::default();
             let (mut now, mut counted) = (0, 0);
             for (step, what) in &steps {
                 now += step / 100;
-                if let Some(omitted) = sparing.ask(&what.to_string(), now) {
+                if let Some(omitted) = sparing.admit(&what.to_string(), now) {
                     counted += 1 + omitted;
                 }
             }

@@ -1,155 +1,155 @@
-//! Tokens and policy: who may do what. `/api/v1/tokens`, `/api/v1/policy`, `/api/v1/whoami`.
+//! Access tokens and policy rules: `/api/v1/tokens`, `/api/v1/policy`, `/api/v1/whoami`.
 
-use access::{Glob, Grant, Role, Who};
+use access::{Glob, Grant, Role, RuleSubject};
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// A token to make (`POST /api/v1/tokens`).
+/// Request to create a token (`POST /api/v1/tokens`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewToken {
-    /// The principal's name, by which rules and records know it.
+    /// Name of the principal, used in rules and audit records.
     pub name: String,
-    /// What it is for: `admin`, `operator`, `deployer`, `robot` or `viewer`.
+    /// Role: `admin`, `operator`, `deployer`, `robot` or `viewer`.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub role: Role,
-    /// For which services, as patterns; needed for deployers, robots and viewers.
+    /// Service name patterns that the token gives access to; required for deployers, robots and viewers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// The robot that it is; needed for robots.
+    /// Robot that the token identifies; required for robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
-    /// Classes of the configuration that it may name, as patterns.
+    /// Patterns of the configured classes that the principal may request.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<String>))]
     pub classes: Vec<Glob>,
-    /// Seconds after which it ends; never, where it is not said.
+    /// Lifetime in seconds (default: the token does not expire).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lifetime: Option<u64>,
 }
 
-/// A token that was made. Its secret is told once, by [`Secret`].
+/// An existing token. Its secret is returned only once, in [`Secret`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Token {
-    /// The principal's name.
+    /// Name of the principal.
     pub name: String,
-    /// What it is for.
+    /// Role of the principal.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub role: Role,
-    /// For which services, as patterns.
+    /// Service name patterns that the token gives access to.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true, value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// The robot that it is.
+    /// Robot that the token identifies.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
-    /// Classes that it may name, as patterns.
+    /// Patterns of the configured classes that the principal may request.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true, value_type = Vec<String>))]
     pub classes: Vec<Glob>,
-    /// When it was made.
+    /// Creation time.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
-    /// When it ends.
+    /// Expiry time; absent if the token does not expire.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub expires: Option<Millis>,
-    /// When it was shown last, to the minute.
+    /// Last use, to the minute.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub last_used: Option<Millis>,
-    /// When it was revoked.
+    /// Time of revocation; absent if the token is not revoked.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub revoked: Option<Millis>,
 }
 
-/// A token with its secret.
+/// A token together with its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Secret {
-    /// What it is for.
+    /// The token.
     pub token: Token,
-    /// What its holder shows. It is kept nowhere.
+    /// Bearer secret to present. The server does not store it.
     pub secret: String,
 }
 
-/// A rule to write (`POST /api/v1/policy`).
+/// Request to add a policy rule (`POST /api/v1/policy`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewRule {
-    /// For whom: a principal's name, or `role:ROLE`.
+    /// Subject of the rule: a principal's name, or `role:ROLE`.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
-    pub who: Who,
-    /// For which services, as a pattern.
+    pub who: RuleSubject,
+    /// Service name pattern that the rule applies to.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub services: Glob,
-    /// What is granted: `subscribe:/camera/**`, `call:/detect`. Nothing is, where the list is empty.
+    /// Grants, such as `subscribe:/camera/**` or `call:/detect`. An empty list grants nothing.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub allow: Vec<Grant>,
 }
 
-/// A rule of the policy.
+/// A policy rule.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Rule {
-    /// Its number, never given twice.
+    /// Rule number; never reused.
     pub id: i64,
-    /// The principals that it is for.
+    /// Principals that the rule applies to.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
-    pub who: Who,
-    /// The services that it is for.
+    pub who: RuleSubject,
+    /// Service name pattern that the rule applies to.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub services: Glob,
-    /// What is granted.
+    /// Permissions granted by the rule.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub allow: Vec<Grant>,
 }
 
-/// Who asks (`GET /api/v1/whoami`).
+/// The authenticated principal (`GET /api/v1/whoami`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Whoami {
-    /// Its name.
+    /// Name of the principal.
     pub name: String,
-    /// Its roles.
+    /// Roles of the principal.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub roles: Vec<Role>,
-    /// Services that it is for, as patterns.
+    /// Service name patterns that the principal has access to.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// The robot that it is.
+    /// Robot that the principal identifies as.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
 }
 
-/// What somebody did (`GET /api/v1/audit`).
+/// An audit record (`GET /api/v1/audit`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Audited {
-    /// Its number, never given twice.
+    /// Record number; never reused.
     pub id: i64,
-    /// When it was done.
+    /// Time of the request.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
-    /// Who, with its roles.
+    /// Principal that made the request, with its roles.
     pub who: String,
-    /// From where: an address and port, or a user of the daemon's machine.
+    /// Origin of the request: an address and port, or a user of the daemon's machine.
     pub from: String,
-    /// Which of the policy's actions it is.
+    /// Policy action that the request was checked against.
     pub action: String,
-    /// The request, without its query.
+    /// Request method and path, without the query.
     pub did: String,
-    /// The object that it was done to.
+    /// Object that the request acted on.
     pub object: String,
-    /// The answer's HTTP status: 403 where it was refused.
+    /// HTTP status of the response; 403 if the request was denied.
     pub status: u16,
-    /// So many alike before it, since the last one that is here, were not recorded.
+    /// Number of identical requests since the previous record that were not recorded separately.
     #[serde(default, skip_serializing_if = "is_zero")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub more: u64,

@@ -1,6 +1,6 @@
-//! Calibrations: `POST /api/v1/services/NAME/calibration?options=JSON` replays recorded requests against a servant of the
-//! service at several limits. The body is the recording (rosbag 2.0), or pictures (PNG files, one behind the other), or
-//! empty where a robot's own requests are taken. The answer is a stream of [`CalibrationEvent`]s. Times are in milliseconds.
+//! Calibrations: `POST /api/v1/services/NAME/calibration?options=JSON` replays recorded requests against a servant of
+//! the service at several CPU limits. The body is a recording (rosbag 2.0), a concatenation of PNG images, or empty if
+//! a robot's live requests are used. The response is a stream of [`CalibrationEvent`]s. Times are in milliseconds.
 
 use std::collections::BTreeMap;
 
@@ -11,168 +11,173 @@ use crate::problem::Problem;
 use crate::size::Size;
 use crate::trial::Fed;
 
-/// What to measure, and with what.
+/// Options of a calibration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct CalibrationOptions {
-    /// What the requests are taken from.
+    /// Source of the requests.
     pub source: Source,
-    /// The robot whose requests are taken, with `live`.
+    /// Robot whose requests are captured; only with source `live`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
-    /// Seconds for which they are taken, at most; 20 by default.
+    /// Maximum time to capture live requests, in seconds (default: 20).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seconds: Option<f64>,
-    /// Bytes of them that are taken, at most; 256M by default.
+    /// Maximum size of the captured live requests, in bytes (default: 256M).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bytes: Option<Size>,
-    /// Limits to measure at, in cores; without, a geometric ladder that ends where more cores make nothing faster.
+    /// CPU limits to measure at, in cores (default: a geometric series that ends when more cores do not reduce the
+    /// response time).
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cpus: Vec<f64>,
-    /// Requests at each limit, at most; 40 by default.
+    /// Maximum number of requests at each limit (default: 40).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub requests: Option<usize>,
-    /// Requests a second, instead of the recording's own pace.
+    /// Requests per second (default: the rate of the recording).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rate: Option<f64>,
-    /// The next request follows the last answer at once. Pictures have no other pace without a rate.
+    /// Send each request as soon as the previous one is answered. This is the default for images if no rate is given.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub fast: bool,
-    /// The input whose messages are the requests; without, the recording's first topic that the service has an input for.
+    /// Input topic whose messages are the requests (default: the first topic of the recording that matches an input of
+    /// the service).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input: Option<String>,
-    /// What robots' networks and stubs add to each request; with `live` it is what the robot measured, unless given.
+    /// Milliseconds that the network and the stub add to each request (default with source `live`: the value measured
+    /// by the robot).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub network: Option<f64>,
-    /// Auxiliary parameters of the rows, such as `image=640x480`.
+    /// Auxiliary parameters of the resulting rows, such as `image=640x480`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub aux: BTreeMap<String, String>,
-    /// Memory that the servant may use from its start on, as another machine would have it, whatever robots may ask for at most; without, the service's own limit.
+    /// Memory limit of the servant from its start, to emulate another machine; may exceed the cap on what robots may
+    /// request (default: the service's own memory limit).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Size>,
-    /// It is measured once, at the cores that the service was pushed with, else at one core, at most those of the machine.
+    /// Measure once only, at the CPU limit that the service was pushed with (default: 1 core), capped at the machine's
+    /// number of cores.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub own: bool,
-    /// The time of each request is told as well.
+    /// Report the response time of each request as well.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub times: bool,
-    /// Seconds for which the servant stays behind the last limit, at most: then whoever asked can use it over their own network,
-    /// and ends it by not reading on.
+    /// Maximum time, in seconds, to keep the servant running at the last limit after the measurement, so that the
+    /// caller can use it over its own network. The caller ends it by closing the stream.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keep: Option<f64>,
 }
 
-/// Kind of the [`Problem`] of a servant that needed more memory than it may use, before anything was measured.
+/// Kind of the [`Problem`] reported if the servant exceeded its memory limit before anything was measured.
 pub const OUT_OF_MEMORY: &str = "urn:cloudroid:out-of-memory";
 
-/// What the requests of a calibration are taken from.
+/// Source of the requests of a calibration.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Source {
-    /// A recording in the body.
+    /// A recording in the request body.
     #[default]
     Bag,
-    /// Pictures in the body.
+    /// Images in the request body.
     Frames,
-    /// What a connected robot sends now.
+    /// Live messages of a connected robot.
     Live,
 }
 
-/// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
+/// One line of the response. The last line is `done` or `error`; a stream that ends otherwise was truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum CalibrationEvent {
     /// A new step begins.
     Step {
-        /// What is done now.
+        /// Title of the step.
         title: String,
     },
-    /// One limit has been measured.
+    /// The measurement at one limit is complete.
     Measured {
-        /// What was measured.
+        /// Result of the measurement.
         point: Point,
-        /// Time of each answered request, in their order, where that was asked for.
+        /// Response time of each answered request, in order; only if requested.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         times: Vec<f64>,
     },
-    /// All limits have been measured, and the servant stays at the last of them for as long as was asked for.
+    /// All limits have been measured; the servant keeps running at the last limit for the requested time.
     Kept {
-        /// Its id.
+        /// Id of the servant.
         servant: String,
-        /// What was found.
+        /// Result of the calibration.
         calibration: Box<Calibration>,
     },
-    /// All limits have been measured; nothing has been written.
+    /// All limits have been measured. The proposed rows have not been written.
     Done {
-        /// What was found.
+        /// Result of the calibration.
         calibration: Box<Calibration>,
     },
-    /// Not measured.
+    /// The calibration failed.
     Error {
-        /// The reason, and what to do.
+        /// Reason of the failure, and the next step.
         problem: Problem,
     },
 }
 
-/// What a calibration found.
+/// Result of a calibration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Calibration {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The revision that was measured.
+    /// Revision that was measured.
     pub revision: u64,
-    /// What was published to it, over all limits.
+    /// Messages published to the service, over all limits.
     pub inputs: Vec<Fed>,
-    /// Topics of the recording that the service has no input for.
+    /// Topics of the recording that match no input of the service.
     pub unused: Vec<String>,
     /// Size of the largest request.
     pub largest: Size,
-    /// Requests a second of the recording; none where each followed the answer before it.
+    /// Requests per second of the recording; absent if each request was sent as soon as the previous one was answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pace: Option<f64>,
-    /// What networks and stubs add to each request: of the robot whose requests were taken, or as it was given.
+    /// Time that the network and the stub add to each request, as measured on the robot or as given in the options.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub network: Option<TimeSpread>,
-    /// What was measured at each limit, fewest cores first.
+    /// Measurements, in ascending order of the CPU limit.
     pub points: Vec<Point>,
-    /// Why no more limits were measured.
+    /// Reason why no further limits were measured.
     pub ended: String,
-    /// The most memory that was in use at any limit, without files that the kernel may drop.
+    /// Peak memory over all limits, not counting reclaimable page cache.
     pub memory_peak: Size,
-    /// Percent that the rows' memory lies above it.
+    /// Margin of the rows' memory limit over the peak, in percent.
     pub memory_margin: u64,
-    /// Rows that it proposes, cheapest first: with its limits, each is the response time that 95 % of the requests met, rounded
-    /// up to two digits.
+    /// Proposed rows, cheapest first. The value of each row is the 95th percentile of the response time under its
+    /// limits, rounded up to two significant digits.
     pub rows: Vec<Row>,
 }
 
-/// What was measured at one limit.
+/// Measurement at one CPU limit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Point {
-    /// The limit, in cores.
+    /// CPU limit in cores.
     pub cpus: f64,
-    /// Requests.
+    /// Number of requests sent.
     pub requests: usize,
-    /// Of them were answered.
+    /// Number of requests that were answered.
     pub answered: usize,
-    /// From the request's arrival at the node to the answer; none where nothing was answered.
+    /// Time from the arrival of a request at the node to its answer; absent if nothing was answered.
     pub compute: Option<TimeSpread>,
-    /// Processor time that a request took, on average.
+    /// Mean CPU time per request.
     pub running: f64,
-    /// Time for which the limit held a request up, on average, summed over the servant's cores.
+    /// Mean time per request for which the CPU limit throttled the servant, summed over its cores.
     pub throttled: f64,
-    /// Requests a second.
+    /// Requests per second.
     pub rate: f64,
-    /// The most memory that was in use, without files that the kernel may drop.
+    /// Peak memory, not counting reclaimable page cache.
     pub memory: Size,
 }
 
-/// Spread of a time, in milliseconds (nearest ranks).
+/// Distribution of a time, in milliseconds (nearest-rank percentiles).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct TimeSpread {
@@ -185,8 +190,8 @@ pub struct TimeSpread {
 }
 
 impl TimeSpread {
-    /// Of times in any order (nearest ranks); none of none.
-    pub fn of(mut times: Vec<f64>) -> Option<TimeSpread> {
+    /// Computes the distribution of samples in any order (nearest-rank percentiles); `None` if there are no samples.
+    pub fn from_samples(mut times: Vec<f64>) -> Option<TimeSpread> {
         times.sort_by(f64::total_cmp);
         let rank = |percent| qos::nearest_rank(&times, percent);
         Some(TimeSpread {
@@ -197,13 +202,13 @@ impl TimeSpread {
     }
 }
 
-/// A time in milliseconds with two digits, never less than it was.
-pub fn rounded_up(milliseconds: f64) -> f64 {
-    // A time of nothing is none that anybody could ask for.
+/// Rounds a time in milliseconds up to two significant digits.
+pub fn round_up_to_two_digits(milliseconds: f64) -> f64 {
+    // A response time of zero could not be requested by anybody.
     let milliseconds = milliseconds.max(1e-3);
     let digit = 10f64.powf(milliseconds.log10().floor() - 1.0);
     let up = (milliseconds / digit).ceil() * digit;
-    // What powers of ten left behind the digits.
+    // Removes the floating-point error of the powers of ten.
     (up * 1e6).round() / 1e6
 }
 
@@ -214,10 +219,13 @@ mod tests {
     #[test]
     fn spreads_are_nearest_ranks_in_any_order() {
         let times = (1..=40).rev().map(f64::from).collect();
-        let spread = TimeSpread::of(times).expect("times");
+        let spread = TimeSpread::from_samples(times).expect("times");
         assert_eq!((spread.p50, spread.p95, spread.max), (20.0, 38.0, 40.0));
-        assert_eq!(TimeSpread::of(vec![7.0]).map(|one| one.p95), Some(7.0));
-        assert_eq!(TimeSpread::of(Vec::new()), None);
+        assert_eq!(
+            TimeSpread::from_samples(vec![7.0]).map(|one| one.p95),
+            Some(7.0)
+        );
+        assert_eq!(TimeSpread::from_samples(Vec::new()), None);
     }
 
     #[test]

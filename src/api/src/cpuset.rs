@@ -1,23 +1,23 @@
-//! Sets of cores, written as the kernel does: `0-3,6`.
+//! CPU sets in the kernel's list format, such as `0-3,6`.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// How many cores can be told apart.
+/// Number of CPUs that a set can represent.
 const CORES: usize = 256;
 
-/// Some cores, written such as `0-3,6`.
+/// A set of CPUs, written as `0-3,6`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema), schema(value_type = String))]
 pub struct CpuSet(
-    /// Bit n of word n / 64 is core n.
+    /// Bit n of word n / 64 represents CPU n.
     pub [u64; CORES / 64],
 );
 
 impl CpuSet {
-    fn has(&self, core: usize) -> bool {
+    fn contains(&self, core: usize) -> bool {
         core < CORES && self.0[core / 64] >> (core % 64) & 1 == 1
     }
 }
@@ -28,7 +28,7 @@ impl FromStr for CpuSet {
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let refused = || {
             format!(
-                "{text:?} is no set of cores; write numbers below {CORES} and ranges, such as 0-3,6"
+                "{text:?} is not a set of cores; write numbers below {CORES} and ranges, such as 0-3,6"
             )
         };
         let mut set = CpuSet([0; CORES / 64]);
@@ -50,12 +50,12 @@ impl fmt::Display for CpuSet {
         let mut separator = "";
         let mut core = 0;
         while core < CORES {
-            if !self.has(core) {
+            if !self.contains(core) {
                 core += 1;
                 continue;
             }
             let first = core;
-            while self.has(core) {
+            while self.contains(core) {
                 core += 1;
             }
             match core - first {

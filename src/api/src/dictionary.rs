@@ -1,4 +1,4 @@
-//! The dictionary of a service: which resources a measure of an SLA costs. `GET /api/v1/services/NAME/sla`.
+//! The dictionary of a service: the resources needed to meet a measure of an SLA. `GET /api/v1/services/NAME/sla`.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,38 +9,38 @@ use crate::Millis;
 use crate::limits::Limits;
 use crate::sla::{AUX, Measure, Stated};
 
-/// With these limits, and up to these auxiliary parameters, a servant reaches this value.
+/// A dictionary row: a servant with these limits reaches this value, up to these auxiliary parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Row {
-    /// Its number, never given twice; 0 in a row that is yet to be written.
+    /// Row number, never reused; 0 in a row that has not been written.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub id: i64,
-    /// What was measured.
+    /// Measure that the row is about.
     pub measure: Measure,
-    /// What is reached: seconds, or frames per second.
+    /// Value that is reached: seconds, or frames per second.
     pub value: f64,
-    /// For what it holds: of a number up to this one, of other text just this.
+    /// Auxiliary parameters that the row is valid for: numeric values up to the given number, other values by equality.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub aux: BTreeMap<String, String>,
-    /// With what. Where it says nothing, the service's own limits apply.
+    /// Resource limits that reach the value. Limits that are absent are the service's own.
     pub limits: Limits,
-    /// How it was measured, where it was.
+    /// Statistics of the measurement; absent if the value was not measured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub spread: Option<Spread>,
-    /// The revision that was current when it was written.
+    /// Revision that was current when the row was written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub revision: Option<u64>,
-    /// When it was written; 0 in a row that is yet to be.
+    /// Time when the row was written; 0 in a row that has not been written.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = crate::schema::Millis))]
     pub written: Millis,
 }
 
-/// How far the requests of a measurement were apart, in the unit of the row's value.
+/// Distribution of the measured requests, in the unit of the row's value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
@@ -49,48 +49,48 @@ pub struct Spread {
     pub p50: f64,
     /// 95th percentile.
     pub p95: f64,
-    /// How many were measured.
+    /// Number of requests measured.
     pub requests: u64,
 }
 
-/// Rows to write (`PUT /api/v1/services/NAME/sla`): all or none. One of the same measure, value and auxiliary parameters
-/// takes an earlier one's place.
+/// Rows to write atomically (`PUT /api/v1/services/NAME/sla`). A row replaces an earlier one with the same measure,
+/// value and auxiliary parameters.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewRows {
-    /// The rows.
+    /// Rows to write.
     pub rows: Vec<Row>,
-    /// All that there were before are removed.
+    /// Remove all existing rows first.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub replace: bool,
 }
 
-/// What a robot would get that states something, and why: `GET /api/v1/services/NAME/sla/explain?rrt=100ms`.
+/// Terms that a robot with the given statement would get, and why: `GET /api/v1/services/NAME/sla/explain?rrt=100ms`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Explained {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// What was stated.
+    /// The statement of the robot.
     pub stated: Stated,
-    /// The class that the robot would be in.
+    /// Class that the robot would be assigned to.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub class: Option<String>,
-    /// Its priority.
+    /// Priority of the class.
     pub priority: i32,
-    /// The limits that it would be promised; none where it would be refused.
+    /// Limits that would be reserved; absent if the robot would be refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub limits: Option<Limits>,
-    /// How they follow, a sentence each.
+    /// Explanation of the limits, one sentence each.
     pub why: Vec<String>,
-    /// Why it would be refused.
+    /// Reason why the robot would be refused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
-    /// Rows next to those that are taken, in words.
+    /// Descriptions of the rows adjacent to those chosen.
     pub next: Vec<String>,
-    /// Each measure of the SLA, with all rows.
+    /// The measures of the SLA, each with all its rows.
     pub goals: Vec<ExplainedGoal>,
 }
 
@@ -98,36 +98,36 @@ pub struct Explained {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ExplainedGoal {
-    /// What is measured.
+    /// The measure.
     pub measure: Measure,
-    /// What is wished for: seconds, or frames per second.
+    /// Desired value: seconds, or frames per second.
     pub desire: f64,
-    /// What is acceptable.
+    /// Worst acceptable value: seconds, or frames per second.
     pub bound: f64,
-    /// All rows of that measure, the cheapest first.
+    /// All rows of the measure, cheapest first.
     pub rows: Vec<Considered>,
 }
 
-/// A row that was looked at.
+/// A row that was considered.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Considered {
     /// The row.
     pub row: Row,
-    /// It is taken.
+    /// True if the row was chosen.
     pub taken: bool,
-    /// The reason why it was taken or not.
+    /// Reason why the row was or was not chosen.
     pub why: String,
 }
 
-/// What it is about, such as `rrt 100ms with aux.width=640`.
+/// Writes the row's subject, such as `rrt 100ms with aux.width=640`.
 impl fmt::Display for Row {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             out,
             "{} {}",
             self.measure.name(),
-            self.measure.print(self.value)
+            self.measure.format_value(self.value)
         )?;
         for (index, (key, value)) in self.aux.iter().enumerate() {
             let before = if index == 0 { " with" } else { "" };

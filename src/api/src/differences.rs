@@ -1,69 +1,69 @@
-//! What differs between two revisions of a service.
+//! Differences between two revisions of a service.
 
 use serde::{Deserialize, Serialize};
 
-/// Two revisions, compared.
+/// Comparison of two revisions.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Differences {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The revision that is compared with.
+    /// Revision to compare with.
     pub from: u64,
-    /// The revision that is compared.
+    /// Revision that is compared.
     pub to: u64,
-    /// What differs, by part and name; empty: nothing that is recorded.
+    /// Differences, sorted by part and name; empty if the recorded data are equal.
     pub differences: Vec<Difference>,
 }
 
-/// One thing that differs.
+/// A single difference.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Difference {
-    /// Of which part.
+    /// Part of the revision that differs.
     pub part: RevisionPart,
-    /// Its name there, such as `/scan`, or `cpus`.
+    /// Name within the part, such as `/scan` or `cpus`.
     pub name: String,
-    /// What it was; none: it was not there.
+    /// Value in the old revision; absent if it did not exist there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub before: Option<String>,
-    /// What it is; none: it is not there any more.
+    /// Value in the new revision; absent if it no longer exists.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub after: Option<String>,
 }
 
-/// Parts of a revision, in the order in which they are told.
+/// Parts of a revision, in the order in which they are reported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum RevisionPart {
-    /// The ROS package, and how it was pushed.
+    /// The ROS package, and the options it was pushed with.
     Push,
-    /// A process.
+    /// A node process.
     Node,
     /// A topic.
     Topic,
     /// A ROS service.
     Service,
-    /// An action.
+    /// A ROS action.
     Action,
-    /// A ROS service that a robot should serve.
+    /// A ROS service that the robot must provide.
     Need,
-    /// The text of a message, service or action definition.
+    /// Text of a message, service or action definition.
     Definition,
-    /// A parameter that is set before nodes start.
+    /// A parameter set before the nodes start.
     Parameter,
-    /// A limit of a servant.
+    /// A resource limit of a servant.
     Limit,
-    /// What a robot may ask for at most.
+    /// Upper limit on what robots may request.
     Cap,
-    /// What stubs promise where their robot says nothing.
+    /// Default SLA of stubs whose robot states none.
     Sla,
-    /// What was asked for beyond a container.
+    /// A grant beyond the container, such as a device.
     Grant,
-    /// How robots share its servants.
+    /// How robots share servants.
     Shared,
-    /// A variable of the environment; its value is not told.
+    /// An environment variable; its value is not reported.
     Environment,
     /// A ROS package in the image.
     Package,

@@ -1,48 +1,48 @@
-//! What the host needs, and whether it is there.
+//! Checks of the host's prerequisites.
 
 use serde::{Deserialize, Serialize};
 
-/// The result of all checks.
+/// Result of all checks.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Doctor {
-    /// Every check, in the order in which a person would fix them.
+    /// All checks, in the order in which they should be fixed.
     pub checks: Vec<Check>,
 }
 
 impl Doctor {
-    /// Nothing that is needed is missing.
-    pub fn well(&self) -> bool {
+    /// Returns whether no required prerequisite is missing.
+    pub fn is_healthy(&self) -> bool {
         self.checks
             .iter()
             .all(|check| check.status != CheckStatus::Missing)
     }
 }
 
-/// One need.
+/// Check of one prerequisite.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Check {
-    /// What is needed.
+    /// Name of the prerequisite.
     pub name: String,
-    /// Whether it is there.
+    /// Result of the check.
     pub status: CheckStatus,
-    /// What was found.
+    /// Description of what was found.
     pub found: String,
-    /// The command or the setting that fixes it.
+    /// Command or setting that fixes the problem.
     #[serde(default, skip_serializing_if = "Option::is_none", alias = "mend")]
     pub fix: Option<String>,
 }
 
-/// Whether a need is met.
+/// Result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum CheckStatus {
-    /// What is checked is there.
+    /// The prerequisite is met.
     Ok,
-    /// It works without, but less well.
+    /// The daemon works without it, with restrictions.
     Warning,
-    /// It does not work without.
+    /// The daemon does not work without it.
     Missing,
 }

@@ -1,44 +1,44 @@
-//! What happened, for people.
+//! Events of the daemon's journal.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// How much it matters.
+/// Severity of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// As it should be.
+    /// Normal operation.
     Info,
-    /// Worth a look.
+    /// Deserves attention.
     Warning,
     /// Something failed.
     Error,
 }
 
-/// One line of the daemon's journal.
+/// An event in the daemon's journal.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Event {
-    /// Grows with every event.
+    /// Event number; increases with every event.
     pub id: i64,
-    /// When it happened.
+    /// Time of the event.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
-    /// How much it matters.
+    /// Severity.
     pub level: Level,
-    /// Kind, such as `servant-ready`.
+    /// Kind of event, such as `servant-ready`.
     pub kind: String,
-    /// The service concerned.
+    /// Service concerned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub service: Option<String>,
-    /// The servant concerned.
+    /// Servant concerned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub servant: Option<String>,
-    /// The robot concerned.
+    /// Robot concerned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
-    /// What happened, in a sentence.
+    /// Description of the event, in one sentence.
     pub message: String,
 }

@@ -1,46 +1,46 @@
-//! Why a robot is slow, or answered locally, now: `GET /api/v1/robots/NAME/explain`.
+//! Explains why a robot is slow, or is served by its local originals: `GET /api/v1/robots/NAME/explain`.
 
 use serde::{Deserialize, Serialize};
 
 use crate::event::Event;
 use crate::servant::Servant;
 
-/// All that is known of one robot, and what follows from it.
+/// Diagnosis of one robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Explanation {
-    /// The robot.
+    /// Name of the robot.
     pub robot: String,
-    /// What follows, the weightiest first; empty when nothing is wrong.
+    /// Causes found, most severe first; empty if nothing is wrong.
     pub causes: Vec<Cause>,
-    /// Servants that the robot has.
+    /// Servants of the robot.
     pub servants: Vec<Served>,
-    /// What happened to it last, oldest first.
+    /// Latest events of the robot, oldest first.
     pub events: Vec<Event>,
 }
 
-/// One reason.
+/// A cause of slow or local service.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Cause {
-    /// How much it matters.
+    /// Severity of the cause.
     pub weight: Weight,
-    /// What is so, with its figures.
+    /// Description of the cause, with figures.
     pub what: String,
-    /// What to do about it.
+    /// Suggested next step.
     pub next: String,
 }
 
-/// How much a cause matters.
+/// Severity of a cause.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Weight {
-    /// Nothing works with it.
+    /// Blocks the service entirely.
     Blocks,
-    /// It costs response time.
+    /// Increases the response time.
     Slows,
-    /// Worth knowing.
+    /// Informational.
     Hint,
 }
 
@@ -48,86 +48,86 @@ pub enum Weight {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Served {
-    /// As in a list.
+    /// The servant.
     pub servant: Servant,
-    /// Share of the last moment in which it wanted to run and had used its cores up, 0 to 1.
+    /// Fraction of the last sampling period in which the servant was throttled by its CPU limit, 0 to 1.
     pub throttled: f64,
-    /// Cores that it used in the last moment.
+    /// CPU usage in the last sampling period, in cores.
     pub cores: f64,
-    /// One for each node that a stub stands for.
+    /// Links, one for each node that a stub stands for.
     pub links: Vec<Link>,
 }
 
-/// A node's link and its last requests. Times are in milliseconds.
+/// Link of a node, and statistics of its latest requests. Times are in milliseconds.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Link {
-    /// The node.
+    /// Name of the node.
     pub node: String,
-    /// Its connection is there and not silent.
+    /// True if the connection is established and has not gone silent.
     pub up: bool,
-    /// Last round trip.
+    /// Latest round-trip time.
     pub round_trip: Option<f64>,
-    /// The robot's clock minus this machine's.
+    /// Offset of the robot's clock from this machine's.
     pub clock: Option<f64>,
-    /// Bytes a second downwards, when it had to hurry.
+    /// Measured downlink throughput in bytes per second, when the link was saturated.
     pub throughput: Option<f64>,
-    /// Messages that were dropped on either side.
+    /// Number of messages dropped on either side.
     pub dropped: u64,
-    /// Of which topics, where and why: a sentence each.
+    /// Dropped messages by topic, place and reason, one sentence each.
     #[serde(default)]
     pub drops: Vec<String>,
-    /// T_desire.
+    /// T_desire of the response time.
     pub desire: Option<f64>,
-    /// T_max.
+    /// T_max of the response time.
     pub max: Option<f64>,
-    /// Q_t, where the robot says it.
+    /// Q threshold Q_t, if the robot states one.
     #[serde(default)]
     pub threshold: Option<f64>,
-    /// The least rate of an output, where that is promised instead: frames per second.
+    /// Lowest acceptable rate of an output in frames per second, if a rate is promised instead of a response time.
     #[serde(default)]
     pub frames_per_second: Option<f64>,
-    /// The rate that is wished for, where it is another.
+    /// Desired rate of the output, if it differs from the lowest acceptable one.
     #[serde(default)]
     pub desired_frames_per_second: Option<f64>,
-    /// The greatest age of an output, where that is promised instead.
+    /// Highest acceptable age of an output, if an age is promised instead of a response time.
     #[serde(default)]
     pub age: Option<f64>,
-    /// The age that is wished for, where it is another.
+    /// Desired age of the output, if it differs from the highest acceptable one.
     #[serde(default)]
     pub desired_age: Option<f64>,
-    /// Where no time is promised: seconds for which the link is down before the local original takes over. Such links have no
-    /// Q, and none of their requests counts as late.
+    /// If no response time is promised: time in seconds for which the link must be down before the local original takes
+    /// over. Such links have no Q, and none of their requests counts as late.
     #[serde(default)]
     pub fallback_after: Option<f64>,
-    /// Q after the last request.
+    /// Q after the latest request.
     pub satisfaction: Option<f64>,
-    /// So many requests are known.
+    /// Number of requests in the statistics.
     pub requests: usize,
-    /// Of them passed T_max, or were never answered by the cloud.
+    /// Number of these requests that exceeded T_max or were never answered by the cloud.
     pub late: usize,
-    /// Of them were answered by the local original.
+    /// Number of these requests that were answered by the local original.
     pub local: usize,
-    /// Where their time went.
+    /// Response time of these requests by phase.
     pub phases: Vec<Part>,
-    /// Where most of the time of the late ones went; none when none was answered.
+    /// Phase in which late requests spent most of their time; absent if none of them was answered.
     #[serde(default)]
     pub late_in: Option<Part>,
-    /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
+    /// Number of messages that the robot discarded in the last minute because they were superseded or too old.
     #[serde(default)]
     pub unsent: u64,
-    /// The number of the last inputs that the node was given and that have a stamp.
+    /// Number of recent stamped inputs delivered to the node.
     #[serde(default)]
     pub given: usize,
-    /// Of these, the inputs that it has left out, since newer ones had come.
+    /// Number of these inputs that the node skipped in favour of newer ones.
     #[serde(default)]
     pub left_out: usize,
-    /// Inputs that the node listens to and nobody on the robot publishes.
+    /// Inputs of the node that nobody on the robot publishes.
     pub unfed: Vec<String>,
-    /// Services that the node has looked for in vain.
+    /// Services that the node looked up without success.
     #[serde(default)]
     pub unserved: Vec<String>,
-    /// Nodes of the robot with which no messages of the node pass, and why: a sentence each.
+    /// Nodes of the robot that cannot exchange messages with this node, with the reason, one sentence each.
     #[serde(default)]
     pub refused: Vec<String>,
     /// Other machines that are connected as the same robot.
@@ -135,11 +135,11 @@ pub struct Link {
     pub duplicates: Vec<String>,
 }
 
-/// A part of the response time, over the last requests.
+/// One phase of the response time, over the latest requests.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Part {
-    /// `serialise`, `up`, `queue`, `compute`, `down` or `total`.
+    /// Phase: `serialise`, `up`, `queue`, `compute`, `down` or `total`.
     pub name: String,
     /// Median.
     pub p50: f64,
@@ -150,8 +150,9 @@ pub struct Part {
 }
 
 impl Part {
-    /// Of times in any order (nearest ranks), those left out that are no numbers; none of none.
-    pub fn of(name: &str, mut times: Vec<f64>) -> Option<Part> {
+    /// Computes the statistics of samples in any order (nearest-rank percentiles), ignoring non-finite ones; `None` if
+    /// none are left.
+    pub fn from_samples(name: &str, mut times: Vec<f64>) -> Option<Part> {
         times.retain(|time| time.is_finite());
         times.sort_by(f64::total_cmp);
         let rank = |percent| qos::nearest_rank(&times, percent);
@@ -165,18 +166,18 @@ impl Part {
 }
 
 impl Link {
-    /// A part by name.
+    /// Returns the phase with the given name.
     pub fn part(&self, name: &str) -> Option<&Part> {
         self.phases.iter().find(|part| part.name == name)
     }
 
-    /// The part with the greatest median.
+    /// Returns the phase with the largest median.
     pub fn dominant(&self) -> Option<&Part> {
         dominant(&self.phases)
     }
 }
 
-/// The part with the greatest median, the whole not counted.
+/// Returns the phase with the largest median, not counting `total`.
 pub fn dominant(parts: &[Part]) -> Option<&Part> {
     parts
         .iter()
@@ -191,8 +192,8 @@ mod tests {
     #[test]
     fn parts_leave_out_what_is_no_number() {
         let times = [f64::NAN, 10.0, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0];
-        let part = Part::of("up", times.to_vec()).expect("times");
+        let part = Part::from_samples("up", times.to_vec()).expect("times");
         assert_eq!((part.p50, part.p90, part.max), (5.0, 9.0, 10.0));
-        assert_eq!(Part::of("up", vec![f64::NAN]), None);
+        assert_eq!(Part::from_samples("up", vec![f64::NAN]), None);
     }
 }

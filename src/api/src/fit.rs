@@ -1,58 +1,60 @@
-//! Whether one more servant of a service would fit.
+//! Admission forecast: room on the machine for one more servant of a service.
 
 use serde::{Deserialize, Serialize};
 
 use crate::size::Size;
 
-/// What `GET /api/v1/services/NAME/fit` answers.
+/// Response of `GET /api/v1/services/NAME/fit`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Fit {
-    /// Cores that one more would be promised.
+    /// CPU reservation of one more servant, in cores.
     pub cpus: f64,
-    /// Memory that one more would be promised.
+    /// Memory reservation of one more servant.
     pub memory: Size,
-    /// Cores that are promised to nobody.
+    /// CPU that is not reserved, in cores.
     pub free_cpus: f64,
-    /// Memory that is promised to nobody.
+    /// Memory that is not reserved.
     pub free_memory: Size,
-    /// So many wait for room.
+    /// Number of servants waiting for admission.
     pub waiting: usize,
-    /// Why nobody is admitted now, if so.
+    /// Reason why admission is currently stalled.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stalled: Option<String>,
-    /// Why it would never be admitted, if so: it is more than all that this machine has for servants.
+    /// Reason why the servant could never be admitted: its reservation exceeds the machine's total capacity for
+    /// servants.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub never: Option<String>,
-    /// As many wait as may: one more that would have to wait is refused.
+    /// True if the admission queue is full: a servant that would have to wait is refused.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub full: bool,
-    /// It would be admitted at once.
+    /// True if the servant would be admitted immediately.
     pub now: bool,
-    /// Idle servants that would be ended for it.
+    /// Idle servants that would be ended to make room.
     pub ends: Vec<String>,
-    /// Cores that would be lacking then.
+    /// CPU that would still be missing after that, in cores.
     pub lacking_cpus: f64,
-    /// Memory that would be lacking then.
+    /// Memory that would still be missing after that.
     pub lacking_memory: Size,
-    /// Who would have less of the cores than it uses now, if the new one used all that it is promised.
+    /// Servants that would have less CPU than they use now if the new servant used its whole reservation.
     pub costs: Vec<Cost>,
-    /// So many of its kind would fit, idle servants being ended for them; none: as many as one likes.
+    /// Number of additional servants of this service that fit if idle ones are ended; absent if unlimited.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub more: Option<u64>,
-    /// Cores that would be lacking for one more than these.
+    /// CPU missing for one more than these, in cores.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub beyond_cpus: f64,
-    /// Memory that would be lacking for one more than these.
+    /// Memory missing for one more than these.
     #[serde(default = "nothing")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub beyond_memory: Size,
-    /// How long requests of one more would take, as far as that is known.
+    /// Expected response time of one more servant, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
-    /// Robots share the servants of this service: so many there are. Where there is one, one more robot needs no room.
+    /// If robots share the servants of this service: the number of running servants. An additional robot needs no room
+    /// if there is at least one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<u64>,
 }
@@ -61,37 +63,37 @@ fn nothing() -> Size {
     Size(0)
 }
 
-/// How long requests would take.
+/// Expected response time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Expected {
-    /// What 19 of 20 do not exceed, seconds.
+    /// 95th percentile of the response time, in seconds.
     pub rrt: f64,
-    /// How that is known, in words.
+    /// Description of how the estimate was made.
     pub from: String,
 }
 
-/// What one more would cost another servant.
+/// Effect of one more servant on an existing one.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Cost {
-    /// Its id.
+    /// Id of the existing servant.
     pub servant: String,
-    /// Its service.
+    /// Service of the servant.
     pub service: String,
-    /// Its robot.
+    /// Robot of the servant.
     pub robot: String,
-    /// Cores that it uses now.
+    /// Current CPU usage, in cores.
     pub cpus: f64,
-    /// What it would have left of them.
+    /// CPU that would remain available to the servant, in cores.
     pub left: f64,
-    /// What 19 of 20 of its requests did not exceed lately, seconds.
+    /// Recent 95th percentile of the response time, in seconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rrt: Option<f64>,
-    /// The same with what would be left of the cores.
+    /// Estimated 95th percentile with the remaining CPU, in seconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub later: Option<f64>,
-    /// The longest that its robot accepts, seconds.
+    /// Longest response time that the robot accepts, in seconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub accepts: Option<f64>,
 }

@@ -1,4 +1,4 @@
-//! What became of the goals of actions: `GET /api/v1/servants/ID/goals`.
+//! Outcome of action goals: `GET /api/v1/servants/ID/goals`.
 
 use std::fmt;
 
@@ -6,61 +6,61 @@ use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// A goal that a servant was sent.
+/// A goal sent to a servant.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Goal {
-    /// The action.
+    /// Name of the action.
     pub action: String,
-    /// As its client has called it.
+    /// Goal id, as assigned by the client.
     pub id: String,
-    /// Who sent it, in words; or that this was not heard.
+    /// Description of the client that sent the goal, or a note that the sending was not observed.
     pub by: String,
-    /// When it was heard of: when it ended, where only that was heard.
+    /// Time when the goal was first observed; the time of its end if only that was observed.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub began: Millis,
-    /// When it ended.
+    /// Time when the goal ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub ended: Option<Millis>,
-    /// How it ended, or that it has not.
+    /// State of the goal.
     pub state: GoalState,
-    /// What the action's server said to that.
+    /// Status text of the action server.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub text: String,
 }
 
-/// The states of `actionlib_msgs/GoalStatus` in which a goal ends.
+/// Goal states, named as the terminal states of `actionlib_msgs/GoalStatus`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum GoalState {
-    /// It has not ended.
+    /// Not finished yet.
     Underway,
-    /// It was cancelled while it was worked at.
+    /// Cancelled while it was being executed.
     Preempted,
-    /// It was reached.
+    /// Reached.
     Succeeded,
-    /// The server gave up.
+    /// Aborted by the server.
     Aborted,
-    /// The server did not take it.
+    /// Rejected by the server.
     Rejected,
-    /// It was cancelled before it was worked at.
+    /// Cancelled before execution began.
     Recalled,
-    /// Nobody knows.
+    /// The outcome is unknown.
     Lost,
 }
 
 impl fmt::Display for GoalState {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(match self {
-            GoalState::Underway => "is under way",
+            GoalState::Underway => "is in progress",
             GoalState::Preempted => "was cancelled",
             GoalState::Succeeded => "succeeded",
-            GoalState::Aborted => "was given up by the server",
+            GoalState::Aborted => "was aborted by the server",
             GoalState::Rejected => "was rejected",
-            GoalState::Recalled => "was cancelled before it began",
+            GoalState::Recalled => "was cancelled before it started",
             GoalState::Lost => "was lost",
         })
     }

@@ -1,21 +1,21 @@
-//! Services that robots share: servants that answer all of them together.
+//! Shared services: groups of servants that serve several robots together.
 
 use serde::{Deserialize, Serialize};
 
-/// What a deployer decides of a service that robots share.
+/// Settings of a service whose servants are shared by robots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Shared {
-    /// Servants that there are while a robot uses the service, at least.
+    /// Minimum number of servants while any robot uses the service.
     pub min: u32,
-    /// Servants at most.
+    /// Maximum number of servants.
     pub max: u32,
-    /// A request may be carried out twice: one whose servant was lost is asked again.
+    /// True if a request may be executed twice: if its servant is lost, it is retried on another one.
     pub idempotent: bool,
-    /// Servants that work at the same call; the first answer is taken.
+    /// Number of servants that each call is sent to; the first answer is used.
     pub replicas: u32,
-    /// Calls that one servant has under way at most; the rest wait.
+    /// Maximum number of concurrent calls per servant; further calls are queued.
     pub calls: u32,
 }
 
@@ -31,27 +31,28 @@ impl Default for Shared {
     }
 }
 
-/// The servants of a revision that answer robots together, and their requests since the first of these robots came.
+/// The servants of a revision that serve robots together, with request counts since the first of these robots
+/// connected.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Group {
-    /// Of this revision.
+    /// Revision of the servants.
     pub revision: u64,
-    /// Robots that use it.
+    /// Number of robots that use the group.
     pub robots: usize,
-    /// Its servants.
+    /// Servants of the group.
     pub servants: Vec<GroupServant>,
-    /// Requests that wait for a servant.
+    /// Number of queued requests.
     pub waiting: usize,
-    /// Requests that were answered.
+    /// Number of answered requests.
     pub answered: u64,
-    /// Requests that failed since their servant was lost, or none was free in time.
+    /// Number of requests that failed because their servant was lost or none became free in time.
     pub failed: u64,
-    /// Requests that were asked again since their servant was lost.
+    /// Number of requests that were retried because their servant was lost.
     pub asked_again: u64,
-    /// Requests that a second servant worked at although the first had answered.
+    /// Number of requests that a second servant was still executing when the first answer arrived.
     pub wasted: u64,
-    /// Mean time from a request to its answer, milliseconds, of those answered lately.
+    /// Mean response time of recently answered requests, in milliseconds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mean_ms: Option<f64>,
 }
@@ -60,12 +61,12 @@ pub struct Group {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct GroupServant {
-    /// Its id.
+    /// Id of the servant.
     pub id: String,
-    /// It can be asked.
+    /// True if the servant accepts requests.
     pub ready: bool,
-    /// It ends what it works at, and is asked no more.
+    /// True if the servant finishes its current requests and accepts no more.
     pub retiring: bool,
-    /// Requests that it works at.
+    /// Number of requests in progress.
     pub under_way: usize,
 }

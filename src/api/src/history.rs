@@ -1,121 +1,123 @@
-//! What servants and the machine did in the last day: `GET /api/v1/history/servants` and `GET /api/v1/history/machine`.
+//! Metrics of servants and of the machine over the last day: `GET /api/v1/history/servants` and
+//! `GET /api/v1/history/machine`.
 //!
-//! Figures are lists of one length, one value for each time; null where none is known. A time is the end of its step. What was not sampled (the
-//! daemon was not running) is not there.
+//! Figures are arrays of equal length with one value per point in time; a value is null if unknown. A time is the end
+//! of its step. Periods that were not sampled (because the daemon was not running) are missing.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// What one servant did; it may have ended.
+/// Metrics of one servant, which may have ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServantHistory {
-    /// Its id.
+    /// Id of the servant.
     pub servant: String,
-    /// Its service.
+    /// Service of the servant.
     pub service: String,
-    /// Its robot.
+    /// Robot of the servant.
     pub robot: String,
-    /// When it was asked for.
+    /// Time when the servant was requested.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub began: Millis,
-    /// When it was looked at last.
+    /// Time of the latest sample.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub seen: Millis,
-    /// Seconds between two times.
+    /// Step between two times, in seconds.
     pub step: u32,
-    /// What it did.
+    /// Metrics over time.
     pub figures: ServantFigures,
-    /// When its robot was served by the local original instead.
+    /// Periods in which the robot was served by its local originals.
     pub local: Vec<LocalPeriod>,
 }
 
-/// Figures of a servant. Where a step is of several samples it has their mean, unless it says otherwise.
+/// Metrics of a servant. A step that covers several samples has their mean unless stated otherwise.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServantFigures {
-    /// When each step ended, milliseconds since 1970-01-01 UTC.
+    /// End of each step, in milliseconds since 1970-01-01 UTC.
     pub time: Vec<u64>,
-    /// Cores used.
+    /// CPU usage in cores.
     pub cores: Vec<Option<f64>>,
-    /// The most of them.
+    /// Maximum CPU usage in cores.
     pub cores_most: Vec<Option<f64>>,
-    /// Share of the time in which it wanted to run and had used its cores up, 0 to 1.
+    /// Fraction of time in which the servant was throttled by its CPU limit, 0 to 1.
     pub throttled: Vec<Option<f64>>,
-    /// Bytes of memory; the most.
+    /// Maximum memory usage in bytes.
     pub memory: Vec<Option<f64>>,
-    /// Response time that half of the requests did not exceed, milliseconds.
+    /// Median response time in milliseconds.
     pub p50: Vec<Option<f64>>,
-    /// Response time that 19 of 20 requests did not exceed, milliseconds; the most.
+    /// Maximum of the 95th percentile of the response time, in milliseconds.
     pub p95: Vec<Option<f64>>,
-    /// T_desire, milliseconds; the last.
+    /// Latest T_desire in milliseconds.
     pub desire: Vec<Option<f64>>,
-    /// T_max, milliseconds; the last.
+    /// Latest T_max in milliseconds.
     pub max: Vec<Option<f64>>,
-    /// Q; the least.
+    /// Minimum of Q.
     pub satisfaction: Vec<Option<f64>>,
-    /// Messages dropped in the step.
+    /// Number of messages dropped in the step.
     pub dropped: Vec<Option<f64>>,
-    /// Median of the time for encoding, milliseconds: of the robot's link with the longest response time, as the four below.
+    /// Median time for encoding in milliseconds, on the robot's link with the longest response time; the next four
+    /// figures are of the same link.
     pub serialise: Vec<Option<f64>>,
-    /// On the way to the cloud.
+    /// Median time for the transfer to the cloud, in milliseconds.
     pub up: Vec<Option<f64>>,
-    /// Waiting there for the node.
+    /// Median time queued for the node, in milliseconds.
     pub queue: Vec<Option<f64>>,
-    /// In the node.
+    /// Median time in the node, in milliseconds.
     pub compute: Vec<Option<f64>>,
-    /// On the way back.
+    /// Median time for the transfer back to the robot, in milliseconds.
     pub down: Vec<Option<f64>>,
 }
 
-/// A time in which a robot's node was served by its local original.
+/// A period in which a node of the robot was served by its local original.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct LocalPeriod {
-    /// The node.
+    /// Name of the node.
     pub node: String,
-    /// When it began.
+    /// Start of the period.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub began: Millis,
-    /// When it ended; none: it has not.
+    /// End of the period; absent if it has not ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub ended: Option<Millis>,
-    /// Why, in the robot's words.
+    /// Reason as reported by the robot.
     pub why: String,
 }
 
-/// What the machine did.
+/// Metrics of the machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct MachineHistory {
-    /// Seconds between two times.
+    /// Step between two times, in seconds.
     pub step: u32,
-    /// What it did.
+    /// Metrics over time.
     pub figures: MachineFigures,
 }
 
-/// Figures of the machine. Where a step is of several samples it has their mean, unless it says otherwise.
+/// Metrics of the machine. A step that covers several samples has their mean unless stated otherwise.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct MachineFigures {
-    /// When each step ended, milliseconds since 1970-01-01 UTC.
+    /// End of each step, in milliseconds since 1970-01-01 UTC.
     pub time: Vec<u64>,
-    /// Cores that all servants together used.
+    /// CPU usage of all servants together, in cores.
     pub cores: Vec<Option<f64>>,
-    /// The most of them.
+    /// Maximum CPU usage of all servants together, in cores.
     pub cores_most: Vec<Option<f64>>,
-    /// Cores that are promised.
+    /// Reserved CPU in cores.
     pub promised: Vec<Option<f64>>,
-    /// Bytes of memory that all servants together had; the most.
+    /// Maximum memory usage of all servants together, in bytes.
     pub memory: Vec<Option<f64>>,
-    /// Percent of the time in which some thread of them waited for a core.
+    /// Percentage of time in which some thread of the servants waited for CPU.
     pub cpu_waits: Vec<Option<f64>>,
-    /// For memory.
+    /// Percentage of time in which some thread of the servants waited for memory.
     pub memory_waits: Vec<Option<f64>>,
-    /// For a disk.
+    /// Percentage of time in which some thread of the servants waited for disk I/O.
     pub io_waits: Vec<Option<f64>>,
-    /// Servants; the most.
+    /// Maximum number of servants.
     pub servants: Vec<Option<f64>>,
 }

@@ -1,158 +1,159 @@
-//! What a robot sees of a service: names and types. (The definitions' texts are served apart, at
+//! Interface of a service as seen by a robot: names and types. (The texts of the definitions are served separately, at
 //! `/api/v1/services/NAME/interface`.)
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Topics, services, actions and parameters.
+/// Topics, services, actions and parameters of a service.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Interface {
-    /// Topics, by name.
+    /// Topics, sorted by name.
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub topics: Vec<Topic>,
-    /// ROS services, by name.
+    /// ROS services, sorted by name.
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub services: Vec<Service>,
-    /// Actions, by name.
+    /// Actions, sorted by name.
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub actions: Vec<Action>,
-    /// Parameters, by name.
+    /// Parameters, sorted by name.
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub parameters: Vec<Parameter>,
-    /// ROS services, and actions of ROS 2, that the package uses and does not serve, by name.
+    /// ROS services, and actions of ROS 2, that the package uses and does not provide, sorted by name.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub needs: Vec<Need>,
-    /// Nodes that have a lifecycle (ROS 2), by name; the services of it are not among `services`.
+    /// Lifecycle nodes (ROS 2), sorted by name; their lifecycle services are not listed in `services`.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub lifecycle: Vec<String>,
-    /// Inputs that are answered by outputs, as stubs are told.
+    /// Request pairs: inputs and the outputs that answer them, as configured in stubs.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub requests: Vec<Request>,
 }
 
-/// An input, and the outputs by whose messages it is answered.
+/// An input and the outputs whose messages answer it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Request {
-    /// The node; empty where it is not known.
+    /// Name of the node; empty if unknown.
     pub node: String,
-    /// Absolute name of the input.
+    /// Absolute name of the input topic.
     pub input: String,
-    /// Absolute names of the outputs; the time of the first one counts.
+    /// Absolute names of the output topics; the response time is that of the first one.
     pub outputs: Vec<String>,
-    /// By what an answer is recognised: `stamp`, or `arrival` where the next message is the answer.
+    /// How an answer is matched: `stamp`, or `arrival` if the next message is the answer.
     pub by: String,
-    /// Why it is these: `stated`, `watched` (at the push), `alone` (the node has no others) or `guessed`.
+    /// How the pair was determined: `stated`, `watched` (observed at the push), `alone` (the node has no other topics)
+    /// or `guessed`.
     pub reason: String,
 }
 
-/// A ROS service, or an action of ROS 2, that a robot should serve.
+/// A ROS service, or an action of ROS 2, that the robot must provide.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Need {
     /// Absolute name.
     pub name: String,
-    /// Nodes of the package that look for it.
+    /// Nodes of the package that use it.
     pub nodes: Vec<String>,
 }
 
-/// From the package's point of view.
+/// Direction from the package's point of view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Direction {
-    /// The package subscribes: a robot publishes.
+    /// The package subscribes; a robot publishes.
     Input,
-    /// The package publishes: a robot subscribes.
+    /// The package publishes; a robot subscribes.
     Output,
 }
 
-/// One end of a topic.
+/// A topic of the package.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Topic {
     /// Absolute name, such as `/image`.
     pub name: String,
-    /// `package/Type`, of ROS 2 `package/msg/Type`.
+    /// Type: `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of the type, of ROS 2 its type hash.
+    /// MD5 of the type (ROS 1) or its type hash (ROS 2).
     pub md5: String,
-    /// Which end the package holds.
+    /// Direction from the package's point of view.
     pub direction: Direction,
-    /// Newcomers get the last message.
+    /// True if new subscribers get the last message.
     pub latched: bool,
-    /// Registered only while an output is subscribed to.
+    /// True if the package registers the topic only while one of its outputs has subscribers.
     pub lazy: bool,
-    /// What the package's nodes offer, or ask for, where ends tell it (ROS 2).
+    /// QoS offered or requested by the package's nodes, if known (ROS 2).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub qos: Option<Qos>,
 }
 
-/// Quality of service of a topic. Times are seconds; none where that is not said.
+/// Quality of service of a topic. Times are in seconds; absent if unspecified.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Qos {
-    /// Whether messages may be lost on the way.
+    /// Reliability policy.
     pub reliability: Reliability,
-    /// What newcomers among the subscribers are given.
+    /// Durability policy.
     pub durability: Durability,
-    /// The longest time between two messages.
+    /// Maximum time between two messages.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deadline: Option<f64>,
-    /// After so long a message is of no use.
+    /// Time after which a message expires.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lifespan: Option<f64>,
-    /// Who says that a publisher is alive.
+    /// Liveliness policy.
     pub liveliness: Liveliness,
-    /// Within which time.
+    /// Liveliness lease duration.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lease: Option<f64>,
 }
 
-/// Whether messages may be lost on the way.
+/// Reliability policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Reliability {
-    /// Sent once.
+    /// Messages may be lost.
     BestEffort,
-    /// Sent again until they have come.
+    /// Lost messages are retransmitted.
     #[default]
     Reliable,
 }
 
-/// What newcomers are given.
+/// Durability policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Durability {
-    /// What is published from then on.
+    /// New subscribers get only messages published after they subscribe.
     #[default]
     Volatile,
-    /// Also what was published last.
+    /// New subscribers also get the latest messages published earlier.
     TransientLocal,
 }
 
-/// Who says that a publisher is alive.
+/// Liveliness policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Liveliness {
-    /// ROS, for as long as its node is there.
+    /// The publisher is alive as long as its node is.
     #[default]
     Automatic,
-    /// What it publishes.
+    /// The publisher is alive as long as it publishes.
     ManualByTopic,
 }
 
-/// In the words of ROS 2's tools; of liveliness and times what is unusual.
+/// Writes the policies as ROS 2's tools do; liveliness and times only if they are not the default.
 impl fmt::Display for Qos {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self.reliability {
@@ -186,23 +187,23 @@ impl fmt::Display for Qos {
 pub struct Service {
     /// Absolute name.
     pub name: String,
-    /// `package/Type`.
+    /// Type: `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// The serving node.
+    /// Node that provides the service.
     pub node: String,
 }
 
-/// An action.
+/// A ROS action.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Action {
     /// Absolute name.
     pub name: String,
-    /// `package/Name`.
+    /// Type: `package/Name`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// The serving node.
+    /// Node that provides the action.
     pub node: String,
 }
 
@@ -210,55 +211,55 @@ pub struct Action {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Parameter {
-    /// Absolute name; of a node's own parameter the node's name, a slash, and what the node calls it.
+    /// Absolute name. For a node's own parameter: the node's name, a slash, and the parameter's name in the node.
     pub name: String,
-    /// The node whose own it is (ROS 2); none where nodes share their parameters.
+    /// Node that owns the parameter (ROS 2); absent if nodes share their parameters.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<String>,
-    /// Its value when the interface was found.
+    /// Value when the interface was recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<serde_json::Value>,
-    /// What its node says of it.
+    /// Descriptor given by the node.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<Descriptor>,
 }
 
-/// What a node says of one of its parameters.
+/// Descriptor of a node's parameter.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Descriptor {
-    /// What it holds: `bool`, `integer`, `double`, `string` or a list of those, such as `double_array`; empty: nothing yet.
+    /// Type: `bool`, `integer`, `double`, `string` or an array of these, such as `double_array`; empty if not set.
     #[serde(rename = "type")]
     pub kind: String,
-    /// For people; may be empty.
+    /// Human-readable description; may be empty.
     pub description: String,
-    /// What else its value must be, for people; may be empty.
+    /// Human-readable additional constraints; may be empty.
     pub constraints: String,
-    /// It keeps the value that it was started with.
+    /// True if the parameter cannot be changed after the node has started.
     pub read_only: bool,
-    /// It may come to hold what is of another type.
+    /// True if the parameter may change its type.
     pub dynamic_typing: bool,
-    /// Between which numbers its value is.
+    /// Range of allowed values.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub range: Option<Range>,
 }
 
-/// The numbers that a parameter may hold, the ends included.
+/// Range of allowed values, bounds included.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Range {
-    /// The smallest; none where there is no bound.
+    /// Minimum; absent if unbounded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<f64>,
-    /// The largest; none where there is no bound.
+    /// Maximum; absent if unbounded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub to: Option<f64>,
-    /// The distance of one to the next, counted from the smallest; none where all between the ends will do.
+    /// Step between allowed values, counted from the minimum; absent if all values in the range are allowed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub step: Option<f64>,
 }
 
-/// For people: `double, 0 to 2.5, read only: m/s`.
+/// Writes a human-readable form, such as `double, 0 to 2.5, read only: m/s`.
 impl fmt::Display for Descriptor {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut words = vec![self.kind.clone()];
@@ -268,15 +269,17 @@ impl fmt::Display for Descriptor {
         words.push(self.constraints.clone());
         words.retain(|word| !word.is_empty());
         f.write_str(&words.join(", "))?;
-        match self.description.is_empty() {
-            true => Ok(()),
-            false if words.is_empty() => f.write_str(&self.description),
-            false => write!(f, ": {}", self.description),
+        if self.description.is_empty() {
+            Ok(())
+        } else if words.is_empty() {
+            f.write_str(&self.description)
+        } else {
+            write!(f, ": {}", self.description)
         }
     }
 }
 
-/// For people; empty where there is no bound.
+/// Writes a human-readable form; empty if unbounded.
 impl fmt::Display for Range {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match (self.from, self.to) {

@@ -1,8 +1,8 @@
-//! What daemon, command line and web page say to each other under `/api/v1`: plain serde types, no behaviour
-//! beyond parsing and printing sizes. Every time is in milliseconds since 1970; every size in bytes.
+//! Types of the HTTP API under `/api/v1`, shared by the daemon, the command line and the web page: plain serde types
+//! without behaviour, except for parsing and printing sizes. Times are in milliseconds since 1970, sizes in bytes.
 //!
-//! A request is answered by one of these types as JSON, by a stream of them as JSON lines ([`NDJSON`]), or by
-//! a [`problem::Problem`] with the HTTP status that it names.
+//! A response is one of these types as JSON, a stream of them as JSON lines ([`NDJSON`]), or a [`problem::Problem`]
+//! with the HTTP status that it contains.
 
 pub mod access;
 pub mod calibration;
@@ -65,7 +65,7 @@ pub const NDJSON: &str = "application/x-ndjson";
 /// Milliseconds since 1970-01-01 UTC.
 pub type Millis = u64;
 
-/// Schemas of types that bear no name of their own.
+/// Schemas of types that have no name of their own.
 #[cfg(feature = "schema")]
 pub mod schema {
     /// Milliseconds since 1970-01-01 UTC.

@@ -1,42 +1,42 @@
-//! What a servant may use, and what it uses.
+//! Resource limits and resource usage of servants.
 
 use serde::{Deserialize, Serialize};
 
 use crate::cpuset::CpuSet;
 use crate::size::Size;
 
-/// Hard limits of one servant; none: the daemon's default, or not limited (in `enforced`).
+/// Hard resource limits of a servant. An absent limit is the daemon's default, or means unlimited (in `enforced`).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Limits {
-    /// Cores, such as 1.5.
+    /// CPU limit in cores, such as 1.5.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpus: Option<f64>,
-    /// Relative share when cores are scarce, 1 to 10000 (100 by default).
+    /// Relative CPU share under contention, 1 to 10000 (default: 100).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpu_weight: Option<u64>,
-    /// Memory, swap not included.
+    /// Memory limit, without swap.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Size>,
-    /// Memory above which it is slowed down and made to give back, before it is killed at `memory` (cgroup v2 only).
+    /// Memory above which the servant is throttled and reclaimed, before it is killed at `memory` (cgroup v2 only).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_high: Option<Size>,
-    /// Processes and threads.
+    /// Maximum number of processes and threads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pids: Option<u64>,
-    /// Bytes a second read from the disk that holds the images.
+    /// Read bandwidth on the disk with the images, in bytes per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub io_read: Option<Size>,
-    /// Bytes a second written to it.
+    /// Write bandwidth on the disk with the images, in bytes per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub io_write: Option<Size>,
-    /// The cores it may run on, such as `0-3,6`.
+    /// CPUs that the servant may run on, such as `0-3,6`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpuset: Option<CpuSet>,
 }
 
-/// Limits made of two, field by field: each by a function of two options, that of cores to run on by another if one is given.
+/// Combines two sets of limits field by field with a function of two options; the CPU set with another one, if given.
 macro_rules! field_by_field {
     ($one:expr, $other:expr, $of:path) => {
         field_by_field!($one, $other, $of, $of)
@@ -56,37 +56,37 @@ macro_rules! field_by_field {
 }
 
 impl Limits {
-    /// These limits, with `default` where nothing is said.
+    /// Returns these limits, with those of `default` where absent.
     pub fn or(self, default: Limits) -> Limits {
         field_by_field!(self, default, Option::or)
     }
 
-    /// Those of `other` where these say something.
+    /// Returns the limits of `other` that are also set in `self`.
     pub fn and(self, other: Limits) -> Limits {
         field_by_field!(self, other, Option::and)
     }
 
-    /// These limits, without those that `other` has, too.
-    pub fn without(self, other: Limits) -> Limits {
-        fn unlike<T: PartialEq>(one: Option<T>, other: Option<T>) -> Option<T> {
+    /// Returns these limits without those that are equal in `other`.
+    pub fn without_equal(self, other: Limits) -> Limits {
+        fn filter_different<T: PartialEq>(one: Option<T>, other: Option<T>) -> Option<T> {
             one.filter(|one| other.as_ref() != Some(one))
         }
-        field_by_field!(self, other, unlike)
+        field_by_field!(self, other, filter_different)
     }
 
-    /// The smallest limits that are enough for both; the cores that these name, if any, to run on.
-    pub fn most(self, other: Limits) -> Limits {
-        fn more<T: PartialOrd>(one: Option<T>, other: Option<T>) -> Option<T> {
+    /// Returns the smallest limits that satisfy both; the CPU set of `self` takes precedence.
+    pub fn combine_max(self, other: Limits) -> Limits {
+        fn larger<T: PartialOrd>(one: Option<T>, other: Option<T>) -> Option<T> {
             match (one, other) {
                 (Some(one), Some(other)) => Some(if other > one { other } else { one }),
                 (one, other) => one.or(other),
             }
         }
-        field_by_field!(self, other, more, Option::or)
+        field_by_field!(self, other, larger, Option::or)
     }
 
-    /// What is limited: the name of the flag that sets it, and its value as written there.
-    pub fn named(&self) -> impl Iterator<Item = (&'static str, String)> {
+    /// Returns the limits that are set: the name of the corresponding flag and its value.
+    pub fn flag_values(&self) -> impl Iterator<Item = (&'static str, String)> {
         fn text(value: Option<impl ToString>) -> Option<String> {
             value.map(|value| value.to_string())
         }
@@ -105,55 +105,55 @@ impl Limits {
     }
 }
 
-/// The most that a robot may ask for.
+/// Upper limits on what robots may request.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Caps {
-    /// Cores.
+    /// Maximum CPU in cores.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpus: Option<f64>,
-    /// Memory.
+    /// Maximum memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Size>,
 }
 
 impl Caps {
-    /// Whether there are none.
+    /// Returns whether there are no caps.
     pub fn is_empty(&self) -> bool {
         *self == Caps::default()
     }
 }
 
-/// What a servant has used, as the kernel counts it.
+/// Resource usage of a servant, as accounted by the kernel.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Usage {
-    /// Microseconds of processor time so far.
+    /// CPU time so far, in microseconds.
     pub cpu_usec: u64,
-    /// Memory now.
+    /// Current memory usage in bytes.
     pub memory: u64,
-    /// Processes and threads now.
+    /// Current number of processes and threads.
     pub pids: u64,
-    /// Processes killed for want of memory so far.
+    /// Number of processes killed by the OOM killer so far.
     pub oom_kills: u64,
-    /// Microseconds so far in which it wanted to run and had used its cores up.
+    /// Time throttled by the CPU limit so far, in microseconds.
     #[serde(default)]
     pub throttled_usec: u64,
-    /// How much it waits for what others use; none where the kernel does not tell.
+    /// Resource pressure; absent if the kernel does not report it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pressure: Option<Pressure>,
 }
 
-/// Percent of the last ten seconds in which some thread waited (`some avg10` of pressure stall information).
+/// Percentage of the last ten seconds in which some thread was stalled (`some avg10` of pressure stall information).
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Pressure {
-    /// For a core.
+    /// Stalled on CPU.
     pub cpu: f64,
-    /// For memory.
+    /// Stalled on memory.
     pub memory: f64,
-    /// For a disk.
+    /// Stalled on I/O.
     pub io: f64,
 }
 
@@ -181,9 +181,12 @@ mod tests {
         assert_eq!(merged(few.or(more)), (one, memory, nine, first));
         let shared = (more.cpus, None, None, more.cpuset);
         assert_eq!(merged(few.and(more)), shared);
-        assert_eq!(merged(few.most(more)), (more.cpus, memory, nine, first));
-        assert_eq!(merged(few.without(few)), (None, None, None, None));
-        let named: Vec<_> = few.or(more).named().map(|(name, _)| name).collect();
+        assert_eq!(
+            merged(few.combine_max(more)),
+            (more.cpus, memory, nine, first)
+        );
+        assert_eq!(merged(few.without_equal(few)), (None, None, None, None));
+        let named: Vec<_> = few.or(more).flag_values().map(|(name, _)| name).collect();
         assert_eq!(named, ["cpus", "cpuset", "memory", "pids"]);
     }
 }

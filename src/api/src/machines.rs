@@ -1,126 +1,127 @@
-//! Pairings of robots: `/api/v1/pairings`, and what robots ask themselves: `/api/v1/pair`, `/api/v1/renew`.
+//! Pairing of robots: `/api/v1/pairings`, and the requests made by robots: `/api/v1/pair`, `/api/v1/renew`.
 
 use access::Glob;
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// A robot to pair (`POST /api/v1/pairings`).
+/// Request to pair a robot (`POST /api/v1/pairings`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewPairing {
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// For which services, as patterns.
+    /// Service name patterns that the robot gets access to.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// Classes of the configuration that it may name, as patterns.
+    /// Patterns of the configured classes that the robot may request.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<String>))]
     pub classes: Vec<Glob>,
-    /// Seconds for which the code is good; 15 minutes where it is not said.
+    /// Lifetime of the pairing code in seconds (default: 900).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lifetime: Option<u64>,
-    /// Host and port by which the robot reaches the daemon; as whoever asks reached it, where it is not said.
+    /// Host and port under which the robot reaches the daemon (default: the address of this request).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
-    /// The lab's own authority signs the robot's certificates: it is paired at once, without a code.
+    /// True if the robot's certificate is issued by the site's own CA: the robot is then paired at once, without a
+    /// code.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub own_certificate: bool,
 }
 
-/// A pairing that was begun. Its code is told once, in the line.
+/// A new pairing. The pairing code is returned only once, in the line.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct PairingMade {
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// What to give to `cloudroid-stub pair` on the robot; none where it has a certificate of the lab's own authority.
+    /// Argument for `cloudroid-stub pair` on the robot; absent if the robot has a certificate of the site's own CA.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub line: Option<String>,
-    /// When the code ends.
+    /// Expiry time of the pairing code.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub expires: Option<Millis>,
 }
 
-/// A robot that is paired, or for which a code waits (`GET /api/v1/pairings`).
+/// A paired robot, or a robot with a pending pairing code (`GET /api/v1/pairings`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Pairing {
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// For which services, as patterns.
+    /// Service name patterns that the robot has access to.
     #[cfg_attr(feature = "schema", schema(value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// Classes of the configuration that it may name, as patterns.
+    /// Patterns of the configured classes that the robot may request.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true, value_type = Vec<String>))]
     pub classes: Vec<Glob>,
-    /// What became of it.
+    /// State of the pairing.
     pub state: PairingState,
-    /// The lab's own authority signs its certificates.
+    /// True if the robot's certificates are issued by the site's own CA.
     pub own_certificate: bool,
-    /// When it, or its code, was made.
+    /// Creation time of the pairing, or of its code.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
-    /// When its newest certificate, or its code, ends.
+    /// Expiry time of the latest certificate, or of the code.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub expires: Option<Millis>,
-    /// When the robot came last, to the minute.
+    /// Last connection of the robot, to the minute.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub last_used: Option<Millis>,
 }
 
-/// What became of a pairing.
+/// State of a pairing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum PairingState {
-    /// Its code was not used yet.
+    /// The code has not been used yet.
     Waiting,
     /// The robot is paired.
     Paired,
 }
 
-/// What a robot shows to be paired (`POST /api/v1/pair`).
+/// Pairing request of a robot (`POST /api/v1/pair`).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Pair {
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// The pairing code.
+    /// Pairing code.
     pub code: String,
-    /// A request for a certificate: PKCS #10 (RFC 2986) in PEM.
+    /// Certificate signing request: PKCS #10 (RFC 2986) in PEM.
     pub request: String,
 }
 
-/// What a robot asks another certificate with (`POST /api/v1/renew`).
+/// Certificate renewal request of a robot (`POST /api/v1/renew`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Renew {
-    /// A request for a certificate of the key that was paired: PKCS #10 in PEM.
+    /// Certificate signing request for the paired key: PKCS #10 in PEM.
     pub request: String,
 }
 
-/// A robot's certificate.
+/// Certificate of a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct RobotCertificate {
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// The certificate, in PEM.
+    /// Certificate in PEM.
     pub certificate: String,
-    /// When it was made, by the daemon's clock.
+    /// Time of issue, by the daemon's clock.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub issued: Millis,
-    /// When it ends, by the daemon's clock.
+    /// Expiry time, by the daemon's clock.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub expires: Millis,
 }

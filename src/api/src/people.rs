@@ -1,121 +1,121 @@
-//! People: their accounts, and sessions of the page. `/api/v1/session`, `/api/v1/sessions`, `/api/v1/accounts`.
+//! User accounts and sessions of the web page: `/api/v1/session`, `/api/v1/sessions`, `/api/v1/accounts`.
 
 use access::{Glob, Role};
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// The header by which the page shows that it has read [`Session::csrf`], which pages of other sites cannot. Each request that
-/// changes something and shows a cookie needs it.
+/// Header in which the web page returns [`Session::csrf`], which pages of other sites cannot read. Required for each
+/// state-changing request that is authenticated by a cookie.
 pub const CSRF_HEADER: &str = "x-csrf-token";
 
-/// Name and password (`POST /api/v1/session`).
+/// Credentials (`POST /api/v1/session`).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct SignIn {
-    /// The account's name.
+    /// Account name.
     pub name: String,
-    /// Its password.
+    /// Password.
     pub password: String,
 }
 
-/// Who is signed in (`GET /api/v1/session`).
+/// The current session (`GET /api/v1/session`).
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Session {
-    /// Who; none: nobody.
+    /// Name of the signed-in user; absent if nobody is signed in.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// Its role.
+    /// Role of the user.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub role: Option<Role>,
-    /// What requests of this session that change something show in `X-CSRF-Token`.
+    /// Token that state-changing requests of this session must send in `X-CSRF-Token`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub csrf: Option<String>,
-    /// When the session ends at the latest.
+    /// Latest time at which the session ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub expires: Option<Millis>,
-    /// Whether anybody needs to say who it is here.
+    /// True if authentication is required.
     pub needed: bool,
-    /// Whether there are accounts with passwords.
+    /// True if accounts with passwords exist.
     pub accounts: bool,
-    /// An identity provider that knows people, too.
+    /// Identity provider, if one is configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provider: Option<ProviderLink>,
 }
 
-/// Where people sign in by an identity provider.
+/// Sign-in through an identity provider.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ProviderLink {
-    /// As people know it.
+    /// Display name of the provider.
     pub name: String,
-    /// Where a browser goes to.
+    /// Path to which the browser navigates to sign in.
     pub path: String,
 }
 
-/// A session of somebody (`GET /api/v1/sessions`).
+/// A session (`GET /api/v1/sessions`).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct SessionLine {
-    /// Its number, never given twice.
+    /// Session number; never reused.
     pub id: i64,
-    /// Whose.
+    /// Name of the user.
     pub name: String,
-    /// In which role.
+    /// Role of the user.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub role: Role,
-    /// From where it was begun.
+    /// Origin of the session.
     pub from: String,
-    /// When it was begun.
+    /// Time when the session began.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
-    /// When it was used last.
+    /// Last use.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub last_used: Millis,
-    /// When it ends at the latest.
+    /// Latest time at which the session ends.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub expires: Millis,
 }
 
-/// An account to make (`POST /api/v1/accounts`).
+/// Request to create an account (`POST /api/v1/accounts`).
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct NewAccount {
-    /// The person's name, by which rules and records know it.
+    /// Name of the user, used in rules and audit records.
     pub name: String,
-    /// At least 12 characters.
+    /// Password; at least 12 characters.
     pub password: String,
-    /// What it is for: `admin`, `operator`, `deployer` or `viewer`.
+    /// Role: `admin`, `operator`, `deployer` or `viewer`.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub role: Role,
-    /// For which services, as patterns; needed for deployers and viewers.
+    /// Service name patterns that the user gets access to; required for deployers and viewers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<String>))]
     pub services: Vec<Glob>,
 }
 
-/// What to change of an account (`PATCH /api/v1/accounts/{name}`). Each change ends all sessions of the person.
+/// Changes to an account (`PATCH /api/v1/accounts/{name}`). Every change ends all sessions of the user.
 #[derive(Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields)]
 pub struct AccountChange {
-    /// Another password.
+    /// New password.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub password: Option<String>,
-    /// Another role, with the services that it is for.
+    /// New role, given together with its services.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub role: Option<Role>,
-    /// For which services, as patterns.
+    /// Service name patterns of the new role.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// Nobody may sign in, or somebody may again.
+    /// True if sign-in is disabled.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub disabled: Option<bool>,
 }
@@ -124,26 +124,26 @@ pub struct AccountChange {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Account {
-    /// The person's name.
+    /// Name of the user.
     pub name: String,
-    /// What it is for.
+    /// Role of the user.
     #[cfg_attr(feature = "schema", schema(value_type = String))]
     pub role: Role,
-    /// For which services, as patterns.
+    /// Service name patterns that the user has access to.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true, value_type = Vec<String>))]
     pub services: Vec<Glob>,
-    /// When it was made.
+    /// Creation time.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
-    /// When somebody last signed in by it.
+    /// Last sign-in.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub last_login: Option<Millis>,
-    /// Since when nobody may sign in by it.
+    /// Time when sign-in was disabled.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub disabled: Option<Millis>,
-    /// Sessions that it has.
+    /// Number of open sessions.
     pub sessions: usize,
 }

@@ -1,4 +1,4 @@
-//! Why a request was refused: RFC 9457 problem details, with the next step to take.
+//! Errors as RFC 9457 problem details, with a suggested next step.
 
 use std::fmt;
 
@@ -7,29 +7,29 @@ use serde::{Deserialize, Serialize};
 /// Media type of a [`Problem`].
 pub const PROBLEM_JSON: &str = "application/problem+json";
 
-/// A refusal that names the thing and the next step.
+/// An error response: what failed, and the next step.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Problem {
-    /// Which kind of problem, as a URN such as `urn:cloudroid:unknown-service`.
+    /// Kind of problem, as a URN such as `urn:cloudroid:unknown-service`.
     #[serde(rename = "type")]
     pub kind: String,
-    /// The kind in a few words.
+    /// Short name of the kind.
     pub title: String,
     /// HTTP status.
     pub status: u16,
-    /// What happened this time.
+    /// Description of this occurrence.
     pub detail: String,
-    /// What to do about it.
+    /// Suggested next step.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<String>,
-    /// Where a name was not found: the names that exist.
+    /// If a name was not found: the names that exist.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exists: Vec<String>,
-    /// Seconds after which to try again, where that helps.
+    /// Seconds after which to retry, if a retry may help.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub retry_after: Option<u64>,
-    /// The last lines of the log that explain it.
+    /// Last lines of the log that explain the error.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub log: Vec<String>,
 }

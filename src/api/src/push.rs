@@ -1,4 +1,4 @@
-//! Pushing a package: options in the query, an archive in the body, a stream of events back.
+//! Pushing a package: options in the query, an archive in the body, a stream of events as the response.
 
 use std::collections::BTreeMap;
 
@@ -11,16 +11,15 @@ use crate::problem::Problem;
 use crate::service::ServiceDetail;
 use crate::sla::Sla;
 
-/// What to make of the archive (`POST /api/v1/push?options=JSON`; the body is a tar, gzipped or not, and empty
-/// with `apt`).
+/// Options of a push (`POST /api/v1/push?options=JSON`; the body is a tar archive, gzipped or not; empty with `apt`).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PushOptions {
-    /// The service's name; the package's by default.
+    /// Name of the service (default: the name of the package).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
-    /// A packaged ROS package instead of an archive.
+    /// ROS package of the distribution to publish instead of an archive.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub apt: Option<String>,
     /// Name of the base image definition.
@@ -29,129 +28,129 @@ pub struct PushOptions {
     /// Launch file, relative to the package, or its bare name.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub launch: Option<String>,
-    /// Executables to run, instead of a launch file: `EXE` or `PACKAGE/EXE`, with arguments behind it as a shell would
-    /// split them.
+    /// Executables to run instead of a launch file: `EXE` or `PACKAGE/EXE`, followed by arguments that are split as by
+    /// a shell.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub nodes: Vec<String>,
-    /// Private parameters of the nodes (`~K`), or global ones when they begin with `/`.
+    /// Private parameters of the nodes (`~K`), or global ones if they begin with `/`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub params: BTreeMap<String, serde_json::Value>,
     /// Arguments of the launch file.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub args: BTreeMap<String, String>,
-    /// Names to remap, from → to.
+    /// Name remappings, from → to.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub remaps: BTreeMap<String, String>,
-    /// What to add to the interface, where the push cannot find all of it: the text of a TOML or JSON file.
+    /// Additions to the interface, where the push cannot find all of it: the text of a TOML or JSON file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub interface: Option<String>,
-    /// Dependencies by hand: rosdep key or ROS package → Debian package.
+    /// Manual dependency mapping: rosdep key or ROS package → Debian package.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub map: BTreeMap<String, String>,
-    /// Which input is answered by which output, instead of what the push finds: `INPUT=OUTPUT`, or as a robot's
-    /// stub.toml has it, `INPUT -> OUTPUT, OUTPUT by arrival`.
+    /// Request pairs that override those found by the push: `INPUT=OUTPUT`, or as in a robot's stub.toml,
+    /// `INPUT -> OUTPUT, OUTPUT by arrival`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub requests: Vec<String>,
-    /// Debian or ROS packages to add, for compiling and for running.
+    /// Additional Debian or ROS packages, for the build and at run time.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub with: Vec<String>,
-    /// Limits of a servant; those given are also reserved for it.
+    /// Resource limits of a servant; limits that are given are also reserved.
     pub limits: Limits,
-    /// The most that robots may ask for.
+    /// Upper limits on what robots may request.
     #[serde(skip_serializing_if = "Caps::is_empty")]
     pub caps: Caps,
-    /// What stubs promise where their robot says nothing: `rrt` and `max_rrt` alone.
+    /// Default SLA of stubs whose robot states none; only `rrt` and `max_rrt`.
     #[serde(skip_serializing_if = "Sla::is_empty")]
     pub sla: Sla,
-    /// What a servant is given beyond its container.
+    /// Access to devices, volumes and hosts beyond the container.
     #[serde(skip_serializing_if = "Grants::is_empty")]
     pub grants: Grants,
-    /// Answers depend on earlier requests: robots' local originals answer only while there is no link.
+    /// True if answers depend on earlier requests: local originals then answer only while the link is down.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub stateful: bool,
-    /// They do not, says the deployer: the push does not ask.
+    /// True if the deployer declares the service stateless: the push then does not ask.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub stateless: bool,
-    /// Robots share its servants; none: each robot has a servant of its own.
+    /// Settings for servants shared by robots; absent if each robot has a servant of its own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shared: Option<Shared>,
-    /// On which terms it takes the place of the revision before; at once by default.
+    /// Rollout terms (default: the revision replaces the previous one at once).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rollout: Option<crate::rollout::RolloutTerms>,
-    /// What was pushed, in words, kept with the revision.
+    /// Human-readable description of what was pushed, stored with the revision.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub source: String,
 }
 
 impl PushOptions {
-    /// Reads [`requests`](Self::requests).
+    /// Parses [`requests`](Self::requests).
     ///
     /// # Errors
-    /// What is wrong with one of them, and how it is written.
-    pub fn read_requests(&self) -> Result<Vec<qos::Pair>, String> {
+    /// Returns a description of the first malformed request pair, with the expected format.
+    pub fn parse_requests(&self) -> Result<Vec<qos::TopicPair>, String> {
         self.requests
             .iter()
-            .map(|text| read_request(text))
+            .map(|text| parse_request(text))
             .collect()
     }
 }
 
-/// Reads a request as `--request` has it.
+/// Parses a request pair in the format of `--request`.
 ///
 /// # Errors
-/// What is wrong with it, and how it is written.
-pub fn read_request(text: &str) -> Result<qos::Pair, String> {
+/// Returns a description of the error, with the expected format.
+pub fn parse_request(text: &str) -> Result<qos::TopicPair, String> {
     match text.split_once('=') {
         Some((input, outputs)) if !text.contains("->") => format!("{input} -> {outputs}").parse(),
         _ => text.parse(),
     }
 }
 
-/// The title of the last step: once it has begun nothing cancels the push.
+/// Title of the last step, which cannot be cancelled.
 pub const PUBLISHING: &str = "publishing";
 
-/// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
+/// One line of the response. The last line is `done` or `error`; a stream that ends otherwise was truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum PushEvent {
     /// A new step begins.
     Step {
-        /// What is done now.
+        /// Title of the step.
         title: String,
     },
-    /// One line of the build log.
+    /// A line of the build log.
     Log {
-        /// Without the line end.
+        /// The line, without its line terminator.
         line: String,
     },
-    /// How far the step is.
+    /// Progress of the current step.
     Progress {
-        /// What is counted, such as `packages`, or `bytes`.
+        /// Unit that is counted, such as `packages` or `bytes`.
         unit: String,
-        /// Number of those that are done.
+        /// Number of units done.
         done: u64,
-        /// Number of all, where it is known.
+        /// Total number of units, if known.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         total: Option<u64>,
     },
-    /// Something to know that is no failure.
+    /// A warning; the push continues.
     Warning {
         /// Text of the warning.
         message: String,
     },
-    /// Published.
+    /// The service is published.
     Done {
-        /// The service as it is now.
+        /// The published service.
         service: Box<ServiceDetail>,
-        /// How its layers came to be.
+        /// Layers of the image.
         layers: Vec<Layer>,
-        /// Milliseconds from the first byte to here.
+        /// Duration of the push in milliseconds, from the first byte.
         took: u64,
     },
-    /// Not published; an earlier revision keeps serving.
+    /// The push failed; an earlier revision remains in service.
     Error {
-        /// The reason, and what to do.
+        /// Reason of the failure, and the next step.
         problem: Problem,
     },
 }
@@ -160,13 +159,13 @@ pub enum PushEvent {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Layer {
-    /// `base`, `dependencies` or `package`.
+    /// Name of the layer: `base`, `dependencies` or `package`.
     pub name: String,
     /// Digest of the compressed layer.
     pub digest: String,
-    /// Compressed size.
+    /// Compressed size in bytes.
     pub size: u64,
-    /// Not made anew: it was known already.
+    /// True if the layer already existed.
     pub cached: bool,
 }
 
@@ -203,7 +202,7 @@ mod tests {
             ("/image -> /boxes by stamp", "/image -> /boxes by stamp"),
         ] {
             assert_eq!(
-                read_request(text).map(|pair| pair.to_string()).as_deref(),
+                parse_request(text).map(|pair| pair.to_string()).as_deref(),
                 Ok(expected)
             );
         }
@@ -218,7 +217,7 @@ mod tests {
                 requests: vec![text.to_owned()],
                 ..PushOptions::default()
             };
-            let refused = options.read_requests().expect_err(text);
+            let refused = options.parse_requests().expect_err(text);
             assert!(refused.contains("write it as"), "{refused}");
         }
     }

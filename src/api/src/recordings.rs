@@ -1,31 +1,31 @@
-//! What flowed in a servant before something went wrong: `GET /api/v1/recordings`.
+//! Recordings of the traffic of a servant before a failure: `GET /api/v1/recordings`.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 use crate::size::Size;
 
-/// A file of the last seconds of a servant.
+/// A recording of the last seconds of a servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Recording {
-    /// Its number; `GET /api/v1/recordings/NUMBER` is the file.
+    /// Recording number; the file is at `GET /api/v1/recordings/NUMBER`.
     pub number: u64,
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The robot.
+    /// Name of the robot.
     pub robot: String,
-    /// The servant's id.
+    /// Id of the servant.
     pub servant: String,
-    /// When it was written.
+    /// Time when the file was written.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
-    /// Why it was written.
+    /// Reason for the recording.
     pub why: String,
-    /// From its first message to its last, in seconds; what was latched before is in it, too.
+    /// Duration from the first to the last message in seconds; latched messages from before are included in the file.
     pub seconds: f64,
-    /// Messages.
+    /// Number of messages.
     pub messages: u64,
-    /// Bytes of the file.
+    /// Size of the file in bytes.
     pub bytes: Size,
 }

@@ -1,4 +1,4 @@
-//! How a service comes to its next revision: at once, or by a canary that serves some robots first.
+//! Rollout of a new revision: at once, or with a canary that serves some robots first.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,13 +7,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 
-/// Which robots a canary serves: `3`, the first three, or `10%` of those that come.
+/// Share of robots served by a canary: `3` for the first three, or `10%` of those that connect.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Share {
-    /// The first so many robots.
+    /// The first robots, by number.
     Robots(u32),
-    /// Percent of the robots.
+    /// Percentage of the robots.
     Percent(f64),
 }
 
@@ -41,7 +41,10 @@ impl FromStr for Share {
                 Share::Percent(percent) => *percent > 0.0 && *percent <= 100.0,
             })
             .ok_or_else(|| {
-                format!("{text:?} is no share of robots; write a number of robots, such as 3, or a percentage, such as 10%")
+                format!(
+                    "{text:?} is not a share of robots; write a number of robots, such as 3, or a percentage, such as \
+                        10%"
+                )
             })
     }
 }
@@ -69,22 +72,23 @@ impl From<Share> for String {
     }
 }
 
-/// On which terms a revision takes another's place.
+/// Terms on which a revision replaces another one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RolloutTerms {
-    /// Robots that it serves before it is the current one; none: it is that at once.
+    /// Share of robots that the revision serves before it is promoted (default: promoted at once).
     pub canary: Option<Share>,
-    /// By how much the canary may be worse before it is taken back: of its share of failures the difference, of its response times
-    /// the part by which they are longer.
+    /// Allowed regression of the canary before it is rolled back: difference of the failure rates, or relative increase
+    /// of the response time (0.1 = 10 %; default: 0.1).
     pub bound: f64,
-    /// Requests of each revision before their failures and times are compared.
+    /// Number of requests to each revision before failures and response times are compared (default: 20).
     pub samples: u32,
-    /// Seconds from becoming the current one to the end of servants of other revisions; none: they end when their robots leave.
+    /// Time in seconds after promotion until servants of other revisions are ended (default: when their robots
+    /// disconnect).
     pub deadline: Option<f64>,
-    /// Seconds after which a canary that was not worse becomes the current one, if there were `samples` requests to it; none: when
-    /// somebody says so.
+    /// Time in seconds after which a canary without regression is promoted if it had at least `samples` requests
+    /// (default: only by hand).
     pub promote_after: Option<f64>,
 }
 
@@ -100,22 +104,22 @@ impl Default for RolloutTerms {
     }
 }
 
-/// How far a revision has come on its way.
+/// State of a rollout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum RolloutState {
-    /// It serves some robots.
+    /// The revision serves some robots.
     Canary,
-    /// It is the current one, and servants of others are there until their deadline.
+    /// The revision is the current one; servants of other revisions run until their deadline.
     Draining,
-    /// It is the current one.
+    /// The revision is the current one.
     Promoted,
-    /// It was worse, and serves nobody.
+    /// The revision regressed and serves no robots.
     RolledBack,
-    /// Somebody took it back.
+    /// The rollout was aborted by hand.
     Aborted,
-    /// Another revision was published, or made the current one.
+    /// Another revision was published or made the current one.
     Replaced,
 }
 
@@ -132,72 +136,72 @@ impl fmt::Display for RolloutState {
     }
 }
 
-/// What was seen of one revision since the rollout began.
+/// Statistics of one revision since the rollout began.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Arm {
-    /// Servants that became ready or failed.
+    /// Number of servants that became ready or failed.
     pub servants: u64,
-    /// Those that failed.
+    /// Number of servants that failed.
     pub servants_failed: u64,
-    /// Requests that were answered, failed or were late.
+    /// Number of requests that were answered, failed or were late.
     pub requests: u64,
-    /// Those that failed, or were not answered within T_max.
+    /// Number of requests that failed or were not answered within T_max.
     pub requests_failed: u64,
-    /// Median of the answered ones' response times, milliseconds.
+    /// Median response time of answered requests, in milliseconds.
     pub p50: Option<f64>,
-    /// Their 95th percentile.
+    /// 95th percentile of the response time of answered requests, in milliseconds.
     pub p95: Option<f64>,
 }
 
-/// A service on its way from one revision to another.
+/// Rollout of a service from one revision to another.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Rollout {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The revision that was the current one.
+    /// Revision that was current when the rollout began.
     pub stable: u64,
-    /// The revision that is to be.
+    /// Revision that is rolled out.
     pub candidate: u64,
-    /// How far it has come.
+    /// State of the rollout.
     pub state: RolloutState,
-    /// The reason of its state.
+    /// Reason for the state.
     pub reason: String,
-    /// The reason why a canary is not promoted whose time for that has come.
+    /// Reason why a canary that is due for promotion has not been promoted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// When it began.
+    /// Time when the rollout began.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub started: Millis,
-    /// When its state changed last.
+    /// Time of the latest change of state.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub changed: Millis,
-    /// On which terms.
+    /// Terms of the rollout.
     pub terms: RolloutTerms,
-    /// What was seen of the stable revision.
+    /// Statistics of the stable revision.
     pub of_stable: Arm,
-    /// What was seen of the candidate.
+    /// Statistics of the candidate.
     pub of_candidate: Arm,
 }
 
-/// What is to be done about a rollout.
+/// Command to a rollout.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "order", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum RolloutOrder {
-    /// A published revision begins its way.
+    /// Start the rollout of a published revision.
     Start {
-        /// The revision's number.
+        /// Number of the revision.
         revision: u64,
-        /// On which terms.
+        /// Terms of the rollout.
         #[serde(default)]
         terms: RolloutTerms,
     },
-    /// The canary becomes the current revision.
+    /// Promote the canary to the current revision.
     Promote,
-    /// The canary is taken back.
+    /// Abort the rollout of the canary.
     Abort,
 }
 

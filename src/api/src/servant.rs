@@ -1,4 +1,4 @@
-//! Servants: containers at work for one robot.
+//! Servants: containers that serve a robot.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,26 +10,26 @@ use crate::dictionary::Row;
 use crate::limits::{Limits, Usage};
 use crate::sla::Stated;
 
-/// Where a servant is in its life; the choreographer draws the machine.
+/// Phase of a servant's life cycle; see the state machine in the choreographer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
-    /// A robot asked for it.
+    /// Requested by a robot.
     Requested,
-    /// The machine has room for it.
+    /// Admitted: resources are reserved.
     Admitted,
-    /// Its container runs.
+    /// The container is running.
     Created,
-    /// Its nodes run; their interface is awaited.
+    /// The nodes are running; their interface is not complete yet.
     Starting,
-    /// Its interface is there.
+    /// The interface is complete.
     Ready,
-    /// It is being ended.
+    /// The servant is being stopped.
     Draining,
-    /// It ended as it should.
+    /// Stopped normally.
     Stopped,
-    /// It ended otherwise.
+    /// Failed.
     Failed,
 }
 
@@ -52,172 +52,173 @@ impl fmt::Display for Phase {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Servant {
-    /// Its id, also its container's and its cgroup's name.
+    /// Servant id, which is also the name of its container and cgroup.
     pub id: String,
-    /// The service it serves.
+    /// Name of the service.
     pub service: String,
-    /// The revision it was started from.
+    /// Revision that the servant was started from.
     pub revision: u64,
-    /// The robot it serves.
+    /// Name of the robot.
     pub robot: String,
-    /// Where it is in its life.
+    /// Phase of the life cycle.
     pub phase: Phase,
-    /// Why it failed or stopped.
+    /// Reason for the failure or stop.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// When it was asked for.
+    /// Time when the servant was requested.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub created: Millis,
-    /// Connections that use it now.
+    /// Number of connections that use the servant.
     pub connections: usize,
-    /// When it is ended if nobody connects before.
+    /// Time at which the servant is stopped if nobody connects before.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<crate::schema::Millis>))]
     pub idle_until: Option<Millis>,
-    /// What its robot stated, and what follows from it; none where nothing was stated.
+    /// The robot's statement and the resulting terms; absent if nothing was stated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub terms: Option<Terms>,
-    /// Limits asked for.
+    /// Requested limits.
     pub limits: Limits,
-    /// Limits in force, read back from the kernel; none while it is not running.
+    /// Limits in force, as read back from the kernel; absent if the servant is not running.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub enforced: Option<Limits>,
-    /// Version of the cgroup controllers that enforce them; 0: none could be used.
+    /// Version of the cgroup controllers that enforce the limits; 0 if none could be used.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true, maximum = 2))]
     pub cgroup_version: u8,
-    /// Usage now; none while it is not running.
+    /// Current resource usage; absent if the servant is not running.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Usage>,
-    /// How long its robot's requests took lately; none where none was answered.
+    /// Recent response times of the robot's requests; absent if none was answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub response: Option<ResponseTimes>,
-    /// Host process ids of its nodes and their children.
+    /// Host process ids of the nodes and their children.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub pids: Vec<i32>,
-    /// Messages dropped because its clients or nodes were slow.
+    /// Number of messages dropped because clients or nodes were slow.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub dropped: u64,
-    /// Of which topics messages were dropped, those of its links among them; the ten with most, the most first.
+    /// Dropped messages by topic, including those of the links; the ten topics with the most drops, in descending
+    /// order.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub drops: Vec<TopicDrops>,
-    /// Its nodes that failed and are not started again yet.
+    /// Nodes that failed and have not been restarted yet.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub down: Vec<NodeDown>,
-    /// Of its nodes that hang: which, and what they leave unanswered, in words.
+    /// Nodes that hang, with a description of what they leave unanswered.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub hung: Vec<String>,
-    /// Its nodes that have a lifecycle (ROS 2), and where they are in it.
+    /// Lifecycle nodes (ROS 2) and their states.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub lifecycle: Vec<NodeStage>,
 }
 
-/// Where a node is in its lifecycle.
+/// Lifecycle state of a node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct NodeStage {
-    /// Its name.
+    /// Name of the node.
     pub node: String,
-    /// In ROS's own word: `unconfigured`, `inactive`, `active`, `finalized`, or one between two of them.
+    /// ROS lifecycle state: `unconfigured`, `inactive`, `active`, `finalized`, or a transition state.
     pub state: String,
-    /// Why it is not active although it was told to be.
+    /// Reason why the node did not become active as requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
 }
 
-/// Messages of a topic that were dropped.
+/// Dropped messages of a topic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct TopicDrops {
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// How many so far.
+    /// Number of messages dropped so far.
     pub count: u64,
 }
 
-/// How long requests took that were answered within the last ten seconds: calls of services, goals, and messages on topics where
-/// the service has one input that its output answers. Measured by the robot's stubs, and of a robot that speaks rosbridge
-/// between the bridge and the servant.
+/// Response times of requests answered within the last ten seconds: service calls, goals, and messages on topics if the
+/// service has one input that its output answers. Measured by the robot's stubs; for a rosbridge robot, between the
+/// bridge and the servant.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ResponseTimes {
-    /// So many requests; at most the last 256.
+    /// Number of requests, at most the last 256.
     pub requests: usize,
-    /// What half of them did not exceed, milliseconds.
+    /// Median in milliseconds.
     pub p50_ms: f64,
-    /// What 19 of 20 of them did not exceed, milliseconds.
+    /// 95th percentile in milliseconds.
     pub p95_ms: f64,
 }
 
-/// A node that failed and is not started again yet.
+/// A node that failed and has not been restarted yet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct NodeDown {
-    /// Its name.
+    /// Name of the node.
     pub node: String,
-    /// How often in a row it failed.
+    /// Number of consecutive failures.
     pub failures: u32,
-    /// When it is started again.
+    /// Time of the next restart.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub again: Millis,
 }
 
-/// A service that is not started for a robot before a time, since its servants have failed again and again.
+/// Back-off of a service for a robot after repeated failures of its servants.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct BackOff {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// Its revision.
+    /// Revision of the service.
     pub revision: u64,
-    /// The robot; `~`: those without a name, `~warm`: servants that are kept ready for robots.
+    /// Name of the robot; `~` for anonymous robots, `~warm` for servants of the warm pool.
     pub robot: String,
-    /// How often in a row.
+    /// Number of consecutive failures.
     pub failures: u32,
-    /// What happened last, beginning with a verb.
+    /// Latest failure, beginning with a verb.
     pub reason: String,
-    /// When it may be started again.
+    /// Earliest time of the next start.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub again: Millis,
 }
 
-/// What a robot stated, and what its servant is promised for it.
+/// The robot's statement, and the terms that its servant gets.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Terms {
-    /// What was stated: by the node that a stub stands for, or by `` (nothing), a rosbridge client.
+    /// Statements by the node that a stub stands for; the empty key is a rosbridge client.
     pub stated: BTreeMap<String, Stated>,
-    /// Auxiliary parameters of the dictionary that were measured, of what its clients sent. What they state comes before.
+    /// Auxiliary parameters of the dictionary as measured on the clients' messages. Stated values take precedence.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub measured: BTreeMap<String, String>,
-    /// The class of the configuration that it is in.
+    /// Class that the robot is assigned to.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub class: Option<String>,
-    /// The class's priority: who has the greater one is served first.
+    /// Priority of the class; higher values are admitted first.
     pub priority: i32,
-    /// Rows of the dictionary that were taken.
+    /// Dictionary rows that were chosen.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub rows: Vec<Row>,
-    /// The limits that follow, those of the push included. They are promised.
+    /// Resulting limits, including those of the push. They are reserved.
     pub limits: Limits,
-    /// How they follow, a sentence each.
+    /// Explanation of the limits, one sentence each.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub why: Vec<String>,
 }
 
 impl Terms {
-    /// What all of its robot's clients stated, in a line.
-    pub fn stated_in_words(&self) -> String {
+    /// Formats the statements of all the robot's clients in one line.
+    pub fn describe_stated(&self) -> String {
         let stated = self.stated.iter().map(|(node, stated)| match &**node {
             "" => stated.to_string(),
             node => format!("{node}: {stated}"),
@@ -226,15 +227,15 @@ impl Terms {
     }
 }
 
-/// Which servants were ended.
+/// Servants that were stopped.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Stopped {
-    /// Their ids.
+    /// Ids of the servants.
     pub stopped: Vec<String>,
 }
 
-/// What a program prints to.
+/// Output stream of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
@@ -245,17 +246,17 @@ pub enum Stream {
     Stderr,
 }
 
-/// One line that a node printed.
+/// A line of a node's output.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct LogLine {
-    /// When the line was printed.
+    /// Time when the line was printed.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub time: Millis,
-    /// Which node.
+    /// Name of the node.
     pub node: String,
-    /// How it was printed.
+    /// Stream that the line was printed to.
     pub stream: Stream,
-    /// Without the line end.
+    /// The line, without its line terminator.
     pub line: String,
 }

@@ -7,90 +7,90 @@ use crate::group::{Group, Shared};
 use crate::interface::Interface;
 use crate::limits::Limits;
 
-/// A service in a list.
+/// Summary of a service.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServiceSummary {
-    /// Its name: the path under which robots reach it.
+    /// Service name; also the path under which robots reach it.
     pub name: String,
-    /// Where robots reach it, such as `ws://127.0.0.1:9090/opencv_apps`.
+    /// Address under which robots reach it, such as `ws://127.0.0.1:9090/opencv_apps`.
     pub address: String,
-    /// The ROS package it was made of.
+    /// ROS package that the service was built from.
     pub package: String,
-    /// The revision that new servants are started from.
+    /// Current revision, which new servants are started from.
     pub revision: u64,
-    /// Digest of that revision's image manifest.
+    /// Digest of the current revision's image manifest.
     pub image: String,
-    /// When that revision was published.
+    /// Time when the current revision was published.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub published: Millis,
-    /// How many topics, ROS services, actions and parameters its interface has.
+    /// Number of topics in the interface.
     pub topics: usize,
-    /// ROS services.
+    /// Number of ROS services in the interface.
     pub services: usize,
-    /// Actions.
+    /// Number of actions in the interface.
     pub actions: usize,
-    /// Parameters.
+    /// Number of parameters in the interface.
     pub parameters: usize,
-    /// Servants alive now.
+    /// Number of running servants.
     pub servants: usize,
-    /// Limits of a servant.
+    /// Resource limits of a servant.
     pub limits: Limits,
 }
 
-/// A service with everything known of it.
+/// A service with all its details.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct ServiceDetail {
-    /// As in a list.
+    /// Summary of the service.
     #[serde(flatten)]
     pub summary: ServiceSummary,
     /// All revisions, newest first.
     pub revisions: Vec<Revision>,
-    /// The current revision's nodes.
+    /// Nodes of the current revision.
     pub nodes: Vec<Node>,
-    /// The current revision's interface.
+    /// Interface of the current revision.
     pub interface: Interface,
-    /// Robots share servants of the current revision so; none: each has a servant of its own.
+    /// How robots share servants of the current revision; absent if each robot has a servant of its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<Shared>,
-    /// Servants that robots share now, of each revision that has any.
+    /// Groups of shared servants, by revision.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub groups: Vec<Group>,
 }
 
-/// One push that succeeded.
+/// A published revision.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Revision {
-    /// From 1.
+    /// Revision number, starting at 1.
     pub number: u64,
     /// Digest of the image manifest.
     pub image: String,
-    /// When it was published.
+    /// Time of publication.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub published: Millis,
-    /// What was pushed, in words, such as `--apt opencv_apps`.
+    /// Human-readable description of what was pushed, such as `--apt opencv_apps`.
     pub source: String,
-    /// Whether new servants are started from it.
+    /// True if this is the current revision.
     pub current: bool,
 }
 
-/// A process of a servant.
+/// A node process of a servant.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Node {
-    /// Its ROS name.
+    /// ROS name of the node.
     pub name: String,
     /// Executable and arguments.
     pub argv: Vec<String>,
 }
 
-/// Asks for an earlier revision.
+/// Request to roll back to an earlier revision.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Rollback {
-    /// Which; none: the one before the current.
+    /// Target revision (default: the one before the current revision).
     pub revision: Option<u64>,
 }

@@ -1,6 +1,6 @@
-//! Shadows: `POST /api/v1/services/NAME/shadow` gives what robots ask of their servants of a service to a candidate, too, and
-//! compares what comes of it. No robot hears anything of the candidate. The answer is a stream of [`ShadowEvent`]s. Times are
-//! in milliseconds.
+//! Shadow runs: `POST /api/v1/services/NAME/shadow` sends a copy of the requests that robots send to their servants to
+//! a candidate revision and compares the answers. Robots receive nothing from the candidate. The response is a stream
+//! of [`ShadowEvent`]s. Times are in milliseconds.
 
 use std::fmt;
 
@@ -9,30 +9,30 @@ use serde::{Deserialize, Serialize};
 use crate::calibration::TimeSpread;
 use crate::problem::Problem;
 
-/// Which revision is the candidate, whose requests it is given, and what counts as equal.
+/// Options of a shadow run: the candidate, the source of requests, and the criteria of equality.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ShadowOptions {
-    /// The revision that is the candidate.
+    /// Candidate revision.
     pub revision: u64,
-    /// The robot whose requests it is given; without, the first that uses the service.
+    /// Robot whose requests are copied (default: the first that uses the service).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robot: Option<String>,
-    /// Seconds for which they are, at most, from the first robot on.
+    /// Maximum duration in seconds, counted from the first robot (default: 60).
     pub seconds: f64,
-    /// Requests after which it is enough, if any number is.
+    /// Number of requests after which the run ends (default: unlimited).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub requests: Option<u64>,
-    /// Two numbers a and b are the same where |a - b| is at most this; unless both are integers, times the greatest of 1, |a|
-    /// and |b|.
+    /// Tolerance for numbers: a and b are equal if |a - b| is at most this value, multiplied by max(1, |a|, |b|) unless
+    /// both are integers (default: 1e-6).
     pub tolerance: f64,
-    /// Fields that may differ, such as `pose.covariance`: with all that is below them, of whatever topic, service or action.
+    /// Fields that may differ, such as `pose.covariance`, including their subfields, in any topic, service or action.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub ignore: Vec<String>,
-    /// The part by which the candidate's median response time may be longer.
+    /// Allowed relative increase of the candidate's median response time (0.1 = 10 %; default: 0.1).
     pub bound: f64,
-    /// The candidate may act on what it is granted outside its container: hosts, directories, devices.
+    /// True if the candidate may use the access it is granted outside its container: hosts, directories, devices.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub acting: bool,
 }
@@ -52,29 +52,29 @@ impl Default for ShadowOptions {
     }
 }
 
-/// One line of the answer. The last is `done` or `error`; a stream that ends otherwise was cut.
+/// One line of the response. The last line is `done` or `error`; a stream that ends otherwise was truncated.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum ShadowEvent {
     /// A new step begins.
     Step {
-        /// What is done now.
+        /// Title of the step.
         title: String,
     },
-    /// The comparison has ended.
+    /// The comparison is complete.
     Done {
-        /// What was found.
+        /// Result of the comparison.
         shadow: Box<Shadow>,
     },
-    /// Nothing was compared.
+    /// The comparison could not be made.
     Error {
-        /// The reason, and what to do.
+        /// Reason of the failure, and the next step.
         problem: Problem,
     },
 }
 
-/// What a comparison came to.
+/// Verdict of a comparison.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
@@ -82,13 +82,13 @@ pub enum Verdict {
     /// Nothing could be compared.
     #[default]
     Nothing,
-    /// The candidate answered as the robot's servant did, and as fast.
+    /// The candidate gave the same answers as the robot's servant, and was as fast.
     Equal,
-    /// It answered the same, and took longer.
+    /// The candidate gave the same answers, but was slower.
     Slower,
-    /// It answered something else, or not at all, or where the robot's servant did not.
+    /// The candidate gave different, missing or additional answers.
     Different,
-    /// Its nodes failed.
+    /// Nodes of the candidate failed.
     Failed,
 }
 
@@ -104,35 +104,35 @@ impl fmt::Display for Verdict {
     }
 }
 
-/// What was found.
+/// Result of a shadow run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Shadow {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The robot whose requests were taken.
+    /// Robot whose requests were copied.
     pub robot: String,
-    /// The revision of its servant.
+    /// Revision of the robot's servant.
     pub revision: u64,
-    /// The revision that was compared with it.
+    /// Candidate revision.
     pub candidate: u64,
-    /// What it came to.
+    /// Verdict.
     pub verdict: Verdict,
-    /// Why, in words.
+    /// Explanation of the verdict.
     pub why: String,
-    /// For so many seconds requests were taken.
+    /// Duration in seconds for which requests were copied.
     pub seconds: f64,
-    /// Why no longer.
+    /// Reason why the run ended.
     pub ended: String,
-    /// The candidate was given so many messages, calls and goals.
+    /// Number of messages, calls and goals sent to the candidate.
     pub given: u64,
-    /// What was compared: each topic that the service publishes, each of its services and actions.
+    /// Comparisons, one for each published topic, service and action.
     pub compared: Vec<Compared>,
-    /// What could not be.
+    /// Things that could not be compared.
     pub not_compared: Vec<NotCompared>,
 }
 
-/// Kinds of what is compared.
+/// Kind of what is compared.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
@@ -156,39 +156,39 @@ impl fmt::Display for Kind {
     }
 }
 
-/// One topic, service or action.
+/// Comparison of one topic, service or action.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Compared {
-    /// Topic, service or action.
+    /// Kind.
     pub kind: Kind,
-    /// Its name.
+    /// Name of the topic, service or action.
     pub name: String,
-    /// Answers that both gave and that are equal, also where both refused.
+    /// Number of answers given by both that are equal, including calls that both refused.
     pub equal: u64,
-    /// Those that both gave and that differ.
+    /// Number of answers given by both that differ.
     pub different: u64,
-    /// Those that the robot's servant gave alone.
+    /// Number of answers given only by the robot's servant.
     pub missing: u64,
-    /// Those that the candidate gave alone.
+    /// Number of answers given only by the candidate.
     pub surplus: u64,
-    /// Response times of the robot's servant; none where an answer cannot be ascribed to a request.
+    /// Response times of the robot's servant; absent if answers cannot be matched to requests.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub present: Option<TimeSpread>,
     /// Response times of the candidate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub candidate: Option<TimeSpread>,
-    /// Fields that differ, those that do so most often first.
+    /// Fields that differ, most frequent first.
     pub fields: Vec<FieldDifference>,
 }
 
 impl Compared {
-    /// All answers, of either.
+    /// Returns the number of all answers of either revision.
     pub fn answers(&self) -> u64 {
         self.equal + self.unequal()
     }
 
-    /// The number of comparisons whose answers differ.
+    /// Returns the number of answers that are different, missing or surplus.
     pub fn unequal(&self) -> u64 {
         self.different + self.missing + self.surplus
     }
@@ -198,13 +198,13 @@ impl Compared {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct FieldDifference {
-    /// Its path, such as `detections[].score`; empty where the whole differs.
+    /// Path of the field, such as `detections[].score`; empty if the answers differ as a whole.
     pub field: String,
-    /// In so many answers.
+    /// Number of answers in which the field differs.
     pub answers: u64,
-    /// The first value of the robot's servant, shortened.
+    /// First value of the robot's servant, shortened.
     pub present: String,
-    /// The candidate's instead of it.
+    /// Corresponding value of the candidate, shortened.
     pub candidate: String,
 }
 
@@ -212,11 +212,11 @@ pub struct FieldDifference {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct NotCompared {
-    /// A topic, a service, an action, or part of what happened.
+    /// A topic, service or action, or some part of the traffic.
     pub what: String,
-    /// The reason.
+    /// Reason.
     pub why: String,
-    /// So often; 0 where that does not matter.
+    /// Number of occurrences; 0 if irrelevant.
     pub count: u64,
 }
 

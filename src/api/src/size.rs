@@ -1,17 +1,17 @@
-//! Sizes as people write them: `512M`, `1.5G`, `65536`. Units are powers of 1024.
+//! Human-readable sizes: `512M`, `1.5G`, `65536`. Units are powers of 1024.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// A number of bytes; in JSON a plain number, in configuration also a text such as `512M`.
+/// Number of bytes: a number in JSON, or a string such as `512M` in the configuration.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(transparent)]
 pub struct Size(pub u64);
 
-/// The text is not a size.
+/// Error of parsing a [`Size`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotASize(String);
 

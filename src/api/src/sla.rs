@@ -1,21 +1,21 @@
-//! What a robot states when it asks for a service: a service level agreement (SLA), a class, or resources outright, and what
-//! the deployer's dictionary may look at beside. It comes before the robot is admitted, in the query of its WebSocket
-//! handshake:
+//! Statements that robots make when they request a service: a service level agreement (SLA), a class, or explicit
+//! resources, plus auxiliary parameters for the deployer's dictionary. The statement precedes admission; it is in the
+//! query of the robot's WebSocket handshake:
 //!
 //! ```text
 //! ws://host:9090/detect?robot=rover1&rrt=100ms&max_rrt=300ms&aux.width=640
 //! ```
 //!
-//! | key | is |
+//! | Key | Meaning |
 //! |---|---|
 //! | `rrt`, `max_rrt` | T_desire and T_max of the request response time |
-//! | `fps`, `min_fps` | rate of an output that is wished for, and the least that is acceptable: frames per second |
-//! | `age`, `max_age` | age of an output that is wished for, and the greatest that is acceptable |
+//! | `fps`, `min_fps` | desired and lowest acceptable rate of an output, in frames per second |
+//! | `age`, `max_age` | desired and highest acceptable age of an output |
 //! | `class` | a class of the daemon's configuration |
-//! | `cpus`, `memory` | resources outright: cores, and bytes (`512M`) |
+//! | `cpus`, `memory` | explicit resources: cores, and bytes (`512M`) |
 //! | `aux.KEY` | an auxiliary parameter of the service's dictionary |
 //!
-//! Times are seconds, or text such as `100ms`. Keys of others (`robot`, `token`, `resume`) are not looked at.
+//! Times are in seconds, or text such as `100ms`. Other keys (`robot`, `token`, `resume`) are ignored.
 
 mod agreement;
 
@@ -26,37 +26,37 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::size::Size;
-use agreement::rate;
+use agreement::parse_rate;
 pub use agreement::{Goal, Measure, Sla};
-pub use qos::{NotASpan, Span};
+pub use qos::{ParseSpanError, Span};
 
-/// What begins the key of an auxiliary parameter.
+/// Prefix of the keys of auxiliary parameters.
 pub const AUX: &str = "aux.";
 
-/// Auxiliary parameters that a robot may state.
+/// Maximum number of auxiliary parameters in a statement.
 const MOST_AUX: usize = 16;
-/// Bytes of a name, and of an auxiliary parameter's value.
+/// Maximum length of a name or of an auxiliary parameter's value, in bytes.
 const LONGEST: usize = 64;
-/// Cores, and bytes of memory, outside of which no servant works.
+/// Allowed range of cores, and minimum memory; servants do not work outside these bounds.
 const CPUS: (f64, f64) = (0.01, 4096.0);
 const LEAST_MEMORY: Size = Size(4 << 20);
 
-/// What a robot states.
+/// Statement of a robot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Stated {
-    /// What it wishes to be kept.
+    /// Service level agreement.
     #[serde(skip_serializing_if = "Sla::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub sla: Sla,
-    /// Its class.
+    /// Class.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub class: Option<String>,
-    /// Cores outright, whatever the SLA would need.
+    /// Explicit CPU in cores, regardless of the SLA.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpus: Option<f64>,
-    /// The same of memory.
+    /// Explicit memory, regardless of the SLA.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Size>,
     /// Auxiliary parameters.
@@ -65,12 +65,12 @@ pub struct Stated {
     pub aux: BTreeMap<String, String>,
 }
 
-/// Something that cannot be stated, or not so.
+/// An invalid key or value in a statement.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unstatable {
-    /// Its key.
+    /// Key that is invalid.
     pub key: String,
-    /// The reason, and what to do.
+    /// Reason, and what to write instead.
     pub reason: String,
 }
 
@@ -92,20 +92,20 @@ impl fmt::Display for Unstatable {
 impl std::error::Error for Unstatable {}
 
 impl Stated {
-    /// All keys but those of auxiliary parameters.
+    /// All keys except those of auxiliary parameters.
     pub const KEYS: [&str; 9] = [
         "rrt", "max_rrt", "fps", "min_fps", "age", "max_age", "class", "cpus", "memory",
     ];
 
-    /// Whether nothing is stated.
+    /// Returns whether nothing is stated.
     pub fn is_empty(&self) -> bool {
         *self == Stated::default()
     }
 
-    /// Reads what is stated among `pairs` of keys and values; keys of others are left out.
+    /// Parses a statement from key-value pairs; unrelated keys are ignored.
     ///
     /// # Errors
-    /// The key that cannot be as it is, why not, and what to write.
+    /// Returns the first invalid key, with the reason and what to write instead.
     pub fn read<K: AsRef<str>, V: AsRef<str>>(
         pairs: impl IntoIterator<Item = (K, V)>,
     ) -> Result<Stated, Unstatable> {
@@ -115,7 +115,7 @@ impl Stated {
             let (key, text) = (key.as_ref(), text.as_ref().trim());
             let is_aux = key.starts_with(AUX);
             if !is_aux && !Stated::KEYS.contains(&key) {
-                meant(key)?;
+                reject_misspelled_key(key)?;
                 continue;
             }
             if seen.iter().any(|earlier| earlier == key) {
@@ -144,7 +144,7 @@ impl Stated {
             let span = Span::from_str(text).map_err(|error| refused(format!("= {error}")))?;
             Ok(Some(span))
         };
-        let rate = || rate(text).map(Some).map_err(refused);
+        let rate = || parse_rate(text).map(Some).map_err(refused);
         match key {
             "rrt" => self.sla.rrt = span()?,
             "max_rrt" => self.sla.max_rrt = span()?,
@@ -153,7 +153,7 @@ impl Stated {
             "age" => self.sla.age = span()?,
             "max_age" => self.sla.max_age = span()?,
             "class" => {
-                name(text).map_err(refused)?;
+                check_name(text).map_err(refused)?;
                 self.class = Some(text.to_owned());
             }
             "cpus" => {
@@ -188,8 +188,8 @@ impl Stated {
         Ok(())
     }
 
-    /// Keys and values, as [`read`](Self::read) reads them.
-    pub fn pairs(&self) -> Vec<(String, String)> {
+    /// Returns the keys and values in the form that [`read`](Self::read) accepts.
+    pub fn to_pairs(&self) -> Vec<(String, String)> {
         let sla = &self.sla;
         let span = |span: Option<Span>| span.map(|span| span.to_string());
         let number = |number: Option<f64>| number.map(|number| number.to_string());
@@ -202,7 +202,7 @@ impl Stated {
             span(sla.max_age),
             self.class.clone(),
             number(self.cpus),
-            self.memory.map(exact),
+            self.memory.map(format_exact),
         ];
         let own = Stated::KEYS
             .into_iter()
@@ -213,9 +213,10 @@ impl Stated {
             .collect()
     }
 
-    /// What two of one robot state together, for one servant: the stricter SLA, the more of resources. Of two classes the
-    /// one that `prefer` picks; of an auxiliary parameter with two values the greater number, else the first.
-    pub fn with(mut self, other: Stated, prefer: impl Fn(&str, &str) -> bool) -> Stated {
+    /// Merges two statements of one robot for the same servant: the stricter SLA and the larger resources; of two
+    /// classes the one that `prefer` selects; of two values of an auxiliary parameter the larger number, otherwise the
+    /// first.
+    pub fn merge(mut self, other: Stated, prefer: impl Fn(&str, &str) -> bool) -> Stated {
         self.sla = self.sla.stricter(other.sla);
         self.class = match (self.class.take(), other.class) {
             (Some(one), Some(other)) if prefer(&other, &one) => Some(other),
@@ -239,10 +240,10 @@ impl Stated {
     }
 }
 
-/// As it would be typed; `nothing` where nothing is stated.
+/// Writes the statement as key-value pairs; `nothing` if it is empty.
 impl fmt::Display for Stated {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let pairs = self.pairs();
+        let pairs = self.to_pairs();
         if pairs.is_empty() {
             return out.write_str("nothing");
         }
@@ -254,31 +255,33 @@ impl fmt::Display for Stated {
     }
 }
 
-/// A size in full: what is printed shortly may be rounded.
-fn exact(size: Size) -> String {
+/// Formats a size exactly, since its display form may be rounded.
+fn format_exact(size: Size) -> String {
     let short = size.to_string();
-    match short.parse() == Ok(size) {
-        true => short,
-        false => size.0.to_string(),
+    if short.parse() == Ok(size) {
+        short
+    } else {
+        size.0.to_string()
     }
 }
 
-/// Refuses a name that no class can have.
-pub fn name(text: &str) -> Result<(), String> {
+/// Validates the name of a class.
+pub fn check_name(text: &str) -> Result<(), String> {
     let fits = !text.is_empty()
         && text.len() <= LONGEST
         && text
             .bytes()
             .all(|byte| byte.is_ascii_alphanumeric() || b"-_".contains(&byte));
-    match fits {
-        true => Ok(()),
-        false => Err(format!(
+    if fits {
+        Ok(())
+    } else {
+        Err(format!(
             "= {text:?} is not a name; write letters, digits, - and _, at most {LONGEST}"
-        )),
+        ))
     }
 }
 
-/// Refuses an auxiliary parameter that cannot be.
+/// Validates the key and value of an auxiliary parameter.
 pub fn check_aux(key: &str, value: &str) -> Result<(), String> {
     let key_fits = !key.is_empty()
         && key.len() <= LONGEST
@@ -287,7 +290,7 @@ pub fn check_aux(key: &str, value: &str) -> Result<(), String> {
             .all(|byte| byte.is_ascii_alphanumeric() || b"-_.".contains(&byte));
     if !key_fits {
         return Err(format!(
-            "names no auxiliary parameter; write {AUX}KEY=VALUE, KEY of letters, digits, -, _ and ., at most {LONGEST}"
+            "is not an auxiliary parameter; write {AUX}KEY=VALUE, KEY of letters, digits, -, _ and ., at most {LONGEST}"
         ));
     }
     let value_fits =
@@ -300,8 +303,8 @@ pub fn check_aux(key: &str, value: &str) -> Result<(), String> {
     Ok(())
 }
 
-/// Refuses a key that was meant to be one of these: one that is silently left out would be missed late.
-fn meant(key: &str) -> Result<(), Unstatable> {
+/// Rejects a misspelled key, which would otherwise be ignored silently.
+fn reject_misspelled_key(key: &str) -> Result<(), Unstatable> {
     let bare = |key: &str| {
         let letters = key.chars().filter(|c| !"-_.".contains(*c));
         letters.collect::<String>().to_ascii_lowercase()

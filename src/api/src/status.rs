@@ -1,90 +1,89 @@
-//! The daemon at a glance.
+//! Status of the daemon.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Millis;
 use crate::limits::{Limits, Usage};
 
-/// What `GET /api/v1/status` answers.
+/// Response of `GET /api/v1/status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Status {
-    /// The daemon's version.
+    /// Version of the daemon.
     pub version: String,
-    /// Its process id.
+    /// Process id of the daemon.
     pub pid: u32,
-    /// Where its state is.
+    /// State directory.
     pub home: String,
-    /// Where it listens.
+    /// Listen address.
     pub listen: String,
-    /// The fingerprint of the certificate that it shows there, `SHA256:` with hexadecimal digits; none where it speaks plain
-    /// text.
+    /// Fingerprint of the TLS certificate of the listen address: `SHA256:` and hexadecimal digits; absent without TLS.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub certificate: Option<String>,
-    /// Where plain connections go.
+    /// Service for connections that name none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub default_service: Option<String>,
-    /// When it started.
+    /// Start time of the daemon.
     #[cfg_attr(feature = "schema", schema(value_type = crate::schema::Millis))]
     pub started: Millis,
-    /// What holds the servants apart.
+    /// Isolation of servants.
     pub isolation: Isolation,
-    /// What the machine gives and what is taken.
+    /// Capacity of the machine and current reservations.
     pub capacity: Capacity,
-    /// Limits of a servant where its push said nothing.
+    /// Default limits of a servant.
     pub limits: Limits,
-    /// Published services.
+    /// Number of published services.
     pub services: usize,
-    /// Servants alive now.
+    /// Number of running servants.
     pub servants: usize,
-    /// Containers made ahead, for robots to come.
+    /// Number of warm containers, created ahead of demand.
     #[serde(default, alias = "spares")]
     pub warm_pool: usize,
-    /// Those of them in which the nodes run.
+    /// Number of warm containers whose nodes are running.
     #[serde(default)]
     pub warm_nodes: usize,
-    /// Connections of robots now.
+    /// Number of connected robots.
     pub connections: usize,
-    /// What the servants that live use together; the pressure is the whole machine's, none where the kernel does not
-    /// tell.
+    /// Resource usage of all running servants together; the pressure is that of the whole machine, absent if the kernel
+    /// does not report it.
     #[serde(default)]
     pub usage: Usage,
-    /// What does not work as it should on this machine.
+    /// Problems of this machine.
     pub warnings: Vec<String>,
 }
 
-/// What holds the servants apart.
+/// Isolation of servants.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Isolation {
-    /// `require` or `best-effort`.
+    /// Mode: `require` or `best-effort`.
     pub mode: String,
-    /// Version of the cgroup controllers in use; 0: none can be used.
+    /// Version of the cgroup controllers in use; 0 if none can be used.
     pub cgroup_version: u8,
-    /// Limits that this machine cannot set.
+    /// Limits that this machine cannot enforce.
     pub missing: Vec<String>,
 }
 
-/// Room for servants.
+/// Capacity for servants.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Capacity {
-    /// Cores that servants may be promised.
+    /// CPU available for reservations, in cores.
     pub cpus: f64,
-    /// Memory that servants may be promised.
+    /// Memory available for reservations, in bytes.
     pub memory: u64,
-    /// Cores promised now.
+    /// Reserved CPU in cores.
     pub cpus_reserved: f64,
-    /// Memory promised now.
+    /// Reserved memory in bytes.
     pub memory_reserved: u64,
-    /// Servants waiting for room.
+    /// Number of servants waiting for admission.
     pub waiting: usize,
 }
 
-/// The daemon's clock, for comparing another with it.
+/// The daemon's clock, for comparison with another clock.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Clock {
-    /// Milliseconds since 1970 with their fraction.
+    /// Milliseconds since 1970, with fraction.
     pub now: f64,
 }

@@ -1,8 +1,8 @@
-//! What the page shows, as it changes: `GET /api/v1/stream`, as server-sent events (WHATWG HTML, 9.2).
+//! Live updates of the web page: `GET /api/v1/stream`, as server-sent events (WHATWG HTML, 9.2).
 //!
 //! ```text
-//!   event: snapshot   all there is: what was told before is forgotten
-//!   event: update     what has changed since
+//!   event: snapshot   the complete state, which replaces all earlier events
+//!   event: update     the changes since the previous event
 //! ```
 
 use std::sync::Arc;
@@ -16,27 +16,27 @@ use crate::servant::BackOff;
 use crate::service::ServiceSummary;
 use crate::status::Status;
 
-/// The data of one event, of `snapshot` and `update` alike: what who listens may see of it.
+/// Data of a `snapshot` or `update` event, filtered by what the listener may see.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Update {
-    /// When it was so.
+    /// Time of the data.
     #[cfg_attr(feature = "schema", schema(required = true, value_type = crate::schema::Millis))]
     pub time: Millis,
-    /// The machine; none: it has not changed, or who listens is not told of it.
+    /// The machine; absent if unchanged, or if the listener may not see it.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<Machine>))]
     pub machine: Option<Arc<Machine>>,
-    /// Services that are new or have changed.
+    /// New or changed services.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<ServiceSummary>))]
     pub services: Vec<Arc<ServiceSummary>>,
-    /// Names of services that are not there any more.
+    /// Names of removed services.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub services_gone: Vec<String>,
-    /// Servants that are new or have changed, with their robots' links.
+    /// New or changed servants, with the links of their robots.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<Served>))]
     pub servants: Vec<Arc<Served>>,
@@ -44,30 +44,30 @@ pub struct Update {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false))]
     pub servants_gone: Vec<String>,
-    /// All robots whose servants have failed again and again; none: as before.
+    /// All current back-offs; absent if unchanged.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub back_offs: Option<Vec<BackOff>>,
-    /// Events that are new, oldest first; in a snapshot the newest.
+    /// New events, oldest first; in a snapshot, the latest events.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "schema", schema(required = false, value_type = Vec<Event>))]
     pub events: Vec<Arc<Event>>,
 }
 
-/// The machine and what works there.
+/// The machine and its current load.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Machine {
-    /// The daemon at a glance.
+    /// Status of the daemon.
     #[serde(flatten)]
     pub status: Status,
-    /// Cores that all servants together used in the last moment.
+    /// CPU usage of all servants together in the last sampling period, in cores.
     pub cores: f64,
-    /// Cores that the host has.
+    /// Number of cores of the host.
     pub host_cores: usize,
-    /// Bytes of memory that the host has; none where it does not tell.
+    /// Memory of the host in bytes; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub host_memory: Option<u64>,
-    /// Percent of it that programs could still be given.
+    /// Percentage of the host's memory that is available.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub host_memory_available: Option<f64>,
 }

@@ -1,39 +1,40 @@
-//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE` answers with an archive, `NAME.tar.gz.sig` with its signature, `GET /stubs`
-//! with [`Stubs`].
+//! Stubs: `GET /stubs/NAME.tar.gz?arch=ARCHITECTURE` returns the archive, `NAME.tar.gz.sig` its signature, and
+//! `GET /stubs` the list, [`Stubs`].
 
 use serde::{Deserialize, Serialize};
 
-/// Architectures that a robot's program is made for, as `uname -m` says them (`armv7` for `armv7l`).
+/// Architectures that the robot's program is built for, in the terms of `uname -m` (`armv7` for `armv7l`).
 pub const ARCHITECTURES: [&str; 3] = ["x86_64", "aarch64", "armv7"];
 
-/// The header of an archive that names the architecture it is for.
+/// Response header with the architecture of an archive.
 pub const ARCHITECTURE: &str = "cloudroid-architecture";
 
-/// The header of an archive with its signature: the lines of the detached one, without those that begin and end it.
+/// Response header with the signature of an archive: the lines of the detached signature without its begin and end
+/// markers.
 pub const SIGNATURE: &str = "cloudroid-signature";
-/// What archives are signed as: the namespace of `ssh-keygen -Y verify -n`.
+/// Signature namespace of archives, for `ssh-keygen -Y verify -n`.
 pub const ARCHIVE: &str = "cloudroid-archive";
-/// What the list of an archive's files is signed as.
+/// Signature namespace of the file list of an archive.
 pub const CONTENTS: &str = "cloudroid-stub";
-/// As whom robots' lists of signers name a server.
+/// Principal name of the server in the robots' allowed-signers files.
 pub const SIGNER: &str = "cloudroid";
 
-/// What stubs this server has.
+/// Stubs available from this server.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Stubs {
-    /// Services, each with its archive at `/stubs/NAME.tar.gz`.
+    /// Services; the archive of each is at `/stubs/NAME.tar.gz`.
     pub services: Vec<String>,
-    /// Architectures whose program this server holds.
+    /// Architectures for which the robot's program is installed.
     pub architectures: Vec<String>,
-    /// Those it could hold and does not.
+    /// Supported architectures for which the robot's program is not installed.
     pub lacking: Vec<String>,
-    /// The key that archives are signed by, as OpenSSH writes it; empty: an earlier version's, which signs none.
+    /// Public key of the archive signatures in OpenSSH format; empty from earlier versions, which do not sign.
     #[serde(default)]
     pub key: String,
 }
 
-/// The architecture that is meant by a name in use for it.
-pub fn architecture(name: &str) -> Option<&'static str> {
+/// Returns the canonical architecture for a common name of it.
+pub fn parse_architecture(name: &str) -> Option<&'static str> {
     match name {
         "x86_64" | "amd64" => Some("x86_64"),
         "aarch64" | "arm64" => Some("aarch64"),
@@ -49,10 +50,10 @@ mod tests {
     #[test]
     fn architectures_have_several_names() {
         for name in ARCHITECTURES {
-            assert_eq!(architecture(name), Some(name));
+            assert_eq!(parse_architecture(name), Some(name));
         }
-        assert_eq!(architecture("armv7l"), Some("armv7"));
-        assert_eq!(architecture("arm64"), Some("aarch64"));
-        assert_eq!(architecture("sparc"), None);
+        assert_eq!(parse_architecture("armv7l"), Some("armv7"));
+        assert_eq!(parse_architecture("arm64"), Some("aarch64"));
+        assert_eq!(parse_architecture("sparc"), None);
     }
 }

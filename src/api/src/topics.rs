@@ -1,32 +1,32 @@
-//! How much flows on the topics of a servant: `GET /api/v1/servants/ID/topics`.
+//! Traffic on the topics of a servant: `GET /api/v1/servants/ID/topics`.
 
 use serde::{Deserialize, Serialize};
 
-/// What was published in the last second or so.
+/// Topics published within a sampling period of about one second.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct PublishedTopics {
-    /// So long was counted, in seconds.
+    /// Length of the sampling period, in seconds.
     pub seconds: f64,
-    /// By name.
+    /// Topics, sorted by name.
     pub topics: Vec<PublishedTopic>,
 }
 
-/// A topic.
+/// Traffic on a topic.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct PublishedTopic {
-    /// Its name.
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Type: `package/Type`.
     #[serde(rename = "type")]
     pub of: String,
-    /// Messages a second.
+    /// Messages per second.
     pub rate: f64,
-    /// Bytes a second, as messages are serialized.
+    /// Bytes per second of serialized messages.
     pub bandwidth: f64,
-    /// From the stamp in a message's header to when it was heard here, in seconds, the median; none of messages without a header, and
-    /// where stamps are of another time, as a simulation's.
+    /// Median delay from the stamp in a message's header to its arrival here, in seconds; absent for messages without a
+    /// header and for stamps of another clock, such as a simulation's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency: Option<f64>,
 }

@@ -1,63 +1,65 @@
-//! Trials: `POST /api/v1/services/NAME/trial?kind=bag` (or `image`, a PNG) with the file as body is answered by a [`Trial`].
+//! Trials: `POST /api/v1/services/NAME/trial?kind=bag` (or `image` for a PNG), with the file as the body, returns a
+//! [`Trial`].
 
 use serde::{Deserialize, Serialize};
 
-/// What a service made of recorded inputs. Times are in milliseconds, on this machine, without any network.
+/// Result of feeding recorded inputs to a service. Times are in milliseconds, measured on this machine without any
+/// network.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Trial {
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// What was published to it.
+    /// Messages published to the service.
     pub inputs: Vec<Fed>,
-    /// Topics of the recording that the service has no input for.
+    /// Topics of the recording that match no input of the service.
     pub unused: Vec<String>,
-    /// What it published.
+    /// Messages published by the service.
     pub outputs: Vec<Heard>,
-    /// Inputs whose answer was awaited.
+    /// Number of inputs that an answer was expected for.
     pub requests: usize,
-    /// Of them were answered.
+    /// Number of these that were answered.
     pub answered: usize,
-    /// Response times; none when nothing was answered.
+    /// Response times; absent if nothing was answered.
     pub rrt: Option<Times>,
 }
 
-/// An input.
+/// Messages sent to an input.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Fed {
-    /// The service's topic.
+    /// Input topic of the service.
     pub topic: String,
-    /// `package/Type`.
+    /// Type: `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Messages published.
+    /// Number of messages published.
     pub sent: usize,
-    /// Topics of other names in the recording that went to it, since it is the only input of their type.
+    /// Topics of other names in the recording that were mapped to this input because it is the only one of their type.
     #[serde(default)]
     #[cfg_attr(feature = "schema", schema(required = true))]
     pub from: Vec<String>,
 }
 
-/// An output.
+/// Messages received from an output.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Heard {
-    /// Topic on which the answer came.
+    /// Output topic of the service.
     pub topic: String,
-    /// `package/Type`.
+    /// Type: `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Messages heard.
+    /// Number of messages received.
     pub received: usize,
-    /// Size of the last one.
+    /// Size of the last message in bytes.
     pub bytes: usize,
-    /// The last one, where it is short enough to show.
+    /// The last message, if it is short enough to show.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<serde_json::Value>,
 }
 
-/// Response times and what follows from them.
+/// Response times, and SLA values derived from them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 pub struct Times {
@@ -67,8 +69,8 @@ pub struct Times {
     pub p90: f64,
     /// Maximum.
     pub max: f64,
-    /// T_desire to begin with: half as much again as the median.
+    /// Suggested T_desire: 1.5 times the median.
     pub desire: f64,
-    /// T_max to begin with: twice the 90th percentile, and at least twice T_desire.
+    /// Suggested T_max: twice the 90th percentile, and at least twice T_desire.
     pub acceptable: f64,
 }

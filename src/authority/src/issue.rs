@@ -1,4 +1,4 @@
-//! The authority itself: its key and certificate, made once, and what it signs.
+//! The certificate authority for robots: its key and certificate, created once, and issuing certificates.
 
 use std::fmt;
 use std::fs::OpenOptions;
@@ -14,27 +14,27 @@ use rcgen::{
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 
-use crate::{Error, Millis, Request, SCHEME, Shown, shown};
+use crate::{CertificateRequest, Error, Millis, SCHEME, VerifiedCertificate, shown};
 
-/// A certificate is good from so long before it was made: clocks of other programs that look at it may be behind.
+/// Time by which a certificate's validity starts earlier, because clocks of other machines may be behind.
 const BEFORE: Duration = Duration::from_secs(300);
 
-/// Signs robots' certificates.
+/// Certificate authority that signs robots' certificates.
 pub struct Authority {
     certificate: CertificateDer<'static>,
     issuer: Issuer<'static, KeyPair>,
-    /// Its name, as it stands in what it has signed (DER).
+    /// Name of the authority (DER), as in the issuer field of its certificates.
     name: Vec<u8>,
 }
 
-/// A certificate that was made.
+/// A certificate that was issued.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Issued {
-    /// PEM.
+pub struct IssuedRobotCertificate {
+    /// The certificate (PEM).
     pub certificate: String,
-    /// From when it counts.
+    /// Time of issue.
     pub issued: Millis,
-    /// Its end, in whole seconds.
+    /// End of validity, in whole seconds.
     pub expires: Millis,
 }
 
@@ -45,8 +45,8 @@ impl fmt::Debug for Authority {
 }
 
 impl Authority {
-    /// That of a file, made at the first time. Only its owner may read the file.
-    pub fn of_file(path: &Path) -> Result<Authority, Error> {
+    /// Loads the authority from a file, or creates the file, readable by its owner only.
+    pub fn load_or_create(path: &Path) -> Result<Authority, Error> {
         let io = |action| {
             let path = path.to_owned();
             move |source| Error::Io {
@@ -62,7 +62,7 @@ impl Authority {
                     what: "robots' authority".to_owned(),
                     source,
                 })?;
-                // Whole or not at all.
+                // The file is written atomically.
                 let half = path.with_extension("half");
                 let _ = std::fs::remove_file(&half);
                 let mut file = OpenOptions::new()
@@ -85,12 +85,12 @@ impl Authority {
         })
     }
 
-    /// Reads a certificate and its key.
+    /// Parses a certificate and its key.
     fn from_pem(text: &str) -> Result<Authority, String> {
         let certificate =
             CertificateDer::from_pem_slice(text.as_bytes()).map_err(|error| error.to_string())?;
-        let key = KeyPair::from_pem(&key_of(text)?).map_err(|error| error.to_string())?;
-        let name = shown::subject(&certificate)?;
+        let key = KeyPair::from_pem(&find_private_key(text)?).map_err(|error| error.to_string())?;
+        let name = shown::subject_der(&certificate)?;
         let issuer =
             Issuer::from_ca_cert_der(&certificate, key).map_err(|error| error.to_string())?;
         Ok(Authority {
@@ -100,29 +100,29 @@ impl Authority {
         })
     }
 
-    /// Whom those trust who take its certificates.
+    /// Returns the authority's own certificate, the trust anchor for those it issues.
     pub fn certificate(&self) -> &CertificateDer<'static> {
         &self.certificate
     }
 
-    /// Whether it has signed a certificate that somebody has verified.
-    pub fn has_signed(&self, shown: &Shown) -> bool {
+    /// Returns true if this authority issued the verified certificate.
+    pub fn has_issued(&self, shown: &VerifiedCertificate) -> bool {
         shown.issuer == self.name
     }
 
-    /// Makes a certificate for a robot, good for `lifetime` from `now` on.
+    /// Issues a certificate to a robot, valid for `lifetime` from `now`.
     pub fn issue(
         &self,
-        request: &Request,
+        request: &CertificateRequest,
         robot: &str,
         now: Millis,
         lifetime: Duration,
-    ) -> Result<Issued, Error> {
+    ) -> Result<IssuedRobotCertificate, Error> {
         let unmade = |source| Error::Unmade {
             what: format!("{SCHEME}{robot}"),
             source,
         };
-        // Certificates have whole seconds (RFC 5280, section 4.1.2.5).
+        // Certificates count in whole seconds (RFC 5280, section 4.1.2.5).
         let now_seconds = now / 1000;
         let end_seconds = now_seconds.saturating_add(lifetime.as_secs().max(1));
         let at = |seconds: u64| date_time_ymd(1970, 1, 1) + Duration::from_secs(seconds);
@@ -134,7 +134,7 @@ impl Authority {
             .push(DnType::CommonName, name.as_str());
         params.subject_alt_names = vec![SanType::URI(name.try_into().map_err(unmade)?)];
         params.not_before = at(now_seconds.saturating_sub(BEFORE.as_secs()));
-        // The last second is part of it.
+        // notAfter is inclusive.
         params.not_after = at(end_seconds - 1);
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
@@ -142,7 +142,7 @@ impl Authority {
         let certificate = params
             .signed_by(request.public_key(), &self.issuer)
             .map_err(unmade)?;
-        Ok(Issued {
+        Ok(IssuedRobotCertificate {
             certificate: certificate.pem(),
             issued: now_seconds * 1000,
             expires: end_seconds * 1000,
@@ -150,19 +150,20 @@ impl Authority {
     }
 }
 
-/// The part of a PEM file that is a private key.
-fn key_of(text: &str) -> Result<String, String> {
+/// Returns the private key section of a PEM file.
+fn find_private_key(text: &str) -> Result<String, String> {
     const BEGIN: &str = "-----BEGIN PRIVATE KEY-----";
     let at = text.find(BEGIN).ok_or("it has no BEGIN PRIVATE KEY")?;
     Ok(text[at..].to_owned())
 }
 
-/// An authority that signs itself. It has no end, as the daemon's own certificate has none: its robots know it by nothing else.
+/// Generates a self-signed authority. It does not expire, like the daemon's own certificate, because robots know it
+/// by nothing else.
 fn generate() -> Result<String, rcgen::Error> {
     let mut params = CertificateParams::default();
     let key = KeyPair::generate()?;
-    // A name of its own, so that what another daemon has signed is told from it before its signature is looked at.
-    let id = hex::encode(&crate::shown::hash(rcgen::PublicKeyData::der_bytes(&key))[..8]);
+    // A unique name, so that certificates of another daemon are recognised before their signature is verified.
+    let id = hex::encode(&crate::shown::hash_key(rcgen::PublicKeyData::der_bytes(&key))[..8]);
     params.distinguished_name = rcgen::DistinguishedName::new();
     params
         .distinguished_name
@@ -181,7 +182,7 @@ mod tests {
 
     use super::*;
 
-    fn request(robot: &str) -> (KeyPair, Request) {
+    fn request(robot: &str) -> (KeyPair, CertificateRequest) {
         let key = KeyPair::generate().expect("a key");
         let mut params = CertificateParams::default();
         params.distinguished_name = rcgen::DistinguishedName::new();
@@ -193,7 +194,7 @@ mod tests {
             .expect("made")
             .pem()
             .expect("PEM");
-        let request = Request::read(&text, robot).expect("good");
+        let request = CertificateRequest::parse(&text, robot).expect("good");
         (key, request)
     }
 
@@ -201,8 +202,11 @@ mod tests {
     fn an_authority_is_made_once_and_is_its_owners_alone() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("authority.pem");
-        let made = Authority::of_file(&path).expect("made").certificate;
-        assert_eq!(Authority::of_file(&path).expect("read").certificate, made);
+        let made = Authority::load_or_create(&path).expect("made").certificate;
+        assert_eq!(
+            Authority::load_or_create(&path).expect("read").certificate,
+            made
+        );
         let mode = path.metadata().expect("there").permissions().mode() & 0o7777;
         assert_eq!(mode, 0o600);
         assert_eq!(std::fs::read_dir(place.path()).expect("there").count(), 1);
@@ -210,7 +214,9 @@ mod tests {
         let (certificate, _) = text.split_at(text.find("-----BEGIN PRIVATE").expect("a key"));
         for damaged in ["rubbish", certificate, &text[certificate.len()..]] {
             std::fs::write(&path, damaged).expect("written");
-            let refused = Authority::of_file(&path).expect_err("none").to_string();
+            let refused = Authority::load_or_create(&path)
+                .expect_err("none")
+                .to_string();
             assert!(
                 refused.contains("authority.pem holds no certificate with its key")
                     && refused.contains("pair all robots again"),
@@ -222,8 +228,8 @@ mod tests {
     #[test]
     fn a_certificate_names_its_robot_its_key_and_its_end() {
         let place = tempfile::tempdir().expect("a directory");
-        let authority = Authority::of_file(&place.path().join("a.pem")).expect("made");
-        let other = Authority::of_file(&place.path().join("b.pem")).expect("made");
+        let authority = Authority::load_or_create(&place.path().join("a.pem")).expect("made");
+        let other = Authority::load_or_create(&place.path().join("b.pem")).expect("made");
         let (_, request) = request("rover1");
         let week = Duration::from_secs(7 * 86_400);
         let now = 1_800_000_000_123;
@@ -235,14 +241,15 @@ mod tests {
             (1_800_000_000_000, 1_800_604_800_000)
         );
         let der = CertificateDer::from_pem_slice(issued.certificate.as_bytes()).expect("PEM");
-        let shown = shown::read(&der).expect("readable");
+        let shown = shown::read_robot_certificate(&der).expect("readable");
         assert_eq!(
             (&*shown.robot, &*shown.key, shown.until),
             ("rover1", request.key_hash(), issued.expires)
         );
-        assert!(authority.has_signed(&shown) && !other.has_signed(&shown));
-        // The authority's own names no robot.
-        let refused = shown::read(authority.certificate()).expect_err("an authority");
+        assert!(authority.has_issued(&shown) && !other.has_issued(&shown));
+        // The authority's own certificate names no robot.
+        let refused =
+            shown::read_robot_certificate(authority.certificate()).expect_err("an authority");
         assert!(refused.to_string().contains("robot:NAME"), "{refused}");
     }
 }

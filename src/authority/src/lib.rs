@@ -1,12 +1,12 @@
-//! The daemon's authority, which signs robots' certificates, and what a certificate says of its robot (docs/adr/086).
+//! The daemon's certificate authority for robots, and reading robots' certificates (docs/adr/086).
 //!
 //! ```text
 //!  HOME/tls/authority.pem ─▶ Authority ─┬─ request (PKCS #10) ──issue──▶ certificate of robot:NAME
-//!                                       └─ certificate of a connection ──read──▶ Shown: robot, key, end
+//!                                       └─ certificate of a connection ──read──▶ VerifiedCertificate: robot, key, end
 //! ```
 //!
-//! Whether a certificate was signed by somebody who is trusted, and whether who shows it has its key, is found out in the TLS handshake,
-//! by rustls; here it is only read.
+//! rustls verifies in the TLS handshake that a trusted authority signed the certificate and that the client holds its
+//! key; this crate only reads it.
 
 #![forbid(unsafe_code)]
 
@@ -16,73 +16,74 @@ mod shown;
 
 use std::path::PathBuf;
 
-pub use issue::{Authority, Issued};
-pub use request::{LONGEST, Request};
-pub use shown::{Period, Shown, period, read};
+pub use issue::{Authority, IssuedRobotCertificate};
+pub use request::{CertificateRequest, LONGEST};
+pub use shown::{ValidityPeriod, VerifiedCertificate, read_robot_certificate, read_validity};
 
 /// Milliseconds since 1970.
 pub type Millis = u64;
 
-/// What stands before a robot's name in a certificate: it is a URI (RFC 3986) of this scheme.
+/// Prefix of a robot's name in a certificate: the scheme of a URI (RFC 3986).
 pub const SCHEME: &str = "robot:";
 
-/// Why a certificate is not made, or says nothing.
+/// Reason why a certificate is not issued or not accepted.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file system refused.
+    /// A file operation failed.
     #[error("cannot {action} {path}: {source}", path = .path.display())]
     Io {
-        /// What was being done.
+        /// The operation.
         action: &'static str,
-        /// The authority's file.
+        /// Path of the authority's file.
         path: PathBuf,
-        /// What the system said.
+        /// Underlying error.
         source: std::io::Error,
     },
     /// The file holds no authority.
     #[error(
-        "{path} holds no certificate with its key (PEM): {reason}; put the right one back, or remove it to get another, and pair \
-         all robots again",
+        "{path} holds no certificate with its key (PEM): {reason}; restore it, or remove it to create a new one and \
+            pair all robots again",
         path = .path.display()
     )]
     NoAuthority {
-        /// The authority's file.
+        /// Path of the authority's file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of what is wrong.
         reason: String,
     },
-    /// A certificate cannot be made.
-    #[error("cannot make a certificate for {what}: {source}")]
+    /// A certificate could not be created.
+    #[error("cannot create a certificate for {what}: {source}")]
     Unmade {
-        /// For whom.
+        /// Subject of the certificate.
         what: String,
-        /// The cause.
+        /// Underlying error.
         source: rcgen::Error,
     },
-    /// What should be a request is none.
-    #[error("this is no request for a certificate (PKCS #10 in PEM, RFC 2986): {0}")]
+    /// The text is not a signing request.
+    #[error("not a certificate request (PKCS #10 in PEM, RFC 2986): {0}")]
     NoRequest(String),
-    /// It is longer than a request can be.
-    #[error("a request for a certificate has at most {LONGEST} bytes, and this one has {0}")]
+    /// The request is too long.
+    #[error("a certificate request has at most {LONGEST} bytes, but this one has {0}")]
     TooLong(usize),
-    /// It is for somebody else.
+    /// The request is for another name.
     #[error(
-        "the request asks for a certificate of {found}, and the pairing is for {SCHEME}{robot}"
+        "the request asks for a certificate of {found}, but the pairing is for {SCHEME}{robot}"
     )]
     OtherName {
-        /// What it asks for.
+        /// Name in the request.
         found: String,
-        /// Whom it may be for.
+        /// Robot that the request must be for.
         robot: String,
     },
-    /// A key of a kind that is not taken.
+    /// The key type is not supported.
     #[error(
-        "the request has a key of a kind that is not taken here; make one of P-256 or Ed25519 (cloudroid-stub pair makes one)"
+        "the key type of the request is not supported; use P-256 or Ed25519 (cloudroid-stub pair creates one)"
     )]
     Kind,
-    /// A certificate that names no robot, or two.
+    /// The certificate names no robot, or several.
     #[error(
-        "the certificate that was shown names no robot: {0}; its subject alternative name (URI) or common name has to be {SCHEME}NAME"
+        "the client certificate names no robot: {0}; its subject alternative name (URI) or common name must be \
+            {SCHEME}NAME"
     )]
     Nameless(String),
 }

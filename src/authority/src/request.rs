@@ -1,4 +1,5 @@
-//! What a robot asks a certificate with: PKCS #10 (RFC 2986), written by somebody who has shown a pairing code, or a certificate.
+//! Certificate signing requests of robots: PKCS #10 (RFC 2986), sent by whoever presented a pairing code or a
+//! certificate.
 
 use rcgen::{
     CertificateSigningRequestParams, DnType, DnValue, PKCS_ECDSA_P256_SHA256, PKCS_ED25519,
@@ -12,26 +13,26 @@ use x509_parser::prelude::FromDer;
 
 use crate::{Error, SCHEME, shown};
 
-/// Bytes of a request: one of P-256 has about 500.
+/// Maximum size of a request in bytes; one with a P-256 key has about 500.
 pub const LONGEST: usize = 4096;
 
-/// A request whose signature was verified: who made it has the key.
+/// A signing request whose signature was verified, which proves that the sender holds the key.
 #[derive(Debug, Clone)]
-pub struct Request {
+pub struct CertificateRequest {
     key: PublicKey,
     hash: String,
 }
 
-impl Request {
-    /// Reads a request (PEM) for a robot's certificate. It may name the robot, and nobody else.
-    pub fn read(text: &str, robot: &str) -> Result<Request, Error> {
+impl CertificateRequest {
+    /// Parses a request (PEM) for a robot's certificate. It may name this robot only, or nobody.
+    pub fn parse(text: &str, robot: &str) -> Result<CertificateRequest, Error> {
         if text.len() > LONGEST {
             return Err(Error::TooLong(text.len()));
         }
         let der = CertificateSigningRequestDer::from_pem_slice(text.as_bytes())
             .map_err(|error| Error::NoRequest(error.to_string()))?;
-        // Signatures of other kinds are not looked at.
-        if !is_of_known_kind(&der)? {
+        // Signatures of unsupported key types are not verified.
+        if !has_supported_key(&der)? {
             return Err(Error::Kind);
         }
         let read =
@@ -45,7 +46,7 @@ impl Request {
             robot: robot.to_owned(),
         };
         for (kind, value) in read.params.distinguished_name.iter() {
-            let text = text_of(value);
+            let text = name_text(value);
             if *kind != DnType::CommonName || text != wanted {
                 return Err(other(text));
             }
@@ -60,7 +61,7 @@ impl Request {
         }
         let key = read.public_key;
         let bytes = PublicKeyData::der_bytes(&key);
-        // The algorithm is the signature's: a key of another curve may have made it.
+        // The algorithm is that of the signature; the key itself may be on another curve.
         let known = match PublicKeyData::algorithm(&key) {
             algorithm if *algorithm == PKCS_ECDSA_P256_SHA256 => bytes.len() == 65 && bytes[0] == 4,
             algorithm if *algorithm == PKCS_ED25519 => bytes.len() == 32,
@@ -69,13 +70,13 @@ impl Request {
         if !known {
             return Err(Error::Kind);
         }
-        Ok(Request {
-            hash: hex::encode(shown::hash(bytes)),
+        Ok(CertificateRequest {
+            hash: hex::encode(shown::hash_key(bytes)),
             key,
         })
     }
 
-    /// SHA-256 of the key, in hexadecimal digits.
+    /// Returns the SHA-256 hash of the key in hexadecimal.
     pub fn key_hash(&self) -> &str {
         &self.hash
     }
@@ -85,8 +86,8 @@ impl Request {
     }
 }
 
-/// Whether the key is of P-256 (RFC 5480, section 2.1.1) or Ed25519 (RFC 8410, section 3).
-fn is_of_known_kind(der: &CertificateSigningRequestDer<'_>) -> Result<bool, Error> {
+/// Returns true if the key is P-256 (RFC 5480, section 2.1.1) or Ed25519 (RFC 8410, section 3).
+fn has_supported_key(der: &CertificateSigningRequestDer<'_>) -> Result<bool, Error> {
     let (_, read) = X509CertificationRequest::from_der(der)
         .map_err(|error| Error::NoRequest(error.to_string()))?;
     let kind = &read.certification_request_info.subject_pki.algorithm;
@@ -98,12 +99,12 @@ fn is_of_known_kind(der: &CertificateSigningRequestDer<'_>) -> Result<bool, Erro
     })
 }
 
-fn text_of(value: &DnValue) -> String {
+fn name_text(value: &DnValue) -> String {
     match value {
         DnValue::Utf8String(text) => text.clone(),
         DnValue::PrintableString(text) => text.as_str().to_owned(),
         DnValue::Ia5String(text) => text.as_str().to_owned(),
-        _ => "a name in letters that are not read here".to_owned(),
+        _ => "a name in an unsupported encoding".to_owned(),
     }
 }
 
@@ -114,7 +115,7 @@ mod tests {
 
     use super::*;
 
-    fn made(key: &KeyPair, names: &[(DnType, &str)], alternative: Vec<SanType>) -> String {
+    fn request_pem(key: &KeyPair, names: &[(DnType, &str)], alternative: Vec<SanType>) -> String {
         let mut params = CertificateParams::default();
         params.distinguished_name = DistinguishedName::new();
         for (kind, name) in names {
@@ -137,35 +138,41 @@ mod tests {
         let key = KeyPair::generate().expect("a key");
         let ed25519 = KeyPair::generate_for(&PKCS_ED25519).expect("a key");
         let own = (DnType::CommonName, "robot:r1");
-        let first = Request::read(&made(&key, &[], Vec::new()), "r1").expect("nameless");
+        let first =
+            CertificateRequest::parse(&request_pem(&key, &[], Vec::new()), "r1").expect("nameless");
         for text in [
-            made(&key, std::slice::from_ref(&own), Vec::new()),
-            made(&key, &[], vec![uri("robot:r1")]),
+            request_pem(&key, std::slice::from_ref(&own), Vec::new()),
+            request_pem(&key, &[], vec![uri("robot:r1")]),
         ] {
             assert_eq!(
-                Request::read(&text, "r1").expect("its own").hash,
+                CertificateRequest::parse(&text, "r1")
+                    .expect("its own")
+                    .hash,
                 first.hash
             );
         }
-        Request::read(&made(&ed25519, &[own], Vec::new()), "r1").expect("Ed25519");
+        CertificateRequest::parse(&request_pem(&ed25519, &[own], Vec::new()), "r1")
+            .expect("Ed25519");
     }
 
     #[test]
     fn what_asks_for_another_name_is_refused_with_both() {
         let key = KeyPair::generate().expect("a key");
         for text in [
-            made(&key, &[(DnType::CommonName, "robot:r2")], Vec::new()),
-            made(&key, &[(DnType::CommonName, "r1")], Vec::new()),
-            made(&key, &[(DnType::OrganizationName, "robot:r1")], Vec::new()),
-            made(&key, &[], vec![uri("robot:r1"), uri("robot:r2")]),
-            made(
+            request_pem(&key, &[(DnType::CommonName, "robot:r2")], Vec::new()),
+            request_pem(&key, &[(DnType::CommonName, "r1")], Vec::new()),
+            request_pem(&key, &[(DnType::OrganizationName, "robot:r1")], Vec::new()),
+            request_pem(&key, &[], vec![uri("robot:r1"), uri("robot:r2")]),
+            request_pem(
                 &key,
                 &[],
                 vec![SanType::DnsName("server".try_into().expect("a name"))],
             ),
-            made(&key, &[], vec![SanType::IpAddress([10, 0, 0, 1].into())]),
+            request_pem(&key, &[], vec![SanType::IpAddress([10, 0, 0, 1].into())]),
         ] {
-            let refused = Request::read(&text, "r1").expect_err(&text).to_string();
+            let refused = CertificateRequest::parse(&text, "r1")
+                .expect_err(&text)
+                .to_string();
             assert!(refused.contains("is for robot:r1"), "{refused}");
         }
     }
@@ -173,10 +180,12 @@ mod tests {
     #[test]
     fn other_kinds_of_keys_are_refused_with_those_that_are_taken() {
         let key = KeyPair::generate_for(&PKCS_ECDSA_P384_SHA384).expect("a key");
-        // By openssl: req -new -newkey rsa:1024 -nodes -subj /CN=robot:r1
+        // Made by openssl: req -new -newkey rsa:1024 -nodes -subj /CN=robot:r1
         let weak = include_str!("../tests/rsa1024.csr");
-        for text in [&*made(&key, &[], Vec::new()), weak] {
-            let refused = Request::read(text, "r1").expect_err(text).to_string();
+        for text in [&*request_pem(&key, &[], Vec::new()), weak] {
+            let refused = CertificateRequest::parse(text, "r1")
+                .expect_err(text)
+                .to_string();
             assert!(refused.contains("P-256 or Ed25519"), "{refused}");
         }
     }
@@ -184,19 +193,19 @@ mod tests {
     #[test]
     fn what_is_no_request_is_refused() {
         let key = KeyPair::generate().expect("a key");
-        let good = made(&key, &[], Vec::new());
+        let good = request_pem(&key, &[], Vec::new());
         let certificate = CertificateParams::default()
             .self_signed(&key)
             .expect("made")
             .pem();
-        // A bit of the key, or of the signature, is another.
+        // Flips a bit of the key or of the signature.
         let turned = |at: usize| {
             let mut der = CertificateSigningRequestDer::from_pem_slice(good.as_bytes())
                 .expect("PEM")
                 .to_vec();
             let at = if at == 0 { der.len() - 1 } else { at };
             der[at] ^= 1;
-            let encoded = pem_of(&der);
+            let encoded = encode_base64(&der);
             format!(
                 "-----BEGIN CERTIFICATE REQUEST-----\n{encoded}\n-----END CERTIFICATE REQUEST-----\n"
             )
@@ -208,18 +217,19 @@ mod tests {
             &good[..good.len() / 2],
             &turned(0),
         ] {
-            let refused = Request::read(text, "r1").expect_err(text).to_string();
-            assert!(
-                refused.contains("no request for a certificate"),
-                "{refused}"
-            );
+            let refused = CertificateRequest::parse(text, "r1")
+                .expect_err(text)
+                .to_string();
+            assert!(refused.contains("not a certificate request"), "{refused}");
         }
         let long = good + &" ".repeat(LONGEST);
-        let refused = Request::read(&long, "r1").expect_err("long").to_string();
+        let refused = CertificateRequest::parse(&long, "r1")
+            .expect_err("long")
+            .to_string();
         assert!(refused.contains("at most 4096 bytes"), "{refused}");
     }
 
-    fn pem_of(der: &[u8]) -> String {
+    fn encode_base64(der: &[u8]) -> String {
         const ALPHABET: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
         let mut text = String::new();
         for three in der.chunks(3) {
@@ -227,9 +237,10 @@ mod tests {
                 bits << 8 | u32::from(*three.get(at).unwrap_or(&0))
             });
             for at in 0..4 {
-                match at <= three.len() {
-                    true => text.push(char::from(ALPHABET[(bits >> (18 - 6 * at) & 63) as usize])),
-                    false => text.push('='),
+                if at <= three.len() {
+                    text.push(char::from(ALPHABET[(bits >> (18 - 6 * at) & 63) as usize]))
+                } else {
+                    text.push('=')
                 }
             }
         }
@@ -237,14 +248,14 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever bytes come in its place, they are refused and nothing breaks.
+        /// Arbitrary bytes are refused without a panic.
         #[test]
         fn bytes_that_are_no_request_are_refused(der in prop::collection::vec(any::<u8>(), 0..300)) {
             let text = format!(
                 "-----BEGIN CERTIFICATE REQUEST-----\n{}\n-----END CERTIFICATE REQUEST-----\n",
-                pem_of(&der)
+                encode_base64(&der)
             );
-            prop_assert!(Request::read(&text, "r1").is_err());
+            prop_assert!(CertificateRequest::parse(&text, "r1").is_err());
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What a certificate says that a connection has shown and rustls has verified.
+//! Contents of a client certificate that rustls has verified.
 
 use sha2::{Digest, Sha256};
 use tokio_rustls::rustls::pki_types::CertificateDer;
@@ -8,62 +8,67 @@ use x509_parser::prelude::FromDer;
 
 use crate::{Error, Millis, SCHEME};
 
-/// Of whom a certificate is.
+/// A robot's certificate.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Shown {
-    /// The robot.
+pub struct VerifiedCertificate {
+    /// Name of the robot.
     pub robot: String,
-    /// SHA-256 of its key, in hexadecimal digits.
+    /// SHA-256 hash of the robot's key in hexadecimal.
     pub key: String,
-    /// The certificate's end.
+    /// End of the certificate's validity.
     pub until: Millis,
-    /// Who signed it, by name (DER).
+    /// Name of the issuer (DER).
     pub(crate) issuer: Vec<u8>,
 }
 
-pub(crate) fn hash(key: &[u8]) -> [u8; 32] {
+pub(crate) fn hash_key(key: &[u8]) -> [u8; 32] {
     Sha256::digest(key).into()
 }
 
-fn parsed<'a>(certificate: &'a CertificateDer<'_>) -> Result<X509Certificate<'a>, String> {
+fn parse_certificate<'a>(
+    certificate: &'a CertificateDer<'_>,
+) -> Result<X509Certificate<'a>, String> {
     match X509Certificate::from_der(certificate) {
         Ok((_, parsed)) => Ok(parsed),
         Err(error) => Err(error.to_string()),
     }
 }
 
-/// The name of whom a certificate is (DER).
-pub(crate) fn subject(certificate: &CertificateDer<'_>) -> Result<Vec<u8>, String> {
-    Ok(parsed(certificate)?.subject().as_raw().to_vec())
+/// Returns the subject of a certificate (DER).
+pub(crate) fn subject_der(certificate: &CertificateDer<'_>) -> Result<Vec<u8>, String> {
+    Ok(parse_certificate(certificate)?.subject().as_raw().to_vec())
 }
 
-/// From when to when a certificate is good.
+/// Validity period of a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Period {
-    /// Its beginning.
+pub struct ValidityPeriod {
+    /// Start of the period.
     pub from: Millis,
-    /// Its end: that of the last second in which it is good (RFC 5280, section 4.1.2.5, counts that in).
+    /// End of the period, exclusive: `notAfter` is inclusive (RFC 5280, section 4.1.2.5), so this is one second
+    /// later.
     pub until: Millis,
 }
 
-/// Reads from when to when any certificate is good. Times before 1970 are 1970.
-pub fn period(certificate: &CertificateDer<'_>) -> Result<Period, String> {
-    Ok(period_of(&parsed(certificate)?))
+/// Reads the validity period of any certificate. Times before 1970 count as 1970.
+pub fn read_validity(certificate: &CertificateDer<'_>) -> Result<ValidityPeriod, String> {
+    Ok(validity_period(&parse_certificate(certificate)?))
 }
 
-fn period_of(parsed: &X509Certificate<'_>) -> Period {
+fn validity_period(parsed: &X509Certificate<'_>) -> ValidityPeriod {
     let validity = parsed.validity();
     let millis = |seconds: i64| Millis::try_from(seconds).unwrap_or(0).saturating_mul(1000);
-    Period {
+    ValidityPeriod {
         from: millis(validity.not_before.timestamp()),
         until: millis(validity.not_after.timestamp().saturating_add(1)),
     }
 }
 
-/// Reads a robot's certificate: its name is `robot:NAME` as URI among the subject alternative names or, where there is none, as
-/// the subject's common name.
-pub fn read(certificate: &CertificateDer<'_>) -> Result<Shown, Error> {
-    let parsed = parsed(certificate).map_err(Error::Nameless)?;
+/// Reads a robot's certificate. Its name is `robot:NAME`, as a URI among the subject alternative names or, if there
+/// is none, as the subject's common name.
+pub fn read_robot_certificate(
+    certificate: &CertificateDer<'_>,
+) -> Result<VerifiedCertificate, Error> {
+    let parsed = parse_certificate(certificate).map_err(Error::Nameless)?;
     let mut names: Vec<&str> = Vec::new();
     let alternative = parsed
         .subject_alternative_name()
@@ -85,10 +90,10 @@ pub fn read(certificate: &CertificateDer<'_>) -> Result<Shown, Error> {
             _ => "it names several".to_owned(),
         }));
     };
-    Ok(Shown {
+    Ok(VerifiedCertificate {
         robot: (*robot).to_owned(),
-        key: hex::encode(hash(&parsed.public_key().subject_public_key.data)),
-        until: period_of(&parsed).until,
+        key: hex::encode(hash_key(&parsed.public_key().subject_public_key.data)),
+        until: validity_period(&parsed).until,
         issuer: parsed.issuer().as_raw().to_vec(),
     })
 }
@@ -100,7 +105,7 @@ mod tests {
 
     use super::*;
 
-    fn named(common: Option<&str>, uris: &[&str]) -> Result<String, String> {
+    fn read_name(common: Option<&str>, uris: &[&str]) -> Result<String, String> {
         let key = KeyPair::generate().expect("a key");
         let mut params = CertificateParams::default();
         params.distinguished_name = DistinguishedName::new();
@@ -110,18 +115,18 @@ mod tests {
         let uri = |uri: &&str| SanType::URI((*uri).try_into().expect("ASCII"));
         params.subject_alt_names = uris.iter().map(uri).collect();
         let made = params.self_signed(&key).expect("made");
-        let read = read(made.der());
+        let read = read_robot_certificate(made.der());
         read.map(|shown| shown.robot)
             .map_err(|error| error.to_string())
     }
 
-    /// A lab's own authority writes the name where its tools do.
+    /// A third-party authority puts the name where its tools do.
     #[test]
     fn the_name_stands_among_the_alternative_ones_or_in_the_subject() {
-        assert_eq!(named(None, &["robot:r1"]), Ok("r1".into()));
-        assert_eq!(named(Some("robot:r1"), &[]), Ok("r1".into()));
+        assert_eq!(read_name(None, &["robot:r1"]), Ok("r1".into()));
+        assert_eq!(read_name(Some("robot:r1"), &[]), Ok("r1".into()));
         assert_eq!(
-            named(Some("robot:r2"), &["https://x", "robot:r1"]),
+            read_name(Some("robot:r2"), &["https://x", "robot:r1"]),
             Ok("r1".into())
         );
         for (common, uris) in [
@@ -130,7 +135,7 @@ mod tests {
             (Some("alice"), &["https://robot:r1"]),
             (None, &["robot:r1", "robot:r2"]),
         ] {
-            let refused = named(common, uris).expect_err("no robot");
+            let refused = read_name(common, uris).expect_err("no robot");
             assert!(refused.contains("names no robot"), "{refused}");
         }
     }
@@ -138,7 +143,7 @@ mod tests {
     proptest! {
         #[test]
         fn bytes_that_are_no_certificate_name_nobody(der in prop::collection::vec(any::<u8>(), 0..300)) {
-            prop_assert!(read(&CertificateDer::from(der)).is_err());
+            prop_assert!(read_robot_certificate(&CertificateDer::from(der)).is_err());
         }
     }
 }

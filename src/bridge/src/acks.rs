@@ -1,45 +1,45 @@
-//! Answers that were sent, until the client is known to have them. A socket that dies takes with it what lay in its
-//! buffers; a call must be answered all the same when the client comes back.
+//! Answers that were sent, kept until the client is known to have them. A broken socket loses what is in its buffers; a
+//! call must still be answered when the client comes back.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use budget::{Budget, Permit};
 
-use crate::outbox::Control;
+use crate::outbox::ControlMessage;
 
-/// Answers kept.
+/// Maximum number of answers kept.
 const MAX_KEPT: usize = 1024;
-/// Bytes of those; the latest is always kept.
+/// Maximum bytes of those answers; the latest is always kept.
 const MAX_KEPT_BYTES: usize = 32 << 20;
-/// Bytes that are kept for no longer than it takes to ask whether they have arrived.
+/// Bytes that are kept only until the next ping: beyond this it is sent at once.
 const ASKED_ABOUT: usize = 4 << 20;
-/// How long an answer waits for a ping of its own. Most are followed by something else before that.
+/// Delay before an answer gets its own ping. Most are followed by another ping earlier.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// Sent and not acknowledged, oldest first.
+/// Answers sent and not acknowledged, oldest first.
 pub(crate) struct Acks {
-    kept: VecDeque<Sent>,
-    /// Bytes of those.
+    kept: VecDeque<UnackedAnswer>,
+    /// Bytes of the answers kept.
     bytes: usize,
-    /// Of those, bytes of answers that have no permit of their own, and the permit for them.
+    /// Bytes of the answers kept that have no permit of their own, and the permit for them.
     small: usize,
     permit: Permit,
-    /// Bytes of those with no ping behind them yet.
+    /// Bytes of answers not followed by a ping yet.
     unasked: usize,
-    /// The number of the last ping.
+    /// Number of the last ping.
     pings: u64,
 }
 
-struct Sent {
-    control: Control,
+struct UnackedAnswer {
+    control: ControlMessage,
     at: Instant,
-    /// The ping behind it: its pong acknowledges.
+    /// Number of the ping that follows it: its pong acknowledges the answer.
     ping: u64,
 }
 
 impl Acks {
-    /// Nothing yet, of a client with this budget.
+    /// Creates an empty queue for a client with this budget.
     pub(crate) fn new(budget: &Budget) -> Self {
         Self {
             kept: VecDeque::new(),
@@ -51,11 +51,11 @@ impl Acks {
         }
     }
 
-    /// An answer goes out.
-    pub(crate) fn sent(&mut self, control: Control, at: Instant) {
+    /// Records an answer that is being sent.
+    pub(crate) fn record_sent(&mut self, control: ControlMessage, at: Instant) {
         let size = control.frame.bytes.len();
         self.bytes += size;
-        self.small += control.small();
+        self.small += control.small_bytes();
         self.unasked += size;
         while self.kept.len() >= MAX_KEPT
             || self.bytes > MAX_KEPT_BYTES
@@ -65,47 +65,50 @@ impl Acks {
                 break;
             };
             self.bytes -= oldest.control.frame.bytes.len();
-            self.small -= oldest.control.small();
+            self.small -= oldest.control.small_bytes();
         }
-        self.kept.push_back(Sent {
+        self.kept.push_back(UnackedAnswer {
             control,
             at,
             ping: self.pings + 1,
         });
     }
 
-    /// When a ping should follow what was sent.
+    /// Returns when a ping should follow the answers sent.
     pub(crate) fn ping_due(&self) -> Option<Instant> {
         let unpinged = self.kept.partition_point(|sent| sent.ping <= self.pings);
-        let patience = match self.unasked > ASKED_ABOUT {
-            true => Duration::ZERO,
-            false => PATIENCE,
+        let patience = if self.unasked > ASKED_ABOUT {
+            Duration::ZERO
+        } else {
+            PATIENCE
         };
         self.kept.get(unpinged).map(|sent| sent.at + patience)
     }
 
-    /// The payload of a ping that goes out now.
-    pub(crate) fn ping(&mut self) -> [u8; 8] {
+    /// Returns the payload of a ping that is sent now.
+    pub(crate) fn next_ping(&mut self) -> [u8; 8] {
         self.pings += 1;
         self.unasked = 0;
         self.pings.to_be_bytes()
     }
 
-    /// A pong came.
-    pub(crate) fn pong(&mut self, payload: &[u8]) {
+    /// Handles a pong.
+    pub(crate) fn on_pong(&mut self, payload: &[u8]) {
         if let Ok(number) = payload.try_into().map(u64::from_be_bytes) {
             let known = self.kept.partition_point(|sent| sent.ping <= number);
             for gone in self.kept.drain(..known) {
                 self.bytes -= gone.control.frame.bytes.len();
-                self.small -= gone.control.small();
+                self.small -= gone.control.small_bytes();
             }
-            // Less always fits.
+            // Shrinking always succeeds.
             let _ = self.permit.count(self.small);
         }
     }
 
-    /// What was never acknowledged.
-    pub(crate) fn take(&mut self) -> impl DoubleEndedIterator<Item = Control> + use<> {
+    /// Takes all answers that were not acknowledged.
+    pub(crate) fn take_unacked(
+        &mut self,
+    ) -> impl DoubleEndedIterator<Item = ControlMessage> + use<> {
         self.bytes = 0;
         self.small = 0;
         self.unasked = 0;
@@ -121,14 +124,14 @@ mod tests {
     use rosbridge::Format;
 
     use super::*;
-    use crate::sample::Frame;
+    use crate::sample::EncodedFrame;
 
-    fn answer(name: &'static str) -> Control {
-        let frame = Frame {
+    fn answer(name: &'static str) -> ControlMessage {
+        let frame = EncodedFrame {
             format: Format::Json,
             bytes: name.into(),
         };
-        Control {
+        ControlMessage {
             frame,
             fragment_size: None,
             answer: true,
@@ -138,44 +141,47 @@ mod tests {
     #[test]
     fn what_is_kept_is_bounded_and_big_answers_are_asked_about_at_once() {
         let now = Instant::now();
-        let big = |size| Control {
-            frame: Frame {
+        let big = |size| ControlMessage {
+            frame: EncodedFrame {
                 format: Format::Json,
                 bytes: vec![0; size].into(),
             },
             ..answer("")
         };
-        let mut acks = Acks::new(&Budget::unlimited());
-        acks.sent(big(5 << 20), now);
+        let mut acks = Acks::new(&Budget::without_limit());
+        acks.record_sent(big(5 << 20), now);
         assert_eq!(acks.ping_due(), Some(now));
-        acks.ping();
+        acks.next_ping();
         assert_eq!(acks.ping_due(), None);
         for _ in 0..100 {
-            acks.sent(big(5 << 20), now);
+            acks.record_sent(big(5 << 20), now);
         }
         assert_eq!((acks.kept.len(), acks.bytes), (6, 30 << 20));
-        acks.sent(big(100 << 20), now);
+        acks.record_sent(big(100 << 20), now);
         assert_eq!((acks.kept.len(), acks.bytes), (1, 100 << 20));
-        let last = acks.ping();
-        acks.pong(&last);
+        let last = acks.next_ping();
+        acks.on_pong(&last);
         assert_eq!((acks.kept.len(), acks.bytes), (0, 0));
     }
 
     #[test]
     fn a_pong_acknowledges_what_was_sent_before_its_ping() {
         let now = Instant::now();
-        let mut acks = Acks::new(&Budget::unlimited());
+        let mut acks = Acks::new(&Budget::without_limit());
         assert_eq!(acks.ping_due(), None);
-        acks.sent(answer("a"), now);
+        acks.record_sent(answer("a"), now);
         assert_eq!(acks.ping_due(), Some(now + PATIENCE));
-        let first = acks.ping();
+        let first = acks.next_ping();
         assert_eq!(acks.ping_due(), None);
-        acks.sent(answer("b"), now);
-        acks.pong(b"other");
-        acks.pong(&first);
+        acks.record_sent(answer("b"), now);
+        acks.on_pong(b"other");
+        acks.on_pong(&first);
         assert_eq!(acks.ping_due(), Some(now + PATIENCE));
-        let left: Vec<_> = acks.take().map(|control| control.frame.bytes).collect();
+        let left: Vec<_> = acks
+            .take_unacked()
+            .map(|control| control.frame.bytes)
+            .collect();
         assert_eq!(left, ["b"]);
-        assert_eq!(acks.take().count(), 0);
+        assert_eq!(acks.take_unacked().count(), 0);
     }
 }

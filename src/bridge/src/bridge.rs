@@ -1,80 +1,80 @@
-//! What all sockets of one servant share.
+//! State shared by all connections of one servant.
 
 use std::sync::Arc;
 
 use ros::bus::Bus;
 use ros::schema::Registry;
-use ros::sizes::Seen;
-use rosbridge::{Format, Level};
+use ros::sizes::SizeSummary;
+use rosbridge::{Format, StatusLevel};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
-use crate::connection::Connection;
+use crate::connection::BridgeConnection;
 use crate::lease::Lease;
-use crate::outbox::Goodbye;
-use crate::shared::Shared;
-use crate::waiting::Waiting;
+use crate::outbox::CloseReason;
+use crate::shared::BridgeShared;
+use crate::waiting::WaitingConnection;
 use crate::{BridgeOptions, Metrics, SessionOptions};
 
-/// One servant's bridge.
+/// The bridge of one servant.
 pub struct Bridge {
-    shared: Arc<Shared>,
+    shared: Arc<BridgeShared>,
 }
 
-/// How many sessions a bridge has.
+/// Number of sessions of a bridge.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SessionCount {
-    /// Connected now.
+    /// Sessions that are connected.
     pub connected: usize,
-    /// Away, and still within their grace time.
+    /// Sessions that are disconnected, but still within their grace period.
     pub away: usize,
 }
 
-/// How a connection ended.
+/// The end of a connection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SessionEnd {
     /// The client closed it.
     Client {
-        /// WebSocket close code; 1005 where it gave none.
+        /// WebSocket close code; 1005 if the client gave none.
         code: u16,
-        /// The client's words.
+        /// Close reason given by the client.
         reason: String,
     },
     /// The bridge closed it.
     Closed {
         /// WebSocket close code.
         code: u16,
-        /// The words sent to the client.
+        /// Close reason sent to the client.
         reason: String,
     },
-    /// The socket failed or ended without goodbye.
+    /// The socket failed or ended without a close frame.
     Lost(String),
 }
 
 impl Bridge {
-    /// A bridge between `bus` and the sockets that [`serve`](Self::serve) will be given. `registry` holds the
-    /// definitions of the servant's types; types that publishers announce are added.
+    /// Creates a bridge between `bus` and the sockets passed to [`serve`](Self::serve). `registry` contains the
+    /// definitions of the servant's types; types announced by publishers are added.
     pub fn new(bus: Arc<dyn Bus>, registry: Arc<Registry>, options: BridgeOptions) -> Arc<Self> {
         Arc::new(Self {
-            shared: Shared::new(bus, registry, options),
+            shared: BridgeShared::new(bus, registry, options),
         })
     }
 
-    /// Speaks rosbridge on `io`, a connection behind its WebSocket upgrade, until it ends.
+    /// Serves rosbridge on `io`, a connection after its WebSocket upgrade, until it ends.
     pub async fn serve<S>(self: &Arc<Self>, io: S, options: SessionOptions) -> SessionEnd
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
-        let waiting =
-            Waiting::new(io, &options.read_ahead, &self.shared.options).within(&options.budget);
+        let waiting = WaitingConnection::new(io, &options.read_ahead, &self.shared.options)
+            .with_budget(&options.budget);
         self.serve_waiting(waiting, options).await
     }
 
-    /// Speaks rosbridge on a connection that has waited for this bridge, until it ends. What the client sent meanwhile
-    /// is carried out first, in order.
+    /// Serves rosbridge on a connection that has waited for this bridge, until it ends. Messages that the client sent
+    /// meanwhile are executed first, in order.
     pub async fn serve_waiting<S>(
         self: &Arc<Self>,
-        waiting: Waiting<S>,
+        waiting: WaitingConnection<S>,
         options: SessionOptions,
     ) -> SessionEnd
     where
@@ -91,21 +91,22 @@ impl Bridge {
         let lease = Lease::take(shared.clone(), client.clone(), options.resume);
         tracing::debug!(client = %client.name, "session begins");
         let (socket, kept) = waiting.into_parts();
-        let end = Connection::new(socket, kept, client.clone(), lease.socket, &options.budget)
-            .run()
-            .await;
+        let end =
+            BridgeConnection::new(socket, kept, client.clone(), lease.socket, &options.budget)
+                .run()
+                .await;
         tracing::debug!(client = %client.name, ?end, "session ends");
         lease.leave(&end);
         end
     }
 
-    /// Tells every session, connected or away, why it ends (a status message and a close frame with code 1012) and
-    /// ends it; later connections are refused the same way. For when the servant dies or is replaced.
+    /// Closes every session, connected or not, with this reason (a status message and a close frame with code 1012);
+    /// later connections are refused the same way. Used when the servant ends or is replaced.
     pub fn close(&self, reason: &str) {
         let clients = self.shared.close(reason);
         for client in clients {
-            client.status(Level::Error, None, Format::Json, reason);
-            client.outbox.say_goodbye(Goodbye {
+            client.send_status(StatusLevel::Error, None, Format::Json, reason);
+            client.outbox.request_close(CloseReason {
                 code: 1012,
                 reason: reason.to_owned(),
             });
@@ -113,36 +114,36 @@ impl Bridge {
         }
     }
 
-    /// Tells every session, connected or away, of something that is wrong: a status message at level error.
+    /// Reports an error to every session, connected or not: a status message at level error.
     pub fn report(&self, what: &str) {
         for client in self.shared.clients() {
-            client.status(Level::Error, None, Format::Json, what);
+            client.send_status(StatusLevel::Error, None, Format::Json, what);
         }
     }
 
-    /// How many sessions there are, now and later.
+    /// Returns a receiver of the number of sessions.
     pub fn sessions(&self) -> watch::Receiver<SessionCount> {
         self.shared.sessions.subscribe()
     }
 
-    /// How large the messages and requests of each topic and service are that clients send to nodes.
-    pub fn inputs(&self) -> Vec<(String, Seen)> {
-        self.shared.inputs.seen()
+    /// Returns the sizes of the messages and requests that clients send to nodes, for each topic and service.
+    pub fn inputs(&self) -> Vec<(String, SizeSummary)> {
+        self.shared.inputs.summaries()
     }
 
-    /// What was counted so far.
+    /// Returns the counters.
     pub fn metrics(&self) -> &Arc<Metrics> {
         &self.shared.metrics
     }
 }
 
-/// Refuses a connection behind its WebSocket upgrade: a status message at level error, then a close frame. For when
+/// Refuses a connection after its WebSocket upgrade: a status message at level error, then a close frame. Used when
 /// there is no bridge to serve it, because its client may not have one.
 pub async fn refuse<S>(io: S, code: u16, reason: &str)
 where
     S: AsyncRead + AsyncWrite + Unpin + Send,
 {
-    Waiting::new(io, b"", &BridgeOptions::default())
+    WaitingConnection::new(io, b"", &BridgeOptions::default())
         .refuse(code, reason)
         .await;
 }

@@ -1,4 +1,4 @@
-//! One client: what it asked for, kept apart from the socket it asked through.
+//! A client: its subscriptions, advertisements and calls, independent of the socket.
 
 mod actions;
 mod calls;
@@ -21,22 +21,22 @@ use parking_lot::Mutex;
 use ros::bus::RosVersion;
 use ros::schema::MessageType;
 use rosbridge::{
-    Compression, Error, Format, Frame as Incoming, GoalStatus, Id, Level, Op, Payload, Qos, Status,
-    Writer,
+    Compression, Error, Format, GoalStatus, Id, Op, Payload, ProtocolFrame as Incoming, QosRequest,
+    Status, StatusLevel, Writer,
 };
 use tokio_util::sync::CancellationToken;
 
 use crate::names;
-use crate::outbox::{Control, Goodbye, Outbox};
-use crate::quality::unheard;
-use crate::sample::Frame;
-use crate::shared::Shared;
-use crate::{Granted, SessionOptions};
+use crate::outbox::{CloseReason, ControlMessage, Outbox};
+use crate::quality::ignored_policies;
+use crate::sample::EncodedFrame;
+use crate::shared::BridgeShared;
+use crate::{ClientGrants, SessionOptions};
 pub(crate) use inbox::Inbox;
-use under_way::UnderWay;
+use under_way::InFlightGuard;
 
-/// Removes the entries of the names that are chosen.
-fn take_chosen<T>(
+/// Removes the entries whose names match.
+fn remove_matching<T>(
     from: &mut HashMap<String, T>,
     chosen: impl Fn(&str) -> bool,
 ) -> Vec<(String, T)> {
@@ -45,61 +45,61 @@ fn take_chosen<T>(
     taken.collect()
 }
 
-/// Characters of a strange field's name that its sender is told.
+/// Maximum length, in characters, of an unknown field's name in a status message.
 const SHOWN: usize = 48;
 
-/// The client.
-pub(crate) struct Client {
-    pub(crate) shared: Arc<Shared>,
+/// A client of the bridge.
+pub(crate) struct BridgeClient {
+    pub(crate) shared: Arc<BridgeShared>,
     pub(crate) name: String,
     pub(crate) outbox: Arc<Outbox>,
-    /// Counts what waits for it.
+    /// Counts the data queued for the client.
     pub(crate) budget: Budget,
-    /// What it may do.
-    granted: Mutex<Granted>,
+    /// Grants of the client.
+    granted: Mutex<ClientGrants>,
     hears_clients: bool,
     resumable: bool,
     level: AtomicU8,
-    /// Calls and goals under way.
+    /// Number of calls and goals in progress.
     under_way: AtomicUsize,
     /// Bytes of their arguments.
     under_way_bytes: AtomicUsize,
     ended: CancellationToken,
-    subscriptions: Mutex<subscribing::Subscribed>,
+    subscriptions: Mutex<subscribing::ClientSubscriptions>,
     topic_publishers: Mutex<publishing::TopicPublishers>,
-    services: Mutex<serving::Services>,
+    services: Mutex<serving::ClientServices>,
     actions: Mutex<actions::Actions>,
 }
 
-/// Where an answer goes: to which interaction, in which format.
+/// Destination of an answer: the interaction and the format.
 #[derive(Debug, Clone)]
-pub(crate) struct Reply {
+pub(crate) struct ReplyTarget {
     pub(crate) id: Option<Id<'static>>,
     pub(crate) format: Format,
 }
 
-impl Client {
-    /// Which ROS its servant speaks.
+impl BridgeClient {
+    /// Returns the ROS version of its servant.
     fn version(&self) -> RosVersion {
         self.shared.bus.version()
     }
 
-    /// The absolute form of a name that it has written.
+    /// Resolves a name written by the client to its absolute form.
     fn resolve<'n>(&self, name: &'n str) -> Result<Cow<'n, str>, String> {
         names::resolve(self.version(), name)
     }
 
-    /// What it may do.
-    pub(crate) fn granted(&self) -> Granted {
+    /// Returns its grants.
+    pub(crate) fn client_grants(&self) -> ClientGrants {
         self.granted.lock().clone()
     }
 
-    /// It has come back: what it may do is told by its new connection from now on.
-    pub(crate) fn grant(&self, granted: Granted) {
+    /// Replaces its grants by those of its new connection, when the client has come back.
+    pub(crate) fn set_grants(&self, granted: ClientGrants) {
         *self.granted.lock() = granted;
     }
 
-    pub(crate) fn new(shared: Arc<Shared>, options: &SessionOptions) -> Arc<Self> {
+    pub(crate) fn new(shared: Arc<BridgeShared>, options: &SessionOptions) -> Arc<Self> {
         let budget = options.budget.clone();
         let outbox = Outbox::new(&shared.options, shared.metrics.clone(), &budget);
         let outbox = Arc::new(outbox);
@@ -122,10 +122,10 @@ impl Client {
         })
     }
 
-    /// It will not come back: gives up all it had.
+    /// Ends the client for good: releases everything it had.
     pub(crate) fn end(&self) {
         self.ended.cancel();
-        // Dropped outside of the locks: what is dropped may want them.
+        // Dropped outside of the locks, since the values may take them in their drops.
         let subscriptions = std::mem::take(&mut *self.subscriptions.lock());
         drop(subscriptions);
         let topic_publishers = std::mem::take(&mut *self.topic_publishers.lock());
@@ -136,26 +136,26 @@ impl Client {
         drop(actions);
     }
 
-    /// Whether another socket may take over.
+    /// Returns whether another socket may take over.
     pub(crate) fn is_resumable(&self) -> bool {
         self.resumable
     }
 
-    pub(crate) async fn ended(&self) {
+    pub(crate) async fn wait_ended(&self) {
         self.ended.cancelled().await;
     }
 
-    /// Takes a text frame.
-    pub(crate) fn text(self: &Arc<Self>, inbox: &mut Inbox, text: &str) {
-        self.frame(inbox, Incoming::Text(text), None, 0);
+    /// Handles a text frame.
+    pub(crate) fn on_text(self: &Arc<Self>, inbox: &mut Inbox, text: &str) {
+        self.handle_frame(inbox, Incoming::Text(text), None, 0);
     }
 
-    /// Takes a binary frame.
-    pub(crate) fn binary(self: &Arc<Self>, inbox: &mut Inbox, bytes: &Bytes) {
-        self.frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
+    /// Handles a binary frame.
+    pub(crate) fn on_binary(self: &Arc<Self>, inbox: &mut Inbox, bytes: &Bytes) {
+        self.handle_frame(inbox, Incoming::Binary(bytes), Some(bytes), 0);
     }
 
-    fn frame(
+    fn handle_frame(
         self: &Arc<Self>,
         inbox: &mut Inbox,
         frame: Incoming<'_>,
@@ -165,17 +165,17 @@ impl Client {
         let format = frame.format();
         let op = match Op::parse(frame) {
             Ok(op) => op,
-            Err(error) => return self.refuse(frame, error),
+            Err(error) => return self.report_invalid(frame, error),
         };
-        if self.hears(Level::Warning) {
+        if self.wants_level(StatusLevel::Warning) {
             for field in rosbridge::unknown_fields(frame) {
                 let field: String = field.chars().take(SHOWN).collect();
                 let text = format!(
                     "{}: field {field:?} is not known and was ignored",
                     op.name()
                 );
-                self.status(
-                    Level::Warning,
+                self.send_status(
+                    StatusLevel::Warning,
                     op.id().cloned().map(Id::into_owned),
                     format,
                     &text,
@@ -183,22 +183,22 @@ impl Client {
             }
         }
         let name = op.name();
-        let reply = Reply {
+        let reply = ReplyTarget {
             id: op.id().cloned().map(Id::into_owned),
             format,
         };
-        if let Err(reason) = self.perform(inbox, op, &reply, source, wrapping) {
+        if let Err(reason) = self.execute(inbox, op, &reply, source, wrapping) {
             let text = format!("{name}: {reason}");
-            self.status(Level::Error, reply.id.clone(), format, &text);
-            self.answer_is_lost(name, reply.id.as_ref(), &text);
+            self.send_status(StatusLevel::Error, reply.id.clone(), format, &text);
+            self.fail_lost_answer(name, reply.id.as_ref(), &text);
         }
     }
 
-    fn perform(
+    fn execute(
         self: &Arc<Self>,
         inbox: &mut Inbox,
         op: Op<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
         source: Option<&Bytes>,
         wrapping: usize,
     ) -> Result<(), String> {
@@ -238,12 +238,13 @@ impl Client {
         }
     }
 
-    /// Tells that a message cannot be read; where somebody would wait for ever because of it, that its call has failed.
-    fn refuse(&self, frame: Incoming<'_>, error: Error) {
+    /// Reports a message that cannot be parsed; if the client waits for an answer to it, also reports the call as
+    /// failed.
+    fn report_invalid(&self, frame: Incoming<'_>, error: Error) {
         let (format, text) = (frame.format(), error.to_string());
-        self.status(Level::Error, error.id.clone(), format, &text);
+        self.send_status(StatusLevel::Error, error.id.clone(), format, &text);
         let op = error.op.as_deref().unwrap_or_default();
-        self.answer_is_lost(op, error.id.as_ref(), &text);
+        self.fail_lost_answer(op, error.id.as_ref(), &text);
         let answer = match op {
             "call_service" => "service_response",
             "send_action_goal" => "action_result",
@@ -255,7 +256,7 @@ impl Client {
             "action"
         };
         let name = rosbridge::text_field(frame, field);
-        // As old clients wrote the id.
+        // Old clients wrote the id as a suffix.
         let suffix = name.as_deref().and_then(|name| name.split_once('#'));
         let id = error
             .id
@@ -271,32 +272,38 @@ impl Client {
         }
         writer.boolean("result", false);
         writer.end();
-        self.send_frame(Frame::new(format, out), None, true);
+        self.send_frame(EncodedFrame::new(format, out), None, true);
     }
 
-    /// Fails the call or goal to which the client has sent an answer that cannot be used: no other answer will come.
-    fn answer_is_lost(&self, op: &str, id: Option<&Id<'_>>, reason: &str) {
+    /// Fails the call or goal to which the client has sent an unusable answer: no other answer will come.
+    fn fail_lost_answer(&self, op: &str, id: Option<&Id<'_>>, reason: &str) {
         let Some(id) = id.map(Id::to_string) else {
             return;
         };
         match op {
-            "service_response" => self.response_is_lost(&id, reason),
-            "action_result" => self.result_is_lost(&id, reason),
+            "service_response" => self.fail_lost_response(&id, reason),
+            "action_result" => self.fail_lost_result(&id, reason),
             _ => {}
         }
     }
 
-    pub(crate) fn hears(&self, level: Level) -> bool {
+    pub(crate) fn wants_level(&self, level: StatusLevel) -> bool {
         level as u8 <= self.level.load(Ordering::Relaxed)
     }
 
-    /// Sends a status message, if the client wants to hear at that level.
-    pub(crate) fn status(&self, level: Level, id: Option<Id<'static>>, format: Format, text: &str) {
-        if level == Level::Error {
+    /// Sends a status message, if the client wants that level.
+    pub(crate) fn send_status(
+        &self,
+        level: StatusLevel,
+        id: Option<Id<'static>>,
+        format: Format,
+        text: &str,
+    ) {
+        if level == StatusLevel::Error {
             self.shared.metrics.errors.add(1);
             tracing::debug!(client = %self.name, "{text}");
         }
-        if self.hears(level) {
+        if self.wants_level(level) {
             self.send(
                 Status {
                     id,
@@ -309,42 +316,48 @@ impl Client {
         }
     }
 
-    pub(crate) fn info(&self, reply: &Reply, text: &str) {
-        self.status(Level::Info, reply.id.clone(), reply.format, text);
+    pub(crate) fn info(&self, reply: &ReplyTarget, text: &str) {
+        self.send_status(StatusLevel::Info, reply.id.clone(), reply.format, text);
     }
 
-    pub(crate) fn warn(&self, reply: &Reply, text: &str) {
-        self.status(Level::Warning, reply.id.clone(), reply.format, text);
+    pub(crate) fn warn(&self, reply: &ReplyTarget, text: &str) {
+        self.send_status(StatusLevel::Warning, reply.id.clone(), reply.format, text);
     }
 
-    pub(crate) fn error(&self, reply: &Reply, text: &str) {
-        self.status(Level::Error, reply.id.clone(), reply.format, text);
+    pub(crate) fn error(&self, reply: &ReplyTarget, text: &str) {
+        self.send_status(StatusLevel::Error, reply.id.clone(), reply.format, text);
     }
 
-    /// Sends a message that holds no payload, or one in `format`.
+    /// Sends a message without payload, or with one in `format`.
     pub(crate) fn send(&self, op: Op<'_>, format: Format) {
         let mut out = Vec::with_capacity(128);
         op.print(&mut out, format);
-        self.send_frame(Frame::new(format, out), None, false);
+        self.send_frame(EncodedFrame::new(format, out), None, false);
     }
 
-    /// Sends a frame made for this client alone. It counts in the client's budget until it is written; one that does not fit
-    /// costs the client its connection, since an answer cannot be left out.
-    pub(crate) fn send_frame(&self, frame: Frame, fragment_size: Option<usize>, answer: bool) {
-        let permit = match frame.is_big() {
-            true => match self.budget.take(frame.bytes.len()) {
+    /// Sends a frame made for this client alone. It counts in the client's budget until it is written; if it does not
+    /// fit, the connection is closed, since an answer must not be dropped.
+    pub(crate) fn send_frame(
+        &self,
+        frame: EncodedFrame,
+        fragment_size: Option<usize>,
+        answer: bool,
+    ) {
+        let permit = if frame.is_big() {
+            match self.budget.take(frame.bytes.len()) {
                 Ok(permit) => Some(permit),
                 Err(full) => {
-                    return self.outbox.say_goodbye(Goodbye {
+                    return self.outbox.request_close(CloseReason {
                         code: 1013,
                         reason: format!("an answer cannot be kept: {full}"),
                     });
                 }
-            },
-            false => None,
+            }
+        } else {
+            None
         };
-        let frame = frame.holding(permit);
-        self.outbox.control(Control {
+        let frame = frame.with_permit(permit);
+        self.outbox.push_control(ControlMessage {
             frame,
             fragment_size,
             answer,
@@ -354,10 +367,10 @@ impl Client {
         }
     }
 
-    /// Sends a frame printed in JSON or CBOR as the client wants it.
+    /// Sends a frame, printed in JSON or CBOR, in the client's encoding.
     pub(crate) fn send_as(
         &self,
-        frame: Frame,
+        frame: EncodedFrame,
         compression: Compression,
         fragment_size: Option<usize>,
     ) {
@@ -367,34 +380,40 @@ impl Client {
         };
         match wrapped {
             Ok(frame) => self.send_frame(frame, fragment_size, true),
-            Err(reason) => self.status(Level::Error, None, Format::Json, &reason),
+            Err(reason) => self.send_status(StatusLevel::Error, None, Format::Json, &reason),
         }
     }
 
-    /// Warns of policies in `qos` that mean nothing here.
-    fn report_unheard(&self, op: &str, qos: Option<Qos>, subscribes: bool, reply: &Reply) {
-        let unheard = qos.and_then(|qos| unheard(self.version(), &qos, subscribes));
+    /// Warns about policies in `qos` that have no effect here.
+    fn warn_ignored_qos(
+        &self,
+        op: &str,
+        qos: Option<QosRequest>,
+        subscribes: bool,
+        reply: &ReplyTarget,
+    ) {
+        let unheard = qos.and_then(|qos| ignored_policies(self.version(), &qos, subscribes));
         if let Some(unheard) = unheard {
             self.warn(reply, &format!("{op}: {unheard}"));
         }
     }
 
-    /// Warns of arguments that the type has no fields for.
-    fn report_surplus(
+    /// Warns about more arguments than the type has fields.
+    fn warn_surplus_args(
         &self,
-        reply: &Reply,
+        reply: &ReplyTarget,
         op: &str,
         message_type: &MessageType,
         args: Option<Payload<'_>>,
     ) {
         let fields = message_type.fields().len();
-        if self.hears(Level::Warning)
+        if self.wants_level(StatusLevel::Warning)
             && let Some(found) = args.and_then(|args| args.list_len())
             && found > fields
         {
             let name = message_type.name();
             let text = format!(
-                "{op}: {name} has {fields} fields, the last {} of \"args\" were left out",
+                "{op}: {name} has {fields} fields, the last {} of \"args\" were ignored",
                 found - fields
             );
             self.warn(reply, &text);
@@ -402,8 +421,8 @@ impl Client {
     }
 }
 
-/// How payloads for this compression are printed: in which format, and whether as ROS bytes.
-fn print_format(compression: Compression) -> Format {
+/// Returns the format of payloads for this encoding; ROS bytes are in CBOR.
+fn payload_format(compression: Compression) -> Format {
     match compression {
         Compression::None | Compression::Png => Format::Json,
         Compression::Cbor | Compression::CborRaw => Format::Cbor,

@@ -1,4 +1,4 @@
-//! What time it is for the servant: the wall's, or a simulation's.
+//! The servant's time: wall time, or that of a simulation.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,30 +8,31 @@ use ros::codec::{Stamps, Time};
 use tokio::sync::mpsc;
 
 use crate::fanout::Listener;
-use crate::sample::Sample;
-use crate::shared::Shared;
+use crate::sample::TopicSample;
+use crate::shared::BridgeShared;
 
-/// How long a simulation may keep silent before the wall's time must do.
+/// Time without a tick of the simulation after which wall time is used.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Where a simulation tells the time.
+/// Topic of simulated time.
 const CLOCK: &str = "/clock";
 
-struct Ticks(mpsc::UnboundedSender<Time>);
+struct ClockListener(mpsc::UnboundedSender<Time>);
 
-impl Listener for Ticks {
-    fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
+impl Listener for ClockListener {
+    fn on_sample(&self, sample: &Arc<TopicSample>, _replay: bool) {
         let Ok(schema) = sample.schema() else { return };
-        if let Some(time) = Stamps::of(&schema).first(&sample.bytes) {
-            // Nobody waits any more.
+        if let Some(time) = Stamps::for_type(&schema).first(&sample.bytes) {
+            // An error means that nobody waits any more.
             let _ = self.0.send(time);
         }
     }
 
-    fn failed(&self, _reason: &str) {}
+    fn on_failed(&self, _reason: &str) {}
 }
 
-/// Whether time is simulated. In ROS 2 each node decides that for itself: it is as soon as one of them publishes the time.
-async fn is_simulated(shared: &Shared) -> bool {
+/// Returns whether time is simulated. In ROS 2 each node decides this itself: here it is when a node publishes the
+/// clock.
+async fn is_simulated(shared: &BridgeShared) -> bool {
     match shared.bus.version() {
         RosVersion::One => {
             let said = shared.bus.parameter("/use_sim_time").await;
@@ -45,11 +46,13 @@ async fn is_simulated(shared: &Shared) -> bool {
     }
 }
 
-/// The time now.
-pub(crate) async fn now(shared: &Arc<Shared>) -> Time {
+/// Returns the current time.
+pub(crate) async fn now(shared: &Arc<BridgeShared>) -> Time {
     if is_simulated(shared).await {
         let (ticks, mut heard) = mpsc::unbounded_channel();
-        let listening = shared.fanout(CLOCK, None).listen(Arc::new(Ticks(ticks)));
+        let listening = shared
+            .fanout(CLOCK, None)
+            .listen(Arc::new(ClockListener(ticks)));
         let tick = tokio::time::timeout(PATIENCE, heard.recv()).await;
         drop(listening);
         if let Ok(Some(time)) = tick {

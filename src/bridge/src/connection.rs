@@ -1,5 +1,5 @@
-//! One socket: moves frames between it and its client, in one task, so that nothing is handed over between threads
-//! on the way.
+//! One socket: moves frames between it and its client, in one task, so that nothing is passed between threads on the
+//! way.
 
 mod sending;
 
@@ -11,46 +11,46 @@ use std::time::Instant;
 
 use budget::Budget;
 use bytes::Bytes;
-use rosbridge::{Format, Level};
+use rosbridge::{Format, StatusLevel};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Sleep, timeout};
 
 use crate::SessionEnd;
 use crate::acks::Acks;
-use crate::client::{Client, Inbox};
-use crate::cut::Cuts;
-use crate::kept::Kept;
-use crate::outbox::{Control, Goodbye};
-use ws::{Message, WebSocket, WsError, frame};
+use crate::client::{BridgeClient, Inbox};
+use crate::cut::Fragmenter;
+use crate::kept::EarlyMessages;
+use crate::outbox::{CloseReason, ControlMessage};
+use ws::{WebSocket, WsError, WsMessage, frame};
 
-/// Bytes in the socket's queue beyond which nothing is added: so at most one big message stands before a small one.
+/// Bytes in the socket's queue above which nothing is added, so that at most one large message delays a small one.
 const SOCKET_FULL: usize = 64 * 1024;
-/// Frames taken from a client before its answers are sent.
+/// Number of frames read from a client before its answers are sent.
 const READ_BATCH: usize = 64;
-/// Rounds before other tasks have their turn.
+/// Number of rounds before yielding to other tasks.
 const ROUNDS: usize = 16;
-/// Bytes moved before other tasks have their turn. What a big message sets off (a node's connection that writes it)
-/// often waits for this very thread; to read the next one first would stall both.
+/// Bytes moved before yielding to other tasks. The work caused by a large message (a node's connection that writes it)
+/// often waits for this very thread; reading the next message first would stall both.
 const MOVED: usize = 128 * 1024;
-/// While so many answers wait nothing more is read from the client.
+/// Number of queued answers above which nothing more is read from the client.
 const CONTROL_HIGH: usize = 256;
 
-/// The socket, its client and what lies between.
-pub(crate) struct Connection<S> {
+/// The socket, its client and the state in between.
+pub(crate) struct BridgeConnection<S> {
     socket: WebSocket<S>,
-    client: Arc<Client>,
-    /// Which of the client's sockets this is.
+    client: Arc<BridgeClient>,
+    /// Number of this socket among the client's.
     number: u64,
     inbox: Inbox,
-    /// What came before there was a servant to take it.
-    kept: Kept,
-    cuts: Cuts,
+    /// Messages received before the servant was ready.
+    kept: EarlyMessages,
+    cuts: Fragmenter,
     heard: Instant,
     /// Bytes received by then.
     heard_bytes: u64,
     ping_at: Option<Instant>,
     acks: Acks,
-    /// Reading was put off because answers wait.
+    /// Reading was suspended because answers are queued.
     held_back: bool,
     /// Bytes read and written since other tasks had their turn.
     moved: usize,
@@ -58,26 +58,26 @@ pub(crate) struct Connection<S> {
     timer_at: Option<Instant>,
 }
 
-/// Why a connection stops.
-enum Stop {
+/// Reason why a connection stops.
+enum StopReason {
     /// The client sent a close frame.
     Client { code: u16, reason: String },
-    /// It is to be closed; `readable` unless the client's bytes can no longer be told apart.
+    /// It is to be closed; `readable` unless the client's byte stream can no longer be parsed.
     Close {
         code: u16,
         reason: String,
         readable: bool,
     },
-    /// The socket is of no more use. `heard_all`: the client ended it in good order, having read what was sent.
+    /// The socket is unusable. `heard_all`: the client ended it cleanly, having read everything that was sent.
     Lost { reason: String, heard_all: bool },
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
-    /// A connection on `socket`, which takes what was `kept` of it first.
+impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
+    /// Creates a connection on `socket`, which first handles the messages in `kept`.
     pub(crate) fn new(
         socket: WebSocket<S>,
-        kept: Kept,
-        client: Arc<Client>,
+        kept: EarlyMessages,
+        client: Arc<BridgeClient>,
         number: u64,
         budget: &Budget,
     ) -> Self {
@@ -88,7 +88,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             number,
             inbox: Inbox::new(&client.shared, budget),
             kept,
-            cuts: Cuts::default(),
+            cuts: Fragmenter::default(),
             heard: now,
             heard_bytes: 0,
             ping_at: (!options.ping_interval.is_zero()).then(|| now + options.ping_interval),
@@ -102,26 +102,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 
     /// Keeps an answer until the client is known to have it.
-    fn remember(&mut self, control: &Control, now: Instant) {
+    fn retain_answer(&mut self, control: &ControlMessage, now: Instant) {
         if control.answer && self.client.is_resumable() {
-            self.acks.sent(control.clone(), now);
+            self.acks.record_sent(control.clone(), now);
         }
     }
 
     fn ping(&mut self) {
-        let payload = self.acks.ping();
+        let payload = self.acks.next_ping();
         self.socket
             .queue(frame::PING, Bytes::copy_from_slice(&payload));
     }
 
-    /// Takes frames from the client. Ready when a batch was taken, pending when none is there.
-    fn read(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), Stop>> {
+    /// Reads frames from the client. Ready when a batch was handled, pending when none is available.
+    fn read(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), StopReason>> {
         for _ in 0..READ_BATCH {
             if self.moved >= MOVED {
                 break;
             }
-            // Who does not read what we answer has nothing more to say.
-            if self.client.outbox.control_waiting() >= CONTROL_HIGH {
+            // A client that does not read our answers has nothing more to say.
+            if self.client.outbox.control_len() >= CONTROL_HIGH {
                 self.held_back = true;
                 return Poll::Pending;
             }
@@ -129,15 +129,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 Some(message) => Poll::Ready(Ok(message)),
                 None => self.socket.poll_next(cx),
             };
-            // A big message on a slow line is heard from its first byte on, not only at its end.
-            if self.heard_bytes != self.socket.received() {
-                self.heard_bytes = self.socket.received();
+            // A large message on a slow line counts as activity from its first byte on.
+            if self.heard_bytes != self.socket.bytes_received() {
+                self.heard_bytes = self.socket.bytes_received();
                 self.heard = now;
             }
             let message = match ready!(next) {
                 Ok(message) => message,
                 Err(WsError::Refused { code, reason }) => {
-                    return Poll::Ready(Err(Stop::Close {
+                    return Poll::Ready(Err(StopReason::Close {
                         code,
                         reason,
                         readable: false,
@@ -145,29 +145,29 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 }
                 Err(error) => {
                     let heard_all = matches!(error, WsError::Eof);
-                    return Poll::Ready(Err(Stop::Lost {
+                    return Poll::Ready(Err(StopReason::Lost {
                         reason: error.to_string(),
                         heard_all,
                     }));
                 }
             };
-            self.take(message)?;
+            self.handle_message(message)?;
         }
         Poll::Ready(Ok(()))
     }
 
-    fn take(&mut self, message: Message) -> Result<(), Stop> {
+    fn handle_message(&mut self, message: WsMessage) -> Result<(), StopReason> {
         let metrics = &self.client.shared.metrics;
         match message {
-            Message::Text(bytes) => {
+            WsMessage::Text(bytes) => {
                 metrics.frames_in.add(1);
                 metrics.bytes_in.add(bytes.len() as u64);
                 self.moved += bytes.len();
                 match std::str::from_utf8(&bytes) {
-                    Ok(text) => self.client.text(&mut self.inbox, text),
+                    Ok(text) => self.client.on_text(&mut self.inbox, text),
                     Err(_) => {
                         let reason = "a text frame is not UTF-8".to_owned();
-                        return Err(Stop::Close {
+                        return Err(StopReason::Close {
                             code: 1007,
                             reason,
                             readable: true,
@@ -175,46 +175,46 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                     }
                 }
             }
-            Message::Binary(bytes) => {
+            WsMessage::Binary(bytes) => {
                 metrics.frames_in.add(1);
                 metrics.bytes_in.add(bytes.len() as u64);
                 self.moved += bytes.len();
-                self.client.binary(&mut self.inbox, &bytes);
+                self.client.on_binary(&mut self.inbox, &bytes);
             }
-            // Pongs that a client does not read pile up no higher than this.
-            Message::Ping(payload) if self.socket.queued() < SOCKET_FULL => {
+            // Limits the pongs queued for a client that does not read.
+            WsMessage::Ping(payload) if self.socket.bytes_queued() < SOCKET_FULL => {
                 self.socket.queue(frame::PONG, payload)
             }
-            Message::Ping(_) => {}
-            Message::Pong(payload) => self.acks.pong(&payload),
-            Message::Close(code, reason) => return Err(Stop::Client { code, reason }),
+            WsMessage::Ping(_) => {}
+            WsMessage::Pong(payload) => self.acks.on_pong(&payload),
+            WsMessage::Close(code, reason) => return Err(StopReason::Client { code, reason }),
         }
-        self.inbox.count().map_err(|full| Stop::Close {
+        self.inbox.count().map_err(|full| StopReason::Close {
             code: 1013,
             reason: format!("fragments cannot be kept: {full}"),
             readable: true,
         })
     }
 
-    /// What the clock demands: a ping, a goodbye.
-    fn mind_the_clock(&mut self, now: Instant) -> Result<(), Stop> {
+    /// Handles timeouts: sends pings, and closes idle connections.
+    fn check_timers(&mut self, now: Instant) -> Result<(), StopReason> {
         let options = &self.client.shared.options;
         let (idle, interval) = (options.idle_timeout, options.ping_interval);
         let silent = now.saturating_duration_since(self.heard);
         if !idle.is_zero() && silent >= idle {
             let reason = format!(
-                "nothing was heard for {} s, not even a pong",
+                "nothing was received for {} s, not even a pong",
                 silent.as_secs()
             );
-            return Err(Stop::Close {
+            return Err(StopReason::Close {
                 code: 1001,
                 reason,
                 readable: true,
             });
         }
         let regular = self.ping_at.is_some_and(|at| at <= now);
-        // Behind a blocked message a ping would only pile up.
-        if self.socket.queued() < SOCKET_FULL
+        // Behind a blocked message pings would only pile up.
+        if self.socket.bytes_queued() < SOCKET_FULL
             && (regular || self.acks.ping_due().is_some_and(|at| at <= now))
         {
             self.ping();
@@ -225,13 +225,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         Ok(())
     }
 
-    /// When to look at the clock again. To be asked after writing: what was written may need a ping behind it, and its
-    /// topic's next message may have to wait for its throttle rate.
-    fn next_look(&self) -> Option<Instant> {
+    /// Returns the time of the next timeout. Must be called after writing: what was written may need a ping after it,
+    /// and its topic's next message may have to wait for its throttle rate.
+    fn next_deadline(&self) -> Option<Instant> {
         let idle = self.client.shared.options.idle_timeout;
         let idle_at = (!idle.is_zero()).then(|| self.heard + idle);
-        // While the socket takes no more there is nothing to send in time; it wakes this task itself.
-        let blocked = self.socket.queued() >= SOCKET_FULL;
+        // While the socket is blocked there is nothing to send in time; it wakes this task itself.
+        let blocked = self.socket.bytes_queued() >= SOCKET_FULL;
         let ack_at = self.acks.ping_due().filter(|_| !blocked);
         let sample_at = self.client.outbox.next_due().filter(|_| !blocked);
         [self.ping_at, idle_at, ack_at, sample_at]
@@ -240,10 +240,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             .min()
     }
 
-    /// Ready when it is time.
-    fn arm(&mut self, cx: &mut Context<'_>, at: Option<Instant>) -> Poll<()> {
+    /// Ready when the time has come.
+    fn poll_timer(&mut self, cx: &mut Context<'_>, at: Option<Instant>) -> Poll<()> {
         let Some(at) = at else { return Poll::Pending };
-        // A deadline that moved away is left to fire early; then it is looked at again.
+        // If the deadline has moved later, the timer fires early and is set again.
         if self.timer_at.is_none_or(|armed| at < armed) {
             self.timer.as_mut().reset(at.into());
             self.timer_at = Some(at);
@@ -253,10 +253,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         Poll::Ready(())
     }
 
-    fn step(&mut self, cx: &mut Context<'_>) -> Poll<Stop> {
+    fn step(&mut self, cx: &mut Context<'_>) -> Poll<StopReason> {
         if !self.client.outbox.register(self.number, cx.waker()) {
             let reason = "a newer connection has taken this session over".to_owned();
-            return Poll::Ready(Stop::Close {
+            return Poll::Ready(StopReason::Close {
                 code: 4001,
                 reason,
                 readable: true,
@@ -264,8 +264,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
         self.moved = 0;
         for _ in 0..ROUNDS {
-            if let Some(Goodbye { code, reason }) = self.client.outbox.goodbye() {
-                return Poll::Ready(Stop::Close {
+            if let Some(CloseReason { code, reason }) = self.client.outbox.close_reason() {
+                return Poll::Ready(StopReason::Close {
                     code,
                     reason,
                     readable: true,
@@ -276,7 +276,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 Poll::Ready(Err(stop)) => return Poll::Ready(stop),
                 read => read,
             };
-            if let Err(stop) = self.mind_the_clock(now) {
+            if let Err(stop) = self.check_timers(now) {
                 return Poll::Ready(stop);
             }
             let written = match self.write(cx, now) {
@@ -288,7 +288,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             if self.moved >= MOVED {
                 break;
             }
-            if !more && self.arm(cx, self.next_look()).is_pending() {
+            if !more && self.poll_timer(cx, self.next_deadline()).is_pending() {
                 return Poll::Pending;
             }
         }
@@ -296,21 +296,21 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         Poll::Pending
     }
 
-    /// Serves the socket until it is to be left; takes back what is not granted any more whenever that changes.
-    async fn serve(&mut self) -> Stop {
-        let mut granted = self.client.granted();
+    /// Serves the socket until it stops; revokes what is no longer granted whenever the grants change.
+    async fn serve(&mut self) -> StopReason {
+        let mut granted = self.client.client_grants();
         loop {
-            if let Some(reason) = granted.ended() {
-                return Stop::Close {
+            if let Some(reason) = granted.end_reason() {
+                return StopReason::Close {
                     code: 1008,
                     reason,
                     readable: true,
                 };
             }
-            self.client.withdraw();
+            self.client.revoke_ungranted();
             tokio::select! {
                 biased;
-                () = granted.changed() => {}
+                () = granted.wait_changed() => {}
                 stop = poll_fn(|cx| self.step(cx)) => return stop,
             }
         }
@@ -320,25 +320,27 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     pub(crate) async fn run(mut self) -> SessionEnd {
         let stop = self.serve().await;
         let patience = self.client.shared.options.close_timeout;
-        // What is still in our own buffer has certainly not arrived.
-        let arrived = self.socket.queued() == 0;
+        // Data still in our own buffer has certainly not arrived.
+        let arrived = self.socket.bytes_queued() == 0;
         let (end, heard_all) = match stop {
-            Stop::Lost { reason, heard_all } => (SessionEnd::Lost(reason), heard_all && arrived),
-            Stop::Client { code, reason } => {
+            StopReason::Lost { reason, heard_all } => {
+                (SessionEnd::Lost(reason), heard_all && arrived)
+            }
+            StopReason::Client { code, reason } => {
                 self.socket.queue_close(code, "");
                 let answered = poll_fn(|cx| self.socket.poll_flush(cx));
                 // A client that does not wait for the answer is gone all the same.
                 let _ = timeout(patience, answered).await;
                 (SessionEnd::Client { code, reason }, arrived)
             }
-            Stop::Close {
+            StopReason::Close {
                 code,
                 reason,
                 readable,
             } => {
-                self.last_words(code, &reason);
-                // A client that does not take its leave in time is left alone.
-                let left = timeout(patience, self.socket.leave(readable)).await;
+                self.queue_remaining_control(code, &reason);
+                // A client that does not complete the close handshake in time is dropped.
+                let left = timeout(patience, self.socket.shutdown(readable)).await;
                 (
                     SessionEnd::Closed { code, reason },
                     matches!(left, Ok(Ok(()))),
@@ -346,20 +348,21 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             }
         };
         if !heard_all {
-            self.client.outbox.again(self.acks.take());
+            self.client.outbox.requeue(self.acks.take_unacked());
         }
         end
     }
 
-    /// Queues what still waits in the control queue, and a close frame.
-    fn last_words(&mut self, code: u16, reason: &str) {
+    /// Queues the rest of the control queue, and a close frame.
+    fn queue_remaining_control(&mut self, code: u16, reason: &str) {
         if matches!(code, 1002 | 1007 | 1009 | 1013) {
-            self.client.status(Level::Error, None, Format::Json, reason);
+            self.client
+                .send_status(StatusLevel::Error, None, Format::Json, reason);
         }
-        // A client that reads nothing need not be told more, one that has another socket hears it there.
+        // A client that reads nothing need not be told more; one that has another socket is told there.
         if code != 1008 && code != 4001 {
             while let Some(control) = self.client.outbox.next_control() {
-                self.remember(&control, Instant::now());
+                self.retain_answer(&control, Instant::now());
                 self.socket
                     .queue(control.frame.opcode(), control.frame.bytes);
             }

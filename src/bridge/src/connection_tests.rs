@@ -1,7 +1,7 @@
 use std::task::Waker;
 use std::time::Duration;
 
-use ros::bus::{Message as BusMessage, WireType};
+use ros::bus::{SerializedMessage as BusMessage, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -12,13 +12,13 @@ use tokio::net::TcpListener;
 
 use super::*;
 use crate::sample::TopicTypes;
-use crate::sample::{Frame, Sample};
-use crate::shared::Shared;
-use crate::topic_queue::Wishes;
+use crate::sample::{EncodedFrame, TopicSample};
+use crate::shared::BridgeShared;
+use crate::topic_queue::SubscriptionOptions;
 use crate::{BridgeOptions, SessionOptions};
 
-/// A connection that nobody polls but the test, without pings of its own, and the client's end.
-async fn connection(options: SessionOptions) -> (Connection<DuplexStream>, DuplexStream) {
+/// Creates a connection that only the test polls, without pings of its own, and the client's end.
+async fn connection(options: SessionOptions) -> (BridgeConnection<DuplexStream>, DuplexStream) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions {
@@ -34,30 +34,30 @@ async fn connection(options: SessionOptions) -> (Connection<DuplexStream>, Duple
         idle_timeout: Duration::ZERO,
         ..BridgeOptions::default()
     };
-    let shared = Shared::new(bus, Arc::new(Registry::new()), quiet);
+    let shared = BridgeShared::new(bus, Arc::new(Registry::new()), quiet);
     let client = shared.client_for(&options).unwrap();
     let (ours, theirs) = tokio::io::duplex(1 << 20);
     let socket = WebSocket::new(ours, b"", 1 << 20, 1 << 20);
     let number = client.outbox.attach();
     (
-        Connection::new(
+        BridgeConnection::new(
             socket,
-            Kept::within(&budget::Budget::unlimited()),
+            EarlyMessages::with_budget(&budget::Budget::without_limit()),
             client,
             number,
-            &budget::Budget::unlimited(),
+            &budget::Budget::without_limit(),
         ),
         theirs,
     )
 }
 
-fn step(connection: &mut Connection<DuplexStream>) {
+fn step(connection: &mut BridgeConnection<DuplexStream>) {
     let step = connection.step(&mut Context::from_waker(Waker::noop()));
     assert!(step.is_pending(), "the connection ends");
 }
 
-fn sample() -> Arc<Sample> {
-    let wire_type = WireType::named("a/B");
+fn sample() -> Arc<TopicSample> {
+    let wire_type = WireType::with_name("a/B");
     let message = BusMessage {
         bytes: vec![0; 8].into(),
         wire_type: Arc::new(wire_type),
@@ -65,14 +65,14 @@ fn sample() -> Arc<Sample> {
         latching: false,
     };
     let types = TopicTypes::new(Arc::new(Registry::new()));
-    Arc::new(Sample::new(message, false, Arc::new(types), &BridgeOptions::default()).unwrap())
+    Arc::new(TopicSample::new(message, false, Arc::new(types), &BridgeOptions::default()).unwrap())
 }
 
 #[tokio::test]
 async fn what_a_throttle_rate_holds_back_wakes_the_connection_when_it_is_due() {
     let (mut connection, _client) = connection(SessionOptions::default()).await;
     let outbox = connection.client.outbox.clone();
-    let wishes = Wishes {
+    let wishes = SubscriptionOptions {
         throttle_rate: Duration::from_secs(300),
         queue_length: 2,
         fragment_size: None,
@@ -80,7 +80,7 @@ async fn what_a_throttle_rate_holds_back_wakes_the_connection_when_it_is_due() {
     };
     let key = outbox.add_topic("/t".into(), wishes);
     for _ in 0..10 {
-        outbox.sample(key, sample(), false);
+        outbox.push_sample(key, sample(), false);
     }
     step(&mut connection);
     let due = outbox.next_due();
@@ -95,7 +95,7 @@ async fn an_answer_is_asked_about_when_its_patience_is_over() {
         ..SessionOptions::default()
     };
     let (mut connection, _client) = connection(options).await;
-    let answer = |size: usize| Frame {
+    let answer = |size: usize| EncodedFrame {
         format: Format::Cbor,
         bytes: vec![0; size].into(),
     };

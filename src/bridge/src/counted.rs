@@ -1,21 +1,21 @@
-//! A publisher on the bus, with a count of what its subscribers were too slow for.
+//! A publisher on the bus that counts the messages its subscribers were too slow for.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros::bus::{Matched, Publisher};
+use ros::bus::{MatchedPeers, Publisher};
 use tokio::sync::watch;
 
 use crate::Metrics;
 
-/// Counts what is dropped for each message: room is made for it when it is published.
-pub(crate) struct Counted {
+/// Counts the messages dropped by each publication: they make room for it when it is published.
+pub(crate) struct CountingPublisher {
     publisher: Box<dyn Publisher>,
     topic: String,
     metrics: Arc<Metrics>,
 }
 
-impl Counted {
+impl CountingPublisher {
     pub(crate) fn new(publisher: Box<dyn Publisher>, topic: &str, metrics: Arc<Metrics>) -> Self {
         Self {
             publisher,
@@ -25,16 +25,16 @@ impl Counted {
     }
 
     pub(crate) fn publish(&self, bytes: Bytes) {
-        // The count may be one of all publishers of the topic, and then what others dropped is theirs.
-        let before = self.publisher.dropped();
+        // The counter may cover all publishers of the topic; drops caused by others are theirs.
+        let before = self.publisher.dropped_count();
         self.publisher.publish(bytes);
-        let new = self.publisher.dropped().saturating_sub(before);
+        let new = self.publisher.dropped_count().saturating_sub(before);
         self.metrics.node_dropped.add(new);
         self.metrics.drops.add(&self.topic, new);
     }
 
-    pub(crate) fn matched(&self) -> watch::Receiver<Matched> {
-        self.publisher.matched()
+    pub(crate) fn match_events(&self) -> watch::Receiver<MatchedPeers> {
+        self.publisher.matched_subscribers()
     }
 }
 
@@ -44,7 +44,7 @@ mod tests {
 
     use super::*;
 
-    /// Its subscriber has room for three messages, and reads none.
+    /// A publisher whose subscriber has room for three messages and reads none.
     struct Stuck(Arc<AtomicU64>);
 
     impl Publisher for Stuck {
@@ -52,11 +52,11 @@ mod tests {
             self.0.fetch_add(1, Ordering::Relaxed);
         }
 
-        fn matched(&self) -> watch::Receiver<Matched> {
+        fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
             watch::Sender::default().subscribe()
         }
 
-        fn dropped(&self) -> u64 {
+        fn dropped_count(&self) -> u64 {
             self.0.load(Ordering::Relaxed).saturating_sub(3)
         }
     }
@@ -64,9 +64,9 @@ mod tests {
     #[test]
     fn what_a_node_is_too_slow_for_is_counted_once_and_told_by_topic() {
         let metrics = Arc::new(Metrics::default());
-        // Others have dropped two of the topic before.
+        // Two messages of the topic were dropped by others before.
         let sent = Arc::new(AtomicU64::new(5));
-        let publisher = Counted::new(Box::new(Stuck(sent)), "/pictures", metrics.clone());
+        let publisher = CountingPublisher::new(Box::new(Stuck(sent)), "/pictures", metrics.clone());
         for _ in 0..4 {
             publisher.publish(Bytes::new());
         }

@@ -1,4 +1,4 @@
-//! Messages on their way in fragments. Between two fragments of one message others have their turn.
+//! Messages being sent in fragments. Other frames are sent between two fragments of a message.
 
 use std::collections::VecDeque;
 
@@ -6,22 +6,22 @@ use bytes::Bytes;
 use rosbridge::{Format, Fragment, Id, Op, split_text};
 
 use crate::outbox::TopicKey;
-use crate::sample::Frame;
+use crate::sample::EncodedFrame;
 
-/// Messages cut at the same time.
+/// Maximum number of messages fragmented at the same time.
 const MAX_CUTS: usize = 4;
 
 #[derive(Default)]
-pub(crate) struct Cuts {
-    cuts: VecDeque<Cut>,
-    /// Ids of messages cut so far.
+pub(crate) struct Fragmenter {
+    cuts: VecDeque<FragmentedMessage>,
+    /// Number of messages fragmented so far, used as their ids.
     ids: i64,
-    /// Whether the next frame is to be a fragment: every other one is.
+    /// True if the next frame is to be a fragment: every other one is.
     due: bool,
 }
 
-struct Cut {
-    /// UTF-8; the frame's own bytes, not a copy.
+struct FragmentedMessage {
+    /// UTF-8 text; the frame's own bytes, not a copy.
     text: Bytes,
     at: usize,
     size: usize,
@@ -31,16 +31,16 @@ struct Cut {
     key: Option<TopicKey>,
 }
 
-impl Cuts {
-    /// Whether a frame would be cut: a text longer than `size`.
-    pub(crate) fn is_long(frame: &Frame, size: Option<usize>) -> bool {
+impl Fragmenter {
+    /// Returns whether a frame would be fragmented: a text longer than `size`.
+    pub(crate) fn is_long(frame: &EncodedFrame, size: Option<usize>) -> bool {
         frame.format == Format::Json && size.is_some_and(|size| frame.bytes.len() > size)
     }
 
-    /// Takes a frame to be cut, where it is a text longer than `size`. Gives whether it was taken.
-    pub(crate) fn cut(
+    /// Adds a frame if it is a text longer than `size`; returns whether it was added.
+    pub(crate) fn add_if_long(
         &mut self,
-        frame: &Frame,
+        frame: &EncodedFrame,
         size: Option<usize>,
         key: Option<TopicKey>,
     ) -> bool {
@@ -52,7 +52,7 @@ impl Cuts {
         };
         let total = split_text(text, size).count() as u64;
         self.ids += 1;
-        self.cuts.push_back(Cut {
+        self.cuts.push_back(FragmentedMessage {
             text: frame.bytes.clone(),
             at: 0,
             size,
@@ -64,7 +64,7 @@ impl Cuts {
         true
     }
 
-    /// Whether no more messages should be begun.
+    /// Returns whether no more messages should be added.
     pub(crate) fn is_full(&self) -> bool {
         self.cuts.len() >= MAX_CUTS
     }
@@ -73,16 +73,16 @@ impl Cuts {
         self.due && !self.cuts.is_empty()
     }
 
-    /// A frame that is no fragment was sent: now it is the fragments' turn.
+    /// Notes that another frame was sent, so that the next one is a fragment.
     pub(crate) fn make_due(&mut self) {
         self.due = true;
     }
 
-    /// The next fragment of the message whose turn it is; with its topic, where it is the last one.
+    /// Returns the next fragment of the message whose turn it is; for its last fragment with its topic.
     pub(crate) fn next(&mut self) -> Option<(Bytes, Option<TopicKey>)> {
         self.due = false;
         let mut cut = self.cuts.pop_front()?;
-        let piece = split_text(window(&cut.text[cut.at..], cut.size), cut.size).next()?;
+        let piece = split_text(utf8_prefix(&cut.text[cut.at..], cut.size), cut.size).next()?;
         let mut out = Vec::with_capacity(piece.len() + piece.len() / 8 + 64);
         let fragment = Fragment {
             id: Id::Integer(cut.id),
@@ -101,9 +101,9 @@ impl Cuts {
     }
 }
 
-/// The beginning of a UTF-8 text: `size` bytes, rounded to whole characters, and at least one character.
-fn window(text: &[u8], size: usize) -> &str {
-    // No character has more than 4 bytes.
+/// Returns a prefix of a UTF-8 text: `size` bytes, rounded down to whole characters, but at least one character.
+fn utf8_prefix(text: &[u8], size: usize) -> &str {
+    // A character has at most 4 bytes.
     let window = &text[..size.max(4).min(text.len())];
     match std::str::from_utf8(window) {
         Ok(window) => window,
@@ -115,21 +115,21 @@ fn window(text: &[u8], size: usize) -> &str {
 mod tests {
     use std::time::{Duration, Instant};
 
-    use rosbridge::{FragmentLimits, Fragments, Frame as Incoming};
+    use rosbridge::{FragmentLimits, Fragments, ProtocolFrame as Incoming};
 
     use super::*;
 
     #[test]
     fn cut_messages_take_turns_and_come_whole() {
         let texts = ["grüße ".repeat(100), "kurz ".repeat(50)];
-        let mut cuts = Cuts::default();
+        let mut cuts = Fragmenter::default();
         for (key, text) in texts.iter().enumerate() {
-            let frame = Frame {
+            let frame = EncodedFrame {
                 format: Format::Json,
                 bytes: text.clone().into(),
             };
-            assert!(cuts.cut(&frame, Some(99), Some(key as u64)));
-            assert!(!cuts.cut(&frame, Some(10_000), None));
+            assert!(cuts.add_if_long(&frame, Some(99), Some(key as u64)));
+            assert!(!cuts.add_if_long(&frame, Some(10_000), None));
         }
         let limits = FragmentLimits {
             age: Duration::from_secs(1),

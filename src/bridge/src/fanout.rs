@@ -1,73 +1,74 @@
-//! One topic of the servant, subscribed to once however many clients listen.
+//! One subscription per topic of the servant, shared by all listening clients.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Instant;
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Matched, Message, PeerId, Qos, Subscription, WireType};
+use ros::bus::{Bus, MatchedPeers, PeerId, QosProfile, SerializedMessage, Subscription, WireType};
 use ros::schema::MessageType;
 use tokio::task::AbortHandle;
 
 use crate::Metrics;
-use crate::names::any_definition;
-use crate::quality::all_there_is;
+use crate::names::wildcard_type;
+use crate::quality::default_subscription_qos;
 use crate::refusals::Refusals;
-use crate::sample::{Sample, TopicTypes};
-use crate::shared::{Heard, Shared};
+use crate::sample::{TopicSample, TopicTypes};
+use crate::shared::{BridgeShared, NodeTopicGuard};
 use crate::topic_requests::TopicRequests;
 
-/// Who listens to a topic: a client's queue, a goal waiting for its result.
+/// A listener on a topic: a client's queue, a goal waiting for its result.
 pub(crate) trait Listener: Send + Sync {
-    /// A message; `replay` where it is an old one from a latching publisher. Must not block or call the fanout.
-    fn sample(&self, sample: &Arc<Sample>, replay: bool);
-    /// The topic cannot be subscribed to.
-    fn failed(&self, reason: &str);
-    /// A publisher of the topic is not heard, because it offers something else. Told once of each.
-    fn refused(&self, _reason: &str) {}
+    /// Called for each message; `replay` if it is an old one of a latching publisher. Must not block or call the
+    /// fanout.
+    fn on_sample(&self, sample: &Arc<TopicSample>, replay: bool);
+    /// Called if the topic cannot be subscribed to.
+    fn on_failed(&self, reason: &str);
+    /// Called once for each publisher of the topic that does not match because it offers something else.
+    fn on_refused(&self, _reason: &str) {}
 }
 
-/// The one subscription for all who ask the same of the topic's publishers.
+/// The subscription shared by all listeners that request the same quality of service.
 pub(crate) struct Fanout {
     pub(crate) topic: String,
-    /// What is asked of them.
-    qos: Qos,
-    shared: Weak<Shared>,
+    /// Quality of service requested from publishers.
+    qos: QosProfile,
+    shared: Weak<BridgeShared>,
     types: Arc<TopicTypes>,
-    /// What its messages answer, if anything.
+    /// Requests that messages of this topic answer, if any.
     answers: Option<Arc<TopicRequests>>,
     state: Mutex<State>,
     pump: OnceLock<AbortHandle>,
-    /// None of a topic of the bridge itself.
-    _heard: Option<Heard>,
+    /// `None` for topics of the bridge itself.
+    _heard: Option<NodeTopicGuard>,
 }
 
 #[derive(Default)]
 struct State {
-    /// Replaced, not changed, so that a message is handed out without holding the lock.
+    /// Replaced instead of changed, so that messages are delivered without holding the lock.
     listeners: Arc<Listeners>,
     /// The last message of every latching publisher.
-    latched: Vec<Arc<Sample>>,
-    /// Publishers that are not heard.
+    latched: Vec<Arc<TopicSample>>,
+    /// Publishers that do not match.
     refusals: Refusals,
     failed: Option<String>,
 }
 
 type Listeners = Vec<(u64, Arc<dyn Listener>)>;
 
-/// Keeps a listener on a fanout.
-pub(crate) struct Listening {
+/// Keeps a listener registered on a fanout.
+pub(crate) struct ListenerGuard {
     fanout: Arc<Fanout>,
     number: u64,
 }
 
-impl Listening {
+impl ListenerGuard {
     pub(crate) fn fanout(&self) -> &Arc<Fanout> {
         &self.fanout
     }
 }
 
-impl Drop for Listening {
+impl Drop for ListenerGuard {
     fn drop(&mut self) {
         let mut state = self.fanout.state.lock();
         let earlier = state.listeners.clone();
@@ -77,18 +78,18 @@ impl Drop for Listening {
             .cloned();
         state.listeners = Arc::new(kept.collect());
         drop(state);
-        // Only now may the listener itself go.
+        // Only now may the listener itself be dropped.
         drop(earlier);
     }
 }
 
 impl Fanout {
-    /// Subscribes in the background. `message_type` is what the first listener expects, where it knows.
+    /// Subscribes in the background. `message_type` is the type expected by the first listener, if known.
     pub(crate) fn start(
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         topic: &str,
         message_type: Option<&MessageType>,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Arc<Fanout> {
         let fanout = Arc::new(Fanout {
             topic: topic.to_owned(),
@@ -98,12 +99,12 @@ impl Fanout {
             answers: shared.answers_on(topic),
             state: Mutex::default(),
             pump: OnceLock::new(),
-            _heard: Some(shared.hear_nodes()),
+            _heard: Some(shared.count_node_listener()),
         });
-        // Any digest: a publisher with another definition is read by its own, or its listeners are told of it; a
-        // connection refused for it would only be silence.
+        // Any digest: a publisher with another definition is decoded by its own, or its listeners are told; refusing
+        // the connection would only lead to silence.
         let name = message_type.map_or("*", MessageType::name);
-        let of = any_definition(shared.bus.version(), name);
+        let of = wildcard_type(shared.bus.version(), name);
         let pump = tokio::spawn(pump(
             Arc::downgrade(&fanout),
             shared.bus.clone(),
@@ -111,16 +112,16 @@ impl Fanout {
             topic.to_owned(),
             (of, qos),
         ));
-        // Set once, here.
+        // Only set here.
         let _ = fanout.pump.set(pump.abort_handle());
         fanout
     }
 
-    /// A fanout for a topic of the bridge itself, which no node publishes.
-    pub(crate) fn internal(shared: &Arc<Shared>, topic: &str) -> Arc<Fanout> {
+    /// Creates a fanout for a topic of the bridge itself, which no node publishes.
+    pub(crate) fn internal(shared: &Arc<BridgeShared>, topic: &str) -> Arc<Fanout> {
         Arc::new(Fanout {
             topic: topic.to_owned(),
-            qos: all_there_is(shared.options.bus_queue),
+            qos: default_subscription_qos(shared.options.bus_queue),
             shared: Arc::downgrade(shared),
             types: Arc::new(TopicTypes::new(shared.registry.clone())),
             answers: None,
@@ -130,7 +131,7 @@ impl Fanout {
         })
     }
 
-    /// Who came last of those who listen now; no two listeners of any fanout have the same number.
+    /// Returns the number of the newest current listener; numbers are unique across all fanouts.
     pub(crate) fn newest_listener(&self) -> Option<u64> {
         let state = self.state.lock();
         state.listeners.last().map(|(number, _)| *number)
@@ -140,38 +141,38 @@ impl Fanout {
         self.pump.get().is_none()
     }
 
-    /// Whether it asks this of the topic's publishers, or has none of nodes.
-    pub(crate) fn serves(&self, qos: &Qos) -> bool {
+    /// Returns whether it requests this quality of service from publishers, or has none in nodes.
+    pub(crate) fn serves_qos(&self, qos: &QosProfile) -> bool {
         self.is_internal() || self.qos == *qos
     }
 
-    /// Whether newcomers are given what was published before.
-    pub(crate) fn keeps(&self) -> bool {
+    /// Returns whether new listeners receive messages published before.
+    pub(crate) fn keeps_latched(&self) -> bool {
         self.qos.is_latching()
     }
 
-    /// Adds a listener, which first hears what latching publishers last said.
-    pub(crate) fn listen(self: &Arc<Self>, listener: Arc<dyn Listener>) -> Listening {
+    /// Adds a listener, which first receives the last messages of latching publishers.
+    pub(crate) fn listen(self: &Arc<Self>, listener: Arc<dyn Listener>) -> ListenerGuard {
         static NUMBER: AtomicU64 = AtomicU64::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
         let mut state = self.state.lock();
         if let Some(reason) = &state.failed {
-            listener.failed(reason);
+            listener.on_failed(reason);
         }
-        for reason in state.refusals.known() {
-            listener.refused(reason);
+        for reason in state.refusals.reasons() {
+            listener.on_refused(reason);
         }
         self.replay_to(&mut state, listener.as_ref());
         let mut listeners = Listeners::clone(&state.listeners);
         listeners.push((number, listener));
         state.listeners = Arc::new(listeners);
-        Listening {
+        ListenerGuard {
             fanout: self.clone(),
             number,
         }
     }
 
-    /// Lets a listener hear once more what latching publishers last said.
+    /// Delivers the last messages of latching publishers to a listener again.
     pub(crate) fn replay(&self, listener: &dyn Listener) {
         self.replay_to(&mut self.state.lock(), listener);
     }
@@ -180,7 +181,7 @@ impl Fanout {
         if state.latched.is_empty() {
             return;
         }
-        // A publisher that is gone has taken its message with it.
+        // Messages of publishers that are gone are removed.
         if let Some(shared) = self.shared.upgrade() {
             let graph = shared.bus.graph().borrow().clone();
             state.latched.retain(|sample| {
@@ -188,26 +189,26 @@ impl Fanout {
             });
         }
         for sample in &state.latched {
-            listener.sample(sample, true);
+            listener.on_sample(sample, true);
         }
     }
 
-    /// Hands a message to every listener.
-    pub(crate) fn deliver(&self, message: Message, local: bool) {
+    /// Delivers a message to every listener.
+    pub(crate) fn deliver(&self, message: SerializedMessage, local: bool) {
         let Some(shared) = self.shared.upgrade() else {
             return;
         };
-        let sample = match Sample::new(message, local, self.types.clone(), &shared.options) {
+        let sample = match TopicSample::new(message, local, self.types.clone(), &shared.options) {
             Ok(sample) => Arc::new(sample),
             Err(full) => {
-                tracing::debug!(topic = %self.topic, %full, "a message is left out");
+                tracing::debug!(topic = %self.topic, %full, "a message was dropped");
                 shared.metrics.drops.add(&self.topic, 1);
                 return shared.metrics.dropped.add(1);
             }
         };
         let listeners = {
             let mut state = self.state.lock();
-            if sample.latching && self.keeps() {
+            if sample.latching && self.keeps_latched() {
                 state
                     .latched
                     .retain(|other| other.publisher != sample.publisher);
@@ -216,32 +217,33 @@ impl Fanout {
             state.listeners.clone()
         };
         for (_, listener) in listeners.iter() {
-            listener.sample(&sample, false);
+            listener.on_sample(&sample, false);
         }
     }
 
-    /// A client that latched a message here publishes no longer.
-    pub(crate) fn forget(&self, publisher: &PeerId) {
+    /// Removes the message latched by a client that no longer publishes.
+    pub(crate) fn forget_publisher(&self, publisher: &PeerId) {
         self.state
             .lock()
             .latched
             .retain(|sample| sample.publisher != *publisher);
     }
 
-    /// Tells how long a request took that this message answers. A latched message tells a state, and answers nothing.
-    fn answers(&self, message: &Message) {
+    /// Records the duration of the request that this message answers. A latched message is a state, and answers
+    /// nothing.
+    fn record_answer(&self, message: &SerializedMessage) {
         let Some(requests) = self.answers.as_ref().filter(|_| !message.latching) else {
             return;
         };
         let of = self.types.find(&message.wire_type).ok();
-        let took = of.and_then(|of| requests.answered(&of, &message.bytes, Instant::now()));
+        let took = of.and_then(|of| requests.record_answer(&of, &message.bytes, Instant::now()));
         if let (Some(took), Some(shared)) = (took, self.shared.upgrade()) {
-            shared.options.called.tell(Some(took));
+            shared.options.called.record(Some(took));
         }
     }
 
-    /// Tells all listeners of publishers that are not heard.
-    fn note_refused(&self, matched: &Matched) {
+    /// Reports publishers that do not match to all listeners.
+    fn report_refusals(&self, matched: &MatchedPeers) {
         let (new, listeners) = {
             let mut state = self.state.lock();
             let new = state.refusals.update(matched);
@@ -249,7 +251,7 @@ impl Fanout {
         };
         for reason in &new {
             for (_, listener) in listeners.iter() {
-                listener.refused(reason);
+                listener.on_refused(reason);
             }
         }
     }
@@ -261,9 +263,9 @@ impl Fanout {
             state.listeners.clone()
         };
         for (_, listener) in listeners.iter() {
-            listener.failed(&reason);
+            listener.on_failed(&reason);
         }
-        // The next to subscribe tries anew.
+        // The next subscription tries again.
         if let Some(shared) = self.shared.upgrade() {
             shared.forget_fanout(self);
         }
@@ -287,7 +289,7 @@ async fn pump(
     bus: Arc<dyn Bus>,
     metrics: Arc<Metrics>,
     topic: String,
-    (of, qos): (WireType, Qos),
+    (of, qos): (WireType, QosProfile),
 ) {
     let mut subscription: Subscription = match bus.subscribe(&topic, of, qos).await {
         Ok(subscription) => subscription,
@@ -302,7 +304,7 @@ async fn pump(
     drop(bus);
     let mut dropped = 0;
     let mut matched = subscription.matched.clone();
-    // Those that are there already.
+    // Includes those that are there already.
     matched.mark_changed();
     let mut watched = true;
     loop {
@@ -321,14 +323,14 @@ async fn pump(
         };
         let Some(message) = next else {
             let now = matched.borrow_and_update().clone();
-            fanout.note_refused(&now);
+            fanout.report_refusals(&now);
             continue;
         };
         metrics.received.add(1);
-        // From an action of another client.
+        // From another client's action.
         let local = message.publisher.node() == own;
         if !local {
-            fanout.answers(&message);
+            fanout.record_answer(&message);
         }
         fanout.deliver(message, local);
         let now_dropped = subscription.dropped.get();

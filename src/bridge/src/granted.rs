@@ -1,77 +1,80 @@
-//! What a client may do, as its operator says now.
+//! Grants of a client, as set by its operator.
 
 use std::fmt;
 use std::sync::Arc;
 
-use access::{Grants, Operation, Standing};
+use access::{ConnectionAccess, Grants, Operation};
 use tokio::sync::watch;
 
-/// What a client may do to topics, services and actions, and why its connection ends when that is so. It changes while the
-/// client is connected; then what it has and may not have any more is taken back.
+/// Permissions of a client for topics, services and actions, or the reason for ending its connection. They can change
+/// while the client is connected; then what it no longer may use is revoked.
 #[derive(Clone)]
-pub struct Granted {
-    standing: watch::Receiver<Standing>,
-    refused: Option<Arc<Told>>,
-    used: Option<Arc<Told>>,
+pub struct ClientGrants {
+    standing: watch::Receiver<ConnectionAccess>,
+    refused: Option<Arc<OperationObserver>>,
+    used: Option<Arc<OperationObserver>>,
 }
 
-/// Hears of an operation, such as `publish:/cmd_vel`.
-type Told = dyn Fn(&str) + Send + Sync;
+/// Callback for an operation, such as `publish:/cmd_vel`.
+type OperationObserver = dyn Fn(&str) + Send + Sync;
 
-impl fmt::Debug for Granted {
+impl fmt::Debug for ClientGrants {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.debug_tuple("Granted").field(&self.standing).finish()
     }
 }
 
-impl Default for Granted {
-    /// Everything, for good.
+impl Default for ClientGrants {
+    /// Grants everything, permanently.
     fn default() -> Self {
-        Granted::always(Grants::everything())
+        ClientGrants::fixed(Grants::everything())
     }
 }
 
-impl Granted {
-    /// What this says, as it changes.
-    pub fn by(standing: watch::Receiver<Standing>) -> Granted {
-        Granted {
+impl ClientGrants {
+    /// Follows `standing` as it changes.
+    pub fn from_standing(standing: watch::Receiver<ConnectionAccess>) -> ClientGrants {
+        ClientGrants {
             standing,
             refused: None,
             used: None,
         }
     }
 
-    /// The same; `hears` is told of each operation that is carried out and does more than listen.
-    pub fn noting(self, hears: impl Fn(&str) + Send + Sync + 'static) -> Granted {
-        Granted {
+    /// Sets a callback for each permitted operation, except subscriptions.
+    pub fn with_use_observer(self, hears: impl Fn(&str) + Send + Sync + 'static) -> ClientGrants {
+        ClientGrants {
             used: Some(Arc::new(hears)),
             ..self
         }
     }
 
-    /// The same; `hears` is told of each operation that is refused.
-    pub fn telling(self, hears: impl Fn(&str) + Send + Sync + 'static) -> Granted {
-        Granted {
+    /// Sets a callback for each refused operation.
+    pub fn with_refusal_observer(
+        self,
+        hears: impl Fn(&str) + Send + Sync + 'static,
+    ) -> ClientGrants {
+        ClientGrants {
             refused: Some(Arc::new(hears)),
             ..self
         }
     }
 
-    /// These grants, for good.
-    pub fn always(grants: Grants) -> Granted {
-        let (_, standing) = watch::channel(Standing::Granted(Arc::new(grants)));
-        Granted::by(standing)
+    /// Grants `grants` permanently.
+    pub fn fixed(grants: Grants) -> ClientGrants {
+        let (_, standing) = watch::channel(ConnectionAccess::Granted(Arc::new(grants)));
+        ClientGrants::from_standing(standing)
     }
 
-    /// What is granted now.
+    /// Returns the current grants.
     pub fn grants(&self) -> Arc<Grants> {
         match &*self.standing.borrow() {
-            Standing::Granted(grants) => Arc::clone(grants),
-            Standing::Ended(_) => Arc::default(),
+            ConnectionAccess::Granted(grants) => Arc::clone(grants),
+            ConnectionAccess::Ended(_) => Arc::default(),
         }
     }
 
-    /// Refuses, in words, what is not granted.
+    /// Refuses, with an explanation, what is not granted.
     pub fn check(&self, operation: Operation, name: &str) -> Result<(), String> {
         let grants = self.grants();
         let asked = || format!("{}:{name}", operation.name());
@@ -88,20 +91,21 @@ impl Granted {
             hears(&asked);
         }
         Err(format!(
-            "{asked} is not granted to this client (granted: {grants}); the operator can, with cloudroidctl policy allow"
+            "{asked} is not granted to this client (granted: {grants}); the operator can grant it with cloudroidctl \
+                policy allow"
         ))
     }
 
-    /// Why the connection is to end, if it is.
-    pub fn ended(&self) -> Option<String> {
+    /// Returns the reason why the connection must end, if it must.
+    pub fn end_reason(&self) -> Option<String> {
         match &*self.standing.borrow() {
-            Standing::Granted(_) => None,
-            Standing::Ended(reason) => Some(reason.clone()),
+            ConnectionAccess::Granted(_) => None,
+            ConnectionAccess::Ended(reason) => Some(reason.clone()),
         }
     }
 
-    /// Comes back when it has changed since this was made or last asked; never, where nobody can change it.
-    pub async fn changed(&mut self) {
+    /// Returns when the grants have changed since this was created or last called; never if nobody can change them.
+    pub async fn wait_changed(&mut self) {
         if self.standing.changed().await.is_err() {
             std::future::pending().await
         }

@@ -1,38 +1,38 @@
-//! What a client sends before there is a servant to take it.
+//! Messages that a client sends before the servant is ready.
 
 use std::collections::VecDeque;
 
 use budget::{Budget, Permit};
-use rosbridge::Frame as Incoming;
-use ws::Message;
+use rosbridge::ProtocolFrame as Incoming;
+use ws::WsMessage;
 
-/// Most messages that are kept, and their bytes beyond which no more is.
+/// Maximum number of messages kept, and bytes above which no more are.
 const MESSAGES: usize = 10_000;
 const BYTES: usize = 16 << 20;
 
-/// Messages in the order they came.
-pub(crate) struct Kept {
-    messages: VecDeque<Message>,
+/// Messages in the order of arrival.
+pub(crate) struct EarlyMessages {
+    messages: VecDeque<WsMessage>,
     bytes: usize,
     permit: Permit,
-    /// Publications that were left out.
+    /// Number of publications dropped.
     left_out: u64,
 }
 
-/// What became of a message.
-pub(crate) enum Taken {
+/// Result of adding a message.
+pub(crate) enum EarlyMessageOutcome {
     Kept,
-    /// It is a publication for which there is no room; the first such, or another.
+    /// A publication was dropped for lack of room; `first` if it is the first one.
     LeftOut {
         first: bool,
     },
-    /// It is something else for which there is no room; the reason.
+    /// Another message has no room; the reason.
     Refused(String),
 }
 
-impl Kept {
-    /// Nothing yet; what comes counts in `budget`.
-    pub(crate) fn within(budget: &Budget) -> Self {
+impl EarlyMessages {
+    /// Creates an empty queue; messages count in `budget`.
+    pub(crate) fn with_budget(budget: &Budget) -> Self {
         Self {
             messages: VecDeque::new(),
             bytes: 0,
@@ -41,16 +41,16 @@ impl Kept {
         }
     }
 
-    /// Takes a message. Beyond the limits publications are left out, as a queue that is full leaves them out later; without
-    /// the rest the session would be another one than the client has asked for.
-    pub(crate) fn take(&mut self, message: Message) -> Taken {
-        let (Message::Text(bytes) | Message::Binary(bytes)) = &message else {
-            return Taken::Kept;
+    /// Adds a message. Beyond the limits publications are dropped, as a full queue drops them later; without other
+    /// messages the session would differ from what the client has asked for, so they are refused.
+    pub(crate) fn push(&mut self, message: WsMessage) -> EarlyMessageOutcome {
+        let (WsMessage::Text(bytes) | WsMessage::Binary(bytes)) = &message else {
+            return EarlyMessageOutcome::Kept;
         };
         let length = bytes.len();
         let full = if self.messages.len() >= MESSAGES || self.bytes >= BYTES {
             format!(
-                "{} messages of {} bytes wait for the servant to start, no more are kept; send what follows when it answers",
+                "{} messages of {} bytes wait for the servant to start, which is the limit; send more when it answers",
                 self.messages.len(),
                 self.bytes
             )
@@ -59,39 +59,39 @@ impl Kept {
                 Ok(()) => {
                     self.bytes += length;
                     self.messages.push_back(message);
-                    return Taken::Kept;
+                    return EarlyMessageOutcome::Kept;
                 }
                 Err(full) => full.to_string(),
             }
         };
         if is_publication(&message) {
             self.left_out += 1;
-            return Taken::LeftOut {
+            return EarlyMessageOutcome::LeftOut {
                 first: self.left_out == 1,
             };
         }
-        Taken::Refused(full)
+        EarlyMessageOutcome::Refused(full)
     }
 
-    /// The oldest.
-    pub(crate) fn pop(&mut self) -> Option<Message> {
+    /// Takes the oldest message.
+    pub(crate) fn pop(&mut self) -> Option<WsMessage> {
         let message = self.messages.pop_front()?;
-        if let Message::Text(bytes) | Message::Binary(bytes) = &message {
+        if let WsMessage::Text(bytes) | WsMessage::Binary(bytes) = &message {
             self.bytes -= bytes.len();
         }
-        // Less always fits.
+        // Shrinking always succeeds.
         let _ = self.permit.count(self.bytes);
         Some(message)
     }
 }
 
-fn is_publication(message: &Message) -> bool {
+fn is_publication(message: &WsMessage) -> bool {
     let frame = match message {
-        Message::Text(bytes) => match std::str::from_utf8(bytes) {
+        WsMessage::Text(bytes) => match std::str::from_utf8(bytes) {
             Ok(text) => Incoming::Text(text),
             Err(_) => return false,
         },
-        Message::Binary(bytes) => Incoming::Binary(bytes),
+        WsMessage::Binary(bytes) => Incoming::Binary(bytes),
         _ => return false,
     };
     rosbridge::text_field(frame, "op").as_deref() == Some("publish")

@@ -1,26 +1,30 @@
-//! A connection's place at the bridge.
+//! Registration of a connection with the bridge.
 
 use std::sync::Arc;
 
 use crate::SessionEnd;
-use crate::client::Client;
-use crate::shared::Shared;
+use crate::client::BridgeClient;
+use crate::shared::BridgeShared;
 
-/// A connection's place: counted and seen by others until it is given up, by [`leave`](Self::leave) or by dropping the
-/// future that serves it.
+/// A connection's registration: it is counted and visible to others until it ends, by [`leave`](Self::leave) or by
+/// dropping the future that serves it.
 pub(crate) struct Lease {
-    shared: Arc<Shared>,
-    client: Arc<Client>,
+    shared: Arc<BridgeShared>,
+    client: Arc<BridgeClient>,
     token: Option<String>,
-    /// Which of the client's sockets it is.
+    /// Number of the socket among the client's.
     pub(crate) socket: u64,
     present: u64,
-    /// Whether the client may come back.
+    /// True if the client must not come back.
     over: bool,
 }
 
 impl Lease {
-    pub(crate) fn take(shared: Arc<Shared>, client: Arc<Client>, token: Option<String>) -> Self {
+    pub(crate) fn take(
+        shared: Arc<BridgeShared>,
+        client: Arc<BridgeClient>,
+        token: Option<String>,
+    ) -> Self {
         shared.metrics.sessions.add(1);
         shared.sessions.send_modify(|count| count.connected += 1);
         let present = shared.next_number();
@@ -59,7 +63,7 @@ impl Drop for Lease {
         match runtime {
             Ok(runtime) if !self.over && !shared.options.resume_grace.is_zero() => {
                 shared.sessions.send_modify(|count| count.away += 1);
-                runtime.spawn(wait(
+                runtime.spawn(wait_for_return(
                     shared.clone(),
                     self.client.clone(),
                     self.socket,
@@ -71,12 +75,17 @@ impl Drop for Lease {
     }
 }
 
-/// Keeps a client that is away until it comes back or its time is over.
-async fn wait(shared: Arc<Shared>, client: Arc<Client>, socket: u64, token: String) {
+/// Keeps a disconnected client until it comes back or its grace period is over.
+async fn wait_for_return(
+    shared: Arc<BridgeShared>,
+    client: Arc<BridgeClient>,
+    socket: u64,
+    token: String,
+) {
     tokio::select! {
         () = tokio::time::sleep(shared.options.resume_grace) => {}
-        () = client.outbox.taken_over(socket) => {}
-        () = client.ended() => {}
+        () = client.outbox.wait_for_takeover(socket) => {}
+        () = client.wait_ended() => {}
     }
     shared.sessions.send_modify(|count| count.away -= 1);
     if client.outbox.is_attached(socket) {

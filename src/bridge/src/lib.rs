@@ -1,8 +1,7 @@
-//! A session between one ROS system and one WebSocket that speaks rosbridge v2.
+//! Sessions between one ROS system and WebSockets that speak rosbridge v2.
 //!
-//! One [`Bridge`] stands before each servant and is shared by all its sockets. In: a [`ros::bus::Bus`], the
-//! definitions of the servant's types, and connections behind their HTTP upgrade. Out: how each ended, and
-//! [`Metrics`].
+//! Each servant has one [`Bridge`], which is shared by all its sockets. In: a [`ros::bus::Bus`], the definitions of the
+//! servant's types, and connections after their HTTP upgrade. Out: how each connection ended, and [`Metrics`].
 //!
 //! ```text
 //!               ┌ Fanout per topic: one subscription, encoded per format   ┐      ┌ topic queues ┐
@@ -12,13 +11,13 @@
 //!   └──────────── topics ◀──────── ROS bytes, decoded in place ◀─────────────────────────────────────────┘
 //! ```
 //!
-//! What a client has asked for (subscriptions, advertisements, calls under way) belongs to its *client*, which can
+//! What a client has asked for (subscriptions, advertisements, calls in progress) belongs to its *client*, which can
 //! outlive the socket: with a resume token the next socket takes it over.
 //!
-//! A session's life; a connection may come before its servant is there, and wait ([`Waiting`]):
+//! Life cycle of a session; a connection may arrive before its servant is ready, and wait ([`WaitingConnection`]):
 //!
 //! ```text
-//!  Waiting ──the servant is there──▶ Open
+//!  Waiting ──the servant is ready──▶ Open
 //!
 //!  Open ──frame over limits, idle, control queue full, servant gone──▶ Closing ──close frame or time-out──▶ Ended
 //!   │ └──client's close frame──────────────────────────────────────────▲                                     ▲
@@ -59,11 +58,11 @@ mod topic_requests;
 mod topics;
 mod waiting;
 
-/// The name of the node by which people look into a servant. What robots send does not wait for it.
+/// Name of the node by which people inspect a servant. Messages of robots do not wait for it.
 pub const INSIDE: &str = "/cloudroid_inside";
 
 pub use bridge::{Bridge, SessionCount, SessionEnd, refuse};
-pub use granted::Granted;
+pub use granted::ClientGrants;
 pub use metrics::{Counter, Drops, Metrics};
-pub use options::{BridgeOptions, Called, SessionOptions};
-pub use waiting::Waiting;
+pub use options::{BridgeOptions, RequestObserver, SessionOptions};
+pub use waiting::WaitingConnection;

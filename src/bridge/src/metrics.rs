@@ -1,37 +1,37 @@
-//! What a bridge has done, counted.
+//! Counters of a bridge.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use parking_lot::Mutex;
-use ros::ring::Lost;
+use ros::ring::DropTally;
 
-/// A number that only grows.
+/// A counter that only increases.
 #[derive(Debug, Default)]
 pub struct Counter(AtomicU64);
 
 impl Counter {
-    /// Adds to it.
+    /// Adds to the counter.
     pub fn add(&self, count: u64) {
         self.0.fetch_add(count, Ordering::Relaxed);
     }
 
-    /// The present value.
+    /// Returns the present value.
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// Topics whose drops are told by name at most; clients name topics as they like.
+/// Maximum number of topics counted by name; clients can invent any number of them.
 const MOST_TOPICS: usize = 256;
 
-/// Messages that were dropped, by topic.
+/// Dropped messages, by topic.
 #[derive(Debug, Default)]
 pub struct Drops(Mutex<BTreeMap<String, u64>>);
 
 impl Drops {
-    /// Counts messages of a topic.
+    /// Counts dropped messages of a topic.
     pub fn add(&self, topic: &str, count: u64) {
         if count == 0 {
             return;
@@ -44,7 +44,7 @@ impl Drops {
         }
     }
 
-    /// All so far, by topic.
+    /// Returns all counts so far, by topic.
     pub fn all(&self) -> BTreeMap<String, u64> {
         self.0.lock().clone()
     }
@@ -56,12 +56,12 @@ macro_rules! metrics {
         #[derive(Debug, Default)]
         pub struct Metrics {
             $($(#[doc = $doc])* pub $field: Counter,)*
-            /// Of the dropped messages, on the way to clients and from them, which topics they were of.
+            /// Topics of the dropped messages, in both directions.
             pub drops: Arc<Drops>,
         }
 
         impl Metrics {
-            /// Every counter with its Prometheus name and help text.
+            /// Returns every counter with its Prometheus name and help text.
             pub fn all(&self) -> Vec<(&'static str, &'static str, u64)> {
                 vec![$(($name, concat!($($doc,)*).trim_ascii(), self.$field.get()),)*]
             }
@@ -118,7 +118,7 @@ metrics! {
 
 impl Metrics {
     /// Counts messages that were dropped because a client read too slowly.
-    pub(crate) fn lost(&self, lost: Lost) {
+    pub(crate) fn record_lost(&self, lost: DropTally) {
         if lost.messages > 0 {
             self.dropped.add(lost.messages);
             self.dropped_bytes.add(lost.bytes);

@@ -1,10 +1,10 @@
-//! Names of ROS as clients write them, and as the servant's ROS does.
+//! Names of ROS as written by clients, and as spelled by the servant's ROS.
 
 use std::borrow::Cow;
 
 use ros::bus::{RosVersion, WireFormat, WireType};
 
-/// The absolute form of a topic's, service's or action's name; clients live in the namespace `/`.
+/// Resolves the name of a topic, service or action to its absolute form; clients are in the namespace `/`.
 pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, String> {
     let well_formed = |part: &str| {
         let mut characters = part.chars();
@@ -30,16 +30,16 @@ pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, S
             Cow::Owned(format!("/{name}"))
         });
     }
-    // Doubled and trailing slashes are forgiven.
+    // Duplicate and trailing slashes are tolerated.
     let parts: Vec<&str> = name.split('/').filter(|part| !part.is_empty()).collect();
     let characters = |part: &&str| {
         part.chars()
             .all(|other| other.is_ascii_alphanumeric() || other == '_')
     };
     let starts = match version {
-        // Parts may begin with a digit or an underscore, but for the first.
+        // Components may start with a digit or an underscore, except for the first.
         RosVersion::One => parts.first().is_some_and(|first| well_formed(first)),
-        // No part may begin with a digit; those that begin with an underscore are hidden.
+        // No component may start with a digit; those that start with an underscore are hidden.
         RosVersion::Two => {
             let digit = |part: &&str| part.starts_with(|first: char| first.is_ascii_digit());
             !parts.is_empty() && !parts.iter().any(digit)
@@ -60,8 +60,9 @@ pub(crate) fn resolve(version: RosVersion, name: &str) -> Result<Cow<'_, str>, S
     ))
 }
 
-/// `package/Type` of what clients and either ROS write: `package/msg/Type` means the same.
-pub(crate) fn plain_type(name: &str) -> Cow<'_, str> {
+/// Converts the name of a type, as written by clients and either ROS, to `package/Type`: `package/msg/Type` means the
+/// same.
+pub(crate) fn short_type_name(name: &str) -> Cow<'_, str> {
     for middle in ["/msg/", "/srv/", "/action/"] {
         if let Some((package, rest)) = name.split_once(middle) {
             return Cow::Owned(format!("{package}/{rest}"));
@@ -70,21 +71,21 @@ pub(crate) fn plain_type(name: &str) -> Cow<'_, str> {
     Cow::Borrowed(name)
 }
 
-/// Whether both mean the type of one name, however they are written.
+/// Returns whether both names mean the same type, however they are spelled.
 pub(crate) fn is_same_type(one: &str, other: &str) -> bool {
-    one == other || plain_type(one) == plain_type(other)
+    one == other || short_type_name(one) == short_type_name(other)
 }
 
-/// That a topic, service or action has another type than a client says, and what to do.
-pub(crate) fn other_type(what: &str, theirs: &str, said: &str) -> String {
+/// Formats the error that a topic, service or action has another type than the client gives.
+pub(crate) fn type_mismatch(what: &str, theirs: &str, said: &str) -> String {
     format!("{what} has type {theirs}, not {said}; use the type that it has")
 }
 
-/// The name of a type as the servant's ROS writes it: `package/Type` in ROS 1, `package/KIND/Type` in ROS 2, where `kind` is `msg`,
-/// `srv` or `action`. What is no name of a type stays as it is.
-pub(crate) fn spelled<'a>(version: RosVersion, name: &'a str, kind: &str) -> Cow<'a, str> {
+/// Returns the name of a type as spelled by the servant's ROS: `package/Type` in ROS 1, `package/KIND/Type` in ROS 2,
+/// where `kind` is `msg`, `srv` or `action`. Anything else is returned unchanged.
+pub(crate) fn ros_type_name<'a>(version: RosVersion, name: &'a str, kind: &str) -> Cow<'a, str> {
     match version {
-        RosVersion::One => plain_type(name),
+        RosVersion::One => short_type_name(name),
         RosVersion::Two => match name.split_once('/') {
             Some((package, rest)) if !rest.contains('/') => {
                 Cow::Owned(format!("{package}/{kind}/{rest}"))
@@ -94,24 +95,24 @@ pub(crate) fn spelled<'a>(version: RosVersion, name: &'a str, kind: &str) -> Cow
     }
 }
 
-/// The name of a type by which the servant's definitions are looked up.
-pub(crate) fn sought(version: RosVersion, name: &str) -> Cow<'_, str> {
+/// Returns the name of a type for looking up the servant's definitions.
+pub(crate) fn lookup_name(version: RosVersion, name: &str) -> Cow<'_, str> {
     match version {
-        RosVersion::One => plain_type(name),
-        // Full names are known as they are, short ones by what they are looked up as.
+        RosVersion::One => short_type_name(name),
+        // Full names are known as they are, short ones are resolved by the lookup.
         RosVersion::Two => Cow::Borrowed(name),
     }
 }
 
-/// Messages of the type of this name (any at all, where it is `*`), whatever their definition.
-pub(crate) fn any_definition(version: RosVersion, name: &str) -> WireType {
+/// Returns the type of this name (any at all for `*`), with any definition.
+pub(crate) fn wildcard_type(version: RosVersion, name: &str) -> WireType {
     WireType {
-        format: WireFormat::of(version),
-        ..WireType::named(name)
+        format: WireFormat::for_version(version),
+        ..WireType::with_name(name)
     }
 }
 
-/// What tells definitions of one name apart, in the words of each ROS.
+/// Returns the term of each ROS for what identifies a definition.
 pub(crate) fn digest_word(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "MD5",
@@ -154,9 +155,9 @@ mod tests {
 
     #[test]
     fn types_are_written_as_either_ros_does() {
-        let message = |version, name| spelled(version, name, "msg").into_owned();
+        let message = |version, name| ros_type_name(version, name, "msg").into_owned();
         for name in ["std_msgs/msg/String", "std_msgs/String"] {
-            assert_eq!(plain_type(name), "std_msgs/String");
+            assert_eq!(short_type_name(name), "std_msgs/String");
             assert_eq!(message(RosVersion::One, name), "std_msgs/String");
             assert_eq!(message(RosVersion::Two, name), "std_msgs/msg/String");
             assert!(is_same_type(name, "std_msgs/String"));
@@ -166,7 +167,7 @@ mod tests {
             message(RosVersion::Two, "a/action/B_Goal"),
             "a/action/B_Goal"
         );
-        assert_eq!(spelled(RosVersion::Two, "a/B", "srv"), "a/srv/B");
+        assert_eq!(ros_type_name(RosVersion::Two, "a/B", "srv"), "a/srv/B");
         assert_eq!(message(RosVersion::Two, "*"), "*");
         assert_eq!(message(RosVersion::Two, ""), "");
     }
@@ -174,14 +175,17 @@ mod tests {
     #[test]
     fn whoever_takes_any_definition_takes_those_of_its_ros() {
         for version in BOTH {
-            let any = any_definition(version, "*");
+            let any = wildcard_type(version, "*");
             let own = WireType {
-                format: WireFormat::of(version),
+                format: WireFormat::for_version(version),
                 ..WireType::new("a/B", "1234", "")
             };
-            assert!(any.agrees(&own));
+            assert!(any.is_compatible_with(&own));
             for other in BOTH {
-                assert_eq!(any_definition(other, "a/B").agrees(&own), other == version);
+                assert_eq!(
+                    wildcard_type(other, "a/B").is_compatible_with(&own),
+                    other == version
+                );
             }
         }
     }

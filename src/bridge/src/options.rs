@@ -1,4 +1,4 @@
-//! What an operator can set, and what each connection brings along.
+//! Options of an operator, and of each connection.
 
 use std::fmt;
 use std::sync::Arc;
@@ -6,93 +6,95 @@ use std::time::Duration;
 
 use budget::Budget;
 use bytes::Bytes;
-use qos::Pair;
+use qos::TopicPair;
 use ros::codec::NonFinite;
-use rosbridge::{FragmentLimits, Level};
+use rosbridge::{FragmentLimits, StatusLevel};
 
-use crate::Granted;
+use crate::ClientGrants;
 
-/// Limits and habits of one servant's bridge. The defaults suit a robot on Wi-Fi.
+/// Limits and timeouts of one servant's bridge. The defaults suit a robot on Wi-Fi.
 #[derive(Debug, Clone)]
 pub struct BridgeOptions {
-    /// Longest WebSocket frame taken, in bytes; longer ones close the connection (1009).
+    /// Maximum length of a WebSocket frame in bytes; longer ones close the connection (1009).
     pub max_frame: usize,
-    /// Longest WebSocket message taken, in bytes, whether in one frame or several (1009).
+    /// Maximum length of a WebSocket message in bytes, in one frame or several; longer ones close the connection
+    /// (1009).
     pub max_message: usize,
-    /// Time between pings; zero: none.
+    /// Interval between pings; zero: none.
     pub ping_interval: Duration,
-    /// A connection from which nothing, not even a pong, came for so long is closed (1001); zero: never.
+    /// Time after which a connection is closed if nothing, not even a pong, was received (1001); zero: never.
     pub idle_timeout: Duration,
-    /// How long a closed connection may take to say goodbye.
+    /// Time for the close handshake.
     pub close_timeout: Duration,
-    /// Answers and status messages kept for a client that does not read; more close the connection (1008).
+    /// Answers and status messages queued for a client that does not read; more close the connection (1008).
     pub control_messages: usize,
     /// Bytes of those.
     pub control_bytes: usize,
-    /// Messages kept per topic for a client that reads slowly; the oldest are dropped beyond.
+    /// Messages queued per topic for a client that reads slowly; beyond this the oldest are dropped.
     pub topic_messages: usize,
-    /// Bytes of those. However large they are, two are kept; as many as the client asked for where it did, at most ten.
+    /// Bytes of those. However large they are, two are kept, or as many as the client asked for, up to ten.
     pub topic_bytes: usize,
-    /// Bytes kept for one client over all its topics; one message is always kept. Its budget is a bound, too.
+    /// Bytes queued for one client over all its topics; one message is always kept. Its budget is a bound, too.
     pub session_bytes: usize,
-    /// Messages that the bus keeps for the bridge, per topic.
+    /// Messages that the bus queues for the bridge, per topic.
     pub bus_queue: usize,
-    /// Subscriptions one client may have.
+    /// Maximum number of subscriptions of one client.
     pub max_subscriptions: usize,
-    /// Topics, services and actions one client may advertise, together.
+    /// Maximum number of topics, services and actions that one client advertises, together.
     pub max_advertisements: usize,
-    /// Service calls and goals of one client that may be under way at once.
+    /// Maximum number of service calls and goals of one client in progress at once.
     pub max_calls: usize,
-    /// Bytes of arguments of those; a single call or goal may have more.
+    /// Maximum bytes of their arguments; a single call or goal may have more.
     pub max_call_bytes: usize,
-    /// How long a service may take when the call says nothing.
+    /// Timeout of a service call that has none of its own.
     pub call_timeout: Duration,
-    /// How long a goal waits for its action server to connect.
+    /// Time that a goal waits for its action server to connect.
     pub action_timeout: Duration,
-    /// How long messages published right after `advertise` wait for the first subscriber to connect.
+    /// Time that messages published right after `advertise` wait for the first subscriber to connect.
     pub warm_up: Duration,
-    /// How long a client with a resume token may be away.
+    /// Grace period of a disconnected client with a resume token.
     pub resume_grace: Duration,
-    /// Bounds of messages that arrive in fragments.
+    /// Limits of messages that arrive in fragments.
     pub fragments: FragmentLimits,
-    /// Most bytes that a `png` may unpack to.
+    /// Maximum bytes of a decoded `png`.
     pub max_png: usize,
-    /// How NaN and infinities are written in JSON.
+    /// Encoding of NaN and infinities in JSON.
     pub non_finite: NonFinite,
-    /// Bytes of JSON or CBOR that one message from ROS may become; a longer one is not sent.
+    /// Maximum bytes of JSON or CBOR for one message from ROS; a longer one is not sent.
     pub max_encoded: usize,
-    /// Budget for JSON and CBOR made of messages from ROS (above 64 KiB), for as long as they wait for their clients. A message
-    /// that does not fit is not sent, and its clients get a status.
+    /// Budget for messages from ROS encoded as JSON and CBOR (above 64 KiB), for as long as they wait for their
+    /// clients. A message that does not fit is not sent, and its clients get a status message.
     pub budget: Budget,
-    /// A WebSocket message that was begun and is not complete after this time closes its connection (1008).
+    /// Time after which an incomplete WebSocket message closes its connection (1008).
     pub unfinished: Duration,
-    /// Who hears of clients' requests to the servant: calls of its services, goals, and messages of the input of `pair`.
-    pub called: Called,
-    /// Topics on which clients ask and the servant answers, where there is one such pair.
-    pub pair: Option<Pair>,
+    /// Observer of clients' requests to the servant: calls of its services, goals, and messages of the input of `pair`.
+    pub called: RequestObserver,
+    /// Topics of requests to the servant and its answers, if there is such a pair.
+    pub pair: Option<TopicPair>,
 }
 
-/// Hears how long each request of a client to the servant took, from the bridge to the servant and back; none where it failed.
+/// Observes the duration of each request of a client to the servant, from the bridge to the servant and back; `None` if
+/// it failed.
 #[derive(Clone, Default)]
-pub struct Called(Option<Arc<Listener>>);
+pub struct RequestObserver(Option<Arc<RequestListener>>);
 
-type Listener = dyn Fn(Option<Duration>) + Send + Sync;
+type RequestListener = dyn Fn(Option<Duration>) + Send + Sync;
 
-impl Called {
-    /// By this function, which must not block.
-    pub fn by(listener: impl Fn(Option<Duration>) + Send + Sync + 'static) -> Called {
-        Called(Some(Arc::new(listener)))
+impl RequestObserver {
+    /// Creates an observer that calls this function, which must not block.
+    pub fn new(listener: impl Fn(Option<Duration>) + Send + Sync + 'static) -> RequestObserver {
+        RequestObserver(Some(Arc::new(listener)))
     }
 
-    /// Tells of one request.
-    pub fn tell(&self, took: Option<Duration>) {
+    /// Records one request.
+    pub fn record(&self, took: Option<Duration>) {
         if let Some(listener) = &self.0 {
             listener(took);
         }
     }
 }
 
-impl fmt::Debug for Called {
+impl fmt::Debug for RequestObserver {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let heard = self.0.is_some();
         out.debug_tuple("Called").field(&heard).finish()
@@ -111,7 +113,7 @@ impl Default for BridgeOptions {
             control_bytes: 32 << 20,
             topic_messages: 1000,
             topic_bytes: 4 << 20,
-            // Ten pictures of 1920x1080.
+            // Ten images of 1920x1080.
             session_bytes: 64 << 20,
             bus_queue: 256,
             max_subscriptions: 1000,
@@ -129,33 +131,33 @@ impl Default for BridgeOptions {
             max_png: 32 << 20,
             non_finite: NonFinite::Null,
             max_encoded: 64 << 20,
-            budget: Budget::unlimited(),
+            budget: Budget::without_limit(),
             unfinished: Duration::from_secs(300),
-            called: Called::default(),
+            called: RequestObserver::default(),
             pair: None,
         }
     }
 }
 
-/// What is particular to one connection.
+/// Options of one connection.
 #[derive(Debug, Clone)]
 pub struct SessionOptions {
-    /// Who it is, for logs and the `connected_clients` topic: the robot's id or the peer's address.
+    /// Name of the client in logs and in the `connected_clients` topic: the robot's id or the peer's address.
     pub client: String,
-    /// A secret that the client made up. Whoever presents it again within [`BridgeOptions::resume_grace`] finds
+    /// Secret chosen by the client. A connection that presents it again within [`BridgeOptions::resume_grace`] finds
     /// subscriptions, advertisements and unanswered calls as they were left.
     pub resume: Option<String>,
-    /// What was already read from the connection behind the HTTP upgrade.
+    /// Bytes already read from the connection after the HTTP upgrade.
     pub read_ahead: Bytes,
-    /// Which status messages it hears until it says `set_level`.
-    pub level: Level,
-    /// Whether it receives what this bridge's own clients publish, as rosbridge's clients do. A robot's link does
-    /// not: its ROS has those messages already.
+    /// Level of status messages until the client sends `set_level`.
+    pub level: StatusLevel,
+    /// Delivery of what this bridge's own clients publish, as for clients of rosbridge. Off for a robot's link: its ROS
+    /// has those messages already.
     pub hears_clients: bool,
-    /// Budget for unfinished messages of the client; one that does not fit closes its connection (1013).
+    /// Budget for the client's incomplete messages; one that does not fit closes its connection (1013).
     pub budget: Budget,
-    /// What it may do.
-    pub granted: Granted,
+    /// Permissions of the client.
+    pub granted: ClientGrants,
 }
 
 impl Default for SessionOptions {
@@ -164,10 +166,10 @@ impl Default for SessionOptions {
             client: String::new(),
             resume: None,
             read_ahead: Bytes::new(),
-            level: Level::Error,
+            level: StatusLevel::Error,
             hears_clients: true,
-            budget: Budget::unlimited(),
-            granted: Granted::default(),
+            budget: Budget::without_limit(),
+            granted: ClientGrants::default(),
         }
     }
 }

@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use ros::bus::{Message, WireType};
+use ros::bus::{SerializedMessage, WireType};
 use ros::schema::Registry;
 use rosbridge::Format;
 
@@ -10,14 +10,14 @@ use crate::sample::TopicTypes;
 fn outbox(options: BridgeOptions) -> (Outbox, Arc<Metrics>) {
     let metrics = Arc::new(Metrics::default());
     (
-        Outbox::new(&options, metrics.clone(), &Budget::unlimited()),
+        Outbox::new(&options, metrics.clone(), &Budget::without_limit()),
         metrics,
     )
 }
 
-fn sample(size: usize) -> Arc<Sample> {
-    let wire_type = Arc::new(WireType::named("a/B"));
-    let message = Message {
+fn sample(size: usize) -> Arc<TopicSample> {
+    let wire_type = Arc::new(WireType::with_name("a/B"));
+    let message = SerializedMessage {
         bytes: vec![0; size].into(),
         wire_type,
         publisher: "/p".into(),
@@ -25,23 +25,23 @@ fn sample(size: usize) -> Arc<Sample> {
     };
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
     let options = BridgeOptions::default();
-    Arc::new(Sample::new(message, false, types, &options).unwrap())
+    Arc::new(TopicSample::new(message, false, types, &options).unwrap())
 }
 
-fn control(size: usize) -> Control {
-    let frame = Frame {
+fn control(size: usize) -> ControlMessage {
+    let frame = EncodedFrame {
         format: Format::Json,
         bytes: vec![b'x'; size].into(),
     };
-    Control {
+    ControlMessage {
         frame,
         fragment_size: None,
         answer: false,
     }
 }
 
-fn wishes() -> Wishes {
-    Wishes {
+fn wishes() -> SubscriptionOptions {
+    SubscriptionOptions {
         throttle_rate: Duration::ZERO,
         queue_length: 0,
         fragment_size: None,
@@ -49,7 +49,7 @@ fn wishes() -> Wishes {
     }
 }
 
-/// What comes out: `c` for control, else the topic and size.
+/// Takes everything: `c` for control messages, otherwise the topic and size.
 fn drain(outbox: &Outbox, now: Instant) -> Vec<String> {
     let mut out = Vec::new();
     while let Some(next) = outbox.next(now) {
@@ -69,17 +69,17 @@ fn control_goes_first_and_topics_take_turns() {
         outbox.add_topic("/b".into(), wishes()),
     );
     for size in 1..=3 {
-        outbox.sample(a, sample(size), false);
+        outbox.push_sample(a, sample(size), false);
     }
-    outbox.sample(b, sample(9), false);
-    outbox.control(control(1));
+    outbox.push_sample(b, sample(9), false);
+    outbox.push_control(control(1));
     assert_eq!(
         drain(&outbox, Instant::now()),
         ["c", "/a1", "/b9", "/a2", "/a3"]
     );
-    outbox.sample(a, sample(1), false);
+    outbox.push_sample(a, sample(1), false);
     outbox.remove_topic(a);
-    outbox.sample(a, sample(1), false);
+    outbox.push_sample(a, sample(1), false);
     assert!(drain(&outbox, Instant::now()).is_empty());
 }
 
@@ -90,15 +90,15 @@ fn a_topic_in_fragments_waits_and_others_do_not() {
         outbox.add_topic("/a".into(), wishes()),
         outbox.add_topic("/b".into(), wishes()),
     );
-    outbox.sample(a, sample(1), false);
-    outbox.sample(a, sample(2), false);
+    outbox.push_sample(a, sample(1), false);
+    outbox.push_sample(a, sample(2), false);
     let now = Instant::now();
     assert!(matches!(outbox.next(now), Some(Outgoing::Sample { key, .. }) if key == a));
-    outbox.sending_fragments(0, a);
-    outbox.sample(b, sample(3), false);
-    outbox.sample(a, sample(4), false);
+    outbox.hold_topic(0, a);
+    outbox.push_sample(b, sample(3), false);
+    outbox.push_sample(a, sample(4), false);
     assert_eq!(drain(&outbox, now), ["/b3"]);
-    outbox.fragments_sent(0, a);
+    outbox.release_topic(0, a);
     assert_eq!(drain(&outbox, Instant::now()), ["/a2", "/a4"]);
 }
 
@@ -108,21 +108,21 @@ fn a_topic_whose_fragments_went_down_with_a_socket_goes_on_over_the_next() {
     let key = outbox.add_topic("/a".into(), wishes());
     let old = outbox.attach();
     for size in 1..=3 {
-        outbox.sample(key, sample(size), false);
+        outbox.push_sample(key, sample(size), false);
     }
     let now = Instant::now();
     assert!(outbox.next(now).is_some());
-    outbox.sending_fragments(old, key);
+    outbox.hold_topic(old, key);
     let new = outbox.attach();
     assert!(
         matches!(outbox.next(now), Some(Outgoing::Sample { sample, .. }) if sample.bytes.len() == 2)
     );
-    // The old one, which has not noticed yet, changes nothing.
-    outbox.sending_fragments(old, key);
-    outbox.sending_fragments(new, key);
-    outbox.fragments_sent(old, key);
+    // The old socket, which has not noticed yet, changes nothing.
+    outbox.hold_topic(old, key);
+    outbox.hold_topic(new, key);
+    outbox.release_topic(old, key);
     assert!(outbox.next(now).is_none());
-    outbox.fragments_sent(new, key);
+    outbox.release_topic(new, key);
     assert_eq!(drain(&outbox, now), ["/a3"]);
 }
 
@@ -137,32 +137,32 @@ fn one_client_holds_bounded_memory_whatever_it_subscribes_to() {
         .collect();
     for _ in 0..100 {
         for key in &topics {
-            outbox.sample(*key, sample(90), false);
+            outbox.push_sample(*key, sample(90), false);
             assert!(outbox.queues.lock().topics.load().bytes <= 1000);
         }
     }
     assert!(metrics.dropped.get() >= 985);
-    // A message larger than all that is allowed gets through as the only one of its topic.
-    outbox.sample(topics[0], sample(3000), false);
+    // A message larger than all limits gets through as the only one of its topic.
+    outbox.push_sample(topics[0], sample(3000), false);
     let sent = drain(&outbox, Instant::now());
     assert!(sent.contains(&"/03000".to_owned()), "{sent:?}");
-    // But not when it alone is many times too much and others are there.
-    outbox.sample(topics[1], sample(10), false);
-    outbox.sample(topics[0], sample(3000), false);
-    outbox.sample(topics[2], sample(3000), false);
+    // But not if it alone is far too large and others are queued.
+    outbox.push_sample(topics[1], sample(10), false);
+    outbox.push_sample(topics[0], sample(3000), false);
+    outbox.push_sample(topics[2], sample(3000), false);
     assert!(outbox.queues.lock().topics.load().bytes <= 4000);
 }
 
 #[test]
 fn ten_large_pictures_fit_into_one_clients_memory() {
     let (outbox, metrics) = outbox(BridgeOptions::default());
-    let wishes = Wishes {
+    let wishes = SubscriptionOptions {
         queue_length: 10,
         ..wishes()
     };
     let key = outbox.add_topic("/pictures".into(), wishes);
     for number in 0..10 {
-        outbox.sample(key, sample(1920 * 1080 * 3 + number), false);
+        outbox.push_sample(key, sample(1920 * 1080 * 3 + number), false);
     }
     assert_eq!(metrics.dropped.get(), 0);
     assert_eq!(drain(&outbox, Instant::now()).len(), 10);
@@ -174,13 +174,13 @@ fn who_reads_no_answers_is_told_goodbye() {
         control_messages: 2,
         ..BridgeOptions::default()
     });
-    outbox.control(control(1));
-    outbox.control(control(1));
-    assert_eq!(outbox.goodbye(), None);
-    outbox.control(control(1));
+    outbox.push_control(control(1));
+    outbox.push_control(control(1));
+    assert_eq!(outbox.close_reason(), None);
+    outbox.push_control(control(1));
     assert_eq!(
-        outbox.goodbye(),
-        Some(Goodbye {
+        outbox.close_reason(),
+        Some(CloseReason {
             code: 1008,
             reason: "2 answers wait and none is read".to_owned()
         })
@@ -193,21 +193,21 @@ fn throttled_topics_come_when_they_are_due() {
     let rate = Duration::from_secs(60);
     let key = outbox.add_topic(
         "/a".into(),
-        Wishes {
+        SubscriptionOptions {
             throttle_rate: rate,
             queue_length: 5,
             ..wishes()
         },
     );
-    outbox.sample(key, sample(1), false);
-    outbox.sample(key, sample(2), false);
+    outbox.push_sample(key, sample(1), false);
+    outbox.push_sample(key, sample(2), false);
     let now = Instant::now();
     assert_eq!(drain(&outbox, now), ["/a1"]);
     assert_eq!(outbox.next_due(), Some(now + rate));
     assert_eq!(drain(&outbox, now + rate), ["/a2"]);
     assert_eq!(metrics.throttled.get(), 0);
     outbox.change_topic(key, wishes());
-    outbox.sample(key, sample(3), false);
+    outbox.push_sample(key, sample(3), false);
     assert_eq!(drain(&outbox, now), ["/a3"]);
 }
 

@@ -1,4 +1,4 @@
-//! Services that the bridge answers itself, where no node of the servant does: rosapi's and tf's.
+//! Services that the bridge answers itself if no node of the servant does: those of rosapi and tf.
 
 use std::sync::Arc;
 
@@ -7,45 +7,46 @@ use async_trait::async_trait;
 use budget::Budget;
 use ros::schema::ServiceDef;
 
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 use crate::{rosapi, tf};
 
-/// The client that calls a service of the bridge's own.
+/// The client that calls one of the bridge's own services.
 pub(crate) struct Caller<'a> {
-    /// What it is shown.
+    /// Grants that filter the answer.
     pub grants: &'a Grants,
-    /// Where what its arguments become counts.
+    /// Budget for the parsed arguments.
     pub budget: &'a Budget,
 }
 
-/// A service of the bridge's own.
+/// A service answered by the bridge itself.
 #[async_trait]
 pub(crate) trait OwnService: Send + Sync {
-    /// Whether anybody may call it: it tells of names and types alone, and of those names alone that its caller may use.
+    /// Returns whether every client may call it: the answer only contains names and types, filtered by the caller's
+    /// grants.
     fn is_filtered(&self) -> bool {
         false
     }
 
-    /// Whether its answer is about what nodes have registered.
-    fn shows_graph(&self) -> bool {
+    /// Returns whether its answer depends on what nodes have registered.
+    fn reads_graph(&self) -> bool {
         false
     }
 
-    /// Its definition, in the servant's ROS.
-    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String>;
+    /// Returns its definition, in the servant's ROS.
+    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, String>;
 
-    /// The response, as JSON, to a request in JSON.
+    /// Answers a request in JSON with a response in JSON.
     async fn answer(
         &self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &[u8],
         caller: &Caller<'_>,
     ) -> Result<Vec<u8>, String>;
 }
 
-/// The one of this absolute name.
-pub(crate) fn find(name: &str) -> Option<Box<dyn OwnService>> {
-    if let Some(service) = rosapi::Service::find(name) {
+/// Finds the service with this absolute name.
+pub(crate) fn find_own_service(name: &str) -> Option<Box<dyn OwnService>> {
+    if let Some(service) = rosapi::RosapiService::find(name) {
         return Some(Box::new(service));
     }
     (name == tf::SERVICE).then(|| Box::new(tf::RepublishTfs) as Box<dyn OwnService>)

@@ -1,10 +1,10 @@
-//! `/client_count` and `/connected_clients`: who is connected, as rosbridge_suite publishes it. The bridge answers
-//! for these topics itself, unless a node of the servant has topics of these names.
+//! `/client_count` and `/connected_clients`: the connected clients, as published by rosbridge_suite. The bridge
+//! publishes these topics itself, unless a node of the servant has topics of these names.
 
 use std::sync::Arc;
 
 use parking_lot::Mutex;
-use ros::bus::{Message, RosVersion, WireType};
+use ros::bus::{RosVersion, SerializedMessage, WireType};
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
@@ -15,7 +15,7 @@ const CLIENTS: &str = "/connected_clients";
 /// Both topics.
 pub(crate) const TOPICS: [&str; 2] = [COUNT, CLIENTS];
 
-/// Types of these topics and what they contain, for one ROS.
+/// Returns the types of these topics and of their fields, for one ROS.
 fn definitions(version: RosVersion) -> [(&'static str, &'static str); 3] {
     let client = match version {
         RosVersion::One => "string ip_address\ntime connection_time\n",
@@ -31,19 +31,19 @@ fn definitions(version: RosVersion) -> [(&'static str, &'static str); 3] {
     ]
 }
 
-/// Who is connected.
+/// The connected clients.
 #[derive(Default)]
 pub(crate) struct Presence {
-    present: Mutex<Vec<Present>>,
+    present: Mutex<Vec<ConnectedClient>>,
 }
 
-struct Present {
+struct ConnectedClient {
     number: u64,
     name: String,
     since: Time,
 }
 
-/// The type of one of these topics.
+/// Returns the type of one of these topics.
 pub(crate) fn type_name(version: RosVersion, topic: &str) -> Option<&'static str> {
     match (topic, version) {
         (COUNT, RosVersion::One) => Some("std_msgs/Int32"),
@@ -54,8 +54,8 @@ pub(crate) fn type_name(version: RosVersion, topic: &str) -> Option<&'static str
     }
 }
 
-/// Adds the types of these topics where the servant has none of these names.
-pub(crate) fn define(version: RosVersion, registry: &Registry) {
+/// Adds the types of these topics unless the servant has types of these names.
+pub(crate) fn define_types(version: RosVersion, registry: &Registry) {
     for (name, text) in definitions(version) {
         if registry.message(name).is_err()
             && let Err(error) = registry.insert(name, text)
@@ -67,7 +67,7 @@ pub(crate) fn define(version: RosVersion, registry: &Registry) {
 
 impl Presence {
     pub(crate) fn enter(&self, number: u64, name: &str) {
-        self.present.lock().push(Present {
+        self.present.lock().push(ConnectedClient {
             number,
             name: name.to_owned(),
             since: Time::now(),
@@ -80,11 +80,15 @@ impl Presence {
             .retain(|present| present.number != number);
     }
 
-    /// What the topic says now, where its type has room for that.
-    pub(crate) fn message(&self, topic: &str, message_type: &MessageType) -> Option<Message> {
+    /// Builds the current message of the topic, if its type has the expected fields.
+    pub(crate) fn build_message(
+        &self,
+        topic: &str,
+        message_type: &MessageType,
+    ) -> Option<SerializedMessage> {
         let said = {
             let present = self.present.lock();
-            let client = |Present { name, since, .. }: &Present| {
+            let client = |ConnectedClient { name, since, .. }: &ConnectedClient| {
                 let Time { secs, nsecs } = *since;
                 json!({ "ip_address": name, "connection_time": { "secs": secs, "nsecs": nsecs } })
             };
@@ -102,9 +106,9 @@ impl Presence {
             &options,
         )
         .ok()?;
-        Some(Message {
+        Some(SerializedMessage {
             bytes: bytes.into(),
-            wire_type: Arc::new(WireType::of(message_type)),
+            wire_type: Arc::new(WireType::from_message(message_type)),
             publisher: "/rosbridge_websocket".into(),
             latching: true,
         })

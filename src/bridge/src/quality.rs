@@ -1,68 +1,68 @@
-//! What clients ask of the ends of topics, in the words of the bus.
+//! Conversion of the quality of service requested by clients to that of the bus.
 
 use std::time::Duration;
 
-use ros::bus::{Durability, Liveliness, Qos, Reliability, RosVersion};
-use rosbridge::{History, Period, Subscribe};
+use ros::bus::{QosDurability, QosLiveliness, QosProfile, QosReliability, RosVersion};
+use rosbridge::{HistoryPolicy, Period, Subscribe};
 
-/// Messages kept per slow node where a client does not say.
+/// Default number of messages queued for a slow node.
 const DEFAULT_QUEUE: usize = 100;
-/// Most messages kept per slow node.
+/// Maximum number of messages queued for a slow node.
 const MOST_QUEUED: usize = 1000;
 
-/// What a client's publications offer.
+/// Quality of service offered by a client's publications.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Offer {
-    /// To nodes.
-    pub(crate) qos: Qos,
-    /// Whether newcomers are given the last message.
+pub(crate) struct PublisherOffer {
+    /// Quality of service towards nodes.
+    pub(crate) qos: QosProfile,
+    /// Latching: new clients receive the last message.
     pub(crate) latch: bool,
 }
 
-/// What is asked of a topic's publishers where no client says what it wants: as much as they offer, all that they keep
-/// included. `depth`: messages that the bus keeps for the bridge.
-pub(crate) const fn all_there_is(depth: usize) -> Qos {
-    Qos::keep_last(depth).latching(true)
+/// Quality of service for subscriptions that do not specify any: as much as publishers offer, including the messages
+/// they keep. `depth` is the number of messages that the bus queues for the bridge.
+pub(crate) const fn default_subscription_qos(depth: usize) -> QosProfile {
+    QosProfile::keep_last(depth).latching(true)
 }
 
-/// What a client's subscription asks of publishers. How many messages are kept for the client itself is
-/// [another matter](queue_length).
-pub(crate) fn asked(qos: Option<rosbridge::Qos>, depth: usize) -> Qos {
-    let all = all_there_is(depth);
+/// Returns the quality of service that a client's subscription requests from publishers. The number of messages queued
+/// for the client itself is [separate](queue_length).
+pub(crate) fn subscription_qos(qos: Option<rosbridge::QosRequest>, depth: usize) -> QosProfile {
+    let all = default_subscription_qos(depth);
     let Some(qos) = qos else { return all };
-    Qos {
+    QosProfile {
         reliability: match qos.reliability {
-            Some(rosbridge::Reliability::BestEffort) => Reliability::BestEffort,
+            Some(rosbridge::ReliabilityPolicy::BestEffort) => QosReliability::BestEffort,
             _ => all.reliability,
         },
         durability: match qos.durability {
-            Some(rosbridge::Durability::Volatile) => Durability::Volatile,
+            Some(rosbridge::DurabilityPolicy::Volatile) => QosDurability::Volatile,
             _ => all.durability,
         },
         ..all
     }
 }
 
-/// What satisfies all of a client's subscriptions to a topic.
-pub(crate) fn most<'q>(all: impl Iterator<Item = &'q Qos>) -> Option<Qos> {
-    all.copied().reduce(|one, other| Qos {
+/// Returns the quality of service that satisfies all of a client's subscriptions to a topic.
+pub(crate) fn merge_qos<'q>(all: impl Iterator<Item = &'q QosProfile>) -> Option<QosProfile> {
+    all.copied().reduce(|one, other| QosProfile {
         reliability: match one.reliability {
-            Reliability::Reliable => Reliability::Reliable,
-            Reliability::BestEffort => other.reliability,
+            QosReliability::Reliable => QosReliability::Reliable,
+            QosReliability::BestEffort => other.reliability,
         },
         durability: match one.durability {
-            Durability::TransientLocal => Durability::TransientLocal,
-            Durability::Volatile => other.durability,
+            QosDurability::TransientLocal => QosDurability::TransientLocal,
+            QosDurability::Volatile => other.durability,
         },
         ..one
     })
 }
 
-/// The policies that a client speaks of and that mean nothing, in words: to ROS 1, or to a subscription, which asks nothing
-/// about time of those that it hears.
-pub(crate) fn unheard(
+/// Describes the policies of a client that have no effect: for ROS 1, or for a subscription, which requests nothing
+/// about the timing of publishers.
+pub(crate) fn ignored_policies(
     version: RosVersion,
-    qos: &rosbridge::Qos,
+    qos: &rosbridge::QosRequest,
     subscribes: bool,
 ) -> Option<String> {
     if version == RosVersion::Two && !subscribes {
@@ -84,12 +84,12 @@ pub(crate) fn unheard(
     }
     let why = match version {
         RosVersion::One => "this servant speaks ROS 1, which has no such policies",
-        RosVersion::Two => "publishers are heard whatever they offer of that",
+        RosVersion::Two => "subscriptions here accept whatever publishers offer there",
     };
-    Some(format!("{} left out: {why}", names.join(", ")))
+    Some(format!("{} ignored: {why}", names.join(", ")))
 }
 
-/// The length of time that a client offers; none where it offers any.
+/// Returns the duration that a client offers; `None` for any.
 fn offered_period(period: Option<Period>) -> Option<Duration> {
     match period {
         Some(Period::Of(long)) => Some(long),
@@ -97,55 +97,55 @@ fn offered_period(period: Option<Period>) -> Option<Duration> {
     }
 }
 
-/// How many messages are kept for a client that subscribes so; 0 where it does not say.
+/// Returns the number of messages queued for a client with this subscription; 0 if unspecified.
 pub(crate) fn queue_length(op: &Subscribe<'_>) -> usize {
     match op.qos {
         Some(qos) if op.queue_length == 0 => match qos.history {
-            Some(History::KeepAll) => usize::MAX,
+            Some(HistoryPolicy::KeepAll) => usize::MAX,
             _ => qos.depth.unwrap_or(0),
         },
         _ => op.queue_length,
     }
 }
 
-/// What a client's publications offer: by `qos` where it says it, else by what rosbridge had before.
-pub(crate) fn offered(
+/// Returns the quality of service of a client's publications: by `qos` if given, otherwise by rosbridge's older fields.
+pub(crate) fn publication_offer(
     version: RosVersion,
-    qos: Option<rosbridge::Qos>,
+    qos: Option<rosbridge::QosRequest>,
     latch: bool,
     queue_size: Option<u64>,
-) -> Offer {
+) -> PublisherOffer {
     let qos = qos.unwrap_or_default();
     let latch = match qos.durability {
-        Some(rosbridge::Durability::TransientLocal) => true,
-        Some(rosbridge::Durability::Volatile) => false,
-        Some(rosbridge::Durability::BestAvailable) | None => latch,
+        Some(rosbridge::DurabilityPolicy::TransientLocal) => true,
+        Some(rosbridge::DurabilityPolicy::Volatile) => false,
+        Some(rosbridge::DurabilityPolicy::BestAvailable) | None => latch,
     };
     let said = queue_size.filter(|size| *size > 0);
     let depth = match (qos.history, qos.depth) {
-        (Some(History::KeepAll), _) => MOST_QUEUED,
+        (Some(HistoryPolicy::KeepAll), _) => MOST_QUEUED,
         (_, Some(depth)) => depth,
-        // So many are given to newcomers: what is latched is the last one.
+        // This many are sent to new subscribers: of latched messages the last one.
         (_, None) if latch && version == RosVersion::Two => 1,
         (_, None) => said.map_or(DEFAULT_QUEUE, |size| {
             usize::try_from(size).unwrap_or(usize::MAX)
         }),
     };
     let reliability = match qos.reliability {
-        Some(rosbridge::Reliability::BestEffort) => Reliability::BestEffort,
-        _ => Reliability::Reliable,
+        Some(rosbridge::ReliabilityPolicy::BestEffort) => QosReliability::BestEffort,
+        _ => QosReliability::Reliable,
     };
     let liveliness = match qos.liveliness {
-        Some(rosbridge::Liveliness::ManualByTopic) => Liveliness::ManualByTopic,
-        _ => Liveliness::Automatic,
+        Some(rosbridge::LivelinessPolicy::ManualByTopic) => QosLiveliness::ManualByTopic,
+        _ => QosLiveliness::Automatic,
     };
-    let basic = Qos {
+    let basic = QosProfile {
         reliability,
-        ..Qos::keep_last(depth.min(MOST_QUEUED)).latching(latch)
+        ..QosProfile::keep_last(depth.min(MOST_QUEUED)).latching(latch)
     };
     let qos = match version {
         RosVersion::One => basic,
-        RosVersion::Two => Qos {
+        RosVersion::Two => QosProfile {
             deadline: offered_period(qos.deadline),
             lifespan: offered_period(qos.lifespan),
             liveliness,
@@ -153,7 +153,7 @@ pub(crate) fn offered(
             ..basic
         },
     };
-    Offer { qos, latch }
+    PublisherOffer { qos, latch }
 }
 
 #[cfg(test)]
@@ -164,31 +164,38 @@ mod tests {
 
     use super::*;
 
-    fn said(qos: rosbridge::Qos) -> Option<rosbridge::Qos> {
+    fn some_qos(qos: rosbridge::QosRequest) -> Option<rosbridge::QosRequest> {
         Some(qos)
     }
 
     #[test]
     fn who_does_not_say_what_it_wants_is_given_all_there_is() {
-        let all = all_there_is(256);
+        let all = default_subscription_qos(256);
         assert!(all.is_latching());
-        assert_eq!(asked(None, 256), all);
-        assert_eq!(asked(said(rosbridge::Qos::default()), 256), all);
-        let deep = rosbridge::Qos {
+        assert_eq!(subscription_qos(None, 256), all);
+        assert_eq!(
+            subscription_qos(some_qos(rosbridge::QosRequest::default()), 256),
+            all
+        );
+        let deep = rosbridge::QosRequest {
             depth: Some(5),
-            reliability: Some(rosbridge::Reliability::BestAvailable),
-            durability: Some(rosbridge::Durability::TransientLocal),
-            ..rosbridge::Qos::default()
+            reliability: Some(rosbridge::ReliabilityPolicy::BestAvailable),
+            durability: Some(rosbridge::DurabilityPolicy::TransientLocal),
+            ..rosbridge::QosRequest::default()
         };
-        assert_eq!(asked(said(deep), 256), all, "its depth is its own queue's");
-        let least = rosbridge::Qos {
-            reliability: Some(rosbridge::Reliability::BestEffort),
-            durability: Some(rosbridge::Durability::Volatile),
-            ..rosbridge::Qos::default()
+        assert_eq!(
+            subscription_qos(some_qos(deep), 256),
+            all,
+            "its depth is its own queue's"
+        );
+        let least = rosbridge::QosRequest {
+            reliability: Some(rosbridge::ReliabilityPolicy::BestEffort),
+            durability: Some(rosbridge::DurabilityPolicy::Volatile),
+            ..rosbridge::QosRequest::default()
         };
-        let least = asked(said(least), 256);
-        assert_eq!(least.reliability, Reliability::BestEffort);
-        assert_eq!(least.durability, Durability::Volatile);
+        let least = subscription_qos(some_qos(least), 256);
+        assert_eq!(least.reliability, QosReliability::BestEffort);
+        assert_eq!(least.durability, QosDurability::Volatile);
         assert_eq!(least.depth, 256);
     }
 
@@ -204,21 +211,21 @@ mod tests {
             compression: Compression::None,
             qos,
         };
-        let depth = |depth| rosbridge::Qos {
+        let depth = |depth| rosbridge::QosRequest {
             depth: Some(depth),
-            ..rosbridge::Qos::default()
+            ..rosbridge::QosRequest::default()
         };
-        let all = rosbridge::Qos {
-            history: Some(History::KeepAll),
+        let all = rosbridge::QosRequest {
+            history: Some(HistoryPolicy::KeepAll),
             ..depth(5)
         };
         for (length, qos, expected) in [
             (0, None, 0),
             (3, None, 3),
-            (0, said(depth(5)), 5),
-            (3, said(depth(5)), 3),
-            (0, said(rosbridge::Qos::default()), 0),
-            (0, said(all), usize::MAX),
+            (0, some_qos(depth(5)), 5),
+            (3, some_qos(depth(5)), 3),
+            (0, some_qos(rosbridge::QosRequest::default()), 0),
+            (0, some_qos(all), usize::MAX),
         ] {
             assert_eq!(queue_length(&subscribe(length, qos)), expected);
         }
@@ -227,59 +234,71 @@ mod tests {
     #[test]
     fn latch_and_queue_size_are_other_words_for_it() {
         let of = |qos, latch, size| {
-            let Offer { qos, latch } = offered(RosVersion::One, qos, latch, size);
+            let PublisherOffer { qos, latch } =
+                publication_offer(RosVersion::One, qos, latch, size);
             (qos.durability, qos.depth, latch)
         };
-        let (old, new) = (Durability::TransientLocal, Durability::Volatile);
+        let (old, new) = (QosDurability::TransientLocal, QosDurability::Volatile);
         assert_eq!(of(None, false, None), (new, DEFAULT_QUEUE, false));
         assert_eq!(of(None, true, Some(0)), (old, DEFAULT_QUEUE, true));
         assert_eq!(of(None, true, Some(7)), (old, 7, true));
         assert_eq!(of(None, false, Some(u64::MAX)), (new, MOST_QUEUED, false));
-        let kept = rosbridge::Qos {
-            durability: Some(rosbridge::Durability::TransientLocal),
+        let kept = rosbridge::QosRequest {
+            durability: Some(rosbridge::DurabilityPolicy::TransientLocal),
             depth: Some(1),
-            ..rosbridge::Qos::default()
+            ..rosbridge::QosRequest::default()
         };
-        assert_eq!(of(said(kept), false, Some(7)), (old, 1, true));
-        let fleeting = rosbridge::Qos {
-            history: Some(History::KeepAll),
-            durability: Some(rosbridge::Durability::Volatile),
+        assert_eq!(of(some_qos(kept), false, Some(7)), (old, 1, true));
+        let fleeting = rosbridge::QosRequest {
+            history: Some(HistoryPolicy::KeepAll),
+            durability: Some(rosbridge::DurabilityPolicy::Volatile),
             ..kept
         };
-        assert_eq!(of(said(fleeting), true, None), (new, MOST_QUEUED, false));
-        let best = rosbridge::Qos {
-            durability: Some(rosbridge::Durability::BestAvailable),
+        assert_eq!(
+            of(some_qos(fleeting), true, None),
+            (new, MOST_QUEUED, false)
+        );
+        let best = rosbridge::QosRequest {
+            durability: Some(rosbridge::DurabilityPolicy::BestAvailable),
             ..kept
         };
-        assert_eq!(of(said(best), true, None), (old, 1, true));
-        // In ROS 2 newcomers are given as many as are kept.
-        let two = |latch, size| offered(RosVersion::Two, None, latch, size).qos.depth;
+        assert_eq!(of(some_qos(best), true, None), (old, 1, true));
+        // In ROS 2 new subscribers receive as many messages as are kept.
+        let two = |latch, size| {
+            publication_offer(RosVersion::Two, None, latch, size)
+                .qos
+                .depth
+        };
         assert_eq!((two(true, Some(7)), two(false, Some(7))), (1, 7));
     }
 
     #[test]
     fn what_is_said_of_time_is_offered_in_ros_2_and_told_to_mean_nothing_elsewhere() {
         let long = Duration::from_millis(100);
-        let timed = rosbridge::Qos {
+        let timed = rosbridge::QosRequest {
             deadline: Some(Period::Of(long)),
             lifespan: Some(Period::Infinite),
-            liveliness: Some(rosbridge::Liveliness::ManualByTopic),
-            ..rosbridge::Qos::default()
+            liveliness: Some(rosbridge::LivelinessPolicy::ManualByTopic),
+            ..rosbridge::QosRequest::default()
         };
-        let of = |version| offered(version, said(timed), false, None).qos;
-        assert_eq!(of(RosVersion::One), Qos::keep_last(DEFAULT_QUEUE));
+        let of = |version| publication_offer(version, some_qos(timed), false, None).qos;
+        assert_eq!(of(RosVersion::One), QosProfile::keep_last(DEFAULT_QUEUE));
         let two = of(RosVersion::Two);
         assert_eq!((two.deadline, two.lifespan), (Some(long), None));
-        assert_eq!(two.liveliness, Liveliness::ManualByTopic);
-        assert_eq!(unheard(RosVersion::Two, &timed, false), None);
+        assert_eq!(two.liveliness, QosLiveliness::ManualByTopic);
+        assert_eq!(ignored_policies(RosVersion::Two, &timed, false), None);
         assert_eq!(
-            unheard(RosVersion::One, &timed, false).unwrap(),
-            "\"qos.deadline\", \"qos.lifespan\", \"qos.liveliness\" left out: this servant speaks ROS 1, which has no such policies"
+            ignored_policies(RosVersion::One, &timed, false).unwrap(),
+            "\"qos.deadline\", \"qos.lifespan\", \"qos.liveliness\" ignored: this servant speaks ROS 1, which has no \
+             such policies"
         );
-        let told = unheard(RosVersion::Two, &timed, true).unwrap();
-        assert!(told.ends_with("publishers are heard whatever they offer of that"));
-        let silent = rosbridge::Qos::default();
-        assert_eq!(unheard(RosVersion::One, &silent, true), None);
-        assert_eq!(asked(said(timed), 256), all_there_is(256));
+        let told = ignored_policies(RosVersion::Two, &timed, true).unwrap();
+        assert!(told.ends_with("subscriptions here accept whatever publishers offer there"));
+        let silent = rosbridge::QosRequest::default();
+        assert_eq!(ignored_policies(RosVersion::One, &silent, true), None);
+        assert_eq!(
+            subscription_qos(some_qos(timed), 256),
+            default_subscription_qos(256)
+        );
     }
 }

@@ -1,20 +1,22 @@
-//! Ends of a topic with which no messages pass, because both ask for different things: each is told once.
+//! Endpoints of a topic that exchange no messages because their quality of service is incompatible: each is reported
+//! once.
 
-use ros::bus::{Matched, PeerId};
+use ros::bus::{MatchedPeers, PeerId};
 
-/// Ends told of at most; who makes more of them is told of these.
+/// Maximum number of endpoints reported.
 const MOST: usize = 64;
 
-/// What is known of one topic's ends.
+/// Incompatible endpoints of one topic.
 #[derive(Debug, Default)]
 pub(crate) struct Refusals {
-    /// Each with what its client is told.
+    /// The endpoints, with the message for the client.
     known: Vec<(PeerId, String)>,
 }
 
 impl Refusals {
-    /// Those that are new. Ends that have left, or match by now, are told again should they come back.
-    pub(crate) fn update(&mut self, matched: &Matched) -> Vec<String> {
+    /// Returns the messages for new endpoints. Endpoints that have left, or match by now, are reported again if they
+    /// come back.
+    pub(crate) fn update(&mut self, matched: &MatchedPeers) -> Vec<String> {
         let refused = &matched.refused;
         self.known
             .retain(|(peer, _)| refused.iter().any(|refusal| refusal.peer == *peer));
@@ -25,7 +27,7 @@ impl Refusals {
                 continue;
             }
             let told = format!(
-                "nothing passes between {} and this client: {}",
+                "no messages pass between {} and this client: {}",
                 refusal.peer, refusal.why
             );
             self.known.push((refusal.peer.clone(), told.clone()));
@@ -34,27 +36,27 @@ impl Refusals {
         new
     }
 
-    /// All there are.
-    pub(crate) fn known(&self) -> impl Iterator<Item = &str> {
+    /// Iterates over the messages of all current endpoints.
+    pub(crate) fn reasons(&self) -> impl Iterator<Item = &str> {
         self.known.iter().map(|(_, told)| told.as_str())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::Refusal;
+    use ros::bus::IncompatiblePeer;
 
     use super::*;
 
-    fn refused(peers: &[(&str, u128)]) -> Matched {
-        let refused = peers.iter().map(|(node, number)| Refusal {
+    fn refused_by(peers: &[(&str, u128)]) -> MatchedPeers {
+        let refused = peers.iter().map(|(node, number)| IncompatiblePeer {
             peer: PeerId::new(*node, *number),
             why: "reliability: the publisher offers best_effort, the subscriber asks for reliable"
                 .to_owned(),
         });
-        Matched {
+        MatchedPeers {
             refused: refused.collect(),
-            ..Matched::default()
+            ..MatchedPeers::default()
         }
     }
 
@@ -62,29 +64,30 @@ mod tests {
     fn each_end_is_told_once_while_it_is_there() {
         let mut refusals = Refusals::default();
         assert_eq!(
-            refusals.update(&refused(&[("/camera", 1)])),
+            refusals.update(&refused_by(&[("/camera", 1)])),
             [
-                "nothing passes between /camera and this client: reliability: the publisher offers best_effort, the subscriber asks for reliable"
+                "no messages pass between /camera and this client: reliability: the publisher offers best_effort, the \
+                    subscriber asks for reliable"
             ]
         );
-        assert_eq!(refusals.update(&refused(&[("/camera", 1)])).len(), 0);
+        assert_eq!(refusals.update(&refused_by(&[("/camera", 1)])).len(), 0);
         assert_eq!(
             refusals
-                .update(&refused(&[("/camera", 1), ("/camera", 2)]))
+                .update(&refused_by(&[("/camera", 1), ("/camera", 2)]))
                 .len(),
             1
         );
-        assert_eq!(refusals.known().count(), 2);
-        assert_eq!(refusals.update(&Matched::default()).len(), 0);
-        assert_eq!(refusals.known().count(), 0);
-        assert_eq!(refusals.update(&refused(&[("/camera", 1)])).len(), 1);
+        assert_eq!(refusals.reasons().count(), 2);
+        assert_eq!(refusals.update(&MatchedPeers::default()).len(), 0);
+        assert_eq!(refusals.reasons().count(), 0);
+        assert_eq!(refusals.update(&refused_by(&[("/camera", 1)])).len(), 1);
     }
 
     #[test]
     fn ends_without_number_are_not_told_without_number() {
         let many: Vec<_> = (0..1000).map(|number| ("/hostile", number)).collect();
         let mut refusals = Refusals::default();
-        assert_eq!(refusals.update(&refused(&many)).len(), MOST);
-        assert_eq!(refusals.update(&refused(&many)).len(), 0);
+        assert_eq!(refusals.update(&refused_by(&many)).len(), MOST);
+        assert_eq!(refusals.update(&refused_by(&many)).len(), 0);
     }
 }

@@ -1,5 +1,5 @@
-//! One registration of a service at a time: a client that advertises anew replaces its earlier handler, and the bus
-//! must have let go of the old one before it takes the new one.
+//! Serializes registrations of a service: a client that advertises anew replaces its earlier handler, and the bus must
+//! have released the old one before it takes the new one.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 use tokio::sync::OwnedMutexGuard;
 
-/// By service.
+/// Locks by service.
 #[derive(Default)]
 pub(crate) struct Registrations {
     held: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
@@ -15,7 +15,7 @@ pub(crate) struct Registrations {
 
 impl Registrations {
     /// Waits until nobody else registers or holds this name.
-    pub(crate) async fn enter(&self, name: &str) -> OwnedMutexGuard<()> {
+    pub(crate) async fn acquire(&self, name: &str) -> OwnedMutexGuard<()> {
         let lock = {
             let mut held = self.held.lock();
             held.retain(|_, lock| Arc::strong_count(lock) > 1);

@@ -1,5 +1,5 @@
-//! rosapi: what clients ask about the ROS system they are connected to. In rosbridge_suite a node serves these
-//! services; here the bridge answers them itself, from the servant's graph, parameters and definitions.
+//! rosapi: services on the ROS system that a client is connected to. In rosbridge_suite a node serves them; here the
+//! bridge answers them itself, from the servant's graph, parameters and definitions.
 
 mod definitions;
 mod graph;
@@ -20,15 +20,15 @@ use serde_json::{Value, json};
 
 use crate::clock;
 use crate::own::{Caller, OwnService};
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 use typedefs::Definitions;
 
-/// The node that seems to serve these services.
+/// Node that appears to serve these services.
 const NODE: &str = "/rosapi";
 
 /// One of rosapi's services.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Service {
+pub(crate) struct RosapiService {
     name: &'static str,
     srv: &'static str,
 }
@@ -46,46 +46,46 @@ struct Args {
     name: String,
     value: String,
     default: String,
-    /// ROS 2's name for it.
+    /// Name of the field `default` in ROS 2.
     default_value: String,
 }
 
-impl Service {
-    /// The service of that (absolute) name.
-    pub(crate) fn find(name: &str) -> Option<Service> {
+impl RosapiService {
+    /// Finds the service with this absolute name.
+    pub(crate) fn find(name: &str) -> Option<RosapiService> {
         let name = name.strip_prefix("/rosapi/")?;
         definitions::SERVICES
             .iter()
             .find(|(known, _)| *known == name)
-            .map(|(name, srv)| Service { name, srv })
+            .map(|(name, srv)| RosapiService { name, srv })
     }
 
-    /// Every service of rosapi.
-    pub(crate) fn all() -> impl Iterator<Item = Service> {
+    /// Iterates over all services of rosapi.
+    pub(crate) fn all() -> impl Iterator<Item = RosapiService> {
         definitions::SERVICES
             .iter()
-            .map(|(name, srv)| Service { name, srv })
+            .map(|(name, srv)| RosapiService { name, srv })
     }
 
-    /// `/rosapi/…`.
+    /// Returns the absolute name, `/rosapi/…`.
     pub(crate) fn full_name(self) -> String {
         format!("{NODE}/{}", self.name)
     }
 
-    /// `rosapi/…`, in ROS 2 `rosapi_msgs/srv/…`.
+    /// Returns the type, `rosapi/…`, in ROS 2 `rosapi_msgs/srv/…`.
     pub(crate) fn type_name(self, version: RosVersion) -> String {
         definitions::type_name(version, self.srv)
     }
 
-    async fn values(
+    async fn call(
         self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &Args,
         caller: &Caller<'_>,
     ) -> Result<Value, String> {
         let (version, grants) = (shared.bus.version(), caller.grants);
         let now = graph::with_own_topics(version, &shared.bus.graph().borrow());
-        let now = graph::shown(now, grants);
+        let now = graph::filter_by_grants(now, grants);
         let definitions = Definitions {
             version,
             registry: &shared.registry,
@@ -111,16 +111,16 @@ impl Service {
             "message_details" => definitions.message(&args.type_name)?,
             "service_request_details" => definitions.request(&args.type_name)?,
             "service_response_details" => definitions.response(&args.type_name)?,
-            "action_goal_details" => definitions.of_action(&args.type_name, |of| &of.goal)?,
-            "action_result_details" => definitions.of_action(&args.type_name, |of| &of.result)?,
+            "action_goal_details" => definitions.action_part(&args.type_name, |of| &of.goal)?,
+            "action_result_details" => definitions.action_part(&args.type_name, |of| &of.result)?,
             "action_feedback_details" => {
-                definitions.of_action(&args.type_name, |of| &of.feedback)?
+                definitions.action_part(&args.type_name, |of| &of.feedback)?
             }
             name if name.contains("param") => match version {
                 RosVersion::One => self.shared_param(shared, args, caller.budget).await?,
                 RosVersion::Two => self.node_param(shared, args, caller.budget).await?,
             },
-            "get_time" => time(version, clock::now(shared).await),
+            "get_time" => time_json(version, clock::now(shared).await),
             "get_ros_version" => json!({
                 "version": version.number(),
                 "distro": shared.bus.distribution().await,
@@ -129,10 +129,10 @@ impl Service {
         })
     }
 
-    /// About parameters that all nodes share.
+    /// Answers services on parameters shared by all nodes.
     async fn shared_param(
         self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &Args,
         budget: &Budget,
     ) -> Result<Value, String> {
@@ -146,10 +146,10 @@ impl Service {
         }
     }
 
-    /// About parameters that belong to nodes.
+    /// Answers services on parameters of individual nodes.
     async fn node_param(
         self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &Args,
         budget: &Budget,
     ) -> Result<Value, String> {
@@ -157,7 +157,7 @@ impl Service {
             "get_param" => node_params::get(shared, args).await,
             "set_param" => node_params::set(shared, args, budget).await,
             "has_param" => node_params::has(shared, args).await,
-            // Nodes have nobody above them of whom to inherit one.
+            // Nodes have no parents to inherit a parameter from.
             "search_param" => params::search(shared, args).await,
             "delete_param" => node_params::delete(shared, args).await,
             _ => node_params::names(shared).await,
@@ -166,19 +166,19 @@ impl Service {
 }
 
 #[async_trait]
-impl OwnService for Service {
+impl OwnService for RosapiService {
     fn is_filtered(&self) -> bool {
         !self.name.contains("param")
     }
 
-    fn shows_graph(&self) -> bool {
+    fn reads_graph(&self) -> bool {
         !matches!(self.name, "get_time" | "get_ros_version" | "interfaces")
             && !self.name.contains("param")
             && !self.name.ends_with("_details")
             || self.name == "node_details"
     }
 
-    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String> {
+    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, String> {
         let version = shared.bus.version();
         definitions::registry(version)
             .service(&self.type_name(version))
@@ -187,18 +187,18 @@ impl OwnService for Service {
 
     async fn answer(
         &self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &[u8],
         caller: &Caller<'_>,
     ) -> Result<Vec<u8>, String> {
         let args: Args = serde_json::from_slice(args).map_err(|error| format!("args: {error}"))?;
-        let values = self.values(shared, &args, caller).await?;
+        let values = self.call(shared, &args, caller).await?;
         Ok(values.to_string().into_bytes())
     }
 }
 
-/// A type's definition in the servant's registry, or among rosapi's own.
-fn with_own<T, E>(
+/// Finds a type in the servant's registry, or among rosapi's own.
+fn find_with_own<T, E>(
     version: RosVersion,
     registry: &Registry,
     find: impl Fn(&Registry) -> Result<T, E>,
@@ -206,15 +206,15 @@ fn with_own<T, E>(
     find(registry).or_else(|error| find(definitions::registry(version)).map_err(|_| error))
 }
 
-/// Every definition that is known.
+/// Returns the names of all known definitions.
 fn interfaces(version: RosVersion, registry: &Registry) -> Value {
     let own = definitions::registry(version).keys();
     let all: BTreeSet<String> = registry.keys().into_iter().chain(own).collect();
     json!({ "interfaces": all })
 }
 
-/// A time as the ROS writes it. Of ROS 2's there are also the names that it has in ROS 1: roslibpy reads those alone.
-fn time(version: RosVersion, Time { secs, nsecs }: Time) -> Value {
+/// Formats a time as in ROS. For ROS 2 the names of ROS 1 are included, since roslibpy only reads those.
+fn time_json(version: RosVersion, Time { secs, nsecs }: Time) -> Value {
     let time = match version {
         RosVersion::One => json!({ "secs": secs, "nsecs": nsecs }),
         RosVersion::Two => json!({ "sec": secs, "nanosec": nsecs, "secs": secs, "nsecs": nsecs }),

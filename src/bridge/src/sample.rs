@@ -1,5 +1,5 @@
-//! One message from ROS on its way to any number of clients: decoded once per encoding while it is one of its topic's
-//! latest, when first needed.
+//! One message from ROS on its way to any number of clients: encoded once per encoding, when first needed, for as long
+//! as it is among the latest messages of its topic.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -17,25 +17,25 @@ use crate::names::digest_word;
 use crate::{BridgeOptions, Metrics};
 use ws::frame::{BINARY, TEXT};
 
-/// A message becomes at most about so many times longer (an array of booleans does), and what it always has besides.
+/// Upper bound of the growth of a message by its encoding (as for an array of booleans), and of its constant part.
 const LONGEST: usize = 8;
 const SHORT: usize = 4 * 1024;
-/// Encodings that a topic keeps, and their bytes. A client that is so far behind that it wants an older one has it encoded
-/// again: what waits for it is the message from ROS alone.
+/// Number of encodings kept per topic, and their bytes. For a client so far behind that it needs an older one, the
+/// message is encoded again: only the message from ROS waits in its queue.
 const WARM: (usize, usize) = (256, 16 << 20);
 
-/// A whole WebSocket message, ready to be sent to anyone.
+/// A whole WebSocket message, which can be sent to any client.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Frame {
+pub(crate) struct EncodedFrame {
     pub(crate) format: Format,
-    /// Above [`UNCOUNTED`] they hold their permit.
+    /// The bytes; above [`UNCOUNTED`] they hold their permit.
     pub(crate) bytes: Bytes,
 }
 
-impl Frame {
-    /// A frame of what was printed, which counts nowhere yet.
+impl EncodedFrame {
+    /// Creates a frame of printed data, which is not counted yet.
     pub(crate) fn new(format: Format, mut printed: Vec<u8>) -> Self {
-        // What is counted is its length.
+        // Its length is counted, not its capacity.
         if printed.capacity() > UNCOUNTED {
             printed.shrink_to_fit();
         }
@@ -45,16 +45,16 @@ impl Frame {
         }
     }
 
-    /// Whether it counts by itself.
+    /// Returns whether it counts by itself.
     pub(crate) fn is_big(&self) -> bool {
         self.bytes.len() > UNCOUNTED
     }
 
-    /// The same, holding `permit`.
-    pub(crate) fn holding(self, permit: Option<Permit>) -> Self {
+    /// Attaches `permit` to the bytes.
+    pub(crate) fn with_permit(self, permit: Option<Permit>) -> Self {
         match permit {
             Some(permit) => Self {
-                bytes: permit.around(self.bytes),
+                bytes: permit.wrap_bytes(self.bytes),
                 ..self
             },
             None => self,
@@ -68,8 +68,9 @@ impl Frame {
         }
     }
 
-    /// JSON text wrapped as the pixels of a picture; in ASCII, since browsers take each byte of it for a character.
-    pub(crate) fn into_png(self) -> Result<Frame, String> {
+    /// Encodes JSON text as the pixels of a PNG image; in ASCII, since browsers interpret each byte of it as a
+    /// character.
+    pub(crate) fn into_png(self) -> Result<EncodedFrame, String> {
         let failed = |error: &dyn std::fmt::Display| format!("cannot be packed as png: {error}");
         let text = std::str::from_utf8(&self.bytes).map_err(|error| failed(&error))?;
         let ascii = rosbridge::to_ascii(text);
@@ -81,23 +82,23 @@ impl Frame {
             part: None,
         })
         .print(&mut out, Format::Json);
-        Ok(Frame::new(Format::Json, out))
+        Ok(EncodedFrame::new(Format::Json, out))
     }
 }
 
-/// What publishers of one topic announced, and the types found for it.
+/// Types announced by publishers of one topic, and the definitions found for them.
 pub(crate) struct TopicTypes {
     registry: Arc<Registry>,
     found: Mutex<Vec<(Arc<WireType>, FoundType)>>,
     /// Length of the last encoding of each kind, as a hint for the next.
     sizes: [AtomicUsize; 3],
-    warm: Mutex<Warm>,
+    warm: Mutex<RecentEncodings>,
 }
 
 /// Messages whose encodings are kept, oldest first.
 #[derive(Default)]
-struct Warm {
-    samples: VecDeque<(Weak<Sample>, usize)>,
+struct RecentEncodings {
+    samples: VecDeque<(Weak<TopicSample>, usize)>,
     bytes: usize,
 }
 
@@ -113,8 +114,8 @@ impl TopicTypes {
         }
     }
 
-    /// Keeps an encoding of `bytes` bytes of this message, and older ones no longer.
-    fn keep_warm(&self, sample: &Arc<Sample>, bytes: usize) {
+    /// Keeps an encoding of `bytes` bytes of this message, and drops older ones.
+    fn cache(&self, sample: &Arc<TopicSample>, bytes: usize) {
         let mut cold = Vec::new();
         {
             let mut warm = self.warm.lock();
@@ -128,13 +129,13 @@ impl TopicTypes {
                 cold.push(oldest);
             }
         }
-        // Not under the lock: one of them may be being encoded.
+        // Not under the lock, since one of them may be in the process of being encoded.
         for sample in cold.iter().filter_map(Weak::upgrade) {
             *sample.encoded.lock() = Encodings::Cold;
         }
     }
 
-    /// The type that messages announced so have.
+    /// Returns the definition of messages announced with this type.
     pub(crate) fn find(&self, wire_type: &Arc<WireType>) -> FoundType {
         let mut found = self.found.lock();
         let same = |known: &Arc<WireType>| Arc::ptr_eq(known, wire_type) || known == wire_type;
@@ -151,9 +152,9 @@ impl TopicTypes {
     }
 }
 
-/// The registry's type where its digest agrees, else one made from the definition that the publisher sent.
+/// Finds the registry's type if its digest matches, otherwise builds one from the definition sent by the publisher.
 fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, String> {
-    let agrees = |found: &MessageType| wire.digest.agrees(&found.digest().into());
+    let agrees = |found: &MessageType| wire.digest.is_compatible_with(&found.digest().into());
     let word = digest_word(wire.format.version());
     let ours = match registry.message(&wire.name) {
         Ok(found) if agrees(&found) => return Ok(found),
@@ -190,39 +191,39 @@ fn find_type(registry: &Registry, wire: &WireType) -> Result<Arc<MessageType>, S
 }
 
 /// A message and its encodings so far.
-pub(crate) struct Sample {
+pub(crate) struct TopicSample {
     pub(crate) bytes: Bytes,
     pub(crate) wire_type: Arc<WireType>,
     pub(crate) publisher: PeerId,
     pub(crate) latching: bool,
-    /// From a client of this bridge rather than from a node.
+    /// True if it comes from a client of this bridge rather than from a node.
     pub(crate) local: bool,
     pub(crate) received: Time,
     types: Arc<TopicTypes>,
     encoded: Mutex<Encodings>,
-    /// For its bytes.
+    /// Permit for its bytes.
     _permit: Option<Permit>,
 }
 
 enum Encodings {
-    Warm(Vec<Encoded>),
-    /// None is kept any more.
+    Warm(Vec<CachedEncoding>),
+    /// Encodings are no longer kept.
     Cold,
 }
 
-struct Encoded {
+struct CachedEncoding {
     compression: Compression,
     topic: Arc<str>,
-    frame: Result<Frame, Arc<str>>,
-    /// In the servant's budget alone; the frame holds the one above.
+    frame: Result<EncodedFrame, Arc<str>>,
+    /// Permit in the servant's budget alone; the frame holds the one of its ancestors.
     _permit: Permit,
 }
 
-impl Sample {
-    /// A sample whose bytes count in the budgets above the servant's while it waits for clients: a slow one of those must not
-    /// use up what the servant has for the others.
+impl TopicSample {
+    /// Creates a sample whose bytes count only in the ancestors of the servant's budget while it waits for clients: a
+    /// slow client must not use up the servant's budget for the others.
     pub(crate) fn new(
-        message: ros::bus::Message,
+        message: ros::bus::SerializedMessage,
         local: bool,
         types: Arc<TopicTypes>,
         options: &BridgeOptions,
@@ -246,30 +247,31 @@ impl Sample {
         })
     }
 
-    /// The type of its bytes; the reason where that cannot be known.
+    /// Returns the definition of its bytes, or the reason why it is unknown.
     pub(crate) fn schema(&self) -> Result<Arc<MessageType>, Arc<str>> {
         self.types.find(&self.wire_type)
     }
 
-    /// Its bytes, where they have a permit of their own.
-    pub(crate) fn big(&self) -> usize {
+    /// Returns its bytes if they have a permit of their own, otherwise 0.
+    pub(crate) fn counted_bytes(&self) -> usize {
         match self.bytes.len() {
             0..=UNCOUNTED => 0,
             bytes => bytes,
         }
     }
 
-    /// The `publish` frame for clients that call the topic `topic`; the reason where it cannot be made.
+    /// Returns the `publish` frame for clients that use the topic name `topic`, or the reason why it cannot be encoded.
     pub(crate) fn frame(
         self: &Arc<Self>,
         compression: Compression,
         topic: &Arc<str>,
         options: &BridgeOptions,
         metrics: &Metrics,
-    ) -> Result<Frame, Arc<str>> {
-        // Held while encoding: a second subscriber waits for the first one's result instead of making its own.
+    ) -> Result<EncodedFrame, Arc<str>> {
+        // Held while encoding, so that a second subscriber waits for the first one's result instead of encoding again.
         let mut encoded = self.encoded.lock();
-        let same = |other: &&Encoded| other.compression == compression && other.topic == *topic;
+        let same =
+            |other: &&CachedEncoding| other.compression == compression && other.topic == *topic;
         if let Encodings::Warm(known) = &*encoded
             && let Some(known) = known.iter().find(same)
         {
@@ -279,14 +281,17 @@ impl Sample {
         let mut permit = options.budget.permit();
         let made = self.encode(compression, topic, options, &mut permit);
         let (own, above) = permit.split();
-        let frame = made.map(|frame| match frame.is_big() {
-            true => frame.holding(above),
-            false => frame,
+        let frame = made.map(|frame| {
+            if frame.is_big() {
+                frame.with_permit(above)
+            } else {
+                frame
+            }
         });
         let Encodings::Warm(known) = &mut *encoded else {
             return frame;
         };
-        known.push(Encoded {
+        known.push(CachedEncoding {
             compression,
             topic: topic.clone(),
             frame: frame.clone(),
@@ -294,7 +299,7 @@ impl Sample {
         });
         drop(encoded);
         let bytes = frame.as_ref().map_or(0, |frame| frame.bytes.len());
-        self.types.keep_warm(self, bytes);
+        self.types.cache(self, bytes);
         frame
     }
 
@@ -304,7 +309,7 @@ impl Sample {
         topic: &str,
         options: &BridgeOptions,
         permit: &mut Permit,
-    ) -> Result<Frame, Arc<str>> {
+    ) -> Result<EncodedFrame, Arc<str>> {
         let slot = match compression {
             Compression::None | Compression::Png => 0,
             Compression::Cbor => 1,
@@ -312,11 +317,11 @@ impl Sample {
         };
         let length = self.bytes.len();
         let last = self.types.sizes[slot].load(Ordering::Relaxed);
-        // The last one may have been of quite another size.
+        // The last one may have had a very different size.
         let hint = last.min(LONGEST * length + SHORT).max(length) + 128;
         let full = |full: budget::Exceeded| {
             Arc::<str>::from(format!(
-                "a message from {} is left out: {full}",
+                "a message from {} was dropped: {full}",
                 self.publisher
             ))
         };
@@ -324,7 +329,7 @@ impl Sample {
             permit.resize(hint).map_err(full)?;
         }
         let max_bytes = options.max_encoded;
-        let left = permit.bytes().saturating_add(options.budget.left());
+        let left = permit.bytes().saturating_add(options.budget.available());
         let max_bytes = max_bytes.min(left.max(UNCOUNTED));
         let mut out = Vec::with_capacity(hint);
         let failed = |error: codec::CodecError| {
@@ -367,7 +372,7 @@ impl Sample {
         } else {
             Format::Cbor
         };
-        let mut frame = Frame::new(format, out);
+        let mut frame = EncodedFrame::new(format, out);
         if compression == Compression::Png {
             frame = frame.into_png().map_err(Arc::from)?;
         }

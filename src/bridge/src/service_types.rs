@@ -1,26 +1,26 @@
-//! Which type each service of the servant has: asked once per server.
+//! The type of each service of the servant: queried once per server.
 
 use std::collections::HashMap;
 
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError, Graph, ServiceType};
 
-/// Answers kept, by service; valid while the same node serves it at the same address.
+/// Cached answers, by service; valid while the same node serves it at the same address.
 #[derive(Default)]
 pub(crate) struct ServiceTypes {
-    known: Mutex<HashMap<String, (Server, ServiceType)>>,
+    known: Mutex<HashMap<String, (ServiceServer, ServiceType)>>,
 }
 
 #[derive(Clone, PartialEq)]
-struct Server {
+struct ServiceServer {
     node: String,
     address: Option<String>,
 }
 
 impl ServiceTypes {
-    /// The type that the service's server announces.
+    /// Returns the type that the service's server announces.
     pub(crate) async fn find(&self, bus: &dyn Bus, service: &str) -> Result<ServiceType, BusError> {
-        let server = server_of(&bus.graph().borrow(), service);
+        let server = find_server(&bus.graph().borrow(), service);
         if let Some(server) = &server
             && let Some((asked, found)) = self.known.lock().get(service)
             && asked == server
@@ -30,7 +30,7 @@ impl ServiceTypes {
         let found = bus.service_type(service).await?;
         if let Some(server) = server {
             let mut known = self.known.lock();
-            // Bounded even where services come and go by the thousand.
+            // Bounded even if thousands of services come and go.
             if known.len() >= 4096 {
                 known.clear();
             }
@@ -40,8 +40,8 @@ impl ServiceTypes {
     }
 }
 
-fn server_of(graph: &Graph, service: &str) -> Option<Server> {
+fn find_server(graph: &Graph, service: &str) -> Option<ServiceServer> {
     let node = graph.services.get(service)?.clone();
     let address = graph.nodes.get(&node).cloned();
-    Some(Server { node, address })
+    Some(ServiceServer { node, address })
 }

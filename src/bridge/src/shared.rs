@@ -1,20 +1,20 @@
-//! What a bridge's sessions, topics and services have in common.
+//! State shared by a bridge's sessions, topics and services.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::{Bus, Message, PeerId, Qos, RosVersion};
+use ros::bus::{Bus, PeerId, QosProfile, RosVersion, SerializedMessage};
 use ros::schema::{MessageType, Registry};
-use ros::sizes::Inputs;
+use ros::sizes::InputSizes;
 use tokio::sync::watch;
 
 use crate::bridge::SessionCount;
-use crate::client::Client;
+use crate::client::BridgeClient;
 use crate::fanout::Fanout;
 use crate::presence::{self, Presence};
-use crate::quality::all_there_is;
+use crate::quality::default_subscription_qos;
 use crate::registrations::Registrations;
 use crate::service_types::ServiceTypes;
 use crate::tf::{self, Republisher};
@@ -22,8 +22,8 @@ use crate::topic_publisher::TopicPublisher;
 use crate::topic_requests::TopicRequests;
 use crate::{BridgeOptions, Metrics, SessionOptions};
 
-/// What the bridge's parts need of it.
-pub(crate) struct Shared {
+/// Shared state of a bridge.
+pub(crate) struct BridgeShared {
     pub(crate) bus: Arc<dyn Bus>,
     pub(crate) registry: Arc<Registry>,
     pub(crate) options: BridgeOptions,
@@ -32,63 +32,64 @@ pub(crate) struct Shared {
     pub(crate) registrations: Registrations,
     pub(crate) presence: Presence,
     pub(crate) republisher: Republisher,
-    /// How large what clients send to nodes is.
-    pub(crate) inputs: Inputs,
+    /// Sizes of the messages from clients to nodes.
+    pub(crate) inputs: InputSizes,
     /// Requests that are made by topic.
     requests: Option<Arc<TopicRequests>>,
-    fanouts: Mutex<HashMap<String, Vec<Known>>>,
-    /// Topics of nodes that somebody listens to.
+    fanouts: Mutex<HashMap<String, Vec<KnownFanout>>>,
+    /// Number of topics of nodes with listeners.
     heard: Arc<AtomicUsize>,
-    /// What clients publish on, by topic.
+    /// Clients' publishers, by topic.
     topic_publishers: Mutex<HashMap<String, Vec<Weak<TopicPublisher>>>>,
-    clients: Mutex<Clients>,
+    clients: Mutex<ClientRegistry>,
     pub(crate) sessions: watch::Sender<SessionCount>,
     numbers: AtomicU64,
 }
 
 /// One of the fanouts of a topic.
-struct Known {
-    /// What it asks of the topic's publishers; none of a topic of the bridge itself, which is the same for all.
-    qos: Option<Qos>,
-    /// The type whose publishers it hears; none where it hears those of all, as in ROS 1.
+struct KnownFanout {
+    /// Quality of service requested from publishers; `None` for topics of the bridge itself, which are the same for
+    /// all.
+    qos: Option<QosProfile>,
+    /// Type of the publishers it receives from; `None` for any type, as in ROS 1.
     type_name: Option<String>,
     fanout: Weak<Fanout>,
 }
 
-impl Known {
-    fn serves(&self, qos: Qos, type_name: Option<&str>) -> bool {
+impl KnownFanout {
+    fn serves(&self, qos: QosProfile, type_name: Option<&str>) -> bool {
         let hears = |(own, asked): (&str, &str)| own == asked;
         self.qos.is_none_or(|own| own == qos)
             && self.type_name.as_deref().zip(type_name).is_none_or(hears)
     }
 }
 
-/// Counts a topic of the nodes that is listened to.
-pub(crate) struct Heard(Arc<AtomicUsize>);
+/// Counts a topic of nodes that has listeners.
+pub(crate) struct NodeTopicGuard(Arc<AtomicUsize>);
 
-impl Drop for Heard {
+impl Drop for NodeTopicGuard {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
 #[derive(Default)]
-struct Clients {
-    all: Vec<Weak<Client>>,
+struct ClientRegistry {
+    all: Vec<Weak<BridgeClient>>,
     /// Clients that can be resumed, by token.
-    resumable: HashMap<String, Arc<Client>>,
+    resumable: HashMap<String, Arc<BridgeClient>>,
     closed: Option<String>,
 }
 
-impl Shared {
+impl BridgeShared {
     pub(crate) fn new(
         bus: Arc<dyn Bus>,
         registry: Arc<Registry>,
         options: BridgeOptions,
     ) -> Arc<Self> {
-        presence::define(bus.version(), &registry);
-        tf::define(bus.version(), &registry);
-        let requests = options.pair.as_ref().map(TopicRequests::of);
+        presence::define_types(bus.version(), &registry);
+        tf::define_types(bus.version(), &registry);
+        let requests = options.pair.as_ref().map(TopicRequests::for_pair);
         Arc::new(Self {
             bus,
             registry,
@@ -98,7 +99,7 @@ impl Shared {
             registrations: Registrations::default(),
             presence: Presence::default(),
             republisher: Republisher::default(),
-            inputs: Inputs::default(),
+            inputs: InputSizes::default(),
             requests: requests.map(Arc::new),
             fanouts: Mutex::default(),
             heard: Arc::default(),
@@ -109,8 +110,8 @@ impl Shared {
         })
     }
 
-    /// Refuses clients from now on; gives those there are.
-    pub(crate) fn close(&self, reason: &str) -> Vec<Arc<Client>> {
+    /// Refuses clients from now on; returns the existing ones.
+    pub(crate) fn close(&self, reason: &str) -> Vec<Arc<BridgeClient>> {
         let mut clients = self.clients.lock();
         clients.closed.get_or_insert_with(|| reason.to_owned());
         clients.resumable.clear();
@@ -121,16 +122,16 @@ impl Shared {
             .collect()
     }
 
-    pub(crate) fn clients(&self) -> Vec<Arc<Client>> {
+    pub(crate) fn clients(&self) -> Vec<Arc<BridgeClient>> {
         let clients = self.clients.lock();
         clients.all.iter().filter_map(Weak::upgrade).collect()
     }
 
-    /// The client that a connection belongs to: the one it was before, or a new one.
+    /// Returns the client of a connection: a resumed one, or a new one.
     pub(crate) fn client_for(
         self: &Arc<Self>,
         options: &SessionOptions,
-    ) -> Result<Arc<Client>, String> {
+    ) -> Result<Arc<BridgeClient>, String> {
         let mut clients = self.clients.lock();
         if let Some(reason) = &clients.closed {
             return Err(reason.clone());
@@ -139,10 +140,10 @@ impl Shared {
             && let Some(client) = clients.resumable.get(token)
         {
             self.metrics.resumed.add(1);
-            client.grant(options.granted.clone());
+            client.set_grants(options.granted.clone());
             return Ok(client.clone());
         }
-        let client = Client::new(self.clone(), options);
+        let client = BridgeClient::new(self.clone(), options);
         clients.all.retain(|other| other.strong_count() > 0);
         clients.all.push(Arc::downgrade(&client));
         if let Some(token) = &options.resume {
@@ -151,7 +152,7 @@ impl Shared {
         Ok(client)
     }
 
-    pub(crate) fn forget_client(&self, client: &Arc<Client>, token: &str) {
+    pub(crate) fn forget_client(&self, client: &Arc<BridgeClient>, token: &str) {
         let mut clients = self.clients.lock();
         if clients
             .resumable
@@ -164,23 +165,27 @@ impl Shared {
         client.end();
     }
 
-    /// The topic's fanout for who takes all there is; begun if it is not there.
+    /// Returns the topic's fanout with the default quality of service; starts it if necessary.
     pub(crate) fn fanout(
         self: &Arc<Self>,
         topic: &str,
         message_type: Option<&MessageType>,
     ) -> Arc<Fanout> {
-        self.fanout_of(topic, message_type, all_there_is(self.options.bus_queue))
+        self.fanout_with_qos(
+            topic,
+            message_type,
+            default_subscription_qos(self.options.bus_queue),
+        )
     }
 
-    /// The same for who asks this of its publishers.
-    pub(crate) fn fanout_of(
+    /// Returns the topic's fanout with this quality of service; starts it if necessary.
+    pub(crate) fn fanout_with_qos(
         self: &Arc<Self>,
         topic: &str,
         message_type: Option<&MessageType>,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Arc<Fanout> {
-        // In ROS 2 ends of different types do not meet.
+        // In ROS 2 endpoints of different types do not match.
         let type_name = message_type.filter(|found| found.version() == RosVersion::Two);
         let type_name = type_name.map(MessageType::name);
         let mut fanouts = self.fanouts.lock();
@@ -189,7 +194,7 @@ impl Shared {
         if let Some(fanout) = known.and_then(|known| known.fanout.upgrade()) {
             return fanout;
         }
-        let (fanout, asked) = match self.own_topic(topic) {
+        let (fanout, asked) = match self.own_topic_type(topic) {
             Some(own) => {
                 let fanout = Fanout::internal(self, topic);
                 if presence::type_name(self.bus.version(), topic).is_some() {
@@ -202,24 +207,24 @@ impl Shared {
         let topic_publishers = self.publishers_of(topic);
         let latched = topic_publishers
             .iter()
-            .filter_map(|topic_publisher| topic_publisher.latched());
-        for message in latched.filter(|_| fanout.keeps()) {
+            .filter_map(|topic_publisher| topic_publisher.latched_message());
+        for message in latched.filter(|_| fanout.keeps_latched()) {
             fanout.deliver(message, true);
         }
         let of_topic = fanouts.entry(topic.to_owned()).or_default();
         of_topic.retain(|known| known.fanout.strong_count() > 0);
-        of_topic.push(Known {
+        of_topic.push(KnownFanout {
             type_name: type_name.filter(|_| asked.is_some()).map(str::to_owned),
             qos: asked,
             fanout: Arc::downgrade(&fanout),
         });
-        // The last owner of an topic_publisher must not drop it under the lock.
+        // The last owner of a topic_publisher must not drop it under the lock.
         drop(fanouts);
         fanout
     }
 
-    /// The type of a topic that the bridge itself publishes, unless a node of the servant has one of this name.
-    fn own_topic(&self, topic: &str) -> Option<Arc<MessageType>> {
+    /// Returns the type of a topic that the bridge itself publishes, unless a node of the servant has one of this name.
+    fn own_topic_type(&self, topic: &str) -> Option<Arc<MessageType>> {
         let version = self.bus.version();
         let made = || self.republisher.type_name(version, topic);
         let name = presence::type_name(version, topic).or_else(made)?;
@@ -227,18 +232,18 @@ impl Shared {
         self.registry.message(name).ok().filter(|_| !taken)
     }
 
-    /// Whether a client listens to a topic of the nodes.
-    pub(crate) fn hears_nodes(&self) -> bool {
+    /// Returns whether a client listens to a topic of the nodes.
+    pub(crate) fn has_node_listeners(&self) -> bool {
         self.heard.load(Ordering::Relaxed) > 0
     }
 
-    /// One more topic of the nodes is listened to, until what is given is dropped.
-    pub(crate) fn hear_nodes(&self) -> Heard {
+    /// Counts another topic of the nodes with listeners, until the returned guard is dropped.
+    pub(crate) fn count_node_listener(&self) -> NodeTopicGuard {
         self.heard.fetch_add(1, Ordering::Relaxed);
-        Heard(Arc::clone(&self.heard))
+        NodeTopicGuard(Arc::clone(&self.heard))
     }
 
-    /// Tells who listens that somebody has come or gone.
+    /// Publishes the change of connected clients.
     pub(crate) fn report_presence(&self) {
         for topic in presence::TOPICS {
             let mut live = self.live_fanouts(topic).into_iter();
@@ -252,7 +257,7 @@ impl Shared {
     }
 
     fn report_presence_to(&self, fanout: &Fanout, of: &MessageType) {
-        if let Some(message) = self.presence.message(&fanout.topic, of) {
+        if let Some(message) = self.presence.build_message(&fanout.topic, of) {
             fanout.deliver(message, true);
         }
     }
@@ -267,14 +272,14 @@ impl Shared {
             .collect()
     }
 
-    /// Whether the client that published so still does.
-    pub(crate) fn has_outlet(&self, topic: &str, id: &PeerId) -> bool {
+    /// Returns whether the client's publisher with this id still exists.
+    pub(crate) fn has_publisher(&self, topic: &str, id: &PeerId) -> bool {
         self.publishers_of(topic)
             .iter()
             .any(|topic_publisher| topic_publisher.id == *id)
     }
 
-    pub(crate) fn add_outlet(&self, topic_publisher: &Arc<TopicPublisher>) {
+    pub(crate) fn add_publisher(&self, topic_publisher: &Arc<TopicPublisher>) {
         self.topic_publishers
             .lock()
             .entry(topic_publisher.topic.clone())
@@ -282,8 +287,8 @@ impl Shared {
             .push(Arc::downgrade(topic_publisher));
     }
 
-    /// Forgets an topic_publisher that is being dropped, and what it latched.
-    pub(crate) fn forget_outlet(&self, topic_publisher: &TopicPublisher) {
+    /// Removes a topic_publisher that is being dropped, and its latched message.
+    pub(crate) fn forget_publisher(&self, topic_publisher: &TopicPublisher) {
         let mut topic_publishers = self.topic_publishers.lock();
         if let Some(others) = topic_publishers.get_mut(&topic_publisher.topic) {
             others.retain(|other| other.strong_count() > 0);
@@ -294,12 +299,13 @@ impl Shared {
         drop(topic_publishers);
         if topic_publisher.offer.latch {
             for fanout in self.live_fanouts(&topic_publisher.topic) {
-                fanout.forget(&topic_publisher.id);
+                fanout.forget_publisher(&topic_publisher.id);
             }
         }
     }
 
-    /// What clients of this bridge publish on a topic, known before the graph shows it.
+    /// Returns the type of a topic published by clients of this bridge or by the bridge itself, before the graph shows
+    /// it.
     pub(crate) fn local_type(&self, topic: &str) -> Option<String> {
         let topic_publishers = self.publishers_of(topic);
         let known = topic_publishers
@@ -312,18 +318,19 @@ impl Shared {
             .map(str::to_owned)
     }
 
-    /// The topic's fanouts; none if nobody listens.
+    /// Returns the topic's fanouts; none if nobody listens.
     pub(crate) fn live_fanouts(&self, topic: &str) -> Vec<Arc<Fanout>> {
         let fanouts = self.fanouts.lock();
         let of_topic = fanouts.get(topic).into_iter().flatten();
-        // None is dropped here: its last owner would forget it, under the lock.
+        // None is dropped here: dropping the last reference would take the lock.
         of_topic
             .filter_map(|known| known.fanout.upgrade())
             .collect()
     }
 
-    /// Hands a message of the bridge's own, or of one of its clients, to all who listen; false where nobody does.
-    pub(crate) fn deliver(&self, topic: &str, message: &Message) -> bool {
+    /// Delivers a message of the bridge itself, or of one of its clients, to all listeners; returns false if there are
+    /// none.
+    pub(crate) fn deliver(&self, topic: &str, message: &SerializedMessage) -> bool {
         let fanouts = self.live_fanouts(topic);
         for fanout in &fanouts {
             fanout.deliver(message.clone(), true);
@@ -331,7 +338,7 @@ impl Shared {
         !fanouts.is_empty()
     }
 
-    /// Forgets a fanout that is gone, or that will never carry anything.
+    /// Removes a fanout that is gone, or that failed.
     pub(crate) fn forget_fanout(&self, fanout: &Fanout) {
         let mut fanouts = self.fanouts.lock();
         if let Some(of_topic) = fanouts.get_mut(&fanout.topic) {
@@ -342,19 +349,19 @@ impl Shared {
         }
     }
 
-    /// The requests that messages on this topic are, if any.
+    /// Returns the tracker of requests if messages on this topic are requests.
     pub(crate) fn requests_on(&self, input: &str) -> Option<Arc<TopicRequests>> {
         let requests = self.requests.as_ref();
         requests.filter(|it| it.is_input(input)).cloned()
     }
 
-    /// The requests that messages on this topic answer, if any.
+    /// Returns the tracker of requests if messages on this topic answer requests.
     pub(crate) fn answers_on(&self, output: &str) -> Option<Arc<TopicRequests>> {
         let requests = self.requests.as_ref();
         requests.filter(|it| it.is_output(output)).cloned()
     }
 
-    /// A number that nothing else of this bridge has.
+    /// Returns a number that is unique in this bridge.
     pub(crate) fn next_number(&self) -> u64 {
         self.numbers.fetch_add(1, Ordering::Relaxed)
     }

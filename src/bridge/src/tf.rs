@@ -1,12 +1,12 @@
-//! What roslibjs's and roslibpy's TF clients need: the interface of tf2_web_republisher, which sends only the
-//! transforms asked for, only when they have changed enough. In a plain ROS a node does this; here the bridge does,
-//! unless the servant has such a node.
+//! Support for the TF clients of roslibjs and roslibpy: the interface of tf2_web_republisher, which sends only the
+//! requested transforms, and only when they have changed enough. In a plain ROS system a node does this; here the
+//! bridge does, unless the servant has such a node.
 //!
-//! * the service `/republish_tfs`, which names a topic of `tf2_web_republisher/TFArray` made for the caller;
+//! * the service `/republish_tfs`, which returns a topic of `tf2_web_republisher/TFArray` created for the caller;
 //! * the action `/tf2_web_republisher`, whose feedback carries the transforms for as long as the goal is active: by
 //!   topics in ROS 1, by operations in either ROS.
 //!
-//! In ROS 2 its types are of the package `tf2_web_republisher_interfaces`.
+//! In ROS 2 its types are in the package `tf2_web_republisher_interfaces`.
 
 mod action;
 mod buffer;
@@ -22,14 +22,14 @@ use ros::codec::{self, CodecError, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
 
-pub(crate) use action::own_action;
-use buffer::Buffer;
+pub(crate) use action::own_action_client;
+use buffer::TransformBuffer;
 pub(crate) use republish::{
     ACTION, GOAL_TOPIC, RepublishTfs, Republisher, SERVICE, STATUS_TOPIC, TOPICS,
 };
 use transform::Transform;
 
-/// Transforms, in words that mean the same to both ROSes.
+/// Definitions of transforms, which mean the same in both versions of ROS.
 const DEFINITIONS: &[(&str, &str)] = &[
     (
         "geometry_msgs/msg/Vector3",
@@ -49,11 +49,12 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ),
 ];
 
-/// What callers and goals ask for.
-const WANTED: &str = "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\nfloat32 rate\n";
+/// Fields of requests by callers and goals.
+const WANTED: &str = "string[] source_frames\nstring target_frame\nfloat32 angular_thres\nfloat32 trans_thres\n\
+                      float32 rate\n";
 const TRANSFORMS: &str = "geometry_msgs/TransformStamped[] transforms\n";
 
-/// Where the republisher's own types are.
+/// Returns the package of the republisher's own types.
 fn package(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "tf2_web_republisher",
@@ -61,7 +62,7 @@ fn package(version: RosVersion) -> &'static str {
     }
 }
 
-/// Name of the type of topics that are made for callers.
+/// Returns the name of the type of topics created for callers.
 fn array_name(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "tf2_web_republisher/TFArray",
@@ -69,7 +70,7 @@ fn array_name(version: RosVersion) -> &'static str {
     }
 }
 
-/// Name of the action's type.
+/// Returns the name of the action's type.
 pub(crate) fn action_name(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "tf2_web_republisher/TFSubscription",
@@ -77,7 +78,7 @@ pub(crate) fn action_name(version: RosVersion) -> &'static str {
     }
 }
 
-/// The republisher's own types.
+/// Returns the republisher's own types.
 fn own_definitions(version: RosVersion) -> [(String, String); 3] {
     let package = package(version);
     let duration = match version {
@@ -97,8 +98,8 @@ fn own_definitions(version: RosVersion) -> [(String, String); 3] {
     ]
 }
 
-/// Adds the types that are needed and that the servant does not have.
-pub(crate) fn define(version: RosVersion, registry: &Registry) {
+/// Adds the required types that the servant does not have.
+pub(crate) fn define_types(version: RosVersion, registry: &Registry) {
     let known = registry.keys();
     let own = own_definitions(version);
     let own = own.iter().map(|(key, text)| (key.as_str(), text.as_str()));
@@ -111,12 +112,12 @@ pub(crate) fn define(version: RosVersion, registry: &Registry) {
     }
 }
 
-/// The one buffer of a bridge, for as long as anybody needs it.
+/// The buffer of a bridge, shared for as long as it is used.
 #[derive(Default)]
-struct SharedBuffer(Mutex<Weak<Buffer>>);
+struct SharedBuffer(Mutex<Weak<TransformBuffer>>);
 
 impl SharedBuffer {
-    fn get(&self, make: impl FnOnce() -> Buffer) -> Arc<Buffer> {
+    fn get(&self, make: impl FnOnce() -> TransformBuffer) -> Arc<TransformBuffer> {
         let mut buffer = self.0.lock();
         buffer.upgrade().unwrap_or_else(|| {
             let made = Arc::new(make());
@@ -126,7 +127,7 @@ impl SharedBuffer {
     }
 }
 
-/// A message whose field `transforms` holds these: parent, child, transform, when it was so.
+/// Encodes a message whose field `transforms` contains these: parent, child, transform, time.
 fn write_transforms<'t>(
     of: &MessageType,
     transforms: impl IntoIterator<Item = (&'t str, &'t str, Transform, Time)>,

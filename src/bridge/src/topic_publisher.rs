@@ -1,4 +1,4 @@
-//! A topic that a client publishes on.
+//! A topic on which a client publishes.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -6,85 +6,86 @@ use std::time::Instant;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Matched, Message, PeerId, WireType};
-use ros::ring::{Bounds, Ring};
+use ros::bus::{MatchedPeers, PeerId, SerializedMessage, WireType};
+use ros::ring::{Ring, RingBounds};
 use ros::schema::MessageType;
-use ros::sizes::Sizes;
+use ros::sizes::SizeCounters;
 use tokio::sync::watch;
 use tokio::time::timeout_at;
 
 use crate::INSIDE;
-use crate::counted::Counted;
-use crate::quality::Offer;
+use crate::counted::CountingPublisher;
+use crate::quality::PublisherOffer;
 use crate::refusals::Refusals;
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 use crate::topic_requests::TopicRequests;
 
-/// Kept while the topic is being advertised.
-const WARM: Bounds = Bounds {
+/// Limits of messages kept while the topic is being advertised.
+const WARM: RingBounds = RingBounds {
     messages: 256,
     bytes: 16 << 20,
 };
 
-/// So many times as long a node is waited for that has registered, where nobody else is connected: on a busy machine rospy takes seconds.
+/// Factor of the waiting time for a registered node while nobody else is connected: on a busy machine rospy takes
+/// seconds.
 const ALONE: u32 = 10;
 
-/// Whoever publishes, for what must be known of the topic.
-pub(crate) trait Notified: Send + Sync + 'static {
-    /// It cannot be advertised.
-    fn failed(&self, reason: &str);
-    /// A subscriber hears nothing, because it asks for something else. Told once of each.
-    fn refused(&self, reason: &str);
+/// Receives events of an advertised topic.
+pub(crate) trait PublisherEvents: Send + Sync + 'static {
+    /// Called if the topic cannot be advertised.
+    fn on_failed(&self, reason: &str);
+    /// Called once for each subscriber that receives nothing because its quality of service is incompatible.
+    fn on_refused(&self, reason: &str);
 }
 
-/// Until when subscribers are waited for.
+/// Deadlines of waiting for subscribers.
 #[derive(Clone, Copy)]
-struct Patience {
-    /// Those that are missing while others are connected.
+struct WaitDeadlines {
+    /// Deadline for missing subscribers while others are connected.
     some: Instant,
-    /// Those that are registered, while nobody is connected.
+    /// Deadline for registered subscribers while nobody is connected.
     none: Instant,
 }
 
-/// One client's advertisement of one topic.
+/// Advertisement of one topic by one client.
 pub(crate) struct TopicPublisher {
     pub(crate) topic: String,
     pub(crate) message_type: Arc<MessageType>,
-    pub(crate) offer: Offer,
+    pub(crate) offer: PublisherOffer,
     wire_type: Arc<WireType>,
-    sizes: Arc<Sizes>,
-    /// Tells this topic_publisher's latched message from others'.
+    sizes: Arc<SizeCounters>,
+    /// Distinguishes this topic_publisher's latched message from others'.
     pub(crate) id: PeerId,
-    /// What its messages are where they are requests.
+    /// Tracker of requests, if its messages are requests.
     requests: Option<Arc<TopicRequests>>,
-    shared: Arc<Shared>,
-    /// The last message, where it latches.
+    shared: Arc<BridgeShared>,
+    /// The last message, if it latches.
     last: Mutex<Option<Bytes>>,
-    /// Subscribers that were waited for in vain: they have another definition of the type, or nobody answers there.
-    given_up: Mutex<BTreeSet<Node>>,
+    /// Subscribers that were waited for in vain: they have another definition of the type, or do not respond.
+    given_up: Mutex<BTreeSet<NodeAddress>>,
     state: Mutex<State>,
 }
 
-/// A node's name and address: of the same name another may come.
-type Node = (String, String);
+/// Name and address of a node: another node may come with the same name.
+type NodeAddress = (String, String);
 
 enum State {
-    /// Not yet advertised, or a node that the Master names as subscriber has not connected yet: messages wait a
-    /// moment, since clients publish right behind their `advertise`, or as soon as rosapi names a subscriber.
+    /// Not advertised yet, or a node registered as subscriber is not connected yet: messages wait a moment, since
+    /// clients publish right after their `advertise`, or as soon as rosapi lists a subscriber.
     Warming {
         waiting: Ring<Bytes>,
-        publisher: Option<Counted>,
+        publisher: Option<CountingPublisher>,
     },
     Live {
-        publisher: Counted,
-        /// The graph in which nobody is missing but those given up.
+        publisher: CountingPublisher,
+        /// Generation of the graph in which no subscriber is missing, except those given up.
         settled: u64,
     },
     Failed,
 }
 
 impl State {
-    fn warming(publisher: Option<Counted>) -> State {
+    fn warming(publisher: Option<CountingPublisher>) -> State {
         State::Warming {
             waiting: Ring::new(WARM),
             publisher,
@@ -95,16 +96,16 @@ impl State {
 impl TopicPublisher {
     /// Advertises in the background.
     pub(crate) fn open(
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         topic: &str,
         message_type: Arc<MessageType>,
-        offer: Offer,
-        notified: Arc<dyn Notified>,
+        offer: PublisherOffer,
+        notified: Arc<dyn PublisherEvents>,
     ) -> Arc<TopicPublisher> {
-        let wire_type = WireType::of(&message_type);
+        let wire_type = WireType::from_message(&message_type);
         let topic_publisher = Arc::new(TopicPublisher {
             topic: topic.to_owned(),
-            sizes: shared.inputs.of(topic, Some(&message_type)),
+            sizes: shared.inputs.for_input(topic, Some(&message_type)),
             message_type,
             offer,
             wire_type: Arc::new(wire_type.clone()),
@@ -115,16 +116,16 @@ impl TopicPublisher {
             given_up: Mutex::default(),
             state: Mutex::new(State::warming(None)),
         });
-        shared.add_outlet(&topic_publisher);
-        // Holds the topic_publisher until what was published at once has been sent, even if the client is gone by then.
+        shared.add_publisher(&topic_publisher);
+        // Holds the topic_publisher until the first messages have been sent, even if the client is gone by then.
         tokio::spawn(warm_up(topic_publisher.clone(), wire_type, notified));
         topic_publisher
     }
 
     pub(crate) fn publish(self: &Arc<Self>, bytes: Bytes) {
         self.shared.metrics.published.add(1);
-        self.sizes.note(&bytes);
-        if self.shared.hears_nodes() {
+        self.sizes.record(&bytes);
+        if self.shared.has_node_listeners() {
             self.shared.metrics.asked.add(1);
         }
         if self.offer.latch {
@@ -137,23 +138,29 @@ impl TopicPublisher {
         if let State::Live { publisher, settled } = &mut *state
             && self.is_incomplete(publisher, settled)
         {
-            let subscribers = publisher.matched();
+            let subscribers = publisher.match_events();
             if let State::Live { publisher, .. } =
                 std::mem::replace(&mut *state, State::warming(None))
             {
                 *state = State::warming(Some(publisher));
             }
-            tokio::spawn(settle(self.clone(), subscribers, self.patience()));
+            tokio::spawn(wait_for_subscribers(
+                self.clone(),
+                subscribers,
+                self.wait_deadlines(),
+            ));
         }
         match &mut *state {
             State::Live { publisher, .. } => {
-                // Not of what waits for connections: that is no time of the servant.
+                // Not for messages that wait for connections: that time is not the servant's.
                 if let Some(requests) = &self.requests {
                     let shared = &self.shared;
-                    let heard = requests.is_heard(|topic| !shared.live_fanouts(topic).is_empty());
+                    let heard =
+                        requests.has_listener(|topic| !shared.live_fanouts(topic).is_empty());
                     let now = Instant::now();
-                    let unanswered = requests.asked(&self.message_type, &bytes, now, heard);
-                    (0..unanswered).for_each(|_| shared.options.called.tell(None));
+                    let unanswered =
+                        requests.record_request(&self.message_type, &bytes, now, heard);
+                    (0..unanswered).for_each(|_| shared.options.called.record(None));
                 }
                 publisher.publish(bytes);
             }
@@ -162,18 +169,18 @@ impl TopicPublisher {
                 let lost = waiting.push(bytes);
                 let metrics = &self.shared.metrics;
                 metrics.drops.add(&self.topic, lost.messages);
-                metrics.lost(lost);
+                metrics.record_lost(lost);
             }
         }
     }
 
-    /// What a newcomer is given.
-    pub(crate) fn latched(&self) -> Option<Message> {
+    /// Returns the message for new subscribers.
+    pub(crate) fn latched_message(&self) -> Option<SerializedMessage> {
         self.last.lock().clone().map(|bytes| self.message(bytes))
     }
 
-    fn message(&self, bytes: Bytes) -> Message {
-        Message {
+    fn message(&self, bytes: Bytes) -> SerializedMessage {
+        SerializedMessage {
             bytes,
             wire_type: self.wire_type.clone(),
             publisher: self.id.clone(),
@@ -181,16 +188,16 @@ impl TopicPublisher {
         }
     }
 
-    /// Whether somebody is missing who was not in the graph of generation `settled`, which becomes the present one if
-    /// not.
-    fn is_incomplete(&self, publisher: &Counted, settled: &mut u64) -> bool {
+    /// Returns whether a subscriber is missing that was not in the graph of generation `settled`; if not, sets
+    /// `settled` to the present generation.
+    fn is_incomplete(&self, publisher: &CountingPublisher, settled: &mut u64) -> bool {
         let generation = self.shared.bus.graph().borrow().generation;
         if generation == *settled {
             return false;
         }
-        let missing = self.missing(&publisher.matched().borrow());
+        let missing = self.missing_subscribers(&publisher.match_events().borrow());
         let mut given_up = self.given_up.lock();
-        // Who has gone meanwhile may come back with the right type.
+        // A node that has left may come back with the right type.
         given_up.retain(|node| missing.contains(node));
         let incomplete = !missing.is_subset(&given_up);
         if !incomplete {
@@ -199,18 +206,18 @@ impl TopicPublisher {
         incomplete
     }
 
-    /// Until when subscribers are waited for from now on.
-    fn patience(&self) -> Patience {
+    /// Returns the deadlines of waiting for subscribers, from now on.
+    fn wait_deadlines(&self) -> WaitDeadlines {
         let (warm_up, now) = (self.shared.options.warm_up, Instant::now());
-        Patience {
+        WaitDeadlines {
             some: now + warm_up,
             none: now + warm_up * ALONE,
         }
     }
 
-    /// Nodes that the graph names as subscribers, and that are not connected. The bridge itself may be among those
-    /// that are named, but never connects; nor does who asks for something else.
-    fn missing(&self, matched: &Matched) -> BTreeSet<Node> {
+    /// Returns the nodes registered as subscribers that are not connected. The bridge itself may be registered, but
+    /// never connects; nor do subscribers with incompatible quality of service.
+    fn missing_subscribers(&self, matched: &MatchedPeers) -> BTreeSet<NodeAddress> {
         let bus = &self.shared.bus;
         let graph = bus.graph().borrow().clone();
         let Some(nodes) = graph.topics.get(&self.topic) else {
@@ -228,13 +235,16 @@ impl TopicPublisher {
             .collect()
     }
 
-    /// Whether all are connected who should be, at least one. Who only observes what flows is not one.
-    fn is_complete(&self, matched: &Matched) -> bool {
-        matched.connected_beside(INSIDE) > 0
-            && self.missing(matched).is_subset(&self.given_up.lock())
+    /// Returns whether all subscribers that should be connected are, and at least one is. An observing node does not
+    /// count.
+    fn is_complete(&self, matched: &MatchedPeers) -> bool {
+        matched.connected_count_except(INSIDE) > 0
+            && self
+                .missing_subscribers(matched)
+                .is_subset(&self.given_up.lock())
     }
 
-    /// Sends what waits, in order, and from now on at once.
+    /// Sends the queued messages, in order, and from now on all at once.
     fn go_live(&self) {
         let settled = self.shared.bus.graph().borrow().generation;
         let mut state = self.state.lock();
@@ -256,45 +266,52 @@ impl TopicPublisher {
 
 impl Drop for TopicPublisher {
     fn drop(&mut self) {
-        self.shared.forget_outlet(self);
+        self.shared.forget_publisher(self);
     }
 }
 
-/// Whether an end of this node's cannot match.
-fn is_refused(matched: &Matched, node: &str) -> bool {
+/// Returns whether an endpoint of this node does not match.
+fn is_refused(matched: &MatchedPeers, node: &str) -> bool {
     let mut refused = matched.refused.iter();
     refused.any(|refusal| refusal.peer.node() == node)
 }
 
-async fn warm_up(topic_publisher: Arc<TopicPublisher>, of: WireType, notified: Arc<dyn Notified>) {
+async fn warm_up(
+    topic_publisher: Arc<TopicPublisher>,
+    of: WireType,
+    notified: Arc<dyn PublisherEvents>,
+) {
     let shared = topic_publisher.shared.clone();
-    let patience = topic_publisher.patience();
+    let patience = topic_publisher.wait_deadlines();
     let (topic, qos) = (&topic_publisher.topic, topic_publisher.offer.qos);
     let publisher = match shared.bus.advertise(topic, of, qos).await {
-        Ok(publisher) => Counted::new(publisher, topic, shared.metrics.clone()),
+        Ok(publisher) => CountingPublisher::new(publisher, topic, shared.metrics.clone()),
         Err(error) => {
             *topic_publisher.state.lock() = State::Failed;
-            return notified.failed(&error.to_string());
+            return notified.on_failed(&error.to_string());
         }
     };
-    let subscribers = publisher.matched();
-    tokio::spawn(tell_refused(subscribers.clone(), notified));
+    let subscribers = publisher.match_events();
+    tokio::spawn(report_refusals(subscribers.clone(), notified));
     if let State::Warming {
         publisher: held, ..
     } = &mut *topic_publisher.state.lock()
     {
         *held = Some(publisher);
     }
-    settle(topic_publisher, subscribers, patience).await;
+    wait_for_subscribers(topic_publisher, subscribers, patience).await;
 }
 
-/// Tells of subscribers that ask for something else, for as long as the topic is advertised.
-async fn tell_refused(mut subscribers: watch::Receiver<Matched>, notified: Arc<dyn Notified>) {
+/// Reports incompatible subscribers for as long as the topic is advertised.
+async fn report_refusals(
+    mut subscribers: watch::Receiver<MatchedPeers>,
+    notified: Arc<dyn PublisherEvents>,
+) {
     let mut refusals = Refusals::default();
     loop {
         let new = refusals.update(&subscribers.borrow_and_update());
         for reason in new {
-            notified.refused(&reason);
+            notified.on_refused(&reason);
         }
         if subscribers.changed().await.is_err() {
             return;
@@ -302,32 +319,35 @@ async fn tell_refused(mut subscribers: watch::Receiver<Matched>, notified: Arc<d
     }
 }
 
-/// Waits until all are connected who should be, at least one; those out of patience get nothing of what waits. As long as nobody at all is
-/// connected, nobody waits either for what a slow node lacks: it has more time.
-async fn settle(
+/// Waits until all subscribers that should be connected are, and at least one is; those that are too late miss the
+/// queued messages. As long as nobody is connected, nobody waits for messages that a slow node would miss: it has more
+/// time.
+async fn wait_for_subscribers(
     topic_publisher: Arc<TopicPublisher>,
-    mut subscribers: watch::Receiver<Matched>,
-    patience: Patience,
+    mut subscribers: watch::Receiver<MatchedPeers>,
+    patience: WaitDeadlines,
 ) {
-    let mut in_time = connected(&topic_publisher, &mut subscribers, patience.some).await;
+    let mut in_time = wait_connected(&topic_publisher, &mut subscribers, patience.some).await;
     let is_slow = {
         let matched = subscribers.borrow();
-        matched.connected_beside(INSIDE) == 0 && !topic_publisher.missing(&matched).is_empty()
+        matched.connected_count_except(INSIDE) == 0
+            && !topic_publisher.missing_subscribers(&matched).is_empty()
     };
     if !in_time && is_slow {
-        in_time = connected(&topic_publisher, &mut subscribers, patience.none).await;
+        in_time = wait_connected(&topic_publisher, &mut subscribers, patience.none).await;
     }
     if !in_time {
-        // Not waited for again while they are what they are.
-        *topic_publisher.given_up.lock() = topic_publisher.missing(&subscribers.borrow());
+        // They are not waited for again while they do not change.
+        *topic_publisher.given_up.lock() =
+            topic_publisher.missing_subscribers(&subscribers.borrow());
     }
     topic_publisher.go_live();
 }
 
-/// Whether all are connected who should be before this time, or the topic has ended.
-async fn connected(
+/// Returns whether all subscribers that should be connected are before `until`, or the topic has ended.
+async fn wait_connected(
     topic_publisher: &TopicPublisher,
-    subscribers: &mut watch::Receiver<Matched>,
+    subscribers: &mut watch::Receiver<MatchedPeers>,
     until: Instant,
 ) -> bool {
     let connected = async {

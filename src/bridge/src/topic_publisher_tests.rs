@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use ros::bus::{Bus, Graph, Qos, WireType};
+use ros::bus::{Bus, Graph, QosProfile, WireType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
@@ -11,30 +11,30 @@ use tokio::time::timeout;
 use super::*;
 use crate::BridgeOptions;
 
-/// Only bounds how long a failing test takes.
+/// Bounds the duration of a failing test.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// Nothing may go wrong.
+/// Events that must not occur.
 struct Fails;
 
-impl Notified for Fails {
-    fn failed(&self, reason: &str) {
+impl PublisherEvents for Fails {
+    fn on_failed(&self, reason: &str) {
         panic!("{reason}")
     }
 
-    fn refused(&self, reason: &str) {
+    fn on_refused(&self, reason: &str) {
         panic!("{reason}")
     }
 }
 
-async fn in_graph(bus: &dyn Bus, condition: impl Fn(&Graph) -> bool) {
+async fn wait_for_graph(bus: &dyn Bus, condition: impl Fn(&Graph) -> bool) {
     let mut graph = bus.graph();
     let seen = graph.wait_for(|graph| condition(graph));
     timeout(PATIENCE, seen).await.expect("in time").unwrap();
 }
 
-/// Who has connected, as soon as the topic is advertised.
-async fn advertised(topic_publisher: &TopicPublisher) -> watch::Receiver<Matched> {
+/// Returns the connected subscribers, as soon as the topic is advertised.
+async fn wait_advertised(topic_publisher: &TopicPublisher) -> watch::Receiver<MatchedPeers> {
     let advertised = async {
         loop {
             if let State::Warming {
@@ -42,7 +42,7 @@ async fn advertised(topic_publisher: &TopicPublisher) -> watch::Receiver<Matched
                 ..
             } = &*topic_publisher.state.lock()
             {
-                return publisher.matched();
+                return publisher.match_events();
             }
             tokio::task::yield_now().await;
         }
@@ -56,7 +56,7 @@ fn is_live(topic_publisher: &TopicPublisher) -> bool {
 
 async fn subscribe(node: &Ros1Bus, md5: &str) -> ros::bus::Subscription {
     let wire_type = WireType::new("std_msgs/Int32", md5, "");
-    node.subscribe("/number", wire_type, Qos::keep_last(100))
+    node.subscribe("/number", wire_type, QosProfile::keep_last(100))
         .await
         .unwrap()
 }
@@ -79,22 +79,22 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
         .unwrap();
     let message_type = registry.message("std_msgs/Int32").unwrap();
     let options = BridgeOptions {
-        // The test says itself when it is over.
+        // The test itself decides when it is over.
         warm_up: PATIENCE * 10,
         ..BridgeOptions::default()
     };
-    let shared = Shared::new(bus.clone(), Arc::new(registry), options);
+    let shared = BridgeShared::new(bus.clone(), Arc::new(registry), options);
 
     let _never = subscribe(&odd, "0123456789abcdef0123456789abcdef").await;
-    in_graph(&*bus, |graph| {
+    wait_for_graph(&*bus, |graph| {
         graph
             .topics
             .get("/number")
             .is_some_and(|nodes| nodes.subscribers == ["/odd"])
     })
     .await;
-    let offer = Offer {
-        qos: Qos::keep_last(10),
+    let offer = PublisherOffer {
+        qos: QosProfile::keep_last(10),
         latch: false,
     };
     let topic_publisher = TopicPublisher::open(
@@ -104,46 +104,46 @@ async fn a_subscriber_that_never_matches_is_waited_for_once() {
         offer,
         Arc::new(Fails),
     );
-    let subscribers = advertised(&topic_publisher).await;
+    let subscribers = wait_advertised(&topic_publisher).await;
     assert!(!is_live(&topic_publisher), "it waits");
     let over = Instant::now();
     let later = Instant::now() + PATIENCE * 10;
-    let still = Patience {
+    let still = WaitDeadlines {
         some: over,
         none: later,
     };
-    let waiting = settle(topic_publisher.clone(), subscribers.clone(), still);
+    let waiting = wait_for_subscribers(topic_publisher.clone(), subscribers.clone(), still);
     let waited = timeout(Duration::from_millis(100), waiting).await;
     assert!(
         waited.is_err() && !is_live(&topic_publisher),
         "nobody else waits for it"
     );
-    let both = Patience {
+    let both = WaitDeadlines {
         some: over,
         none: over,
     };
-    settle(topic_publisher.clone(), subscribers, both).await;
+    wait_for_subscribers(topic_publisher.clone(), subscribers, both).await;
     assert!(is_live(&topic_publisher), "it has waited long enough");
 
-    // The graph changes, and what is published goes out at once all the same.
+    // The graph changes, and messages are still sent at once.
     for number in 0..3 {
         let name = format!("/other{number}");
         let _other = odd
             .advertise(
                 &name,
                 (*topic_publisher.wire_type).clone(),
-                Qos::keep_last(1),
+                QosProfile::keep_last(1),
             )
             .await
             .unwrap();
-        in_graph(&*bus, |graph| graph.topics.contains_key(&name)).await;
+        wait_for_graph(&*bus, |graph| graph.topics.contains_key(&name)).await;
         topic_publisher.publish(vec![0; 4].into());
         assert!(is_live(&topic_publisher), "message {number} waits");
     }
 
-    // For one who comes later it is waited; not one message is lost to it.
+    // A later subscriber is waited for, and misses no message.
     let mut heard = subscribe(&fitting, message_type.md5()).await;
-    in_graph(&*bus, |graph| {
+    wait_for_graph(&*bus, |graph| {
         graph.topics["/number"].subscribers.len() == 2
     })
     .await;

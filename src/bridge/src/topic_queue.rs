@@ -1,37 +1,41 @@
-//! What waits for one client on one topic: newest wins, bounded in messages and bytes, no faster than asked for.
+//! Messages of one topic queued for one client: the newest are kept, within limits on messages and bytes, and sent no
+//! faster than requested.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros::bus::PeerId;
-use ros::ring::{Bounds, Held, Lost, Ring};
+use ros::ring::{DropTally, Ring, RingBounds, RingItem};
 use rosbridge::{Compression, Id};
 
 use crate::Drops;
-use crate::sample::Sample;
+use crate::sample::TopicSample;
 
-/// Latching publishers remembered.
+/// Maximum number of latching publishers remembered.
 const MAX_MET: usize = 1024;
-/// So many messages are kept however large they are, where a client asked for that many: as many as ROS's own queues have by default.
+/// Maximum number of messages kept however large they are, if a client asked for them: the default of ROS's own queues.
 const MOST_LARGE: usize = 10;
-/// As many for a client that did not say: one that is taken up while another waits costs nothing, and nobody is shown what is older than that.
+/// Default for a client that did not ask: a message that is read while another waits costs nothing, and no client gets
+/// older ones.
 const LARGE: usize = 2;
 
-/// What one `subscribe` asked for.
+/// Options of one `subscribe`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Wishes {
+pub(crate) struct SubscriptionOptions {
     pub(crate) throttle_rate: Duration,
     pub(crate) queue_length: usize,
     pub(crate) fragment_size: Option<usize>,
     pub(crate) compression: Compression,
 }
 
-impl Wishes {
-    /// What satisfies all of a client's subscriptions to a topic: the lowest rate limit and fragment size, the
-    /// longest queue, the most compact encoding.
-    pub(crate) fn merged<'w>(all: impl Iterator<Item = &'w Wishes>) -> Option<Wishes> {
-        all.copied().reduce(|one, other| Wishes {
+impl SubscriptionOptions {
+    /// Returns the options that satisfy all of a client's subscriptions to a topic: the lowest throttle rate and
+    /// fragment size, the longest queue, the most compact encoding.
+    pub(crate) fn merge<'w>(
+        all: impl Iterator<Item = &'w SubscriptionOptions>,
+    ) -> Option<SubscriptionOptions> {
+        all.copied().reduce(|one, other| SubscriptionOptions {
             throttle_rate: one.throttle_rate.min(other.throttle_rate),
             queue_length: one.queue_length.max(other.queue_length),
             fragment_size: match (one.fragment_size, other.fragment_size) {
@@ -43,64 +47,69 @@ impl Wishes {
     }
 }
 
-/// The subscriptions of one client to one topic, by id.
-pub(crate) type Subscriptions = HashMap<Option<Id<'static>>, Wishes>;
+/// Subscriptions of one client to one topic, by id.
+pub(crate) type Subscriptions = HashMap<Option<Id<'static>>, SubscriptionOptions>;
 
-struct Waiting {
-    sample: Arc<Sample>,
-    /// No throttle rate holds it back: what a latching publisher last said, for a newcomer.
+struct QueuedSample {
+    sample: Arc<TopicSample>,
+    /// Not delayed by a throttle rate: the last message of a latching publisher, for a new subscriber.
     first: bool,
 }
 
-impl Held for Waiting {
-    fn held(&self) -> usize {
+impl RingItem for QueuedSample {
+    fn memory_size(&self) -> usize {
         self.sample.bytes.len()
     }
 }
 
-/// Bytes of samples that wait.
+/// Bytes of queued samples.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Load {
+pub(crate) struct QueuedBytes {
     pub(crate) bytes: usize,
-    /// Of those, bytes of samples that count for the daemon by themselves.
+    /// Bytes of samples among them that count for the daemon by themselves.
     pub(crate) big: usize,
 }
 
-impl Load {
-    /// A part of it has changed.
-    pub(crate) fn replace(&mut self, before: Load, after: Load) {
+impl QueuedBytes {
+    /// Replaces a part of the sum.
+    pub(crate) fn replace(&mut self, before: QueuedBytes, after: QueuedBytes) {
         self.bytes = self.bytes - before.bytes + after.bytes;
         self.big = self.big - before.big + after.big;
     }
 }
 
-/// The queue.
+/// Queue of one topic.
 pub(crate) struct TopicQueue {
-    /// The topic as the client wrote it.
+    /// Topic as the client wrote it.
     pub(crate) topic: Arc<str>,
-    /// Where what it drops is counted.
+    /// Counter of dropped messages.
     drops: Arc<Drops>,
-    pub(crate) wishes: Wishes,
-    limits: Bounds,
-    samples: Ring<Waiting>,
+    pub(crate) wishes: SubscriptionOptions,
+    limits: RingBounds,
+    samples: Ring<QueuedSample>,
     /// Latching publishers whose first message has been queued.
     met: HashSet<PeerId>,
     /// Bytes of samples that count for the daemon by themselves.
     big: usize,
-    /// When the throttle rate lets the next one through.
+    /// Time at which the throttle rate lets the next message through.
     next_at: Option<Instant>,
-    /// When something was last said about messages that cannot be sent.
+    /// Time of the last report on messages that cannot be sent.
     complained: Option<Instant>,
 }
 
 impl TopicQueue {
-    pub(crate) fn new(topic: Arc<str>, wishes: Wishes, limits: Bounds, drops: Arc<Drops>) -> Self {
+    pub(crate) fn new(
+        topic: Arc<str>,
+        wishes: SubscriptionOptions,
+        limits: RingBounds,
+        drops: Arc<Drops>,
+    ) -> Self {
         Self {
             topic,
             drops,
             wishes,
             limits,
-            samples: Ring::unbounded(),
+            samples: Ring::new_unbounded(),
             met: HashSet::new(),
             big: 0,
             next_at: None,
@@ -108,20 +117,25 @@ impl TopicQueue {
         }
     }
 
-    pub(crate) fn has_one(&self) -> bool {
+    pub(crate) fn has_at_most_one(&self) -> bool {
         self.samples.len() <= 1
     }
 
-    pub(crate) fn load(&self) -> Load {
-        Load {
+    pub(crate) fn load(&self) -> QueuedBytes {
+        QueuedBytes {
             bytes: self.samples.bytes(),
             big: self.big,
         }
     }
 
-    /// Queues a sample, for which others may be dropped; none if it is left out because of the throttle rate. `replay`:
-    /// it is an old one for a newcomer.
-    pub(crate) fn push(&mut self, sample: Arc<Sample>, replay: bool, now: Instant) -> Option<Lost> {
+    /// Queues a sample, for which others may be dropped; returns `None` if it is dropped because of the throttle rate.
+    /// `replay`: it is an old one for a new subscriber.
+    pub(crate) fn push(
+        &mut self,
+        sample: Arc<TopicSample>,
+        replay: bool,
+        now: Instant,
+    ) -> Option<DropTally> {
         let first = self.is_first(&sample, replay);
         let throttles = !self.wishes.throttle_rate.is_zero() && self.wishes.queue_length == 0;
         if throttles && !first {
@@ -130,66 +144,67 @@ impl TopicQueue {
             }
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }
-        self.big += sample.big();
-        let at = match first {
-            true => self.firsts(),
-            false => self.samples.len(),
+        self.big += sample.counted_bytes();
+        let at = if first {
+            self.first_count()
+        } else {
+            self.samples.len()
         };
-        self.samples.insert(at, Waiting { sample, first });
-        let mut lost = Lost::default();
-        while self.is_over() {
+        self.samples.insert(at, QueuedSample { sample, first });
+        let mut lost = DropTally::default();
+        while self.exceeds_limits() {
             let Some(one) = self.drop_one() else { break };
             lost += one;
         }
         Some(lost)
     }
 
-    /// How many are first messages of latching publishers; they come before all others.
-    fn firsts(&self) -> usize {
+    /// Returns the number of first messages of latching publishers; they come before all others.
+    fn first_count(&self) -> usize {
         let waiting = self.samples.iter();
         waiting.take_while(|waiting| waiting.first).count()
     }
 
-    fn is_first(&mut self, sample: &Sample, replay: bool) -> bool {
+    fn is_first(&mut self, sample: &TopicSample, replay: bool) -> bool {
         if !sample.latching {
             return replay;
         }
-        // Publishers whose names never end must not fill the memory.
+        // An endless number of publisher names must not fill the memory.
         if self.met.len() >= MAX_MET {
             self.met.clear();
         }
         self.met.insert(sample.publisher.clone()) || replay
     }
 
-    fn is_over(&self) -> bool {
+    fn exceeds_limits(&self) -> bool {
         let (asked, large) = match self.wishes.queue_length {
             0 => (self.limits.messages, LARGE),
             length => (length.min(self.limits.messages), length.min(MOST_LARGE)),
         };
         let waiting = self.samples.len();
-        // What latching publishers said first does not count: it may never come again.
+        // First messages of latching publishers do not count: they may never be repeated.
         waiting > self.limits.messages
-            || waiting - self.firsts() > asked
+            || waiting - self.first_count() > asked
             || (waiting > large && self.samples.bytes() > self.limits.bytes)
     }
 
-    /// Drops the oldest sample that can be spared.
-    pub(crate) fn drop_one(&mut self) -> Option<Lost> {
+    /// Drops the oldest sample that may be dropped.
+    pub(crate) fn drop_one(&mut self) -> Option<DropTally> {
         let waiting = self.samples.iter().enumerate();
-        let spare = waiting.clone().find(|(at, Waiting { sample, .. })| {
-            let newer = |(_, later): (_, &Waiting)| later.sample.publisher == sample.publisher;
+        let spare = waiting.clone().find(|(at, QueuedSample { sample, .. })| {
+            let newer = |(_, later): (_, &QueuedSample)| later.sample.publisher == sample.publisher;
             !sample.latching || waiting.clone().skip(at + 1).any(newer)
         });
         let spare = spare.map_or(0, |(at, _)| at);
         drop(waiting);
         let gone = self.samples.remove(spare)?;
-        self.big -= gone.sample.big();
+        self.big -= gone.sample.counted_bytes();
         self.drops.add(&self.topic, 1);
-        Some(Lost::one(&gone))
+        Some(DropTally::from_message(&gone))
     }
 
-    /// Its messages cannot be sent; gives whether it is time to say so again.
-    pub(crate) fn may_complain(&mut self, now: Instant) -> bool {
+    /// Returns whether it is time to report again that its messages cannot be sent.
+    pub(crate) fn should_report(&mut self, now: Instant) -> bool {
         let recently = |at| now.saturating_duration_since(at).as_secs() < 5;
         let due = !self.complained.is_some_and(recently);
         if due {
@@ -198,7 +213,7 @@ impl TopicQueue {
         due
     }
 
-    /// When the next sample may be sent; `None` while there is none.
+    /// Returns when the next sample may be sent; `None` while there is none.
     pub(crate) fn due(&self, now: Instant) -> Option<Instant> {
         let next = self.samples.front()?;
         let held_back =
@@ -210,10 +225,10 @@ impl TopicQueue {
         )
     }
 
-    /// The next sample to send.
-    pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<Sample>> {
-        let Waiting { sample, first } = self.samples.pop()?;
-        self.big -= sample.big();
+    /// Takes the next sample to send.
+    pub(crate) fn pop(&mut self, now: Instant) -> Option<Arc<TopicSample>> {
+        let QueuedSample { sample, first } = self.samples.pop()?;
+        self.big -= sample.counted_bytes();
         if self.wishes.queue_length > 0 && !first {
             self.next_at = now.checked_add(self.wishes.throttle_rate);
         }

@@ -1,13 +1,13 @@
-use ros::bus::{Message, WireType};
+use ros::bus::{SerializedMessage, WireType};
 use ros::schema::Registry;
 
 use super::*;
 use crate::BridgeOptions;
 use crate::sample::TopicTypes;
 
-fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
-    let wire_type = Arc::new(WireType::named("a/B"));
-    let message = Message {
+fn sample(publisher: &str, latching: bool, size: usize) -> Arc<TopicSample> {
+    let wire_type = Arc::new(WireType::with_name("a/B"));
+    let message = SerializedMessage {
         bytes: vec![0; size].into(),
         wire_type,
         publisher: publisher.into(),
@@ -15,11 +15,11 @@ fn sample(publisher: &str, latching: bool, size: usize) -> Arc<Sample> {
     };
     let types = Arc::new(TopicTypes::new(Arc::new(Registry::new())));
     let options = BridgeOptions::default();
-    Arc::new(Sample::new(message, false, types, &options).unwrap())
+    Arc::new(TopicSample::new(message, false, types, &options).unwrap())
 }
 
-fn wishes(throttle: u64, length: usize) -> Wishes {
-    Wishes {
+fn wishes(throttle: u64, length: usize) -> SubscriptionOptions {
+    SubscriptionOptions {
         throttle_rate: Duration::from_millis(throttle),
         queue_length: length,
         fragment_size: None,
@@ -31,7 +31,7 @@ fn queue(throttle: u64, length: usize) -> TopicQueue {
     TopicQueue::new(
         "/x".into(),
         wishes(throttle, length),
-        Bounds {
+        RingBounds {
             messages: 5,
             bytes: 1000,
         },
@@ -73,7 +73,7 @@ fn the_newest_win_within_messages_and_bytes() {
     assert_eq!(sizes(&asked), [3, 4]);
 }
 
-/// A picture that is taken up while the one before it waits must not cost that one, however large they are.
+/// However large images are, one that is read while the previous one waits must not cause that to be dropped.
 #[test]
 fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
     let now = Instant::now();
@@ -81,7 +81,7 @@ fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
         let mut queue = TopicQueue::new(
             "/x".into(),
             wishes(0, asked),
-            Bounds {
+            RingBounds {
                 messages: 1000,
                 bytes: 1000,
             },
@@ -94,7 +94,7 @@ fn a_topic_of_large_messages_keeps_as_many_as_its_client_asked_for() {
     };
     assert_eq!(kept(1), [6020]);
     assert_eq!(kept(5), [6016, 6017, 6018, 6019, 6020]);
-    // Whoever does not say is behind by no more than that.
+    // A client that did not ask is no further behind than that.
     assert_eq!(kept(0), [6019, 6020]);
     // As many as ROS's own queues have, and no more.
     assert_eq!(kept(1000).len(), 10);
@@ -156,20 +156,20 @@ fn the_first_of_each_latching_publisher_is_neither_held_back_nor_dropped() {
 
 #[test]
 fn several_subscriptions_of_a_topic_merge() {
-    let one = Wishes {
+    let one = SubscriptionOptions {
         fragment_size: Some(500),
         ..wishes(100, 0)
     };
-    let two = Wishes {
+    let two = SubscriptionOptions {
         compression: Compression::CborRaw,
         ..wishes(50, 3)
     };
-    let merged = Wishes::merged([one, two].iter()).unwrap();
-    let expected = Wishes {
+    let merged = SubscriptionOptions::merge([one, two].iter()).unwrap();
+    let expected = SubscriptionOptions {
         fragment_size: Some(500),
         compression: Compression::CborRaw,
         ..wishes(50, 3)
     };
     assert_eq!(merged, expected);
-    assert_eq!(Wishes::merged([].iter()), None);
+    assert_eq!(SubscriptionOptions::merge([].iter()), None);
 }

@@ -1,38 +1,38 @@
-//! Requests that clients make by topic, where the interface names one pair: a message of its input, and the message of its
+//! Requests that clients make by topic, if the interface names a pair: a message of its input, and the message of its
 //! outputs that answers it.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
-use qos::{Correlation, Pair};
+use qos::{Correlation, TopicPair};
 use ros::codec::{Time, header_stamp};
 use ros::schema::MessageType;
 
-/// Inputs whose answers are awaited at most; of more the oldest are forgotten.
+/// Maximum number of inputs awaiting an answer; beyond it the oldest are dropped.
 const OPEN: usize = 256;
-/// What comes so long after an input does not answer it.
+/// Time after which an output no longer answers an input.
 const FORGOTTEN: Duration = Duration::from_secs(60);
 
-/// The requests of one pair, over all clients of a bridge.
+/// Requests of one pair, over all clients of a bridge.
 pub(crate) struct TopicRequests {
-    pair: Pair,
-    /// The oldest first.
-    open: Mutex<VecDeque<Open>>,
+    pair: TopicPair,
+    /// Unanswered requests, oldest first.
+    open: Mutex<VecDeque<OpenRequest>>,
 }
 
-struct Open {
-    /// By which the answer is recognised; none where the next output answers.
+struct OpenRequest {
+    /// Stamp that identifies the answer; `None` if the next output is the answer.
     stamp: Option<Time>,
     since: Instant,
     /// A client listened to one of the outputs: an answer would have been seen.
     heard: bool,
-    /// A later one was answered: the servant has left it out.
+    /// A later request was answered: the servant has skipped this one.
     left_out: bool,
 }
 
 impl TopicRequests {
-    pub(crate) fn of(pair: &Pair) -> TopicRequests {
+    pub(crate) fn for_pair(pair: &TopicPair) -> TopicRequests {
         TopicRequests {
             pair: pair.clone(),
             open: Mutex::default(),
@@ -47,8 +47,8 @@ impl TopicRequests {
         self.pair.outputs.iter().any(|output| output == topic)
     }
 
-    /// By what an answer is recognised; nothing of a message that cannot be recognised.
-    fn key(&self, of: &MessageType, bytes: &[u8]) -> Option<Option<Time>> {
+    /// Returns the key by which an answer is recognised; `None` for a message without one.
+    fn correlation_key(&self, of: &MessageType, bytes: &[u8]) -> Option<Option<Time>> {
         if self.pair.by != Some(Correlation::Stamp) {
             return Some(None);
         }
@@ -56,16 +56,22 @@ impl TopicRequests {
         (stamp.secs != 0 || stamp.nsecs != 0).then_some(Some(stamp))
     }
 
-    /// A client's message on the input goes to the servant. Of several with one stamp the first is the request; without stamps
-    /// what comes before the answer is none. Returns how many earlier requests are given up that the servant has not answered:
-    /// those that were `heard`, and after which it has answered none.
-    pub(crate) fn asked(&self, of: &MessageType, bytes: &[u8], now: Instant, heard: bool) -> usize {
-        let Some(stamp) = self.key(of, bytes) else {
+    /// Records a client's message on the input. Among several with the same stamp the first is the request; without
+    /// stamps, messages before the answer are no requests of their own. Returns how many earlier requests are given up
+    /// that the servant has not answered: those that were `heard` and after which it has answered none.
+    pub(crate) fn record_request(
+        &self,
+        of: &MessageType,
+        bytes: &[u8],
+        now: Instant,
+        heard: bool,
+    ) -> usize {
+        let Some(stamp) = self.correlation_key(of, bytes) else {
             return 0;
         };
         let mut open = self.open.lock();
         let mut unanswered = 0;
-        let mut forget = |open: &mut VecDeque<Open>| {
+        let mut forget = |open: &mut VecDeque<OpenRequest>| {
             let first = open.pop_front();
             unanswered += usize::from(first.is_some_and(|it| it.heard && heard && !it.left_out));
         };
@@ -79,7 +85,7 @@ impl TopicRequests {
             if open.len() == OPEN {
                 forget(&mut open);
             }
-            open.push_back(Open {
+            open.push_back(OpenRequest {
                 stamp,
                 since: now,
                 heard,
@@ -89,20 +95,20 @@ impl TopicRequests {
         unanswered
     }
 
-    /// Whether a client listens to an output, as far as `listened` knows of topics.
-    pub(crate) fn is_heard(&self, listened: impl Fn(&str) -> bool) -> bool {
+    /// Returns whether a client listens to an output, according to `listened`.
+    pub(crate) fn has_listener(&self, listened: impl Fn(&str) -> bool) -> bool {
         self.pair.outputs.iter().any(|output| listened(output))
     }
 
-    /// A message of the servant on one of the outputs; how long its request took, if it answers one. The first output that
-    /// comes is the answer.
-    pub(crate) fn answered(
+    /// Records a message of the servant on one of the outputs; returns how long its request took if it answers one. The
+    /// first output is the answer.
+    pub(crate) fn record_answer(
         &self,
         of: &MessageType,
         bytes: &[u8],
         now: Instant,
     ) -> Option<Duration> {
-        let stamp = self.key(of, bytes)?;
+        let stamp = self.correlation_key(of, bytes)?;
         let mut open = self.open.lock();
         let at = open.iter().position(|one| one.stamp == stamp)?;
         let took = now.saturating_duration_since(open.remove(at)?.since);
@@ -122,7 +128,7 @@ mod tests {
     const SECOND: Duration = Duration::from_secs(1);
 
     fn pair(by: Correlation) -> TopicRequests {
-        TopicRequests::of(&Pair {
+        TopicRequests::for_pair(&TopicPair {
             input: "/in".to_owned(),
             outputs: vec!["/out".to_owned(), "/view".to_owned()],
             by: Some(by),
@@ -138,7 +144,7 @@ mod tests {
     }
 
     /// A message of a type that begins with a header.
-    fn stamped(secs: u32, nsecs: u32) -> Vec<u8> {
+    fn stamped_message(secs: u32, nsecs: u32) -> Vec<u8> {
         let words = [7, secs, nsecs, 0];
         words.into_iter().flat_map(u32::to_le_bytes).collect()
     }
@@ -148,23 +154,23 @@ mod tests {
         let requests = pair(Correlation::Stamp);
         let of = of_type("Stamped", "std_msgs/Header header\n");
         let began = Instant::now();
-        requests.asked(&of, &stamped(1, 0), began, true);
-        requests.asked(&of, &stamped(0, 2), began + SECOND, true);
-        // Again, and one that nobody has stamped.
-        requests.asked(&of, &stamped(1, 0), began + SECOND, true);
-        requests.asked(&of, &stamped(0, 0), began, true);
+        requests.record_request(&of, &stamped_message(1, 0), began, true);
+        requests.record_request(&of, &stamped_message(0, 2), began + SECOND, true);
+        // A duplicate, and one without a stamp.
+        requests.record_request(&of, &stamped_message(1, 0), began + SECOND, true);
+        requests.record_request(&of, &stamped_message(0, 0), began, true);
         let answered = |secs, nsecs, after: u32| {
-            requests.answered(&of, &stamped(secs, nsecs), began + SECOND * after)
+            requests.record_answer(&of, &stamped_message(secs, nsecs), began + SECOND * after)
         };
         assert_eq!(answered(0, 0, 2), None);
         assert_eq!(answered(9, 9, 2), None, "nobody asked");
         assert_eq!(answered(0, 2, 2), Some(SECOND));
         assert_eq!(answered(1, 0, 3), Some(SECOND * 3));
         assert_eq!(answered(1, 0, 3), None, "it is answered");
-        requests.asked(&of, &stamped(1, 1), began, true);
+        requests.record_request(&of, &stamped_message(1, 1), began, true);
         assert_eq!(answered(1, 1, 60), None, "that is no answer any more");
         // Too short to have a stamp.
-        requests.asked(&of, &stamped(1, 2)[..11], began, true);
+        requests.record_request(&of, &stamped_message(1, 2)[..11], began, true);
         assert!(requests.open.lock().is_empty());
         assert!(requests.is_input("/in") && !requests.is_input("/out"));
         assert!(requests.is_output("/view") && !requests.is_output("/in"));
@@ -175,19 +181,19 @@ mod tests {
         let requests = pair(Correlation::Arrival);
         let of = of_type("Text", "string data\n");
         let began = Instant::now();
-        assert_eq!(requests.answered(&of, b"", began), None);
-        requests.asked(&of, b"", began, true);
-        requests.asked(&of, b"", began + SECOND, true);
+        assert_eq!(requests.record_answer(&of, b"", began), None);
+        requests.record_request(&of, b"", began, true);
+        requests.record_request(&of, b"", began + SECOND, true);
         assert_eq!(
-            requests.answered(&of, b"", began + SECOND * 2),
+            requests.record_answer(&of, b"", began + SECOND * 2),
             Some(SECOND * 2)
         );
-        assert_eq!(requests.answered(&of, b"", began + SECOND * 2), None);
-        // One that is never answered does not stand before others for ever.
-        requests.asked(&of, b"", began, true);
-        requests.asked(&of, b"", began + FORGOTTEN, true);
+        assert_eq!(requests.record_answer(&of, b"", began + SECOND * 2), None);
+        // A request that is never answered does not block others forever.
+        requests.record_request(&of, b"", began, true);
+        requests.record_request(&of, b"", began + FORGOTTEN, true);
         assert_eq!(
-            requests.answered(&of, b"", began + FORGOTTEN + SECOND),
+            requests.record_answer(&of, b"", began + FORGOTTEN + SECOND),
             Some(SECOND)
         );
     }
@@ -198,12 +204,18 @@ mod tests {
         let of = of_type("Stamped", "std_msgs/Header header\n");
         let began = Instant::now();
         for number in 1..=10 * OPEN as u32 {
-            requests.asked(&of, &stamped(number, 0), began, true);
+            requests.record_request(&of, &stamped_message(number, 0), began, true);
         }
         assert_eq!(requests.open.lock().len(), OPEN);
-        let last = stamped(10 * OPEN as u32, 0);
-        assert_eq!(requests.answered(&of, &last, began), Some(Duration::ZERO));
-        assert_eq!(requests.answered(&of, &stamped(1, 0), began), None);
+        let last = stamped_message(10 * OPEN as u32, 0);
+        assert_eq!(
+            requests.record_answer(&of, &last, began),
+            Some(Duration::ZERO)
+        );
+        assert_eq!(
+            requests.record_answer(&of, &stamped_message(1, 0), began),
+            None
+        );
     }
 
     #[test]
@@ -213,17 +225,21 @@ mod tests {
         let began = Instant::now();
         let asked = |secs, after: u32, heard| {
             let now = began + SECOND * after;
-            requests.asked(&of, &stamped(secs, 0), now, heard)
+            requests.record_request(&of, &stamped_message(secs, 0), now, heard)
         };
         for secs in 1..=4 {
             assert_eq!(asked(secs, 0, true), 0);
         }
         assert_eq!(asked(5, 0, false), 0, "nobody would see its answer");
-        // It takes the newest, and has left out those before.
-        assert!(requests.answered(&of, &stamped(3, 0), began).is_some());
+        // The servant takes the newest, and skips those before.
+        assert!(
+            requests
+                .record_answer(&of, &stamped_message(3, 0), began)
+                .is_some()
+        );
         assert_eq!(asked(6, 60, true), 1, "the fourth alone");
         assert_eq!(asked(7, 120, false), 0, "nobody listens any more");
-        // One after the other, too fast for anybody to answer in time.
+        // One after the other, too fast to be answered in time.
         let all = (10..10 + OPEN as u32 + 9).map(|secs| asked(secs, 200, true));
         assert_eq!(all.sum::<usize>(), 9);
     }

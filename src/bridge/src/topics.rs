@@ -1,36 +1,36 @@
-//! What waits for one client on all of its topics, and which of them is next.
+//! Queues of all topics of one client, and the choice of the next one.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use ros::ring::Lost;
-use ros::turns::Turns;
+use ros::ring::DropTally;
+use ros::turns::RoundRobin;
 
-use crate::sample::Sample;
-use crate::topic_queue::{Load, TopicQueue};
+use crate::sample::TopicSample;
+use crate::topic_queue::{QueuedBytes, TopicQueue};
 
-/// Names one topic of one client.
+/// Key of a topic of one client.
 pub(crate) type TopicKey = u64;
 
-/// The topics.
+/// Queues of a client's topics.
 #[derive(Default)]
-pub(crate) struct Topics {
+pub(crate) struct TopicQueues {
     queues: HashMap<TopicKey, TopicQueue>,
     next_key: TopicKey,
-    turns: Turns<TopicKey>,
-    load: Load,
+    turns: RoundRobin<TopicKey>,
+    load: QueuedBytes,
 }
 
-impl Topics {
+impl TopicQueues {
     pub(crate) fn add(&mut self, queue: TopicQueue) -> TopicKey {
         self.next_key += 1;
         self.queues.insert(self.next_key, queue);
         self.next_key
     }
 
-    /// Changes a topic, if it is still there.
-    pub(crate) fn change<R>(
+    /// Updates a topic, if it still exists.
+    pub(crate) fn update<R>(
         &mut self,
         key: TopicKey,
         change: impl FnOnce(&mut TopicQueue) -> R,
@@ -44,31 +44,31 @@ impl Topics {
 
     pub(crate) fn remove(&mut self, key: TopicKey) {
         if let Some(queue) = self.queues.remove(&key) {
-            self.load.replace(queue.load(), Load::default());
+            self.load.replace(queue.load(), QueuedBytes::default());
             self.turns.forget(key);
         }
     }
 
-    /// Of all topics.
-    pub(crate) fn load(&self) -> Load {
+    /// Returns the sum over all topics.
+    pub(crate) fn load(&self) -> QueuedBytes {
         self.load
     }
 
-    /// Gives a topic a turn if something waits there.
+    /// Gives a topic a turn if a message is queued there.
     pub(crate) fn schedule(&mut self, key: TopicKey, now: Instant) {
         let queue = self.queues.get(&key);
         if let Some(due) = queue.and_then(|queue| queue.due(now)) {
-            self.turns.join_at(key, due, now);
+            self.turns.enqueue_at(key, due, now);
         }
     }
 
-    /// The same, where it may be due at another time than before.
+    /// Gives a topic a new turn, since it may be due at another time than before.
     pub(crate) fn reschedule(&mut self, key: TopicKey, now: Instant) {
         self.turns.withdraw(key);
         self.schedule(key, now);
     }
 
-    /// Gives the topic no turn before it is [released](Self::release).
+    /// Gives the topic no turn until it is [released](Self::release).
     pub(crate) fn hold(&mut self, key: TopicKey) {
         if self.queues.contains_key(&key) {
             self.turns.hold(key);
@@ -87,39 +87,42 @@ impl Topics {
         }
     }
 
-    /// The next sample of the topic whose turn it is.
-    pub(crate) fn next(&mut self, now: Instant) -> Option<(TopicKey, Arc<Sample>, &TopicQueue)> {
-        self.turns.wake(now);
+    /// Returns the next sample of the topic whose turn it is.
+    pub(crate) fn next(
+        &mut self,
+        now: Instant,
+    ) -> Option<(TopicKey, Arc<TopicSample>, &TopicQueue)> {
+        self.turns.wake_due(now);
         loop {
             let key = self.turns.take(|_| true)?;
-            if let Some(Some(sample)) = self.change(key, |queue| queue.pop(now)) {
+            if let Some(Some(sample)) = self.update(key, |queue| queue.pop(now)) {
                 self.schedule(key, now);
                 return Some((key, sample, self.queues.get(&key)?));
             }
         }
     }
 
-    /// When a throttle rate lets something through that now waits.
+    /// Returns when a throttle rate lets the next queued message through.
     pub(crate) fn next_due(&self) -> Option<Instant> {
         self.turns.next_due()
     }
 
-    /// Drops a sample of the topic that holds most while there is more than `limit` bytes in all. A topic's only message
-    /// is spared up to four times that: a map larger than the limit must get through, too.
-    pub(crate) fn give_way(&mut self, limit: usize) -> Option<Lost> {
+    /// Drops a sample of the topic that holds most while there are more than `limit` bytes in all. The only message of
+    /// a topic is kept up to four times that: a map larger than the limit must get through, too.
+    pub(crate) fn drop_over_limit(&mut self, limit: usize) -> Option<DropTally> {
         let all = self.load.bytes;
         if all <= limit {
             return None;
         }
         let bytes = self.queues.values().map(|queue| queue.load().bytes);
         let spare_only = all <= limit.saturating_mul(4) || Some(all) == bytes.max();
-        self.drop_largest(|queue| !(spare_only && queue.has_one()))
+        self.drop_largest(|queue| !(spare_only && queue.has_at_most_one()))
     }
 
-    /// Drops a sample of the topic that holds most, of those that `may` lose one.
-    pub(crate) fn drop_largest(&mut self, may: impl Fn(&TopicQueue) -> bool) -> Option<Lost> {
+    /// Drops a sample of the topic that holds most, among those that `may` lose one.
+    pub(crate) fn drop_largest(&mut self, may: impl Fn(&TopicQueue) -> bool) -> Option<DropTally> {
         let candidates = self.queues.iter().filter(|(_, queue)| may(queue));
         let (key, _) = candidates.max_by_key(|(_, queue)| queue.load().bytes)?;
-        self.change(*key, TopicQueue::drop_one)?
+        self.update(*key, TopicQueue::drop_one)?
     }
 }

@@ -1,4 +1,4 @@
-//! Limits of memory, in a hierarchy of budgets. In: requests for a number of bytes. Out: permits, which count these bytes
+//! Memory limits as a hierarchy of budgets. In: requests for a number of bytes. Out: permits, which count these bytes
 //! until they are dropped.
 //!
 //! ```text
@@ -6,8 +6,9 @@
 //!                 │                            └─ a permit: a body being read
 //!                 └─ servant cam-1, 256 MiB ───── a permit: a TCPROS frame being read
 //! ```
-//! A permit counts in its budget and in all budgets above it. If it does not fit in one of them it is refused, and the error
-//! names the budget that is full. What a refusal costs is the caller's decision; other permits are not affected.
+//! A permit counts in its budget and in all of that budget's ancestors. If one of them has no room, the permit is
+//! refused, and the error names the budget that is full. The caller decides what a refusal leads to; other permits are
+//! not affected.
 
 #![forbid(unsafe_code)]
 
@@ -25,71 +26,77 @@ use tokio::sync::Notify;
 pub use json::JsonWeight;
 pub use shares::Shares;
 
-/// Up to this size a single message, body or queue counts in no budget: the number of connections limits their sum.
+/// Size in bytes up to which a single message, body or queue is not counted in any budget: the number of connections
+/// limits their sum.
 pub const UNCOUNTED: usize = 64 * 1024;
 
-/// A limit in bytes, and how many of them are in use. Clones are handles to the same budget.
+/// A limit in bytes and the bytes in use. Clones are handles to the same budget.
 #[derive(Clone)]
 pub struct Budget {
-    node: Arc<Node>,
-    /// Permits of this handle do not count in the budgets above.
+    node: Arc<BudgetNode>,
+    /// Permits of this handle do not count in the ancestors.
     alone: bool,
 }
 
-struct Node {
+struct BudgetNode {
     name: String,
     limit: usize,
     used: AtomicUsize,
     refused: AtomicU64,
-    /// Bytes were given back, here or below.
+    /// Notified when bytes are released, here or in a descendant.
     released: Notify,
     above: Option<Budget>,
-    /// Is told of refusals, here and below.
+    /// Called for refusals, here and in descendants.
     observer: Option<Observer>,
 }
 
-/// Called for each refusal, with the name of the budget that was asked and the error. Must not block.
+/// Callback for each refusal, with the name of the budget that was asked and the error. Must not block.
 pub type Observer = Box<dyn Fn(&str, &Exceeded) + Send + Sync>;
 
-/// Bytes that were asked for and do not fit.
+/// A request for bytes that do not fit into a budget.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{asked} bytes more do not fit into the memory for {name}: {used} of {limit} bytes are in use"
 )]
 pub struct Exceeded {
-    /// Which budget is full.
+    /// Name of the budget that is full.
     pub name: String,
-    /// Bytes that were asked for.
+    /// Bytes requested.
     pub asked: usize,
-    /// Bytes held at that moment.
+    /// Bytes in use at that moment.
     pub used: usize,
-    /// Bytes that may be held.
+    /// Limit of the budget in bytes.
     pub limit: usize,
 }
 
 impl Budget {
-    /// A topmost budget of `limit` bytes. `name` is what errors call it.
+    /// Creates a root budget of `limit` bytes; error messages call it `name`.
     pub fn new(name: impl Into<String>, limit: usize) -> Self {
-        Self::node(name.into(), limit, None, None)
+        Self::from_parts(name.into(), limit, None, None)
     }
 
-    /// The same; `observer` is called for each refusal in it and in budgets below it.
-    pub fn observed(name: impl Into<String>, limit: usize, observer: Observer) -> Self {
-        Self::node(name.into(), limit, None, Some(observer))
+    /// Creates a root budget whose `observer` is called for each refusal, in it and in its descendants.
+    pub fn with_observer(name: impl Into<String>, limit: usize, observer: Observer) -> Self {
+        Self::from_parts(name.into(), limit, None, Some(observer))
     }
 
-    /// A budget of `limit` bytes below this one: its permits count in both.
-    pub fn within(&self, name: impl Into<String>, limit: usize) -> Self {
-        Self::node(name.into(), limit, Some(self.clone()), None)
+    /// Creates a budget of `limit` bytes below this one: its permits count in both.
+    pub fn child(&self, name: impl Into<String>, limit: usize) -> Self {
+        Self::from_parts(name.into(), limit, Some(self.clone()), None)
     }
 
-    /// A budget that refuses nothing.
-    pub fn unlimited() -> Self {
+    /// Creates a budget that never refuses.
+    pub fn without_limit() -> Self {
         Self::new("everything", usize::MAX)
     }
 
-    fn node(name: String, limit: usize, above: Option<Budget>, observer: Option<Observer>) -> Self {
-        Self::from(Arc::new(Node {
+    fn from_parts(
+        name: String,
+        limit: usize,
+        above: Option<Budget>,
+        observer: Option<Observer>,
+    ) -> Self {
+        Self::from(Arc::new(BudgetNode {
             name,
             limit,
             used: AtomicUsize::new(0),
@@ -100,47 +107,48 @@ impl Budget {
         }))
     }
 
-    /// The same budget without those above it. Its permits are for bytes that count above already, because another permit
-    /// holds them: a message that many clients share counts once for the daemon and in the budget of each client.
-    pub fn alone(&self) -> Self {
+    /// Returns a handle to this budget whose permits do not count in its ancestors: for bytes that count there already
+    /// because another permit holds them. A message shared by many clients counts once for the daemon, and once in the
+    /// budget of each client.
+    pub fn without_parents(&self) -> Self {
         Self {
             node: self.node.clone(),
             alone: true,
         }
     }
 
-    /// Its name, as errors call it.
+    /// Returns the name used in error messages.
     pub fn name(&self) -> &str {
         &self.node.name
     }
 
-    /// Its limit in bytes.
+    /// Returns the limit in bytes.
     pub fn limit(&self) -> usize {
         self.node.limit
     }
 
-    /// Bytes of its permits now.
-    pub fn used(&self) -> usize {
+    /// Returns the bytes held by permits now.
+    pub fn used_bytes(&self) -> usize {
         self.node.used.load(Ordering::Relaxed)
     }
 
-    /// How many refusals it has caused.
-    pub fn refused(&self) -> u64 {
+    /// Returns the number of refusals caused by this budget's limit.
+    pub fn refusal_count(&self) -> u64 {
         self.node.refused.load(Ordering::Relaxed)
     }
 
-    /// The most bytes that one permit can hold, when nothing else is held.
-    pub fn most(&self) -> usize {
+    /// Returns the largest permit possible, in bytes, when nothing else is held.
+    pub fn max_permit(&self) -> usize {
         self.chain().map(Budget::limit).min().unwrap_or(0)
     }
 
-    /// Bytes that a permit could be given now.
-    pub fn left(&self) -> usize {
-        let left = |budget: &Budget| budget.limit().saturating_sub(budget.used());
+    /// Returns the bytes that a permit could be granted now.
+    pub fn available(&self) -> usize {
+        let left = |budget: &Budget| budget.limit().saturating_sub(budget.used_bytes());
         self.chain().map(left).min().unwrap_or(0)
     }
 
-    /// A permit for nothing yet.
+    /// Returns an empty permit.
     pub fn permit(&self) -> Permit {
         Permit {
             budget: self.clone(),
@@ -148,37 +156,37 @@ impl Budget {
         }
     }
 
-    /// A permit for `bytes` bytes.
+    /// Takes a permit for `bytes` bytes.
     ///
     /// # Errors
-    /// They do not fit in this budget or in one above.
+    /// Fails if they do not fit into this budget or one of its ancestors.
     pub fn take(&self, bytes: usize) -> Result<Permit, Exceeded> {
         let mut permit = self.permit();
         permit.resize(bytes)?;
         Ok(permit)
     }
 
-    /// A permit for `bytes` bytes, waiting at most for `patience` until they fit.
+    /// Takes a permit for `bytes` bytes, waiting up to `patience` until they fit.
     ///
     /// # Errors
-    /// They did not fit in time; at once if they exceed the limit itself.
+    /// Fails if they do not fit in time; at once if they exceed the limit itself.
     pub async fn wait(&self, bytes: usize, patience: Duration) -> Result<Permit, Exceeded> {
         let mut permit = self.permit();
         permit.wait(bytes, patience).await?;
         Ok(permit)
     }
 
-    /// The next one in which its permits count.
-    fn above(&self) -> Option<&Budget> {
+    /// Returns the parent, if permits of this handle count there.
+    fn parent(&self) -> Option<&Budget> {
         self.node.above.as_ref().filter(|_| !self.alone)
     }
 
-    /// This budget and those above it, upwards.
+    /// Iterates over this budget and its ancestors, from the bottom up.
     fn chain(&self) -> impl Iterator<Item = &Budget> {
-        std::iter::successors(Some(self), |budget| budget.above())
+        std::iter::successors(Some(self), |budget| budget.parent())
     }
 
-    fn add(&self, bytes: usize) -> Result<(), Full> {
+    fn add(&self, bytes: usize) -> Result<(), FullBudget> {
         for (depth, budget) in self.chain().enumerate() {
             let node = &budget.node;
             let more = |used: usize| used.checked_add(bytes).filter(|sum| *sum <= node.limit);
@@ -195,7 +203,7 @@ impl Budget {
                     used,
                     limit: node.limit,
                 };
-                return Err(Full {
+                return Err(FullBudget {
                     at: node.clone(),
                     exceeded,
                 });
@@ -204,10 +212,10 @@ impl Budget {
         Ok(())
     }
 
-    /// Counts and reports a refusal. Budgets are compared by identity: two of them may have the same name.
-    fn report(&self, full: Full) -> Exceeded {
+    /// Counts and reports a refusal. Budgets are compared by identity, since two of them may have the same name.
+    fn report(&self, full: FullBudget) -> Exceeded {
         full.at.refused.fetch_add(1, Ordering::Relaxed);
-        // Those above are told even if nothing is counted there.
+        // Observers of ancestors are called even if nothing is counted there.
         let all = std::iter::successors(Some(self), |budget| budget.node.above.as_ref());
         for observer in all.filter_map(|budget| budget.node.observer.as_ref()) {
             observer(self.name(), &full.exceeded);
@@ -225,14 +233,14 @@ impl Budget {
     }
 }
 
-/// Where bytes did not fit.
-struct Full {
-    at: Arc<Node>,
+/// The budget that was full, and the error to report.
+struct FullBudget {
+    at: Arc<BudgetNode>,
     exceeded: Exceeded,
 }
 
-impl From<Arc<Node>> for Budget {
-    fn from(node: Arc<Node>) -> Self {
+impl From<Arc<BudgetNode>> for Budget {
+    fn from(node: Arc<BudgetNode>) -> Self {
         Self { node, alone: false }
     }
 }
@@ -242,7 +250,7 @@ impl fmt::Debug for Budget {
         formatter
             .debug_struct("Budget")
             .field("name", &self.name())
-            .field("used", &self.used())
+            .field("used", &self.used_bytes())
             .field("limit", &self.limit())
             .finish_non_exhaustive()
     }
@@ -256,21 +264,21 @@ pub struct Permit {
 }
 
 impl Permit {
-    /// Its size in bytes.
+    /// Returns the size in bytes.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Sets its size to `bytes`.
+    /// Changes the size to `bytes`.
     ///
     /// # Errors
-    /// More bytes do not fit; it keeps its size. Fewer bytes always succeed.
+    /// Fails if additional bytes do not fit; the size then stays as it is. Shrinking always succeeds.
     pub fn resize(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.try_resize(bytes)
             .map_err(|full| self.budget.report(full))
     }
 
-    fn try_resize(&mut self, bytes: usize) -> Result<(), Full> {
+    fn try_resize(&mut self, bytes: usize) -> Result<(), FullBudget> {
         match bytes.checked_sub(self.bytes) {
             Some(0) => {}
             Some(more) => self.budget.add(more)?,
@@ -280,16 +288,16 @@ impl Permit {
         Ok(())
     }
 
-    /// Grows it to `bytes`; fewer bytes than it has change nothing.
+    /// Grows the permit to `bytes`; does nothing if it is that large already.
     pub fn grow_to(&mut self, bytes: usize) -> Result<(), Exceeded> {
         self.resize(bytes.max(self.bytes))
     }
 
-    /// Sets its size for something that holds `bytes` bytes and changes often, such as a queue: in steps of [`UNCOUNTED`], and
-    /// zero up to there, so that most changes touch no budget.
+    /// Sets the size for something that holds `bytes` bytes and changes often, such as a queue: in steps of
+    /// [`UNCOUNTED`], and zero up to the first step, so that most changes touch no budget.
     ///
     /// # Errors
-    /// More bytes do not fit; it keeps its size.
+    /// Fails if additional bytes do not fit; the size then stays as it is.
     pub fn count(&mut self, bytes: usize) -> Result<(), Exceeded> {
         let steps = match bytes {
             0..=UNCOUNTED => 0,
@@ -298,35 +306,35 @@ impl Permit {
         self.resize(steps)
     }
 
-    /// Divides it in two that together count as it did: one in its budget alone, one in the budgets above (none for a
-    /// topmost budget).
+    /// Splits the permit into two that together count like this one: one for its own budget alone, and one for the
+    /// ancestors (`None` for a root budget).
     pub fn split(mut self) -> (Permit, Option<Permit>) {
         let bytes = std::mem::take(&mut self.bytes);
-        let above = self.budget.above().cloned();
+        let above = self.budget.parent().cloned();
         let alone = Permit {
-            budget: self.budget.alone(),
+            budget: self.budget.without_parents(),
             bytes,
         };
         (alone, above.map(|budget| Permit { budget, bytes }))
     }
 
-    /// These bytes, which hold the permit until the last handle to any part of them is dropped.
-    pub fn around(self, bytes: impl AsRef<[u8]> + Send + 'static) -> Bytes {
-        Bytes::from_owner(Counted {
+    /// Wraps `bytes` so that the permit is held until the last handle to any slice of them is dropped.
+    pub fn wrap_bytes(self, bytes: impl AsRef<[u8]> + Send + 'static) -> Bytes {
+        Bytes::from_owner(BytesWithPermit {
             bytes,
             _permit: self,
         })
     }
 
-    /// Grows it to `bytes`, waiting at most for `patience` until others have given back enough.
+    /// Grows the permit to `bytes`, waiting up to `patience` until others have released enough.
     pub async fn wait(&mut self, bytes: usize, patience: Duration) -> Result<(), Exceeded> {
         let deadline = tokio::time::Instant::now() + patience;
-        let never = bytes > self.budget.most();
-        // Whatever can make room stands below the topmost of them, and tells it, too.
+        let never = bytes > self.budget.max_permit();
+        // Every budget that can make room is a descendant of the root, which is notified as well.
         let top = self.budget.chain().last().unwrap_or(&self.budget).clone();
         loop {
             let mut released = Box::pin(top.node.released.notified());
-            // Before looking: what is given back in between is not missed.
+            // Registered before trying, so that no release in between is missed.
             released.as_mut().enable();
             let Err(full) = self.try_resize(bytes.max(self.bytes)) else {
                 return Ok(());
@@ -338,12 +346,12 @@ impl Permit {
     }
 }
 
-struct Counted<B> {
+struct BytesWithPermit<B> {
     bytes: B,
     _permit: Permit,
 }
 
-impl<B: AsRef<[u8]>> AsRef<[u8]> for Counted<B> {
+impl<B: AsRef<[u8]>> AsRef<[u8]> for BytesWithPermit<B> {
     fn as_ref(&self) -> &[u8] {
         self.bytes.as_ref()
     }

@@ -1,24 +1,24 @@
-//! Budgets by name, such as one for each client.
+//! Budgets by name, such as one per client.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 
-use crate::{Budget, Node};
+use crate::{Budget, BudgetNode};
 
-/// One budget for each name, all of the same size, below a common budget. A name's budget exists for as long as there is
-/// a handle or a permit of it.
+/// One budget per name, all of the same size, below a common parent. A name's budget exists for as long as there is a
+/// handle to it or a permit of it.
 #[derive(Debug)]
 pub struct Shares {
     whole: Budget,
     what: &'static str,
     each: usize,
-    known: Mutex<HashMap<String, Weak<Node>>>,
+    known: Mutex<HashMap<String, Weak<BudgetNode>>>,
 }
 
 impl Shares {
-    /// Budgets of `each` bytes below `whole`; their names begin with `what` (such as "client").
+    /// Creates a set of budgets of `each` bytes below `whole`; their names start with `what` (such as "client").
     pub fn new(whole: &Budget, what: &'static str, each: usize) -> Self {
         Self {
             whole: whole.clone(),
@@ -28,21 +28,19 @@ impl Shares {
         }
     }
 
-    /// The budget of this name.
-    pub fn of(&self, name: &str) -> Budget {
+    /// Returns the budget for `name`, creating it if necessary.
+    pub fn for_name(&self, name: &str) -> Budget {
         let mut known = self.known.lock();
         if let Some(node) = known.get(name).and_then(Weak::upgrade) {
             return Budget::from(node);
         }
         known.retain(|_, node| node.strong_count() > 0);
-        let budget = self
-            .whole
-            .within(format!("{} {name}", self.what), self.each);
+        let budget = self.whole.child(format!("{} {name}", self.what), self.each);
         known.insert(name.to_owned(), Arc::downgrade(&budget.node));
         budget
     }
 
-    /// How many names have a budget now.
+    /// Returns the number of names that have a budget now.
     pub fn len(&self) -> usize {
         let known = self.known.lock();
         known
@@ -51,13 +49,13 @@ impl Shares {
             .count()
     }
 
-    /// Whether no name has a budget now.
+    /// Returns whether no name has a budget now.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-impl std::fmt::Debug for Node {
+impl std::fmt::Debug for BudgetNode {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.write_str(&self.name)
     }

@@ -1,61 +1,61 @@
 use crate::names::NameError;
 
-/// Why something of the catalogue cannot be had or changed.
+/// Errors of reading or changing the catalogue.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No such service.
-    #[error("there is no service {name:?}")]
+    /// The service does not exist.
+    #[error("no service {name:?}")]
     UnknownService {
-        /// Asked for.
+        /// Name that was requested.
         name: String,
-        /// Names that exist.
+        /// Services that exist.
         exists: Vec<String>,
     },
-    /// No such revision.
+    /// The revision does not exist.
     #[error("service {service} has no revision {revision}")]
     UnknownRevision {
-        /// The service.
+        /// Name of the service.
         service: String,
-        /// Asked for.
+        /// Revision that was requested.
         revision: String,
-        /// Names that exist.
+        /// Revisions that exist.
         exists: Vec<String>,
     },
-    /// No such image or blob.
-    #[error("there is no {what} in the image store")]
+    /// The image or blob does not exist.
+    #[error("no {what} in the image store")]
     UnknownImage {
-        /// Asked for.
+        /// Image or blob that was requested.
         what: String,
     },
-    /// No stub can be made of it.
-    #[error("there is no stub of {service}: {reason}")]
+    /// The stub cannot be built.
+    #[error("no stub of {service}: {reason}")]
     NoStub {
-        /// The service.
+        /// Name of the service.
         service: String,
-        /// The reason.
+        /// Reason.
         reason: String,
     },
-    /// The robot's program is not held for an architecture.
-    #[error("this server holds no cloudroid-stub for {asked:?}")]
+    /// The robot's program is not installed for this architecture.
+    #[error("this server has no cloudroid-stub for {asked:?}")]
     UnknownArchitecture {
-        /// Asked for.
+        /// Architecture that was requested.
         asked: String,
-        /// Names that exist.
+        /// Architectures that are installed.
         exists: Vec<String>,
     },
-    /// A name that cannot be given.
+    /// Invalid name.
     #[error(transparent)]
     Name(#[from] NameError),
-    /// What an image holds cannot be read.
+    /// The content of an image cannot be read.
     #[error(transparent)]
     Inventory(package::Error),
-    /// The state database.
+    /// Error of the state database.
     #[error(transparent)]
     State(#[from] store::Error),
-    /// The image store.
+    /// Error of the image store.
     #[error("the image store: {0}")]
     Image(#[from] image::Error),
-    /// A task of the daemon broke.
-    #[error("the daemon failed at {0}; its log says more")]
+    /// A task of the daemon panicked.
+    #[error("internal error of the daemon while {0}; see its log")]
     Internal(&'static str),
 }

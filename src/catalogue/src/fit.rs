@@ -1,14 +1,16 @@
-//! A stub is made of one revision and may meet a later one: it goes on unless what it relies on is different.
+//! Compatibility of a stub with a later revision than the one it was built from: it remains usable unless the interface
+//! that it relies on has changed.
 
 use package::difference::Difference;
 
 use store::{RevisionRecord, State};
 
-/// How many differences are named.
+/// Maximum number of differences named in an error.
 const NAMED: usize = 8;
 
-/// Whether a stub that was made of revision `made_of`, with this image, can use `now`; or why not and what to do.
-pub fn fits(
+/// Checks whether a stub built from revision `made_of`, with this image, is compatible with `now`. Otherwise returns
+/// the incompatible differences and the next step.
+pub fn check_stub_compatibility(
     state: &State,
     now: &RevisionRecord,
     made_of: Option<u64>,
@@ -23,12 +25,12 @@ pub fn fits(
         .map_err(|error| error.to_string())?;
     let Some(earlier) = earlier.filter(|earlier| earlier.image == image) else {
         tracing::warn!(
-            "a stub of {service} was made of revision {number} of another server: whether it fits revision {} is not known",
+            "a stub of {service} was made from revision {number} of another server, so it may not match revision {}",
             now.number
         );
         return Ok(());
     };
-    let difference = Difference::between(&earlier.interface, &now.interface);
+    let difference = Difference::compare(&earlier.interface, &now.interface);
     if difference.compatible() {
         return Ok(());
     }
@@ -43,8 +45,9 @@ pub fn fits(
         words.push(format!("{more} more"));
     }
     Err(format!(
-        "service {service} is at revision {}, this robot's stub was made of revision {number}, and they differ: {}; \
-         install the stub again from /stubs/{service}.tar.gz, or have the server go back: cloudroidctl rollback {service} {number}",
+        "service {service} is at revision {}, but this robot's stub was made from revision {number}, and they differ: \
+            {}; install the stub again from /stubs/{service}.tar.gz, or roll the server back: cloudroidctl rollback \
+            {service} {number}",
         now.number,
         words.join("; "),
     ))
@@ -98,14 +101,19 @@ mod tests {
                 .publish(revision, &Default::default())
                 .expect("published");
         }
-        let fits = |now: usize, image: &str| super::fits(&state, &all[now], Some(1), image);
+        let fits = |now: usize, image: &str| {
+            super::check_stub_compatibility(&state, &all[now], Some(1), image)
+        };
         assert_eq!(fits(1, "sha256:1"), Ok(()), "something is new");
         let refused = fits(2, "sha256:1").expect_err("something is gone");
         assert!(
-            refused.contains("output topic /a is gone") && refused.contains("/stubs/s.tar.gz"),
+            refused.contains("output topic /a was removed") && refused.contains("/stubs/s.tar.gz"),
             "{refused}"
         );
         assert_eq!(fits(2, "sha256:of another server"), Ok(()));
-        assert_eq!(super::fits(&state, &all[2], None, ""), Ok(()));
+        assert_eq!(
+            super::check_stub_compatibility(&state, &all[2], None, ""),
+            Ok(())
+        );
     }
 }

@@ -1,12 +1,12 @@
-//! What the images of revisions hold, as recorded when they were published. Of a revision that an earlier version of this
-//! program published it is recorded when it is first asked for.
+//! Inventories of the images of revisions, recorded at publication. For a revision published by an earlier version of
+//! this program the inventory is recorded when it is first requested.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Weak};
 
 use image::Store;
-use package::inventory::{Inventory, Published};
+use package::inventory::{Inventory, SearchHints};
 use parking_lot::Mutex;
 use ros::flavour::Flavour;
 use ros::schema::Registry;
@@ -14,41 +14,44 @@ use store::{RevisionRecord, State};
 
 use crate::{Catalogue, Error, blocking};
 
-/// The image's label that names its base.
+/// Image label that names the base.
 const BASE: &str = "org.cloudroid.base";
 
-/// What is known of a revision beyond its record.
+/// Inventory and message definitions of a revision.
 #[derive(Debug, Clone, Default)]
-pub struct Known {
-    /// What its image holds.
+pub struct RevisionContents {
+    /// Inventory of the revision's image.
     pub inventory: Arc<Inventory>,
-    /// All message definitions that its servants know: its interface's, and those in its image.
+    /// Message definitions known to its servants: those of the interface, and those in the image.
     pub registry: Arc<Registry>,
 }
 
-/// Of revisions in use, by service and number.
-pub(crate) type InUse = Mutex<HashMap<(String, u64), (Weak<Inventory>, Weak<Registry>)>>;
+/// Cached contents of revisions in use, by service and revision number.
+pub(crate) type ContentsCache = Mutex<HashMap<(String, u64), (Weak<Inventory>, Weak<Registry>)>>;
 
 impl Catalogue {
-    /// What is known of a revision.
-    pub async fn known(&self, revision: &RevisionRecord) -> Result<Known, Error> {
+    /// Returns the contents of a revision.
+    pub async fn revision_contents(
+        &self,
+        revision: &RevisionRecord,
+    ) -> Result<RevisionContents, Error> {
         let key = (revision.service.clone(), revision.number);
         if let Some((inventory, registry)) = self.in_use.lock().get(&key)
             && let (Some(inventory), Some(registry)) = (inventory.upgrade(), registry.upgrade())
         {
-            return Ok(Known {
+            return Ok(RevisionContents {
                 inventory,
                 registry,
             });
         }
         let inventory = Arc::new(self.inventory(revision).await?);
-        let registry = Registry::of(revision.flavour.ros.bus());
-        // The interface's own come last and win: they were compared with the running node.
+        let registry = Registry::for_version(revision.flavour.ros.ros_version());
+        // Definitions of the interface are inserted last and take precedence: they were compared with the running node.
         let texts = inventory.definitions.iter();
         for (key, text) in texts.chain(&revision.interface.definitions) {
             if let Err(error) = registry.insert(key, text) {
                 tracing::debug!(
-                    "the definition {key} of {} is unusable: {error}",
+                    "invalid message definition {key} of {}: {error}",
                     revision.service
                 );
             }
@@ -58,21 +61,21 @@ impl Catalogue {
         in_use.retain(|_, (_, registry)| registry.strong_count() > 0);
         let weak = (Arc::downgrade(&inventory), Arc::downgrade(&registry));
         in_use.insert(key, weak);
-        Ok(Known {
+        Ok(RevisionContents {
             inventory,
             registry,
         })
     }
 
-    /// Records what the images of current revisions hold where an earlier version of this program did not, so that no
-    /// robot waits for that.
-    pub async fn complete(&self) -> Result<(), Error> {
-        for line in self.state.incomplete()? {
+    /// Records the missing inventories of current revisions that were published by an earlier version of this program,
+    /// so that no robot has to wait for it.
+    pub async fn record_missing_inventories(&self) -> Result<(), Error> {
+        for line in self.state.revisions_without_inventory()? {
             if let Some(revision) = self.state.revision(&line.service, line.number)?
                 && let Err(error) = self.inventory(&revision).await
             {
                 tracing::warn!(
-                    "what the image of revision {} of {} holds cannot be found out: {error}",
+                    "cannot inspect the image of revision {} of {}: {error}",
                     line.number,
                     line.service
                 );
@@ -87,44 +90,50 @@ impl Catalogue {
         }
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let revision = revision.clone();
-        blocking("looking into an image", move || {
-            found(&state, &store, &revision)
+        blocking("inspecting an image", move || {
+            take_inventory(&state, &store, &revision)
         })
         .await
     }
 }
 
-/// Looks into the image of a revision, and records what is there. Blocking.
-fn found(state: &State, store: &Store, revision: &RevisionRecord) -> Result<Inventory, Error> {
+/// Takes the inventory of a revision's image and records it. Blocking.
+fn take_inventory(
+    state: &State,
+    store: &Store,
+    revision: &RevisionRecord,
+) -> Result<Inventory, Error> {
     let nodes = revision.plan.nodes.iter();
     let commands: Vec<&[String]> = nodes.map(|node| node.argv.as_slice()).collect();
-    let of = Published {
+    let of = SearchHints {
         package: &revision.package,
         environment: &revision.plan.environment,
         commands: &commands,
     };
     let layers = layers(store, &revision.image)?;
-    let taken = privilege::reading(|| Inventory::take(&layers, of));
+    let taken = privilege::run_as_reader(|| Inventory::scan(&layers, of));
     let inventory = taken.map_err(Error::Inventory)?;
     let labels = store.image(&digest(&revision.image)?)?.spec.labels;
     let mut flavour = Flavour::default();
     flavour.base = labels.get(BASE).cloned().unwrap_or(flavour.base);
-    // It serves all the same; the next one looks again.
-    if let Err(error) = state.complete(&revision.service, revision.number, &flavour, &inventory) {
+    // A failure is not fatal: the inventory is taken again at the next request.
+    if let Err(error) =
+        state.record_inventory(&revision.service, revision.number, &flavour, &inventory)
+    {
         tracing::warn!(
-            "what the image of {} holds is not recorded: {error}",
+            "cannot record the contents of the image of {}: {error}",
             revision.service
         );
     }
     Ok(inventory)
 }
 
-/// The extracted layers of an image, lowest first.
+/// Returns the extracted layers of an image, lowest first.
 pub(crate) fn layers(store: &Store, image: &str) -> Result<Vec<PathBuf>, Error> {
     let layers = store.image(&digest(image)?)?.spec.layers;
     Ok(layers
         .iter()
-        .map(|layer| store.extracted(&layer.diff_id))
+        .map(|layer| store.ensure_extracted(&layer.diff_id))
         .collect::<Result<_, _>>()?)
 }
 
@@ -153,7 +162,7 @@ pub(crate) mod tests {
         std::fs::set_permissions(path, PermissionsExt::from_mode(mode)).expect("set");
     }
 
-    /// A catalogue with the image of a package, and a revision of it that is not published yet.
+    /// Creates a catalogue with the image of a package, and a revision of it that is not published yet.
     pub(crate) fn catalogue(place: &Path) -> (Catalogue, RevisionRecord) {
         let tree = place.join("tree");
         write(&tree, "usr/share/p/package.xml", "<package/>", 0o644);
@@ -206,14 +215,20 @@ pub(crate) mod tests {
         };
         let published = catalogue.publish(revision.clone(), recorded.clone()).await;
         assert_eq!(published.expect("published"), 1);
-        // Nothing of the image is there any more.
+        // The image has been removed.
         std::fs::remove_dir_all(place.path().join("layers")).expect("removed");
         std::fs::remove_dir_all(place.path().join("images")).expect("removed");
-        let known = catalogue.known(&revision).await.expect("recorded");
+        let known = catalogue
+            .revision_contents(&revision)
+            .await
+            .expect("recorded");
         assert_eq!(*known.inventory, recorded);
         known.registry.message("p/Other").expect("defined");
-        // Servants of a revision share what is known of it.
-        let again = catalogue.known(&revision).await.expect("recorded");
+        // Servants of the same revision share its contents.
+        let again = catalogue
+            .revision_contents(&revision)
+            .await
+            .expect("recorded");
         assert!(Arc::ptr_eq(&known.registry, &again.registry));
     }
 
@@ -229,15 +244,23 @@ pub(crate) mod tests {
                 database.execute("UPDATE revisions SET inventory = NULL, flavour = NULL", [])
             })
             .expect("as it was before");
-        catalogue.complete().await.expect("completed");
+        catalogue
+            .record_missing_inventories()
+            .await
+            .expect("completed");
         let state = &catalogue.state;
         let inventory = state.inventory("serves", 1).expect("readable");
         let inventory = inventory.expect("recorded");
         assert_eq!(inventory.programs["node"], "/usr/lib/p/node");
         assert_eq!(inventory.packages["p"].share, "/usr/share/p");
         assert!(inventory.definitions.contains_key("p/msg/Said"));
-        let revision = catalogue.current("serves").expect("there");
+        let revision = catalogue.current_revision("serves").expect("there");
         assert_eq!(revision.flavour.base, "lab-ros1");
-        assert!(state.incomplete().expect("readable").is_empty());
+        assert!(
+            state
+                .revisions_without_inventory()
+                .expect("readable")
+                .is_empty()
+        );
     }
 }

@@ -1,8 +1,8 @@
-//! What is published: the servant repository (images and the revisions made of them) and the stub repository (archives
-//! that robots install in a package's place, composed of both).
+//! The catalogue of published services: the servant repository (images and the revisions built from them) and the stub
+//! repository (archives that robots install in place of a package, composed from both).
 //!
 //! ```text
-//!  push ──revision──▶ Catalogue ─┬─ state database: the revision, its plan, its interface, what its image holds
+//!  push ──revision──▶ Catalogue ─┬─ state database: the revision, its plan, interface, and image inventory
 //!                                └─ image store: tags follow the database
 //!  choreographer ◀── current revision, layers, programs, message definitions
 //!  portal        ◀── stubs, images, interfaces
@@ -24,45 +24,45 @@ use std::sync::Arc;
 use store::{RevisionRecord, State};
 
 pub use error::Error;
-pub use inventory::Known;
-pub use publish::{RolledBack, Withdrawn};
+pub use inventory::RevisionContents;
+pub use publish::{RollbackResult, WithdrawnService};
 
-use inventory::InUse;
+use inventory::ContentsCache;
 
-/// Services, their revisions, and what these are made of.
+/// Published services and their revisions, backed by the state database and the image store.
 pub struct Catalogue {
     state: Arc<State>,
     images: Arc<image::Store>,
-    in_use: InUse,
+    in_use: ContentsCache,
 }
 
 impl Catalogue {
-    /// What this database and this image store hold.
+    /// Creates a catalogue on a state database and an image store.
     pub fn new(state: Arc<State>, images: Arc<image::Store>) -> Catalogue {
         Catalogue {
             state,
             images,
-            in_use: InUse::default(),
+            in_use: ContentsCache::default(),
         }
     }
 
-    /// The images.
+    /// Returns the image store.
     pub fn images(&self) -> &Arc<image::Store> {
         &self.images
     }
 
-    /// The current revision of a service that exists.
-    pub fn current(&self, service: &str) -> Result<Arc<RevisionRecord>, Error> {
-        match self.state.current(service)? {
+    /// Returns the current revision of a service.
+    pub fn current_revision(&self, service: &str) -> Result<Arc<RevisionRecord>, Error> {
+        match self.state.current_revision(service)? {
             Some(revision) => Ok(revision),
-            None => Err(self.unknown(service)?),
+            None => Err(self.unknown_service(service)?),
         }
     }
 
-    /// One revision of a service.
+    /// Returns a revision of a service.
     ///
     /// # Errors
-    /// [`Error::UnknownRevision`] with those that there are.
+    /// [`Error::UnknownRevision`] with the revisions that exist.
     pub fn revision(&self, service: &str, number: u64) -> Result<Arc<RevisionRecord>, Error> {
         match self.state.revision(service, number)? {
             Some(revision) => Ok(revision),
@@ -77,13 +77,13 @@ impl Catalogue {
         }
     }
 
-    /// The ROS package that a service was first made of.
-    pub fn package(&self, service: &str) -> Result<Option<String>, Error> {
+    /// Returns the ROS package that a service was first built from.
+    pub fn service_package(&self, service: &str) -> Result<Option<String>, Error> {
         Ok(self.state.service_package(service)?)
     }
 
-    /// Writes rows of a service's dictionary where it has none; whether it had none.
-    pub fn take_over_rows(
+    /// Writes the rows of a service's dictionary if it is empty; returns whether it was.
+    pub fn initialize_dictionary(
         &self,
         service: &str,
         rows: &api::dictionary::NewRows,
@@ -91,30 +91,31 @@ impl Catalogue {
         if !self.state.dictionary(service)?.is_empty() {
             return Ok(false);
         }
-        let revision = self.current(service)?.number;
+        let revision = self.current_revision(service)?.number;
         self.state.write_dictionary(service, revision, rows)?;
         Ok(true)
     }
 
-    /// Whether a stub that was made of revision `made_of`, with this image, can use `now`; or why not and what to do.
-    pub fn fits(
+    /// Checks whether a stub built from revision `made_of`, with this image, is compatible with `now`. Otherwise
+    /// returns the incompatible differences and the next step.
+    pub fn check_stub_compatibility(
         &self,
         now: &RevisionRecord,
         made_of: Option<u64>,
         image: &str,
     ) -> Result<(), String> {
-        fit::fits(&self.state, now, made_of, image)
+        fit::check_stub_compatibility(&self.state, now, made_of, image)
     }
 
-    /// The refusal of a service that does not exist: it names those that do.
-    pub fn unknown(&self, service: &str) -> Result<Error, Error> {
+    /// Returns the error for a service that does not exist, naming those that do.
+    pub fn unknown_service(&self, service: &str) -> Result<Error, Error> {
         Ok(Error::UnknownService {
             name: service.to_owned(),
             exists: self.state.service_names()?,
         })
     }
 
-    /// The extracted layers of an image, lowest first.
+    /// Returns the extracted layers of an image, lowest first.
     pub async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, Error> {
         let (images, digest) = (Arc::clone(&self.images), image.to_owned());
         blocking("extracting layers", move || {
@@ -124,12 +125,12 @@ impl Catalogue {
     }
 }
 
-/// Runs `work`, which blocks and needs files of the image store, where it may have them; `what` names it where it breaks.
+/// Runs blocking `work` with access to the files of the image store; `what` names it in the error if it panics.
 async fn blocking<T: Send + 'static>(
     what: &'static str,
     work: impl FnOnce() -> Result<T, Error> + Send + 'static,
 ) -> Result<T, Error> {
-    privilege::blocking(work)
+    privilege::spawn_blocking(work)
         .await
         .map_err(|_| Error::Internal(what))?
 }

@@ -1,34 +1,34 @@
-//! Which names may be given: to services (they become paths on the portal, repositories under `/v2/` and parts of
-//! container names) and to robots.
+//! Validation of the names of services (used as paths on the portal, as repositories under `/v2/`, and in container
+//! names) and of robots.
 
-/// First path segments that the portal keeps for itself.
+/// First path segments reserved by the portal.
 pub const RESERVED: [&str; 7] = [
     "api", "v2", "stubs", "metrics", "healthz", "assets", "foxglove",
 ];
 
-/// A name that cannot be given.
+/// An invalid name.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum NameError {
-    /// Not in the form that a service's name has.
+    /// Malformed service name.
     #[error(
         "{0:?} cannot name a service: use 1 to 63 lower-case letters, digits, `_` and `-`, \
          beginning with a letter and not ending with `_` or `-`"
     )]
     Service(String),
-    /// The portal serves something else there.
+    /// Path reserved by the portal.
     #[error(
         "{0:?} is a reserved name: the portal serves something else at that path; choose another with --name"
     )]
     Reserved(String),
-    /// Not in the form that a robot's name has.
+    /// Malformed robot name.
     #[error(
         "{0:?} cannot name a robot: use 1 to 64 letters, digits, `.`, `_` and `-`, beginning with a letter or digit"
     )]
     Robot(String),
 }
 
-/// Accepts a service's name.
-pub fn service(name: &str) -> Result<(), NameError> {
+/// Validates the name of a service.
+pub fn validate_service(name: &str) -> Result<(), NameError> {
     let inner = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_' || c == '-';
     let well_formed = name.len() <= 63
         && name.starts_with(|c: char| c.is_ascii_lowercase())
@@ -43,8 +43,8 @@ pub fn service(name: &str) -> Result<(), NameError> {
     Ok(())
 }
 
-/// Accepts a robot's name.
-pub fn robot(name: &str) -> Result<(), NameError> {
+/// Validates the name of a robot.
+pub fn validate_robot(name: &str) -> Result<(), NameError> {
     let inner = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '-');
     let well_formed = (1..=64).contains(&name.len())
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
@@ -56,7 +56,7 @@ pub fn robot(name: &str) -> Result<(), NameError> {
     }
 }
 
-/// An id for a servant of `service`: its name as a host name allows it, and something random.
+/// Generates an id for a servant of `service`: the service name as a valid host name, followed by random characters.
 pub fn servant_id(service: &str) -> String {
     let mut id: String = service
         .chars()
@@ -68,7 +68,7 @@ pub fn servant_id(service: &str) -> String {
     id
 }
 
-/// `length` random characters of `[a-z0-9]`.
+/// Generates `length` random characters of `[a-z0-9]`.
 pub fn random(length: usize) -> String {
     use rand::Rng;
     const ALPHABET: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
@@ -85,7 +85,7 @@ mod tests {
     #[test]
     fn ros_package_names_name_services() {
         for name in ["opencv_apps", "image-proc", "a", "slam2d"] {
-            assert_eq!(service(name), Ok(()), "{name}");
+            assert_eq!(validate_service(name), Ok(()), "{name}");
         }
     }
 
@@ -95,24 +95,30 @@ mod tests {
         for name in [
             "", "Image", "2d", "a/b", "..", "a b", "a_", "-a", "é", "a.b", &long,
         ] {
-            assert_eq!(service(name), Err(NameError::Service(name.to_owned())));
+            assert_eq!(
+                validate_service(name),
+                Err(NameError::Service(name.to_owned()))
+            );
         }
     }
 
     #[test]
     fn the_portals_own_paths_are_reserved() {
         for name in RESERVED {
-            assert_eq!(service(name), Err(NameError::Reserved(name.to_owned())));
+            assert_eq!(
+                validate_service(name),
+                Err(NameError::Reserved(name.to_owned()))
+            );
         }
     }
 
     #[test]
     fn robots_are_named_more_freely() {
         for name in ["r1", "Turtlebot.3_b-2", "0"] {
-            assert_eq!(robot(name), Ok(()), "{name}");
+            assert_eq!(validate_robot(name), Ok(()), "{name}");
         }
         for name in ["", "a b", "../x", "a/b", "-x", ".", &"r".repeat(65)] {
-            assert_eq!(robot(name), Err(NameError::Robot(name.to_owned())));
+            assert_eq!(validate_robot(name), Err(NameError::Robot(name.to_owned())));
         }
     }
 

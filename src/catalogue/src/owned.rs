@@ -1,4 +1,4 @@
-//! What the services of one owner take on the disk.
+//! Disk usage of the images of one owner.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,9 +9,9 @@ use crate::inventory::digest;
 use crate::{Catalogue, Error, blocking};
 
 impl Catalogue {
-    /// Bytes of the layers of all images of a deployer's services, compressed, each layer once; with those of `image`, which need not be
-    /// published yet.
-    pub async fn bytes_of(&self, owner: &str, image: Option<&str>) -> Result<u64, Error> {
+    /// Returns the compressed size of the layers of all images of a deployer's services, counting each layer once,
+    /// including those of `image`, which need not be published yet.
+    pub async fn owner_image_bytes(&self, owner: &str, image: Option<&str>) -> Result<u64, Error> {
         let (state, images) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let (owner, image) = (owner.to_owned(), image.map(str::to_owned));
         blocking("counting a deployer's images", move || {
@@ -34,7 +34,7 @@ impl Catalogue {
     }
 }
 
-/// Adds the layers of an image, if it is there.
+/// Adds the layers of an image, if it exists.
 fn add_layers(store: &Store, image: &str, layers: &mut BTreeMap<Digest, u64>) -> Result<(), Error> {
     match store.image(&digest(image)?) {
         Ok(found) => {
@@ -62,7 +62,7 @@ mod tests {
         let images = catalogue.images();
         let first = images.image(&digest(&revision.image).expect("one"));
         let shared = first.expect("there").spec.layers[0];
-        // Another image on the same layer.
+        // Another image on top of the same layer.
         let tree = place.path().join("other");
         std::fs::create_dir_all(tree.join("opt")).expect("made");
         let own = images.layer_from_tree(&tree, &TreeOptions::default());
@@ -73,7 +73,7 @@ mod tests {
         };
         let other = images.put_image(&spec).expect("written").to_string();
         let taken = async |owner: &str, image: Option<&str>| {
-            let bytes = catalogue.bytes_of(owner, image).await;
+            let bytes = catalogue.owner_image_bytes(owner, image).await;
             bytes.expect("counted")
         };
         for (service, owner) in [
@@ -90,7 +90,7 @@ mod tests {
         }
         assert_eq!(taken("ann", None).await, shared.size);
         assert_eq!(taken("ann", Some(&other)).await, shared.size + own.size);
-        // Revisions before the current one count, too.
+        // Earlier revisions count as well.
         let mut record = revision.clone();
         (record.service, record.image) = ("one".to_owned(), other);
         let published = catalogue.publish(record, Inventory::default()).await;

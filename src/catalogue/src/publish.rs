@@ -1,52 +1,52 @@
-//! Makes a revision the current one, goes back to an earlier one, takes a service away, and keeps image store and
-//! database of one mind. The database decides; tags follow it.
+//! Publishes revisions, rolls back, removes services, and keeps the image store consistent with the database. The
+//! database is authoritative; tags follow it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use image::{Digest, Store};
 use package::inventory::Inventory;
-use store::{RevisionLine, RevisionRecord};
+use store::{RevisionRecord, RevisionSummary};
 
 use crate::inventory::digest;
 use crate::{Catalogue, Error, blocking};
 
-/// A service that went back (or on) to another revision.
+/// Result of a rollback.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RolledBack {
-    /// The revision that was the current one.
+pub struct RollbackResult {
+    /// Revision that was current before.
     pub from: u64,
-    /// The revision that is the current one now.
+    /// Revision that is current now.
     pub to: u64,
 }
 
-/// A service that is not in the database any more, and whose images are still tagged.
+/// A service that has been removed from the database and whose images are still tagged.
 #[derive(Debug)]
-pub struct Withdrawn {
+pub struct WithdrawnService {
     service: String,
-    revisions: Vec<RevisionLine>,
+    revisions: Vec<RevisionSummary>,
 }
 
 impl Catalogue {
-    /// Writes the revision; from here on it is what new servants are started from. Gives its number.
+    /// Publishes a revision and makes it the current one, from which new servants are started. Returns its number.
     pub async fn publish(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
     ) -> Result<u64, Error> {
-        self.publish_as(record, inventory, true).await
+        self.publish_revision(record, inventory, true).await
     }
 
-    /// Writes the revision beside the one that new servants are started from. Gives its number.
-    pub async fn publish_beside(
+    /// Publishes a revision without making it the current one. Returns its number.
+    pub async fn publish_inactive(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
     ) -> Result<u64, Error> {
-        self.publish_as(record, inventory, false).await
+        self.publish_revision(record, inventory, false).await
     }
 
-    async fn publish_as(
+    async fn publish_revision(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
@@ -54,13 +54,14 @@ impl Catalogue {
     ) -> Result<u64, Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("publishing", move || {
-            let number = match current {
-                true => state.publish(&record, &inventory)?,
-                false => state.publish_beside(&record, &inventory)?,
+            let number = if current {
+                state.publish(&record, &inventory)?
+            } else {
+                state.publish_inactive(&record, &inventory)?
             };
-            // A crash before these is repaired at the next start.
+            // If the daemon crashes before these, the tags are repaired at the next start.
             tag(&store, &record.service, number, &record.image)?;
-            if let Some(current) = state.current(&record.service)? {
+            if let Some(current) = state.current_revision(&record.service)? {
                 tag_current(&store, &record.service, &current.image)?;
             }
             Ok(number)
@@ -68,9 +69,9 @@ impl Catalogue {
         .await
     }
 
-    /// Makes the revision of the number `wanted` the current one; without a number the one before.
-    pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<RolledBack, Error> {
-        let current = self.current(name)?;
+    /// Makes revision `wanted` the current one, or the previous revision if `None`.
+    pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<RollbackResult, Error> {
+        let current = self.current_revision(name)?;
         let revisions = self.state.revisions(name)?;
         let target = match wanted {
             Some(number) => revisions.iter().find(|revision| revision.number == number),
@@ -94,17 +95,18 @@ impl Catalogue {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let to = target.number;
         blocking("rolling back", move || {
-            state.set_current(&target.service, target.number)?;
+            state.set_current_revision(&target.service, target.number)?;
             tag_current(&store, &target.service, &target.image)
         })
         .await?;
-        Ok(RolledBack {
+        Ok(RollbackResult {
             from: current.number,
             to,
         })
     }
 
-    /// Makes revision `to` the current one where `from` is it, or `to` itself; false where another one is, which stays.
+    /// Makes revision `to` the current one if the current one is `from` or `to`; otherwise changes nothing and returns
+    /// false.
     pub async fn promote(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         let service = service.to_owned();
@@ -113,7 +115,7 @@ impl Catalogue {
             let Some(target) = target else {
                 return Ok(false);
             };
-            if !state.replace_current(&service, from, to)? {
+            if !state.replace_current_revision(&service, from, to)? {
                 return Ok(false);
             }
             tag_current(&store, &service, &target.image)?;
@@ -122,22 +124,22 @@ impl Catalogue {
         .await
     }
 
-    /// Takes a service out of the database: nobody is given a servant of it any more. Its images stay until
+    /// Removes a service from the database, so that no new servants of it are started. Its images stay until
     /// [`untag`](Self::untag).
-    pub fn withdraw(&self, service: &str) -> Result<Withdrawn, Error> {
+    pub fn withdraw(&self, service: &str) -> Result<WithdrawnService, Error> {
         let revisions = self.state.revisions(service)?;
         self.state.remove_service(service)?;
-        Ok(Withdrawn {
+        Ok(WithdrawnService {
             service: service.to_owned(),
             revisions,
         })
     }
 
-    /// Gives up the images of a service that was withdrawn, and whose servants have ended.
-    pub async fn untag(&self, withdrawn: Withdrawn) -> Result<(), Error> {
+    /// Removes the tags of a withdrawn service whose servants have ended.
+    pub async fn untag(&self, withdrawn: WithdrawnService) -> Result<(), Error> {
         let store = Arc::clone(&self.images);
         blocking("removing a service", move || {
-            let Withdrawn { service, revisions } = withdrawn;
+            let WithdrawnService { service, revisions } = withdrawn;
             store.untag(&service)?;
             for revision in revisions {
                 store.untag(&format!("{service}:{}", revision.number))?;
@@ -147,12 +149,12 @@ impl Catalogue {
         .await
     }
 
-    /// Makes the tags say what the database says: a crash may have come between.
-    pub async fn repair(&self) -> Result<(), Error> {
+    /// Makes the tags consistent with the database after a crash.
+    pub async fn repair_tags(&self) -> Result<(), Error> {
         let (state, store) = (Arc::clone(&self.state), Arc::clone(&self.images));
         blocking("repairing the image store", move || {
             let tagged = store.tags()?;
-            // Each change of a tag writes the index anew, and robots wait for all of them.
+            // Every change of a tag rewrites the index, which delays the start for all robots.
             let keep = |name: &str, image: &str| match tagged.get(name) {
                 Some(known) if *known == digest(image)? => Ok(()),
                 _ => set_tag(&store, name, image),
@@ -164,7 +166,7 @@ impl Catalogue {
                 wanted.insert(name);
             }
             for service in state.service_names()? {
-                if let Some(current) = state.current(&service)? {
+                if let Some(current) = state.current_revision(&service)? {
                     keep(&service, &current.image)?;
                 }
                 wanted.insert(service);
@@ -177,24 +179,24 @@ impl Catalogue {
         .await
     }
 
-    /// Removes what nothing needs: what has no tag and is not in `keep`. A failure is logged alone.
+    /// Removes images that have no tag and are not in `keep`. A failure is only logged.
     pub async fn collect_garbage(&self, keep: BTreeSet<Digest>) {
         let store = Arc::clone(&self.images);
         match blocking("collecting garbage", move || Ok(store.gc(&keep)?)).await {
             Ok(swept) if swept.blobs + swept.trees + swept.leftovers > 0 => {
                 tracing::info!(
-                    "removed {} blobs and {} trees that nothing needs",
+                    "removed {} unused blobs and {} unused trees",
                     swept.blobs,
                     swept.trees
                 );
             }
             Ok(_) => {}
-            Err(error) => tracing::warn!("garbage could not be collected: {error}"),
+            Err(error) => tracing::warn!("cannot collect garbage: {error}"),
         }
     }
 }
 
-/// A tag that cannot be set because its image is gone is told, and is no reason not to start.
+/// A tag that cannot be set because its image is missing is logged; it does not prevent the daemon from starting.
 fn tag(store: &Store, service: &str, number: u64, image: &str) -> Result<(), Error> {
     set_tag(store, &format!("{service}:{number}"), image)
 }

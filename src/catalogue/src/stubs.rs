@@ -1,16 +1,16 @@
-//! Stubs of published services: composed from the image and the interface, packed with the robot's program.
+//! Stub archives of published services: composed from the image and the interface, and packed with the robot's program.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
-use api::stub::{ARCHITECTURES, architecture};
+use api::stub::{ARCHITECTURES, parse_architecture};
 use flate2::{Compression, GzBuilder};
 use package::inventory::Inventory;
 use package::stub::{
-    About, Answered, Content, Contents, Files, MANIFEST, PROGRAM, Portal, SIGNATURE, SIGNER,
-    compose, manifest,
+    Content, Contents, Files, MANIFEST, PROGRAM, Portal, ProgramRequest, SIGNATURE, SIGNER,
+    StubInfo, compose, manifest,
 };
 use ros::bus::RosVersion;
 use ros::remaps::Remaps;
@@ -21,55 +21,55 @@ use tar::{EntryType, Header};
 
 use crate::{Error, inventory};
 
-/// The time of every file: the same input gives the same archive.
+/// Modification time of all files, so that the same input gives the same archive.
 const MTIME: u64 = 1_700_000_000;
 
-/// The robot's program, for each architecture that there is one for: `stubs/ARCHITECTURE/cloudroid-stub` beside
-/// this program or where it is installed.
-pub struct Programs {
-    found: Vec<Program>,
+/// The robot's program for each installed architecture: `stubs/ARCHITECTURE/cloudroid-stub` beside this program or in
+/// its installation directories.
+pub struct StubPrograms {
+    found: Vec<StubProgram>,
 }
 
-/// A program of a stub.
-pub struct Program {
-    /// As in [`ARCHITECTURES`].
+/// The robot's program for one architecture.
+pub struct StubProgram {
+    /// One of [`ARCHITECTURES`].
     pub architecture: &'static str,
     path: PathBuf,
 }
 
-impl Programs {
-    /// Looks for them. They may be added while the daemon runs.
-    pub fn look() -> Programs {
+impl StubPrograms {
+    /// Finds the installed programs. They may be added while the daemon runs.
+    pub fn find_installed() -> StubPrograms {
         let beside = std::env::current_exe()
             .ok()
             .and_then(|path| Some(path.parent()?.to_owned()));
         let installed = ["/usr/local/lib/cloudroid", "/usr/lib/cloudroid"].map(PathBuf::from);
         let places: Vec<PathBuf> = beside.into_iter().chain(installed).collect();
-        Self::below(&places)
+        Self::find_in(&places)
     }
 
-    fn below(places: &[PathBuf]) -> Programs {
+    fn find_in(places: &[PathBuf]) -> StubPrograms {
         let find = |architecture: &'static str| {
             let of = |place: &PathBuf| place.join("stubs").join(architecture).join(PROGRAM);
             let path = places.iter().map(of).find(|path| path.is_file())?;
-            Some(Program { architecture, path })
+            Some(StubProgram { architecture, path })
         };
-        Programs {
+        StubPrograms {
             found: ARCHITECTURES.into_iter().filter_map(find).collect(),
         }
     }
 
-    /// Architectures for which there is a program.
-    pub fn held(&self) -> Vec<String> {
+    /// Returns the architectures for which a program is installed.
+    pub fn architectures(&self) -> Vec<String> {
         self.found
             .iter()
             .map(|program| program.architecture.to_owned())
             .collect()
     }
 
-    /// Architectures for which there is no program.
-    pub fn lacking(&self) -> Vec<String> {
-        let held = self.held();
+    /// Returns the supported architectures for which no program is installed.
+    pub fn missing_architectures(&self) -> Vec<String> {
+        let held = self.architectures();
         ARCHITECTURES
             .into_iter()
             .map(str::to_owned)
@@ -77,11 +77,11 @@ impl Programs {
             .collect()
     }
 
-    /// The one for an architecture; none: this machine's.
-    pub fn of(self, asked: Option<&str>) -> Result<Program, Error> {
+    /// Returns the program for an architecture; `None` means that of this machine.
+    pub fn for_architecture(self, asked: Option<&str>) -> Result<StubProgram, Error> {
         let asked = asked.unwrap_or(std::env::consts::ARCH);
-        let exists = self.held();
-        let wanted = architecture(asked);
+        let exists = self.architectures();
+        let wanted = parse_architecture(asked);
         self.found
             .into_iter()
             .find(|program| Some(program.architecture) == wanted)
@@ -92,7 +92,7 @@ impl Programs {
     }
 }
 
-/// `HOST` or `HOST:PORT`, nothing that a file or script could misunderstand.
+/// Returns whether a text is `HOST` or `HOST:PORT` without characters that are special in files or scripts.
 pub fn is_authority(text: &str) -> bool {
     !text.is_empty()
         && text
@@ -100,8 +100,8 @@ pub fn is_authority(text: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "-._:[]".contains(c))
 }
 
-/// The files of a revision's stub, but for the robot's program.
-pub fn files(
+/// Returns the files of a revision's stub, except the robot's program.
+pub fn compose_files(
     store: &image::Store,
     revision: &RevisionRecord,
     inventory: &Inventory,
@@ -117,8 +117,8 @@ pub fn files(
         Some(package) => Contents::read(&layers, package).map_err(no_stub)?,
         None => Contents::default(),
     };
-    let about = About {
-        ros: revision.flavour.ros.bus(),
+    let about = StubInfo {
+        ros: revision.flavour.ros.ros_version(),
         service: &revision.service,
         package: &revision.package,
         revision: revision.number,
@@ -126,30 +126,31 @@ pub fn files(
         portal,
         architecture,
         outsourced: &inventory.programs.keys().cloned().collect(),
-        names: &names(revision, inventory),
+        names: &node_names(revision, inventory),
         interface: &revision.interface,
         stateful: revision.plan.stateful,
-        requests: &requests(revision, inventory),
-        times: times(&revision.plan.sla),
+        requests: &request_pairs(revision, inventory),
+        times: response_times(&revision.plan.sla),
     };
     compose(&about, contents).map_err(no_stub)
 }
 
-/// What nodes of ROS 2 are called by their programs, where each runs once, or once without being told a name; of a program of several nodes the first. A
-/// robot's launch files seldom name its nodes, and parameters files go by what those are called. With the namespace where the program gives one (`/camera/detector`), and not where the push has:
-/// a robot has its own. ROS 1's always name them.
-fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
+/// Returns the names that ROS 2 programs give their own nodes, for programs that run once, or once without an explicit
+/// name; for a program of several nodes, the name of the first. A robot's launch files seldom name its nodes, and its
+/// parameter files refer to these names. The namespace is included if the program sets it (`/camera/detector`), not if
+/// the push did, since a robot has its own. ROS 1 programs always name their nodes.
+fn node_names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, String> {
     let mut names = BTreeMap::new();
-    if revision.flavour.ros.bus() == RosVersion::One {
+    if revision.flavour.ros.ros_version() == RosVersion::One {
         return names;
     }
     for (program, path) in &inventory.programs {
         let nodes = revision.plan.nodes.iter();
         let nodes: Vec<_> = nodes.filter(|node| node.argv.contains(path)).collect();
-        if let Some(node) = arguments::named_by_program(nodes, |node| &node.argv) {
+        if let Some(node) = arguments::node_for_stub(nodes, |node| &node.argv) {
             let name = match node.name.rsplit_once('/') {
                 Some(("", name)) => name,
-                Some((_, name)) if arguments::gives_namespace(&node.argv) => name,
+                Some((_, name)) if arguments::sets_namespace(&node.argv) => name,
                 _ => &node.name,
             };
             names.insert(program.clone(), name.to_owned());
@@ -158,11 +159,11 @@ fn names(revision: &RevisionRecord, inventory: &Inventory) -> BTreeMap<String, S
     names
 }
 
-/// Which inputs are answered by which outputs, as programs call them: a robot remaps its nodes otherwise than the push
-/// did. Those of a publication that says nothing of them are decided now.
-fn requests(revision: &RevisionRecord, inventory: &Inventory) -> Vec<Answered> {
-    let ros = revision.flavour.ros.bus();
-    let mut answered: Vec<Answered> = Vec::new();
+/// Returns the request pairs with topics as the programs name them, since a robot's remappings differ from those of the
+/// push. For a revision published without request pairs they are decided now.
+fn request_pairs(revision: &RevisionRecord, inventory: &Inventory) -> Vec<ProgramRequest> {
+    let ros = revision.flavour.ros.ros_version();
+    let mut answered: Vec<ProgramRequest> = Vec::new();
     for request in revision.interface.decided_requests(ros) {
         let node = revision
             .plan
@@ -174,11 +175,11 @@ fn requests(revision: &RevisionRecord, inventory: &Inventory) -> Vec<Answered> {
             programs.find(|(_, path)| node.argv.contains(path))
         });
         let remaps = node
-            .map(|node| Remaps::of(ros, node.argv.get(1..).unwrap_or_default(), &node.name))
+            .map(|node| Remaps::parse(ros, node.argv.get(1..).unwrap_or_default(), &node.name))
             .unwrap_or_default();
-        let one = Answered {
+        let one = ProgramRequest {
             program: program.map(|(name, _)| name.clone()),
-            request: request.pair.renamed(|name| remaps.undo(name).to_owned()),
+            request: request.pair.map_names(|name| remaps.undo(name).to_owned()),
             node: request.node,
         };
         if !answered.contains(&one) {
@@ -188,30 +189,30 @@ fn requests(revision: &RevisionRecord, inventory: &Inventory) -> Vec<Answered> {
     answered
 }
 
-/// T_desire and T_max in seconds; where one of them is given it is both.
-fn times(sla: &api::Sla) -> Option<(f64, f64)> {
+/// Returns T_desire and T_max in seconds; if only one is given, it is used for both.
+fn response_times(sla: &api::Sla) -> Option<(f64, f64)> {
     let (desire, max) = (sla.rrt.or(sla.max_rrt)?, sla.max_rrt.or(sla.rrt)?);
     Some((desire.as_seconds(), max.as_seconds()))
 }
 
-/// A packed stub.
+/// A packed stub archive.
 pub struct Archive {
-    /// It, from its beginning; the file is gone when it is closed.
+    /// Archive, positioned at its start; the file is deleted when closed.
     pub file: File,
-    /// Its signature, of [`api::stub::ARCHIVE`].
+    /// Signature in the namespace [`api::stub::ARCHIVE`].
     pub signature: String,
 }
 
-/// The archive of a revision's stub.
-pub fn archive(
+/// Builds the archive of a revision's stub.
+pub fn build_archive(
     store: &image::Store,
     revision: &RevisionRecord,
     inventory: &Inventory,
-    program: &Program,
+    program: &StubProgram,
     portal: &Portal,
     key: &SigningKey,
 ) -> Result<Archive, Error> {
-    let mut files = files(store, revision, inventory, program.architecture, portal)?;
+    let mut files = compose_files(store, revision, inventory, program.architecture, portal)?;
     let failed = |error: std::io::Error| Error::NoStub {
         service: revision.service.clone(),
         reason: format!("it could not be packed: {error}"),
@@ -261,13 +262,13 @@ fn pack(service: &str, mut files: Files, key: &SigningKey) -> std::io::Result<Ar
     })
 }
 
-/// Adds the key, the list of all files, and its signature.
+/// Adds the public key, the list of all files, and the list's signature.
 fn sign_all(files: &mut Files, key: &SigningKey) -> std::io::Result<()> {
     let plain = |text: String| Content::File {
         bytes: text.into_bytes(),
         executable: false,
     };
-    let signer = format!("{}\n", key.public().signer());
+    let signer = format!("{}\n", key.public_key().allowed_signers_line());
     files.insert(SIGNER.to_owned(), plain(signer));
     let list = manifest(files);
     let signature = key.sign(api::stub::CONTENTS, &sign::digest(&mut list.as_bytes())?);
@@ -276,7 +277,7 @@ fn sign_all(files: &mut Files, key: &SigningKey) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Every directory that these paths are in, each after its parent.
+/// Returns all parent directories of the paths, each after its own parent.
 fn directories<'a>(paths: impl Iterator<Item = &'a String>) -> BTreeSet<String> {
     let mut directories = BTreeSet::from([String::new()]);
     for path in paths {
@@ -311,7 +312,7 @@ mod tests {
 
     use super::*;
 
-    fn packed(key: &SigningKey) -> (Vec<u8>, String) {
+    fn pack_example(key: &SigningKey) -> (Vec<u8>, String) {
         let executable = true;
         let node = Content::File {
             bytes: b"#!/bin/sh".to_vec(),
@@ -379,16 +380,16 @@ mod tests {
                 .into(),
             ..Inventory::default()
         };
-        // What runs twice says nothing of its own name, unless one of them was told no other.
+        // A program that runs twice does not determine a name, unless only one of its nodes was left unnamed.
         let expected = [
             ("camera_node", "camera"),
             ("duet", "alto"),
             ("gripper", "/arm/gripper"),
         ];
         let expected = expected.map(|(program, node)| (program.to_owned(), node.to_owned()));
-        assert_eq!(names(&revision, &inventory), expected.into());
+        assert_eq!(node_names(&revision, &inventory), expected.into());
         revision.flavour.ros = Version::Ros1;
-        assert!(names(&revision, &inventory).is_empty());
+        assert!(node_names(&revision, &inventory).is_empty());
     }
 
     #[test]
@@ -428,7 +429,7 @@ mod tests {
                 }],
                 ..Plan::default()
             },
-            // Of an earlier release: nothing is decided in it.
+            // Published by an earlier release, without request pairs.
             interface: Interface {
                 topics: vec![
                     topic("/camera", Direction::Input),
@@ -442,21 +443,21 @@ mod tests {
             programs: [("find".to_owned(), "/opt/p/lib/p/find".to_owned())].into(),
             ..Inventory::default()
         };
-        let expected = Answered {
+        let expected = ProgramRequest {
             node: "/left/finder".into(),
             program: Some("find".into()),
             request: "/left/image -> /left/finder/found by arrival"
                 .parse()
                 .expect("a pair"),
         };
-        assert_eq!(requests(&revision, &inventory), [expected]);
+        assert_eq!(request_pairs(&revision, &inventory), [expected]);
     }
 
     #[test]
     fn the_same_files_make_the_same_archive_and_each_has_its_mode() {
         let (key, _) = SigningKey::generate().expect("made");
-        let (bytes, signature) = packed(&key);
-        assert_eq!((bytes.clone(), signature), packed(&key));
+        let (bytes, signature) = pack_example(&key);
+        assert_eq!((bytes.clone(), signature), pack_example(&key));
         let mut archive = tar::Archive::new(flate2::read::GzDecoder::new(&bytes[..]));
         let entries: Vec<(String, u32)> = archive
             .entries()
@@ -487,10 +488,11 @@ mod tests {
     #[test]
     fn an_archive_is_signed_as_such() {
         let (key, _) = SigningKey::generate().expect("made");
-        let (mut bytes, signature) = packed(&key);
+        let (mut bytes, signature) = pack_example(&key);
         let verify = |bytes: &[u8]| {
             let digest = sign::digest(&mut &*bytes).expect("read");
-            key.public().verify(api::stub::ARCHIVE, &digest, &signature)
+            key.public_key()
+                .verify(api::stub::ARCHIVE, &digest, &signature)
         };
         verify(&bytes).expect("signed");
         bytes.pop();
@@ -503,17 +505,17 @@ mod tests {
         let directory = place.path().join("stubs/aarch64");
         std::fs::create_dir_all(&directory).expect("made");
         std::fs::write(directory.join(PROGRAM), "").expect("written");
-        let look = || Programs::below(&[place.path().to_owned()]);
-        assert_eq!(look().held(), ["aarch64"]);
-        assert_eq!(look().lacking(), ["x86_64", "armv7"]);
+        let look = || StubPrograms::find_in(&[place.path().to_owned()]);
+        assert_eq!(look().architectures(), ["aarch64"]);
+        assert_eq!(look().missing_architectures(), ["x86_64", "armv7"]);
         assert_eq!(
             look()
-                .of(Some("arm64"))
+                .for_architecture(Some("arm64"))
                 .ok()
                 .map(|program| program.architecture),
             Some("aarch64")
         );
-        let refused = look().of(Some("riscv64")).err();
+        let refused = look().for_architecture(Some("riscv64")).err();
         assert!(
             matches!(&refused, Some(Error::UnknownArchitecture { exists, .. }) if *exists == ["aarch64"]),
             "{refused:?}"

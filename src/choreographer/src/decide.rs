@@ -1,35 +1,35 @@
-//! Decides which servants live, where and with what, by pure functions: of what is, of what is asked, and of the time, to what
-//! is to be done, with the reason. None reads a clock, holds a lock or waits, and all types are plain data. The tasks of
-//! [`crate::lives`] collect the facts, ask, and carry the answer out.
+//! Decides which servants live, where and with what, by pure functions of the current state, the request and the time;
+//! they return what is to be done, with the reason. None of them reads a clock, holds a lock or waits, and all types
+//! are plain data. The tasks of [`crate::lives`] collect the facts, call these functions, and carry the decisions out.
 //!
-//! | file | decides | from |
-//! |---|---|---|
-//! | [`demand`] | what a servant gets and is promised | the limits that were asked for; what is set aside without |
-//! | [`dictionary`] | which row of a service's dictionary a goal of an SLA takes | rows, auxiliary parameters, caps |
-//! | [`measured`] | auxiliary parameters of a robot that does not state them | how large what it sends is, the keys of rows |
-//! | [`told`] | which refusals are told of | when which robots were refused |
-//! | [`terms`] | which limits a robot's servant is promised | what the robot states, classes, the service, caps |
-//! | [`placement`] | which servant a robot is given, and which one ends for it | its servant, the published revision, the warm pool |
-//! | [`admission`] | who is admitted, waits or is refused; whether a promise may change | capacity, promises, the queue and its priorities |
-//! | [`capacity`] | which idle servants end for those who wait, which pushes give way | what they lack, all servants |
-//! | [`stall`] | whether the machine admits anybody | what the kernel tells of memory and swap |
-//! | [`controller`] | `cpu.max` and `cpu.weight` of servants at work | promises, measured times, what is used and held up |
-//! | [`fit`] | whether one more servant would fit, and what that costs | the same as admission; what others use |
-//! | [`shares`] | who gets how much of what does not suffice | a floor and a wish of each |
-//! | [`lifetime`] | whether a servant can be used, and whether it is still needed | its stage, its interface, its connections, the time |
-//! | [`nodes`] | restart, go on or fail when a node has ended | how it ended, how often before, the nodes left |
-//! | [`calibration`] | at which limits a service is measured, and which rows of the dictionary follow | what was measured |
-//! | [`group`] | how many servants answer the robots that share a service | their requests, how long these take, bounds, the time |
-//! | [`back_off`] | when a servant that failed may be started again | how often in a row, how long it was ready |
-//! | [`rollout`] | which robots a new revision serves first, when it is taken back or promoted | its terms, what was seen of both revisions |
-//! | [`requests`] | on which topics robots ask and are answered | the interface |
-//! | [`shadow`] | what a candidate answers as the present revision does, and what not | the answers of both, what may differ |
-//! | [`hung`] | whether nodes hang | what went to them and came from them, T_max |
-//! | [`warm_pool`] | how many containers each service has ahead, in which the nodes run, which end | what is published, what was asked for last, the forecast, a budget |
-//! | [`forecast`] | how many robots are about to ask | when robots asked |
-//! | [`adoption`] | what becomes of a container that an earlier daemon left | what the database says of it |
+//! | module | decides |
+//! |---|---|
+//! | [`demand`] | the limits of a servant and its promise |
+//! | [`dictionary`] | which row of a service's dictionary a goal of an SLA takes |
+//! | [`measured`] | auxiliary parameters of a robot that does not state them, from the size of its messages |
+//! | [`told`] | which refusals are reported |
+//! | [`terms`] | the limits promised to a robot's servant |
+//! | [`placement`] | which servant a robot gets, and which one ends for it |
+//! | [`admission`] | who is admitted, waits or is refused; whether a promise may change |
+//! | [`capacity`] | which idle servants end, and which pushes give way, for waiting requests |
+//! | [`stall`] | whether the machine stalls and admits nobody, from the kernel's memory pressure |
+//! | [`controller`] | `cpu.max` and `cpu.weight` of running servants |
+//! | [`fit`] | whether one more servant would fit, and what that costs |
+//! | [`shares`] | max-min fair shares of a scarce resource |
+//! | [`lifetime`] | whether a servant can be used, and whether it is still needed |
+//! | [`nodes`] | restart, continue or fail after the exit of a node |
+//! | [`calibration`] | at which limits a service is measured, and which dictionary rows follow |
+//! | [`group`] | how many servants answer the robots that share a service |
+//! | [`back_off`] | when a failed servant may be started again |
+//! | [`rollout`] | which robots get a new revision first; when it is rolled back or promoted |
+//! | [`requests`] | on which topics robots send requests and receive answers |
+//! | [`shadow`] | in what the answers of a candidate differ from the present revision's |
+//! | [`hung`] | whether nodes hang |
+//! | [`warm_pool`] | how many containers each service has in advance, which of them have nodes, which end |
+//! | [`forecast`] | how many robots are about to ask |
+//! | [`adoption`] | the fate of a container that an earlier daemon left |
 //!
-//! What is decided under the choreographer's lock, or the queue's, is recorded under the same lock.
+//! A decision made under the choreographer's lock, or the admission queue's, is recorded under the same lock.
 
 pub(crate) mod admission;
 pub(crate) mod adoption;
@@ -65,28 +65,28 @@ use api::Millis;
 
 pub use amount::Amount;
 
-/// A servant that lives, as decisions about several of them see it.
+/// A live servant, as seen by decisions about several servants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Servant<'a> {
-    /// Its id.
+pub(crate) struct ServantFacts<'a> {
+    /// Id of the servant.
     pub(crate) id: &'a str,
-    /// The revision that it was started from.
+    /// Revision that it was started from.
     pub(crate) revision: u64,
-    /// Connections that use it.
+    /// Number of connections to it.
     pub(crate) connections: usize,
-    /// What it is promised; none before it is admitted.
+    /// Capacity promised to it; `None` before it is admitted.
     pub(crate) promised: Option<Amount>,
-    /// When it is ended if nobody connects before; none where somebody is connected.
+    /// Time at which it is ended unless a client connects; `None` while one is connected.
     pub(crate) idle_until: Option<Millis>,
-    /// Its end has been asked for.
+    /// The end of the servant has been requested.
     pub(crate) ending: bool,
 }
 
-/// A servant, or a container of the warm pool, is to end.
+/// Order to end a servant or a container of the warm pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct End<'a> {
-    /// Its id.
+pub(crate) struct StopOrder<'a> {
+    /// Id of the servant or container.
     pub(crate) id: &'a str,
-    /// The reason, for people.
+    /// Human-readable reason.
     pub(crate) reason: &'static str,
 }

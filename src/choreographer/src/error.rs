@@ -1,68 +1,70 @@
 use api::Size;
 
-use crate::decide::admission::Refused;
-use crate::decide::terms::Untenable;
+use crate::decide::admission::AdmissionError;
+use crate::decide::terms::TermsError;
 
-/// Nodes of one robot whose stubs may state something: what they say is kept, and written down, for as long as the servant lives.
+/// Maximum number of nodes of one robot whose stubs may state something: statements are kept and stored for as long as
+/// the servant lives.
 pub(crate) const STATING: usize = 64;
 
-/// Why a servant is not resized.
+/// The error of a servant that is not resized.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Unchanged {
-    /// On no terms.
+pub enum ResizeError {
+    /// The terms cannot be granted.
     #[error(transparent)]
-    Untenable(Untenable),
-    /// There is no room for more.
+    Untenable(TermsError),
+    /// There is no capacity for more.
     #[error(transparent)]
-    Full(Refused),
-    /// It would be killed for want of memory.
-    #[error("it uses {used} of memory, which is more than the {wanted} that it would have")]
+    Full(AdmissionError),
+    /// The servant would be killed for lack of memory.
+    #[error("it uses {used} of memory, more than the new limit {wanted}")]
     Used {
-        /// What it uses.
+        /// Memory in use.
         used: Size,
-        /// What it would have.
+        /// Memory limit that it would get.
         wanted: Size,
     },
-    /// Too many clients of one robot state something.
-    #[error("{STATING} nodes of its robot have stated something already")]
+    /// Too many clients of the robot have stated something.
+    #[error("{STATING} nodes of its robot already have requests")]
     Many,
 }
 
-/// Why a servant cannot be had, used or changed.
+/// The error of a servant that cannot be started, used or changed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No such servant.
-    #[error("there is no servant {id:?}")]
+    /// No servant has this id.
+    #[error("no servant {id:?}")]
     UnknownServant {
-        /// Asked for.
+        /// The requested id.
         id: String,
-        /// Names that exist.
+        /// Existing ids.
         exists: Vec<String>,
     },
-    /// There is no room.
+    /// There is no capacity.
     #[error(transparent)]
-    Full(#[from] Refused),
-    /// What the robot states cannot be had.
+    Full(#[from] AdmissionError),
+    /// The robot's terms cannot be granted.
     #[error(transparent)]
-    Terms(#[from] Untenable),
-    /// What the robot states anew cannot be had by the servant that it has, which stays as it is.
+    Terms(#[from] TermsError),
+    /// The robot's new statement cannot be applied to its existing servant, which stays unchanged.
     #[error("servant {servant} of {service} cannot be resized for {stated}: {reason}")]
     NotResized {
-        /// Its id.
+        /// Id of the servant.
         servant: String,
-        /// Its service.
+        /// The service.
         service: String,
-        /// What was stated.
+        /// The new statement.
         stated: String,
-        /// What stood against it.
-        reason: Box<Unchanged>,
+        /// The reason.
+        reason: Box<ResizeError>,
     },
-    /// It has no container of its own.
+    /// The servant is a place in a group and has no container of its own.
     #[error(
-        "{id} is the place of robot {robot} at {service}, which robots share: it has no container, and what it uses is its servants'"
+        "{id} is the reservation of robot {robot} at the shared service {service}: it has no container; look at the \
+            service's servants instead"
     )]
     Place {
-        /// Its id.
+        /// Id of the servant.
         id: String,
         /// The service.
         service: String,
@@ -72,18 +74,19 @@ pub enum Error {
     /// The servant could not be started, or ended.
     #[error("the servant of {service} for robot {robot} {reason}")]
     Servant {
-        /// Its service.
+        /// The service.
         service: String,
-        /// Its robot.
+        /// The robot.
         robot: String,
-        /// What happened, beginning with a verb.
+        /// The failure, as a phrase that starts with a verb.
         reason: String,
         /// Last lines of its log.
         log: Vec<String>,
     },
-    /// Its servants have failed again and again.
+    /// The robot's servants have failed repeatedly.
     #[error(
-        "servants of {service} for robot {robot} have failed {failures} times in a row (the last one {reason}); the next is started in {} s at the earliest",
+        "servants of {service} for robot {robot} have failed {failures} times in a row (last: {reason}); next start in \
+            {} s at the earliest",
         crate::decide::back_off::seconds(*again)
     )]
     BackOff {
@@ -91,60 +94,60 @@ pub enum Error {
         service: String,
         /// The robot.
         robot: String,
-        /// How often.
+        /// Number of failures in a row.
         failures: u32,
-        /// What happened last, beginning with a verb.
+        /// The last failure, as a phrase that starts with a verb.
         reason: String,
-        /// After this time it may ask again.
+        /// Time after which the robot may ask again.
         again: std::time::Duration,
     },
-    /// The service was never on its way to another revision.
-    #[error("{0} is on its way to no other revision, nor was it")]
+    /// The service never had a rollout.
+    #[error("{0} has no rollout")]
     NoRollout(String),
-    /// A rollout cannot be begun or changed so.
+    /// The rollout cannot be started or changed.
     #[error("{0}")]
     Rollout(String),
-    /// The daemon is ending.
-    #[error("the daemon is ending")]
+    /// The daemon is shutting down.
+    #[error("the daemon is shutting down")]
     Ending,
-    /// A service cannot be calibrated so.
+    /// The service cannot be calibrated.
     #[error("{0}")]
     Calibration(String),
-    /// A servant that is measured needed more memory than it was to be measured with.
+    /// A calibrated servant needed more memory than allowed.
     #[error(
-        "{service} needs more than {memory} of memory: the kernel has ended it{}",
-        if *ready { " at its requests" } else { " while it started" }
+        "{service} needs more than {memory} of memory: the kernel killed it{}",
+        if *ready { " during its requests" } else { " while it started" }
     )]
     OutOfMemory {
         /// The service.
         service: String,
-        /// What it may use.
+        /// The memory limit.
         memory: api::Size,
-        /// It had started.
+        /// The servant had become ready.
         ready: bool,
     },
-    /// A revision cannot be compared so with what a robot uses.
+    /// The revision cannot be compared with what a robot uses.
     #[error("{0}")]
     Shadow(String),
-    /// What is published.
+    /// An error of the catalogue.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),
-    /// The state database.
+    /// An error of the state database.
     #[error(transparent)]
     State(#[from] store::Error),
-    /// The engine.
+    /// An error of the container engine.
     #[error(transparent)]
     Engine(#[from] servant::Error),
-    /// Reaching a servant.
+    /// An error when reaching a servant.
     #[error(transparent)]
     Reach(#[from] reach::Error),
-    /// A task of the daemon broke.
-    #[error("the daemon failed at {0}; its log says more")]
+    /// A task of the daemon failed.
+    #[error("internal error of the daemon while {0}; see its log")]
     Internal(&'static str),
 }
 
-/// `text` and the last line of a log that says something.
-pub fn with_last_words(text: &str, log: &[String]) -> String {
+/// Appends the last non-empty line of a log to `text`.
+pub fn with_last_log_line(text: &str, log: &[String]) -> String {
     match log.iter().rev().find(|line| !line.trim().is_empty()) {
         Some(line) => format!("{text}; its log ends with: {line}"),
         None => text.to_owned(),

@@ -1,21 +1,21 @@
-//! Decides which servants live: one for each robot of each service, started when the robot first connects, kept
-//! for a grace time after it left; of a shared service a group of servants for all its robots.
+//! Decides which servants live: one for each robot of each service, started when the robot first connects and kept for
+//! a grace time after it left; for a shared service a group of servants for all its robots.
 //!
 //! ```text
-//!              no room                 engine, node or time-out
+//!              no capacity             engine, node or time-out
 //!          ┌───────────────┬─────────────┬────────────┬───────────┐
 //!          │               │             │            │           ▼
 //!      Requested ──▶ Admitted ──▶ Created ──▶ Starting ──▶ Ready ─┬▶ Draining ──▶ Failed
-//!      (asked for)   (room)     (container)  (nodes)   (interface)└▶ Draining ──▶ Stopped
+//!      (requested)   (capacity) (container)  (nodes)   (interface)└▶ Draining ──▶ Stopped
 //!                                    ▲                   idle, stopped, removed
 //!                                    └── adopted: an earlier daemon started it
 //! ```
 //!
-//! What is decided, [`decide`] decides by pure functions of what is, what is asked and the time; what it says is carried out
-//! by the tasks of [`lives`], which alone wait, lock and talk to the engine.
+//! The decisions are pure functions in [`decide`] of the current state, the request and the time; the tasks of
+//! [`lives`] carry them out, and only these wait, lock and talk to the engine.
 //!
 //! ```text
-//!   robots, stubs, pushes, operators           connections, ends of nodes, the graph, time
+//!   robots, stubs, pushes, operators           connections, node exits, the graph, time
 //!             │ ask                                          │ facts
 //!             ▼                                              ▼
 //!   ┌ lives ───────────────────────────────────────────────────────────────────────────┐
@@ -30,8 +30,8 @@
 //!   └──────────────────────────────────────────────────────────────────────────────────┘
 //! ```
 //!
-//! Each servant has one task ([`lives::driver`]) that alone changes its state; everybody else asks for its end, counts
-//! themselves in and out as a connection ([`Lease`]), and watches. Who gets which servant is decided and recorded under one
+//! Each servant has one task ([`lives::driver`]) that alone changes its state; everyone else requests its end,
+//! registers as a connection ([`Lease`]), and watches. Which robot gets which servant is decided and recorded under one
 //! short lock: a servant that is being ended is never given to anyone.
 
 #![forbid(unsafe_code)]
@@ -52,57 +52,57 @@ use std::time::Duration;
 use bridge::BridgeOptions;
 use catalogue::{Catalogue, names};
 use parking_lot::Mutex;
-use reach::{Material, Opener, Pace, RequestTimes};
+use reach::{Material, Opener, ReplayPace, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, State};
 use tokio::sync::{broadcast, watch};
 
 pub use decide::Amount;
-pub use decide::admission::{Position, Refused};
+pub use decide::admission::{AdmissionError, Position};
 pub use decide::back_off::seconds;
 pub use decide::controller;
 pub use decide::dictionary::{MOST_ROWS, check as check_row};
-pub use decide::terms::{Cap, Capper, Untenable};
-pub use error::{Error, Unchanged, with_last_words};
+pub use decide::terms::{Cap, CapSource, TermsError};
+pub use error::{Error, ResizeError, with_last_log_line};
 pub use limits::engine_limits;
-pub use lives::adoption::Inheritance;
-pub use lives::calibration::Requests;
-pub use lives::capture::Bounds;
+pub use lives::adoption::AdoptionResult;
+pub use lives::calibration::CalibrationRequests;
+pub use lives::capture::CaptureBounds;
 pub use lives::handle::Handle;
 pub use lives::lease::Lease;
-pub use lives::recent::Answered;
+pub use lives::recent::AnsweredRequest;
 pub use lives::rollouts::check_terms;
-pub use lives::waiting::{Admission, Permit, Standing};
+pub use lives::waiting::{Admission, Permit, QueueStanding};
 pub use memory::{Memory, MemoryOptions};
-pub use options::{Class, DEFAULT_CLASS, Hung, Options};
+pub use options::{ClassOptions, DEFAULT_CLASS, HungPolicy, Options};
 pub use request::ServantRequest;
 pub use shown::usage;
 
-use decide::admission::Ask;
+use decide::admission::AdmissionRequest;
 use decide::dictionary::Aux;
 use decide::placement::{Placement, place};
 use decide::terms::explain;
-use lives::Inner;
+use lives::ChoreographerInner;
 use lives::back_off::BackOffs;
-use lives::driver::{self, Beginning};
+use lives::driver::{self, ServantSource};
 use lives::group::is_place;
 use lives::hung;
-use lives::lease::Anew;
+use lives::lease::NewStatement;
 use lives::warm_pool::{self, WarmPool};
 
-/// In a trial, for one answer: a message of a recording that is answered by nothing must not hold up the rest.
+/// Timeout for one answer in a trial: a recorded message without an answer must not delay the rest.
 const TRIED: Duration = Duration::from_secs(2);
-/// A picture is tried with so many requests.
+/// Number of requests with which a picture is tried.
 const SHOWN: usize = 20;
 
 /// Decides which servants live. Cheap to clone.
 #[derive(Clone)]
 pub struct Choreographer {
-    inner: Arc<Inner>,
+    inner: Arc<ChoreographerInner>,
 }
 
 impl Choreographer {
-    /// One that starts servants by `engine` and reaches them by `opener`.
+    /// Creates a choreographer that starts servants by `engine` and reaches them by `opener`.
     pub fn new(
         options: Options,
         state: Arc<State>,
@@ -113,7 +113,7 @@ impl Choreographer {
     ) -> Choreographer {
         let journal = Journal::new(Arc::clone(&state));
         let memory = Memory::new(&options.memory, journal.clone());
-        let inner = Inner {
+        let inner = ChoreographerInner {
             memory: Arc::new(memory),
             options,
             state,
@@ -139,22 +139,22 @@ impl Choreographer {
         }
     }
 
-    /// The servant that is asked for: the one that is there, or a new one. Comes back at once; the lease tells when the
-    /// servant can be used, and keeps it for as long as it lives.
+    /// Returns a lease of the requested servant: the existing one, or a new one. Returns at once; the lease reports
+    /// when the servant can be used, and keeps it alive.
     ///
     /// # Errors
-    /// Terms that cannot be had ([`Error::Terms`]) where a new one is needed. Those of a servant that is there are looked at by
-    /// [`Lease::admitted`].
+    /// [`Error::Terms`] if a new servant is needed and the terms cannot be granted. The terms for an existing one are
+    /// checked by [`Lease::wait_admitted`].
     pub fn ensure(&self, request: ServantRequest) -> Result<Lease, Error> {
         let inner = &self.inner;
         let key = (request.service.clone(), request.robot.clone());
-        // Not under the lock, since all other robots wait for that: the dictionary is read, and may be long.
+        // Not under the lock, which all other robots wait for: reading the dictionary may take long.
         let is_new = !inner.servants.lock().given.contains_key(&key);
         let ahead = is_new.then(|| inner.terms_ahead(&request)).transpose()?;
         let (handle, lease, warm, takes_canary) = {
             let mut servants = inner.servants.lock();
-            // Under the lock: a revision that is published meanwhile ends the servants that it finds, and must not be
-            // followed by one of the revision before.
+            // Under the lock: a revision that is published meanwhile ends the servants that it finds, and no servant of
+            // the previous revision may be added after that.
             let (revision, takes_canary) = inner.revision_for(&request)?;
             if inner.ending.load(Ordering::SeqCst) {
                 return Err(Error::Ending);
@@ -163,10 +163,11 @@ impl Choreographer {
             if has.as_ref().is_none_or(|has| has.ending) {
                 inner.check_back_off(&revision, &request.robot, request.anonymous)?;
             }
-            // Nobody who waits for capacity is overtaken by one that takes what was promised ahead.
-            // Nor do nodes run already that may use less memory than they perhaps do.
+            // A container with promised capacity must not overtake waiting requests, nor have nodes running with more
+            // memory than the robot may use.
             let bounded = request.set.memory.is_some();
-            let default_names = request.stub.is_none() && !bounded && inner.admission.is_calm();
+            let default_names =
+                request.stub.is_none() && !bounded && inner.admission.is_uncontended();
             let (placement, warm) = if is_place(&revision, &request.robot) {
                 // It needs no container.
                 let placement = place(has.as_ref(), None, revision.number, &revision.image);
@@ -177,8 +178,8 @@ impl Choreographer {
             };
             let ends = match placement {
                 Placement::Keep(id) => {
-                    let lease = Lease::new(Arc::clone(&servants.all[id]), request.who());
-                    return Ok(lease.stating(Anew {
+                    let lease = Lease::new(Arc::clone(&servants.all[id]), request.client());
+                    return Ok(lease.with_statement(NewStatement {
                         inner: Arc::clone(inner),
                         stated: request.stated,
                     }));
@@ -203,17 +204,17 @@ impl Choreographer {
             servants.end(ends);
             if takes_canary {
                 let rollouts = &inner.rollouts;
-                rollouts.takes_canary(&request.service, &request.robot);
+                rollouts.add_canary_robot(&request.service, &request.robot);
             }
             let id = warm.as_ref().map(|warm| warm.container.id().to_owned());
-            let who = request.who().to_owned();
+            let who = request.client().to_owned();
             let handle = Arc::new(Handle::new(
                 id.unwrap_or_else(|| names::servant_id(&request.service)),
                 request.robot,
                 request.anonymous,
-                decide::demand::Asked {
+                decide::demand::LimitSources {
                     set: request.set,
-                    ..inner.asked(terms)
+                    ..inner.limit_sources(terms)
                 },
                 revision,
                 store::now(),
@@ -227,22 +228,22 @@ impl Choreographer {
             (handle, lease, warm, takes_canary)
         };
         if takes_canary {
-            // At once: a daemon that is started after this one was killed would give its place to another robot.
+            // At once: if this daemon is killed, the next one would otherwise give the canary's place to another robot.
             inner.write_changed();
         }
-        let beginning = Beginning::Asked(warm);
+        let beginning = ServantSource::Asked(warm);
         tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
         Ok(lease)
     }
 
-    /// All servants that live, oldest first.
+    /// Returns all live servants, oldest first.
     pub fn servants(&self) -> Vec<Arc<Handle>> {
         let mut servants: Vec<_> = self.inner.servants.lock().all.values().cloned().collect();
         servants.sort_by(|one, other| (one.created, &one.id).cmp(&(other.created, &other.id)));
         servants
     }
 
-    /// One servant.
+    /// Returns a servant by id.
     pub fn servant(&self, id: &str) -> Result<Arc<Handle>, Error> {
         let servants = self.inner.servants.lock();
         servants.all.get(id).cloned().ok_or_else(|| {
@@ -255,7 +256,7 @@ impl Choreographer {
         })
     }
 
-    /// Ends the servants that `chosen` picks and waits until nothing is left of them; gives their ids.
+    /// Ends the servants selected by `chosen` and waits until they are gone; returns their ids.
     pub async fn stop(&self, reason: &str, chosen: impl Fn(&Handle) -> bool) -> Vec<String> {
         let leaving: Vec<Arc<Handle>> = {
             let servants = self.inner.servants.lock();
@@ -272,36 +273,36 @@ impl Choreographer {
         };
         let mut ids = Vec::new();
         for handle in leaving {
-            handle.ended().await;
+            handle.wait_ended().await;
             ids.push(handle.id.clone());
         }
         ids.sort();
         ids
     }
 
-    /// Starts no more servants.
+    /// Stops starting servants.
     pub fn close(&self) {
         let _servants = self.inner.servants.lock();
         self.inner.ending.store(true, Ordering::SeqCst);
     }
 
-    /// Keeps the warm pool from now on; comes back at once.
+    /// Starts maintaining the warm pool; returns at once.
     pub fn keep_warm_pool(&self) {
-        tokio::spawn(warm_pool::keep(Arc::clone(&self.inner)));
-        self.inner.warm_pool.look();
+        tokio::spawn(warm_pool::run(Arc::clone(&self.inner)));
+        self.inner.warm_pool.wake();
     }
 
-    /// Looks from now on for nodes that hang; comes back at once.
+    /// Starts watching for hung nodes; returns at once.
     pub fn watch_nodes(&self) {
-        tokio::spawn(hung::keep(Arc::clone(&self.inner)));
+        tokio::spawn(hung::watch(Arc::clone(&self.inner)));
     }
 
-    /// Has warm containers made for what is published now.
+    /// Triggers making warm containers for the published revisions.
     pub fn refill_warm_pool(&self) {
-        self.inner.warm_pool.look();
+        self.inner.warm_pool.wake();
     }
 
-    /// Ends the warm containers of what is not published any more.
+    /// Ends the warm containers of revisions that are not published any more.
     pub async fn end_stale_warm(&self) -> Result<(), Error> {
         warm_pool::tidy(&self.inner, false).await
     }
@@ -311,63 +312,64 @@ impl Choreographer {
         warm_pool::end_all(&self.inner).await;
     }
 
-    /// Looks after the machine from now on, moves cores where that is wanted, and resizes servants by how large what their
-    /// robots send is, and by who of their clients has left; comes back at once.
+    /// Starts watching the machine, moving cores if configured, and resizing servants by the size of their robots'
+    /// messages and by the clients that have left; returns at once.
     pub fn keep_watch(&self) {
         tokio::spawn(lives::controller::watch(Arc::clone(&self.inner)));
         tokio::spawn(lives::measuring::watch(Arc::clone(&self.inner)));
         tokio::spawn(lives::leaving::watch(Arc::clone(&self.inner)));
     }
 
-    /// So often cores were moved.
-    pub fn moves(&self) -> u64 {
+    /// Returns how often cores were moved.
+    pub fn move_count(&self) -> u64 {
         self.inner.moves.load(Ordering::Relaxed)
     }
 
-    /// How long requests of robots take.
+    /// Returns the response times of robots' requests.
     pub fn request_times(&self) -> &RequestTimes {
         &self.inner.request_times
     }
 
-    /// Where what happens is told.
+    /// Returns the journal of events.
     pub fn journal(&self) -> &Journal {
         &self.inner.journal
     }
 
-    /// Requests of robots that are answered from now on.
-    pub fn answered(&self) -> broadcast::Receiver<Answered> {
-        self.inner.recent.answered()
+    /// Subscribes to answered requests of robots.
+    pub fn subscribe_answers(&self) -> broadcast::Receiver<AnsweredRequest> {
+        self.inner.recent.subscribe()
     }
 
-    /// The longest that the robot of a servant accepts for a request, in milliseconds; none where it has not said.
-    pub fn accepts(&self, handle: &Handle) -> Option<f64> {
-        let goal = lives::controller::goal(&self.inner, handle)?;
-        goal.bound()
+    /// Returns the maximum response time that the servant's robot accepts, in milliseconds; `None` if it has not stated
+    /// one.
+    pub fn accepted_time(&self, handle: &Handle) -> Option<f64> {
+        let goal = lives::controller::response_goal(&self.inner, handle)?;
+        goal.upper_bound()
     }
 
-    /// Containers of the warm pool, and those of them in which the nodes run.
+    /// Returns the number of containers in the warm pool, and of those with running nodes.
     pub fn warm_pool(&self) -> (usize, usize) {
         self.inner.warm_pool.count()
     }
 
-    /// Whose servants have failed again and again, and are not started again yet.
+    /// Returns the robots whose servants have failed repeatedly and are not restarted yet.
     pub fn back_offs(&self) -> Vec<api::BackOff> {
         self.inner.back_offs()
     }
 
-    /// What may be held for clients and servants.
+    /// Returns the memory budgets of clients and servants.
     pub fn memory(&self) -> &Memory {
         &self.inner.memory
     }
 
-    /// What the machine promises.
+    /// Returns the admission control of the machine.
     pub fn admission(&self) -> &Admission {
         &self.inner.admission
     }
 
-    /// Room for something of a push that is started like a servant of these limits: the memory of those, and the cores that
-    /// are set aside for servants that ask for none, since robots go before it there. Calls `on_wait` when there is none at
-    /// once. When [`Permit::is_needed`] comes back, a robot waits for it.
+    /// Admits work of a push that is started like a servant with these limits: with their memory, and at most the
+    /// reserved cores of servants without limits, since robots take precedence there. Calls `on_wait` if there is no
+    /// capacity at once. When [`Permit::wait_needed`] returns, a robot waits for the capacity.
     pub async fn admit_like_a_servant(
         &self,
         asked: &api::Limits,
@@ -375,7 +377,7 @@ impl Choreographer {
         on_wait: impl FnOnce(),
     ) -> Result<Permit, Error> {
         let cpus = self.inner.options.reserve_cpus;
-        let wanted = self.inner.promised(&api::Limits {
+        let wanted = self.inner.promised_amount(&api::Limits {
             cpus: Some(asked.cpus.map_or(cpus, |asked| asked.min(cpus))),
             ..*asked
         });
@@ -386,37 +388,37 @@ impl Choreographer {
         let admission = &self.inner.admission;
         let stands = watch::Sender::new(None);
         Ok(admission
-            .admit(Ask::push(wanted), deadline, stands, make_room)
+            .admit(AdmissionRequest::push(wanted), deadline, stands, make_room)
             .await?)
     }
 
-    /// Limits of a servant where its push says nothing.
+    /// Returns the limits of servants whose push states none.
     pub fn default_limits(&self) -> api::Limits {
         self.inner.options.limits
     }
 
-    /// Sessions of rosbridge before each servant.
+    /// Returns the options of the rosbridge sessions of each servant.
     pub fn bridge_options(&self) -> &BridgeOptions {
         &self.inner.options.bridge
     }
 
-    /// Refuses what a push asks for beyond a container if it is not allowed or not there; answers, in words, what of it
+    /// Checks the grants requested by a push: refuses those not allowed or not present; returns, in words, what
     /// servants will lack.
     pub fn check_grants(&self, asked: &api::Grants) -> Result<Vec<String>, Error> {
-        Ok(self.inner.engine.check(asked)?)
+        Ok(self.inner.engine.check_grants(asked)?)
     }
 
-    /// Tries the current revision of a service, with a servant that is there for the trial alone.
+    /// Tries the current revision of a service, with a servant started for the trial only.
     pub async fn trial(
         &self,
         service: &str,
         material: Material,
     ) -> Result<api::trial::Trial, Error> {
-        let measured = self.measured(service, "try", api::Limits::default())?;
-        measured.lease.admitted().await?;
-        let reach = measured.lease.ready().await?;
+        let measured = self.start_measured(service, "try", api::Limits::default())?;
+        measured.lease.wait_admitted().await?;
+        let reach = measured.lease.wait_ready().await?;
         let interface = &measured.lease.handle().revision.interface;
-        let mut pace = Pace::once(TRIED);
+        let mut pace = ReplayPace::once(TRIED);
         if let Material::Pictures(_) = material {
             pace.again = true;
             pace.requests = SHOWN;
@@ -425,32 +427,40 @@ impl Choreographer {
         Ok(replay.into_trial(service))
     }
 
-    /// A servant that serves no robot, to be measured; `why` becomes part of its robot's name. Of a service that robots share
-    /// it is one of its own, beside the group. It has the limits of `set` from its start on.
-    fn measured(&self, service: &str, why: &str, set: api::Limits) -> Result<Measured, Error> {
+    /// Starts a servant without a robot, to be measured; `why` becomes part of its robot's name. For a shared service
+    /// it is a servant of its own, beside the group. It has the limits of `set` from the start.
+    fn start_measured(
+        &self,
+        service: &str,
+        why: &str,
+        set: api::Limits,
+    ) -> Result<MeasuredServant, Error> {
         let robot = format!("~{why}-{}", names::random(6));
-        let request = ServantRequest::new(service, &robot).setting(set);
+        let request = ServantRequest::new(service, &robot).with_limits(set);
         let lease = self.ensure(request.anonymous())?;
-        Ok(Measured { lease })
+        Ok(MeasuredServant { lease })
     }
 
-    /// What a robot would get that states this to a service, and why.
+    /// Returns what a robot with this statement would get from a service, and why.
     pub fn explain_terms(
         &self,
         service: &str,
         stated: &api::Stated,
     ) -> Result<api::dictionary::Explained, Error> {
         let inner = &self.inner;
-        let revision = inner.catalogue.current(service)?;
-        inner.offering(&revision, |_| Aux::new(), |offer| explain(stated, offer))
+        let revision = inner.catalogue.current_revision(service)?;
+        inner.with_offer(&revision, |_| Aux::new(), |offer| explain(stated, offer))
     }
 
-    /// Refuses limits that would never be admitted.
+    /// Refuses limits that can never be admitted.
     pub fn check_limits(&self, limits: &api::Limits) -> Result<(), Error> {
-        Ok(self.inner.admission.check(self.inner.promised(limits))?)
+        Ok(self
+            .inner
+            .admission
+            .check(self.inner.promised_amount(limits))?)
     }
 
-    /// Images that live servants and warm containers were started from; they must stay.
+    /// Returns the images of live servants and warm containers, which must be kept.
     pub fn images_in_use(&self) -> Vec<String> {
         let mut images = self.inner.warm_pool.images();
         let servants = self.inner.servants.lock();
@@ -464,14 +474,14 @@ impl Choreographer {
     }
 }
 
-/// A servant that serves no robot; it is ended with this value, also where what measures it is given up halfway.
-pub(crate) struct Measured {
+/// A servant without a robot; it is ended when this value is dropped, also if the measurement is cancelled.
+pub(crate) struct MeasuredServant {
     pub(crate) lease: Lease,
 }
 
-impl Drop for Measured {
+impl Drop for MeasuredServant {
     fn drop(&mut self) {
-        self.lease.handle().end("it has been measured");
+        self.lease.handle().end("its measurement is complete");
     }
 }
 

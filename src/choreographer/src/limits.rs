@@ -1,9 +1,9 @@
-//! Limits as the API has them, as the engine takes them, and those that no kernel takes.
+//! Conversion of limits between the API and the engine, and their validation.
 
 use crate::decide::demand;
 
-/// Limits as the API shows them.
-pub(crate) fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
+/// Converts limits to the API's type.
+pub(crate) fn to_api_limits(limits: &servant::spec::ResourceLimits) -> api::Limits {
     api::Limits {
         cpus: limits.cpus,
         cpu_weight: limits.cpu_weight,
@@ -16,9 +16,9 @@ pub(crate) fn limits_of(limits: &servant::spec::Limits) -> api::Limits {
     }
 }
 
-/// Limits as the engine takes them.
-pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
-    servant::spec::Limits {
+/// Converts limits to the engine's type.
+pub fn engine_limits(limits: &api::Limits) -> servant::spec::ResourceLimits {
+    servant::spec::ResourceLimits {
         cpus: limits.cpus,
         cpu_weight: limits.cpu_weight,
         memory: limits.memory.map(|memory| memory.0),
@@ -30,26 +30,26 @@ pub fn engine_limits(limits: &api::Limits) -> servant::spec::Limits {
     }
 }
 
-/// Limits that no kernel takes, or that may not be asked for.
+/// The error of limits that no kernel accepts, or that may not be requested.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub struct Unusable(String);
+pub struct UnusableLimits(String);
 
-/// Refuses a weight that only an operator may give: of more than the cores that these limits promise.
-pub fn check_weight(limits: &api::Limits) -> Result<(), Unusable> {
-    let most = demand::most_weight(limits);
+/// Refuses a weight that only an operator may set: more than the weight of the promised cores.
+pub fn check_weight(limits: &api::Limits) -> Result<(), UnusableLimits> {
+    let most = demand::max_weight(limits);
     match limits.cpu_weight {
-        Some(weight) if weight > most => Err(Unusable(format!(
-            "cpu_weight = {weight} is more than {most}, which is the most here: 1000 for each core asked for with cpus, \
-             100 without; ask for more cores, or have an operator give more by cloudroidctl set"
+        Some(weight) if weight > most => Err(UnusableLimits(format!(
+            "cpu_weight = {weight} is more than the maximum {most}: 1000 per core requested with cpus, 100 without; \
+                request more cores, or ask an operator to raise it with cloudroidctl set"
         ))),
         _ => Ok(()),
     }
 }
 
-/// Refuses limits that no kernel takes.
-pub fn check(limits: &api::Limits) -> Result<(), Unusable> {
-    let refused = |words: String| Err(Unusable(words));
+/// Refuses limits that no kernel accepts.
+pub fn check(limits: &api::Limits) -> Result<(), UnusableLimits> {
+    let refused = |words: String| Err(UnusableLimits(words));
     if let Some(cpus) = limits.cpus
         && !(cpus.is_finite() && (0.01..=4096.0).contains(&cpus))
     {
@@ -64,7 +64,7 @@ pub fn check(limits: &api::Limits) -> Result<(), Unusable> {
         && memory.0 < 4 << 20
     {
         return refused(format!(
-            "memory = {memory} is too little for any node; at least 4M"
+            "memory = {memory} is too little for any node; write at least 4M"
         ));
     }
     for (name, limit) in [
@@ -74,14 +74,16 @@ pub fn check(limits: &api::Limits) -> Result<(), Unusable> {
     ] {
         if limit == Some(api::Size(0)) {
             return refused(format!(
-                "{name} = 0 would stop the servant; leave it out for no limit"
+                "{name} = 0 would stop the servant; omit it for no limit"
             ));
         }
     }
     if let Some(pids) = limits.pids
         && pids < 4
     {
-        return refused(format!("pids = {pids} is too few for any node; at least 4"));
+        return refused(format!(
+            "pids = {pids} is too few for any node; write at least 4"
+        ));
     }
     Ok(())
 }

@@ -1,5 +1,6 @@
-//! The tasks that carry out what was decided: one for each servant ([`driver`]), which alone changes its state, and one that
-//! keeps the warm pool ([`warm_pool`]), and one that looks at the machine and moves cores ([`controller`]). Servants of an earlier daemon are taken over here ([`adoption`]).
+//! The tasks that carry decisions out: one for each servant ([`driver`]), which alone changes its state, one that
+//! maintains the warm pool ([`warm_pool`]), and one that watches the machine and moves cores ([`controller`]). Servants
+//! of an earlier daemon are taken over here ([`adoption`]).
 
 pub(crate) mod adoption;
 pub(crate) mod back_off;
@@ -37,25 +38,25 @@ use reach::{Opener, RequestTimes};
 use servant::engine::Engine;
 use store::{Journal, RevisionRecord, State};
 
-use crate::decide::capacity::Room;
-use crate::decide::demand::{self, Asked};
+use crate::decide::capacity::RoomPlan;
+use crate::decide::demand::{self, LimitSources};
 use crate::decide::dictionary::Aux;
-use crate::decide::terms::{Offer, terms};
-use crate::decide::told::Told;
-use crate::decide::{Amount, End, Servant, capacity};
+use crate::decide::terms::{Offer, compute_terms};
+use crate::decide::told::RefusalLog;
+use crate::decide::{Amount, ServantFacts, StopOrder, capacity};
 use crate::lives::handle::Handle;
 use crate::memory::SharedMemory;
 use crate::options::Options;
 use crate::{Error, ServantRequest};
 use back_off::BackOffs;
 use group::Groups;
-use recent::Recent;
+use recent::RecentRequests;
 use rollouts::Rollouts;
 use waiting::Admission;
 use warm_pool::WarmPool;
 
-/// What the choreographer and its tasks share.
-pub(crate) struct Inner {
+/// State shared by the choreographer and its tasks.
+pub(crate) struct ChoreographerInner {
     pub(crate) options: Options,
     pub(crate) state: Arc<State>,
     pub(crate) journal: Journal,
@@ -64,8 +65,8 @@ pub(crate) struct Inner {
     pub(crate) opener: Arc<dyn Opener>,
     pub(crate) admission: Admission,
     pub(crate) request_times: Arc<RequestTimes>,
-    pub(crate) recent: Arc<Recent>,
-    /// So often the controller has changed what a servant has.
+    pub(crate) recent: Arc<RecentRequests>,
+    /// Number of times the controller has changed a servant's cores.
     pub(crate) moves: AtomicU64,
     pub(crate) memory: SharedMemory,
     pub(crate) servants: Mutex<Servants>,
@@ -73,59 +74,63 @@ pub(crate) struct Inner {
     pub(crate) groups: Groups,
     pub(crate) back_offs: BackOffs,
     pub(crate) rollouts: Arc<Rollouts>,
-    /// Images whose nodes did not show all of their interface although they had all the time of a start.
+    /// Images whose nodes did not register all of their interface within the full start time.
     pub(crate) incomplete: Mutex<BTreeSet<String>>,
     pub(crate) ending: AtomicBool,
-    /// Of which refusals was told.
-    pub(crate) refusals: Mutex<Told>,
+    /// Recently reported refusals.
+    pub(crate) refusals: Mutex<RefusalLog>,
 }
 
 #[derive(Default)]
 pub(crate) struct Servants {
-    /// All that live, by id.
+    /// All live servants, by id.
     pub(crate) all: HashMap<String, Arc<Handle>>,
-    /// Those that a robot may be given, by service and robot.
+    /// Servants that a robot may be given, by service and robot.
     pub(crate) given: HashMap<(String, String), Arc<Handle>>,
 }
 
-impl Inner {
+impl ChoreographerInner {
     pub(crate) fn is_ending(&self) -> bool {
         self.ending.load(Ordering::SeqCst)
     }
 
-    /// The limits of a servant of this revision where no robot stated anything.
-    pub(crate) fn of_push(&self, revision: &RevisionRecord) -> Asked {
-        // Where it cannot be found out whose it is, it is no operator's.
+    /// Returns the limits of a servant of this revision whose robot stated nothing.
+    pub(crate) fn push_limits(&self, revision: &RevisionRecord) -> LimitSources {
+        // If the owner is unknown, the service is treated as a deployer's.
         let limits = if self.is_deployers(&revision.service).unwrap_or(true) {
             demand::with_bounded_weight(revision.plan.limits)
         } else {
             revision.plan.limits
         };
-        self.asked(api::Terms {
+        self.limit_sources(api::Terms {
             limits,
             ..api::Terms::default()
         })
     }
 
-    /// The limits of a servant that its robot has on these terms.
-    pub(crate) fn asked(&self, terms: api::Terms) -> Asked {
-        Asked {
+    /// Returns the limits of a servant with these terms.
+    pub(crate) fn limit_sources(&self, terms: api::Terms) -> LimitSources {
+        LimitSources {
             set: api::Limits::default(),
             terms,
             default: self.options.limits,
         }
     }
 
-    /// The terms for what the clients of one robot state to a servant of this revision.
+    /// Derives the terms of a servant of this revision from the statements of one robot's clients.
     pub(crate) fn terms(
         &self,
         stated: &BTreeMap<String, api::Stated>,
         revision: &RevisionRecord,
     ) -> Result<api::Terms, Error> {
-        self.offering(revision, |_| Aux::new(), |offer| Ok(terms(stated, offer)?))?
+        self.with_offer(
+            revision,
+            |_| Aux::new(),
+            |offer| Ok(compute_terms(stated, offer)?),
+        )?
     }
 
-    /// The terms of a servant of the revision that a robot would be given now.
+    /// Derives the terms of a servant of the revision that a robot would be given now.
     #[allow(clippy::type_complexity)]
     pub(crate) fn terms_ahead(
         &self,
@@ -136,9 +141,9 @@ impl Inner {
         Ok((revision, terms))
     }
 
-    /// What terms for a servant of this revision are made from; `measured` says, of the dictionary's rows, which auxiliary
-    /// parameters of its robot were measured.
-    pub(crate) fn offering<T>(
+    /// Calls `work` with the context from which terms for a servant of this revision are derived; `measured` returns,
+    /// given the dictionary's rows, the measured auxiliary parameters of its robot.
+    pub(crate) fn with_offer<T>(
         &self,
         revision: &RevisionRecord,
         measured: impl FnOnce(&[Row]) -> Aux,
@@ -155,43 +160,43 @@ impl Inner {
             rows: &rows,
             measured: &measured(&rows),
             reserve: (options.reserve_cpus, options.reserve_memory),
-            capacity: self.admission.look().0,
+            capacity: self.admission.snapshot().0,
         }))
     }
 
-    /// Whether a deployer, and no operator, publishes a service.
+    /// Returns true if the service belongs to a deployer rather than an operator.
     fn is_deployers(&self, service: &str) -> Result<bool, Error> {
         Ok(self.state.service_owner(service)?.flatten().is_some())
     }
 
-    /// What is promised to a servant of these limits.
-    pub(crate) fn promised(&self, asked: &api::Limits) -> Amount {
+    /// Returns the capacity promised to a servant with these limits.
+    pub(crate) fn promised_amount(&self, asked: &api::Limits) -> Amount {
         let options = &self.options;
-        demand::promised(asked, (options.reserve_cpus, options.reserve_memory))
+        demand::promised_amount(asked, (options.reserve_cpus, options.reserve_memory))
     }
 
-    /// A servant as decisions see it.
-    pub(crate) fn facts<'a>(&self, handle: &'a Handle) -> Servant<'a> {
+    /// Returns a servant as input for decisions.
+    pub(crate) fn facts<'a>(&self, handle: &'a Handle) -> ServantFacts<'a> {
         let admitted = handle.promise().is_some();
-        Servant {
+        ServantFacts {
             id: &handle.id,
             revision: handle.revision.number,
             connections: handle.connections(),
-            promised: admitted.then(|| self.promised(&handle.asked())),
+            promised: admitted.then(|| self.promised_amount(&handle.requested_limits())),
             idle_until: handle.idle_until(),
             ending: handle.is_ending(),
         }
     }
 
-    /// Ends servants that were made ahead, then idle ones, and has pushes give way, for those who wait for capacity.
+    /// Makes room for waiting requests: ends prepared servants, then idle ones, and asks pushes to give way.
     pub(crate) fn make_room(self: &Arc<Self>) {
         let servants = self.servants.lock();
-        let warm = self.warm_pool.promised(self);
+        let warm = self.warm_pool.promised_servants(self);
         let warm = warm_facts(&warm);
         let all = servants.all.values().map(|handle| self.facts(handle));
-        let (lacking, pushes) = self.admission.lacking();
-        let Room { ends, give_way } = capacity::make_room(lacking, warm.chain(all), &pushes);
-        let (warm, used): (Vec<End<'_>>, Vec<End<'_>>) = ends
+        let (lacking, pushes) = self.admission.shortage();
+        let RoomPlan { ends, give_way } = capacity::make_room(lacking, warm.chain(all), &pushes);
+        let (warm, used): (Vec<StopOrder<'_>>, Vec<StopOrder<'_>>) = ends
             .into_iter()
             .partition(|end| !servants.all.contains_key(end.id));
         for end in warm {
@@ -201,50 +206,53 @@ impl Inner {
         self.admission.give_way(&give_way);
     }
 
-    /// Takes the servant out of reach if nobody is connected; true when so.
+    /// Withdraws the servant from its robot if no client is connected; returns true if so.
     pub(crate) fn retire_if_idle(&self, handle: &Arc<Handle>) -> bool {
         let mut servants = self.servants.lock();
         let idle = handle.connections() == 0;
         if idle {
-            servants.take_back(handle);
+            servants.unassign(handle);
         }
         idle
     }
 
-    /// Takes the servant out of reach.
+    /// Withdraws the servant from its robot.
     pub(crate) fn retire(&self, handle: &Arc<Handle>) {
-        self.servants.lock().take_back(handle);
+        self.servants.lock().unassign(handle);
     }
 
     pub(crate) fn forget(&self, handle: &Arc<Handle>) {
         let mut servants = self.servants.lock();
-        servants.take_back(handle);
+        servants.unassign(handle);
         servants.all.remove(&handle.id);
     }
 }
 
-/// Containers that were made ahead and are promised something, as decisions see them: id, promise, whether it ends.
-pub(crate) fn warm_facts(warm: &[(String, Amount, bool)]) -> impl Iterator<Item = Servant<'_>> {
-    warm.iter().map(|(id, promised, ending)| Servant {
+/// Returns prepared containers with a promise as input for decisions; given as id, promise, and whether it is being
+/// ended.
+pub(crate) fn warm_facts(
+    warm: &[(String, Amount, bool)],
+) -> impl Iterator<Item = ServantFacts<'_>> {
+    warm.iter().map(|(id, promised, ending)| ServantFacts {
         id,
         revision: 0,
         connections: 0,
         promised: Some(*promised),
-        // Before any that a robot may come back to.
+        // Before any servant that a robot may come back to.
         idle_until: Some(0),
         ending: *ending,
     })
 }
 
 impl Servants {
-    /// Asks for the end of those that are to end.
-    pub(crate) fn end<'a>(&self, ends: impl IntoIterator<Item = End<'a>>) {
+    /// Requests the end of these servants.
+    pub(crate) fn end<'a>(&self, ends: impl IntoIterator<Item = StopOrder<'a>>) {
         for end in ends {
             self.all[end.id].end(end.reason);
         }
     }
 
-    fn take_back(&mut self, handle: &Arc<Handle>) {
+    fn unassign(&mut self, handle: &Arc<Handle>) {
         let key = (handle.service().to_owned(), handle.robot.clone());
         if self
             .given

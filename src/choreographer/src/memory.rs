@@ -1,4 +1,4 @@
-//! Limits of the memory that the daemon uses for each client and each servant. A refusal becomes an event.
+//! Limits on the memory that the daemon uses for each client and each servant. A refusal becomes an event.
 //!
 //! ```text
 //!  the daemon ─┬─ client 10.0.0.7    unfinished messages, bodies of requests
@@ -16,37 +16,37 @@ use parking_lot::Mutex;
 use store::Journal;
 use store::NewEvent;
 
-/// Shortest time between two events about the same client or servant.
+/// Minimum time between two events about the same client or servant.
 const TOLD_AGAIN: Duration = Duration::from_secs(60);
-/// How many clients and servants are remembered for that.
+/// Maximum number of clients and servants remembered for that.
 const REMEMBERED: usize = 1000;
 
-/// Limits of memory outside of servants' containers.
+/// Limits on memory outside of servants' containers.
 #[derive(Debug, Clone)]
 pub struct MemoryOptions {
     /// Bytes for all clients and servants together.
     pub daemon: u64,
-    /// Bytes for one client: its unfinished messages, and bodies of its requests.
+    /// Bytes for one client: its unfinished messages, and the bodies of its requests.
     pub client: u64,
-    /// Bytes for one servant: unfinished messages of its nodes and links, and JSON or CBOR made of its messages.
+    /// Bytes for one servant: unfinished messages of its nodes and links, and JSON or CBOR made from its messages.
     pub servant: u64,
-    /// Time from the first byte of a message, frame or body to its last.
+    /// Maximum time from the first byte of a message, frame or body to its last.
     pub unfinished: Duration,
 }
 
-/// The daemon's budgets.
+/// The daemon's memory budgets.
 #[derive(Debug)]
 pub struct Memory {
     whole: Budget,
     clients: Shares,
     servants: Shares,
     refused: Arc<AtomicU64>,
-    /// Time from the first byte of a message, frame or body to its last.
+    /// Maximum time from the first byte of a message, frame or body to its last.
     pub unfinished: Duration,
 }
 
 impl Memory {
-    /// Budgets as configured; refusals are written to the journal.
+    /// Creates the budgets as configured; refusals are written to the journal.
     pub fn new(options: &MemoryOptions, journal: Journal) -> Memory {
         let bytes = |size: u64| usize::try_from(size).unwrap_or(usize::MAX);
         let refused = Arc::<AtomicU64>::default();
@@ -54,7 +54,7 @@ impl Memory {
         let told: Mutex<HashMap<String, Instant>> = Mutex::default();
         let observer = move |who: &str, full: &Exceeded| {
             count.fetch_add(1, Ordering::Relaxed);
-            tracing::debug!(who, %full, "memory was refused");
+            tracing::debug!(who, %full, "memory limit reached");
             let mut told = told.lock();
             let known = told.get(who);
             if known.is_some_and(|at| at.elapsed() < TOLD_AGAIN) {
@@ -67,7 +67,7 @@ impl Memory {
                 report(&journal, who, full);
             }
         };
-        let whole = Budget::observed("the daemon", bytes(options.daemon), Box::new(observer));
+        let whole = Budget::with_observer("the daemon", bytes(options.daemon), Box::new(observer));
         Memory {
             clients: Shares::new(&whole, "client", bytes(options.client)),
             servants: Shares::new(&whole, "servant", bytes(options.servant)),
@@ -77,22 +77,22 @@ impl Memory {
         }
     }
 
-    /// The budget of the client of this name.
+    /// Returns the budget of the client with this name.
     pub fn client(&self, name: &str) -> Budget {
-        self.clients.of(name)
+        self.clients.for_name(name)
     }
 
-    /// The budget of a servant.
+    /// Returns the budget of a servant.
     pub fn servant(&self, id: &str) -> Budget {
-        self.servants.of(id)
+        self.servants.for_name(id)
     }
 
-    /// How often a request for memory was refused.
-    pub fn refused(&self) -> u64 {
+    /// Returns the number of refused requests for memory.
+    pub fn refusal_count(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }
 
-    /// The budget above all others.
+    /// Returns the budget above all others.
     pub fn whole(&self) -> &Budget {
         &self.whole
     }
@@ -102,9 +102,9 @@ fn report(journal: &Journal, who: &str, full: &Exceeded) {
     let journal = journal.clone();
     let servant = who.strip_prefix("servant ").map(str::to_owned);
     let message = format!(
-        "{who} was refused memory: {full}; the data was dropped (the limits are in [memory] of the configuration)"
+        "{who} reached its memory limit: {full}; the data was dropped (limits: [memory] of the configuration)"
     );
-    // The database may make whoever writes wait; who asks for memory must not.
+    // Writing to the database may block; a request for memory must not.
     let write = move || {
         let about = NewEvent {
             servant: servant.as_deref(),
@@ -118,5 +118,5 @@ fn report(journal: &Journal, who: &str, full: &Exceeded) {
     }
 }
 
-/// The daemon's budgets, shared by its parts.
+/// The daemon's memory budgets, shared by its parts.
 pub(crate) type SharedMemory = Arc<Memory>;

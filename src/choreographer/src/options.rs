@@ -6,69 +6,69 @@ use bridge::BridgeOptions;
 
 use crate::memory::MemoryOptions;
 
-/// What is done about nodes that are given inputs and answer none.
+/// Reaction to nodes that receive inputs and answer none.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Hung {
-    /// Hung nodes are left alone, and no event says so.
+pub enum HungPolicy {
+    /// Hung nodes are ignored, without an event.
     Ignore,
-    /// An event says so.
+    /// An event is reported.
     #[default]
     Report,
-    /// An event says so, and the nodes are started again.
+    /// An event is reported, and the nodes are restarted.
     Restart,
 }
 
-/// What the operator decides of servants.
+/// The operator's options for servants.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// Limits of a servant where its push says nothing.
+    /// Limits of servants whose push states none.
     pub limits: Limits,
-    /// Classes that robots may name, by name. [`DEFAULT_CLASS`] is that of robots that name none.
-    pub classes: BTreeMap<String, Class>,
-    /// Cores that there are for servants, whatever is promised of them.
+    /// Classes that robots may name, by name. [`DEFAULT_CLASS`] applies to robots that name none.
+    pub classes: BTreeMap<String, ClassOptions>,
+    /// Cores available to servants, whatever is promised of them.
     pub cores: f64,
-    /// Cores are moved between servants while they work.
+    /// Move cores between running servants.
     pub controller: bool,
-    /// Cores promised to a servant whose push asked for none.
+    /// Cores promised to a servant whose push requested none.
     pub reserve_cpus: f64,
-    /// Bytes of memory promised to a servant whose push asked for none.
+    /// Bytes of memory promised to a servant whose push requested none.
     pub reserve_memory: u64,
-    /// How long a robot may wait for room.
+    /// Maximum time that a robot waits for capacity.
     pub deadline: Duration,
-    /// How long a servant may take from its request to ready.
+    /// Maximum time from a servant's request until it is ready.
     pub start: Duration,
-    /// How long a robot's servant is kept after its last connection.
+    /// Time for which a robot's servant is kept after its last connection.
     pub grace: Duration,
-    /// The same for connections that named no robot.
+    /// Grace time of connections without a robot's name.
     pub anonymous_grace: Duration,
-    /// Most services that have containers made ahead.
+    /// Maximum number of services with containers made in advance.
     pub warm_pool: usize,
-    /// Bytes that all those containers may take.
+    /// Maximum memory of all those containers, in bytes.
     pub warm_memory: u64,
-    /// Most of them in which the nodes run.
+    /// Maximum number of them with running nodes.
     pub warm_nodes: usize,
-    /// What is done about nodes that hang.
-    pub hung: Hung,
-    /// They hang that answer nothing for so many times T_max.
+    /// Reaction to hung nodes.
+    pub hung: HungPolicy,
+    /// Multiple of T_max without an answer after which nodes count as hung.
     pub hung_after: f64,
-    /// Sessions of rosbridge before each servant.
+    /// Options of the rosbridge sessions of each servant.
     pub bridge: BridgeOptions,
-    /// Memory held for clients and servants.
+    /// Limits on the memory held for clients and servants.
     pub memory: MemoryOptions,
 }
 
-/// The class of robots that name none, where it is configured.
+/// Name of the class of robots that name none, if it is configured.
 pub const DEFAULT_CLASS: &str = "default";
 
 /// A class of robots.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Class {
-    /// Who has the greater one is served first; 0 without a class.
+pub struct ClassOptions {
+    /// Priority: greater ones are served first (0 without a class).
     pub priority: i32,
-    /// What its robots may ask for.
+    /// Caps on what its robots may request.
     pub caps: Caps,
-    /// The SLA of robots that state neither one nor resources.
+    /// SLA of robots that state neither an SLA nor resources.
     pub sla: Sla,
-    /// Limits where neither the robot nor the push says anything.
+    /// Limits if neither the robot nor the push states any.
     pub limits: Limits,
 }

@@ -2,26 +2,26 @@ use std::collections::BTreeMap;
 
 use api::{Limits, Stated};
 
-/// Whom a servant is asked for, of which service, and on which terms.
+/// A request for a servant: service, robot and terms.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ServantRequest {
     /// The service.
     pub service: String,
     /// The robot.
     pub robot: String,
-    /// The robot named no name: nobody can come back to its servant.
+    /// The robot gave no name and cannot come back to its servant.
     pub anonymous: bool,
-    /// A stub asks, which stands for this node; a new servant begins without nodes, since stubs start them one by one. None:
-    /// a rosbridge client.
+    /// The node of the requesting stub; a new servant starts without nodes, since stubs start them one by one. `None`
+    /// for a rosbridge client.
     pub stub: Option<String>,
-    /// What is stated. Where it is nothing, what was stated before stays.
+    /// The statement; an empty one keeps the earlier statement.
     pub stated: Stated,
-    /// Limits that this daemon sets from the start on, whatever robots may ask for: of what it measures.
+    /// Limits that this daemon sets from the start, regardless of caps on robots; used for measurements.
     pub set: Limits,
 }
 
 impl ServantRequest {
-    /// By a rosbridge client that states nothing.
+    /// Creates a request of a rosbridge client without a statement.
     pub fn new(service: &str, robot: &str) -> ServantRequest {
         ServantRequest {
             service: service.to_owned(),
@@ -30,7 +30,7 @@ impl ServantRequest {
         }
     }
 
-    /// The same for a robot that named no name.
+    /// Marks the robot as one without a name.
     pub fn anonymous(self) -> ServantRequest {
         ServantRequest {
             anonymous: true,
@@ -38,38 +38,39 @@ impl ServantRequest {
         }
     }
 
-    /// The same by the stub of `node`.
-    pub fn by_stub(self, node: &str) -> ServantRequest {
+    /// Sets the stub's node.
+    pub fn with_stub(self, node: &str) -> ServantRequest {
         ServantRequest {
             stub: Some(node.to_owned()),
             ..self
         }
     }
 
-    /// The same with what is stated.
-    pub fn stating(self, stated: Stated) -> ServantRequest {
+    /// Sets the statement.
+    pub fn with_stated(self, stated: Stated) -> ServantRequest {
         ServantRequest { stated, ..self }
     }
 
-    /// The same with limits that this daemon sets.
-    pub(crate) fn setting(self, set: Limits) -> ServantRequest {
+    /// Sets limits that this daemon imposes.
+    pub(crate) fn with_limits(self, set: Limits) -> ServantRequest {
         ServantRequest { set, ..self }
     }
 
-    /// Who states it, of all clients of one robot: the stub's node, or nobody's name.
-    pub(crate) fn who(&self) -> &str {
+    /// Returns the name of the requesting client: the stub's node, or an empty name.
+    pub(crate) fn client(&self) -> &str {
         self.stub.as_deref().unwrap_or_default()
     }
 
-    /// What is stated, by whom; nothing where nothing is.
+    /// Returns the statement by client; empty without a statement.
     pub(crate) fn statement(&self) -> BTreeMap<String, Stated> {
-        let some = (!self.stated.is_empty()).then(|| (self.who().to_owned(), self.stated.clone()));
+        let some =
+            (!self.stated.is_empty()).then(|| (self.client().to_owned(), self.stated.clone()));
         some.into_iter().collect()
     }
 }
 
-/// Whether a servant of this name serves no robot, but a purpose of this daemon: its measurement (`~try-…`, `~calibrate-…`), or
-/// many robots (`~group-…`). Robots that name no name are given one without a dash.
+/// Returns true if a servant with this name serves no robot but a purpose of the daemon: a measurement (`~try-…`,
+/// `~calibrate-…`), or a group (`~group-…`). Robots without a name are given one without a dash.
 pub(crate) fn serves_no_robot(robot: &str, anonymous: bool) -> bool {
     anonymous && robot.contains('-')
 }

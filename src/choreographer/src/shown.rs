@@ -1,4 +1,4 @@
-//! What the API shows of a servant.
+//! Descriptions of servants for the API.
 
 use api::Phase;
 use reach::Reach;
@@ -6,21 +6,23 @@ use tokio::time::Instant;
 
 use crate::{Choreographer, Handle, limits};
 
-/// Topics whose drops are shown.
+/// Maximum number of topics with drops that are shown.
 const SHOWN_DROPS: usize = 10;
 
 impl Choreographer {
-    /// A servant as the API shows it.
+    /// Returns the description of a servant.
     pub async fn describe(&self, handle: &Handle) -> api::Servant {
         let inner = &self.inner;
         let life = handle.life();
         let reach = handle.reach();
-        let running = runs(life.phase);
+        let running = is_running(life.phase);
         let container = handle.container().filter(|_| running);
-        let enforced = container.as_ref().map(|container| container.enforced());
+        let enforced = container
+            .as_ref()
+            .map(|container| container.enforced_limits());
         let pids = container
             .as_ref()
-            .map(|container| inner.opener.processes(container.id()));
+            .map(|container| inner.opener.process_ids(container.id()));
         api::Servant {
             id: handle.id.clone(),
             service: handle.service().to_owned(),
@@ -43,20 +45,22 @@ impl Choreographer {
             cgroup_version: enforced
                 .as_ref()
                 .map_or(0, |enforced| enforced.cgroup_version),
-            enforced: enforced.map(|enforced| limits::limits_of(&enforced.limits)),
+            enforced: enforced.map(|enforced| limits::to_api_limits(&enforced.limits)),
             usage: usage(handle).await,
-            response: inner.recent.shown(&handle.id, Instant::now().into_std()),
+            response: inner
+                .recent
+                .response_times(&handle.id, Instant::now().into_std()),
             pids: pids.unwrap_or_default(),
-            dropped: reach.as_ref().map_or(0, |reach| reach.dropped()),
+            dropped: reach.as_ref().map_or(0, |reach| reach.dropped_count()),
             lifecycle: reach.as_deref().map(lifecycle).unwrap_or_default(),
             drops: reach.map(|reach| drops(&*reach)).unwrap_or_default(),
-            down: handle.down(),
-            hung: handle.hung(),
+            down: handle.nodes_down(),
+            hung: handle.hung_nodes(),
         }
     }
 }
 
-/// Nodes that have a lifecycle, and where they are in it.
+/// Returns the lifecycle nodes and their states.
 fn lifecycle(reach: &dyn Reach) -> Vec<api::NodeStage> {
     let stages = reach.lifecycles();
     let stages = stages.map(|stages| stages.borrow().clone());
@@ -70,17 +74,19 @@ fn lifecycle(reach: &dyn Reach) -> Vec<api::NodeStage> {
         .collect()
 }
 
-/// Topics that lost most.
+/// Returns the topics with the most drops.
 fn drops(reach: &dyn Reach) -> Vec<api::TopicDrops> {
     let topics = reach.drops().into_iter().take(SHOWN_DROPS);
     let told = topics.map(|(topic, count)| api::TopicDrops { topic, count });
     told.collect()
 }
 
-/// What a servant uses, while it runs.
+/// Returns the resource usage of a running servant.
 pub async fn usage(handle: &Handle) -> Option<api::Usage> {
-    let container = handle.container().filter(|_| runs(handle.life().phase))?;
-    // One that has ended meanwhile uses nothing.
+    let container = handle
+        .container()
+        .filter(|_| is_running(handle.life().phase))?;
+    // A servant that has ended meanwhile uses nothing.
     let usage = container.usage().await.ok()?;
     Some(api::Usage {
         cpu_usec: usage.cpu_usec,
@@ -92,6 +98,6 @@ pub async fn usage(handle: &Handle) -> Option<api::Usage> {
     })
 }
 
-fn runs(phase: Phase) -> bool {
+fn is_running(phase: Phase) -> bool {
     matches!(phase, Phase::Created | Phase::Starting | Phase::Ready)
 }

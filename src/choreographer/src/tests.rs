@@ -50,7 +50,7 @@ fn options() -> Options {
         warm_pool: 8,
         warm_memory: 1 << 30,
         warm_nodes: 0,
-        hung: Hung::default(),
+        hung: HungPolicy::default(),
         hung_after: 10.0,
         bridge: BridgeOptions::default(),
         memory: MemoryOptions {
@@ -62,7 +62,7 @@ fn options() -> Options {
     }
 }
 
-/// A choreographer of a machine with two cores.
+/// Returns a choreographer of a machine with two cores.
 fn choreographer() -> (tempfile::TempDir, Choreographer) {
     let home = tempfile::tempdir().expect("a directory");
     let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
@@ -81,8 +81,8 @@ fn choreographer() -> (tempfile::TempDir, Choreographer) {
     (home, choreographer)
 }
 
-/// A servant that runs, promised so many cores, and idle since then.
-async fn runs(
+/// Adds a running servant with these promised cores, idle since then.
+async fn running_servant(
     choreographer: &Choreographer,
     id: &str,
     cpus: f64,
@@ -90,9 +90,11 @@ async fn runs(
 ) -> Arc<Handle> {
     let inner = &choreographer.inner;
     let revision = Arc::new(revision("sha256:1", cpus));
-    let asked = inner.of_push(&revision);
+    let asked = inner.push_limits(&revision);
     let handle = Handle::new(id.into(), id.into(), false, asked, revision, 0);
-    let permit = inner.admission.adopt(inner.promised(&handle.asked()));
+    let permit = inner
+        .admission
+        .adopt(inner.promised_amount(&handle.requested_limits()));
     handle.set_promise(permit.promise());
     std::mem::forget(permit);
     handle.set_idle_until(idle_until);
@@ -106,17 +108,17 @@ async fn runs(
 async fn as_many_idle_servants_end_as_it_takes() {
     let (_home, choreographer) = choreographer();
     let inner = &choreographer.inner;
-    let oldest = runs(&choreographer, "oldest", 0.5, Some(10)).await;
-    let middle = runs(&choreographer, "middle", 0.5, Some(20)).await;
-    let newest = runs(&choreographer, "newest", 0.5, Some(30)).await;
-    let busy = runs(&choreographer, "busy", 0.5, None).await;
+    let oldest = running_servant(&choreographer, "oldest", 0.5, Some(10)).await;
+    let middle = running_servant(&choreographer, "middle", 0.5, Some(20)).await;
+    let newest = running_servant(&choreographer, "newest", 0.5, Some(30)).await;
+    let busy = running_servant(&choreographer, "busy", 0.5, None).await;
     let ending = |handle: &Arc<Handle>| handle.is_ending();
     inner.make_room();
     assert!(!ending(&oldest), "nobody waits");
     let wanted = Amount::new(1.0, 0);
     let deadline = Duration::from_secs(1);
     let waiting = inner.admission.admit(
-        Ask::robot(wanted, 0),
+        AdmissionRequest::robot(wanted, 0),
         deadline,
         watch::Sender::new(None),
         || inner.make_room(),
@@ -128,10 +130,10 @@ async fn as_many_idle_servants_end_as_it_takes() {
         "one of them has not enough"
     );
     assert!(!ending(&newest) && !ending(&busy), "more is not needed");
-    // One that waited for more than is idle finds the next as soon as that is idle.
+    // A request that waits for more than is idle takes the next servant as soon as that is idle.
     let wanted = Amount::new(2.0, 0);
     let waiting = inner.admission.admit(
-        Ask::robot(wanted, 0),
+        AdmissionRequest::robot(wanted, 0),
         deadline,
         watch::Sender::new(None),
         || inner.make_room(),
@@ -153,7 +155,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
     let first = state
         .publish(&revision("sha256:1", 9.0), &Default::default())
         .expect("published");
-    // Somebody asks while others are being given theirs, and meanwhile there is a new revision.
+    // A robot asks while others are being given theirs, and meanwhile there is a new revision.
     let held = choreographer.inner.servants.lock();
     let (sender, thread) = std::sync::mpsc::channel();
     let asking = {
@@ -166,7 +168,7 @@ async fn a_servant_is_of_the_revision_that_is_current_when_it_is_given() {
             lease.expect("a lease").handle().revision.number
         })
     };
-    // As far as it can come: it sleeps until the servants are free.
+    // As far as it can get: it sleeps until the servants are free.
     let thread = thread.recv().expect("it runs");
     let state_of = || std::fs::read_to_string(format!("/proc/self/task/{thread}/stat"));
     while !state_of().expect("it runs").contains(") S ") {

@@ -1,13 +1,15 @@
-//! An ordinary ROS node: what comes on `in` leaves on `out`, with a greeting before it; `~echo` answers with its request.
-//! `crash-on=TEXT` ends it with status 3 when TEXT comes. When `ask SERVICE` or `get PARAMETER` comes, what that
-//! service answers or the parameter's value leaves. `patient`: it
-//! listens once it is heard. `keeps`: it wants what was said before, too. `awaits=TOPIC`, `awaits-latched=TOPIC`: it listens once it
-//! has heard something there.
+//! An ordinary ROS node: it publishes each message of `in` on `out` with a greeting before it, and its service `~echo`
+//! returns its request.
 //!
-//! In ROS 1 the greeting is a sibling's parameter. With `--ros-args` it is a node of ROS 2, the greeting is a parameter of its own,
-//! and there is an action, `count`, whose goals are their results.
+//! A message `ask SERVICE` or `get PARAMETER` publishes the response of the service or the value of the parameter
+//! instead. Arguments: `crash-on=TEXT` exits with status 3 when TEXT arrives; `patient` subscribes to `in` when `out`
+//! has a subscriber; `keeps` also requests latched messages; `awaits=TOPIC` and `awaits-latched=TOPIC` subscribe to
+//! `in` after the first message on TOPIC.
 //!
-//! The tests of the local original start it in place of one.
+//! In ROS 1 the greeting is a parameter of a sibling. With `--ros-args` it is a ROS 2 node, the greeting is a parameter
+//! of its own, and there is an action `count` whose results are its goals.
+//!
+//! The tests of the local original use it as the original.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,7 +18,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use ros::JoinOptions;
 use ros::bus::{
-    ActionHandler, ActionServer, Bus, GoalEnd, Outcome, ParamValue, Qos, RosVersion,
+    ActionHandler, ActionServer, Bus, GoalEnd, GoalOutcome, ParamValue, QosProfile, RosVersion,
     ServiceHandler, ServiceType, WireType,
 };
 use ros::net::{HostSockets, Sockets};
@@ -33,51 +35,51 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// Passes goals on, to be ended.
-struct Goals(mpsc::UnboundedSender<(String, Bytes)>);
+/// Forwards goals, to be ended later.
+struct RelayGoals(mpsc::UnboundedSender<(String, Bytes)>);
 
-impl ActionHandler for Goals {
-    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+impl ActionHandler for RelayGoals {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
         let sent = self.0.send((id.to_owned(), goal));
         sent.map_err(|error| error.to_string())
     }
-    fn cancel(&self, _: &str) {}
-    fn failed(&self, reason: &str) {
+    fn on_cancel(&self, _: &str) {}
+    fn on_failed(&self, reason: &str) {
         eprintln!("{reason}");
     }
 }
 
-/// A server, and the goals that are sent to it.
+/// An action server and the goals that it receives.
 type Counting = (
     Box<dyn ActionServer>,
     mpsc::UnboundedReceiver<(String, Bytes)>,
 );
 
-fn count(bus: &dyn Bus, action: &str) -> Result<Counting, Box<dyn std::error::Error>> {
-    let registry = Registry::of(RosVersion::Two);
+fn serve_count(bus: &dyn Bus, action: &str) -> Result<Counting, Box<dyn std::error::Error>> {
+    let registry = Registry::for_version(RosVersion::Two);
     let text = "int32 number\n---\nint32 number\n---\nint32 number\n";
     registry.insert("tests/action/Count", text)?;
     let (sender, goals) = mpsc::unbounded_channel();
     let of = registry.action("tests/action/Count")?;
-    let server = bus.serve_action(action, &of, Arc::new(Goals(sender)))?;
+    let server = bus.serve_action(action, &of, Arc::new(RelayGoals(sender)))?;
     Ok((server, goals))
 }
 
-/// Where the message begins: behind CDR's header in ROS 2.
-fn begin(bus: &dyn Bus) -> usize {
+/// Returns the offset of the message: in ROS 2 it follows the CDR header.
+fn payload_offset(bus: &dyn Bus) -> usize {
     match bus.version() {
         RosVersion::One => 0,
         RosVersion::Two => 4,
     }
 }
 
-fn read(bus: &dyn Bus, message: &[u8]) -> String {
-    let text = &message[begin(bus) + 4..];
+fn decode(bus: &dyn Bus, message: &[u8]) -> String {
+    let text = &message[payload_offset(bus) + 4..];
     let text = String::from_utf8_lossy(text).into_owned();
     text.trim_end_matches('\0').to_owned()
 }
 
-fn written(bus: &dyn Bus, text: &str) -> Result<Bytes, Box<dyn std::error::Error>> {
+fn encode(bus: &dyn Bus, text: &str) -> Result<Bytes, Box<dyn std::error::Error>> {
     let (header, end): (&[u8], &[u8]) = match bus.version() {
         RosVersion::One => (&[], &[]),
         RosVersion::Two => (&[0, 1, 0, 0], &[0]),
@@ -86,18 +88,18 @@ fn written(bus: &dyn Bus, text: &str) -> Result<Bytes, Box<dyn std::error::Error
     Ok([header, &length, text.as_bytes(), end].concat().into())
 }
 
-async fn asked(bus: &dyn Bus, service: &str) -> String {
+async fn ask_service(bus: &dyn Bus, service: &str) -> String {
     let request = match bus.version() {
         RosVersion::One => Bytes::new(),
         RosVersion::Two => Bytes::from_static(&[0, 1, 0, 0, 0]),
     };
     match bus.call(service, request, Duration::from_secs(20)).await {
-        Ok(answer) => String::from_utf8_lossy(&answer[begin(bus)..]).into_owned(),
+        Ok(answer) => String::from_utf8_lossy(&answer[payload_offset(bus)..]).into_owned(),
         Err(error) => error.to_string(),
     }
 }
 
-/// Joins the system that the environment tells of.
+/// Joins the ROS system that the environment names.
 async fn join(version: RosVersion, node: &str) -> Result<Arc<dyn Bus>, Box<dyn std::error::Error>> {
     let options = match version {
         RosVersion::One => {
@@ -122,9 +124,10 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             .find_map(|argument| argument.strip_prefix(&prefix))
             .map(str::to_owned)
     };
-    let version = match arguments.iter().any(|argument| argument == "--ros-args") {
-        true => RosVersion::Two,
-        false => RosVersion::One,
+    let version = if arguments.iter().any(|argument| argument == "--ros-args") {
+        RosVersion::Two
+    } else {
+        RosVersion::One
     };
     let namespace = std::env::var("ROS_NAMESPACE").unwrap_or_default();
     let namespace = given("__ns").unwrap_or(namespace);
@@ -149,13 +152,13 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         Err(_) => given("greeting").unwrap_or_default(),
     };
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     registry.insert("std_msgs/msg/String", "string data\n")?;
-    let wire_type = WireType::of(&*registry.message("std_msgs/String")?);
+    let wire_type = WireType::from_message(&*registry.message("std_msgs/String")?);
     let (server, mut goals) = match version {
         RosVersion::One => (None, mpsc::unbounded_channel().1),
         RosVersion::Two => {
-            let (server, goals) = count(&*bus, &topic("count"))?;
+            let (server, goals) = serve_count(&*bus, &topic("count"))?;
             (Some(server), goals)
         }
     };
@@ -164,45 +167,47 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         .serve(&format!("{node}/echo"), echo_type, Arc::new(Echo))
         .await?;
     let out = bus
-        .advertise(&topic("out"), wire_type.clone(), Qos::keep_last(8))
+        .advertise(&topic("out"), wire_type.clone(), QosProfile::keep_last(8))
         .await?;
     if arguments.iter().any(|argument| argument == "patient") {
-        out.matched().wait_for(|now| now.connected() > 0).await?;
+        out.matched_subscribers()
+            .wait_for(|now| now.connected_count() > 0)
+            .await?;
     }
     for (prefix, is_latched) in [("awaits=", false), ("awaits-latched=", true)] {
         let awaited = arguments.iter().find_map(|it| it.strip_prefix(prefix));
         if let Some(awaited) = awaited {
-            let qos = Qos::keep_last(8).latching(is_latched);
+            let qos = QosProfile::keep_last(8).latching(is_latched);
             let mut heard = bus.subscribe(awaited, wire_type.clone(), qos).await?;
             heard.messages.recv().await;
         }
     }
     let keeps = arguments.iter().any(|argument| argument == "keeps");
-    let qos = Qos::keep_last(8).latching(keeps);
+    let qos = QosProfile::keep_last(8).latching(keeps);
     let mut input = bus.subscribe(&topic("in"), wire_type, qos).await?;
     let mut end = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::interrupt())?;
     loop {
         tokio::select! {
             message = input.messages.recv() => {
                 let Some(message) = message else { return Ok(()) };
-                let text = read(&*bus, &message.bytes);
+                let text = decode(&*bus, &message.bytes);
                 if crash == Some(text.as_str()) {
                     std::process::exit(3);
                 }
                 let text = match text.split_once(' ') {
-                    Some(("ask", service)) => asked(&*bus, service).await,
+                    Some(("ask", service)) => ask_service(&*bus, service).await,
                     Some(("get", parameter)) => match bus.parameter(parameter).await {
                         Ok(value) => format!("{value:?}"),
                         Err(error) => error.to_string(),
                     },
                     _ => format!("{greeting}{text}"),
                 };
-                out.publish(written(&*bus, &text)?);
+                out.publish(encode(&*bus, &text)?);
             }
             Some((id, result)) = goals.recv() => {
                 if let Some(server) = &server {
-                    let outcome = Outcome::Succeeded;
-                    server.end(&id, GoalEnd { outcome, text: String::new(), result });
+                    let outcome = GoalOutcome::Succeeded;
+                    server.end_goal(&id, GoalEnd { outcome, text: String::new(), result });
                 }
             }
             _ = end.recv() => {

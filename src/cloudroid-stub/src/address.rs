@@ -1,52 +1,53 @@
-//! The portal's address, as `stub.toml` says it: `ws://host:9090`, or `wss://host` where TLS is spoken.
+//! Address of the portal in `stub.toml`: `ws://host:9090`, or `wss://host` with TLS.
 
-/// A portal's address, taken apart.
+/// A parsed address of a portal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Address {
-    /// TLS is spoken.
+    /// Set for TLS.
     pub secure: bool,
     /// Name or IP address, without brackets.
     pub host: String,
-    /// The port; WebSocket's own (RFC 6455, section 3) where none is said.
+    /// The port (default: WebSocket's own, RFC 6455, section 3).
     pub port: u16,
-    /// Host and port as written, for HTTP's `Host`.
+    /// Host and port as written, for the HTTP header `Host`.
     pub authority: String,
 }
 
 impl Address {
-    /// The name by which its certificate is remembered: host and port.
-    pub fn known_as(&self) -> String {
-        match self.host.contains(':') {
-            true => format!("[{}]:{}", self.host, self.port),
-            false => format!("{}:{}", self.host, self.port),
+    /// Returns the name under which its certificate is stored: host and port.
+    pub fn known_server_name(&self) -> String {
+        if self.host.contains(':') {
+            format!("[{}]:{}", self.host, self.port)
+        } else {
+            format!("{}:{}", self.host, self.port)
         }
     }
 
-    /// Reads it; says what is wrong with it.
+    /// Parses an address; the error describes the mistake.
     pub fn parse(server: &str) -> Result<Self, String> {
         let wrong = |what: &str| {
             format!("server is {server:?}: {what}, such as ws://host:9090 or wss://host")
         };
         let (scheme, authority) = server
             .split_once("://")
-            .ok_or_else(|| wrong("it should be an address"))?;
+            .ok_or_else(|| wrong("expected a URL"))?;
         let secure = match scheme {
             "ws" => false,
             "wss" => true,
-            _ => return Err(wrong("it should begin with ws:// or wss://")),
+            _ => return Err(wrong("expected ws:// or wss:// at its start")),
         };
         let authority = authority.trim_end_matches('/');
         if authority.is_empty()
             || authority.contains(['/', '?', '#', '@'])
             || authority.contains(char::is_whitespace)
         {
-            return Err(wrong("it should be a host and a port and nothing else"));
+            return Err(wrong("expected only a host and a port"));
         }
         let (host, port) = match authority.rsplit_once(':') {
             Some((host, port)) if !port.contains(']') => {
                 let port = port
                     .parse()
-                    .map_err(|_| wrong("its port should be a number"))?;
+                    .map_err(|_| wrong("its port is not a number"))?;
                 (host, port)
             }
             _ => (authority, if secure { 443 } else { 80 }),

@@ -1,4 +1,4 @@
-//! The command line. Launchers write it, people only type `doctor` and `pair`.
+//! The command line. Launchers generate it; people only type `doctor` and `pair`.
 
 use std::path::PathBuf;
 
@@ -7,89 +7,89 @@ use clap::{Args, Parser, Subcommand};
 /// Runs a robot's node in the cloud, under its own name.
 #[derive(Debug, Parser)]
 #[command(name = "cloudroid-stub", version, arg_required_else_help = true)]
-pub struct Arguments {
-    /// The command.
+pub struct StubArguments {
+    /// Command to run.
     #[command(subcommand)]
-    pub verb: Verb,
+    pub verb: StubCommand,
 }
 
-/// What can be done.
+/// Commands of the stub.
 #[derive(Debug, Subcommand)]
-pub enum Verb {
-    /// Be the node: register under its name, have the real one run in the cloud.
-    Run(Run),
-    /// Become the next executable of this name in libexec order: one that is not outsourced.
-    ExecOriginal(ExecOriginal),
-    /// Say of each thing the stub needs whether it is there.
-    Doctor(Doctor),
-    /// Pair this robot with a server: make its own key, and have a certificate of it.
-    Pair(Pair),
+pub enum StubCommand {
+    /// Run as the node: register under its name and have the real node run in the cloud.
+    Run(RunArgs),
+    /// Execute the original: the next executable of this name in libexec order, which is not outsourced.
+    ExecOriginal(ExecOriginalArgs),
+    /// Check everything that the stub needs, and show how to fix what is missing.
+    Doctor(StubDoctorArgs),
+    /// Pair this robot with a server: make its own key and obtain a certificate for it.
+    Pair(PairRobotArgs),
 }
 
-/// Which executable is meant.
+/// Executable of a package.
 #[derive(Debug, Clone, Args)]
-pub struct Node {
-    /// The ROS package.
+pub struct NodeArgs {
+    /// ROS package.
     #[arg(long, value_name = "PKG")]
     pub package: String,
-    /// The executable below lib/PKG.
+    /// Executable below lib/PKG.
     #[arg(long, value_name = "EXE")]
     pub node: String,
-    /// The stub's share/PKG, where interface.toml and stub.toml are.
+    /// Directory share/PKG of the stub, which contains interface.toml and stub.toml.
     #[arg(long, value_name = "DIR")]
     pub share: PathBuf,
 }
 
-/// Be the node.
+/// Arguments of `run`.
 #[derive(Debug, Args)]
-pub struct Run {
+pub struct RunArgs {
     #[command(flatten)]
-    /// The node to stand in for.
-    pub node: Node,
-    /// As roslaunch or rosrun gave it: arguments, remaps, __name:=, __log:=.
+    /// Node to stand in for.
+    pub node: NodeArgs,
+    /// Arguments from roslaunch or rosrun: the node's own, remaps, __name:=, __log:=.
     #[arg(last = true, allow_hyphen_values = true)]
     pub argv: Vec<String>,
 }
 
-/// Become the original.
+/// Arguments of `exec-original`.
 #[derive(Debug, Args)]
-pub struct ExecOriginal {
+pub struct ExecOriginalArgs {
     #[command(flatten)]
-    /// The node whose original is executed.
-    pub node: Node,
-    /// Passed on as it is.
+    /// Node whose original is executed.
+    pub node: NodeArgs,
+    /// Arguments for the original, passed on unchanged.
     #[arg(last = true, allow_hyphen_values = true)]
     pub argv: Vec<String>,
 }
 
-/// Pair.
+/// Arguments of `pair`.
 #[derive(Debug, Args)]
-pub struct Pair {
-    /// What cloudroidctl pair ROBOT printed on the server, between single quotes.
+pub struct PairRobotArgs {
+    /// Line printed by cloudroidctl pair ROBOT on the server, in single quotes.
     #[arg(value_name = "LINE")]
     pub line: String,
-    /// Directory of the robot's key and certificates; ~/.config/cloudroid by default.
+    /// Directory of the robot's key and certificates (default: ~/.config/cloudroid).
     #[arg(long, value_name = "DIR", env = "CLOUDROID_IDENTITY")]
     pub identity: Option<PathBuf>,
 }
 
-/// Check.
+/// Arguments of `doctor`.
 #[derive(Debug, Args)]
-pub struct Doctor {
-    /// The stub's share/PKG, where interface.toml and stub.toml are; by default that of this very program.
+pub struct StubDoctorArgs {
+    /// Directory share/PKG of the stub, which contains interface.toml and stub.toml (default: that of this program).
     #[arg(long, value_name = "DIR")]
     pub share: Option<PathBuf>,
-    /// The ROS package; by default the share directory's name.
+    /// ROS package (default: name of the share directory).
     #[arg(long, value_name = "PKG")]
     pub package: Option<String>,
-    /// Only this part.
+    /// Run only these checks.
     #[arg(long, value_enum)]
-    pub only: Option<Part>,
+    pub only: Option<DoctorPart>,
 }
 
-/// A part of what is checked.
+/// Groups of checks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Part {
+pub enum DoctorPart {
     /// Address, token, service, clock and MTU.
     Server,
 }

@@ -1,58 +1,61 @@
-//! `stub.toml`, which stands beside `interface.toml` in the stub's share directory, and what overrides it.
+//! `stub.toml`, next to `interface.toml` in the stub's share directory, and the settings that override it.
 //!
 //! ```toml
-//! server = "ws://cloud.example:9090"   # the portal; wss:// where TLS is spoken
-//! service = "opencv_apps"              # what was published
-//! ca_file = "/path/ca.pem"             # for wss://: whom to trust, PEM; by default the system's authorities
-//! # For wss://: the server's certificate, where no authority that is trusted has signed it; without it a certificate that
-//! # signs itself is remembered when it is first seen, in the file that known_servers names.
+//! server = "ws://cloud.example:9090"   # address of the portal; wss:// with TLS
+//! service = "opencv_apps"              # name of the published service
+//! ca_file = "/path/ca.pem"             # for wss://: authorities to trust, PEM (default: the system's)
+//! # For wss://: fingerprint of the server's certificate, if no trusted authority has signed it. Without it, a
+//! # self-signed certificate is accepted when it is first seen and stored in the file known_servers.
 //! fingerprint = "SHA256:5d215d215d215d215d215d215d215d215d215d215d215d215d215d215d215d21"
 //! known_servers = "~/.config/cloudroid/known_servers"
-//! identity = "~/.config/cloudroid"    # for wss://: where this robot's key and certificates are, once it is paired
-//! token_file = "~/.config/cloudroid/token"   # holds the bearer token; none is needed where the portal asks for none
-//! robot = "rover1"                     # this robot's id; by default its host name
+//! identity = "~/.config/cloudroid"    # for wss://: directory of the robot's key and certificates, once it is paired
+//! token_file = "~/.config/cloudroid/token"   # file of the bearer token, if the portal requires one
+//! robot = "rover1"                     # robot id (default: the host name)
 //!
-//! desire = 0.10        # T_desire, seconds: the response time that is wished for
-//! max = 0.30           # T_max, seconds: the longest that is acceptable
+//! desire = 0.10        # T_desire: desired response time, seconds
+//! max = 0.30           # T_max: longest acceptable response time, seconds
 //! threshold = 4.0      # Q_t: below it the local original is started
-//! initial = 8.0        # Q at the beginning; 2·Q_t where absent
-//! cap = 16.0           # Q stays below it; 4·Q_t where absent, inf for no bound
-//! frames_per_second = 5.0   # instead of desire and max: least rate of an output
-//! desired_frames_per_second = 10.0   # the rate that is wished for; frames_per_second where absent
-//! age = 0.5            # instead of desire and max, seconds: greatest age that an output reaches
-//! desired_age = 0.2    # the age that is wished for; age where absent
-//! output = "/people"   # which output those are about; the one that answers the node's requests where absent
-//! request = "auto"     # "auto": as the push decided (revision.toml), or "INPUT -> OUTPUT" where that is wrong
-//! # The same for several, with other times than desire and max for those that need them: inputs, services and actions.
+//! initial = 8.0        # initial Q (default: 2·Q_t)
+//! cap = 16.0           # upper limit of Q (default: 4·Q_t); inf for none
+//! frames_per_second = 5.0   # instead of desire and max: lowest acceptable rate of an output, Hz
+//! desired_frames_per_second = 10.0   # desired rate, Hz (default: frames_per_second)
+//! age = 0.5            # instead of desire and max: greatest acceptable age of an output, seconds
+//! desired_age = 0.2    # desired age, seconds (default: age)
+//! output = "/people"   # output that the rate or age is for (default: the one that answers the node's requests)
+//! request = "auto"     # "auto": as decided by the push (revision.toml), or "INPUT -> OUTPUT" to correct that
+//! # Several requests, with their own times if they differ from desire and max: inputs, services and actions.
 //! requests = ["/image -> /people", { request = "/plan", desire = 1.0, max = 5.0 }]
 //!
-//! fallback_after = 3.0 # where no time, rate or age is promised: seconds for which the link is down before the local
-//!                      # original takes over, until the link is up again
-//! call_limit = 600.0   # seconds that a service of the robot may take when the node in the cloud calls it
+//! fallback_after = 3.0 # if no time, rate or age is promised: seconds that the link is down before the local original
+//!                      # takes over, until the link is up again
+//! call_limit = 600.0   # longest time for a call of a robot's service by the node in the cloud, seconds
 //!
-//! local = "cold"       # the local original: "cold" started when needed, "warm" started at once and fed when needed,
-//!                      # "first-sign" started by the first late request and fed when needed, "none"
-//! stateful = false     # the local original takes over only while the link is down
-//! safe_stop = "/cmd_vel"   # experimental: an output on which a message of zeros is published when neither side answers in time, or
-//! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }  # any topic
-//! # The name that an executable's node has when none is given, where that is not the executable's; in ROS 2 with a namespace
-//! # ("/camera/listener") where the program gives it one.
+//! local = "cold"       # process of the local original: "cold" is started when needed; "warm" is started at once and
+//!                      # fed when needed; "first-sign" is started by the first late request and fed when needed;
+//!                      # "none" disables it
+//! stateful = false     # if true, the local original takes over only while the link is down
+//! # Experimental: message that is published when neither side answers in time. Zeros on an output:
+//! safe_stop = "/cmd_vel"
+//! # Or a message on any topic:
+//! safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = { linear = { x = 0.0 } } }
+//! # Name of an executable's node if none is given, where it differs from the executable's; in ROS 2 with the
+//! # namespace ("/camera/listener") if the program sets one.
 //! nodes = { "listener.py" = "listener" }
 //!
-//! # What the node in the cloud is to get, stated to the server with desire and max, or what else is promised:
-//! class = "interactive"   # a class that the server's operator has configured
-//! cpus = 1.5           # cores outright, whatever the server knows of what desire and max need
-//! memory = "1G"        # and memory
-//! aux = { width = 640 }   # what the service's deployer wants to know, such as the width of pictures
+//! # Resources for the node in the cloud, stated to the server with desire and max, or with what else is promised:
+//! class = "interactive"   # class of the server's configuration
+//! cpus = 1.5           # cores, instead of those that the server derives from desire and max
+//! memory = "1G"        # memory, instead of what the server derives
+//! aux = { width = 640 }   # auxiliary parameters that the service's deployer asks for, such as the width of images
 //!
-//! stamps = "rewrite"   # "rewrite" to the cloud's clock and back, or "keep"
-//! codec = "auto"       # "none", "auto" (lossless), or "jpeg": pictures may lose detail where no lossless codec keeps up
-//!                      # with them or with T_max; "video" is the same as H.264, in programs that are built with it
-//! quality = 80         # of "jpeg", 1 to 100
+//! stamps = "rewrite"   # "rewrite" converts stamps to the cloud's clock and back, "keep" leaves them unchanged
+//! codec = "auto"       # "none", "auto" (lossless), or "jpeg": images may lose detail if no lossless codec keeps up
+//!                      # with them or with T_max; "video" is the same with H.264, if both programs are built with it
+//! quality = 80         # quality of "jpeg", 1 to 100
 //! ```
 //!
-//! Each key can be given by the environment, as `CLOUDROID_` and the key in capitals, and, before that, by a ROS
-//! parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
+//! A key can also be set by the environment variable `CLOUDROID_` with the key in capitals, and, with precedence over
+//! that, by a ROS parameter: `cloudroid/KEY` in the node's own namespace (`~cloudroid/KEY`) or in one around it.
 
 mod aux_parameters;
 mod check;
@@ -75,43 +78,43 @@ use crate::address::Address;
 use crate::pairing;
 use crate::revision::Defaults;
 
-pub use parameters::{Group, groups};
-pub use requests::Requests;
-pub use sources::read;
+pub use parameters::{ParameterGroup, group_names};
+pub use requests::RequestsSetting;
+pub use sources::load;
 
-/// The file's name in the share directory.
+/// Name of the file in the share directory.
 pub const FILE: &str = "stub.toml";
 
-/// Times, rates and counts of a configuration must be less than this.
+/// Upper limit of the times, rates and counts in a configuration.
 const MOST: f64 = 1e6;
 
-/// How the stub is to behave.
+/// Settings of the stub.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
-    /// The portal: `ws://host:port` or `wss://host:port`.
+    /// Address of the portal: `ws://host:port` or `wss://host:port`.
     pub server: String,
-    /// The service's name.
+    /// Name of the service.
     pub service: String,
-    /// The bearer token itself; prefer `token_file`, which only its owner can read.
+    /// Bearer token; prefer `token_file`, which only its owner can read.
     #[serde(default)]
     pub token: Option<String>,
-    /// A file that holds it.
+    /// File of the bearer token.
     #[serde(default)]
     pub token_file: Option<PathBuf>,
-    /// For `wss://`: a PEM file with the certificates to trust; the system's where absent.
+    /// For `wss://`: PEM file of the certificates to trust (default: the system's).
     #[serde(default)]
     pub ca_file: Option<PathBuf>,
-    /// For `wss://`: the certificate to trust, by its fingerprint, besides those that an authority has signed.
+    /// For `wss://`: fingerprint of the certificate to trust, besides those that an authority has signed.
     #[serde(default)]
     pub fingerprint: Option<Fingerprint>,
-    /// For `wss://`: where certificates are remembered that were seen first; below the user's configuration where absent.
+    /// For `wss://`: file of certificates that were accepted at first sight (default: in the user's configuration).
     #[serde(default)]
     pub known_servers: Option<PathBuf>,
-    /// For `wss://`: directory of the robot's own key and certificates; below the user's configuration where absent.
+    /// For `wss://`: directory of the robot's own key and certificates (default: in the user's configuration).
     #[serde(default)]
     pub identity: Option<PathBuf>,
-    /// This robot's id; where absent, the one that it is paired as, or else its host name.
+    /// Robot id (default: the one that it is paired as, otherwise its host name).
     #[serde(default)]
     pub robot: Option<String>,
     /// T_desire in seconds.
@@ -120,82 +123,83 @@ pub struct Config {
     /// T_max in seconds.
     #[serde(default)]
     pub max: Option<f64>,
-    /// Q_t.
+    /// Threshold Q_t.
     #[serde(default)]
     pub threshold: Option<f64>,
-    /// Q at the beginning.
+    /// Initial Q.
     #[serde(default)]
     pub initial: Option<f64>,
-    /// Q stays below it; may be infinite.
+    /// Upper limit of Q; may be infinite.
     #[serde(default)]
     pub cap: Option<f64>,
-    /// Least rate of an output.
+    /// Lowest acceptable rate of an output, in Hz.
     #[serde(default)]
     pub frames_per_second: Option<f64>,
-    /// The rate that is wished for.
+    /// Desired rate of an output, in Hz.
     #[serde(default)]
     pub desired_frames_per_second: Option<f64>,
-    /// Greatest age of an output in seconds.
+    /// Greatest acceptable age of an output, in seconds.
     #[serde(default)]
     pub age: Option<f64>,
-    /// The age that is wished for, seconds.
+    /// Desired age of an output, in seconds.
     #[serde(default)]
     pub desired_age: Option<f64>,
-    /// What those two are about.
+    /// Output that the rate or age is for.
     #[serde(default)]
     pub output: Option<String>,
     /// `auto`, or `INPUT -> OUTPUT`.
     #[serde(default)]
     pub request: Option<String>,
-    /// The same for several, with times of their own.
+    /// Several requests, with times of their own.
     #[serde(default)]
-    pub requests: Option<Requests>,
-    /// Seconds for which the link is down before the local original takes over, where no time, rate or age is promised.
+    pub requests: Option<RequestsSetting>,
+    /// Time in seconds that the link is down before the local original takes over, if no time, rate or age is promised.
     #[serde(default = "fallback_after")]
     pub fallback_after: f64,
-    /// Seconds that a service of the robot may take when the node in the cloud calls it.
+    /// Longest time in seconds for a call of a robot's service by the node in the cloud.
     #[serde(default = "call_limit")]
     pub call_limit: f64,
-    /// When the local original runs.
+    /// Start of the local original.
     #[serde(default)]
-    pub local: Local,
-    /// The local original takes over only while the link is down.
+    pub local: LocalMode,
+    /// Set if the local original takes over only while the link is down.
     #[serde(default)]
     pub stateful: bool,
-    /// What is published when neither side answers in time.
+    /// Message that is published when neither side answers in time.
     #[serde(default)]
-    pub safe_stop: Option<SafeStop>,
-    /// A class of the server's configuration.
+    pub safe_stop: Option<SafeStopConfig>,
+    /// Class of the server's configuration.
     #[serde(default)]
     pub class: Option<String>,
-    /// Cores that are asked for outright.
+    /// Requested number of cores.
     #[serde(default)]
     pub cpus: Option<f64>,
-    /// Memory that is asked for outright.
+    /// Requested memory.
     #[serde(default)]
     pub memory: Option<Scalar>,
     /// Auxiliary parameters of the service's dictionary.
     #[serde(default)]
     pub aux: Option<Aux>,
-    /// What becomes of stamps while the clocks of robot and cloud differ.
+    /// Treatment of stamps while the clocks of robot and cloud differ.
     #[serde(default)]
-    pub stamps: Stamps,
-    /// How messages are made smaller on the link.
+    pub stamps: StampMode,
+    /// Compression of messages on the link.
     #[serde(default)]
-    pub codec: Codec,
-    /// Quality of JPEG pictures, 1 to 100.
+    pub codec: CodecSetting,
+    /// Quality of JPEG images, 1 to 100.
     #[serde(default)]
     pub quality: Option<f64>,
-    /// Executable → the name its node has when none is given; in ROS 2 also with a namespace.
+    /// Default names of nodes by executable; in ROS 2 optionally with a namespace.
     #[serde(default)]
     pub nodes: BTreeMap<String, String>,
 }
 
-/// Default of [`Config::fallback_after`], seconds.
+/// Default of [`Config::fallback_after`], in seconds.
 pub const FALLBACK_AFTER: f64 = 3.0;
 
-/// What a robot says that has no authorities.
-const NOBODY_TRUSTED: &str = "this robot trusts nobody yet: sudo apt install ca-certificates, or name the server's authority by ca_file in stub.toml";
+/// Advice for a robot without trusted authorities.
+const NOBODY_TRUSTED: &str = "no certificate authorities are installed on this robot: sudo apt install \
+    ca-certificates, or set ca_file in stub.toml to the server's authority";
 
 fn fallback_after() -> f64 {
     FALLBACK_AFTER
@@ -206,31 +210,31 @@ fn call_limit() -> f64 {
 }
 
 impl Config {
-    /// Seconds without an answer, or without a frame, after which the promise is broken.
-    pub fn longest(&self) -> Option<f64> {
+    /// Returns the time in seconds without an answer, or without a frame, after which the promise is broken.
+    pub fn promise_timeout(&self) -> Option<f64> {
         let interval = self.frames_per_second.map(|rate| 1.0 / rate);
         self.max.or(interval).or(self.age)
     }
 
-    /// Quality of JPEG pictures, 1 to 100; none: the codec's own, 80.
+    /// Returns the quality of JPEG images, 1 to 100; `None` for the codec's default, 80.
     pub fn quality(&self) -> Option<u8> {
         self.quality.map(|quality| quality as u8)
     }
 
-    /// [`call_limit`](Self::call_limit) as a duration.
+    /// Returns [`call_limit`](Self::call_limit) as a duration.
     pub fn call_limit(&self) -> Duration {
         Duration::from_secs_f64(self.call_limit)
     }
 
-    /// Whether a time, a rate or an age is promised.
-    pub fn promises(&self) -> bool {
+    /// Returns whether a time, a rate or an age is promised.
+    pub fn has_promise(&self) -> bool {
         let all = [self.desire, self.max, self.frames_per_second, self.age];
         all.iter().any(Option::is_some)
     }
 
-    /// With what the service's deployer says of response times, where the robot promises nothing.
-    pub fn or(self, defaults: &Defaults) -> Config {
-        if self.promises() {
+    /// Uses the response times of the service's deployer if the robot promises nothing.
+    pub fn or_defaults(self, defaults: &Defaults) -> Config {
+        if self.has_promise() {
             return self;
         }
         Config {
@@ -240,14 +244,14 @@ impl Config {
         }
     }
 
-    /// This robot's id.
-    pub fn robot(&self) -> String {
+    /// Returns the robot id.
+    pub fn robot_id(&self) -> String {
         let host = || {
             nix::unistd::gethostname()
                 .ok()
                 .and_then(|name| name.into_string().ok())
         };
-        let paired = || pairing::robot(self);
+        let paired = || pairing::paired_robot(self);
         self.robot
             .clone()
             .or_else(paired)
@@ -255,31 +259,31 @@ impl Config {
             .unwrap_or_else(|| "robot".to_owned())
     }
 
-    /// The portal's address.
+    /// Returns the parsed address of the portal.
     pub fn address(&self) -> Result<Address, String> {
         Address::parse(&self.server)
     }
 
-    /// Whom to trust where TLS is spoken, and what to show there.
+    /// Returns the trust settings for TLS and the identity to present.
     pub fn trust(&self) -> anyhow::Result<Trust> {
-        let named = self.known_servers.as_deref().map(at_home);
-        // Where a robot's certificates are, there pairing has left what it knows of servers.
-        let beside = self.identity.as_deref().map(at_home);
+        let named = self.known_servers.as_deref().map(expand_home);
+        // Pairing stores the known servers in the directory of the robot's certificates.
+        let beside = self.identity.as_deref().map(expand_home);
         let beside = beside.map(|directory| directory.join("known_servers"));
         Ok(Trust {
-            authorities: self.ca_file.as_deref().map(at_home),
+            authorities: self.ca_file.as_deref().map(expand_home),
             fingerprint: self.fingerprint,
             known: named
                 .or(beside)
-                .map(KnownServers::at)
-                .or_else(KnownServers::of_user),
+                .map(KnownServers::new)
+                .or_else(KnownServers::for_user),
             accept: "install.sh --fingerprint".to_owned(),
             advice: NOBODY_TRUSTED,
-            identity: pairing::identity(self)?,
+            identity: pairing::load_identity(self)?,
         })
     }
 
-    /// The bearer token.
+    /// Returns the bearer token.
     pub fn token(&self) -> anyhow::Result<Option<String>> {
         if let Some(token) = &self.token {
             return Ok(Some(token.clone()));
@@ -287,15 +291,15 @@ impl Config {
         let Some(path) = &self.token_file else {
             return Ok(None);
         };
-        let path = at_home(path);
+        let path = expand_home(path);
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("cannot read the token in {}", path.display()))?;
         Ok(Some(text.trim().to_owned()))
     }
 }
 
-/// A path with `~` for the user's own directory.
-pub fn at_home(path: &Path) -> PathBuf {
+/// Replaces a leading `~` of a path with the user's home directory.
+pub fn expand_home(path: &Path) -> PathBuf {
     let home = std::env::var_os("HOME").map(PathBuf::from);
     match (path.strip_prefix("~"), home) {
         (Ok(below), Some(home)) => home.join(below),
@@ -303,20 +307,20 @@ pub fn at_home(path: &Path) -> PathBuf {
     }
 }
 
-/// What brings the robot to rest.
+/// Message that brings the robot to rest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
-pub enum SafeStop {
+pub enum SafeStopConfig {
     /// Zeros on an output of the node.
     Output(String),
     /// A message on any topic.
     Message(qos::SafeStop),
 }
 
-/// When the local original runs.
+/// Start of the local original.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Local {
+pub enum LocalMode {
     /// Started when it is needed.
     #[default]
     Cold,
@@ -324,38 +328,38 @@ pub enum Local {
     Warm,
     /// Started by the first late request, given requests when it is needed.
     FirstSign,
-    /// Never.
+    /// Never started.
     None,
 }
 
-/// How stamps are treated while the clocks of robot and cloud differ.
+/// Treatment of stamps while the clocks of robot and cloud differ.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Stamps {
-    /// The node has them in its own clock's time, the robot in its.
+pub enum StampMode {
+    /// Converted, so that the node and the robot each see their own clock's time.
     #[default]
     Rewrite,
-    /// They cross as they are.
+    /// Unchanged.
     Keep,
 }
 
-/// How messages are made smaller.
+/// Compression of messages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Codec {
+pub enum CodecSetting {
     /// No codec: messages are sent unchanged.
     None,
-    /// Where it saves time, without loss.
+    /// Lossless, if it saves time.
     #[default]
     Auto,
-    /// Where it saves time; pictures may lose detail, each as a JPEG.
+    /// If it saves time; images may lose detail, as JPEG.
     Jpeg,
-    /// Where it saves time; pictures may lose detail, as H.264.
+    /// If it saves time; images may lose detail, as H.264.
     Video,
 }
 
-impl Codec {
-    /// The codec by which pictures may lose detail.
+impl CodecSetting {
+    /// Returns the lossy codec for images.
     pub fn lossy(self) -> Option<codec::Codec> {
         match self {
             Self::None | Self::Auto => None,
@@ -364,24 +368,27 @@ impl Codec {
         }
     }
 
-    /// Why this choice has no effect with a server that decodes the codecs `decoded`, and what to do; none if it has.
-    pub fn unmet(self, decoded: &[String]) -> Option<String> {
+    /// Returns why this setting has no effect with a server that decodes the codecs `decoded`, and what to do; `None`
+    /// if it has.
+    pub fn unsupported_reason(self, decoded: &[String]) -> Option<String> {
         let lossy = self.lossy()?;
         let name = lossy.name();
         let instead = match self {
             Self::Video => {
-                "set codec = \"jpeg\", or use programs that are built with the feature `video` on both sides"
+                "set codec = \"jpeg\", or use a stub and a server that are built with the feature `video`"
             }
             _ => "update the server",
         };
-        if !lossy.is_built() {
+        if !lossy.is_available() {
             return Some(format!(
-                "codec = \"{name}\" is not built into this stub, so pictures lose no detail and need more of the network; {instead}"
+                "codec = \"{name}\" is not built into this stub, so images are sent lossless and need more bandwidth; \
+                    {instead}"
             ));
         }
         if !decoded.iter().any(|has| has == name) {
             return Some(format!(
-                "codec = \"{name}\" is not known to the server, so pictures lose no detail and need more of the network; {instead}"
+                "codec = \"{name}\" is not supported by the server, so images are sent lossless and need more \
+                    bandwidth; {instead}"
             ));
         }
         None

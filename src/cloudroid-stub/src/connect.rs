@@ -14,29 +14,29 @@ use crate::address::Address;
 use crate::config::Config;
 use crate::resolver;
 use crate::run;
-use crate::stream::{Stream, refused_certificate};
+use crate::stream::{PortalStream, certificate_refusal};
 
-/// For TCP's own handshake.
+/// Time allowed for the TCP handshake.
 const TCP: Duration = Duration::from_secs(2);
-/// The longest answer to the handshake.
+/// Largest response to the WebSocket handshake, in bytes.
 const MAX_HEAD: usize = 64 * 1024;
-/// For a frame of the server to come as a whole, once it has begun.
+/// Time allowed for a frame of the server from its first byte to its last.
 const UNFINISHED: Duration = Duration::from_secs(300);
 const GUID: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
-/// Unsent bytes that the kernel may hold: what waits in it cannot be replaced by something newer, and a command waits for it. At 500 kbit/s they
-/// are a quarter of a second.
+/// Unsent bytes that the kernel may hold: data in the kernel cannot be replaced by newer data, and a command has to
+/// wait for it. At 500 kbit/s this is a quarter of a second.
 const UNSENT: u32 = 16 * 1024;
 
-/// Why there is no connection.
+/// Reason why there is no connection.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Trying again may help.
+    /// The server cannot be reached; a retry may help.
     #[error("{0}")]
     Unreachable(String),
-    /// Trying again may help, and the server is there: it has no room, say.
+    /// The server is reachable but cannot accept the stub now, for example for lack of capacity; a retry may help.
     #[error("{0}")]
     Busy(String),
-    /// The portal does not want this stub; trying again changes nothing.
+    /// The portal refuses this stub; a retry does not help.
     #[error("{0}")]
     Refused(String),
 }
@@ -47,7 +47,7 @@ pub async fn open(
     path: &str,
     token: Option<&str>,
     patience: Duration,
-) -> Result<WebSocket<Stream>, Error> {
+) -> Result<WebSocket<PortalStream>, Error> {
     let address = config.address().map_err(Error::Refused)?;
     let trust = config
         .trust()
@@ -67,16 +67,16 @@ async fn handshake(
     trust: &Trust,
     path: &str,
     token: Option<&str>,
-) -> Result<WebSocket<Stream>, Error> {
+) -> Result<WebSocket<PortalStream>, Error> {
     let authority = &address.authority;
-    let unreachable = |what: &str, error: std::io::Error| match refused_certificate(&error) {
+    let unreachable = |what: &str, error: std::io::Error| match certificate_refusal(&error) {
         Some(words) => Error::Refused(format!("{authority} refuses this robot: {words}")),
         None => Error::Unreachable(format!("{what} {authority}: {error}")),
     };
     let ip = resolver::resolve(&address.host)
         .await
         .map_err(|error| unreachable("cannot find", error))?;
-    // A packet that was lost would be sent again ever more seldom.
+    // TCP would retransmit a lost packet at increasing intervals.
     let stream = match timeout(TCP, TcpStream::connect((ip, address.port))).await {
         Ok(stream) => stream,
         Err(elapsed) => Err(elapsed.into()),
@@ -86,12 +86,14 @@ async fn handshake(
     let _ = socket.set_tcp_nodelay(true);
     let _ = socket.set_tcp_keepalive(&keepalive());
     let _ = socket.set_tcp_notsent_lowat(UNSENT);
-    let mut stream = Stream::over(stream, address, trust)
+    let mut stream = PortalStream::connect(stream, address, trust)
         .await
-        .map_err(|error| unreachable("no TLS with", error))?;
+        .map_err(|error| unreachable("TLS handshake failed with", error))?;
     let key = STANDARD.encode_to_string(rand::random::<[u8; 16]>());
     let mut request = format!(
-        "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: {}\r\nUser-Agent: cloudroid-stub/{}\r\n",
+        "GET {path} HTTP/1.1\r\nHost: {authority}\r\nConnection: Upgrade\r\nUpgrade: \
+         websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Protocol: \
+         {}\r\nUser-Agent: cloudroid-stub/{}\r\n",
         link::SUBPROTOCOL,
         env!("CARGO_PKG_VERSION"),
     );
@@ -102,19 +104,17 @@ async fn handshake(
     let sent = stream.write_all(request.as_bytes()).await;
     let mut answer = Vec::new();
     if let Err(error) = sent {
-        // What the server has said before it closed says more.
+        // A response that the server sent before it closed explains more.
         let said = stream.read_buf(&mut answer).await.err();
-        let said = said.filter(|said| refused_certificate(said).is_some());
+        let said = said.filter(|said| certificate_refusal(said).is_some());
         return Err(unreachable("cannot write to", said.unwrap_or(error)));
     }
     let end = loop {
-        if let Some(end) = find(&answer, b"\r\n\r\n") {
+        if let Some(end) = find_bytes(&answer, b"\r\n\r\n") {
             break end + 4;
         }
         if answer.len() > MAX_HEAD {
-            return Err(Error::Refused(format!(
-                "{authority} does not answer in HTTP"
-            )));
+            return Err(Error::Refused(format!("{authority} is not an HTTP server")));
         }
         match stream.read_buf(&mut answer).await {
             Ok(0) => {
@@ -133,12 +133,12 @@ async fn handshake(
         .and_then(|code| code.parse().ok())
         .unwrap_or(0);
     if status != 101 {
-        let problem = body(&mut stream, &head, answer.split_off(end)).await;
+        let problem = problem_text(&mut stream, &head, answer.split_off(end)).await;
         let mut text = format!("{authority} answers {status}: {problem}");
         if status == 401 && trust.identity.is_none() {
             text.push_str("; on this robot: install.sh --token TOKEN, or token_file in stub.toml");
         }
-        // No room and the like pass; what this stub is does not.
+        // Lack of capacity and the like are temporary; other errors of the client are not.
         return Err(match status {
             400..=499 if status != 408 && status != 429 => Error::Refused(text),
             _ => Error::Busy(text),
@@ -147,12 +147,13 @@ async fn handshake(
     let expected = STANDARD.encode_to_string(Sha1::digest(format!("{key}{GUID}")));
     if header(&head, "sec-websocket-accept") != Some(&expected) {
         return Err(Error::Refused(format!(
-            "{authority} is no WebSocket server"
+            "{authority} is not a WebSocket server"
         )));
     }
     if header(&head, "sec-websocket-protocol") != Some(link::SUBPROTOCOL) {
         return Err(Error::Refused(format!(
-            "{authority} does not speak {}: its version is older than this stub; install the stub from it again",
+            "{authority} does not support {}: its version is older than this stub; install the stub again from this \
+                server",
             link::SUBPROTOCOL
         )));
     }
@@ -163,10 +164,10 @@ async fn handshake(
         link::MAX_RECORD,
         rand::random(),
     );
-    Ok(socket.within(&run::FROM_SERVER, UNFINISHED))
+    Ok(socket.with_budget(&run::FROM_SERVER, UNFINISHED))
 }
 
-/// While a servant is made ready nothing comes, and yet the network may be lost.
+/// Returns keepalive settings: while a servant is started no data arrives, and a lost network must still be noticed.
 fn keepalive() -> socket2::TcpKeepalive {
     socket2::TcpKeepalive::new()
         .with_time(Duration::from_secs(5))
@@ -174,8 +175,8 @@ fn keepalive() -> socket2::TcpKeepalive {
         .with_retries(3)
 }
 
-/// What a problem document says, or the text as it is.
-async fn body(stream: &mut Stream, head: &str, mut begun: Vec<u8>) -> String {
+/// Reads the details of a problem document, or the body as text.
+async fn problem_text(stream: &mut PortalStream, head: &str, mut begun: Vec<u8>) -> String {
     let length = header(head, "content-length")
         .and_then(|text| text.parse().ok())
         .unwrap_or(0_usize);
@@ -201,7 +202,7 @@ fn header<'a>(head: &'a str, name: &str) -> Option<&'a str> {
     })
 }
 
-fn find(bytes: &[u8], wanted: &[u8]) -> Option<usize> {
+fn find_bytes(bytes: &[u8], wanted: &[u8]) -> Option<usize> {
     bytes
         .windows(wanted.len())
         .position(|window| window == wanted)
@@ -213,8 +214,8 @@ mod tests {
 
     use super::*;
 
-    /// What a server that `serves` one connection is taken for.
-    async fn met<F: Future<Output = ()> + Send + 'static>(
+    /// Returns the error of connecting to a server that `serves` one connection.
+    async fn error_from<F: Future<Output = ()> + Send + 'static>(
         serves: impl FnOnce(TcpStream) -> F,
     ) -> Error {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -234,30 +235,36 @@ mod tests {
 
     #[tokio::test]
     async fn a_server_that_speaks_no_version_of_the_link_is_named() {
-        let error = met(|stream| async {
-            // An honest WebSocket server, which knows nothing of links.
+        let error = error_from(|stream| async {
+            // A regular WebSocket server that does not know the link's subprotocol.
             let _ = tokio_tungstenite::accept_async(stream).await;
         })
         .await;
         let Error::Refused(text) = error else {
             panic!("trying again changes nothing, but: {error}");
         };
-        assert!(text.contains("does not speak cloudroid-link.v2"), "{text}");
-        assert!(text.contains("install the stub from it again"), "{text}");
+        assert!(
+            text.contains("does not support cloudroid-link.v2"),
+            "{text}"
+        );
+        assert!(
+            text.contains("install the stub again from this server"),
+            "{text}"
+        );
     }
 
     #[tokio::test]
     async fn what_is_no_server_of_the_web_is_named() {
-        let error = met(|mut stream| async move {
+        let error = error_from(|mut stream| async move {
             let noise = vec![b'x'; MAX_HEAD * 2];
             let _ = stream.write_all(&noise).await;
         })
         .await;
         assert!(
-            error.to_string().contains("does not answer in HTTP"),
+            error.to_string().contains("is not an HTTP server"),
             "{error}"
         );
-        let error = met(|stream| async move { drop(stream) }).await;
+        let error = error_from(|stream| async move { drop(stream) }).await;
         assert!(matches!(error, Error::Unreachable(_)), "{error}");
     }
 }

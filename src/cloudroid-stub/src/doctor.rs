@@ -1,4 +1,4 @@
-//! `cloudroid-stub doctor`: each thing that a stub needs, whether it is there, and the command that fixes it.
+//! `cloudroid-stub doctor`: checks everything that a stub needs, and shows the commands that fix problems.
 
 mod overlay;
 mod server;
@@ -7,25 +7,25 @@ use std::process::ExitCode;
 
 use foreign::terminal;
 
-use crate::arguments::{Doctor, Part};
+use crate::arguments::{DoctorPart, StubDoctorArgs};
 
-/// How a check came out.
+/// Result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Verdict {
+enum CheckVerdict {
     Good,
     /// It works, but not as well as it could.
     Warning,
     Bad,
 }
 
-/// One thing that was looked at.
+/// A check and its result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Check {
     name: &'static str,
-    verdict: Verdict,
-    /// What was found.
+    verdict: CheckVerdict,
+    /// Observed state.
     found: String,
-    /// The command that fixes it.
+    /// Command that fixes the problem.
     fix: Option<String>,
 }
 
@@ -33,7 +33,7 @@ impl Check {
     fn good(name: &'static str, found: impl Into<String>) -> Check {
         Check {
             name,
-            verdict: Verdict::Good,
+            verdict: CheckVerdict::Good,
             found: found.into(),
             fix: None,
         }
@@ -42,7 +42,7 @@ impl Check {
     fn bad(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
         Check {
             name,
-            verdict: Verdict::Bad,
+            verdict: CheckVerdict::Bad,
             found: found.into(),
             fix: Some(fix.into()),
         }
@@ -50,17 +50,17 @@ impl Check {
 
     fn warning(name: &'static str, found: impl Into<String>, fix: impl Into<String>) -> Check {
         Check {
-            verdict: Verdict::Warning,
+            verdict: CheckVerdict::Warning,
             ..Check::bad(name, found, fix)
         }
     }
 
-    /// As it is printed.
-    fn lines(&self) -> String {
+    /// Formats the check for printing.
+    fn render(&self) -> String {
         let mark = match self.verdict {
-            Verdict::Good => "ok  ",
-            Verdict::Warning => "warn",
-            Verdict::Bad => "FAIL",
+            CheckVerdict::Good => "ok  ",
+            CheckVerdict::Warning => "warn",
+            CheckVerdict::Bad => "FAIL",
         };
         let fix = self
             .fix
@@ -75,22 +75,24 @@ impl Check {
     }
 }
 
-/// Examines and prints; fails when something is bad.
-pub fn examine(asked: &Doctor) -> anyhow::Result<ExitCode> {
-    let stub = overlay::ExaminedStub::of(asked)?;
-    let config = crate::config::read(&stub.share, std::env::vars())?;
+/// Runs the checks and prints them; fails if any is bad.
+pub fn examine(asked: &StubDoctorArgs) -> anyhow::Result<ExitCode> {
+    let stub = overlay::ExaminedStub::from_args(asked)?;
+    let config = crate::config::load(&stub.share, std::env::vars())?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
     let mut checks = runtime.block_on(server::checks(&config, &stub));
-    if asked.only != Some(Part::Server) {
+    if asked.only != Some(DoctorPart::Server) {
         let variable = |name: &str| std::env::var(name).ok();
         checks.extend(runtime.block_on(overlay::checks(&stub, &config, &variable)));
     }
     for check in &checks {
-        println!("{}", terminal::escape(&check.lines(), false));
+        println!("{}", terminal::escape(&check.render(), false));
     }
-    let bad = checks.iter().any(|check| check.verdict == Verdict::Bad);
+    let bad = checks
+        .iter()
+        .any(|check| check.verdict == CheckVerdict::Bad);
     Ok(if bad {
         ExitCode::FAILURE
     } else {
@@ -110,11 +112,11 @@ mod tests {
             "sh install.sh --token TOKEN",
         );
         assert_eq!(
-            check.lines(),
+            check.render(),
             "FAIL  token      the server wants one\n                 fix it:  sh install.sh --token TOKEN"
         );
         assert_eq!(
-            Check::good("clock", "in step").lines(),
+            Check::good("clock", "in step").render(),
             "ok    clock      in step"
         );
     }

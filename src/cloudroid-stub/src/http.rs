@@ -1,4 +1,4 @@
-//! One request over a connection of its own: what the doctor asks the portal before there is a link, and pairing.
+//! Single HTTP requests, each over its own connection: the doctor's before there is a link, and those of pairing.
 
 use std::io;
 use std::net::IpAddr;
@@ -10,78 +10,82 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 use crate::address::Address;
-use crate::stream::{self, Stream};
+use crate::stream::{self, PortalStream};
 
-/// For all of one answer.
+/// Time allowed for a complete response.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// The doctor asks for nothing bigger.
+/// Largest response in bytes, more than the doctor requests.
 const LONGEST: u64 = 16 << 20;
 
-/// An answer.
-pub struct Answer {
+/// An HTTP response.
+pub struct HttpAnswer {
     /// HTTP status.
     pub status: u16,
-    /// Body of the answer.
+    /// Body of the response.
     pub body: Vec<u8>,
-    /// From the request to the first byte of the answer.
+    /// Time from the request to the first byte of the response.
     pub waited: Duration,
-    /// When that came, by this machine's clock: the connection may end much later.
+    /// Arrival of the first byte, by this machine's clock: the connection may end much later.
     pub arrived: SystemTime,
-    /// The path's MTU as the kernel knows it, where it does.
+    /// MTU of the path, if the kernel knows it.
     pub mtu: Option<i32>,
 }
 
-/// A server to be asked over HTTP.
-pub struct Server {
-    /// Address as it was configured.
+/// A server for HTTP requests.
+pub struct HttpServer {
+    /// Configured address.
     pub address: Address,
-    /// The address to which its name was resolved.
+    /// Resolved IP address.
     pub ip: IpAddr,
-    /// Whom to trust where TLS is spoken.
+    /// Trust settings for TLS.
     pub trust: Trust,
-    /// The one certificate that the server must show, whoever has signed it.
+    /// Fingerprint of the only accepted certificate, whoever has signed it.
     pub only: Option<Fingerprint>,
 }
 
-/// `GET path`.
-pub async fn get(server: &Server, path: &str, token: Option<&str>) -> io::Result<Answer> {
-    in_time(server, path, token, None).await
+/// Sends `GET path`.
+pub async fn get(server: &HttpServer, path: &str, token: Option<&str>) -> io::Result<HttpAnswer> {
+    exchange_in_time(server, path, token, None).await
 }
 
-/// `POST path` with JSON.
-pub async fn post(server: &Server, path: &str, body: &serde_json::Value) -> io::Result<Answer> {
-    in_time(server, path, None, Some(body.to_string())).await
+/// Sends `POST path` with JSON.
+pub async fn post(
+    server: &HttpServer,
+    path: &str,
+    body: &serde_json::Value,
+) -> io::Result<HttpAnswer> {
+    exchange_in_time(server, path, None, Some(body.to_string())).await
 }
 
-async fn in_time(
-    server: &Server,
+async fn exchange_in_time(
+    server: &HttpServer,
     path: &str,
     token: Option<&str>,
     body: Option<String>,
-) -> io::Result<Answer> {
+) -> io::Result<HttpAnswer> {
     tokio::time::timeout(PATIENCE, exchange(server, path, token, body))
         .await
         .unwrap_or_else(|_| {
-            let words = format!("no whole answer to {path} within {PATIENCE:?}");
+            let words = format!("no complete response to {path} within {PATIENCE:?}");
             Err(io::Error::new(io::ErrorKind::TimedOut, words))
         })
 }
 
 async fn exchange(
-    server: &Server,
+    server: &HttpServer,
     path: &str,
     token: Option<&str>,
     body: Option<String>,
-) -> io::Result<Answer> {
+) -> io::Result<HttpAnswer> {
     let authority = &server.address.authority;
     let stream = TcpStream::connect((server.ip, server.address.port)).await?;
     stream.set_nodelay(true)?;
-    let mut stream = Stream::over(stream, &server.address, &server.trust).await?;
+    let mut stream = PortalStream::connect(stream, &server.address, &server.trust).await?;
     let shown = stream.fingerprint();
     if let Some(only) = server.only.filter(|only| shown != Some(*only)) {
         let shown = shown.map_or_else(|| "none".to_owned(), |shown| shown.to_string());
         return Err(io::Error::other(format!(
-            "the server shows the certificate {shown}, and the one that was told is {only}: somebody may stand between"
+            "the server's certificate is {shown}, but {only} is expected: the connection may be intercepted"
         )));
     }
     let method = if body.is_some() { "POST" } else { "GET" };
@@ -104,9 +108,9 @@ async fn exchange(
     let sent = stream.write_all(request.as_bytes()).await;
     let mut first = [0; 1];
     if let Err(error) = sent {
-        // What the server has said before it closed says more.
+        // A response that the server sent before it closed explains more.
         let said = stream.read_exact(&mut first).await.err();
-        let said = said.filter(|said| stream::refused_certificate(said).is_some());
+        let said = said.filter(|said| stream::certificate_refusal(said).is_some());
         return Err(said.unwrap_or(error));
     }
     stream.read_exact(&mut first).await?;
@@ -115,13 +119,13 @@ async fn exchange(
     let mut answer = first.to_vec();
     match stream.take(LONGEST).read_to_end(&mut answer).await {
         Ok(_) => {}
-        // Many servers of TLS end without saying so; what has come is judged by its length.
+        // Many TLS servers close without close_notify; the response is checked by its length.
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {}
         Err(error) => return Err(error),
     }
-    let (status, body) = understood(&answer)
-        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "this is no HTTP answer"))?;
-    Ok(Answer {
+    let (status, body) = parse_answer(&answer)
+        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "not an HTTP response"))?;
+    Ok(HttpAnswer {
         status,
         body,
         waited,
@@ -130,21 +134,22 @@ async fn exchange(
     })
 }
 
-impl Answer {
-    /// What a problem document says (RFC 9457), or the text as it is.
-    pub fn words(&self) -> String {
+impl HttpAnswer {
+    /// Returns the details of a problem document (RFC 9457), or the body as text.
+    pub fn problem_text(&self) -> String {
         let document: serde_json::Value = serde_json::from_slice(&self.body).unwrap_or_default();
         let said = ["detail", "next"].iter();
         let said: Vec<&str> = said.filter_map(|key| document[key].as_str()).collect();
-        match said.is_empty() {
-            true => String::from_utf8_lossy(&self.body).trim().to_owned(),
-            false => said.join("; "),
+        if said.is_empty() {
+            String::from_utf8_lossy(&self.body).trim().to_owned()
+        } else {
+            said.join("; ")
         }
     }
 }
 
-/// Status and body. (RFC 9112; the portal sends bodies with a length or in chunks.)
-fn understood(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
+/// Parses status and body (RFC 9112; the portal sends bodies with a length or in chunks).
+fn parse_answer(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
     let end = answer.windows(4).position(|four| four == b"\r\n\r\n")?;
     let head = std::str::from_utf8(&answer[..end]).ok()?;
     let status = head
@@ -158,14 +163,14 @@ fn understood(answer: &[u8]) -> Option<(u16, Vec<u8>)> {
         .to_ascii_lowercase()
         .contains("transfer-encoding: chunked");
     let body = if chunked {
-        without_chunks(body)?
+        decode_chunked(body)?
     } else {
         body.to_vec()
     };
     Some((status, body))
 }
 
-fn without_chunks(mut body: &[u8]) -> Option<Vec<u8>> {
+fn decode_chunked(mut body: &[u8]) -> Option<Vec<u8>> {
     let mut whole = Vec::new();
     loop {
         let end = body.windows(2).position(|two| two == b"\r\n")?;
@@ -186,7 +191,7 @@ mod tests {
 
     use super::*;
 
-    /// Answers one connection, keeps it open for a while, and says when it closed it.
+    /// Serves one connection, keeps it open for a while, and returns the time at which it was closed.
     async fn closes_late(listener: TcpListener) -> SystemTime {
         let (mut stream, _) = listener.accept().await.unwrap();
         let mut head = Vec::new();
@@ -195,7 +200,7 @@ mod tests {
         }
         let answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok";
         stream.write_all(answer).await.unwrap();
-        // Nothing tells the server that its answer was read.
+        // The server does not notice that its response was read.
         tokio::time::sleep(Duration::from_millis(100)).await;
         SystemTime::now()
     }
@@ -206,7 +211,7 @@ mod tests {
         let address = listener.local_addr().unwrap();
         let settings = format!("server = 'ws://{address}'\nservice = 'any'");
         let config: crate::config::Config = toml::from_str(&settings).unwrap();
-        let server = Server {
+        let server = HttpServer {
             address: config.address().unwrap(),
             ip: address.ip(),
             trust: config.trust().unwrap(),
@@ -221,16 +226,16 @@ mod tests {
     #[test]
     fn answers_are_understood_whole_or_in_chunks() {
         let plain = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok";
-        assert_eq!(understood(plain), Some((200, b"ok".to_vec())));
+        assert_eq!(parse_answer(plain), Some((200, b"ok".to_vec())));
         let chunked =
             b"HTTP/1.1 404 Not Found\r\nTransfer-Encoding: chunked\r\n\r\n2\r\nab\r\n1;x\r\nc\r\n0\r\n\r\n";
-        assert_eq!(understood(chunked), Some((404, b"abc".to_vec())));
+        assert_eq!(parse_answer(chunked), Some((404, b"abc".to_vec())));
         for broken in [
             &b""[..],
             b"SSH-2.0-x\r\n\r\n",
             b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nff\r\nshort",
         ] {
-            assert_eq!(understood(broken), None);
+            assert_eq!(parse_answer(broken), None);
         }
     }
 }

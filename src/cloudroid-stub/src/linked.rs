@@ -5,16 +5,17 @@
 //!             └──silent──▶ tries another connection beside it ──it stands──▶ hello (resume)
 //!                  └─anything came─▶ Linked
 //! ```
-//! TCP waits ever longer before it sends again what was lost: after some seconds without a network a connection stays
-//! silent for as many more once the network is back. So a silent one is not waited for until it is given up; a new one
-//! takes its place as soon as there can be one.
+//!
+//! TCP retransmits at increasing intervals: after some seconds without a network, a connection stays silent for as many
+//! more seconds when the network is back. So the stub does not wait until a silent connection is given up, but replaces
+//! it with a new one as soon as that can be established.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use link::control::{Hello, Resume, Welcome};
 use link::session::{receive_open, send_open};
-use link::{Lost, RobotSession};
+use link::{DisconnectReason, RobotSession};
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 use ws::WebSocket;
 
@@ -22,59 +23,61 @@ use crate::config::{self, Config};
 use crate::connect;
 use crate::mirror::Mirror;
 use crate::run;
-use crate::stream::Stream;
+use crate::stream::PortalStream;
 use crate::terms;
 
-/// For the portal to accept a connection.
+/// Time allowed for the portal to accept a connection.
 const CONNECT: Duration = Duration::from_secs(10);
-/// For the first welcome, which comes when the servant runs.
+/// Time allowed for the first welcome, which arrives when the servant runs.
 const SERVANT: Duration = Duration::from_secs(120);
-/// For the welcome of a link that is taken up again, at first: a network may be lost here, too.
+/// Initial time allowed for the welcome of a link that is resumed: the network may be lost here, too.
 const WELCOME: Duration = Duration::from_secs(5);
-/// Between the beginnings of two attempts, at first.
+/// Initial interval between the starts of two attempts.
 const PAUSE: Duration = Duration::from_millis(50);
-/// The longest pauses between the beginnings of two attempts.
-const PAUSES: Pauses = Pauses {
+/// Upper limits of the interval between the starts of two attempts.
+const PAUSES: RetryPauses = RetryPauses {
     away: Duration::from_secs(1),
     busy: Duration::from_secs(3),
     refused: Duration::from_secs(60),
     stood: Duration::from_secs(10),
 };
-/// After a link has fallen silent, until another connection is tried beside it.
+/// Time that a link is silent before another connection is tried besides it.
 const STANDBY: Duration = Duration::from_secs(1);
 
-/// How long the pauses between attempts become.
-struct Pauses {
-    /// While no server is reached.
+/// Upper limits of the interval between attempts.
+struct RetryPauses {
+    /// Limit while no server is reachable.
     away: Duration,
-    /// While the server says that it has no capacity.
+    /// Limit while the server reports that it has no capacity.
     busy: Duration,
-    /// While the server refuses a stub whose link it had accepted before: from the first such pause on.
+    /// Limit while the server refuses a stub whose link it had accepted before; applies from the first such attempt on.
     refused: Duration,
-    /// A link that stood for so long is tried again at once when it is lost. One that did not may be accepted and lost again and again.
+    /// Age of a link after which it is retried at once when it is lost. A younger one may be accepted and lost
+    /// repeatedly.
     stood: Duration,
 }
 
-/// How a connection ended that had carried the link.
-enum End {
-    Lost(Lost),
-    /// It was silent, and this one is not.
-    Replaced(Box<WebSocket<Stream>>),
+/// End of a connection that carried the link.
+enum LinkEnd {
+    Lost(DisconnectReason),
+    /// The connection was silent, and this one is not.
+    Replaced(Box<WebSocket<PortalStream>>),
 }
 
-/// Keeps a link until the cloud refuses its first connection, or this side ends it; says why. What was accepted once may be refused for a
-/// while, by a proxy before the server or while an operator works there, and the robot's nodes go on meanwhile.
-pub async fn keep(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
-    keep_with(config, mirror, hello, &PAUSES).await
+/// Keeps a link until the cloud refuses its first connection, or this side ends it; returns the reason. A link that was
+/// accepted once may be refused for a while, by a proxy before the server or during maintenance, and the robot's nodes
+/// go on meanwhile.
+pub async fn run_link(config: &Config, mirror: &Arc<Mirror>, hello: &mut Hello) -> String {
+    run_link_with(config, mirror, hello, &PAUSES).await
 }
 
-async fn keep_with(
+async fn run_link_with(
     config: &Config,
     mirror: &Arc<Mirror>,
     hello: &mut Hello,
-    pauses: &Pauses,
+    pauses: &RetryPauses,
 ) -> String {
-    let mut link = Link {
+    let mut link = RobotLink {
         config,
         mirror,
         hello,
@@ -83,26 +86,26 @@ async fn keep_with(
         welcome: WELCOME,
         unmet: None,
     };
-    let mut pace = Pace::default();
+    let mut pace = RetryPace::default();
     let mut told = String::new();
-    let mut standby: Option<Box<WebSocket<Stream>>> = None;
+    let mut standby: Option<Box<WebSocket<PortalStream>>> = None;
     loop {
-        pace.begin();
+        pace.start_attempt();
         let outcome = match standby.take() {
             Some(socket) => link.carry(*socket).await,
-            None => link.once().await,
+            None => link.connect_once().await,
         };
         let reason = match outcome {
-            Ok(End::Lost(lost @ Lost::Ended)) => return lost.to_string(),
-            Ok(End::Lost(lost)) => {
+            Ok(LinkEnd::Lost(lost @ DisconnectReason::Ended)) => return lost.to_string(),
+            Ok(LinkEnd::Lost(lost)) => {
                 tracing::warn!("the link to {} was lost: {lost}", config.server);
                 told.clear();
-                pace.lost(link.since, pauses);
+                pace.on_link_lost(link.since, pauses);
                 None
             }
-            Ok(End::Replaced(socket)) => {
+            Ok(LinkEnd::Replaced(socket)) => {
                 tracing::warn!(
-                    "the connection to {} is silent, another takes its place",
+                    "the connection to {} is silent, a new one replaces it",
                     config.server
                 );
                 told.clear();
@@ -113,7 +116,7 @@ async fn keep_with(
             Err(connect::Error::Refused(reason)) => {
                 pace.pause = pauses.refused;
                 let again = format!(
-                    "the server has accepted this node before: it is asked again about every {:?}",
+                    "the server accepted this node before, so the stub retries about every {:?}",
                     pauses.refused
                 );
                 Some((format!("{reason}; {again}"), pauses.refused))
@@ -136,13 +139,13 @@ async fn keep_with(
     }
 }
 
-/// Attempts begin ever more seldom; the time that one took counts.
-struct Pace {
+/// Exponential backoff between attempts; the duration of an attempt counts as part of the interval.
+struct RetryPace {
     began: Instant,
     pause: Duration,
 }
 
-impl Default for Pace {
+impl Default for RetryPace {
     fn default() -> Self {
         Self {
             began: Instant::now(),
@@ -151,63 +154,70 @@ impl Default for Pace {
     }
 }
 
-impl Pace {
-    fn begin(&mut self) {
+impl RetryPace {
+    fn start_attempt(&mut self) {
         self.began = Instant::now();
     }
 
-    /// A link that was accepted then is lost.
-    fn lost(&mut self, since: Option<Instant>, pauses: &Pauses) {
+    /// Resets the backoff if the lost link had been up for long enough.
+    fn on_link_lost(&mut self, since: Option<Instant>, pauses: &RetryPauses) {
         if since.is_some_and(|since| since.elapsed() >= pauses.stood) {
             *self = Self::default();
         }
     }
 
-    /// Until the next attempt: with jitter, or all robots of a server come at once when it is back.
+    /// Waits until the next attempt, with jitter: otherwise all robots would connect at once when the server is back.
     async fn wait(&mut self, longest: Duration) {
         let pause = self.pause.min(longest);
         let jitter = rand::random_range(0.5..1.0);
-        // An attempt may have taken longer than its pause.
+        // An attempt may have taken longer than the interval.
         let least = Instant::now() + PAUSE.mul_f64(jitter);
         sleep_until(least.max(self.began + pause.mul_f64(jitter))).await;
         self.pause = (pause * 2).min(longest);
     }
 }
 
-struct Link<'a> {
+struct RobotLink<'a> {
     config: &'a Config,
     mirror: &'a Arc<Mirror>,
     hello: &'a mut Hello,
-    /// As the last welcome named it.
+    /// Session id of the last welcome.
     session: Option<String>,
-    /// When that came.
+    /// Time of the last welcome.
     since: Option<Instant>,
-    /// How long a welcome may take when the link is taken up again.
+    /// Time allowed for the welcome when the link is resumed.
     welcome: Duration,
-    /// What was said of the codec that the configuration asks for.
+    /// Last warning about the configured codec.
     unmet: Option<String>,
 }
 
-impl Link<'_> {
-    /// One connection, from its handshake to its loss.
-    async fn once(&mut self) -> Result<End, connect::Error> {
-        let socket = open(self.config, &self.hello.node.name).await?;
+impl RobotLink<'_> {
+    /// Makes one connection and runs it from its handshake to its loss.
+    async fn connect_once(&mut self) -> Result<LinkEnd, connect::Error> {
+        let socket = open_link(self.config, &self.hello.node.name).await?;
         self.carry(socket).await
     }
 
-    /// Says hello on a connection, and has it carry the link until it is lost or another one is better.
-    async fn carry(&mut self, mut socket: WebSocket<Stream>) -> Result<End, connect::Error> {
-        self.greet(&mut socket).await?;
+    /// Exchanges hello and welcome on a connection, and lets it carry the link until it is lost or replaced.
+    async fn carry(
+        &mut self,
+        mut socket: WebSocket<PortalStream>,
+    ) -> Result<LinkEnd, connect::Error> {
+        self.exchange_hello(&mut socket).await?;
         let session = self.mirror.session();
         let running = session.run(&mut socket, &**self.mirror);
         tokio::select! {
-            lost = running => Ok(End::Lost(lost)),
-            fresh = standby(self.config, &self.hello.node.name, &session) => Ok(End::Replaced(Box::new(fresh))),
+            lost = running => Ok(LinkEnd::Lost(lost)),
+            fresh = connect_standby(self.config, &self.hello.node.name,
+                &session) => Ok(LinkEnd::Replaced(Box::new(fresh))),
         }
     }
 
-    /// Hello and welcome: the session goes on, or another one begins.
-    async fn greet(&mut self, socket: &mut WebSocket<Stream>) -> Result<(), connect::Error> {
+    /// Sends hello and receives welcome; the session is resumed, or another one begins.
+    async fn exchange_hello(
+        &mut self,
+        socket: &mut WebSocket<PortalStream>,
+    ) -> Result<(), connect::Error> {
         let hello = &mut *self.hello;
         if self.session.is_none() && hello.parameters.is_empty() {
             hello.parameters = self.mirror.parameters().await;
@@ -256,24 +266,24 @@ impl Link<'_> {
                 servant,
             } => {
                 if !resumed && self.session.is_some() {
-                    let fresh = run::session(self.config);
+                    let fresh = run::new_session(self.config);
                     fresh.begin_at(self.hello.next);
-                    self.mirror.renew(fresh);
+                    self.mirror.replace_session(fresh);
                 }
                 self.session = Some(session);
                 self.since = Some(Instant::now());
                 tracing::info!(servant, resumed, "linked to {}", self.config.server);
                 let session = self.mirror.session();
-                if self.config.codec != config::Codec::None {
+                if self.config.codec != config::CodecSetting::None {
                     session.set_quality(self.config.quality());
-                    session.peer_decodes(&codecs);
+                    session.set_peer_codecs(&codecs);
                 }
-                let unmet = self.config.codec.unmet(&codecs);
+                let unmet = self.config.codec.unsupported_reason(&codecs);
                 if let Some(unmet) = unmet.as_ref().filter(|_| unmet != self.unmet) {
                     tracing::warn!("{unmet}");
                 }
                 self.unmet = unmet;
-                session.peer_takes(limits);
+                session.set_peer_limits(limits);
                 session.reconnect(received, &ahead, next);
                 Ok(())
             }
@@ -281,11 +291,11 @@ impl Link<'_> {
     }
 }
 
-async fn open(config: &Config, node: &str) -> Result<WebSocket<Stream>, connect::Error> {
-    let stated = terms::query(config, node);
-    let path = format!("/{}?robot={}{stated}", config.service, config.robot());
+async fn open_link(config: &Config, node: &str) -> Result<WebSocket<PortalStream>, connect::Error> {
+    let stated = terms::to_query(config, node);
+    let path = format!("/{}?robot={}{stated}", config.service, config.robot_id());
     let refused = |error: anyhow::Error| connect::Error::Refused(format!("{error:#}"));
-    // Who is paired shows its certificate, and an older token says nothing that counts.
+    // A paired robot presents its certificate, and an old token has no effect.
     let token = match config.trust().map_err(refused)?.identity {
         Some(_) => None,
         None => config.token().map_err(refused)?,
@@ -293,17 +303,21 @@ async fn open(config: &Config, node: &str) -> Result<WebSocket<Stream>, connect:
     connect::open(config, &path, token.as_deref(), CONNECT).await
 }
 
-/// A connection beside the one that carries the session, once that has been silent and still is.
-async fn standby(config: &Config, node: &str, session: &RobotSession) -> WebSocket<Stream> {
-    let mut up = session.up();
+/// Opens a connection besides the one that carries the session, after that has been silent for a while and still is.
+async fn connect_standby(
+    config: &Config,
+    node: &str,
+    session: &RobotSession,
+) -> WebSocket<PortalStream> {
+    let mut up = session.watch_up();
     loop {
-        // The session lives as long as this.
+        // The session outlives this function.
         let _ = up.wait_for(|up| !up).await;
-        let mut back = session.up();
+        let mut back = session.watch_up();
         let opening = async {
             loop {
                 sleep(STANDBY).await;
-                if let Ok(socket) = open(config, node).await {
+                if let Ok(socket) = open_link(config, node).await {
                     return socket;
                 }
             }

@@ -5,9 +5,11 @@
 //!        ▲         │       └─▶ Original: private system ─▶ process ┤
 //!        └─────────┴──────────── first answer ◀───────────────────┘
 //! ```
-//! The process lives in a ROS system of its own, on loopback: a Master inside the stub with a copy of the robot's parameters
-//! (ROS 1), or a domain that nobody else is in (ROS 2). So it keeps its names, remaps and namespace, none of its topics, tf or logs can reach the robot's
-//! graph except through the [`Keeper`], and it is given no backlog. See docs/adr/015-a-master-for-the-local-original.md.
+//!
+//! The process lives in a private ROS system on loopback: a Master inside the stub with a copy of the robot's
+//! parameters (ROS 1), or a domain that no other node is in (ROS 2). So it keeps its names, remaps and namespace, none
+//! of its topics, tf or logs can reach the robot's graph except through the [`Keeper`], and it receives no backlog. See
+//! docs/adr/015-a-master-for-the-local-original.md.
 
 mod keeper;
 mod latched;
@@ -24,12 +26,12 @@ mod stamp;
 #[cfg(test)]
 pub mod tests;
 
-pub use keeper::{Answer, Application, Cloud, Keeper};
-pub use lender::{limit, took_too_long};
-pub use original::{Interface, Original, QUEUE, Setting};
+pub use keeper::{Application, Cloud, Keeper, PendingAnswer};
+pub use lender::{call_limit_for, report_timeout};
+pub use original::{ExpectedInterface, Original, OriginalSetup, QUEUE};
 #[cfg(test)]
 pub use private_domain::PrivateDomain;
-pub use private_system::Registered;
-pub use process::Program;
+pub use private_system::RegisteredInterface;
+pub use process::OriginalProgram;
 pub use service_use::ServiceUse;
 pub use stamp::is_stamped;

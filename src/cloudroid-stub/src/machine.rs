@@ -1,23 +1,23 @@
-//! Which machine this is, as far as a server must know to tell two robots of one id apart.
+//! Identity of this machine, with which a server distinguishes two robots that use the same id.
 
 use std::path::Path;
 
 use ros::bus::{Bus, ParamValue};
 use sha1::{Digest, Sha1};
 
-/// What is read. Machines made of one disk image share the first two; no two have booted alike.
+/// Files that identify a machine. Machines cloned from one disk image share the first two; no two share a boot id.
 const IDS: [&str; 3] = [
     "/etc/machine-id",
     "/var/lib/dbus/machine-id",
     "/proc/sys/kernel/random/boot_id",
 ];
 
-/// Tells this machine, since it was booted, from others, without telling which it is.
+/// Returns an id that distinguishes this machine, since its last boot, from others without revealing which it is.
 pub fn id() -> String {
-    of(IDS.map(|path| std::fs::read_to_string(Path::new(path)).unwrap_or_default()))
+    digest_ids(IDS.map(|path| std::fs::read_to_string(Path::new(path)).unwrap_or_default()))
 }
 
-fn of(ids: [String; 3]) -> String {
+fn digest_ids(ids: [String; 3]) -> String {
     let mut digest = Sha1::new();
     for id in ids {
         digest.update(id.trim());
@@ -28,15 +28,16 @@ fn of(ids: [String; 3]) -> String {
     short.map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Its host name, for messages.
+/// Returns the host name, for messages.
 pub fn host() -> String {
     let name = nix::unistd::gethostname().ok();
     let name = name.and_then(|name| name.into_string().ok());
     name.unwrap_or_default()
 }
 
-/// The id of the Master's life, where it has one: several machines with one Master are one robot.
-pub async fn roscore(bus: &dyn Bus) -> String {
+/// Returns the run id of the ROS Master, or an empty string if there is none. Several machines with one Master are one
+/// robot.
+pub async fn roscore_id(bus: &dyn Bus) -> String {
     match bus.parameter("/run_id").await {
         Ok(ParamValue::String(id)) => id,
         _ => String::new(),
@@ -50,13 +51,13 @@ mod tests {
     #[test]
     fn copies_of_one_disk_are_told_apart() {
         let ids = |machine: &str, boot: &str| [machine.into(), String::new(), boot.into()];
-        assert_eq!(of(ids("a\n", "1")), of(ids("a", "1")));
+        assert_eq!(digest_ids(ids("a\n", "1")), digest_ids(ids("a", "1")));
         assert_ne!(
-            of(ids("a", "1")),
-            of(ids("a", "2")),
+            digest_ids(ids("a", "1")),
+            digest_ids(ids("a", "2")),
             "one disk, two machines"
         );
-        assert_ne!(of(ids("a", "1")), of(ids("b", "1")));
+        assert_ne!(digest_ids(ids("a", "1")), digest_ids(ids("b", "1")));
         assert_eq!(id(), id());
     }
 }

@@ -1,6 +1,6 @@
-//! `cloudroid-stub`: what runs on the robot in place of a package's node. The launchers of a generated package call
-//! it under the original's name; it registers as that node, has the real one started in the robot's servant, and
-//! carries bytes between the two.
+//! `cloudroid-stub` runs on the robot in place of a package's node. The launchers of a generated package start it under
+//! the original's name; it registers as that node, has the real one started in the robot's servant, and forwards bytes
+//! between the two.
 //!
 //! ```text
 //!  roslaunch ─▶ lib/PKG/NODE (launcher) ─▶ cloudroid-stub run ─┬─ robot's ROS Master, TCPROS ─ the robot's nodes
@@ -8,8 +8,8 @@
 //!                                                              └─ the local original, when the cloud is too slow
 //! ```
 //!
-//! In: the command line as roslaunch gave it, `stub.toml` and `interface.toml` of the package's share directory, the
-//! robot's parameters. Out: the node's exit status.
+//! Input: the command line as roslaunch passes it, `stub.toml` and `interface.toml` of the package's share directory,
+//! and the robot's parameters. Output: the node's exit status.
 
 #![deny(unsafe_code)]
 
@@ -42,7 +42,7 @@ mod testing;
 
 use std::process::ExitCode;
 
-use arguments::{Arguments, Verb};
+use arguments::{StubArguments, StubCommand};
 use clap::Parser;
 use foreign::terminal;
 
@@ -54,21 +54,21 @@ fn main() -> ExitCode {
         .with_writer(|| &*output::STDERR)
         .with_target(false)
         .init();
-    // One machine has one clock: tests of two need this.
+    // A machine has only one clock; tests of two clocks shift it.
     if let Some(seconds) = std::env::var("CLOUDROID_TEST_CLOCK_SHIFT")
         .ok()
         .and_then(|seconds| seconds.parse::<i64>().ok())
     {
-        link::clock::shift(seconds.saturating_mul(1_000_000_000));
+        link::clock::shift_clock(seconds.saturating_mul(1_000_000_000));
     }
-    let outcome = match Arguments::parse().verb {
-        Verb::Run(asked) => run::run(&asked),
-        Verb::ExecOriginal(asked) => original::exec(&asked.node, &asked.argv),
-        Verb::Doctor(asked) => doctor::examine(&asked),
-        Verb::Pair(asked) => pairing::pair(&asked),
+    let outcome = match StubArguments::parse().verb {
+        StubCommand::Run(asked) => run::run(&asked),
+        StubCommand::ExecOriginal(asked) => original::exec(&asked.node, &asked.argv),
+        StubCommand::Doctor(asked) => doctor::examine(&asked),
+        StubCommand::Pair(asked) => pairing::pair(&asked),
     };
     let exit = outcome.unwrap_or_else(|error| {
-        // It may have words of a server.
+        // The error may contain text from a server.
         let text = format!("cloudroid-stub: {error:#}");
         output::STDERR.print(format!("{}\n", terminal::escape(&text, false)));
         ExitCode::FAILURE

@@ -1,5 +1,5 @@
-//! The node on the robot: what the real one has registered in its servant is registered here, and messages, calls and
-//! parameters are carried between the two.
+//! The node on the robot: it registers here what the real one has registered in its servant, and forwards messages,
+//! calls and parameters between the two.
 //!
 //! ```text
 //!  Graph ─▶ outputs: advertised here ──listeners──▶ cloud          data ─▶ publish
@@ -7,7 +7,8 @@
 //!        ─▶ services: served here ─▶ call ─▶ cloud ─▶ answer
 //!  Lookup ─▶ lent: services of the robot ◀─ call ◀─ cloud
 //! ```
-//! Registrations outlive a lost link: the robot's other nodes see one node that lives on.
+//!
+//! Registrations outlive a lost link: the robot's other nodes see one node that stays alive.
 
 mod calls;
 pub mod diagnostics;
@@ -33,9 +34,9 @@ use std::time::Duration;
 use budget::Permit;
 use foreign::terminal;
 use link::control::{Exit, FromCloud, Graph};
-use link::drops::{Cause, Drops};
-use link::record::{Called, Record};
-use link::{Handler, RobotSession};
+use link::drops::{Cause, DropCounters};
+use link::record::{ReceivedCall, Record};
+use link::{RobotSession, SessionHandler};
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{Bus, NodeNames, ParamValue, WireType};
 use tokio::sync::{mpsc, watch};
@@ -49,15 +50,15 @@ use parameters::Parameters;
 use promise::Promise;
 use refusals::Refusals;
 
-/// How long a node of a new session may take to register what it had before.
+/// Time that a node of a new session has to register again what it had registered before.
 const SETTLE: Duration = Duration::from_secs(3);
 
 /// The node on the robot.
 pub struct Mirror {
-    /// For tasks that it starts.
+    /// Passed to the tasks that it starts.
     this: Weak<Mirror>,
     bus: Arc<dyn Bus>,
-    /// By which stubs of one servant know each other.
+    /// Label by which stubs of one servant recognize each other.
     label: String,
     session: watch::Sender<Arc<RobotSession>>,
     inputs: Inputs,
@@ -65,16 +66,16 @@ pub struct Mirror {
     calls: Calls,
     lent: LentServices,
     parameters: Parameters,
-    /// Messages dropped on this side, but for the session's own.
-    drops: Drops,
-    /// With whom no messages pass.
+    /// Messages dropped on this side, without the session's own.
+    drops: DropCounters,
+    /// Endpoints with incompatible quality of service.
     refusals: Arc<Refusals>,
     promise: OnceLock<Promise>,
-    /// How long a call of a robot's service may take.
+    /// Time limit for calls of the robot's services.
     call_limit: Duration,
-    /// What is registered here; locked while it is changed.
-    applied: tokio::sync::Mutex<Applied>,
-    /// Definitions by name and md5.
+    /// The interface registered here; locked while it is changed.
+    applied: tokio::sync::Mutex<AppliedGraph>,
+    /// Definitions by name and MD5 sum.
     types: Mutex<HashMap<(String, String), KnownType>>,
     siblings: RwLock<BTreeSet<String>>,
     exit: watch::Sender<Option<Exit>>,
@@ -82,8 +83,8 @@ pub struct Mirror {
 }
 
 impl Mirror {
-    /// A mirror on `bus`, which is labelled so; its tasks end with it. A service of the robot may take `call_limit` when
-    /// the node calls it.
+    /// Starts a mirror on `bus`, labeled with `label`; its tasks end with it. `call_limit` is the time limit for calls
+    /// that the node makes to the robot's services.
     pub fn start(
         bus: Arc<dyn Bus>,
         label: String,
@@ -101,7 +102,7 @@ impl Mirror {
             calls: Calls::default(),
             lent: LentServices::default(),
             parameters: Parameters::default(),
-            drops: Drops::default(),
+            drops: DropCounters::default(),
             refusals: Arc::default(),
             promise: OnceLock::new(),
             call_limit,
@@ -111,79 +112,78 @@ impl Mirror {
             exit: watch::Sender::new(None),
             orders,
         });
-        tokio::spawn(obey(Arc::downgrade(&mirror), taken));
-        tokio::spawn(lent::follow(Arc::downgrade(&mirror)));
-        tokio::spawn(dropped::report(Arc::downgrade(&mirror)));
-        tokio::spawn(refusals::report(Arc::downgrade(&mirror)));
+        tokio::spawn(process_orders(Arc::downgrade(&mirror), taken));
+        tokio::spawn(lent::watch_graph(Arc::downgrade(&mirror)));
+        tokio::spawn(dropped::report_loop(Arc::downgrade(&mirror)));
+        tokio::spawn(refusals::report_loop(Arc::downgrade(&mirror)));
         mirror
     }
 
-    /// How the real node ended, once it has.
+    /// Returns the exit status of the real node, as soon as it has ended.
     pub fn exit(&self) -> watch::Receiver<Option<Exit>> {
         self.exit.subscribe()
     }
 
-    /// The session in use, as it is replaced.
+    /// Returns the current session and its replacements.
     pub fn sessions(&self) -> watch::Receiver<Arc<RobotSession>> {
         self.session.subscribe()
     }
 
-    /// All parameters of the robot, and from now on their changes go to the cloud.
+    /// Returns all parameters of the robot and starts to forward their changes to the cloud.
     pub async fn parameters(self: &Arc<Self>) -> BTreeMap<String, ParamValue> {
-        parameters::begin(self).await
+        parameters::start_sync(self).await
     }
 
-    /// The session in use.
+    /// Returns the current session.
     pub fn session(&self) -> Arc<RobotSession> {
         self.session.borrow().clone()
     }
 
-    /// Another session takes the place of the one that was lost: calls under way have failed, and what the node
-    /// listens to is opened again.
-    pub fn renew(&self, session: Arc<RobotSession>) {
-        self.calls.renew();
+    /// Replaces a lost session: pending calls fail, and the node's inputs are opened again.
+    pub fn replace_session(&self, session: Arc<RobotSession>) {
+        self.calls.reset_channels();
         let before = self.session.send_replace(session);
         for drop in before.drops() {
             self.drops.add(&drop.topic, drop.cause, drop.count);
         }
-        self.lent.renew();
-        self.calls.fail(
+        self.lent.clear();
+        self.calls.fail_all(
             self.keeper(),
-            "the cloud has forgotten this call: its daemon or servant was restarted",
+            "this call was lost: the daemon or the servant was restarted",
         );
-        self.inputs.renew();
+        self.inputs.reset_channels();
     }
 
-    /// The type of this name and hash, with its definition where that was told.
+    /// Returns the type of this name and MD5 sum, with its definition if it is known.
     fn wire_type(&self, name: &str, md5: &str) -> WireType {
         if name == "*" {
             return WireType::any();
         }
         let key = (name.to_owned(), md5.to_owned());
         let known = self.types.lock().get(&key).map(|known| known.of.clone());
-        known.unwrap_or_else(|| WireType::new(name, md5, "").written_by(self.bus.version()))
+        known.unwrap_or_else(|| WireType::new(name, md5, "").with_version(self.bus.version()))
     }
 
-    async fn apply(self: &Arc<Self>, graph: Graph) {
+    async fn apply_graph(self: &Arc<Self>, graph: Graph) {
         let mut applied = self.applied.lock().await;
         let session = Arc::downgrade(&self.session());
         if !Weak::ptr_eq(&applied.session, &session) {
             applied.session = session;
-            // Before the first one nothing was registered, unless the original stood in.
+            // Before the first session nothing was registered, unless the local original took over.
             applied.settled = applied.graph.is_none() && !applied.stood_in;
             if !applied.settled {
                 tokio::spawn(settle(self.this.clone(), applied.session.clone()));
             }
         }
         *self.siblings.write() = graph.siblings.iter().cloned().collect();
-        applied.told(graph);
+        applied.set_graph(graph);
         self.register(&applied).await;
     }
 
-    async fn register(self: &Arc<Self>, applied: &Applied) {
+    async fn register(self: &Arc<Self>, applied: &AppliedGraph) {
         let Some(graph) = &applied.graph else { return };
         let keeps = !applied.settled;
-        self.bus.stands_for(applied.nodes.clone());
+        self.bus.set_represented_nodes(applied.nodes.clone());
         self.outputs.apply(self, &graph.outputs, keeps).await;
         self.inputs.apply(self, &graph.inputs, keeps);
         self.calls.apply(self, &graph.services, (true, keeps)).await;
@@ -191,16 +191,16 @@ impl Mirror {
     }
 }
 
-impl Handler<FromCloud> for Mirror {
-    fn undecodable(&self, channel: u32) {
-        if let Some(topic) = self.outputs.topic_of(channel) {
+impl SessionHandler<FromCloud> for Mirror {
+    fn on_undecodable(&self, channel: u32) {
+        if let Some(topic) = self.outputs.topic_name(channel) {
             self.drops.add(&topic, Cause::Undecodable, 1);
         }
     }
 
-    fn record(&self, record: Record<FromCloud>, held: Permit, arrived: i64) {
+    fn on_record(&self, record: Record<FromCloud>, held: Permit, arrived: i64) {
         match record {
-            Record::Data(data) => self.outputs.take(self, data, arrived),
+            Record::Data(data) => self.outputs.publish_cloud(self, data, arrived),
             Record::Answer {
                 id,
                 taken,
@@ -208,7 +208,7 @@ impl Handler<FromCloud> for Mirror {
                 response,
             } => {
                 let way = (taken, given, arrived);
-                self.calls.answered(self, id, way, response);
+                self.calls.on_answer(self, id, way, response);
             }
             Record::Call {
                 id,
@@ -216,7 +216,7 @@ impl Handler<FromCloud> for Mirror {
                 request,
             } => self.lent.call(
                 self,
-                Called {
+                ReceivedCall {
                     id,
                     service,
                     request,
@@ -224,7 +224,7 @@ impl Handler<FromCloud> for Mirror {
                     taken: arrived,
                 },
             ),
-            // A server that is not to be trusted could have the robot's terminal do what it likes.
+            // An untrusted server could otherwise send control sequences to the robot's terminal.
             Record::Control(FromCloud::Line { error: true, text }) => {
                 output::STDERR.print(format!("{}\n", terminal::escape(&text, true)));
             }
@@ -239,36 +239,36 @@ impl Handler<FromCloud> for Mirror {
     }
 }
 
-/// A type by its name and hash, with its definition.
+/// A type by name and MD5 sum, with its definition.
 struct KnownType {
     of: WireType,
-    /// One that the server told counts as the server's: there is no end to what it may tell.
+    /// Memory of a type sent by the server counts against the server's budget, since it may send any number of them.
     _held: Option<Permit>,
 }
 
-/// What the cloud has told to register.
+/// The interface that the cloud has told the mirror to register.
 #[derive(Default)]
-struct Applied {
-    /// By which session.
+struct AppliedGraph {
+    /// The session that sent it.
     session: Weak<RobotSession>,
-    /// That has had time to tell all: what it does not list is taken back.
+    /// The session has had time to list everything; what it does not list is removed.
     settled: bool,
-    /// Told last; none: never.
+    /// The last one received, if any.
     graph: Option<Graph>,
-    /// Which of it is whose, with what is kept of the last session.
+    /// Names that belong to each node, together with those retained from the last session.
     nodes: BTreeMap<String, NodeNames>,
-    /// Something was registered without being told.
+    /// Something was registered without the cloud's instruction.
     stood_in: bool,
 }
 
-impl Applied {
-    fn told(&mut self, graph: Graph) {
+impl AppliedGraph {
+    fn set_graph(&mut self, graph: Graph) {
         let told = graph.nodes.iter();
         let told = told.map(|(node, has)| (node.clone(), NodeNames::from(has.clone())));
         if self.settled {
             self.nodes = told.collect();
         } else {
-            // What it does not list yet stays registered, and whose it is, too.
+            // Names that are not listed yet stay registered, and so does their owner.
             for (node, names) in told {
                 let known = self.nodes.entry(node).or_default();
                 known.publishes.extend(names.publishes);
@@ -280,8 +280,8 @@ impl Applied {
     }
 }
 
-/// A session's node may have just been started, and registers one thing after the other: for so long what was
-/// registered on the robot before stays, and whoever uses it waits.
+/// Waits for the node of a session to register. It may have just been started and registers one name after the other;
+/// until then, everything registered on the robot before is kept, and its users wait.
 async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
     tokio::time::sleep(SETTLE).await;
     let Some(mirror) = mirror.upgrade() else {
@@ -291,14 +291,17 @@ async fn settle(mirror: Weak<Mirror>, session: Weak<RobotSession>) {
     if Weak::ptr_eq(&applied.session, &session) {
         applied.settled = true;
         if let Some(graph) = applied.graph.take() {
-            applied.told(graph);
+            applied.set_graph(graph);
         }
         mirror.register(&applied).await;
     }
 }
 
-/// Does what the cloud tells, one thing after the other.
-async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<(FromCloud, Permit)>) {
+/// Processes messages from the cloud in order.
+async fn process_orders(
+    mirror: Weak<Mirror>,
+    mut orders: mpsc::UnboundedReceiver<(FromCloud, Permit)>,
+) {
     while let Some((order, held)) = orders.recv().await {
         let Some(mirror) = mirror.upgrade() else {
             return;
@@ -312,13 +315,13 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<(FromClo
                 let key = (name.clone(), md5.clone());
                 let wire_type = WireType::new(name, md5, definition);
                 let known = KnownType {
-                    of: wire_type.written_by(mirror.bus.version()),
+                    of: wire_type.with_version(mirror.bus.version()),
                     _held: Some(held),
                 };
                 mirror.types.lock().insert(key, known);
             }
-            FromCloud::Graph(graph) => mirror.apply(graph).await,
-            FromCloud::Parameters(changes) => parameters::change(&mirror, changes).await,
+            FromCloud::Graph(graph) => mirror.apply_graph(graph).await,
+            FromCloud::Parameters(changes) => parameters::apply_changes(&mirror, changes).await,
             FromCloud::Exited(exit) => {
                 mirror.exit.send_replace(Some(exit));
             }
@@ -327,7 +330,7 @@ async fn obey(mirror: Weak<Mirror>, mut orders: mpsc::UnboundedReceiver<(FromClo
                 text,
             } => tracing::warn!("{text}"),
             FromCloud::Notice { text, .. } => tracing::info!("{text}"),
-            other => tracing::debug!(?other, "not for the robot"),
+            other => tracing::debug!(?other, "unexpected record from the cloud"),
         }
     }
 }

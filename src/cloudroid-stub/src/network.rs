@@ -1,14 +1,14 @@
-//! Where a stub of ROS 2 looks for the robot's nodes: what the environment says, by the names and values that ROS 2's own nodes
-//! read (docs.ros.org, "Improved Dynamic Discovery").
+//! Discovery settings of a ROS 2 stub, read from the same environment variables as ROS 2 nodes read (docs.ros.org,
+//! "Improved Dynamic Discovery").
 
 mod servers;
 
 use std::net::{IpAddr, SocketAddr};
 
 use anyhow::bail;
-use ros::{Interfaces, Network};
+use ros::{DiscoveryNetwork, InterfaceSelection};
 
-use self::servers::servers_found;
+use self::servers::resolve_servers;
 use crate::resolver;
 
 const DOMAIN: &str = "ROS_DOMAIN_ID";
@@ -17,57 +17,60 @@ const LOCALHOST_ONLY: &str = "ROS_LOCALHOST_ONLY";
 const PEERS: &str = "ROS_STATIC_PEERS";
 const SERVERS: &str = "ROS_DISCOVERY_SERVER";
 
-/// The last domain that has all its ports (DDSI-RTPS 2.5, 9.6.2.3).
+/// Highest domain whose ports all exist (DDSI-RTPS 2.5, 9.6.2.3).
 const LAST_DOMAIN: u16 = 232;
 
-/// Looks a variable of the environment up.
+/// Looks up an environment variable.
 pub type Variable<'a> = &'a (dyn Fn(&str) -> Option<String> + Sync);
 
-/// How far a node looks for others by itself.
+/// Range within which a node discovers others by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Range {
+enum DiscoveryRange {
     Off,
     Localhost,
     Subnet,
 }
 
-/// The domain and the network of a node in this environment.
+/// Returns the domain and the network of a node in this environment.
 ///
 /// # Errors
-/// A variable has a value that ROS 2 does not know, or names a discovery server that cannot be found or spoken with. A peer that
-/// cannot be found is named in the log, as by ROS 2's nodes, and left out.
-pub async fn network(variable: Variable<'_>) -> anyhow::Result<(u16, Network)> {
+/// A variable has a value that ROS 2 does not accept, or names a discovery server that cannot be resolved or uses an
+/// unsupported protocol. A peer that cannot be resolved is reported in the log, as ROS 2 nodes do, and skipped.
+pub async fn read_network(variable: Variable<'_>) -> anyhow::Result<(u16, DiscoveryNetwork)> {
     let given = |name: &str| variable(name).filter(|value| !value.is_empty());
-    let domain = domain(given(DOMAIN).as_deref())?;
-    let this_machine = localhost_only(given(LOCALHOST_ONLY).as_deref())?;
-    let range = match this_machine {
-        true => Range::Localhost,
-        false => range(given(RANGE).as_deref())?,
+    let domain = parse_domain(given(DOMAIN).as_deref())?;
+    let this_machine = parse_localhost_only(given(LOCALHOST_ONLY).as_deref())?;
+    let range = if this_machine {
+        DiscoveryRange::Localhost
+    } else {
+        parse_range(given(RANGE).as_deref())?
     };
-    if range == Range::Off {
-        let alone = Network {
+    if range == DiscoveryRange::Off {
+        let alone = DiscoveryNetwork {
             alone: true,
             multicast: false,
-            ..Network::default()
+            ..DiscoveryNetwork::default()
         };
         return Ok((domain, alone));
     }
-    // Where it is only for this machine, ROS 2 does not read it either.
+    // If discovery is limited to this machine, ROS 2 does not read the peers either.
     let peers = given(PEERS).filter(|_| !this_machine);
-    let mut peers = peers_found(&peers.unwrap_or_default()).await;
-    let servers = servers_found(&given(SERVERS).unwrap_or_default()).await?;
+    let mut peers = resolve_peers(&peers.unwrap_or_default()).await;
+    let servers = resolve_servers(&given(SERVERS).unwrap_or_default()).await?;
     if !servers.is_empty() && !peers.is_empty() {
-        tracing::warn!("{PEERS} is not used where {SERVERS} is, as by Fast DDS");
+        tracing::warn!("{PEERS} is ignored because {SERVERS} is set, as in Fast DDS");
         peers.clear();
     }
     let mut named = servers.iter().map(|server| &server.at).chain(&peers);
-    let is_wide = range == Range::Subnet || named.any(|address| !address.ip().is_loopback());
-    let network = Network {
-        interfaces: match is_wide && !this_machine {
-            true => Interfaces::All,
-            false => Interfaces::default(),
+    let is_wide =
+        range == DiscoveryRange::Subnet || named.any(|address| !address.ip().is_loopback());
+    let network = DiscoveryNetwork {
+        interfaces: if is_wide && !this_machine {
+            InterfaceSelection::All
+        } else {
+            InterfaceSelection::default()
         },
-        multicast: range == Range::Subnet && servers.is_empty(),
+        multicast: range == DiscoveryRange::Subnet && servers.is_empty(),
         alone: false,
         peers,
         servers,
@@ -76,33 +79,33 @@ pub async fn network(variable: Variable<'_>) -> anyhow::Result<(u16, Network)> {
     Ok((domain, network))
 }
 
-fn domain(given: Option<&str>) -> anyhow::Result<u16> {
+fn parse_domain(given: Option<&str>) -> anyhow::Result<u16> {
     let Some(given) = given else {
         return Ok(0);
     };
     match given.parse() {
         Ok(domain) if domain <= LAST_DOMAIN => Ok(domain),
-        _ => bail!("{DOMAIN} is {given:?}: give a number from 0 to {LAST_DOMAIN}"),
+        _ => bail!("{DOMAIN} is {given:?}: expected a number from 0 to {LAST_DOMAIN}"),
     }
 }
 
-fn range(given: Option<&str>) -> anyhow::Result<Range> {
+fn parse_range(given: Option<&str>) -> anyhow::Result<DiscoveryRange> {
     match given {
-        // What the implementation of DDS does where nobody says anything is the same.
-        None | Some("SUBNET" | "SYSTEM_DEFAULT") => Ok(Range::Subnet),
-        Some("LOCALHOST") => Ok(Range::Localhost),
-        Some("OFF") => Ok(Range::Off),
+        // The default of the DDS implementation is the same.
+        None | Some("SUBNET" | "SYSTEM_DEFAULT") => Ok(DiscoveryRange::Subnet),
+        Some("LOCALHOST") => Ok(DiscoveryRange::Localhost),
+        Some("OFF") => Ok(DiscoveryRange::Off),
         Some(other) => {
-            bail!("{RANGE} is {other:?}: give SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT")
+            bail!("{RANGE} is {other:?}: expected SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT")
         }
     }
 }
 
-fn localhost_only(given: Option<&str>) -> anyhow::Result<bool> {
+fn parse_localhost_only(given: Option<&str>) -> anyhow::Result<bool> {
     match given {
         None | Some("0") => Ok(false),
         Some("1") => Ok(true),
-        Some(other) => bail!("{LOCALHOST_ONLY} is {other:?}: give 0 or 1"),
+        Some(other) => bail!("{LOCALHOST_ONLY} is {other:?}: expected 0 or 1"),
     }
 }
 
@@ -112,24 +115,24 @@ fn entries(list: &str) -> impl Iterator<Item = &str> {
         .filter(|entry| !entry.is_empty())
 }
 
-/// Each with port 0, which stands for those of all nodes of a host.
-async fn peers_found(list: &str) -> Vec<SocketAddr> {
+/// Resolves the peers, each with port 0, which stands for the ports of all nodes on a host.
+async fn resolve_peers(list: &str) -> Vec<SocketAddr> {
     let mut found = Vec::new();
     for host in entries(list) {
-        match address(host).await {
+        match resolve_ipv4(host).await {
             Ok(ip) => found.push(SocketAddr::new(ip, 0)),
             Err(error) => tracing::warn!(
-                "{PEERS} names {host}, which is left out: {error:#}; its nodes are not told of this one"
+                "{PEERS} has {host}, which is skipped: {error:#}; its nodes do not discover this one"
             ),
         }
     }
     found
 }
 
-async fn address(host: &str) -> anyhow::Result<IpAddr> {
+async fn resolve_ipv4(host: &str) -> anyhow::Result<IpAddr> {
     let ip = resolver::resolve(host).await?;
     if ip.is_ipv6() {
-        bail!("its address is {ip}, and only IPv4 is spoken here: give an address of IPv4");
+        bail!("its address is {ip}, but only IPv4 is supported: give an IPv4 address");
     }
     Ok(ip)
 }
@@ -138,22 +141,22 @@ async fn address(host: &str) -> anyhow::Result<IpAddr> {
 mod tests {
     use super::*;
 
-    async fn of(given: &[(&str, &str)]) -> anyhow::Result<(u16, Network)> {
+    async fn parse_network(given: &[(&str, &str)]) -> anyhow::Result<(u16, DiscoveryNetwork)> {
         let variable = |name: &str| {
             let mut given = given.iter();
             given
                 .find(|(given, _)| *given == name)
                 .map(|(_, value)| (*value).to_owned())
         };
-        network(&variable).await
+        read_network(&variable).await
     }
 
-    async fn good(given: &[(&str, &str)]) -> (u16, Network) {
-        of(given).await.expect("a network")
+    async fn good(given: &[(&str, &str)]) -> (u16, DiscoveryNetwork) {
+        parse_network(given).await.expect("a network")
     }
 
     async fn bad(given: &[(&str, &str)]) -> String {
-        format!("{:#}", of(given).await.expect_err("an error"))
+        format!("{:#}", parse_network(given).await.expect_err("an error"))
     }
 
     fn addresses(list: &[&str]) -> Vec<SocketAddr> {
@@ -163,13 +166,13 @@ mod tests {
 
     #[tokio::test]
     async fn without_a_word_all_networks_are_used() {
-        let wide = Network {
-            interfaces: Interfaces::All,
+        let wide = DiscoveryNetwork {
+            interfaces: InterfaceSelection::All,
             well_known: true,
-            ..Network::default()
+            ..DiscoveryNetwork::default()
         };
         assert_eq!(good(&[]).await, (0, wide.clone()));
-        // As set to nothing in a shell.
+        // A variable set to an empty string in the shell.
         let empty = [DOMAIN, RANGE, LOCALHOST_ONLY, PEERS, SERVERS].map(|name| (name, ""));
         assert_eq!(good(&empty).await, (0, wide.clone()));
         for range in ["SUBNET", "SYSTEM_DEFAULT"] {
@@ -183,20 +186,20 @@ mod tests {
         for (given, quoted) in [("233", "\"233\""), ("-1", "\"-1\""), ("robot", "\"robot\"")] {
             assert_eq!(
                 bad(&[(DOMAIN, given)]).await,
-                format!("ROS_DOMAIN_ID is {quoted}: give a number from 0 to 232")
+                format!("ROS_DOMAIN_ID is {quoted}: expected a number from 0 to 232")
             );
         }
     }
 
     #[tokio::test]
     async fn this_machine_alone() {
-        let narrow = Network {
+        let narrow = DiscoveryNetwork {
             multicast: false,
             well_known: true,
-            ..Network::default()
+            ..DiscoveryNetwork::default()
         };
         assert_eq!(good(&[(RANGE, "LOCALHOST")]).await.1, narrow);
-        // The older variable stands above both.
+        // The older variable has precedence over both.
         let older = [
             (LOCALHOST_ONLY, "1"),
             (RANGE, "SUBNET"),
@@ -208,15 +211,15 @@ mod tests {
             good(&[]).await.1,
             "0 is as nothing"
         );
-        // Peers elsewhere have to reach us.
+        // Peers on other machines must be able to reach this node.
         let (_, peers) = good(&[(RANGE, "LOCALHOST"), (PEERS, "10.0.0.7")]).await;
         assert_eq!(
             (peers.interfaces, peers.multicast),
-            (Interfaces::All, false)
+            (InterfaceSelection::All, false)
         );
         assert_eq!(
             bad(&[(LOCALHOST_ONLY, "yes")]).await,
-            "ROS_LOCALHOST_ONLY is \"yes\": give 0 or 1"
+            "ROS_LOCALHOST_ONLY is \"yes\": expected 0 or 1"
         );
     }
 
@@ -226,7 +229,7 @@ mod tests {
         assert!(off.alone && !off.multicast && off.peers.is_empty());
         assert_eq!(
             bad(&[(RANGE, "off")]).await,
-            "ROS_AUTOMATIC_DISCOVERY_RANGE is \"off\": give SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT"
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is \"off\": expected SUBNET, LOCALHOST, OFF or SYSTEM_DEFAULT"
         );
     }
 
@@ -247,16 +250,20 @@ mod tests {
         };
         assert_eq!((server.place, server.at.port()), (1, 11888));
         assert!(!network.multicast && network.peers.is_empty());
-        assert_eq!(network.interfaces, Interfaces::All);
-        // A server elsewhere has to reach us, one here has not.
+        assert_eq!(network.interfaces, InterfaceSelection::All);
+        // A server on another machine must be able to reach this node; one on this machine is reached on the loopback
+        // interface.
         let of = |server| [(SERVERS, server), (RANGE, "LOCALHOST")];
-        let interfaces = |(_, network): (u16, Network)| network.interfaces;
-        assert_eq!(interfaces(good(&of("10.0.0.7")).await), Interfaces::All);
+        let interfaces = |(_, network): (u16, DiscoveryNetwork)| network.interfaces;
+        assert_eq!(
+            interfaces(good(&of("10.0.0.7")).await),
+            InterfaceSelection::All
+        );
         let here = interfaces(good(&of("127.0.0.1")).await);
-        assert_eq!(here, Interfaces::default());
+        assert_eq!(here, InterfaceSelection::default());
         let told = bad(&[(SERVERS, "10.0.0.7;TCPv4:[10.0.0.8]:42100")]).await;
         assert!(told.contains("TCPv4:[10.0.0.8]:42100"), "{told}");
-        // Nothing but places of servers that are not there.
+        // A list of empty entries.
         assert!(good(&[(SERVERS, ";")]).await.1.multicast);
     }
 }

@@ -1,9 +1,9 @@
 //! The original: the executable that would run if the stub were not installed.
 //!
-//! Searched as the tools of the robot's ROS do. ROS 1: `lib/PKG/NODE` and then `share/PKG` of each workspace on CMAKE_PREFIX_PATH,
-//! the source spaces that its `.catkin` lists, ROS_PACKAGE_PATH, and last `/usr` and `/opt/ros/$ROS_DISTRO`, which
-//! upstream's set-up files do not always name. ROS 2: `lib/PKG/EXE` of each install space on AMENT_PREFIX_PATH, of those on
-//! COLCON_PREFIX_PATH, and of `/opt/ros/$ROS_DISTRO`.
+//! Searched as the tools of the robot's ROS version do. ROS 1: `lib/PKG/NODE` and then `share/PKG` of each workspace on
+//! CMAKE_PREFIX_PATH, the source spaces that its `.catkin` lists, ROS_PACKAGE_PATH, and last `/usr` and
+//! `/opt/ros/$ROS_DISTRO`, which upstream's setup files do not always name. ROS 2: `lib/PKG/EXE` of each install space
+//! on AMENT_PREFIX_PATH, of those on COLCON_PREFIX_PATH, and of `/opt/ros/$ROS_DISTRO`.
 
 mod ament;
 mod catkin;
@@ -18,12 +18,12 @@ use std::process::{Command, ExitCode};
 use anyhow::bail;
 use ros::bus::RosVersion;
 
-use crate::arguments::Node;
+use crate::arguments::NodeArgs;
 use crate::revision::Revision;
 
-/// How deep executables may lie below `share/PKG` or a source directory.
+/// Maximum depth of executables below `share/PKG` or a source directory.
 const DEPTH: usize = 4;
-/// The variables that name workspaces.
+/// Variables that list workspaces.
 const SEARCHED: [&str; 4] = [
     "CMAKE_PREFIX_PATH",
     "ROS_PACKAGE_PATH",
@@ -31,12 +31,12 @@ const SEARCHED: [&str; 4] = [
     "COLCON_PREFIX_PATH",
 ];
 
-/// Becomes the original, in the environment that it would have had.
-pub fn exec(node: &Node, argv: &[String]) -> anyhow::Result<ExitCode> {
+/// Replaces this process with the original, in the environment that it would have had.
+pub fn exec(node: &NodeArgs, argv: &[String]) -> anyhow::Result<ExitCode> {
     let overlay = overlay(&node.share);
     let Some(path) = find(node, &|name| std::env::var(name).ok()) else {
         bail!(
-            "no other {}/{} is installed beside this stub; install the original package, or outsource this node",
+            "no original {}/{} is installed beside this stub; install the original package, or outsource this node",
             node.package,
             node.node
         );
@@ -45,10 +45,10 @@ pub fn exec(node: &Node, argv: &[String]) -> anyhow::Result<ExitCode> {
         .args(argv)
         .envs(environment(&overlay))
         .exec();
-    bail!("{} cannot be executed: {error}", path.display())
+    bail!("cannot execute {}: {error}", path.display())
 }
 
-/// The overlay that `share/PKG` belongs to.
+/// Returns the overlay that `share/PKG` belongs to.
 pub fn overlay(share: &Path) -> PathBuf {
     share
         .parent()
@@ -57,51 +57,52 @@ pub fn overlay(share: &Path) -> PathBuf {
         .to_owned()
 }
 
-/// The variables that name workspaces, without this stub's overlay: what the original starts finds originals, too.
+/// Returns the variables that list workspaces, without this stub's overlay, so that programs started by the original
+/// find originals, too.
 pub fn environment(overlay: &Path) -> Vec<(&'static str, OsString)> {
     SEARCHED
         .into_iter()
-        .filter_map(|name| Some((name, without(&std::env::var_os(name)?, overlay)?)))
+        .filter_map(|name| Some((name, without_overlay(&std::env::var_os(name)?, overlay)?)))
         .collect()
 }
 
-/// A list of directories but for those in the overlay.
-fn without(list: &OsStr, overlay: &Path) -> Option<OsString> {
-    let kept = std::env::split_paths(list).filter(|entry| !within(entry, overlay));
+/// Returns the list of directories without those in the overlay.
+fn without_overlay(list: &OsStr, overlay: &Path) -> Option<OsString> {
+    let kept = std::env::split_paths(list).filter(|entry| !is_within(entry, overlay));
     std::env::join_paths(kept).ok()
 }
 
-fn within(path: &Path, overlay: &Path) -> bool {
+fn is_within(path: &Path, overlay: &Path) -> bool {
     let canonical = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_owned());
     canonical(path).starts_with(canonical(overlay))
 }
 
-/// What is looked for, and where.
-struct Search<'a> {
-    node: &'a Node,
+/// Search for the original of a node.
+struct OriginalSearch<'a> {
+    node: &'a NodeArgs,
     overlay: PathBuf,
     variable: &'a dyn Fn(&str) -> Option<String>,
 }
 
-impl Search<'_> {
-    /// The directories that a variable names, but for the stub's.
+impl OriginalSearch<'_> {
+    /// Returns the directories that a variable lists, without the stub's.
     fn entries(&self, name: &str) -> Vec<PathBuf> {
         let value = (self.variable)(name).unwrap_or_default();
         std::env::split_paths(&value)
-            .filter(|entry| entry.is_absolute() && !within(entry, &self.overlay))
+            .filter(|entry| entry.is_absolute() && !is_within(entry, &self.overlay))
             .collect()
     }
 
-    /// Where ROS itself is, where it is not the system's.
+    /// Returns the directory of the ROS distribution, which may not be installed in `/usr`.
     fn distribution(&self) -> Option<PathBuf> {
         let name = (self.variable)("ROS_DISTRO")?;
         Some(Path::new("/opt/ros").join(name))
     }
 }
 
-/// The next executable of this name after the stub, with variables from `variable`.
-pub fn find(node: &Node, variable: &dyn Fn(&str) -> Option<String>) -> Option<PathBuf> {
-    let search = Search {
+/// Returns the next executable of this name after the stub, with variables from `variable`.
+pub fn find(node: &NodeArgs, variable: &dyn Fn(&str) -> Option<String>) -> Option<PathBuf> {
+    let search = OriginalSearch {
         node,
         overlay: overlay(&node.share),
         variable,
@@ -112,8 +113,8 @@ pub fn find(node: &Node, variable: &dyn Fn(&str) -> Option<String>) -> Option<Pa
     }
 }
 
-/// An executable of this name at or below a package's directory.
-fn below_package(directory: &Path, node: &str) -> Option<PathBuf> {
+/// Returns an executable of this name at or below a package's directory.
+fn find_below(directory: &Path, node: &str) -> Option<PathBuf> {
     let mut open = VecDeque::from([(directory.to_owned(), 0)]);
     while let Some((directory, depth)) = open.pop_front() {
         let here = directory.join(node);
@@ -144,7 +145,7 @@ fn children(directory: &Path) -> Vec<PathBuf> {
     children
 }
 
-/// Executable, and not the stub under another name.
+/// Returns whether the file is executable and not this stub under another name.
 fn is_executable(path: &Path) -> bool {
     let Ok(metadata) = std::fs::metadata(path) else {
         return false;
@@ -158,7 +159,7 @@ fn is_executable(path: &Path) -> bool {
 mod tests {
     use super::*;
 
-    /// Makes a program.
+    /// Creates an executable.
     pub(super) fn executable(path: &Path) {
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, "#!/bin/sh\n").unwrap();

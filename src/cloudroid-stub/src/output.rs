@@ -1,10 +1,10 @@
-//! What the stub prints: the node's lines and its own, each stream by a thread of its own.
+//! Output of the stub: the node's lines and its own, each stream written by a separate thread.
 //!
-//! Whoever reads them may stop (a full pipe) or go (a closed one). Neither is waited for: the robot's messages pass through the same
-//! thread that would wait, and with them the safe stop. What nobody reads is left out, the oldest first, and its number is printed once
-//! somebody reads again.
+//! The reader may stop (a full pipe) or exit (a closed one). The stub waits for neither: messages of the robot pass
+//! through the thread that would wait, and with them the safe stop. Lines that are not read are dropped, the oldest
+//! first, and their number is printed as soon as the stream is read again.
 //!
-//! Not by a crate: those that there are (tracing-appender) need a later compiler than robots' programs are built with.
+//! Existing crates (tracing-appender) require a later compiler than robots' programs are built with.
 
 use std::io::Write;
 use std::sync::{Arc, LazyLock};
@@ -12,55 +12,55 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use parking_lot::{Condvar, Mutex};
-use ros::ring::{Bounds, Ring};
+use ros::ring::{Ring, RingBounds};
 
-/// Lines that wait for a slow reader.
-const WAITING: Bounds = Bounds {
+/// Limits for lines that wait for a slow reader.
+const WAITING: RingBounds = RingBounds {
     messages: 4096,
     bytes: 1 << 20,
 };
-/// For a reader to take the last lines when the stub ends.
+/// Time that a reader has for the last lines when the stub ends.
 const LAST: Duration = Duration::from_millis(500);
 
 /// Standard output.
-pub static STDOUT: LazyLock<Printer> = LazyLock::new(|| Printer::over(std::io::stdout()));
+pub static STDOUT: LazyLock<Printer> = LazyLock::new(|| Printer::new(std::io::stdout()));
 /// Standard error.
-pub static STDERR: LazyLock<Printer> = LazyLock::new(|| Printer::over(std::io::stderr()));
+pub static STDERR: LazyLock<Printer> = LazyLock::new(|| Printer::new(std::io::stderr()));
 
-/// Lets whoever reads both streams take the last lines, if it does so within half a second.
+/// Waits until the last lines of both streams are written, for half a second at most.
 pub fn finish() {
     let deadline = Instant::now() + LAST;
     STDOUT.finish(deadline);
     STDERR.finish(deadline);
 }
 
-/// Prints on a thread of its own, which lives as long as the process.
-pub struct Printer(Arc<Shared>);
+/// Prints on a separate thread, which lives as long as the process.
+pub struct Printer(Arc<PrinterShared>);
 
-struct Shared {
+struct PrinterShared {
     state: Mutex<State>,
     changed: Condvar,
 }
 
 struct State {
     waiting: Ring<Bytes>,
-    /// Lines left out since that was printed last.
+    /// Number of lines dropped since the number was last printed.
     left_out: u64,
-    /// The thread writes.
+    /// The thread is writing.
     is_writing: bool,
-    /// Nobody will read any more.
+    /// The reader is gone.
     is_closed: bool,
 }
 
 impl Printer {
-    fn over(stream: impl Write + Send + 'static) -> Self {
+    fn new(stream: impl Write + Send + 'static) -> Self {
         let state = State {
             waiting: Ring::new(WAITING),
             left_out: 0,
             is_writing: false,
             is_closed: false,
         };
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(PrinterShared {
             state: Mutex::new(state),
             changed: Condvar::new(),
         });
@@ -68,12 +68,12 @@ impl Printer {
         let spawned = std::thread::Builder::new()
             .name("output".to_owned())
             .spawn(move || printing.print(stream));
-        // Without a thread nothing is printed, which costs less than a robot that does not start.
+        // If the thread cannot be started nothing is printed, which is better than a robot that does not start.
         shared.state.lock().is_closed = spawned.is_err();
         Self(shared)
     }
 
-    /// Prints this, which ends with its line; never waits.
+    /// Prints this text, which ends with a newline; never waits.
     pub fn print(&self, text: impl Into<Bytes>) {
         let mut state = self.0.state.lock();
         if !state.is_closed {
@@ -83,7 +83,7 @@ impl Printer {
         }
     }
 
-    /// Returns once all is printed, or at this time.
+    /// Waits until all lines are printed, until the deadline.
     fn finish(&self, deadline: Instant) {
         let mut state = self.0.state.lock();
         while (state.is_writing || !state.waiting.is_empty()) && !state.is_closed {
@@ -94,13 +94,13 @@ impl Printer {
     }
 }
 
-impl Shared {
+impl PrinterShared {
     fn print(&self, mut stream: impl Write) {
         loop {
             let (text, left_out) = self.next();
             let note = || {
                 format!(
-                    "cloudroid-stub: {left_out} lines before this one were left out, since nobody read them\n"
+                    "cloudroid-stub: {left_out} lines before this one were dropped because the output was not read\n"
                 )
             };
             let noted = match left_out {
@@ -121,7 +121,7 @@ impl Shared {
         }
     }
 
-    /// What is to be printed next, and how many lines before it were left out.
+    /// Returns the text to print next, and the number of lines dropped before it.
     fn next(&self) -> (Bytes, u64) {
         let mut state = self.state.lock();
         loop {
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn a_reader_that_stops_keeps_nobody_waiting_and_is_told_what_it_missed() {
         let (writes, reads) = UnixStream::pair().unwrap();
-        let printer = Printer::over(writes);
+        let printer = Printer::new(writes);
         let total = 100_000;
         for number in 0..total {
             printer.print(format!("line {number} {}\n", "x".repeat(100)));
@@ -178,11 +178,11 @@ mod tests {
     #[test]
     fn a_reader_that_has_gone_ends_nothing() {
         let (writes, reads) = UnixStream::pair().unwrap();
-        let printer = Printer::over(writes);
+        let printer = Printer::new(writes);
         drop(reads);
         for _ in 0..3 {
             printer.print("words\n");
-            // Everything is done with: printed or given up.
+            // Lines are either printed or discarded by then.
             printer.finish(Instant::now() + Duration::from_secs(600));
         }
         assert!(printer.0.state.lock().is_closed);
@@ -191,7 +191,7 @@ mod tests {
     #[test]
     fn the_last_lines_are_waited_for() {
         let (writes, reads) = UnixStream::pair().unwrap();
-        let printer = Printer::over(writes);
+        let printer = Printer::new(writes);
         printer.print("last\n");
         printer.finish(Instant::now() + Duration::from_secs(600));
         let mut line = String::new();

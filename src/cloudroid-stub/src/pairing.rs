@@ -1,10 +1,11 @@
-//! The robot's own key, and the certificates that servers have given it (docs/adr/086).
+//! The robot's key and the certificates that servers have issued to it (docs/adr/086).
 //!
 //! ```text
 //!  ~/.config/cloudroid/robot.key               made at the first pairing; it never leaves the robot
 //!  ~/.config/cloudroid/paired/HOST:PORT.toml   the certificate for a server: shown to it, and renewed in time
 //!  ~/.config/cloudroid/servers.pub             the keys that these servers sign stubs by, for install.sh
 //! ```
+//!
 //! All stubs of a robot share them.
 
 mod key;
@@ -19,7 +20,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use serde_json::json;
-use tls::{Identity, Known, KnownServers, PairingLine, Trust};
+use tls::{ClientIdentity, KnownIdentity, KnownServers, PairingLine, Trust};
 
 use crate::address::Address;
 use crate::arguments;
@@ -27,86 +28,85 @@ use crate::config::{self, Config};
 use crate::http;
 use crate::resolver;
 
-use key::Key;
-use own::{Certificate, Own};
-pub use renewal::keep_renewed;
+use key::RobotKey;
+use own::{IdentityDirectory, PairedCertificate};
+pub use renewal::run_renewal;
 
-/// Where this robot's key and certificates are.
-fn directory(named: Option<&Path>) -> Option<Own> {
-    let usual = || Some(KnownServers::of_user()?.path().parent()?.to_owned());
-    let path = named.map(config::at_home).or_else(usual);
-    path.map(Own)
+/// Returns the directory of this robot's key and certificates.
+fn identity_directory(named: Option<&Path>) -> Option<IdentityDirectory> {
+    let usual = || Some(KnownServers::for_user()?.path().parent()?.to_owned());
+    let path = named.map(config::expand_home).or_else(usual);
+    path.map(IdentityDirectory)
 }
 
-/// The server that a configuration names, where it may ask for a certificate, and what is kept for it.
-fn of(config: &Config) -> Option<(Own, Address)> {
+/// Returns the identity directory and the address of the configured server, if it is reached over TLS.
+fn locate_identity(config: &Config) -> Option<(IdentityDirectory, Address)> {
     let address = config.address().ok().filter(|address| address.secure)?;
-    Some((directory(config.identity.as_deref())?, address))
+    Some((identity_directory(config.identity.as_deref())?, address))
 }
 
-/// As whom this robot is paired with the server of a configuration.
-pub fn robot(config: &Config) -> Option<String> {
-    let (own, address) = of(config)?;
-    Some(own.certificate(&address).ok()??.robot)
+/// Returns the name under which this robot is paired with the configured server.
+pub fn paired_robot(config: &Config) -> Option<String> {
+    let (own, address) = locate_identity(config)?;
+    Some(own.load_certificate(&address).ok()??.robot)
 }
 
-/// What this robot shows to the server of a configuration, where it is paired with it.
-pub fn identity(config: &Config) -> anyhow::Result<Option<Arc<Identity>>> {
-    let Some((own, address)) = of(config) else {
+/// Returns the key and the certificate that this robot presents to the configured server, if it is paired with it.
+pub fn load_identity(config: &Config) -> anyhow::Result<Option<Arc<ClientIdentity>>> {
+    let Some((own, address)) = locate_identity(config) else {
         return Ok(None);
     };
-    let Some(certificate) = own.certificate(&address)? else {
+    let Some(certificate) = own.load_certificate(&address)? else {
         return Ok(None);
     };
-    let key = Key::read(&own.key())?;
-    Ok(Some(Arc::new(Identity {
+    let key = RobotKey::read(&own.key_path())?;
+    Ok(Some(Arc::new(ClientIdentity {
         chain: certificate.chain()?,
-        key: key.to_show(),
+        key: key.private_key(),
     })))
 }
 
 /// Pairs this robot.
-pub fn pair(asked: &arguments::Pair) -> anyhow::Result<ExitCode> {
+pub fn pair(asked: &arguments::PairRobotArgs) -> anyhow::Result<ExitCode> {
     let line: PairingLine = asked.line.parse()?;
-    let own = directory(asked.identity.as_deref())
+    let own = identity_directory(asked.identity.as_deref())
         .context("neither XDG_CONFIG_HOME nor HOME is set; set one of them, or name a directory with --identity")?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()?;
-    let lifetime = runtime.block_on(paired(&line, &own))?;
+    let lifetime = runtime.block_on(request_pairing(&line, &own))?;
     println!(
-        "This robot is paired with {} as {}. Its key is {}; its certificate is good for {}, and the stubs renew it.",
+        "This robot is paired with {} as {}. Its key is {}; its certificate is valid for {}, and the stubs renew it.",
         line.server,
         line.robot,
-        own.key().display(),
-        in_words(lifetime)
+        own.key_path().display(),
+        duration_in_words(lifetime)
     );
     Ok(ExitCode::SUCCESS)
 }
 
-async fn paired(line: &PairingLine, own: &Own) -> anyhow::Result<Duration> {
+async fn request_pairing(line: &PairingLine, own: &IdentityDirectory) -> anyhow::Result<Duration> {
     let address = Address::parse(&format!("wss://{}", line.server)).map_err(anyhow::Error::msg)?;
-    let key = own.make_key()?;
+    let key = own.load_or_create_key()?;
     let trust = Trust {
         authorities: None,
         fingerprint: Some(line.fingerprint),
         known: None,
-        accept: "a new line of cloudroidctl pair, which says".to_owned(),
+        accept: "a new line of cloudroidctl pair with".to_owned(),
         advice: "",
         identity: None,
     };
     let ip = resolver::resolve(&address.host)
         .await
         .with_context(|| format!("cannot find {}", address.host))?;
-    let server = http::Server {
+    let server = http::HttpServer {
         address,
         ip,
         trust,
-        // An authority's word is not enough: the line names the one certificate.
+        // A certificate authority is not sufficient: the line names the exact certificate.
         only: Some(line.fingerprint),
     };
-    let asks =
-        json!({ "robot": line.robot, "code": line.code, "request": key.request(&line.robot)? });
+    let asks = json!({ "robot": line.robot, "code": line.code, "request": key.certificate_request(&line.robot)? });
     let answer = http::post(&server, "/api/v1/pair", &asks)
         .await
         .with_context(|| format!("cannot pair with {}", line.server))?;
@@ -115,24 +115,24 @@ async fn paired(line: &PairingLine, own: &Own) -> anyhow::Result<Duration> {
             "{} answers {}: {}",
             line.server,
             answer.status,
-            answer.words()
+            answer.problem_text()
         );
     }
-    let certificate = Certificate::read(&answer.body)
-        .with_context(|| format!("what {} answers is no certificate", line.server))?;
-    own.keep(&server.address, &certificate)?;
+    let certificate = PairedCertificate::read(&answer.body)
+        .with_context(|| format!("the response of {} is not a certificate", line.server))?;
+    own.store_certificate(&server.address, &certificate)?;
     own.trust_signer(&line.key)?;
     own.known_servers()
         .remember(
-            &server.address.known_as(),
-            Known::Certificate(line.fingerprint),
+            &server.address.known_server_name(),
+            KnownIdentity::Certificate(line.fingerprint),
         )
-        .context("cannot remember the server's certificate")?;
+        .context("cannot store the server's certificate")?;
     Ok(certificate.lifetime())
 }
 
-/// A length of time for people.
-fn in_words(length: Duration) -> String {
+/// Formats a duration for a message.
+fn duration_in_words(length: Duration) -> String {
     match length.as_secs() {
         seconds if seconds >= 2 * 86_400 => format!("{} days", seconds / 86_400),
         seconds if seconds >= 2 * 3600 => format!("{} hours", seconds / 3600),
@@ -141,13 +141,13 @@ fn in_words(length: Duration) -> String {
     }
 }
 
-/// A file that is about this robot's key or its certificates, and what is wrong with it.
-fn about(path: &Path, what: impl std::fmt::Display) -> anyhow::Error {
+/// Returns an error about a file of this robot's key or certificates.
+fn file_error(path: &Path, what: impl std::fmt::Display) -> anyhow::Error {
     anyhow::anyhow!("{}: {what}", path.display())
 }
 
-/// Writes a file of this user's alone, whole or not at all.
-fn write_whole(path: &Path, text: &str) -> anyhow::Result<()> {
+/// Writes a file atomically, accessible only to this user.
+fn write_atomically(path: &Path, text: &str) -> anyhow::Result<()> {
     use std::io::Write;
     use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
     let directory = path.parent().unwrap_or(Path::new("."));
@@ -155,8 +155,8 @@ fn write_whole(path: &Path, text: &str) -> anyhow::Result<()> {
     making.recursive(true).mode(0o700);
     making
         .create(directory)
-        .map_err(|error| about(directory, error))?;
-    let half = half(path);
+        .map_err(|error| file_error(directory, error))?;
+    let half = temporary_path(path);
     let _ = std::fs::remove_file(&half);
     let written = || -> std::io::Result<()> {
         let mut file = std::fs::OpenOptions::new()
@@ -168,10 +168,10 @@ fn write_whole(path: &Path, text: &str) -> anyhow::Result<()> {
         file.sync_all()?;
         std::fs::rename(&half, path)
     };
-    written().map_err(|error| about(path, error))
+    written().map_err(|error| file_error(path, error))
 }
 
-fn half(path: &Path) -> PathBuf {
+fn temporary_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(format!(".{}", std::process::id()));
     name.into()

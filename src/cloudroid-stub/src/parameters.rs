@@ -1,57 +1,57 @@
-//! The robot's parameters, all at once. A Master answers for all or for none: one value that XML-RPC cannot carry (an
-//! integer of more than 32 bits, nothing at all) spoils the whole answer. Then they are asked for one by one.
+//! Reads all parameters of the robot at once. A Master answers for all or for none: one value that XML-RPC cannot carry
+//! (an integer of more than 32 bits, nil) makes the whole request fail. In this case they are read one by one.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError, ParamValue};
-use ros::ros1::own_parameters::is_of_master;
+use ros::ros1::own_parameters::is_set_by_master;
 
-/// Named once for each life of the stub.
+/// Parameters already reported; each is reported once per run of the stub.
 static TOLD: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
 
-/// All parameters as a tree, without the Master's own. Those that cannot be read are left out, and named in the log.
-pub async fn all(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
+/// Returns all parameters as a tree, without the Master's own. Unreadable ones are omitted and reported in the log.
+pub async fn read_all(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
     let mut all = match bus.parameter("/").await {
         Ok(ParamValue::Map(all)) => all,
         Ok(_) => BTreeMap::new(),
-        Err(error) if is_of_values(&error) => one_by_one(bus).await?,
+        Err(error) if is_value_error(&error) => read_one_by_one(bus).await?,
         Err(error) => return Err(error),
     };
-    all.retain(|name, _| !is_of_master(name));
-    without_nothing(&mut all, "");
+    all.retain(|name, _| !is_set_by_master(name));
+    remove_nil(&mut all, "");
     Ok(all)
 }
 
-/// Takes what is no value out of a tree, and names it.
-fn without_nothing(tree: &mut BTreeMap<String, ParamValue>, above: &str) {
+/// Removes nil values from a tree and reports them.
+fn remove_nil(tree: &mut BTreeMap<String, ParamValue>, above: &str) {
     tree.retain(|name, value| {
         let name = format!("{above}/{name}");
-        if is_nothing(value) {
-            report(&name, &"it is nothing");
+        if contains_nil(value) {
+            warn_once(&name, &"it is null");
             return false;
         }
         if let ParamValue::Map(below) = value {
-            without_nothing(below, &name);
+            remove_nil(below, &name);
         }
         true
     });
 }
 
-fn is_nothing(value: &ParamValue) -> bool {
+fn contains_nil(value: &ParamValue) -> bool {
     match value {
         ParamValue::Nil => true,
-        ParamValue::List(items) => items.iter().any(is_nothing),
+        ParamValue::List(items) => items.iter().any(contains_nil),
         _ => false,
     }
 }
 
-/// Whether a parameter that has changed can be carried; names it if not.
-pub fn can_be_carried(name: &str, value: &mut Option<ParamValue>) -> bool {
+/// Returns whether a changed parameter can be transferred; reports it if not.
+pub fn make_transferable(name: &str, value: &mut Option<ParamValue>) -> bool {
     match value {
-        Some(ParamValue::Map(below)) => without_nothing(below, name),
-        Some(value) if is_nothing(value) => {
-            report(name, &"it is nothing");
+        Some(ParamValue::Map(below)) => remove_nil(below, name),
+        Some(value) if contains_nil(value) => {
+            warn_once(name, &"it is null");
             return false;
         }
         _ => {}
@@ -59,31 +59,32 @@ pub fn can_be_carried(name: &str, value: &mut Option<ParamValue>) -> bool {
     true
 }
 
-fn report(name: &str, reason: &dyn std::fmt::Display) {
+fn warn_once(name: &str, reason: &dyn std::fmt::Display) {
     if TOLD.lock().insert(name.to_owned()) {
         tracing::warn!(
-            "parameter {name} has a value that XML-RPC cannot carry ({reason}): the node in the cloud does not get it; set it otherwise, or remove it with: rosparam delete {name}"
+            "parameter {name} has a value that XML-RPC cannot represent ({reason}), so the node in the cloud does not \
+                get it; correct it, or remove it with: rosparam delete {name}"
         );
     }
 }
 
-/// The Master was reached, and what it said cannot be used.
-fn is_of_values(error: &BusError) -> bool {
+/// Returns whether the Master was reached but its answer cannot be used.
+fn is_value_error(error: &BusError) -> bool {
     matches!(
         error,
         BusError::Master { .. } | BusError::Protocol { .. } | BusError::NoParam(_)
     )
 }
 
-async fn one_by_one(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
+async fn read_one_by_one(bus: &dyn Bus) -> Result<BTreeMap<String, ParamValue>, BusError> {
     let mut all = BTreeMap::new();
     for name in bus.parameters()?.names().await? {
         match bus.parameter(&name).await {
             Ok(value) => insert(&mut all, name.trim_start_matches('/'), value),
-            // Deleted meanwhile.
+            // Deleted in the meantime.
             Err(BusError::NoParam(_)) => {}
-            Err(error) if is_of_values(&error) => {
-                report(&name, &error);
+            Err(error) if is_value_error(&error) => {
+                warn_once(&name, &error);
             }
             Err(error) => return Err(error),
         }
@@ -129,11 +130,11 @@ mod tests {
                 map(&[("nothing", ParamValue::Nil), ("bytes", bytes.clone())]),
             ),
         ]));
-        assert!(can_be_carried("/n", &mut value));
+        assert!(make_transferable("/n", &mut value));
         let rest = map(&[("one", one), ("below", map(&[("bytes", bytes)]))]);
         assert_eq!(value, Some(rest));
-        assert!(!can_be_carried("/n", &mut Some(ParamValue::Nil)));
-        assert!(can_be_carried("/n", &mut None), "deleted");
+        assert!(!make_transferable("/n", &mut Some(ParamValue::Nil)));
+        assert!(make_transferable("/n", &mut None), "deleted");
         for name in ["/n/nothing", "/n/holes", "/n/below/nothing", "/n"] {
             assert!(TOLD.lock().contains(name), "{name}");
         }

@@ -1,4 +1,4 @@
-//! Parameters files of ROS 2, which are on the robot only. They are read as rcl and the client libraries do
+//! ROS 2 parameters files, which exist on the robot only. They are interpreted as rcl and the client libraries do
 //! (<https://docs.ros.org/en/jazzy/How-To-Guides/Node-arguments.html>).
 //!
 //! ```yaml
@@ -19,30 +19,30 @@ use ros::bus::ParamValue;
 use ros::ros2::arguments::is_token;
 use saphyr_parser::Event;
 
-use events::{Events, Problem};
+use events::{Problem, YamlEvents};
 
-/// The largest file that is read.
+/// Maximum file size in bytes.
 const MAX_BYTES: u64 = 8 << 20;
-/// Groups within groups.
+/// Maximum nesting depth of groups.
 const MAX_DEPTH: usize = 32;
-/// What parameters stand below.
+/// Key between a node and its parameters.
 const PARAMETERS: &str = "ros__parameters";
 
-/// Parameters of the nodes that a pattern names.
+/// Parameters of the nodes that match a pattern.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Section {
-    /// Such as `/front/see` or `/**`.
+    /// Pattern of the node names, such as `/front/see` or `/**`.
     pub nodes: String,
-    /// By name; levels are parted by dots.
+    /// Values by parameter name, with levels separated by dots.
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
-/// Parameters of nodes in the order in which rcl keeps them: that in which their patterns were first seen.
+/// Parameters of nodes in the order in which rcl keeps them: that of the first occurrence of their patterns.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Sections(Vec<Section>);
 
 impl Sections {
-    /// Sets a parameter of the nodes of a pattern.
+    /// Sets a parameter for the nodes that match a pattern.
     pub fn set(&mut self, nodes: &str, name: String, value: ParamValue) {
         let at = self.0.iter().position(|section| section.nodes == nodes);
         let at = at.unwrap_or_else(|| {
@@ -55,12 +55,12 @@ impl Sections {
         self.0[at].parameters.insert(name, value);
     }
 
-    /// Adds those of a file.
+    /// Adds the parameters of a file.
     ///
     /// # Errors
-    /// The file cannot be read, or is no parameters file: its path, the line and the reason.
+    /// The file cannot be read or is not a parameters file; the error states its path, the line and the reason.
     pub fn read(&mut self, path: &Path) -> anyhow::Result<()> {
-        let text = text(path)?;
+        let text = read_text(path)?;
         self.parse(&text).map_err(|problem| {
             let Problem { line, reason } = problem;
             anyhow!("parameters file {}, line {line}: {reason}", path.display())
@@ -68,23 +68,23 @@ impl Sections {
     }
 
     fn parse(&mut self, text: &str) -> Result<(), Problem> {
-        let mut file = File {
-            events: Events::of(text),
+        let mut file = ParametersFileReader {
+            events: YamlEvents::new(text),
             found: self,
         };
         file.read()
     }
 
-    /// The parameters of the node of this absolute name. Of several sections the later one counts: that is how rclcpp and
-    /// rclpy do it, whatever is the more precise.
-    pub fn of(&self, node: &str) -> BTreeMap<String, ParamValue> {
+    /// Returns the parameters of the node of this absolute name. A later section overrides an earlier one, even if that
+    /// is more specific, as in rclcpp and rclpy.
+    pub fn for_node(&self, node: &str) -> BTreeMap<String, ParamValue> {
         let sections = self.0.iter();
-        let own = sections.filter(|section| matches(&section.nodes, node));
+        let own = sections.filter(|section| matches_node(&section.nodes, node));
         own.flat_map(|section| section.parameters.clone()).collect()
     }
 }
 
-fn text(path: &Path) -> anyhow::Result<String> {
+fn read_text(path: &Path) -> anyhow::Result<String> {
     let failed = || {
         format!(
             "cannot read the parameters file {}; --params-file names a file of this robot",
@@ -93,13 +93,14 @@ fn text(path: &Path) -> anyhow::Result<String> {
     };
     let size = std::fs::metadata(path).with_context(failed)?.len();
     if size > MAX_BYTES {
-        return Err(anyhow!("it has {size} bytes, and {MAX_BYTES} are read")).with_context(failed);
+        return Err(anyhow!("it has {size} bytes; the limit is {MAX_BYTES}")).with_context(failed);
     }
     std::fs::read_to_string(path).with_context(failed)
 }
 
-/// Whether a node of this absolute name is meant: `*` is one part of a name, `**` any number of them.
-fn matches(nodes: &str, node: &str) -> bool {
+/// Returns whether the pattern matches a node of this absolute name: `*` is one segment of a name, `**` any number of
+/// them.
+fn matches_node(nodes: &str, node: &str) -> bool {
     fn parts(pattern: &[&str], node: &[&str]) -> bool {
         match (pattern.split_first(), node.split_first()) {
             (None, None) => true,
@@ -120,12 +121,12 @@ fn matches(nodes: &str, node: &str) -> bool {
     parts(&nodes, &node)
 }
 
-struct File<'a, 's> {
-    events: Events<'a>,
+struct ParametersFileReader<'a, 's> {
+    events: YamlEvents<'a>,
     found: &'s mut Sections,
 }
 
-impl File<'_, '_> {
+impl ParametersFileReader<'_, '_> {
     fn read(&mut self) -> Result<(), Problem> {
         loop {
             let (event, line) = self.events.next()?;
@@ -136,14 +137,14 @@ impl File<'_, '_> {
                 _ => {
                     return Err(Problem::new(
                         line,
-                        format!("this is no name of a node with {PARAMETERS} below it"),
+                        format!("expected a node name with {PARAMETERS} below it"),
                     ));
                 }
             }
         }
     }
 
-    /// Names of nodes, and of namespaces around them.
+    /// Reads names of nodes, and of namespaces around them.
     fn nodes(&mut self, above: &str, depth: usize) -> Result<(), Problem> {
         while let Some((key, line)) = self.key(depth)? {
             let (event, at) = self.events.next()?;
@@ -152,14 +153,11 @@ impl File<'_, '_> {
                 if above.is_empty() {
                     return Err(Problem::new(
                         line,
-                        format!("{PARAMETERS} stands below no name of a node; /** names all"),
+                        format!("{PARAMETERS} is not below a node name; use /** for all nodes"),
                     ));
                 }
                 if !is_group {
-                    return Err(Problem::new(
-                        at,
-                        format!("there is nothing below {PARAMETERS}"),
-                    ));
+                    return Err(Problem::new(at, format!("{PARAMETERS} is empty")));
                 }
                 self.parameters(above, "", depth + 1)?;
                 continue;
@@ -168,13 +166,16 @@ impl File<'_, '_> {
             let named = parts.peek().is_some()
                 && parts.all(|part| is_token(part) || part == "*" || part == "**");
             if !named {
-                return Err(Problem::new(line, format!("{key:?} is no name of a node")));
+                return Err(Problem::new(
+                    line,
+                    format!("{key:?} is not a valid node name"),
+                ));
             }
             if !is_group {
                 return Err(Problem::new(
                     at,
                     format!(
-                        "{key} has a value before {PARAMETERS}, which stands between a node and its parameters"
+                        "{key} has a value without {PARAMETERS}, which must be between a node name and its parameters"
                     ),
                 ));
             }
@@ -194,8 +195,8 @@ impl File<'_, '_> {
                 self.parameters(nodes, &name, depth + 1)?;
                 continue;
             }
-            let value = value::of_event(event, at, &mut self.events).map_err(|problem| {
-                // An empty value stands where the next thing does.
+            let value = value::parse_event(event, at, &mut self.events).map_err(|problem| {
+                // An empty value has the position of the next token.
                 let line = if problem.reason == value::NO_VALUE {
                     line
                 } else {
@@ -208,21 +209,21 @@ impl File<'_, '_> {
         Ok(())
     }
 
-    /// The next key of a group and its line; none at its end.
+    /// Returns the next key of a group and its line, or `None` at its end.
     fn key(&mut self, depth: usize) -> Result<Option<(String, usize)>, Problem> {
         let (event, line) = self.events.next()?;
         match event {
             Event::MappingEnd => Ok(None),
             _ if depth > MAX_DEPTH => Err(Problem::new(
                 line,
-                format!("more than {MAX_DEPTH} groups stand within each other"),
+                format!("more than {MAX_DEPTH} nested groups"),
             )),
             Event::Scalar(text, ..) if !text.is_empty() => Ok(Some((text.into_owned(), line))),
             Event::Alias(_) => Err(Problem::new(
                 line,
-                "ROS 2 reads no aliases: write the name out",
+                "ROS 2 does not support aliases: write the name",
             )),
-            _ => Err(Problem::new(line, "a name stands before each colon")),
+            _ => Err(Problem::new(line, "expected a name before each colon")),
         }
     }
 }

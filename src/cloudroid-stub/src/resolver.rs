@@ -1,6 +1,6 @@
-//! Host names without the C library: a static program has no NSS. `/etc/hosts` first, then multicast DNS for `.local`
-//! (RFC 6762), else the servers of `/etc/resolv.conf` (RFC 1035). Nothing is remembered between two questions: robots
-//! roam, and so do the files and the answers.
+//! Resolves host names without the C library, since a static program has no NSS: first `/etc/hosts`, then multicast DNS
+//! for `.local` (RFC 6762), otherwise the servers of `/etc/resolv.conf` (RFC 1035). Nothing is cached, because a robot
+//! moves between networks, where both the files and the answers change.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -15,13 +15,13 @@ use hickory_resolver::proto::rr::{Name, RecordType};
 use hickory_resolver::system_conf::read_system_conf;
 use hickory_resolver::{Hosts, TokioResolver};
 use mdns_sd::{HostnameResolutionEvent, ServiceDaemon};
-use ros::Interface;
+use ros::InterfaceAddress;
 use ros::net::{HostSockets, Sockets};
 use tokio::net::{TcpListener, TcpStream, UdpSocket};
 
-/// For a host of this network to answer; it is asked at 0 and 1 s.
+/// Timeout for hosts of this network to answer; queries are sent at 0 and 1 s.
 const MULTICAST: Duration = Duration::from_millis(1800);
-/// For one server to answer once.
+/// Timeout for one query to one server.
 const ANSWER: Duration = Duration::from_millis(1500);
 const ATTEMPTS: usize = 3;
 
@@ -43,23 +43,24 @@ impl Sockets for RobotSockets {
         Ok(SocketAddr::new(resolve(host).await?, port))
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        HostSockets.datagrams(address, shared).await
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        HostSockets.bind_udp(address, shared).await
     }
 
-    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
+    async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
         HostSockets.interfaces().await
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        HostSockets.diagnostics().await
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
+        HostSockets.open_sock_diag().await
     }
 }
 
-/// The address of a host, IPv4 before IPv6: ROS 1 nodes listen on IPv4.
+/// Returns the address of a host, IPv4 before IPv6, because ROS 1 nodes listen on IPv4.
 ///
 /// # Errors
-/// `NotFound` if nobody knows the name, with who was asked; otherwise why it could not be asked.
+/// `NotFound`, with the servers that were queried, if the name does not exist; otherwise the reason why the query
+/// failed.
 pub async fn resolve(host: &str) -> io::Result<IpAddr> {
     let bare = host
         .strip_prefix('[')
@@ -71,26 +72,26 @@ pub async fn resolve(host: &str) -> io::Result<IpAddr> {
     let name = bare.trim_end_matches('.').to_ascii_lowercase();
     let parsed = Name::from_utf8(&name)
         .map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, format!("{name}: {error}")))?;
-    if let Some(known) = in_hosts(&parsed) {
+    if let Some(known) = lookup_hosts_file(&parsed) {
         return Ok(known);
     }
     if name == "localhost" || name.ends_with(".localhost") {
         return Ok(Ipv4Addr::LOCALHOST.into());
     }
     if name.ends_with(".local") {
-        return on_this_network(&name).await;
+        return resolve_multicast(&name).await;
     }
-    by_servers(&name, parsed).await
+    resolve_dns(&name, parsed).await
 }
 
-fn unknown(name: &str, asked: &str) -> io::Error {
+fn not_found(name: &str, asked: &str) -> io::Error {
     io::Error::new(
         io::ErrorKind::NotFound,
         format!("host {name} has no address: {asked}"),
     )
 }
 
-fn in_hosts(name: &Name) -> Option<IpAddr> {
+fn lookup_hosts_file(name: &Name) -> Option<IpAddr> {
     let hosts = Hosts::from_system().ok()?;
     [RecordType::A, RecordType::AAAA]
         .into_iter()
@@ -102,10 +103,10 @@ fn in_hosts(name: &Name) -> Option<IpAddr> {
         })
 }
 
-/// Asks all hosts on all of this machine's networks.
-async fn on_this_network(name: &str) -> io::Result<IpAddr> {
+/// Queries the hosts on all networks of this machine.
+async fn resolve_multicast(name: &str) -> io::Result<IpAddr> {
     let failed = |error: mdns_sd::Error| {
-        io::Error::other(format!("cannot ask for {name} by multicast DNS: {error}"))
+        io::Error::other(format!("cannot look up {name} by multicast DNS: {error}"))
     };
     let daemon = ServiceDaemon::new().map_err(failed)?;
     let patience = u64::try_from(MULTICAST.as_millis()).unwrap_or(u64::MAX);
@@ -126,23 +127,23 @@ async fn on_this_network(name: &str) -> io::Result<IpAddr> {
             _ => {}
         }
     }
-    // Its thread and sockets end by this; nobody waits for that.
+    // Ends its thread and sockets, which is not waited for.
     let _ = daemon.shutdown();
     found.sort_by_key(|address| !address.is_ipv4());
-    found
-        .into_iter()
-        .next()
-        .ok_or_else(|| unknown(name, "nobody on this network answers to it (multicast DNS)"))
+    found.into_iter().next().ok_or_else(|| {
+        not_found(
+            name,
+            "no host on this network has that name (multicast DNS)",
+        )
+    })
 }
 
-async fn by_servers(name: &str, parsed: Name) -> io::Result<IpAddr> {
+async fn resolve_dns(name: &str, parsed: Name) -> io::Result<IpAddr> {
     let (config, mut options): (ResolverConfig, ResolverOpts) =
         read_system_conf().map_err(|error| {
-            unknown(
+            not_found(
                 name,
-                &format!(
-                    "/etc/hosts does not name it, and /etc/resolv.conf cannot be used ({error})"
-                ),
+                &format!("it is not in /etc/hosts, and /etc/resolv.conf cannot be used ({error})"),
             )
         })?;
     options.ip_strategy = LookupIpStrategy::Ipv4thenIpv6;
@@ -161,13 +162,13 @@ async fn by_servers(name: &str, parsed: Name) -> io::Result<IpAddr> {
         Ok(addresses) => addresses
             .iter()
             .next()
-            .ok_or_else(|| unknown(name, "its servers know no address of it")),
+            .ok_or_else(|| not_found(name, "the DNS servers have no address for it")),
         Err(error) if error.is_nx_domain() || error.is_no_records_found() => {
             let mut servers = servers;
             servers.dedup();
-            Err(unknown(name, &format!("asked {}", servers.join(", "))))
+            Err(not_found(name, &format!("asked {}", servers.join(", "))))
         }
-        Err(error) => Err(io::Error::other(format!("cannot ask for {name}: {error}"))),
+        Err(error) => Err(io::Error::other(format!("cannot look up {name}: {error}"))),
     }
 }
 

@@ -1,4 +1,4 @@
-//! `revision.toml` beside `stub.toml`: what the server made the stub of.
+//! The `revision.toml` beside `stub.toml`, which describes the source of the stub.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -6,56 +6,56 @@ use std::path::Path;
 use ros::bus::RosVersion;
 use serde::Deserialize;
 
-/// The file, as far as it matters on the robot. Everything is absent in a stub that was put together by hand.
+/// The part of the file that matters on the robot. All fields are absent in a stub that was assembled by hand.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 pub struct Revision {
-    /// The service's ROS: 1 or 2; 1 where absent, as before there were stubs of the other.
+    /// ROS version of the service, 1 or 2 (default: 1, as in stubs made before ROS 2 was supported).
     pub ros: Option<u8>,
-    /// The service's revision.
+    /// Revision of the service.
     pub revision: Option<u64>,
     /// Digest of its image.
     pub image: String,
     /// Executables that run in the cloud.
     pub outsourced: Vec<String>,
-    /// Names that programs give their nodes where nobody else does, by executable.
+    /// Default node names by executable, as the programs set them.
     pub names: BTreeMap<String, String>,
-    /// What holds where the robot says nothing.
+    /// Defaults for settings that the robot does not make.
     pub defaults: Defaults,
-    /// Which inputs are answered by which outputs, as the push has decided.
-    pub requests: Vec<Answered>,
+    /// Inputs and the outputs that answer them, as decided by the push.
+    pub requests: Vec<DecidedRequest>,
 }
 
 /// An input of a node and the outputs that answer it.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Deserialize)]
 #[serde(default)]
-pub struct Answered {
-    /// Absolute name of the node at the push; empty where it was not known.
+pub struct DecidedRequest {
+    /// Absolute name of the node at the push; empty if unknown.
     pub node: String,
-    /// Its executable, where it is known.
+    /// Executable of the node, if known.
     pub program: Option<String>,
-    /// `INPUT -> OUTPUT, OUTPUT by stamp`, by absolute names at the push, as they were without remaps.
+    /// `INPUT -> OUTPUT, OUTPUT by stamp`, with absolute names at the push, before remapping.
     pub request: String,
 }
 
-/// What the service's deployer says of response times, in seconds; both or neither.
+/// Response times that the service's deployer has set, in seconds; both or neither.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(default)]
 pub struct Defaults {
-    /// T_desire.
+    /// Default T_desire.
     pub desire: Option<f64>,
-    /// T_max.
+    /// Default T_max.
     pub max: Option<f64>,
 }
 
 impl Revision {
-    /// That of the stub with this share directory.
+    /// Reads the revision of the stub with this share directory.
     pub fn read(share: &Path) -> Self {
         let text = std::fs::read_to_string(share.join("revision.toml")).unwrap_or_default();
         toml::from_str(&text).unwrap_or_default()
     }
 
-    /// The service's ROS, which is the robot's.
+    /// Returns the ROS version of the service, which is the robot's, too.
     pub fn ros(&self) -> RosVersion {
         match self.ros {
             Some(2) => RosVersion::Two,

@@ -1,4 +1,4 @@
-//! The node as launch files started it, and the robot's ROS as its environment tells.
+//! The node as launch files started it, and the robot's ROS as its environment describes it.
 
 mod ros1;
 mod ros2;
@@ -7,71 +7,71 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
 use link::control;
-use ros::Network;
+use ros::DiscoveryNetwork;
 use ros::bus::{ParamValue, RosVersion};
 
 use crate::network::Variable;
 use crate::original;
 use crate::revision::Revision;
 
-/// What the command line and the environment say.
+/// Settings from the command line and the environment.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Robot {
-    /// The robot's ROS.
+pub struct LaunchedNode {
+    /// The robot's ROS version.
     pub ros: RosVersion,
-    /// Where its other nodes are.
-    pub place: Place,
+    /// Location of its other nodes.
+    pub place: RosLocation,
     /// Absolute name of the node.
     pub node: String,
-    /// Arguments for the node in the cloud: what its name and its namespace follow from is left out in ROS 1, and said in ROS 2, where a program may be
-    /// several nodes; parameters that stand in files of the robot are written out.
+    /// Arguments for the node in the cloud. In ROS 1 they omit those that define its name and namespace; in ROS 2 they
+    /// contain them, because a program may create several nodes. Parameters from files of the robot are expanded.
     pub argv: Vec<String>,
     /// Arguments for the local original.
     pub original_argv: Vec<String>,
-    /// The parameters that the node is given by its command line (ROS 2).
+    /// The node's parameters on its command line (ROS 2).
     pub parameters: BTreeMap<String, ParamValue>,
-    /// Whether the node's time is that of `/clock`, as far as its command line says (ROS 2).
+    /// Set if the node takes its time from `/clock`, as far as its command line says (ROS 2).
     pub sim_time: bool,
 }
 
-/// Where the nodes of a robot find each other.
+/// Location where the nodes of a robot discover each other.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Place {
-    /// At a Master (ROS 1).
+pub enum RosLocation {
+    /// A Master (ROS 1).
     Master {
-        /// Its host.
+        /// Host of the Master.
         host: String,
-        /// Its port.
+        /// Port of the Master.
         port: u16,
-        /// The host that others reach this node under, where it is said.
+        /// Host under which other nodes reach this node, if configured.
         own: Option<String>,
     },
-    /// In a domain (ROS 2).
+    /// A domain (ROS 2).
     Domain {
         /// `ROS_DOMAIN_ID`.
         id: u16,
-        /// Where nodes of that domain are looked for.
-        network: Network,
+        /// Network in which nodes of that domain are discovered.
+        network: DiscoveryNetwork,
     },
 }
 
-/// What a node is called where the robot does not say it.
+/// Name of a node unless the robot sets one.
 #[derive(Debug, Clone, Copy)]
-pub struct Usual<'a> {
-    /// Its name; in ROS 2 with the namespace that its program gives it.
+pub struct DefaultName<'a> {
+    /// The name; in ROS 2 with the namespace that its program sets.
     pub name: &'a str,
-    /// Its program calls it so, and is not to be told.
+    /// The program sets this name itself, so it need not be passed.
     pub by_program: bool,
 }
 
-impl Robot {
-    /// Reads `argv` (without the program) of the executable, whose node is usually called so.
+impl LaunchedNode {
+    /// Parses `argv` (without the program) of the executable, whose default node name is `usual`.
     ///
     /// # Errors
-    /// The argument, the file or the variable that cannot be, and why.
+    /// The invalid argument, file or variable, and the reason.
     pub async fn read(
         argv: &[String],
-        usual: Usual<'_>,
+        usual: DefaultName<'_>,
         ros: RosVersion,
         variable: Variable<'_>,
     ) -> anyhow::Result<Self> {
@@ -81,7 +81,7 @@ impl Robot {
         }
     }
 
-    /// What the node's parameters say of the stub itself, by key: `cloudroid.max` by `max`.
+    /// Returns the node's parameters that are settings of the stub, by key: `cloudroid.max` as `max`.
     pub fn settings(&self) -> BTreeMap<String, ParamValue> {
         let parameters = self.parameters.iter();
         let settings = parameters.filter_map(|(name, value)| {
@@ -91,12 +91,17 @@ impl Robot {
         settings.collect()
     }
 
-    /// What the cloud is to run.
-    pub fn for_the_cloud(&self, package: &str, executable: &str, share: &Path) -> control::Node {
+    /// Returns the description of the node that the cloud is to run.
+    pub fn to_cloud_node(
+        &self,
+        package: &str,
+        executable: &str,
+        share: &Path,
+    ) -> control::NodeLaunch {
         let made_of = Revision::read(share);
-        let share = plain(share);
-        let directory = directory(&share, std::env::current_dir().unwrap_or_default());
-        control::Node {
+        let share = normalize(share);
+        let directory = working_directory(&share, std::env::current_dir().unwrap_or_default());
+        control::NodeLaunch {
             name: self.node.clone(),
             package: package.to_owned(),
             executable: executable.to_owned(),
@@ -115,9 +120,9 @@ impl Robot {
     }
 }
 
-/// A path without `..`, as others on the robot write it: launchers say `lib/PKG/../../share/PKG`, while rospack, and
-/// so `$(find PKG)`, say `share/PKG`.
-fn plain(path: &Path) -> PathBuf {
+/// Returns a path without `..`, in the form that other programs on the robot use: launchers use
+/// `lib/PKG/../../share/PKG`, while rospack, and so `$(find PKG)`, uses `share/PKG`.
+fn normalize(path: &Path) -> PathBuf {
     let mut plain = PathBuf::new();
     for part in path.components() {
         match part {
@@ -129,8 +134,9 @@ fn plain(path: &Path) -> PathBuf {
     plain
 }
 
-/// The working directory. Within the overlay it is written as the share directory is, even where links lead there.
-fn directory(share: &Path, current: PathBuf) -> PathBuf {
+/// Returns the working directory. Within the overlay it has the same form as the share directory, even if symbolic
+/// links lead there.
+fn working_directory(share: &Path, current: PathBuf) -> PathBuf {
     let overlay = original::overlay(share);
     let canonical = overlay.canonicalize();
     let below = canonical
@@ -139,8 +145,8 @@ fn directory(share: &Path, current: PathBuf) -> PathBuf {
     below.map_or(current, |below| overlay.join(below))
 }
 
-/// The name of a node that is started without one, from its executable's.
-pub fn usual_name(executable: &str) -> String {
+/// Returns the name of a node that is started without one, derived from its executable.
+pub fn default_node_name(executable: &str) -> String {
     let stem = executable.strip_suffix(".py").unwrap_or(executable);
     let allowed = |letter: char| {
         if letter.is_ascii_alphanumeric() {
@@ -158,7 +164,7 @@ mod tests {
 
     #[test]
     fn places_in_the_overlay_are_written_as_launch_files_write_them() {
-        let share = plain(Path::new("/o/lib/p/../../share/./p"));
+        let share = normalize(Path::new("/o/lib/p/../../share/./p"));
         assert_eq!(share, Path::new("/o/share/p"));
         let place = tempfile::tempdir().unwrap();
         let (real, link) = (place.path().join("real"), place.path().join("link"));
@@ -166,17 +172,17 @@ mod tests {
         std::os::unix::fs::symlink(&real, &link).unwrap();
         let current = real.canonicalize().unwrap().join("lib/p");
         assert_eq!(
-            directory(&link.join("share/p"), current),
+            working_directory(&link.join("share/p"), current),
             link.join("lib/p")
         );
         assert_eq!(
-            directory(&link.join("share/p"), "/root".into()),
+            working_directory(&link.join("share/p"), "/root".into()),
             Path::new("/root")
         );
     }
 
     #[test]
     fn a_node_without_a_name_has_its_executables() {
-        assert_eq!(usual_name("image-view.py"), "image_view");
+        assert_eq!(default_node_name("image-view.py"), "image_view");
     }
 }

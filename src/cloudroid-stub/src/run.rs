@@ -1,4 +1,4 @@
-//! The life of a stub: from roslaunch's exec to the real node's exit status.
+//! Runs a stub, from its start by roslaunch to the real node's exit status.
 //!
 //! ```text
 //!  Master reached ─▶ linked (see `linked`) ── node exited ─▶ exit status
@@ -14,7 +14,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use budget::Budget;
 use futures_util::FutureExt;
-use link::control::{Exit, Hello, Sla};
+use link::control::{Exit, Hello, SlaTargets};
 use link::{RobotSession, SessionOptions};
 use nix::sys::signal::{SigHandler, Signal, kill, signal};
 use nix::unistd::Pid;
@@ -25,48 +25,48 @@ use tokio::signal::unix::{SignalKind, signal as signals};
 use tokio::sync::watch;
 use tokio::time::sleep;
 
-use crate::config::{self, Config, Group, Local};
+use crate::config::{self, Config, LocalMode, ParameterGroup};
 use crate::farewell;
 use crate::linked;
-use crate::local::{Program, Setting};
+use crate::local::{OriginalProgram, OriginalSetup};
 use crate::machine;
 use crate::mirror::diagnostics::Diagnostics;
-use crate::mirror::requests::Request;
+use crate::mirror::requests::RequestPattern;
 use crate::mirror::{Mirror, promise};
 use crate::original;
 use crate::output;
 use crate::pairing;
 use crate::resolver::RobotSockets;
 use crate::revision::Revision;
-use crate::robot::{Place, Robot, Usual, usual_name};
+use crate::robot::{DefaultName, LaunchedNode, RosLocation, default_node_name};
 
-/// Where no T_max is given, a link silent for so long counts as down.
+/// Time without any data after which a link counts as down, unless T_max is set.
 const SILENT: Duration = Duration::from_secs(2);
 
-/// How long a local original may take to listen to its requests: a model may be loaded before, or a transform be awaited that does
-/// not come.
+/// Time that a local original may take to subscribe to its inputs: it may load a model first, or wait for a transform
+/// that does not come.
 const READY: Duration = Duration::from_secs(60);
 
-/// How it ends.
-enum End {
+/// Reason why the stub ends.
+enum StubEnd {
     /// The real node has ended.
     Node(Exit),
-    /// Someone asked for it.
+    /// The stub was asked to end.
     Asked,
-    /// The cloud does not want this stub.
+    /// The cloud has refused this stub.
     Refused(String),
 }
 
 /// Runs the stub.
-pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
+pub fn run(asked: &crate::arguments::RunArgs) -> anyhow::Result<ExitCode> {
     let share = &asked.node.share;
-    let config = config::read(share, std::env::vars())?;
+    let config = config::load(share, std::env::vars())?;
     let made_of = Revision::read(share);
     let executable = &asked.node.node;
     let found = made_of.names.get(executable);
     let set = config.nodes.get(executable);
-    let guessed = usual_name(executable);
-    let usual = Usual {
+    let guessed = default_node_name(executable);
+    let usual = DefaultName {
         name: set.or(found).unwrap_or(&guessed),
         by_program: found.is_some() && set.is_none_or(|set| Some(set) == found),
     };
@@ -75,18 +75,18 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
         .build()?;
     let ros = made_of.ros();
     let variable = |name: &str| std::env::var(name).ok();
-    let robot = runtime.block_on(Robot::read(&asked.argv, usual, ros, &variable))?;
-    let end = runtime.block_on(live(asked, config.clone(), &robot))?;
-    // Whatever still runs elsewhere (a codec, say) is not waited for.
+    let robot = runtime.block_on(LaunchedNode::read(&asked.argv, usual, ros, &variable))?;
+    let end = runtime.block_on(run_stub(asked, config.clone(), &robot))?;
+    // Running blocking tasks (a codec, for example) are not waited for.
     runtime.shutdown_background();
     match end {
-        End::Asked => Ok(ExitCode::SUCCESS),
-        End::Node(exit) => {
+        StubEnd::Asked => Ok(ExitCode::SUCCESS),
+        StubEnd::Node(exit) => {
             output::finish();
-            Ok(exit_as(&exit))
+            Ok(exit_like(&exit))
         }
-        End::Refused(reason) => {
-            if config.local != Local::None {
+        StubEnd::Refused(reason) => {
+            if config.local != LocalMode::None {
                 tracing::error!("{reason}; running the local original instead");
                 output::finish();
                 return original::exec(&asked.node, &asked.argv);
@@ -96,14 +96,18 @@ pub fn run(asked: &crate::arguments::Run) -> anyhow::Result<ExitCode> {
     }
 }
 
-async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> anyhow::Result<End> {
-    let mut stopping = stopping()?;
+async fn run_stub(
+    asked: &crate::arguments::RunArgs,
+    config: Config,
+    robot: &LaunchedNode,
+) -> anyhow::Result<StubEnd> {
+    let mut stopping = stop_signals()?;
     let mut buses = Vec::new();
     let begun = tokio::select! {
-        begun = begin(asked, config, robot, &mut buses) => begun.map(Some),
-        () = stopped(&mut stopping) => Ok(None),
+        begun = start(asked, config, robot, &mut buses) => begun.map(Some),
+        () = wait_for_signal(&mut stopping) => Ok(None),
     };
-    let Begun {
+    let StartedStub {
         config,
         mirror,
         mut hello,
@@ -111,62 +115,63 @@ async fn live(asked: &crate::arguments::Run, config: Config, robot: &Robot) -> a
     } = match begun {
         Ok(Some(begun)) => begun,
         over => {
-            farewell::of_the_robot(&buses).await;
-            return over.map(|_| End::Asked);
+            farewell::close_buses(&buses).await;
+            return over.map(|_| StubEnd::Asked);
         }
     };
-    let renewing = tokio::spawn(pairing::keep_renewed(config.clone()));
+    let renewing = tokio::spawn(pairing::run_renewal(config.clone()));
     let mut exit = mirror.exit();
-    let linked = linked::keep(&config, &mirror, &mut hello).fuse();
+    let linked = linked::run_link(&config, &mirror, &mut hello).fuse();
     tokio::pin!(linked);
     let end = tokio::select! {
-        refused = &mut linked => End::Refused(refused),
+        refused = &mut linked => StubEnd::Refused(refused),
         ended = exit.wait_for(Option::is_some) => node_end(ended.ok().and_then(|exit| exit.clone())),
-        signal = asked_to_stop(&mut stopping, &mut shutdown) => {
-            tracing::debug!(signal, "asked to end");
+        signal = wait_for_stop(&mut stopping, &mut shutdown) => {
+            tracing::debug!(signal, "shutting down");
             let other = async {
                 tokio::select! {
                     _ = &mut linked => {}
-                    _ = asked_to_stop(&mut stopping, &mut shutdown) => {}
+                    _ = wait_for_stop(&mut stopping, &mut shutdown) => {}
                 }
             };
-            node_end(farewell::of_the_node(&mirror, signal, other).await)
+            node_end(farewell::stop_node(&mirror, signal, other).await)
         }
     };
     renewing.abort();
-    farewell::of_all(&mirror, linked, &buses).await;
+    farewell::close_all(&mirror, linked, &buses).await;
     Ok(end)
 }
 
-/// What there is before the cloud is asked for.
-struct Begun {
+/// State of the stub before it connects to the cloud.
+struct StartedStub {
     config: Config,
     mirror: Arc<Mirror>,
     hello: Hello,
-    /// XML-RPC's `shutdown`.
+    /// The `shutdown` call of XML-RPC.
     shutdown: Option<watch::Receiver<Option<String>>>,
 }
 
-/// Becomes a node of the robot; `buses` are those that it has joined so far.
-async fn begin(
-    asked: &crate::arguments::Run,
+/// Joins the robot's ROS; `buses` are those that were joined so far.
+async fn start(
+    asked: &crate::arguments::RunArgs,
     config: Config,
-    robot: &Robot,
+    robot: &LaunchedNode,
     buses: &mut Vec<Arc<dyn Bus>>,
-) -> anyhow::Result<Begun> {
+) -> anyhow::Result<StartedStub> {
     let bus = join(robot, &robot.node).await?;
     buses.push(Arc::clone(&bus));
-    let config = with_parameters(config, &*bus, robot).await?;
+    let config = apply_parameters(config, &*bus, robot).await?;
     let made_of = Revision::read(&asked.node.share);
-    let config = config.or(&made_of.defaults);
-    if config.promises() && config.fallback_after != config::FALLBACK_AFTER {
+    let config = config.or_defaults(&made_of.defaults);
+    if config.has_promise() && config.fallback_after != config::FALLBACK_AFTER {
         tracing::warn!(
-            "fallback_after counts only until the server is reached for the first time where desire and max, a rate or an age are given: then those decide when the local original answers"
+            "fallback_after applies only until the server is first reached, because desire and max, a rate or an age \
+                are set: after that, those decide when the local original answers"
         );
     }
     let shutdown = bus.shutdown_requested();
-    let session = session(&config);
-    let label = format!("{} for {}", config.service, config.robot());
+    let session = new_session(&config);
+    let label = format!("{} for {}", config.service, config.robot_id());
     if let Ok(lending) = bus.lending() {
         lending.set_label(&label);
     }
@@ -174,11 +179,11 @@ async fn begin(
     if let Some(sla) = promise::sla(&config).context("the SLA")? {
         let watcher = join(robot, &format!("{}_cloudroid", robot.node)).await?;
         buses.push(Arc::clone(&watcher));
-        let diagnostics = Diagnostics::new(&watcher, &robot.node, &config.robot()).await?;
-        let original = local_original(asked, robot);
-        let decided = Request::decided(&made_of.requests, &asked.node.node, robot);
+        let diagnostics = Diagnostics::new(&watcher, &robot.node, &config.robot_id()).await?;
+        let original = original_setup(asked, robot);
+        let decided = RequestPattern::from_revision(&made_of.requests, &asked.node.node, robot);
         mirror
-            .promise(sla, original, decided, diagnostics, &watcher)
+            .start_promise(sla, original, decided, diagnostics, &watcher)
             .await?;
     }
     let mut parameters = mirror.parameters().await;
@@ -191,20 +196,20 @@ async fn begin(
         run: format!("{:016x}", rand::random::<u64>()),
         machine: machine::id(),
         host: machine::host(),
-        roscore: machine::roscore(&*bus).await,
-        node: robot.for_the_cloud(&asked.node.package, &asked.node.node, &asked.node.share),
-        sla: sla(&config),
+        roscore: machine::roscore_id(&*bus).await,
+        node: robot.to_cloud_node(&asked.node.package, &asked.node.node, &asked.node.share),
+        sla: stated_sla(&config),
         codecs: match config.codec {
-            config::Codec::None => Vec::new(),
-            wanted => link::packing::decoded_here(|codec| wanted.lossy() == Some(codec)),
+            config::CodecSetting::None => Vec::new(),
+            wanted => link::packing::supported_codecs(|codec| wanted.lossy() == Some(codec)),
         },
         quality: config.quality(),
         lends: true,
-        keep_stamps: config.stamps == config::Stamps::Keep,
+        keep_stamps: config.stamps == config::StampMode::Keep,
         parameters,
         ..Hello::default()
     };
-    Ok(Begun {
+    Ok(StartedStub {
         config,
         mirror,
         hello,
@@ -212,33 +217,34 @@ async fn begin(
     })
 }
 
-/// Of a node that has ended, or of which nothing is known.
-fn node_end(exit: Option<Exit>) -> End {
+/// Returns the end of a node that has exited, or of one whose state is unknown.
+fn node_end(exit: Option<Exit>) -> StubEnd {
     match exit {
         Some(exit) => {
             if exit.code != Some(0) {
                 tracing::warn!("{}", exit.text);
             }
-            End::Node(exit)
+            StubEnd::Node(exit)
         }
-        None => End::Asked,
+        None => StubEnd::Asked,
     }
 }
 
-/// Joins the robot's ROS as a node of this name; waits for its Master, or for room in its domain, as every node does.
-async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
+/// Joins the robot's ROS as a node of this name; waits for the Master, or for a free participant id in the domain, as
+/// every node does.
+async fn join(robot: &LaunchedNode, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
     let mut told = false;
     loop {
         let joined = async {
             let options = match &robot.place {
-                Place::Master { host, port, own } => {
+                RosLocation::Master { host, port, own } => {
                     let master = RobotSockets.resolve(host, *port).await?;
                     JoinOptions {
                         host: own.clone(),
                         ..JoinOptions::new(master, node)
                     }
                 }
-                Place::Domain { id, network } => JoinOptions {
+                RosLocation::Domain { id, network } => JoinOptions {
                     network: network.clone(),
                     distribution: std::env::var("ROS_DISTRO").unwrap_or_default(),
                     ..JoinOptions::in_domain(*id, node)
@@ -250,7 +256,7 @@ async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
             Ok(bus) => return Ok(bus),
             Err(error) if !told => {
                 told = true;
-                tracing::warn!("{error:#}; trying again until it is there");
+                tracing::warn!("{error:#}; retrying until it is available");
             }
             Err(_) => {}
         }
@@ -258,50 +264,56 @@ async fn join(robot: &Robot, node: &str) -> anyhow::Result<Arc<dyn Bus>> {
     }
 }
 
-/// The configuration with what parameters of the node (ROS 2), or of its namespaces (ROS 1), say instead.
-async fn with_parameters(config: Config, bus: &dyn Bus, robot: &Robot) -> anyhow::Result<Config> {
+/// Returns the configuration with the settings that parameters of the node (ROS 2) or of its namespaces (ROS 1)
+/// override.
+async fn apply_parameters(
+    config: Config,
+    bus: &dyn Bus,
+    robot: &LaunchedNode,
+) -> anyhow::Result<Config> {
     if robot.ros == RosVersion::Two {
         let settings = robot.settings();
-        return config.with_parameters(&[Group {
+        return config.with_parameters(&[ParameterGroup {
             name: None,
             settings,
         }]);
     }
     let mut given = Vec::new();
-    for name in config::groups(&robot.node) {
+    for name in config::group_names(&robot.node) {
         match bus.parameter(&name).await {
-            Ok(ParamValue::Map(settings)) => given.push(Group {
+            Ok(ParamValue::Map(settings)) => given.push(ParameterGroup {
                 name: Some(name),
                 settings,
             }),
             Ok(_) => bail!(
-                "parameter {name} is a single value, and stands where this node's settings are looked for; remove it with: rosparam delete {name}"
+                "parameter {name} is a single value, but this node's settings are expected there; remove it with: \
+                    rosparam delete {name}"
             ),
             Err(BusError::NoParam(_)) => {}
             Err(error) => bail!(
-                "parameter {name} cannot be read ({error}); set it otherwise, or remove it with: rosparam delete {name}"
+                "cannot read parameter {name} ({error}); correct it, or remove it with: rosparam delete {name}"
             ),
         }
     }
     config.with_parameters(&given)
 }
 
-/// How the original would have been started without this stub.
-fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
+/// Returns the setup of the original, as it would have been started without this stub.
+fn original_setup(asked: &crate::arguments::RunArgs, robot: &LaunchedNode) -> OriginalSetup {
     let overlay = original::overlay(&asked.node.share);
     let path = original::find(&asked.node, &|name| std::env::var(name).ok());
     let (namespace, _) = robot.node.rsplit_once('/').unwrap_or_default();
     let mut environment = original::environment(&overlay);
     let domain = match &robot.place {
-        Place::Domain { id, .. } => Some(*id),
-        Place::Master { .. } => {
+        RosLocation::Domain { id, .. } => Some(*id),
+        RosLocation::Master { .. } => {
             environment.push(("ROS_NAMESPACE", format!("{namespace}/").into()));
             None
         }
     };
     let argv = robot.original_argv.clone();
-    Setting {
-        program: path.map(|path| Program {
+    OriginalSetup {
+        program: path.map(|path| OriginalProgram {
             path,
             argv,
             environment,
@@ -312,25 +324,26 @@ fn local_original(asked: &crate::arguments::Run, robot: &Robot) -> Setting {
     }
 }
 
-/// Memory for what the server sends: what is under way, and what it tells until that is done. No server takes more of the robot's.
+/// Memory budget for data from the server: records in progress, and those that it has sent until they are processed. No
+/// server uses more of the robot's memory.
 pub static FROM_SERVER: LazyLock<Budget> =
-    LazyLock::new(|| Budget::new("what the server sends", 256 << 20));
+    LazyLock::new(|| Budget::new("data from the server", 256 << 20));
 
-/// A session with the cloud that no connection carries yet.
-pub fn session(config: &Config) -> Arc<RobotSession> {
-    Arc::new(RobotSession::new(session_options(config)).within(&FROM_SERVER))
+/// Creates a session with the cloud that has no connection yet.
+pub fn new_session(config: &Config) -> Arc<RobotSession> {
+    Arc::new(RobotSession::new(session_options(config)).with_budget(&FROM_SERVER))
 }
 
-/// How the link is watched.
+/// Returns the timeouts of the link.
 fn session_options(config: &Config) -> SessionOptions {
     let max = config
-        .longest()
+        .promise_timeout()
         .and_then(|max| Duration::try_from_secs_f64(max).ok());
     SessionOptions::for_silence(max.unwrap_or(SILENT), max)
 }
 
-fn sla(config: &Config) -> Sla {
-    Sla {
+fn stated_sla(config: &Config) -> SlaTargets {
+    SlaTargets {
         desire: config.desire,
         max: config.max,
         frames_per_second: config.frames_per_second,
@@ -338,34 +351,34 @@ fn sla(config: &Config) -> Sla {
         age: config.age,
         desired_age: config.desired_age,
         threshold: config.threshold,
-        fallback_after: (!config.promises() && config.local != Local::None)
+        fallback_after: (!config.has_promise() && config.local != LocalMode::None)
             .then_some(config.fallback_after),
     }
 }
 
-/// The streams of signals that end a node.
-struct Stopping {
+/// Streams of the signals that end a node.
+struct StopSignals {
     interrupt: tokio::signal::unix::Signal,
     terminate: tokio::signal::unix::Signal,
 }
 
-fn stopping() -> std::io::Result<Stopping> {
-    Ok(Stopping {
+fn stop_signals() -> std::io::Result<StopSignals> {
+    Ok(StopSignals {
         interrupt: signals(SignalKind::interrupt())?,
         terminate: signals(SignalKind::terminate())?,
     })
 }
 
-async fn stopped(stopping: &mut Stopping) {
+async fn wait_for_signal(stopping: &mut StopSignals) {
     tokio::select! {
         _ = stopping.interrupt.recv() => {}
         _ = stopping.terminate.recv() => {}
     }
 }
 
-/// A signal, or XML-RPC's `shutdown`, which means the same as SIGINT.
-async fn asked_to_stop(
-    stopping: &mut Stopping,
+/// Waits for a signal, or for the `shutdown` call of XML-RPC, which is equivalent to SIGINT.
+async fn wait_for_stop(
+    stopping: &mut StopSignals,
     shutdown: &mut Option<watch::Receiver<Option<String>>>,
 ) -> i32 {
     let asked = async {
@@ -384,22 +397,22 @@ async fn asked_to_stop(
     }
 }
 
-/// Ends as the real node did: by its code, or by its signal.
-fn exit_as(exit: &Exit) -> ExitCode {
+/// Ends as the real node did: with its exit code, or by its signal.
+fn exit_like(exit: &Exit) -> ExitCode {
     if let Some(code) = exit.code {
         return ExitCode::from(u8::try_from(code).unwrap_or(1));
     }
     if let Some(number) = exit.signal.and_then(|number| Signal::try_from(number).ok()) {
-        // The crash was the real node's: no core of the stub.
+        // The real node crashed, so the stub dumps no core.
         let _ = nix::sys::resource::setrlimit(nix::sys::resource::Resource::RLIMIT_CORE, 0, 0);
-        restore(number);
+        reset_signal(number);
         let _ = kill(Pid::this(), number);
     }
     ExitCode::FAILURE
 }
 
 #[allow(unsafe_code)]
-fn restore(number: Signal) {
+fn reset_signal(number: Signal) {
     // SAFETY: the default action runs no code of this process.
     let _ = unsafe { signal(number, SigHandler::SigDfl) };
 }

@@ -1,14 +1,14 @@
-//! What a node has, by the graph of either ROS. Topics and services of ROS 2's graph are those that its tools show: parts of
-//! actions are among the ends of nodes alone.
+//! Interface of a node in the graph of either ROS version. Topics and services of the ROS 2 graph are those that its
+//! tools show; topics and services of actions are listed only among the endpoints of nodes.
 
 use ros::bus::Graph;
 
-/// Whether a node of this name is there.
-pub fn is_there(graph: &Graph, node: &str) -> bool {
+/// Returns whether a node of this name exists.
+pub fn has_node(graph: &Graph, node: &str) -> bool {
     graph.nodes.contains_key(node) || graph.ends.contains_key(node)
 }
 
-/// Whether the node publishes this topic.
+/// Returns whether the node publishes this topic.
 pub fn publishes(graph: &Graph, node: &str, topic: &str) -> bool {
     let shown = graph.topics.get(topic);
     let shown = shown.is_some_and(|ends| ends.publishers.iter().any(|name| name == node));
@@ -16,7 +16,7 @@ pub fn publishes(graph: &Graph, node: &str, topic: &str) -> bool {
     shown || ends.is_some_and(|ends| ends.publishers.contains_key(topic))
 }
 
-/// Whether the node subscribes to this topic.
+/// Returns whether the node subscribes to this topic.
 pub fn subscribes(graph: &Graph, node: &str, topic: &str) -> bool {
     let shown = graph.topics.get(topic);
     let shown = shown.is_some_and(|ends| ends.subscribers.iter().any(|name| name == node));
@@ -24,7 +24,7 @@ pub fn subscribes(graph: &Graph, node: &str, topic: &str) -> bool {
     shown || ends.is_some_and(|ends| ends.subscribers.contains_key(topic))
 }
 
-/// Whether the node serves this service.
+/// Returns whether the node serves this service.
 pub fn serves(graph: &Graph, node: &str, service: &str) -> bool {
     let shown = graph.services.get(service);
     let ends = graph.ends.get(node);
@@ -36,22 +36,22 @@ pub fn serves(graph: &Graph, node: &str, service: &str) -> bool {
 mod tests {
     use std::collections::BTreeMap;
 
-    use ros::bus::{NodeEnds, Qos, ServiceType, TopicNodes, WireType};
+    use ros::bus::{NodeEntities, QosProfile, ServiceType, TopicNodes, WireType};
 
     use super::*;
 
     #[test]
     fn what_tools_hide_is_seen_too() {
-        let of_two = NodeEnds {
+        let of_two = NodeEntities {
             publishers: BTreeMap::from([(
                 "/fib/_action/feedback".to_owned(),
-                (WireType::any(), Qos::keep_last(1)),
+                (WireType::any(), QosProfile::keep_last(1)),
             )]),
             services: BTreeMap::from([(
                 "/fib/_action/send_goal".to_owned(),
                 ServiceType::new("a/action/Fib_SendGoal", "*"),
             )]),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         let graph = Graph {
             topics: BTreeMap::from([(
@@ -68,7 +68,7 @@ mod tests {
         assert!(subscribes(&graph, "/one", "/scan") && serves(&graph, "/one", "/set"));
         assert!(publishes(&graph, "/two", "/fib/_action/feedback"));
         assert!(serves(&graph, "/two", "/fib/_action/send_goal"));
-        assert!(is_there(&graph, "/two") && !is_there(&graph, "/three"));
+        assert!(has_node(&graph, "/two") && !has_node(&graph, "/three"));
         assert!(!publishes(&graph, "/one", "/scan") && !serves(&graph, "/two", "/set"));
     }
 }

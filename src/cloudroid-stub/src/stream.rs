@@ -1,4 +1,4 @@
-//! A connection to the portal: TCP, or TLS over it (TLS 1.2 and 1.3, by rustls).
+//! A connection to the portal: TCP, or TLS over it (TLS 1.2 and 1.3, with rustls).
 
 use std::io;
 use std::pin::Pin;
@@ -13,24 +13,28 @@ use tokio_rustls::rustls;
 use crate::address::Address;
 
 /// A TCP connection, with or without TLS.
-pub enum Stream {
+pub enum PortalStream {
     /// TCP without TLS.
     Plain(TcpStream),
-    /// Encrypted, and the portal has shown who it is.
+    /// TLS; the portal is authenticated.
     Tls(Box<TlsStream<TcpStream>>),
 }
 
-impl Stream {
-    /// Over a connection that stands, to a portal that `trust` accepts.
-    pub async fn over(tcp: TcpStream, address: &Address, trust: &Trust) -> io::Result<Self> {
+impl PortalStream {
+    /// Performs the TLS handshake on an established connection, if the address requires it, with a portal that `trust`
+    /// accepts.
+    pub async fn connect(tcp: TcpStream, address: &Address, trust: &Trust) -> io::Result<Self> {
         if !address.secure {
             return Ok(Self::Plain(tcp));
         }
-        let connected = trust.connect(tcp, &address.host, &address.known_as()).await;
-        let connected = connected.map_err(explained)?;
+        let connected = trust
+            .connect(tcp, &address.host, &address.known_server_name())
+            .await;
+        let connected = connected.map_err(explain_error)?;
         if let (Some(first), Some(known)) = (connected.first, &trust.known) {
             tracing::warn!(
-                "{} is new to this robot; its certificate {first} is remembered in {}: compare it with what the server's operator tells",
+                "first connection to {}; its certificate's fingerprint {first} is stored in {}: compare it with the \
+                    one from the server's operator",
                 address.authority,
                 known.path().display()
             );
@@ -38,18 +42,18 @@ impl Stream {
         Ok(Self::Tls(Box::new(connected.stream)))
     }
 
-    /// The fingerprint of the certificate that the portal has shown.
+    /// Returns the fingerprint of the certificate that the portal has presented.
     pub fn fingerprint(&self) -> Option<Fingerprint> {
         match self {
             Self::Plain(_) => None,
             Self::Tls(tls) => {
                 let shown = tls.get_ref().1.peer_certificates()?;
-                shown.first().map(Fingerprint::of)
+                shown.first().map(Fingerprint::from_certificate)
             }
         }
     }
 
-    /// What it goes over.
+    /// Returns the underlying TCP connection.
     pub fn tcp(&self) -> &TcpStream {
         match self {
             Self::Plain(tcp) => tcp,
@@ -58,64 +62,66 @@ impl Stream {
     }
 }
 
-/// With what to do, where it is known.
-fn explained(error: io::Error) -> io::Error {
+/// Adds advice to an error, if there is any.
+fn explain_error(error: io::Error) -> io::Error {
     use rustls::CertificateError as Certificate;
     let inner = error
         .get_ref()
         .and_then(|inner| inner.downcast_ref::<rustls::Error>());
     let next = match inner {
         Some(rustls::Error::InvalidCertificate(reason)) => match reason {
-            // The second is another authority of the same name.
+            // `BadSignature` is reported for another authority of the same name.
             Certificate::UnknownIssuer | Certificate::BadSignature => {
-                "nobody whom this robot trusts has signed it; put the authority's certificate into a file and name it: install.sh --ca FILE"
+                "it is not signed by an authority that this robot trusts; put the authority's certificate into a file \
+                    and run: install.sh --ca FILE"
             }
             Certificate::NotValidForName | Certificate::NotValidForNameContext { .. } => {
-                "it is another server's; correct the address: install.sh --server"
+                "it belongs to another server; correct the address: install.sh --server"
             }
             Certificate::Expired
             | Certificate::ExpiredContext { .. }
             | Certificate::NotValidYet
             | Certificate::NotValidYetContext { .. } => {
-                "look at this robot's clock (date) first, then at the certificate"
+                "check this robot's clock (date) first, then the certificate"
             }
             Certificate::Other(reason) if reason.to_string().contains("CaUsedAsEndEntity") => {
-                "it is an authority's own, which servers must not show; have it sign one for the server"
+                "it is a CA certificate, which servers must not use; issue a server certificate with it"
             }
-            _ => "have it made anew",
+            _ => "replace it",
         },
         Some(rustls::Error::InvalidMessage(_)) => {
-            "the server does not speak TLS there; try ws:// in place of wss://"
+            "the server does not use TLS there; try ws:// instead of wss://"
         }
         _ => return error,
     };
     io::Error::other(format!("{error}: {next}"))
 }
 
-/// Why a server refused the certificate that this robot shows, and what to do, where it said so by an alert (RFC 8446, section 6.2).
-/// It comes with the first bytes that are read: in TLS 1.3 a client has done with the handshake before its certificate is looked at.
-pub fn refused_certificate(error: &io::Error) -> Option<&'static str> {
+/// Returns the reason why a server refused this robot's certificate, with advice, if it sent an alert (RFC 8446,
+/// section 6.2). The alert comes with the first data that is read: in TLS 1.3 a client has completed the handshake
+/// before its certificate is checked.
+pub fn certificate_refusal(error: &io::Error) -> Option<&'static str> {
     use rustls::AlertDescription as Alert;
     let rustls::Error::AlertReceived(alert) = error.get_ref()?.downcast_ref()? else {
         return None;
     };
     match alert {
         Alert::CertificateExpired => Some(
-            "its certificate has expired, because it was off, or the server away, for longer than that is good; pair it again: on the \
-             server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
+            "its certificate has expired, because the robot or the server was off for too long; pair it again: on the \
+                server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
         ),
         Alert::UnknownCA
         | Alert::BadCertificate
         | Alert::CertificateUnknown
         | Alert::DecryptError => Some(
-            "no authority that the server trusts has signed its certificate, as when the server was set up anew; pair it again: on the \
-             server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
+            "its certificate is not signed by an authority that the server trusts, for example because the server was \
+                set up again; pair it again: on the server cloudroidctl pair ROBOT, here cloudroid-stub pair 'LINE'",
         ),
         _ => None,
     }
 }
 
-impl AsyncRead for Stream {
+impl AsyncRead for PortalStream {
     fn poll_read(
         self: Pin<&mut Self>,
         cx: &mut Context<'_>,
@@ -128,7 +134,7 @@ impl AsyncRead for Stream {
     }
 }
 
-impl AsyncWrite for Stream {
+impl AsyncWrite for PortalStream {
     fn poll_write(
         self: Pin<&mut Self>,
         cx: &mut Context<'_>,

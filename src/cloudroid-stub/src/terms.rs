@@ -1,20 +1,20 @@
-//! What the robot states to the server when it asks for its servant, before it is admitted: in the query of each handshake. A
-//! server of an earlier version does not look at it.
+//! Requirements that the robot states when it requests its servant, before it is admitted, in the query of each
+//! handshake. A server of an earlier version ignores them.
 
 use std::fmt::Write;
 
 use crate::config::{Aux, Config, Scalar};
 
-/// Bytes of a name, and of an auxiliary parameter's value, as the server takes them.
+/// Maximum length of a name or of an auxiliary parameter's value in bytes; the server has the same limit.
 const LONGEST: usize = 64;
-/// Auxiliary parameters, as the server takes them.
+/// Maximum number of auxiliary parameters; the server has the same limit.
 const MOST_AUX: usize = 16;
-/// Bytes of memory with which no node works.
+/// Minimum memory in bytes; no node works with less.
 const LEAST_MEMORY: f64 = (4 << 20) as f64;
-/// Cores, as the server takes them.
+/// Range of the number of cores; the server has the same limits.
 const CPUS: std::ops::RangeInclusive<f64> = 0.01..=4096.0;
 
-/// Refuses what the server would; the key, the reason and what to write.
+/// Rejects settings that the server would reject. The error is the key, and the reason with the expected value.
 pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
     if let Some(cpus) = config.cpus.filter(|cpus| !CPUS.contains(cpus)) {
         let reason = format!(
@@ -25,7 +25,7 @@ pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
         return Err(("cpus", reason));
     }
     if let Some(memory) = &config.memory {
-        match bytes(memory) {
+        match parse_size(memory) {
             Some(bytes) if bytes >= LEAST_MEMORY => {}
             Some(_) => {
                 return Err((
@@ -77,8 +77,8 @@ pub fn check(config: &Config) -> Result<(), (&'static str, String)> {
     Ok(())
 }
 
-/// A size in bytes.
-fn bytes(size: &Scalar) -> Option<f64> {
+/// Parses a size in bytes.
+fn parse_size(size: &Scalar) -> Option<f64> {
     let text = match size {
         Scalar::Number(number) => return Some(*number).filter(|number| number.is_finite()),
         Scalar::Text(text) => text.trim().to_ascii_uppercase(),
@@ -95,8 +95,8 @@ fn bytes(size: &Scalar) -> Option<f64> {
     Some(number * unit as f64).filter(|bytes| bytes.is_finite())
 }
 
-/// What is stated for a node, as a query's parameters, the first one with `&` before it, too.
-pub fn query(config: &Config, node: &str) -> String {
+/// Returns the requirements of a node as query parameters, each preceded by `&`, including the first.
+pub fn to_query(config: &Config, node: &str) -> String {
     let number = |value: Option<f64>| value.map(|value| value.to_string());
     let mut pairs = vec![("node".to_owned(), node.to_owned())];
     for (key, value) in [
@@ -181,7 +181,7 @@ mod tests {
         ] {
             let config = config(settings);
             check(&config).unwrap();
-            assert_eq!(query(&config, "/a/b"), expected, "{settings}");
+            assert_eq!(to_query(&config, "/a/b"), expected, "{settings}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! What tests of both ROSes share: one text, two worlds.
+//! Helpers for tests of both ROS versions.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -6,17 +6,17 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use ros::JoinOptions;
-use ros::bus::{Bus, Message, RosVersion, WireType};
+use ros::bus::{Bus, RosVersion, SerializedMessage, WireType};
 use ros::net::HostSockets;
 use ros::ros1::master::{Master, MasterOptions};
 use ros::schema::Registry;
 
 use crate::local::PrivateDomain;
 
-/// Generous: it only bounds how long a failing test takes.
+/// A generous timeout, which only limits the duration of a failing test.
 pub const SOON: Duration = Duration::from_secs(120);
 
-/// Has stories, which take the ROS that they are told of, run as tests.
+/// Runs stories, which take a ROS version as argument, as tests.
 macro_rules! stories {
     ($($of:ident = $version:ident: $($story:ident),* $(,)?;)*) => {
         $(mod $of {
@@ -31,7 +31,7 @@ macro_rules! stories {
 }
 pub(crate) use stories;
 
-/// A ROS system of this machine, which ends with it: a Master, or a domain that nobody else is in.
+/// A ROS system on this machine, which ends when it is dropped: a Master, or a domain without other participants.
 pub struct World {
     ros: RosVersion,
     options: JoinOptions,
@@ -41,7 +41,7 @@ pub struct World {
 impl World {
     pub async fn new(ros: RosVersion) -> Self {
         let (options, domain) = match ros {
-            RosVersion::One => (JoinOptions::new(master().await, ""), None),
+            RosVersion::One => (JoinOptions::new(start_master().await, ""), None),
             RosVersion::Two => {
                 let domain = PrivateDomain::take(None).unwrap();
                 (JoinOptions::in_domain(domain.id(), ""), Some(domain))
@@ -54,7 +54,7 @@ impl World {
         }
     }
 
-    /// A node of this name there.
+    /// Joins as a node of this name.
     pub async fn node(&self, name: &str) -> Arc<dyn Bus> {
         let options = JoinOptions {
             node: name.to_owned(),
@@ -64,13 +64,13 @@ impl World {
         joined.await.unwrap()
     }
 
-    /// Its number, where it is a domain.
+    /// Returns the domain id, if it is a domain.
     pub fn domain(&self) -> Option<u16> {
         self.domain.as_ref().map(PrivateDomain::id)
     }
 }
 
-async fn master() -> SocketAddr {
+async fn start_master() -> SocketAddr {
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions {
@@ -81,16 +81,16 @@ async fn master() -> SocketAddr {
     address
 }
 
-/// `std_msgs/String`, as each ROS has it.
+/// Returns the type `std_msgs/String` of a ROS version.
 pub fn string_type(ros: RosVersion) -> WireType {
-    let registry = Registry::of(ros);
+    let registry = Registry::for_version(ros);
     let inserted = registry.insert("std_msgs/msg/String", "string data\n");
     let known = inserted.and_then(|()| registry.message("std_msgs/String"));
-    WireType::of(&known.unwrap())
+    WireType::from_message(&known.unwrap())
 }
 
-/// A serialized string.
-pub fn written(ros: RosVersion, text: &str) -> Bytes {
+/// Serializes a string.
+pub fn encode_string(ros: RosVersion, text: &str) -> Bytes {
     let (header, end): (&[u8], &[u8]) = match ros {
         RosVersion::One => (&[], &[]),
         RosVersion::Two => (&[0, 1, 0, 0], &[0]),
@@ -101,28 +101,28 @@ pub fn written(ros: RosVersion, text: &str) -> Bytes {
         .into()
 }
 
-/// A message of a node of the application.
-pub fn string(ros: RosVersion, text: &str) -> Message {
-    Message {
-        bytes: written(ros, text),
+/// Returns a message of a node of the application.
+pub fn string_message(ros: RosVersion, text: &str) -> SerializedMessage {
+    SerializedMessage {
+        bytes: encode_string(ros, text),
         wire_type: Arc::new(string_type(ros)),
         publisher: "/app".into(),
         latching: false,
     }
 }
 
-/// What a serialized string says.
-pub fn read(ros: RosVersion, message: &[u8]) -> String {
+/// Decodes a serialized string.
+pub fn decode_string(ros: RosVersion, message: &[u8]) -> String {
     let begin = match ros {
         RosVersion::One => 4,
         RosVersion::Two => 8,
     };
     let text = String::from_utf8(message[begin..].to_vec()).unwrap();
-    // CDR has its end, and fills up to four bytes.
+    // CDR strings end with a zero byte, and are padded to four bytes.
     text.trim_end_matches('\0').to_owned()
 }
 
-/// What a message says.
-pub fn text(message: &Message) -> String {
-    read(message.wire_type.format.version(), &message.bytes)
+/// Returns the text of a message.
+pub fn message_text(message: &SerializedMessage) -> String {
+    decode_string(message.wire_type.format.version(), &message.bytes)
 }

@@ -1,204 +1,210 @@
-//! `account`: people who sign in with a password.
+//! `account`: accounts of people who sign in with a password.
 
 mod password;
 
 use api::people::{Account, AccountChange, NewAccount, SessionLine};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
-/// Accounts: people who sign in to the portal's page with a name and a password.
+/// Manage accounts: people who sign in to the portal's page with a name and a password.
 #[derive(Debug, clap::Args)]
-pub struct Accounts {
+pub struct AccountArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: AccountCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Verb {
-    Create(Create),
-    List(List),
-    Passwd(Passwd),
-    Role(Role),
-    Disable(Disable),
-    Enable(Enable),
-    Remove(Remove),
-    Sessions(Sessions),
-    Logout(Logout),
+enum AccountCommand {
+    Create(CreateAccount),
+    List(ListAccounts),
+    Passwd(ChangePassword),
+    Role(ChangeRole),
+    Disable(DisableAccount),
+    Enable(EnableAccount),
+    Remove(RemoveAccount),
+    Sessions(ListSessions),
+    Logout(LogoutAccount),
 }
 
-/// Make an account; its password is asked for.
+/// Create an account; asks for its password.
 #[derive(Debug, clap::Args)]
-struct Create {
-    /// Name of the person: rules of the policy and records know it by this.
+struct CreateAccount {
+    /// Name of the person, as it appears in policy rules and in the audit log.
     name: String,
-    /// What it is for: admin (everything), operator (everything but accounts, tokens and policy), deployer (publishes services, and
-    /// does what it likes with its own), viewer (reads).
+    /// Role: admin (everything), operator (everything but accounts, tokens and policy), deployer (publishes services
+    /// and manages its own), viewer (reads).
     #[arg(long)]
     role: String,
-    /// Service that it is for, or a pattern such as 'lab_*'; may be given several times. '*' is all.
+    /// Service that the role is limited to, or a pattern such as 'lab_*' ('*' for all); may be given several times.
     #[arg(long = "service", value_name = "NAME")]
     services: Vec<String>,
-    /// Read the password from standard input, up to the end of its first line.
+    /// Read the password from the first line of standard input.
     #[arg(long)]
     password_stdin: bool,
 }
 
 /// List all accounts.
 #[derive(Debug, clap::Args)]
-struct List;
+struct ListAccounts;
 
-/// Set another password; the person is signed out everywhere.
+/// Change the password of an account; signs the person out everywhere.
 #[derive(Debug, clap::Args)]
-struct Passwd {
-    /// Its name.
+struct ChangePassword {
+    /// Name of the account.
     name: String,
-    /// Read the password from standard input, up to the end of its first line.
+    /// Read the password from the first line of standard input.
     #[arg(long)]
     password_stdin: bool,
 }
 
-/// Give a person another role and scope; it is signed out everywhere.
+/// Change the role and the services of an account; signs the person out everywhere.
 #[derive(Debug, clap::Args)]
-struct Role {
-    /// Its name.
+struct ChangeRole {
+    /// Name of the account.
     name: String,
-    /// admin, operator, deployer or viewer.
+    /// Role: admin, operator, deployer or viewer.
     role: String,
-    /// Service that it is for, or a pattern; may be given several times. '*' is all.
+    /// Service that the role is limited to, or a pattern ('*' for all); may be given several times.
     #[arg(long = "service", value_name = "NAME")]
     services: Vec<String>,
 }
 
-/// Let a person sign in no more; it is signed out everywhere.
+/// Disable an account: the person is signed out everywhere and cannot sign in again.
 #[derive(Debug, clap::Args)]
-struct Disable {
-    /// Its name.
+struct DisableAccount {
+    /// Name of the account.
     name: String,
 }
 
-/// Let a person sign in again.
+/// Enable a disabled account.
 #[derive(Debug, clap::Args)]
-struct Enable {
-    /// Its name.
+struct EnableAccount {
+    /// Name of the account.
     name: String,
 }
 
-/// Remove an account; the person is signed out everywhere.
+/// Remove an account; signs the person out everywhere.
 #[derive(Debug, clap::Args)]
-struct Remove {
-    /// Its name.
+struct RemoveAccount {
+    /// Name of the account.
     name: String,
 }
 
-/// List who is signed in, and from where.
+/// List the sessions: who is signed in, and from where.
 #[derive(Debug, clap::Args)]
-struct Sessions {
-    /// Of this person alone; oidc:NAME of somebody whom the identity provider knows.
+struct ListSessions {
+    /// Only sessions of this person; oidc:NAME for a person known by the identity provider.
     name: Option<String>,
 }
 
 /// Sign a person out everywhere.
 #[derive(Debug, clap::Args)]
-struct Logout {
-    /// Its name; oidc:NAME of somebody whom the identity provider knows.
+struct LogoutAccount {
+    /// Name of the account; oidc:NAME for a person known by the identity provider.
     name: String,
 }
 
-fn patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
+fn parse_patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
     let patterns = texts.iter().map(|text| text.parse());
     Ok(patterns.collect::<Result<_, _>>()?)
 }
 
-fn path(name: &str) -> String {
-    format!("/api/v1/accounts/{}", escaped(name))
+fn account_path(name: &str) -> String {
+    format!("/api/v1/accounts/{}", percent_encode(name))
 }
 
-impl Accounts {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl AccountArgs {
+    /// Sends the requests and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.verb {
-            Verb::Create(verb) => {
+            AccountCommand::Create(verb) => {
                 let new = NewAccount {
                     role: verb.role.parse()?,
-                    services: patterns(&verb.services)?,
-                    password: password::read(verb.password_stdin)?,
+                    services: parse_patterns(&verb.services)?,
+                    password: password::read_password(verb.password_stdin)?,
                     name: verb.name,
                 };
                 let all = client.post("/api/v1/accounts", &new).await?;
-                done(all, format, &format!("account {} is made", new.name))
+                print_outcome(all, format, &format!("account {} created", new.name))
             }
-            Verb::List(List) => list(
+            AccountCommand::List(ListAccounts) => list(
                 &client.get::<Vec<Account>>("/api/v1/accounts").await?,
                 format,
             ),
-            Verb::Passwd(verb) => {
+            AccountCommand::Passwd(verb) => {
                 let change = AccountChange {
-                    password: Some(password::read(verb.password_stdin)?),
+                    password: Some(password::read_password(verb.password_stdin)?),
                     ..AccountChange::default()
                 };
-                let all = client.patch(&path(&verb.name), &change).await?;
-                done(all, format, &format!("{} has another password", verb.name))
+                let all = client.patch(&account_path(&verb.name), &change).await?;
+                print_outcome(all, format, &format!("password of {} changed", verb.name))
             }
-            Verb::Role(verb) => {
+            AccountCommand::Role(verb) => {
                 let change = AccountChange {
                     role: Some(verb.role.parse()?),
-                    services: patterns(&verb.services)?,
+                    services: parse_patterns(&verb.services)?,
                     ..AccountChange::default()
                 };
-                let all = client.patch(&path(&verb.name), &change).await?;
-                done(
+                let all = client.patch(&account_path(&verb.name), &change).await?;
+                print_outcome(
                     all,
                     format,
-                    &format!("{} has the role {}", verb.name, verb.role),
+                    &format!("{} now has the role {}", verb.name, verb.role),
                 )
             }
-            Verb::Disable(Disable { name }) => {
+            AccountCommand::Disable(DisableAccount { name }) => {
                 let all = set_disabled(client, &name, true).await?;
-                done(all, format, &format!("{name} cannot sign in any more"))
+                print_outcome(all, format, &format!("{name} can no longer sign in"))
             }
-            Verb::Enable(Enable { name }) => {
+            AccountCommand::Enable(EnableAccount { name }) => {
                 let all = set_disabled(client, &name, false).await?;
-                done(all, format, &format!("{name} can sign in"))
+                print_outcome(all, format, &format!("{name} can sign in"))
             }
-            Verb::Remove(Remove { name }) => {
-                let all = client.delete(&path(&name)).await?;
-                done(all, format, &format!("account {name} is removed"))
+            AccountCommand::Remove(RemoveAccount { name }) => {
+                let all = client.delete(&account_path(&name)).await?;
+                print_outcome(all, format, &format!("account {name} removed"))
             }
-            Verb::Sessions(Sessions { name }) => {
+            AccountCommand::Sessions(ListSessions { name }) => {
                 let mut all: Vec<SessionLine> = client.get("/api/v1/sessions").await?;
                 all.retain(|line| name.as_ref().is_none_or(|name| line.name == *name));
                 list_sessions(&all, format)
             }
-            Verb::Logout(Logout { name }) => {
-                let path = format!("{}/sessions", path(&name));
+            AccountCommand::Logout(LogoutAccount { name }) => {
+                let path = format!("{}/sessions", account_path(&name));
                 let all: Vec<SessionLine> = client.delete(&path).await?;
                 match format {
-                    Format::Json => output::json(&all),
-                    Format::Table => output::line(&format!("{name} is signed out everywhere")),
+                    OutputFormat::Json => output::json(&all),
+                    OutputFormat::Table => {
+                        output::line(&format!("{name} is signed out everywhere"))
+                    }
                 }
             }
         }
     }
 }
 
-async fn set_disabled(client: &Client, name: &str, disabled: bool) -> anyhow::Result<Vec<Account>> {
+async fn set_disabled(
+    client: &DaemonClient,
+    name: &str,
+    disabled: bool,
+) -> anyhow::Result<Vec<Account>> {
     let change = AccountChange {
         disabled: Some(disabled),
         ..AccountChange::default()
     };
-    client.patch(&path(name), &change).await
+    client.patch(&account_path(name), &change).await
 }
 
-fn done(all: Vec<Account>, format: Format, words: &str) -> anyhow::Result<()> {
+fn print_outcome(all: Vec<Account>, format: OutputFormat, words: &str) -> anyhow::Result<()> {
     match format {
-        Format::Json => output::json(&all),
-        Format::Table => output::line(words),
+        OutputFormat::Json => output::json(&all),
+        OutputFormat::Table => output::line(words),
     }
 }
 
-fn list(accounts: &[Account], format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+fn list(accounts: &[Account], format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(&accounts);
     }
     let mut table = Table::new(&[
@@ -221,21 +227,20 @@ fn list(accounts: &[Account], format: Format) -> anyhow::Result<()> {
             last.map_or_else(|| "never".into(), |at| format!("{} ago", output::age(at))),
             account.sessions.to_string(),
             account.disabled.map_or_else(
-                || "good".into(),
+                || "active".into(),
                 |at| format!("disabled {} ago", output::age(at)),
             ),
         ]);
     }
-    match table.is_empty() {
-        true => output::line(
-            "there are no accounts; make one with: cloudroidctl account create NAME --role ROLE",
-        ),
-        false => table.print(),
+    if table.is_empty() {
+        output::line("no accounts; create one with: cloudroidctl account create NAME --role ROLE")
+    } else {
+        table.print()
     }
 }
 
-fn list_sessions(sessions: &[SessionLine], format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+fn list_sessions(sessions: &[SessionLine], format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(&sessions);
     }
     let mut table = Table::new(&["NAME", "ROLE", "FROM", "AGE", "USED", "STATE"]);
@@ -246,11 +251,12 @@ fn list_sessions(sessions: &[SessionLine], format: Format) -> anyhow::Result<()>
             session.from.clone(),
             output::age(session.created),
             format!("{} ago", output::age(session.last_used)),
-            format!("ends in {}", output::until(session.expires)),
+            format!("expires in {}", output::time_until(session.expires)),
         ]);
     }
-    match table.is_empty() {
-        true => output::line("nobody is signed in"),
-        false => table.print(),
+    if table.is_empty() {
+        output::line("nobody is signed in")
+    } else {
+        table.print()
     }
 }

@@ -1,43 +1,43 @@
-//! `audit`: who did what.
+//! `audit`: the audit log.
 
 use api::access::Audited;
 use futures_util::StreamExt;
 
-use crate::client::Client;
-use crate::output::{self, Format};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat};
 
-/// Print who did what to what from where, oldest first.
+/// Print the audit log: who did what to what from where, oldest first.
 #[derive(Debug, clap::Args)]
-pub struct Audit {
-    /// Go on printing as records come.
+pub struct AuditArgs {
+    /// Keep printing new records.
     #[arg(short, long)]
     follow: bool,
-    /// So many of the last records.
+    /// Number of recent records.
     #[arg(short = 'n', long, value_name = "RECORDS", default_value_t = 100)]
     tail: u32,
 }
 
-impl Audit {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl AuditArgs {
+    /// Sends the request and prints the records.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let path = format!("/api/v1/audit?follow={}&limit={}", self.follow, self.tail);
-        let records = client.lines::<Audited>(&path).await?;
+        let records = client.get_lines::<Audited>(&path).await?;
         let mut records = std::pin::pin!(records);
         while let Some(record) = records.next().await {
             let record = record?;
             match format {
-                Format::Json => output::json_line(&record)?,
-                Format::Table => output::line(&in_a_line(&record))?,
+                OutputFormat::Json => output::json_line(&record)?,
+                OutputFormat::Table => output::line(&format_record(&record))?,
             }
         }
         Ok(())
     }
 }
 
-fn in_a_line(record: &Audited) -> String {
+fn format_record(record: &Audited) -> String {
     let more = match record.more {
         0 => String::new(),
-        more => format!(" (and {more} alike before)"),
+        more => format!(" (and {more} similar before)"),
     };
     format!(
         "{} {} from {}: {}, {}: {}{more}",

@@ -1,4 +1,4 @@
-//! `calibrate`: what response times cost, measured, as rows of the dictionary.
+//! `calibrate`: measures which response times a service reaches at which limits, as rows of its dictionary.
 
 pub(crate) mod curve;
 
@@ -14,82 +14,84 @@ use futures_util::StreamExt;
 use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
-use crate::client::{self, Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{self, DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 use crate::stated::aux;
-use crate::trial::renamed;
+use crate::trial::describe_renamed_topics;
 
-/// Measure how fast a service answers recorded requests at several limits, and propose rows of its dictionary.
+/// Measure how fast a service answers recorded requests at several CPU limits, and propose rows of its dictionary.
 ///
-/// A servant of its own is started, gives way to robots, and is ended afterwards. Rows are written when you say yes.
+/// Starts a servant of its own, which gives way to robots and is ended afterwards. The rows are written after
+/// confirmation.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "frames", "live"])))]
-pub struct Calibrate {
-    /// The service.
+pub struct CalibrateArgs {
+    /// Service to calibrate.
     service: String,
-    /// A recording of its inputs: a rosbag file, not compressed. It is replayed at its own pace.
+    /// Recording of the service's inputs: an uncompressed rosbag file, replayed at its own rate.
     #[arg(long, value_name = "FILE")]
     bag: Option<PathBuf>,
-    /// A directory of pictures for its camera inputs: PNG files, in the order of their names.
+    /// Directory of images for the service's camera inputs: PNG files, in the order of their names.
     #[arg(long, value_name = "DIR")]
     frames: Option<PathBuf>,
-    /// Take what this connected robot sends now; it is answered as before, and hears nothing of this.
+    /// Use the requests of this connected robot, which is served as before and does not notice.
     #[arg(long, value_name = "ROBOT")]
     live: Option<String>,
-    /// Seconds for which a robot's requests are taken, at most; 20 by default.
+    /// Longest time to collect a robot's requests, in seconds (default: 20).
     #[arg(long, value_name = "N", requires = "live")]
     seconds: Option<f64>,
-    /// Bytes of a robot's requests, at most; 256M by default.
+    /// Largest amount of a robot's requests to collect, in bytes (default: 256M).
     #[arg(long, value_name = "BYTES", requires = "live")]
     bytes: Option<Size>,
-    /// Limits to measure at, in cores, separated by commas; by default ever larger ones, until more makes nothing faster.
+    /// CPU limits to measure at, in cores, separated by commas (default: increasing limits until a higher one makes
+    /// nothing faster).
     #[arg(long, value_name = "N,…", value_delimiter = ',')]
     cpus: Vec<f64>,
-    /// Requests at each limit, at most; 40 by default.
+    /// Largest number of requests at each limit (default: 40).
     #[arg(long, value_name = "N")]
     requests: Option<usize>,
-    /// Requests a second, instead of the recording's own pace.
+    /// Request rate in Hz (default: the recording's own).
     #[arg(long, value_name = "HZ", conflicts_with = "fast")]
     rate: Option<f64>,
-    /// Each request follows the last answer at once, as pictures do without --rate.
+    /// Send each request as soon as the previous one is answered; the default for images without --rate.
     #[arg(long)]
     fast: bool,
-    /// The input whose messages are the requests; by default the recording's first topic that is an input.
+    /// Input whose messages are the requests (default: the recording's first topic that is an input).
     #[arg(long, value_name = "TOPIC")]
     input: Option<String>,
-    /// Milliseconds that robots' networks add to each request; with --live it is measured.
+    /// Latency that the robots' network adds to each request, in milliseconds; measured with --live.
     #[arg(long, value_name = "MS")]
     network: Option<f64>,
     /// Auxiliary parameter of the rows, such as width=640; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
-    /// Where to draw the curve; SERVICE-calibration.svg by default.
+    /// Output file of the curve (default: SERVICE-calibration.svg).
     #[arg(long, value_name = "FILE")]
     curve: Option<PathBuf>,
-    /// Write the rows without asking.
+    /// Write the rows without asking for confirmation.
     #[arg(long)]
     yes: bool,
 }
 
-impl Calibrate {
-    /// Measures, shows, asks, writes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let body = self.body()?;
+impl CalibrateArgs {
+    /// Measures, prints the result and writes the rows if that is confirmed.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let body = self.read_material()?;
         let curve = self
             .curve
             .clone()
             .unwrap_or_else(|| PathBuf::from(format!("{}-calibration.svg", self.service)));
-        check_place(&curve, "curve")?;
+        check_writable(&curve, "curve")?;
         let calibration = tokio::select! {
             measured = self.measure(client, format, body) => measured?,
             _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
         };
-        // What was measured is shown all the same.
+        // The result is printed even if the curve cannot be written.
         let drawn = fs::write(&curve, curve::draw(&calibration))
             .with_context(|| format!("cannot write the curve {}", curve.display()));
         match format {
-            Format::Json => output::json_line(&calibration)?,
-            Format::Table => print(&calibration, &curve)?,
+            OutputFormat::Json => output::json_line(&calibration)?,
+            OutputFormat::Table => print(&calibration, &curve)?,
         }
         if let Err(error) = drawn {
             eprintln!("warning: {error:#}");
@@ -98,30 +100,30 @@ impl Calibrate {
             return Ok(());
         }
         let say = |words: &str| match format {
-            Format::Json => Ok(()),
-            Format::Table => output::line(words),
+            OutputFormat::Json => Ok(()),
+            OutputFormat::Table => output::line(words),
         };
-        if !self.yes && !agrees(&self.service)? {
-            return say("nothing was written; --yes writes the rows without asking");
+        if !self.yes && !confirm(&self.service)? {
+            return say("nothing was written; --yes writes the entries without asking");
         }
         let rows = calibration.rows;
         let count = rows.len();
-        write(client, &self.service, rows).await?;
+        write_rows(client, &self.service, rows).await?;
         say(&format!(
-            "{count} rows written; see them with: cloudroidctl sla list {}",
+            "{count} entries written; see them with: cloudroidctl sla list {}",
             self.service
         ))
     }
 
-    /// What is sent: a recording, or pictures one behind the other.
-    fn body(&self) -> anyhow::Result<Vec<u8>> {
+    /// Returns the body of the request: a recording, or the concatenated images.
+    fn read_material(&self) -> anyhow::Result<Vec<u8>> {
         let read =
             |path: &Path| fs::read(path).with_context(|| format!("cannot read {}", path.display()));
         match (&self.bag, &self.frames) {
             (Some(path), _) => read(path),
             (None, Some(directory)) => {
                 let mut body = Vec::new();
-                for path in pictures(directory)? {
+                for path in find_pictures(directory)? {
                     body.extend(read(&path)?);
                 }
                 Ok(body)
@@ -153,38 +155,38 @@ impl Calibrate {
 
     async fn measure(
         &self,
-        client: &Client,
-        format: Format,
+        client: &DaemonClient,
+        format: OutputFormat,
         body: Vec<u8>,
     ) -> anyhow::Result<Calibration> {
         let path = format!(
             "/api/v1/services/{}/calibration?options={}",
-            escaped(&self.service),
-            escaped(&serde_json::to_string(&self.options())?)
+            percent_encode(&self.service),
+            percent_encode(&serde_json::to_string(&self.options())?)
         );
         let body = Full::new(body.into())
             .map_err(|never| match never {})
             .boxed_unsync();
         let answer = client.send(Method::POST, &path, body).await?;
-        let mut events = client::lines(answer);
+        let mut events = client::json_lines(answer);
         while let Some(event) = events.next().await {
             match event? {
                 CalibrationEvent::Done { calibration }
                 | CalibrationEvent::Kept { calibration, .. } => return Ok(*calibration),
                 CalibrationEvent::Error { problem } => return Err(problem.into()),
-                event if format == Format::Json => output::json_line(&event)?,
+                event if format == OutputFormat::Json => output::json_line(&event)?,
                 CalibrationEvent::Step { title } => output::line(&format!("== {title}"))?,
                 CalibrationEvent::Measured { point, .. } => {
-                    output::line(&format!("   {}", in_a_line(&point)))?;
+                    output::line(&format!("   {}", format_point(&point)))?;
                 }
             }
         }
-        bail!("the daemon broke off the calibration; nothing was written")
+        bail!("the daemon aborted the calibration; nothing was written")
     }
 }
 
-/// PNG files of a directory, in the order of their names.
-fn pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
+/// Returns the PNG files of a directory, in the order of their names.
+fn find_pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let reading = || format!("cannot read {}", directory.display());
     let mut found = Vec::new();
     for entry in fs::read_dir(directory).with_context(reading)? {
@@ -206,10 +208,10 @@ fn pictures(directory: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-pub(crate) fn in_a_line(point: &Point) -> String {
+pub(crate) fn format_point(point: &Point) -> String {
     match point.compute {
         Some(compute) => format!(
-            "{} of {} answered: {:.1} ms (median), {:.1} ms (95 %)",
+            "{} of {} answered: p50 {:.1} ms, p95 {:.1} ms",
             point.answered, point.requests, compute.p50, compute.p95
         ),
         None => format!("none of {} answered", point.requests),
@@ -218,7 +220,15 @@ pub(crate) fn in_a_line(point: &Point) -> String {
 
 fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     let mut table = Table::new(&[
-        "CPUS", "ANSWERED", "P50 MS", "P95 MS", "MAX MS", "RUNNING", "HELD UP", "PER S", "MEMORY",
+        "CPUS",
+        "ANSWERED",
+        "P50 MS",
+        "P95 MS",
+        "MAX MS",
+        "RUNNING",
+        "THROTTLED",
+        "PER S",
+        "MEMORY",
     ]);
     for point in &calibration.points {
         let time = |of: fn(&api::calibration::TimeSpread) -> f64| {
@@ -242,7 +252,7 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     output::line("")?;
     table.print()?;
     output::line(&format!("ended: {}", calibration.ended))?;
-    for words in renamed(&calibration.inputs) {
+    for words in describe_renamed_topics(&calibration.inputs) {
         output::line(&words)?;
     }
     if !calibration.unused.is_empty() {
@@ -250,32 +260,32 @@ fn print(calibration: &Calibration, curve: &Path) -> anyhow::Result<()> {
     }
     if let Some(pace) = calibration.pace {
         output::line(&format!(
-            "asked for {pace:.1} requests a second; limits that do not keep it are not proposed"
+            "sent {pace:.1} requests per second; limits that cannot keep up are not proposed"
         ))?;
     }
     if let Some(network) = calibration.network {
         output::line(&format!(
-            "added for the network: {:.1} ms (median), {:.1} ms (95 %)",
+            "added for the network: p50 {:.1} ms, p95 {:.1} ms",
             network.p50, network.p95
         ))?;
     }
     output::line(&format!(
-        "largest request {}; memory at most {}, proposed with {} % more",
+        "largest request {}; peak memory {}, proposed with a margin of {} %",
         calibration.largest, calibration.memory_peak, calibration.memory_margin
     ))?;
     output::line(&format!("curve: {}", curve.display()))?;
     if calibration.rows.is_empty() {
         return output::line(
-            "no row is proposed: at no limit were enough requests answered at the asked pace",
+            "no entry is proposed: no limit answered enough requests at the request rate",
         );
     }
     output::line("")?;
-    rows(&calibration.rows)
+    print_rows(&calibration.rows)
 }
 
-/// Writes rows into the dictionary of a service; all rows that it has then.
-pub(crate) async fn write(
-    client: &Client,
+/// Writes rows to the dictionary of a service and returns all its rows.
+pub(crate) async fn write_rows(
+    client: &DaemonClient,
     service: &str,
     rows: Vec<Row>,
 ) -> anyhow::Result<Vec<Row>> {
@@ -283,12 +293,12 @@ pub(crate) async fn write(
         rows,
         replace: false,
     };
-    let path = format!("/api/v1/services/{}/sla", escaped(service));
+    let path = format!("/api/v1/services/{}/sla", percent_encode(service));
     client.put(&path, &new).await
 }
 
-/// Refuses a place for the picture of this option that cannot be written to, before minutes of measuring.
-pub(crate) fn check_place(curve: &Path, option: &str) -> anyhow::Result<()> {
+/// Checks that the output file of `option` can be written, before minutes are spent on measuring.
+pub(crate) fn check_writable(curve: &Path, option: &str) -> anyhow::Result<()> {
     let new = !curve.exists();
     fs::OpenOptions::new()
         .append(true)
@@ -296,7 +306,7 @@ pub(crate) fn check_place(curve: &Path, option: &str) -> anyhow::Result<()> {
         .open(curve)
         .with_context(|| {
             format!(
-                "the {option} cannot be written to {}; name another place with --{option}",
+                "cannot write the {option} to {}; name another file with --{option}",
                 curve.display()
             )
         })?;
@@ -306,15 +316,15 @@ pub(crate) fn check_place(curve: &Path, option: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether whoever sits at the terminal says yes; nobody does where there is none.
-pub(crate) fn agrees(service: &str) -> anyhow::Result<bool> {
+/// Asks for confirmation at the terminal; false if there is no terminal.
+pub(crate) fn confirm(service: &str) -> anyhow::Result<bool> {
     if !std::io::stdin().is_terminal() {
         return Ok(false);
     }
     let mut out = std::io::stderr().lock();
     write!(
         out,
-        "write these rows to the dictionary of {service}? [y/N] "
+        "write these entries to the SLA table of {service}? [y/N] "
     )?;
     out.flush()?;
     let mut answer = String::new();
@@ -326,9 +336,9 @@ fn is_yes(answer: &str) -> bool {
     matches!(answer.trim().to_ascii_lowercase().as_str(), "y" | "yes")
 }
 
-/// Proposed rows.
-pub(crate) fn rows(rows: &[Row]) -> anyhow::Result<()> {
-    let mut table = Table::new(&["ROW", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
+/// Prints proposed rows.
+pub(crate) fn print_rows(rows: &[Row]) -> anyhow::Result<()> {
+    let mut table = Table::new(&["ENTRY", "CPUS", "MEMORY", "P50 MS", "P95 MS", "REQUESTS"]);
     for row in rows {
         let shown = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let time = |time: f64| format!("{:.1}", time * 1000.0);
@@ -351,14 +361,14 @@ mod tests {
     #[test]
     fn a_curve_that_cannot_be_written_is_told_before_measuring() {
         let place = tempfile::tempdir().expect("a directory");
-        let told =
-            check_place(&place.path().join("gone/curve.svg"), "curve").expect_err("no directory");
+        let told = check_writable(&place.path().join("gone/curve.svg"), "curve")
+            .expect_err("no directory");
         assert!(format!("{told:#}").contains("--curve"), "{told:#}");
         let fine = place.path().join("curve.svg");
-        check_place(&fine, "curve").expect("it can be written");
+        check_writable(&fine, "curve").expect("it can be written");
         assert!(!fine.exists(), "nothing is left");
         fs::write(&fine, "an earlier one").expect("written");
-        check_place(&fine, "curve").expect("it can be written");
+        check_writable(&fine, "curve").expect("it can be written");
         assert_eq!(fs::read_to_string(&fine).expect("read"), "an earlier one");
     }
 
@@ -379,12 +389,12 @@ mod tests {
     fn pictures_come_in_the_order_of_their_names() {
         let directory = std::env::temp_dir().join(format!("calibrate-{}", std::process::id()));
         fs::create_dir_all(&directory).expect("a directory");
-        let none = pictures(&directory).expect_err("none").to_string();
+        let none = find_pictures(&directory).expect_err("none").to_string();
         assert!(none.contains("holds no .png file"), "{none}");
         for name in ["b.png", "a.PNG", "c.jpg"] {
             fs::write(directory.join(name), name).expect("a file");
         }
-        let found = pictures(&directory);
+        let found = find_pictures(&directory);
         fs::remove_dir_all(&directory).expect("removed");
         let names: Vec<_> = found
             .expect("pictures")

@@ -1,4 +1,4 @@
-//! HTTP to the daemon, over TCP or its Unix socket.
+//! HTTP client for the daemon, over TCP, TLS or its Unix socket.
 
 use std::fmt;
 use std::io;
@@ -30,62 +30,63 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
 const FALLBACK: &str = "127.0.0.1:9090";
-/// How long a server may take to accept a connection, and then to show its certificate.
+/// Time allowed to establish a connection, and again for the TLS handshake.
 const CONNECTING: Duration = Duration::from_secs(10);
 
-/// What to do about a 401.
-const TOKEN_WANTED: &str = "give a token that an admin made for you with --token TOKEN or CLOUDROID_TOKEN; root and the group \
-                            cloudroid need none over the daemon's sockets (--server unix:PATH)";
+/// Advice after a response of 401.
+const TOKEN_WANTED: &str = "pass a token created by an admin with --token TOKEN or CLOUDROID_TOKEN; root and members \
+    of the group cloudroid need none on the server itself (--server unix:PATH)";
 
-/// Where no authority is known.
-const NOBODY_TRUSTED: &str = "no authority is trusted here, and the server's certificate does not sign itself: apt install ca-certificates";
+/// Advice when no authorities are installed.
+const NOBODY_TRUSTED: &str = "no certificate authorities are installed here, and the server's certificate is not \
+    self-signed: apt install ca-certificates";
 
 const NAME: &str = concat!("cloudroidctl/", env!("CARGO_PKG_VERSION"));
 
 /// A WebSocket to the daemon.
-pub type Socket = WebSocketStream<TokioIo<Upgraded>>;
+pub type DaemonSocket = WebSocketStream<TokioIo<Upgraded>>;
 
-/// What is sent.
-pub type Body = UnsyncBoxBody<Bytes, std::io::Error>;
+/// Body of a request.
+pub type RequestBody = UnsyncBoxBody<Bytes, std::io::Error>;
 
-/// Where the daemon is.
+/// Address of the daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Server {
-    /// `HOST:PORT`.
+pub enum ServerAddress {
+    /// `HOST:PORT`, without TLS.
     Tcp(String),
-    /// The same through TLS.
+    /// `HOST:PORT`, with TLS.
     Tls(String),
     /// Unix socket of the daemon on this machine.
     Unix(PathBuf),
 }
 
-impl fmt::Display for Server {
+impl fmt::Display for ServerAddress {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Server::Tcp(authority) => write!(out, "http://{authority}"),
-            Server::Tls(authority) => write!(out, "https://{authority}"),
-            Server::Unix(path) => write!(out, "unix:{}", path.display()),
+            ServerAddress::Tcp(authority) => write!(out, "http://{authority}"),
+            ServerAddress::Tls(authority) => write!(out, "https://{authority}"),
+            ServerAddress::Unix(path) => write!(out, "unix:{}", path.display()),
         }
     }
 }
 
-impl Server {
-    /// Reads `--server`.
-    pub fn parse(text: &str) -> anyhow::Result<Server> {
+impl ServerAddress {
+    /// Parses the value of `--server`.
+    pub fn parse(text: &str) -> anyhow::Result<ServerAddress> {
         if let Some(path) = text.strip_prefix("unix:") {
             let path = path.strip_prefix("//").unwrap_or(path);
-            return Ok(Server::Unix(path.into()));
+            return Ok(ServerAddress::Unix(path.into()));
         }
         if text.starts_with('/') {
-            return Ok(Server::Unix(text.into()));
+            return Ok(ServerAddress::Unix(text.into()));
         }
-        // Without a port: the daemon's own, and that of a proxy (RFC 9110, section 4.2.2).
+        // Default ports: the daemon's own, or that of a proxy (RFC 9110, section 4.2.2) for HTTPS.
         let (secure, rest, port) = match text.split_once("://") {
             Some(("http" | "ws", rest)) => (false, rest, 9090),
             Some(("https" | "wss", rest)) => (true, rest, 443),
             Some((scheme, _)) => {
                 bail!(
-                    "{text}: {scheme} is not spoken here; write https://HOST:PORT, http://HOST:PORT or unix:PATH"
+                    "{text}: unsupported scheme {scheme}; write https://HOST:PORT, http://HOST:PORT or unix:PATH"
                 )
             }
             None => (false, text, 9090),
@@ -97,18 +98,20 @@ impl Server {
         let has_port = authority.rsplit_once(':').is_some_and(|(host, port)| {
             (!host.contains(':') || host.ends_with(']')) && port.parse::<u16>().is_ok()
         });
-        let authority = match has_port {
-            true => authority.to_owned(),
-            false => format!("{authority}:{port}"),
+        let authority = if has_port {
+            authority.to_owned()
+        } else {
+            format!("{authority}:{port}")
         };
-        Ok(match secure {
-            true => Server::Tls(authority),
-            false => Server::Tcp(authority),
+        Ok(if secure {
+            ServerAddress::Tls(authority)
+        } else {
+            ServerAddress::Tcp(authority)
         })
     }
 
-    /// The daemon of this machine.
-    fn default() -> Server {
+    /// Returns the address of this machine's daemon.
+    fn local_daemon() -> ServerAddress {
         let variable = |name| {
             std::env::var_os(name)
                 .filter(|value| !value.is_empty())
@@ -123,33 +126,33 @@ impl Server {
             .chain([PathBuf::from("/var/lib/cloudroid")]);
         let sockets: Vec<PathBuf> = candidates
             .map(|home| home.join("run/daemon.sock"))
-            // At which members of a group are admins.
+            // The admin socket, where members of a group are admins.
             .chain([PathBuf::from("/run/cloudroid/daemon.sock")])
             .collect();
         match sockets.iter().find(|socket| socket.exists()) {
-            Some(socket) if !chosen || *socket == sockets[0] => Server::Unix(socket.clone()),
-            // Who names a home means its daemon and no other.
-            _ if chosen => Server::Unix(sockets[0].clone()),
-            _ => Server::Tcp(FALLBACK.to_owned()),
+            Some(socket) if !chosen || *socket == sockets[0] => ServerAddress::Unix(socket.clone()),
+            // With CLOUDROID_HOME set, only the daemon of that home is meant.
+            _ if chosen => ServerAddress::Unix(sockets[0].clone()),
+            _ => ServerAddress::Tcp(FALLBACK.to_owned()),
         }
     }
 }
 
-/// Speaks to one daemon.
+/// HTTP client for one daemon.
 #[derive(Debug)]
-pub struct Client {
-    server: Server,
+pub struct DaemonClient {
+    server: ServerAddress,
     token: Option<String>,
 }
 
-/// The daemon does not answer at all.
+/// The daemon cannot be reached.
 #[derive(Debug)]
-pub struct Unreachable {
-    server: Server,
+pub struct DaemonUnreachable {
+    server: ServerAddress,
     source: std::io::Error,
 }
 
-impl fmt::Display for Unreachable {
+impl fmt::Display for DaemonUnreachable {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             out,
@@ -159,110 +162,119 @@ impl fmt::Display for Unreachable {
     }
 }
 
-impl std::error::Error for Unreachable {}
+impl std::error::Error for DaemonUnreachable {}
 
-/// The connection was lost before there was an answer: the daemon was ended in between, perhaps.
+/// The connection was lost before a response, for example because the daemon was stopped.
 #[derive(Debug)]
-struct Lost {
-    server: Server,
+struct ConnectionLost {
+    server: ServerAddress,
 }
 
-impl fmt::Display for Lost {
+impl fmt::Display for ConnectionLost {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "the daemon at {} broke the connection", self.server)
     }
 }
 
-/// Whether there is no daemon to answer now; one that is being started again is there soon.
-pub fn is_away(error: &anyhow::Error) -> bool {
-    error.is::<Unreachable>() || error.is::<Lost>() || error.is::<BrokenOff>()
+/// Returns whether an error means that the daemon does not answer now; one that is being restarted will answer soon.
+pub fn is_unavailable(error: &anyhow::Error) -> bool {
+    error.is::<DaemonUnreachable>()
+        || error.is::<ConnectionLost>()
+        || error.is::<TruncatedResponse>()
 }
 
-/// The connection was lost within an answer that comes in parts.
+/// The connection was lost in the middle of a streamed response.
 #[derive(Debug)]
-struct BrokenOff {
+struct TruncatedResponse {
     source: hyper::Error,
 }
 
-impl fmt::Display for BrokenOff {
+impl fmt::Display for TruncatedResponse {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "the daemon broke off its answer: {}", self.source)
+        write!(out, "the daemon's response was cut off: {}", self.source)
     }
 }
 
-impl std::error::Error for BrokenOff {}
+impl std::error::Error for TruncatedResponse {}
 
-impl Client {
-    /// For the daemon that `--server` names.
-    pub fn new(server: Option<&str>, token: Option<String>) -> anyhow::Result<Client> {
+impl DaemonClient {
+    /// Creates a client for the daemon at `server`, or for this machine's daemon.
+    pub fn new(server: Option<&str>, token: Option<String>) -> anyhow::Result<DaemonClient> {
         let server = match server {
-            Some(text) => Server::parse(text)?,
-            None => Server::default(),
+            Some(text) => ServerAddress::parse(text)?,
+            None => ServerAddress::local_daemon(),
         };
-        Ok(Client {
+        Ok(DaemonClient {
             server,
             token: token.filter(|token| !token.is_empty()),
         })
     }
 
-    /// `GET path`.
+    /// Sends `GET path`.
     pub async fn get<T: DeserializeOwned>(&self, path: &str) -> anyhow::Result<T> {
-        read(self.send(Method::GET, path, empty()).await?).await
+        read_json(self.send(Method::GET, path, empty_body()).await?).await
     }
 
-    /// `PATCH path` with `body` as JSON.
+    /// Sends `PATCH path` with `body` as JSON.
     pub async fn patch<T: DeserializeOwned>(
         &self,
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        read(self.send(Method::PATCH, path, json(body)?).await?).await
+        read_json(self.send(Method::PATCH, path, json_body(body)?).await?).await
     }
 
-    /// `DELETE path`.
+    /// Sends `DELETE path`.
     pub async fn delete<T: DeserializeOwned>(&self, path: &str) -> anyhow::Result<T> {
-        read(self.send(Method::DELETE, path, empty()).await?).await
+        read_json(self.send(Method::DELETE, path, empty_body()).await?).await
     }
 
-    /// `PUT path` with `body` as JSON.
+    /// Sends `PUT path` with `body` as JSON.
     pub async fn put<T: DeserializeOwned>(
         &self,
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        read(self.send(Method::PUT, path, json(body)?).await?).await
+        read_json(self.send(Method::PUT, path, json_body(body)?).await?).await
     }
 
-    /// `POST path` with a JSON body.
+    /// Sends `POST path` with `body` as JSON.
     pub async fn post<T: DeserializeOwned>(
         &self,
         path: &str,
         body: &impl Serialize,
     ) -> anyhow::Result<T> {
-        read(self.send(Method::POST, path, json(body)?).await?).await
+        read_json(self.send(Method::POST, path, json_body(body)?).await?).await
     }
 
-    /// `GET path` of JSON lines.
-    pub async fn lines<T: DeserializeOwned>(
+    /// Sends `GET path` and returns the response as a stream of JSON lines.
+    pub async fn get_lines<T: DeserializeOwned>(
         &self,
         path: &str,
     ) -> anyhow::Result<impl Stream<Item = anyhow::Result<T>>> {
-        Ok(lines(self.send(Method::GET, path, empty()).await?))
+        Ok(json_lines(
+            self.send(Method::GET, path, empty_body()).await?,
+        ))
     }
 
-    /// Sends a request and gives the answer if it is a good one, else its [`Problem`].
+    /// Sends a request and returns the response if its status is a success; otherwise returns its [`Problem`] as the
+    /// error.
     pub async fn send(
         &self,
         method: Method,
         path: &str,
-        body: Body,
+        body: RequestBody,
     ) -> anyhow::Result<Response<Incoming>> {
         let request = Request::builder().method(method).uri(path);
-        self.ask(request.body(body)?).await
+        self.dispatch(request.body(body)?).await
     }
 
-    /// Becomes a WebSocket of this subprotocol (RFC 6455, section 4.1).
-    pub async fn socket(&self, path: &str, protocol: &str) -> anyhow::Result<Socket> {
+    /// Opens a WebSocket with this subprotocol (RFC 6455, section 4.1).
+    pub async fn connect_websocket(
+        &self,
+        path: &str,
+        protocol: &str,
+    ) -> anyhow::Result<DaemonSocket> {
         let key = generate_key();
         let request = Request::builder()
             .uri(path)
@@ -271,15 +283,17 @@ impl Client {
             .header(header::SEC_WEBSOCKET_VERSION, "13")
             .header(header::SEC_WEBSOCKET_KEY, &key)
             .header(header::SEC_WEBSOCKET_PROTOCOL, protocol);
-        let response = self.ask(request.body(empty())?).await?;
+        let response = self.dispatch(request.body(empty_body())?).await?;
         let accepted = response.headers().get(header::SEC_WEBSOCKET_ACCEPT);
         let accepted = accepted.is_some_and(|accept| *accept == derive_accept_key(key.as_bytes()));
         if response.status() != StatusCode::SWITCHING_PROTOCOLS || !accepted {
-            bail!("what answers at {} speaks no WebSocket", self.server);
+            bail!("the server at {} does not support WebSocket", self.server);
         }
-        let upgraded = hyper::upgrade::on(response).await.with_context(|| Lost {
-            server: self.server.clone(),
-        })?;
+        let upgraded = hyper::upgrade::on(response)
+            .await
+            .with_context(|| ConnectionLost {
+                server: self.server.clone(),
+            })?;
         let config = WebSocketConfig::default()
             .max_message_size(None)
             .max_frame_size(None);
@@ -287,29 +301,29 @@ impl Client {
         Ok(WebSocketStream::from_raw_socket(io, Role::Client, Some(config)).await)
     }
 
-    async fn ask(&self, request: Request<Body>) -> anyhow::Result<Response<Incoming>> {
-        let unreachable = |source| Unreachable {
+    async fn dispatch(&self, request: Request<RequestBody>) -> anyhow::Result<Response<Incoming>> {
+        let unreachable = |source| DaemonUnreachable {
             server: self.server.clone(),
             source,
         };
         match &self.server {
-            Server::Tcp(authority) => {
-                let stream = dial(authority).await.map_err(unreachable)?;
+            ServerAddress::Tcp(authority) => {
+                let stream = connect_tcp(authority).await.map_err(unreachable)?;
                 self.exchange(stream, authority, request).await
             }
-            Server::Tls(authority) => {
-                let stream = dial(authority).await.map_err(unreachable)?;
-                let stream = self.secured(stream, authority).await?;
+            ServerAddress::Tls(authority) => {
+                let stream = connect_tcp(authority).await.map_err(unreachable)?;
+                let stream = self.connect_tls(stream, authority).await?;
                 self.exchange(stream, authority, request).await
             }
-            Server::Unix(socket) => {
-                let stream = connect(socket).await.map_err(unreachable)?;
+            ServerAddress::Unix(socket) => {
+                let stream = connect_unix(socket).await.map_err(unreachable)?;
                 self.exchange(stream, "localhost", request).await
             }
         }
     }
 
-    async fn secured(
+    async fn connect_tls(
         &self,
         stream: TcpStream,
         authority: &str,
@@ -318,7 +332,7 @@ impl Client {
         let trust = Trust {
             authorities: None,
             fingerprint: None,
-            known: KnownServers::of_user(),
+            known: KnownServers::for_user(),
             accept: format!("cloudroidctl trust {}", self.server),
             advice: NOBODY_TRUSTED,
             identity: None,
@@ -326,11 +340,12 @@ impl Client {
         let connecting = trust.connect(stream, host.trim_matches(['[', ']']), authority);
         let connected = timeout(CONNECTING, connecting)
             .await
-            .unwrap_or_else(|_| Err(silent()))
-            .with_context(|| format!("no TLS with {}", self.server))?;
+            .unwrap_or_else(|_| Err(timeout_error()))
+            .with_context(|| format!("TLS handshake with {} failed", self.server))?;
         if let (Some(first), Some(known)) = (connected.first, &trust.known) {
             eprintln!(
-                "note: {} is new here; its certificate {first} is remembered in {}: compare it with what the daemon said at its start",
+                "note: first connection to {}; its certificate's fingerprint {first} is stored in {}: compare it with \
+                    the one that the daemon printed at start",
                 self.server,
                 known.path().display()
             );
@@ -342,9 +357,9 @@ impl Client {
         &self,
         stream: impl AsyncRead + AsyncWrite + Send + Unpin + 'static,
         host: &str,
-        mut request: Request<Body>,
+        mut request: Request<RequestBody>,
     ) -> anyhow::Result<Response<Incoming>> {
-        let lost = || Lost {
+        let lost = || ConnectionLost {
             server: self.server.clone(),
         };
         let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
@@ -363,25 +378,26 @@ impl Client {
         if status.is_success() || status == StatusCode::SWITCHING_PROTOCOLS {
             return Ok(response);
         }
-        Err(refusal(response).await)
+        Err(error_from_response(response).await)
     }
 }
 
-/// A server that is switched off answers nothing at all.
-async fn dial(authority: &str) -> io::Result<TcpStream> {
+/// Connects with a timeout: a server that is switched off does not answer at all.
+async fn connect_tcp(authority: &str) -> io::Result<TcpStream> {
     let dialled = timeout(CONNECTING, TcpStream::connect(authority)).await;
-    let stream = dialled.unwrap_or_else(|_| Err(silent()))?;
+    let stream = dialled.unwrap_or_else(|_| Err(timeout_error()))?;
     let _ = stream.set_nodelay(true);
     Ok(stream)
 }
 
-fn silent() -> io::Error {
-    let words = format!("nothing answered within {} s", CONNECTING.as_secs());
+fn timeout_error() -> io::Error {
+    let words = format!("no response within {} s", CONNECTING.as_secs());
     io::Error::new(io::ErrorKind::TimedOut, words)
 }
 
-/// Through a descriptor of its directory, because the path itself may be longer than an address can be.
-async fn connect(socket: &Path) -> io::Result<UnixStream> {
+/// Connects through a descriptor of the socket's directory, because the path may be longer than a socket address
+/// allows.
+async fn connect_unix(socket: &Path) -> io::Result<UnixStream> {
     let (Some(directory), Some(name)) = (socket.parent(), socket.file_name()) else {
         return UnixStream::connect(socket).await;
     };
@@ -394,30 +410,32 @@ async fn connect(socket: &Path) -> io::Result<UnixStream> {
     }
 }
 
-/// No body.
-pub fn empty() -> Body {
+/// Returns an empty body.
+pub fn empty_body() -> RequestBody {
     Full::default()
         .map_err(|never| match never {})
         .boxed_unsync()
 }
 
-/// A body as JSON.
-pub fn json(body: &impl Serialize) -> serde_json::Result<Body> {
+/// Returns a body of JSON.
+pub fn json_body(body: &impl Serialize) -> serde_json::Result<RequestBody> {
     Ok(Full::new(Bytes::from(serde_json::to_vec(body)?))
         .map_err(|never| match never {})
         .boxed_unsync())
 }
 
-async fn refusal(response: Response<Incoming>) -> anyhow::Error {
+async fn error_from_response(response: Response<Incoming>) -> anyhow::Error {
     let status = response.status();
     let body = match response.into_body().collect().await {
         Ok(collected) => collected.to_bytes(),
-        Err(error) => return anyhow!("the daemon answered {status} and broke off: {error}"),
+        Err(error) => {
+            return anyhow!("the daemon answered {status}, and the response was cut off: {error}");
+        }
     };
     match serde_json::from_slice::<Problem>(&body) {
         Ok(mut problem) => {
             if status == StatusCode::UNAUTHORIZED {
-                // The daemon tells whoever speaks HTTP what to send; here it is an option.
+                // The daemon's advice is for HTTP clients; here the token is an option.
                 problem.next = Some(TOKEN_WANTED.to_owned());
             }
             problem.into()
@@ -429,20 +447,20 @@ async fn refusal(response: Response<Incoming>) -> anyhow::Error {
     }
 }
 
-/// The JSON of an answer.
-pub async fn read<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
+/// Reads a response as JSON.
+pub async fn read_json<T: DeserializeOwned>(response: Response<Incoming>) -> anyhow::Result<T> {
     let body = response
         .into_body()
         .collect()
         .await
-        .context("the daemon broke off its answer")?
+        .context("the daemon's response was cut off")?
         .to_bytes();
     serde_json::from_slice(&body)
-        .context("the daemon's answer is not what this version of cloudroidctl understands")
+        .context("this version of cloudroidctl does not understand the daemon's response")
 }
 
-/// The JSON lines of an answer, as they come.
-pub fn lines<T: DeserializeOwned>(
+/// Reads a response as a stream of JSON lines.
+pub fn json_lines<T: DeserializeOwned>(
     response: Response<Incoming>,
 ) -> impl Stream<Item = anyhow::Result<T>> {
     let state = (response.into_body(), BytesMut::new());
@@ -454,13 +472,16 @@ pub fn lines<T: DeserializeOwned>(
                     continue;
                 }
                 let value = serde_json::from_slice(&line).context(
-                    "the daemon's answer is not what this version of cloudroidctl understands",
+                    "this version of cloudroidctl does not understand the daemon's response",
                 )?;
                 return Ok(Some((value, (body, pending))));
             }
             match body.frame().await {
                 Some(frame) => {
-                    if let Ok(data) = frame.map_err(|source| BrokenOff { source })?.into_data() {
+                    if let Ok(data) = frame
+                        .map_err(|source| TruncatedResponse { source })?
+                        .into_data()
+                    {
                         pending.extend_from_slice(&data);
                     }
                 }
@@ -475,8 +496,8 @@ fn line_end(bytes: &[u8]) -> Option<usize> {
     bytes.iter().position(|byte| *byte == b'\n')
 }
 
-/// A text as one segment of a path or one value of a query.
-pub fn escaped(text: &str) -> String {
+/// Percent-encodes a text as a path segment or a query value.
+pub fn percent_encode(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for byte in text.bytes() {
         match byte {
@@ -495,8 +516,8 @@ mod tests {
 
     #[test]
     fn servers_are_named_in_several_ways() {
-        let tcp = |text: &str| Server::Tcp(text.to_owned());
-        let tls = |text: &str| Server::Tls(text.to_owned());
+        let tcp = |text: &str| ServerAddress::Tcp(text.to_owned());
+        let tls = |text: &str| ServerAddress::Tls(text.to_owned());
         for (text, server) in [
             ("http://10.0.0.1:9091", tcp("10.0.0.1:9091")),
             ("http://robot-server/", tcp("robot-server:9090")),
@@ -506,13 +527,19 @@ mod tests {
             ("https://10.0.0.1:9091/", tls("10.0.0.1:9091")),
             ("wss://robot-server", tls("robot-server:443")),
             ("https://[::1]", tls("[::1]:443")),
-            ("unix:/run/x.sock", Server::Unix("/run/x.sock".into())),
-            ("unix:///run/x.sock", Server::Unix("/run/x.sock".into())),
+            (
+                "unix:/run/x.sock",
+                ServerAddress::Unix("/run/x.sock".into()),
+            ),
+            (
+                "unix:///run/x.sock",
+                ServerAddress::Unix("/run/x.sock".into()),
+            ),
         ] {
-            assert_eq!(Server::parse(text).expect(text), server);
+            assert_eq!(ServerAddress::parse(text).expect(text), server);
         }
         for text in ["ftp://x", "https://", "http://", "http://x/api", ""] {
-            Server::parse(text).expect_err(text);
+            ServerAddress::parse(text).expect_err(text);
         }
     }
 
@@ -523,18 +550,19 @@ mod tests {
             .expect("a port");
         let address = listener.local_addr().expect("its address");
         let ends = tokio::spawn(async move { drop(listener.accept().await) });
-        let client = Client::new(Some(&format!("http://{address}")), None).expect("an address");
+        let client =
+            DaemonClient::new(Some(&format!("http://{address}")), None).expect("an address");
         let asked = || client.get::<api::Clock>("/api/v1/clock");
         let lost = asked().await.expect_err("nothing answers");
-        assert!(is_away(&lost), "{lost:#}");
+        assert!(is_unavailable(&lost), "{lost:#}");
         ends.await.expect("it ended");
         let unreachable = asked().await.expect_err("nothing is there");
-        assert!(is_away(&unreachable), "{unreachable:#}");
-        assert!(!is_away(&anyhow::anyhow!("anything else")));
+        assert!(is_unavailable(&unreachable), "{unreachable:#}");
+        assert!(!is_unavailable(&anyhow::anyhow!("anything else")));
     }
 
     #[test]
     fn names_are_escaped() {
-        assert_eq!(escaped("a/b c?ä"), "a%2Fb%20c%3F%C3%A4");
+        assert_eq!(percent_encode("a/b c?ä"), "a%2Fb%20c%3F%C3%A4");
     }
 }

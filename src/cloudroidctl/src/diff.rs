@@ -1,24 +1,25 @@
-//! `diff`: two revisions side by side.
+//! `diff`: compares two revisions.
 
 use api::differences::{Difference, Differences};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
-/// Show what differs between two revisions of a service: interface, nodes, parameters, limits, packages of the image.
+/// Show the differences between two revisions of a service: interface, nodes, parameters, limits, packages of the
+/// image.
 #[derive(Debug, clap::Args)]
-pub struct Diff {
-    /// The service.
+pub struct DiffArgs {
+    /// Service whose revisions are compared.
     service: String,
-    /// The revision to compare with; the one before the other by default.
+    /// Older revision (default: the one before TO).
     from: Option<u64>,
-    /// The revision to compare; the current one by default.
+    /// Newer revision (default: the current one).
     to: Option<u64>,
 }
 
-impl Diff {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl DiffArgs {
+    /// Sends the request and prints the differences.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let asked = [("from", self.from), ("to", self.to)];
         let asked = asked.iter();
         let query: Vec<String> = asked
@@ -26,13 +27,13 @@ impl Diff {
             .collect();
         let path = format!(
             "/api/v1/services/{}/differences?{}",
-            escaped(&self.service),
+            percent_encode(&self.service),
             query.join("&")
         );
         let found: Differences = client.get(&path).await?;
         match format {
-            Format::Json => output::json(&found),
-            Format::Table => show(&found),
+            OutputFormat::Json => output::json(&found),
+            OutputFormat::Table => show(&found),
         }
     }
 }
@@ -43,7 +44,7 @@ fn show(found: &Differences) -> anyhow::Result<()> {
     } = found;
     if found.differences.is_empty() {
         return output::line(&format!(
-            "nothing that is recorded differs between revisions {from} and {to} of {service}"
+            "no recorded differences between revisions {from} and {to} of {service}"
         ));
     }
     let (before, after) = (format!("REVISION {from}"), format!("REVISION {to}"));
@@ -59,7 +60,7 @@ fn cells(of: &Difference) -> [String; 4] {
     let part = part.as_str().unwrap_or_default().to_owned();
     let side = |side: &Option<String>| side.clone().unwrap_or_else(|| "-".to_owned());
     let after = match &of.after {
-        // Text that is not told, such as a definition's, may differ where what is told of it does not.
+        // Some texts, such as definitions, are summarized: the summaries may be equal although the texts differ.
         Some(after) if of.before.as_ref() == Some(after) => format!("{after}, changed"),
         _ => side(&of.after),
     };

@@ -1,4 +1,4 @@
-//! `doctor`: what the host needs. With a daemon, it is asked; without, its program checks on its own.
+//! `doctor`: checks the host. A running daemon is asked; without one, its program makes the checks.
 
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -6,25 +6,25 @@ use std::process::Stdio;
 use anyhow::{Context, bail};
 use api::{Check, CheckStatus};
 
-use crate::client::{Client, Unreachable};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, DaemonUnreachable};
+use crate::output::{self, OutputFormat, Table};
 
-/// Check what this machine needs to run servants, and say how to fix what is missing.
+/// Check that this machine can run servants, and show how to fix what is missing.
 #[derive(Debug, clap::Args)]
-pub struct Doctor {}
+pub struct DoctorArgs {}
 
-impl Doctor {
-    /// Asks and prints; fails when something is missing.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl DoctorArgs {
+    /// Runs the checks and prints them; fails if something is missing.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let doctor: api::Doctor = match client.get("/api/v1/doctor").await {
-            Err(error) if error.is::<Unreachable>() => without_daemon(&error).await?,
+            Err(error) if error.is::<DaemonUnreachable>() => check_without_daemon(&error).await?,
             answer => answer?,
         };
         match format {
-            Format::Json => output::json(&doctor)?,
-            Format::Table => show(&doctor)?,
+            OutputFormat::Json => output::json(&doctor)?,
+            OutputFormat::Table => show(&doctor)?,
         }
-        if !doctor.well() {
+        if !doctor.is_healthy() {
             let missing: Vec<&str> = doctor
                 .checks
                 .iter()
@@ -37,7 +37,7 @@ impl Doctor {
     }
 }
 
-async fn without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doctor> {
+async fn check_without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doctor> {
     let beside = std::env::current_exe()
         .ok()
         .and_then(|path| Some(path.parent()?.join("cloudroidd")));
@@ -52,12 +52,16 @@ async fn without_daemon(unreachable: &anyhow::Error) -> anyhow::Result<api::Doct
         .await
         .with_context(|| {
             format!(
-                "{unreachable}; and {} cannot be run to check without it",
+                "{unreachable}; cannot run {} to check without the daemon",
                 program.display()
             )
         })?;
-    let mut doctor: api::Doctor = serde_json::from_slice(&output.stdout)
-        .with_context(|| format!("{} doctor --json gave no answer", program.display()))?;
+    let mut doctor: api::Doctor = serde_json::from_slice(&output.stdout).with_context(|| {
+        format!(
+            "the output of {} doctor --json is not valid",
+            program.display()
+        )
+    })?;
     doctor.checks.push(Check {
         name: "daemon".to_owned(),
         status: CheckStatus::Warning,

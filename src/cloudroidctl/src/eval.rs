@@ -1,5 +1,5 @@
-//! `eval`: whether a package is worth outsourcing from a robot of some size, measured: the same requests on as many cores and as
-//! much memory as the robot has, and outsourced, over the network from where this is typed.
+//! `eval`: measures whether outsourcing a package from a robot of some size is worthwhile: the same requests with as
+//! many cores and as much memory as the robot has, and outsourced over the network from this machine.
 
 mod check;
 mod measure;
@@ -19,144 +19,156 @@ use anyhow::{Context, bail};
 use api::Size;
 use bytes::Bytes;
 
-use crate::calibrate::{agrees, check_place, write};
-use crate::client::Client;
-use crate::output::{self, Format};
-use check::unusable;
-use network::Network;
-use robot::Class;
+use crate::calibrate::{check_writable, confirm, write_rows};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat};
+use check::invalid_input;
+use network::AddedNetwork;
+use robot::RobotClass;
 use verdict::Evaluation;
 
-/// Evaluate a service on a recording: native on a robot of some size against outsourced, with phases, a verdict and an SLA.
+/// Evaluate a service on a recording: compare it on a robot of some size with the outsourced one, with phases, a
+/// verdict and an SLA.
 ///
-/// Both are measured on this server, native with as many cores and as much memory as the robot has; outsourced requests go over the
-/// network from where this is typed. Servants of its own are started, give way to robots, and are ended afterwards.
+/// Both are measured on the server: native with as many cores and as much memory as the robot has, outsourced with
+/// requests over the network from this machine. Starts servants of its own, which give way to robots and are ended
+/// afterwards.
 #[derive(Debug, clap::Args)]
-pub struct Eval {
-    /// The service; push a package first.
+pub struct EvalArgs {
+    /// Service to evaluate; its package must have been pushed.
     #[arg(value_name = "PACKAGE")]
     service: String,
-    /// A recording of its inputs: a rosbag file, not compressed. It is replayed at its own pace.
+    /// Recording of the service's inputs: an uncompressed rosbag file, replayed at its own rate.
     #[arg(long, value_name = "FILE")]
     bag: PathBuf,
-    /// What the robot has: pi is a quarter of a core and 1G, ultrabook half a core and 4G.
-    #[arg(long, value_enum, default_value_t = Class::Pi)]
-    robot: Class,
-    /// The robot's cores, instead of those of its class.
+    /// Class of the robot: pi has a quarter of a core and 1G of memory, ultrabook half a core and 4G.
+    #[arg(long, value_enum, default_value_t = RobotClass::Pi)]
+    robot: RobotClass,
+    /// Cores of the robot (default: those of its class).
     #[arg(long, value_name = "N", value_parser = robot::cores, allow_hyphen_values = true)]
     robot_cpus: Option<f64>,
-    /// The robot's memory, instead of that of its class.
+    /// Memory of the robot (default: that of its class).
     #[arg(long, value_name = "BYTES", value_parser = robot::memory)]
     robot_memory: Option<Size>,
-    /// Cores of the outsourced servant; by default those that it was pushed with, else one core, which the row promises then.
+    /// Cores of the outsourced servant (default: the limit it was pushed with, otherwise one core, which the row then
+    /// promises).
     #[arg(long, value_name = "N", value_parser = robot::cores, allow_hyphen_values = true)]
     cpus: Option<f64>,
-    /// What a network adds to what is measured, where this is typed at the server itself: lan (1 ms each way, 100 Mbit/s), wan (30 ms,
-    /// 20 Mbit/s), or milliseconds for each request.
+    /// Network to add to the measured times, when this is run on the server itself: lan (1 ms each way, 100 Mbit/s),
+    /// wan (30 ms, 20 Mbit/s), or milliseconds per request.
     #[arg(long, value_name = "lan|wan|MS")]
-    network: Option<Network>,
-    /// Requests on each side, at most; 40 by default.
+    network: Option<AddedNetwork>,
+    /// Largest number of requests on each side (default: 40).
     #[arg(long, value_name = "N", value_parser = robot::requests)]
     requests: Option<usize>,
-    /// Each request follows the last answer at once, instead of the recording's pace.
+    /// Send each request as soon as the previous one is answered, instead of at the recording's rate.
     #[arg(long)]
     fast: bool,
-    /// The input whose messages are the requests; by default the recording's first topic that is an input.
+    /// Input whose messages are the requests (default: the recording's first topic that is an input).
     #[arg(long, value_name = "TOPIC")]
     input: Option<String>,
-    /// The output whose messages are the answers over the network; by default that whose message comes first.
+    /// Output whose messages are the answers over the network (default: the first one to publish).
     #[arg(long, value_name = "TOPIC")]
     output: Option<String>,
-    /// Where to draw the distribution of response times; SERVICE-evaluation.svg by default.
+    /// Output file of the plot of response times (default: SERVICE-evaluation.svg).
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
-    /// Write the row of the dictionary without asking.
+    /// Write the row to the dictionary without asking for confirmation.
     #[arg(long)]
     yes: bool,
 }
 
-impl Eval {
-    /// Measures both sides, shows, asks, writes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl EvalArgs {
+    /// Measures both sides, prints the result and writes the row if that is confirmed.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let file =
             fs::read(&self.bag).with_context(|| format!("cannot read {}", self.bag.display()))?;
         let file = Bytes::from(file);
-        // What cannot be replayed is told before anything is sent or started.
-        let recorded = ros::bag::read(&file, probe::RECORDED)
-            .map_err(|why| unusable(format!("{} cannot be replayed: {why}", self.bag.display())))?;
+        // A recording that cannot be replayed is reported before anything is sent or started.
+        let recorded = ros::bag::read(&file, probe::RECORDED).map_err(|why| {
+            invalid_input(format!("{} cannot be replayed: {why}", self.bag.display()))
+        })?;
         let service = self.check(client).await?;
-        self.check_room(client).await?;
+        self.check_capacity(client).await?;
         let plot = self
             .plot
             .clone()
             .unwrap_or_else(|| PathBuf::from(format!("{}-evaluation.svg", self.service)));
-        check_place(&plot, "plot")?;
+        check_writable(&plot, "plot")?;
         let mut measured = tokio::select! {
             measured = self.measure(client, format, file, &recorded, &service) => measured?,
             _ = tokio::signal::ctrl_c() => bail!("cancelled; nothing was written"),
         };
-        // What was measured is shown all the same.
+        // The result is printed even if the plot cannot be written.
         let drawn = fs::write(&plot, plot::draw(&measured))
             .with_context(|| format!("cannot write the plot {}", plot.display()));
-        // In JSON all is one value.
-        let is_written = self.yes && matches!(format, Format::Json);
-        let written = match is_written {
-            true => self.write(client, &mut measured).await.map(drop),
-            false => Ok(()),
+        // The JSON output is one value, which includes the written row.
+        let is_written = self.yes && matches!(format, OutputFormat::Json);
+        let written = if is_written {
+            self.write_row(client, &mut measured).await.map(drop)
+        } else {
+            Ok(())
         };
         match format {
-            Format::Json => output::json(&measured)?,
-            Format::Table => shown::print(&measured, &plot)?,
+            OutputFormat::Json => output::json(&measured)?,
+            OutputFormat::Table => shown::print(&measured, &plot)?,
         }
         if let Err(error) = drawn {
-            output::complain(&format!("warning: {error:#}"));
+            output::eprint_line(&format!("warning: {error:#}"));
         }
         if let Some(why) = &measured.outsourced.broken {
             bail!(
-                "asking the servant over the network failed: {why}; what was measured before is shown"
+                "sending requests to the servant over the network failed: {why}; shown is what was measured before \
+                    that"
             );
         }
         written?;
-        match is_written {
-            true => Ok(()),
-            false => self.propose(client, format, measured).await,
+        if is_written {
+            Ok(())
+        } else {
+            self.propose(client, format, measured).await
         }
     }
 
-    /// Writes the row that is suggested; numbers of others that promise the same limits.
-    async fn write(&self, client: &Client, measured: &mut Evaluation) -> anyhow::Result<Vec<i64>> {
+    /// Writes the suggested row; returns the ids of other rows for the same limits.
+    async fn write_row(
+        &self,
+        client: &DaemonClient,
+        measured: &mut Evaluation,
+    ) -> anyhow::Result<Vec<i64>> {
         let Some(sla) = &mut measured.sla else {
             return Ok(Vec::new());
         };
-        let rows = write(client, &self.service, vec![sla.row.clone()]).await?;
-        Ok(sla.note_written(&rows))
+        let rows = write_rows(client, &self.service, vec![sla.row.clone()]).await?;
+        Ok(sla.mark_written(&rows))
     }
 
-    /// Writes the row, where there is one and who asked says yes.
+    /// Writes the suggested row, if there is one and this is confirmed.
     async fn propose(
         &self,
-        client: &Client,
-        format: Format,
+        client: &DaemonClient,
+        format: OutputFormat,
         mut measured: Evaluation,
     ) -> anyhow::Result<()> {
         if measured.sla.is_none() {
             return Ok(());
         }
         let say = |words: &str| match format {
-            Format::Json => Ok(()),
-            Format::Table => output::line(words),
+            OutputFormat::Json => Ok(()),
+            OutputFormat::Table => output::line(words),
         };
-        if !self.yes && !agrees(&self.service)? {
-            // Who was asked knows how to answer.
-            return say(match std::io::stdin().is_terminal() {
-                true => "nothing was written",
-                false => "nothing was written; --yes writes the row without asking",
+        if !self.yes && !confirm(&self.service)? {
+            // After a prompt there is no need to mention --yes.
+            return say(if std::io::stdin().is_terminal() {
+                "nothing was written"
+            } else {
+                "nothing was written; --yes writes the entry without asking"
             });
         }
         let name = &self.service;
-        let others = self.write(client, &mut measured).await?;
+        let others = self.write_row(client, &mut measured).await?;
         say(&format!(
-            "1 row written; see it with: cloudroidctl sla list {name}"
+            "1 entry written; see it with: cloudroidctl sla list {name}"
         ))?;
         if others.is_empty() {
             return Ok(());
@@ -164,7 +176,8 @@ impl Eval {
         let others: Vec<String> = others.iter().map(i64::to_string).collect();
         let others = others.join(" ");
         say(&format!(
-            "the dictionary has had rows for as many cores before ({others}); remove what is outdated with: cloudroidctl sla rm {name} {others}"
+            "the SLA table already had entries for the same number of cores ({others}); remove outdated ones with: \
+                cloudroidctl sla rm {name} {others}"
         ))
     }
 }
@@ -179,14 +192,14 @@ mod tests {
         #[derive(Debug, Parser)]
         struct Line {
             #[command(flatten)]
-            eval: Eval,
+            eval: EvalArgs,
         }
         for (option, value, range) in [
-            ("--robot-memory", "1", "16M or more"),
-            ("--robot-cpus", "nan", "between 0.01 and 4096"),
-            ("--robot-cpus", "-1", "between 0.01 and 4096"),
-            ("--cpus", "0", "between 0.01 and 4096"),
-            ("--requests", "0", "between 10 and 10000"),
+            ("--robot-memory", "1", "at least 16M"),
+            ("--robot-cpus", "nan", "0.01 to 4096"),
+            ("--robot-cpus", "-1", "0.01 to 4096"),
+            ("--cpus", "0", "0.01 to 4096"),
+            ("--requests", "0", "10 to 10000"),
         ] {
             let line = ["eval", "people", "--bag", "x.bag", option, value];
             let refused = Line::try_parse_from(line).expect_err(option);

@@ -1,4 +1,4 @@
-//! `events`: the daemon's journal.
+//! `events`: the daemon's event journal.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -6,24 +6,24 @@ use std::time::Duration;
 use api::{Event, Level};
 use futures_util::StreamExt;
 
-use crate::client::{self, Client, escaped};
-use crate::output::{self, Format};
+use crate::client::{self, DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat};
 
-/// Between attempts to reach a daemon that is away.
+/// Interval between attempts to reach the daemon.
 const RETRY: Duration = Duration::from_millis(250);
-/// More than a journal holds.
+/// Limit that exceeds the size of any journal.
 const ALL: u32 = u32::MAX;
 
-/// Print what happened lately: pushes, starts, failures.
+/// Print recent events: pushes, starts, failures.
 #[derive(Debug, clap::Args)]
-pub struct Events {
-    /// So many of the last events.
+pub struct EventsArgs {
+    /// Number of recent events.
     #[arg(short = 'n', long, default_value_t = 50, value_name = "EVENTS")]
     tail: u32,
-    /// Go on printing as more happens.
+    /// Keep printing new events.
     #[arg(short, long)]
     follow: bool,
-    /// Only events of this kind, such as node-hung; docs/operators.md names them.
+    /// Only events of this kind, such as node-hung; docs/operators.md lists the kinds.
     #[arg(long, value_name = "KIND")]
     kind: Option<String>,
     /// Only events of this service.
@@ -37,9 +37,9 @@ pub struct Events {
     robot: Option<String>,
 }
 
-impl Events {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl EventsArgs {
+    /// Sends the request and prints the events.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         if self.follow {
             return self.follow(client, format).await;
         }
@@ -49,20 +49,21 @@ impl Events {
             let all: Vec<Event> = client
                 .get(&format!("/api/v1/events?since=0&limit={ALL}"))
                 .await?;
-            output::complain(&nothing_of(kind, &all));
+            output::eprint_line(&describe_no_events(kind, &all));
         }
         match format {
-            Format::Json => output::json(&events),
-            Format::Table => events.iter().try_for_each(print),
+            OutputFormat::Json => output::json(&events),
+            OutputFormat::Table => events.iter().try_for_each(print),
         }
     }
 
-    /// Prints what comes until it is ended. A daemon that is started again tells what happened meanwhile, and nothing twice.
-    async fn follow(&self, client: &Client, format: Format) -> anyhow::Result<()> {
-        // What comes without an end is one event a line.
+    /// Prints events until the process is ended. After a restart of the daemon, missed events are printed, and none
+    /// twice.
+    async fn follow(&self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        // An endless output is one event per line.
         let print = |event: &Event| match format {
-            Format::Json => output::json_line(event),
-            Format::Table => print(event),
+            OutputFormat::Json => output::json_line(event),
+            OutputFormat::Table => print(event),
         };
         let (mut begun, mut last) = (false, None);
         loop {
@@ -71,11 +72,11 @@ impl Events {
                 Some(last) => self.query(last, ALL),
             };
             let path = format!("/api/v1/events/follow?{query}");
-            let mut events = match client.lines::<Event>(&path).await {
+            let mut events = match client.get_lines::<Event>(&path).await {
                 Ok(events) => events,
-                // It was there a moment ago.
-                Err(error) if begun && client::is_away(&error) => {
-                    self.come_back(client).await?;
+                // The daemon answered before, so it may come back.
+                Err(error) if begun && client::is_unavailable(&error) => {
+                    self.wait_for_daemon(client).await?;
                     continue;
                 }
                 Err(error) => return Err(error),
@@ -84,25 +85,25 @@ impl Events {
             while let Some(event) = events.next().await {
                 let event = match event {
                     Ok(event) => event,
-                    Err(error) if client::is_away(&error) => break,
+                    Err(error) if client::is_unavailable(&error) => break,
                     Err(error) => return Err(error),
                 };
                 last = Some(last.unwrap_or(0).max(event.id));
                 print(&event)?;
             }
-            self.come_back(client).await?;
+            self.wait_for_daemon(client).await?;
         }
     }
 
-    /// Waits for a daemon that is away.
-    async fn come_back(&self, client: &Client) -> anyhow::Result<()> {
+    /// Waits until the daemon answers.
+    async fn wait_for_daemon(&self, client: &DaemonClient) -> anyhow::Result<()> {
         let mut told = false;
         loop {
             match client.get::<api::Clock>("/api/v1/clock").await {
                 Ok(_) => return Ok(()),
-                Err(error) if client::is_away(&error) => {
+                Err(error) if client::is_unavailable(&error) => {
                     if !std::mem::replace(&mut told, true) {
-                        output::complain(&format!("{error:#}; waiting for it"));
+                        output::eprint_line(&format!("{error:#}; waiting for the daemon"));
                     }
                     tokio::time::sleep(RETRY).await;
                 }
@@ -120,17 +121,17 @@ impl Events {
         ];
         let filter = filter.into_iter();
         let filter: String = filter
-            .filter_map(|(key, value)| Some(format!("&{key}={}", escaped(value.as_ref()?))))
+            .filter_map(|(key, value)| Some(format!("&{key}={}", percent_encode(value.as_ref()?))))
             .collect();
         format!("since={since}&limit={limit}{filter}")
     }
 }
 
 fn print(event: &Event) -> anyhow::Result<()> {
-    output::line(&in_a_line(event))
+    output::line(&format_event(event))
 }
 
-fn in_a_line(event: &Event) -> String {
+fn format_event(event: &Event) -> String {
     let mark = match event.level {
         Level::Info => ' ',
         Level::Warning => '!',
@@ -140,15 +141,16 @@ fn in_a_line(event: &Event) -> String {
     format!("{time} {mark} {kind:<18} {}", event.message)
 }
 
-/// Words about a kind of which nothing is told; it may be misspelt.
-fn nothing_of(kind: &str, all: &[Event]) -> String {
+/// Returns the message for a kind without events; the kind may be misspelt.
+fn describe_no_events(kind: &str, all: &[Event]) -> String {
     let kinds: BTreeSet<&str> = all.iter().map(|event| event.kind.as_str()).collect();
-    match kinds.contains(kind) {
-        true => format!("no event of kind {kind} is told of that"),
-        false => format!(
-            "no event of kind {kind} is in the journal; there are: {}; docs/operators.md names all",
+    if kinds.contains(kind) {
+        format!("no event of kind {kind} matches")
+    } else {
+        format!(
+            "no event of kind {kind} in the journal; recorded kinds: {}; docs/operators.md lists all",
             kinds.into_iter().collect::<Vec<_>>().join(", ")
-        ),
+        )
     }
 }
 
@@ -161,7 +163,7 @@ mod tests {
     #[derive(Debug, Parser)]
     struct Line {
         #[command(flatten)]
-        events: Events,
+        events: EventsArgs,
     }
 
     #[test]
@@ -191,12 +193,12 @@ mod tests {
             robot: None,
             message: "it hangs".into(),
         };
-        let unknown = nothing_of("node-hnug", std::slice::from_ref(&event));
-        assert!(unknown.contains("there are: node-hung;"), "{unknown}");
-        let known = nothing_of("node-hung", std::slice::from_ref(&event));
-        assert!(!known.contains("there are"), "{known}");
+        let unknown = describe_no_events("node-hnug", std::slice::from_ref(&event));
+        assert!(unknown.contains("recorded kinds: node-hung;"), "{unknown}");
+        let known = describe_no_events("node-hung", std::slice::from_ref(&event));
+        assert!(!known.contains("recorded kinds"), "{known}");
         assert_eq!(
-            in_a_line(&event),
+            format_event(&event),
             "00:00:00.000 ! node-hung          it hangs"
         );
     }

@@ -1,36 +1,36 @@
-//! What `cloudroidctl` ends with, so that a script can tell what to do next without reading words.
+//! Exit status of `cloudroidctl`, so that scripts can react without parsing messages.
 
 use std::fmt;
 use std::process::ExitCode;
 
 use api::Problem;
 
-use crate::client::Unreachable;
+use crate::client::DaemonUnreachable;
 
-/// How it ended. Numbers stay what they are: scripts compare them.
+/// Exit status. The numbers are stable: scripts compare them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Exit {
-    /// It was done.
+    /// Success.
     Done = 0,
-    /// It was not done, for a reason that no other number names.
+    /// Failed for another reason.
     Failed = 1,
-    /// The command line cannot be understood.
+    /// Invalid command line.
     Usage = 2,
-    /// No daemon answers.
+    /// The daemon cannot be reached.
     Unreachable = 3,
-    /// Who asks may not: HTTP 401 and 403.
+    /// The caller is not authorized: HTTP 401 and 403.
     Forbidden = 4,
-    /// What is named is not there: HTTP 404 and 410.
+    /// A named object does not exist: HTTP 404 and 410.
     Missing = 5,
-    /// What is asked for cannot be done as it is asked: every other HTTP status of 400 to 499.
+    /// The request is invalid or cannot be fulfilled: any other HTTP status from 400 to 499.
     Refused = 6,
-    /// There is no room now, or too much is asked at once: HTTP 429, 503 and 507. Later it may be done.
+    /// No capacity now, or too many requests: HTTP 429, 503 and 507. A later attempt may succeed.
     Busy = 7,
-    /// What `--wait` waits for did not come in time.
+    /// The condition of `--wait` was not met in time.
     TimedOut = 8,
 }
 
-/// All, in order.
+/// All values, in numeric order.
 pub const EXITS: [Exit; 9] = [
     Exit::Done,
     Exit::Failed,
@@ -44,27 +44,27 @@ pub const EXITS: [Exit; 9] = [
 ];
 
 impl Exit {
-    /// When it is, for the help and the manual.
+    /// Returns the description for the help and the manual.
     pub fn meaning(self) -> &'static str {
         match self {
             Exit::Done => "done",
-            Exit::Failed => "not done, for a reason that has no number of its own",
-            Exit::Usage => "the command line cannot be understood",
-            Exit::Unreachable => "no daemon answers",
-            Exit::Forbidden => "who asks may not do it, or has shown no token",
-            Exit::Missing => "what is named is not there",
-            Exit::Refused => "it cannot be done as it is asked for",
-            Exit::Busy => "there is no room now, or too much at once; later it may be done",
-            Exit::TimedOut => "what --wait waits for did not come in time",
+            Exit::Failed => "failed for another reason",
+            Exit::Usage => "invalid command line",
+            Exit::Unreachable => "cannot reach the daemon",
+            Exit::Forbidden => "not permitted, or no token given",
+            Exit::Missing => "not found",
+            Exit::Refused => "invalid or refused request",
+            Exit::Busy => "no capacity now; try again later",
+            Exit::TimedOut => "--wait timed out",
         }
     }
 
-    /// Of what went wrong.
-    pub fn of(error: &anyhow::Error) -> Exit {
-        if error.is::<Unreachable>() {
+    /// Returns the exit status for an error.
+    pub fn from_error(error: &anyhow::Error) -> Exit {
+        if error.is::<DaemonUnreachable>() {
             return Exit::Unreachable;
         }
-        if error.is::<TimeUp>() {
+        if error.is::<WaitTimedOut>() {
             return Exit::TimedOut;
         }
         match error
@@ -86,26 +86,26 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// The table at the end of `--help` and in the manual.
+/// Returns the table for the end of `--help` and for the manual.
 pub fn table() -> String {
     let rows = EXITS.map(|exit| format!("  {}  {}", exit as u8, exit.meaning()));
     format!("Exit status:\n{}", rows.join("\n"))
 }
 
-/// What was waited for did not come in time.
+/// The condition of `--wait` was not met in time.
 #[derive(Debug)]
-pub struct TimeUp {
-    /// What did not come, and what was so instead.
+pub struct WaitTimedOut {
+    /// Description of the condition and of the current state.
     pub words: String,
 }
 
-impl fmt::Display for TimeUp {
+impl fmt::Display for WaitTimedOut {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(&self.words)
     }
 }
 
-impl std::error::Error for TimeUp {}
+impl std::error::Error for WaitTimedOut {}
 
 #[cfg(test)]
 mod tests {
@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn every_refusal_has_its_number() {
         let refused = |status| {
-            Exit::of(
+            Exit::from_error(
                 &Problem {
                     status,
                     ..Problem::default()
@@ -137,9 +137,12 @@ mod tests {
         ] {
             assert_eq!(refused(status), expected, "{status}");
         }
-        assert_eq!(Exit::of(&anyhow::anyhow!("anything")), Exit::Failed);
+        assert_eq!(Exit::from_error(&anyhow::anyhow!("anything")), Exit::Failed);
         let words = "late".to_owned();
-        assert_eq!(Exit::of(&TimeUp { words }.into()), Exit::TimedOut);
+        assert_eq!(
+            Exit::from_error(&WaitTimedOut { words }.into()),
+            Exit::TimedOut
+        );
     }
 
     #[test]

@@ -1,25 +1,25 @@
-//! `explain`: one screen that says why a robot is slow, or on its local original.
+//! `explain`: shows why a robot is slow or served by its local original.
 
 use api::explain::{Explanation, Link, Served, Weight};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
-/// Say why a robot is slow, or answered by its local original, now.
+/// Explain why a robot is slow or served by its local original.
 #[derive(Debug, clap::Args)]
-pub struct Explain {
-    /// The robot.
+pub struct ExplainArgs {
+    /// Id of the robot.
     robot: String,
 }
 
-impl Explain {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let path = format!("/api/v1/robots/{}/explain", escaped(&self.robot));
+impl ExplainArgs {
+    /// Sends the request and prints the explanation.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let path = format!("/api/v1/robots/{}/explain", percent_encode(&self.robot));
         let explanation: Explanation = client.get(&path).await?;
         match format {
-            Format::Json => output::json(&explanation),
-            Format::Table => print(&explanation),
+            OutputFormat::Json => output::json(&explanation),
+            OutputFormat::Table => print(&explanation),
         }
     }
 }
@@ -37,7 +37,7 @@ fn print(explanation: &Explanation) -> anyhow::Result<()> {
         output::line(&format!("{mark}  {}\n        {}", cause.what, cause.next))?;
     }
     for served in &explanation.servants {
-        servant(served)?;
+        print_servant(served)?;
     }
     if !explanation.events.is_empty() {
         output::line("\nlately")?;
@@ -52,10 +52,10 @@ fn print(explanation: &Explanation) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn servant(served: &Served) -> anyhow::Result<()> {
+fn print_servant(served: &Served) -> anyhow::Result<()> {
     let servant = &served.servant;
     output::line(&format!(
-        "\n{} of {} (revision {}): {}, {} connections, {:.2} cores used, held back {:.0} % of the time, limits {}",
+        "\n{} of {} (revision {}): {}, {} connections, {:.2} cores used, throttled {:.0} % of the time, limits {}",
         servant.id,
         servant.service,
         servant.revision,
@@ -71,28 +71,28 @@ fn servant(served: &Served) -> anyhow::Result<()> {
             output::line(&format!("  {why}"))?;
         }
     }
-    served.links.iter().try_for_each(link)
+    served.links.iter().try_for_each(print_link)
 }
 
-/// What the robot was promised.
-fn promise(link: &Link) -> String {
+/// Returns the robot's SLA in words.
+fn promise_in_words(link: &Link) -> String {
     let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
     let threshold = link
         .threshold
         .map_or_else(String::new, |threshold| format!(", Q_t {threshold:.1}"));
     if let Some(after) = link.fallback_after {
         let after = after / 1000.0;
-        return format!("no time promised, fallback {after:.1} s after the link is lost");
+        return format!("no response time set, fallback {after:.1} s after the link is lost");
     }
     match (link.frames_per_second, link.age) {
         (Some(rate), _) => {
             let desired = link.desired_frames_per_second;
-            let desired = desired.map_or_else(String::new, |rate| format!(", {rate} wished for"));
-            format!("at least {rate} frames a second{desired}{threshold}")
+            let desired = desired.map_or_else(String::new, |rate| format!(", {rate} desired"));
+            format!("at least {rate} frames per second{desired}{threshold}")
         }
         (None, Some(_)) => {
             let desired = link.desired_age.map(|_| millis(link.desired_age));
-            let desired = desired.map_or_else(String::new, |age| format!(", {age} wished for"));
+            let desired = desired.map_or_else(String::new, |age| format!(", {age} desired"));
             format!("at most {} old{desired}{threshold}", millis(link.age))
         }
         (None, None) => format!(
@@ -103,7 +103,7 @@ fn promise(link: &Link) -> String {
     }
 }
 
-fn link(link: &Link) -> anyhow::Result<()> {
+fn print_link(link: &Link) -> anyhow::Result<()> {
     let millis = |time: Option<f64>| time.map_or("-".to_owned(), |time| format!("{time:.1} ms"));
     output::line(&format!(
         "  {}: link {}, round trip {}, clock {}, {}, Q {}; of {} requests {} late, {} answered locally",
@@ -111,14 +111,14 @@ fn link(link: &Link) -> anyhow::Result<()> {
         if link.up { "up" } else { "DOWN" },
         millis(link.round_trip),
         millis(link.clock),
-        promise(link),
+        promise_in_words(link),
         link.satisfaction
             .map_or("-".to_owned(), |q| format!("{q:.1}")),
         link.requests,
         link.late,
         link.local,
     ))?;
-    let mut table = Table::new(&["    PART", "MEDIAN", "90 %", "MAX"]);
+    let mut table = Table::new(&["    PART", "P50", "P90", "MAX"]);
     for part in &link.phases {
         table.row([
             format!("    {}", part.name),

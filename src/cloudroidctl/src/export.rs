@@ -1,4 +1,5 @@
-//! `export`: a revision's image as one file, which tools of containers read (OCI image specification 1.1, image layout).
+//! `export`: writes the image of a revision to a file that container tools can read (OCI image specification 1.1, image
+//! layout).
 
 use std::collections::BTreeSet;
 use std::io::{BufWriter, Write};
@@ -14,37 +15,37 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
-use crate::client::{Client, empty, escaped};
+use crate::client::{DaemonClient, empty_body, percent_encode};
 use crate::exit::Exit;
-use crate::output::{self, Format};
-use crate::whole::Half;
+use crate::output::{self, OutputFormat};
+use crate::whole::AtomicFile;
 
-/// The largest manifest that is read: that of an image of the daemon has some kilobytes.
+/// Largest manifest that is read: the daemon's manifests have a few kilobytes.
 const LARGEST_MANIFEST: usize = 16 << 20;
-/// What a tar archive is counted in (POSIX.1-2017, pax interchange format).
+/// Block size of a tar archive (POSIX.1-2017, pax interchange format).
 const BLOCK: u64 = 512;
-/// The annotation of the image that names the blob of the service's record, as the daemon reads it.
+/// Annotation of the image that names the blob with the service's record, as the daemon reads it.
 const RECORD: &str = "org.cloudroid.record";
 
-/// Write a service into one file, for another server: `cloudroidctl import FILE` publishes it there.
+/// Export a service to a file for another server, where `cloudroidctl import FILE` publishes it.
 ///
-/// The file is a tar archive of an OCI image layout, which skopeo, umoci and podman read, too; beside the image it has the service's
-/// interface, how its nodes are started and limited, and its dictionary.
+/// The file is a tar archive of an OCI image layout, which skopeo, umoci and podman can read. Besides the image it
+/// contains the service's interface, the commands and limits of its nodes, and its dictionary.
 #[derive(Debug, clap::Args)]
-pub struct Export {
-    /// The service.
+pub struct ExportArgs {
+    /// Service to export.
     service: String,
-    /// The revision; the current one by default.
+    /// Revision to export (default: the current one).
     #[arg(long, value_name = "N")]
     revision: Option<u64>,
-    /// The file; SERVICE.oci.tar by default. An earlier one is replaced when the new one is whole.
+    /// Output file (default: SERVICE.oci.tar). An existing file is replaced when the new one is complete.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
-/// What was written.
+/// Summary of an export.
 #[derive(Serialize)]
-struct Exported {
+struct ExportSummary {
     service: String,
     revision: u64,
     /// Digest of the image's manifest.
@@ -53,26 +54,26 @@ struct Exported {
     bytes: u64,
 }
 
-/// Points at a blob (OCI image specification, descriptor).
+/// Reference to a blob (OCI image specification, descriptor).
 #[derive(Debug, Clone, Deserialize)]
-struct Descriptor {
+struct BlobDescriptor {
     digest: String,
     size: u64,
 }
 
-/// What of a manifest names blobs.
+/// Fields of a manifest that refer to blobs.
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct Manifest {
+struct BlobManifest {
     media_type: String,
-    config: Descriptor,
-    layers: Vec<Descriptor>,
+    config: BlobDescriptor,
+    layers: Vec<BlobDescriptor>,
 }
 
-impl Export {
-    /// Asks and writes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let path = format!("/api/v1/services/{}", escaped(&self.service));
+impl ExportArgs {
+    /// Downloads the service and writes the file.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let path = format!("/api/v1/services/{}", percent_encode(&self.service));
         let service: ServiceDetail = client.get(&path).await?;
         let number = self.revision.unwrap_or(service.summary.revision);
         let Some(revision) = service.revisions.iter().find(|one| one.number == number) else {
@@ -88,20 +89,20 @@ impl Export {
         let target = self
             .output
             .unwrap_or_else(|| PathBuf::from(format!("{}.oci.tar", self.service)));
-        let half = Half::beside(&target)?;
-        let record = record(client, &self.service, number).await?;
+        let half = AtomicFile::create_beside(&target)?;
+        let record = fetch_record(client, &self.service, number).await?;
         let name = format!("{}:{number}", self.service);
-        let of = Named {
+        let of = ExportedImage {
             service: &self.service,
             image: &revision.image,
             name: &name,
             record,
         };
-        let mut out = Archive::new(BufWriter::new(&half.file));
-        copy(client, of, &mut out).await?;
-        let bytes = out.finish().with_context(|| half.failed())?;
-        half.publish()?;
-        let exported = Exported {
+        let mut out = LayoutWriter::new(BufWriter::new(&half.file));
+        copy_image(client, of, &mut out).await?;
+        let bytes = out.finish().with_context(|| half.error_context())?;
+        half.persist()?;
+        let exported = ExportSummary {
             service: self.service,
             revision: number,
             image: revision.image.clone(),
@@ -109,8 +110,8 @@ impl Export {
             bytes,
         };
         match format {
-            Format::Json => output::json(&exported),
-            Format::Table => output::line(&format!(
+            OutputFormat::Json => output::json(&exported),
+            OutputFormat::Table => output::line(&format!(
                 "{}: revision {number} of {} ({}), {}",
                 exported.path.display(),
                 exported.service,
@@ -121,15 +122,20 @@ impl Export {
     }
 }
 
-/// What of a revision is not in its image; none for who may not see it.
-async fn record(client: &Client, service: &str, number: u64) -> anyhow::Result<Option<Bytes>> {
-    let service = escaped(service);
+/// Downloads the record of a revision, which is not in its image; `None` if the caller may not see it.
+async fn fetch_record(
+    client: &DaemonClient,
+    service: &str,
+    number: u64,
+) -> anyhow::Result<Option<Bytes>> {
+    let service = percent_encode(service);
     let path = format!("/api/v1/services/{service}/record?revision={number}");
-    let answer = match client.send(Method::GET, &path, empty()).await {
+    let answer = match client.send(Method::GET, &path, empty_body()).await {
         Ok(answer) => answer,
-        Err(error) if Exit::of(&error) == Exit::Forbidden => {
-            output::complain(
-                "only the image is exported: how the service is started and limited is shown to who may deploy it; import needs that",
+        Err(error) if Exit::from_error(&error) == Exit::Forbidden => {
+            output::eprint_line(
+                "only the image is exported: start commands and limits, which an import needs, are shown to its \
+                    deployers only",
             );
             return Ok(None);
         }
@@ -142,38 +148,42 @@ async fn record(client: &Client, service: &str, number: u64) -> anyhow::Result<O
     }
 }
 
-/// What is written.
-struct Named<'a> {
+/// Image to be written.
+struct ExportedImage<'a> {
     service: &'a str,
     /// Digest of the manifest.
     image: &'a str,
-    /// The image's name in the archive.
+    /// Name of the image in the archive.
     name: &'a str,
     record: Option<Bytes>,
 }
 
-/// Writes an image and its record.
-async fn copy(client: &Client, of: Named<'_>, out: &mut Archive<impl Write>) -> anyhow::Result<()> {
-    let Named {
+/// Writes an image and its record to an archive.
+async fn copy_image(
+    client: &DaemonClient,
+    of: ExportedImage<'_>,
+    out: &mut LayoutWriter<impl Write>,
+) -> anyhow::Result<()> {
+    let ExportedImage {
         image,
         name,
         record,
         ..
     } = of;
-    let service = escaped(of.service);
-    let path = format!("/v2/{service}/manifests/{}", escaped(image));
-    let answer = client.send(Method::GET, &path, empty()).await?;
+    let service = percent_encode(of.service);
+    let path = format!("/v2/{service}/manifests/{}", percent_encode(image));
+    let answer = client.send(Method::GET, &path, empty_body()).await?;
     let limited = http_body_util::Limited::new(answer.into_body(), LARGEST_MANIFEST);
     let bytes = match limited.collect().await {
         Ok(collected) => collected.to_bytes(),
         Err(error) => bail!("the daemon did not send the manifest {image}: {error}"),
     };
-    let manifest: Manifest = serde_json::from_slice(&bytes)
+    let manifest: BlobManifest = serde_json::from_slice(&bytes)
         .with_context(|| format!("the manifest {image} cannot be read"))?;
     let mut annotations = json!({ "org.opencontainers.image.ref.name": name });
     let record = record.map(|record| {
-        let named = Descriptor {
-            digest: digest_of(&record),
+        let named = BlobDescriptor {
+            digest: sha256_digest(&record),
             size: record.len() as u64,
         };
         annotations[RECORD] = named.digest.clone().into();
@@ -189,44 +199,44 @@ async fn copy(client: &Client, of: Named<'_>, out: &mut Archive<impl Write>) -> 
             "annotations": annotations,
         }],
     });
-    out.file("oci-layout", br#"{"imageLayoutVersion":"1.0.0"}"#)?;
-    out.file("index.json", &serde_json::to_vec(&index)?)?;
-    let named = Descriptor {
+    out.write_file("oci-layout", br#"{"imageLayoutVersion":"1.0.0"}"#)?;
+    out.write_file("index.json", &serde_json::to_vec(&index)?)?;
+    let named = BlobDescriptor {
         digest: image.to_owned(),
         size: bytes.len() as u64,
     };
-    out.blob(&named, futures_util::stream::iter([Ok(bytes)]))
+    out.write_blob(&named, futures_util::stream::iter([Ok(bytes)]))
         .await?;
     if let Some((named, record)) = record {
-        out.blob(&named, futures_util::stream::iter([Ok(record)]))
+        out.write_blob(&named, futures_util::stream::iter([Ok(record)]))
             .await?;
     }
     let mut written = BTreeSet::new();
     for blob in std::iter::once(&manifest.config).chain(&manifest.layers) {
-        // Layers may be equal.
+        // Layers may be identical.
         if !written.insert(&blob.digest) {
             continue;
         }
-        let path = format!("/v2/{service}/blobs/{}", escaped(&blob.digest));
-        let answer = client.send(Method::GET, &path, empty()).await?;
+        let path = format!("/v2/{service}/blobs/{}", percent_encode(&blob.digest));
+        let answer = client.send(Method::GET, &path, empty_body()).await?;
         let length = answer.headers().get(header::CONTENT_LENGTH);
         let length = length.and_then(|length| length.to_str().ok()?.parse::<u64>().ok());
         ensure!(
             length.is_none_or(|length| length == blob.size),
-            "the daemon's blob {} is not of {} bytes, as the manifest says",
+            "the daemon's blob {} does not have the {} bytes that the manifest states",
             blob.digest,
             blob.size
         );
         let parts = BodyStream::new(answer.into_body()).map(|frame| {
-            let frame = frame.context("the daemon broke off its answer")?;
+            let frame = frame.context("the daemon's response was cut off")?;
             Ok(frame.into_data().unwrap_or_default())
         });
-        out.blob(blob, parts).await?;
+        out.write_blob(blob, parts).await?;
     }
     Ok(())
 }
 
-fn digest_of(bytes: &[u8]) -> String {
+fn sha256_digest(bytes: &[u8]) -> String {
     format!("sha256:{}", hex_digits(&Sha256::digest(bytes)))
 }
 
@@ -234,21 +244,21 @@ fn hex_digits(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// A tar archive that is written as its content comes.
-struct Archive<W: Write> {
+/// Writes a tar archive from streamed content.
+struct LayoutWriter<W: Write> {
     out: W,
     bytes: u64,
 }
 
-impl<W: Write> Archive<W> {
+impl<W: Write> LayoutWriter<W> {
     fn new(out: W) -> Self {
-        Archive { out, bytes: 0 }
+        LayoutWriter { out, bytes: 0 }
     }
 
-    /// A blob, whose digest and size are compared with what comes.
-    async fn blob(
+    /// Writes a blob and verifies its digest and size.
+    async fn write_blob(
         &mut self,
-        named: &Descriptor,
+        named: &BlobDescriptor,
         parts: impl Stream<Item = anyhow::Result<Bytes>>,
     ) -> anyhow::Result<()> {
         let digest = &named.digest;
@@ -256,9 +266,9 @@ impl<W: Write> Archive<W> {
         let hex = digest.strip_prefix("sha256:").unwrap_or_default();
         ensure!(
             hex.len() == 64 && hex.bytes().all(is_digit),
-            "the manifest names a blob {digest:?}, which is not sha256: and 64 digits"
+            "the manifest has an invalid digest {digest:?}: expected sha256: and 64 digits"
         );
-        self.begin(&format!("blobs/sha256/{hex}"), named.size)?;
+        self.begin_entry(&format!("blobs/sha256/{hex}"), named.size)?;
         let mut hash = Sha256::new();
         let mut came = 0;
         let mut parts = std::pin::pin!(parts);
@@ -281,19 +291,19 @@ impl<W: Write> Archive<W> {
         let found = hex_digits(&hash.finalize());
         ensure!(
             found == hex,
-            "what the daemon sent for {digest} has the digest sha256:{found}; nothing was written"
+            "the daemon's data for {digest} has the digest sha256:{found}; nothing was written"
         );
-        self.end(named.size)
+        self.pad_entry(named.size)
     }
 
-    /// A small file.
-    fn file(&mut self, name: &str, content: &[u8]) -> anyhow::Result<()> {
-        self.begin(name, content.len() as u64)?;
+    /// Writes a small file.
+    fn write_file(&mut self, name: &str, content: &[u8]) -> anyhow::Result<()> {
+        self.begin_entry(name, content.len() as u64)?;
         self.write(content)?;
-        self.end(content.len() as u64)
+        self.pad_entry(content.len() as u64)
     }
 
-    fn begin(&mut self, name: &str, size: u64) -> anyhow::Result<()> {
+    fn begin_entry(&mut self, name: &str, size: u64) -> anyhow::Result<()> {
         let mut head = tar::Header::new_ustar();
         head.set_path(name)?;
         head.set_size(size);
@@ -303,8 +313,8 @@ impl<W: Write> Archive<W> {
         self.write(head.as_bytes())
     }
 
-    /// Contents are filled up to whole blocks.
-    fn end(&mut self, size: u64) -> anyhow::Result<()> {
+    /// Pads the content to whole blocks.
+    fn pad_entry(&mut self, size: u64) -> anyhow::Result<()> {
         let over = size.next_multiple_of(BLOCK) - size;
         self.write(&[0; BLOCK as usize][..over as usize])
     }
@@ -312,12 +322,12 @@ impl<W: Write> Archive<W> {
     fn write(&mut self, bytes: &[u8]) -> anyhow::Result<()> {
         self.out
             .write_all(bytes)
-            .context("the archive cannot be written")?;
+            .context("cannot write the archive")?;
         self.bytes += bytes.len() as u64;
         Ok(())
     }
 
-    /// Two empty blocks end an archive; gives its length.
+    /// Writes the end of the archive, two empty blocks, and returns its length.
     fn finish(mut self) -> anyhow::Result<u64> {
         self.write(&[0; 2 * BLOCK as usize])?;
         self.out.flush()?;
@@ -334,18 +344,22 @@ mod tests {
     /// SHA-256 of `abc` (FIPS 180-2, appendix B.1).
     const ABC: &str = "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
 
-    async fn written(digest: &str, size: u64, parts: &[&'static str]) -> anyhow::Result<Vec<u8>> {
+    async fn export_blob(
+        digest: &str,
+        size: u64,
+        parts: &[&'static str],
+    ) -> anyhow::Result<Vec<u8>> {
         let mut bytes = Vec::new();
-        let mut out = Archive::new(&mut bytes);
-        out.file("oci-layout", b"{}")?;
+        let mut out = LayoutWriter::new(&mut bytes);
+        out.write_file("oci-layout", b"{}")?;
         let parts = parts
             .iter()
             .map(|part| Ok(Bytes::from_static(part.as_bytes())));
-        let named = Descriptor {
+        let named = BlobDescriptor {
             digest: digest.to_owned(),
             size,
         };
-        out.blob(
+        out.write_blob(
             &named,
             futures_util::stream::iter(parts.collect::<Vec<_>>()),
         )
@@ -357,7 +371,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_archive_is_one_that_others_read() {
-        let bytes = written(ABC, 3, &["a", "bc"]).await.expect("whole");
+        let bytes = export_blob(ABC, 3, &["a", "bc"]).await.expect("whole");
         let mut read = Vec::new();
         for entry in tar::Archive::new(&bytes[..]).entries().expect("a tar") {
             let mut entry = entry.expect("an entry");
@@ -385,7 +399,7 @@ mod tests {
             ("sha256:../../../etc/passwd", 3, &["abc"], "64 digits"),
             ("sha512:00", 3, &["abc"], "64 digits"),
         ] {
-            let refused = written(digest, size, parts).await.expect_err(expected);
+            let refused = export_blob(digest, size, parts).await.expect_err(expected);
             assert!(refused.to_string().contains(expected), "{refused}");
         }
     }

@@ -1,32 +1,34 @@
-//! `fit`: whether one more servant of a service would fit.
+//! `fit`: predicts whether another servant of a service would fit.
 
 use api::Size;
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
-use crate::stated::{StatedFlags, query};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
+use crate::stated::{StatedFlags, to_query};
 
-/// Say whether one more robot would find room, what it would cost the others, and how many more would fit.
+/// Predict whether the server has capacity for another robot, what it would cost the others, and how many more would
+/// fit.
 #[derive(Debug, clap::Args)]
-pub struct Fit {
-    /// The service.
+pub struct FitArgs {
+    /// Service that the robot would use.
     service: String,
     #[command(flatten)]
     stated: StatedFlags,
 }
 
-impl Fit {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl FitArgs {
+    /// Sends the request and prints the prediction.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let fit: api::Fit = client.get(&self.path()?).await?;
         match format {
-            Format::Json => output::json(&fit),
-            Format::Table => {
+            OutputFormat::Json => output::json(&fit),
+            OutputFormat::Table => {
                 print(&self.service, &fit)?;
-                let stated = self.stated.stated()?;
+                let stated = self.stated.to_stated()?;
                 if stated.sla.rrt.is_some() && fit.expected.is_none() {
                     output::line(&format!(
-                        "how long its requests would take is not known: no row of the dictionary says so, and nobody's requests were measured; measure with: cloudroidctl calibrate {}",
+                        "unknown how long its requests would take: the SLA table has no entry for it, and no robot's \
+                            requests were measured; measure with: cloudroidctl calibrate {}",
                         self.service
                     ))?;
                 }
@@ -36,20 +38,20 @@ impl Fit {
     }
 
     fn path(&self) -> anyhow::Result<String> {
-        let query = query(&self.stated.stated()?);
+        let query = to_query(&self.stated.to_stated()?);
         Ok(format!(
             "/api/v1/services/{}/fit{query}",
-            escaped(&self.service)
+            percent_encode(&self.service)
         ))
     }
 }
 
 fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
-    output::line(&in_words(service, fit))?;
+    output::line(&fit_in_words(service, fit))?;
     if fit.costs.is_empty() {
         return Ok(());
     }
-    output::line("\nif it used all of that, these would have less than they use now")?;
+    output::line("\nif it used all of that, these servants would get less than they use now")?;
     let mut table = Table::new(&[
         "SERVANT", "ROBOT", "CORES", "LEFT", "RRT", "THEN", "ACCEPTS",
     ]);
@@ -67,7 +69,7 @@ fn print(service: &str, fit: &api::Fit) -> anyhow::Result<()> {
     table.print()
 }
 
-/// A time in whole milliseconds; a dash where it is not known.
+/// Formats a time in whole milliseconds; a dash if it is unknown.
 fn time(seconds: Option<f64>) -> String {
     seconds.map_or_else(
         || "-".to_owned(),
@@ -75,20 +77,20 @@ fn time(seconds: Option<f64>) -> String {
     )
 }
 
-/// What is lacking.
-fn lacking(cpus: f64, memory: Size) -> String {
+/// Formats missing resources.
+fn lacking_in_words(cpus: f64, memory: Size) -> String {
     let cores = (cpus > 0.0).then(|| format!("{cpus} cores"));
     let memory = (memory > Size(0)).then(|| format!("{memory} of memory"));
     let all: Vec<String> = cores.into_iter().chain(memory).collect();
-    format!("{} are lacking", all.join(" and "))
+    format!("lacking {}", all.join(" and "))
 }
 
-/// The answer in sentences.
-fn in_words(service: &str, fit: &api::Fit) -> String {
+/// Formats the prediction as sentences.
+fn fit_in_words(service: &str, fit: &api::Fit) -> String {
     let expected = fit.expected.as_ref().map(|expected| {
         let rrt = time(Some(expected.rrt));
         format!(
-            "\n19 of 20 of its requests would take up to {rrt} ({})",
+            "\n95 % of its requests would take up to {rrt} ({})",
             expected.from
         )
     });
@@ -99,42 +101,42 @@ fn in_words(service: &str, fit: &api::Fit) -> String {
             more => format!("{more} servants"),
         };
         return format!(
-            "robots share {servants} of {service}; one more robot needs no room{expected}"
+            "robots share {servants} of {service}; one more robot needs no more capacity{expected}"
         );
     }
     let wanted = format!(
-        "one more servant of {service} is promised {} cores and {} of memory",
+        "one more servant of {service} reserves {} cores and {} of memory",
         fit.cpus, fit.memory
     );
     let lacks = fit.lacking_cpus > 0.0 || fit.lacking_memory > Size(0);
     let now = match (&fit.stalled, fit.now) {
         (Some(why), _) => format!("it would wait: {why}"),
-        (None, true) => "it would be started at once".to_owned(),
+        (None, true) => "it would start at once".to_owned(),
         (None, false) if fit.full => format!(
-            "it would be refused: {} wait already, and no further one may ([capacity] queue)",
+            "it would be refused: the queue is full with {} robots ([capacity] queue)",
             fit.waiting
         ),
         (None, false) if lacks => format!(
-            "it would wait: {}, and {} wait already",
-            lacking(fit.lacking_cpus, fit.lacking_memory),
+            "it would wait: {}; {} already waiting",
+            lacking_in_words(fit.lacking_cpus, fit.lacking_memory),
             fit.waiting
         ),
         (None, false) => format!(
-            "it would be started when these have ended, which are idle: {}",
+            "it would start once these idle servants have ended: {}",
             fit.ends.join(", ")
         ),
     };
     let answer = match &fit.never {
-        Some(why) => format!("it would be refused, now and later: {why}"),
+        Some(why) => format!("it would always be refused: {why}"),
         None => now,
     };
     let more = match fit.more {
-        None => "as many as one likes would fit".to_owned(),
-        Some(0) => "none would fit beside those that are in use".to_owned(),
+        None => "any number would fit".to_owned(),
+        Some(0) => "none would fit beside the servants in use".to_owned(),
         Some(more) => format!(
             "{more} would fit, {} would not: {}",
             more.saturating_add(1),
-            lacking(fit.beyond_cpus, fit.beyond_memory)
+            lacking_in_words(fit.beyond_cpus, fit.beyond_memory)
         ),
     };
     format!(
@@ -197,7 +199,7 @@ mod tests {
         let expected = api::Fit {
             expected: Some(api::Expected {
                 rrt: 0.11,
-                from: "row 3 of the dictionary".into(),
+                from: "entry 3 of the SLA table".into(),
             }),
             ..fit()
         };
@@ -216,31 +218,31 @@ mod tests {
         for (fit, words) in [
             (
                 expected,
-                "1.5 cores are lacking\n19 of 20 of its requests would take up to 110 ms (row 3",
+                "lacking 1.5 cores\n95 % of its requests would take up to 110 ms (entry 3",
             ),
             (
                 shared,
-                "robots share 2 servants of a; one more robot needs no room\n19 of 20",
+                "robots share 2 servants of a; one more robot needs no more capacity\n95 %",
             ),
-            (none_yet, "one more servant of a is promised"),
+            (none_yet, "one more servant of a reserves"),
             (
                 fit(),
                 "1 cores and 64M of memory; 0.5 cores and 1G are free",
             ),
             (
                 fit(),
-                "idle: a-1\n1 would fit, 2 would not: 1.5 cores are lacking",
+                "ended: a-1\n1 would fit, 2 would not: lacking 1.5 cores",
             ),
             (
                 lacking,
-                "0.5 cores are lacking, and 2 wait already\nnone would fit",
+                "lacking 0.5 cores; 2 already waiting\nnone would fit",
             ),
-            (never, "it would be refused, now and later: 64 cores"),
-            (full, "it would be refused: 2 wait already"),
-            (now, "at once\nas many"),
+            (never, "it would always be refused: 64 cores"),
+            (full, "it would be refused: the queue is full with 2"),
+            (now, "at once\nany number"),
             (stalled, "it would wait: this machine swaps"),
         ] {
-            let said = in_words("a", &fit);
+            let said = fit_in_words("a", &fit);
             assert!(said.contains(words), "{said}");
         }
     }
@@ -251,7 +253,7 @@ mod tests {
         #[derive(Parser)]
         struct Line {
             #[command(flatten)]
-            fit: Fit,
+            fit: FitArgs,
         }
         let line = [
             "fit",

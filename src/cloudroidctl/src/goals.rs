@@ -1,34 +1,34 @@
-//! `goals`: what became of the goals of a servant's actions.
+//! `goals`: the goals of a servant's actions and their outcomes.
 
 use api::goals::Goal;
 
-use crate::client::{Client, escaped};
+use crate::client::{DaemonClient, percent_encode};
 use crate::inside;
-use crate::output::{self, Format, Table};
+use crate::output::{self, OutputFormat, Table};
 
-/// Print what became of the goals that a servant's actions were sent, the newest first.
+/// Print the goals that were sent to a servant's actions and their outcomes, newest first.
 #[derive(Debug, clap::Args)]
-pub struct Goals {
-    /// The servant's id, or the name of a service that has one servant.
+pub struct GoalsArgs {
+    /// Id of the servant, or name of a service that has one servant.
     servant: String,
 }
 
-impl Goals {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let servant = inside::servant(client, &self.servant).await?;
-        let path = format!("/api/v1/servants/{}/goals", escaped(&servant));
+impl GoalsArgs {
+    /// Sends the request and prints the goals.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let servant = inside::resolve_servant(client, &self.servant).await?;
+        let path = format!("/api/v1/servants/{}/goals", percent_encode(&servant));
         let goals: Vec<Goal> = client.get(&path).await?;
-        if format == Format::Json {
+        if format == OutputFormat::Json {
             return output::json(&goals);
         }
         if goals.is_empty() {
-            output::complain("its actions were sent no goal yet, or it has none");
+            output::eprint_line("no goals yet, or the service has no actions");
             return Ok(());
         }
         let mut table = Table::new(&["ACTION", "SENT BY", "AT", "OUTCOME", "AFTER", "SAID"]);
         for goal in goals {
-            // Of one of which only the end was heard nobody knows.
+            // The duration is unknown if only the end of the goal was observed.
             let took = goal.ended.map(|ended| ended.saturating_sub(goal.began));
             let took = took.filter(|took| *took > 0);
             table.row([

@@ -1,4 +1,4 @@
-//! A servant's ROS from inside, by Foxglove's WebSocket protocol: its messages as the bytes that they are.
+//! Access to a servant's ROS topics by Foxglove's WebSocket protocol, with serialized messages.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -10,20 +10,20 @@ use foxglove::ws_protocol::server::ServerMessage;
 use futures_util::{SinkExt, StreamExt};
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
-use recording::Format;
+use recording::RecordingFormat;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 
-use crate::client::{Client, escaped};
+use crate::client::{DaemonClient, percent_encode};
 
-/// Of the daemon's, see docs/page.md.
+/// Subprotocol of the daemon, see docs/page.md.
 const PROTOCOL: &str = "foxglove.sdk.v1";
 
-/// The id of the servant that is named by its id, or by a service that has no other.
-pub async fn servant(client: &Client, named: &str) -> anyhow::Result<String> {
+/// Returns the id of the servant with this id, or of the only servant of the service with this name.
+pub async fn resolve_servant(client: &DaemonClient, named: &str) -> anyhow::Result<String> {
     let servants: Vec<Servant> = client.get("/api/v1/servants").await?;
     if servants.iter().any(|servant| servant.id == named) {
         return Ok(named.to_owned());
@@ -34,7 +34,7 @@ pub async fn servant(client: &Client, named: &str) -> anyhow::Result<String> {
         .collect();
     match of_service.as_slice() {
         [only] => Ok(only.id.clone()),
-        // The daemon says what exists.
+        // The daemon's error lists the existing servants.
         [] => Ok(named.to_owned()),
         several => {
             let ids: Vec<&str> = several.iter().map(|servant| servant.id.as_str()).collect();
@@ -47,53 +47,58 @@ pub async fn servant(client: &Client, named: &str) -> anyhow::Result<String> {
     }
 }
 
-/// One connection.
-pub struct Inside<S = TokioIo<Upgraded>> {
+/// A connection to a servant.
+pub struct FoxgloveSession<S = TokioIo<Upgraded>> {
     socket: WebSocketStream<S>,
-    /// Which ROS the servant's messages are of.
-    pub format: Format,
-    /// What has come while something was sent, and when.
+    /// Message format of the servant's ROS version.
+    pub format: RecordingFormat,
+    /// Messages that arrived while something was sent, and when.
     ahead: VecDeque<(Instant, Message)>,
 }
 
-impl Inside {
-    /// Attaches to a servant; `depth` messages of each topic wait in the daemon.
-    pub async fn attach(client: &Client, servant: &str, depth: usize) -> anyhow::Result<Self> {
-        let path = format!("/foxglove/{}?depth={depth}", escaped(servant));
-        let socket = client.socket(&path, PROTOCOL).await?;
-        let mut inside = Self::of(socket);
-        inside.greeted().await?;
+impl FoxgloveSession {
+    /// Attaches to a servant; the daemon queues up to `depth` messages of each topic.
+    pub async fn attach(
+        client: &DaemonClient,
+        servant: &str,
+        depth: usize,
+    ) -> anyhow::Result<Self> {
+        let path = format!("/foxglove/{}?depth={depth}", percent_encode(servant));
+        let socket = client.connect_websocket(&path, PROTOCOL).await?;
+        let mut inside = Self::from_socket(socket);
+        inside.read_greeting().await?;
         Ok(inside)
     }
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
-    fn of(socket: WebSocketStream<S>) -> Self {
+impl<S: AsyncRead + AsyncWrite + Unpin> FoxgloveSession<S> {
+    fn from_socket(socket: WebSocketStream<S>) -> Self {
         Self {
             socket,
-            format: Format::default(),
+            format: RecordingFormat::default(),
             ahead: VecDeque::new(),
         }
     }
 
-    /// Takes the daemon's first message, which says how messages are written.
-    async fn greeted(&mut self) -> anyhow::Result<()> {
+    /// Reads the daemon's first message, which announces the message encoding.
+    async fn read_greeting(&mut self) -> anyhow::Result<()> {
         let Some(message) = self.next().await? else {
             bail!("the servant has ended");
         };
-        match read(&message) {
+        match parse_message(&message) {
             Some(ServerMessage::ServerInfo(told)) => {
                 let mut encodings = told.supported_encodings.iter();
-                let known = encodings.find_map(|encoding| Format::of_encoding(encoding));
+                let known = encodings.find_map(|encoding| RecordingFormat::from_encoding(encoding));
                 self.format = known.unwrap_or_default();
                 Ok(())
             }
-            _ => bail!("the daemon does not greet as the protocol {PROTOCOL} has it"),
+            _ => bail!("the daemon's first message is not that of the protocol {PROTOCOL}"),
         }
     }
 
-    /// Sends one message. What comes meanwhile is taken, and given by [`next`](Self::next): the daemon takes nothing more of who
-    /// takes nothing, so that two big messages that meet would wait for each other.
+    /// Sends one message. Incoming messages are received meanwhile and returned by [`next`](Self::next): the daemon
+    /// stops reading from a client that does not read, so two large messages in opposite directions would block each
+    /// other.
     pub async fn send(&mut self, message: impl Into<Message>) -> anyhow::Result<()> {
         let mut waiting = Some(message.into());
         poll_fn(|cx| self.poll_send(cx, &mut waiting)).await
@@ -108,7 +113,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
         while let Poll::Ready(came) = self.socket.poll_next_unpin(cx) {
             match came {
                 Some(Ok(Message::Close(close))) => {
-                    let over = ended(close).map(|()| anyhow!("the servant has ended"));
+                    let over = close_outcome(close).map(|()| anyhow!("the servant has ended"));
                     return Poll::Ready(over.and_then(Err));
                 }
                 Some(Ok(message)) => self.ahead.push_back((Instant::now(), message)),
@@ -127,16 +132,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
             .map_err(|error| anyhow::Error::new(error).context(BROKEN))
     }
 
-    /// The next that is told, as it came; none where the servant has ended.
+    /// Returns the next message; `None` if the servant has ended.
     ///
     /// # Errors
     /// The connection was lost, or closed for another reason.
     pub async fn next(&mut self) -> anyhow::Result<Option<Message>> {
-        Ok(self.next_at().await?.map(|(_, message)| message))
+        Ok(self.next_timed().await?.map(|(_, message)| message))
     }
 
-    /// The same, and when it came.
-    pub async fn next_at(&mut self) -> anyhow::Result<Option<(Instant, Message)>> {
+    /// Returns the next message and the time of its arrival.
+    pub async fn next_timed(&mut self) -> anyhow::Result<Option<(Instant, Message)>> {
         loop {
             let came = match self.ahead.pop_front() {
                 Some((at, message)) => Some((at, Ok(message))),
@@ -149,7 +154,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
                 Some((at, Ok(message @ (Message::Text(_) | Message::Binary(_))))) => {
                     return Ok(Some((at, message)));
                 }
-                Some((_, Ok(Message::Close(close)))) => return ended(close).map(|()| None),
+                Some((_, Ok(Message::Close(close)))) => return close_outcome(close).map(|()| None),
                 Some((_, Ok(_))) => {}
                 Some((_, Err(error))) => {
                     return Err(error).context("the daemon broke the connection");
@@ -159,8 +164,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
         }
     }
 
-    /// Leaves once the daemon has taken all that was sent; what it says of that.
-    pub async fn leave(mut self) -> Vec<Message> {
+    /// Closes the connection after the daemon has received everything; returns its last messages.
+    pub async fn close(mut self) -> Vec<Message> {
         let _ = self.socket.close(None).await;
         let ahead = self.ahead.drain(..);
         let mut last: Vec<Message> = ahead.map(|(_, message)| message).collect();
@@ -171,17 +176,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Inside<S> {
     }
 }
 
-/// What a goodbye of the daemon says: nothing where the servant has ended.
-fn ended(close: Option<CloseFrame>) -> anyhow::Result<()> {
+/// Converts a close frame of the daemon: `Ok` if the servant has ended.
+fn close_outcome(close: Option<CloseFrame>) -> anyhow::Result<()> {
     match close {
         Some(close) if u16::from(close.code) == 1012 => Ok(()),
-        Some(close) => Err(anyhow!("the daemon ended it: {}", close.reason)),
+        Some(close) => Err(anyhow!(
+            "the daemon closed the connection: {}",
+            close.reason
+        )),
         None => bail!("the daemon broke the connection"),
     }
 }
 
-/// What a message says; none where it is nothing that is known here.
-pub fn read(message: &Message) -> Option<ServerMessage<'_>> {
+/// Parses a message of the daemon; `None` if its type is unknown here.
+pub fn parse_message(message: &Message) -> Option<ServerMessage<'_>> {
     ServerMessage::try_from(message).ok()
 }
 
@@ -199,9 +207,9 @@ mod tests {
         const BIG: usize = 1 << 20;
         let (ours, theirs) = tokio::io::duplex(4096);
         let socket = WebSocketStream::from_raw_socket(ours, Role::Client, None).await;
-        let mut inside = Inside::of(socket);
+        let mut inside = FoxgloveSession::from_socket(socket);
         let mut daemon = WebSocketStream::from_raw_socket(theirs, Role::Server, None).await;
-        // It reads nothing before all that it sends is taken.
+        // It reads nothing until everything it sends has been received.
         let daemon = async move {
             let sent = daemon.send(Message::Binary(vec![7; BIG].into())).await;
             sent.expect("taken");
@@ -222,7 +230,7 @@ mod tests {
     async fn a_servant_that_ends_while_it_is_written_to_is_told() {
         let (ours, theirs) = tokio::io::duplex(64);
         let socket = WebSocketStream::from_raw_socket(ours, Role::Client, None).await;
-        let mut inside = Inside::of(socket);
+        let mut inside = FoxgloveSession::from_socket(socket);
         let mut daemon = WebSocketStream::from_raw_socket(theirs, Role::Server, None).await;
         let over = CloseFrame {
             code: 1012.into(),

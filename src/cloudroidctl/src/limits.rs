@@ -1,43 +1,44 @@
-//! Limits as flags, of `push` and `set`, and caps.
+//! Flags for limits, of `push` and `set`, and for caps.
 
 use api::{Caps, CpuSet, Limits, Size};
 
-/// What a servant may use.
+/// Resource limits of a servant.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct LimitFlags {
-    /// Cores that a servant may use, and is promised.
+    /// CPU limit in cores, which is also promised.
     #[arg(long, value_name = "N", value_parser = cores)]
     cpus: Option<f64>,
-    /// Its share when cores are scarce, 1 to 10000; 100 by default.
+    /// CPU weight when cores are scarce, 1 to 10000 (default: 100).
     #[arg(long, value_name = "N")]
     cpu_weight: Option<u64>,
-    /// The cores it may run on, such as 0-3,6; on cgroup v1 only a servant that starts with some.
+    /// CPUs that the servant may run on, such as 0-3,6; on cgroup v1 it can be changed only for a servant that was
+    /// started with it.
     #[arg(long, value_name = "CORES")]
     cpuset: Option<CpuSet>,
-    /// Memory that a servant may use, and is promised, such as 512M.
+    /// Memory limit, which is also promised, such as 512M.
     #[arg(long, value_name = "SIZE")]
     memory: Option<Size>,
-    /// Memory above which it is slowed down and made to give back (cgroup v2).
+    /// Memory above which the servant is slowed down and its memory reclaimed (cgroup v2).
     #[arg(long, value_name = "SIZE")]
     memory_high: Option<Size>,
-    /// Processes and threads.
+    /// Largest number of processes and threads.
     #[arg(long, value_name = "N")]
     pids: Option<u64>,
-    /// Bytes a second that it may read from disk, such as 10M.
+    /// Disk read rate in bytes per second, such as 10M.
     #[arg(long, value_name = "SIZE")]
     io_read: Option<Size>,
-    /// Bytes a second that it may write to disk.
+    /// Disk write rate in bytes per second.
     #[arg(long, value_name = "SIZE")]
     io_write: Option<Size>,
 }
 
-/// The most that robots may ask for.
+/// Largest resources that robots may request.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct CapFlags {
-    /// Cores that a robot may ask for at most.
+    /// Largest number of cores that a robot may request.
     #[arg(long, value_name = "N", value_parser = cores)]
     max_cpus: Option<f64>,
-    /// Memory that a robot may ask for at most, such as 2G.
+    /// Largest amount of memory that a robot may request, such as 2G.
     #[arg(long, value_name = "SIZE")]
     max_memory: Option<Size>,
 }

@@ -1,5 +1,5 @@
-//! `cloudroidctl`: what a deployer types. Every verb is one file and speaks only HTTP with the daemon; its doc
-//! comments are its help.
+//! `cloudroidctl`: the command line for deployers. Each command is one file and uses only the daemon's HTTP API; its
+//! doc comments are its help.
 
 #![forbid(unsafe_code)]
 
@@ -55,11 +55,11 @@ use std::process::ExitCode;
 use api::Problem;
 use clap::{Parser, Subcommand};
 
-use client::Client;
+use client::DaemonClient;
 use exit::Exit;
-use output::Format;
+use output::OutputFormat;
 
-/// Robot packages as services: push them, watch them, end them.
+/// Manage ROS packages as services: push, observe and end them.
 #[derive(Debug, Parser)]
 #[command(
     name = "cloudroidctl",
@@ -68,12 +68,12 @@ use output::Format;
     propagate_version = true,
     after_help = exit::table()
 )]
-struct Arguments {
-    /// The daemon: https://HOST:PORT, http://HOST:PORT, or unix:PATH of its socket. By default the socket below CLOUDROID_HOME, that of
-    /// your own or of the installed daemon, or http://127.0.0.1:9090 where there is none.
+struct CtlArguments {
+    /// Address of the daemon: https://HOST:PORT, http://HOST:PORT, or unix:PATH of its socket. Default: the socket in
+    /// CLOUDROID_HOME, of your own or of the installed daemon, otherwise http://127.0.0.1:9090.
     #[arg(long, global = true, env = "CLOUDROID_SERVER", value_name = "URL")]
     server: Option<String>,
-    /// Bearer token; needed over TCP where the daemon has tokens configured.
+    /// Bearer token; required over TCP if the daemon has tokens configured.
     #[arg(
         long,
         global = true,
@@ -82,57 +82,57 @@ struct Arguments {
         hide_env_values = true
     )]
     token: Option<String>,
-    /// How to print: for people or for programs.
-    #[arg(long, global = true, value_enum, default_value_t = Format::Table)]
-    format: Format,
+    /// Output format.
+    #[arg(long, global = true, value_enum, default_value_t = OutputFormat::Table)]
+    format: OutputFormat,
     #[command(subcommand)]
-    verb: Verb,
+    verb: CtlCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum Verb {
-    Push(Box<push::Push>),
-    Services(services::Services),
-    Servants(servants::Servants),
-    Top(top::Top),
-    Logs(logs::Logs),
-    Record(record::Record),
-    Replay(replay::Replay),
-    Recordings(recordings::Recordings),
-    Topics(published::Published),
-    Goals(goals::Goals),
-    Events(events::Events),
-    Set(set::Set),
-    Shadow(shadow::Shadow),
-    Sla(sla::Sla),
-    Stop(stop::Stop),
-    Rm(rm::Rm),
-    Rollback(rollback::Rollback),
-    Diff(diff::Diff),
-    Export(export::Export),
-    Import(Box<import::Import>),
-    Rollout(rollout::Rollout),
-    Stub(stub::Stub),
-    Try(Box<trial::Try>),
-    Calibrate(Box<calibrate::Calibrate>),
-    Eval(Box<eval::Eval>),
-    Explain(explain::Explain),
-    Fit(fit::Fit),
-    Account(account::Accounts),
-    Token(token::Tokens),
-    Pair(pair::Pair),
-    Unpair(pair::Unpair),
-    Audit(audit::Audit),
-    Policy(policy::Policy),
-    Trust(trust::TrustServer),
-    Status(status::Status),
-    Doctor(doctor::Doctor),
-    Completions(manual::Completions),
-    Man(manual::Man),
+enum CtlCommand {
+    Push(Box<push::PushArgs>),
+    Services(services::ServicesArgs),
+    Servants(servants::ServantsArgs),
+    Top(top::TopArgs),
+    Logs(logs::LogsArgs),
+    Record(record::RecordArgs),
+    Replay(replay::ReplayArgs),
+    Recordings(recordings::RecordingsArgs),
+    Topics(published::TopicsArgs),
+    Goals(goals::GoalsArgs),
+    Events(events::EventsArgs),
+    Set(set::SetArgs),
+    Shadow(shadow::ShadowArgs),
+    Sla(sla::SlaArgs),
+    Stop(stop::StopArgs),
+    Rm(rm::RmArgs),
+    Rollback(rollback::RollbackArgs),
+    Diff(diff::DiffArgs),
+    Export(export::ExportArgs),
+    Import(Box<import::ImportArgs>),
+    Rollout(rollout::RolloutArgs),
+    Stub(stub::StubArgs),
+    Try(Box<trial::TryArgs>),
+    Calibrate(Box<calibrate::CalibrateArgs>),
+    Eval(Box<eval::EvalArgs>),
+    Explain(explain::ExplainArgs),
+    Fit(fit::FitArgs),
+    Account(account::AccountArgs),
+    Token(token::TokenArgs),
+    Pair(pair::PairArgs),
+    Unpair(pair::UnpairArgs),
+    Audit(audit::AuditArgs),
+    Policy(policy::PolicyArgs),
+    Trust(trust::TrustArgs),
+    Status(status::StatusArgs),
+    Doctor(doctor::DoctorArgs),
+    Completions(manual::CompletionsArgs),
+    Man(manual::ManArgs),
 }
 
 fn main() -> ExitCode {
-    let arguments = Arguments::parse();
+    let arguments = CtlArguments::parse();
     let runtime = match tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
@@ -144,83 +144,83 @@ fn main() -> ExitCode {
         }
     };
     let outcome = runtime.block_on(run(arguments));
-    // A read of standard input or of a directory must not hold up the end.
+    // A pending read of standard input or a directory must not delay the exit.
     runtime.shutdown_background();
     match outcome {
         Ok(()) => Exit::Done.into(),
         Err(error) if output::is_closed_pipe(&error) => Exit::Done.into(),
         Err(error) => {
-            complain(&error);
-            Exit::of(&error).into()
+            print_error(&error);
+            Exit::from_error(&error).into()
         }
     }
 }
 
-async fn run(arguments: Arguments) -> anyhow::Result<()> {
-    // These are asked for while a package is made, where there is no daemon.
+async fn run(arguments: CtlArguments) -> anyhow::Result<()> {
+    // These run while a package is built, where there is no daemon.
     let arguments = match arguments.verb {
-        Verb::Completions(verb) => return verb.run::<Arguments>(),
-        Verb::Man(verb) => return verb.run::<Arguments>(),
-        verb => Arguments { verb, ..arguments },
+        CtlCommand::Completions(verb) => return verb.run::<CtlArguments>(),
+        CtlCommand::Man(verb) => return verb.run::<CtlArguments>(),
+        verb => CtlArguments { verb, ..arguments },
     };
-    let client = Client::new(arguments.server.as_deref(), arguments.token)?;
+    let client = DaemonClient::new(arguments.server.as_deref(), arguments.token)?;
     let format = arguments.format;
     match arguments.verb {
-        Verb::Push(verb) => verb.run(&client, format).await,
-        Verb::Services(verb) => verb.run(&client, format).await,
-        Verb::Servants(verb) => verb.run(&client, format).await,
-        Verb::Top(verb) => verb.run(&client, format).await,
-        Verb::Logs(verb) => verb.run(&client, format).await,
-        Verb::Record(verb) => verb.run(&client, format).await,
-        Verb::Replay(verb) => verb.run(&client, format).await,
-        Verb::Recordings(verb) => verb.run(&client, format).await,
-        Verb::Topics(verb) => verb.run(&client, format).await,
-        Verb::Goals(verb) => verb.run(&client, format).await,
-        Verb::Events(verb) => verb.run(&client, format).await,
-        Verb::Set(verb) => verb.run(&client, format).await,
-        Verb::Shadow(verb) => verb.run(&client, format).await,
-        Verb::Sla(verb) => verb.run(&client, format).await,
-        Verb::Stop(verb) => verb.run(&client, format).await,
-        Verb::Rm(verb) => verb.run(&client, format).await,
-        Verb::Rollback(verb) => verb.run(&client, format).await,
-        Verb::Diff(verb) => verb.run(&client, format).await,
-        Verb::Export(verb) => verb.run(&client, format).await,
-        Verb::Import(verb) => verb.run(&client, format).await,
-        Verb::Rollout(verb) => verb.run(&client, format).await,
-        Verb::Stub(verb) => verb.run(&client, format).await,
-        Verb::Try(verb) => verb.run(&client, format).await,
-        Verb::Calibrate(verb) => verb.run(&client, format).await,
-        Verb::Eval(verb) => verb.run(&client, format).await,
-        Verb::Explain(verb) => verb.run(&client, format).await,
-        Verb::Fit(verb) => verb.run(&client, format).await,
-        Verb::Pair(verb) => verb.run(&client, format).await,
-        Verb::Unpair(verb) => verb.run(&client, format).await,
-        Verb::Account(verb) => verb.run(&client, format).await,
-        Verb::Token(verb) => verb.run(&client, format).await,
-        Verb::Audit(verb) => verb.run(&client, format).await,
-        Verb::Policy(verb) => verb.run(&client, format).await,
-        Verb::Trust(verb) => verb.run(),
-        Verb::Status(verb) => verb.run(&client, format).await,
-        Verb::Doctor(verb) => verb.run(&client, format).await,
-        Verb::Completions(_) | Verb::Man(_) => Ok(()),
+        CtlCommand::Push(verb) => verb.run(&client, format).await,
+        CtlCommand::Services(verb) => verb.run(&client, format).await,
+        CtlCommand::Servants(verb) => verb.run(&client, format).await,
+        CtlCommand::Top(verb) => verb.run(&client, format).await,
+        CtlCommand::Logs(verb) => verb.run(&client, format).await,
+        CtlCommand::Record(verb) => verb.run(&client, format).await,
+        CtlCommand::Replay(verb) => verb.run(&client, format).await,
+        CtlCommand::Recordings(verb) => verb.run(&client, format).await,
+        CtlCommand::Topics(verb) => verb.run(&client, format).await,
+        CtlCommand::Goals(verb) => verb.run(&client, format).await,
+        CtlCommand::Events(verb) => verb.run(&client, format).await,
+        CtlCommand::Set(verb) => verb.run(&client, format).await,
+        CtlCommand::Shadow(verb) => verb.run(&client, format).await,
+        CtlCommand::Sla(verb) => verb.run(&client, format).await,
+        CtlCommand::Stop(verb) => verb.run(&client, format).await,
+        CtlCommand::Rm(verb) => verb.run(&client, format).await,
+        CtlCommand::Rollback(verb) => verb.run(&client, format).await,
+        CtlCommand::Diff(verb) => verb.run(&client, format).await,
+        CtlCommand::Export(verb) => verb.run(&client, format).await,
+        CtlCommand::Import(verb) => verb.run(&client, format).await,
+        CtlCommand::Rollout(verb) => verb.run(&client, format).await,
+        CtlCommand::Stub(verb) => verb.run(&client, format).await,
+        CtlCommand::Try(verb) => verb.run(&client, format).await,
+        CtlCommand::Calibrate(verb) => verb.run(&client, format).await,
+        CtlCommand::Eval(verb) => verb.run(&client, format).await,
+        CtlCommand::Explain(verb) => verb.run(&client, format).await,
+        CtlCommand::Fit(verb) => verb.run(&client, format).await,
+        CtlCommand::Pair(verb) => verb.run(&client, format).await,
+        CtlCommand::Unpair(verb) => verb.run(&client, format).await,
+        CtlCommand::Account(verb) => verb.run(&client, format).await,
+        CtlCommand::Token(verb) => verb.run(&client, format).await,
+        CtlCommand::Audit(verb) => verb.run(&client, format).await,
+        CtlCommand::Policy(verb) => verb.run(&client, format).await,
+        CtlCommand::Trust(verb) => verb.run(),
+        CtlCommand::Status(verb) => verb.run(&client, format).await,
+        CtlCommand::Doctor(verb) => verb.run(&client, format).await,
+        CtlCommand::Completions(_) | CtlCommand::Man(_) => Ok(()),
     }
 }
 
-/// What went wrong, what explains it, and what to do.
-fn complain(error: &anyhow::Error) {
+/// Prints an error with its log, its alternatives and the next step.
+fn print_error(error: &anyhow::Error) {
     let Some(problem) = error.downcast_ref::<Problem>() else {
-        output::complain(&format!("error: {error:#}"));
+        output::eprint_line(&format!("error: {error:#}"));
         return;
     };
     for line in &problem.log {
-        output::complain(&format!("  | {line}"));
+        output::eprint_line(&format!("  | {line}"));
     }
-    output::complain(&format!("error: {problem}"));
+    output::eprint_line(&format!("error: {problem}"));
     if !problem.exists.is_empty() {
-        output::complain(&format!("there are: {}", problem.exists.join(", ")));
+        output::eprint_line(&format!("available: {}", problem.exists.join(", ")));
     }
     if let Some(next) = &problem.next {
-        output::complain(&format!("next: {next}"));
+        output::eprint_line(&format!("next: {next}"));
     }
 }
 
@@ -231,13 +231,13 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
-        Arguments::command().debug_assert();
+        CtlArguments::command().debug_assert();
     }
 
     #[test]
     fn every_verb_explains_itself() {
         use clap::CommandFactory;
-        for verb in Arguments::command().get_subcommands() {
+        for verb in CtlArguments::command().get_subcommands() {
             assert!(
                 verb.get_about().is_some(),
                 "{} has no help",
@@ -261,8 +261,8 @@ mod tests {
             ["cloudroidctl", "status", "--format", "json"],
         ] {
             assert_eq!(
-                Arguments::try_parse_from(line).expect("valid").format,
-                Format::Json
+                CtlArguments::try_parse_from(line).expect("valid").format,
+                OutputFormat::Json
             );
         }
     }

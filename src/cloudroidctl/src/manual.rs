@@ -1,4 +1,4 @@
-//! `completions`, `man`: what shells and `man` read, made from the same words as the help.
+//! `completions`, `man`: shell completions and manual pages, generated from the help.
 
 use std::path::PathBuf;
 
@@ -8,37 +8,38 @@ use clap_complete::Shell;
 
 use crate::output;
 
-/// Print what makes a shell complete cloudroidctl's verbs and options.
+/// Print the completion script of a shell.
 ///
-/// bash: cloudroidctl completions bash > ~/.local/share/bash-completion/completions/cloudroidctl. zsh: into _cloudroidctl in a directory
-/// of fpath. fish: into ~/.config/fish/completions/cloudroidctl.fish. The Debian package and make install bring all three.
+/// bash: cloudroidctl completions bash > ~/.local/share/bash-completion/completions/cloudroidctl. zsh: into
+/// _cloudroidctl in a directory of fpath. fish: into ~/.config/fish/completions/cloudroidctl.fish. The Debian package
+/// and make install install all three.
 #[derive(Debug, clap::Args)]
-pub struct Completions {
-    /// For which shell.
+pub struct CompletionsArgs {
+    /// Shell to complete in.
     #[arg(value_enum)]
-    shell: Named,
+    shell: CompletionShell,
 }
 
-/// Shells that cloudroidctl is completed in.
+/// Supported shells.
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum Named {
+enum CompletionShell {
     Bash,
     Zsh,
     Fish,
 }
 
-impl From<Named> for Shell {
-    fn from(named: Named) -> Shell {
+impl From<CompletionShell> for Shell {
+    fn from(named: CompletionShell) -> Shell {
         match named {
-            Named::Bash => Shell::Bash,
-            Named::Zsh => Shell::Zsh,
-            Named::Fish => Shell::Fish,
+            CompletionShell::Bash => Shell::Bash,
+            CompletionShell::Zsh => Shell::Zsh,
+            CompletionShell::Fish => Shell::Fish,
         }
     }
 }
 
-impl Completions {
-    /// Prints.
+impl CompletionsArgs {
+    /// Prints the script.
     pub fn run<A: CommandFactory>(self) -> anyhow::Result<()> {
         let mut script = Vec::new();
         clap_complete::generate(
@@ -51,17 +52,17 @@ impl Completions {
     }
 }
 
-/// Print the manual page of cloudroidctl, or write those of all its verbs into a directory.
+/// Print the manual page of cloudroidctl, or write the pages of all commands to a directory.
 ///
-/// man -l <(cloudroidctl man) shows it. The Debian package and make install bring them: man cloudroidctl-push.
+/// man -l <(cloudroidctl man) shows it. The Debian package and make install install them: man cloudroidctl-push.
 #[derive(Debug, clap::Args)]
-pub struct Man {
-    /// Where to write the pages of all verbs, such as /usr/local/share/man/man1.
+pub struct ManArgs {
+    /// Output directory for the pages of all commands, such as /usr/local/share/man/man1.
     directory: Option<PathBuf>,
 }
 
-impl Man {
-    /// Prints, or writes.
+impl ManArgs {
+    /// Prints the page, or writes all pages.
     pub fn run<A: CommandFactory>(self) -> anyhow::Result<()> {
         let command = A::command();
         let Some(directory) = self.directory else {
@@ -69,15 +70,15 @@ impl Man {
             clap_mangen::Man::new(command).render(&mut page)?;
             return output::raw(&page);
         };
-        let failed = || format!("cannot write the pages into {}", directory.display());
+        let failed = || format!("cannot write the manual pages to {}", directory.display());
         std::fs::create_dir_all(&directory).with_context(failed)?;
-        clap_mangen::generate_to(without_help(command), &directory).with_context(failed)
+        clap_mangen::generate_to(remove_help_subcommands(command), &directory).with_context(failed)
     }
 }
 
-/// The verb `help` of each has no page of its own: it shows the others'.
-fn without_help(command: Command) -> Command {
+/// Removes the `help` subcommands, which need no manual page of their own.
+fn remove_help_subcommands(command: Command) -> Command {
     command
         .disable_help_subcommand(true)
-        .mut_subcommands(without_help)
+        .mut_subcommands(remove_help_subcommands)
 }

@@ -1,4 +1,4 @@
-//! Printing: tables for people, JSON for programs.
+//! Output: tables for people, JSON for programs.
 
 use std::borrow::Cow;
 use std::io::{IsTerminal, Write};
@@ -8,12 +8,12 @@ use api::{Limits, Millis, Servant};
 use foreign::terminal;
 use serde::Serialize;
 
-/// How to print.
+/// Output format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Format {
-    /// Aligned columns.
+pub enum OutputFormat {
+    /// Aligned columns, for people.
     Table,
-    /// JSON; streams as one value per line.
+    /// JSON, for programs; streams as one value per line.
     Json,
 }
 
@@ -29,27 +29,27 @@ pub fn json_line(value: &impl Serialize) -> anyhow::Result<()> {
     write_line(&terminal::escape_json(&serde_json::to_string(value)?))
 }
 
-/// Prints a line at once, without control sequences.
+/// Prints a line without control sequences, and flushes it.
 pub fn line(text: &str) -> anyhow::Result<()> {
     write_line(&terminal::escape(text, std::io::stdout().is_terminal()))
 }
 
-/// A line for a screen that is drawn anew, without control sequences.
-pub fn shown(text: &str) -> Cow<'_, str> {
+/// Removes control sequences from a line that is drawn on a screen.
+pub fn sanitize(text: &str) -> Cow<'_, str> {
     terminal::escape(text, false)
 }
 
-/// Writes what is no text for people as it is.
+/// Writes bytes unchanged.
 pub fn raw(bytes: &[u8]) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     out.write_all(bytes)?;
     Ok(out.flush()?)
 }
 
-/// Prints a line on standard error, without control sequences.
-pub fn complain(text: &str) {
+/// Prints a line to standard error, without control sequences.
+pub fn eprint_line(text: &str) {
     let shown = terminal::escape(text, std::io::stderr().is_terminal());
-    // There is nobody left to tell.
+    // If standard error fails, the message cannot be shown anywhere else.
     let _ = writeln!(std::io::stderr().lock(), "{shown}");
 }
 
@@ -60,21 +60,21 @@ fn write_line(text: &str) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Whether printing failed because the reader (`head`, say) has had enough.
+/// Returns whether printing failed because the reader (`head`, for example) has closed the pipe.
 pub fn is_closed_pipe(error: &anyhow::Error) -> bool {
     error
         .downcast_ref::<std::io::Error>()
         .is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
-/// Columns of one width each.
+/// A table with aligned columns.
 #[derive(Debug, Default)]
 pub struct Table {
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    /// A table with these headings.
+    /// Creates a table with these headings.
     pub fn new(headings: &[&str]) -> Table {
         Table {
             rows: vec![
@@ -86,17 +86,17 @@ impl Table {
         }
     }
 
-    /// One more row.
+    /// Adds a row.
     pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
         self.rows.push(cells.into_iter().collect());
     }
 
-    /// Whether there is nothing but headings.
+    /// Returns whether the table has no rows besides its headings.
     pub fn is_empty(&self) -> bool {
         self.rows.len() <= 1
     }
 
-    /// Prints the table, its columns aligned.
+    /// Prints the table.
     pub fn print(&self) -> anyhow::Result<()> {
         for text in self.lines() {
             line(&text)?;
@@ -104,7 +104,7 @@ impl Table {
         Ok(())
     }
 
-    /// Its lines, the columns aligned.
+    /// Returns the lines of the table, with aligned columns.
     pub fn lines(&self) -> Vec<String> {
         let columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let widths: Vec<usize> = (0..columns)
@@ -134,7 +134,7 @@ impl Table {
     }
 }
 
-/// How long ago, roughly.
+/// Returns the time since `then`, rounded down to its largest unit.
 pub fn age(then: Millis) -> String {
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
@@ -142,8 +142,8 @@ pub fn age(then: Millis) -> String {
     span(now.saturating_sub(then))
 }
 
-/// How long until then, roughly.
-pub fn until(then: Millis) -> String {
+/// Returns the time until `then`, rounded down to its largest unit.
+pub fn time_until(then: Millis) -> String {
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0, |since| since.as_millis() as u64);
@@ -160,13 +160,13 @@ fn span(millis: u64) -> String {
     }
 }
 
-/// Whether a time is over.
+/// Returns whether a time has passed.
 pub fn is_past(time: Millis) -> bool {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     now.is_ok_and(|now| now.as_millis() as Millis >= time)
 }
 
-/// Time of day, UTC.
+/// Formats the time of day, UTC.
 pub fn clock(time: Millis) -> String {
     let seconds = time / 1000 % 86_400;
     format!(
@@ -178,13 +178,13 @@ pub fn clock(time: Millis) -> String {
     )
 }
 
-/// Limits in a cell: what is limited.
+/// Formats the limits that are set, for a table cell.
 pub fn limits(limits: &Limits) -> String {
     let set: Vec<String> = limits
-        .named()
+        .flag_values()
         .filter_map(|(name, value)| match name {
             "cpus" | "pids" => Some(format!("{value} {name}")),
-            // It is always enforced, and says little.
+            // The weight is always enforced and says little.
             "cpu-weight" => None,
             "cpuset" => Some(format!("on cores {value}")),
             "memory" => Some(value),
@@ -201,17 +201,17 @@ pub fn limits(limits: &Limits) -> String {
     }
 }
 
-/// What a servant's robot stated, and the rows that were taken for it, in a cell.
+/// Formats the terms that a servant's robot stated and the rows that apply, for a table cell.
 pub fn terms(servant: &Servant) -> String {
     let Some(terms) = &servant.terms else {
         return String::new();
     };
-    let mut said = vec![terms.stated_in_words()];
+    let mut said = vec![terms.describe_stated()];
     if let Some(class) = &terms.class {
         said.push(format!("class {class}"));
     }
     let rows = terms.rows.iter();
-    said.extend(rows.map(|row| format!("row {} ({row})", row.id)));
+    said.extend(rows.map(|row| format!("entry {} ({row})", row.id)));
     said.retain(|part| !part.is_empty());
     said.join(", ")
 }

@@ -1,4 +1,4 @@
-//! `pair`, `unpair`: robots that have a key of their own.
+//! `pair`, `unpair`: pairing of robots, which have keys of their own.
 
 use std::time::Duration;
 
@@ -7,91 +7,95 @@ use api::machines::{NewPairing, Pairing, PairingMade, PairingState};
 use qrcode::render::unicode::Dense1x2;
 use qrcode::{EcLevel, QrCode};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
-use crate::token::{lifetime, patterns};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
+use crate::token::{lifetime, parse_patterns};
 
-/// Pair a robot: make a line that is good once, with which the robot makes its own key and gets a certificate.
+/// Pair a robot: create a one-time line with which the robot makes its own key and obtains a certificate.
 ///
-/// Type the line on the robot: cloudroid-stub pair 'LINE', or install.sh --pair 'LINE'. The robot's certificate renews itself.
+/// On the robot, run: cloudroid-stub pair 'LINE', or install.sh --pair 'LINE'. The certificate is renewed
+/// automatically.
 #[derive(Debug, clap::Args)]
-pub struct Pair {
-    /// The robot's name.
+pub struct PairArgs {
+    /// Id of the robot.
     #[arg(required_unless_present = "list", conflicts_with = "list")]
     robot: Option<String>,
-    /// Services that it is for, or patterns such as 'lab_*'; all by default.
+    /// Services that the robot may use, or patterns such as 'lab_*' (default: all).
     #[arg(long, value_name = "A,B", value_delimiter = ',')]
     services: Vec<String>,
-    /// Class of the configuration that it may name; may be given several times.
+    /// Class that the robot may name; may be given several times.
     #[arg(long = "class", value_name = "NAME")]
     classes: Vec<String>,
-    /// How long the line is good, such as 15m; 7d at most.
+    /// Time for which the line is valid, such as 15m; at most 7d.
     #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "15m")]
     ttl: Duration,
-    /// Host and port by which the robot reaches the daemon, where the robot knows it by another name than you do.
+    /// Address of the daemon for the robot, if it differs from the one used here.
     #[arg(long, value_name = "HOST:PORT")]
     address: Option<String>,
-    /// The robot has a certificate of the lab's own authority (client_authorities): pair it at once, without a line.
+    /// Pair a robot that has a certificate of the lab's own authority (client_authorities) at once, without a line.
     #[arg(long)]
     own_certificate: bool,
-    /// Print no QR code.
+    /// Do not print a QR code.
     #[arg(long)]
     no_qr: bool,
-    /// List robots that are paired, and those for which a line waits.
+    /// List the paired robots and the pending lines.
     #[arg(long)]
     list: bool,
-    /// Take back the line that was made for the robot.
+    /// Cancel the pending line of the robot.
     #[arg(long, conflicts_with_all = ["list", "own_certificate", "services", "address"])]
     cancel: bool,
 }
 
-/// End a robot's pairing: its connections end at once, and its certificate is refused.
+/// Unpair a robot: its connections are closed and its certificate is refused.
 #[derive(Debug, clap::Args)]
-pub struct Unpair {
-    /// The robot's name.
+pub struct UnpairArgs {
+    /// Id of the robot.
     robot: String,
 }
 
-impl Pair {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl PairArgs {
+    /// Sends the request and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let Some(robot) = self.robot else {
             let pairings: Vec<Pairing> = client.get("/api/v1/pairings").await?;
             return list(&pairings, format);
         };
         if self.cancel {
-            let path = format!("/api/v1/pairings/{}/code", escaped(&robot));
+            let path = format!("/api/v1/pairings/{}/code", percent_encode(&robot));
             let left: Vec<Pairing> = client.delete(&path).await?;
             return match format {
-                Format::Json => output::json(&left),
-                Format::Table => output::line(&format!("the line for {robot} is good no more")),
+                OutputFormat::Json => output::json(&left),
+                OutputFormat::Table => {
+                    output::line(&format!("the pairing line for {robot} is no longer valid"))
+                }
             };
         }
-        let services = match self.services.is_empty() {
-            true => vec!["*".to_owned()],
-            false => self.services,
+        let services = if self.services.is_empty() {
+            vec!["*".to_owned()]
+        } else {
+            self.services
         };
         let new = NewPairing {
-            services: patterns(&services)?,
-            classes: patterns(&self.classes)?,
+            services: parse_patterns(&services)?,
+            classes: parse_patterns(&self.classes)?,
             lifetime: Some(self.ttl.as_secs()),
             address: self.address,
             own_certificate: self.own_certificate,
             robot,
         };
         let made: PairingMade = client.post("/api/v1/pairings", &new).await?;
-        told(&made, format, !self.no_qr)
+        print_pairing(&made, format, !self.no_qr)
     }
 }
 
-impl Unpair {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let path = format!("/api/v1/pairings/{}", escaped(&self.robot));
+impl UnpairArgs {
+    /// Sends the request and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let path = format!("/api/v1/pairings/{}", percent_encode(&self.robot));
         let left: Vec<Pairing> = client.delete(&path).await?;
         match format {
-            Format::Json => output::json(&left),
-            Format::Table => output::line(&format!(
+            OutputFormat::Json => output::json(&left),
+            OutputFormat::Table => output::line(&format!(
                 "{} is unpaired: its connections are closed, and its certificate is refused",
                 self.robot
             )),
@@ -99,29 +103,31 @@ impl Unpair {
     }
 }
 
-/// The line alone on standard output, so that it can be taken from there; the rest beside it.
-fn told(made: &PairingMade, format: Format, qr: bool) -> anyhow::Result<()> {
-    if let Format::Json = format {
+/// Prints only the line to standard output, so that it can be piped, and everything else to standard error.
+fn print_pairing(made: &PairingMade, format: OutputFormat, qr: bool) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(made);
     }
     let robot = &made.robot;
     let (Some(line), Some(end)) = (&made.line, made.expires) else {
         return output::line(&format!(
-            "{robot} is paired: it comes with its own certificate, whose name is robot:{robot}"
+            "{robot} is paired: it authenticates with its own certificate, named robot:{robot}"
         ));
     };
     if qr {
-        output::complain(&picture(line)?);
+        output::eprint_line(&render_qr(line)?);
     }
-    output::complain(&format!(
-        "this line pairs {robot}, once, within {}; on the robot: cloudroid-stub pair 'LINE', or install.sh --pair 'LINE'",
-        output::until(end)
+    output::eprint_line(&format!(
+        "this line pairs {robot} once, within {}; redeem it on the robot: cloudroid-stub pair 'LINE', or install.sh \
+            --pair 'LINE'",
+        output::time_until(end)
     ));
     output::line(line)
 }
 
-/// A QR code (ISO/IEC 18004), two modules in a character: light ones are drawn, as terminals are dark.
-fn picture(line: &str) -> anyhow::Result<String> {
+/// Renders a QR code (ISO/IEC 18004) with two modules per character. Light modules are drawn, because terminals are
+/// dark.
+fn render_qr(line: &str) -> anyhow::Result<String> {
     let code = QrCode::with_error_correction_level(line, EcLevel::L)
         .context("the line is too long for a QR code; leave it out with --no-qr")?;
     let picture = code
@@ -135,8 +141,8 @@ fn picture(line: &str) -> anyhow::Result<String> {
     Ok(picture)
 }
 
-fn list(pairings: &[Pairing], format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+fn list(pairings: &[Pairing], format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(&pairings);
     }
     let mut table = Table::new(&["ROBOT", "SERVICES", "CLASSES", "AGE", "CAME", "STATE"]);
@@ -160,22 +166,28 @@ fn list(pairings: &[Pairing], format: Format) -> anyhow::Result<()> {
             state(pairing),
         ]);
     }
-    match table.is_empty() {
-        true => output::line("no robot is paired; pair one with: cloudroidctl pair ROBOT"),
-        false => table.print(),
+    if table.is_empty() {
+        output::line("no robots are paired; pair one with: cloudroidctl pair ROBOT")
+    } else {
+        table.print()
     }
 }
 
 fn state(pairing: &Pairing) -> String {
     match (pairing.state, pairing.expires) {
-        (PairingState::Waiting, Some(end)) => format!("a line waits, for {}", output::until(end)),
-        (PairingState::Waiting, None) => "a line waits".into(),
+        (PairingState::Waiting, Some(end)) => {
+            format!(
+                "line not redeemed yet, expires in {}",
+                output::time_until(end)
+            )
+        }
+        (PairingState::Waiting, None) => "line not redeemed yet".into(),
         (PairingState::Paired, _) if pairing.own_certificate => "paired, own certificate".into(),
         (PairingState::Paired, Some(end)) if output::is_past(end) => {
             format!("certificate expired {} ago", output::age(end))
         }
         (PairingState::Paired, Some(end)) => {
-            format!("paired, certificate for {}", output::until(end))
+            format!("paired, certificate expires in {}", output::time_until(end))
         }
         (PairingState::Paired, None) => "paired".into(),
     }
@@ -188,17 +200,18 @@ mod tests {
     #[test]
     fn a_line_is_drawn_within_a_terminals_width() {
         let line = format!(
-            "cloudroid://a-long-name-of-a-server.lab.example:9090/?robot=rover-number-1&fingerprint=SHA256:{}&key={}&code={}",
+            "cloudroid://a-long-name-of-a-server.lab.example:9090/?robot=rover-number-1&fingerprint=SHA256:{}&key={}&\
+             code={}",
             "5d".repeat(32),
             "A".repeat(68),
             "c".repeat(26)
         );
-        let drawn = picture(&line).expect("drawn");
+        let drawn = render_qr(&line).expect("drawn");
         let widest = drawn.lines().map(|line| line.chars().count()).max();
         assert!(
             widest.is_some_and(|width| (40..80).contains(&width)),
             "{widest:?}"
         );
-        picture(&"x".repeat(4000)).expect_err("too long");
+        render_qr(&"x".repeat(4000)).expect_err("too long");
     }
 }

@@ -1,55 +1,55 @@
-//! `policy`: what principals may use of services.
+//! `policy`: rules for what principals may use of services.
 
 use api::access::{NewRule, Rule};
 
-use crate::client::Client;
-use crate::output::{self, Format, Table};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat, Table};
 
-/// Say what robots and others may use of a service: which topics, services and actions. Changes hold at once.
+/// Manage the policy: which topics, services and actions robots and others may use. Changes take effect at once.
 #[derive(Debug, clap::Args)]
-pub struct Policy {
+pub struct PolicyArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: PolicyCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Verb {
-    List(List),
-    Allow(Allow),
-    Rm(Rm),
+enum PolicyCommand {
+    List(ListRules),
+    Allow(AllowRule),
+    Rm(RemoveRules),
 }
 
 /// List the rules.
 #[derive(Debug, clap::Args)]
-struct List;
+struct ListRules;
 
-/// Write a rule. One that names a principal stands in place of those of its role; what no rule grants is refused.
+/// Add a rule. Rules for a principal replace those of its role; anything without a rule is refused.
 #[derive(Debug, clap::Args)]
-struct Allow {
-    /// For whom: the name of a token, or role:robot, role:deployer, role:viewer.
+struct AllowRule {
+    /// Principal: the name of a token, or role:robot, role:deployer, role:viewer.
     who: String,
-    /// What: OPERATION:NAME with publish, subscribe, call, advertise or *, such as subscribe:/camera/** or call:/detect. None
-    /// grants nothing.
+    /// Grants: OPERATION:NAME with publish, subscribe, call, advertise or *, such as subscribe:/camera/** or
+    /// call:/detect. Without any, nothing is granted.
     grants: Vec<String>,
-    /// Service for which it is, or a pattern.
+    /// Service that the rule applies to, or a pattern.
     #[arg(long, default_value = "*", value_name = "NAME")]
     service: String,
 }
 
-/// Remove rules by their numbers.
+/// Remove rules by their ids.
 #[derive(Debug, clap::Args)]
-struct Rm {
-    /// Numbers of rules, as `policy list` shows them.
+struct RemoveRules {
+    /// Ids of rules, as shown by `policy list`.
     #[arg(required = true)]
     rules: Vec<i64>,
 }
 
-impl Policy {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl PolicyArgs {
+    /// Sends the request and prints the rules.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let rules: Vec<Rule> = match self.verb {
-            Verb::List(List) => client.get("/api/v1/policy").await?,
-            Verb::Allow(verb) => {
+            PolicyCommand::List(ListRules) => client.get("/api/v1/policy").await?,
+            PolicyCommand::Allow(verb) => {
                 let new = NewRule {
                     who: verb.who.parse()?,
                     services: verb.service.parse()?,
@@ -61,7 +61,7 @@ impl Policy {
                 };
                 client.post("/api/v1/policy", &new).await?
             }
-            Verb::Rm(verb) => {
+            PolicyCommand::Rm(verb) => {
                 let mut left = Vec::new();
                 for rule in &verb.rules {
                     left = client.delete(&format!("/api/v1/policy/{rule}")).await?;
@@ -73,8 +73,8 @@ impl Policy {
     }
 }
 
-fn list(rules: &[Rule], format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+fn list(rules: &[Rule], format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(&rules);
     }
     let mut table = Table::new(&["RULE", "WHO", "SERVICES", "ALLOW"]);
@@ -84,16 +84,18 @@ fn list(rules: &[Rule], format: Format) -> anyhow::Result<()> {
             rule.id.to_string(),
             rule.who.to_string(),
             rule.services.to_string(),
-            match grants.is_empty() {
-                true => "nothing".into(),
-                false => grants.join(" "),
+            if grants.is_empty() {
+                "nothing".into()
+            } else {
+                grants.join(" ")
             },
         ]);
     }
-    match table.is_empty() {
-        true => output::line(
-            "there are no rules: robots and deployers may use nothing; grant something with: cloudroidctl policy allow",
-        ),
-        false => table.print(),
+    if table.is_empty() {
+        output::line(
+            "no rules: robots and deployers have no access; grant it with: cloudroidctl policy allow",
+        )
+    } else {
+        table.print()
     }
 }

@@ -1,34 +1,35 @@
-//! `topics`: what is published in a servant, and how much.
+//! `topics`: publication statistics of a servant's topics.
 
 use api::topics::PublishedTopics;
 use futures_util::StreamExt;
 
-use crate::client::{Client, escaped};
+use crate::client::{DaemonClient, percent_encode};
 use crate::inside;
-use crate::output::{self, Format, Table};
+use crate::output::{self, OutputFormat, Table};
 
-/// Print what is published on each topic of a servant: rate, bandwidth, and how old messages are when they come.
+/// Print the statistics of each topic of a servant: rate, bandwidth, and age of messages on arrival.
 ///
-/// To count it, the daemon hears all of it beside the servant's robot: nodes that publish only what somebody listens to publish it then.
+/// The daemon subscribes to all topics for this, besides the servant's robot: nodes that publish only when they have
+/// subscribers start to publish.
 #[derive(Debug, clap::Args)]
-pub struct Published {
-    /// The servant's id, or the name of a service that has one servant.
+pub struct TopicsArgs {
+    /// Id of the servant, or name of a service that has one servant.
     servant: String,
-    /// Count for so many seconds, a table for each; without it until Ctrl-C.
+    /// Number of seconds, with one table each (default: until Ctrl-C).
     #[arg(short = 'n', long, value_name = "SECONDS")]
     seconds: Option<usize>,
 }
 
-impl Published {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let servant = inside::servant(client, &self.servant).await?;
-        let path = format!("/api/v1/servants/{}/topics", escaped(&servant));
-        let told = client.lines::<PublishedTopics>(&path).await?;
+impl TopicsArgs {
+    /// Sends the request and prints the statistics.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let servant = inside::resolve_servant(client, &self.servant).await?;
+        let path = format!("/api/v1/servants/{}/topics", percent_encode(&servant));
+        let told = client.get_lines::<PublishedTopics>(&path).await?;
         let mut told = std::pin::pin!(told.take(self.seconds.unwrap_or(usize::MAX)));
         while let Some(topics) = told.next().await {
             let topics = topics?;
-            if format == Format::Json {
+            if format == OutputFormat::Json {
                 output::json_line(&topics)?;
                 continue;
             }

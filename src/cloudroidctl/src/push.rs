@@ -1,4 +1,4 @@
-//! `push`: a package becomes a service.
+//! `push`: publishes a package as a service.
 
 mod archive;
 mod progress;
@@ -12,44 +12,43 @@ use api::{Grants, PushEvent, PushOptions, ServiceDetail, Sla, Span, Volume};
 use futures_util::StreamExt;
 use hyper::Method;
 
-use crate::client::{self, Client, escaped};
+use crate::client::{self, DaemonClient, percent_encode};
 use crate::limits::{CapFlags, LimitFlags};
-use crate::output::{self, Format};
+use crate::output::{self, OutputFormat};
 use crate::push::shared::SharedFlags;
 use crate::rollout::{self, TermFlags};
 use crate::services;
 use crate::wait::WaitFlag;
-use progress::Progress;
+use progress::PushProgress;
 
-/// The longest query that HTTP servers take.
+/// Largest query in bytes: HTTP servers refuse longer ones.
 const LONGEST_QUERY: usize = 60_000;
 
-/// Push a ROS package: build an image of it, find its interface, publish it as a service.
+/// Push a ROS package: build an image, determine its interface and publish it as a service.
 ///
-/// PATH is a package or workspace of ROS 1 (catkin) or ROS 2 (ament), which is compiled here, a prebuilt install space, or a
-/// tar archive of one.
-/// With --apt a packaged ROS package is taken instead.
+/// PATH is a package or workspace of ROS 1 (catkin) or ROS 2 (ament), which is compiled on the server, a prebuilt
+/// install space, or a tar archive of one. With --apt, a Debian package is used instead.
 #[derive(Debug, Default, clap::Args)]
 #[command(group(clap::ArgGroup::new("what").required(true).args(["path", "apt"])))]
-pub struct Push {
-    /// A ROS package, workspace or install space, or a tar archive of one.
+pub struct PushArgs {
+    /// ROS package, workspace or install space, or a tar archive of one.
     path: Option<PathBuf>,
-    /// A packaged ROS package instead of a PATH, such as opencv_apps.
+    /// Packaged ROS package to use instead of a PATH, such as opencv_apps.
     #[arg(long, value_name = "NAME")]
     apt: Option<String>,
-    /// Name of the service; the package's by default.
+    /// Name of the service (default: the package's).
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// Base image definition; by default one that fits the ROS of the package.
+    /// Base image definition (default: one that fits the package's ROS).
     #[arg(long, value_name = "BASE")]
     base: Option<String>,
     /// Launch file to run, as roslaunch or ros2 launch finds it in the package.
     #[arg(long, value_name = "FILE", conflicts_with = "nodes")]
     launch: Option<String>,
-    /// Executable to run (EXE, or PACKAGE/EXE), its arguments behind it in one pair of quotes: --node
-    /// 'topic_tools/relay /in /out'; may be given several times. The node has its program's own name, as under rosrun or
-    /// ros2 run; __name:=NAME (in ROS 2 __node:=NAME, too) gives it another. In ROS 2 also the class of a component
-    /// (talkers::Talker, or PACKAGE/CLASS), with remaps and -p NAME:=VALUE behind it: it gets a container of its own.
+    /// Executable to run (EXE, or PACKAGE/EXE) with its arguments, in one pair of quotes: --node 'topic_tools/relay /in
+    /// /out'; may be given several times. The node has its program's own name, as under rosrun or ros2 run, unless
+    /// __name:=NAME (in ROS 2 also __node:=NAME) sets another. In ROS 2 also the class of a component (talkers::Talker,
+    /// or PACKAGE/CLASS), followed by remaps and -p NAME:=VALUE; the component gets a container of its own.
     #[arg(long = "node", value_name = "EXE [ARGS]")]
     nodes: Vec<String>,
     /// Private parameter of the nodes, or a global one (/K=V); may be given several times.
@@ -58,26 +57,26 @@ pub struct Push {
     /// Argument of the launch file; may be given several times.
     #[arg(long = "arg", value_name = "K:=V", value_parser = assignment)]
     args: Vec<(String, String)>,
-    /// Name to remap; may be given several times.
+    /// Remapping of a name; may be given several times.
     #[arg(long = "remap", value_name = "A:=B", value_parser = assignment)]
     remaps: Vec<(String, String)>,
-    /// TOML or JSON file with what to add to the interface, where the push cannot find all of it.
+    /// TOML or JSON file with additions to the interface, for what the push cannot determine.
     #[arg(long, value_name = "FILE")]
     interface: Option<PathBuf>,
-    /// Which input is answered by which output, instead of what the push finds; may be given several times. The
-    /// output's messages are counted against the input's times by robots that promise any. Several outputs:
-    /// /image=/boxes,/view; also as in a robot's stub.toml: '/image -> /boxes by arrival'.
+    /// Input and the output that answers it, instead of what the push determines; may be given several times. If a
+    /// robot states times, it measures them from the input to this output. Several outputs: /image=/boxes,/view; also
+    /// accepts the syntax of stub.toml: '/image -> /boxes by arrival'.
     #[arg(long = "request", value_name = "INPUT=OUTPUT", value_parser = request)]
     requests: Vec<String>,
     /// Debian package that provides a dependency; may be given several times.
     #[arg(long = "map", value_name = "KEY=DEB", value_parser = mapping)]
     map: Vec<(String, String)>,
-    /// Debian or ROS package to add, for compiling and for running; may be given several times.
+    /// Additional Debian or ROS package, for compiling and running; may be given several times.
     #[arg(long = "with", value_name = "PACKAGE")]
     with: Vec<String>,
     /// Answers depend on earlier requests (maps, trackers): a robot's local original takes over only while the link is
-    /// down, and hands back. Without this, both may be asked and the first answer is taken. =false says that each answer
-    /// stands alone where the push would ask.
+    /// down, and hands back. Otherwise both may be asked, and the first answer is used. =false states that answers are
+    /// independent, if the push would ask.
     #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true", value_name = "BOOL")]
     stateful: Option<bool>,
     #[command(flatten)]
@@ -90,19 +89,19 @@ pub struct Push {
     limits: LimitFlags,
     #[command(flatten)]
     caps: CapFlags,
-    /// T_desire of stubs whose robot promises nothing itself, such as 100ms.
+    /// T_desire for robots that state no times, such as 100ms.
     #[arg(long, value_name = "TIME")]
     rrt: Option<Span>,
-    /// T_max of such stubs; T_desire by default.
+    /// T_max for robots that state no times (default: T_desire).
     #[arg(long, value_name = "TIME")]
     max_rrt: Option<Span>,
     /// Device by its name in the machine's CDI specifications, such as nvidia.com/gpu=0; may be given several times.
     #[arg(long = "device", value_name = "VENDOR/CLASS=NAME")]
     devices: Vec<String>,
-    /// Directory or file of the daemon's machine, read-only inside; may be given several times.
+    /// Directory or file of the server to mount read-only; may be given several times.
     #[arg(long = "volume", value_name = "SOURCE:TARGET", value_parser = volume)]
     volumes: Vec<Volume>,
-    /// Where nodes may connect to, by TCP; may be given several times.
+    /// TCP destination that the nodes may connect to; may be given several times.
     #[arg(long = "egress", value_name = "HOST:PORT")]
     egress: Vec<String>,
 }
@@ -125,7 +124,7 @@ fn assignment(text: &str) -> Result<(String, String), String> {
 }
 
 fn request(text: &str) -> Result<String, String> {
-    api::push::read_request(text).map(|pair| pair.to_string())
+    api::push::parse_request(text).map(|pair| pair.to_string())
 }
 
 fn volume(text: &str) -> Result<Volume, String> {
@@ -149,25 +148,25 @@ fn mapping(text: &str) -> Result<(String, String), String> {
     }
 }
 
-impl Push {
-    /// Of a file that export has written.
-    pub fn of_exported(
+impl PushArgs {
+    /// Creates the push of a file that export has written.
+    pub fn from_export(
         file: PathBuf,
         name: Option<String>,
         rollout: TermFlags,
         wait: WaitFlag,
-    ) -> Push {
-        Push {
+    ) -> PushArgs {
+        PushArgs {
             path: Some(file),
             name,
             rollout,
             wait,
-            ..Push::default()
+            ..PushArgs::default()
         }
     }
 
-    /// Sends the package, shows what is done with it, and ends with the service's address and interface.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+    /// Sends the package, prints the progress, and finally the service's address and interface.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let rolls_out = self.rollout.terms().is_some();
         let wait = self.wait;
         let service = self.publish(client, format).await?;
@@ -176,72 +175,79 @@ impl Push {
         if let Some(newest) =
             newest.filter(|newest| rolls_out && *newest != service.summary.revision)
         {
-            output::complain(&format!(
-                "revision {newest} is tried beside the current one, {}, of which the following is",
+            output::eprint_line(&format!(
+                "revision {newest} is on trial beside the current one, {}, which is described below",
                 service.summary.revision
             ));
         }
-        if format == Format::Table {
+        if format == OutputFormat::Table {
             services::show(&service)?;
         }
-        // The first revision of a service has nothing to take the place of.
+        // The first revision of a service replaces nothing.
         if !rolls_out || service.revisions.len() < 2 {
             return Ok(());
         }
-        let rollout = match wait.is_set() {
-            true => rollout::over(client, name, wait).await?,
-            false => {
-                client
-                    .get(&format!("/api/v1/services/{}/rollout", escaped(name)))
-                    .await?
-            }
+        let rollout = if wait.is_set() {
+            rollout::wait_until_over(client, name, wait).await?
+        } else {
+            client
+                .get(&format!(
+                    "/api/v1/services/{}/rollout",
+                    percent_encode(name)
+                ))
+                .await?
         };
-        if format == Format::Table {
+        if format == OutputFormat::Table {
             output::line("")?;
             rollout::show(&rollout)?;
         }
-        match wait.is_set() {
-            true => rollout::promoted(&rollout),
-            false => Ok(()),
+        if wait.is_set() {
+            rollout::require_promoted(&rollout)
+        } else {
+            Ok(())
         }
     }
 
-    /// The same under a name that nobody else has, without the service's address and interface.
-    pub async fn under(
+    /// Publishes the package under another name, without printing the service's address and interface.
+    pub async fn publish_as(
         mut self,
         name: &str,
-        client: &Client,
-        format: Format,
+        client: &DaemonClient,
+        format: OutputFormat,
     ) -> anyhow::Result<()> {
         self.name = Some(name.to_owned());
         self.publish(client, format).await.map(|_| ())
     }
 
-    async fn publish(self, client: &Client, format: Format) -> anyhow::Result<ServiceDetail> {
+    async fn publish(
+        self,
+        client: &DaemonClient,
+        format: OutputFormat,
+    ) -> anyhow::Result<ServiceDetail> {
         let options = self.options()?;
         let query = serde_json::to_string(&options)?;
-        let uri = format!("/api/v1/push?options={}", escaped(&query));
+        let uri = format!("/api/v1/push?options={}", percent_encode(&query));
         if uri.len() > LONGEST_QUERY {
             bail!(
-                "the options are {} bytes long, which is too much; shorten --interface or the parameters",
+                "the options are too long, {} bytes; shorten --interface or the parameters",
                 uri.len()
             );
         }
         let publishing = AtomicBool::new(false);
         tokio::select! {
             outcome = send(client, format, &uri, self.path, &publishing) => outcome,
-            _ = tokio::signal::ctrl_c() => bail!(cancelled(publishing.into_inner())),
+            _ = tokio::signal::ctrl_c() => bail!(cancellation_message(publishing.into_inner())),
         }
     }
 
     fn options(&self) -> anyhow::Result<PushOptions> {
-        let interface = match &self.interface {
-            Some(path) => Some(
-                std::fs::read_to_string(path)
-                    .with_context(|| format!("cannot read the interface {}", path.display()))?,
-            ),
-            None => None,
-        };
+        let interface =
+            match &self.interface {
+                Some(path) => Some(std::fs::read_to_string(path).with_context(|| {
+                    format!("cannot read the interface file {}", path.display())
+                })?),
+                None => None,
+            };
         let source = match (&self.apt, &self.path) {
             (Some(package), _) => format!("--apt {package}"),
             (None, Some(path)) => path.display().to_string(),
@@ -274,66 +280,66 @@ impl Push {
             },
             stateful: self.stateful == Some(true),
             stateless: self.stateful == Some(false),
-            shared: self.shared.asked(),
+            shared: self.shared.shared_settings(),
             rollout: self.rollout.terms(),
             source,
         })
     }
 }
 
-/// What is said of a push that was interrupted here. `publishing`: the daemon had begun to.
-fn cancelled(publishing: bool) -> &'static str {
+/// Returns the message for a push that was interrupted here; `publishing` is set if the daemon had begun to publish.
+fn cancellation_message(publishing: bool) -> &'static str {
     if publishing {
-        "interrupted while it was being published, which goes on; see cloudroidctl services"
+        "interrupted, but the daemon goes on publishing; see cloudroidctl services"
     } else {
         "cancelled; nothing was published"
     }
 }
 
 async fn send(
-    client: &Client,
-    format: Format,
+    client: &DaemonClient,
+    format: OutputFormat,
     uri: &str,
     path: Option<PathBuf>,
     publishing: &AtomicBool,
 ) -> anyhow::Result<ServiceDetail> {
     let (body, packing) = match path {
         Some(path) => {
-            let (body, packing) = archive::of(&path)?;
+            let (body, packing) = archive::request_body(&path)?;
             (body, Some(packing))
         }
-        None => (archive::nothing(), None),
+        None => (archive::empty_body(), None),
     };
     let response = match client.send(Method::POST, uri, body).await {
         Ok(response) => response,
-        Err(error) => return Err(packing_failed(packing).unwrap_or(error)),
+        Err(error) => return Err(packing_error(packing).unwrap_or(error)),
     };
-    let mut progress = Progress::new(format);
-    let mut events = client::lines::<PushEvent>(response);
+    let mut progress = PushProgress::new(format);
+    let mut events = client::json_lines::<PushEvent>(response);
     while let Some(event) = events.next().await {
         let event = match event {
             Ok(event) => event,
-            Err(error) => return Err(packing_failed(packing).unwrap_or(error)),
+            Err(error) => return Err(packing_error(packing).unwrap_or(error)),
         };
         progress.show(&event)?;
         match event {
-            // The daemon's last step.
+            // Title of the daemon's last step.
             PushEvent::Step { title } if title == api::push::PUBLISHING => {
                 publishing.store(true, Ordering::Relaxed)
             }
             PushEvent::Done { service, .. } => return Ok(*service),
             PushEvent::Error { problem } => {
-                return Err(packing_failed(packing).unwrap_or_else(|| problem.into()));
+                return Err(packing_error(packing).unwrap_or_else(|| problem.into()));
             }
             _ => {}
         }
     }
-    bail!("the daemon broke off; see its log, and cloudroidctl status")
+    bail!("the daemon aborted the push; see its log, and cloudroidctl status")
 }
 
-/// When the archive could not be packed, that is the reason, whatever the daemon made of the torn stream.
-fn packing_failed(packing: Option<archive::Packing>) -> Option<anyhow::Error> {
-    packing.and_then(archive::Packing::error)
+/// Returns the error of packing, if any: it is the cause, whatever the daemon reported about the truncated stream.
+fn packing_error(packing: Option<archive::Packing>) -> Option<anyhow::Error> {
+    packing.and_then(archive::Packing::into_error)
 }
 
 #[cfg(test)]
@@ -344,10 +350,10 @@ mod tests {
     #[derive(Debug, Parser)]
     struct Line {
         #[command(flatten)]
-        push: Push,
+        push: PushArgs,
     }
 
-    fn parse(line: &str) -> Result<Push, clap::Error> {
+    fn parse(line: &str) -> Result<PushArgs, clap::Error> {
         Line::try_parse_from(std::iter::once("push").chain(line.split_whitespace()))
             .map(|line| line.push)
     }
@@ -356,7 +362,8 @@ mod tests {
     fn everything_that_is_typed_is_sent() {
         let push = parse(
             "--apt opencv_apps --name people --base b --node people_detect --node other/node --param debug_view=false \
-             --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map eigen=libeigen3-dev \
+             --param /rate=1.5 --param word=hi --param list=[1,2] --remap image:=/camera/image --map \
+             eigen=libeigen3-dev \
              --with opencv-data --cpus 1.5 --memory 512M --max-cpus 2 --max-memory 1G \
              --rrt 100ms --max-rrt 0.3 --request /image=/people_detect/found",
         )
@@ -368,7 +375,8 @@ mod tests {
             "remaps": {"image": "/camera/image"}, "map": {"eigen": "libeigen3-dev"}, "with": ["opencv-data"],
             "requests": ["/image -> /people_detect/found"],
             "limits": {"cpus": 1.5, "memory": 536_870_912},
-            "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "sla": {"rrt": "100ms", "max_rrt": "300ms"}, "source": "--apt opencv_apps"
+            "caps": {"cpus": 2.0, "memory": 1_073_741_824}, "sla": {"rrt": "100ms", "max_rrt": "300ms"},
+                "source": "--apt opencv_apps"
         });
         assert_eq!(serde_json::to_value(options).expect("plain data"), expected);
     }
@@ -415,23 +423,23 @@ mod tests {
         assert_eq!(options.source, "./pkg");
     }
 
-    /// The page's fields, one a line.
+    /// Source of the page's fields, one per line.
     const FIELDS: &str = include_str!("../../../web/src/lib/options.ts");
-    /// The form around them.
+    /// Source of the form around the fields.
     const FORM: &str = include_str!("../../../web/src/pages/Deploy.svelte");
 
-    /// Between two others, where both are.
-    fn between<'a>(line: &'a str, before: &str, after: &str) -> Option<&'a str> {
+    /// Returns the text between two others, if both are found.
+    fn text_between<'a>(line: &'a str, before: &str, after: &str) -> Option<&'a str> {
         let (_, rest) = line.split_once(before)?;
         Some(rest.split_once(after)?.0)
     }
 
-    /// Flag and label of each of the page's fields.
+    /// Returns flag and label of each field of the page.
     fn fields() -> Vec<(&'static str, &'static str)> {
         let field = |line: &'static str| {
-            let flag = between(line, "flag: '", "'")?;
-            let label = between(line, "label: '", "', flag: ")
-                .or_else(|| between(line, "label: \"", "\", flag: "))?;
+            let flag = text_between(line, "flag: '", "'")?;
+            let label = text_between(line, "label: '", "', flag: ")
+                .or_else(|| text_between(line, "label: \"", "\", flag: "))?;
             Some((flag, label))
         };
         FIELDS.lines().filter_map(field).collect()
@@ -441,9 +449,9 @@ mod tests {
     fn the_page_asks_for_all_that_the_command_line_does() {
         let fields = fields();
         assert!(fields.len() > 30, "{fields:?}");
-        // Chosen in the form, not written.
+        // Chosen with controls of the form that are not fields.
         let chosen = ["--apt", "--stateful", "--shared", "--idempotent"];
-        // The service's own page shows how a rollout goes on, for as long as it is open.
+        // The service's own page shows the progress of a rollout while it is open.
         let needless = ["--wait"];
         let command = Line::command();
         let flags: Vec<String> = command
@@ -480,12 +488,13 @@ mod tests {
             ("--calls", f64::from(shared.calls)),
             ("--bound", terms.bound),
             ("--samples", f64::from(terms.samples)),
-            // The kernel's, as cgroup-v2.rst has it.
+            // Default of the kernel (cgroup-v2.rst).
             ("--cpu-weight", 100.0),
         ];
         let named = |label: &str| {
-            let (before, _) = label.split_once(" by default")?;
-            before.rsplit(' ').next()?.parse::<f64>().ok()
+            let (_, default) = label.split_once("default: ")?;
+            let end = default.find(|c: char| !c.is_ascii_digit() && c != '.');
+            default[..end.unwrap_or(default.len())].parse::<f64>().ok()
         };
         let fields = fields();
         for (flag, holds) in hold {

@@ -1,4 +1,4 @@
-//! `record`: what flows in a servant, into a file.
+//! `record`: records the messages in a servant to a file.
 
 use std::collections::HashMap;
 use std::io::IsTerminal;
@@ -8,45 +8,45 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use foxglove::ws_protocol::client::{Subscribe, Subscription};
 use foxglove::ws_protocol::server::{Channel, ServerMessage};
-use recording::{Summary, Writer};
+use recording::{RecordingWriter, Summary};
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 
-use crate::client::Client;
-use crate::inside::{self, Inside};
-use crate::output::{self, Format};
+use crate::client::DaemonClient;
+use crate::inside::{self, FoxgloveSession};
+use crate::output::{self, OutputFormat};
 use crate::token::lifetime;
-use crate::topics::Topics;
+use crate::topics::TopicFilter;
 
-/// Messages of a topic that wait in the daemon while the file is written.
+/// Length of the daemon's queue for each topic, for while the file is written.
 const DEPTH: usize = 1000;
-/// Between two times that what came is written out.
+/// Interval between flushes of the file.
 const FLUSH: Duration = Duration::from_secs(1);
 
-/// Record the messages that flow in a servant into an MCAP file, until Ctrl-C, the servant's end, or the duration's.
+/// Record the messages in a servant to an MCAP file, until Ctrl-C, the servant's end, or the end of the duration.
 #[derive(Debug, clap::Args)]
-pub struct Record {
-    /// The servant's id, or the name of a service that has one servant.
+pub struct RecordArgs {
+    /// Id of the servant, or name of a service that has one servant.
     servant: String,
-    /// The file to write, which must not be there yet.
+    /// Output file, which must not exist.
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
-    topics: Topics,
-    /// Record for so long, such as 30s or 5m.
+    topics: TopicFilter,
+    /// Duration of the recording, such as 30s or 5m (default: until Ctrl-C).
     #[arg(short, long, value_name = "TIME", value_parser = lifetime)]
     duration: Option<Duration>,
 }
 
-impl Record {
-    /// Records.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let servant = inside::servant(client, &self.servant).await?;
-        let inside = Inside::attach(client, &servant, DEPTH).await?;
-        let writer = Writer::create(&self.output, inside.format)
-            .context("-o is to name a new file, in a directory that exists")?;
-        output::complain(&format!(
-            "recording {servant} into {}; Ctrl-C ends it",
+impl RecordArgs {
+    /// Records until the end and prints a summary.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let servant = inside::resolve_servant(client, &self.servant).await?;
+        let inside = FoxgloveSession::attach(client, &servant, DEPTH).await?;
+        let writer = RecordingWriter::create(&self.output, inside.format)
+            .context("-o must name a new file in an existing directory")?;
+        output::eprint_line(&format!(
+            "recording {servant} to {}; stop with Ctrl-C",
             self.output.display()
         ));
         let mut recorder = Recorder {
@@ -58,13 +58,14 @@ impl Record {
             last: 0,
         };
         let begun = Instant::now();
-        let ended = recorder.records(self.duration).await;
-        // What came before is kept, whatever has ended it.
+        let ended = recorder.record(self.duration).await;
+        // Keep the messages recorded so far, whatever ended the recording.
         let summary = recorder.writer.finish()?;
-        told(&summary, begun.elapsed(), format)?;
+        print_summary(&summary, begun.elapsed(), format)?;
         if recorder.last == 0 {
-            output::complain(&format!(
-                "none of the wanted topics was published in {servant}; see what is there with: cloudroidctl services NAME"
+            output::eprint_line(&format!(
+                "none of the selected topics was published in {servant}; see its topics with: cloudroidctl services \
+                    NAME"
             ));
         }
         ended
@@ -72,18 +73,18 @@ impl Record {
 }
 
 struct Recorder {
-    inside: Inside,
-    writer: Writer,
-    topics: Topics,
-    /// The file's channels by subscription.
+    inside: FoxgloveSession,
+    writer: RecordingWriter,
+    topics: TopicFilter,
+    /// Channels of the file, by subscription id.
     channels: HashMap<u32, u16>,
-    /// Subscriptions by the daemon's channel.
+    /// Subscription ids, by the daemon's channel id.
     subscribed: HashMap<u64, u32>,
     last: u32,
 }
 
 impl Recorder {
-    async fn records(&mut self, duration: Option<Duration>) -> anyhow::Result<()> {
+    async fn record(&mut self, duration: Option<Duration>) -> anyhow::Result<()> {
         let begun = Instant::now();
         let deadline = duration.map(|duration| begun + duration);
         let time_up = async {
@@ -102,10 +103,10 @@ impl Recorder {
             tokio::select! {
                 message = self.inside.next() => {
                     let Some(message) = message? else {
-                        output::complain("the servant has ended");
+                        output::eprint_line("the servant has ended");
                         return Ok(());
                     };
-                    match inside::read(&message) {
+                    match inside::parse_message(&message) {
                         Some(ServerMessage::Advertise(told)) => {
                             for channel in told.channels {
                                 self.subscribe(&channel).await?;
@@ -120,10 +121,10 @@ impl Recorder {
                         }
                         Some(ServerMessage::MessageData(told)) => {
                             if let Some(channel) = self.channels.get(&told.subscription_id) {
-                                self.writer.add(*channel, told.log_time, &told.data)?;
+                                self.writer.add_message(*channel, told.log_time, &told.data)?;
                             }
                         }
-                        Some(ServerMessage::Status(told)) => output::complain(&told.message),
+                        Some(ServerMessage::Status(told)) => output::eprint_line(&told.message),
                         _ => {}
                     }
                 }
@@ -143,15 +144,15 @@ impl Recorder {
 
     async fn subscribe(&mut self, channel: &Channel<'_>) -> anyhow::Result<()> {
         let encoding = self.inside.format.encoding();
-        if !self.topics.want(&channel.topic) || channel.encoding != encoding {
+        if !self.topics.accepts(&channel.topic) || channel.encoding != encoding {
             return Ok(());
         }
         let Ok(definition) = channel.decode_schema() else {
-            bail!("the daemon tells no definition of {}", channel.topic);
+            bail!("the daemon sent no message definition of {}", channel.topic);
         };
         let written = self
             .writer
-            .channel(&channel.topic, &channel.schema_name, &definition)?;
+            .add_channel(&channel.topic, &channel.schema_name, &definition)?;
         self.last += 1;
         self.channels.insert(self.last, written);
         self.subscribed.insert(channel.id, self.last);
@@ -160,8 +161,8 @@ impl Recorder {
     }
 }
 
-fn told(summary: &Summary, time: Duration, format: Format) -> anyhow::Result<()> {
-    if format == Format::Json {
+fn print_summary(summary: &Summary, time: Duration, format: OutputFormat) -> anyhow::Result<()> {
+    if format == OutputFormat::Json {
         return output::json(summary);
     }
     if std::io::stderr().is_terminal() {
@@ -178,7 +179,7 @@ fn told(summary: &Summary, time: Duration, format: Format) -> anyhow::Result<()>
     }
     table.print()?;
     output::line(&format!(
-        "{} messages of {} topics in {:.1} s: {} ({:.1} MB)",
+        "{} messages on {} topics in {:.1} s: {} ({:.1} MB)",
         summary.messages,
         summary.topics.len(),
         time.as_secs_f64(),

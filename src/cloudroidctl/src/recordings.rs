@@ -1,4 +1,4 @@
-//! `recordings`: files of the last seconds of servants, which the daemon keeps.
+//! `recordings`: recordings of the last seconds of servants, which the daemon keeps.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -9,76 +9,76 @@ use futures_util::StreamExt;
 use http_body_util::BodyStream;
 use hyper::Method;
 
-use crate::client::{Client, empty, escaped};
+use crate::client::{DaemonClient, empty_body, percent_encode};
 use crate::inside;
-use crate::output::{self, Format, Table};
-use crate::whole::Half;
+use crate::output::{self, OutputFormat, Table};
+use crate::whole::AtomicFile;
 
-/// Black boxes: what flowed in servants in the seconds before their robots waited too long.
+/// Manage black boxes: recordings of the seconds in servants before their robots waited too long.
 ///
-/// The daemon writes them where its configuration says so ([black_box]).
+/// The daemon writes them if its configuration enables it ([black_box]).
 #[derive(Debug, clap::Args)]
-pub struct Recordings {
+pub struct RecordingsArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: RecordingsCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Verb {
-    List(List),
-    Get(Get),
-    Take(Take),
-    Rm(Rm),
+enum RecordingsCommand {
+    List(ListRecordings),
+    Get(GetRecording),
+    Take(TakeRecording),
+    Rm(RemoveRecording),
 }
 
-/// List them, the newest first.
+/// List recordings, newest first.
 #[derive(Debug, clap::Args)]
-struct List {
-    /// Only those of this service.
+struct ListRecordings {
+    /// Only recordings of this service.
     #[arg(long, value_name = "NAME")]
     service: Option<String>,
-    /// Only those of this robot.
+    /// Only recordings of this robot.
     #[arg(long, value_name = "ID")]
     robot: Option<String>,
 }
 
-/// Fetch one: an MCAP file, as `cloudroidctl record` writes them.
+/// Download a recording: an MCAP file, like those of `cloudroidctl record`.
 #[derive(Debug, clap::Args)]
-struct Get {
-    /// Its number.
+struct GetRecording {
+    /// Number of the recording.
     number: u64,
-    /// The file; recording-NUMBER.mcap by default. An earlier one is replaced when the new one is whole.
+    /// Output file (default: recording-NUMBER.mcap). An existing file is replaced when the new one is complete.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
-/// Write what flowed in a servant in the last seconds, now.
+/// Write the last seconds of a servant to a recording now.
 #[derive(Debug, clap::Args)]
-struct Take {
-    /// The servant's id, or the name of a service that has one servant.
+struct TakeRecording {
+    /// Id of the servant, or name of a service that has one servant.
     servant: String,
 }
 
-/// Remove one.
+/// Remove a recording.
 #[derive(Debug, clap::Args)]
-struct Rm {
-    /// Its number.
+struct RemoveRecording {
+    /// Number of the recording.
     number: u64,
 }
 
-impl Recordings {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl RecordingsArgs {
+    /// Sends the requests and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.verb {
-            Verb::List(verb) => verb.run(client, format).await,
-            Verb::Get(verb) => verb.run(client, format).await,
-            Verb::Take(verb) => {
-                let servant = inside::servant(client, &verb.servant).await?;
-                let path = format!("/api/v1/servants/{}/recording", escaped(&servant));
+            RecordingsCommand::List(verb) => verb.run(client, format).await,
+            RecordingsCommand::Get(verb) => verb.run(client, format).await,
+            RecordingsCommand::Take(verb) => {
+                let servant = inside::resolve_servant(client, &verb.servant).await?;
+                let path = format!("/api/v1/servants/{}/recording", percent_encode(&servant));
                 let taken: Recording = client.post(&path, &()).await?;
                 list(&[taken], format)
             }
-            Verb::Rm(verb) => {
+            RecordingsCommand::Rm(verb) => {
                 let path = format!("/api/v1/recordings/{}", verb.number);
                 let left: Vec<Recording> = client.delete(&path).await?;
                 list(&left, format)
@@ -87,57 +87,60 @@ impl Recordings {
     }
 }
 
-impl List {
-    async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl ListRecordings {
+    async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let asked = [("service", self.service), ("robot", self.robot)];
         let asked: Vec<String> = asked
             .into_iter()
-            .filter_map(|(name, value)| Some(format!("{name}={}", escaped(&value?))))
+            .filter_map(|(name, value)| Some(format!("{name}={}", percent_encode(&value?))))
             .collect();
         let path = format!("/api/v1/recordings?{}", asked.join("&"));
         let all: Vec<Recording> = client.get(&path).await?;
-        if all.is_empty() && format == Format::Table {
-            output::complain(match asked.is_empty() {
-                true => {
-                    "there are no recordings: where [black_box] has seconds in the daemon's configuration, it writes one when a robot waits longer than it accepts, and by: cloudroidctl recordings take SERVANT"
-                }
-                false => {
-                    "there are no recordings of that service and robot; without --service and --robot all are listed"
-                }
+        if all.is_empty() && format == OutputFormat::Table {
+            output::eprint_line(if asked.is_empty() {
+                "no recordings; with seconds in [black_box] of its configuration, the daemon writes one when a \
+                    response comes later than the robot's limit; write one now with: cloudroidctl recordings take \
+                    SERVANT"
+            } else {
+                "no recordings of that service and robot; omit --service and --robot to list all"
             });
         }
         list(&all, format)
     }
 }
 
-impl Get {
-    async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl GetRecording {
+    async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let target = self
             .output
             .unwrap_or_else(|| PathBuf::from(format!("recording-{}.mcap", self.number)));
         let path = format!("/api/v1/recordings/{}", self.number);
-        let answer = client.send(Method::GET, &path, empty()).await?;
-        let half = Half::beside(&target)?;
+        let answer = client.send(Method::GET, &path, empty_body()).await?;
+        let half = AtomicFile::create_beside(&target)?;
         let mut bytes = 0;
         let mut parts = BodyStream::new(answer.into_body());
         while let Some(part) = parts.next().await {
-            let part = part.context("the daemon broke off its answer")?;
+            let part = part.context("the daemon's response was cut off")?;
             let part = part.into_data().unwrap_or_default();
             bytes += part.len() as u64;
             (&half.file)
                 .write_all(&part)
-                .with_context(|| half.failed())?;
+                .with_context(|| half.error_context())?;
         }
-        half.publish()?;
+        half.persist()?;
         match format {
-            Format::Json => output::json(&serde_json::json!({ "path": target, "bytes": bytes })),
-            Format::Table => output::line(&format!("{} ({})", target.display(), api::Size(bytes))),
+            OutputFormat::Json => {
+                output::json(&serde_json::json!({ "path": target, "bytes": bytes }))
+            }
+            OutputFormat::Table => {
+                output::line(&format!("{} ({})", target.display(), api::Size(bytes)))
+            }
         }
     }
 }
 
-fn list(all: &[Recording], format: Format) -> anyhow::Result<()> {
-    if format == Format::Json {
+fn list(all: &[Recording], format: OutputFormat) -> anyhow::Result<()> {
+    if format == OutputFormat::Json {
         return output::json(&all);
     }
     if all.is_empty() {

@@ -1,4 +1,4 @@
-//! `replay`: what a file holds, into a servant, at its times.
+//! `replay`: publishes the messages of a file in a servant, at the recorded times.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
@@ -10,58 +10,62 @@ use foxglove::ws_protocol::client::{Advertise, MessageData};
 use foxglove::ws_protocol::schema::Schema;
 use foxglove::ws_protocol::server::ServerMessage;
 use foxglove::ws_protocol::server::status::Level;
-use recording::{Played, Reader};
+use recording::{RecordedMessage, RecordingReader};
 use tokio::time::{Instant, sleep_until};
 use tokio_tungstenite::tungstenite::Message;
 
-use crate::client::Client;
-use crate::inside::{self, Inside};
-use crate::output::{self, Format};
-use crate::topics::Topics;
+use crate::client::DaemonClient;
+use crate::inside::{self, FoxgloveSession};
+use crate::output::{self, OutputFormat};
+use crate::topics::TopicFilter;
 
-/// Messages of a topic that wait for a node that is slow.
+/// Length of the daemon's queue for each topic, for slow nodes.
 const DEPTH: usize = 1000;
 
-/// Publish the messages of an MCAP file in a servant of the same ROS, as far apart as they were recorded.
+/// Replay the messages of an MCAP file in a servant of the same ROS version, at the recorded intervals.
 #[derive(Debug, clap::Args)]
-pub struct Replay {
-    /// The file, such as record writes.
+pub struct ReplayArgs {
+    /// Recording to replay, such as a file written by record.
     file: PathBuf,
-    /// The servant's id, or the name of a service that has one servant.
+    /// Id of the servant, or name of a service that has one servant.
     #[arg(long, value_name = "SERVANT")]
     to: String,
     #[command(flatten)]
-    topics: Topics,
-    /// So many times as fast as they were recorded.
+    topics: TopicFilter,
+    /// Speed relative to the recording.
     #[arg(short, long, value_name = "FACTOR", default_value_t = 1.0, value_parser = rate)]
     rate: f64,
-    /// Begin again at the end, until Ctrl-C.
+    /// Repeat the recording until Ctrl-C.
     #[arg(short = 'l', long = "loop")]
     again: bool,
 }
 
 fn rate(text: &str) -> Result<f64, String> {
-    let rate: f64 = text.parse().map_err(|_| "it is no number".to_owned())?;
-    match rate.is_finite() && rate > 0.0 {
-        true => Ok(rate),
-        false => Err("it must be more than 0".to_owned()),
+    let rate: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if rate.is_finite() && rate > 0.0 {
+        Ok(rate)
+    } else {
+        Err("must be greater than 0".to_owned())
     }
 }
 
-impl Replay {
-    /// Publishes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        // Before anybody is asked: what cannot be read is said first.
-        if let Err(error) = Reader::open(&self.file).and_then(|mut file| file.next_message()) {
-            let hint = "; cloudroidctl record writes such, and `mcap convert` makes one of a bag";
+impl ReplayArgs {
+    /// Replays the file and prints the number of messages by topic.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        // Report an unreadable file before anything is requested.
+        if let Err(error) =
+            RecordingReader::open(&self.file).and_then(|mut file| file.next_message())
+        {
+            let hint =
+                "; create one with cloudroidctl record, or convert a bag with `mcap convert`";
             match error {
                 recording::Error::NoRecording { .. } => bail!("{error}{hint}"),
                 error => return Err(error.into()),
             }
         }
-        let servant = inside::servant(client, &self.to).await?;
+        let servant = inside::resolve_servant(client, &self.to).await?;
         let mut player = Player {
-            inside: Inside::attach(client, &servant, DEPTH).await?,
+            inside: FoxgloveSession::attach(client, &servant, DEPTH).await?,
             channels: HashMap::new(),
             published: BTreeMap::new(),
             left_out: BTreeMap::new(),
@@ -69,7 +73,7 @@ impl Replay {
         };
         let played = async {
             loop {
-                let published = player.plays(&self).await?;
+                let published = player.play_once(&self).await?;
                 if !self.again || !published {
                     return anyhow::Ok(());
                 }
@@ -86,21 +90,21 @@ impl Replay {
             mut complaints,
             ..
         } = player;
-        for message in inside.leave().await {
-            complaints += told(&message);
+        for message in inside.close().await {
+            complaints += relay_status(&message);
         }
         for (topic, why) in &left_out {
-            output::complain(&format!("{topic} was left out: {why}"));
+            output::eprint_line(&format!("{topic} was skipped: {why}"));
         }
         if published.is_empty() {
             bail!(
-                "nothing of {} was published: it holds no message of a wanted topic",
+                "nothing of {} was published: it has no messages on the selected topics",
                 self.file.display()
             );
         }
         match format {
-            Format::Json => output::json(&published)?,
-            Format::Table => {
+            OutputFormat::Json => output::json(&published)?,
+            OutputFormat::Table => {
                 let mut table = output::Table::new(&["TOPIC", "MESSAGES"]);
                 for (topic, messages) in &published {
                     table.row([topic.clone(), messages.to_string()]);
@@ -110,7 +114,8 @@ impl Replay {
         }
         if complaints > 0 {
             bail!(
-                "not all of {} was published: the words above say why; --topic names what to play, and push --with DEBIAN-PACKAGE adds definitions to an image",
+                "not all of {} was published, for the reasons above; select topics with --topic, and add message \
+                    definitions to the image with push --with DEBIAN-PACKAGE",
                 self.file.display()
             );
         }
@@ -119,75 +124,76 @@ impl Replay {
 }
 
 struct Player {
-    inside: Inside,
-    /// By topic.
+    inside: FoxgloveSession,
+    /// Channel ids, by topic.
     channels: HashMap<String, u32>,
-    /// How many messages, by topic.
+    /// Number of published messages, by topic.
     published: BTreeMap<String, u64>,
-    /// Topics, and why.
+    /// Topics that were left out, with the reason.
     left_out: BTreeMap<String, String>,
-    /// How often the daemon refused something.
+    /// Number of refusals by the daemon.
     complaints: usize,
 }
 
-/// Passes on what the daemon says; 1 where it is a refusal.
-fn told(message: &Message) -> usize {
-    let Some(ServerMessage::Status(told)) = inside::read(message) else {
+/// Prints a status message of the daemon; returns 1 if it is an error, otherwise 0.
+fn relay_status(message: &Message) -> usize {
+    let Some(ServerMessage::Status(told)) = inside::parse_message(message) else {
         return 0;
     };
-    output::complain(&told.message);
+    output::eprint_line(&told.message);
     usize::from(told.level == Level::Error)
 }
 
 impl Player {
-    /// Plays the file once; whether there was anything.
-    async fn plays(&mut self, replay: &Replay) -> anyhow::Result<bool> {
-        let mut reader = Reader::open(&replay.file)?;
+    /// Plays the file once; returns whether it had any wanted message.
+    async fn play_once(&mut self, replay: &ReplayArgs) -> anyhow::Result<bool> {
+        let mut reader = RecordingReader::open(&replay.file)?;
         let mut first = None;
         let begun = Instant::now();
         while let Some(played) = reader.next_message()? {
-            if !replay.topics.want(&played.topic) {
+            if !replay.topics.accepts(&played.topic) {
                 continue;
             }
             let since = played
                 .time
                 .saturating_sub(*first.get_or_insert(played.time));
             let due = begun + Duration::from_nanos(since).div_f64(replay.rate);
-            self.wait(due).await?;
+            self.relay_until(due).await?;
             self.publish(&played).await?;
         }
-        if reader.breaks_off() {
-            output::complain(&format!(
-                "{} breaks off; what it holds up to there was published",
+        if reader.is_truncated() {
+            output::eprint_line(&format!(
+                "{} is truncated; everything up to that point was published",
                 replay.file.display()
             ));
         }
         Ok(first.is_some())
     }
 
-    /// Until then, what the daemon says is passed on.
-    async fn wait(&mut self, due: Instant) -> anyhow::Result<()> {
+    /// Waits until `due` and prints the daemon's status messages meanwhile.
+    async fn relay_until(&mut self, due: Instant) -> anyhow::Result<()> {
         loop {
             tokio::select! {
                 biased;
                 () = sleep_until(due) => return Ok(()),
                 message = self.inside.next() => {
                     let Some(message) = message? else { bail!("the servant has ended") };
-                    self.complaints += told(&message);
+                    self.complaints += relay_status(&message);
                 }
             }
         }
     }
 
-    async fn publish(&mut self, played: &Played) -> anyhow::Result<()> {
+    async fn publish(&mut self, played: &RecordedMessage) -> anyhow::Result<()> {
         let encoding = self.inside.format.encoding();
         if played.encoding != encoding {
             let why = format!(
-                "it is written as {:?}, and this servant takes {encoding}: its service is of {}; replay it to one of the other ROS",
+                "it is encoded as {:?}, but this servant expects {encoding} because its service uses {}; replay it to \
+                    a service of the other ROS version",
                 played.encoding,
                 match self.inside.format {
-                    recording::Format::Ros1 => "ROS 1",
-                    recording::Format::Ros2 => "ROS 2",
+                    recording::RecordingFormat::Ros1 => "ROS 1",
+                    recording::RecordingFormat::Ros2 => "ROS 2",
                 }
             );
             self.left_out.insert(played.topic.clone(), why);

@@ -1,26 +1,29 @@
-//! `rm`: takes a service away.
+//! `rm`: removes a service.
 
 use api::Stopped;
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat};
 
-/// Remove a service: its servants are ended, its revisions and their images forgotten.
+/// Remove a service: end its servants and delete its revisions and their images.
 #[derive(Debug, clap::Args)]
-pub struct Rm {
-    /// The service.
+pub struct RmArgs {
+    /// Service to remove.
     service: String,
 }
 
-impl Rm {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl RmArgs {
+    /// Sends the request and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let ended: Stopped = client
-            .delete(&format!("/api/v1/services/{}", escaped(&self.service)))
+            .delete(&format!(
+                "/api/v1/services/{}",
+                percent_encode(&self.service)
+            ))
             .await?;
         match format {
-            Format::Json => output::json(&ended),
-            Format::Table => output::line(&match ended.stopped.as_slice() {
+            OutputFormat::Json => output::json(&ended),
+            OutputFormat::Table => output::line(&match ended.stopped.as_slice() {
                 [] => format!("removed {}", self.service),
                 stopped => format!("removed {} and ended {}", self.service, stopped.join(", ")),
             }),

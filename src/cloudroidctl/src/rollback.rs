@@ -1,23 +1,26 @@
-//! `rollback`: back to an earlier revision.
+//! `rollback`: returns to an earlier revision.
 
 use api::ServiceDetail;
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat};
 
-/// Start new servants of a service from an earlier revision. Those at work stay as they are.
+/// Roll a service back: new servants start from an earlier revision, existing ones are not changed.
 #[derive(Debug, clap::Args)]
-pub struct Rollback {
-    /// The service.
+pub struct RollbackArgs {
+    /// Service to roll back.
     service: String,
-    /// The revision; the one before the current by default.
+    /// Revision to return to (default: the one before the current).
     revision: Option<u64>,
 }
 
-impl Rollback {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let path = format!("/api/v1/services/{}/rollback", escaped(&self.service));
+impl RollbackArgs {
+    /// Sends the request and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let path = format!(
+            "/api/v1/services/{}/rollback",
+            percent_encode(&self.service)
+        );
         let service: ServiceDetail = client
             .post(
                 &path,
@@ -27,11 +30,11 @@ impl Rollback {
             )
             .await?;
         match format {
-            Format::Json => output::json(&service),
-            Format::Table => {
+            OutputFormat::Json => output::json(&service),
+            OutputFormat::Table => {
                 let summary = &service.summary;
                 output::line(&format!(
-                    "{} is at revision {} again",
+                    "{} is back at revision {}",
                     summary.name, summary.revision
                 ))
             }

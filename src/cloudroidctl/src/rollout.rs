@@ -1,68 +1,68 @@
-//! `rollout`: how a service comes to its next revision.
+//! `rollout`: transition of a service to another revision.
 
 use std::time::Duration;
 
 use anyhow::bail;
 use api::rollout::{Arm, Rollout as Shown, RolloutOrder, RolloutState, RolloutTerms, Share};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 use crate::wait::WaitFlag;
 
-/// Show how a service comes to its next revision, promote or abort a canary, or begin with an earlier revision.
+/// Show the rollout of a service's next revision, promote or abort a canary, or start a rollout of an earlier revision.
 #[derive(Debug, clap::Args)]
-pub struct Rollout {
-    /// The service.
+pub struct RolloutArgs {
+    /// Service that is rolled out.
     service: String,
     #[command(flatten)]
     wait: WaitFlag,
     #[command(subcommand)]
-    order: Option<Order>,
+    order: Option<RolloutCommand>,
 }
 
 #[derive(Debug, Clone, clap::Subcommand)]
-enum Order {
-    /// Show how far it has come, and how the two revisions compare.
+enum RolloutCommand {
+    /// Show the progress and the comparison of the two revisions.
     Status,
     /// Make the canary the current revision.
     Promote,
-    /// Take the canary back; its robots get the current revision when they connect again.
+    /// Abort the canary; its robots get the current revision when they connect again.
     Abort,
-    /// Begin with a revision that was published before.
+    /// Start a rollout of a published revision.
     Start {
-        /// The revision.
+        /// Revision to roll out.
         revision: u64,
         #[command(flatten)]
         terms: TermFlags,
     },
 }
 
-/// On which terms a revision takes another's place.
+/// Terms on which a revision replaces another.
 #[derive(Debug, Default, Clone, clap::Args)]
 pub struct TermFlags {
-    /// Robots that the revision serves first: 3 for the first three, 10% for a tenth of those that come. It is taken back by
-    /// itself when it is worse than the revision before.
+    /// Robots that the new revision serves first: 3 for the first three, 10% for a tenth of the robots that connect. It
+    /// is aborted automatically if it is worse than the previous revision.
     #[arg(long, value_name = "ROBOTS")]
     canary: Option<Share>,
-    /// By how much a canary may be worse: of its failures the difference to the revision before (0.1 are ten in a hundred), of its
-    /// response times the part by which they are longer.
+    /// Allowed regression of a canary (default: 0.1, which is 10 %): difference of the failure rates, and relative
+    /// increase of the response times.
     #[arg(long, value_name = "PART", requires = "canary")]
     bound: Option<f64>,
-    /// Requests of each revision before they are compared; 20 by default.
+    /// Number of requests of each revision before they are compared (default: 20).
     #[arg(long, value_name = "N", requires = "canary")]
     samples: Option<u32>,
-    /// Promote a canary that was not worse automatically after this time, such as 30m, once it has been asked as often as --samples
-    /// says (default: only by hand).
+    /// Promote a canary that is not worse automatically after this time, such as 30m, once it has served --samples
+    /// requests (default: only by hand).
     #[arg(long, value_name = "TIME", value_parser = time, requires = "canary")]
     promote_after: Option<Duration>,
-    /// Time from becoming the current revision to the end of servants of other revisions, such as 10m; without it they
-    /// stay until their robots leave.
+    /// Time after the promotion until servants of other revisions are ended, such as 10m (default: when their robots
+    /// disconnect).
     #[arg(long, value_name = "TIME", value_parser = time)]
     deadline: Option<Duration>,
 }
 
 impl TermFlags {
-    /// What was said; none where nothing was.
+    /// Returns the terms, or `None` if no flag is given.
     pub fn terms(&self) -> Option<RolloutTerms> {
         let of = RolloutTerms::default();
         let terms = RolloutTerms {
@@ -76,7 +76,7 @@ impl TermFlags {
     }
 }
 
-/// `500ms`, `30s`, `5m`, `1h`, or a number of seconds.
+/// Parses `500ms`, `30s`, `5m`, `1h`, or a number of seconds.
 fn time(text: &str) -> Result<Duration, String> {
     let end = text
         .find(|c: char| !c.is_ascii_digit() && c != '.')
@@ -94,15 +94,15 @@ fn time(text: &str) -> Result<Duration, String> {
         .map_err(|_| "write a number with ms, s, m or h, such as 10m".to_owned())
 }
 
-impl Rollout {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let path = format!("/api/v1/services/{}/rollout", escaped(&self.service));
-        let order = match self.order.unwrap_or(Order::Status) {
-            Order::Status => None,
-            Order::Promote => Some(RolloutOrder::Promote),
-            Order::Abort => Some(RolloutOrder::Abort),
-            Order::Start { revision, terms } => Some(RolloutOrder::Start {
+impl RolloutArgs {
+    /// Sends the request and prints the rollout.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let path = format!("/api/v1/services/{}/rollout", percent_encode(&self.service));
+        let order = match self.order.unwrap_or(RolloutCommand::Status) {
+            RolloutCommand::Status => None,
+            RolloutCommand::Promote => Some(RolloutOrder::Promote),
+            RolloutCommand::Abort => Some(RolloutOrder::Abort),
+            RolloutCommand::Start { revision, terms } => Some(RolloutOrder::Start {
                 revision,
                 terms: terms.terms().unwrap_or_default(),
             }),
@@ -112,23 +112,27 @@ impl Rollout {
             Some(order) => client.post(&path, &order).await?,
         };
         if self.wait.is_set() {
-            let rollout = over(client, &self.service, self.wait).await?;
-            return told(&rollout, format).and_then(|()| promoted(&rollout));
+            let rollout = wait_until_over(client, &self.service, self.wait).await?;
+            return print_rollout(&rollout, format).and_then(|()| require_promoted(&rollout));
         }
-        told(&rollout, format)
+        print_rollout(&rollout, format)
     }
 }
 
-fn told(rollout: &Shown, format: Format) -> anyhow::Result<()> {
+fn print_rollout(rollout: &Shown, format: OutputFormat) -> anyhow::Result<()> {
     match format {
-        Format::Json => output::json(rollout),
-        Format::Table => show(rollout),
+        OutputFormat::Json => output::json(rollout),
+        OutputFormat::Table => show(rollout),
     }
 }
 
-/// A service's last rollout, once it is over.
-pub async fn over(client: &Client, service: &str, wait: WaitFlag) -> anyhow::Result<Shown> {
-    let path = &format!("/api/v1/services/{}/rollout", escaped(service));
+/// Returns a service's last rollout when it has ended.
+pub async fn wait_until_over(
+    client: &DaemonClient,
+    service: &str,
+    wait: WaitFlag,
+) -> anyhow::Result<Shown> {
+    let path = &format!("/api/v1/services/{}/rollout", percent_encode(service));
     let look = || async move {
         let rollout: Shown = client.get(path).await?;
         let goes_on = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
@@ -136,44 +140,42 @@ pub async fn over(client: &Client, service: &str, wait: WaitFlag) -> anyhow::Res
         let words = format!("{service} is at {}: {why}", rollout.state);
         Ok(if goes_on { Err(words) } else { Ok(rollout) })
     };
-    wait.until(look).await
+    wait.poll_until(look).await
 }
 
-/// Fails where the candidate has not become the current revision.
-pub fn promoted(rollout: &Shown) -> anyhow::Result<()> {
+/// Fails unless the candidate has become the current revision.
+pub fn require_promoted(rollout: &Shown) -> anyhow::Result<()> {
     let Shown {
         service, candidate, ..
     } = rollout;
     match rollout.state {
         RolloutState::Promoted => Ok(()),
         state => bail!(
-            "revision {candidate} of {service} has not become the current one: {state}, {}",
+            "revision {candidate} of {service} was not promoted: {state}, {}",
             rollout.reason
         ),
     }
 }
 
-/// What is to come, and what it waits for.
+/// Returns the next steps and their conditions in words.
 fn next_in_words(rollout: &Shown) -> Vec<String> {
     let terms = &rollout.terms;
     let time = |seconds: f64| format!("{seconds} s");
     let mut words = Vec::new();
     if rollout.state == RolloutState::Canary {
         words.push(format!(
-            "it is taken back when it is worse by more than {}, from {} requests of each revision on",
+            "rolled back when worse by more than {}, after at least {} requests to each revision",
             terms.bound, terms.samples
         ));
         words.push(match (&rollout.waits, terms.promote_after) {
-            (Some(waits), Some(_)) => format!(
-                "its time to become the current revision has come, and it waits: {waits}"
-            ),
+            (Some(waits), Some(_)) => format!("its promotion is due but waits: {waits}"),
             (_, Some(after)) => format!(
-                "it becomes the current revision {} after it has begun, unless it is worse, once it has been asked {} times",
+                "promoted {} after its start, unless it is worse, and after at least {} requests",
                 time(after),
                 terms.samples
             ),
             (_, None) => format!(
-                "it becomes the current revision when you say: cloudroidctl rollout {} promote",
+                "promote it with: cloudroidctl rollout {} promote",
                 rollout.service
             ),
         });
@@ -181,14 +183,14 @@ fn next_in_words(rollout: &Shown) -> Vec<String> {
     let is_to_end = matches!(rollout.state, RolloutState::Canary | RolloutState::Draining);
     if let Some(deadline) = terms.deadline.filter(|_| is_to_end) {
         words.push(format!(
-            "servants of other revisions end {} after it has become the current one",
+            "servants of other revisions end {} after the promotion",
             time(deadline)
         ));
     }
     words
 }
 
-/// Also what a push of a canary ends with.
+/// Prints a rollout. Also used by a push of a canary.
 pub fn show(rollout: &Shown) -> anyhow::Result<()> {
     output::line(&format!(
         "{}, revision {} after {}: {}, {} ago: {}",
@@ -207,7 +209,7 @@ pub fn show(rollout: &Shown) -> anyhow::Result<()> {
     if !is_canary && seen.iter().all(|arm| **arm == Arm::default()) {
         return Ok(());
     }
-    let mut table = Table::new(&["REVISION", "SERVANTS", "REQUESTS", "MEDIAN", "95 %"]);
+    let mut table = Table::new(&["REVISION", "SERVANTS", "REQUESTS", "P50", "P95"]);
     for (revision, arm) in [rollout.stable, rollout.candidate].into_iter().zip(seen) {
         let failed = |all: u64, failed: u64| match failed {
             0 => all.to_string(),
@@ -236,10 +238,10 @@ mod tests {
     #[derive(Debug, Parser)]
     struct Line {
         #[command(flatten)]
-        rollout: Rollout,
+        rollout: RolloutArgs,
     }
 
-    fn parse(line: &str) -> Result<Rollout, clap::Error> {
+    fn parse(line: &str) -> Result<RolloutArgs, clap::Error> {
         let words = std::iter::once("rollout").chain(line.split_whitespace());
         Line::try_parse_from(words).map(|line| line.rollout)
     }
@@ -248,7 +250,8 @@ mod tests {
     fn terms_are_read_as_they_are_typed() {
         let line =
             "s start 3 --canary 10% --bound 0.2 --samples 5 --deadline 10m --promote-after 500ms";
-        let Some(Order::Start { revision, terms }) = parse(line).expect("valid").order else {
+        let Some(RolloutCommand::Start { revision, terms }) = parse(line).expect("valid").order
+        else {
             panic!("it begins");
         };
         let expected = RolloutTerms {

@@ -1,33 +1,35 @@
-//! `servants`: who works for which robot.
+//! `servants`: lists servants and their robots.
 
 use api::{BackOff, Pressure, ResponseTimes, Servant, Size};
 
-use crate::client::Client;
-use crate::output::{self, Format, Table};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat, Table};
 
-/// List the servants: the containers at work, each for one robot.
+/// List the servants: the running containers, each for one robot.
 #[derive(Debug, clap::Args)]
-pub struct Servants {
-    /// Only those of this service.
+pub struct ServantsArgs {
+    /// Only servants of this service.
     service: Option<String>,
 }
 
-impl Servants {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl ServantsArgs {
+    /// Sends the requests and prints the servants.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let mut servants: Vec<Servant> = client.get("/api/v1/servants").await?;
         servants.retain(|servant| {
             self.service
                 .as_ref()
                 .is_none_or(|service| *service == servant.service)
         });
-        if format == Format::Json {
+        if format == OutputFormat::Json {
             return output::json(&servants);
         }
         let mut failing: Vec<BackOff> = client.get("/api/v1/back-offs").await?;
         failing.retain(|one| self.service.as_ref().is_none_or(|it| *it == one.service));
         if servants.is_empty() && failing.is_empty() {
-            return output::line("no servants; one starts when a robot connects to a service");
+            return output::line(
+                "no servants (instances); one starts when a robot connects to a service",
+            );
         }
         let mut table = Table::new(&[
             "SERVANT",
@@ -42,7 +44,7 @@ impl Servants {
             "PRESSURE",
             "RESPONSE",
             "LIMITS",
-            "STATED",
+            "REQUESTED",
         ]);
         for servant in &servants {
             let usage = servant.usage.as_ref();
@@ -75,25 +77,25 @@ impl Servants {
         }
         for one in failing {
             output::line(&format!(
-                "{}:{} for {} has failed {} times in a row (the last one {}); next start in {}",
+                "{}:{} for {} has failed {} times in a row (last: {}); next start in {}",
                 one.service,
                 one.revision,
                 one.robot,
                 one.failures,
                 one.reason,
-                output::until(one.again),
+                output::time_until(one.again),
             ))?;
         }
         Ok(())
     }
 }
 
-/// What half of the requests of the last seconds did not exceed, and what 19 of 20 did not.
+/// Formats the median and the 95th percentile of the response times of the last seconds.
 fn response(times: ResponseTimes) -> String {
-    format!("{:.0}, {:.0} ms", times.p50_ms, times.p95_ms)
+    format!("p50 {:.0}, p95 {:.0} ms", times.p50_ms, times.p95_ms)
 }
 
-/// What some of it waits for, if for anything.
+/// Formats the resources that a servant waits for.
 fn pressure(of: Pressure) -> String {
     let waits: Vec<String> = [("cpu", of.cpu), ("memory", of.memory), ("io", of.io)]
         .into_iter()
@@ -115,7 +117,7 @@ fn state(servant: &Servant) -> String {
                 "{} failed {} times in a row, next start in {}",
                 down.node,
                 down.failures,
-                output::until(down.again)
+                output::time_until(down.again)
             )
         })
         .collect();

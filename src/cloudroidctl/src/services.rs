@@ -1,35 +1,35 @@
-//! `services`: what is published.
+//! `services`: lists published services.
 
 use api::{Group, ServiceDetail, ServiceSummary, Shared};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
 /// List the published services, or show one with its interface and revisions.
 #[derive(Debug, clap::Args)]
-pub struct Services {
-    /// Show this service alone, with everything known of it.
+pub struct ServicesArgs {
+    /// Show only this service, with all details.
     name: Option<String>,
 }
 
-impl Services {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl ServicesArgs {
+    /// Sends the request and prints the services.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.name {
             Some(name) => {
                 let service: ServiceDetail = client
-                    .get(&format!("/api/v1/services/{}", escaped(&name)))
+                    .get(&format!("/api/v1/services/{}", percent_encode(&name)))
                     .await?;
                 match format {
-                    Format::Json => output::json(&service),
-                    Format::Table => show(&service),
+                    OutputFormat::Json => output::json(&service),
+                    OutputFormat::Table => show(&service),
                 }
             }
             None => {
                 let services: Vec<ServiceSummary> = client.get("/api/v1/services").await?;
                 match format {
-                    Format::Json => output::json(&services),
-                    Format::Table => list(&services),
+                    OutputFormat::Json => output::json(&services),
+                    OutputFormat::Table => list(&services),
                 }
             }
         }
@@ -63,7 +63,7 @@ fn list(services: &[ServiceSummary]) -> anyhow::Result<()> {
     table.print()
 }
 
-/// Everything of one service; a push ends with it.
+/// Prints the details of a service. Also used at the end of a push.
 pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     let summary = &service.summary;
     output::line(&format!(
@@ -113,7 +113,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.needs {
         needs.row([entry.name.clone(), entry.nodes.join(", ")]);
     }
-    let mut lifecycle = Table::new(&["NODE WITH A LIFECYCLE"]);
+    let mut lifecycle = Table::new(&["LIFECYCLE NODE"]);
     for node in &service.interface.lifecycle {
         lifecycle.row([node.clone()]);
     }
@@ -121,7 +121,7 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
     for entry in &service.interface.parameters {
         parameters.row([
             entry.name.clone(),
-            entry.value.as_ref().map(shortened).unwrap_or_default(),
+            entry.value.as_ref().map(shorten).unwrap_or_default(),
             entry
                 .descriptor
                 .as_ref()
@@ -167,9 +167,9 @@ pub fn show(service: &ServiceDetail) -> anyhow::Result<()> {
 fn shared_in_words(shared: &Shared) -> String {
     let mut words = format!("robots share {} to {} servants", shared.min, shared.max);
     if shared.replicas > 1 {
-        words += &format!(", {} at each call", shared.replicas);
+        words += &format!(", {} per call", shared.replicas);
     } else if shared.idempotent {
-        words += ", requests are asked again";
+        words += ", requests are retried";
     }
     words
 }
@@ -192,19 +192,20 @@ fn group_in_words(group: &Group) -> String {
         .count();
     let under_way: usize = group.servants.iter().map(|one| one.under_way).sum();
     let mut words = format!(
-        "revision {revision}: {robots} robots at {ready} of {} servants; {under_way} requests under way, {waiting} waiting; {answered} answered, {failed} failed, {asked_again} asked again",
+        "revision {revision}: {robots} robots, {ready} of {} servants ready; {under_way} requests in progress, \
+            {waiting} waiting; {answered} answered, {failed} failed, {asked_again} retried",
         group.servants.len()
     );
     if *wasted > 0 {
-        words += &format!("; {wasted} of {} answers wasted", answered + wasted);
+        words += &format!("; {wasted} of {} answers unused", answered + wasted);
     }
     if let Some(mean) = group.mean_ms {
-        words += &format!("; {mean:.1} ms in the mean");
+        words += &format!("; mean {mean:.1} ms");
     }
     words
 }
 
-fn shortened(value: &serde_json::Value) -> String {
+fn shorten(value: &serde_json::Value) -> String {
     let text = value.to_string();
     if text.chars().count() <= 60 {
         text

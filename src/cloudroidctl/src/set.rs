@@ -1,35 +1,35 @@
-//! `set`: changes the limits of a servant at work.
+//! `set`: changes the limits of a running servant.
 
 use anyhow::bail;
 use api::{Limits, Servant};
 
-use crate::client::{Client, escaped};
+use crate::client::{DaemonClient, percent_encode};
 use crate::inside;
 use crate::limits::LimitFlags;
-use crate::output::{self, Format};
+use crate::output::{self, OutputFormat};
 
-/// Change limits of a servant while it works. Those that are not named stay; what it is promised changes too.
+/// Change limits of a running servant, and what it is promised. Limits that are not named stay the same.
 #[derive(Debug, clap::Args)]
-pub struct Set {
-    /// The servant's id, or the name of a service that has one servant.
+pub struct SetArgs {
+    /// Id of the servant, or name of a service that has one servant.
     servant: String,
     #[command(flatten)]
     limits: LimitFlags,
 }
 
-impl Set {
-    /// Asks and prints what is in force then.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl SetArgs {
+    /// Sends the request and prints the limits in force.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let limits = Limits::from(self.limits);
         if limits == Limits::default() {
             bail!("nothing to change; name a limit, such as --cpus 1.5 or --memory 512M");
         }
-        let servant = inside::servant(client, &self.servant).await?;
-        let path = format!("/api/v1/servants/{}", escaped(&servant));
+        let servant = inside::resolve_servant(client, &self.servant).await?;
+        let path = format!("/api/v1/servants/{}", percent_encode(&servant));
         let servant: Servant = client.patch(&path, &limits).await?;
         match format {
-            Format::Json => output::json(&servant),
-            Format::Table => output::line(&format!(
+            OutputFormat::Json => output::json(&servant),
+            OutputFormat::Table => output::line(&format!(
                 "{}: {}",
                 servant.id,
                 output::limits(servant.enforced.as_ref().unwrap_or(&servant.limits))

@@ -1,4 +1,4 @@
-//! `shadow`: whether another revision answers a robot's requests as the one does that it uses.
+//! `shadow`: compares the answers of another revision with those of the one that a robot uses.
 
 use anyhow::bail;
 use api::calibration::TimeSpread;
@@ -6,56 +6,57 @@ use api::shadow::{Compared, Shadow as Found, ShadowEvent, ShadowOptions};
 use futures_util::StreamExt;
 use hyper::Method;
 
-use crate::client::{self, Client, escaped, json};
-use crate::output::{self, Format, Table};
+use crate::client::{self, DaemonClient, json_body, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
-/// Fields that are shown of each topic, service and action.
+/// Number of fields that are printed for each topic, service and action.
 const FIELDS: usize = 8;
 
-/// Give what a robot asks of its servant to a candidate of another revision, too, and say what differs.
+/// Shadow a robot's servant with a candidate of another revision: send it the same requests, and report differences.
 ///
-/// The candidate is a servant of its own, started now and ended afterwards. The robot is answered as before; it hears nothing
-/// of the candidate. A robot that needs the candidate's room is given it.
+/// The candidate is a servant of its own, which is started now and ended afterwards. The robot is served as before and
+/// gets no answers of the candidate. A robot that needs the candidate's capacity gets it.
 #[derive(Debug, clap::Args)]
-pub struct Shadow {
-    /// The service.
+pub struct ShadowArgs {
+    /// Service to compare.
     service: String,
-    /// The revision that is the candidate.
+    /// Revision of the candidate.
     revision: u64,
-    /// The robot whose requests are taken; the first that uses the service by default.
+    /// Robot whose requests are used (default: the first one that uses the service).
     #[arg(long)]
     robot: Option<String>,
-    /// Seconds for which they are, at most; 60 by default.
+    /// Longest duration in seconds (default: 60).
     #[arg(long, value_name = "N")]
     seconds: Option<f64>,
-    /// So many messages, calls and goals are enough.
+    /// Number of messages, calls and goals after which the comparison ends.
     #[arg(long, value_name = "N")]
     requests: Option<u64>,
-    /// Two numbers are the same if they are no farther apart than this; where one has a fraction, this times the greater of
-    /// them, if that is above 1. 0.000001 by default.
+    /// Largest difference at which two numbers count as equal (default: 0.000001); unless both are integers, it is
+    /// multiplied by the greater magnitude if that is above 1.
     #[arg(long, value_name = "NUMBER")]
     tolerance: Option<f64>,
-    /// A field that may differ, such as pose.covariance, or detections[].id; may be given several times.
+    /// Field that may differ, such as pose.covariance or detections[].id; may be given several times.
     #[arg(long, value_name = "FIELD")]
     ignore: Vec<String>,
-    /// The part by which the candidate's median response time may be longer; 0.1 by default.
+    /// Allowed relative increase of the candidate's median response time (default: 0.1).
     #[arg(long, value_name = "PART")]
     bound: Option<f64>,
-    /// Let the candidate use the hosts and devices that its revision is granted, although the robot's servant does.
+    /// Let the candidate use the hosts and devices granted to its revision, although the robot's servant uses them,
+    /// too.
     #[arg(long)]
     acting: bool,
 }
 
-impl Shadow {
-    /// Compares and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl ShadowArgs {
+    /// Runs the comparison and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let found = tokio::select! {
             found = self.compare(client, format) => found?,
-            _ = tokio::signal::ctrl_c() => bail!("cancelled; the candidate is ended"),
+            _ = tokio::signal::ctrl_c() => bail!("cancelled; the candidate was ended"),
         };
         match format {
-            Format::Json => output::json_line(&found),
-            Format::Table => print(&found),
+            OutputFormat::Json => output::json_line(&found),
+            OutputFormat::Table => print(&found),
         }
     }
 
@@ -73,21 +74,21 @@ impl Shadow {
         }
     }
 
-    async fn compare(&self, client: &Client, format: Format) -> anyhow::Result<Found> {
-        let path = format!("/api/v1/services/{}/shadow", escaped(&self.service));
+    async fn compare(&self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<Found> {
+        let path = format!("/api/v1/services/{}/shadow", percent_encode(&self.service));
         let answer = client
-            .send(Method::POST, &path, json(&self.options())?)
+            .send(Method::POST, &path, json_body(&self.options())?)
             .await?;
-        let mut events = client::lines(answer);
+        let mut events = client::json_lines(answer);
         while let Some(event) = events.next().await {
             match event? {
                 ShadowEvent::Done { shadow } => return Ok(*shadow),
                 ShadowEvent::Error { problem } => return Err(problem.into()),
-                event if format == Format::Json => output::json_line(&event)?,
+                event if format == OutputFormat::Json => output::json_line(&event)?,
                 ShadowEvent::Step { title } => output::line(&format!("== {title}"))?,
             }
         }
-        bail!("the daemon broke off the comparison")
+        bail!("the daemon aborted the comparison")
     }
 }
 
@@ -167,7 +168,7 @@ fn times(times: Option<&TimeSpread>) -> String {
     })
 }
 
-/// The fields of a topic, service or action that differ.
+/// Returns the differing fields of a topic, service or action as lines.
 fn fields(found: &Found, row: &Compared) -> Vec<String> {
     let mut lines = vec![format!("{} differs in", row.name)];
     for field in row.fields.iter().take(FIELDS) {
@@ -182,7 +183,7 @@ fn fields(found: &Found, row: &Compared) -> Vec<String> {
     }
     let more = row.fields.len().saturating_sub(FIELDS);
     if more > 0 {
-        lines.push(format!("  and {more} more; --format json has them all"));
+        lines.push(format!("  and {more} more; --format json lists all"));
     }
     lines
 }
@@ -213,8 +214,8 @@ mod tests {
             revision: 1,
             candidate: 2,
             verdict: Verdict::Different,
-            why: "2 of 2 answers are not the same: /add_two".into(),
-            ended: "its time is over".into(),
+            why: "2 of 2 answers differ: /add_two".into(),
+            ended: "its time is up".into(),
             given: 2,
             ..Found::default()
         };

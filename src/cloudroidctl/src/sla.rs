@@ -1,4 +1,4 @@
-//! `sla`: a service's dictionary, from what robots state to resources.
+//! `sla`: a service's dictionary, which maps what robots state to resources.
 
 use std::collections::BTreeMap;
 
@@ -6,139 +6,141 @@ use anyhow::bail;
 use api::dictionary::{Explained, NewRows, Row, Spread};
 use api::{Limits, Measure};
 
-use crate::client::{Client, escaped};
+use crate::client::{DaemonClient, percent_encode};
 use crate::limits::LimitFlags;
-use crate::output::{self, Format, Table};
-use crate::stated::{StatedFlags, aux, once, query};
+use crate::output::{self, OutputFormat, Table};
+use crate::stated::{StatedFlags, aux, to_query, unique_aux};
 
-/// What an SLA costs: list, set, remove and explain the rows of a service's dictionary.
+/// Manage the dictionary of a service, which maps SLAs to resources: list, set, remove and explain its rows.
 #[derive(Debug, clap::Args)]
-pub struct Sla {
+pub struct SlaArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: SlaCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Verb {
-    List(List),
-    Set(Set),
-    Rm(Rm),
-    Explain(Explain),
+enum SlaCommand {
+    List(ListRows),
+    Set(SetRow),
+    Rm(RemoveRows),
+    Explain(ExplainRow),
 }
 
 /// List the rows of a service's dictionary.
 #[derive(Debug, clap::Args)]
-struct List {
-    /// The service.
+struct ListRows {
+    /// Service of the dictionary.
     service: String,
 }
 
-/// Write a row: with these limits, a servant reaches this value. One of the same value and auxiliary parameters is replaced.
+/// Set a row: with these limits, a servant reaches this value. Replaces a row with the same value and auxiliary
+/// parameters.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("value").required(true).args(["rrt", "fps", "age"])))]
-struct Set {
-    /// The service.
+struct SetRow {
+    /// Service of the dictionary.
     service: String,
     /// Response time that is reached, such as 100ms.
     #[arg(long, value_name = "TIME", value_parser = rrt, allow_hyphen_values = true)]
     rrt: Option<f64>,
-    /// Frames per second that are reached.
+    /// Frame rate that is reached, in Hz.
     #[arg(long, value_name = "RATE", value_parser = fps, allow_hyphen_values = true)]
     fps: Option<f64>,
     /// Age of an output that is reached, such as 500ms.
     #[arg(long, value_name = "TIME", value_parser = age, allow_hyphen_values = true)]
     age: Option<f64>,
-    /// Auxiliary parameter for which it holds: of a number up to this one; may be given several times.
+    /// Auxiliary parameter for which the row holds, up to this value for a number; may be given several times.
     #[arg(long = "aux", value_name = "KEY=VALUE", value_parser = aux)]
     aux: Vec<(String, String)>,
     #[command(flatten)]
     limits: LimitFlags,
-    /// How it was measured: median, 95th percentile and number of requests, such as 80ms,95ms,200.
+    /// Measurement of the row: median, 95th percentile and number of requests, such as 80ms,95ms,200.
     #[arg(long, value_name = "P50,P95,N")]
     spread: Option<String>,
 }
 
-/// Remove rows by their numbers.
+/// Remove rows by their ids.
 #[derive(Debug, clap::Args)]
-struct Rm {
-    /// The service.
+struct RemoveRows {
+    /// Service of the dictionary.
     service: String,
-    /// Numbers of rows, as `sla list` shows them.
+    /// Ids of rows, as shown by `sla list`.
     #[arg(required = true)]
     rows: Vec<i64>,
 }
 
-/// Say which row a robot would get that states this, why, and what comes next.
+/// Explain which row a robot with these terms would get, why, and which rows come next.
 #[derive(Debug, clap::Args)]
-struct Explain {
-    /// The service.
+struct ExplainRow {
+    /// Service of the dictionary.
     service: String,
     #[command(flatten)]
     stated: StatedFlags,
 }
 
 fn rrt(text: &str) -> Result<f64, String> {
-    Measure::Rrt.read(text)
+    Measure::Rrt.parse_value(text)
 }
 
 fn fps(text: &str) -> Result<f64, String> {
-    Measure::Fps.read(text)
+    Measure::Fps.parse_value(text)
 }
 
 fn age(text: &str) -> Result<f64, String> {
-    Measure::Age.read(text)
+    Measure::Age.parse_value(text)
 }
 
-impl Sla {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl SlaArgs {
+    /// Sends the requests and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.verb {
-            Verb::List(verb) => {
-                let rows: Vec<Row> = client.get(&path(&verb.service, "")).await?;
+            SlaCommand::List(verb) => {
+                let rows: Vec<Row> = client.get(&sla_path(&verb.service, "")).await?;
                 list(&verb.service, &rows, format)
             }
-            Verb::Set(verb) => {
+            SlaCommand::Set(verb) => {
                 let new = NewRows {
                     rows: vec![verb.row()?],
                     replace: false,
                 };
-                let rows: Vec<Row> = client.put(&path(&verb.service, ""), &new).await?;
+                let rows: Vec<Row> = client.put(&sla_path(&verb.service, ""), &new).await?;
                 list(&verb.service, &rows, format)
             }
-            Verb::Rm(verb) => {
-                let mut left: Vec<Row> = client.get(&path(&verb.service, "")).await?;
+            SlaCommand::Rm(verb) => {
+                let mut left: Vec<Row> = client.get(&sla_path(&verb.service, "")).await?;
                 let gone = |row: &&i64| !left.iter().any(|one| one.id == **row);
                 if let Some(row) = verb.rows.iter().find(gone) {
                     bail!(
-                        "{} has no row \"{row}\"; nothing was removed; see its rows with: cloudroidctl sla list {}",
+                        "{} has no entry \"{row}\"; nothing was removed; see its entries with: cloudroidctl sla list \
+                            {}",
                         verb.service,
                         verb.service
                     );
                 }
                 for row in &verb.rows {
-                    let path = path(&verb.service, &format!("/{row}"));
+                    let path = sla_path(&verb.service, &format!("/{row}"));
                     left = client.delete(&path).await?;
                 }
                 list(&verb.service, &left, format)
             }
-            Verb::Explain(verb) => {
-                let query = query(&verb.stated.stated()?);
-                let path = path(&verb.service, &format!("/explain{query}"));
+            SlaCommand::Explain(verb) => {
+                let query = to_query(&verb.stated.to_stated()?);
+                let path = sla_path(&verb.service, &format!("/explain{query}"));
                 let explained: Explained = client.get(&path).await?;
                 match format {
-                    Format::Json => output::json(&explained),
-                    Format::Table => explain(&explained),
+                    OutputFormat::Json => output::json(&explained),
+                    OutputFormat::Table => print_explanation(&explained),
                 }
             }
         }
     }
 }
 
-fn path(service: &str, rest: &str) -> String {
-    format!("/api/v1/services/{}/sla{rest}", escaped(service))
+fn sla_path(service: &str, rest: &str) -> String {
+    format!("/api/v1/services/{}/sla{rest}", percent_encode(service))
 }
 
-impl Set {
+impl SetRow {
     fn row(&self) -> anyhow::Result<Row> {
         let given = [
             (Measure::Rrt, self.rrt),
@@ -149,34 +151,34 @@ impl Set {
             .into_iter()
             .find_map(|(measure, value)| Some((measure, value?)));
         let Some((measure, value)) = given else {
-            bail!("nothing is reached; name --rrt, --fps or --age");
+            bail!("no goal given; pass --rrt, --fps or --age");
         };
         let limits = Limits::from(self.limits);
         if limits == Limits::default() {
-            bail!("nothing is needed; name a limit, such as --cpus 1.5 or --memory 512M");
+            bail!("no limits given; pass one, such as --cpus 1.5 or --memory 512M");
         }
         let spread = self.spread.as_deref();
         Ok(Row {
             id: 0,
             measure,
             value,
-            aux: once(&self.aux)?,
+            aux: unique_aux(&self.aux)?,
             limits,
-            spread: spread.map(|text| spread_of(measure, text)).transpose()?,
+            spread: spread.map(|text| parse_spread(measure, text)).transpose()?,
             revision: None,
             written: 0,
         })
     }
 }
 
-fn spread_of(measure: Measure, text: &str) -> anyhow::Result<Spread> {
+fn parse_spread(measure: Measure, text: &str) -> anyhow::Result<Spread> {
     let parts: Vec<&str> = text.split(',').map(str::trim).collect();
     let [p50, p95, requests] = parts[..] else {
-        bail!("--spread {text:?} has not three parts; write P50,P95,N such as 80ms,95ms,200");
+        bail!("--spread {text:?} does not have three parts; write P50,P95,N such as 80ms,95ms,200");
     };
     let read = |text| {
         measure
-            .read(text)
+            .parse_value(text)
             .map_err(|reason| anyhow::anyhow!("--spread {reason}"))
     };
     let Ok(requests) = requests.parse() else {
@@ -189,45 +191,46 @@ fn spread_of(measure: Measure, text: &str) -> anyhow::Result<Spread> {
     })
 }
 
-fn in_words(aux: &BTreeMap<String, String>) -> String {
+fn aux_in_words(aux: &BTreeMap<String, String>) -> String {
     let pairs = aux.iter().map(|(key, value)| format!("{key}={value}"));
     pairs.collect::<Vec<_>>().join(" ")
 }
 
 fn cells(row: &Row) -> [String; 6] {
-    let print = |value| row.measure.print(value);
+    let print = |value| row.measure.format_value(value);
     let spread = row.spread.map(|spread| {
         format!(
             "p50 {}, p95 {} of {}",
-            print(rounded(spread.p50)),
-            print(rounded(spread.p95)),
+            print(round_digits(spread.p50)),
+            print(round_digits(spread.p95)),
             spread.requests
         )
     });
     [
         row.id.to_string(),
         format!("{} {}", row.measure.name(), print(row.value)),
-        in_words(&row.aux),
+        aux_in_words(&row.aux),
         output::limits(&row.limits),
         spread.unwrap_or_default(),
         row.revision.map_or_else(String::new, |n| n.to_string()),
     ]
 }
 
-/// To three digits that count: more is noise of the measurement.
-fn rounded(value: f64) -> f64 {
+/// Rounds to three significant digits: more are noise of the measurement.
+fn round_digits(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 
-const HEADINGS: [&str; 6] = ["ROW", "REACHES", "FOR", "WITH", "MEASURED", "REVISION"];
+const HEADINGS: [&str; 6] = ["ENTRY", "REACHES", "FOR", "WITH", "MEASURED", "REVISION"];
 
-fn list(service: &str, rows: &[Row], format: Format) -> anyhow::Result<()> {
-    if format == Format::Json {
+fn list(service: &str, rows: &[Row], format: OutputFormat) -> anyhow::Result<()> {
+    if format == OutputFormat::Json {
         return output::json(&rows);
     }
     if rows.is_empty() {
         return output::line(&format!(
-            "{service} has no rows: every robot gets the service's own limits; add one with: cloudroidctl sla set {service} --rrt 100ms --cpus 1.5"
+            "the SLA table of {service} is empty: every robot gets the service's own limits; add an entry with: \
+                cloudroidctl sla set {service} --rrt 100ms --cpus 1.5"
         ));
     }
     let mut table = Table::new(&HEADINGS);
@@ -237,27 +240,29 @@ fn list(service: &str, rows: &[Row], format: Format) -> anyhow::Result<()> {
     table.print()
 }
 
-/// What the robot gets.
+/// Returns a sentence about what the robot gets.
 fn outcome(explained: &Explained) -> String {
     let Explained {
         service, stated, ..
     } = explained;
-    let robot = match stated.is_empty() {
-        true => format!("a robot that states nothing to {service}"),
-        false => format!("a robot that states {stated} to {service}"),
+    let robot = if stated.is_empty() {
+        format!("a robot without requests to {service}")
+    } else {
+        format!("a robot that requests {stated} of {service}")
     };
     match (&explained.limits, &explained.refused) {
         (_, Some(refused)) => format!("{robot} is refused: {refused}"),
         (Some(limits), None) if *limits != Limits::default() => {
-            format!("{robot} is promised {}", output::limits(limits))
+            format!("{robot} gets {}", output::limits(limits))
         }
         _ => format!(
-            "{robot} is promised nothing; its servant gets the limits that the server gives to all ([limits] of its configuration)"
+            "{robot} has nothing reserved; its servant gets the server's default limits ([limits] of its \
+                configuration)"
         ),
     }
 }
 
-fn explain(explained: &Explained) -> anyhow::Result<()> {
+fn print_explanation(explained: &Explained) -> anyhow::Result<()> {
     output::line(&outcome(explained))?;
     if let Some(class) = &explained.class {
         output::line(&format!("  class {class}, priority {}", explained.priority))?;
@@ -269,14 +274,14 @@ fn explain(explained: &Explained) -> anyhow::Result<()> {
         output::line(&format!("next {next}"))?;
     }
     for goal in &explained.goals {
-        let print = |value| goal.measure.print(value);
+        let print = |value| goal.measure.format_value(value);
         output::line(&format!(
-            "\n{}: {} is wished for, {} acceptable",
+            "\n{}: {} desired, {} acceptable",
             goal.measure.name(),
             print(goal.desire),
             print(goal.bound)
         ))?;
-        let mut table = Table::new(&["ROW", "REACHES", "FOR", "WITH", ""]);
+        let mut table = Table::new(&["ENTRY", "REACHES", "FOR", "WITH", ""]);
         for considered in &goal.rows {
             let [id, reaches, aux, limits, ..] = cells(&considered.row);
             table.row([id, reaches, aux, limits, considered.why.clone()]);
@@ -297,10 +302,10 @@ mod tests {
     #[derive(Debug, Parser)]
     struct Line {
         #[command(flatten)]
-        sla: Sla,
+        sla: SlaArgs,
     }
 
-    fn parse(line: &str) -> Result<Verb, clap::Error> {
+    fn parse(line: &str) -> Result<SlaCommand, clap::Error> {
         Line::try_parse_from(std::iter::once("sla").chain(line.split_whitespace()))
             .map(|line| line.sla.verb)
     }
@@ -308,7 +313,7 @@ mod tests {
     #[test]
     fn a_row_is_what_is_typed() {
         let line = "set detect --rrt 100ms --aux width=640 --cpus 1.5 --memory 512M --spread 80ms,95ms,200";
-        let Verb::Set(set) = parse(line).expect("valid") else {
+        let SlaCommand::Set(set) = parse(line).expect("valid") else {
             panic!("another verb");
         };
         let row = set.row().expect("a row");
@@ -342,15 +347,15 @@ mod tests {
         for (said, expected) in [
             (
                 said(stated.clone(), Some(1.5), None),
-                "a robot that states rrt=100ms to s is promised 1.5 cpus",
+                "a robot that requests rrt=100ms of s gets 1.5 cpus",
             ),
             (
                 said(stated.clone(), None, Some("no row")),
-                "a robot that states rrt=100ms to s is refused: no row",
+                "a robot that requests rrt=100ms of s is refused: no row",
             ),
             (
                 said(nothing, None, None),
-                "a robot that states nothing to s is promised nothing; its servant gets",
+                "a robot without requests to s has nothing reserved; its servant gets",
             ),
         ] {
             assert!(said.starts_with(expected), "{said}");
@@ -359,17 +364,17 @@ mod tests {
 
     #[test]
     fn what_was_measured_is_rounded() {
-        let rounded = [0.17320284, 0.236046755, 12.349, 0.08, 0.0].map(rounded);
+        let rounded = [0.17320284, 0.236046755, 12.349, 0.08, 0.0].map(round_digits);
         assert_eq!(rounded, [0.173, 0.236, 12.3, 0.08, 0.0]);
     }
 
     #[test]
     fn what_is_stated_is_what_is_typed() {
         let line = "explain detect --rrt 100ms --max-rrt 0.3 --class urgent --aux width=640";
-        let Verb::Explain(explain) = parse(line).expect("valid") else {
+        let SlaCommand::Explain(explain) = parse(line).expect("valid") else {
             panic!("another verb");
         };
-        let stated = explain.stated.stated().expect("it can be stated");
+        let stated = explain.stated.to_stated().expect("it can be stated");
         assert_eq!(
             stated.to_string(),
             "rrt=100ms max_rrt=300ms class=urgent aux.width=640"
@@ -391,7 +396,7 @@ mod tests {
             assert!(refused.contains(words), "{line}: {refused}");
         }
         for (line, words) in [
-            ("set detect --rrt 1", "name a limit"),
+            ("set detect --rrt 1", "no limits given"),
             ("set detect --rrt 1 --cpus 1 --spread 1,2", "P50,P95,N"),
             (
                 "set detect --rrt 1 --cpus 1 --spread 1,x,3",
@@ -402,19 +407,20 @@ mod tests {
                 "number of requests",
             ),
         ] {
-            let Verb::Set(set) = parse(line).expect(line) else {
+            let SlaCommand::Set(set) = parse(line).expect(line) else {
                 panic!("another verb");
             };
             let refused = set.row().expect_err(line).to_string();
             assert!(refused.contains(words), "{line}: {refused}");
         }
-        let Verb::Explain(explain) = parse("explain detect --rrt 2 --max-rrt 1").expect("parsed")
+        let SlaCommand::Explain(explain) =
+            parse("explain detect --rrt 2 --max-rrt 1").expect("parsed")
         else {
             panic!("another verb");
         };
         let refused = explain
             .stated
-            .stated()
+            .to_stated()
             .expect_err("in disorder")
             .to_string();
         assert!(refused.contains("greater than max_rrt"), "{refused}");

@@ -2,30 +2,30 @@
 
 use api::{Pressure, Size};
 
-use crate::client::Client;
-use crate::output::{self, Format};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat};
 use crate::wait::WaitFlag;
 
-/// Show the daemon: where it listens, what it holds, what does not work as it should. With --wait, once it answers.
+/// Show the status of the daemon: its address, its load and its problems. With --wait, waits until it answers.
 #[derive(Debug, clap::Args)]
-pub struct Status {
+pub struct StatusArgs {
     #[command(flatten)]
     wait: WaitFlag,
 }
 
-impl Status {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl StatusArgs {
+    /// Sends the request and prints the status.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let look = || async { client.get::<api::Status>("/api/v1/status").await.map(Ok) };
-        let status = self.wait.until(look).await?;
+        let status = self.wait.poll_until(look).await?;
         match format {
-            Format::Json => output::json(&status),
-            Format::Table => show(&status),
+            OutputFormat::Json => output::json(&status),
+            OutputFormat::Table => show(&status),
         }
     }
 }
 
-/// Where it listens, and what it shows there.
+/// Formats the daemon's address and certificate.
 fn address(status: &api::Status) -> String {
     match &status.certificate {
         Some(fingerprint) => format!("https://{}, certificate {fingerprint}", status.listen),
@@ -36,7 +36,7 @@ fn address(status: &api::Status) -> String {
 fn show(status: &api::Status) -> anyhow::Result<()> {
     let room = &status.capacity;
     let isolation = match status.isolation.cgroup_version {
-        0 => format!("{}, no limits can be set", status.isolation.mode),
+        0 => format!("{}, limits cannot be set", status.isolation.mode),
         version => format!("{}, cgroup v{version}", status.isolation.mode),
     };
     let rows = [
@@ -62,20 +62,20 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
         (
             "servants",
             format!(
-                "{} with {} connections; {} warm containers, {} of them with nodes",
+                "{} with {} connections; {} warm containers, {} of them with running nodes",
                 status.servants, status.connections, status.warm_pool, status.warm_nodes
             ),
         ),
         (
             "used by servants",
             format!(
-                "{} of memory, {:.1} s of processor time, {:.1} s throttled",
+                "{} of memory, {:.1} s of CPU time, {:.1} s throttled",
                 Size(status.usage.memory),
                 status.usage.cpu_usec as f64 / 1e6,
                 status.usage.throttled_usec as f64 / 1e6
             ),
         ),
-        ("machine waits for", pressure(status.usage.pressure)),
+        ("stalled (PSI)", pressure(status.usage.pressure)),
         ("isolation", isolation),
         ("limits of a servant", output::limits(&status.limits)),
         (
@@ -101,10 +101,10 @@ fn show(status: &api::Status) -> anyhow::Result<()> {
 
 fn pressure(of: Option<Pressure>) -> String {
     of.map_or_else(
-        || "unknown: its kernel does not tell (PSI)".to_owned(),
+        || "unknown: its kernel has no PSI".to_owned(),
         |of| {
             format!(
-                "cpu {:.0} %, memory {:.0} %, io {:.0} % of the last 10 s",
+                "cpu {:.0} %, memory {:.0} %, io {:.0} % (last 10 s)",
                 of.cpu, of.memory, of.io
             )
         },

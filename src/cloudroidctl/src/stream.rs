@@ -1,4 +1,4 @@
-//! What the daemon shows, as it changes: `GET /api/v1/stream`, taken together.
+//! The daemon's live state: merges the updates of `GET /api/v1/stream`.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -11,22 +11,22 @@ use http_body_util::BodyExt;
 use hyper::Method;
 use hyper::body::Incoming;
 
-use crate::client::{Client, empty};
+use crate::client::{DaemonClient, empty_body};
 
-/// All there is now.
+/// Current state of the machine and its servants.
 #[derive(Debug, Default)]
-pub struct Live {
-    /// The machine, for those who are told of it.
+pub struct LiveState {
+    /// State of the machine, if the caller may see it.
     pub machine: Option<Arc<Machine>>,
     /// Servants by id.
     pub servants: BTreeMap<String, Arc<Served>>,
 }
 
-impl Live {
-    /// Takes in what is so, or what has changed.
-    fn take(&mut self, is_all: bool, update: Update) {
+impl LiveState {
+    /// Applies a snapshot (`is_all`) or a change.
+    fn apply(&mut self, is_all: bool, update: Update) {
         if is_all {
-            *self = Live::default();
+            *self = LiveState::default();
         }
         if let Some(machine) = update.machine {
             self.machine = Some(machine);
@@ -40,49 +40,52 @@ impl Live {
     }
 }
 
-/// Server-sent events (WHATWG HTML, section 9.2.6), of which the daemon uses `event`, `data` of one line, and comments.
-pub struct Stream {
+/// Reader of server-sent events (WHATWG HTML, section 9.2.6), of which the daemon uses `event`, one-line `data`, and
+/// comments.
+pub struct LiveStream {
     body: Incoming,
     pending: BytesMut,
     event: String,
-    /// All there is now.
-    pub live: Live,
+    /// Current state.
+    pub live: LiveState,
 }
 
-impl Stream {
-    /// Begins to listen.
-    pub async fn begin(client: &Client) -> anyhow::Result<Stream> {
-        let answer = client.send(Method::GET, "/api/v1/stream", empty()).await?;
-        Ok(Stream {
+impl LiveStream {
+    /// Opens the stream.
+    pub async fn open(client: &DaemonClient) -> anyhow::Result<LiveStream> {
+        let answer = client
+            .send(Method::GET, "/api/v1/stream", empty_body())
+            .await?;
+        Ok(LiveStream {
             body: answer.into_body(),
             pending: BytesMut::new(),
             event: String::new(),
-            live: Live::default(),
+            live: LiveState::default(),
         })
     }
 
-    /// Waits for a change and takes it in; false when there will be none any more. What came is kept where this is dropped.
-    pub async fn changed(&mut self) -> anyhow::Result<bool> {
+    /// Waits for a change and applies it; false at the end of the stream. Cancel-safe: data received so far is kept.
+    pub async fn next_change(&mut self) -> anyhow::Result<bool> {
         loop {
             while let Some(end) = self.pending.iter().position(|byte| *byte == b'\n') {
                 let line = self.pending.split_to(end + 1);
-                let line = std::str::from_utf8(&line).context("the stream is no text")?;
-                if self.line(line.trim_end())? {
+                let line = std::str::from_utf8(&line).context("the stream is not valid UTF-8")?;
+                if self.process_line(line.trim_end())? {
                     return Ok(true);
                 }
             }
             let Some(frame) = self.body.frame().await else {
                 return Ok(false);
             };
-            let frame = frame.context("the daemon broke off its answer")?;
+            let frame = frame.context("the daemon's response was cut off")?;
             if let Ok(data) = frame.into_data() {
                 self.pending.extend_from_slice(&data);
             }
         }
     }
 
-    /// Whether this line was a change.
-    fn line(&mut self, line: &str) -> anyhow::Result<bool> {
+    /// Processes a line; returns whether it was a change.
+    fn process_line(&mut self, line: &str) -> anyhow::Result<bool> {
         if let Some(event) = line.strip_prefix("event:") {
             event.trim_start().clone_into(&mut self.event);
         }
@@ -90,8 +93,8 @@ impl Stream {
             return Ok(false);
         };
         let update: Update = serde_json::from_str(data)
-            .context("the daemon's answer is not what this version of cloudroidctl understands")?;
-        self.live.take(self.event == "snapshot", update);
+            .context("this version of cloudroidctl does not understand the daemon's response")?;
+        self.live.apply(self.event == "snapshot", update);
         Ok(true)
     }
 }

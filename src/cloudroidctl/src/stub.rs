@@ -1,36 +1,36 @@
-//! `stub`: fetches what a robot installs in a package's place.
+//! `stub`: downloads the package that a robot installs in place of the original.
 
 use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use api::Stubs;
-use api::stub::{ARCHITECTURE, ARCHIVE, SIGNATURE, SIGNER, architecture};
+use api::stub::{ARCHITECTURE, ARCHIVE, SIGNATURE, SIGNER, parse_architecture};
 use hyper::Method;
 use sign::PublicKey;
 
-use crate::client::{Client, empty, escaped};
-use crate::output::{self, Format};
+use crate::client::{DaemonClient, empty_body, percent_encode};
+use crate::output::{self, OutputFormat};
 
-/// Fetch the stub of a service: the package that a robot installs in the original's place.
+/// Download the stub of a service: the package that a robot installs in place of the original.
 #[derive(Debug, clap::Args)]
-pub struct Stub {
-    /// The service. Without one: which services and architectures there are stubs for.
+pub struct StubArgs {
+    /// Service of the stub. Without one, lists the services and architectures that have stubs.
     service: Option<String>,
-    /// Directory to write NAME.tar.gz into.
+    /// Output directory for NAME.tar.gz.
     #[arg(short, long, value_name = "DIR", default_value = ".")]
     output: PathBuf,
-    /// The robot's architecture, as `uname -m` says it there; this machine's by default.
+    /// Architecture of the robot, as printed by `uname -m` (default: this machine's).
     #[arg(long, value_name = "ARCH")]
     arch: Option<String>,
-    /// The server's key, which the archive has to be signed by ("ssh-ed25519 AAAA…"); what the server says by default.
+    /// Key that must have signed the archive ("ssh-ed25519 AAAA…"; default: the key that the server reports).
     #[arg(long, value_name = "KEY")]
     key: Option<PublicKey>,
 }
 
-/// What was fetched.
+/// Summary of a download.
 #[derive(serde::Serialize)]
-struct Fetched {
+struct FetchedStub {
     service: String,
     architecture: String,
     path: PathBuf,
@@ -39,9 +39,9 @@ struct Fetched {
     key: String,
 }
 
-impl Stub {
-    /// Asks and writes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl StubArgs {
+    /// Downloads, verifies and writes the archive.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let Some(service) = &self.service else {
             return list(client, format).await;
         };
@@ -50,7 +50,7 @@ impl Stub {
             None => {
                 let stubs: Stubs = client.get("/stubs").await?;
                 if stubs.key.is_empty() {
-                    bail!("this server signs no stubs: it is of an earlier version; update it");
+                    bail!("this server's version is too old to sign stubs; update it");
                 }
                 stubs.key.parse().context("the server's key")?
             }
@@ -58,10 +58,10 @@ impl Stub {
         let asked = self.arch.as_deref().unwrap_or(std::env::consts::ARCH);
         let path = format!(
             "/stubs/{}.tar.gz?arch={}",
-            escaped(service),
-            escaped(architecture(asked).unwrap_or(asked))
+            percent_encode(service),
+            percent_encode(parse_architecture(asked).unwrap_or(asked))
         );
-        let mut answer = client.send(Method::GET, &path, empty()).await?;
+        let mut answer = client.send(Method::GET, &path, empty_body()).await?;
         let architecture = answer
             .headers()
             .get(ARCHITECTURE)
@@ -72,17 +72,17 @@ impl Stub {
             .headers()
             .get(SIGNATURE)
             .and_then(|value| value.to_str().ok())
-            .map(sign::in_lines)
-            .context("the archive is not signed: the server is of an earlier version; update it")?;
+            .map(sign::to_armoured_lines)
+            .context("the archive is not signed: the server's version is too old; update it")?;
         let target = self.output.join(format!("{service}.tar.gz"));
         let failed = || format!("cannot write {}", target.display());
         std::fs::create_dir_all(&self.output).with_context(failed)?;
-        // Whole or not at all: an earlier one stays until this one is there.
+        // Atomically: an existing archive stays until the new one is complete.
         let half = self.output.join(format!(".{service}.tar.gz.part"));
         let mut file = std::fs::File::create(&half).with_context(failed)?;
         let mut bytes = 0;
         while let Some(frame) = http_body_util::BodyExt::frame(answer.body_mut()).await {
-            let frame = frame.context("the daemon broke off its answer")?;
+            let frame = frame.context("the daemon's response was cut off")?;
             if let Some(data) = frame.data_ref() {
                 file.write_all(data).with_context(failed)?;
                 bytes += data.len() as u64;
@@ -98,14 +98,14 @@ impl Stub {
         if let Err(refused) = key.verify(ARCHIVE, &digest, &signature) {
             let _ = std::fs::remove_file(&half);
             return Err(anyhow::Error::new(refused).context(format!(
-                "the archive of {service} is not what a server with the key {key} signed; nothing was written"
+                "the signature of the archive of {service} does not match the server's key {key}; nothing was written"
             )));
         }
         let beside = self.output.join(format!("{service}.tar.gz.sig"));
         std::fs::write(&beside, signature)
             .with_context(|| format!("cannot write {}", beside.display()))?;
         std::fs::rename(&half, &target).with_context(failed)?;
-        let fetched = Fetched {
+        let fetched = FetchedStub {
             service: service.clone(),
             architecture,
             path: target,
@@ -114,8 +114,8 @@ impl Stub {
             key: key.to_string(),
         };
         match format {
-            Format::Json => output::json(&fetched),
-            Format::Table => {
+            OutputFormat::Json => output::json(&fetched),
+            OutputFormat::Table => {
                 output::line(&format!(
                     "{} for {} ({})",
                     fetched.path.display(),
@@ -124,30 +124,31 @@ impl Stub {
                 ))?;
                 output::line(&format!("signed by {key}"))?;
                 output::line("on the robot, with both files:")?;
-                output::line(&format!("  {}", to_install(service, key)))
+                output::line(&format!("  {}", install_command(service, key)))
             }
         }
     }
 }
 
-/// Verifies the archive before anything of it runs, and has what follows verified by the same key.
-fn to_install(service: &str, key: PublicKey) -> String {
+/// Returns the commands that verify the archive before any of it runs, and that use the same key for later updates.
+fn install_command(service: &str, key: PublicKey) -> String {
     format!(
-        "echo '{}' > server.pub && ssh-keygen -Y verify -f server.pub -I {SIGNER} -n {ARCHIVE} -s {service}.tar.gz.sig < {service}.tar.gz \
+        "echo '{}' > server.pub && ssh-keygen -Y verify -f server.pub -I {SIGNER} -n {ARCHIVE} -s {service}.tar.gz.sig \
+         < {service}.tar.gz \
          && tar xzf {service}.tar.gz && sh {service}-stub/install.sh --key server.pub",
-        key.signer()
+        key.allowed_signers_line()
     )
 }
 
-async fn list(client: &Client, format: Format) -> anyhow::Result<()> {
+async fn list(client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
     let stubs: Stubs = client.get("/stubs").await?;
     let list = |names: &[String]| match names.len() {
         0 => "none".to_owned(),
         _ => names.join(", "),
     };
     match format {
-        Format::Json => output::json(&stubs),
-        Format::Table => {
+        OutputFormat::Json => output::json(&stubs),
+        OutputFormat::Table => {
             output::line(&format!("services       {}", list(&stubs.services)))?;
             output::line(&format!("architectures  {}", list(&stubs.architectures)))?;
             output::line(&format!("signed by      {}", stubs.key))?;
@@ -155,7 +156,7 @@ async fn list(client: &Client, format: Format) -> anyhow::Result<()> {
                 return Ok(());
             }
             output::line(&format!(
-                "lacking        {} (make stub-cross builds them)",
+                "missing        {} (make stub-cross builds them)",
                 list(&stubs.lacking)
             ))
         }

@@ -1,69 +1,69 @@
-//! `token`: who may use the daemon, and as what.
+//! `token`: bearer tokens for the daemon and their roles.
 
 use std::time::Duration;
 
 use api::access::{NewToken, Secret, Token};
 
-use crate::client::{Client, escaped};
-use crate::output::{self, Format, Table};
+use crate::client::{DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat, Table};
 
-/// Tokens: make them for people and robots, list, revoke and rotate them.
+/// Manage tokens of people and robots: create, list, revoke and rotate them.
 #[derive(Debug, clap::Args)]
-pub struct Tokens {
+pub struct TokenArgs {
     #[command(subcommand)]
-    verb: Verb,
+    verb: TokenCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum Verb {
-    Create(Create),
-    List(List),
-    Revoke(Revoke),
-    Rotate(Rotate),
+enum TokenCommand {
+    Create(CreateToken),
+    List(ListTokens),
+    Revoke(RevokeToken),
+    Rotate(RotateToken),
 }
 
-/// Make a token and print it: this once.
+/// Create a token and print it, this once only.
 #[derive(Debug, clap::Args)]
-struct Create {
-    /// Name of whoever it is for: rules of the policy and records know it by this.
+struct CreateToken {
+    /// Name of the holder, as it appears in policy rules and in the audit log.
     name: String,
-    /// What it is for: admin (everything), operator (everything but tokens and policy), deployer (publishes services, and does
-    /// what it likes with its own), robot (connects as one robot), viewer (reads).
+    /// Role: admin (everything), operator (everything but tokens and policy), deployer (publishes services and manages
+    /// its own), robot (connects as one robot), viewer (reads).
     #[arg(long)]
     role: String,
-    /// Service that it is for, or a pattern such as 'lab_*'; may be given several times. '*' is all.
+    /// Service that the token is limited to, or a pattern such as 'lab_*' ('*' for all); may be given several times.
     #[arg(long = "service", value_name = "NAME")]
     services: Vec<String>,
-    /// Id of the robot that it is for; needed with --role robot.
+    /// Id of the robot; required with --role robot.
     #[arg(long, value_name = "ID")]
     robot: Option<String>,
-    /// Class of the configuration that it may name; may be given several times.
+    /// Class that the robot may name; may be given several times.
     #[arg(long = "class", value_name = "NAME")]
     classes: Vec<String>,
-    /// When it ends, such as 12h or 30d; never by default.
+    /// Lifetime of the token, such as 12h or 30d (default: unlimited).
     #[arg(long, value_name = "TIME", value_parser = lifetime)]
     expires: Option<Duration>,
 }
 
-/// List all tokens there ever were, without their secrets.
+/// List all tokens, including revoked ones, without their secrets.
 #[derive(Debug, clap::Args)]
-struct List;
+struct ListTokens;
 
-/// End a token; connections that show it are closed.
+/// Revoke a token; its connections are closed.
 #[derive(Debug, clap::Args)]
-struct Revoke {
-    /// Its name.
+struct RevokeToken {
+    /// Name of the token.
     name: String,
 }
 
-/// Give a token another secret and print it; connections that show the old one are closed.
+/// Replace the secret of a token and print it; connections with the old one are closed.
 #[derive(Debug, clap::Args)]
-struct Rotate {
-    /// Its name.
+struct RotateToken {
+    /// Name of the token.
     name: String,
 }
 
-/// `90s`, `30m`, `12h`, `30d`.
+/// Parses `90s`, `30m`, `12h` or `30d`.
 pub fn lifetime(text: &str) -> Result<Duration, String> {
     let bad = || "write a whole number with s, m, h or d, such as 30d".to_owned();
     let (number, unit) = text.split_at(text.len() - text.chars().last().map_or(0, char::len_utf8));
@@ -79,62 +79,62 @@ pub fn lifetime(text: &str) -> Result<Duration, String> {
     length.map(Duration::from_secs).ok_or_else(bad)
 }
 
-pub fn patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
+pub fn parse_patterns(texts: &[String]) -> anyhow::Result<Vec<access::Glob>> {
     Ok(texts
         .iter()
         .map(|text| text.parse())
         .collect::<Result<_, _>>()?)
 }
 
-impl Tokens {
-    /// Asks and prints.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl TokenArgs {
+    /// Sends the requests and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         match self.verb {
-            Verb::Create(verb) => {
+            TokenCommand::Create(verb) => {
                 let new = NewToken {
                     role: verb.role.parse()?,
-                    services: patterns(&verb.services)?,
-                    classes: patterns(&verb.classes)?,
+                    services: parse_patterns(&verb.services)?,
+                    classes: parse_patterns(&verb.classes)?,
                     robot: verb.robot,
                     lifetime: verb.expires.map(|length| length.as_secs()),
                     name: verb.name,
                 };
-                told(&client.post("/api/v1/tokens", &new).await?, format)
+                print_secret(&client.post("/api/v1/tokens", &new).await?, format)
             }
-            Verb::List(List) => {
+            TokenCommand::List(ListTokens) => {
                 let tokens: Vec<Token> = client.get("/api/v1/tokens").await?;
                 list(&tokens, format)
             }
-            Verb::Revoke(verb) => {
-                let path = format!("/api/v1/tokens/{}", escaped(&verb.name));
+            TokenCommand::Revoke(verb) => {
+                let path = format!("/api/v1/tokens/{}", percent_encode(&verb.name));
                 let tokens: Vec<Token> = client.delete(&path).await?;
                 match format {
-                    Format::Json => output::json(&tokens),
-                    Format::Table => output::line(&format!("token {} is revoked", verb.name)),
+                    OutputFormat::Json => output::json(&tokens),
+                    OutputFormat::Table => output::line(&format!("token {} is revoked", verb.name)),
                 }
             }
-            Verb::Rotate(verb) => {
-                let path = format!("/api/v1/tokens/{}/rotate", escaped(&verb.name));
-                told(&client.post(&path, &()).await?, format)
+            TokenCommand::Rotate(verb) => {
+                let path = format!("/api/v1/tokens/{}/rotate", percent_encode(&verb.name));
+                print_secret(&client.post(&path, &()).await?, format)
             }
         }
     }
 }
 
-/// The secret alone on standard output, so that it can be taken from there; the rest beside it.
-fn told(made: &Secret, format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+/// Prints only the secret to standard output, so that it can be piped, and everything else to standard error.
+fn print_secret(made: &Secret, format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(made);
     }
     let Token { name, role, .. } = &made.token;
-    output::complain(&format!(
-        "the token of {name} ({role}) follows; it is shown this once, and only its hash is kept"
+    output::eprint_line(&format!(
+        "the token of {name} ({role}) follows; it is shown only once, and the server keeps only its hash"
     ));
     output::line(&made.secret)
 }
 
-fn list(tokens: &[Token], format: Format) -> anyhow::Result<()> {
-    if let Format::Json = format {
+fn list(tokens: &[Token], format: OutputFormat) -> anyhow::Result<()> {
+    if let OutputFormat::Json = format {
         return output::json(&tokens);
     }
     let mut table = Table::new(&[
@@ -162,20 +162,19 @@ fn list(tokens: &[Token], format: Format) -> anyhow::Result<()> {
             state(token),
         ]);
     }
-    match table.is_empty() {
-        true => output::line(
-            "there are no tokens; make one with: cloudroidctl token create NAME --role ROLE",
-        ),
-        false => table.print(),
+    if table.is_empty() {
+        output::line("no tokens; create one with: cloudroidctl token create NAME --role ROLE")
+    } else {
+        table.print()
     }
 }
 
 fn state(token: &Token) -> String {
     match (token.revoked, token.expires) {
         (Some(at), _) => format!("revoked {} ago", output::age(at)),
-        (None, None) => "good".into(),
+        (None, None) => "active".into(),
         (None, Some(end)) if output::is_past(end) => format!("expired {} ago", output::age(end)),
-        (None, Some(end)) => format!("ends in {}", output::until(end)),
+        (None, Some(end)) => format!("expires in {}", output::time_until(end)),
     }
 }
 

@@ -1,4 +1,4 @@
-//! `top`: who uses the machine now.
+//! `top`: live view of the servants.
 
 use std::cmp::Ordering;
 use std::io::{IsTerminal, Write, stdout};
@@ -10,29 +10,30 @@ use crossterm::event::{Event, EventStream, KeyCode, KeyModifiers};
 use crossterm::{cursor, execute, queue, style, terminal};
 use futures_util::StreamExt;
 
-use crate::client::Client;
-use crate::output::{self, Format, Table};
-use crate::stream::{Live, Stream};
+use crate::client::DaemonClient;
+use crate::output::{self, OutputFormat, Table};
+use crate::stream::{LiveState, LiveStream};
 
-/// Show servants and what they use, as it changes: q ends it, c, m, r and n sort by cores, memory, response time and name.
+/// Show servants and their resource usage, updated live. Keys: q quits; c, m, r and n sort by cores, memory, response
+/// time and name.
 ///
-/// Where nobody looks (a pipe, a file) it prints what is so now and ends, as with --once.
+/// Without a terminal (a pipe, a file), prints the current state and exits, as with --once.
 #[derive(Debug, clap::Args)]
-pub struct Top {
-    /// By what to sort.
-    #[arg(long, value_enum, default_value_t = By::Cores, value_name = "WHAT")]
-    sort: By,
+pub struct TopArgs {
+    /// Sort key.
+    #[arg(long, value_enum, default_value_t = SortKey::Cores, value_name = "WHAT")]
+    sort: SortKey,
     /// Only servants of this service.
     #[arg(long, value_name = "SERVICE")]
     service: Option<String>,
-    /// Print once, and end.
+    /// Print the current state and exit.
     #[arg(long)]
     once: bool,
 }
 
-/// By what servants are sorted.
+/// Sort key of the servants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum By {
+enum SortKey {
     /// Most cores first.
     Cores,
     /// Most memory first.
@@ -43,35 +44,35 @@ enum By {
     Name,
 }
 
-/// The terminal as it was, whatever ends this.
-struct Screen;
+/// Restores the terminal when dropped.
+struct ScreenGuard;
 
-impl Screen {
-    fn take() -> anyhow::Result<Screen> {
+impl ScreenGuard {
+    fn enter() -> anyhow::Result<ScreenGuard> {
         terminal::enable_raw_mode()?;
-        let screen = Screen;
+        let screen = ScreenGuard;
         execute!(stdout(), terminal::EnterAlternateScreen, cursor::Hide)?;
         Ok(screen)
     }
 }
 
-impl Drop for Screen {
+impl Drop for ScreenGuard {
     fn drop(&mut self) {
-        // There is nobody left to tell.
+        // If the terminal fails, the error cannot be shown anywhere else.
         let _ = execute!(stdout(), cursor::Show, terminal::LeaveAlternateScreen);
         let _ = terminal::disable_raw_mode();
     }
 }
 
-impl Top {
-    /// Asks and shows.
-    pub async fn run(mut self, client: &Client, format: Format) -> anyhow::Result<()> {
-        let mut stream = Stream::begin(client).await?;
-        if !stream.changed().await? {
-            bail!("the daemon told nothing; it may be ending");
+impl TopArgs {
+    /// Opens the stream and prints or draws it.
+    pub async fn run(mut self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
+        let mut stream = LiveStream::open(client).await?;
+        if !stream.next_change().await? {
+            bail!("the daemon sent nothing; it may be shutting down");
         }
-        if format == Format::Json {
-            let servants: Vec<&Served> = self.sorted(&stream.live);
+        if format == OutputFormat::Json {
+            let servants: Vec<&Served> = self.sorted_servants(&stream.live);
             return output::json(&servants);
         }
         if self.once || !stdout().is_terminal() {
@@ -80,14 +81,14 @@ impl Top {
                 .iter()
                 .try_for_each(|line| output::line(line));
         }
-        let screen = Screen::take()?;
+        let screen = ScreenGuard::enter()?;
         let mut keys = EventStream::new();
         loop {
             self.draw(&stream.live)?;
             tokio::select! {
-                changed = stream.changed() => if !changed? {
+                changed = stream.next_change() => if !changed? {
                     drop(screen);
-                    bail!("the daemon has ended the connection; look again with: cloudroidctl top");
+                    bail!("the daemon closed the connection; run again: cloudroidctl top");
                 },
                 key = keys.next() => match key.transpose()? {
                     Some(Event::Key(key)) => {
@@ -95,10 +96,10 @@ impl Top {
                         match key.code {
                             KeyCode::Char('c') if interrupts => return Ok(()),
                             KeyCode::Char('q') | KeyCode::Esc => return Ok(()),
-                            KeyCode::Char('c') => self.sort = By::Cores,
-                            KeyCode::Char('m') => self.sort = By::Memory,
-                            KeyCode::Char('r') => self.sort = By::Rrt,
-                            KeyCode::Char('n') => self.sort = By::Name,
+                            KeyCode::Char('c') => self.sort = SortKey::Cores,
+                            KeyCode::Char('m') => self.sort = SortKey::Memory,
+                            KeyCode::Char('r') => self.sort = SortKey::Rrt,
+                            KeyCode::Char('n') => self.sort = SortKey::Name,
                             _ => {}
                         }
                     }
@@ -109,19 +110,19 @@ impl Top {
         }
     }
 
-    fn sorted<'a>(&self, live: &'a Live) -> Vec<&'a Served> {
+    fn sorted_servants<'a>(&self, live: &'a LiveState) -> Vec<&'a Served> {
         let all = live.servants.values().map(AsRef::as_ref);
         let is_asked_for = |one: &&Served| {
             let service = self.service.as_ref();
             service.is_none_or(|service| *service == one.servant.service)
         };
         let mut all: Vec<&Served> = all.filter(is_asked_for).collect();
-        all.sort_by(|a, b| order(self.sort, a, b));
+        all.sort_by(|a, b| compare(self.sort, a, b));
         all
     }
 
-    fn lines(&self, live: &Live) -> Vec<String> {
-        let mut lines: Vec<String> = live.machine.iter().map(|of| machine(of)).collect();
+    fn lines(&self, live: &LiveState) -> Vec<String> {
+        let mut lines: Vec<String> = live.machine.iter().map(|of| machine_line(of)).collect();
         let mut table = Table::new(&[
             "SERVICE",
             "ROBOT",
@@ -133,18 +134,21 @@ impl Top {
             "LIMITS",
             "AGE",
         ]);
-        for served in self.sorted(live) {
-            table.row(row(served));
+        for served in self.sorted_servants(live) {
+            table.row(servant_row(served));
         }
-        lines.extend(match table.is_empty() {
-            true => vec!["no servants; one starts when a robot connects to a service".to_owned()],
-            false => table.lines(),
+        lines.extend(if table.is_empty() {
+            vec![
+                "no servants (instances); one starts when a robot connects to a service".to_owned(),
+            ]
+        } else {
+            table.lines()
         });
         lines
     }
 
-    fn draw(&self, live: &Live) -> anyhow::Result<()> {
-        // A terminal that does not say how large it is has zero of both.
+    fn draw(&self, live: &LiveState) -> anyhow::Result<()> {
+        // A terminal that does not report its size has zero columns or rows.
         let (columns, rows) = match terminal::size()? {
             (0, _) | (_, 0) => (80, 24),
             (columns, rows) => (usize::from(columns), usize::from(rows)),
@@ -153,7 +157,7 @@ impl Top {
         let mut out = stdout().lock();
         queue!(out, terminal::BeginSynchronizedUpdate, cursor::MoveTo(0, 0))?;
         for line in lines.iter().take(rows.saturating_sub(1)) {
-            let shown: String = output::shown(line).chars().take(columns).collect();
+            let shown: String = output::sanitize(line).chars().take(columns).collect();
             queue!(
                 out,
                 style::Print(shown),
@@ -167,23 +171,23 @@ impl Top {
     }
 }
 
-fn order(by: By, a: &Served, b: &Served) -> Ordering {
+fn compare(by: SortKey, a: &Served, b: &Served) -> Ordering {
     let name = |of: &Served| (of.servant.service.clone(), of.servant.robot.clone());
     let memory = |of: &Served| of.servant.usage.as_ref().map_or(0, |usage| usage.memory);
     let time = |of: &Served| of.servant.response.map_or(0.0, |times| times.p95_ms);
     let first = match by {
-        By::Cores => b.cores.total_cmp(&a.cores),
-        By::Memory => memory(b).cmp(&memory(a)),
-        By::Rrt => time(b).total_cmp(&time(a)),
-        By::Name => Ordering::Equal,
+        SortKey::Cores => b.cores.total_cmp(&a.cores),
+        SortKey::Memory => memory(b).cmp(&memory(a)),
+        SortKey::Rrt => time(b).total_cmp(&time(a)),
+        SortKey::Name => Ordering::Equal,
     };
     first.then_with(|| name(a).cmp(&name(b)))
 }
 
-fn machine(of: &api::stream::Machine) -> String {
+fn machine_line(of: &api::stream::Machine) -> String {
     let room = &of.status.capacity;
     format!(
-        "{} servants; {:.2} of {} cores used, {:.2} promised; {} of {} of memory promised; {} waiting",
+        "{} servants; {:.2} of {} cores used, {:.2} reserved; {} of {} of memory reserved; {} waiting",
         of.status.servants,
         of.cores,
         of.host_cores,
@@ -194,7 +198,7 @@ fn machine(of: &api::stream::Machine) -> String {
     )
 }
 
-fn row(of: &Served) -> [String; 9] {
+fn servant_row(of: &Served) -> [String; 9] {
     let servant = &of.servant;
     [
         format!("{}:{}", servant.service, servant.revision),

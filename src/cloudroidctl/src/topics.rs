@@ -1,17 +1,17 @@
-//! Which topics are wanted.
+//! Selection of topics.
 
-/// Topics that are wanted: all where none is named; `/camera/*` is all below `/camera/`.
+/// Selection of topics: all if none is named; `/camera/*` selects all below `/camera/`.
 #[derive(Debug, Clone, clap::Args)]
-pub struct Topics {
-    /// Only this topic, or all that begin with what stands before a last `*`. May be given several times.
+pub struct TopicFilter {
+    /// Only this topic, or all topics with the prefix before a trailing `*`; may be given several times.
     #[arg(short, long = "topic", value_name = "TOPIC")]
     topics: Vec<String>,
 }
 
-impl Topics {
-    /// Whether this one is among them.
-    pub fn want(&self, topic: &str) -> bool {
-        // As a servant names them; `tf` is `/tf`, as everywhere in ROS.
+impl TopicFilter {
+    /// Returns whether a topic is selected.
+    pub fn accepts(&self, topic: &str) -> bool {
+        // Compare without the leading slash: `tf` is `/tf`, as everywhere in ROS.
         let topic = topic.strip_prefix('/').unwrap_or(topic);
         let matches = |pattern: &String| {
             let pattern = pattern.strip_prefix('/').unwrap_or(pattern);
@@ -30,15 +30,15 @@ mod tests {
 
     #[test]
     fn topics_are_wanted_by_name_or_by_beginning() {
-        let topics = |all: &[&str]| Topics {
+        let topics = |all: &[&str]| TopicFilter {
             topics: all.iter().map(|one| (*one).to_owned()).collect(),
         };
-        assert!(topics(&[]).want("/any"));
+        assert!(topics(&[]).accepts("/any"));
         let some = topics(&["/tf", "/camera/*"]);
-        assert!(some.want("/tf") && some.want("/camera/left/image"));
-        assert!(!some.want("/tf_static") && !some.want("/camera"));
+        assert!(some.accepts("/tf") && some.accepts("/camera/left/image"));
+        assert!(!some.accepts("/tf_static") && !some.accepts("/camera"));
         let relative = topics(&["tf", "camera/*"]);
-        assert!(relative.want("/tf") && relative.want("/camera/left/image"));
-        assert!(!relative.want("/tf_static") && topics(&["*"]).want("/any"));
+        assert!(relative.accepts("/tf") && relative.accepts("/camera/left/image"));
+        assert!(!relative.accepts("/tf_static") && topics(&["*"]).accepts("/any"));
     }
 }

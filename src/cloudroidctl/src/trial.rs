@@ -1,4 +1,4 @@
-//! `try`: what a package makes of a recording or a picture, before a robot is touched.
+//! `try`: runs a package on a recording or an image, before it is used by a robot.
 
 use std::path::{Path, PathBuf};
 
@@ -8,65 +8,72 @@ use api::trial::{Fed, Trial};
 use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
-use crate::client::{self, Client};
-use crate::output::{self, Format, Table};
-use crate::push::Push;
+use crate::client::{self, DaemonClient};
+use crate::output::{self, OutputFormat, Table};
+use crate::push::PushArgs;
 
-/// Try a package on a recording or a picture: show what it answers and how fast, and suggest T_desire and T_max.
+/// Try a package on a recording or an image: show its answers and response times, and suggest T_desire and T_max.
 ///
-/// It is built and started as by push, but under a name of its own that is gone afterwards.
+/// It is built and started as by push, but under a temporary name, and removed afterwards.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("material").required(true).args(["bag", "image"])))]
-pub struct Try {
+pub struct TryArgs {
     #[command(flatten)]
-    push: Push,
-    /// A recording of its inputs: a rosbag file, not compressed.
+    push: PushArgs,
+    /// Recording of the package's inputs: an uncompressed rosbag file.
     #[arg(long, value_name = "FILE")]
     bag: Option<PathBuf>,
-    /// A picture for its camera inputs: a PNG file.
+    /// Image for the package's camera inputs: a PNG file.
     #[arg(long, value_name = "FILE")]
     image: Option<PathBuf>,
 }
 
-impl Try {
-    /// Pushes, tries, removes.
-    pub async fn run(self, client: &Client, format: Format) -> anyhow::Result<()> {
+impl TryArgs {
+    /// Pushes the package, runs the trial, removes the service and prints the result.
+    pub async fn run(self, client: &DaemonClient, format: OutputFormat) -> anyhow::Result<()> {
         let (kind, path) = match (&self.bag, &self.image) {
             (Some(path), _) => ("bag", path),
             (None, Some(path)) => ("image", path),
-            (None, None) => anyhow::bail!("say with what to try it: --bag FILE or --image FILE"),
+            (None, None) => anyhow::bail!("no input given; pass --bag FILE or --image FILE"),
         };
-        // Before minutes are spent on building.
+        // Read the file before minutes are spent on building.
         let material =
             std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
         let name = format!("try-{}", std::process::id());
         let tried = async {
-            self.push.under(&name, client, format).await?;
-            ask(client, &name, kind, material).await
+            self.push.publish_as(&name, client, format).await?;
+            run_trial(client, &name, kind, material).await
         };
         let tried = tokio::select! {
             tried = tried => tried,
             _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("cancelled")),
         };
-        // There is none where the push failed.
+        // There is no service if the push failed.
         let removed = client
             .delete::<Stopped>(&format!("/api/v1/services/{name}"))
             .await;
         let trial = tried?;
-        removed.with_context(|| format!("the trial's service is left: cloudroidctl rm {name}"))?;
+        removed.with_context(|| {
+            format!("cannot remove the trial's service; remove it with: cloudroidctl rm {name}")
+        })?;
         match format {
-            Format::Json => output::json(&trial),
-            Format::Table => print(&trial, path),
+            OutputFormat::Json => output::json(&trial),
+            OutputFormat::Table => print(&trial, path),
         }
     }
 }
 
-async fn ask(client: &Client, name: &str, kind: &str, material: Vec<u8>) -> anyhow::Result<Trial> {
+async fn run_trial(
+    client: &DaemonClient,
+    name: &str,
+    kind: &str,
+    material: Vec<u8>,
+) -> anyhow::Result<Trial> {
     let body = Full::new(material.into())
         .map_err(|never| match never {})
         .boxed_unsync();
     let path = format!("/api/v1/services/{name}/trial?kind={kind}");
-    client::read(client.send(Method::POST, &path, body).await?).await
+    client::read_json(client.send(Method::POST, &path, body).await?).await
 }
 
 fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
@@ -90,7 +97,7 @@ fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
     }
     output::line("")?;
     table.print()?;
-    for words in renamed(&trial.inputs) {
+    for words in describe_renamed_topics(&trial.inputs) {
         output::line(&words)?;
     }
     if !trial.unused.is_empty() {
@@ -99,27 +106,27 @@ fn print(trial: &Trial, path: &Path) -> anyhow::Result<()> {
     }
     let Some(rrt) = trial.rrt else {
         return output::line(&format!(
-            "none of {} requests was answered: look whether an input is missing, or a parameter",
+            "none of {} requests was answered: check whether an input or a parameter is missing",
             trial.requests
         ));
     };
     output::line(&format!(
-        "{} of {} requests answered; response times {:.1} ms (median), {:.1} ms (90 %), {:.1} ms (longest)",
+        "{} of {} requests answered; response times p50 {:.1} ms, p90 {:.1} ms, max {:.1} ms",
         trial.answered, trial.requests, rrt.p50, rrt.p90, rrt.max
     ))?;
     output::line(&format!(
-        "to begin with: desire = {:.3}, max = {:.3} (seconds; add the round trip of the robot's network)",
+        "initial values: desire = {:.3}, max = {:.3} (seconds; add the robot's network round trip)",
         rrt.desire / 1000.0,
         rrt.acceptable / 1000.0
     ))
 }
 
-/// Which topics of the recording went to inputs of other names.
-pub fn renamed(inputs: &[Fed]) -> impl Iterator<Item = String> {
+/// Describes the topics of the recording that went to inputs of other names.
+pub fn describe_renamed_topics(inputs: &[Fed]) -> impl Iterator<Item = String> {
     let renamed = inputs.iter().filter(|input| !input.from.is_empty());
     renamed.map(|input| {
         format!(
-            "{} of the recording went to {}, the only input of type {}",
+            "{} of the recording was sent to {}, the only input of type {}",
             input.from.join(", "),
             input.topic,
             input.type_name

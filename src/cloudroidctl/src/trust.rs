@@ -1,39 +1,42 @@
-//! `cloudroidctl trust`: accepts the certificate of a server.
+//! `trust`: accepts the certificate of a server.
 
 use anyhow::{Context, bail};
 use clap::Args;
-use tls::{Fingerprint, Known, KnownServers};
+use tls::{Fingerprint, KnownIdentity, KnownServers};
 
-use crate::client::Server;
+use crate::client::ServerAddress;
 
-/// Accept a server's certificate, which no authority has signed, by its fingerprint.
+/// Accept a server's self-signed certificate by its fingerprint.
 ///
-/// The daemon says it at its start, and so does cloudroidctl status on the server. It is remembered in
-/// ~/.config/cloudroid/known_servers, in place of what the server showed before.
+/// The daemon prints the fingerprint when it starts, and so does cloudroidctl status on the server. It is stored in
+/// ~/.config/cloudroid/known_servers, in place of an earlier one of this server.
 #[derive(Debug, Args)]
-pub struct TrustServer {
-    /// The server, as --server names it: https://HOST:PORT.
+pub struct TrustArgs {
+    /// Address of the server, as for --server: https://HOST:PORT.
     #[arg(value_name = "URL")]
     address: String,
-    /// Such as SHA256:5d21...
+    /// Fingerprint of the certificate, such as SHA256:5d21...
     fingerprint: Fingerprint,
 }
 
-impl TrustServer {
-    /// Remembers it.
+impl TrustArgs {
+    /// Stores the fingerprint.
     pub fn run(&self) -> anyhow::Result<()> {
-        let Server::Tls(server) = Server::parse(&self.address)? else {
+        let ServerAddress::Tls(server) = ServerAddress::parse(&self.address)? else {
             bail!(
-                "{} is reached without TLS and shows no certificate; write https://HOST:PORT",
+                "{} does not use TLS, so it has no certificate; write https://HOST:PORT",
                 self.address
             );
         };
-        let known = KnownServers::of_user()
+        let known = KnownServers::for_user()
             .context("neither XDG_CONFIG_HOME nor HOME is set; set one of them")?;
         known
-            .remember(&server, Known::Certificate(self.fingerprint))
-            .context("cannot remember the certificate")?;
-        println!("{server} is trusted with {}", self.fingerprint);
+            .remember(&server, KnownIdentity::Certificate(self.fingerprint))
+            .context("cannot store the certificate")?;
+        println!(
+            "{server} is now trusted with the certificate {}",
+            self.fingerprint
+        );
         Ok(())
     }
 }

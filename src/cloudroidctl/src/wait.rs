@@ -1,22 +1,22 @@
-//! `--wait`: until what was asked for has come about.
+//! `--wait`: waits until a condition is met.
 
 use std::future::Future;
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-use crate::client::is_away;
-use crate::exit::TimeUp;
+use crate::client::is_unavailable;
+use crate::exit::WaitTimedOut;
 use crate::token::lifetime;
 
-/// Between two looks.
+/// Interval between two checks of the condition.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Whether, and how long.
+/// Flag to wait, with an optional time limit.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct WaitFlag {
-    /// Wait until it has come about, for TIME at most, such as --wait=90s; without a time for as long as it takes. Exit status 8 when
-    /// the time is up.
+    /// Wait until it is done, at most for TIME, such as --wait=90s (default: no limit). Exit status 8 when the time is
+    /// up.
     #[arg(
         long,
         value_name = "TIME",
@@ -28,17 +28,17 @@ pub struct WaitFlag {
 }
 
 impl WaitFlag {
-    /// Whether somebody waits.
+    /// Returns whether the flag is given.
     pub fn is_set(self) -> bool {
         self.wait.is_some()
     }
 
-    /// Looks again and again until a look finds it; once where nobody waits. A look that finds something else says what. A daemon
-    /// that is away is waited for, too.
+    /// Calls `look` until it returns a value; once only without the flag. A `look` without a value returns the current
+    /// state for the error message. Also waits for a daemon that is unavailable.
     ///
     /// # Errors
-    /// What a look fails with, and [`TimeUp`].
-    pub async fn until<T, Look>(self, mut look: impl FnMut() -> Look) -> anyhow::Result<T>
+    /// Errors of `look`, and [`WaitTimedOut`].
+    pub async fn poll_until<T, Look>(self, mut look: impl FnMut() -> Look) -> anyhow::Result<T>
     where
         Look: Future<Output = anyhow::Result<Result<T, String>>>,
     {
@@ -47,12 +47,12 @@ impl WaitFlag {
             let instead = match look().await {
                 Ok(Ok(found)) => return Ok(found),
                 Ok(Err(instead)) => instead,
-                Err(error) if self.is_set() && is_away(&error) => format!("{error:#}"),
+                Err(error) if self.is_set() && is_unavailable(&error) => format!("{error:#}"),
                 Err(error) => return Err(error),
             };
             if !self.is_set() || deadline.is_some_and(|deadline| Instant::now() >= deadline) {
-                let words = format!("it has not come about: {instead}");
-                return Err(TimeUp { words }.into());
+                let words = format!("timed out: {instead}");
+                return Err(WaitTimedOut { words }.into());
             }
             tokio::time::sleep(LOOK).await;
         }
@@ -85,7 +85,7 @@ mod tests {
         ] {
             assert_eq!(parse(words).expect("valid").wait.wait, expected);
         }
-        // What follows is another argument, not its time.
+        // A following word is another argument, not the time.
         let line = parse(&["--wait", "90s"]).expect("valid");
         assert_eq!(line.after.as_deref(), Some("90s"));
         parse(&["--wait=soon"]).expect_err("no time");
@@ -103,18 +103,18 @@ mod tests {
             async move { Ok(found) }
         };
         let forever = parse(&["--wait"]).expect("valid").wait;
-        assert_eq!(forever.until(&mut third).await.expect("found"), 3);
+        assert_eq!(forever.poll_until(&mut third).await.expect("found"), 3);
 
         let never = || async { Ok(Err::<(), _>("still at work".to_owned())) };
         let over = WaitFlag {
             wait: Some(Some(Duration::ZERO)),
         };
-        let late = over.until(never).await.expect_err("time is up");
-        assert!(late.is::<TimeUp>());
+        let late = over.poll_until(never).await.expect_err("time is up");
+        assert!(late.is::<WaitTimedOut>());
         assert!(late.to_string().contains("still at work"), "{late}");
 
         let failing = || async { Err::<Result<(), String>, _>(anyhow::anyhow!("no such service")) };
-        let error = forever.until(failing).await.expect_err("it fails");
+        let error = forever.poll_until(failing).await.expect_err("it fails");
         assert_eq!(error.to_string(), "no such service");
     }
 }

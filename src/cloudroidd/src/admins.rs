@@ -1,4 +1,5 @@
-//! The socket at which members of a group are admins: the daemon's own is in a directory that only its user enters.
+//! The admin socket, at which members of a group are admins. The daemon's own socket is in a directory that only its
+//! user can enter.
 
 use std::fs::Permissions;
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
@@ -13,38 +14,38 @@ use tokio::net::UnixListener;
 
 use crate::config::Config;
 
-/// The group when none is configured.
+/// Default admin group.
 const GROUP: &str = "cloudroid";
 
-/// Where members of which group are admins.
+/// Path of the admin socket and the group whose members are admins there.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Admins {
+pub struct AdminSocket {
     path: PathBuf,
     group: Gid,
 }
 
-/// A socket that listens for them; its file goes with it.
-pub struct Listening {
-    /// Accepts their connections.
+/// A bound admin socket; its file is removed with it.
+pub struct AdminListener {
+    /// Accepts the connections of admins.
     pub listener: UnixListener,
-    /// Their group.
+    /// Group id of the admins.
     pub group: u32,
-    /// The file.
+    /// File of the socket, removed on drop.
     pub file: SocketFile,
 }
 
-/// Removes a socket's file at the end.
+/// Removes a socket's file on drop.
 pub struct SocketFile(PathBuf);
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
         let path = std::mem::take(&mut self.0);
-        let _ = privilege::now(move || std::fs::remove_file(path));
+        let _ = privilege::run_sync(move || std::fs::remove_file(path));
     }
 }
 
-/// The number of a group that is written as its name or its number.
-fn find(written: &str) -> anyhow::Result<Option<Gid>> {
+/// Looks up a group by its name or number.
+fn find_group(written: &str) -> anyhow::Result<Option<Gid>> {
     if let Ok(number) = written.parse() {
         return Ok(Some(Gid::from_raw(number)));
     }
@@ -53,9 +54,13 @@ fn find(written: &str) -> anyhow::Result<Option<Gid>> {
     Ok(group.map(|group| group.gid))
 }
 
-impl Admins {
-    /// Those of the configuration, or none. `runtime`: the directory that systemd made for the service.
-    pub fn of(config: &Config, runtime: Option<PathBuf>) -> anyhow::Result<Option<Admins>> {
+impl AdminSocket {
+    /// Returns the admin socket of the configuration, if any. `runtime` is the directory that systemd made for the
+    /// service.
+    pub fn from_config(
+        config: &Config,
+        runtime: Option<PathBuf>,
+    ) -> anyhow::Result<Option<AdminSocket>> {
         let path = match (&config.admin_socket, &config.admin_group, runtime) {
             (Some(path), ..) => path.clone(),
             (None, _, Some(directory)) => directory.join("daemon.sock"),
@@ -65,32 +70,32 @@ impl Admins {
             (None, None, None) => return Ok(None),
         };
         let written = config.admin_group.as_deref().unwrap_or(GROUP);
-        match find(written)? {
-            Some(group) => Ok(Some(Admins { path, group })),
-            // Nobody asked for it.
+        match find_group(written)? {
+            Some(group) => Ok(Some(AdminSocket { path, group })),
+            // Without a configured group or socket, a missing default group is no error.
             None if config.admin_group.is_none() && config.admin_socket.is_none() => Ok(None),
             None => bail!(
-                "there is no group {written:?} whose members could be admins; make it (groupadd --system {written}), or name another \
-                 with admin_group in the configuration"
+                "no group {written:?} for admin access; create it (groupadd --system {written}), or set admin_group in \
+                    the configuration to another group"
             ),
         }
     }
 
-    /// Listens for them.
-    pub fn listen(&self) -> anyhow::Result<Listening> {
+    /// Binds the socket and gives it to the group (mode 0660).
+    pub fn listen(&self) -> anyhow::Result<AdminListener> {
         let path = &self.path;
         if let Some(directory) = path.parent() {
             std::fs::create_dir_all(directory)
                 .with_context(|| format!("cannot create the directory {}", directory.display()))?;
         }
-        clear(path)?;
+        remove_stale_socket(path)?;
         let listen = || {
             let listener = UnixListener::bind(path)?;
             chown(path, None, Some(self.group))?;
             std::fs::set_permissions(path, Permissions::from_mode(0o660))?;
             Ok::<_, std::io::Error>(listener)
         };
-        Ok(Listening {
+        Ok(AdminListener {
             listener: listen().with_context(|| format!("cannot listen on {}", path.display()))?,
             group: self.group.as_raw(),
             file: SocketFile(path.clone()),
@@ -98,9 +103,9 @@ impl Admins {
     }
 }
 
-/// Answers them until the daemon ends.
-pub async fn serve(app: Arc<App>, router: Router, admins: Option<Listening>) {
-    let Some(Listening {
+/// Serves the admin socket until the daemon ends.
+pub async fn serve(app: Arc<App>, router: Router, admins: Option<AdminListener>) {
+    let Some(AdminListener {
         listener,
         group,
         file,
@@ -112,14 +117,14 @@ pub async fn serve(app: Arc<App>, router: Router, admins: Option<Listening>) {
     drop(file);
 }
 
-/// Removes the socket of a daemon that was killed, and nothing else.
-fn clear(path: &Path) -> anyhow::Result<()> {
+/// Removes the socket of a daemon that was killed; any other file, or a socket in use, is an error.
+fn remove_stale_socket(path: &Path) -> anyhow::Result<()> {
     let Ok(about) = path.symlink_metadata() else {
         return Ok(());
     };
     if !about.file_type().is_socket() {
         bail!(
-            "{} is there and is no socket; choose another admin_socket",
+            "{} exists and is not a socket; choose another admin_socket",
             path.display()
         );
     }
@@ -143,9 +148,9 @@ mod tests {
     #[test]
     fn the_group_is_the_one_that_was_named_and_nobody_is_admin_unasked() {
         let runtime = || Some(PathBuf::from("/run/cloudroid"));
-        let of = |text: &str, runtime| Admins::of(&config(text), runtime);
+        let of = |text: &str, runtime| AdminSocket::from_config(&config(text), runtime);
         let admins = |path: &str, number| {
-            Some(Admins {
+            Some(AdminSocket {
                 path: path.into(),
                 group: Gid::from_raw(number),
             })
@@ -163,7 +168,7 @@ mod tests {
             ("admin_group = \"root\"", "needs a socket"),
             (
                 "admin_group = \"no such group\"\nadmin_socket = \"/x/y\"",
-                "there is no group",
+                "no group",
             ),
         ] {
             let refused = of(text, None).expect_err(text).to_string();
@@ -179,7 +184,7 @@ mod tests {
     async fn only_what_a_killed_daemon_left_is_replaced() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("below/daemon.sock");
-        let admins = Admins {
+        let admins = AdminSocket {
             path: path.clone(),
             group: Gid::current(),
         };
@@ -188,8 +193,8 @@ mod tests {
         assert_eq!(mode, 0o660);
         let refused = admins.listen().err().expect("taken").to_string();
         assert!(refused.contains("another program"), "{refused}");
-        // Killed: the listener is gone, its file is not.
-        let Listening { listener, file, .. } = first;
+        // Simulates a killed daemon: the listener is gone, its file is not.
+        let AdminListener { listener, file, .. } = first;
         std::mem::forget(file);
         drop(listener);
         let second = admins.listen().expect("listens again");
@@ -197,7 +202,7 @@ mod tests {
         assert!(!path.exists());
         std::fs::write(&path, "precious").expect("written");
         let refused = admins.listen().err().expect("no socket").to_string();
-        assert!(refused.contains("is no socket"), "{refused}");
+        assert!(refused.contains("is not a socket"), "{refused}");
         assert_eq!(
             std::fs::read_to_string(&path).expect("left alone"),
             "precious"

@@ -8,7 +8,7 @@ use crate::config::Config;
 use crate::home::Home;
 use store::private;
 
-/// `images/` of the source tree.
+/// Files of `images/` in the source tree.
 const BUILT_IN: [(&str, &str); 6] = [
     (
         "bookworm-jazzy-wheels.build.requirements.txt",
@@ -36,13 +36,14 @@ const BUILT_IN: [(&str, &str); 6] = [
     ),
 ];
 
-/// Whether a file is a definition, or the requirements of one.
-fn is_part(name: &str) -> bool {
+/// Returns whether a file is a definition or the requirements of one.
+fn is_definition_file(name: &str) -> bool {
     name.ends_with(".toml") || name.ends_with(".requirements.txt")
 }
 
-/// A directory with all definitions. The operator's take the place of those built in with the same name.
-pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
+/// Writes all definitions to a directory of the home and returns its path. A definition of the operator replaces a
+/// built-in one of the same name.
+pub fn write_definitions(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
     let directory = home.path().join("definitions");
     let made = || {
         format!(
@@ -62,13 +63,13 @@ pub fn directory(config: &Config, home: &Home) -> anyhow::Result<PathBuf> {
         for entry in std::fs::read_dir(theirs).with_context(unread)? {
             let path = entry.with_context(unread)?.path();
             if let Some(name) = path.file_name().and_then(|name| name.to_str())
-                && is_part(name)
+                && is_definition_file(name)
             {
                 std::fs::copy(&path, directory.join(name)).with_context(unread)?;
             }
         }
     }
-    private::close_below(&directory, 1, &|_| false).with_context(made)?;
+    private::restrict_tree(&directory, 1, &|_| false).with_context(made)?;
     Ok(directory)
 }
 
@@ -88,7 +89,7 @@ mod tests {
                     .to_string_lossy()
                     .into_owned()
             })
-            .filter(|name| is_part(name))
+            .filter(|name| is_definition_file(name))
             .collect();
         there.sort();
         assert_eq!(there, BUILT_IN.map(|(name, _)| name));
@@ -107,7 +108,7 @@ mod tests {
             definitions: Some(theirs.path().to_owned()),
             ..Config::default()
         };
-        let directory = super::directory(&config, &home).expect("made");
+        let directory = super::write_definitions(&config, &home).expect("made");
         let read = |name: &str| std::fs::read_to_string(directory.join(name)).ok();
         assert_eq!(read("bookworm-ros1.toml").as_deref(), Some("mine"));
         assert_eq!(read("other.toml").as_deref(), Some("other"));

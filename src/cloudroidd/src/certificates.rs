@@ -1,5 +1,5 @@
-//! The certificate that the portal shows: the operator's, read again when its files change; that of an authority which is asked by
-//! ACME; or one that the daemon makes for itself (ADR 080, 081). The latter two are kept in its home.
+//! The portal's certificate: the operator's, reloaded when its files change; one obtained from an authority by ACME; or
+//! one that the daemon makes for itself (ADR 080, 081). The latter two are kept in the home.
 
 mod acme;
 mod files;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use anyhow::Context;
 use authority::Authority;
-use portal::{Robots, Tls};
+use portal::{RobotAuthority, Tls};
 use store::private;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject};
 use tokio_rustls::rustls::pki_types::{
@@ -22,152 +22,154 @@ use crate::config;
 use crate::home::Home;
 
 pub use acme::{Renewal, listen_for_challenges};
-pub use files::{keep, keep_lists};
+pub use files::{watch_certificate, watch_revocation_lists};
 
-/// Where the home has certificates and keys.
+/// Directory of certificates and keys in the home.
 const DIRECTORY: &str = "tls";
-/// The authority of robots' certificates and its key.
+/// File of the authority of robots' certificates and its key.
 const AUTHORITY: &str = "authority.pem";
 
-/// Why there is no certificate.
+/// Reason why there is no certificate.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file that cannot be read, or holds something else.
+    /// A file cannot be read, or holds something else.
     #[error("cannot read the {what} in {path}: {source}; it should be a PEM file")]
     Unreadable {
         /// `certificate`, `key` or `revocation list`.
         what: &'static str,
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The cause.
+        /// Underlying error.
         source: pem::Error,
     },
-    /// A file without one.
+    /// A file holds no certificate.
     #[error("{0} holds no certificate; it should be a PEM file with BEGIN CERTIFICATE")]
     None(PathBuf),
-    /// A file without a revocation list.
+    /// A file holds no revocation list.
     #[error("{0} holds no revocation list; it should be a PEM file with BEGIN X509 CRL")]
     NoList(PathBuf),
-    /// They do not belong together, or are of a kind that nobody knows.
+    /// Certificate and key do not match, or are of an unsupported kind.
     #[error("{path}: {source}")]
     Unusable {
-        /// The certificate's file.
+        /// Path of the certificate.
         path: PathBuf,
-        /// The cause.
+        /// Underlying error.
         source: portal::TlsError,
     },
-    /// The daemon's own cannot be made.
+    /// The daemon's own certificate cannot be made.
     #[error(
-        "cannot make a certificate for {names}: {source}; correct names in [tls] of the configuration"
+        "cannot create a certificate for {names}: {source}; correct names in [tls] of the configuration"
     )]
     Unmade {
-        /// The names that it was to have.
+        /// Names that the certificate was to have.
         names: String,
-        /// The cause.
+        /// Underlying error.
         source: rcgen::Error,
     },
-    /// The daemon's own cannot be kept.
-    #[error("cannot keep the daemon's certificate in {path}: {source}")]
+    /// The daemon's own certificate cannot be written to its file.
+    #[error("cannot write the daemon's certificate to {path}: {source}")]
     Unkept {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The cause.
+        /// Underlying error.
         source: std::io::Error,
     },
 }
 
-/// A certificate with those that lead from it to an authority, and its key.
-type Pair = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
+/// A certificate chain and its key.
+type ChainAndKey = (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>);
 
 fn unreadable(what: &'static str, path: &Path) -> impl FnOnce(pem::Error) -> Error {
     let path = path.to_owned();
     move |source| Error::Unreadable { what, path, source }
 }
 
-fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error> {
+fn read_certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, Error> {
     let read = CertificateDer::pem_file_iter(path)
         .and_then(Iterator::collect::<Result<Vec<_>, _>>)
         .map_err(unreadable("certificate", path))?;
-    match read.is_empty() {
-        true => Err(Error::None(path.to_owned())),
-        false => Ok(read),
+    if read.is_empty() {
+        Err(Error::None(path.to_owned()))
+    } else {
+        Ok(read)
     }
 }
 
-/// Has certificates refused that the lists of a file name.
-fn revoke(tls: &Tls, path: &Path) -> Result<(), Error> {
+/// Loads revocation lists from a file; certificates that they name are refused from then on.
+fn load_revocation_lists(tls: &Tls, path: &Path) -> Result<(), Error> {
     let lists = CertificateRevocationListDer::pem_file_iter(path)
         .and_then(Iterator::collect::<Result<Vec<_>, _>>)
         .map_err(unreadable("revocation list", path))?;
     if lists.is_empty() {
         return Err(Error::NoList(path.to_owned()));
     }
-    tls.revoke(lists).map_err(|source| Error::Unusable {
-        path: path.to_owned(),
-        source,
-    })
+    tls.set_revocation_lists(lists)
+        .map_err(|source| Error::Unusable {
+            path: path.to_owned(),
+            source,
+        })
 }
 
-fn read(certificate: &Path, key: &Path) -> Result<Pair, Error> {
-    let chain = certificates(certificate)?;
+fn read_chain_and_key(certificate: &Path, key: &Path) -> Result<ChainAndKey, Error> {
+    let chain = read_certificates(certificate)?;
     let key = PrivateKeyDer::from_pem_file(key).map_err(unreadable("key", key))?;
     Ok((chain, key))
 }
 
-/// The authority of robots' certificates, where TLS is spoken: made at the first time.
-pub fn robots(
-    config: &config::Tls,
+/// Opens the authority of robots' certificates, which is created at first use; `None` without TLS.
+pub fn open_robot_authority(
+    config: &config::TlsConfig,
     home: &Home,
     listen: SocketAddr,
-) -> anyhow::Result<Option<Robots>> {
-    if !config.is_spoken(listen) {
+) -> anyhow::Result<Option<RobotAuthority>> {
+    if !config.is_enabled(listen) {
         return Ok(None);
     }
     let directory = home.path().join(DIRECTORY);
     private::make_directory(&directory)
-        .with_context(|| format!("cannot make {}", directory.display()))?;
-    Ok(Some(Robots {
-        authority: Authority::of_file(&directory.join(AUTHORITY))?,
+        .with_context(|| format!("cannot create {}", directory.display()))?;
+    Ok(Some(RobotAuthority {
+        authority: Authority::load_or_create(&directory.join(AUTHORITY))?,
         lifetime: config.robot_certificates.0,
     }))
 }
 
-/// TLS for a portal that listens at `listen`, where it is spoken there.
-pub fn tls(
-    config: &config::Tls,
+/// Builds the TLS of a portal that listens at `listen`; `None` without TLS.
+pub fn build_tls(
+    config: &config::TlsConfig,
     home: &Home,
     listen: SocketAddr,
-    robots: Option<&Robots>,
+    robots: Option<&RobotAuthority>,
 ) -> Result<Option<Arc<Tls>>, Error> {
     let Some(robots) = robots else {
         return Ok(None);
     };
     let directory = home.path().join(DIRECTORY);
-    let (certificate, (chain, key)) = match (config.files(), &config.acme) {
+    let (certificate, (chain, key)) = match (config.certificate_files(), &config.acme) {
         (Some((certificate, key)), _) => {
-            let pair = read(&certificate, &key)?;
+            let pair = read_chain_and_key(&certificate, &key)?;
             (certificate, pair)
         }
-        (None, Some(acme)) => match acme::kept(acme, &directory) {
+        (None, Some(acme)) => match acme::load_certificate(acme, &directory) {
             Some(kept) => kept,
-            None => own::kept(&directory, config, listen)?,
+            None => own::load_or_create(&directory, config, listen)?,
         },
-        (None, None) => own::kept(&directory, config, listen)?,
+        (None, None) => own::load_or_create(&directory, config, listen)?,
     };
     let unusable = |source| Error::Unusable {
         path: certificate,
         source,
     };
     let others = match &config.client_authorities {
-        Some(path) => certificates(path)?,
+        Some(path) => read_certificates(path)?,
         None => Vec::new(),
     };
     let tls = Tls::new(chain, key, robots.authority.certificate(), others).map_err(unusable)?;
     if let Some(path) = &config.client_revocations {
-        revoke(&tls, path)?;
+        load_revocation_lists(&tls, path)?;
     }
     if config.acme.is_none() {
-        own::warn_of_other_names(&tls, &config.names);
+        own::warn_of_missing_names(&tls, &config.names);
     }
     Ok(Some(Arc::new(tls)))
 }

@@ -1,5 +1,5 @@
-//! The configuration file: TOML, every key optional, unknown keys refused by name.
-//! `systemd/cloudroid.example.toml` shows each key with its default.
+//! The configuration file: TOML, every key optional, unknown keys refused by name. `systemd/cloudroid.example.toml`
+//! shows each key with its default.
 
 mod acme;
 mod archives;
@@ -32,84 +32,87 @@ use serde::Deserialize;
 
 use crate::machine;
 
-pub use self::oidc::Oidc;
-pub use self::portal::{NonFinite, Portal};
-pub use self::push::Push;
-pub use self::servant::{Hung, Servant};
-pub use acme::Acme;
-pub use archives::Archives;
-pub use black_box::BlackBox;
-pub use capacity::{Capacity, Controller};
-pub use class::Class;
-pub use memory::Memory;
-pub use people::People;
+pub use self::oidc::OidcConfig;
+pub use self::portal::{NonFinite, PortalConfig};
+pub use self::push::PushConfig;
+pub use self::servant::{Hung, ServantConfig};
+pub use acme::AcmeConfig;
+pub use archives::ArchivesConfig;
+pub use black_box::BlackBoxConfig;
+pub use capacity::{CapacityConfig, Controller};
+pub use class::ClassConfig;
+pub use memory::MemoryConfig;
+pub use people::PeopleConfig;
 pub use time::Time;
-pub use tls::Tls;
+pub use tls::TlsConfig;
 
-/// Everything that can be configured.
+/// The daemon's configuration.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Config {
-    /// Address and port of the portal.
+    /// Address and port of the portal (default: 127.0.0.1:9090).
     pub listen: SocketAddr,
-    /// Bearer tokens, or `sha256:HEX` of them. They, or an identity provider, are needed to listen beyond loopback.
+    /// Bearer tokens, or `sha256:HEX` of them. To listen beyond loopback, tokens or an identity provider are required.
     pub tokens: Vec<String>,
-    /// Name or number of the group whose members are admins at `admin_socket`; `cloudroid` by default, where there is such a group.
+    /// Name or number of the group whose members are admins at `admin_socket` (default: `cloudroid`, if that group
+    /// exists).
     pub admin_group: Option<String>,
-    /// A socket for them; below the directory that systemd makes for the service by default, else none.
+    /// Path of the admin socket (default: `daemon.sock` in the directory that systemd makes for the service, otherwise
+    /// none).
     pub admin_socket: Option<PathBuf>,
-    /// Name or number of the user whose rights to files the threads have that read what strangers send.
+    /// Name or number of the user whose file access rights the threads have that read input of strangers.
     pub portal_user: Option<String>,
-    /// Web origins besides this machine's own whose pages may use the portal without a token.
+    /// Web origins whose pages may use the portal without a token, besides this machine's own.
     pub origins: Vec<String>,
-    /// Addresses and networks of proxies in front of the portal that are believed for whom they ask.
+    /// Addresses and networks of trusted proxies in front of the portal: the client's address that they forward is
+    /// believed.
     pub trusted_proxies: Vec<String>,
-    /// Where a plain `ws://host:9090` goes.
+    /// Service of a plain `ws://host:9090`.
     pub default_service: Option<String>,
-    /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
+    /// Robot id of connections to a plain `ws://host:9090` (default: each connection is a robot of its own).
     pub default_robot: Option<String>,
-    /// What to do on a machine that cannot set the limits.
+    /// Behaviour on a machine that cannot set the limits.
     pub isolation: IsolationMode,
-    /// Servants outlive the daemon. Under systemd by default, else not.
+    /// Keep servants when the daemon ends (default: yes under systemd, otherwise no).
     pub keep_servants: Option<bool>,
-    /// Directory of base image definitions, searched before those built in.
+    /// Directory of base image definitions, searched before the built-in ones.
     pub definitions: Option<PathBuf>,
-    /// Where the packages of bases come from.
-    pub archives: Archives,
-    /// Limits of a servant where its push says nothing.
+    /// Package archives of the bases.
+    pub archives: ArchivesConfig,
+    /// Limits of a servant whose push sets none.
     pub limits: Limits,
-    /// Classes that robots may name; `default` is that of robots that name none.
-    pub class: BTreeMap<String, Class>,
-    /// How many servants fit.
+    /// Classes that robots may name; `default` is the class of robots that name none.
+    pub class: BTreeMap<String, ClassConfig>,
+    /// Capacity that may be promised to servants.
     #[serde(alias = "room")]
-    pub capacity: Capacity,
-    /// The life of a servant.
-    pub servant: Servant,
-    /// Where TLS is spoken.
-    pub tls: Tls,
-    /// How people's sessions last.
-    pub people: People,
-    /// An identity provider that knows people.
-    pub oidc: Option<Oidc>,
-    /// What clients may do.
-    pub portal: Portal,
-    /// Limits of memory outside of servants' containers.
-    pub memory: Memory,
-    /// What of servants is kept for when something goes wrong.
-    pub black_box: BlackBox,
+    pub capacity: CapacityConfig,
+    /// Lifetime and resources of servants.
+    pub servant: ServantConfig,
+    /// TLS of the portal.
+    pub tls: TlsConfig,
+    /// Lifetime of people's sessions.
+    pub people: PeopleConfig,
+    /// Identity provider for people.
+    pub oidc: Option<OidcConfig>,
+    /// Limits of clients' connections.
+    pub portal: PortalConfig,
+    /// Memory limits outside of servants' containers.
+    pub memory: MemoryConfig,
+    /// Recording of the last seconds of servants, kept for when something goes wrong.
+    pub black_box: BlackBoxConfig,
     /// Limits of pushes.
-    pub push: Push,
-    /// What pushes may ask for beyond a container.
+    pub push: PushConfig,
+    /// Grants beyond a container that pushes may ask for.
     pub allow: Allow,
 }
 
-/// Whether limits that cannot be set are an error.
+/// Handling of limits that cannot be set.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum IsolationMode {
-    /// Refuse to run without every limit.
+    /// Refuse to run unless every limit can be set.
     Require,
-    /// Say so and run.
+    /// Run without, and warn.
     #[default]
     BestEffort,
 }
@@ -138,7 +141,7 @@ impl Default for Config {
             isolation: IsolationMode::default(),
             keep_servants: None,
             definitions: None,
-            archives: Archives::default(),
+            archives: ArchivesConfig::default(),
             limits: Limits {
                 cpus: Some(machine::cores()),
                 cpu_weight: Some(100),
@@ -147,22 +150,22 @@ impl Default for Config {
                 ..Limits::default()
             },
             class: BTreeMap::new(),
-            capacity: Capacity::default(),
-            servant: Servant::default(),
-            tls: Tls::default(),
-            people: People::default(),
+            capacity: CapacityConfig::default(),
+            servant: ServantConfig::default(),
+            tls: TlsConfig::default(),
+            people: PeopleConfig::default(),
             oidc: None,
-            portal: Portal::default(),
-            memory: Memory::default(),
-            black_box: BlackBox::default(),
-            push: Push::default(),
+            portal: PortalConfig::default(),
+            memory: MemoryConfig::default(),
+            black_box: BlackBoxConfig::default(),
+            push: PushConfig::default(),
             allow: Allow::default(),
         }
     }
 }
 
 impl Config {
-    /// Reads `path`; without one, everything is as by default.
+    /// Reads the file at `path`; without one, returns the defaults.
     pub fn read(path: Option<&Path>) -> anyhow::Result<Config> {
         let Some(path) = path else {
             return Ok(Config::default());
@@ -181,7 +184,7 @@ impl Config {
         Ok(config)
     }
 
-    /// Whose rights to files the portal's threads have.
+    /// Returns the account whose file access rights the portal's threads have.
     pub fn account(&self) -> anyhow::Result<privilege::Account> {
         match &self.portal_user {
             Some(written) => Ok(privilege::Account::find(written)?),
@@ -189,14 +192,14 @@ impl Config {
         }
     }
 
-    /// Refuses what cannot work together, before anything is started.
+    /// Checks all values and their combinations before anything is started.
     pub fn check(&self) -> anyhow::Result<()> {
         self.account()?;
         Tokens::new(&self.tokens)?;
         if !self.listen.ip().is_loopback() && self.tokens.is_empty() && self.oidc.is_none() {
             bail!(
-                "listening on {} lets everyone on the network in; \
-                 put a token into the configuration (tokens = [\"…\"]) or listen on 127.0.0.1:{}",
+                "listening on {} gives everyone on the network access; put a token into the configuration (tokens = \
+                    [\"…\"]) or listen on 127.0.0.1:{}",
                 self.listen,
                 self.listen.port()
             );
@@ -217,7 +220,7 @@ impl Config {
                 .check(name)
                 .with_context(|| format!("[class.{name}] of the configuration"))?;
         }
-        reach::egress::check(&self.allow.egress)
+        reach::egress::validate(&self.allow.egress)
             .context("egress in [allow] of the configuration")?;
         self.black_box
             .check(self.memory.servant)
@@ -230,10 +233,12 @@ impl Config {
             .check()
             .context("[capacity] of the configuration")?;
         if let Some(service) = &self.default_service {
-            catalogue::names::service(service).context("default_service of the configuration")?;
+            catalogue::names::validate_service(service)
+                .context("default_service of the configuration")?;
         }
         if let Some(robot) = &self.default_robot {
-            catalogue::names::robot(robot).context("default_robot of the configuration")?;
+            catalogue::names::validate_robot(robot)
+                .context("default_robot of the configuration")?;
         }
         self.memory
             .check()
@@ -242,24 +247,24 @@ impl Config {
         Ok(())
     }
 
-    /// The proxies that are believed.
-    pub fn proxies(&self) -> Result<Proxies, ::portal::NoNetwork> {
+    /// Returns the trusted proxies.
+    pub fn proxies(&self) -> Result<Proxies, ::portal::ParseIpNetworkError> {
         let networks = self.trusted_proxies.iter().map(|written| written.parse());
         Ok(Proxies(networks.collect::<Result<_, _>>()?))
     }
 
-    /// Whether servants outlive this daemon when it is ended.
+    /// Returns whether servants are kept when this daemon ends.
     pub fn keeps_servants(&self) -> bool {
         self.keep_servants
             .unwrap_or_else(|| std::env::var_os("NOTIFY_SOCKET").is_some())
     }
 }
 
-/// Refuses a time in which nothing can begin; `right` is one in which it can.
-fn begins(key: &str, time: Time, right: &str) -> anyhow::Result<()> {
+/// Refuses a duration of zero; `right` is an example of a valid one for the error message.
+fn check_nonzero(key: &str, time: Time, right: &str) -> anyhow::Result<()> {
     if time.0.is_zero() {
         bail!(
-            "{key} = 0 in the configuration would give up before anything has begun; write a time such as \"{right}\""
+            "{key} = 0 in the configuration would always time out at once; write a time such as \"{right}\""
         );
     }
     Ok(())
@@ -292,29 +297,29 @@ mod tests {
         let written = Config::parse(&uncommented).expect("every example value is valid");
         assert_eq!(
             written.capacity,
-            Capacity {
+            CapacityConfig {
                 cpus: Some(2.0),
                 memory: Some(Size(4 << 30)),
-                ..Capacity::default()
+                ..CapacityConfig::default()
             }
         );
-        let servant = Servant {
+        let servant = ServantConfig {
             scratch: Some(Size(512 << 20)),
-            ..Servant::default()
+            ..ServantConfig::default()
         };
         assert_eq!(written.servant, servant);
-        assert_eq!(written.portal, Portal::default());
-        let memory = Memory {
+        assert_eq!(written.portal, PortalConfig::default());
+        let memory = MemoryConfig {
             daemon: Some(Size(1 << 30)),
-            ..Memory::default()
+            ..MemoryConfig::default()
         };
         assert_eq!(written.memory, memory);
         assert_eq!(
             written.push,
-            Push {
+            PushConfig {
                 cpus: Some(2.0),
                 memory: Some(Size(4 << 30)),
-                ..Push::default()
+                ..PushConfig::default()
             }
         );
         assert_eq!(written.limits.memory, Config::default().limits.memory);
@@ -347,7 +352,7 @@ mod tests {
         for text in ["scratch = \"0\"", "inodes = 0", "log_rate = \"0\""] {
             let config = Config::parse(&format!("[servant]\n{text}\n")).expect("understood");
             let refused = config.check().expect_err(text).to_string();
-            assert!(refused.contains("256 inodes"), "{refused}");
+            assert!(refused.contains("inodes at least 256"), "{refused}");
         }
     }
 

@@ -1,5 +1,5 @@
-//! What this machine must offer, looked at before anything is started, by `cloudroidd doctor`, and by
-//! `/api/v1/doctor`. Nothing is changed by looking.
+//! Checks of what this machine must offer: made before anything is started, by `cloudroidd doctor`, and by
+//! `/api/v1/doctor`. The checks change nothing.
 
 mod cgroups;
 
@@ -7,16 +7,16 @@ use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 
 use api::{Check, CheckStatus, Doctor, Size};
-use portal::Machine;
+use portal::MachineChecks;
 
-/// Overlays of idmapped layers are known since Linux 5.19.
+/// Oldest supported kernel: overlays of idmapped layers need Linux 5.19.
 const OLDEST_KERNEL: (u32, u32) = (5, 19);
-/// A base image and one package with its dependencies.
+/// Free disk space required and recommended: a base image and one package with its dependencies.
 const ROOM_NEEDED: u64 = 2 << 30;
 const SPACE_WANTED: u64 = 10 << 30;
 
-/// Every check. `listening`: the portal that runs already and holds its port. `doubts`: what of the configuration is beyond this
-/// machine.
+/// Runs all checks. `listening` is the address of a portal that already runs and holds its port; `doubts` are settings
+/// that exceed this machine.
 pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) -> Doctor {
     let mut checks = vec![
         root(),
@@ -34,7 +34,7 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
     checks.push(optional(program(
         "pip3",
         "python3-pip",
-        "fetches the wheels that some bases of ROS 2 are made of",
+        "fetches the Python wheels for some ROS 2 base images",
     )));
     checks.push(apt_lists());
     checks.push(disk_space(home));
@@ -44,8 +44,8 @@ pub fn examine(home: &Path, listening: Option<SocketAddr>, doubts: &[String]) ->
     Doctor { checks }
 }
 
-/// What matters while the daemon runs, and what keeps it from running.
-pub fn look(home: &Path) -> (Machine, Vec<Check>) {
+/// Returns the state of the machine while the daemon runs, and the failed checks that keep it from starting.
+pub fn check_requirements(home: &Path) -> (MachineChecks, Vec<Check>) {
     let checks = [
         root(),
         kernel(),
@@ -59,11 +59,11 @@ pub fn look(home: &Path) -> (Machine, Vec<Check>) {
         .into_iter()
         .filter(|check| check.status == CheckStatus::Missing)
         .collect();
-    let found = cgroups::find();
+    let found = cgroups::detect();
     let mut warnings = Vec::new();
     if !found.missing.is_empty() {
         warnings.push(format!(
-            "servants cannot be limited in {}: {}",
+            "no limits for servants on {}: {}",
             found.missing.join(", "),
             found.why
         ));
@@ -77,7 +77,7 @@ pub fn look(home: &Path) -> (Machine, Vec<Check>) {
             warnings.push(format!("{}: {}", check.name, check.found));
         }
     }
-    let machine = Machine {
+    let machine = MachineChecks {
         cgroup_version: found.version,
         missing_limits: found.missing,
         warnings,
@@ -85,10 +85,10 @@ pub fn look(home: &Path) -> (Machine, Vec<Check>) {
     (machine, missing)
 }
 
-/// The static init of servants: beside this program, where packages install it, or where `CLOUDROID_INIT` says.
+/// Finds the static init of servants: `CLOUDROID_INIT`, the file beside this program, or where packages install it.
 pub fn find_init() -> Option<PathBuf> {
     let named = std::env::var_os("CLOUDROID_INIT").map(PathBuf::from);
-    // As built, and as installed below any prefix.
+    // In the build directory, and installed below any prefix.
     let directory = std::env::current_exe()
         .ok()
         .and_then(|path| Some(path.parent()?.to_owned()));
@@ -99,7 +99,7 @@ pub fn find_init() -> Option<PathBuf> {
     found.map(|path| path.canonicalize().unwrap_or(path))
 }
 
-/// A list for people, for the daemon that cannot start.
+/// Formats failed checks as a list for the error message of a daemon that cannot start.
 pub fn list(checks: &[Check]) -> String {
     let lines = checks.iter().map(|check| match &check.fix {
         Some(fix) => format!("  {}: {}\n    {fix}", check.name, check.found),
@@ -142,7 +142,7 @@ fn root() -> Check {
     } else {
         missing(
             "root",
-            format!("running as user {uid}; containers are made by root"),
+            format!("running as user {uid}; creating containers needs root"),
             "sudo cloudroidd",
         )
     }
@@ -161,11 +161,7 @@ fn kernel() -> Check {
             ),
             "install a newer kernel, such as Debian 12's or Ubuntu's linux-generic-hwe, and reboot",
         ),
-        None => warning(
-            "kernel",
-            format!("{release:?} is no version this program knows"),
-            "uname -r",
-        ),
+        None => warning("kernel", format!("unknown version {release:?}"), "uname -r"),
     }
 }
 
@@ -180,11 +176,11 @@ fn overlay() -> Check {
         .lines()
         .any(|line| line.split_whitespace().last() == Some("overlay"))
     {
-        ok("overlay", "overlay file systems are known")
+        ok("overlay", "overlay file systems are supported")
     } else {
         missing(
             "overlay",
-            "the kernel does not know overlay file systems",
+            "the kernel has no overlay file system",
             "modprobe overlay",
         )
     }
@@ -195,13 +191,13 @@ fn user_namespaces() -> Check {
     match limit.and_then(|text| text.trim().parse::<u64>().ok()) {
         Some(0) => missing(
             "user namespaces",
-            "none are allowed",
+            "none allowed",
             "sysctl -w user.max_user_namespaces=15000",
         ),
-        Some(limit) => ok("user namespaces", format!("{limit} are allowed")),
+        Some(limit) => ok("user namespaces", format!("{limit} allowed")),
         None => missing(
             "user namespaces",
-            "the kernel does not know them",
+            "not supported by the kernel",
             "boot a kernel with CONFIG_USER_NS, such as the distribution's own",
         ),
     }
@@ -219,15 +215,15 @@ fn seccomp() -> Check {
 }
 
 fn landlock() -> Check {
-    if servant::shim::can_keep_to_files() {
+    if servant::shim::can_restrict_files() {
         return ok(
             "landlock",
-            "the ROS Masters of servants are kept to their own files",
+            "the servants' ROS Masters are confined to their own files",
         );
     }
     warning(
         "landlock",
-        "the kernel cannot keep the ROS Masters of servants to their own files",
+        "the kernel cannot confine the servants' ROS Masters to their own files",
         "boot with landlock among lsm=, such as lsm=landlock,lockdown,yama,integrity,apparmor",
     )
 }
@@ -241,15 +237,15 @@ fn idmapped_mounts(home: &Path) -> Check {
     if !nix::unistd::geteuid().is_root() {
         return warning(NAME, "can only be tested as root", "sudo cloudroidd doctor");
     }
-    match servant::idmap::try_on(existing) {
+    match servant::idmap::check_idmap_support(existing) {
         Ok(()) => ok(
             NAME,
-            format!("work on the file system of {}", existing.display()),
+            format!("supported by the file system of {}", existing.display()),
         ),
         Err(error) => missing(
             NAME,
             format!(
-                "do not work on the file system of {}: {error}",
+                "not supported by the file system of {}: {error}",
                 existing.display()
             ),
             "choose a state directory on ext4, xfs or btrfs with --home, or install a newer kernel",
@@ -266,13 +262,13 @@ fn program(name: &str, package: &str, what_for: &str) -> Check {
         Some(path) => ok(name, path.display().to_string()),
         None => missing(
             name,
-            format!("is not installed; it {what_for}"),
+            format!("not installed; it {what_for}"),
             format!("apt-get install {package}"),
         ),
     }
 }
 
-/// Something without which most works.
+/// Turns a failed check into a warning, for something that most functions work without.
 fn optional(check: Check) -> Check {
     let status = match check.status {
         CheckStatus::Missing => CheckStatus::Warning,
@@ -316,7 +312,7 @@ fn disk_space(home: &Path) -> Check {
     };
     let free = found.blocks_available() * found.fragment_size();
     let text = format!("{} free at {}", Size(free), existing.display());
-    let fix = "free some, or choose another state directory with --home; cloudroidctl rm removes services";
+    let fix = "free some space, or choose another state directory with --home; cloudroidctl rm removes services";
     match free {
         _ if free < ROOM_NEEDED => missing(
             NAME,
@@ -342,7 +338,7 @@ fn init() -> Check {
 
 fn configuration(doubts: &[String]) -> Check {
     match doubts {
-        [] => ok("configuration", "fits this machine"),
+        [] => ok("configuration", "fits this machine's resources"),
         doubts => warning(
             "configuration",
             doubts.join("; "),
@@ -363,7 +359,7 @@ fn port(listening: Option<SocketAddr>) -> Check {
             NAME,
             format!("{address} is taken: {error}"),
             format!(
-                "ss -ltnp 'sport = :{}' shows by whom; cloudroidd --listen chooses another",
+                "ss -ltnp 'sport = :{}' shows the program; choose another address with cloudroidd --listen",
                 address.port()
             ),
         ),

@@ -1,10 +1,11 @@
-//! The state directory: where everything of one daemon is, and the lock that makes it one.
+//! The state directory of one daemon, and the lock that makes it exclusive.
 //!
 //! ```text
-//! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock  servants/<id>/  build/<push>/  logs/  recordings/
+//! lock  cloudroid.db  signing.pem  tls/  images/  layers/  run/daemon.sock
+//! servants/<id>/  build/<push>/  logs/  recordings/
 //! ```
 //!
-//! Nobody else enters it (docs/adr/033).
+//! No other user can enter it (docs/adr/033).
 
 mod mounts;
 
@@ -16,58 +17,58 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::fcntl::{Flock, FlockArg};
-use servant::process::Identity;
+use servant::process::ProcessIdentity;
 use tokio::net::UnixListener;
 
 use store::private;
 
-/// How often, and how long each time, a lock is waited for whose daemon is gone.
+/// Number of attempts, and the pause between them, to get a lock whose daemon has ended.
 const PAUSES: u32 = 100;
 const PAUSE: Duration = Duration::from_millis(20);
 
-/// Why a directory cannot be the home.
+/// Reason why a directory cannot be the home.
 #[derive(Debug, thiserror::Error)]
 pub enum HomeError {
-    /// Another daemon has it.
+    /// Another daemon uses it.
     #[error(
-        "another cloudroidd{pid} already uses {home}; end it first ({way}), or choose another directory with --home"
+        "another cloudroidd{pid} already uses {home}; stop it first ({way}), or choose another directory with --home"
     )]
     Taken {
         /// The directory.
         home: PathBuf,
-        /// ` (pid N)`, where it is surely that one.
+        /// ` (pid N)`, if that process certainly holds it.
         pid: String,
-        /// How to end it, or to find it.
+        /// Command to end the other daemon, or to find it.
         way: String,
     },
-    /// No default directory can be named.
+    /// No default directory can be determined.
     #[error(
         "neither CLOUDROID_HOME nor XDG_DATA_HOME nor HOME is set; name a state directory with --home"
     )]
     Nowhere,
-    /// The file system refused.
+    /// A file system operation failed.
     #[error("cannot {action} {path}: {source}")]
     Io {
-        /// What was being done.
+        /// Verb of the operation.
         action: &'static str,
-        /// The directory.
+        /// Path of the file or directory.
         path: PathBuf,
-        /// What the system said.
+        /// Underlying error.
         source: std::io::Error,
     },
 }
 
-/// What is done to what others could enter or read.
-const CLOSE: &str = "close to others";
+/// Verb for removing the access rights of others.
+const CLOSE: &str = "restrict access to";
 
-/// A home that this process has locked. The lock falls with the process, however it ends.
+/// A home that this process has locked. The lock ends with the process, however it ends.
 #[derive(Debug)]
 pub struct Home {
     path: PathBuf,
     _lock: Flock<File>,
 }
 
-/// Where the state is by default: `$CLOUDROID_HOME`, else `cloudroid` below the user's data directory.
+/// Returns the default state directory: `$CLOUDROID_HOME`, otherwise `cloudroid` in the user's data directory.
 pub fn default_path(
     variable: impl Fn(&str) -> Option<std::ffi::OsString>,
 ) -> Result<PathBuf, HomeError> {
@@ -83,7 +84,8 @@ pub fn default_path(
 }
 
 impl Home {
-    /// Shared between daemons: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; below the home where neither is known.
+    /// Returns the cache directory, which daemons share: `$XDG_CACHE_HOME/cloudroid` or `~/.cache/cloudroid`; in the
+    /// home if neither variable is set.
     pub fn cache(&self) -> PathBuf {
         let variable = |name| {
             std::env::var_os(name)
@@ -98,26 +100,28 @@ impl Home {
             )
     }
 
-    /// Makes what is missing of the directory and locks it.
+    /// Creates what is missing of the directory and locks it.
     pub fn open(path: &Path) -> Result<Home, HomeError> {
-        let path = std::path::absolute(path).map_err(io("resolve", path))?;
-        private::make_directory(&path).map_err(io("create the directory", &path))?;
+        let path = std::path::absolute(path).map_err(io_error("resolve", path))?;
+        private::make_directory(&path).map_err(io_error("create the directory", &path))?;
         let lock = lock(&path, &mut || std::thread::sleep(PAUSE))?;
         let home = Home { path, _lock: lock };
         for name in ["images", "layers", "run", "servants", "build", "logs"] {
             let directory = home.path.join(name);
-            private::make_directory(&directory).map_err(io("create the directory", &directory))?;
+            private::make_directory(&directory)
+                .map_err(io_error("create the directory", &directory))?;
         }
-        home.close()?;
+        home.restrict_permissions()?;
         Ok(home)
     }
 
-    /// Takes from others what an earlier version, or an operator's umask, has left open. Roots of servants are left alone:
-    /// what is in a layer has the rights that its image gives, and is behind a directory that nobody else enters.
-    fn close(&self) -> Result<(), HomeError> {
+    /// Removes access rights of others that an earlier version, or an operator's umask, has left. Root file systems of
+    /// servants are left alone: the files of a layer have the rights that their image gives, and are in a directory
+    /// that no other user can enter.
+    fn restrict_permissions(&self) -> Result<(), HomeError> {
         let closed = |name: &str, levels, leave: &dyn Fn(&Path) -> bool| {
             let path = self.path.join(name);
-            private::close_below(&path, levels, leave).map_err(io(CLOSE, &path))
+            private::restrict_tree(&path, levels, leave).map_err(io_error(CLOSE, &path))
         };
         let nothing = |_: &Path| false;
         closed("images", 3, &nothing)?;
@@ -127,7 +131,7 @@ impl Home {
         closed("tls", 1, &nothing)?;
         closed("layers", 0, &nothing)?;
         closed("build", 1, &nothing)?;
-        // Below a servant's there is only the topmost layer of its root.
+        // The only root file system below a servant's directory is its topmost layer.
         closed("servants", 2, &|path| {
             path.is_dir() && path.ends_with("skeleton")
         })?;
@@ -139,81 +143,82 @@ impl Home {
         ] {
             closed(name, 0, &nothing)?;
         }
-        if !is_ours(&self.path).map_err(io(CLOSE, &self.path))? {
+        if !is_exclusive(&self.path).map_err(io_error(CLOSE, &self.path))? {
             tracing::warn!(
-                "{} is not the daemon's alone: who may enter it stays as it is, and what the daemon keeps in it is closed to \
-                 others; give it a directory of its own with --home",
+                "{} has other files, so its permissions are not changed; only the daemon's own files in it are \
+                    restricted; use a dedicated directory with --home",
                 self.path.display()
             );
             return Ok(());
         }
-        private::close_below(&self.path, 1, &|path| path.is_dir()).map_err(io(CLOSE, &self.path))
+        private::restrict_tree(&self.path, 1, &|path| path.is_dir())
+            .map_err(io_error(CLOSE, &self.path))
     }
 
-    /// The directory.
+    /// Returns the path of the directory.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The OCI layout.
+    /// Returns the path of the OCI image layout.
     pub fn images(&self) -> PathBuf {
         self.path.join("images")
     }
 
-    /// Extracted layers.
+    /// Returns the path of the extracted layers.
     pub fn layers(&self) -> PathBuf {
         self.path.join("layers")
     }
 
-    /// The database.
+    /// Returns the path of the database.
     pub fn database(&self) -> PathBuf {
         self.path.join("cloudroid.db")
     }
 
-    /// The key that stubs are signed by.
+    /// Returns the path of the key that signs stubs.
     pub fn signing_key(&self) -> PathBuf {
         self.path.join("signing.pem")
     }
 
-    /// Listens on the command line's socket, for root and this user alone.
+    /// Listens on the socket of the command line, for root and this user only.
     pub fn listen(&self) -> Result<UnixListener, HomeError> {
         let path = self.socket();
-        // Nobody else can be listening: the home is locked.
+        // No other process can be listening: the home is locked.
         let _ = std::fs::remove_file(&path);
         let directory = self.path.join("run");
-        let opened = File::open(&directory).map_err(io("open", &directory))?;
-        // Through a descriptor of its directory, because the path itself may be longer than an address can be.
+        let opened = File::open(&directory).map_err(io_error("open", &directory))?;
+        // Through a descriptor of its directory, because the path may be longer than a socket address allows.
         let address = format!("/proc/self/fd/{}/daemon.sock", opened.as_raw_fd());
-        let listener = UnixListener::bind(address).map_err(io("listen on", &path))?;
+        let listener = UnixListener::bind(address).map_err(io_error("listen on", &path))?;
         std::fs::set_permissions(&path, Permissions::from_mode(0o600))
-            .map_err(io("protect", &path))?;
+            .map_err(io_error("protect", &path))?;
         Ok(listener)
     }
 
-    /// The command line's socket.
+    /// Returns the path of the socket of the command line.
     pub fn socket(&self) -> PathBuf {
         self.path.join("run/daemon.sock")
     }
 
-    /// What an earlier daemon's builds left half-made. To be asked before any build begins.
-    pub fn half_made_builds(&self) -> Vec<PathBuf> {
+    /// Returns the unfinished builds of an earlier daemon. Must be called before any build begins.
+    pub fn leftover_builds(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.path.join("build"));
         let entries = entries.into_iter().flatten().flatten();
         entries.map(|entry| entry.path()).collect()
     }
 }
 
-/// Removes half-made builds, once their containers have ended, and before that detaches what is mounted there: it may be a
-/// directory of the host. Blocking. What cannot be removed is told, and the next start tries again.
+/// Removes unfinished builds, after their containers have ended. Detaches what is mounted there first, which may be a
+/// directory of the host. Blocking. Failures are logged, and the next start tries again.
 pub fn sweep_builds(half_made: &[PathBuf]) {
     for half_made in half_made {
         if let Err(error) = mounts::detach_below(half_made) {
-            tracing::error!("cannot sweep {}: {error}", half_made.display());
+            tracing::error!("cannot remove {}: {error}", half_made.display());
             continue;
         }
         match foreign::remove(half_made) {
-            Ok(()) => tracing::info!("swept the half-made build {}", half_made.display()),
-            Err(error) => tracing::error!("cannot sweep {}: {error}", half_made.display()),
+            Ok(()) => tracing::info!("removed the unfinished build {}", half_made.display()),
+            Err(error) => tracing::error!("cannot remove {}: {error}", half_made.display()),
         }
     }
 }
@@ -232,8 +237,8 @@ const DIRECTORIES: [&str; 10] = [
     "lost+found",
 ];
 
-/// Whether a directory is a daemon's alone: it belongs to this user, and nobody has directories of other things in it.
-fn is_ours(path: &Path) -> std::io::Result<bool> {
+/// Returns whether a directory is used by a daemon only: it belongs to this user and contains no other directories.
+fn is_exclusive(path: &Path) -> std::io::Result<bool> {
     let about = std::fs::metadata(path)?;
     let shared = about.mode() & libc::S_ISVTX != 0;
     if shared || about.uid() != nix::unistd::geteuid().as_raw() {
@@ -249,8 +254,8 @@ fn is_ours(path: &Path) -> std::io::Result<bool> {
     Ok(true)
 }
 
-/// Locks a home. A daemon that was killed may have started a process that does not yet run its own program, and holds what the daemon
-/// held: that is waited for.
+/// Locks a home. A daemon that was killed may have forked a process that has not executed its own program yet and still
+/// holds the daemon's lock: waits for that.
 fn lock(home: &Path, pause: &mut dyn FnMut()) -> Result<Flock<File>, HomeError> {
     let mut left = PAUSES;
     loop {
@@ -266,20 +271,21 @@ fn lock(home: &Path, pause: &mut dyn FnMut()) -> Result<Flock<File>, HomeError> 
 
 fn try_lock(home: &Path) -> Result<Flock<File>, HomeError> {
     let path = home.join("lock");
-    let file = private::open(&path).map_err(io("open", &path))?;
+    let file = private::open(&path).map_err(io_error("open", &path))?;
     match Flock::lock(file, FlockArg::LockExclusiveNonblock) {
         Ok(mut locked) => {
-            let holder = Identity::of(std::process::id() as i32).map_err(io("look at", &path))?;
-            locked.set_len(0).map_err(io("write", &path))?;
-            locked.rewind().map_err(io("write", &path))?;
+            let holder = ProcessIdentity::from_pid(std::process::id() as i32)
+                .map_err(io_error("look at", &path))?;
+            locked.set_len(0).map_err(io_error("write", &path))?;
+            locked.rewind().map_err(io_error("write", &path))?;
             let record = serde_json::to_string(&holder).unwrap_or_default();
-            writeln!(locked, "{record}").map_err(io("write", &path))?;
+            writeln!(locked, "{record}").map_err(io_error("write", &path))?;
             Ok(locked)
         }
         Err((mut file, nix::errno::Errno::EWOULDBLOCK)) => {
             let mut record = String::new();
             let _ = file.read_to_string(&mut record);
-            Err(taken(home, &record))
+            Err(taken_error(home, &record))
         }
         Err((_, errno)) => Err(HomeError::Io {
             action: "lock",
@@ -289,15 +295,16 @@ fn try_lock(home: &Path) -> Result<Flock<File>, HomeError> {
     }
 }
 
-/// Who has the home. A process is named only if it is the one that wrote the record, not another that has its number by now.
-fn taken(home: &Path, record: &str) -> HomeError {
-    let holder = serde_json::from_str::<Identity>(record)
+/// Returns the error that names the holder of the home. A process is named only if it is the one that wrote the record,
+/// and not another that has the same pid now.
+fn taken_error(home: &Path, record: &str) -> HomeError {
+    let holder = serde_json::from_str::<ProcessIdentity>(record)
         .ok()
-        .filter(|holder| holder.open().is_ok_and(|held| held.is_some()));
+        .filter(|holder| holder.open_pidfd().is_ok_and(|held| held.is_some()));
     let (pid, way) = match holder {
-        Some(Identity { pid, .. }) => (format!(" (pid {pid})"), format!("kill {pid}")),
+        Some(ProcessIdentity { pid, .. }) => (format!(" (pid {pid})"), format!("kill {pid}")),
         None => {
-            let way = format!("fuser -v {}/lock shows which it is", home.display());
+            let way = format!("fuser -v {}/lock shows its process", home.display());
             (String::new(), way)
         }
     };
@@ -308,7 +315,7 @@ fn taken(home: &Path, record: &str) -> HomeError {
     }
 }
 
-fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> HomeError {
+fn io_error(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> HomeError {
     let path = path.to_owned();
     move |source| HomeError::Io {
         action,
@@ -376,7 +383,7 @@ mod tests {
         let parent = tempfile::tempdir().expect("a directory");
         let first = Home::open(&parent.path().join("home")).expect("free");
         let path = first.path().to_owned();
-        // The lock is another process's that never wrote who it is.
+        // Simulates a lock that another process holds without a record.
         std::fs::write(path.join("lock"), "").expect("written");
         let (mut first, mut pauses) = (Some(first), 0);
         let locked = lock(&path, &mut || {
@@ -397,19 +404,19 @@ mod tests {
 
     #[test]
     fn a_process_that_only_has_the_number_is_not_named() {
-        let own = Identity::of(std::process::id() as i32).expect("this process");
-        let later = Identity {
+        let own = ProcessIdentity::from_pid(std::process::id() as i32).expect("this process");
+        let later = ProcessIdentity {
             start: own.start + 1,
             ..own
         };
-        let before = Identity {
+        let before = ProcessIdentity {
             boot: own.boot ^ 1,
             ..own
         };
         let home = Path::new("/home/of/a/daemon");
-        let text = |holder: &Identity| serde_json::to_string(holder).expect("JSON");
+        let text = |holder: &ProcessIdentity| serde_json::to_string(holder).expect("JSON");
         for record in [text(&later), text(&before), "1\n".to_owned(), String::new()] {
-            let refused = taken(home, &record).to_string();
+            let refused = taken_error(home, &record).to_string();
             assert!(!refused.contains("kill"), "{record}: {refused}");
             assert!(!refused.contains("pid"), "{record}: {refused}");
             assert!(
@@ -417,7 +424,7 @@ mod tests {
                 "{refused}"
             );
         }
-        let known = taken(home, &text(&own)).to_string();
+        let known = taken_error(home, &text(&own)).to_string();
         assert!(known.contains(&format!("kill {}", own.pid)), "{known}");
     }
 
@@ -425,7 +432,7 @@ mod tests {
         path.symlink_metadata().expect("there").permissions().mode() & 0o7777
     }
 
-    /// As an earlier version left it, at work for a servant.
+    /// Creates the files of a home of an earlier version, with a servant at work.
     fn lay_out(home: &Path) {
         let files = [
             "cloudroid.db",
@@ -456,7 +463,7 @@ mod tests {
         }
     }
 
-    /// Everything below, but for what is in directories of these names.
+    /// Visits all files below a path, except inside directories of these names.
     fn walk(path: &Path, inside: &[&str], each: &mut dyn FnMut(&Path)) {
         each(path);
         let skipped = inside.iter().any(|name| path.ends_with(name));
@@ -496,7 +503,7 @@ mod tests {
         std::fs::set_permissions(parent.path(), shared).expect("set");
         let rights = mode(&theirs);
         drop(Home::open(parent.path()).expect("free"));
-        // A second time, too, when the daemon's own things are there.
+        // Opens it a second time, when the daemon's own files exist.
         let home = Home::open(parent.path()).expect("free");
         assert_eq!((mode(parent.path()), mode(&theirs)), (0o755, rights));
         for name in [
@@ -513,7 +520,7 @@ mod tests {
         std::fs::create_dir_all(home.path().join("build/p1/deep")).expect("a build");
         drop(home);
         let home = Home::open(parent.path()).expect("free");
-        sweep_builds(&home.half_made_builds());
+        sweep_builds(&home.leftover_builds());
         assert!(!home.path().join("build/p1").exists());
     }
 

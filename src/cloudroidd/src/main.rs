@@ -1,5 +1,5 @@
-//! `cloudroidd`: one process per machine that turns pushed ROS packages into services, and gives each robot that
-//! connects a servant of its own. Here: config → build → serve → drain.
+//! `cloudroidd`: one process per machine that turns pushed ROS packages into services and gives each connected robot a
+//! servant of its own. This file: config → build → serve → drain.
 //!
 //! ```text
 //!   cloudroidctl push ─▶ portal ─▶ push ─▶ rootfs_builder ─▶ image ─▶ catalogue ─▶ store
@@ -31,7 +31,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::{Parser, Subcommand};
-use portal::Machine;
+use portal::MachineChecks;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tracing_subscriber::EnvFilter;
@@ -39,26 +39,26 @@ use tracing_subscriber::EnvFilter;
 use config::{Config, IsolationMode};
 use home::Home;
 
-/// Robot packages as services, on this machine.
+/// Runs ROS packages as services for robots, on this machine.
 #[derive(Debug, Parser)]
 #[command(name = "cloudroidd", version)]
-struct Arguments {
-    /// State directory; cloudroid below the user's data directory by default.
+struct DaemonArguments {
+    /// State directory (default: cloudroid in the user's data directory).
     #[arg(long, env = "CLOUDROID_HOME", value_name = "DIR")]
     home: Option<PathBuf>,
-    /// Address and port of the portal; 127.0.0.1:9090 by default.
+    /// Address and port of the portal (default: 127.0.0.1:9090).
     #[arg(long, value_name = "ADDR")]
     listen: Option<SocketAddr>,
     /// Configuration file (TOML).
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     #[command(subcommand)]
-    verb: Option<Verb>,
+    verb: Option<DaemonCommand>,
 }
 
 #[derive(Debug, Subcommand)]
-enum Verb {
-    /// Check what this machine needs, without a daemon.
+enum DaemonCommand {
+    /// Check that this machine meets all requirements; needs no running daemon.
     Doctor {
         /// Print JSON.
         #[arg(long)]
@@ -66,17 +66,17 @@ enum Verb {
     },
 }
 
-/// How long blocking work may take to end, once everything else has.
+/// Time that blocking work has to end, after everything else has ended.
 const LAST_WORK: Duration = Duration::from_secs(1);
 
 fn main() -> ExitCode {
-    // A servant's shim forks: it must begin before any thread does.
+    // A servant's shim forks, so it must start before any thread does.
     let mut words = std::env::args_os().skip(1);
     if words.next().is_some_and(|word| word == "shim") {
         let directory = PathBuf::from(words.next().unwrap_or_default());
         return servant::shim::run(&directory, Box::new(shim::MasterResident::default()));
     }
-    let arguments = Arguments::parse();
+    let arguments = DaemonArguments::parse();
     let filter =
         EnvFilter::try_from_env("CLOUDROID_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
     tracing_subscriber::fmt()
@@ -86,12 +86,12 @@ fn main() -> ExitCode {
         .with_target(false)
         .init();
     let outcome = match &arguments.verb {
-        Some(Verb::Doctor { json }) => examine(&arguments, *json),
+        Some(DaemonCommand::Doctor { json }) => examine(&arguments, *json),
         None => prepare(arguments).and_then(|(config, home, machine)| {
-            let (engine, portal) = threads(&config)?;
+            let (engine, portal) = start_threads(&config)?;
             let outcome = portal.block_on(run(config, home, machine));
-            // Threads that still work for a cancelled push are not waited for: what they make is half-made, and the
-            // next daemon sweeps it.
+            // Threads that still work for a cancelled push are not waited for: what they make is unfinished, and the
+            // next daemon removes it.
             portal.shutdown_timeout(LAST_WORK);
             engine.end(LAST_WORK);
             outcome
@@ -106,13 +106,13 @@ fn main() -> ExitCode {
     }
 }
 
-/// The engine's threads, which keep what containers take, and the portal's, which have no rights and on which everything runs
-/// that is not handed over.
-fn threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::runtime::Runtime)> {
+/// Starts the engine's threads, which keep the capabilities that containers need, and the portal's, which have none and
+/// run everything that is not handed to the engine.
+fn start_threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::runtime::Runtime)> {
     let account = config.account()?;
-    privilege::limit()?;
+    privilege::limit_capabilities()?;
     let engine = privilege::Engine::start(account)?;
-    // Tried once where it can be said why it fails.
+    // Confine one thread first, where a failure can still be reported.
     std::thread::scope(|scope| scope.spawn(|| privilege::confine(account)).join())
         .unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
     let portal = tokio::runtime::Builder::new_multi_thread()
@@ -121,7 +121,7 @@ fn threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::runtime
         .on_thread_start(move || {
             if let Err(error) = privilege::confine(account) {
                 tracing::error!(
-                    "{error}; ending, because no thread may answer strangers with rights"
+                    "{error}; stopping, because threads that serve clients must not keep privileges"
                 );
                 std::process::abort();
             }
@@ -130,17 +130,17 @@ fn threads(config: &Config) -> anyhow::Result<(privilege::Engine, tokio::runtime
     Ok((engine, portal))
 }
 
-fn home_of(arguments: &Arguments) -> anyhow::Result<PathBuf> {
+fn home_path(arguments: &DaemonArguments) -> anyhow::Result<PathBuf> {
     match &arguments.home {
         Some(home) => Ok(home.clone()),
         None => Ok(home::default_path(|name| std::env::var_os(name))?),
     }
 }
 
-fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
+fn examine(arguments: &DaemonArguments, json: bool) -> anyhow::Result<()> {
     let config = Config::read(arguments.config.as_deref())?;
-    let doubts = config.doubts(machine::has());
-    let doctor = doctor::examine(&home_of(arguments)?, None, &doubts);
+    let doubts = config.machine_warnings(machine::resources());
+    let doctor = doctor::examine(&home_path(arguments)?, None, &doubts);
     if json {
         println!("{}", serde_json::to_string_pretty(&doctor)?);
         return Ok(());
@@ -156,29 +156,31 @@ fn examine(arguments: &Arguments, json: bool) -> anyhow::Result<()> {
             println!("    {fix}");
         }
     }
-    if doctor.well() {
+    if doctor.is_healthy() {
         Ok(())
     } else {
-        bail!("something that is needed is missing")
+        bail!("requirements are missing")
     }
 }
 
-/// Everything that can be refused without having changed anything but the state directory.
-fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
-    if let Err(error) = machine::raise_descriptors() {
-        tracing::warn!("the number of open files cannot be raised: {error}");
+/// Makes all checks that need no change except to the state directory.
+fn prepare(arguments: DaemonArguments) -> anyhow::Result<(Config, Home, MachineChecks)> {
+    if let Err(error) = machine::raise_descriptor_limit() {
+        tracing::warn!("cannot raise the limit of open files: {error}");
     }
     let mut config = Config::read(arguments.config.as_deref())?;
     config.listen = arguments.listen.unwrap_or(config.listen);
     config.check()?;
-    let path = home_of(&arguments)?;
+    let path = home_path(&arguments)?;
     require_root(nix::unistd::geteuid())?;
     let home = Home::open(&path)?;
-    let (mut machine, missing) = doctor::look(home.path());
-    machine.warnings.extend(config.doubts(machine::has()));
+    let (mut machine, missing) = doctor::check_requirements(home.path());
+    machine
+        .warnings
+        .extend(config.machine_warnings(machine::resources()));
     if !missing.is_empty() {
         bail!(
-            "this machine lacks what servants need:\n{}",
+            "this machine lacks requirements for servants:\n{}",
             doctor::list(&missing)
         );
     }
@@ -195,15 +197,15 @@ fn prepare(arguments: Arguments) -> anyhow::Result<(Config, Home, Machine)> {
 fn require_root(user: nix::unistd::Uid) -> anyhow::Result<()> {
     if !user.is_root() {
         bail!(
-            "servants are made by root, and this is user {user}; run:\n    {}",
-            as_root()
+            "creating servants needs root, but this is user {user}; run:\n    {}",
+            sudo_command()
         );
     }
     Ok(())
 }
 
-/// This very command, by sudo.
-fn as_root() -> String {
+/// Returns this command line with sudo.
+fn sudo_command() -> String {
     let quoted = |word: OsString| {
         let text = word.to_string_lossy().into_owned();
         let plain = !text.is_empty()
@@ -220,34 +222,34 @@ fn as_root() -> String {
     format!("sudo {}", command.join(" "))
 }
 
-async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()> {
+async fn run(config: Config, home: Home, machine: MachineChecks) -> anyhow::Result<()> {
     let socket = home.socket();
-    let asked = supervision::end_asked(move || {
-        let _ = privilege::now(move || std::fs::remove_file(socket));
+    let asked = supervision::termination_token(move || {
+        let _ = privilege::run_sync(move || std::fs::remove_file(socket));
     })?;
     let listener = listen(config.listen).await?;
     let looked_at = certificates::listen_for_challenges(config.tls.acme.as_ref()).await?;
     let socket = home.listen()?;
     let runtime = std::env::var_os("RUNTIME_DIRECTORY").map(PathBuf::from);
-    let admins = admins::Admins::of(&config, runtime)?;
+    let admins = admins::AdminSocket::from_config(&config, runtime)?;
     let admins = admins.map(|admins| admins.listen()).transpose()?;
     let app = wiring::build(&config, &home, machine, listener.local_addr()?)?;
     for warning in &app.machine.warnings {
         tracing::warn!("{warning}");
     }
     app.catalogue
-        .repair()
+        .repair_tags()
         .await
         .context("cannot repair the image store")?;
     app.choreographer
         .keep_rollouts()
-        .context("cannot go on with the rollouts of an earlier daemon")?;
-    let half_made = home.half_made_builds();
-    let choreographer::Inheritance { adopted, removal } = app
+        .context("cannot resume the rollouts of a previous daemon")?;
+    let half_made = home.leftover_builds();
+    let choreographer::AdoptionResult { adopted, removal } = app
         .choreographer
         .adopt()
         .await
-        .context("cannot take over the servants of an earlier daemon")?;
+        .context("cannot adopt the servants of a previous daemon")?;
     let router = portal::router(Arc::clone(&app));
     let tcp = tokio::spawn(portal::serve_tcp(
         Arc::clone(&app),
@@ -263,14 +265,14 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     let history = tokio::spawn(portal::keep_history(Arc::clone(&app)));
     let observers = tokio::spawn(portal::keep_observers(Arc::clone(&app)));
     let members = tokio::spawn(admins::serve(Arc::clone(&app), router, admins));
-    tokio::spawn(freed::give_back());
-    if let Some((certificate, key)) = config.tls.files() {
-        // The key is root's.
-        let keeping = certificates::keep(Arc::clone(&app), certificate, key);
+    tokio::spawn(freed::trim_periodically());
+    if let Some((certificate, key)) = config.tls.certificate_files() {
+        // Only root can read the key.
+        let keeping = certificates::watch_certificate(Arc::clone(&app), certificate, key);
         tokio::spawn(privilege::run(keeping));
     }
     if let Some(lists) = config.tls.client_revocations.clone() {
-        let keeping = certificates::keep_lists(Arc::clone(&app), lists);
+        let keeping = certificates::watch_revocation_lists(Arc::clone(&app), lists);
         tokio::spawn(privilege::run(keeping));
     }
     if let Some(acme) = config.tls.acme.clone() {
@@ -278,7 +280,7 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
             tokio::spawn(portal::serve_challenges(Arc::clone(&app), looked_at));
         }
         let renewal = certificates::Renewal::new(Arc::clone(&app), acme, &home, app.listen);
-        tokio::spawn(renewal.keep());
+        tokio::spawn(renewal.run());
     }
     let (scheme, shown) = match &app.tls {
         Some(tls) => ("https", format!(" (certificate {})", tls.fingerprint())),
@@ -290,14 +292,14 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
         app.listen,
         home.path().display()
     );
-    supervision::ready();
-    tokio::spawn(tidy(Arc::clone(&app), removal, half_made));
-    app.catalogue.complete().await?;
+    supervision::notify_ready();
+    tokio::spawn(remove_leftovers(Arc::clone(&app), removal, half_made));
+    app.catalogue.record_missing_inventories().await?;
     app.choreographer.watch_nodes();
     app.choreographer.keep_warm_pool();
     app.choreographer.keep_watch();
     asked.cancelled().await;
-    supervision::stopping();
+    supervision::notify_stopping();
     wiring::drain(&app, config.keeps_servants()).await;
     app.ending.cancel();
     let _ = tokio::join!(tcp, unix, members, history, observers);
@@ -305,13 +307,13 @@ async fn run(config: Config, home: Home, machine: Machine) -> anyhow::Result<()>
     Ok(())
 }
 
-/// Removes what an earlier daemon left, beside robots that are served already: containers, then the builds that they worked at,
-/// then what of the image store nothing needs. What is interrupted the next start goes on with.
-async fn tidy(app: Arc<portal::App>, removal: JoinHandle<()>, half_made: Vec<PathBuf>) {
+/// Removes what an earlier daemon left, while robots are already served: its containers, then their builds, then unused
+/// content of the image store. If it is interrupted, the next start continues.
+async fn remove_leftovers(app: Arc<portal::App>, removal: JoinHandle<()>, half_made: Vec<PathBuf>) {
     if let Err(panic) = removal.await {
-        tracing::error!("what an earlier daemon left could not be removed: {panic}");
+        tracing::error!("cannot remove leftovers of a previous daemon: {panic}");
     }
-    let _ = privilege::blocking(move || home::sweep_builds(&half_made)).await;
+    let _ = privilege::spawn_blocking(move || home::sweep_builds(&half_made)).await;
     app.pusher.collect_garbage().await;
 }
 
@@ -320,8 +322,8 @@ async fn listen(address: SocketAddr) -> anyhow::Result<TcpListener> {
         .await
         .map_err(|error| match error.kind() {
             std::io::ErrorKind::AddrInUse => anyhow::anyhow!(
-                "{address} is taken by another program (ss -ltnp 'sport = :{}' shows which); \
-             end it, or choose another port with --listen {}:{}",
+                "{address} is used by another program (ss -ltnp 'sport = :{}' shows which); stop it, or choose another \
+                    port with --listen {}:{}",
                 address.port(),
                 address.ip(),
                 address.port().checked_add(1).unwrap_or(9090)
@@ -339,7 +341,7 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         use clap::CommandFactory;
-        Arguments::command().debug_assert();
+        DaemonArguments::command().debug_assert();
     }
 
     #[test]

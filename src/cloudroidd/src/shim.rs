@@ -1,5 +1,5 @@
-//! `cloudroidd shim`: the process that a servant belongs to, composed of the container's shim and, of a servant of ROS 1, its
-//! ROS Master. It outlives the daemon. Runs before any thread or runtime is started, because libcontainer forks.
+//! `cloudroidd shim`: the process of a servant, with the container's shim and, for ROS 1, its ROS Master. It outlives
+//! the daemon. Runs before any thread or runtime is started, because libcontainer forks.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -12,7 +12,7 @@ use serde::Deserialize;
 use servant::shim::{Resident, ResidentContext, ResidentError};
 use tokio::net::TcpListener;
 
-/// The ROS Master in the shim, where there is one.
+/// The ROS Master in the shim, if there is one.
 #[derive(Default)]
 pub struct MasterResident {
     master: Option<Master>,
@@ -47,7 +47,7 @@ impl Resident for MasterResident {
 
     fn process_exited(&mut self, _pid: i32) {
         if let Some(master) = self.master.clone() {
-            tokio::task::spawn_local(async move { master.process_exited().await });
+            tokio::task::spawn_local(async move { master.on_process_exit().await });
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What ties the daemon to its supervisor (systemd, a shell): signals, readiness, the watchdog.
+//! The daemon's interface to its supervisor (systemd, a shell): signals, readiness, the watchdog.
 
 use std::time::Duration;
 
@@ -6,9 +6,12 @@ use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
-/// Hears of signals that ask for the daemon's end: the first cancels what this gives. The second ends the process at
-/// once, whatever it is doing, after `at_once`; servants go on, and the next daemon sweeps what was half-made.
-pub fn end_asked(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<CancellationToken> {
+/// Handles the signals that ask the daemon to end: the first one cancels the returned token. The second one ends the
+/// process at once, whatever it is doing, after `at_once`; servants go on, and the next daemon removes what is
+/// unfinished.
+pub fn termination_token(
+    at_once: impl FnOnce() + Send + 'static,
+) -> std::io::Result<CancellationToken> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let asked = CancellationToken::new();
@@ -23,16 +26,16 @@ pub fn end_asked(at_once: impl FnOnce() + Send + 'static) -> std::io::Result<Can
                 first.cancel();
             }
         }
-        tracing::warn!("asked a second time: ending at once");
+        tracing::warn!("second signal: stopping at once");
         at_once();
         std::process::exit(1);
     });
     Ok(asked)
 }
 
-/// Tells systemd that requests are answered, and keeps its watchdog quiet from now on.
-pub fn ready() {
-    report(&[NotifyState::Ready]);
+/// Tells systemd that the daemon is ready, and serves its watchdog from now on.
+pub fn notify_ready() {
+    notify(&[NotifyState::Ready]);
     let mut microseconds = 0;
     if sd_notify::watchdog_enabled(false, &mut microseconds) {
         let interval = Duration::from_micros(microseconds / 2);
@@ -40,19 +43,19 @@ pub fn ready() {
             let mut ticks = tokio::time::interval(interval);
             loop {
                 ticks.tick().await;
-                report(&[NotifyState::Watchdog]);
+                notify(&[NotifyState::Watchdog]);
             }
         });
     }
 }
 
 /// Tells systemd that the daemon is ending.
-pub fn stopping() {
-    report(&[NotifyState::Stopping]);
+pub fn notify_stopping() {
+    notify(&[NotifyState::Stopping]);
 }
 
-fn report(state: &[NotifyState<'_>]) {
+fn notify(state: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(false, state) {
-        tracing::debug!("systemd was not told: {error}");
+        tracing::debug!("cannot notify systemd: {error}");
     }
 }

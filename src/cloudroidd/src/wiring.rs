@@ -1,4 +1,4 @@
-//! Makes the daemon's parts and gives each what it needs of the others; ends them in the opposite order.
+//! Creates the daemon's components and connects them; shuts them down in reverse order.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
@@ -8,7 +8,7 @@ use anyhow::Context;
 use async_trait::async_trait;
 use catalogue::Catalogue;
 use choreographer::{Admission, Amount, Choreographer};
-use portal::{App, Audit, Machine, Passwords, Principals, Tokens};
+use portal::{App, Audit, MachineChecks, Passwords, Principals, Tokens};
 use push::Pusher;
 use reach::{LocalOpener, Opener};
 use rootfs_builder::Builder;
@@ -23,56 +23,56 @@ use crate::config::{Config, IsolationMode};
 use crate::home::Home;
 use crate::{bases, certificates, doctor, machine};
 
-/// Why something is not to be had.
+/// Error of another crate.
 type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
-/// The daemon with all its parts; nothing runs yet but the watch over the database.
+/// Builds the daemon with all its components; only the watch over the database runs yet.
 pub fn build(
     config: &Config,
     home: &Home,
-    machine: Machine,
+    machine: MachineChecks,
     listen: SocketAddr,
 ) -> anyhow::Result<Arc<App>> {
     let state = Arc::new(State::open(&home.database())?);
-    tokio::spawn(store::watch(Arc::clone(&state)));
+    tokio::spawn(store::flush_pending_writes(Arc::clone(&state)));
     let principals = Principals::new(Tokens::new(&config.tokens)?, Arc::clone(&state))?
-        .lasting(config.people.lasting());
-    let provider = config.oidc.as_ref().map(|oidc| oidc.provider());
+        .with_session_lifetimes(config.people.session_lifetimes());
+    let provider = config.oidc.as_ref().map(|oidc| oidc.identity_provider());
     let provider = provider.transpose()?;
     let known = provider.as_ref();
     let known = known.map(|known| (known.provider.issuer(), &known.roles));
-    let principals = principals.provided(known)?;
+    let principals = principals.with_provider(known)?;
     let images = Arc::new(image::Store::open(&home.images(), &home.layers())?);
     let catalogue = Arc::new(Catalogue::new(Arc::clone(&state), images));
-    let resources = Resources {
+    let resources = EngineResources {
         catalogue: Arc::clone(&catalogue),
         egress: config.allow.egress.clone(),
     };
-    let local = LocalEngine::new(engine_config(config, home)?)?.with(Arc::new(resources));
+    let local = LocalEngine::new(engine_config(config, home)?)?.with_resources(Arc::new(resources));
     let engine: Arc<dyn Engine> = Arc::new(local.clone());
     let opener = Arc::new(LocalOpener::new(local.clone(), config.allow.egress.clone()));
     let promised = &config.capacity;
     let memory = promised
         .memory
-        .map_or_else(machine::most_memory, |size| size.0);
+        .map_or_else(machine::usable_memory, |size| size.0);
     let capacity = Amount::new(promised.cores() * promised.overcommit, memory);
     let choreographer = Choreographer::new(
-        config.choreographer(),
+        config.choreographer_options(),
         Arc::clone(&state),
         Arc::clone(&catalogue),
         Arc::clone(&engine),
         Arc::clone(&opener) as Arc<dyn Opener>,
         Admission::new(capacity, promised.queue),
     );
-    let definitions = bases::directory(config, home)?;
-    let builder = builder(
+    let definitions = bases::write_definitions(config, home)?;
+    let builder = image_builder(
         config,
         home,
         definitions,
         catalogue.images(),
         Arc::new(local),
     )?;
-    let parts = push::Parts {
+    let parts = push::PusherParts {
         builder: Arc::new(builder),
         catalogue: Arc::clone(&catalogue),
         engine,
@@ -80,46 +80,46 @@ pub fn build(
         choreographer: choreographer.clone(),
         journal: Journal::new(Arc::clone(&state)),
     };
-    let pusher = Pusher::new(config.push(), home.path().to_owned(), parts);
+    let pusher = Pusher::new(config.push_options(), home.path().to_owned(), parts);
     let examined = home.path().to_owned();
-    let doubts = config.doubts(machine::has());
-    let robots = certificates::robots(&config.tls, home, listen)?;
+    let doubts = config.machine_warnings(machine::resources());
+    let robots = certificates::open_robot_authority(&config.tls, home, listen)?;
     Ok(Arc::new(App {
         principals,
         passwords: Passwords::default(),
         provider,
         audit: Audit::new(Arc::clone(&state)),
-        strangers: Arc::new(portal::Strangers::new(machine::descriptors())),
+        strangers: Arc::new(portal::Strangers::new(machine::descriptor_limit())),
         listen,
-        tls: certificates::tls(&config.tls, home, listen, robots.as_ref())?,
+        tls: certificates::build_tls(&config.tls, home, listen, robots.as_ref())?,
         robots,
-        signing: Arc::new(sign::SigningKey::of_file(&home.signing_key())?),
+        signing: Arc::new(sign::SigningKey::load_or_create(&home.signing_key())?),
         home: home.path().to_owned(),
         state,
         catalogue,
         choreographer,
         pusher: Arc::new(pusher),
         machine,
-        live: portal::Live::default(),
-        inside: portal::Lookers::default(),
+        live: portal::LiveSamples::default(),
+        inside: portal::InsideConnections::default(),
         observers: portal::Observers::default(),
         started: store::now(),
         sessions: TaskTracker::new(),
         ending: CancellationToken::new(),
-        options: config.portal(),
+        options: config.portal_options(),
         examine: Box::new(move || doctor::examine(&examined, Some(listen), &doubts)),
     }))
 }
 
-/// What the engine of this host asks the rest of the daemon.
-struct Resources {
+/// Resources that the engine of this host requests from the rest of the daemon.
+struct EngineResources {
     catalogue: Arc<Catalogue>,
-    /// `egress` of what the operator allows.
+    /// Destinations that the operator allows (`egress` of `[allow]`).
     egress: Vec<String>,
 }
 
 #[async_trait]
-impl servant::local::Resources for Resources {
+impl servant::local::Resources for EngineResources {
     async fn layers(&self, image: &str) -> Result<Vec<PathBuf>, BoxError> {
         Ok(self.catalogue.layers(image).await?)
     }
@@ -129,8 +129,8 @@ impl servant::local::Resources for Resources {
     }
 }
 
-/// What makes images of pushes.
-fn builder(
+/// Creates the builder of images for pushes.
+fn image_builder(
     config: &Config,
     home: &Home,
     bases_dir: PathBuf,
@@ -138,9 +138,9 @@ fn builder(
     sandbox: Arc<dyn Sandbox>,
 ) -> anyhow::Result<Builder> {
     let cache = home.cache();
-    // What was compiled lies there, too.
+    // The cache contains compiled code, too: nobody else may change it.
     store::private::make_directory(&cache)
-        .and_then(|()| store::private::close(&cache))
+        .and_then(|()| store::private::restrict_to_owner(&cache))
         .with_context(|| format!("cannot prepare the cache {}", cache.display()))?;
     Builder::new(rootfs_builder::Config {
         cache_dir: cache,
@@ -157,15 +157,15 @@ fn builder(
 }
 
 fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConfig> {
-    let program = std::env::current_exe().context("cannot find this very program")?;
+    let program = std::env::current_exe().context("cannot find the path of this program")?;
     let init = doctor::find_init().context("cloudroid-init is not beside cloudroidd")?;
     let servants = home.path().join("servants");
     let mut engine = LocalEngineConfig::new(servants, vec![program.into(), "shim".into()], init);
     engine.default_limits = choreographer::engine_limits(&config.limits);
-    engine.shim_limits = servant::spec::Limits {
+    engine.shim_limits = servant::spec::ResourceLimits {
         cpus: Some(config.memory.shim_cpus),
         memory: Some(config.memory.shim.0),
-        ..servant::spec::Limits::default()
+        ..servant::spec::ResourceLimits::default()
     };
     engine.quotas = servant::quotas::Quotas {
         scratch: config.servant.scratch.map(|size| size.0),
@@ -180,14 +180,14 @@ fn engine_config(config: &Config, home: &Home) -> anyhow::Result<LocalEngineConf
     Ok(engine)
 }
 
-/// Lets pushes, sessions and, unless they are to be kept, servants end.
+/// Ends pushes, sessions and, unless they are to be kept, servants.
 pub async fn drain(app: &App, keep_servants: bool) {
     app.choreographer.close();
     app.pusher.cancel_all(app.options.drain).await;
     app.choreographer.end_warm_pool().await;
     if keep_servants {
         tracing::info!(
-            "ending; {} servants go on",
+            "stopping; {} servants keep running",
             app.choreographer.servants().len()
         );
         for handle in app.choreographer.servants() {
@@ -198,9 +198,9 @@ pub async fn drain(app: &App, keep_servants: bool) {
     } else {
         let ended = app
             .choreographer
-            .stop("the daemon is ending", |_| true)
+            .stop("the daemon is shutting down", |_| true)
             .await;
-        tracing::info!("ending; {} servants ended", ended.len());
+        tracing::info!("stopping; {} servants ended", ended.len());
     }
     app.sessions.close();
     let _ = tokio::time::timeout(app.options.drain, app.sessions.wait()).await;

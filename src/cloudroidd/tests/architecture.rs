@@ -1,5 +1,5 @@
-//! What is written down of the repository is compared with the repository: in ARCHITECTURE.md which crate uses which, in
-//! docs/security.md which stories security rests on, in tests/subjects.rs which crates stories are about.
+//! Compares the documentation with the repository: ARCHITECTURE.md (dependencies between crates), docs/security.md
+//! (stories that security rests on) and tests/subjects.rs (crates that stories are about).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[path = "../../../tests/subjects.rs"]
 mod subjects;
 
-/// The repository.
+/// Returns the root of the repository.
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../..")
@@ -20,7 +20,7 @@ fn read(path: &Path) -> toml::Table {
     toml::from_str(&text).expect("TOML")
 }
 
-/// Directories of all crates, as the workspace lists them, with the name of each.
+/// Returns the names of all crates of the workspace by their directories.
 fn members() -> BTreeMap<String, String> {
     let workspace = read(&root().join("Cargo.toml"));
     let members = workspace["workspace"]["members"]
@@ -36,7 +36,7 @@ fn members() -> BTreeMap<String, String> {
         .collect()
 }
 
-/// Crates of `known` that the crate in `directory` depends on, tests aside.
+/// Returns the crates of `known` that the crate in `directory` depends on, without dev-dependencies.
 fn dependencies(directory: &str, known: &BTreeSet<&str>) -> BTreeSet<String> {
     let manifest = read(&root().join(directory).join("Cargo.toml"));
     let Some(dependencies) = manifest.get("dependencies").and_then(|all| all.as_table()) else {
@@ -48,7 +48,7 @@ fn dependencies(directory: &str, known: &BTreeSet<&str>) -> BTreeSet<String> {
     ours.cloned().collect()
 }
 
-/// Rows of the map: what stands at the left, and what it uses.
+/// Returns the rows of the map: the path in the first column and the crates that it uses.
 fn rows() -> Vec<(String, BTreeSet<String>)> {
     let text = std::fs::read_to_string(root().join("ARCHITECTURE.md")).expect("it is there");
     let (_, map) = text
@@ -70,7 +70,7 @@ fn rows() -> Vec<(String, BTreeSet<String>)> {
 #[test]
 fn the_map_says_what_the_manifests_say() {
     let members = members();
-    // Measurements and stories are told with one another's help; that is no part of the system.
+    // Benchmarks and stories use one another; they do not belong to the system.
     let part = |name: &&str| *name != "stories" && !name.starts_with("bench-");
     let known: BTreeSet<&str> = members.values().map(String::as_str).filter(part).collect();
     let rows = rows();
@@ -103,7 +103,8 @@ fn the_map_says_what_the_manifests_say() {
     assert!(untold.is_empty(), "the map has no row for {untold:?}");
 }
 
-/// Whether a cell names unit tests, "`one`, `two` (crate `of_these`)", all of which there are.
+/// Returns whether a cell names unit tests, such as "`one`, `two` (crate `of_these`)", and checks that all of them
+/// exist.
 fn is_tested(cell: &str) -> bool {
     let crates = members();
     let mut parts = cell.split("(crate `");
@@ -143,7 +144,7 @@ fn the_stories_that_security_rests_on_exist() {
             .split('`')
             .filter(|text| text.contains("::"))
             .collect();
-        // A bound that one crate keeps is shown by a test of that crate.
+        // A limit that one crate enforces is covered by a test of that crate.
         let tested = is_tested(cells[3]);
         assert!(!stories.is_empty() || tested, "nothing shows: {row}");
         for story in stories {
@@ -160,7 +161,7 @@ fn the_stories_that_security_rests_on_exist() {
         }
     }
     assert!(named > 15, "{named} were found");
-    // Each story holds itself to what the document says that it tries.
+    // Each story asserts the number of attempts that the document states.
     let directory = root().join("tests/stories/breakin");
     let stories: Vec<String> = std::fs::read_dir(directory)
         .expect("it is there")
@@ -226,16 +227,16 @@ fn every_module_of_stories_and_every_crate_has_a_subject() {
     }
 }
 
-/// A struct or enum as it stands in a file.
-struct Type {
+/// A struct or enum declaration in a file.
+struct TypeDefinition {
     file: PathBuf,
     name: String,
     attributes: String,
-    /// Words of its body, comments aside.
+    /// Identifiers in its body, without comments.
     words: BTreeSet<String>,
 }
 
-/// Names in a line; of paths the last one, and none of another crate's.
+/// Returns the identifiers in a line: the last segment of each path, unless the path is of another crate.
 fn words(line: &str) -> Vec<String> {
     let is_of_path = |character: char| character.is_alphanumeric() || "_:".contains(character);
     let paths = line.split(|character| !is_of_path(character));
@@ -249,8 +250,8 @@ fn words(line: &str) -> Vec<String> {
         .collect()
 }
 
-/// The types of a file, found by how rustfmt lays them out.
-fn types(file: &Path) -> Vec<Type> {
+/// Returns the types declared in a file, found by the layout of rustfmt.
+fn types(file: &Path) -> Vec<TypeDefinition> {
     let text = std::fs::read_to_string(file).expect("text");
     let lines: Vec<&str> = text.lines().collect();
     let mut types = Vec::new();
@@ -273,9 +274,9 @@ fn types(file: &Path) -> Vec<Type> {
         let ends =
             |line: &&str| line.len() - line.trim_start().len() == indent && line.trim() == "}";
         let body = lines[at + 1..].iter().take_while(|line| !ends(line));
-        // A type of one line ends in it.
+        // A type on one line has no body.
         let body = body.take(if line.ends_with('{') { usize::MAX } else { 0 });
-        types.push(Type {
+        types.push(TypeDefinition {
             file: file.to_owned(),
             name,
             attributes: above.filter(is_code).copied().collect(),
@@ -287,7 +288,7 @@ fn types(file: &Path) -> Vec<Type> {
     types
 }
 
-/// Rust files below a directory.
+/// Collects the Rust files below a directory.
 fn sources(directory: &Path, into: &mut Vec<PathBuf>) {
     let Ok(entries) = std::fs::read_dir(directory) else {
         return;
@@ -302,8 +303,9 @@ fn sources(directory: &Path, into: &mut Vec<PathBuf>) {
     }
 }
 
-/// What serde derives for an untagged enum keeps a copy of what it reads: one that holds itself keeps one for each level, so that a short
-/// text that is nested takes all memory. Who needs such a type reads it by a visitor, as `ros::bus::ParamValue` is read.
+/// The code that serde derives for an untagged enum keeps a copy of its input: a recursive one keeps a copy for each
+/// level, so that a short nested text takes all memory. Such a type must be read by a visitor, as
+/// `ros::bus::ParamValue` is.
 #[test]
 fn no_untagged_enum_is_read_that_holds_itself() {
     let mut untagged = 0;
@@ -312,13 +314,13 @@ fn no_untagged_enum_is_read_that_holds_itself() {
         for part in ["src", "tests", "fuzz_targets", "examples"] {
             sources(&root().join(directory).join(part), &mut files);
         }
-        let types: Vec<Type> = files.iter().flat_map(|file| types(file)).collect();
+        let types: Vec<TypeDefinition> = files.iter().flat_map(|file| types(file)).collect();
         let mut holds: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
         for one in &types {
             let words = one.words.iter().map(String::as_str);
             holds.entry(&one.name).or_default().extend(words);
         }
-        let is_read_untagged = |one: &&Type| {
+        let is_read_untagged = |one: &&TypeDefinition| {
             one.attributes.contains("untagged") && one.attributes.contains("Deserialize")
         };
         for one in types.iter().filter(is_read_untagged) {

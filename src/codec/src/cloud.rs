@@ -1,7 +1,7 @@
-//! `sensor_msgs/PointCloud2` by field layout: every field is a column of its own.
+//! Codec for `sensor_msgs/PointCloud2` by field layout: every field is a column of its own.
 //!
-//! Coordinates are more than columns: a camera's x and y follow from z and the pixel's direction, and what a
-//! spinning laser measures lies on cones. So a coordinate may be guessed from others (see [`ratio`]), and only what the
+//! Coordinates are more than columns: a camera's x and y follow from z and the pixel's direction, and the points of a
+//! spinning laser lie on cones. So a coordinate may be predicted from others (see [`ratio`]), and only what the
 //! drivers' arithmetic leaves is coded.
 //!
 //! Body: `head · is_dense · row padding · gaps · columns`.
@@ -10,23 +10,23 @@ mod ratio;
 
 use crate::Error;
 use crate::column::{self, Shape, put_packed, take_packed};
-use crate::layout::{Cloud, Field, Meaning, Number};
+use crate::layout::{CloudLayout, FieldMeaning, NumberType, PointField};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::rows::{put_padding, take_padding};
-use crate::wire::{Cursor, Ends};
-use ratio::Guess;
+use crate::wire::{FrameCursor, MessageEnds};
+use ratio::CoordinatePredictor;
 
-/// How a column is told.
+/// Encodings of a column.
 const NUMBERS: u8 = 0;
 const SUCCESSORS: u8 = 1;
 const GUESSED: u8 = 2;
 
 /// Appends the body of `message`, which has `layout`.
-pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
+pub(crate) fn encode(message: &[u8], layout: &CloudLayout, out: &mut Vec<u8>) {
     let dense = message.len() - layout.tail - 1;
     let data = &message[layout.head..dense];
-    Ends::around(message, layout.head, layout.tail).put(out);
+    MessageEnds::from_message(message, layout.head, layout.tail).put(out);
     out.push(message[dense]);
     let row = layout.width * layout.point_step;
     put_padding(data, row, layout.row_step, out);
@@ -38,24 +38,24 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
             .for_each(|line| packed.extend_from_slice(&line[..row]));
         &packed
     };
-    for offset in gaps(layout) {
+    for offset in gap_offsets(layout) {
         put_gap(points, layout, offset, out);
     }
-    let shape = shape(layout);
-    let mut known = Known::default();
-    for field in order(layout) {
+    let shape = column_shape(layout);
+    let mut known = ReferenceColumns::default();
+    for field in column_order(layout) {
         match (field.meaning, field.number) {
-            (Meaning::Colour, _) => put_colours(points, layout, field.offset, out),
-            (_, Number::Float) => {
-                let bits = words(points, layout, field.offset);
+            (FieldMeaning::Colour, _) => put_colours(points, layout, field.offset, out),
+            (_, NumberType::Float) => {
+                let bits = read_words(points, layout, field.offset);
                 put_floats(&bits, &known, shape, out);
                 known.add(field, bits);
             }
-            (_, Number::Word) => {
+            (_, NumberType::Word) => {
                 out.push(NUMBERS);
-                column::encode_words(&words(points, layout, field.offset), shape, out);
+                column::encode_words(&read_words(points, layout, field.offset), shape, out);
             }
-            (_, Number::Short) => {
+            (_, NumberType::Short) => {
                 let at = |point: &[u8]| {
                     u16::from_le_bytes([point[field.offset], point[field.offset + 1]])
                 };
@@ -63,7 +63,7 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
-            (_, Number::Byte) => {
+            (_, NumberType::Byte) => {
                 let samples: Vec<u16> = points
                     .chunks_exact(layout.point_step)
                     .map(|point| point[field.offset].into())
@@ -71,10 +71,14 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
                 put_shorts(&samples, shape, out);
                 known.add_ring(field, samples);
             }
-            (_, Number::Double) => {
+            (_, NumberType::Double) => {
                 for offset in [0, 4] {
                     out.push(NUMBERS);
-                    column::encode_words(&words(points, layout, field.offset + offset), shape, out);
+                    column::encode_words(
+                        &read_words(points, layout, field.offset + offset),
+                        shape,
+                        out,
+                    );
                 }
             }
         }
@@ -82,40 +86,44 @@ pub(crate) fn encode(message: &[u8], layout: &Cloud, out: &mut Vec<u8>) {
 }
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
-pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
+pub(crate) fn decode(
+    input: &mut FrameCursor<'_>,
+    total: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), Error> {
     let ends = input.block()?;
-    let layout = Cloud::read(ends, total)
+    let layout = CloudLayout::read(ends, total)
         .filter(|layout| layout.head + layout.tail == ends.len())
         .ok_or(Error::Corrupt("a head that is not a cloud's"))?;
     let length = layout.row_step * layout.height;
-    let data = Ends::of(ends, layout.head).restore(length + 1, out);
+    let data = MessageEnds::from_joined(ends, layout.head).restore(length + 1, out);
     let (data, dense) = data.split_at_mut(length);
     dense.copy_from_slice(&[input.byte()?]);
     let row = layout.width * layout.point_step;
     take_padding(input, data, row, layout.row_step)?;
-    let mut points = Points {
+    let mut points = PointWriter {
         data,
         layout: &layout,
     };
-    for offset in gaps(&layout) {
+    for offset in gap_offsets(&layout) {
         take_gap(input, &mut points, offset)?;
     }
-    let shape = shape(&layout);
-    let mut known = Known::default();
-    for field in order(&layout) {
+    let shape = column_shape(&layout);
+    let mut known = ReferenceColumns::default();
+    for field in column_order(&layout) {
         match (field.meaning, field.number) {
-            (Meaning::Colour, _) => take_colours(input, &mut points, field.offset)?,
-            (_, Number::Float) => {
+            (FieldMeaning::Colour, _) => take_colours(input, &mut points, field.offset)?,
+            (_, NumberType::Float) => {
                 let bits = take_floats(input, &known, shape)?;
                 points.put(field.offset, bits.iter().map(|bits| bits.to_le_bytes()));
                 known.add(field, bits);
             }
-            (_, Number::Word) => {
-                numbers(input)?;
+            (_, NumberType::Word) => {
+                expect_numbers(input)?;
                 let samples = column::decode_words(input, shape)?;
                 points.put(field.offset, samples.into_iter().map(u32::to_le_bytes));
             }
-            (_, Number::Short) => {
+            (_, NumberType::Short) => {
                 let samples = take_shorts(input, shape)?;
                 points.put(
                     field.offset,
@@ -123,14 +131,14 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
                 );
                 known.add_ring(field, samples);
             }
-            (_, Number::Byte) => {
+            (_, NumberType::Byte) => {
                 let samples = take_shorts(input, shape)?;
                 points.put(field.offset, samples.iter().map(|&sample| [sample as u8]));
                 known.add_ring(field, samples);
             }
-            (_, Number::Double) => {
+            (_, NumberType::Double) => {
                 for offset in [0, 4] {
-                    numbers(input)?;
+                    expect_numbers(input)?;
                     let samples = column::decode_words(input, shape)?;
                     points.put(
                         field.offset + offset,
@@ -143,7 +151,7 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
     Ok(())
 }
 
-fn numbers(input: &mut Cursor<'_>) -> Result<(), Error> {
+fn expect_numbers(input: &mut FrameCursor<'_>) -> Result<(), Error> {
     if input.byte()? == NUMBERS {
         Ok(())
     } else {
@@ -151,7 +159,7 @@ fn numbers(input: &mut Cursor<'_>) -> Result<(), Error> {
     }
 }
 
-fn shape(layout: &Cloud) -> Shape {
+fn column_shape(layout: &CloudLayout) -> Shape {
     if layout.height > 1 {
         Shape::Picture {
             width: layout.width,
@@ -162,24 +170,24 @@ fn shape(layout: &Cloud) -> Shape {
     }
 }
 
-/// In which order columns are told: rings first, for coordinates may depend on them; then z, x, y of a picture (z is
-/// what a camera measures) or x, y, z of a sequence; then the rest.
-fn order(layout: &Cloud) -> Vec<Field> {
+/// Returns the fields in coding order: rings first, because coordinates may depend on them; then z, x, y of a picture
+/// (z is what a camera measures) or x, y, z of a sequence; then the rest.
+fn column_order(layout: &CloudLayout) -> Vec<PointField> {
     let mut fields = layout.fields.clone();
     let camera = layout.height > 1;
     fields.sort_by_key(|field| match field.meaning {
-        Meaning::Ring => 0,
-        Meaning::Z if camera => 1,
-        Meaning::X => 2,
-        Meaning::Y => 3,
-        Meaning::Z => 4,
-        Meaning::Plain | Meaning::Colour => 5,
+        FieldMeaning::Ring => 0,
+        FieldMeaning::Z if camera => 1,
+        FieldMeaning::X => 2,
+        FieldMeaning::Y => 3,
+        FieldMeaning::Z => 4,
+        FieldMeaning::Plain | FieldMeaning::Colour => 5,
     });
     fields
 }
 
-/// Bytes of a point that belong to no field.
-fn gaps(layout: &Cloud) -> Vec<usize> {
+/// Returns the offsets of a point's bytes that belong to no field.
+fn gap_offsets(layout: &CloudLayout) -> Vec<usize> {
     let mut free = vec![true; layout.point_step];
     for field in &layout.fields {
         free[field.offset..field.offset + field.number.bytes()].fill(false);
@@ -189,7 +197,7 @@ fn gaps(layout: &Cloud) -> Vec<usize> {
         .collect()
 }
 
-fn words(points: &[u8], layout: &Cloud, offset: usize) -> Vec<u32> {
+fn read_words(points: &[u8], layout: &CloudLayout, offset: usize) -> Vec<u32> {
     points
         .chunks_exact(layout.point_step)
         .map(|point| {
@@ -199,13 +207,13 @@ fn words(points: &[u8], layout: &Cloud, offset: usize) -> Vec<u32> {
         .collect()
 }
 
-/// The data being restored.
-struct Points<'a> {
+/// Writes columns into the data being restored.
+struct PointWriter<'a> {
     data: &'a mut [u8],
-    layout: &'a Cloud,
+    layout: &'a CloudLayout,
 }
 
-impl Points<'_> {
+impl PointWriter<'_> {
     fn put<const N: usize>(&mut self, offset: usize, mut samples: impl Iterator<Item = [u8; N]>) {
         let row = self.layout.width * self.layout.point_step;
         for line in self.data.chunks_exact_mut(self.layout.row_step) {
@@ -219,8 +227,8 @@ impl Points<'_> {
     }
 }
 
-/// One byte of every point that no field describes: mostly the same.
-fn put_gap(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) {
+/// Appends one byte of every point that no field describes; mostly constant.
+fn put_gap(points: &[u8], layout: &CloudLayout, offset: usize, out: &mut Vec<u8>) {
     let mut bytes = points
         .iter()
         .skip(offset)
@@ -241,7 +249,11 @@ fn put_gap(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) {
     }
 }
 
-fn take_gap(input: &mut Cursor<'_>, points: &mut Points<'_>, offset: usize) -> Result<(), Error> {
+fn take_gap(
+    input: &mut FrameCursor<'_>,
+    points: &mut PointWriter<'_>,
+    offset: usize,
+) -> Result<(), Error> {
     match input.byte()? {
         0 => {
             let byte = input.byte()?;
@@ -259,8 +271,8 @@ fn take_gap(input: &mut Cursor<'_>, points: &mut Points<'_>, offset: usize) -> R
     Ok(())
 }
 
-/// Colours are a picture of four channels, alpha mostly constant.
-fn put_colours(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) {
+/// Appends colours as a picture of four channels, alpha mostly constant.
+fn put_colours(points: &[u8], layout: &CloudLayout, offset: usize, out: &mut Vec<u8>) {
     let mut lanes = colour_lanes(layout);
     for (index, point) in points.chunks_exact(layout.point_step).enumerate() {
         let (x, y) = (index % layout.width, index / layout.width);
@@ -279,7 +291,7 @@ fn put_colours(points: &[u8], layout: &Cloud, offset: usize, out: &mut Vec<u8>) 
     plane8::encode(&mut lanes, 4, out);
 }
 
-fn colour_lanes(layout: &Cloud) -> Lanes<u8> {
+fn colour_lanes(layout: &CloudLayout) -> Lanes<u8> {
     if layout.height > 1 {
         Lanes::pictures(4, layout.width, layout.height)
     } else {
@@ -288,8 +300,8 @@ fn colour_lanes(layout: &Cloud) -> Lanes<u8> {
 }
 
 fn take_colours(
-    input: &mut Cursor<'_>,
-    points: &mut Points<'_>,
+    input: &mut FrameCursor<'_>,
+    points: &mut PointWriter<'_>,
     offset: usize,
 ) -> Result<(), Error> {
     let mut lanes = colour_lanes(points.layout);
@@ -314,8 +326,8 @@ fn take_colours(
     Ok(())
 }
 
-/// Small numbers, mostly a fixed sequence (rings): zero where a number follows the same one as last time.
-fn successors(samples: &[u16]) -> Option<Vec<u32>> {
+/// Codes small numbers that are mostly a fixed sequence (rings): zero if a number follows the same one as last time.
+fn successor_codes(samples: &[u16]) -> Option<Vec<u32>> {
     let mut next = vec![0u16; 1 << 16];
     let (mut last, mut hits) = (0u16, 0usize);
     let differences: Vec<u32> = samples
@@ -335,7 +347,7 @@ fn successors(samples: &[u16]) -> Option<Vec<u32>> {
 }
 
 fn put_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
-    match successors(samples) {
+    match successor_codes(samples) {
         Some(differences) => {
             out.push(SUCCESSORS);
             column::encode_differences(&differences, shape, out);
@@ -347,7 +359,7 @@ fn put_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     }
 }
 
-fn take_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
+fn take_shorts(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
     match input.byte()? {
         NUMBERS => column::decode_shorts(input, shape),
         SUCCESSORS => {
@@ -371,28 +383,31 @@ fn take_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> 
     }
 }
 
-/// The columns a later one can be guessed from.
+/// Columns from which later ones can be predicted.
 #[derive(Default)]
-struct Known {
+struct ReferenceColumns {
     coordinates: Vec<Vec<u32>>,
     ring: Option<Vec<u16>>,
 }
 
-impl Known {
-    fn add(&mut self, field: Field, bits: Vec<u32>) {
-        if matches!(field.meaning, Meaning::X | Meaning::Y | Meaning::Z) {
+impl ReferenceColumns {
+    fn add(&mut self, field: PointField, bits: Vec<u32>) {
+        if matches!(
+            field.meaning,
+            FieldMeaning::X | FieldMeaning::Y | FieldMeaning::Z
+        ) {
             self.coordinates.push(bits);
         }
     }
 
-    fn add_ring(&mut self, field: Field, samples: Vec<u16>) {
-        if field.meaning == Meaning::Ring && self.ring.is_none() {
+    fn add_ring(&mut self, field: PointField, samples: Vec<u16>) {
+        if field.meaning == FieldMeaning::Ring && self.ring.is_none() {
             self.ring = Some(samples);
         }
     }
 }
 
-fn put_floats(bits: &[u32], known: &Known, shape: Shape, out: &mut Vec<u8>) {
+fn put_floats(bits: &[u32], known: &ReferenceColumns, shape: Shape, out: &mut Vec<u8>) {
     match ratio::choose(bits, known, shape) {
         Some(guess) => {
             out.push(GUESSED);
@@ -407,11 +422,15 @@ fn put_floats(bits: &[u32], known: &Known, shape: Shape, out: &mut Vec<u8>) {
     }
 }
 
-fn take_floats(input: &mut Cursor<'_>, known: &Known, shape: Shape) -> Result<Vec<u32>, Error> {
+fn take_floats(
+    input: &mut FrameCursor<'_>,
+    known: &ReferenceColumns,
+    shape: Shape,
+) -> Result<Vec<u32>, Error> {
     match input.byte()? {
         NUMBERS => column::decode_floats(input, shape),
         GUESSED => {
-            let guess = Guess::named(input.byte()?, known)?;
+            let guess = CoordinatePredictor::from_name(input.byte()?, known)?;
             let differences = column::decode_differences(input, shape)?;
             Ok(ratio::restore(&differences, guess, known, shape))
         }

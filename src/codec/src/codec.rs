@@ -1,22 +1,21 @@
-//! Which codecs there are, and how they are named on the wire and in configuration.
+//! The codecs, and their names on the wire and in configuration.
 
 use crate::layout::Schema;
 use std::fmt;
 use std::str::FromStr;
 
-/// A way to encode a message.
+/// A codec for messages.
 ///
-/// Written as `raw`, `zlib`, `zlib:9`, `deflate:1`, `zstd:3`, `image`, `grid`, `scan`, `cloud`, `video`,
-/// `jpeg`.
+/// Text forms: `raw`, `zlib`, `zlib:9`, `deflate:1`, `zstd:3`, `image`, `grid`, `scan`, `cloud`, `video`, `jpeg`.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Codec {
     /// The serialized message, unchanged.
     Raw,
-    /// RFC 1950 at a level of 0 to 9.
+    /// zlib (RFC 1950) at level 0 to 9.
     Zlib(u8),
-    /// RFC 1951 at a level of 0 to 9.
+    /// deflate (RFC 1951) at level 0 to 9.
     Deflate(u8),
-    /// RFC 8878 at a level of -7 to 22.
+    /// zstd (RFC 8878) at level -7 to 22.
     Zstd(i8),
     /// `sensor_msgs/Image`, lossless: 8-bit colour, grey and Bayer, 16-bit and float depth.
     Image,
@@ -26,13 +25,13 @@ pub enum Codec {
     Scan,
     /// `sensor_msgs/PointCloud2`, lossless, by field layout.
     Cloud,
-    /// `sensor_msgs/Image` in colour as H.264: the pixels are lossy, all else is exact.
+    /// `sensor_msgs/Image` in colour as H.264: the pixels are lossy, everything else is exact.
     Video,
-    /// `sensor_msgs/Image`, grey or colour, as JPEG: the pixels are lossy, all else is exact.
+    /// `sensor_msgs/Image`, grey or colour, as JPEG: the pixels are lossy, everything else is exact.
     Jpeg,
 }
 
-/// Tag, name, and the codec with its usual level.
+/// Tag, name, and codec with its default level.
 const CODECS: [(u8, &str, Codec); 10] = [
     (0x00, "raw", Codec::Raw),
     (0x01, "zlib", Codec::Zlib(6)),
@@ -62,42 +61,42 @@ impl Codec {
         }]
     }
 
-    /// The first byte of a frame.
+    /// Returns the tag, the first byte of a frame.
     pub fn tag(self) -> u8 {
         self.entry().0
     }
 
-    /// The name without its level.
+    /// Returns the name without the level.
     pub fn name(self) -> &'static str {
         self.entry().1
     }
 
-    /// The version of the codec's frames: raised when they change.
+    /// Returns the version of the codec's frames, which is raised when they change.
     pub fn version(self) -> u8 {
         match self {
-            // Since 2 with a checksum; grids are told whole, and since 3 in shades that are no picture's.
+            // Since 2 with a checksum; grids are coded whole, and since 3 in shades that are not coded as a picture.
             Self::Image | Self::Scan | Self::Cloud => 2,
             Self::Grid => 3,
             _ => 1,
         }
     }
 
-    /// Whether frames hold a checksum of the message: those of codecs that predict each value from earlier ones, where one
-    /// wrong byte spoils all values after it.
+    /// Returns true if frames carry a checksum of the message: those of codecs that predict each value from earlier
+    /// ones, where one wrong byte spoils all values after it.
     pub(crate) fn has_checksum(self) -> bool {
         matches!(self, Self::Image | Self::Grid | Self::Scan | Self::Cloud)
     }
 
-    /// What a frame's tag means; levels are not on the wire and come back as the usual ones.
-    pub fn of_tag(tag: u8) -> Option<Self> {
+    /// Returns the codec with this tag; levels are not on the wire, so it has its default level.
+    pub fn from_tag(tag: u8) -> Option<Self> {
         CODECS
             .iter()
             .find(|&&(known, ..)| known == tag)
             .map(|&(.., codec)| codec)
     }
 
-    /// The lossless codec made for messages of `schema`; zstd where there is none.
-    pub fn made_for(schema: Schema) -> Self {
+    /// Returns the lossless codec for messages of `schema`; zstd if there is no specific one.
+    pub fn for_schema(schema: Schema) -> Self {
         match schema {
             Schema::Image => Self::Image,
             Schema::OccupancyGrid => Self::Grid,
@@ -107,12 +106,12 @@ impl Codec {
         }
     }
 
-    /// Whether this build has it: H.264 is an option.
-    pub fn is_built(self) -> bool {
+    /// Returns true if this build includes the codec: H.264 is optional.
+    pub fn is_available(self) -> bool {
         self != Self::Video || cfg!(feature = "video")
     }
 
-    /// Whether a message comes back bit by bit.
+    /// Returns true if the codec restores messages bit by bit.
     pub fn is_lossless(self) -> bool {
         !matches!(self, Self::Video | Self::Jpeg)
     }
@@ -130,7 +129,7 @@ impl fmt::Display for Codec {
     }
 }
 
-/// A codec's name that names none.
+/// The error of an unknown codec name.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "`{0}` is no codec; use raw, zlib[:0-9], deflate[:0-9], zstd[:-7-22], image, grid, scan, cloud, jpeg or video"
@@ -182,7 +181,7 @@ mod tests {
         ] {
             let codec: Codec = name.parse().unwrap();
             assert_eq!(codec.to_string(), name);
-            assert_eq!(Codec::of_tag(codec.tag()).unwrap().name(), codec.name());
+            assert_eq!(Codec::from_tag(codec.tag()).unwrap().name(), codec.name());
         }
         assert_eq!("zlib".parse(), Ok(Codec::Zlib(6)));
         for name in [
@@ -190,6 +189,6 @@ mod tests {
         ] {
             assert_eq!(name.parse::<Codec>(), Err(UnknownCodec(name.to_owned())));
         }
-        assert_eq!(Codec::of_tag(0xff), None);
+        assert_eq!(Codec::from_tag(0xff), None);
     }
 }

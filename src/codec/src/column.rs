@@ -1,32 +1,32 @@
-//! A column of numbers, integer or float: the common part of depth images, scans and clouds.
+//! Columns of numbers, integer or float: the common part of depth images, scans and clouds.
 //!
 //! Sensors measure in integers even where drivers publish floats, and often use few of them. So before prediction a
-//! column is mapped to the integers behind it where that is exact: floats that are multiples of a scale to the
-//! multiples, numbers of which only some occur to their rank among those. What does not fit the mapping (no echo, NaN,
-//! infinity) is *missing* from the plane and listed apart.
+//! column is mapped to the integers behind it if that is exact: floats that are multiples of a scale to the multiples,
+//! sparse numbers to their ranks. Values that do not fit the mapping (no echo, NaN, infinity) are *missing* from the
+//! plane and listed separately.
 //!
 //! Layout: `flags · [scale] · [missing] · [offset] · [ranks] · plane`.
 
 use crate::Error;
-use crate::generic::{self, Zstd};
+use crate::generic::{self, ZstdCompressor};
 use crate::padded::Lanes;
-use crate::predict::{Kind, Sample};
+use crate::predict::{Kind, PlaneSample};
 use crate::scale::Scale;
 use crate::wide::Wide;
-use crate::wire::{Cursor, put_block, put_varint, unzigzag, zigzag};
+use crate::wire::{FrameCursor, put_block, put_varint, unzigzag, zigzag};
 
-/// Some samples are missing.
+/// Flag: some samples are missing.
 const MISSING: u8 = 1;
-/// Samples are ranks in a list.
+/// Flag: samples are ranks in a list.
 const RANKS: u8 = 2;
-/// Samples are 32 bits wide, else 16.
+/// Flag: samples are 32 bits wide, otherwise 16.
 const WIDE: u8 = 4;
-/// Floats are multiples of a scale.
+/// Flag: floats are multiples of a scale.
 const SCALED: u8 = 8;
-/// Floats are mapped to integers in their order.
+/// Flag: floats are mapped to integers in their order.
 const ORDERED: u8 = 16;
 
-/// How the samples lie.
+/// Arrangement of the samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum Shape {
     Picture { width: usize, height: usize },
@@ -63,9 +63,9 @@ impl Shape {
     }
 }
 
-/// The order of floats as an order of integers.
+/// Maps a float's bits to an integer such that the order of floats is kept.
 #[inline]
-pub(crate) fn ordered(bits: u32) -> u32 {
+pub(crate) fn to_ordered_bits(bits: u32) -> u32 {
     if bits >> 31 == 0 {
         bits | 1 << 31
     } else {
@@ -73,9 +73,9 @@ pub(crate) fn ordered(bits: u32) -> u32 {
     }
 }
 
-/// The inverse of [`ordered`].
+/// The inverse of [`to_ordered_bits`].
 #[inline]
-pub(crate) fn unordered(order: u32) -> u32 {
+pub(crate) fn from_ordered_bits(order: u32) -> u32 {
     if order >> 31 == 0 {
         !order
     } else {
@@ -83,7 +83,7 @@ pub(crate) fn unordered(order: u32) -> u32 {
     }
 }
 
-/// Encodes 16-bit integers. Zero is taken for "nothing measured" when all others are far from it.
+/// Encodes 16-bit integers. Zero counts as "nothing measured" if all others are far from it.
 pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     let (mut zeros, mut smallest) = (0usize, u16::MAX);
     for &sample in samples {
@@ -99,12 +99,13 @@ pub(crate) fn encode_shorts(samples: &[u16], shape: Shape, out: &mut Vec<u8>) {
     encode_plane16(samples, missing, flags, &[], shape, out);
 }
 
-/// The ranks of the values of `samples` where `counted` holds, when so few occur that ranks are worth a list.
+/// Returns the distinct values of `samples`, without the missing ones, and the rank of each; `None` if the values are
+/// not sparse enough for a list.
 fn ranks(samples: &[u16], missing: Option<&Lanes<u8>>) -> Option<(Vec<u16>, Vec<u16>)> {
     if samples.len() < 4096 {
         return None;
     }
-    // What is missing is noted in the upper half, so that nothing has to be looked at before.
+    // Missing samples are recorded in the upper half, so that no check is needed before.
     let mut present = vec![false; 1 << 17];
     match missing {
         None => samples
@@ -197,7 +198,7 @@ pub(crate) fn encode_words(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     }
 }
 
-/// Encodes differences that are small numbers already.
+/// Encodes differences that are small already.
 pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut lanes = shape.lanes();
     lanes.fill(samples, |sample| sample);
@@ -208,8 +209,11 @@ pub(crate) fn encode_differences(samples: &[u32], shape: Shape, out: &mut Vec<u8
     .encode(&[Kind::Zero], out);
 }
 
-/// The counterpart of [`encode_differences`].
-pub(crate) fn decode_differences(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+/// Decodes what [`encode_differences`] wrote.
+pub(crate) fn decode_differences(
+    input: &mut FrameCursor<'_>,
+    shape: Shape,
+) -> Result<Vec<u32>, Error> {
     decode_plane(input, shape, None::<Lanes<u8>>).map(|(samples, _)| samples)
 }
 
@@ -223,7 +227,7 @@ pub(crate) fn encode_floats(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
 
 fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     let mut multiples = scale.multiples(bits);
-    // Zero is taken for "nothing measured" when all others are far from it. What does not fit is far, too.
+    // Zero counts as "nothing measured" if all others are far from it. Values that do not fit are far from it, too.
     let (mut zeros, mut nearest) = (0u32, i32::MAX);
     for &multiple in &multiples {
         zeros += u32::from(multiple == 0);
@@ -243,7 +247,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     let (mut unfit, mut below, mut largest) = (0u32, i32::MAX, i32::MIN);
     for &multiple in &multiples {
         unfit += u32::from(multiple == Scale::NONE);
-        // One less than what does not fit is larger than everything else.
+        // The value for "does not fit" minus one wraps to the largest number.
         below = below.min(multiple.wrapping_sub(1));
         largest = largest.max(multiple);
     }
@@ -257,7 +261,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     let mut missing = None;
     if unfit > 0 {
         flags |= MISSING;
-        if !put_unfit(bits, &multiples, unfit, &mut preamble) {
+        if !put_unscaled(bits, &multiples, unfit, &mut preamble) {
             return encode_ordered(bits, shape, out);
         }
         let mut lanes = shape.lanes();
@@ -265,7 +269,7 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
         missing = Some(lanes);
     }
     put_varint(&mut preamble, zigzag(i64::from(smallest)));
-    // What is missing gets any value: its place is bridged.
+    // Missing samples may have any value: they are bridged.
     if i64::from(largest) - i64::from(smallest) < 1 << 16 {
         let above = |multiple: i32| multiple.wrapping_sub(smallest) as u16;
         let samples: Vec<u16> = multiples.iter().map(|&multiple| above(multiple)).collect();
@@ -285,8 +289,9 @@ fn encode_scaled(bits: &[u32], scale: Scale, shape: Shape, out: &mut Vec<u8>) {
     }
 }
 
-/// Lists the `unfit` floats that are no multiple. False when too many of them were measured for a scale to be worth it.
-fn put_unfit(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -> bool {
+/// Appends the `unfit` floats that are no multiples. Returns false if too many of them are measurements for a scale to
+/// pay off.
+fn put_unscaled(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -> bool {
     let pairs = || bits.iter().zip(multiples);
     let first = pairs()
         .find(|&(_, &multiple)| multiple == Scale::NONE)
@@ -295,39 +300,39 @@ fn put_unfit(bits: &[u32], multiples: &[i32], unfit: usize, out: &mut Vec<u8>) -
         |(&bits, &multiple): (&u32, &i32)| u32::from((multiple == Scale::NONE) & (bits == first));
     if pairs().map(same).sum::<u32>() as usize == unfit {
         put_run(first, unfit as u32, out);
-        return !measured(first) || unfit * 16 <= bits.len();
+        return !is_measured(first) || unfit * 16 <= bits.len();
     }
     let apart = || {
         pairs()
             .filter(|&(_, &multiple)| multiple == Scale::NONE)
             .map(|(&bits, _)| bits)
     };
-    put_apart(apart(), out);
-    apart().filter(|&bits| measured(bits)).count() * 16 <= bits.len()
+    put_exceptions(apart(), out);
+    apart().filter(|&bits| is_measured(bits)).count() * 16 <= bits.len()
 }
 
-/// Whether a float is one that a sensor measured rather than a mark for "nothing".
-fn measured(bits: u32) -> bool {
-    // In one comparison: neither zero, of either sign, nor infinite or more.
+/// Returns true if the float is a measurement rather than a mark for "nothing".
+fn is_measured(bits: u32) -> bool {
+    // In one comparison: neither zero of either sign nor infinite nor NaN.
     (bits & 0x7fff_ffff).wrapping_sub(1) < f32::INFINITY.to_bits() - 1
 }
 
 fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     let mut flags = ORDERED | WIDE;
     let mut preamble = Vec::new();
-    let unfit: u32 = bits.iter().map(|&bits| u32::from(!measured(bits))).sum();
+    let unfit: u32 = bits.iter().map(|&bits| u32::from(!is_measured(bits))).sum();
     let missing = (unfit > 0).then(|| {
         flags |= MISSING;
         put_unmeasured(bits, unfit, &mut preamble);
         let mut lanes = shape.lanes();
-        lanes.fill(bits, |bits| u8::from(!measured(bits)));
+        lanes.fill(bits, |bits| u8::from(!is_measured(bits)));
         lanes
     });
     put_varint(&mut preamble, 0);
     out.push(flags);
     out.extend_from_slice(&preamble);
     let mut lanes = shape.lanes();
-    lanes.fill(bits, ordered);
+    lanes.fill(bits, to_ordered_bits);
     Wide {
         samples: lanes,
         missing,
@@ -335,27 +340,27 @@ fn encode_ordered(bits: &[u32], shape: Shape, out: &mut Vec<u8>) {
     .encode(shape.kinds(), out);
 }
 
-/// Lists the `unfit` floats that were not measured.
+/// Appends the `unfit` floats that are no measurements.
 fn put_unmeasured(bits: &[u32], unfit: u32, out: &mut Vec<u8>) {
-    let apart = || bits.iter().copied().filter(|&bits| !measured(bits));
+    let apart = || bits.iter().copied().filter(|&bits| !is_measured(bits));
     let first = apart().next().unwrap_or(0);
     let same: u32 = bits.iter().map(|&bits| u32::from(bits == first)).sum();
     if same == unfit {
         put_run(first, unfit, out);
     } else {
-        put_apart(apart(), out);
+        put_exceptions(apart(), out);
     }
 }
 
-/// As [`put_apart`], for one mark for "nothing", as most drivers have it.
+/// Appends one repeated mark for "nothing", as most drivers use it, in the format of [`put_exceptions`].
 fn put_run(value: u32, count: u32, out: &mut Vec<u8>) {
     let mut run = value.to_le_bytes().to_vec();
     put_varint(&mut run, u64::from(count) - 1);
     put_packed(&run, out);
 }
 
-/// Values listed apart: as runs, for they are mostly one and the same.
-fn put_apart(values: impl Iterator<Item = u32>, out: &mut Vec<u8>) {
+/// Appends the exceptional values as runs, since they are mostly the same.
+fn put_exceptions(values: impl Iterator<Item = u32>, out: &mut Vec<u8>) {
     let mut runs = Vec::new();
     let mut values = values.peekable();
     while let Some(value) = values.next() {
@@ -369,13 +374,13 @@ fn put_apart(values: impl Iterator<Item = u32>, out: &mut Vec<u8>) {
     put_packed(&runs, out);
 }
 
-fn take_apart(input: &mut Cursor<'_>, count: usize) -> Result<Vec<u32>, Error> {
+fn take_exceptions(input: &mut FrameCursor<'_>, count: usize) -> Result<Vec<u32>, Error> {
     let runs = take_packed(input, count.saturating_mul(6) + 16)?;
-    let mut runs = Cursor::new(&runs);
+    let mut runs = FrameCursor::new(&runs);
     let mut values = Vec::new();
     while runs.remaining() > 0 {
         let value = runs.u32()?;
-        let run = runs.bounded(count - values.len().min(count))? + 1;
+        let run = runs.bounded_varint(count - values.len().min(count))? + 1;
         if run > count - values.len() {
             return Err(Error::Corrupt("more values apart than there are"));
         }
@@ -384,12 +389,12 @@ fn take_apart(input: &mut Cursor<'_>, count: usize) -> Result<Vec<u32>, Error> {
     Ok(values)
 }
 
-/// A block of bytes, by zstd where that helps.
+/// Appends a block of bytes, compressed by zstd if that makes it smaller.
 pub(crate) fn put_packed(bytes: &[u8], out: &mut Vec<u8>) {
     put_varint(out, bytes.len() as u64);
     let mut packed = Vec::new();
     if bytes.len() > 32 {
-        Zstd::default().compress(bytes, 3, &mut packed);
+        ZstdCompressor::default().compress(bytes, 3, &mut packed);
     }
     if packed.is_empty() || packed.len() >= bytes.len() {
         put_block(out, bytes);
@@ -398,9 +403,9 @@ pub(crate) fn put_packed(bytes: &[u8], out: &mut Vec<u8>) {
     }
 }
 
-/// The counterpart of [`put_packed`], for at most `limit` bytes.
-pub(crate) fn take_packed(input: &mut Cursor<'_>, limit: usize) -> Result<Vec<u8>, Error> {
-    let length = input.bounded(limit)?;
+/// Reads what [`put_packed`] wrote, at most `limit` bytes.
+pub(crate) fn take_packed(input: &mut FrameCursor<'_>, limit: usize) -> Result<Vec<u8>, Error> {
+    let length = input.bounded_varint(limit)?;
     let packed = input.block()?;
     let mut bytes = Vec::new();
     if packed.len() == length {
@@ -411,8 +416,8 @@ pub(crate) fn take_packed(input: &mut Cursor<'_>, limit: usize) -> Result<Vec<u8
     Ok(bytes)
 }
 
-fn decode_plane<T: Sample>(
-    input: &mut Cursor<'_>,
+fn decode_plane<T: PlaneSample>(
+    input: &mut FrameCursor<'_>,
     shape: Shape,
     missing: Option<Lanes<u8>>,
 ) -> Result<(Vec<T>, Option<Lanes<u8>>), Error> {
@@ -429,8 +434,8 @@ fn decode_plane<T: Sample>(
     Ok((samples, wide.missing))
 }
 
-/// What was read before a plane's samples mean something.
-struct Decoded {
+/// A decoded plane with the information to map its samples back.
+struct DecodedColumn {
     flags: u8,
     scale: Option<Scale>,
     apart: Vec<u32>,
@@ -439,25 +444,25 @@ struct Decoded {
     missing: Option<Lanes<u8>>,
 }
 
-/// Reads a column; `allowed` are the flags its type can have, `offset` whether one was written.
+/// Reads a column; `allowed` are the flags its type can have, `listed` whether missing values are listed.
 fn decode(
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
     shape: Shape,
     allowed: u8,
     listed: bool,
-) -> Result<Decoded, Error> {
+) -> Result<DecodedColumn, Error> {
     let flags = input.byte()?;
     if flags & !allowed != 0 {
         return Err(Error::Corrupt("a column of another type"));
     }
     let scale = if flags & SCALED != 0 {
-        Some(Scale::named(input.byte()?)?)
+        Some(Scale::from_name(input.byte()?)?)
     } else {
         None
     };
     let gaps = flags & MISSING != 0;
     let apart = if gaps && listed {
-        take_apart(input, shape.count())?
+        take_exceptions(input, shape.count())?
     } else {
         Vec::new()
     };
@@ -469,7 +474,7 @@ fn decode(
     let missing = gaps.then(|| shape.lanes());
     if flags & WIDE != 0 {
         let (samples, missing) = decode_plane::<u32>(input, shape, missing)?;
-        return Ok(Decoded {
+        return Ok(DecodedColumn {
             flags,
             scale,
             apart,
@@ -491,7 +496,7 @@ fn decode(
             .map(|rank| values.get(usize::from(rank)).copied().unwrap_or(0).widen())
             .collect(),
     };
-    Ok(Decoded {
+    Ok(DecodedColumn {
         flags,
         scale,
         apart,
@@ -501,22 +506,22 @@ fn decode(
     })
 }
 
-fn take_ranks(input: &mut Cursor<'_>) -> Result<Vec<u16>, Error> {
-    let count = input.bounded(1 << 16)?;
+fn take_ranks(input: &mut FrameCursor<'_>) -> Result<Vec<u16>, Error> {
+    let count = input.bounded_varint(1 << 16)?;
     let steps = take_packed(input, count * 3)?;
-    let mut steps = Cursor::new(&steps);
+    let mut steps = FrameCursor::new(&steps);
     let mut values = Vec::with_capacity(count);
     let mut last = 0usize;
     for _ in 0..count {
-        last += steps.bounded(usize::from(u16::MAX) - last)?;
+        last += steps.bounded_varint(usize::from(u16::MAX) - last)?;
         values.push(last as u16);
     }
     steps.finish()?;
     Ok(values)
 }
 
-impl Decoded {
-    /// Puts the values that were listed apart where samples are missing.
+impl DecodedColumn {
+    /// Maps the samples to values, and inserts the listed values where samples are missing.
     fn restore(self, mut number: impl FnMut(u32) -> u32) -> Result<Vec<u32>, Error> {
         let Some(missing) = self.missing else {
             return Ok(self.samples.into_iter().map(number).collect());
@@ -535,8 +540,8 @@ impl Decoded {
     }
 }
 
-/// The counterpart of [`encode_shorts`].
-pub(crate) fn decode_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
+/// Decodes what [`encode_shorts`] wrote.
+pub(crate) fn decode_shorts(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u16>, Error> {
     let decoded = decode(input, shape, MISSING | RANKS, false)?;
     let mut samples: Vec<u16> = decoded
         .samples
@@ -553,15 +558,15 @@ pub(crate) fn decode_shorts(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<
     Ok(samples)
 }
 
-/// The counterpart of [`encode_words`].
-pub(crate) fn decode_words(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+/// Decodes what [`encode_words`] wrote.
+pub(crate) fn decode_words(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
     let decoded = decode(input, shape, RANKS | WIDE, false)?;
     let offset = decoded.offset as u32;
     decoded.restore(|sample| sample.wrapping_add(offset))
 }
 
-/// The counterpart of [`encode_floats`].
-pub(crate) fn decode_floats(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
+/// Decodes what [`encode_floats`] wrote.
+pub(crate) fn decode_floats(input: &mut FrameCursor<'_>, shape: Shape) -> Result<Vec<u32>, Error> {
     let decoded = decode(
         input,
         shape,
@@ -573,7 +578,7 @@ pub(crate) fn decode_floats(input: &mut Cursor<'_>, shape: Shape) -> Result<Vec<
         (Some(scale), false) => {
             decoded.restore(|sample| scale.value((sample as i32).wrapping_add(offset)))
         }
-        (None, true) => decoded.restore(unordered),
+        (None, true) => decoded.restore(from_ordered_bits),
         _ => Err(Error::Corrupt("a column of floats without a mapping")),
     }
 }
@@ -587,11 +592,11 @@ mod tests {
         height: 50,
     };
 
-    fn floats(values: &[f32], shape: Shape) -> usize {
+    fn round_trip_floats(values: &[f32], shape: Shape) -> usize {
         let bits: Vec<u32> = values.iter().map(|value| value.to_bits()).collect();
         let mut bytes = Vec::new();
         encode_floats(&bits, shape, &mut bytes);
-        let mut input = Cursor::new(&bytes);
+        let mut input = FrameCursor::new(&bytes);
         assert_eq!(decode_floats(&mut input, shape).unwrap(), bits);
         input.finish().unwrap();
         bytes.len()
@@ -616,7 +621,7 @@ mod tests {
             let mut bytes = Vec::new();
             encode_shorts(&samples, shape, &mut bytes);
             assert_eq!(bytes[0], MISSING | RANKS);
-            let mut input = Cursor::new(&bytes);
+            let mut input = FrameCursor::new(&bytes);
             assert_eq!(decode_shorts(&mut input, shape).unwrap(), samples);
             input.finish().unwrap();
         }
@@ -630,7 +635,7 @@ mod tests {
                 .collect();
             let mut bytes = Vec::new();
             encode_words(&samples, PICTURE, &mut bytes);
-            let mut input = Cursor::new(&bytes);
+            let mut input = FrameCursor::new(&bytes);
             assert_eq!(decode_words(&mut input, PICTURE).unwrap(), samples);
             input.finish().unwrap();
         }
@@ -641,7 +646,7 @@ mod tests {
         let millimetres: Vec<f32> = (0..2000)
             .map(|index| (1000 + index % 300) as f32 * 0.001)
             .collect();
-        assert!(floats(&millimetres, PICTURE) < 800);
+        assert!(round_trip_floats(&millimetres, PICTURE) < 800);
         let mut holes = millimetres.clone();
         holes
             .iter_mut()
@@ -650,25 +655,25 @@ mod tests {
         holes[3] = f32::from_bits(0x7fc0_1234);
         holes[4] = f32::NEG_INFINITY;
         holes[5] = 1.234_567_9;
-        floats(&holes, PICTURE);
-        floats(&holes, Shape::Sequence(2000));
+        round_trip_floats(&holes, PICTURE);
+        round_trip_floats(&holes, Shape::Sequence(2000));
         let rough: Vec<f32> = (0..2000).map(|index| (index as f32).sin() * 1e10).collect();
-        floats(&rough, PICTURE);
-        floats(&rough, Shape::Sequence(2000));
-        floats(
+        round_trip_floats(&rough, PICTURE);
+        round_trip_floats(&rough, Shape::Sequence(2000));
+        round_trip_floats(
             &[0.0, -0.0, f32::MIN_POSITIVE, f32::MAX],
             Shape::Sequence(4),
         );
-        floats(&[], Shape::Sequence(0));
+        round_trip_floats(&[], Shape::Sequence(0));
     }
 
     #[test]
     fn what_is_no_measurement_is_told() {
         for value in [1.0, -1.0, f32::MIN_POSITIVE, f32::MAX, f32::MIN, 1e-45] {
-            assert!(measured(value.to_bits()), "{value}");
+            assert!(is_measured(value.to_bits()), "{value}");
         }
         for value in [0.0, -0.0, f32::INFINITY, f32::NEG_INFINITY, f32::NAN] {
-            assert!(!measured(value.to_bits()), "{value}");
+            assert!(!is_measured(value.to_bits()), "{value}");
         }
     }
 
@@ -684,9 +689,9 @@ mod tests {
             1.0,
             f32::INFINITY,
         ];
-        let orders = values.map(|value| ordered(value.to_bits()));
+        let orders = values.map(|value| to_ordered_bits(value.to_bits()));
         assert!(orders.windows(2).all(|pair| pair[0] < pair[1]));
-        assert_eq!(orders.map(unordered), values.map(f32::to_bits));
+        assert_eq!(orders.map(from_ordered_bits), values.map(f32::to_bits));
     }
 
     #[test]
@@ -695,7 +700,7 @@ mod tests {
         let mut bytes = Vec::new();
         encode_shorts(&samples, PICTURE, &mut bytes);
         for length in 0..bytes.len() {
-            assert!(decode_shorts(&mut Cursor::new(&bytes[..length]), PICTURE).is_err());
+            assert!(decode_shorts(&mut FrameCursor::new(&bytes[..length]), PICTURE).is_err());
         }
     }
 }

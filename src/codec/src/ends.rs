@@ -1,164 +1,168 @@
-//! The two ends of one topic on a link: encoder and choice here, decoder there, and what is sent back.
+//! The two ends of one topic on a link: the encoder with its codec selection, the decoder, and the feedback between
+//! them.
 //!
 //! ```text
 //!   Sender::encode ──frame──▶ Receiver::decode ──▶ message
-//!   Sender::answered ◀──Answer (after loss or damage)────┘
+//!   Sender::on_feedback ◀──ReceiverFeedback (after loss or damage)──┘
 //! ```
-//! After a reconnect both are told so: what the other side remembers is then no matter.
+//! After a reconnect both are told so; the state of the other side does not matter then.
 
-use crate::auto::{Auto, Choice};
+use crate::auto::{CodecChoice, CodecSelector};
 use crate::codec::Codec;
 use crate::error::Error;
 use crate::jpeg::JpegOptions;
 use crate::layout::Schema;
-use crate::topic::{Decoded, Decoder, Encoded, Encoder};
+use crate::topic::{DecodedFrame, Decoder, EncodedFrame, Encoder};
 use crate::video::VideoOptions;
 use std::time::Duration;
 
-/// What may be done to a topic's messages.
+/// Policy for encoding a topic's messages.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
-pub enum Policy {
-    /// Nothing: they go as they are.
+pub enum CodecPolicy {
+    /// Messages are sent unchanged.
     AsIs,
-    /// One codec always; it falls back where a message does not fit.
+    /// Always the same codec, with its fallback for messages that do not fit.
     Always(Codec),
-    /// The lossless codec that pays.
+    /// The fastest lossless codec.
     #[default]
     Lossless,
     /// The fastest codec; pictures may lose detail if no lossless codec keeps up.
-    Lossy(Lossy),
+    Lossy(LossyCodec),
 }
 
-/// The lossy codecs of pictures.
+/// Lossy codecs for pictures.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Lossy {
-    /// JPEG: each picture alone.
+pub enum LossyCodec {
+    /// JPEG: each picture is independent.
     Jpeg(JpegOptions),
-    /// H.264: predicted from the picture before; only where it is built.
+    /// H.264: predicted from the picture before; only in builds that include it.
     Video(VideoOptions),
 }
 
-/// What a [`Receiver`] wants its [`Sender`] to know.
+/// Feedback from a [`Receiver`] to its [`Sender`].
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Answer {
-    /// Something was lost: the next frame must refer to none before it.
+pub enum ReceiverFeedback {
+    /// A frame was lost: the next one must not refer to earlier ones.
     Keyframe,
-    /// The frame does not make the message that was encoded: this one, and those after it, must come another way.
+    /// The frame does not decode to the message that was encoded: this message and later ones must be sent with another
+    /// codec.
     Damaged,
 }
 
-/// The end that encodes one topic's messages.
+/// The sending end, which encodes one topic's messages.
 #[derive(Debug)]
 pub struct Sender {
     encoder: Encoder,
-    choosing: Choosing,
+    choosing: CodecSelection,
 }
 
 #[derive(Debug)]
-enum Choosing {
+enum CodecSelection {
     Fixed(Codec),
-    Auto(Auto),
+    Auto(CodecSelector),
 }
 
 impl Sender {
-    /// For messages of `schema`. Video that is not built is not chosen.
-    pub fn new(schema: Schema, policy: Policy) -> Self {
+    /// Creates a sender for messages of `schema`. Video is not chosen if the build lacks it.
+    pub fn new(schema: Schema, policy: CodecPolicy) -> Self {
         let mut encoder = Encoder::new(schema);
         let mut lossy = None;
         match policy {
-            Policy::Lossy(Lossy::Jpeg(options)) => {
+            CodecPolicy::Lossy(LossyCodec::Jpeg(options)) => {
                 encoder = encoder.allow_jpeg(options);
                 lossy = Some(Codec::Jpeg);
             }
-            Policy::Lossy(Lossy::Video(options)) => {
+            CodecPolicy::Lossy(LossyCodec::Video(options)) => {
                 encoder = encoder.allow_video(options);
-                lossy = Some(Codec::Video).filter(|codec| codec.is_built());
+                lossy = Some(Codec::Video).filter(|codec| codec.is_available());
             }
             _ => {}
         }
         let choosing = match policy {
-            Policy::AsIs => Choosing::Fixed(Codec::Raw),
-            Policy::Always(codec) => Choosing::Fixed(codec),
-            Policy::Lossless | Policy::Lossy(_) => Choosing::Auto(Auto::new(schema, lossy)),
+            CodecPolicy::AsIs => CodecSelection::Fixed(Codec::Raw),
+            CodecPolicy::Always(codec) => CodecSelection::Fixed(codec),
+            CodecPolicy::Lossless | CodecPolicy::Lossy(_) => {
+                CodecSelection::Auto(CodecSelector::new(schema, lossy))
+            }
         };
         Self { encoder, choosing }
     }
 
-    /// A lossless codec that takes longer than this to bring a message to the other side does not keep up.
+    /// Sets the maximum latency: a lossless codec that takes longer to deliver a message does not keep up.
     #[must_use]
-    pub fn within(mut self, deadline: Option<Duration>) -> Self {
-        if let Choosing::Auto(auto) = &mut self.choosing {
-            auto.within(deadline);
+    pub fn with_deadline(mut self, deadline: Option<Duration>) -> Self {
+        if let CodecSelection::Auto(auto) = &mut self.choosing {
+            auto.set_deadline(deadline);
         }
         self
     }
 
-    /// Appends the frame of `message` to `out`. `clock` is any steady clock; processor time serves best.
+    /// Appends the frame of `message` to `out`. `clock` is any steady clock; CPU time serves best.
     pub fn encode(
         &mut self,
         message: &[u8],
         clock: impl Fn() -> Duration,
         out: &mut Vec<u8>,
-    ) -> Encoded {
+    ) -> EncodedFrame {
         match &mut self.choosing {
-            Choosing::Fixed(codec) => self.encoder.encode(*codec, message, out),
-            Choosing::Auto(auto) => auto.encode(&mut self.encoder, message, clock, out),
+            CodecSelection::Fixed(codec) => self.encoder.encode(*codec, message, out),
+            CodecSelection::Auto(auto) => auto.encode(&mut self.encoder, message, clock, out),
         }
     }
 
-    /// The link took `time` for `bytes`, while it had nothing else to do.
-    pub fn sent(&mut self, bytes: usize, time: Duration) {
-        if let Choosing::Auto(auto) = &mut self.choosing {
-            auto.link(bytes, time);
+    /// Records that the otherwise idle link took `time` for `bytes`.
+    pub fn record_transfer(&mut self, bytes: usize, time: Duration) {
+        if let CodecSelection::Auto(auto) = &mut self.choosing {
+            auto.record_transfer(bytes, time);
         }
     }
 
-    /// The receiver has answered.
-    pub fn answered(&mut self, answer: Answer) {
+    /// Handles feedback from the receiver.
+    pub fn on_feedback(&mut self, answer: ReceiverFeedback) {
         match answer {
-            Answer::Keyframe => self.encoder.request_keyframe(),
-            Answer::Damaged => {
+            ReceiverFeedback::Keyframe => self.encoder.request_keyframe(),
+            ReceiverFeedback::Damaged => {
                 let next = match self.choosing {
-                    Choosing::Fixed(Codec::Raw | Codec::Zstd(_)) => Codec::Raw,
+                    CodecSelection::Fixed(Codec::Raw | Codec::Zstd(_)) => Codec::Raw,
                     _ => Codec::Zstd(3),
                 };
-                self.choosing = Choosing::Fixed(next);
+                self.choosing = CodecSelection::Fixed(next);
             }
         }
     }
 
-    /// The link is another one now: the next frame refers to none before it, and how fast the link is must be
-    /// measured again. What the codecs cost is still known.
-    pub fn reconnected(&mut self) {
+    /// Handles a reconnect: the next frame refers to no earlier ones, and the throughput of the link must be measured
+    /// again. The measured costs of the codecs are kept.
+    pub fn on_reconnect(&mut self) {
         self.encoder.request_keyframe();
-        if let Choosing::Auto(auto) = &mut self.choosing {
+        if let CodecSelection::Auto(auto) = &mut self.choosing {
             auto.forget_link();
         }
     }
 
-    /// What is chosen and why; `None` where there is nothing to choose.
-    pub fn choice(&self) -> Option<Choice> {
+    /// Returns the current choice and its reason; `None` if the codec is fixed.
+    pub fn choice(&self) -> Option<CodecChoice> {
         match &self.choosing {
-            Choosing::Fixed(_) => None,
-            Choosing::Auto(auto) => Some(auto.choice()),
+            CodecSelection::Fixed(_) => None,
+            CodecSelection::Auto(auto) => Some(auto.choice()),
         }
     }
 }
 
-/// After so many more frames that cannot be decoded a keyframe is asked for again.
+/// Number of undecodable frames after which a keyframe is requested again.
 const ASK_AGAIN: u32 = 30;
 
-/// The end that decodes one topic's frames.
+/// The receiving end, which decodes one topic's frames.
 #[derive(Debug)]
 pub struct Receiver {
     limit: usize,
     decoder: Decoder,
-    /// Frames that could not be decoded since a keyframe was asked for.
+    /// Number of undecodable frames since a keyframe was requested.
     waiting: Option<u32>,
 }
 
 impl Receiver {
-    /// For messages of at most `limit` bytes.
+    /// Creates a receiver for messages of at most `limit` bytes.
     pub fn new(limit: usize) -> Self {
         Self {
             limit,
@@ -167,13 +171,13 @@ impl Receiver {
         }
     }
 
-    /// Appends the message of `frame` to `out`; on an error `out` is as before. The answer, if there is one, goes to
+    /// Appends the message of `frame` to `out`; on an error `out` is unchanged. The feedback, if any, is to be sent to
     /// the sender.
     pub fn decode(
         &mut self,
         frame: &[u8],
         out: &mut Vec<u8>,
-    ) -> (Result<Decoded, Error>, Option<Answer>) {
+    ) -> (Result<DecodedFrame, Error>, Option<ReceiverFeedback>) {
         let result = self.decoder.decode(frame, out);
         let answer = match &result {
             Ok(_) => {
@@ -183,15 +187,17 @@ impl Receiver {
             Err(error) if error.wants_keyframe() => {
                 let waiting = self.waiting.map_or(0, |waiting| (waiting + 1) % ASK_AGAIN);
                 self.waiting = Some(waiting);
-                (waiting == 0).then_some(Answer::Keyframe)
+                (waiting == 0).then_some(ReceiverFeedback::Keyframe)
             }
-            Err(error) => error.wants_another_codec().then_some(Answer::Damaged),
+            Err(error) => error
+                .wants_another_codec()
+                .then_some(ReceiverFeedback::Damaged),
         };
         (result, answer)
     }
 
-    /// The link is another one now: nothing that was received before is referred to.
-    pub fn reconnected(&mut self) {
+    /// Handles a reconnect: later frames refer to nothing received before.
+    pub fn on_reconnect(&mut self) {
         *self = Self::new(self.limit);
     }
 }
@@ -200,7 +206,7 @@ impl Receiver {
 mod tests {
     use super::*;
 
-    /// A grid of 40×40 cells with a wall up to `wall`.
+    /// Returns a grid of 40×40 cells with a wall up to `wall`.
     fn grid(wall: usize) -> Vec<u8> {
         let mut message = vec![0; 16];
         message.extend_from_slice(&[0; 8]);
@@ -219,7 +225,7 @@ mod tests {
 
     #[test]
     fn what_is_damaged_on_its_way_is_never_given_out_and_comes_another_way() {
-        let mut sender = Sender::new(Schema::OccupancyGrid, Policy::Always(Codec::Grid));
+        let mut sender = Sender::new(Schema::OccupancyGrid, CodecPolicy::Always(Codec::Grid));
         let mut receiver = Receiver::new(10_000);
         let mut frame = Vec::new();
         sender.encode(&grid(800), no_clock, &mut frame);
@@ -228,18 +234,18 @@ mod tests {
             damaged[at] ^= 0x10;
             let mut back = Vec::new();
             match receiver.decode(&damaged, &mut back) {
-                // The frame's own number is of no consequence.
+                // The frame's own number does not matter.
                 (Ok(_), None) => assert_eq!(back, grid(800), "byte {at}"),
                 (Err(error), answer) => {
-                    let asks =
-                        matches!(error, Error::TooLarge { .. }) || answer == Some(Answer::Damaged);
+                    let asks = matches!(error, Error::TooLarge { .. })
+                        || answer == Some(ReceiverFeedback::Damaged);
                     assert!(asks && back.is_empty(), "byte {at}: {error}");
                 }
                 (Ok(_), answer) => panic!("{answer:?}"),
             }
         }
         for codec in [Codec::Zstd(3), Codec::Raw, Codec::Raw] {
-            sender.answered(Answer::Damaged);
+            sender.on_feedback(ReceiverFeedback::Damaged);
             let (mut frame, mut back) = (Vec::new(), Vec::new());
             let encoded = sender.encode(&grid(800), no_clock, &mut frame);
             assert_eq!(encoded.codec, codec);
@@ -258,9 +264,9 @@ mod tests {
         picture.extend(96u32.to_le_bytes());
         picture.extend(3072u32.to_le_bytes());
         picture.extend([90; 3072]);
-        let lossy = Lossy::Video(VideoOptions::default());
-        let mut sender = Sender::new(Schema::Image, Policy::Lossy(lossy));
-        sender.choosing = Choosing::Fixed(Codec::Video);
+        let lossy = LossyCodec::Video(VideoOptions::default());
+        let mut sender = Sender::new(Schema::Image, CodecPolicy::Lossy(lossy));
+        sender.choosing = CodecSelection::Fixed(Codec::Video);
         sender.encode(&picture, no_clock, &mut Vec::new());
         let mut receiver = Receiver::new(10_000);
         let mut answers = Vec::new();
@@ -271,8 +277,8 @@ mod tests {
             assert!(matches!(result, Err(Error::KeyframeNeeded(_))));
             answers.extend(answer);
         }
-        assert_eq!(answers, [Answer::Keyframe; 2]);
-        sender.answered(Answer::Keyframe);
+        assert_eq!(answers, [ReceiverFeedback::Keyframe; 2]);
+        sender.on_feedback(ReceiverFeedback::Keyframe);
         let mut frame = Vec::new();
         sender.encode(&picture, no_clock, &mut frame);
         receiver.decode(&frame, &mut Vec::new()).0.unwrap();
@@ -280,10 +286,10 @@ mod tests {
 
     #[test]
     fn a_policy_is_kept() {
-        let mut as_it_is = Sender::new(Schema::Other, Policy::AsIs);
+        let mut as_it_is = Sender::new(Schema::Other, CodecPolicy::AsIs);
         let encoded = as_it_is.encode(&[0; 1000], no_clock, &mut Vec::new());
         assert_eq!((encoded.codec, as_it_is.choice()), (Codec::Raw, None));
-        let lossless = Sender::new(Schema::Image, Policy::Lossless);
+        let lossless = Sender::new(Schema::Image, CodecPolicy::Lossless);
         let candidates = |sender: &Sender| -> Vec<Codec> {
             let expected = sender.choice().unwrap().expected;
             expected
@@ -296,10 +302,10 @@ mod tests {
                 .iter()
                 .all(|codec| codec.is_lossless())
         );
-        let jpeg = Policy::Lossy(Lossy::Jpeg(JpegOptions::default()));
+        let jpeg = CodecPolicy::Lossy(LossyCodec::Jpeg(JpegOptions::default()));
         let lossy = Sender::new(Schema::Image, jpeg);
         assert!(candidates(&lossy).contains(&Codec::Jpeg));
-        let video = Policy::Lossy(Lossy::Video(VideoOptions::default()));
+        let video = CodecPolicy::Lossy(LossyCodec::Video(VideoOptions::default()));
         let lossy = Sender::new(Schema::Image, video);
         assert_eq!(
             candidates(&lossy).contains(&Codec::Video),
@@ -309,11 +315,11 @@ mod tests {
 
     #[test]
     fn a_new_link_is_measured_anew() {
-        let mut sender = Sender::new(Schema::Other, Policy::Lossless);
+        let mut sender = Sender::new(Schema::Other, CodecPolicy::Lossless);
         let unknown = sender.choice().unwrap().link;
-        sender.sent(1_000_000, Duration::from_millis(10));
+        sender.record_transfer(1_000_000, Duration::from_millis(10));
         assert!(sender.choice().unwrap().link > 2.0 * unknown);
-        sender.reconnected();
+        sender.on_reconnect();
         assert_eq!(sender.choice().unwrap().link, unknown);
     }
 }

@@ -1,6 +1,6 @@
-//! Why a frame could not be decoded.
+//! Errors of decoding.
 
-/// Encoding never fails; decoding says what is wrong with the frame and what to do about it.
+/// The error of a frame that cannot be decoded, with what to do about it. Encoding never fails.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Error {
     /// The frame ends before its content does.
@@ -12,7 +12,7 @@ pub enum Error {
     /// The tag names no codec.
     #[error("unknown codec tag {0:#04x}; the peer speaks a newer protocol, update this side")]
     UnknownTag(u8),
-    /// The codec is known, its version is not.
+    /// The codec is known, but not its version.
     #[error(
         "codec `{codec}` in version {version}; this side knows version {known}, update the older side"
     )]
@@ -34,7 +34,7 @@ pub enum Error {
         /// The limit given to the decoder.
         limit: usize,
     },
-    /// The decoded message has another checksum than the encoded one. It is not returned.
+    /// The checksum of the decoded message is wrong. The message is not returned.
     #[error(
         "message decoded by `{codec}` has another checksum than the one sent; send it another way and report this"
     )]
@@ -57,12 +57,12 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the message may come through another codec: what is wrong is the frame, not the message.
+    /// Returns true if the message may be sent with another codec: the frame is wrong, not the message.
     pub fn wants_another_codec(&self) -> bool {
         !self.wants_keyframe() && !matches!(self, Self::TooLarge { .. })
     }
 
-    /// Whether the sender's next keyframe puts things right.
+    /// Returns true if the sender's next keyframe resolves the error.
     pub fn wants_keyframe(&self) -> bool {
         matches!(self, Self::KeyframeNeeded(_) | Self::Video(_))
     }

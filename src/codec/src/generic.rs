@@ -1,11 +1,11 @@
-//! The codecs that take any bytes: zlib (RFC 1950), deflate (RFC 1951), zstd (RFC 8878).
+//! Generic codecs: zlib (RFC 1950), deflate (RFC 1951), zstd (RFC 8878).
 //!
-//! All of them restore an exact, declared number of bytes or fail; none allocates more.
+//! All of them restore exactly the declared number of bytes or fail; none allocates more.
 
 use crate::Error;
 use flate2::{Compress, Compression, Decompress, FlushCompress, FlushDecompress, Status};
 
-/// Compresses as one zlib stream (`header`) or bare deflate data.
+/// Compresses `message` to a zlib stream (`header`) or to bare deflate data.
 pub(crate) fn deflate(message: &[u8], level: u32, header: bool, out: &mut Vec<u8>) {
     let mut stream = Compress::new(Compression::new(level.min(9)), header);
     loop {
@@ -19,7 +19,7 @@ pub(crate) fn deflate(message: &[u8], level: u32, header: bool, out: &mut Vec<u8
     }
 }
 
-/// Appends exactly `length` bytes to `out`.
+/// Decompresses exactly `length` bytes and appends them to `out`.
 pub(crate) fn inflate(
     data: &[u8],
     length: usize,
@@ -29,7 +29,7 @@ pub(crate) fn inflate(
     const BAD: Error = Error::Corrupt("a deflate stream that does not hold what it declares");
     let mut stream = Decompress::new(header);
     let first = out.len();
-    // What a stream of this size can hold at most; the declared length may be a lie.
+    // Maximum output of a stream of this size; the declared length may be wrong.
     let possible = data.len().saturating_mul(1032).saturating_add(64);
     if length > possible {
         return Err(BAD);
@@ -54,13 +54,13 @@ pub(crate) fn inflate(
     }
 }
 
-/// A zstd context that is kept from message to message: setting one up costs more than a small message.
+/// A zstd context that is reused: setting one up costs more than a small message.
 #[derive(Default)]
-pub(crate) struct Zstd {
+pub(crate) struct ZstdCompressor {
     context: Option<(i32, zstd::bulk::Compressor<'static>)>,
 }
 
-impl Zstd {
+impl ZstdCompressor {
     /// Appends `message` compressed at `level` to `out`.
     pub(crate) fn compress(&mut self, message: &[u8], level: i32, out: &mut Vec<u8>) {
         if self
@@ -87,16 +87,16 @@ impl Zstd {
     }
 }
 
-impl std::fmt::Debug for Zstd {
+impl std::fmt::Debug for ZstdCompressor {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         formatter.debug_struct("Zstd").finish_non_exhaustive()
     }
 }
 
-/// Appends exactly `length` bytes to `out`.
+/// Decompresses exactly `length` bytes and appends them to `out`.
 pub(crate) fn unzstd(data: &[u8], length: usize, out: &mut Vec<u8>) -> Result<(), Error> {
     const BAD: Error = Error::Corrupt("a zstd frame that does not hold what it declares");
-    // One of our frames tells its size; ask before making room for a lie.
+    // Our frames declare their size; check it before allocating for a false one.
     match zstd::zstd_safe::get_frame_content_size(data) {
         Ok(Some(told)) if told == length as u64 => {}
         _ => return Err(BAD),
@@ -131,7 +131,7 @@ mod tests {
                 }
             }
             let mut frame = Vec::new();
-            Zstd::default().compress(message, 3, &mut frame);
+            ZstdCompressor::default().compress(message, 3, &mut frame);
             let mut back = b"before".to_vec();
             unzstd(&frame, message.len(), &mut back).unwrap();
             assert_eq!(back, [b"before", message].concat());

@@ -1,6 +1,6 @@
-//! `nav_msgs/OccupancyGrid`: every grid whole, as what differs from its most common cell.
+//! Codec for `nav_msgs/OccupancyGrid`: every grid is coded whole, as the differences from its most common cell.
 //!
-//! Each frame can be decoded alone, so neither end keeps earlier grids (see docs/adr/040).
+//! Each frame is decoded independently, so neither end keeps earlier grids (see docs/adr/040).
 //!
 //! Body: `head · mode · background · cells`.
 
@@ -9,40 +9,45 @@ mod classes;
 mod ladder;
 
 use crate::Error;
-use crate::generic::{Zstd, unzstd};
-use crate::layout::Grid;
+use crate::generic::{ZstdCompressor, unzstd};
+use crate::layout::GridLayout;
 use crate::padded::Lanes;
 use crate::plane8;
-use crate::wire::{Cursor, Ends};
-use classes::Classes;
-use ladder::{Ladder, Values};
+use crate::wire::{FrameCursor, MessageEnds};
+use classes::ClassModel;
+use ladder::{LadderModel, LadderValues};
 
-/// How the cells are told: by three values and few others, as a picture, as few values in any mixture, or by zstd.
+/// Encodings of the cells: by three values and few others, as a picture, as few values in any mixture, or by zstd.
 const PLAIN: u8 = 0;
 const SHADES: u8 = 2;
 const LADDER: u8 = 3;
 const PACKED: u8 = 4;
 
-/// Cells of three values that take at least one byte where zstd is tried as well.
+/// Number of three-valued cells per output byte below which zstd is tried as well.
 const DEAR: usize = 20;
-/// The levels of zstd that are taken elsewhere: neither is always the smaller one.
+/// The zstd levels used elsewhere: neither always gives the smaller result.
 const LEVELS: [i32; 2] = [1, 3];
 
 /// Appends the body of `message`, which has `layout`, to `out`.
-pub(crate) fn encode(message: &[u8], layout: &Grid, zstd: &mut Zstd, out: &mut Vec<u8>) {
+pub(crate) fn encode(
+    message: &[u8],
+    layout: &GridLayout,
+    zstd: &mut ZstdCompressor,
+    out: &mut Vec<u8>,
+) {
     let cells = &message[layout.head..message.len() - layout.tail];
-    Ends::around(message, layout.head, layout.tail).put(out);
+    MessageEnds::from_message(message, layout.head, layout.tail).put(out);
     let background = background(cells);
     let first = out.len();
-    let dear = if classes::shaded(cells, background) {
-        shades(cells, layout, background, out);
+    let dear = if classes::has_many_shades(cells, background) {
+        encode_shades(cells, layout, background, out);
         true
     } else {
         out.extend_from_slice(&[PLAIN, background]);
-        let told = cells::encode(cells, layout, background, Classes::new(), out);
+        let told = cells::encode(cells, layout, background, ClassModel::new(), out);
         (out.len() - first) * DEAR > told
     };
-    // What repeats itself from afar is seen by zstd alone. It takes a part of the time of shades, but as long as three values.
+    // Only zstd sees distant repetitions. It takes a fraction of the time of shades, but as long as three values.
     if dear {
         for level in LEVELS {
             let mut packed = vec![PACKED, background];
@@ -56,12 +61,12 @@ pub(crate) fn encode(message: &[u8], layout: &Grid, zstd: &mut Zstd, out: &mut V
 }
 
 /// Appends cells of many values.
-fn shades(cells: &[u8], layout: &Grid, background: u8, out: &mut Vec<u8>) {
-    let values = Values::of(cells, background);
+fn encode_shades(cells: &[u8], layout: &GridLayout, background: u8, out: &mut Vec<u8>) {
+    let values = LadderValues::from_cells(cells, background);
     if values.count() <= ladder::MOST {
         out.extend_from_slice(&[LADDER, background]);
         values.write(out);
-        cells::encode(cells, layout, background, Ladder::new(&values), out);
+        cells::encode(cells, layout, background, LadderModel::new(&values), out);
         return;
     }
     out.extend_from_slice(&[SHADES, background]);
@@ -72,7 +77,7 @@ fn shades(cells: &[u8], layout: &Grid, background: u8, out: &mut Vec<u8>) {
     plane8::encode(&mut lanes, 1, out);
 }
 
-/// The most common cell among a few thousand.
+/// Returns the most common cell among a few thousand.
 fn background(cells: &[u8]) -> u8 {
     let mut seen = [0u32; 256];
     for &cell in cells.iter().step_by((cells.len() / 4096).max(1)) {
@@ -83,13 +88,17 @@ fn background(cells: &[u8]) -> u8 {
         .unwrap_or(0)
 }
 
-/// Appends a message of `total` bytes to `out`.
-pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
+/// Decodes a message of `total` bytes and appends it to `out`.
+pub(crate) fn decode(
+    input: &mut FrameCursor<'_>,
+    total: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), Error> {
     let ends = input.block()?;
-    let layout = Grid::read(ends, total)
+    let layout = GridLayout::read(ends, total)
         .filter(|layout| layout.head + layout.tail == ends.len())
         .ok_or(Error::Corrupt("a head that is not a grid's"))?;
-    let ends = Ends::of(ends, layout.head);
+    let ends = MessageEnds::from_joined(ends, layout.head);
     let mode = input.byte()?;
     let background = input.byte()?;
     let count = layout.width * layout.height;
@@ -101,10 +110,10 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
     match mode {
         PLAIN => {
             let rest = input.take_rest();
-            cells::decode(rest, &layout, background, Classes::new(), cells)
+            cells::decode(rest, &layout, background, ClassModel::new(), cells)
         }
         LADDER => {
-            let tell = Ladder::new(&Values::read(input)?);
+            let tell = LadderModel::new(&LadderValues::read(input)?);
             cells::decode(input.take_rest(), &layout, background, tell, cells)
         }
         SHADES => {
@@ -123,7 +132,7 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
 mod tests {
     use super::*;
 
-    /// A grid message with `cells`.
+    /// Returns a grid message with `cells`.
     fn message(width: u32, height: u32, cells: &[u8]) -> Vec<u8> {
         let mut message = vec![7; 12];
         message.extend_from_slice(&[3, 0, 0, 0]);
@@ -138,7 +147,7 @@ mod tests {
         message
     }
 
-    /// A room of `size` cells inside a grid of `width` by `height`, with a pillar at `pillar`.
+    /// Returns a room of `size` cells inside a grid of `width` by `height`, with a pillar at `pillar`.
     fn room(width: usize, height: usize, size: usize, pillar: usize) -> Vec<u8> {
         let mut cells = vec![255u8; width * height];
         for y in 0..size {
@@ -151,22 +160,22 @@ mod tests {
         cells
     }
 
-    /// Encodes and decodes; the body's size.
-    fn sent(message: &[u8]) -> usize {
-        let layout = Grid::read(message, message.len()).unwrap();
+    /// Encodes and decodes the message; returns the size of the body.
+    fn round_trip_size(message: &[u8]) -> usize {
+        let layout = GridLayout::read(message, message.len()).unwrap();
         let (mut body, mut back) = (Vec::new(), Vec::new());
-        encode(message, &layout, &mut Zstd::default(), &mut body);
-        decode(&mut Cursor::new(&body), message.len(), &mut back).unwrap();
+        encode(message, &layout, &mut ZstdCompressor::default(), &mut body);
+        decode(&mut FrameCursor::new(&body), message.len(), &mut back).unwrap();
         assert!(back == message);
         body.len()
     }
 
     #[test]
     fn a_map_is_small() {
-        let size = sent(&message(500, 400, &room(500, 400, 300, 40)));
+        let size = round_trip_size(&message(500, 400, &room(500, 400, 300, 40)));
         assert!(size < 700, "{size}");
-        sent(&message(1, 1, &[55]));
-        sent(&message(10, 10, &room(50, 50, 20, 5)[..100]));
+        round_trip_size(&message(1, 1, &[55]));
+        round_trip_size(&message(10, 10, &room(50, 50, 20, 5)[..100]));
     }
 
     #[test]
@@ -174,17 +183,17 @@ mod tests {
         let mut shades: Vec<u8> = (0..120 * 100)
             .map(|index| (index % 120 + index / 120 / 2) as u8 % 101)
             .collect();
-        sent(&message(120, 100, &shades));
+        round_trip_size(&message(120, 100, &shades));
         shades[500] = 77;
         shades[501..700].fill(3);
-        sent(&message(120, 100, &shades));
+        round_trip_size(&message(120, 100, &shades));
     }
 
-    /// Rungs of a ladder of log odds, as MRPT's grids have them: far from where the robot was, few scans have met a cell.
+    /// Steps of log odds, as in MRPT's grids: far from where the robot was, few scans have met a cell.
     const RUNGS: [u8; 8] = [35, 22, 13, 8, 4, 2, 1, 0];
 
-    /// The middle of a grid, where it is known, in shades that a mapper's noise has left.
-    fn noisy(width: usize, height: usize, size: usize) -> Vec<u8> {
+    /// Returns a grid whose known middle has the noisy shades of a mapper.
+    fn noisy_cells(width: usize, height: usize, size: usize) -> Vec<u8> {
         let mut cells = vec![255u8; width * height];
         let mut state = 7u32;
         for y in 0..size {
@@ -203,11 +212,11 @@ mod tests {
         cells
     }
 
-    /// What zstd makes of the same message.
-    fn packed(message: &[u8]) -> usize {
+    /// Returns the size of the message compressed by zstd.
+    fn zstd_size(message: &[u8]) -> usize {
         let sizes = LEVELS.map(|level| {
             let mut packed = Vec::new();
-            Zstd::default().compress(message, level, &mut packed);
+            ZstdCompressor::default().compress(message, level, &mut packed);
             packed.len()
         });
         sizes[0].min(sizes[1])
@@ -216,8 +225,12 @@ mod tests {
     #[test]
     fn a_map_in_noisy_shades_is_a_fifth_smaller_than_by_zstd() {
         for (width, height) in [(300, 280), (1000, 900)] {
-            let message = message(width, height, &noisy(width as usize, height as usize, 240));
-            let (sent, packed) = (sent(&message), packed(&message));
+            let message = message(
+                width,
+                height,
+                &noisy_cells(width as usize, height as usize, 240),
+            );
+            let (sent, packed) = (round_trip_size(&message), zstd_size(&message));
             assert!(sent * 5 < packed * 4, "{sent} and {packed}");
         }
     }
@@ -230,7 +243,7 @@ mod tests {
             all.collect()
         };
         let noise = |at: usize| (at.wrapping_mul(2_654_435_761) >> 13) as u8;
-        // The same rows of noise again and again: in three values, in a ladder's, and in all.
+        // The same rows of noise repeated: in three values, in a ladder's, and in all.
         let repeated = [
             of(&|x, y| [255, 0, 100][usize::from(noise(x + y % 5 * 977)) % 3]),
             of(&|x, y| RUNGS[usize::from(noise(x + y % 5 * 977)) % 8]),
@@ -238,7 +251,7 @@ mod tests {
         ];
         for cells in repeated {
             let message = message(width as u32, height as u32, &cells);
-            let (sent, packed) = (sent(&message), packed(&message));
+            let (sent, packed) = (round_trip_size(&message), zstd_size(&message));
             assert!(sent < packed + 120, "{sent} and {packed}");
         }
     }

@@ -1,38 +1,46 @@
-//! `sensor_msgs/Image`, lossless: 8-bit colour, grey and Bayer, 16-bit and float depth.
+//! Lossless codec for `sensor_msgs/Image`: 8-bit colour, grey and Bayer, 16-bit and float depth.
 //!
 //! Body: `head · padding · decorrelated? · planes`. Colour channels are sent as green and the differences of the others
-//! to it where that makes them smaller; a Bayer picture is sent as its four colours.
+//! to it if that makes them smaller; a Bayer picture is sent as its four colours.
 
 use crate::Error;
 use crate::column::{self, Shape};
-use crate::layout::{Image, Pixel};
+use crate::layout::{ImageLayout, Pixel};
 use crate::padded::Lanes;
 use crate::plane8;
 use crate::rows::{put_padding, take_padding};
-use crate::wire::{Cursor, Ends};
+use crate::wire::{FrameCursor, MessageEnds};
 
 /// Appends the body of `message`, which has `layout`.
-pub(crate) fn encode(message: &[u8], layout: &Image, out: &mut Vec<u8>) {
+pub(crate) fn encode(message: &[u8], layout: &ImageLayout, out: &mut Vec<u8>) {
     let data = layout.data(message);
-    Ends::around(message, layout.head, layout.tail).put(out);
-    put_padding(data, layout.row(), layout.step, out);
+    MessageEnds::from_message(message, layout.head, layout.tail).put(out);
+    put_padding(data, layout.row_bytes(), layout.step, out);
     match layout.pixel {
         Pixel::Bytes(channels) => encode_colour(data, layout, channels, out),
         Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => {
             encode_bayer(data, layout, out)
         }
         Pixel::Bayer => encode_colour(data, layout, 1, out),
-        Pixel::Short => column::encode_shorts(&shorts(data, layout), shape(layout), out),
-        Pixel::Word => column::encode_words(&words(data, layout), shape(layout), out),
-        Pixel::Float => column::encode_floats(&words(data, layout), shape(layout), out),
+        Pixel::Short => {
+            column::encode_shorts(&read_shorts(data, layout), picture_shape(layout), out)
+        }
+        Pixel::Word => column::encode_words(&read_words(data, layout), picture_shape(layout), out),
+        Pixel::Float => {
+            column::encode_floats(&read_words(data, layout), picture_shape(layout), out)
+        }
     }
 }
 
 /// The inverse of [`encode`]: appends a message of `total` bytes to `out`.
-pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let (layout, ends) = Image::take(input, total)?;
+pub(crate) fn decode(
+    input: &mut FrameCursor<'_>,
+    total: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), Error> {
+    let (layout, ends) = ImageLayout::take(input, total)?;
     let data = ends.restore(layout.step * layout.height, out);
-    take_padding(input, data, layout.row(), layout.step)?;
+    take_padding(input, data, layout.row_bytes(), layout.step)?;
     match layout.pixel {
         Pixel::Bytes(channels) => decode_colour(input, data, &layout, channels),
         Pixel::Bayer if layout.width % 2 == 0 && layout.height % 2 == 0 => {
@@ -40,7 +48,7 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
         }
         Pixel::Bayer => decode_colour(input, data, &layout, 1),
         Pixel::Short => {
-            let samples = column::decode_shorts(input, shape(&layout))?;
+            let samples = column::decode_shorts(input, picture_shape(&layout))?;
             let order = if layout.big_endian {
                 u16::to_be_bytes
             } else {
@@ -51,8 +59,8 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
         }
         Pixel::Word | Pixel::Float => {
             let samples = match layout.pixel {
-                Pixel::Word => column::decode_words(input, shape(&layout))?,
-                _ => column::decode_floats(input, shape(&layout))?,
+                Pixel::Word => column::decode_words(input, picture_shape(&layout))?,
+                _ => column::decode_floats(input, picture_shape(&layout))?,
             };
             let order = if layout.big_endian {
                 u32::to_be_bytes
@@ -65,21 +73,21 @@ pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) ->
     }
 }
 
-fn shape(layout: &Image) -> Shape {
+fn picture_shape(layout: &ImageLayout) -> Shape {
     Shape::Picture {
         width: layout.width,
         height: layout.height,
     }
 }
 
-fn rows<'a>(data: &'a [u8], layout: &Image) -> impl Iterator<Item = &'a [u8]> {
-    let row = layout.row();
+fn sample_rows<'a>(data: &'a [u8], layout: &ImageLayout) -> impl Iterator<Item = &'a [u8]> {
+    let row = layout.row_bytes();
     data.chunks_exact(layout.step).map(move |line| &line[..row])
 }
 
-fn shorts(data: &[u8], layout: &Image) -> Vec<u16> {
+fn read_shorts(data: &[u8], layout: &ImageLayout) -> Vec<u16> {
     let mut samples = Vec::with_capacity(layout.width * layout.height);
-    for row in rows(data, layout) {
+    for row in sample_rows(data, layout) {
         let shorts = row
             .chunks_exact(2)
             .map(|bytes| u16::from_le_bytes([bytes[0], bytes[1]]));
@@ -93,9 +101,9 @@ fn shorts(data: &[u8], layout: &Image) -> Vec<u16> {
     samples
 }
 
-fn words(data: &[u8], layout: &Image) -> Vec<u32> {
+fn read_words(data: &[u8], layout: &ImageLayout) -> Vec<u32> {
     let mut samples = Vec::with_capacity(layout.width * layout.height);
-    for row in rows(data, layout) {
+    for row in sample_rows(data, layout) {
         let words = row
             .chunks_exact(4)
             .map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]));
@@ -111,10 +119,10 @@ fn words(data: &[u8], layout: &Image) -> Vec<u32> {
 
 fn put_samples<const N: usize>(
     data: &mut [u8],
-    layout: &Image,
+    layout: &ImageLayout,
     mut samples: impl Iterator<Item = [u8; N]>,
 ) {
-    let row = layout.row();
+    let row = layout.row_bytes();
     for line in data.chunks_exact_mut(layout.step) {
         for (slot, sample) in line[..row].chunks_exact_mut(N).zip(&mut samples) {
             slot.copy_from_slice(&sample);
@@ -122,10 +130,10 @@ fn put_samples<const N: usize>(
     }
 }
 
-/// Whether channels differ less from green than from their own neighbours.
-fn decorrelates(data: &[u8], layout: &Image, channels: usize) -> bool {
+/// Returns true if channels differ less from green than from their own neighbours.
+fn should_decorrelate(data: &[u8], layout: &ImageLayout, channels: usize) -> bool {
     let (mut apart, mut together) = (0u64, 0u64);
-    for row in rows(data, layout).step_by(16) {
+    for row in sample_rows(data, layout).step_by(16) {
         for pair in row.windows(2 * channels).step_by(channels * 3) {
             let step =
                 |channel: usize| i32::from(pair[channels + channel]) - i32::from(pair[channel]);
@@ -138,11 +146,11 @@ fn decorrelates(data: &[u8], layout: &Image, channels: usize) -> bool {
     together <= apart
 }
 
-fn encode_colour(data: &[u8], layout: &Image, channels: usize, out: &mut Vec<u8>) {
+fn encode_colour(data: &[u8], layout: &ImageLayout, channels: usize, out: &mut Vec<u8>) {
     let mut lanes = Lanes::<u8>::pictures(channels, layout.width, layout.height);
-    let decorrelate = channels >= 3 && decorrelates(data, layout, channels);
+    let decorrelate = channels >= 3 && should_decorrelate(data, layout, channels);
     out.push(decorrelate.into());
-    for (y, row) in rows(data, layout).enumerate() {
+    for (y, row) in sample_rows(data, layout).enumerate() {
         match channels {
             1 => lanes.row_mut(0, y).copy_from_slice(row),
             2 => split_row::<2>(row, &mut lanes, y, false),
@@ -163,7 +171,7 @@ fn split_row<const C: usize>(row: &[u8], lanes: &mut Lanes<u8>, y: usize, decorr
     let green = if decorrelate { 0xff } else { 0 };
     for (x, pixel) in row.chunks_exact(C).enumerate() {
         for channel in 0..C {
-            // Green and alpha stay as they are.
+            // Green and alpha stay unchanged.
             let reference = if channel == 0 || channel == 2 {
                 pixel[1] & green
             } else {
@@ -175,9 +183,9 @@ fn split_row<const C: usize>(row: &[u8], lanes: &mut Lanes<u8>, y: usize, decorr
 }
 
 fn decode_colour(
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
     data: &mut [u8],
-    layout: &Image,
+    layout: &ImageLayout,
     channels: usize,
 ) -> Result<(), Error> {
     let decorrelated = match input.byte()? {
@@ -187,7 +195,7 @@ fn decode_colour(
     };
     let mut lanes = Lanes::<u8>::pictures(channels, layout.width, layout.height);
     plane8::decode(input, &mut lanes, channels)?;
-    let row = layout.row();
+    let row = layout.row_bytes();
     for (y, line) in data.chunks_exact_mut(layout.step).enumerate() {
         let line = &mut line[..row];
         match channels {
@@ -216,10 +224,10 @@ fn join_row<const C: usize>(row: &mut [u8], lanes: &Lanes<u8>, y: usize, decorre
     }
 }
 
-/// The four colours of a Bayer picture are planes of half its width and height.
-fn encode_bayer(data: &[u8], layout: &Image, out: &mut Vec<u8>) {
+/// Encodes the four colours of a Bayer picture as planes of half its width and height.
+fn encode_bayer(data: &[u8], layout: &ImageLayout, out: &mut Vec<u8>) {
     let mut lanes = Lanes::<u8>::pictures(4, layout.width / 2, layout.height / 2);
-    for (y, row) in rows(data, layout).enumerate() {
+    for (y, row) in sample_rows(data, layout).enumerate() {
         let first = (y % 2) * 2;
         for (x, pair) in row.chunks_exact(2).enumerate() {
             lanes.row_mut(first, y / 2)[x] = pair[0];
@@ -229,10 +237,14 @@ fn encode_bayer(data: &[u8], layout: &Image, out: &mut Vec<u8>) {
     plane8::encode(&mut lanes, 4, out);
 }
 
-fn decode_bayer(input: &mut Cursor<'_>, data: &mut [u8], layout: &Image) -> Result<(), Error> {
+fn decode_bayer(
+    input: &mut FrameCursor<'_>,
+    data: &mut [u8],
+    layout: &ImageLayout,
+) -> Result<(), Error> {
     let mut lanes = Lanes::<u8>::pictures(4, layout.width / 2, layout.height / 2);
     plane8::decode(input, &mut lanes, 4)?;
-    let row = layout.row();
+    let row = layout.row_bytes();
     for (y, line) in data.chunks_exact_mut(layout.step).enumerate() {
         let first = (y % 2) * 2;
         let (left, right) = (lanes.row(first, y / 2), lanes.row(first + 1, y / 2));

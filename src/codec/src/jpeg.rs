@@ -1,15 +1,15 @@
-//! Pictures as JPEG, each decodable alone. The pixels are lossy, so it is only used where the robot's configuration
-//! allows it. All other bytes of the message are exact, alpha included. Only camera encodings are taken: 8-bit grey and
-//! colour by name (`mono8`, `rgb8`, …), never `8UC1` and the like, which may hold labels.
+//! Codec for pictures as JPEG, each decodable alone. The pixels are lossy, so it is only used if the robot's
+//! configuration allows it. All other bytes of the message are exact, alpha included. Only camera encodings are
+//! accepted: 8-bit grey and colour by name (`mono8`, `rgb8`, …), never `8UC1` and the like, which may hold labels.
 //!
 //! Body: `head · padding · [alpha] · JPEG (baseline, one interleaved scan)`.
 
 mod guard;
 
 use crate::Error;
-use crate::layout::{Image, Pixel};
+use crate::layout::{ImageLayout, Pixel};
 use crate::rows::{put_alpha, put_padding, take_alpha, take_padding};
-use crate::wire::{Cursor, Ends};
+use crate::wire::{FrameCursor, MessageEnds};
 use jpeg_encoder::ColorType;
 use zune_jpeg::JpegDecoder;
 use zune_jpeg::zune_core::bytestream::ZCursor;
@@ -19,7 +19,7 @@ use zune_jpeg::zune_core::options::DecoderOptions;
 /// Settings of the JPEG encoder.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct JpegOptions {
-    /// JPEG's usual quality: 1 (smallest) to 100 (best). Below 90 colour has half the resolution in both directions.
+    /// JPEG quality, 1 (smallest) to 100 (best). Below 90 colour has half the resolution in both directions.
     pub quality: u8,
 }
 
@@ -29,8 +29,8 @@ impl Default for JpegOptions {
     }
 }
 
-/// The channels of a picture that can be encoded as JPEG.
-fn channels(layout: &Image) -> Option<usize> {
+/// Returns the number of channels if the picture can be encoded as JPEG.
+fn channels(layout: &ImageLayout) -> Option<usize> {
     let Pixel::Bytes(channels @ (1 | 3 | 4)) = layout.pixel else {
         return None;
     };
@@ -42,23 +42,26 @@ fn channels(layout: &Image) -> Option<usize> {
 /// Appends the body of `message`; `None` if its encoding is not a camera's.
 pub(crate) fn encode(
     message: &[u8],
-    layout: &Image,
+    layout: &ImageLayout,
     options: JpegOptions,
     out: &mut Vec<u8>,
 ) -> Option<()> {
     let channels = channels(layout)?;
     let data = layout.data(message);
-    Ends::around(message, layout.head, layout.tail).put(out);
-    put_padding(data, layout.row(), layout.step, out);
+    MessageEnds::from_message(message, layout.head, layout.tail).put(out);
+    put_padding(data, layout.row_bytes(), layout.step, out);
     if channels == 4 {
         put_alpha(data, layout, out);
     }
     let packed: Vec<u8>;
-    let pixels = if layout.row() == layout.step {
+    let pixels = if layout.row_bytes() == layout.step {
         data
     } else {
         let rows = data.chunks_exact(layout.step);
-        packed = rows.flat_map(|row| &row[..layout.row()]).copied().collect();
+        packed = rows
+            .flat_map(|row| &row[..layout.row_bytes()])
+            .copied()
+            .collect();
         &packed
     };
     let colour = match (channels, layout.red_first) {
@@ -77,18 +80,22 @@ pub(crate) fn encode(
         .ok()
 }
 
-/// Appends a message of `total` bytes to `out`.
-pub(crate) fn decode(input: &mut Cursor<'_>, total: usize, out: &mut Vec<u8>) -> Result<(), Error> {
-    let (layout, ends) = Image::take(input, total)?;
+/// Decodes a message of `total` bytes and appends it to `out`.
+pub(crate) fn decode(
+    input: &mut FrameCursor<'_>,
+    total: usize,
+    out: &mut Vec<u8>,
+) -> Result<(), Error> {
+    let (layout, ends) = ImageLayout::take(input, total)?;
     let channels = channels(&layout).ok_or(Error::Corrupt("a JPEG of pictures that are none"))?;
     let colours = channels.min(3);
     let data = ends.restore(layout.step * layout.height, out);
-    take_padding(input, data, layout.row(), layout.step)?;
+    take_padding(input, data, layout.row_bytes(), layout.step)?;
     if channels == 4 {
         take_alpha(input, data, &layout)?;
     }
     let stream = input.take_rest();
-    // Before the library makes room for anything.
+    // Before the library allocates anything.
     guard::check(stream, layout.width, layout.height, colours)?;
     let space = if colours == 1 {
         ColorSpace::Luma

@@ -1,18 +1,18 @@
-//! Where things lie in the serialized messages the codecs know: in the ROS 1 wire format (little endian, strings and
-//! arrays preceded by a 32-bit length), and in CDR as ROS 2 has it (see [`Fields`]).
+//! Layouts of the serialized messages that the codecs know: in the ROS 1 wire format (little endian, strings and arrays
+//! preceded by a 32-bit length), and in the CDR of ROS 2 (see [`FieldReader`]).
 //!
 //! A layout is read from the *head* of a message, all bytes before its big array, and the message's length. It is
 //! `None` unless every byte of the message is accounted for, so that a codec which accepts a layout can restore the
-//! message from it. The decoder reads the very same layout from the head it was sent; so nobody has to be told which of the two formats a
-//! message is in.
+//! message from it. The decoder reads the same layout from the head it received, so the format of a message need not be
+//! transmitted.
 
 mod fields;
 
 use crate::Error;
-use crate::wire::{Cursor, Ends};
-use fields::{Fields, in_either};
+use crate::wire::{FrameCursor, MessageEnds};
+use fields::{FieldReader, read_in_either_format};
 
-/// The message types with a codec of their own, told by name and md5 or type hash (which fix the layout).
+/// The message types with a codec of their own, identified by name and md5 or type hash (which fix the layout).
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Hash)]
 pub enum Schema {
     /// `sensor_msgs/Image`
@@ -23,11 +23,11 @@ pub enum Schema {
     LaserScan,
     /// `sensor_msgs/PointCloud2`
     PointCloud2,
-    /// Any other: bytes.
+    /// Any other type: plain bytes.
     Other,
 }
 
-/// By name; the md5 of ROS 1, and the hash (REP-2016) of ROS 2 as Jazzy has it.
+/// Known types by name, with the md5 of ROS 1 and the type hash (REP-2016) of ROS 2 Jazzy.
 const KNOWN: [(&str, [&str; 2], Schema); 4] = [
     (
         "sensor_msgs/Image",
@@ -64,8 +64,9 @@ const KNOWN: [(&str, [&str; 2], Schema); 4] = [
 ];
 
 impl Schema {
-    /// Looks a type up, by its name (`pkg/Type` or `pkg/msg/Type`) and its md5 or hash; a known name with another one is `Other`.
-    pub fn of(name: &str, digest: &str) -> Self {
+    /// Returns the schema of a type, by its name (`pkg/Type` or `pkg/msg/Type`) and its md5 or type hash; a known name
+    /// with another digest is `Other`.
+    pub fn for_type(name: &str, digest: &str) -> Self {
         let name = name.replacen("/msg/", "/", 1);
         KNOWN
             .iter()
@@ -74,7 +75,7 @@ impl Schema {
     }
 }
 
-/// What a picture's samples are.
+/// Format of a picture's samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(crate) enum Pixel {
     /// Interleaved 8-bit channels: one to four.
@@ -90,7 +91,7 @@ pub(crate) enum Pixel {
 }
 
 impl Pixel {
-    fn of(encoding: &[u8]) -> Option<Self> {
+    fn from_encoding(encoding: &[u8]) -> Option<Self> {
         Some(match encoding {
             b"mono8" | b"8UC1" | b"8SC1" => Self::Bytes(1),
             b"8UC2" | b"8SC2" => Self::Bytes(2),
@@ -117,38 +118,38 @@ impl Pixel {
 
 /// `sensor_msgs/Image`; the data is the end of the message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Image {
-    /// Where the data begins.
+pub(crate) struct ImageLayout {
+    /// Offset of the data.
     pub(crate) head: usize,
-    /// Bytes behind the data, which fill the last word.
+    /// Number of padding bytes behind the data, which fill the last word.
     pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) step: usize,
     pub(crate) big_endian: bool,
     pub(crate) pixel: Pixel,
-    /// Whether the channels are red first (or unknown) rather than blue first.
+    /// The channels are red first (or unknown) rather than blue first.
     pub(crate) red_first: bool,
-    /// Whether the samples are known to be what a camera saw, rather than labels or other numbers.
+    /// The samples are known to come from a camera, rather than being labels or other numbers.
     pub(crate) seen: bool,
 }
 
-impl Image {
+impl ImageLayout {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        in_either(head, |input| Self::read_fields(input, total))
+        read_in_either_format(head, |input| Self::read_fields(input, total))
     }
 
-    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
-        input.header()?;
+    fn read_fields(mut input: FieldReader<'_>, total: usize) -> Option<Self> {
+        input.skip_header()?;
         let height = input.size()?;
         let width = input.size()?;
         let encoding = input.string()?;
-        let pixel = Pixel::of(encoding)?;
+        let pixel = Pixel::from_encoding(encoding)?;
         let big_endian = input.byte()? != 0;
         let step = input.size()?;
         let data = input.size()?;
-        let head = input.taken();
-        let tail = input.tail(data, total)?;
+        let head = input.bytes_read();
+        let tail = input.tail_length(data, total)?;
         let fits = width > 0
             && height > 0
             && width.checked_mul(pixel.bytes())? <= step
@@ -168,56 +169,56 @@ impl Image {
         })
     }
 
-    /// Reads what a frame tells of an image's ends.
+    /// Reads the head and tail of an image from a frame.
     pub(crate) fn take<'a>(
-        input: &mut Cursor<'a>,
+        input: &mut FrameCursor<'a>,
         total: usize,
-    ) -> Result<(Self, Ends<'a>), Error> {
+    ) -> Result<(Self, MessageEnds<'a>), Error> {
         let ends = input.block()?;
         let layout = Self::read(ends, total)
             .filter(|layout| layout.head + layout.tail == ends.len())
             .ok_or(Error::Corrupt("a head that is not an image's"))?;
-        Ok((layout, Ends::of(ends, layout.head)))
+        Ok((layout, MessageEnds::from_joined(ends, layout.head)))
     }
 
-    /// Its samples, and what is between their rows.
+    /// Returns the samples with the padding between their rows.
     pub(crate) fn data<'a>(&self, message: &'a [u8]) -> &'a [u8] {
         &message[self.head..message.len() - self.tail]
     }
 
-    /// Bytes of a row that are samples; the rest of `step` is padding.
-    pub(crate) fn row(&self) -> usize {
+    /// Returns the number of bytes of a row that are samples; the rest of `step` is padding.
+    pub(crate) fn row_bytes(&self) -> usize {
         self.width * self.pixel.bytes()
     }
 }
 
 /// `nav_msgs/OccupancyGrid`; the cells are the end of the message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Grid {
-    /// Where the cells begin.
+pub(crate) struct GridLayout {
+    /// Offset of the cells.
     pub(crate) head: usize,
-    /// Bytes behind them, which fill the last word.
+    /// Number of padding bytes behind the cells, which fill the last word.
     pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
 }
 
-impl Grid {
+impl GridLayout {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        in_either(head, |input| Self::read_fields(input, total))
+        read_in_either_format(head, |input| Self::read_fields(input, total))
     }
 
-    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
-        input.header()?;
-        // When the map was loaded, and metres per cell.
-        input.words(3)?;
+    fn read_fields(mut input: FieldReader<'_>, total: usize) -> Option<Self> {
+        input.skip_header()?;
+        // Time of loading, and metres per cell.
+        input.skip_words(3)?;
         let width = input.size()?;
         let height = input.size()?;
-        // Where cell (0, 0) lies.
-        input.doubles(7)?;
+        // Pose of cell (0, 0).
+        input.skip_doubles(7)?;
         let cells = input.size()?;
-        let head = input.taken();
-        let tail = input.tail(cells, total)?;
+        let head = input.bytes_read();
+        let tail = input.tail_length(cells, total)?;
         let fits = width > 0 && height > 0 && width.checked_mul(height)? == cells;
         fits.then_some(Self {
             head,
@@ -230,24 +231,24 @@ impl Grid {
 
 /// `sensor_msgs/LaserScan`: ranges, then intensities.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Scan {
-    /// Where the ranges begin.
+pub(crate) struct ScanLayout {
+    /// Offset of the ranges.
     pub(crate) head: usize,
     pub(crate) ranges: usize,
     pub(crate) intensities: usize,
 }
 
-impl Scan {
-    /// The number of intensities follows from the message's length.
+impl ScanLayout {
+    /// Reads the layout; the number of intensities follows from the message's length.
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        in_either(head, |input| Self::read_fields(input, total))
+        read_in_either_format(head, |input| Self::read_fields(input, total))
     }
 
-    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
-        input.header()?;
-        input.words(7)?;
+    fn read_fields(mut input: FieldReader<'_>, total: usize) -> Option<Self> {
+        input.skip_header()?;
+        input.skip_words(7)?;
         let ranges = input.size()?;
-        let head = input.taken();
+        let head = input.bytes_read();
         let rest = total
             .checked_sub(head)?
             .checked_sub(ranges.checked_mul(4)?)?
@@ -259,15 +260,15 @@ impl Scan {
         })
     }
 
-    /// Where the intensities' length lies.
-    pub(crate) fn middle(&self) -> usize {
+    /// Returns the offset of the intensities' length.
+    pub(crate) fn intensity_length_offset(&self) -> usize {
         self.head + self.ranges * 4
     }
 }
 
-/// The numbers of a point field, by the constants of `sensor_msgs/PointField`.
+/// Type of a point field's numbers, by the constants of `sensor_msgs/PointField`.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum Number {
+pub(crate) enum NumberType {
     Byte,
     Short,
     Word,
@@ -275,7 +276,7 @@ pub(crate) enum Number {
     Double,
 }
 
-impl Number {
+impl NumberType {
     pub(crate) fn bytes(self) -> usize {
         match self {
             Self::Byte => 1,
@@ -286,52 +287,52 @@ impl Number {
     }
 }
 
-/// What a field's name says about its numbers.
+/// Meaning of a field, derived from its name.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum Meaning {
+pub(crate) enum FieldMeaning {
     X,
     Y,
     Z,
     /// Four bytes: blue, green, red, alpha.
     Colour,
-    /// Which laser measured the point.
+    /// Index of the laser that measured the point.
     Ring,
     Plain,
 }
 
 /// One number of every point.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) struct Field {
+pub(crate) struct PointField {
     pub(crate) offset: usize,
-    pub(crate) number: Number,
-    pub(crate) meaning: Meaning,
+    pub(crate) number: NumberType,
+    pub(crate) meaning: FieldMeaning,
 }
 
 /// `sensor_msgs/PointCloud2`; one byte, `is_dense`, follows the data.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub(crate) struct Cloud {
-    /// Where the data begins.
+pub(crate) struct CloudLayout {
+    /// Offset of the data.
     pub(crate) head: usize,
-    /// Bytes behind `is_dense`, which fill the last word.
+    /// Number of padding bytes behind `is_dense`, which fill the last word.
     pub(crate) tail: usize,
     pub(crate) width: usize,
     pub(crate) height: usize,
     pub(crate) point_step: usize,
     pub(crate) row_step: usize,
-    /// By offset, without overlap.
-    pub(crate) fields: Vec<Field>,
+    /// Sorted by offset, without overlap.
+    pub(crate) fields: Vec<PointField>,
 }
 
-/// No known sensor has more; a bound on what a head can make the codec do.
+/// Maximum number of fields: no known sensor has more, and it bounds the work that a head can cause.
 const MAX_FIELDS: usize = 64;
 
-impl Cloud {
+impl CloudLayout {
     pub(crate) fn read(head: &[u8], total: usize) -> Option<Self> {
-        in_either(head, |input| Self::read_fields(input, total))
+        read_in_either_format(head, |input| Self::read_fields(input, total))
     }
 
-    fn read_fields(mut input: Fields<'_>, total: usize) -> Option<Self> {
-        input.header()?;
+    fn read_fields(mut input: FieldReader<'_>, total: usize) -> Option<Self> {
+        input.skip_header()?;
         let height = input.size()?;
         let width = input.size()?;
         let count = input.size()?;
@@ -343,8 +344,8 @@ impl Cloud {
         let point_step = input.size()?;
         let row_step = input.size()?;
         let data = input.size()?;
-        let head = input.taken();
-        let tail = input.tail(data.checked_add(1)?, total)?;
+        let head = input.bytes_read();
+        let tail = input.tail_length(data.checked_add(1)?, total)?;
         fields.sort_by_key(|field| field.offset);
         let apart = fields
             .windows(2)
@@ -371,32 +372,34 @@ impl Cloud {
         })
     }
 
-    fn read_field(input: &mut Fields<'_>, fields: &mut Vec<Field>) -> Option<()> {
+    fn read_field(input: &mut FieldReader<'_>, fields: &mut Vec<PointField>) -> Option<()> {
         let name = input.string()?;
         let offset = input.size()?;
         let number = match input.byte()? {
-            1 | 2 => Number::Byte,
-            3 | 4 => Number::Short,
-            5 | 6 => Number::Word,
-            7 => Number::Float,
-            8 => Number::Double,
+            1 | 2 => NumberType::Byte,
+            3 | 4 => NumberType::Short,
+            5 | 6 => NumberType::Word,
+            7 => NumberType::Float,
+            8 => NumberType::Double,
             _ => return None,
         };
         let count = input.size()?;
         let meaning = match (name, number, count) {
-            (b"x", Number::Float, 1) => Meaning::X,
-            (b"y", Number::Float, 1) => Meaning::Y,
-            (b"z", Number::Float, 1) => Meaning::Z,
-            (b"rgb" | b"rgba", Number::Float | Number::Word, 1) => Meaning::Colour,
-            (b"ring" | b"channel" | b"line", Number::Byte | Number::Short, 1) => Meaning::Ring,
-            _ => Meaning::Plain,
+            (b"x", NumberType::Float, 1) => FieldMeaning::X,
+            (b"y", NumberType::Float, 1) => FieldMeaning::Y,
+            (b"z", NumberType::Float, 1) => FieldMeaning::Z,
+            (b"rgb" | b"rgba", NumberType::Float | NumberType::Word, 1) => FieldMeaning::Colour,
+            (b"ring" | b"channel" | b"line", NumberType::Byte | NumberType::Short, 1) => {
+                FieldMeaning::Ring
+            }
+            _ => FieldMeaning::Plain,
         };
         for index in 0..count {
             if fields.len() >= MAX_FIELDS {
                 return None;
             }
             let offset = offset.checked_add(index * number.bytes())?;
-            fields.push(Field {
+            fields.push(PointField {
                 offset,
                 number,
                 meaning,
@@ -418,13 +421,19 @@ mod tests {
     fn a_type_is_known_by_its_name_and_what_fixes_its_layout() {
         let md5 = "060021388200f6f0f447d0fcd9c64743";
         let hash = "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47";
-        assert_eq!(Schema::of("sensor_msgs/Image", md5), Schema::Image);
-        assert_eq!(Schema::of("sensor_msgs/msg/Image", hash), Schema::Image);
-        assert_eq!(Schema::of("sensor_msgs/LaserScan", md5), Schema::Other);
+        assert_eq!(Schema::for_type("sensor_msgs/Image", md5), Schema::Image);
         assert_eq!(
-            Schema::of("sensor_msgs/msg/Image", &hash[1..]),
+            Schema::for_type("sensor_msgs/msg/Image", hash),
+            Schema::Image
+        );
+        assert_eq!(
+            Schema::for_type("sensor_msgs/LaserScan", md5),
             Schema::Other
         );
-        assert_eq!(Schema::of("my_msgs/msg/Image", hash), Schema::Other);
+        assert_eq!(
+            Schema::for_type("sensor_msgs/msg/Image", &hash[1..]),
+            Schema::Other
+        );
+        assert_eq!(Schema::for_type("my_msgs/msg/Image", hash), Schema::Other);
     }
 }

@@ -1,19 +1,19 @@
-//! Link codecs: ROS messages in, smaller frames out, and back; nothing lost that must not be.
+//! Link codecs: turn ROS messages into smaller frames and back, losing only what may be lost.
 //!
 //! ```text
-//!   message (serialized, as it is) ──▶ Encoder ──▶ frame ──▶ Decoder ──▶ the same message, by its checksum
-//!                                        ▲  request_keyframe()  │ (of videos all but the pixels, of JPEG too)
-//!                                        └──────────────────────┘
+//!   message (serialized) ──▶ Encoder ──▶ frame ──▶ Decoder ──▶ the same message, verified by its checksum
+//!                              ▲  request_keyframe()  │        (for video and JPEG everything but the pixels)
+//!                              └──────────────────────┘
 //! ```
-//! Pure: no I/O, no threads, no clock; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry their
-//! codec and its version, so codecs can change from message to message: [`Auto`] chooses
-//! them. [`Sender`] and [`Receiver`] put the three together, with what they tell each other.
+//! Pure code without I/O, threads or clocks; state lives in one [`Encoder`] and one [`Decoder`] per topic. Frames carry
+//! their codec and its version, so codecs can change from message to message: [`CodecSelector`] chooses them.
+//! [`Sender`] and [`Receiver`] combine the three, with the feedback between them.
 //!
-//! Every lossless codec restores the message bit by bit, and one that does not fit a message leaves it to zstd. Every
-//! decoder is safe with any input: it fails or returns a message of the declared size, within the limit it was given.
+//! Every lossless codec restores the message bit by bit, and leaves a message that does not fit to zstd. Every decoder
+//! is safe with any input: it fails or returns a message of the declared size, within its limit.
 
 #![forbid(unsafe_code)]
-// Lanes and columns are walked side by side in several arrays: an index says that, zipped iterators hide it.
+// Several arrays of lanes and columns are walked in parallel: an index shows that, zipped iterators hide it.
 #![allow(clippy::needless_range_loop)]
 
 mod auto;
@@ -39,11 +39,11 @@ mod video;
 mod wide;
 mod wire;
 
-pub use auto::{Auto, Choice, Estimate, Reason};
+pub use auto::{CodecChoice, CodecEstimate, CodecSelector, Reason};
 pub use codec::{Codec, UnknownCodec};
-pub use ends::{Answer, Lossy, Policy, Receiver, Sender};
+pub use ends::{CodecPolicy, LossyCodec, Receiver, ReceiverFeedback, Sender};
 pub use error::Error;
 pub use jpeg::JpegOptions;
 pub use layout::Schema;
-pub use topic::{Decoded, Decoder, Encoded, Encoder, peek};
+pub use topic::{DecodedFrame, Decoder, EncodedFrame, Encoder, peek};
 pub use video::VideoOptions;

@@ -1,14 +1,14 @@
-//! Samples laid out for prediction: every sample finds its neighbours at fixed distances behind it.
+//! Samples laid out for prediction: every sample finds its neighbours at fixed distances before it.
 //!
 //! ```text
 //!        c b d        c = at - lag - 1    b = at - lag    d = at - lag + 1
 //!        a v          a = at - 1          v = at
 //! ```
-//! A picture has a margin of one sample left and right (so `lag` is the width plus two) and a row of zeros above.
-//! The margin repeats the sample above (left) or the last one of the row (right). A plain sequence is one row with a
-//! lag of two: its neighbours are the three samples before.
+//! A picture has a margin of one sample left and right (so `lag` is the width plus two) and a row of zeros above. The
+//! margin repeats the sample above (left) or the last one of the row (right). A plain sequence is one row with a lag of
+//! two: its neighbours are the three samples before.
 
-/// One lane's samples with their margins.
+/// Samples of one lane with their margins.
 pub(crate) struct Padded<T> {
     pub(crate) width: usize,
     pub(crate) height: usize,
@@ -40,7 +40,7 @@ impl<T: Copy + Default> Padded<T> {
         self.lag == 2
     }
 
-    /// Where the samples of row `y` begin.
+    /// Returns the index of the first sample of row `y`.
     #[inline]
     pub(crate) fn start(&self, y: usize) -> usize {
         self.lag * (y + 1) + 1
@@ -70,7 +70,7 @@ impl<T: Copy + Default> Padded<T> {
         }
     }
 
-    /// Sets the margins a decoder needs before it can guess in row `y`: those of the row before, and its own left one.
+    /// Sets the margins that a decoder needs to predict row `y`: those of the row before, and its own left one.
     #[inline]
     pub(crate) fn open_row(&mut self, y: usize) {
         self.close_row_before(y);
@@ -88,7 +88,7 @@ impl<T: Copy + Default> Padded<T> {
         }
     }
 
-    /// The neighbourhood of row `y`: (a, b, c, d, v), each as long as the row.
+    /// Returns the neighbourhood of row `y`: (a, b, c, d, v), each as long as the row.
     #[inline]
     pub(crate) fn neighbours(&self, y: usize) -> [&[T]; 5] {
         let (start, lag, width) = (self.start(y), self.lag, self.width);
@@ -103,17 +103,17 @@ impl<T: Copy + Default> Padded<T> {
     }
 }
 
-/// The planes of one picture (or one sequence), cut into lanes that are coded in lockstep.
+/// The planes of one picture (or one sequence), divided into lanes that are coded in lockstep.
 ///
-/// Several planes are a lane each. A single plane is cut into four stripes of equal height, and what does not divide
-/// by four is a fifth lane coded by itself.
+/// Several planes are one lane each. A single plane is divided into four stripes of equal height, and the remainder is
+/// a fifth lane coded by itself.
 pub(crate) struct Lanes<T> {
     pub(crate) lanes: Vec<Padded<T>>,
     stripe: usize,
     stripes: usize,
 }
 
-/// How many stripes a single plane of any useful size is cut into.
+/// Number of stripes of a single plane of any useful size.
 pub(crate) const STRIPES: usize = 4;
 
 impl<T: Copy + Default> Lanes<T> {
@@ -150,7 +150,7 @@ impl<T: Copy + Default> Lanes<T> {
                 stripes: 1,
             };
         }
-        // What does not divide by four is filled up rather than coded apart.
+        // A remainder is padded rather than coded separately.
         let stripe = length.div_ceil(STRIPES);
         Self {
             lanes: (0..STRIPES).map(|_| Padded::sequence(stripe)).collect(),
@@ -159,7 +159,7 @@ impl<T: Copy + Default> Lanes<T> {
         }
     }
 
-    /// Several sequences of one length, a lane each.
+    /// Creates several sequences of one length, one lane each.
     pub(crate) fn sequences(count: usize, length: usize) -> Self {
         let lanes = (0..count).map(|_| Padded::sequence(length)).collect();
         Self {
@@ -169,7 +169,7 @@ impl<T: Copy + Default> Lanes<T> {
         }
     }
 
-    /// Which lanes run in lockstep: groups of equal shape.
+    /// Returns the ranges of lanes that run in lockstep: groups of equal shape.
     pub(crate) fn groups(&self) -> Vec<std::ops::Range<usize>> {
         let count = self.lanes.len();
         if self.stripes > STRIPES {
@@ -187,7 +187,7 @@ impl<T: Copy + Default> Lanes<T> {
         self.lanes[plane * self.stripes + y / self.stripe].row_mut(y % self.stripe)
     }
 
-    /// Sets all margins, once the samples are in.
+    /// Sets all margins, once the samples are in place.
     pub(crate) fn close(&mut self) {
         for lane in &mut self.lanes {
             for y in 0..lane.height {
@@ -196,7 +196,7 @@ impl<T: Copy + Default> Lanes<T> {
         }
     }
 
-    /// Fills a single plane or sequence from samples in order, each mapped; what is over gets the last one.
+    /// Fills a single plane or sequence with the mapped samples in order; what is left over gets the last one.
     pub(crate) fn fill<S: Copy>(&mut self, samples: &[S], map: impl Fn(S) -> T) {
         let mut rest = samples;
         let mut last = T::default();
@@ -215,7 +215,7 @@ impl<T: Copy + Default> Lanes<T> {
         }
     }
 
-    /// All samples, lane by lane, row by row: for a single plane or sequence this is their order.
+    /// Returns all samples, lane by lane and row by row: for a single plane or sequence this is their order.
     pub(crate) fn rows(&self) -> impl Iterator<Item = &[T]> {
         self.lanes
             .iter()

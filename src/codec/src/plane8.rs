@@ -1,24 +1,25 @@
-//! Planes of 8-bit samples: guess each from its neighbours, code the difference in a context of its surroundings.
+//! Codec for planes of 8-bit samples: predicts each sample from its neighbours and codes the difference in a context of
+//! its surroundings.
 //!
-//! The encoder's first half has no dependence from one sample to the next and is written for the vectoriser; the
+//! The first half of the encoder has no dependence from one sample to the next and is written for the vectoriser; the
 //! decoder has one, and hides it by decoding several lanes in lockstep.
 //!
 //! Layout: `predictor · tables · lane₀ · lane₁ …`, each lane preceded by its length.
 
 use crate::Error;
-use crate::entropy::counts::Order;
-use crate::entropy::tans::{BATCH, Decoder, Encoder, Histogram, Lane};
+use crate::entropy::counts::SymbolOrder;
+use crate::entropy::tans::{BATCH, Histogram, LaneReader, TansDecoder, TansEncoder};
 use crate::padded::{Lanes, Padded};
 use crate::predict::{self, Kind, Predictor};
-use crate::wire::{Cursor, put_block};
+use crate::wire::{FrameCursor, put_block};
 
-/// Contexts of one plane; four planes share a model.
+/// Number of contexts of one plane; four planes share a model.
 const CONTEXTS: usize = 8;
-/// The unease from which the next context begins.
+/// Activity ("unease") at which the next context begins.
 const THRESHOLDS: [u16; CONTEXTS - 1] = [1, 3, 6, 10, 17, 30, 56];
 
-/// How many neighbouring contexts a plane of that many samples merges into one (as a shift): tables cost bytes.
-fn merge(samples: usize) -> u32 {
+/// Returns how many neighbouring contexts a plane of that many samples merges into one (as a shift): tables cost bytes.
+fn merge_shift(samples: usize) -> u32 {
     match samples {
         0..0x400 => 3,
         0x400..0x1000 => 2,
@@ -32,12 +33,12 @@ fn unease(a: i16, b: i16, c: i16, d: i16) -> i16 {
     (a - c).abs() + (c - b).abs() + (b - d).abs()
 }
 
-/// Encodes all samples; `planes` tells how many of the lanes' models are apart.
+/// Encodes all samples; `planes` is the number of lanes with models of their own.
 pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
     lanes.close();
     let count = lanes.count();
-    let shift = merge(count / planes.max(1));
-    let kind = choose(lanes);
+    let shift = merge_shift(count / planes.max(1));
+    let kind = choose_predictor(lanes);
     out.push(kind as u8);
     let mut histogram = Histogram::new(contexts(planes));
     let keys: Vec<Vec<u16>> = lanes
@@ -63,7 +64,7 @@ pub(crate) fn encode(lanes: &mut Lanes<u8>, planes: usize, out: &mut Vec<u8>) {
             keys
         })
         .collect();
-    let encoder = Encoder::new(histogram, Order::Signed, out);
+    let encoder = TansEncoder::new(histogram, SymbolOrder::Signed, out);
     for group in lanes.groups() {
         let keys = &keys[group];
         match *keys {
@@ -92,8 +93,8 @@ fn contexts(planes: usize) -> usize {
     CONTEXTS * planes.max(1)
 }
 
-/// The predictor with the smaller differences on every eighth row.
-fn choose(lanes: &Lanes<u8>) -> Kind {
+/// Returns the predictor with the smaller differences on every eighth row.
+fn choose_predictor(lanes: &Lanes<u8>) -> Kind {
     let mut costs = [0u64; 2];
     for lane in &lanes.lanes {
         for y in (1..lane.height).step_by(8) {
@@ -128,7 +129,7 @@ fn guess<P: Predictor>(a: i16, b: i16, c: i16, d: i16) -> i16 {
     }
 }
 
-/// The keys of row `y`. All slices have one length, so this becomes vector code.
+/// Computes the keys of row `y`. All slices have one length, so this becomes vector code.
 #[inline(never)]
 fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, keys: &mut [u16]) {
     let [a, b, c, d, v] = lane.neighbours(y);
@@ -154,7 +155,7 @@ fn row_keys<P: Predictor>(lane: &Padded<u8>, y: usize, first: u16, shift: u32, k
 
 /// Decodes into lanes of the shape they were encoded with.
 pub(crate) fn decode(
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
     lanes: &mut Lanes<u8>,
     planes: usize,
 ) -> Result<(), Error> {
@@ -162,9 +163,10 @@ pub(crate) fn decode(
     if !matches!(kind, Kind::Median | Kind::Slope) {
         return Err(Error::Corrupt("a predictor that 8-bit planes do not use"));
     }
-    let shift = merge(lanes.count() / planes.max(1));
+    let shift = merge_shift(lanes.count() / planes.max(1));
     let mut rest = *input;
-    let (tables, used) = Decoder::read(rest.take_rest(), contexts(planes), Order::Signed)?;
+    let (tables, used) =
+        TansDecoder::read(rest.take_rest(), contexts(planes), SymbolOrder::Signed)?;
     input.take(used)?;
     let bases: Vec<[u16; 1024]> = (0..planes.max(1))
         .map(|plane| {
@@ -191,23 +193,23 @@ pub(crate) fn decode(
 }
 
 fn decode_group<const N: usize>(
-    tables: &Decoder,
+    tables: &TansDecoder,
     kind: Kind,
     bases: &[[u16; 1024]],
     mut planes: [&mut Padded<u8>; N],
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
 ) -> Result<(), Error> {
     let mut lanes = Vec::with_capacity(N);
     for _ in 0..N {
         lanes.push(tables.lane(input.block()?)?);
     }
-    let Ok(mut lanes) = <[Lane<'_>; N]>::try_from(lanes) else {
+    let Ok(mut lanes) = <[LaneReader<'_>; N]>::try_from(lanes) else {
         unreachable!("N lanes were pushed")
     };
     let bases: [&[u16; 1024]; N] = std::array::from_fn(|index| &bases[index.min(bases.len() - 1)]);
     if planes[0].is_sequence() {
         decode_sequence(tables, bases, &mut planes, &mut lanes);
-        return lanes.iter().try_for_each(Lane::finish);
+        return lanes.iter().try_for_each(LaneReader::finish);
     }
     for y in 0..planes[0].height {
         match if y == 0 { Kind::West } else { kind } {
@@ -220,19 +222,19 @@ fn decode_group<const N: usize>(
             _ => decode_row::<predict::West, N>(tables, bases, &mut planes, &mut lanes, y),
         }
     }
-    lanes.iter().try_for_each(Lane::finish)
+    lanes.iter().try_for_each(LaneReader::finish)
 }
 
 /// Decodes sequences, in which the neighbours above are the samples just decoded.
 fn decode_sequence<const N: usize>(
-    tables: &Decoder,
+    tables: &TansDecoder,
     bases: [&[u16; 1024]; N],
     planes: &mut [&mut Padded<u8>; N],
-    lanes: &mut [Lane<'_>; N],
+    lanes: &mut [LaneReader<'_>; N],
 ) {
     let (width, start) = (planes[0].width, planes[0].start(0));
-    let mut windows = lanes.each_ref().map(Lane::window);
-    // The last three samples, the newest first.
+    let mut windows = lanes.each_ref().map(LaneReader::window);
+    // The last three samples, newest first.
     let mut last = [[0i16; 3]; N];
     for at in 0..width {
         for lane in 0..N {
@@ -247,17 +249,17 @@ fn decode_sequence<const N: usize>(
         }
     }
     for lane in 0..N {
-        lanes[lane].leave(windows[lane]);
+        lanes[lane].set_window(windows[lane]);
     }
 }
 
-/// Samples decoded at a time: what does not depend on them is worked out before, in vector code.
+/// Number of samples decoded at a time: what does not depend on them is computed before, in vector code.
 const CHUNK: usize = 16 * BATCH;
 
-/// What the row above says about a chunk.
+/// The contribution of the row above to a chunk.
 #[derive(Clone, Copy)]
-struct Above {
-    /// The unease without the sample to the left.
+struct RowAbove {
+    /// Activity without the sample to the left.
     ease: [i16; CHUNK],
     corner: [i16; CHUNK],
     north: [i16; CHUNK],
@@ -265,7 +267,7 @@ struct Above {
     tilt: [i16; CHUNK],
 }
 
-impl Above {
+impl RowAbove {
     const NONE: Self = Self {
         ease: [0; CHUNK],
         corner: [0; CHUNK],
@@ -273,9 +275,9 @@ impl Above {
         tilt: [0; CHUNK],
     };
 
-    /// `row` begins one sample left of the chunk and ends one to the right.
+    /// Loads the row above; `row` begins one sample left of the chunk and ends one to the right.
     #[inline(always)]
-    fn look(&mut self, row: &[u8]) {
+    fn load(&mut self, row: &[u8]) {
         let length = (row.len() - 2).min(CHUNK);
         let (corner, north, east) = (&row[..length], &row[1..=length], &row[2..length + 2]);
         for x in 0..length {
@@ -290,26 +292,26 @@ impl Above {
 
 #[inline(never)]
 fn decode_row<P: Predictor, const N: usize>(
-    tables: &Decoder,
+    tables: &TansDecoder,
     bases: [&[u16; 1024]; N],
     planes: &mut [&mut Padded<u8>; N],
-    lanes: &mut [Lane<'_>; N],
+    lanes: &mut [LaneReader<'_>; N],
     y: usize,
 ) {
     let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
-    let mut windows = lanes.each_ref().map(Lane::window);
+    let mut windows = lanes.each_ref().map(LaneReader::window);
     let mut west = [0i16; N];
     for lane in 0..N {
         planes[lane].open_row(y);
         west[lane] = planes[lane].samples[start - 1].into();
     }
-    let mut above = [Above::NONE; N];
+    let mut above = [RowAbove::NONE; N];
     let mut here = [[0u8; CHUNK]; N];
     let mut x = 0;
     while x < width {
         let length = (width - x).min(CHUNK);
         for lane in 0..N {
-            above[lane].look(&planes[lane].samples[start + x - lag - 1..][..length + 2]);
+            above[lane].load(&planes[lane].samples[start + x - lag - 1..][..length + 2]);
         }
         for first in (0..length).step_by(BATCH) {
             for lane in 0..N {
@@ -339,7 +341,7 @@ fn decode_row<P: Predictor, const N: usize>(
         x += length;
     }
     for lane in 0..N {
-        lanes[lane].leave(windows[lane]);
+        lanes[lane].set_window(windows[lane]);
     }
 }
 
@@ -364,7 +366,7 @@ mod tests {
         let mut bytes = Vec::new();
         encode(&mut lanes, planes, &mut bytes);
         let mut back = Lanes::pictures(planes, width, height);
-        let mut input = Cursor::new(&bytes);
+        let mut input = FrameCursor::new(&bytes);
         decode(&mut input, &mut back, planes).unwrap();
         input.finish().unwrap();
         for plane in 0..planes {
@@ -422,7 +424,7 @@ mod tests {
         for length in 0..bytes.len() {
             let mut back = Lanes::pictures(1, 40, 40);
             assert!(
-                decode(&mut Cursor::new(&bytes[..length]), &mut back, 1).is_err(),
+                decode(&mut FrameCursor::new(&bytes[..length]), &mut back, 1).is_err(),
                 "{length}"
             );
         }

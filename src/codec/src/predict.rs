@@ -1,8 +1,8 @@
-//! Guesses of a sample from its neighbours, and what remains.
+//! Predictions of a sample from its neighbours, and their residuals.
 
 use crate::Error;
 
-/// How a sample is guessed; the letters are those of [`crate::padded`].
+/// The predictors; the letters are those of [`crate::padded`].
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u8)]
 pub(crate) enum Kind {
@@ -44,7 +44,7 @@ impl Kind {
     }
 }
 
-/// A kind known at compile time, so that inner loops hold no choice.
+/// A predictor known at compile time, so that inner loops hold no branch.
 pub(crate) trait Predictor {
     const KIND: Kind;
 }
@@ -77,26 +77,26 @@ macro_rules! with_predictor {
 pub(crate) use with_predictor;
 
 /// A sample of 16 or 32 bits.
-pub(crate) trait Sample: Copy + Default + Eq {
-    /// Zigzag of the sample minus its guess.
+pub(crate) trait PlaneSample: Copy + Default + Eq {
+    /// Returns the zigzag code of the sample minus its prediction.
     fn residual<P: Predictor>(self, a: Self, b: Self, c: Self, d: Self) -> u32;
-    /// The sample whose [`Sample::residual`] is `residual`.
+    /// Returns the sample whose [`PlaneSample::residual`] is `residual`.
     fn restore<P: Predictor>(residual: u32, a: Self, b: Self, c: Self, d: Self) -> Self;
-    /// The part of the unease that does not depend on a.
+    /// Returns the part of the activity that does not depend on a.
     fn ease<P: Predictor>(b: Self, c: Self, d: Self) -> u32;
-    /// How uneasy the neighbourhood is.
+    /// Returns the activity ("unease") of the neighbourhood: the sum of differences between neighbours.
     fn unease<P: Predictor>(ease: u32, a: Self, c: Self) -> u32;
-    /// The context of an unease, below [`EASE`].
+    /// Returns the context of an activity, below [`EASE`].
     fn context(unease: u32) -> u16;
-    /// [`Sample::context`] in arithmetic that the vectoriser can use.
-    fn context_of_many(unease: u32) -> u16;
-    /// Residuals have no other bits.
+    /// Returns [`PlaneSample::context`], in arithmetic that the vectoriser can use.
+    fn branchless_context(unease: u32) -> u16;
+    /// Mask of the bits that residuals can have.
     const RESIDUAL: u32;
     fn widen(self) -> u32;
 }
 
 #[inline(always)]
-fn middle_of_five(v: [i32; 5]) -> i32 {
+fn median_of_five(v: [i32; 5]) -> i32 {
     // Drop the smallest and the largest of two pairs; the median of five is the median of the three left.
     let [a, b, c, d, e] = v;
     let (low_ab, high_ab) = (a.min(b), a.max(b));
@@ -107,7 +107,7 @@ fn middle_of_five(v: [i32; 5]) -> i32 {
     e.clamp(low, high)
 }
 
-/// The guess in 32-bit arithmetic, for samples that leave room in it.
+/// Returns the prediction in 32-bit arithmetic, for samples that leave room in it.
 #[inline(always)]
 pub(crate) fn guess<P: Predictor>(a: i32, b: i32, c: i32, d: i32) -> i32 {
     match P::KIND {
@@ -118,7 +118,7 @@ pub(crate) fn guess<P: Predictor>(a: i32, b: i32, c: i32, d: i32) -> i32 {
         Kind::Plane => a + b - c,
         Kind::Median => (a + b - c).clamp(a.min(b), a.max(b)),
         Kind::Middle => {
-            middle_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)])
+            median_of_five([a, b, a + b - c, a + d - b, ((a + b) >> 1) + ((d - c) >> 2)])
         }
         Kind::Line => 2 * a - b,
     }
@@ -134,10 +134,10 @@ pub(crate) fn unzigzag(value: u32) -> i32 {
     (value >> 1) as i32 ^ -((value & 1) as i32)
 }
 
-/// The first context that is not about unease.
+/// The first context that does not stand for activity.
 pub(crate) const EASE: u16 = 29;
 
-/// Two contexts per octave.
+/// Returns the context of an activity, with two contexts per octave.
 const fn half_octave(unease: u32) -> u8 {
     if unease < 4 {
         return unease as u8;
@@ -151,16 +151,16 @@ const fn half_octave(unease: u32) -> u8 {
     }
 }
 
-/// The logarithm of a number to the base of two, times 2^`fraction`, rounded down; anything for zero. The first bits of
-/// a float are one, without a branch.
+/// Returns the binary logarithm of a number, times 2^`fraction`, rounded down; any value for zero. The first bits of a
+/// float are one, without a branch.
 #[inline(always)]
 pub(crate) fn scaled_log(value: u32, fraction: u32) -> u32 {
-    // Of two bits four apart one is cleared, lest rounding carries into the bits that count (three at most).
+    // Of two bits four apart one is cleared, so that rounding does not carry into the significant bits (three at most).
     let value = value & !(value >> 4);
     ((value as f32).to_bits() >> (23 - fraction)).wrapping_sub(127 << fraction)
 }
 
-/// [`half_octave`] of small numbers, to be looked up.
+/// Lookup table of [`half_octave`] for small numbers.
 const HALF_OCTAVES: [u8; 1024] = {
     let mut contexts = [0; 1024];
     let mut unease = 0;
@@ -171,7 +171,7 @@ const HALF_OCTAVES: [u8; 1024] = {
     contexts
 };
 
-impl Sample for u16 {
+impl PlaneSample for u16 {
     #[inline(always)]
     fn residual<P: Predictor>(self, a: Self, b: Self, c: Self, d: Self) -> u32 {
         zigzag(i32::from(self) - guess::<P>(a.into(), b.into(), c.into(), d.into()))
@@ -209,7 +209,7 @@ impl Sample for u16 {
     }
 
     #[inline(always)]
-    fn context_of_many(unease: u32) -> u16 {
+    fn branchless_context(unease: u32) -> u16 {
         let unease = unease.min(1 << (EASE / 2));
         let context = if unease < 2 {
             unease
@@ -227,7 +227,7 @@ impl Sample for u16 {
     }
 }
 
-impl Sample for u32 {
+impl PlaneSample for u32 {
     #[inline(always)]
     fn residual<P: Predictor>(self, a: Self, b: Self, c: Self, d: Self) -> u32 {
         zigzag(self.wrapping_sub(wide_guess::<P>(a, b, c, d)) as i32)
@@ -262,7 +262,7 @@ impl Sample for u32 {
     }
 
     #[inline(always)]
-    fn context_of_many(unease: u32) -> u16 {
+    fn branchless_context(unease: u32) -> u16 {
         let context = if unease == 0 {
             0
         } else {
@@ -279,7 +279,7 @@ impl Sample for u32 {
     }
 }
 
-/// The guess modulo 2^32.
+/// Returns the prediction modulo 2^32.
 #[inline(always)]
 fn wide_guess<P: Predictor>(a: u32, b: u32, c: u32, d: u32) -> u32 {
     let mean = || (a & b).wrapping_add((a ^ b) >> 1);
@@ -348,12 +348,12 @@ mod tests {
         let edges = (2..32).flat_map(|bit| [(1u32 << bit) - 1, 1 << bit, 3 << (bit - 1)]);
         for unease in (0..300_000).chain(edges).chain([u32::MAX]) {
             assert_eq!(
-                u16::context_of_many(unease),
+                u16::branchless_context(unease),
                 u16::context(unease),
                 "{unease}"
             );
             assert_eq!(
-                u32::context_of_many(unease),
+                u32::branchless_context(unease),
                 u32::context(unease),
                 "{unease}"
             );
@@ -370,7 +370,7 @@ mod tests {
                 code /= 5 - index;
                 left.remove(choice)
             });
-            assert_eq!(middle_of_five(drawn), 3);
+            assert_eq!(median_of_five(drawn), 3);
         }
     }
 }

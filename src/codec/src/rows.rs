@@ -1,10 +1,10 @@
-//! What stands beside the colours of a picture, kept exactly where those are not: the bytes between a row's samples and
-//! the next row, and alpha.
+//! The bytes beside the colours of a picture, kept exact where the colours are lossy: the padding between rows, and
+//! alpha.
 
 use crate::Error;
 use crate::column::{put_packed, take_packed};
-use crate::layout::Image;
-use crate::wire::Cursor;
+use crate::layout::ImageLayout;
+use crate::wire::FrameCursor;
 
 /// Appends the last `step - row` bytes of every `step` bytes of `data`.
 pub(crate) fn put_padding(data: &[u8], row: usize, step: usize, out: &mut Vec<u8>) {
@@ -26,7 +26,7 @@ pub(crate) fn put_padding(data: &[u8], row: usize, step: usize, out: &mut Vec<u8
 
 /// Reads what [`put_padding`] wrote into `data`.
 pub(crate) fn take_padding(
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
     data: &mut [u8],
     row: usize,
     step: usize,
@@ -57,10 +57,10 @@ pub(crate) fn take_padding(
 }
 
 /// Appends the last of every four channels.
-pub(crate) fn put_alpha(data: &[u8], layout: &Image, out: &mut Vec<u8>) {
+pub(crate) fn put_alpha(data: &[u8], layout: &ImageLayout, out: &mut Vec<u8>) {
     let rows = data.chunks_exact(layout.step);
     let alpha: Vec<u8> = rows
-        .flat_map(|line| line[..layout.row()].iter().skip(3).step_by(4))
+        .flat_map(|line| line[..layout.row_bytes()].iter().skip(3).step_by(4))
         .copied()
         .collect();
     put_packed(&alpha, out);
@@ -68,9 +68,9 @@ pub(crate) fn put_alpha(data: &[u8], layout: &Image, out: &mut Vec<u8>) {
 
 /// Reads what [`put_alpha`] wrote into `data`.
 pub(crate) fn take_alpha(
-    input: &mut Cursor<'_>,
+    input: &mut FrameCursor<'_>,
     data: &mut [u8],
-    layout: &Image,
+    layout: &ImageLayout,
 ) -> Result<(), Error> {
     let count = layout.width * layout.height;
     let alpha = take_packed(input, count)?;
@@ -81,7 +81,7 @@ pub(crate) fn take_alpha(
         .chunks_exact_mut(layout.step)
         .zip(alpha.chunks_exact(layout.width))
     {
-        for (pixel, &alpha) in line[..layout.row()].chunks_exact_mut(4).zip(alpha) {
+        for (pixel, &alpha) in line[..layout.row_bytes()].chunks_exact_mut(4).zip(alpha) {
             pixel[3] = alpha;
         }
     }

@@ -1,19 +1,19 @@
-//! Floats that are integers in disguise: drivers divide or multiply what the sensor counted.
+//! Floats that are scaled integers: drivers divide or multiply the sensor's counts.
 
 use crate::Error;
 
-/// How a float was made from a whole number.
+/// The way a float was computed from an integer.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub(crate) struct Scale {
     name: u8,
-    /// The float is `multiple / divisor`; zero where `factor` counts.
+    /// The float is `multiple / divisor`, unless `factor` is not zero.
     divisor: f32,
-    /// When it is not zero, the float is `multiple · factor`.
+    /// If not zero, the float is `multiple · factor`.
     factor: f32,
 }
 
-/// From coarse to fine, so that the first that fits gives the smallest numbers. The position is the name on the wire:
-/// append only.
+/// From coarse to fine, so that the first one that fits gives the smallest numbers. The position is the name on the
+/// wire: append only.
 const SCALES: [(f32, f32); 26] = [
     (1.0, 0.0),
     (2.0, 0.0),
@@ -44,14 +44,14 @@ const SCALES: [(f32, f32); 26] = [
 ];
 
 impl Scale {
-    /// The multiple of what is none.
+    /// Value for floats that are no multiple.
     pub(crate) const NONE: i32 = i32::MIN;
-    /// Beyond this the product below is no longer good to half a multiple.
+    /// Beyond this the product below is no longer accurate to half a multiple.
     const LARGEST: f32 = 4_000_000.0;
-    /// Adding this rounds to a whole number: there is no room for less.
+    /// Adding this rounds to an integer: the mantissa has no room for fractions.
     const ROUND: f32 = 12_582_912.0;
 
-    pub(crate) fn named(name: u8) -> Result<Self, Error> {
+    pub(crate) fn from_name(name: u8) -> Result<Self, Error> {
         let &(divisor, factor) = SCALES
             .get(usize::from(name))
             .ok_or(Error::Corrupt("an unknown scale"))?;
@@ -66,7 +66,7 @@ impl Scale {
         self.name
     }
 
-    /// The float of a multiple.
+    /// Returns the float of a multiple, as bits.
     #[inline]
     pub(crate) fn value(self, multiple: i32) -> u32 {
         let multiple = multiple as f32;
@@ -78,13 +78,14 @@ impl Scale {
         value.to_bits()
     }
 
-    /// The multiple whose float has these very bits, or [`Scale::NONE`]. Without a branch, for the vectoriser.
+    /// Returns the multiple whose float has exactly these bits, or [`Scale::NONE`]. Without a branch, for the
+    /// vectoriser.
     #[inline(always)]
     pub(crate) fn multiple(self, bits: u32) -> i32 {
         let scaled = f32::from_bits(bits) * self.divisor;
-        // Not a number fails the comparison too.
+        // NaN fails the comparison, too.
         let near = scaled.abs() <= Self::LARGEST;
-        // The sum's last bits are the whole number; a conversion would look at what it cannot convert.
+        // The sum's last bits are the integer; a conversion would check for values that it cannot convert.
         let multiple = (scaled + Self::ROUND)
             .to_bits()
             .wrapping_sub(Self::ROUND.to_bits()) as i32;
@@ -95,7 +96,7 @@ impl Scale {
         }
     }
 
-    /// [`Scale::multiple`] of many.
+    /// Returns [`Scale::multiple`] of each.
     pub(crate) fn multiples(self, bits: &[u32]) -> Vec<i32> {
         let mut multiples = vec![0; bits.len()];
         // Whether to divide or multiply is decided once.
@@ -117,10 +118,10 @@ impl Scale {
         multiples
     }
 
-    /// The coarsest scale that nearly all of the floats measured are multiples of.
+    /// Returns the coarsest scale of which nearly all measured floats are multiples.
     pub(crate) fn find(bits: &[u32]) -> Option<Self> {
-        // Few are enough to tell: a chance multiple of a coarse scale is one in thousands.
-        // An odd step, lest all of a pattern's even values be taken.
+        // A few are enough: a chance multiple of a coarse scale is one in thousands. The step is odd, so that not all
+        // of a pattern's even values are taken.
         let step = (bits.len() / 96) | 1;
         let sample: Vec<u32> = bits
             .iter()
@@ -137,7 +138,7 @@ impl Scale {
             unfit.take(misses + 1).count() <= misses
         };
         (0..SCALES.len() as u8)
-            .filter_map(|name| Self::named(name).ok())
+            .filter_map(|name| Self::from_name(name).ok())
             .find(fits)
             .filter(|_| !sample.is_empty())
     }
@@ -150,12 +151,12 @@ mod tests {
     #[test]
     fn multiples_are_found_and_restored() {
         for name in 0..SCALES.len() as u8 {
-            let scale = Scale::named(name).unwrap();
+            let scale = Scale::from_name(name).unwrap();
             for multiple in [-70_000, -1, 1, 2, 3, 1001, 65_537, 1_000_003] {
                 assert_eq!(scale.multiple(scale.value(multiple)), multiple, "{scale:?}");
             }
         }
-        assert!(Scale::named(200).is_err());
+        assert!(Scale::from_name(200).is_err());
     }
 
     #[test]
@@ -177,7 +178,7 @@ mod tests {
 
     #[test]
     fn what_is_no_number_is_no_multiple() {
-        let scale = Scale::named(0).unwrap();
+        let scale = Scale::from_name(0).unwrap();
         for value in [f32::NAN, f32::INFINITY, 0.5, 1e9, -0.0] {
             assert_eq!(scale.multiple(value.to_bits()), Scale::NONE, "{value}");
         }

@@ -1,47 +1,47 @@
-//! One topic's encoder and decoder: their memory, and the frame around every body.
+//! Encoder and decoder of one topic: their state, and the frame around every body.
 //!
 //! Frame: `tag · version · sequence · length of the message · [checksum] · body`, the two numbers in base 128; the
-//! checksum is the message's CRC-32, little endian, where [`Codec::has_checksum`].
+//! checksum is the message's CRC-32, little endian, if [`Codec::has_checksum`].
 
 use crate::codec::Codec;
-use crate::generic::{self, Zstd};
+use crate::generic::{self, ZstdCompressor};
 use crate::jpeg::{self, JpegOptions};
-use crate::layout::{Cloud, Grid, Image, Scan, Schema};
+use crate::layout::{CloudLayout, GridLayout, ImageLayout, ScanLayout, Schema};
 use crate::video::{VideoDecoder, VideoEncoder, VideoOptions};
-use crate::wire::{Cursor, put_varint};
+use crate::wire::{FrameCursor, put_varint};
 use crate::{Error, cloud, grid, image, scan};
 
-/// What became of a message.
+/// Description of an encoded frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Encoded {
-    /// The codec used: the one asked for, or what it fell back to.
+pub struct EncodedFrame {
+    /// The codec used: the requested one, or its fallback.
     pub codec: Codec,
-    /// The frame's number.
+    /// Sequence number of the frame.
     pub sequence: u64,
-    /// The frame's size in bytes.
+    /// Size of the frame in bytes.
     pub bytes: usize,
 }
 
 /// Encodes the messages of one topic, in order.
 ///
-/// Every message can be encoded with any codec, at any time: a frame tells its own. A message that does not fit a codec
-/// (another type, an unusual layout) falls back to zstd, and what does not get smaller goes as it is.
+/// Every message can be encoded with any codec at any time: a frame names its own. A message that does not fit a codec
+/// (another type, an unusual layout) falls back to zstd, and what does not get smaller is sent unchanged.
 #[derive(Debug)]
 pub struct Encoder {
     schema: Schema,
     sequence: u64,
-    zstd: Zstd,
+    zstd: ZstdCompressor,
     jpeg: Option<JpegOptions>,
     video: Option<VideoEncoder>,
 }
 
 impl Encoder {
-    /// An encoder for messages of `schema`. Lossy codecs fall back until they are allowed.
+    /// Creates an encoder for messages of `schema`. Lossy codecs fall back until they are allowed.
     pub fn new(schema: Schema) -> Self {
         Self {
             schema,
             sequence: 0,
-            zstd: Zstd::default(),
+            zstd: ZstdCompressor::default(),
             jpeg: None,
             video: None,
         }
@@ -61,13 +61,13 @@ impl Encoder {
         self
     }
 
-    /// What the messages are.
+    /// Returns the schema of the messages.
     pub fn schema(&self) -> Schema {
         self.schema
     }
 
     /// Appends the frame of `message` to `out`.
-    pub fn encode(&mut self, codec: Codec, message: &[u8], out: &mut Vec<u8>) -> Encoded {
+    pub fn encode(&mut self, codec: Codec, message: &[u8], out: &mut Vec<u8>) -> EncodedFrame {
         self.sequence += 1;
         let first = out.len();
         let mut used = codec;
@@ -80,14 +80,14 @@ impl Encoder {
         }
         let header = 2 + varint_size(self.sequence) + varint_size(message.len() as u64);
         let grown = out.len() - first - header >= message.len();
-        // A later frame of a video refers to this one, so it must arrive as it is.
+        // A later frame of a video refers to this one, so it must arrive unchanged.
         if grown && !matches!(used, Codec::Raw | Codec::Video) {
             used = Codec::Raw;
             out.truncate(first);
             self.put_header(used, message, out);
             out.extend_from_slice(message);
         }
-        Encoded {
+        EncodedFrame {
             codec: used,
             sequence: self.sequence,
             bytes: out.len() - first,
@@ -103,7 +103,7 @@ impl Encoder {
         }
     }
 
-    /// `None` when the message does not fit the codec; `out` may hold anything then.
+    /// Appends the body; `None` if the message does not fit the codec, with `out` undefined.
     fn put_body(&mut self, codec: Codec, message: &[u8], out: &mut Vec<u8>) -> Option<()> {
         let total = message.len();
         match (codec, self.schema) {
@@ -112,31 +112,41 @@ impl Encoder {
             (Codec::Deflate(level), _) => generic::deflate(message, level.into(), false, out),
             (Codec::Zstd(level), _) => self.zstd.compress(message, level.into(), out),
             (Codec::Image, Schema::Image) => {
-                image::encode(message, &Image::read(message, total)?, out)
+                image::encode(message, &ImageLayout::read(message, total)?, out)
             }
             (Codec::Grid, Schema::OccupancyGrid) => {
-                grid::encode(message, &Grid::read(message, total)?, &mut self.zstd, out);
+                grid::encode(
+                    message,
+                    &GridLayout::read(message, total)?,
+                    &mut self.zstd,
+                    out,
+                );
             }
             (Codec::Scan, Schema::LaserScan) => {
-                scan::encode(message, &Scan::read(message, total)?, out)?
+                scan::encode(message, &ScanLayout::read(message, total)?, out)?
             }
             (Codec::Cloud, Schema::PointCloud2) => {
-                cloud::encode(message, &Cloud::read(message, total)?, out)
+                cloud::encode(message, &CloudLayout::read(message, total)?, out)
             }
             (Codec::Jpeg, Schema::Image) => {
-                jpeg::encode(message, &Image::read(message, total)?, self.jpeg?, out)?;
+                jpeg::encode(
+                    message,
+                    &ImageLayout::read(message, total)?,
+                    self.jpeg?,
+                    out,
+                )?;
             }
             (Codec::Video, Schema::Image) => {
                 self.video
                     .as_mut()?
-                    .encode(message, &Image::read(message, total)?, out)?;
+                    .encode(message, &ImageLayout::read(message, total)?, out)?;
             }
             _ => return None,
         }
         Some(())
     }
 
-    /// The peer lost something: the next frame refers to none before it.
+    /// Requests a keyframe, because the peer lost a frame: the next frame refers to none before it.
     pub fn request_keyframe(&mut self) {
         if let Some(video) = &mut self.video {
             video.request_keyframe();
@@ -148,23 +158,23 @@ fn varint_size(value: u64) -> usize {
     (64 - (value | 1).leading_zeros() as usize).div_ceil(7)
 }
 
-/// What a frame was.
+/// Description of a decoded frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Decoded {
-    /// The codec; levels are not on the wire.
+pub struct DecodedFrame {
+    /// The codec; its level is not on the wire.
     pub codec: Codec,
-    /// The frame's number.
+    /// Sequence number of the frame.
     pub sequence: u64,
-    /// The message's size in bytes.
+    /// Size of the message in bytes.
     pub bytes: usize,
 }
 
 /// Decodes the frames of one topic, in order.
 ///
-/// None may declare a message of more bytes than the limit, and none makes it allocate more than sixteen times what
-/// it declares (two to four, usually) and two MiB of tables. What does not have the checksum that was sent is an error.
-/// After an error that asks for a keyframe (see [`Error::wants_keyframe`]) the sender's [`Encoder::request_keyframe`]
-/// puts things right; after one that wants another codec (see [`Error::wants_another_codec`]) another codec does.
+/// No frame may declare a message of more bytes than the limit, and none causes allocations of more than sixteen times
+/// the declared size (two to four, usually) and two MiB of tables. A message with a wrong checksum is an error. After
+/// an error that asks for a keyframe (see [`Error::wants_keyframe`]) call the sender's [`Encoder::request_keyframe`];
+/// after one that wants another codec (see [`Error::wants_another_codec`]) use another codec.
 #[derive(Debug)]
 pub struct Decoder {
     limit: usize,
@@ -172,7 +182,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// A decoder of messages of at most `limit` bytes.
+    /// Creates a decoder for messages of at most `limit` bytes.
     pub fn new(limit: usize) -> Self {
         Self {
             limit,
@@ -180,8 +190,8 @@ impl Decoder {
         }
     }
 
-    /// Appends the message of `frame` to `out`; on an error `out` is as before.
-    pub fn decode(&mut self, frame: &[u8], out: &mut Vec<u8>) -> Result<Decoded, Error> {
+    /// Appends the message of `frame` to `out`; on an error `out` is unchanged.
+    pub fn decode(&mut self, frame: &[u8], out: &mut Vec<u8>) -> Result<DecodedFrame, Error> {
         let first = out.len();
         let result = self.decode_frame(frame, out);
         if result.is_err() {
@@ -190,9 +200,9 @@ impl Decoder {
         result
     }
 
-    fn decode_frame(&mut self, frame: &[u8], out: &mut Vec<u8>) -> Result<Decoded, Error> {
-        let mut input = Cursor::new(frame);
-        let (decoded, version) = header(&mut input)?;
+    fn decode_frame(&mut self, frame: &[u8], out: &mut Vec<u8>) -> Result<DecodedFrame, Error> {
+        let mut input = FrameCursor::new(frame);
+        let (decoded, version) = read_header(&mut input)?;
         let (codec, total) = (decoded.codec, decoded.bytes);
         if version != codec.version() {
             return Err(Error::Version {
@@ -238,20 +248,20 @@ impl Decoder {
     }
 }
 
-/// A frame's codec, number and message size without decoding it: what a queue needs to know.
-pub fn peek(frame: &[u8]) -> Result<Decoded, Error> {
-    header(&mut Cursor::new(frame)).map(|(decoded, _)| decoded)
+/// Returns a frame's codec, number and message size without decoding it, for queues.
+pub fn peek(frame: &[u8]) -> Result<DecodedFrame, Error> {
+    read_header(&mut FrameCursor::new(frame)).map(|(decoded, _)| decoded)
 }
 
-/// Reads a header: what follows, and in which version.
-fn header(input: &mut Cursor<'_>) -> Result<(Decoded, u8), Error> {
+/// Reads a frame's header; returns its description and version.
+fn read_header(input: &mut FrameCursor<'_>) -> Result<(DecodedFrame, u8), Error> {
     let tag = input.byte()?;
-    let codec = Codec::of_tag(tag).ok_or(Error::UnknownTag(tag))?;
+    let codec = Codec::from_tag(tag).ok_or(Error::UnknownTag(tag))?;
     let version = input.byte()?;
     let sequence = input.varint()?;
     let bytes = usize::try_from(input.varint()?).unwrap_or(usize::MAX);
     Ok((
-        Decoded {
+        DecodedFrame {
             codec,
             sequence,
             bytes,

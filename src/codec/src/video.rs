@@ -1,8 +1,8 @@
-//! Colour pictures as H.264: the pixels are lossy, so it is only used where the robot's configuration allows it. All
-//! other bytes of the message are exact, alpha included.
+//! Codec for colour pictures as H.264: the pixels are lossy, so it is only used if the robot's configuration allows it.
+//! All other bytes of the message are exact, alpha included.
 //!
-//! Every frame but a keyframe refers to the one before. The decoder notices a gap and asks for a keyframe; so does one
-//! that starts late.
+//! Every frame but a keyframe refers to the one before. The decoder detects a gap and asks for a keyframe; so does a
+//! decoder that starts late.
 //!
 //! Body: `head · padding · number · key? · [alpha] · H.264 (Annex B)`.
 
@@ -14,13 +14,13 @@ mod guard;
 mod h264;
 
 use crate::Error;
-use crate::layout::Image;
-use crate::wire::Cursor;
+use crate::layout::ImageLayout;
+use crate::wire::FrameCursor;
 
-/// How much may be lost.
+/// Settings of the video encoder.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct VideoOptions {
-    /// H.264's quantiser, 0 (best) to 51 (smallest). Six more halve the detail kept; 22 is hard to tell from the
+    /// Quantiser of H.264, 0 (best) to 51 (smallest). Six more halve the detail kept; 22 is hard to tell from the
     /// original.
     pub quantiser: u8,
 }
@@ -31,7 +31,7 @@ impl Default for VideoOptions {
     }
 }
 
-/// The encoder's memory.
+/// State of the encoder.
 #[derive(Debug)]
 pub(crate) struct VideoEncoder {
     #[cfg(feature = "video")]
@@ -47,12 +47,12 @@ impl VideoEncoder {
         }
     }
 
-    /// Appends the body of `message`; `None` when it is no colour picture or the library refuses it.
+    /// Appends the body of `message`; `None` if it is no colour picture or the library refuses it.
     #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
     pub(crate) fn encode(
         &mut self,
         message: &[u8],
-        layout: &Image,
+        layout: &ImageLayout,
         out: &mut Vec<u8>,
     ) -> Option<()> {
         #[cfg(feature = "video")]
@@ -61,14 +61,14 @@ impl VideoEncoder {
         None
     }
 
-    /// The next frame refers to none.
+    /// Makes the next frame a keyframe.
     pub(crate) fn request_keyframe(&mut self) {
         #[cfg(feature = "video")]
         self.inner.request_keyframe();
     }
 }
 
-/// The decoder's memory.
+/// State of the decoder.
 #[derive(Debug, Default)]
 pub(crate) struct VideoDecoder {
     #[cfg(feature = "video")]
@@ -76,11 +76,11 @@ pub(crate) struct VideoDecoder {
 }
 
 impl VideoDecoder {
-    /// Appends a message of `total` bytes to `out`.
+    /// Decodes a message of `total` bytes and appends it to `out`.
     #[cfg_attr(not(feature = "video"), allow(unused_variables, clippy::ptr_arg))]
     pub(crate) fn decode(
         &mut self,
-        input: &mut Cursor<'_>,
+        input: &mut FrameCursor<'_>,
         total: usize,
         out: &mut Vec<u8>,
     ) -> Result<(), Error> {

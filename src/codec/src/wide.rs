@@ -1,28 +1,28 @@
-//! Planes and sequences of 16- or 32-bit samples, some of which may be missing.
+//! Codec for planes and sequences of 16- or 32-bit samples, some of which may be missing.
 //!
 //! A difference is coded as a *token*, its size to about two bits, in a context of its surroundings; the bits below
-//! follow plainly, for they are noise. A missing sample (no echo, NaN) is a token of its own: its place takes
-//! the value left of it, so that prediction goes on undisturbed on the other side.
+//! follow uncoded, since they are noise. A missing sample (no echo, NaN) has a token of its own: it takes the value to
+//! its left, so that prediction continues undisturbed beyond it.
 //!
 //! Layout: `predictor · tables`, then per lane `tokens · plain bits`, each preceded by its length.
 
 mod decode;
 
 use crate::entropy::bits::BitWriter;
-use crate::entropy::counts::{CONTEXTS, Order};
-use crate::entropy::tans::{Encoder, Histogram};
+use crate::entropy::counts::{CONTEXTS, SymbolOrder};
+use crate::entropy::tans::{Histogram, TansEncoder};
 use crate::padded::{Lanes, Padded};
-use crate::predict::{EASE, Kind, Predictor, Sample, scaled_log, with_predictor};
+use crate::predict::{EASE, Kind, PlaneSample, Predictor, scaled_log, with_predictor};
 use crate::wire::put_block;
 
-/// The token of a missing sample.
+/// Token of a missing sample.
 const MISSING: u8 = LAST_TOKEN as u8 + 1;
 /// Differences below this are their own token; above it there are four tokens per octave.
 const EXACT: u32 = 16;
-/// The token of the largest difference.
+/// Token of the largest difference.
 const LAST_TOKEN: usize = 16 + 27 * 4 + 3;
 
-/// Per token: the smallest difference, and how many plain bits tell the rest.
+/// Per token: the smallest difference, and the number of plain bits for the rest.
 const RESIDUALS: [(u32, u32); 256] = {
     let mut residuals = [(0, 0); 256];
     let mut token = 0;
@@ -38,9 +38,10 @@ const RESIDUALS: [(u32, u32); 256] = {
     residuals
 };
 
-/// A difference's token, and how many of its low bits follow plainly, in arithmetic that the vectoriser can use.
+/// Returns a difference's token, and the number of its low bits that follow plainly, in arithmetic that the vectoriser
+/// can use.
 #[inline(always)]
-fn token(residual: u32) -> (u32, u32) {
+fn tokenise(residual: u32) -> (u32, u32) {
     let log = scaled_log(residual, 2);
     if residual < EXACT {
         (residual, 0)
@@ -49,11 +50,11 @@ fn token(residual: u32) -> (u32, u32) {
     }
 }
 
-/// The shift that merges all contexts into one.
+/// Shift that merges all contexts into one.
 const ALL: u32 = CONTEXTS.ilog2();
 
-/// How many neighbouring contexts are merged into one (as a shift): tables cost bytes, and time.
-fn merge(samples: usize) -> u32 {
+/// Returns how many neighbouring contexts are merged into one (as a shift): tables cost bytes and time.
+fn merge_shift(samples: usize) -> u32 {
     match samples {
         0..0x800 => ALL,
         0x800..0x1000 => 3,
@@ -69,8 +70,8 @@ pub(crate) struct Wide<T> {
     pub(crate) missing: Option<Lanes<u8>>,
 }
 
-impl<T: Sample> Wide<T> {
-    /// Gives every missing sample the value left of it.
+impl<T: PlaneSample> Wide<T> {
+    /// Gives every missing sample the value to its left.
     fn bridge(&mut self) {
         let Some(missing) = &mut self.missing else {
             return;
@@ -92,8 +93,8 @@ impl<T: Sample> Wide<T> {
     pub(crate) fn encode(&mut self, kinds: &[Kind], out: &mut Vec<u8>) {
         self.bridge();
         self.samples.close();
-        let kind = self.choose(kinds);
-        let shift = merge(self.samples.count());
+        let kind = self.choose_predictor(kinds);
+        let shift = merge_shift(self.samples.count());
         out.push(kind as u8);
         let mut histogram = Histogram::new(CONTEXTS >> shift);
         let mut keys = Vec::with_capacity(self.samples.lanes.len());
@@ -110,7 +111,7 @@ impl<T: Sample> Wide<T> {
             keys.push(lane);
             plain.push(bits.finish());
         }
-        let encoder = Encoder::new(histogram, Order::Natural, out);
+        let encoder = TansEncoder::new(histogram, SymbolOrder::Natural, out);
         for group in self.samples.groups() {
             let first = group.start;
             let mut put = |lanes: &[Vec<u8>]| {
@@ -127,9 +128,10 @@ impl<T: Sample> Wide<T> {
         }
     }
 
-    /// The predictor whose differences take the fewest bits on some rows of a picture, or the beginning of a sequence.
-    fn choose(&self, kinds: &[Kind]) -> Kind {
-        /// Samples of a row that are looked at.
+    /// Returns the predictor whose differences take the fewest bits on some rows of a picture, or at the start of a
+    /// sequence.
+    fn choose_predictor(&self, kinds: &[Kind]) -> Kind {
+        /// Number of samples of a row to look at.
         const SOME: usize = 40;
         if let [only] = kinds {
             return *only;
@@ -155,7 +157,7 @@ impl<T: Sample> Wide<T> {
     }
 }
 
-/// In the first row of a picture there is nothing above to guess from.
+/// Returns the predictor for a row: in the first row of a picture there is nothing above to predict from.
 fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
     if y == 0 && height > 1 && kind != Kind::Zero {
         Kind::West
@@ -164,7 +166,7 @@ fn row_kind(kind: Kind, y: usize, height: usize) -> Kind {
     }
 }
 
-fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize, some: usize) -> u64 {
+fn row_cost<P: Predictor, T: PlaneSample>(plane: &Padded<T>, y: usize, some: usize) -> u64 {
     let length = plane.width.min(some);
     let [a, b, c, d, v] = plane.neighbours(y).map(|row| &row[..length]);
     let mut sum = 0u32;
@@ -179,14 +181,14 @@ fn row_cost<P: Predictor, T: Sample>(plane: &Padded<T>, y: usize, some: usize) -
     sum.into()
 }
 
-/// The context where the neighbour left (1) or above (2) is missing, or both.
+/// Returns the context if the neighbour left (1) or above (2) is missing, or both.
 #[inline(always)]
 fn gap_context(left: u8, above: u8) -> u16 {
     EASE - 1 + u16::from(left != 0) + 2 * u16::from(above != 0)
 }
 
 #[inline(never)]
-fn row_keys<P: Predictor, T: Sample>(
+fn row_keys<P: Predictor, T: PlaneSample>(
     plane: &Padded<T>,
     gaps: Option<&Padded<u8>>,
     y: usize,
@@ -194,7 +196,7 @@ fn row_keys<P: Predictor, T: Sample>(
     keys: &mut [u16],
     plain: &mut BitWriter,
 ) {
-    /// Samples worked on at a time: first what the vectoriser can do, then the rest.
+    /// Number of samples processed at a time: first the part for the vectoriser, then the rest.
     const CHUNK: usize = 64;
     let width = keys.len();
     let rows = plane.neighbours(y).map(|row| &row[..width]);
@@ -213,16 +215,16 @@ fn row_keys<P: Predictor, T: Sample>(
         if shift != ALL {
             for x in 0..length {
                 let unease = T::unease::<P>(T::ease::<P>(b[x], c[x], d[x]), a[x], c[x]);
-                contexts[x] = T::context_of_many(unease);
+                contexts[x] = T::branchless_context(unease);
             }
         }
         for x in 0..length {
-            let (token, count) = token(residuals[x]);
+            let (token, count) = tokenise(residuals[x]);
             (tokens[x], counts[x]) = (token as u16, count as u8);
         }
         if let Some(gaps) = gaps {
             let [left, above, _, _, here] = gaps.map(|row| &row[range.clone()]);
-            // Where gaps begin and end nobody can foresee, so there is no branch on them.
+            // Gaps are unpredictable, so there is no branch on them.
             let mask = |yes: bool| 0u16.wrapping_sub(yes.into());
             for x in 0..length {
                 let gap = mask(here[x] != 0);
@@ -246,7 +248,7 @@ fn row_keys<P: Predictor, T: Sample>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::Cursor;
+    use crate::wire::FrameCursor;
 
     const PICTURE: [Kind; 6] = [
         Kind::West,
@@ -258,7 +260,7 @@ mod tests {
     ];
     const SEQUENCE: [Kind; 2] = [Kind::West, Kind::Line];
 
-    /// The token of a difference.
+    /// Returns the token of a difference.
     fn token_of(residual: u32) -> u8 {
         if residual < EXACT {
             return residual as u8;
@@ -270,17 +272,17 @@ mod tests {
     #[test]
     fn tokens_name_every_residual() {
         for residual in (0..70_000).chain([1 << 20, 1 << 31, u32::MAX]) {
-            let (token, count) = token(residual);
+            let (token, count) = tokenise(residual);
             let (smallest, bits) = RESIDUALS[token as usize];
             assert!(token as usize <= LAST_TOKEN && token == u32::from(token_of(residual)));
             assert_eq!(bits, count);
             assert!((smallest..=smallest + ((1u32 << bits) - 1)).contains(&residual));
-            // The bits that follow are the lowest ones as they are.
+            // The bits that follow are the lowest ones, unchanged.
             assert_eq!(smallest & ((1 << bits) - 1), 0);
         }
     }
 
-    fn round_trip<T: Sample + std::fmt::Debug>(
+    fn round_trip<T: PlaneSample + std::fmt::Debug>(
         shape: impl Fn() -> Lanes<T>,
         gaps: impl Fn() -> Option<Lanes<u8>>,
         kinds: &[Kind],
@@ -309,7 +311,7 @@ mod tests {
             samples: shape(),
             missing: gaps(),
         };
-        let mut input = Cursor::new(&bytes);
+        let mut input = FrameCursor::new(&bytes);
         back.decode(&mut input).unwrap();
         input.finish().unwrap();
         let gaps: Vec<u8> = back
@@ -399,7 +401,8 @@ mod tests {
                 missing: None,
             };
             assert!(
-                back.decode(&mut Cursor::new(&bytes[..length])).is_err(),
+                back.decode(&mut FrameCursor::new(&bytes[..length]))
+                    .is_err(),
                 "{length}"
             );
         }

@@ -1,8 +1,8 @@
-//! Little helpers for the bytes of a frame: varints out, a checked cursor in.
+//! Helpers for the bytes of a frame: varints out, a checked cursor in.
 
 use crate::Error;
 
-/// Appends `value` in base 128, low bits first.
+/// Appends `value` as a varint in base 128, low bits first.
 pub(crate) fn put_varint(out: &mut Vec<u8>, mut value: u64) {
     while value >= 0x80 {
         out.push(value as u8 | 0x80);
@@ -17,7 +17,7 @@ pub(crate) fn put_block(out: &mut Vec<u8>, bytes: &[u8]) {
     out.extend_from_slice(bytes);
 }
 
-/// Maps a signed difference to an unsigned one whose size grows with the difference's.
+/// Maps a signed difference to an unsigned one that grows with its magnitude.
 pub(crate) fn zigzag(value: i64) -> u64 {
     ((value << 1) ^ (value >> 63)) as u64
 }
@@ -27,22 +27,22 @@ pub(crate) fn unzigzag(value: u64) -> i64 {
     (value >> 1) as i64 ^ -((value & 1) as i64)
 }
 
-/// What stands around a message's big array.
+/// The bytes around a message's big array.
 #[derive(Clone, Copy)]
-pub(crate) struct Ends<'a> {
+pub(crate) struct MessageEnds<'a> {
     head: &'a [u8],
     tail: &'a [u8],
 }
 
-impl<'a> Ends<'a> {
-    /// Of both, one after the other; the tail begins at `head`.
-    pub(crate) fn of(both: &'a [u8], head: usize) -> Self {
+impl<'a> MessageEnds<'a> {
+    /// Creates the ends from a joined block; the tail begins at `head`.
+    pub(crate) fn from_joined(both: &'a [u8], head: usize) -> Self {
         let (head, tail) = both.split_at(head);
         Self { head, tail }
     }
 
-    /// The first `head` bytes of `message`, and the last `tail`.
-    pub(crate) fn around(message: &'a [u8], head: usize, tail: usize) -> Self {
+    /// Takes the first `head` bytes of `message`, and the last `tail`.
+    pub(crate) fn from_message(message: &'a [u8], head: usize, tail: usize) -> Self {
         Self {
             head: &message[..head],
             tail: &message[message.len() - tail..],
@@ -56,7 +56,7 @@ impl<'a> Ends<'a> {
         out.extend_from_slice(self.tail);
     }
 
-    /// Appends a message whose array is `data` zeros, which are to be replaced.
+    /// Appends a message whose array is `data` zeros, and returns that array to be overwritten.
     pub(crate) fn restore<'o>(&self, data: usize, out: &'o mut Vec<u8>) -> &'o mut [u8] {
         let first = out.len() + self.head.len();
         out.extend_from_slice(self.head);
@@ -80,11 +80,11 @@ impl<'a> Ends<'a> {
 
 /// Reads a frame from the front; every step is checked, none allocates.
 #[derive(Clone, Copy)]
-pub(crate) struct Cursor<'a> {
+pub(crate) struct FrameCursor<'a> {
     rest: &'a [u8],
 }
 
-impl<'a> Cursor<'a> {
+impl<'a> FrameCursor<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self { rest: bytes }
     }
@@ -102,7 +102,7 @@ impl<'a> Cursor<'a> {
         Ok(front)
     }
 
-    /// Everything that is left.
+    /// Returns all remaining bytes.
     pub(crate) fn take_rest(&mut self) -> &'a [u8] {
         std::mem::take(&mut self.rest)
     }
@@ -128,8 +128,8 @@ impl<'a> Cursor<'a> {
         Err(Error::Corrupt("a number of more than ten bytes"))
     }
 
-    /// A varint that must not exceed `limit`: the guard before every allocation.
-    pub(crate) fn bounded(&mut self, limit: usize) -> Result<usize, Error> {
+    /// Reads a varint that must not exceed `limit`: the check before every allocation.
+    pub(crate) fn bounded_varint(&mut self, limit: usize) -> Result<usize, Error> {
         let value = self.varint()?;
         usize::try_from(value)
             .ok()
@@ -137,13 +137,13 @@ impl<'a> Cursor<'a> {
             .ok_or(Error::Corrupt("a count larger than what it counts"))
     }
 
-    /// The counterpart of [`put_block`].
+    /// Reads what [`put_block`] wrote.
     pub(crate) fn block(&mut self) -> Result<&'a [u8], Error> {
-        let length = self.bounded(self.rest.len())?;
+        let length = self.bounded_varint(self.rest.len())?;
         self.take(length)
     }
 
-    /// Fails when bytes are left over: a frame is read to its end or not at all.
+    /// Fails if bytes are left over: a frame is read to its end or not at all.
     pub(crate) fn finish(self) -> Result<(), Error> {
         if self.rest.is_empty() {
             Ok(())
@@ -164,7 +164,7 @@ mod tests {
         for number in numbers {
             put_varint(&mut bytes, number);
         }
-        let mut cursor = Cursor::new(&bytes);
+        let mut cursor = FrameCursor::new(&bytes);
         for number in numbers {
             assert_eq!(cursor.varint().unwrap(), number);
         }
@@ -180,15 +180,15 @@ mod tests {
         put_varint(&mut bytes, 10);
         bytes.extend_from_slice(b"short");
         assert!(matches!(
-            Cursor::new(&bytes).block(),
+            FrameCursor::new(&bytes).block(),
             Err(Error::Corrupt(_))
         ));
         assert!(matches!(
-            Cursor::new(&[0x80; 12]).varint(),
+            FrameCursor::new(&[0x80; 12]).varint(),
             Err(Error::Corrupt(_))
         ));
         assert!(matches!(
-            Cursor::new(&[0x80]).varint(),
+            FrameCursor::new(&[0x80]).varint(),
             Err(Error::Truncated)
         ));
     }

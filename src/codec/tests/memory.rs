@@ -1,4 +1,4 @@
-//! What a decoder may cost: memory in proportion to the message declared, never more, whatever the frame says.
+//! Memory bounds of decoders: memory in proportion to the declared message, whatever the frame says.
 
 use codec::{Codec, Decoder, Encoder, Error, JpegOptions, Schema};
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -9,7 +9,7 @@ thread_local! {
     static PEAK: Cell<usize> = const { Cell::new(0) };
 }
 
-/// The system's allocator, counting what each thread holds.
+/// The system's allocator, counting the bytes that each thread holds.
 struct Counting;
 
 fn count(taken: usize, given: usize) {
@@ -49,7 +49,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// The result of `work`, and how much more than before was held at the worst moment.
+/// Returns the result of `work`, and the additional memory held at its peak.
 fn peak<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.with(Cell::get);
     PEAK.with(|peak| peak.set(before));
@@ -57,9 +57,9 @@ fn peak<T>(work: impl FnOnce() -> T) -> (T, usize) {
     (result, PEAK.with(Cell::get) - before)
 }
 
-/// Tables and contexts, whatever the message's size.
+/// Bytes for tables and contexts, independent of the message's size.
 const TABLES: usize = 2 << 20;
-/// Bytes held at the worst moment per byte of message: samples of one byte are worked on as numbers of two and four.
+/// Peak bytes per byte of message: samples of one byte are processed as numbers of two and four.
 const FACTOR: usize = 16;
 
 fn message(head: &[&[u8]], data: usize, tail: &[u8]) -> Vec<u8> {
@@ -122,7 +122,7 @@ fn messages() -> Vec<(Schema, Vec<u8>)> {
         (Schema::PointCloud2, cloud(&[("t", 0, 8)], 8, 1000, 100)),
         (Schema::PointCloud2, cloud(&[("rgb", 0, 7)], 4, 1000, 200)),
         (Schema::PointCloud2, cloud(&[], 3, 1000, 200)),
-        // Margins are largest beside columns of one.
+        // Margins are relatively largest with columns of width one.
         (Schema::PointCloud2, cloud(&[("i", 0, 2)], 1, 1, 300_000)),
         (Schema::PointCloud2, cloud(&[("r", 0, 4)], 2, 1, 200_000)),
         (Schema::PointCloud2, cloud(&[("x", 0, 7)], 4, 1, 100_000)),
@@ -133,7 +133,7 @@ fn messages() -> Vec<(Schema, Vec<u8>)> {
 fn decoding_takes_memory_in_proportion_to_the_message() {
     for (schema, message) in messages() {
         for codec in [
-            Codec::made_for(schema),
+            Codec::for_schema(schema),
             Codec::Zlib(1),
             Codec::Zstd(1),
             Codec::Raw,
@@ -162,7 +162,7 @@ fn decoding_takes_memory_in_proportion_to_the_message() {
 fn a_frame_that_lies_takes_no_more() {
     for (schema, message) in messages() {
         let mut frame = Vec::new();
-        Encoder::new(schema).encode(Codec::made_for(schema), &message, &mut frame);
+        Encoder::new(schema).encode(Codec::for_schema(schema), &message, &mut frame);
         // Cut short at many places, and with one byte changed.
         for part in (1..40).step_by(3) {
             let at = if part < 20 {

@@ -1,4 +1,4 @@
-//! What must hold for every message and every frame.
+//! Properties that hold for every message and every frame.
 
 use codec::{Codec, Decoder, Encoder, Error, JpegOptions, Schema, VideoOptions};
 use proptest::collection::vec;
@@ -24,7 +24,7 @@ const SCHEMAS: [Schema; 5] = [
 ];
 const LIMIT: usize = 1 << 22;
 
-/// How a message is serialized.
+/// Serialization format of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Ros1,
@@ -36,14 +36,14 @@ fn format() -> impl Strategy<Value = Format> {
     prop::sample::select(vec![Format::Ros1, Format::Cdr])
 }
 
-/// Fields of a ROS message, one after the other.
+/// Builder of a ROS message, field by field.
 struct Message {
     bytes: Vec<u8>,
     format: Format,
 }
 
 impl Message {
-    /// With a header, whose frame has a name of this length.
+    /// Starts with a header whose frame name has this length.
     fn new(format: Format, name: usize) -> Self {
         let first = match format {
             Format::Ros1 => [1, 0, 0, 0],
@@ -59,7 +59,7 @@ impl Message {
         self
     }
 
-    fn aligned(mut self, size: usize) -> Self {
+    fn align(mut self, size: usize) -> Self {
         while self.format == Format::Cdr && (self.bytes.len() - 4) % size != 0 {
             self.bytes.push(0);
         }
@@ -67,11 +67,11 @@ impl Message {
     }
 
     fn u32(self, value: u32) -> Self {
-        self.aligned(4).raw(&value.to_le_bytes())
+        self.align(4).raw(&value.to_le_bytes())
     }
 
     fn f64(self, value: f64) -> Self {
-        self.aligned(8).raw(&value.to_le_bytes())
+        self.align(8).raw(&value.to_le_bytes())
     }
 
     fn bytes(self, bytes: &[u8]) -> Self {
@@ -83,13 +83,13 @@ impl Message {
         self.bytes(&[text.as_bytes(), zero].concat())
     }
 
-    /// As it comes over the wire: in whole words.
-    fn whole(self) -> Vec<u8> {
-        self.aligned(4).bytes
+    /// Pads the message to whole words, as on the wire.
+    fn finish(self) -> Vec<u8> {
+        self.align(4).bytes
     }
 }
 
-/// Bytes that look like samples: smooth, with noise of some size.
+/// Returns bytes that look like samples: smooth, with noise of some size.
 fn samples(count: usize, seed: u64, noise: u8) -> Vec<u8> {
     let mut state = seed | 1;
     (0..count)
@@ -148,7 +148,7 @@ fn image() -> impl Strategy<Value = Vec<u8>> {
                     .u32(width as u32)
                     .string(encoding);
                 let message = message.raw(&[big_endian.into()]).u32(step as u32);
-                message.bytes(&samples(step * height, seed, noise)).whole()
+                message.bytes(&samples(step * height, seed, noise)).finish()
             },
         )
 }
@@ -181,7 +181,7 @@ fn grid() -> impl Strategy<Value = Vec<u8>> {
                 .u32(height as u32)
                 .f64(origin)
                 .raw(&[0; 48]);
-            message.bytes(&cells).whole()
+            message.bytes(&cells).finish()
         })
 }
 
@@ -209,8 +209,8 @@ fn scan() -> impl Strategy<Value = Vec<u8>> {
                     message.raw(&value.to_le_bytes())
                 })
         };
-        let message = Message::new(format, name).aligned(4).raw(&[1; 28]);
-        floats(floats(message, &ranges), &intensities).whole()
+        let message = Message::new(format, name).align(4).raw(&[1; 28]);
+        floats(floats(message, &ranges), &intensities).finish()
     })
 }
 
@@ -265,7 +265,7 @@ fn cloud() -> impl Strategy<Value = Vec<u8>> {
                     .u32(row as u32)
                     .bytes(&data)
                     .raw(&[1])
-                    .whole()
+                    .finish()
             },
         )
 }
@@ -286,7 +286,7 @@ fn any_message() -> impl Strategy<Value = (Schema, Vec<u8>)> {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
 
-    /// Whatever the message and the codec: it comes back bit by bit, and a frame is hardly larger than the message.
+    /// For any message and codec, the message is restored bit by bit, and a frame is hardly larger than the message.
     #[test]
     fn every_message_comes_back_from_every_codec((schema, message) in any_message()) {
         for codec in CODECS {
@@ -307,15 +307,17 @@ proptest! {
         }
     }
 
-    /// A message that is a byte off fits no codec of its own, or comes back all the same.
+    /// A message with a wrong byte fits no codec of its own, or is restored all the same.
     #[test]
-    fn a_damaged_message_comes_back((schema, mut message) in any_message(), at in any::<prop::sample::Index>(), bit in 0u8..8) {
+    fn a_damaged_message_comes_back(
+        (schema, mut message) in any_message(), at in any::<prop::sample::Index>(), bit in 0u8..8
+    ) {
         if !message.is_empty() {
             let at = at.index(message.len().min(200));
             message[at] ^= 1 << bit;
         }
         let mut frame = Vec::new();
-        Encoder::new(schema).encode(Codec::made_for(schema), &message, &mut frame);
+        Encoder::new(schema).encode(Codec::for_schema(schema), &message, &mut frame);
         let mut back = Vec::new();
         Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
         prop_assert_eq!(back, message);
@@ -323,9 +325,11 @@ proptest! {
 
     /// A damaged frame is an error or a message of the declared size, never a panic.
     #[test]
-    fn a_damaged_frame_does_no_harm((schema, message) in any_message(), damage in vec((any::<prop::sample::Index>(), any::<u8>()), 1..4)) {
+    fn a_damaged_frame_does_no_harm(
+        (schema, message) in any_message(), damage in vec((any::<prop::sample::Index>(), any::<u8>()), 1..4)
+    ) {
         let mut frame = Vec::new();
-        Encoder::new(schema).encode(Codec::made_for(schema), &message, &mut frame);
+        Encoder::new(schema).encode(Codec::for_schema(schema), &message, &mut frame);
         for (at, byte) in damage {
             let at = at.index(frame.len());
             frame[at] = byte;
@@ -338,7 +342,7 @@ proptest! {
     }
 }
 
-/// A moving scene of 64×48 pixels.
+/// Returns a picture of a moving scene of 64×48 pixels.
 fn scene(encoding: &str, channels: usize, round: usize) -> Vec<u8> {
     scene_in(Format::Ros1, encoding, channels, round)
 }
@@ -366,10 +370,10 @@ fn scene_in(format: Format, encoding: &str, channels: usize, round: usize) -> Ve
         .raw(&[0])
         .u32((width * channels + padding) as u32)
         .bytes(&data)
-        .whole()
+        .finish()
 }
 
-/// Messages as nodes send them have frames of their own codec, in both formats and whatever fills the last word.
+/// Messages as nodes send them use the codec of their type, in both formats and with any padding.
 #[test]
 fn each_schema_is_told_by_its_own_codec_in_both_formats() {
     for format in [Format::Ros1, Format::Cdr] {
@@ -385,7 +389,7 @@ fn each_schema_is_told_by_its_own_codec_in_both_formats() {
                 .bytes(&cells);
             let grid = message().u32(1).u32(2).u32(3).u32(21);
             let grid = grid.u32(3 + length as u32).f64(1.0).raw(&[0; 48]);
-            let scan = message().aligned(4).raw(&[1; 28]);
+            let scan = message().align(4).raw(&[1; 28]);
             let scan = scan.u32(64).raw(&samples(256, 3, 0)).u32(0);
             let field =
                 |message: Message, name, offset| message.string(name).u32(offset).raw(&[7]).u32(1);
@@ -397,8 +401,8 @@ fn each_schema_is_told_by_its_own_codec_in_both_formats() {
                 (Schema::LaserScan, scan),
                 (Schema::PointCloud2, cloud.raw(&[1])),
             ] {
-                let (message, mut frame) = (message.whole(), Vec::new());
-                let made = Codec::made_for(schema);
+                let (message, mut frame) = (message.finish(), Vec::new());
+                let made = Codec::for_schema(schema);
                 let encoded = Encoder::new(schema).encode(made, &message, &mut frame);
                 assert_eq!(encoded.codec, made, "{format:?}, {schema:?}, {length}");
                 let mut back = Vec::new();
@@ -422,8 +426,8 @@ fn what_is_lossy_is_never_used_unless_allowed() {
     }
 }
 
-/// A scene after it was decoded: all but the colours is as it was, and those differ by less than `most`.
-fn assert_seen(back: &[u8], message: &[u8], channels: usize, most: u8) {
+/// Checks a decoded scene: everything but the colours is unchanged, and those differ by less than `most`.
+fn assert_lossy(back: &[u8], message: &[u8], channels: usize, most: u8) {
     let colours = channels.min(3);
     assert_eq!(back.len(), message.len());
     let head = message.len() - 48 * (64 * channels + 5);
@@ -473,7 +477,7 @@ fn jpeg_keeps_all_but_the_colours_and_each_picture_stands_alone() {
             before = frame.len();
             let mut back = Vec::new();
             Decoder::new(LIMIT).decode(&frame, &mut back).unwrap();
-            assert_seen(&back, &message, channels, most);
+            assert_lossy(&back, &message, channels, most);
         }
     }
 }
@@ -511,7 +515,7 @@ fn a_jpeg_that_is_cut_changed_or_of_another_size_is_refused_or_a_picture() {
             out.clear();
         }
     }
-    // One that tells of a far larger picture: the library never sees it.
+    // A stream that declares a far larger picture: the library never sees it.
     let at = frame.windows(2).position(|pair| pair == [0xff, 0xc0]);
     let size = at.unwrap() + 5;
     frame[size..size + 4].copy_from_slice(&[0xff; 4]);
@@ -551,7 +555,7 @@ fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
                 continue;
             }
             decoded.unwrap();
-            assert_seen(&back, &message, channels, 40);
+            assert_lossy(&back, &message, channels, 40);
         }
     }
 }
@@ -561,7 +565,7 @@ fn video_keeps_all_but_the_colours_and_recovers_from_loss() {
 fn a_build_without_video_falls_back() {
     let message = scene("rgb8", 3, 0);
     let mut encoder = Encoder::new(Schema::Image).allow_video(VideoOptions::default());
-    assert!(!Codec::Video.is_built());
+    assert!(!Codec::Video.is_available());
     assert_eq!(
         encoder
             .encode(Codec::Video, &message, &mut Vec::new())

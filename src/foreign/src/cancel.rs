@@ -1,7 +1,8 @@
-//! Cancels blocking work.
+//! Cancellation of blocking work.
 //!
-//! Packing, hashing and extracting run for minutes on threads of their own, several calls deep. Whoever starts such a
-//! thread runs the work under a [`Cancel`]; the loops in it call [`check`], which reads the `Cancel` of the current thread.
+//! Packing, hashing and extracting run for minutes on their own threads, several calls deep. The caller that starts
+//! such a thread runs the work with [`Cancel::run`]; its loops call [`check`], which reads the `Cancel` of the current
+//! thread.
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -11,45 +12,45 @@ thread_local! {
     static CURRENT: RefCell<Option<Cancel>> = const { RefCell::new(None) };
 }
 
-/// A flag that cancels work. Clones share the flag.
+/// A cancellation flag. Clones share it.
 #[derive(Debug, Clone, Default)]
 pub struct Cancel(Arc<AtomicBool>);
 
-/// Cancels when it is dropped.
+/// Guard that cancels the work when it is dropped.
 #[derive(Debug)]
 #[must_use = "dropping it cancels"]
 pub struct CancelOnDrop(Cancel);
 
-/// The error of cancelled work.
+/// Error of work that was cancelled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("it was cancelled")]
 pub struct Cancelled;
 
 impl From<Cancelled> for std::io::Error {
     fn from(cancelled: Cancelled) -> Self {
-        // Not `Interrupted`: that is tried again.
+        // Not `Interrupted`, since callers retry that.
         std::io::Error::other(cancelled)
     }
 }
 
 impl Cancel {
-    /// From now on [`check`] fails in all work under it.
+    /// Cancels: from now on [`check`] fails in all work that runs with this flag.
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Whether it was cancelled.
+    /// Returns whether it was cancelled.
     pub fn is_cancelled(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 
-    /// A guard that cancels when it is dropped.
-    pub fn on_drop(&self) -> CancelOnDrop {
+    /// Returns a guard that cancels when it is dropped.
+    pub fn drop_guard(&self) -> CancelOnDrop {
         CancelOnDrop(self.clone())
     }
 
-    /// Does `work` on this thread, under this flag. Afterwards the thread has the flag that it had before.
-    pub fn during<T>(&self, work: impl FnOnce() -> T) -> T {
+    /// Runs `work` on this thread with this flag, and restores the thread's previous flag afterwards.
+    pub fn run<T>(&self, work: impl FnOnce() -> T) -> T {
         struct Restore(Option<Cancel>);
         impl Drop for Restore {
             fn drop(&mut self) {
@@ -67,12 +68,12 @@ impl Drop for CancelOnDrop {
     }
 }
 
-/// The flag that the current thread works under, for threads that it starts to work under it, too.
+/// Returns the flag of the current thread, to be passed on to threads that it starts.
 pub fn current() -> Option<Cancel> {
     CURRENT.with_borrow(Option::clone)
 }
 
-/// Fails if the work of the current thread was cancelled.
+/// Fails if the current thread's work was cancelled.
 pub fn check() -> Result<(), Cancelled> {
     let cancelled =
         CURRENT.with_borrow(|current| current.as_ref().is_some_and(Cancel::is_cancelled));
@@ -86,9 +87,9 @@ mod tests {
     #[test]
     fn work_hears_of_its_own_cancellation_only() {
         let (outer, inner) = (Cancel::default(), Cancel::default());
-        outer.during(|| {
-            let gone = inner.on_drop();
-            inner.during(|| {
+        outer.run(|| {
+            let gone = inner.drop_guard();
+            inner.run(|| {
                 assert_eq!(check(), Ok(()));
                 let current = current().expect("this one");
                 drop(gone);

@@ -1,25 +1,25 @@
-//! What can be wrong with a foreign tree.
+//! Errors of reading, walking or removing an untrusted tree.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::cancel::Cancelled;
 
-/// Why a foreign tree is not read, walked or removed any further.
+/// An error of reading, walking or removing an untrusted tree.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A system call failed.
     #[error("cannot {action} {path}: {source}", path = path.display())]
     File {
-        /// What was being done: "open", "read", "list".
+        /// Operation that failed: "open", "read", "list".
         action: &'static str,
         /// The file or directory.
         path: PathBuf,
-        /// The system's error.
+        /// Error of the system call.
         source: io::Error,
     },
     /// A file is larger than the caller allows.
-    #[error("{path} is larger than the {limit} bytes that are read of it", path = path.display())]
+    #[error("{path} is larger than the limit of {limit} bytes", path = path.display())]
     TooLarge {
         /// The file.
         path: PathBuf,
@@ -31,30 +31,30 @@ pub enum Error {
     TooDeep {
         /// The first directory that is too deep.
         path: PathBuf,
-        /// The most levels.
+        /// Maximum number of levels.
         limit: usize,
     },
-    /// A link, a directory, a pipe or a device stands where a file should.
+    /// A link, directory, pipe or device was found where a file is expected.
     #[error("{path} is not a regular file, or lies behind a symbolic link", path = path.display())]
     NotAFile {
-        /// What was to be read.
+        /// Path that was to be read.
         path: PathBuf,
     },
-    /// A name or a link that leads out of the tree.
+    /// A name or link leads out of the tree.
     #[error("{path} leads out of {root}", path = path.display(), root = root.display())]
     Outside {
-        /// What was to be read.
+        /// Path that was to be read.
         path: PathBuf,
-        /// The tree.
+        /// Root of the tree.
         root: PathBuf,
     },
-    /// Something is mounted in a tree that is to be removed; what is in the mount may be the host's.
+    /// A file system is mounted in a tree that is to be removed; its content may belong to the host.
     #[error(
         "a file system is mounted at {path}; detach it with `umount --lazy {path}`, and try again",
         path = path.display()
     )]
     Mounted {
-        /// Where it is mounted.
+        /// Mount point.
         path: PathBuf,
     },
     /// The work was cancelled.
@@ -75,7 +75,7 @@ impl Error {
 impl From<Error> for io::Error {
     fn from(error: Error) -> Self {
         match error {
-            // Whoever tells a full disk from other failures can go on doing so.
+            // Keeps the error code, so that callers can still recognise a full disk.
             Error::File { source, .. } if source.raw_os_error().is_some() => source,
             Error::Cancelled(cancelled) => cancelled.into(),
             other => io::Error::other(other),

@@ -1,19 +1,18 @@
-//! File trees whose content is not ours: what a push sent, what a container left, layers of images. In: a path of ours to
-//! the tree. Out: bytes of files, and entries, of this tree only.
+//! File trees with untrusted content: pushed sources, leftovers of containers, image layers. In: a trusted path to the
+//! tree. Out: bytes of files, and directory entries, of this tree only.
 //!
 //! ```text
-//!   path of ours ──Tree::open──▶ descriptor ──read──▶ bytes: beneath it, through no link, at most so many
+//!   path of ours ──Tree::open──▶ descriptor ──read──▶ bytes: beneath it, through no link, up to a limit
 //!                                    │
-//!                                    ├─────walk──▶ every entry: no recursion, a limit of depth, no link followed
-//!                                    └────remove─▶ nothing left: any depth, three open files at most
+//!                                    ├─────walk──▶ every entry: no recursion, limited depth, no link followed
+//!                                    └────remove─▶ everything removed: any depth, at most three open files
 //! ```
 //!
 //! In such a tree a name may be a symbolic link to anywhere, a device or a pipe, a file may be larger than memory, and
-//! directories may lie in each other by the thousand. Nothing here follows a link, leaves the tree, blocks on what it
-//! opens, reads more than it was told to, or uses the stack in proportion to the tree's depth. Calls block; [`cancel`]
-//! ends them early.
+//! directories may be nested thousands deep. Nothing here follows a link, leaves the tree, blocks when opening, reads
+//! more than its limit, or uses the stack in proportion to the tree's depth. Calls block; [`cancel`] ends them early.
 //!
-//! What strangers wrote is also printed: [`terminal`] makes text of theirs safe for that.
+//! Untrusted text is also printed: [`terminal`] makes it safe for that.
 
 #![forbid(unsafe_code)]
 
@@ -26,5 +25,5 @@ mod walk;
 
 pub use error::Error;
 pub use remove::remove;
-pub use tree::{File, Found, Tree};
-pub use walk::{Entry, MAX_DEPTH, Visit, walk, walk_changing};
+pub use tree::{DirectoryLookup, File, Tree};
+pub use walk::{MAX_DEPTH, Visit, WalkEntry, walk, walk_changing};

@@ -1,8 +1,8 @@
-//! Removing a tree of any depth.
+//! Removal of a tree of any depth.
 //!
-//! The standard library's `remove_dir_all` calls itself for each level and keeps a file open for each: fifteen thousand
-//! nested directories overflow a thread's stack, which ends the process. Here the way back to the parent is `..`, checked
-//! against the directory from which it was entered, so each level costs some bytes of the heap.
+//! The standard library's `remove_dir_all` recurses for each level and keeps a file open for each: fifteen thousand
+//! nested directories overflow a thread's stack, which ends the process. Here the way back to the parent is `..`,
+//! checked against the directory from which it was entered, so that a level costs only some bytes of the heap.
 
 use std::ffi::{CStr, CString};
 use std::os::fd::OwnedFd;
@@ -15,17 +15,18 @@ use crate::Error;
 use crate::tree::DIRECTORY;
 use crate::walk::names;
 
-/// Below this directory, through no link, and not into what is mounted there.
+/// Resolves below the directory only, through no link, and not into mounts.
 const HERE: ResolveFlags = ResolveFlags::BENEATH
     .union(ResolveFlags::NO_SYMLINKS)
     .union(ResolveFlags::NO_MAGICLINKS)
     .union(ResolveFlags::NO_XDEV);
 
-/// Removes `path` and all below it. Links are removed, not followed. A path that does not exist is no error. Directories that
-/// their owner may not write are made writable first.
+/// Removes `path` and everything below it. Links are removed, not followed. A path that does not exist is not an error.
+/// Directories that their owner may not write are made writable first.
 ///
 /// # Errors
-/// [`Error::Mounted`] where a file system is mounted in the tree; [`Error::File`] where directories are moved meanwhile, or a system call fails.
+/// [`Error::Mounted`] if a file system is mounted in the tree; [`Error::File`] if directories are moved meanwhile, or a
+/// system call fails.
 pub fn remove(path: &Path) -> Result<(), Error> {
     let failed = |action, error: Errno| Error::file(action, path, error);
     let above = match path.parent() {
@@ -36,7 +37,7 @@ pub fn remove(path: &Path) -> Result<(), Error> {
         return Err(failed("remove", Errno::INVAL));
     };
     let name = CString::new(name.as_encoded_bytes()).map_err(|_| failed("remove", Errno::INVAL))?;
-    // The way to the tree is ours.
+    // The path to the tree is trusted.
     let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
     let parent = match rustix::fs::open(above, flags, Mode::empty()) {
         Ok(parent) => parent,
@@ -51,17 +52,17 @@ struct Remover<'a> {
 }
 
 /// A directory that is being emptied.
-struct Level {
+struct RemovalLevel {
     name: CString,
-    /// Device and inode of the directory above it.
+    /// Device and inode of its parent directory.
     above: (u64, u64),
-    /// Directories in it that are left; everything else is gone.
+    /// Subdirectories still to be removed; everything else in it is gone.
     left: Vec<CString>,
 }
 
 impl Remover<'_> {
     fn run(&self, parent: OwnedFd, name: CString) -> Result<(), Error> {
-        let mut stack: Vec<Level> = Vec::new();
+        let mut stack: Vec<RemovalLevel> = Vec::new();
         let mut at = parent;
         let mut next = Some(name);
         loop {
@@ -69,7 +70,7 @@ impl Remover<'_> {
                 if let Some((directory, left)) = self.enter(&at, &name, &stack)? {
                     let above = identity(&self.stat(&at, &stack)?);
                     at = directory;
-                    stack.push(Level { name, above, left });
+                    stack.push(RemovalLevel { name, above, left });
                 }
             }
             let Some(level) = stack.last_mut() else {
@@ -83,27 +84,27 @@ impl Remover<'_> {
                 return Ok(());
             };
             let up = rustix::fs::openat(&at, c"..", DIRECTORY, Mode::empty())
-                .map_err(|error| self.failed("leave", &stack, &[&level.name], error))?;
+                .map_err(|error| self.error_at("leave", &stack, &[&level.name], error))?;
             if identity(&self.stat(&up, &stack)?) != level.above {
-                return Err(self.failed("leave", &stack, &[&level.name], Errno::STALE));
+                return Err(self.error_at("leave", &stack, &[&level.name], Errno::STALE));
             }
             at = up;
             match rustix::fs::unlinkat(&at, &level.name, AtFlags::REMOVEDIR) {
                 Ok(()) | Err(Errno::NOENT) => {}
-                Err(error) => return Err(self.failed("remove", &stack, &[&level.name], error)),
+                Err(error) => return Err(self.error_at("remove", &stack, &[&level.name], error)),
             }
         }
     }
 
-    /// Removes `name` unless it is a directory; of one, everything but directories. Gives the directory, and what is
-    /// left in it.
+    /// Removes `name` unless it is a directory; in a directory, removes everything but subdirectories. Returns the
+    /// directory and the names of its subdirectories.
     fn enter(
         &self,
         at: &OwnedFd,
         name: &CString,
-        stack: &[Level],
+        stack: &[RemovalLevel],
     ) -> Result<Option<(OwnedFd, Vec<CString>)>, Error> {
-        let failed = |action, error| self.failed(action, stack, &[name], error);
+        let failed = |action, error| self.error_at(action, stack, &[name], error);
         match rustix::fs::statat(at, name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) if FileType::from_raw_mode(stat.st_mode) == FileType::Directory => {}
             Ok(_) => {
@@ -118,7 +119,8 @@ impl Remover<'_> {
         let open = || rustix::fs::openat2(at, name, DIRECTORY, Mode::empty(), HERE);
         let directory = match open() {
             Err(Errno::ACCESS) => {
-                // Only somebody who is not root is ever refused; the second look says whether it was this.
+                // Only users other than root are ever refused; the second attempt tells whether permissions were the
+                // cause.
                 let _ = rustix::fs::chmodat(at, name, Mode::RWXU, AtFlags::empty());
                 open()
             }
@@ -138,39 +140,40 @@ impl Remover<'_> {
             }
             match removed {
                 Ok(()) | Err(Errno::NOENT) => {}
-                // What Linux says of a directory, and what POSIX does.
+                // Linux answers EISDIR for a directory, POSIX EPERM.
                 Err(Errno::ISDIR | Errno::PERM) => left.push(entry),
-                Err(error) => return Err(self.failed("remove", stack, &[name, &entry], error)),
+                Err(error) => return Err(self.error_at("remove", stack, &[name, &entry], error)),
             }
         }
-        // Removing a directory needs the right to write the one it is in.
+        // Removing a directory needs write permission on its parent.
         if !left.is_empty() && self.stat(&directory, stack)?.st_mode & 0o700 != 0o700 {
             let _ = rustix::fs::fchmod(&directory, Mode::RWXU);
         }
         Ok(Some((directory, left)))
     }
 
-    fn stat(&self, directory: &OwnedFd, stack: &[Level]) -> Result<Stat, Error> {
-        rustix::fs::fstat(directory).map_err(|error| self.failed("look at", stack, &[c"."], error))
+    fn stat(&self, directory: &OwnedFd, stack: &[RemovalLevel]) -> Result<Stat, Error> {
+        rustix::fs::fstat(directory)
+            .map_err(|error| self.error_at("look at", stack, &[c"."], error))
     }
 
-    /// The error of a system call about what has these names, one in another, below the directories of the stack.
-    fn failed(
+    /// Builds the error of a system call on the path made of `names`, below the directories of the stack.
+    fn error_at(
         &self,
         action: &'static str,
-        stack: &[Level],
+        stack: &[RemovalLevel],
         names: &[&CStr],
         error: Errno,
     ) -> Error {
         use std::os::unix::ffi::OsStrExt;
         let mut path = PathBuf::from(self.root);
         let above = stack.iter().map(|level| level.name.as_c_str());
-        // The first name is the root's own.
+        // The first name is that of the root itself.
         for name in above.chain(names.iter().copied()).skip(1) {
             path.push(std::ffi::OsStr::from_bytes(name.to_bytes()));
         }
         match error {
-            // A directory and a file that something is mounted on.
+            // XDEV for a directory, BUSY for a file that something is mounted on.
             Errno::XDEV | Errno::BUSY => Error::Mounted { path },
             error => Error::file(action, &path, error),
         }
@@ -198,7 +201,7 @@ mod tests {
             at = rustix::fs::openat(&at, "d", DIRECTORY, Mode::empty()).expect("opened");
         }
         drop(at);
-        // A small stack, so that one frame for each level would not fit.
+        // With a small stack, so that one frame per level would not fit.
         let removed = root.clone();
         std::thread::Builder::new()
             .stack_size(128 << 10)
@@ -229,7 +232,7 @@ mod tests {
         remove(&root.join("below/nothing")).expect("gone already");
     }
 
-    /// Mounts are seen by the test alone: it is told once more, in a mount namespace of its own.
+    /// The test runs itself once more in its own mount namespace, where only it sees the mounts.
     #[test]
     fn what_is_mounted_in_a_tree_stays_and_is_named() {
         const INSIDE: &str = "CLOUDROID_FOREIGN_PLACE";
@@ -255,7 +258,7 @@ mod tests {
         std::fs::create_dir(&outside).expect("made");
         std::fs::write(outside.join("f"), "the host's").expect("written");
         for (what, point) in [(&outside, "a/sys"), (&outside.join("f"), "f")] {
-            // What is no directory goes before anything else.
+            // Entries that are not directories are removed first.
             std::fs::write(root.join("f"), "").expect("written");
             let point = root.join(point);
             let mounted = Command::new("mount")

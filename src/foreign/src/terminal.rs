@@ -1,15 +1,15 @@
-//! Makes text from nodes, compilers and servers safe to print. Terminals interpret control sequences in text: these can rename the
-//! window, type on the command line, or make a line look like another one.
+//! Makes text from nodes, compilers and servers safe to print. Terminals interpret control sequences in text: these can
+//! rename the window, type on the command line, or make a line look like another one.
 //!
 //! Control characters are shown as visible text. Colours (SGR, `ESC [ … m`) are kept on a terminal, because compilers'
 //! colours are useful, and are reset at the end of their line.
 
 use std::borrow::Cow;
 
-/// How many characters of parameters a colour may have.
+/// Maximum length of a colour's parameters in characters.
 const LONGEST_COLOUR: usize = 32;
 
-/// `text` without control sequences. Line ends and tabs stay; colours stay if `colours`.
+/// Escapes control sequences in `text`. Line ends and tabs are kept; so are colours if `colours` is set.
 pub fn escape(text: &str, colours: bool) -> Cow<'_, str> {
     if !text.contains(is_dangerous) {
         return Cow::Borrowed(text);
@@ -41,7 +41,7 @@ pub fn escape(text: &str, colours: bool) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// JSON without control characters: those that JSON allows in its strings are written as `\u…`, which means the same.
+/// Escapes control characters that JSON allows in its strings as `\u…`; the meaning is the same.
 pub fn escape_json(json: &str) -> Cow<'_, str> {
     if !json.contains(is_dangerous) {
         return Cow::Borrowed(json);
@@ -57,13 +57,14 @@ pub fn escape_json(json: &str) -> Cow<'_, str> {
     Cow::Owned(out)
 }
 
-/// Control characters (C0, DEL, C1) except line ends and tabs, and characters that change the direction of text.
+/// Returns whether `c` is a control character (C0, DEL, C1) other than line end and tab, or changes the direction of
+/// text.
 fn is_dangerous(c: char) -> bool {
     (c.is_control() && c != '\n' && c != '\t')
         || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{200e}' | '\u{200f}' | '\u{61c}')
 }
 
-/// The colour that `text` begins with.
+/// Returns the colour sequence that `text` starts with.
 fn colour(text: &str) -> Option<&str> {
     let parameters = text.strip_prefix("\x1b[")?;
     let end = parameters.find(|c: char| !(c.is_ascii_digit() || c == ';'))?;
@@ -85,7 +86,7 @@ mod tests {
             ("\u{9b}31m\u{9d}0;x\u{9c}", "\\u{9b}31m\\u{9d}0;x\\u{9c}"),
             ("a\u{202e}b", "a\\u{202e}b"),
             ("back\x08\x7f", "back\\u{8}\\u{7f}"),
-            // Not ended, or not a colour.
+            // Unterminated, or not a colour.
             ("\x1b[31", "\\u{1b}[31"),
             ("\x1b[?25lm", "\\u{1b}[?25lm"),
         ] {

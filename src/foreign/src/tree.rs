@@ -1,4 +1,4 @@
-//! Reading single files of a tree.
+//! Reading of single files of a tree.
 
 use std::ffi::OsString;
 use std::io::Read;
@@ -33,28 +33,28 @@ pub struct Tree {
     path: PathBuf,
 }
 
-/// What is found at a path where a directory is expected.
+/// Result of looking up a path that should be a directory.
 #[derive(Debug)]
-pub enum Found {
+pub enum DirectoryLookup {
     /// A directory.
     Directory(Tree),
     /// A file, link, device or the like; or the path leads out of the tree.
     SomethingElse,
-    /// Nothing has that name.
+    /// There is no such entry.
     Nothing,
 }
 
-/// A regular file's content.
+/// Content of a regular file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct File {
     /// The whole content.
     pub bytes: Vec<u8>,
-    /// One of its execute bits is set.
+    /// One of the execute bits is set.
     pub executable: bool,
 }
 
 impl Tree {
-    /// Opens the tree's root. This path is ours and may contain links.
+    /// Opens the root of a tree. The path is trusted and may contain links.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         let directory = rustix::fs::open(path, flags, Mode::empty())
@@ -65,17 +65,17 @@ impl Tree {
         })
     }
 
-    /// The path of the tree, for messages only.
+    /// Returns the path of the tree, for messages only.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The descriptor.
+    /// Returns the descriptor of the directory.
     pub fn as_fd(&self) -> BorrowedFd<'_> {
         self.directory.as_fd()
     }
 
-    /// Another handle to the same directory.
+    /// Returns another handle to the same directory.
     pub fn try_clone(&self) -> Result<Self, Error> {
         let directory = self.directory.try_clone();
         Ok(Self {
@@ -84,8 +84,8 @@ impl Tree {
         })
     }
 
-    /// What is at `path` in this directory, where a directory is expected.
-    pub fn directory(&self, path: impl AsRef<Path>) -> Result<Found, Error> {
+    /// Opens the directory at `path` in this one.
+    pub fn open_directory(&self, path: impl AsRef<Path>) -> Result<DirectoryLookup, Error> {
         let shown = self.path.join(path.as_ref());
         match rustix::fs::openat2(
             &self.directory,
@@ -94,26 +94,26 @@ impl Tree {
             Mode::empty(),
             INSIDE,
         ) {
-            Ok(directory) => Ok(Found::Directory(Self {
+            Ok(directory) => Ok(DirectoryLookup::Directory(Self {
                 directory,
                 path: shown,
             })),
-            Err(Errno::NOENT) => Ok(Found::Nothing),
-            Err(error) if is_something_else(error) => Ok(Found::SomethingElse),
+            Err(Errno::NOENT) => Ok(DirectoryLookup::Nothing),
+            Err(error) if is_something_else(error) => Ok(DirectoryLookup::SomethingElse),
             Err(error) => Err(Error::file("open", &shown, error)),
         }
     }
 
-    /// The regular file at `path` in it, of at most `limit` bytes; none when nothing has the name.
+    /// Reads the regular file at `path`, of at most `limit` bytes; `None` if there is no such entry.
     ///
     /// # Errors
-    /// [`Error::NotAFile`] for anything that is not a regular file, or is behind a link, [`Error::Outside`] for a
-    /// path that leaves the tree; [`Error::TooLarge`] for a larger one, of which no more than the limit is read.
-    pub fn file(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
+    /// [`Error::NotAFile`] for anything that is not a regular file or is behind a link, [`Error::Outside`] for a path
+    /// that leaves the tree, [`Error::TooLarge`] for a file above the limit, of which no more than the limit is read.
+    pub fn read_file(&self, path: impl AsRef<Path>, limit: u64) -> Result<Option<File>, Error> {
         self.open_and_read(path.as_ref(), limit, INSIDE)
     }
 
-    /// Names in it, without `.` and `..`, in no order.
+    /// Returns the names in the directory, without `.` and `..`, unordered.
     pub fn names(&self) -> Result<Vec<OsString>, Error> {
         let names = crate::walk::names(&self.directory)
             .map_err(|error| Error::file("list", &self.path, error))?;
@@ -123,7 +123,7 @@ impl Tree {
             .collect())
     }
 
-    /// Whether a regular file is at `path`, behind no link.
+    /// Returns whether a regular file is at `path`, behind no link.
     pub fn has_file(&self, path: impl AsRef<Path>) -> bool {
         let flags = OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         rustix::fs::openat2(&self.directory, path.as_ref(), flags, Mode::empty(), INSIDE)
@@ -131,8 +131,8 @@ impl Tree {
             .is_ok_and(|stat| FileType::from_raw_mode(stat.st_mode) == FileType::RegularFile)
     }
 
-    /// The same, through symbolic links as long as they stay in the tree.
-    pub fn file_following(
+    /// Reads a file like [`Tree::read_file`], but follows symbolic links that stay in the tree.
+    pub fn read_file_following(
         &self,
         path: impl AsRef<Path>,
         limit: u64,
@@ -141,13 +141,13 @@ impl Tree {
         self.open_and_read(path.as_ref(), limit, resolve)
     }
 
-    /// The regular file at `path` in it, opened for reading; none when nothing has the name.
+    /// Opens the regular file at `path` for reading; `None` if there is no such entry.
     ///
     /// # Errors
-    /// As [`Tree::file`].
+    /// The same as those of [`Tree::read_file`].
     pub fn open_file(&self, path: impl AsRef<Path>) -> Result<Option<OwnedFd>, Error> {
         let path = path.as_ref();
-        let Some(file) = self.opened(path, INSIDE)? else {
+        let Some(file) = self.open_beneath(path, INSIDE)? else {
             return Ok(None);
         };
         let shown = self.path.join(path);
@@ -165,12 +165,12 @@ impl Tree {
         limit: u64,
         resolve: ResolveFlags,
     ) -> Result<Option<File>, Error> {
-        let file = self.opened(path, resolve)?;
+        let file = self.open_beneath(path, resolve)?;
         file.map(|file| read(file, &self.path.join(path), limit))
             .transpose()
     }
 
-    fn opened(&self, path: &Path, resolve: ResolveFlags) -> Result<Option<OwnedFd>, Error> {
+    fn open_beneath(&self, path: &Path, resolve: ResolveFlags) -> Result<Option<OwnedFd>, Error> {
         let shown = self.path.join(path);
         let flags = if resolve.contains(ResolveFlags::NO_SYMLINKS) {
             FILE
@@ -190,7 +190,8 @@ impl Tree {
     }
 }
 
-/// What `openat2` says where a name is a link, no directory, outside, or a device or socket that cannot be opened.
+/// Returns whether `openat2` failed because the name is a link, not a directory, outside the tree, or a device or
+/// socket that cannot be opened.
 pub(crate) fn is_something_else(error: Errno) -> bool {
     matches!(
         error,
@@ -198,7 +199,7 @@ pub(crate) fn is_something_else(error: Errno) -> bool {
     )
 }
 
-/// The bytes of an open regular file, at most `limit`.
+/// Reads an open regular file, of at most `limit` bytes.
 pub(crate) fn read(file: OwnedFd, path: &Path, limit: u64) -> Result<File, Error> {
     let stat = rustix::fs::fstat(&file).map_err(|error| Error::file("look at", path, error))?;
     if FileType::from_raw_mode(stat.st_mode) != FileType::RegularFile {
@@ -249,9 +250,9 @@ mod tests {
     #[test]
     fn nothing_is_read_but_what_is_in_the_tree() {
         let (_place, tree) = world();
-        let found = tree.file("d/f", 10).expect("read").expect("there");
+        let found = tree.read_file("d/f", 10).expect("read").expect("there");
         assert_eq!((&found.bytes[..], found.executable), (&b"mine"[..], false));
-        assert!(tree.file("d/none", 10).expect("looked").is_none());
+        assert!(tree.read_file("d/none", 10).expect("looked").is_none());
         let there = ["d/f", "d", "into/f", "out", "d/none"].map(|path| tree.has_file(path));
         assert_eq!(there, [true, false, false, false, false]);
         for path in [
@@ -264,7 +265,7 @@ mod tests {
             "d/../../secret",
             "magic",
         ] {
-            let refused = tree.file(path, 10).expect_err(path);
+            let refused = tree.read_file(path, 10).expect_err(path);
             let expected = if path.contains("..") || path.starts_with('/') {
                 matches!(refused, Error::Outside { .. })
             } else {
@@ -278,10 +279,10 @@ mod tests {
             ("x", "nothing"),
             ("d", "it"),
         ] {
-            let found = match tree.directory(path).expect(path) {
-                Found::Directory(_) => "it",
-                Found::SomethingElse => "else",
-                Found::Nothing => "nothing",
+            let found = match tree.open_directory(path).expect(path) {
+                DirectoryLookup::Directory(_) => "it",
+                DirectoryLookup::SomethingElse => "else",
+                DirectoryLookup::Nothing => "nothing",
             };
             assert_eq!(found, expected, "{path}");
         }
@@ -290,10 +291,10 @@ mod tests {
     #[test]
     fn links_that_stay_inside_are_followed_where_that_is_asked_for() {
         let (_place, tree) = world();
-        let found = tree.file_following("into/f", 10).expect("read");
+        let found = tree.read_file_following("into/f", 10).expect("read");
         assert_eq!(found.expect("there").bytes, b"mine");
         for path in ["out", "absolute", "magic/f"] {
-            tree.file_following(path, 10).expect_err(path);
+            tree.read_file_following(path, 10).expect_err(path);
         }
     }
 
@@ -301,9 +302,9 @@ mod tests {
     fn a_file_larger_than_allowed_is_not_read() {
         let (place, tree) = world();
         let file = std::fs::File::create(place.path().join("tree/sparse")).expect("made");
-        // Were it read, this test would end for want of memory.
+        // If the file were read, this test would run out of memory.
         file.set_len(1 << 42).expect("set");
-        let refused = tree.file("sparse", 1 << 20).expect_err("too large");
+        let refused = tree.read_file("sparse", 1 << 20).expect_err("too large");
         assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
     }
 
@@ -319,7 +320,7 @@ mod tests {
             0,
         )
         .expect("made");
-        let refused = tree.file("pipe", 10).expect_err("no file");
+        let refused = tree.read_file("pipe", 10).expect_err("no file");
         assert!(matches!(refused, Error::NotAFile { .. }), "{refused}");
     }
 }

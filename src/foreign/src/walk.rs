@@ -1,4 +1,4 @@
-//! Walking a tree, by descriptors and without recursion.
+//! Walking of a tree, by descriptors and without recursion.
 
 use std::ffi::{CString, OsStr};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -11,43 +11,43 @@ use rustix::io::Errno;
 use crate::tree::{DIRECTORY, FILE, INSIDE, is_something_else};
 use crate::{Error, cancel};
 
-/// The most levels of nested directories. Each level costs an open file while it is walked.
+/// Maximum nesting depth of directories. Each level costs an open file during the walk.
 pub const MAX_DEPTH: usize = 256;
 
-/// Whether a walk enters a directory.
+/// Decision of the visitor on how the walk goes on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Visit {
-    /// Its entries come next. Has no effect on other entries than directories.
+    /// Enters a directory: its entries come next. Has no effect on other entries.
     Into,
-    /// They are left out.
+    /// Skips the entries of a directory.
     Skip,
 }
 
 /// A file, directory, link or other entry of a tree.
 #[derive(Debug)]
-pub struct Entry<'a> {
+pub struct WalkEntry<'a> {
     parent: BorrowedFd<'a>,
     name: &'a CString,
-    /// Its path from the tree's root; empty for the root itself.
+    /// Path relative to the tree's root; empty for the root itself.
     pub path: &'a Path,
-    /// Its kind, mode, owner, size and times.
+    /// Type, mode, owner, size and times.
     pub stat: Stat,
     root: &'a Path,
 }
 
-impl Entry<'_> {
-    /// File, directory, link or another.
+impl WalkEntry<'_> {
+    /// Returns the type: file, directory, link or another.
     pub fn kind(&self) -> FileType {
         FileType::from_raw_mode(self.stat.st_mode)
     }
 
-    /// Its name in its directory.
+    /// Returns the name within its directory.
     pub fn name(&self) -> &OsStr {
         OsStr::from_bytes(self.name.as_bytes())
     }
 
-    /// Its path with that of the tree, for messages only: a name in it may have become a link meanwhile.
-    pub fn shown(&self) -> PathBuf {
+    /// Returns the full path, for messages only: a component of it may have become a link meanwhile.
+    pub fn display_path(&self) -> PathBuf {
         if self.path.as_os_str().is_empty() {
             self.root.to_owned()
         } else {
@@ -55,9 +55,9 @@ impl Entry<'_> {
         }
     }
 
-    /// The open file or directory, for reading: the one that was seen, or an error.
+    /// Opens the file or directory for reading: the one that was visited, or an error.
     pub fn open(&self) -> Result<std::fs::File, Error> {
-        let failed = |error: Errno| Error::file("open", &self.shown(), error);
+        let failed = |error: Errno| Error::file("open", &self.display_path(), error);
         let flags = if self.kind() == FileType::Directory {
             DIRECTORY
         } else {
@@ -67,32 +67,35 @@ impl Entry<'_> {
             .map_err(failed)?;
         let now = rustix::fs::fstat(&file).map_err(failed)?;
         if (now.st_dev, now.st_ino) != (self.stat.st_dev, self.stat.st_ino) {
-            return Err(Error::NotAFile { path: self.shown() });
+            return Err(Error::NotAFile {
+                path: self.display_path(),
+            });
         }
         Ok(file.into())
     }
 
-    /// Where a link leads.
-    pub fn link(&self) -> Result<Vec<u8>, Error> {
+    /// Returns the target of a link.
+    pub fn read_link(&self) -> Result<Vec<u8>, Error> {
         rustix::fs::readlinkat(self.parent, self.name, Vec::new())
             .map(CString::into_bytes)
-            .map_err(|error| Error::file("read the link", &self.shown(), error))
+            .map_err(|error| Error::file("read the link", &self.display_path(), error))
     }
 
-    /// The directory that it is in, and its name there: for calls that take these two and follow no link.
-    pub fn place(&self) -> (BorrowedFd<'_>, &CString) {
+    /// Returns the parent directory and the name in it, for calls that take these two and follow no link.
+    pub fn parent_and_name(&self) -> (BorrowedFd<'_>, &CString) {
         (self.parent, self.name)
     }
 }
 
-/// Shows `visit` the root and everything below it: a directory before its entries, those by their names' bytes.
+/// Calls `visit` for the root and everything below it: a directory before its entries, entries sorted by the bytes of
+/// their names.
 ///
 /// # Errors
 /// [`Error::TooDeep`] below [`MAX_DEPTH`] directories, the first error of the system or of `visit`, and
 /// [`Error::Cancelled`].
 pub fn walk<E: From<Error>>(
     root: &Path,
-    visit: impl FnMut(&Entry<'_>) -> Result<Visit, E>,
+    visit: impl FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
 ) -> Result<(), E> {
     Walker {
         root,
@@ -102,10 +105,11 @@ pub fn walk<E: From<Error>>(
     .run()
 }
 
-/// The same for a tree that other processes change meanwhile: entries that disappear after they were listed are skipped.
+/// Walks like [`walk`] a tree that other processes change meanwhile: entries that disappear after they were listed are
+/// skipped.
 pub fn walk_changing<E: From<Error>>(
     root: &Path,
-    visit: impl FnMut(&Entry<'_>) -> Result<Visit, E>,
+    visit: impl FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
 ) -> Result<(), E> {
     Walker {
         root,
@@ -121,23 +125,23 @@ struct Walker<'a, V> {
     visit: V,
 }
 
-/// A directory whose entries are being shown.
-struct Level {
+/// A directory whose entries are being visited.
+struct WalkLevel {
     directory: OwnedFd,
-    /// The last first.
+    /// Entries still to be visited, in reverse order.
     left: Vec<CString>,
 }
 
 impl<V> Walker<'_, V> {
     fn run<E: From<Error>>(mut self) -> Result<(), E>
     where
-        V: FnMut(&Entry<'_>) -> Result<Visit, E>,
+        V: FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
     {
         let mut path = PathBuf::new();
         let failed = |error: Errno| Error::file("open", self.root, error);
         let top = rustix::fs::open(self.root, DIRECTORY, Mode::empty()).map_err(failed)?;
         let here = c".".to_owned();
-        let entry = Entry {
+        let entry = WalkEntry {
             parent: top.as_fd(),
             name: &here,
             path: &path,
@@ -147,7 +151,7 @@ impl<V> Walker<'_, V> {
         if (self.visit)(&entry)? == Visit::Skip {
             return Ok(());
         }
-        let mut stack = vec![Level {
+        let mut stack = vec![WalkLevel {
             left: self.names(&top, &path)?,
             directory: top,
         }];
@@ -159,7 +163,7 @@ impl<V> Walker<'_, V> {
             };
             cancel::check().map_err(Error::from)?;
             path.push(OsStr::from_bytes(name.as_bytes()));
-            let below = self.child::<E>(&level.directory, &name, &path)?;
+            let below = self.visit_child::<E>(&level.directory, &name, &path)?;
             match below {
                 Some(_) if stack.len() >= MAX_DEPTH => {
                     return Err(Error::TooDeep {
@@ -168,7 +172,7 @@ impl<V> Walker<'_, V> {
                     }
                     .into());
                 }
-                Some(directory) => stack.push(Level {
+                Some(directory) => stack.push(WalkLevel {
                     left: self.names(&directory, &path)?,
                     directory,
                 }),
@@ -180,22 +184,22 @@ impl<V> Walker<'_, V> {
         Ok(())
     }
 
-    /// Shows one entry; a directory whose entries come next is given back.
-    fn child<E: From<Error>>(
+    /// Visits one entry; returns a directory whose entries are to be visited next.
+    fn visit_child<E: From<Error>>(
         &mut self,
         parent: &OwnedFd,
         name: &CString,
         path: &Path,
     ) -> Result<Option<OwnedFd>, E>
     where
-        V: FnMut(&Entry<'_>) -> Result<Visit, E>,
+        V: FnMut(&WalkEntry<'_>) -> Result<Visit, E>,
     {
         let stat = match rustix::fs::statat(parent, name, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) => stat,
             Err(Errno::NOENT) if self.changing => return Ok(None),
             Err(error) => return Err(Error::file("look at", &self.root.join(path), error).into()),
         };
-        let entry = Entry {
+        let entry = WalkEntry {
             parent: parent.as_fd(),
             name,
             path,
@@ -221,7 +225,7 @@ impl<V> Walker<'_, V> {
     }
 }
 
-/// Names in a directory, without `.` and `..`, in no order.
+/// Returns the names in a directory, without `.` and `..`, unordered.
 pub(crate) fn names(directory: &OwnedFd) -> Result<Vec<CString>, Errno> {
     let mut names = Vec::new();
     for entry in Dir::read_from(directory)? {
@@ -239,7 +243,7 @@ mod tests {
     use super::*;
     use crate::cancel::Cancel;
 
-    fn seen(root: &Path) -> Result<Vec<String>, Error> {
+    fn visited_paths(root: &Path) -> Result<Vec<String>, Error> {
         let mut seen = Vec::new();
         walk(root, |entry| {
             seen.push(entry.path.display().to_string());
@@ -262,7 +266,7 @@ mod tests {
         std::fs::write(place.path().join("b.txt"), "").expect("written");
         std::os::unix::fs::symlink("/", place.path().join("a")).expect("linked");
         let expected = ["", "a", "b", "b/c", "b/c/f", "b.txt", "skipped"];
-        assert_eq!(seen(place.path()).expect("walked"), expected);
+        assert_eq!(visited_paths(place.path()).expect("walked"), expected);
     }
 
     #[test]
@@ -270,9 +274,12 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let levels = |count: usize| vec!["d"; count].join("/");
         std::fs::create_dir_all(place.path().join(levels(MAX_DEPTH - 1))).expect("made");
-        assert_eq!(seen(place.path()).expect("walked").len(), MAX_DEPTH);
+        assert_eq!(
+            visited_paths(place.path()).expect("walked").len(),
+            MAX_DEPTH
+        );
         std::fs::create_dir_all(place.path().join(levels(MAX_DEPTH))).expect("made");
-        let refused = seen(place.path()).expect_err("too deep");
+        let refused = visited_paths(place.path()).expect_err("too deep");
         assert!(matches!(refused, Error::TooDeep { .. }), "{refused}");
     }
 
@@ -284,7 +291,7 @@ mod tests {
         }
         let cancel = Cancel::default();
         let mut count = 0;
-        let ended = cancel.during(|| {
+        let ended = cancel.run(|| {
             walk(place.path(), |_| {
                 count += 1;
                 if count == 3 {

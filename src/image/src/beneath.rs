@@ -1,8 +1,8 @@
-//! Makes files below a directory whose content is untrusted, so that none can appear anywhere else.
+//! Confined file creation below a directory with untrusted content: no file can be created anywhere else.
 //!
-//! Every directory on the way is opened by `openat2`, which keeps even symbolic links to absolute paths inside
-//! (`RESOLVE_IN_ROOT`) or refuses them (`RESOLVE_BENEATH | RESOLVE_NO_SYMLINKS`); the last name is only ever used
-//! relative to the open directory and without following it.
+//! Every directory on the path is opened by `openat2`, which confines symbolic links, even absolute ones, to the root
+//! (`RESOLVE_IN_ROOT`) or rejects them (`RESOLVE_BENEATH | RESOLVE_NO_SYMLINKS`); the last component is only used
+//! relative to the open directory and is not followed.
 
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::path::Path;
@@ -13,8 +13,8 @@ use rustix::io::Errno;
 
 use crate::names::split;
 
-/// The root, and the directory that was used last: entries mostly come sorted.
-pub(crate) struct Beneath {
+/// A root directory, with a cache of the last directory opened, since entries mostly come sorted.
+pub(crate) struct ConfinedRoot {
     root: OwnedFd,
     resolve: ResolveFlags,
     last: Option<(Vec<u8>, Rc<OwnedFd>)>,
@@ -24,14 +24,14 @@ const DIRECTORY: OFlags = OFlags::RDONLY
     .union(OFlags::DIRECTORY)
     .union(OFlags::CLOEXEC);
 
-impl Beneath {
-    /// Symbolic links in the middle of a path lead where they would lead if `root` were `/`.
-    pub(crate) fn following(root: &Path) -> Result<Self, Errno> {
+impl ConfinedRoot {
+    /// Opens a root in which symbolic links in the middle of a path are resolved as if `root` were `/`.
+    pub(crate) fn following_links(root: &Path) -> Result<Self, Errno> {
         Self::new(root, ResolveFlags::IN_ROOT | ResolveFlags::NO_MAGICLINKS)
     }
 
-    /// Symbolic links in the middle of a path are errors (`ELOOP`).
-    pub(crate) fn strict(root: &Path) -> Result<Self, Errno> {
+    /// Opens a root in which symbolic links in the middle of a path are errors (`ELOOP`).
+    pub(crate) fn without_links(root: &Path) -> Result<Self, Errno> {
         Self::new(root, ResolveFlags::BENEATH | ResolveFlags::NO_SYMLINKS)
     }
 
@@ -48,7 +48,7 @@ impl Beneath {
         self.root.as_fd()
     }
 
-    /// The directory at `path` (empty for the root).
+    /// Opens the directory at `path` (empty for the root).
     pub(crate) fn directory(&mut self, path: &[u8]) -> Result<Rc<OwnedFd>, Errno> {
         if let Some((known, directory)) = &self.last {
             if known == path {
@@ -67,14 +67,14 @@ impl Beneath {
         Ok(directory)
     }
 
-    /// The same, made with all above it where it is missing.
+    /// Opens the directory at `path`, creating it and its missing parents.
     pub(crate) fn make_directory(&mut self, path: &[u8]) -> Result<Rc<OwnedFd>, Errno> {
         match self.directory(path) {
             Err(Errno::NOENT) if !path.is_empty() => {
                 let (above, name) = split(path);
                 let above = self.make_directory(above)?;
                 match rustix::fs::mkdirat(&*above, name, Mode::from_raw_mode(0o755)) {
-                    // A dangling link, then: the second look says so.
+                    // If this is a dangling link, the second lookup fails.
                     Ok(()) | Err(Errno::EXIST) => self.directory(path),
                     Err(error) => Err(error),
                 }
@@ -83,14 +83,14 @@ impl Beneath {
         }
     }
 
-    /// Forgets the last directory: something on the way to it was replaced.
-    pub(crate) fn forget(&mut self) {
+    /// Clears the cache, because a component of the path was replaced.
+    pub(crate) fn invalidate_cache(&mut self) {
         self.last = None;
     }
 }
 
-/// What is at `name`, not following a link.
-pub(crate) fn look(directory: &OwnedFd, name: &[u8]) -> Result<Option<Stat>, Errno> {
+/// Returns the metadata of `name` without following a link; `None` if it does not exist.
+pub(crate) fn stat_entry(directory: &OwnedFd, name: &[u8]) -> Result<Option<Stat>, Errno> {
     match rustix::fs::statat(directory, name, AtFlags::SYMLINK_NOFOLLOW) {
         Ok(stat) => Ok(Some(stat)),
         Err(Errno::NOENT) => Ok(None),
@@ -98,17 +98,17 @@ pub(crate) fn look(directory: &OwnedFd, name: &[u8]) -> Result<Option<Stat>, Err
     }
 }
 
-pub(crate) fn is(stat: &Stat, kind: FileType) -> bool {
+pub(crate) fn is_kind(stat: &Stat, kind: FileType) -> bool {
     FileType::from_raw_mode(stat.st_mode) == kind
 }
 
-/// A new file for writing; `EEXIST` if anything has that name.
+/// Creates a file for writing; `EEXIST` if the name exists.
 pub(crate) fn create(directory: &OwnedFd, name: &[u8]) -> Result<OwnedFd, Errno> {
     let flags = OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
     rustix::fs::openat(directory, name, flags, Mode::from_raw_mode(0o600))
 }
 
-/// The directory `name` itself, not one a link of that name points to.
+/// Opens the directory `name` without following a link.
 pub(crate) fn open_directory(directory: &OwnedFd, name: &[u8]) -> Result<OwnedFd, Errno> {
     rustix::fs::openat(directory, name, DIRECTORY | OFlags::NOFOLLOW, Mode::empty())
 }

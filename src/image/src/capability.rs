@@ -1,9 +1,9 @@
-//! File capabilities as they are on disk (`struct vfs_ns_cap_data`, linux/capability.h).
+//! File capabilities in their on-disk format (`struct vfs_ns_cap_data`, linux/capability.h).
 //!
-//! A file that got its capabilities inside a user namespace carries them in version 3, bound to the host id that
-//! is root there. In a layer they are version 2, bound to root wherever the layer is used.
+//! A file that got its capabilities inside a user namespace has them in version 3, bound to the host id of the
+//! namespace's root. In a layer they are in version 2, bound to root wherever the layer is used.
 
-/// The attribute's name.
+/// Name of the extended attribute.
 pub(crate) const NAME: &[u8] = b"security.capability";
 
 const REVISION_MASK: u32 = 0xFF00_0000;
@@ -12,7 +12,7 @@ const REVISION_3: u32 = 0x0300_0000;
 const SIZE_2: usize = 20;
 const SIZE_3: usize = 24;
 
-/// Version 2 of a value; none if it is of another version, or bound to another namespace's root than `root`.
+/// Converts a value to version 2; `None` if it is of another version, or bound to another root id than `root`.
 pub(crate) fn as_version_2(value: &[u8], root: u32) -> Option<Vec<u8>> {
     let word = |at: usize| {
         value

@@ -1,4 +1,4 @@
-//! Names of content: SHA-256.
+//! SHA-256 digests of content.
 
 use std::fmt;
 use std::io::{self, Read, Write};
@@ -9,23 +9,23 @@ use sha2::Digest as _;
 
 use crate::Error;
 
-/// A SHA-256 digest, written `sha256:` and 64 lower-case hexadecimal digits (OCI image specification,
-/// descriptor). Names blobs, manifests and, as diff-id, the uncompressed content of layers.
+/// A SHA-256 digest, written `sha256:` and 64 lower-case hexadecimal digits (OCI image specification, descriptor).
+/// Identifies blobs, manifests and, as diff-id, the uncompressed content of layers.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Digest([u8; 32]);
 
 impl Digest {
-    /// The digest of these bytes.
-    pub fn of(bytes: impl AsRef<[u8]>) -> Self {
+    /// Computes the digest of `bytes`.
+    pub fn compute(bytes: impl AsRef<[u8]>) -> Self {
         Self(sha2::Sha256::digest(bytes).into())
     }
 
-    /// The 64 hexadecimal digits alone: the file name of a blob.
+    /// Returns the 64 hexadecimal digits alone, as in the file name of a blob.
     pub fn hex(&self) -> String {
         hex::encode(self.0)
     }
 
-    /// From the 64 hexadecimal digits alone, such as a file name.
+    /// Parses the 64 hexadecimal digits alone, as in a file name.
     pub(crate) fn from_hex(text: &str) -> Option<Self> {
         if text.len() != 64 || text.bytes().any(|b| b.is_ascii_uppercase()) {
             return None;
@@ -74,15 +74,15 @@ impl<'de> Deserialize<'de> for Digest {
     }
 }
 
-/// Passes bytes on, in either direction, and knows their digest and number. All that is packed, extracted or copied
-/// passes here, so this is where such work ends when it is cancelled.
-pub(crate) struct Hashing<T> {
+/// Reader or writer adapter that computes the digest and length of what passes through. All content that is packed,
+/// extracted or copied passes here, so cancellation of such work is checked here.
+pub(crate) struct HashingStream<T> {
     inner: T,
     hasher: sha2::Sha256,
     bytes: u64,
 }
 
-impl<T> Hashing<T> {
+impl<T> HashingStream<T> {
     pub(crate) fn new(inner: T) -> Self {
         Self {
             inner,
@@ -91,7 +91,7 @@ impl<T> Hashing<T> {
         }
     }
 
-    /// What was wrapped, the digest of all that went through, and how many bytes that was.
+    /// Returns the wrapped value, the digest of all bytes passed, and their number.
     pub(crate) fn finish(self) -> (T, Digest, u64) {
         (
             self.inner,
@@ -101,7 +101,7 @@ impl<T> Hashing<T> {
     }
 }
 
-impl<W: Write> Write for Hashing<W> {
+impl<W: Write> Write for HashingStream<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         foreign::cancel::check()?;
         let written = self.inner.write(bytes)?;
@@ -115,7 +115,7 @@ impl<W: Write> Write for Hashing<W> {
     }
 }
 
-impl<R: Read> Read for Hashing<R> {
+impl<R: Read> Read for HashingStream<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         foreign::cancel::check()?;
         let read = self.inner.read(buffer)?;
@@ -133,8 +133,8 @@ mod tests {
 
     #[test]
     fn prints_and_parses_the_text_of_the_specification() {
-        assert_eq!(Digest::of("").to_string(), EMPTY);
-        assert_eq!(EMPTY.parse::<Digest>().unwrap(), Digest::of(""));
+        assert_eq!(Digest::compute("").to_string(), EMPTY);
+        assert_eq!(EMPTY.parse::<Digest>().unwrap(), Digest::compute(""));
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! One entry of a tar stream, as it is read and as it is written.
+//! Entries of tar streams, for reading and writing.
 
-/// What an entry is (POSIX ustar, typeflag).
+/// Type of an entry (POSIX ustar, typeflag).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Kind {
     File,
@@ -10,14 +10,14 @@ pub(crate) enum Kind {
     Block,
     Directory,
     Fifo,
-    /// Anything else, by its typeflag.
+    /// Any other type, by its typeflag.
     Other(u8),
 }
 
 impl Kind {
     pub(crate) fn from_typeflag(flag: u8) -> Self {
         match flag {
-            // 7 is "contiguous file", which no one treats otherwise than a file.
+            // 7 means "contiguous file", which everybody treats as a regular file.
             0 | b'0' | b'7' => Self::File,
             b'1' => Self::Hardlink,
             b'2' => Self::Symlink,
@@ -43,30 +43,30 @@ impl Kind {
     }
 }
 
-/// An entry without its content.
+/// A tar entry without its content.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Entry {
-    /// As in the archive; any bytes.
+    /// Path as in the archive; arbitrary bytes.
     pub(crate) name: Vec<u8>,
     pub(crate) kind: Kind,
     /// Target of a symbolic or hard link.
     pub(crate) link: Vec<u8>,
-    /// Permission bits, set-id and sticky bits included.
+    /// Permission bits, including set-id and sticky bits.
     pub(crate) mode: u32,
     pub(crate) uid: u64,
     pub(crate) gid: u64,
     /// Seconds since 1970.
     pub(crate) mtime: u64,
-    /// Bytes of content that follow.
+    /// Size of the content that follows, in bytes.
     pub(crate) size: u64,
     /// Major and minor number of a device.
     pub(crate) device: (u32, u32),
-    /// Extended attributes, name and value.
+    /// Extended attributes: names and values.
     pub(crate) xattrs: Vec<(Vec<u8>, Vec<u8>)>,
 }
 
 impl Entry {
-    /// An entry of root's without content, from 1970.
+    /// Creates an entry without content, owned by root, with time 0.
     pub(crate) fn new(name: impl Into<Vec<u8>>, kind: Kind, mode: u32) -> Self {
         Self {
             name: name.into(),
@@ -83,8 +83,9 @@ impl Entry {
     }
 }
 
-/// A name from an archive, for a message: not endless. Messages quote it, so control characters are escaped there.
-pub(crate) fn shown(name: &[u8]) -> String {
+/// Formats an untrusted entry name for a message: shortened if it is long. Messages quote it, which escapes control
+/// characters.
+pub(crate) fn display_name(name: &[u8]) -> String {
     let text = String::from_utf8_lossy(name);
     let mut short: String = text.chars().take(160).collect();
     if short.len() < text.len() {

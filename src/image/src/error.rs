@@ -1,116 +1,118 @@
-//! What can go wrong in the store.
+//! Errors of the image store.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
-use crate::tar_reader::Stop;
+use crate::tar_reader::ReadStop;
 use crate::{Digest, Refusal};
 
-/// Every failure names the file, blob or entry it is about.
+/// Every error names the file, blob or entry it is about.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The disk (or the quota) is full. Nothing half-made remains.
-    #[error("no space to write {}: {}; free some space there or use a home directory on a larger disk", .path.display(), FreeSpace { needed: *.needed, free: *.free })]
+    /// The disk (or the quota) is full. Partial files are removed.
+    #[error("no space to write {}: {}; free some space there or use a home directory \
+             on a larger disk", .path.display(), FreeSpace { needed: *.needed, free: *.free })]
     DiskFull {
-        /// The file or tree that was being written.
+        /// File or tree that was being written.
         path: PathBuf,
-        /// Bytes it takes in all, where known.
+        /// Total number of bytes needed, if known.
         needed: Option<u64>,
-        /// Bytes that are free there now, where known.
+        /// Number of bytes free now, if known.
         free: Option<u64>,
     },
     /// A file operation failed.
     #[error("cannot {action} {}: {source}", .path.display())]
     File {
-        /// What was attempted, such as "open".
+        /// Operation, such as "open".
         action: &'static str,
-        /// The file.
+        /// File.
         path: PathBuf,
         /// Error of the system call.
         source: io::Error,
     },
-    /// A directory that is no store, or one of a later version.
-    #[error("{} is not an OCI image layout of version 1.x: {problem}; move it away or choose another directory", .path.display())]
+    /// The directory is not an image store, or one of a later version.
+    #[error("{} is not an OCI image layout of version 1.x: {problem}; move it away or choose \
+             another directory", .path.display())]
     NotALayout {
-        /// The directory or its file.
+        /// Directory, or a file in it.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         problem: String,
     },
-    /// JSON of the store that does not parse.
-    #[error("{} does not parse: {source}; run a check of the store and push the package again", .path.display())]
+    /// A JSON document of the store cannot be parsed.
+    #[error("cannot parse {}: {source}; check the store and push the package again", .path.display())]
     Json {
-        /// The file.
+        /// File.
         path: PathBuf,
         /// Error of the JSON parser.
         source: serde_json::Error,
     },
-    /// Not the text of a digest.
+    /// The text is not a digest.
     #[error("{text:?} is not a digest: it must be sha256: and 64 hexadecimal digits in lower case")]
     BadDigest {
-        /// What was given.
+        /// Text that was given.
         text: String,
     },
-    /// A tag that the image specification's grammar forbids.
+    /// The tag violates the grammar of the image specification.
     #[error(
         "{name:?} is not a tag: 1 to 255 of the characters A-Z a-z 0-9 . _ : @ + / -, the first a letter or digit"
     )]
     BadTag {
-        /// What was given.
+        /// Tag that was given.
         name: String,
     },
-    /// What was sent is no image that can be taken in.
-    #[error("the image cannot be taken in: {problem}")]
+    /// The image cannot be received.
+    #[error("cannot import the image: {problem}")]
     Unreceivable {
-        /// What is wrong.
+        /// Description of the problem.
         problem: String,
     },
-    /// A layer that is not in the store.
+    /// The layer is not in the store.
     #[error("layer {diff_id} is not in the store at {}; push the package again", .store.display())]
     UnknownLayer {
-        /// The layer.
+        /// Diff-id of the layer.
         diff_id: Digest,
-        /// The store.
+        /// Path of the store.
         store: PathBuf,
     },
-    /// An image that is not in the store.
+    /// The image is not in the store.
     #[error("image {digest} is not in the store at {}; push the package again", .store.display())]
     UnknownImage {
-        /// The image's manifest.
+        /// Digest of the image's manifest.
         digest: Digest,
-        /// The store.
+        /// Path of the store.
         store: PathBuf,
     },
-    /// Bytes that are not what their name says.
+    /// The content does not match its digest.
     #[error("{} is damaged: its content is {found}, not {expected}; push the package again", .path.display())]
     Damaged {
-        /// The blob or tree.
+        /// Blob or tree.
         path: PathBuf,
-        /// What its name promises.
+        /// Digest in its name.
         expected: Digest,
-        /// What it holds.
+        /// Digest of its content.
         found: Digest,
     },
-    /// A file tree that cannot become a layer.
+    /// A file tree cannot be packed into a layer.
     #[error("{} cannot go into a layer: {problem}", .path.display())]
     Tree {
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// In which way it is invalid.
+        /// Description of the problem.
         problem: String,
     },
-    /// An archive that is not accepted; nothing of it remains.
+    /// The archive is refused; nothing of it is kept.
     #[error("{archive}: {problem}")]
     Archive {
-        /// The archive: a path, or "the archive" for a stream.
+        /// Path of the archive, or "the archive" for a stream.
         archive: String,
-        /// Which entry and why.
+        /// Entry and reason.
         #[source]
         problem: Refusal,
     },
 }
 
-/// "N bytes are needed, M are free", as far as known.
+/// Formats "N bytes are needed, M are free", as far as known.
 struct FreeSpace {
     needed: Option<u64>,
     free: Option<u64>,
@@ -134,7 +136,7 @@ impl std::fmt::Display for FreeSpace {
     }
 }
 
-/// A byte count for people.
+/// Number of bytes in human-readable form.
 pub(crate) struct Bytes(pub(crate) u64);
 
 impl std::fmt::Display for Bytes {
@@ -149,7 +151,7 @@ impl std::fmt::Display for Bytes {
 }
 
 impl Error {
-    /// A failed file operation; a full disk becomes [`Error::DiskFull`].
+    /// Creates the error of a failed file operation; a full disk becomes [`Error::DiskFull`].
     pub(crate) fn file(
         action: &'static str,
         path: impl AsRef<Path>,
@@ -167,7 +169,7 @@ impl Error {
         }
     }
 
-    /// The disk is full while writing `path`, which takes `needed` bytes.
+    /// Creates the error of a full disk while writing `path`, which needs `needed` bytes.
     pub(crate) fn disk_full(path: &Path, needed: Option<u64>) -> Self {
         Self::DiskFull {
             path: path.to_owned(),
@@ -176,19 +178,19 @@ impl Error {
         }
     }
 
-    /// Reading an archive stopped.
-    pub(crate) fn stopped(archive: &str, path: &Path, stop: Stop) -> Self {
+    /// Creates the error of an interrupted read of an archive.
+    pub(crate) fn from_stop(archive: &str, path: &Path, stop: ReadStop) -> Self {
         match stop {
-            Stop::Refused(problem) => Self::Archive {
+            ReadStop::Refused(problem) => Self::Archive {
                 archive: archive.to_owned(),
                 problem,
             },
-            Stop::Source(error) => Self::file("read", path, error),
+            ReadStop::Source(error) => Self::file("read", path, error),
         }
     }
 
-    /// The same error, with what the whole thing takes filled in where it is a full disk.
-    pub(crate) fn needing(self, needed: u64) -> Self {
+    /// Adds the total number of bytes needed, if the error is a full disk.
+    pub(crate) fn with_needed_bytes(self, needed: u64) -> Self {
         match self {
             Self::DiskFull {
                 path,
@@ -204,7 +206,7 @@ impl Error {
     }
 }
 
-/// Whether this is a full disk or an exhausted quota.
+/// Returns whether the error is a full disk or an exhausted quota.
 pub(crate) fn is_disk_full(error: &io::Error) -> bool {
     matches!(
         error.kind(),
@@ -212,7 +214,7 @@ pub(crate) fn is_disk_full(error: &io::Error) -> bool {
     )
 }
 
-/// Free bytes of the file system that holds `path`, or would.
+/// Returns the free bytes of the file system that contains `path` or would contain it.
 fn free_bytes(path: &Path) -> Option<u64> {
     path.ancestors()
         .find_map(|directory| rustix::fs::statvfs(directory).ok())
@@ -227,7 +229,7 @@ mod tests {
     fn a_full_disk_is_told_with_the_space_needed_and_left() {
         let error = std::fs::write("/dev/full", "x").unwrap_err();
         let text = Error::file("write", "/dev/full", error)
-            .needing(230_000_000)
+            .with_needed_bytes(230_000_000)
             .to_string();
         assert!(
             text.starts_with("no space to write /dev/full: 230 MB are needed and "),

@@ -1,16 +1,16 @@
-//! Extracted layers: one directory each, ready to be the lower directory of an overlay mount.
+//! Extracted layers: one directory each, usable as the lower directory of an overlay mount.
 //!
-//! A tree appears under its diff-id only after all of it was written and its digest was right. It is not flushed
-//! to the disk before that: waiting for a quarter of a gigabyte costs more than extracting it. Instead a
-//! `.volatile` file with the boot's id is there, durable, before the tree is, and goes when a background flush is
-//! through; trees that a power failure caught in between are removed by the next `open` and extracted again.
+//! A tree is renamed to its diff-id only after it was written completely and its digest was verified. It is not flushed
+//! to the disk before that, since flushing a quarter of a gigabyte takes longer than extracting it. Instead, a
+//! `.volatile` file with the boot id is durable before the tree appears, and is removed when a background flush is
+//! complete; trees caught in between by a power failure are removed by the next `open` and extracted again.
 
 use std::fs::File;
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 
-use crate::digest::Hashing;
+use crate::digest::HashingStream;
 use crate::files::{self, HALF_MADE, Lock};
 use crate::layer_writer::LayerWriter;
 use crate::pipe::pipe;
@@ -22,12 +22,12 @@ use crate::{Digest, Error, LayerInfo, Store, TreeOptions, gzip};
 const VOLATILE: &str = "volatile";
 
 impl Store {
-    /// The extracted tree of a layer: extracted now if it was not yet. It is shared, and must not be changed.
+    /// Returns the extracted tree of a layer, extracting it if needed. The tree is shared and must not be modified.
     ///
-    /// Owners and groups are those in the layer when this process is root, otherwise this process's. Whiteouts
-    /// are an overlay's: character device 0:0, and `trusted.overlay.opaque` (`user.overlay.opaque` without the
-    /// right to set that). Device nodes are left out. Several threads and processes may ask for the same layer.
-    pub fn extracted(&self, diff_id: &Digest) -> Result<PathBuf, Error> {
+    /// Owners and groups are those in the layer if this process is root, otherwise those of this process. Whiteouts are
+    /// in overlay format: character device 0:0, and `trusted.overlay.opaque` (or `user.overlay.opaque` without the
+    /// privilege to set that). Device nodes are left out. Several threads and processes may request the same layer.
+    pub fn ensure_extracted(&self, diff_id: &Digest) -> Result<PathBuf, Error> {
         let tree = self.tree_path(diff_id);
         if tree.exists() {
             return Ok(tree);
@@ -61,10 +61,10 @@ impl Store {
 
     fn extract(&self, diff_id: &Digest, tree: PathBuf) -> Result<PathBuf, Error> {
         let layer = self.existing_layer(diff_id)?;
-        let half_made = HalfMadeTree::create(self.layers_dir())?;
+        let half_made = TemporaryTree::create(self.layers_dir())?;
         self.extract_into(&half_made.path, &layer)
-            .map_err(|error| error.needing(layer.unpacked))?;
-        self.appear(half_made, diff_id)?;
+            .map_err(|error| error.with_needed_bytes(layer.unpacked))?;
+        self.publish_tree(half_made, diff_id)?;
         Ok(tree)
     }
 
@@ -73,7 +73,10 @@ impl Store {
         let label = format!("layer {}", layer.diff_id);
         let blob = File::open(&path).map_err(|error| Error::file("open", &path, error))?;
         let content = gzip::decoder(blob).map_err(|error| Error::file("read", &path, error))?;
-        let found = gzip::reading_ahead(content, |content| fill(tree, content, &label, &path))?.0;
+        let found = gzip::read_ahead(content, |content| {
+            extract_stream(tree, content, &label, &path)
+        })?
+        .0;
         if found != layer.diff_id {
             return Err(Error::Damaged {
                 path,
@@ -84,14 +87,14 @@ impl Store {
         Ok(())
     }
 
-    /// Makes the extracted tree of the layer that [`Store::layer_from_tree`] makes of the same tree with the same
-    /// options, without its blob: what is put on top of the layer need not wait until that is compressed. Gives the
-    /// layer's diff-id and the bytes of its tar stream.
+    /// Creates the extracted tree of the layer that [`Store::layer_from_tree`] would create of the same tree with the
+    /// same options, without its blob, so that further layers need not wait for the compression. Returns the diff-id of
+    /// the layer and the size of its tar stream.
     ///
-    /// Until the blob is there too, no image can have the layer, and [`Store::layer`] does not know it.
+    /// Until the blob exists as well, no image can use the layer, and [`Store::layer`] does not find it.
     pub fn stage_tree(&self, tree: &Path, options: &TreeOptions) -> Result<(Digest, u64), Error> {
         let _hold = self.hold()?;
-        let half_made = HalfMadeTree::create(self.layers_dir())?;
+        let half_made = TemporaryTree::create(self.layers_dir())?;
         let pack = |output: &mut dyn std::io::Write| {
             let mut packer = Packer::new(TarWriter::new(output), options);
             packer.pack(tree)?;
@@ -101,21 +104,26 @@ impl Store {
                 .map_err(|error| Error::file("pack", tree, error))
         };
         let into = &half_made.path;
-        let ((), (diff_id, bytes)) =
-            pipe(pack, |content| fill(into, content, "the new layer", tree))?;
-        self.appear(half_made, &diff_id)?;
+        let ((), (diff_id, bytes)) = pipe(pack, |content| {
+            extract_stream(into, content, "the new layer", tree)
+        })?;
+        self.publish_tree(half_made, &diff_id)?;
         Ok((diff_id, bytes))
     }
 
-    /// Gives a tree that is complete its name.
-    pub(crate) fn appear(&self, half_made: HalfMadeTree, diff_id: &Digest) -> Result<(), Error> {
+    /// Renames a complete tree to its final name.
+    pub(crate) fn publish_tree(
+        &self,
+        half_made: TemporaryTree,
+        diff_id: &Digest,
+    ) -> Result<(), Error> {
         let tree = self.tree_path(diff_id);
         if tree.exists() {
             return Ok(());
         }
         self.mark_volatile(diff_id)?;
         match std::fs::rename(&half_made.path, &tree) {
-            // Another process may have been faster; what it made is the same.
+            // Another process may have been faster; its result is the same.
             Err(error) if !tree.exists() => return Err(Error::file("create", &tree, error)),
             _ => self.flush_later(*diff_id),
         }
@@ -128,10 +136,10 @@ impl Store {
     }
 
     fn mark_volatile(&self, diff_id: &Digest) -> Result<(), Error> {
-        files::write_whole(&self.volatile_path(diff_id), boot_id()?.as_bytes())
+        files::write_atomically(&self.volatile_path(diff_id), boot_id()?.as_bytes())
     }
 
-    /// Flushes the file system in the background. Nothing is lost if that never ends: the mark stays.
+    /// Flushes the file system in the background. Nothing is lost if that never completes, since the marker remains.
     fn flush_later(&self, diff_id: Digest) {
         let (mark, layers) = (self.volatile_path(&diff_id), self.layers_dir().to_owned());
         let flush = move || {
@@ -139,7 +147,7 @@ impl Store {
                 File::open(&layers).and_then(|directory| Ok(rustix::fs::syncfs(&directory)?));
             match flushed.and_then(|()| std::fs::remove_file(&mark)) {
                 Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-                    tracing::warn!(path = %layers.display(), %error, "an extracted layer could not be flushed");
+                    tracing::warn!(path = %layers.display(), %error, "cannot flush an extracted layer to disk");
                 }
                 _ => {}
             }
@@ -148,12 +156,12 @@ impl Store {
             .name("flush layers".to_owned())
             .spawn(flush)
         {
-            tracing::warn!(%error, "no thread to flush an extracted layer");
+            tracing::warn!(%error, "cannot start a thread to flush an extracted layer");
         }
     }
 
-    /// Trees that were not flushed when the machine went down may hold anything: they go.
-    pub(crate) fn settle_volatile_trees(&self) -> Result<(), Error> {
+    /// Removes trees that had not been flushed when the machine went down, since their content is undefined.
+    pub(crate) fn remove_unflushed_trees(&self) -> Result<(), Error> {
         let this_boot = boot_id()?;
         for entry in files::list(self.layers_dir())? {
             let path = entry.path();
@@ -168,8 +176,8 @@ impl Store {
                 continue;
             };
             let tree = self.tree_path(&diff_id);
-            // A flush that is through takes the mark away, perhaps just now: then the tree is whole.
-            let Some(boot) = files::read_whole(&path, 4096)? else {
+            // A concurrent flush may have just removed the marker; then the tree is complete.
+            let Some(boot) = files::read_limited(&path, 4096)? else {
                 continue;
             };
             if boot == this_boot.as_bytes() {
@@ -184,10 +192,10 @@ impl Store {
         Ok(())
     }
 
-    /// Removes an extracted layer, so that at no time part of it is there under its name.
+    /// Removes an extracted layer atomically: no partial tree is ever visible under its name.
     pub(crate) fn discard_tree(&self, diff_id: &Digest) -> Result<(), Error> {
         let tree = self.tree_path(diff_id);
-        let doomed = self.layers_dir().join(files::half_made_name());
+        let doomed = self.layers_dir().join(files::temporary_name());
         match std::fs::rename(&tree, &doomed) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(Error::file("remove", &tree, error));
@@ -207,23 +215,23 @@ impl Store {
     }
 }
 
-/// Writes the entries of a tar stream below `tree`; gives the digest and the bytes of the stream. `label` and `path` are
-/// where it came from, for messages.
-pub(crate) fn fill(
+/// Extracts a tar stream below `tree`; returns the digest and size of the stream. `label` and `path` describe its
+/// source in messages.
+pub(crate) fn extract_stream(
     tree: &Path,
     content: &mut dyn std::io::Read,
     label: &str,
     path: &Path,
 ) -> Result<(Digest, u64), Error> {
-    let mut reader = TarReader::new(Hashing::new(content));
+    let mut reader = TarReader::new(HashingStream::new(content));
     let mut writer = LayerWriter::new(tree)?;
     loop {
         let entry = reader
             .next_entry()
-            .map_err(|stop| Error::stopped(label, path, stop))?;
+            .map_err(|stop| Error::from_stop(label, path, stop))?;
         let Some(entry) = entry else { break };
         writer
-            .entry(&entry, &mut reader)
+            .write_entry(&entry, &mut reader)
             .map_err(|failed| failed.into_error(label, tree, &reader))?;
     }
     writer.finish()?;
@@ -234,22 +242,22 @@ pub(crate) fn fill(
     Ok((digest, bytes))
 }
 
-/// Changes with every start of the kernel.
+/// Returns the boot id of the kernel.
 fn boot_id() -> Result<String, Error> {
     let path = "/proc/sys/kernel/random/boot_id";
     std::fs::read_to_string(path).map_err(|error| Error::file("read", path, error))
 }
 
-/// A directory under a temporary name, locked while it is filled, and removed unless it was renamed.
-pub(crate) struct HalfMadeTree {
+/// A directory with a temporary name, locked while it is filled, and removed on drop unless it was renamed.
+pub(crate) struct TemporaryTree {
     pub(crate) path: PathBuf,
     _lock: Lock,
 }
 
-impl HalfMadeTree {
+impl TemporaryTree {
     pub(crate) fn create(directory: &Path) -> Result<Self, Error> {
         loop {
-            let path = directory.join(files::half_made_name());
+            let path = directory.join(files::temporary_name());
             debug_assert!(
                 path.file_name()
                     .is_some_and(|name| name.to_string_lossy().starts_with(HALF_MADE))
@@ -258,8 +266,8 @@ impl HalfMadeTree {
                 .mode(0o700)
                 .create(&path)
                 .map_err(|error| Error::file("create", &path, error))?;
-            // A sweep may come between the two; then the next name has better luck.
-            if let Ok(lock) = Lock::alone(&path) {
+            // A sweep may have removed it before it was locked; then another name is tried.
+            if let Ok(lock) = Lock::lock_exclusive(&path) {
                 if path.exists() {
                     return Ok(Self { path, _lock: lock });
                 }
@@ -268,11 +276,11 @@ impl HalfMadeTree {
     }
 }
 
-impl Drop for HalfMadeTree {
+impl Drop for TemporaryTree {
     fn drop(&mut self) {
-        // After the rename there is nothing under this name.
+        // After the rename nothing exists under this name.
         if let Err(error) = files::remove_tree(&self.path) {
-            tracing::warn!(%error, "a half-made tree remains until the next start");
+            tracing::warn!(%error, "an unfinished tree remains until the next start");
         }
     }
 }

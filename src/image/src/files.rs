@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all, and locks that end with the process that took them.
+//! Atomic files, and locks that end with the process that holds them.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -12,11 +12,11 @@ use rustix::io::Errno;
 
 use crate::Error;
 
-/// How the names of half-made files and trees begin.
+/// Prefix of the names of temporary files and trees.
 pub(crate) const HALF_MADE: &str = "tmp-";
 
-/// A name no other file of this directory has.
-pub(crate) fn half_made_name() -> String {
+/// Generates a name that is unique in its directory.
+pub(crate) fn temporary_name() -> String {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     let time = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
@@ -36,18 +36,18 @@ pub(crate) struct Lock {
 }
 
 impl Lock {
-    /// Waits until nobody else holds it alone, or this thread's work is cancelled.
-    pub(crate) fn shared(path: &Path) -> Result<Self, Error> {
-        Self::take(path, FlockOperation::NonBlockingLockShared)
+    /// Acquires a shared lock, waiting for exclusive holders, unless this thread's work is cancelled.
+    pub(crate) fn lock_shared(path: &Path) -> Result<Self, Error> {
+        Self::acquire(path, FlockOperation::NonBlockingLockShared)
     }
 
-    /// Waits until nobody else holds it, or this thread's work is cancelled.
-    pub(crate) fn alone(path: &Path) -> Result<Self, Error> {
-        Self::take(path, FlockOperation::NonBlockingLockExclusive)
+    /// Acquires an exclusive lock, waiting for all other holders, unless this thread's work is cancelled.
+    pub(crate) fn lock_exclusive(path: &Path) -> Result<Self, Error> {
+        Self::acquire(path, FlockOperation::NonBlockingLockExclusive)
     }
 
-    /// None when somebody else holds it.
-    pub(crate) fn alone_now(path: &Path) -> Result<Option<Self>, Error> {
+    /// Tries to acquire an exclusive lock; `None` if it is held by somebody else.
+    pub(crate) fn try_lock_exclusive(path: &Path) -> Result<Option<Self>, Error> {
         let file = open(path)?;
         match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
             Ok(()) => Ok(Some(Self { _file: file })),
@@ -56,9 +56,9 @@ impl Lock {
         }
     }
 
-    fn take(path: &Path, operation: FlockOperation) -> Result<Self, Error> {
+    fn acquire(path: &Path, operation: FlockOperation) -> Result<Self, Error> {
         let file = open(path)?;
-        // Asked again and again: a thread that waits in the kernel hears of no cancellation.
+        // Polls, because a thread that blocks in the kernel does not notice cancellation.
         let mut pause = Duration::from_millis(1);
         loop {
             match rustix::fs::flock(&file, operation) {
@@ -78,7 +78,7 @@ impl Lock {
 }
 
 fn open(path: &Path) -> Result<File, Error> {
-    // Not blocking: a foreign fifo of this name must not stop the sweep.
+    // Non-blocking: a foreign FIFO of this name must not block the sweep.
     File::options()
         .read(true)
         .custom_flags(rustix::fs::OFlags::NONBLOCK.bits() as i32)
@@ -86,7 +86,7 @@ fn open(path: &Path) -> Result<File, Error> {
         .map_err(|error| Error::file("open", path, error))
 }
 
-/// A file under a temporary name, locked so that no sweep takes it for a leftover, and removed unless published.
+/// A file with a temporary name, locked so that no sweep removes it, and removed on drop unless published.
 #[derive(Debug)]
 pub(crate) struct NewFile {
     file: File,
@@ -95,10 +95,10 @@ pub(crate) struct NewFile {
 }
 
 impl NewFile {
-    /// An empty one in `directory`.
+    /// Creates an empty file in `directory`.
     pub(crate) fn create(directory: &Path) -> Result<Self, Error> {
         loop {
-            let path = directory.join(half_made_name());
+            let path = directory.join(temporary_name());
             let file = File::options()
                 .read(true)
                 .write(true)
@@ -112,7 +112,7 @@ impl NewFile {
                 published: false,
             };
             let locked = rustix::fs::flock(&new.file, FlockOperation::NonBlockingLockExclusive);
-            // A sweep may have come between creating and locking.
+            // A sweep may have removed it between creation and locking.
             let there = rustix::fs::fstat(&new.file).is_ok_and(|stat| stat.st_nlink > 0);
             if locked.is_ok() && there {
                 return Ok(new);
@@ -129,7 +129,7 @@ impl NewFile {
         &self.file
     }
 
-    /// Flushes the content and gives it its name in `target`'s directory, which is flushed too.
+    /// Flushes the content, renames the file to `target`, and flushes the directory.
     pub(crate) fn publish(mut self, target: &Path) -> Result<(), Error> {
         self.file
             .sync_data()
@@ -144,7 +144,7 @@ impl NewFile {
 impl Drop for NewFile {
     fn drop(&mut self) {
         if !self.published {
-            // It may be gone already; a sweep comes for the rest.
+            // It may be gone already; a sweep removes the rest.
             let _ = std::fs::remove_file(&self.path);
         }
     }
@@ -160,7 +160,7 @@ impl Write for &NewFile {
     }
 }
 
-/// The directory a file is in; a bare name is in the working directory.
+/// Returns the directory of a file; a bare name is in the working directory.
 pub(crate) fn directory_of(path: &Path) -> &Path {
     match path.parent() {
         Some(parent) if parent.as_os_str().is_empty() => Path::new("."),
@@ -169,27 +169,27 @@ pub(crate) fn directory_of(path: &Path) -> &Path {
     }
 }
 
-/// Makes the names in a directory durable.
+/// Flushes the entries of a directory.
 pub(crate) fn sync_directory(directory: &Path) -> Result<(), Error> {
     open(directory)?
         .sync_all()
         .map_err(|error| Error::file("flush", directory, error))
 }
 
-/// Writes a small file of mode 0600 that appears whole or not at all, and survives a power cut: content and name are flushed.
+/// Writes a small file of mode 0600 atomically and durably: content and name are flushed.
 ///
 /// # Errors
-/// When the file cannot be written, with the bytes needed and free where the disk is full.
-pub fn write_whole(target: &Path, bytes: &[u8]) -> Result<(), Error> {
+/// If the file cannot be written; with the bytes needed and free if the disk is full.
+pub fn write_atomically(target: &Path, bytes: &[u8]) -> Result<(), Error> {
     let new = NewFile::create(directory_of(target))?;
-    (&new)
-        .write_all(bytes)
-        .map_err(|error| Error::file("write", target, error).needing(bytes.len() as u64))?;
+    (&new).write_all(bytes).map_err(|error| {
+        Error::file("write", target, error).with_needed_bytes(bytes.len() as u64)
+    })?;
     new.publish(target)
 }
 
-/// A small file's content; none when there is none. At most `most` bytes are accepted.
-pub(crate) fn read_whole(path: &Path, most: u64) -> Result<Option<Vec<u8>>, Error> {
+/// Reads a small file; `None` if it does not exist. Fails if it is longer than `most` bytes.
+pub(crate) fn read_limited(path: &Path, most: u64) -> Result<Option<Vec<u8>>, Error> {
     let file = match File::open(path) {
         Ok(file) => file,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -209,7 +209,7 @@ pub(crate) fn read_whole(path: &Path, most: u64) -> Result<Option<Vec<u8>>, Erro
     Ok(Some(bytes))
 }
 
-/// A directory that only its owner may enter, with those above it.
+/// Creates a directory that only its owner can access, and its missing parents.
 pub(crate) fn make_private_directory(path: &Path) -> Result<(), Error> {
     std::fs::DirBuilder::new()
         .recursive(true)
@@ -218,13 +218,13 @@ pub(crate) fn make_private_directory(path: &Path) -> Result<(), Error> {
         .map_err(|error| Error::file("create", path, error))
 }
 
-/// Removes a tree of any depth, also one whose directories do not let their owner write. One that is gone is fine.
+/// Removes a tree of any depth, even if its directories are not writable. It is not an error if it does not exist.
 pub(crate) fn remove_tree(path: &Path) -> Result<(), Error> {
     foreign::remove(path).map_err(|error| Error::file("remove", path, io::Error::from(error)))
 }
 
-/// Removes what a crash left in `directory`: half-made files and trees that no living process has locked.
-pub(crate) fn sweep_half_made(directory: &Path) -> Result<u64, Error> {
+/// Removes leftovers of a crash in `directory`: temporary files and trees that no running process has locked.
+pub(crate) fn sweep_temporary(directory: &Path) -> Result<u64, Error> {
     let mut swept = 0;
     for entry in list(directory)? {
         let name = entry.file_name();
@@ -232,8 +232,8 @@ pub(crate) fn sweep_half_made(directory: &Path) -> Result<u64, Error> {
             continue;
         }
         let path = entry.path();
-        // Not readable or gone in the meantime: somebody else's business.
-        let Ok(Some(_lock)) = Lock::alone_now(&path) else {
+        // Unreadable or removed meanwhile: not ours.
+        let Ok(Some(_lock)) = Lock::try_lock_exclusive(&path) else {
             continue;
         };
         if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
@@ -246,13 +246,13 @@ pub(crate) fn sweep_half_made(directory: &Path) -> Result<u64, Error> {
                 _ => {}
             }
         }
-        tracing::info!(path = %path.display(), "removed a half-made leftover");
+        tracing::info!(path = %path.display(), "removed an unfinished leftover");
         swept += 1;
     }
     Ok(swept)
 }
 
-/// The entries of a directory.
+/// Returns the entries of a directory.
 pub(crate) fn list(directory: &Path) -> Result<Vec<std::fs::DirEntry>, Error> {
     std::fs::read_dir(directory)
         .and_then(Iterator::collect)
@@ -277,7 +277,7 @@ mod tests {
         std::fs::write(directory.path().join("tmp-dead"), "half").unwrap();
         std::fs::create_dir_all(directory.path().join("tmp-tree/usr")).unwrap();
         std::fs::write(directory.path().join("other"), "whole").unwrap();
-        assert_eq!(sweep_half_made(directory.path()).unwrap(), 2);
+        assert_eq!(sweep_temporary(directory.path()).unwrap(), 2);
         assert!(being_written.path().exists());
         being_written
             .publish(&directory.path().join("done"))
@@ -294,10 +294,10 @@ mod tests {
     #[test]
     fn waiting_for_a_lock_ends_when_it_is_cancelled() {
         let directory = tempfile::tempdir().unwrap();
-        let _held = Lock::alone(directory.path()).unwrap();
+        let _held = Lock::lock_exclusive(directory.path()).unwrap();
         let cancel = foreign::cancel::Cancel::default();
         std::thread::scope(|scope| {
-            let waiting = scope.spawn(|| cancel.during(|| Lock::shared(directory.path())));
+            let waiting = scope.spawn(|| cancel.run(|| Lock::lock_shared(directory.path())));
             cancel.cancel();
             waiting.join().unwrap().unwrap_err();
         });
@@ -306,12 +306,24 @@ mod tests {
     #[test]
     fn a_shared_lock_keeps_others_from_holding_it_alone() {
         let directory = tempfile::tempdir().unwrap();
-        let first = Lock::shared(directory.path()).unwrap();
-        let _second = Lock::shared(directory.path()).unwrap();
-        assert!(Lock::alone_now(directory.path()).unwrap().is_none());
+        let first = Lock::lock_shared(directory.path()).unwrap();
+        let _second = Lock::lock_shared(directory.path()).unwrap();
+        assert!(
+            Lock::try_lock_exclusive(directory.path())
+                .unwrap()
+                .is_none()
+        );
         drop(first);
-        assert!(Lock::alone_now(directory.path()).unwrap().is_none());
+        assert!(
+            Lock::try_lock_exclusive(directory.path())
+                .unwrap()
+                .is_none()
+        );
         drop(_second);
-        assert!(Lock::alone_now(directory.path()).unwrap().is_some());
+        assert!(
+            Lock::try_lock_exclusive(directory.path())
+                .unwrap()
+                .is_some()
+        );
     }
 }

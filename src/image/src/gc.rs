@@ -1,4 +1,4 @@
-//! Removing what nobody needs, and checking what is there.
+//! Garbage collection and verification of the store.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -7,50 +7,50 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 
-use crate::digest::Hashing;
+use crate::digest::HashingStream;
 use crate::files::{self, Lock};
 use crate::layer::gunzip_and_hash;
 use crate::store::MAX_DOCUMENT;
 use crate::{Digest, Error, Store};
 
-/// What [`Store::gc`] removed.
+/// Result of [`Store::gc`].
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Swept {
-    /// Manifests, configurations and layers.
+pub struct GcReport {
+    /// Number of manifests, configurations and layers removed.
     pub blobs: u64,
-    /// Extracted layers.
+    /// Number of extracted layers removed.
     pub trees: u64,
-    /// Half-made files and trees.
+    /// Number of temporary files and trees removed.
     pub leftovers: u64,
-    /// Bytes of the blobs.
+    /// Size of the removed blobs in bytes.
     pub bytes: u64,
-    /// Someone holds the store: only leftovers were looked for.
+    /// True if the store is held by someone, so that only leftovers were removed.
     pub deferred: bool,
 }
 
-/// Something wrong in the store.
+/// A defect found in the store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Damage {
-    /// The file.
+    /// File.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// Description of the defect.
     pub problem: String,
 }
 
 impl Store {
-    /// Removes every image without a tag, and every blob and extracted layer that no remaining image needs.
-    /// `keep` names what stays besides: images or layers (by digest or diff-id).
+    /// Removes every image without a tag, and every blob and extracted layer that no remaining image references. `keep`
+    /// names further images or layers to keep (by digest or diff-id).
     ///
-    /// While anyone holds the store (see [`Store::hold`]; every call that writes does), only what a crash left is
+    /// While anyone holds the store (see [`Store::hold`]; every call that writes does), only leftovers of crashes are
     /// removed and `deferred` is set: call again later.
-    pub fn gc(&self, keep: &BTreeSet<Digest>) -> Result<Swept, Error> {
+    pub fn gc(&self, keep: &BTreeSet<Digest>) -> Result<GcReport, Error> {
         let leftovers =
-            files::sweep_half_made(self.images_dir())? + files::sweep_half_made(self.layers_dir())?;
-        let mut swept = Swept {
+            files::sweep_temporary(self.images_dir())? + files::sweep_temporary(self.layers_dir())?;
+        let mut swept = GcReport {
             leftovers,
-            ..Swept::default()
+            ..GcReport::default()
         };
-        let Some(_alone) = Lock::alone_now(self.layers_dir())? else {
+        let Some(_alone) = Lock::try_lock_exclusive(self.layers_dir())? else {
             swept.deferred = true;
             return Ok(swept);
         };
@@ -71,7 +71,8 @@ impl Store {
         Ok(swept)
     }
 
-    /// Adds a blob, and if it is a document of the layout all that it names, and the blob of a diff-id.
+    /// Marks a blob as needed, the blob of a diff-id, and, if the blob is an OCI document, everything that it
+    /// references.
     fn mark(&self, digest: &Digest, needed: &mut BTreeSet<Digest>) -> Result<(), Error> {
         if !needed.insert(*digest) {
             return Ok(());
@@ -83,7 +84,7 @@ impl Store {
         if size == 0 || size > MAX_DOCUMENT {
             return Ok(());
         }
-        let Some(bytes) = self.document(digest)? else {
+        let Some(bytes) = self.read_document(digest)? else {
             return Ok(());
         };
         let Ok(document) = serde_json::from_slice::<Value>(&bytes) else {
@@ -95,9 +96,9 @@ impl Store {
         Ok(())
     }
 
-    fn sweep_blobs(&self, needed: &BTreeSet<Digest>, swept: &mut Swept) -> Result<(), Error> {
-        for entry in files::list(&self.blobs())? {
-            // What has another name is not ours.
+    fn sweep_blobs(&self, needed: &BTreeSet<Digest>, swept: &mut GcReport) -> Result<(), Error> {
+        for entry in files::list(&self.blobs_dir())? {
+            // Files with other names are not ours.
             let Some(digest) = entry.file_name().to_str().and_then(Digest::from_hex) else {
                 continue;
             };
@@ -112,7 +113,7 @@ impl Store {
         Ok(())
     }
 
-    fn sweep_trees(&self, needed: &BTreeSet<Digest>, swept: &mut Swept) -> Result<(), Error> {
+    fn sweep_trees(&self, needed: &BTreeSet<Digest>, swept: &mut GcReport) -> Result<(), Error> {
         for entry in files::list(self.layers_dir())? {
             let name = entry.file_name();
             let Some(name) = name.to_str() else { continue };
@@ -139,11 +140,11 @@ impl Store {
         Ok(())
     }
 
-    /// Hashes everything again and follows every reference. Changes nothing; empty means all is well.
+    /// Verifies all digests and references. Changes nothing; an empty result means that no defects were found.
     pub fn verify(&self) -> Result<Vec<Damage>, Error> {
         let _hold = self.hold()?;
         let mut damages = Vec::new();
-        for entry in files::list(&self.blobs())? {
+        for entry in files::list(&self.blobs_dir())? {
             if let Some(problem) = check_blob(&entry) {
                 damages.push(Damage {
                     path: entry.path(),
@@ -170,7 +171,7 @@ impl Store {
         let manifest = match self.read_manifest(image) {
             Ok(Some(manifest)) => manifest,
             Ok(None) => return damage(image, missing("the manifest")),
-            // A wrong content was found above already.
+            // The wrong content was already reported above.
             Err(Error::Damaged { .. }) => return,
             Err(error) => return damage(image, error.to_string()),
         };
@@ -185,7 +186,7 @@ impl Store {
             damage(
                 image,
                 format!(
-                    "it has {} layers and its configuration names {}",
+                    "it has {} layers, but its configuration names {}",
                     counts.1, counts.0
                 ),
             );
@@ -207,7 +208,7 @@ impl Store {
     }
 }
 
-/// Digests of the descriptors in a manifest or index.
+/// Returns the digests of the descriptors in a manifest or index.
 fn named_digests(document: &Value) -> Vec<Digest> {
     let list = |key: &str| {
         document
@@ -224,7 +225,7 @@ fn named_digests(document: &Value) -> Vec<Digest> {
     let mut digests: Vec<Digest> = descriptors
         .filter_map(|descriptor| descriptor.get("digest")?.as_str()?.parse().ok())
         .collect();
-    // The extracted layers are named by a configuration.
+    // The extracted layers are referenced by a configuration.
     let diff_ids = document
         .pointer("/rootfs/diff_ids")
         .and_then(Value::as_array)
@@ -237,10 +238,10 @@ fn named_digests(document: &Value) -> Vec<Digest> {
 fn check_blob(entry: &std::fs::DirEntry) -> Option<String> {
     let name = entry.file_name();
     let Some(expected) = name.to_str().and_then(Digest::from_hex) else {
-        return Some("its name is no digest".to_owned());
+        return Some("its name is not a digest".to_owned());
     };
     let hashed = File::open(entry.path()).and_then(|file| {
-        let mut file = Hashing::new(file);
+        let mut file = HashingStream::new(file);
         io::copy(&mut file, &mut io::sink())?;
         Ok(file.finish().1)
     });

@@ -1,11 +1,11 @@
-//! The patterns that leave files out of a layer.
+//! Glob patterns that exclude files from a layer.
 
-/// Patterns over paths relative to a root.
+/// Patterns for paths relative to a root.
 #[derive(Debug, Default)]
 pub(crate) struct Globs {
-    /// With a slash: matched against the whole path.
+    /// Patterns with a slash: matched against the whole path.
     paths: Vec<Vec<u8>>,
-    /// Without: matched against the last name.
+    /// Patterns without a slash: matched against the last component.
     names: Vec<Vec<u8>>,
 }
 
@@ -23,19 +23,19 @@ impl Globs {
         globs
     }
 
-    /// Whether `path`, whose last part is `name`, is left out.
+    /// Returns whether `path`, whose last component is `name`, is excluded.
     pub(crate) fn matches(&self, path: &[u8], name: &[u8]) -> bool {
         self.names.iter().any(|pattern| matches(pattern, name))
             || self.paths.iter().any(|pattern| matches(pattern, path))
     }
 }
 
-/// `*` and `?` stop at a slash, `**` does not.
+/// Matches a pattern; `*` and `?` stop at a slash, `**` does not.
 fn matches(pattern: &[u8], text: &[u8]) -> bool {
     match pattern {
         [] => text.is_empty(),
         [b'*', b'*', rest @ ..] => {
-            // `a/**/b` also means `a/b`.
+            // `a/**/b` also matches `a/b`.
             let without_slash = rest
                 .strip_prefix(b"/")
                 .is_some_and(|rest| matches(rest, text));
@@ -59,24 +59,24 @@ fn matches(pattern: &[u8], text: &[u8]) -> bool {
 mod tests {
     use super::*;
 
-    fn hits(pattern: &str, path: &str) -> bool {
+    fn is_match(pattern: &str, path: &str) -> bool {
         let name = path.rsplit('/').next().unwrap();
         Globs::new(&[pattern.to_owned()]).matches(path.as_bytes(), name.as_bytes())
     }
 
     #[test]
     fn bare_names_match_at_any_depth_and_paths_from_the_root() {
-        assert!(hits("*.pyc", "usr/lib/a.pyc"));
-        assert!(hits("__pycache__", "opt/x/__pycache__"));
-        assert!(!hits("*.pyc", "usr/lib/a.py"));
-        assert!(hits("/tmp", "tmp"));
-        assert!(!hits("/tmp", "var/tmp"));
-        assert!(hits("var/log/*", "var/log/dpkg.log"));
-        assert!(!hits("var/log/*", "var/log"));
-        assert!(!hits("var/log/*", "var/log/apt/term.log"));
-        assert!(hits("var/**/old", "var/old") && hits("var/**/old", "var/a/b/old"));
-        assert!(hits("usr/share/doc/**", "usr/share/doc/a/b"));
-        assert!(hits("a?c/", "abc"));
-        assert!(!hits("x/a?c", "x/a/c"));
+        assert!(is_match("*.pyc", "usr/lib/a.pyc"));
+        assert!(is_match("__pycache__", "opt/x/__pycache__"));
+        assert!(!is_match("*.pyc", "usr/lib/a.py"));
+        assert!(is_match("/tmp", "tmp"));
+        assert!(!is_match("/tmp", "var/tmp"));
+        assert!(is_match("var/log/*", "var/log/dpkg.log"));
+        assert!(!is_match("var/log/*", "var/log"));
+        assert!(!is_match("var/log/*", "var/log/apt/term.log"));
+        assert!(is_match("var/**/old", "var/old") && is_match("var/**/old", "var/a/b/old"));
+        assert!(is_match("usr/share/doc/**", "usr/share/doc/a/b"));
+        assert!(is_match("a?c/", "abc"));
+        assert!(!is_match("x/a?c", "x/a/c"));
     }
 }

@@ -1,8 +1,7 @@
-//! gzip on all cores, and decompression on a thread of its own.
+//! Parallel gzip compression, and decompression on a thread of its own.
 //!
-//! The stream is cut into pieces of a fixed size, each a gzip member of its own (RFC 1952, 2.2: members may
-//! follow one another; every reader of image layers joins them). So the bytes do not depend on how many threads
-//! wrote them.
+//! The stream is split into pieces of a fixed size, each a gzip member of its own (RFC 1952, 2.2: members may be
+//! concatenated; all readers of image layers support that). So the output does not depend on the number of threads.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -12,24 +11,24 @@ use std::thread;
 use flate2::bufread::MultiGzDecoder;
 use flate2::{Compression, GzBuilder};
 
-/// Bytes in one gzip member: large enough to cost less than half a percent of size.
+/// Size of the content of a gzip member in bytes; large enough to cost less than 0.5 % of compression.
 const PIECE: usize = 4 << 20;
 
-/// Bytes handed from the decompressing thread at once.
+/// Number of bytes passed at once from the decompressing thread.
 const CHUNK: usize = 256 << 10;
 
-/// More threads only wait for the one that reads the files and hashes.
+/// More threads would only wait for the one that reads the files and hashes.
 const MAX_WORKERS: usize = 8;
 
-/// A piece to compress, and where the result is awaited.
+/// A piece to compress, and the channel for the result.
 type Job = (Vec<u8>, SyncSender<Vec<u8>>);
 
-/// Runs `fill` with a writer whose gzip form goes to `output`. Gives back `output` and what `fill` gave.
+/// Runs `fill` with a writer that compresses into `output`. Returns `output` and the result of `fill`.
 pub(crate) fn compress<W, T, E>(
     output: W,
     level: u32,
     fill: impl FnOnce(&mut dyn Write) -> Result<T, E>,
-) -> Result<(W, T), Failed<E>>
+) -> Result<(W, T), CompressError<E>>
 where
     W: Write + Send,
 {
@@ -39,10 +38,10 @@ where
     let waiting = Mutex::new(waiting);
     thread::scope(|scope| {
         for _ in 0..workers {
-            scope.spawn(|| work(&waiting, level));
+            scope.spawn(|| compress_jobs(&waiting, level));
         }
         let writing = scope.spawn(move || write_in_order(output, &results));
-        let mut pieces = Pieces {
+        let mut pieces = PieceWriter {
             buffer: Vec::with_capacity(PIECE),
             jobs,
             order,
@@ -52,34 +51,34 @@ where
         let written = writing
             .join()
             .unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-        // When the output failed, what `fill` says is only that the pipe broke.
-        let output = written.map_err(Failed::Output)?;
-        let filled = filled.map_err(Failed::Fill)?;
-        closed.map_err(Failed::Output)?;
+        // If the output failed, the error of `fill` is only a broken pipe.
+        let output = written.map_err(CompressError::Output)?;
+        let filled = filled.map_err(CompressError::Fill)?;
+        closed.map_err(CompressError::Output)?;
         Ok((output, filled))
     })
 }
 
-/// Which side of [`compress`] failed.
-pub(crate) enum Failed<E> {
+/// Side of [`compress`] that failed.
+pub(crate) enum CompressError<E> {
     Output(io::Error),
     Fill(E),
 }
 
-fn work(waiting: &Mutex<Receiver<Job>>, level: u32) {
+fn compress_jobs(waiting: &Mutex<Receiver<Job>>, level: u32) {
     loop {
         let job = waiting
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .recv();
         let Ok((piece, result)) = job else { return };
-        // The receiver is gone when the output failed; then nobody needs the piece.
-        let _ = result.send(member(&piece, level));
+        // If the output has failed, the receiver is gone and nobody needs the piece.
+        let _ = result.send(compress_member(&piece, level));
     }
 }
 
-/// One gzip member without name, time or system.
-fn member(piece: &[u8], level: u32) -> Vec<u8> {
+/// Compresses a gzip member without name, time or operating system.
+fn compress_member(piece: &[u8], level: u32) -> Vec<u8> {
     let output = Vec::with_capacity(piece.len() / 2);
     let mut encoder = GzBuilder::new()
         .mtime(0)
@@ -101,14 +100,14 @@ fn write_in_order<W: Write>(mut output: W, results: &Receiver<Receiver<Vec<u8>>>
     Ok(output)
 }
 
-/// Cuts what is written into pieces.
-struct Pieces {
+/// Writer that splits its input into pieces.
+struct PieceWriter {
     buffer: Vec<u8>,
     jobs: SyncSender<Job>,
     order: SyncSender<Receiver<Vec<u8>>>,
 }
 
-impl Pieces {
+impl PieceWriter {
     fn send(&mut self) -> io::Result<()> {
         let piece = std::mem::replace(&mut self.buffer, Vec::with_capacity(PIECE));
         let (result, awaited) = sync_channel(1);
@@ -128,7 +127,7 @@ impl Pieces {
     }
 }
 
-impl Write for Pieces {
+impl Write for PieceWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let taken = bytes.len().min(PIECE - self.buffer.len());
         self.buffer.extend_from_slice(&bytes[..taken]);
@@ -143,17 +142,17 @@ impl Write for Pieces {
     }
 }
 
-/// What a stream begins with.
+/// Format of a stream, detected by its magic number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Format {
     Gzip,
     Zstd,
-    /// Anything else is taken for tar, whose reader knows better.
+    /// Anything else is assumed to be tar, whose reader reports errors.
     Plain,
 }
 
-/// Looks at the first bytes without taking them.
-pub(crate) fn detect(input: &mut impl BufRead) -> io::Result<Format> {
+/// Detects the format without consuming input.
+pub(crate) fn detect_format(input: &mut impl BufRead) -> io::Result<Format> {
     let start = input.fill_buf()?;
     Ok(match start {
         [0x1f, 0x8b, ..] => Format::Gzip,
@@ -162,31 +161,31 @@ pub(crate) fn detect(input: &mut impl BufRead) -> io::Result<Format> {
     })
 }
 
-/// A reader of what a stream holds, gzip or plain.
+/// Returns a reader of the decompressed content of a stream, gzip or plain.
 pub(crate) fn decoder<'a>(input: impl Read + Send + 'a) -> io::Result<Box<dyn Read + Send + 'a>> {
     let mut input = BufReader::with_capacity(CHUNK, input);
-    match detect(&mut input)? {
+    match detect_format(&mut input)? {
         Format::Gzip => Ok(Box::new(MultiGzDecoder::new(input))),
         Format::Plain => Ok(Box::new(input)),
         Format::Zstd => Err(io::Error::new(
             io::ErrorKind::InvalidData,
-            "it is compressed with zstd; gzip is what is read here",
+            "it is compressed with zstd; only gzip is supported",
         )),
     }
 }
 
-/// Runs `consume` with a reader whose bytes another thread reads ahead from `input`. That thread may read and do nothing else: it
-/// decompresses what strangers have written.
-pub(crate) fn reading_ahead<R: Read + Send, T>(
+/// Runs `consume` with a reader that is filled by another thread from `input`. That thread has no other privileges than
+/// reading, because it decompresses untrusted data.
+pub(crate) fn read_ahead<R: Read + Send, T>(
     mut input: R,
     consume: impl FnOnce(&mut dyn Read) -> T,
 ) -> T {
     let (chunks, received) = sync_channel::<io::Result<Vec<u8>>>(8);
     thread::scope(|scope| {
-        privilege::reading_beside(scope, move || {
+        privilege::spawn_reader(scope, move || {
             loop {
                 let mut chunk = vec![0; CHUNK];
-                let read = fill(&mut input, &mut chunk);
+                let read = read_full(&mut input, &mut chunk);
                 let last = !matches!(read, Ok(CHUNK));
                 let sent = chunks.send(read.map(|read| {
                     chunk.truncate(read);
@@ -197,7 +196,7 @@ pub(crate) fn reading_ahead<R: Read + Send, T>(
                 }
             }
         });
-        consume(&mut Ahead {
+        consume(&mut ReadAhead {
             received,
             chunk: Vec::new(),
             at: 0,
@@ -206,7 +205,7 @@ pub(crate) fn reading_ahead<R: Read + Send, T>(
 }
 
 /// Reads until the buffer is full or the input ends.
-fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
+fn read_full(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     let mut filled = 0;
     while filled < buffer.len() {
         match input.read(&mut buffer[filled..]) {
@@ -219,16 +218,16 @@ fn fill(input: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     Ok(filled)
 }
 
-struct Ahead {
+struct ReadAhead {
     received: Receiver<io::Result<Vec<u8>>>,
     chunk: Vec<u8>,
     at: usize,
 }
 
-impl Read for Ahead {
+impl Read for ReadAhead {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.at == self.chunk.len() {
-            // The sender hangs up after the last chunk.
+            // The sender disconnects after the last chunk.
             let Ok(chunk) = self.received.recv() else {
                 return Ok(0);
             };
@@ -249,7 +248,7 @@ mod tests {
         (0..length).map(|i| (i * i / 7 % 251) as u8).collect()
     }
 
-    fn packed(bytes: &[u8]) -> Vec<u8> {
+    fn compress_to_vec(bytes: &[u8]) -> Vec<u8> {
         match compress(Vec::new(), 6, |out| out.write_all(bytes)) {
             Ok((packed, ())) => packed,
             Err(_) => panic!("compressing to memory failed"),
@@ -259,18 +258,18 @@ mod tests {
     #[test]
     fn several_pieces_come_back_as_one_stream() {
         let bytes = pattern(2 * PIECE + 12_345);
-        let packed = packed(&bytes);
+        let packed = compress_to_vec(&bytes);
         assert!(packed.len() < bytes.len());
         let decoder = decoder(&packed[..]).unwrap();
         let mut back = Vec::new();
-        reading_ahead(decoder, |input| input.read_to_end(&mut back)).unwrap();
+        read_ahead(decoder, |input| input.read_to_end(&mut back)).unwrap();
         assert!(back == bytes);
     }
 
-    /// Who the thread is that reads from it.
-    struct Asked(Option<u32>);
+    /// Reader that records the user id of the thread that reads from it.
+    struct UserIdReader(Option<u32>);
 
-    impl Read for Asked {
+    impl Read for UserIdReader {
         fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
             self.0 = Some(rustix::process::geteuid().as_raw());
             Ok(0)
@@ -279,9 +278,9 @@ mod tests {
 
     #[test]
     fn what_is_read_ahead_is_read_without_roots_rights() {
-        let told = crate::by_engine(|| {
-            let mut asked = Asked(None);
-            reading_ahead(&mut asked, |content| io::copy(content, &mut io::sink())).expect("read");
+        let told = crate::run_as_engine(|| {
+            let mut asked = UserIdReader(None);
+            read_ahead(&mut asked, |content| io::copy(content, &mut io::sink())).expect("read");
             (asked.0, rustix::process::geteuid().as_raw())
         });
         assert_eq!(told, (Some(privilege::DEFAULT_USER), 0));
@@ -290,10 +289,10 @@ mod tests {
     #[test]
     fn the_same_bytes_give_the_same_gzip() {
         let bytes = pattern(PIECE + 1);
-        assert!(packed(&bytes) == packed(&bytes));
-        // No time, no name, "unknown" system.
-        assert_eq!(packed(&bytes)[..8], [0x1f, 0x8b, 8, 0, 0, 0, 0, 0]);
-        assert_eq!(packed(&bytes)[9], 255);
+        assert!(compress_to_vec(&bytes) == compress_to_vec(&bytes));
+        // No time, no name, "unknown" operating system.
+        assert_eq!(compress_to_vec(&bytes)[..8], [0x1f, 0x8b, 8, 0, 0, 0, 0, 0]);
+        assert_eq!(compress_to_vec(&bytes)[9], 255);
     }
 
     #[test]
@@ -304,15 +303,17 @@ mod tests {
             .unwrap();
         let bytes = pattern(40 * PIECE);
         match compress(full, 1, |out| out.write_all(&bytes)) {
-            Err(Failed::Output(error)) => assert_eq!(error.kind(), io::ErrorKind::StorageFull),
-            Err(Failed::Fill(error)) => panic!("the wrong side is blamed: {error}"),
+            Err(CompressError::Output(error)) => {
+                assert_eq!(error.kind(), io::ErrorKind::StorageFull)
+            }
+            Err(CompressError::Fill(error)) => panic!("the wrong side is blamed: {error}"),
             Ok(_) => panic!("a full disk took everything"),
         }
     }
 
     #[test]
     fn a_cut_stream_is_an_error() {
-        let packed = packed(&pattern(100_000));
+        let packed = compress_to_vec(&pattern(100_000));
         let mut back = Vec::new();
         let error = decoder(&packed[..packed.len() - 5])
             .unwrap()

@@ -3,22 +3,22 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::oci::{self, Config, Descriptor, History, Process, REF_NAME, RootFs};
-use crate::store::json;
+use crate::store::to_json;
 use crate::{Digest, Error, LayerInfo, Store};
 
-/// Every image's date: a true one would give equal images different digests. umoci fails without one.
+/// Creation date of all images: a real one would give equal images different digests. umoci requires one.
 const EPOCH: &str = "1970-01-01T00:00:00Z";
 
-/// What to make an image of. The same values always give the same digest.
+/// Specification of an image. Equal values give equal digests.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ImageSpec {
-    /// Lowest first.
+    /// Layers, lowest first.
     pub layers: Vec<LayerInfo>,
     /// Environment of its processes.
     pub env: BTreeMap<String, String>,
-    /// What a container runs by default.
+    /// Default command of a container.
     pub cmd: Vec<String>,
-    /// Where it runs; empty for `/`.
+    /// Working directory; empty for `/`.
     pub working_dir: String,
     /// Labels of the configuration.
     pub labels: BTreeMap<String, String>,
@@ -27,8 +27,12 @@ pub struct ImageSpec {
 }
 
 impl ImageSpec {
-    /// What configuration and manifest say, of these layers.
-    pub(crate) fn read(layers: Vec<LayerInfo>, config: Config, manifest: oci::Manifest) -> Self {
+    /// Creates the specification from a configuration, a manifest and their layers.
+    pub(crate) fn from_documents(
+        layers: Vec<LayerInfo>,
+        config: Config,
+        manifest: oci::Manifest,
+    ) -> Self {
         let process = config.config;
         let env = process.env.iter().filter_map(|pair| pair.split_once('='));
         ImageSpec {
@@ -44,30 +48,30 @@ impl ImageSpec {
     }
 }
 
-/// An image of the store, read back.
+/// An image read from the store.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Image {
-    /// Of the manifest.
+    /// Digest of the manifest.
     pub digest: Digest,
-    /// What it was made of.
+    /// Specification of the image.
     pub spec: ImageSpec,
 }
 
-/// A manifest as it is served.
+/// A manifest as served by a registry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Manifest {
     /// Digest of the manifest.
     pub digest: Digest,
-    /// For `Content-Type`.
+    /// Media type, for `Content-Type`.
     pub media_type: String,
-    /// The document.
+    /// JSON document.
     pub bytes: Vec<u8>,
 }
 
 impl Store {
-    /// Writes an image; its manifest's digest is its name. Its layers must be in the store.
+    /// Writes an image and returns the digest of its manifest. Its layers must be in the store.
     ///
-    /// It has no tag yet: without [`Store::hold`] or a tag, the next [`Store::gc`] removes it.
+    /// The image has no tag yet: without [`Store::hold`] or a tag, the next [`Store::gc`] removes it.
     pub fn put_image(&self, spec: &ImageSpec) -> Result<Digest, Error> {
         let _hold = self.hold()?;
         for layer in &spec.layers {
@@ -78,13 +82,13 @@ impl Store {
                 });
             }
         }
-        let config = json(&configuration(spec));
+        let config = to_json(&make_config(spec));
         let config = Descriptor::new(
             oci::MEDIA_CONFIG,
             self.put_blob(&config)?,
             config.len() as u64,
         );
-        let manifest = json(&manifest(spec, config));
+        let manifest = to_json(&make_manifest(spec, config));
         let digest = self.put_blob(&manifest)?;
         let descriptor = Descriptor::new(oci::MEDIA_MANIFEST, digest, manifest.len() as u64);
         self.change_index(|index| {
@@ -124,14 +128,14 @@ impl Store {
             .collect::<Result<_, Error>>()?;
         Ok(Image {
             digest: *image,
-            spec: ImageSpec::read(layers, config, manifest),
+            spec: ImageSpec::from_documents(layers, config, manifest),
         })
     }
 
-    /// All images, tagged or not.
+    /// Returns all images, tagged or not.
     pub fn images(&self) -> Result<BTreeSet<Digest>, Error> {
         Ok(self
-            .index()?
+            .read_index()?
             .unwrap_or_default()
             .manifests
             .iter()
@@ -139,7 +143,7 @@ impl Store {
             .collect())
     }
 
-    /// Gives an image a name such as `opencv_apps:3`, taking it from another image if that had it.
+    /// Tags an image with a name such as `opencv_apps:3`, which is removed from another image if that had it.
     pub fn tag(&self, name: &str, image: &Digest) -> Result<(), Error> {
         check_tag(name)?;
         self.change_index(|index| {
@@ -162,20 +166,20 @@ impl Store {
                 .iter()
                 .find(|entry| entry.tag() == Some(name))
                 .map(|entry| entry.digest);
-            // The entry that only said that the image is there has done its duty.
+            // The untagged entry of the image is no longer needed.
             index.manifests.retain(|entry| {
                 entry.tag() != Some(name) && !(entry.digest == *image && entry.tag().is_none())
             });
             index.manifests.push(tagged);
             if let Some(loser) = loser {
-                keep_listed(index, loser, self)?;
+                ensure_listed(index, loser, self)?;
             }
-            sort(index);
+            sort_index(index);
             Ok((true, ()))
         })
     }
 
-    /// Takes a name away; false if there was none such. The image stays until [`Store::gc`].
+    /// Removes a tag; returns false if it did not exist. The image stays until [`Store::gc`].
     pub fn untag(&self, name: &str) -> Result<bool, Error> {
         self.change_index(|index| {
             let Some(at) = index
@@ -186,15 +190,15 @@ impl Store {
                 return Ok((false, false));
             };
             let loser = index.manifests.remove(at).digest;
-            keep_listed(index, loser, self)?;
-            sort(index);
+            ensure_listed(index, loser, self)?;
+            sort_index(index);
             Ok((true, true))
         })
     }
 
-    /// All names.
+    /// Returns all tags.
     pub fn tags(&self) -> Result<BTreeMap<String, Digest>, Error> {
-        let index = self.index()?.unwrap_or_default();
+        let index = self.read_index()?.unwrap_or_default();
         let tagged = index
             .manifests
             .iter()
@@ -202,9 +206,9 @@ impl Store {
         Ok(tagged.collect())
     }
 
-    /// The image with this tag or digest; none if there is none, or only a blob of that digest.
+    /// Returns the image with this tag or digest; `None` if there is none, or only a blob of that digest.
     pub fn resolve(&self, reference: &str) -> Result<Option<Digest>, Error> {
-        let index = self.index()?.unwrap_or_default();
+        let index = self.read_index()?.unwrap_or_default();
         let digest = reference.parse::<Digest>().ok();
         let mut entries = index.manifests.iter();
         let found =
@@ -212,15 +216,15 @@ impl Store {
         Ok(found.map(|entry| entry.digest))
     }
 
-    /// The manifest with this tag or digest, as `/v2/NAME/manifests/REFERENCE` serves it.
+    /// Returns the manifest with this tag or digest, for `/v2/NAME/manifests/REFERENCE`.
     pub fn manifest(&self, reference: &str) -> Result<Option<Manifest>, Error> {
         let Some(digest) = self.resolve(reference)? else {
             return Ok(None);
         };
-        let Some(bytes) = self.document(&digest)? else {
+        let Some(bytes) = self.read_document(&digest)? else {
             return Ok(None);
         };
-        let index = self.index()?.unwrap_or_default();
+        let index = self.read_index()?.unwrap_or_default();
         let media_type = index
             .manifests
             .into_iter()
@@ -234,8 +238,8 @@ impl Store {
         }))
     }
 
-    /// Whether a blob is one of an image's: its manifest, its configuration or one of its layers. Digests elsewhere in the manifest, such
-    /// as in annotations, are what whoever pushed it has written.
+    /// Returns whether a blob is part of an image: its manifest, its configuration or one of its layers. Digests
+    /// elsewhere in the manifest, for example in annotations, do not count, since they are chosen by whoever pushed it.
     pub fn has_blob(&self, image: &Digest, blob: &Digest) -> Result<bool, Error> {
         if image == blob {
             return Ok(true);
@@ -248,15 +252,18 @@ impl Store {
     }
 
     pub(crate) fn read_manifest(&self, digest: &Digest) -> Result<Option<oci::Manifest>, Error> {
-        self.parsed(digest)
+        self.parse_document(digest)
     }
 
     pub(crate) fn read_config(&self, digest: &Digest) -> Result<Option<Config>, Error> {
-        self.parsed(digest)
+        self.parse_document(digest)
     }
 
-    fn parsed<T: serde::de::DeserializeOwned>(&self, digest: &Digest) -> Result<Option<T>, Error> {
-        let Some(bytes) = self.document(digest)? else {
+    fn parse_document<T: serde::de::DeserializeOwned>(
+        &self,
+        digest: &Digest,
+    ) -> Result<Option<T>, Error> {
+        let Some(bytes) = self.read_document(digest)? else {
             return Ok(None);
         };
         let parsed = serde_json::from_slice(&bytes);
@@ -267,12 +274,12 @@ impl Store {
     }
 }
 
-/// An image that lost its last tag stays in the index without one.
-fn keep_listed(index: &mut oci::Index, image: Digest, store: &Store) -> Result<(), Error> {
+/// Keeps an image that has lost its last tag in the index without a tag.
+fn ensure_listed(index: &mut oci::Index, image: Digest, store: &Store) -> Result<(), Error> {
     if index.manifests.iter().any(|entry| entry.digest == image) {
         return Ok(());
     }
-    if let Some(bytes) = store.document(&image)? {
+    if let Some(bytes) = store.read_document(&image)? {
         index.manifests.push(Descriptor::new(
             oci::MEDIA_MANIFEST,
             image,
@@ -282,18 +289,18 @@ fn keep_listed(index: &mut oci::Index, image: Digest, store: &Store) -> Result<(
     Ok(())
 }
 
-/// The index says the same whatever the order of the calls was.
-fn sort(index: &mut oci::Index) {
+/// Sorts the index, so that it does not depend on the order of calls.
+fn sort_index(index: &mut oci::Index) {
     index
         .manifests
         .sort_by(|a, b| (a.tag(), a.digest).cmp(&(b.tag(), b.digest)));
 }
 
-/// `ref.name` of the image layout specification, a little wider: ROS names may hold `__`.
+/// Validates a tag: `ref.name` of the image layout specification, extended because ROS names may contain `__`.
 fn check_tag(name: &str) -> Result<(), Error> {
     let fits = |c: char| c.is_ascii_alphanumeric() || "._:@+/-".contains(c);
     let begins = name.starts_with(|c: char| c.is_ascii_alphanumeric());
-    // A tag that reads as a digest would hide that digest.
+    // A tag in the form of a digest would hide that digest.
     if begins && name.len() <= 255 && name.chars().all(fits) && name.parse::<Digest>().is_err() {
         return Ok(());
     }
@@ -302,7 +309,7 @@ fn check_tag(name: &str) -> Result<(), Error> {
     })
 }
 
-fn configuration(spec: &ImageSpec) -> Config {
+fn make_config(spec: &ImageSpec) -> Config {
     let (architecture, variant) = oci::platform();
     Config {
         created: Some(EPOCH.to_owned()),
@@ -334,7 +341,7 @@ fn configuration(spec: &ImageSpec) -> Config {
     }
 }
 
-fn manifest(spec: &ImageSpec, config: Descriptor) -> oci::Manifest {
+fn make_manifest(spec: &ImageSpec, config: Descriptor) -> oci::Manifest {
     oci::Manifest {
         schema_version: 2,
         media_type: oci::MEDIA_MANIFEST.to_owned(),
@@ -381,7 +388,7 @@ mod tests {
             assert!(store.has_blob(&image, &part).expect("read"), "{part}");
         }
         assert!(!store.has_blob(&image, &other.digest).expect("read"));
-        // An image that is gone has itself alone.
+        // A missing image contains only itself.
         assert!(!store.has_blob(&own.diff_id, &own.digest).expect("read"));
     }
 }

@@ -1,4 +1,4 @@
-//! Layers: made from trees, imported, exported, found again by their content.
+//! Layers: creation from trees, import, export, and lookup by content.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::digest::Hashing;
-use crate::entry::shown;
-use crate::extract::{HalfMadeTree, fill};
+use crate::digest::HashingStream;
+use crate::entry::display_name;
+use crate::extract::{TemporaryTree, extract_stream};
 use crate::files::{self, NewFile};
-use crate::gzip::{self, Failed};
-use crate::store::{MAX_DOCUMENT, json};
+use crate::gzip::{self, CompressError};
+use crate::store::{MAX_DOCUMENT, to_json};
 use crate::tar_reader::TarReader;
 use crate::tar_writer::TarWriter;
 use crate::tree::Packer;
@@ -20,30 +20,30 @@ use crate::{Digest, Error, Limits, Refusal, Store};
 /// A layer in the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LayerInfo {
-    /// Of the compressed blob.
+    /// Digest of the compressed blob.
     pub digest: Digest,
-    /// Of the tar stream inside.
+    /// Digest of the uncompressed tar stream.
     pub diff_id: Digest,
-    /// Bytes of the compressed blob.
+    /// Size of the compressed blob in bytes.
     pub size: u64,
-    /// Bytes of the tar stream inside: about what the extracted tree takes. 0 when not known.
+    /// Size of the tar stream in bytes, which is about the size of the extracted tree; 0 if unknown.
     #[serde(default)]
     pub unpacked: u64,
 }
 
-/// How a file tree becomes a layer.
+/// Options for packing a file tree into a layer.
 #[derive(Debug, Clone)]
 pub struct TreeOptions {
-    /// Subtracted from every owner and group: the first host id of the user namespace the tree was made in.
-    /// Ids below it (files the daemon itself put there) become 0.
+    /// First host id of the user namespace that the tree was created in; subtracted from every owner and group. Ids
+    /// below it (files created by the daemon itself) become 0.
     pub uid_offset: u32,
-    /// What to leave out: globs of paths relative to the root (`*` and `?` within one name, `**` across names),
-    /// or of bare names at any depth (`*.log`) when there is no slash. What is left out is left out with all
-    /// below it; `var/cache/*` keeps the directory itself.
+    /// Exclusion patterns: globs of paths relative to the root (`*` and `?` within a component, `**` across
+    /// components), or of bare names at any depth (`*.log`) if there is no slash. An excluded directory is excluded
+    /// with all its content; `var/cache/*` keeps the directory itself.
     pub exclude: Vec<String>,
-    /// The tree is the upper directory of an overlay mount: its marks for deletions become whiteouts.
+    /// True if the tree is the upper directory of an overlay mount: its deletion marks become whiteouts.
     pub overlay_upper: bool,
-    /// Which modification times are recorded.
+    /// Modification times to record.
     pub mtime: Mtime,
     /// gzip level, 1 (fast) to 9 (small).
     pub level: u32,
@@ -52,11 +52,10 @@ pub struct TreeOptions {
 /// Modification times in a layer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mtime {
-    /// All the same: seconds since 1970.
+    /// A fixed time for all files, in seconds since 1970.
     Fixed(u64),
-    /// Each file's own, but none later than this. For trees whose files carry dates that mean something and are
-    /// reproducible, such as an unpacked Debian package: Python throws away a `.pyc` whose source has another
-    /// time than the one it recorded.
+    /// The time of each file, but not later than this. For trees with meaningful and reproducible times, such as
+    /// unpacked Debian packages: Python discards a `.pyc` whose source has another time than the recorded one.
     Clamp(u64),
 }
 
@@ -73,15 +72,15 @@ impl Default for TreeOptions {
 }
 
 impl Store {
-    /// Packs a file tree into a layer. The same tree with the same options gives the same layer, whoever's
-    /// directory order, inode numbers and clock it has.
+    /// Packs a file tree into a layer. The same tree with the same options gives the same layer, regardless of
+    /// directory order, inode numbers and clock.
     ///
-    /// Symbolic links are packed, never followed; sockets are left out. The tree's root itself has no entry.
+    /// Symbolic links are packed, never followed; sockets are left out. The root directory itself has no entry.
     pub fn layer_from_tree(&self, tree: &Path, options: &TreeOptions) -> Result<LayerInfo, Error> {
         let _hold = self.hold()?;
         let blob = self.new_blob()?;
-        let packed = gzip::compress(Hashing::new(&blob), options.level, |output| {
-            let mut packer = Packer::new(TarWriter::new(Hashing::new(output)), options);
+        let packed = gzip::compress(HashingStream::new(&blob), options.level, |output| {
+            let mut packer = Packer::new(TarWriter::new(HashingStream::new(output)), options);
             packer.pack(tree)?;
             let finished = packer
                 .finish()
@@ -90,8 +89,10 @@ impl Store {
             Ok((diff_id, unpacked))
         });
         let (output, (diff_id, unpacked)) = packed.map_err(|failed| match failed {
-            Failed::Output(error) => Error::file("write a layer to", self.images_dir(), error),
-            Failed::Fill(error) => error,
+            CompressError::Output(error) => {
+                Error::file("write a layer to", self.images_dir(), error)
+            }
+            CompressError::Fill(error) => error,
         })?;
         let (_, digest, size) = output.finish();
         let layer = LayerInfo {
@@ -104,31 +105,33 @@ impl Store {
         Ok(layer)
     }
 
-    /// Copies a `tar.gz` into the store as a layer, and extracts it: in one pass, since decompressing takes longer than all else. Its digest
-    /// and diff-id are found on the way.
+    /// Imports a `tar.gz` as a layer and extracts it in a single pass, since decompression takes most of the time. Its
+    /// digest and diff-id are computed on the way.
     pub fn import_layer(&self, archive: &Path) -> Result<LayerInfo, Error> {
         let file = File::open(archive).map_err(|error| Error::file("open", archive, error))?;
         let label = archive.display().to_string();
         let _hold = self.hold()?;
-        let tree = HalfMadeTree::create(self.layers_dir())?;
-        let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
+        let tree = TemporaryTree::create(self.layers_dir())?;
+        let read = |copy: &mut Tee<File, HashingStream<&NewFile>>| {
             let content =
                 gzip::decoder(copy).map_err(|error| Error::file("read", archive, error))?;
-            gzip::reading_ahead(content, |content| {
-                fill(&tree.path, content, &label, archive)
+            gzip::read_ahead(content, |content| {
+                extract_stream(&tree.path, content, &label, archive)
             })
             .map_err(|error| match error {
-                Error::File { source, .. } if is_damage(&source) => malformed(archive, source),
+                Error::File { source, .. } if is_corruption(&source) => {
+                    malformed_archive(archive, source)
+                }
                 error => error,
             })
         };
         let layer = self.copy_layer(file, archive, read, |_| Ok(()))?;
-        self.appear(tree, &layer.diff_id)?;
+        self.publish_tree(tree, &layer.diff_id)?;
         Ok(layer)
     }
 
-    /// The same of a file that strangers have written, called `label`, which may not hold more than `limits`; gives the number of its
-    /// entries, too. Nothing of it is kept unless `accept` takes it.
+    /// Imports an untrusted `tar.gz`, called `label` in messages, which may not exceed `limits`; also returns the
+    /// number of its entries. The layer is discarded unless `accept` succeeds.
     pub(crate) fn import_layer_within(
         &self,
         file: File,
@@ -137,11 +140,11 @@ impl Store {
         accept: impl FnOnce(&LayerInfo) -> Result<(), Error>,
     ) -> Result<(LayerInfo, u64), Error> {
         let mut entries = 0;
-        let read = |copy: &mut Tee<File, Hashing<&NewFile>>| {
-            let (digest, bytes, counted) = by_reader(|| {
+        let read = |copy: &mut Tee<File, HashingStream<&NewFile>>| {
+            let (digest, bytes, counted) = run_as_reader(|| {
                 let content =
                     gzip::decoder(copy).map_err(|error| Error::file("read", label, error))?;
-                gzip::reading_ahead(content, |content| walk(content, label, limits))
+                gzip::read_ahead(content, |content| scan_layer(content, label, limits))
             })?;
             entries = counted;
             Ok((digest, bytes))
@@ -150,12 +153,13 @@ impl Store {
         Ok((layer, entries))
     }
 
-    /// Copies what `read` reads, which finds the digest and the bytes of the content, and keeps it if `accept` takes it.
+    /// Copies what `read` consumes, which returns the digest and size of the content; the layer is discarded unless
+    /// `accept` succeeds.
     pub(crate) fn copy_layer(
         &self,
         file: File,
         archive: &Path,
-        read: impl FnOnce(&mut Tee<File, Hashing<&NewFile>>) -> Result<(Digest, u64), Error>,
+        read: impl FnOnce(&mut Tee<File, HashingStream<&NewFile>>) -> Result<(Digest, u64), Error>,
         accept: impl FnOnce(&LayerInfo) -> Result<(), Error>,
     ) -> Result<LayerInfo, Error> {
         let _hold = self.hold()?;
@@ -164,12 +168,14 @@ impl Store {
         let blob = self.new_blob()?;
         let mut copy = Tee {
             from: file,
-            to: Hashing::new(&blob),
+            to: HashingStream::new(&blob),
             failed: None,
         };
         let read = read(&mut copy);
         if let Some(error) = copy.failed.take() {
-            return Err(Error::file("write a layer to", self.images_dir(), error).needing(needed));
+            return Err(
+                Error::file("write a layer to", self.images_dir(), error).with_needed_bytes(needed)
+            );
         }
         let (diff_id, unpacked) = read?;
         let (_, digest, size) = copy.to.finish();
@@ -184,20 +190,20 @@ impl Store {
         Ok(layer)
     }
 
-    /// Copies a layer out of the store as a `tar.gz`; appears whole or not at all.
+    /// Exports a layer as a `tar.gz`, atomically.
     pub fn export_layer(&self, diff_id: &Digest, to: &Path) -> Result<(), Error> {
         let _hold = self.hold()?;
         let layer = self.existing_layer(diff_id)?;
         let from = self.blob_path(&layer.digest);
         let mut file = File::open(&from).map_err(|error| Error::file("open", &from, error))?;
         let new = NewFile::create(files::directory_of(to))?;
-        // From file to file the kernel copies, or shares the blocks.
+        // The kernel copies from file to file, or shares the blocks.
         io::copy(&mut file, &mut new.file())
-            .map_err(|error| Error::file("write", to, error).needing(layer.size))?;
+            .map_err(|error| Error::file("write", to, error).with_needed_bytes(layer.size))?;
         new.publish(to)
     }
 
-    /// The layer with this content, if it is in the store.
+    /// Returns the layer with this diff-id, if it is in the store.
     pub fn layer(&self, diff_id: &Digest) -> Result<Option<LayerInfo>, Error> {
         if let Some(layer) = self.layer_record(diff_id)? {
             let blob = std::fs::metadata(self.blob_path(&layer.digest));
@@ -205,7 +211,7 @@ impl Store {
                 return Ok(Some(layer));
             }
         }
-        // The directory of layers may have been emptied, or another tool have brought the image.
+        // The directory of layers may have been emptied, or another tool may have added the image.
         for image in self.images()? {
             let Some(manifest) = self.read_manifest(&image)? else {
                 continue;
@@ -240,53 +246,55 @@ impl Store {
         self.layer(diff_id)?.ok_or_else(unknown)
     }
 
-    /// Where the record of which blob holds a layer is.
+    /// Returns the path of the record that maps a layer to its blob.
     pub(crate) fn record_path(&self, diff_id: &Digest) -> PathBuf {
         self.layers_dir().join(format!("{}.json", diff_id.hex()))
     }
 
     pub(crate) fn layer_record(&self, diff_id: &Digest) -> Result<Option<LayerInfo>, Error> {
         let path = self.record_path(diff_id);
-        let Some(bytes) = files::read_whole(&path, MAX_DOCUMENT)? else {
+        let Some(bytes) = files::read_limited(&path, MAX_DOCUMENT)? else {
             return Ok(None);
         };
-        // A record can be made again; one that does not parse is as good as none.
+        // A record can be recreated; one that cannot be parsed counts as missing.
         Ok(serde_json::from_slice(&bytes)
             .ok()
             .filter(|layer: &LayerInfo| layer.diff_id == *diff_id))
     }
 
-    /// The blob first: a record never names a blob that is not there. One that is there stays: the same content in other blobs would change
-    /// the digests of images that are made of it later.
+    /// Publishes the blob before the record, so that a record never names a missing blob. An existing record is kept:
+    /// other blobs of the same content would change the digests of images built from it later.
     fn publish_layer(&self, blob: NewFile, layer: &LayerInfo) -> Result<(), Error> {
         self.publish_blob(blob, &layer.digest)?;
         let known = self.layer_record(&layer.diff_id)?;
         if known.is_some_and(|known| self.blob_path(&known.digest).exists()) {
             return Ok(());
         }
-        files::write_whole(&self.record_path(&layer.diff_id), &json(layer))
+        files::write_atomically(&self.record_path(&layer.diff_id), &to_json(layer))
     }
 }
 
-/// Does what parses strangers' bytes on a thread that may read and do nothing else; it ends with the work that calls this.
-pub(crate) fn by_reader<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+/// Runs code that parses untrusted data with no other privileges than reading; cancelled together with the caller's
+/// work.
+pub(crate) fn run_as_reader<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let cancel = foreign::cancel::current().unwrap_or_default();
-    privilege::reading(|| cancel.during(work))
+    privilege::run_as_reader(|| cancel.run(work))
 }
 
-/// Reads a layer to its end: digest and bytes of the tar stream inside.
+/// Reads a layer to its end; returns the digest and size of its tar stream.
 pub(crate) fn gunzip_and_hash(archive: impl Read + Send) -> io::Result<(Digest, u64)> {
     let content = gzip::decoder(archive)?;
-    gzip::reading_ahead(content, |content| {
-        let mut content = Hashing::new(content);
+    gzip::read_ahead(content, |content| {
+        let mut content = HashingStream::new(content);
         io::copy(&mut content, &mut io::sink())?;
         let (_, diff_id, bytes) = content.finish();
         Ok((diff_id, bytes))
     })
 }
 
-/// The same of the content of a layer that strangers have written, with the number of its headers.
-fn walk(
+/// Reads the content of an untrusted layer to its end; returns the digest and size of the tar stream and the number of
+/// its headers.
+fn scan_layer(
     content: &mut dyn Read,
     label: &Path,
     limits: &Limits,
@@ -296,13 +304,13 @@ fn walk(
         problem,
     };
     let most = limits.bytes.saturating_add(1);
-    let mut reader = TarReader::new(Hashing::new(content.take(most)));
+    let mut reader = TarReader::new(HashingStream::new(content.take(most)));
     let mut last = String::new();
     let walked = loop {
         match reader.next_entry() {
             Ok(None) => break Ok(()),
             Ok(Some(entry)) => {
-                last = shown(&entry.name);
+                last = display_name(&entry.name);
                 if reader.headers() > limits.entries {
                     return Err(refused(Refusal::TooManyEntries {
                         entry: last,
@@ -310,15 +318,16 @@ fn walk(
                     }));
                 }
             }
-            Err(stop) => break Err(Error::stopped(&label.display().to_string(), label, stop)),
+            Err(stop) => break Err(Error::from_stop(&label.display().to_string(), label, stop)),
         }
     };
     let headers = reader.headers();
     let mut rest = reader.into_inner();
-    // What follows the end mark counts for the digest.
-    let read = match walked.is_ok() {
-        true => io::copy(&mut rest, &mut io::sink()),
-        false => Ok(0),
+    // Data after the end mark is part of the digest.
+    let read = if walked.is_ok() {
+        io::copy(&mut rest, &mut io::sink())
+    } else {
+        Ok(0)
     };
     let (_, digest, bytes) = rest.finish();
     if bytes > limits.bytes {
@@ -328,27 +337,27 @@ fn walk(
         }));
     }
     walked?;
-    read.map_err(|error| malformed(label, error))?;
+    read.map_err(|error| malformed_archive(label, error))?;
     Ok((digest, bytes, headers))
 }
 
-/// The media type promises gzip, so nothing else is let in.
+/// Accepts only gzip, since the media type promises it.
 fn check_gzip(file: &File, path: &Path) -> Result<(), Error> {
     let mut start = [0; 2];
     let read = std::os::unix::fs::FileExt::read_at(file, &mut start, 0);
     match read.map_err(|error| Error::file("read", path, error))? {
         2 if start == [0x1f, 0x8b] => Ok(()),
-        _ => Err(malformed(path, "it is not gzip")),
+        _ => Err(malformed_archive(path, "it is not gzip")),
     }
 }
 
-/// Tells if what was read is wrong, and not the reading of it.
-fn is_damage(error: &io::Error) -> bool {
+/// Returns whether an error means corrupt data, as opposed to a failed read.
+fn is_corruption(error: &io::Error) -> bool {
     use io::ErrorKind::{InvalidData, InvalidInput, UnexpectedEof};
     [UnexpectedEof, InvalidInput, InvalidData].contains(&error.kind())
 }
 
-fn malformed(archive: &Path, problem: impl ToString) -> Error {
+fn malformed_archive(archive: &Path, problem: impl ToString) -> Error {
     let problem = Refusal::Malformed {
         after: String::new(),
         problem: problem.to_string(),
@@ -359,11 +368,11 @@ fn malformed(archive: &Path, problem: impl ToString) -> Error {
     }
 }
 
-/// Writes down all that is read from it.
+/// Reader that copies all it reads to a writer.
 pub(crate) struct Tee<R, W> {
     from: R,
     to: W,
-    /// Writing failed, which the reader sees as a failure to read.
+    /// Error of the writer; the reader sees it as a failed read.
     failed: Option<io::Error>,
 }
 

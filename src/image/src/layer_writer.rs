@@ -1,4 +1,4 @@
-//! Turns the entries of a layer into a directory for an overlay mount, whatever the untrusted layer holds.
+//! Extraction of an untrusted layer into a directory for an overlay mount.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -9,21 +9,21 @@ use std::path::Path;
 use rustix::fs::{AtFlags, FileType, Gid, Mode, Timespec, Timestamps, Uid, XattrFlags};
 use rustix::io::Errno;
 
-use crate::beneath::{self, Beneath, is, look};
-use crate::entry::{Entry, Kind, shown};
+use crate::beneath::{self, ConfinedRoot, is_kind, stat_entry};
+use crate::entry::{Entry, Kind, display_name};
 use crate::names::{self, MAX_PATH, split};
-use crate::tar_reader::{Stop, TarReader};
+use crate::tar_reader::{ReadStop, TarReader};
 use crate::tree::{OPAQUE, WHITEOUT};
 use crate::{Error, Refusal, capability};
 
 const BUFFER: usize = 256 << 10;
 
-/// Fills one directory.
+/// Writer of the entries of a layer into a directory.
 pub(crate) struct LayerWriter {
-    beneath: Beneath,
-    /// What directories get when nothing is written into them any more.
+    beneath: ConfinedRoot,
+    /// Metadata that directories get once nothing more is written into them.
     directories: BTreeMap<Vec<u8>, Metadata>,
-    /// Only root can give files away and set trusted attributes.
+    /// True if running as root: only root can change owners and set trusted attributes.
     privileged: bool,
     tree: std::path::PathBuf,
     buffer: Vec<u8>,
@@ -37,19 +37,19 @@ struct Metadata {
     mtime: u64,
 }
 
-/// Why an entry could not be written.
-pub(crate) enum Failed {
+/// Error of writing an entry.
+pub(crate) enum WriteFailure {
     Refused(Refusal),
     File(&'static str, Vec<u8>, std::io::Error),
     Read(std::io::Error),
 }
 
-impl Failed {
+impl WriteFailure {
     fn file(action: &'static str, path: &[u8], error: Errno) -> Self {
         Self::File(action, path.to_vec(), error.into())
     }
 
-    /// With the names of the archive and of the tree.
+    /// Converts to an error that names the archive and the tree.
     pub(crate) fn into_error<R: Read>(
         self,
         archive: &str,
@@ -58,25 +58,25 @@ impl Failed {
     ) -> Error {
         use std::os::unix::ffi::OsStrExt;
         match self {
-            Self::Refused(refusal) => Error::stopped(archive, tree, Stop::Refused(refusal)),
+            Self::Refused(refusal) => Error::from_stop(archive, tree, ReadStop::Refused(refusal)),
             Self::File(action, path, error) => {
                 Error::file(action, tree.join(std::ffi::OsStr::from_bytes(&path)), error)
             }
-            Self::Read(error) => Error::stopped(archive, tree, reader.stop(error)),
+            Self::Read(error) => Error::from_stop(archive, tree, reader.classify_error(error)),
         }
     }
 }
 
-impl From<Refusal> for Failed {
+impl From<Refusal> for WriteFailure {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)
     }
 }
 
 impl LayerWriter {
-    /// `tree` is an empty directory.
+    /// Creates a writer for `tree`, an empty directory.
     pub(crate) fn new(tree: &Path) -> Result<Self, Error> {
-        let beneath = Beneath::following(tree)
+        let beneath = ConfinedRoot::following_links(tree)
             .map_err(|error| Error::file("open the directory", tree, error))?;
         let root = Metadata {
             mode: 0o755,
@@ -93,10 +93,14 @@ impl LayerWriter {
         })
     }
 
-    /// One entry; `content` gives its bytes.
-    pub(crate) fn entry(&mut self, entry: &Entry, content: &mut impl Read) -> Result<(), Failed> {
-        let path = names::normal(&entry.name, MAX_PATH)?;
-        let metadata = metadata(entry)?;
+    /// Writes an entry; `content` is its data.
+    pub(crate) fn write_entry(
+        &mut self,
+        entry: &Entry,
+        content: &mut impl Read,
+    ) -> Result<(), WriteFailure> {
+        let path = names::normalize(&entry.name, MAX_PATH)?;
+        let metadata = read_metadata(entry)?;
         if path.is_empty() {
             if entry.kind == Kind::Directory {
                 self.directories.insert(path, metadata);
@@ -107,30 +111,30 @@ impl LayerWriter {
         let parent = self
             .beneath
             .make_directory(above)
-            .map_err(|error| Failed::file("create", above, error))?;
+            .map_err(|error| WriteFailure::file("create", above, error))?;
         if let Some(hidden) = name.strip_prefix(WHITEOUT) {
-            return self.whiteout(&parent, above, name, hidden);
+            return self.create_whiteout(&parent, above, name, hidden);
         }
-        let failed = |error| Failed::file("create", &path, error);
+        let failed = |error| WriteFailure::file("create", &path, error);
         match entry.kind {
-            Kind::Directory => return self.directory(&parent, &path, name, entry, metadata),
+            Kind::Directory => return self.create_directory(&parent, &path, name, entry, metadata),
             Kind::File => {
-                let file = self
-                    .in_place_of_what_is_there(&parent, &path, || beneath::create(&parent, name))?;
-                self.fill(&file, &path, content)?;
-                self.adorn(&file, &path, metadata, entry)?;
+                let file =
+                    self.replace_existing(&parent, &path, || beneath::create(&parent, name))?;
+                self.copy_content(&file, &path, content)?;
+                self.set_metadata(&file, &path, metadata, entry)?;
             }
             Kind::Symlink => {
-                self.in_place_of_what_is_there(&parent, &path, || {
+                self.replace_existing(&parent, &path, || {
                     rustix::fs::symlinkat(&entry.link[..], &parent, name)
                 })?;
-                self.adorn_unopened(&parent, name, metadata)
+                self.set_metadata_at(&parent, name, metadata)
                     .map_err(failed)?;
             }
-            Kind::Hardlink => self.hardlink(&parent, &path, entry)?,
+            Kind::Hardlink => self.create_hardlink(&parent, &path, entry)?,
             Kind::Fifo => {
                 let fifo = || rustix::fs::mkfifoat(&parent, name, Mode::from_raw_mode(0o600));
-                self.in_place_of_what_is_there(&parent, &path, fifo)?;
+                self.replace_existing(&parent, &path, fifo)?;
                 rustix::fs::chmodat(
                     &parent,
                     name,
@@ -138,31 +142,31 @@ impl LayerWriter {
                     AtFlags::empty(),
                 )
                 .map_err(failed)?;
-                self.adorn_unopened(&parent, name, metadata)
+                self.set_metadata_at(&parent, name, metadata)
                     .map_err(failed)?;
             }
-            // A container gets its own /dev; an untrusted device node would reach the host's disks.
+            // A container has its own /dev; an untrusted device node would give access to the host's disks.
             Kind::Character | Kind::Block => {
                 tracing::debug!(
-                    entry = shown(&entry.name),
-                    "left a device node out of an extracted layer"
+                    entry = display_name(&entry.name),
+                    "skipped a device node of a layer"
                 );
             }
             Kind::Other(flag) => {
                 tracing::debug!(
-                    entry = shown(&entry.name),
+                    entry = display_name(&entry.name),
                     flag,
-                    "left an unknown entry out of an extracted layer"
+                    "skipped an unknown entry of a layer"
                 );
             }
         }
         Ok(())
     }
 
-    /// Gives all directories their rights and times.
+    /// Sets the permissions and times of all directories.
     pub(crate) fn finish(mut self) -> Result<(), Error> {
         let directories = std::mem::take(&mut self.directories);
-        // From the deepest up, as setting the rights of one may bar the way to those below.
+        // Deepest first, because the permissions of a directory may prevent access to those below.
         for (path, metadata) in directories.iter().rev() {
             let failed = |error| {
                 use std::os::unix::ffi::OsStrExt;
@@ -181,8 +185,10 @@ impl LayerWriter {
                     .and_then(|parent| beneath::open_directory(&parent, name))
             };
             match opened {
-                Ok(directory) => self.own(&directory, *metadata).map_err(failed)?,
-                // A later entry took its place.
+                Ok(directory) => self
+                    .set_owner_and_times(&directory, *metadata)
+                    .map_err(failed)?,
+                // A later entry has replaced it.
                 Err(Errno::NOENT | Errno::NOTDIR | Errno::LOOP) => {}
                 Err(error) => return Err(failed(error)),
             }
@@ -190,54 +196,59 @@ impl LayerWriter {
         Ok(())
     }
 
-    fn hardlink(&mut self, parent: &OwnedFd, path: &[u8], entry: &Entry) -> Result<(), Failed> {
-        let target = names::normal(&entry.link, MAX_PATH)?;
+    fn create_hardlink(
+        &mut self,
+        parent: &OwnedFd,
+        path: &[u8],
+        entry: &Entry,
+    ) -> Result<(), WriteFailure> {
+        let target = names::normalize(&entry.link, MAX_PATH)?;
         if path == target {
             return Ok(());
         }
         let nothing = || Refusal::LinkToNothing {
-            entry: shown(&entry.name),
-            target: shown(&entry.link),
+            entry: display_name(&entry.name),
+            target: display_name(&entry.link),
         };
         let (above, name) = split(&target);
         let from = self.beneath.directory(above).map_err(|_| nothing())?;
-        // The kernel links no directories.
-        if look(&from, name)
+        // The kernel does not allow hard links to directories.
+        if stat_entry(&from, name)
             .ok()
             .flatten()
-            .is_none_or(|stat| is(&stat, FileType::Directory))
+            .is_none_or(|stat| is_kind(&stat, FileType::Directory))
         {
             return Err(nothing().into());
         }
         let link = || rustix::fs::linkat(&from, name, parent, split(path).1, AtFlags::empty());
-        self.in_place_of_what_is_there(parent, path, link)
+        self.replace_existing(parent, path, link)
     }
 
-    fn directory(
+    fn create_directory(
         &mut self,
         parent: &OwnedFd,
         path: &[u8],
         name: &[u8],
         entry: &Entry,
         metadata: Metadata,
-    ) -> Result<(), Failed> {
-        let failed = |error| Failed::file("create", path, error);
+    ) -> Result<(), WriteFailure> {
+        let failed = |error| WriteFailure::file("create", path, error);
         let make = || rustix::fs::mkdirat(parent, name, Mode::RWXU);
         let mut hides = false;
         match make() {
             Ok(()) => {}
             Err(Errno::EXIST) => {
-                let there = look(parent, name).map_err(failed)?;
-                if !there.is_some_and(|stat| is(&stat, FileType::Directory)) {
-                    // After a whiteout of its own name the directory is new, not merged.
-                    hides = there.is_some_and(|stat| is(&stat, FileType::CharacterDevice));
-                    self.in_place_of_what_is_there(parent, path, make)?;
+                let there = stat_entry(parent, name).map_err(failed)?;
+                if !there.is_some_and(|stat| is_kind(&stat, FileType::Directory)) {
+                    // After a whiteout of the same name the directory is new, not merged.
+                    hides = there.is_some_and(|stat| is_kind(&stat, FileType::CharacterDevice));
+                    self.replace_existing(parent, path, make)?;
                 }
             }
             Err(error) => return Err(failed(error)),
         }
         let directory = beneath::open_directory(parent, name).map_err(failed)?;
-        self.attributes(&directory, path, entry)?;
+        self.set_xattrs(&directory, path, entry)?;
         if hides {
             self.make_opaque(&directory, path)?;
         }
@@ -245,28 +256,29 @@ impl LayerWriter {
         Ok(())
     }
 
-    /// `.wh.NAME` deletes NAME of the layers below; `.wh..wh..opq` all of them in this directory.
-    fn whiteout(
+    /// Writes a whiteout: `.wh.NAME` deletes NAME from the layers below, `.wh..wh..opq` everything in this directory.
+    fn create_whiteout(
         &mut self,
         parent: &OwnedFd,
         above: &[u8],
         name: &[u8],
         hidden: &[u8],
-    ) -> Result<(), Failed> {
+    ) -> Result<(), WriteFailure> {
         if name == OPAQUE {
             return self.make_opaque(parent, above);
         }
-        // Other names of this form are an old union file system's own business (aufs).
+        // Other names of this form are internal to an old union file system (aufs).
         if hidden.starts_with(WHITEOUT) || hidden.is_empty() || hidden == b"." || hidden == b".." {
             return Ok(());
         }
-        let failed = |error| Failed::file("create", &names::join(above, hidden), error);
+        let failed = |error| WriteFailure::file("create", &names::join(above, hidden), error);
         match rustix::fs::mknodat(parent, hidden, FileType::CharacterDevice, Mode::empty(), 0) {
             Ok(()) => Ok(()),
-            // It is also in this layer: a file hides what is below anyway, a directory must be told to.
+            // The name also exists in this layer: a file hides what is below anyway, a directory must be marked as
+            // opaque.
             Err(Errno::EXIST) => {
-                let there = look(parent, hidden).map_err(failed)?;
-                if there.is_some_and(|stat| is(&stat, FileType::Directory)) {
+                let there = stat_entry(parent, hidden).map_err(failed)?;
+                if there.is_some_and(|stat| is_kind(&stat, FileType::Directory)) {
                     let directory = beneath::open_directory(parent, hidden).map_err(failed)?;
                     self.make_opaque(&directory, &names::join(above, hidden))?;
                 }
@@ -276,81 +288,86 @@ impl LayerWriter {
         }
     }
 
-    fn make_opaque(&self, directory: &OwnedFd, path: &[u8]) -> Result<(), Failed> {
+    fn make_opaque(&self, directory: &OwnedFd, path: &[u8]) -> Result<(), WriteFailure> {
         let set = |name: &str| rustix::fs::fsetxattr(directory, name, b"y", XattrFlags::empty());
         let done = match set("trusted.overlay.opaque") {
             Err(Errno::PERM) => set("user.overlay.opaque"),
             other => other,
         };
-        done.map_err(|error| Failed::file("mark as opaque", path, error))
+        done.map_err(|error| WriteFailure::file("mark as opaque", path, error))
     }
 
-    /// Does `make`; if something else has the name, that goes first: the last entry of a name counts.
-    fn in_place_of_what_is_there<T>(
+    /// Calls `make`, removing an existing file of the name first: the last entry of a name wins.
+    fn replace_existing<T>(
         &mut self,
         parent: &OwnedFd,
         path: &[u8],
         make: impl Fn() -> Result<T, Errno>,
-    ) -> Result<T, Failed> {
-        let failed = |error| Failed::file("create", path, error);
+    ) -> Result<T, WriteFailure> {
+        let failed = |error| WriteFailure::file("create", path, error);
         match make() {
             Err(Errno::EXIST) => {}
             other => return other.map_err(failed),
         }
         let (_, name) = split(path);
-        self.beneath.forget();
-        if look(parent, name)
+        self.beneath.invalidate_cache();
+        if stat_entry(parent, name)
             .map_err(failed)?
-            .is_some_and(|stat| is(&stat, FileType::Directory))
+            .is_some_and(|stat| is_kind(&stat, FileType::Directory))
         {
             use std::os::unix::ffi::OsStrExt;
             let within = format!("/proc/self/fd/{}", parent.as_raw_fd());
             let within = Path::new(&within).join(std::ffi::OsStr::from_bytes(name));
             foreign::remove(&within)
-                .map_err(|error| Failed::File("replace", path.to_vec(), error.into()))?;
+                .map_err(|error| WriteFailure::File("replace", path.to_vec(), error.into()))?;
         } else {
             rustix::fs::unlinkat(parent, name, AtFlags::empty()).map_err(failed)?;
         }
         make().map_err(failed)
     }
 
-    fn fill(&mut self, file: &OwnedFd, path: &[u8], content: &mut impl Read) -> Result<(), Failed> {
+    fn copy_content(
+        &mut self,
+        file: &OwnedFd,
+        path: &[u8],
+        content: &mut impl Read,
+    ) -> Result<(), WriteFailure> {
         let mut file = File::from(
             file.try_clone()
-                .map_err(|error| Failed::File("create", path.to_vec(), error))?,
+                .map_err(|error| WriteFailure::File("create", path.to_vec(), error))?,
         );
         loop {
-            let read = content.read(&mut self.buffer).map_err(Failed::Read)?;
+            let read = content.read(&mut self.buffer).map_err(WriteFailure::Read)?;
             if read == 0 {
                 return Ok(());
             }
             file.write_all(&self.buffer[..read])
-                .map_err(|error| Failed::File("write", path.to_vec(), error))?;
+                .map_err(|error| WriteFailure::File("write", path.to_vec(), error))?;
         }
     }
 
-    /// Owner, rights, attributes and time of an open file. In this order: a new owner clears set-id bits and
-    /// capabilities.
-    fn adorn(
+    /// Sets owner, permissions, attributes and time of an open file, in this order, since changing the owner clears
+    /// set-id bits and capabilities.
+    fn set_metadata(
         &self,
         file: &OwnedFd,
         path: &[u8],
         metadata: Metadata,
         entry: &Entry,
-    ) -> Result<(), Failed> {
-        self.own_and_allow(file, metadata)
-            .map_err(|error| Failed::file("set the rights of", path, error))?;
-        self.attributes(file, path, entry)?;
-        rustix::fs::futimens(file, &times(metadata))
-            .map_err(|error| Failed::file("set the time of", path, error))
+    ) -> Result<(), WriteFailure> {
+        self.set_owner_and_mode(file, metadata)
+            .map_err(|error| WriteFailure::file("set the rights of", path, error))?;
+        self.set_xattrs(file, path, entry)?;
+        rustix::fs::futimens(file, &timestamps(metadata))
+            .map_err(|error| WriteFailure::file("set the time of", path, error))
     }
 
-    fn own(&self, file: &OwnedFd, metadata: Metadata) -> Result<(), Errno> {
-        self.own_and_allow(file, metadata)?;
-        rustix::fs::futimens(file, &times(metadata))
+    fn set_owner_and_times(&self, file: &OwnedFd, metadata: Metadata) -> Result<(), Errno> {
+        self.set_owner_and_mode(file, metadata)?;
+        rustix::fs::futimens(file, &timestamps(metadata))
     }
 
-    fn own_and_allow(&self, file: &OwnedFd, metadata: Metadata) -> Result<(), Errno> {
+    fn set_owner_and_mode(&self, file: &OwnedFd, metadata: Metadata) -> Result<(), Errno> {
         if self.privileged {
             let (uid, gid) = (Uid::from_raw(metadata.uid), Gid::from_raw(metadata.gid));
             rustix::fs::fchown(file, Some(uid), Some(gid))?;
@@ -358,8 +375,8 @@ impl LayerWriter {
         rustix::fs::fchmod(file, Mode::from_raw_mode(metadata.mode))
     }
 
-    /// Owner and time of what cannot be opened.
-    fn adorn_unopened(
+    /// Sets owner and time of a file that cannot be opened.
+    fn set_metadata_at(
         &self,
         parent: &OwnedFd,
         name: &[u8],
@@ -375,11 +392,16 @@ impl LayerWriter {
                 AtFlags::SYMLINK_NOFOLLOW,
             )?;
         }
-        rustix::fs::utimensat(parent, name, &times(metadata), AtFlags::SYMLINK_NOFOLLOW)
+        rustix::fs::utimensat(
+            parent,
+            name,
+            &timestamps(metadata),
+            AtFlags::SYMLINK_NOFOLLOW,
+        )
     }
 
-    /// Only file capabilities and the user's own: an overlay's attributes would make it look elsewhere.
-    fn attributes(&self, file: &OwnedFd, path: &[u8], entry: &Entry) -> Result<(), Failed> {
+    /// Sets file capabilities and user attributes only, since overlay attributes would redirect lookups.
+    fn set_xattrs(&self, file: &OwnedFd, path: &[u8], entry: &Entry) -> Result<(), WriteFailure> {
         for (name, value) in &entry.xattrs {
             let capability = name == capability::NAME && self.privileged;
             let users = name.starts_with(b"user.") && !name.starts_with(b"user.overlay.");
@@ -389,23 +411,24 @@ impl LayerWriter {
             match rustix::fs::fsetxattr(file, &name[..], value, XattrFlags::empty()) {
                 Ok(()) => {}
                 Err(error @ (Errno::NOTSUP | Errno::PERM | Errno::INVAL)) => {
-                    tracing::debug!(path = shown(path), attribute = shown(name), %error, "left an attribute out");
+                    tracing::debug!(path = display_name(path), attribute = display_name(name), %error,
+                        "skipped an attribute");
                 }
-                Err(error) => return Err(Failed::file("set an attribute of", path, error)),
+                Err(error) => return Err(WriteFailure::file("set an attribute of", path, error)),
             }
         }
         Ok(())
     }
 }
 
-fn metadata(entry: &Entry) -> Result<Metadata, Refusal> {
+fn read_metadata(entry: &Entry) -> Result<Metadata, Refusal> {
     let id = |value: u64| {
-        // The highest one means "unchanged" to the kernel.
+        // The highest id means "unchanged" to the kernel.
         u32::try_from(value)
             .ok()
             .filter(|&id| id != u32::MAX)
             .ok_or_else(|| Refusal::Malformed {
-                after: shown(&entry.name),
+                after: display_name(&entry.name),
                 problem: format!("owner {value} is out of range"),
             })
     };
@@ -417,7 +440,7 @@ fn metadata(entry: &Entry) -> Result<Metadata, Refusal> {
     })
 }
 
-fn times(metadata: Metadata) -> Timestamps {
+fn timestamps(metadata: Metadata) -> Timestamps {
     let time = Timespec {
         tv_sec: i64::try_from(metadata.mtime).unwrap_or(0),
         tv_nsec: 0,

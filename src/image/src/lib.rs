@@ -1,17 +1,17 @@
-//! A content-addressed store of container images in the OCI image layout (version 1.1), which skopeo, umoci and
-//! podman read and which is served read-only under `/v2/`.
+//! Content-addressed store of container images in the OCI image layout (version 1.1), which skopeo, umoci and podman
+//! can read and which is served read-only under `/v2/`.
 //!
 //! ```text
-//!   tree ──layer_from_tree──▶ blobs/sha256/<digest> ──extracted──▶ layers/<diff-id>/  (shared, read-only)
-//!     │  ╰───────────stage_tree──────────────────────────────────▲   (the tree at once, the blob later)
+//!   tree ──layer_from_tree──▶ blobs/sha256/<digest> ──ensure_extracted──▶ layers/<diff-id>/  (shared, read-only)
+//!     │  ╰───────────stage_tree───────────────────────────────────────────▲   (the tree at once, the blob later)
 //!   tar.gz ──import_layer───▶        ▲   (a whole image of another store: receive)
-//!                          put_image ┴ tag ──▶ index.json      gc: what no tag and no caller keeps, goes
-//!   upload ──unpack──▶ directory     (refuses whatever could leave it)
+//!                          put_image ┴ tag ──▶ index.json      gc: removes what no tag and no caller uses
+//!   upload ──unpack──▶ directory     (rejects entries that would escape from it)
 //! ```
 //!
-//! Blobs come and go whole: they are written without a name (or under a temporary one that is locked while it is
-//! written), flushed, and then linked to their digest. A crash leaves nothing that looks complete, and
-//! [`Store::open`] sweeps what it does leave. All calls block; several threads may make the same one.
+//! Blobs appear and disappear atomically: they are written without a name (or with a temporary one that is locked while
+//! it is written), flushed, and then linked to their digest. A crash leaves nothing that looks complete, and
+//! [`Store::open`] removes what it does leave. All calls block; several threads may make the same call concurrently.
 
 #![forbid(unsafe_code)]
 
@@ -41,22 +41,22 @@ mod unpack;
 
 pub use digest::Digest;
 pub use error::Error;
-pub use files::write_whole;
-pub use gc::{Damage, Swept};
+pub use files::write_atomically;
+pub use gc::{Damage, GcReport};
 pub use images::{Image, ImageSpec, Manifest};
 pub use layer::{LayerInfo, Mtime, TreeOptions};
-pub use received::{Received, document, is_layout};
+pub use received::{ReceivedImage, is_layout, read_layout_document};
 pub use refusal::Refusal;
-pub use store::{Blob, Hold, Store};
-pub use unpack::{Limits, Unpacked, unpack};
+pub use store::{Blob, GcHold, Store};
+pub use unpack::{Limits, UnpackStats, unpack};
 
-/// Does `work` on a thread of the engine, as the daemon does; for tests, of which all share one engine.
+/// Runs `work` on a thread of the engine, as the daemon does; for tests, which all share one engine.
 #[cfg(test)]
-fn by_engine<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+fn run_as_engine<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     static ENGINE: std::sync::OnceLock<privilege::Engine> = std::sync::OnceLock::new();
     ENGINE.get_or_init(|| {
         let engine = privilege::Engine::start(privilege::Account::default());
         engine.expect("threads; run this test as root")
     });
-    privilege::now(work)
+    privilege::run_sync(work)
 }

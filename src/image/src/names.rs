@@ -1,22 +1,22 @@
-//! Paths of archive entries, made safe to walk.
+//! Normalization of the paths of archive entries.
 
 use crate::Refusal;
-use crate::entry::shown;
+use crate::entry::display_name;
 
-/// Directories within directories that a tree may have. Each level costs an open file while a tree is walked.
+/// Maximum depth of a tree. Each level costs an open file while a tree is walked.
 pub(crate) const MAX_DEPTH: usize = foreign::MAX_DEPTH;
 
-/// The longest path that the kernel takes, less its final NUL.
+/// Maximum length of a path accepted by the kernel, without the final NUL.
 pub(crate) const MAX_PATH: usize = 4095;
 
-/// The longest name of one file.
+/// Maximum length of a file name.
 const MAX_NAME: usize = 255;
 
-/// `a/b` of `./a//b/`: no `.`, no `..`, no empty part; empty for the root itself. A leading `/` is dropped:
-/// who minds checks before.
-pub(crate) fn normal(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
+/// Normalizes a path: `./a//b/` becomes `a/b`, without `.`, `..` and empty components; empty for the root itself. A
+/// leading `/` is dropped; callers that reject absolute paths check before.
+pub(crate) fn normalize(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
     let bad = |problem: String| Refusal::BadName {
-        entry: shown(name),
+        entry: display_name(name),
         problem,
     };
     if name.contains(&0) {
@@ -24,7 +24,7 @@ pub(crate) fn normal(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
     }
     if name.len() > longest {
         return Err(bad(format!(
-            "it is {} bytes long, and {longest} are accepted",
+            "it is {} bytes long; the limit is {longest}",
             name.len()
         )));
     }
@@ -33,10 +33,14 @@ pub(crate) fn normal(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
     for part in name.split(|&byte| byte == b'/') {
         match part {
             b"" | b"." => continue,
-            b".." => return Err(Refusal::ParentDirectory { entry: shown(name) }),
+            b".." => {
+                return Err(Refusal::ParentDirectory {
+                    entry: display_name(name),
+                });
+            }
             long if long.len() > MAX_NAME => {
                 return Err(bad(format!(
-                    "one part is {} bytes long, and {MAX_NAME} are possible",
+                    "one part is {} bytes long; the limit is {MAX_NAME}",
                     long.len()
                 )));
             }
@@ -51,13 +55,13 @@ pub(crate) fn normal(name: &[u8], longest: usize) -> Result<Vec<u8>, Refusal> {
     }
     if depth > MAX_DEPTH {
         return Err(bad(format!(
-            "it is {depth} directories deep, and {MAX_DEPTH} are accepted"
+            "it is {depth} directories deep; the limit is {MAX_DEPTH}"
         )));
     }
     Ok(path)
 }
 
-/// The directory (empty for the root) and the last part.
+/// Splits a path into its directory (empty for the root) and its last component.
 pub(crate) fn split(path: &[u8]) -> (&[u8], &[u8]) {
     match path.iter().rposition(|&byte| byte == b'/') {
         Some(slash) => (&path[..slash], &path[slash + 1..]),
@@ -65,7 +69,7 @@ pub(crate) fn split(path: &[u8]) -> (&[u8], &[u8]) {
     }
 }
 
-/// `directory/name`, or `name` in the root.
+/// Joins `directory` and `name`; the directory may be empty for the root.
 pub(crate) fn join(directory: &[u8], name: &[u8]) -> Vec<u8> {
     if directory.is_empty() {
         return name.to_vec();
@@ -77,24 +81,24 @@ pub(crate) fn join(directory: &[u8], name: &[u8]) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    fn refused(name: &[u8]) -> String {
-        normal(name, 4000).unwrap_err().to_string()
+    fn refusal(name: &[u8]) -> String {
+        normalize(name, 4000).unwrap_err().to_string()
     }
 
     #[test]
     fn drops_what_means_nothing() {
-        assert_eq!(normal(b"./a//b/./c/", 100).unwrap(), b"a/b/c");
-        assert_eq!(normal(b"./", 100).unwrap(), b"");
+        assert_eq!(normalize(b"./a//b/./c/", 100).unwrap(), b"a/b/c");
+        assert_eq!(normalize(b"./", 100).unwrap(), b"");
         assert_eq!(split(b"a/b/c"), (&b"a/b"[..], &b"c"[..]));
         assert_eq!(split(b"c"), (&b""[..], &b"c"[..]));
     }
 
     #[test]
     fn refuses_what_leaves_or_cannot_be() {
-        assert!(refused(b"a/../b").contains("goes up with '..'"));
-        assert!(refused(b"a\0b").contains("NUL"));
-        assert!(refused(&[b'x'; 256]).contains("one part is 256 bytes long"));
-        assert!(refused(&[b'x'; 4001]).contains("4001 bytes long"));
-        assert!(refused(&b"d/".repeat(257)).contains("257 directories deep"));
+        assert!(refusal(b"a/../b").contains("goes up with '..'"));
+        assert!(refusal(b"a\0b").contains("NUL"));
+        assert!(refusal(&[b'x'; 256]).contains("one part is 256 bytes long"));
+        assert!(refusal(&[b'x'; 4001]).contains("4001 bytes long"));
+        assert!(refusal(&b"d/".repeat(257)).contains("257 directories deep"));
     }
 }

@@ -1,7 +1,7 @@
-//! The JSON of an image layout (OCI image specification 1.1), as far as this store writes and reads it.
+//! JSON documents of an image layout (OCI image specification 1.1), as far as this store reads and writes them.
 //!
-//! Own types instead of a library's, because their maps are ordered: the same image must always give the same
-//! bytes, for its digest is its name.
+//! Own types instead of a library's, because their maps are ordered: the same image must always give the same bytes,
+//! since it is identified by their digest.
 
 use std::collections::BTreeMap;
 
@@ -18,10 +18,10 @@ pub const MEDIA_CONFIG: &str = "application/vnd.oci.image.config.v1+json";
 /// `mediaType` of a gzip layer.
 pub const MEDIA_LAYER_GZIP: &str = "application/vnd.oci.image.layer.v1.tar+gzip";
 
-/// The annotation of an index entry that holds its tag.
+/// Annotation of an index entry with its tag.
 pub(crate) const REF_NAME: &str = "org.opencontainers.image.ref.name";
 
-/// The only `imageLayoutVersion` there is, also in specification 1.1.
+/// The only defined `imageLayoutVersion`, also in specification 1.1.
 pub(crate) const LAYOUT_VERSION: &str = "1.0.0";
 
 /// The file `oci-layout`.
@@ -31,7 +31,7 @@ pub(crate) struct Layout {
     pub(crate) image_layout_version: String,
 }
 
-/// Points at a blob.
+/// Reference to a blob.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Descriptor {
@@ -40,7 +40,7 @@ pub(crate) struct Descriptor {
     pub(crate) size: u64,
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub(crate) annotations: BTreeMap<String, String>,
-    /// What other tools wrote, kept.
+    /// Unknown fields written by other tools; preserved.
     #[serde(flatten)]
     pub(crate) other: BTreeMap<String, serde_json::Value>,
 }
@@ -56,13 +56,13 @@ impl Descriptor {
         }
     }
 
-    /// The tag of an index entry.
+    /// Returns the tag of an index entry.
     pub(crate) fn tag(&self) -> Option<&str> {
         self.annotations.get(REF_NAME).map(String::as_str)
     }
 }
 
-/// `index.json`.
+/// The file `index.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Index {
@@ -70,7 +70,7 @@ pub(crate) struct Index {
     #[serde(default = "media_index")]
     pub(crate) media_type: String,
     pub(crate) manifests: Vec<Descriptor>,
-    /// What other tools wrote, kept.
+    /// Unknown fields written by other tools; preserved.
     #[serde(flatten)]
     pub(crate) other: BTreeMap<String, serde_json::Value>,
 }
@@ -90,7 +90,7 @@ impl Default for Index {
     }
 }
 
-/// A manifest.
+/// An image manifest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(crate) struct Manifest {
@@ -119,7 +119,7 @@ pub(crate) struct Config {
     pub(crate) history: Vec<History>,
 }
 
-/// What a container of the image runs.
+/// Process settings of an image's containers.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase", default)]
 pub(crate) struct Process {
@@ -133,7 +133,7 @@ pub(crate) struct Process {
     pub(crate) labels: BTreeMap<String, String>,
 }
 
-/// The layers of an image, uncompressed, lowest first.
+/// Diff-ids of an image's layers, lowest first.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RootFs {
     #[serde(rename = "type")]
@@ -141,7 +141,7 @@ pub(crate) struct RootFs {
     pub(crate) diff_ids: Vec<Digest>,
 }
 
-/// How a layer came to be.
+/// History entry of a layer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct History {
     #[serde(default, skip_serializing_if = "String::is_empty")]
@@ -150,7 +150,7 @@ pub(crate) struct History {
     pub(crate) created_by: String,
 }
 
-/// This machine in the specification's (Go's) words: architecture and variant.
+/// Returns architecture and variant of this machine, in the terms of the specification (those of Go).
 pub(crate) fn platform() -> (&'static str, Option<&'static str>) {
     match std::env::consts::ARCH {
         "x86_64" => ("amd64", None),

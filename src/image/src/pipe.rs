@@ -1,18 +1,18 @@
-//! Bytes written in one thread and read in another.
+//! Pipe between a writing and a reading thread.
 
 use std::io::{self, Read, Write};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
-/// Bytes handed over at once.
+/// Number of bytes passed at once.
 const CHUNK: usize = 256 << 10;
-/// Chunks that may wait.
+/// Capacity of the queue, in chunks.
 const WAITING: usize = 16;
 
-/// Runs `fill` with a writer, and `consume` on a thread of its own with a reader of what is written.
+/// Runs `fill` with a writer, and `consume` on another thread with a reader of what is written.
 ///
 /// # Errors
-/// That of `fill`; but where `fill` failed only because nobody read any more, that of `consume`.
+/// The error of `fill`; or that of `consume`, if `fill` failed only because the reader was gone.
 pub(crate) fn pipe<T, U: Send, E: Send>(
     fill: impl FnOnce(&mut dyn Write) -> Result<T, E>,
     consume: impl FnOnce(&mut dyn Read) -> Result<U, E> + Send,
@@ -20,20 +20,20 @@ pub(crate) fn pipe<T, U: Send, E: Send>(
     let (chunks, received) = sync_channel(WAITING);
     thread::scope(|scope| {
         let consuming = scope.spawn(move || {
-            consume(&mut Output {
+            consume(&mut ChunkReader {
                 received,
                 chunk: Vec::new(),
                 at: 0,
             })
         });
-        let mut input = Input {
+        let mut input = ChunkWriter {
             chunks,
             chunk: Vec::with_capacity(CHUNK),
             broken: false,
         };
         let filled = fill(&mut input);
         if filled.is_ok() {
-            // A reader that has gone says itself why.
+            // A reader that has gone reports its own error.
             let _ = input.flush();
         }
         let broken = input.broken;
@@ -49,13 +49,13 @@ pub(crate) fn pipe<T, U: Send, E: Send>(
     })
 }
 
-struct Input {
+struct ChunkWriter {
     chunks: SyncSender<Vec<u8>>,
     chunk: Vec<u8>,
     broken: bool,
 }
 
-impl Write for Input {
+impl Write for ChunkWriter {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let taken = bytes.len().min(CHUNK - self.chunk.len());
         self.chunk.extend_from_slice(&bytes[..taken]);
@@ -77,16 +77,16 @@ impl Write for Input {
     }
 }
 
-struct Output {
+struct ChunkReader {
     received: Receiver<Vec<u8>>,
     chunk: Vec<u8>,
     at: usize,
 }
 
-impl Read for Output {
+impl Read for ChunkReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.at == self.chunk.len() {
-            // The writer hangs up after the last chunk.
+            // The writer disconnects after the last chunk.
             let Ok(chunk) = self.received.recv() else {
                 return Ok(0);
             };

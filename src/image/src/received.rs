@@ -1,4 +1,4 @@
-//! Images that come from elsewhere: an image layout (OCI image specification 1.1) in a tree that somebody has sent.
+//! Import of images from an untrusted OCI image layout (image specification 1.1).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -8,43 +8,43 @@ use std::path::{Path, PathBuf};
 use foreign::Tree;
 use serde::de::DeserializeOwned;
 
-use crate::digest::Hashing;
-use crate::layer::by_reader;
+use crate::digest::HashingStream;
+use crate::layer::run_as_reader;
 use crate::oci::{self, Config, Descriptor, Index, Layout, Manifest};
 use crate::{Digest, Error, Image, ImageSpec, LayerInfo, Limits, Store};
 
-/// The largest document of a layout, in bytes.
+/// Maximum size of a document of a layout, in bytes.
 const LARGEST: u64 = 16 << 20;
-/// Layers of an image at most: an overlay mount takes no more than some hundreds.
+/// Maximum number of layers of an image; an overlay mount supports only a few hundred.
 const MOST_LAYERS: usize = 128;
 
-/// An image that was received.
+/// A received image.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Received {
-    /// As it is in the store now, untagged: equal content, made by this store. Its digest is that of the layout's image where
-    /// this store wrote that, too.
+pub struct ReceivedImage {
+    /// The image in the store, untagged: the same content, with documents written by this store. Its digest equals that
+    /// of the layout's image if that was written by such a store, too.
     pub image: Image,
-    /// Of each layer: whether it was there already.
+    /// For each layer, whether it was already in the store.
     pub known: Vec<bool>,
-    /// Annotations of the layout's entry.
+    /// Annotations of the layout's index entry.
     pub annotations: BTreeMap<String, String>,
 }
 
-/// Whether a tree is an image layout.
+/// Returns whether a tree is an image layout.
 pub fn is_layout(tree: &Tree) -> bool {
     tree.has_file("oci-layout") && tree.has_file("index.json")
 }
 
-/// A document of an image layout, whose digest is as its name says; of at most 16 MiB.
+/// Reads a document of an image layout, of at most 16 MiB, and verifies its digest.
 ///
 /// # Errors
-/// [`Error::Unreceivable`] where it is not there or is another.
-pub fn document(layout: &Tree, digest: &Digest) -> Result<Vec<u8>, Error> {
+/// [`Error::Unreceivable`] if it is missing or has another digest.
+pub fn read_layout_document(layout: &Tree, digest: &Digest) -> Result<Vec<u8>, Error> {
     let path = blob_path(digest);
     let bytes = read(layout, &path)?;
-    let found = Digest::of(&bytes);
+    let found = Digest::compute(&bytes);
     if found != *digest {
-        return Err(unreceivable(format!(
+        return Err(unreceivable_error(format!(
             "its blob {digest} has the content of {found}"
         )));
     }
@@ -52,18 +52,18 @@ pub fn document(layout: &Tree, digest: &Digest) -> Result<Vec<u8>, Error> {
 }
 
 impl Store {
-    /// Takes in the one image of an image layout: each blob is compared with its digest, each layer with its diff-id. Without
-    /// [`Store::hold`] or a tag, the next [`Store::gc`] removes it.
+    /// Imports the single image of an image layout, verifying the digest of each blob and the diff-id of each layer.
+    /// Without [`Store::hold`] or a tag, the next [`Store::gc`] removes it.
     ///
     /// # Errors
-    /// [`Error::Unreceivable`], [`Error::Archive`] where layers hold more than `limits` or cannot be read.
-    pub fn receive(&self, layout: &Tree, limits: &Limits) -> Result<Received, Error> {
+    /// [`Error::Unreceivable`] for an invalid layout, [`Error::Archive`] if layers exceed `limits` or cannot be read.
+    pub fn receive(&self, layout: &Tree, limits: &Limits) -> Result<ReceivedImage, Error> {
         let _hold = self.hold()?;
-        let Documents {
+        let LayoutDocuments {
             entry,
             manifest,
             config,
-        } = by_reader(|| Documents::read(layout))?;
+        } = run_as_reader(|| LayoutDocuments::read(layout))?;
         let mut left = *limits;
         let mut known = Vec::new();
         let mut layers = Vec::new();
@@ -72,13 +72,13 @@ impl Store {
             let there = there.filter(|layer| layer.digest == named.digest);
             known.push(there.is_some());
             layers.push(match there {
-                // Whoever names it must have it: it may be of an image that is none of theirs.
-                Some(layer) => has_blob(layout, &named.digest).map(|()| layer)?,
+                // The sender must possess the blob: the known layer may belong to an image that it has no access to.
+                Some(layer) => check_blob(layout, &named.digest).map(|()| layer)?,
                 None => self.receive_layer(layout, named, diff_id, &mut left)?,
             });
         }
-        let spec = ImageSpec::read(layers, config, manifest);
-        Ok(Received {
+        let spec = ImageSpec::from_documents(layers, config, manifest);
+        Ok(ReceivedImage {
             image: Image {
                 digest: self.put_image(&spec)?,
                 spec,
@@ -96,8 +96,8 @@ impl Store {
         left: &mut Limits,
     ) -> Result<LayerInfo, Error> {
         if named.media_type != oci::MEDIA_LAYER_GZIP {
-            return Err(unreceivable(format!(
-                "its layer {} is of type {:?}, and {} is read here",
+            return Err(unreceivable_error(format!(
+                "its layer {} has type {:?}; supported is {}",
                 named.digest,
                 named.media_type,
                 oci::MEDIA_LAYER_GZIP
@@ -109,71 +109,79 @@ impl Store {
             if layer.digest == named.digest && layer.diff_id == *diff_id {
                 return Ok(());
             }
-            Err(unreceivable(format!(
+            Err(unreceivable_error(format!(
                 "its layer {} has the content of {} ({}, not {diff_id}, unpacked)",
                 named.digest, layer.digest, layer.diff_id
             )))
         };
         let (layer, entries) = self.import_layer_within(file, &label, left, is_named)?;
         left.bytes -= layer.unpacked;
-        // Extended headers may follow the last entry that was compared with the limit.
+        // Extended headers may follow the last entry that was checked against the limit.
         left.entries = left.entries.saturating_sub(entries);
         Ok(layer)
     }
 }
 
-/// What a layout says of its one image.
-struct Documents {
-    /// The image in the layout's index.
+/// The documents of a layout with a single image.
+struct LayoutDocuments {
+    /// Index entry of the image.
     entry: Descriptor,
     manifest: Manifest,
     config: Config,
 }
 
-impl Documents {
-    /// Reads and checks them; no layer is looked at.
+impl LayoutDocuments {
+    /// Reads and validates the documents; layers are not read.
     fn read(layout: &Tree) -> Result<Self, Error> {
-        let version: Layout = parsed("oci-layout", &read(layout, "oci-layout")?)?;
+        let version: Layout = parse_json("oci-layout", &read(layout, "oci-layout")?)?;
         if version.image_layout_version != oci::LAYOUT_VERSION {
-            return Err(unreceivable(format!(
-                "its layout is of version {:?}, and {} is read here",
+            return Err(unreceivable_error(format!(
+                "its layout has version {:?}; supported is {}",
                 version.image_layout_version,
                 oci::LAYOUT_VERSION
             )));
         }
-        let mut index: Index = parsed("index.json", &read(layout, "index.json")?)?;
+        let mut index: Index = parse_json("index.json", &read(layout, "index.json")?)?;
         let images = index.manifests.len();
         let (1, Some(entry)) = (images, index.manifests.pop()) else {
-            return Err(unreceivable(format!(
-                "it holds {images} images, and one is expected"
+            return Err(unreceivable_error(format!(
+                "it contains {images} images instead of one"
             )));
         };
         if entry.media_type != oci::MEDIA_MANIFEST {
-            return Err(unreceivable(format!(
-                "its image is of type {:?}, and {} is expected",
+            return Err(unreceivable_error(format!(
+                "its image has type {:?} instead of {}",
                 entry.media_type,
                 oci::MEDIA_MANIFEST
             )));
         }
-        let manifest: Manifest = parsed("its manifest", &document(layout, &entry.digest)?)?;
-        let config: Config = parsed("its config", &document(layout, &manifest.config.digest)?)?;
+        let manifest: Manifest = parse_json(
+            "its manifest",
+            &read_layout_document(layout, &entry.digest)?,
+        )?;
+        let config: Config = parse_json(
+            "its config",
+            &read_layout_document(layout, &manifest.config.digest)?,
+        )?;
         let diff_ids = &config.rootfs.diff_ids;
         if manifest.layers.len() != diff_ids.len() || diff_ids.len() > MOST_LAYERS {
-            return Err(unreceivable(format!(
-                "it has {} layers and {} diff-ids; as many are expected, and at most {MOST_LAYERS}",
+            return Err(unreceivable_error(format!(
+                "it has {} layers and {} diff-ids; both must be equal, and at most {MOST_LAYERS}",
                 manifest.layers.len(),
                 diff_ids.len()
             )));
         }
-        // An overlay takes each once, and each is read and compared.
+        // An overlay accepts each layer once, and each is read and verified.
         let distinct: BTreeSet<&Digest> = diff_ids.iter().collect();
         if distinct.len() != diff_ids.len() {
-            return Err(unreceivable("it lists the same layer twice".to_owned()));
+            return Err(unreceivable_error(
+                "it lists the same layer twice".to_owned(),
+            ));
         }
         let (architecture, _) = oci::platform();
         if config.architecture != architecture {
-            return Err(unreceivable(format!(
-                "it is for {}, and this machine is {architecture}",
+            return Err(unreceivable_error(format!(
+                "it is for {}, but this machine is {architecture}",
                 config.architecture
             )));
         }
@@ -189,45 +197,46 @@ fn blob_path(digest: &Digest) -> String {
     format!("blobs/sha256/{}", digest.hex())
 }
 
-/// Refuses a layout that lacks a blob, or has another in its place.
-fn has_blob(layout: &Tree, digest: &Digest) -> Result<(), Error> {
+/// Rejects a layout in which a blob is missing or has other content.
+fn check_blob(layout: &Tree, digest: &Digest) -> Result<(), Error> {
     let path = blob_path(digest);
-    let mut content = Hashing::new(open(layout, &path)?);
+    let mut content = HashingStream::new(open(layout, &path)?);
     io::copy(&mut content, &mut io::sink())
         .map_err(|error| Error::file("read", Path::new(&path), error))?;
     let (_, found, _) = content.finish();
-    match found == *digest {
-        true => Ok(()),
-        false => Err(unreceivable(format!(
+    if found == *digest {
+        Ok(())
+    } else {
+        Err(unreceivable_error(format!(
             "its blob {digest} has the content of {found}"
-        ))),
+        )))
     }
 }
 
 fn open(layout: &Tree, path: &str) -> Result<File, Error> {
-    let file = layout.open_file(path).map_err(unfit)?;
-    file.map(File::from).ok_or_else(|| missing(path))
+    let file = layout.open_file(path).map_err(tree_error)?;
+    file.map(File::from).ok_or_else(|| missing_file(path))
 }
 
 fn read(layout: &Tree, path: &str) -> Result<Vec<u8>, Error> {
-    let file = layout.file(path, LARGEST).map_err(unfit)?;
-    Ok(file.ok_or_else(|| missing(path))?.bytes)
+    let file = layout.read_file(path, LARGEST).map_err(tree_error)?;
+    Ok(file.ok_or_else(|| missing_file(path))?.bytes)
 }
 
-fn parsed<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
+fn parse_json<T: DeserializeOwned>(what: &str, bytes: &[u8]) -> Result<T, Error> {
     serde_json::from_slice(bytes)
-        .map_err(|error| unreceivable(format!("{what} cannot be read: {error}")))
+        .map_err(|error| unreceivable_error(format!("{what} cannot be read: {error}")))
 }
 
-fn missing(path: &str) -> Error {
-    unreceivable(format!("{path} is missing"))
+fn missing_file(path: &str) -> Error {
+    unreceivable_error(format!("{path} is missing"))
 }
 
-fn unfit(error: foreign::Error) -> Error {
-    unreceivable(error.to_string())
+fn tree_error(error: foreign::Error) -> Error {
+    unreceivable_error(error.to_string())
 }
 
-fn unreceivable(problem: String) -> Error {
+fn unreceivable_error(problem: String) -> Error {
     Error::Unreceivable { problem }
 }
 

@@ -1,59 +1,61 @@
-//! Reads tar streams (ustar, GNU and pax) entry by entry, from whoever sent them.
+//! Reader of untrusted tar streams (ustar, GNU and pax).
 //!
-//! Not the `tar` crate's reader: weighed again at its version 0.4.46, it reads an extended header into memory whatever its
-//! size, and takes a stream without an end mark for complete. Neither can be mended from outside, since it reads
-//! extended headers before it gives an entry; in raw mode, which gives them one by one, it ignores the sizes that pax states. Only its
-//! header fields are used here.
+//! The reader of the `tar` crate is not used: as of version 0.4.46 it reads an extended header into memory regardless
+//! of its size, and accepts a stream without an end mark as complete. Neither can be fixed from outside, since it reads
+//! extended headers before it returns an entry; in raw mode, which returns them one by one, it ignores sizes in pax
+//! headers. Only its header fields are used here.
 
 use std::io::{self, Read};
 
 use tar::Header;
 
 use crate::Refusal;
-use crate::entry::{Entry, Kind, shown};
+use crate::entry::{Entry, Kind, display_name};
 
 const BLOCK: usize = 512;
 
-/// The most bytes in all extended headers of one entry: far beyond a path and all attributes a file can have (64 KiB each name).
+/// Maximum total size of the extended headers of one entry: far more than a path and all attributes of a file (64 KiB
+/// for each name).
 const MAX_EXTENSION: u64 = 1 << 20;
 
-/// The most extended headers of one entry. Writers need three: a pax header, and GNU's for a name and for a link.
+/// Maximum number of extended headers of one entry. Writers need three: a pax header, and GNU headers for a name and
+/// for a link.
 const MAX_EXTENSIONS: u64 = 8;
 
-/// Why reading stopped.
+/// Reason why reading stopped.
 #[derive(Debug)]
-pub(crate) enum Stop {
+pub(crate) enum ReadStop {
     /// The source failed.
     Source(io::Error),
-    /// The archive is at fault.
+    /// The archive is invalid.
     Refused(Refusal),
 }
 
-impl From<Refusal> for Stop {
+impl From<Refusal> for ReadStop {
     fn from(refusal: Refusal) -> Self {
         Self::Refused(refusal)
     }
 }
 
-/// The entries of a stream; reading from it gives the content of the entry that `next_entry` gave last.
+/// Reader of the entries of a stream; as a [`Read`] it returns the content of the entry last returned by `next_entry`.
 pub(crate) struct TarReader<R> {
     input: R,
-    /// Content of the present entry that was not read yet.
+    /// Unread bytes of the current entry's content.
     remaining: u64,
-    /// Zero bytes that fill up its last block.
+    /// Padding bytes of the current entry's last block.
     padding: u64,
-    /// Headers that were read, extended ones among them.
+    /// Number of headers read, including extended ones.
     headers: u64,
-    /// For messages: the entry being read.
+    /// Name of the current entry, for messages.
     last: Vec<u8>,
 }
 
-/// What extended headers say about the entry that follows.
+/// Extended headers of the following entry.
 #[derive(Default)]
-struct Extension {
-    /// How many there were.
+struct ExtendedHeaders {
+    /// Number of headers.
     headers: u64,
-    /// Bytes in them.
+    /// Total size in bytes.
     bytes: u64,
     name: Option<Vec<u8>>,
     link: Option<Vec<u8>>,
@@ -75,81 +77,87 @@ impl<R: Read> TarReader<R> {
         }
     }
 
-    /// How many headers were read, extended ones among them: each takes as much work as an entry.
+    /// Returns the number of headers read, including extended ones, each of which costs as much work as an entry.
     pub(crate) fn headers(&self) -> u64 {
         self.headers
     }
 
-    /// The next entry; none at the end mark. What was not read of the present one is skipped.
-    pub(crate) fn next_entry(&mut self) -> Result<Option<Entry>, Stop> {
-        let mut extension = Extension::default();
+    /// Returns the next entry; `None` at the end mark. Unread content of the current one is skipped.
+    pub(crate) fn next_entry(&mut self) -> Result<Option<Entry>, ReadStop> {
+        let mut extension = ExtendedHeaders::default();
         loop {
             self.skip_content()?;
-            let Some(header) = self.header()? else {
+            let Some(header) = self.read_header()? else {
                 return Ok(None);
             };
-            let size = header.entry_size().map_err(|error| self.malformed(error))?;
+            let size = header
+                .entry_size()
+                .map_err(|error| self.malformed_archive(error))?;
             let kind = header.entry_type().as_byte();
             if matches!(kind, b'L' | b'K' | b'x' | b'g') {
                 extension.headers += 1;
                 if extension.headers > MAX_EXTENSIONS {
                     let problem =
                         format!("an entry of more than {MAX_EXTENSIONS} extended headers");
-                    return Err(self.malformed(problem));
+                    return Err(self.malformed_archive(problem));
                 }
             }
             match kind {
-                b'L' => extension.name = Some(self.long_name(size, &mut extension.bytes)?),
-                b'K' => extension.link = Some(self.long_name(size, &mut extension.bytes)?),
+                b'L' => extension.name = Some(self.read_long_name(size, &mut extension.bytes)?),
+                b'K' => extension.link = Some(self.read_long_name(size, &mut extension.bytes)?),
                 b'x' => {
-                    let records = self.extension(size, &mut extension.bytes)?;
-                    self.pax(&records, &mut extension)?;
+                    let records = self.read_extension(size, &mut extension.bytes)?;
+                    self.apply_pax_records(&records, &mut extension)?;
                 }
-                // Global headers carry comments (git archive); nobody puts paths there.
-                b'g' => self.expect(size),
+                // Global headers contain comments (git archive); nobody puts paths there.
+                b'g' => self.begin_content(size),
                 b'S' => {
-                    return Err(self.malformed("sparse files are not read; pack without --sparse"));
+                    return Err(self.malformed_archive(
+                        "sparse files are not supported; pack without --sparse",
+                    ));
                 }
-                _ => return self.entry(&header, size, extension).map(Some),
+                _ => return self.build_entry(&header, size, extension).map(Some),
             }
         }
     }
 
-    /// The stream itself.
+    /// Returns the underlying stream.
     pub(crate) fn source(&mut self) -> &mut R {
         &mut self.input
     }
 
-    /// Gives the stream back, positioned after the end mark's first block.
+    /// Returns the underlying stream, positioned after the first block of the end mark.
     pub(crate) fn into_inner(self) -> R {
         self.input
     }
 
-    /// What a failed read of content means.
-    pub(crate) fn stop(&self, error: io::Error) -> Stop {
+    /// Classifies the error of a failed read of content.
+    pub(crate) fn classify_error(&self, error: io::Error) -> ReadStop {
         match error.kind() {
-            io::ErrorKind::UnexpectedEof => Stop::Refused(Refusal::Truncated {
-                after: shown(&self.last),
+            io::ErrorKind::UnexpectedEof => ReadStop::Refused(Refusal::Truncated {
+                after: display_name(&self.last),
             }),
-            // flate2 reports a corrupt stream so.
-            io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => self.malformed(error),
-            _ => Stop::Source(error),
+            // flate2 reports a corrupt stream this way.
+            io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => {
+                self.malformed_archive(error)
+            }
+            _ => ReadStop::Source(error),
         }
     }
 
-    fn malformed(&self, problem: impl ToString) -> Stop {
-        Stop::Refused(Refusal::Malformed {
-            after: shown(&self.last),
+    fn malformed_archive(&self, problem: impl ToString) -> ReadStop {
+        ReadStop::Refused(Refusal::Malformed {
+            after: display_name(&self.last),
             problem: problem.to_string(),
         })
     }
 
-    fn expect(&mut self, size: u64) {
+    fn begin_content(&mut self, size: u64) {
         self.remaining = size;
         self.padding = (BLOCK as u64 - size % BLOCK as u64) % BLOCK as u64;
     }
 
-    fn skip_content(&mut self) -> Result<(), Stop> {
+    fn skip_content(&mut self) -> Result<(), ReadStop> {
         let rest = self.remaining.saturating_add(self.padding);
         (self.remaining, self.padding) = (0, 0);
         if rest == 0 {
@@ -158,22 +166,22 @@ impl<R: Read> TarReader<R> {
         let skipped = io::copy(&mut (&mut self.input).take(rest), &mut io::sink());
         match skipped {
             Ok(skipped) if skipped == rest => Ok(()),
-            Ok(_) => Err(self.stop(io::ErrorKind::UnexpectedEof.into())),
-            Err(error) => Err(self.stop(error)),
+            Ok(_) => Err(self.classify_error(io::ErrorKind::UnexpectedEof.into())),
+            Err(error) => Err(self.classify_error(error)),
         }
     }
 
-    fn header(&mut self) -> Result<Option<Header>, Stop> {
+    fn read_header(&mut self) -> Result<Option<Header>, ReadStop> {
         let mut header = Header::new_old();
         let block = header.as_mut_bytes();
         if let Err(error) = self.input.read_exact(block) {
-            return Err(self.stop(error));
+            return Err(self.classify_error(error));
         }
         if block.iter().all(|&byte| byte == 0) {
             return Ok(None);
         }
         self.headers += 1;
-        // The sum is taken with the eight bytes of its own field as spaces.
+        // The checksum treats the eight bytes of its own field as spaces.
         let sum: u32 = block[..148]
             .iter()
             .chain(&block[156..])
@@ -182,38 +190,42 @@ impl<R: Read> TarReader<R> {
             + 8 * 32;
         match header.cksum() {
             Ok(stated) if stated == sum => Ok(Some(header)),
-            _ => Err(self.malformed("a header's checksum is wrong")),
+            _ => Err(self.malformed_archive("a header has a wrong checksum")),
         }
     }
 
-    /// The content of an extended header; `sum` counts those of one entry.
-    fn extension(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, Stop> {
+    /// Reads the content of an extended header; `sum` is the total of the entry.
+    fn read_extension(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, ReadStop> {
         *sum = sum.saturating_add(size);
         if *sum > MAX_EXTENSION {
             let problem = format!("an entry with extended headers of {sum} bytes");
-            return Err(self.malformed(problem));
+            return Err(self.malformed_archive(problem));
         }
-        self.expect(size);
+        self.begin_content(size);
         let mut bytes = vec![0; size as usize];
         if let Err(error) = self.read_exact(&mut bytes) {
-            return Err(self.stop(error));
+            return Err(self.classify_error(error));
         }
         Ok(bytes)
     }
 
-    fn long_name(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, Stop> {
-        let mut name = self.extension(size, sum)?;
+    fn read_long_name(&mut self, size: u64, sum: &mut u64) -> Result<Vec<u8>, ReadStop> {
+        let mut name = self.read_extension(size, sum)?;
         if name.last() == Some(&0) {
             name.pop();
         }
         Ok(name)
     }
 
-    /// POSIX pax records: `LENGTH KEY=VALUE\n`, LENGTH counting all of it.
-    fn pax(&self, mut records: &[u8], extension: &mut Extension) -> Result<(), Stop> {
+    /// Parses POSIX pax records: `LENGTH KEY=VALUE `, where LENGTH includes all of it.
+    fn apply_pax_records(
+        &self,
+        mut records: &[u8],
+        extension: &mut ExtendedHeaders,
+    ) -> Result<(), ReadStop> {
         while !records.is_empty() {
             let record =
-                pax_record(records).ok_or_else(|| self.malformed("a pax record does not parse"))?;
+                pax_record(records).ok_or_else(|| self.malformed_archive("invalid pax record"))?;
             let (key, value) = (record.key, record.value);
             let number = || {
                 let whole = value.split(|&byte| byte == b'.').next().unwrap_or(value);
@@ -224,7 +236,9 @@ impl<R: Read> TarReader<R> {
                     .map(|number| number.max(0) as u64)
             };
             let required = || {
-                number().ok_or_else(|| self.malformed(format!("pax {} is no number", shown(key))))
+                number().ok_or_else(|| {
+                    self.malformed_archive(format!("pax {} is not a number", display_name(key)))
+                })
             };
             match key {
                 b"path" => extension.name = Some(value.to_vec()),
@@ -234,7 +248,9 @@ impl<R: Read> TarReader<R> {
                 b"gid" => extension.gid = Some(required()?),
                 b"mtime" => extension.mtime = number(),
                 key if key.starts_with(b"GNU.sparse.") => {
-                    return Err(self.malformed("sparse files are not read; pack without --sparse"));
+                    return Err(self.malformed_archive(
+                        "sparse files are not supported; pack without --sparse",
+                    ));
                 }
                 key => {
                     if let Some(name) = key.strip_prefix(b"SCHILY.xattr.") {
@@ -247,7 +263,12 @@ impl<R: Read> TarReader<R> {
         Ok(())
     }
 
-    fn entry(&mut self, header: &Header, size: u64, extension: Extension) -> Result<Entry, Stop> {
+    fn build_entry(
+        &mut self,
+        header: &Header,
+        size: u64,
+        extension: ExtendedHeaders,
+    ) -> Result<Entry, ReadStop> {
         let name = extension
             .name
             .unwrap_or_else(|| header.path_bytes().into_owned());
@@ -260,17 +281,20 @@ impl<R: Read> TarReader<R> {
             .link
             .or_else(|| header.link_name_bytes().map(|link| link.into_owned()));
         let device = |number: io::Result<Option<u32>>| number.ok().flatten().unwrap_or(0);
-        // Left blank means 0, as GNU tar reads it.
+        // Blank means 0, as in GNU tar.
         let blank = |raw: &[u8]| raw.iter().all(|byte| matches!(byte, 0 | b' '));
         let field = |raw: &[u8], value: io::Result<u64>| match value {
             Err(_) if blank(raw) => Ok(0),
-            value => value.map_err(|error| self.malformed(error)),
+            value => value.map_err(|error| self.malformed_archive(error)),
         };
         let old = header.as_old();
         let entry = Entry {
             kind,
             link: link.unwrap_or_default(),
-            mode: header.mode().map_err(|error| self.malformed(error))? & 0o7777,
+            mode: header
+                .mode()
+                .map_err(|error| self.malformed_archive(error))?
+                & 0o7777,
             uid: extension
                 .uid
                 .map_or_else(|| field(&old.uid, header.uid()), Ok)?,
@@ -280,7 +304,7 @@ impl<R: Read> TarReader<R> {
             mtime: extension
                 .mtime
                 .unwrap_or_else(|| header.mtime().unwrap_or(0)),
-            // Links and directories carry no content, though some writers state the target's size.
+            // Links and directories have no content, though some writers store the target's size.
             size: if kind == Kind::File {
                 extension.size.unwrap_or(size)
             } else {
@@ -291,8 +315,8 @@ impl<R: Read> TarReader<R> {
             name,
         };
         match kind {
-            Kind::File | Kind::Other(_) => self.expect(extension.size.unwrap_or(size)),
-            _ => self.expect(0),
+            Kind::File | Kind::Other(_) => self.begin_content(extension.size.unwrap_or(size)),
+            _ => self.begin_content(0),
         }
         Ok(entry)
     }

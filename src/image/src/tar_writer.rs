@@ -1,4 +1,4 @@
-//! Writes tar streams: ustar, with a pax header only where ustar has no room, so that the same entries always
+//! Writer of tar streams: ustar, with a pax header only where ustar is not sufficient, so that the same entries always
 //! give the same bytes.
 
 use std::io::{self, Read, Write};
@@ -8,7 +8,7 @@ use tar::Header;
 use crate::entry::{Entry, Kind};
 
 const BLOCK: usize = 512;
-/// What the octal fields of ustar can hold.
+/// Maximum values of the octal fields of ustar.
 const MAX_SIZE: u64 = 0o77_777_777_777;
 const MAX_ID: u64 = 0o7_777_777;
 
@@ -21,8 +21,8 @@ impl<W: Write> TarWriter<W> {
         Self { output }
     }
 
-    /// An entry without content, or the head of one whose content follows.
-    pub(crate) fn header(&mut self, entry: &Entry) -> io::Result<()> {
+    /// Writes the header of an entry, whose content, if any, follows.
+    pub(crate) fn write_header(&mut self, entry: &Entry) -> io::Result<()> {
         let records = pax_records(entry);
         if !records.is_empty() {
             let mut extended = Entry::new(*b"././@PaxHeader", Kind::Other(b'x'), 0o644);
@@ -34,14 +34,14 @@ impl<W: Write> TarWriter<W> {
         self.output.write_all(ustar(entry).as_bytes())
     }
 
-    /// A file with its content, exactly `entry.size` bytes of `content`; `UnexpectedEof` when there are fewer.
-    pub(crate) fn file(
+    /// Writes a file with exactly `entry.size` bytes of `content`; `UnexpectedEof` if there are fewer.
+    pub(crate) fn write_file(
         &mut self,
         entry: &Entry,
         content: impl Read,
         buffer: &mut [u8],
     ) -> io::Result<()> {
-        self.header(entry)?;
+        self.write_header(entry)?;
         let mut content = content.take(entry.size);
         let mut copied = 0;
         while copied < entry.size {
@@ -55,7 +55,7 @@ impl<W: Write> TarWriter<W> {
         self.pad(entry.size)
     }
 
-    /// The end mark.
+    /// Writes the end mark.
     pub(crate) fn finish(mut self) -> io::Result<W> {
         self.output.write_all(&[0; 2 * BLOCK])?;
         Ok(self.output)
@@ -90,7 +90,7 @@ fn pax_records(entry: &Entry) -> Vec<u8> {
     records
 }
 
-/// `LENGTH KEY=VALUE\n`, LENGTH counting itself too.
+/// Appends a record `LENGTH KEY=VALUE `, where LENGTH includes itself.
 fn pax_record(records: &mut Vec<u8>, key: &[u8], value: &[u8]) {
     let rest = key.len() + value.len() + 3;
     let mut length = rest + 1;
@@ -132,9 +132,9 @@ mod tests {
     use super::*;
     use crate::tar_reader::TarReader;
 
-    fn there_and_back(entry: &Entry, content: &[u8]) -> Entry {
+    fn round_trip(entry: &Entry, content: &[u8]) -> Entry {
         let mut writer = TarWriter::new(Vec::new());
-        writer.file(entry, content, &mut [0; 64]).unwrap();
+        writer.write_file(entry, content, &mut [0; 64]).unwrap();
         let bytes = writer.finish().unwrap();
         assert_eq!(bytes.len() % BLOCK, 0);
         let mut reader = TarReader::new(&bytes[..]);
@@ -150,7 +150,7 @@ mod tests {
     fn what_is_written_is_read() {
         let mut entry = Entry::new(*b"bin/sudo", Kind::File, 0o4755);
         (entry.uid, entry.gid, entry.mtime, entry.size) = (0, 42, 1_700_000_000, 5);
-        assert_eq!(there_and_back(&entry, b"hello"), entry);
+        assert_eq!(round_trip(&entry, b"hello"), entry);
     }
 
     #[test]
@@ -159,10 +159,10 @@ mod tests {
             let mut entry = Entry::new(vec![b'n'; length], Kind::File, 0o644);
             (entry.uid, entry.gid) = (3_000_000, 4_000_000_000);
             entry.xattrs = vec![(b"user.x".to_vec(), b"\0\n=\xff".to_vec())];
-            assert_eq!(there_and_back(&entry, b""), entry);
+            assert_eq!(round_trip(&entry, b""), entry);
         }
         let mut link = Entry::new(*b"l", Kind::Symlink, 0o777);
         link.link = vec![b't'; 300];
-        assert_eq!(there_and_back(&link, b""), link);
+        assert_eq!(round_trip(&link, b""), link);
     }
 }

@@ -1,7 +1,7 @@
-//! Turns a file tree into tar entries, always the same ones for the same tree.
+//! Deterministic conversion of a file tree to tar entries.
 //!
-//! The tree may be untrusted (a build wrote it): it is walked by directory descriptors, no symbolic link is
-//! followed, nothing that would block is opened.
+//! The tree may be untrusted (written by a build): it is walked by directory descriptors, symbolic links are not
+//! followed, and files that could block are not opened.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -19,14 +19,14 @@ use crate::names::{MAX_DEPTH, join};
 use crate::tar_writer::TarWriter;
 use crate::{Error, Mtime, TreeOptions, capability};
 
-/// Prefix of an entry that deletes its namesake in the layers below (OCI layer specification, whiteouts).
+/// Prefix of an entry that deletes the entry of that name in the layers below (OCI layer specification, whiteouts).
 pub(crate) const WHITEOUT: &[u8] = b".wh.";
-/// Name of an entry that hides all that the layers below have in its directory.
+/// Name of an entry that hides the content of its directory in the layers below.
 pub(crate) const OPAQUE: &[u8] = b".wh..wh..opq";
 
-/// Bytes read from a file at once.
+/// Number of bytes read from a file at once.
 const BUFFER: usize = 256 << 10;
-/// The largest list of attribute names, and the largest value (linux/limits.h).
+/// Maximum size of a list of attribute names, and of a value (linux/limits.h).
 const XATTR_MAX: usize = 64 << 10;
 
 const READ: OFlags = OFlags::RDONLY
@@ -35,16 +35,16 @@ const READ: OFlags = OFlags::RDONLY
     .union(OFlags::NONBLOCK);
 const DIRECTORY: OFlags = READ.union(OFlags::DIRECTORY);
 
-/// Packs one tree.
+/// Packer of a file tree.
 pub(crate) struct Packer<'a, W: Write> {
     writer: TarWriter<W>,
     options: &'a TreeOptions,
     exclude: Globs,
     root: PathBuf,
-    /// First path of each file that has several, by device and inode.
+    /// First path of each file with several hard links, by device and inode.
     links: HashMap<(u64, u64), Vec<u8>>,
     buffer: Vec<u8>,
-    /// Room for the names of a file's attributes.
+    /// Buffer for the attribute names of a file.
     attribute_names: Vec<u8>,
 }
 
@@ -61,41 +61,41 @@ impl<'a, W: Write> Packer<'a, W> {
         }
     }
 
-    /// All below `tree`.
+    /// Packs everything below `tree`.
     pub(crate) fn pack(&mut self, tree: &Path) -> Result<(), Error> {
         self.root = tree.to_owned();
         let root = rustix::fs::open(tree, DIRECTORY, Mode::empty())
             .map_err(|error| Error::file("open the directory", tree, error))?;
-        self.directory(root.as_fd(), b"", 0)
+        self.pack_directory(root.as_fd(), b"", 0)
     }
 
-    /// The end mark; gives the output back.
+    /// Writes the end mark and returns the output.
     pub(crate) fn finish(self) -> io::Result<W> {
         self.writer.finish()
     }
 
-    fn directory(
+    fn pack_directory(
         &mut self,
         directory: BorrowedFd<'_>,
         path: &[u8],
         depth: usize,
     ) -> Result<(), Error> {
         if depth > MAX_DEPTH {
-            return Err(self.problem(
+            return Err(self.tree_error(
                 path,
                 format!("it is more than {MAX_DEPTH} directories deep"),
             ));
         }
         let mut children = Vec::new();
-        for name in self.names(directory, path)? {
+        for name in self.list_names(directory, path)? {
             let child = join(path, &name);
             if self.exclude.matches(&child, &name) {
                 continue;
             }
             let stat = rustix::fs::statat(directory, &name[..], AtFlags::SYMLINK_NOFOLLOW)
-                .map_err(|error| self.failed("look at", &child, error))?;
+                .map_err(|error| self.file_error("look at", &child, error))?;
             if self.is_whiteout(&stat) {
-                // Before all others, as the specification wishes.
+                // Whiteouts come first, as the specification recommends.
                 self.write(&Entry {
                     mtime: self.mtime(0),
                     ..Entry::new(join(path, &[WHITEOUT, &name].concat()), Kind::File, 0o644)
@@ -103,7 +103,7 @@ impl<'a, W: Write> Packer<'a, W> {
                 continue;
             }
             if name.starts_with(WHITEOUT) {
-                return Err(self.problem(
+                return Err(self.tree_error(
                     &child,
                     "names that begin with .wh. mean deletions; rename it",
                 ));
@@ -111,14 +111,14 @@ impl<'a, W: Write> Packer<'a, W> {
             children.push((name, child, stat));
         }
         for (name, child, stat) in children {
-            self.child(directory, &name, child, &stat, depth)?;
+            self.pack_child(directory, &name, child, &stat, depth)?;
         }
         Ok(())
     }
 
-    /// Names in a directory, sorted by their bytes.
-    fn names(&self, directory: BorrowedFd<'_>, path: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
-        let failed = |error| self.failed("list", path, error);
+    /// Returns the names in a directory, sorted bytewise.
+    fn list_names(&self, directory: BorrowedFd<'_>, path: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
+        let failed = |error| self.file_error("list", path, error);
         let mut names = Vec::new();
         for entry in Dir::read_from(directory).map_err(failed)? {
             let name = entry.map_err(failed)?.file_name().to_bytes().to_vec();
@@ -130,7 +130,7 @@ impl<'a, W: Write> Packer<'a, W> {
         Ok(names)
     }
 
-    fn child(
+    fn pack_child(
         &mut self,
         parent: BorrowedFd<'_>,
         name: &[u8],
@@ -139,8 +139,8 @@ impl<'a, W: Write> Packer<'a, W> {
         depth: usize,
     ) -> Result<(), Error> {
         let mut entry = Entry {
-            uid: self.id(stat.st_uid),
-            gid: self.id(stat.st_gid),
+            uid: self.mapped_id(stat.st_uid),
+            gid: self.mapped_id(stat.st_gid),
             mtime: self.mtime(stat.st_mtime),
             ..Entry::new(path, Kind::File, stat.st_mode & 0o7777)
         };
@@ -156,7 +156,7 @@ impl<'a, W: Write> Packer<'a, W> {
         match kind {
             FileType::Directory => {
                 let directory = self.open(parent, name, &entry.name, DIRECTORY)?;
-                let attributes = self.attributes(directory.as_fd(), &entry.name)?;
+                let attributes = self.list_and_read_attributes(directory.as_fd(), &entry.name)?;
                 let path = std::mem::take(&mut entry.name);
                 entry.kind = Kind::Directory;
                 entry.name = [&path[..], b"/"].concat();
@@ -169,15 +169,15 @@ impl<'a, W: Write> Packer<'a, W> {
                         ..opaque
                     })?;
                 }
-                self.directory(directory.as_fd(), &path, depth + 1)
+                self.pack_directory(directory.as_fd(), &path, depth + 1)
             }
-            FileType::RegularFile => self.file(parent, name, entry, stat),
+            FileType::RegularFile => self.pack_file(parent, name, entry, stat),
             FileType::Symlink => {
                 entry.kind = Kind::Symlink;
-                // Linux gives every link all rights; what others give must not show.
+                // On Linux every link has all permissions; those of other systems must not make a difference.
                 entry.mode = 0o777;
                 entry.link = rustix::fs::readlinkat(parent, name, Vec::new())
-                    .map_err(|error| self.failed("read the link", &entry.name, error))?
+                    .map_err(|error| self.file_error("read the link", &entry.name, error))?
                     .into_bytes();
                 self.write(&entry)
             }
@@ -197,12 +197,12 @@ impl<'a, W: Write> Packer<'a, W> {
                 entry.kind = Kind::Fifo;
                 self.write(&entry)
             }
-            // A socket means nothing without the process that listens on it.
+            // A socket is useless without the process that listens on it.
             _ => Ok(()),
         }
     }
 
-    fn file(
+    fn pack_file(
         &mut self,
         parent: BorrowedFd<'_>,
         name: &[u8],
@@ -210,21 +210,23 @@ impl<'a, W: Write> Packer<'a, W> {
         stat: &Stat,
     ) -> Result<(), Error> {
         let file = File::from(self.open(parent, name, &entry.name, READ)?);
-        let now =
-            rustix::fs::fstat(&file).map_err(|error| self.failed("look at", &entry.name, error))?;
+        let now = rustix::fs::fstat(&file)
+            .map_err(|error| self.file_error("look at", &entry.name, error))?;
         if (now.st_dev, now.st_ino) != (stat.st_dev, stat.st_ino) {
-            return Err(self.problem(&entry.name, "it was replaced while it was read"));
+            return Err(self.tree_error(&entry.name, "it was replaced while it was read"));
         }
         entry.size = now.st_size as u64;
-        entry.xattrs = self.attributes(file.as_fd(), &entry.name)?.kept;
+        entry.xattrs = self
+            .list_and_read_attributes(file.as_fd(), &entry.name)?
+            .kept;
         let mut buffer = std::mem::take(&mut self.buffer);
-        let written = self.writer.file(&entry, &file, &mut buffer);
+        let written = self.writer.write_file(&entry, &file, &mut buffer);
         self.buffer = buffer;
         written.map_err(|error| match error.kind() {
             io::ErrorKind::UnexpectedEof => {
-                self.problem(&entry.name, "it became shorter while it was read")
+                self.tree_error(&entry.name, "it became shorter while it was read")
             }
-            _ => Error::file("pack", self.shown(&entry.name), error),
+            _ => Error::file("pack", self.full_path(&entry.name), error),
         })
     }
 
@@ -236,23 +238,23 @@ impl<'a, W: Write> Packer<'a, W> {
         flags: OFlags,
     ) -> Result<OwnedFd, Error> {
         rustix::fs::openat(parent, name, flags, Mode::empty())
-            .map_err(|error| self.failed("open", path, error))
+            .map_err(|error| self.file_error("open", path, error))
     }
 
     fn write(&mut self, entry: &Entry) -> Result<(), Error> {
         self.writer
-            .header(entry)
-            .map_err(|error| Error::file("pack", self.shown(&entry.name), error))
+            .write_header(entry)
+            .map_err(|error| Error::file("pack", self.full_path(&entry.name), error))
     }
 
-    /// An overlay's mark for "deleted": a character device with number 0:0.
+    /// Returns whether a file is an overlay's deletion mark: a character device with number 0:0.
     fn is_whiteout(&self, stat: &Stat) -> bool {
         self.options.overlay_upper
             && FileType::from_raw_mode(stat.st_mode) == FileType::CharacterDevice
             && stat.st_rdev == 0
     }
 
-    fn id(&self, on_disk: u32) -> u64 {
+    fn mapped_id(&self, on_disk: u32) -> u64 {
         u64::from(on_disk.saturating_sub(self.options.uid_offset))
     }
 
@@ -263,12 +265,16 @@ impl<'a, W: Write> Packer<'a, W> {
         }
     }
 
-    fn attributes(&mut self, file: BorrowedFd<'_>, path: &[u8]) -> Result<Attributes, Error> {
+    fn list_and_read_attributes(
+        &mut self,
+        file: BorrowedFd<'_>,
+        path: &[u8],
+    ) -> Result<Attributes, Error> {
         let mut names = std::mem::take(&mut self.attribute_names);
         let result = match rustix::fs::flistxattr(file, &mut names[..]) {
             Ok(0) | Err(Errno::NOTSUP) => Ok(Attributes::default()),
             Ok(length) => self.read_attributes(file, path, &names[..length]),
-            Err(error) => Err(self.failed("list the attributes of", path, error)),
+            Err(error) => Err(self.file_error("list the attributes of", path, error)),
         };
         self.attribute_names = names;
         result
@@ -289,13 +295,13 @@ impl<'a, W: Write> Packer<'a, W> {
         names.sort_unstable();
         for name in names {
             let length = rustix::fs::fgetxattr(file, name, &mut value[..])
-                .map_err(|error| self.failed("read an attribute of", path, error))?;
-            self.attribute(&mut found, name, &value[..length], path)?;
+                .map_err(|error| self.file_error("read an attribute of", path, error))?;
+            self.add_attribute(&mut found, name, &value[..length], path)?;
         }
         Ok(found)
     }
 
-    fn attribute(
+    fn add_attribute(
         &self,
         found: &mut Attributes,
         name: &[u8],
@@ -308,7 +314,11 @@ impl<'a, W: Write> Packer<'a, W> {
         match overlay {
             Some(b"opaque") if self.options.overlay_upper => found.opaque |= value == b"y",
             Some(b"redirect" | b"metacopy") if self.options.overlay_upper => {
-                return Err(self.problem(path, "its content is partly in another layer; mount the overlay with redirect_dir=off,metacopy=off"));
+                return Err(self.tree_error(
+                    path,
+                    "its content is partly in another layer; mount the overlay with \
+                                               redirect_dir=off,metacopy=off",
+                ));
             }
             Some(_) => {}
             None if name == capability::NAME => {
@@ -322,23 +332,23 @@ impl<'a, W: Write> Packer<'a, W> {
         Ok(())
     }
 
-    fn shown(&self, path: &[u8]) -> PathBuf {
+    fn full_path(&self, path: &[u8]) -> PathBuf {
         self.root.join(std::ffi::OsStr::from_bytes(path))
     }
 
-    fn failed(&self, action: &'static str, path: &[u8], error: Errno) -> Error {
-        Error::file(action, self.shown(path), error)
+    fn file_error(&self, action: &'static str, path: &[u8], error: Errno) -> Error {
+        Error::file(action, self.full_path(path), error)
     }
 
-    fn problem(&self, path: &[u8], problem: impl Into<String>) -> Error {
+    fn tree_error(&self, path: &[u8], problem: impl Into<String>) -> Error {
         Error::Tree {
-            path: self.shown(path),
+            path: self.full_path(path),
             problem: problem.into(),
         }
     }
 }
 
-/// What a file's extended attributes say.
+/// Extended attributes of a file.
 #[derive(Default)]
 struct Attributes {
     kept: Vec<(Vec<u8>, Vec<u8>)>,

@@ -1,8 +1,8 @@
-//! What is said between a servant's shim and its init, and how it is sent.
+//! Messages between a servant's shim and its init, and their transport.
 //!
-//! In: [`Request`] datagrams on a `SEQPACKET` socket that is init's standard input, with file descriptors beside
-//! them. Out: [`Reply`] datagrams. Every integer is little-endian. Decoding borrows and allocates nothing, because
-//! init lives as long as its servant does and is to cost next to nothing.
+//! In: [`InitRequest`] datagrams on a `SEQPACKET` socket that is init's standard input, with file descriptors attached.
+//! Out: [`InitReply`] datagrams. All integers are little-endian. Decoding borrows and allocates nothing, because init
+//! lives as long as its servant and should cost next to nothing.
 //!
 //! ```text
 //!   shim                          init (pid 1)
@@ -17,4 +17,6 @@
 pub mod socket;
 pub mod wire;
 
-pub use wire::{EncodeError, MAX_MESSAGE, Reply, Request, Scope, Stage, Start, StartRequest};
+pub use wire::{
+    EncodeError, InitReply, InitRequest, MAX_MESSAGE, Scope, Start, StartRequest, StartStage,
+};

@@ -1,8 +1,8 @@
-//! PID 1 of a servant. Static, allocates nothing, knows nothing but how to start, signal and reap.
+//! PID 1 of a servant: a static binary without allocations that only starts, signals and reaps processes.
 //!
-//! Its standard input is the socket to the shim; when that closes, every process of the servant ends. The state it
-//! keeps is none: the shim remembers. It runs under the servant's own seccomp filter, user and limits, which its
-//! children inherit; nothing here could grant them more.
+//! Its standard input is the socket to the shim; when that closes, every process of the servant is killed. It keeps no
+//! state: the shim does. It runs with the servant's own seccomp filter, user and limits, which its children inherit;
+//! nothing here could grant them more.
 #![no_main]
 
 use std::ffi::{c_char, c_int};
@@ -10,19 +10,19 @@ use std::os::fd::RawFd;
 use std::ptr;
 
 use init::socket::{self, MAX_FDS};
-use init::wire::{MAX_MESSAGE, Reply, Request, Scope, Stage, Start};
+use init::wire::{InitReply, InitRequest, MAX_MESSAGE, Scope, Start, StartStage};
 
-/// Exit statuses, for whoever reads init's own.
+/// Exit statuses of init itself.
 const NOT_PID_ONE: c_int = 64;
 const BROKEN: c_int = 70;
 
-/// Arguments and variables of one program.
+/// Maximum number of arguments and variables of one program.
 const MAX_STRINGS: usize = 8192;
 
 static mut MESSAGE: [u8; MAX_MESSAGE] = [0; MAX_MESSAGE];
 static mut POINTERS: [*const c_char; MAX_STRINGS] = [ptr::null(); MAX_STRINGS];
 
-/// The socket and the signal descriptor sit above the standard streams.
+/// The socket and the signal descriptor are placed above the standard streams.
 const FIRST_FREE: c_int = 3;
 
 #[unsafe(no_mangle)]
@@ -33,22 +33,22 @@ extern "C" fn main(_count: c_int, _arguments: *const *const c_char) -> c_int {
         if libc::getpid() != 1 {
             return NOT_PID_ONE;
         }
-        // Nodes share init's user: without this they could open its descriptors through /proc/1/fd.
+        // Nodes run as the same user: without this they could open init's descriptors through /proc/1/fd.
         libc::prctl(libc::PR_SET_DUMPABLE, 0);
     }
     let (Some(shim), Some(children)) = (take_socket(), watch_children()) else {
         return BROKEN;
     };
-    if !tell(shim, Reply::Ready, &[]) {
+    if !send_reply(shim, InitReply::Ready, &[]) {
         return BROKEN;
     }
     serve(shim, children);
-    // SAFETY: pid 1: this reaches the processes of this pid namespace only.
+    // SAFETY: as pid 1 this reaches only the processes of this pid namespace.
     unsafe { libc::kill(-1, libc::SIGKILL) };
     0
 }
 
-/// Moves the socket away from standard input, so that no node inherits it, and gives the standard streams to
+/// Moves the socket away from standard input, so that no node inherits it, and redirects the standard streams to
 /// /dev/null.
 fn take_socket() -> Option<RawFd> {
     // SAFETY: calls on descriptors only; the path is a literal.
@@ -66,7 +66,7 @@ fn take_socket() -> Option<RawFd> {
     }
 }
 
-/// A descriptor that becomes readable when a child has ended.
+/// Returns a descriptor that becomes readable when a child exits.
 fn watch_children() -> Option<RawFd> {
     // SAFETY: the set is initialised before it is used.
     unsafe {
@@ -80,7 +80,7 @@ fn watch_children() -> Option<RawFd> {
     }
 }
 
-/// Until the shim is gone.
+/// Handles events until the shim is gone.
 fn serve(shim: RawFd, children: RawFd) {
     let mut watched = [
         libc::pollfd {
@@ -103,48 +103,48 @@ fn serve(shim: RawFd, children: RawFd) {
         if watched[1].revents != 0 && !reap(shim, children) {
             return;
         }
-        if watched[0].revents != 0 && !obey(shim) {
+        if watched[0].revents != 0 && !handle_request(shim) {
             return;
         }
     }
 }
 
-/// Tells the end of every process that has ended; false when nobody listens any more.
+/// Reports every process that has exited; returns false when the shim has closed the socket.
 fn reap(shim: RawFd, children: RawFd) -> bool {
     let mut info = [0_u8; size_of::<libc::signalfd_siginfo>()];
-    // SAFETY: the buffer has the length given. What is read is not needed: SIGCHLDs merge, waitpid knows all.
+    // SAFETY: the buffer has the given length. Its content is not needed: SIGCHLDs merge, waitpid knows them all.
     unsafe { libc::read(children, info.as_mut_ptr().cast(), info.len()) };
     loop {
         let mut status = 0;
-        // SAFETY: `status` is a valid place.
+        // SAFETY: `status` is a valid location.
         let pid = unsafe { libc::waitpid(-1, &mut status, libc::WNOHANG) };
         if pid <= 0 {
             return true;
         }
-        if !tell(shim, Reply::Exited { pid, status }, &[]) {
+        if !send_reply(shim, InitReply::Exited { pid, status }, &[]) {
             return false;
         }
     }
 }
 
-/// Takes one request; false when the shim is gone.
-fn obey(shim: RawFd) -> bool {
+/// Receives and handles one request; returns false when the shim is gone.
+fn handle_request(shim: RawFd) -> bool {
     let mut fds = [-1; MAX_FDS];
-    // SAFETY: init has one thread and this is the only use of the buffer at a time.
+    // SAFETY: init has one thread, and this is the only use of the buffer at this time.
     let buffer = unsafe { &mut *ptr::addr_of_mut!(MESSAGE) };
     let (length, count) = match socket::receive(shim, buffer, &mut fds) {
         Ok((0, 0)) | Err(_) => return false,
         Ok(received) => received,
     };
-    let alive = match Request::decode(&buffer[..length]) {
-        Some(Request::Start(request)) => start(shim, &request, &fds[..count]),
-        Some(Request::Signal { pid, signal, scope }) => {
+    let alive = match InitRequest::decode(&buffer[..length]) {
+        Some(InitRequest::Start(request)) => start(shim, &request, &fds[..count]),
+        Some(InitRequest::Signal { pid, signal, scope }) => {
             let target = match scope {
                 Scope::Process => pid,
                 Scope::Group => -pid,
                 Scope::All => -1,
             };
-            // 0, 1 and their negatives would mean init itself or its own group.
+            // 0, 1 and their negatives would address init itself or its own group.
             if scope == Scope::All || pid > 1 {
                 // SAFETY: no pointers.
                 unsafe { libc::kill(target, signal) };
@@ -160,12 +160,12 @@ fn obey(shim: RawFd) -> bool {
     alive
 }
 
-/// Forks and executes; the answer says which of the two failed, if any.
+/// Forks and executes a program; the reply says which step failed, if any.
 fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     let failed = |errno, stage| {
-        tell(
+        send_reply(
             shim,
-            Reply::Failed {
+            InitReply::Failed {
                 id: request.id,
                 errno,
                 stage,
@@ -176,17 +176,17 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     if streams.len() != 2
         || usize::from(request.arguments) + usize::from(request.variables) + 2 > MAX_STRINGS
     {
-        return failed(libc::E2BIG, Stage::Request);
+        return failed(libc::E2BIG, StartStage::Request);
     }
     let mut report = [-1; 2];
-    // SAFETY: two places for two descriptors.
+    // SAFETY: an array of two for two descriptors.
     if unsafe { libc::pipe2(report.as_mut_ptr(), libc::O_CLOEXEC) } != 0 {
-        return failed(errno(), Stage::Fork);
+        return failed(errno(), StartStage::Fork);
     }
     // SAFETY: one thread; the child goes straight to exec or _exit.
     let pid = unsafe { libc::fork() };
     if pid == 0 {
-        let (stage, error) = become_program(request, streams);
+        let (stage, error) = exec_program(request, streams);
         let bytes = [stage as u8, error as u8, (error >> 8) as u8];
         // SAFETY: a live buffer of the length given; then the process ends.
         unsafe {
@@ -208,23 +208,23 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
         read
     };
     if pid < 0 {
-        return failed(fork_error, Stage::Fork);
+        return failed(fork_error, StartStage::Fork);
     }
     if read == 3 {
-        // SAFETY: our child, which is about to end: it must not be told of as a process that ran.
+        // SAFETY: our child, which is about to exit: it must not be reported as a process that ran.
         unsafe { libc::waitpid(pid, ptr::null_mut(), 0) };
         return failed(
             i32::from(bytes[1]) | i32::from(bytes[2]) << 8,
-            Stage::from_byte(bytes[0]),
+            StartStage::from_byte(bytes[0]),
         );
     }
-    // The child is unreaped, so that the pid is surely its own.
+    // The child is not reaped yet, so the pid is certainly its own.
     // SAFETY: no pointers.
     let pidfd = unsafe { libc::syscall(libc::SYS_pidfd_open, pid, 0) } as RawFd;
     let beside = [pidfd];
-    let told = tell(
+    let told = send_reply(
         shim,
-        Reply::Started {
+        InitReply::Started {
             id: request.id,
             pid,
         },
@@ -235,10 +235,10 @@ fn start(shim: RawFd, request: &Start<'_>, streams: &[RawFd]) -> bool {
     told
 }
 
-/// In the child: returns only when it could not execute.
-fn become_program(request: &Start<'_>, streams: &[RawFd]) -> (Stage, c_int) {
-    // SAFETY: after fork in a process with one thread. The strings end in zero bytes and their number was checked
-    // when the request was decoded; the pointer table is large enough and each of its two lists ends in null.
+/// Executes the program, in the child; returns only on failure.
+fn exec_program(request: &Start<'_>, streams: &[RawFd]) -> (StartStage, c_int) {
+    // SAFETY: after fork in a process with one thread. The strings end in zero bytes and their number was checked when
+    // the request was decoded; the pointer table is large enough, and each of its two lists ends in null.
     unsafe {
         let mut none: libc::sigset_t = std::mem::zeroed();
         libc::sigemptyset(&mut none);
@@ -247,7 +247,7 @@ fn become_program(request: &Start<'_>, streams: &[RawFd]) -> (Stage, c_int) {
         }
         libc::sigprocmask(libc::SIG_SETMASK, &none, ptr::null_mut());
         if libc::setsid() < 0 || libc::dup2(streams[0], 1) < 0 || libc::dup2(streams[1], 2) < 0 {
-            return (Stage::Prepare, errno());
+            return (StartStage::Prepare, errno());
         }
         libc::umask(0o022);
         let table = ptr::addr_of_mut!(POINTERS).cast::<*const c_char>();
@@ -276,19 +276,19 @@ fn become_program(request: &Start<'_>, streams: &[RawFd]) -> (Stage, c_int) {
         let arguments = list(request.arguments, table, &mut slot);
         let variables = list(request.variables, table, &mut slot);
         if libc::chdir(directory) != 0 {
-            return (Stage::Directory, errno());
+            return (StartStage::Directory, errno());
         }
         libc::execve(*arguments, arguments, variables);
-        (Stage::Execute, errno())
+        (StartStage::Execute, errno())
     }
 }
 
-/// False when nobody listens any more.
-fn tell(shim: RawFd, reply: Reply, fds: &[RawFd]) -> bool {
+/// Sends a reply; returns false when the shim has closed the socket.
+fn send_reply(shim: RawFd, reply: InitReply, fds: &[RawFd]) -> bool {
     socket::send(shim, &reply.encode(), fds).is_ok()
 }
 
 fn errno() -> c_int {
-    // SAFETY: always a valid place in this thread.
+    // SAFETY: always a valid location in this thread.
     unsafe { *libc::__errno_location() }
 }

@@ -1,15 +1,15 @@
-//! Datagrams with file descriptors beside them (`SCM_RIGHTS`, unix(7)).
+//! Datagrams with attached file descriptors (`SCM_RIGHTS`, unix(7)).
 
 use std::io;
 use std::os::fd::RawFd;
 
-/// The most file descriptors that one message carries.
+/// Maximum number of file descriptors in one message.
 pub const MAX_FDS: usize = 4;
 
 const CONTROL: usize = 64;
 
 #[repr(C, align(8))]
-struct Control([u8; CONTROL]);
+struct ControlBuffer([u8; CONTROL]);
 
 /// Sends one message. Interrupted calls are repeated; a closed peer is an error, not a signal.
 pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
@@ -17,7 +17,7 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
         iov_base: bytes.as_ptr().cast_mut().cast(),
         iov_len: bytes.len(),
     };
-    let mut control = Control([0; CONTROL]);
+    let mut control = ControlBuffer([0; CONTROL]);
     // SAFETY: an all-zero msghdr is valid; every pointer put into it outlives the call.
     let mut message: libc::msghdr = unsafe { std::mem::zeroed() };
     message.msg_iov = &mut vector;
@@ -31,8 +31,8 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
         message.msg_control = control.0.as_mut_ptr().cast();
         // SAFETY: pure arithmetic.
         message.msg_controllen = unsafe { libc::CMSG_SPACE(payload as u32) } as _;
-        // SAFETY: the control buffer is aligned and large enough for MAX_FDS descriptors, so that the first
-        // header and its data lie within it.
+        // SAFETY: the control buffer is aligned and large enough for MAX_FDS descriptors, so that the first header and
+        // its data lie within it.
         unsafe {
             let header = libc::CMSG_FIRSTHDR(&message);
             (*header).cmsg_level = libc::SOL_SOCKET;
@@ -46,7 +46,7 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
         }
     }
     loop {
-        // SAFETY: `message` points to live buffers of the stated lengths.
+        // SAFETY: `message` points to live buffers of the given lengths.
         let sent = unsafe { libc::sendmsg(socket, &message, libc::MSG_NOSIGNAL) };
         if sent >= 0 {
             return Ok(sent as usize);
@@ -58,8 +58,8 @@ pub fn send(socket: RawFd, bytes: &[u8], fds: &[RawFd]) -> io::Result<usize> {
     }
 }
 
-/// Receives one message: how many bytes, how many file descriptors (close-on-exec, now the caller's). No bytes and
-/// no descriptors: the peer has closed. A message longer than `bytes` is an error.
+/// Receives one message; returns the number of bytes and of file descriptors (close-on-exec, now owned by the caller).
+/// Neither bytes nor descriptors mean that the peer has closed. A message longer than `bytes` is an error.
 pub fn receive(
     socket: RawFd,
     bytes: &mut [u8],
@@ -69,7 +69,7 @@ pub fn receive(
         iov_base: bytes.as_mut_ptr().cast(),
         iov_len: bytes.len(),
     };
-    let mut control = Control([0; CONTROL]);
+    let mut control = ControlBuffer([0; CONTROL]);
     // SAFETY: an all-zero msghdr is valid; every pointer put into it outlives the calls.
     let mut message: libc::msghdr = unsafe { std::mem::zeroed() };
     message.msg_iov = &mut vector;
@@ -77,7 +77,7 @@ pub fn receive(
     message.msg_control = control.0.as_mut_ptr().cast();
     message.msg_controllen = CONTROL as _;
     let received = loop {
-        // SAFETY: `message` points to live, writable buffers of the stated lengths.
+        // SAFETY: `message` points to live, writable buffers of the given lengths.
         let received = unsafe { libc::recvmsg(socket, &mut message, libc::MSG_CMSG_CLOEXEC) };
         if received >= 0 {
             break received as usize;

@@ -1,8 +1,8 @@
-//! The datagrams, as data.
+//! Wire format of the datagrams.
 
 use std::fmt;
 
-/// The longest datagram; a command line with its environment must fit.
+/// Maximum length of a datagram in bytes; a command line with its environment must fit.
 pub const MAX_MESSAGE: usize = 128 * 1024;
 
 const START: u8 = 1;
@@ -12,65 +12,65 @@ const STARTED: u8 = 0x81;
 const FAILED: u8 = 0x82;
 const EXITED: u8 = 0x83;
 
-/// What the shim asks of init.
+/// A request from the shim to init.
 #[derive(Debug, PartialEq)]
-pub enum Request<'a> {
-    /// Fork and execute. Standard output and error come beside it as file descriptors.
+pub enum InitRequest<'a> {
+    /// Fork and execute a program. Its standard output and error are attached as file descriptors.
     Start(Start<'a>),
     /// Send a signal.
     Signal {
-        /// Pid inside; ignored for [`Scope::All`].
+        /// Pid in the container; ignored for [`Scope::All`].
         pid: i32,
         /// Signal number.
         signal: i32,
-        /// Whom it reaches.
+        /// Processes that receive the signal.
         scope: Scope,
     },
 }
 
-/// Whom a signal reaches.
+/// Processes that receive a signal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scope {
     /// The process only.
     Process,
-    /// Its process group.
+    /// The process group of the process.
     Group,
     /// Every process but init.
     All,
 }
 
-/// A request to start a program, as init reads it.
+/// A request to start a program, as decoded by init.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Start<'a> {
-    /// Chosen by the shim, returned in the answer.
+    /// Id chosen by the shim, repeated in the reply.
     pub id: u32,
-    /// How many arguments follow the directory.
+    /// Number of arguments that follow the directory.
     pub arguments: u16,
-    /// How many `NAME=value` follow the arguments.
+    /// Number of `NAME=value` strings that follow the arguments.
     pub variables: u16,
-    /// Directory, arguments and variables, each ended by a zero byte.
+    /// Directory, arguments and variables, each terminated by a zero byte.
     pub strings: &'a [u8],
 }
 
-/// A request to start a program, as the shim writes it.
+/// A request to start a program, as encoded by the shim.
 #[derive(Debug, Clone, Copy)]
 pub struct StartRequest<'a> {
-    /// Returned in the answer.
+    /// Id repeated in the reply.
     pub id: u32,
     /// Working directory; `/` when empty.
     pub directory: &'a str,
     /// Path of the program and its arguments.
     pub argv: &'a [String],
-    /// Environment as `NAME=value`.
+    /// Environment as `NAME=value` strings.
     pub environment: &'a [String],
 }
 
-/// Why a request cannot be sent.
+/// Reason why a request cannot be encoded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum EncodeError {
-    /// No program is named.
+    /// No program is given.
     Empty,
-    /// A string holds a zero byte.
+    /// A string contains a zero byte.
     ZeroByte(String),
     /// Arguments and environment together are longer than [`MAX_MESSAGE`] allows.
     TooLong(usize),
@@ -94,54 +94,54 @@ impl fmt::Display for EncodeError {
 
 impl std::error::Error for EncodeError {}
 
-/// What init tells the shim.
+/// A message from init to the shim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reply {
-    /// It listens.
+pub enum InitReply {
+    /// Init is ready for requests.
     Ready,
-    /// The program was executed; its pidfd comes beside this.
+    /// The program was executed; its pidfd is attached.
     Started {
-        /// From the request.
+        /// Id of the request.
         id: u32,
-        /// Pid inside.
+        /// Pid in the container.
         pid: i32,
     },
-    /// The command was not carried out.
+    /// The program could not be started.
     Failed {
-        /// From the request.
+        /// Id of the request.
         id: u32,
-        /// Error number.
+        /// Error number (errno).
         errno: i32,
-        /// What was being done.
-        stage: Stage,
+        /// Step that failed.
+        stage: StartStage,
     },
-    /// A process ended: a started one, or an orphan that init had inherited.
+    /// A process exited: a started one, or an orphan that init had inherited.
     Exited {
-        /// Pid inside.
+        /// Pid in the container.
         pid: i32,
-        /// Status as `waitpid` gives it.
+        /// Wait status, as from `waitpid`.
         status: i32,
     },
 }
 
-/// Which step of a start failed.
+/// Step of a start that failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Stage {
-    /// The request could not be read.
+pub enum StartStage {
+    /// Decoding of the request.
     Request = 0,
     /// `fork`.
     Fork = 1,
-    /// Sessions, signals, standard streams.
+    /// Setup of session, signals and standard streams.
     Prepare = 2,
-    /// Changing to the working directory.
+    /// Change to the working directory.
     Directory = 3,
     /// `execve`.
     Execute = 4,
 }
 
-impl Stage {
-    /// From the byte on the wire.
+impl StartStage {
+    /// Decodes the byte used on the wire.
     pub fn from_byte(byte: u8) -> Self {
         match byte {
             1 => Self::Fork,
@@ -154,7 +154,7 @@ impl Stage {
 }
 
 impl StartRequest<'_> {
-    /// The datagram.
+    /// Encodes the request as a datagram.
     pub fn encode(&self) -> Result<Vec<u8>, EncodeError> {
         if self.argv.first().is_none_or(|program| program.is_empty()) {
             return Err(EncodeError::Empty);
@@ -191,8 +191,8 @@ impl StartRequest<'_> {
     }
 }
 
-impl<'a> Request<'a> {
-    /// Reads a datagram; none when it is not one of ours.
+impl<'a> InitRequest<'a> {
+    /// Decodes a datagram; `None` if it is malformed.
     pub fn decode(bytes: &'a [u8]) -> Option<Self> {
         let (&kind, rest) = bytes.split_first()?;
         match kind {
@@ -204,7 +204,7 @@ impl<'a> Request<'a> {
                 let complete = strings.last() == Some(&0)
                     && ended == 1 + usize::from(arguments) + usize::from(variables);
                 (complete && arguments > 0).then_some(Self::Start(Start {
-                    id: word(fixed, 0)?,
+                    id: read_u32(fixed, 0)?,
                     arguments,
                     variables,
                     strings,
@@ -218,8 +218,8 @@ impl<'a> Request<'a> {
                     _ => return None,
                 };
                 Some(Self::Signal {
-                    pid: word(rest, 0)? as i32,
-                    signal: word(rest, 4)? as i32,
+                    pid: read_u32(rest, 0)? as i32,
+                    signal: read_u32(rest, 4)? as i32,
                     scope,
                 })
             }
@@ -227,8 +227,8 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// The datagram that sends a signal.
-    pub fn signal(pid: i32, signal: i32, scope: Scope) -> [u8; 10] {
+    /// Encodes a signal request as a datagram.
+    pub fn encode_signal(pid: i32, signal: i32, scope: Scope) -> [u8; 10] {
         let mut out = [0; 10];
         out[0] = SIGNAL;
         out[1..5].copy_from_slice(&pid.to_le_bytes());
@@ -242,8 +242,8 @@ impl<'a> Request<'a> {
     }
 }
 
-impl Reply {
-    /// The datagram.
+impl InitReply {
+    /// Encodes the reply as a datagram.
     pub fn encode(self) -> [u8; 10] {
         let (kind, first, second, last) = match self {
             Self::Ready => (READY, 0, 0, 0),
@@ -259,10 +259,10 @@ impl Reply {
         out
     }
 
-    /// Reads a datagram; none when it is not one of ours.
+    /// Decodes a datagram; `None` if it is malformed.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let (&kind, rest) = bytes.split_first()?;
-        let (first, second, last) = (word(rest, 0)?, word(rest, 4)?, *rest.get(8)?);
+        let (first, second, last) = (read_u32(rest, 0)?, read_u32(rest, 4)?, *rest.get(8)?);
         match kind {
             READY => Some(Self::Ready),
             STARTED => Some(Self::Started {
@@ -272,7 +272,7 @@ impl Reply {
             FAILED => Some(Self::Failed {
                 id: first,
                 errno: second as i32,
-                stage: Stage::from_byte(last),
+                stage: StartStage::from_byte(last),
             }),
             EXITED => Some(Self::Exited {
                 pid: first as i32,
@@ -283,7 +283,7 @@ impl Reply {
     }
 }
 
-fn word(bytes: &[u8], at: usize) -> Option<u32> {
+fn read_u32(bytes: &[u8], at: usize) -> Option<u32> {
     Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
 }
 
@@ -305,7 +305,7 @@ mod tests {
             environment: &environment,
         };
         let bytes = request.encode().unwrap();
-        let Some(Request::Start(start)) = Request::decode(&bytes) else {
+        let Some(InitRequest::Start(start)) = InitRequest::decode(&bytes) else {
             panic!("not a start")
         };
         assert_eq!((start.id, start.arguments, start.variables), (7, 3, 2));
@@ -347,34 +347,38 @@ mod tests {
         .encode()
         .unwrap();
         for length in 0..bytes.len() {
-            assert_eq!(Request::decode(&bytes[..length]), None, "{length} bytes");
+            assert_eq!(
+                InitRequest::decode(&bytes[..length]),
+                None,
+                "{length} bytes"
+            );
         }
-        assert_eq!(Request::decode(&[99; 32]), None);
-        assert_eq!(Reply::decode(&[1, 2, 3]), None);
+        assert_eq!(InitRequest::decode(&[99; 32]), None);
+        assert_eq!(InitReply::decode(&[1, 2, 3]), None);
     }
 
     #[test]
     fn replies_and_signals_are_read_as_written() {
         for reply in [
-            Reply::Ready,
-            Reply::Started { id: 3, pid: 12 },
-            Reply::Failed {
+            InitReply::Ready,
+            InitReply::Started { id: 3, pid: 12 },
+            InitReply::Failed {
                 id: 4,
                 errno: 2,
-                stage: Stage::Execute,
+                stage: StartStage::Execute,
             },
-            Reply::Exited {
+            InitReply::Exited {
                 pid: 5,
                 status: 0x8b,
             },
         ] {
-            assert_eq!(Reply::decode(&reply.encode()), Some(reply));
+            assert_eq!(InitReply::decode(&reply.encode()), Some(reply));
         }
         for scope in [Scope::Process, Scope::Group, Scope::All] {
-            let bytes = Request::signal(9, 15, scope);
+            let bytes = InitRequest::encode_signal(9, 15, scope);
             assert_eq!(
-                Request::decode(&bytes),
-                Some(Request::Signal {
+                InitRequest::decode(&bytes),
+                Some(InitRequest::Signal {
                     pid: 9,
                     signal: 15,
                     scope

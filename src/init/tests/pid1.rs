@@ -1,11 +1,11 @@
-//! The real init, as the first process of a pid namespace. Needs root.
+//! Tests of the real init as the first process of a pid namespace. Needs root.
 
 use std::io::Read;
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
 use std::process::{Child, Command, Stdio};
 
 use init::socket::{self, MAX_FDS};
-use init::{Reply, Request, Scope, Stage, StartRequest};
+use init::{InitReply, InitRequest, Scope, StartRequest, StartStage};
 
 const INIT: &str = env!("CARGO_BIN_EXE_cloudroid-init");
 
@@ -18,18 +18,18 @@ impl Init {
     fn start() -> Self {
         let mut pair = [-1; 2];
         let kind = libc::SOCK_SEQPACKET | libc::SOCK_CLOEXEC;
-        // SAFETY: two places for two descriptors.
+        // SAFETY: an array of two for two descriptors.
         let made = unsafe { libc::socketpair(libc::AF_UNIX, kind, 0, pair.as_mut_ptr()) };
         assert_eq!(made, 0);
-        // SAFETY: made just now, owned by nobody else.
+        // SAFETY: just created, owned by nobody else.
         let [ours, theirs] = pair.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
-        // What never comes must fail, not hang.
+        // A missing message must fail the test, not hang it.
         let patience = libc::timeval {
             tv_sec: 30,
             tv_usec: 0,
         };
         let length = size_of::<libc::timeval>() as libc::socklen_t;
-        // SAFETY: a live structure of the stated length.
+        // SAFETY: a live structure of the given length.
         let set = unsafe {
             let value = std::ptr::addr_of!(patience).cast();
             libc::setsockopt(
@@ -50,7 +50,7 @@ impl Init {
             socket: Some(ours),
             process,
         };
-        assert_eq!(init.receive().0, Reply::Ready);
+        assert_eq!(init.receive().0, InitReply::Ready);
         init
     }
 
@@ -58,15 +58,18 @@ impl Init {
         self.socket.as_ref().expect("not closed yet").as_raw_fd()
     }
 
-    fn receive(&self) -> (Reply, Option<OwnedFd>) {
+    fn receive(&self) -> (InitReply, Option<OwnedFd>) {
         let (mut bytes, mut fds) = ([0; 64], [-1; MAX_FDS]);
         let (length, count) = socket::receive(self.fd(), &mut bytes, &mut fds).expect("an answer");
-        // SAFETY: received just now, owned by nobody else.
+        // SAFETY: just received, owned by nobody else.
         let fd = (count > 0).then(|| unsafe { OwnedFd::from_raw_fd(fds[0]) });
-        (Reply::decode(&bytes[..length]).expect("one of ours"), fd)
+        (
+            InitReply::decode(&bytes[..length]).expect("one of ours"),
+            fd,
+        )
     }
 
-    /// Asks for a shell script; what it prints can be read from what is returned.
+    /// Starts a shell script; its output can be read from the returned file.
     fn shell(&self, id: u32, script: &str) -> std::fs::File {
         self.run(id, &["/bin/sh", "-c", script], "/")
     }
@@ -81,10 +84,10 @@ impl Init {
             environment: &environment,
         };
         let mut pipe = [-1; 2];
-        // SAFETY: two places for two descriptors.
+        // SAFETY: an array of two for two descriptors.
         let made = unsafe { libc::pipe2(pipe.as_mut_ptr(), libc::O_CLOEXEC) };
         assert_eq!(made, 0);
-        // SAFETY: made just now, owned by nobody else.
+        // SAFETY: just created, owned by nobody else.
         let [read, write] = pipe.map(|fd| unsafe { OwnedFd::from_raw_fd(fd) });
         socket::send(
             self.fd(),
@@ -95,16 +98,16 @@ impl Init {
         read.into()
     }
 
-    fn started(&self, id: u32) -> i32 {
+    fn expect_started(&self, id: u32) -> i32 {
         match self.receive() {
-            (Reply::Started { id: told, pid }, Some(_pidfd)) if told == id => pid,
+            (InitReply::Started { id: told, pid }, Some(_pidfd)) if told == id => pid,
             other => panic!("not started but {other:?}"),
         }
     }
 
-    fn exited(&self, pid: i32) -> i32 {
+    fn expect_exit(&self, pid: i32) -> i32 {
         match self.receive().0 {
-            Reply::Exited { pid: told, status } if told == pid => status,
+            InitReply::Exited { pid: told, status } if told == pid => status,
             other => panic!("no end of {pid} but {other:?}"),
         }
     }
@@ -121,8 +124,8 @@ impl Drop for Init {
 fn it_runs_programs_and_tells_how_they_end() {
     let init = Init::start();
     let mut printed = init.shell(1, "echo $GREETING $(pwd); cat; exit 3");
-    let pid = init.started(1);
-    assert_eq!(init.exited(pid), 3 << 8);
+    let pid = init.expect_started(1);
+    assert_eq!(init.expect_exit(pid), 3 << 8);
     let mut text = String::new();
     printed.read_to_string(&mut text).unwrap();
     assert_eq!(text, "hello /\n", "and its standard input was empty");
@@ -134,50 +137,54 @@ fn what_cannot_be_executed_is_told_apart_with_its_error() {
     init.run(1, &["/no/such/program"], "/");
     assert_eq!(
         init.receive().0,
-        Reply::Failed {
+        InitReply::Failed {
             id: 1,
             errno: libc::ENOENT,
-            stage: Stage::Execute
+            stage: StartStage::Execute
         }
     );
     init.run(2, &["/bin/sh"], "/no/such/directory");
     assert_eq!(
         init.receive().0,
-        Reply::Failed {
+        InitReply::Failed {
             id: 2,
             errno: libc::ENOENT,
-            stage: Stage::Directory
+            stage: StartStage::Directory
         }
     );
     socket::send(init.fd(), b"nonsense", &[]).unwrap();
     init.shell(3, "exit 0");
-    assert_eq!(init.exited(init.started(3)), 0, "nonsense is passed over");
+    assert_eq!(
+        init.expect_exit(init.expect_started(3)),
+        0,
+        "nonsense is passed over"
+    );
 }
 
 #[test]
 fn programs_begin_with_ordinary_signals_and_a_session_of_their_own() {
     let init = Init::start();
-    // Our own process ignores SIGPIPE, as every Rust program does.
+    // The test process ignores SIGPIPE, as every Rust program does.
     init.shell(1, "kill -PIPE $$; exit 0");
-    let pid = init.started(1);
-    assert_eq!(init.exited(pid), libc::SIGPIPE);
+    let pid = init.expect_started(1);
+    assert_eq!(init.expect_exit(pid), libc::SIGPIPE);
     let mut printed = init.shell(2, "trap '' INT; sleep 60 & echo up; wait");
-    let pid = init.started(2);
-    // Its child must be there before the group is killed.
+    let pid = init.expect_started(2);
+    // The script's child must exist before the group is killed.
     let mut line = [0; 3];
     printed.read_exact(&mut line).unwrap();
     socket::send(
         init.fd(),
-        &Request::signal(pid, libc::SIGKILL, Scope::Group),
+        &InitRequest::encode_signal(pid, libc::SIGKILL, Scope::Group),
         &[],
     )
     .unwrap();
-    assert_eq!(init.exited(pid) & 0x7f, libc::SIGKILL);
+    assert_eq!(init.expect_exit(pid) & 0x7f, libc::SIGKILL);
     let orphan = init.receive().0;
     assert!(
         matches!(
             orphan,
-            Reply::Exited {
+            InitReply::Exited {
                 status: libc::SIGKILL,
                 ..
             }
@@ -190,11 +197,11 @@ fn programs_begin_with_ordinary_signals_and_a_session_of_their_own() {
 fn orphans_are_reaped_and_told() {
     let init = Init::start();
     init.shell(1, "(sleep 0.1; exit 7) & exit 0");
-    let pid = init.started(1);
-    assert_eq!(init.exited(pid), 0);
+    let pid = init.expect_started(1);
+    assert_eq!(init.expect_exit(pid), 0);
     assert!(matches!(
         init.receive().0,
-        Reply::Exited { status: 0x700, .. }
+        InitReply::Exited { status: 0x700, .. }
     ));
 }
 
@@ -202,7 +209,7 @@ fn orphans_are_reaped_and_told() {
 fn when_the_socket_closes_everything_ends() {
     let mut init = Init::start();
     let mut printed = init.shell(1, "trap '' INT TERM HUP; setsid sleep 600 & sleep 600");
-    init.started(1);
+    init.expect_started(1);
     init.socket = None;
     assert!(init.process.wait().unwrap().success());
     let mut text = String::new();

@@ -1,19 +1,20 @@
-//! The difference between two clocks, measured as NTP does (RFC 5905, section 8): of the last samples the one with
-//! the shortest round trip is believed.
+//! Clock offset estimation as in NTP (RFC 5905, section 8): among the most recent samples, the one with the shortest
+//! round trip is used.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Samples believed in.
+/// Number of samples kept.
 const SAMPLES: usize = 16;
 
-/// Exchanges disagree when they differ by more than their ways allow, and what clocks drift meanwhile: 5 ms.
+/// Clock drift tolerated between two samples, in nanoseconds (5 ms). Samples whose offsets differ by more than this
+/// plus half of both round trips contradict each other.
 const DRIFT: i64 = 5_000_000;
 
 static SHIFT: AtomicI64 = AtomicI64::new(0);
 
-/// Nanoseconds since 1970.
+/// Returns the current time in nanoseconds since the Unix epoch.
 pub fn now() -> i64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     let now = since.map_or(0, |since| {
@@ -22,22 +23,23 @@ pub fn now() -> i64 {
     now.saturating_add(SHIFT.load(Ordering::Relaxed))
 }
 
-/// Makes this process's clock differ from the machine's by so many nanoseconds: for tests that have one machine only.
-pub fn shift(nanoseconds: i64) {
+/// Shifts this process's clock by the given number of nanoseconds. For tests in which both ends run on one machine.
+pub fn shift_clock(nanoseconds: i64) {
     SHIFT.store(nanoseconds, Ordering::Relaxed);
 }
 
-/// One exchange.
+/// The result of one ping and its pong.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Sample {
-    /// What must be added to our clock to have the peer's, in nanoseconds.
+pub struct ClockSample {
+    /// Nanoseconds to add to the local clock to obtain the peer's clock.
     pub offset: i64,
-    /// Time on the way, both ways together, in nanoseconds: the offset is right within half of it.
+    /// Round-trip time on the network in nanoseconds; the offset is accurate to half of it.
     pub delay: i64,
 }
 
-impl Sample {
-    /// From when a ping was sent and its pong came (our clock) and when the ping arrived and the pong left (the peer's).
+impl ClockSample {
+    /// Computes a sample from the times at which the ping was sent and its pong received (local clock) and the ping was
+    /// received and the pong sent (peer's clock).
     pub fn new(sent: i64, arrived: i64, left: i64, came: i64) -> Self {
         let there = arrived.saturating_sub(sent);
         let back = left.saturating_sub(came);
@@ -48,20 +50,20 @@ impl Sample {
     }
 }
 
-/// What is known of the peer's clock.
+/// The recent samples of the peer's clock.
 #[derive(Debug, Clone, Default)]
-pub struct Clock {
-    samples: VecDeque<Sample>,
+pub struct ClockFilter {
+    samples: VecDeque<ClockSample>,
 }
 
-impl Clock {
-    /// Takes in one exchange.
-    pub fn add(&mut self, sample: Sample) {
-        let disagree = |best: Sample| {
+impl ClockFilter {
+    /// Adds a sample.
+    pub fn add(&mut self, sample: ClockSample) {
+        let disagree = |best: ClockSample| {
             let apart = sample.offset.saturating_sub(best.offset).saturating_abs();
             apart > sample.delay / 2 + best.delay / 2 + DRIFT
         };
-        // One of the clocks was set.
+        // One of the clocks was stepped.
         if self.best().is_some_and(disagree) {
             self.samples.clear();
         }
@@ -71,15 +73,15 @@ impl Clock {
         self.samples.push_back(sample);
     }
 
-    /// The sample that is believed; none before the first pong.
-    pub fn best(&self) -> Option<Sample> {
+    /// Returns the sample with the shortest round trip, or `None` before the first pong.
+    pub fn best(&self) -> Option<ClockSample> {
         self.samples
             .iter()
             .min_by_key(|sample| sample.delay)
             .copied()
     }
 
-    /// The last round trip, in nanoseconds.
+    /// Returns the most recent round-trip time in nanoseconds.
     pub fn last_delay(&self) -> Option<i64> {
         self.samples.back().map(|sample| sample.delay)
     }
@@ -92,23 +94,23 @@ mod tests {
     const MS: i64 = 1_000_000;
 
     #[test]
-    fn the_quickest_exchange_tells_the_offset() {
-        let mut clock = Clock::default();
-        // The peer is 250 ms ahead; 3 ms each way.
-        clock.add(Sample::new(0, 253 * MS, 254 * MS, 7 * MS));
+    fn the_exchange_with_the_shortest_round_trip_determines_the_offset() {
+        let mut clock = ClockFilter::default();
+        // The peer is 250 ms ahead, with a delay of 3 ms each way.
+        clock.add(ClockSample::new(0, 253 * MS, 254 * MS, 7 * MS));
         assert_eq!(
             clock.best(),
-            Some(Sample {
+            Some(ClockSample {
                 offset: 250 * MS,
                 delay: 6 * MS
             })
         );
-        // A slow way there spoils a sample, and nobody believes it.
-        clock.add(Sample::new(100 * MS, 450 * MS, 450 * MS, 203 * MS));
+        // A slow forward path spoils a sample, which is then not used.
+        clock.add(ClockSample::new(100 * MS, 450 * MS, 450 * MS, 203 * MS));
         assert_eq!(clock.best().unwrap().offset, 250 * MS);
         assert_eq!(clock.last_delay(), Some(103 * MS));
         for _ in 0..SAMPLES {
-            clock.add(Sample {
+            clock.add(ClockSample {
                 offset: 1,
                 delay: 1000 * MS,
             });
@@ -117,9 +119,9 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_was_set_is_believed_at_once() {
-        let mut clock = Clock::default();
-        let sample = |offset, delay| Sample { offset, delay };
+    fn a_stepped_clock_is_accepted_at_once() {
+        let mut clock = ClockFilter::default();
+        let sample = |offset, delay| ClockSample { offset, delay };
         clock.add(sample(0, MS));
         clock.add(sample(20 * MS, 40 * MS));
         assert_eq!(clock.best().unwrap().offset, 0, "they agree");

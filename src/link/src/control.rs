@@ -1,7 +1,9 @@
-//! What the two ends tell each other beside messages and calls: JSON, since it is seldom and will grow. Fields unknown
-//! to a reader are ignored, those absent have a default, so a minor addition needs no new version.
+//! Messages that the two ends exchange besides topic messages and calls. They are encoded as JSON because they are rare
+//! and the schema will grow. Readers ignore unknown fields and use defaults for absent ones, so that a field can be
+//! added without a new protocol version.
 //!
-//! Lists are read up to a number of entries, since one of many small ones takes much more memory than its text.
+//! Lists have a limit on the number of entries, because a list of many small entries takes much more memory than its
+//! JSON text.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,54 +11,54 @@ use ros::bus::{NodeNames, ParamValue};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use crate::drops::Drop;
-use crate::{Limits, MAX_CONTROL, MAX_FRAME, bounded};
+use crate::drops::TopicDropCount;
+use crate::{LinkLimits, MAX_CONTROL, MAX_FRAME, bounded};
 
-/// The robot's first frame on every connection.
+/// The first frame that the robot sends on every connection.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Hello {
-    /// The stub's own version, for logs.
+    /// Version of the stub, for logs.
     pub version: String,
-    /// Which ROS the robot's is; 0, as earlier stubs say, means 1.
+    /// ROS version of the robot. Earlier stubs send 0, which means ROS 1.
     pub ros: u8,
-    /// Made up when the stub's process began: names this life of the node.
+    /// Random identifier created when the stub's process started; identifies this run of the node.
     pub run: String,
-    /// Counts the connections that this life has tried: one that was overtaken on its way does not displace a later
-    /// one. 0: they are not counted.
+    /// Number of connections that this run has attempted, so that a hello that arrives late does not displace a later
+    /// connection. 0: attempts are not counted.
     pub attempt: u64,
-    /// The robot's machine since it was started, so that two robots under one id can be told apart.
+    /// Identifier of the robot's machine and its current boot, to tell apart two robots that use the same id.
     pub machine: String,
-    /// The machine's host name, for messages.
+    /// Host name of the machine, for messages.
     pub host: String,
-    /// The id of the life of the machine's ROS Master: several machines with one Master are one robot.
+    /// Identifier of the running ROS Master. Machines that share a Master are one robot.
     pub roscore: String,
-    /// The session to go on with.
+    /// The session to resume.
     pub resume: Option<Resume>,
-    /// The first number that the robot will use on this connection.
+    /// The first record number that the robot will use on this connection.
     pub next: u64,
-    /// The node to run; only its name is looked at in a resumed session.
-    pub node: Node,
-    /// What the robot's application promises itself.
-    pub sla: Sla,
-    /// Codecs that the robot decodes; none: messages come as they are.
+    /// The node to run. Only its name is used when a session is resumed.
+    pub node: NodeLaunch,
+    /// Service-level agreement requested by the robot's application.
+    pub sla: SlaTargets,
+    /// Codecs that the robot can decode; if empty, messages are sent uncompressed.
     #[serde(deserialize_with = "bounded::list::<_, _, 256>")]
     pub codecs: Vec<String>,
-    /// Quality of JPEG pictures, 1 to 100; 80 where absent.
+    /// Quality of JPEG images, 1 to 100 (default: 80).
     pub quality: Option<u8>,
-    /// Stamps stay as they are, whatever the clocks say.
+    /// Leave time stamps unchanged even if the clocks differ.
     pub keep_stamps: bool,
-    /// The robot answers a `Lookup`.
+    /// The robot answers `Lookup` requests.
     pub lends: bool,
-    /// What the robot takes of the cloud; absent: what all earlier releases take.
-    pub limits: Limits,
-    /// All parameters of the robot, as a tree of values.
+    /// Limits on what the robot accepts from the cloud; if absent, those of all earlier releases.
+    pub limits: LinkLimits,
+    /// All parameters of the robot as a tree.
     #[serde(with = "crate::values::tree")]
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
 impl Hello {
-    /// Bytes of its texts and lists, without the parameters.
+    /// Returns the size in bytes of all texts and lists except the parameters.
     pub fn own_bytes(&self) -> usize {
         let node = &self.node;
         let texts = [
@@ -81,215 +83,216 @@ impl Hello {
     }
 }
 
-/// What the robot has of an earlier connection.
+/// Receive state of the robot in an earlier session.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Resume {
-    /// As the welcome named it.
+    /// Session id from the welcome.
     pub session: String,
-    /// All numbers up to this one have come.
+    /// All record numbers up to and including this one have been received.
     pub received: u64,
-    /// Numbers above that which have come, too.
+    /// Received record numbers beyond that.
     #[serde(deserialize_with = "bounded::list::<_, _, 65536>")]
     pub ahead: Vec<u64>,
 }
 
-/// A node as roslaunch starts it.
+/// A node to run, described as roslaunch does.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Node {
-    /// Absolute name, as it is on the robot.
+pub struct NodeLaunch {
+    /// Absolute name of the node on the robot.
     pub name: String,
-    /// The package.
+    /// ROS package.
     pub package: String,
-    /// The executable below its libexec directory.
+    /// Executable below the package's libexec directory.
     pub executable: String,
-    /// Arguments, remaps and private parameters; nothing that begins with `__` in ROS 1.
+    /// Arguments, remappings and private parameters. In ROS 1 there is nothing that begins with `__`.
     #[serde(deserialize_with = "bounded::list::<_, _, 4096>")]
     pub argv: Vec<String>,
-    /// All that the robot calls the program's nodes stands in `argv`; `name` is what the first of them is called then. Else all of them are called so, as
-    /// by earlier stubs of ROS 2 and in ROS 1, where it is one.
+    /// Set if `argv` contains all node names that the robot assigns; then `name` is the resulting name of the first
+    /// node. Otherwise all nodes of the program get `name`, as with earlier ROS 2 stubs and in ROS 1, where there is
+    /// one node.
     pub named_by_argv: bool,
-    /// ROS_NAMESPACE.
+    /// Value of ROS_NAMESPACE.
     pub namespace: String,
-    /// The stub's share directory: paths into it mean the same files of the package in the cloud.
+    /// Share directory of the stub's package. Paths below it refer to the same files of the package in the cloud.
     pub share: String,
-    /// Where it was started: its working directory on the robot.
+    /// Working directory of the node on the robot.
     pub directory: String,
-    /// The service's revision that the stub was made of.
+    /// Revision of the service from which the stub was generated.
     pub revision: Option<u64>,
-    /// The digest of the revision's image, since another server counts revisions otherwise.
+    /// Digest of the revision's image, because revision numbers of different servers differ.
     pub image: String,
 }
 
-/// Response times and the like, in seconds.
+/// Service-level objectives; times in seconds.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Sla {
-    /// T_desire.
+pub struct SlaTargets {
+    /// T_desire, the desired response time.
     pub desire: Option<f64>,
-    /// T_max.
+    /// T_max, the maximum acceptable response time.
     pub max: Option<f64>,
-    /// Least rate of an output.
+    /// Minimum rate of an output, in messages per second.
     pub frames_per_second: Option<f64>,
-    /// The rate that is wished for.
+    /// Desired rate of an output, in messages per second.
     pub desired_frames_per_second: Option<f64>,
-    /// Greatest age of an output.
+    /// Maximum age of an output.
     pub age: Option<f64>,
-    /// The age that is wished for.
+    /// Desired age of an output.
     pub desired_age: Option<f64>,
-    /// Q_t, which has no unit.
+    /// Satisfaction threshold Q_t (dimensionless).
     pub threshold: Option<f64>,
-    /// Nothing is promised: the local original stands in so long after the link was lost.
+    /// Best effort: the local original takes over this long after the link was lost.
     pub fallback_after: Option<f64>,
 }
 
-/// The cloud's first frame on every connection.
+/// The first frame that the cloud sends on every connection.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Welcome {
-    /// The session goes on, or has begun.
+    /// The session has started or was resumed.
     Accepted {
-        /// Names it.
+        /// Session id.
         session: String,
-        /// It goes on: what the robot has not acknowledged is sent again.
+        /// The session was resumed: records that the robot has not acknowledged are sent again.
         resumed: bool,
-        /// What the cloud has of the robot's numbers.
+        /// All record numbers of the robot up to and including this one have been received.
         received: u64,
-        /// Numbers above that which it has, too.
+        /// Received record numbers beyond that.
         #[serde(deserialize_with = "bounded::list::<_, _, 65_536>")]
         ahead: Vec<u64>,
-        /// The first number that the cloud will use on this connection.
+        /// The first record number that the cloud will use on this connection.
         next: u64,
-        /// Codecs that the cloud decodes.
+        /// Codecs that the cloud can decode.
         #[serde(default, deserialize_with = "bounded::list::<_, _, 256>")]
         codecs: Vec<String>,
-        /// What the cloud takes of the robot; absent: what all earlier releases take.
+        /// Limits on what the cloud accepts from the robot; if absent, those of all earlier releases.
         #[serde(default)]
-        limits: Limits,
-        /// The servant, for logs.
+        limits: LinkLimits,
+        /// Id of the servant, for logs.
         servant: String,
     },
-    /// There will be no session.
+    /// The connection is refused.
     Refused {
-        /// The reason, and what to do.
+        /// Reason and remedy.
         reason: String,
-        /// Trying again may help.
+        /// Retrying may succeed.
         again: bool,
     },
 }
 
-/// What a robot tells the cloud.
+/// Control messages from the robot to the cloud.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FromRobot {
-    /// A topic's publisher whose messages come as this channel.
-    Open(Input),
-    /// That publisher is gone.
+    /// A publisher on the robot whose messages will be sent on this channel.
+    Open(InputChannel),
+    /// The publisher is gone.
     Close {
-        /// The channel's number.
+        /// Channel number.
         channel: u32,
     },
-    /// So many listen to an output now.
+    /// Number of subscribers of an output changed.
     Listeners {
-        /// The channel's number.
+        /// Channel number.
         channel: u32,
-        /// How many nodes of the robot, other nodes of this servant not counted.
+        /// Number of subscribing nodes on the robot, not counting other nodes of this servant.
         count: usize,
     },
-    /// Parameters that changed; without a value: was deleted.
+    /// Changed parameters; those without a value were deleted.
     Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),
-    /// Send the node this signal.
+    /// Sends a signal to the node.
     Signal {
-        /// Its number.
+        /// Signal number.
         signal: i32,
     },
-    /// How a request went, for the cloud's statistics.
-    Requests(#[serde(deserialize_with = "bounded::list::<_, _, 4096>")] Vec<Request>),
-    /// What it has under that name. Control as an answer, and when what was there is gone.
+    /// Timing of requests, for the cloud's statistics.
+    Requests(#[serde(deserialize_with = "bounded::list::<_, _, 4096>")] Vec<RequestTiming>),
+    /// State of a service on the robot. Sent as the reply to a lookup, and when the service is gone.
     Lent {
-        /// The name.
+        /// Name of the service.
         service: String,
-        /// The service, unless there is none; the number of its channel is chosen by the robot, and never used again.
-        of: Option<Served>,
+        /// The service, or `None` if there is none. The robot chooses the channel number and never reuses it.
+        of: Option<ServiceChannel>,
     },
-    /// All messages that were dropped on its side so far.
-    Dropped(#[serde(deserialize_with = "bounded::list::<_, _, 10000>")] Vec<Drop>),
-    /// Messages of this session that it has not sent, so far.
+    /// All messages dropped on the robot's side so far.
+    Dropped(#[serde(deserialize_with = "bounded::list::<_, _, 10000>")] Vec<TopicDropCount>),
+    /// Messages of this session that the robot has not sent so far.
     Unsent {
-        /// Messages that a newer one replaced.
+        /// Number of messages replaced by a newer one.
         replaced: u64,
-        /// Messages that had become too old.
+        /// Number of messages that had become too old.
         stale: u64,
     },
-    /// What was decided about the local original, for the cloud's events, oldest first.
+    /// Decisions about the local original for the cloud's event log, oldest first.
     Decided(#[serde(deserialize_with = "bounded::list::<_, _, 1024>")] Vec<Decision>),
-    /// All ends on the robot with which no messages pass now.
-    Refused(#[serde(deserialize_with = "bounded::list::<_, _, 1024>")] Vec<Refused>),
+    /// All endpoints on the robot that are currently incompatible.
+    Refused(#[serde(deserialize_with = "bounded::list::<_, _, 1024>")] Vec<IncompatibleEndpoint>),
 }
 
-/// What the cloud tells a robot.
+/// Control messages from the cloud to the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum FromCloud {
-    /// Parameters that changed; without a value: was deleted.
+    /// Changed parameters; those without a value were deleted.
     Parameters(#[serde(with = "crate::values::changes")] Vec<(String, Option<ParamValue>)>),
-    /// A type that later names refer to.
+    /// Definition of a type that later messages refer to by name.
     Type {
-        /// `package/Type`.
+        /// Type name, `package/Type`.
         name: String,
-        /// Its hash.
+        /// Hash of the type.
         md5: String,
-        /// With all it contains.
+        /// Definition including all nested types.
         definition: String,
     },
-    /// All that the node has registered now.
+    /// Complete current ROS graph of the node.
     Graph(Graph),
-    /// The node has ended.
+    /// The node has exited.
     Exited(Exit),
-    /// Something that belongs into the robot's log.
+    /// A message for the robot's log.
     Notice {
-        /// It needs attention.
+        /// The message needs attention and is logged as a warning.
         warning: bool,
-        /// In words.
+        /// Text of the message.
         text: String,
     },
-    /// A line that the node printed.
+    /// A line printed by the node.
     Line {
-        /// On standard error.
+        /// The line was printed on standard error.
         error: bool,
-        /// Without its end.
+        /// The line without its line break.
         text: String,
     },
-    /// A node looks for a service that nobody in the servant serves.
+    /// A node is looking for a service that has no server in the servant.
     Lookup {
-        /// Its name.
+        /// Name of the service.
         service: String,
     },
 }
 
-/// What the sessions of both ends tell each other.
+/// Control messages between the sessions of both ends.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Between {
-    /// A frame of a channel was lost that later ones refer to.
+pub(crate) enum SessionMessage {
+    /// Requests a key frame because a frame that later frames depend on was lost.
     Keyframe {
-        /// The channel's number.
+        /// Channel number.
         channel: u32,
     },
 }
 
-/// A control record.
+/// A parsed control record.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Control<O> {
-    /// For whoever uses the session.
+    /// A message for the user of the session.
     Order(O),
-    /// For the session itself.
-    Between(Between),
+    /// A message for the session itself.
+    Between(SessionMessage),
 }
 
-/// Bytes of a control record, at most: of parameters, which may be long texts, and of anything else.
-pub(crate) fn longest(json: &[u8]) -> usize {
+/// Returns the maximum size in bytes of a control record. Parameters may contain long texts, so their limit is higher.
+pub(crate) fn max_control_length(json: &[u8]) -> usize {
     if json.starts_with(b"{\"parameters\"") {
         return MAX_FRAME;
     }
@@ -297,9 +300,9 @@ pub(crate) fn longest(json: &[u8]) -> usize {
 }
 
 impl<O: DeserializeOwned> Control<O> {
-    /// Reads a control record of an end that gives orders `O`.
+    /// Parses a control record from a peer that sends messages of type `O`.
     pub(crate) fn read(json: &[u8]) -> serde_json::Result<Self> {
-        // What is told begins with its name, so an order is known for none of these at once.
+        // The name comes first in the JSON, so a message of another type is detected immediately.
         match serde_json::from_slice(json) {
             Ok(between) => Ok(Self::Between(between)),
             Err(_) => serde_json::from_slice(json).map(Self::Order),
@@ -307,23 +310,23 @@ impl<O: DeserializeOwned> Control<O> {
     }
 }
 
-/// The end of a link that a session is of: which orders it gives.
-pub trait Order: Serialize + DeserializeOwned + Send + Sync + 'static {
-    /// Those that the other end gives.
-    type OfPeer: Order;
+/// The control messages that one end of a session sends.
+pub trait ControlMessage: Serialize + DeserializeOwned + Send + Sync + 'static {
+    /// The control messages that the other end sends.
+    type FromPeer: ControlMessage;
 
-    /// Whether it may be left out where the link does not carry all.
+    /// Returns whether the message may be omitted when the link is congested.
     fn is_line(&self) -> bool {
         false
     }
 }
 
-impl Order for FromRobot {
-    type OfPeer = FromCloud;
+impl ControlMessage for FromRobot {
+    type FromPeer = FromCloud;
 }
 
-impl Order for FromCloud {
-    type OfPeer = FromRobot;
+impl ControlMessage for FromCloud {
+    type FromPeer = FromRobot;
 
     fn is_line(&self) -> bool {
         matches!(self, Self::Line { .. })
@@ -334,125 +337,126 @@ impl Order for FromCloud {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Decision {
-    /// What kind of event it is, such as `local-takes-over`.
+    /// Kind of event, such as `local-takes-over`.
     pub kind: String,
-    /// It needs attention.
+    /// The decision needs attention and is reported as a warning.
     pub warning: bool,
-    /// In words.
+    /// Description of the decision.
     pub text: String,
-    /// So many seconds before it was told: while the link is down it waits.
+    /// Age of the decision in seconds when it was sent; decisions wait while the link is down.
     pub ago: f64,
 }
 
-/// An end of a topic on the robot with which no messages pass, since one of both asks for what the other does not offer.
+/// An endpoint on the robot that exchanges no messages with ours because its QoS is incompatible: one of them requests
+/// what the other does not offer.
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Refused {
-    /// The topic.
+pub struct IncompatibleEndpoint {
+    /// Name of the topic.
     pub topic: String,
-    /// Whose end it is.
+    /// Node of the endpoint.
     pub node: String,
-    /// In what both differ, and what both say.
+    /// The incompatible policies, with both values.
     pub why: String,
 }
 
-impl Refused {
-    /// Told at most.
+impl IncompatibleEndpoint {
+    /// Maximum number of endpoints reported.
     pub const MOST: usize = 64;
 }
 
-/// How the node ended.
+/// Exit status of the node.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Exit {
-    /// Exit code, when it exited.
+    /// Exit code, if the node exited.
     pub code: Option<i32>,
-    /// Signal number, when it was killed.
+    /// Signal number, if the node was killed.
     pub signal: Option<i32>,
-    /// In words.
+    /// Description of how the node ended.
     pub text: String,
 }
 
-/// A publisher of the robot that the node listens to.
+/// A publisher on the robot to which the node subscribes.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Input {
-    /// Number of the channel, chosen by the robot.
+pub struct InputChannel {
+    /// Channel number, chosen by the robot.
     pub channel: u32,
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Type name, `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its hash.
+    /// Hash of the type.
     pub md5: String,
-    /// With all it contains.
+    /// Definition including all nested types.
     pub definition: String,
-    /// Newcomers get the last message.
+    /// New subscribers receive the last message.
     pub latching: bool,
-    /// What the publisher offers beside that; none where nobody says it (ROS 1).
+    /// QoS offered by the publisher; `None` in ROS 1.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub qos: Option<Qos>,
+    pub qos: Option<WireQos>,
 }
 
-/// Quality of service of an end of a topic, as far as ends must agree on it. Times in seconds.
+/// The QoS policies of an endpoint on which publisher and subscriber must agree. Times in seconds.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Qos {
-    /// Messages may be lost on the way.
+pub struct WireQos {
+    /// Best-effort reliability: messages may be lost.
     pub best_effort: bool,
-    /// Newcomers get the last messages.
+    /// Transient-local durability: new subscribers receive the last messages.
     pub transient_local: bool,
-    /// Messages kept; 0: as it is usual.
+    /// History depth; 0: default.
     pub depth: usize,
-    /// The longest time between two messages.
+    /// Maximum time between two messages.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline: Option<f64>,
-    /// After so long a message is of no use.
+    /// Time after which a message is stale.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lifespan: Option<f64>,
-    /// The publisher itself says that it is alive, not only its node.
+    /// Liveliness is asserted by the publisher itself, not only by its node.
     pub manual_liveliness: bool,
-    /// Within which time that is said.
+    /// Liveliness lease duration.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease: Option<f64>,
 }
 
-/// What a node has registered.
+/// The topics and services that a node has registered.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Graph {
-    /// What it publishes.
+    /// Topics that the node publishes.
     #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
-    pub outputs: Vec<Output>,
-    /// What it subscribes to.
+    pub outputs: Vec<OutputChannel>,
+    /// Topics that the node subscribes to.
     #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
-    pub inputs: Vec<Wanted>,
-    /// What it serves.
+    pub inputs: Vec<RequestedInput>,
+    /// Services that the node provides.
     #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
-    pub services: Vec<Served>,
-    /// Other nodes of the same servant: what they publish on the robot is not sent up again.
+    pub services: Vec<ServiceChannel>,
+    /// Other nodes of the same servant. What they publish on the robot is not sent to the cloud again.
     #[serde(deserialize_with = "bounded::list::<_, _, 10000>")]
     pub siblings: Vec<String>,
-    /// Which of all this is whose, by the nodes' names, where the program is several nodes (ROS 2). Stubs that do not know it have it all for their
-    /// own node.
+    /// Ownership of the above by node name, if the program consists of several nodes (ROS 2). Stubs that do not know
+    /// this field attribute everything to their own node.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub nodes: BTreeMap<String, Has>,
+    pub nodes: BTreeMap<String, NodeEndpoints>,
 }
 
-/// What one of several nodes has, by name.
+/// Names of what one of several nodes owns.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Has {
-    /// What it publishes.
+pub struct NodeEndpoints {
+    /// Topics that it publishes.
     pub outputs: BTreeSet<String>,
-    /// What it subscribes to.
+    /// Topics that it subscribes to.
     pub inputs: BTreeSet<String>,
-    /// What it serves.
+    /// Services that it provides.
     pub services: BTreeSet<String>,
 }
 
-impl From<NodeNames> for Has {
+impl From<NodeNames> for NodeEndpoints {
     fn from(names: NodeNames) -> Self {
         Self {
             outputs: names.publishes,
@@ -462,8 +466,8 @@ impl From<NodeNames> for Has {
     }
 }
 
-impl From<Has> for NodeNames {
-    fn from(has: Has) -> Self {
+impl From<NodeEndpoints> for NodeNames {
+    fn from(has: NodeEndpoints) -> Self {
         Self {
             publishes: has.outputs,
             subscribes: has.inputs,
@@ -472,56 +476,56 @@ impl From<Has> for NodeNames {
     }
 }
 
-/// An output.
+/// A topic that the node publishes.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Output {
-    /// Number of its channel, chosen by the cloud.
+pub struct OutputChannel {
+    /// Channel number, chosen by the cloud.
     pub channel: u32,
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`, as a `Type` before said.
+    /// Type name, `package/Type`; a preceding `Type` message contains the definition.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its hash.
+    /// Hash of the type.
     pub md5: String,
-    /// What the node offers; none where nobody says it (ROS 1).
+    /// QoS offered by the node; `None` in ROS 1.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub qos: Option<Qos>,
+    pub qos: Option<WireQos>,
 }
 
-/// An input.
+/// A topic that the node subscribes to.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Wanted {
-    /// The topic.
+pub struct RequestedInput {
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`, or `*`.
+    /// Type name, `package/Type`, or `*` for any type.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its hash, or `*`.
+    /// Hash of the type, or `*`.
     pub md5: String,
-    /// This robot's node is the one that sends it; else another node of the servant does.
+    /// Set if this node's link sends the messages; otherwise the link of another node of the servant does.
     pub feed: bool,
-    /// What the node asks for; none where nobody says it (ROS 1).
+    /// QoS requested by the node; `None` in ROS 1.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub qos: Option<Qos>,
+    pub qos: Option<WireQos>,
 }
 
 /// A service.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Served {
-    /// Number of its channel, chosen by the end that tells of it.
+pub struct ServiceChannel {
+    /// Channel number, chosen by the end that announces the service.
     pub channel: u32,
-    /// The service.
+    /// Name of the service.
     pub name: String,
-    /// `package/Type`.
+    /// Type name, `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its hash.
+    /// Hash of the type.
     pub md5: String,
-    /// The hashes of its requests and responses, where ends tell those of each other (ROS 2); else empty.
+    /// Hashes of the request and response types where ROS exposes them (ROS 2), otherwise empty.
     #[serde(
         skip_serializing_if = "Vec::is_empty",
         deserialize_with = "bounded::list::<_, _, 16>"
@@ -529,29 +533,29 @@ pub struct Served {
     pub halves: Vec<String>,
 }
 
-/// One request's way, times in milliseconds.
+/// Timing of one request; times in milliseconds.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Request {
-    /// Counts the robot's requests; told again, it is the same one.
+pub struct RequestTiming {
+    /// Sequence number of the robot's request. An entry with the same number updates the earlier one.
     pub id: u64,
-    /// The input, service or action.
+    /// Name of the input topic, service or action.
     pub name: String,
-    /// From asked to answered; none when the cloud did not answer.
+    /// Time from request to response; `None` if the cloud did not answer.
     pub total: Option<f64>,
-    /// Encoding.
+    /// Encoding time.
     pub serialise: f64,
-    /// On the way up.
+    /// Uplink time.
     pub up: f64,
-    /// Waiting: on both sides, and for the node to be done with what came before.
+    /// Queueing time on both sides, including the time until the node had finished its earlier inputs.
     pub queue: f64,
-    /// In the node.
+    /// Computing time in the node.
     pub compute: f64,
-    /// On the way down.
+    /// Downlink time.
     pub down: f64,
-    /// The local original's answer was taken.
+    /// The answer of the local original was used.
     pub local: bool,
-    /// The satisfaction after it.
+    /// Satisfaction after this request.
     pub satisfaction: f64,
 }
 
@@ -559,9 +563,9 @@ pub struct Request {
 mod tests {
     use super::*;
 
-    /// What stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    /// Messages as sent by deployed stubs. If this test fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
-    fn what_earlier_stubs_say_is_understood() {
+    fn messages_of_earlier_stubs_are_parsed() {
         assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
         let hello = r#"{"version":"0.1.0","run":"r","machine":"m","resume":{"session":"s","received":4,"ahead":[6]},
             "next":5,"node":{"name":"/n","package":"p","executable":"e","argv":["a:=b"],"namespace":"/","share":"/s",
@@ -570,7 +574,7 @@ mod tests {
         let hello: Hello = serde_json::from_str(hello).unwrap();
         assert_eq!((hello.run.as_str(), hello.machine.as_str()), ("r", "m"));
         assert_eq!((hello.next, hello.attempt), (5, 0));
-        let earlier = Limits {
+        let earlier = LinkLimits {
             record: 256 << 20,
             under_way: 256,
             under_way_bytes: 320 << 20,
@@ -602,7 +606,7 @@ mod tests {
                 "local":true,"satisfaction":2.5}]}"#,
             r#"{"dropped":[{"topic":"/t","cause":"cut_off","count":3}]}"#,
         ] {
-            says_the_same::<FromRobot>(told);
+            assert_round_trips::<FromRobot>(told);
         }
         for told in [
             r#"{"parameters":[["/a",1],["/b",null]]}"#,
@@ -615,21 +619,21 @@ mod tests {
             r#"{"notice":{"warning":true,"text":"t"}}"#,
             r#"{"line":{"error":false,"text":"t"}}"#,
         ] {
-            says_the_same::<FromCloud>(told);
+            assert_round_trips::<FromCloud>(told);
         }
-        says_the_same::<Between>(r#"{"keyframe":{"channel":1}}"#);
+        assert_round_trips::<SessionMessage>(r#"{"keyframe":{"channel":1}}"#);
     }
 
-    /// An order that is read and written again says the same: nothing was left out for want of understanding.
-    fn says_the_same<O: Serialize + DeserializeOwned>(told: &str) {
+    /// Asserts that parsing and serializing a message preserves every field.
+    fn assert_round_trips<O: Serialize + DeserializeOwned>(told: &str) {
         let order: O = serde_json::from_str(told).expect(told);
         let again = serde_json::to_value(&order).unwrap();
         let told: serde_json::Value = serde_json::from_str(told).unwrap();
-        assert_eq!(covers(&again, &told), None, "{again} {told}");
+        assert_eq!(find_missing(&again, &told), None, "{again} {told}");
     }
 
     #[test]
-    fn an_order_of_the_wrong_way_is_none() {
+    fn a_control_message_of_the_other_direction_is_rejected() {
         let order = serde_json::to_string(&FromRobot::Signal { signal: 9 }).unwrap();
         assert!(serde_json::from_str::<FromCloud>(&order).is_err());
         let order = r#"{"line":{"error":false,"text":"t"}}"#;
@@ -637,12 +641,18 @@ mod tests {
     }
 
     #[test]
-    fn what_is_meant_for_the_session_is_told_from_orders() {
+    fn session_messages_are_distinguished_from_control_messages() {
         let asked = Control::<FromRobot>::read(br#"{"keyframe":{"channel":7}}"#).unwrap();
-        assert_eq!(asked, Control::Between(Between::Keyframe { channel: 7 }));
-        // However it is written.
+        assert_eq!(
+            asked,
+            Control::Between(SessionMessage::Keyframe { channel: 7 })
+        );
+        // Whitespace does not matter.
         let asked = Control::<FromCloud>::read(b" { \"keyframe\" : { \"channel\" : 7 } }").unwrap();
-        assert_eq!(asked, Control::Between(Between::Keyframe { channel: 7 }));
+        assert_eq!(
+            asked,
+            Control::Between(SessionMessage::Keyframe { channel: 7 })
+        );
         let order = Control::read(br#"{"signal":{"signal":9}}"#).unwrap();
         assert_eq!(order, Control::Order(FromRobot::Signal { signal: 9 }));
         for unknown in [r#"{"keyframe":{}}"#, r#"{"later":{}}"#, "{", ""] {
@@ -653,21 +663,21 @@ mod tests {
         }
     }
 
-    /// Where `whole` lacks something of `part`.
-    fn covers(whole: &serde_json::Value, part: &serde_json::Value) -> Option<String> {
+    /// Returns the first place where `whole` lacks something that `part` contains.
+    fn find_missing(whole: &serde_json::Value, part: &serde_json::Value) -> Option<String> {
         use serde_json::Value;
         match (whole, part) {
             (Value::Object(whole), Value::Object(part)) => part.iter().find_map(|(key, value)| {
                 let Some(found) = whole.get(key) else {
                     return Some(key.clone());
                 };
-                covers(found, value)
+                find_missing(found, value)
             }),
             (Value::Array(whole), Value::Array(part)) if whole.len() == part.len() => {
                 let pairs = whole.iter().zip(part);
                 pairs
                     .into_iter()
-                    .find_map(|(whole, part)| covers(whole, part))
+                    .find_map(|(whole, part)| find_missing(whole, part))
             }
             (Value::Number(whole), Value::Number(part)) => {
                 (whole.as_f64() != part.as_f64()).then(|| part.to_string())

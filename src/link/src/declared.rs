@@ -1,57 +1,64 @@
-//! Types and qualities of service between a bus and what links tell of them.
+//! Conversions between the types and QoS profiles of a bus and their representation on the link.
 
 use std::time::Duration;
 
-use ros::bus::{self, Digest, Durability, Liveliness, Reliability, RosVersion, ServiceType};
+use ros::bus::{
+    self, Digest, QosDurability, QosLiveliness, QosReliability, RosVersion, ServiceType,
+};
 
-use crate::control::{Qos, Served};
+use crate::control::{ServiceChannel, WireQos};
 
-impl Qos {
-    /// What is told of this one.
-    pub fn of(qos: &bus::Qos) -> Self {
+impl WireQos {
+    /// Converts a QoS profile of a bus.
+    pub fn from_bus(qos: &bus::QosProfile) -> Self {
         let seconds = |time: Option<Duration>| time.map(|time| time.as_secs_f64());
         Self {
-            best_effort: qos.reliability == Reliability::BestEffort,
+            best_effort: qos.reliability == QosReliability::BestEffort,
             transient_local: qos.is_latching(),
             depth: qos.depth,
             deadline: seconds(qos.deadline),
             lifespan: seconds(qos.lifespan),
-            manual_liveliness: qos.liveliness == Liveliness::ManualByTopic,
+            manual_liveliness: qos.liveliness == QosLiveliness::ManualByTopic,
             lease: seconds(qos.lease),
         }
     }
 
-    /// What it tells of, with a queue of at least `depth` messages. Times that no clock has are left out.
-    pub fn to_qos(&self, depth: usize) -> bus::Qos {
+    /// Converts to a QoS profile of a bus with a history depth of at least `depth`. Times that cannot be represented
+    /// are omitted.
+    pub fn to_bus(&self, depth: usize) -> bus::QosProfile {
         let time = |seconds: Option<f64>| Duration::try_from_secs_f64(seconds?).ok();
-        bus::Qos {
-            reliability: match self.best_effort {
-                true => Reliability::BestEffort,
-                false => Reliability::Reliable,
+        bus::QosProfile {
+            reliability: if self.best_effort {
+                QosReliability::BestEffort
+            } else {
+                QosReliability::Reliable
             },
-            durability: match self.transient_local {
-                true => Durability::TransientLocal,
-                false => Durability::Volatile,
+            durability: if self.transient_local {
+                QosDurability::TransientLocal
+            } else {
+                QosDurability::Volatile
             },
             depth: self.depth.max(depth),
             deadline: time(self.deadline),
             lifespan: time(self.lifespan),
-            liveliness: match self.manual_liveliness {
-                true => Liveliness::ManualByTopic,
-                false => Liveliness::Automatic,
+            liveliness: if self.manual_liveliness {
+                QosLiveliness::ManualByTopic
+            } else {
+                QosLiveliness::Automatic
             },
             lease: time(self.lease),
         }
     }
 }
 
-impl Served {
-    /// A service of this type under this name.
-    pub fn of(channel: u32, name: &str, of: &ServiceType) -> Self {
+impl ServiceChannel {
+    /// Creates the description of a service with this name and type.
+    pub fn new(channel: u32, name: &str, of: &ServiceType) -> Self {
         let told = |digest: &Digest| !digest.is_any();
-        let halves = match told(&of.request) || told(&of.response) {
-            true => vec![of.request.to_string(), of.response.to_string()],
-            false => Vec::new(),
+        let halves = if told(&of.request) || told(&of.response) {
+            vec![of.request.to_string(), of.response.to_string()]
+        } else {
+            Vec::new()
         };
         Self {
             channel,
@@ -62,7 +69,7 @@ impl Served {
         }
     }
 
-    /// The type, as a robot or servant of this ROS has it.
+    /// Returns the service type for the given ROS version.
     pub fn service_type(&self, version: RosVersion) -> ServiceType {
         let half = |at: usize| self.halves.get(at).map_or_else(Digest::any, Digest::from);
         ServiceType {
@@ -70,7 +77,7 @@ impl Served {
             response: half(1),
             ..ServiceType::new(self.type_name.clone(), self.md5.clone())
         }
-        .written_by(version)
+        .with_version(version)
     }
 }
 
@@ -79,24 +86,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_told_of_a_quality_of_service_comes_back() {
-        let qos = bus::Qos {
-            reliability: Reliability::BestEffort,
+    fn a_qos_profile_round_trips() {
+        let qos = bus::QosProfile {
+            reliability: QosReliability::BestEffort,
             deadline: Some(Duration::from_millis(100)),
             lease: Some(Duration::from_secs(2)),
-            liveliness: Liveliness::ManualByTopic,
-            ..bus::Qos::keep_last(5).latching(true)
+            liveliness: QosLiveliness::ManualByTopic,
+            ..bus::QosProfile::keep_last(5).latching(true)
         };
-        let told = serde_json::to_string(&Qos::of(&qos)).unwrap();
-        let read: Qos = serde_json::from_str(&told).unwrap();
-        assert_eq!(read.to_qos(1), qos);
-        assert_eq!(read.to_qos(256).depth, 256);
-        let nonsense = Qos {
+        let told = serde_json::to_string(&WireQos::from_bus(&qos)).unwrap();
+        let read: WireQos = serde_json::from_str(&told).unwrap();
+        assert_eq!(read.to_bus(1), qos);
+        assert_eq!(read.to_bus(256).depth, 256);
+        let nonsense = WireQos {
             lease: Some(-1.0),
             deadline: Some(f64::NAN),
-            ..Qos::default()
+            ..WireQos::default()
         };
-        assert_eq!(nonsense.to_qos(1), bus::Qos::keep_last(1));
+        assert_eq!(nonsense.to_bus(1), bus::QosProfile::keep_last(1));
     }
 
     #[test]
@@ -105,11 +112,11 @@ mod tests {
             request: "RIHS01_1".into(),
             ..ServiceType::new("a/srv/B", "*")
         }
-        .written_by(RosVersion::Two);
-        let served = Served::of(3, "/b", &of);
+        .with_version(RosVersion::Two);
+        let served = ServiceChannel::new(3, "/b", &of);
         assert_eq!(served.service_type(RosVersion::Two), of);
         let of = ServiceType::new("a/B", "d41d8cd98f00b204e9800998ecf8427e");
-        let served = Served::of(3, "/b", &of);
+        let served = ServiceChannel::new(3, "/b", &of);
         assert!(served.halves.is_empty());
         assert_eq!(served.service_type(RosVersion::One), of);
     }

@@ -1,4 +1,4 @@
-//! Messages that were dropped, by topic and cause: bounded queues lose what they must, and none in silence.
+//! Counts of dropped messages by topic and cause: bounded queues drop what they must, but never silently.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,80 +8,80 @@ use parking_lot::Mutex;
 use ros::ring::DropCount;
 use serde::{Deserialize, Serialize};
 
-/// Why a message was dropped.
+/// Reason why a message was dropped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
-    /// Newest wins.
+    /// Replaced by a newer message.
     Replaced,
-    /// Deadline-aware.
+    /// Older than T_max while a newer message was waiting.
     Stale,
-    /// Too big to be kept, and not seen to arrive.
+    /// Too big for the retransmit buffer and in flight when a connection was lost.
     CutOff,
-    /// The queue before the link was full.
+    /// The queue in front of the link was full.
     Busy,
-    /// The queue before a reader was full.
+    /// The queue in front of a subscriber was full.
     Slow,
-    /// More than waits for a node to connect.
+    /// The queue of messages waiting for a node to connect was full.
     Early,
-    /// More than is kept of what counts one by one.
+    /// The queue of messages that must not be replaced was full.
     Full,
-    /// The publisher has left meanwhile.
+    /// The publisher had gone before the message was sent.
     Gone,
-    /// A codec's frame that refers to one that did not come.
+    /// An encoded frame refers to one that was not received.
     Undecodable,
-    /// What a later version tells.
+    /// A cause introduced by a later version.
     #[serde(other)]
     Other,
 }
 
 impl Cause {
-    /// Dropping is what was asked for: newest wins, none older than T_max.
-    pub fn is_meant(self) -> bool {
+    /// Returns whether the drop is intended: newest wins, and nothing is older than T_max.
+    pub fn is_intended(self) -> bool {
         matches!(self, Self::Replaced | Self::Stale)
     }
 
-    fn words(self) -> &'static str {
+    fn description(self) -> &'static str {
         match self {
-            Self::Replaced => "newer ones took their place before the link could carry them",
+            Self::Replaced => "newer ones replaced them before the link could send them",
             Self::Stale => "they were older than T_max and a newer one waited",
-            Self::CutOff => "they were on their way when a connection was lost",
-            Self::Busy => "they came faster than this end of the link takes them",
-            Self::Slow => "whoever listens takes them too slowly",
+            Self::CutOff => "they were in transit when a connection was lost",
+            Self::Busy => "they arrived faster than this end of the link accepts them",
+            Self::Slow => "the subscriber is too slow",
             Self::Early => "the node had not connected to the topic yet",
             Self::Full => {
-                "more latched messages and goals waited for the link than are kept (64 MB)"
+                "more latched messages and goals waited for the link than fit into its queue (64 MB)"
             }
             Self::Gone => "their publisher was gone before they could be sent",
-            Self::Undecodable => "they were encoded upon one that did not come",
+            Self::Undecodable => "they were encoded relative to a message that was lost",
             Self::Other => "for a reason that this version does not know",
         }
     }
 }
 
-/// Messages that were not sent, as was meant.
+/// Numbers of messages that were intentionally not sent.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Dropped {
-    /// Messages that a newer one replaced.
+pub struct SkipCounts {
+    /// Number of messages replaced by a newer one.
     pub replaced: u64,
-    /// Messages that had become too old.
+    /// Number of messages that had become too old.
     pub stale: u64,
 }
 
-/// Messages of a topic that were dropped for one cause.
+/// Number of messages of a topic dropped for one cause.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Drop {
-    /// The topic.
+pub struct TopicDropCount {
+    /// Name of the topic.
     pub topic: String,
-    /// The cause.
+    /// Cause of the drops.
     pub cause: Cause,
-    /// How many so far.
+    /// Total number so far.
     pub count: u64,
 }
 
-impl fmt::Display for Drop {
+impl fmt::Display for TopicDropCount {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (topic, words) = (&self.topic, self.cause.words());
+        let (topic, words) = (&self.topic, self.cause.description());
         match self.count {
             1 => write!(formatter, "1 message of {topic} was dropped: {words}"),
             count => write!(
@@ -92,17 +92,17 @@ impl fmt::Display for Drop {
     }
 }
 
-/// A counter of someone else's: how much it stands at, and whether that was the last of it.
+/// An external counter. Returns its value and whether it is final.
 type Counter = Box<dyn Fn() -> (u64, bool) + Send + Sync>;
 
-struct Watched {
+struct WatchedCounter {
     topic: String,
     cause: Cause,
     seen: u64,
     counter: Counter,
 }
 
-/// How many messages were dropped, by what `K` names (a topic, a channel) and by cause.
+/// Number of dropped messages by key `K` (a topic or a channel) and cause.
 #[derive(Debug, Clone)]
 pub(crate) struct Tally<K>(BTreeMap<(K, Cause), u64>);
 
@@ -124,13 +124,13 @@ impl<K: Ord> Tally<K> {
         all.map(|((of, cause), count)| (of, *cause, *count))
     }
 
-    /// All that were dropped for this cause.
-    pub(crate) fn because_of(&self, cause: Cause) -> u64 {
+    /// Returns the number of messages dropped for this cause.
+    pub(crate) fn count_for(&self, cause: Cause) -> u64 {
         let all = self.iter().filter(|(_, why, _)| *why == cause);
         all.map(|(_, _, count)| count).sum()
     }
 
-    /// Forgets what counts for `of`; gives that.
+    /// Removes the counts of a key and returns them.
     pub(crate) fn take(&mut self, of: &K) -> Vec<(Cause, u64)> {
         let mut taken = Vec::new();
         self.0.retain(|(known, cause), count| {
@@ -144,9 +144,9 @@ impl<K: Ord> Tally<K> {
 }
 
 impl Tally<String> {
-    /// By topic.
-    pub(crate) fn drops(&self) -> Vec<Drop> {
-        let all = self.iter().map(|(topic, cause, count)| Drop {
+    /// Returns the counts by topic.
+    pub(crate) fn per_topic(&self) -> Vec<TopicDropCount> {
+        let all = self.iter().map(|(topic, cause, count)| TopicDropCount {
             topic: topic.clone(),
             cause,
             count,
@@ -155,35 +155,35 @@ impl Tally<String> {
     }
 }
 
-/// All drops of one end of a link.
+/// All drop counts of one end of a link.
 #[derive(Default)]
-pub struct Drops {
+pub struct DropCounters {
     counts: Mutex<Tally<String>>,
-    watched: Mutex<Vec<Watched>>,
+    watched: Mutex<Vec<WatchedCounter>>,
 }
 
-impl Drops {
-    /// Counts messages of a topic that were dropped.
+impl DropCounters {
+    /// Adds dropped messages of a topic.
     pub fn add(&self, topic: &str, cause: Cause, count: u64) {
         self.counts.lock().add(topic.to_owned(), cause, count);
     }
 
-    /// Counts what this counter counts, until its owner lets go of it.
+    /// Includes the value of an external counter until its owner drops it.
     pub fn watch(&self, topic: &str, cause: Cause, counter: Arc<DropCount>) {
-        self.ask(topic, cause, move || {
+        self.watch_with(topic, cause, move || {
             let owned = Arc::strong_count(&counter) > 1;
             (counter.get(), !owned)
         });
     }
 
-    /// Counts what `counter` says when asked, until it says that there will be no more.
-    pub fn ask(
+    /// Includes the value returned by `counter` until it reports that its value is final.
+    pub fn watch_with(
         &self,
         topic: &str,
         cause: Cause,
         counter: impl Fn() -> (u64, bool) + Send + Sync + 'static,
     ) {
-        self.watched.lock().push(Watched {
+        self.watched.lock().push(WatchedCounter {
             topic: topic.to_owned(),
             cause,
             seen: 0,
@@ -191,8 +191,8 @@ impl Drops {
         });
     }
 
-    /// All so far.
-    pub fn all(&self) -> Vec<Drop> {
+    /// Returns all counts so far.
+    pub fn snapshot(&self) -> Vec<TopicDropCount> {
         self.watched.lock().retain_mut(|watched| {
             let (count, over) = (watched.counter)();
             self.add(
@@ -203,19 +203,19 @@ impl Drops {
             watched.seen = count.max(watched.seen);
             !over
         });
-        self.counts.lock().drops()
+        self.counts.lock().per_topic()
     }
 }
 
-/// What of all drops is worth telling: those that are new, and those that have grown tenfold since they were told.
+/// Selects the drops worth reporting: new ones, and those that have grown tenfold since they were last reported.
 #[derive(Debug, Default)]
-pub struct Reporter {
+pub struct DropReporter {
     told: BTreeMap<(String, Cause), u64>,
 }
 
-impl Reporter {
-    /// Those to tell now.
-    pub fn news(&mut self, all: &[Drop]) -> Vec<Drop> {
+impl DropReporter {
+    /// Returns the drops to report now and marks them as reported.
+    pub fn take_new(&mut self, all: &[TopicDropCount]) -> Vec<TopicDropCount> {
         let mut news = Vec::new();
         for drop in all {
             let told = self
@@ -233,53 +233,53 @@ impl Reporter {
 
 #[cfg(test)]
 mod tests {
-    use ros::ring::Lost;
+    use ros::ring::DropTally;
 
     use super::*;
 
     #[test]
-    fn drops_are_counted_for_good_and_told_now_and_then() {
-        let (drops, mut reporter) = (Drops::default(), Reporter::default());
+    fn drops_are_counted_forever_and_reported_when_they_grow_tenfold() {
+        let (drops, mut reporter) = (DropCounters::default(), DropReporter::default());
         let counter = Arc::new(DropCount::default());
-        let lost = |messages| Lost { messages, bytes: 0 };
+        let lost = |messages| DropTally { messages, bytes: 0 };
         counter.add(lost(2));
         drops.watch("/scan", Cause::Busy, counter.clone());
         drops.add("/image", Cause::Replaced, 1);
         let told: Vec<String> = reporter
-            .news(&drops.all())
+            .take_new(&drops.snapshot())
             .iter()
-            .map(Drop::to_string)
+            .map(TopicDropCount::to_string)
             .collect();
         assert_eq!(
             told,
             [
-                "1 message of /image was dropped: newer ones took their place before the link could carry them",
-                "2 messages of /scan were dropped: they came faster than this end of the link takes them",
+                "1 message of /image was dropped: newer ones replaced them before the link could send them",
+                "2 messages of /scan were dropped: they arrived faster than this end of the link accepts them",
             ]
         );
         drops.add("/image", Cause::Replaced, 8);
         assert!(
-            reporter.news(&drops.all()).is_empty(),
+            reporter.take_new(&drops.snapshot()).is_empty(),
             "9 are few more than 1"
         );
         counter.add(lost(23));
         drop(counter);
         drops.add("/image", Cause::Replaced, 1);
         let told: Vec<u64> = reporter
-            .news(&drops.all())
+            .take_new(&drops.snapshot())
             .iter()
             .map(|drop| drop.count)
             .collect();
         assert_eq!(told, [10, 25]);
-        // The counter's owner is gone, its count is not.
-        assert_eq!(drops.all()[1].count, 25);
+        // The owner of the counter is gone, but its count remains.
+        assert_eq!(drops.snapshot()[1].count, 25);
         assert!(drops.watched.lock().is_empty());
     }
 
     #[test]
-    fn causes_of_a_later_version_are_understood_as_far_as_they_can() {
+    fn unknown_causes_of_later_versions_are_other() {
         let later = r#"{"topic": "/a", "cause": "eaten", "count": 1}"#;
-        let drop: Drop = serde_json::from_str(later).unwrap();
+        let drop: TopicDropCount = serde_json::from_str(later).unwrap();
         assert_eq!(drop.cause, Cause::Other);
     }
 }

@@ -1,4 +1,4 @@
-//! Parameters that one end sets in the other's name: their changes do not go back.
+//! Suppresses the echo of parameter changes that one end makes on behalf of the other.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
@@ -6,11 +6,12 @@ use std::hash::{BuildHasher, RandomState};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 
-/// Values of one parameter that are remembered: who sets it so often before the first change is told is heard again by its last ones.
+/// Number of values remembered per parameter. If a parameter is set more often than this before the first change is
+/// reported, its last values are echoed.
 const REMEMBERED: usize = 64;
 
-/// What was set in the name of the other end, and may be told yet, in that order. Of values only hashes are kept: all of a robot's
-/// parameters may be among them.
+/// Parameter values that were set on behalf of the other end and whose changes may still be reported, in order. Only
+/// hashes of the values are kept, because all parameters of a robot may be among them.
 #[derive(Debug, Default)]
 pub struct Echoes {
     hashing: RandomState,
@@ -18,7 +19,7 @@ pub struct Echoes {
 }
 
 impl Echoes {
-    /// Notes that this value is about to be set.
+    /// Records that this value is about to be set.
     pub fn expect(&self, key: &str, value: &ParamValue) {
         let hash = self.hashing.hash_one(value);
         let mut set = self.set.lock();
@@ -31,13 +32,13 @@ impl Echoes {
         }
     }
 
-    /// Forgets a parameter that is set here no more.
+    /// Forgets a parameter that is no longer set on behalf of the other end.
     pub fn forget(&self, key: &str) {
         self.set.lock().remove(key);
     }
 
-    /// Whether a parameter is now as it was set here, or neither was set here nor is there. If not, it is forgotten: it belongs to this
-    /// end again.
+    /// Returns whether a change is the echo of a value set here, or the deletion of a parameter that was not set here.
+    /// If it is not, the parameter is forgotten: it belongs to this end again.
     pub fn is_echo(&self, key: &str, value: Option<&ParamValue>) -> bool {
         let hash = value.map(|value| self.hashing.hash_one(value));
         let mut set = self.set.lock();
@@ -45,7 +46,7 @@ impl Echoes {
             return hash.is_none();
         };
         match values.iter().position(|known| Some(*known) == hash) {
-            // Changes are told in their order; those before it will not be told any more.
+            // Changes are reported in order, so the earlier values will not be reported any more.
             Some(at) => drop(values.drain(..at)),
             None => {
                 set.remove(key);
@@ -61,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_set_here_is_an_echo_until_it_changes() {
+    fn a_value_set_here_is_an_echo_until_it_changes() {
         let echoes = Echoes::default();
         let (one, two) = (ParamValue::Double(f64::NAN), ParamValue::Int(2));
         echoes.expect("/a", &one);
@@ -73,7 +74,7 @@ mod tests {
         );
         echoes.expect("/a", &one);
         assert!(!echoes.is_echo("/a", None), "it was removed here");
-        // One that was set after the other is told after the other.
+        // Values are reported in the order in which they were set.
         let three = ParamValue::Int(3);
         for value in [&one, &two, &two, &three] {
             echoes.expect("/a", value);

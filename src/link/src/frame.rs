@@ -1,4 +1,4 @@
-//! What one WebSocket message of a link holds. All numbers are little endian.
+//! Encoding of the WebSocket messages of a link. All numbers are little-endian.
 //!
 //! | first byte | then |
 //! |---|---|
@@ -11,9 +11,10 @@
 //! | 6 ack | received u64 · bytes u64 |
 //! | 7 damaged | channel u32 · born i64 |
 //!
-//! A record with a number other than 0 is remembered by its sender until the peer has it, and sent again after a lost
-//! connection or counted as dropped: `received` says that all numbers up to and with it have come. `bytes` is all that ever came, from which
-//! the sender knows how fast the link is. Times are nanoseconds since 1970 on the clock of whoever wrote them.
+//! A record with a number other than 0 is kept by its sender until the peer has acknowledged it; after a lost
+//! connection it is sent again or counted as dropped. `received` acknowledges all numbers up to and including its
+//! value. `bytes` is the total number of bytes received, from which the sender computes the throughput of the link.
+//! Times are nanoseconds since the Unix epoch on the clock of the end that wrote them.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 
@@ -28,75 +29,75 @@ const PONG: u8 = 5;
 const ACK: u8 = 6;
 const DAMAGED: u8 = 7;
 
-/// One WebSocket message.
+/// A WebSocket message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Frame {
-    /// The first each way.
+    /// The first message in each direction.
     Open(Bytes),
     /// A record in one piece.
     Whole {
-        /// 0: whether it came is of no interest.
+        /// Record number; 0: not acknowledged.
         number: u64,
         /// The record.
         record: Bytes,
     },
     /// The beginning of a record in several pieces.
     Begin {
-        /// Names the record while it is under way.
+        /// Identifies the record until it is complete.
         stream: u32,
-        /// 0: whether it came is of no interest.
+        /// Record number; 0: not acknowledged.
         number: u64,
-        /// The record's length.
+        /// Total length of the record.
         total: u32,
-        /// Its first bytes.
+        /// The first bytes of the record.
         bytes: Bytes,
     },
-    /// A continuation.
+    /// A continuation of a record.
     More {
-        /// The record's stream.
+        /// Stream of the record.
         stream: u32,
-        /// Its next bytes.
+        /// The next bytes of the record.
         bytes: Bytes,
     },
-    /// Asks for a pong.
+    /// A request for a pong.
     Ping {
-        /// When it left.
+        /// Time at which the ping was sent.
         sent: i64,
-        /// What has come.
-        received: Received,
+        /// Receive progress of the sender.
+        received: ReceiveProgress,
     },
-    /// Answers a ping.
+    /// The reply to a ping.
     Pong {
-        /// The ping's.
+        /// Time at which the ping was sent, copied from it.
         sent: i64,
-        /// When the ping arrived.
+        /// Time at which the ping was received.
         arrived: i64,
-        /// When this left.
+        /// Time at which the pong was sent.
         left: i64,
-        /// What has come.
-        received: Received,
+        /// Receive progress of the sender.
+        received: ReceiveProgress,
     },
-    /// Says what has come.
-    Ack(Received),
-    /// The message of this channel that the sender had from ROS then came, and its frame does not make what it was.
+    /// An acknowledgement.
+    Ack(ReceiveProgress),
+    /// A message of the channel was received and its encoded frame does not decode to the original.
     Damaged {
-        /// The sender's channel.
+        /// Channel number of the sender.
         channel: u32,
-        /// The message's `born`.
+        /// Value of `born` in the message.
         born: i64,
     },
 }
 
-/// What has come from the peer.
+/// Receive progress of an end.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Received {
-    /// All numbers up to and with this one.
+pub struct ReceiveProgress {
+    /// All record numbers up to and including this one have been received.
     pub number: u64,
-    /// Bytes of records, over the session.
+    /// Bytes of records received in the session.
     pub bytes: u64,
 }
 
-impl Received {
+impl ReceiveProgress {
     fn put(self, out: &mut BytesMut) {
         out.put_u64_le(self.number);
         out.put_u64_le(self.bytes);
@@ -111,7 +112,7 @@ impl Received {
 }
 
 impl Frame {
-    /// As it goes into a WebSocket message.
+    /// Encodes the frame as a WebSocket message.
     pub fn encode(&self) -> Bytes {
         let mut out = BytesMut::with_capacity(40 + self.payload().map_or(0, Bytes::len));
         match self {
@@ -178,7 +179,7 @@ impl Frame {
         }
     }
 
-    /// Reads a WebSocket message; payloads are cut from it, not copied.
+    /// Decodes a WebSocket message. Payloads are slices of it, not copies.
     pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
         let Some(&kind) = bytes.first() else {
             return Err(Error::Protocol("an empty frame"));
@@ -216,15 +217,15 @@ impl Frame {
             },
             PING => Frame::Ping {
                 sent: bytes.get_i64_le(),
-                received: Received::get(&mut bytes),
+                received: ReceiveProgress::get(&mut bytes),
             },
             PONG => Frame::Pong {
                 sent: bytes.get_i64_le(),
                 arrived: bytes.get_i64_le(),
                 left: bytes.get_i64_le(),
-                received: Received::get(&mut bytes),
+                received: ReceiveProgress::get(&mut bytes),
             },
-            ACK => Frame::Ack(Received::get(&mut bytes)),
+            ACK => Frame::Ack(ReceiveProgress::get(&mut bytes)),
             _ => Frame::Damaged {
                 channel: bytes.get_u32_le(),
                 born: bytes.get_i64_le(),
@@ -238,8 +239,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_come_back() {
-        let received = Received {
+    fn frames_round_trip() {
+        let received = ReceiveProgress {
             number: 7,
             bytes: 1 << 40,
         };
@@ -274,11 +275,11 @@ mod tests {
         }
     }
 
-    /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    /// The bytes that deployed stubs send. If this test fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
     fn the_bytes_of_frames_are_those_of_this_version() {
         assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
-        let received = Received {
+        let received = ReceiveProgress {
             number: 7,
             bytes: 0x0102_0304_0506_0708,
         };

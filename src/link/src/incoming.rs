@@ -1,30 +1,30 @@
-//! From frames to records: pieces put together, doubles dropped, what has come counted. No I/O.
+//! Reassembly of records from frames: joins pieces, drops duplicates and tracks what was received. No I/O.
 
 use std::collections::{BTreeSet, HashMap};
 
 use budget::{Budget, Permit};
 use bytes::{Bytes, BytesMut};
 
-use crate::frame::Received;
+use crate::frame::ReceiveProgress;
 use crate::record::is_control;
-use crate::{Error, Limits, MAX_FRAME};
+use crate::{Error, LinkLimits, MAX_FRAME};
 
 /// Bytes allocated for a record before its bytes arrive; the buffer doubles as they do.
 const READ_AHEAD: usize = 1 << 20;
 
-/// What has come over the life of a session.
+/// Receive state of a session.
 #[derive(Debug)]
 pub(crate) struct Incoming {
-    /// Where records under way count.
+    /// Budget for incomplete records.
     budget: Budget,
     number: u64,
     ahead: BTreeSet<u64>,
-    /// The first number on this connection, until the peer shows by using it that it knows what has come.
+    /// The first number on this connection, until the peer uses it and thereby shows that it knows what was received.
     next: Option<u64>,
     bytes: u64,
     streams: HashMap<u32, Partial>,
     partial: usize,
-    pub(crate) limits: Limits,
+    pub(crate) limits: LinkLimits,
 }
 
 #[derive(Debug)]
@@ -37,13 +37,13 @@ struct Partial {
 
 impl Default for Incoming {
     fn default() -> Self {
-        Self::within(&Budget::unlimited())
+        Self::with_budget(&Budget::without_limit())
     }
 }
 
 impl Incoming {
-    /// An empty state, whose unfinished records count in `budget`.
-    pub(crate) fn within(budget: &Budget) -> Self {
+    /// Creates an empty state whose incomplete records are charged to `budget`.
+    pub(crate) fn with_budget(budget: &Budget) -> Self {
         Self {
             budget: budget.clone(),
             number: 0,
@@ -52,45 +52,49 @@ impl Incoming {
             bytes: 0,
             streams: HashMap::new(),
             partial: 0,
-            limits: Limits::default(),
+            limits: LinkLimits::default(),
         }
     }
 
-    /// All numbers up to this one have come, and those.
-    pub(crate) fn state(&self) -> (u64, Vec<u64>) {
+    /// Returns the number up to which all records have been received, and the received numbers beyond it.
+    pub(crate) fn received_numbers(&self) -> (u64, Vec<u64>) {
         (self.number, self.ahead.iter().copied().collect())
     }
 
-    pub(crate) fn received(&self) -> Received {
-        Received {
+    pub(crate) fn progress(&self) -> ReceiveProgress {
+        ReceiveProgress {
             number: self.number,
             bytes: self.bytes,
         }
     }
 
-    /// How many records are under way, and their bytes together.
+    /// Returns the number of incomplete records and the sum of their lengths.
     #[cfg(test)]
-    pub(crate) fn under_way(&self) -> (usize, usize) {
+    pub(crate) fn in_flight(&self) -> (usize, usize) {
         (self.streams.len(), self.partial)
     }
 
-    /// A new connection on which the peer's numbers begin with `next`. What was under way has to come again: the peer
-    /// sends it under new numbers, once it has heard what came. The connection may be lost before that, so what came is
-    /// not forgotten yet.
+    /// Begins a new connection on which the peer's numbers start at `next`. Incomplete records must be sent again: the
+    /// peer does so under new numbers once it knows what was received. Because the connection may be lost before that,
+    /// the received numbers are not forgotten yet.
     pub(crate) fn reconnect(&mut self, next: u64) {
         self.streams.clear();
         self.partial = 0;
         self.next = Some(next);
     }
 
-    /// Takes a record in one piece; `None` if it had come before.
-    pub(crate) fn whole(&mut self, number: u64, record: Bytes) -> Result<Option<Bytes>, Error> {
+    /// Receives a record in one piece. Returns `None` for a duplicate.
+    pub(crate) fn receive_whole(
+        &mut self,
+        number: u64,
+        record: Bytes,
+    ) -> Result<Option<Bytes>, Error> {
         self.bytes += record.len() as u64;
-        Ok(self.note(number)?.then_some(record))
+        Ok(self.note_number(number)?.then_some(record))
     }
 
-    /// Takes the beginning of a record in several pieces.
-    pub(crate) fn begin(
+    /// Receives the beginning of a record in several pieces.
+    pub(crate) fn receive_begin(
         &mut self,
         stream: u32,
         number: u64,
@@ -100,14 +104,18 @@ impl Incoming {
         let total = total as usize;
         let limits = self.limits;
         if total > limits.record {
-            return Err(too_much("a record", total, limits.record));
+            return Err(limit_error("a record", total, limits.record));
         }
         if is_control(bytes) && total > MAX_FRAME {
-            return Err(too_much("a control record", total, MAX_FRAME));
+            return Err(limit_error("a control record", total, MAX_FRAME));
         }
         let under_way = self.streams.len();
         if under_way >= limits.under_way {
-            return Err(too_much("records under way", under_way, limits.under_way));
+            return Err(limit_error(
+                "records under way",
+                under_way,
+                limits.under_way,
+            ));
         }
         if bytes.len() > total || self.streams.contains_key(&stream) {
             return Err(Error::Protocol("a record that begins twice or is too long"));
@@ -115,7 +123,7 @@ impl Incoming {
         self.partial += total;
         if self.partial > limits.under_way_bytes {
             let limit = limits.under_way_bytes;
-            return Err(too_much("records under way", self.partial, limit));
+            return Err(limit_error("records under way", self.partial, limit));
         }
         let partial = Partial {
             number,
@@ -124,11 +132,15 @@ impl Incoming {
             permit: self.budget.permit(),
         };
         self.streams.insert(stream, partial);
-        self.more(stream, bytes)
+        self.receive_more(stream, bytes)
     }
 
-    /// Takes more of it; the record once it is whole.
-    pub(crate) fn more(&mut self, stream: u32, bytes: &[u8]) -> Result<Option<Bytes>, Error> {
+    /// Receives the next piece; returns the record once it is complete.
+    pub(crate) fn receive_more(
+        &mut self,
+        stream: u32,
+        bytes: &[u8],
+    ) -> Result<Option<Bytes>, Error> {
         let Some(partial) = self.streams.get_mut(&stream) else {
             return Err(Error::Protocol("more of a record that did not begin"));
         };
@@ -138,7 +150,7 @@ impl Incoming {
         }
         let missing = partial.total - partial.bytes.len();
         if partial.bytes.capacity() - partial.bytes.len() < bytes.len() {
-            // It grows with what comes, not with what was promised.
+            // Memory grows with what is received, not with the announced length.
             let room = partial.bytes.len().max(READ_AHEAD).max(bytes.len());
             let room = room.min(missing);
             partial.permit.grow_to(partial.bytes.len() + room)?;
@@ -152,11 +164,13 @@ impl Incoming {
             return Ok(None);
         };
         self.partial -= whole.total;
-        Ok(self.note(whole.number)?.then(|| whole.bytes.freeze()))
+        Ok(self
+            .note_number(whole.number)?
+            .then(|| whole.bytes.freeze()))
     }
 
-    /// Whether a number is new.
-    fn note(&mut self, number: u64) -> Result<bool, Error> {
+    /// Records a received number and returns whether it is new.
+    fn note_number(&mut self, number: u64) -> Result<bool, Error> {
         if number == 0 {
             return Ok(true);
         }
@@ -175,7 +189,7 @@ impl Incoming {
             return Ok(true);
         }
         if self.ahead.len() >= self.limits.ahead {
-            return Err(too_much(
+            return Err(limit_error(
                 "numbers ahead",
                 self.ahead.len(),
                 self.limits.ahead,
@@ -186,7 +200,7 @@ impl Incoming {
     }
 }
 
-pub(crate) fn too_much(what: &'static str, bytes: usize, limit: usize) -> Error {
+pub(crate) fn limit_error(what: &'static str, bytes: usize, limit: usize) -> Error {
     Error::TooMuch {
         what,
         bytes: bytes as u64,
@@ -199,38 +213,38 @@ mod tests {
     use super::*;
 
     #[test]
-    fn records_under_way_take_no_more_than_their_budget() {
+    fn incomplete_records_stay_within_their_budget() {
         let budget = Budget::new("servant x", 4 << 20);
-        let mut incoming = Incoming::within(&budget);
-        // Promises cost little.
+        let mut incoming = Incoming::with_budget(&budget);
+        // Announced lengths cost little memory.
         for stream in 0..2 {
-            let begun = incoming.begin(stream, u64::from(stream) + 1, 100 << 20, b"x");
+            let begun = incoming.receive_begin(stream, u64::from(stream) + 1, 100 << 20, b"x");
             assert!(begun.expect("there is room").is_none());
         }
-        assert_eq!(budget.used(), 2 * READ_AHEAD);
+        assert_eq!(budget.used_bytes(), 2 * READ_AHEAD);
         let more = vec![7; 2 * READ_AHEAD];
         let refused = incoming
-            .more(0, &more)
-            .and_then(|_| incoming.more(1, &more));
+            .receive_more(0, &more)
+            .and_then(|_| incoming.receive_more(1, &more));
         let refused = refused.expect_err("both cannot grow");
         assert!(
             refused.to_string().contains("the memory for servant x"),
             "{refused}"
         );
         incoming.reconnect(1);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[test]
-    fn a_whole_record_counts_no_longer() {
+    fn a_complete_record_releases_its_budget() {
         let budget = Budget::new("servant x", 3 << 20);
-        let mut incoming = Incoming::within(&budget);
+        let mut incoming = Incoming::with_budget(&budget);
         let begun = incoming
-            .begin(1, 1, 1000, &[7; 400])
+            .receive_begin(1, 1, 1000, &[7; 400])
             .expect("there is room");
-        assert!(begun.is_none() && budget.used() == 1000);
-        let whole = incoming.more(1, &[7; 600]).expect("there is room");
+        assert!(begun.is_none() && budget.used_bytes() == 1000);
+        let whole = incoming.receive_more(1, &[7; 600]).expect("there is room");
         assert_eq!(whole, Some(vec![7; 1000].into()));
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 }

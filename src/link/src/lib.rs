@@ -1,20 +1,20 @@
 //! The link between a robot's stub and the cloud: the protocol, and a session that outlives its connections. Both ends
-//! share it.
+//! share this crate.
 //!
 //! ```text
 //!  records ─▶ Outgoing: control · calls and goals · answers · data · lines ─▶ frames ─▶ WebSocket
-//!  WebSocket ─▶ frames ─▶ Incoming: pieces put together, doubles dropped ─▶ records
+//!  WebSocket ─▶ frames ─▶ Incoming: pieces joined, duplicates dropped ─▶ records
 //! ```
 //!
-//! A [`Session`] lives as long as its node: connections come and go below it. What must not be lost (control, calls,
-//! answers, small messages) is numbered, kept until the peer has it and sent again on the next connection; pictures
-//! and the like are not, since a newer one comes.
+//! A [`Session`] lives as long as its node, over any number of connections. What must not be lost (control messages,
+//! calls, responses, small messages) is numbered, kept until the peer has acknowledged it, and sent again on the next
+//! connection. Images and the like are not, because a newer one will follow.
 //!
-//! A session's connection:
+//! States of a session's connection:
 //!
 //! ```text
-//!  (none) ──hello, welcome──▶ Up ──no pong in time──▶ Silent ──silent for long, socket lost──▶ (none)
-//!                              ▲────anything came───────┘
+//!  (none) ──hello, welcome──▶ Up ──no pong in time──▶ Silent ──silence too long, socket lost──▶ (none)
+//!                              ▲──anything received────┘
 //! ```
 
 #![forbid(unsafe_code)]
@@ -37,60 +37,62 @@ pub mod session;
 pub mod skew;
 mod values;
 
-pub use drops::Dropped;
+pub use drops::SkipCounts;
 pub use echoes::Echoes;
-pub use limits::{Limits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
-pub use outgoing::Quality;
-pub use session::{CloudSession, Handler, Lost, RobotSession, Session, SessionOptions};
+pub use limits::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
+pub use outgoing::DeliveryMode;
+pub use session::{
+    CloudSession, DisconnectReason, RobotSession, Session, SessionHandler, SessionOptions,
+};
 
-/// The WebSocket subprotocol of this version. Both ends list those they speak, newest first.
+/// The WebSocket subprotocol of this version. Both ends list those they support, newest first.
 ///
-/// Its number grows when an end of the version before would misread what an end of this one sends:
+/// The version number is increased when an end of the previous version would misread what an end of this version sends:
 ///
-/// * the bytes of a [frame](frame) or a [record](record) change, or there is a new kind of either: the tests that pin
-///   those bytes fail, and are changed together with this number;
-/// * a field of [hello, welcome or what is told later](control) changes its name, its type or what it means, or one
-///   that was optional must be there.
+/// * the encoding of a [frame](frame) or a [record](record) changes, or a new kind of either is added: the tests that
+///   pin the encoding fail and are changed together with this number;
+/// * a field of [hello, welcome or a control message](control) changes its name, type or meaning, or an optional field
+///   becomes required.
 ///
-/// It stays when a field with a default is added to one of those, or something more is told: readers leave out what
-/// they do not know, and what they do not find has its default, which must mean what it meant before. So it does when
-/// a codec is added, since each end says which it decodes.
+/// It stays the same when a field with a default or a new control message is added: readers ignore what they do not
+/// know and use defaults for what they do not find, so the default must mean what absence meant before. It also stays
+/// the same when a codec is added, because each end lists the codecs that it decodes.
 pub const SUBPROTOCOL: &str = "cloudroid-link.v2";
-/// What all versions begin with.
+/// Common prefix of the subprotocols of all versions.
 pub const SUBPROTOCOLS: &str = "cloudroid-link.";
-/// What can go wrong with a peer.
+/// Errors of the protocol, caused by the peer.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The peer sends what makes no sense.
+    /// Invalid data.
     #[error("the other end broke the protocol: {0}")]
     Protocol(&'static str),
-    /// More than can be kept.
+    /// A size limit was exceeded.
     #[error("the other end sends {what} of {bytes} bytes, more than the limit of {limit}")]
     TooMuch {
-        /// The kind of message.
+        /// Kind of message.
         what: &'static str,
-        /// Its size, bytes.
+        /// Size in bytes.
         bytes: u64,
-        /// The greatest size, bytes.
+        /// Limit in bytes.
         limit: u64,
     },
-    /// An unfinished record does not fit into its memory budget.
+    /// An incomplete record exceeds its memory budget.
     #[error("a record cannot be received: {0}")]
     Exceeded(#[from] budget::Exceeded),
-    /// Its WebSocket frames are not taken.
-    #[error("the other end's frames are refused: {reason}")]
+    /// Invalid WebSocket frames.
+    #[error("the other end's frames were refused: {reason}")]
     Refused {
         /// WebSocket close code.
         code: u16,
-        /// The reason.
+        /// Reason for the close.
         reason: String,
     },
-    /// JSON that is not what it should be.
+    /// Invalid JSON.
     #[error("the other end sends a {what} that cannot be read: {reason}")]
     Json {
-        /// The kind of message.
+        /// Kind of message.
         what: &'static str,
-        /// The reason.
+        /// Reason from the JSON parser.
         reason: String,
     },
 }

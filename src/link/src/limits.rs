@@ -1,33 +1,35 @@
-//! All limits of a link, in one place: what a receiver takes, which its peer keeps to as sender; and what a sender lets wait.
+//! All limits of a link: what a receiver accepts, which the peer observes as sender, and what a sender queues.
 
-use ros::ring::Bounds;
+use ros::ring::RingBounds;
 use serde::{Deserialize, Serialize};
 
-/// The longest WebSocket frame: a piece, or a hello with all of a robot's parameters.
+/// Maximum length of a WebSocket frame: a piece of a record, or a hello with all parameters of a robot.
 pub const MAX_FRAME: usize = 32 << 20;
-/// The longest record.
+/// Maximum length of a record.
 pub const MAX_RECORD: usize = 256 << 20;
-/// The longest control record but those of parameters, which may be as long as a frame; and the longest hello, without its parameters.
+/// Maximum length of a control record (parameters may be as long as a frame), and of a hello without its parameters.
 pub const MAX_CONTROL: usize = 1 << 20;
-/// What control records of one session take in memory at once, at most: those that were read and wait to be obeyed.
+/// Maximum memory for control records of one session that were parsed and wait to be processed.
 pub const MAX_TOLD: usize = 64 << 20;
 
-/// What an end of a link takes. It says so in its opening frame; beyond, it ends the connection, so its peer stays below.
+/// Limits on what an end of a link accepts. Each end announces them in its opening frame and closes the connection if
+/// they are exceeded; the peer stays below them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Limits {
+pub struct LinkLimits {
     /// Bytes of a record.
     pub record: usize,
-    /// Records in several pieces that have begun to come and are not complete.
+    /// Incomplete records, received in pieces.
     pub under_way: usize,
-    /// Bytes of those together, as they will be when they are complete.
+    /// Total length of the incomplete records in bytes.
     pub under_way_bytes: usize,
-    /// Numbers that came before one that is still missing.
+    /// Record numbers received ahead of a missing one.
     pub ahead: usize,
 }
 
-impl Default for Limits {
-    /// Those of this release, which are those of all earlier releases of this version of the protocol: they do not say them.
+impl Default for LinkLimits {
+    /// Returns the limits of this release, which all earlier releases of this protocol version use without announcing
+    /// them.
     fn default() -> Self {
         Self {
             record: MAX_RECORD,
@@ -38,8 +40,8 @@ impl Default for Limits {
     }
 }
 
-impl Limits {
-    /// With these no peer could send anything useful.
+impl LinkLimits {
+    /// Minimum values below which a peer could send nothing useful.
     const LEAST: Self = Self {
         record: MAX_CONTROL,
         under_way: 8,
@@ -47,8 +49,8 @@ impl Limits {
         ahead: 256,
     };
 
-    /// Makes limits usable that a peer has stated: each is at least so great that something goes.
-    pub(crate) fn raise(self) -> Self {
+    /// Raises limits announced by a peer to the minimum values.
+    pub(crate) fn with_minimums(self) -> Self {
         let record = self.record.max(Self::LEAST.record);
         Self {
             record,
@@ -59,38 +61,39 @@ impl Limits {
     }
 }
 
-/// Control records that wait, are under way and are kept until the peer has them; beyond, the session is given up. One may have any size.
-pub(crate) const CONTROL: Bounds = Bounds {
+/// Control records that are queued, in flight or unacknowledged. If the limit is exceeded, the session is closed. A
+/// single record may have any size.
+pub(crate) const CONTROL: RingBounds = RingBounds {
     messages: 16_384,
     bytes: 128 << 20,
 };
-/// The same of calls and goals; what is beyond of goals is dropped and counted.
-pub(crate) const CALLS: Bounds = Bounds {
+/// Limit for calls and goals, as [`CONTROL`]; goals beyond it are dropped and counted.
+pub(crate) const CALLS: RingBounds = RingBounds {
     messages: 16_384,
     bytes: 256 << 20,
 };
-/// The same of answers.
-pub(crate) const ANSWERS: Bounds = CALLS;
-/// Lines that wait. The oldest give way.
-pub(crate) const LINES: Bounds = Bounds {
+/// Limit for responses, as [`CONTROL`].
+pub(crate) const ANSWERS: RingBounds = CALLS;
+/// Queued lines; the oldest are dropped first.
+pub(crate) const LINES: RingBounds = RingBounds {
     messages: 4096,
     bytes: 1 << 20,
 };
-/// Messages that wait on one topic. The oldest give way.
-pub(crate) const WAITING: Bounds = Bounds {
+/// Messages queued for one topic; the oldest are dropped first.
+pub(crate) const WAITING: RingBounds = RingBounds {
     messages: 256,
     bytes: 2 << 20,
 };
-/// The same once a big message waits: only the newest counts.
-pub(crate) const BIG_WAITING: Bounds = Bounds {
+/// Limit for a topic on which a big message is queued: only the newest is kept.
+pub(crate) const BIG_WAITING: RingBounds = RingBounds {
     messages: 1,
     ..WAITING
 };
-/// Bytes of messages that must all come (latched ones, actions), over all topics, beside the last one; and that are kept until the peer
-/// has them.
+/// Bytes of messages that must all be delivered (latched messages, messages of actions), over all topics, in addition
+/// to the last one; and of those kept until they are acknowledged.
 pub(crate) const EACH: usize = 64 << 20;
-/// Messages and lines that are kept in case they are lost. Those beyond are not sent again.
-pub(crate) const KEPT: Bounds = Bounds {
+/// Messages and lines kept for retransmission. Those beyond the limit are not sent again.
+pub(crate) const KEPT: RingBounds = RingBounds {
     messages: 2048,
     bytes: 4 << 20,
 };

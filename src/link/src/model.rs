@@ -1,14 +1,18 @@
-//! A model of both ends of a link: two [`Outgoing`] and two [`Incoming`], the frames on their way between them, and whatever happens to those.
+//! A model test of both ends of a link: two [`Outgoing`] and two [`Incoming`], the frames in flight between them, and
+//! faults.
 //!
-//! However messages, orders, calls and lines are pushed, however often a connection is lost with all that is on its way, a welcome is lost, a hello
-//! that was overtaken comes late, or one of the ends begins anew:
+//! The following holds for any sequence of messages, control messages, calls and lines, and any combination of lost
+//! connections with everything in flight, lost welcomes, delayed hellos of displaced connections, and restarts of
+//! either end:
 //!
-//! 1. Orders come in the order in which they were told, each once. Over connections that are lost none is lost: a session that goes on has all.
-//! 2. Calls and goals come in the order in which they were made, each once, over all topics and services: a cancel never before its goal.
-//! 3. No message comes before the opening of its channel, and none after its closing.
-//! 4. No end sends what the other one, by the limits that it has stated, refuses: no session ends by what was allowed.
-//! 5. What waits, is kept, and is under way stays below the limits, in number and in bytes.
-//! 6. Lines come in order, and the number of those that do not come is told.
+//! 1. Control messages arrive in the order in which they were sent, each once. A resumed session loses none.
+//! 2. Calls and goals arrive in the order in which they were made, each once, over all topics and services; a cancel
+//!    never overtakes its goal.
+//! 3. No message arrives before its channel was opened or after it was closed.
+//! 4. No end sends anything that exceeds the limits announced by its peer, so no session ends because of permitted
+//!    input.
+//! 5. What is queued, kept and in flight stays below its limits, in number and in bytes.
+//! 6. Lines arrive in order, and the number of omitted lines is reported.
 
 use std::collections::{BTreeSet, VecDeque};
 
@@ -18,12 +22,12 @@ use proptest::test_runner::TestCaseResult;
 
 use crate::frame::Frame;
 use crate::incoming::Incoming;
-use crate::limits::{Limits, WAITING};
-use crate::outgoing::{Outgoing, Quality};
+use crate::limits::{LinkLimits, WAITING};
+use crate::outgoing::{DeliveryMode, Outgoing};
 use crate::record::{Data, Record};
 
-/// As little as an end may state.
-const LIMITS: Limits = Limits {
+/// The lowest limits that an end may announce.
+const LIMITS: LinkLimits = LinkLimits {
     record: 1 << 20,
     under_way: 8,
     under_way_bytes: 1 << 20,
@@ -31,8 +35,8 @@ const LIMITS: Limits = Limits {
 };
 const CHANNELS: u32 = 12;
 
-/// One end: what it sends, what it has heard, and the frames that it has sent and that have not come.
-struct End {
+/// One end: its state, what it has sent and received, and its frames in flight.
+struct ModelEnd {
     out: Outgoing,
     incoming: Incoming,
     wire: VecDeque<Frame>,
@@ -40,16 +44,16 @@ struct End {
     heard: u32,
     called: u32,
     answered: u32,
-    /// Those that this end has opened, and those that it was told of.
+    /// Channels that this end has opened, and channels that the peer has announced.
     opened: BTreeSet<u32>,
     known: BTreeSet<u32>,
-    /// Closed, and never opened again.
+    /// Channels that were closed and are never opened again.
     gone: BTreeSet<u32>,
     printed: u32,
     read: u32,
 }
 
-impl End {
+impl ModelEnd {
     fn new() -> Self {
         let mut end = Self {
             out: Outgoing::new(Some(50)),
@@ -70,20 +74,20 @@ impl End {
         end
     }
 
-    fn tell(&mut self, kind: u8, channel: u32, size: usize) -> Record {
+    fn next_control(&mut self, kind: u8, channel: u32, size: usize) -> Record {
         self.told += 1;
         control(kind, self.told, channel, size)
     }
 
-    fn push(&mut self, step: &Step) {
+    fn push(&mut self, step: &ModelStep) {
         match *step {
-            Step::Goal(channel, _) | Step::Publish(channel, ..) if self.gone.contains(&channel) => {
+            ModelStep::Goal(channel, _) | ModelStep::Publish(channel, ..)
+                if self.gone.contains(&channel) => {}
+            ModelStep::Tell(size) => {
+                let record = self.next_control(b'T', 0, size);
+                self.out.push(&record, DeliveryMode::Each);
             }
-            Step::Tell(size) => {
-                let record = self.tell(b'T', 0, size);
-                self.out.push(&record, Quality::Each);
-            }
-            Step::Call(size) => {
+            ModelStep::Call(size) => {
                 self.called += 1;
                 let (id, request) = (self.called, vec![0; size].into());
                 let call = Record::Call {
@@ -91,29 +95,33 @@ impl End {
                     service: 1,
                     request,
                 };
-                self.out.push(&call, Quality::Each);
+                self.out.push(&call, DeliveryMode::Each);
             }
-            Step::Goal(channel, size) => {
+            ModelStep::Goal(channel, size) => {
                 self.open(channel, size);
                 self.called += 1;
                 let goal = data(channel, self.called.into(), size);
-                self.out.push(&goal, Quality::InOrder);
+                self.out.push(&goal, DeliveryMode::InOrder);
             }
-            Step::Publish(channel, size, each) => {
+            ModelStep::Publish(channel, size, each) => {
                 self.open(channel, size);
-                let quality = if each { Quality::Each } else { Quality::Newest };
+                let quality = if each {
+                    DeliveryMode::Each
+                } else {
+                    DeliveryMode::Newest
+                };
                 self.out.push(&data(channel, 0, size), quality);
             }
-            Step::Close(channel) if self.opened.remove(&channel) => {
+            ModelStep::Close(channel) if self.opened.remove(&channel) => {
                 self.gone.insert(channel);
-                // It is told after all that waits on the channel, whatever orders are told meanwhile.
+                // The close arrives after everything queued on the channel, independently of other control messages.
                 let record = control(b'C', 0, channel, 0);
-                self.out.close(channel, &record);
+                self.out.close_channel(channel, &record);
             }
-            Step::Print(size) => {
+            ModelStep::Print(size) => {
                 self.printed += 1;
                 let line = control(b'L', self.printed, 0, size);
-                self.out.print(&line);
+                self.out.push_line(&line);
             }
             _ => {}
         }
@@ -121,23 +129,23 @@ impl End {
 
     fn open(&mut self, channel: u32, size: usize) {
         if self.opened.insert(channel) {
-            let record = self.tell(b'O', channel, size);
-            self.out.push(&record, Quality::Each);
-            self.out.opens(channel);
+            let record = self.next_control(b'O', channel, size);
+            self.out.push(&record, DeliveryMode::Each);
+            self.out.open_channel(channel);
         }
     }
 
-    /// Takes a frame of the other end, and checks what it completes.
+    /// Receives a frame from the other end and checks the record that it completes.
     fn take(&mut self, frame: Frame) -> TestCaseResult {
         let record = match frame {
-            Frame::Whole { number, record } => self.incoming.whole(number, record),
+            Frame::Whole { number, record } => self.incoming.receive_whole(number, record),
             Frame::Begin {
                 stream,
                 number,
                 total,
                 bytes,
-            } => self.incoming.begin(stream, number, total, &bytes),
-            Frame::More { stream, bytes } => self.incoming.more(stream, &bytes),
+            } => self.incoming.receive_begin(stream, number, total, &bytes),
+            Frame::More { stream, bytes } => self.incoming.receive_more(stream, &bytes),
             Frame::Ack(received) => {
                 self.out.acknowledge(received.number);
                 Ok(None)
@@ -147,13 +155,13 @@ impl End {
         let record = record.map_err(|error| TestCaseError::fail(format!("refused: {error}")))?;
         match record.map(Record::decode).transpose() {
             Ok(None) => {}
-            Ok(Some(Record::Control(text))) => self.hear(&text)?,
-            Ok(Some(Record::Call { id, .. })) => self.is_called(id)?,
+            Ok(Some(Record::Control(text))) => self.check_control(&text)?,
+            Ok(Some(Record::Call { id, .. })) => self.check_call(id)?,
             Ok(Some(Record::Data(data))) => {
                 let channel = data.channel;
                 prop_assert!(self.known.contains(&channel), "{channel} is not open");
                 if data.born > 0 {
-                    self.is_called(data.born as u32)?;
+                    self.check_call(data.born as u32)?;
                 }
             }
             other => panic!("{other:?}"),
@@ -161,7 +169,7 @@ impl End {
         Ok(())
     }
 
-    fn hear(&mut self, text: &[u8]) -> TestCaseResult {
+    fn check_control(&mut self, text: &[u8]) -> TestCaseResult {
         let word = |at: usize| u32::from_le_bytes(text[at..at + 4].try_into().unwrap());
         match text[0] {
             b'{' => {
@@ -192,21 +200,21 @@ impl End {
         Ok(())
     }
 
-    fn is_called(&mut self, number: u32) -> TestCaseResult {
+    fn check_call(&mut self, number: u32) -> TestCaseResult {
         self.answered += 1;
         prop_assert_eq!(number, self.answered, "a call or goal out of its order");
         Ok(())
     }
 
-    /// What waits, is kept and is under way is within the limits.
+    /// Checks that what is queued, kept and in flight is within the limits.
     fn check(&self) -> TestCaseResult {
-        let (_, ahead) = self.incoming.state();
+        let (_, ahead) = self.incoming.received_numbers();
         prop_assert!(ahead.len() <= LIMITS.ahead);
-        prop_assert!(self.out.unacknowledged() <= LIMITS.ahead);
-        let (under_way, bytes) = self.incoming.under_way();
+        prop_assert!(self.out.unacknowledged_count() <= LIMITS.ahead);
+        let (under_way, bytes) = self.incoming.in_flight();
         prop_assert!(under_way <= LIMITS.under_way && bytes <= LIMITS.under_way_bytes);
-        for waiting in self.out.waiting() {
-            // Those that were sent and did not come wait once more.
+        for waiting in self.out.queue_lengths() {
+            // Records that were sent and not received are queued again.
             prop_assert!(waiting <= WAITING.messages + LIMITS.ahead, "{waiting}");
         }
         Ok(())
@@ -236,64 +244,65 @@ fn data(channel: u32, born: i64, size: usize) -> Record {
 }
 
 #[derive(Debug, Clone)]
-enum Step {
+enum ModelStep {
     Tell(usize),
     Call(usize),
     Goal(u32, usize),
     Publish(u32, usize, bool),
     Close(u32),
     Print(usize),
-    /// So many frames leave.
+    /// This many frames are sent.
     Leave(usize),
-    /// So many come.
+    /// This many frames are received.
     Come(usize),
     Acknowledge,
-    /// The connection is lost, and there is another one.
+    /// The connection is lost and replaced by another one.
     Reconnect,
-    /// The same; the first welcome is lost, after so many frames of the cloud.
+    /// As above, but the first welcome is lost, after this many frames from the cloud.
     LoseWelcome(usize),
     RestartRobot,
     RestartCloud,
 }
 
-fn step() -> impl Strategy<Value = Step> {
+fn step() -> impl Strategy<Value = ModelStep> {
     let size =
         || prop_oneof![4 => 0usize..2000, 1 => 30_000usize..120_000, 1 => Just(600_000usize)];
     let channel = || 1..CHANNELS;
     prop_oneof![
-        4 => size().prop_map(Step::Tell),
-        4 => size().prop_map(Step::Call),
-        3 => (CHANNELS..CHANNELS + 4, size()).prop_map(|(of, size)| Step::Goal(of, size)),
-        8 => (channel(), size(), any::<bool>()).prop_map(|(of, size, each)| Step::Publish(of, size, each)),
-        1 => (1..CHANNELS + 4).prop_map(Step::Close),
-        4 => (0usize..10_000).prop_map(Step::Print),
-        10 => (1usize..40).prop_map(Step::Leave),
-        10 => (1usize..60).prop_map(Step::Come),
-        4 => Just(Step::Acknowledge),
-        2 => Just(Step::Reconnect),
-        1 => (0usize..20).prop_map(Step::LoseWelcome),
-        1 => prop_oneof![Just(Step::RestartRobot), Just(Step::RestartCloud)],
+        4 => size().prop_map(ModelStep::Tell),
+        4 => size().prop_map(ModelStep::Call),
+        3 => (CHANNELS..CHANNELS + 4, size()).prop_map(|(of, size)| ModelStep::Goal(of, size)),
+        8 => (channel(), size(), any::<bool>()).prop_map(|(of, size, each)| ModelStep::Publish(of, size, each)),
+        1 => (1..CHANNELS + 4).prop_map(ModelStep::Close),
+        4 => (0usize..10_000).prop_map(ModelStep::Print),
+        10 => (1usize..40).prop_map(ModelStep::Leave),
+        10 => (1usize..60).prop_map(ModelStep::Come),
+        4 => Just(ModelStep::Acknowledge),
+        2 => Just(ModelStep::Reconnect),
+        1 => (0usize..20).prop_map(ModelStep::LoseWelcome),
+        1 => prop_oneof![Just(ModelStep::RestartRobot), Just(ModelStep::RestartCloud)],
     ]
 }
 
 /// Both ends, the robot's first.
-struct World([End; 2]);
+struct LinkModel([ModelEnd; 2]);
 
-impl World {
+impl LinkModel {
     fn new() -> Self {
-        let mut world = Self([End::new(), End::new()]);
+        let mut world = Self([ModelEnd::new(), ModelEnd::new()]);
         world.connect(None);
         world
     }
 
-    /// What was on its way is lost; hello and welcome pass, the welcome unless it is `lost` after so many frames.
+    /// Reconnects: frames in flight are lost, and hello and welcome are exchanged, unless the welcome is `lost` after
+    /// this many frames.
     fn connect(&mut self, lost: Option<usize>) {
         let [robot, cloud] = &mut self.0;
         robot.wire.clear();
         cloud.wire.clear();
-        let (has, ahead) = robot.incoming.state();
+        let (has, ahead) = robot.incoming.received_numbers();
         let next = robot.out.next_number();
-        let (cloud_has, cloud_ahead) = cloud.incoming.state();
+        let (cloud_has, cloud_ahead) = cloud.incoming.received_numbers();
         let cloud_next = cloud.out.next_number();
         cloud.out.reconnect(has, &ahead);
         cloud.incoming.reconnect(next);
@@ -307,17 +316,17 @@ impl World {
         robot.incoming.reconnect(cloud_next);
     }
 
-    /// A session of which one end knows nothing any more is replaced; numbers go on where the robot's end is the same.
+    /// Replaces a session of which one end has lost its state. Numbering continues if the robot's end is the same.
     fn restart(&mut self, is_robot: bool) {
         let next = self.0[0].out.next_number();
-        self.0 = [End::new(), End::new()];
+        self.0 = [ModelEnd::new(), ModelEnd::new()];
         if !is_robot {
             self.0[0].out.begin_at(next);
         }
         self.connect(None);
     }
 
-    fn take(&mut self, at_robot: bool, step: &Step) -> TestCaseResult {
+    fn take(&mut self, at_robot: bool, step: &ModelStep) -> TestCaseResult {
         let [robot, cloud] = &mut self.0;
         let (this, other) = if at_robot {
             (robot, cloud)
@@ -325,35 +334,39 @@ impl World {
             (cloud, robot)
         };
         match step {
-            Step::Leave(frames) => {
+            ModelStep::Leave(frames) => {
                 let left = std::iter::from_fn(|| this.out.next(0)).take(*frames);
                 this.wire.extend(left);
             }
-            Step::Come(frames) => {
+            ModelStep::Come(frames) => {
                 let frames = this.wire.len().min(*frames);
                 for frame in this.wire.drain(..frames) {
                     other.take(frame)?;
                 }
             }
-            Step::Acknowledge => {
-                let received = this.incoming.received();
+            ModelStep::Acknowledge => {
+                let received = this.incoming.progress();
                 this.wire.push_back(Frame::Ack(received));
             }
-            Step::Reconnect => self.connect(None),
-            Step::LoseWelcome(frames) => self.connect(Some(*frames)),
-            Step::RestartRobot => self.restart(true),
-            Step::RestartCloud => self.restart(false),
+            ModelStep::Reconnect => self.connect(None),
+            ModelStep::LoseWelcome(frames) => self.connect(Some(*frames)),
+            ModelStep::RestartRobot => self.restart(true),
+            ModelStep::RestartCloud => self.restart(false),
             step => this.push(step),
         }
-        self.0.iter().try_for_each(End::check)
+        self.0.iter().try_for_each(ModelEnd::check)
     }
 
-    /// A connection that holds: in the end all has come.
+    /// Keeps the connection up until everything has been delivered.
     fn finish(&mut self) -> TestCaseResult {
         self.connect(None);
         while !self.0.iter().all(|end| end.out.is_empty()) {
             for at_robot in [true, false] {
-                for step in [Step::Leave(50), Step::Acknowledge, Step::Come(usize::MAX)] {
+                for step in [
+                    ModelStep::Leave(50),
+                    ModelStep::Acknowledge,
+                    ModelStep::Come(usize::MAX),
+                ] {
                     self.take(at_robot, &step)?;
                 }
             }
@@ -374,7 +387,7 @@ proptest! {
 
     #[test]
     fn whatever_happens_to_a_link_its_promises_hold(steps in prop::collection::vec((any::<bool>(), step()), 0..300)) {
-        let mut world = World::new();
+        let mut world = LinkModel::new();
         for (at_robot, step) in &steps {
             world.take(*at_robot, step)?;
         }

@@ -1,18 +1,19 @@
-//! From records to frames: what goes next, in which pieces, and what is kept in case it is lost. No I/O, no clock of
-//! its own.
+//! The send side of a session: decides which frame is sent next, splits records into pieces, and keeps what may have to
+//! be sent again. No I/O, no clock of its own.
 //!
 //! ```text
 //!  control ───────── in order ─────────────────────┐
 //!  calls and goals ─ in order ─────────────────────┤
-//!  answers ───────── short ones, long ones ────────┼─▶ next(): short records, after SMALL_IN_A_ROW of them a piece of a
-//!  data ──────────── a queue per topic, newest wins┤           long one; lines where nothing waits, and a small share else
-//!  lines ─────────── the oldest give way, counted ─┘
+//!  responses ─────── short ones, long ones ────────┼─▶ next(): short records, after SMALL_IN_A_ROW of them a piece
+//!  data ──────────── a queue per topic, newest wins┤           of a long one; lines when idle, plus a small share
+//!  lines ─────────── the oldest are dropped ───────┘
 //! ```
-//! Of control, and of calls and goals, one record is under way at a time, so none overtakes another. A message waits for the opening of its
-//! channel. The sender keeps to the peer's [`Limits`]: what the peer would not take waits here, or is left out and counted.
+//! One control record and one call or goal are in flight at a time, so that none overtakes another. A message waits
+//! until its channel has been opened. The sender stays within the peer's [`LinkLimits`]: what the peer would not accept
+//! is queued here, or dropped and counted.
 //!
-//! Deciding late is the point: the socket is given little at a time, so a newer picture can still replace one that
-//! waits, and a small message never waits for more than a piece.
+//! Decisions are made as late as possible: the socket is given little at a time, so that a newer image can still
+//! replace a queued one, and a small message never waits for more than one piece.
 
 mod budget;
 mod data;
@@ -25,79 +26,81 @@ mod retransmit;
 use std::collections::{BTreeMap, VecDeque};
 
 use ::budget::{Budget, Permit};
-use ros::ring::{Held, Ring};
-use ros::turns::Turns;
+use ros::ring::{Ring, RingItem};
+use ros::turns::RoundRobin;
 
 use crate::drops::{Cause, Tally};
 use crate::frame::Frame;
-use crate::limits::Limits;
+use crate::limits::LinkLimits;
 use crate::record::{LEFT_AT, Record};
 use encoding::Encoding;
 use gate::Gate;
-use lanes::{Lane, Lanes, Lines};
-use out::Out;
-pub use out::Quality;
-use retransmit::Retransmit;
+use lanes::{LineQueue, RecordLane, RecordLanes};
+pub use out::DeliveryMode;
+use out::OutgoingRecord;
+use retransmit::RetransmitBuffer;
 
-/// Records up to this size go in one piece, and are kept until the peer has them.
+/// Records up to this size are sent in one piece and kept until they are acknowledged.
 pub(crate) const SMALL: usize = 32 * 1024;
-/// Pieces are made so long that one takes about this on the link as measured, seconds.
+/// Target transmission time of a piece at the measured throughput, in seconds.
 const PIECE_TIME: f64 = 0.008;
-/// The least and the greatest size of a piece, bytes.
+/// Minimum and maximum size of a piece in bytes.
 const PIECES: (usize, usize) = (4 * 1024, 64 * 1024);
-/// The socket is given more only when it holds less than this: what is decided later is decided better.
+/// The socket buffer is refilled when it holds less than this; late decisions are better decisions.
 const LOW_WATER: usize = 24 * 1024;
-/// Before the link was measured.
+/// Size of a piece before the throughput was measured.
 const FIRST_PIECE: usize = 32 * 1024;
 const SMALL_IN_A_ROW: u32 = 16;
-/// Of so many short records in a row one is a message, if one waits, however many calls and answers do.
+/// One of this many short records in a row is a topic message, if one is queued, regardless of the number of calls and
+/// responses.
 const TURN_OF_DATA: u32 = 4;
-/// The part of the numbers that the peer takes ahead of a missing one which is used for what would not be sent again.
+/// Divisor of the peer's limit on numbers ahead: the part that may be used for records that are not kept for
+/// retransmission.
 const UNKEPT_AHEAD: usize = 4;
 
 #[derive(Debug)]
-struct Sending {
+struct InFlightRecord {
     stream: u32,
     number: u64,
-    /// It is sent again after a lost connection.
+    /// The record is sent again after a lost connection.
     again: bool,
     at: usize,
-    out: Out,
+    out: OutgoingRecord,
 }
 
-/// What goes out over the life of a session.
+/// Send state of a session.
 #[derive(Debug)]
 pub(crate) struct Outgoing {
     next_number: u64,
-    /// The peer has all numbers up to this one.
+    /// The peer has acknowledged all numbers up to this one.
     acknowledged: u64,
     next_stream: u32,
     next_order: u64,
-    /// What the peer takes.
-    peer: Limits,
-    lanes: Lanes,
-    lines: Lines,
-    topics: BTreeMap<u32, Ring<Out>>,
-    /// The last order that was told before a channel's first message.
+    /// Limits of the peer.
+    peer: LinkLimits,
+    lanes: RecordLanes,
+    lines: LineQueue,
+    topics: BTreeMap<u32, Ring<OutgoingRecord>>,
+    /// By channel: the last control record that was pushed before its first message.
     openings: BTreeMap<u32, u64>,
-    /// Topics with something to send; one with a big message under way, or one that is being encoded, is held.
-    turns: Turns<u32>,
-    sending: VecDeque<Sending>,
-    retransmit: Retransmit,
-    /// For all that waits and is kept, but for the last `uncounted` bytes.
+    /// Topics with something to send. A topic whose big message is in flight or being encoded is held.
+    turns: RoundRobin<u32>,
+    sending: VecDeque<InFlightRecord>,
+    retransmit: RetransmitBuffer,
+    /// Memory permit for everything queued and kept, except for the last `uncounted` bytes.
     permit: Permit,
     uncounted: usize,
-    /// Why the session must be given up.
+    /// Why the session must be closed.
     full: Option<String>,
     in_a_row: u32,
     pub(crate) encoding: Encoding,
     piece: usize,
     max_age: Option<i64>,
-    /// Messages dropped so far, by channel.
+    /// Dropped messages by channel.
     pub(crate) dropped: Tally<u32>,
-    /// Channels that the peer knows to be closed.
+    /// Channels whose closing was acknowledged by the peer.
     pub(crate) closed: Vec<u32>,
-    /// Bytes of records given to the socket, over the session.
+    /// Bytes of records given to the socket in this session.
     pub(crate) sent: u64,
 }
 
@@ -108,15 +111,15 @@ impl Outgoing {
             acknowledged: 0,
             next_stream: 0,
             next_order: 0,
-            peer: Limits::default(),
-            lanes: Lanes::default(),
-            lines: Lines::default(),
+            peer: LinkLimits::default(),
+            lanes: RecordLanes::default(),
+            lines: LineQueue::default(),
             topics: BTreeMap::new(),
             openings: BTreeMap::new(),
-            turns: Turns::default(),
+            turns: RoundRobin::default(),
             sending: VecDeque::new(),
-            retransmit: Retransmit::default(),
-            permit: Budget::unlimited().permit(),
+            retransmit: RetransmitBuffer::default(),
+            permit: Budget::without_limit().permit(),
             uncounted: 0,
             full: None,
             in_a_row: 0,
@@ -129,78 +132,79 @@ impl Outgoing {
         }
     }
 
-    /// Counts what waits and is kept in `budget`. Messages and lines that do not fit are dropped; an order, call or answer that
-    /// does not fit is the end of the session.
-    pub(crate) fn within(&mut self, budget: &Budget) {
+    /// Charges what is queued and kept to `budget`. Messages and lines that do not fit are dropped; a control message,
+    /// call or response that does not fit ends the session.
+    pub(crate) fn set_budget(&mut self, budget: &Budget) {
         self.permit = budget.permit();
     }
 
-    /// Why more waits than may: the peer does not take what it must, or does not say that it has.
-    pub(crate) fn is_full(&self) -> Option<&str> {
+    /// Returns why more is queued than allowed: the peer does not receive what it must, or does not acknowledge it.
+    pub(crate) fn overflow_reason(&self) -> Option<&str> {
         self.full.as_deref()
     }
 
-    /// The peer takes so much.
-    pub(crate) fn set_limits(&mut self, peer: Limits) {
-        self.peer = peer.raise();
+    /// Sets the limits announced by the peer.
+    pub(crate) fn set_limits(&mut self, peer: LinkLimits) {
+        self.peer = peer.with_minimums();
     }
 
-    /// The peer has been told of this channel by what was pushed before: no message of it comes earlier.
-    pub(crate) fn opens(&mut self, channel: u32) {
+    /// Marks a channel as announced by the control record pushed before: no message of the channel is sent earlier.
+    pub(crate) fn open_channel(&mut self, channel: u32) {
         self.openings.insert(channel, self.next_order);
         self.encoding.add(channel);
     }
 
-    pub(crate) fn push(&mut self, record: &Record, quality: Quality) {
+    pub(crate) fn push(&mut self, record: &Record, quality: DeliveryMode) {
         let lane = match record {
-            Record::Control(_) => Lane::Control,
-            Record::Answer { .. } => Lane::Answers,
-            Record::Data(_) if quality != Quality::InOrder => Lane::Data,
-            Record::Data(_) | Record::Call { .. } => Lane::Calls,
+            Record::Control(_) => RecordLane::Control,
+            Record::Answer { .. } => RecordLane::Answers,
+            Record::Data(_) if quality != DeliveryMode::InOrder => RecordLane::Data,
+            Record::Data(_) | Record::Call { .. } => RecordLane::Calls,
         };
-        let mut out = self.number(Out::of(record, lane));
-        out.each = quality != Quality::Newest;
-        if lane == Lane::Answers && out.is_big() {
-            out.lane = Lane::LongAnswers;
+        let mut out = self.assign_order(OutgoingRecord::new(record, lane));
+        out.each = quality != DeliveryMode::Newest;
+        if lane == RecordLane::Answers && out.is_big() {
+            out.lane = RecordLane::LongAnswers;
         }
         if out.len() > self.peer.record {
             let (bytes, limit) = (out.len(), self.peer.record);
             tracing::warn!(
                 bytes,
                 limit,
-                "a record is longer than the other end of the link takes, and is left out"
+                "a record is longer than the other end of the link accepts, and was dropped"
             );
             if let Some(channel) = out.channel {
                 self.dropped.add(channel, Cause::Full, 1);
             }
             return;
         }
-        match out.channel.filter(|_| lane == Lane::Data) {
+        match out.channel.filter(|_| lane == RecordLane::Data) {
             Some(channel) => self.push_message(channel, out),
             None => self.push_required(out),
         }
     }
 
-    /// Sends a line that a node has printed, when there is time.
-    pub(crate) fn print(&mut self, line: &Record) {
-        let line = self.number(Out::of(line, Lane::Lines));
+    /// Queues a line printed by a node; it is sent when there is spare capacity.
+    pub(crate) fn push_line(&mut self, line: &Record) {
+        let line = self.assign_order(OutgoingRecord::new(line, RecordLane::Lines));
         self.lines.push(line);
     }
 
-    fn number(&mut self, out: Out) -> Out {
+    fn assign_order(&mut self, out: OutgoingRecord) -> OutgoingRecord {
         self.next_order += 1;
         let order = self.next_order;
-        Out { order, ..out }
+        OutgoingRecord { order, ..out }
     }
 
-    /// Queues what must come. An order, call or answer beyond the limits is the end of the session: to leave one out would be to lose it.
-    fn push_required(&mut self, out: Out) {
+    /// Queues a record that must be delivered. A control message, call or response beyond the limits ends the session,
+    /// because omitting it would lose it.
+    fn push_required(&mut self, out: OutgoingRecord) {
         if self.full.is_some() {
             return;
         }
-        let bytes = out.held();
-        let refused = self.lanes.refuse(out.lane, bytes);
-        let refused = refused.or_else(|| Some(self.count_more(bytes).err()?.to_string()));
+        let bytes = out.memory_size();
+        let refused = self.lanes.overflow_reason(out.lane, bytes);
+        let refused = refused.or_else(|| Some(self.charge(bytes).err()?.to_string()));
         match (refused, out.channel) {
             (None, _) => self.lanes.push(out),
             (Some(_), Some(channel)) => self.dropped.add(channel, Cause::Full, 1),
@@ -208,16 +212,16 @@ impl Outgoing {
         }
     }
 
-    /// Whether the socket has all there is for it.
+    /// Returns whether the socket has been given everything that can be sent.
     pub(crate) fn is_idle(&self) -> bool {
         self.lanes.is_empty()
             && self.lines.is_empty()
             && self.sending.is_empty()
-            && !self.encoding.is_done()
+            && !self.encoding.has_encoded()
             && (self.turns.is_empty() || self.encoding.is_busy())
     }
 
-    /// Whether anything waits.
+    /// Returns whether nothing is queued.
     pub(crate) fn is_empty(&self) -> bool {
         self.lanes.is_empty()
             && self.lines.is_empty()
@@ -226,16 +230,16 @@ impl Outgoing {
             && self.encoding.is_empty()
     }
 
-    /// How many messages wait on each topic.
+    /// Returns the number of messages queued on each topic.
     #[cfg(test)]
-    pub(crate) fn waiting(&self) -> impl Iterator<Item = usize> {
+    pub(crate) fn queue_lengths(&self) -> impl Iterator<Item = usize> {
         self.topics.values().map(Ring::len)
     }
 
-    /// The next frame.
+    /// Returns the next frame to send.
     pub(crate) fn next(&mut self, now: i64) -> Option<Frame> {
-        if self.unacknowledged() >= self.peer.ahead {
-            // The peer takes no further number before what is under way has come.
+        if self.unacknowledged_count() >= self.peer.ahead {
+            // The peer accepts no further number until the records in flight are complete.
             return self.next_piece();
         }
         if let Some(line) = self.next_line(false) {
@@ -259,17 +263,17 @@ impl Outgoing {
         Some(self.start(line, now))
     }
 
-    fn next_line(&mut self, is_alone: bool) -> Option<Out> {
+    fn next_line(&mut self, is_alone: bool) -> Option<OutgoingRecord> {
         let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
-        self.lines.take(is_alone, |out| gate.lets(out))
+        self.lines.take(is_alone, |out| gate.allows(out))
     }
 
-    /// Numbers that were used and that the peer has not said to have, all before them included.
-    pub(crate) fn unacknowledged(&self) -> usize {
+    /// Returns the number of record numbers in use that the peer has not acknowledged.
+    pub(crate) fn unacknowledged_count(&self) -> usize {
         usize::try_from(self.next_number - 1 - self.acknowledged).unwrap_or(usize::MAX)
     }
 
-    fn next_record(&mut self, now: i64) -> Option<Out> {
+    fn next_record(&mut self, now: i64) -> Option<OutgoingRecord> {
         let is_turn_of_data = self.in_a_row % TURN_OF_DATA == TURN_OF_DATA - 1;
         let data = if is_turn_of_data {
             self.next_data(now)
@@ -279,42 +283,42 @@ impl Outgoing {
         let gate = Gate::new(&self.sending, &self.lanes, &self.openings, self.peer);
         let place = data
             .is_none()
-            .then(|| self.lanes.first(|out| gate.lets(out)));
+            .then(|| self.lanes.first_ready(|out| gate.allows(out)));
         let required = place.flatten().and_then(|lane| self.lanes.take(lane));
         data.or(required).or_else(|| self.next_data(now))
     }
 
-    fn start(&mut self, mut out: Out, now: i64) -> Frame {
+    fn start(&mut self, mut out: OutgoingRecord, now: i64) -> Frame {
         if out.channel.is_some() && !out.closes {
             out.head[LEFT_AT..LEFT_AT + 8].copy_from_slice(&now.to_le_bytes());
         }
         let length = out.len();
-        let again = self.retransmit.takes(&out);
-        let number = if again || self.unacknowledged() < self.peer.ahead / UNKEPT_AHEAD {
+        let again = self.retransmit.should_keep(&out);
+        let number = if again || self.unacknowledged_count() < self.peer.ahead / UNKEPT_AHEAD {
             self.next_number += 1;
             self.next_number - 1
         } else {
             0
         };
         if length <= SMALL {
-            self.turn_after(&out);
+            self.end_turn(&out);
             let record = out.piece(0, length);
             self.count_sent(out.lane, length);
             self.retransmit.add(number, again, out);
             return Frame::Whole { number, record };
         }
-        // The topic waits until it is through.
-        if let Some(channel) = out.channel.filter(|_| out.lane == Lane::Data) {
+        // The topic is held until the message has been sent completely.
+        if let Some(channel) = out.channel.filter(|_| out.lane == RecordLane::Data) {
             self.turns.hold(channel);
         }
         let stream = self.next_stream;
         self.next_stream = self.next_stream.wrapping_add(1);
-        // On a quick link a piece may be longer than the record; the rest must not be empty.
+        // On a fast link a piece may be longer than the record; the rest must not be empty.
         let bytes = out.piece(0, self.piece.min(length - 1));
         self.count_sent(out.lane, bytes.len());
         let total = u32::try_from(length).unwrap_or(u32::MAX);
         let at = bytes.len();
-        self.sending.push_back(Sending {
+        self.sending.push_back(InFlightRecord {
             stream,
             number,
             again,
@@ -329,10 +333,10 @@ impl Outgoing {
         }
     }
 
-    fn count_sent(&mut self, lane: Lane, bytes: usize) {
+    fn count_sent(&mut self, lane: RecordLane, bytes: usize) {
         self.sent += bytes as u64;
-        if lane != Lane::Lines {
-            self.lines.earn(bytes);
+        if lane != RecordLane::Lines {
+            self.lines.earn_credit(bytes);
         }
     }
 
@@ -345,31 +349,31 @@ impl Outgoing {
         if sending.at < sending.out.len() {
             self.sending.push_back(sending);
         } else {
-            self.turn_after(&sending.out);
+            self.end_turn(&sending.out);
             self.retransmit
                 .add(sending.number, sending.again, sending.out);
         }
         Some(Frame::More { stream, bytes })
     }
 
-    /// The link carries so many bytes per second.
+    /// Sets the size of pieces for a link with this throughput.
     pub(crate) fn set_throughput(&mut self, bytes_per_second: f64) {
         let piece = (bytes_per_second * PIECE_TIME) as usize;
         self.piece = piece.clamp(PIECES.0, PIECES.1);
     }
 
-    /// Bytes that the socket is to hold before it is given no more: what waits in it, a small message waits for.
+    /// Returns the level in bytes below which the socket buffer is refilled; a small message waits for what is in it.
     pub(crate) fn low_water(&self) -> usize {
         LOW_WATER.min(2 * self.piece)
     }
 
-    /// Begins with this number, which the peer was told to expect.
+    /// Starts numbering at this number, which was announced to the peer.
     pub(crate) fn begin_at(&mut self, number: u64) {
         self.next_number = number.max(1);
         self.acknowledged = self.next_number - 1;
     }
 
-    /// The first number on the next connection.
+    /// Returns the first number of the next connection.
     pub(crate) fn next_number(&self) -> u64 {
         self.next_number
     }

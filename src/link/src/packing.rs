@@ -1,24 +1,28 @@
-//! Messages made smaller on their way: an encoder for each topic that goes out, a decoder for each that comes in.
+//! Compression of topic messages: one encoder for each outgoing topic and one decoder for each incoming topic.
 //!
-//! Encoded is what is about to be sent, not what waits: a picture that a newer one replaces costs nothing, and the
-//! codecs that refer to earlier frames never miss one but by a lost connection. And only while the link is what
-//! holds messages up: over a fast one they are sooner there as they are.
+//! Messages are encoded when they are about to be sent, not when they are queued. An image that is replaced by a newer
+//! one therefore costs nothing, and codecs that refer to earlier frames miss one only when a connection is lost.
+//! Messages are encoded only while the link is the bottleneck: over a fast link they arrive sooner unencoded.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use codec::{Answer, Codec, JpegOptions, Lossy, Policy, Receiver, Schema, Sender, VideoOptions};
+use codec::{
+    Codec, CodecPolicy, JpegOptions, LossyCodec, Receiver, ReceiverFeedback, Schema, Sender,
+    VideoOptions,
+};
 
 use crate::MAX_RECORD;
 
-/// A link this fast, in bytes per second, is never the bottleneck: encoding takes longer than it saves.
+/// Throughput in bytes per second above which the link is not the bottleneck: encoding takes longer than it saves.
 const FAST: f64 = 60e6;
-/// Topics that may be decoded at once.
+/// Maximum number of topics decoded at a time.
 const MAX_TOPICS: usize = 1024;
-/// Part of T_max that encoding and sending may take; if it takes longer, and a lossy codec is allowed, that is used.
+/// Divisor of T_max: the time that encoding and sending may take. If it takes longer, a lossy codec is used where
+/// allowed.
 const SHARE_OF_T_MAX: u32 = 4;
-/// What lossless encoding makes use of.
+/// Codecs used for lossless encoding.
 const LOSSLESS: [Codec; 6] = [
     Codec::Raw,
     Codec::Zstd(3),
@@ -28,53 +32,54 @@ const LOSSLESS: [Codec; 6] = [
     Codec::Cloud,
 ];
 
-/// Those that lose detail of pictures.
+/// Codecs that lose detail of images.
 const LOSSY: [Codec; 2] = [Codec::Jpeg, Codec::Video];
 
-/// The names of the codecs that this side decodes, for the opening frames; of lossy ones those that are welcome.
-pub fn decoded_here(welcome: impl Fn(Codec) -> bool) -> Vec<String> {
-    // Decoding is built with encoding.
+/// Returns the names of the codecs that this end can decode, for the opening frames; of the lossy ones, those for which
+/// `welcome` returns true.
+pub fn supported_codecs(welcome: impl Fn(Codec) -> bool) -> Vec<String> {
+    // A decoder is built together with its encoder.
     let lossy = LOSSY
         .into_iter()
-        .filter(|codec| codec.is_built() && welcome(*codec));
+        .filter(|codec| codec.is_available() && welcome(*codec));
     let all = LOSSLESS.into_iter().chain(lossy);
     all.map(|codec| codec.name().to_owned()).collect()
 }
 
-/// A topic's encoder.
+/// The encoder of a topic.
 #[derive(Debug)]
-struct Lane {
+struct TopicEncoder {
     schema: Schema,
-    /// None while it is at work.
+    /// `None` while it is in use.
     sender: Option<Sender>,
-    /// What came while it was at work.
-    answers: Vec<Answer>,
+    /// Replies of the receiver that arrived while it was in use.
+    answers: Vec<ReceiverFeedback>,
     begin_anew: bool,
 }
 
-/// One message to be encoded, with all that is needed for it: it is done on another thread.
-pub(crate) struct Job {
+/// A message to be encoded together with its encoder; it is encoded on another thread.
+pub(crate) struct EncodeJob {
     channel: u32,
     sender: Sender,
     message: Bytes,
 }
 
-/// What came of it.
-pub(crate) struct Packed {
+/// The result of encoding a message.
+pub(crate) struct EncodedMessage {
     channel: u32,
     sender: Sender,
     pub(crate) frame: Bytes,
     pub(crate) took: Duration,
 }
 
-impl Job {
-    /// Encodes.
-    pub(crate) fn run(mut self) -> Packed {
+impl EncodeJob {
+    /// Encodes the message.
+    pub(crate) fn run(mut self) -> EncodedMessage {
         let begun = Instant::now();
         let mut frame = Vec::new();
         self.sender
             .encode(&self.message, || begun.elapsed(), &mut frame);
-        Packed {
+        EncodedMessage {
             channel: self.channel,
             sender: self.sender,
             frame: frame.into(),
@@ -83,19 +88,19 @@ impl Job {
     }
 }
 
-/// The codecs of a session.
+/// The encoders and decoders of a session.
 #[derive(Debug, Default)]
-pub(crate) struct Packing {
+pub(crate) struct SessionCodecs {
     lossless: bool,
     lossy: Option<Codec>,
     jpeg: JpegOptions,
     deadline: Option<Duration>,
-    lanes: HashMap<u32, Lane>,
+    lanes: HashMap<u32, TopicEncoder>,
     receivers: HashMap<u32, Receiver>,
 }
 
-impl Packing {
-    /// For a link on which messages are answered within `t_max`.
+impl SessionCodecs {
+    /// Creates the codecs for a link with this maximum response time.
     pub(crate) fn new(t_max: Option<Duration>) -> Self {
         Self {
             deadline: t_max.map(|t_max| t_max / SHARE_OF_T_MAX),
@@ -103,21 +108,21 @@ impl Packing {
         }
     }
 
-    /// Sets the quality of JPEG pictures, 1 to 100; none: 80.
+    /// Sets the quality of JPEG images, 1 to 100 (default: 80).
     pub(crate) fn set_quality(&mut self, quality: Option<u8>) {
         self.jpeg = quality.map_or_else(JpegOptions::default, |quality| JpegOptions { quality });
     }
 
-    /// The peer decodes these.
-    pub(crate) fn peer_decodes(&mut self, names: &[String]) {
+    /// Sets the codecs that the peer can decode.
+    pub(crate) fn set_peer_codecs(&mut self, names: &[String]) {
         let has = |codec: &Codec| names.iter().any(|name| name == codec.name());
         self.lossless = LOSSLESS.iter().all(has);
         self.lossy = LOSSY.into_iter().find(has);
     }
 
-    /// A topic's messages are of this schema.
+    /// Adds an outgoing topic with messages of this schema.
     pub(crate) fn add(&mut self, channel: u32, schema: Schema) {
-        let lane = Lane {
+        let lane = TopicEncoder {
             schema,
             sender: None,
             answers: Vec::new(),
@@ -130,86 +135,86 @@ impl Packing {
         self.lanes.remove(&channel);
     }
 
-    pub(crate) fn peer_closed(&mut self, channel: u32) {
+    pub(crate) fn on_peer_closed(&mut self, channel: u32) {
         self.receivers.remove(&channel);
     }
 
-    /// Whether encoding pays on a link that carries so many bytes per second; none: it never had to hurry.
-    pub(crate) fn pays(&self, throughput: Option<f64>) -> bool {
+    /// Returns whether encoding is worthwhile at this throughput in bytes per second; `None`: the link was never busy.
+    pub(crate) fn is_worthwhile(&self, throughput: Option<f64>) -> bool {
         self.lossless && throughput.is_some_and(|rate| rate < FAST)
     }
 
-    /// What is needed to encode a message, alone if it must be understood without those before.
-    pub(crate) fn job(
+    /// Creates the job that encodes a message. If `alone` is set, the result is decodable without earlier frames.
+    pub(crate) fn encode_job(
         &mut self,
         channel: u32,
         message: Bytes,
         alone: bool,
         throughput: Option<f64>,
-    ) -> Option<Job> {
+    ) -> Option<EncodeJob> {
         let lane = self.lanes.get_mut(&channel)?;
         let policy = match self.lossy {
-            Some(Codec::Jpeg) => Policy::Lossy(Lossy::Jpeg(self.jpeg)),
-            Some(Codec::Video) => Policy::Lossy(Lossy::Video(VideoOptions::default())),
-            _ => Policy::Lossless,
+            Some(Codec::Jpeg) => CodecPolicy::Lossy(LossyCodec::Jpeg(self.jpeg)),
+            Some(Codec::Video) => CodecPolicy::Lossy(LossyCodec::Video(VideoOptions::default())),
+            _ => CodecPolicy::Lossless,
         };
         let (schema, deadline) = (lane.schema, self.deadline);
         let mut sender = lane
             .sender
             .take()
-            .unwrap_or_else(|| Sender::new(schema, policy).within(deadline));
+            .unwrap_or_else(|| Sender::new(schema, policy).with_deadline(deadline));
         if std::mem::take(&mut lane.begin_anew) {
-            sender.reconnected();
+            sender.on_reconnect();
         }
         for answer in lane.answers.drain(..) {
-            sender.answered(answer);
+            sender.on_feedback(answer);
         }
         if alone {
-            sender.answered(Answer::Keyframe);
+            sender.on_feedback(ReceiverFeedback::Keyframe);
         }
         if let Some(rate) = throughput {
-            sender.sent(
+            sender.record_transfer(
                 1 << 20,
                 Duration::from_secs_f64(f64::from(1 << 20) / rate.max(1.0)),
             );
         }
-        Some(Job {
+        Some(EncodeJob {
             channel,
             sender,
             message,
         })
     }
 
-    /// It was encoded.
-    pub(crate) fn done(&mut self, packed: Packed) -> Bytes {
+    /// Returns the encoder to its topic and the frame to the caller.
+    pub(crate) fn finish(&mut self, packed: EncodedMessage) -> Bytes {
         if let Some(lane) = self.lanes.get_mut(&packed.channel) {
             lane.sender = Some(packed.sender);
         }
         packed.frame
     }
 
-    /// The peer has answered a frame.
-    pub(crate) fn answered(&mut self, channel: u32, answer: Answer) {
+    /// Passes the receiver's reply about a frame to the encoder.
+    pub(crate) fn on_answer(&mut self, channel: u32, answer: ReceiverFeedback) {
         if let Some(lane) = self.lanes.get_mut(&channel) {
-            // Twice the same tells no more.
+            // Duplicates carry no information.
             lane.answers.retain(|earlier| *earlier != answer);
             lane.answers.push(answer);
         }
     }
 
-    /// What was under way on the last connection may be lost: the next frames refer to none before.
+    /// Starts anew on another connection: frames in flight may be lost, so the next ones refer to no earlier ones.
     pub(crate) fn reconnect(&mut self) {
         for lane in self.lanes.values_mut() {
             lane.begin_anew = true;
         }
     }
 
-    /// Decodes what came; what to answer.
-    pub(crate) fn unpack(
+    /// Decodes a frame; returns the message and the reply to send.
+    pub(crate) fn decode(
         &mut self,
         channel: u32,
         frame: &[u8],
-    ) -> (Result<Bytes, codec::Error>, Option<Answer>) {
+    ) -> (Result<Bytes, codec::Error>, Option<ReceiverFeedback>) {
         if self.receivers.len() >= MAX_TOPICS && !self.receivers.contains_key(&channel) {
             self.receivers.clear();
         }

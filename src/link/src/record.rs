@@ -1,11 +1,13 @@
-//! What the two ends of a link tell each other, as bytes.
+//! Encoding of the records that the two ends of a link exchange.
 //!
 //! | first byte | then |
 //! |---|---|
-//! | 0 control | JSON, an order [`FromRobot`](crate::control::FromRobot) or [`FromCloud`](crate::control::FromCloud) |
-//! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · [answered: born i64 · serialise u32 · left i64 · taken i64 · given i64] · message |
+//! | 0 control | JSON, [`FromRobot`](crate::control::FromRobot) or [`FromCloud`](crate::control::FromCloud) |
+//! | 1 data | channel u32 · flags u8 · born i64 · left i64 · serialise u32 · answered (optional) · message |
 //! | 2 call | id u32 · service u32 · request |
-//! | 3 answer | id u32 · ok u8 · taken i64 · given i64 · response, or why not |
+//! | 3 answer | id u32 · ok u8 · taken i64 · given i64 · response, or the reason why there is none |
+//!
+//! where answered, present if its flag is set, is: born i64 · serialise u32 · left i64 · taken i64 · given i64
 
 use budget::Permit;
 use bytes::{Buf, BufMut, Bytes, BytesMut};
@@ -20,100 +22,100 @@ const ANSWER: u8 = 3;
 pub(crate) const ENCODED: u8 = 1;
 const ANSWERED: u8 = 2;
 const LATCHING: u8 = 4;
-/// Where `left` stands in a data record's head.
+/// Offset of `left` in the header of a data record.
 pub(crate) const LEFT_AT: usize = 14;
-/// And `flags`, and `serialise`.
+/// Offsets of `flags` and `serialise`.
 pub(crate) const FLAGS_AT: usize = 5;
 pub(crate) const SERIALISE_AT: usize = 22;
 
-/// One thing told. `C` is what control records hold: JSON on the wire, what the peer orders behind its session.
+/// A record. `C` is the content of a control record: JSON on the wire, a parsed message above the session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Record<C = Bytes> {
-    /// JSON, or the order that it is.
+    /// A control message.
     Control(C),
-    /// A message of a topic.
+    /// A topic message.
     Data(Data),
     /// A service call.
     Call {
-        /// Chosen by the caller's end.
+        /// Id chosen by the caller's end.
         id: u32,
-        /// The channel of the service.
+        /// Channel of the service.
         service: u32,
-        /// Serialized.
+        /// Serialized request.
         request: Bytes,
     },
-    /// Its answer.
+    /// The response to a call.
     Answer {
-        /// The call's.
+        /// Id of the call.
         id: u32,
-        /// When the call had arrived, on the answering end's clock.
+        /// Time at which the call was received, on the clock of the answering end.
         taken: i64,
-        /// When the answer was there, on the same clock.
+        /// Time at which the response was available, on the same clock.
         given: i64,
-        /// The serialized response, or why there is none.
+        /// Serialized response, or the reason why there is none.
         response: Result<Bytes, String>,
     },
 }
 
-/// A call that has come.
+/// A received call.
 #[derive(Debug)]
-pub struct Called {
-    /// Chosen by the caller's end.
+pub struct ReceivedCall {
+    /// Id chosen by the caller's end.
     pub id: u32,
-    /// The channel of the service.
+    /// Channel of the service.
     pub service: u32,
-    /// Serialized.
+    /// Serialized request.
     pub request: Bytes,
-    /// It counts as the other end's until it is answered.
+    /// Memory permit charged to the peer until the call is answered.
     pub held: Permit,
-    /// When it had come as a whole (nanoseconds since 1970).
+    /// Time at which it had been received completely (nanoseconds since the Unix epoch).
     pub taken: i64,
 }
 
-/// A message of a topic.
+/// A topic message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Data {
-    /// Which, as `Open` or `Graph` said.
+    /// Channel announced by `Open` or `Graph`.
     pub channel: u32,
-    /// `message` is a frame of a codec.
+    /// The message is an encoded frame.
     pub encoded: bool,
-    /// Its publisher gives newcomers the last message.
+    /// The publisher is latching: new subscribers receive the last message.
     pub latching: bool,
-    /// When the sender had it from ROS, on the sender's clock.
+    /// Time at which the sender received it from ROS, on the sender's clock.
     pub born: i64,
-    /// When its first byte was given to the socket, on the sender's clock.
+    /// Time at which its first byte was given to the socket, on the sender's clock.
     pub left: i64,
-    /// Microseconds spent encoding it.
+    /// Encoding time in microseconds.
     pub serialise: u32,
-    /// From the cloud: the input that this may be an answer to.
-    pub answered: Option<Answered>,
-    /// Serialized.
+    /// From the cloud: the input to which this may be the response.
+    pub answered: Option<InputTiming>,
+    /// Serialized message.
     pub message: Bytes,
 }
 
-/// The way of an input through the cloud.
+/// Timing of an input on its way through the cloud.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Answered {
-    /// The input's own `born`, on the robot's clock: which one it was.
+pub struct InputTiming {
+    /// Value of `born` of the input, on the robot's clock; identifies the input.
     pub born: i64,
-    /// Microseconds that the robot spent encoding it.
+    /// The robot's encoding time in microseconds.
     pub serialise: u32,
-    /// When its first byte was given to the socket, on the robot's clock.
+    /// Time at which its first byte was given to the socket, on the robot's clock.
     pub left: i64,
-    /// When it had arrived as a whole, on the cloud's clock.
+    /// Time at which it had been received completely, on the cloud's clock.
     pub taken: i64,
-    /// When it was given to the node, on the cloud's clock.
+    /// Time at which it was given to the node, on the cloud's clock.
     pub given: i64,
 }
 
-/// Whether a record that begins so is a control record.
+/// Returns whether a record that begins with these bytes is a control record.
 pub(crate) fn is_control(bytes: &[u8]) -> bool {
     bytes.first() == Some(&CONTROL)
 }
 
 impl Record {
-    /// The same with the order that `read` makes of its JSON; none where that makes none.
-    pub(crate) fn read<C, E>(
+    /// Converts the JSON of a control record with `read`. Returns `None` if `read` does.
+    pub(crate) fn try_map_control<C, E>(
         self,
         read: impl FnOnce(Bytes) -> Result<Option<C>, E>,
     ) -> Result<Option<Record<C>>, E> {
@@ -146,8 +148,8 @@ impl Record {
         }))
     }
 
-    /// Head and payload, in this order on the wire.
-    pub fn parts(&self) -> (BytesMut, Bytes) {
+    /// Returns header and payload, in this order on the wire.
+    pub fn to_parts(&self) -> (BytesMut, Bytes) {
         let mut head = BytesMut::with_capacity(64);
         let payload = match self {
             Record::Control(json) => {
@@ -203,7 +205,7 @@ impl Record {
         (head, payload)
     }
 
-    /// Reads a record; its payload is cut from `bytes`, not copied.
+    /// Decodes a record. Its payload is a slice of `bytes`, not a copy.
     pub fn decode(mut bytes: Bytes) -> Result<Self, Error> {
         let short = || Error::Protocol("a record that ends in its head");
         let Some(&kind) = bytes.first() else {
@@ -234,7 +236,7 @@ impl Record {
                     born: bytes.get_i64_le(),
                     left: bytes.get_i64_le(),
                     serialise: bytes.get_u32_le(),
-                    answered: (flags & ANSWERED != 0).then(|| Answered {
+                    answered: (flags & ANSWERED != 0).then(|| InputTiming {
                         born: bytes.get_i64_le(),
                         serialise: bytes.get_u32_le(),
                         left: bytes.get_i64_le(),
@@ -275,7 +277,7 @@ mod tests {
         bytes.iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// These bytes are what stubs in the field send. If this fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
+    /// The bytes that deployed stubs send. If this test fails, see [`SUBPROTOCOL`](crate::SUBPROTOCOL).
     #[test]
     fn the_bytes_of_records_are_those_of_this_version() {
         assert_eq!(crate::SUBPROTOCOL, "cloudroid-link.v2");
@@ -292,7 +294,7 @@ mod tests {
         let answered = Data {
             encoded: false,
             latching: true,
-            answered: Some(Answered {
+            answered: Some(InputTiming {
                 born: 1,
                 serialise: 2,
                 left: 3,
@@ -315,7 +317,8 @@ mod tests {
             ),
             (
                 Record::Data(answered),
-                "01 04030201 06 1817161514131211 feffffffffffffff 24232221 0100000000000000 02000000 0300000000000000 0400000000000000 0500000000000000 6d7367",
+                "01 04030201 06 1817161514131211 feffffffffffffff 24232221 0100000000000000 02000000 0300000000000000 \
+                 0400000000000000 0500000000000000 6d7367",
             ),
             (
                 Record::Call {
@@ -335,7 +338,7 @@ mod tests {
             ),
         ];
         for (record, expected) in pinned {
-            let (mut head, payload) = record.parts();
+            let (mut head, payload) = record.to_parts();
             head.extend_from_slice(&payload);
             assert_eq!(hex(&head), expected.replace(' ', ""), "{record:?}");
             assert_eq!(Record::decode(head.freeze()).unwrap(), record);
@@ -343,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn records_come_back() {
+    fn records_round_trip() {
         let data = Data {
             channel: 3,
             encoded: true,
@@ -357,7 +360,7 @@ mod tests {
         let answered = Data {
             encoded: false,
             latching: true,
-            answered: Some(Answered {
+            answered: Some(InputTiming {
                 born: 1,
                 serialise: 4,
                 left: 5,
@@ -388,7 +391,7 @@ mod tests {
                 response: Err("no".into()),
             },
         ] {
-            let (mut head, payload) = record.parts();
+            let (mut head, payload) = record.to_parts();
             head.extend_from_slice(&payload);
             let whole = head.freeze();
             assert_eq!(Record::decode(whole.clone()).unwrap(), record);

@@ -17,52 +17,52 @@ use serde::Serialize;
 use tokio::sync::{Notify, watch};
 use tokio::time::{Instant, timeout};
 
-use crate::clock::{Clock, Sample, now};
-use crate::control::{Between, FromCloud, FromRobot, Order};
-use crate::drops::{Cause, Drop, Dropped, Tally};
-use crate::frame::Received;
+use crate::clock::{ClockFilter, ClockSample, now};
+use crate::control::{ControlMessage, FromCloud, FromRobot, SessionMessage};
+use crate::drops::{Cause, SkipCounts, Tally, TopicDropCount};
+use crate::frame::ReceiveProgress;
 use crate::incoming::Incoming;
-use crate::outgoing::{Outgoing, Quality};
-use crate::packing::Packing;
+use crate::outgoing::{DeliveryMode, Outgoing};
+use crate::packing::SessionCodecs;
 use crate::record::{Data, Record};
-use crate::{Error, Limits, MAX_RECORD, MAX_TOLD, control};
+use crate::{Error, LinkLimits, MAX_RECORD, MAX_TOLD, control};
 
 pub use opening::{receive_open, send_open};
-use throughput::{Counters, Throughput};
+use throughput::{Counters, ThroughputEstimator};
 
-/// No link is watched more closely.
+/// Minimum silence timeout.
 const SHORTEST: Duration = Duration::from_millis(50);
-/// A connection is given up after so much silence, at least and at most.
+/// Minimum and maximum silence after which a connection is closed.
 const LOST: (Duration, Duration) = (Duration::from_secs(3), Duration::from_secs(20));
 
-/// What errors call the memory for orders.
+/// Name of the memory for control messages in errors.
 const TOLD: &str = "what the other end of a link tells";
 
-/// The longest response, for which there is room in a record.
+/// Maximum length of a response that fits into a record.
 const MAX_RESPONSE: usize = MAX_RECORD - 1024;
 
-/// And the memory for calls, half of a session's: what is under way has room beside them.
+/// Name of the memory for calls in errors; it is half of a session's, which leaves room for records in flight.
 const CALLED: &str = "calls of the other end of a link";
 
-/// How a session's connections are watched.
+/// Supervision of a session's connections.
 #[derive(Debug, Clone)]
 pub struct SessionOptions {
-    /// Between pings while nothing else comes.
+    /// Ping interval while nothing else is received.
     pub ping: Duration,
-    /// Without a sign of the peer for so long the link counts as down.
+    /// Time without a sign of the peer after which the link counts as down.
     pub silent: Duration,
-    /// Without a sign of the peer for so long the connection is given up.
+    /// Time without a sign of the peer after which the connection is closed.
     pub lost: Duration,
-    /// A message older than this is not sent when a newer one waits.
+    /// Age above which a message is not sent if a newer one is queued.
     pub max_age: Option<Duration>,
 }
 
 impl SessionOptions {
-    /// Habits of a side that wants to know within `silent` that the link carries nothing any more.
+    /// Creates options that detect a dead link within `silent`.
     pub fn for_silence(silent: Duration, max_age: Option<Duration>) -> Self {
         let silent = silent.max(SHORTEST);
         Self {
-            // A ping is out, and its pong awaited, within that time.
+            // A ping is sent and its pong expected within that time.
             ping: (silent / 2).min(Duration::from_secs(2)),
             silent,
             lost: (silent * 10).clamp(LOST.0, LOST.1),
@@ -71,58 +71,63 @@ impl SessionOptions {
     }
 }
 
-/// How a connection ended.
+/// Reason why a connection ended.
 #[derive(Debug, thiserror::Error)]
-pub enum Lost {
-    /// This side wanted it.
+pub enum DisconnectReason {
+    /// This end closed the session.
     #[error("this side ended the link")]
     Ended,
-    /// The peer closed it in good order.
+    /// The peer closed the connection.
     #[error("the other end closed the link ({code}: {reason})")]
     Closed {
         /// WebSocket close code.
         code: u16,
-        /// Its words.
+        /// Reason given by the peer.
         reason: String,
     },
     /// The socket failed.
     #[error("the connection was lost: {0}")]
     Socket(String),
-    /// Nothing came.
-    #[error("nothing came from the other end for {0:?}")]
+    /// Nothing was received for this time.
+    #[error("nothing was received from the other end for {0:?}")]
     Silent(Duration),
-    /// The peer makes no sense.
+    /// The peer violated the protocol.
     #[error(transparent)]
     Protocol(#[from] Error),
-    /// More waits for the peer than may; says what.
-    #[error("the other end takes too little: {0}")]
+    /// More is queued for the peer than allowed; says what.
+    #[error("the other end reads too slowly: {0}")]
     Full(String),
 }
 
-impl Lost {
-    /// What the other end is told, where it can still be told something: a WebSocket close code and the reason.
-    pub fn goodbye(&self) -> Option<(u16, String)> {
+impl DisconnectReason {
+    /// Returns the WebSocket close code and reason to send to the peer, if the connection still works.
+    pub fn close_frame(&self) -> Option<(u16, String)> {
         match self {
-            Lost::Protocol(Error::Refused { code, reason }) => Some((*code, reason.clone())),
-            Lost::Protocol(error @ Error::Exceeded(_)) => Some((1013, error.to_string())),
-            Lost::Protocol(error) => Some((1002, error.to_string())),
-            Lost::Full(_) => Some((1013, self.to_string())),
+            DisconnectReason::Protocol(Error::Refused { code, reason }) => {
+                Some((*code, reason.clone()))
+            }
+            DisconnectReason::Protocol(error @ Error::Exceeded(_)) => {
+                Some((1013, error.to_string()))
+            }
+            DisconnectReason::Protocol(error) => Some((1002, error.to_string())),
+            DisconnectReason::Full(_) => Some((1013, self.to_string())),
             _ => None,
         }
     }
 }
 
-/// Takes what comes from an end that gives orders `O`.
-pub trait Handler<O>: Sync {
-    /// A record, and when it had come as a whole (nanoseconds since 1970). An order or call counts in the session's budget until `held` is
-    /// dropped: it is kept until the order is obeyed, the call answered. Must not block.
-    fn record(&self, record: Record<O>, held: Permit, arrived: i64);
-    /// A message of this channel came that cannot be decoded.
-    fn undecodable(&self, channel: u32) {
+/// Receives what a peer sends whose control messages are of type `O`.
+pub trait SessionHandler<O>: Sync {
+    /// Handles a record that had been received completely at `arrived` (nanoseconds since the Unix epoch). A control
+    /// message or call is charged to the session's budget until `held` is dropped, so `held` is kept until the message
+    /// is processed or the call answered. Must not block.
+    fn on_record(&self, record: Record<O>, held: Permit, arrived: i64);
+    /// Handles a message of this channel that cannot be decoded.
+    fn on_undecodable(&self, channel: u32) {
         let _ = channel;
     }
-    /// The peer's clock was compared with ours once more; `best` is what is believed.
-    fn clock(&self, best: Sample) {
+    /// Handles a new measurement of the peer's clock; `best` is the current estimate.
+    fn on_clock_sample(&self, best: ClockSample) {
         let _ = best;
     }
 }
@@ -132,20 +137,21 @@ pub type RobotSession = Session<FromRobot>;
 /// The cloud's end of a session.
 pub type CloudSession = Session<FromCloud>;
 
-/// What two ends know of each other, whichever connection carries it. This one gives orders `O`.
+/// State shared by two ends, independent of the connection that carries it. This end sends control messages of type
+/// `O`.
 pub struct Session<O> {
     options: SessionOptions,
     state: Mutex<State>,
     wake: Notify,
     up: watch::Sender<bool>,
-    /// Somebody wants to know whether the peer is there.
+    /// Set by [`probe`](Self::probe) to request a ping.
     asked: AtomicBool,
-    /// Pongs so far.
+    /// Number of pongs received so far.
     pongs: watch::Sender<u64>,
     next_call: AtomicU32,
-    /// Where the peer's orders count until they are obeyed.
+    /// Budget for the peer's control messages until they are processed.
     told: Budget,
-    /// Where its calls count until they are answered.
+    /// Budget for the peer's calls until they are answered.
     called: Budget,
     orders: PhantomData<fn(O)>,
 }
@@ -153,18 +159,18 @@ pub struct Session<O> {
 struct State {
     out: Outgoing,
     incoming: Incoming,
-    clock: Clock,
-    packing: Packing,
-    throughput: Throughput,
-    ending: Option<Ending>,
-    /// What this side's channels stand for, until the peer knows that they are gone.
+    clock: ClockFilter,
+    packing: SessionCodecs,
+    throughput: ThroughputEstimator,
+    ending: Option<RequestedClose>,
+    /// Topics of this end's channels, until the peer knows that they are closed.
     topics: BTreeMap<u32, String>,
-    /// What was dropped of those that are gone.
+    /// Drop counts of channels that are closed.
     dropped: Tally<String>,
 }
 
-/// How this side has ended the session.
-struct Ending {
+/// How this end closes the session.
+struct RequestedClose {
     /// WebSocket close code.
     code: u16,
     reason: String,
@@ -172,8 +178,8 @@ struct Ending {
 }
 
 impl State {
-    /// Forgets channels that the peer knows to be closed, but for what was dropped of them.
-    fn let_go(&mut self) {
+    /// Forgets channels that the peer knows to be closed, except for their drop counts.
+    fn forget_closed(&mut self) {
         for channel in std::mem::take(&mut self.out.closed) {
             self.packing.remove(channel);
             let Some(topic) = self.topics.remove(&channel) else {
@@ -186,21 +192,21 @@ impl State {
     }
 }
 
-impl<O: Order> Session<O> {
-    /// A session without a connection.
+impl<O: ControlMessage> Session<O> {
+    /// Creates a session without a connection.
     pub fn new(options: SessionOptions) -> Self {
         let age = options
             .max_age
             .map(|age| i64::try_from(age.as_nanos()).unwrap_or(i64::MAX));
-        let packing = Packing::new(options.max_age);
+        let packing = SessionCodecs::new(options.max_age);
         Self {
             options,
             state: Mutex::new(State {
                 out: Outgoing::new(age),
                 incoming: Incoming::default(),
-                clock: Clock::default(),
+                clock: ClockFilter::default(),
                 packing,
-                throughput: Throughput::default(),
+                throughput: ThroughputEstimator::default(),
                 ending: None,
                 topics: BTreeMap::new(),
                 dropped: Tally::default(),
@@ -211,71 +217,72 @@ impl<O: Order> Session<O> {
             pongs: watch::Sender::new(0),
             next_call: AtomicU32::new(1),
             told: Budget::new(TOLD, MAX_TOLD),
-            called: Budget::unlimited(),
+            called: Budget::without_limit(),
             orders: PhantomData,
         }
     }
 
-    /// Counts records that are arriving in `budget`, and orders until they are obeyed; one that does not fit ends its connection. Counts
-    /// calls until they are answered; one that does not fit fails. Counts what waits for the peer,
-    /// too: messages that do not fit are dropped, a call or answer that does not fit ends the session.
-    pub fn within(mut self, budget: &Budget) -> Self {
-        self.told = budget.within(TOLD, MAX_TOLD);
-        self.called = budget.within(CALLED, budget.most() / 2);
+    /// Charges memory to `budget`: incomplete records, where one that does not fit ends its connection; control
+    /// messages until they are processed; calls until they are answered, where one that does not fit fails; and what is
+    /// queued for the peer, where messages that do not fit are dropped and a call or response that does not fit ends
+    /// the session.
+    pub fn with_budget(mut self, budget: &Budget) -> Self {
+        self.told = budget.child(TOLD, MAX_TOLD);
+        self.called = budget.child(CALLED, budget.max_permit() / 2);
         {
             let mut state = self.state.lock();
-            state.incoming = Incoming::within(budget);
-            state.out.within(budget);
+            state.incoming = Incoming::with_budget(budget);
+            state.out.set_budget(budget);
         }
         self
     }
 
-    /// Whether the peer is there, now and later.
-    pub fn up(&self) -> watch::Receiver<bool> {
+    /// Returns a watch on whether the peer is connected.
+    pub fn watch_up(&self) -> watch::Receiver<bool> {
         self.up.subscribe()
     }
 
-    /// Whether the peer is there now. Nothing stays borrowed: a second look in the same expression, with a change that waits
-    /// between the two, would wait for ever.
+    /// Returns whether the peer is connected now. Does not keep the watch borrowed: a second access in the same
+    /// expression, with a change waiting in between, would deadlock.
     pub fn is_up(&self) -> bool {
         *self.up.borrow()
     }
 
-    /// Asks the peer for a sign, and tells whether it gives one within `limit`, by whichever connection.
-    pub async fn is_there(&self, limit: Duration) -> bool {
+    /// Sends a ping and returns whether a pong arrives within `limit`, over any connection.
+    pub async fn probe(&self, limit: Duration) -> bool {
         let mut pongs = self.pongs.subscribe();
         self.asked.store(true, Ordering::Relaxed);
         self.wake.notify_one();
         timeout(limit, pongs.changed()).await.is_ok()
     }
 
-    /// The peer's clock against ours.
-    pub fn clock(&self) -> Option<Sample> {
+    /// Returns the estimate of the peer's clock.
+    pub fn clock(&self) -> Option<ClockSample> {
         self.state.lock().clock.best()
     }
 
-    /// The last round trip in nanoseconds.
+    /// Returns the last round-trip time in nanoseconds.
     pub fn round_trip(&self) -> Option<i64> {
         self.state.lock().clock.last_delay()
     }
 
-    /// Bytes per second that the link carried when it had to.
+    /// Returns the throughput of the link in bytes per second, measured while it was busy.
     pub fn throughput(&self) -> Option<f64> {
-        self.state.lock().throughput.known()
+        self.state.lock().throughput.estimate()
     }
 
-    /// Messages not sent so far, since newer ones had come or they were too old.
-    pub fn dropped(&self) -> Dropped {
+    /// Returns the numbers of messages that were not sent because newer ones had arrived or they were too old.
+    pub fn skip_counts(&self) -> SkipCounts {
         let state = self.state.lock();
-        let of = |cause| state.out.dropped.because_of(cause) + state.dropped.because_of(cause);
-        Dropped {
+        let of = |cause| state.out.dropped.count_for(cause) + state.dropped.count_for(cause);
+        SkipCounts {
             replaced: of(Cause::Replaced),
             stale: of(Cause::Stale),
         }
     }
 
-    /// Messages that did not get to the peer so far.
-    pub fn drops(&self) -> Vec<Drop> {
+    /// Returns the numbers of messages that did not reach the peer.
+    pub fn drops(&self) -> Vec<TopicDropCount> {
         let state = self.state.lock();
         let mut all = state.dropped.clone();
         for (channel, cause, count) in state.out.dropped.iter() {
@@ -283,43 +290,43 @@ impl<O: Order> Session<O> {
                 all.add(topic.clone(), cause, count);
             }
         }
-        all.drops()
+        all.per_topic()
     }
 
-    /// Bytes of records sent so far, and that came.
+    /// Returns the numbers of bytes of records sent and received so far.
     pub fn traffic(&self) -> (u64, u64) {
         let state = self.state.lock();
-        (state.out.sent, state.incoming.received().bytes)
+        (state.out.sent, state.incoming.progress().bytes)
     }
 
-    /// Tells the peer something; it will come, in order, over however many connections. A line of a node comes when there is time, or is left
-    /// out, which the next line tells.
-    pub fn report(&self, order: &O) {
+    /// Sends a control message. It will be delivered, in order, over any number of connections. A line of a node is
+    /// sent when there is spare capacity, or omitted, which the next line reports.
+    pub fn send_control(&self, order: &O) {
         let Some(record) = control_record(order) else {
             return;
         };
         let out = &mut self.state.lock().out;
         if order.is_line() {
-            out.print(&record);
+            out.push_line(&record);
         } else {
-            out.push(&record, Quality::Each);
+            out.push(&record, DeliveryMode::Each);
         }
         self.wake.notify_one();
     }
 
-    /// Has the peer's session send a frame that refers to none before it.
-    fn ask_for_keyframe(&self, channel: u32) {
-        if let Some(record) = control_record(&Between::Keyframe { channel }) {
-            self.push(&record, Quality::Each);
+    /// Requests a frame from the peer's session that refers to no earlier one.
+    fn request_keyframe(&self, channel: u32) {
+        if let Some(record) = control_record(&SessionMessage::Keyframe { channel }) {
+            self.push(&record, DeliveryMode::Each);
         }
     }
 
-    /// Sends a message of a topic.
-    pub fn publish(&self, data: Data, quality: Quality) {
+    /// Sends a topic message.
+    pub fn publish(&self, data: Data, quality: DeliveryMode) {
         self.push(&Record::Data(data), quality);
     }
 
-    /// Calls a service; the answer comes as a record with the id that is returned.
+    /// Calls a service. The response arrives as a record with the returned id.
     pub fn call(&self, service: u32, request: Bytes) -> u32 {
         let id = self.next_call.fetch_add(1, Ordering::Relaxed);
         let call = Record::Call {
@@ -327,11 +334,11 @@ impl<O: Order> Session<O> {
             service,
             request,
         };
-        self.push(&call, Quality::Each);
+        self.push(&call, DeliveryMode::Each);
         id
     }
 
-    /// Answers a call that had arrived at `taken` (nanoseconds since 1970).
+    /// Answers a call that was received at `taken` (nanoseconds since the Unix epoch).
     pub fn answer(&self, id: u32, taken: i64, response: Result<Bytes, String>) {
         let response = response.and_then(|response| match response.len() {
             0..MAX_RESPONSE => Ok(response),
@@ -345,56 +352,57 @@ impl<O: Order> Session<O> {
             given: now(),
             response,
         };
-        self.push(&answer, Quality::Each);
+        self.push(&answer, DeliveryMode::Each);
     }
 
-    /// This side will send a topic's messages as this channel, of which the peer was told just now. They may be made smaller, by what is known of their
-    /// type.
-    pub fn opens(&self, channel: u32, topic: &str, schema: codec::Schema) {
+    /// Opens a channel for sending messages of a topic, which was just announced to the peer. Messages may be
+    /// compressed according to `schema`.
+    pub fn open_channel(&self, channel: u32, topic: &str, schema: codec::Schema) {
         let mut state = self.state.lock();
         state.topics.insert(channel, topic.to_owned());
         state.packing.add(channel, schema);
-        state.out.opens(channel);
+        state.out.open_channel(channel);
     }
 
-    /// Quality of JPEG pictures, 1 to 100; 80 where absent.
+    /// Sets the quality of JPEG images, 1 to 100 (default: 80).
     pub fn set_quality(&self, quality: Option<u8>) {
         self.state.lock().packing.set_quality(quality);
     }
 
-    /// The peer takes so much, as its opening frame says. Before [`reconnect`](Self::reconnect).
-    pub fn peer_takes(&self, limits: Limits) {
+    /// Sets the limits that the peer announced in its opening frame. To be called before
+    /// [`reconnect`](Self::reconnect).
+    pub fn set_peer_limits(&self, limits: LinkLimits) {
         self.state.lock().out.set_limits(limits);
     }
 
-    /// The peer decodes these, as its opening frame says.
-    pub fn peer_decodes(&self, codecs: &[String]) {
+    /// Sets the codecs that the peer announced in its opening frame.
+    pub fn set_peer_codecs(&self, codecs: &[String]) {
         let mut state = self.state.lock();
-        state.packing.peer_decodes(codecs);
-        let pays = state.packing.pays(state.throughput.known());
-        state.out.encoding.set_pays(pays);
+        state.packing.set_peer_codecs(codecs);
+        let pays = state.packing.is_worthwhile(state.throughput.estimate());
+        state.out.encoding.set_enabled(pays);
     }
 
-    fn push(&self, record: &Record, quality: Quality) {
+    fn push(&self, record: &Record, quality: DeliveryMode) {
         self.state.lock().out.push(record, quality);
         self.wake.notify_one();
     }
 
-    /// Nothing more will come as this channel of the peer.
-    pub fn peer_closed(&self, channel: u32) {
-        self.state.lock().packing.peer_closed(channel);
+    /// Handles the closing of a channel by the peer.
+    pub fn on_peer_closed(&self, channel: u32) {
+        self.state.lock().packing.on_peer_closed(channel);
     }
 
-    /// Forgets what waits on a channel that is gone.
-    pub fn forget(&self, channel: u32) {
+    /// Drops what is queued on a channel that is gone.
+    pub fn forget_channel(&self, channel: u32) {
         let mut state = self.state.lock();
-        state.out.forget(channel);
+        state.out.forget_channel(channel);
         state.packing.remove(channel);
     }
 
-    /// Ends the connection, once what waits was sent, or the peer takes none of it for two seconds.
-    pub fn end(&self, code: u16, reason: &str) {
-        self.state.lock().ending = Some(Ending {
+    /// Closes the session once everything queued was sent, or the peer has received nothing for two seconds.
+    pub fn close(&self, code: u16, reason: &str) {
+        self.state.lock().ending = Some(RequestedClose {
             code,
             reason: reason.to_owned(),
             at: Instant::now(),
@@ -402,20 +410,21 @@ impl<O: Order> Session<O> {
         self.wake.notify_one();
     }
 
-    /// For the opening of a connection: what has come, and the first number that this side will use.
+    /// Returns what was received and the first number that this end will use, for the opening frame of a connection.
     pub fn position(&self) -> (u64, Vec<u64>, u64) {
         let state = self.state.lock();
-        let (received, ahead) = state.incoming.state();
+        let (received, ahead) = state.incoming.received_numbers();
         (received, ahead, state.out.next_number())
     }
 
-    /// For a new session that takes the place of one the peer has forgotten: the first number that the peer was told
-    /// to expect. Before anything is sent.
+    /// Starts numbering at the number that was announced to the peer, for a session that replaces one that the peer has
+    /// forgotten. To be called before anything is sent.
     pub fn begin_at(&self, number: u64) {
         self.state.lock().out.begin_at(number);
     }
 
-    /// A new connection: what the peer has, and the first number that it will use.
+    /// Begins a new connection: `received` and `ahead` are what the peer has received, `next` is the first number that
+    /// it will use.
     pub fn reconnect(&self, received: u64, ahead: &[u64], next: u64) {
         let mut state = self.state.lock();
         state.out.reconnect(received, ahead);
@@ -424,37 +433,37 @@ impl<O: Order> Session<O> {
         state.throughput.reconnect();
     }
 
-    /// The peer has said what came.
-    fn acknowledged(&self, received: Received) {
+    /// Handles an acknowledgement of the peer.
+    fn on_acknowledged(&self, received: ReceiveProgress) {
         let mut state = self.state.lock();
         state.out.acknowledge(received.number);
-        state.let_go();
+        state.forget_closed();
         let counters = Counters {
             at: Instant::now(),
             bytes: received.bytes,
             sent: state.out.sent,
             idle: state.out.is_idle(),
         };
-        if let Some(rate) = state.throughput.report(counters) {
+        if let Some(rate) = state.throughput.update(counters) {
             state.out.set_throughput(rate);
-            let pays = state.packing.pays(Some(rate));
-            state.out.encoding.set_pays(pays);
+            let pays = state.packing.is_worthwhile(Some(rate));
+            state.out.encoding.set_enabled(pays);
         }
     }
 }
 
-/// What is told, as a record; none where the peer would not read it.
+/// Serializes a control message; returns `None` if the peer would not accept it.
 fn control_record(told: &impl Serialize) -> Option<Record> {
     let json = serde_json::to_vec(told).unwrap_or_default();
-    let (bytes, limit) = (json.len(), control::longest(&json));
-    let (weight, room) = (JsonWeight::of(&json).bytes, MAX_TOLD);
+    let (bytes, limit) = (json.len(), control::max_control_length(&json));
+    let (weight, room) = (JsonWeight::estimate(&json).bytes, MAX_TOLD);
     if bytes > limit || weight > room {
         tracing::warn!(
             bytes,
             limit,
             weight,
             room,
-            "something is too long to be told to the other end of the link"
+            "a message is too long for the link and was not sent"
         );
         return None;
     }
@@ -462,11 +471,13 @@ fn control_record(told: &impl Serialize) -> Option<Record> {
 }
 
 impl Session<FromRobot> {
-    /// Closes a channel for sending; the peer is told after all messages that wait on it.
-    pub fn closes(&self, channel: u32) {
+    /// Closes a channel for sending; the peer is told after all messages queued on it.
+    pub fn close_channel(&self, channel: u32) {
         let json = serde_json::to_vec(&FromRobot::Close { channel }).unwrap_or_default();
         let mut state = self.state.lock();
-        state.out.close(channel, &Record::Control(json.into()));
+        state
+            .out
+            .close_channel(channel, &Record::Control(json.into()));
         drop(state);
         self.wake.notify_one();
     }

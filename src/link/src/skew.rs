@@ -1,11 +1,11 @@
-//! One time on both sides: stamps of the robot's clock become stamps of this machine's on their way in, and the other
-//! way round on their way out, by the difference that the link has measured. See docs/adr/011.
+//! Translation of time stamps between the clocks of robot and cloud, by the measured difference: incoming stamps are
+//! converted to the local clock, outgoing stamps to the robot's. See docs/adr/011.
 //!
 //! ```text
-//!  robot: stamp s ──in──▶ s − difference ──▶ node ──▶ s − difference ──out──▶ s, the very same
+//!  robot: stamp s ──in──▶ s − difference ──▶ node ──▶ s − difference ──out──▶ s, exactly
 //! ```
-//! What was changed is remembered for a while, so that a stamp that a node copies from its input to its output comes
-//! back as it was, even when the difference has been measured anew meanwhile.
+//! Conversions are remembered for a while, so that a stamp that a node copies from its input to its output is restored
+//! exactly, even if the difference was measured anew in between.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::atomic::{AtomicI64, Ordering};
@@ -13,16 +13,16 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use bytes::{Bytes, BytesMut};
 use parking_lot::Mutex;
 
-use crate::clock::Sample;
+use crate::clock::ClockSample;
 use ros::codec::{Stamps, Time};
 
-/// A difference smaller than this, beyond what the measurement leaves open, is none: 1 ms.
+/// Differences smaller than this, beyond the error of the measurement, are ignored: 1 ms.
 const NOTICED: i64 = 1_000_000;
-/// Stamps remembered each way.
+/// Number of stamps remembered in each direction.
 const REMEMBERED: usize = 4096;
 const SECOND: i64 = 1_000_000_000;
 
-/// The way of a message.
+/// Direction of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
     /// From the robot to the node.
@@ -31,39 +31,40 @@ pub enum Direction {
     Out,
 }
 
-/// The difference between a robot's clock and ours, and what was changed by it.
+/// The difference between a robot's clock and the local clock, and the stamps converted with it.
 #[derive(Debug, Default)]
 pub struct Skew {
-    /// Robot's clock minus ours, in nanoseconds; 0: none that counts.
+    /// Robot's clock minus local clock in nanoseconds; 0: no significant difference.
     difference: AtomicI64,
-    known: Mutex<Known>,
+    known: Mutex<ConvertedStamps>,
 }
 
 #[derive(Debug, Default)]
-struct Known {
-    /// Stamp of ours → the robot's.
-    robots: Pairs,
-    /// Stamp of the robot → ours.
-    ours: Pairs,
+struct ConvertedStamps {
+    /// Local stamp → robot's stamp.
+    robots: StampMap,
+    /// Robot's stamp → local stamp.
+    ours: StampMap,
 }
 
 impl Skew {
-    /// The clocks were compared: `sample` is the robot's against ours.
-    pub fn measured(&self, sample: Sample) {
+    /// Handles a new measurement of the robot's clock against the local clock.
+    pub fn on_clock_sample(&self, sample: ClockSample) {
         let now = self.difference.load(Ordering::Relaxed);
-        // Within half of the delay nobody can tell (RFC 5905, section 8).
+        // The offset is uncertain within half of the delay (RFC 5905, section 8).
         let unsure = sample.delay / 2 + NOTICED;
         if sample.offset.saturating_sub(now).saturating_abs() > unsure {
             self.difference.store(sample.offset, Ordering::Relaxed);
         }
     }
 
-    /// What is added to our time to have the robot's, in nanoseconds.
+    /// Returns the nanoseconds to add to local time to obtain the robot's time.
     pub fn difference(&self) -> i64 {
         self.difference.load(Ordering::Relaxed)
     }
 
-    /// The message with its stamps in the other side's time. Stamps of zero stay zero, and so does what no clock shows.
+    /// Converts the stamps of a message to the time of the other side. Zero stamps, and values that are not times of a
+    /// clock, stay unchanged.
     pub fn apply(&self, direction: Direction, stamps: &Stamps, message: Bytes) -> Bytes {
         let difference = self.difference();
         if difference == 0 || stamps.is_empty() {
@@ -78,7 +79,7 @@ impl Skew {
             own
         });
         let mut known = self.known.lock();
-        let Known { robots, ours } = &mut *known;
+        let ConvertedStamps { robots, ours } = &mut *known;
         let (change, there, back) = match direction {
             Direction::In => (-difference, ours, robots),
             Direction::Out => (difference, robots, ours),
@@ -89,10 +90,10 @@ impl Skew {
             };
             let changed = there
                 .get(stamp)
-                .or_else(|| shifted(stamp, change))
+                .or_else(|| shift_stamp(stamp, change))
                 .unwrap_or(stamp);
             if changed != stamp {
-                back.note(changed, stamp);
+                back.insert(changed, stamp);
                 stamps.write(&mut message, at, changed);
             }
         }
@@ -100,8 +101,8 @@ impl Skew {
     }
 }
 
-/// None for what is no time of a clock.
-fn shifted(stamp: Time, by: i64) -> Option<Time> {
+/// Returns `None` for a value that is not a time of a clock.
+fn shift_stamp(stamp: Time, by: i64) -> Option<Time> {
     let nanoseconds = i64::from(stamp.nsecs);
     if stamp == Time::default() || nanoseconds >= SECOND {
         return None;
@@ -116,19 +117,19 @@ fn shifted(stamp: Time, by: i64) -> Option<Time> {
     })
 }
 
-/// The last of them.
+/// The most recent conversions.
 #[derive(Debug, Default)]
-struct Pairs {
+struct StampMap {
     found: HashMap<Time, Time>,
     order: VecDeque<Time>,
 }
 
-impl Pairs {
+impl StampMap {
     fn get(&self, key: Time) -> Option<Time> {
         self.found.get(&key).copied()
     }
 
-    fn note(&mut self, key: Time, value: Time) {
+    fn insert(&mut self, key: Time, value: Time) {
         if self.found.insert(key, value).is_some() {
             return;
         }

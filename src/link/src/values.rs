@@ -1,6 +1,5 @@
-//! Parameters as JSON, which has no numbers for infinities and NaN, and no bytes: those are spelt out, as
-//! `{"~double": "inf"}` and `{"~base64": "AA=="}`.
-//! No parameter is called so, since a ROS name holds no tilde but at its beginning.
+//! Parameters as JSON, which has no infinities, NaN or bytes. Those are written as `{"~double": "inf"}` and
+//! `{"~base64": "AA=="}`. No parameter has such a name, because a ROS name contains a tilde only at its beginning.
 
 use std::collections::BTreeMap;
 
@@ -11,18 +10,18 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::bounded;
 
-/// The member of a map that is a double which JSON cannot write.
+/// Key of a map that represents a double which JSON cannot represent.
 const DOUBLE: &str = "~double";
-/// The member of a map that is bytes.
+/// Key of a map that represents bytes.
 const BYTES: &str = "~base64";
 
-/// Changes that are told at once, at most.
+/// Maximum number of changes in one message.
 const MOST_CHANGES: usize = 50_000;
 
-/// A value as it is written.
-struct Written<'a>(&'a ParamValue);
+/// A value serialized for the link.
+struct JsonParam<'a>(&'a ParamValue);
 
-impl Serialize for Written<'_> {
+impl Serialize for JsonParam<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         match self.0 {
             ParamValue::Bool(truth) => serializer.serialize_bool(*truth),
@@ -30,33 +29,33 @@ impl Serialize for Written<'_> {
             ParamValue::Double(number) if number.is_finite() => serializer.serialize_f64(*number),
             ParamValue::Double(number) => serializer.collect_map([(DOUBLE, number.to_string())]),
             ParamValue::String(text) => serializer.serialize_str(text),
-            // Stubs leave it out, and say so.
+            // Stubs omit such values and log that.
             ParamValue::Nil => serializer.serialize_str(""),
             ParamValue::Binary(bytes) => {
                 serializer.collect_map([(BYTES, STANDARD.encode_to_string(bytes))])
             }
-            ParamValue::List(items) => serializer.collect_seq(items.iter().map(Written)),
+            ParamValue::List(items) => serializer.collect_seq(items.iter().map(JsonParam)),
             ParamValue::Map(members) => {
-                serializer.collect_map(members.iter().map(|(name, value)| (name, Written(value))))
+                serializer.collect_map(members.iter().map(|(name, value)| (name, JsonParam(value))))
             }
         }
     }
 }
 
-/// Takes a value from how it was written, in its place: maps that spell a double or bytes become those.
-fn take_written(value: &mut ParamValue) {
+/// Replaces maps that represent a double or bytes by those, in place.
+fn decode_special_values(value: &mut ParamValue) {
     match value {
-        ParamValue::List(items) => items.iter_mut().for_each(take_written),
-        ParamValue::Map(members) => match spelt(members) {
+        ParamValue::List(items) => items.iter_mut().for_each(decode_special_values),
+        ParamValue::Map(members) => match parse_special(members) {
             Some(spelt) => *value = spelt,
-            None => members.values_mut().for_each(take_written),
+            None => members.values_mut().for_each(decode_special_values),
         },
         _ => {}
     }
 }
 
-/// The double or the bytes that a map of one member spells.
-fn spelt(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
+/// Returns the double or the bytes that a map with one entry represents.
+fn parse_special(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
     let (name, ParamValue::String(text)) = members.first_key_value()? else {
         return None;
     };
@@ -70,7 +69,7 @@ fn spelt(members: &BTreeMap<String, ParamValue>) -> Option<ParamValue> {
     }
 }
 
-/// For a tree of parameters.
+/// Serialization of a parameter tree.
 pub(crate) mod tree {
     use super::*;
 
@@ -78,16 +77,16 @@ pub(crate) mod tree {
         tree: &BTreeMap<String, ParamValue>,
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(tree.iter().map(|(key, value)| (key, Written(value))))
+        serializer.collect_map(tree.iter().map(|(key, value)| (key, JsonParam(value))))
     }
 
     pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
         deserializer: D,
     ) -> Result<BTreeMap<String, ParamValue>, D::Error> {
-        // One value, so that the bounds of one hold for all of them.
+        // Deserialized as one value, so that the limits for one value apply to all of them.
         match ParamValue::deserialize(deserializer)? {
             ParamValue::Map(mut tree) => {
-                tree.values_mut().for_each(take_written);
+                tree.values_mut().for_each(decode_special_values);
                 Ok(tree)
             }
             _ => Err(D::Error::custom("parameters are a map")),
@@ -95,7 +94,7 @@ pub(crate) mod tree {
     }
 }
 
-/// For changes.
+/// Serialization of parameter changes.
 pub(crate) mod changes {
     use super::*;
 
@@ -104,7 +103,7 @@ pub(crate) mod changes {
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
         let written = changes.iter();
-        serializer.collect_seq(written.map(|(key, value)| (key, value.as_ref().map(Written))))
+        serializer.collect_seq(written.map(|(key, value)| (key, value.as_ref().map(JsonParam))))
     }
 
     pub(crate) fn deserialize<'de, D: Deserializer<'de>>(
@@ -113,7 +112,7 @@ pub(crate) mod changes {
         let mut changes =
             bounded::list::<_, (String, Option<ParamValue>), MOST_CHANGES>(deserializer)?;
         let values = changes.iter_mut().filter_map(|(_, value)| value.as_mut());
-        values.for_each(take_written);
+        values.for_each(decode_special_values);
         Ok(changes)
     }
 }
@@ -125,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_json_has_not_arrives_as_it_was() {
+    fn values_that_json_lacks_round_trip() {
         let values = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1.0, 1e300];
         let list = ParamValue::List(values.map(ParamValue::Double).to_vec());
         let map = ParamValue::Map(

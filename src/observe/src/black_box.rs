@@ -1,4 +1,5 @@
-//! A black box: the last seconds of what flows in a servant, in memory, to be written into a file when something has gone wrong.
+//! Black box: keeps the last seconds of a servant's messages in memory, to be written to a file when something goes
+//! wrong.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -6,73 +7,73 @@ use std::time::Duration;
 
 use budget::{Budget, Permit};
 use parking_lot::Mutex;
-use recording::{Format, Summary, Writer};
-use ros::bus::{Message, RosVersion, WireType};
+use recording::{RecordingFormat, RecordingWriter, Summary};
+use ros::bus::{RosVersion, SerializedMessage, WireType};
 
-use crate::follow::{Followed, Observer, Seen, follow, now};
-use crate::numbered::Numbered;
-use crate::ring::{Bounds, EACH, Kept, Ring};
+use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
+use crate::numbered::IdMap;
+use crate::ring::{EACH, RetentionBounds, Ring, StoredMessage};
 
-/// What is kept.
+/// Settings of a black box.
 #[derive(Clone)]
-pub struct BoxOptions {
-    /// The last seconds.
+pub struct BlackBoxSettings {
+    /// How far back messages are kept.
     pub span: Duration,
-    /// Bytes of messages, with what each takes beside its own.
+    /// Memory limit in bytes, including the overhead per message.
     pub bytes: usize,
-    /// Where these bytes are counted besides, and those of definitions.
+    /// Budget that message bytes and type definitions are charged to as well.
     pub budget: Budget,
-    /// Which topics are heard.
+    /// Predicate that selects the topics to record.
     pub wanted: Arc<dyn Fn(&str) -> bool + Send + Sync>,
 }
 
-/// Hears a servant until it is dropped.
+/// Records a servant's messages until dropped.
 pub struct BlackBox {
-    inner: Arc<Inner>,
-    _followed: Followed,
+    inner: Arc<BlackBoxRecorder>,
+    _followed: ObserverTask,
 }
 
-/// What a file holds.
+/// Summary of a black-box file.
 #[derive(Debug)]
-pub struct Frozen {
-    /// The file.
+pub struct BlackBoxDump {
+    /// The MCAP file's own summary.
     pub summary: Summary,
-    /// The topics that it has messages of, by name.
+    /// Topics that have messages in the file, sorted by name.
     pub topics: Vec<String>,
-    /// From the first message to the last, without those that were latched before.
+    /// Time from the first message to the last, not counting earlier latched messages.
     pub span: Duration,
-    /// Messages so far that were larger than all that may be kept, or for which the servant had no memory left.
+    /// Number of messages dropped so far because they exceeded the memory limit or the servant's budget.
     pub left_out: u64,
 }
 
-struct Inner {
-    format: Format,
-    options: BoxOptions,
-    /// Locked before the ring, where both are.
-    topics: Mutex<Numbered<Topic>>,
+struct BlackBoxRecorder {
+    format: RecordingFormat,
+    options: BlackBoxSettings,
+    /// Lock order: this lock is taken before the ring's.
+    topics: Mutex<IdMap<RecordedTopic>>,
     ring: Mutex<Ring>,
 }
 
-struct Topic {
+struct RecordedTopic {
     name: String,
     of: Arc<WireType>,
-    /// Nobody publishes it any more: it is known for as long as something of it is kept.
+    /// Set once nobody publishes the topic; the entry stays while the ring still holds messages of it.
     ended: bool,
-    /// What its definition takes.
+    /// Budget permit for the topic's type definition.
     _counted: Permit,
 }
 
 impl BlackBox {
-    /// Hears what flows there.
-    pub fn of(seen: Seen, options: BoxOptions) -> Self {
-        let ring = Ring::new(Bounds {
+    /// Starts recording the servant's topics.
+    pub fn start(seen: ObservedServant, options: BlackBoxSettings) -> Self {
+        let ring = Ring::new(RetentionBounds {
             span: options.span,
             bytes: options.bytes,
         });
-        let inner = Arc::new(Inner {
+        let inner = Arc::new(BlackBoxRecorder {
             format: match seen.bus.version() {
-                RosVersion::One => Format::Ros1,
-                RosVersion::Two => Format::Ros2,
+                RosVersion::One => RecordingFormat::Ros1,
+                RosVersion::Two => RecordingFormat::Ros2,
             },
             options,
             topics: Mutex::default(),
@@ -81,30 +82,31 @@ impl BlackBox {
         let observer = Arc::clone(&inner);
         Self {
             inner,
-            _followed: follow(seen, observer),
+            _followed: spawn_observer(seen, observer),
         }
     }
 
-    /// How a file of it is to be written.
-    pub fn format(&self) -> Format {
+    /// Returns the format in which this box's messages are written.
+    pub fn format(&self) -> RecordingFormat {
         self.inner.format
     }
 
-    /// Lets go of what is too old by now, also where nothing comes any more.
-    pub fn forget(&self) {
-        self.inner.ring.lock().forget(now());
-        self.inner.forget_topics(&mut self.inner.topics.lock());
+    /// Drops messages that have expired, even when no new ones arrive.
+    pub fn evict(&self) {
+        self.inner.ring.lock().evict(now());
+        self.inner
+            .forget_ended_topics(&mut self.inner.topics.lock());
     }
 
-    /// Writes what is kept into a file of this box's [`format`](Self::format); blocks.
+    /// Writes the buffered messages to a file of this box's [`format`](Self::format). Blocks.
     ///
     /// # Errors
-    /// The file cannot be written; it may be there in part then.
-    pub fn write(&self, mut writer: Writer) -> Result<Frozen, recording::Error> {
+    /// Fails if the file cannot be written; a partial file may remain.
+    pub fn write(&self, mut writer: RecordingWriter) -> Result<BlackBoxDump, recording::Error> {
         let (topics, before, kept, left_out) = {
             let mut topics = self.inner.topics.lock();
             let mut ring = self.inner.ring.lock();
-            let (before, kept) = ring.all(now());
+            let (before, kept) = ring.snapshot(now());
             let topics = topics
                 .iter_mut()
                 .map(|(number, topic)| (number, (topic.name.clone(), Arc::clone(&topic.of))));
@@ -121,16 +123,16 @@ impl BlackBox {
                 Some(channel) => *channel,
                 None => {
                     let definition = of.definition.as_bytes();
-                    let channel = writer.channel(name, &of.name, definition)?;
+                    let channel = writer.add_channel(name, &of.name, definition)?;
                     names.insert(name.clone());
                     channels.insert(message.topic, channel);
                     channel
                 }
             };
-            writer.add(channel, message.time, &message.bytes)?;
+            writer.add_message(channel, message.time, &message.bytes)?;
         }
-        let time = |one: Option<&Kept>| one.map_or(0, |one| one.time);
-        Ok(Frozen {
+        let time = |one: Option<&StoredMessage>| one.map_or(0, |one| one.time);
+        Ok(BlackBoxDump {
             summary: writer.finish()?,
             topics: names.into_iter().collect(),
             span: Duration::from_nanos(time(kept.last()) - time(kept.first())),
@@ -139,21 +141,21 @@ impl BlackBox {
     }
 }
 
-impl Inner {
-    /// Lets go of topics that have ended, and of which nothing is kept.
-    fn forget_topics(&self, topics: &mut Numbered<Topic>) {
+impl BlackBoxRecorder {
+    /// Removes topics that have ended and have no messages left in the ring.
+    fn forget_ended_topics(&self, topics: &mut IdMap<RecordedTopic>) {
         let ring = self.ring.lock();
-        topics.retain(|number, topic| !topic.ended || ring.has(number));
+        topics.retain(|number, topic| !topic.ended || ring.has_topic(number));
     }
 }
 
-impl Observer for Inner {
-    fn wants(&self, topic: &str, _named: &str) -> bool {
+impl Observer for BlackBoxRecorder {
+    fn wants_topic(&self, topic: &str, _named: &str) -> bool {
         (self.options.wanted)(topic)
     }
 
-    /// The number of before, where the topic comes again.
-    fn begins(&self, topic: &str, of: WireType) -> Option<u32> {
+    /// Reuses the previous number if the topic reappears.
+    fn on_topic_started(&self, topic: &str, of: WireType) -> Option<u32> {
         let mut topics = self.topics.lock();
         let known = topics.find(|known| known.name == topic && *known.of == of);
         if let Some(number) = known {
@@ -161,11 +163,11 @@ impl Observer for Inner {
             return Some(number);
         }
         if topics.is_full() {
-            self.forget_topics(&mut topics);
+            self.forget_ended_topics(&mut topics);
         }
         let size = of.definition.len() + of.name.len() + topic.len() + EACH;
         let counted = self.options.budget.take(size).ok()?;
-        topics.add(Topic {
+        topics.add(RecordedTopic {
             name: topic.to_owned(),
             of: Arc::new(of),
             ended: false,
@@ -173,7 +175,7 @@ impl Observer for Inner {
         })
     }
 
-    fn hears(&self, topic: u32, message: Message) {
+    fn on_message(&self, topic: u32, message: SerializedMessage) {
         let latched_by = message.latching.then_some(message.publisher);
         let permit = self.options.budget.take(message.bytes.len() + EACH);
         let mut ring = self.ring.lock();
@@ -181,21 +183,21 @@ impl Observer for Inner {
             ring.left_out += 1;
             return;
         };
-        let kept = Kept {
+        let kept = StoredMessage {
             topic,
             time: now(),
-            bytes: permit.around(message.bytes),
+            bytes: permit.wrap_bytes(message.bytes),
         };
         ring.push(kept, latched_by);
     }
 
-    /// What was latched there is nobody's state any more.
-    fn ends(&self, topic: &str) {
+    /// Drops the topic's latched messages: they no longer describe anybody's state.
+    fn on_topic_ended(&self, topic: &str) {
         let mut topics = self.topics.lock();
         let mut ring = self.ring.lock();
         for (number, known) in topics.iter_mut().filter(|(_, known)| known.name == topic) {
             known.ended = true;
-            ring.gone(number);
+            ring.forget_latched(number);
         }
     }
 }
@@ -208,14 +210,14 @@ mod tests {
     use super::*;
     use crate::numbered::MOST;
 
-    fn inner(budget: &Budget) -> Inner {
-        let bounds = Bounds {
+    fn inner(budget: &Budget) -> BlackBoxRecorder {
+        let bounds = RetentionBounds {
             span: Duration::from_secs(3600),
             bytes: 1 << 20,
         };
-        Inner {
-            format: Format::Ros1,
-            options: BoxOptions {
+        BlackBoxRecorder {
+            format: RecordingFormat::Ros1,
+            options: BlackBoxSettings {
                 span: bounds.span,
                 bytes: bounds.bytes,
                 budget: budget.clone(),
@@ -226,8 +228,8 @@ mod tests {
         }
     }
 
-    fn message(of: &WireType) -> Message {
-        Message {
+    fn message(of: &WireType) -> SerializedMessage {
+        SerializedMessage {
             bytes: Bytes::new(),
             wire_type: Arc::new(of.clone()),
             publisher: PeerId::from("/node"),
@@ -240,36 +242,43 @@ mod tests {
         let budget = Budget::new("servant", 100_000);
         let inner = inner(&budget);
         let of = WireType::new("a/Type", "digest", "#".repeat(50_000));
-        let topic = inner.begins("/one", of.clone()).expect("room");
-        assert!(budget.used() > 50_000, "{budget:?}");
-        assert_eq!(inner.begins("/two", of.clone()), None, "too much");
-        let before = budget.used();
-        (0..10).for_each(|_| inner.hears(topic, message(&of)));
-        assert_eq!(budget.used() - before, 10 * EACH);
+        let topic = inner.on_topic_started("/one", of.clone()).expect("room");
+        assert!(budget.used_bytes() > 50_000, "{budget:?}");
+        assert_eq!(inner.on_topic_started("/two", of.clone()), None, "too much");
+        let before = budget.used_bytes();
+        (0..10).for_each(|_| inner.on_message(topic, message(&of)));
+        assert_eq!(budget.used_bytes() - before, 10 * EACH);
     }
 
     #[test]
     fn topics_that_have_ended_are_forgotten_with_what_is_kept_of_them() {
-        let budget = Budget::unlimited();
+        let budget = Budget::without_limit();
         let inner = inner(&budget);
         let of = WireType::new("a/Type", "digest", "string data");
-        let kept = inner.begins("/kept", of.clone()).expect("room");
-        inner.hears(kept, message(&of));
-        inner.ends("/kept");
+        let kept = inner.on_topic_started("/kept", of.clone()).expect("room");
+        inner.on_message(kept, message(&of));
+        inner.on_topic_ended("/kept");
         for number in 0..3 * MOST {
             let topic = format!("/topic{number}");
-            assert!(inner.begins(&topic, of.clone()).is_some(), "{topic}");
-            inner.ends(&topic);
+            assert!(
+                inner.on_topic_started(&topic, of.clone()).is_some(),
+                "{topic}"
+            );
+            inner.on_topic_ended(&topic);
         }
         let mut topics = inner.topics.lock();
-        inner.forget_topics(&mut topics);
+        inner.forget_ended_topics(&mut topics);
         assert_eq!(topics.iter_mut().count(), 1);
         drop(topics);
-        assert_eq!(inner.begins("/kept", of), Some(kept), "as before");
-        // No more than that at once.
+        assert_eq!(inner.on_topic_started("/kept", of), Some(kept), "as before");
+        // The number of simultaneous topics is bounded.
         for number in 0..MOST {
-            let _ = inner.begins(&format!("/at/once{number}"), WireType::new("a/B", "", ""));
+            let _ =
+                inner.on_topic_started(&format!("/at/once{number}"), WireType::new("a/B", "", ""));
         }
-        assert_eq!(inner.begins("/more", WireType::new("a/B", "", "")), None);
+        assert_eq!(
+            inner.on_topic_started("/more", WireType::new("a/B", "", "")),
+            None
+        );
     }
 }

@@ -1,79 +1,79 @@
-//! Figures of topics: how much is published, and how old it is when it comes.
+//! Topic statistics: how much is published, and how old messages are on arrival.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
-use ros::bus::{Message, WireType};
+use ros::bus::{SerializedMessage, WireType};
 
-use crate::follow::{Followed, Observer, Seen, follow, now};
-use crate::numbered::Numbered;
+use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
+use crate::numbered::IdMap;
 
-/// Ages that make sense: stamps of a simulation, or of a recording, are of another time.
+/// Plausible message ages in nanoseconds; stamps of a simulation or a recording lie outside.
 const AGES: std::ops::Range<i64> = -60_000_000_000..60_000_000_000;
 
-/// Ages of a topic's messages that are kept until somebody takes the figures.
+/// Limit on the ages kept for a topic until the statistics are taken.
 const MOST_AGES: usize = 10_000;
 
-/// What was published on a topic in a time.
+/// Statistics of one topic over a period.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TopicFigures {
-    /// The topic.
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Message type, `package/Type`.
     pub of: String,
-    /// Messages.
+    /// Number of messages.
     pub messages: u64,
-    /// Bytes of them, as they are serialized.
+    /// Size of the messages in bytes, serialized.
     pub bytes: u64,
-    /// From the stamp in the header to here, of the messages in the middle; none where they have no header, or one without a stamp of
-    /// this time.
+    /// Median age on arrival in seconds, by the stamp in the header; `None` if the messages have no header or no
+    /// plausible stamp.
     pub age: Option<f64>,
 }
 
-/// Counts what flows in a servant until it is dropped.
+/// Counts a servant's messages until dropped.
 pub struct Figures {
-    counts: Arc<Counts>,
+    counts: Arc<TopicCounters>,
     since: Mutex<Instant>,
-    _followed: Followed,
+    _followed: ObserverTask,
 }
 
 #[derive(Default)]
-struct Counts {
-    all: Mutex<Numbered<Count>>,
+struct TopicCounters {
+    all: Mutex<IdMap<TopicCounter>>,
 }
 
-struct Count {
+struct TopicCounter {
     topic: String,
     of: String,
     stamped: bool,
     published: bool,
     messages: u64,
     bytes: u64,
-    /// Nanoseconds; of the first messages alone, where they are many.
+    /// Ages in nanoseconds; of the first messages only, if there are many.
     ages: Vec<i64>,
 }
 
 impl Figures {
-    /// Of all topics that somebody publishes there.
-    pub fn of(seen: Seen) -> Self {
-        let counts = Arc::<Counts>::default();
+    /// Starts counting the messages of all published topics.
+    pub fn start(seen: ObservedServant) -> Self {
+        let counts = Arc::<TopicCounters>::default();
         let observer = Arc::clone(&counts);
         Self {
             counts,
             since: Mutex::new(Instant::now()),
-            _followed: follow(seen, observer),
+            _followed: spawn_observer(seen, observer),
         }
     }
 
-    /// Since they were taken last, and how long that is; by name.
+    /// Returns the statistics since they were last taken, sorted by topic, and the length of that period.
     pub fn take(&self) -> (Duration, Vec<TopicFigures>) {
         let since = std::mem::replace(&mut *self.since.lock(), Instant::now());
         (since.elapsed(), self.counts.take())
     }
 }
 
-impl Counts {
+impl TopicCounters {
     fn take(&self) -> Vec<TopicFigures> {
         let mut all = self.all.lock();
         let counted = all
@@ -86,7 +86,7 @@ impl Counts {
     }
 }
 
-impl Count {
+impl TopicCounter {
     fn take(&mut self) -> TopicFigures {
         let mut ages = std::mem::take(&mut self.ages);
         ages.sort_unstable();
@@ -101,12 +101,12 @@ impl Count {
     }
 }
 
-impl Observer for Counts {
-    fn wants(&self, _topic: &str, _named: &str) -> bool {
+impl Observer for TopicCounters {
+    fn wants_topic(&self, _topic: &str, _named: &str) -> bool {
         true
     }
 
-    fn begins(&self, topic: &str, of: WireType) -> Option<u32> {
+    fn on_topic_started(&self, topic: &str, of: WireType) -> Option<u32> {
         let mut all = self.all.lock();
         let known = all.find(|count| count.topic == topic && count.of == of.name);
         if let Some(number) = known {
@@ -114,12 +114,12 @@ impl Observer for Counts {
             return Some(number);
         }
         if all.is_full() {
-            // Nobody takes them, and topics come and go.
+            // Nobody takes the statistics while topics come and go.
             all.retain(|_, count| count.published);
         }
-        all.add(Count {
+        all.add(TopicCounter {
             topic: topic.to_owned(),
-            stamped: is_stamped(&of.definition),
+            stamped: has_header(&of.definition),
             of: of.name,
             published: true,
             messages: 0,
@@ -128,18 +128,18 @@ impl Observer for Counts {
         })
     }
 
-    fn hears(&self, topic: u32, message: Message) {
+    fn on_message(&self, topic: u32, message: SerializedMessage) {
         let mut all = self.all.lock();
         let Some(count) = all.get_mut(topic) else {
             return;
         };
         count.messages += 1;
         count.bytes += message.bytes.len() as u64;
-        // What was latched is as old as it is.
+        // A latched message is as old as it is; its age says nothing about latency.
         if count.stamped
             && !message.latching
             && count.ages.len() < MOST_AGES
-            && let Some(stamp) = header_stamp(&message.bytes)
+            && let Some(stamp) = read_header_stamp(&message.bytes)
             && let Some(age) = i64::try_from(now())
                 .ok()
                 .and_then(|now| now.checked_sub(stamp))
@@ -149,7 +149,7 @@ impl Observer for Counts {
         }
     }
 
-    fn ends(&self, topic: &str) {
+    fn on_topic_ended(&self, topic: &str) {
         let mut all = self.all.lock();
         for (_, count) in all.iter_mut().filter(|(_, count)| count.topic == topic) {
             count.published = false;
@@ -157,8 +157,8 @@ impl Observer for Counts {
     }
 }
 
-/// Of the header that a message begins with (`std_msgs/Header`: seq, stamp, frame_id), nanoseconds since 1970.
-fn header_stamp(message: &[u8]) -> Option<i64> {
+/// Reads the stamp of a message's header (`std_msgs/Header`: seq, stamp, frame_id), in nanoseconds since 1970.
+fn read_header_stamp(message: &[u8]) -> Option<i64> {
     let word = |at: usize| {
         let bytes = message.get(at..at + 4)?;
         bytes.try_into().ok().map(u32::from_le_bytes)
@@ -166,8 +166,8 @@ fn header_stamp(message: &[u8]) -> Option<i64> {
     Some(i64::from(word(4)?) * 1_000_000_000 + i64::from(word(8)?))
 }
 
-/// Whether messages of this definition begin with a header.
-fn is_stamped(definition: &str) -> bool {
+/// Returns true if messages of this definition begin with a header.
+fn has_header(definition: &str) -> bool {
     let mut lines = definition.lines().map(|line| {
         let line = line.split('#').next().unwrap_or_default();
         line.trim()
@@ -184,47 +184,50 @@ mod tests {
 
     #[test]
     fn messages_that_begin_with_a_header_have_a_stamp() {
-        assert!(is_stamped(
+        assert!(has_header(
             "# A picture\n\nuint8 X=1\nHeader header # when\nuint32 height\n"
         ));
-        assert!(is_stamped("std_msgs/Header header"));
-        assert!(!is_stamped("string data\nHeader header"));
-        assert!(!is_stamped(""));
+        assert!(has_header("std_msgs/Header header"));
+        assert!(!has_header("string data\nHeader header"));
+        assert!(!has_header(""));
         let message = [[9, 0, 0, 0], [2, 0, 0, 0], [5, 0, 0, 0]].concat();
-        assert_eq!(header_stamp(&message), Some(2_000_000_005));
-        assert_eq!(header_stamp(&message[..11]), None);
+        assert_eq!(read_header_stamp(&message), Some(2_000_000_005));
+        assert_eq!(read_header_stamp(&message[..11]), None);
     }
 
     #[test]
     fn figures_that_nobody_takes_are_bounded() {
-        let counts = Counts::default();
+        let counts = TopicCounters::default();
         let of = WireType::new("a/Stamped", "digest", "Header header");
-        let topic = counts.begins("/scan", of.clone()).expect("room");
+        let topic = counts.on_topic_started("/scan", of.clone()).expect("room");
         let seconds = u32::try_from(now() / 1_000_000_000).expect("this century");
         let words = [0, seconds, 0].map(u32::to_le_bytes);
-        let message = Message {
+        let message = SerializedMessage {
             bytes: words.concat().into(),
             wire_type: Arc::new(of.clone()),
             publisher: ros::bus::PeerId::from("/node"),
             latching: false,
         };
         let many = MOST_AGES + 10;
-        (0..many).for_each(|_| counts.hears(topic, message.clone()));
+        (0..many).for_each(|_| counts.on_message(topic, message.clone()));
         let ages = |number| counts.all.lock().get(number).map(|count| count.ages.len());
         assert_eq!(ages(topic), Some(MOST_AGES));
-        // Topics that come and go, too.
+        // Topics that come and go are bounded, too.
         for number in 0..2 * MOST {
             let topic = format!("/topic{number}");
-            assert!(counts.begins(&topic, of.clone()).is_some(), "{topic}");
-            counts.ends(&topic);
+            assert!(
+                counts.on_topic_started(&topic, of.clone()).is_some(),
+                "{topic}"
+            );
+            counts.on_topic_ended(&topic);
         }
         let taken = counts.take();
         assert_eq!(taken.len(), 1, "{taken:?}");
         assert_eq!(taken[0].messages, many as u64);
         assert_eq!(counts.all.lock().iter_mut().count(), 1);
-        // What has just ended is told once more.
-        counts.hears(topic, message);
-        counts.ends("/scan");
+        // A topic that has just ended is reported once more.
+        counts.on_message(topic, message);
+        counts.on_topic_ended("/scan");
         assert_eq!((counts.take().len(), counts.take().len()), (1, 0));
     }
 }

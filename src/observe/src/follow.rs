@@ -1,68 +1,69 @@
-//! Hears topics of a servant's ROS as they come and go.
+//! Subscribes an observer to a servant's topics as they come and go.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use ros::bus::{Bus, Graph, Message, Qos, Subscription, WireType};
+use ros::bus::{Bus, Graph, QosProfile, SerializedMessage, Subscription, WireType};
 use ros::schema::Registry;
 use tokio::task::{AbortHandle, JoinSet};
 
-/// Messages of a topic that wait while others are looked at.
+/// Queue size of a topic while the observer handles others.
 const QUEUE: usize = 100;
-/// Topics that are heard at most.
+/// Limit on the observed topics.
 const TOPICS: usize = 1000;
 
-/// What is observed.
-pub struct Seen {
-    /// The servant's ROS.
+/// A servant to observe.
+pub struct ObservedServant {
+    /// The servant's ROS bus.
     pub bus: Arc<dyn Bus>,
     /// Message definitions of its image.
     pub registry: Arc<Registry>,
-    /// Dropped when nobody observes any more.
+    /// Guard, dropped when the observation ends.
     pub held: Box<dyn Send + Sync>,
 }
 
-/// Hears messages.
+/// Receives the messages of a servant's topics.
 pub(crate) trait Observer: Send + Sync + 'static {
-    /// Whether it hears this topic, whose type is called so.
-    fn wants(&self, topic: &str, named: &str) -> bool;
-    /// The topic is heard from now on. Its number, by which messages are told; none: it is not heard.
-    fn begins(&self, topic: &str, of: WireType) -> Option<u32>;
-    /// A message of the topic of this number.
-    fn hears(&self, topic: u32, message: Message);
-    /// Nobody publishes the topic any more.
-    fn ends(&self, topic: &str);
+    /// Returns true if the topic, whose type is `named`, should be observed.
+    fn wants_topic(&self, topic: &str, named: &str) -> bool;
+    /// Called when observation of the topic starts. Returns the id under which its messages are delivered, or `None`
+    /// to decline.
+    fn on_topic_started(&self, topic: &str, of: WireType) -> Option<u32>;
+    /// Called for each message of the topic with this id.
+    fn on_message(&self, topic: u32, message: SerializedMessage);
+    /// Called when nobody publishes the topic any more.
+    fn on_topic_ended(&self, topic: &str);
 }
 
-/// Keeps an observer hearing until it is dropped.
-pub struct Followed(AbortHandle);
+/// Handle of an observer's task; ends the observation when dropped.
+pub struct ObserverTask(AbortHandle);
 
-impl Drop for Followed {
+impl Drop for ObserverTask {
     fn drop(&mut self) {
         self.0.abort();
     }
 }
 
-/// Has `observer` hear what is published on a bus.
-pub(crate) fn follow(seen: Seen, observer: Arc<dyn Observer>) -> Followed {
+/// Subscribes `observer` to what is published on a servant's bus.
+pub(crate) fn spawn_observer(seen: ObservedServant, observer: Arc<dyn Observer>) -> ObserverTask {
     let task = tokio::spawn(async move {
-        let Seen {
+        let ObservedServant {
             bus,
             registry,
             held,
         } = seen;
-        followed(&bus, &registry, &observer).await;
+        follow_graph(&bus, &registry, &observer).await;
         drop(held);
     });
-    Followed(task.abort_handle())
+    ObserverTask(task.abort_handle())
 }
 
-async fn followed(bus: &Arc<dyn Bus>, registry: &Arc<Registry>, observer: &Arc<dyn Observer>) {
+async fn follow_graph(bus: &Arc<dyn Bus>, registry: &Arc<Registry>, observer: &Arc<dyn Observer>) {
     let mut graph = bus.graph();
     graph.mark_changed();
     let mut heard: HashMap<String, AbortHandle> = HashMap::new();
-    // They end with this.
+    // They are aborted when this function returns.
     let mut tasks = JoinSet::new();
     while graph.changed().await.is_ok() {
         let now = Arc::clone(&graph.borrow_and_update());
@@ -70,7 +71,7 @@ async fn followed(bus: &Arc<dyn Bus>, registry: &Arc<Registry>, observer: &Arc<d
             let stays = is_published(&now, bus.node(), topic);
             if !stays {
                 task.abort();
-                observer.ends(topic);
+                observer.on_topic_ended(topic);
             }
             stays
         });
@@ -78,8 +79,8 @@ async fn followed(bus: &Arc<dyn Bus>, registry: &Arc<Registry>, observer: &Arc<d
         for (topic, ends) in &now.topics {
             let new = !heard.contains_key(topic) && heard.len() < TOPICS;
             let named = &ends.type_name;
-            if new && is_published(&now, bus.node(), topic) && observer.wants(topic, named) {
-                let hearing = hear(
+            if new && is_published(&now, bus.node(), topic) && observer.wants_topic(topic, named) {
+                let hearing = forward_messages(
                     Arc::clone(bus),
                     Arc::clone(registry),
                     Arc::clone(observer),
@@ -91,21 +92,21 @@ async fn followed(bus: &Arc<dyn Bus>, registry: &Arc<Registry>, observer: &Arc<d
     }
 }
 
-async fn hear(
+async fn forward_messages(
     bus: Arc<dyn Bus>,
     registry: Arc<Registry>,
     observer: Arc<dyn Observer>,
     (name, named): (String, String),
 ) {
     let of = match registry.message(&named) {
-        Ok(message) => WireType::of(&message),
-        // What is not in the image is told by who publishes it.
+        Ok(message) => WireType::from_message(&message),
+        // The publisher tells the definitions of types that are not in the image.
         Err(_) => match bus.topic_type(&name).await {
             Ok(of) if !of.definition.is_empty() => of,
             _ => return,
         },
     };
-    let qos = Qos::keep_last(QUEUE).latching(true);
+    let qos = QosProfile::keep_last(QUEUE).latching(true);
     let subscription = match bus.subscribe(&name, of.clone(), qos).await {
         Ok(subscription) => subscription,
         Err(error) => {
@@ -113,27 +114,27 @@ async fn hear(
             return;
         }
     };
-    let Some(topic) = observer.begins(&name, of) else {
+    let Some(topic) = observer.on_topic_started(&name, of) else {
         return;
     };
-    // What keeps the subscription is dropped with it.
+    // The subscription lasts until this guard is dropped.
     let Subscription {
         mut messages,
         guard: _guard,
         ..
     } = subscription;
     while let Some(message) = messages.recv().await {
-        observer.hears(topic, message);
+        observer.on_message(topic, message);
     }
 }
 
-/// Whether anybody else publishes it.
+/// Returns true if another node publishes the topic.
 fn is_published(graph: &Graph, own: &str, topic: &str) -> bool {
     let ends = graph.topics.get(topic);
     ends.is_some_and(|ends| ends.publishers.iter().any(|node| node != own))
 }
 
-/// Nanoseconds since 1970.
+/// Returns the time in nanoseconds since 1970.
 pub(crate) fn now() -> u64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     now.map_or(0, |since| {

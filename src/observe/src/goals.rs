@@ -1,73 +1,74 @@
-//! What became of goals: each goal of an action that was sent to the servant, who sent it, and how it ended (actionlib; its
-//! messages are `actionlib_msgs/GoalID` and `GoalStatus`).
+//! Outcomes of action goals: every goal sent to the servant, who sent it, and how it ended (actionlib, with the
+//! messages `actionlib_msgs/GoalID` and `GoalStatus`).
 
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Message, WireType};
-use ros::ros1::actions::messages::{self, Status};
+use ros::bus::{SerializedMessage, WireType};
+use ros::ros1::actions::messages::{self, ActionlibStatus};
 use tokio::sync::watch;
 
-use crate::follow::{Followed, Observer, Seen, follow, now};
-use crate::numbered::Numbered;
+use crate::follow::{ObservedServant, Observer, ObserverTask, now, spawn_observer};
+use crate::numbered::IdMap;
 
-/// Goals that are remembered; beyond, the oldest that have ended go first.
+/// Limit on the goals remembered; beyond it, the oldest ended goal is dropped first.
 const MOST: usize = 200;
-/// Characters of an id or of a server's words that are kept.
+/// Maximum length of an id or a result text in characters.
 const LONGEST: usize = 200;
 
-/// A goal.
+/// An action goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Goal {
-    /// The action.
+pub struct ObservedGoal {
+    /// Name of the action.
     pub action: String,
-    /// As its client has called it.
+    /// Goal id chosen by the client.
     pub id: String,
-    /// Who sent it.
-    pub sender: Sender,
-    /// When it was heard of first, nanoseconds since 1970: of one that was not heard itself, when it ended.
+    /// Sender of the goal.
+    pub sender: GoalSender,
+    /// Time when the goal was first seen, in nanoseconds since 1970; if only its result was seen, the time when it
+    /// ended.
     pub began: u64,
-    /// How it ended, and when; none: it has not yet.
-    pub ended: Option<(u64, Outcome)>,
+    /// Time and outcome of the end; `None` while the goal is active.
+    pub ended: Option<(u64, ObservedOutcome)>,
 }
 
-/// Who sent a goal.
+/// Sender of a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Sender {
-    /// This side, which does not hear itself: the goal is known by its id.
+pub enum GoalSender {
+    /// This node itself, which does not receive its own messages: recognised by the goal id.
     Inside,
-    /// This node.
+    /// Another node.
     Node(String),
-    /// The result was heard alone: the goal was sent before anybody listened, or where nobody can.
+    /// Unknown: only the result was seen, because the goal was sent earlier or cannot be observed.
     Unheard,
 }
 
-/// How a goal ended.
+/// Outcome of a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Outcome {
-    /// One in which goals end.
-    pub status: Status,
-    /// The server's words.
+pub struct ObservedOutcome {
+    /// Terminal status.
+    pub status: ActionlibStatus,
+    /// Text from the action server.
     pub text: String,
-    /// The how manieth it is of those that were heard to end; from 1.
+    /// Sequence number among the ended goals, from 1.
     pub number: u64,
 }
 
-/// Hears a servant's actions until it is dropped.
-pub struct Goals {
-    heard: Arc<Heard>,
-    _followed: Followed,
+/// Observes the goals of a servant's actions until dropped.
+pub struct GoalMonitor {
+    heard: Arc<GoalLog>,
+    _followed: ObserverTask,
 }
 
-struct Heard {
-    /// The name of this side's node.
+struct GoalLog {
+    /// Name of this node.
     own: String,
-    all: Mutex<VecDeque<Goal>>,
-    /// By number.
-    topics: Mutex<Numbered<(String, Kind)>>,
-    /// Grows with each goal that has ended, while all are locked.
+    all: Mutex<VecDeque<ObservedGoal>>,
+    /// Action and kind of each observed topic, by id.
+    topics: Mutex<IdMap<(String, Kind)>>,
+    /// Number of ended goals; changed only while `all` is locked.
     ended: watch::Sender<u64>,
 }
 
@@ -77,10 +78,10 @@ enum Kind {
     Result,
 }
 
-impl Goals {
-    /// Of all actions there.
-    pub fn of(seen: Seen) -> Self {
-        let heard = Arc::new(Heard {
+impl GoalMonitor {
+    /// Starts observing all actions of the servant.
+    pub fn start(seen: ObservedServant) -> Self {
+        let heard = Arc::new(GoalLog {
             own: seen.bus.node().to_owned(),
             all: Mutex::default(),
             topics: Mutex::default(),
@@ -89,28 +90,28 @@ impl Goals {
         let observer = Arc::clone(&heard);
         Self {
             heard,
-            _followed: follow(seen, observer),
+            _followed: spawn_observer(seen, observer),
         }
     }
 
-    /// Those that are remembered, the newest first.
-    pub fn all(&self) -> Vec<Goal> {
+    /// Returns the remembered goals, newest first.
+    pub fn recent(&self) -> Vec<ObservedGoal> {
         self.heard.all.lock().iter().rev().cloned().collect()
     }
 
-    /// Those that have ended after so many had, the first of them first; without those that are not remembered any more.
-    pub fn ended_after(&self, number: u64) -> Vec<Goal> {
+    /// Returns the remembered goals that ended after goal number `number`, in the order in which they ended.
+    pub fn ended_after(&self, number: u64) -> Vec<ObservedGoal> {
         self.heard.ended_after(number)
     }
 
-    /// Grows with each goal that has ended.
-    pub fn ended(&self) -> watch::Receiver<u64> {
+    /// Returns a receiver of the number of ended goals.
+    pub fn subscribe_ended(&self) -> watch::Receiver<u64> {
         self.heard.ended.subscribe()
     }
 }
 
-/// The action of a topic, and what it carries.
-fn part(topic: &str, named: &str) -> Option<(String, Kind)> {
+/// Returns the action of a topic and what the topic carries.
+fn parse_action_topic(topic: &str, named: &str) -> Option<(String, Kind)> {
     let (action, last) = topic.rsplit_once('/')?;
     let kind = match last {
         "goal" if named.ends_with("ActionGoal") => Kind::Goal,
@@ -120,30 +121,30 @@ fn part(topic: &str, named: &str) -> Option<(String, Kind)> {
     Some((action.to_owned(), kind))
 }
 
-impl Observer for Heard {
-    fn wants(&self, topic: &str, named: &str) -> bool {
-        part(topic, named).is_some()
+impl Observer for GoalLog {
+    fn wants_topic(&self, topic: &str, named: &str) -> bool {
+        parse_action_topic(topic, named).is_some()
     }
 
-    fn begins(&self, topic: &str, of: WireType) -> Option<u32> {
-        let part = part(topic, &of.name)?;
+    fn on_topic_started(&self, topic: &str, of: WireType) -> Option<u32> {
+        let part = parse_action_topic(topic, &of.name)?;
         let mut topics = self.topics.lock();
         let known = topics.find(|known| *known == part);
         known.or_else(|| topics.add(part))
     }
 
-    fn hears(&self, topic: u32, message: Message) {
+    fn on_message(&self, topic: u32, message: SerializedMessage) {
         let Some((action, kind)) = self.topics.lock().get(topic).cloned() else {
             return;
         };
         let client = message.publisher.node();
         match kind {
-            Kind::Goal => self.sent(action, &message.bytes, client),
-            Kind::Result => self.answered(&action, &message.bytes),
+            Kind::Goal => self.record_goal(action, &message.bytes, client),
+            Kind::Result => self.record_result(&action, &message.bytes),
         };
     }
 
-    fn ends(&self, topic: &str) {
+    fn on_topic_ended(&self, topic: &str) {
         self.topics.lock().retain(|_, (action, kind)| {
             let last = match kind {
                 Kind::Goal => "/goal",
@@ -154,11 +155,12 @@ impl Observer for Heard {
     }
 }
 
-impl Heard {
-    fn ended_after(&self, number: u64) -> Vec<Goal> {
-        let number_of = |goal: &Goal| goal.ended.as_ref().map_or(0, |(_, outcome)| outcome.number);
+impl GoalLog {
+    fn ended_after(&self, number: u64) -> Vec<ObservedGoal> {
+        let number_of =
+            |goal: &ObservedGoal| goal.ended.as_ref().map_or(0, |(_, outcome)| outcome.number);
         let all = self.all.lock();
-        let mut ended: Vec<Goal> = all
+        let mut ended: Vec<ObservedGoal> = all
             .iter()
             .filter(|goal| number_of(goal) > number)
             .cloned()
@@ -168,26 +170,27 @@ impl Heard {
         ended
     }
 
-    fn sent(&self, action: String, bytes: &Bytes, client: &str) -> Option<()> {
+    fn record_goal(&self, action: String, bytes: &Bytes, client: &str) -> Option<()> {
         let (goal, _) = messages::read_goal(bytes)?;
-        let id = short(&goal.id);
-        let sender = match client == self.own {
-            true => Sender::Inside,
-            false => Sender::Node(client.to_owned()),
+        let id = truncate(&goal.id);
+        let sender = if client == self.own {
+            GoalSender::Inside
+        } else {
+            GoalSender::Node(client.to_owned())
         };
         let mut all = self.all.lock();
-        // Its result may have been heard first: they come over two connections.
+        // The result may arrive first, because both come over separate connections.
         let known = all
             .iter_mut()
             .rev()
             .find(|goal| goal.id == id && goal.action == action);
         match known {
-            // Who was heard to send it first; what an id says counts where nobody was.
-            Some(goal) if matches!(goal.sender, Sender::Node(_)) => {}
+            // The first observed sender counts; the id decides only if none was observed.
+            Some(goal) if matches!(goal.sender, GoalSender::Node(_)) => {}
             Some(goal) => goal.sender = sender,
             None => remember(
                 &mut all,
-                Goal {
+                ObservedGoal {
                     action,
                     id,
                     sender,
@@ -199,15 +202,15 @@ impl Heard {
         Some(())
     }
 
-    fn answered(&self, action: &str, bytes: &Bytes) -> Option<()> {
+    fn record_result(&self, action: &str, bytes: &Bytes) -> Option<()> {
         let (state, _) = messages::read_state(bytes)?;
-        let id = short(&state.goal.id);
+        let id = truncate(&state.goal.id);
         let mut all = self.all.lock();
         let time = now();
         let number = *self.ended.borrow() + 1;
-        let outcome = Outcome {
+        let outcome = ObservedOutcome {
             status: state.status,
-            text: short(&state.text),
+            text: truncate(&state.text),
             number,
         };
         let ended = Some((time, outcome));
@@ -216,17 +219,18 @@ impl Heard {
             .rev()
             .find(|goal| goal.id == id && goal.action == action);
         match open {
-            // A result that is latched comes again with each connection.
+            // A latched result arrives again with each connection.
             Some(goal) if goal.ended.is_some() => return None,
             Some(goal) => goal.ended = ended,
             None => {
-                let sender = match is_of(&state.goal.id, &self.own) {
-                    true => Sender::Inside,
-                    false => Sender::Unheard,
+                let sender = if is_id_of_node(&state.goal.id, &self.own) {
+                    GoalSender::Inside
+                } else {
+                    GoalSender::Unheard
                 };
                 remember(
                     &mut all,
-                    Goal {
+                    ObservedGoal {
                         action: action.to_owned(),
                         id,
                         sender,
@@ -241,8 +245,9 @@ impl Heard {
     }
 }
 
-/// Whether a goal's id is one that actionlib's clients make, and this node has: NODE-NUMBER-SECONDS.NANOSECONDS.
-fn is_of(id: &str, node: &str) -> bool {
+/// Returns true if the goal id has the form that actionlib clients of this node generate:
+/// NODE-NUMBER-SECONDS.NANOSECONDS.
+fn is_id_of_node(id: &str, node: &str) -> bool {
     let rest = id
         .strip_prefix(node)
         .and_then(|rest| rest.strip_prefix('-'));
@@ -255,11 +260,11 @@ fn is_of(id: &str, node: &str) -> bool {
     !node.is_empty() && parts.is_some_and(|parts| parts.into_iter().all(is_number))
 }
 
-fn short(text: &str) -> String {
+fn truncate(text: &str) -> String {
     text.chars().take(LONGEST).collect()
 }
 
-fn remember(all: &mut VecDeque<Goal>, goal: Goal) {
+fn remember(all: &mut VecDeque<ObservedGoal>, goal: ObservedGoal) {
     if all.len() >= MOST {
         let over = all.iter().position(|goal| goal.ended.is_some());
         all.remove(over.unwrap_or(0));
@@ -285,7 +290,7 @@ mod tests {
         messages::write_goal(Time::default(), &id(name), b"its own")
     }
 
-    fn result(name: &str, status: Status, text: &str) -> Bytes {
+    fn result(name: &str, status: ActionlibStatus, text: &str) -> Bytes {
         let state = GoalState {
             goal: id(name),
             status,
@@ -294,8 +299,8 @@ mod tests {
         messages::write_state(Time::default(), &state, b"its own")
     }
 
-    fn heard() -> Heard {
-        Heard {
+    fn goal_log() -> GoalLog {
+        GoalLog {
             own: "/inside".to_owned(),
             all: Mutex::default(),
             topics: Mutex::default(),
@@ -305,36 +310,42 @@ mod tests {
 
     #[test]
     fn a_goal_is_known_by_who_sent_it_and_by_its_end() {
-        let heard = heard();
-        heard.sent("/dock".into(), &goal("a-1"), "/rover");
-        heard.answered("/dock", &result("a-1", Status::Succeeded, "there"));
-        // Again, as a latched one.
-        heard.answered("/dock", &result("a-1", Status::Aborted, "not there"));
-        heard.sent("/dock".into(), &goal("a-2"), "/rover");
+        let heard = goal_log();
+        heard.record_goal("/dock".into(), &goal("a-1"), "/rover");
+        heard.record_result("/dock", &result("a-1", ActionlibStatus::Succeeded, "there"));
+        // The same result again, as if latched.
+        heard.record_result(
+            "/dock",
+            &result("a-1", ActionlibStatus::Aborted, "not there"),
+        );
+        heard.record_goal("/dock".into(), &goal("a-2"), "/rover");
         let all = heard.all.lock();
         let (_, outcome) = all[0].ended.clone().expect("it has ended");
         assert_eq!(
             outcome,
-            Outcome {
-                status: Status::Succeeded,
+            ObservedOutcome {
+                status: ActionlibStatus::Succeeded,
                 text: "there".into(),
                 number: 1
             }
         );
-        assert_eq!(all[0].sender, Sender::Node("/rover".into()));
+        assert_eq!(all[0].sender, GoalSender::Node("/rover".into()));
         assert_eq!((all.len(), &all[1].ended), (2, &None));
         assert_eq!(*heard.ended.borrow(), 1);
     }
 
     #[test]
     fn a_result_may_come_before_its_goal_and_without_one() {
-        let heard = heard();
-        heard.answered("/dock", &result("a-1", Status::Succeeded, ""));
-        heard.sent("/dock".into(), &goal("a-1"), "/rover");
-        heard.answered("/dock", &result("own", Status::Succeeded, ""));
+        let heard = goal_log();
+        heard.record_result("/dock", &result("a-1", ActionlibStatus::Succeeded, ""));
+        heard.record_goal("/dock".into(), &goal("a-1"), "/rover");
+        heard.record_result("/dock", &result("own", ActionlibStatus::Succeeded, ""));
         let all = heard.all.lock();
         let senders: Vec<_> = all.iter().map(|goal| goal.sender.clone()).collect();
-        assert_eq!(senders, [Sender::Node("/rover".into()), Sender::Unheard]);
+        assert_eq!(
+            senders,
+            [GoalSender::Node("/rover".into()), GoalSender::Unheard]
+        );
         assert_eq!(
             all[1].ended.as_ref().map(|(time, _)| *time),
             Some(all[1].began)
@@ -343,35 +354,35 @@ mod tests {
 
     #[test]
     fn this_sides_goals_are_known_by_their_ids_and_others_are_not_taken_for_them() {
-        let heard = heard();
+        let heard = goal_log();
         for (id, sender) in [
-            ("/inside-3-17.000000005", Sender::Inside),
-            ("/inside", Sender::Unheard),
-            ("/inside-", Sender::Unheard),
-            ("/inside-3-17", Sender::Unheard),
-            ("/inside_too-3-17.5", Sender::Unheard),
-            ("/inside-too-3-17.5", Sender::Unheard),
-            ("/rover-3-17.5", Sender::Unheard),
-            ("", Sender::Unheard),
+            ("/inside-3-17.000000005", GoalSender::Inside),
+            ("/inside", GoalSender::Unheard),
+            ("/inside-", GoalSender::Unheard),
+            ("/inside-3-17", GoalSender::Unheard),
+            ("/inside_too-3-17.5", GoalSender::Unheard),
+            ("/inside-too-3-17.5", GoalSender::Unheard),
+            ("/rover-3-17.5", GoalSender::Unheard),
+            ("", GoalSender::Unheard),
         ] {
-            heard.answered("/dock", &result(id, Status::Succeeded, ""));
+            heard.record_result("/dock", &result(id, ActionlibStatus::Succeeded, ""));
             let all = heard.all.lock();
             assert_eq!(all.back().map(|goal| &goal.sender), Some(&sender), "{id}");
         }
-        // Who says so and is heard is not believed.
-        heard.sent("/dock".into(), &goal("/inside-3-17.000000005"), "/rover");
+        // An observed sender outweighs the id it chose.
+        heard.record_goal("/dock".into(), &goal("/inside-3-17.000000005"), "/rover");
         let first = heard.all.lock()[0].sender.clone();
-        assert_eq!(first, Sender::Node("/rover".into()));
+        assert_eq!(first, GoalSender::Node("/rover".into()));
     }
 
     #[test]
-    fn each_that_has_ended_is_told_in_turn() {
-        let heard = heard();
+    fn ended_goals_are_listed_in_order() {
+        let heard = goal_log();
         for id in ["a", "b", "c"] {
-            heard.sent("/dock".into(), &goal(id), "/rover");
+            heard.record_goal("/dock".into(), &goal(id), "/rover");
         }
         for id in ["b", "a"] {
-            heard.answered("/dock", &result(id, Status::Succeeded, ""));
+            heard.record_result("/dock", &result(id, ActionlibStatus::Succeeded, ""));
         }
         let ids = |number| -> Vec<String> {
             let ended = heard.ended_after(number).into_iter();
@@ -379,25 +390,25 @@ mod tests {
         };
         assert_eq!(ids(0), ["b", "a"]);
         assert_eq!(ids(1), ["a"]);
-        heard.answered("/dock", &result("c", Status::Aborted, ""));
+        heard.record_result("/dock", &result("c", ActionlibStatus::Aborted, ""));
         assert_eq!((ids(2), *heard.ended.borrow()), (vec!["c".to_owned()], 3));
     }
 
     #[test]
-    fn what_is_cut_off_is_no_goal_and_no_more_are_kept_than_allowed() {
-        let heard = heard();
+    fn truncated_goals_are_ignored_and_the_log_is_bounded() {
+        let heard = goal_log();
         let whole = goal("a-1");
         for end in 0..whole.len() - b"its own".len() {
             assert_eq!(
-                heard.sent("/dock".into(), &whole.slice(..end), "/rover"),
+                heard.record_goal("/dock".into(), &whole.slice(..end), "/rover"),
                 None
             );
         }
         for number in 0..=MOST {
             let id = format!("a-{number}");
-            heard.sent("/dock".into(), &goal(&id), "/rover");
+            heard.record_goal("/dock".into(), &goal(&id), "/rover");
             if number == 1 {
-                heard.answered("/dock", &result(&id, Status::Succeeded, ""));
+                heard.record_result("/dock", &result(&id, ActionlibStatus::Succeeded, ""));
             }
         }
         let all = heard.all.lock();
@@ -407,12 +418,18 @@ mod tests {
     #[test]
     fn topics_of_actions_are_told_by_their_types() {
         let dock = |kind| Some(("/dock".to_owned(), kind));
-        assert_eq!(part("/dock/goal", "nav/DockActionGoal"), dock(Kind::Goal));
         assert_eq!(
-            part("/dock/result", "nav/DockActionResult"),
+            parse_action_topic("/dock/goal", "nav/DockActionGoal"),
+            dock(Kind::Goal)
+        );
+        assert_eq!(
+            parse_action_topic("/dock/result", "nav/DockActionResult"),
             dock(Kind::Result)
         );
-        assert_eq!(part("/dock/goal", "geometry_msgs/Pose"), None);
-        assert_eq!(part("/dock/status", "actionlib_msgs/GoalStatusArray"), None);
+        assert_eq!(parse_action_topic("/dock/goal", "geometry_msgs/Pose"), None);
+        assert_eq!(
+            parse_action_topic("/dock/status", "actionlib_msgs/GoalStatusArray"),
+            None
+        );
     }
 }

@@ -1,9 +1,9 @@
-//! Observers of a servant's ROS: they hear topics beside its robot, as these come and go, and publish nothing.
+//! Observers of a servant's ROS: they subscribe to its topics beside its robot and publish nothing.
 //!
 //! ```text
-//!   bus ──▶ follow: a subscription for each topic that is wanted ─┬─▶ black box: the last seconds ──▶ MCAP file
-//!                                                                 ├─▶ figures: rate, bandwidth and latency of topics
-//!                                                                 └─▶ goals: what became of each goal of an action
+//!   bus ──▶ follow: a subscription for each topic selected ─┬─▶ black box: the last seconds ──▶ MCAP file
+//!                                                           ├─▶ figures: rate, bandwidth and latency of topics
+//!                                                           └─▶ goals: outcome of each goal of an action
 //! ```
 
 #![forbid(unsafe_code)]
@@ -15,7 +15,7 @@ mod goals;
 mod numbered;
 mod ring;
 
-pub use black_box::{BlackBox, BoxOptions, Frozen};
+pub use black_box::{BlackBox, BlackBoxDump, BlackBoxSettings};
 pub use figures::{Figures, TopicFigures};
-pub use follow::{Followed, Seen};
-pub use goals::{Goal, Goals, Outcome, Sender};
+pub use follow::{ObservedServant, ObserverTask};
+pub use goals::{GoalMonitor, GoalSender, ObservedGoal, ObservedOutcome};

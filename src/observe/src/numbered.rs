@@ -1,18 +1,19 @@
-//! What is heard, by number.
+//! Map that assigns ids to its values.
 
 use std::collections::BTreeMap;
 
-/// Numbers that are in use at once.
+/// Maximum number of values at once.
 pub(crate) const MOST: usize = 2000;
 
-/// So many things at most, by number. No number is used again: a message that comes late is not taken for another topic's.
+/// Map with a bounded number of values, each under an id that is never reused, so that a late message is not
+/// attributed to another topic.
 #[derive(Debug)]
-pub(crate) struct Numbered<T> {
+pub(crate) struct IdMap<T> {
     all: BTreeMap<u32, T>,
     next: u32,
 }
 
-impl<T> Default for Numbered<T> {
+impl<T> Default for IdMap<T> {
     fn default() -> Self {
         Self {
             all: BTreeMap::new(),
@@ -21,14 +22,14 @@ impl<T> Default for Numbered<T> {
     }
 }
 
-impl<T> Numbered<T> {
-    /// The number of the first that is so.
+impl<T> IdMap<T> {
+    /// Returns the id of the first value that satisfies the predicate.
     pub fn find(&self, mut is: impl FnMut(&T) -> bool) -> Option<u32> {
         let found = self.all.iter().find(|(_, one)| is(one));
         found.map(|(number, _)| *number)
     }
 
-    /// Adds one; its number. None: there are too many.
+    /// Adds a value and returns its id; `None` if the map is full.
     pub fn add(&mut self, one: T) -> Option<u32> {
         if self.is_full() {
             return None;
@@ -39,27 +40,27 @@ impl<T> Numbered<T> {
         Some(number)
     }
 
-    /// Whether one more finds no room.
+    /// Returns true if no more values can be added.
     pub fn is_full(&self) -> bool {
         self.all.len() >= MOST
     }
 
-    /// Of this number.
+    /// Returns the value with this id.
     pub fn get(&self, number: u32) -> Option<&T> {
         self.all.get(&number)
     }
 
-    /// Of this number.
+    /// Returns the value with this id for modification.
     pub fn get_mut(&mut self, number: u32) -> Option<&mut T> {
         self.all.get_mut(&number)
     }
 
-    /// Those that are there, by number.
+    /// Iterates over ids and values.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = (u32, &mut T)> {
         self.all.iter_mut().map(|(number, one)| (*number, one))
     }
 
-    /// Lets go of those that are not so.
+    /// Removes the values that do not satisfy the predicate.
     pub fn retain(&mut self, mut stays: impl FnMut(u32, &T) -> bool) {
         self.all.retain(|number, one| stays(*number, one));
     }
@@ -70,8 +71,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn there_are_so_many_at_once_and_no_number_comes_again() {
-        let mut numbered = Numbered::default();
+    fn ids_are_bounded_and_never_reused() {
+        let mut numbered = IdMap::default();
         for index in 0..MOST {
             assert_eq!(numbered.add(index), u32::try_from(index).ok());
         }

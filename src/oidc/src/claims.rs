@@ -1,8 +1,9 @@
-//! What a provider says of a person: the claims of an ID token, or of userinfo.
+//! Claims about a person, from an ID token or the userinfo endpoint.
 
 use serde_json::{Map, Value};
 
-/// Groups that a person may have, and characters of each; more are not looked at.
+/// Maximum number of groups of a person and maximum length of a group's name in characters; further or longer ones
+/// are ignored.
 const MOST: usize = 1000;
 const LONGEST: usize = 200;
 
@@ -13,13 +14,13 @@ pub struct Claims {
 }
 
 impl Claims {
-    /// Reads a JSON object.
-    pub fn read(text: &[u8]) -> Result<Claims, serde_json::Error> {
-        serde_json::from_slice(text).and_then(Claims::of)
+    /// Parses a JSON object.
+    pub fn from_slice(text: &[u8]) -> Result<Claims, serde_json::Error> {
+        serde_json::from_slice(text).and_then(Claims::from_value)
     }
 
-    /// Takes a JSON object.
-    pub fn of(value: Value) -> Result<Claims, serde_json::Error> {
+    /// Converts a JSON object.
+    pub fn from_value(value: Value) -> Result<Claims, serde_json::Error> {
         let all: Map<String, Value> = serde_json::from_value(value)?;
         let subject = all.get("sub").cloned().unwrap_or_default();
         Ok(Claims {
@@ -28,12 +29,12 @@ impl Claims {
         })
     }
 
-    /// Whom the provider means.
+    /// Returns the subject identifier (`sub`).
     pub fn subject(&self) -> &str {
         &self.subject
     }
 
-    /// A claim of this name; else, where the name has dots, what is within others (`realm_access.roles`).
+    /// Returns the claim of this name or, if the name has dots, the nested value (`realm_access.roles`).
     pub fn find(&self, name: &str) -> Option<&Value> {
         if let Some(found) = self.all.get(name) {
             return Some(found);
@@ -46,14 +47,15 @@ impl Claims {
         Some(found)
     }
 
-    /// A claim that is a text.
-    pub fn text(&self, name: &str) -> Option<String> {
+    /// Returns a claim that is a non-empty string.
+    pub fn find_text(&self, name: &str) -> Option<String> {
         let text = self.find(name)?.as_str()?;
         (!text.is_empty()).then(|| text.to_owned())
     }
 
-    /// The groups that a claim names: a list of texts, or one text. An address of mail counts when the provider has verified it.
-    pub fn groups(&self, name: &str) -> Option<Vec<String>> {
+    /// Returns the groups of a claim that is a list of strings or one string. An `email` claim counts only if the
+    /// provider has verified it.
+    pub fn find_groups(&self, name: &str) -> Option<Vec<String>> {
         let found = self.find(name)?;
         if name == "email" && self.all.get("email_verified") != Some(&Value::Bool(true)) {
             return Some(Vec::new());
@@ -75,7 +77,7 @@ mod tests {
     use super::*;
 
     fn claims(value: Value) -> Claims {
-        Claims::of(value).expect("claims")
+        Claims::from_value(value).expect("claims")
     }
 
     #[test]
@@ -88,7 +90,7 @@ mod tests {
             "realm_access": {"roles": ["e"]},
             "number": 3,
         }));
-        let groups = |name: &str| all.groups(name).map(|found| found.join(" "));
+        let groups = |name: &str| all.find_groups(name).map(|found| found.join(" "));
         assert_eq!(groups("groups").as_deref(), Some("a b"));
         assert_eq!(groups("one").as_deref(), Some("c"));
         assert_eq!(groups("https://lab.example/groups").as_deref(), Some("d"));
@@ -109,7 +111,7 @@ mod tests {
             let all =
                 claims(json!({"sub": "1", "email": "a@lab.example", "email_verified": verified}));
             assert_eq!(
-                all.groups("email").expect("there").len(),
+                all.find_groups("email").expect("there").len(),
                 count,
                 "{verified}"
             );
@@ -120,14 +122,14 @@ mod tests {
     fn more_groups_than_anybody_has_are_not_looked_at() {
         let many: Vec<String> = (0..MOST + 1).map(|number| number.to_string()).collect();
         let all = claims(json!({"sub": "1", "groups": many, "long": ["x".repeat(LONGEST + 1)]}));
-        assert_eq!(all.groups("groups").expect("there").len(), MOST);
-        assert_eq!(all.groups("long").expect("there").len(), 0);
+        assert_eq!(all.find_groups("groups").expect("there").len(), MOST);
+        assert_eq!(all.find_groups("long").expect("there").len(), 0);
     }
 
     #[test]
     fn without_a_subject_there_is_nobody() {
         for text in ["{}", "[]", "{\"sub\": 1}", "{\"sub\": ", "\"sub\""] {
-            assert!(Claims::read(text.as_bytes()).is_err(), "{text}");
+            assert!(Claims::from_slice(text.as_bytes()).is_err(), "{text}");
         }
     }
 }

@@ -1,80 +1,83 @@
-//! Why nobody is signed in.
+//! Errors of a sign-in.
 
-/// Characters of what a provider says that are passed on.
+/// Maximum length in characters of provider messages that are passed on.
 const LONGEST: usize = 300;
 
-/// Why nobody is signed in.
+/// Reason why a sign-in failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// An address that is none, or that others could read on the way.
+    /// The URL is invalid or would be sent in plain text.
     #[error(
-        "{0:?} is no address of a provider; write https://HOST/PATH (http:// is for this machine alone), without query"
+        "{0:?} is not the address of a provider; write https://HOST/PATH without a query (http:// only for this \
+            machine)"
     )]
     NoAddress(String),
-    /// The provider gives no answer, or none that can be used.
-    #[error("the identity provider {issuer} cannot be asked: {reason}")]
+    /// The provider did not answer, or its answer is unusable.
+    #[error("cannot reach the identity provider {issuer}: {reason}")]
     Unreachable {
-        /// Its issuer identifier.
+        /// Issuer identifier of the provider.
         issuer: String,
-        /// The cause.
+        /// Underlying error.
         reason: String,
     },
-    /// Too many sign in at once.
-    #[error("too many people sign in at once")]
+    /// Too many sign-ins are in progress.
+    #[error("too many sign-ins at once")]
     Busy,
     /// The state is unknown.
-    #[error("this sign-in was not begun here, is over, or took longer than 10 minutes")]
+    #[error(
+        "this sign-in was not started here, is already finished, or took longer than 10 minutes"
+    )]
     UnknownState,
-    /// Another browser began it.
-    #[error("this sign-in was begun in another browser")]
+    /// The sign-in was started in another browser.
+    #[error("this sign-in was started in another browser")]
     OtherBrowser,
-    /// The provider says that nobody signed in (section 3.1.2.6).
+    /// The provider reported that the sign-in failed (section 3.1.2.6).
     #[error("the identity provider refused: {reason}")]
     Denied {
-        /// In its words.
+        /// The provider's message.
         reason: String,
     },
-    /// The provider does not know the code.
-    #[error("the identity provider does not take its code back: {reason}")]
+    /// The provider rejected the authorization code.
+    #[error("the identity provider rejected its own code: {reason}")]
     Code {
-        /// In its words.
+        /// The provider's message.
         reason: String,
     },
-    /// The provider does not know this server.
-    #[error("the identity provider {issuer} refuses this server: {reason}")]
+    /// The provider rejected this server's client credentials.
+    #[error("the identity provider {issuer} rejected this server: {reason}")]
     Client {
-        /// Its issuer identifier.
+        /// Issuer identifier of the provider.
         issuer: String,
-        /// In its words.
+        /// The provider's message.
         reason: String,
     },
-    /// What the provider says of the person cannot be believed.
-    #[error("the ID token of {issuer} is not good: {reason}")]
+    /// The ID token or userinfo failed verification.
+    #[error("the ID token of {issuer} is invalid: {reason}")]
     Token {
-        /// Its issuer identifier.
+        /// Issuer identifier of the provider.
         issuer: String,
-        /// What is wrong.
+        /// Description of what is wrong.
         reason: String,
     },
 }
 
 impl Error {
-    /// What the provider says that it is refused for.
-    pub fn denied(reason: &str) -> Error {
+    /// Creates the error for a sign-in that the provider refused.
+    pub fn from_denial(reason: &str) -> Error {
         Error::Denied {
-            reason: cut(reason),
+            reason: sanitize(reason),
         }
     }
 
-    /// Whether it is for an operator to look at.
-    pub fn is_providers(&self) -> bool {
+    /// Returns true if an operator has to look into it.
+    pub fn is_provider_fault(&self) -> bool {
         matches!(
             self,
             Error::Unreachable { .. } | Error::Client { .. } | Error::Token { .. }
         )
     }
 
-    /// Whether somebody may have made it up who tries many.
+    /// Returns true if the error may be the result of guessing.
     pub fn is_guess(&self) -> bool {
         matches!(
             self,
@@ -82,35 +85,38 @@ impl Error {
         )
     }
 
-    /// What to do.
-    pub fn next(&self) -> &'static str {
+    /// Returns what the person should do next.
+    pub fn next_step(&self) -> &'static str {
         match self {
             Error::NoAddress(_) => "correct [oidc] of the configuration",
             Error::Unreachable { .. } => {
-                "try again later; an operator looks at issuer in [oidc] of the configuration, and at the provider; accounts and tokens work on"
+                "try again later, or ask an operator to check issuer in [oidc] of the configuration, and the provider; \
+                    accounts and tokens still work"
             }
             Error::Busy => "try again later",
             Error::UnknownState | Error::OtherBrowser | Error::Code { .. } => {
-                "sign in again from the portal's page, in one browser that takes cookies"
+                "sign in again from the portal's page, in one browser with cookies enabled"
             }
-            Error::Denied { .. } => "sign in again, or ask who runs the identity provider",
+            Error::Denied { .. } => "sign in again, or ask the operator of the identity provider",
             Error::Client { .. } => {
-                "compare client_id and client_secret_file in [oidc] of the configuration with what the provider has for this server"
+                "compare client_id and client_secret_file in [oidc] of the configuration with the settings of the \
+                    provider for this server"
             }
             Error::Token { .. } => {
-                "sign in again; if it is so again, compare issuer and client_id in [oidc] of the configuration with the provider's, and both clocks"
+                "sign in again; if it fails again, compare issuer and client_id in [oidc] of the configuration with \
+                    the provider's, and both clocks"
             }
         }
     }
 }
 
-/// What others say, for a message: of a bounded length, in a line.
-pub(crate) fn cut(text: &str) -> String {
+/// Sanitizes third-party text for a message: limits its length and replaces control characters by blanks.
+pub(crate) fn sanitize(text: &str) -> String {
     let plain = text.chars().map(|c| if c.is_control() { ' ' } else { c });
     plain.take(LONGEST).collect()
 }
 
-/// An error with what caused it.
+/// Formats an error with its causes.
 pub(crate) fn with_causes(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

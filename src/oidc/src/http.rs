@@ -1,4 +1,4 @@
-//! Asking the provider by HTTP: as `openidconnect` asks, and for userinfo.
+//! HTTP requests to the provider, made by `openidconnect` and for userinfo.
 
 use std::future::Future;
 use std::path::PathBuf;
@@ -12,53 +12,54 @@ use openidconnect::url::Url;
 use openidconnect::{AsyncHttpClient, HttpRequest, HttpResponse};
 
 use crate::claims::Claims;
-use crate::{BYTES, TIME, is_private};
+use crate::{BYTES, TIME, is_confidential};
 
-const ADVICE: &str = "name the authorities of the provider's certificate: authorities in [oidc] of the configuration";
+const ADVICE: &str =
+    "add the authority of the provider's certificate to authorities in [oidc] of the configuration";
 
-/// Why a request has no answer.
+/// Reason why a request failed.
 #[derive(Debug, thiserror::Error)]
-pub enum Unanswered {
-    /// The provider would have this server ask in plain text.
+pub enum ProviderRequestError {
+    /// The provider named a URL that is not https.
     #[error("it names an address that is not https: {0}")]
     PlainText(String),
-    /// No answer.
+    /// The request failed.
     #[error(transparent)]
     Outbound(#[from] outbound::Error),
 }
 
-/// Asks the provider.
+/// HTTP client for the provider.
 pub struct Http {
-    client: outbound::Client,
-    /// Whether its issuer is at https: then all of it is.
+    client: outbound::OutboundClient,
+    /// True if the issuer uses https; then every request must.
     secure: bool,
 }
 
 impl Http {
     pub fn new(authorities: Option<PathBuf>, secure: bool) -> Http {
         Http {
-            client: outbound::Client::new(authorities, ADVICE).bounded(TIME, BYTES),
+            client: outbound::OutboundClient::new(authorities, ADVICE).with_limits(TIME, BYTES),
             secure,
         }
     }
 
-    /// Whether an address that the provider names is as its issuer is.
-    pub fn may_ask(&self, url: &Url) -> bool {
-        url.scheme() == "https" || (!self.secure && is_private(url))
+    /// Returns true if a URL named by the provider is as secure as its issuer.
+    pub fn is_allowed(&self, url: &Url) -> bool {
+        url.scheme() == "https" || (!self.secure && is_confidential(url))
     }
 
-    async fn send(&self, request: HttpRequest) -> Result<HttpResponse, Unanswered> {
+    async fn send(&self, request: HttpRequest) -> Result<HttpResponse, ProviderRequestError> {
         if self.secure && request.uri().scheme_str() != Some("https") {
             let host = request.uri().host().unwrap_or_default();
-            return Err(Unanswered::PlainText(host.to_owned()));
+            return Err(ProviderRequestError::PlainText(host.to_owned()));
         }
         let request = request.map(|body| Full::new(Bytes::from(body)));
         let answer = self.client.send(request).await?;
         Ok(answer.map(|body| body.to_vec()))
     }
 
-    /// What it says of whoever an access token is of (section 5.3.1).
-    pub async fn userinfo(&self, url: &Url, access_token: &str) -> Result<Claims, String> {
+    /// Fetches the claims of the access token's owner (section 5.3.1).
+    pub async fn fetch_userinfo(&self, url: &Url, access_token: &str) -> Result<Claims, String> {
         let shown = HeaderValue::from_str(&format!("Bearer {access_token}"))
             .map_err(|_| "its access token cannot be sent".to_owned())?;
         let request = Request::get(url.as_str())
@@ -71,17 +72,21 @@ impl Http {
             .await
             .map_err(|error| error.to_string())?;
         if answer.status() != StatusCode::OK {
-            return Err(format!("its userinfo is answered by {}", answer.status()));
+            return Err(format!(
+                "its userinfo endpoint answered {}",
+                answer.status()
+            ));
         }
-        Claims::read(answer.body()).map_err(|error| {
-            format!("its userinfo is no JSON object with a sub ({error}); signed ones are not read")
+        Claims::from_slice(answer.body()).map_err(|error| {
+            format!("its userinfo is not a JSON object with a sub ({error}); signed userinfo is not supported")
         })
     }
 }
 
 impl<'c> AsyncHttpClient<'c> for Http {
-    type Error = Unanswered;
-    type Future = Pin<Box<dyn Future<Output = Result<HttpResponse, Unanswered>> + Send + 'c>>;
+    type Error = ProviderRequestError;
+    type Future =
+        Pin<Box<dyn Future<Output = Result<HttpResponse, ProviderRequestError>> + Send + 'c>>;
 
     fn call(&'c self, request: HttpRequest) -> Self::Future {
         Box::pin(self.send(request))

@@ -1,13 +1,13 @@
-//! People whom an identity provider knows, by OpenID Connect Core 1.0: the authorization code flow (section 3.1) with PKCE
-//! (RFC 7636), state and nonce.
+//! Sign-in through an identity provider with OpenID Connect Core 1.0: the authorization code flow (section 3.1) with
+//! PKCE (RFC 7636), state and nonce.
 //!
 //! ```text
-//!  begin: where the browser goes, and what it keeps ─▶ (the provider asks who it is) ─▶ take: what was begun, once
-//!                                                             ─▶ finish: code ─▶ ID token, verified ─▶ [`Person`]
+//!  begin: redirect URL and cookie ─▶ (the provider authenticates the person) ─▶ resume: the pending sign-in, once
+//!                                                    ─▶ finish: code ─▶ ID token, verified ─▶ [`Person`]
 //! ```
 //!
-//! What a person may do is for [`Roles`]. The provider is asked when somebody signs in, and not before: what it says of itself is
-//! kept for an hour.
+//! [`Roles`] determines what a person may do. The provider is contacted only when somebody signs in; its metadata is
+//! cached for an hour.
 
 #![forbid(unsafe_code)]
 
@@ -34,62 +34,62 @@ use parking_lot::Mutex;
 use tokio::sync::{Semaphore, SemaphorePermit};
 
 pub use error::Error;
-pub use pending::Started;
-pub use roles::{Granted, Group, Roles};
+pub use pending::ReturnedSignIn;
+pub use roles::{GrantedRole, RoleGroup, Roles};
 
 use http::Http;
-use metadata::{Known, Metadata};
-use pending::{Pending, Waiting};
-use token::Client;
+use metadata::{DiscoveredProvider, MetadataCache};
+use pending::{PendingSignIn, PendingSignIns};
+use token::OidcClient;
 
-/// How long the provider may take for one answer, and how many bytes that may have.
+/// Timeout of a response from the provider, and its maximum size in bytes.
 const TIME: Duration = Duration::from_secs(10);
 const BYTES: usize = 256 << 10;
-/// Requests to the provider at once; who comes beyond is told to try again.
+/// Limit on concurrent requests to the provider; further ones are told to try again.
 const AT_ONCE: usize = 16;
-/// Bytes of what makes a browser, or a sign-in, known again.
+/// Length of the random values that identify a browser or a sign-in, in bytes.
 const SECRET: u32 = 32;
-/// Longest code that is looked at, in bytes.
+/// Maximum length of an authorization code in bytes.
 const LONGEST_CODE: usize = 8192;
 
-/// What the operator says of the provider.
+/// Configuration of the provider.
 #[derive(Clone)]
 pub struct Settings {
-    /// Its issuer identifier: what it says of itself is at `ISSUER/.well-known/openid-configuration`.
+    /// Issuer identifier; its metadata is at `ISSUER/.well-known/openid-configuration`.
     pub issuer: String,
-    /// As whom it knows this server.
+    /// Client identifier of this server.
     pub client_id: String,
-    /// By what this server proves that; none: a public client.
+    /// Client secret; `None` for a public client.
     pub client_secret: Option<String>,
-    /// Where it sends browsers back to.
+    /// Redirect URI, to which the provider sends browsers back.
     pub redirect: String,
-    /// What is asked for besides `openid`.
+    /// Scopes requested besides `openid`.
     pub scopes: Vec<String>,
-    /// The claim that has a person's groups.
+    /// Claim that holds a person's groups.
     pub groups_claim: String,
-    /// The claim that has its name.
+    /// Claim that holds a person's name.
     pub name_claim: String,
-    /// PEM file of the authorities that its certificate is checked by; none: the system's.
+    /// PEM file with the authorities that sign the provider's certificate (default: the system's).
     pub authorities: Option<PathBuf>,
 }
 
-/// Somebody whom the provider knows.
+/// A person authenticated by the provider.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Person {
-    /// By which the provider tells people apart, for ever (`sub`).
+    /// Subject identifier (`sub`), unique and permanent at the provider.
     pub subject: String,
-    /// As it calls the person now: not unique, and another tomorrow perhaps (section 5.7).
+    /// Display name, neither unique nor permanent (section 5.7).
     pub name: String,
-    /// Its groups.
+    /// Groups of the person.
     pub groups: Vec<String>,
 }
 
-/// A sign-in that has begun.
+/// A sign-in that has been started.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Begun {
-    /// Where the browser goes.
+pub struct SignInRedirect {
+    /// URL to which the browser is redirected.
     pub url: String,
-    /// By what it is known when it comes back.
+    /// Value that identifies the browser when it returns.
     pub browser: String,
 }
 
@@ -99,28 +99,28 @@ pub struct Provider {
     issuer: IssuerUrl,
     redirect: RedirectUrl,
     http: Http,
-    metadata: Metadata,
-    pending: Mutex<Pending>,
+    metadata: MetadataCache,
+    pending: Mutex<PendingSignIns>,
     turns: Semaphore,
 }
 
-/// Whether nobody can read what is sent to an address, or only this machine's own.
-fn is_private(url: &Url) -> bool {
+/// Returns true if requests to the URL are encrypted or stay on this machine.
+fn is_confidential(url: &Url) -> bool {
     match url.scheme() {
         "https" => true,
         "http" => url.host_str().is_some_and(|host| {
-            // Those of IPv6 stand in brackets.
-            outbound::is_this_machine(host.trim_matches(['[', ']']))
+            // IPv6 addresses are in brackets.
+            outbound::is_loopback_host(host.trim_matches(['[', ']']))
         }),
         _ => false,
     }
 }
 
 impl Provider {
-    /// One that is asked later.
+    /// Creates a provider; it is contacted later.
     pub fn new(settings: Settings) -> Result<Provider, Error> {
         let address = |text: &str| {
-            let url = Url::parse(text).ok().filter(is_private);
+            let url = Url::parse(text).ok().filter(is_confidential);
             url.filter(|url| url.query().is_none() && url.fragment().is_none())
                 .ok_or_else(|| Error::NoAddress(text.to_owned()))
         };
@@ -136,54 +136,55 @@ impl Provider {
             redirect: RedirectUrl::new(settings.redirect.clone())
                 .map_err(wrong(&settings.redirect))?,
             http,
-            metadata: Metadata::default(),
+            metadata: MetadataCache::default(),
             pending: Mutex::default(),
             turns: Semaphore::new(AT_ONCE),
             settings,
         })
     }
 
-    /// Its issuer identifier.
+    /// Returns the issuer identifier.
     pub fn issuer(&self) -> &str {
         &self.settings.issuer
     }
 
-    fn turn(&self) -> Result<SemaphorePermit<'_>, Error> {
+    fn acquire_permit(&self) -> Result<SemaphorePermit<'_>, Error> {
         self.turns.try_acquire().map_err(|_| Error::Busy)
     }
 
     fn unreachable(&self, reason: String) -> Error {
         Error::Unreachable {
             issuer: self.settings.issuer.clone(),
-            reason: error::cut(&reason),
+            reason: error::sanitize(&reason),
         }
     }
 
-    fn client(&self, known: &Known) -> Client {
+    fn client(&self, known: &DiscoveredProvider) -> OidcClient {
         let secret = self.settings.client_secret.clone().map(ClientSecret::new);
-        let client = Client::from_provider_metadata(
+        let client = OidcClient::from_provider_metadata(
             known.metadata.clone(),
             ClientId::new(self.settings.client_id.clone()),
             secret,
         );
-        let how = match known.takes_basic() {
-            true => AuthType::BasicAuth,
-            false => AuthType::RequestBody,
+        let how = if known.supports_basic_auth() {
+            AuthType::BasicAuth
+        } else {
+            AuthType::RequestBody
         };
         client
             .set_redirect_uri(self.redirect.clone())
             .set_auth_type(how)
     }
 
-    /// Begins to sign somebody in, in the browser that is known by `browser` if it was here before. `earlier`: what
-    /// [`Started::earlier`] says later.
+    /// Starts a sign-in. `browser` identifies the browser if it was here before; `earlier` is returned as
+    /// [`ReturnedSignIn::earlier`].
     pub async fn begin(
         &self,
         browser: Option<&str>,
         from: IpAddr,
         earlier: Option<String>,
-    ) -> Result<Begun, Error> {
-        let _turn = self.turn()?;
+    ) -> Result<SignInRedirect, Error> {
+        let _turn = self.acquire_permit()?;
         let known = self.metadata.get(&self.issuer, &self.http).await;
         let known = known.map_err(|reason| self.unreachable(reason))?;
         let (challenge, verifier) = PkceCodeChallenge::new_random_sha256();
@@ -196,18 +197,18 @@ impl Provider {
             .add_scopes(scopes)
             .set_pkce_challenge(challenge);
         let (url, state, nonce) = asked.url();
-        if !self.http.may_ask(&url) {
+        if !self.http.is_allowed(&url) {
             return Err(self.unreachable(format!(
                 "it sends browsers to {}, which is not https",
                 url.origin().ascii_serialization()
             )));
         }
         let browser = match browser {
-            // Whoever signs in in two windows of one browser goes on in both.
+            // Sign-ins in two windows of one browser may both be finished.
             Some(browser) => browser.to_owned(),
             None => CsrfToken::new_random_len(SECRET).into_secret(),
         };
-        let waiting = Waiting {
+        let waiting = PendingSignIn {
             browser: browser.clone(),
             from,
             nonce,
@@ -215,53 +216,56 @@ impl Provider {
             earlier,
         };
         let mut pending = self.pending.lock();
-        pending.keep(state.into_secret(), waiting, Instant::now());
-        Ok(Begun {
+        pending.insert(state.into_secret(), waiting, Instant::now());
+        Ok(SignInRedirect {
             url: url.into(),
             browser,
         })
     }
 
-    /// What was begun by this state, in the browser that is known by `browser`: once.
-    pub fn take(&self, state: &str, browser: Option<&str>) -> Result<Started, Error> {
+    /// Takes the sign-in that was started with this state in this browser. Works once.
+    pub fn resume(&self, state: &str, browser: Option<&str>) -> Result<ReturnedSignIn, Error> {
         self.pending.lock().take(state, browser, Instant::now())
     }
 
-    /// Refuses an answer of another provider (RFC 9207).
+    /// Refuses a response from another issuer (RFC 9207).
     pub fn check_issuer(&self, issuer: Option<&str>) -> Result<(), Error> {
         match issuer {
             Some(other) if other != self.settings.issuer => Err(Error::Token {
                 issuer: self.settings.issuer.clone(),
-                reason: format!("the answer is one of {}", error::cut(other)),
+                reason: format!(
+                    "the answer comes from another issuer, {}",
+                    error::sanitize(other)
+                ),
             }),
             _ => Ok(()),
         }
     }
 
-    /// Who has signed in, by the code that the provider gave its browser.
-    pub async fn finish(&self, started: Started, code: String) -> Result<Person, Error> {
+    /// Exchanges the authorization code for the person who signed in.
+    pub async fn finish(&self, started: ReturnedSignIn, code: String) -> Result<Person, Error> {
         if code.is_empty() || code.len() > LONGEST_CODE {
             return Err(Error::Code {
                 reason: "it is empty, or too long".into(),
             });
         }
-        let _turn = self.turn()?;
+        let _turn = self.acquire_permit()?;
         let known = self.metadata.get(&self.issuer, &self.http).await;
         let known = known.map_err(|reason| self.unreachable(reason))?;
         let response = self.exchange(&known, code, started.verifier).await?;
         let Some(id_token) = response.id_token() else {
-            return Err(self.bad("there is none".into()));
+            return Err(self.token_error("there is none".into()));
         };
-        let checks = token::Checks {
+        let checks = token::IdTokenChecks {
             client_id: &self.settings.client_id,
             issuer: &self.issuer,
             nonce: &started.nonce,
             access: response.access_token(),
         };
         let claims = match checks.verify(id_token, &known) {
-            // It may sign by another key since it was asked for its keys.
-            Err(refused) if refused.is_of_unknown_key() => {
-                let fresh = self.metadata.renewed(&known, &self.http).await;
+            // The provider may have rotated its keys since they were fetched.
+            Err(refused) if refused.is_unknown_key() => {
+                let fresh = self.metadata.refresh_keys(&known, &self.http).await;
                 match fresh.map_err(|reason| self.unreachable(reason))? {
                     Some(fresh) => checks.verify(id_token, &fresh),
                     None => Err(refused),
@@ -269,21 +273,21 @@ impl Provider {
             }
             verified => verified,
         };
-        let claims = claims.map_err(|refused| self.bad(refused.to_string()))?;
-        self.person(&known, claims, response.access_token().secret())
+        let claims = claims.map_err(|refused| self.token_error(refused.to_string()))?;
+        self.resolve_person(&known, claims, response.access_token().secret())
             .await
     }
 
-    fn bad(&self, reason: String) -> Error {
+    fn token_error(&self, reason: String) -> Error {
         Error::Token {
             issuer: self.settings.issuer.clone(),
-            reason: error::cut(&reason),
+            reason: error::sanitize(&reason),
         }
     }
 
     async fn exchange(
         &self,
-        known: &Known,
+        known: &DiscoveredProvider,
         code: String,
         verifier: PkceCodeVerifier,
     ) -> Result<token::Response, Error> {
@@ -297,8 +301,8 @@ impl Provider {
             .await
             .map_err(|error| match error {
                 RequestTokenError::ServerResponse(refusal) => {
-                    // Of the client, not of the code (RFC 6749, section 5.2): nobody can sign in.
-                    let reason = error::cut(&refusal.to_string());
+                    // The error concerns the client, not the code (RFC 6749, section 5.2): nobody can sign in.
+                    let reason = error::sanitize(&refusal.to_string());
                     match refusal.error().as_ref() {
                         "invalid_grant" => Error::Code { reason },
                         _ => Error::Client {
@@ -308,43 +312,43 @@ impl Provider {
                     }
                 }
                 RequestTokenError::Request(error) => self.unreachable(error.to_string()),
-                // What stands there may be a secret.
-                RequestTokenError::Parse(..) => self.bad(
-                    "the answer of the token endpoint is not one with an ID token that has iss, sub, aud, exp and iat"
+                // The response may contain a secret.
+                RequestTokenError::Parse(..) => self.token_error(
+                    "the answer of the token endpoint has no ID token with iss, sub, aud, exp and iat"
                         .into(),
                 ),
-                other => self.bad(error::with_causes(&other)),
+                other => self.token_error(error::with_causes(&other)),
             })
     }
 
-    /// The person that verified claims are of. Groups that are not in them are asked for (userinfo, section 5.3).
-    async fn person(
+    /// Builds the person from verified claims. Missing groups are fetched from the userinfo endpoint (section 5.3).
+    async fn resolve_person(
         &self,
-        known: &Known,
+        known: &DiscoveredProvider,
         claims: claims::Claims,
         access_token: &str,
     ) -> Result<Person, Error> {
         let subject = claims.subject().to_owned();
         let (name, groups) = (&self.settings.name_claim, &self.settings.groups_claim);
         let lacks = claims.find(groups).is_none() || claims.find(name).is_none();
-        let more = match known.userinfo().filter(|_| lacks) {
+        let more = match known.userinfo_endpoint().filter(|_| lacks) {
             Some(url) => {
-                let told = self.http.userinfo(url, access_token).await;
+                let told = self.http.fetch_userinfo(url, access_token).await;
                 let told = told.map_err(|reason| self.unreachable(reason))?;
                 if told.subject() != subject {
-                    return Err(self.bad("its userinfo is of another person".into()));
+                    return Err(self.token_error("its userinfo is of another person".into()));
                 }
                 Some(told)
             }
             None => None,
         };
         let told = |claim: &str| {
-            let of_userinfo = || more.as_ref().and_then(|more| more.groups(claim));
-            claims.groups(claim).or_else(of_userinfo)
+            let of_userinfo = || more.as_ref().and_then(|more| more.find_groups(claim));
+            claims.find_groups(claim).or_else(of_userinfo)
         };
         let named = claims
-            .text(name)
-            .or_else(|| more.as_ref().and_then(|more| more.text(name)));
+            .find_text(name)
+            .or_else(|| more.as_ref().and_then(|more| more.find_text(name)));
         Ok(Person {
             name: named.unwrap_or_else(|| subject.clone()),
             groups: told(groups).unwrap_or_default(),

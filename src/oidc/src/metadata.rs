@@ -1,4 +1,4 @@
-//! What a provider says of itself (OpenID Connect Discovery 1.0) and its keys: asked for when somebody signs in, and kept.
+//! Cache of the provider's metadata (OpenID Connect Discovery 1.0) and keys, fetched when somebody signs in.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,49 +11,53 @@ use tokio::sync::Mutex;
 use crate::error::with_causes;
 use crate::http::Http;
 
-/// How long it is kept.
+/// Time for which the metadata is cached.
 const AGE: Duration = Duration::from_secs(3600);
-/// Keys are asked for anew no more often, whatever tokens name.
+/// Minimum interval between refreshes of the keys, whatever tokens demand.
 const KEYS_AGAIN: Duration = Duration::from_secs(60);
-/// Those who waited while the provider gave no answer are not made to wait again.
+/// Time for which a failure is cached, so that those who waited for it need not wait again.
 const FAILED: Duration = Duration::from_secs(1);
 
-/// What is known of a provider.
-pub struct Known {
-    /// Its own words, keys included.
+/// Metadata of the provider.
+pub struct DiscoveredProvider {
+    /// The provider's metadata, including its keys.
     pub metadata: CoreProviderMetadata,
     at: Instant,
 }
 
-impl Known {
-    /// Whether it takes the client's secret in a header, which it does if it says nothing (Core, section 9).
-    pub fn takes_basic(&self) -> bool {
+impl DiscoveredProvider {
+    /// Returns true if the client secret may be sent in a header, which is the default (Core, section 9).
+    pub fn supports_basic_auth(&self) -> bool {
         let methods = self.metadata.token_endpoint_auth_methods_supported();
         methods.is_none_or(|methods| methods.contains(&CoreClientAuthMethod::ClientSecretBasic))
     }
 
-    /// Where it tells more of a person.
-    pub fn userinfo(&self) -> Option<&Url> {
+    /// Returns the URL of the userinfo endpoint.
+    pub fn userinfo_endpoint(&self) -> Option<&Url> {
         self.metadata.userinfo_endpoint().map(|url| url.url())
     }
 }
 
 #[derive(Default)]
 struct State {
-    known: Option<Arc<Known>>,
+    known: Option<Arc<DiscoveredProvider>>,
     failed: Option<(Instant, String)>,
-    /// When keys were asked for anew.
+    /// Time when the keys were last refreshed.
     keys: Option<Instant>,
 }
 
-/// What a provider says of itself.
+/// Cached metadata of a provider.
 #[derive(Default)]
-pub struct Metadata(Mutex<State>);
+pub struct MetadataCache(Mutex<State>);
 
-impl Metadata {
-    /// What is known, or what it says now; else why it says nothing.
-    pub async fn get(&self, issuer: &IssuerUrl, http: &Http) -> Result<Arc<Known>, String> {
-        // Who comes meanwhile waits for the same answer.
+impl MetadataCache {
+    /// Returns the cached metadata, or fetches it; otherwise the reason why it cannot be fetched.
+    pub async fn get(
+        &self,
+        issuer: &IssuerUrl,
+        http: &Http,
+    ) -> Result<Arc<DiscoveredProvider>, String> {
+        // Concurrent callers wait for the same response.
         let asked = Instant::now();
         let mut state = self.0.lock().await;
         if let Some(known) = state
@@ -71,7 +75,7 @@ impl Metadata {
         match CoreProviderMetadata::discover_async(issuer.clone(), http).await {
             Ok(metadata) => {
                 let at = Instant::now();
-                let known = Arc::new(Known { metadata, at });
+                let known = Arc::new(DiscoveredProvider { metadata, at });
                 state.known = Some(Arc::clone(&known));
                 state.failed = None;
                 Ok(known)
@@ -84,10 +88,14 @@ impl Metadata {
         }
     }
 
-    /// The same with keys of now; none where it was asked for them a moment ago.
-    pub async fn renewed(&self, before: &Known, http: &Http) -> Result<Option<Arc<Known>>, String> {
+    /// Returns the metadata with refreshed keys; `None` if they were refreshed a moment ago.
+    pub async fn refresh_keys(
+        &self,
+        before: &DiscoveredProvider,
+        http: &Http,
+    ) -> Result<Option<Arc<DiscoveredProvider>>, String> {
         let mut state = self.0.lock().await;
-        // Another has asked while this one waited.
+        // Another caller has refreshed them while this one waited.
         if let Some(known) = state.known.as_ref().filter(|known| known.at > before.at) {
             return Ok(Some(Arc::clone(known)));
         }
@@ -97,7 +105,7 @@ impl Metadata {
         state.keys = Some(Instant::now());
         let asked = CoreJsonWebKeySet::fetch_async(before.metadata.jwks_uri(), http).await;
         let keys = asked.map_err(|error| with_causes(&error))?;
-        let known = Arc::new(Known {
+        let known = Arc::new(DiscoveredProvider {
             metadata: before.metadata.clone().set_jwks(keys),
             at: Instant::now(),
         });

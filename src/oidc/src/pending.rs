@@ -1,4 +1,4 @@
-//! Sign-ins under way: in memory, each good once and for ten minutes, of a bounded number.
+//! Pending sign-ins, in memory: each is valid once and for ten minutes, and their number is bounded.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -9,14 +9,15 @@ use openidconnect::{Nonce, PkceCodeVerifier};
 
 use crate::Error;
 
-/// How long somebody may take to say to the provider who it is.
+/// Time a person may take to sign in at the provider.
 const TIME: Duration = Duration::from_secs(600);
-/// Sign-ins under way, of all and of one host. The oldest of that host, or of the network that has the most, makes room for a new one.
+/// Limits on pending sign-ins, in total and per host. The oldest of that host, or of the network that has the most,
+/// is replaced.
 const MOST: usize = 4096;
 const MOST_OF_ONE: usize = 64;
 
-/// A sign-in that waits for its browser to come back.
-pub struct Waiting {
+/// A sign-in whose browser has not returned yet.
+pub struct PendingSignIn {
     pub browser: String,
     pub from: IpAddr,
     pub nonce: Nonce,
@@ -24,24 +25,24 @@ pub struct Waiting {
     pub earlier: Option<String>,
 }
 
-/// A sign-in whose browser has come back.
-pub struct Started {
+/// A sign-in whose browser has returned.
+pub struct ReturnedSignIn {
     pub(crate) nonce: Nonce,
     pub(crate) verifier: PkceCodeVerifier,
-    /// What was said of the browser when it began.
+    /// Value passed to `begin`.
     pub earlier: Option<String>,
 }
 
 #[derive(Default)]
-pub struct Pending {
-    /// By their states.
-    all: HashMap<String, (Instant, Waiting)>,
+pub struct PendingSignIns {
+    /// Sign-ins by state.
+    all: HashMap<String, (Instant, PendingSignIn)>,
 }
 
-impl Pending {
-    /// Keeps a sign-in.
-    pub fn keep(&mut self, state: String, waiting: Waiting, now: Instant) {
-        self.all.retain(|_, (begun, _)| is_good(*begun, now));
+impl PendingSignIns {
+    /// Adds a sign-in.
+    pub fn insert(&mut self, state: String, waiting: PendingSignIn, now: Instant) {
+        self.all.retain(|_, (begun, _)| is_fresh(*begun, now));
         let of = Host::from(waiting.from);
         let hosts = || self.all.values().map(|(_, it)| Host::from(it.from));
         if hosts().filter(|host| *host == of).count() >= MOST_OF_ONE {
@@ -62,21 +63,21 @@ impl Pending {
         }
     }
 
-    /// What was begun by a state. Whoever comes with it, it is good for nobody any more.
+    /// Removes and returns the sign-in with this state. It is used up even if the caller is refused.
     pub fn take(
         &mut self,
         state: &str,
         browser: Option<&str>,
         now: Instant,
-    ) -> Result<Started, Error> {
+    ) -> Result<ReturnedSignIn, Error> {
         let (begun, waiting) = self.all.remove(state).ok_or(Error::UnknownState)?;
-        if !is_good(begun, now) {
+        if !is_fresh(begun, now) {
             return Err(Error::UnknownState);
         }
         if browser != Some(&*waiting.browser) {
             return Err(Error::OtherBrowser);
         }
-        Ok(Started {
+        Ok(ReturnedSignIn {
             nonce: waiting.nonce,
             verifier: waiting.verifier,
             earlier: waiting.earlier,
@@ -84,7 +85,7 @@ impl Pending {
     }
 }
 
-fn is_good(begun: Instant, now: Instant) -> bool {
+fn is_fresh(begun: Instant, now: Instant) -> bool {
     now.saturating_duration_since(begun) < TIME
 }
 
@@ -92,8 +93,8 @@ fn is_good(begun: Instant, now: Instant) -> bool {
 mod tests {
     use super::*;
 
-    fn waiting(from: &str) -> Waiting {
-        Waiting {
+    fn pending_sign_in(from: &str) -> PendingSignIn {
+        PendingSignIn {
             browser: "browser".into(),
             from: from.parse().expect("an address"),
             nonce: Nonce::new("nonce".into()),
@@ -104,13 +105,13 @@ mod tests {
 
     #[test]
     fn a_state_is_good_once_for_its_browser_and_its_time() {
-        let (mut pending, now) = (Pending::default(), Instant::now());
+        let (mut pending, now) = (PendingSignIns::default(), Instant::now());
         for state in ["a", "b", "c", "d"] {
-            pending.keep(state.into(), waiting("192.0.2.1"), now);
+            pending.insert(state.into(), pending_sign_in("192.0.2.1"), now);
         }
         let mine = Some("browser");
         pending.take("a", mine, now).map(|_| ()).expect("begun");
-        let wrong = |taken: Result<Started, Error>| taken.map(|_| ()).expect_err("refused");
+        let wrong = |taken: Result<ReturnedSignIn, Error>| taken.map(|_| ()).expect_err("refused");
         assert!(matches!(
             wrong(pending.take("a", mine, now)),
             Error::UnknownState
@@ -123,7 +124,7 @@ mod tests {
             wrong(pending.take("b", Some("other"), now)),
             Error::OtherBrowser
         ));
-        // Who came with it first has used it up.
+        // The first caller has used it up.
         assert!(matches!(
             wrong(pending.take("b", mine, now)),
             Error::UnknownState
@@ -140,13 +141,13 @@ mod tests {
     }
 
     #[test]
-    fn whoever_begins_many_pushes_out_its_own() {
-        let (mut pending, now) = (Pending::default(), Instant::now());
-        pending.keep("other".into(), waiting("192.0.2.9"), now);
+    fn a_host_that_begins_many_sign_ins_evicts_its_own() {
+        let (mut pending, now) = (PendingSignIns::default(), Instant::now());
+        pending.insert("other".into(), pending_sign_in("192.0.2.9"), now);
         for number in 0..=MOST_OF_ONE as u32 {
             let from = format!("2001:db8::{number:x}");
             let at = now + Duration::from_millis(number.into());
-            pending.keep(number.to_string(), waiting(&from), at);
+            pending.insert(number.to_string(), pending_sign_in(&from), at);
         }
         assert_eq!(pending.all.len(), MOST_OF_ONE + 1);
         assert!(!pending.all.contains_key("0"), "the oldest");
@@ -154,19 +155,19 @@ mod tests {
     }
 
     #[test]
-    fn who_has_a_great_network_takes_no_more_than_there_are_places_and_pushes_out_its_own() {
-        let (mut pending, now) = (Pending::default(), Instant::now());
-        pending.keep("other".into(), waiting("192.0.2.1"), now);
+    fn a_large_network_is_bounded_and_evicts_its_own_sign_ins() {
+        let (mut pending, now) = (PendingSignIns::default(), Instant::now());
+        pending.insert("other".into(), pending_sign_in("192.0.2.1"), now);
         for number in 0..MOST + 9 {
-            // Each is another host, of one site.
+            // Each is another host of the same site.
             let from = format!("2001:db8:0:{number:x}::1");
             let at = now + Duration::from_millis(1 + number as u64);
-            pending.keep(number.to_string(), waiting(&from), at);
+            pending.insert(number.to_string(), pending_sign_in(&from), at);
         }
         assert_eq!(pending.all.len(), MOST);
         assert!(pending.all.contains_key("other"));
         assert!(!pending.all.contains_key("0"), "the oldest of its own");
-        pending.keep("later".into(), waiting("192.0.2.1"), now + 2 * TIME);
+        pending.insert("later".into(), pending_sign_in("192.0.2.1"), now + 2 * TIME);
         assert_eq!(pending.all.len(), 1);
     }
 }

@@ -1,41 +1,41 @@
-//! Which groups of a provider have which role, for which services.
+//! Mapping from the provider's groups to roles and services.
 
 use access::{Glob, Role};
 
-/// A group that may do something.
+/// A group that has a role.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Group {
-    /// As the provider calls it.
+pub struct RoleGroup {
+    /// Name of the group at the provider.
     pub name: String,
-    /// Its people's role.
+    /// Role of its members.
     pub role: Role,
-    /// For which services; none where the role is for all.
+    /// Services to which the role applies; empty if the role is for all services.
     pub services: Vec<Glob>,
 }
 
-/// What somebody may do.
+/// Role granted to a person.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Granted {
-    /// The strongest of the roles that the person's groups have.
+pub struct GrantedRole {
+    /// The strongest role of the person's groups.
     pub role: Role,
-    /// The services of those of its groups that have this role, together.
+    /// Services of all the person's groups that have this role.
     pub services: Vec<Glob>,
-    /// Those groups of the person that are named here, in the order of the configuration.
+    /// The person's groups that are mapped, in the order of the configuration.
     pub groups: Vec<String>,
 }
 
-/// All groups that may do something.
+/// All groups that have a role.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Roles(pub Vec<Group>);
+pub struct Roles(pub Vec<RoleGroup>);
 
-/// Who may more comes first; people are no robots.
+/// Roles from the strongest to the weakest; people cannot be robots.
 const STRONGEST_FIRST: [Role; 4] = [Role::Admin, Role::Operator, Role::Deployer, Role::Viewer];
 
 impl Roles {
-    /// What somebody of these groups may do; none: nothing.
-    pub fn of(&self, groups: &[String]) -> Option<Granted> {
-        let of_person = |group: &&Group| groups.contains(&group.name);
-        let mine: Vec<&Group> = self.0.iter().filter(of_person).collect();
+    /// Returns the role of a person with these groups, or `None` if no group has one.
+    pub fn grant_for_groups(&self, groups: &[String]) -> Option<GrantedRole> {
+        let of_person = |group: &&RoleGroup| groups.contains(&group.name);
+        let mine: Vec<&RoleGroup> = self.0.iter().filter(of_person).collect();
         let has = |role: &Role| mine.iter().any(|group| group.role == *role);
         let role = STRONGEST_FIRST.into_iter().find(has)?;
         let mut services: Vec<Glob> = Vec::new();
@@ -44,7 +44,7 @@ impl Roles {
             let new: Vec<Glob> = new.cloned().collect();
             services.extend(new);
         }
-        Some(Granted {
+        Some(GrantedRole {
             role,
             services,
             groups: mine.iter().map(|group| group.name.clone()).collect(),
@@ -56,8 +56,8 @@ impl Roles {
 mod tests {
     use super::*;
 
-    fn group(name: &str, role: Role, services: &[&str]) -> Group {
-        Group {
+    fn group(name: &str, role: Role, services: &[&str]) -> RoleGroup {
+        RoleGroup {
             name: name.into(),
             role,
             services: services
@@ -77,12 +77,12 @@ mod tests {
         ]);
         let of = |groups: &[&str]| {
             let groups: Vec<String> = groups.iter().map(|&one| one.to_owned()).collect();
-            let granted = roles.of(&groups)?;
+            let granted = roles.grant_for_groups(&groups)?;
             let services: Vec<String> = granted.services.iter().map(ToString::to_string).collect();
             Some((granted.role, services.join(" "), granted.groups.join(" ")))
         };
         assert_eq!(of(&["all"]), Some((Role::Viewer, "*".into(), "all".into())));
-        // What a viewer sees is no deployer's.
+        // A viewer's services do not become a deployer's.
         let both = of(&["b", "all", "a", "unknown"]);
         assert_eq!(
             both,

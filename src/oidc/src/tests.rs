@@ -24,8 +24,9 @@ fn provider(issuer: &str) -> Provider {
     Provider::new(settings(issuer)).expect("good settings")
 }
 
-/// Answers each connection with the next of these, as JSON; `ISSUER` in them is its address, which is given.
-async fn answering(answers: Vec<&'static str>) -> String {
+/// Starts a server that answers each connection with the next of `answers` as JSON, replacing `ISSUER` by its URL;
+/// returns that URL.
+async fn serve_answers(answers: Vec<&'static str>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let issuer = format!("http://{}", listener.local_addr().expect("bound"));
     let mine = issuer.clone();
@@ -85,7 +86,7 @@ fn addresses_that_others_read_are_none() {
 
 #[tokio::test]
 async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
-    let issuer = answering(vec![METADATA, KEYS]).await;
+    let issuer = serve_answers(vec![METADATA, KEYS]).await;
     let provider = provider(&issuer);
     let first = provider.begin(None, HERE, None).await.expect("begun");
     let second = provider
@@ -93,7 +94,7 @@ async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
         .await;
     let second = second.expect("begun: what the provider says of itself is kept");
     assert_eq!(first.browser, second.browser, "two windows of one browser");
-    let asked = |begun: &Begun, name: &str| {
+    let asked = |begun: &SignInRedirect, name: &str| {
         let url = Url::parse(&begun.url).expect("an address");
         let mut pairs = url.query_pairs();
         let found = pairs.find(|(key, _)| key == name);
@@ -113,7 +114,9 @@ async fn a_sign_in_has_a_state_a_nonce_and_a_challenge_of_its_own() {
         assert!(one.len() >= 43 && one != other, "{name}: {one} {other}");
     }
     let state = asked(&second, "state");
-    let taken = provider.take(&state, Some(&second.browser)).expect("begun");
+    let taken = provider
+        .resume(&state, Some(&second.browser))
+        .expect("begun");
     assert_eq!(taken.earlier.as_deref(), Some("earlier"));
 }
 
@@ -122,7 +125,7 @@ async fn a_provider_that_says_it_is_another_is_not_asked() {
     let other = r#"{"issuer": "https://another.example", "authorization_endpoint": "ISSUER/auth", "jwks_uri": "ISSUER/keys",
         "response_types_supported": ["code"], "subject_types_supported": ["public"],
         "id_token_signing_alg_values_supported": ["RS256"]}"#;
-    let provider = provider(&answering(vec![other]).await);
+    let provider = provider(&serve_answers(vec![other]).await);
     let refused = provider.begin(None, HERE, None).await.expect_err("another");
     assert!(refused.to_string().contains("another.example"), "{refused}");
 }
@@ -137,14 +140,14 @@ async fn a_provider_at_https_names_no_plain_text() {
     let refused = refused.expect_err("plain text").to_string();
     assert!(refused.contains("not https"), "{refused}");
     let url = |text: &str| Url::parse(text).expect("an address");
-    assert!(http.may_ask(&url("https://login.lab.example/auth")));
-    assert!(!http.may_ask(&url("http://127.0.0.1:1/auth")));
-    assert!(Http::new(None, false).may_ask(&url("http://127.0.0.1:1/auth")));
-    assert!(!Http::new(None, false).may_ask(&url("http://lab.example/auth")));
+    assert!(http.is_allowed(&url("https://login.lab.example/auth")));
+    assert!(!http.is_allowed(&url("http://127.0.0.1:1/auth")));
+    assert!(Http::new(None, false).is_allowed(&url("http://127.0.0.1:1/auth")));
+    assert!(!Http::new(None, false).is_allowed(&url("http://lab.example/auth")));
 }
 
 #[tokio::test]
-async fn more_than_go_on_at_once_are_refused() {
+async fn concurrent_sign_ins_beyond_the_limit_are_refused() {
     let provider = provider("https://id.lab.example");
     let all = provider
         .turns
@@ -160,7 +163,7 @@ async fn more_than_go_on_at_once_are_refused() {
 async fn a_code_that_is_none_is_not_sent() {
     let provider = provider("https://id.lab.example");
     for code in [String::new(), "x".repeat(LONGEST_CODE + 1)] {
-        let started = Started {
+        let started = ReturnedSignIn {
             nonce: Nonce::new("n".into()),
             verifier: PkceCodeVerifier::new("v".repeat(43)),
             earlier: None,
@@ -184,7 +187,7 @@ fn an_answer_of_another_provider_is_refused() {
 
 #[test]
 fn what_others_say_is_cut_to_a_line() {
-    let denied = Error::denied(&format!("a\nb\u{1b}{}", "x".repeat(1000))).to_string();
+    let denied = Error::from_denial(&format!("a\nb\u{1b}{}", "x".repeat(1000))).to_string();
     assert!(
         !denied.contains(char::is_control) && denied.len() < 400,
         "{denied}"

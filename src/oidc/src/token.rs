@@ -1,4 +1,4 @@
-//! The ID token, and what is checked of it (OpenID Connect Core 1.0, section 3.1.3.7).
+//! Verification of the ID token (OpenID Connect Core 1.0, section 3.1.3.7).
 
 use std::collections::BTreeMap;
 
@@ -19,11 +19,12 @@ use serde_json::Value;
 
 use crate::claims::Claims;
 use crate::error::with_causes;
-use crate::metadata::Known;
+use crate::metadata::DiscoveredProvider;
 
-/// How far the provider's clock may be from this machine's.
+/// Tolerated clock skew between the provider and this machine.
 const SKEW: TimeDelta = TimeDelta::seconds(60);
-/// Signatures that count: those of key pairs. By a secret that both know this server could sign, too, and by none anybody.
+/// Accepted signature algorithms: asymmetric ones only. With a shared secret this server could sign as well, and with
+/// `none` anybody could.
 const ALGORITHMS: [CoreJwsSigningAlgorithm; 9] = [
     CoreJwsSigningAlgorithm::RsaSsaPkcs1V15Sha256,
     CoreJwsSigningAlgorithm::RsaSsaPkcs1V15Sha384,
@@ -36,23 +37,23 @@ const ALGORITHMS: [CoreJwsSigningAlgorithm; 9] = [
     CoreJwsSigningAlgorithm::EdDsa,
 ];
 
-/// Claims beyond those that the standard names, groups among them.
+/// Claims beyond the standard ones, such as groups.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Others(BTreeMap<String, Value>);
+pub struct ExtraClaims(BTreeMap<String, Value>);
 
-impl AdditionalClaims for Others {}
+impl AdditionalClaims for ExtraClaims {}
 
 type IdToken = openidconnect::IdToken<
-    Others,
+    ExtraClaims,
     CoreGenderClaim,
     CoreJweContentEncryptionAlgorithm,
     CoreJwsSigningAlgorithm,
 >;
 
-/// What the token endpoint answers.
+/// Response of the token endpoint.
 pub type Response = StandardTokenResponse<
     IdTokenFields<
-        Others,
+        ExtraClaims,
         EmptyExtraTokenFields,
         CoreGenderClaim,
         CoreJweContentEncryptionAlgorithm,
@@ -61,9 +62,9 @@ pub type Response = StandardTokenResponse<
     CoreTokenType,
 >;
 
-/// This server as the provider knows it.
-pub type Client = openidconnect::Client<
-    Others,
+/// OAuth client that represents this server.
+pub type OidcClient = openidconnect::Client<
+    ExtraClaims,
     CoreAuthDisplay,
     CoreGenderClaim,
     CoreJweContentEncryptionAlgorithm,
@@ -82,85 +83,90 @@ pub type Client = openidconnect::Client<
     EndpointMaybeSet,
 >;
 
-/// Why an ID token is not good.
+/// Reason why an ID token is refused.
 #[derive(Debug, thiserror::Error)]
-pub enum Refused {
-    /// Its claims, or its signature.
+pub enum IdTokenError {
+    /// The claims or the signature are invalid.
     #[error("{}", with_causes(.0))]
     Claims(ClaimsVerificationError),
-    /// It was made for another server that the provider knows.
-    #[error("it was made for the client {0}")]
+    /// It was issued for another client of the provider.
+    #[error("it was issued for the client {0}")]
     Party(String),
-    /// It has several audiences, and does not say for which of them it was made.
+    /// It has several audiences and no authorized party (azp).
     #[error("it has several audiences, and no azp")]
     NoParty,
-    /// The access token beside it is another's.
+    /// The token's hash does not match the access token.
     #[error("its at_hash is of another access token")]
     AccessToken,
-    /// Its claims cannot be written as JSON.
+    /// The claims cannot be serialized as JSON.
     #[error(transparent)]
     Unwritable(#[from] serde_json::Error),
 }
 
-impl Refused {
-    /// Whether it is signed by a key that the provider did not have when it was asked.
-    pub fn is_of_unknown_key(&self) -> bool {
+impl IdTokenError {
+    /// Returns true if it is signed by a key that is missing from the fetched key set.
+    pub fn is_unknown_key(&self) -> bool {
         let unknown = ClaimsVerificationError::SignatureVerification(
             SignatureVerificationError::NoMatchingKey,
         );
-        matches!(self, Refused::Claims(error) if *error == unknown)
+        matches!(self, IdTokenError::Claims(error) if *error == unknown)
     }
 }
 
-/// What an ID token must fit.
-pub struct Checks<'a> {
+/// Expected values of an ID token.
+pub struct IdTokenChecks<'a> {
     pub client_id: &'a str,
     pub issuer: &'a IssuerUrl,
-    /// What was sent when the sign-in began.
+    /// Nonce sent when the sign-in started.
     pub nonce: &'a Nonce,
-    /// What came beside it.
+    /// Access token received with the ID token.
     pub access: &'a AccessToken,
 }
 
-impl Checks<'_> {
-    /// Its claims, when all is as it should be.
-    pub fn verify(&self, token: &IdToken, known: &Known) -> Result<Claims, Refused> {
+impl IdTokenChecks<'_> {
+    /// Verifies the token and returns its claims.
+    pub fn verify(
+        &self,
+        token: &IdToken,
+        known: &DiscoveredProvider,
+    ) -> Result<Claims, IdTokenError> {
         let keys = known.metadata.jwks().clone();
         let client = ClientId::new(self.client_id.to_owned());
         let verifier = IdTokenVerifier::new_public_client(client, self.issuer.clone(), keys)
             .set_allowed_algs(ALGORITHMS)
             .set_time_fn(|| Utc::now() - SKEW)
-            .set_issue_time_verifier_fn(not_from_later)
-            // Which of several it was made for says azp.
+            .set_issue_time_verifier_fn(check_issue_time)
+            // With several audiences, azp decides.
             .set_other_audience_verifier_fn(|_| true);
         let claims = token
             .claims(&verifier, self.nonce)
-            .map_err(Refused::Claims)?;
+            .map_err(IdTokenError::Claims)?;
         match claims.authorized_party() {
             Some(party) if party.as_str() != self.client_id => {
-                return Err(Refused::Party(party.as_str().to_owned()));
+                return Err(IdTokenError::Party(party.as_str().to_owned()));
             }
-            None if claims.audiences().len() > 1 => return Err(Refused::NoParty),
+            None if claims.audiences().len() > 1 => return Err(IdTokenError::NoParty),
             _ => {}
         }
         if let Some(expected) = claims.access_token_hash() {
             let signature =
-                |error| Refused::Claims(ClaimsVerificationError::SignatureVerification(error));
+                |error| IdTokenError::Claims(ClaimsVerificationError::SignatureVerification(error));
             let algorithm = token.signing_alg().map_err(signature)?;
             let key = token.signing_key(&verifier).map_err(signature)?;
             let found = AccessTokenHash::from_token(self.access, algorithm, key)
-                .map_err(|_| Refused::AccessToken)?;
+                .map_err(|_| IdTokenError::AccessToken)?;
             if found != *expected {
-                return Err(Refused::AccessToken);
+                return Err(IdTokenError::AccessToken);
             }
         }
-        Ok(Claims::of(serde_json::to_value(claims)?)?)
+        Ok(Claims::from_value(serde_json::to_value(claims)?)?)
     }
 }
 
-fn not_from_later(issued: DateTime<Utc>) -> Result<(), String> {
-    match issued <= Utc::now() + SKEW {
-        true => Ok(()),
-        false => Err(format!("issued at {issued}, which is yet to come")),
+fn check_issue_time(issued: DateTime<Utc>) -> Result<(), String> {
+    if issued <= Utc::now() + SKEW {
+        Ok(())
+    } else {
+        Err(format!("issued at {issued}, which is in the future"))
     }
 }

@@ -1,5 +1,5 @@
-//! Requests of the daemon to servers of others, by HTTP/1.1 over TLS (RFC 9110, RFC 9112): one connection each, bounded in time and
-//! bytes. Redirects are not followed, and nothing goes beyond this machine in plain text.
+//! HTTP/1.1 client (RFC 9110, RFC 9112) for the daemon's requests to third-party servers, over TLS: one connection
+//! per request, limited in time and bytes. Redirects are not followed, and plain text never leaves this machine.
 
 use std::net::IpAddr;
 use std::path::PathBuf;
@@ -15,67 +15,68 @@ use tls::Trust;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 
-/// How long a request may take, from the look-up of its server's name to the last byte of its answer.
+/// Default timeout of a request, from DNS lookup to the last byte of the response.
 const TIME: Duration = Duration::from_secs(15);
-/// Bytes of an answer's body.
+/// Default limit on the size of a response body in bytes.
 const BYTES: usize = 1 << 20;
 
-/// Why a request has no answer.
+/// Reason why a request failed.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// An address without a host, or of another scheme.
+    /// The URL has no host, or another scheme.
     #[error("{0} is no address of a server; write https://HOST/PATH")]
     NoAddress(String),
-    /// Plain text to another machine.
+    /// The URL would send plain text to another machine.
     #[error(
         "{0} would be asked in plain text, which is done on this machine alone; write https://"
     )]
     PlainText(String),
-    /// No connection.
+    /// The connection could not be established.
     #[error("{server} cannot be reached: {source}")]
     Unreachable {
-        /// Its host and port.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// Underlying error.
         source: std::io::Error,
     },
-    /// A connection that ended, or another protocol.
+    /// The connection ended early, or the server does not speak HTTP.
     #[error("{server} gave no answer by HTTP: {source}")]
     NoAnswer {
-        /// Its host and port.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// Underlying error.
         source: hyper::Error,
     },
-    /// An answer's body that ended too soon, or is longer than it may be.
+    /// The response body was cut short or exceeds the limit.
     #[error("the answer of {server} cannot be read: {reason}")]
     Unreadable {
-        /// Its host and port.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// Underlying error.
         reason: String,
     },
-    /// It took too long.
+    /// The request timed out.
     #[error("{server} did not answer within {} s", .time.as_secs())]
     Late {
-        /// Its host and port.
+        /// Host and port of the server.
         server: String,
-        /// How long it may take.
+        /// The timeout.
         time: Duration,
     },
 }
 
-/// Asks servers of others.
+/// HTTP client for third-party servers.
 #[derive(Debug, Clone)]
-pub struct Client {
+pub struct OutboundClient {
     trust: Trust,
     time: Duration,
     bytes: usize,
 }
 
-impl Client {
-    /// Trusts the system's authorities, or those of a PEM file. `advice` is what to do where neither has any.
-    pub fn new(authorities: Option<PathBuf>, advice: &'static str) -> Client {
+impl OutboundClient {
+    /// Creates a client that trusts the authorities of a PEM file (default: the system's). `advice` tells the
+    /// operator what to do if there are none.
+    pub fn new(authorities: Option<PathBuf>, advice: &'static str) -> OutboundClient {
         let trust = Trust {
             authorities,
             fingerprint: None,
@@ -84,25 +85,25 @@ impl Client {
             advice,
             identity: None,
         };
-        Client {
+        OutboundClient {
             trust,
             time: TIME,
             bytes: BYTES,
         }
     }
 
-    /// Another time for each request, and other bytes for the body of each answer.
-    pub fn bounded(self, time: Duration, bytes: usize) -> Client {
-        Client {
+    /// Sets the timeout of each request and the size limit of each response body in bytes.
+    pub fn with_limits(self, time: Duration, bytes: usize) -> OutboundClient {
+        OutboundClient {
             time,
             bytes,
             ..self
         }
     }
 
-    /// Sends a request to the server in its address, and reads the answer whole.
+    /// Sends a request to the server of its URL and reads the whole response.
     pub async fn send(&self, request: Request<Full<Bytes>>) -> Result<Response<Bytes>, Error> {
-        let address = Address::of(request.uri())?;
+        let address = ServerAddress::from_uri(request.uri())?;
         let server = address.authority();
         match tokio::time::timeout(self.time, self.exchange(&address, request)).await {
             Ok(answer) => answer,
@@ -115,7 +116,7 @@ impl Client {
 
     async fn exchange(
         &self,
-        address: &Address,
+        address: &ServerAddress,
         request: Request<Full<Bytes>>,
     ) -> Result<Response<Bytes>, Error> {
         let unreachable = |source| Error::Unreachable {
@@ -126,20 +127,20 @@ impl Client {
             .await
             .map_err(unreachable)?;
         if !address.secure {
-            return self.speak(stream, address, request).await;
+            return self.send_over(stream, address, request).await;
         }
         let connected = self
             .trust
             .connect(stream, &address.host, &address.authority())
             .await
             .map_err(unreachable)?;
-        self.speak(connected.stream, address, request).await
+        self.send_over(connected.stream, address, request).await
     }
 
-    async fn speak<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
+    async fn send_over<S: AsyncRead + AsyncWrite + Send + Unpin + 'static>(
         &self,
         stream: S,
-        address: &Address,
+        address: &ServerAddress,
         mut request: Request<Full<Bytes>>,
     ) -> Result<Response<Bytes>, Error> {
         let no_answer = |source| Error::NoAnswer {
@@ -150,11 +151,11 @@ impl Client {
             server: address.authority(),
             reason,
         };
-        let named = HeaderValue::from_str(&address.named).map_err(|_| address.wrong())?;
+        let named = HeaderValue::from_str(&address.named).map_err(|_| address.invalid_address())?;
         request.headers_mut().insert(HOST, named);
         let close = HeaderValue::from_static("close");
         request.headers_mut().insert(CONNECTION, close);
-        // What a server that is no proxy is asked for (RFC 9112, section 3.2.1).
+        // Origin form of the request target (RFC 9112, section 3.2.1).
         let path = request.uri().path_and_query().cloned();
         *request.uri_mut() = path.map_or(Uri::from_static("/"), Uri::from);
         let (mut sender, connection) = http1::handshake(TokioIo::new(stream))
@@ -169,7 +170,7 @@ impl Client {
                 .map_err(|error| unreadable(error.to_string()))?;
             Ok(Response::from_parts(parts, body.to_bytes()))
         };
-        // The connection ends with its one answer, or when this is given up.
+        // The connection ends after its only response, or when the request is dropped.
         tokio::pin!(answer);
         tokio::select! {
             answer = &mut answer => answer,
@@ -178,18 +179,18 @@ impl Client {
     }
 }
 
-/// Where a request goes.
-struct Address {
-    /// Without the brackets of an IPv6 address.
+/// Server that a request goes to.
+struct ServerAddress {
+    /// Host name, without the brackets of an IPv6 address.
     host: String,
     port: u16,
-    /// As it stands in the address.
+    /// Authority as written in the URL.
     named: String,
     secure: bool,
 }
 
-impl Address {
-    fn of(uri: &Uri) -> Result<Address, Error> {
+impl ServerAddress {
+    fn from_uri(uri: &Uri) -> Result<ServerAddress, Error> {
         let none = || Error::NoAddress(uri.to_string());
         let authority = uri.authority().ok_or_else(none)?;
         let host = authority.host();
@@ -199,15 +200,15 @@ impl Address {
             .unwrap_or(host);
         let secure = match uri.scheme_str() {
             Some("https") => true,
-            Some("http") if is_this_machine(host) => false,
+            Some("http") if is_loopback_host(host) => false,
             Some("http") => return Err(Error::PlainText(uri.to_string())),
             _ => return Err(none()),
         };
-        // Neither a name nor a password of a user is sent to anybody.
+        // User names and passwords are never sent.
         if authority.as_str().contains('@') {
             return Err(none());
         }
-        Ok(Address {
+        Ok(ServerAddress {
             host: host.to_owned(),
             port: authority
                 .port_u16()
@@ -218,19 +219,20 @@ impl Address {
     }
 
     fn authority(&self) -> String {
-        match self.host.contains(':') {
-            true => format!("[{}]:{}", self.host, self.port),
-            false => format!("{}:{}", self.host, self.port),
+        if self.host.contains(':') {
+            format!("[{}]:{}", self.host, self.port)
+        } else {
+            format!("{}:{}", self.host, self.port)
         }
     }
 
-    fn wrong(&self) -> Error {
+    fn invalid_address(&self) -> Error {
         Error::NoAddress(self.named.clone())
     }
 }
 
-/// Whether nobody is on the way to a host.
-pub fn is_this_machine(host: &str) -> bool {
+/// Returns true if the host is this machine, so that nobody on the network can intercept.
+pub fn is_loopback_host(host: &str) -> bool {
     host.eq_ignore_ascii_case("localhost")
         || host
             .parse::<IpAddr>()
@@ -244,8 +246,8 @@ mod tests {
 
     use super::*;
 
-    fn client() -> Client {
-        Client::new(None, "no authorities")
+    fn client() -> OutboundClient {
+        OutboundClient::new(None, "no authorities")
     }
 
     fn get(address: &str) -> Request<Full<Bytes>> {
@@ -254,7 +256,7 @@ mod tests {
             .expect("a request")
     }
 
-    /// A server that answers its first connection with `answer`, and tells what it was asked.
+    /// Starts a server that answers its first connection with `answer` and returns the request it received.
     async fn server(answer: Vec<u8>) -> (String, tokio::task::JoinHandle<String>) {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = format!("http://{}", listener.local_addr().expect("bound"));
@@ -264,7 +266,7 @@ mod tests {
             while !asked.ends_with(b"\r\n\r\n") {
                 assert!(stream.read_buf(&mut asked).await.expect("a request") > 0);
             }
-            // A client that has read enough is gone.
+            // The client closes the connection once it has read enough.
             let _ = stream.write_all(&answer).await;
             String::from_utf8(asked).expect("text")
         });
@@ -300,7 +302,7 @@ mod tests {
         long.extend(vec![b'x'; 2000]);
         let (address, _) = server(long).await;
         let refused = client()
-            .bounded(TIME, 1000)
+            .with_limits(TIME, 1000)
             .send(get(&address))
             .await
             .expect_err("too long");

@@ -1,25 +1,25 @@
-//! Ament's index: which packages an install space of ROS 2 has, and what else packages have registered there
-//! (`share/ament_index/resource_index/KIND/PACKAGE`).
+//! The ament resource index of ROS 2 install spaces (`share/ament_index/resource_index/KIND/PACKAGE`): packages, and
+//! what they have registered.
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use crate::merged::{self, Level, Merged};
+use crate::merged::{self, LayerDirectory, MergedDirectory};
 use crate::{Error, names};
 
 const INDEX: &str = "share/ament_index/resource_index";
-/// The largest resource that is read.
+/// Maximum size of a resource in bytes.
 const MAX_BYTES: u64 = 64 << 10;
-/// Component classes of one package.
+/// Maximum number of component classes of a package.
 const MAX_COMPONENTS: usize = 1000;
 
-/// Names of packages in the indexes of these install spaces (absolute paths in the layers). `layers` are extracted trees,
-/// lowest first. Blocking.
+/// Returns the names of the packages in the indexes of install spaces (absolute paths in the layers). `layers` are
+/// extracted trees, lowest first. Blocking.
 pub fn packages<L: AsRef<Path>, P: AsRef<str>>(
     layers: &[L],
     prefixes: &[P],
 ) -> Result<BTreeSet<String>, Error> {
-    let stack = merged::open(layers)?;
+    let stack = merged::open_layers(layers)?;
     let mut found = BTreeSet::new();
     for prefix in prefixes {
         found.extend(packages_in(&stack, prefix.as_ref())?);
@@ -27,21 +27,24 @@ pub fn packages<L: AsRef<Path>, P: AsRef<str>>(
     Ok(found)
 }
 
-pub(crate) fn packages_in(stack: &[Level], prefix: &str) -> Result<BTreeSet<String>, Error> {
-    let index = Merged::at(stack, &format!("{prefix}/{INDEX}/packages"))?;
+pub(crate) fn packages_in(
+    stack: &[LayerDirectory],
+    prefix: &str,
+) -> Result<BTreeSet<String>, Error> {
+    let index = MergedDirectory::open_path(stack, &format!("{prefix}/{INDEX}/packages"))?;
     let names = index.names()?.into_keys();
     let names = names.filter_map(|name| String::from_utf8(name).ok());
     Ok(names.filter(|name| names::is_package(name)).collect())
 }
 
-/// Classes of nodes that a package's libraries have for component containers (`rclcpp_components`): each with its library,
-/// relative to the install space.
+/// Returns the component classes registered by a package (`rclcpp_components`), each with its library, relative to the
+/// install space.
 pub(crate) fn components(
-    stack: &[Level],
+    stack: &[LayerDirectory],
     prefix: &str,
     package: &str,
 ) -> Result<Vec<(String, String)>, Error> {
-    let index = Merged::at(stack, &format!("{prefix}/{INDEX}/rclcpp_components"))?;
+    let index = MergedDirectory::open_path(stack, &format!("{prefix}/{INDEX}/rclcpp_components"))?;
     let names = index.names()?;
     let Some(level) = names.get(package.as_bytes()) else {
         return Ok(Vec::new());

@@ -1,22 +1,22 @@
-//! Commands of CMake's language, as they are written: nothing is evaluated.
+//! Parser for the command syntax of CMake; nothing is evaluated.
 
-/// A command with its arguments, of which quotes are taken away and variables are left as they are.
+/// A command with its arguments, without quotes and with variables unexpanded.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Command {
-    /// In lower case, as CMake takes no notice of it.
+    /// Name in lower case, since CMake ignores case.
     pub(crate) name: String,
     pub(crate) arguments: Vec<String>,
 }
 
-/// Reads the commands of a file. One that does not end is left out, and so is what follows it.
-pub(crate) fn commands(text: &str) -> Vec<Command> {
-    let mut reader = Reader { rest: text };
+/// Parses the commands of a file. An unterminated command and everything after it are left out.
+pub(crate) fn parse_commands(text: &str) -> Vec<Command> {
+    let mut reader = CmakeParser { rest: text };
     let mut found = Vec::new();
     loop {
         reader.skip_space();
         let name = reader.take_while(|c| c.is_ascii_alphanumeric() || c == '_');
         if name.is_empty() {
-            // No file that CMake takes has anything else here.
+            // Valid CMake files contain nothing else here.
             if reader.next().is_none() {
                 return found;
             }
@@ -36,11 +36,11 @@ pub(crate) fn commands(text: &str) -> Vec<Command> {
     }
 }
 
-struct Reader<'a> {
+struct CmakeParser<'a> {
     rest: &'a str,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> CmakeParser<'a> {
     fn next(&mut self) -> Option<char> {
         let next = self.rest.chars().next()?;
         self.rest = &self.rest[next.len_utf8()..];
@@ -60,21 +60,21 @@ impl<'a> Reader<'a> {
         taken
     }
 
-    /// Goes over space and comments.
+    /// Skips white space and comments.
     fn skip_space(&mut self) {
         loop {
             self.take_while(char::is_whitespace);
             if !self.skip("#") {
                 return;
             }
-            if self.bracket().is_none() {
+            if self.bracket_argument().is_none() {
                 self.take_while(|c| c != '\n');
             }
         }
     }
 
-    /// The text of `[[text]]` or `[=[text]=]`; none, and nothing is read, where there is none.
-    fn bracket(&mut self) -> Option<&'a str> {
+    /// Parses `[[text]]` or `[=[text]=]`; returns `None` and consumes nothing if there is none.
+    fn bracket_argument(&mut self) -> Option<&'a str> {
         let inside = self.rest.strip_prefix('[')?;
         let signs = inside.len() - inside.trim_start_matches('=').len();
         let inside = inside[signs..].strip_prefix('[')?;
@@ -84,13 +84,13 @@ impl<'a> Reader<'a> {
         Some(text)
     }
 
-    /// Up to the parenthesis that closes the command; none where none does. Inner parentheses are arguments.
+    /// Parses the arguments up to the closing parenthesis; `None` if it is missing. Inner parentheses are arguments.
     fn arguments(&mut self) -> Option<Vec<String>> {
         let mut found = Vec::new();
         let mut depth = 0;
         loop {
             self.skip_space();
-            if let Some(text) = self.bracket() {
+            if let Some(text) = self.bracket_argument() {
                 found.push(text.to_owned());
                 continue;
             }
@@ -118,7 +118,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Up to one of these that no backslash stands before.
+    /// Parses up to an unescaped end character.
     fn word(&mut self, is_end: impl Fn(char) -> bool) -> Option<String> {
         let mut word = String::new();
         loop {
@@ -141,7 +141,7 @@ mod tests {
     proptest! {
         #[test]
         fn whatever_is_read_ends(text in "[a(\\[\\]=)\"\\\\#\n ß$]{0,60}") {
-            let read: usize = commands(&text).iter().map(|command| command.name.len()).sum();
+            let read: usize = parse_commands(&text).iter().map(|command| command.name.len()).sum();
             prop_assert!(read <= text.len());
         }
     }
@@ -157,7 +157,7 @@ mod tests {
             endif()
             torn("never ends
         "#;
-        let told: Vec<String> = commands(text)
+        let told: Vec<String> = parse_commands(text)
             .into_iter()
             .map(|command| format!("{}:{}", command.name, command.arguments.join("|")))
             .collect();
@@ -172,7 +172,7 @@ mod tests {
             ]
         );
         for nothing in ["", "(", ")", "x", "x(", "# x(", "\u{fffd}(]", "[[", "a([["] {
-            assert!(commands(nothing).is_empty(), "{nothing}");
+            assert!(parse_commands(nothing).is_empty(), "{nothing}");
         }
     }
 }

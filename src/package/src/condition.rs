@@ -1,23 +1,23 @@
 //! `condition` attributes of `package.xml` (REP 149, format 3).
 //!
 //! ```text
-//!   either  := both { "or" both }
-//!   both    := test { "and" test }
-//!   test    := value operator value | "(" either ")"
-//!   value   := $VARIABLE | bare word | "quoted" | 'quoted'
+//!   or_expression   := and_expression { "or" and_expression }
+//!   and_expression  := comparison { "and" comparison }
+//!   comparison      := value operator value | "(" or_expression ")"
+//!   value           := $VARIABLE | bare word | "quoted" | 'quoted'
 //! ```
-//! All values are text, and are compared as text. A variable that is not set is empty.
+//! All values are strings and are compared as strings. An unset variable is empty.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
 
-/// The variables that conditions may ask for.
+/// Variables available to conditions.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Variables(BTreeMap<String, String>);
 
 impl Variables {
-    /// Those of a distribution such as `noetic` of this version of ROS, with Python 3.
-    pub fn ros(version: u8, distribution: &str) -> Self {
+    /// Returns the variables of a distribution, such as `noetic`, of this ROS version, with Python 3.
+    pub fn for_distribution(version: u8, distribution: &str) -> Self {
         Self::from_iter([
             ("ROS_VERSION", &*version.to_string()),
             ("ROS_DISTRO", distribution),
@@ -29,18 +29,18 @@ impl Variables {
         self.0.get(name).map_or("", String::as_str)
     }
 
-    /// Whether a condition holds; else what does not parse.
-    pub fn hold(&self, condition: &str) -> Result<bool, String> {
-        let tokens = tokens(condition)?;
+    /// Evaluates a condition; returns a description of the error if it cannot be parsed.
+    pub fn evaluate(&self, condition: &str) -> Result<bool, String> {
+        let tokens = tokenize(condition)?;
         let mut parser = Parser {
             tokens: &tokens,
             variables: self,
             depth: 0,
         };
-        let holds = parser.either()?;
+        let holds = parser.or_expression()?;
         match parser.tokens {
             [] => Ok(holds),
-            [extra, ..] => Err(format!("{extra:?} is not expected there")),
+            [extra, ..] => Err(format!("unexpected {extra:?}")),
         }
     }
 }
@@ -66,12 +66,12 @@ enum Token {
     Close,
 }
 
-/// Deeper brackets than anyone writes.
+/// Maximum nesting of parentheses.
 const MAX_DEPTH: usize = 32;
 
 const OPERATORS: [&str; 6] = ["==", "!=", "<=", ">=", "<", ">"];
 
-fn tokens(text: &str) -> Result<Vec<Token>, String> {
+fn tokenize(text: &str) -> Result<Vec<Token>, String> {
     let mut tokens = Vec::new();
     let mut rest = text.trim_start();
     while let Some(first) = rest.chars().next() {
@@ -98,7 +98,7 @@ fn tokens(text: &str) -> Result<Vec<Token>, String> {
             }
         };
         if matches!(&token, Token::Word(name) | Token::Variable(name) if name.is_empty()) {
-            return Err(format!("{first:?} is not expected there"));
+            return Err(format!("unexpected {first:?}"));
         }
         tokens.push(token);
         rest = rest[length..].trim_start();
@@ -132,30 +132,30 @@ impl Parser<'_> {
         there
     }
 
-    fn either(&mut self) -> Result<bool, String> {
-        let mut holds = self.both()?;
+    fn or_expression(&mut self) -> Result<bool, String> {
+        let mut holds = self.and_expression()?;
         while self.take_word("or") {
-            holds |= self.both()?;
+            holds |= self.and_expression()?;
         }
         Ok(holds)
     }
 
-    fn both(&mut self) -> Result<bool, String> {
-        let mut holds = self.test()?;
+    fn and_expression(&mut self) -> Result<bool, String> {
+        let mut holds = self.comparison()?;
         while self.take_word("and") {
-            holds &= self.test()?;
+            holds &= self.comparison()?;
         }
         Ok(holds)
     }
 
-    fn test(&mut self) -> Result<bool, String> {
+    fn comparison(&mut self) -> Result<bool, String> {
         if self.tokens.first() == Some(&Token::Open) {
             self.tokens = &self.tokens[1..];
             self.depth += 1;
             if self.depth > MAX_DEPTH {
-                return Err(format!("more than {MAX_DEPTH} brackets are open"));
+                return Err(format!("more than {MAX_DEPTH} nested brackets"));
             }
-            let holds = self.either()?;
+            let holds = self.or_expression()?;
             self.depth -= 1;
             return match self.next()? {
                 Token::Close => Ok(holds),
@@ -194,7 +194,9 @@ mod tests {
     use super::*;
 
     fn holds(condition: &str) -> bool {
-        Variables::ros(1, "noetic").hold(condition).unwrap()
+        Variables::for_distribution(1, "noetic")
+            .evaluate(condition)
+            .unwrap()
     }
 
     #[test]
@@ -217,15 +219,15 @@ mod tests {
             ("", "ends too early"),
             ("$ROS_VERSION", "ends too early"),
             ("$ROS_VERSION 1", "comparison is missing"),
-            ("1 == 1 1", "not expected"),
+            ("1 == 1 1", "unexpected"),
             ("(1 == 1", "ends too early"),
             ("'x == 1", "not closed"),
-            ("1 == $", "not expected"),
-            ("1 & 2", "not expected"),
+            ("1 == $", "unexpected"),
+            ("1 & 2", "unexpected"),
             ("== 1", "value is missing"),
             (&"(".repeat(1000), "brackets"),
         ] {
-            let problem = Variables::default().hold(condition).unwrap_err();
+            let problem = Variables::default().evaluate(condition).unwrap_err();
             assert!(problem.contains(reason), "{condition}: {problem}");
         }
     }

@@ -1,40 +1,40 @@
-//! Definitions of messages, services and actions in extracted layers.
+//! Message, service and action definitions in extracted layers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use ros::schema::{InterfaceFile, SchemaError};
 
-use crate::merged::{self, Level, Merged};
+use crate::merged::{self, LayerDirectory, MergedDirectory};
 use crate::{Error, names};
 
-/// Texts by `package/msg/Type`, `package/srv/Type` and `package/action/Type`.
+/// Definition texts by `package/msg/Type`, `package/srv/Type` and `package/action/Type`.
 pub type Definitions = BTreeMap<String, String>;
 
-/// The largest definition that is read.
+/// Maximum size of a definition in bytes.
 const MAX_BYTES: u64 = 256 << 10;
-/// All definitions together.
+/// Maximum total size of all definitions in bytes.
 const MAX_TOTAL: usize = 32 << 20;
 const MAX_FILES: usize = 20_000;
-/// Directories of one package, and how deep they are, in which definitions are looked for.
+/// Maximum number and depth of the directories of a package that are searched for definitions.
 const MAX_DIRECTORIES: usize = 2000;
 const MAX_DEPTH: usize = 8;
 
-/// Directories of a package that definitions are usually in, and the files of each kind.
+/// Directories of a package that usually contain definitions, and the file extension of each kind.
 const KINDS: [(&str, &str); 3] = [("msg", ".msg"), ("srv", ".srv"), ("action", ".action")];
 
-/// Other forms that packages of ROS 2 have interfaces in, some of them nothing else.
-struct Form {
+/// Another format of interface files; some ROS 2 packages have no other.
+struct InterfaceFormat {
     extension: &'static str,
     read: fn(&str, &str) -> Result<InterfaceFile, SchemaError>,
 }
 
-const FORMS: [Form; 2] = [
-    Form {
+const FORMS: [InterfaceFormat; 2] = [
+    InterfaceFormat {
         extension: ".idl",
         read: InterfaceFile::read_idl,
     },
-    Form {
+    InterfaceFormat {
         extension: ".json",
         read: InterfaceFile::read_description,
     },
@@ -43,35 +43,34 @@ const FORMS: [Form; 2] = [
 /// Reads all definitions below the share directories of a stack of layers.
 ///
 /// `layers` are extracted trees, lowest first. `shares` are paths in them such as `usr/share` and
-/// `opt/ros/noetic/share`; of a package that is in several of them only the definitions in the first count, as ROS
-/// itself finds them; of several definitions of one type that in `msg`, `srv` or `action`. Text that is not UTF-8 (in
-/// comments) is replaced. IDL and descriptions of types become texts in the
-/// language of `.msg`, where a package has no such file.
+/// `opt/ros/noetic/share`; of a package in several of them only the definitions in the first are used, as in ROS
+/// itself; of several definitions of one type the one in `msg`, `srv` or `action`. Text that is not UTF-8 (in comments)
+/// is replaced. IDL and type descriptions are converted to the language of `.msg` if the package has no such file.
 pub fn read<L: AsRef<Path>, S: AsRef<str>>(
     layers: &[L],
     shares: &[S],
 ) -> Result<Definitions, Error> {
-    let stack = merged::open(layers)?;
-    let mut reader = Reader {
+    let stack = merged::open_layers(layers)?;
+    let mut reader = DefinitionReader {
         definitions: Definitions::new(),
         packages: BTreeSet::new(),
         total: 0,
     };
     for share in shares {
-        reader.share(&Merged::at(&stack, share.as_ref())?)?;
+        reader.read_share(&MergedDirectory::open_path(&stack, share.as_ref())?)?;
     }
     Ok(reader.definitions)
 }
 
-struct Reader {
+struct DefinitionReader {
     definitions: Definitions,
-    /// Packages that an earlier share directory had.
+    /// Packages found in earlier share directories.
     packages: BTreeSet<String>,
     total: usize,
 }
 
-impl Reader {
-    fn share(&mut self, share: &Merged) -> Result<(), Error> {
+impl DefinitionReader {
+    fn read_share(&mut self, share: &MergedDirectory) -> Result<(), Error> {
         let mut found = Vec::new();
         for name in share.names()?.into_keys() {
             let Ok(name) = String::from_utf8(name) else {
@@ -81,7 +80,7 @@ impl Reader {
                 continue;
             }
             let before = self.definitions.len();
-            self.package(&name, &share.below(name.as_bytes())?)?;
+            self.read_package(&name, &share.open_child(name.as_bytes())?)?;
             if self.definitions.len() > before {
                 found.push(name);
             }
@@ -90,26 +89,26 @@ impl Reader {
         Ok(())
     }
 
-    fn package(&mut self, package: &str, directory: &Merged) -> Result<(), Error> {
+    fn read_package(&mut self, package: &str, directory: &MergedDirectory) -> Result<(), Error> {
         for (kind, extension) in KINDS {
-            let merged = directory.below(kind.as_bytes())?;
+            let merged = directory.open_child(kind.as_bytes())?;
             let files = merged.names()?;
-            for (level, name, of_type) in ending(&files, extension) {
-                if let Some(text) = self.file(level, name)? {
+            for (level, name, of_type) in files_with_extension(&files, extension) {
+                if let Some(text) = self.read_file(level, name)? {
                     self.definitions
                         .insert(format!("{package}/{kind}/{of_type}"), text);
                 }
             }
             for form in FORMS {
-                for (level, name, of_type) in ending(&files, form.extension) {
+                for (level, name, of_type) in files_with_extension(&files, form.extension) {
                     let key = format!("{package}/{kind}/{of_type}");
                     if self.definitions.contains_key(&key) {
                         continue;
                     }
-                    let Some(text) = self.file(level, name)? else {
+                    let Some(text) = self.read_file(level, name)? else {
                         continue;
                     };
-                    // What cannot be read is missed where it is needed, and named there.
+                    // A definition that cannot be parsed is reported where it is needed.
                     if let Ok(read) = (form.read)(&key, &text)
                         && let Some(text) = read.definitions.get(&key)
                     {
@@ -119,15 +118,15 @@ impl Reader {
             }
         }
         let mut left = MAX_DIRECTORIES;
-        self.elsewhere(package, directory, MAX_DEPTH, &mut left)
+        self.read_subdirectories(package, directory, MAX_DEPTH, &mut left)
     }
 
-    /// Adds what a package of ROS has in other directories, such as `add_service_files(DIRECTORY services)` of ROS 1
-    /// installs it. Large files and directories are data: they are passed over.
-    fn elsewhere(
+    /// Adds definitions in other directories of a ROS package, as installed by `add_service_files(DIRECTORY services)`
+    /// of ROS 1. Large files and directories are data and are skipped.
+    fn read_subdirectories(
         &mut self,
         package: &str,
-        directory: &Merged,
+        directory: &MergedDirectory,
         depth: usize,
         left: &mut usize,
     ) -> Result<(), Error> {
@@ -135,17 +134,17 @@ impl Reader {
             Err(Error::TooMany { .. }) => return Ok(()),
             files => files?,
         };
-        // Beside packages of ROS, `share` has many that are of no ROS and large.
+        // Besides ROS packages, `share` contains many other, large directories.
         if depth == MAX_DEPTH && !files.contains_key(b"package.xml".as_slice()) {
             return Ok(());
         }
         for (kind, extension) in KINDS {
-            for (level, name, of_type) in ending(&files, extension) {
+            for (level, name, of_type) in files_with_extension(&files, extension) {
                 let key = format!("{package}/{kind}/{of_type}");
                 if self.definitions.contains_key(&key) {
                     continue;
                 }
-                let text = match self.file(level, name) {
+                let text = match self.read_file(level, name) {
                     Err(Error::TooLarge { .. }) => None,
                     text => text?,
                 };
@@ -158,17 +157,17 @@ impl Reader {
             if depth == 0 || *left == 0 {
                 break;
             }
-            let inside = directory.below(name)?;
+            let inside = directory.open_child(name)?;
             if inside.exists() {
                 *left -= 1;
-                self.elsewhere(package, &inside, depth - 1, left)?;
+                self.read_subdirectories(package, &inside, depth - 1, left)?;
             }
         }
         Ok(())
     }
 
-    /// The text of a file; none for a link, a deletion or anything else that is no file.
-    fn file(&mut self, level: &Level, name: &str) -> Result<Option<String>, Error> {
+    /// Reads the text of a file; `None` for a link, a deletion or anything else that is not a file.
+    fn read_file(&mut self, level: &LayerDirectory, name: &str) -> Result<Option<String>, Error> {
         let Some(file) = level.file(name.as_bytes(), MAX_BYTES)? else {
             return Ok(None);
         };
@@ -185,11 +184,11 @@ impl Reader {
     }
 }
 
-/// Files with an extension and a name of a type, which is given without it.
-fn ending<'a>(
-    files: &'a BTreeMap<Vec<u8>, &'a Level>,
+/// Returns the files with an extension and a valid type name, and the names without it.
+fn files_with_extension<'a>(
+    files: &'a BTreeMap<Vec<u8>, &'a LayerDirectory>,
     extension: &'a str,
-) -> impl Iterator<Item = (&'a Level, &'a str, &'a str)> {
+) -> impl Iterator<Item = (&'a LayerDirectory, &'a str, &'a str)> {
     files.iter().filter_map(move |(name, level)| {
         let name = std::str::from_utf8(name).ok()?;
         let of_type = name.strip_suffix(extension)?;
@@ -262,7 +261,7 @@ mod tests {
         assert_eq!(list(&found), expected);
     }
 
-    /// As rosidl writes them beside each other.
+    /// As generated by rosidl next to each other.
     const IDL: &str = "module p { module msg { struct Point { double x; double y; }; }; };";
     const DESCRIPTION: &str = r#"{"type_description_msg": {"type_description": {"type_name": "p/msg/Count",
         "fields": [{"name": "n", "type": {"type_id": 6, "capacity": 0, "string_capacity": 0,
@@ -284,7 +283,7 @@ mod tests {
         assert_eq!(found["p/msg/Both"], "int8 of_text");
         assert_eq!(found["p/msg/Count"], "int32 n 7\n");
         let registry =
-            ros::schema::Registry::of_definitions(ros::bus::RosVersion::Two, &found).unwrap();
+            ros::schema::Registry::with_definitions(ros::bus::RosVersion::Two, &found).unwrap();
         assert_eq!(registry.message("p/msg/Point").unwrap().fields().len(), 2);
     }
 
@@ -299,7 +298,7 @@ mod tests {
             .write("base/usr/share/p/interfaces/deep/Go.action", "---\n---\n")
             .write("base/usr/share/p/a/Twice.msg", "int8 other")
             .write("base/usr/share/p/mail/Large.msg", "#".repeat(300 << 10))
-            // Not a package of ROS, whatever it holds.
+            // Not a ROS package, whatever it contains.
             .write("base/usr/share/doc/mails/Letter.msg", "x");
         for number in 0..=merged::MAX_FILES {
             layers.write(&format!("base/usr/share/p/data/{number}.png"), "");
@@ -405,7 +404,7 @@ mod tests {
         layers.write("base/usr/share/p/msg/Big.msg", "#".repeat(300 << 10));
         let text = layers.read(&["base"]).unwrap_err().to_string();
         assert!(
-            text.contains("p/msg/Big.msg is larger than the 262144 bytes"),
+            text.contains("p/msg/Big.msg is larger than the limit of 262144 bytes"),
             "{text}"
         );
         let text = layers.read(&["missing"]).unwrap_err().to_string();

@@ -1,4 +1,4 @@
-//! What became different between two revisions of a service, and whether robots will notice.
+//! Comparison of the interfaces of two revisions of a service with regard to the compatibility of robots.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,12 +6,12 @@ use std::fmt;
 use crate::interface::{Action, Direction, Interface, Parameter, Qos, Service, Topic};
 use crate::names;
 
-/// One thing that is different.
+/// A single difference.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Change {
-    /// A robot made for the old interface works with the new one in this respect.
+    /// True if a robot built for the old interface works with the new one in this respect.
     pub compatible: bool,
-    /// For people, such as "output topic /found is gone".
+    /// Human-readable description, such as "output topic /found is gone".
     pub text: String,
 }
 
@@ -21,27 +21,27 @@ impl fmt::Display for Change {
     }
 }
 
-/// All that is different between two interfaces: what breaks robots first, then by text.
+/// Differences between two interfaces: incompatible ones first, then by text.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Difference {
-    /// Empty when nothing is.
+    /// Differences; empty if there are none.
     pub changes: Vec<Change>,
 }
 
 impl Difference {
-    /// Nothing changed that a robot relies on.
+    /// Returns whether nothing has changed that a robot relies on.
     pub fn compatible(&self) -> bool {
         self.changes.iter().all(|change| change.compatible)
     }
 
-    /// From `old` to `new`. Something new is compatible; something gone, of another type or no longer latched is
-    /// not; parameters are notes only.
-    pub fn between(old: &Interface, new: &Interface) -> Self {
-        let mut changes = Changes::default();
-        changes.topics(&old.topics, &new.topics);
-        changes.services(&old.services, &new.services);
-        changes.actions(old, new);
-        changes.parameters(&old.parameters, &new.parameters);
+    /// Compares `old` with `new`. Additions are compatible; removed objects, other types and topics that are no longer
+    /// latched are not; changes of parameters are always compatible.
+    pub fn compare(old: &Interface, new: &Interface) -> Self {
+        let mut changes = ChangeList::default();
+        changes.compare_topics(&old.topics, &new.topics);
+        changes.compare_services(&old.services, &new.services);
+        changes.compare_actions(old, new);
+        changes.compare_parameters(&old.parameters, &new.parameters);
         let mut changes = changes.0;
         changes.sort_by(|a, b| (a.compatible, &a.text).cmp(&(b.compatible, &b.text)));
         changes.dedup();
@@ -60,25 +60,25 @@ impl fmt::Display for Difference {
 }
 
 #[derive(Default)]
-struct Changes(Vec<Change>);
+struct ChangeList(Vec<Change>);
 
-impl Changes {
-    fn note(&mut self, text: String) {
+impl ChangeList {
+    fn add_compatible(&mut self, text: String) {
         self.0.push(Change {
             compatible: true,
             text,
         });
     }
 
-    fn breaks(&mut self, text: String) {
+    fn add_breaking(&mut self, text: String) {
         self.0.push(Change {
             compatible: false,
             text,
         });
     }
 
-    /// Pairs two lists by key, tells what is gone and what is new, and gives the rest to `both`.
-    fn pair<'a, T>(
+    /// Matches two lists by key, records removed and added items, and passes the others to `both`.
+    fn compare_by_key<'a, T>(
         &mut self,
         old: &'a [T],
         new: &'a [T],
@@ -90,84 +90,86 @@ impl Changes {
         for (key, old) in old {
             match new.remove(&key) {
                 Some(new) => both(self, &key, old, new),
-                None => self.breaks(format!("{key} is gone")),
+                None => self.add_breaking(format!("{key} was removed")),
             }
         }
         for key in new.into_keys() {
-            self.note(format!("{key} is new"));
+            self.add_compatible(format!("{key} is new"));
         }
     }
 
-    fn typed(&mut self, what: &str, old: (&str, &str), new: (&str, &str)) {
+    fn compare_type(&mut self, what: &str, old: (&str, &str), new: (&str, &str)) {
         if old.0 != new.0 {
-            self.breaks(format!("{what} was a {} and is a {}", old.0, new.0));
+            self.add_breaking(format!("{what} was a {} and is a {}", old.0, new.0));
         } else if old.1 != new.1 && !old.1.is_empty() && !new.1.is_empty() {
-            self.breaks(format!(
-                "{what} has another definition of {} (md5 {} was {})",
+            self.add_breaking(format!(
+                "{what} has a different definition of {} (md5 {} was {})",
                 new.0, new.1, old.1
             ));
         }
     }
 
-    fn topics(&mut self, old: &[Topic], new: &[Topic]) {
-        self.pair(old, new, topic, |changes, what, old, new| {
-            changes.typed(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
+    fn compare_topics(&mut self, old: &[Topic], new: &[Topic]) {
+        self.compare_by_key(old, new, topic_key, |changes, what, old, new| {
+            changes.compare_type(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
             match (old.latched, new.latched) {
-                (true, false) => changes.breaks(format!("{what} is no longer latched")),
-                (false, true) => changes.note(format!("{what} is latched now")),
+                (true, false) => changes.add_breaking(format!("{what} is no longer latched")),
+                (false, true) => changes.add_compatible(format!("{what} is now latched")),
                 _ => {}
             }
             if let (Some(before), Some(after)) = (old.qos, new.qos) {
-                changes.qos(what, new.direction, before, after);
+                changes.compare_qos(what, new.direction, before, after);
             }
         });
     }
 
-    /// Where it offers less than before, or asks for more, robots that fitted do not hear it, or are not heard.
-    fn qos(&mut self, what: &str, direction: Direction, before: Qos, after: Qos) {
+    /// Compares QoS: if the package offers less or requests more than before, robots that were compatible may no longer
+    /// exchange messages with it.
+    fn compare_qos(&mut self, what: &str, direction: Direction, before: Qos, after: Qos) {
         if before == after {
             return;
         }
         let suits = match direction {
-            Direction::Output => before.least(after) == before,
-            Direction::Input => before.most(after) == before,
+            Direction::Output => before.common_offer(after) == before,
+            Direction::Input => before.common_request(after) == before,
         };
         let text = format!("the quality of service of {what} is {after} and was {before}");
-        match suits {
-            true => self.note(text),
-            false => self.breaks(text),
+        if suits {
+            self.add_compatible(text)
+        } else {
+            self.add_breaking(text)
         }
     }
 
-    fn services(&mut self, old: &[Service], new: &[Service]) {
+    fn compare_services(&mut self, old: &[Service], new: &[Service]) {
         let key = |service: &Service| format!("service {}", service.name);
-        self.pair(old, new, key, |changes, what, old, new| {
-            changes.typed(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
+        self.compare_by_key(old, new, key, |changes, what, old, new| {
+            changes.compare_type(what, (&old.type_name, &old.md5), (&new.type_name, &new.md5));
         });
     }
 
-    fn actions(&mut self, old_all: &Interface, new_all: &Interface) {
+    fn compare_actions(&mut self, old_all: &Interface, new_all: &Interface) {
         let key = |action: &Action| format!("action {}", action.name);
         let definition = |all: &Interface, action: &Action| {
             let text = all
                 .definitions
-                .get(&names::key(&action.type_name, "action"));
-            text.map(|text| essence(text))
+                .get(&names::definition_key(&action.type_name, "action"));
+            text.map(|text| normalize(text))
         };
-        self.pair(
+        self.compare_by_key(
             &old_all.actions,
             &new_all.actions,
             key,
             |changes, what, old, new| {
-                changes.typed(what, (&old.type_name, ""), (&new.type_name, ""));
+                changes.compare_type(what, (&old.type_name, ""), (&new.type_name, ""));
                 let (before, after) = (definition(old_all, old), definition(new_all, new));
                 if old.type_name == new.type_name
                     && before.is_some()
                     && after.is_some()
                     && before != after
                 {
-                    changes.breaks(format!(
-                        "{what} has another definition of {}",
+                    changes.add_breaking(format!(
+                        "{what} has a different definition of {}",
                         new.type_name
                     ));
                 }
@@ -175,13 +177,13 @@ impl Changes {
         );
     }
 
-    fn parameters(&mut self, old: &[Parameter], new: &[Parameter]) {
+    fn compare_parameters(&mut self, old: &[Parameter], new: &[Parameter]) {
         let key = |parameter: &Parameter| format!("parameter {}", parameter.name);
         let mut notes = Self::default();
-        notes.pair(old, new, key, |changes, what, old, new| {
+        notes.compare_by_key(old, new, key, |changes, what, old, new| {
             if let (Some(before), Some(after)) = (&old.value, &new.value) {
                 if before != after {
-                    changes.note(format!("{what} is {after} and was {before}"));
+                    changes.add_compatible(format!("{what} is {after} and was {before}"));
                 }
             }
         });
@@ -192,7 +194,7 @@ impl Changes {
     }
 }
 
-fn topic(topic: &Topic) -> String {
+fn topic_key(topic: &Topic) -> String {
     let direction = match topic.direction {
         Direction::Input => "input",
         Direction::Output => "output",
@@ -200,8 +202,8 @@ fn topic(topic: &Topic) -> String {
     format!("{direction} topic {}", topic.name)
 }
 
-/// A definition without comments and white space that mean nothing.
-fn essence(text: &str) -> Vec<String> {
+/// Returns a definition without comments and insignificant white space.
+fn normalize(text: &str) -> Vec<String> {
     let lines = text
         .lines()
         .map(|line| line.split('#').next().unwrap_or_default());
@@ -270,7 +272,7 @@ mod tests {
         new.topics[0].nodes = vec!["/renamed".into()];
         new.definitions
             .insert("a/action/Go".into(), "int32   x\n\n---\n---".into());
-        let difference = Difference::between(&old(), &new);
+        let difference = Difference::compare(&old(), &new);
         assert_eq!(difference, Difference::default());
         assert!(difference.compatible());
     }
@@ -281,7 +283,7 @@ mod tests {
         before.topics.remove(0);
         before.services.clear();
         before.parameters[0].value = Some(2.into());
-        let difference = Difference::between(&before, &old());
+        let difference = Difference::compare(&before, &old());
         assert!(difference.compatible());
         assert_eq!(
             texts(&difference),
@@ -313,11 +315,11 @@ mod tests {
             (0, weak, strong, false),
             (0, strong, weak, true),
         ] {
-            let difference = Difference::between(&with(at, from), &with(at, to));
+            let difference = Difference::compare(&with(at, from), &with(at, to));
             assert_eq!(difference.changes.len(), 1, "{difference}");
             assert_eq!(difference.compatible(), compatible, "{difference}");
         }
-        let text = Difference::between(&with(1, strong), &with(1, weak)).to_string();
+        let text = Difference::compare(&with(1, strong), &with(1, weak)).to_string();
         assert_eq!(
             text,
             "! the quality of service of output topic /out is best_effort, volatile and was reliable, volatile\n"
@@ -335,7 +337,7 @@ mod tests {
             definitions: [("a/action/Go".to_owned(), text.to_owned())].into(),
             ..Interface::default()
         };
-        let difference = Difference::between(&go("---\n---\n"), &go("int8 x\n---\n---\n"));
+        let difference = Difference::compare(&go("---\n---\n"), &go("int8 x\n---\n---\n"));
         assert!(!difference.compatible(), "{difference}");
     }
 
@@ -348,23 +350,23 @@ mod tests {
         new.definitions
             .insert("a/action/Go".into(), "int64 x\n---\n---\n".into());
         new.parameters.clear();
-        let difference = Difference::between(&old(), &new);
+        let difference = Difference::compare(&old(), &new);
         assert!(!difference.compatible());
         let expected = [
-            "! action /act has another definition of a/Go",
+            "! action /act has a different definition of a/Go",
             "! input topic /in was a std_msgs/String and is a std_msgs/Int32",
-            "! output topic /out is gone",
-            "! service /s has another definition of a/S (md5 cc was bb)",
+            "! output topic /out was removed",
+            "! service /s has a different definition of a/S (md5 cc was bb)",
             "  input topic /out is new",
-            "  parameter /p is gone",
+            "  parameter /p was removed",
         ];
         assert_eq!(texts(&difference), expected);
         let mut unlatched = old();
         unlatched.topics[1].latched = false;
         assert_eq!(
-            texts(&Difference::between(&old(), &unlatched)),
+            texts(&Difference::compare(&old(), &unlatched)),
             ["! output topic /out is no longer latched"]
         );
-        assert!(Difference::between(&unlatched, &old()).compatible());
+        assert!(Difference::compare(&unlatched, &old()).compatible());
     }
 }

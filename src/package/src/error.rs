@@ -1,210 +1,219 @@
-//! What is wrong with what was pushed.
+//! Errors in what was pushed.
 
 use std::io;
 use std::path::PathBuf;
 
-/// Every failure names the file, and the line where there is one.
+/// Every error names the file, and the line if there is one.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// A file operation failed.
     #[error("cannot {action} {}: {source}", .path.display())]
     File {
-        /// What was attempted, such as "read".
+        /// Operation, such as "read".
         action: &'static str,
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A file that is larger than such a file can sensibly be.
-    #[error("{} is larger than the {limit} bytes that are read; leave it out", .path.display())]
+    /// A file exceeds the size limit of its kind.
+    #[error("{} is larger than the limit of {limit} bytes; remove it", .path.display())]
     TooLarge {
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// Bytes that are accepted.
+        /// Maximum size in bytes.
         limit: u64,
     },
-    /// More of something than can sensibly be.
-    #[error("{} holds more than {limit} {what}; push a smaller directory", .path.display())]
+    /// There are more objects than supported.
+    #[error("{} contains more than {limit} {what}; push a smaller directory", .path.display())]
     TooMany {
-        /// The directory.
+        /// Directory.
         path: PathBuf,
-        /// Such as "packages".
+        /// Kind of object, such as "packages".
         what: &'static str,
-        /// How many are accepted.
+        /// Maximum number.
         limit: usize,
     },
-    /// A link that leads out of what was pushed.
+    /// A link points outside what was pushed.
     #[error("{} leads out of {}; replace the link with a copy", .path.display(), .root.display())]
     Outside {
-        /// The link.
+        /// Link.
         path: PathBuf,
-        /// What it must stay in.
+        /// Directory that it must not leave.
         root: PathBuf,
     },
-    /// A `package.xml` that does not parse or says something impossible.
+    /// A `package.xml` cannot be parsed or is invalid.
     #[error("{}, line {line}, column {column}: {problem}", .path.display())]
     Manifest {
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// Counted from 1.
+        /// Line, starting at 1.
         line: u32,
-        /// Counted from 1.
+        /// Column, starting at 1.
         column: u32,
-        /// What is wrong.
+        /// Description of the problem.
         problem: String,
     },
-    /// Nothing that can be pushed.
-    #[error("{} is no ROS package: {looked_for}; give the directory of a package, of a workspace, or of an install space", .path.display())]
+    /// The directory contains nothing that can be pushed.
+    #[error("{} is not a ROS package: {looked_for}; give the directory of a package, of a workspace, or of an install \
+        space", .path.display())]
     NoPackage {
-        /// The directory.
+        /// Directory.
         path: PathBuf,
-        /// Where a package was looked for.
+        /// Description of where packages were searched.
         looked_for: String,
     },
-    /// A devel space, which only works beside its sources and its build.
-    #[error("{} is a devel space, which only works where it was built; push the workspace, or its install space after 'catkin_make install'", .path.display())]
+    /// A devel space, which is usable only beside its sources and its build.
+    #[error("{} is a devel space, which only works where it was built; push the workspace, or its install space \
+             after 'catkin_make install'", .path.display())]
     DevelSpace {
-        /// The directory.
+        /// Directory.
         path: PathBuf,
     },
-    /// Two packages of one name.
-    #[error("two packages are named {name:?}: {} and {}; remove one, or put a file COLCON_IGNORE (or CATKIN_IGNORE) beside it", .first.display(), .second.display())]
+    /// Two packages have the same name.
+    #[error("two packages are named {name:?}: {} and {}; remove one, or put a file COLCON_IGNORE (or \
+             CATKIN_IGNORE) beside it", .first.display(), .second.display())]
     SameName {
-        /// The name.
+        /// Name of the packages.
         name: String,
-        /// Where it is, below what was pushed.
+        /// First directory, below what was pushed.
         first: PathBuf,
-        /// The second directory of that name.
+        /// Second directory, below what was pushed.
         second: PathBuf,
     },
-    /// A space that leads back to where it was built.
-    #[error("{} was built with --symlink-install: {} leads to the workspace, which is not there; build it without, or push the workspace", .path.display(), .hook.display())]
+    /// The install space contains links to where it was built.
+    #[error("{} was built with --symlink-install: {} leads to the workspace, which is not there; build it without, or \
+             push the workspace", .path.display(), .hook.display())]
     SymlinkInstall {
-        /// The install space.
+        /// Install space.
         path: PathBuf,
-        /// What leads there.
+        /// File that points there.
         hook: PathBuf,
     },
-    /// Packages of both versions of ROS.
+    /// Packages of both ROS versions.
     #[error(
-        "packages of both versions of ROS cannot be in one service: {first} (ROS {first_version}), and {second} (ROS {second_version}); push them apart, or put a COLCON_IGNORE file beside the package.xml of one"
+        "packages of both versions of ROS cannot be in one service: {first} (ROS {first_version}), and {second} (ROS \
+            {second_version}); push them separately, or put a COLCON_IGNORE file beside the package.xml of one"
     )]
     TwoFlavours {
-        /// A package, and what makes it one of its version: `talker has build type catkin`.
+        /// A package and what determines its version: `talker has build type catkin`.
         first: String,
-        /// 1 or 2.
+        /// ROS version, 1 or 2.
         first_version: u8,
-        /// The other.
+        /// Package of the other version.
         second: String,
-        /// 1 or 2.
+        /// ROS version, 1 or 2.
         second_version: u8,
     },
-    /// A build type that nothing here builds.
+    /// Unsupported build type.
     #[error(
-        "{}: build type {build_type} is built by no base; those that can be built are catkin (ROS 1), ament_cmake and ament_python (ROS 2), and cmake", .path.display()
+        "{}: no base supports build type {build_type}; supported are catkin (ROS 1), ament_cmake and ament_python (ROS \
+            2), and cmake", .path.display()
     )]
     BuildType {
-        /// The package.xml.
+        /// Path of the package.xml.
         path: PathBuf,
-        /// What it says.
+        /// Build type stated there.
         build_type: String,
     },
-    /// A package of ROS 2 that counts as one of catkin.
+    /// A ROS 2 package without a build type, which counts as catkin.
     #[error(
-        "{}: it is built with {tool}, but says no build type, which means catkin; add <export><build_type>{build_type}</build_type></export>", .path.display()
+        "{}: it is built with {tool}, but has no build type, which means catkin; add \
+            <export><build_type>{build_type}</build_type></export>", .path.display()
     )]
     NoBuildType {
-        /// The package.xml.
+        /// Path of the package.xml.
         path: PathBuf,
-        /// Such as `ament_cmake` or `rosidl`.
+        /// Build tool, such as `ament_cmake` or `rosidl`.
         tool: String,
-        /// What it should say.
+        /// Build type that it should state.
         build_type: &'static str,
     },
-    /// An interface file that cannot be used.
+    /// Invalid interface file.
     #[error("{}: {problem}", .path.display())]
     Definition {
-        /// The `.msg`, `.srv`, `.action` or `.idl`.
+        /// Path of the `.msg`, `.srv`, `.action` or `.idl`.
         path: PathBuf,
-        /// What is wrong with it, its line where there is one, and what to do.
+        /// Description of the problem, with its line if there is one, and the next step.
         problem: String,
     },
-    /// Packages that need each other to be built.
-    #[error("packages need each other to be built: {}; break the circle in their package.xml", .circle.join(" needs "))]
+    /// Packages depend on each other in a cycle.
+    #[error("packages depend on each other to be built: {}; break the cycle in their \
+        package.xml", .circle.join(" needs "))]
     Circle {
-        /// The first name is also the last.
+        /// Names along the cycle; the first is also the last.
         circle: Vec<String>,
     },
-    /// An interface file that does not parse or says something impossible.
+    /// An interface description cannot be parsed or is invalid.
     #[error("{}, line {line}, column {column}: {problem}", .path.display())]
     Interface {
-        /// The file.
+        /// File.
         path: PathBuf,
-        /// Counted from 1.
+        /// Line, starting at 1.
         line: usize,
-        /// Counted from 1.
+        /// Column, starting at 1.
         column: usize,
-        /// What is wrong.
+        /// Description of the problem.
         problem: String,
     },
-    /// A supplement that contradicts what was found in the running package.
+    /// A supplement contradicts what was found in the running package.
     #[error(
-        "the interface file says that {what} is {stated}, but it was found to be {found}; correct or remove it there"
+        "in the interface file {what} is {stated}, but {found} was found; correct or remove it there"
     )]
     Contradiction {
-        /// Such as "input topic /image".
+        /// Object, such as "input topic /image".
         what: String,
-        /// What the file says.
+        /// Value stated in the supplement.
         stated: String,
-        /// What was found.
+        /// Value that was found.
         found: String,
     },
-    /// A request is said to be of a topic that there is not.
-    #[error("{topic} is no {direction} of this service; {}", listed(.direction, .topics))]
+    /// A request pair names a topic that does not exist.
+    #[error("{topic} is not an {direction} of this service; {}", describe_topics(.direction, .topics))]
     NoSuchTopic {
-        /// The topic.
+        /// Topic.
         topic: String,
         /// `input` or `output`.
         direction: &'static str,
-        /// Those that there are.
+        /// Existing topics of this direction.
         topics: Vec<String>,
     },
-    /// A request is said to be answered by stamp, and a message has none.
+    /// A request pair is to be matched by stamp, but a message has none.
     #[error("{topic} is a {type_name}, which has no header.stamp; write \"by arrival\"")]
     NoStamp {
-        /// The topic.
+        /// Topic.
         topic: String,
-        /// Its type.
+        /// Type of the topic.
         type_name: String,
     },
-    /// A request is said to be the goal of an action.
+    /// A request pair is to be matched by the goal of an action.
     #[error(
-        "{input} is said to be answered by goal; goals of actions are recognised without being named, so leave it out"
+        "{input} is given with \"by goal\"; action goals are recognised automatically, so remove it"
     )]
     GoalIsNoTopic {
-        /// The topic.
+        /// Topic.
         input: String,
     },
-    /// Two requests are said to have the same topic.
+    /// Two request pairs name the same topic.
     #[error(
         "{topic} is named twice; name all outputs that answer an input in one request, and each output in one"
     )]
     NamedTwice {
-        /// The topic.
+        /// Topic.
         topic: String,
     },
-    /// A stub cannot be put together.
+    /// The stub cannot be composed.
     #[error(
-        "the image holds no package.xml of {package}, so robots could not install a stub of it; push it with its share directory"
+        "the image has no package.xml of {package}, so robots could not install its stub; push it with its share \
+            directory"
     )]
     NoManifest {
-        /// The ROS package.
+        /// ROS package.
         package: String,
     },
 }
 
-fn listed(direction: &str, topics: &[String]) -> String {
+fn describe_topics(direction: &str, topics: &[String]) -> String {
     match topics {
         [] => format!("it has no {direction}s"),
         topics => format!("its {direction}s are {}", topics.join(", ")),

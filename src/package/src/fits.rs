@@ -1,70 +1,70 @@
-//! Which versions of ROS what was pushed is written for, as its package.xml files say.
+//! ROS versions that the pushed packages support, according to their package.xml files.
 //!
-//! Many packages are written for both: what their package.xml says depends on ROS_VERSION. So each is read once for
-//! each distribution that there is a base of, and fits those for which it names a build type that they build:
+//! Many packages support both, with a package.xml that depends on ROS_VERSION. So each is parsed once for each
+//! distribution with a base, and supports those for which it states a build type of that version:
 //!
-//! | build type | ROS 1 | ROS 2 |
+//! | Build type | ROS 1 | ROS 2 |
 //! |---|---|---|
 //! | `catkin` | yes | no |
 //! | `ament_cmake`, `ament_python` | no | yes |
-//! | `cmake` | unless built with ament's tools | unless built with catkin |
+//! | `cmake` | unless it uses ament's build tools | unless it uses catkin |
 //!
-//! An install space is of the version whose tools made it.
+//! An install space supports the version of the tools that created it.
 
 use std::path::Path;
 
 use ros::bus::RosVersion;
 
 use crate::condition::Variables;
-use crate::locate::{Located, What, locate};
+use crate::locate::{Located, LocatedKind, locate};
 use crate::manifest::{INTERFACES, Kind, MAX_BYTES, Manifest};
 use crate::{Error, read};
 
-/// A distribution of ROS, such as `noetic` of ROS 1.
+/// A ROS distribution, such as `noetic` of ROS 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Distribution {
-    /// The version of ROS.
+    /// ROS version.
     pub version: RosVersion,
-    /// What `$ROS_DISTRO` stands for.
+    /// Name of the distribution, as in `$ROS_DISTRO`.
     pub name: String,
 }
 
-/// What something that was pushed fits.
+/// ROS versions supported by what was pushed.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Fits {
-    /// Both.
+pub enum RosSupport {
+    /// Both versions.
     Either,
-    /// This version alone.
+    /// One version only.
     Only {
-        /// The version.
+        /// Supported version.
         version: RosVersion,
-        /// A package that says so.
+        /// Package that determines it.
         package: String,
-        /// In words that follow "it": `has build type catkin`.
+        /// Reason, as a phrase that follows "it": `has build type catkin`.
         because: String,
     },
 }
 
-impl Fits {
-    /// Whether it can be put on a base of this version.
-    pub fn has(&self, version: RosVersion) -> bool {
+impl RosSupport {
+    /// Returns whether a base of this version is supported.
+    pub fn supports(&self, version: RosVersion) -> bool {
         match self {
-            Fits::Either => true,
-            Fits::Only { version: only, .. } => *only == version,
+            RosSupport::Either => true,
+            RosSupport::Only { version: only, .. } => *only == version,
         }
     }
 }
 
-/// Looks at a directory that [`crate::workspace::inspect`] takes.
+/// Detects the ROS versions supported by a directory that [`crate::workspace::inspect`] accepts.
 ///
 /// # Errors
-/// As there; [`Error::TwoFlavours`] where two packages have no version in common, [`Error::BuildType`] for a package
-/// that none of the distributions builds, [`Error::NoBuildType`] for one that forgot to say it.
-pub fn of(root: &Path, distributions: &[Distribution]) -> Result<Fits, Error> {
+/// As there; [`Error::TwoFlavours`] if two packages have no version in common, [`Error::BuildType`] for a package that
+/// none of the distributions can build, [`Error::NoBuildType`] for one that lacks its build type.
+pub fn detect(root: &Path, distributions: &[Distribution]) -> Result<RosSupport, Error> {
     let located = locate(root)?;
-    if let What::Space(space) = &located.what {
+    if let LocatedKind::Space(space) = &located.what {
         let first = space.packages.first().and_then(|path| path.file_name());
-        return Ok(Fits::Only {
+        return Ok(RosSupport::Only {
             version: space.layout.version(),
             package: first.unwrap_or_default().to_string_lossy().into_owned(),
             because: match space.layout.version() {
@@ -73,97 +73,101 @@ pub fn of(root: &Path, distributions: &[Distribution]) -> Result<Fits, Error> {
             },
         });
     }
-    let mut all = Fits::Either;
+    let mut all = RosSupport::Either;
     for path in located.packages() {
-        let one = of_package(&located, path, distributions)?;
-        all = both(all, one)?;
+        let one = detect_package(&located, path, distributions)?;
+        all = intersect(all, one)?;
     }
     Ok(all)
 }
 
-/// What fits both of these.
-fn both(earlier: Fits, later: Fits) -> Result<Fits, Error> {
+/// Returns the versions supported by both.
+fn intersect(earlier: RosSupport, later: RosSupport) -> Result<RosSupport, Error> {
     match (earlier, later) {
-        (Fits::Either, later) => Ok(later),
-        (earlier, Fits::Either) => Ok(earlier),
+        (RosSupport::Either, later) => Ok(later),
+        (earlier, RosSupport::Either) => Ok(earlier),
         (
-            Fits::Only {
+            RosSupport::Only {
                 version: first,
                 package: first_package,
                 because: first_because,
             },
-            Fits::Only {
+            RosSupport::Only {
                 version: second,
                 package: second_package,
                 because: second_because,
             },
-        ) => match first == second {
-            true => Ok(Fits::Only {
-                version: first,
-                package: first_package,
-                because: first_because,
-            }),
-            false => Err(Error::TwoFlavours {
-                first: format!("{first_package} {first_because}"),
-                first_version: first.number(),
-                second: format!("{second_package} {second_because}"),
-                second_version: second.number(),
-            }),
-        },
+        ) => {
+            if first == second {
+                Ok(RosSupport::Only {
+                    version: first,
+                    package: first_package,
+                    because: first_because,
+                })
+            } else {
+                Err(Error::TwoFlavours {
+                    first: format!("{first_package} {first_because}"),
+                    first_version: first.number(),
+                    second: format!("{second_package} {second_because}"),
+                    second_version: second.number(),
+                })
+            }
+        }
     }
 }
 
-fn of_package(
+fn detect_package(
     located: &Located,
     path: &Path,
     distributions: &[Distribution],
-) -> Result<Fits, Error> {
+) -> Result<RosSupport, Error> {
     let file = located.base().join(path).join("package.xml");
-    let text = read::text_inside(&located.root, &file, MAX_BYTES)?;
+    let text = read::read_text(&located.root, &file, MAX_BYTES)?;
     let mut fitting: Vec<(RosVersion, Manifest)> = Vec::new();
     let mut last = None;
     for distribution in distributions {
         let version = distribution.version;
-        let variables = Variables::ros(version.number(), &distribution.name);
+        let variables = Variables::for_distribution(version.number(), &distribution.name);
         let manifest = Manifest::parse(&text, &file, &variables)?;
-        if manifest.fits(version) && fitting.iter().all(|(of, _)| *of != version) {
+        if manifest.supports_ros(version) && fitting.iter().all(|(of, _)| *of != version) {
             fitting.push((version, manifest.clone()));
         }
         last = Some(manifest);
     }
     match &fitting[..] {
-        [] => Err(none(&file, last)),
-        [(version, manifest)] => Ok(Fits::Only {
+        [] => Err(unsupported_error(&file, last)),
+        [(version, manifest)] => Ok(RosSupport::Only {
             version: *version,
-            because: because(manifest),
+            because: reason(manifest),
             package: manifest.name.clone(),
         }),
-        _ => Ok(Fits::Either),
+        _ => Ok(RosSupport::Either),
     }
 }
 
-fn because(manifest: &Manifest) -> String {
-    match (&*manifest.build_type, manifest.of_ament()) {
+fn reason(manifest: &Manifest) -> String {
+    match (&*manifest.build_type, manifest.ament_tool()) {
         ("cmake", Some(tool)) => format!("is built with {tool}"),
-        ("cmake", None) if manifest.of_catkin() => "is built with catkin".to_owned(),
+        ("cmake", None) if manifest.uses_catkin() => "is built with catkin".to_owned(),
         (build_type, _) => format!("has build type {build_type}"),
     }
 }
 
-/// Of a package that no distribution builds.
-fn none(file: &Path, manifest: Option<Manifest>) -> Error {
+/// Returns the error for a package that no distribution can build.
+fn unsupported_error(file: &Path, manifest: Option<Manifest>) -> Error {
     let Some(manifest) = manifest else {
         return Error::BuildType {
             path: file.to_owned(),
             build_type: "unknown".to_owned(),
         };
     };
-    match manifest.of_ament() {
+    match manifest.ament_tool() {
         Some(tool) if manifest.build_type == "catkin" => Error::NoBuildType {
             path: file.to_owned(),
-            build_type: match manifest.needs(&[Kind::Buildtool]).contains("ament_python") {
-                true => "ament_python",
-                false => "ament_cmake",
+            build_type: if manifest.needs(&[Kind::Buildtool]).contains("ament_python") {
+                "ament_python"
+            } else {
+                "ament_cmake"
             },
             tool,
         },
@@ -175,24 +179,24 @@ fn none(file: &Path, manifest: Option<Manifest>) -> Error {
 }
 
 impl Manifest {
-    /// Whether a version of ROS builds the package, of a manifest that was read for it.
-    pub fn fits(&self, version: RosVersion) -> bool {
+    /// Returns whether a ROS version can build the package; the manifest must have been parsed for that version.
+    pub fn supports_ros(&self, version: RosVersion) -> bool {
         match (&*self.build_type, version) {
-            // Without a word about it catkin is meant (REP 149), which is forgotten often.
-            ("catkin", RosVersion::One) => self.of_catkin() || self.of_ament().is_none(),
+            // The default build type is catkin (REP 149); packages often omit it by mistake.
+            ("catkin", RosVersion::One) => self.uses_catkin() || self.ament_tool().is_none(),
             ("ament_cmake" | "ament_python", RosVersion::Two) => true,
-            ("cmake", RosVersion::One) => self.of_ament().is_none(),
-            ("cmake", RosVersion::Two) => !self.of_catkin(),
+            ("cmake", RosVersion::One) => self.ament_tool().is_none(),
+            ("cmake", RosVersion::Two) => !self.uses_catkin(),
             _ => false,
         }
     }
 
-    fn of_catkin(&self) -> bool {
+    fn uses_catkin(&self) -> bool {
         self.needs(&[Kind::Buildtool]).contains("catkin")
     }
 
-    /// A tool of ROS 2 that it is built with.
-    fn of_ament(&self) -> Option<String> {
+    /// Returns a ROS 2 build tool that the package uses.
+    fn ament_tool(&self) -> Option<String> {
         if self.groups.contains(INTERFACES) {
             return Some("rosidl".to_owned());
         }

@@ -1,8 +1,8 @@
-//! What sources show of what their packages will have to run, before anything is compiled.
+//! Scan of the sources for what they will have to run, before anything is compiled.
 //!
-//! A push that does not say what to run runs the only executable, or else the only launch file. Where the sources show
-//! for certain that there are several, that is asked for at once, and not after everything was compiled. A package's
-//! build files may do anything; so only what is written in plain words, outside of every condition, counts.
+//! A push that does not state what to run uses the only executable, or else the only launch file. If the sources show
+//! for certain that there are several, the push fails at once instead of after compilation. Build files may do
+//! anything, so only unconditional literal statements count.
 
 mod executables;
 
@@ -14,20 +14,20 @@ use rustix::fs::FileType;
 
 use crate::workspace::{Package, Workspace};
 
-/// What an image of a workspace will have at least.
+/// Minimum content of the image of a workspace.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Foreseen {
-    /// Names of programs, as far as they can be told; sorted by package.
+pub struct SourceScan {
+    /// Names of executables, as far as they are known; sorted by package.
     pub executables: Vec<String>,
     /// Launch files, relative to their packages.
     pub launch_files: Vec<String>,
-    /// Programs for certain, those whose names cannot be told included.
+    /// Number of executables that certainly exist, including those whose names are unknown.
     programs: usize,
-    /// There may be launch files besides.
+    /// True if there may be further launch files.
     may_launch_more: bool,
 }
 
-/// Directories of a package of ROS 1 whose files are not installed unless its build files say so.
+/// Directories of a ROS 1 package whose files are installed only if its build files state so.
 const LEFT_OUT: [&str; 10] = [
     "build",
     "devel",
@@ -41,14 +41,14 @@ const LEFT_OUT: [&str; 10] = [
     "cmake",
 ];
 
-/// Ends of names of launch files of ROS 2, wherever they are installed.
+/// File name suffixes of ROS 2 launch files, wherever they are installed.
 const LAUNCH_OF_TWO: [&str; 4] = ["launch.py", "launch.xml", "launch.yaml", "launch.yml"];
 
-/// Looks through the sources of a workspace. What cannot be read shows nothing. Blocking.
-pub fn foresee(workspace: &Workspace, version: RosVersion) -> Foreseen {
-    let mut foreseen = Foreseen::default();
+/// Scans the sources of a workspace. Unreadable files are ignored. Blocking.
+pub fn scan_sources(workspace: &Workspace, version: RosVersion) -> SourceScan {
+    let mut foreseen = SourceScan::default();
     for package in &workspace.packages {
-        let own = executables::of(&workspace.root, package, version);
+        let own = executables::scan_package(&workspace.root, package, version);
         foreseen.programs += own.programs.len();
         let names = own.programs.into_iter().filter(|name| !name.contains('$'));
         foreseen.executables.extend(names);
@@ -58,8 +58,8 @@ pub fn foresee(workspace: &Workspace, version: RosVersion) -> Foreseen {
     foreseen
 }
 
-impl Foreseen {
-    /// Whether it must be said what to run, whatever else the packages turn out to have.
+impl SourceScan {
+    /// Returns whether the push must state what to run, whatever else the packages contain.
     pub fn must_be_chosen(&self) -> bool {
         let launch_files = self.launch_files.len();
         self.programs > 1 && (launch_files > 1 || launch_files == 0 && !self.may_launch_more)
@@ -72,7 +72,7 @@ impl Foreseen {
         version: RosVersion,
         installed: &[String],
     ) {
-        // It may stand behind a link that stays inside, as the workspace was searched.
+        // The package may be behind a link that stays inside, as in the search of the workspace.
         let Ok(directory) = root.join(&package.path).canonicalize() else {
             self.may_launch_more = true;
             return;
@@ -104,7 +104,7 @@ impl Foreseen {
     }
 }
 
-/// Whether a file of a package of ROS 1 comes into its share whatever its build files say.
+/// Returns whether a file of a ROS 1 package is copied to its share directory regardless of its build files.
 fn is_shared(path: &Path) -> bool {
     path.components().all(|part| match part {
         Component::Normal(name) => {

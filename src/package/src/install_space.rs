@@ -1,8 +1,8 @@
-//! Install spaces: what was compiled elsewhere.
+//! Install spaces, which were compiled elsewhere.
 //!
 //! ```text
 //!   catkin               .catkin  setup.sh  share/PACKAGE  lib/PACKAGE
-//!   colcon, merged       setup.sh  share/ament_index  share/PACKAGE  lib/PACKAGE     (also of ament alone)
+//!   colcon, merged       setup.sh  share/ament_index  share/PACKAGE  lib/PACKAGE     (also plain ament)
 //!   colcon, isolated     setup.sh  PACKAGE/share/ament_index  PACKAGE/share/PACKAGE  PACKAGE/lib/PACKAGE
 //! ```
 
@@ -10,17 +10,17 @@ use std::path::{Path, PathBuf};
 
 use ros::bus::RosVersion;
 
-use crate::locate::{not_too_many, subdirectories};
+use crate::locate::{check_package_count, subdirectories};
 use crate::{Error, read};
 
-/// Marks a catkin result space: empty in an install space, a list of sources in a devel space.
+/// Marker of a catkin result space: empty in an install space, a list of sources in a devel space.
 pub(crate) const MARKER: &str = ".catkin";
-/// Where ament's tools find the names of packages.
+/// Package index of ament.
 pub(crate) const INDEX: &str = "share/ament_index/resource_index/packages";
-/// `setup.sh`, the marker and the like.
+/// Maximum size of `setup.sh`, the marker and similar files in bytes.
 const MAX_BYTES: u64 = 1 << 20;
-/// What setup scripts of catkin, colcon and ament fall back to where nobody says where they are: the place that they were
-/// made for.
+/// Default prefixes in setup scripts of catkin, colcon and ament: the place where the space was installed when it was
+/// built.
 const PLACES: [(&str, &str); 4] = [
     ("setup.sh", "_CATKIN_SETUP_DIR:="),
     ("local_setup.sh", "_colcon_prefix_sh_COLCON_CURRENT_PREFIX="),
@@ -28,19 +28,19 @@ const PLACES: [(&str, &str); 4] = [
     ("local_setup.sh", "AMENT_CURRENT_PREFIX:="),
 ];
 
-/// How an install space is laid out.
+/// Layout of an install space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layout {
-    /// catkin's: one prefix for all packages.
+    /// catkin: one prefix for all packages.
     Catkin,
-    /// One prefix for all packages of ROS 2 (`colcon build --merge-install`).
+    /// ROS 2: one prefix for all packages (`colcon build --merge-install`).
     Merged,
-    /// A prefix for each package of ROS 2, in a directory of its name (`colcon build`).
+    /// ROS 2: a prefix for each package, in a directory of its name (`colcon build`).
     Isolated,
 }
 
 impl Layout {
-    /// The version of ROS that packages in it are of.
+    /// Returns the ROS version of the packages in this layout.
     pub fn version(self) -> RosVersion {
         match self {
             Layout::Catkin => RosVersion::One,
@@ -49,18 +49,18 @@ impl Layout {
     }
 }
 
-/// One that was found.
-pub(crate) struct Space {
-    /// The directory with `setup.sh`.
+/// An install space that was found.
+pub(crate) struct LocatedSpace {
+    /// Directory with `setup.sh`.
     pub(crate) root: PathBuf,
     pub(crate) layout: Layout,
     /// Directories with a package.xml, below `root`; at least one.
     pub(crate) packages: Vec<PathBuf>,
 }
 
-/// The install space at a directory; none where it is none.
-pub(crate) fn at(root: &Path, space: &Path) -> Result<Option<Space>, Error> {
-    let Some(layout) = layout(root, space)? else {
+/// Finds the install space at a directory; `None` if it is not one.
+pub(crate) fn find_install_space(root: &Path, space: &Path) -> Result<Option<LocatedSpace>, Error> {
+    let Some(layout) = detect_layout(root, space)? else {
         return Ok(None);
     };
     if layout == Layout::Catkin && is_devel(root, space)? {
@@ -74,27 +74,27 @@ pub(crate) fn at(root: &Path, space: &Path) -> Result<Option<Space>, Error> {
     };
     let mut packages = Vec::new();
     for prefix in prefixes {
-        for path in shared(root, &prefix)? {
-            is_no_link_to_sources(space, &path)?;
+        for path in share_packages(root, &prefix)? {
+            check_no_symlink_install(space, &path)?;
             packages.push(path.strip_prefix(space).unwrap_or(&path).to_owned());
-            not_too_many(packages.len(), space)?;
+            check_package_count(packages.len(), space)?;
         }
     }
     if packages.is_empty() {
-        let looked_for = "it is an install space without a share/*/package.xml".to_owned();
+        let looked_for = "the install space has no share/*/package.xml".to_owned();
         return Err(Error::NoPackage {
             path: space.to_owned(),
             looked_for,
         });
     }
-    Ok(Some(Space {
+    Ok(Some(LocatedSpace {
         root: space.to_owned(),
         layout,
         packages,
     }))
 }
 
-fn layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
+fn detect_layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
     if space.join(INDEX).is_dir() {
         return Ok(Some(Layout::Merged));
     }
@@ -102,7 +102,7 @@ fn layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
     if is_file(MARKER) && (is_file("setup.sh") || is_file("_setup_util.py")) {
         return Ok(Some(Layout::Catkin));
     }
-    // Elsewhere packages may be side by side, each with a directory `share` of its sources.
+    // Other directories may contain packages side by side, each with a source directory `share`.
     if !is_file("local_setup.sh") && !is_file(".colcon_install_layout") {
         return Ok(None);
     }
@@ -113,12 +113,12 @@ fn layout(root: &Path, space: &Path) -> Result<Option<Layout>, Error> {
 }
 
 fn is_devel(root: &Path, space: &Path) -> Result<bool, Error> {
-    let marker = read::text_inside(root, &space.join(MARKER), MAX_BYTES)?;
+    let marker = read::read_text(root, &space.join(MARKER), MAX_BYTES)?;
     Ok(!marker.trim().is_empty())
 }
 
-/// Directories of packages in a prefix.
-fn shared(root: &Path, prefix: &Path) -> Result<Vec<PathBuf>, Error> {
+/// Returns the directories of packages in a prefix.
+fn share_packages(root: &Path, prefix: &Path) -> Result<Vec<PathBuf>, Error> {
     let share = prefix.join("share");
     if !share.is_dir() {
         return Ok(Vec::new());
@@ -128,8 +128,8 @@ fn shared(root: &Path, prefix: &Path) -> Result<Vec<PathBuf>, Error> {
     Ok(found)
 }
 
-/// With `--symlink-install` Python modules stay where they were built, and a hook leads there.
-fn is_no_link_to_sources(space: &Path, package: &Path) -> Result<(), Error> {
+/// Rejects `--symlink-install`, which leaves Python modules where they were built, with a hook that points there.
+fn check_no_symlink_install(space: &Path, package: &Path) -> Result<(), Error> {
     let hook = package.join("hook/pythonpath_develop.sh");
     if hook.is_file() {
         return Err(Error::SymlinkInstall {
@@ -140,24 +140,24 @@ fn is_no_link_to_sources(space: &Path, package: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// Where a space was installed when it was built.
-pub(crate) fn prefix(root: &Path, space: &Path) -> Result<Option<PathBuf>, Error> {
+/// Returns the prefix for which a space was built.
+pub(crate) fn read_prefix(root: &Path, space: &Path) -> Result<Option<PathBuf>, Error> {
     for (name, before) in PLACES {
         let script = space.join(name);
         if !script.is_file() {
             continue;
         }
-        let text = read::text_inside(root, &script, MAX_BYTES)?;
+        let text = read::read_text(root, &script, MAX_BYTES)?;
         if let Some((_, after)) = text.split_once(before) {
-            return Ok(plain(after));
+            return Ok(parse_plain_path(after));
         }
     }
     Ok(None)
 }
 
-/// The path that a line of a shell script begins with. It becomes a path in the image: nothing but a plain absolute path
-/// will do.
-fn plain(after: &str) -> Option<PathBuf> {
+/// Parses the path at the beginning of a line of a shell script. It becomes a path in the image, so only a literal
+/// absolute path is accepted.
+fn parse_plain_path(after: &str) -> Option<PathBuf> {
     let named = after.split(['}', '\n']).next()?;
     let name = named.trim().trim_matches(['"', '\'']);
     let is_plain = name.starts_with('/')

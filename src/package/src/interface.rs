@@ -1,4 +1,4 @@
-//! The interface of a service: everything a robot can see of the package.
+//! The interface of a service: everything that a robot can see of the package.
 
 use std::collections::BTreeMap;
 
@@ -17,37 +17,37 @@ pub use qos::{Durability, Liveliness, Qos, Reliability};
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Interface {
-    /// Names of services and actions that nodes register only once they have been given what they wait for, such as
-    /// transforms or a map. (Topics have [`Topic::lazy`].)
+    /// Names of services and actions that nodes register only once they have received what they wait for, such as
+    /// transforms or a map. (For topics see [`Topic::lazy`].)
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub late: Vec<String>,
-    /// Topics, by name.
+    /// Topics, sorted by name.
     pub topics: Vec<Topic>,
-    /// Services, by name.
+    /// Services, sorted by name.
     pub services: Vec<Service>,
-    /// Actions, by name; topics and services that they are made of are not repeated in `topics` and `services`.
+    /// Actions, sorted by name; their topics and services are not repeated in `topics` and `services`.
     pub actions: Vec<Action>,
-    /// Parameters that a node read or wrote, or has of its own (ROS 2), by name.
+    /// Parameters that nodes read, write or own (ROS 2), sorted by name.
     pub parameters: Vec<Parameter>,
-    /// Services that nodes of the package call and none of them serves, by name; of ROS 2 actions, too.
+    /// Services (in ROS 2 also actions) that nodes of the package use and none of them provides, sorted by name.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub needs: Vec<Need>,
-    /// Nodes that have a lifecycle (ROS 2), by name; the services of it are not repeated in `services`.
+    /// Lifecycle nodes (ROS 2), sorted by name; their lifecycle services are not repeated in `services`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub lifecycle: Vec<String>,
-    /// Which inputs are answered by which outputs, as the push has decided; none in what was recorded before pushes did
+    /// Request pairs, as decided by the push; absent in interfaces recorded by earlier versions
     /// ([`Interface::decided_requests`]).
     #[serde(
         skip_serializing_if = "Option::is_none",
         deserialize_with = "read_requests"
     )]
     pub requests: Option<Vec<Request>>,
-    /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`:
-    /// those used above and all they refer to.
+    /// Definition texts by `package/msg/Type`, `package/srv/Type`, `package/action/Type`: those used above and all that
+    /// they refer to.
     pub definitions: BTreeMap<String, String>,
 }
 
-/// Reads decided requests. Where one of them cannot be read there are none, and they are decided anew.
+/// Deserializes request pairs. If one of them cannot be decoded, returns `None`, so that they are decided again.
 fn read_requests<'de, D: Deserializer<'de>>(from: D) -> Result<Option<Vec<Request>>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged)]
@@ -63,7 +63,7 @@ fn read_requests<'de, D: Deserializer<'de>>(from: D) -> Result<Option<Vec<Reques
     Ok(written.and_then(|all| all.into_iter().map(read).collect()))
 }
 
-/// From the package's point of view.
+/// Direction from the package's point of view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Direction {
@@ -73,69 +73,70 @@ pub enum Direction {
     Output,
 }
 
-/// One end of a topic.
+/// A topic of the package.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Topic {
     /// Absolute name, such as `/image`.
     pub name: String,
-    /// `package/Type`, of ROS 2 `package/msg/Type`.
+    /// Type: `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5 of the type, lower-case hex, or its type hash (ROS 2), as the node announced it and as the definition gives it.
-    /// Empty where it is not known yet, as in a supplement.
+    /// MD5 of the type in lower-case hexadecimal (ROS 1) or its type hash (ROS 2), as announced by the node and as
+    /// given by the definition. Empty if not known yet, as in a supplement.
     #[serde(default)]
     pub md5: String,
-    /// Which end the package holds.
+    /// Direction from the package's point of view.
     pub direction: Direction,
-    /// Nodes of the package at that end.
+    /// Nodes of the package that publish or subscribe to the topic.
     #[serde(default)]
     pub nodes: Vec<String>,
-    /// Outputs: newcomers get the last message.
+    /// For outputs: true if new subscribers get the last message.
     #[serde(default)]
     pub latched: bool,
-    /// Registered only while an output is subscribed to, or once the node has been given what it waits for.
+    /// True if registered only while an output has subscribers, or once the node has received what it waits for.
     #[serde(default)]
     pub lazy: bool,
-    /// What the package's nodes offer, or ask for, where ends tell it (ROS 2): of several ends, what suits all of them.
+    /// QoS offered or requested by the package's nodes, if known (ROS 2); for several endpoints, the QoS that is
+    /// compatible with all of them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub qos: Option<Qos>,
 }
 
-/// A service the package serves.
+/// A service provided by the package.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Service {
     /// Absolute name.
     pub name: String,
-    /// `package/Type`, of ROS 2 `package/srv/Type`.
+    /// Type: `package/Type` (ROS 1) or `package/srv/Type` (ROS 2).
     #[serde(rename = "type")]
     pub type_name: String,
-    /// MD5, or type hash, of request and response. Empty where it is not known yet.
+    /// MD5 or type hash of request and response. Empty if not known yet.
     #[serde(default)]
     pub md5: String,
-    /// The serving node. Empty where it is not known.
+    /// Node that provides the service. Empty if unknown.
     #[serde(default)]
     pub node: String,
 }
 
-/// An action the package serves.
+/// An action provided by the package.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Action {
     /// Absolute name, without the `/goal` of its topics.
     pub name: String,
-    /// `package/Name` of the `.action` file, without `Action`; of ROS 2 `package/action/Name`.
+    /// Type: `package/Name` of the `.action` file, without `Action` (ROS 1), or `package/action/Name` (ROS 2).
     #[serde(rename = "type")]
     pub type_name: String,
-    /// The serving node. Empty where it is not known.
+    /// Node that provides the action. Empty if unknown.
     #[serde(default)]
     pub node: String,
 }
 
-/// A service, or of ROS 2 an action, that the package looks for on its robot. A lookup tells no type.
+/// A service (in ROS 2 also an action) that the package looks up on its robot. A lookup does not reveal the type.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Need {
     /// Absolute name.
     pub name: String,
-    /// Nodes of the package that looked for it.
+    /// Nodes of the package that look it up.
     #[serde(default)]
     pub nodes: Vec<String>,
 }
@@ -143,27 +144,28 @@ pub struct Need {
 /// A parameter.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Parameter {
-    /// Absolute name; of a node's own parameter the node's name, a slash, and what the node calls it: `/see/camera.rate`.
+    /// Absolute name. For a node's own parameter: the node's name, a slash, and the parameter's name in the node, as in
+    /// `/see/camera.rate`.
     pub name: String,
-    /// The node whose own it is (ROS 2); empty where nodes share their parameters.
+    /// Node that owns the parameter (ROS 2); empty if nodes share their parameters.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub node: String,
-    /// Its value when the interface was found, as JSON; none where it was only asked for.
+    /// Value when the interface was recorded, as JSON; absent if the parameter was only read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<serde_json::Value>,
-    /// Nodes that asked for it.
+    /// Nodes that read it.
     #[serde(default)]
     pub read_by: Vec<String>,
     /// Nodes that wrote it.
     #[serde(default)]
     pub written_by: Vec<String>,
-    /// What its node says of it.
+    /// Descriptor given by the node.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub descriptor: Option<Descriptor>,
 }
 
 impl Parameter {
-    /// What its node calls it; none where nodes share it.
+    /// Returns the parameter's name in its node; `None` if nodes share it.
     pub fn own_name(&self) -> Option<&str> {
         let below = self.name.strip_prefix(&self.node)?.strip_prefix('/')?;
         (!self.node.is_empty()).then_some(below)

@@ -1,4 +1,4 @@
-//! Interfaces as TOML: the supplement that a deployer writes, and the `interface.toml` of a stub.
+//! Interfaces as TOML: the supplement of a deployer, and the `interface.toml` of a stub.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::interface::Interface;
 use crate::{Error, names};
 
-/// Keys that may stand in each table of a file.
+/// Keys allowed in each table of a file.
 const KEYS: [(&str, &[&str]); 7] = [
     (
         "topics",
@@ -42,20 +42,20 @@ const KEYS: [(&str, &[&str]); 7] = [
 ];
 
 impl Interface {
-    /// The text of an `interface.toml`, without the requests. TOML has no null: members and elements that are null are
+    /// Returns the text of an `interface.toml`, without request pairs. TOML has no null: null members and elements are
     /// left out.
     pub fn to_toml(&self) -> String {
         let mut writable = self.clone();
-        // Decided, and not to be stated here.
+        // Request pairs are decided by the push and cannot be stated here.
         writable.requests = None;
         for parameter in &mut writable.parameters {
-            parameter.value = parameter.value.take().and_then(without_nulls);
+            parameter.value = parameter.value.take().and_then(remove_nulls);
         }
         toml::to_string_pretty(&writable).expect("an interface without nulls is TOML")
     }
 
-    /// Parses the text of a file, whose path is for messages. A supplement only needs names, types and the
-    /// topics' directions:
+    /// Parses the text of a file; `path` is used in messages. A supplement needs only names, types and the directions
+    /// of topics:
     ///
     /// ```toml
     /// [[topics]]
@@ -64,23 +64,24 @@ impl Interface {
     /// direction = "input"        # the package subscribes
     /// ```
     pub fn from_toml(text: &str, path: &Path) -> Result<Self, Error> {
-        let failed = |error: &toml::de::Error| wrong(text, path, error.span(), error.message());
-        // First as it stands, for keys that are misspelt.
+        let failed =
+            |error: &toml::de::Error| parse_error(text, path, error.span(), error.message());
+        // First as a generic table, to detect misspelled keys.
         let table: toml::Table = toml::from_str(text).map_err(|error| failed(&error))?;
-        if let Some((key, problem)) = misspelt(&table) {
+        if let Some((key, problem)) = find_unknown_key(&table) {
             let at = text.find(key).map(|start| start..start + key.len());
-            return Err(wrong(text, path, at, problem));
+            return Err(parse_error(text, path, at, problem));
         }
         let interface: Self = toml::from_str(text).map_err(|error| failed(&error))?;
-        if let Some((name, problem)) = interface.impossible() {
+        if let Some((name, problem)) = interface.find_invalid_name() {
             let at = text.find(name).map(|start| start..start + name.len());
-            return Err(wrong(text, path, at, problem));
+            return Err(parse_error(text, path, at, problem));
         }
         Ok(interface)
     }
 
-    /// A name or type that cannot be, and why.
-    fn impossible(&self) -> Option<(&str, String)> {
+    /// Returns an invalid name or type, and the reason.
+    fn find_invalid_name(&self) -> Option<(&str, String)> {
         let named = self
             .topics
             .iter()
@@ -95,7 +96,7 @@ impl Interface {
                 .iter()
                 .map(|action| (&action.name, Some(&action.type_name))),
         );
-        // What a node calls its own parameters is not a graph name: `/see/qos.depth`.
+        // The name of a node's own parameter is not a graph name: `/see/qos.depth`.
         let shared = self
             .parameters
             .iter()
@@ -115,7 +116,7 @@ impl Interface {
                     format!("{name:?} is not an absolute name such as \"/camera/image\""),
                 ));
             }
-            // Some nodes take any type, such as relays.
+            // Some nodes accept any type, such as relays.
             let fits = |of_type: &str| of_type == "*" || names::is_full_type(of_type);
             let bad = of_type.filter(|of_type| !fits(of_type))?;
             Some((
@@ -126,29 +127,29 @@ impl Interface {
     }
 }
 
-/// What a node may call a parameter of its own.
+/// Returns whether a name is valid for a node's own parameter.
 fn is_own_name(name: &str) -> bool {
     (1..=512).contains(&name.len()) && !name.chars().any(|c| c.is_control() || c.is_whitespace())
 }
 
-fn without_nulls(value: Value) -> Option<Value> {
+fn remove_nulls(value: Value) -> Option<Value> {
     Some(match value {
         Value::Null => return None,
-        Value::Array(items) => items.into_iter().filter_map(without_nulls).collect(),
+        Value::Array(items) => items.into_iter().filter_map(remove_nulls).collect(),
         Value::Object(members) => {
             let kept = members
                 .into_iter()
-                .filter_map(|(key, value)| Some((key, without_nulls(value)?)));
+                .filter_map(|(key, value)| Some((key, remove_nulls(value)?)));
             Value::Object(kept.collect())
         }
-        // TOML's integers are signed.
+        // TOML integers are signed.
         Value::Number(number) if number.as_i64().is_none() => number.as_f64()?.into(),
         other => other,
     })
 }
 
-/// A key that no interface file has, and what it should be.
-fn misspelt(table: &toml::Table) -> Option<(&str, String)> {
+/// Returns a key that is not allowed, and a message with those that are.
+fn find_unknown_key(table: &toml::Table) -> Option<(&str, String)> {
     for (section, content) in table {
         if section == "definitions" {
             continue;
@@ -157,7 +158,7 @@ fn misspelt(table: &toml::Table) -> Option<(&str, String)> {
             let known = KEYS.map(|(known, _)| known).join(", ");
             return Some((
                 section,
-                format!("{section:?} is not known; there are {known} and definitions"),
+                format!("unknown section {section:?}; the sections are {known} and definitions"),
             ));
         };
         let entries = content
@@ -170,7 +171,7 @@ fn misspelt(table: &toml::Table) -> Option<(&str, String)> {
                 return Some((
                     key,
                     format!(
-                        "{key:?} is not known in {section}; there are {}",
+                        "unknown key {key:?} in {section}; the keys are {}",
                         keys.join(", ")
                     ),
                 ));
@@ -180,7 +181,7 @@ fn misspelt(table: &toml::Table) -> Option<(&str, String)> {
     None
 }
 
-fn wrong(
+fn parse_error(
     text: &str,
     path: &Path,
     span: Option<std::ops::Range<usize>>,
@@ -251,7 +252,7 @@ value = 0.5
         interface.topics[0].nodes = vec!["/n".into()];
         interface.topics[0].latched = true;
         interface.late = vec!["/go".into()];
-        // A relay takes any type.
+        // A relay accepts any type.
         let any = Topic {
             name: "/any".into(),
             type_name: "*".into(),
@@ -270,7 +271,7 @@ value = 0.5
             read_by: vec!["/n".into()],
             ..Parameter::default()
         });
-        // What ROS 2 adds.
+        // Additions of ROS 2.
         interface.topics[0].qos = Some(Qos {
             durability: Durability::TransientLocal,
             deadline: Some(0.5),
@@ -329,7 +330,7 @@ value = 0.5
             ),
             (
                 topic("typ = \"a/B\"\ndirection = \"input\""),
-                "line 3, column 1: \"typ\" is not known in topics; there are name, type",
+                "line 3, column 1: unknown key \"typ\" in topics; the keys are name, type",
             ),
             (
                 topic("type = \"B\"\ndirection = \"input\""),
@@ -349,7 +350,7 @@ value = 0.5
             ),
             (
                 "[[topic]]\nname = \"a\"".to_owned(),
-                "\"topic\" is not known; there are topics, services",
+                "unknown section \"topic\"; the sections are topics, services",
             ),
         ] {
             let message = parse(&text).unwrap_err().to_string();

@@ -1,10 +1,9 @@
-//! The interfaces that packages of ROS 2 define (`msg`, `srv` and `action` of their sources), read before anything is
-//! compiled: a mistake, or a type that nobody defines, is told with its file and line at once, and not from within a
-//! code generator.
+//! Validation of the interface files of ROS 2 packages (`msg`, `srv` and `action`) before anything is compiled: an
+//! error, or a type without definition, is reported at once with its file and line, and not by a code generator later.
 
 use std::path::{Path, PathBuf};
 
-use foreign::{Found, Tree};
+use foreign::{DirectoryLookup, Tree};
 use ros::bus::RosVersion;
 use ros::schema::{InterfaceFile, Registry, SchemaError};
 
@@ -12,33 +11,34 @@ use crate::definitions::Definitions;
 use crate::workspace::{Package, Workspace};
 use crate::{Error, names, read};
 
-/// The largest file that is read.
+/// Maximum size of an interface file in bytes.
 const MAX_BYTES: u64 = 256 << 10;
-/// `CMakeLists.txt`.
+/// Maximum size of a `CMakeLists.txt` in bytes.
 const MAX_BUILD_FILE: u64 = 1 << 20;
-/// Files of one directory.
+/// Maximum number of files in a directory.
 const MAX_FILES: usize = 20_000;
-/// The function that makes code of interfaces.
+/// CMake function that generates code for interfaces.
 const GENERATE: &str = "rosidl_generate_interfaces";
 
-/// Directories of a package, and the extensions of the files in them.
+/// Directories of a package, and the extension of the files in them.
 const KINDS: [(&str, &str); 3] = [("msg", "msg"), ("srv", "srv"), ("action", "action")];
 
-/// An interface of a package's sources.
-struct Source {
-    /// `package/msg/Type`
+/// An interface file of a package.
+struct InterfaceSource {
+    /// Type name: `package/msg/Type`.
     key: String,
-    /// Below what was pushed.
+    /// Path, below what was pushed.
     path: PathBuf,
     text: String,
-    /// The build makes code of it.
+    /// True if the build generates code for it.
     is_built: bool,
 }
 
-/// Checks those of a workspace. `known`: definitions that its packages are built with. Blocking.
+/// Validates the interface files of a workspace. `known` are the definitions that its packages are built with.
+/// Blocking.
 ///
 /// # Errors
-/// [`Error::Definition`] for the first that does not parse, or that needs a type of which there is no definition.
+/// [`Error::Definition`] for the first file that cannot be parsed, or that refers to a type without definition.
 pub fn check(workspace: &Workspace, known: &Definitions) -> Result<(), Error> {
     let mut sources = Vec::new();
     for package in &workspace.packages {
@@ -47,25 +47,26 @@ pub fn check(workspace: &Workspace, known: &Definitions) -> Result<(), Error> {
     if sources.is_empty() {
         return Ok(());
     }
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in known {
-        // Of those that are unusable somebody may be told below.
+        // Unusable definitions are reported below if they are needed.
         let _ = registry.insert(key, text);
     }
     for source in &sources {
-        if let Err(error) = add(&registry, source)
+        if let Err(error) = register(&registry, source)
             && source.is_built
         {
-            return Err(wrong(workspace, source, &error));
+            return Err(definition_error(workspace, source, &error));
         }
     }
     for source in sources.iter().filter(|source| source.is_built) {
-        resolve(&registry, &source.key).map_err(|error| wrong(workspace, source, &error))?;
+        resolve(&registry, &source.key)
+            .map_err(|error| definition_error(workspace, source, &error))?;
     }
     Ok(())
 }
 
-fn add(registry: &Registry, source: &Source) -> Result<(), SchemaError> {
+fn register(registry: &Registry, source: &InterfaceSource) -> Result<(), SchemaError> {
     if source.path.extension().is_some_and(|end| end == "idl") {
         let file = InterfaceFile::read_idl(&source.key, &source.text)?;
         let mut definitions = file.definitions.iter();
@@ -82,12 +83,12 @@ fn resolve(registry: &Registry, key: &str) -> Result<(), SchemaError> {
     }
 }
 
-fn wrong(workspace: &Workspace, source: &Source, error: &SchemaError) -> Error {
+fn definition_error(workspace: &Workspace, source: &InterfaceSource, error: &SchemaError) -> Error {
     let missing = |name: &str, needed_by: &str| {
         let package = name.split('/').next().unwrap_or(name);
         format!(
-            "{needed_by} needs {name}, of which there is no definition; name the package {package} as a <depend> in \
-             package.xml, or push it along"
+            "{needed_by} needs {name}, which has no definition; name the package {package} as a <depend> in \
+                package.xml, or push it, too"
         )
     };
     let problem = match error {
@@ -104,21 +105,25 @@ fn wrong(workspace: &Workspace, source: &Source, error: &SchemaError) -> Error {
     }
 }
 
-/// Reads a package's interfaces, if its build makes code of any.
-fn read_package(root: &Path, package: &Package, sources: &mut Vec<Source>) -> Result<(), Error> {
+/// Reads the interface files of a package, if its build generates code for any.
+fn read_package(
+    root: &Path,
+    package: &Package,
+    sources: &mut Vec<InterfaceSource>,
+) -> Result<(), Error> {
     let directory = root.join(&package.path);
     let build_file = directory.join("CMakeLists.txt");
     if !build_file.is_file() {
         return Ok(());
     }
-    let build = read::text_inside(root, &build_file, MAX_BUILD_FILE)?;
+    let build = read::read_text(root, &build_file, MAX_BUILD_FILE)?;
     if !build.contains(GENERATE) {
         return Ok(());
     }
     let (top, tree) = (Tree::open(root)?, Tree::open(&directory)?);
     let first = sources.len();
     for (kind, extension) in KINDS {
-        let Found::Directory(files) = tree.directory(kind)? else {
+        let DirectoryLookup::Directory(files) = tree.open_directory(kind)? else {
             continue;
         };
         let mut names = files.names()?;
@@ -141,11 +146,11 @@ fn read_package(root: &Path, package: &Package, sources: &mut Vec<Source>) -> Re
                 continue;
             }
             let path = package.path.join(kind).join(name);
-            // A link to another directory of what was pushed is as good as a file.
-            let Some(file) = top.file_following(&path, MAX_BYTES)? else {
+            // A link to another directory of what was pushed is accepted as a file.
+            let Some(file) = top.read_file_following(&path, MAX_BYTES)? else {
                 continue;
             };
-            sources.push(Source {
+            sources.push(InterfaceSource {
                 key: format!("{}/{kind}/{of_type}", package.manifest.name),
                 path,
                 text: String::from_utf8_lossy(&file.bytes).into_owned(),
@@ -153,7 +158,7 @@ fn read_package(root: &Path, package: &Package, sources: &mut Vec<Source>) -> Re
             });
         }
     }
-    // A build file that names none of them looks for them itself.
+    // A build file that names none of them finds them by a pattern.
     let own = &mut sources[first..];
     if own.iter().all(|source| !source.is_built) {
         own.iter_mut().for_each(|source| source.is_built = true);
@@ -161,7 +166,7 @@ fn read_package(root: &Path, package: &Package, sources: &mut Vec<Source>) -> Re
     Ok(())
 }
 
-/// Whether a text has a file's name as a word of its own.
+/// Returns whether a text contains a file name as a separate word.
 fn mentions(text: &str, name: &str) -> bool {
     text.match_indices(name).any(|(at, _)| {
         let before = text[..at].chars().next_back();

@@ -1,5 +1,5 @@
-//! What an image holds: install spaces, ROS packages with their programs, message definitions. It is looked for once, when a
-//! revision is published, and recorded with it; nobody searches layers afterwards.
+//! Inventory of an image: install spaces, ROS packages with their executables, message definitions. It is taken once,
+//! when a revision is published, and recorded with it, so that layers need not be searched afterwards.
 
 mod launch;
 
@@ -9,73 +9,73 @@ use std::path::{Component, Path};
 use serde::{Deserialize, Serialize};
 
 use crate::definitions::{self, Definitions};
-use crate::merged::{self, Level, Merged};
+use crate::merged::{self, LayerDirectory, MergedDirectory};
 use crate::{Error, ament, names};
 
-/// Links that are followed from one to the next.
+/// Maximum number of links followed in a chain.
 const MAX_LINKS: usize = 8;
-/// Install spaces that are looked into.
+/// Maximum number of install spaces searched.
 const MAX_PREFIXES: usize = 1024;
 
-/// What an image holds.
+/// Content of an image.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Inventory {
-    /// Install spaces, absolute, in the order in which the nodes search them.
+    /// Install spaces (absolute paths), in the order in which the nodes search them.
     pub prefixes: Vec<String>,
-    /// ROS packages by name, each as the first install space that has it.
-    pub packages: BTreeMap<String, Installed>,
-    /// Programs of the pushed package that the revision's nodes run: absolute paths by name. A stub may have these
-    /// started and no others.
+    /// ROS packages by name, each in the first install space that contains it.
+    pub packages: BTreeMap<String, InstalledPackage>,
+    /// Executables of the pushed package that the revision's nodes run: absolute paths by name. A stub may start these
+    /// and no others.
     pub programs: BTreeMap<String, String>,
     /// Texts of message, service and action definitions.
     pub definitions: Definitions,
 }
 
-/// Where a package is installed.
+/// An installed package.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Installed {
-    /// What it shares: the directory of its `package.xml`, absolute.
+pub struct InstalledPackage {
+    /// Share directory, which contains `package.xml`; absolute.
     pub share: String,
-    /// The directory of its programs, absolute; empty where it has none.
+    /// Directory of the executables, absolute; empty if there are none.
     pub lib: String,
-    /// Names of the programs there.
+    /// Names of the executables.
     pub executables: BTreeSet<String>,
-    /// Launch files, by their paths below `share`.
+    /// Launch files, as paths below `share`.
     #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
     pub launch_files: BTreeSet<String>,
-    /// Classes of nodes for component containers (ROS 2), each with its library's absolute path.
+    /// Component classes (ROS 2), each with the absolute path of its library.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub components: BTreeMap<String, String>,
 }
 
-/// What a revision says of itself, which tells where to look.
+/// Properties of a revision that determine where to search.
 #[derive(Debug, Clone, Copy)]
-pub struct Published<'a> {
-    /// The pushed package.
+pub struct SearchHints<'a> {
+    /// Pushed package.
     pub package: &'a str,
     /// Environment of every process.
     pub environment: &'a BTreeMap<String, String>,
-    /// Command lines of its nodes.
+    /// Command lines of the nodes.
     pub commands: &'a [&'a [String]],
 }
 
 impl Inventory {
-    /// Looks through a stack of extracted layers, given lowest first. Blocking.
-    pub fn take<L: AsRef<Path>>(layers: &[L], of: Published<'_>) -> Result<Self, Error> {
-        let stack = merged::open(layers)?;
-        let prefixes = prefixes(&stack, of)?;
+    /// Takes the inventory of a stack of extracted layers, given lowest first. Blocking.
+    pub fn scan<L: AsRef<Path>>(layers: &[L], of: SearchHints<'_>) -> Result<Self, Error> {
+        let stack = merged::open_layers(layers)?;
+        let prefixes = find_prefixes(&stack, of)?;
         let shares: Vec<String> = prefixes.iter().map(|p| format!("{p}/share")).collect();
         Ok(Self {
-            packages: packages(&stack, &prefixes)?,
-            programs: programs(&stack, of),
+            packages: find_packages(&stack, &prefixes)?,
+            programs: find_programs(&stack, of),
             definitions: definitions::read(layers, &shares)?,
             prefixes,
         })
     }
 }
 
-/// Install spaces, as the environment and the nodes name them, then `/usr`, then others below `/opt`.
-fn prefixes(stack: &[Level], of: Published<'_>) -> Result<Vec<String>, Error> {
+/// Returns the install spaces: those named by the environment and the nodes, then `/usr`, then others below `/opt`.
+fn find_prefixes(stack: &[LayerDirectory], of: SearchHints<'_>) -> Result<Vec<String>, Error> {
     let variable = |name| {
         of.environment
             .get(name)
@@ -93,8 +93,8 @@ fn prefixes(stack: &[Level], of: Published<'_>) -> Result<Vec<String>, Error> {
     };
     named.extend(of.commands.iter().filter_map(of_program));
     named.push("/usr".to_owned());
-    for space in below(stack, "/opt")? {
-        let inner = below(stack, &space)?;
+    for space in list_directories(stack, "/opt")? {
+        let inner = list_directories(stack, &space)?;
         named.push(space);
         named.extend(inner);
     }
@@ -110,8 +110,8 @@ fn prefixes(stack: &[Level], of: Published<'_>) -> Result<Vec<String>, Error> {
     let mut prefixes = Vec::new();
     for prefix in named {
         let prefix = prefix.trim_end_matches('/');
-        if Merged::at(stack, &format!("{prefix}/share"))?.exists()
-            || Merged::at(stack, &format!("{prefix}/lib"))?.exists()
+        if MergedDirectory::open_path(stack, &format!("{prefix}/share"))?.exists()
+            || MergedDirectory::open_path(stack, &format!("{prefix}/lib"))?.exists()
         {
             prefixes.push(prefix.to_owned());
         }
@@ -119,13 +119,13 @@ fn prefixes(stack: &[Level], of: Published<'_>) -> Result<Vec<String>, Error> {
     Ok(prefixes)
 }
 
-/// Directories in a directory, absolute.
-fn below(stack: &[Level], parent: &str) -> Result<Vec<String>, Error> {
-    let directory = Merged::at(stack, parent)?;
+/// Returns the subdirectories of a directory, as absolute paths.
+fn list_directories(stack: &[LayerDirectory], parent: &str) -> Result<Vec<String>, Error> {
+    let directory = MergedDirectory::open_path(stack, parent)?;
     let mut found = Vec::new();
     for name in directory.names()?.into_keys() {
         if let Ok(text) = std::str::from_utf8(&name)
-            && directory.below(&name)?.exists()
+            && directory.open_child(&name)?.exists()
         {
             found.push(format!("{parent}/{text}"));
         }
@@ -133,10 +133,13 @@ fn below(stack: &[Level], parent: &str) -> Result<Vec<String>, Error> {
     Ok(found)
 }
 
-fn packages(stack: &[Level], prefixes: &[String]) -> Result<BTreeMap<String, Installed>, Error> {
-    let mut packages: BTreeMap<String, Installed> = BTreeMap::new();
+fn find_packages(
+    stack: &[LayerDirectory],
+    prefixes: &[String],
+) -> Result<BTreeMap<String, InstalledPackage>, Error> {
+    let mut packages: BTreeMap<String, InstalledPackage> = BTreeMap::new();
     for prefix in prefixes {
-        let share = Merged::at(stack, &format!("{prefix}/share"))?;
+        let share = MergedDirectory::open_path(stack, &format!("{prefix}/share"))?;
         let indexed = ament::packages_in(stack, prefix)?;
         let named = share.names()?.into_keys();
         let mut named: BTreeSet<String> = named
@@ -148,32 +151,33 @@ fn packages(stack: &[Level], prefixes: &[String]) -> Result<BTreeMap<String, Ins
             if packages.contains_key(&name) {
                 continue;
             }
-            let own = share.below(name.as_bytes())?;
+            let own = share.open_child(name.as_bytes())?;
             let is_package = own.names()?.contains_key(b"package.xml".as_slice());
             if !is_package && !indexed.contains(&name) {
                 continue;
             }
-            let components = match indexed.contains(&name) {
-                true => ament::components(stack, prefix, &name)?,
-                false => Vec::new(),
+            let components = if indexed.contains(&name) {
+                ament::components(stack, prefix, &name)?
+            } else {
+                Vec::new()
             };
             let components = components.into_iter();
-            let installed = Installed {
+            let installed = InstalledPackage {
                 share: format!("{prefix}/share/{name}"),
-                launch_files: launch::files(&own)?,
+                launch_files: launch::find_launch_files(&own)?,
                 components: components
                     .map(|(class, library)| (class, format!("{prefix}/{library}")))
                     .collect(),
-                ..Installed::default()
+                ..InstalledPackage::default()
             };
             packages.insert(name, installed);
         }
     }
     for prefix in prefixes {
-        let libraries = Merged::at(stack, &format!("{prefix}/lib"))?;
+        let libraries = MergedDirectory::open_path(stack, &format!("{prefix}/lib"))?;
         for (name, package) in &mut packages {
             if package.lib.is_empty() {
-                let executables = executables(&libraries.below(name.as_bytes())?)?;
+                let executables = find_executables(&libraries.open_child(name.as_bytes())?)?;
                 if !executables.is_empty() {
                     package.lib = format!("{prefix}/lib/{name}");
                     package.executables = executables;
@@ -184,11 +188,11 @@ fn packages(stack: &[Level], prefixes: &[String]) -> Result<BTreeMap<String, Ins
     Ok(packages)
 }
 
-/// What `dynamic_reconfigure` makes code of: executable, and of no use to a node.
+/// Suffix of input files of `dynamic_reconfigure`'s code generator, which are executable but useless at run time.
 const OF_BUILDS: &str = ".cfg";
 
-/// Names of programs. A link to one is one.
-fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
+/// Returns the names of executables. A link counts as one.
+fn find_executables(lib: &MergedDirectory) -> Result<BTreeSet<String>, Error> {
     let mut found = BTreeSet::new();
     for (name, level) in lib.names()? {
         let Ok(text) = String::from_utf8(name.clone()) else {
@@ -204,14 +208,14 @@ fn executables(lib: &Merged) -> Result<BTreeSet<String>, Error> {
     Ok(found)
 }
 
-fn programs(stack: &[Level], of: Published<'_>) -> BTreeMap<String, String> {
+fn find_programs(stack: &[LayerDirectory], of: SearchHints<'_>) -> BTreeMap<String, String> {
     let package = of.package;
     let below = [format!("/lib/{package}/"), format!("/share/{package}/")];
     let of_package = |argument: &&String| {
         argument.starts_with('/') && below.iter().any(|below| argument.contains(below))
     };
-    // Nodes are given files of the package, too. What cannot be found or looked at is taken for a program, as it was
-    // when it was started.
+    // Nodes also get files of the package as arguments. A file that cannot be found or inspected is assumed to be an
+    // executable, since it was when it was started.
     let runs = |path: &&String| !matches!(is_program(stack, Path::new(path)), Ok(Some(false)));
     let commands = of.commands.iter();
     commands
@@ -221,9 +225,9 @@ fn programs(stack: &[Level], of: Published<'_>) -> BTreeMap<String, String> {
         .collect()
 }
 
-/// Whether the file at an absolute path may be executed; none where there is none. Links are followed as a process in the
-/// image would.
-fn is_program(stack: &[Level], path: &Path) -> Result<Option<bool>, Error> {
+/// Returns whether the file at an absolute path is executable; `None` if it does not exist. Links are followed as by a
+/// process in the image.
+fn is_program(stack: &[LayerDirectory], path: &Path) -> Result<Option<bool>, Error> {
     let mut path = path.to_owned();
     for _ in 0..MAX_LINKS {
         let (Some(parent), Some(name)) = (path.parent(), path.file_name()) else {
@@ -232,7 +236,7 @@ fn is_program(stack: &[Level], path: &Path) -> Result<Option<bool>, Error> {
         let Some(directory) = parent.to_str() else {
             return Ok(None);
         };
-        let directory = Merged::at(stack, directory)?;
+        let directory = MergedDirectory::open_path(stack, directory)?;
         let names = directory.names()?;
         let Some((name, level)) = names.get_key_value(name.as_encoded_bytes()) else {
             return Ok(None);

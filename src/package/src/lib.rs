@@ -1,17 +1,17 @@
-//! What a deployer pushes, as data. Reads files, does nothing else.
+//! Data model of what a deployer pushes. Reads files and has no other side effects.
 //!
 //! ```text
-//!   directory ──workspace::inspect──▶ Pushed: packages in build order │ an install space
+//!   directory ──workspace::inspect──▶ PushedDirectory: packages in build order │ an install space
 //!                 package.xml ──manifest──▶ Manifest (conditions evaluated)
-//!   sources ──foreseen──▶ programs and launch files, as far as they show
-//!   layers ──inventory::take──▶ install spaces, packages, programs, definitions
+//!   sources ──foreseen──▶ programs and launch files that can be found
+//!   layers ──inventory::scan──▶ install spaces, packages, programs, definitions
 //!   running package, supplement ──interface──▶ Interface, compared by difference
-//!   interface, answers that were seen ──requests──▶ which input is answered by which outputs
-//!   layers, inventory, interface ──stub──▶ the files that a robot installs in the package's place
+//!   interface, observed answers ──requests──▶ which outputs answer which input
+//!   layers, inventory, interface ──stub──▶ the files that a robot installs instead of the package
 //! ```
 //!
-//! Everything here is untrusted: names are checked before anyone puts them into a path or a command, sizes
-//! are bounded, and no symbolic link leads out of the tree that is read.
+//! All input is untrusted: names are validated before they are used in a path or a command, sizes are bounded, and no
+//! symbolic link is followed out of the tree that is read.
 
 #![forbid(unsafe_code)]
 

@@ -8,73 +8,73 @@ use roxmltree::{Document, Node};
 use crate::condition::Variables;
 use crate::{Error, names, read};
 
-/// The group of packages from whose `.msg`, `.srv` and `.action` files rosidl makes code.
+/// Group of the packages for whose `.msg`, `.srv` and `.action` files rosidl generates code.
 pub const INTERFACES: &str = "rosidl_interface_packages";
 
-/// The largest `package.xml` that is read.
+/// Maximum size of a `package.xml` in bytes.
 pub(crate) const MAX_BYTES: u64 = 1 << 20;
 
-/// What a package says about itself, for the distribution its conditions were evaluated for.
+/// Content of a `package.xml`, with conditions evaluated for a distribution.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Manifest {
-    /// 1, 2 or 3.
+    /// Format: 1, 2 or 3.
     pub format: u8,
-    /// The package's name, valid.
+    /// Name of the package, validated.
     pub name: String,
-    /// As written, such as `1.2.3`; empty when missing.
+    /// Version as written, such as `1.2.3`; empty if missing.
     pub version: String,
-    /// Text of the description, white space folded.
+    /// Text of the description, with white space collapsed.
     pub description: String,
     /// Licences, as written.
     pub licenses: Vec<String>,
-    /// What it needs, and for what.
+    /// Dependencies and their kinds.
     pub dependencies: BTreeSet<Dependency>,
-    /// `catkin` unless exported otherwise.
+    /// Build type; `catkin` unless exported otherwise.
     pub build_type: String,
-    /// Groups that it says it is a member of, such as [`INTERFACES`] (format 3).
+    /// Groups that the package is a member of, such as [`INTERFACES`] (format 3).
     pub groups: BTreeSet<String>,
-    /// Groups all of whose members it needs to be built (format 3).
+    /// Groups all of whose members are needed to build it (format 3).
     pub group_dependencies: BTreeSet<String>,
-    /// It only groups others.
+    /// True for a metapackage.
     pub metapackage: bool,
 }
 
-/// Something a package needs.
+/// A dependency.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Dependency {
-    /// A package or a rosdep key, valid.
+    /// Name of a package or a rosdep key, validated.
     pub name: String,
-    /// The kind of dependency.
+    /// Kind of dependency.
     pub kind: Kind,
 }
 
-/// What a dependency is needed for.
+/// Kinds of dependencies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
-    /// A tool that runs while it is built, such as catkin.
+    /// Build tool, such as catkin.
     Buildtool,
-    /// A tool that those who build against it need.
+    /// Build tool for those who build against the package.
     BuildtoolExport,
-    /// Headers and libraries to build it.
+    /// Headers and libraries for building it.
     Build,
-    /// Headers and libraries to build against it.
+    /// Headers and libraries for building against it.
     BuildExport,
-    /// To run it.
+    /// Needed at run time.
     Exec,
-    /// To test it.
+    /// Needed for testing.
     Test,
-    /// To build its documentation.
+    /// Needed for building the documentation.
     Doc,
 }
 
 impl Kind {
-    /// What an element means in a format; none where the format does not know it.
-    fn of_element(element: &str, format: u8) -> Option<&'static [Self]> {
+    /// Returns the kinds that an element stands for in a format; `None` if the format does not define it.
+    fn from_element(element: &str, format: u8) -> Option<&'static [Self]> {
         Some(match (element, format) {
             ("buildtool_depend", _) => &[Self::Buildtool],
             ("build_depend", _) => &[Self::Build],
             ("test_depend", _) => &[Self::Test],
-            // Format 1 does not tell running from building against.
+            // Format 1 does not distinguish running from building against.
             ("run_depend", 1) => &[Self::BuildExport, Self::Exec],
             ("depend", 2..) => &[Self::Build, Self::BuildExport, Self::Exec],
             ("build_export_depend", 2..) => &[Self::BuildExport],
@@ -87,33 +87,29 @@ impl Kind {
 }
 
 impl Manifest {
-    /// Reads `path` in the foreign tree `root`, through links that stay in it.
-    pub(crate) fn read_inside(
-        root: &Path,
-        path: &Path,
-        variables: &Variables,
-    ) -> Result<Self, Error> {
-        let text = read::text_inside(root, path, MAX_BYTES)?;
+    /// Reads `path` in the untrusted tree `root`, following links that stay inside.
+    pub(crate) fn load(root: &Path, path: &Path, variables: &Variables) -> Result<Self, Error> {
+        let text = read::read_text(root, path, MAX_BYTES)?;
         Self::parse(&text, path, variables)
     }
 
-    /// Parses the text of a file, whose path is for messages.
+    /// Parses the text of a file; `path` is used in messages.
     pub fn parse(text: &str, path: &Path, variables: &Variables) -> Result<Self, Error> {
-        let document = Document::parse(text).map_err(|error| malformed(path, &error))?;
-        let reader = Reader {
+        let document = Document::parse(text).map_err(|error| xml_error(path, &error))?;
+        let reader = ManifestReader {
             document: &document,
             path,
             variables,
         };
-        reader.manifest()
+        reader.parse_manifest()
     }
 
-    /// Whether it needs a group that another package is a member of.
+    /// Returns whether the package needs a group that another one is a member of.
     pub fn needs_group_of(&self, other: &Self) -> bool {
         !self.group_dependencies.is_disjoint(&other.groups)
     }
 
-    /// Names of what is needed for any of `kinds`.
+    /// Returns the names of the dependencies of any of `kinds`.
     pub fn needs(&self, kinds: &[Kind]) -> BTreeSet<&str> {
         let wanted = self
             .dependencies
@@ -123,10 +119,10 @@ impl Manifest {
     }
 }
 
-fn malformed(path: &Path, error: &roxmltree::Error) -> Error {
+fn xml_error(path: &Path, error: &roxmltree::Error) -> Error {
     let position = error.pos();
     let text = error.to_string();
-    // The position is told at the beginning already.
+    // The position is already part of the error.
     let problem = text
         .strip_suffix(&format!(" at {position}"))
         .unwrap_or(&text);
@@ -138,21 +134,21 @@ fn malformed(path: &Path, error: &roxmltree::Error) -> Error {
     }
 }
 
-struct Reader<'a> {
+struct ManifestReader<'a> {
     document: &'a Document<'a>,
     path: &'a Path,
     variables: &'a Variables,
 }
 
-impl<'a> Reader<'a> {
-    fn manifest(&self) -> Result<Manifest, Error> {
+impl<'a> ManifestReader<'a> {
+    fn parse_manifest(&self) -> Result<Manifest, Error> {
         let root = self.document.root_element();
         if !root.has_tag_name("package") {
             let problem = format!(
                 "the root element is <{}>, not <package>",
                 root.tag_name().name()
             );
-            return Err(self.wrong(root, problem));
+            return Err(self.manifest_error(root, problem));
         }
         let format = self.format(root)?;
         let name = self.name(root)?;
@@ -164,7 +160,7 @@ impl<'a> Reader<'a> {
         let description = self
             .children(root, "description")?
             .first()
-            .map(|node| folded(*node))
+            .map(|node| folded_text(*node))
             .unwrap_or_default();
         let licenses = self
             .children(root, "license")?
@@ -194,9 +190,9 @@ impl<'a> Reader<'a> {
             None | Some("1") => Ok(1),
             Some("2") => Ok(2),
             Some("3") => Ok(3),
-            Some(other) => Err(self.wrong(
+            Some(other) => Err(self.manifest_error(
                 root,
-                format!("format {other:?} is not known; 1, 2 and 3 are"),
+                format!("unknown format {other:?}; supported are 1, 2 and 3"),
             )),
         }
     }
@@ -204,15 +200,17 @@ impl<'a> Reader<'a> {
     fn name(&self, root: Node<'a, 'a>) -> Result<String, Error> {
         let names = self.children(root, "name")?;
         let node = match names[..] {
-            [] => return Err(self.wrong(root, "the <name> element is missing".to_owned())),
+            [] => return Err(self.manifest_error(root, "the <name> element is missing".to_owned())),
             [only] => only,
-            [_, second, ..] => return Err(self.wrong(second, "a second <name> element".to_owned())),
+            [_, second, ..] => {
+                return Err(self.manifest_error(second, "a second <name> element".to_owned()));
+            }
         };
         let name = self.text(node);
         if !names::is_package(&name) {
             let problem =
                 format!("{name:?} is not a package name: a letter, then letters, digits, _ and -");
-            return Err(self.wrong(node, problem));
+            return Err(self.manifest_error(node, problem));
         }
         Ok(name)
     }
@@ -220,7 +218,7 @@ impl<'a> Reader<'a> {
     fn dependencies(&self, root: Node<'a, 'a>, format: u8) -> Result<BTreeSet<Dependency>, Error> {
         let mut dependencies = BTreeSet::new();
         for node in root.children().filter(Node::is_element) {
-            let Some(kinds) = Kind::of_element(node.tag_name().name(), format) else {
+            let Some(kinds) = Kind::from_element(node.tag_name().name(), format) else {
                 continue;
             };
             if !self.applies(node)? {
@@ -229,10 +227,10 @@ impl<'a> Reader<'a> {
             let name = self.text(node);
             if !names::is_dependency(&name) {
                 let problem = format!(
-                    "{name:?} in <{}> is not the name of a dependency",
+                    "{name:?} in <{}> is not a valid dependency name",
                     node.tag_name().name()
                 );
-                return Err(self.wrong(node, problem));
+                return Err(self.manifest_error(node, problem));
             }
             dependencies.extend(kinds.iter().map(|&kind| Dependency {
                 name: name.clone(),
@@ -242,7 +240,7 @@ impl<'a> Reader<'a> {
         Ok(dependencies)
     }
 
-    /// Names of groups in elements of a name.
+    /// Returns the names of groups in elements of this name.
     fn groups(
         &self,
         root: Node<'a, 'a>,
@@ -255,12 +253,13 @@ impl<'a> Reader<'a> {
         };
         let named = nodes.into_iter().map(|node| {
             let name = self.text(node);
-            match names::is_dependency(&name) {
-                true => Ok(name),
-                false => Err(self.wrong(
+            if names::is_dependency(&name) {
+                Ok(name)
+            } else {
+                Err(self.manifest_error(
                     node,
-                    format!("{name:?} in <{element}> is not the name of a group"),
-                )),
+                    format!("{name:?} in <{element}> is not a valid group name"),
+                ))
             }
         });
         named.collect()
@@ -277,7 +276,7 @@ impl<'a> Reader<'a> {
         Ok((build_type, metapackage))
     }
 
-    /// Child elements of a name whose conditions hold.
+    /// Returns the child elements of this name whose conditions hold.
     fn children(&self, parent: Node<'a, 'a>, name: &str) -> Result<Vec<Node<'a, 'a>>, Error> {
         let mut found = Vec::new();
         for node in parent.children().filter(|node| node.has_tag_name(name)) {
@@ -293,19 +292,16 @@ impl<'a> Reader<'a> {
             return Ok(true);
         };
         let wrong = |problem| {
-            self.wrong(
-                node,
-                format!("the condition {condition:?} does not parse: {problem}"),
-            )
+            self.manifest_error(node, format!("invalid condition {condition:?}: {problem}"))
         };
-        self.variables.hold(condition).map_err(wrong)
+        self.variables.evaluate(condition).map_err(wrong)
     }
 
     fn text(&self, node: Node<'a, 'a>) -> String {
-        folded(node)
+        folded_text(node)
     }
 
-    fn wrong(&self, node: Node<'a, 'a>, problem: String) -> Error {
+    fn manifest_error(&self, node: Node<'a, 'a>, problem: String) -> Error {
         let position = self.document.text_pos_at(node.range().start);
         Error::Manifest {
             path: self.path.to_owned(),
@@ -316,8 +312,8 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// All text in an element, white space folded.
-fn folded(node: Node<'_, '_>) -> String {
+/// Returns all text in an element, with white space collapsed.
+fn folded_text(node: Node<'_, '_>) -> String {
     let texts = node
         .descendants()
         .filter(Node::is_text)
@@ -334,11 +330,11 @@ mod tests {
         Manifest::parse(
             text,
             Path::new("src/x/package.xml"),
-            &Variables::ros(1, "noetic"),
+            &Variables::for_distribution(1, "noetic"),
         )
     }
 
-    fn refused(text: &str) -> String {
+    fn refusal(text: &str) -> String {
         parse(text).unwrap_err().to_string()
     }
 
@@ -423,7 +419,7 @@ mod tests {
         assert_eq!(manifest.build_type, "catkin");
     }
 
-    /// As packages for both versions of ROS are written.
+    /// A typical package.xml for both ROS versions.
     const OF_BOTH: &str = r#"<?xml version="1.0"?>
         <package format="3">
           <name>both_msgs</name><version>1.0.0</version>
@@ -442,7 +438,7 @@ mod tests {
     #[test]
     fn one_manifest_for_both_versions() {
         let read = |version, distribution| {
-            let variables = Variables::ros(version, distribution);
+            let variables = Variables::for_distribution(version, distribution);
             Manifest::parse(OF_BOTH, Path::new("package.xml"), &variables).unwrap()
         };
         let one = read(1, "noetic");
@@ -480,15 +476,15 @@ mod tests {
         assert_eq!(manifest.groups, BTreeSet::from(["h".to_owned()]));
         let manifest = parse(&text(2)).unwrap();
         assert!(manifest.group_dependencies.is_empty() && manifest.groups.is_empty());
-        let message = refused(
+        let message = refusal(
             "<package format='3'><name>x</name><member_of_group>../g</member_of_group></package>",
         );
-        assert!(message.contains("not the name of a group"), "{message}");
+        assert!(message.contains("not a valid group name"), "{message}");
     }
 
     #[test]
     fn malformed_xml_is_told_with_its_place() {
-        let text = refused("<package>\n  <name>x</nam>\n</package>");
+        let text = refusal("<package>\n  <name>x</nam>\n</package>");
         assert!(
             text.starts_with("src/x/package.xml, line 2, column "),
             "{text}"
@@ -497,9 +493,9 @@ mod tests {
             text.contains("malformed XML") && !text.contains(" at 2:"),
             "{text}"
         );
-        assert!(refused("").contains("malformed XML"));
+        assert!(refusal("").contains("malformed XML"));
         let entities = r#"<!DOCTYPE p [<!ENTITY a "aaaa">]><package><name>&a;</name></package>"#;
-        assert!(refused(entities).contains("malformed XML"));
+        assert!(refusal(entities).contains("malformed XML"));
     }
 
     #[test]
@@ -522,7 +518,7 @@ mod tests {
             ("<package><name>../x</name></package>", "not a package name"),
             (
                 "<package format='4'><name>x</name></package>",
-                "format \"4\" is not known",
+                "unknown format \"4\"",
             ),
             (
                 "<package><name>x</name><build_depend>-o x</build_depend></package>",
@@ -534,10 +530,10 @@ mod tests {
             ),
             (
                 "<package format='3'><name>x</name><depend condition='$A'>y</depend></package>",
-                "condition \"$A\" does not parse",
+                "invalid condition \"$A\"",
             ),
         ] {
-            let message = refused(text);
+            let message = refusal(text);
             assert!(message.contains(reason), "{message}");
         }
     }
@@ -547,13 +543,17 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("package.xml");
         let read = || {
-            Manifest::read_inside(directory.path(), &path, &Variables::ros(1, "noetic"))
-                .unwrap_err()
-                .to_string()
+            Manifest::load(
+                directory.path(),
+                &path,
+                &Variables::for_distribution(1, "noetic"),
+            )
+            .unwrap_err()
+            .to_string()
         };
         assert!(read().starts_with("cannot open ") && read().contains("package.xml"));
         std::fs::write(&path, " ".repeat(2 << 20)).unwrap();
-        assert!(read().contains("larger than the 1048576 bytes"));
+        assert!(read().contains("larger than the limit of 1048576 bytes"));
         std::fs::write(&path, b"<package>\xff").unwrap();
         assert!(read().contains("UTF-8"), "{}", read());
     }

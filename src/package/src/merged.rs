@@ -1,43 +1,42 @@
-//! A stack of extracted layers, read as one tree.
+//! Merged view of a stack of extracted layers.
 //!
-//! The layers are other people's: each is a tree whose links, device nodes and sizes mean nothing good. So the
-//! stack is walked by directory descriptors, as an overlay mount would merge it, without following any link and
-//! without leaving any layer ([`foreign`]).
+//! The layers are untrusted: their links, device nodes and sizes may be malicious. So the stack is walked by directory
+//! descriptors and merged like an overlay mount, without following links and without leaving any layer ([`foreign`]).
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
-use foreign::{Found, Tree};
+use foreign::{DirectoryLookup, Tree};
 use rustix::fs::{Dir, FileType};
 
 use crate::{Error, read};
 
-/// The most names in one directory.
+/// Maximum number of names in a directory.
 pub(crate) const MAX_FILES: usize = 20_000;
 
-/// Opens extracted trees, given lowest first; the uppermost comes first.
-pub(crate) fn open<L: AsRef<Path>>(layers: &[L]) -> Result<Vec<Level>, Error> {
+/// Opens extracted trees, given lowest first; returns them uppermost first.
+pub(crate) fn open_layers<L: AsRef<Path>>(layers: &[L]) -> Result<Vec<LayerDirectory>, Error> {
     let layers = layers.iter().rev();
     layers
-        .map(|layer| Ok(Level(Tree::open(layer.as_ref())?)))
+        .map(|layer| Ok(LayerDirectory(Tree::open(layer.as_ref())?)))
         .collect()
 }
 
-/// One layer's part of a directory.
-pub(crate) struct Level(Tree);
+/// A directory in one layer.
+pub(crate) struct LayerDirectory(Tree);
 
-impl Level {
-    /// A file in this part; none for a link, a deletion or anything else that is no file.
+impl LayerDirectory {
+    /// Reads a file in this layer; `None` for a link, a deletion or anything else that is not a file.
     pub(crate) fn file(&self, name: &[u8], limit: u64) -> Result<Option<foreign::File>, Error> {
-        match self.0.file(OsStr::from_bytes(name), limit) {
+        match self.0.read_file(OsStr::from_bytes(name), limit) {
             Err(foreign::Error::NotAFile { .. }) => Ok(None),
             read => Ok(read?),
         }
     }
 
-    /// Whether a name in this part is a file that somebody may execute.
+    /// Returns whether a name in this layer is an executable file.
     pub(crate) fn is_executable(&self, name: &[u8]) -> bool {
         let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
         rustix::fs::statat(self.0.as_fd(), name, flags).is_ok_and(|stat| {
@@ -46,34 +45,34 @@ impl Level {
         })
     }
 
-    /// Whether a name in this part says that the layers below have nothing of it.
+    /// Returns whether a name in this layer deletes that of the layers below.
     pub(crate) fn is_deletion(&self, name: &[u8]) -> bool {
         let flags = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
         rustix::fs::statat(self.0.as_fd(), name, flags)
             .is_ok_and(|stat| FileType::from_raw_mode(stat.st_mode) == FileType::CharacterDevice)
     }
 
-    /// Where a link in this part leads, unless it is none.
+    /// Returns the target of a link in this layer; `None` if it is not a link.
     pub(crate) fn link(&self, name: &[u8]) -> Option<PathBuf> {
         let target = rustix::fs::readlinkat(self.0.as_fd(), name, Vec::new()).ok()?;
         Some(PathBuf::from(OsStr::from_bytes(target.as_bytes())))
     }
 
-    /// For messages.
+    /// Returns the path, for messages.
     pub(crate) fn path(&self) -> &Path {
         self.0.path()
     }
 }
 
-/// A directory as an overlay mount shows it: its parts, the uppermost first.
-pub(crate) struct Merged {
-    levels: Vec<Level>,
+/// A directory merged as by an overlay mount: the directories of the layers, uppermost first.
+pub(crate) struct MergedDirectory {
+    levels: Vec<LayerDirectory>,
 }
 
-impl Merged {
-    /// The directory at a path such as `usr/share`. `..` leads up, and at the top nowhere, as it does for a process
-    /// whose root this is.
-    pub(crate) fn at(stack: &[Level], path: &str) -> Result<Self, Error> {
+impl MergedDirectory {
+    /// Opens the directory at a path such as `usr/share`. `..` goes up, but not beyond the root, as in a process with
+    /// this root directory.
+    pub(crate) fn open_path(stack: &[LayerDirectory], path: &str) -> Result<Self, Error> {
         let mut parts = Vec::new();
         for part in path.split('/') {
             match part {
@@ -84,50 +83,52 @@ impl Merged {
                 name => parts.push(name),
             }
         }
-        let mut merged = Self::top(stack)?;
+        let mut merged = Self::open_root(stack)?;
         for part in parts {
-            merged = merged.below(part.as_bytes())?;
+            merged = merged.open_child(part.as_bytes())?;
         }
         Ok(merged)
     }
 
-    fn top(stack: &[Level]) -> Result<Self, Error> {
-        let levels = stack.iter().map(|level| Ok(Level(level.0.try_clone()?)));
+    fn open_root(stack: &[LayerDirectory]) -> Result<Self, Error> {
+        let levels = stack
+            .iter()
+            .map(|level| Ok(LayerDirectory(level.0.try_clone()?)));
         Ok(Self {
             levels: levels.collect::<Result<_, Error>>()?,
         })
     }
 
-    /// Whether there is such a directory.
+    /// Returns whether the directory exists.
     pub(crate) fn exists(&self) -> bool {
         !self.levels.is_empty()
     }
 
-    /// A directory in this one; one without parts if there is none.
-    pub(crate) fn below(&self, name: &[u8]) -> Result<Self, Error> {
+    /// Opens a subdirectory; the result is empty if it does not exist.
+    pub(crate) fn open_child(&self, name: &[u8]) -> Result<Self, Error> {
         let mut levels = Vec::new();
         for level in &self.levels {
-            match level.0.directory(OsStr::from_bytes(name))? {
-                Found::Directory(directory) => {
+            match level.0.open_directory(OsStr::from_bytes(name))? {
+                DirectoryLookup::Directory(directory) => {
                     let opaque = is_opaque(&directory);
-                    levels.push(Level(directory));
+                    levels.push(LayerDirectory(directory));
                     if opaque {
                         break;
                     }
                 }
-                Found::Nothing => {}
-                // A file, a link or a deletion: it hides what the layers below have.
-                Found::SomethingElse => break,
+                DirectoryLookup::Nothing => {}
+                // A file, a link or a deletion hides the layers below.
+                DirectoryLookup::SomethingElse => break,
             }
         }
         Ok(Self { levels })
     }
 
-    /// All names in it, each with the uppermost level that has it.
-    pub(crate) fn names(&self) -> Result<BTreeMap<Vec<u8>, &Level>, Error> {
+    /// Returns all names in the directory, each with the uppermost layer that contains it.
+    pub(crate) fn names(&self) -> Result<BTreeMap<Vec<u8>, &LayerDirectory>, Error> {
         let mut names = BTreeMap::new();
         for level in &self.levels {
-            let failed = |error| read::failed("list", level.path(), error);
+            let failed = |error| read::file_error("list", level.path(), error);
             for entry in Dir::read_from(level.0.as_fd()).map_err(failed)? {
                 let name = entry.map_err(failed)?.file_name().to_bytes().to_vec();
                 if name != b"." && name != b".." {
@@ -146,7 +147,7 @@ impl Merged {
     }
 }
 
-/// Whether a directory hides those of its name in the layers below.
+/// Returns whether a directory hides those of its name in the layers below.
 fn is_opaque(directory: &Tree) -> bool {
     ["trusted.overlay.opaque", "user.overlay.opaque"]
         .iter()

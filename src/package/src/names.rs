@@ -1,6 +1,7 @@
-//! Names that go into paths, commands and addresses.
+//! Validation of names that are used in paths, commands and addresses.
 
-/// A ROS package's name: a letter, then letters, digits, `_` and `-` (REP 144, with what is in use beside it).
+/// Returns whether a text is the name of a ROS package: a letter, then letters, digits, `_` and `-` (REP 144, extended
+/// by what is in use).
 pub fn is_package(name: &str) -> bool {
     name.len() <= 128
         && name.starts_with(|c: char| c.is_ascii_alphabetic())
@@ -9,7 +10,8 @@ pub fn is_package(name: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "_-".contains(c))
 }
 
-/// A dependency's name: a package's or a rosdep key, such as `libstdc++6` or `python3.11-dev`.
+/// Returns whether a text is the name of a dependency: a package or a rosdep key, such as `libstdc++6` or
+/// `python3.11-dev`.
 pub fn is_dependency(name: &str) -> bool {
     name.len() <= 128
         && name.starts_with(|c: char| c.is_ascii_alphanumeric())
@@ -18,14 +20,15 @@ pub fn is_dependency(name: &str) -> bool {
             .all(|c| c.is_ascii_alphanumeric() || "_-.+".contains(c))
 }
 
-/// The second half of a type: a letter, then letters, digits and `_`.
+/// Returns whether a text is the second part of a type: a letter, then letters, digits and `_`.
 pub fn is_type(name: &str) -> bool {
     name.len() <= 128
         && name.starts_with(|c: char| c.is_ascii_alphabetic())
         && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
 }
 
-/// The name of a program in a package: that of a file, which commands and scripts can hold without surprises.
+/// Returns whether a text is the name of an executable: a file name without characters that are special in commands and
+/// scripts.
 pub fn is_executable(name: &str) -> bool {
     (1..=255).contains(&name.len())
         && !name.starts_with(['.', '-'])
@@ -34,17 +37,17 @@ pub fn is_executable(name: &str) -> bool {
             .all(|c| !c.is_control() && !"'\"`$\\/".contains(c))
 }
 
-/// A C++ class in its namespaces, such as `image_tools::ShowImage`.
+/// Returns whether a text is a qualified C++ class, such as `image_tools::ShowImage`.
 pub fn is_class(name: &str) -> bool {
     name.len() <= 512 && name.split("::").all(is_type)
 }
 
-/// A library's path in an install space, such as `lib/libtalker.so`.
+/// Returns whether a text is the path of a library in an install space, such as `lib/libtalker.so`.
 pub fn is_library(path: &str) -> bool {
     path.len() <= 512 && path.split('/').all(is_executable)
 }
 
-/// `package/Type`, or `package/msg/Type` as ROS 2 has it.
+/// Returns whether a text is a type: `package/Type`, or `package/msg/Type` as in ROS 2.
 pub fn is_full_type(name: &str) -> bool {
     let parts: Vec<&str> = name.splitn(4, '/').collect();
     match parts[..] {
@@ -55,16 +58,16 @@ pub fn is_full_type(name: &str) -> bool {
     }
 }
 
-/// What the definition of a type is found by: `package/kind/Type`. `kind` (`msg`, `srv`, `action`) is that of names which do
-/// not say, as those of ROS 1.
-pub fn key(type_name: &str, kind: &str) -> String {
+/// Returns the key of a type's definition: `package/kind/Type`. `kind` (`msg`, `srv`, `action`) is used for names
+/// without a kind, as in ROS 1.
+pub fn definition_key(type_name: &str, kind: &str) -> String {
     match type_name.split_once('/') {
         Some((package, short)) if !short.contains('/') => format!("{package}/{kind}/{short}"),
         _ => type_name.to_owned(),
     }
 }
 
-/// An absolute graph name such as `/camera/image_raw`.
+/// Returns whether a text is an absolute graph name, such as `/camera/image_raw`.
 pub fn is_graph_name(name: &str) -> bool {
     name.len() <= 512
         && name.strip_prefix('/').is_some_and(|parts| {
@@ -98,8 +101,8 @@ mod tests {
                 && !is_full_type("a/msg/b/C")
                 && !is_full_type("a/msg/")
         );
-        assert_eq!(key("a/B", "srv"), "a/srv/B");
-        assert_eq!(key("a/msg/B", "srv"), "a/msg/B");
+        assert_eq!(definition_key("a/B", "srv"), "a/srv/B");
+        assert_eq!(definition_key("a/msg/B", "srv"), "a/msg/B");
         assert!(is_class("image_tools::ShowImage") && !is_class("a::") && !is_class("a b"));
         assert!(
             is_library("lib/libx.so") && !is_library("/lib/libx.so") && !is_library("lib/../x")

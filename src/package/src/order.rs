@@ -1,4 +1,4 @@
-//! The order in which packages are built.
+//! Build order of packages.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,7 +6,7 @@ use crate::Error;
 use crate::manifest::Kind;
 use crate::workspace::Package;
 
-/// What must be there before a package is built.
+/// Dependencies that must be built before a package.
 const BEFORE: [Kind; 4] = [
     Kind::Buildtool,
     Kind::BuildtoolExport,
@@ -14,7 +14,7 @@ const BEFORE: [Kind; 4] = [
     Kind::BuildExport,
 ];
 
-/// Each package after those it needs to be built, otherwise by name.
+/// Sorts packages after their build dependencies, otherwise by name.
 pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error> {
     let mut waiting: BTreeMap<String, Package> = packages
         .into_iter()
@@ -24,12 +24,12 @@ pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error>
     while !waiting.is_empty() {
         let ready = waiting
             .values()
-            .find(|package| needed(package, &waiting).is_empty());
+            .find(|package| build_prerequisites(package, &waiting).is_empty());
         match ready.map(|package| package.manifest.name.clone()) {
             Some(name) => ordered.extend(waiting.remove(&name)),
             None => {
                 return Err(Error::Circle {
-                    circle: circle(&waiting),
+                    circle: find_cycle(&waiting),
                 });
             }
         }
@@ -37,8 +37,11 @@ pub(crate) fn build_order(packages: Vec<Package>) -> Result<Vec<Package>, Error>
     Ok(ordered)
 }
 
-/// Names of waiting packages that must come before this one.
-fn needed<'a>(package: &'a Package, waiting: &'a BTreeMap<String, Package>) -> BTreeSet<&'a str> {
+/// Returns the names of remaining packages that must be built before this one.
+fn build_prerequisites<'a>(
+    package: &'a Package,
+    waiting: &'a BTreeMap<String, Package>,
+) -> BTreeSet<&'a str> {
     let own = &package.manifest;
     let mut names = own.needs(&BEFORE);
     names.retain(|name| waiting.contains_key(*name));
@@ -51,8 +54,8 @@ fn needed<'a>(package: &'a Package, waiting: &'a BTreeMap<String, Package>) -> B
     names
 }
 
-/// Follows needs, of which every package here has one, until one comes again.
-fn circle(waiting: &BTreeMap<String, Package>) -> Vec<String> {
+/// Follows dependencies, of which every remaining package has one, until a package repeats.
+fn find_cycle(waiting: &BTreeMap<String, Package>) -> Vec<String> {
     let mut path: Vec<String> = Vec::new();
     let mut name = waiting.keys().next().cloned().unwrap_or_default();
     loop {
@@ -62,7 +65,7 @@ fn circle(waiting: &BTreeMap<String, Package>) -> Vec<String> {
             return circle;
         }
         let next = waiting.get(&name).and_then(|package| {
-            needed(package, waiting)
+            build_prerequisites(package, waiting)
                 .first()
                 .map(|next| (*next).to_owned())
         });

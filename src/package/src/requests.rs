@@ -1,57 +1,57 @@
-//! Which input of a service is answered by which outputs. It is decided once, at the push, when the interface is
-//! complete; the robot is told and guesses nothing.
+//! Request pairs: which input of a service is answered by which outputs. They are decided once, at the push, when the
+//! interface is complete; robots do not guess.
 //!
 //! ```text
-//!   --request ──────────────▶ state ─┐
-//!   stamps that the push saw ─▶ decide ─┴─▶ Vec<Request>, each with its reason ──▶ interface ──▶ stubs, words for the deployer
-//!   names and types ──────────▶
+//!   --request ─────────────────▶ apply_stated ────┐
+//!   stamps seen in the push ─┬─▶ decide_requests ─┴─▶ Vec<Request> with reasons ──▶ interface ──▶ stubs, CLI output
+//!   names and types ─────────┘
 //! ```
-//! Each node of the package is looked at by itself, since a stub stands for one. Goals of actions are none of this:
-//! their results carry the goal's id, whatever else there is.
+//! Each node of the package is considered separately, since a stub stands for one node. Goals of actions are not
+//! covered, since their results carry the goal's id.
 
 mod rules;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-use qos::{Correlation, Pair};
+use qos::{Correlation, TopicPair};
 use ros::bus::RosVersion;
 use ros::schema::Registry;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::interface::{Direction, Interface, Topic};
-use rules::End;
+use rules::TopicEnd;
 
 /// An input of a node and the outputs that answer it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Request {
-    /// The node whose topics they are; empty where it is not known.
+    /// Name of the node; empty if unknown.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub node: String,
-    /// The topics, by their names at the push, and by what an answer is recognised.
-    pub pair: Pair,
-    /// Why it is these.
+    /// Topics, as named at the push, and how an answer is matched.
+    pub pair: TopicPair,
+    /// How the pair was determined.
     pub reason: Reason,
 }
 
-/// Why an output is taken for the answer to an input.
+/// How a request pair was determined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Reason {
-    /// The deployer says so.
+    /// Stated by the deployer.
     Stated,
-    /// The push gave the input a message, and the output answered it.
+    /// Observed: the push sent a message to the input, and the output answered it.
     Watched,
-    /// The node has no other input and no other output that it could be.
+    /// Unambiguous: the node has no other eligible input and output.
     Alone,
-    /// It is the likeliest by types and names.
+    /// Guessed from types and names.
     Guessed,
 }
 
-/// An answer that the push saw: a message of the output with the stamp of the one that the input was given.
+/// An answer observed by the push: a message of the output with the stamp of a message sent to the input.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Watched {
+pub struct ObservedAnswer {
     /// Absolute name of the input.
     pub input: String,
     /// Absolute name of the output.
@@ -60,48 +60,53 @@ pub struct Watched {
 
 impl fmt::Display for Request {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Pair { input, outputs, .. } = &self.pair;
+        let TopicPair { input, outputs, .. } = &self.pair;
         let answer = outputs.first().map_or("", String::as_str);
         let why = match self.reason {
             Reason::Stated => {
                 return write!(
                     out,
-                    "an answer on {answer} is counted against {input}, as --request says"
+                    "answers on {answer} count for {input}, as set by --request"
                 );
             }
-            Reason::Watched => "it carried the stamp of what the push gave",
-            Reason::Alone => "its node has no others",
-            Reason::Guessed => "a guess by types and names, since no answer was seen",
+            Reason::Watched => "it carried the stamp of the test input",
+            Reason::Alone => "its node has no other topics",
+            Reason::Guessed => "a guess by types and names, because no answer was seen",
         };
         write!(
             out,
-            "an answer on {answer} is counted against {input} ({why}); change it with --request INPUT=OUTPUT"
+            "answers on {answer} count for {input} ({why}); change it with --request INPUT=OUTPUT"
         )
     }
 }
 
 impl Interface {
-    /// The requests that the push has decided; decided now for an interface that was recorded before pushes did.
+    /// Returns the request pairs decided by the push, or decides them now for an interface recorded by an earlier
+    /// version.
     pub fn decided_requests(&self, ros: RosVersion) -> Vec<Request> {
         match &self.requests {
             Some(requests) => requests.clone(),
-            None => decide(ros, self, &BTreeSet::new()),
+            None => decide_requests(ros, self, &BTreeSet::new()),
         }
     }
 }
 
-/// Decides which input of each node is answered by which outputs.
+/// Decides the request pairs of each node.
 ///
-/// What was `watched` counts first; the rest is decided by rules. An output answers one input, since its messages are
-/// counted against that alone.
-pub fn decide(ros: RosVersion, interface: &Interface, watched: &BTreeSet<Watched>) -> Vec<Request> {
-    let ends = Ends::of(ros, interface);
+/// Pairs in `watched` take precedence; the rest is decided by rules. An output answers a single input, since its
+/// messages are matched with that only.
+pub fn decide_requests(
+    ros: RosVersion,
+    interface: &Interface,
+    watched: &BTreeSet<ObservedAnswer>,
+) -> Vec<Request> {
+    let ends = TopicEnds::from_interface(ros, interface);
     let nodes: BTreeSet<&str> = interface
         .topics
         .iter()
         .flat_map(|topic| topic.nodes.iter().map(String::as_str))
         .collect();
-    // A supplement may leave out whose its topics are.
+    // A supplement may leave the nodes of its topics unspecified.
     let nodes = if nodes.is_empty() {
         BTreeSet::from([""])
     } else {
@@ -109,10 +114,10 @@ pub fn decide(ros: RosVersion, interface: &Interface, watched: &BTreeSet<Watched
     };
     let of_node = |node: &str| -> Vec<Request> {
         let (inputs, outputs) = (
-            ends.of_node(node, Direction::Input),
-            ends.of_node(node, Direction::Output),
+            ends.topics_of_node(node, Direction::Input),
+            ends.topics_of_node(node, Direction::Output),
         );
-        let found = rules::pairs(&inputs, &outputs, watched).into_iter();
+        let found = rules::pair_topics(&inputs, &outputs, watched).into_iter();
         let request = |(pair, reason)| Request {
             node: node.to_owned(),
             pair,
@@ -123,18 +128,17 @@ pub fn decide(ros: RosVersion, interface: &Interface, watched: &BTreeSet<Watched
     nodes.into_iter().flat_map(of_node).collect()
 }
 
-/// Puts what the deployer says in the place of what was decided for the same nodes.
+/// Replaces the decided pairs of a node by those that the deployer states.
 ///
 /// # Errors
-/// A topic that the interface does not have, with those that it has; a stamp where there is none; topics that are named
-/// twice.
-pub fn state(
+/// An unknown topic, with the existing ones; matching by stamp without a stamp; topics that are named twice.
+pub fn apply_stated(
     ros: RosVersion,
     interface: &Interface,
-    stated: &[Pair],
+    stated: &[TopicPair],
     decided: Vec<Request>,
 ) -> Result<Vec<Request>, Error> {
-    let ends = Ends::of(ros, interface);
+    let ends = TopicEnds::from_interface(ros, interface);
     let mut requests = Vec::new();
     for pair in stated {
         let input = ends.find(Direction::Input, &pair.input)?;
@@ -175,8 +179,8 @@ pub fn state(
             });
         }
         requests.push(Request {
-            node: ends.node_of(&input.name, &outputs),
-            pair: Pair { by, ..pair.clone() },
+            node: ends.find_node(&input.name, &outputs),
+            pair: TopicPair { by, ..pair.clone() },
             reason: Reason::Stated,
         });
     }
@@ -189,21 +193,21 @@ pub fn state(
     Ok(requests)
 }
 
-/// The topics of an interface, with what is to be known of their types.
-struct Ends<'a> {
-    topics: Vec<(&'a Topic, End)>,
+/// Topics of an interface, with the relevant properties of their types.
+struct TopicEnds<'a> {
+    topics: Vec<(&'a Topic, TopicEnd)>,
 }
 
-impl<'a> Ends<'a> {
-    fn of(ros: RosVersion, interface: &'a Interface) -> Self {
-        let registry = Registry::of(ros);
+impl<'a> TopicEnds<'a> {
+    fn from_interface(ros: RosVersion, interface: &'a Interface) -> Self {
+        let registry = Registry::for_version(ros);
         for (key, text) in &interface.definitions {
-            // Of a type that is not usable no message is recognised.
+            // Messages of an unusable type cannot be matched.
             let _ = registry.insert(key, text);
         }
         let end = |topic: &'a Topic| {
             let of_type = registry.message(&topic.type_name);
-            let end = End {
+            let end = TopicEnd {
                 name: topic.name.clone(),
                 type_name: topic.type_name.replacen("/msg/", "/", 1),
                 is_known: of_type.is_ok(),
@@ -217,25 +221,28 @@ impl<'a> Ends<'a> {
         }
     }
 
-    fn of_direction(&self, direction: Direction) -> impl Iterator<Item = &(&'a Topic, End)> {
+    fn topics_in_direction(
+        &self,
+        direction: Direction,
+    ) -> impl Iterator<Item = &(&'a Topic, TopicEnd)> {
         self.topics
             .iter()
             .filter(move |(topic, _)| topic.direction == direction)
     }
 
-    /// Those at which a node is; topics of which that is not known are every node's.
-    fn of_node(&self, node: &str, direction: Direction) -> Vec<End> {
+    /// Returns the topics of a node; topics without known nodes belong to every node.
+    fn topics_of_node(&self, node: &str, direction: Direction) -> Vec<TopicEnd> {
         let is_of =
             |topic: &Topic| topic.nodes.is_empty() || topic.nodes.iter().any(|name| name == node);
         let ends = self
-            .of_direction(direction)
+            .topics_in_direction(direction)
             .filter(|(topic, _)| is_of(topic));
         ends.map(|(_, end)| end.clone()).collect()
     }
 
-    fn find(&self, direction: Direction, name: &str) -> Result<End, Error> {
+    fn find(&self, direction: Direction, name: &str) -> Result<TopicEnd, Error> {
         let found = self
-            .of_direction(direction)
+            .topics_in_direction(direction)
             .find(|(topic, _)| topic.name == name);
         found
             .map(|(_, end)| end.clone())
@@ -246,21 +253,21 @@ impl<'a> Ends<'a> {
                     Direction::Output => "output",
                 },
                 topics: self
-                    .of_direction(direction)
+                    .topics_in_direction(direction)
                     .map(|(topic, _)| topic.name.clone())
                     .collect(),
             })
     }
 
-    /// The node that has the input and the answer; where none has both, the input's.
-    fn node_of(&self, input: &str, outputs: &[End]) -> String {
+    /// Returns the node with both the input and the answer; if there is none, that of the input.
+    fn find_node(&self, input: &str, outputs: &[TopicEnd]) -> String {
         let mut nodes: BTreeMap<&str, usize> = BTreeMap::new();
         for (topic, end) in &self.topics {
             let is_input = topic.direction == Direction::Input && end.name == input;
             let is_answer = topic.direction == Direction::Output
                 && outputs.first().is_some_and(|first| first.name == end.name);
             for node in topic.nodes.iter().filter(|_| is_input || is_answer) {
-                // An input's node counts more than an output's, and one that has both the most.
+                // The input's node has a higher weight than the output's; a node with both has the highest.
                 *nodes.entry(node).or_default() += if is_input { 2 } else { 1 };
             }
         }

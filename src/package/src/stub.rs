@@ -1,13 +1,13 @@
-//! The stub: the package as a robot installs it, under the original's name, with launchers in place of programs.
+//! The stub: a package that robots install under the original's name, with launchers in place of executables.
 //!
 //! ```text
-//!  image ──contents──▶ Contents ─┐
-//!  service, interface ─▶ About ──┴─compose─▶ files of an install space (catkin's, ament's) ──(caller)──▶ NAME.tar.gz
+//!  image ──contents──▶ Contents ────┐
+//!  service, interface ─▶ StubInfo ──┴─compose─▶ files of an install space (catkin, ament) ──(caller)──▶ NAME.tar.gz
 //! ```
 //!
-//! Install spaces are searched only up to the first that holds a package. So the stub has a launcher for every
-//! executable, not only for those that run in the cloud, and everything that the package shares. The same input
-//! gives the same files. The robot's program, `lib/PACKAGE/cloudroid-stub`, is added by the caller, who has it.
+//! Install spaces are searched only up to the first that contains a package. So the stub has a launcher for every
+//! executable, not only for those that run in the cloud, and all shared files. The same input gives the same files. The
+//! robot's program, `lib/PACKAGE/cloudroid-stub`, is added by the caller, who has it.
 
 mod ament;
 mod catkin;
@@ -26,7 +26,7 @@ use ros::bus::RosVersion;
 use crate::Error;
 use crate::interface::Interface;
 
-/// The robot's program, in `lib/PACKAGE`.
+/// Name of the robot's program in `lib/PACKAGE`.
 pub const PROGRAM: &str = "cloudroid-stub";
 
 const RUN: &str = include_str!("stub/inside/run.sh");
@@ -34,60 +34,60 @@ const ORIGINAL: &str = include_str!("stub/inside/original.sh");
 const INSTALL: &str = include_str!("stub/inside/install.sh");
 const README: &str = include_str!("stub/inside/README.md");
 
-/// Where robots reach the portal.
+/// Address of the portal for robots.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Portal {
-    /// Such as `wss://server:9090`.
+    /// URL, such as `wss://server:9090`.
     pub address: String,
-    /// The fingerprint of its certificate, where no authority has signed it.
+    /// Fingerprint of the certificate, if it is not issued by a CA.
     pub fingerprint: Option<String>,
 }
 
-/// What a stub stands for.
+/// Properties of the service that a stub is built for.
 #[derive(Debug, Clone)]
-pub struct About<'a> {
-    /// The service's ROS, which the robot's has to be.
+pub struct StubInfo<'a> {
+    /// ROS version of the service, which the robot must have as well.
     pub ros: RosVersion,
-    /// The service.
+    /// Name of the service.
     pub service: &'a str,
-    /// The ROS package.
+    /// ROS package.
     pub package: &'a str,
-    /// The service's revision.
+    /// Revision of the service.
     pub revision: u64,
-    /// Digest of its image.
+    /// Digest of the image.
     pub image: &'a str,
-    /// Where robots reach the portal.
+    /// Address of the portal.
     pub portal: &'a Portal,
-    /// Architecture of the robot's program, as `uname -m` says it.
+    /// Architecture of the robot's program, in the terms of `uname -m`.
     pub architecture: &'a str,
     /// Executables that run in the cloud.
     pub outsourced: &'a BTreeSet<String>,
-    /// Names that programs give their nodes where nobody else does, by executable, as far as they are known.
+    /// Names that programs give their own nodes, by executable, as far as known.
     pub names: &'a BTreeMap<String, String>,
-    /// What the package shows.
+    /// Interface of the service.
     pub interface: &'a Interface,
-    /// Answers depend on earlier requests, as the deployer says.
+    /// True if answers depend on earlier requests, as declared by the deployer.
     pub stateful: bool,
-    /// Which inputs of nodes are answered by which outputs.
-    pub requests: &'a [Answered],
-    /// T_desire and T_max in seconds, as the deployer says, where a robot says nothing of its own.
+    /// Request pairs of the nodes.
+    pub requests: &'a [ProgramRequest],
+    /// Default T_desire and T_max in seconds, as set by the deployer.
     pub times: Option<(f64, f64)>,
 }
 
-/// An input of a node and the outputs that answer it, as the node's program calls them.
+/// Request pair of a node, with topics as its program names them.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Answered {
-    /// Absolute name of the node at the push: what is below it or beside it is so on a robot, too.
+pub struct ProgramRequest {
+    /// Absolute name of the node at the push; topics below or beside it are so on a robot as well.
     pub node: String,
-    /// Its executable, where it is known.
+    /// Executable of the node, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub program: Option<String>,
-    /// Absolute names of the topics, as they were without remaps.
-    pub request: qos::Pair,
+    /// Absolute names of the topics before remapping.
+    pub request: qos::TopicPair,
 }
 
-/// What the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a robot's
-/// token would get its rights, and its content would be taken for a setting.
+/// Files that the stub and its installer keep in `share/PACKAGE`. A file of the package with such a name is left out: a
+/// robot's token would get its permissions, and its content would be read as a setting.
 const OURS: [&str; 6] = [
     "token",
     "ca.pem",
@@ -97,11 +97,11 @@ const OURS: [&str; 6] = [
     "revision.toml",
 ];
 
-/// The files of a stub, by path in the install space.
+/// Files of a stub, by path in the install space.
 pub type Files = BTreeMap<String, Content>;
 
-/// Puts a stub together.
-pub fn compose(about: &About<'_>, mut contents: Contents) -> Result<Files, Error> {
+/// Composes the files of a stub.
+pub fn compose(about: &StubInfo<'_>, mut contents: Contents) -> Result<Files, Error> {
     let package = about.package;
     if !contents.share.contains_key("package.xml") {
         return Err(Error::NoManifest {
@@ -110,46 +110,49 @@ pub fn compose(about: &About<'_>, mut contents: Contents) -> Result<Files, Error
     }
     let mut files = match about.ros {
         RosVersion::One => {
-            catkin::replaced(about, &mut contents);
-            catkin::files()
+            catkin::replace_plugin_lists(about, &mut contents);
+            catkin::setup_files()
         }
-        RosVersion::Two => ament::files(about, &contents),
+        RosVersion::Two => ament::index_files(about, &contents),
     };
-    let names = executables(about, &contents);
-    files.insert("install.sh".to_owned(), plain(&filled(INSTALL, about)));
-    files.insert("README.md".to_owned(), plain(&manual(about, &names)));
+    let names = launcher_names(about, &contents);
+    files.insert(
+        "install.sh".to_owned(),
+        text_file(&fill_template(INSTALL, about)),
+    );
+    files.insert("README.md".to_owned(), text_file(&readme(about, &names)));
     for name in &names {
         let launcher = launcher(about, name, "/../..");
         files.insert(format!("lib/{package}/{name}"), launcher);
     }
     for (path, content) in contents.share {
-        // Below such a name, too: then it is a directory.
+        // Also below such a name, which is then a directory.
         if OURS.contains(&path.split('/').next().unwrap_or_default())
-            || !goes_along(about, &path, &content)
+            || !is_shipped(about, &path, &content)
         {
             continue;
         }
-        let content = shared(about, &path, content);
+        let content = to_stub_content(about, &path, content);
         files.insert(format!("share/{package}/{path}"), content);
     }
     for (key, text) in &about.interface.definitions {
-        // Where an image has definitions without their files.
+        // For images that contain definitions without their files.
         if let Some(path) = definition_path(package, key) {
-            files.entry(path).or_insert_with(|| plain(text));
+            files.entry(path).or_insert_with(|| text_file(text));
         }
     }
     for (name, text) in [
         ("interface.toml", about.interface.to_toml()),
-        ("stub.toml", settings::stub(about)),
-        ("revision.toml", settings::revision(about, &names)),
+        ("stub.toml", settings::stub_toml(about)),
+        ("revision.toml", settings::revision_toml(about, &names)),
     ] {
-        files.insert(format!("share/{package}/{name}"), plain(&text));
+        files.insert(format!("share/{package}/{name}"), text_file(&text));
     }
     Ok(files)
 }
 
-fn goes_along(about: &About<'_>, path: &str, content: &Content) -> bool {
-    if about.ros == RosVersion::Two && ament::is_of_the_install_space(path, content) {
+fn is_shipped(about: &StubInfo<'_>, path: &str, content: &Content) -> bool {
+    if about.ros == RosVersion::Two && ament::belongs_to_install_space(path, content) {
         return false;
     }
     match content {
@@ -160,30 +163,30 @@ fn goes_along(about: &About<'_>, path: &str, content: &Content) -> bool {
     }
 }
 
-/// Every name that has a launcher in `lib/PACKAGE`.
-fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
+/// Returns the names of all launchers in `lib/PACKAGE`.
+fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String> {
     let mut names = match about.ros {
-        RosVersion::One => catkin::executables(about, contents),
-        RosVersion::Two => ament::executables(about, contents),
+        RosVersion::One => catkin::launcher_names(about, contents),
+        RosVersion::Two => ament::launcher_names(about, contents),
     };
     names.retain(|name| name != PROGRAM && !name.chars().any(char::is_control));
     names
 }
 
-/// What texts call things that have other names in the other ROS.
-struct Words {
-    /// The command that starts a node.
+/// Terms in the generated texts that differ between the ROS versions.
+struct RosTerms {
+    /// Command that starts a node.
     run: &'static str,
-    /// Why the overlay's set-up file is sourced last.
+    /// Reason why the overlay's setup file is sourced last.
     order: &'static str,
-    /// What cannot be loaded on the robot.
+    /// Description of what cannot be loaded on the robot.
     plugins: &'static str,
-    /// Where a robot may give a setting beside `stub.toml`.
+    /// Where a robot may give a setting besides `stub.toml`.
     settings: &'static str,
 }
 
-impl Words {
-    fn of(ros: RosVersion) -> &'static Words {
+impl RosTerms {
+    fn for_ros(ros: RosVersion) -> &'static RosTerms {
         match ros {
             RosVersion::One => &catkin::WORDS,
             RosVersion::Two => &ament::WORDS,
@@ -191,8 +194,8 @@ impl Words {
     }
 }
 
-/// A shared file as the stub has it: programs give way to launchers.
-fn shared(about: &About<'_>, path: &str, content: Content) -> Content {
+/// Converts a shared file for the stub: executables are replaced by launchers.
+fn to_stub_content(about: &StubInfo<'_>, path: &str, content: Content) -> Content {
     let Content::File {
         bytes,
         executable: true,
@@ -205,12 +208,12 @@ fn shared(about: &About<'_>, path: &str, content: Content) -> Content {
     if !about.outsourced.contains(name) && !machine_code {
         return content;
     }
-    // From the file's directory up to the install space: below share/PACKAGE, so two more than in the path.
+    // From the directory of the file up to the install space: it is below share/PACKAGE, so two more than in the path.
     let up = "/..".repeat(2 + path.matches('/').count());
     launcher(about, name, &up)
 }
 
-fn launcher(about: &About<'_>, node: &str, up: &str) -> Content {
+fn launcher(about: &StubInfo<'_>, node: &str, up: &str) -> Content {
     let template = if about.outsourced.contains(node) {
         RUN
     } else {
@@ -219,28 +222,28 @@ fn launcher(about: &About<'_>, node: &str, up: &str) -> Content {
     let text = template
         .replace("@PACKAGE@", about.package)
         .replace("@UP@", up)
-        // The last, since anything may stand in it.
-        .replace("@NODE@", &quoted(node));
+        // Last, since the name may contain anything.
+        .replace("@NODE@", &shell_quote(node));
     Content::File {
         bytes: text.into_bytes(),
         executable: true,
     }
 }
 
-/// One word of a shell's command, whatever is in it.
-fn quoted(word: &str) -> String {
+/// Quotes a word for a shell.
+fn shell_quote(word: &str) -> String {
     format!("'{}'", word.replace('\'', "'\\''"))
 }
 
-fn plain(text: &str) -> Content {
+fn text_file(text: &str) -> Content {
     Content::File {
         bytes: text.as_bytes().to_vec(),
         executable: false,
     }
 }
 
-fn filled(template: &str, about: &About<'_>) -> String {
-    let words = Words::of(about.ros);
+fn fill_template(template: &str, about: &StubInfo<'_>) -> String {
+    let words = RosTerms::for_ros(about.ros);
     template
         .replace("@ROS@", &about.ros.number().to_string())
         .replace("@RUN@", words.run)
@@ -251,14 +254,14 @@ fn filled(template: &str, about: &About<'_>) -> String {
         .replace("@REVISION@", &about.revision.to_string())
 }
 
-fn manual(about: &About<'_>, names: &BTreeSet<String>) -> String {
+fn readme(about: &StubInfo<'_>, names: &BTreeSet<String>) -> String {
     let list = |names: Vec<&str>| match names.len() {
         0 => "none".to_owned(),
         _ => names.join(", "),
     };
     let original = names.difference(about.outsourced).map(String::as_str);
     let example = about.outsourced.first().or(names.first());
-    filled(README, about)
+    fill_template(README, about)
         .replace(
             "@OUTSOURCED@",
             &list(about.outsourced.iter().map(String::as_str).collect()),
@@ -267,7 +270,7 @@ fn manual(about: &About<'_>, names: &BTreeSet<String>) -> String {
         .replace("@EXAMPLE@", example.map_or("NODE", String::as_str))
 }
 
-/// `pkg/msg/Type` of this package as a path in the install space.
+/// Returns the path of `pkg/msg/Type` in the install space, if it is of this package.
 fn definition_path(package: &str, key: &str) -> Option<String> {
     let (kind, name) = key
         .strip_prefix(package)?

@@ -1,4 +1,4 @@
-//! Adding what a deployer knows of an interface to what was found in the running package.
+//! Supplements: additions by the deployer to the interface found in the running package.
 
 use std::fmt::Display;
 
@@ -6,8 +6,8 @@ use crate::Error;
 use crate::interface::{Action, Direction, Interface, Parameter, Service, Topic};
 
 impl Interface {
-    /// Adds what a deployer knows to what was found in the running package. What was found stands; a type or
-    /// definition that contradicts it is an error, and then nothing is changed.
+    /// Adds the deployer's entries to what was found in the running package. What was found takes precedence; a
+    /// contradicting type or definition is an error, and then nothing is changed.
     pub fn supplement(&mut self, stated: &Self) -> Result<(), Error> {
         let mut merged = self.clone();
         for topic in &stated.topics {
@@ -22,14 +22,14 @@ impl Interface {
         for parameter in &stated.parameters {
             merged.add_parameter(parameter);
         }
-        join(&mut merged.lifecycle, &stated.lifecycle);
+        merge_names(&mut merged.lifecycle, &stated.lifecycle);
         for (key, text) in &stated.definitions {
             match merged.definitions.get(key) {
                 Some(found) if found.trim() != text.trim() => {
-                    return Err(contradiction(
+                    return Err(contradiction_error(
                         format!("the definition of {key}"),
-                        "another",
-                        "what the image holds",
+                        "a different one",
+                        "that of the image",
                     ));
                 }
                 Some(_) => {}
@@ -43,7 +43,7 @@ impl Interface {
         Ok(())
     }
 
-    /// By name, so that equal interfaces are equal texts.
+    /// Sorts by name, so that equal interfaces have equal texts.
     pub fn sort(&mut self) {
         let direction = |topic: &Topic| matches!(topic.direction, Direction::Output);
         self.topics
@@ -61,8 +61,8 @@ impl Interface {
             return Ok(());
         };
         let what = || format!("topic {}", stated.name);
-        agree(what, &stated.type_name, &mut found.type_name)?;
-        agree(
+        fill_in(what, &stated.type_name, &mut found.type_name)?;
+        fill_in(
             || format!("the md5 of topic {}", stated.name),
             &stated.md5,
             &mut found.md5,
@@ -70,7 +70,7 @@ impl Interface {
         found.latched |= stated.latched;
         found.lazy |= stated.lazy;
         found.qos = found.qos.or(stated.qos);
-        join(&mut found.nodes, &stated.nodes);
+        merge_names(&mut found.nodes, &stated.nodes);
         Ok(())
     }
 
@@ -83,12 +83,12 @@ impl Interface {
             self.services.push(stated.clone());
             return Ok(());
         };
-        agree(
+        fill_in(
             || format!("service {}", stated.name),
             &stated.type_name,
             &mut found.type_name,
         )?;
-        agree(
+        fill_in(
             || format!("the md5 of service {}", stated.name),
             &stated.md5,
             &mut found.md5,
@@ -104,7 +104,7 @@ impl Interface {
             self.actions.push(stated.clone());
             return Ok(());
         };
-        agree(
+        fill_in(
             || format!("action {}", stated.name),
             &stated.type_name,
             &mut found.type_name,
@@ -119,8 +119,8 @@ impl Interface {
         {
             Some(found) => {
                 found.value = found.value.take().or_else(|| stated.value.clone());
-                join(&mut found.read_by, &stated.read_by);
-                join(&mut found.written_by, &stated.written_by);
+                merge_names(&mut found.read_by, &stated.read_by);
+                merge_names(&mut found.written_by, &stated.written_by);
                 let said = found.descriptor.take();
                 found.descriptor = said.or_else(|| stated.descriptor.clone());
             }
@@ -129,20 +129,20 @@ impl Interface {
     }
 }
 
-/// Fills in what is not known; what is known must be the same.
-fn agree(what: impl Fn() -> String, stated: &str, found: &mut String) -> Result<(), Error> {
-    // A node that takes any type shows `*`; the deployer knows what it is used with.
+/// Fills in an unknown value; a known one must be equal.
+fn fill_in(what: impl Fn() -> String, stated: &str, found: &mut String) -> Result<(), Error> {
+    // A node that accepts any type announces `*`; the deployer knows the type that is used.
     if found.is_empty() || (found == "*" && !stated.is_empty()) {
         stated.clone_into(found);
     }
     if stated.is_empty() || stated == found {
         Ok(())
     } else {
-        Err(contradiction(what(), stated, found))
+        Err(contradiction_error(what(), stated, found))
     }
 }
 
-fn contradiction(what: String, stated: impl Display, found: impl Display) -> Error {
+fn contradiction_error(what: String, stated: impl Display, found: impl Display) -> Error {
     Error::Contradiction {
         what,
         stated: stated.to_string(),
@@ -150,7 +150,7 @@ fn contradiction(what: String, stated: impl Display, found: impl Display) -> Err
     }
 }
 
-fn join(found: &mut Vec<String>, stated: &[String]) {
+fn merge_names(found: &mut Vec<String>, stated: &[String]) {
     found.extend(stated.iter().cloned());
     found.sort();
     found.dedup();
@@ -162,7 +162,7 @@ mod tests {
 
     use super::*;
 
-    fn stated() -> Interface {
+    fn stated_interface() -> Interface {
         let text = r#"
             topics = [{ name = "/image", type = "sensor_msgs/Image", direction = "input" }]
             services = [{ name = "/reset", type = "std_srvs/Empty" }]
@@ -176,10 +176,10 @@ mod tests {
     #[test]
     fn a_stated_type_takes_the_place_of_any() {
         let mut found = Interface::default();
-        let mut any = stated().topics.remove(0);
+        let mut any = stated_interface().topics.remove(0);
         (any.type_name, any.md5) = ("*".into(), "*".into());
         found.topics.push(any);
-        found.supplement(&stated()).unwrap();
+        found.supplement(&stated_interface()).unwrap();
         assert_eq!(found.topics[0].type_name, "sensor_msgs/Image");
     }
 
@@ -202,7 +202,7 @@ mod tests {
             read_by: vec!["/n".into()],
             ..Parameter::default()
         });
-        let mut stated = stated();
+        let mut stated = stated_interface();
         stated.topics.push(Topic {
             direction: Direction::Output,
             ..stated.topics[0].clone()
@@ -230,7 +230,7 @@ mod tests {
 
     #[test]
     fn a_contradiction_is_refused_and_changes_nothing() {
-        let found = stated();
+        let found = stated_interface();
         let change = |change: fn(&mut Interface)| {
             let mut stated = found.clone();
             change(&mut stated);
@@ -241,9 +241,7 @@ mod tests {
         };
         let text = change(|stated| stated.topics[0].type_name = "std_msgs/String".into());
         assert!(
-            text.contains(
-                "topic /image is std_msgs/String, but it was found to be sensor_msgs/Image"
-            ),
+            text.contains("topic /image is std_msgs/String, but sensor_msgs/Image was found"),
             "{text}"
         );
         assert!(

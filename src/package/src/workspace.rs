@@ -1,69 +1,69 @@
-//! What a pushed directory is: one package, a workspace of several, or an install space.
+//! Kinds of pushed directories: a single package, a workspace of several, or an install space.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use crate::condition::Variables;
-use crate::locate::{What, locate};
+use crate::locate::{LocatedKind, locate};
 use crate::manifest::{Kind, Manifest};
 use crate::{Error, install_space, order};
 
 pub use crate::install_space::Layout;
 
-/// What was pushed.
+/// Content of a pushed directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Pushed {
-    /// Sources, to be built.
+pub enum PushedDirectory {
+    /// Sources, which are to be built.
     Source(Workspace),
-    /// Built elsewhere, to be put where it was built for.
+    /// An install space that was built elsewhere and is placed at its original prefix.
     Installed(InstallSpace),
 }
 
-/// A package in a directory that was pushed.
+/// A package in a pushed directory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Package {
-    /// Its directory, below what was pushed; empty for the directory itself.
+    /// Directory of the package, relative to what was pushed; empty for the directory itself.
     pub path: PathBuf,
-    /// Its `package.xml`.
+    /// Content of its `package.xml`.
     pub manifest: Manifest,
 }
 
-/// Source packages.
+/// A workspace of source packages.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Workspace {
-    /// What was pushed.
+    /// Directory that was pushed.
     pub root: PathBuf,
-    /// At least one, each after those it needs to be built.
+    /// At least one package; each after its build dependencies.
     pub packages: Vec<Package>,
 }
 
 /// An install space.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct InstallSpace {
-    /// The directory with `setup.sh`.
+    /// Directory with `setup.sh`.
     pub root: PathBuf,
-    /// How packages are laid out in it.
+    /// Layout of the packages.
     pub layout: Layout,
-    /// Where it was installed when it was built, which its scripts and configuration files still name. One of catkin
-    /// works only there; one of ROS 2 where it is told that it is. None when its scripts name no place.
+    /// Prefix for which it was built, which its scripts and configuration files still contain. A catkin space works
+    /// only there; a ROS 2 space works elsewhere if it is told where it is. `None` if its scripts contain no prefix.
     pub prefix: Option<PathBuf>,
-    /// By name.
+    /// Packages, sorted by name.
     pub packages: Vec<Package>,
 }
 
-/// Something that packages need and that was not pushed with them.
+/// A dependency that was not pushed together with the packages.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct External {
-    /// A ROS package or rosdep key.
+pub struct ExternalDependency {
+    /// Name of a ROS package, or a rosdep key.
     pub name: String,
-    /// The kinds of dependency, such as at build or at run time.
+    /// Kinds of the dependency, such as at build time or at run time.
     pub kinds: BTreeSet<Kind>,
-    /// The packages that need it.
+    /// Packages that need it.
     pub needed_by: BTreeSet<String>,
 }
 
-impl Pushed {
-    /// The packages, whichever it is.
+impl PushedDirectory {
+    /// Returns the packages of either kind.
     pub fn packages(&self) -> &[Package] {
         match self {
             Self::Source(workspace) => &workspace.packages,
@@ -71,33 +71,33 @@ impl Pushed {
         }
     }
 
-    /// What its packages need besides each other, by name.
-    pub fn external(&self) -> Vec<External> {
-        external(self.packages())
+    /// Returns the external dependencies of the packages, sorted by name.
+    pub fn external_dependencies(&self) -> Vec<ExternalDependency> {
+        external_dependencies(self.packages())
     }
 }
 
-/// Looks at a directory.
+/// Inspects a directory.
 ///
-/// A `package.xml` in it makes it one package; a `.catkin` file with a `setup.sh` or `_setup_util.py`, or ament's index
-/// of packages, an install space (also one directory down, in `install`); otherwise packages are looked for in `src`,
-/// or if there is none in the whole directory: not in hidden or ignored directories or result spaces, and not within
-/// packages. Links are followed as long as they stay inside.
-pub fn inspect(root: &Path, variables: &Variables) -> Result<Pushed, Error> {
+/// A directory with a `package.xml` is a single package; one with a `.catkin` file and a `setup.sh` or
+/// `_setup_util.py`, or with ament's package index, is an install space (also one level down, in `install`). Otherwise
+/// packages are searched in `src`, or in the whole directory if there is none: not in hidden or ignored directories or
+/// result spaces, and not within packages. Links are followed as long as they stay inside.
+pub fn inspect(root: &Path, variables: &Variables) -> Result<PushedDirectory, Error> {
     let located = locate(root)?;
     let mut packages = BTreeMap::new();
     for path in located.packages() {
-        let found = package(&located.root, located.base(), path, variables)?;
-        insert(&mut packages, found)?;
+        let found = read_package(&located.root, located.base(), path, variables)?;
+        insert_unique(&mut packages, found)?;
     }
     let packages = packages.into_values().collect();
     Ok(match located.what {
-        What::Sources(_) => Pushed::Source(Workspace {
+        LocatedKind::Sources(_) => PushedDirectory::Source(Workspace {
             root: located.root,
             packages: order::build_order(packages)?,
         }),
-        What::Space(space) => Pushed::Installed(InstallSpace {
-            prefix: install_space::prefix(&located.root, &space.root)?,
+        LocatedKind::Space(space) => PushedDirectory::Installed(InstallSpace {
+            prefix: install_space::read_prefix(&located.root, &space.root)?,
             layout: space.layout,
             root: space.root,
             packages,
@@ -105,20 +105,20 @@ pub fn inspect(root: &Path, variables: &Variables) -> Result<Pushed, Error> {
     })
 }
 
-/// What packages need besides each other, by name.
-pub fn external(packages: &[Package]) -> Vec<External> {
+/// Returns the dependencies of packages that are not among them, sorted by name.
+pub fn external_dependencies(packages: &[Package]) -> Vec<ExternalDependency> {
     let own: BTreeSet<&str> = packages
         .iter()
         .map(|package| package.manifest.name.as_str())
         .collect();
-    let mut found: BTreeMap<&str, External> = BTreeMap::new();
+    let mut found: BTreeMap<&str, ExternalDependency> = BTreeMap::new();
     for package in packages {
         for dependency in &package.manifest.dependencies {
             let name = dependency.name.as_str();
             if own.contains(name) {
                 continue;
             }
-            let external = found.entry(name).or_insert_with(|| External {
+            let external = found.entry(name).or_insert_with(|| ExternalDependency {
                 name: name.to_owned(),
                 kinds: BTreeSet::new(),
                 needed_by: BTreeSet::new(),
@@ -130,16 +130,21 @@ pub fn external(packages: &[Package]) -> Vec<External> {
     found.into_values().collect()
 }
 
-/// The package in `base/path`, whose links may lead anywhere in `root`.
-fn package(root: &Path, base: &Path, path: &Path, variables: &Variables) -> Result<Package, Error> {
+/// Reads the package in `base/path`, whose links may point anywhere in `root`.
+fn read_package(
+    root: &Path,
+    base: &Path,
+    path: &Path,
+    variables: &Variables,
+) -> Result<Package, Error> {
     let file = base.join(path).join("package.xml");
     Ok(Package {
-        manifest: Manifest::read_inside(root, &file, variables)?,
+        manifest: Manifest::load(root, &file, variables)?,
         path: path.to_owned(),
     })
 }
 
-fn insert(packages: &mut BTreeMap<String, Package>, package: Package) -> Result<(), Error> {
+fn insert_unique(packages: &mut BTreeMap<String, Package>, package: Package) -> Result<(), Error> {
     match packages.get(&package.manifest.name) {
         Some(first) => Err(Error::SameName {
             name: package.manifest.name,

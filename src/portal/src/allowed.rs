@@ -1,10 +1,10 @@
-//! Whether who asks may: decided for each request by its row of the table of routes, before its handler; and what was done,
-//! recorded before it is answered.
+//! Authorisation: decided for each request by its row of the route table, before the handler runs. What was done is
+//! written to the audit log before the response is sent.
 
 use std::sync::Arc;
 
-use access::decide::may_use_class;
-use access::{Action, Object, Principal, Role, decide};
+use access::decide::can_use_class;
+use access::{AccessAction, AccessObject, Principal, Role, decide};
 use axum::extract::rejection::RawPathParamsRejection;
 use axum::extract::{RawPathParams, Request, State};
 use axum::http::StatusCode;
@@ -13,31 +13,31 @@ use axum::response::{IntoResponse, Response};
 use choreographer::Handle;
 
 use crate::app::App;
-use crate::audit::{About, is_recorded};
+use crate::audit::{AuditObject, is_recorded};
 use crate::errors::Error;
 use crate::guard::Caller;
-use crate::routes::{Access, Of, Route};
+use crate::routes::{Access, AccessTarget, Route};
 use crate::{recordings, stubs};
 
-/// The class of robots that name none.
+/// Class of robots that name none.
 const DEFAULT: &str = "default";
 
-/// Lets a request through that its caller may make.
-pub async fn allowed(
+/// Middleware that passes a request on if its caller may make it.
+pub async fn authorise(
     State((app, route)): State<(Arc<App>, &'static Route)>,
     params: Result<RawPathParams, RawPathParamsRejection>,
     mut request: Request,
     next: Next,
 ) -> Response {
     if let Err(RawPathParamsRejection::InvalidUtf8InPathParam(unreadable)) = &params {
-        let why = format!("the address cannot be read: {}", unreadable.body_text());
+        let why = format!("cannot parse the address: {}", unreadable.body_text());
         return Error::BadRequest(why).into_response();
     }
     let Access::May(action, of) = route.access else {
         return next.run(request).await;
     };
     let Some(caller) = request.extensions().get::<Caller>().cloned() else {
-        return Error::Internal("telling who asks").into_response();
+        return Error::Internal("identifying the caller").into_response();
     };
     let caller = &caller;
     let named = |parameter: &str| {
@@ -46,27 +46,27 @@ pub async fn allowed(
         Some(value)
     };
     let decided = match of {
-        Of::Machine => caller.may(action, &Object::MACHINE),
-        // Who may not even at a service of its own need not be heard further.
-        Of::Handler => {
+        AccessTarget::Machine => caller.check_access(action, &AccessObject::MACHINE),
+        // A caller that may not do this even at a service of its own is refused before the handler runs.
+        AccessTarget::Handler => {
             let name = &caller.who.principal.name;
-            caller.may(action, &Object::service("", Some(name)))
+            caller.check_access(action, &AccessObject::service("", Some(name)))
         }
-        Of::Service(parameter) => {
-            at_service(&app, caller, action, named(parameter).unwrap_or_default())
+        AccessTarget::Service(parameter) => {
+            check_service(&app, caller, action, named(parameter).unwrap_or_default())
         }
-        Of::Stub(parameter) => {
+        AccessTarget::Stub(parameter) => {
             let file = named(parameter).unwrap_or_default();
-            let service = stubs::service(file).map_or(file, |(service, _)| service);
-            at_service(&app, caller, action, service)
+            let service = stubs::parse_file_name(file).map_or(file, |(service, _)| service);
+            check_service(&app, caller, action, service)
         }
-        Of::Servant(parameter) => {
-            at_servant(&app, caller, action, named(parameter).unwrap_or_default())
+        AccessTarget::Servant(parameter) => {
+            check_servant(&app, caller, action, named(parameter).unwrap_or_default())
         }
-        Of::Recording(parameter) => {
-            at_recording(&app, caller, action, named(parameter).unwrap_or_default())
+        AccessTarget::Recording(parameter) => {
+            check_recording(&app, caller, action, named(parameter).unwrap_or_default())
         }
-        Of::Robot(parameter) => at_robot(
+        AccessTarget::Robot(parameter) => check_robot(
             &caller.who.principal,
             action,
             named(parameter).unwrap_or_default(),
@@ -75,136 +75,179 @@ pub async fn allowed(
     let method = request.method().clone();
     let did = format!("{method} {}", request.uri().path());
     let object = match of {
-        Of::Machine | Of::Handler => "the server".to_owned(),
-        Of::Service(parameter) => format!("service {}", named(parameter).unwrap_or_default()),
-        Of::Stub(parameter) => format!("stub {}", named(parameter).unwrap_or_default()),
-        Of::Servant(parameter) => format!("servant {}", named(parameter).unwrap_or_default()),
-        Of::Robot(parameter) => format!("robot {}", named(parameter).unwrap_or_default()),
-        Of::Recording(parameter) => {
+        AccessTarget::Machine | AccessTarget::Handler => "the server".to_owned(),
+        AccessTarget::Service(parameter) => {
+            format!("service {}", named(parameter).unwrap_or_default())
+        }
+        AccessTarget::Stub(parameter) => format!("stub {}", named(parameter).unwrap_or_default()),
+        AccessTarget::Servant(parameter) => {
+            format!("servant {}", named(parameter).unwrap_or_default())
+        }
+        AccessTarget::Robot(parameter) => format!("robot {}", named(parameter).unwrap_or_default()),
+        AccessTarget::Recording(parameter) => {
             format!("recording {}", named(parameter).unwrap_or_default())
         }
     };
-    let about = About::default();
+    let about = AuditObject::default();
     request.extensions_mut().insert(about.clone());
     let response = match decided {
         Ok(()) => next.run(request).await,
         Err(error) => error.into_response(),
     };
     let status = response.status();
-    // What fails can be tried without end: it does not push what was done out of the log.
+    // Failures can be repeated without end; they must not push what was done out of the log.
     let failed = status.is_client_error() && is_recorded(action, &method);
     if status == StatusCode::FORBIDDEN || failed {
-        app.audit
-            .record_sparingly(caller, action, &did, &about.or(&object), status.as_u16());
+        app.audit.record_throttled(
+            caller,
+            action,
+            &did,
+            &about.get_or(&object),
+            status.as_u16(),
+        );
     } else if is_recorded(action, &method) {
-        app.audit
-            .record(caller, action, &did, &about.or(&object), status.as_u16());
+        app.audit.record(
+            caller,
+            action,
+            &did,
+            &about.get_or(&object),
+            status.as_u16(),
+        );
     }
     response
 }
 
 impl Caller {
-    /// Whether it may; else why not.
-    pub fn may(&self, action: Action, object: &Object<'_>) -> Result<(), Error> {
+    /// Checks whether the caller may perform the action on the object.
+    pub fn check_access(
+        &self,
+        action: AccessAction,
+        object: &AccessObject<'_>,
+    ) -> Result<(), Error> {
         Ok(decide(&self.who.principal, action, object)?)
     }
 
-    /// Whether it may be told of a service.
-    pub fn sees(&self, app: &App, service: &str) -> bool {
-        self.who.principal.sees_all() || self.may_at(app, Action::See, service, None).is_ok()
+    /// Returns true if the caller may see the service.
+    pub fn can_see(&self, app: &App, service: &str) -> bool {
+        self.who.principal.sees_all()
+            || self
+                .check_service_access(app, AccessAction::See, service, None)
+                .is_ok()
     }
 
-    /// Comes back when what it is answered about a service is to end: the daemon does, or whoever asked has shown a token that is not
-    /// good any more.
-    pub fn over(&self, app: &Arc<App>, service: &str) -> impl Future<Output = ()> + Send + use<> {
+    /// Waits until responses about a service must end: the daemon stops, or the caller's credential has become
+    /// invalid.
+    pub fn wait_for_end(
+        &self,
+        app: &Arc<App>,
+        service: &str,
+    ) -> impl Future<Output = ()> + Send + use<> {
         let (app, who, service) = (Arc::clone(app), self.who.clone(), service.to_owned());
         async move {
             tokio::select! {
                 () = app.ending.cancelled() => {}
-                _ = app.principals.ended(&who, &service, false) => {}
+                _ = app.principals.wait_for_end(&who, &service, false) => {}
             }
         }
     }
 
-    /// Whether it may be told of a servant: a robot sees its own alone.
-    pub fn sees_servant(&self, app: &App, handle: &Handle) -> bool {
-        self.is_robot_of(&handle.robot) && self.sees(app, handle.service())
+    /// Returns true if the caller may see the servant: a robot sees only its own.
+    pub fn can_see_servant(&self, app: &App, handle: &Handle) -> bool {
+        self.can_act_for_robot(&handle.robot) && self.can_see(app, handle.service())
     }
 
-    /// The one robot that it is, where it is a robot that has a name.
+    /// Returns the robot that the caller is, if it is a named robot.
     pub fn own_robot(&self) -> Option<&str> {
         let principal = &self.who.principal;
         let own = principal.scope.robot.as_deref();
-        own.filter(|_| principal.is(Role::Robot))
+        own.filter(|_| principal.has_role(Role::Robot))
     }
 
-    /// Whether it is no robot, or this one.
-    pub fn is_robot_of(&self, robot: &str) -> bool {
+    /// Returns true unless the caller is another robot.
+    pub fn can_act_for_robot(&self, robot: &str) -> bool {
         self.own_robot().is_none_or(|own| own == robot)
     }
 
-    /// Whether it may do something to what is of a robot at a service: robots may to their own alone.
-    pub fn may_of(&self, app: &App, action: Action, service: &str, robot: &str) -> bool {
-        self.is_robot_of(robot) && self.may_at(app, action, service, None).is_ok()
-    }
-
-    /// Whether it may do something at a service, as a robot where one is named.
-    pub fn may_at(
+    /// Returns true if the caller may perform the action on what belongs to a robot at a service; robots are limited
+    /// to their own.
+    pub fn is_allowed_for_robot(
         &self,
         app: &App,
-        action: Action,
+        action: AccessAction,
+        service: &str,
+        robot: &str,
+    ) -> bool {
+        self.can_act_for_robot(robot)
+            && self
+                .check_service_access(app, action, service, None)
+                .is_ok()
+    }
+
+    /// Checks whether the caller may perform the action on a service, as a robot if one is named.
+    pub fn check_service_access(
+        &self,
+        app: &App,
+        action: AccessAction,
         service: &str,
         robot: Option<&str>,
     ) -> Result<(), Error> {
-        // What a deployer may depends on whose the service is; the others need not be looked up.
-        let (exists, owner) = match self.who.principal.is(Role::Deployer) {
-            true => match app.state.service_owner(service)? {
+        // Only a deployer's permissions depend on the owner of the service.
+        let (exists, owner) = if self.who.principal.has_role(Role::Deployer) {
+            match app.state.service_owner(service)? {
                 Some(owner) => (true, owner),
                 None => (false, None),
-            },
-            false => (true, None),
+            }
+        } else {
+            (true, None)
         };
-        let object = Object {
+        let object = AccessObject {
             service: Some(service),
             exists,
             owner: owner.as_deref(),
             robot,
         };
-        self.may(action, &object)
+        self.check_access(action, &object)
     }
 
-    /// Whether it may name a class of the configuration.
-    pub fn may_use_class(&self, class: &str) -> Result<(), Error> {
-        match class == DEFAULT || may_use_class(&self.who.principal, class) {
-            true => Ok(()),
-            false => Err(Error::Forbidden {
-                what: format!("{} may not be of class {class}", self.who.principal.name),
-            }),
+    /// Checks whether the caller may use a class of the configuration.
+    pub fn check_class(&self, class: &str) -> Result<(), Error> {
+        if class == DEFAULT || can_use_class(&self.who.principal, class) {
+            Ok(())
+        } else {
+            Err(Error::Forbidden {
+                what: format!("{} may not use class {class}", self.who.principal.name),
+            })
         }
     }
 }
 
-fn at_service(app: &App, caller: &Caller, action: Action, service: &str) -> Result<(), Error> {
-    caller.may_at(app, action, service, None)?;
-    known_to(app, caller, service)
+fn check_service(
+    app: &App,
+    caller: &Caller,
+    action: AccessAction,
+    service: &str,
+) -> Result<(), Error> {
+    caller.check_service_access(app, action, service, None)?;
+    check_service_known(app, caller, service)
 }
 
-/// Refuses a service that there is not, to those who are not told of all: the refusal names those that they see.
-pub fn known_to(app: &App, caller: &Caller, service: &str) -> Result<(), Error> {
+/// Refuses an unknown service. A caller that may not see all services is shown only those it may see.
+pub fn check_service_known(app: &App, caller: &Caller, service: &str) -> Result<(), Error> {
     if caller.who.principal.sees_all() || app.state.service_package(service)?.is_some() {
         return Ok(());
     }
-    let mut refusal = app.catalogue.unknown(service)?;
+    let mut refusal = app.catalogue.unknown_service(service)?;
     if let catalogue::Error::UnknownService { exists, .. } = &mut refusal {
-        exists.retain(|name| caller.sees(app, name));
+        exists.retain(|name| caller.can_see(app, name));
     }
     Err(refusal.into())
 }
 
-fn at_servant(app: &App, caller: &Caller, action: Action, id: &str) -> Result<(), Error> {
+fn check_servant(app: &App, caller: &Caller, action: AccessAction, id: &str) -> Result<(), Error> {
     let handle = app.choreographer.servant(id);
-    let may = handle.map(|handle| caller.may_of(app, action, handle.service(), &handle.robot));
-    hidden(
+    let may = handle
+        .map(|handle| caller.is_allowed_for_robot(app, action, handle.service(), &handle.robot));
+    conceal_missing(
         caller,
         action,
         may.map_err(Error::from),
@@ -212,16 +255,22 @@ fn at_servant(app: &App, caller: &Caller, action: Action, id: &str) -> Result<()
     )
 }
 
-fn at_recording(app: &App, caller: &Caller, action: Action, number: &str) -> Result<(), Error> {
-    let known = recordings::known(app, number);
-    let may = known.map(|known| caller.may_of(app, action, &known.service, &known.robot));
-    hidden(caller, action, may, format_args!("recording {number}"))
+fn check_recording(
+    app: &App,
+    caller: &Caller,
+    action: AccessAction,
+    number: &str,
+) -> Result<(), Error> {
+    let known = recordings::find_recording(app, number);
+    let may =
+        known.map(|known| caller.is_allowed_for_robot(app, action, &known.service, &known.robot));
+    conceal_missing(caller, action, may, format_args!("recording {number}"))
 }
 
-/// Refuses what is not there as what somebody may not see: whether it is there is told to those alone who are told of all.
-fn hidden(
+/// Refuses a missing object like a forbidden one: only callers that see everything learn whether it exists.
+fn conceal_missing(
     caller: &Caller,
-    action: Action,
+    action: AccessAction,
     may: Result<bool, Error>,
     object: std::fmt::Arguments<'_>,
 ) -> Result<(), Error> {
@@ -229,16 +278,17 @@ fn hidden(
     match may {
         Ok(true) => Ok(()),
         Err(error) if principal.is_unscoped() => Err(error),
-        Err(error) if principal.sees_all() && action == Action::See => Err(error),
-        _ => Err(access::Refusal::new(principal, action, object).into()),
+        Err(error) if principal.sees_all() && action == AccessAction::See => Err(error),
+        _ => Err(access::AccessDenied::new(principal, action, object).into()),
     }
 }
 
-/// Whether somebody may be told of a robot.
-pub fn at_robot(principal: &Principal, action: Action, robot: &str) -> Result<(), Error> {
-    let own = principal.is(Role::Robot) && principal.scope.robot.as_deref() == Some(robot);
-    match own || principal.sees_all() {
-        true => Ok(()),
-        false => Err(access::Refusal::new(principal, action, format_args!("robot {robot}")).into()),
+/// Checks whether the principal may see the robot.
+pub fn check_robot(principal: &Principal, action: AccessAction, robot: &str) -> Result<(), Error> {
+    let own = principal.has_role(Role::Robot) && principal.scope.robot.as_deref() == Some(robot);
+    if own || principal.sees_all() {
+        Ok(())
+    } else {
+        Err(access::AccessDenied::new(principal, action, format_args!("robot {robot}")).into())
     }
 }

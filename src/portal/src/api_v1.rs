@@ -1,9 +1,9 @@
-//! `/api/v1`: what cloudroidctl and the page ask.
+//! Handlers of `/api/v1`, used by cloudroidctl and the page.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use access::{Action, Object};
+use access::{AccessAction, AccessObject};
 use api::{NDJSON, Rollback, ServiceDetail, Status, Stopped};
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -17,19 +17,19 @@ use servant::engine::LogStart;
 use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
-use super::audit::About;
-use super::body::{self, Held};
+use super::audit::AuditObject;
+use super::body::{self, BufferedBody};
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
 use crate::query::Query;
 use crate::{recordings, views};
 
-pub(super) type Answer<T> = Result<Json<T>, Error>;
+pub(super) type JsonResult<T> = Result<Json<T>, Error>;
 
-/// Lines of a log when nobody says how many.
+/// Default number of log lines.
 const LOG_LINES: usize = 10_000;
-/// Bytes that a line of a log takes beside its text, about.
+/// Estimated overhead of a log line in bytes, besides its text.
 const LOG_LINE: usize = 150;
 
 /// `/healthz`.
@@ -38,12 +38,12 @@ pub async fn health(State(app): State<Arc<App>>) -> Result<&'static str, Error> 
     Ok("ok\n")
 }
 
-/// The daemon at a glance.
-pub async fn status(State(app): State<Arc<App>>) -> Answer<Status> {
+/// The daemon's status.
+pub async fn status(State(app): State<Arc<App>>) -> JsonResult<Status> {
     Ok(Json(views::status(&app).await?))
 }
 
-/// The time here.
+/// The daemon's clock.
 pub async fn clock() -> Json<api::Clock> {
     let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
     Json(api::Clock {
@@ -51,25 +51,25 @@ pub async fn clock() -> Json<api::Clock> {
     })
 }
 
-/// All checks of the machine, made anew.
-pub async fn doctor(State(app): State<Arc<App>>) -> Answer<api::Doctor> {
-    let doctor = privilege::blocking(move || (app.examine)())
+/// Runs all checks of the machine anew.
+pub async fn doctor(State(app): State<Arc<App>>) -> JsonResult<api::Doctor> {
+    let doctor = privilege::spawn_blocking(move || (app.examine)())
         .await
         .map_err(|_| Error::Internal("examining the machine"))?;
     Ok(Json(doctor))
 }
 
-/// All services.
+/// Lists all services.
 pub async fn services(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
-) -> Answer<Vec<api::ServiceSummary>> {
+) -> JsonResult<Vec<api::ServiceSummary>> {
     let mut services = Vec::new();
     for name in app.state.service_names()? {
-        if !caller.sees(&app, &name) {
+        if !caller.can_see(&app, &name) {
             continue;
         }
-        if let Some(revision) = app.state.current(&name)? {
+        if let Some(revision) = app.state.current_revision(&name)? {
             services.push(views::summary(&app, &revision));
         }
     }
@@ -80,7 +80,7 @@ pub async fn services(
 pub async fn service(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-) -> Answer<ServiceDetail> {
+) -> JsonResult<ServiceDetail> {
     Ok(Json(views::service(&app, &name)?))
 }
 
@@ -88,48 +88,50 @@ pub async fn service(
 pub async fn interface(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-) -> Answer<package::interface::Interface> {
-    Ok(Json(app.catalogue.current(&name)?.interface.clone()))
+) -> JsonResult<package::interface::Interface> {
+    Ok(Json(
+        app.catalogue.current_revision(&name)?.interface.clone(),
+    ))
 }
 
-/// Which revision.
+/// Query: which revision.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct OfRevision {
-    /// Its number; that of the current one by default.
+pub struct RevisionQuery {
+    /// Number of the revision (default: the current one).
     revision: Option<u64>,
 }
 
-/// What of a revision is not in its image.
+/// The part of a revision that is not in its image.
 pub async fn record(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Query(of): Query<OfRevision>,
-) -> Answer<push::ServiceRecord> {
-    let current = app.catalogue.current(&name)?;
+    Query(of): Query<RevisionQuery>,
+) -> JsonResult<push::ServiceRecord> {
+    let current = app.catalogue.current_revision(&name)?;
     let revision = match of.revision {
         Some(number) => app.catalogue.revision(&name, number)?,
         None => current,
     };
     let rows = app.state.dictionary(&name)?;
-    Ok(Json(push::ServiceRecord::of(&revision, rows)))
+    Ok(Json(push::ServiceRecord::from_revision(&revision, rows)))
 }
 
 /// Removes a service, its servants and its images.
 pub async fn remove_service(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-) -> Answer<Stopped> {
-    app.catalogue.current(&name)?;
+) -> JsonResult<Stopped> {
+    app.catalogue.current_revision(&name)?;
     let removed = {
         let app = Arc::clone(&app);
         async move {
             let stopped = app.pusher.remove(&name).await?;
-            // The next of this name may be somebody else's.
+            // The next service of this name may belong to somebody else.
             recordings::forget_service(&app, &name).await?;
             Ok(Json(Stopped { stopped }))
         }
     };
-    let removed = recordings::to_its_end(&app.sessions, removed).await;
+    let removed = recordings::run_to_end(&app.sessions, removed).await;
     removed.unwrap_or(Err(Error::Internal("removing a service")))
 }
 
@@ -138,10 +140,10 @@ pub async fn rollback(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<ServiceDetail> {
-    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+) -> JsonResult<ServiceDetail> {
+    let body = read_body(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let asked: Rollback = if body.is_empty() {
         Rollback::default()
     } else {
@@ -149,31 +151,31 @@ pub async fn rollback(
             .map_err(|error| Error::BadRequest(format!("the rollback cannot be read: {error}")))?
     };
     let current = app.pusher.rollback(&name, asked.revision).await?;
-    about.is(format!("service {name}: to revision {current}"));
+    about.set(format!("service {name}: to revision {current}"));
     Ok(Json(views::service(&app, &name)?))
 }
 
-/// How a service comes to its next revision.
+/// The rollout of a service's next revision.
 pub async fn rollout(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-) -> Answer<api::Rollout> {
+) -> JsonResult<api::Rollout> {
     Ok(Json(app.choreographer.rollout(&name)?))
 }
 
-/// Begins a rollout, promotes its canary, or takes it back.
+/// Starts a rollout, promotes its canary, or aborts it.
 pub async fn order_rollout(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<api::Rollout> {
+) -> JsonResult<api::Rollout> {
     use api::rollout::RolloutOrder;
-    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+    let body = read_body(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let order: RolloutOrder = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the order cannot be read: {error}")))?;
-    about.is_set(&format!("service {name}"), &order);
+    about.set_value(&format!("service {name}"), &order);
     let choreographer = &app.choreographer;
     Ok(Json(match order {
         RolloutOrder::Start { revision, terms } => {
@@ -186,38 +188,42 @@ pub async fn order_rollout(
     }))
 }
 
-/// The largest recording for a trial or a calibration, where its sender may have so much: it is held in memory.
+/// Maximum size of a recording for a trial or a calibration, if its sender's budget allows: it is held in memory.
 const LARGEST_TRIAL: usize = 512 << 20;
-/// The longest of other bodies.
+/// Maximum size of other bodies.
 pub(super) const LARGEST_WORDS: usize = 64 << 10;
 
-/// A body, within what its sender may have held.
-pub(super) async fn held(
+/// Reads a body within its sender's memory budget.
+pub(super) async fn read_body(
     app: &App,
     caller: &Caller,
     body: Body,
     max: usize,
-) -> Result<Held, Error> {
+) -> Result<BufferedBody, Error> {
     let memory = app.choreographer.memory();
-    let budget = memory.client(&caller.peer.client(None));
+    let budget = memory.client(&caller.peer.budget_name(None));
     body::read(body, max, &budget, memory.unfinished).await
 }
 
-/// A recording or pictures.
-pub(super) async fn recording(app: &App, caller: &Caller, body: Body) -> Result<Held, Error> {
+/// Reads a body that is a recording or pictures.
+pub(super) async fn read_recording(
+    app: &App,
+    caller: &Caller,
+    body: Body,
+) -> Result<BufferedBody, Error> {
     let memory = app.choreographer.memory();
-    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.client(None)).most());
-    let read = held(app, caller, body, max).await;
+    let max = LARGEST_TRIAL.min(memory.client(&caller.peer.budget_name(None)).max_permit());
+    let read = read_body(app, caller, body, max).await;
     read.map_err(|error| match error {
         Error::BodyTooLarge { limit } => Error::TrialTooLarge { limit },
         error => error,
     })
 }
 
-/// With what a service is tried.
+/// Query of a trial.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct With {
-    /// What the body is.
+pub struct TrialQuery {
+    /// Content of the body.
     #[param(inline)]
     kind: Kind,
 }
@@ -231,30 +237,30 @@ enum Kind {
     Image,
 }
 
-/// What a robot would state; auxiliary parameters are `aux.KEY`.
+/// Query: requirements as a robot would state them; auxiliary parameters are `aux.KEY`.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Statement {
-    /// T_desire, such as `100ms`.
+pub struct StatementQuery {
+    /// Desired response time (T_desire), such as `100ms`.
     rrt: Option<String>,
-    /// T_max.
+    /// Maximum acceptable response time (T_max), such as `300ms`.
     max_rrt: Option<String>,
-    /// Frames per second.
+    /// Desired frames per second.
     fps: Option<String>,
-    /// Age of an output.
+    /// Desired maximum age of an output, such as `100ms`.
     age: Option<String>,
-    /// A class of the configuration.
+    /// Class of the configuration.
     class: Option<String>,
-    /// Cores outright.
+    /// CPU limit in cores, stated directly.
     cpus: Option<String>,
-    /// Memory outright.
+    /// Memory limit, such as `512M`, stated directly.
     memory: Option<String>,
     #[serde(flatten)]
     #[param(ignore)]
     others: BTreeMap<String, String>,
 }
 
-impl Statement {
-    fn read(self) -> Result<api::Stated, Error> {
+impl StatementQuery {
+    fn parse(self) -> Result<api::Stated, Error> {
         let known = [
             ("rrt", self.rrt),
             ("max_rrt", self.max_rrt),
@@ -271,32 +277,32 @@ impl Statement {
     }
 }
 
-/// Whether one more servant of a service would fit.
+/// Tells whether another servant of a service would fit.
 pub async fn fit(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Query(statement): Query<Statement>,
+    Query(statement): Query<StatementQuery>,
     Extension(caller): Extension<Caller>,
-) -> Answer<api::Fit> {
-    let mut fit = app.choreographer.fit(&name, statement.read()?).await?;
+) -> JsonResult<api::Fit> {
+    let mut fit = app.choreographer.fit(&name, statement.parse()?).await?;
     let sees = |id: &str| {
         let servant = app.choreographer.servant(id);
-        servant.is_ok_and(|servant| caller.sees_servant(&app, &servant))
+        servant.is_ok_and(|servant| caller.can_see_servant(&app, &servant))
     };
     fit.costs.retain(|cost| sees(&cost.servant));
     fit.ends.retain(|id| sees(id));
     Ok(Json(fit))
 }
 
-/// What a service makes of a recording or a picture, and how fast.
+/// Runs a service on a recording or a picture and reports the output and its timing.
 pub async fn trial(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Query(with): Query<With>,
+    Query(with): Query<TrialQuery>,
     Extension(caller): Extension<Caller>,
     body: Body,
-) -> Answer<api::trial::Trial> {
-    let Held { bytes, permit } = recording(&app, &caller, body).await?;
+) -> JsonResult<api::trial::Trial> {
+    let BufferedBody { bytes, permit } = read_recording(&app, &caller, body).await?;
     let material = tokio::task::spawn_blocking(move || match with.kind {
         Kind::Image => Picture::read(&bytes)
             .map(|picture| Material::Pictures(vec![picture]))
@@ -307,58 +313,64 @@ pub async fn trial(
     });
     let material = material
         .await
-        .map_err(|_| Error::Internal("reading what a service is tried with"))??;
+        .map_err(|_| Error::Internal("reading the input of a trial"))??;
     let trial = app.choreographer.trial(&name, material).await;
-    // Messages of a recording were cut from the body.
+    // The messages of a recording share the body's memory.
     drop(permit);
     Ok(Json(trial?))
 }
 
-/// All servants.
+/// Lists all servants.
 pub async fn servants(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
 ) -> Json<Vec<api::Servant>> {
     let mut handles = app.choreographer.servants();
-    handles.retain(|handle| caller.sees_servant(&app, handle));
+    handles.retain(|handle| caller.can_see_servant(&app, handle));
     let described = handles
         .iter()
         .map(|handle| app.choreographer.describe(handle));
     Json(futures_util::future::join_all(described).await)
 }
 
-/// Whose servants have failed again and again, and are not started again yet.
+/// Lists services and robots whose servants failed repeatedly and are not restarted yet.
 pub async fn back_offs(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
 ) -> Json<Vec<api::BackOff>> {
     let mut back_offs = app.choreographer.back_offs();
-    back_offs.retain(|of| caller.is_robot_of(&of.robot) && caller.sees(&app, &of.service));
+    back_offs.retain(|of| caller.can_act_for_robot(&of.robot) && caller.can_see(&app, &of.service));
     Json(back_offs)
 }
 
 /// One servant.
-pub async fn servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<api::Servant> {
+pub async fn servant(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+) -> JsonResult<api::Servant> {
     let handle = app.choreographer.servant(&id)?;
     Ok(Json(app.choreographer.describe(&handle).await))
 }
 
-/// Changes limits of one servant while it runs.
+/// Changes limits of a running servant.
 pub async fn set_limits(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<api::Servant> {
-    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+) -> JsonResult<api::Servant> {
+    let body = read_body(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let change: api::Limits = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the limits cannot be read: {error}")))?;
-    about.is_set(&format!("servant {id}"), &change);
+    about.set_value(&format!("servant {id}"), &change);
     choreographer::limits::check(&change).map_err(|error| Error::BadRequest(error.to_string()))?;
     let moves_cores = change.cpu_weight.is_some() || change.cpus.is_some();
     if moves_cores && !caller.who.principal.is_unscoped() {
-        let asked = app.choreographer.servant(&id)?.asked_after(change);
+        let asked = app
+            .choreographer
+            .servant(&id)?
+            .requested_limits_after(change);
         choreographer::limits::check_weight(&asked)
             .map_err(|error| Error::BadRequest(error.to_string()))?;
     }
@@ -367,17 +379,22 @@ pub async fn set_limits(
     Ok(Json(app.choreographer.describe(&handle).await))
 }
 
-/// Why a robot is slow, or on its local original.
+/// Explains why a robot is slow, or on its local original.
 pub async fn explain(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
-) -> Answer<api::explain::Explanation> {
-    Ok(Json(crate::explain::robot(&app, &caller, &name).await?))
+) -> JsonResult<api::explain::Explanation> {
+    Ok(Json(
+        crate::explain::explain_robot(&app, &caller, &name).await?,
+    ))
 }
 
-/// Ends one servant.
-pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -> Answer<Stopped> {
+/// Stops one servant.
+pub async fn stop_servant(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+) -> JsonResult<Stopped> {
     app.choreographer.servant(&id)?;
     Ok(Json(Stopped {
         stopped: app
@@ -387,30 +404,30 @@ pub async fn stop_servant(State(app): State<Arc<App>>, Path(id): Path<String>) -
     }))
 }
 
-/// Whose servants.
+/// Query: whose servants.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct OfService {
-    /// Only those of this service.
+pub struct ServiceQuery {
+    /// Only servants of this service.
     service: Option<String>,
 }
 
-/// Ends all servants, or all of one service.
+/// Stops all servants, or all of one service.
 pub async fn stop_servants(
     State(app): State<Arc<App>>,
-    Query(of): Query<OfService>,
+    Query(of): Query<ServiceQuery>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
-) -> Answer<Stopped> {
-    about.is(match &of.service {
+    Extension(about): Extension<AuditObject>,
+) -> JsonResult<Stopped> {
+    about.set(match &of.service {
         Some(service) => format!("servants of service {service}"),
         None => "all servants".to_owned(),
     });
     match &of.service {
-        Some(service) => caller.may_at(&app, Action::Operate, service, None)?,
-        None => caller.may(Action::Operate, &Object::MACHINE)?,
+        Some(service) => caller.check_service_access(&app, AccessAction::Operate, service, None)?,
+        None => caller.check_access(AccessAction::Operate, &AccessObject::MACHINE)?,
     }
     if let Some(service) = &of.service {
-        app.catalogue.current(service)?;
+        app.catalogue.current_revision(service)?;
     }
     let chosen = |handle: &choreographer::Handle| {
         of.service
@@ -422,53 +439,56 @@ pub async fn stop_servants(
     }))
 }
 
-/// Which part of a log.
+/// Query of a log.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Part {
-    /// Go on as lines come.
+pub struct LogQuery {
+    /// Keep the response open and send new lines as they come.
     #[serde(default)]
     follow: bool,
-    /// So many of the last lines; 10000 by default.
+    /// Number of lines from the end of the log (default: 10000).
     tail: Option<usize>,
 }
 
-/// What a servant's nodes print, as JSON lines.
+/// Output of a servant's nodes, as JSON lines.
 pub async fn logs(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
-    Query(part): Query<Part>,
+    Query(part): Query<LogQuery>,
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let handle = app.choreographer.servant(&id)?;
     handle.check_container()?;
     let Some(container) = handle.container() else {
-        return Ok(lines(futures_util::stream::empty::<api::LogLine>()));
+        return Ok(json_lines(futures_util::stream::empty::<api::LogLine>()));
     };
     let count = part.tail.unwrap_or(LOG_LINES);
-    // Whoever reads slowly keeps files open and lines in memory for as long.
-    let place = app.live.place(&caller)?;
+    // A slow reader keeps files open and lines in memory for that long.
+    let place = app.live.acquire_slot(&caller)?;
     if part.follow {
         let printed = ReceiverStream::new(container.follow(LogStart::Last(count)));
         let printed = printed.map(move |line| {
             let _held = &place;
             views::log_line(line)
         });
-        // A follower must not keep the daemon from ending.
-        let ending = caller.over(&app, handle.service());
-        return Ok(lines(printed.take_until(ending)));
+        // A follower must not keep the daemon from stopping.
+        let ending = caller.wait_for_end(&app, handle.service());
+        return Ok(json_lines(printed.take_until(ending)));
     }
     let past = container.logs(count, None).await;
-    let budget = app.choreographer.memory().client(&caller.peer.client(None));
+    let budget = app
+        .choreographer
+        .memory()
+        .client(&caller.peer.budget_name(None));
     let held = budget.take(past.iter().map(|line| line.line.len() + LOG_LINE).sum())?;
     let past = futures_util::stream::iter(past).map(move |line| {
         let _held = (&place, &held);
         views::log_line(line)
     });
-    Ok(lines(past))
+    Ok(json_lines(past))
 }
 
-/// A stream of values as JSON lines.
-pub fn lines<T: serde::Serialize + Send + 'static>(
+/// Builds a response that streams values as JSON lines.
+pub fn json_lines<T: serde::Serialize + Send + 'static>(
     values: impl futures_util::Stream<Item = T> + Send + 'static,
 ) -> Response {
     let encoded = values.map(|value| {

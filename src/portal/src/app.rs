@@ -1,4 +1,4 @@
-//! What requests are answered from.
+//! Shared state of all request handlers.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,100 +12,100 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::audit::Audit;
-use crate::inside::Lookers;
+use crate::inside::InsideConnections;
 use crate::observers::{BlackBoxOptions, Observers};
 use crate::people::passwords::Passwords;
 use crate::people::provider::IdentityProvider;
 use crate::principals::Principals;
 use crate::proxies::Proxies;
 use crate::strangers::Strangers;
-use crate::stream::Live;
+use crate::stream::LiveSamples;
 use crate::tls::Tls;
 
-/// What the operator decides of the portal.
+/// Operator's settings of the portal.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// Web origins besides this machine's own whose pages may use the portal without a token.
+    /// Web origins, besides this machine's own, whose pages may use the portal without a token.
     pub origins: Vec<String>,
-    /// Proxies in front of the portal that are believed for whom they ask.
+    /// Trusted proxies in front of the portal.
     pub proxies: Proxies,
-    /// Where a plain `ws://host:9090` goes.
+    /// Service reached by a plain `ws://host:9090`.
     pub default_service: Option<String>,
-    /// The robot that a plain `ws://host:9090` is taken for; one of its own each when not set.
+    /// Robot assumed for a plain `ws://host:9090`; if not set, each connection is a robot of its own.
     pub default_robot: Option<String>,
-    /// How long a request's header may take, and the `auth` message where one is awaited.
+    /// Timeout of a request's header and of an awaited `auth` message.
     pub handshake: Duration,
-    /// How long connections may take to end when the daemon ends.
+    /// Time that connections get to finish when the daemon stops.
     pub drain: Duration,
-    /// What is done on a machine that cannot set limits, as the configuration names it.
+    /// Isolation mode of the configuration: what to do on a machine that cannot set limits.
     pub isolation: String,
-    /// What of servants is kept for when something goes wrong.
+    /// Settings of the servants' black boxes.
     pub black_box: BlackBoxOptions,
 }
 
-/// What the daemon keeps of its first look at the machine.
+/// Results of the checks of the machine at startup.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Machine {
-    /// Version of the usable cgroup controllers; 0: none.
+pub struct MachineChecks {
+    /// Version of the usable cgroup controllers; 0 if there are none.
     pub cgroup_version: u8,
     /// Limits that cannot be set.
     pub missing_limits: Vec<String>,
-    /// What does not work as it should.
+    /// Problems found.
     pub warnings: Vec<String>,
 }
 
-/// What requests are answered from.
+/// Shared state of all request handlers.
 pub struct App {
-    /// What the operator decides.
+    /// Operator's settings.
     pub options: Options,
-    /// Who may do what.
+    /// Principals and the policy.
     pub principals: Principals,
-    /// Hashes of people's passwords.
+    /// Hashing of people's passwords.
     pub passwords: Passwords,
-    /// Who else knows people.
+    /// Identity provider, if configured.
     pub provider: Option<IdentityProvider>,
-    /// What was done.
+    /// Audit log.
     pub audit: Audit,
-    /// Connections on which nobody has shown yet who asks.
+    /// Connections that have not authenticated yet.
     pub strangers: Arc<Strangers>,
-    /// Where the portal listens, as bound.
+    /// Address to which the portal is bound.
     pub listen: std::net::SocketAddr,
-    /// TLS of the TCP listener; none: plain text.
+    /// TLS of the TCP listener; `None` for plain text.
     pub tls: Option<Arc<Tls>>,
-    /// What signs robots' certificates, where TLS is spoken.
-    pub robots: Option<crate::machines::Robots>,
-    /// What stubs are signed by.
+    /// Authority that signs robots' certificates, if TLS is used.
+    pub robots: Option<crate::machines::RobotAuthority>,
+    /// Key that signs stubs.
     pub signing: Arc<sign::SigningKey>,
-    /// The state directory.
+    /// State directory.
     pub home: std::path::PathBuf,
-    /// The database.
+    /// Database.
     pub state: Arc<State>,
-    /// What is published.
+    /// Published services.
     pub catalogue: Arc<Catalogue>,
     /// Servants.
     pub choreographer: Choreographer,
     /// Pushes.
     pub pusher: Arc<Pusher>,
-    /// The state of this machine, as checked at start.
-    pub machine: Machine,
-    /// Makes all checks of this machine anew; blocks.
+    /// Results of the checks at startup.
+    pub machine: MachineChecks,
+    /// Runs all checks of the machine anew. Blocks.
     pub examine: Box<dyn Fn() -> api::Doctor + Send + Sync>,
-    /// What pages are told as it changes.
-    pub live: Live,
-    /// Who looks into servants.
-    pub inside: Lookers,
-    /// Who hears servants beside their robots.
+    /// Live updates for pages.
+    pub live: LiveSamples,
+    /// Connections that look into servants.
+    pub inside: InsideConnections,
+    /// Observers of servants: black boxes and goal monitors.
     pub observers: Observers,
-    /// When the daemon started.
+    /// Start time of the daemon.
     pub started: Millis,
-    /// Sessions under way.
+    /// Sessions in progress.
     pub sessions: TaskTracker,
-    /// Cancelled when the daemon ends.
+    /// Cancelled when the daemon stops.
     pub ending: CancellationToken,
 }
 
 impl App {
-    /// Where robots reach a service.
+    /// Returns the address at which robots reach a service.
     pub fn address(&self, service: &str) -> String {
         let scheme = if self.tls.is_some() { "wss" } else { "ws" };
         let mut address = self.listen;

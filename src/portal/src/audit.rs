@@ -1,10 +1,10 @@
-//! The audit log: who did what to what from where. Secrets are in none of it: of a request only method and path, which has
-//! names alone, never its query, headers or body.
+//! The audit log: who did what to what from where. It never contains secrets: of a request, only the method and the
+//! path (which consists of names) are recorded, never its query, headers or body.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
-use access::{Action, Sparing};
+use access::{AccessAction, NoticeThrottle};
 use axum::Extension;
 use axum::extract::State as AxumState;
 use axum::http::Method;
@@ -12,54 +12,55 @@ use axum::response::Response;
 use futures_util::StreamExt;
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
-use store::{NewAudited, State};
+use store::{NewAuditRecord, State};
 use tokio::sync::watch;
 use utoipa::IntoParams;
 
-use super::api_v1::lines;
+use super::api_v1::json_lines;
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
 use crate::query::Query;
 
-/// Longest text of an object: some hold names that a client chose.
+/// Maximum length of an object's text, since some contain names chosen by a client.
 const LONGEST: usize = 300;
-/// Records when nobody says how many.
+/// Default number of records.
 const RECORDS: u32 = 100;
-/// Records that are read at once for somebody who follows.
+/// Number of records read at once for a follower.
 const AT_ONCE: u32 = 1_000;
 
-/// What a handler tells of its object where the address does not name it.
+/// Object of an action, set by the handler if the path does not name it.
 #[derive(Debug, Clone, Default)]
-pub struct About(Arc<OnceLock<String>>);
+pub struct AuditObject(Arc<OnceLock<String>>);
 
-impl About {
-    /// Says what it is about.
-    pub fn is(&self, object: String) {
+impl AuditObject {
+    /// Sets the object.
+    pub fn set(&self, object: String) {
         let _ = self.0.set(object);
     }
 
-    /// Names an object and the value that it is given, as JSON.
-    pub fn is_set(&self, object: &str, value: &impl Serialize) {
+    /// Sets the object and the value that it is given, as JSON.
+    pub fn set_value(&self, object: &str, value: &impl Serialize) {
         let value = serde_json::to_string(value).unwrap_or_default();
-        self.is(format!("{object}: {value}"));
+        self.set(format!("{object}: {value}"));
     }
 
-    /// What was said, or else `object`.
-    pub fn or(&self, object: &str) -> String {
+    /// Returns the object that was set, or else `object`.
+    pub fn get_or(&self, object: &str) -> String {
         self.0.get().cloned().unwrap_or_else(|| object.to_owned())
     }
 }
 
-/// What a principal did lately. What succeeded has a room of its own: however much fails, it hides nothing that was done.
+/// Recent actions of a principal. Successes are throttled separately, so that failures, however many, cannot hide
+/// them.
 #[derive(Debug, Default)]
-struct Recent {
-    succeeded: Sparing,
-    failed: Sparing,
+struct RecentActions {
+    succeeded: NoticeThrottle,
+    failed: NoticeThrottle,
 }
 
-impl Recent {
-    fn room(&mut self, status: u16) -> &mut Sparing {
+impl RecentActions {
+    fn throttle_for(&mut self, status: u16) -> &mut NoticeThrottle {
         if status < 400 {
             &mut self.succeeded
         } else {
@@ -68,26 +69,27 @@ impl Recent {
     }
 }
 
-/// Records what callers do.
+/// Writes the audit log.
 pub struct Audit {
     state: Arc<State>,
-    /// Of each principal, so that nobody takes another's room.
-    recent: Mutex<HashMap<String, Recent>>,
+    /// Recent actions by principal, so that nobody uses up another's share.
+    recent: Mutex<HashMap<String, RecentActions>>,
     last: watch::Sender<i64>,
 }
 
-/// Whether a request is recorded however it ends: others only when they were refused.
-pub fn is_recorded(action: Action, method: &Method) -> bool {
-    let reads = [Action::Enter, Action::Look, Action::See];
+/// Returns true if requests of this kind are recorded whatever their outcome; others are recorded only when
+/// forbidden.
+pub fn is_recorded(action: AccessAction, method: &Method) -> bool {
+    let reads = [AccessAction::Enter, AccessAction::Look, AccessAction::See];
     !reads.contains(&action) && method != Method::GET && method != Method::HEAD
 }
 
-fn cut(text: &str) -> String {
+fn truncate(text: &str) -> String {
     text.chars().take(LONGEST).collect()
 }
 
 impl Audit {
-    /// Into `state`.
+    /// Creates the log in the database `state`.
     pub fn new(state: Arc<State>) -> Audit {
         Audit {
             state,
@@ -96,63 +98,70 @@ impl Audit {
         }
     }
 
-    /// Records what was done, on disk when this returns.
-    pub fn record(&self, caller: &Caller, action: Action, did: &str, object: &str, status: u16) {
-        let what = What {
+    /// Records an action; it is on disk when this returns.
+    pub fn record(
+        &self,
+        caller: &Caller,
+        action: AccessAction,
+        did: &str,
+        object: &str,
+        status: u16,
+    ) {
+        let what = AuditEntry {
             action,
             did,
             object,
             status,
             more: 0,
         };
-        self.write(caller, &what, State::add_audited);
+        self.write(caller, &what, State::add_audit_record);
     }
 
-    /// Records what may be done, or tried, again and again: once a minute, with how often it was, and without waiting for the
-    /// disk.
-    pub fn record_sparingly(
+    /// Records an action that may be repeated or tried often: once a minute, with the number of repetitions, and
+    /// without waiting for the disk.
+    pub fn record_throttled(
         &self,
         caller: &Caller,
-        action: Action,
+        action: AccessAction,
         did: &str,
         object: &str,
         status: u16,
     ) {
         let (who, address) = (&caller.who.principal.name, caller.peer.ip());
-        let (did, object) = (&cut(did), &cut(object));
+        let (did, object) = (&truncate(did), &truncate(object));
         let alike = format!("{address} {did} {object} {status}");
         let more = {
             let mut recent = self.recent.lock();
             let own = recent.entry(who.clone()).or_default();
-            own.room(status).ask(&alike, store::now())
+            own.throttle_for(status).admit(&alike, store::now())
         };
         if let Some(more) = more {
-            let what = What {
+            let what = AuditEntry {
                 action,
                 did,
                 object,
                 status,
                 more,
             };
-            self.write(caller, &what, State::add_audited_soon);
+            self.write(caller, &what, State::add_audit_record_without_sync);
         }
     }
 
-    /// What cannot be recorded has been done: the log says so.
+    /// Writes a record. If that fails, the action has still been done, so the daemon's log reports it.
     fn write(
         &self,
         caller: &Caller,
-        what: &What<'_>,
-        add: fn(&State, &NewAudited<'_>) -> Result<i64, store::Error>,
+        what: &AuditEntry<'_>,
+        add: fn(&State, &NewAuditRecord<'_>) -> Result<i64, store::Error>,
     ) {
         let recorded = add(
             &self.state,
-            &NewAudited {
+            &NewAuditRecord {
                 who: &caller.who.principal.to_string(),
                 peer: &caller.peer.to_string(),
                 action: what.action.name(),
-                did: &cut(what.did),
-                object: &cut(what.object),
+                did: &truncate(what.did),
+                object: &truncate(what.object),
                 status: what.status,
                 more: what.more,
             },
@@ -176,40 +185,40 @@ impl Audit {
     }
 }
 
-/// What is recorded of a request.
-struct What<'a> {
-    action: Action,
+/// A record of the audit log.
+struct AuditEntry<'a> {
+    action: AccessAction,
     did: &'a str,
     object: &'a str,
     status: u16,
     more: u64,
 }
 
-/// Which records.
+/// Query of the audit log.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Which {
-    /// Go on as they come.
+pub struct AuditQuery {
+    /// Keep the response open and send new records as they come.
     #[serde(default)]
     follow: bool,
-    /// Only those with a greater number.
+    /// Only records with a greater number.
     #[serde(default)]
     since: i64,
-    /// So many of the newest; 100 by default.
+    /// Number of records, the newest ones (default: 100).
     limit: Option<u32>,
 }
 
 /// The audit log, as JSON lines.
 pub async fn audit(
     AxumState(app): AxumState<Arc<App>>,
-    Query(which): Query<Which>,
+    Query(which): Query<AuditQuery>,
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let told = app.audit.last.subscribe();
     let past = app
         .state
-        .audited(which.since, which.limit.unwrap_or(RECORDS))?;
+        .audit_records(which.since, which.limit.unwrap_or(RECORDS))?;
     if !which.follow {
-        return Ok(lines(futures_util::stream::iter(past)));
+        return Ok(json_lines(futures_util::stream::iter(past)));
     }
     let since = past.last().map_or(which.since, |record| record.id);
     let reader = Arc::clone(&app);
@@ -218,8 +227,9 @@ pub async fn audit(
         async move {
             loop {
                 told.borrow_and_update();
-                // The newest are read: who reads too slowly for a thousand at a time misses the older ones, and sees it by their numbers.
-                let new = app.state.audited(since, AT_ONCE)?;
+                // A follower too slow for a thousand records at a time misses the older ones and notices by their
+                // numbers.
+                let new = app.state.audit_records(since, AT_ONCE)?;
                 if let Some(last) = new.last() {
                     let since = last.id;
                     return Ok::<_, store::Error>(Some((new, (since, told))));
@@ -233,8 +243,8 @@ pub async fn audit(
     let coming = coming
         .take_while(|new| std::future::ready(new.is_ok()))
         .flat_map(|new| futures_util::stream::iter(new.unwrap_or_default()));
-    let ending = caller.over(&app, "");
-    Ok(lines(
+    let ending = caller.wait_for_end(&app, "");
+    Ok(json_lines(
         futures_util::stream::iter(past)
             .chain(coming)
             .take_until(ending),
@@ -248,15 +258,15 @@ mod tests {
     #[test]
     fn what_changes_something_is_recorded() {
         for (action, method, recorded) in [
-            (Action::Deploy, Method::POST, true),
-            (Action::Operate, Method::DELETE, true),
-            (Action::Operate, Method::PATCH, true),
-            (Action::Administer, Method::POST, true),
-            (Action::Administer, Method::GET, false),
-            (Action::Try, Method::POST, true),
-            (Action::Logs, Method::GET, false),
-            (Action::See, Method::GET, false),
-            (Action::Enter, Method::POST, false),
+            (AccessAction::Deploy, Method::POST, true),
+            (AccessAction::Operate, Method::DELETE, true),
+            (AccessAction::Operate, Method::PATCH, true),
+            (AccessAction::Administer, Method::POST, true),
+            (AccessAction::Administer, Method::GET, false),
+            (AccessAction::Try, Method::POST, true),
+            (AccessAction::Logs, Method::GET, false),
+            (AccessAction::See, Method::GET, false),
+            (AccessAction::Enter, Method::POST, false),
         ] {
             assert_eq!(
                 is_recorded(action, &method),

@@ -1,7 +1,7 @@
-//! rosbridge's `auth` operation, for clients that cannot put a token into the address: it must be the first message.
+//! rosbridge's `auth` operation, for clients that cannot put a token into the address. It must be the first message.
 //!
-//! It is read as a frame of its own, not as a message of a `WebSocket`: the bridge takes the connection from the next
-//! byte on, with what was read ahead.
+//! It is parsed as a frame here, not as a message of a `WebSocket`: the bridge takes over the connection at the next
+//! byte, with what was read ahead.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -11,12 +11,12 @@ use ws::frame::{Header, TEXT, unmask};
 
 use crate::tokens::AuthMessage;
 
-/// An auth message is a few short fields.
+/// Maximum size of an auth message in bytes; it has a few short fields.
 const LONGEST: usize = 16 << 10;
 
-/// Reads the first message: whom `recognise` says that it proves, given also the time (seconds since 1970), and what was read
-/// beyond it.
-pub async fn first_message<S: AsyncRead + Unpin, T>(
+/// Reads the auth message. Returns what `recognise` makes of it and of the time (seconds since 1970), and the bytes
+/// read beyond it.
+pub async fn read_auth_message<S: AsyncRead + Unpin, T>(
     io: &mut S,
     read_ahead: Bytes,
     recognise: impl Fn(&AuthMessage, f64) -> Result<T, String>,
@@ -39,11 +39,11 @@ pub async fn first_message<S: AsyncRead + Unpin, T>(
     let now = SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0.0, |since| since.as_secs_f64());
-    let who = recognise(&read(&payload)?, now)?;
+    let who = recognise(&parse_auth_message(&payload)?, now)?;
     Ok((who, buffer.freeze()))
 }
 
-fn read(payload: &[u8]) -> Result<AuthMessage, String> {
+fn parse_auth_message(payload: &[u8]) -> Result<AuthMessage, String> {
     #[derive(serde::Deserialize)]
     struct Operation {
         op: String,
@@ -61,7 +61,7 @@ fn read(payload: &[u8]) -> Result<AuthMessage, String> {
         .map_err(|error| format!("the auth message cannot be read: {error}"))
 }
 
-/// The payload of one whole text frame, taken out of `buffer`; none while it is not complete.
+/// Takes the payload of one complete text frame out of `buffer`; `None` if it is incomplete.
 fn take_frame(buffer: &mut BytesMut) -> Result<Option<BytesMut>, String> {
     let header = Header::parse(buffer).map_err(|error| error.to_string())?;
     let Some((header, size)) = header else {
@@ -114,7 +114,7 @@ mod tests {
             let known = tokens.recognise_auth(message, now);
             known.map_err(|refusal| refusal.to_string())
         };
-        first_message(&mut rest, Bytes::copy_from_slice(ahead), recognise).await
+        read_auth_message(&mut rest, Bytes::copy_from_slice(ahead), recognise).await
     }
 
     #[tokio::test]

@@ -1,4 +1,4 @@
-//! Reads bodies of requests into memory, within the client's budget and a time.
+//! Reads request bodies into memory, within the client's budget and a timeout.
 
 use std::time::Duration;
 
@@ -8,15 +8,15 @@ use futures_util::StreamExt;
 
 use crate::errors::Error;
 
-/// Bigger ones count in steps of this size.
+/// Larger bodies are charged in steps of this size.
 const STEP: usize = 1 << 20;
 
-/// A body, and the permit to hold it.
+/// A body in memory, with its budget permit.
 #[derive(Debug)]
-pub struct Held {
-    /// The bytes.
+pub struct BufferedBody {
+    /// Content of the body.
     pub bytes: Bytes,
-    /// To be kept for as long as the bytes are.
+    /// Budget permit, to be kept as long as the bytes.
     pub permit: Permit,
 }
 
@@ -26,7 +26,7 @@ pub async fn read(
     max: usize,
     budget: &Budget,
     unfinished: Duration,
-) -> Result<Held, Error> {
+) -> Result<BufferedBody, Error> {
     let reading = async {
         let mut permit = budget.permit();
         let mut bytes = Vec::new();
@@ -40,17 +40,20 @@ pub async fn read(
                 return Err(Error::BodyTooLarge { limit });
             }
             if length > bytes.capacity() {
-                // It may take twice as much while it grows.
+                // Growing may take twice the memory.
                 let room = (2 * bytes.capacity()).max(length).min(max);
                 if room > UNCOUNTED {
-                    // A budget need not be a multiple.
-                    permit.grow_to(room.next_multiple_of(STEP).min(budget.most().max(room)))?;
+                    // The budget need not be a multiple of the step.
+                    permit.grow_to(
+                        room.next_multiple_of(STEP)
+                            .min(budget.max_permit().max(room)),
+                    )?;
                 }
                 bytes.reserve_exact(room - bytes.len());
             }
             bytes.extend_from_slice(&part);
         }
-        Ok(Held {
+        Ok(BufferedBody {
             bytes: bytes.into(),
             permit,
         })
@@ -67,8 +70,8 @@ mod tests {
 
     const LONG: Duration = Duration::from_secs(3600);
 
-    /// A body of which so many bytes come, and then nothing.
-    fn unfinished(length: usize) -> Body {
+    /// Creates a body that delivers `length` bytes and then stalls.
+    fn unfinished_body(length: usize) -> Body {
         let parts = (0..length / STEP).map(|_| Ok::<_, std::io::Error>(vec![7; STEP]));
         let some = futures_util::stream::iter(parts);
         Body::from_stream(some.chain(futures_util::stream::pending()))
@@ -80,7 +83,7 @@ mod tests {
         let mut reading = tokio::task::JoinSet::new();
         for _ in 0..4 {
             let budget = budget.clone();
-            let body = unfinished(6 << 20);
+            let body = unfinished_body(6 << 20);
             reading.spawn(async move { read(body, 512 << 20, &budget, LONG).await });
         }
         for _ in 0..3 {
@@ -88,19 +91,19 @@ mod tests {
             let refused = refused.expect_err("they do not fit");
             assert_eq!(refused.problem().status, 503, "{refused}");
             assert!(refused.to_string().contains("client x"), "{refused}");
-            assert!(budget.used() <= budget.limit());
+            assert!(budget.used_bytes() <= budget.limit());
         }
         reading.shutdown().await;
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_body_that_stays_unfinished_is_given_up() {
-        let budget = Budget::unlimited();
-        let refused = read(unfinished(1 << 20), 2 << 20, &budget, LONG).await;
+        let budget = Budget::without_limit();
+        let refused = read(unfinished_body(1 << 20), 2 << 20, &budget, LONG).await;
         let refused = refused.expect_err("it never ends");
         assert_eq!(refused.problem().status, 408, "{refused}");
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[tokio::test]
@@ -117,9 +120,9 @@ mod tests {
         let held = read(Body::from(vec![7; 3 << 20]), 4 << 20, &budget, LONG).await;
         let held = held.expect("it fits");
         assert_eq!(held.bytes, vec![7; 3 << 20]);
-        assert!(budget.used() >= 3 << 20);
+        assert!(budget.used_bytes() >= 3 << 20);
         drop(held);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
         let refused = read(Body::from(vec![7; 100]), 99, &budget, LONG).await;
         assert_eq!(refused.expect_err("too long").problem().status, 413);
     }

@@ -1,5 +1,5 @@
-//! `POST /api/v1/services/NAME/calibration`: options in the query, a recording or pictures in the body, events as JSON lines
-//! in the answer.
+//! `POST /api/v1/services/NAME/calibration`: options in the query, a recording or pictures in the body, events as
+//! JSON lines in the response.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,35 +10,35 @@ use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, Path, State};
 use axum::response::Response;
-use choreographer::{Bounds, Requests};
+use choreographer::{CalibrationRequests, CaptureBounds};
 use futures_util::StreamExt;
 use reach::{Material, Picture, RECORDED};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::api_v1::{lines, recording};
-use super::guard::{Caller, query};
+use super::api_v1::{json_lines, read_recording};
+use super::guard::{Caller, query_value};
 use crate::app::App;
-use crate::body::Held;
+use crate::body::BufferedBody;
 use crate::errors::Error;
 
-/// Events that a client has not read.
+/// Queue size of events that the client has not read.
 const EVENTS_AHEAD: usize = 64;
-/// For how long a robot's requests are taken where nobody says it, and the longest.
+/// Duration of capturing a robot's requests in seconds: default and maximum.
 const SECONDS: f64 = 20.0;
 const LONGEST: f64 = 600.0;
-/// Bytes of them, where nobody says it.
+/// Default limit on the captured bytes.
 const BYTES: Size = Size(256 << 20);
-/// The longest that a servant stays behind its last limit.
+/// Maximum time in seconds that a servant is kept under its last limit.
 const KEPT: f64 = 600.0;
-/// The least memory that anything can be measured with; nothing starts with less.
+/// Minimum memory limit in bytes that can be measured; nothing starts with less.
 const LEAST_MEMORY: f64 = (16 << 20) as f64;
-/// Limits that are measured in one calibration, and requests at each.
+/// Maximum number of limits measured in one calibration, and of requests at each.
 const MOST_LIMITS: usize = 32;
 const MOST_REQUESTS: usize = 10_000;
 
-/// Answers a calibration.
+/// Runs a calibration.
 pub async fn calibration(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
@@ -47,18 +47,18 @@ pub async fn calibration(
     body: Body,
 ) -> Result<Response, Error> {
     let options = read_options(uri.query())?;
-    app.catalogue.current(&name)?;
+    app.catalogue.current_revision(&name)?;
     let given = match options.source {
         Source::Live => None,
-        Source::Bag | Source::Frames => Some(recording(&app, &caller, body).await?),
+        Source::Bag | Source::Frames => Some(read_recording(&app, &caller, body).await?),
     };
     let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
-    let ending = caller.over(&app, &name);
+    let ending = caller.wait_for_end(&app, &name);
     let work = async move {
         let outcome = async {
             let requests = match given {
-                Some(held) => material(options.source, held, &events).await?,
-                None => live(&app, &caller, &name, &options, &events).await?,
+                Some(held) => read_material(options.source, held, &events).await?,
+                None => capture_live(&app, &caller, &name, &options, &events).await?,
             };
             let choreographer = &app.choreographer;
             let calibration = choreographer.calibrate(&name, requests, &options, &events);
@@ -74,26 +74,26 @@ pub async fn calibration(
         };
         let _ = events.send(event).await;
     };
-    // Lives in the answer: when the client goes away the answer is dropped, and the calibration with it.
+    // Owned by the response: if the client disconnects, the calibration is aborted with it.
     let work = AbortOnDropHandle::new(tokio::spawn(work));
     let events = ReceiverStream::new(receiver).take_until(Box::pin(ending));
-    Ok(lines(events.map(move |event| {
+    Ok(json_lines(events.map(move |event| {
         let _ = &work;
         event
     })))
 }
 
-async fn step(events: &mpsc::Sender<CalibrationEvent>, title: String) {
+async fn send_step(events: &mpsc::Sender<CalibrationEvent>, title: String) {
     let _ = events.send(CalibrationEvent::Step { title }).await;
 }
 
-/// What was sent, as messages.
-async fn material(
+/// Parses the body into messages.
+async fn read_material(
     source: Source,
-    held: Held,
+    held: BufferedBody,
     events: &mpsc::Sender<CalibrationEvent>,
-) -> Result<Requests, Error> {
-    let Held { bytes, permit } = held;
+) -> Result<CalibrationRequests, Error> {
+    let BufferedBody { bytes, permit } = held;
     let reading = tokio::task::spawn_blocking(move || match source {
         Source::Frames => Picture::read_all(&bytes)
             .map(|(pictures, count)| (Some((pictures.len(), count)), Material::Pictures(pictures)))
@@ -104,51 +104,54 @@ async fn material(
     });
     let (pictures, material) = reading
         .await
-        .map_err(|_| Error::Internal("reading what a service is calibrated with"))??;
+        .map_err(|_| Error::Internal("reading the input of a calibration"))??;
     if let Some((used, count)) = pictures.filter(|(used, count)| used < count) {
-        step(
+        send_step(
             events,
             format!("using the first {used} of {count} pictures: more do not fit into memory"),
         )
         .await;
     }
-    Ok(Requests {
+    Ok(CalibrationRequests {
         material,
         network: None,
-        // Messages were cut from the body.
+        // The messages share the body's memory.
         permit,
     })
 }
 
-/// What a robot sends.
-async fn live(
+/// Captures what a robot sends.
+async fn capture_live(
     app: &App,
     caller: &Caller,
     service: &str,
     options: &CalibrationOptions,
     events: &mpsc::Sender<CalibrationEvent>,
-) -> Result<Requests, Error> {
+) -> Result<CalibrationRequests, Error> {
     let robot = options.robot.as_deref().unwrap_or_default();
-    let bounds = Bounds {
+    let bounds = CaptureBounds {
         time: Duration::from_secs_f64(options.seconds.unwrap_or(SECONDS)),
         bytes: options.bytes.unwrap_or(BYTES).0 as usize,
         messages: RECORDED,
     };
-    step(
+    send_step(
         events,
         format!(
-            "taking what robot {robot} sends to {service}, for {} s at most",
+            "recording what robot {robot} sends to {service}, for at most {} s",
             bounds.time.as_secs_f64()
         ),
     )
     .await;
-    let budget = app.choreographer.memory().client(&caller.peer.client(None));
+    let budget = app
+        .choreographer
+        .memory()
+        .client(&caller.peer.budget_name(None));
     let captured = app.choreographer.capture(service, robot, bounds, &budget);
     Ok(captured.await?)
 }
 
 fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
-    let options = match query(query_of, "options") {
+    let options = match query_value(query_of, "options") {
         Some(text) => serde_json::from_str(&text).map_err(|error| {
             Error::BadRequest(format!("the calibration's options cannot be read: {error}"))
         })?,
@@ -158,7 +161,7 @@ fn read_options(query_of: Option<&str>) -> Result<CalibrationOptions, Error> {
     Ok(options)
 }
 
-/// Refuses what cannot be measured.
+/// Refuses options that cannot be measured.
 fn check(options: &CalibrationOptions) -> Result<(), String> {
     let positive = |name: &str, value: Option<f64>, least: f64, most: f64| match value {
         Some(value) if !(least..=most).contains(&value) => Err(format!(
@@ -187,9 +190,9 @@ fn check(options: &CalibrationOptions) -> Result<(), String> {
         return Err("rate and fast exclude each other".to_owned());
     }
     match (options.source, &options.robot) {
-        (Source::Live, None) => Err("live needs the robot whose requests are taken".to_owned()),
+        (Source::Live, None) => Err("live needs robot, whose requests are recorded".to_owned()),
         (Source::Bag | Source::Frames, Some(_)) => {
-            Err("a robot's requests are taken with live alone".to_owned())
+            Err("robot can be given with live only".to_owned())
         }
         _ => Ok(()),
     }
@@ -232,8 +235,8 @@ mod tests {
             ),
             (r#"{"rate":5,"fast":true}"#, "exclude each other"),
             (r#"{"own":true,"cpus":[1]}"#, "exclude each other"),
-            (r#"{"source":"live"}"#, "needs the robot"),
-            (r#"{"robot":"r1"}"#, "with live alone"),
+            (r#"{"source":"live"}"#, "live needs robot"),
+            (r#"{"robot":"r1"}"#, "with live only"),
             (r#"{"limits":[1]}"#, "`limits`"),
             (r#"{"source":"video"}"#, "`video`"),
         ] {

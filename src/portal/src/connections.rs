@@ -1,10 +1,10 @@
-//! Connections: accepted from TCP, through TLS where the portal speaks it, and from Unix sockets.
+//! Connections: accepted from TCP, through TLS if the portal uses it, and from Unix sockets.
 
 use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
-use access::{Action, Principal};
+use access::{AccessAction, Principal};
 use axum::Router;
 use hyper::Request;
 use hyper::body::Incoming;
@@ -17,19 +17,19 @@ use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio_util::task::TaskTracker;
 
 use crate::app::App;
-use crate::guard::{self, Caller, Connection, Peer, User};
+use crate::guard::{self, Caller, ConnectionPeer, PortalConnection, User};
 use crate::peer_groups;
-use crate::principals::Shown;
-use crate::tls::{self, Accepted, Tls};
+use crate::principals::Credential;
+use crate::tls::{self, AcceptedConnection, Tls};
 
-/// When no connection can be accepted (no file descriptor is left, say), the next attempt waits.
+/// Delay after a failed accept, for example if no file descriptor is left.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
-/// Bytes of a request's header. What has come of it is read again with each part that comes.
+/// Maximum size of a request's header in bytes. The header is parsed again with each part received.
 const LONGEST_HEADER: usize = 64 << 10;
-/// Bytes that the kernel takes for a connection beyond those that are on their way.
+/// Bytes the kernel buffers for a connection beyond those in flight.
 const UNSENT: u32 = 128 * 1024;
 
-/// Accepts TCP connections until the daemon ends.
+/// Accepts TCP connections until the daemon stops.
 pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
     let connections = TaskTracker::new();
     loop {
@@ -41,11 +41,11 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
             Ok((stream, address)) => {
                 tune(&stream);
                 let stranger = app.strangers.enter(&app.options.proxies, address.ip());
-                let connection = Connection {
+                let connection = PortalConnection {
                     stranger: Some(Arc::new(stranger)),
-                    ..Connection::plain(Peer::Tcp(address))
+                    ..PortalConnection::without_tls(ConnectionPeer::Tcp(address))
                 };
-                connections.spawn(secured(
+                connections.spawn(serve_tcp_connection(
                     Arc::clone(&app),
                     router.clone(),
                     stream,
@@ -54,7 +54,7 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
             }
             Err(error) => {
                 tracing::warn!("no connection can be accepted: {error}");
-                // It may be for want of a descriptor.
+                // The cause may be a lack of descriptors.
                 app.strangers.make_room();
                 tokio::time::sleep(ACCEPT_AGAIN).await;
             }
@@ -63,7 +63,7 @@ pub async fn serve_tcp(app: Arc<App>, router: Router, listener: TcpListener) {
     drain(&app, connections).await;
 }
 
-/// Answers challenges of authorities (RFC 8737), and nothing else, until the daemon ends.
+/// Answers only the authorities' challenges (RFC 8737), until the daemon stops.
 pub async fn serve_challenges(app: Arc<App>, listener: TcpListener) {
     let Some(tls) = &app.tls else { return };
     let connections = TaskTracker::new();
@@ -76,24 +76,24 @@ pub async fn serve_challenges(app: Arc<App>, listener: TcpListener) {
         let (tls, time) = (Arc::clone(tls), app.options.handshake);
         connections.spawn(async move {
             tokio::select! {
-                // Whoever did not come for it is let go.
+                // Other clients are disconnected.
                 _ = tokio::time::timeout(time, tls.accept(stream)) => {}
-                () = stranger.dropped() => {}
+                () = stranger.wait_until_dropped() => {}
             }
         });
     }
     drain(&app, connections).await;
 }
 
-/// Makes a connection fit for many small messages beside big ones. What cannot be set is not needed to go on.
+/// Tunes a connection for many small messages beside large ones. Failures are ignored.
 fn tune(stream: &TcpStream) {
-    // None of them waits for the next.
+    // Small messages must not be delayed by Nagle's algorithm.
     let _ = stream.set_nodelay(true);
-    // The kernel would take megabytes for a client that reads slowly, and an answer would wait behind all of them.
+    // Otherwise the kernel would buffer megabytes for a slow client, and a reply would wait behind them.
     let _ = SockRef::from(stream).set_tcp_notsent_lowat(UNSENT);
 }
 
-/// Accepts connections on a Unix socket until the daemon ends. Members of `group` are admins there.
+/// Accepts connections on a Unix socket until the daemon stops. Members of `group` are admins there.
 pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, group: Option<u32>) {
     let connections = TaskTracker::new();
     loop {
@@ -101,9 +101,9 @@ pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, g
             accepted = listener.accept() => accepted,
             () = app.ending.cancelled() => break,
         };
-        match accepted.and_then(|(stream, _)| Ok((user(&stream, group)?, stream))) {
+        match accepted.and_then(|(stream, _)| Ok((peer_user(&stream, group)?, stream))) {
             Ok((user, stream)) => {
-                let connection = Connection::plain(Peer::Unix(user));
+                let connection = PortalConnection::without_tls(ConnectionPeer::Unix(user));
                 connections.spawn(serve(Arc::clone(&app), router.clone(), stream, connection));
             }
             Err(error) => {
@@ -115,12 +115,12 @@ pub async fn serve_unix(app: Arc<App>, router: Router, listener: UnixListener, g
     drain(&app, connections).await;
 }
 
-/// Who is at the other end.
-fn user(stream: &UnixStream, group: Option<u32>) -> std::io::Result<User> {
+/// Returns the user at the other end.
+fn peer_user(stream: &UnixStream, group: Option<u32>) -> std::io::Result<User> {
     let peer = stream.peer_cred()?;
     let is_member = match group {
         None => false,
-        Some(group) => peer.gid() == group || peer_groups::of(stream)?.contains(&group),
+        Some(group) => peer.gid() == group || peer_groups::peer_groups(stream)?.contains(&group),
     };
     Ok(User {
         uid: peer.uid(),
@@ -133,8 +133,13 @@ async fn drain(app: &App, connections: TaskTracker) {
     let _ = tokio::time::timeout(app.options.drain, connections.wait()).await;
 }
 
-/// Serves a TCP connection, through TLS where the portal speaks it, until it ends or newer ones need its place.
-async fn secured(app: Arc<App>, router: Router, stream: TcpStream, connection: Connection) {
+/// Serves a TCP connection, through TLS if the portal uses it, until it ends or is dropped in favour of newer ones.
+async fn serve_tcp_connection(
+    app: Arc<App>,
+    router: Router,
+    stream: TcpStream,
+    connection: PortalConnection,
+) {
     let peer = connection.peer;
     let place = connection.clone();
     let served = async {
@@ -145,8 +150,8 @@ async fn secured(app: Arc<App>, router: Router, stream: TcpStream, connection: C
     };
     tokio::select! {
         () = served => {}
-        () = place.dropped() => {
-            tracing::debug!("dropped {peer}: it has not shown who asks, and newer ones need its place");
+        () = place.wait_until_dropped() => {
+            tracing::debug!("dropped {peer}: it had not authenticated, and newer connections need its place");
         }
     }
 }
@@ -156,7 +161,7 @@ async fn serve_tls(
     tls: &Tls,
     router: Router,
     stream: TcpStream,
-    connection: Connection,
+    connection: PortalConnection,
 ) {
     let peer = connection.peer;
     let accepted = tokio::select! {
@@ -164,51 +169,65 @@ async fn serve_tls(
         () = app.ending.cancelled() => return,
     };
     match accepted {
-        Ok(Ok(Accepted::Tls(stream))) => {
-            let connection = Connection {
+        Ok(Ok(AcceptedConnection::Tls(stream))) => {
+            let connection = PortalConnection {
                 secure: true,
-                certificates: tls::certificates(&stream),
+                certificates: tls::peer_certificates(&stream),
                 ..connection
             };
-            let ended = unpaired(app, &connection);
+            let ended = wait_until_unpaired(app, &connection);
             tokio::select! {
-                // A connection that became a WebSocket goes on in its session, which is told the same.
+                // A connection upgraded to a WebSocket continues in its session, which is notified as well.
                 () = ended => {}
                 () = serve(Arc::clone(app), router, *stream, connection) => {}
             }
         }
-        Ok(Ok(Accepted::Plain(stream))) => {
-            serve(Arc::clone(app), tls::refusing(), stream, connection).await;
+        Ok(Ok(AcceptedConnection::Plain(stream))) => {
+            serve(
+                Arc::clone(app),
+                tls::plain_text_router(),
+                stream,
+                connection,
+            )
+            .await;
         }
-        Ok(Ok(Accepted::Challenge)) => {
-            tracing::debug!("{peer} has seen the answer to a challenge");
+        Ok(Ok(AcceptedConnection::Challenge)) => {
+            tracing::debug!("answered an ACME challenge of {peer}");
         }
         Ok(Err(error)) => {
-            tracing::debug!("no TLS with {peer}: {error}");
+            tracing::debug!("TLS handshake with {peer} failed: {error}");
             if let Some(refused) = tls::refused_certificate(&error) {
-                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
-                let did = format!("showed a certificate that was refused: {refused}");
+                let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
+                let did = format!("presented a certificate that was refused: {refused}");
                 let status = axum::http::StatusCode::UNAUTHORIZED.as_u16();
-                app.audit
-                    .record_sparingly(&nobody, Action::Enter, &did, "the server", status);
+                app.audit.record_throttled(
+                    &nobody,
+                    AccessAction::Enter,
+                    &did,
+                    "the server",
+                    status,
+                );
             }
         }
-        Err(_) => tracing::debug!("no TLS with {peer}: its handshake did not end in time"),
+        Err(_) => tracing::debug!("TLS handshake with {peer} failed: it did not finish in time"),
     }
 }
 
-/// Comes back when the pairing ends of the robot whose certificate a connection has shown.
-fn unpaired(app: &Arc<App>, connection: &Connection) -> impl Future<Output = ()> + use<> {
+/// Waits until the robot is unpaired whose certificate the connection presented.
+fn wait_until_unpaired(
+    app: &Arc<App>,
+    connection: &PortalConnection,
+) -> impl Future<Output = ()> + use<> {
     let who = app
         .principals
-        .with(|known| guard::certified(app, connection, known));
+        .with_recogniser(|known| guard::recognise_certificate(app, connection, known));
     let app = Arc::clone(app);
     async move {
         match who {
             Some(Ok(who)) => {
-                app.principals.ended(&who, "", false).await;
+                app.principals.wait_for_end(&who, "", false).await;
             }
-            // Who shows none, or one that is refused, is answered so.
+            // Without a certificate, or with a refused one, requests are answered accordingly.
             _ => std::future::pending().await,
         }
     }
@@ -218,7 +237,7 @@ async fn serve(
     app: Arc<App>,
     router: Router,
     stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    connection: Connection,
+    connection: PortalConnection,
 ) {
     let peer = connection.peer;
     let router = TowerToHyperService::new(router);

@@ -1,4 +1,4 @@
-//! `/api/v1/services/NAME/sla`: the dictionary of a service.
+//! `/api/v1/services/NAME/sla`: a service's dictionary.
 
 use std::sync::Arc;
 
@@ -12,51 +12,53 @@ use serde::Deserialize;
 use store::{Journal, NewEvent};
 use utoipa::IntoParams;
 
-use super::api_v1::{Answer, held};
-use super::audit::About;
+use super::api_v1::{JsonResult, read_body};
+use super::audit::AuditObject;
 use super::guard::{self, Caller};
 use crate::app::App;
 use crate::errors::Error;
 
-/// The longest body of rows.
+/// Maximum size of a body with rows.
 const LARGEST: usize = 1 << 20;
 
-/// All rows.
-pub async fn rows(State(app): State<Arc<App>>, Path(name): Path<String>) -> Answer<Vec<Row>> {
-    app.catalogue.current(&name)?;
+/// Lists all rows.
+pub async fn rows(State(app): State<Arc<App>>, Path(name): Path<String>) -> JsonResult<Vec<Row>> {
+    app.catalogue.current_revision(&name)?;
     Ok(Json(app.state.dictionary(&name)?))
 }
 
-/// Writes rows; answers all that there are then.
+/// Writes rows and returns all rows.
 pub async fn write(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<Vec<Row>> {
-    let revision = app.catalogue.current(&name)?;
-    let body = held(&app, &caller, body, LARGEST).await?.bytes;
+) -> JsonResult<Vec<Row>> {
+    let revision = app.catalogue.current_revision(&name)?;
+    let body = read_body(&app, &caller, body, LARGEST).await?.bytes;
     let new: NewRows = serde_json::from_slice(&body)
-        .map_err(|error| Error::BadRequest(format!("the rows cannot be read: {error}")))?;
-    about.is_set(&format!("dictionary of service {name}"), &new);
+        .map_err(|error| Error::BadRequest(format!("cannot read the entries: {error}")))?;
+    about.set_value(&format!("SLA table of service {name}"), &new);
     for row in &new.rows {
-        check_row(row).map_err(|reason| Error::BadRequest(format!("row of {row}: {reason}")))?;
+        check_row(row).map_err(|reason| Error::BadRequest(format!("entry for {row}: {reason}")))?;
     }
-    let there = match new.replace {
-        true => 0,
-        false => app.state.dictionary(&name)?.len(),
+    let there = if new.replace {
+        0
+    } else {
+        app.state.dictionary(&name)?.len()
     };
     if there + new.rows.len() > MOST_ROWS {
         return Err(Error::BadRequest(format!(
-            "{there} rows and {} more are too many; a service may have {MOST_ROWS}. Remove some with: cloudroidctl sla rm {name} NUMBER",
+            "{there} entries and {} more exceed the limit of {MOST_ROWS} for a service; remove some with: cloudroidctl \
+                sla rm {name} NUMBER",
             new.rows.len()
         )));
     }
     app.state.write_dictionary(&name, revision.number, &new)?;
     let rows = app.state.dictionary(&name)?;
     let message = format!(
-        "{} rows of the dictionary of {name} were written; it has {}",
+        "{} entries of the SLA table of {name} were written; it now has {}",
         new.rows.len(),
         rows.len()
     );
@@ -68,14 +70,14 @@ pub async fn write(
     Ok(Json(rows))
 }
 
-/// Removes a row; answers those that are left.
+/// Removes a row and returns those that are left.
 pub async fn remove(
     State(app): State<Arc<App>>,
     Path((name, id)): Path<(String, String)>,
-    Extension(about): Extension<About>,
-) -> Answer<Vec<Row>> {
-    about.is(format!("row {id} of the dictionary of service {name}"));
-    app.catalogue.current(&name)?;
+    Extension(about): Extension<AuditObject>,
+) -> JsonResult<Vec<Row>> {
+    about.set(format!("entry {id} of the SLA table of service {name}"));
+    app.catalogue.current_revision(&name)?;
     let number = id.parse().ok();
     let removed = match number {
         Some(number) => app.state.remove_from_dictionary(&name, number)?,
@@ -89,7 +91,7 @@ pub async fn remove(
             exists: rows.iter().map(|row| row.id.to_string()).collect(),
         });
     }
-    let message = format!("row {id} of the dictionary of {name} was removed");
+    let message = format!("entry {id} of the SLA table of {name} was removed");
     let about = NewEvent {
         service: Some(&name),
         ..NewEvent::default()
@@ -98,36 +100,36 @@ pub async fn remove(
     Ok(Json(rows))
 }
 
-/// What is stated, as in the query of a robot's handshake.
+/// Query: requirements as in the query of a robot's handshake.
 #[derive(Debug, Deserialize, IntoParams)]
 #[allow(dead_code, reason = "it is for the document; what is read is `Stated`")]
-pub struct Stating {
-    /// T_desire, such as `100ms`.
+pub struct StatedQuery {
+    /// Desired response time (T_desire), such as `100ms`.
     rrt: Option<String>,
-    /// T_max.
+    /// Maximum acceptable response time (T_max), such as `300ms`.
     max_rrt: Option<String>,
-    /// Frames per second that are wished for.
+    /// Desired frames per second.
     fps: Option<f64>,
-    /// The least that is acceptable.
+    /// Minimum acceptable frames per second.
     min_fps: Option<f64>,
-    /// Age of an output that is wished for.
+    /// Desired maximum age of an output, such as `100ms`.
     age: Option<String>,
-    /// The greatest that is acceptable.
+    /// Maximum acceptable age of an output, such as `300ms`.
     max_age: Option<String>,
-    /// A class of the configuration.
+    /// Class of the configuration.
     class: Option<String>,
-    /// Cores outright.
+    /// CPU limit in cores, stated directly.
     cpus: Option<f64>,
-    /// Memory outright, such as `512M`.
+    /// Memory limit, such as `512M`, stated directly.
     memory: Option<String>,
 }
 
-/// What a robot would get that states this, and why.
+/// Explains what a robot that states these requirements would get.
 pub async fn explain(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     OriginalUri(uri): OriginalUri,
-) -> Answer<Explained> {
-    let stated = Stated::read(guard::pairs(uri.query())).map_err(Error::Unstatable)?;
+) -> JsonResult<Explained> {
+    let stated = Stated::read(guard::query_pairs(uri.query())).map_err(Error::Unstatable)?;
     Ok(Json(app.choreographer.explain_terms(&name, &stated)?))
 }

@@ -1,4 +1,4 @@
-//! `/api/v1/services/{name}/differences`: what a deployer wants to know before a rollback, and a reviewer after a push.
+//! `/api/v1/services/{name}/differences`: for a deployer before a rollback, or a reviewer after a push.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -14,17 +14,17 @@ use serde_json::Value;
 use store::RevisionRecord;
 use utoipa::IntoParams;
 
-use crate::api_v1::Answer;
+use crate::api_v1::JsonResult;
 use crate::app::App;
 use crate::errors::Error;
 use crate::query::Query;
 
-/// Which revisions.
+/// Query: which revisions.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Between {
-    /// The revision to compare with; the one published before `to` by default.
+pub struct DifferencesQuery {
+    /// Number of the revision to compare with (default: the one published before `to`).
     from: Option<u64>,
-    /// The revision to compare; the current one by default.
+    /// Number of the revision to compare (default: the current one).
     to: Option<u64>,
 }
 
@@ -32,12 +32,12 @@ pub struct Between {
 pub async fn differences(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Query(between): Query<Between>,
-) -> Answer<Differences> {
+    Query(between): Query<DifferencesQuery>,
+) -> JsonResult<Differences> {
     let revisions = app.state.revisions(&name)?;
     let to = match between.to {
         Some(to) => to,
-        None => app.catalogue.current(&name)?.number,
+        None => app.catalogue.current_revision(&name)?.number,
     };
     let before = || revisions.iter().find(|line| line.number < to);
     let from = between.from.or_else(|| Some(before()?.number));
@@ -54,12 +54,15 @@ pub async fn differences(
         let found = app.state.revision(&name, number)?;
         found.ok_or_else(|| unknown(number.to_string()))
     };
-    // A service that is not there is told before a revision that it cannot have.
-    app.catalogue.current(&name)?;
+    // A missing service is reported rather than its missing revision.
+    app.catalogue.current_revision(&name)?;
     let to = record(to)?;
     let from = record(from.ok_or_else(|| unknown(format!("before {}", to.number)))?)?;
-    let before = parts(&from, &app.catalogue.known(&from).await?.inventory);
-    let after = parts(&to, &app.catalogue.known(&to).await?.inventory);
+    let before = revision_parts(
+        &from,
+        &app.catalogue.revision_contents(&from).await?.inventory,
+    );
+    let after = revision_parts(&to, &app.catalogue.revision_contents(&to).await?.inventory);
     Ok(Json(Differences {
         service: name,
         from: from.number,
@@ -68,10 +71,10 @@ pub async fn differences(
     }))
 }
 
-/// What a revision consists of: in words, and where those do not tell all, with a number that differs where it does.
-type Parts = BTreeMap<(Part, String), (String, u64)>;
+/// Parts of a revision: each with a text and, where the text does not show every change, a number that differs.
+type RevisionParts = BTreeMap<(Part, String), (String, u64)>;
 
-fn compare(before: Parts, mut after: Parts) -> Vec<Difference> {
+fn compare(before: RevisionParts, mut after: RevisionParts) -> Vec<Difference> {
     let difference = |(part, name): (Part, String), before, after| Difference {
         part,
         name,
@@ -91,8 +94,8 @@ fn compare(before: Parts, mut after: Parts) -> Vec<Difference> {
     found
 }
 
-fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
-    let mut parts = Parts::new();
+fn revision_parts(of: &RevisionRecord, inventory: &Inventory) -> RevisionParts {
+    let mut parts = RevisionParts::new();
     let mut add = |part: Part, name: &str, words: String, all: u64| {
         parts.insert((part, name.to_owned()), (words, all));
     };
@@ -110,7 +113,7 @@ fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
             fields.retain(|field, _| !["name", "argv", "environment"].contains(&&**field));
         }
         let name = |field: &str| format!("{} {field}", node.name);
-        for (field, value) in fields(&more) {
+        for (field, value) in meaningful_fields(&more) {
             add(Part::Node, &name(&field), value, 0);
         }
         for (variable, value) in &node.environment {
@@ -134,19 +137,19 @@ fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
     for (variable, value) in &of.plan.environment {
         add(Part::Environment, variable, "set".to_owned(), hash(value));
     }
-    interface(&of.interface, &mut add);
+    add_interface(&of.interface, &mut add);
     for (name, value) in &of.plan.parameters {
         let value = serde_json::to_value(value).unwrap_or_default();
-        add(Part::Parameter, name, text(&value), 0);
+        add(Part::Parameter, name, value_text(&value), 0);
     }
     for (part, value) in [
-        (Part::Limit, json(&of.plan.limits)),
-        (Part::Cap, json(&of.plan.caps)),
-        (Part::Sla, json(&of.plan.sla)),
-        (Part::Grant, json(&of.plan.grants)),
-        (Part::Shared, json(&of.plan.shared)),
+        (Part::Limit, to_json(&of.plan.limits)),
+        (Part::Cap, to_json(&of.plan.caps)),
+        (Part::Sla, to_json(&of.plan.sla)),
+        (Part::Grant, to_json(&of.plan.grants)),
+        (Part::Shared, to_json(&of.plan.shared)),
     ] {
-        for (field, value) in fields(&value) {
+        for (field, value) in meaningful_fields(&value) {
             add(part, &field, value, 0);
         }
     }
@@ -161,7 +164,7 @@ fn parts(of: &RevisionRecord, inventory: &Inventory) -> Parts {
     parts
 }
 
-fn interface(of: &Interface, add: &mut impl FnMut(Part, &str, String, u64)) {
+fn add_interface(of: &Interface, add: &mut impl FnMut(Part, &str, String, u64)) {
     for topic in &of.topics {
         let direction = match topic.direction {
             package::interface::Direction::Input => "input",
@@ -203,20 +206,20 @@ fn hash(of: &(impl Hash + ?Sized)) -> u64 {
     hasher.finish()
 }
 
-fn json(of: &impl Serialize) -> Value {
+fn to_json(of: &impl Serialize) -> Value {
     serde_json::to_value(of).unwrap_or_default()
 }
 
-fn text(value: &Value) -> String {
+fn value_text(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
-        Value::Array(all) => all.iter().map(text).collect::<Vec<_>>().join(", "),
+        Value::Array(all) => all.iter().map(value_text).collect::<Vec<_>>().join(", "),
         other => other.to_string(),
     }
 }
 
-/// What an object has that says something, each value in words.
-fn fields(of: &Value) -> Vec<(String, String)> {
+/// Returns the fields of an object that are set, each value as text.
+fn meaningful_fields(of: &Value) -> Vec<(String, String)> {
     let says_nothing = |value: &Value| match value {
         Value::Null | Value::Bool(false) => true,
         Value::String(text) => text.is_empty(),
@@ -226,7 +229,7 @@ fn fields(of: &Value) -> Vec<(String, String)> {
     };
     let all = of.as_object().into_iter().flatten();
     all.filter(|(_, value)| !says_nothing(value))
-        .map(|(name, value)| (name.clone(), text(value)))
+        .map(|(name, value)| (name.clone(), value_text(value)))
         .collect()
 }
 
@@ -268,7 +271,7 @@ mod tests {
             .insert("TOKEN".into(), "other".into());
         let nothing = Inventory::default();
         let told = |from: &RevisionRecord, to: &RevisionRecord| -> Vec<String> {
-            let found = compare(parts(from, &nothing), parts(to, &nothing));
+            let found = compare(revision_parts(from, &nothing), revision_parts(to, &nothing));
             let lines = found.iter().map(|one| {
                 let side = |side: &Option<String>| side.clone().unwrap_or_else(|| "-".into());
                 let (before, after) = (side(&one.before), side(&one.after));

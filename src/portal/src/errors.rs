@@ -1,258 +1,258 @@
-//! Every refusal of the HTTP API, and the problem details (RFC 9457) that each becomes.
+//! All errors of the HTTP API and their problem details (RFC 9457).
 
 use api::Problem;
 use api::problem::PROBLEM_JSON;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use catalogue::names::NameError;
-use choreographer::{Refused, Unchanged, Untenable, with_last_words};
+use choreographer::{AdmissionError, ResizeError, TermsError, with_last_log_line};
 
-use crate::principals::{Uncertified, Uncoded, Unrecognised};
+use crate::principals::{AuthenticationError, CertificateRefusal, PairingCodeRefusal};
 
 mod next;
 
-/// Why a request is refused.
+/// Reason why a request is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No robot of that name is served, or was lately.
-    #[error("robot {name:?} is not served, and nothing is known of it")]
+    /// No robot of that name is served, or was recently.
+    #[error("unknown robot {name:?}: it has no servant and no recent events")]
     UnknownRobot {
-        /// Asked for.
+        /// Requested name.
         name: String,
-        /// Those that are served.
+        /// Robots that are served.
         exists: Vec<String>,
     },
-    /// No such row of a service's dictionary.
-    #[error("the dictionary of {service} has no row {id:?}")]
+    /// The service's dictionary has no such row.
+    #[error("the SLA table of {service} has no entry {id:?}")]
     UnknownRow {
-        /// The service.
+        /// Name of the service.
         service: String,
-        /// Asked for.
+        /// Requested row.
         id: String,
-        /// Names that exist.
+        /// Existing rows.
         exists: Vec<String>,
     },
-    /// Nothing is served there.
-    #[error("nothing is served at {path}")]
+    /// The path is unknown.
+    #[error("there is nothing at {path}")]
     UnknownPath {
-        /// Asked for.
+        /// Requested path.
         path: String,
     },
-    /// Something is served there, by other methods.
-    #[error("{method} is not answered at {path}")]
+    /// The path exists, but not for this method.
+    #[error("{method} is not supported at {path}")]
     OtherMethod {
-        /// Asked with.
+        /// Request method.
         method: String,
-        /// Asked for.
+        /// Requested path.
         path: String,
     },
-    /// Something in the request is not what it should be.
+    /// The request is malformed.
     #[error("{0}")]
     BadRequest(String),
-    /// What a robot states cannot be.
+    /// The stated requirements are invalid.
     #[error("{0}")]
     Unstatable(api::sla::Unstatable),
-    /// A WebSocket handshake of another version than 13.
-    #[error("this is no WebSocket handshake: Sec-WebSocket-Version is not 13")]
+    /// The WebSocket handshake has a version other than 13.
+    #[error("not a WebSocket handshake: Sec-WebSocket-Version is not 13")]
     WebSocketVersion,
-    /// No token.
+    /// No credential was presented.
     #[error("{0}")]
     Unauthorised(&'static str),
-    /// A token that lets nobody in.
+    /// The token, session or sign-in was not accepted.
     #[error(transparent)]
-    Unrecognised(#[from] Unrecognised),
-    /// A certificate that lets nobody in.
+    Unrecognised(#[from] AuthenticationError),
+    /// The client certificate was not accepted.
     #[error(transparent)]
-    Uncertified(#[from] Uncertified),
-    /// A pairing code that pairs nobody.
+    Uncertified(#[from] CertificateRefusal),
+    /// The pairing code was not accepted.
     #[error(transparent)]
-    Uncoded(#[from] Uncoded),
-    /// A certificate that is not made.
+    Uncoded(#[from] PairingCodeRefusal),
+    /// No certificate could be issued.
     #[error(transparent)]
     Uncertifiable(authority::Error),
-    /// The robot is not paired, and no code waits for it.
-    #[error("no robot {name:?} is paired, and no pairing code waits for one")]
+    /// The robot is not paired, and no pairing code is pending for it.
+    #[error("robot {name:?} is not paired and has no pending pairing code")]
     UnknownPairing {
-        /// Asked for.
+        /// Requested name.
         name: String,
-        /// Those that there are.
+        /// Existing pairings.
         exists: Vec<String>,
     },
-    /// HTTP without TLS, where TLS is spoken.
-    #[error("this port speaks https, and this request came as plain text")]
+    /// Plain HTTP on a port that uses TLS.
+    #[error("this port requires https, but the request was plain http")]
     PlainText {
-        /// The address to ask instead.
+        /// URL to use instead.
         instead: String,
     },
-    /// The request comes from a page that is not ours, or is addressed to another host.
+    /// The request comes from another site's page, or is addressed to another host.
     #[error("{what}")]
     Foreign {
-        /// What was wrong.
+        /// Description of what is wrong.
         what: String,
-        /// The next step.
+        /// Next step for the client.
         next: String,
     },
-    /// The policy does not allow it.
+    /// The policy does not allow the request.
     #[error("{what}")]
     Forbidden {
-        /// Who may not do what.
+        /// Description: the caller, and what it may not do.
         what: String,
     },
     /// No token of that name, or it was revoked.
-    #[error("there is no token {name:?} that could be used")]
+    #[error("there is no valid token {name:?}")]
     UnknownToken {
-        /// Asked for.
+        /// Requested name.
         name: String,
-        /// Those that there are.
+        /// Existing tokens.
         exists: Vec<String>,
     },
-    /// The name is another token's.
+    /// The token's name is taken.
     #[error("there is a token {0:?} already")]
     TokenExists(String),
     /// No account of that name.
     #[error("there is no account {name:?}")]
     UnknownAccount {
-        /// Asked for.
+        /// Requested name.
         name: String,
-        /// Those that there are.
+        /// Existing accounts.
         exists: Vec<String>,
     },
-    /// The name is another account's.
+    /// The account's name is taken.
     #[error("there is an account {0:?} already")]
     AccountExists(String),
-    /// The name is that of a robot that is paired, or for which a code waits.
-    #[error("there is a robot {0:?} already, which is paired or is to be")]
+    /// The name belongs to a robot that is paired or has a pending pairing code.
+    #[error("robot {0:?} is already paired or has a pending pairing code")]
     PairingExists(String),
-    /// The password is wrong, or there is no such account: which of both is not said.
+    /// Wrong password or unknown account; which of the two is not revealed.
     #[error("name or password is wrong")]
     WrongPassword,
     /// No identity provider is configured.
-    #[error("no identity provider knows people here")]
+    #[error("no identity provider is configured")]
     NoProvider,
-    /// The identity provider, or what came from it.
+    /// The sign-in through the identity provider failed.
     #[error(transparent)]
     Provider(#[from] oidc::Error),
-    /// Somebody has signed in who may nothing here.
-    #[error("{who} has signed in, and none of its groups has a role here: {has}")]
+    /// A person signed in whose groups have no role here.
+    #[error("{who} signed in, but is in no group that has a role here: {has}")]
     NoRole {
-        /// By what it would be known here.
+        /// Name that the person would have here.
         who: String,
-        /// The groups that it has.
+        /// Groups of the person.
         has: String,
     },
-    /// Too many sign in at once.
-    #[error("too many people sign in at once")]
+    /// Too many sign-ins at once.
+    #[error("too many sign-ins at once")]
     SignInBusy,
-    /// One has more streams open than one may.
-    #[error("{most} streams are open already, as many as one may have")]
+    /// The caller has too many open streams.
+    #[error("{most} streams are already open, which is the limit")]
     TooManyStreams {
-        /// So many.
+        /// The limit.
         most: usize,
     },
-    /// A servant is looked into by as many as may.
+    /// Too many connections look into the servant.
     #[error(
-        "servant {servant} is looked into by as many as may at once: {most}, and {each} of each"
+        "too many connections look into servant {servant}: the limit is {most}, and {each} for each user"
     )]
     TooManyLook {
-        /// Which.
+        /// Id of the servant.
         servant: String,
-        /// So many, all together.
+        /// Limit on all connections.
         most: usize,
-        /// So many of each principal.
+        /// Limit on the connections of each principal.
         each: usize,
     },
-    /// A servant's ROS is not there yet, or not any more.
-    #[error("nobody can look into servant {0}: it is starting, or ending")]
+    /// The servant's ROS is not available yet, or no longer.
+    #[error("cannot look into servant {0}: it is starting or ending")]
     NotThereYet(String),
-    /// No black box listens to the servant.
-    #[error("nothing of servant {0} is kept")]
+    /// The servant has no black box.
+    #[error("servant {0} has no ring-buffer recording")]
     NoBlackBox(String),
-    /// No such file.
+    /// No such recording.
     #[error("there is no recording {0}")]
     UnknownRecording(String),
-    /// A file of a servant's last seconds is not written.
-    #[error("the last seconds of servant {servant} are not recorded: {reason}")]
+    /// The servant's last seconds could not be recorded.
+    #[error("the last seconds of servant {servant} could not be recorded: {reason}")]
     NotRecorded {
-        /// Whose.
+        /// Id of the servant.
         servant: String,
-        /// Why.
+        /// Reason of the failure.
         reason: String,
     },
-    /// A file of a servant's last seconds was taken a moment ago.
+    /// The servant's last seconds were recorded a moment ago.
     #[error("the last seconds of servant {servant} were recorded a moment ago")]
     RecordedLately {
-        /// Whose.
+        /// Id of the servant.
         servant: String,
-        /// In so many seconds again.
+        /// Seconds to wait.
         again: u64,
     },
     /// No such rule of the policy.
     #[error("the policy has no rule {id:?}")]
     UnknownRule {
-        /// Asked for.
+        /// Requested rule.
         id: String,
-        /// Those that there are.
+        /// Existing rules.
         exists: Vec<String>,
     },
-    /// Another token owns the robot's name.
+    /// The robot's name belongs to another token.
     #[error("the robot name {0:?} belongs to another token")]
     RobotTaken(String),
-    /// A body is too big.
-    #[error("the body is bigger than {limit}")]
+    /// The body is too large.
+    #[error("the body is larger than {limit}")]
     BodyTooLarge {
-        /// What is allowed.
+        /// Maximum size.
         limit: api::Size,
     },
-    /// What a service is tried with is too big.
-    #[error("the recording or picture is bigger than {limit}")]
+    /// The recording or picture is too large.
+    #[error("the recording or picture is larger than {limit}")]
     TrialTooLarge {
-        /// What is allowed.
+        /// Maximum size.
         limit: api::Size,
     },
-    /// A body does not fit into its sender's memory budget.
-    #[error("there is no memory for the body: {0}")]
+    /// The body exceeds its sender's memory budget.
+    #[error("not enough memory for the body: {0}")]
     Memory(#[from] budget::Exceeded),
-    /// A body is not complete in time.
-    #[error("the body is not complete after {} s", after.as_secs())]
+    /// The body was not complete in time.
+    #[error("the body was not complete after {} s", after.as_secs())]
     Unfinished {
-        /// The time that it may take.
+        /// The timeout.
         after: std::time::Duration,
     },
-    /// Pushes.
+    /// The push failed.
     #[error(transparent)]
     Push(#[from] push::Error),
-    /// Servants.
+    /// The choreographer refused or failed.
     #[error(transparent)]
     Choreographer(#[from] choreographer::Error),
-    /// What is published.
+    /// The catalogue refused or failed.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),
-    /// The state database.
+    /// The state database failed.
     #[error(transparent)]
     State(#[from] store::Error),
-    /// The image store.
+    /// The image store failed.
     #[error("the image store: {0}")]
     Image(#[from] image::Error),
-    /// A task of the daemon broke.
-    #[error("the daemon failed at {0}; its log says more")]
+    /// A task of the daemon failed.
+    #[error("the daemon failed at {0}; see its log for details")]
     Internal(&'static str),
 }
 
 impl Error {
-    /// What happened and, where a log explains it, its last line: for a status message.
-    pub fn in_a_line(&self) -> String {
+    /// Formats the error for a status message: what happened, and the last line of the log if one explains it.
+    pub fn one_line(&self) -> String {
         match self.log() {
-            Some(log) => with_last_words(&self.to_string(), log),
-            None if self.is_of_terms() => {
-                format!("{self}; {}", self.next())
+            Some(log) => with_last_log_line(&self.to_string(), log),
+            None if self.is_terms_refusal() => {
+                format!("{self}; {}", self.next_step())
             }
             None => self.to_string(),
         }
     }
 }
 
-impl From<access::Refusal> for Error {
-    fn from(refusal: access::Refusal) -> Error {
+impl From<access::AccessDenied> for Error {
+    fn from(refusal: access::AccessDenied) -> Error {
         Error::Forbidden {
             what: refusal.to_string(),
         }
@@ -260,25 +260,27 @@ impl From<access::Refusal> for Error {
 }
 
 impl Error {
-    /// Whether a robot is refused for as long as it asks for the same, on a machine of this configuration: for what it states, or since
-    /// its servant fits on no machine that is empty.
+    /// Returns true if the robot is refused as long as it asks for the same on a machine of this configuration:
+    /// because of its requirements, or because its servant does not fit even on an empty machine.
     pub fn is_final(&self) -> bool {
         use choreographer::Error as C;
-        let error = self.of_choreographer();
-        matches!(error, Some(C::Terms(_) | C::Full(Refused::TooBig { .. })))
-            || matches!(error, Some(C::NotResized { reason, .. }) if !matches!(&**reason, Unchanged::Full(_)))
+        let error = self.choreographer_error();
+        matches!(
+            error,
+            Some(C::Terms(_) | C::Full(AdmissionError::TooBig { .. }))
+        ) || matches!(error, Some(C::NotResized { reason, .. }) if !matches!(&**reason, ResizeError::Full(_)))
     }
 
-    /// Whether a robot is refused for what it states: then it is told in one line what it could.
-    fn is_of_terms(&self) -> bool {
+    /// Returns true if the robot is refused because of its requirements; the message then tells what it could state.
+    fn is_terms_refusal(&self) -> bool {
         matches!(
-            self.of_choreographer(),
+            self.choreographer_error(),
             Some(choreographer::Error::Terms(_) | choreographer::Error::NotResized { .. })
         )
     }
 }
 
-/// Seconds after which a full machine may be asked again.
+/// Default of `Retry-After` in seconds.
 const RETRY_AFTER: u64 = 10;
 
 /// Status, kind and title of a problem.
@@ -287,12 +289,16 @@ type Kind = (StatusCode, &'static str, &'static str);
 const INTERNAL: Kind = (
     StatusCode::INTERNAL_SERVER_ERROR,
     "internal",
-    "the daemon failed",
+    "internal error",
 );
-const ENDING: Kind = (StatusCode::SERVICE_UNAVAILABLE, "ending", "daemon ending");
+const ENDING: Kind = (
+    StatusCode::SERVICE_UNAVAILABLE,
+    "ending",
+    "daemon shutting down",
+);
 
 impl Error {
-    /// The problem that a client is told.
+    /// Returns the problem details for the client.
     pub fn problem(&self) -> Problem {
         let (status, kind, title) = self.kind();
         let mut problem = Problem {
@@ -300,7 +306,7 @@ impl Error {
             title: title.to_owned(),
             status: status.as_u16(),
             detail: self.to_string(),
-            next: Some(self.next()),
+            next: Some(self.next_step()),
             ..Problem::default()
         };
         if let Error::UnknownRobot { exists, .. }
@@ -314,8 +320,8 @@ impl Error {
         }
         if let Some(
             choreographer::Error::UnknownServant { exists, .. }
-            | choreographer::Error::Terms(Untenable::UnknownClass { exists, .. }),
-        ) = self.of_choreographer()
+            | choreographer::Error::Terms(TermsError::UnknownClass { exists, .. }),
+        ) = self.choreographer_error()
         {
             problem.exists = exists.clone();
         }
@@ -323,7 +329,7 @@ impl Error {
             catalogue::Error::UnknownService { exists, .. }
             | catalogue::Error::UnknownRevision { exists, .. }
             | catalogue::Error::UnknownArchitecture { exists, .. },
-        ) = self.of_catalogue()
+        ) = self.catalogue_error()
         {
             problem.exists = exists.clone();
         }
@@ -334,9 +340,11 @@ impl Error {
             StatusCode::SERVICE_UNAVAILABLE,
             StatusCode::TOO_MANY_REQUESTS,
         ];
-        let after = match (self, self.of_choreographer()) {
+        let after = match (self, self.choreographer_error()) {
             (
-                Error::Unrecognised(Unrecognised::Slowed(left) | Unrecognised::SlowedSignIn(left)),
+                Error::Unrecognised(
+                    AuthenticationError::Slowed(left) | AuthenticationError::SlowedSignIn(left),
+                ),
                 _,
             ) => left.div_ceil(1000),
             (_, Some(choreographer::Error::BackOff { again, .. })) => {
@@ -349,8 +357,8 @@ impl Error {
         problem
     }
 
-    /// The refusal of the choreographer that it passes on.
-    fn of_choreographer(&self) -> Option<&choreographer::Error> {
+    /// Returns the choreographer's error that this error wraps, if any.
+    fn choreographer_error(&self) -> Option<&choreographer::Error> {
         match self {
             Error::Choreographer(error) | Error::Push(push::Error::Choreographer(error)) => {
                 Some(error)
@@ -359,22 +367,22 @@ impl Error {
         }
     }
 
-    /// The refusal of the catalogue that it passes on.
-    fn of_catalogue(&self) -> Option<&catalogue::Error> {
+    /// Returns the catalogue's error that this error wraps, if any.
+    fn catalogue_error(&self) -> Option<&catalogue::Error> {
         match self {
             Error::Catalogue(error) | Error::Push(push::Error::Catalogue(error)) => Some(error),
-            _ => match self.of_choreographer()? {
+            _ => match self.choreographer_error()? {
                 choreographer::Error::Catalogue(error) => Some(error),
                 _ => None,
             },
         }
     }
 
-    /// The log that explains it.
+    /// Returns the log that explains the error, if any.
     fn log(&self) -> Option<&[String]> {
         match self {
             Error::Push(push::Error::Failed { log, .. }) => Some(log),
-            _ => match self.of_choreographer()? {
+            _ => match self.choreographer_error()? {
                 choreographer::Error::Servant { log, .. } => Some(log),
                 _ => None,
             },
@@ -385,52 +393,52 @@ impl Error {
         use StatusCode as S;
         match self {
             Error::UnknownRobot { .. } => (S::NOT_FOUND, "unknown-robot", "unknown robot"),
-            Error::UnknownRow { .. } => (S::NOT_FOUND, "unknown-row", "unknown row"),
-            Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "nothing there"),
-            Error::OtherMethod { .. } => {
-                (S::METHOD_NOT_ALLOWED, "other-method", "method not answered")
-            }
+            Error::UnknownRow { .. } => (S::NOT_FOUND, "unknown-row", "unknown entry"),
+            Error::UnknownPath { .. } => (S::NOT_FOUND, "unknown-path", "not found"),
+            Error::OtherMethod { .. } => (
+                S::METHOD_NOT_ALLOWED,
+                "other-method",
+                "method not supported",
+            ),
             Error::BodyTooLarge { .. } | Error::TrialTooLarge { .. } => {
                 (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
             }
-            Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "no memory for it"),
-            Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body not complete"),
+            Error::Memory(_) => (S::SERVICE_UNAVAILABLE, "memory", "not enough memory"),
+            Error::Unfinished { .. } => (S::REQUEST_TIMEOUT, "unfinished", "body incomplete"),
             Error::BadRequest(_) => (S::BAD_REQUEST, "bad-request", "bad request"),
-            Error::Unstatable(_) => (S::BAD_REQUEST, "unstatable", "cannot be stated"),
+            Error::Unstatable(_) => (S::BAD_REQUEST, "unstatable", "invalid terms"),
             Error::WebSocketVersion => (
                 S::UPGRADE_REQUIRED,
                 "websocket-version",
-                "other WebSocket version needed",
+                "WebSocket version not supported",
             ),
-            Error::Unrecognised(Unrecognised::Slowed(_)) => {
+            Error::Unrecognised(AuthenticationError::Slowed(_)) => {
                 (S::TOO_MANY_REQUESTS, "guessing", "too many unknown tokens")
             }
-            Error::Unrecognised(Unrecognised::SlowedSignIn(_)) => {
+            Error::Unrecognised(AuthenticationError::SlowedSignIn(_)) => {
                 (S::TOO_MANY_REQUESTS, "guessing", "too many wrong passwords")
             }
-            Error::Unrecognised(Unrecognised::SessionOver) => {
-                (S::UNAUTHORIZED, "unauthorised", "session over")
+            Error::Unrecognised(AuthenticationError::SessionOver) => {
+                (S::UNAUTHORIZED, "unauthorised", "session ended")
             }
-            Error::WrongPassword => (S::UNAUTHORIZED, "wrong-password", "not signed in"),
+            Error::WrongPassword => (S::UNAUTHORIZED, "wrong-password", "sign-in failed"),
             Error::TooManyStreams { .. } => {
                 (S::TOO_MANY_REQUESTS, "too-many-streams", "too many streams")
             }
             Error::TooManyLook { .. } => (
                 S::TOO_MANY_REQUESTS,
                 "too-many-look",
-                "too many look inside",
+                "too many connections inside",
             ),
-            Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not there yet"),
-            Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "nothing is kept"),
+            Error::NotThereYet(_) => (S::CONFLICT, "not-ready", "not ready"),
+            Error::NoBlackBox(_) => (S::CONFLICT, "no-black-box", "no ring-buffer recording"),
             Error::UnknownRecording(_) => (S::NOT_FOUND, "unknown-recording", "unknown recording"),
             Error::NotRecorded { .. } => (S::INSUFFICIENT_STORAGE, "not-recorded", "not recorded"),
-            Error::RecordedLately { .. } => (
-                S::TOO_MANY_REQUESTS,
-                "recorded-lately",
-                "recorded a moment ago",
-            ),
+            Error::RecordedLately { .. } => {
+                (S::TOO_MANY_REQUESTS, "recorded-lately", "already recorded")
+            }
             Error::SignInBusy | Error::Provider(oidc::Error::Busy) => {
-                (S::SERVICE_UNAVAILABLE, "busy", "too many sign in")
+                (S::SERVICE_UNAVAILABLE, "busy", "too many sign-ins")
             }
             Error::NoProvider => (S::NOT_FOUND, "no-provider", "no identity provider"),
             Error::NoRole { .. } => (S::FORBIDDEN, "no-role", "not allowed"),
@@ -447,14 +455,14 @@ impl Error {
                 (S::PAYLOAD_TOO_LARGE, "too-large", "body too large")
             }
             Error::Uncertifiable(_) => {
-                (S::BAD_REQUEST, "no-request", "no request for a certificate")
+                (S::BAD_REQUEST, "no-request", "invalid certificate request")
             }
             Error::UnknownPairing { .. } => (S::NOT_FOUND, "unknown-pairing", "unknown robot"),
             Error::UnknownAccount { .. } => (S::NOT_FOUND, "unknown-account", "unknown account"),
             Error::AccountExists(_) => (S::CONFLICT, "account-exists", "name taken"),
             Error::PairingExists(_) => (S::CONFLICT, "pairing-exists", "name taken"),
-            Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https is spoken here"),
-            Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from elsewhere"),
+            Error::PlainText { .. } => (S::BAD_REQUEST, "plain-text", "https required"),
+            Error::Foreign { .. } => (S::FORBIDDEN, "foreign", "request from another site"),
             Error::Forbidden { .. } => (S::FORBIDDEN, "forbidden", "not allowed"),
             Error::UnknownToken { .. } => (S::NOT_FOUND, "unknown-token", "unknown token"),
             Error::TokenExists(_) => (S::CONFLICT, "token-exists", "name taken"),
@@ -473,12 +481,12 @@ fn kind_of_provider(error: &oidc::Error) -> Kind {
     use oidc::Error as O;
     match error {
         O::Unreachable { .. } | O::Client { .. } | O::NoAddress(_) => {
-            (S::BAD_GATEWAY, "provider", "no answer of the provider")
+            (S::BAD_GATEWAY, "provider", "identity provider failed")
         }
-        O::Busy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign in"),
-        O::UnknownState | O::OtherBrowser => (S::BAD_REQUEST, "sign-in", "not signed in"),
-        O::Denied { .. } => (S::FORBIDDEN, "denied", "not signed in"),
-        O::Code { .. } | O::Token { .. } => (S::UNAUTHORIZED, "sign-in", "not signed in"),
+        O::Busy => (S::SERVICE_UNAVAILABLE, "busy", "too many sign-ins"),
+        O::UnknownState | O::OtherBrowser => (S::BAD_REQUEST, "sign-in", "sign-in failed"),
+        O::Denied { .. } => (S::FORBIDDEN, "denied", "sign-in failed"),
+        O::Code { .. } | O::Token { .. } => (S::UNAUTHORIZED, "sign-in", "sign-in failed"),
     }
 }
 
@@ -504,24 +512,22 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
     use choreographer::Error as C;
     match error {
         C::UnknownServant { .. } => (S::NOT_FOUND, "unknown-servant", "unknown servant"),
-        C::Full(Refused::TooBig { .. }) => (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit"),
-        C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
+        C::Full(AdmissionError::TooBig { .. }) => {
+            (S::UNPROCESSABLE_ENTITY, "too-big", "does not fit")
+        }
+        C::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no capacity"),
         C::Terms(untenable) => kind_of_terms(untenable),
         C::NotResized { reason, .. } => match &**reason {
-            Unchanged::Untenable(untenable) => kind_of_terms(untenable),
-            Unchanged::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no room"),
-            Unchanged::Used { .. } => (S::CONFLICT, "in-use", "more is in use"),
-            Unchanged::Many => (S::CONFLICT, "too-many", "too many state something"),
+            ResizeError::Untenable(untenable) => kind_of_terms(untenable),
+            ResizeError::Full(_) => (S::SERVICE_UNAVAILABLE, "full", "no capacity"),
+            ResizeError::Used { .. } => (S::CONFLICT, "in-use", "more memory in use"),
+            ResizeError::Many => (S::CONFLICT, "too-many", "too many stubs with terms"),
         },
         C::Place { .. } => (S::CONFLICT, "place", "no container"),
         C::Servant { .. } => (S::BAD_GATEWAY, "servant-failed", "servant failed"),
         C::NoRollout(_) => (S::NOT_FOUND, "no-rollout", "no rollout"),
         C::Rollout(_) => (S::CONFLICT, "rollout", "no such rollout"),
-        C::BackOff { .. } => (
-            S::SERVICE_UNAVAILABLE,
-            "back-off",
-            "servant fails again and again",
-        ),
+        C::BackOff { .. } => (S::SERVICE_UNAVAILABLE, "back-off", "servant keeps failing"),
         C::Ending => ENDING,
         C::Catalogue(error) => kind_of_catalogue(error),
         C::Engine(error) => kind_of_engine(error),
@@ -536,21 +542,21 @@ fn kind_of_choreographer(error: &choreographer::Error) -> Kind {
     }
 }
 
-fn kind_of_terms(untenable: &Untenable) -> Kind {
+fn kind_of_terms(untenable: &TermsError) -> Kind {
     use StatusCode as S;
     match untenable {
-        Untenable::UnknownClass { .. } => (S::BAD_REQUEST, "unknown-class", "unknown class"),
-        Untenable::Capped { .. } | Untenable::Beyond { .. } => {
-            (S::FORBIDDEN, "capped", "more than is allowed")
+        TermsError::UnknownClass { .. } => (S::BAD_REQUEST, "unknown-class", "unknown class"),
+        TermsError::Capped { .. } | TermsError::Beyond { .. } => {
+            (S::FORBIDDEN, "capped", "more than allowed")
         }
-        Untenable::Unmet { .. } => (S::UNPROCESSABLE_ENTITY, "unmet", "cannot be reached"),
+        TermsError::Unmet { .. } => (S::UNPROCESSABLE_ENTITY, "unmet", "SLA cannot be met"),
     }
 }
 
 fn kind_of_engine(error: &servant::Error) -> Kind {
     match error {
         servant::Error::Grant(_) => (StatusCode::FORBIDDEN, "not-granted", "not granted"),
-        servant::Error::Refused { .. } => (StatusCode::CONFLICT, "refused", "the servant refused"),
+        servant::Error::Refused { .. } => (StatusCode::CONFLICT, "refused", "servant refused"),
         _ => INTERNAL,
     }
 }
@@ -567,7 +573,7 @@ fn kind_of_catalogue(error: &catalogue::Error) -> Kind {
             (S::NOT_FOUND, "unknown-architecture", "unknown architecture")
         }
         C::Name(NameError::Reserved(_)) => (S::CONFLICT, "reserved-name", "reserved name"),
-        C::Name(_) => (S::BAD_REQUEST, "bad-name", "name not allowed"),
+        C::Name(_) => (S::BAD_REQUEST, "bad-name", "invalid name"),
         C::Inventory(_) => (S::UNPROCESSABLE_ENTITY, "push-failed", "push failed"),
         C::State(_) | C::Image(_) | C::Internal(_) => INTERNAL,
     }
@@ -589,7 +595,7 @@ impl IntoResponse for Error {
     }
 }
 
-/// A problem as an HTTP answer.
+/// Builds the HTTP response of a problem.
 pub fn respond(problem: &Problem) -> Response {
     let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
     if status.is_server_error() && status != StatusCode::SERVICE_UNAVAILABLE {
@@ -615,7 +621,7 @@ pub fn respond(problem: &Problem) -> Response {
 mod tests {
     use super::*;
 
-    fn refused(refused: Refused) -> Error {
+    fn refusal(refused: AdmissionError) -> Error {
         choreographer::Error::from(refused).into()
     }
 
@@ -637,7 +643,7 @@ mod tests {
 
     #[test]
     fn a_full_machine_says_when_to_come_again() {
-        let response = refused(Refused::QueueFull { waiting: 3 }).into_response();
+        let response = refusal(AdmissionError::QueueFull { waiting: 3 }).into_response();
         assert_eq!(response.status(), 503);
         assert_eq!(response.headers()[header::RETRY_AFTER], "10");
         assert_eq!(response.headers()[header::CONTENT_TYPE], PROBLEM_JSON);
@@ -646,7 +652,7 @@ mod tests {
     #[test]
     fn what_can_never_fit_is_not_to_be_tried_again() {
         let amount = choreographer::Amount::new(64.0, 1);
-        let problem = refused(Refused::TooBig {
+        let problem = refusal(AdmissionError::TooBig {
             wanted: amount,
             capacity: amount,
         })
@@ -676,7 +682,7 @@ mod tests {
             (Error::Unfinished { after }, "raise unfinished"),
             (
                 Error::Choreographer(choreographer::Error::Ending),
-                "started again",
+                "has restarted",
             ),
         ] {
             let problem = error.problem();
@@ -694,7 +700,7 @@ mod tests {
 
     #[test]
     fn who_guesses_is_told_when_to_come_again() {
-        let response = Error::from(Unrecognised::Slowed(3_001)).into_response();
+        let response = Error::from(AuthenticationError::Slowed(3_001)).into_response();
         assert_eq!(response.status(), 429);
         assert_eq!(response.headers()[header::RETRY_AFTER], "4");
     }
@@ -707,9 +713,9 @@ mod tests {
             " ".to_owned(),
         ];
         assert_eq!(
-            with_last_words("it ended", &log),
+            with_last_log_line("it ended", &log),
             "it ended; its log ends with: no map file"
         );
-        assert_eq!(with_last_words("it ended", &[]), "it ended");
+        assert_eq!(with_last_log_line("it ended", &[]), "it ended");
     }
 }

@@ -1,4 +1,4 @@
-//! `/api/v1/events`: the journal, as it is and as it grows.
+//! `/api/v1/events`: the journal, as a list and as a stream.
 
 use std::sync::Arc;
 
@@ -7,26 +7,26 @@ use axum::response::Response;
 use axum::{Extension, Json};
 use futures_util::StreamExt;
 use serde::Deserialize;
-use store::{EventFilter, Told};
+use store::{EventFilter, EventVisibility};
 use tokio::sync::watch;
 use utoipa::IntoParams;
 
-use crate::api_v1::{Answer, lines};
+use crate::api_v1::{JsonResult, json_lines};
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
 use crate::query::Query;
 
-/// Events of one answer, where nobody says how many.
+/// Default number of events in a response.
 const EVENTS: u32 = 100;
 
-/// Which events.
+/// Query of the journal.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Which {
+pub struct EventQuery {
     /// Only events with a greater number.
     #[serde(default)]
     since: i64,
-    /// So many of the newest that there are; 100 by default.
+    /// Number of events, the newest ones (default: 100).
     limit: Option<u32>,
     /// Only events of this kind, such as `node-hung`.
     kind: Option<String>,
@@ -38,8 +38,8 @@ pub struct Which {
     robot: Option<String>,
 }
 
-impl Which {
-    /// The newest `limit` of them after number `since` that the caller is told of, oldest first.
+impl EventQuery {
+    /// Returns the newest `limit` events after number `since` that the caller may see, oldest first.
     fn read(
         &self,
         app: &App,
@@ -47,8 +47,8 @@ impl Which {
         since: i64,
         limit: u32,
     ) -> Result<Vec<api::Event>, Error> {
-        let services = services_seen(app, caller)?;
-        let told = services.as_deref().map(|services| Told {
+        let services = visible_services(app, caller)?;
+        let told = services.as_deref().map(|services| EventVisibility {
             services,
             own_robot: caller.who.principal.scope.robot.as_deref(),
         });
@@ -59,51 +59,55 @@ impl Which {
             robot: self.robot.as_deref(),
             told,
         };
-        Ok(app.state.events_of(filter, since, limit)?)
+        Ok(app.state.filtered_events(filter, since, limit)?)
     }
 }
 
-/// Services with events that the caller may see, by name; none where it sees all that there is.
-pub fn services_seen(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
+/// Returns the services with events that the caller may see, or `None` if it may see everything.
+pub fn visible_services(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
     if caller.who.principal.sees_all() {
         return Ok(None);
     }
-    let mut services = app.state.services_of_events()?;
-    services.retain(|service| caller.sees(app, service));
+    let mut services = app.state.services_with_events()?;
+    services.retain(|service| caller.can_see(app, service));
     Ok(Some(services))
 }
 
-/// Whether somebody who does not see all is told of an event: a robot is told of itself, and everybody of services that they see;
-/// the machine's own are for those who see it.
-pub fn is_told(caller: &Caller, event: &api::Event, sees: &mut impl FnMut(&str) -> bool) -> bool {
+/// Returns true if a caller that does not see everything may see the event: a robot sees its own events, everybody
+/// those of services that they see; the machine's own events require access to the machine.
+pub fn is_visible(
+    caller: &Caller,
+    event: &api::Event,
+    sees: &mut impl FnMut(&str) -> bool,
+) -> bool {
     let own = caller.who.principal.scope.robot.as_deref();
     event.service.as_deref().is_some_and(sees)
         && own.is_none_or(|own| event.robot.as_deref().is_none_or(|robot| robot == own))
 }
 
-/// The journal.
+/// Lists events of the journal.
 pub async fn events(
     State(app): State<Arc<App>>,
-    Query(which): Query<Which>,
+    Query(which): Query<EventQuery>,
     Extension(caller): Extension<Caller>,
-) -> Answer<Vec<api::Event>> {
+) -> JsonResult<Vec<api::Event>> {
     let limit = which.limit.unwrap_or(EVENTS);
     Ok(Json(which.read(&app, &caller, which.since, limit)?))
 }
 
-/// One who follows the journal.
+/// A caller that follows the journal.
 struct Follower {
     app: Arc<App>,
     caller: Caller,
-    which: Which,
-    /// Tells that there are more.
+    which: EventQuery,
+    /// Notifies of new events.
     grown: watch::Receiver<i64>,
-    /// The number of the last that was looked at.
+    /// Number of the last event examined.
     last: i64,
 }
 
 impl Follower {
-    /// What there is more of, as soon as there is some; none where it cannot be read: who follows asks again, and is told why.
+    /// Waits for new events; `None` if the journal cannot be read. The client then asks again and is told the reason.
     async fn next(&mut self) -> Option<Vec<api::Event>> {
         loop {
             self.grown.changed().await.ok()?;
@@ -122,20 +126,20 @@ impl Follower {
     }
 }
 
-/// The journal, and what comes to it from now on, until the caller leaves or may not know it any more. A caller that comes back
-/// with the number of the last event it was told of misses none.
+/// Streams the journal and new events until the caller disconnects or loses access. A caller that reconnects with the
+/// number of its last event misses none.
 pub async fn follow(
     State(app): State<Arc<App>>,
-    Query(which): Query<Which>,
+    Query(which): Query<EventQuery>,
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
-    let place = app.live.place(&caller)?;
-    // First, so that none is missed that comes meanwhile.
+    let place = app.live.acquire_slot(&caller)?;
+    // Subscribes before reading, so that no event is missed in between.
     let mut grown = app.state.watch_events();
     let newest = *grown.borrow_and_update();
     let limit = which.limit.unwrap_or(EVENTS);
     let there = which.read(&app, &caller, which.since, limit)?;
-    let ending = caller.over(&app, "");
+    let ending = caller.wait_for_end(&app, "");
     let last = there.last().map_or(newest, |event| event.id.max(newest));
     let follower = Follower {
         last: last.max(which.since),
@@ -149,7 +153,7 @@ pub async fn follow(
         Some((events, (follower, place)))
     });
     let all = futures_util::stream::once(async { there }).chain(more);
-    Ok(lines(
+    Ok(json_lines(
         all.flat_map(futures_util::stream::iter).take_until(ending),
     ))
 }

@@ -1,4 +1,5 @@
-//! Why is this robot slow, or on its local original? Gathers what its stubs tell and what the kernel counts; `causes` judges.
+//! Explains why a robot is slow or on its local original: gathers what its stubs report and what the kernel counts;
+//! `causes` draws the conclusions.
 
 mod causes;
 
@@ -8,28 +9,28 @@ use std::time::Duration;
 
 use api::Event;
 use api::explain::{Explanation, Link, Part, Served, dominant};
-use link::control::{Refused, Request};
+use link::control::{IncompatibleEndpoint, RequestTiming};
 use reach::links::LinkStatus;
 
 use crate::app::App;
 use crate::errors::Error;
-use crate::events::services_seen;
+use crate::events::visible_services;
 use crate::guard::Caller;
 use choreographer::{Choreographer, Handle};
-use store::{EventFilter, Told};
+use store::{EventFilter, EventVisibility};
 
-/// Between two looks at what a servant uses.
+/// Interval between two samples of a servant's resource usage.
 const MOMENT: Duration = Duration::from_millis(400);
-/// Events that are told.
+/// Number of events included.
 const EVENTS: u32 = 8;
 
 /// Explains one robot.
-pub async fn robot(app: &App, caller: &Caller, name: &str) -> Result<Explanation, Error> {
+pub async fn explain_robot(app: &App, caller: &Caller, name: &str) -> Result<Explanation, Error> {
     let choreographer = &app.choreographer;
     let mut all = choreographer.servants();
-    all.retain(|handle| caller.sees_servant(app, handle));
+    all.retain(|handle| caller.can_see_servant(app, handle));
     let mine: Vec<&Arc<Handle>> = all.iter().filter(|handle| handle.robot == name).collect();
-    let events = events(app, caller, name)?;
+    let events = recent_events(app, caller, name)?;
     if mine.is_empty() && events.is_empty() {
         let mut exists: Vec<String> = all.iter().map(|handle| handle.robot.clone()).collect();
         exists.sort();
@@ -39,36 +40,38 @@ pub async fn robot(app: &App, caller: &Caller, name: &str) -> Result<Explanation
             exists,
         });
     }
-    let servants =
-        futures_util::future::join_all(mine.iter().map(|handle| served(choreographer, handle)))
-            .await;
+    let servants = futures_util::future::join_all(
+        mine.iter()
+            .map(|handle| sample_servant(choreographer, handle)),
+    )
+    .await;
     Ok(Explanation {
         robot: name.to_owned(),
-        causes: causes::causes(
+        causes: causes::find_causes(
             &servants,
             &events,
-            &failing(choreographer, name),
-            &waiting(choreographer, &servants),
+            &robot_back_offs(choreographer, name),
+            &waiting_rollouts(choreographer, &servants),
         ),
         servants,
         events,
     })
 }
 
-fn events(app: &App, caller: &Caller, robot: &str) -> Result<Vec<Event>, Error> {
-    let services = services_seen(app, caller)?;
+fn recent_events(app: &App, caller: &Caller, robot: &str) -> Result<Vec<Event>, Error> {
+    let services = visible_services(app, caller)?;
     let of_it = EventFilter {
         robot: Some(robot),
-        told: services.as_deref().map(|services| Told {
+        told: services.as_deref().map(|services| EventVisibility {
             services,
             own_robot: Some(robot),
         }),
         ..EventFilter::default()
     };
-    Ok(app.state.events_of(of_it, 0, EVENTS)?)
+    Ok(app.state.filtered_events(of_it, 0, EVENTS)?)
 }
 
-async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {
+async fn sample_servant(choreographer: &Choreographer, handle: &Handle) -> Served {
     let before = choreographer.describe(handle).await;
     tokio::time::sleep(MOMENT).await;
     let servant = choreographer.describe(handle).await;
@@ -86,23 +89,27 @@ async fn served(choreographer: &Choreographer, handle: &Handle) -> Served {
     }
 }
 
-/// The links to a servant, if it has got that far.
+/// Returns the links to a servant, if it has any yet.
 pub fn links(handle: &Handle) -> Vec<Link> {
     let status = handle.reach().map(|reach| reach.links());
-    status.unwrap_or_default().into_iter().map(link).collect()
+    status
+        .unwrap_or_default()
+        .into_iter()
+        .map(to_link)
+        .collect()
 }
 
-fn link(status: LinkStatus) -> Link {
+fn to_link(status: LinkStatus) -> Link {
     let millis = |seconds: f64| seconds * 1000.0;
     let max = status.sla.max.map(millis);
     let unpromised = status.sla.fallback_after.is_some();
-    let is_late = |request: &&Request| match (request.total, max) {
+    let is_late = |request: &&RequestTiming| match (request.total, max) {
         _ if unpromised => false,
         (Some(total), Some(max)) => total > max,
         (answered, _) => answered.is_none(),
     };
     let requests = &status.requests;
-    let late: Vec<&Request> = requests.iter().filter(is_late).collect();
+    let late: Vec<&RequestTiming> = requests.iter().filter(is_late).collect();
     let dropped = status.drops.iter().chain(&status.dropped);
     let here = status
         .drops
@@ -113,9 +120,9 @@ fn link(status: LinkStatus) -> Link {
         .chain(there.map(|drop| format!("on the robot {drop}")))
         .collect();
     let refused = status.refused.iter().map(|one| {
-        let Refused { topic, node, why } = one;
+        let IncompatibleEndpoint { topic, node, why } = one;
         format!(
-            "no messages of {topic} pass between {node} and {}: {why}",
+            "no messages on {topic} pass between {node} and {}: {why}",
             status.node
         )
     });
@@ -142,8 +149,8 @@ fn link(status: LinkStatus) -> Link {
         requests: requests.len(),
         late: late.len(),
         local: requests.iter().filter(|request| request.local).count(),
-        phases: parts(requests),
-        late_in: dominant(&parts(late)).cloned(),
+        phases: phase_times(requests),
+        late_in: dominant(&phase_times(late)).cloned(),
         unsent: status.unsent,
         given: status.given,
         left_out: status.left_out,
@@ -155,33 +162,34 @@ fn link(status: LinkStatus) -> Link {
     }
 }
 
-/// Where the time of those went that were answered.
-fn parts<'a>(requests: impl IntoIterator<Item = &'a Request>) -> Vec<Part> {
-    let answered: Vec<&Request> = requests
+/// Returns how the time of the answered requests is divided into phases.
+fn phase_times<'a>(requests: impl IntoIterator<Item = &'a RequestTiming>) -> Vec<Part> {
+    let answered: Vec<&RequestTiming> = requests
         .into_iter()
         .filter(|request| request.total.is_some())
         .collect();
-    let times = |of: fn(&Request) -> f64| answered.iter().map(|request| of(request)).collect();
+    let times =
+        |of: fn(&RequestTiming) -> f64| answered.iter().map(|request| of(request)).collect();
     let parts = [
-        Part::of("serialise", times(|request| request.serialise)),
-        Part::of("up", times(|request| request.up)),
-        Part::of("queue", times(|request| request.queue)),
-        Part::of("compute", times(|request| request.compute)),
-        Part::of("down", times(|request| request.down)),
-        Part::of("total", times(|request| request.total.unwrap_or(f64::NAN))),
+        Part::from_samples("serialise", times(|request| request.serialise)),
+        Part::from_samples("up", times(|request| request.up)),
+        Part::from_samples("queue", times(|request| request.queue)),
+        Part::from_samples("compute", times(|request| request.compute)),
+        Part::from_samples("down", times(|request| request.down)),
+        Part::from_samples("total", times(|request| request.total.unwrap_or(f64::NAN))),
     ];
     parts.into_iter().flatten().collect()
 }
 
-/// The robot's servants that are not started again yet, each with when they will be.
-fn failing(choreographer: &Choreographer, robot: &str) -> Vec<api::BackOff> {
+/// Returns the robot's failed servants that are not restarted yet.
+fn robot_back_offs(choreographer: &Choreographer, robot: &str) -> Vec<api::BackOff> {
     let mut all = choreographer.back_offs();
     all.retain(|one| one.robot == robot);
     all
 }
 
-/// Rollouts of the robot's services whose canaries are not promoted although their time has come.
-fn waiting(choreographer: &Choreographer, servants: &[Served]) -> Vec<api::Rollout> {
+/// Returns rollouts of the robot's services whose canaries are due but not promoted.
+fn waiting_rollouts(choreographer: &Choreographer, servants: &[Served]) -> Vec<api::Rollout> {
     let services = servants
         .iter()
         .map(|served| served.servant.service.as_str());

@@ -1,4 +1,4 @@
-//! `GET /api/v1/servants/ID/goals`: what became of the goals of a servant's actions.
+//! `GET /api/v1/servants/ID/goals`: the goals of a servant's actions and their outcomes.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,54 +8,55 @@ use api::goals::{Goal, GoalState};
 use axum::extract::{Path, State};
 use axum::{Extension, Json};
 use choreographer::Handle;
-use observe::{Goals, Sender};
-use ros::ros1::actions::messages::Status;
+use observe::{GoalMonitor, GoalSender};
+use ros::ros1::actions::messages::ActionlibStatus;
 use store::NewEvent;
 
-use crate::api_v1::Answer;
+use crate::api_v1::JsonResult;
 use crate::app::App;
 use crate::guard::Caller;
-use crate::inside::{self, Whose};
+use crate::inside::{self, InsideTarget};
 
-/// Event: a goal has ended.
+/// Event kind: a goal has ended.
 const GOAL_ENDED: &str = "goal-ended";
-/// In place of who sent it.
-const UNHEARD: &str = "who sent it was not heard";
-/// Between two such events of a servant on average; those that are too many are counted.
+/// Text used if the sender is unknown.
+const UNHEARD: &str = "unknown sender";
+/// Average interval between such events of a servant; those in excess are only counted.
 const PAUSE: Duration = Duration::from_secs(1);
-/// So many that end at once are told each.
+/// Number of goals ending at once that are reported individually.
 const FEW: usize = 5;
-/// A goal and its result come over two connections: so long the goal may come after it.
+/// Time by which a goal may arrive after its result, because they come over two connections.
 const SETTLES: Duration = Duration::from_millis(200);
 
-/// Goals that were sent to the servant and that the caller may hear of, the newest first.
+/// Lists the servant's goals that the caller may see, newest first.
 pub async fn goals(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
     Path(id): Path<String>,
-) -> Answer<Vec<Goal>> {
+) -> JsonResult<Vec<Goal>> {
     let handle = app.choreographer.servant(&id)?;
-    let whose = Whose {
+    let whose = InsideTarget {
         service: handle.service(),
         robot: &handle.robot,
         object: format_args!("servant {id}"),
     };
-    let grants = inside::grants(&app, &caller, whose)?;
+    let grants = inside::inside_grants(&app, &caller, whose)?;
     let goals = app.observers.goals(&id);
-    let mut all = goals.map(|goals| goals.all()).unwrap_or_default();
-    all.retain(|goal| may_hear(&grants, &goal.action));
-    let told = all.into_iter().map(|goal| told(&handle, goal));
+    let mut all = goals.map(|goals| goals.recent()).unwrap_or_default();
+    all.retain(|goal| can_see_goals(&grants, &goal.action));
+    let told = all.into_iter().map(|goal| to_api_goal(&handle, goal));
     Ok(Json(told.collect()))
 }
 
-/// Whether somebody may be told of the goals of an action: who may send some, and who may hear them and their results.
-fn may_hear(grants: &Grants, action: &str) -> bool {
+/// Returns true if the grants reveal the goals of an action: to those who may send goals, and to those who may
+/// subscribe to both goals and results.
+fn can_see_goals(grants: &Grants, action: &str) -> bool {
     let hears = |end: &str| grants.permits(Operation::Subscribe, &format!("{action}/{end}"));
     grants.permits(Operation::Call, action) || (hears("goal") && hears("result"))
 }
 
-/// Who sent a goal, in words; none where nobody has heard.
-fn sender(handle: &Handle, sender: &Sender) -> Option<String> {
+/// Describes the sender of a goal; `None` if it is unknown.
+fn describe_sender(handle: &Handle, sender: &GoalSender) -> Option<String> {
     let by_its_own = |node: &String| {
         let interface = &handle.revision.interface;
         let nodes = handle.revision.plan.nodes.iter();
@@ -63,15 +64,15 @@ fn sender(handle: &Handle, sender: &Sender) -> Option<String> {
             || nodes.map(|planned| &planned.name).any(|name| name == node)
     };
     match sender {
-        Sender::Inside => Some("somebody who looks inside".to_owned()),
-        Sender::Node(node) if by_its_own(node) => Some(format!("the servant's node {node}")),
-        Sender::Node(_) => Some(format!("robot {}", handle.robot)),
-        Sender::Unheard => None,
+        GoalSender::Inside => Some("somebody who looks inside".to_owned()),
+        GoalSender::Node(node) if by_its_own(node) => Some(format!("the servant's node {node}")),
+        GoalSender::Node(_) => Some(format!("robot {}", handle.robot)),
+        GoalSender::Unheard => None,
     }
 }
 
-fn told(handle: &Handle, goal: observe::Goal) -> Goal {
-    let by = sender(handle, &goal.sender);
+fn to_api_goal(handle: &Handle, goal: observe::ObservedGoal) -> Goal {
+    let by = describe_sender(handle, &goal.sender);
     let millis = |nanoseconds: u64| nanoseconds / 1_000_000;
     let ended = goal.ended.as_ref();
     Goal {
@@ -80,7 +81,9 @@ fn told(handle: &Handle, goal: observe::Goal) -> Goal {
         by: by.unwrap_or_else(|| UNHEARD.to_owned()),
         began: millis(goal.began),
         ended: ended.map(|(time, _)| millis(*time)),
-        state: ended.map_or(GoalState::Underway, |(_, outcome)| state(outcome.status)),
+        state: ended.map_or(GoalState::Underway, |(_, outcome)| {
+            to_goal_state(outcome.status)
+        }),
         text: goal
             .ended
             .map(|(_, outcome)| outcome.text)
@@ -88,26 +91,26 @@ fn told(handle: &Handle, goal: observe::Goal) -> Goal {
     }
 }
 
-fn state(status: Status) -> GoalState {
+fn to_goal_state(status: ActionlibStatus) -> GoalState {
     match status {
-        Status::Preempted => GoalState::Preempted,
-        Status::Succeeded => GoalState::Succeeded,
-        Status::Aborted => GoalState::Aborted,
-        Status::Rejected => GoalState::Rejected,
-        Status::Recalled => GoalState::Recalled,
+        ActionlibStatus::Preempted => GoalState::Preempted,
+        ActionlibStatus::Succeeded => GoalState::Succeeded,
+        ActionlibStatus::Aborted => GoalState::Aborted,
+        ActionlibStatus::Rejected => GoalState::Rejected,
+        ActionlibStatus::Recalled => GoalState::Recalled,
         _ => GoalState::Lost,
     }
 }
 
-/// Has the journal say what becomes of goals, as long as they are heard.
-pub fn tell(app: &Arc<App>, handle: &Handle, goals: &Arc<Goals>) {
+/// Writes the outcomes of goals to the journal for as long as they are observed.
+pub fn report_ended_goals(app: &Arc<App>, handle: &Handle, goals: &Arc<GoalMonitor>) {
     let Ok(handle) = app.choreographer.servant(&handle.id) else {
         return;
     };
-    let mut ended = goals.ended();
+    let mut ended = goals.subscribe_ended();
     let goals = Arc::downgrade(goals);
     let app = Arc::clone(app);
-    // None of the sessions that the daemon waits for when it ends: it goes on until then.
+    // Not one of the sessions that the daemon waits for when it stops: it runs until then.
     tokio::spawn(async move {
         let telling = async {
             let mut before = 0;
@@ -117,12 +120,12 @@ pub fn tell(app: &Arc<App>, handle: &Handle, goals: &Arc<Goals>) {
                     return;
                 };
                 let count = *ended.borrow_and_update();
-                let (more, few) = few(all, &mut before, count);
+                let (more, few) = take_latest(all, &mut before, count);
                 let pause = PAUSE * u32::try_from(few.len()).unwrap_or(1);
                 let last = few.len().saturating_sub(1);
                 for (at, goal) in few.into_iter().enumerate() {
                     let more = if at == last { more } else { 0 };
-                    journal(&app, &handle, goal, more);
+                    journal_goal(&app, &handle, goal, more);
                 }
                 tokio::time::sleep(pause).await;
             }
@@ -134,8 +137,13 @@ pub fn tell(app: &Arc<App>, handle: &Handle, goals: &Arc<Goals>) {
     });
 }
 
-/// Of those that have ended since so many had, the last few; and how many others have. `count`: so many had when it was looked, at least.
-fn few(mut all: Vec<observe::Goal>, before: &mut u64, count: u64) -> (u64, Vec<observe::Goal>) {
+/// Returns the last few of the goals that ended since number `before`, and the number of the others. `count` is the
+/// number of ended goals, at least.
+fn take_latest(
+    mut all: Vec<observe::ObservedGoal>,
+    before: &mut u64,
+    count: u64,
+) -> (u64, Vec<observe::ObservedGoal>) {
     let last = all.last().and_then(|goal| goal.ended.as_ref());
     let count = last.map_or(count, |(_, outcome)| outcome.number.max(count));
     let few = all.split_off(all.len().saturating_sub(FEW));
@@ -144,25 +152,26 @@ fn few(mut all: Vec<observe::Goal>, before: &mut u64, count: u64) -> (u64, Vec<o
     (more, few)
 }
 
-fn journal(app: &App, handle: &Handle, goal: observe::Goal, more: u64) {
-    let whose = match sender(handle, &goal.sender) {
+fn journal_goal(app: &App, handle: &Handle, goal: observe::ObservedGoal, more: u64) {
+    let whose = match describe_sender(handle, &goal.sender) {
         Some(sender) => format!("the goal of {sender}"),
-        None => "a goal whose sender was not heard".to_owned(),
+        None => "a goal of an unknown sender".to_owned(),
     };
-    let goal = told(handle, goal);
+    let goal = to_api_goal(handle, goal);
     let took = goal.ended.unwrap_or(goal.began).saturating_sub(goal.began);
     let took = match took {
-        // It was not heard when it began.
+        // Its start was not observed.
         0 => String::new(),
         took => format!(" after {:.1} s", took as f64 / 1e3),
     };
-    let words = match goal.text.is_empty() {
-        true => String::new(),
-        false => format!(" ({})", goal.text),
+    let words = if goal.text.is_empty() {
+        String::new()
+    } else {
+        format!(" ({})", goal.text)
     };
     let more = match more {
         0 => String::new(),
-        more => format!("; {more} more have ended since the last that was told"),
+        more => format!("; {more} more have ended since the last report"),
     };
     let message = format!("{}: {whose} {}{took}{words}{more}", goal.action, goal.state);
     let about = NewEvent {
@@ -178,20 +187,20 @@ fn journal(app: &App, handle: &Handle, goal: observe::Goal, more: u64) {
 #[cfg(test)]
 mod tests {
     use access::Grant;
-    use observe::Outcome;
+    use observe::ObservedOutcome;
 
     use super::*;
 
-    fn goal(number: u64) -> observe::Goal {
-        let outcome = Outcome {
-            status: Status::Succeeded,
+    fn goal(number: u64) -> observe::ObservedGoal {
+        let outcome = ObservedOutcome {
+            status: ActionlibStatus::Succeeded,
             text: String::new(),
             number,
         };
-        observe::Goal {
+        observe::ObservedGoal {
             action: "/dock".to_owned(),
             id: number.to_string(),
-            sender: Sender::Unheard,
+            sender: GoalSender::Unheard,
             began: 1,
             ended: Some((2, outcome)),
         }
@@ -200,29 +209,32 @@ mod tests {
     #[test]
     fn each_goal_is_told_where_they_are_few() {
         let mut before = 2;
-        let (more, told) = few(vec![goal(3), goal(4)], &mut before, 4);
+        let (more, told) = take_latest(vec![goal(3), goal(4)], &mut before, 4);
         assert_eq!((more, told, before), (0, vec![goal(3), goal(4)], 4));
-        // Of many the last; some of them are not even remembered.
+        // Of many goals, the last few; some are not even remembered any more.
         let many = 20;
-        let (more, told) = few((10..=many).map(goal).collect(), &mut before, many);
+        let (more, told) = take_latest((10..=many).map(goal).collect(), &mut before, many);
         let last: Vec<_> = (16..=many).map(goal).collect();
         assert_eq!((more, told, before), (11, last, many));
-        // One has ended while it was looked.
-        let (more, told) = few(vec![goal(21)], &mut before, 20);
+        // One ended during the call.
+        let (more, told) = take_latest(vec![goal(21)], &mut before, 20);
         assert_eq!((more, told, before), (0, vec![goal(21)], 21));
-        assert_eq!(few(Vec::new(), &mut before, 21), (0, Vec::new()));
+        assert_eq!(take_latest(Vec::new(), &mut before, 21), (0, Vec::new()));
     }
 
     #[test]
-    fn of_goals_hears_who_may_send_them_or_hear_both_ends() {
+    fn goals_are_visible_to_senders_and_to_subscribers_of_both_ends() {
         let grants = |all: &[&str]| {
             let all = all.iter().map(|grant| grant.parse::<Grant>());
             Grants::new(all.map(|grant| grant.expect("a grant")))
         };
-        assert!(may_hear(&grants(&["call:/dock"]), "/dock"));
-        assert!(may_hear(&grants(&["subscribe:/dock/*"]), "/dock"));
-        assert!(!may_hear(&grants(&["subscribe:/dock/result"]), "/dock"));
-        assert!(!may_hear(
+        assert!(can_see_goals(&grants(&["call:/dock"]), "/dock"));
+        assert!(can_see_goals(&grants(&["subscribe:/dock/*"]), "/dock"));
+        assert!(!can_see_goals(
+            &grants(&["subscribe:/dock/result"]),
+            "/dock"
+        ));
+        assert!(!can_see_goals(
             &grants(&["subscribe:/map", "call:/other"]),
             "/dock"
         ));

@@ -1,15 +1,15 @@
-//! Who asks: decided for each request, before its handler. What they may do is decided where the request is routed
+//! Authentication of each request, before its handler. What the caller may do is decided where the request is routed
 //! ([`crate::allowed`]).
 //!
-//! Where there are tokens, each TCP request needs one, also from this machine, because requests of a web server in front
-//! of the portal come from this machine, too. People show a session in its place, by a cookie
-//! ([`crate::people::cookies`]). Without either only the page (which asks for one), its assets, `/healthz`
+//! Where tokens exist, every TCP request needs one, even from this machine, because the requests of a web server in
+//! front of the portal come from this machine, too. People present a session cookie instead
+//! ([`crate::people::cookies`]). Without either, only the page (which asks for a credential), its assets, `/healthz`,
 //! and a robot's WebSocket handshake (whose first message must be rosbridge's `auth`) are answered.
 //!
-//! Where there never was a token the portal listens on loopback only, and requests need none: this machine's users see
-//! everything and are any robot; root, at its socket, is an admin. Web pages of other sites must
-//! not use the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS
-//! rebinding), with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
+//! Where there never was a token, the portal listens on loopback only and requests need none: this machine's users
+//! see everything and may act as any robot; root, at its socket, is an admin. Web pages of other sites must not use
+//! the portal through the browser of a user of this machine. So requests with another host in `Host` (DNS rebinding),
+//! with another origin (cross-site requests and WebSockets), or with a proxy's headers are refused.
 
 mod caller;
 mod elsewhere;
@@ -18,7 +18,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use access::{Action, Principal};
+use access::{AccessAction, Principal};
 use axum::extract::{Request, State};
 use axum::http::{HeaderMap, Method, Uri, header};
 use axum::middleware::Next;
@@ -30,91 +30,95 @@ use crate::app::App;
 use crate::errors::Error;
 use crate::oci;
 use crate::people::cookies;
-use crate::principals::{Identity, Recognising, Shown, Uncertified};
+use crate::principals::{CallerIdentity, CertificateRefusal, Credential, Recogniser};
 use crate::routes::{self, Access};
 use crate::tokens;
 
-pub use caller::{Caller, Connection, Peer, User};
-pub use elsewhere::check_part;
+pub use caller::{Caller, ConnectionPeer, PortalConnection, User};
+pub use elsewhere::check_not_embedded;
 
-/// Shortest time between two log lines about the same refusal.
+/// Minimum interval between two log lines about the same refusal.
 const AGAIN: Duration = Duration::from_secs(60);
-/// Most different refusals that are logged within that time; their text is chosen by the client.
+/// Limit on the distinct refusals logged within that interval; their text is chosen by the client.
 const DIFFERENT: usize = 32;
 
-/// What decides who asks.
-pub struct Rules<'a> {
-    /// The portal is bound to loopback.
+/// Settings that decide which requests are admitted.
+pub struct AdmissionRules<'a> {
+    /// True if the portal is bound to loopback.
     pub loopback: bool,
-    /// By what tokens are recognised.
-    pub known: Recognising<'a>,
-    /// Origins allowed besides loopback's.
+    /// Recognises credentials.
+    pub known: Recogniser<'a>,
+    /// Allowed origins besides loopback's.
     pub origins: &'a [String],
 }
 
-/// Lets a request through with its [`Caller`], or refuses it.
+/// Middleware that passes a request on with its [`Caller`], or refuses it.
 pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next) -> Response {
-    let Some(connection) = request.extensions().get::<Connection>() else {
-        return Error::Internal("telling who asks").into_response();
+    let Some(connection) = request.extensions().get::<PortalConnection>() else {
+        return Error::Internal("identifying the caller").into_response();
     };
-    let connection = match app.options.proxies.seen(connection, request.headers()) {
+    let connection = match app
+        .options
+        .proxies
+        .resolve_client(connection, request.headers())
+    {
         Ok(seen) => seen,
         Err(error) => {
-            // For whom the proxy asks cannot be told: it is the proxy's.
-            let nobody = Caller::new(connection, Principal::nobody(), Shown::Nothing);
+            // The client cannot be determined, so the request is attributed to the proxy.
+            let nobody = Caller::new(connection, Principal::nobody(), Credential::Nothing);
             let did = format!("{} {}", request.method(), request.uri().path());
             let status = error.problem().status;
-            let object = "a client that its proxy names badly";
+            let object = "a client with a malformed proxy header";
             app.audit
-                .record_sparingly(&nobody, Action::Enter, &did, object, status);
+                .record_throttled(&nobody, AccessAction::Enter, &did, object, status);
             return error.into_response();
         }
     };
     let peer = connection.peer;
-    let admitted = app.principals.with(|known| {
-        let rules = Rules {
+    let admitted = app.principals.with_recogniser(|known| {
+        let rules = AdmissionRules {
             loopback: app.listen.ip().is_loopback(),
             known,
             origins: &app.options.origins,
         };
         let (uri, headers) = (request.uri(), request.headers());
-        if let Some(certified) = certified(&app, &connection, known) {
-            // A token that is shown beside it says who asks; and no page uses a browser's certificate.
-            if token_in(uri, headers).is_none() {
+        if let Some(certified) = recognise_certificate(&app, &connection, known) {
+            // A token sent as well takes precedence, and no page may use a browser's certificate.
+            if find_token(uri, headers).is_none() {
                 elsewhere::check_origin(headers, rules.origins)?;
-                elsewhere::check_part(headers)?;
-                return Ok(Caller::by(&connection, certified?));
+                elsewhere::check_not_embedded(headers)?;
+                return Ok(Caller::from_identity(&connection, certified?));
             }
         }
         rules.admit(&connection, request.method(), uri, headers)
     });
     match admitted {
         Ok(caller) => {
-            if caller.who.shown != Shown::Nothing {
+            if caller.who.shown != Credential::Nothing {
                 connection.admit();
             }
-            app.principals.note_use(&caller.who, store::now());
+            app.principals.record_use(&caller.who, store::now());
             request.extensions_mut().insert(caller);
             next.run(request).await
         }
         Err(error) => {
             if let Error::Foreign { what, next } = &error {
-                report(peer, what, next);
+                log_refusal(peer, what, next);
                 let (method, path) = (request.method(), request.uri().path());
-                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
+                let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
                 let (did, status) = (format!("{method} {path}"), error.problem().status);
                 app.audit
-                    .record_sparingly(&nobody, Action::Enter, &did, what, status);
+                    .record_throttled(&nobody, AccessAction::Enter, &did, what, status);
             }
             if let Error::Uncertified(why) = &error {
-                let nobody = Caller::new(&connection, Principal::nobody(), Shown::Nothing);
+                let nobody = Caller::new(&connection, Principal::nobody(), Credential::Nothing);
                 let did = format!("{} {}", request.method(), request.uri().path());
                 let (object, status) = (why.to_string(), error.problem().status);
                 app.audit
-                    .record_sparingly(&nobody, Action::Enter, &did, &object, status);
+                    .record_throttled(&nobody, AccessAction::Enter, &did, &object, status);
             }
-            if oci::is_of_registry_client(request.uri().path(), request.headers()) {
-                oci::not_let_in(&error)
+            if oci::is_registry_client(request.uri().path(), request.headers()) {
+                oci::unauthorised(&error)
             } else {
                 error.into_response()
             }
@@ -122,20 +126,21 @@ pub async fn guard(State(app): State<Arc<App>>, mut request: Request, next: Next
     }
 }
 
-/// Whose robot's certificate a connection has shown, if any.
-pub fn certified(
+/// Recognises the robot certificate of a connection, if it presented one.
+pub fn recognise_certificate(
     app: &App,
-    connection: &Connection,
-    known: Recognising<'_>,
-) -> Option<Result<Identity, Uncertified>> {
+    connection: &PortalConnection,
+    known: Recogniser<'_>,
+) -> Option<Result<CallerIdentity, CertificateRefusal>> {
     let own = connection.certificates.first()?;
     let authority = &app.robots.as_ref()?.authority;
-    let shown = authority::read(own).map_err(|error| Uncertified::Nameless(error.to_string()));
-    Some(shown.and_then(|shown| known.certified(authority, &shown, store::now())))
+    let shown = authority::read_robot_certificate(own)
+        .map_err(|error| CertificateRefusal::Nameless(error.to_string()));
+    Some(shown.and_then(|shown| known.recognise_certificate(authority, &shown, store::now())))
 }
 
 /// Logs a refusal, so that the operator can allow it; at most once a minute, because pages repeat their requests.
-fn report(peer: Peer, what: &str, next: &str) {
+fn log_refusal(peer: ConnectionPeer, what: &str, next: &str) {
     static TOLD: Mutex<Vec<(Instant, String)>> = Mutex::new(Vec::new());
     let mut told = TOLD.lock();
     told.retain(|(at, _)| at.elapsed() < AGAIN);
@@ -145,25 +150,25 @@ fn report(peer: Peer, what: &str, next: &str) {
     }
 }
 
-impl Rules<'_> {
+impl AdmissionRules<'_> {
     fn admit(
         &self,
-        connection: &Connection,
+        connection: &PortalConnection,
         method: &Method,
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Caller, Error> {
-        if let Peer::Unix(user) = connection.peer {
+        if let ConnectionPeer::Unix(user) = connection.peer {
             return admit_user(connection, user);
         }
-        let given = token_in(uri, headers);
+        let given = find_token(uri, headers);
         if self.loopback && self.known.tokens.is_empty() && self.known.stored.is_empty() {
             elsewhere::check_direct(headers)?;
             elsewhere::check_host(headers)?;
             elsewhere::check_origin(headers, self.origins)?;
-            elsewhere::check_part(headers)?;
-            let mut caller = Caller::new(connection, Principal::local(), Shown::Nothing);
-            // Any token is taken; it only owns robots' names.
+            elsewhere::check_not_embedded(headers)?;
+            let mut caller = Caller::new(connection, Principal::local(), Credential::Nothing);
+            // Any token is accepted; it only owns robots' names.
             let token = given.as_deref().map(tokens::hash);
             caller.who.owner.clone_from(&token);
             caller.who.token = token;
@@ -173,31 +178,32 @@ impl Rules<'_> {
             Some(token) => {
                 let from = connection.peer.ip();
                 let who = self.known.recognise(&token, from, store::now())?;
-                Ok(Caller::by(connection, who))
+                Ok(Caller::from_identity(connection, who))
             }
             None => self.admit_session(connection, method, uri, headers),
         }
     }
 
-    /// Who shows no token may show a session, by a cookie; and some requests need neither.
+    /// Recognises a session cookie if no token was sent; some requests need neither.
     fn admit_session(
         &self,
-        connection: &Connection,
+        connection: &PortalConnection,
         method: &Method,
         uri: &Uri,
         headers: &HeaderMap,
     ) -> Result<Caller, Error> {
         let open = is_open(method, uri, headers);
-        // Who signs in may show a session that it was given by another: it counts for nothing.
-        let signs_in = *method == Method::POST && routes::access(uri.path()) == Access::SignIn;
-        let shown = match signs_in {
-            true => None,
-            false => cookies::shown(connection, headers)?,
+        // During a sign-in, a session is ignored: another site may have planted it.
+        let signs_in = *method == Method::POST && routes::find_access(uri.path()) == Access::SignIn;
+        let shown = if signs_in {
+            None
+        } else {
+            cookies::session_cookie(connection, headers)?
         };
         let session = shown.map(|secret| {
             let who = self.known.recognise_session(&secret, store::now())?;
             cookies::check(connection, method, headers, &secret)?;
-            Ok::<_, Error>(Caller::by(connection, who))
+            Ok::<_, Error>(Caller::from_identity(connection, who))
         });
         match session {
             Some(Ok(caller)) => Ok(caller),
@@ -205,16 +211,16 @@ impl Rules<'_> {
             Some(Err(error)) if !open => Err(error),
             _ if open => {
                 let nobody = Principal::nobody();
-                Ok(Caller::new(connection, nobody, Shown::Nothing))
+                Ok(Caller::new(connection, nobody, Credential::Nothing))
             }
             _ => Err(Error::Unauthorised("a token is needed")),
         }
     }
 }
 
-fn admit_user(connection: &Connection, user: User) -> Result<Caller, Error> {
+fn admit_user(connection: &PortalConnection, user: User) -> Result<Caller, Error> {
     let User { uid, is_member } = user;
-    // The daemon is root's. This thread is not, and its own user may nothing.
+    // The daemon runs as root. This thread does not, and its own user has no permissions.
     if uid == 0 || is_member {
         let name = match uid {
             0 => "root".to_owned(),
@@ -223,7 +229,7 @@ fn admit_user(connection: &Connection, user: User) -> Result<Caller, Error> {
         return Ok(Caller::new(
             connection,
             Principal::admin(&name),
-            Shown::User,
+            Credential::User,
         ));
     }
     Err(Error::Foreign {
@@ -233,12 +239,12 @@ fn admit_user(connection: &Connection, user: User) -> Result<Caller, Error> {
     })
 }
 
-/// Whether a request is answered without a token, as the table of routes says.
+/// Returns true if the route table admits the request without a credential.
 fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     let path = uri.path();
-    match (routes::access(path), is_upgrade(headers)) {
+    match (routes::find_access(path), is_upgrade(headers)) {
         (Access::Connect | Access::ReadOrConnect, true) => {
-            *method == Method::GET && (path == "/" || is_service(path))
+            *method == Method::GET && (path == "/" || is_service_path(path))
         }
         (Access::Code, false) => *method == Method::POST,
         (Access::Read | Access::ReadOrConnect, false) => {
@@ -249,27 +255,28 @@ fn is_open(method: &Method, uri: &Uri, headers: &HeaderMap) -> bool {
     }
 }
 
-/// Whether a path can be that of a service: `/NAME`, or `/NAME/`.
-fn is_service(path: &str) -> bool {
+/// Returns true if the path has the form of a service's: `/NAME` or `/NAME/`.
+fn is_service_path(path: &str) -> bool {
     let name = path.strip_prefix('/').unwrap_or_default();
-    names::service(name.strip_suffix('/').unwrap_or(name)).is_ok()
+    names::validate_service(name.strip_suffix('/').unwrap_or(name)).is_ok()
 }
 
-/// Whether a WebSocket is asked for.
+/// Returns true if the request asks for a WebSocket.
 pub fn is_upgrade(headers: &HeaderMap) -> bool {
     header_text(headers, header::UPGRADE)
         .is_some_and(|upgrade| upgrade.eq_ignore_ascii_case("websocket"))
 }
 
-/// The token of `Authorization`: `Bearer` everywhere. At the registry, whose clients have nothing else, also the password of `Basic`, whatever
-/// the name beside it is. Browsers send that by themselves once somebody has given it: nothing is changed there.
+/// Returns the token of `Authorization`: `Bearer` everywhere and, at the registry, whose clients know nothing else,
+/// also the password of `Basic`, whatever its user name. Browsers resend Basic credentials by themselves; the
+/// registry is read-only.
 fn authorization(uri: &Uri, headers: &HeaderMap) -> Option<String> {
     let (scheme, sent) = header_text(headers, header::AUTHORIZATION)?.split_once(' ')?;
     let sent = sent.trim();
     if scheme.eq_ignore_ascii_case("bearer") {
         return Some(sent.to_owned());
     }
-    if scheme.eq_ignore_ascii_case("basic") && oci::is_registrys(uri.path()) {
+    if scheme.eq_ignore_ascii_case("basic") && oci::is_registry_path(uri.path()) {
         let pair = base64_simd::STANDARD.decode_to_vec(sent).ok()?;
         let (_, password) = std::str::from_utf8(&pair).ok()?.split_once(':')?;
         return Some(password.to_owned());
@@ -277,22 +284,22 @@ fn authorization(uri: &Uri, headers: &HeaderMap) -> Option<String> {
     None
 }
 
-fn token_in(uri: &Uri, headers: &HeaderMap) -> Option<String> {
+fn find_token(uri: &Uri, headers: &HeaderMap) -> Option<String> {
     let protocol = || {
         let token = protocols(headers).find_map(|protocol| protocol.strip_prefix(BEARER))?;
         Some(token.to_owned())
     };
     authorization(uri, headers)
         .or_else(protocol)
-        .or_else(|| query(uri.query(), "token"))
+        .or_else(|| query_value(uri.query(), "token"))
 }
 
-/// A WebSocket subprotocol that begins so is a token, of clients that can set no other header.
+/// Prefix of a WebSocket subprotocol that is a token, for clients that can set no other header.
 pub const BEARER: &str = "bearer.";
-/// The one that is chosen where they offer it.
+/// Subprotocol chosen if the client offers it.
 pub const ROSBRIDGE: &str = "rosbridge";
 
-/// The WebSocket subprotocols that are offered.
+/// Returns the WebSocket subprotocols offered.
 pub fn protocols(headers: &HeaderMap) -> impl Iterator<Item = &str> {
     let offered = headers.get_all(header::SEC_WEBSOCKET_PROTOCOL).iter();
     offered
@@ -301,14 +308,14 @@ pub fn protocols(headers: &HeaderMap) -> impl Iterator<Item = &str> {
         .map(str::trim)
 }
 
-/// One value of the query, decoded.
-pub fn query(query: Option<&str>, name: &str) -> Option<String> {
-    let (_, value) = pairs(query).find(|(key, _)| key == name)?;
+/// Returns one decoded value of the query.
+pub fn query_value(query: Option<&str>, name: &str) -> Option<String> {
+    let (_, value) = query_pairs(query).find(|(key, _)| key == name)?;
     Some(value.into_owned())
 }
 
-/// All parameters of a query, in their order.
-pub fn pairs(query: Option<&str>) -> impl Iterator<Item = (Cow<'_, str>, Cow<'_, str>)> {
+/// Returns all parameters of a query in order.
+pub fn query_pairs(query: Option<&str>) -> impl Iterator<Item = (Cow<'_, str>, Cow<'_, str>)> {
     form_urlencoded::parse(query.unwrap_or_default().as_bytes())
 }
 

@@ -1,4 +1,4 @@
-//! The opening handshake of a WebSocket (RFC 6455, section 4.2).
+//! WebSocket opening handshake (RFC 6455, section 4.2).
 
 use axum::extract::Request;
 use axum::http::{HeaderValue, Method, header};
@@ -7,12 +7,12 @@ use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::errors::Error;
 
-/// Bytes that a client's key stands for.
+/// Length of the decoded key in bytes.
 const KEY: usize = 16;
 
-/// The value of `Sec-WebSocket-Accept` that accepts a handshake.
+/// Returns the value of `Sec-WebSocket-Accept` that accepts the handshake.
 pub fn accept(request: &Request) -> Result<HeaderValue, Error> {
-    let bad = |what: &str| Error::BadRequest(format!("this is no WebSocket handshake: {what}"));
+    let bad = |what: &str| Error::BadRequest(format!("not a WebSocket handshake: {what}"));
     let text = |name| {
         request
             .headers()
@@ -20,14 +20,14 @@ pub fn accept(request: &Request) -> Result<HeaderValue, Error> {
             .and_then(|value| value.to_str().ok())
     };
     if request.method() != Method::GET {
-        return Err(bad("it does not GET"));
+        return Err(bad("the method is not GET"));
     }
     let connection = text(header::CONNECTION).unwrap_or_default();
     if !connection
         .split(',')
         .any(|option| option.trim().eq_ignore_ascii_case("upgrade"))
     {
-        return Err(bad("Connection does not say Upgrade"));
+        return Err(bad("the header Connection has no Upgrade"));
     }
     if text(header::SEC_WEBSOCKET_VERSION) != Some("13") {
         return Err(Error::WebSocketVersion);
@@ -68,13 +68,16 @@ mod tests {
         ("sec-websocket-key", "dGhlIHNhbXBsZSBub25jZQ=="),
     ];
 
-    /// The good handshake with another value of one header, or without it.
-    fn with(header: &str, value: Option<&'static str>) -> Request {
+    /// Creates the valid handshake with one header replaced or removed.
+    fn with_header(header: &str, value: Option<&'static str>) -> Request {
         let headers: Vec<_> = GOOD
             .into_iter()
-            .filter_map(|(name, good)| match name == header {
-                true => value.map(|value| (name, value)),
-                false => Some((name, good)),
+            .filter_map(|(name, good)| {
+                if name == header {
+                    value.map(|value| (name, value))
+                } else {
+                    Some((name, good))
+                }
             })
             .collect();
         request(&headers)
@@ -92,7 +95,7 @@ mod tests {
     #[test]
     fn half_of_it_is_refused() {
         for missing in ["connection", "sec-websocket-key"] {
-            let refused = accept(&with(missing, None)).expect_err(missing);
+            let refused = accept(&with_header(missing, None)).expect_err(missing);
             assert_eq!(refused.problem().status, 400, "{missing}");
         }
     }
@@ -100,7 +103,8 @@ mod tests {
     #[test]
     fn another_version_is_refused_with_the_one_that_is_spoken() {
         for version in [None, Some("8"), Some("14")] {
-            let refused = accept(&with("sec-websocket-version", version)).expect_err("refused");
+            let refused =
+                accept(&with_header("sec-websocket-version", version)).expect_err("refused");
             let response = refused.into_response();
             assert_eq!(response.status(), 426, "{version:?}");
             assert_eq!(response.headers()["sec-websocket-version"], "13");
@@ -118,7 +122,7 @@ mod tests {
             "!!!!!!!!!!!!!!!!!!!!!!==",
         ];
         for key in keys {
-            let refused = accept(&with("sec-websocket-key", Some(key))).expect_err(key);
+            let refused = accept(&with_header("sec-websocket-key", Some(key))).expect_err(key);
             assert_eq!(refused.problem().status, 400, "{key:?}");
         }
     }

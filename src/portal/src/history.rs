@@ -1,4 +1,5 @@
-//! What servants and the machine did: recorded every ten seconds, kept as that for an hour and by the minute for a day.
+//! History of servants and machine: recorded every ten seconds, kept in this resolution for an hour and per minute
+//! for a day.
 
 mod figures;
 mod recorder;
@@ -10,49 +11,49 @@ use api::history::{MachineHistory, ServantHistory};
 use axum::extract::State;
 use axum::{Extension, Json};
 use serde::Deserialize;
-use store::{RecordedFilter, RecordedLine, Told};
+use store::{EventVisibility, RecordedSeries, SeriesFilter};
 use utoipa::IntoParams;
 
-use crate::api_v1::Answer;
+use crate::api_v1::JsonResult;
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
 use crate::query::Query;
-pub use recorder::keep;
+pub use recorder::record_history;
 
-/// Times that one answer has, over all servants.
+/// Limit on the samples in a response, over all servants.
 const MOST: usize = 20_000;
-/// Servants that are looked at for one answer.
+/// Limit on the servants examined for a response.
 const SERVANTS: u32 = 1_000;
 
-/// How finely is recorded, and for how long.
+/// Resolution of recorded samples and their retention.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Step {
+struct HistoryStep {
     seconds: u32,
-    /// Of them.
+    /// Number of steps kept.
     kept: u32,
 }
 
-const FINE: Step = Step {
+const FINE: HistoryStep = HistoryStep {
     seconds: 10,
     kept: 360,
 };
-const COARSE: Step = Step {
+const COARSE: HistoryStep = HistoryStep {
     seconds: 60,
     kept: 1_440,
 };
 
-impl Step {
+impl HistoryStep {
     fn millis(self) -> Millis {
         Millis::from(self.seconds) * 1_000
     }
 
-    /// Milliseconds for which it is kept.
-    fn kept(self) -> Millis {
+    /// Returns the retention in milliseconds.
+    fn retention(self) -> Millis {
         self.millis() * Millis::from(self.kept)
     }
 
-    fn asked(seconds: Option<u32>) -> Result<Step, Error> {
+    fn parse(seconds: Option<u32>) -> Result<HistoryStep, Error> {
         let steps = [FINE, COARSE];
         let seconds = seconds.unwrap_or(COARSE.seconds);
         let step = steps.into_iter().find(|step| step.seconds == seconds);
@@ -65,79 +66,79 @@ impl Step {
     }
 }
 
-/// Of when.
+/// Query: which period.
 #[derive(Debug, Clone, Copy, Deserialize, IntoParams)]
-pub struct When {
-    /// Milliseconds since 1970; as long ago as the step is kept by default.
+pub struct TimeQuery {
+    /// Start in milliseconds since 1970 (default: as far back as the step is kept).
     from: Option<u64>,
-    /// Milliseconds since 1970; now by default.
+    /// End in milliseconds since 1970 (default: now).
     to: Option<u64>,
-    /// Seconds: 10, which are kept for an hour, or 60, kept for a day and the default.
+    /// Step in seconds: 10 (kept for an hour) or 60 (kept for a day; the default).
     step: Option<u32>,
 }
 
-/// Whose, and of when.
+/// Query: which servants and which period.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Whose {
-    /// Only of this servant.
+pub struct ServantHistoryQuery {
+    /// Only this servant.
     servant: Option<String>,
-    /// Only of servants of this service.
+    /// Only servants of this service.
     service: Option<String>,
-    /// Only of servants of this robot.
+    /// Only servants of this robot.
     robot: Option<String>,
-    /// Milliseconds since 1970; as long ago as the step is kept by default.
+    /// Start in milliseconds since 1970 (default: as far back as the step is kept).
     from: Option<u64>,
-    /// Milliseconds since 1970; now by default.
+    /// End in milliseconds since 1970 (default: now).
     to: Option<u64>,
-    /// Seconds: 10, which are kept for an hour, or 60, kept for a day and the default.
+    /// Step in seconds: 10 (kept for an hour) or 60 (kept for a day; the default).
     step: Option<u32>,
 }
 
-/// A time that was asked for, and its step.
-struct Asked {
-    step: Step,
+/// A requested period and its step.
+struct RequestedPeriod {
+    step: HistoryStep,
     from: Millis,
     to: Millis,
 }
 
-impl Asked {
-    fn of(when: When) -> Result<Asked, Error> {
-        let step = Step::asked(when.step)?;
+impl RequestedPeriod {
+    fn parse(when: TimeQuery) -> Result<RequestedPeriod, Error> {
+        let step = HistoryStep::parse(when.step)?;
         let now = store::now();
-        let oldest = now.saturating_sub(step.kept());
-        // What is older than what is kept, or to come, is not there: SQLite's numbers need not hold it.
+        let oldest = now.saturating_sub(step.retention());
+        // Clamped to what can exist, so that the numbers fit into SQLite's integers.
         let from = when.from.unwrap_or(oldest).max(oldest);
         let to = when.to.unwrap_or(now).min(now);
         if when.from.zip(when.to).is_some_and(|(from, to)| from > to) {
             return Err(Error::BadRequest("from is after to".to_owned()));
         }
-        Ok(Asked { step, from, to })
+        Ok(RequestedPeriod { step, from, to })
     }
 }
 
-/// What servants did, those of the last day that have ended included.
+/// Returns the history of servants, including those of the last day that have ended.
 pub async fn servants(
     State(app): State<Arc<App>>,
-    Query(whose): Query<Whose>,
+    Query(whose): Query<ServantHistoryQuery>,
     Extension(caller): Extension<Caller>,
-) -> Answer<Vec<ServantHistory>> {
-    let asked = Asked::of(When {
+) -> JsonResult<Vec<ServantHistory>> {
+    let asked = RequestedPeriod::parse(TimeQuery {
         from: whose.from,
         to: whose.to,
         step: whose.step,
     })?;
-    let services = services_seen(&app, &caller)?;
-    let filter = RecordedFilter {
-        // The machine's has an address of its own.
+    let services = visible_services(&app, &caller)?;
+    let filter = SeriesFilter {
+        // The machine's history has an endpoint of its own.
         servant: whose.servant.as_deref(),
         service: whose.service.as_deref(),
         robot: whose.robot.as_deref(),
-        told: services.as_deref().map(|services| Told {
+        told: services.as_deref().map(|services| EventVisibility {
             services,
             own_robot: caller.own_robot(),
         }),
     };
-    let mut found = app.state.recorded(filter, asked.from, SERVANTS)?;
+    let mut found = app.state.recorded_series(filter, asked.from, SERVANTS)?;
     found.retain(|one| one.servant != recorder::THE_MACHINE);
     let mut left = MOST;
     let mut told = Vec::new();
@@ -147,32 +148,32 @@ pub async fn servants(
         told.push(history);
         if left == 0 {
             return Err(Error::BadRequest(format!(
-                "that is more than {MOST} times; ask for one servant, one robot, or a shorter time (from, to)"
+                "that is more than {MOST} points in time; ask for one servant, one robot, or a shorter time (from, to)"
             )));
         }
     }
     Ok(Json(told))
 }
 
-/// Services with samples that the caller may see, by name; none where it sees all that there is.
-fn services_seen(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
+/// Returns the services with samples that the caller may see, or `None` if it may see everything.
+fn visible_services(app: &App, caller: &Caller) -> Result<Option<Vec<String>>, Error> {
     if caller.who.principal.sees_all() {
         return Ok(None);
     }
-    let mut services = app.state.services_recorded()?;
-    services.retain(|service| caller.sees(app, service));
+    let mut services = app.state.services_with_samples()?;
+    services.retain(|service| caller.can_see(app, service));
     Ok(Some(services))
 }
 
 fn history(
     app: &App,
-    one: RecordedLine,
-    asked: &Asked,
+    one: RecordedSeries,
+    asked: &RequestedPeriod,
     most: usize,
 ) -> Result<ServantHistory, Error> {
     let when = (asked.from, asked.to);
     let samples = app.state.samples(one.id, asked.step.seconds, when, most)?;
-    // While it was not there another servant of the robot's was.
+    // Before this one began, the robot had another servant.
     let lived = (asked.from.max(one.began), asked.to);
     Ok(ServantHistory {
         local: app.state.local_periods(&one.service, &one.robot, lived)?,
@@ -186,18 +187,18 @@ fn history(
     })
 }
 
-/// What the machine did.
+/// Returns the history of the machine.
 pub async fn machine(
     State(app): State<Arc<App>>,
-    Query(when): Query<When>,
-) -> Answer<MachineHistory> {
-    let asked = Asked::of(when)?;
-    let filter = RecordedFilter {
+    Query(when): Query<TimeQuery>,
+) -> JsonResult<MachineHistory> {
+    let asked = RequestedPeriod::parse(when)?;
+    let filter = SeriesFilter {
         servant: Some(recorder::THE_MACHINE),
-        ..RecordedFilter::default()
+        ..SeriesFilter::default()
     };
     let mut samples = Vec::new();
-    for one in app.state.recorded(filter, asked.from, 1)? {
+    for one in app.state.recorded_series(filter, asked.from, 1)? {
         let when = (asked.from, asked.to);
         samples = app.state.samples(one.id, asked.step.seconds, when, MOST)?;
     }
@@ -213,7 +214,7 @@ mod tests {
 
     #[test]
     fn what_is_asked_badly_is_refused_in_words() {
-        let asked = |from, to, step| Asked::of(When { from, to, step });
+        let asked = |from, to, step| RequestedPeriod::parse(TimeQuery { from, to, step });
         let refused = |from, to, step| match asked(from, to, step) {
             Err(Error::BadRequest(words)) => words,
             other => panic!("{:?}", other.map(|asked| asked.from)),
@@ -221,6 +222,6 @@ mod tests {
         assert!(refused(None, None, Some(7)).contains("step=10"));
         assert_eq!(refused(Some(2), Some(1), None), "from is after to");
         let all = asked(Some(0), Some(Millis::MAX), Some(10)).expect("what there is");
-        assert!(all.to <= store::now() && all.to - all.from <= FINE.kept() + 1_000);
+        assert!(all.to <= store::now() && all.to - all.from <= FINE.retention() + 1_000);
     }
 }

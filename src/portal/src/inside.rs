@@ -1,21 +1,21 @@
-//! People look into a servant: `ws://host:9090/api/v1/servants/ID/inside` speaks rosbridge beside the servant's robot. It makes no
-//! servant, keeps none alive, and is no session of the robot.
+//! Looking into a servant: `ws://host:9090/api/v1/servants/ID/inside` speaks rosbridge beside the servant's robot.
+//! Such a connection creates no servant, keeps none alive, and is not a session of the robot.
 //!
-//! | who | what it may there |
+//! | caller | permissions inside |
 //! |---|---|
-//! | may operate the service, or is the servant's robot | what the policy grants it |
-//! | sees the servant otherwise | list and subscribe |
+//! | may operate the service, or is the servant's robot | the operations that the policy grants |
+//! | may otherwise see the servant | list and subscribe |
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use access::{Action, Grants, Refusal, Role, Standing};
+use access::{AccessAction, AccessDenied, ConnectionAccess, Grants, Role};
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::Response;
-use bridge::{Granted, SessionOptions, Waiting};
+use bridge::{ClientGrants, SessionOptions, WaitingConnection};
 use budget::Budget;
 use bytes::Bytes;
 use choreographer::Handle;
@@ -29,28 +29,28 @@ use crate::errors::Error;
 use crate::guard::Caller;
 use crate::{handshake, robots};
 
-/// Who may look into one servant at once, all together.
+/// Limit on the connections that look into one servant.
 const MOST: usize = 16;
-/// Of these, connections of one principal: nobody keeps all others out.
+/// Limit on one principal's share of them, so that nobody can lock others out.
 const MOST_EACH: usize = 4;
 
-/// Who looks into which servant.
+/// Connections that look into servants.
 #[derive(Debug, Default)]
-pub struct Lookers {
+pub struct InsideConnections {
     /// Names of principals, by servant.
     all: Arc<Mutex<HashMap<String, Vec<String>>>>,
 }
 
-/// One connection of those that a servant may have.
+/// Slot of one connection that looks into a servant; released when dropped.
 #[derive(Debug)]
-pub struct Place {
+pub struct InsideSlot {
     all: Arc<Mutex<HashMap<String, Vec<String>>>>,
     servant: String,
     who: String,
 }
 
-impl Lookers {
-    pub(crate) fn place(&self, servant: &str, who: &str) -> Result<Place, Error> {
+impl InsideConnections {
+    pub(crate) fn acquire(&self, servant: &str, who: &str) -> Result<InsideSlot, Error> {
         let mut all = self.all.lock();
         let there = all.entry(servant.to_owned()).or_default();
         let own = there.iter().filter(|other| *other == who).count();
@@ -62,7 +62,7 @@ impl Lookers {
             });
         }
         there.push(who.to_owned());
-        Ok(Place {
+        Ok(InsideSlot {
             all: Arc::clone(&self.all),
             servant: servant.to_owned(),
             who: who.to_owned(),
@@ -70,7 +70,7 @@ impl Lookers {
     }
 }
 
-impl Drop for Place {
+impl Drop for InsideSlot {
     fn drop(&mut self) {
         let mut all = self.all.lock();
         let Some(there) = all.get_mut(&self.servant) else {
@@ -85,101 +85,113 @@ impl Drop for Place {
     }
 }
 
-/// What somebody may do inside.
+/// Permission level inside a servant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Part {
-    /// What the policy grants.
+pub enum InsideRole {
+    /// Everything that the policy grants.
     Acts,
-    /// Listening alone.
+    /// Subscribe only.
     Looks,
 }
 
-/// Whose servants are looked into, or what is kept of them.
+/// Target of a request for access: a robot's servants, or a recording of them.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Whose<'a> {
+pub(crate) struct InsideTarget<'a> {
     pub service: &'a str,
     pub robot: &'a str,
-    /// In words: servant, or recording.
+    /// Description: servant or recording.
     pub object: std::fmt::Arguments<'a>,
 }
 
-/// What the caller, who sees the service, may do inside a robot's servants there. A robot is let in where it may be that robot, and nowhere
-/// else.
-pub(crate) fn part(app: &App, caller: &Caller, whose: Whose<'_>) -> Result<Part, Error> {
+/// Determines what the caller, who may see the service, may do inside a robot's servants. A robot has access where it
+/// may act as that robot, and nowhere else.
+pub(crate) fn inside_role(
+    app: &App,
+    caller: &Caller,
+    whose: InsideTarget<'_>,
+) -> Result<InsideRole, Error> {
     let principal = &caller.who.principal;
-    let Whose {
+    let InsideTarget {
         service,
         robot,
         object,
     } = whose;
-    if caller.may_at(app, Action::Operate, service, None).is_ok() {
-        return Ok(Part::Acts);
+    if caller
+        .check_service_access(app, AccessAction::Operate, service, None)
+        .is_ok()
+    {
+        return Ok(InsideRole::Acts);
     }
-    if !principal.is(Role::Robot) {
-        return Ok(Part::Looks);
+    if !principal.has_role(Role::Robot) {
+        return Ok(InsideRole::Looks);
     }
-    let connects = caller.may_at(app, Action::Connect, service, Some(robot));
-    // Whose name a nameless robot's servant has is nobody else's business.
+    let connects = caller.check_service_access(app, AccessAction::Connect, service, Some(robot));
+    // The generated name of a nameless robot's servant is not revealed to others.
     let own = match principal.scope.robot.as_deref() {
         Some(own) => own == robot,
         None => {
-            principal.is(Role::Viewer) && (robot.starts_with('~') || is_free(app, caller, robot)?)
+            principal.has_role(Role::Viewer)
+                && (robot.starts_with('~') || is_robot_name_free(app, caller, robot)?)
         }
     };
-    match (connects, principal.is(Role::Viewer)) {
-        (Ok(()), _) if own => Ok(Part::Acts),
-        (_, true) => Ok(Part::Looks),
-        _ => Err(Refusal::new(principal, Action::See, object).into()),
+    match (connects, principal.has_role(Role::Viewer)) {
+        (Ok(()), _) if own => Ok(InsideRole::Acts),
+        (_, true) => Ok(InsideRole::Looks),
+        _ => Err(AccessDenied::new(principal, AccessAction::See, object).into()),
     }
 }
 
-/// What the caller may use of what flows inside them now.
-pub(crate) fn grants(app: &App, caller: &Caller, whose: Whose<'_>) -> Result<Arc<Grants>, Error> {
-    let part = part(app, caller, whose)?;
+/// Returns the caller's current grants inside the target.
+pub(crate) fn inside_grants(
+    app: &App,
+    caller: &Caller,
+    whose: InsideTarget<'_>,
+) -> Result<Arc<Grants>, Error> {
+    let part = inside_role(app, caller, whose)?;
     let standing = app
         .principals
-        .standing_inside(&caller.who, whose.service, part);
+        .inside_access(&caller.who, whose.service, part);
     match standing {
-        Standing::Granted(grants) => Ok(grants),
-        Standing::Ended(reason) => Err(Error::Forbidden { what: reason }),
+        ConnectionAccess::Granted(grants) => Ok(grants),
+        ConnectionAccess::Ended(reason) => Err(Error::Forbidden { what: reason }),
     }
 }
 
-/// Whether a robot's name is nobody's, or the caller's.
-fn is_free(app: &App, caller: &Caller, robot: &str) -> Result<bool, Error> {
-    let owner = app.state.owner_of_robot(robot)?;
+/// Returns true if the robot's name has no owner, or the caller owns it.
+fn is_robot_name_free(app: &App, caller: &Caller, robot: &str) -> Result<bool, Error> {
+    let owner = app.state.find_robot_owner(robot)?;
     Ok(owner.is_none() || owner == caller.who.owner)
 }
 
-/// Somebody who looks into a servant, once the connection is a WebSocket.
-pub struct Looker {
+/// A connection that looks into a servant, after its WebSocket upgrade.
+pub struct InsideSession {
     pub handle: Arc<Handle>,
     pub reach: Arc<dyn Reach>,
-    /// What all its connections may hold.
+    /// Memory budget of all the caller's connections.
     pub budget: Budget,
-    /// What it may, as it changes.
-    pub granted: Granted,
+    /// Current grants, updated as they change.
+    pub granted: ClientGrants,
     pub caller: Caller,
 }
 
-/// A servant that the caller may look into, and what the caller may do there.
-pub struct Door {
+/// Permission of a caller to look into a servant.
+pub struct InsideAccess {
     app: Arc<App>,
     handle: Arc<Handle>,
     caller: Caller,
-    part: Part,
+    part: InsideRole,
 }
 
-impl Door {
-    /// Of the servant of this id.
-    pub fn of(app: &Arc<App>, id: &str, caller: Caller) -> Result<Self, Error> {
+impl InsideAccess {
+    /// Checks whether the caller may look into the servant with this id.
+    pub fn authorise(app: &Arc<App>, id: &str, caller: Caller) -> Result<Self, Error> {
         let handle = app.choreographer.servant(id)?;
-        let whose = Whose {
+        let whose = InsideTarget {
             service: handle.service(),
             robot: &handle.robot,
             object: format_args!("servant {id}"),
         };
-        let part = part(app, &caller, whose)?;
+        let part = inside_role(app, &caller, whose)?;
         Ok(Self {
             app: Arc::clone(app),
             handle,
@@ -188,29 +200,32 @@ impl Door {
         })
     }
 
-    /// Becomes a WebSocket of this subprotocol, at which `serve` speaks for as long as the caller may look inside.
-    pub fn open<Served: Future<Output = ()> + Send>(
+    /// Upgrades to a WebSocket with this subprotocol, on which `serve` runs for as long as the caller has access.
+    pub fn upgrade<Served: Future<Output = ()> + Send>(
         self,
         mut request: Request,
         protocol: Option<&'static str>,
-        serve: impl FnOnce(Looker, reach::Stream, Bytes) -> Served + Send + 'static,
+        serve: impl FnOnce(InsideSession, reach::UpgradedStream, Bytes) -> Served + Send + 'static,
     ) -> Result<Response, Error> {
         let accept = handshake::accept(&request)?;
         let id = &self.handle.id;
         let Some(reach) = self.handle.reach() else {
             return Err(Error::NotThereYet(id.clone()));
         };
-        let place = self.app.inside.place(id, &self.caller.who.principal.name)?;
+        let place = self
+            .app
+            .inside
+            .acquire(id, &self.caller.who.principal.name)?;
         let Some(upgrade) = request.extensions_mut().remove::<OnUpgrade>() else {
             return Err(Error::BadRequest(
                 "this connection cannot become a WebSocket".to_owned(),
             ));
         };
-        notes(&self.app, &self.caller, &self.handle)("looks inside");
+        audit_recorder(&self.app, &self.caller, &self.handle)("looks inside");
         let sessions = self.app.sessions.clone();
         sessions.spawn(async move {
             match upgrade.await {
-                Ok(upgraded) => self.session(upgraded, reach, serve).await,
+                Ok(upgraded) => self.run(upgraded, reach, serve).await,
                 Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
             }
             drop(place);
@@ -228,11 +243,11 @@ impl Door {
         Ok(response)
     }
 
-    async fn session<Served: Future<Output = ()>>(
+    async fn run<Served: Future<Output = ()>>(
         self,
         upgraded: Upgraded,
         reach: Arc<dyn Reach>,
-        serve: impl FnOnce(Looker, reach::Stream, Bytes) -> Served,
+        serve: impl FnOnce(InsideSession, reach::UpgradedStream, Bytes) -> Served,
     ) {
         let Self {
             app,
@@ -240,41 +255,43 @@ impl Door {
             caller,
             part,
         } = self;
-        let (io, read_ahead) = robots::unwrapped(upgraded);
+        let (io, read_ahead) = robots::into_raw_stream(upgraded);
         let memory = app.choreographer.memory();
         let service = handle.service().to_owned();
         let (standing, granted) =
-            watch::channel(app.principals.standing_inside(&caller.who, &service, part));
-        let refused = notes(&app, &caller, &handle);
-        let used = notes(&app, &caller, &handle);
-        let looker = Looker {
+            watch::channel(app.principals.inside_access(&caller.who, &service, part));
+        let refused = audit_recorder(&app, &caller, &handle);
+        let used = audit_recorder(&app, &caller, &handle);
+        let looker = InsideSession {
             handle,
             reach,
-            budget: memory.client(&caller.peer.client(None)),
-            granted: Granted::by(granted)
-                .telling(move |operation| refused(&format!("was refused {operation}")))
-                .noting(move |operation| used(&format!("inside: {operation}"))),
+            budget: memory.client(&caller.peer.budget_name(None)),
+            granted: ClientGrants::from_standing(granted)
+                .with_refusal_observer(move |operation| {
+                    refused(&format!("was refused {operation}"))
+                })
+                .with_use_observer(move |operation| used(&format!("inside: {operation}"))),
             caller: caller.clone(),
         };
         tokio::select! {
             () = serve(looker, io, read_ahead) => {}
-            () = app.principals.follow_inside(&caller.who, &service, part, &standing) => {}
+            () = app.principals.follow_inside_access(&caller.who, &service, part, &standing) => {}
         }
     }
 }
 
-/// Becomes a WebSocket that speaks rosbridge inside the servant.
-pub async fn inside(
+/// Upgrades to a WebSocket that speaks rosbridge inside the servant.
+pub async fn open_inside(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Extension(caller): Extension<Caller>,
     request: Request,
 ) -> Result<Response, Error> {
-    let door = Door::of(&app, &id, caller)?;
+    let door = InsideAccess::authorise(&app, &id, caller)?;
     let protocol = robots::rosbridge_protocol(request.headers())?;
     let bridge = app.choreographer.bridge_options().clone();
-    door.open(request, protocol, async move |looker, io, read_ahead| {
-        let waiting = Waiting::new(io, &read_ahead, &bridge).within(&looker.budget);
+    door.upgrade(request, protocol, async move |looker, io, read_ahead| {
+        let waiting = WaitingConnection::new(io, &read_ahead, &bridge).with_budget(&looker.budget);
         let who = &looker.caller.who.principal;
         let options = SessionOptions {
             budget: looker.budget,
@@ -284,12 +301,16 @@ pub async fn inside(
         };
         let end = looker.reach.serve_inside(waiting, options).await;
         let id = &looker.handle.id;
-        tracing::debug!("{who} looks into servant {id} no more: {end:?}");
+        tracing::debug!("{who} stopped looking into servant {id}: {end:?}");
     })
 }
 
-/// Records what somebody does inside; where it is done again and again, once a minute.
-fn notes(app: &Arc<App>, caller: &Caller, handle: &Handle) -> impl Fn(&str) + Send + Sync + use<> {
+/// Returns a function that records what the caller does inside; repeated actions once a minute.
+fn audit_recorder(
+    app: &Arc<App>,
+    caller: &Caller,
+    handle: &Handle,
+) -> impl Fn(&str) + Send + Sync + use<> {
     let (app, caller) = (Arc::clone(app), caller.clone());
     let object = format!(
         "servant {} of robot {} at service {}",
@@ -299,12 +320,12 @@ fn notes(app: &Arc<App>, caller: &Caller, handle: &Handle) -> impl Fn(&str) + Se
     );
     move |did| {
         let (action, status) = match did {
-            "looks inside" => (Action::See, StatusCode::SWITCHING_PROTOCOLS),
-            did if did.starts_with("was refused") => (Action::Operate, StatusCode::FORBIDDEN),
-            _ => (Action::Operate, StatusCode::OK),
+            "looks inside" => (AccessAction::See, StatusCode::SWITCHING_PROTOCOLS),
+            did if did.starts_with("was refused") => (AccessAction::Operate, StatusCode::FORBIDDEN),
+            _ => (AccessAction::Operate, StatusCode::OK),
         };
         app.audit
-            .record_sparingly(&caller, action, did, &object, status.as_u16());
+            .record_throttled(&caller, action, did, &object, status.as_u16());
     }
 }
 
@@ -314,19 +335,19 @@ mod tests {
 
     #[test]
     fn a_servant_is_looked_into_by_so_many_and_nobody_keeps_the_others_out() {
-        let lookers = Lookers::default();
+        let lookers = InsideConnections::default();
         let mut eves: Vec<_> = (0..MOST_EACH)
-            .map(|_| lookers.place("s1", "eve").expect("room"))
+            .map(|_| lookers.acquire("s1", "eve").expect("room"))
             .collect();
-        let refused = lookers.place("s1", "eve").expect_err("hers are taken");
+        let refused = lookers.acquire("s1", "eve").expect_err("hers are taken");
         assert!(matches!(refused, Error::TooManyLook { .. }), "{refused}");
-        let elsewhere = lookers.place("s2", "eve").expect("another servant");
+        let elsewhere = lookers.acquire("s2", "eve").expect("another servant");
         let others: Vec<_> = (0..MOST - MOST_EACH)
-            .map(|index| lookers.place("s1", &format!("p{index}")).expect("room"))
+            .map(|index| lookers.acquire("s1", &format!("p{index}")).expect("room"))
             .collect();
-        lookers.place("s1", "late").expect_err("all are taken");
+        lookers.acquire("s1", "late").expect_err("all are taken");
         eves.pop();
-        let late = lookers.place("s1", "late").expect("room again");
+        let late = lookers.acquire("s1", "late").expect("room again");
         drop((eves, elsewhere, others, late));
         assert!(lookers.all.lock().is_empty(), "nothing is left behind");
     }

@@ -1,13 +1,13 @@
-//! Everything on the port, and on the daemon's Unix socket: one router.
+//! The portal: everything served on the port and on the daemon's Unix socket, with one router.
 //!
 //! ```text
 //!  TLS, TCP, Unix ─▶ hyper ─▶ guard ─▶ allowed ─┬─▶ /            the page, or the default service
-//!                      who asks    may they  ├─▶ /healthz /metrics /assets
-//!                                            ├─▶ /api/v1      what cloudroidctl does
-//!                                            ├─▶ /v2          images, read-only (OCI distribution)
-//!                                            ├─▶ /foxglove   viewers, beside a servant's robot
-//!                                            ├─▶ /stubs       what robots install in a package's place
-//!                                            └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
+//!                         authenticate authorise├─▶ /healthz /metrics /assets
+//!                                               ├─▶ /api/v1      requests of cloudroidctl and the page
+//!                                               ├─▶ /v2          images, read-only (OCI distribution)
+//!                                               ├─▶ /foxglove    viewers, beside a servant's robot
+//!                                               ├─▶ /stubs       stubs that robots install in place of a package
+//!                                               └─▶ /<service>   upgrade ─▶ lease ─▶ bridge
 //! ```
 
 #![deny(unsafe_code)]
@@ -63,31 +63,31 @@ pub use axum::Router;
 pub use axum::http::Uri;
 
 pub use ::tls::Fingerprint;
-pub use app::{App, Machine, Options};
+pub use app::{App, MachineChecks, Options};
 pub use audit::Audit;
 pub use connections::{serve_challenges, serve_tcp, serve_unix};
-pub use history::keep as keep_history;
-pub use inside::Lookers;
-pub use machines::Robots;
-pub use observers::{BlackBoxOptions, Observers, keep as keep_observers};
+pub use history::record_history as keep_history;
+pub use inside::InsideConnections;
+pub use machines::RobotAuthority;
+pub use observers::{BlackBoxOptions, Observers, run_observers as keep_observers};
 pub use people::passwords::Passwords;
 pub use people::provider::{CALLBACK, IdentityProvider};
-pub use principals::{Lasting, Principals};
-pub use proxies::{Network, NoNetwork, Proxies};
+pub use principals::{Principals, SessionLifetimes};
+pub use proxies::{IpNetwork, ParseIpNetworkError, Proxies};
 pub use strangers::Strangers;
-pub use stream::Live;
+pub use stream::LiveSamples;
 pub use tls::{Challenge, Tls, TlsError};
 pub use tokens::{TokenError, Tokens};
 
-/// The routes, behind the guard.
+/// Builds the router, behind the guard.
 pub fn router(app: Arc<App>) -> Router {
     let served = routes::ROUTES.iter().fold(Router::new(), |router, route| {
         let allowed =
-            axum::middleware::from_fn_with_state((Arc::clone(&app), route), allowed::allowed);
+            axum::middleware::from_fn_with_state((Arc::clone(&app), route), allowed::authorise);
         router.route(route.path, (route.handler)().layer(allowed))
     });
     served
-        .fallback(routes::nothing)
+        .fallback(routes::not_found)
         .method_not_allowed_fallback(routes::other_method)
         .layer(axum::middleware::from_fn_with_state(
             Arc::clone(&app),

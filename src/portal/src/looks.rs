@@ -1,4 +1,4 @@
-//! Looks at the machine and the servants: what they are, and what they have used since the look before.
+//! Samples servants and machine: their state, and the resources used since the previous sample.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -12,20 +12,20 @@ use crate::app::App;
 use crate::errors::Error;
 use crate::{explain, views};
 
-/// Over less, processor time says little.
+/// Minimum interval over which processor time is meaningful.
 const MEASURED: Duration = Duration::from_millis(900);
 
-/// Looks again and again, and knows what was used at the look before.
+/// Samples servants repeatedly and computes usage since the previous sample.
 #[derive(Default)]
-pub struct Looker {
-    measured: HashMap<String, Measured>,
+pub struct ServantSampler {
+    measured: HashMap<String, CpuMeasurement>,
 }
 
-impl Looker {
-    /// All servants as they are now.
-    pub async fn servants(&mut self, app: &App) -> Vec<Served> {
+impl ServantSampler {
+    /// Returns the current state of all servants.
+    pub async fn sample(&mut self, app: &App) -> Vec<Served> {
         let handles = app.choreographer.servants();
-        let looks = handles.iter().map(|handle| served(app, handle));
+        let looks = handles.iter().map(|handle| describe_servant(app, handle));
         let mut servants = futures_util::future::join_all(looks).await;
         let now = Instant::now();
         self.measured
@@ -37,9 +37,9 @@ impl Looker {
     }
 }
 
-/// Processor time at a moment, and what was used before it.
+/// Processor time at a moment, and the usage computed up to then.
 #[derive(Clone, Copy)]
-struct Measured {
+struct CpuMeasurement {
     at: Instant,
     cpu_usec: u64,
     throttled_usec: u64,
@@ -47,7 +47,7 @@ struct Measured {
     throttled: f64,
 }
 
-async fn served(app: &App, handle: &Handle) -> Served {
+async fn describe_servant(app: &App, handle: &Handle) -> Served {
     Served {
         servant: app.choreographer.describe(handle).await,
         throttled: 0.0,
@@ -56,13 +56,13 @@ async fn served(app: &App, handle: &Handle) -> Served {
     }
 }
 
-/// Says what a servant has used since it was measured last.
-fn measure(served: &mut Served, measured: &mut HashMap<String, Measured>, now: Instant) {
+/// Fills in what a servant has used since it was last measured.
+fn measure(served: &mut Served, measured: &mut HashMap<String, CpuMeasurement>, now: Instant) {
     let Some(usage) = &served.servant.usage else {
         measured.remove(&served.servant.id);
         return;
     };
-    let new = Measured {
+    let new = CpuMeasurement {
         at: now,
         cpu_usec: usage.cpu_usec,
         throttled_usec: usage.throttled_usec,
@@ -74,7 +74,7 @@ fn measure(served: &mut Served, measured: &mut HashMap<String, Measured>, now: I
     if passed >= MEASURED {
         let share =
             |now: u64, then: u64| now.saturating_sub(then) as f64 / passed.as_micros() as f64;
-        *last = Measured {
+        *last = CpuMeasurement {
             cores: share(new.cpu_usec, last.cpu_usec),
             throttled: share(new.throttled_usec, last.throttled_usec).min(1.0),
             ..new
@@ -84,15 +84,15 @@ fn measure(served: &mut Served, measured: &mut HashMap<String, Measured>, now: I
     served.throttled = last.throttled;
 }
 
-/// The machine, with what these servants use of it.
-pub async fn machine(app: &App, servants: &[Served]) -> Result<Machine, Error> {
+/// Returns the state of the machine, with the usage of these servants.
+pub async fn sample_machine(app: &App, servants: &[Served]) -> Result<Machine, Error> {
     Ok(Machine {
         status: views::status(app).await?,
-        // The sum of none would be -0.
+        // `sum()` of nothing would be -0.
         cores: servants.iter().fold(0.0, |sum, one| sum + one.cores),
         host_cores: std::thread::available_parallelism().map_or(1, usize::from),
-        host_memory: servant::host::memory(),
-        host_memory_available: servant::host::memory_available(),
+        host_memory: servant::host::total_memory(),
+        host_memory_available: servant::host::available_memory_percent(),
     })
 }
 
@@ -100,7 +100,7 @@ pub async fn machine(app: &App, servants: &[Served]) -> Result<Machine, Error> {
 pub mod tests {
     use super::*;
 
-    pub fn served(cpu_usec: u64, throttled_usec: u64) -> Served {
+    pub fn served_servant(cpu_usec: u64, throttled_usec: u64) -> Served {
         let usage = api::Usage {
             cpu_usec,
             throttled_usec,
@@ -122,7 +122,7 @@ pub mod tests {
     fn use_is_measured_over_long_enough() {
         let (mut measured, start) = (HashMap::new(), Instant::now());
         let mut at = |after: u64, cpu, throttled| {
-            let mut servant = served(cpu, throttled);
+            let mut servant = served_servant(cpu, throttled);
             measure(
                 &mut servant,
                 &mut measured,
@@ -132,7 +132,7 @@ pub mod tests {
         };
         assert_eq!(at(0, 1_000_000, 0), (0.0, 0.0));
         assert_eq!(at(1_000, 1_500_000, 250_000), (0.5, 0.25));
-        // A look right after an event tells what was measured before.
+        // A sample right after an event repeats the previous measurement.
         assert_eq!(at(1_100, 1_600_000, 250_000), (0.5, 0.25));
         assert_eq!(at(2_000, 1_500_000, 9_250_000), (0.0, 1.0));
     }

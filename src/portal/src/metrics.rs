@@ -1,4 +1,5 @@
-//! `/metrics`: what Prometheus and its like read. docs/metrics.md lists them; a story compares it with what is told.
+//! `/metrics`: read by Prometheus and compatible collectors. docs/metrics.md lists the metrics; a story compares it
+//! with the output.
 
 mod exposition;
 
@@ -15,7 +16,8 @@ use crate::app::App;
 use crate::errors::Error;
 use choreographer::{Choreographer, Handle};
 use exposition::{
-    OPEN_METRICS, PROMETHEUS, asks_for_open_metrics, family, gauge, labels, open_metrics,
+    OPEN_METRICS, PROMETHEUS, accepts_open_metrics, format_labels, to_open_metrics, write_family,
+    write_gauge,
 };
 
 const PHASES: [Phase; 6] = [
@@ -27,104 +29,111 @@ const PHASES: [Phase; 6] = [
     Phase::Draining,
 ];
 
-/// Answers with all figures, as OpenMetrics where that is asked for.
+/// Responds with all metrics, as OpenMetrics if that is requested.
 pub async fn metrics(State(app): State<Arc<App>>, headers: HeaderMap) -> Result<Response, Error> {
     let mut out = String::new();
     let services = app.state.service_names()?;
-    gauge(
+    write_gauge(
         &mut out,
         "cloudroid_services",
         "Published services.",
         [(String::new(), services.len() as f64)],
     );
-    servants(&mut out, &app.choreographer);
-    shared(&mut out, &app.choreographer, &services);
+    write_servant_metrics(&mut out, &app.choreographer);
+    write_group_metrics(&mut out, &app.choreographer, &services);
     let (pushes, failed) = app.pusher.counts();
-    family(
+    write_family(
         &mut out,
         "cloudroid_pushes_total",
         "counter",
         "Pushes since the daemon started.",
         [
-            (labels(&[("result", "published")]), pushes as f64),
-            (labels(&[("result", "failed")]), failed as f64),
+            (format_labels(&[("result", "published")]), pushes as f64),
+            (format_labels(&[("result", "failed")]), failed as f64),
         ],
     );
-    let (unknown, slowed) = app.principals.guessed();
-    family(
+    let (unknown, slowed) = app.principals.token_counts();
+    write_family(
         &mut out,
         "cloudroid_refused_tokens_total",
         "counter",
         "Tokens that let nobody in: unknown ones, and those not looked at because too many came from their address.",
         [
-            (labels(&[("why", "unknown")]), unknown as f64),
-            (labels(&[("why", "slowed")]), slowed as f64),
+            (format_labels(&[("why", "unknown")]), unknown as f64),
+            (format_labels(&[("why", "slowed")]), slowed as f64),
         ],
     );
-    let (wrong, slowed) = app.principals.mistaken();
-    family(
+    let (wrong, slowed) = app.principals.password_counts();
+    write_family(
         &mut out,
         "cloudroid_refused_passwords_total",
         "counter",
         "Passwords that let nobody in: wrong ones, and those not looked at because too many came for their account.",
         [
-            (labels(&[("why", "wrong")]), wrong as f64),
-            (labels(&[("why", "slowed")]), slowed as f64),
+            (format_labels(&[("why", "wrong")]), wrong as f64),
+            (format_labels(&[("why", "slowed")]), slowed as f64),
         ],
     );
-    gauge(
+    write_gauge(
         &mut out,
         "cloudroid_strangers",
         "TCP connections on which nobody has shown yet who asks.",
         [(String::new(), app.strangers.count() as f64)],
     );
-    family(
+    write_family(
         &mut out,
         "cloudroid_dropped_strangers_total",
         "counter",
         "TCP connections that were dropped before anybody had shown who asks, because newer ones needed their places.",
-        [(String::new(), app.strangers.dropped() as f64)],
+        [(String::new(), app.strangers.dropped_count() as f64)],
     );
-    if let Some(end) = app.tls.as_ref().and_then(|tls| tls.end()) {
-        gauge(
+    if let Some(end) = app.tls.as_ref().and_then(|tls| tls.expiry()) {
+        write_gauge(
             &mut out,
             "cloudroid_certificate_end_seconds",
             "When the portal's certificate ends, in seconds since 1970.",
             [(String::new(), end as f64 / 1000.0)],
         );
     }
-    capacity(&mut out, &app.choreographer);
+    write_capacity_metrics(&mut out, &app.choreographer);
     let memory = app.choreographer.memory().whole();
-    gauge(
+    write_gauge(
         &mut out,
         "cloudroid_memory_bytes",
         "Bytes held for clients and servants, and how many may be.",
         [
-            (labels(&[("what", "held")]), memory.used() as f64),
-            (labels(&[("what", "limit")]), memory.limit() as f64),
+            (
+                format_labels(&[("what", "held")]),
+                memory.used_bytes() as f64,
+            ),
+            (format_labels(&[("what", "limit")]), memory.limit() as f64),
         ],
     );
-    family(
+    write_family(
         &mut out,
         "cloudroid_memory_refused_total",
         "counter",
         "How often a client or servant was refused memory.",
-        [(String::new(), app.choreographer.memory().refused() as f64)],
+        [(
+            String::new(),
+            app.choreographer.memory().refusal_count() as f64,
+        )],
     );
     let exists = |name: &str| services.iter().any(|service| service == name);
     app.choreographer
         .request_times()
-        .prometheus(&mut out, exists);
-    usage(&mut out, &app.choreographer.servants()).await;
-    let (kind, text) = match asks_for_open_metrics(&headers) {
-        true => (OPEN_METRICS, open_metrics(&out)),
-        false => (PROMETHEUS, out),
+        .write_prometheus(&mut out, exists);
+    write_usage_metrics(&mut out, &app.choreographer.servants()).await;
+    let (kind, text) = if accepts_open_metrics(&headers) {
+        (OPEN_METRICS, to_open_metrics(&out))
+    } else {
+        (PROMETHEUS, out)
     };
     Ok(([(header::CONTENT_TYPE, kind)], text).into_response())
 }
 
-/// What robots share.
-fn shared(out: &mut String, choreographer: &Choreographer, services: &[String]) {
+/// Writes the metrics of groups of robots that share servants.
+fn write_group_metrics(out: &mut String, choreographer: &Choreographer, services: &[String]) {
     let (mut requests, mut waiting, mut ready) = (Vec::new(), Vec::new(), Vec::new());
     for service in services {
         for group in choreographer.groups(service) {
@@ -136,28 +145,28 @@ fn shared(out: &mut String, choreographer: &Choreographer, services: &[String]) 
                 ("asked_again", group.asked_again),
                 ("wasted", group.wasted),
             ] {
-                let of = labels(&[of[0], of[1], ("outcome", outcome)]);
+                let of = format_labels(&[of[0], of[1], ("outcome", outcome)]);
                 requests.push((of, count as f64));
             }
-            waiting.push((labels(&of), group.waiting as f64));
+            waiting.push((format_labels(&of), group.waiting as f64));
             let count = group.servants.iter().filter(|one| one.ready).count();
-            ready.push((labels(&of), count as f64));
+            ready.push((format_labels(&of), count as f64));
         }
     }
-    family(
+    write_family(
         out,
         "cloudroid_shared_requests_total",
         "counter",
         "Requests to servants that robots share, by what became of them; wasted: work of replicas that nobody needed.",
         requests,
     );
-    gauge(
+    write_gauge(
         out,
         "cloudroid_shared_waiting",
         "Requests that wait for a servant that robots share.",
         waiting,
     );
-    gauge(
+    write_gauge(
         out,
         "cloudroid_shared_servants",
         "Servants that robots share and that answer.",
@@ -165,7 +174,7 @@ fn shared(out: &mut String, choreographer: &Choreographer, services: &[String]) 
     );
 }
 
-fn servants(out: &mut String, choreographer: &Choreographer) {
+fn write_servant_metrics(out: &mut String, choreographer: &Choreographer) {
     let handles = choreographer.servants();
     let count = |phase| {
         handles
@@ -175,12 +184,12 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     };
     let by_phase = PHASES.map(|phase| {
         (
-            labels(&[("phase", &phase.to_string())]),
+            format_labels(&[("phase", &phase.to_string())]),
             count(phase) as f64,
         )
     });
-    gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
-    gauge(
+    write_gauge(out, "cloudroid_servants", "Servants by state.", by_phase);
+    write_gauge(
         out,
         "cloudroid_warm_pool",
         "Containers made ahead.",
@@ -192,8 +201,8 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     }
     let connections = connections
         .into_iter()
-        .map(|(service, count)| (labels(&[("service", &service)]), count as f64));
-    gauge(
+        .map(|(service, count)| (format_labels(&[("service", &service)]), count as f64));
+    write_gauge(
         out,
         "cloudroid_connections",
         "Connections of robots.",
@@ -201,7 +210,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     );
     let bridges: Vec<_> = handles
         .iter()
-        .filter_map(|handle| Some((labels_of(handle), handle.reach()?)))
+        .filter_map(|handle| Some((servant_labels(handle), handle.reach()?)))
         .collect();
     let messages = bridges.iter().flat_map(|(of, reach)| {
         let metrics = reach.metrics();
@@ -216,7 +225,7 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
             ),
         ]
     });
-    family(
+    write_family(
         out,
         "cloudroid_messages_total",
         "counter",
@@ -225,15 +234,15 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
     );
     let dropped = bridges
         .iter()
-        .map(|(of, reach)| (of.clone(), reach.dropped() as f64));
-    family(
+        .map(|(of, reach)| (of.clone(), reach.dropped_count() as f64));
+    write_family(
         out,
         "cloudroid_dropped_total",
         "counter",
         "Messages dropped because someone was slow.",
         dropped,
     );
-    // All rows of a counter stand together.
+    // All rows of a counter must be adjacent.
     let told: Vec<_> = bridges
         .iter()
         .map(|(of, reach)| (of, reach.metrics().all()))
@@ -242,12 +251,12 @@ fn servants(out: &mut String, choreographer: &Choreographer) {
         let rows = told
             .iter()
             .map(|(of, all)| ((*of).clone(), all[at].2 as f64));
-        family(out, name, "counter", help, rows);
+        write_family(out, name, "counter", help, rows);
     }
 }
 
-fn capacity(out: &mut String, choreographer: &Choreographer) {
-    let (capacity, taken, waiting) = choreographer.admission().look();
+fn write_capacity_metrics(out: &mut String, choreographer: &Choreographer) {
+    let (capacity, taken, waiting) = choreographer.admission().snapshot();
     let rows = [
         (
             "cloudroid_capacity_cpus",
@@ -272,49 +281,49 @@ fn capacity(out: &mut String, choreographer: &Choreographer) {
         ),
     ];
     for (name, help, value) in rows {
-        gauge(out, name, help, [(String::new(), value)]);
+        write_gauge(out, name, help, [(String::new(), value)]);
     }
-    let stalled = choreographer.admission().stalled().is_some();
-    gauge(
+    let stalled = choreographer.admission().stall_reason().is_some();
+    write_gauge(
         out,
         "cloudroid_stalled",
         "1 while nobody is admitted since the machine stalls.",
         [(String::new(), f64::from(u8::from(stalled)))],
     );
-    family(
+    write_family(
         out,
         "cloudroid_moves_total",
         "counter",
         "How often the controller changed cpu.max or cpu.weight of a servant.",
-        [(String::new(), choreographer.moves() as f64)],
+        [(String::new(), choreographer.move_count() as f64)],
     );
 }
 
-async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
+async fn write_usage_metrics(out: &mut String, handles: &[Arc<Handle>]) {
     let mut rows = Vec::new();
     for handle in handles {
         if let Some(usage) = choreographer::usage(handle).await {
-            rows.push((labels_of(handle), usage));
+            rows.push((servant_labels(handle), usage));
         }
     }
     let of = |value: fn(&api::Usage) -> f64| {
         rows.iter()
             .map(move |(labels, usage)| (labels.clone(), value(usage)))
     };
-    gauge(
+    write_gauge(
         out,
         "cloudroid_servant_memory_bytes",
         "Memory of a servant.",
         of(|usage| usage.memory as f64),
     );
-    gauge(
+    write_gauge(
         out,
         "cloudroid_servant_pids",
         "Processes and threads of a servant.",
         of(|usage| usage.pids as f64),
     );
     let cpu = of(|usage| usage.cpu_usec as f64 / 1e6);
-    family(
+    write_family(
         out,
         "cloudroid_servant_cpu_seconds_total",
         "counter",
@@ -322,16 +331,16 @@ async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
         cpu,
     );
     let throttled = of(|usage| usage.throttled_usec as f64 / 1e6);
-    family(
+    write_family(
         out,
         "cloudroid_servant_throttled_seconds_total",
         "counter",
         "Time in which a servant had used its cores up.",
         throttled,
     );
-    pressure(out, &rows);
+    write_pressure_metrics(out, &rows);
     let kills = of(|usage| usage.oom_kills as f64);
-    family(
+    write_family(
         out,
         "cloudroid_servant_oom_kills_total",
         "counter",
@@ -340,8 +349,8 @@ async fn usage(out: &mut String, handles: &[Arc<Handle>]) {
     );
 }
 
-/// None on cgroup v1.
-fn pressure(out: &mut String, rows: &[(String, api::Usage)]) {
+/// Writes the pressure metrics, which cgroup v1 does not have.
+fn write_pressure_metrics(out: &mut String, rows: &[(String, api::Usage)]) {
     let waits = rows.iter().flat_map(|(labels, usage)| {
         let each = usage.pressure.map(|pressure| {
             [
@@ -354,7 +363,7 @@ fn pressure(out: &mut String, rows: &[(String, api::Usage)]) {
             .flatten()
             .map(move |(what, percent)| (format!("{labels},resource=\"{what}\""), percent / 100.0))
     });
-    gauge(
+    write_gauge(
         out,
         "cloudroid_servant_pressure_ratio",
         "Share of the last ten seconds in which some of a servant waited.",
@@ -362,8 +371,8 @@ fn pressure(out: &mut String, rows: &[(String, api::Usage)]) {
     );
 }
 
-fn labels_of(handle: &Handle) -> String {
-    labels(&[
+fn servant_labels(handle: &Handle) -> String {
+    format_labels(&[
         ("servant", &handle.id),
         ("service", handle.service()),
         ("robot", &handle.robot),

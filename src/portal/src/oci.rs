@@ -1,4 +1,4 @@
-//! `/v2/`: the images, as the OCI distribution specification (1.1) has a registry serve them; reading only.
+//! `/v2/`: container images, served read-only according to the OCI distribution specification (1.1).
 
 use std::sync::Arc;
 
@@ -18,25 +18,26 @@ const API_VERSION: HeaderName = HeaderName::from_static("docker-distribution-api
 const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 const CHUNK: usize = 256 << 10;
 
-/// How clients of registries ask people for a token: as the password of any name (RFC 7617). A challenge for bearer tokens would need the
-/// address of a server that makes them, and the daemon's are made by an operator.
+/// Challenge that makes registry clients ask for a token as the password of any user (RFC 7617). A bearer challenge
+/// would need the URL of a token server, but the daemon's tokens are created by an operator.
 const CHALLENGE: HeaderValue =
     HeaderValue::from_static(r#"Basic realm="cloudroid", charset="UTF-8""#);
 
-/// Whether an address is the registry's.
-pub fn is_registrys(path: &str) -> bool {
+/// Returns true if the path is the registry's.
+pub fn is_registry_path(path: &str) -> bool {
     path == "/v2" || path.starts_with("/v2/")
 }
 
-/// Whether a request is one of a client of registries, which has to be asked for a password in its words. A browser would show such a
-/// challenge to whoever sits before it, as a dialog that any page can bring up; all browsers call themselves Mozilla (RFC 9110, section 10.1.5).
-pub fn is_of_registry_client(path: &str, headers: &HeaderMap) -> bool {
+/// Returns true if the request comes from a registry client, which must be challenged for a password. A browser would
+/// show a password dialog, which any page could trigger; all browsers identify themselves as Mozilla (RFC 9110,
+/// section 10.1.5).
+pub fn is_registry_client(path: &str, headers: &HeaderMap) -> bool {
     let agent = headers.get(header::USER_AGENT);
     let is_browser = agent.is_some_and(|agent| agent.as_bytes().starts_with(b"Mozilla/"));
-    is_registrys(path) && !is_browser
+    is_registry_path(path) && !is_browser
 }
 
-/// `/v2/`: yes, this is a registry.
+/// `/v2/`: confirms that this is a registry.
 pub async fn version() -> Response {
     ([(API_VERSION, "registry/2.0")], Json(json!({}))).into_response()
 }
@@ -47,7 +48,7 @@ pub async fn catalog(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let mut names = app.state.service_names()?;
-    names.retain(|name| caller.sees(&app, name));
+    names.retain(|name| caller.can_see(&app, name));
     Ok(Json(json!({ "repositories": names })).into_response())
 }
 
@@ -58,7 +59,7 @@ pub async fn tags(
 ) -> Result<Response, Error> {
     let revisions = app.state.revisions(&name)?;
     if revisions.is_empty() {
-        return Ok(unknown(
+        return Ok(not_found(
             "NAME_UNKNOWN",
             &format!("there is no repository {name}"),
         ));
@@ -78,7 +79,7 @@ pub async fn manifest(
     Path((name, reference)): Path<(String, String)>,
 ) -> Result<Response, Error> {
     let revisions = app.state.revisions(&name)?;
-    let current = app.state.current(&name)?;
+    let current = app.state.current_revision(&name)?;
     let image = match reference.as_str() {
         "latest" => current.map(|revision| revision.image.clone()),
         _ => revisions
@@ -89,17 +90,17 @@ pub async fn manifest(
             .map(|revision| revision.image),
     };
     let Some(image) = image else {
-        return Ok(unknown(
+        return Ok(not_found(
             "MANIFEST_UNKNOWN",
             &format!("there is no image {name}:{reference}"),
         ));
     };
     let store = Arc::clone(app.catalogue.images());
-    let found = privilege::blocking(move || store.manifest(&image))
+    let found = privilege::spawn_blocking(move || store.manifest(&image))
         .await
         .map_err(|_| Error::Internal("reading a manifest"))??;
     let Some(manifest) = found else {
-        return Ok(unknown(
+        return Ok(not_found(
             "MANIFEST_UNKNOWN",
             &format!("the image {name}:{reference} is gone"),
         ));
@@ -118,13 +119,13 @@ pub async fn blob(
     Extension(caller): Extension<Caller>,
 ) -> Result<Response, Error> {
     let Ok(parsed) = digest.parse::<image::Digest>() else {
-        return Ok(refused(
+        return Ok(error_response(
             StatusCode::BAD_REQUEST,
             "DIGEST_INVALID",
             &format!("{digest} is not a digest"),
         ));
     };
-    // Blobs lie in one place; who is not told of every service gets those alone that are of this one.
+    // Blobs are shared by all services. A caller that does not see every service gets only those of this one.
     let images: Option<Vec<image::Digest>> = if caller.who.principal.sees_all() {
         None
     } else {
@@ -136,7 +137,7 @@ pub async fn blob(
         )
     };
     let store = Arc::clone(app.catalogue.images());
-    let found = privilege::blocking(move || {
+    let found = privilege::spawn_blocking(move || {
         for image in images.iter().flatten() {
             if store.has_blob(image, &parsed)? {
                 return store.blob(&parsed);
@@ -150,7 +151,7 @@ pub async fn blob(
     .await
     .map_err(|_| Error::Internal("reading a blob"))??;
     let Some(blob) = found else {
-        return Ok(unknown(
+        return Ok(not_found(
             "BLOB_UNKNOWN",
             &format!("there is no blob {digest}"),
         ));
@@ -164,47 +165,47 @@ pub async fn blob(
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 
-/// Anything else: pushing by this interface, for one, is not offered.
-pub async fn nothing(OriginalUri(uri): OriginalUri) -> Response {
-    refused(
+/// Any other path; pushing through this interface is not supported.
+pub async fn unsupported(OriginalUri(uri): OriginalUri) -> Response {
+    error_response(
         StatusCode::NOT_FOUND,
         "UNSUPPORTED",
         &format!("{} is not served; images are read-only here", uri.path()),
     )
 }
 
-/// The same of a path that is served by another method.
+/// A supported path with an unsupported method.
 pub fn other_method(method: &Method, uri: &Uri) -> Response {
-    refused(
+    error_response(
         StatusCode::METHOD_NOT_ALLOWED,
         "UNSUPPORTED",
         &format!(
-            "{method} is not answered at {}; images are read-only here",
+            "{method} is not supported at {}; images are read-only here",
             uri.path()
         ),
     )
 }
 
-/// Why a request is not let in, as clients of registries read it.
-pub fn not_let_in(error: &Error) -> Response {
+/// Refuses an unauthenticated request in the format of registry clients.
+pub fn unauthorised(error: &Error) -> Response {
     let problem = error.problem();
     let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
     if status != StatusCode::UNAUTHORIZED {
         return errors::respond(&problem);
     }
     let detail = problem.detail;
-    let message = format!("{detail}; log in with a token as the password, under any name");
-    let mut response = refused(status, "UNAUTHORIZED", &message);
+    let message = format!("{detail}; log in with a token as the password and any user name");
+    let mut response = error_response(status, "UNAUTHORIZED", &message);
     let headers = response.headers_mut();
     headers.insert(header::WWW_AUTHENTICATE, CHALLENGE);
     response
 }
 
-fn unknown(code: &str, message: &str) -> Response {
-    refused(StatusCode::NOT_FOUND, code, message)
+fn not_found(code: &str, message: &str) -> Response {
+    error_response(StatusCode::NOT_FOUND, code, message)
 }
 
-fn refused(status: StatusCode, code: &str, message: &str) -> Response {
+fn error_response(status: StatusCode, code: &str, message: &str) -> Response {
     (
         status,
         Json(json!({ "errors": [{ "code": code, "message": message }] })),
@@ -220,27 +221,27 @@ mod tests {
     fn browsers_are_not_asked_for_a_password() {
         let of = |path, agent: &'static str| {
             let agent = (header::USER_AGENT, HeaderValue::from_static(agent));
-            is_of_registry_client(path, &HeaderMap::from_iter([agent]))
+            is_registry_client(path, &HeaderMap::from_iter([agent]))
         };
         assert!(of("/v2/", "skopeo/1.9.3"));
-        assert!(is_of_registry_client("/v2/_catalog", &HeaderMap::new()));
+        assert!(is_registry_client("/v2/_catalog", &HeaderMap::new()));
         assert!(!of("/v2/_catalog", "Mozilla/5.0 (X11; Linux x86_64)"));
         assert!(!of("/api/v1/services", "skopeo/1.9.3"));
     }
 
     #[tokio::test]
     async fn clients_of_registries_are_asked_for_a_password_in_their_words() {
-        let response = not_let_in(&Error::Unauthorised("a token is needed"));
+        let response = unauthorised(&Error::Unauthorised("a token is needed"));
         assert_eq!(response.status(), StatusCode::UNAUTHORIZED);
-        // One that names `Bearer` without the address of a server for tokens ends skopeo and containerd.
+        // A `Bearer` challenge without the URL of a token server makes skopeo and containerd give up.
         let challenges = response.headers().get_all(header::WWW_AUTHENTICATE);
         assert_eq!(challenges.iter().collect::<Vec<_>>(), [&CHALLENGE]);
         let body = axum::body::to_bytes(response.into_body(), 4096).await;
         let body: serde_json::Value =
             serde_json::from_slice(&body.expect("a body")).expect("a document");
         assert_eq!(body["errors"][0]["code"], "UNAUTHORIZED");
-        let slowed = Error::from(crate::principals::Unrecognised::Slowed(3_001));
-        let response = not_let_in(&slowed);
+        let slowed = Error::from(crate::principals::AuthenticationError::Slowed(3_001));
+        let response = unauthorised(&slowed);
         assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
         assert_eq!(response.headers()[header::RETRY_AFTER], "4");
     }

@@ -1,4 +1,4 @@
-//! The OpenAPI document of `/api/v1`, made of the table of routes and of the types of crate `api`.
+//! OpenAPI document of `/api/v1`, generated from the route table and the types of the crate `api`.
 
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
@@ -27,44 +27,44 @@ use utoipa::{IntoParams, PartialSchema, ToSchema};
 use crate::errors::Error;
 use crate::routes::{Access, ROUTES, Route};
 
-/// What all addresses that are described begin with.
+/// Prefix of all described paths.
 const BASE: &str = "/api/v1";
 const JSON: &str = "application/json";
 const EVENT_STREAM: &str = "text/event-stream";
 const HTML: &str = "text/html";
-const ABOUT: &str = "What cloudroidctl and the portal's page ask of cloudroidd. Robots connect elsewhere: \
-                     ws://host:port/SERVICE?robot=ID speaks rosbridge v2. Images are served read-only at /v2/ (OCI \
-                     distribution).";
+const ABOUT: &str = "API of cloudroidd for cloudroidctl and the portal's page. Robots connect to \
+    ws://host:port/SERVICE?robot=ID instead, which speaks rosbridge v2. Images are served read-only at /v2/ (OCI \
+    distribution).";
 
 type AnySchema = RefOr<Schema>;
 
-/// What a refusal of each status says, in a few words.
+/// Descriptions of the refusals, by status.
 const REFUSED: &[(u16, &str)] = &[
-    (400, "Something in the request is not what it should be."),
-    (401, "Nobody is known who asks."),
-    (403, "Who asks may not."),
-    (
-        404,
-        "There is no such thing; exists names those that there are.",
-    ),
-    (408, "The body was not complete in time."),
-    (409, "It stands against what is there now."),
-    (413, "The body is too big."),
-    (422, "It cannot be, whenever it is asked."),
-    (426, "The WebSocket handshake is of another version."),
-    (429, "Too many; Retry-After says when to ask again."),
+    (400, "The request is invalid."),
+    (401, "No valid token, certificate or session."),
+    (403, "Not permitted."),
+    (404, "Not found; `exists` lists the existing names."),
+    (408, "The body was not received in time."),
+    (409, "Conflict with the current state."),
+    (413, "The body is too large."),
+    (422, "The request can never succeed as it is."),
+    (426, "The WebSocket version is not supported."),
+    (429, "Too many requests; see Retry-After."),
     (500, "The daemon failed."),
-    (502, "Whoever was asked in turn did not answer."),
-    (503, "Not now; Retry-After says when to ask again."),
-    (507, "There is no room on the disk."),
+    (
+        502,
+        "Another component failed, such as the servant or the identity provider.",
+    ),
+    (503, "Temporarily unavailable; see Retry-After."),
+    (507, "The disk is full."),
 ];
-/// With what any operation may be refused.
+/// Refusals of any operation.
 const ANY: &[u16] = &[400, 401, 403, 429, 500];
-/// One of something that the address names.
+/// Refusals of operations whose path names an object.
 const NAMED: &[u16] = &[404];
-/// One whose body is read first.
+/// Refusals of operations that read a body.
 const WITH_BODY: &[u16] = &[408, 413, 503];
-/// Operations that may be refused with more, by their ids.
+/// Further refusals of operations, by operation id.
 const MORE: &[(&str, &[u16])] = &[
     ("calibrate", &[409]),
     ("createAccount", &[409]),
@@ -86,7 +86,7 @@ const MORE: &[(&str, &[u16])] = &[
     ("trial", &[422, 502]),
 ];
 
-/// One method at one address, in words and schemas.
+/// Description of one method of one path.
 pub struct Operation {
     id: String,
     built: OperationBuilder,
@@ -95,7 +95,7 @@ pub struct Operation {
     schemas: Vec<(String, AnySchema)>,
 }
 
-/// An operation: its id, by which generators of clients call it, and what it does.
+/// Creates an operation with its id, from which generated clients derive a name, and its summary.
 pub fn operation(id: &str, summary: &str) -> Operation {
     Operation {
         id: id.to_owned(),
@@ -108,75 +108,80 @@ pub fn operation(id: &str, summary: &str) -> Operation {
 }
 
 impl Operation {
-    /// It answers one value as JSON.
+    /// Declares a response with one JSON value.
     pub fn answers<T: ToSchema>(mut self) -> Self {
-        let schema = self.named::<T>();
-        self.answer("200", "As asked.", JSON, schema)
+        let schema = self.register_schema::<T>();
+        self.answer("200", "The requested file.", JSON, schema)
     }
 
-    /// It answers a list as JSON.
+    /// Declares a response with a JSON list.
     pub fn lists<T: ToSchema>(mut self) -> Self {
-        let schema = Array::new(self.named::<T>());
-        self.answer("200", "As asked.", JSON, Schema::Array(schema).into())
+        let schema = Array::new(self.register_schema::<T>());
+        self.answer(
+            "200",
+            "The requested file.",
+            JSON,
+            Schema::Array(schema).into(),
+        )
     }
 
-    /// It answers values as JSON lines.
+    /// Declares a response with JSON lines.
     pub fn streams<T: ToSchema>(mut self) -> Self {
-        let schema = self.named::<T>();
-        self.answer("200", "As asked.", NDJSON, schema)
+        let schema = self.register_schema::<T>();
+        self.answer("200", "The requested file.", NDJSON, schema)
     }
 
-    /// It answers server-sent events, whose data is a value as JSON.
+    /// Declares a response with server-sent events whose data is JSON.
     pub fn sends<T: ToSchema>(mut self) -> Self {
-        let schema = self.named::<T>();
-        self.answer("200", "As asked.", EVENT_STREAM, schema)
+        let schema = self.register_schema::<T>();
+        self.answer("200", "The requested file.", EVENT_STREAM, schema)
     }
 
-    /// It answers a JSON object that is described elsewhere.
+    /// Declares a response with a JSON object that is described elsewhere.
     pub fn answers_object(self) -> Self {
         let object = ObjectBuilder::new().schema_type(Type::Object);
-        self.answer("200", "As asked.", JSON, object.into())
+        self.answer("200", "The requested file.", JSON, object.into())
     }
 
-    /// It answers a file of this media type.
+    /// Declares a response with a file of this media type.
     pub fn answers_file(self, media: &str) -> Self {
         let file = ObjectBuilder::new()
             .schema_type(Type::String)
             .format(Some(SchemaFormat::KnownFormat(KnownFormat::Binary)));
-        self.answer("200", "As asked.", media, file.into())
+        self.answer("200", "The requested file.", media, file.into())
     }
 
-    /// It sends a browser elsewhere.
-    pub fn leads_on(mut self) -> Self {
-        let response = ResponseBuilder::new().description("Elsewhere, by Location.");
+    /// Declares a redirect.
+    pub fn redirects(mut self) -> Self {
+        let response = ResponseBuilder::new().description("Redirect to Location.");
         self.built = self.built.response("303", response);
         self
     }
 
-    /// It answers that it was done.
+    /// Declares an empty response.
     pub fn answers_nothing(mut self) -> Self {
         let response = ResponseBuilder::new().description("Done.");
         self.built = self.built.response("204", response);
         self
     }
 
-    /// It becomes a WebSocket.
+    /// Declares an upgrade to a WebSocket.
     pub fn becomes_a_websocket(mut self) -> Self {
-        let response = ResponseBuilder::new().description("A WebSocket from here on.");
+        let response = ResponseBuilder::new().description("The connection is now a WebSocket.");
         self.built = self.built.response("101", response);
         self
     }
 
-    /// It answers a page for people.
+    /// Declares a response with an HTML page.
     pub fn answers_page(mut self) -> Self {
         let response = ResponseBuilder::new()
-            .description("As asked.")
+            .description("The requested file.")
             .content(HTML, page());
         self.built = self.built.response("200", response);
         self
     }
 
-    /// It reads these from the query.
+    /// Declares query parameters.
     pub fn asks<P: IntoParams>(mut self) -> Self {
         for parameter in P::into_params(|| Some(ParameterIn::Query)) {
             self.built = self.built.parameter(parameter);
@@ -184,10 +189,10 @@ impl Operation {
         self
     }
 
-    /// It reads a value as JSON from the query.
+    /// Declares a query parameter that holds JSON.
     pub fn asks_json<T: ToSchema>(mut self, name: &str, description: &str) -> Self {
-        // `ParameterBuilder` knows no `content`.
-        let content = Content::new(Some(self.named::<T>()));
+        // `ParameterBuilder` does not support `content`.
+        let content = Content::new(Some(self.register_schema::<T>()));
         self.built = self.built.parameter(
             ParameterBuilder::new()
                 .name(name)
@@ -201,13 +206,13 @@ impl Operation {
         self
     }
 
-    /// Its body is a value as JSON.
+    /// Declares a JSON body.
     pub fn takes<T: ToSchema>(mut self, required: Required) -> Self {
-        let schema = self.named::<T>();
+        let schema = self.register_schema::<T>();
         self.body(JSON, schema, RequestBodyBuilder::new(), required)
     }
 
-    /// Its body is a file of this media type.
+    /// Declares a body that is a file of this media type.
     pub fn takes_file(self, media: &str, description: &str, required: Required) -> Self {
         let file = ObjectBuilder::new()
             .schema_type(Type::String)
@@ -239,15 +244,15 @@ impl Operation {
         self
     }
 
-    /// Refers to a type's schema, which the document then holds.
-    fn named<T: ToSchema>(&mut self) -> AnySchema {
+    /// Adds the schema of a type to the document and returns a reference to it.
+    fn register_schema<T: ToSchema>(&mut self) -> AnySchema {
         T::schemas(&mut self.schemas);
         self.schemas.push((T::name().into_owned(), T::schema()));
         Ref::from_schema_name(T::name()).into()
     }
 }
 
-/// With what an operation at this path may be refused.
+/// Returns the statuses with which an operation at this path may be refused.
 fn refusals(path: &str, operation: &Operation) -> BTreeSet<u16> {
     let named = if path.contains('{') { NAMED } else { &[] };
     let body = if operation.reads_body { WITH_BODY } else { &[] };
@@ -257,30 +262,31 @@ fn refusals(path: &str, operation: &Operation) -> BTreeSet<u16> {
     all.copied().collect()
 }
 
-/// The name of the response that all refusals of a status are.
+/// Returns the name of the response shared by all refusals of a status.
 fn name_of_refusal(status: u16) -> String {
     format!("Refused{status}")
 }
 
-/// A refusal: a problem; where a browser was sent, a page for its person if it asks for one.
+/// Describes a refusal: a problem document or, where a browser was redirected, an HTML page if it asks for one.
 fn refusal(words: &str, is_page: bool) -> utoipa::openapi::Response {
     let problem = Content::new(Some(Ref::from_schema_name(Problem::name())));
     let response = ResponseBuilder::new()
         .description(words)
         .content(PROBLEM_JSON, problem);
-    match is_page {
-        true => response.content(HTML, page()).build(),
-        false => response.build(),
+    if is_page {
+        response.content(HTML, page()).build()
+    } else {
+        response.build()
     }
 }
 
-/// A page for people.
+/// Describes an HTML page.
 fn page() -> Content {
     let text = ObjectBuilder::new().schema_type(Type::String);
     Content::new(Some(Schema::from(text.build())))
 }
 
-/// Describes those routes that have an operation.
+/// Builds the document from the routes that have an operation.
 fn document(routes: &[Route]) -> OpenApi {
     let mut paths = Paths::new();
     let mut components = Components::new();
@@ -313,20 +319,19 @@ fn document(routes: &[Route]) -> OpenApi {
             if !statuses.contains(status) {
                 continue;
             }
-            // Browsers alone are sent there.
-            built = match path.starts_with("/oidc/") {
-                true => built.response(status.to_string(), refusal(words, true)),
-                false => {
-                    let all = Ref::from_response_name(name_of_refusal(*status));
-                    built.response(status.to_string(), all)
-                }
+            // Only browsers are sent there.
+            built = if path.starts_with("/oidc/") {
+                built.response(status.to_string(), refusal(words, true))
+            } else {
+                let all = Ref::from_response_name(name_of_refusal(*status));
+                built.response(status.to_string(), all)
             };
         }
-        for parameter in named_in(path) {
+        for parameter in path_parameters(path) {
             built = built.parameter(parameter);
         }
         if route.access == Access::Code {
-            // Its body says who asks.
+            // Its body authenticates the caller.
             built = built.security(SecurityRequirement::default());
         }
         paths.add_path_operation(path, vec![method], built);
@@ -366,8 +371,8 @@ fn method(name: &str) -> Option<HttpMethod> {
     })
 }
 
-/// What is named in a path: in `/services/{name}`, the service.
-fn named_in(path: &str) -> impl Iterator<Item = ParameterBuilder> {
+/// Returns the path parameters: in `/services/{name}`, the service.
+fn path_parameters(path: &str) -> impl Iterator<Item = ParameterBuilder> {
     let collections = path.split('/');
     collections
         .zip(path.split('/').skip(1))
@@ -385,7 +390,7 @@ fn named_in(path: &str) -> impl Iterator<Item = ParameterBuilder> {
         })
 }
 
-/// The description of all this.
+/// Responds with the OpenAPI document.
 pub async fn serve() -> Result<Response, Error> {
     static DOCUMENT: LazyLock<Option<Bytes>> = LazyLock::new(|| {
         let text = document(ROUTES).to_json().ok()?;

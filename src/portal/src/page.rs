@@ -1,5 +1,5 @@
-//! The portal's page: what `make web` has built of `web/`, built in. Each file is there as it is and compressed, so that nothing is
-//! compressed for a request.
+//! The portal's page: the output of `make web` in `web/`, compiled in. Each file is included both plain and
+//! compressed, so that no request needs compression.
 
 use axum::extract::Path;
 use axum::http::{HeaderMap, HeaderValue, Method, header};
@@ -8,20 +8,20 @@ use include_dir::{Dir, include_dir};
 
 use crate::errors::Error;
 
-/// Empty where cargo was run without make.
+/// Empty if cargo was run without make.
 static BUILT: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/../../web/dist");
 
 const INDEX: &str = "index.html";
-/// In the page's place where it was not built.
+/// Placeholder for a page that was not built.
 const UNBUILT: &[u8] = include_bytes!("page/unbuilt.html");
-/// Nothing but our own files, and nobody frames the page.
+/// Content-Security-Policy: only our own files, and no framing of the page.
 const POLICY: &str = "default-src 'none'; style-src 'self'; script-src 'self'; img-src 'self'; connect-src 'self'; \
                       frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
-/// The one asset whose name stays: licences of what others wrote.
+/// The one asset whose name does not change: licences of third-party code.
 const LICENCES: &str = "licences.txt";
-/// Names of the others change with what they hold.
+/// Caching of the other assets, whose names change with their content.
 const FOR_GOOD: &str = "public, max-age=31536000, immutable";
-/// By `Accept-Encoding` (RFC 9110, 12.5.3), the smallest first.
+/// Suffixes by `Accept-Encoding` (RFC 9110, 12.5.3), best compression first.
 const ENCODINGS: [(&str, &str); 2] = [("br", ".br"), ("gzip", ".gz")];
 
 /// `/`.
@@ -56,11 +56,11 @@ pub async fn asset(Path(name): Path<String>, headers: HeaderMap) -> Response {
     })
 }
 
-/// A file, in the smallest form that the client takes.
+/// Returns a file in the smallest form that the client accepts.
 fn file(path: &str, headers: &HeaderMap, kept: &'static str) -> Option<Response> {
     let compressed = |(encoding, ending): (&'static str, &str)| {
         let file = BUILT.get_file(format!("{path}{ending}"))?;
-        takes(headers, encoding).then_some((file, Some(encoding)))
+        accepts_encoding(headers, encoding).then_some((file, Some(encoding)))
     };
     let found = ENCODINGS.into_iter().find_map(compressed);
     let (file, encoding) = match found {
@@ -70,8 +70,8 @@ fn file(path: &str, headers: &HeaderMap, kept: &'static str) -> Option<Response>
     Some(answer(path, kept, file.contents(), encoding))
 }
 
-/// Whether a client takes an encoding, as it says in `Accept-Encoding`.
-fn takes(headers: &HeaderMap, encoding: &str) -> bool {
+/// Returns true if the client accepts the encoding, according to `Accept-Encoding`.
+fn accepts_encoding(headers: &HeaderMap, encoding: &str) -> bool {
     let said = headers.get_all(header::ACCEPT_ENCODING);
     let words = said.iter().filter_map(|value| value.to_str().ok());
     words.flat_map(|value| value.split(',')).any(|one| {
@@ -88,7 +88,7 @@ fn answer(
     encoding: Option<&'static str>,
 ) -> Response {
     let headers = [
-        (header::CONTENT_TYPE, kind(path)),
+        (header::CONTENT_TYPE, media_type(path)),
         (header::CACHE_CONTROL, kept),
         (header::VARY, "accept-encoding"),
         (header::CONTENT_SECURITY_POLICY, POLICY),
@@ -105,8 +105,8 @@ fn answer(
     answer
 }
 
-/// The media type of what Vite writes.
-fn kind(path: &str) -> &'static str {
+/// Returns the media type of a file written by Vite.
+fn media_type(path: &str) -> &'static str {
     match path.rsplit_once('.').map_or("", |(_, ending)| ending) {
         "html" => "text/html; charset=utf-8",
         "css" => "text/css; charset=utf-8",
@@ -141,12 +141,12 @@ mod tests {
             ("", "gzip", false),
         ] {
             assert_eq!(
-                takes(&headers(accepts), encoding),
+                accepts_encoding(&headers(accepts), encoding),
                 taken,
                 "{accepts:?} {encoding}"
             );
         }
-        assert!(!takes(&HeaderMap::new(), "gzip"));
+        assert!(!accepts_encoding(&HeaderMap::new(), "gzip"));
     }
 
     #[test]
@@ -172,7 +172,7 @@ mod tests {
                 continue;
             }
             assert_eq!(answer.status(), StatusCode::OK, "{name}");
-            assert_ne!(kind(name), "application/octet-stream", "{name}");
+            assert_ne!(media_type(name), "application/octet-stream", "{name}");
             assert_eq!(answer.headers()[header::CONTENT_ENCODING], "gzip", "{name}");
             let is_kept = answer.headers()[header::CACHE_CONTROL] == FOR_GOOD;
             assert_eq!(is_kept, name != LICENCES, "{name}");

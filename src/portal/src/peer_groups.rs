@@ -5,13 +5,14 @@
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
 
-/// The option (unix(7), since Linux 4.13), for which libc has no name; its number on all architectures but SPARC and PA-RISC.
+/// Socket option (unix(7), since Linux 4.13), which libc does not define; the number holds for all architectures
+/// except SPARC and PA-RISC.
 const SO_PEERGROUPS: libc::c_int = 59;
-/// A process has at most so many (setgroups(2)).
+/// Maximum number of groups of a process (setgroups(2)).
 const MOST: usize = 65_536;
 
-/// The groups that the process was in when it connected.
-pub fn of(stream: &impl AsFd) -> io::Result<Vec<libc::gid_t>> {
+/// Returns the groups that the process had when it connected.
+pub fn peer_groups(stream: &impl AsFd) -> io::Result<Vec<libc::gid_t>> {
     let mut groups: Vec<libc::gid_t> = vec![0; 32];
     loop {
         let room = size_of_val(groups.as_slice());
@@ -32,7 +33,7 @@ pub fn of(stream: &impl AsFd) -> io::Result<Vec<libc::gid_t>> {
             return Ok(groups);
         }
         let error = io::Error::last_os_error();
-        // With too little room the kernel says how much it takes.
+        // If the buffer is too small, the kernel returns the size needed.
         if error.raw_os_error() != Some(libc::ERANGE) || needed <= groups.len() || needed > MOST {
             return Err(error);
         }
@@ -47,8 +48,8 @@ mod tests {
     #[test]
     fn groups_are_those_of_the_process_that_connected() {
         let (one, other) = std::os::unix::net::UnixStream::pair().expect("a pair");
-        let mut told = of(&one).expect("told");
-        assert_eq!(told, of(&other).expect("told"));
+        let mut told = peer_groups(&one).expect("told");
+        assert_eq!(told, peer_groups(&other).expect("told"));
         let mut own: Vec<_> = nix::unistd::getgroups()
             .expect("told")
             .into_iter()

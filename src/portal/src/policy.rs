@@ -1,4 +1,4 @@
-//! `/api/v1/tokens`, `/api/v1/policy`, `/api/v1/whoami`: who may do what, and changing it.
+//! `/api/v1/tokens`, `/api/v1/policy`, `/api/v1/whoami`: tokens and the access policy.
 
 use std::sync::Arc;
 
@@ -8,27 +8,27 @@ use axum::extract::{Path, State};
 use axum::{Extension, Json};
 use serde::de::DeserializeOwned;
 
-use super::api_v1::{Answer, held};
+use super::api_v1::{JsonResult, read_body};
 use super::guard::Caller;
 use crate::app::App;
-use crate::audit::About;
+use crate::audit::AuditObject;
 use crate::errors::Error;
 
-/// The longest body.
+/// Maximum size of a body in bytes.
 const LARGEST: usize = 64 << 10;
 
-pub(super) async fn read<T: DeserializeOwned>(
+pub(super) async fn read_json<T: DeserializeOwned>(
     app: &App,
     caller: &Caller,
     body: Body,
     what: &str,
 ) -> Result<T, Error> {
-    let body = held(app, caller, body, LARGEST).await?.bytes;
+    let body = read_body(app, caller, body, LARGEST).await?.bytes;
     serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the {what} cannot be read: {error}")))
 }
 
-/// Who asks.
+/// Returns the caller's identity.
 pub async fn whoami(Extension(caller): Extension<Caller>) -> Json<Whoami> {
     let principal = &caller.who.principal;
     Json(Whoami {
@@ -39,64 +39,64 @@ pub async fn whoami(Extension(caller): Extension<Caller>) -> Json<Whoami> {
     })
 }
 
-/// All tokens there ever were.
+/// Lists all tokens, including revoked ones.
 pub async fn tokens(State(app): State<Arc<App>>) -> Json<Vec<Token>> {
     Json(app.principals.tokens())
 }
 
-/// Makes a token.
+/// Creates a token.
 pub async fn create(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<Secret> {
-    let new: NewToken = read(&app, &caller, body, "token").await?;
-    about.is_set(&format!("token {}", new.name), &new);
-    let first = app.principals.names_nobody();
-    let made = app.principals.create(&new)?;
+) -> JsonResult<Secret> {
+    let new: NewToken = read_json(&app, &caller, body, "token").await?;
+    about.set_value(&format!("token {}", new.name), &new);
+    let first = app.principals.has_no_credentials();
+    let made = app.principals.create_token(&new)?;
     if first {
-        tracing::warn!("the first token was made: from now on every request over TCP needs one");
+        tracing::warn!("the first token was created: from now on every request over TCP needs one");
     }
     Ok(Json(made))
 }
 
-/// Gives a token another secret.
+/// Replaces the secret of a token.
 pub async fn rotate(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Extension(about): Extension<About>,
-) -> Answer<Secret> {
-    about.is(format!("token {name}"));
-    Ok(Json(app.principals.rotate(&name)?))
+    Extension(about): Extension<AuditObject>,
+) -> JsonResult<Secret> {
+    about.set(format!("token {name}"));
+    Ok(Json(app.principals.rotate_token(&name)?))
 }
 
-/// Ends a token, and the connections that show it; gives all there are.
+/// Revokes a token, which closes the connections that use it, and returns all tokens.
 pub async fn revoke(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
-    Extension(about): Extension<About>,
-) -> Answer<Vec<Token>> {
-    about.is(format!("token {name}"));
-    app.principals.revoke(&name)?;
+    Extension(about): Extension<AuditObject>,
+) -> JsonResult<Vec<Token>> {
+    about.set(format!("token {name}"));
+    app.principals.revoke_token(&name)?;
     Ok(Json(app.principals.tokens()))
 }
 
-/// All rules.
+/// Lists all rules.
 pub async fn rules(State(app): State<Arc<App>>) -> Json<Vec<Rule>> {
     Json(app.principals.rules())
 }
 
-/// Writes a rule; gives all there are.
+/// Adds a rule and returns all rules.
 pub async fn add_rule(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
-    Extension(about): Extension<About>,
+    Extension(about): Extension<AuditObject>,
     body: Body,
-) -> Answer<Vec<Rule>> {
-    let new: NewRule = read(&app, &caller, body, "rule").await?;
+) -> JsonResult<Vec<Rule>> {
+    let new: NewRule = read_json(&app, &caller, body, "rule").await?;
     let allow: Vec<String> = new.allow.iter().map(ToString::to_string).collect();
-    about.is(format!(
+    about.set(format!(
         "{} at {}: {}",
         new.who,
         new.services,
@@ -106,12 +106,12 @@ pub async fn add_rule(
     Ok(Json(app.principals.rules()))
 }
 
-/// Removes a rule; gives those that are left.
+/// Removes a rule and returns those that are left.
 pub async fn remove_rule(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
-    Extension(about): Extension<About>,
-) -> Answer<Vec<Rule>> {
+    Extension(about): Extension<AuditObject>,
+) -> JsonResult<Vec<Rule>> {
     let number = id.parse().ok();
     let named = app
         .principals
@@ -119,8 +119,8 @@ pub async fn remove_rule(
         .into_iter()
         .find(|rule| Some(rule.id) == number);
     match named {
-        Some(rule) => about.is_set("rule", &rule),
-        None => about.is(format!("rule {id}")),
+        Some(rule) => about.set_value("rule", &rule),
+        None => about.set(format!("rule {id}")),
     }
     let removed = match number {
         Some(number) => app.principals.remove_rule(number)?,

@@ -1,5 +1,5 @@
-//! Who shows which token, and what it may do: the tokens of the configuration and of the database, and the policy. Changes
-//! hold at once, for open connections as for requests.
+//! Principals: who presents which credential, and what they may do, by the tokens of the configuration and of the
+//! database, and by the policy. Changes take effect at once, for open connections as well as for requests.
 
 mod changing;
 mod pairings;
@@ -13,7 +13,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use access::{Guesses, Principal};
+use access::{GuessLimiter, Principal};
 use api::Millis;
 use parking_lot::{Mutex, RwLock};
 use store::{Owner, State, TokenHash};
@@ -21,144 +21,147 @@ use tokio::sync::watch;
 
 use crate::tokens::{AuthMessage, Tokens};
 
-pub use pairings::{Uncertified, Uncoded};
-pub use people::{Begun, Lasting};
+pub use pairings::{CertificateRefusal, PairingCodeRefusal};
 use people::{KnownAccount, KnownSession};
-pub use recognising::Recognising;
-use stored::Known;
-pub use stored::Stored;
+pub use people::{SessionLifetimes, StartedSession};
+pub use recognising::Recogniser;
+use stored::KnownToken;
+pub use stored::StoredPrincipals;
 
-/// A token's last use is written no more often.
+/// Minimum interval at which a token's last use is written.
 const USED: Millis = 60_000;
 
-/// By what somebody is known.
+/// Credential by which a caller is known.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Shown {
-    /// By nothing: on loopback, on a machine whose operator has named nobody; or not at all.
+pub enum Credential {
+    /// None: a local caller on a machine without any credentials, or an unauthenticated one.
     Nothing,
-    /// By a token of the configuration.
+    /// A token of the configuration.
     Configured,
-    /// By a token of the database.
+    /// A token of the database.
     Stored {
-        /// Its number.
+        /// Id of the token.
         id: i64,
-        /// The secret's hash: after a rotation it is another.
+        /// Hash of its secret, which changes on rotation.
         hash: TokenHash,
     },
-    /// By a certificate in TLS.
+    /// A TLS client certificate.
     Certificate {
-        /// The number of the robot's pairing.
+        /// Id of the robot's pairing.
         pairing: i64,
-        /// SHA-256 of the key that was paired; none where another authority than the daemon's signs the robot's certificates.
+        /// SHA-256 hash of the paired key; `None` if an authority other than the daemon's signs the robot's
+        /// certificates.
         key: Option<String>,
-        /// The certificate's end.
+        /// End of the certificate's validity.
         until: Millis,
     },
-    /// By a session of the page.
+    /// A session of the page.
     Session {
-        /// Its number.
+        /// Id of the session.
         id: i64,
     },
-    /// By the kernel, at the daemon's socket.
+    /// User id at the daemon's socket, from the kernel.
     User,
 }
 
-/// Somebody who has been recognised.
+/// An authenticated caller.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Identity {
+pub struct CallerIdentity {
     /// The principal.
     pub principal: Arc<Principal>,
-    /// By what.
-    pub shown: Shown,
-    /// The hash of the token that was shown.
+    /// The credential.
+    pub shown: Credential,
+    /// Hash of the token presented.
     pub token: Option<TokenHash>,
-    /// To whom names of robots are bound that it uses first.
+    /// Owner to which robot names are bound when the caller first uses them.
     pub owner: Option<Owner>,
 }
 
-impl Identity {
-    /// To what its resume tokens are bound: to whoever has a token of the database, whichever its secret is now; else to the token.
-    pub fn bound_by(&self) -> Option<String> {
+impl CallerIdentity {
+    /// Returns what the caller's resume tokens are bound to: a token of the database (whatever its current secret), a
+    /// pairing, a person, or else the hash of the token.
+    pub fn resume_binding(&self) -> Option<String> {
         match &self.shown {
-            Shown::Stored { id, .. } => Some(format!("token {id}")),
-            Shown::Certificate { pairing, .. } => Some(format!("pairing {pairing}")),
-            // Also by that person's next session.
-            Shown::Session { .. } => Some(format!("person {}", self.principal.name)),
+            Credential::Stored { id, .. } => Some(format!("token {id}")),
+            Credential::Certificate { pairing, .. } => Some(format!("pairing {pairing}")),
+            // Shared by that person's next session.
+            Credential::Session { .. } => Some(format!("person {}", self.principal.name)),
             _ => self.token.clone(),
         }
     }
 }
 
-/// Why a token lets nobody in.
+/// Reason why a token, session or sign-in is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum Unrecognised {
-    /// It was good once.
+pub enum AuthenticationError {
+    /// The token was revoked.
     #[error("this token was revoked")]
     Revoked,
-    /// It was good until its end.
+    /// The token has expired.
     #[error("this token has expired")]
     Expired,
-    /// Nobody has it.
+    /// The token is unknown.
     #[error("this token is not known")]
     Unknown,
-    /// It was not looked at.
-    #[error("too many tokens that are not known came from this address; none is looked at for {} s", .0.div_ceil(1000))]
+    /// The token was not looked at.
+    #[error("too many unknown tokens came from this address; tokens are not checked for {} s", .0.div_ceil(1000))]
     Slowed(Millis),
-    /// A password, or what a provider gave a browser, was not looked at.
+    /// The password, or the result of a provider's sign-in, was not looked at.
     #[error(
-        "too many sign-ins that failed came from this address, or for this account; none is looked at for {} s",
+        "too many failed sign-ins from this address or for this account; sign-ins are not checked for {} s",
         .0.div_ceil(1000)
     )]
     SlowedSignIn(Millis),
-    /// It was somebody's session, perhaps.
-    #[error("this session is over")]
+    /// The session is unknown or over.
+    #[error("this session has ended")]
     SessionOver,
 }
 
-/// All who are known, and what they may do.
+/// All principals, their credentials and the policy.
 pub struct Principals {
     configured: Tokens,
     state: Arc<State>,
-    stored: RwLock<Stored>,
-    guesses: Mutex<Guesses>,
+    stored: RwLock<StoredPrincipals>,
+    guesses: Mutex<GuessLimiter>,
     /// Wrong passwords, by account.
-    wrong: Mutex<Guesses<String>>,
-    /// Passwords for names that are no account's, by name. They are slowed alike, and make nothing of an account's forgotten.
-    in_vain: Mutex<Guesses<String>>,
-    /// How long sessions last.
-    lasting: Lasting,
-    /// Grows by one with every change.
+    wrong: Mutex<GuessLimiter<String>>,
+    /// Passwords for names without an account, by name. They are slowed in the same way, but kept apart so that they
+    /// cannot displace the failures of an account.
+    in_vain: Mutex<GuessLimiter<String>>,
+    /// Lifetimes of sessions.
+    lasting: SessionLifetimes,
+    /// Change counter.
     changed: watch::Sender<u64>,
 }
 
 impl Principals {
-    /// Those of the configuration and of the database.
+    /// Loads the principals of the configuration and of the database.
     pub fn new(configured: Tokens, state: Arc<State>) -> Result<Principals, store::Error> {
         let principals = Principals {
-            stored: RwLock::new(Stored::read(&state)?),
+            stored: RwLock::new(StoredPrincipals::load(&state)?),
             configured,
             state,
             guesses: Mutex::default(),
             wrong: Mutex::default(),
             in_vain: Mutex::default(),
-            lasting: Lasting::default(),
+            lasting: SessionLifetimes::default(),
             changed: watch::Sender::new(0),
         };
         principals.release_robots()?;
         Ok(principals)
     }
 
-    /// With sessions that last so long.
-    pub fn lasting(self, lasting: Lasting) -> Principals {
+    /// Sets the lifetimes of sessions.
+    pub fn with_session_lifetimes(self, lasting: SessionLifetimes) -> Principals {
         Principals { lasting, ..self }
     }
 
-    /// Names of robots that are bound to nobody who is left would be nobody's for ever.
+    /// Releases robot names whose owner no longer exists; otherwise nobody could ever use them again.
     fn release_robots(&self) -> Result<(), store::Error> {
         let mut owners: Vec<Owner> = self.configured.hashes().to_vec();
         let stored = self.stored.read();
         let live = stored.tokens.iter().filter(|known| known.revoked.is_none());
-        owners.extend(live.map(Known::owner));
+        owners.extend(live.map(KnownToken::owner));
         owners.extend(stored.paired_owners());
         let people = stored.accounts.iter().filter(|known| known.is_live());
         owners.extend(people.map(KnownAccount::owner));
@@ -167,9 +170,9 @@ impl Principals {
         self.state.release_robots(&owners).map(|_| ())
     }
 
-    /// Calls `look` with what is known now.
-    pub fn with<T>(&self, look: impl FnOnce(Recognising<'_>) -> T) -> T {
-        look(Recognising {
+    /// Calls `look` with the current credentials.
+    pub fn with_recogniser<T>(&self, look: impl FnOnce(Recogniser<'_>) -> T) -> T {
+        look(Recogniser {
             tokens: &self.configured,
             stored: &self.stored.read(),
             guesses: &self.guesses,
@@ -177,8 +180,8 @@ impl Principals {
         })
     }
 
-    /// Where wrong passwords for an account of that name are counted.
-    fn wrong_at(&self, account: &str) -> &Mutex<Guesses<String>> {
+    /// Returns the limiter that counts wrong passwords for this account name.
+    fn failure_counter(&self, account: &str) -> &Mutex<GuessLimiter<String>> {
         if self.has_account(account) {
             &self.wrong
         } else {
@@ -186,92 +189,105 @@ impl Principals {
         }
     }
 
-    /// Whether a password may be looked at that came from an address, for an account of that name.
-    pub fn may_try(&self, account: &str, from: IpAddr, now: Millis) -> Result<(), Unrecognised> {
-        let by_account = self.wrong_at(account).lock().ask(account, now);
-        let by_address = by_account.and_then(|()| self.guesses.lock().ask(from, now));
-        by_address.map_err(Unrecognised::SlowedSignIn)
+    /// Checks whether a password for this account from this address may be looked at.
+    pub fn check_sign_in(
+        &self,
+        account: &str,
+        from: IpAddr,
+        now: Millis,
+    ) -> Result<(), AuthenticationError> {
+        let by_account = self.failure_counter(account).lock().check(account, now);
+        let by_address = by_account.and_then(|()| self.guesses.lock().check(from, now));
+        by_address.map_err(AuthenticationError::SlowedSignIn)
     }
 
-    /// Counts a password that was looked at and is wrong.
-    pub fn wrong_password(&self, account: &str, from: IpAddr, now: Millis) {
-        let by_account = self.wrong_at(account).lock().failed(account, now);
-        let by_address = self.guesses.lock().failed(from, now);
+    /// Records a wrong password.
+    pub fn record_wrong_password(&self, account: &str, from: IpAddr, now: Millis) {
+        let by_account = self
+            .failure_counter(account)
+            .lock()
+            .record_failure(account, now);
+        let by_address = self.guesses.lock().record_failure(from, now);
         if let Some(wait) = by_account.max(by_address) {
             let seconds = wait.div_ceil(1000);
-            tracing::warn!("wrong passwords come from {from}: for {seconds} s none is looked at");
+            tracing::warn!("too many wrong passwords from {from}: none is checked for {seconds} s");
         }
     }
 
-    /// Whether what comes from an address with an answer of an identity provider may be looked at.
-    pub fn may_come(&self, from: IpAddr, now: Millis) -> Result<(), Unrecognised> {
-        let asked = self.guesses.lock().ask(from, now);
-        asked.map_err(Unrecognised::SlowedSignIn)
+    /// Checks whether a sign-in through the identity provider from this address may proceed.
+    pub fn check_provider_sign_in(
+        &self,
+        from: IpAddr,
+        now: Millis,
+    ) -> Result<(), AuthenticationError> {
+        let asked = self.guesses.lock().check(from, now);
+        asked.map_err(AuthenticationError::SlowedSignIn)
     }
 
-    /// Counts an answer of an identity provider that was looked at and is made up, perhaps.
-    pub fn mistaken_sign_in(&self, from: IpAddr, now: Millis) {
-        let wait = self.guesses.lock().failed(from, now);
+    /// Records a sign-in through the identity provider that may have been made up.
+    pub fn record_failed_sign_in(&self, from: IpAddr, now: Millis) {
+        let wait = self.guesses.lock().record_failure(from, now);
         if let Some(wait) = wait {
             let seconds = wait.div_ceil(1000);
-            tracing::warn!(
-                "sign-ins that fail come from {from}: for {seconds} s none is looked at"
-            );
+            tracing::warn!("too many failed sign-ins from {from}: none is checked for {seconds} s");
         }
     }
 
-    /// Passwords since the daemon started that were wrong, and those that were not looked at for their account's sake.
-    pub fn mistaken(&self) -> (u64, u64) {
+    /// Returns the number of wrong passwords since the daemon started, and of those not looked at because of their
+    /// account.
+    pub fn password_counts(&self) -> (u64, u64) {
         let (wrong, slowed) = self.wrong.lock().counts();
         let (in_vain, in_vain_slowed) = self.in_vain.lock().counts();
         (wrong + in_vain, slowed + in_vain_slowed)
     }
 
-    /// Tokens since the daemon started that were not known, and those that were not looked at.
-    pub fn guessed(&self) -> (u64, u64) {
+    /// Returns the number of unknown tokens since the daemon started, and of those not looked at.
+    pub fn token_counts(&self) -> (u64, u64) {
         self.guesses.lock().counts()
     }
 
-    /// Whether nobody was ever named: then this machine's own users need no token.
-    pub fn names_nobody(&self) -> bool {
+    /// Returns true if no credential was ever created; then this machine's own users need none.
+    pub fn has_no_credentials(&self) -> bool {
         self.configured.is_empty() && self.stored.read().is_empty()
     }
 
-    /// Who is meant by rosbridge's `auth` message that came from an address, at `seconds` since 1970.
+    /// Authenticates rosbridge's `auth` message received from an address at `seconds` since 1970.
     pub fn recognise_auth(
         &self,
         message: &AuthMessage,
         from: IpAddr,
         seconds: f64,
-    ) -> Result<Identity, String> {
+    ) -> Result<CallerIdentity, String> {
         let now = (seconds * 1000.0) as Millis;
         let mut refusal = None;
-        let identity = self.with(|known| {
-            known.by(&message.mac, from, now, || {
+        let identity = self.with_recogniser(|known| {
+            known.recognise_with(&message.mac, from, now, || {
                 let recognised = known.tokens.recognise_auth(message, seconds);
                 recognised.map_err(|why| refusal = Some(why)).ok()
             })
         });
         match identity {
             Ok(identity) => {
-                self.note_use(&identity, now);
+                self.record_use(&identity, now);
                 Ok(identity)
             }
-            // What is expected of such a message says more.
+            // The refusal specific to `auth` messages says more.
             Err(why) => Err(refusal.map_or_else(|| why.to_string(), |refusal| refusal.to_string())),
         }
     }
 
-    /// Remembers that a token was shown, to the minute.
-    pub fn note_use(&self, identity: &Identity, now: Millis) {
+    /// Records the use of a credential, with a resolution of a minute.
+    pub fn record_use(&self, identity: &CallerIdentity, now: Millis) {
         let id = match identity.shown {
-            Shown::Stored { id, .. } => id,
-            Shown::Certificate { pairing, .. } => return self.note_pairing(pairing, now),
-            Shown::Session { id } => return self.note_session(id, now),
+            Credential::Stored { id, .. } => id,
+            Credential::Certificate { pairing, .. } => {
+                return self.record_pairing_use(pairing, now);
+            }
+            Credential::Session { id } => return self.record_session_use(id, now),
             _ => return,
         };
         let stored = self.stored.read();
-        let due = stored.of_id(id).is_some_and(|known| {
+        let due = stored.find_token(id).is_some_and(|known| {
             let last = known.last_used.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
                 && known
@@ -280,15 +296,15 @@ impl Principals {
                     .is_ok()
         });
         drop(stored);
-        if due && let Err(error) = self.state.token_used(id, now) {
-            tracing::warn!("when a token was used last cannot be written: {error}");
+        if due && let Err(error) = self.state.record_token_use(id, now) {
+            tracing::warn!("cannot store when a token was last used: {error}");
         }
     }
 
-    /// Remembers that a session was shown; on the disk, to the minute.
-    fn note_session(&self, id: i64, now: Millis) {
+    /// Records the use of a session; on disk with a resolution of a minute.
+    fn record_session_use(&self, id: i64, now: Millis) {
         let stored = self.stored.read();
-        let due = stored.session_of_id(id).is_some_and(|known| {
+        let due = stored.find_session(id).is_some_and(|known| {
             known.last_used.fetch_max(now, Ordering::Relaxed);
             let last = known.written.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
@@ -298,8 +314,8 @@ impl Principals {
                     .is_ok()
         });
         drop(stored);
-        if due && let Err(error) = self.state.session_used(id, now) {
-            tracing::warn!("when a session was used last cannot be written: {error}");
+        if due && let Err(error) = self.state.record_session_use(id, now) {
+            tracing::warn!("cannot store when a session was last used: {error}");
         }
     }
 }

@@ -1,8 +1,8 @@
-//! Proxies that the operator names: from them alone it is believed for whom they ask. Of the addresses that they tell, the
-//! right-most that is no such proxy's is the client's: what stands left of it, the client may have written itself.
+//! Trusted proxies: only their forwarding headers are believed. Of the listed addresses, the right-most one that is
+//! not such a proxy is the client; anything left of it may have been made up by the client.
 //!
-//! `Forwarded` (RFC 7239) and `X-Forwarded-For` are read, with `X-Forwarded-Proto`. A proxy writes one of the first two and
-//! may pass on the other as the client sent it; so where both are there, they must name the same client.
+//! Reads `Forwarded` (RFC 7239) and `X-Forwarded-For`, with `X-Forwarded-Proto`. A proxy writes one of the first two
+//! and may pass on the other as sent by the client; so if both are present, they must name the same client.
 
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
@@ -12,57 +12,58 @@ use std::sync::Arc;
 use axum::http::HeaderMap;
 
 use crate::errors::Error;
-use crate::guard::{Connection, Peer};
+use crate::guard::{ConnectionPeer, PortalConnection};
 
 const FORWARDED: &str = "forwarded";
 const FORWARDED_FOR: &str = "x-forwarded-for";
 const FORWARDED_PROTO: &str = "x-forwarded-proto";
 
-/// Addresses that share their first bits.
+/// An IP network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Network {
+pub struct IpNetwork {
     address: IpAddr,
     prefix: u32,
 }
 
-/// A text that is no network.
+/// Error for text that is not a network.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{written:?} is no address and no network: {why}; write one such as 192.0.2.7 or 10.0.0.0/8"
+    "{written:?} is neither an address nor a network: {why}; write one such as 192.0.2.7 or 10.0.0.0/8"
 )]
-pub struct NoNetwork {
+pub struct ParseIpNetworkError {
     written: String,
     why: String,
 }
 
-fn bits(address: IpAddr) -> (u128, u32) {
+fn address_bits(address: IpAddr) -> (u128, u32) {
     match address.to_canonical() {
         IpAddr::V4(address) => (u128::from(address.to_bits()) << 96, 32),
         IpAddr::V6(address) => (address.to_bits(), 128),
     }
 }
 
-/// The first bits of an address; the others are 0.
-fn first(address: u128, prefix: u32) -> u128 {
+/// Returns the first bits of an address; the others are 0.
+fn prefix_bits(address: u128, prefix: u32) -> u128 {
     match prefix {
         0 => 0,
         prefix => address & (u128::MAX << (128 - prefix)),
     }
 }
 
-impl Network {
-    /// Whether an address is of it.
-    pub fn has(&self, address: IpAddr) -> bool {
-        let ((own, width), (other, other_width)) = (bits(self.address), bits(address));
-        width == other_width && first(own, self.prefix) == first(other, self.prefix)
+impl IpNetwork {
+    /// Returns true if the network contains the address.
+    pub fn contains(&self, address: IpAddr) -> bool {
+        let ((own, width), (other, other_width)) =
+            (address_bits(self.address), address_bits(address));
+        width == other_width && prefix_bits(own, self.prefix) == prefix_bits(other, self.prefix)
     }
 }
 
-impl FromStr for Network {
-    type Err = NoNetwork;
+impl FromStr for IpNetwork {
+    type Err = ParseIpNetworkError;
 
-    fn from_str(written: &str) -> Result<Network, NoNetwork> {
-        let no = |why: &str| NoNetwork {
+    fn from_str(written: &str) -> Result<IpNetwork, ParseIpNetworkError> {
+        let no = |why: &str| ParseIpNetworkError {
             written: written.to_owned(),
             why: why.to_owned(),
         };
@@ -72,8 +73,8 @@ impl FromStr for Network {
         };
         let address: IpAddr = address
             .parse()
-            .map_err(|_| no("names of hosts are not looked up"))?;
-        let (value, width) = bits(address);
+            .map_err(|_| no("host names are not supported"))?;
+        let (value, width) = address_bits(address);
         let prefix = match prefix {
             None => width,
             Some(prefix) => prefix
@@ -82,120 +83,130 @@ impl FromStr for Network {
                 .filter(|bits| *bits <= width)
                 .ok_or_else(|| no(&format!("its prefix is not between 0 and {width}")))?,
         };
-        if first(value, prefix) != value {
-            return Err(no("it has bits beyond its prefix"));
+        if prefix_bits(value, prefix) != value {
+            return Err(no("it has bits set beyond its prefix"));
         }
-        Ok(Network { address, prefix })
+        Ok(IpNetwork { address, prefix })
     }
 }
 
-impl fmt::Display for Network {
+impl fmt::Display for IpNetwork {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{}/{}", self.address.to_canonical(), self.prefix)
     }
 }
 
-/// For whom a proxy asks.
+/// The client for which a proxy forwards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Client {
-    /// None: what the proxy wrote is no address; it does not know, or does not tell.
+struct ForwardedClient {
+    /// `None` if the proxy wrote something other than an address, because it does not know or reveal it.
     address: Option<SocketAddr>,
-    /// Through TLS, where the proxy says so.
+    /// True if the client uses TLS, where the proxy says so.
     secure: Option<bool>,
 }
 
-/// The proxies that are named.
+/// The trusted proxies.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Proxies(pub Vec<Network>);
+pub struct Proxies(pub Vec<IpNetwork>);
 
 impl Proxies {
-    pub(crate) fn has(&self, address: IpAddr) -> bool {
-        self.0.iter().any(|network| network.has(address))
+    pub(crate) fn contains(&self, address: IpAddr) -> bool {
+        self.0.iter().any(|network| network.contains(address))
     }
 
-    /// A connection as its request's client has it: of that for which a proxy asks.
-    pub(crate) fn seen(
+    /// Returns the connection with the properties of the client for which a proxy forwards.
+    pub(crate) fn resolve_client(
         &self,
-        connection: &Connection,
+        connection: &PortalConnection,
         headers: &HeaderMap,
-    ) -> Result<Connection, Error> {
-        let Peer::Tcp(proxy) = connection.peer else {
+    ) -> Result<PortalConnection, Error> {
+        let ConnectionPeer::Tcp(proxy) = connection.peer else {
             return Ok(connection.clone());
         };
-        if !self.has(proxy.ip()) {
+        if !self.contains(proxy.ip()) {
             return Ok(connection.clone());
         }
-        let written = quoted(headers).map_err(|why| {
+        let written = parse_forwarded(headers).map_err(|why| {
             let proxy = proxy.ip();
             Error::BadRequest(format!(
-                "the header Forwarded, as the proxy {proxy} passed it on, {why}; have it remove what its clients send"
+                "the header Forwarded, as the proxy {proxy} passed it on, {why}; configure the proxy to remove this \
+                    header from its clients"
             ))
         })?;
         let (listed, protocols) = (
-            values(headers, FORWARDED_FOR),
-            values(headers, FORWARDED_PROTO),
+            list_values(headers, FORWARDED_FOR),
+            list_values(headers, FORWARDED_PROTO),
         );
-        let by_standard = (!written.is_empty()).then(|| self.client(written.iter().map(element)));
+        let by_standard =
+            (!written.is_empty()).then(|| self.pick_client(written.iter().map(parse_element)));
         let by_list = (!listed.is_empty()).then(|| {
-            // One value is of the client's own connection; of several, each is of the address beside it.
+            // A single protocol belongs to the client's own connection; of several, each belongs to the address at
+            // the same position.
             let beside = |at: usize| match protocols.len() {
                 1 => protocols.first(),
                 count if count == listed.len() => protocols.get(at),
                 _ => None,
             };
-            let clients = listed.iter().enumerate().map(|(at, listed)| Client {
-                address: address(listed),
-                secure: beside(at).map(|protocol| is_secure(protocol)),
-            });
-            self.client(clients)
+            let clients = listed
+                .iter()
+                .enumerate()
+                .map(|(at, listed)| ForwardedClient {
+                    address: parse_address(listed),
+                    secure: beside(at).map(|protocol| is_secure(protocol)),
+                });
+            self.pick_client(clients)
         });
         let client = match (by_standard, by_list) {
             (Some(one), Some(other))
                 if one.address.map(|at| at.ip()) != other.address.map(|at| at.ip()) =>
             {
                 return Err(Error::BadRequest(format!(
-                    "the proxy {} names two clients, in Forwarded and in X-Forwarded-For; have it set one and remove the other",
+                    "the proxy {} names two clients, in Forwarded and in X-Forwarded-For; have it set one and remove \
+                     the other",
                     proxy.ip()
                 )));
             }
-            (Some(one), other) => Client {
+            (Some(one), other) => ForwardedClient {
                 secure: one.secure.or(other.and_then(|other| other.secure)),
                 ..one
             },
             (None, Some(other)) => other,
-            (None, None) if !protocols.is_empty() => Client {
+            (None, None) if !protocols.is_empty() => ForwardedClient {
                 address: None,
                 secure: protocols.last().map(|protocol| is_secure(protocol)),
             },
-            // It asks for itself: to see whether this portal is well, say.
+            // The request is the proxy's own, such as a health check.
             (None, None) => return Ok(connection.clone()),
         };
-        Ok(Connection {
-            peer: client.address.map_or(connection.peer, Peer::Tcp),
+        Ok(PortalConnection {
+            peer: client.address.map_or(connection.peer, ConnectionPeer::Tcp),
             secure: client.secure.unwrap_or(false),
             forwarded: true,
-            // What the proxy shows is the proxy's.
+            // A certificate presented is the proxy's.
             certificates: Arc::default(),
             stranger: connection.stranger.clone(),
         })
     }
 
-    /// The right-most of those that are no proxies that are named, or the left-most.
-    fn client(&self, clients: impl DoubleEndedIterator<Item = Client>) -> Client {
-        let mut nearest = Client {
+    /// Returns the right-most client that is not a trusted proxy, or else the left-most.
+    fn pick_client(
+        &self,
+        clients: impl DoubleEndedIterator<Item = ForwardedClient>,
+    ) -> ForwardedClient {
+        let mut nearest = ForwardedClient {
             address: None,
             secure: None,
         };
         for client in clients.rev() {
             let Some(address) = client.address else {
-                // The last proxy whose address is known stands for whoever is behind it.
-                return Client {
+                // If an address is unknown, the last proxy with a known address stands for whoever is behind it.
+                return ForwardedClient {
                     secure: client.secure,
                     ..nearest
                 };
             };
             nearest = client;
-            if !self.has(address.ip()) {
+            if !self.contains(address.ip()) {
                 break;
             }
         }
@@ -203,35 +214,35 @@ impl Proxies {
     }
 }
 
-/// All values of a header that is a list, in their order. None of those that proxies write has a comma or a quote in it.
-fn values<'a>(headers: &'a HeaderMap, name: &str) -> Vec<&'a str> {
+/// Returns all values of a header that is a list, in order. Those written by proxies contain no commas or quotes.
+fn list_values<'a>(headers: &'a HeaderMap, name: &str) -> Vec<&'a str> {
     let lines = headers.get_all(name).into_iter();
-    // What is no text is no address either.
+    // A value that is not text is not an address either.
     let lines = lines.map(|line| line.to_str().unwrap_or("?"));
     lines
         .flat_map(|line| line.split(',').map(str::trim))
         .collect()
 }
 
-/// All elements of `Forwarded`, in their order; commas within quotes do not count. A client that could leave a quote open
-/// would take what the proxy writes behind it for its own value.
-fn quoted(headers: &HeaderMap) -> Result<Vec<&str>, &'static str> {
+/// Returns all elements of `Forwarded`, in order; commas within quotes do not count. A client that could leave a
+/// quote open would swallow what the proxy appends.
+fn parse_forwarded(headers: &HeaderMap) -> Result<Vec<&str>, &'static str> {
     let mut elements = Vec::new();
     for line in headers.get_all(FORWARDED) {
-        let line = line.to_str().map_err(|_| "is no text")?;
+        let line = line.to_str().map_err(|_| "is not text")?;
         if line.matches('"').count() % 2 == 1 {
             return Err("has a quote that is not closed");
         }
         if line.contains('\\') {
             return Err("has a backslash, which no address needs");
         }
-        elements.extend(unquoted(line, ',').map(str::trim));
+        elements.extend(split_outside_quotes(line, ',').map(str::trim));
     }
     Ok(elements)
 }
 
-/// Splits a text where a character stands outside of quotes.
-fn unquoted(text: &str, at: char) -> impl Iterator<Item = &str> {
+/// Splits a text at a character outside of quotes.
+fn split_outside_quotes(text: &str, at: char) -> impl Iterator<Item = &str> {
     let mut quoted = false;
     text.split(move |c| {
         quoted ^= c == '"';
@@ -239,19 +250,19 @@ fn unquoted(text: &str, at: char) -> impl Iterator<Item = &str> {
     })
 }
 
-/// One element of `Forwarded`.
-fn element(written: &&str) -> Client {
-    let mut client = Client {
+/// Parses one element of `Forwarded`.
+fn parse_element(written: &&str) -> ForwardedClient {
+    let mut client = ForwardedClient {
         address: None,
         secure: None,
     };
-    for pair in unquoted(written, ';') {
+    for pair in split_outside_quotes(written, ';') {
         let Some((name, value)) = pair.split_once('=') else {
             continue;
         };
         let value = value.trim().trim_matches('"');
         match name.trim().to_ascii_lowercase().as_str() {
-            "for" => client.address = address(value),
+            "for" => client.address = parse_address(value),
             "proto" => client.secure = Some(is_secure(value)),
             _ => {}
         }
@@ -265,8 +276,8 @@ fn is_secure(protocol: &str) -> bool {
         .any(|secure| protocol.eq_ignore_ascii_case(secure))
 }
 
-/// An address with or without a port; port 0 where none is told.
-fn address(text: &str) -> Option<SocketAddr> {
+/// Parses an address with or without a port; the port is 0 if missing.
+fn parse_address(text: &str) -> Option<SocketAddr> {
     let bare = || {
         let inside = text
             .strip_prefix('[')
@@ -286,16 +297,16 @@ mod tests {
         Proxies(written.iter().map(|one| one.parse().expect(one)).collect())
     }
 
-    /// Who is seen behind `peer`, and whether through TLS.
-    fn seen(peer: &str, headers: &[(&'static str, &str)]) -> Result<(String, bool), Error> {
+    /// Returns the client behind `peer`, and whether it uses TLS.
+    fn resolve(peer: &str, headers: &[(&'static str, &str)]) -> Result<(String, bool), Error> {
         let proxies = proxies(&["127.0.0.1", "10.0.0.0/8", "2001:db8::/32"]);
         let mut map = HeaderMap::new();
         for (name, value) in headers {
             map.append(*name, value.parse().expect("a header"));
         }
         let address = SocketAddr::new(peer.parse().expect("an address"), 5000);
-        let connection = Connection::plain(Peer::Tcp(address));
-        let seen = proxies.seen(&connection, &map)?;
+        let connection = PortalConnection::without_tls(ConnectionPeer::Tcp(address));
+        let seen = proxies.resolve_client(&connection, &map)?;
         Ok((seen.peer.ip().to_string(), seen.secure))
     }
 
@@ -310,7 +321,10 @@ mod tests {
             &[],
         ] {
             for peer in ["203.0.113.9", "127.0.0.2", "11.0.0.1", "::1"] {
-                assert_eq!(seen(peer, headers).expect("seen"), (peer.to_owned(), false));
+                assert_eq!(
+                    resolve(peer, headers).expect("seen"),
+                    (peer.to_owned(), false)
+                );
             }
         }
     }
@@ -324,14 +338,14 @@ mod tests {
             ("198.51.100.7, 192.0.2.1", client),
             ("198.51.100.7, 192.0.2.1, 10.1.2.3", client),
             ("192.0.2.1 ,10.1.2.3,10.1.2.4", client),
-            // Itself says that it is a proxy of ours: its proxy wrote 192.0.2.1.
+            // The client claims to be one of our proxies; the proxy wrote 192.0.2.1.
             ("10.9.9.9, 192.0.2.1", client),
-            // All are proxies: the left-most has asked.
+            // All are proxies: the left-most made the request.
             ("10.0.0.1, 10.0.0.2", "10.0.0.1"),
             ("::ffff:192.0.2.1", client),
             ("[2001:db8:1::1]:80, 2001:db8::5", "2001:db8:1::1"),
             ("2003::1, 2001:db8::5", "2003::1"),
-            // Whom a proxy does not tell is that proxy.
+            // A client that a proxy does not reveal is represented by that proxy.
             ("unknown", "127.0.0.1"),
             ("", "127.0.0.1"),
             ("192.0.2.1,", "127.0.0.1"),
@@ -340,23 +354,23 @@ mod tests {
             ("192.0.2.256", "127.0.0.1"),
             ("192.0.2.1:99999", "127.0.0.1"),
         ] {
-            let listed = seen("127.0.0.1", &[("x-forwarded-for", listed)]).expect(listed);
+            let listed = resolve("127.0.0.1", &[("x-forwarded-for", listed)]).expect(listed);
             assert_eq!(listed.0, who, "{listed:?}");
         }
         let many = vec!["10.0.0.1"; 5000].join(",");
         let long = format!("192.0.2.1,{many}");
         assert_eq!(
-            seen("127.0.0.1", &[("x-forwarded-for", &long)])
+            resolve("127.0.0.1", &[("x-forwarded-for", &long)])
                 .expect("seen")
                 .0,
             client
         );
-        // Lines of the same name are one list.
+        // Header lines of the same name form one list.
         let lines = [
             ("x-forwarded-for", "198.51.100.7"),
             ("x-forwarded-for", client),
         ];
-        assert_eq!(seen("127.0.0.1", &lines).expect("seen").0, client);
+        assert_eq!(resolve("127.0.0.1", &lines).expect("seen").0, client);
     }
 
     #[test]
@@ -385,7 +399,7 @@ mod tests {
             ("for=\"a,b\";proto=https", "127.0.0.1", true),
             (";;=,=;", "127.0.0.1", false),
         ] {
-            let seen = seen("127.0.0.1", &[("forwarded", written)]).expect(written);
+            let seen = resolve("127.0.0.1", &[("forwarded", written)]).expect(written);
             assert_eq!(seen, (who.to_owned(), secure), "{written}");
         }
     }
@@ -407,7 +421,7 @@ mod tests {
                 ("x-forwarded-for", listed),
                 ("x-forwarded-proto", protocols),
             ];
-            let seen = seen("127.0.0.1", &headers).expect(listed);
+            let seen = resolve("127.0.0.1", &headers).expect(listed);
             assert_eq!(seen, (client.to_owned(), secure), "{listed} {protocols}");
         }
     }
@@ -418,7 +432,9 @@ mod tests {
             ("x-forwarded-for", "192.0.2.1"),
             ("forwarded", "for=198.51.100.7"),
         ];
-        let refused = seen("127.0.0.1", &headers).expect_err("which?").problem();
+        let refused = resolve("127.0.0.1", &headers)
+            .expect_err("which?")
+            .problem();
         assert_eq!(refused.status, 400);
         assert!(refused.detail.contains("127.0.0.1"), "{refused:?}");
         let alike = [
@@ -426,7 +442,7 @@ mod tests {
             ("x-forwarded-proto", "https"),
             ("forwarded", "for=192.0.2.1"),
         ];
-        let seen = seen("127.0.0.1", &alike).expect("one client");
+        let seen = resolve("127.0.0.1", &alike).expect("one client");
         assert_eq!(seen, ("192.0.2.1".to_owned(), true));
     }
 
@@ -435,7 +451,7 @@ mod tests {
         // The proxy has appended 192.0.2.1 to what its client sent.
         for sent in ["\"", "198.51.100.7, \"", "\"198.51.100.7", "\"a\"\""] {
             let listed = format!("{sent}, 192.0.2.1");
-            let seen = seen("127.0.0.1", &[("x-forwarded-for", &listed)]).expect(&listed);
+            let seen = resolve("127.0.0.1", &[("x-forwarded-for", &listed)]).expect(&listed);
             assert_eq!(seen.0, "192.0.2.1", "{listed}");
         }
         for sent in [
@@ -444,7 +460,7 @@ mod tests {
             "for=198.51.100.7;by=\"",
         ] {
             let written = format!("{sent}, for=192.0.2.1");
-            let refused = seen("127.0.0.1", &[("forwarded", &written)]).expect_err(&written);
+            let refused = resolve("127.0.0.1", &[("forwarded", &written)]).expect_err(&written);
             let refused = refused.problem();
             assert_eq!(refused.status, 400, "{written}");
             assert!(refused.detail.contains("127.0.0.1"), "{refused:?}");
@@ -453,26 +469,28 @@ mod tests {
 
     #[test]
     fn a_proxys_certificate_is_not_its_clients() {
-        let connection = Connection {
+        let connection = PortalConnection {
             secure: true,
             certificates: Arc::new([vec![1].into()]),
-            ..Connection::plain(Peer::Tcp("10.0.0.1:5".parse().expect("an address")))
+            ..PortalConnection::without_tls(ConnectionPeer::Tcp(
+                "10.0.0.1:5".parse().expect("an address"),
+            ))
         };
         let mut headers = HeaderMap::new();
         headers.insert("x-forwarded-for", "192.0.2.1".parse().expect("a header"));
         let seen = proxies(&["10.0.0.1"])
-            .seen(&connection, &headers)
+            .resolve_client(&connection, &headers)
             .expect("seen");
         assert!(seen.certificates.is_empty() && !seen.secure && seen.forwarded);
         headers.clear();
         headers.insert("x-forwarded-proto", "https".parse().expect("a header"));
         let seen = proxies(&["10.0.0.1"])
-            .seen(&connection, &headers)
+            .resolve_client(&connection, &headers)
             .expect("seen");
         assert!(seen.secure && seen.forwarded && seen.peer == connection.peer);
-        // Without such headers it asks for itself.
+        // Without such headers the request is the proxy's own.
         let itself = proxies(&["10.0.0.1"])
-            .seen(&connection, &HeaderMap::new())
+            .resolve_client(&connection, &HeaderMap::new())
             .expect("seen");
         assert!(!itself.certificates.is_empty() && itself.secure && !itself.forwarded);
     }
@@ -486,25 +504,28 @@ mod tests {
             ("::/0", "2003::1", "203.0.113.1"),
             ("2001:db8::/33", "2001:db8:7fff::", "2001:db8:8000::"),
         ] {
-            let network: Network = written.parse().expect(written);
-            assert!(network.has(inside.parse().expect(inside)), "{network}");
-            assert!(!network.has(outside.parse().expect(outside)), "{network}");
+            let network: IpNetwork = written.parse().expect(written);
+            assert!(network.contains(inside.parse().expect(inside)), "{network}");
+            assert!(
+                !network.contains(outside.parse().expect(outside)),
+                "{network}"
+            );
         }
         assert!(
             "10.0.0.0/8"
-                .parse::<Network>()
+                .parse::<IpNetwork>()
                 .expect("v4")
-                .has("::ffff:10.1.1.1".parse().expect("mapped"))
+                .contains("::ffff:10.1.1.1".parse().expect("mapped"))
         );
         for (written, words) in [
-            ("proxy.lab", "names of hosts"),
-            ("", "names of hosts"),
+            ("proxy.lab", "host names are not supported"),
+            ("", "host names are not supported"),
             ("10.0.0.0/33", "between 0 and 32"),
             ("10.0.0.0/x", "between 0 and 32"),
             ("::/129", "between 0 and 128"),
             ("10.0.0.1/8", "beyond its prefix"),
         ] {
-            let refused = written.parse::<Network>().expect_err(written).to_string();
+            let refused = written.parse::<IpNetwork>().expect_err(written).to_string();
             assert!(
                 refused.contains(words) && refused.contains("10.0.0.0/8"),
                 "{refused}"

@@ -1,30 +1,30 @@
-//! `POST /api/v1/push`: options in the query, the archive in the body, events as JSON lines in the answer.
+//! `POST /api/v1/push`: options in the query, the archive in the body, events as JSON lines in the response.
 
 use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
-use access::{Action, Standing};
+use access::{AccessAction, ConnectionAccess};
 use api::{PushEvent, PushOptions};
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{OriginalUri, State};
 use axum::response::{IntoResponse, Response};
 use futures_util::{FutureExt, StreamExt, TryStreamExt};
-use push::{Deployer, Published};
+use push::{Deployer, PushResult};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::api_v1::lines;
-use super::guard::{Caller, query};
+use super::api_v1::json_lines;
+use super::guard::{Caller, query_value};
 use crate::app::App;
 use crate::errors::Error;
 use crate::views;
 
-/// How long the last event waits for a client that does not read.
+/// Timeout for sending the last event to a client that does not read.
 const FAREWELL: Duration = Duration::from_secs(5);
 
-/// Answers a push.
+/// Runs a push.
 pub async fn push(
     State(app): State<Arc<App>>,
     OriginalUri(uri): OriginalUri,
@@ -35,7 +35,7 @@ pub async fn push(
     let pusher = Arc::clone(&app.pusher);
     let (options, by) = match read_options(uri.query()).and_then(|options| {
         let by = deployer(&app, caller.clone());
-        pusher.check(&options, &by)?;
+        pusher.check_request(&options, &by)?;
         Ok((options, by))
     }) {
         Ok(read) => read,
@@ -46,46 +46,48 @@ pub async fn push(
     };
     let (sender, receiver) = mpsc::channel(push::EVENTS_AHEAD);
     let last = sender.clone();
-    // Lives in the answer: when the client goes away the answer is dropped, and the push with it.
-    let guard = pusher.begin(options, by, archive, sender, |outcome| async move {
+    // Owned by the response: if the client disconnects, the push is aborted with it.
+    let guard = pusher.start(options, by, archive, sender, |outcome| async move {
         if let Ok(published) = &outcome {
             let object = format!("service {}", published.service);
             app.audit
-                .record(&caller, Action::Deploy, "published", &object, 200);
+                .record(&caller, AccessAction::Deploy, "published", &object, 200);
         }
         let event = match outcome
             .map_err(Error::from)
-            .and_then(|done| told(&app, done))
+            .and_then(|done| done_event(&app, done))
         {
             Ok(event) => event,
             Err(error) => PushEvent::Error {
                 problem: error.problem(),
             },
         };
-        // A client that does not read it must not keep the push, and with it the daemon, from ending.
+        // A client that does not read must not keep the push, and with it the daemon, from ending.
         let _ = tokio::time::timeout(FAREWELL, last.send(event)).await;
     });
-    lines(ReceiverStream::new(receiver).map(move |event| {
+    json_lines(ReceiverStream::new(receiver).map(move |event| {
         let _ = &guard;
         event
     }))
 }
 
-/// What the policy lets whoever pushes publish. Decided when its name is known, which without `--name` is after the build.
+/// Returns the permissions of the pushing caller, checked when the service's name is known, which without `--name` is
+/// after the build.
 fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     let principal = &caller.who.principal;
     let owner = (!principal.is_unscoped()).then(|| principal.name.clone());
     let (known, who) = (Arc::clone(app), caller.who.clone());
     let over = move || {
         let (app, who) = (Arc::clone(&known), who.clone());
-        async move { app.principals.ended(&who, "", false).await }.boxed()
+        async move { app.principals.wait_for_end(&who, "", false).await }.boxed()
     };
     let app = Arc::clone(app);
     let may = move |name: &str| {
-        if let Standing::Ended(reason) = app.principals.standing(&caller.who, name) {
+        if let ConnectionAccess::Ended(reason) = app.principals.connection_access(&caller.who, name)
+        {
             return Err(reason);
         }
-        let may = caller.may_at(&app, Action::Deploy, name, None);
+        let may = caller.check_service_access(&app, AccessAction::Deploy, name, None);
         may.map_err(|error| error.to_string())
     };
     Deployer {
@@ -95,7 +97,7 @@ fn deployer(app: &Arc<App>, caller: Caller) -> Deployer {
     }
 }
 
-fn told(app: &App, published: Published) -> Result<PushEvent, Error> {
+fn done_event(app: &App, published: PushResult) -> Result<PushEvent, Error> {
     Ok(PushEvent::Done {
         service: Box::new(views::service(app, &published.service)?),
         layers: published.layers,
@@ -104,7 +106,7 @@ fn told(app: &App, published: Published) -> Result<PushEvent, Error> {
 }
 
 fn read_options(query_of: Option<&str>) -> Result<PushOptions, Error> {
-    match query(query_of, "options") {
+    match query_value(query_of, "options") {
         Some(text) => serde_json::from_str(&text).map_err(|error| {
             Error::BadRequest(format!("the push options cannot be read: {error}"))
         }),

@@ -1,4 +1,4 @@
-//! What stands behind the `?` of an address.
+//! Query parameters of a request.
 
 use std::error::Error as _;
 
@@ -8,8 +8,8 @@ use serde::de::DeserializeOwned;
 
 use crate::errors::Error;
 
-/// The parameters of a request; one that cannot be read is refused with its name, as everything else is: a
-/// [`api::Problem`].
+/// Extractor of query parameters; one that cannot be parsed is refused by name with an [`api::Problem`], like all
+/// errors.
 #[derive(Debug)]
 pub struct Query<T>(pub T);
 

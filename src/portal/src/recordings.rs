@@ -1,11 +1,11 @@
-//! Files of the last seconds of servants, `HOME/recordings/NUMBER.mcap`: `GET /api/v1/recordings` lists them.
+//! Recordings of the last seconds of servants, in `HOME/recordings/NUMBER.mcap`; listed by `GET /api/v1/recordings`.
 
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use access::{Action, Grants, Operation};
+use access::{AccessAction, Grants, Operation};
 use api::recordings::Recording;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -14,44 +14,44 @@ use axum::response::Response;
 use axum::{Extension, Json};
 use choreographer::Handle;
 use futures_util::StreamExt;
-use recording::Writer;
+use recording::RecordingWriter;
 use serde::Deserialize;
 use store::{NewEvent, RecordingRecord};
 use tokio_util::io::ReaderStream;
 use tokio_util::task::TaskTracker;
 use utoipa::IntoParams;
 
-use crate::api_v1::Answer;
+use crate::api_v1::JsonResult;
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
-use crate::inside::{self, Whose};
+use crate::inside::{self, InsideTarget};
 use crate::observers::BlackBoxOptions;
 use crate::query::Query;
 
-/// Where files are, below the state directory.
+/// Directory of the recordings, below the state directory.
 const DIRECTORY: &str = "recordings";
-/// The one that is being written.
+/// Name of the file being written.
 const HALF: &str = "half.mcap";
-/// Event: a file was written.
+/// Event kind: a recording was written.
 const RECORDED: &str = "recorded";
-/// Event: a file could not be written.
+/// Event kind: a recording could not be written.
 pub const NOT_RECORDED: &str = "not-recorded";
-/// Bytes of a file that are sent at a time.
+/// Bytes of a file sent at a time.
 const CHUNK: usize = 256 << 10;
 
-/// Which files.
+/// Query: which recordings.
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
-pub struct Which {
-    /// Of this service.
+pub struct RecordingQuery {
+    /// Only recordings of this service.
     service: Option<String>,
-    /// Of this robot.
+    /// Only recordings of this robot.
     robot: Option<String>,
 }
 
-/// What events say they are about.
-pub fn about(handle: &Handle) -> NewEvent<'_> {
+/// Returns the subject of events about a servant.
+pub fn event_subject(handle: &Handle) -> NewEvent<'_> {
     NewEvent {
         service: Some(handle.service()),
         servant: Some(&handle.id),
@@ -59,8 +59,13 @@ pub fn about(handle: &Handle) -> NewEvent<'_> {
     }
 }
 
-/// Writes what is kept of a servant into a file. To be awaited to its end: else the next one would begin while this one is written.
-pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recording, Error> {
+/// Writes a servant's black box to a file. Must be polled to completion: otherwise the next recording would start
+/// while this one is still written.
+pub async fn write_recording(
+    app: &Arc<App>,
+    handle: &Handle,
+    why: &str,
+) -> Result<Recording, Error> {
     let Some(kept) = app.observers.black_box(&handle.id) else {
         return Err(Error::NoBlackBox(handle.id.clone()));
     };
@@ -70,21 +75,23 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
     };
     let _turn = app.observers.writing.lock().await;
     let half = directory(app).join(HALF);
-    // The directory is root's. What is written, strangers have said: only the file is made with root's rights.
+    // The directory belongs to root. The content comes from strangers, so only creating the file needs root's
+    // privileges.
     let path = half.clone();
-    let file = privileged(move || make(&path)).await;
+    let file = run_privileged(move || create_file(&path)).await;
     let file = file.map_err(|error| failed(format!("{}: {error}", half.display())))?;
     let path = half.clone();
-    let written =
-        tokio::task::spawn_blocking(move || kept.write(Writer::of(&path, file, kept.format())?))
-            .await;
+    let written = tokio::task::spawn_blocking(move || {
+        kept.write(RecordingWriter::from_file(&path, file, kept.format())?)
+    })
+    .await;
     let frozen = match written {
         Ok(Ok(frozen)) => frozen,
         error => {
             remove_file(half).await;
             return Err(failed(match error {
                 Ok(Err(error)) => error.to_string(),
-                _ => "the daemon's task broke".to_owned(),
+                _ => "a task of the daemon failed".to_owned(),
             }));
         }
     };
@@ -100,21 +107,21 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
         bytes: frozen.summary.size,
         topics: Some(frozen.topics),
     };
-    match admit(app, handle, &record).await {
+    match admit_recording(app, handle, &record).await {
         Ok(number) => record.id = number,
         Err(error) => {
             remove_file(half).await;
             return Err(error);
         }
     }
-    let whole = path_of(app, record.id);
-    if let Err(error) = privileged(move || std::fs::rename(half, whole)).await {
+    let whole = recording_path(app, record.id);
+    if let Err(error) = run_privileged(move || std::fs::rename(half, whole)).await {
         app.state.forget_recording(record.id)?;
         return Err(failed(error.to_string()));
     }
     let left_out = match frozen.left_out {
         0 => String::new(),
-        many => format!("; {many} messages so far found no room (memory of [black_box])"),
+        many => format!("; {many} messages so far did not fit (memory in [black_box])"),
     };
     let words = format!(
         "recording {}: the last {:.1} s ({} messages), because {why}{left_out}",
@@ -123,13 +130,17 @@ pub async fn write(app: &Arc<App>, handle: &Handle, why: &str) -> Result<Recordi
         record.messages
     );
     let journal = app.choreographer.journal();
-    journal.info(RECORDED, &words, &about(handle));
-    Ok(told(record))
+    journal.info(RECORDED, &words, &event_subject(handle));
+    Ok(to_api_recording(record))
 }
 
-/// Makes room for a new file, and remembers it; its number. Its service may have been removed while it was written, and another may be of that
-/// name by now: whose servant is gone, of that nothing is kept.
-async fn admit(app: &App, handle: &Handle, record: &RecordingRecord) -> Result<u64, Error> {
+/// Makes room for a new file, records it and returns its number. The service may have been removed while the file was
+/// written, and another may have its name by now; if the servant is gone, nothing is kept.
+async fn admit_recording(
+    app: &App,
+    handle: &Handle,
+    record: &RecordingRecord,
+) -> Result<u64, Error> {
     let now = app.choreographer.servant(&handle.id)?;
     let is_published = app.state.service_package(handle.service())?.is_some();
     if !is_published || !std::ptr::eq(Arc::as_ptr(&now), handle) {
@@ -140,22 +151,23 @@ async fn admit(app: &App, handle: &Handle, record: &RecordingRecord) -> Result<u
         return Err(Error::NotRecorded {
             servant: handle.id.clone(),
             reason: format!(
-                "the file has {}, and all of them may have {} (disk of [black_box])",
+                "the file has {}, but all recordings together may have {} (disk in [black_box])",
                 api::Size(record.bytes),
                 api::Size(options.disk)
             ),
         });
     }
     let known = app.state.recordings()?;
-    for number in in_the_way(&known, record, options) {
-        forget(app, number).await?;
+    for number in files_to_evict(&known, record, options) {
+        forget_recording(app, number).await?;
     }
     Ok(app.state.add_recording(record)?)
 }
 
-/// The files that go for a new one, among those that there are, the newest first: of the service that takes most, the new one counted, the
-/// oldest. However many files come of a service, they drive out none of those that take less.
-fn in_the_way(
+/// Returns the files to remove for a new one. `known` lists the existing files, newest first. The service that uses
+/// most, including the new file, loses its oldest; so a service cannot drive out the files of those that use less,
+/// however many it produces.
+fn files_to_evict(
     known: &[RecordingRecord],
     new: &RecordingRecord,
     options: &BlackBoxOptions,
@@ -174,7 +186,7 @@ fn in_the_way(
                 .map(|one| if many { 1 } else { one.bytes })
                 .sum::<u64>()
         };
-        // Of equals its own.
+        // Of equals, the new file's own service.
         let most = left
             .iter()
             .map(|one| one.service.as_str())
@@ -191,54 +203,54 @@ fn directory(app: &App) -> PathBuf {
     app.home.join(DIRECTORY)
 }
 
-fn path_of(app: &App, number: u64) -> PathBuf {
+fn recording_path(app: &App, number: u64) -> PathBuf {
     directory(app).join(format!("{number}.mcap"))
 }
 
-/// Does this with root's rights.
-async fn privileged<T: Send + 'static>(
+/// Runs `work` with root's privileges.
+async fn run_privileged<T: Send + 'static>(
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
 ) -> io::Result<T> {
-    match privilege::blocking(work).await {
+    match privilege::spawn_blocking(work).await {
         Ok(done) => done,
         Err(error) => Err(io::Error::other(error)),
     }
 }
 
-fn make(path: &std::path::Path) -> io::Result<File> {
+fn create_file(path: &std::path::Path) -> io::Result<File> {
     if let Some(directory) = path.parent() {
         store::private::make_directory(directory)?;
     }
     let mut options = OpenOptions::new();
-    // One that is there is of a daemon that was killed.
+    // An existing file was left by a daemon that was killed.
     options.write(true).create(true).truncate(true).open(path)
 }
 
 async fn remove_file(path: PathBuf) {
-    let _ = privileged(move || std::fs::remove_file(path)).await;
+    let _ = run_privileged(move || std::fs::remove_file(path)).await;
 }
 
-async fn forget(app: &App, number: u64) -> Result<(), Error> {
-    // Forgotten first: what is listed is there.
+async fn forget_recording(app: &App, number: u64) -> Result<(), Error> {
+    // The record is removed first, so that every listed recording exists.
     if app.state.forget_recording(number)? {
-        remove_file(path_of(app, number)).await;
+        remove_file(recording_path(app, number)).await;
     }
     Ok(())
 }
 
-/// Removes those of a service, which is there no more.
+/// Removes the recordings of a service that no longer exists.
 pub async fn forget_service(app: &App, service: &str) -> Result<(), Error> {
-    // One that is being written is forgotten, too.
+    // Waits for one being written, to remove it as well.
     let _turn = app.observers.writing.lock().await;
     let mut all = app.state.recordings()?;
     all.retain(|one| one.service == service);
     for one in all {
-        forget(app, one.id).await?;
+        forget_recording(app, one.id).await?;
     }
     Ok(())
 }
 
-/// Removes files that nobody knows of, and those of services that there are not: of a daemon that was killed in between.
+/// Removes orphaned files, and recordings of services that no longer exist, as left by a daemon that was killed.
 pub async fn sweep(app: &App) {
     let _turn = app.observers.writing.lock().await;
     let Ok(mut known) = app.state.recordings() else {
@@ -249,7 +261,7 @@ pub async fn sweep(app: &App) {
         !(is_gone && app.state.forget_recording(one.id).is_ok())
     });
     let directory = directory(app);
-    let swept = privileged(move || {
+    let swept = run_privileged(move || {
         for file in std::fs::read_dir(directory)?.flatten() {
             let name = file.file_name();
             let is_known = known.iter().any(|one| *name == *format!("{}.mcap", one.id));
@@ -259,11 +271,11 @@ pub async fn sweep(app: &App) {
         }
         Ok(())
     });
-    // Where there is no directory, there is nothing to sweep.
+    // Without a directory there is nothing to sweep.
     let _ = swept.await;
 }
 
-fn told(record: RecordingRecord) -> Recording {
+fn to_api_recording(record: RecordingRecord) -> Recording {
     Recording {
         number: record.id,
         service: record.service,
@@ -277,50 +289,52 @@ fn told(record: RecordingRecord) -> Recording {
     }
 }
 
-/// Refuses a file to who may not hear all that is in it: what somebody may not hear inside the robot's servants, it may not have later.
-fn check_heard(app: &App, caller: &Caller, record: &RecordingRecord) -> Result<(), Error> {
-    let grants = inside::grants(
+/// Refuses a recording to callers who may not subscribe to all its topics: what a caller may not see inside the
+/// robot's servants, it may not see later either.
+fn check_topics(app: &App, caller: &Caller, record: &RecordingRecord) -> Result<(), Error> {
+    let grants = inside::inside_grants(
         app,
         caller,
-        Whose {
+        InsideTarget {
             service: &record.service,
             robot: &record.robot,
             object: format_args!("recording {}", record.id),
         },
     )?;
     match &record.topics {
-        Some(topics) if may_hear(&grants, topics) => Ok(()),
+        Some(topics) if can_hear_all(&grants, topics) => Ok(()),
         Some(_) => {
             let who = &caller.who.principal.name;
             Err(Error::Forbidden {
                 what: format!(
-                    "recording {} holds topics that {who} may not hear (granted: {grants}); an admin can grant them: cloudroidctl policy allow {who} 'subscribe:/**' --service {}",
+                    "recording {} contains topics that {who} may not subscribe to (granted: {grants}); an admin can \
+                        grant them: cloudroidctl policy allow {who} 'subscribe:/**' --service {}",
                     record.id, record.service
                 ),
             })
         }
-        None => caller.may_at(app, Action::Operate, &record.service, None),
+        None => caller.check_service_access(app, AccessAction::Operate, &record.service, None),
     }
 }
 
-/// Whether all of these may be heard.
-fn may_hear(grants: &Grants, topics: &[String]) -> bool {
+/// Returns true if all topics may be subscribed to.
+fn can_hear_all(grants: &Grants, topics: &[String]) -> bool {
     let mut all = topics.iter();
     all.all(|topic| grants.permits(Operation::Subscribe, topic))
 }
 
-/// Those that the caller may have, the newest first.
-fn seen(app: &App, caller: &Caller) -> Result<Vec<RecordingRecord>, Error> {
+/// Returns the recordings that the caller may have, newest first.
+fn visible_recordings(app: &App, caller: &Caller) -> Result<Vec<RecordingRecord>, Error> {
     let mut all = app.state.recordings()?;
     all.retain(|one| {
-        caller.may_of(app, Action::See, &one.service, &one.robot)
-            && check_heard(app, caller, one).is_ok()
+        caller.is_allowed_for_robot(app, AccessAction::See, &one.service, &one.robot)
+            && check_topics(app, caller, one).is_ok()
     });
     Ok(all)
 }
 
-/// The one of this number, as it stands in an address.
-pub fn known(app: &App, number: &str) -> Result<RecordingRecord, Error> {
+/// Returns the recording with this number, as written in a path.
+pub fn find_recording(app: &App, number: &str) -> Result<RecordingRecord, Error> {
     let mut all = app.state.recordings()?.into_iter();
     let found = number
         .parse()
@@ -329,42 +343,46 @@ pub fn known(app: &App, number: &str) -> Result<RecordingRecord, Error> {
     found.ok_or_else(|| Error::UnknownRecording(number.to_owned()))
 }
 
-/// All files that the caller may have, the newest first.
+/// Lists the recordings that the caller may have, newest first.
 pub async fn list(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
-    Query(which): Query<Which>,
-) -> Answer<Vec<Recording>> {
-    let mut all = seen(&app, &caller)?;
+    Query(which): Query<RecordingQuery>,
+) -> JsonResult<Vec<Recording>> {
+    let mut all = visible_recordings(&app, &caller)?;
     let of =
         |wanted: &Option<String>, is: &str| wanted.as_deref().is_none_or(|wanted| wanted == is);
     all.retain(|one| of(&which.service, &one.service) && of(&which.robot, &one.robot));
-    Ok(Json(all.into_iter().map(told).collect()))
+    Ok(Json(all.into_iter().map(to_api_recording).collect()))
 }
 
-/// A file.
+/// Downloads a recording.
 pub async fn file(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
     Path(number): Path<String>,
 ) -> Result<Response, Error> {
-    let record = known(&app, &number)?;
-    check_heard(&app, &caller, &record)?;
-    let path = path_of(&app, record.id);
-    let opened = privileged(move || {
+    let record = find_recording(&app, &number)?;
+    check_topics(&app, &caller, &record)?;
+    let path = recording_path(&app, record.id);
+    let opened = run_privileged(move || {
         let file = File::open(path)?;
         let size = file.metadata()?.len();
         Ok((file, size))
     });
-    // It may have been removed by hand.
+    // The file may have been removed by hand.
     let (file, size) = opened
         .await
         .map_err(|_| Error::UnknownRecording(number.clone()))?;
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(file), CHUNK);
-    // It breaks off when what was shown is not good any more.
+    // The download is cut off when the caller's credential becomes invalid.
     let ended = {
         let (app, service) = (Arc::clone(&app), record.service.clone());
-        async move { app.principals.ended(&caller.who, &service, false).await }
+        async move {
+            app.principals
+                .wait_for_end(&caller.who, &service, false)
+                .await
+        }
     };
     let stream = stream.take_until(Box::pin(ended));
     let mut response = Response::new(Body::from_stream(stream));
@@ -379,38 +397,38 @@ pub async fn file(
     Ok(response)
 }
 
-/// Removes a file; gives those that are left.
+/// Removes a recording and returns those that are left.
 pub async fn remove(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
     Path(number): Path<String>,
-) -> Answer<Vec<Recording>> {
-    forget(&app, known(&app, &number)?.id).await?;
-    let left = seen(&app, &caller)?;
-    Ok(Json(left.into_iter().map(told).collect()))
+) -> JsonResult<Vec<Recording>> {
+    forget_recording(&app, find_recording(&app, &number)?.id).await?;
+    let left = visible_recordings(&app, &caller)?;
+    Ok(Json(left.into_iter().map(to_api_recording).collect()))
 }
 
-/// Writes a file of the last seconds of a servant now.
+/// Records the last seconds of a servant now.
 pub async fn take(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
     Path(id): Path<String>,
-) -> Answer<Recording> {
+) -> JsonResult<Recording> {
     let handle = app.choreographer.servant(&id)?;
-    app.observers.may_take(&id)?;
+    app.observers.check_take(&id)?;
     let why = format!("{} asked for it", caller.who.principal.name);
     let taken = {
         let app = Arc::clone(&app);
-        async move { write(&app, &handle, &why).await }
+        async move { write_recording(&app, &handle, &why).await }
     };
-    match to_its_end(&app.sessions, taken).await {
+    match run_to_end(&app.sessions, taken).await {
         Some(taken) => taken.map(Json),
         None => Err(Error::Internal("writing a recording")),
     }
 }
 
-/// What comes of it, also where whoever waits for that has left. None: it broke.
-pub async fn to_its_end<T: Send + 'static>(
+/// Runs `work` to completion even if the caller stops waiting. Returns `None` if it panicked.
+pub async fn run_to_end<T: Send + 'static>(
     tasks: &TaskTracker,
     work: impl Future<Output = T> + Send + 'static,
 ) -> Option<T> {
@@ -459,7 +477,7 @@ mod tests {
                 .iter()
                 .map(|(id, service, bytes)| record(*id, service, *bytes))
                 .collect();
-            in_the_way(&all, &record(0, new.0, new.1), &options(files, disk))
+            files_to_evict(&all, &record(0, new.0, new.1), &options(files, disk))
         };
         let all = [
             (5, "busy", 10),
@@ -470,20 +488,20 @@ mod tests {
         ];
         // There is room.
         assert_eq!(gone(&all, ("busy", 4), (6, 60)), [] as [u64; 0]);
-        // By number: the busy one has most, whoever comes.
+        // By number: the busy service has most, whichever is new.
         assert_eq!(gone(&all, ("busy", 1), (5, 60)), [3]);
         assert_eq!(gone(&all, ("new", 1), (5, 60)), [3]);
         assert_eq!(gone(&all, ("quiet", 1), (5, 60)), [1]);
         // By bytes.
         assert_eq!(gone(&all, ("busy", 10), (9, 60)), [3]);
         assert_eq!(gone(&all, ("new", 15), (9, 60)), [3, 1]);
-        // One that needs so much alone.
+        // One that needs everything.
         assert_eq!(gone(&all, ("busy", 40), (9, 60)), [3, 4, 5, 1, 2]);
-        // However often the busy one comes, the quiet one's stay.
+        // However often the busy service records, the files of the quiet one stay.
         let mut known = vec![record(1, "quiet", 10)];
         for id in 2..50 {
             let new = record(id, "busy", 10);
-            let gone = in_the_way(&known, &new, &options(3, 1000));
+            let gone = files_to_evict(&known, &new, &options(3, 1000));
             known.retain(|one| !gone.contains(&one.id));
             known.insert(0, new);
         }
@@ -501,10 +519,10 @@ mod tests {
         let map: Vec<String> = topics(&["/map"]);
         let both: Vec<String> = topics(&["/map", "/camera/image"]);
         let narrow = grants(&["subscribe:/map", "publish:/camera/**"]);
-        assert!(may_hear(&narrow, &map));
-        assert!(!may_hear(&narrow, &both));
-        assert!(may_hear(&grants(&["subscribe:/**"]), &both));
-        assert!(!may_hear(&grants(&["call:/**"]), &map));
+        assert!(can_hear_all(&narrow, &map));
+        assert!(!can_hear_all(&narrow, &both));
+        assert!(can_hear_all(&grants(&["subscribe:/**"]), &both));
+        assert!(!can_hear_all(&grants(&["call:/**"]), &map));
     }
 
     #[tokio::test]
@@ -518,7 +536,7 @@ mod tests {
                 done.notify_one();
             }
         };
-        let mut waiting = Box::pin(to_its_end(&tasks, work));
+        let mut waiting = Box::pin(run_to_end(&tasks, work));
         assert!((&mut waiting).now_or_never().is_none());
         drop(waiting);
         go.notify_one();

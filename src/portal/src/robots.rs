@@ -1,50 +1,53 @@
-//! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`, and on which terms ([`api::sla`]): `&rrt=100ms&max_rrt=300ms`.
+//! Robots: `ws://host:9090/<service>?robot=ID&token=…&resume=…`, with requirements ([`api::sla`]) such as
+//! `&rrt=100ms&max_rrt=300ms`.
 //!
-//! Where tokens are configured, a client without one can only send `auth`: it gets no servant and no information before.
+//! Where tokens are configured, a client without one can only send `auth`; before that it gets no servant and no
+//! information.
 
 use std::pin::pin;
 use std::sync::Arc;
 
-use access::{Action, Standing};
+use access::{AccessAction, ConnectionAccess};
 use api::Stated;
 use axum::Extension;
 use axum::body::Body;
 use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri, header};
 use axum::response::{IntoResponse, Response};
-use bridge::{Granted, SessionEnd, SessionOptions, Waiting};
+use bridge::{ClientGrants, SessionEnd, SessionOptions, WaitingConnection};
 use bytes::BytesMut;
 use catalogue::names;
 use hyper::upgrade::{OnUpgrade, Upgraded};
 use hyper_util::rt::TokioIo;
-use reach::{Reach, Stream};
+use reach::{Reach, UpgradedStream};
 use tokio::io::{AsyncRead, AsyncReadExt};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::sync::{mpsc, watch};
 use tokio_rustls::server::TlsStream;
 
-use super::guard::{self, Caller, Connection, Peer};
+use super::guard::{self, Caller, ConnectionPeer, PortalConnection};
 use super::{App, allowed, auth, handshake, page};
 use crate::errors::Error;
-use crate::principals::Identity;
+use crate::principals::CallerIdentity;
 use crate::tokens::{self, AuthMessage};
 use choreographer::{Lease, ServantRequest};
 use store::Owner;
 
 /// Close code for "try again later" (RFC 6455 and its registry).
 const TRY_AGAIN_LATER: u16 = 1013;
-/// Close code for a policy that was violated.
+/// Close code for a policy violation.
 const POLICY: u16 = 1008;
-/// Why a client is sent away of whom nobody knows yet who it is.
-const CROWDED: &str = "too many connect and do not say who they are; send the auth message sooner, or a token in the address";
-/// Bytes that a robot's stub may send before its servant is there.
+/// Close reason for a client that was not authenticated in time.
+const CROWDED: &str =
+    "too many unauthenticated connections; send the auth message sooner, or a token in the address";
+/// Bytes that a stub may send before its servant is ready.
 const STUB_AHEAD: usize = 64 * 1024;
-/// Words about where a robot stands that may wait to be sent.
+/// Queue size of messages about a waiting robot's position.
 const NEWS: usize = 4;
-/// Characters by which a robot is called that gave no name, which are shown: so many that nobody finds a resume token with the same ones
-/// (128 bits of a hash).
+/// Length of the generated name of a nameless robot: 128 bits of a hash, so that nobody finds another resume token
+/// with the same name.
 const NAMELESS: usize = 32;
-/// Bytes of a node's name.
+/// Maximum length of a node's name in bytes.
 const LONGEST_NODE: usize = 256;
 
 /// `/`: the page, or the default service.
@@ -60,11 +63,11 @@ pub async fn root(
         Some(service) => connect(app, service, caller, request)
             .await
             .unwrap_or_else(IntoResponse::into_response),
-        // What there is, is told to those who may ask.
+        // Only authorised callers learn which services exist.
         None if !caller.is_known() => Error::Unauthorised("a token is needed").into_response(),
         None => {
-            let refusal = allowed::known_to(&app, &caller, "")
-                .and_then(|()| Err(app.catalogue.unknown("")?.into()));
+            let refusal = allowed::check_service_known(&app, &caller, "")
+                .and_then(|()| Err(app.catalogue.unknown_service("")?.into()));
             refusal.map_or_else(IntoResponse::into_response, |()| {
                 StatusCode::NOT_FOUND.into_response()
             })
@@ -86,7 +89,7 @@ pub async fn service_with_slash(
     self::service(app, service, caller, request).await
 }
 
-/// `/<service>`: its servant, or an explanation.
+/// `/<service>`: the connection to its servant, or an explanation.
 pub async fn service(
     State(app): State<Arc<App>>,
     Path(service): Path<String>,
@@ -101,22 +104,23 @@ pub async fn service(
     answer.unwrap_or_else(IntoResponse::into_response)
 }
 
-/// What someone is told who opens a service's address in a browser.
+/// Explains the service to somebody who opens its address in a browser.
 fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result<Response, Error> {
     if !matches!(*method, Method::GET | Method::HEAD) {
         return Err(Error::BadRequest(format!(
-            "{method} is not answered here; services are reached by WebSocket"
+            "{method} is not supported here; connect to services by WebSocket"
         )));
     }
-    caller.may_at(app, Action::See, service, None)?;
-    allowed::known_to(app, caller, service)?;
-    let revision = app.catalogue.current(service)?;
+    caller.check_service_access(app, AccessAction::See, service, None)?;
+    allowed::check_service_known(app, caller, service)?;
+    let revision = app.catalogue.current_revision(service)?;
     let answer = serde_json::json!({
         "service": service,
         "revision": revision.number,
         "address": app.address(service),
         "protocol": "rosbridge v2 over WebSocket",
-        "next": "connect with any rosbridge client, such as roslibpy or roslibjs; ?robot=ID finds the same servant again",
+        "next": "connect with any rosbridge client, such as roslibpy or roslibjs; ?robot=ID finds the same servant \
+                 again",
         "interface": format!("/api/v1/services/{service}/interface"),
     });
     Ok((
@@ -127,24 +131,24 @@ fn explain(app: &App, service: &str, caller: &Caller, method: &Method) -> Result
         .into_response())
 }
 
-/// What the address says about the robot.
+/// A robot's request, as given by the URL.
 struct RobotRequest {
     service: String,
     robot: Option<String>,
-    /// The configured default robot, which is everybody's.
+    /// True for the configured default robot, which everybody shares.
     shared: bool,
     resume: Option<String>,
-    /// A robot's stub asks, in the link's protocol.
+    /// True if a robot's stub asks, in the link protocol.
     link: bool,
-    /// The node that the stub stands for; stubs of earlier versions do not say it here.
+    /// Node that the stub represents; stubs of earlier versions do not send it here.
     node: String,
-    /// On which terms.
+    /// Stated requirements.
     stated: Stated,
 }
 
 impl RobotRequest {
-    fn read(app: &App, service: String, link: bool, uri: &Uri) -> Result<RobotRequest, Error> {
-        let named = guard::query(uri.query(), "robot");
+    fn parse(app: &App, service: String, link: bool, uri: &Uri) -> Result<RobotRequest, Error> {
+        let named = guard::query_value(uri.query(), "robot");
         let shared = named.is_none() && uri.path() == "/" && app.options.default_robot.is_some();
         let robot = if shared {
             app.options.default_robot.clone()
@@ -152,11 +156,11 @@ impl RobotRequest {
             named
         };
         if let Some(robot) = &robot {
-            names::robot(robot).map_err(catalogue::Error::from)?;
+            names::validate_robot(robot).map_err(catalogue::Error::from)?;
         }
-        let node = guard::query(uri.query(), "node").unwrap_or_default();
+        let node = guard::query_value(uri.query(), "node").unwrap_or_default();
         check_node(&node).map_err(Error::BadRequest)?;
-        let stated = Stated::read(guard::pairs(uri.query()));
+        let stated = Stated::read(guard::query_pairs(uri.query()));
         Ok(RobotRequest {
             node,
             stated: stated.map_err(Error::Unstatable)?,
@@ -164,48 +168,53 @@ impl RobotRequest {
             service,
             robot,
             shared,
-            resume: guard::query(uri.query(), "resume").filter(|token| !token.is_empty()),
+            resume: guard::query_value(uri.query(), "resume").filter(|token| !token.is_empty()),
         })
     }
 }
 
-/// Refuses what cannot name a node; it is kept with what its stub states, and shown.
+/// Checks the name of a node; it is stored with the stub's requirements and displayed.
 fn check_node(node: &str) -> Result<(), String> {
     let is_name = |c: char| c.is_ascii_alphanumeric() || "_/".contains(c);
-    match node.len() <= LONGEST_NODE && node.chars().all(is_name) {
-        true => Ok(()),
-        false => Err(format!(
+    if node.len() <= LONGEST_NODE && node.chars().all(is_name) {
+        Ok(())
+    } else {
+        Err(format!(
             "node={:?} does not name a node; write letters, digits, _ and /, at most {LONGEST_NODE}",
             node.chars().take(LONGEST_NODE).collect::<String>()
-        )),
+        ))
     }
 }
 
 impl RobotRequest {
-    /// Takes for granted what the caller's token says: who has one of a robot is that robot.
-    fn by(&mut self, caller: &Caller) -> Result<(), Error> {
+    /// Applies the caller's token: the holder of a robot's token is that robot.
+    fn apply_identity(&mut self, caller: &Caller) -> Result<(), Error> {
         if let Some(own) = &caller.who.principal.scope.robot
             && (self.robot.is_none() || self.shared)
         {
             (self.robot, self.shared) = (Some(own.clone()), false);
         }
-        match self.link && self.robot.is_none() {
-            true => Err(Error::BadRequest(
+        if self.link && self.robot.is_none() {
+            Err(Error::BadRequest(
                 "a link needs the robot's id: ?robot=ID".to_owned(),
-            )),
-            false => Ok(()),
+            ))
+        } else {
+            Ok(())
         }
     }
 
-    /// The robot's name, where it is its own.
+    /// Returns the robot's name if it belongs to one robot.
     fn own_name(&self) -> Option<&str> {
         self.robot.as_deref().filter(|_| !self.shared)
     }
 
-    /// The resume token, bound to the caller.
+    /// Returns the resume token, bound to the caller.
     fn bound_resume(&self, caller: &Caller) -> Option<String> {
         let token = self.resume.as_deref()?;
-        Some(tokens::bound_to(caller.who.bound_by().as_deref(), token))
+        Some(tokens::bind_resume_token(
+            caller.who.resume_binding().as_deref(),
+            token,
+        ))
     }
 }
 
@@ -217,28 +226,29 @@ async fn connect(
 ) -> Result<Response, Error> {
     let accept = handshake::accept(&request)?;
     let link = asks_for_link(request.headers())?;
-    let mut asked = RobotRequest::read(&app, service, link, request.uri())?;
-    // A stub shows its token at once; without it nothing is told, not even what there is.
+    let mut asked = RobotRequest::parse(&app, service, link, request.uri())?;
+    // A stub must send its token with the handshake; without one it learns nothing, not even which services exist.
     if asked.link && !caller.is_known() {
         return Err(Error::Unauthorised("a link needs a token"));
     }
     if caller.is_known() {
-        asked.by(&caller)?;
-        let allowed = check(&app, &asked, &caller);
-        note(&app, &asked, &caller, &allowed);
+        asked.apply_identity(&caller)?;
+        let allowed = check_access(&app, &asked, &caller);
+        audit_connect(&app, &asked, &caller, &allowed);
         allowed?;
     }
-    // Who has yet to show a token is not told what there is, nor whether this is: the auth message comes first.
+    // An unauthenticated caller must not learn whether the service exists: the auth message comes first.
     if caller.is_known() && app.state.service_package(&asked.service)?.is_none() {
-        return Err(app.catalogue.unknown(&asked.service)?.into());
+        return Err(app.catalogue.unknown_service(&asked.service)?.into());
     }
-    // Who has not shown a token must be let in to show one. Where there is no room, a stub is told by the HTTP status; a robot
-    // that speaks rosbridge alone is let in, and told by status messages where it stands, and why it is refused.
+    // An unauthenticated caller must be let in to authenticate. If there is no room, a stub is refused by the HTTP
+    // status; a robot that only speaks rosbridge is let in and learns its position, and the reason of a refusal, from
+    // status messages.
     let lease = if caller.is_known() {
-        let lease = lease(&app, &asked, &caller)?;
+        let lease = request_lease(&app, &asked, &caller)?;
         if asked.link {
-            lease.admitted().await?;
-            claim(&app, &asked, &caller)?;
+            lease.wait_admitted().await?;
+            claim_robot_name(&app, &asked, &caller)?;
         }
         Some(lease)
     } else {
@@ -249,20 +259,21 @@ async fn connect(
             "this connection cannot become a WebSocket".to_owned(),
         ));
     };
-    let protocol = match asked.link {
-        true => Some(link::SUBPROTOCOL),
-        false => rosbridge_protocol(request.headers())?,
+    let protocol = if asked.link {
+        Some(link::SUBPROTOCOL)
+    } else {
+        rosbridge_protocol(request.headers())?
     };
     let sessions = app.sessions.clone();
-    let connection = request.extensions_mut().remove::<Connection>();
+    let connection = request.extensions_mut().remove::<PortalConnection>();
     if let (Some(connection), Some(_)) = (&connection, &lease) {
         connection.admit();
     }
     sessions.spawn(async move {
         match upgrade.await {
             Ok(upgraded) => {
-                let (io, read_ahead) = unwrapped(upgraded);
-                session(app, asked, caller, lease, connection, io, read_ahead).await;
+                let (io, read_ahead) = into_raw_stream(upgraded);
+                serve_session(app, asked, caller, lease, connection, io, read_ahead).await;
             }
             Err(error) => tracing::debug!("a connection was lost at its upgrade: {error}"),
         }
@@ -280,7 +291,7 @@ async fn connect(
     Ok(response)
 }
 
-/// Whether a robot's stub asks, in a version of the link's protocol that is spoken here.
+/// Returns true if a robot's stub asks in a version of the link protocol that is supported here.
 fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
     let offered: Vec<&str> = guard::protocols(headers)
         .filter(|protocol| protocol.starts_with(link::SUBPROTOCOLS))
@@ -296,27 +307,28 @@ fn asks_for_link(headers: &HeaderMap) -> Result<bool, Error> {
     }
 }
 
-/// The subprotocol to choose: a browser gives up where it offered some and none is chosen, and the one that is a token must not
-/// be written into an answer.
+/// Returns the subprotocol to select. A browser gives up if it offered some and none is selected; one that is a token
+/// must not be written into a response.
 pub fn rosbridge_protocol(headers: &HeaderMap) -> Result<Option<&'static str>, Error> {
     if guard::protocols(headers).any(|protocol| protocol == guard::ROSBRIDGE) {
         return Ok(Some(guard::ROSBRIDGE));
     }
-    match guard::protocols(headers).any(|protocol| protocol.starts_with(guard::BEARER)) {
-        false => Ok(None),
-        true => Err(Error::BadRequest(format!(
-            "a token alone is no subprotocol that can be chosen; offer {} before it",
+    if guard::protocols(headers).any(|protocol| protocol.starts_with(guard::BEARER)) {
+        Err(Error::BadRequest(format!(
+            "a token alone cannot be chosen as the subprotocol; offer {} before it",
             guard::ROSBRIDGE
-        ))),
+        )))
+    } else {
+        Ok(None)
     }
 }
 
-/// The right to the servant that is asked for.
-fn lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lease, Error> {
+/// Requests a lease on the servant.
+fn request_lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lease, Error> {
     let (service, stated) = (&asked.service, asked.stated.clone());
     let request = match &asked.robot {
         None => {
-            let (robot, anonymous) = nameless(asked.bound_resume(caller).as_deref());
+            let (robot, anonymous) = generated_name(asked.bound_resume(caller).as_deref());
             ServantRequest {
                 anonymous,
                 ..ServantRequest::new(service, &robot)
@@ -324,49 +336,64 @@ fn lease(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<Lease, Erro
         }
         Some(robot) => {
             let request = ServantRequest::new(service, robot);
-            match asked.link {
-                true => request.by_stub(&asked.node),
-                false => request,
+            if asked.link {
+                request.with_stub(&asked.node)
+            } else {
+                request
             }
         }
     };
-    Ok(app.choreographer.ensure(request.stating(stated))?)
+    Ok(app.choreographer.ensure(request.with_stated(stated))?)
 }
 
-/// Whether the caller may be that robot at that service, on those terms.
-fn check(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
-    caller.may_at(app, Action::Connect, &asked.service, asked.robot.as_deref())?;
+/// Checks whether the caller may act as that robot at that service, with those requirements.
+fn check_access(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
+    caller.check_service_access(
+        app,
+        AccessAction::Connect,
+        &asked.service,
+        asked.robot.as_deref(),
+    )?;
     if let Some(class) = &asked.stated.class {
-        caller.may_use_class(class)?;
+        caller.check_class(class)?;
     }
-    // A stub is given everything that its node uses.
+    // A stub is given access to everything that its node uses.
     if asked.link
-        && let Standing::Granted(grants) = app.principals.standing(&caller.who, &asked.service)
+        && let ConnectionAccess::Granted(grants) = app
+            .principals
+            .connection_access(&caller.who, &asked.service)
         && !grants.is_everything()
     {
         return Err(Error::Forbidden {
             what: format!(
-                "a stub needs all of {}, and {} is granted {grants}",
+                "a stub needs all of {}, but {} is granted only {grants}",
                 asked.service, caller.who.principal.name
             ),
         });
     }
-    allowed::known_to(app, caller, &asked.service)?;
+    allowed::check_service_known(app, caller, &asked.service)?;
     match asked.own_name() {
-        Some(robot) => check_owner(robot, app.state.owner_of_robot(robot)?, caller),
+        Some(robot) => check_owner(robot, app.state.find_robot_owner(robot)?, caller),
         None => Ok(()),
     }
 }
 
-/// Records that somebody connected, or was refused, aside: it does not wait for that.
-fn note(app: &Arc<App>, asked: &RobotRequest, caller: &Caller, allowed: &Result<(), Error>) {
+/// Records in the audit log that somebody connected or was refused. Runs in the background, because it waits for the
+/// disk.
+fn audit_connect(
+    app: &Arc<App>,
+    asked: &RobotRequest,
+    caller: &Caller,
+    allowed: &Result<(), Error>,
+) {
     let status = match allowed {
         Ok(()) => StatusCode::SWITCHING_PROTOCOLS.as_u16(),
         Err(error) => error.problem().status,
     };
-    let did = match asked.link {
-        true => "connected by a stub",
-        false => "connected by rosbridge",
+    let did = if asked.link {
+        "connected by a stub"
+    } else {
+        "connected by rosbridge"
     };
     let object = match &asked.robot {
         Some(robot) => format!("service {} as robot {robot}", asked.service),
@@ -376,23 +403,23 @@ fn note(app: &Arc<App>, asked: &RobotRequest, caller: &Caller, allowed: &Result<
     let sessions = app.sessions.clone();
     sessions.spawn_blocking(move || {
         app.audit
-            .record_sparingly(&caller, Action::Connect, did, &object, status);
+            .record_throttled(&caller, AccessAction::Connect, did, &object, status);
     });
 }
 
-/// Binds the robot's name to whoever uses it first. Not before there is room for it: who is refused leaves nothing behind.
-fn claim(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
+/// Binds the robot's name to its first user. Not before there is room, so that a refused robot leaves nothing behind.
+fn claim_robot_name(app: &App, asked: &RobotRequest, caller: &Caller) -> Result<(), Error> {
     let Some(robot) = asked.own_name() else {
         return Ok(());
     };
-    // Where tokens are configured, a name used before there were any goes to the first who has one.
-    let claim = !app.principals.names_nobody();
+    // Where tokens are configured, a name used before there were any goes to the first caller with a token.
+    let claim = !app.principals.has_no_credentials();
     let own = caller.who.owner.as_ref();
-    let owner = app.state.robot_owner(robot, own, claim)?;
+    let owner = app.state.claim_robot(robot, own, claim)?;
     check_owner(robot, owner, caller)
 }
 
-/// Nobody takes over another's robot.
+/// Refuses a robot's name that belongs to somebody else.
 fn check_owner(robot: &str, owner: Option<Owner>, caller: &Caller) -> Result<(), Error> {
     if owner.is_some() && owner != caller.who.owner {
         return Err(Error::RobotTaken(robot.to_owned()));
@@ -400,18 +427,19 @@ fn check_owner(robot: &str, owner: Option<Owner>, caller: &Caller) -> Result<(),
     Ok(())
 }
 
-/// A name for a robot that gave none (one that no robot can give, so nobody takes it over), and whether nobody can come
-/// back under it: who holds the resume token, here bound to who shows it, can.
-fn nameless(resume: Option<&str>) -> (String, bool) {
+/// Returns a name for a nameless robot (one that no robot can claim, so that nobody can take it over) and whether the
+/// name is unique to this connection. It is not with a resume token, here bound to its holder, who can return under
+/// the same name.
+fn generated_name(resume: Option<&str>) -> (String, bool) {
     match resume {
         Some(bound) => (format!("~{}", &bound[..NAMELESS]), false),
         None => (format!("~{}", names::random(NAMELESS)), true),
     }
 }
 
-/// A connection behind its upgrade, and what was already read from it. Without hyper's wrapping around them, reads and writes go
+/// Returns the upgraded connection and the bytes already read from it. Without hyper's wrappers, reads and writes go
 /// straight to the socket.
-pub fn unwrapped(upgraded: Upgraded) -> (Stream, bytes::Bytes) {
+pub fn into_raw_stream(upgraded: Upgraded) -> (UpgradedStream, bytes::Bytes) {
     match upgraded.downcast::<TokioIo<TcpStream>>() {
         Ok(parts) => (Box::new(parts.io.into_inner()), parts.read_buf),
         Err(upgraded) => match upgraded.downcast::<TokioIo<UnixStream>>() {
@@ -424,47 +452,47 @@ pub fn unwrapped(upgraded: Upgraded) -> (Stream, bytes::Bytes) {
     }
 }
 
-/// Who sends the first message of a connection, and what was read beyond it; else with which code it is closed, and why.
+/// Authenticates the sender of the first message; returns the bytes read beyond it, or the close code and reason.
 async fn recognise(
     app: &App,
     caller: &Caller,
-    io: &mut Stream,
+    io: &mut UpgradedStream,
     read_ahead: bytes::Bytes,
-) -> Result<(Identity, bytes::Bytes), (u16, String)> {
+) -> Result<(CallerIdentity, bytes::Bytes), (u16, String)> {
     let from = caller.peer.ip();
     let recognise = |message: &AuthMessage, now| app.principals.recognise_auth(message, from, now);
-    let awaited = auth::first_message(io, read_ahead, recognise);
+    let awaited = auth::read_auth_message(io, read_ahead, recognise);
     match tokio::time::timeout(app.options.handshake, awaited).await {
         Ok(heard) => heard.map_err(|reason| (POLICY, reason)),
-        Err(_) => Err((POLICY, "no auth message came; send a token".to_owned())),
+        Err(_) => Err((POLICY, "no auth message received; send a token".to_owned())),
     }
 }
 
-/// Comes back when newer connections of strangers need the place of this one.
-async fn dropped(connection: Option<&Connection>) {
+/// Waits until this connection must make way for newer unauthenticated ones.
+async fn wait_until_dropped(connection: Option<&PortalConnection>) {
     match connection {
-        Some(connection) => connection.dropped().await,
+        Some(connection) => connection.wait_until_dropped().await,
         None => std::future::pending().await,
     }
 }
 
-async fn session(
+async fn serve_session(
     app: Arc<App>,
     mut asked: RobotRequest,
     mut caller: Caller,
     lease: Option<Lease>,
-    connection: Option<Connection>,
-    mut io: Stream,
+    connection: Option<PortalConnection>,
+    mut io: UpgradedStream,
     mut read_ahead: bytes::Bytes,
 ) {
     if asked.link {
-        return linked(&app, &asked, &caller, lease, io, read_ahead).await;
+        return serve_stub(&app, &asked, &caller, lease, io, read_ahead).await;
     }
     if lease.is_none() {
         let awaited = recognise(&app, &caller, &mut io, read_ahead);
         let recognised = tokio::select! {
             recognised = awaited => recognised,
-            () = dropped(connection.as_ref()) => Err((TRY_AGAIN_LATER, CROWDED.to_owned())),
+            () = wait_until_dropped(connection.as_ref()) => Err((TRY_AGAIN_LATER, CROWDED.to_owned())),
         };
         match recognised {
             Ok((who, rest)) => {
@@ -478,29 +506,31 @@ async fn session(
         connection.admit();
     }
     let allowed = asked
-        .by(&caller)
-        .and_then(|()| check(&app, &asked, &caller));
+        .apply_identity(&caller)
+        .and_then(|()| check_access(&app, &asked, &caller));
     if lease.is_none() {
-        note(&app, &asked, &caller, &allowed);
+        audit_connect(&app, &asked, &caller, &allowed);
     }
     if let Err(error) = allowed {
-        return bridge::refuse(io, POLICY, &error.in_a_line()).await;
+        return bridge::refuse(io, POLICY, &error.one_line()).await;
     }
     let memory = app.choreographer.memory();
-    let budget = memory.client(&caller.peer.client(asked.robot.as_deref()));
-    let mut waiting =
-        Waiting::new(io, &read_ahead, app.choreographer.bridge_options()).within(&budget);
+    let budget = memory.client(&caller.peer.budget_name(asked.robot.as_deref()));
+    let mut waiting = WaitingConnection::new(io, &read_ahead, app.choreographer.bridge_options())
+        .with_budget(&budget);
     let (news, told) = mpsc::channel(NEWS);
-    let taking = servant(&app, &asked, &caller, lease, &news);
-    let ended = app.principals.ended(&caller.who, &asked.service, false);
+    let taking = wait_for_servant(&app, &asked, &caller, lease, &news);
+    let ended = app
+        .principals
+        .wait_for_end(&caller.who, &asked.service, false);
     let taken = tokio::select! {
-        taken = waiting.until_told(taking, told) => taken,
+        taken = waiting.wait_for_with_news(taking, told) => taken,
         reason = ended => return waiting.refuse(POLICY, &reason).await,
     };
     let (lease, reach) = match taken {
         Ok(Ok(taken)) => taken,
-        Ok(Err(error)) => return waiting.refuse(code(&error), &error.in_a_line()).await,
-        // With its lease its place in the queue is given up, and the servant that only it could have used.
+        Ok(Err(error)) => return waiting.refuse(close_code(&error), &error.one_line()).await,
+        // Dropping the lease gives up its place in the queue and a servant that only it could have used.
         Err(end) => {
             tracing::debug!("a robot left before {} was ready: {end:?}", asked.service);
             return;
@@ -508,21 +538,24 @@ async fn session(
     };
     let client = match (&asked.robot, caller.peer) {
         (Some(robot), _) => robot.clone(),
-        (None, Peer::Tcp(address)) => address.to_string(),
+        (None, ConnectionPeer::Tcp(address)) => address.to_string(),
         (None, user) => user.to_string(),
     };
-    let now = app.principals.standing(&caller.who, &asked.service);
+    let now = app
+        .principals
+        .connection_access(&caller.who, &asked.service);
     let (standing, granted) = watch::channel(now);
     let options = SessionOptions {
         budget,
         client,
         resume: asked.bound_resume(&caller),
-        granted: Granted::by(granted).telling(refusals(&app, &asked, &caller)),
+        granted: ClientGrants::from_standing(granted)
+            .with_refusal_observer(audit_refusal(&app, &asked, &caller)),
         ..SessionOptions::default()
     };
     let end = tokio::select! {
         end = reach.serve_rosbridge(waiting, options) => end,
-        () = app.principals.follow(&caller.who, &asked.service, &standing) => return,
+        () = app.principals.follow_access(&caller.who, &asked.service, &standing) => return,
     };
     let handle = lease.handle();
     match end {
@@ -542,8 +575,8 @@ async fn session(
     }
 }
 
-/// Records operations that were refused because nothing grants them.
-fn refusals(
+/// Returns a function that records operations refused for lack of a grant.
+fn audit_refusal(
     app: &Arc<App>,
     asked: &RobotRequest,
     caller: &Caller,
@@ -554,20 +587,21 @@ fn refusals(
         let object = format!("service {service}");
         let status = StatusCode::FORBIDDEN.as_u16();
         app.audit
-            .record_sparingly(&caller, Action::Connect, &did, &object, status);
+            .record_throttled(&caller, AccessAction::Connect, &did, &object, status);
     }
 }
 
-/// With which code a robot's connection is closed that has no servant.
-fn code(error: &Error) -> u16 {
-    match error.is_final() {
-        true => POLICY,
-        false => TRY_AGAIN_LATER,
+/// Returns the close code for a robot that gets no servant.
+fn close_code(error: &Error) -> u16 {
+    if error.is_final() {
+        POLICY
+    } else {
+        TRY_AGAIN_LATER
     }
 }
 
-/// The servant that is asked for, once it is ready, and its lease.
-async fn servant(
+/// Returns the requested servant once it is ready, and its lease.
+async fn wait_for_servant(
     app: &App,
     asked: &RobotRequest,
     caller: &Caller,
@@ -576,25 +610,28 @@ async fn servant(
 ) -> Result<(Lease, Arc<dyn Reach>), Error> {
     let lease = match lease {
         Some(lease) => lease,
-        None => self::lease(app, asked, caller)?,
+        None => self::request_lease(app, asked, caller)?,
     };
-    admitted(&lease, news).await?;
-    claim(app, asked, caller)?;
-    let reach = lease.ready().await?;
+    wait_for_admission(&lease, news).await?;
+    claim_robot_name(app, asked, caller)?;
+    let reach = lease.wait_ready().await?;
     Ok((lease, reach))
 }
 
-/// Waits until there is room, and tells where the robot stands meanwhile, whenever that changes.
-async fn admitted(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), choreographer::Error> {
+/// Waits for admission and reports the robot's position whenever it changes.
+async fn wait_for_admission(
+    lease: &Lease,
+    news: &mpsc::Sender<String>,
+) -> Result<(), choreographer::Error> {
     let mut standing = lease.handle().watch_standing();
-    let mut admitted = pin!(lease.admitted());
+    let mut admitted = pin!(lease.wait_admitted());
     loop {
         let stands = standing
             .borrow_and_update()
             .as_ref()
             .map(ToString::to_string);
         if let Some(stands) = stands {
-            // One that does not read is told the next time.
+            // A robot that does not read gets the next report.
             let _ = news.try_send(stands);
         }
         tokio::select! {
@@ -605,26 +642,26 @@ async fn admitted(lease: &Lease, news: &mpsc::Sender<String>) -> Result<(), chor
     }
 }
 
-/// A connection of a robot's stub.
-async fn linked(
+/// Serves a connection of a robot's stub.
+async fn serve_stub(
     app: &App,
     asked: &RobotRequest,
     caller: &Caller,
     lease: Option<Lease>,
-    mut io: Stream,
+    mut io: UpgradedStream,
     read_ahead: bytes::Bytes,
 ) {
     let Some(lease) = lease else {
         let error = Error::Internal("taking a servant");
-        return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
+        return bridge::refuse(io, TRY_AGAIN_LATER, &error.one_line()).await;
     };
     let mut read_ahead = BytesMut::from(read_ahead);
     let ready = tokio::select! {
-        ready = lease.ready() => ready,
-        reason = app.principals.ended(&caller.who, &asked.service, true) => {
+        ready = lease.wait_ready() => ready,
+        reason = app.principals.wait_for_end(&caller.who, &asked.service, true) => {
             return bridge::refuse(io, POLICY, &reason).await;
         }
-        () = left(&mut io, &mut read_ahead) => {
+        () = wait_for_close(&mut io, &mut read_ahead) => {
             tracing::debug!("a stub left before {} was ready", asked.service);
             return;
         }
@@ -633,14 +670,14 @@ async fn linked(
         Ok(reach) => reach,
         Err(error) => {
             let error = Error::from(error);
-            return bridge::refuse(io, TRY_AGAIN_LATER, &error.in_a_line()).await;
+            return bridge::refuse(io, TRY_AGAIN_LATER, &error.one_line()).await;
         }
     };
     let robot = asked.robot.as_deref().unwrap_or_default();
     let lost = tokio::select! {
         lost = reach.serve_link(io, &read_ahead) => lost.to_string(),
         () = app.ending.cancelled() => "the daemon is ending".to_owned(),
-        reason = app.principals.ended(&caller.who, &asked.service, true) => reason,
+        reason = app.principals.wait_for_end(&caller.who, &asked.service, true) => reason,
     };
     tracing::info!(
         "the link of {robot} to servant {} ended: {lost}",
@@ -648,8 +685,8 @@ async fn linked(
     );
 }
 
-/// Keeps what comes from a connection, as far as there is room for it; comes back when the connection has ended.
-async fn left<S: AsyncRead + Unpin>(io: &mut S, kept: &mut BytesMut) {
+/// Buffers what the connection sends, up to a limit; returns when the connection has ended.
+async fn wait_for_close<S: AsyncRead + Unpin>(io: &mut S, kept: &mut BytesMut) {
     while kept.len() < STUB_AHEAD {
         if !matches!(io.read_buf(kept).await, Ok(1..)) {
             return;
@@ -696,16 +733,16 @@ mod tests {
 
     #[test]
     fn who_holds_the_resume_token_comes_back_to_the_same_servant() {
-        let bound = |resume| tokens::bound_to(None, resume);
-        let named = |resume| nameless(Some(&bound(resume)));
+        let bound = |resume| tokens::bind_resume_token(None, resume);
+        let named = |resume| generated_name(Some(&bound(resume)));
         assert_eq!(named("secret"), named("secret"));
         assert_ne!(named("secret"), named("other"));
-        assert_ne!(nameless(None).0, nameless(None).0);
+        assert_ne!(generated_name(None).0, generated_name(None).0);
         assert!(
-            names::robot(&named("secret").0).is_err(),
+            names::validate_robot(&named("secret").0).is_err(),
             "no robot can claim it"
         );
-        for name in [named("secret").0, nameless(None).0] {
+        for name in [named("secret").0, generated_name(None).0] {
             assert!(name.len() > 32, "{name} can be found");
         }
     }

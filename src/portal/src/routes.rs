@@ -1,10 +1,10 @@
-//! Every address that the portal answers, in one table: its method, who is answered there, its handler, and what the
-//! OpenAPI document says of it. Router, guard and document are made of it.
+//! Route table of the portal: for each address its method, who may use it, its handler, and its entry in the OpenAPI
+//! document. Router, guard and document are generated from it.
 
 #[cfg(test)]
 mod matrix;
 
-use ::access::Action;
+use ::access::AccessAction;
 use api::access;
 use axum::extract::{DefaultBodyLimit, OriginalUri};
 use axum::http::Method;
@@ -23,26 +23,26 @@ use super::{
 use crate::errors::Error;
 use crate::openapi::{Operation, operation};
 
-/// Who is answered where there are tokens.
+/// Callers that may use a route, where tokens exist.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Who may do this to that.
-    May(Action, Of),
-    /// Anyone who reads.
+    /// Callers that may perform this action on this object.
+    May(AccessAction, AccessTarget),
+    /// Anybody, read-only.
     Read,
-    /// Who shows a pairing code.
+    /// Whoever presents a pairing code.
     Code,
-    /// Anyone who reads who is signed in, or signs in.
+    /// Anybody, to query the session or to sign in.
     SignIn,
-    /// Any robot that connects: its first message must be rosbridge's `auth`.
+    /// Any robot; its first message must be rosbridge's `auth`.
     Connect,
-    /// Anyone who reads, and any robot that connects.
+    /// Anybody, read-only, and any robot.
     ReadOrConnect,
 }
 
-/// To what an address leads: the parameter that names it.
+/// The object of a route, and the path parameter that names it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Of {
+pub enum AccessTarget {
     /// The machine, or all services.
     Machine,
     /// A service.
@@ -55,47 +55,47 @@ pub enum Of {
     Robot(&'static str),
     /// The service and the robot of a recording.
     Recording(&'static str),
-    /// What the query or the body names: the handler decides.
+    /// Named by the query or the body: the handler decides.
     Handler,
 }
 
 use Access::{Code, Connect, May, Read, ReadOrConnect, SignIn};
-use Action::{Deploy, Enter, Logs, Look, Operate, See, Try};
+use AccessAction::{Deploy, Enter, Logs, Look, Operate, See, Try};
 
-/// What each principal is told, as far as it may see it.
-const ENTER: Access = May(Enter, Of::Machine);
+/// Queries open to every principal, within what it may see.
+const ENTER: Access = May(Enter, AccessTarget::Machine);
 /// The whole machine.
-const LOOK: Access = May(Look, Of::Machine);
+const LOOK: Access = May(Look, AccessTarget::Machine);
 /// Pairings of robots.
-const PAIR: Access = May(Action::Pair, Of::Machine);
+const PAIR: Access = May(AccessAction::Pair, AccessTarget::Machine);
 /// Tokens and policy.
-const ADMINISTER: Access = May(Action::Administer, Of::Machine);
+const ADMINISTER: Access = May(AccessAction::Administer, AccessTarget::Machine);
 
-/// To the service that `{name}` names.
-const fn service(action: Action) -> Access {
-    May(action, Of::Service("name"))
+/// Access to the service named by `{name}`.
+const fn service(action: AccessAction) -> Access {
+    May(action, AccessTarget::Service("name"))
 }
 
-/// To the servant that `{id}` names.
-const fn servant(action: Action) -> Access {
-    May(action, Of::Servant("id"))
+/// Access to the servant named by `{id}`.
+const fn servant(action: AccessAction) -> Access {
+    May(action, AccessTarget::Servant("id"))
 }
 
-/// One method at one address.
+/// One method of one address.
 pub struct Route {
-    /// `GET`, …, or `ANY` where the handler tells methods apart. `GET` answers `HEAD`, too.
+    /// `GET`, …, or `ANY` if the handler distinguishes methods. `GET` also answers `HEAD`.
     pub method: &'static str,
-    /// Its address as axum writes it; `{…}` is one segment.
+    /// Path in axum's syntax; `{…}` is one segment.
     pub path: &'static str,
-    /// Whom it answers.
+    /// Callers that may use the route.
     pub access: Access,
-    /// Makes its handler.
+    /// Creates the handler.
     pub handler: fn() -> MethodRouter<Arc<App>>,
-    /// What the OpenAPI document says of it.
+    /// Entry in the OpenAPI document.
     pub operation: Option<fn() -> Operation>,
 }
 
-const fn at(
+const fn route(
     method: &'static str,
     path: &'static str,
     access: Access,
@@ -114,15 +114,15 @@ const fn at(
     }
 }
 
-/// Whether what is to be looked up is in the address. Where it is not, the program does not compile.
+/// Returns true if the path has the parameter that names the object; otherwise the program does not compile.
 const fn names_its_object(path: &str, access: Access) -> bool {
     let May(
         _,
-        Of::Service(name)
-        | Of::Stub(name)
-        | Of::Servant(name)
-        | Of::Robot(name)
-        | Of::Recording(name),
+        AccessTarget::Service(name)
+        | AccessTarget::Stub(name)
+        | AccessTarget::Servant(name)
+        | AccessTarget::Robot(name)
+        | AccessTarget::Recording(name),
     ) = access
     else {
         return true;
@@ -145,15 +145,15 @@ const fn names_its_object(path: &str, access: Access) -> bool {
 }
 
 impl Route {
-    const fn described(self, operation: fn() -> Operation) -> Self {
+    const fn with_operation(self, operation: fn() -> Operation) -> Self {
         Route {
             operation: Some(operation),
             ..self
         }
     }
 
-    /// Whether a path is one of its address, as it stands in the request.
-    fn leads(&self, path: &str) -> bool {
+    /// Returns true if a request's path matches the route.
+    fn matches(&self, path: &str) -> bool {
         let mut segments = path.split('/');
         self.path.split('/').all(|expected| {
             segments.next().is_some_and(|segment| {
@@ -163,160 +163,161 @@ impl Route {
     }
 }
 
-/// Who is answered at a path: whom the first row says that leads there.
-pub fn access(path: &str) -> Access {
-    let row = ROUTES.iter().find(|route| route.leads(path));
+/// Returns the access of the first route that matches the path.
+pub fn find_access(path: &str) -> Access {
+    let row = ROUTES.iter().find(|route| route.matches(path));
     row.map_or(LOOK, |route| route.access)
 }
 
-/// All routes: a fixed address before those with a name in its place.
+/// All routes; fixed paths precede those with a parameter in their place.
 pub const ROUTES: &[Route] = &[
-    at("ANY", "/", ReadOrConnect, || any(robots::root)),
-    at("GET", "/healthz", Read, || get(api_v1::health)),
-    at("GET", "/metrics", LOOK, || get(metrics::metrics)),
-    at("ANY", "/assets", ENTER, || any(nothing)),
-    at("GET", "/assets/{name}", Read, || get(page::asset)),
-    at("ANY", "/api", ENTER, || any(nothing)),
-    at("GET", "/api/v1/status", LOOK, || get(api_v1::status))
-        .described(|| operation("status", "The daemon at a glance.").answers::<api::Status>()),
-    at("GET", "/api/v1/doctor", LOOK, || get(api_v1::doctor)).described(|| {
+    route("ANY", "/", ReadOrConnect, || any(robots::root)),
+    route("GET", "/healthz", Read, || get(api_v1::health)),
+    route("GET", "/metrics", LOOK, || get(metrics::metrics)),
+    route("ANY", "/assets", ENTER, || any(not_found)),
+    route("GET", "/assets/{name}", Read, || get(page::asset)),
+    route("ANY", "/api", ENTER, || any(not_found)),
+    route("GET", "/api/v1/status", LOOK, || get(api_v1::status))
+        .with_operation(|| operation("status", "Summary of the daemon.").answers::<api::Status>()),
+    route("GET", "/api/v1/doctor", LOOK, || get(api_v1::doctor)).with_operation(|| {
         operation(
             "doctor",
-            "What this machine needs, and whether it is there.",
+            "Checks what this machine needs to run servants.",
         )
         .answers::<api::Doctor>()
     }),
-    at("GET", "/api/v1/clock", ENTER, || get(api_v1::clock)).described(|| {
+    route("GET", "/api/v1/clock", ENTER, || get(api_v1::clock)).with_operation(|| {
         operation(
             "clock",
-            "The daemon's clock, for comparing another with it.",
+            "The daemon's clock, to compare another clock with.",
         )
         .answers::<api::Clock>()
     }),
-    at("GET", "/api/v1/events", ENTER, || get(events::events)).described(|| {
-        operation("events", "The journal, oldest first.")
-            .asks::<events::Which>()
+    route("GET", "/api/v1/events", ENTER, || get(events::events)).with_operation(|| {
+        operation("events", "Events, oldest first.")
+            .asks::<events::EventQuery>()
             .lists::<api::Event>()
     }),
-    at("GET", "/api/v1/events/follow", ENTER, || get(events::follow)).described(|| {
+    route("GET", "/api/v1/events/follow", ENTER, || get(events::follow)).with_operation(|| {
         operation(
             "followEvents",
-            "The journal, oldest first, and what comes to it from now on. With since=N, none after N is missed.",
+            "Events, oldest first, and new ones as they happen. With since=N, no event after N is missed.",
         )
-        .asks::<events::Which>()
+        .asks::<events::EventQuery>()
         .streams::<api::Event>()
     }),
-    at("GET", "/api/v1/stream", ENTER, || get(stream::stream)).described(|| {
+    route("GET", "/api/v1/stream", ENTER, || get(stream::stream)).with_operation(|| {
         operation(
             "stream",
-            "Machine, services, servants and events as they change: an event snapshot, then events update.",
+            "Machine, services, servants and events as server-sent events: one `snapshot`, then `update` for each \
+                change.",
         )
         .sends::<api::stream::Update>()
     }),
-    at("GET", "/api/v1/history/servants", ENTER, || {
+    route("GET", "/api/v1/history/servants", ENTER, || {
         get(history::servants)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "servantsHistory",
-            "What servants did in the last day, those that have ended included: the last asked for first.",
+            "History of servants in the last day, ended ones included, most recently requested first.",
         )
-        .asks::<history::Whose>()
+        .asks::<history::ServantHistoryQuery>()
         .lists::<api::history::ServantHistory>()
     }),
-    at("GET", "/api/v1/history/machine", LOOK, || get(history::machine)).described(|| {
-        operation("machineHistory", "What the machine did in the last day.")
-            .asks::<history::When>()
+    route("GET", "/api/v1/history/machine", LOOK, || get(history::machine)).with_operation(|| {
+        operation("machineHistory", "History of the machine in the last day.")
+            .asks::<history::TimeQuery>()
             .answers::<api::history::MachineHistory>()
     }),
-    at("GET", "/api/v1/services", ENTER, || get(api_v1::services))
-        .described(|| operation("services", "All services.").lists::<api::ServiceSummary>()),
-    at("GET", "/api/v1/services/{name}", service(See), || {
+    route("GET", "/api/v1/services", ENTER, || get(api_v1::services))
+        .with_operation(|| operation("services", "All services.").lists::<api::ServiceSummary>()),
+    route("GET", "/api/v1/services/{name}", service(See), || {
         get(api_v1::service)
     })
-    .described(|| {
-        operation("service", "One service with its interface and revisions.")
+    .with_operation(|| {
+        operation("service", "A service with its interface and revisions.")
             .answers::<api::ServiceDetail>()
     }),
-    at("DELETE", "/api/v1/services/{name}", service(Deploy), || {
+    route("DELETE", "/api/v1/services/{name}", service(Deploy), || {
         delete(api_v1::remove_service)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "removeService",
             "Removes the service, its servants, its images and its recordings.",
         )
         .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/services/{name}/interface", service(See), || {
+    route("GET", "/api/v1/services/{name}/interface", service(See), || {
         get(api_v1::interface)
     })
-    .described(|| operation("interface", "The interface with all definitions.").answers_object()),
-    at("GET", "/api/v1/services/{name}/record", service(Deploy), || {
+    .with_operation(|| operation("interface", "The interface with all message definitions.").answers_object()),
+    route("GET", "/api/v1/services/{name}/record", service(Deploy), || {
         get(api_v1::record)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "serviceRecord",
-            "What of a revision is not in its image, for another server to publish both.",
+            "Metadata of a revision that is not in its image, so that another server can publish both.",
         )
-        .asks::<api_v1::OfRevision>()
+        .asks::<api_v1::RevisionQuery>()
         .answers_object()
     }),
-    at("GET", "/api/v1/services/{name}/differences", service(See), || {
+    route("GET", "/api/v1/services/{name}/differences", service(See), || {
         get(differences::differences)
     })
-    .described(|| {
-        operation("differences", "What differs between two of its revisions.")
-            .asks::<differences::Between>()
+    .with_operation(|| {
+        operation("differences", "Differences between two revisions.")
+            .asks::<differences::DifferencesQuery>()
             .answers::<api::differences::Differences>()
     }),
-    at("GET", "/api/v1/services/{name}/fit", service(See), || {
+    route("GET", "/api/v1/services/{name}/fit", service(See), || {
         get(api_v1::fit)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "fit",
-            "Whether one more servant would fit, what it would cost the others, and how many more would.",
+            "Whether one more servant would fit, how many more would, and what it would cost the others.",
         )
-        .asks::<api_v1::Statement>()
+        .asks::<api_v1::StatementQuery>()
         .answers::<api::Fit>()
     }),
-    at("POST", "/api/v1/services/{name}/rollback", service(Deploy), || {
+    route("POST", "/api/v1/services/{name}/rollback", service(Deploy), || {
         post(api_v1::rollback)
     })
-    .described(|| {
+    .with_operation(|| {
         operation("rollback", "Makes an earlier revision the current one.")
             .takes::<api::Rollback>(Required::False)
             .answers::<api::ServiceDetail>()
     }),
-    at("GET", "/api/v1/services/{name}/rollout", service(See), || {
+    route("GET", "/api/v1/services/{name}/rollout", service(See), || {
         get(api_v1::rollout)
     })
-    .described(|| {
-        operation("rollout", "How a service comes to its next revision.")
+    .with_operation(|| {
+        operation("rollout", "The rollout of a service.")
             .answers::<api::Rollout>()
     }),
-    at("POST", "/api/v1/services/{name}/rollout", service(Deploy), || {
+    route("POST", "/api/v1/services/{name}/rollout", service(Deploy), || {
         post(api_v1::order_rollout)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "orderRollout",
-            "Begins a rollout, promotes its canary, or takes it back.",
+            "Starts a rollout, promotes its canary, or aborts it.",
         )
         .takes::<api::rollout::RolloutOrder>(Required::True)
         .answers::<api::Rollout>()
     }),
-    at("POST", "/api/v1/services/{name}/trial", service(Try), || {
+    route("POST", "/api/v1/services/{name}/trial", service(Try), || {
         post(api_v1::trial)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "trial",
-            "What a service makes of a recording (rosbag 2.0) or a picture (PNG), and how fast.",
+            "Runs a service on a recording (rosbag 2.0) or a picture (PNG) and returns its outputs and response times.",
         )
-        .asks::<api_v1::With>()
+        .asks::<api_v1::TrialQuery>()
         .takes_file(
             "application/octet-stream",
             "The recording or the picture.",
@@ -324,324 +325,326 @@ pub const ROUTES: &[Route] = &[
         )
         .answers::<api::trial::Trial>()
     }),
-    at("POST", "/api/v1/services/{name}/calibration", service(Try), || {
+    route("POST", "/api/v1/services/{name}/calibration", service(Try), || {
         post(calibration::calibration).layer(DefaultBodyLimit::disable())
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "calibrate",
-            "Replays recorded requests at several limits and proposes rows of the dictionary; writes none. The last line is \
-             done or error.",
+            "Replays recorded requests at several limits and proposes rows for the SLA table without writing them. The \
+                last line is `done` or `error`.",
         )
-        .asks_json::<api::CalibrationOptions>("options", "What to measure, and with what.")
+        .asks_json::<api::CalibrationOptions>("options", "Options of the calibration.")
         .takes_file(
             "application/octet-stream",
-            "A recording (rosbag 2.0), or pictures (PNG files, one behind the other); empty with live.",
+            "A recording (rosbag 2.0), or pictures (concatenated PNG files); empty with `live`.",
             Required::False,
         )
         .streams::<api::CalibrationEvent>()
     }),
-    at("POST", "/api/v1/services/{name}/shadow", service(Try), || {
+    route("POST", "/api/v1/services/{name}/shadow", service(Try), || {
         post(shadow::shadow)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "shadow",
-            "Gives a robot's requests to a candidate, too, which answers nobody, and compares the answers. The last line is done or \
-             error.",
+            "Mirrors a robot's requests to a candidate revision, whose answers are only compared. The last line is \
+                `done` or `error`.",
         )
         .takes::<api::ShadowOptions>(Required::True)
         .streams::<api::ShadowEvent>()
     }),
-    at("GET", "/api/v1/services/{name}/sla", service(See), || {
+    route("GET", "/api/v1/services/{name}/sla", service(See), || {
         get(dictionary::rows)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "dictionary",
-            "Rows of the service's dictionary: what a measure of an SLA costs.",
+            "The service's SLA table: the limits that each SLA needs.",
         )
         .lists::<api::dictionary::Row>()
     }),
-    at("PUT", "/api/v1/services/{name}/sla", service(Deploy), || {
+    route("PUT", "/api/v1/services/{name}/sla", service(Deploy), || {
         put(dictionary::write)
     })
-    .described(|| {
-        operation("writeDictionary", "Writes rows, all or none.")
+    .with_operation(|| {
+        operation("writeDictionary", "Writes rows of the SLA table, all or none.")
             .takes::<api::dictionary::NewRows>(Required::True)
             .lists::<api::dictionary::Row>()
     }),
-    at("GET", "/api/v1/services/{name}/sla/explain", service(See), || {
+    route("GET", "/api/v1/services/{name}/sla/explain", service(See), || {
         get(dictionary::explain)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "explainSla",
-            "What a robot would get that states this, and why. Auxiliary parameters are aux.KEY=VALUE.",
+            "The limits that a robot with these terms would get, and why. Auxiliary parameters are aux.KEY=VALUE.",
         )
-        .asks::<dictionary::Stating>()
+        .asks::<dictionary::StatedQuery>()
         .answers::<api::dictionary::Explained>()
     }),
-    at("DELETE", "/api/v1/services/{name}/sla/{id}", service(Deploy), || {
+    route("DELETE", "/api/v1/services/{name}/sla/{id}", service(Deploy), || {
         delete(dictionary::remove)
     })
-    .described(|| {
-        operation("removeFromDictionary", "Removes a row; gives those that are left.")
+    .with_operation(|| {
+        operation("removeFromDictionary", "Removes a row of the SLA table; returns the remaining rows.")
             .lists::<api::dictionary::Row>()
     }),
-    at("GET", "/api/v1/servants", ENTER, || get(api_v1::servants))
-        .described(|| operation("servants", "All servants.").lists::<api::Servant>()),
-    at("DELETE", "/api/v1/servants", May(Operate, Of::Handler), || {
+    route("GET", "/api/v1/servants", ENTER, || get(api_v1::servants))
+        .with_operation(|| operation("servants", "All servants.").lists::<api::Servant>()),
+    route("DELETE", "/api/v1/servants", May(Operate, AccessTarget::Handler), || {
         delete(api_v1::stop_servants)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "stopServants",
-            "Ends all servants, or those of one service.",
+            "Stops all servants, or those of one service.",
         )
-        .asks::<api_v1::OfService>()
+        .asks::<api_v1::ServiceQuery>()
         .answers::<api::Stopped>()
     }),
-    at("GET", "/api/v1/servants/{id}", servant(See), || {
+    route("GET", "/api/v1/servants/{id}", servant(See), || {
         get(api_v1::servant)
     })
-    .described(|| operation("servant", "One servant.").answers::<api::Servant>()),
-    at("PATCH", "/api/v1/servants/{id}", servant(Operate), || {
+    .with_operation(|| operation("servant", "One servant.").answers::<api::Servant>()),
+    route("PATCH", "/api/v1/servants/{id}", servant(Operate), || {
         patch(api_v1::set_limits)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "setLimits",
-            "Changes the limits that are given, while the servant runs.",
+            "Changes the given limits of a running servant.",
         )
         .takes::<api::Limits>(Required::True)
         .answers::<api::Servant>()
     }),
-    at("DELETE", "/api/v1/servants/{id}", servant(Operate), || {
+    route("DELETE", "/api/v1/servants/{id}", servant(Operate), || {
         delete(api_v1::stop_servant)
     })
-    .described(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
-    at("GET", "/api/v1/servants/{id}/logs", servant(Logs), || {
+    .with_operation(|| operation("stopServant", "Ends a servant.").answers::<api::Stopped>()),
+    route("GET", "/api/v1/servants/{id}/logs", servant(Logs), || {
         get(api_v1::logs)
     })
-    .described(|| {
-        operation("logs", "What its nodes printed.")
-            .asks::<api_v1::Part>()
+    .with_operation(|| {
+        operation("logs", "Output of its nodes.")
+            .asks::<api_v1::LogQuery>()
             .streams::<api::LogLine>()
     }),
-    at("GET", "/api/v1/servants/{id}/inside", servant(See), || {
-        get(inside::inside)
+    route("GET", "/api/v1/servants/{id}/inside", servant(See), || {
+        get(inside::open_inside)
     })
-    .described(|| {
-        operation("inside", "Looks into a servant: a WebSocket that speaks rosbridge beside its robot.")
+    .with_operation(|| {
+        operation("inside", "Opens a WebSocket into a servant that speaks rosbridge, besides its robot.")
             .becomes_a_websocket()
     }),
-    at("GET", "/api/v1/servants/{id}/topics", servant(See), || {
+    route("GET", "/api/v1/servants/{id}/topics", servant(See), || {
         get(topics::topics)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "topics",
-            "What is published on each topic of a servant: a line each second. To count it, all of it is heard beside its robot.",
+            "Message rates of all topics of a servant, a line each second. The daemon subscribes to all topics \
+                meanwhile.",
         )
         .streams::<api::topics::PublishedTopics>()
     }),
-    at("GET", "/api/v1/servants/{id}/goals", servant(See), || {
+    route("GET", "/api/v1/servants/{id}/goals", servant(See), || {
         get(goals::goals)
     })
-    .described(|| {
-        operation("goals", "What became of the goals of a servant's actions, the newest first.")
+    .with_operation(|| {
+        operation("goals", "Goals of a servant's actions and their outcome, newest first.")
             .lists::<api::goals::Goal>()
     }),
-    at("POST", "/api/v1/servants/{id}/recording", servant(Operate), || {
+    route("POST", "/api/v1/servants/{id}/recording", servant(Operate), || {
         post(recordings::take)
     })
-    .described(|| {
-        operation("takeRecording", "Writes a file of what flowed in a servant in the last seconds.")
+    .with_operation(|| {
+        operation("takeRecording", "Saves the messages of the last seconds of a servant (ring-buffer recording).")
             .answers::<api::recordings::Recording>()
     }),
-    at("GET", "/api/v1/recordings", ENTER, || get(recordings::list)).described(|| {
-        operation("recordings", "Files of the last seconds of servants, the newest first.")
-            .asks::<recordings::Which>()
+    route("GET", "/api/v1/recordings", ENTER, || get(recordings::list)).with_operation(|| {
+        operation("recordings", "Ring-buffer recordings, newest first.")
+            .asks::<recordings::RecordingQuery>()
             .lists::<api::recordings::Recording>()
     }),
-    at("GET", "/api/v1/recordings/{number}", May(See, Of::Recording("number")), || {
+    route("GET", "/api/v1/recordings/{number}", May(See, AccessTarget::Recording("number")), || {
         get(recordings::file)
     })
-    .described(|| {
-        operation("recording", "Such a file (MCAP).").answers_file("application/octet-stream")
+    .with_operation(|| {
+        operation("recording", "A ring-buffer recording (MCAP).").answers_file("application/octet-stream")
     }),
-    at("DELETE", "/api/v1/recordings/{number}", May(Operate, Of::Recording("number")), || {
+    route("DELETE", "/api/v1/recordings/{number}", May(Operate, AccessTarget::Recording("number")), || {
         delete(recordings::remove)
     })
-    .described(|| {
-        operation("removeRecording", "Removes such a file; gives those that are left.")
+    .with_operation(|| {
+        operation("removeRecording", "Removes a ring-buffer recording; returns the remaining ones.")
             .lists::<api::recordings::Recording>()
     }),
-    at("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).described(|| {
+    route("GET", "/api/v1/back-offs", ENTER, || get(api_v1::back_offs)).with_operation(|| {
         operation(
             "backOffs",
-            "Whose servants have failed again and again, and when each is started again at the earliest.",
+            "Servants that failed repeatedly, and when each may be started again.",
         )
         .lists::<api::BackOff>()
     }),
-    at("GET", "/api/v1/robots/{name}/explain", May(See, Of::Robot("name")), || {
+    route("GET", "/api/v1/robots/{name}/explain", May(See, AccessTarget::Robot("name")), || {
         get(api_v1::explain)
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "explain",
-            "Why a robot is slow, or on its local original, now.",
+            "Explains why a robot is slow or uses its local original.",
         )
         .answers::<api::explain::Explanation>()
     }),
-    at("GET", "/api/v1/audit", ADMINISTER, || get(audit::audit)).described(|| {
-        operation("audit", "Who did what to what from where, oldest first.")
-            .asks::<audit::Which>()
+    route("GET", "/api/v1/audit", ADMINISTER, || get(audit::audit)).with_operation(|| {
+        operation("audit", "Audit log, oldest first.")
+            .asks::<audit::AuditQuery>()
             .streams::<access::Audited>()
     }),
-    at("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
-        .described(|| operation("whoami", "Who asks, as the daemon knows it.").answers::<access::Whoami>()),
-    at("GET", "/api/v1/session", SignIn, || get(people::session)).described(|| {
-        operation("session", "Who is signed in, if anybody is.").answers::<api::people::Session>()
+    route("GET", "/api/v1/whoami", ENTER, || get(policy::whoami))
+        .with_operation(|| operation("whoami", "The caller, as the daemon identified it.").answers::<access::Whoami>()),
+    route("GET", "/api/v1/session", SignIn, || get(people::session)).with_operation(|| {
+        operation("session", "The current session, if any.").answers::<api::people::Session>()
     }),
-    at("POST", "/api/v1/session", SignIn, || post(people::sign_in)).described(|| {
-        operation("signIn", "Signs in by a password. The session is told by a cookie.")
+    route("POST", "/api/v1/session", SignIn, || post(people::sign_in)).with_operation(|| {
+        operation("signIn", "Signs in with a password and sets the session cookie.")
             .takes::<api::people::SignIn>(Required::True)
             .answers::<api::people::Session>()
     }),
-    at("DELETE", "/api/v1/session", ENTER, || delete(people::sign_out)).described(|| {
-        operation("signOut", "Ends the session that is shown, or all of that person.")
-            .asks::<people::Ending>()
+    route("DELETE", "/api/v1/session", ENTER, || delete(people::sign_out)).with_operation(|| {
+        operation("signOut", "Ends the current session, or all sessions of the account.")
+            .asks::<people::SignOutQuery>()
             .answers_nothing()
     }),
-    at("GET", "/api/v1/oidc/login", Read, || get(people::provider::login)).described(|| {
-        operation("oidcLogin", "Sends a browser to the identity provider, where somebody signs in.")
-            .asks::<people::provider::Beginning>()
-            .leads_on()
+    route("GET", "/api/v1/oidc/login", Read, || get(people::provider::login)).with_operation(|| {
+        operation("oidcLogin", "Redirects the browser to the identity provider to sign in.")
+            .asks::<people::provider::LoginQuery>()
+            .redirects()
     }),
-    at("GET", "/api/v1/oidc/callback", Read, || get(people::provider::callback)).described(|| {
-        operation("oidcCallback", "Signs in whoever comes back from the identity provider: its session is told by a cookie.")
-            .asks::<people::provider::ComingBack>()
+    route("GET", "/api/v1/oidc/callback", Read, || get(people::provider::callback)).with_operation(|| {
+        operation("oidcCallback", "Completes the sign-in at the identity provider and sets the session cookie.")
+            .asks::<people::provider::CallbackQuery>()
             .answers_page()
     }),
-    at("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions)).described(|| {
-        operation("sessions", "All sessions of people.").lists::<api::people::SessionLine>()
+    route("GET", "/api/v1/sessions", ADMINISTER, || get(people::sessions)).with_operation(|| {
+        operation("sessions", "All sessions.").lists::<api::people::SessionLine>()
     }),
-    at("GET", "/api/v1/accounts", ADMINISTER, || get(people::accounts)).described(|| {
-        operation("accounts", "All accounts of people.").lists::<api::people::Account>()
+    route("GET", "/api/v1/accounts", ADMINISTER, || get(people::accounts)).with_operation(|| {
+        operation("accounts", "All accounts.").lists::<api::people::Account>()
     }),
-    at("POST", "/api/v1/accounts", ADMINISTER, || post(people::create)).described(|| {
-        operation("createAccount", "Makes an account; gives all there are.")
+    route("POST", "/api/v1/accounts", ADMINISTER, || post(people::create)).with_operation(|| {
+        operation("createAccount", "Creates an account; returns all accounts.")
             .takes::<api::people::NewAccount>(Required::True)
             .lists::<api::people::Account>()
     }),
-    at("PATCH", "/api/v1/accounts/{name}", ADMINISTER, || patch(people::change)).described(|| {
-        operation("changeAccount", "Changes an account and ends its sessions; gives all there are.")
+    route("PATCH", "/api/v1/accounts/{name}", ADMINISTER, || patch(people::change)).with_operation(|| {
+        operation("changeAccount", "Changes an account and ends its sessions; returns all accounts.")
             .takes::<api::people::AccountChange>(Required::True)
             .lists::<api::people::Account>()
     }),
-    at("DELETE", "/api/v1/accounts/{name}", ADMINISTER, || delete(people::remove)).described(|| {
-        operation("removeAccount", "Removes an account and ends its sessions; gives those that are left.")
+    route("DELETE", "/api/v1/accounts/{name}", ADMINISTER, || delete(people::remove)).with_operation(|| {
+        operation("removeAccount", "Removes an account and ends its sessions; returns the remaining ones.")
             .lists::<api::people::Account>()
     }),
-    at("DELETE", "/api/v1/accounts/{name}/sessions", ADMINISTER, || delete(people::end_sessions)).described(|| {
-        operation("endSessions", "Ends all sessions of a person; gives those of others.")
+    route("DELETE", "/api/v1/accounts/{name}/sessions", ADMINISTER, || delete(people::end_sessions)).with_operation(|| {
+        operation("endSessions", "Ends all sessions of an account; returns the remaining sessions.")
             .lists::<api::people::SessionLine>()
     }),
-    at("GET", "/api/v1/tokens", ADMINISTER, || get(policy::tokens)).described(|| {
-        operation("tokens", "All tokens there ever were, without their secrets.").lists::<access::Token>()
+    route("GET", "/api/v1/tokens", ADMINISTER, || get(policy::tokens)).with_operation(|| {
+        operation("tokens", "All tokens without their secrets, revoked ones included.").lists::<access::Token>()
     }),
-    at("POST", "/api/v1/tokens", ADMINISTER, || post(policy::create)).described(|| {
-        operation("createToken", "Makes a token. Its secret is told here and never again.")
+    route("POST", "/api/v1/tokens", ADMINISTER, || post(policy::create)).with_operation(|| {
+        operation("createToken", "Creates a token. Its secret is returned only here.")
             .takes::<access::NewToken>(Required::True)
             .answers::<access::Secret>()
     }),
-    at("DELETE", "/api/v1/tokens/{name}", ADMINISTER, || delete(policy::revoke)).described(|| {
-        operation("revokeToken", "Ends a token and what shows it; gives all tokens.").lists::<access::Token>()
+    route("DELETE", "/api/v1/tokens/{name}", ADMINISTER, || delete(policy::revoke)).with_operation(|| {
+        operation("revokeToken", "Revokes a token and closes its connections; returns all \
+            tokens.").lists::<access::Token>()
     }),
-    at("POST", "/api/v1/tokens/{name}/rotate", ADMINISTER, || post(policy::rotate)).described(|| {
-        operation("rotateToken", "Gives a token another secret; what shows the old one ends.")
+    route("POST", "/api/v1/tokens/{name}/rotate", ADMINISTER, || post(policy::rotate)).with_operation(|| {
+        operation("rotateToken", "Replaces the secret of a token and closes connections that use the old one.")
             .answers::<access::Secret>()
     }),
-    at("GET", "/api/v1/policy", ADMINISTER, || get(policy::rules)).described(|| {
-        operation("policy", "Rules that say what principals may use of services.").lists::<access::Rule>()
+    route("GET", "/api/v1/policy", ADMINISTER, || get(policy::rules)).with_operation(|| {
+        operation("policy", "Policy rules: what principals may use of services.").lists::<access::Rule>()
     }),
-    at("POST", "/api/v1/policy", ADMINISTER, || post(policy::add_rule)).described(|| {
-        operation("addRule", "Writes a rule; it holds at once. Gives all rules.")
+    route("POST", "/api/v1/policy", ADMINISTER, || post(policy::add_rule)).with_operation(|| {
+        operation("addRule", "Adds a rule, which applies at once; returns all rules.")
             .takes::<access::NewRule>(Required::True)
             .lists::<access::Rule>()
     }),
-    at("DELETE", "/api/v1/policy/{id}", ADMINISTER, || delete(policy::remove_rule)).described(|| {
-        operation("removeRule", "Removes a rule; that holds at once. Gives those that are left.")
+    route("DELETE", "/api/v1/policy/{id}", ADMINISTER, || delete(policy::remove_rule)).with_operation(|| {
+        operation("removeRule", "Removes a rule, which applies at once; returns the remaining rules.")
             .lists::<access::Rule>()
     }),
-    at("GET", "/api/v1/pairings", PAIR, || get(machines::list)).described(|| {
-        operation("pairings", "Robots that are paired, and those for which a pairing code waits.")
+    route("GET", "/api/v1/pairings", PAIR, || get(machines::list)).with_operation(|| {
+        operation("pairings", "Paired robots, and robots with a pending pairing code.")
             .lists::<api::machines::Pairing>()
     }),
-    at("POST", "/api/v1/pairings", PAIR, || post(machines::begin)).described(|| {
-        operation("beginPairing", "Makes a pairing code for a robot. It is told here and never again.")
+    route("POST", "/api/v1/pairings", PAIR, || post(machines::begin)).with_operation(|| {
+        operation("beginPairing", "Creates a pairing code for a robot. It is returned only here.")
             .takes::<api::machines::NewPairing>(Required::True)
             .answers::<api::machines::PairingMade>()
     }),
-    at("DELETE", "/api/v1/pairings/{name}", PAIR, || delete(machines::unpair)).described(|| {
-        operation("unpair", "Ends a robot's pairing and its connections; gives those that are left.")
+    route("DELETE", "/api/v1/pairings/{name}", PAIR, || delete(machines::unpair)).with_operation(|| {
+        operation("unpair", "Unpairs a robot and closes its connections; returns the remaining pairings.")
             .lists::<api::machines::Pairing>()
     }),
-    at("DELETE", "/api/v1/pairings/{name}/code", PAIR, || delete(machines::cancel)).described(|| {
-        operation("cancelPairing", "Takes a robot's pairing code back; gives those that are left.")
+    route("DELETE", "/api/v1/pairings/{name}/code", PAIR, || delete(machines::cancel)).with_operation(|| {
+        operation("cancelPairing", "Revokes a robot's pairing code; returns the remaining pairings.")
             .lists::<api::machines::Pairing>()
     }),
-    at("POST", "/api/v1/pair", Code, || post(machines::pair)).described(|| {
-        operation("pair", "Gives a robot that shows its pairing code a certificate of its key.")
+    route("POST", "/api/v1/pair", Code, || post(machines::pair)).with_operation(|| {
+        operation("pair", "Issues a certificate for the key of a robot that presents its pairing code.")
             .takes::<api::machines::Pair>(Required::True)
             .answers::<api::machines::RobotCertificate>()
     }),
-    at("POST", "/api/v1/renew", ENTER, || post(machines::renew)).described(|| {
-        operation("renew", "Gives the paired robot that asks another certificate of its key.")
+    route("POST", "/api/v1/renew", ENTER, || post(machines::renew)).with_operation(|| {
+        operation("renew", "Renews the certificate of the calling robot for its key.")
             .takes::<api::machines::Renew>(Required::True)
             .answers::<api::machines::RobotCertificate>()
     }),
-    at("POST", "/api/v1/push", May(Deploy, Of::Handler), || {
+    route("POST", "/api/v1/push", May(Deploy, AccessTarget::Handler), || {
         post(push::push).layer(DefaultBodyLimit::disable())
     })
-    .described(|| {
+    .with_operation(|| {
         operation(
             "push",
-            "Builds an image of a package and publishes it. The last line is done or error.",
+            "Builds an image of a package and publishes it. The last line is `done` or `error`.",
         )
-        .asks_json::<api::PushOptions>("options", "What to make of the archive.")
+        .asks_json::<api::PushOptions>("options", "Options of the push.")
         .takes_file(
             "application/x-tar",
-            "A tar archive, gzipped or not; empty with apt.",
+            "A tar archive, optionally gzipped; empty with `apt`.",
             Required::False,
         )
         .streams::<api::PushEvent>()
     }),
-    at("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
-        .described(|| operation("openapi", "This document.").answers_object()),
-    at("GET", "/v2", ENTER, || get(oci::version)),
-    at("GET", "/v2/", ENTER, || get(oci::version)),
-    at("GET", "/v2/_catalog", ENTER, || get(oci::catalog)),
-    at("GET", "/v2/{name}/tags/list", service(See), || get(oci::tags)),
-    at("GET", "/v2/{name}/manifests/{reference}", service(See), || {
+    route("GET", "/api/v1/openapi.json", ENTER, || get(openapi::serve))
+        .with_operation(|| operation("openapi", "This document.").answers_object()),
+    route("GET", "/v2", ENTER, || get(oci::version)),
+    route("GET", "/v2/", ENTER, || get(oci::version)),
+    route("GET", "/v2/_catalog", ENTER, || get(oci::catalog)),
+    route("GET", "/v2/{name}/tags/list", service(See), || get(oci::tags)),
+    route("GET", "/v2/{name}/manifests/{reference}", service(See), || {
         get(oci::manifest)
     }),
-    at("GET", "/v2/{name}/blobs/{digest}", service(See), || get(oci::blob)),
-    at("GET", "/stubs", ENTER, || get(stubs::list)),
-    at("GET", "/stubs/{file}", May(See, Of::Stub("file")), || get(stubs::archive)),
-    at("GET", "/foxglove/{id}", servant(See), || get(viewers::viewer)),
-    at("ANY", "/{service}", Connect, || any(robots::service)),
-    at("ANY", "/{service}/", Connect, || {
+    route("GET", "/v2/{name}/blobs/{digest}", service(See), || get(oci::blob)),
+    route("GET", "/stubs", ENTER, || get(stubs::list)),
+    route("GET", "/stubs/{file}", May(See, AccessTarget::Stub("file")), || get(stubs::archive)),
+    route("GET", "/foxglove/{id}", servant(See), || get(viewers::viewer)),
+    route("ANY", "/{service}", Connect, || any(robots::service)),
+    route("ANY", "/{service}/", Connect, || {
         any(robots::service_with_slash)
     }),
 ];
 
-/// Answers paths that are in no row: 404.
-pub async fn nothing(uri: OriginalUri) -> Response {
+/// Responds to paths without a route: 404.
+pub async fn not_found(uri: OriginalUri) -> Response {
     if uri.path().starts_with("/v2/") {
-        return oci::nothing(uri).await;
+        return oci::unsupported(uri).await;
     }
     Error::UnknownPath {
         path: uri.path().to_owned(),
@@ -649,7 +652,7 @@ pub async fn nothing(uri: OriginalUri) -> Response {
     .into_response()
 }
 
-/// Answers methods that no row has of a path that is in one: 405. Which it has is added by the router.
+/// Responds to methods that a path does not support: 405. The router adds the supported methods.
 pub async fn other_method(method: Method, OriginalUri(uri): OriginalUri) -> Response {
     if uri.path().starts_with("/v2/") {
         return oci::other_method(&method, &uri);

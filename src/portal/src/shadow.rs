@@ -1,4 +1,4 @@
-//! `POST /api/v1/services/NAME/shadow`: options as JSON in the body, events as JSON lines in the answer.
+//! `POST /api/v1/services/NAME/shadow`: options as JSON in the body, events as JSON lines in the response.
 
 use std::sync::Arc;
 
@@ -12,35 +12,37 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::api_v1::{LARGEST_WORDS, held, lines};
+use super::api_v1::{LARGEST_WORDS, json_lines, read_body};
 use super::guard::Caller;
 use crate::app::App;
 use crate::errors::Error;
 
-/// Events that a client has not read.
+/// Queue size of events that the client has not read.
 const EVENTS_AHEAD: usize = 64;
-/// The longest comparison, in seconds.
+/// Maximum duration of a comparison in seconds.
 const LONGEST: f64 = 86_400.0;
-/// Fields that may be left out.
+/// Maximum number of fields left out.
 const MOST_FIELDS: usize = 100;
 
-/// Compares a revision with what a robot uses.
+/// Compares a revision with the one that a robot uses.
 pub async fn shadow(
     State(app): State<Arc<App>>,
     Path(name): Path<String>,
     Extension(caller): Extension<Caller>,
     body: Body,
 ) -> Result<Response, Error> {
-    let body = held(&app, &caller, body, LARGEST_WORDS).await?.bytes;
+    let body = read_body(&app, &caller, body, LARGEST_WORDS).await?.bytes;
     let options: ShadowOptions = serde_json::from_slice(&body)
         .map_err(|error| Error::BadRequest(format!("the options cannot be read: {error}")))?;
     check(&options).map_err(Error::BadRequest)?;
-    app.catalogue.current(&name)?;
+    app.catalogue.current_revision(&name)?;
     let (events, receiver) = mpsc::channel(EVENTS_AHEAD);
-    let ending = caller.over(&app, &name);
+    let ending = caller.wait_for_end(&app, &name);
     let work = async move {
         let choreographer = &app.choreographer;
-        let budget = choreographer.memory().client(&caller.peer.client(None));
+        let budget = choreographer
+            .memory()
+            .client(&caller.peer.budget_name(None));
         let shadow = choreographer.shadow(&name, &options, &budget, &events);
         let event = match shadow.await {
             Ok(shadow) => ShadowEvent::Done {
@@ -52,16 +54,16 @@ pub async fn shadow(
         };
         let _ = events.send(event).await;
     };
-    // Lives in the answer: when the client goes away the answer is dropped, and the candidate with it.
+    // Owned by the response: if the client disconnects, the candidate is stopped with it.
     let work = AbortOnDropHandle::new(tokio::spawn(work));
     let events = ReceiverStream::new(receiver).take_until(Box::pin(ending));
-    Ok(lines(events.map(move |event| {
+    Ok(json_lines(events.map(move |event| {
         let _ = &work;
         event
     })))
 }
 
-/// Refuses what cannot be compared by.
+/// Refuses options that make no comparison possible.
 fn check(options: &ShadowOptions) -> Result<(), String> {
     let between = |name: &str, value: f64, least: f64, most: f64| match value {
         value if (least..=most).contains(&value) => Ok(()),

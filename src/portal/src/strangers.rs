@@ -1,15 +1,16 @@
-//! Strangers: TCP connections on which nobody has shown yet who asks. They cost descriptors and memory of whoever comes, so their number is
-//! bounded, for each host and in all. A newcomer is always let in; where there is no room, the oldest connection of whoever has the most of
-//! them is dropped for it.
+//! Strangers: TCP connections that have not authenticated yet. Anybody can open them, and they cost descriptors and
+//! memory, so their number is limited per host and in total. A new one is always admitted; if there is no room, the
+//! oldest connection of the network that has most is dropped for it.
 //!
 //! ```text
-//!   accepted ──▶ stranger ──▶ known (something was shown, or a robot has a lease): not counted here any more
-//!                   └───────▶ dropped: newer ones need its place; its client comes again
+//!   accepted ──▶ stranger ──▶ admitted (authenticated, or a robot has a lease): no longer counted
+//!                   └───────▶ dropped in favour of newer ones; its client reconnects
 //! ```
 //!
-//! Time alone would not do. A robot on a bad link needs seconds for a few packets: a ClientHello that is lost twice is sent again after
-//! 1 s and after 3 s (RFC 6298). So a stranger has all the time of `[portal] handshake` while there is room, and less only while others press.
-//! And whoever presses presses itself first: as long as one network has more strangers than another, it loses the next one (docs/adr/114).
+//! A timeout alone would not do. A robot on a bad link needs seconds for a few packets: a ClientHello that is lost
+//! twice is retransmitted after 1 s and after 3 s (RFC 6298). So a stranger has the whole timeout
+//! `[portal] handshake` while there is room, and less only under pressure. And whoever causes the pressure suffers
+//! from it first: as long as one network has more strangers than another, it loses the next one (docs/adr/114).
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -22,30 +23,31 @@ use tokio_util::sync::CancellationToken;
 
 use crate::proxies::Proxies;
 
-/// Strangers at once. One takes some 40 kB in a handshake of TLS, and as much again for the header of a request.
+/// Limit on all strangers. One takes about 40 kB during a TLS handshake, and as much again for a request's header.
 const ALL: usize = 1024;
-/// Those of one host. Robots behind one address that all come back at once are more, and come again.
+/// Limit on the strangers of one host. If more robots behind one address reconnect at once, some have to retry.
 const OF_A_HOST: usize = 128;
-/// One descriptor in so many may be a stranger's; the others are for robots that are known, servants and files.
+/// Divisor for the share of descriptors available to strangers; the others are for authenticated robots, servants and
+/// files.
 const SHARE: u64 = 4;
 
-/// The strangers that are there.
+/// The current strangers.
 #[derive(Debug)]
 pub struct Strangers {
-    /// By their number, which grows: the first is the oldest.
-    present: Mutex<BTreeMap<u64, Present>>,
+    /// By an increasing number: the first is the oldest.
+    present: Mutex<BTreeMap<u64, PresentStranger>>,
     most: usize,
     came: AtomicU64,
     dropped: AtomicU64,
 }
 
 #[derive(Debug)]
-struct Present {
+struct PresentStranger {
     host: Host,
     dropped: CancellationToken,
 }
 
-/// One connection, a stranger's until it is known who asks there, or until this is dropped.
+/// A connection counted as a stranger until it is admitted or dropped.
 #[derive(Debug)]
 pub struct Stranger {
     strangers: Arc<Strangers>,
@@ -54,7 +56,7 @@ pub struct Stranger {
 }
 
 impl Strangers {
-    /// Nobody, of a daemon that may open so many descriptors.
+    /// Creates an empty set, for a process that may open this many descriptors.
     pub fn new(descriptors: u64) -> Strangers {
         let share = usize::try_from(descriptors / SHARE).unwrap_or(ALL);
         Strangers {
@@ -65,22 +67,22 @@ impl Strangers {
         }
     }
 
-    /// Lets in a connection from an address, and drops another one where there is no room. This machine, and proxies in front of the
-    /// portal, are many clients: of theirs, only all together are bounded.
+    /// Registers a connection from an address, dropping another if there is no room. This machine and trusted proxies
+    /// stand for many clients, so the limit per host does not apply to them.
     pub fn enter(self: &Arc<Self>, proxies: &Proxies, from: IpAddr) -> Stranger {
-        let is_many = from.to_canonical().is_loopback() || proxies.has(from);
+        let is_many = from.to_canonical().is_loopback() || proxies.contains(from);
         let host = Host::from(from);
         let number = self.came.fetch_add(1, Ordering::Relaxed);
         let dropped = CancellationToken::new();
         let mut present = self.present.lock();
         let of_host = present.values().filter(|other| other.host == host).count();
         if !is_many && of_host >= OF_A_HOST {
-            self.drop_one(&mut present, |other| other == host);
+            self.drop_oldest(&mut present, |other| other == host);
         } else if present.len() >= self.most {
-            let network = largest(&present);
-            self.drop_one(&mut present, |other| Some(other.network()) == network);
+            let network = largest_network(&present);
+            self.drop_oldest(&mut present, |other| Some(other.network()) == network);
         }
-        let newcomer = Present {
+        let newcomer = PresentStranger {
             host,
             dropped: dropped.clone(),
         };
@@ -92,14 +94,18 @@ impl Strangers {
         }
     }
 
-    /// Drops the oldest of whoever has the most, because no descriptor is left.
+    /// Drops the oldest stranger of the network that has most, because no descriptor is left.
     pub fn make_room(&self) {
         let mut present = self.present.lock();
-        let network = largest(&present);
-        self.drop_one(&mut present, |other| Some(other.network()) == network);
+        let network = largest_network(&present);
+        self.drop_oldest(&mut present, |other| Some(other.network()) == network);
     }
 
-    fn drop_one(&self, present: &mut BTreeMap<u64, Present>, is_meant: impl Fn(Host) -> bool) {
+    fn drop_oldest(
+        &self,
+        present: &mut BTreeMap<u64, PresentStranger>,
+        is_meant: impl Fn(Host) -> bool,
+    ) {
         let oldest = present.iter().find(|(_, other)| is_meant(other.host));
         let Some(number) = oldest.map(|(number, _)| *number) else {
             return;
@@ -110,30 +116,30 @@ impl Strangers {
         }
     }
 
-    /// How many were dropped since the daemon started.
-    pub fn dropped(&self) -> u64 {
+    /// Returns the number of strangers dropped since the daemon started.
+    pub fn dropped_count(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
 
-    /// How many there are.
+    /// Returns the number of strangers.
     pub fn count(&self) -> usize {
         self.present.lock().len()
     }
 }
 
-/// The network that has the most strangers.
-fn largest(present: &BTreeMap<u64, Present>) -> Option<Host> {
+/// Returns the network with the most strangers.
+fn largest_network(present: &BTreeMap<u64, PresentStranger>) -> Option<Host> {
     access::largest_network(present.values().map(|stranger| stranger.host))
 }
 
 impl Stranger {
-    /// Counts the connection no more, because it is known who asks there.
+    /// Ends the count of this connection as a stranger, because it is authenticated.
     pub fn admit(&self) {
         self.strangers.present.lock().remove(&self.number);
     }
 
-    /// Comes back when the connection is to be dropped, which never happens to one that is known.
-    pub async fn dropped(&self) {
+    /// Waits until the connection is to be dropped, which never happens once it is admitted.
+    pub async fn wait_until_dropped(&self) {
         self.dropped.cancelled().await;
     }
 }
@@ -155,8 +161,8 @@ mod tests {
         strangers.enter(&proxies, from.parse().expect("an address"))
     }
 
-    /// Those of `held` that were dropped, by their place.
-    fn dropped(held: &[Stranger]) -> Vec<usize> {
+    /// Returns the positions in `held` of those that were dropped.
+    fn dropped_positions(held: &[Stranger]) -> Vec<usize> {
         let dropped = held.iter().enumerate();
         dropped
             .filter(|(_, stranger)| stranger.dropped.is_cancelled())
@@ -169,11 +175,14 @@ mod tests {
         let strangers = Arc::new(Strangers::new(DESCRIPTORS));
         let mut held = vec![enter(&strangers, "198.51.100.1")];
         held.extend((0..OF_A_HOST).map(|n| enter(&strangers, &format!("2001:db8::{n:x}"))));
-        assert_eq!(dropped(&held), [0; 0]);
+        assert_eq!(dropped_positions(&held), [0; 0]);
         held.push(enter(&strangers, "2001:db8::ffff"));
         held.push(enter(&strangers, "2001:db8:0:1::1"));
-        assert_eq!(dropped(&held), [1], "the oldest of the same host");
-        assert_eq!((strangers.dropped(), strangers.count()), (1, OF_A_HOST + 2));
+        assert_eq!(dropped_positions(&held), [1], "the oldest of the same host");
+        assert_eq!(
+            (strangers.dropped_count(), strangers.count()),
+            (1, OF_A_HOST + 2)
+        );
         drop(held);
         assert_eq!(strangers.count(), 0);
     }
@@ -186,9 +195,12 @@ mod tests {
             .map(|n| enter(&strangers, &format!("198.51.100.{}", n % 8)))
             .collect();
         let others = [robot, enter(&strangers, "203.0.113.10")];
-        assert_eq!(dropped(&others), [0; 0]);
+        assert_eq!(dropped_positions(&others), [0; 0]);
         assert_eq!(strangers.count(), ALL);
-        assert_eq!(dropped(&silent).len(), 4 * ALL - (ALL - others.len()));
+        assert_eq!(
+            dropped_positions(&silent).len(),
+            4 * ALL - (ALL - others.len())
+        );
     }
 
     #[test]
@@ -199,13 +211,13 @@ mod tests {
         let silent: Vec<Stranger> = (0..2 * ALL)
             .map(|n| enter(&strangers, &format!("2001:db8:2:{n:x}::1")))
             .collect();
-        assert_eq!(dropped(&[robot]), [0; 0]);
-        assert_eq!(dropped(&silent).len(), ALL + 1);
+        assert_eq!(dropped_positions(&[robot]), [0; 0]);
+        assert_eq!(dropped_positions(&silent).len(), ALL + 1);
     }
 
     #[test]
     fn all_together_are_bounded_whoever_they_are() {
-        // As few as a shell gives where nobody raises it.
+        // The usual default limit of a shell.
         let strangers = Arc::new(Strangers::new(1024));
         let held: Vec<Stranger> = (0..1_100)
             .map(|n| {
@@ -230,8 +242,8 @@ mod tests {
         let held: Vec<Stranger> = (0..=OF_A_HOST)
             .map(|_| enter(&strangers, "198.51.100.1"))
             .collect();
-        assert_eq!(dropped(&held), [0]);
-        held[0].dropped().await;
+        assert_eq!(dropped_positions(&held), [0]);
+        held[0].wait_until_dropped().await;
         assert!(!known.dropped.is_cancelled());
     }
 }

@@ -1,14 +1,14 @@
-//! `/api/v1/stream`: what the page shows, as it changes. One task looks at the machine for all who listen, and only while somebody
-//! does; each is told the difference between what it was told last and what is so when it can take more.
+//! `/api/v1/stream`: live updates for the page. One task samples the machine for all listeners, and only while there
+//! are any; each listener receives the difference between what it was last sent and the state when it can take more.
 //!
 //! ```text
-//!              ┌─▶ sampler ──newest sample──▶ listener: what its caller sees, less what it was told ─▶ SSE
+//!              ┌─▶ sampler ──newest sample──▶ listener: what its caller may see, less the state last sent ─▶ SSE
 //!   an event, ─┘                         └──▶ listener …
 //!   or a second
 //! ```
 //!
-//! So nothing is queued for who reads slowly: it misses what was between, but for events, which are kept until there are too
-//! many; then it is told all anew.
+//! So nothing is queued for slow readers: they miss intermediate states, except for events, which are kept up to a
+//! limit; beyond it, the listener receives a new snapshot.
 
 mod listener;
 mod sampler;
@@ -30,25 +30,25 @@ use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
 use listener::Listener;
-use sampler::Sample;
+use sampler::StateSample;
 
-/// Streams of one principal from one client: pages that are open beside each other, logs and events that are followed.
+/// Limit on the streams of one principal from one client: open pages, and followed logs and events.
 const MOST: usize = 32;
-/// A comment this often tells proxies and pages that the connection is there.
+/// Interval of keep-alive comments, by which proxies and pages see that the connection is open.
 const ALIVE: Duration = Duration::from_secs(15);
 
-/// The newest sample, for all who listen.
-pub struct Live {
-    newest: watch::Sender<Option<Arc<Sample>>>,
-    /// Whether the sampler runs.
+/// Live samples for all listeners.
+pub struct LiveSamples {
+    newest: watch::Sender<Option<Arc<StateSample>>>,
+    /// True while the sampler runs.
     running: Mutex<bool>,
-    /// How many streams each has.
+    /// Number of streams of each client.
     streams: Arc<Mutex<HashMap<String, usize>>>,
 }
 
-impl Default for Live {
-    fn default() -> Live {
-        Live {
+impl Default for LiveSamples {
+    fn default() -> LiveSamples {
+        LiveSamples {
             newest: watch::Sender::new(None),
             running: Mutex::new(false),
             streams: Arc::default(),
@@ -56,9 +56,9 @@ impl Default for Live {
     }
 }
 
-impl Live {
-    /// The newest sample, from now on; begins to look where nobody has listened.
-    fn listen(app: &Arc<App>) -> watch::Receiver<Option<Arc<Sample>>> {
+impl LiveSamples {
+    /// Subscribes to the newest sample, starting the sampler if necessary.
+    fn listen(app: &Arc<App>) -> watch::Receiver<Option<Arc<StateSample>>> {
         let samples = app.live.newest.subscribe();
         let mut running = app.live.running.lock();
         if !*running {
@@ -68,45 +68,45 @@ impl Live {
         samples
     }
 
-    /// Whether the sampler may end: nobody listens any more, and who comes later begins another.
-    fn rests(&self) -> bool {
+    /// Returns true if the sampler may stop because nobody listens; the next listener starts another.
+    fn try_stop(&self) -> bool {
         let mut running = self.running.lock();
         if self.newest.receiver_count() > 0 {
             return false;
         }
-        // Who comes is not told what was so once.
+        // The next listener must not receive an outdated sample.
         self.newest.send_replace(None);
         *running = false;
         true
     }
 
-    /// A place for a stream of the caller's.
-    pub fn place(&self, caller: &Caller) -> Result<Place, Error> {
-        let who = format!("{} {}", caller.who.principal, caller.peer.client(None));
-        self.place_of(who)
+    /// Acquires a slot for a stream of the caller.
+    pub fn acquire_slot(&self, caller: &Caller) -> Result<StreamSlot, Error> {
+        let who = format!("{} {}", caller.who.principal, caller.peer.budget_name(None));
+        self.acquire_slot_for(who)
     }
 
-    fn place_of(&self, who: String) -> Result<Place, Error> {
+    fn acquire_slot_for(&self, who: String) -> Result<StreamSlot, Error> {
         let mut streams = self.streams.lock();
         let count = streams.entry(who.clone()).or_default();
         if *count >= MOST {
             return Err(Error::TooManyStreams { most: MOST });
         }
         *count += 1;
-        Ok(Place {
+        Ok(StreamSlot {
             streams: Arc::clone(&self.streams),
             who,
         })
     }
 }
 
-/// One stream of those that somebody may have.
-pub struct Place {
+/// Slot of one stream; released when dropped.
+pub struct StreamSlot {
     streams: Arc<Mutex<HashMap<String, usize>>>,
     who: String,
 }
 
-impl Drop for Place {
+impl Drop for StreamSlot {
     fn drop(&mut self) {
         let mut streams = self.streams.lock();
         if let Some(count) = streams.get_mut(&self.who) {
@@ -123,14 +123,14 @@ pub async fn stream(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
 ) -> Result<impl IntoResponse, Error> {
-    let place = app.live.place(&caller)?;
-    let ending = caller.over(&app, "");
-    let listener = Listener::new(Arc::clone(&app), caller, Live::listen(&app), place);
+    let place = app.live.acquire_slot(&caller)?;
+    let ending = caller.wait_for_end(&app, "");
+    let listener = Listener::new(Arc::clone(&app), caller, LiveSamples::listen(&app), place);
     let told = futures_util::stream::unfold(listener, |mut listener| async move {
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
     });
-    // No proxy collects what is to be seen at once.
+    // Forbids proxies to buffer live updates.
     let unkept = [("cache-control", "no-store"), ("x-accel-buffering", "no")];
     let events = Sse::new(told.take_until(ending)).keep_alive(KeepAlive::new().interval(ALIVE));
     Ok((unkept, events))
@@ -142,27 +142,29 @@ mod tests {
 
     #[test]
     fn one_principal_has_so_many_streams_and_no_more() {
-        let live = Live::default();
+        let live = LiveSamples::default();
         let mut places: Vec<_> = (0..MOST)
-            .map(|_| live.place_of("ada".into()).expect("room"))
+            .map(|_| live.acquire_slot_for("ada".into()).expect("room"))
             .collect();
-        let refused = live.place_of("ada".into()).map(|_| ());
+        let refused = live.acquire_slot_for("ada".into()).map(|_| ());
         assert!(matches!(refused, Err(Error::TooManyStreams { most: MOST })));
-        let of_another = live.place_of("bob".into()).expect("room of his own");
+        let of_another = live
+            .acquire_slot_for("bob".into())
+            .expect("room of his own");
         drop(places.pop());
-        places.push(live.place_of("ada".into()).expect("room again"));
+        places.push(live.acquire_slot_for("ada".into()).expect("room again"));
         drop((places, of_another));
         assert!(live.streams.lock().is_empty(), "nothing is left behind");
     }
 
     #[test]
     fn the_sampler_ends_when_nobody_listens() {
-        let live = Live::default();
+        let live = LiveSamples::default();
         *live.running.lock() = true;
         let listening = live.newest.subscribe();
-        assert!(!live.rests());
+        assert!(!live.try_stop());
         drop(listening);
-        assert!(live.rests());
+        assert!(live.try_stop());
         assert!(!*live.running.lock());
     }
 }

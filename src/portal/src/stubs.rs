@@ -9,63 +9,63 @@ use axum::extract::{OriginalUri, Path, State};
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
-use catalogue::stubs::{self, Programs};
+use catalogue::stubs::{self, StubPrograms};
 use package::stub::Portal;
 use serde::Deserialize;
 use tokio::sync::Semaphore;
 use tokio_util::io::ReaderStream;
 
-use super::guard::{Caller, Peer};
+use super::guard::{Caller, ConnectionPeer};
 use crate::app::App;
 use crate::errors::Error;
 use crate::query::Query;
 
-/// Read from the archive at a time.
+/// Bytes read from the archive at a time.
 const CHUNK: usize = 64 << 10;
-/// Archives that are packed at the same time: each holds its files in memory meanwhile, and takes a core.
+/// Limit on the archives packed at once: each holds its files in memory meanwhile, and occupies a core.
 static PACKING: Semaphore = Semaphore::const_new(2);
 
-/// `/stubs`: services, and for which architectures.
+/// `/stubs`: services and architectures.
 pub async fn list(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
 ) -> Result<Json<Stubs>, Error> {
     let mut services = app.state.service_names()?;
-    services.retain(|name| caller.sees(&app, name));
-    let programs = privilege::now(Programs::look);
+    services.retain(|name| caller.can_see(&app, name));
+    let programs = privilege::run_sync(StubPrograms::find_installed);
     Ok(Json(Stubs {
         services,
-        architectures: programs.held(),
-        lacking: programs.lacking(),
-        key: app.signing.public().to_string(),
+        architectures: programs.architectures(),
+        lacking: programs.missing_architectures(),
+        key: app.signing.public_key().to_string(),
     }))
 }
 
-/// For which robot.
+/// Query of a stub.
 #[derive(Debug, Deserialize)]
-pub struct For {
-    /// Its architecture; this machine's by default.
+pub struct StubQuery {
+    /// Architecture of the robot (default: this machine's).
     arch: Option<String>,
 }
 
-/// The service of `NAME.tar.gz` and `NAME.tar.gz.sig`, and whether it is the latter.
-pub fn service(file: &str) -> Option<(&str, bool)> {
+/// Returns the service of `NAME.tar.gz` or `NAME.tar.gz.sig`, and whether the file is the signature.
+pub fn parse_file_name(file: &str) -> Option<(&str, bool)> {
     let signature = file.strip_suffix(".sig");
     let name = signature.unwrap_or(file).strip_suffix(".tar.gz")?;
     Some((name, signature.is_some()))
 }
 
-/// `/stubs/NAME.tar.gz`, and `/stubs/NAME.tar.gz.sig`: asked alike, they belong together as long as the service has
-/// the same revision.
+/// `/stubs/NAME.tar.gz` and `/stubs/NAME.tar.gz.sig`: requested alike, they match as long as the service has the same
+/// revision.
 pub async fn archive(
     State(app): State<Arc<App>>,
     Path(file): Path<String>,
-    Query(asked): Query<For>,
+    Query(asked): Query<StubQuery>,
     OriginalUri(uri): OriginalUri,
     Extension(caller): Extension<Caller>,
     headers: HeaderMap,
 ) -> Result<Response, Error> {
-    let Some((name, is_signature)) = service(&file) else {
+    let Some((name, is_signature)) = parse_file_name(&file) else {
         return Err(Error::UnknownPath {
             path: format!(
                 "{}; a stub is at /stubs/NAME.tar.gz, its signature at /stubs/NAME.tar.gz.sig",
@@ -73,17 +73,19 @@ pub async fn archive(
             ),
         });
     };
-    let revision = app.catalogue.current(name)?;
-    let program = privilege::now(Programs::look).of(asked.arch.as_deref())?;
-    let portal = portal(&app, &caller, &headers);
-    let inventory = app.catalogue.known(&revision).await?.inventory;
+    let revision = app.catalogue.current_revision(name)?;
+    let program = privilege::run_sync(StubPrograms::find_installed)
+        .for_architecture(asked.arch.as_deref())?;
+    let portal = stub_portal(&app, &caller, &headers);
+    let inventory = app.catalogue.revision_contents(&revision).await?.inventory;
     let store = Arc::clone(app.catalogue.images());
     let architecture = program.architecture;
     let key = Arc::clone(&app.signing);
-    let packing = move || stubs::archive(&store, &revision, &inventory, &program, &portal, &key);
-    // It is never closed.
+    let packing =
+        move || stubs::build_archive(&store, &revision, &inventory, &program, &portal, &key);
+    // The semaphore is never closed.
     let turn = PACKING.acquire().await;
-    let archive = privilege::blocking(packing).await;
+    let archive = privilege::spawn_blocking(packing).await;
     drop(turn);
     let archive = archive.map_err(|_| Error::Internal("packing a stub"))??;
     if is_signature {
@@ -102,34 +104,37 @@ pub async fn archive(
         ),
         (
             header::HeaderName::from_static(SIGNATURE),
-            sign::in_a_line(&archive.signature),
+            sign::to_single_line(&archive.signature),
         ),
     ];
     let stream = ReaderStream::with_capacity(tokio::fs::File::from_std(archive.file), CHUNK);
     Ok((headers, Body::from_stream(stream)).into_response())
 }
 
-/// Where the robot reaches this portal: as whoever asks for the stub reached it, if nobody else can be meant by that: the
-/// archive is signed, and robots send their tokens there. What signs itself is pinned by its fingerprint whatever the name
-/// is; what an authority has signed speaks for the names in it alone. Of a proxy that is named, the operator has said to
-/// believe it.
-fn portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
+/// Returns where the robot reaches this portal: as the caller reached it, provided that this cannot mean another
+/// server, because the archive is signed and robots send their tokens there. A self-signed certificate is pinned by
+/// its fingerprint, whatever the name; one signed by an authority is valid only for the names in it. A trusted proxy
+/// is believed.
+fn stub_portal(app: &App, caller: &Caller, headers: &HeaderMap) -> Portal {
     let host = headers
         .get(header::HOST)
         .and_then(|host| host.to_str().ok())
         .filter(|host| stubs::is_authority(host))
         .filter(|host| match &app.tls {
-            Some(tls) if !caller.forwarded => tls.signs_itself() || tls.speaks_for(host),
+            Some(tls) if !caller.forwarded => tls.is_self_signed() || tls.is_valid_for_host(host),
             _ => true,
         });
     let scheme = if caller.secure { "wss" } else { "ws" };
     let address = match (caller.peer, host) {
-        (Peer::Tcp(_), Some(host)) => format!("{scheme}://{host}"),
+        (ConnectionPeer::Tcp(_), Some(host)) => format!("{scheme}://{host}"),
         _ => app.address("").trim_end_matches('/').to_owned(),
     };
-    // What a proxy shows is its own.
+    // Behind a proxy, robots see the proxy's certificate.
     let direct = !caller.forwarded;
-    let tls = app.tls.as_ref().filter(|tls| direct && tls.signs_itself());
+    let tls = app
+        .tls
+        .as_ref()
+        .filter(|tls| direct && tls.is_self_signed());
     Portal {
         address,
         fingerprint: tls.map(|tls| tls.fingerprint().to_string()),

@@ -26,39 +26,40 @@ use tokio_rustls::server::TlsStream;
 
 use crate::errors::Error;
 
-/// The first byte of a TLS connection: a record with a handshake message (RFC 8446, section 5.1).
+/// First byte of a TLS connection: a record with a handshake message (RFC 8446, section 5.1).
 const HANDSHAKE: u8 = 22;
-/// How long a client may take to read why its certificate is refused, and how many bytes it may send meanwhile.
+/// Time that a client gets to read why its certificate is refused, and the number of bytes that it may send
+/// meanwhile.
 const LINGER: Duration = Duration::from_secs(1);
 const UNREAD: u64 = 64 << 10;
-/// What is spoken through TLS (RFC 7301).
+/// Protocol negotiated by ALPN (RFC 7301).
 const HTTP_1_1: &[u8] = b"http/1.1";
-/// What an authority says that looks whether a name leads here (RFC 8737).
+/// ALPN protocol of an authority that validates a domain name (RFC 8737).
 const ACME_TLS_1: &[u8] = b"acme-tls/1";
 
-/// Why a certificate and a key cannot be used.
+/// Error for an unusable certificate or key.
 #[derive(Debug, thiserror::Error)]
 #[error("the certificate and its key cannot be used: {0}")]
 pub struct TlsError(#[from] rustls::Error);
 
-/// TLS as the portal speaks it. What it shows can be replaced while it listens.
+/// TLS server of the portal. Its certificate can be replaced while it listens.
 pub struct Tls {
     config: RwLock<Arc<ServerConfig>>,
-    shown: Arc<Shown>,
+    shown: Arc<CertificateResolver>,
     /// Authorities that sign robots' certificates.
     roots: Arc<RootCertStore>,
     trusts_others: bool,
 }
 
-/// The certificate that is shown, and its key.
+/// Certificates to present, with their keys.
 #[derive(Debug)]
-struct Shown {
+struct CertificateResolver {
     current: RwLock<Arc<CertifiedKey>>,
-    /// What authorities are shown instead, by name in lower case.
+    /// Certificates presented to authorities instead, by name in lower case.
     challenges: RwLock<HashMap<String, Arc<CertifiedKey>>>,
 }
 
-impl ResolvesServerCert for Shown {
+impl ResolvesServerCert for CertificateResolver {
     fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
         if is_challenge(hello.alpn()) {
             let name = hello.server_name()?.to_ascii_lowercase();
@@ -68,19 +69,19 @@ impl ResolvesServerCert for Shown {
     }
 }
 
-/// Whether the protocols that are offered are those of an authority's look (RFC 8737, section 3: that one alone).
+/// Returns true if the offered protocols are those of an authority's validation (RFC 8737, section 3: exactly one).
 fn is_challenge<'a>(offered: Option<impl Iterator<Item = &'a [u8]>>) -> bool {
     offered
         .is_some_and(|mut offered| offered.next() == Some(ACME_TLS_1) && offered.next().is_none())
 }
 
-/// What an authority is shown that looks whether a name leads here.
+/// Certificate for an authority's validation of a domain name.
 pub struct Challenge {
-    /// The name.
+    /// The domain name.
     pub name: String,
     /// The certificate (RFC 8737, section 3).
     pub certificate: CertificateDer<'static>,
-    /// Its key.
+    /// Private key of the certificate.
     pub key: PrivateKeyDer<'static>,
 }
 
@@ -90,17 +91,17 @@ impl fmt::Debug for Tls {
     }
 }
 
-/// What came of a connection to a port where TLS is spoken.
-pub enum Accepted {
-    /// TLS.
+/// Result of accepting a connection.
+pub enum AcceptedConnection {
+    /// A TLS connection.
     Tls(Box<TlsStream<TcpStream>>),
-    /// Something else: nothing has been read of it.
+    /// A connection with another protocol, of which nothing has been read.
     Plain(TcpStream),
-    /// An authority that has seen what it looked for. Nothing else is said to it (RFC 8737, section 3).
+    /// A completed validation by an authority. Nothing else is sent (RFC 8737, section 3).
     Challenge,
 }
 
-fn checked(
+fn load_certified_key(
     chain: Vec<CertificateDer<'static>>,
     key: PrivateKeyDer<'static>,
 ) -> Result<Arc<CertifiedKey>, TlsError> {
@@ -108,17 +109,17 @@ fn checked(
     Ok(Arc::new(key))
 }
 
-/// Asks clients for certificates that one of `roots` has signed and no list names.
-fn configure(
+/// Builds a configuration that requests client certificates signed by one of `roots` and not revoked by `lists`.
+fn build_config(
     roots: &Arc<RootCertStore>,
-    shown: &Arc<Shown>,
+    shown: &Arc<CertificateResolver>,
     lists: Vec<CertificateRevocationListDer<'static>>,
 ) -> Result<Arc<ServerConfig>, TlsError> {
     let provider = Arc::new(ring::default_provider());
     let clients =
         WebPkiClientVerifier::builder_with_provider(Arc::clone(roots), Arc::clone(&provider))
             .with_crls(lists)
-            // The daemon's own authority has no list: whom it has signed is unpaired.
+            // The daemon's own authority has no list: its robots are unpaired instead.
             .allow_unknown_revocation_status()
             .allow_unauthenticated()
             .build()
@@ -133,8 +134,8 @@ fn configure(
 }
 
 impl Tls {
-    /// Shows a certificate, followed by those that lead from it to an authority. Asks clients for one, and takes those that the
-    /// daemon's authority for robots has signed, or one of `others`; who has none is let in without.
+    /// Creates a server that presents this certificate chain. Clients are asked for a certificate; accepted are those
+    /// signed by the daemon's authority for robots or by one of `others`. Clients without one are admitted.
     pub fn new(
         chain: Vec<CertificateDer<'static>>,
         key: PrivateKeyDer<'static>,
@@ -147,43 +148,43 @@ impl Tls {
             roots.add(root)?;
         }
         let roots = Arc::new(roots);
-        let shown = Arc::new(Shown {
-            current: RwLock::new(checked(chain, key)?),
+        let shown = Arc::new(CertificateResolver {
+            current: RwLock::new(load_certified_key(chain, key)?),
             challenges: RwLock::default(),
         });
         Ok(Tls {
-            config: RwLock::new(configure(&roots, &shown, Vec::new())?),
+            config: RwLock::new(build_config(&roots, &shown, Vec::new())?),
             shown,
             roots,
             trusts_others,
         })
     }
 
-    /// Refuses from now on certificates that these lists name, and no others any more. Nobody goes on with a session of TLS that was begun
-    /// before. A list whose time is over counts on: an authority that is late lets nobody in again.
-    pub fn revoke(
+    /// Replaces the revocation lists: the certificates they name are refused from now on. TLS sessions cannot be
+    /// resumed across this change. Expired lists remain in force, so that an authority that is late readmits nobody.
+    pub fn set_revocation_lists(
         &self,
         lists: Vec<CertificateRevocationListDer<'static>>,
     ) -> Result<(), TlsError> {
-        let config = configure(&self.roots, &self.shown, lists)?;
+        let config = build_config(&self.roots, &self.shown, lists)?;
         *self.config.write() = config;
         Ok(())
     }
 
-    /// Shows another from now on. Connections that stand go on.
-    pub fn show(
+    /// Replaces the certificate. Open connections are not affected.
+    pub fn replace_certificate(
         &self,
         chain: Vec<CertificateDer<'static>>,
         key: PrivateKeyDer<'static>,
     ) -> Result<(), TlsError> {
-        *self.shown.current.write() = checked(chain, key)?;
+        *self.shown.current.write() = load_certified_key(chain, key)?;
         Ok(())
     }
 
-    /// Shows these to authorities that look for them, and no others any more.
-    pub fn answer(&self, challenges: Vec<Challenge>) -> Result<(), TlsError> {
+    /// Replaces the certificates for validations by authorities.
+    pub fn set_challenges(&self, challenges: Vec<Challenge>) -> Result<(), TlsError> {
         let answers = challenges.into_iter().map(|challenge| {
-            // Its extension, which only an authority understands, is critical: checked it would be refused.
+            // Not checked, because its critical extension is understood only by authorities.
             let key = ring::default_provider()
                 .key_provider
                 .load_private_key(challenge.key)?;
@@ -195,56 +196,56 @@ impl Tls {
         Ok(())
     }
 
-    /// The fingerprint of what is shown.
+    /// Returns the fingerprint of the current certificate.
     pub fn fingerprint(&self) -> Fingerprint {
         let shown = self.shown.current.read();
-        // rustls takes no key without a certificate.
-        Fingerprint::of(shown.cert.first().unwrap_or(&CertificateDer::from(&[][..])))
+        // rustls accepts no key without a certificate.
+        Fingerprint::from_certificate(shown.cert.first().unwrap_or(&CertificateDer::from(&[][..])))
     }
 
-    /// When what is shown ends.
-    pub(crate) fn end(&self) -> Option<Millis> {
+    /// Returns when the current certificate expires.
+    pub(crate) fn expiry(&self) -> Option<Millis> {
         let shown = self.shown.current.read();
-        let period = shown.cert.first().map(authority::period)?;
+        let period = shown.cert.first().map(authority::read_validity)?;
         period.ok().map(|period| period.until)
     }
 
-    /// Whether no authority has signed what is shown.
-    pub(crate) fn signs_itself(&self) -> bool {
+    /// Returns true if the current certificate is self-signed.
+    pub(crate) fn is_self_signed(&self) -> bool {
         let shown = self.shown.current.read();
-        shown.cert.first().is_some_and(::tls::signs_itself)
+        shown.cert.first().is_some_and(::tls::is_self_signed)
     }
 
-    /// Whether what is shown is valid for a host, which may have a port behind it.
-    pub fn speaks_for(&self, authority: &str) -> bool {
+    /// Returns true if the current certificate is valid for a host, optionally followed by a port.
+    pub fn is_valid_for_host(&self, authority: &str) -> bool {
         let shown = self.shown.current.read();
         shown
             .cert
             .first()
-            .is_some_and(|certificate| ::tls::speaks_for(certificate, authority))
+            .is_some_and(|certificate| ::tls::is_valid_for_host(certificate, authority))
     }
 
-    /// Whether another authority than the daemon's signs robots' certificates, too.
-    pub(crate) fn trusts_others(&self) -> bool {
+    /// Returns true if authorities other than the daemon's may sign robots' certificates.
+    pub(crate) fn has_other_authorities(&self) -> bool {
         self.trusts_others
     }
 
-    /// Makes a TLS connection of a TCP one.
-    pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<Accepted> {
+    /// Performs the TLS handshake on a TCP connection.
+    pub(crate) async fn accept(&self, stream: TcpStream) -> io::Result<AcceptedConnection> {
         let mut first = [0];
         if stream.peek(&mut first).await? == 0 {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
         if first[0] != HANDSHAKE {
-            return Ok(Accepted::Plain(stream));
+            return Ok(AcceptedConnection::Plain(stream));
         }
         let acceptor = TlsAcceptor::from(Arc::clone(&self.config.read()));
         match acceptor.accept(stream).into_fallible().await {
             Ok(mut stream) if stream.get_ref().1.alpn_protocol() == Some(ACME_TLS_1) => {
                 let _ = tokio::time::timeout(LINGER, stream.shutdown()).await;
-                Ok(Accepted::Challenge)
+                Ok(AcceptedConnection::Challenge)
             }
-            Ok(stream) => Ok(Accepted::Tls(Box::new(stream))),
+            Ok(stream) => Ok(AcceptedConnection::Tls(Box::new(stream))),
             Err((error, stream)) => {
                 if refused_certificate(&error).is_some() {
                     let _ = tokio::time::timeout(LINGER, linger(stream)).await;
@@ -255,23 +256,23 @@ impl Tls {
     }
 }
 
-/// Lets a client read the alert that it was sent: it has gone on to its request, and closing the connection before that is read would
-/// reset it (RFC 1122, section 4.2.2.13).
+/// Lets a client read the alert: it has already sent its request, and closing the connection before that is read
+/// would reset it (RFC 1122, section 4.2.2.13).
 async fn linger(mut stream: TcpStream) {
     if stream.shutdown().await.is_ok() {
         let _ = tokio::io::copy(&mut stream.take(UNREAD), &mut tokio::io::sink()).await;
     }
 }
 
-/// What the client has shown.
-pub(crate) fn certificates(stream: &TlsStream<TcpStream>) -> Arc<[CertificateDer<'static>]> {
+/// Returns the certificates presented by the client.
+pub(crate) fn peer_certificates(stream: &TlsStream<TcpStream>) -> Arc<[CertificateDer<'static>]> {
     let (_, connection) = stream.get_ref();
     let shown = connection.peer_certificates().unwrap_or_default();
     shown.iter().map(|one| one.clone().into_owned()).collect()
 }
 
-/// Why a client's certificate was refused, where that ended a handshake; the client is told the same by an alert (RFC 8446, section
-/// 6.2).
+/// Returns why the client's certificate was refused, if that ended the handshake; an alert tells the client the same
+/// (RFC 8446, section 6.2).
 pub(crate) fn refused_certificate(error: &io::Error) -> Option<String> {
     match error.get_ref()?.downcast_ref()? {
         rustls::Error::InvalidCertificate(why) => Some(why.to_string()),
@@ -279,8 +280,8 @@ pub(crate) fn refused_certificate(error: &io::Error) -> Option<String> {
     }
 }
 
-/// Answers each request that comes in plain text with what is spoken here.
-pub(crate) fn refusing() -> Router {
+/// Builds a router that answers plain-text requests with the URL to use instead.
+pub(crate) fn plain_text_router() -> Router {
     Router::new().fallback(refuse)
 }
 
@@ -289,9 +290,10 @@ async fn refuse(uri: Uri, headers: HeaderMap) -> Response {
         .get(header::HOST)
         .and_then(|host| host.to_str().ok())
         .unwrap_or("HOST:PORT");
-    let scheme = match crate::guard::is_upgrade(&headers) {
-        true => "wss",
-        false => "https",
+    let scheme = if crate::guard::is_upgrade(&headers) {
+        "wss"
+    } else {
+        "https"
     };
     let instead = format!("{scheme}://{host}{}", uri.path());
     let mut response = Error::PlainText { instead }.into_response();

@@ -1,5 +1,5 @@
-//! Who may use the portal. Only hashes of tokens are kept in memory and on disk, except for what rosauth's
-//! message authentication needs: there the token is the shared secret.
+//! Tokens of the configuration. Only hashes of tokens are kept in memory and on disk, except for rosauth's message
+//! authentication, where the token is the shared secret.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,32 +13,32 @@ pub use store::TokenHash;
 #[derive(Debug, Clone, Default)]
 pub struct Tokens {
     hashes: Vec<TokenHash>,
-    /// Those written in clear.
+    /// Tokens written in clear text.
     secrets: Vec<String>,
-    /// MACs that have let somebody in, and until when (seconds since 1970) each would again.
+    /// MACs that were accepted, and until when (seconds since 1970) they would be accepted again.
     used: Arc<Mutex<HashMap<String, f64>>>,
 }
 
-/// A token that cannot be one.
+/// Error for an invalid token.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TokenError {
-    /// No hash follows `sha256:`.
+    /// `sha256:` is not followed by a hash.
     #[error("token \"sha256:{0}\" is not followed by 64 hexadecimal digits")]
     Digest(String),
-    /// It can be guessed.
+    /// The token is too short.
     #[error("a token of {0} characters is too short; use at least 8")]
     Short(usize),
 }
 
-/// Why an `auth` message lets nobody in.
+/// Reason why an `auth` message is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum AuthRefusal {
-    /// It holds no token, and no token signed it for now.
+    /// It contains no known token and is not currently signed by one.
     #[error("the auth message neither contains a known token nor is signed by one")]
     Unknown,
     /// It was accepted before.
     #[error(
-        "this auth message was used before, and each counts once; sign a new one (t, rand) for each connection"
+        "this auth message was used before; each is valid once: sign a new one (t, rand) for each connection"
     )]
     Used,
 }
@@ -46,39 +46,39 @@ pub enum AuthRefusal {
 /// rosbridge's `auth` operation (rosauth): a MAC over the other fields and the secret.
 #[derive(Debug, Clone, serde::Deserialize)]
 pub struct AuthMessage {
-    /// The MAC, or a token as it is.
+    /// The MAC, or a token in clear text.
     #[serde(alias = "token")]
     pub mac: String,
-    /// The client's address.
+    /// Address of the client.
     #[serde(default)]
     pub client: String,
-    /// The destination's address.
+    /// Address of the destination.
     #[serde(default)]
     pub dest: String,
-    /// Something random.
+    /// Random text.
     #[serde(default)]
     pub rand: String,
-    /// Seconds since 1970 when it was made.
+    /// Time of creation in seconds since 1970.
     #[serde(default)]
     pub t: f64,
-    /// The client's level.
+    /// Access level of the client.
     #[serde(default)]
     pub level: String,
-    /// Seconds since 1970 when it ends.
+    /// End of validity in seconds since 1970.
     #[serde(default)]
     pub end: f64,
 }
 
-/// Clocks may differ by so many seconds, as in rosauth.
+/// Tolerated clock skew in seconds, as in rosauth.
 const CLOCK_DIFFERENCE: f64 = 5.0;
 
-/// SHA-256 of `token`, as it may be written into the configuration after `sha256:`.
+/// Returns the SHA-256 hash of `token`, as it may be written into the configuration after `sha256:`.
 pub fn hash(token: &str) -> TokenHash {
     hex::encode(Sha256::digest(token.as_bytes()))
 }
 
 impl Tokens {
-    /// Reads the configuration's list.
+    /// Parses the configuration's list.
     pub fn new(written: &[String]) -> Result<Tokens, TokenError> {
         let mut tokens = Tokens::default();
         for text in written {
@@ -99,24 +99,24 @@ impl Tokens {
         Ok(tokens)
     }
 
-    /// Whether none is configured.
+    /// Returns true if no token is configured.
     pub fn is_empty(&self) -> bool {
         self.hashes.is_empty()
     }
 
-    /// Hashes of all tokens.
+    /// Returns the hashes of all tokens.
     pub fn hashes(&self) -> &[TokenHash] {
         &self.hashes
     }
 
-    /// The hash of `token`, if it is one of these.
+    /// Returns the hash of `token` if it is configured.
     pub fn recognise(&self, token: &str) -> Option<TokenHash> {
         let hash = hash(token);
         self.hashes.contains(&hash).then_some(hash)
     }
 
-    /// The hash of the token that is in `message` or signed it, at `now` (seconds since 1970). What is signed counts once:
-    /// whoever has overheard it comes too late.
+    /// Returns the hash of the token that `message` contains or is signed with, at `now` (seconds since 1970). A
+    /// signed message is accepted once, so it cannot be replayed.
     pub fn recognise_auth(
         &self,
         message: &AuthMessage,
@@ -134,7 +134,7 @@ impl Tokens {
             .ok_or(AuthRefusal::Unknown)?;
         let mut used = self.used.lock();
         used.retain(|_, until| *until >= now);
-        // The fraction of `t` is not signed.
+        // The MAC does not cover the fraction of `t`.
         let until = message.t.trunc() + 1.0 + CLOCK_DIFFERENCE;
         match used.insert(mac, until) {
             None => Ok(hash(secret)),
@@ -143,15 +143,15 @@ impl Tokens {
     }
 }
 
-/// The key of a client's resume token: a hash of it and of what it is bound to, so that nobody else, or nobody known, can
-/// resume by it.
-pub fn bound_to(principal: Option<&str>, resume: &str) -> String {
+/// Returns the key for a client's resume token: a hash of the token and the principal it is bound to, so that nobody
+/// else can resume with it.
+pub fn bind_resume_token(principal: Option<&str>, resume: &str) -> String {
     let principal = principal.unwrap_or_default();
     hash(&format!("{principal} {resume}"))
 }
 
 impl AuthMessage {
-    /// SHA-512 over secret and fields; whole seconds, as roslibjs and rosauth write them.
+    /// Computes the SHA-512 hash of secret and fields, with whole seconds, as roslibjs and rosauth do.
     fn signature(&self, secret: &str) -> String {
         let text = format!(
             "{secret}{}{}{}{}{}{}",
@@ -198,8 +198,8 @@ mod tests {
         }
     }
 
-    /// A message of 1000 s, good until 2000 s.
-    fn signed(secret: &str) -> AuthMessage {
+    /// Creates a message signed at 1000 s and valid until 2000 s.
+    fn signed_message(secret: &str) -> AuthMessage {
         let mut message = AuthMessage {
             mac: String::new(),
             client: "10.0.0.2".into(),
@@ -216,7 +216,7 @@ mod tests {
     #[test]
     fn rosauth_messages_are_verified() {
         let known = tokens(&["open-sesame"]);
-        let message = signed("open-sesame");
+        let message = signed_message("open-sesame");
         assert_eq!(
             known.recognise_auth(&message, 1010.0),
             Err(AuthRefusal::Unknown),
@@ -247,7 +247,7 @@ mod tests {
     #[test]
     fn a_signed_message_counts_once() {
         let known = tokens(&["open-sesame"]);
-        let message = signed("open-sesame");
+        let message = signed_message("open-sesame");
         let later = tokens(&["open-sesame"]);
         known.recognise_auth(&message, 996.0).expect("the first");
         let upper = AuthMessage {
@@ -265,7 +265,7 @@ mod tests {
                 "{now}"
             );
         }
-        // What is too old anyway is not remembered.
+        // Messages too old to be accepted are forgotten.
         let mut next = AuthMessage {
             t: 1010.0,
             ..message.clone()
@@ -281,13 +281,16 @@ mod tests {
     #[test]
     fn a_resume_token_is_bound_to_who_shows_it() {
         let (one, two) = (hash("one"), hash("two"));
-        assert_eq!(bound_to(Some(&one), "mine"), bound_to(Some(&one), "mine"));
+        assert_eq!(
+            bind_resume_token(Some(&one), "mine"),
+            bind_resume_token(Some(&one), "mine")
+        );
         for other in [
-            bound_to(Some(&two), "mine"),
-            bound_to(None, "mine"),
-            bound_to(Some(&one), "yours"),
+            bind_resume_token(Some(&two), "mine"),
+            bind_resume_token(None, "mine"),
+            bind_resume_token(Some(&one), "yours"),
         ] {
-            assert_ne!(bound_to(Some(&one), "mine"), other);
+            assert_ne!(bind_resume_token(Some(&one), "mine"), other);
         }
     }
 }

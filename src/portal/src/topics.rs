@@ -1,10 +1,11 @@
-//! `GET /api/v1/servants/ID/topics`: each second, what was published on each topic of a servant, until whoever asks leaves. To count it, all of
-//! it is heard beside the servant's robot. Whoever asks is told of those topics that it may hear there.
+//! `GET /api/v1/servants/ID/topics`: every second, statistics of each of a servant's topics, until the caller
+//! disconnects. To compute them, all messages are received besides the servant's robot. The caller sees those topics
+//! to which it may subscribe there.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use access::{Grants, Operation, Standing};
+use access::{ConnectionAccess, Grants, Operation};
 use api::topics::{PublishedTopic, PublishedTopics};
 use axum::Extension;
 use axum::extract::{Path, State};
@@ -13,17 +14,17 @@ use observe::{Figures, TopicFigures};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::api_v1::lines;
+use crate::api_v1::json_lines;
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::Caller;
-use crate::inside::{self, Whose};
+use crate::inside::{self, InsideTarget};
 use crate::observers;
 
-/// What one line tells of.
+/// Period of one line.
 const EACH: Duration = Duration::from_secs(1);
 
-/// Figures of all topics, a line each second.
+/// Streams the statistics of all topics, one line per second.
 pub async fn topics(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
@@ -34,48 +35,53 @@ pub async fn topics(
         return Err(Error::NotThereYet(id));
     };
     let part = {
-        let whose = Whose {
+        let whose = InsideTarget {
             service: handle.service(),
             robot: &handle.robot,
             object: format_args!("servant {id}"),
         };
-        inside::part(&app, &caller, whose)?
+        inside::inside_role(&app, &caller, whose)?
     };
-    let place = app.inside.place(&id, &caller.who.principal.name)?;
-    let Some(seen) = observers::seen(&*reach).await else {
+    let place = app.inside.acquire(&id, &caller.who.principal.name)?;
+    let Some(seen) = observers::observed_servant(&*reach).await else {
         return Err(Error::NotThereYet(id));
     };
-    let figures = Figures::of(seen);
+    let figures = Figures::start(seen);
     let (lines_of, received) = mpsc::channel(1);
-    // None of the sessions that the daemon waits for when it ends: it ends with the daemon.
+    // Not one of the sessions that the daemon waits for: it ends with the daemon.
     tokio::spawn(async move {
         let service = handle.service().to_owned();
         let told = async {
             loop {
                 tokio::time::sleep(EACH).await;
-                // There is none any more, or another of the same id.
+                // The servant has ended, or another has its id.
                 let ended = app.choreographer.servant(&id).is_err();
-                // Asked anew each time: rules may have changed.
-                let standing = app.principals.standing_inside(&caller.who, &service, part);
-                let Standing::Granted(grants) = standing else {
+                // Checked each time because rules may have changed.
+                let standing = app.principals.inside_access(&caller.who, &service, part);
+                let ConnectionAccess::Granted(grants) = standing else {
                     return;
                 };
-                if ended || lines_of.send(told(&figures, &grants)).await.is_err() {
+                if ended
+                    || lines_of
+                        .send(to_published_topics(&figures, &grants))
+                        .await
+                        .is_err()
+                {
                     return;
                 }
             }
         };
         tokio::select! {
             () = told => {}
-            () = caller.over(&app, &service) => {}
+            () = caller.wait_for_end(&app, &service) => {}
             () = lines_of.closed() => {}
         }
         drop(place);
     });
-    Ok(lines(ReceiverStream::new(received)))
+    Ok(json_lines(ReceiverStream::new(received)))
 }
 
-fn told(figures: &Figures, grants: &Grants) -> PublishedTopics {
+fn to_published_topics(figures: &Figures, grants: &Grants) -> PublishedTopics {
     let (span, mut all) = figures.take();
     all.retain(|figures| grants.permits(Operation::Subscribe, &figures.topic));
     let seconds = span.as_secs_f64().max(f64::MIN_POSITIVE);

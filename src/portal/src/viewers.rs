@@ -1,5 +1,5 @@
-//! Viewers look into a servant: `ws://host:9090/foxglove/ID` speaks Foxglove's WebSocket protocol beside the servant's robot, to those who may
-//! look inside, who may there what they may there ([`crate::inside`]).
+//! Viewers: `ws://host:9090/foxglove/ID` speaks Foxglove's WebSocket protocol beside the servant's robot, with the
+//! same permissions as looking inside ([`crate::inside`]).
 
 use std::sync::Arc;
 
@@ -12,47 +12,48 @@ use viewer::{DEPTH, PROTOCOLS, ViewerOptions};
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::{self, Caller};
-use crate::inside::Door;
+use crate::inside::InsideAccess;
 
-/// The newest of the subprotocols that the viewer offers and that is spoken here.
-fn protocol(headers: &HeaderMap) -> Result<&'static str, Error> {
+/// Returns the newest subprotocol that the viewer offers and this server supports.
+fn choose_protocol(headers: &HeaderMap) -> Result<&'static str, Error> {
     let spoken = PROTOCOLS
         .into_iter()
         .find(|protocol| guard::protocols(headers).any(|offered| offered == *protocol));
     spoken.ok_or_else(|| {
         Error::BadRequest(format!(
-            "this address speaks {} to viewers, and the client offers none of these; Foxglove and Lichtblick do (\"Open connection\")",
+            "this address speaks {} to viewers, but the client offers none of these; Foxglove and Lichtblick do \
+                (\"Open connection\")",
             PROTOCOLS.join(" and ")
         ))
     })
 }
 
-/// How many messages of a topic wait for the viewer: `?depth=N`.
-fn depth(query: Option<&str>) -> Result<usize, Error> {
-    let Some(said) = guard::query(query, "depth") else {
+/// Parses the queue size per topic: `?depth=N`.
+fn parse_depth(query: Option<&str>) -> Result<usize, Error> {
+    let Some(said) = guard::query_value(query, "depth") else {
         return Ok(*DEPTH.start());
     };
     let depth = said.parse().ok().filter(|depth| DEPTH.contains(depth));
     depth.ok_or_else(|| {
         let (least, most) = (DEPTH.start(), DEPTH.end());
         Error::BadRequest(format!(
-            "depth={said:?} is no number of messages from {least} to {most}"
+            "depth={said:?} is not a number of messages from {least} to {most}"
         ))
     })
 }
 
-/// Becomes a WebSocket that speaks with a viewer inside the servant.
+/// Upgrades to a WebSocket that serves a viewer inside the servant.
 pub async fn viewer(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     Extension(caller): Extension<Caller>,
     request: Request,
 ) -> Result<Response, Error> {
-    let door = Door::of(&app, &id, caller)?;
-    let protocol = protocol(request.headers())?;
-    let depth = depth(request.uri().query())?;
+    let door = InsideAccess::authorise(&app, &id, caller)?;
+    let protocol = choose_protocol(request.headers())?;
+    let depth = parse_depth(request.uri().query())?;
     let unfinished = app.choreographer.bridge_options().unfinished;
-    door.open(
+    door.upgrade(
         request,
         Some(protocol),
         async move |looker, io, read_ahead| {
@@ -65,8 +66,8 @@ pub async fn viewer(
                 depth,
             };
             let servant = async {
-                let looked = looker.reach.look_inside().await;
-                looked.map(|looked| viewer::Servant {
+                let looked = looker.reach.open_inside().await;
+                looked.map(|looked| viewer::ViewedServant {
                     bus: Arc::clone(&looked.bus),
                     registry: Arc::clone(&looked.registry),
                     ended: looked.ended.clone(),
@@ -74,7 +75,7 @@ pub async fn viewer(
                 })
             };
             viewer::serve(io, read_ahead, servant, options).await;
-            tracing::debug!("a viewer looks into servant {id} no more");
+            tracing::debug!("a viewer left servant {id}");
         },
     )
 }

@@ -1,4 +1,4 @@
-//! The daemon's records as the API shows them.
+//! Conversion of the daemon's records to the types of the API.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::errors::Error;
 use choreographer::Handle;
 use store::RevisionRecord;
 
-/// A service in a list.
+/// Returns the summary of a service.
 pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
     let interface = &revision.interface;
     let servants = app.choreographer.servants();
@@ -34,9 +34,9 @@ pub fn summary(app: &App, revision: &RevisionRecord) -> ServiceSummary {
     }
 }
 
-/// A service with everything known of it.
+/// Returns everything known of a service.
 pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
-    let current = app.catalogue.current(name)?;
+    let current = app.catalogue.current_revision(name)?;
     let revisions = app.state.revisions(name)?;
     Ok(ServiceDetail {
         summary: summary(app, &current),
@@ -59,7 +59,7 @@ pub fn service(app: &App, name: &str) -> Result<ServiceDetail, Error> {
                 argv: node.argv.clone(),
             })
             .collect(),
-        interface: interface(current.flavour.ros.bus(), &current.interface),
+        interface: interface(current.flavour.ros.ros_version(), &current.interface),
         shared: current.plan.shared,
         groups: app.choreographer.groups(name),
     })
@@ -178,11 +178,11 @@ fn descriptor(of: &recorded::Descriptor) -> api::interface::Descriptor {
     }
 }
 
-/// The daemon at a glance.
+/// Returns the daemon's status.
 pub async fn status(app: &App) -> Result<Status, Error> {
     let servants = app.choreographer.servants();
-    let usage = used(&servants).await;
-    let (capacity, taken, waiting) = app.choreographer.admission().look();
+    let usage = total_usage(&servants).await;
+    let (capacity, taken, waiting) = app.choreographer.admission().snapshot();
     let (warm_pool, warm_nodes) = app.choreographer.warm_pool();
     Ok(Status {
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -216,14 +216,14 @@ pub async fn status(app: &App) -> Result<Status, Error> {
             .warnings
             .iter()
             .cloned()
-            .chain(app.state.unwritable())
-            .chain(app.choreographer.admission().stalled())
+            .chain(app.state.outage_message())
+            .chain(app.choreographer.admission().stall_reason())
             .collect(),
     })
 }
 
-/// What they use together, and how much the machine waits.
-async fn used(servants: &[Arc<Handle>]) -> api::Usage {
+/// Returns the servants' total usage, and the machine's pressure.
+async fn total_usage(servants: &[Arc<Handle>]) -> api::Usage {
     let mut sum = api::Usage {
         pressure: servant::host::pressure(),
         ..api::Usage::default()
@@ -240,7 +240,7 @@ async fn used(servants: &[Arc<Handle>]) -> api::Usage {
     sum
 }
 
-/// A line of a servant's log.
+/// Converts a line of a servant's log.
 pub fn log_line(line: servant::engine::LogLine) -> api::LogLine {
     api::LogLine {
         time: store::millis(line.time),

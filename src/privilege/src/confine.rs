@@ -1,4 +1,4 @@
-//! Giving up rights, for the calling thread alone and for good.
+//! Dropping of privileges, for the calling thread alone and irrevocably.
 
 use std::io;
 
@@ -7,47 +7,47 @@ use nix::unistd::User;
 
 use crate::Error;
 
-/// The user and group of threads without capabilities, where no other is configured. Of the numbers that systemd's list of
-/// user ids (UIDS-GIDS.md) gives to nobody; servants have theirs from 0x70000000 on.
+/// Default user and group of threads without capabilities. One of the numbers that systemd's list of user ids
+/// (UIDS-GIDS.md) assigns to nobody; servants use numbers from 0x70000000 on.
 pub const DEFAULT_USER: u32 = 65521;
 
-/// What the daemon keeps for the engine's threads and the programs that these start.
+/// Capabilities that the daemon keeps for the engine's threads and the programs that these start.
 pub const KEPT: [Capability; 16] = [
-    // Trees of builds and layers: owners, modes, set-user-id bits and file capabilities that packages have.
+    // Trees of builds and layers: owners, modes, set-user-id bits and file capabilities of packages.
     Capability::CAP_CHOWN,
     Capability::CAP_DAC_OVERRIDE,
     Capability::CAP_DAC_READ_SEARCH,
     Capability::CAP_FOWNER,
     Capability::CAP_FSETID,
     Capability::CAP_SETFCAP,
-    // Whiteouts of overlays, devices of bases.
+    // Whiteouts of overlays, devices of base images.
     Capability::CAP_MKNOD,
-    // Ending containers, and finding the namespaces of shims.
+    // Killing containers, and finding the namespaces of shims.
     Capability::CAP_KILL,
     Capability::CAP_SYS_PTRACE,
-    // User ids of containers and of apt's downloads; giving up capabilities.
+    // User ids of containers and of apt's downloads; dropping capabilities.
     Capability::CAP_SETUID,
     Capability::CAP_SETGID,
     Capability::CAP_SETPCAP,
-    // Namespaces, mounts, device filters of cgroups; lo inside; ports below 1024.
+    // Namespaces, mounts, device filters of cgroups; lo in containers; ports below 1024.
     Capability::CAP_SYS_ADMIN,
     Capability::CAP_SYS_CHROOT,
     Capability::CAP_NET_ADMIN,
     Capability::CAP_NET_BIND_SERVICE,
 ];
 
-/// What those threads of the engine keep that read what strangers have written.
+/// Capability kept by the engine's threads that read untrusted files.
 pub(crate) const READING: Capability = Capability::CAP_DAC_READ_SEARCH;
 
-/// Held where the process has it, and not missed where it has not: limits of open files of servants.
+/// Kept if the process has it, but not required: for limits of open files of servants.
 const KEPT_IF_THERE: Capability = Capability::CAP_SYS_RESOURCE;
 
-/// Whose rights to files a thread has that has no capabilities.
+/// User and group that determine the file permissions of a thread without capabilities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Account {
-    /// The user's number; never root's.
+    /// User id; never root's.
     pub user: u32,
-    /// The group's number; never root's.
+    /// Group id; never root's.
     pub group: u32,
 }
 
@@ -61,7 +61,7 @@ impl Default for Account {
 }
 
 impl Account {
-    /// A user by name or number. A number need not have a name.
+    /// Looks up a user by name or number. A number need not have a name.
     pub fn find(written: &str) -> Result<Self, Error> {
         let unknown = || Error::Unknown {
             written: written.to_owned(),
@@ -80,65 +80,71 @@ impl Account {
                 }
             }
         };
-        // The greatest number means "unchanged" to setresuid(2).
+        // The largest number means "unchanged" to setresuid(2).
         let real = |number| number != 0 && number != u32::MAX;
-        match real(account.user) && real(account.group) {
-            true => Ok(account),
-            false => Err(unknown()),
+        if real(account.user) && real(account.group) {
+            Ok(account)
+        } else {
+            Err(unknown())
         }
     }
 }
 
-fn failed(action: &'static str) -> impl FnOnce(caps::errors::CapsError) -> Error {
+fn capabilities_error(action: &'static str) -> impl FnOnce(caps::errors::CapsError) -> Error {
     move |source| Error::Capabilities { action, source }
 }
 
-/// Takes from the calling thread, and those it starts, every capability but [`KEPT`]; programs that they execute get no
-/// others either. To be called before the process has other threads.
-pub fn limit() -> Result<(), Error> {
+/// Removes all capabilities but [`KEPT`] from the calling thread and the threads it starts; programs they execute
+/// cannot regain others. Must be called before the process has other threads.
+pub fn limit_capabilities() -> Result<(), Error> {
     let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
-    hold(&kept)
+    set_capabilities(&kept)
 }
 
-/// Leaves the calling thread `capabilities` alone.
-pub fn only(capabilities: &[Capability]) -> Result<(), Error> {
-    hold(&capabilities.iter().copied().collect())
+/// Restricts the calling thread to `capabilities`.
+pub fn retain_capabilities(capabilities: &[Capability]) -> Result<(), Error> {
+    set_capabilities(&capabilities.iter().copied().collect())
 }
 
-fn hold(kept: &CapsHashSet) -> Result<(), Error> {
-    let bounding = caps::read(None, CapSet::Bounding).map_err(failed("read the bounding set"))?;
-    // Without this capability nothing can be taken from the bounding set; nor can a program that is executed gain from
-    // it what this thread has not.
+fn set_capabilities(kept: &CapsHashSet) -> Result<(), Error> {
+    let bounding =
+        caps::read(None, CapSet::Bounding).map_err(capabilities_error("read the bounding set"))?;
+    // Without this capability nothing can be removed from the bounding set; nor can an executed program gain from the
+    // set what this thread does not have.
     let may = caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP);
-    if may.map_err(failed("read the effective capabilities"))? {
+    if may.map_err(capabilities_error("read the effective capabilities"))? {
         for capability in bounding.difference(kept) {
             caps::drop(None, CapSet::Bounding, *capability)
-                .map_err(failed("give up a capability for good"))?;
+                .map_err(capabilities_error("give up a capability for good"))?;
         }
     }
-    let held = caps::read(None, CapSet::Permitted).map_err(failed("read the capabilities"))?;
+    let held =
+        caps::read(None, CapSet::Permitted).map_err(capabilities_error("read the capabilities"))?;
     let kept: CapsHashSet = held.intersection(kept).copied().collect();
-    caps::clear(None, CapSet::Ambient).map_err(failed("clear the ambient capabilities"))?;
-    caps::clear(None, CapSet::Inheritable).map_err(failed("clear the inheritable capabilities"))?;
-    caps::set(None, CapSet::Effective, &kept).map_err(failed("give up capabilities"))?;
-    caps::set(None, CapSet::Permitted, &kept).map_err(failed("give up capabilities"))
+    caps::clear(None, CapSet::Ambient)
+        .map_err(capabilities_error("clear the ambient capabilities"))?;
+    caps::clear(None, CapSet::Inheritable)
+        .map_err(capabilities_error("clear the inheritable capabilities"))?;
+    caps::set(None, CapSet::Effective, &kept)
+        .map_err(capabilities_error("give up capabilities"))?;
+    caps::set(None, CapSet::Permitted, &kept).map_err(capabilities_error("give up capabilities"))
 }
 
-/// Takes every right from the calling thread, for good: no capability, no group but `account`'s, all user ids (real,
-/// effective, saved, of files) `account`'s, and no program that it executes gains anything. Checked by reading it back.
-/// Does nothing more to a thread that is confined already.
+/// Removes all privileges from the calling thread, irrevocably: it keeps no capability and no group but `account`'s,
+/// all its user ids (real, effective, saved, file system) become `account`'s, and programs it executes gain nothing.
+/// The result is verified by reading it back. Does nothing more to a thread that is confined already.
 pub fn confine(account: Account) -> Result<(), Error> {
     confine_to(account, &CapsHashSet::new())
 }
 
-/// The same, but for the right to read every file.
+/// Confines the calling thread like [`confine`], but leaves it the right to read every file.
 pub(crate) fn confine_to_reading(account: Account) -> Result<(), Error> {
     let failed = |errno: nix::errno::Errno| Error::Account {
         user: account.user,
         group: account.group,
         source: errno.into(),
     };
-    // Else another user has no capability.
+    // Otherwise changing the user id would clear the capabilities.
     nix::sys::prctl::set_keepcaps(true).map_err(failed)?;
     confine_to(account, &CapsHashSet::from([READING]))?;
     nix::sys::prctl::set_keepcaps(false).map_err(failed)
@@ -152,28 +158,29 @@ fn confine_to(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
     };
     let user = nix::unistd::geteuid().as_raw();
     if user != account.user {
-        // The bounding set goes first: it takes a capability to empty it.
-        let bounding =
-            caps::read(None, CapSet::Bounding).map_err(failed("read the bounding set"))?;
+        // The bounding set goes first: changing it needs a capability.
+        let bounding = caps::read(None, CapSet::Bounding)
+            .map_err(capabilities_error("read the bounding set"))?;
         for capability in bounding.difference(kept) {
             caps::drop(None, CapSet::Bounding, *capability)
-                .map_err(failed("give up a capability for good"))?;
+                .map_err(capabilities_error("give up a capability for good"))?;
         }
         become_account(account).map_err(failed_for_account)?;
     }
-    hold(kept)?;
+    set_capabilities(kept)?;
     nix::sys::prctl::set_no_new_privs().map_err(|errno| failed_for_account(errno.into()))?;
-    check(account, kept)
+    verify_confined(account, kept)
 }
 
-/// The C library's functions of these names change all threads of the process; the system calls change this one.
+/// Changes the ids of this thread by system calls; the C library's functions of the same names would change all threads
+/// of the process.
 fn become_account(account: Account) -> io::Result<()> {
     let Account { user, group } = account;
     let done = |outcome: libc::c_long| match outcome {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     };
-    // SAFETY: a list of no groups, which is not read.
+    // SAFETY: an empty list of groups, which is not read.
     done(unsafe { libc::syscall(libc::SYS_setgroups, 0_usize, std::ptr::null::<u32>()) })?;
     // SAFETY: no pointers.
     done(unsafe { libc::syscall(libc::SYS_setresgid, group, group, group) })?;
@@ -181,8 +188,8 @@ fn become_account(account: Account) -> io::Result<()> {
     done(unsafe { libc::syscall(libc::SYS_setresuid, user, user, user) })
 }
 
-/// What the kernel says that the calling thread has beyond `kept`.
-fn check(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
+/// Verifies with the kernel that the calling thread has nothing beyond `kept`.
+fn verify_confined(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
     let left = |left: String| Err(Error::Left { left });
     for set in [
         CapSet::Effective,
@@ -191,7 +198,7 @@ fn check(account: Account, kept: &CapsHashSet) -> Result<(), Error> {
         CapSet::Ambient,
         CapSet::Bounding,
     ] {
-        let held = caps::read(None, set).map_err(failed("read the capabilities"))?;
+        let held = caps::read(None, set).map_err(capabilities_error("read the capabilities"))?;
         let more = held.difference(kept).count();
         if more > 0 {
             return left(format!("{more} capabilities ({set:?})"));

@@ -1,4 +1,4 @@
-//! The engine's threads, and how work gets there.
+//! The engine's threads, and the handover of work to them.
 
 use std::cell::Cell;
 use std::future::Future;
@@ -15,16 +15,16 @@ use crate::{Account, Error};
 static ENGINE: OnceLock<(Handle, Account)> = OnceLock::new();
 
 thread_local! {
-    /// Whether this is one of the engine's threads.
+    /// Set on the engine's threads.
     static OF_ENGINE: Cell<bool> = const { Cell::new(false) };
 }
 
-/// The engine's threads. There is one such set in a process.
+/// The engine's threads. A process has one such set.
 pub struct Engine(Runtime);
 
 impl Engine {
-    /// Starts them with the rights of the calling thread, for all work that is handed over from now on. `others`: who the
-    /// threads are that hand it over.
+    /// Starts the threads with the privileges of the calling thread, for all work handed over from now on. `others` is
+    /// the account of the threads that hand it over.
     pub fn start(others: Account) -> Result<Self, Error> {
         let runtime = Builder::new_multi_thread()
             .enable_all()
@@ -36,32 +36,32 @@ impl Engine {
         Ok(Self(runtime))
     }
 
-    /// Ends them; what still works after `patience` is left to the process's end.
+    /// Stops the threads; work that still runs after `patience` is abandoned to the end of the process.
     pub fn end(self, patience: Duration) {
         self.0.shutdown_timeout(patience);
     }
 }
 
-/// Where work is to be handed to: none on the engine's threads themselves, and where there are none.
-fn elsewhere() -> Option<&'static Handle> {
+/// Returns the runtime to hand work to; `None` on the engine's threads themselves, and if there are none.
+fn handoff_target() -> Option<&'static Handle> {
     let (engine, _) = ENGINE.get()?;
     (!OF_ENGINE.get()).then_some(engine)
 }
 
-/// Who the threads are that have no rights; none where there are no such threads.
-pub fn confined() -> Option<Account> {
+/// Returns the account of the confined threads; `None` if there are no such threads.
+pub fn confined_account() -> Option<Account> {
     ENGINE.get().map(|(_, account)| *account)
 }
 
-/// On the engine's threads: who those are that have no rights.
-pub(crate) fn is_engines() -> Option<Account> {
-    OF_ENGINE.get().then(confined).flatten()
+/// On the engine's threads, returns the account of the confined threads.
+pub(crate) fn account_on_engine() -> Option<Account> {
+    OF_ENGINE.get().then(confined_account).flatten()
 }
 
-/// Work that was handed over; it goes on when this is dropped.
-pub struct Task<T>(Handed<T>);
+/// Work that was handed over; it continues when this is dropped.
+pub struct Task<T>(EngineHandle<T>);
 
-enum Handed<T> {
+enum EngineHandle<T> {
     Here(JoinHandle<T>),
     There(JoinHandle<Result<T, JoinError>>),
 }
@@ -71,53 +71,53 @@ impl<T> Future for Task<T> {
 
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
         match &mut self.0 {
-            Handed::Here(task) => Pin::new(task).poll(context),
-            Handed::There(task) => Pin::new(task)
+            EngineHandle::Here(task) => Pin::new(task).poll(context),
+            EngineHandle::There(task) => Pin::new(task)
                 .poll(context)
                 .map(|outcome| outcome.and_then(|outcome| outcome)),
         }
     }
 }
 
-/// Begins `work`, which blocks, on a thread of the engine where that may be.
-pub fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Task<T> {
-    Task(match elsewhere() {
-        None => Handed::Here(tokio::task::spawn_blocking(work)),
-        // From there: a thread has the rights of the one that starts it.
+/// Runs blocking `work` on a thread of the engine if there is one.
+pub fn spawn_blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Task<T> {
+    Task(match handoff_target() {
+        None => EngineHandle::Here(tokio::task::spawn_blocking(work)),
+        // Spawned from there, since a thread inherits the privileges of the one that starts it.
         Some(engine) => {
-            Handed::There(engine.spawn(async { tokio::task::spawn_blocking(work).await }))
+            EngineHandle::There(engine.spawn(async { tokio::task::spawn_blocking(work).await }))
         }
     })
 }
 
-/// Ends the task with whoever awaits it.
-struct Awaited<T>(JoinHandle<T>);
+/// Aborts the task when the future that awaits it is dropped.
+struct AbortOnDrop<T>(JoinHandle<T>);
 
-impl<T> Drop for Awaited<T> {
+impl<T> Drop for AbortOnDrop<T> {
     fn drop(&mut self) {
         self.0.abort();
     }
 }
 
-/// Awaits `future` on the engine's threads; it is dropped, there, when this is.
+/// Awaits `future` on the engine's threads; it is dropped there when the returned future is.
 pub async fn run<T: Send + 'static>(future: impl Future<Output = T> + Send + 'static) -> T {
-    let Some(engine) = elsewhere() else {
+    let Some(engine) = handoff_target() else {
         return future.await;
     };
-    let mut task = Awaited(engine.spawn(future));
+    let mut task = AbortOnDrop(engine.spawn(future));
     match (&mut task.0).await {
         Ok(outcome) => outcome,
         Err(error) => match error.try_into_panic() {
             Ok(panic) => std::panic::resume_unwind(panic),
-            // The process is ending.
+            // The process is exiting.
             Err(_) => std::future::pending().await,
         },
     }
 }
 
-/// Does `work`, which is short, on a thread of the engine, and waits for it. Tasks that it starts run there.
-pub fn now<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
-    let Some(engine) = elsewhere() else {
+/// Runs short `work` on a thread of the engine and waits for it. Tasks that it spawns run there.
+pub fn run_sync<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
+    let Some(engine) = handoff_target() else {
         return work();
     };
     let (sender, receiver) = mpsc::sync_channel(1);

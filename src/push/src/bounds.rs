@@ -1,8 +1,8 @@
-//! Limits of one push: how long it takes, and the bytes of its files.
+//! Limits of one push: its duration and the disk space of its files.
 //!
-//! Memory, processes and cores of its containers are limits of their cgroups. Files have no such thing where file
-//! systems are mounted without quotas, so the directory of the build is measured, often enough that a build which
-//! writes without end is ended long before the disk is full.
+//! Memory, processes and cores of its containers are limited by their cgroups. There is no such limit for files on file
+//! systems without quotas, so the build directory is measured, often enough that a build which writes without end is
+//! stopped long before the disk is full.
 
 use std::collections::HashSet;
 use std::future::Future;
@@ -18,25 +18,30 @@ use tokio::time::{Instant, MissedTickBehavior};
 use crate::room::Disks;
 use crate::{Error, Options};
 
-/// How often it is looked whether the file system fills.
+/// Interval at which the usage of the file system is checked.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// How often a build is measured although the file system does not fill: somebody else may be making room in it.
+/// Maximum interval at which a build is measured even if the file system does not fill up, since others may be freeing
+/// space in it.
 const MEASURE_EVERY: Duration = Duration::from_secs(10);
-/// Bytes that each file counts at least, for its inode, name and block.
+/// Minimum size counted for each file, in bytes, for its inode, name and block.
 const LEAST: u64 = 4 << 10;
 
-/// What a push may still use. Waiting does not count.
-pub(super) struct Left<'a> {
+/// Remaining time and disk space of a push. Time spent waiting does not count.
+pub(super) struct PushBudget<'a> {
     options: &'a Options,
     directory: PathBuf,
     disks: &'a Disks,
     time: Duration,
 }
 
-impl<'a> Left<'a> {
-    /// Of a push that works in `directory`.
-    pub(super) fn new(options: &'a Options, directory: PathBuf, disks: &'a Disks) -> Left<'a> {
-        Left {
+impl<'a> PushBudget<'a> {
+    /// Creates the budget of a push that works in `directory`.
+    pub(super) fn new(
+        options: &'a Options,
+        directory: PathBuf,
+        disks: &'a Disks,
+    ) -> PushBudget<'a> {
+        PushBudget {
             options,
             directory,
             disks,
@@ -44,75 +49,77 @@ impl<'a> Left<'a> {
         }
     }
 
-    /// Does a part of the push, within what is left; ended where that is exceeded.
-    pub(super) async fn during<T>(
+    /// Runs a part of the push within the remaining budget; cancels it if the budget is exceeded.
+    pub(super) async fn run_within<T>(
         &mut self,
         work: impl Future<Output = Result<T, Error>>,
     ) -> Result<T, Error> {
         let began = Instant::now();
         let outcome = tokio::select! {
             outcome = work => outcome,
-            error = exceeded(self.options, self.time, &self.directory) => Err(error),
-            error = self.disks.low() => Err(error),
+            error = wait_until_exceeded(self.options, self.time, &self.directory) => Err(error),
+            error = self.disks.wait_until_low() => Err(error),
         };
         self.time = self.time.saturating_sub(began.elapsed());
         outcome
     }
 }
 
-/// Returns when the push that works in `directory` has exceeded a limit, with the error for its client. `time`: what is
-/// left of the limit.
-async fn exceeded(options: &Options, time: Duration, directory: &Path) -> Error {
+/// Waits until the push that works in `directory` has exceeded a limit; returns the error for its client. `time` is the
+/// remaining time.
+async fn wait_until_exceeded(options: &Options, time: Duration, directory: &Path) -> Error {
     let (what, next) = tokio::select! {
         () = tokio::time::sleep(time) => (
             format!("it took longer than {} s", options.time.as_secs()),
-            "push only what is needed, or raise time in [push] of the configuration",
+            "push fewer files, or raise time in [push] of the configuration",
         ),
-        what = overfull(options.disk, directory) => (
+        what = wait_until_overfull(options.disk, directory) => (
             what,
-            "push only what is needed, or raise disk in [push] of the configuration",
+            "push fewer files, or raise disk in [push] of the configuration",
         ),
     };
     Error::Failed {
-        message: format!("the push was ended: {what}"),
+        message: format!("the push was aborted: {what}"),
         next: Some(next.to_owned()),
         log: Vec::new(),
     }
 }
 
-/// Returns when the files of a build exceed their limit, with the reason.
-async fn overfull(most: Size, directory: &Path) -> String {
+/// Waits until the files of a build exceed their limit; returns the reason.
+async fn wait_until_overfull(most: Size, directory: &Path) -> String {
     let mut ticks = tokio::time::interval(LOOK_EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut known = None;
     loop {
         ticks.tick().await;
         let of = directory.to_owned();
-        let taken = privilege::blocking(move || taken(&of)).await.unwrap_or(0);
+        let taken = privilege::spawn_blocking(move || used_bytes(&of))
+            .await
+            .unwrap_or(0);
         if let Some((at, size, then)) = known
             && Instant::now() < at + MEASURE_EVERY
             && size + taken.saturating_sub(then) <= most.0
         {
-            // All that the build can have written since shows in the file system's use.
+            // The usage of the file system bounds all that the build can have written since.
             continue;
         }
         let measured = directory.to_owned();
         // Cancelled with the push.
-        let work = blocking::cancelled_with_this(move || measure(measured, most.0));
-        match privilege::blocking(work).await {
+        let work = blocking::cancel_with_caller(move || measure_tree(measured, most.0));
+        match privilege::spawn_blocking(work).await {
             Ok(Ok(size)) if size > most.0 => {
-                return format!("its files take more than the {most} that a push may have");
+                return format!("its files exceed the limit of {most} per push");
             }
             Ok(Ok(size)) => known = Some((Instant::now(), size, taken)),
             Ok(Err(error @ foreign::Error::TooDeep { .. })) => return error.to_string(),
-            // It is being made or removed, or changes faster than it can be looked at.
+            // The directory is being created or removed, or changes faster than it can be walked.
             Ok(Err(_)) | Err(_) => {}
         }
     }
 }
 
-/// Bytes in use on the file system of a directory.
-fn taken(directory: &Path) -> u64 {
+/// Returns the number of bytes in use on the file system of a directory.
+fn used_bytes(directory: &Path) -> u64 {
     let above = directory.parent().unwrap_or(directory);
     statvfs(above).map_or(0, |about| {
         let blocks = about.blocks().saturating_sub(about.blocks_free());
@@ -120,9 +127,8 @@ fn taken(directory: &Path) -> u64 {
     })
 }
 
-/// Bytes that the files of a directory take, or would take if they had no holes: a layer has none. Counts no further
-/// than a little beyond `most`.
-fn measure(directory: PathBuf, most: u64) -> Result<u64, foreign::Error> {
+/// Returns the size of the files of a directory without holes, as in a layer. Stops counting shortly after `most`.
+fn measure_tree(directory: PathBuf, most: u64) -> Result<u64, foreign::Error> {
     let mut total = 0_u64;
     let mut counted = HashSet::new();
     foreign::walk_changing(&directory, |entry| {
@@ -149,7 +155,7 @@ mod tests {
     fn options() -> Options {
         Options {
             disk: Size(1 << 20),
-            ..Options::wide()
+            ..Options::unlimited()
         }
     }
 
@@ -158,17 +164,17 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let directory = place.path().join("push-1");
         let options = options();
-        let exceeded = exceeded(&options, options.time, &directory);
+        let exceeded = wait_until_exceeded(&options, options.time, &directory);
         let written = directory.clone();
         tokio::task::spawn_blocking(move || {
             std::fs::create_dir_all(written.join("upper")).expect("made");
-            // A hole, which becomes as large as it says when it is packed and extracted.
+            // A sparse file, which grows to its apparent size when it is packed and extracted.
             let file = std::fs::File::create(written.join("upper/sparse")).expect("made");
             file.set_len(2 << 20).expect("set");
         })
         .await
         .expect("no panic");
-        let told = exceeded.await.words();
+        let told = exceeded.await.message_and_advice();
         assert!(
             told.contains("1M") && told.contains("raise disk in [push] of the configuration"),
             "{told}"
@@ -184,16 +190,18 @@ mod tests {
             disk: Size(1 << 30),
             ..options()
         };
-        let told = exceeded(&options, options.time, &directory).await.words();
+        let told = wait_until_exceeded(&options, options.time, &directory)
+            .await
+            .message_and_advice();
         assert!(told.contains("directories deep"), "{told}");
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_push_that_takes_too_long_is_told_so() {
         let place = tempfile::tempdir().expect("a directory");
-        let told = exceeded(&options(), options().time, &place.path().join("none"))
+        let told = wait_until_exceeded(&options(), options().time, &place.path().join("none"))
             .await
-            .words();
+            .message_and_advice();
         assert!(
             told.contains("longer than 7200 s") && told.contains("raise time"),
             "{told}"
@@ -206,7 +214,7 @@ mod tests {
         for number in 0..10 {
             std::fs::write(place.path().join(number.to_string()), "").expect("written");
         }
-        let before = measure(place.path().to_owned(), u64::MAX).expect("measured");
+        let before = measure_tree(place.path().to_owned(), u64::MAX).expect("measured");
         assert!(before >= 11 * LEAST, "{before}");
         let first = place.path().join("0");
         std::fs::write(&first, vec![1; 1 << 20]).expect("written");
@@ -214,7 +222,7 @@ mod tests {
             std::fs::hard_link(&first, place.path().join(format!("again-{number}")))
                 .expect("linked");
         }
-        let after = measure(place.path().to_owned(), u64::MAX).expect("measured");
+        let after = measure_tree(place.path().to_owned(), u64::MAX).expect("measured");
         let grown = after - before;
         assert!(((1 << 20) - LEAST..2 << 20).contains(&grown), "{grown}");
     }

@@ -1,69 +1,67 @@
-/// Why something is not pushed, set back or removed.
+/// Errors of pushing, rolling back and removing services.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The name is that of a service of another package.
-    #[error(
-        "the service name {name} is taken: it was made of the package {package}, and this one is {newcomer}"
-    )]
+    /// The name belongs to a service of another package.
+    #[error("the service name {name} is taken: its package is {package}, not {newcomer}")]
     NameTaken {
-        /// The name.
+        /// Name of the service.
         name: String,
-        /// The package.
+        /// Package of the existing service.
         package: String,
-        /// Who wants it.
+        /// Package that was pushed.
         newcomer: String,
     },
-    /// Whoever pushes may not publish it.
+    /// The deployer is not allowed to publish the service.
     #[error("{0}")]
     NotAllowed(String),
-    /// Something in the options is not what it should be.
+    /// Invalid options.
     #[error("{0}")]
     Options(String),
-    /// A push that failed.
+    /// The push failed.
     #[error("{message}")]
     Failed {
-        /// What failed.
+        /// Description of the failure.
         message: String,
-        /// The next step.
+        /// Suggested next step.
         next: Option<String>,
-        /// What explains it.
+        /// Log lines that explain the failure.
         log: Vec<String>,
     },
-    /// The archive is too big.
-    #[error("the archive is bigger than {limit}")]
+    /// The archive is too large.
+    #[error("the archive is larger than {limit}")]
     TooLarge {
-        /// What is allowed.
+        /// Maximum size.
         limit: api::Size,
     },
-    /// The daemon is ending.
-    #[error("the daemon is ending")]
+    /// The daemon is shutting down.
+    #[error("the daemon is shutting down")]
     Ending,
-    /// Servants.
+    /// Error of the choreographer.
     #[error(transparent)]
     Choreographer(#[from] choreographer::Error),
-    /// What is published.
+    /// Error of the catalogue.
     #[error(transparent)]
     Catalogue(#[from] catalogue::Error),
-    /// The state database.
+    /// Error of the state database.
     #[error(transparent)]
     State(#[from] store::Error),
-    /// The image store.
+    /// Error of the image store.
     #[error("the image store: {0}")]
     Image(#[from] image::Error),
-    /// The engine.
+    /// Error of the container engine.
     #[error(transparent)]
     Engine(#[from] servant::Error),
-    /// A task of the daemon broke.
-    #[error("the daemon failed at {0}; its log says more")]
+    /// A task of the daemon panicked.
+    #[error("internal error of the daemon while {0}; see its log")]
     Internal(&'static str),
 }
 
 #[cfg(test)]
 impl Error {
-    /// Message and advice of a push that failed.
-    pub(crate) fn words(self) -> String {
+    /// Returns the message and the advice of a failed push.
+    pub(crate) fn message_and_advice(self) -> String {
         let Error::Failed { message, next, .. } = self else {
-            panic!("{self} is no failed push");
+            panic!("{self} is not a failed push");
         };
         format!("{message}; {}", next.unwrap_or_default())
     }

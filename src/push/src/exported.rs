@@ -1,6 +1,6 @@
-//! A revision as it goes from one server to another: its image as an OCI image layout, and beside it this record, which says what image
-//! tools have no words for. `GET /api/v1/services/NAME/record` gives it, `cloudroidctl export` puts it into the archive as a blob that the
-//! annotation [`RECORD`] of the image names, and a push of the archive reads it.
+//! Transfer of a revision from one server to another: its image as an OCI image layout, together with this record of
+//! what OCI images cannot express. `GET /api/v1/services/NAME/record` returns it, `cloudroidctl export` adds it to the
+//! archive as a blob named by the image's annotation [`RECORD`], and a push of the archive reads it.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,13 +9,13 @@ use std::sync::Arc;
 use api::PushOptions;
 use api::dictionary::{NewRows, Row};
 use foreign::Tree;
-use image::Received;
+use image::ReceivedImage;
 use package::interface::Interface;
-use package::inventory::{Inventory, Published};
+use package::inventory::{Inventory, SearchHints};
 use package::names::{is_graph_name, is_package};
 use package::requests::Reason;
 use rootfs_builder::{
-    BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, wrong_with_components,
+    BuildOutcome, BuiltLayer, LaunchNode, LaunchPlan, blocking, find_components_problem,
 };
 use ros::flavour::Flavour;
 use serde::{Deserialize, Serialize};
@@ -23,43 +23,43 @@ use servant::spec::NodeSpec;
 use store::{Plan, RevisionRecord};
 
 use super::request::Reporter;
-use super::{Error, HOME_INSIDE, Made, Options, Pusher};
+use super::{Error, HOME_INSIDE, Options, PushedImage, Pusher};
 
-/// The annotation of the image's entry whose value is the digest of the record.
+/// Annotation of the image's index entry with the digest of the record.
 pub const RECORD: &str = "org.cloudroid.record";
-/// Of this module's form.
+/// Format version of the record.
 const FORMAT: u32 = 1;
-/// Characters of what was pushed, in words, that are kept: each export and import adds some.
+/// Maximum length of the description of what was pushed, in characters; each export and import extends it.
 const LONGEST_SOURCE: usize = 200;
-/// Bytes of a record at most: as values in memory it takes many times as much.
+/// Maximum size of a record in bytes; decoded it takes many times as much memory.
 const LARGEST_RECORD: usize = 4 << 20;
-/// Nodes of a service at most.
+/// Maximum number of nodes of a service.
 const MOST_NODES: usize = 256;
 
-/// What of a revision is not in its image.
+/// Properties of a revision that are not part of its image.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ServiceRecord {
-    /// Of the record; 1.
+    /// Format version of the record; 1.
     pub format: u32,
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The ROS package.
+    /// ROS package.
     pub package: String,
-    /// What was pushed, in words.
+    /// Human-readable description of what was pushed.
     pub source: String,
-    /// The ROS that its image is built for.
+    /// ROS flavour that the image is built for.
     pub flavour: Flavour,
-    /// How its servants are started.
+    /// Launch plan of its servants.
     pub plan: Plan,
-    /// Its interface, definitions included.
+    /// Interface, with message definitions.
     pub interface: Interface,
-    /// What a measure of an SLA costs, as it was measured there.
+    /// Dictionary rows, as measured on the exporting server.
     pub dictionary: Vec<Row>,
 }
 
 impl ServiceRecord {
-    /// Of a revision, with the rows of its service.
-    pub fn of(revision: &RevisionRecord, rows: Vec<Row>) -> Self {
+    /// Creates the record of a revision with the dictionary rows of its service.
+    pub fn from_revision(revision: &RevisionRecord, rows: Vec<Row>) -> Self {
         ServiceRecord {
             format: FORMAT,
             service: revision.service.clone(),
@@ -72,66 +72,69 @@ impl ServiceRecord {
         }
     }
 
-    /// Reads the record that an image's entry names.
+    /// Reads the record named by the annotations of an image's index entry.
     fn read(layout: &Tree, annotations: &BTreeMap<String, String>) -> Result<Self, Error> {
         let Some(digest) = annotations.get(RECORD) else {
-            return Err(refused(
-                "the image was not exported from a service, and does not say how its nodes are started".to_owned(),
-                "push the package itself, or what cloudroidctl export has written",
+            return Err(refusal(
+                "the image is not an exported service: it does not state how its nodes are started"
+                    .to_owned(),
+                "push the package itself, or a file of cloudroidctl export",
             ));
         };
         let bytes = digest
             .parse()
-            .and_then(|digest| image::document(layout, &digest))
-            .map_err(unreceivable)?;
+            .and_then(|digest| image::read_layout_document(layout, &digest))
+            .map_err(receive_error)?;
         if bytes.len() > LARGEST_RECORD {
-            return Err(unreadable(&format!(
-                "it has {} bytes, and at most {LARGEST_RECORD} are read",
+            return Err(unreadable_record(&format!(
+                "it has {} bytes; the limit is {LARGEST_RECORD}",
                 bytes.len()
             )));
         }
-        let record: Self =
-            serde_json::from_slice(&bytes).map_err(|error| unreadable(&error.to_string()))?;
+        let record: Self = serde_json::from_slice(&bytes)
+            .map_err(|error| unreadable_record(&error.to_string()))?;
         if record.format != FORMAT {
-            return Err(refused(
+            return Err(refusal(
                 format!(
-                    "the record of the exported service is of form {}, and {FORMAT} is read here",
+                    "the record of the exported service has format {}; supported is {FORMAT}",
                     record.format
                 ),
-                "export it with the version of cloudroidctl that is used here",
+                "export it with this server's version of cloudroidctl",
             ));
         }
-        record.check().map_err(|problem| unreadable(&problem))?;
+        record
+            .check()
+            .map_err(|problem| unreadable_record(&problem))?;
         Ok(record)
     }
 
-    /// What a push would have made sure of.
+    /// Checks what a regular push would have ensured.
     fn check(&self) -> Result<(), String> {
         if !is_package(&self.package) {
-            return Err(format!("{:?} is no name of a package", self.package));
+            return Err(format!("{:?} is not a valid package name", self.package));
         }
         let word = |text: &str| {
             let is_of_it = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
             !text.is_empty() && text.len() < 100 && text.chars().all(is_of_it)
         };
         if !word(&self.flavour.base) || !word(&self.flavour.distribution) {
-            return Err("its base or distribution is no name".to_owned());
+            return Err("its base or distribution is not a valid name".to_owned());
         }
         if self.plan.nodes.is_empty() {
-            return Err("it starts no node".to_owned());
+            return Err("it starts no nodes".to_owned());
         }
         if self.plan.nodes.len() > MOST_NODES {
             return Err(format!(
-                "it starts {} nodes, and at most {MOST_NODES} can be",
+                "it starts {} nodes; the limit is {MOST_NODES}",
                 self.plan.nodes.len()
             ));
         }
-        environment(&self.plan.environment)?;
+        check_environment(&self.plan.environment)?;
         for node in &self.plan.nodes {
             check_node(node)?;
         }
         let is_node = |name: &String| self.plan.nodes.iter().any(|node| node.name == *name);
-        if let Some(problem) = wrong_with_components(&self.plan.components, &is_node) {
+        if let Some(problem) = find_components_problem(&self.plan.components, &is_node) {
             return Err(problem);
         }
         if let Some(name) = self
@@ -140,21 +143,22 @@ impl ServiceRecord {
             .keys()
             .find(|name| !is_graph_name(name))
         {
-            return Err(format!("{name:?} is no name of a parameter"));
+            return Err(format!("{name:?} is not a valid parameter name"));
         }
         Ok(())
     }
 
-    /// As options of a push, of which `asked` may say the name, the source and the rollout.
-    fn options(&self, asked: &PushOptions) -> Result<PushOptions, Error> {
+    /// Returns the equivalent push options; `asked` may give the name, source and rollout.
+    fn push_options(&self, asked: &PushOptions) -> Result<PushOptions, Error> {
         let plan = &self.plan;
         let interface = serde_json::to_string(&self.interface);
-        let interface = interface.map_err(|error| unreadable(&error.to_string()))?;
+        let interface = interface.map_err(|error| unreadable_record(&error.to_string()))?;
         let printable = self.source.chars().filter(|c| !c.is_control());
         let before: String = printable.take(LONGEST_SOURCE).collect();
-        let source = match asked.source.is_empty() {
-            true => before,
-            false => format!("{}, exported from {before}", asked.source),
+        let source = if asked.source.is_empty() {
+            before
+        } else {
+            format!("{}, exported from {before}", asked.source)
         };
         Ok(PushOptions {
             name: Some(asked.name.clone().unwrap_or_else(|| self.service.clone())),
@@ -177,8 +181,8 @@ impl ServiceRecord {
         })
     }
 
-    /// Rows that are written where the service has none yet.
-    pub(super) fn rows(&self) -> NewRows {
+    /// Returns the rows to write if the service has no dictionary yet.
+    pub(super) fn new_rows(&self) -> NewRows {
         NewRows {
             rows: self.dictionary.clone(),
             replace: false,
@@ -188,95 +192,92 @@ impl ServiceRecord {
 
 fn check_node(node: &NodeSpec) -> Result<(), String> {
     if !is_graph_name(&node.name) {
-        return Err(format!("{:?} is no name of a node", node.name));
+        return Err(format!("{:?} is not a valid node name", node.name));
     }
     let argv = &node.argv;
     let is_program = argv.first().is_some_and(|program| program.starts_with('/'));
     if !is_program || argv.iter().any(|word| word.contains('\0')) {
-        return Err(format!(
-            "node {} has no program that can be started",
-            node.name
-        ));
+        return Err(format!("node {} has no valid program", node.name));
     }
     if !(0.0..=1e6).contains(&node.respawn_delay) {
-        return Err(format!(
-            "node {} comes again after no time that can be",
-            node.name
-        ));
+        return Err(format!("node {} has an invalid respawn delay", node.name));
     }
-    environment(&node.environment)
+    check_environment(&node.environment)
 }
 
-fn environment(variables: &BTreeMap<String, String>) -> Result<(), String> {
+fn check_environment(variables: &BTreeMap<String, String>) -> Result<(), String> {
     let is_good = |(name, value): &(&String, &String)| {
         !name.is_empty() && !name.contains(['=', '\0']) && !value.contains('\0')
     };
     match variables.iter().find(|variable| !is_good(variable)) {
-        Some((name, _)) => Err(format!("{name:?} is no variable of an environment")),
+        Some((name, _)) => Err(format!("{name:?} is not a valid environment variable")),
         None => Ok(()),
     }
 }
 
-/// An exported service whose image is in the store.
-pub(super) struct Imported {
+/// An exported service whose image has been imported into the store.
+pub(super) struct ImportedService {
     pub(super) record: ServiceRecord,
     pub(super) options: PushOptions,
     pub(super) built: BuildOutcome,
 }
 
 impl Pusher {
-    /// An exported service, whose image is there already.
-    pub(super) async fn taken_in(
+    /// Imports an exported service from the unpacked archive.
+    pub(super) async fn import(
         &self,
         options: &PushOptions,
         tree: PathBuf,
         report: &Reporter,
-    ) -> Result<Made, Error> {
+    ) -> Result<PushedImage, Error> {
         check_options(options)?;
-        report.step("taking in the exported service").await;
+        report.step("importing the exported service").await;
         let store = Arc::clone(self.catalogue.images());
         let (asked, limits) = (options.clone(), self.options.clone());
-        let work = blocking::cancelled_with_this(move || take_in(&store, &tree, &asked, &limits));
-        let imported = privilege::blocking(work)
+        let work =
+            blocking::cancel_with_caller(move || import_image(&store, &tree, &asked, &limits));
+        let imported = privilege::spawn_blocking(work)
             .await
-            .map_err(|_| Error::Internal("taking in an exported service"))??;
-        Ok(Made::Imported(Box::new(imported)))
+            .map_err(|_| Error::Internal("importing an exported service"))??;
+        Ok(PushedImage::Imported(Box::new(imported)))
     }
 
-    /// Writes the rows of an exported service, where there are none: those that were measured here are better. The
-    /// service is published without them, too.
-    pub(super) fn take_over_rows(&self, name: &str, record: &ServiceRecord, report: &Reporter) {
-        let rows = record.rows();
+    /// Writes the dictionary rows of an exported service if the service has none; rows measured here are better.
+    /// Failures are only warnings.
+    pub(super) fn import_dictionary(&self, name: &str, record: &ServiceRecord, report: &Reporter) {
+        let rows = record.new_rows();
         if rows.rows.is_empty() {
             return;
         }
         let outcome = match rows.rows.iter().try_for_each(choreographer::check_row) {
-            _ if rows.rows.len() > choreographer::MOST_ROWS => Err("there are too many".to_owned()),
-            Err(reason) => Err(reason),
-            Ok(()) => {
-                (self.catalogue.take_over_rows(name, &rows)).map_err(|error| error.to_string())
+            _ if rows.rows.len() > choreographer::MOST_ROWS => {
+                Err("it has too many entries".to_owned())
             }
+            Err(reason) => Err(reason),
+            Ok(()) => (self.catalogue.initialize_dictionary(name, &rows))
+                .map_err(|error| error.to_string()),
         };
         let count = rows.rows.len();
         let words = match outcome {
             Ok(true) => format!(
-                "its dictionary has {count} rows that were measured on another machine; measure them here with: cloudroidctl calibrate {name}"
+                "its SLA table has {count} entries that were measured on another machine; measure again here with: \
+                    cloudroidctl calibrate {name}"
             ),
             Ok(false) => format!(
-                "{name} has a dictionary already, which stays; the exported one of {count} rows is left out"
+                "{name} keeps its existing SLA table; the {count} exported entries were not imported"
             ),
-            Err(reason) => format!("the exported dictionary is left out: {reason}"),
+            Err(reason) => format!("the exported SLA table was not imported: {reason}"),
         };
-        report.last_warning(words);
+        report.try_warning(words);
     }
 }
 
-/// Whether what was sent is an exported service.
+/// Returns whether an unpacked archive is an exported service.
 pub(super) fn is_exported(tree: &Path) -> bool {
     Tree::open(tree).is_ok_and(|tree| image::is_layout(&tree))
 }
 
-/// Refuses options that an exported service says itself.
+/// Rejects options that are determined by the exported service.
 fn check_options(asked: &PushOptions) -> Result<(), Error> {
     let left = PushOptions {
         name: None,
@@ -286,38 +287,39 @@ fn check_options(asked: &PushOptions) -> Result<(), Error> {
     };
     if left != PushOptions::default() {
         return Err(Error::Options(
-            "an exported service says itself how it is started and limited; only its name and the terms of its rollout can be given"
+            "an exported service includes its start commands and limits; only its name and the rollout options can be \
+                given"
                 .to_owned(),
         ));
     }
     Ok(())
 }
 
-/// Takes an exported service into the store; blocks.
-fn take_in(
+/// Imports an exported service into the store. Blocking.
+fn import_image(
     store: &image::Store,
     tree: &Path,
     asked: &PushOptions,
     limits: &Options,
-) -> Result<Imported, Error> {
+) -> Result<ImportedService, Error> {
     let hold = store.hold()?;
-    let layout = Tree::open(tree).map_err(|error| unreadable(&error.to_string()))?;
+    let layout = Tree::open(tree).map_err(|error| unreadable_record(&error.to_string()))?;
     let bounds = image::Limits {
         entries: limits.entries,
         bytes: limits.unpacked.0,
         ..image::Limits::default()
     };
-    let received = store.receive(&layout, &bounds).map_err(unreceivable)?;
-    let record = privilege::reading(|| ServiceRecord::read(&layout, &received.annotations))?;
-    let inventory = inventory(store, &received, &record)?;
-    let options = record.options(asked)?;
-    let nodes = record.plan.nodes.iter().map(launched).collect();
+    let received = store.receive(&layout, &bounds).map_err(receive_error)?;
+    let record = privilege::run_as_reader(|| ServiceRecord::read(&layout, &received.annotations))?;
+    let inventory = take_inventory(store, &received, &record)?;
+    let options = record.push_options(asked)?;
+    let nodes = record.plan.nodes.iter().map(launch_node).collect();
     let built = BuildOutcome {
         package: record.package.clone(),
         version: String::new(),
         flavour: record.flavour.clone(),
         image: received.image.digest,
-        layers: layers(&received),
+        layers: built_layers(&received),
         environment: record.plan.environment.clone(),
         plan: LaunchPlan {
             nodes,
@@ -327,46 +329,49 @@ fn take_in(
         inventory,
         hold,
     };
-    Ok(Imported {
+    Ok(ImportedService {
         record,
         options,
         built,
     })
 }
 
-/// What the image holds: looked for here, whatever the record says.
-fn inventory(
+/// Takes the inventory of the image, regardless of the record.
+fn take_inventory(
     store: &image::Store,
-    received: &Received,
+    received: &ReceivedImage,
     record: &ServiceRecord,
 ) -> Result<Inventory, Error> {
     let layers = received.image.spec.layers.iter();
     let trees: Result<Vec<_>, _> = layers
-        .map(|layer| store.extracted(&layer.diff_id))
+        .map(|layer| store.ensure_extracted(&layer.diff_id))
         .collect();
-    let trees = trees.map_err(unreceivable)?;
+    let trees = trees.map_err(receive_error)?;
     let nodes = &record.plan.nodes;
     let commands: Vec<&[String]> = nodes.iter().map(|node| node.argv.as_slice()).collect();
-    let of = Published {
+    let of = SearchHints {
         package: &record.package,
         environment: &record.plan.environment,
         commands: &commands,
     };
-    privilege::reading(|| Inventory::take(&trees, of)).map_err(|error| {
-        refused(
-            format!("what the image holds cannot be read: {error}"),
+    privilege::run_as_reader(|| Inventory::scan(&trees, of)).map_err(|error| {
+        refusal(
+            format!("cannot read the image's contents: {error}"),
             "export the service again",
         )
     })
 }
 
-fn layers(received: &Received) -> Vec<BuiltLayer> {
+fn built_layers(received: &ReceivedImage) -> Vec<BuiltLayer> {
     const NAMES: [&str; 3] = ["base", "dependencies", "package"];
     let layers = received.image.spec.layers.iter().zip(&received.known);
     let last = received.known.len().saturating_sub(1);
-    let named = |at: usize| match at == last {
-        true => NAMES[2],
-        false => NAMES[at.min(1)],
+    let named = |at: usize| {
+        if at == last {
+            NAMES[2]
+        } else {
+            NAMES[at.min(1)]
+        }
     };
     let layer = |(at, (info, known)): (usize, (&image::LayerInfo, &bool))| BuiltLayer {
         name: named(at),
@@ -376,8 +381,8 @@ fn layers(received: &Received) -> Vec<BuiltLayer> {
     layers.enumerate().map(layer).collect()
 }
 
-/// A node that was told its name when the service was pushed.
-fn launched(node: &NodeSpec) -> LaunchNode {
+/// Converts a node that was given its name when the service was pushed.
+fn launch_node(node: &NodeSpec) -> LaunchNode {
     LaunchNode {
         name: node.name.clone(),
         package: String::new(),
@@ -393,11 +398,11 @@ fn launched(node: &NodeSpec) -> LaunchNode {
     }
 }
 
-fn unreceivable(error: image::Error) -> Error {
+fn receive_error(error: image::Error) -> Error {
     match error {
         image::Error::Unreceivable { .. }
         | image::Error::Archive { .. }
-        | image::Error::BadDigest { .. } => refused(
+        | image::Error::BadDigest { .. } => refusal(
             error.to_string(),
             "export the service again, and send the whole file",
         ),
@@ -405,14 +410,14 @@ fn unreceivable(error: image::Error) -> Error {
     }
 }
 
-fn unreadable(problem: &str) -> Error {
-    refused(
-        format!("the record of the exported service cannot be read: {problem}"),
+fn unreadable_record(problem: &str) -> Error {
+    refusal(
+        format!("cannot read the record of the exported service: {problem}"),
         "export the service again",
     )
 }
 
-fn refused(message: String, next: &str) -> Error {
+fn refusal(message: String, next: &str) -> Error {
     Error::Failed {
         message,
         next: Some(next.to_owned()),

@@ -1,15 +1,15 @@
-//! Interfaces that no robot could use.
+//! Limits on the size of interfaces.
 
 use package::interface::Interface;
 
 use crate::Error;
 
-/// Bytes of a topic's, service's, action's or parameter's name.
+/// Maximum length of a topic, service, action or parameter name, in bytes.
 const LONGEST_NAME: usize = 1024;
-/// Of those together.
+/// Maximum number of topics, services, actions and parameters together.
 const MOST_NAMES: usize = 20_000;
 
-/// Refuses an interface that no robot could use: it is what untrusted nodes registered, and goes into the database, to
+/// Rejects an interface that no robot could use. It is registered by untrusted nodes and goes into the database, to
 /// every client and into stubs.
 pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
     let topics = interface.topics.iter().map(|topic| &topic.name);
@@ -20,7 +20,7 @@ pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
     let refused = |message: String| {
         Err(Error::Failed {
             message,
-            next: Some("look at what the nodes register".to_owned()),
+            next: Some("check the names that the nodes register".to_owned()),
             log: Vec::new(),
         })
     };
@@ -29,14 +29,14 @@ pub(super) fn check_interface(interface: &Interface) -> Result<(), Error> {
         count += 1;
         if name.len() > LONGEST_NAME || name.chars().any(char::is_control) {
             return refused(format!(
-                "the interface has a name that is not valid: {:?}",
+                "the interface has an invalid name: {:?}",
                 name.chars().take(100).collect::<String>()
             ));
         }
     }
     if count > MOST_NAMES {
         return refused(format!(
-            "the interface has {count} topics, services, actions and parameters, and {MOST_NAMES} are allowed at most"
+            "the interface has {count} topics, services, actions and parameters; the limit is {MOST_NAMES}"
         ));
     }
     Ok(())
@@ -66,11 +66,11 @@ mod tests {
         for bad in ["/a\x1b[2J", &"/a".repeat(1000)] {
             let refused = check_interface(&interface(vec![topic(bad)]))
                 .expect_err(bad)
-                .words();
-            assert!(refused.contains("not valid"), "{refused}");
+                .message_and_advice();
+            assert!(refused.contains("invalid name"), "{refused}");
         }
         let many = (0..=MOST_NAMES).map(|number| topic(&format!("/t{number}")));
         let refused = check_interface(&interface(many.collect())).expect_err("too many");
-        assert!(refused.words().contains("20001"));
+        assert!(refused.message_and_advice().contains("20001"));
     }
 }

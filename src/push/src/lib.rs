@@ -1,13 +1,14 @@
-//! From an archive to a published revision, told line by line; rolling back and removing what is published.
+//! Publication pipeline: from an archive to a published revision, with progress events; also rollback and removal of
+//! services.
 //!
 //! ```text
-//!  body ─▶ unpack (nothing leaves the tree) ─▶ build (layers, image) ─▶ probe (start once, record the interface)
-//!                                                                              │
-//!             whoever connects next gets the new revision ◀─ tags ◀─ database ◀┘
+//!  body ─▶ unpack (confined to the tree) ─▶ build (layers, image) ─▶ probe (start once, record the interface)
+//!                                                                      │
+//!            new connections get the new revision ◀─ tags ◀─ database ◀┘
 //! ```
 //!
-//! Until the database has the revision nothing of it can be seen, so whatever fails, and whenever the client goes
-//! away, an earlier revision keeps serving. Pushes of one service follow one another; others run side by side.
+//! Nothing of a revision is visible until the database has it, so if anything fails or the client disconnects, the
+//! earlier revision remains in service. Pushes of the same service are serialized; others run concurrently.
 
 #![forbid(unsafe_code)]
 
@@ -41,15 +42,15 @@ use package::inventory::Inventory;
 use package::requests;
 use reach::Opener;
 use reach::group::shareable;
-use rootfs_builder::{BuildOutcome, Builder, PushRequest, Source};
+use rootfs_builder::{BuildOutcome, Builder, PushRequest, PushSource};
 use servant::engine::Engine;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use bounds::Left;
-use exported::Imported;
-use places::Places;
+use bounds::PushBudget;
+use exported::ImportedService;
+use places::PushQueue;
 use request::Reporter;
 use room::Disks;
 use store::{Journal, Plan, RevisionRecord};
@@ -58,28 +59,28 @@ pub use error::Error;
 pub use exported::{RECORD, ServiceRecord};
 pub use options::Options;
 pub use receive::Archive;
-pub use request::{Deployer, Published};
+pub use request::{Deployer, PushResult};
 
-/// Events that may wait for a slow client before the build waits for it.
+/// Capacity of the event queue of a client; a build blocks when a slow client lets it fill up.
 pub const EVENTS_AHEAD: usize = 256;
-/// The unpacked archive, in the directory of its build.
+/// Name of the unpacked archive in the build directory.
 const PUSHED: &str = "pushed";
-/// Where nodes run, and keep what they write: a tmpfs.
+/// Home directory of nodes in the container, a tmpfs.
 const HOME_INSIDE: &str = "/root";
 
-/// What a push is done with.
-pub struct Parts {
-    /// Makes images.
+/// Dependencies of a [`Pusher`].
+pub struct PusherParts {
+    /// Builds images.
     pub builder: Arc<Builder>,
-    /// Where they are published.
+    /// Publishes revisions.
     pub catalogue: Arc<Catalogue>,
-    /// Starts the container in which the interface is looked for.
+    /// Runs the container in which the interface is probed.
     pub engine: Arc<dyn Engine>,
-    /// Reaches its ROS.
+    /// Connects to the ROS graph of that container.
     pub opener: Arc<dyn Opener>,
-    /// Admits it, and ends the servants of what is removed.
+    /// Admits that container, and stops the servants of removed services.
     pub choreographer: Choreographer,
-    /// Where the operator reads what came of it.
+    /// Records the outcome for the operator.
     pub journal: Journal,
 }
 
@@ -93,7 +94,7 @@ pub struct Pusher {
     choreographer: Choreographer,
     builder: Arc<Builder>,
     journal: Journal,
-    places: Places,
+    places: PushQueue,
     disks: Disks,
     published: AtomicU64,
     failed: AtomicU64,
@@ -102,9 +103,9 @@ pub struct Pusher {
 }
 
 impl Pusher {
-    /// With half-made things below `home`, the state directory.
-    pub fn new(options: Options, home: PathBuf, parts: Parts) -> Pusher {
-        let Parts {
+    /// Creates a pusher with build directories below `home`, the state directory.
+    pub fn new(options: Options, home: PathBuf, parts: PusherParts) -> Pusher {
+        let PusherParts {
             builder,
             catalogue,
             engine,
@@ -113,7 +114,7 @@ impl Pusher {
             journal,
         } = parts;
         Pusher {
-            places: Places::new(&options),
+            places: PushQueue::new(&options),
             disks: Disks::new(&home, builder.cache_dir(), options.free),
             options,
             home,
@@ -130,7 +131,7 @@ impl Pusher {
         }
     }
 
-    /// Pushes that succeeded and failed since the start.
+    /// Returns the numbers of successful and failed pushes since the start.
     pub fn counts(&self) -> (u64, u64) {
         (
             self.published.load(Ordering::Relaxed),
@@ -138,8 +139,8 @@ impl Pusher {
         )
     }
 
-    /// Cancels every push and waits until nothing is left of them, for `patience`: what is left then is swept by the
-    /// next daemon.
+    /// Cancels all pushes and waits up to `patience` until they have cleaned up; what is left is removed at the next
+    /// start.
     pub async fn cancel_all(&self, patience: Duration) {
         self.cancel.cancel();
         self.tasks.close();
@@ -147,11 +148,11 @@ impl Pusher {
             .await
             .is_err()
         {
-            tracing::warn!("what cancelled pushes left is removed at the next start");
+            tracing::warn!("leftovers of cancelled pushes are removed at the next start");
         }
     }
 
-    /// Pushes when it is its turn, within what a push may use.
+    /// Runs a push when its turn comes, within its budget.
     async fn push(
         &self,
         id: &str,
@@ -159,27 +160,32 @@ impl Pusher {
         by: &Deployer,
         archive: Archive,
         report: &Reporter,
-    ) -> Result<Published, Error> {
+    ) -> Result<PushResult, Error> {
         let began = Instant::now();
         let known = options.name.as_deref().or(options.apt.as_deref());
-        let mut admitted = self.places.enter(known, report).await?;
+        let mut admitted = self.places.admit(known, report).await?;
         self.disks.check().await?;
         self.check_quota(by.owner.as_deref(), None).await?;
         let build = self.home.join("build").join(id);
-        let mut left = Left::new(&self.options, build, &self.disks);
+        let mut left = PushBudget::new(&self.options, build, &self.disks);
         let made = left
-            .during(Box::pin(self.made(id, options, archive, (by, report))))
+            .run_within(Box::pin(self.build_or_import(
+                id,
+                options,
+                archive,
+                (by, report),
+            )))
             .await?;
         let (built, imported) = match made {
-            Made::Built(built) => (*built, None),
-            Made::Imported(imported) => {
-                let Imported {
+            PushedImage::Built(built) => (*built, None),
+            PushedImage::Imported(imported) => {
+                let ImportedService {
                     record,
                     options,
                     built,
                 } = *imported;
-                // Another server allowed it; this one may not.
-                self.check(&options, by)?;
+                // The exporting server allowed it; this one may not.
+                self.check_request(&options, by)?;
                 (built, Some((record, options)))
             }
         };
@@ -188,81 +194,82 @@ impl Pusher {
             .name
             .clone()
             .unwrap_or_else(|| built.package.clone());
-        names::service(&name).map_err(catalogue::Error::from)?;
-        admitted.named(&name, report).await?;
-        // Pushes of one service follow one another: whose it is does not change until this one is done.
-        by.may(&name)?;
+        names::validate_service(&name).map_err(catalogue::Error::from)?;
+        admitted.assign_service(&name, report).await?;
+        // Pushes of one service are serialized, so its owner does not change until this push is done.
+        by.check_may_publish(&name)?;
         let image = built.image.to_string();
         self.check_quota(by.owner.as_deref(), Some(&image)).await?;
-        let mut plan = plan_of(&built, options);
+        let mut plan = make_plan(&built, options);
         if let Some((record, _)) = &imported {
             plan.restart = record.plan.restart;
         }
-        let layers: Vec<_> = built.layers.iter().map(layer).collect();
-        // Together they take more than a thread's stack has in a build that is not optimised.
-        let shown = Box::pin(self.shown(id, options, (built, plan), (name.clone(), by), report));
-        let (record, inventory) = left.during(shown).await?;
+        let layers: Vec<_> = built.layers.iter().map(api_layer).collect();
+        // Boxed: in an unoptimized build both together would overflow a thread's stack.
+        let shown =
+            Box::pin(self.probe_image(id, options, (built, plan), (name.clone(), by), report));
+        let (record, inventory) = left.run_within(shown).await?;
         // The token may have been revoked meanwhile.
-        by.may(&name)?;
-        // From here on nothing breaks it off: what was published is not told to have been cancelled.
+        by.check_may_publish(&name)?;
+        // From here on the push cannot be cancelled: a published revision must not be reported as cancelled.
         report.publishing.cancel();
         let terms = options.rollout;
-        Box::pin(self.publish(record, inventory, terms, report)).await?;
+        Box::pin(self.publish_and_rollout(record, inventory, terms, report)).await?;
         if let Some((record, _)) = &imported {
-            self.take_over_rows(&name, record, report);
+            self.import_dictionary(&name, record, report);
         }
-        Ok(Published {
+        Ok(PushResult {
             layers,
             service: name,
             took: began.elapsed(),
         })
     }
 
-    /// The image of what is pushed.
-    async fn made(
+    /// Builds or imports the image.
+    async fn build_or_import(
         &self,
         id: &str,
         options: &PushOptions,
         archive: Archive,
         (by, report): (&Deployer, &Reporter),
-    ) -> Result<Made, Error> {
+    ) -> Result<PushedImage, Error> {
         let source = match &options.apt {
             Some(package) => {
-                // Names of Debian packages have hyphens, those of ROS packages do not.
+                // Names of Debian packages contain hyphens, those of ROS packages do not.
                 if let (Some(name), false) = (&options.name, package.contains('-')) {
                     self.check_owner(name, std::slice::from_ref(package))?;
                 }
-                Source::Packaged(package.clone())
+                PushSource::Packaged(package.clone())
             }
             None => {
                 report.step("receiving the package").await;
                 let tree = self.home.join("build").join(id).join(PUSHED);
                 receive::unpack(archive, &tree, &self.options, report).await?;
                 let of = tree.clone();
-                if privilege::blocking(move || exported::is_exported(&of))
+                if privilege::spawn_blocking(move || exported::is_exported(&of))
                     .await
                     .unwrap_or(false)
                 {
-                    return self.taken_in(options, tree, report).await;
+                    return self.import(options, tree, report).await;
                 }
                 if let Some(name) = &options.name {
                     let of = tree.clone();
-                    let look = move || privilege::reading(|| receive::packages_of(&of));
-                    let packages = privilege::blocking(look)
+                    let look = move || privilege::run_as_reader(|| receive::package_names(&of));
+                    let packages = privilege::spawn_blocking(look)
                         .await
-                        .map_err(|_| Error::Internal("looking at the package"))?;
+                        .map_err(|_| Error::Internal("inspecting the package"))?;
                     self.check_owner(name, &packages)?;
                 }
-                Source::Tree(tree)
+                PushSource::Tree(tree)
             }
         };
         self.build(id, options, source, (by, report))
             .await
-            .map(|built| Made::Built(Box::new(built)))
+            .map(|built| PushedImage::Built(Box::new(built)))
     }
 
-    /// Finds the interface of an image: what is to be published of it.
-    async fn shown(
+    /// Probes the interface of an image; returns the revision to publish.
+    async fn probe_image(
         &self,
         id: &str,
         options: &PushOptions,
@@ -275,29 +282,32 @@ impl Pusher {
         for warning in self.choreographer.check_grants(&plan.grants)? {
             report.warning(warning).await;
         }
-        let found = probe::interface(self, id, &built, &mut plan, options, report);
+        let found = probe::probe_interface(self, id, &built, &mut plan, options, report);
         let found = Box::pin(found).await?;
         for warning in found.warnings {
             report.warning(warning).await;
         }
         let mut interface = found.interface;
         if let Some(text) = &options.interface {
-            let known = (built.flavour.ros.bus(), &built.inventory.definitions);
+            let known = (
+                built.flavour.ros.ros_version(),
+                &built.inventory.definitions,
+            );
             supplement::add(&mut interface, text, known)
                 .map_err(|error| Error::Options(format!("the interface supplement: {error}")))?;
         }
         interface_limits::check_interface(&interface)?;
-        let ros = built.flavour.ros.bus();
-        let decided = requests::decide(ros, &interface, &found.watched);
-        let stated = options.read_requests().map_err(Error::Options)?;
-        let decided = requests::state(ros, &interface, &stated, decided)
+        let ros = built.flavour.ros.ros_version();
+        let decided = requests::decide_requests(ros, &interface, &found.watched);
+        let stated = options.parse_requests().map_err(Error::Options)?;
+        let decided = requests::apply_stated(ros, &interface, &stated, decided)
             .map_err(|error| Error::Options(format!("--request: {error}")))?;
         for request in &decided {
             report.request(request).await;
         }
         interface.requests = Some(decided);
         if !(options.stateful || options.stateless) {
-            let signs = stateful::signs(&interface, &found.growing);
+            let signs = stateful::find_signs(&interface, &found.growing);
             if let Some(question) = stateful::question(&signs) {
                 report.warning(question).await;
             }
@@ -324,9 +334,9 @@ impl Pusher {
         Ok((record, built.inventory))
     }
 
-    /// A service belongs to the package that it was first made of.
+    /// Checks that the service belongs to the package that it was first built from.
     fn check_owner(&self, name: &str, packages: &[String]) -> Result<(), Error> {
-        match (self.catalogue.package(name)?, packages) {
+        match (self.catalogue.service_package(name)?, packages) {
             (Some(owner), [first, ..]) if !packages.contains(&owner) => Err(Error::NameTaken {
                 name: name.to_owned(),
                 package: owner,
@@ -340,7 +350,7 @@ impl Pusher {
         &self,
         id: &str,
         options: &PushOptions,
-        source: Source,
+        source: PushSource,
         (by, report): (&Deployer, &Reporter),
     ) -> Result<BuildOutcome, Error> {
         let request = PushRequest {
@@ -359,25 +369,25 @@ impl Pusher {
         let (sender, mut events) = mpsc::channel(EVENTS_AHEAD);
         let forwarded = async {
             while let Some(event) = events.recv().await {
-                report.event(told::event(event, by)).await;
+                report.event(told::to_push_event(event, by)).await;
             }
         };
         let builder = Arc::clone(&self.builder);
         let work = async move { builder.build(&request, sender).await };
-        // However this is left: what the build has begun is cleared away when it has seen so (`Pusher::run`).
+        // If this future is dropped, the files of the build are removed once the builder has noticed (`Pusher::run`).
         let work = privilege::run(report.building.track_future(work));
         let (built, ()) = tokio::join!(work, forwarded);
-        built.map_err(|error| told::error(&error, &self.home, &options.source))
+        built.map_err(|error| told::to_push_error(&error, &self.home, &options.source))
     }
 }
 
-/// What is published, before it was started once.
-enum Made {
+/// The image to publish, before it is probed.
+enum PushedImage {
     Built(Box<BuildOutcome>),
-    Imported(Box<Imported>),
+    Imported(Box<ImportedService>),
 }
 
-fn layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
+fn api_layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
     api::push::Layer {
         name: of.name.to_owned(),
         digest: of.info.digest.to_string(),
@@ -386,14 +396,14 @@ fn layer(of: &rootfs_builder::BuiltLayer) -> api::push::Layer {
     }
 }
 
-fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
+fn make_plan(built: &BuildOutcome, options: &PushOptions) -> Plan {
     let mut environment = built.environment.clone();
     environment.extend(built.flavour.environment(HOME_INSIDE));
     let mut nodes: Vec<_> = built
         .plan
         .nodes
         .iter()
-        .map(|node| node.spec(HOME_INSIDE))
+        .map(|node| node.to_node_spec(HOME_INSIDE))
         .collect();
     for node in &mut nodes {
         naming::tell_parameters(&built.flavour, node, &built.plan.parameters);
@@ -407,7 +417,7 @@ fn plan_of(built: &BuildOutcome, options: &PushOptions) -> Plan {
         caps: options.caps,
         sla: options.sla,
         grants: options.grants.clone(),
-        // A launch file says itself which nodes come again.
+        // A launch file specifies itself which nodes are respawned.
         restart: options.launch.is_none(),
         stateful: options.stateful,
         shared: options.shared,

@@ -1,8 +1,9 @@
-//! What nodes are called that were told no name (`--node`): what their programs say, as under rosrun.
+//! Names of nodes that were started without an explicit name (`--node`): those given by their programs, as under
+//! rosrun.
 //!
-//! The name is known only when a program runs, and parameters must be there before it does. So it is started once, each
-//! program with a mark of its own to tell its nodes by, and ended as soon as it has registered. From then on it is told that
-//! name: one with a random end (an anonymous node's) would be another each time.
+//! The name is known only when a program runs, but parameters must be set before. So each program is started once with
+//! a unique mark that identifies its nodes, and stopped as soon as it has registered. From then on it is started with
+//! that name explicitly; a random suffix (of an anonymous node) would differ each time.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -12,44 +13,45 @@ use api::PushOptions;
 use package::interface::Interface;
 use package::names::is_graph_name;
 use rootfs_builder::BuildOutcome;
-use rootfs_builder::probe::{ProbeError, ProbeOptions, still};
+use rootfs_builder::probe::{ProbeError, ProbeOptions, wait_until_still};
 use ros::bus::{Graph, ParamValue, RosVersion};
-use ros::flavour::{Called, Flavour};
+use ros::flavour::{Flavour, NodeRename};
 use ros::plumbing;
 use ros::ros2;
 use ros::ros2::composition::Component;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::spec::NodeSpec;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::Pusher;
-use super::probe::{self, Alive, NODE};
+use super::probe::{self, NODE, RoomGuard};
 use crate::Error;
 use store::Plan;
 
-/// A program may be several nodes (ROS 2), which come one after the other: its first by name is the one that it is called by. What is taken already
-/// gets a number, as every node of a second such program does. Others are waited for until none has come for so long after one, and at most for so long:
-/// of the nodes' own time, which stands still while they wait for a core.
+/// In ROS 2 a program may have several nodes, which register one after the other; the first by name identifies the
+/// program. A name that is taken gets a numeric suffix, as all nodes of a second such program do. The probe waits for
+/// further nodes until none has registered for `QUIET` after the last one, and at most for `MORE_NODES`, both in the
+/// nodes' own time, which stands still while they wait for a core.
 const QUIET: Duration = Duration::from_millis(200);
 const MORE_NODES: Duration = Duration::from_secs(2);
 
-/// Parameters that a warning names.
+/// Maximum number of parameters named in a warning.
 const NAMED: usize = 12;
 
-/// What the nodes of an index are marked by while their names are looked for.
-fn mark_of(index: usize) -> String {
+/// Returns the mark of the node at an index of the plan, while names are probed.
+fn mark_for_index(index: usize) -> String {
     format!("/cloudroid_name_{index}")
 }
 
-/// Gives the nodes of `plan` that were told no name the one that their program has.
-pub(super) async fn settle(
+/// Gives the unnamed nodes of `plan` the names that their programs use.
+pub(super) async fn resolve_names(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
     plan: &mut Plan,
     options: &PushOptions,
-    alive: &Alive,
+    alive: &RoomGuard,
 ) -> Result<(), Error> {
     let planned = built.plan.nodes.iter().enumerate();
     let unnamed: Vec<usize> = planned
@@ -64,45 +66,45 @@ pub(super) async fn settle(
         .iter()
         .map(|index| {
             let mut node = plan.nodes[*index].clone();
-            let marked = built.flavour.marked(&mark_of(*index));
+            let marked = built.flavour.marker_identity(&mark_for_index(*index));
             node.argv.extend(marked.arguments);
             node.environment.extend(marked.environment);
             node
         })
         .collect();
-    let mut spec = probe::spec(pusher, id, built, &alone, options);
+    let mut spec = probe::probe_spec(pusher, id, built, &alone, options);
     spec.id = format!("{id}-names");
     let (servant, trial) = probe::start(pusher, spec, alive).await?;
-    let ros = built.flavour.ros.bus();
-    let found = look(pusher, &servant, ros, &alone, &unnamed).await;
+    let ros = built.flavour.ros.ros_version();
+    let found = find_names(pusher, &servant, ros, &alone, &unnamed).await;
     trial.end().await?;
-    apply(plan, &built.flavour, &unnamed, &found?, options);
+    apply_names(plan, &built.flavour, &unnamed, &found?, options);
     Ok(())
 }
 
-/// What programs call their nodes, by index; the first by name first.
-type Names = BTreeMap<usize, Vec<Called>>;
+/// Names of the programs' nodes by index in the plan, sorted by name.
+type FoundNames = BTreeMap<usize, Vec<NodeRename>>;
 
-/// Names by index, as far as they could be found; those of nodes that end at once stay unknown.
-async fn look(
+/// Probes the names by index, as far as possible; those of nodes that exit immediately stay unknown.
+async fn find_names(
     pusher: &Pusher,
-    servant: &Arc<dyn Servant>,
+    servant: &Arc<dyn ServantHandle>,
     ros: RosVersion,
     alone: &Plan,
     unnamed: &[usize],
-) -> Result<Names, Error> {
+) -> Result<FoundNames, Error> {
     let failed = |message: String| Error::Failed {
         message,
         next: None,
         log: Vec::new(),
     };
-    // A container is a host of that name.
+    // The host name of a container is its id.
     let host = servant.id();
     let opener = &pusher.opener;
     let looked = opener
-        .look(servant, ros, NODE, &[])
+        .observe(servant, ros, NODE, &[])
         .await
-        .map_err(|error| failed(format!("the started image cannot be reached: {error}")))?;
+        .map_err(|error| failed(format!("cannot reach the started image: {error}")))?;
     let mut graph = looked.bus.graph();
     let seen = graph.clone();
     let options = ProbeOptions {
@@ -110,33 +112,34 @@ async fn look(
         patience: pusher.options.probe,
         settle: QUIET,
         restless: MORE_NODES,
-        work: Some(probe::work(servant)),
+        work: Some(probe::cpu_time_source(servant)),
         ..ProbeOptions::new(
             alone.nodes.iter().map(|node| node.name.clone()).collect(),
             NODE,
         )
     };
-    let all_there = |graph: &Arc<Graph>| names(ros, graph, unnamed, host).len() == unnamed.len();
+    let all_there =
+        |graph: &Arc<Graph>| names_in_graph(ros, graph, unnamed, host).len() == unnamed.len();
     let registered = tokio::select! {
         biased;
-        // What it says of itself is told when it is started again, with its parameters.
-        _ = probe::ended(servant, alone) => Ok(()),
-        registered = registered(&mut graph, all_there, &options) => match registered {
-            // Here it cannot reach what it was granted; it can when it is looked at.
+        // If a node exits here, the error is reported when it is started again with its parameters.
+        _ = probe::wait_for_failure(servant, alone) => Ok(()),
+        registered = wait_until_registered(&mut graph, all_there, &options) => match registered {
+            // Granted hosts cannot be reached here; they can when the interface is probed.
             Err(ProbeError::NeverRegistered { .. }) if !alone.grants.egress.is_empty() => Ok(()),
             registered => registered,
         },
     };
-    let found = names(ros, &seen.borrow(), unnamed, host);
+    let found = names_in_graph(ros, &seen.borrow(), unnamed, host);
     looked.bus.close().await;
     match registered {
         Ok(()) => Ok(found),
-        Err(error) => Err(probe::explained(failed(error.to_string()), servant).await),
+        Err(error) => Err(probe::with_node_logs(failed(error.to_string()), servant).await),
     }
 }
 
-/// Returns when all are there, and no others come.
-async fn registered(
+/// Waits until all nodes are registered, and no others follow.
+async fn wait_until_registered(
     graph: &mut watch::Receiver<Arc<Graph>>,
     all_there: impl FnMut(&Arc<Graph>) -> bool,
     options: &ProbeOptions,
@@ -153,19 +156,19 @@ async fn registered(
             });
         }
     }
-    // In ROS 1 a program is one node.
+    // In ROS 1 a program has one node.
     if options.ros == RosVersion::Two {
-        still(graph, options).await?;
+        wait_until_still(graph, options).await?;
     }
     Ok(())
 }
 
-/// Which nodes of the graph are whose: their absolute names in ROS 2; those below their namespace in ROS 1, where nobody else gives one. `host`: the name
-/// of the machine that they think they run on.
-fn names(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> Names {
-    let mut names = Names::new();
+/// Assigns the nodes of the graph to programs: in ROS 2 by absolute name, in ROS 1 by the name below the marked
+/// namespace, which nobody else uses. `host` is the host name that the programs see.
+fn names_in_graph(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> FoundNames {
+    let mut names = FoundNames::new();
     for index in unnamed {
-        let mark = mark_of(*index);
+        let mark = mark_for_index(*index);
         let mut said: Vec<&str> = match ros {
             RosVersion::One => {
                 let all = graph.nodes.keys();
@@ -174,22 +177,23 @@ fn names(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> Names
             }
             RosVersion::Two => {
                 let own = graph.enclaves.get(&mark).into_iter().flatten();
-                // What tools do not show is no name to call a program by.
+                // Hidden nodes do not name a program.
                 let shown = own.filter(|node| !ros2::names::is_hidden(node));
                 shown.map(String::as_str).collect()
             }
         };
-        // A program may take no notice of its mark; alone it is known all the same.
+        // A program may ignore its mark; if it is the only one, its nodes are known anyway.
         if said.is_empty() && unnamed.len() == 1 {
             let others = graph.nodes.keys().filter(|node| *node != NODE);
             said.extend(others.map(String::as_str));
         }
-        // What a program registers is untrusted.
-        let called = said.into_iter().map(|own| called(own, host));
-        let known =
-            |called: &Called| is_graph_name(&format!("/{}", called.node.trim_start_matches('/')));
-        let mut called: Vec<Called> = called.filter(known).collect();
-        // No rule fits one among several whose name is another each time.
+        // Names registered by a program are untrusted.
+        let called = said.into_iter().map(|own| classify_name(own, host));
+        let known = |called: &NodeRename| {
+            is_graph_name(&format!("/{}", called.node.trim_start_matches('/')))
+        };
+        let mut called: Vec<NodeRename> = called.filter(known).collect();
+        // No remapping rule can match one of several nodes whose name varies.
         if called.iter().any(|called| called.own.is_some()) {
             called.retain(|called| called.own.is_some());
         }
@@ -200,16 +204,16 @@ fn names(ros: RosVersion, graph: &Graph, unnamed: &[usize], host: &str) -> Names
     names
 }
 
-/// A node by the name that its program has given it, which may have parts that are others each time.
-fn called(own: &str, host: &str) -> Called {
+/// Returns the stable part of the name that a program gave its node; `own` is set only if the whole name is stable.
+fn classify_name(own: &str, host: &str) -> NodeRename {
     let without = without_host(without_random_end(own), host);
-    Called {
+    NodeRename {
         own: (without == own).then(|| own.to_owned()),
         node: without,
     }
 }
 
-/// The name of an anonymous node without what makes it unique: `_PID_MILLISECONDS` (rospy), `_NANOSECONDS` (roscpp).
+/// Removes the unique suffix of an anonymous node's name: `_PID_MILLISECONDS` (rospy), `_NANOSECONDS` (roscpp).
 fn without_random_end(name: &str) -> &str {
     let cut = |name: &str, digits: usize| -> Option<usize> {
         let (_, end) = name.rsplit_once('_')?;
@@ -227,10 +231,10 @@ fn without_random_end(name: &str) -> &str {
     }
 }
 
-/// The name of a node that has the machine's in it (`cpu_monitor_HOST`) without that: here it is a container's, another one
-/// each time. Nothing is left of one that has no other name.
+/// Removes the host name from a node's name (`cpu_monitor_HOST`), since it is that of a container and different each
+/// time. Returns an empty string if nothing else is left.
 fn without_host(name: &str, host: &str) -> String {
-    // A hyphen is not allowed in a node's name.
+    // Hyphens are not allowed in node names.
     let host = host.replace('-', "_");
     if host.is_empty() || !name.contains(&host) {
         return name.to_owned();
@@ -244,7 +248,7 @@ fn without_host(name: &str, host: &str) -> String {
         None => part.to_owned(),
     };
     let parts: Vec<String> = name.split('/').map(part).collect();
-    // A namespace of which nothing is left is none; what an absolute name begins with stays.
+    // Empty namespaces are dropped; the leading slash of an absolute name is kept.
     let left = parts
         .iter()
         .enumerate()
@@ -253,12 +257,13 @@ fn without_host(name: &str, host: &str) -> String {
     left.join("/")
 }
 
-/// Writes names into the plan, and moves private parameters there. A node whose name is not known is told the guess.
-fn apply(
+/// Writes the names into the plan and moves private parameters accordingly. A node whose name is unknown keeps the
+/// guessed one.
+fn apply_names(
     plan: &mut Plan,
     flavour: &Flavour,
     unnamed: &[usize],
-    found: &Names,
+    found: &FoundNames,
     options: &PushOptions,
 ) {
     let mut taken: BTreeSet<String> = plan
@@ -277,15 +282,15 @@ fn apply(
                 called.node = format!("{above}/{}", called.node);
             }
         }
-        free(&mut called, &mut taken);
+        assign_free_names(&mut called, &mut taken);
         if called.is_empty() {
-            called.push(Called {
+            called.push(NodeRename {
                 own: None,
                 node: guess.clone(),
             });
-            free(&mut called, &mut taken);
+            assign_free_names(&mut called, &mut taken);
         }
-        let (name, identity) = (called[0].node.clone(), flavour.renamed(&called));
+        let (name, identity) = (called[0].node.clone(), flavour.rename_identity(&called));
         for key in options.params.keys().filter(|key| !key.starts_with('/')) {
             let bare = key.trim_start_matches(['~', '_']);
             if let Some(value) = plan.parameters.remove(&format!("{guess}/{bare}")) {
@@ -295,14 +300,14 @@ fn apply(
         let node = &mut plan.nodes[*index];
         node.name = name;
         tell_parameters(flavour, node, &plan.parameters);
-        flavour.put(identity.arguments, &mut node.argv);
+        flavour.insert_arguments(identity.arguments, &mut node.argv);
         node.environment.extend(identity.environment);
     }
 }
 
-/// Takes the names of a program's nodes, with a number where one is taken: the same one for all of its nodes of one name, for which there is one rule,
-/// whatever their namespaces.
-fn free(called: &mut [Called], taken: &mut BTreeSet<String>) {
+/// Reserves the names of a program's nodes, with a numeric suffix if one is taken. All nodes of the program with the
+/// same base name get the same suffix regardless of their namespaces, since there is one remapping rule for them.
+fn assign_free_names(called: &mut [NodeRename], taken: &mut BTreeSet<String>) {
     let wanted: Vec<String> = called.iter().map(|called| called.node.clone()).collect();
     let last = |name: &str| {
         name.rsplit_once('/')
@@ -324,13 +329,14 @@ fn free(called: &mut [Called], taken: &mut BTreeSet<String>) {
     taken.extend(called.iter().map(|called| called.node.clone()));
 }
 
-/// Tells a node its parameters, where nodes hold their own; not again what it was told before (a node of an exported service).
+/// Passes a node its parameters on the command line, if nodes hold their own parameters, unless they are already there
+/// (a node of an exported service).
 pub(super) fn tell_parameters(
     flavour: &Flavour,
     node: &mut NodeSpec,
     all: &BTreeMap<String, ParamValue>,
 ) {
-    let arguments = flavour.arguments(&node.name, all);
+    let arguments = flavour.parameter_arguments(&node.name, all);
     let told = |argv: &[String]| {
         argv.windows(arguments.len().max(1))
             .any(|part| part == arguments)
@@ -340,20 +346,24 @@ pub(super) fn tell_parameters(
     }
 }
 
-/// Marks the nodes that were told a name and no namespace (by a launch file, say): their programs may give them one. Marks by name.
-pub(super) fn mark(plan: &mut Plan, flavour: &Flavour) -> BTreeMap<String, String> {
+/// Marks nodes that were given a name but no namespace (by a launch file, for example), since their programs may choose
+/// one. Returns the marks by node name.
+pub(super) fn mark_nodes_without_namespace(
+    plan: &mut Plan,
+    flavour: &Flavour,
+) -> BTreeMap<String, String> {
     let nodes = plan.nodes.iter_mut().enumerate();
-    let free = nodes.filter(|(_, node)| flavour.may_choose_namespace(&node.argv));
+    let free = nodes.filter(|(_, node)| flavour.can_choose_namespace(&node.argv));
     free.map(|(index, node)| {
-        let mark = mark_of(index);
-        node.argv.extend(flavour.marked(&mark).arguments);
+        let mark = mark_for_index(index);
+        node.argv.extend(flavour.marker_identity(&mark).arguments);
         (node.name.clone(), mark)
     })
     .collect()
 }
 
-/// Nodes are where their programs have put them, and their parameters with them.
-pub(super) fn place(plan: &mut Plan, moved: &BTreeMap<String, String>) {
+/// Moves nodes and their parameters to the namespaces that their programs chose.
+pub(super) fn move_nodes(plan: &mut Plan, moved: &BTreeMap<String, String>) {
     for (name, there) in moved {
         for node in plan.nodes.iter_mut().filter(|node| node.name == *name) {
             node.name.clone_from(there);
@@ -368,8 +378,12 @@ pub(super) fn place(plan: &mut Plan, moved: &BTreeMap<String, String>) {
     }
 }
 
-/// Parameters that were given for a name that no node has, and that none read.
-pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) -> Vec<String> {
+/// Returns warnings about parameters that were given for an unknown node and read by none.
+pub(super) fn unused_parameters(
+    plan: &Plan,
+    interface: &Interface,
+    options: &PushOptions,
+) -> Vec<String> {
     let below = |key: &str, name: &str| {
         key.strip_prefix(name)
             .is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
@@ -380,7 +394,7 @@ pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) 
     let names: Vec<&str> = names.chain(loaded.iter().map(String::as_str)).collect();
     let mut warnings = Vec::new();
     for key in options.params.keys() {
-        // `/rate` is everybody's.
+        // A global parameter such as `/rate` is for all nodes.
         let of_a_name = key.starts_with('/') && key[1..].contains('/');
         let known = names.iter().any(|name| below(key, name));
         let read = interface.parameters.iter().any(|parameter| {
@@ -389,27 +403,27 @@ pub(super) fn unused(plan: &Plan, interface: &Interface, options: &PushOptions) 
         });
         if of_a_name && !known && !read {
             warnings.push(format!(
-                "parameter {key} is given for a name that no node has, and none read it; there are the nodes {}",
+                "parameter {key} matches no node, and no node read it; the nodes are {}",
                 names.join(", ")
             ));
         }
-        if let Some(has) = undeclared(interface, key) {
+        if let Some(has) = describe_undeclared(interface, key) {
             warnings.push(format!(
-                "no node has declared a parameter {key}, so that it is without effect; {has}"
+                "no node declares a parameter {key}, so it has no effect; {has}"
             ));
         }
     }
     warnings
 }
 
-/// Where nodes have parameters of their own (ROS 2) and none has one of this name: those that there are, in words.
-fn undeclared(interface: &Interface, key: &str) -> Option<String> {
+/// If nodes have their own parameters (ROS 2) and none has one of this name, returns a description of those that exist.
+fn describe_undeclared(interface: &Interface, key: &str) -> Option<String> {
     let own: Vec<_> = interface
         .parameters
         .iter()
         .filter(|parameter| parameter.own_name().is_some())
         .collect();
-    // A level of names is a dot there; `/rate` is everybody's.
+    // Levels of a name are separated by dots there; a global parameter such as `/rate` is for all nodes.
     let wanted = key.trim_start_matches(['~', '_']);
     let is_it = |parameter: &&&package::interface::Parameter| {
         let name = parameter.own_name().unwrap_or_default();
@@ -426,12 +440,12 @@ fn undeclared(interface: &Interface, key: &str) -> Option<String> {
         }
     };
     let last = wanted.rsplit('/').next().unwrap_or_default();
-    if own.is_empty() || plumbing::parameter(last) || own.iter().any(|it| is_it(&it)) {
+    if own.is_empty() || plumbing::is_builtin_parameter(last) || own.iter().any(|it| is_it(&it)) {
         return None;
     }
     let mut names: Vec<&str> = own.iter().map(|it| it.name.as_str()).collect();
     names.truncate(NAMED);
-    Some(format!("there are {}", names.join(", ")))
+    Some(format!("declared: {}", names.join(", ")))
 }
 
 #[cfg(test)]

@@ -2,39 +2,39 @@ use std::time::Duration;
 
 use api::Size;
 
-/// How big pushes may be, and what building them may take.
+/// Limits on the size of pushes and on the resources for building them.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// Bytes of the archive as sent.
+    /// Maximum size of the archive as sent.
     pub archive: Size,
-    /// Bytes of the files in it, unpacked.
+    /// Maximum total size of the unpacked files.
     pub unpacked: Size,
-    /// How many files the archive may have.
+    /// Maximum number of files in the archive.
     pub entries: u64,
-    /// How long the nodes may take to show their interface.
+    /// Maximum time for the nodes to show their interface.
     pub probe: Duration,
-    /// How long the archive may pause while it is sent.
+    /// Maximum pause while the archive is sent.
     pub stall: Duration,
-    /// Bytes of the archive that must come in a second, on the average over times of `stall`; 0 for any.
+    /// Minimum transfer rate of the archive in bytes per second, averaged over `stall`; 0 for none.
     pub min_rate: Size,
-    /// Pushes that are built at once; others wait.
+    /// Maximum number of concurrent builds; further pushes wait.
     pub at_once: usize,
-    /// Pushes that may wait.
+    /// Maximum number of waiting pushes.
     pub queue: usize,
-    /// Time from the start of a push's build (after waiting) to its end.
+    /// Maximum duration of a push from the start of its build, not counting the time it waits.
     pub time: Duration,
-    /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
+    /// Maximum size of a push's files during the build; each file counts at least 4 KiB.
     pub disk: Size,
-    /// Bytes that stay free on the disks that pushes write to, though no more than a twentieth of a disk.
+    /// Minimum free space on the disks that pushes write to, at most 1/20 of each disk.
     pub free: Size,
-    /// Bytes of the images of all services of one deployer; 0 for any.
+    /// Maximum total size of the images of one deployer's services; 0 for unlimited.
     pub per_deployer: Size,
 }
 
 #[cfg(test)]
 impl Options {
     /// Limits that no test reaches unless it sets one.
-    pub(crate) fn wide() -> Options {
+    pub(crate) fn unlimited() -> Options {
         Options {
             archive: Size(2 << 30),
             unpacked: Size(8 << 30),

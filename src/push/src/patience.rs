@@ -1,5 +1,5 @@
-//! Waiting for a body, but not for ever: a thread unpacks it while it comes, and would wait with it, and so would the
-//! pushes behind it.
+//! Minimum transfer rate of request bodies. A thread unpacks the body while it arrives; it must not wait forever, nor
+//! keep the pushes behind it waiting.
 
 use std::io;
 use std::sync::{Arc, OnceLock};
@@ -12,44 +12,45 @@ use tokio_util::sync::CancellationToken;
 
 use crate::Archive;
 
-/// How slowly a body may come.
+/// Minimum transfer rate of a body.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Patience {
-    /// How long it may pause.
+pub(super) struct BodyRateLimit {
+    /// Maximum pause between chunks.
     pub(super) pause: Duration,
-    /// Bytes a second, over such times; 0 for any.
+    /// Minimum average rate over `pause`, in bytes per second; 0 for none.
     pub(super) rate: u64,
 }
 
-/// Why a body was not waited for any longer.
+/// Reason why a body was too slow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TooSlow {
-    /// Nothing came.
+    /// No data arrived.
     Paused,
-    /// Something came, but less than must.
+    /// Data arrived at less than the minimum rate.
     Trickled,
 }
 
-/// Whether a body came too slowly.
+/// Flag that records whether and why a body was too slow.
 #[derive(Clone, Default)]
-pub(super) struct Stalled(Arc<OnceLock<TooSlow>>);
+pub(super) struct StallFlag(Arc<OnceLock<TooSlow>>);
 
-impl Stalled {
-    pub(super) fn why(&self) -> Option<TooSlow> {
+impl StallFlag {
+    pub(super) fn reason(&self) -> Option<TooSlow> {
         self.0.get().copied()
     }
 }
 
-/// The chunks of a body. It ends with an error when they come more slowly than they may, which `stalled` then says, or
-/// when `ended` is cancelled. Time in which no chunk is asked for does not count.
-pub(super) fn chunks(
+/// Returns the chunks of a body. The stream ends with an error if they arrive too slowly, which sets `stalled`, or when
+/// `ended` is cancelled. Time in which no chunk is polled does not count.
+pub(super) fn timed_chunks(
     archive: Archive,
-    patience: Patience,
-    stalled: Stalled,
+    patience: BodyRateLimit,
+    stalled: StallFlag,
     ended: CancellationToken,
 ) -> impl Stream<Item = io::Result<Bytes>> + Send {
     let begin = Some((archive, patience.pause));
-    // `left`: how long may be waited until the next chunk. Waiting uses it up, and bytes add to it what they may take.
+    // `left` is the time to wait for the next chunk. Waiting uses it up, and each chunk adds the time that its bytes
+    // may take.
     futures_util::stream::unfold(begin, move |state| {
         let (stalled, ended) = (stalled.clone(), ended.clone());
         async move {
@@ -64,7 +65,8 @@ pub(super) fn chunks(
             };
             match next {
                 Ok(Some(Ok(chunk))) => {
-                    let left = patience.after(left.saturating_sub(began.elapsed()), chunk.len());
+                    let left =
+                        patience.remaining_after(left.saturating_sub(began.elapsed()), chunk.len());
                     Some((Ok(chunk), Some((stream, left))))
                 }
                 Ok(Some(Err(error))) => Some((Err(error), None)),
@@ -83,9 +85,9 @@ pub(super) fn chunks(
     })
 }
 
-impl Patience {
-    /// How long may be waited after a chunk.
-    fn after(&self, left: Duration, bytes: usize) -> Duration {
+impl BodyRateLimit {
+    /// Returns how long to wait for the chunk after this one.
+    fn remaining_after(&self, left: Duration, bytes: usize) -> Duration {
         match self.rate {
             0 => self.pause,
             rate => {
@@ -100,38 +102,52 @@ impl Patience {
 mod tests {
     use super::*;
 
-    /// How many chunks of a body come through, each so many bytes after such a pause.
-    async fn come(pause: u64, bytes: usize, rate: u64, chunks: usize) -> (usize, Option<TooSlow>) {
+    /// Returns the number of chunks of a body that get through, each of `bytes` bytes after the given pause.
+    async fn receive_chunks(
+        pause: u64,
+        bytes: usize,
+        rate: u64,
+        chunks: usize,
+    ) -> (usize, Option<TooSlow>) {
         let stream = futures_util::stream::iter(0..chunks).then(move |_| async move {
             tokio::time::sleep(Duration::from_secs(pause)).await;
             Ok(Bytes::from(vec![0_u8; bytes]))
         });
-        let patience = Patience {
+        let patience = BodyRateLimit {
             pause: Duration::from_secs(60),
             rate,
         };
-        let (stalled, ended) = (Stalled::default(), CancellationToken::new());
-        let through = super::chunks(stream.boxed(), patience, stalled.clone(), ended);
+        let (stalled, ended) = (StallFlag::default(), CancellationToken::new());
+        let through = super::timed_chunks(stream.boxed(), patience, stalled.clone(), ended);
         let through: Vec<_> = through.filter_map(async |chunk| chunk.ok()).collect().await;
-        (through.len(), stalled.why())
+        (through.len(), stalled.reason())
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_body_that_trickles_is_not_waited_for() {
         assert_eq!(
-            come(59, 1, 16 << 10, 100).await,
+            receive_chunks(59, 1, 16 << 10, 100).await,
             (1, Some(TooSlow::Trickled))
         );
-        // A chunk for each pause is enough of them all.
-        assert_eq!(come(59, 1 << 20, 16 << 10, 100).await, (100, None));
-        assert_eq!(come(1, 20 << 10, 16 << 10, 1000).await, (1000, None));
-        let (came, why) = come(1, 15 << 10, 16 << 10, 10_000).await;
+        // One chunk per pause is sufficient.
+        assert_eq!(
+            receive_chunks(59, 1 << 20, 16 << 10, 100).await,
+            (100, None)
+        );
+        assert_eq!(
+            receive_chunks(1, 20 << 10, 16 << 10, 1000).await,
+            (1000, None)
+        );
+        let (came, why) = receive_chunks(1, 15 << 10, 16 << 10, 10_000).await;
         assert!(
             came > 100 && why == Some(TooSlow::Trickled),
             "{came} {why:?}"
         );
         // Without a rate only pauses count.
-        assert_eq!(come(59, 1, 0, 100).await, (100, None));
-        assert_eq!(come(61, 1 << 20, 0, 100).await, (0, Some(TooSlow::Paused)));
+        assert_eq!(receive_chunks(59, 1, 0, 100).await, (100, None));
+        assert_eq!(
+            receive_chunks(61, 1 << 20, 0, 100).await,
+            (0, Some(TooSlow::Paused))
+        );
     }
 }

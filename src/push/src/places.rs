@@ -1,4 +1,4 @@
-//! How many pushes are built and wait at a time, and which of them may change a service.
+//! Admission of pushes: limits on concurrent and waiting builds, and locks per service.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,12 +10,11 @@ use tokio::sync::{OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 use super::request::Reporter;
 use crate::{Error, Options};
 
-/// Limits the number of pushes that are built at a time and that wait, and lets those of one service follow one
-/// another.
+/// Limits the number of concurrent and waiting builds, and serializes pushes of the same service.
 ///
-/// Whoever has a place never waits for a turn, so that a place is always given back: a push that learns only from what
-/// it has built which service it is of gives its place back while it waits.
-pub(super) struct Places {
+/// A push that holds a build slot never waits for a service lock, so slots are always released eventually: a push that
+/// learns its service only from the build releases its slot while it waits for the lock.
+pub(super) struct PushQueue {
     free: Arc<Semaphore>,
     turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
     waiting: AtomicUsize,
@@ -23,19 +22,19 @@ pub(super) struct Places {
     queue: usize,
 }
 
-/// The right to change a service, until it is dropped.
-pub(super) type Turn = OwnedMutexGuard<()>;
+/// Lock on a service, held until dropped.
+pub(super) type ServiceLock = OwnedMutexGuard<()>;
 
-/// A push's place, and its turn once its service is known. Both are given back when this is dropped.
-pub(super) struct Admitted<'a> {
-    places: &'a Places,
-    turn: Option<(String, Turn)>,
+/// Build slot of a push, and the lock on its service once that is known. Both are released on drop.
+pub(super) struct AdmittedPush<'a> {
+    places: &'a PushQueue,
+    turn: Option<(String, ServiceLock)>,
     place: Option<OwnedSemaphorePermit>,
 }
 
-impl Places {
-    pub(super) fn new(options: &Options) -> Places {
-        Places {
+impl PushQueue {
+    pub(super) fn new(options: &Options) -> PushQueue {
+        PushQueue {
             free: Arc::new(Semaphore::new(options.at_once)),
             turns: Mutex::default(),
             waiting: AtomicUsize::new(0),
@@ -44,21 +43,21 @@ impl Places {
         }
     }
 
-    /// Waits for the turn of a service, where it is known, and then for a place.
-    pub(super) async fn enter(
+    /// Waits for the lock on the service, if it is known, and then for a build slot.
+    pub(super) async fn admit(
         &self,
         service: Option<&str>,
         report: &Reporter,
-    ) -> Result<Admitted<'_>, Error> {
+    ) -> Result<AdmittedPush<'_>, Error> {
         let mut waiting = None;
         let turn = match service {
             None => None,
             Some(name) => {
-                let turn = match self.turn_of(name).try_lock_owned() {
+                let turn = match self.service_lock(name).try_lock_owned() {
                     Ok(turn) => turn,
                     Err(_) => {
-                        waiting = Some(self.wait()?);
-                        self.report_turn(name, report).await
+                        waiting = Some(self.enqueue()?);
+                        self.report_and_lock_service(name, report).await
                     }
                 };
                 Some((name.to_owned(), turn))
@@ -69,46 +68,46 @@ impl Places {
             Err(_) => {
                 let waiting = match waiting {
                     Some(waiting) => waiting,
-                    None => self.wait()?,
+                    None => self.enqueue()?,
                 };
-                self.report_place(&waiting, report).await?
+                self.report_and_acquire_slot(&waiting, report).await?
             }
         };
-        Ok(Admitted {
+        Ok(AdmittedPush {
             places: self,
             turn,
             place: Some(place),
         })
     }
 
-    /// Waits for the turn of a service, without a place.
-    pub(super) async fn turn(&self, service: &str) -> Turn {
-        self.turn_of(service).lock_owned().await
+    /// Waits for the lock on a service, without a build slot.
+    pub(super) async fn lock_service(&self, service: &str) -> ServiceLock {
+        self.service_lock(service).lock_owned().await
     }
 
-    fn turn_of(&self, service: &str) -> Arc<tokio::sync::Mutex<()>> {
+    fn service_lock(&self, service: &str) -> Arc<tokio::sync::Mutex<()>> {
         let mut turns = self.turns.lock();
         turns.retain(|_, turn| Arc::strong_count(turn) > 1);
         Arc::clone(turns.entry(service.to_owned()).or_default())
     }
 
-    async fn report_turn(&self, service: &str, report: &Reporter) -> Turn {
+    async fn report_and_lock_service(&self, service: &str, report: &Reporter) -> ServiceLock {
         report
             .step(&format!(
-                "waiting: {service} is being pushed or changed already"
+                "waiting: {service} is already being pushed or changed"
             ))
             .await;
-        self.turn(service).await
+        self.lock_service(service).await
     }
 
-    async fn report_place(
+    async fn report_and_acquire_slot(
         &self,
-        waiting: &Waiting<'_>,
+        waiting: &QueuedPush<'_>,
         report: &Reporter,
     ) -> Result<OwnedSemaphorePermit, Error> {
         report
             .step(&format!(
-                "waiting: {} pushes are being built, and {} wait before this one",
+                "waiting: {} pushes are building, and {} are ahead of this one",
                 self.at_once, waiting.before
             ))
             .await;
@@ -116,13 +115,13 @@ impl Places {
         place.map_err(|_| Error::Ending)
     }
 
-    /// Counts as waiting, if another may.
-    fn wait(&self) -> Result<Waiting<'_>, Error> {
-        let waiting = Waiting::among(&self.waiting);
+    /// Joins the queue, unless it is full.
+    fn enqueue(&self) -> Result<QueuedPush<'_>, Error> {
+        let waiting = QueuedPush::count_in(&self.waiting);
         if waiting.before >= self.queue {
             return Err(Error::Failed {
                 message: format!(
-                    "{} pushes are being built, and {} wait already",
+                    "{} pushes are building, and {} are already waiting",
                     self.at_once, waiting.before
                 ),
                 next: Some(
@@ -136,22 +135,30 @@ impl Places {
     }
 }
 
-impl Admitted<'_> {
-    /// Takes the turn of the service, which may be known only now: then the place is given back while another push of
-    /// it is built, and taken again. That is never refused, since the work is done.
-    pub(super) async fn named(&mut self, service: &str, report: &Reporter) -> Result<(), Error> {
+impl AdmittedPush<'_> {
+    /// Acquires the lock on the service, which may be known only now. If another push holds it, the build slot is
+    /// released while waiting and acquired again. This is never refused, since the work is already done.
+    pub(super) async fn assign_service(
+        &mut self,
+        service: &str,
+        report: &Reporter,
+    ) -> Result<(), Error> {
         if self.turn.as_ref().is_some_and(|(name, _)| name == service) {
             return Ok(());
         }
-        // Of another name that the package goes by.
+        // The package may go by another name.
         self.turn = None;
-        let turn = match self.places.turn_of(service).try_lock_owned() {
+        let turn = match self.places.service_lock(service).try_lock_owned() {
             Ok(turn) => turn,
             Err(_) => {
-                let waiting = Waiting::among(&self.places.waiting);
+                let waiting = QueuedPush::count_in(&self.places.waiting);
                 self.place = None;
-                let turn = self.places.report_turn(service, report).await;
-                self.place = Some(self.places.report_place(&waiting, report).await?);
+                let turn = self.places.report_and_lock_service(service, report).await;
+                self.place = Some(
+                    self.places
+                        .report_and_acquire_slot(&waiting, report)
+                        .await?,
+                );
                 turn
             }
         };
@@ -160,20 +167,20 @@ impl Admitted<'_> {
     }
 }
 
-/// One that waits, counted until it is dropped.
-struct Waiting<'a> {
+/// A queued push; counted until it is dropped.
+struct QueuedPush<'a> {
     count: &'a AtomicUsize,
     before: usize,
 }
 
-impl Waiting<'_> {
-    fn among(count: &AtomicUsize) -> Waiting<'_> {
+impl QueuedPush<'_> {
+    fn count_in(count: &AtomicUsize) -> QueuedPush<'_> {
         let before = count.fetch_add(1, Ordering::Relaxed);
-        Waiting { count, before }
+        QueuedPush { count, before }
     }
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for QueuedPush<'_> {
     fn drop(&mut self) {
         self.count.fetch_sub(1, Ordering::Relaxed);
     }
@@ -189,31 +196,31 @@ mod tests {
         Options {
             at_once: 1,
             queue: 1,
-            ..Options::wide()
+            ..Options::unlimited()
         }
     }
 
     #[tokio::test]
     async fn pushes_take_turns_and_no_more_wait_than_may() {
-        let places = Arc::new(Places::new(&options()));
+        let places = Arc::new(PushQueue::new(&options()));
         let (sender, mut told) = mpsc::channel(16);
         let report = Reporter::new(sender);
-        let first = places.enter(None, &report).await.expect("free");
+        let first = places.admit(None, &report).await.expect("free");
         let (again, report_again) = (Arc::clone(&places), report.clone());
-        let second = tokio::spawn(async move { again.enter(None, &report_again).await.map(drop) });
+        let second = tokio::spawn(async move { again.admit(None, &report_again).await.map(drop) });
         let Some(api::PushEvent::Step { title }) = told.recv().await else {
             panic!("nothing was told");
         };
-        assert!(title.contains("1 pushes are being built"), "{title}");
-        let refused = places.enter(None, &report).await.map(drop);
-        let refused = refused.expect_err("the queue is full").words();
+        assert!(title.contains("1 pushes are building"), "{title}");
+        let refused = places.admit(None, &report).await.map(drop);
+        let refused = refused.expect_err("the queue is full").message_and_advice();
         assert!(
-            refused.contains("1 wait already") && refused.contains("at_once"),
+            refused.contains("1 are already waiting") && refused.contains("at_once"),
             "{refused}"
         );
         drop(first);
         second.await.expect("no panic").expect("its turn");
-        drop(places.enter(None, &report).await.expect("free again"));
+        drop(places.admit(None, &report).await.expect("free again"));
     }
 
     #[tokio::test]
@@ -223,31 +230,31 @@ mod tests {
             queue: 2,
             ..options()
         };
-        let places = Arc::new(Places::new(&options));
+        let places = Arc::new(PushQueue::new(&options));
         let (sender, mut told) = mpsc::channel(16);
         let report = Reporter::new(sender);
-        let first = places.enter(Some("a"), &report).await.expect("free");
+        let first = places.admit(Some("a"), &report).await.expect("free");
         let (again, report_again) = (Arc::clone(&places), report.clone());
         let named = tokio::spawn(async move {
-            let second = again.enter(Some("a"), &report_again).await;
+            let second = again.admit(Some("a"), &report_again).await;
             second.map(drop)
         });
         let waits = |event| match event {
             Some(api::PushEvent::Step { title }) => {
-                assert!(title.contains("a is being pushed"), "{title}");
+                assert!(title.contains("a is already being pushed"), "{title}");
             }
             other => panic!("{other:?}"),
         };
         waits(told.recv().await);
-        // One that is told its service when it is built.
+        // A push whose service becomes known when it is built.
         let (again, report_again) = (Arc::clone(&places), report.clone());
         let unnamed = tokio::spawn(async move {
-            let mut second = again.enter(None, &report_again).await?;
-            second.named("a", &report_again).await
+            let mut second = again.admit(None, &report_again).await?;
+            second.assign_service("a", &report_again).await
         });
         waits(told.recv().await);
-        // Two wait, and there is a place for a third.
-        let other = places.enter(Some("b"), &report).await.expect("a place");
+        // Two are waiting, and the queue has a place for a third.
+        let other = places.admit(Some("b"), &report).await.expect("a place");
         drop((first, other));
         for waiting in [named, unnamed] {
             waiting.await.expect("no panic").expect("its turn");

@@ -1,4 +1,4 @@
-//! Finds the interface of a new image: it is started once, as a servant, and looked at.
+//! Probes the interface of a new image: starts it once, as a servant, and observes it.
 
 mod started;
 
@@ -9,11 +9,11 @@ use std::time::Duration;
 use api::PushOptions;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
-use reach::{how_it_ended, master};
+use reach::{describe_exit, master};
 use rootfs_builder::BuildOutcome;
-use rootfs_builder::probe::{Found, ProbeOptions, Work, Worked};
+use rootfs_builder::probe::{CpuTime, CpuTimeSource, ProbeOptions, ProbeResult};
 use ros::schema::Registry;
-use servant::engine::{ContainerState, NodeExit, Servant};
+use servant::engine::{ContainerState, NodeExit, ServantHandle};
 use servant::spec::Spec;
 
 use super::request::Reporter;
@@ -22,35 +22,35 @@ use crate::Error;
 use choreographer::Permit;
 use store::Plan;
 
-pub(super) use started::{Alive, ProbeServant};
+pub(super) use started::{ProbeServant, RoomGuard};
 
-/// The name of the looking node.
+/// Name of the observing node.
 pub(super) const NODE: &str = "/cloudroid_probe";
-/// As of a build: servants go before it where cores do not suffice.
+/// CPU weight of the probe, as of a build: servants take precedence when cores are scarce.
 const WEIGHT: u64 = 20;
-/// Lines of a node's log that explain its failure.
+/// Number of log lines that explain a node's failure.
 const LOG_LINES: usize = 20;
 
-/// Starts the image once and records what it shows. Where a robot needs its room meanwhile, it is ended, and begins again
-/// when there is room.
-pub(super) async fn interface(
+/// Starts the image once and records its interface. If a robot needs the reserved resources meanwhile, the probe is
+/// stopped and starts again when there is room.
+pub(super) async fn probe_interface(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
     plan: &mut Plan,
     options: &PushOptions,
     report: &Reporter,
-) -> Result<Found, Error> {
+) -> Result<ProbeResult, Error> {
     loop {
-        let room = room(pusher, options, report).await?;
-        let (alive, mut gone) = Alive::begin(room);
+        let room = admit_probe(pusher, options, report).await?;
+        let (alive, mut gone) = RoomGuard::with_room(room);
         let tried = {
-            // What it learns counts when it was there to the end.
+            // The plan is updated only if the probe runs to completion.
             let mut plan = plan.clone();
             let found = tokio::select! {
                 biased;
-                found = shown(pusher, id, built, &mut plan, options, &alive) => Some(found?),
-                () = alive.room().is_needed() => None,
+                found = probe_once(pusher, id, built, &mut plan, options, &alive) => Some(found?),
+                () = alive.room().wait_needed() => None,
             };
             found.map(|found| (found, plan))
         };
@@ -58,52 +58,53 @@ pub(super) async fn interface(
             *plan = settled;
             return Ok(found);
         }
-        let words = "a robot needs its room: it is ended, and started again when there is room";
+        let words =
+            "a robot needs this capacity: stopping the started image, to start it again later";
         report.step(words).await;
-        // What was started is being ended by a task, which has the room as long as something is left of it.
+        // A task stops what was started; it keeps the reservation until nothing is left of it.
         drop(alive);
         let _ = gone.recv().await;
     }
 }
 
-/// What the image shows when it is started.
-async fn shown(
+/// Starts the image and observes it.
+async fn probe_once(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,
     plan: &mut Plan,
     options: &PushOptions,
-    alive: &Alive,
-) -> Result<Found, Error> {
-    naming::settle(pusher, id, built, plan, options, alive).await?;
+    alive: &RoomGuard,
+) -> Result<ProbeResult, Error> {
+    naming::resolve_names(pusher, id, built, plan, options, alive).await?;
     let mut marked = plan.clone();
-    let marks = naming::mark(&mut marked, &built.flavour);
-    let spec = self::spec(pusher, id, built, &marked, options);
+    let marks = naming::mark_nodes_without_namespace(&mut marked, &built.flavour);
+    let spec = self::probe_spec(pusher, id, built, &marked, options);
     let (servant, trial) = start(pusher, spec, alive).await?;
     let unmet = servant
-        .enforced()
-        .unmet(&choreographer::engine_limits(&options.limits));
-    let found = look(pusher, &servant, built, plan, marks, options).await;
+        .enforced_limits()
+        .unmet_limits(&choreographer::engine_limits(&options.limits));
+    let found = observe_interface(pusher, &servant, built, plan, marks, options).await;
     trial.end().await?;
     let mut found = match found {
         Ok(found) => found,
-        Err(error) => return Err(advised(pusher, built, error).await),
+        Err(error) => return Err(with_advice(pusher, built, error).await),
     };
-    naming::place(plan, &found.moved);
-    let unused = naming::unused(plan, &found.interface, options);
+    naming::move_nodes(plan, &found.moved);
+    let unused = naming::unused_parameters(plan, &found.interface, options);
     found.warnings.extend(unused);
-    let warn = |what| format!("servants will run without a limit that was asked for: {what}");
+    let warn = |what| format!("servants will run without a requested limit: {what}");
     found.warnings.extend(unmet.into_iter().map(warn));
     Ok(found)
 }
 
-/// Starts it; it is ended however the trial is dropped: a push can be cancelled at any await. Starting itself is not
-/// interrupted, because what is half-started has no handle to end it by.
+/// Starts a servant that is stopped when the guard is dropped, since a push can be cancelled at any await. The start
+/// itself is not interrupted, because a half-started servant has no handle to stop it by.
 pub(super) async fn start(
     pusher: &Pusher,
     spec: Spec,
-    alive: &Alive,
-) -> Result<(Arc<dyn Servant>, ProbeServant), Error> {
+    alive: &RoomGuard,
+) -> Result<(Arc<dyn ServantHandle>, ProbeServant), Error> {
     let (engine, tasks) = (Arc::clone(&pusher.engine), pusher.tasks.clone());
     let alive = alive.clone();
     let starting = pusher.tasks.spawn(async move {
@@ -115,8 +116,12 @@ pub(super) async fn start(
     Ok(started.map_err(|_| Error::Internal("starting the image once"))??)
 }
 
-/// Room for it, as for any servant of these limits: waited for where there is none.
-async fn room(pusher: &Pusher, options: &PushOptions, report: &Reporter) -> Result<Permit, Error> {
+/// Reserves resources as for any servant with these limits; waits until they are available.
+async fn admit_probe(
+    pusher: &Pusher,
+    options: &PushOptions,
+    report: &Reporter,
+) -> Result<Permit, Error> {
     let (full, is_full) = tokio::sync::oneshot::channel();
     let patience = pusher.options.time;
     let admitted = pusher
@@ -127,7 +132,7 @@ async fn room(pusher: &Pusher, options: &PushOptions, report: &Reporter) -> Resu
     let told = async {
         if is_full.await.is_ok() {
             report
-                .step("waiting for room to start it: this machine is full")
+                .step("waiting for free capacity to start it: this machine is full")
                 .await;
         }
         std::future::pending::<()>().await;
@@ -138,21 +143,24 @@ async fn room(pusher: &Pusher, options: &PushOptions, report: &Reporter) -> Resu
     }
 }
 
-async fn look(
+async fn observe_interface(
     pusher: &Pusher,
-    servant: &Arc<dyn Servant>,
+    servant: &Arc<dyn ServantHandle>,
     built: &BuildOutcome,
     plan: &Plan,
     marks: BTreeMap<String, String>,
     push: &PushOptions,
-) -> Result<Found, Error> {
+) -> Result<ProbeResult, Error> {
     let failed = |message: String| Error::Failed {
         message,
         next: None,
         log: Vec::new(),
     };
-    let registry = Registry::of_definitions(built.flavour.ros.bus(), &built.inventory.definitions)
-        .map_err(|error| failed(format!("a definition in the image is unusable: {error}")))?;
+    let registry = Registry::with_definitions(
+        built.flavour.ros.ros_version(),
+        &built.inventory.definitions,
+    )
+    .map_err(|error| failed(format!("invalid message definition in the image: {error}")))?;
     let options = ProbeOptions {
         patience: pusher.options.probe,
         types: push
@@ -162,7 +170,7 @@ async fn look(
             .unwrap_or_default(),
         components: plan.components.clone(),
         marks,
-        work: Some(work(servant)),
+        work: Some(cpu_time_source(servant)),
         ..ProbeOptions::new(
             plan.nodes.iter().map(|node| node.name.clone()).collect(),
             NODE,
@@ -171,11 +179,11 @@ async fn look(
     let looking = async {
         let opener = &pusher.opener;
         let looked = tokio::select! {
-            // First: of a node that ended, nothing else is worth saying.
+            // Polled first: if a node has exited, no other error matters.
             biased;
-            words = ended(servant, plan) => return Err(failed(words)),
-            looked = opener.look(servant, built.flavour.ros.bus(), NODE, &plan.grants.egress) => {
-                looked.map_err(|error| failed(format!("the started image cannot be reached: {error}")))?
+            words = wait_for_failure(servant, plan) => return Err(failed(words)),
+            looked = opener.observe(servant, built.flavour.ros.ros_version(), NODE, &plan.grants.egress) => {
+                looked.map_err(|error| failed(format!("cannot reach the started image: {error}")))?
             }
         };
         rootfs_builder::probe::probe(
@@ -183,19 +191,19 @@ async fn look(
             &registry,
             &built.inventory.definitions,
             &options,
-            ended(servant, plan),
+            wait_for_failure(servant, plan),
         )
         .await
         .map_err(|error| failed(error.to_string()))
     };
     match looking.await {
         Ok(found) => Ok(found),
-        Err(error) => Err(explained(error, servant).await),
+        Err(error) => Err(with_node_logs(error, servant).await),
     }
 }
 
-/// With the option that adds what the nodes say is missing.
-async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
+/// Adds the options that provide what the nodes report as missing.
+async fn with_advice(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
     match error {
         Error::Failed {
             message,
@@ -216,22 +224,22 @@ async fn advised(pusher: &Pusher, built: &BuildOutcome, error: Error) -> Error {
     }
 }
 
-/// What a servant's nodes have had of the processors.
-pub(super) fn work(servant: &Arc<dyn Servant>) -> Work {
+/// Returns a source of the CPU time used by a servant's nodes.
+pub(super) fn cpu_time_source(servant: &Arc<dyn ServantHandle>) -> CpuTimeSource {
     let servant = Arc::clone(servant);
-    Work::new(move || worked(Arc::clone(&servant)))
+    CpuTimeSource::new(move || measure_cpu_time(Arc::clone(&servant)))
 }
 
-async fn worked(servant: Arc<dyn Servant>) -> Option<Worked> {
+async fn measure_cpu_time(servant: Arc<dyn ServantHandle>) -> Option<CpuTime> {
     let usage = servant.usage().await.ok()?;
-    Some(Worked {
+    Some(CpuTime {
         ran: Duration::from_micros(usage.cpu_usec),
-        waited: servant.waited().await,
+        waited: servant.cpu_wait_time().await,
     })
 }
 
-/// Comes back when a node ends that should not, or the container does, with what is to be said about it.
-pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
+/// Waits until a node exits unexpectedly, or the container does; returns a description.
+pub(super) async fn wait_for_failure(servant: &Arc<dyn ServantHandle>, plan: &Plan) -> String {
     let mut nodes: FuturesUnordered<_> = plan
         .nodes
         .iter()
@@ -243,13 +251,13 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
         while let Some((name, exit)) = nodes.next().await {
             left -= 1;
             match exit {
-                // Launch files have nodes that do one thing and end.
+                // Launch files may contain nodes that do one thing and exit.
                 Ok(NodeExit { code: Some(0), .. }) if left > 0 => {}
                 Ok(exit) => {
-                    let how = how_it_ended(&exit, &plan.limits);
-                    return format!("{name} {how} before its interface was seen");
+                    let how = describe_exit(&exit, &plan.limits);
+                    return format!("{name} {how} before its interface was found");
                 }
-                // The container's own state says more.
+                // The state of the container has more details.
                 Err(_) => {}
             }
         }
@@ -262,15 +270,15 @@ pub(super) async fn ended(servant: &Arc<dyn Servant>, plan: &Plan) -> String {
         words = node_ended => words,
         over = over => match over.as_deref() {
             Ok(ContainerState::Stopped { reason } | ContainerState::Failed { reason }) => {
-                format!("the started image ended before its interface was seen: {reason}")
+                format!("the started image ended before its interface was found: {reason}")
             }
-            _ => "the started image was lost by the engine".to_owned(),
+            _ => "the container engine lost the started image".to_owned(),
         },
     }
 }
 
-/// With the last lines that the nodes printed.
-pub(super) async fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error {
+/// Adds the last lines printed by the nodes to an error.
+pub(super) async fn with_node_logs(error: Error, servant: &Arc<dyn ServantHandle>) -> Error {
     match error {
         Error::Failed { message, next, log } if log.is_empty() => {
             let lines = servant.logs(LOG_LINES, None).await;
@@ -284,7 +292,7 @@ pub(super) async fn explained(error: Error, servant: &Arc<dyn Servant>) -> Error
     }
 }
 
-pub(super) fn spec(
+pub(super) fn probe_spec(
     pusher: &Pusher,
     id: &str,
     built: &BuildOutcome,

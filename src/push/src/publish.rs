@@ -1,9 +1,9 @@
-//! Publishing, rolling back and removing services: the catalogue does it, servants and warm containers follow.
+//! Publishing, rolling back and removing services: the catalogue changes, then servants and warm containers follow.
 
 use std::sync::Arc;
 
 use api::rollout::RolloutTerms;
-use catalogue::RolledBack;
+use catalogue::RollbackResult;
 use package::inventory::Inventory;
 use store::{NewEvent, RevisionRecord};
 
@@ -12,9 +12,9 @@ use super::request::Reporter;
 use crate::Error;
 
 impl Pusher {
-    /// Publishes the revision on these terms, and has a warm container made of it. What fails once it is published is a
-    /// warning: then it is there.
-    pub(super) async fn publish(
+    /// Publishes the revision on these terms and refills the warm pool. A failure after publication is only a warning,
+    /// since the revision is published.
+    pub(super) async fn publish_and_rollout(
         &self,
         record: RevisionRecord,
         inventory: Inventory,
@@ -22,8 +22,8 @@ impl Pusher {
         report: &Reporter,
     ) -> Result<(), Error> {
         let service = record.service.clone();
-        let before = match self.catalogue.package(&service)? {
-            Some(_) => Some(self.catalogue.current(&service)?.number),
+        let before = match self.catalogue.service_package(&service)? {
+            Some(_) => Some(self.catalogue.current_revision(&service)?.number),
             None => None,
         };
         let terms = terms.filter(|_| before.is_some());
@@ -31,9 +31,10 @@ impl Pusher {
         if beside {
             self.choreographer.check_canary(&record)?;
         }
-        let published = match beside {
-            true => self.catalogue.publish_beside(record, inventory).await,
-            false => self.catalogue.publish(record, inventory).await,
+        let published = if beside {
+            self.catalogue.publish_inactive(record, inventory).await
+        } else {
+            self.catalogue.publish(record, inventory).await
         };
         self.choreographer.refill_warm_pool();
         let number = published?;
@@ -52,29 +53,31 @@ impl Pusher {
             None => choreographer.revision_changed(&service, number).await,
         };
         if let Err(error) = followed {
-            report.last_warning(format!("{words}, but its servants do not follow: {error}"));
+            report.try_warning(format!(
+                "{words}, but its servants were not updated: {error}"
+            ));
         }
         Ok(())
     }
 
     /// Makes an earlier revision the current one.
     pub async fn rollback(&self, name: &str, wanted: Option<u64>) -> Result<u64, Error> {
-        let _turn = self.places.turn(name).await;
-        let RolledBack { from, to } = self.catalogue.rollback(name, wanted).await?;
+        let _turn = self.places.lock_service(name).await;
+        let RollbackResult { from, to } = self.catalogue.rollback(name, wanted).await?;
         self.choreographer.refill_warm_pool();
         self.choreographer.revision_changed(name, to).await?;
         let about = NewEvent {
             service: Some(name),
             ..NewEvent::default()
         };
-        let message = format!("{name} was set from revision {from} to revision {to}");
+        let message = format!("{name} was changed from revision {from} to revision {to}");
         self.journal.info("rolled-back", &message, &about);
         Ok(to)
     }
 
-    /// Removes a service, its servants and its images; gives the servants' ids.
+    /// Removes a service, its servants and its images; returns the ids of the servants.
     pub async fn remove(&self, name: &str) -> Result<Vec<String>, Error> {
-        let _turn = self.places.turn(name).await;
+        let _turn = self.places.lock_service(name).await;
         let withdrawn = self.catalogue.withdraw(name)?;
         let stopped = self
             .choreographer
@@ -93,10 +96,10 @@ impl Pusher {
         Ok(stopped)
     }
 
-    /// Removes what of the image store nothing needs. A failure is logged alone.
+    /// Removes unused images from the store. A failure is only logged.
     pub async fn collect_garbage(&self) {
         let builder = Arc::clone(&self.builder);
-        let mut keep = privilege::blocking(move || builder.keep())
+        let mut keep = privilege::spawn_blocking(move || builder.layers_to_keep())
             .await
             .unwrap_or_default();
         let in_use = self.choreographer.images_in_use();

@@ -1,4 +1,4 @@
-//! The archive of a push: unpacked while it comes in, so that it is never on disk as such.
+//! Reception of a push: the archive is unpacked while it arrives, and is never stored as such.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -17,24 +17,24 @@ use rootfs_builder::blocking;
 use tokio_util::io::{StreamReader, SyncIoBridge};
 use tokio_util::sync::CancellationToken;
 
-use super::patience::{self, Patience, Stalled, TooSlow};
+use super::patience::{self, BodyRateLimit, StallFlag, TooSlow};
 use super::request::Reporter;
 use crate::Error;
 use crate::Options;
 
-/// How often it is told how far the archive has come.
+/// Interval of progress events.
 const TOLD_EVERY: Duration = Duration::from_millis(500);
-/// How long a refused client is listened to.
+/// Maximum time to read from a refused client.
 const DISCARD_FOR: Duration = Duration::from_secs(60);
-/// How deep a package.xml is looked for.
+/// Maximum depth at which a package.xml is searched.
 const DEPTH: usize = 6;
-/// The largest package.xml that is looked at, in bytes.
+/// Maximum size of a package.xml, in bytes.
 const MANIFEST: u64 = 1 << 20;
 
-/// The bytes of an archive, as they come.
+/// Body of an archive, in chunks.
 pub type Archive = BoxStream<'static, io::Result<Bytes>>;
 
-/// Unpacks the archive into `tree`, which is made.
+/// Unpacks the archive into `tree`, which is created.
 pub(super) async fn unpack(
     archive: Archive,
     tree: &Path,
@@ -42,17 +42,17 @@ pub(super) async fn unpack(
     report: &Reporter,
 ) -> Result<(), Error> {
     let received = Arc::new(AtomicU64::new(0));
-    // However this is left, the thread that reads the body hears of it.
+    // Cancels the reading thread however this function is left.
     let ended = CancellationToken::new();
     let _ended = ended.clone().drop_guard();
-    let stalled = Stalled::default();
-    let patience = Patience {
+    let stalled = StallFlag::default();
+    let patience = BodyRateLimit {
         pause: limits.stall,
         rate: limits.min_rate.0,
     };
-    let chunks = patience::chunks(archive, patience, stalled.clone(), ended);
+    let chunks = patience::timed_chunks(archive, patience, stalled.clone(), ended);
     let stream = StreamReader::new(chunks.boxed());
-    let mut counted = Counted {
+    let mut counted = CountingReader {
         inner: SyncIoBridge::new(stream),
         received: Arc::clone(&received),
         limit: limits.archive.0,
@@ -65,19 +65,19 @@ pub(super) async fn unpack(
     };
     let (limit, slowest) = (limits.archive, limits.min_rate);
     let destination = tree.to_owned();
-    let place = privilege::blocking(move || Place::make(&destination))
+    let place = privilege::spawn_blocking(move || UnpackDirectory::create(&destination))
         .await
-        .map_err(|_| Error::Internal("making room for the archive"))??;
-    let inside = place.inside();
+        .map_err(|_| Error::Internal("creating a directory for the archive"))??;
+    let inside = place.confined_path();
     let work = blocking::spawn(move || {
         let outcome = image::unpack(&mut counted, &inside, &unpacked);
         if counted.exceeded {
             return Err(Error::TooLarge { limit });
         }
-        if let Some(why) = stalled.why() {
-            return Err(too_slow(why, patience.pause, slowest));
+        if let Some(why) = stalled.reason() {
+            return Err(too_slow_error(why, patience.pause, slowest));
         }
-        outcome.map(|_| ()).map_err(refused)
+        outcome.map(|_| ()).map_err(refusal)
     });
     let told = async {
         let mut ticks = tokio::time::interval(TOLD_EVERY);
@@ -99,35 +99,35 @@ pub(super) async fn unpack(
         outcome = work => outcome.map_err(|_| Error::Internal("unpacking the archive"))?,
         () = told => Ok(()),
     }?;
-    let done = blocking::cancelled_with_this(move || place.done());
-    privilege::blocking(done)
+    let done = blocking::cancel_with_caller(move || place.finish());
+    privilege::spawn_blocking(done)
         .await
-        .map_err(|_| Error::Internal("taking over what was unpacked"))?
+        .map_err(|_| Error::Internal("moving the unpacked files"))?
 }
 
-/// Where an archive is unpacked by threads that may write nowhere else: a directory that is theirs, which they know by its
-/// descriptor, since they cannot get to it by its path.
-struct Place {
-    /// That directory.
+/// Directory into which an archive is unpacked by threads that may write nowhere else. It is owned by them, and they
+/// access it by its file descriptor, since they have no access to its path.
+struct UnpackDirectory {
+    /// Open handle of the directory.
     opened: File,
     path: PathBuf,
-    /// Where the tree is to be in the end.
+    /// Final path of the tree.
     tree: PathBuf,
 }
 
-/// The tree, in the directory in which it is unpacked.
+/// Name of the tree in the directory.
 const UNPACKED: &str = "tree";
 
-impl Place {
-    fn make(tree: &Path) -> Result<Self, Error> {
+impl UnpackDirectory {
+    fn create(tree: &Path) -> Result<Self, Error> {
         let parent = tree.parent().unwrap_or(tree);
         let path = parent.join("received");
-        let failed = cannot("make", &path);
+        let failed = file_error("make", &path);
         store::private::make_directory(&path).map_err(failed)?;
-        let opened = File::open(&path).map_err(cannot("open", &path))?;
-        if let Some(account) = privilege::confined() {
+        let opened = File::open(&path).map_err(file_error("open", &path))?;
+        if let Some(account) = privilege::confined_account() {
             std::os::unix::fs::fchown(&opened, Some(account.user), Some(account.group))
-                .map_err(cannot("give away", &path))?;
+                .map_err(file_error("give away", &path))?;
         }
         Ok(Self {
             opened,
@@ -136,45 +136,45 @@ impl Place {
         })
     }
 
-    /// The tree's path for those threads.
-    fn inside(&self) -> PathBuf {
+    /// Returns the path of the tree for those threads.
+    fn confined_path(&self) -> PathBuf {
         PathBuf::from(format!(
             "/proc/self/fd/{}/{UNPACKED}",
             self.opened.as_raw_fd()
         ))
     }
 
-    /// Takes the tree over: it is this user's from now on, and where it is to be.
-    fn done(self) -> Result<(), Error> {
+    /// Takes ownership of the tree and moves it to its final path.
+    fn finish(self) -> Result<(), Error> {
         let found = self.path.join(UNPACKED);
-        if privilege::confined().is_some() {
-            let failed = cannot("take over", &found);
-            take_over(&found).map_err(|error| failed(io::Error::other(error)))?;
+        if privilege::confined_account().is_some() {
+            let failed = file_error("take over", &found);
+            chown_tree(&found).map_err(|error| failed(io::Error::other(error)))?;
         }
-        std::fs::rename(&found, &self.tree).map_err(cannot("move", &found))?;
-        std::fs::remove_dir(&self.path).map_err(cannot("remove", &self.path))
+        std::fs::rename(&found, &self.tree).map_err(file_error("move", &found))?;
+        std::fs::remove_dir(&self.path).map_err(file_error("remove", &self.path))
     }
 }
 
-/// Makes the files of a tree this user's, and no link's target.
-fn take_over(tree: &Path) -> Result<(), foreign::Error> {
+/// Changes the owner of all files of a tree to this user, without following links.
+fn chown_tree(tree: &Path) -> Result<(), foreign::Error> {
     let (user, group) = (rustix::process::geteuid(), rustix::process::getegid());
     let ours = |error: rustix::io::Errno| foreign::Error::File {
         action: "take over",
         path: tree.to_owned(),
         source: error.into(),
     };
-    // First the directories that lead there: nobody else changes them from then on.
+    // Top-down: once a directory is owned by this user, nobody else can change its entries.
     let no_link = rustix::fs::AtFlags::SYMLINK_NOFOLLOW;
     rustix::fs::chownat(rustix::fs::CWD, tree, Some(user), Some(group), no_link).map_err(ours)?;
     foreign::walk(tree, |entry| {
-        let (parent, name) = entry.place();
+        let (parent, name) = entry.parent_and_name();
         rustix::fs::chownat(parent, name, Some(user), Some(group), no_link).map_err(ours)?;
         Ok(foreign::Visit::Into)
     })
 }
 
-fn cannot(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+fn file_error(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
     let path = path.display().to_string();
     move |error| Error::Failed {
         message: format!("cannot {action} {path}: {error}"),
@@ -183,14 +183,14 @@ fn cannot(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error 
     }
 }
 
-fn too_slow(why: TooSlow, pause: Duration, rate: Size) -> Error {
+fn too_slow_error(why: TooSlow, pause: Duration, rate: Size) -> Error {
     let (message, next) = match why {
         TooSlow::Paused => (
-            format!("nothing of the archive came for {} s", pause.as_secs()),
-            "look at the connection and push again, or raise stall in [push] of the configuration",
+            format!("no data of the archive arrived for {} s", pause.as_secs()),
+            "check the connection and push again, or raise stall in [push] of the configuration",
         ),
         TooSlow::Trickled => (
-            format!("the archive came at less than {rate} a second"),
+            format!("the archive arrived at less than {rate} per second"),
             "push over a faster connection, or lower min_rate in [push] of the configuration",
         ),
     };
@@ -201,26 +201,25 @@ fn too_slow(why: TooSlow, pause: Duration, rate: Size) -> Error {
     }
 }
 
-fn refused(error: image::Error) -> Error {
+fn refusal(error: image::Error) -> Error {
     let next = match &error {
         image::Error::Archive {
             problem: Refusal::TooManyEntries { .. },
             ..
-        } => Some("push less, or raise entries in [push] of the configuration".to_owned()),
+        } => Some("push fewer files, or raise entries in [push] of the configuration".to_owned()),
         image::Error::Archive {
             problem: Refusal::TooLarge { .. },
             ..
-        } => Some("push less, or raise unpacked in [push] of the configuration".to_owned()),
+        } => Some("push fewer files, or raise unpacked in [push] of the configuration".to_owned()),
         image::Error::Archive {
             problem: Refusal::LinkLeaves { .. },
             ..
         } => Some(
-            "replace the link with a copy; an install space made with 'colcon build --symlink-install' is full of them: \
-             build it without"
+            "replace the link with a copy; build install spaces without 'colcon build --symlink-install'"
                 .to_owned(),
         ),
         image::Error::Archive { .. } => Some(
-            "push a tar archive of a package, workspace or install space that keeps to itself"
+            "push a tar archive of a package, workspace or install space whose links stay inside it"
                 .to_owned(),
         ),
         _ => None,
@@ -249,9 +248,9 @@ pub(super) async fn discard(mut archive: Archive, limit: Size, ending: Cancellat
     }
 }
 
-/// Names of the packages in a tree, as far as they can be read; that of the tree's root first. (The build reads
-/// them strictly; this is for an early word.)
-pub(super) fn packages_of(tree: &Path) -> Vec<String> {
+/// Returns the names of the packages in a tree, as far as they can be parsed; that of the root first. (The build parses
+/// them strictly; this is for early errors.)
+pub(super) fn package_names(tree: &Path) -> Vec<String> {
     let mut names = Vec::new();
     collect_packages(tree, DEPTH, &mut names);
     names
@@ -259,9 +258,9 @@ pub(super) fn packages_of(tree: &Path) -> Vec<String> {
 
 fn collect_packages(directory: &Path, depth: usize, names: &mut Vec<String>) {
     let manifest = foreign::Tree::open(directory)
-        .and_then(|tree| tree.file_following("package.xml", MANIFEST));
+        .and_then(|tree| tree.read_file_following("package.xml", MANIFEST));
     if let Ok(Some(file)) = manifest {
-        names.extend(name_in(&String::from_utf8_lossy(&file.bytes)));
+        names.extend(parse_name(&String::from_utf8_lossy(&file.bytes)));
         return;
     }
     if depth == 0 {
@@ -281,21 +280,21 @@ fn collect_packages(directory: &Path, depth: usize, names: &mut Vec<String>) {
     }
 }
 
-fn name_in(manifest: &str) -> Option<String> {
+fn parse_name(manifest: &str) -> Option<String> {
     let (_, rest) = manifest.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     Some(name.trim().to_owned())
 }
 
-/// Counts what is read and ends with an error beyond the limit.
-struct Counted<R> {
+/// Reader that counts bytes and fails beyond a limit.
+struct CountingReader<R> {
     inner: R,
     received: Arc<AtomicU64>,
     limit: u64,
     exceeded: bool,
 }
 
-impl<R: Read> Read for Counted<R> {
+impl<R: Read> Read for CountingReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(buffer)?;
         let total = self.received.fetch_add(read as u64, Ordering::Relaxed) + read as u64;
@@ -332,13 +331,13 @@ mod tests {
         builder.into_inner().expect("into memory")
     }
 
-    async fn unpacked(bytes: Vec<u8>, limits: &Options) -> Result<Vec<String>, Error> {
+    async fn unpack_archive(bytes: Vec<u8>, limits: &Options) -> Result<Vec<String>, Error> {
         let place = tempfile::tempdir().expect("a directory");
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
         let whole = futures_util::stream::iter([Ok(Bytes::from(bytes))]).boxed();
         unpack(whole, &tree, limits, &Reporter::new(sender)).await?;
-        Ok(packages_of(&tree))
+        Ok(package_names(&tree))
     }
 
     #[tokio::test(flavor = "multi_thread")]
@@ -355,7 +354,9 @@ mod tests {
             ),
         ]);
         assert_eq!(
-            unpacked(bytes, &Options::wide()).await.expect("good"),
+            unpack_archive(bytes, &Options::unlimited())
+                .await
+                .expect("good"),
             ["one", "two"]
         );
     }
@@ -365,9 +366,9 @@ mod tests {
         let bytes = archive(&[("package.xml", &"x".repeat(10_000))]);
         let limits = Options {
             archive: Size(2000),
-            ..Options::wide()
+            ..Options::unlimited()
         };
-        let refused = unpacked(bytes, &limits).await.expect_err("too big");
+        let refused = unpack_archive(bytes, &limits).await.expect_err("too big");
         assert!(matches!(refused, Error::TooLarge { .. }), "{refused}");
     }
 
@@ -381,13 +382,15 @@ mod tests {
         let body = chunks.chain(futures_util::stream::pending()).boxed();
         let limits = Options {
             stall: Duration::from_millis(50),
-            ..Options::wide()
+            ..Options::unlimited()
         };
         let refused = unpack(body, &tree, &limits, &Reporter::new(sender))
             .await
             .expect_err("it never ends");
         assert!(
-            refused.to_string().contains("nothing of the archive came"),
+            refused
+                .to_string()
+                .contains("no data of the archive arrived"),
             "{refused}"
         );
         assert!(!tree.exists());
@@ -398,7 +401,7 @@ mod tests {
         let place = tempfile::tempdir().expect("a directory");
         let tree = place.path().join("build/pushed");
         let (sender, _receiver) = mpsc::channel(16);
-        // What the thread reads from is dropped when it ends.
+        // The reader of the thread is dropped when it ends.
         let (held, dropped) = tokio::sync::oneshot::channel::<()>();
         let (asked, waiting) = tokio::sync::oneshot::channel::<()>();
         let mut asked = Some(asked);
@@ -409,7 +412,7 @@ mod tests {
         });
         let push = tokio::spawn(async move {
             let body = never.boxed();
-            unpack(body, &tree, &Options::wide(), &Reporter::new(sender)).await
+            unpack(body, &tree, &Options::unlimited(), &Reporter::new(sender)).await
         });
         waiting.await.expect("it reads");
         push.abort();
@@ -418,9 +421,12 @@ mod tests {
 
     #[tokio::test(flavor = "multi_thread")]
     async fn what_is_no_archive_is_refused() {
-        let refused = unpacked(b"hello, this is no archive".repeat(100), &Options::wide())
-            .await
-            .expect_err("text");
+        let refused = unpack_archive(
+            b"hello, this is no archive".repeat(100),
+            &Options::unlimited(),
+        )
+        .await
+        .expect_err("text");
         assert!(matches!(refused, Error::Failed { .. }), "{refused}");
         assert!(refused.to_string().contains("archive"), "{refused}");
     }

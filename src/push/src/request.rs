@@ -1,4 +1,4 @@
-//! A push as a task of its own: begun, bounded, cancelled as a whole, and told of.
+//! Life cycle of a push: a task that is started, bounded, cancelled as a whole, and reported on.
 
 use std::future::Future;
 use std::sync::Arc;
@@ -17,13 +17,13 @@ use tokio_util::task::TaskTracker;
 
 use super::{Archive, Error, Pusher, receive, shared};
 
-/// Tells the client what is being done. It may have gone away: that cancels the push by itself.
+/// Reports progress to the client. A client that has disconnected cancels the push separately.
 #[derive(Clone)]
 pub(super) struct Reporter {
     events: mpsc::Sender<PushEvent>,
-    /// The build of this push, as long as it works.
+    /// Tracks the build of this push while it runs.
     pub(super) building: TaskTracker,
-    /// Cancelled when the push begins to publish, after which nothing breaks it off.
+    /// Cancelled when the push begins to publish, after which it can no longer be cancelled.
     pub(super) publishing: CancellationToken,
 }
 
@@ -47,12 +47,12 @@ impl Reporter {
         self.event(PushEvent::Warning { message }).await;
     }
 
-    /// Tells it if the client reads: what is published does not wait for one that does not.
-    pub(super) fn last_warning(&self, message: String) {
+    /// Sends a warning if the client keeps up; publication does not wait for a slow client.
+    pub(super) fn try_warning(&self, message: String) {
         let _ = self.events.try_send(PushEvent::Warning { message });
     }
 
-    /// Tells what an answer is counted against.
+    /// Reports a request pair.
     pub(super) async fn request(&self, request: &Request) {
         let words = request.to_string();
         match request.reason {
@@ -68,49 +68,49 @@ impl Reporter {
     }
 }
 
-/// Whether a service of this name may be published; else why not.
-type MayPublish = dyn Fn(&str) -> Result<(), String> + Send + Sync;
+/// Checks whether a service name may be published; returns the reason if not.
+type PublishCheck = dyn Fn(&str) -> Result<(), String> + Send + Sync;
 
-/// When a push ends before its time, and why.
-type Over = dyn Fn() -> BoxFuture<'static, String> + Send + Sync;
+/// Future that resolves with the reason when the deployer's credentials are revoked.
+type Revocation = dyn Fn() -> BoxFuture<'static, String> + Send + Sync;
 
-/// Whoever pushes.
+/// Principal that pushes.
 pub struct Deployer {
-    /// Whose a service is that is published for the first time; none: its operators'.
+    /// Owner of services that are published for the first time; `None` for operators.
     pub owner: Option<String>,
-    /// What it may publish.
-    pub may: Box<MayPublish>,
-    /// Comes back with the reason when what it pushes by is not good any more.
-    pub over: Box<Over>,
+    /// Check of the services that it may publish.
+    pub may: Box<PublishCheck>,
+    /// Resolves with the reason when its credentials are no longer valid.
+    pub over: Box<Revocation>,
 }
 
 impl Deployer {
-    pub(super) fn may(&self, name: &str) -> Result<(), Error> {
+    pub(super) fn check_may_publish(&self, name: &str) -> Result<(), Error> {
         (self.may)(name).map_err(Error::NotAllowed)
     }
 }
 
-/// What a push came to.
+/// Result of a push.
 #[derive(Debug)]
-pub struct Published {
-    /// The service.
+pub struct PushResult {
+    /// Name of the service.
     pub service: String,
-    /// Layers of its image.
+    /// Layers of the image.
     pub layers: Vec<api::push::Layer>,
-    /// How long it took, with what it waited for others.
+    /// Duration, including the time spent waiting for other pushes.
     pub took: Duration,
 }
 
 impl Pusher {
-    /// Begins a push; `events` are told what is done, and `finished` what it came to. It is cancelled when what this
-    /// gives is dropped.
-    pub fn begin<F>(
+    /// Starts a push; `events` receives its progress, `finished` its result. The push is cancelled when the returned
+    /// guard is dropped.
+    pub fn start<F>(
         self: &Arc<Self>,
         options: PushOptions,
         by: Deployer,
         archive: Archive,
         events: mpsc::Sender<PushEvent>,
-        finished: impl FnOnce(Result<Published, Error>) -> F + Send + 'static,
+        finished: impl FnOnce(Result<PushResult, Error>) -> F + Send + 'static,
     ) -> DropGuard
     where
         F: Future<Output = ()> + Send,
@@ -125,28 +125,29 @@ impl Pusher {
             let failed = outcome.is_err();
             finished(outcome).await;
             if failed && !pusher.cancel.is_cancelled() {
-                // What the failed push had made is of no use any more.
+                // The layers of a failed push are no longer needed.
                 pusher.collect_garbage().await;
             }
         });
         guard
     }
 
-    /// Reads what a refused client still sends, for a while: were it cut off, it might not see why.
+    /// Reads what a refused client still sends, for a while: if the connection were closed at once, it might not see
+    /// the response.
     pub fn discard(&self, archive: Archive) {
         let limit = self.options.archive;
         let ending = self.cancel.clone();
         self.tasks.spawn(receive::discard(archive, limit, ending));
     }
 
-    /// Refuses what can be refused before anything is received.
-    pub fn check(&self, options: &PushOptions, by: &Deployer) -> Result<(), Error> {
+    /// Rejects what can be rejected before anything is received.
+    pub fn check_request(&self, options: &PushOptions, by: &Deployer) -> Result<(), Error> {
         if self.cancel.is_cancelled() {
             return Err(Error::Ending);
         }
         if let Some(name) = &options.name {
-            names::service(name).map_err(catalogue::Error::from)?;
-            by.may(name)?;
+            names::validate_service(name).map_err(catalogue::Error::from)?;
+            by.check_may_publish(name)?;
         }
         choreographer::limits::check(&options.limits)
             .map_err(|error| Error::Options(error.to_string()))?;
@@ -157,7 +158,7 @@ impl Pusher {
         check_caps(options).map_err(Error::Options)?;
         check_sla(options).map_err(Error::Options)?;
         options
-            .read_requests()
+            .parse_requests()
             .map_err(|error| Error::Options(format!("--request {error}")))?;
         if let Some(terms) = &options.rollout {
             choreographer::check_terms(terms)?;
@@ -167,7 +168,7 @@ impl Pusher {
         Ok(self.choreographer.check_limits(&options.limits)?)
     }
 
-    /// Pushes from beginning to end.
+    /// Runs a push from start to end.
     async fn run(
         &self,
         options: &PushOptions,
@@ -175,7 +176,7 @@ impl Pusher {
         archive: Archive,
         report: &Reporter,
         cancel: CancellationToken,
-    ) -> Result<Published, Error> {
+    ) -> Result<PushResult, Error> {
         let id = format!("push-{}", names::random(8));
         let push = Box::pin(self.push(&id, options, by, archive, report));
         let work = blocking::cancellable(push);
@@ -185,15 +186,15 @@ impl Pusher {
                 reason = (by.over)() => Error::NotAllowed(reason),
             }
         };
-        let outcome = unless_over(work, over, &report.publishing).await;
-        // First what the builder has in there: it goes when its containers have ended.
+        let outcome = run_until_revoked(work, over, &report.publishing).await;
+        // The builder first: it removes its files when its containers have ended.
         report.building.close();
         report.building.wait().await;
-        self.builder.removed(&id).await;
+        self.builder.wait_removed(&id).await;
         let build = self.home.join("build").join(&id);
-        let removed = privilege::blocking(move || foreign::remove(&build)).await;
+        let removed = privilege::spawn_blocking(move || foreign::remove(&build)).await;
         if let Ok(Err(error)) = removed {
-            tracing::warn!("what the push {id} left remains until the next start: {error}");
+            tracing::warn!("leftovers of the push {id} remain until the next start: {error}");
         }
         match outcome {
             Ok(published) => {
@@ -220,8 +221,8 @@ impl Pusher {
     }
 }
 
-/// Does the work, unless it is `over` before it publishes.
-async fn unless_over<T>(
+/// Runs the work unless `over` resolves before it begins to publish.
+async fn run_until_revoked<T>(
     work: impl Future<Output = Result<T, Error>>,
     over: impl Future<Output = Error>,
     publishing: &CancellationToken,
@@ -236,7 +237,7 @@ async fn unless_over<T>(
     work.await
 }
 
-/// Refuses caps that no limits keep.
+/// Rejects caps that contradict the limits.
 fn check_caps(options: &PushOptions) -> Result<(), String> {
     let PushOptions { caps, limits, .. } = options;
     let most = Limits {
@@ -262,7 +263,7 @@ fn check_caps(options: &PushOptions) -> Result<(), String> {
     Ok(())
 }
 
-/// Refuses what stubs cannot promise by default.
+/// Rejects an SLA that cannot be a default for stubs.
 fn check_sla(options: &PushOptions) -> Result<(), String> {
     let sla = &options.sla;
     sla.check().map_err(|error| format!("--{error}"))?;
@@ -271,11 +272,13 @@ fn check_sla(options: &PushOptions) -> Result<(), String> {
         max_rrt: sla.max_rrt,
         ..Sla::default()
     };
-    match *sla == times {
-        true => Ok(()),
-        false => Err(
-            "sla says more than rrt and max_rrt; rates and ages are for the robot to say, in its stub.toml".into(),
-        ),
+    if *sla == times {
+        Ok(())
+    } else {
+        Err(
+            "sla may have only rrt and max_rrt; the robot sets rates and ages in its stub.toml"
+                .into(),
+        )
     }
 }
 
@@ -295,7 +298,7 @@ mod tests {
                     publishing.cancel();
                 }
                 over.cancel();
-                // The client is gone, and the database works yet.
+                // The client has disconnected while the database is still writing.
                 let _ = awaited.await;
                 Ok("published")
             };
@@ -304,7 +307,7 @@ mod tests {
                 let _ = done.send(());
                 Error::Ending
             };
-            let outcome = unless_over(work, ended, &publishing).await;
+            let outcome = run_until_revoked(work, ended, &publishing).await;
             assert_eq!(outcome.unwrap_or("nothing"), expected);
         }
     }
@@ -355,8 +358,8 @@ mod tests {
             })
         };
         let times = |rrt: u64, max_rrt: u64| Sla {
-            rrt: Span::millis(rrt),
-            max_rrt: Span::millis(max_rrt),
+            rrt: Span::from_millis(rrt),
+            max_rrt: Span::from_millis(max_rrt),
             ..Sla::default()
         };
         assert_eq!(check(times(100, 300)), Ok(()));

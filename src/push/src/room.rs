@@ -1,4 +1,4 @@
-//! Room for what pushes leave behind: free space of the disks that they write to, and bytes of the images of one deployer.
+//! Disk space for pushes: free space of the disks that they write to, and a quota for the images of each deployer.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -9,12 +9,12 @@ use tokio::time::MissedTickBehavior;
 
 use crate::{Error, Pusher};
 
-/// How often it is looked how much is free.
+/// Interval at which the free space is checked.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Of a small disk as much as this part of it stays free.
+/// Divisor of the disk size: on small disks 1/20 of the size stays free.
 const PART: u64 = 20;
 
-/// The disks that pushes write to: that of the state directory, and that of the cache of builds.
+/// The disks that pushes write to: those of the state directory and of the build cache.
 #[derive(Debug, Clone)]
 pub(super) struct Disks {
     directories: Vec<PathBuf>,
@@ -22,7 +22,7 @@ pub(super) struct Disks {
 }
 
 impl Disks {
-    /// With at least `free` bytes left on each, or a twentieth of it.
+    /// Requires `free` bytes on each disk, or 1/20 of its size if that is less.
     pub(super) fn new(home: &Path, cache: &Path, free: Size) -> Self {
         Self {
             directories: vec![home.to_owned(), cache.to_owned()],
@@ -30,17 +30,17 @@ impl Disks {
         }
     }
 
-    /// Refuses a push where one of them has less left.
+    /// Rejects a push if one of the disks has less free space.
     pub(super) async fn check(&self) -> Result<(), Error> {
         let disks = self.clone();
-        let lacking = privilege::blocking(move || disks.lacking())
+        let lacking = privilege::spawn_blocking(move || disks.describe_shortage())
             .await
-            .map_err(|_| Error::Internal("looking at the disks"))?;
-        lacking.map_or(Ok(()), |what| Err(refused(what)))
+            .map_err(|_| Error::Internal("checking disk space"))?;
+        lacking.map_or(Ok(()), |what| Err(no_space_error(what)))
     }
 
-    /// Returns when one of them has less left, with the error of the push that is ended.
-    pub(super) async fn low(&self) -> Error {
+    /// Waits until one of the disks has less free space; returns the error for the push.
+    pub(super) async fn wait_until_low(&self) -> Error {
         let mut ticks = tokio::time::interval(LOOK_EVERY);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -51,8 +51,8 @@ impl Disks {
         }
     }
 
-    /// What is said of the first that has less left.
-    fn lacking(&self) -> Option<String> {
+    /// Describes the first disk that has less free space.
+    fn describe_shortage(&self) -> Option<String> {
         self.directories.iter().find_map(|directory| {
             let about = statvfs(directory).ok()?;
             let size = about.blocks().saturating_mul(about.fragment_size());
@@ -62,7 +62,7 @@ impl Disks {
             let needed = self.free.0.min(size / PART);
             (left < needed).then(|| {
                 format!(
-                    "there is no space for a push: {} bytes are free on the disk of {}, and {needed} are to stay free",
+                    "no space for a push: {} bytes are free on the disk of {}, and {needed} must stay free",
                     left,
                     directory.display()
                 )
@@ -71,12 +71,12 @@ impl Disks {
     }
 }
 
-fn refused(message: String) -> Error {
+fn no_space_error(message: String) -> Error {
     Error::Failed {
         message,
         next: Some(
-            "remove services that nobody needs (cloudroidctl rm NAME), have an operator make room there, or lower free or cache in [push] of \
-             the configuration"
+            "remove unused services (cloudroidctl rm NAME), ask an operator to free space there, or lower free or \
+                cache in [push] of the configuration"
                 .to_owned(),
         ),
         log: Vec::new(),
@@ -84,8 +84,8 @@ fn refused(message: String) -> Error {
 }
 
 impl Pusher {
-    /// Refuses a push of a deployer whose images, with `image` if that is made already, take more than one may have. Operators are not
-    /// bounded. What is pushed at the same time is not counted yet.
+    /// Rejects a push of a deployer whose images exceed the quota, including `image` if it has been built. Operators
+    /// have no quota. Concurrent pushes are not counted yet.
     pub(super) async fn check_quota(
         &self,
         owner: Option<&str>,
@@ -95,23 +95,23 @@ impl Pusher {
         let Some(owner) = owner.filter(|_| most.0 > 0) else {
             return Ok(());
         };
-        let taken = self.catalogue.bytes_of(owner, image).await?;
-        within_quota(owner, taken, most)
+        let taken = self.catalogue.owner_image_bytes(owner, image).await?;
+        check_within_quota(owner, taken, most)
     }
 }
 
-fn within_quota(owner: &str, taken: u64, most: Size) -> Result<(), Error> {
+fn check_within_quota(owner: &str, taken: u64, most: Size) -> Result<(), Error> {
     if taken <= most.0 {
         return Ok(());
     }
     Err(Error::Failed {
         message: format!(
-            "the images of all services of {owner} would take {} MB, and a deployer's may take {most}",
+            "the images of all services of {owner} would take {} MB; the limit per deployer is {most}",
             taken >> 20
         ),
         next: Some(
-            "remove services that are not needed, with all their revisions (cloudroidctl rm NAME), or have an operator raise per_deployer \
-             in [push] of the configuration"
+            "remove unused services with all their revisions (cloudroidctl rm NAME), or ask an operator to raise \
+                per_deployer in [push] of the configuration"
                 .to_owned(),
         ),
         log: Vec::new(),
@@ -130,11 +130,11 @@ mod tests {
         let left = about.blocks_available() * about.fragment_size();
         let disks = |free| Disks::new(place.path(), place.path(), Size(free));
         disks(0).check().await.expect("nothing is to stay free");
-        // More than a twentieth is asked of no disk.
+        // At most 1/20 of a disk is required.
         let full = left < size / PART;
         assert_eq!(disks(u64::MAX).check().await.is_err(), full);
         assert!(!full, "this test needs a disk of which a twentieth is free");
-        // Of a disk that is not there nothing is known.
+        // A disk that does not exist is not checked.
         let nowhere = place.path().join("nowhere");
         let disks = Disks::new(&nowhere, &nowhere, Size(u64::MAX));
         disks.check().await.expect("not known");
@@ -155,9 +155,9 @@ mod tests {
                 let (kind, size) = (Some("tmpfs"), Some("size=4M"));
                 mount(kind, &small, kind, MsFlags::empty(), size).expect("mounted");
                 let disks = Disks::new(place.path(), &small, Size(1 << 30));
-                let before = disks.lacking();
+                let before = disks.describe_shortage();
                 std::fs::write(small.join("filler"), vec![1; 3900 << 10]).expect("written");
-                (before, disks.lacking())
+                (before, disks.describe_shortage())
             });
             apart.join().expect("no panic")
         });
@@ -168,20 +168,20 @@ mod tests {
             "{lacking}"
         );
         assert!(
-            lacking.contains(&format!("{} are to stay free", (4 << 20) / PART)),
+            lacking.contains(&format!("{} must stay free", (4 << 20) / PART)),
             "{lacking}"
         );
-        let words = refused(lacking).words();
+        let words = no_space_error(lacking).message_and_advice();
         assert!(words.contains("lower free or cache"), "{words}");
     }
 
     #[test]
     fn a_deployers_images_take_no_more_than_allowed() {
         let most = Size(1 << 30);
-        within_quota("ann", 1 << 30, most).expect("just as much");
-        let refused = within_quota("ann", (1 << 30) + 1, most)
+        check_within_quota("ann", 1 << 30, most).expect("just as much");
+        let refused = check_within_quota("ann", (1 << 30) + 1, most)
             .expect_err("more")
-            .words();
+            .message_and_advice();
         for part in ["ann", "1024 MB", "1G", "rm NAME", "per_deployer"] {
             assert!(refused.contains(part), "{part}: {refused}");
         }

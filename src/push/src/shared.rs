@@ -1,4 +1,4 @@
-//! What a push must be for robots to share the service.
+//! Requirements for services whose servants are shared by robots.
 
 use api::PushOptions;
 use package::interface::Interface;
@@ -7,10 +7,10 @@ use ros::bus::RosVersion;
 
 use crate::Error;
 
-/// Servants of one service at most, and calls of one servant.
+/// Maximum number of servants of a service, and of concurrent calls of a servant.
 const MOST: u32 = 64;
 
-/// Refuses numbers of servants that contradict each other.
+/// Rejects contradictory numbers of servants.
 pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
     let Some(shared) = &options.shared else {
         return Ok(());
@@ -18,11 +18,12 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
     let refused = |words: String| Err(Error::Options(words));
     if options.stateful {
         return refused(
-            "--stateful and --shared exclude each other: answers that depend on earlier requests depend on other robots' requests where robots share a servant".to_owned(),
+            "--stateful and --shared exclude each other: in a shared servant, answers would depend on other robots' \
+                earlier requests".to_owned(),
         );
     }
     let (min, max) = (shared.min, shared.max);
-    // First: it is what --min is where nobody says that.
+    // Checked first: it is the default of --min.
     if !(1..=max).contains(&shared.replicas) {
         return refused(format!(
             "--replicas {} should be between 1 and --max, which is {max}",
@@ -31,7 +32,7 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
     }
     if !(1..=MOST).contains(&max) || !(1..=max).contains(&min) {
         return refused(format!(
-            "--min {min} and --max {max} should be 1 <= MIN <= MAX <= {MOST}"
+            "--min {min} and --max {max} should satisfy 1 <= MIN <= MAX <= {MOST}"
         ));
     }
     if !(1..=MOST).contains(&shared.calls) {
@@ -43,12 +44,12 @@ pub(crate) fn check_options(options: &PushOptions) -> Result<(), Error> {
     Ok(())
 }
 
-/// What to do instead.
-const ALONE: &str = "push it without --shared, then each robot has a servant of its own";
+/// Advice on alternatives to sharing.
+const ALONE: &str = "push it without --shared, so that each robot gets its own servant";
 
-/// Refuses an interface that robots cannot share, with what was found.
+/// Rejects an interface that robots cannot share, naming the reason.
 pub(crate) fn check_interface(ros: RosVersion, interface: &Interface) -> Result<(), Error> {
-    shareable::check(ros, interface).map_err(|error| Error::Failed {
+    shareable::check_shareable(ros, interface).map_err(|error| Error::Failed {
         message: error.to_string(),
         next: Some(format!(
             "{ALONE}; or push only the nodes that answer services and actions, with --node"

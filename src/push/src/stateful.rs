@@ -1,8 +1,9 @@
-//! Guesses from an interface whether answers depend on earlier inputs: the deployer is asked, nothing is decided here.
+//! Heuristics for stateful services, whose answers depend on earlier inputs: the deployer is asked, nothing is decided
+//! here.
 
 use package::interface::{Direction, Interface, Topic};
 
-/// Types that hold what was gathered of many inputs.
+/// Message types that accumulate many inputs.
 const MAPS: [&str; 5] = [
     "nav_msgs/OccupancyGrid",
     "map_msgs/ProjectedMap",
@@ -17,13 +18,13 @@ const SWITCHING: [&str; 12] = [
     "pause", "resume",
 ];
 
-/// What points to state, a phrase each; `growing` are outputs whose messages became longer and longer.
-pub(super) fn signs(interface: &Interface, growing: &[String]) -> Vec<String> {
+/// Returns the signs of state, one phrase each; `growing` are outputs whose messages grew steadily.
+pub(super) fn find_signs(interface: &Interface, growing: &[String]) -> Vec<String> {
     let of = |direction: Direction| {
         let topics = interface.topics.iter();
         topics.filter(move |topic| topic.direction == direction)
     };
-    // What nothing is given to has nothing to remember: a map server, say.
+    // A service without inputs cannot have state: a map server, for example.
     let is_given = of(Direction::Input).any(|topic| !is_transforms(topic));
     if !is_given {
         return Vec::new();
@@ -38,18 +39,19 @@ pub(super) fn signs(interface: &Interface, growing: &[String]) -> Vec<String> {
         } else if name == "/tf" {
             Some("it publishes transforms on /tf".to_owned())
         } else if growing.contains(name) {
-            Some(format!("messages of {name} became longer and longer"))
+            Some(format!("messages on {name} kept growing"))
         } else {
             None
         }
     };
     let mut signs: Vec<String> = of(Direction::Output).filter_map(sign).collect();
-    signs.extend(switches(interface));
+    signs.extend(find_switches(interface));
     signs
 }
 
-/// What may switch how messages are answered: it is given to whoever answers then, and the other side does not know it.
-fn switches(interface: &Interface) -> Vec<String> {
+/// Returns the services and actions that may change how messages are answered: only the side that answers receives such
+/// a call, and the other side does not know of it.
+fn find_switches(interface: &Interface) -> Vec<String> {
     let requests = interface.requests.iter().flatten();
     let Some(answer) = requests
         .filter_map(|request| request.pair.outputs.first())
@@ -58,7 +60,7 @@ fn switches(interface: &Interface) -> Vec<String> {
         return Vec::new();
     };
     let may =
-        |what: &str, name: &str| format!("its {what} {name} may switch what it says on {answer}");
+        |what: &str, name: &str| format!("its {what} {name} may change its answers on {answer}");
     let actions = interface
         .actions
         .iter()
@@ -70,9 +72,9 @@ fn switches(interface: &Interface) -> Vec<String> {
         .collect()
 }
 
-/// Whether a service is likely to change how its node works, by type and name.
+/// Returns whether a service is likely to change how its node works, judging by its type and name.
 fn is_switch(name: &str, type_name: &str) -> bool {
-    // What that sets is given to both sides.
+    // Settings made by it are given to both sides.
     if type_name == "dynamic_reconfigure/Reconfigure" {
         return false;
     }
@@ -82,15 +84,15 @@ fn is_switch(name: &str, type_name: &str) -> bool {
         || words.iter().any(|word| SWITCHING.contains(word))
 }
 
-/// The question to the deployer; none where nothing points to state.
+/// Returns the question to the deployer; `None` without signs of state.
 pub(super) fn question(signs: &[String]) -> Option<String> {
     if signs.is_empty() {
         return None;
     }
     Some(format!(
-        "do answers depend on earlier inputs? it looks so: {}. If they do, push again with --stateful: then a robot's local \
-         original answers only while the link is down, and each hand-over tells what is lost. If not, --stateful=false \
-         says so",
+        "answers seem to depend on earlier inputs: {}. If they do, push again with --stateful: a robot's local \
+            original then answers only while the link is down, and each hand-over reports what is lost. If not, push \
+            with --stateful=false",
         signs.join("; ")
     ))
 }
@@ -120,13 +122,13 @@ mod tests {
         }
     }
 
-    fn of(topics: Vec<Topic>, growing: &[&str]) -> Vec<String> {
+    fn signs_from_topics(topics: Vec<Topic>, growing: &[&str]) -> Vec<String> {
         let interface = Interface {
             topics,
             ..Interface::default()
         };
         let growing: Vec<String> = growing.iter().map(|name| (*name).to_owned()).collect();
-        signs(&interface, &growing)
+        find_signs(&interface, &growing)
     }
 
     #[test]
@@ -166,11 +168,11 @@ mod tests {
                 "a trajectory",
                 vec![scan(), path()],
                 vec!["/path"],
-                vec!["messages of /path became longer"],
+                vec!["messages on /path kept growing"],
             ),
             ("a plan", vec![scan(), path()], vec![], vec![]),
         ] {
-            let found = of(topics, &growing);
+            let found = signs_from_topics(topics, &growing);
             assert_eq!(found.len(), words.len(), "{what}: {found:?}");
             for (found, words) in found.iter().zip(words) {
                 assert!(found.contains(words), "{what}: {found}");
@@ -205,17 +207,17 @@ mod tests {
             ..Interface::default()
         };
         assert!(
-            signs(&mux, &[]).is_empty(),
+            find_signs(&mux, &[]).is_empty(),
             "nothing is answered, so nothing is switched"
         );
-        mux.requests = Some(package::requests::decide(
+        mux.requests = Some(package::requests::decide_requests(
             RosVersion::One,
             &mux,
             &BTreeSet::new(),
         ));
-        let switched = |what: &str| format!("its {what} may switch what it says on /cmd_vel");
+        let switched = |what: &str| format!("its {what} may change its answers on /cmd_vel");
         assert_eq!(
-            signs(&mux, &[]),
+            find_signs(&mux, &[]),
             [
                 "action /priority",
                 "service /mux/select_input",
@@ -230,7 +232,7 @@ mod tests {
         assert_eq!(question(&[]), None);
         let asked = question(&["it publishes transforms on /tf".into()]).unwrap();
         for words in [
-            "do answers depend on earlier inputs?",
+            "answers seem to depend on earlier inputs",
             "on /tf",
             "--stateful:",
             "--stateful=false",

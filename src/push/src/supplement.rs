@@ -1,4 +1,4 @@
-//! `--interface FILE`: what to add to the interface, where the push cannot find all of it.
+//! `--interface FILE`: additions to the interface, where the push cannot find all of it.
 //!
 //! ```toml
 //! [[topics]]
@@ -19,74 +19,75 @@ use package::names;
 use ros::bus::RosVersion;
 use ros::schema::{Base, MessageType, Registry, SchemaError};
 
-/// Why a supplement is refused.
+/// Errors of an interface supplement.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum SupplementError {
-    /// Neither TOML nor JSON of this form.
+    /// Neither valid TOML nor valid JSON.
     #[error("{0}")]
     Unreadable(String),
-    /// What was found says otherwise.
+    /// Contradicts the interface that was found.
     #[error("{0}")]
     Contradiction(String),
-    /// Not an absolute name.
+    /// The name is not absolute.
     #[error("{0:?} is not an absolute name; begin it with /")]
     Relative(String),
-    /// A type that the image does not hold.
-    #[error("{name}: {source}; add the Debian package that holds the type with --with")]
+    /// The type is not defined in the image.
+    #[error("{name}: {source}; add the Debian package of this type with --with")]
     Type {
-        /// What has the type.
+        /// Name of the object with the type.
         name: String,
-        /// What is missing.
+        /// Missing definition.
         source: SchemaError,
     },
 }
 
-/// Adds the supplement `text` to `interface`. What was found stays as it was found.
+/// Adds the supplement `text` to `interface`. Entries that were found by the push are kept.
 pub(super) fn add(
     interface: &mut Interface,
     text: &str,
     (ros, definitions): (RosVersion, &BTreeMap<String, String>),
 ) -> Result<(), SupplementError> {
     let mut stated = read(text)?;
-    let registry = Registry::of_definitions(ros, definitions).map_err(unknown("the image"))?;
-    let mut texts = Texts {
+    let registry =
+        Registry::with_definitions(ros, definitions).map_err(unknown_type("the image"))?;
+    let mut texts = UsedDefinitions {
         definitions,
         used: BTreeMap::new(),
     };
     for topic in &mut stated.topics {
-        absolute(&topic.name)?;
+        check_absolute(&topic.name)?;
         let message = registry
             .message(&topic.type_name)
-            .map_err(unknown(&topic.name))?;
-        texts.message(&message);
-        // A type may be stated with its kind or without; each ROS has one way to write it.
+            .map_err(unknown_type(&topic.name))?;
+        texts.add_message(&message);
+        // A type may be stated with or without its kind; each ROS version has one canonical form.
         topic.type_name = message.name().to_owned();
         topic.md5 = message.digest().to_owned();
     }
     for service in &mut stated.services {
-        absolute(&service.name)?;
+        check_absolute(&service.name)?;
         let definition = registry
             .service(&service.type_name)
-            .map_err(unknown(&service.name))?;
-        texts.own(&service.type_name, "srv");
-        texts.message(&definition.request);
-        texts.message(&definition.response);
+            .map_err(unknown_type(&service.name))?;
+        texts.add_definition(&service.type_name, "srv");
+        texts.add_message(&definition.request);
+        texts.add_message(&definition.response);
         service.type_name.clone_from(&definition.name);
         service.md5.clone_from(&definition.md5);
     }
     for action in &mut stated.actions {
-        absolute(&action.name)?;
+        check_absolute(&action.name)?;
         let definition = registry
             .action(&action.type_name)
-            .map_err(unknown(&action.name))?;
-        texts.own(&action.type_name, "action");
+            .map_err(unknown_type(&action.name))?;
+        texts.add_definition(&action.type_name, "action");
         for message in [&definition.goal, &definition.result, &definition.feedback] {
-            texts.message(message);
+            texts.add_message(message);
         }
         action.type_name.clone_from(&definition.name);
     }
     for parameter in &stated.parameters {
-        absolute(&parameter.name)?;
+        check_absolute(&parameter.name)?;
     }
     stated.definitions = texts.used;
     interface
@@ -94,7 +95,7 @@ pub(super) fn add(
         .map_err(|error| SupplementError::Contradiction(error.to_string()))
 }
 
-/// Topics and their types, as far as the text can be read: what is wrong with it is said when it is added.
+/// Returns the topics and their types, as far as the text can be parsed; errors are reported when it is added.
 pub(super) fn topic_types(text: &str) -> BTreeMap<String, String> {
     let topics = read(text).unwrap_or_default().topics.into_iter();
     topics.map(|topic| (topic.name, topic.type_name)).collect()
@@ -109,7 +110,7 @@ fn read(text: &str) -> Result<Interface, SupplementError> {
         .map_err(|error| SupplementError::Unreadable(error.to_string()))
 }
 
-fn absolute(name: &str) -> Result<(), SupplementError> {
+fn check_absolute(name: &str) -> Result<(), SupplementError> {
     if name.starts_with('/') && name.len() > 1 {
         Ok(())
     } else {
@@ -117,31 +118,31 @@ fn absolute(name: &str) -> Result<(), SupplementError> {
     }
 }
 
-fn unknown(name: &str) -> impl FnOnce(SchemaError) -> SupplementError {
+fn unknown_type(name: &str) -> impl FnOnce(SchemaError) -> SupplementError {
     let name = name.to_owned();
     move |source| SupplementError::Type { name, source }
 }
 
-/// The definitions that are used, with all that they refer to.
-struct Texts<'a> {
+/// Collects the definitions that are used, with all that they refer to.
+struct UsedDefinitions<'a> {
     definitions: &'a BTreeMap<String, String>,
     used: BTreeMap<String, String>,
 }
 
-impl Texts<'_> {
-    fn own(&mut self, type_name: &str, kind: &str) -> bool {
-        let key = names::key(type_name, kind);
+impl UsedDefinitions<'_> {
+    fn add_definition(&mut self, type_name: &str, kind: &str) -> bool {
+        let key = names::definition_key(type_name, kind);
         match self.definitions.get(&key) {
             Some(text) => self.used.insert(key, text.clone()).is_none(),
             None => false,
         }
     }
 
-    fn message(&mut self, message: &MessageType) {
-        self.own(message.name(), "msg");
+    fn add_message(&mut self, message: &MessageType) {
+        self.add_definition(message.name(), "msg");
         for field in message.fields() {
             if let Base::Message(inner) = &field.base {
-                self.message(inner);
+                self.add_message(inner);
             }
         }
     }

@@ -1,4 +1,4 @@
-//! What a deployer is told of a build, in words that mean something to whoever pushed.
+//! Translation of build events and errors for the deployer.
 
 use std::path::Path;
 
@@ -7,16 +7,16 @@ use rootfs_builder::BuildEvent;
 
 use super::{Deployer, Error, PUSHED};
 
-/// What a deployer is told of a build. Of others' services it hears nothing but where it may publish them itself.
-pub(super) fn event(event: BuildEvent, by: &Deployer) -> PushEvent {
+/// Converts a build event for the deployer. Services of others are named only if the deployer may publish them.
+pub(super) fn to_push_event(event: BuildEvent, by: &Deployer) -> PushEvent {
     match event {
         BuildEvent::Waits { push } => {
-            let whose = match by.may(&push) {
+            let whose = match by.check_may_publish(&push) {
                 Ok(()) => format!("the push of {push}"),
                 Err(_) => "another push".to_owned(),
             };
             PushEvent::Step {
-                title: format!("waiting: {whose} makes a layer that this one needs, too"),
+                title: format!("waiting: {whose} is building a layer that this one needs, too"),
             }
         }
         BuildEvent::Step { title } => PushEvent::Step { title },
@@ -30,8 +30,9 @@ pub(super) fn event(event: BuildEvent, by: &Deployer) -> PushEvent {
     }
 }
 
-/// Why a build failed. `home`: the daemon's; `source`: what was pushed, as the pusher named it.
-pub(super) fn error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error {
+/// Converts an error of the build. `home` is the daemon's home directory, `source` what was pushed, as named by the
+/// deployer.
+pub(super) fn to_push_error(error: &rootfs_builder::Error, home: &Path, source: &str) -> Error {
     let mut next = None;
     let (message, log) = match error {
         // The complete log has been sent line by line.
@@ -46,15 +47,15 @@ pub(super) fn error(error: &rootfs_builder::Error, home: &Path, source: &str) ->
             (format!("the build of {package} failed"), lines)
         }
         error => (
-            as_the_pusher_knows_it(&error.to_string(), home, source),
+            strip_build_paths(&error.to_string(), home, source),
             Vec::new(),
         ),
     };
     Error::Failed { message, next, log }
 }
 
-/// Names what was pushed as the pusher did (`source`), and leaves out where the build is: that means nothing to him.
-fn as_the_pusher_knows_it(text: &str, home: &Path, source: &str) -> String {
+/// Replaces paths of the build directory by the deployer's own name for what was pushed (`source`).
+fn strip_build_paths(text: &str, home: &Path, source: &str) -> String {
     let builds = format!("{}/", home.join("build").display());
     let mut parts = text.split(builds.as_str());
     let mut named = parts.next().unwrap_or_default().to_owned();
@@ -78,8 +79,7 @@ mod tests {
 
     #[test]
     fn paths_of_the_build_are_told_as_the_pusher_knows_them() {
-        let told =
-            |text: &str, source: &str| as_the_pusher_knows_it(text, Path::new("/home"), source);
+        let told = |text: &str, source: &str| strip_build_paths(text, Path::new("/home"), source);
         let text = "/home/build/push-1/pushed/src/a/package.xml, line 4: malformed; see /home/build/push-1/log";
         assert_eq!(
             told(text, "../torn/"),
@@ -110,10 +110,10 @@ mod tests {
             ("field", "another push"),
         ] {
             let event = BuildEvent::Waits { push: push.into() };
-            let PushEvent::Step { title } = super::event(event, &by) else {
+            let PushEvent::Step { title } = super::to_push_event(event, &by) else {
                 panic!("a step");
             };
-            let expected = format!("waiting: {whose} makes a layer that this one needs, too");
+            let expected = format!("waiting: {whose} is building a layer that this one needs, too");
             assert_eq!(title, expected);
         }
     }
@@ -128,7 +128,8 @@ mod tests {
                 "the CMake package warp is missing: push with `--with libwarp-dev`".into(),
             ],
         };
-        let Error::Failed { message, next, log } = error(&failed, Path::new("/home"), "broken")
+        let Error::Failed { message, next, log } =
+            to_push_error(&failed, Path::new("/home"), "broken")
         else {
             panic!("it failed");
         };

@@ -1,4 +1,4 @@
-//! For each request: who was asked, who answered first, what is a late duplicate.
+//! Tracks each request: which sides were asked, which answered first, and which answers are late duplicates.
 
 mod record;
 
@@ -6,22 +6,23 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::channel::Channel;
-use crate::request::{Key, Leg, RequestId, Side};
+use crate::channel::RequestChannel;
+use crate::request::{CorrelationKey, RequestId, RequestLeg, Responder};
 
 pub(crate) use record::{Kind, Record};
 
-/// What is kept, and for how long.
+/// Bounds on the requests that are remembered, and for how long.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Limits {
-    /// After its T_max a request is remembered for so long: late answers are recognised, and an input that nobody
-    /// answered is given up.
+pub struct RetentionLimits {
+    /// Time for which a request is remembered after its T_max: until then late answers are recognised, and an input
+    /// that nobody answered is still open.
     pub patience: Duration,
-    /// Requests remembered; beyond it the oldest that came on topics are forgotten. Those that hold a caller are not counted.
+    /// Maximum number of remembered requests; beyond it the oldest that came on topics are dropped. Requests with a
+    /// waiting caller do not count.
     pub requests: usize,
 }
 
-impl Default for Limits {
+impl Default for RetentionLimits {
     fn default() -> Self {
         Self {
             patience: Duration::from_secs(30),
@@ -30,40 +31,40 @@ impl Default for Limits {
     }
 }
 
-/// Inputs kept beyond their T_max, for a local original that has time for them.
+/// Number of inputs kept beyond their T_max, for a local original that has time for them.
 const STRAGGLERS: usize = 8;
 
-/// What to do with an answer.
+/// Decision whether an answer is delivered to the application.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
-    /// Hand it to the application.
+pub enum DeliveryVerdict {
+    /// Deliver it to the application.
     Deliver,
-    /// The request was answered already, failed, or nobody knows it: drop it.
+    /// Drop it: the request is unknown, has failed, or was answered already.
     Drop,
 }
 
-/// At T_max an answer is still in time.
+/// Smallest time after T_max: an answer that arrives exactly at T_max is still in time.
 const PAST: Duration = Duration::from_nanos(1);
 
-/// The requests of one node that are open or were until lately. `P` is what was asked, cheap to clone.
+/// The open and recent requests of one node. `P` is the request's payload, cheap to clone.
 #[derive(Debug)]
 pub(crate) struct Arbiter<P> {
-    limits: Limits,
+    limits: RetentionLimits,
     next: u64,
     requests: BTreeMap<RequestId, Record<P>>,
-    /// Those whose answers are recognised by a key, by the name of their channel.
-    keyed: HashMap<(Arc<str>, Key), RequestId>,
-    /// How many of them hold no caller.
+    /// Requests whose answers carry a key, by channel name and key.
+    keyed: HashMap<(Arc<str>, CorrelationKey), RequestId>,
+    /// Number of requests without a waiting caller.
     inputs: usize,
-    /// One for each of them ([`Record::timer`]): its T_max, or the end of its patience.
+    /// One timer per request ([`Record::timer`]): its T_max, or the end of its patience.
     timers: BTreeSet<(Instant, RequestId)>,
-    /// Inputs that nobody answered by T_max, the oldest first.
+    /// Inputs that were not answered by T_max, oldest first.
     stragglers: VecDeque<RequestId>,
 }
 
 impl<P: Clone> Arbiter<P> {
-    /// Knows no request yet.
-    pub(crate) fn new(limits: Limits) -> Self {
+    /// Creates an arbiter without requests.
+    pub(crate) fn new(limits: RetentionLimits) -> Self {
         Self {
             limits,
             next: 0,
@@ -75,13 +76,13 @@ impl<P: Clone> Arbiter<P> {
         }
     }
 
-    /// Something is to be asked, and nobody is asked yet. Answers are recognised by `key`, where they have one.
+    /// Opens a request that no side has been asked yet. Its answers are matched by `key`, if it has one.
     pub(crate) fn open(
         &mut self,
         (now, t_max): (Instant, Duration),
         kind: Kind,
-        channel: Channel,
-        key: Option<Key>,
+        channel: RequestChannel,
+        key: Option<CorrelationKey>,
         payload: P,
     ) -> RequestId {
         let id = RequestId(self.next);
@@ -99,8 +100,8 @@ impl<P: Clone> Arbiter<P> {
             asked_at: now,
             deadline,
             timer: deadline + PAST,
-            cloud: Leg::NotAsked,
-            local: Leg::NotAsked,
+            cloud: RequestLeg::NotAsked,
+            local: RequestLeg::NotAsked,
             owners: vec![None],
             failed: false,
             overdue: false,
@@ -117,78 +118,80 @@ impl<P: Clone> Arbiter<P> {
         id
     }
 
-    /// The request on the channel of this name whose answers are recognised by `key`.
-    pub(crate) fn keyed(&self, name: &Arc<str>, key: &Key) -> Option<RequestId> {
+    /// Returns the request on the channel `name` whose answers carry `key`.
+    pub(crate) fn find_by_key(&self, name: &Arc<str>, key: &CorrelationKey) -> Option<RequestId> {
         self.keyed.get(&(name.clone(), key.clone())).copied()
     }
 
-    /// Marks `side` as asked and gives what to ask, unless it was asked already or the request needs nobody.
-    pub(crate) fn ask(&mut self, now: Instant, id: RequestId, side: Side) -> Option<P> {
+    /// Marks `side` as asked and returns the payload to send, unless that side was asked already or the request is
+    /// closed.
+    pub(crate) fn ask(&mut self, now: Instant, id: RequestId, side: Responder) -> Option<P> {
         let record = self.requests.get_mut(&id)?;
-        if !record.is_open() || !matches!(record.leg(side), Leg::NotAsked) {
+        if !record.is_open() || !matches!(record.leg(side), RequestLeg::NotAsked) {
             return None;
         }
         let payload = record.payload.clone()?;
-        *record.leg(side) = Leg::Asked;
-        if side == Side::Local {
+        *record.leg(side) = RequestLeg::Asked;
+        if side == Responder::Local {
             record.local_asked = Some(now);
         }
         Some(payload)
     }
 
-    /// `side` gave output number `output`. The side that is first with it keeps it: a node that answers one input
-    /// with several messages on a topic is passed as it is. A call is remembered until it is closed.
+    /// Records output number `output` of `side`. The side that delivers an output first owns it: a node that answers
+    /// one input with several messages on a topic is passed through unchanged. A call is remembered until it is closed.
     pub(crate) fn answer_with(
         &mut self,
         now: Instant,
         id: RequestId,
-        side: Side,
+        side: Responder,
         output: usize,
-    ) -> Verdict {
+    ) -> DeliveryVerdict {
         let Some(record) = self.requests.get_mut(&id) else {
-            return Verdict::Drop;
+            return DeliveryVerdict::Drop;
         };
         let took = now.saturating_duration_since(record.asked_at);
         if output == 0 {
-            *record.leg(side) = Leg::Answered;
-            if side == Side::Cloud {
+            *record.leg(side) = RequestLeg::Answered;
+            if side == Responder::Cloud {
                 record.cloud_time.get_or_insert(took);
             }
         }
-        // Feedback of a goal is as many messages as its side likes.
+        // A side may send any number of feedback messages for a goal.
         let is_single = record.is_call() && output == 0;
         let failed = record.failed;
-        // The pair may have got further outputs since the request was made.
+        // The pair may have gained outputs since the request was opened.
         let outputs = record.owners.len().max(output + 1);
         record.owners.resize(outputs, None);
         let owner = &mut record.owners[output];
         let verdict = match *owner {
-            _ if failed => Verdict::Drop,
-            None => Verdict::Deliver,
-            Some(first) if first == side && !is_single => Verdict::Deliver,
-            Some(_) => Verdict::Drop,
+            _ if failed => DeliveryVerdict::Drop,
+            None => DeliveryVerdict::Deliver,
+            Some(first) if first == side && !is_single => DeliveryVerdict::Deliver,
+            Some(_) => DeliveryVerdict::Drop,
         };
-        if verdict == Verdict::Deliver {
+        if verdict == DeliveryVerdict::Deliver {
             *owner = Some(side);
         }
-        if record.answered().is_some() {
+        if record.answered_by().is_some() {
             record.payload = None;
             record.answer_time.get_or_insert(took);
         }
         verdict
     }
 
-    /// `side` cannot answer. Whether that fails the request is for the caller to say, who knows what else may come.
-    pub(crate) fn failed(&mut self, id: RequestId, side: Side, reason: &str) {
+    /// Records that `side` cannot answer. The caller decides whether the request fails, since it knows what else may
+    /// come.
+    pub(crate) fn mark_failed(&mut self, id: RequestId, side: Responder, reason: &str) {
         if let Some(record) = self.requests.get_mut(&id) {
-            if *record.leg(side) != Leg::Answered {
-                *record.leg(side) = Leg::Failed(reason.to_owned());
+            if *record.leg(side) != RequestLeg::Answered {
+                *record.leg(side) = RequestLeg::Failed(reason.to_owned());
             }
         }
         self.close_call(id);
     }
 
-    /// Gives the request up. True for the first time, and only where it was not answered.
+    /// Fails the request. Returns true the first time, and only if the request was not answered.
     pub(crate) fn fail(&mut self, id: RequestId) -> bool {
         let Some(record) = self.requests.get_mut(&id).filter(|record| record.is_open()) else {
             return false;
@@ -199,7 +202,7 @@ impl<P: Clone> Arbiter<P> {
         true
     }
 
-    /// Nobody wants the answer any more; what comes is dropped.
+    /// Drops the request: later answers are ignored.
     pub(crate) fn cancel(&mut self, id: RequestId) {
         self.remove(id);
     }
@@ -208,7 +211,7 @@ impl<P: Clone> Arbiter<P> {
         let record = self.requests.remove(&id)?;
         self.timers.remove(&(record.timer, id));
         self.inputs -= usize::from(!record.has_caller());
-        // The key may be another's by now: a goal that is sent again, once it has ended.
+        // The key may belong to another request by now, such as a goal that was sent again after it ended.
         let key = record.key.as_ref();
         if let Some(key) = key.filter(|key| self.keyed.get(key) == Some(&id)) {
             self.keyed.remove(key);
@@ -216,10 +219,10 @@ impl<P: Clone> Arbiter<P> {
         Some(record)
     }
 
-    /// A call is over when everybody who was asked has spoken; inputs stay until their patience ends, because
-    /// further outputs may come. One that the cloud could not be asked counts at T_max and stays until then.
+    /// Forgets a call once every side that was asked has answered or failed; inputs stay until their patience ends,
+    /// because further outputs may come. A call that the cloud could not be asked counts at T_max and stays until then.
     pub(crate) fn close_call(&mut self, id: RequestId) {
-        let counts = |record: &Record<P>| record.judged || record.cloud != Leg::NotAsked;
+        let counts = |record: &Record<P>| record.judged || record.cloud != RequestLeg::NotAsked;
         let over = |record: &Record<P>| {
             record.is_call() && !record.is_open() && record.awaits_nobody() && counts(record)
         };
@@ -228,7 +231,7 @@ impl<P: Clone> Arbiter<P> {
         }
     }
 
-    /// Notes that the cloud's time counts now. True for the first time only.
+    /// Counts the cloud's time of the request. Returns true the first time only.
     pub(crate) fn judge(&mut self, id: RequestId, time: Option<Duration>) -> bool {
         self.requests.get_mut(&id).is_some_and(|record| {
             record.cloud_time = record.cloud_time.or(time);
@@ -244,14 +247,19 @@ impl<P: Clone> Arbiter<P> {
         self.requests.get(&id)
     }
 
-    /// Requests in the order asked.
+    /// Returns the ids of the requests that match `wanted`, in the order in which they were opened.
     pub(crate) fn select(&self, wanted: impl Fn(&Record<P>) -> bool) -> Vec<RequestId> {
         let wanted = self.requests.iter().filter(|(_, record)| wanted(record));
         wanted.map(|(id, _)| *id).collect()
     }
 
-    /// Changes the legs of `side` that are `from`, and names their requests.
-    pub(crate) fn turn(&mut self, side: Side, from: &Leg, to: &Leg) -> Vec<RequestId> {
+    /// Changes the legs of `side` that equal `from` to `to`, and returns their requests.
+    pub(crate) fn replace_legs(
+        &mut self,
+        side: Responder,
+        from: &RequestLeg,
+        to: &RequestLeg,
+    ) -> Vec<RequestId> {
         let mut turned = Vec::new();
         for (id, record) in &mut self.requests {
             if record.leg(side) == from {
@@ -265,11 +273,12 @@ impl<P: Clone> Arbiter<P> {
         turned
     }
 
-    /// The oldest input that nobody answered by T_max and that the local original was not asked for.
-    pub(crate) fn straggler(&mut self) -> Option<RequestId> {
+    /// Returns the oldest input that was not answered by T_max and that the local original was not asked for.
+    pub(crate) fn next_straggler(&mut self) -> Option<RequestId> {
         while let Some(id) = self.stragglers.front().copied() {
             let waits = |record: &Record<P>| {
-                let is_free = record.local == Leg::NotAsked && record.cloud != Leg::LeftOut;
+                let is_free =
+                    record.local == RequestLeg::NotAsked && record.cloud != RequestLeg::LeftOut;
                 record.is_open() && record.payload.is_some() && is_free
             };
             if self.requests.get(&id).is_some_and(waits) {
@@ -280,18 +289,19 @@ impl<P: Clone> Arbiter<P> {
         None
     }
 
-    /// When [`expire`](Self::expire) has something to say.
+    /// Returns the time at which [`expire`](Self::expire) has work to do.
     pub(crate) fn deadline(&self) -> Option<Instant> {
         self.timers.first().map(|(at, _)| *at)
     }
 
-    /// More inputs are remembered than may be.
+    /// Returns true if more inputs are remembered than the limit allows.
     pub(crate) fn is_crowded(&self) -> bool {
         self.inputs > self.limits.requests
     }
 
-    /// Requests whose T_max has passed since the last call, with those whose callers wait still, and those that are forgotten now.
-    /// `put_off` gives until when one may turn out to have been left out.
+    /// Returns the requests whose T_max has passed since the last call, including those whose callers still wait, and
+    /// the requests that are forgotten now. `put_off` returns the time until which a request may still turn out to have
+    /// been left out.
     pub(crate) fn expire(
         &mut self,
         now: Instant,
@@ -314,7 +324,7 @@ impl<P: Clone> Arbiter<P> {
                 record.timer = at + self.limits.patience;
                 overdue.push(id);
             } else if record.is_call() && record.is_open() {
-                // Somebody waits for it, as long as it takes. Whether it can come at all is looked at again later.
+                // A caller waits for it without a time limit. Whether an answer can come at all is checked again later.
                 record.timer = now + self.limits.patience;
                 overdue.push(id);
             } else {
@@ -335,7 +345,7 @@ impl<P: Clone> Arbiter<P> {
                 .requests
                 .iter()
                 .filter(|(_, record)| !record.has_caller());
-            // Goals take as long as they take: they go last.
+            // Goals may take arbitrarily long, so they are dropped last.
             let (inputs, goals): (Vec<_>, Vec<_>) =
                 inputs.partition(|(_, record)| matches!(record.kind, Kind::Input(_)));
             let oldest = inputs.iter().chain(&goals).map(|(id, _)| **id).take(crowd);
@@ -353,20 +363,25 @@ mod tests {
     use super::*;
 
     fn arbiter() -> (Arbiter<u8>, Instant) {
-        (Arbiter::new(Limits::default()), Instant::now())
+        (Arbiter::new(RetentionLimits::default()), Instant::now())
     }
 
     fn call(arbiter: &mut Arbiter<u8>, now: Instant) -> RequestId {
-        let channel = Channel::Call("/add".into());
+        let channel = RequestChannel::Call("/add".into());
         arbiter.open((now, MAX), Kind::Call, channel, None, 7)
     }
 
     fn input(arbiter: &mut Arbiter<u8>, now: Instant) -> RequestId {
-        let channel = Channel::Topic("/in".into());
+        let channel = RequestChannel::Topic("/in".into());
         arbiter.open((now, MAX), Kind::Input(0), channel, None, 7)
     }
 
-    fn answer(arbiter: &mut Arbiter<u8>, now: Instant, id: RequestId, side: Side) -> Verdict {
+    fn answer(
+        arbiter: &mut Arbiter<u8>,
+        now: Instant,
+        id: RequestId,
+        side: Responder,
+    ) -> DeliveryVerdict {
         let verdict = arbiter.answer_with(now, id, side, 0);
         arbiter.close_call(id);
         verdict
@@ -378,24 +393,39 @@ mod tests {
     fn the_first_result_wins_and_the_second_is_dropped() {
         let (mut arbiter, now) = arbiter();
         let id = call(&mut arbiter, now);
-        assert_eq!(arbiter.ask(now, id, Side::Cloud), Some(7));
-        assert_eq!(arbiter.ask(now, id, Side::Cloud), None, "asked once");
-        assert_eq!(arbiter.ask(now, id, Side::Local), Some(7));
-        assert_eq!(answer(&mut arbiter, now, id, Side::Local), Verdict::Deliver);
-        assert_eq!(answer(&mut arbiter, now, id, Side::Local), Verdict::Drop);
-        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(arbiter.ask(now, id, Responder::Cloud), Some(7));
+        assert_eq!(arbiter.ask(now, id, Responder::Cloud), None, "asked once");
+        assert_eq!(arbiter.ask(now, id, Responder::Local), Some(7));
+        assert_eq!(
+            answer(&mut arbiter, now, id, Responder::Local),
+            DeliveryVerdict::Deliver
+        );
+        assert_eq!(
+            answer(&mut arbiter, now, id, Responder::Local),
+            DeliveryVerdict::Drop
+        );
+        assert_eq!(
+            answer(&mut arbiter, now, id, Responder::Cloud),
+            DeliveryVerdict::Drop
+        );
         assert!(arbiter.get(id).is_none(), "both have spoken: it is over");
-        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(
+            answer(&mut arbiter, now, id, Responder::Cloud),
+            DeliveryVerdict::Drop
+        );
     }
 
     #[test]
     fn an_answer_after_the_failure_is_dropped() {
         let (mut arbiter, now) = arbiter();
         let id = call(&mut arbiter, now);
-        arbiter.ask(now, id, Side::Cloud);
+        arbiter.ask(now, id, Responder::Cloud);
         assert!(arbiter.fail(id));
         assert!(!arbiter.fail(id));
-        assert_eq!(answer(&mut arbiter, now, id, Side::Cloud), Verdict::Drop);
+        assert_eq!(
+            answer(&mut arbiter, now, id, Responder::Cloud),
+            DeliveryVerdict::Drop
+        );
         assert!(arbiter.requests.is_empty());
     }
 
@@ -403,28 +433,34 @@ mod tests {
     fn one_input_may_have_several_messages_of_one_side() {
         let (mut arbiter, now) = arbiter();
         let id = input(&mut arbiter, now);
-        arbiter.ask(now, id, Side::Cloud);
-        arbiter.ask(now, id, Side::Local);
+        arbiter.ask(now, id, Responder::Cloud);
+        arbiter.ask(now, id, Responder::Local);
         assert_eq!(
-            arbiter.answer_with(now, id, Side::Local, 1),
-            Verdict::Deliver
-        );
-        assert_eq!(arbiter.answer_with(now, id, Side::Cloud, 1), Verdict::Drop);
-        assert_eq!(
-            arbiter.answer_with(now, id, Side::Cloud, 0),
-            Verdict::Deliver
+            arbiter.answer_with(now, id, Responder::Local, 1),
+            DeliveryVerdict::Deliver
         );
         assert_eq!(
-            arbiter.answer_with(now, id, Side::Cloud, 0),
-            Verdict::Deliver
+            arbiter.answer_with(now, id, Responder::Cloud, 1),
+            DeliveryVerdict::Drop
         );
-        assert_eq!(arbiter.answer_with(now, id, Side::Local, 0), Verdict::Drop);
+        assert_eq!(
+            arbiter.answer_with(now, id, Responder::Cloud, 0),
+            DeliveryVerdict::Deliver
+        );
+        assert_eq!(
+            arbiter.answer_with(now, id, Responder::Cloud, 0),
+            DeliveryVerdict::Deliver
+        );
+        assert_eq!(
+            arbiter.answer_with(now, id, Responder::Local, 0),
+            DeliveryVerdict::Drop
+        );
     }
 
     #[test]
     fn memory_is_bounded_and_waiting_callers_are_not_forgotten() {
         let now = Instant::now();
-        let limits = Limits {
+        let limits = RetentionLimits {
             patience: Duration::from_secs(1),
             requests: 10,
         };

@@ -1,18 +1,18 @@
-//! The channels of a node that messages of requests go through.
+//! The channels of a node on which requests and answers travel.
 
 use std::sync::Arc;
 
-/// Where a message goes to or came from.
+/// The channel a message was sent to or received from.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Channel {
-    /// A service or an action, by absolute name.
+pub enum RequestChannel {
+    /// Absolute name of a service or an action.
     Call(Arc<str>),
-    /// A topic, by absolute name.
+    /// Absolute name of a topic.
     Topic(Arc<str>),
 }
 
-impl Channel {
-    /// The absolute name.
+impl RequestChannel {
+    /// Returns the absolute name.
     pub fn name(&self) -> &Arc<str> {
         let (Self::Call(name) | Self::Topic(name)) = self;
         name

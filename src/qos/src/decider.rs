@@ -1,87 +1,88 @@
-//! When the local original is started, fed, not fed any more, and stopped.
+//! Decides when the local original is started, fed, no longer fed, and stopped.
 
 use serde::{Deserialize, Serialize};
 
 use crate::satisfaction::Satisfaction;
-use crate::sla::{Local, Mode, Sla, Warm};
+use crate::sla::{LocalPolicy, Mode, QosSla, WarmStart};
 
-/// How the local original's process is, as whoever runs it reports.
+/// State of the local original's process, as reported by whoever runs it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LocalState {
-    /// There is no such package on the robot.
+    /// The package is not installed on the robot.
     Missing,
-    /// It does not run.
+    /// The process does not run.
     Stopped,
-    /// It was told to run and does not answer yet; also after a crash, until it is up again.
+    /// The process was started and is not ready yet; also after a crash, until it is up again.
     Starting,
-    /// It can be fed.
+    /// The process accepts requests.
     Ready,
 }
 
-/// Why something is done.
+/// Reason for a decision.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Why {
+pub enum DecisionReason {
     /// Q fell below the threshold, or rose above it.
     Satisfaction {
-        /// Satisfaction when it was decided.
+        /// Q at the time of the decision.
         q: f64,
     },
-    /// Stateful, or no time promised: the link is down, the local original takes over.
+    /// The link is down, and the service is stateful or has no response-time goal: the local original takes over.
     LinkDown,
-    /// The same: the cloud is there again, the local original hands back.
+    /// The link is up again, in the same cases: the local original hands back.
     LinkUp,
-    /// It is kept warm.
+    /// The SLA keeps the process warm.
     Warm,
-    /// It is kept warm from the first late request on.
+    /// The SLA keeps the process warm from the first late request on.
     FirstSign,
-    /// Its process ended by itself.
+    /// The process ended unexpectedly.
     Crash,
 }
 
-/// What is decided; each is carried out by whoever runs the local original, and told to the user.
+/// A decision about the local original; it is carried out by whoever runs the process and reported to the user.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Event {
-    /// Start its process.
-    Start(Why),
-    /// Give it the requests, too.
-    Feed(Why),
-    /// Give it no more requests.
-    StopFeeding(Why),
-    /// End its process.
-    Stop(Why),
-    /// It is not there: said once, the cloud is alone from now on.
+pub enum QosEvent {
+    /// Start the process.
+    Start(DecisionReason),
+    /// Send it the requests as well.
+    Feed(DecisionReason),
+    /// Send it no more requests.
+    StopFeeding(DecisionReason),
+    /// Stop the process.
+    Stop(DecisionReason),
+    /// The local original is not installed, so the cloud answers alone; reported once.
     SaidOnceMissing,
-    /// Its process ended by itself; it is started again after a while.
+    /// The process ended unexpectedly and is restarted after a pause.
     Crashed(String),
-    /// Outputs of this input's pair never carry its stamp: from now on the next output answers.
+    /// Outputs of the pair with this input never carry the input's stamp: from now on the next output counts as the
+    /// answer.
     Uncorrelated(String),
 }
 
-/// Runs the local original as the SLA says. Its answers are the commands; it asks nobody.
+/// Decides about the local original as the SLA says. It returns the commands and performs no I/O.
 #[derive(Debug, Clone)]
 pub struct Decider {
-    /// The link's state decides, not Q.
+    /// The state of the link decides instead of Q.
     by_link: bool,
-    local: Local,
-    warm: Warm,
+    local: LocalPolicy,
+    warm: WarmStart,
     state: LocalState,
-    /// The algorithm's last word: is it to answer requests.
+    /// Latest result of the algorithm: the local original is to answer requests.
     wanted: bool,
-    /// It is wanted because the cloud was never reached, whatever Q is.
+    /// The local original is wanted because the cloud was never reached, whatever Q is.
     alone: bool,
-    /// The first late request has been seen, and Q was not full since.
+    /// A request was late, and Q has not been full since.
     sign: bool,
     fed: bool,
 }
 
 impl Decider {
-    /// The process does not run yet.
-    pub fn new(sla: &Sla) -> Self {
+    /// Creates a decider for a process that does not run yet.
+    pub fn new(sla: &QosSla) -> Self {
         Self {
-            by_link: sla.mode == Mode::Stateful || sla.is_of_link(),
+            by_link: sla.mode == Mode::Stateful || sla.is_link_based(),
             local: sla.local,
             warm: sla.warm,
             state: LocalState::Stopped,
@@ -92,51 +93,51 @@ impl Decider {
         }
     }
 
-    /// Requests go to it, too.
+    /// Returns true if requests are sent to the local original.
     pub fn is_fed(&self) -> bool {
         self.fed
     }
 
-    /// It is to answer, and will once it is ready.
+    /// Returns true if the local original is wanted and will answer once it is ready.
     pub fn is_coming(&self) -> bool {
         let alive = matches!(self.state, LocalState::Starting | LocalState::Ready);
-        self.wanted && alive && self.local != Local::None
+        self.wanted && alive && self.local != LocalPolicy::None
     }
 
-    /// Its process, as last heard or as last told.
+    /// Returns the state of the process, as last reported or last ordered.
     pub fn state(&self) -> LocalState {
         self.state
     }
 
-    /// `late`: the last request was.
-    pub fn late(&mut self) {
+    /// Records that a request was late.
+    pub fn note_late(&mut self) {
         self.sign = true;
     }
 
-    /// Nothing points to trouble any more.
-    pub fn calm(&mut self) {
+    /// Clears the sign of a late request.
+    pub fn clear_sign(&mut self) {
         self.sign = false;
     }
 
-    /// The process changed.
-    pub fn reported(&mut self, state: LocalState) -> Vec<Event> {
+    /// Records a new state of the process and returns the decisions that follow.
+    pub fn on_state_change(&mut self, state: LocalState) -> Vec<QosEvent> {
         let before = std::mem::replace(&mut self.state, state);
         let mut events = Vec::new();
         if self.fed && state != LocalState::Ready {
             self.fed = false;
-            events.push(Event::StopFeeding(Why::Crash));
+            events.push(QosEvent::StopFeeding(DecisionReason::Crash));
         }
-        if state == LocalState::Missing && before != state && self.local != Local::None {
-            events.push(Event::SaidOnceMissing);
+        if state == LocalState::Missing && before != state && self.local != LocalPolicy::None {
+            events.push(QosEvent::SaidOnceMissing);
         }
         events
     }
 
-    /// What follows from Q and the link; `link`: it has not been away for too long. Where Q decides, that is said of a
-    /// link that was never there.
-    pub fn decide(&mut self, satisfaction: &Satisfaction, link: bool) -> Vec<Event> {
+    /// Returns the decisions that follow from Q and the link. `link` is false if the link has been down for too long;
+    /// where Q decides, that applies only to a link that was never up.
+    pub fn decide(&mut self, satisfaction: &Satisfaction, link: bool) -> Vec<QosEvent> {
         let mut events = Vec::new();
-        if self.local == Local::None || self.state == LocalState::Missing {
+        if self.local == LocalPolicy::None || self.state == LocalState::Missing {
             return events;
         }
         if satisfaction.is_full() {
@@ -144,37 +145,43 @@ impl Decider {
         }
         let why = if self.by_link {
             self.wanted = !link;
-            if link { Why::LinkUp } else { Why::LinkDown }
+            if link {
+                DecisionReason::LinkUp
+            } else {
+                DecisionReason::LinkDown
+            }
         } else if !link {
             self.wanted = true;
             self.alone = true;
-            Why::LinkDown
+            DecisionReason::LinkDown
         } else if std::mem::take(&mut self.alone) {
             self.wanted = satisfaction.wants_local();
-            Why::LinkUp
+            DecisionReason::LinkUp
         } else {
             if satisfaction.wants_local() {
                 self.wanted = true;
             } else if satisfaction.wants_cloud_alone() {
                 self.wanted = false;
             }
-            Why::Satisfaction {
+            DecisionReason::Satisfaction {
                 q: satisfaction.q(),
             }
         };
         let kept = match (self.local, self.warm) {
-            (Local::Warm, Warm::AtOnce) => Some(Why::Warm),
-            (Local::Warm, Warm::FirstSign) if self.sign => Some(Why::FirstSign),
+            (LocalPolicy::Warm, WarmStart::AtOnce) => Some(DecisionReason::Warm),
+            (LocalPolicy::Warm, WarmStart::FirstSign) if self.sign => {
+                Some(DecisionReason::FirstSign)
+            }
             _ => None,
         };
         let running = matches!(self.state, LocalState::Starting | LocalState::Ready);
         if !self.wanted && self.fed {
             self.fed = false;
-            events.push(Event::StopFeeding(why));
+            events.push(QosEvent::StopFeeding(why));
         }
         if !self.wanted && kept.is_none() && running {
             self.state = LocalState::Stopped;
-            events.push(Event::Stop(why));
+            events.push(QosEvent::Stop(why));
         }
         if (self.wanted || kept.is_some()) && !running {
             self.state = LocalState::Starting;
@@ -183,11 +190,11 @@ impl Decider {
             } else {
                 kept.unwrap_or(why)
             };
-            events.push(Event::Start(why));
+            events.push(QosEvent::Start(why));
         }
         if self.wanted && !self.fed && self.state == LocalState::Ready {
             self.fed = true;
-            events.push(Event::Feed(why));
+            events.push(QosEvent::Feed(why));
         }
         events
     }
@@ -200,24 +207,24 @@ mod tests {
 
     fn decider(more: &str) -> Decider {
         let text = format!("t_desire = 0.1\nt_max = 0.3\n{more}");
-        Decider::new(&Sla::parse(toml::Deserializer::parse(&text).unwrap()).unwrap())
+        Decider::new(&QosSla::parse(toml::Deserializer::parse(&text).unwrap()).unwrap())
     }
 
-    fn judged(satisfaction: &mut Satisfaction, ms: Option<u64>) -> Satisfaction {
+    fn observe_ms(satisfaction: &mut Satisfaction, ms: Option<u64>) -> Satisfaction {
         let (desire, max) = (Duration::from_millis(100), Duration::from_millis(300));
         satisfaction.observe(ms.map(Duration::from_millis), desire, max);
         satisfaction.clone()
     }
 
-    fn names(events: &[Event]) -> Vec<&'static str> {
-        let name = |event: &Event| match event {
-            Event::Start(_) => "start",
-            Event::Feed(_) => "feed",
-            Event::StopFeeding(_) => "stop feeding",
-            Event::Stop(_) => "stop",
-            Event::SaidOnceMissing => "missing",
-            Event::Crashed(_) => "crashed",
-            Event::Uncorrelated(_) => "uncorrelated",
+    fn names(events: &[QosEvent]) -> Vec<&'static str> {
+        let name = |event: &QosEvent| match event {
+            QosEvent::Start(_) => "start",
+            QosEvent::Feed(_) => "feed",
+            QosEvent::StopFeeding(_) => "stop feeding",
+            QosEvent::Stop(_) => "stop",
+            QosEvent::SaidOnceMissing => "missing",
+            QosEvent::Crashed(_) => "crashed",
+            QosEvent::Uncorrelated(_) => "uncorrelated",
         };
         events.iter().map(name).collect()
     }
@@ -230,16 +237,16 @@ mod tests {
             decider.decide(&q, true).is_empty(),
             "at the threshold nothing changes"
         );
-        judged(&mut q, None);
+        observe_ms(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
         assert!(decider.decide(&q, true).is_empty(), "it is started once");
-        decider.reported(LocalState::Ready);
+        decider.on_state_change(LocalState::Ready);
         assert_eq!(names(&decider.decide(&q, true)), ["feed"]);
-        judged(&mut q, Some(1));
+        observe_ms(&mut q, Some(1));
         assert_eq!(q.q(), 4.0);
         assert!(decider.decide(&q, true).is_empty());
         assert!(decider.is_fed());
-        judged(&mut q, Some(1));
+        observe_ms(&mut q, Some(1));
         assert_eq!(names(&decider.decide(&q, true)), ["stop feeding", "stop"]);
     }
 
@@ -247,13 +254,16 @@ mod tests {
     fn warm_runs_at_once_and_is_only_fed() {
         let mut decider = decider("local = 'warm'");
         let mut q = Satisfaction::new(5.0, 4.0, 16.0);
-        assert_eq!(decider.decide(&q, true), [Event::Start(Why::Warm)]);
-        decider.reported(LocalState::Ready);
+        assert_eq!(
+            decider.decide(&q, true),
+            [QosEvent::Start(DecisionReason::Warm)]
+        );
+        decider.on_state_change(LocalState::Ready);
         assert!(decider.decide(&q, true).is_empty());
-        judged(&mut q, None);
+        observe_ms(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["feed"]);
-        judged(&mut q, Some(1));
-        judged(&mut q, Some(1));
+        observe_ms(&mut q, Some(1));
+        observe_ms(&mut q, Some(1));
         assert_eq!(names(&decider.decide(&q, true)), ["stop feeding"]);
     }
 
@@ -262,15 +272,18 @@ mod tests {
         let mut decider = decider("local = 'warm'\nwarm = 'first-sign'");
         let mut q = Satisfaction::new(15.0, 4.0, 16.0);
         assert!(decider.decide(&q, true).is_empty());
-        judged(&mut q, None);
-        decider.late();
-        assert_eq!(decider.decide(&q, true), [Event::Start(Why::FirstSign)]);
-        decider.reported(LocalState::Ready);
+        observe_ms(&mut q, None);
+        decider.note_late();
+        assert_eq!(
+            decider.decide(&q, true),
+            [QosEvent::Start(DecisionReason::FirstSign)]
+        );
+        decider.on_state_change(LocalState::Ready);
         for _ in 0..4 {
-            judged(&mut q, Some(1));
+            observe_ms(&mut q, Some(1));
             assert!(decider.decide(&q, true).is_empty(), "Q {}", q.q());
         }
-        judged(&mut q, Some(1));
+        observe_ms(&mut q, Some(1));
         assert!(q.is_full());
         assert_eq!(names(&decider.decide(&q, true)), ["stop"]);
     }
@@ -280,30 +293,45 @@ mod tests {
         let mut decider = decider("mode = 'stateful'\nlocal = 'warm'");
         let mut q = Satisfaction::new(5.0, 4.0, 16.0);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
-        decider.reported(LocalState::Ready);
+        decider.on_state_change(LocalState::Ready);
         for _ in 0..5 {
-            judged(&mut q, None);
+            observe_ms(&mut q, None);
             assert!(decider.decide(&q, true).is_empty(), "slow is not down");
         }
-        assert_eq!(decider.decide(&q, false), [Event::Feed(Why::LinkDown)]);
-        assert_eq!(decider.decide(&q, true), [Event::StopFeeding(Why::LinkUp)]);
+        assert_eq!(
+            decider.decide(&q, false),
+            [QosEvent::Feed(DecisionReason::LinkDown)]
+        );
+        assert_eq!(
+            decider.decide(&q, true),
+            [QosEvent::StopFeeding(DecisionReason::LinkUp)]
+        );
     }
 
     #[test]
     fn a_cloud_that_was_never_reached_is_stood_in_for_whatever_q_is() {
         let mut decider = decider("local = 'cold'");
         let mut q = Satisfaction::new(8.0, 4.0, 16.0);
-        assert_eq!(decider.decide(&q, false), [Event::Start(Why::LinkDown)]);
-        decider.reported(LocalState::Ready);
-        assert_eq!(decider.decide(&q, false), [Event::Feed(Why::LinkDown)]);
-        let back = [Event::StopFeeding(Why::LinkUp), Event::Stop(Why::LinkUp)];
+        assert_eq!(
+            decider.decide(&q, false),
+            [QosEvent::Start(DecisionReason::LinkDown)]
+        );
+        decider.on_state_change(LocalState::Ready);
+        assert_eq!(
+            decider.decide(&q, false),
+            [QosEvent::Feed(DecisionReason::LinkDown)]
+        );
+        let back = [
+            QosEvent::StopFeeding(DecisionReason::LinkUp),
+            QosEvent::Stop(DecisionReason::LinkUp),
+        ];
         assert_eq!(decider.decide(&q, true), back);
-        // Where the cloud kept no promise meanwhile it goes on, and Q decides.
+        // If the cloud missed its goal meanwhile, the local original goes on, and Q decides.
         decider.decide(&q, false);
-        decider.reported(LocalState::Ready);
+        decider.on_state_change(LocalState::Ready);
         decider.decide(&q, false);
-        judged(&mut q, None);
-        judged(&mut q, None);
+        observe_ms(&mut q, None);
+        observe_ms(&mut q, None);
         assert!(decider.decide(&q, true).is_empty());
         assert!(decider.is_fed());
     }
@@ -312,11 +340,14 @@ mod tests {
     fn an_absent_original_is_said_once() {
         let mut decider = decider("local = 'cold'");
         let mut q = Satisfaction::new(4.0, 4.0, 16.0);
-        judged(&mut q, None);
+        observe_ms(&mut q, None);
         assert_eq!(names(&decider.decide(&q, true)), ["start"]);
-        assert_eq!(names(&decider.reported(LocalState::Missing)), ["missing"]);
-        assert!(decider.reported(LocalState::Missing).is_empty());
-        judged(&mut q, None);
+        assert_eq!(
+            names(&decider.on_state_change(LocalState::Missing)),
+            ["missing"]
+        );
+        assert!(decider.on_state_change(LocalState::Missing).is_empty());
+        observe_ms(&mut q, None);
         assert!(decider.decide(&q, true).is_empty());
         assert!(!decider.is_coming());
     }
@@ -325,14 +356,14 @@ mod tests {
     fn after_a_crash_it_is_fed_again_when_ready() {
         let mut decider = decider("local = 'cold'");
         let mut q = Satisfaction::new(4.0, 4.0, 16.0);
-        judged(&mut q, None);
+        observe_ms(&mut q, None);
         decider.decide(&q, true);
-        decider.reported(LocalState::Ready);
+        decider.on_state_change(LocalState::Ready);
         assert_eq!(names(&decider.decide(&q, true)), ["feed"]);
-        let events = decider.reported(LocalState::Starting);
-        assert_eq!(events, [Event::StopFeeding(Why::Crash)]);
+        let events = decider.on_state_change(LocalState::Starting);
+        assert_eq!(events, [QosEvent::StopFeeding(DecisionReason::Crash)]);
         assert!(decider.decide(&q, true).is_empty());
-        decider.reported(LocalState::Ready);
+        decider.on_state_change(LocalState::Ready);
         assert_eq!(names(&decider.decide(&q, true)), ["feed"]);
     }
 }

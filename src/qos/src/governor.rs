@@ -1,4 +1,4 @@
-//! All parts together, for one node of the package.
+//! Quality of service of one node of the package: combines all parts of this crate.
 
 mod asking;
 mod effect;
@@ -14,60 +14,61 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crate::arbiter::{Arbiter, Kind, Limits, Record, Verdict};
-use crate::channel::Channel;
-use crate::decider::{Decider, Event, LocalState};
+use crate::arbiter::{Arbiter, DeliveryVerdict, Kind, Record, RetentionLimits};
+use crate::channel::RequestChannel;
+use crate::decider::{Decider, LocalState, QosEvent};
 use crate::measure::Meter;
-use crate::pair::{Correlation, Pair};
-use crate::phases::PhaseBook;
-use crate::report::Counts;
-use crate::request::{Failure, Key, Leg, RequestId, Side, Sides};
+use crate::pair::{Correlation, TopicPair};
+use crate::phases::PhaseHistory;
+use crate::report::RequestCounts;
+use crate::request::{CorrelationKey, Failure, RequestId, RequestLeg, Responder, Responders};
 use crate::satisfaction::Satisfaction;
-use crate::sla::{Mode, Sla};
+use crate::sla::{Mode, QosSla};
 
 pub use effect::Effect;
-use frames::Metered;
-use stream::Stream;
+use frames::OutputMeters;
+use stream::PairState;
 
-/// Events kept for the report.
+/// Number of events kept for the report.
 const EVENTS: usize = 32;
-/// So many stamped outputs of which none carries the stamp of an input show that the node does not copy it.
+/// Number of stamped outputs without a matching input after which the node is assumed not to copy stamps.
 const UNMATCHED: u32 = 8;
 
 /// Quality of service of one node. `P` is a message, cheap to clone.
 ///
-/// Whoever drives it calls a method for whatever happens, then takes [`effects`](Self::next_effect) until there are
-/// none, and calls [`tick`](Self::tick) at [`deadline`](Self::deadline).
+/// The driver calls a method for each thing that happens, then takes [`effects`](Self::next_effect) until there are
+/// none left, and calls [`tick`](Self::tick) at [`deadline`](Self::deadline).
 #[derive(Debug)]
 pub struct Governor<P> {
-    sla: Sla,
+    sla: QosSla,
     satisfaction: Satisfaction,
     decider: Decider,
     arbiter: Arbiter<P>,
-    /// What the cloud's outputs are measured by, where that is not the response time.
-    meter: Option<Metered>,
-    pairs: Vec<Stream>,
+    /// Meters of the cloud's outputs, if the SLA measures something else than the response time.
+    meter: Option<OutputMeters>,
+    pairs: Vec<PairState>,
     link: bool,
-    /// Whether the link was ever up.
+    /// The link has been up at least once.
     reached: bool,
-    /// The link has been down for so long that the local original is to stand in whatever Q is.
+    /// The link has been down for so long that the local original takes over whatever Q is.
     away: bool,
-    /// When the cloud will have been away for so long that the local original stands in.
+    /// Time at which the link will have been down for that long.
     away_at: Option<Instant>,
-    counts: Counts,
-    phases: PhaseBook,
-    /// How long the local original took for its last answer.
+    counts: RequestCounts,
+    phases: PhaseHistory,
+    /// Response time of the local original's last answer.
     local_time: Option<Duration>,
-    /// Outputs that somebody listens to.
+    /// Outputs that have a subscriber.
     listened: BTreeSet<String>,
-    events: VecDeque<(Instant, Event)>,
+    events: VecDeque<(Instant, QosEvent)>,
     effects: VecDeque<Effect<P>>,
 }
 
 impl<P: Clone> Governor<P> {
-    /// The link is down and the local original not started. `pairs` are those whose topics exist already.
-    pub fn new(sla: Sla, pairs: Vec<Pair>, limits: Limits) -> Self {
-        let metered = |(output, meter): (&str, Meter)| Metered {
+    /// Creates a governor; the link is down and the local original not started. `pairs` are the pairs whose topics
+    /// exist already.
+    pub fn new(sla: QosSla, pairs: Vec<TopicPair>, limits: RetentionLimits) -> Self {
+        let metered = |(output, meter): (&str, Meter)| OutputMeters {
             output: output.to_owned(),
             delivered: meter.clone(),
             cloud: meter,
@@ -77,13 +78,13 @@ impl<P: Clone> Governor<P> {
             decider: Decider::new(&sla),
             arbiter: Arbiter::new(limits),
             meter: Meter::new(&sla).map(metered),
-            pairs: pairs.into_iter().map(Stream::new).collect(),
+            pairs: pairs.into_iter().map(PairState::new).collect(),
             link: false,
             reached: false,
-            away: sla.mode == Mode::Stateful && !sla.is_of_link(),
+            away: sla.mode == Mode::Stateful && !sla.is_link_based(),
             away_at: None,
-            counts: Counts::default(),
-            phases: PhaseBook::default(),
+            counts: RequestCounts::default(),
+            phases: PhaseHistory::default(),
             local_time: None,
             listened: BTreeSet::new(),
             events: VecDeque::new(),
@@ -92,12 +93,12 @@ impl<P: Clone> Governor<P> {
         }
     }
 
-    /// The next thing to do.
+    /// Returns the next action to carry out.
     pub fn next_effect(&mut self) -> Option<Effect<P>> {
         self.effects.pop_front()
     }
 
-    /// When [`tick`](Self::tick) has something to do.
+    /// Returns the time at which [`tick`](Self::tick) has work to do.
     pub fn deadline(&self) -> Option<Instant> {
         let meters = self.meter.as_ref();
         let meters = meters.map(|meter| [meter.cloud.deadline(), meter.delivered.deadline()]);
@@ -105,35 +106,35 @@ impl<P: Clone> Governor<P> {
         self.arbiter.deadline().into_iter().chain(others).min()
     }
 
-    /// Who is given messages at the moment.
-    pub fn sides(&self) -> Sides {
-        Sides {
+    /// Returns the sides that receive messages now.
+    pub fn sides(&self) -> Responders {
+        Responders {
             cloud: self.link,
             local: self.decider.is_fed(),
         }
     }
 
-    /// Q now.
+    /// Returns the current satisfaction.
     pub fn satisfaction(&self) -> &Satisfaction {
         &self.satisfaction
     }
 
-    /// The node is up; a warm local original is started now.
+    /// Starts operation once the node is up; a warm local original is started now.
     pub fn begin(&mut self, now: Instant) {
         if !self.link {
-            self.left_alone(now);
+            self.on_link_lost(now);
         }
         self.decide(now);
     }
 
-    /// The topics of more decided pairs exist now, or further outputs of those that are known: nothing else is paired.
-    pub fn learn(&mut self, now: Instant, pairs: Vec<Pair>) {
+    /// Adds pairs whose topics exist now, or further outputs of known pairs.
+    pub fn add_pairs(&mut self, now: Instant, pairs: Vec<TopicPair>) {
         if let Some(meter) = &mut self.meter {
             if let Some(first) = pairs.first().filter(|_| meter.output.is_empty()) {
                 meter.output = first.outputs[0].clone();
             }
         }
-        self.await_frames(now);
+        self.update_meters(now);
         for pair in pairs {
             match self
                 .pairs
@@ -141,24 +142,37 @@ impl<P: Clone> Governor<P> {
                 .find(|stream| stream.pair.input == pair.input)
             {
                 Some(stream) => stream.pair.outputs = pair.outputs,
-                None => self.pairs.push(Stream::new(pair)),
+                None => self.pairs.push(PairState::new(pair)),
             }
         }
     }
 
-    /// The application calls a service.
+    /// Opens a request for a service call of the application.
     pub fn call(&mut self, now: Instant, name: &Arc<str>, payload: P) -> RequestId {
-        self.open(now, Kind::Call, Channel::Call(name.clone()), None, payload)
+        self.open(
+            now,
+            Kind::Call,
+            RequestChannel::Call(name.clone()),
+            None,
+            payload,
+        )
     }
 
-    /// The application sends a goal of an action that is made of calls (ROS 2), with its id. Its result answers it.
-    pub fn goal(&mut self, now: Instant, action: &Arc<str>, id: Key, payload: P) -> RequestId {
-        let channel = Channel::Call(action.clone());
+    /// Opens a request for a goal of an action that is made of calls (ROS 2), with the goal's id. The action's result
+    /// answers it.
+    pub fn goal(
+        &mut self,
+        now: Instant,
+        action: &Arc<str>,
+        id: CorrelationKey,
+        payload: P,
+    ) -> RequestId {
+        let channel = RequestChannel::Call(action.clone());
         self.open(now, Kind::Goal, channel, Some(id), payload)
     }
 
-    /// A side has accepted a goal: it is being carried out, however long that takes.
-    pub fn accepted(&mut self, now: Instant, id: RequestId) {
+    /// Records that a side has accepted a goal: it is being carried out, however long that takes.
+    pub fn on_goal_accepted(&mut self, now: Instant, id: RequestId) {
         self.tick(now);
         if let Some(record) = self.arbiter.get_mut(id) {
             record.taken = true;
@@ -169,8 +183,8 @@ impl<P: Clone> Governor<P> {
         &mut self,
         now: Instant,
         kind: Kind,
-        channel: Channel,
-        key: Option<Key>,
+        channel: RequestChannel,
+        key: Option<CorrelationKey>,
         payload: P,
     ) -> RequestId {
         self.tick(now);
@@ -178,114 +192,125 @@ impl<P: Clone> Governor<P> {
         let id = self
             .arbiter
             .open((now, times.t_max), kind, channel, key, payload);
-        self.asked(now, id);
+        self.dispatch(now, id);
         id
     }
 
-    /// The application does not want the answer any more.
+    /// Cancels a request: the application no longer waits for the answer.
     pub fn cancel(&mut self, now: Instant, id: RequestId) {
         self.tick(now);
         self.arbiter.cancel(id);
     }
 
-    /// The application publishes an input; its answer is recognised by `key`, where it has one.
-    pub fn input(&mut self, now: Instant, topic: &Arc<str>, key: Option<Key>, payload: P) {
+    /// Handles an input published by the application; its answer carries `key`, if the input has one.
+    pub fn input(
+        &mut self,
+        now: Instant,
+        topic: &Arc<str>,
+        key: Option<CorrelationKey>,
+        payload: P,
+    ) {
         self.tick(now);
         let mut pairs = self.pairs.iter();
         let Some(index) = pairs.position(|stream| *stream.input == **topic) else {
-            return self.pass_on(topic, &payload);
+            return self.forward(topic, &payload);
         };
         let by = self.pairs[index].by;
-        let key = key.filter(|key| by.takes(key));
+        let key = key.filter(|key| by.accepts_key(key));
         let kind = match by {
             Correlation::Goal => Kind::Goal,
             _ => Kind::Input(index),
         };
         let is_request = match &key {
-            Some(key) => self.arbiter.keyed(topic, key).is_none(),
-            // Its server makes up the id: nothing tells which result is its own.
+            Some(key) => self.arbiter.find_by_key(topic, key).is_none(),
+            // The action server assigns the id, so no result can be matched to the goal.
             None if kind == Kind::Goal => false,
-            None => (self.told_sides().iter()).any(|side| self.is_free(index, side)),
+            None => (self.forward_sides().iter()).any(|side| self.is_free(index, side)),
         };
         if !is_request {
-            // The same stamp again, or, by arrival, one is outstanding already.
-            return self.pass_on(topic, &payload);
+            // The stamp was seen before, or, when matching by arrival, a request is outstanding already.
+            return self.forward(topic, &payload);
         }
-        if let Some(Key::Stamp(stamp)) = &key {
+        if let Some(CorrelationKey::Stamp(stamp)) = &key {
             self.pairs[index].first.get_or_insert(*stamp);
         }
-        let channel = Channel::Topic(topic.clone());
+        let channel = RequestChannel::Topic(topic.clone());
         self.open(now, kind, channel, key, payload);
     }
 
-    /// An input that the cloud has by another way: it is for the local original, if that is fed.
-    pub fn overheard(&mut self, now: Instant, topic: &Arc<str>, payload: P) {
+    /// Handles an input that the cloud receives by another path: it is sent to the local original if that is fed.
+    pub fn on_overheard_input(&mut self, now: Instant, topic: &Arc<str>, payload: P) {
         self.tick(now);
         if self.decider.is_fed() {
-            self.give(Side::Local, None, Channel::Topic(topic.clone()), payload);
+            self.give(
+                Responder::Local,
+                None,
+                RequestChannel::Topic(topic.clone()),
+                payload,
+            );
         }
     }
 
-    /// A side gave the result of a call or a goal.
+    /// Handles the result of a call or a goal from one side, and returns whether to deliver it.
     #[must_use]
-    pub fn answered(&mut self, now: Instant, side: Side, id: RequestId) -> Verdict {
+    pub fn on_result(&mut self, now: Instant, side: Responder, id: RequestId) -> DeliveryVerdict {
         self.tick(now);
-        self.completed(now, side, id, 0)
+        self.on_answer(now, side, id, 0)
     }
 
-    /// A side cannot give the result of a call or a goal.
-    pub fn failed(&mut self, now: Instant, side: Side, id: RequestId, failure: &Failure) {
+    /// Records that one side cannot give the result of a call or a goal.
+    pub fn on_failure(&mut self, now: Instant, side: Responder, id: RequestId, failure: &Failure) {
         self.tick(now);
         let Some(record) = self.arbiter.get(id) else {
             return;
         };
-        if side == Side::Cloud {
+        if side == Responder::Cloud {
             let t = matches!(failure, Failure::Refused(_)).then(|| now - record.asked_at);
             self.judge(id, t);
             if t.is_some() {
-                self.announce(id);
+                self.report_outcome(id);
             }
         }
-        self.arbiter.failed(id, side, failure.text());
+        self.arbiter.mark_failed(id, side, failure.text());
         self.decide(now);
         self.fail_if_hopeless(id);
     }
 
-    /// A side publishes an output; `key` tells which input it answers, where it has one, as the application wrote it;
-    /// `age` is the time since that stamp, zero where it is not known.
+    /// Handles an output of one side, and returns whether to deliver it. `key` identifies the input that it answers, as
+    /// the application wrote it, if it has one; `age` is the time since that stamp, zero if unknown.
     #[must_use]
     pub fn output(
         &mut self,
         now: Instant,
-        side: Side,
+        side: Responder,
         topic: &str,
-        key: Option<Key>,
+        key: Option<CorrelationKey>,
         age: Duration,
-    ) -> Verdict {
+    ) -> DeliveryVerdict {
         self.tick(now);
-        if side == Side::Cloud {
+        if side == Responder::Cloud {
             self.measure(now, topic, age);
         }
-        let verdict = match self.request_of(now, side, topic, key) {
-            Some((id, output)) => self.completed(now, side, id, output),
-            // Nobody asked for it: only who speaks for the node at the moment is heard.
+        let verdict = match self.find_request(now, side, topic, key) {
+            Some((id, output)) => self.on_answer(now, side, id, output),
+            // It answers no request: only the side that speaks for the node at the moment is delivered.
             None => {
                 self.decide(now);
-                // It may say something before it is known to listen: without a link nobody else speaks.
+                // It may publish before it is known to listen: without a link no other side speaks.
                 let alone = !self.link && self.decider.is_coming();
                 let speaker = if self.decider.is_fed() || alone {
-                    Side::Local
+                    Responder::Local
                 } else {
-                    Side::Cloud
+                    Responder::Cloud
                 };
                 if side == speaker {
-                    Verdict::Deliver
+                    DeliveryVerdict::Deliver
                 } else {
-                    Verdict::Drop
+                    DeliveryVerdict::Drop
                 }
             }
         };
-        if verdict == Verdict::Deliver {
+        if verdict == DeliveryVerdict::Deliver {
             if let Some(meter) = self.meter.as_mut().filter(|meter| meter.output == topic) {
                 meter.delivered.output(now, age);
             }
@@ -293,7 +318,7 @@ impl<P: Clone> Governor<P> {
         verdict
     }
 
-    /// The link is up. `resumed`: what was sent before and not answered will be answered yet.
+    /// Handles the link coming up. `resumed`: requests sent before will still be answered.
     pub fn link_up(&mut self, now: Instant, resumed: bool) {
         self.tick(now);
         if std::mem::replace(&mut self.link, true) {
@@ -302,71 +327,84 @@ impl<P: Clone> Governor<P> {
         self.reached = true;
         self.away = false;
         self.away_at = None;
-        if self.sla.is_of_link() {
-            self.decider.calm();
+        if self.sla.is_link_based() {
+            self.decider.clear_sign();
         }
-        let next = if resumed { Leg::Asked } else { Leg::NotAsked };
+        let next = if resumed {
+            RequestLeg::Asked
+        } else {
+            RequestLeg::NotAsked
+        };
         if !resumed {
             for stream in &mut self.pairs {
-                stream.queues[Side::Cloud.index()].waiting.clear();
+                stream.queues[Responder::Cloud.index()].waiting.clear();
             }
         }
-        // A stateful service that is new has forgotten what it was asked; asking again could do it twice.
+        // A new stateful service has lost its earlier requests, and asking again could execute them twice.
         let anew = resumed || self.sla.mode == Mode::Stateless;
         if anew {
-            self.arbiter.turn(Side::Cloud, &Leg::Lost, &next);
+            self.arbiter
+                .replace_legs(Responder::Cloud, &RequestLeg::Lost, &next);
         } else {
-            for id in self.arbiter.select(|record| record.cloud == Leg::Lost) {
+            for id in self
+                .arbiter
+                .select(|record| record.cloud == RequestLeg::Lost)
+            {
                 self.judge(id, None);
             }
-            let reason = Leg::Failed("the servant was lost with the link".into());
-            for id in self.arbiter.turn(Side::Cloud, &Leg::Lost, &reason) {
+            let reason = RequestLeg::Failed("the servant was lost with the link".into());
+            for id in self
+                .arbiter
+                .replace_legs(Responder::Cloud, &RequestLeg::Lost, &reason)
+            {
                 self.fail_if_hopeless(id);
             }
         }
         self.decide(now);
-        self.give_waiting(now, Side::Cloud);
+        self.ask_open_requests(now, Responder::Cloud);
     }
 
-    /// The link is down. What is in flight may be answered in time yet when the link is back, so it counts as late at
-    /// T_max only; it goes to the local original if that is fed.
+    /// Handles the loss of the link. Requests in flight may still be answered in time when the link is back, so they
+    /// count as late only at T_max; they are sent to the local original if that is fed.
     pub fn link_down(&mut self, now: Instant) {
         self.tick(now);
         if !std::mem::replace(&mut self.link, false) {
             return;
         }
-        self.left_alone(now);
-        let lost = self.arbiter.turn(Side::Cloud, &Leg::Asked, &Leg::Lost);
+        self.on_link_lost(now);
+        let lost =
+            self.arbiter
+                .replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
         self.decide(now);
         for id in lost {
             self.fail_if_hopeless(id);
         }
     }
 
-    /// The local original's process changed.
-    pub fn local(&mut self, now: Instant, state: LocalState) {
+    /// Handles a new state of the local original's process.
+    pub fn on_local_state(&mut self, now: Instant, state: LocalState) {
         self.tick(now);
-        for event in self.decider.reported(state) {
-            self.say(now, event);
+        for event in self.decider.on_state_change(state) {
+            self.push_event(now, event);
         }
         self.decide(now);
         if self.decider.state() != LocalState::Ready {
-            self.local_lost(now);
-            // Some waited for it to come.
+            self.on_local_lost(now);
+            // Some requests were waiting for it to start.
             for id in self.arbiter.select(Record::is_open) {
                 self.fail_if_hopeless(id);
             }
         }
     }
 
-    /// The local original ended by itself and will be started again.
-    pub fn local_crashed(&mut self, now: Instant, reason: &str) {
+    /// Handles a crash of the local original; it will be restarted.
+    pub fn on_local_crash(&mut self, now: Instant, reason: &str) {
         self.tick(now);
-        self.say(now, Event::Crashed(reason.to_owned()));
-        self.local(now, LocalState::Starting);
+        self.push_event(now, QosEvent::Crashed(reason.to_owned()));
+        self.on_local_state(now, LocalState::Starting);
     }
 
-    /// Time has passed.
+    /// Handles everything that is due at `now`.
     pub fn tick(&mut self, now: Instant) {
         if !self.arbiter.is_crowded() && self.deadline().is_none_or(|deadline| deadline > now) {
             return;
@@ -377,19 +415,19 @@ impl<P: Clone> Governor<P> {
         }
         let pairs = &self.pairs;
         let (overdue, forgotten) = self.arbiter.expire(now, |id, record| match record.kind {
-            Kind::Input(pair) => pairs[pair].may_be_left_out(id, record),
+            Kind::Input(pair) => pairs[pair].left_out_deadline(id, record),
             _ => None,
         });
         let mut stop = false;
         for id in &overdue {
-            stop |= self.passes_t_max(*id);
+            stop |= self.on_t_max(*id);
         }
         for (id, record) in forgotten {
             self.forget(id, record);
         }
         if let Some(meter) = &mut self.meter {
-            let missed = meter.cloud.missed(now);
-            stop |= meter.delivered.missed(now) > 0;
+            let missed = meter.cloud.take_missed(now);
+            stop |= meter.delivered.take_missed(now) > 0;
             for _ in 0..missed {
                 self.observe(None, self.sla.t_desire, self.sla.t_max);
             }
@@ -399,7 +437,7 @@ impl<P: Clone> Governor<P> {
             self.effects.push_back(Effect::SafeStop);
         }
         self.decide(now);
-        // The local original may be wanted because of them, and answer yet.
+        // The overdue requests may have started the local original, which may still answer them.
         for id in overdue {
             self.fail_if_hopeless(id);
             self.arbiter.close_call(id);

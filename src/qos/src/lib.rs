@@ -1,4 +1,4 @@
-//! Quality of service on the robot: pure decisions, no I/O, no threads; the time is passed in.
+//! Quality of service on the robot: decisions as pure code, without I/O and threads; the caller passes the time in.
 //!
 //! ```text
 //!   calls, goals, inputs ──▶ ┌──────────┐ ──▶ ask the cloud, the local original, or both
@@ -6,12 +6,12 @@
 //!   link, local original ──▶ │          │ ──▶ start, feed, stop feeding, stop the local original
 //!   the time             ──▶ └──────────┘ ──▶ failures, safe stop, a report
 //! ```
-//! The parts, each usable alone: [`Sla`] is what the robot was promised; [`Satisfaction`] is the algorithm that judges
-//! the cloud; a [`Pair`] tells which input triggers which output; `Arbiter` knows for each request who was asked and
-//! who answered; [`Decider`] runs the local original; [`PhaseBook`] says where the time of a request goes. A
-//! [`Governor`] is all of them for one node.
+//! The parts, each usable alone: [`QosSla`] holds the goals and policies; [`Satisfaction`] is the algorithm that rates
+//! the cloud; a [`TopicPair`] says which input triggers which output; `Arbiter` tracks for each request which sides
+//! were asked and which answered; [`Decider`] decides about the local original; [`PhaseHistory`] records where the time
+//! of requests goes. A [`Governor`] combines all of them for one node.
 //!
-//! The local original of a stateless service, as `local = "cold"` and `local = "warm"` have it:
+//! The states of the local original of a stateless service, for `local = "cold"` and `local = "warm"`:
 //! ```text
 //!            Q < Q_t: Start             ready: Feed
 //!  stopped ─────────────────▶ starting ─────────────▶ fed      cold
@@ -42,19 +42,19 @@ mod sla;
 mod sla_error;
 mod span;
 
-pub use arbiter::{Limits, Verdict};
-pub use channel::Channel;
-pub use decider::{Decider, Event, LocalState, Why};
+pub use arbiter::{DeliveryVerdict, RetentionLimits};
+pub use channel::RequestChannel;
+pub use decider::{Decider, DecisionReason, LocalState, QosEvent};
 pub use governor::{Effect, Governor};
-pub use hand_over::{HandOver, Ledger, Missed};
+pub use hand_over::{HandOver, HandOverLedger, MissedInputs};
 pub use measure::Meter;
-pub use outcome::Outcome;
-pub use pair::{Correlation, Pair};
-pub use phases::{PhaseBook, Phases, Quantiles};
+pub use outcome::RequestOutcome;
+pub use pair::{Correlation, TopicPair};
+pub use phases::{PhaseHistory, Phases, Quantiles};
 pub use quantile::nearest_rank;
-pub use report::{Counts, Report, TimedEvent};
-pub use request::{Failure, Key, Leg, RequestId, Side, Sides, Stamp};
-pub use satisfaction::{DEFAULT_CAP, Satisfaction, Step};
-pub use sla::{Local, Measure, Mode, SafeStop, Sla, Warm};
+pub use report::{QosReport, RequestCounts, TimedEvent};
+pub use request::{CorrelationKey, Failure, RequestId, RequestLeg, Responder, Responders, Stamp};
+pub use satisfaction::{DEFAULT_CAP, ResponseGrade, Satisfaction};
+pub use sla::{LocalPolicy, Measure, Mode, QosSla, SafeStop, WarmStart};
 pub use sla_error::SlaError;
-pub use span::{NotASpan, Span};
+pub use span::{ParseSpanError, Span};

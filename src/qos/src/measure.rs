@@ -1,44 +1,45 @@
-//! Measures other than the response time: frames per second of an output, and its age.
+//! Meters for the rate and the age of an output.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use crate::sla::{Measure, Sla};
+use crate::sla::{Measure, QosSla};
 
-/// An output that comes at T_max is still in time.
+/// Smallest time after T_max: an output that arrives exactly at T_max is still in time.
 const PAST: Duration = Duration::from_nanos(1);
 
-/// Turns one side's outputs on one topic into times for the satisfaction algorithm.
+/// Turns the outputs of one side on one topic into times for the satisfaction algorithm.
 ///
 /// - Frames per second: T is the mean interval of the last `over` frames.
-/// - Age: T is how old the newest output has become when the next one comes.
+/// - Age: T is the age that an output has reached when the next one arrives.
 ///
-/// What does not come counts too, at the moment when T passes T_max, and again each T_max from then on. Outputs are
-/// awaited from [`start`](Self::start) on.
+/// A missing output counts as well: at the moment when T exceeds T_max, and again after each further T_max. Outputs are
+/// expected from [`start`](Self::start) on.
 #[derive(Debug, Clone)]
 pub struct Meter {
     kind: Kind,
     t_max: Duration,
-    /// When the next missing output counts: right after T has passed T_max. None before the start.
+    /// Time at which the next missing output counts, right after T exceeds T_max. `None` before the start.
     deadline: Option<Instant>,
-    /// What is awaited was counted as missing already; when it comes it must not count again.
+    /// The expected output was counted as missing already and must not count again when it comes.
     counted: bool,
 }
 
 #[derive(Debug, Clone)]
 enum Kind {
-    /// Arrivals, the newest last; at most `over + 1`.
+    /// Arrival times, newest last; at most `over + 1`.
     Rate {
         over: usize,
         arrivals: VecDeque<Instant>,
     },
-    /// When the newest output was born.
+    /// Time of the newest output's stamp.
     Age { born: Option<Instant> },
 }
 
 impl Meter {
-    /// For an SLA's measure, with the topic it looks at; none where that is the response time.
-    pub fn new(sla: &Sla) -> Option<(&str, Self)> {
+    /// Creates the meter for an SLA's measure, with the topic it observes; `None` if the measure is the response time
+    /// or the link.
+    pub fn new(sla: &QosSla) -> Option<(&str, Self)> {
         let (output, kind) = match &sla.measure {
             Measure::Rrt | Measure::Link { .. } => return None,
             Measure::FramesPerSecond { output, over } => {
@@ -62,12 +63,12 @@ impl Meter {
         Some((output, meter))
     }
 
-    /// Outputs are to come from now on. Later calls change nothing.
+    /// Starts expecting outputs. Later calls have no effect.
     pub fn start(&mut self, now: Instant) {
         self.deadline.get_or_insert(now + self.t_max + PAST);
     }
 
-    /// Nobody waits for outputs any more (no subscriber, say); what was seen is forgotten.
+    /// Stops expecting outputs (without a subscriber, say) and forgets earlier ones.
     pub fn stop(&mut self) {
         self.deadline = None;
         self.counted = false;
@@ -77,9 +78,10 @@ impl Meter {
         }
     }
 
-    /// An output came, `age` after its stamp (zero where it has none); what was [`missed`](Self::missed) until `now`
-    /// was asked for before. Gives T, and none where there is nothing to compare with. While none is awaited nothing is
-    /// noted: one that was on its way when the last subscriber left is followed by none.
+    /// Records an output that arrived `age` after its stamp (zero without a stamp), and returns T, or `None` if there
+    /// is no earlier output to compare with. [`take_missed`](Self::take_missed) must have been called for `now` before.
+    /// While outputs are not expected nothing is recorded, because an output in flight when the last subscriber left is
+    /// followed by none.
     pub fn output(&mut self, now: Instant, age: Duration) -> Option<Duration> {
         self.deadline?;
         let counted = std::mem::take(&mut self.counted);
@@ -92,8 +94,8 @@ impl Meter {
                 if arrivals.len() > *over + 1 {
                     arrivals.pop_front();
                 }
-                // With the next frame the mean is taken over one interval more, `over` at most; it will be too
-                // long once those have used up their time.
+                // With the next frame the mean covers one more interval, up to `over`; it exceeds T_max once those
+                // intervals have used up their time.
                 let next = arrivals.len().min(*over);
                 let used = next as u32 * self.t_max;
                 let due = arrivals[arrivals.len() - next] + used;
@@ -110,19 +112,19 @@ impl Meter {
         }
     }
 
-    /// When [`missed`](Self::missed) is to be asked next.
+    /// Returns the time at which [`take_missed`](Self::take_missed) is to be called next.
     pub fn deadline(&self) -> Option<Instant> {
         self.deadline
     }
 
-    /// How often an output has been missing since the last call.
-    pub fn missed(&mut self, now: Instant) -> u32 {
+    /// Returns how many outputs have gone missing since the last call.
+    pub fn take_missed(&mut self, now: Instant) -> u32 {
         let mut missed = 0;
         while let Some(deadline) = self.deadline.filter(|deadline| *deadline <= now) {
             missed += 1;
             self.counted = true;
             self.deadline = Some(deadline + self.t_max);
-            // Q is as low as it gets long before.
+            // Q has reached its minimum long before.
             if missed == 1000 {
                 self.deadline = Some(now + self.t_max);
             }
@@ -136,7 +138,7 @@ mod tests {
     use super::*;
 
     fn meter(text: &str) -> Meter {
-        let sla = Sla::parse(toml::Deserializer::parse(text).unwrap()).unwrap();
+        let sla = QosSla::parse(toml::Deserializer::parse(text).unwrap()).unwrap();
         Meter::new(&sla).unwrap().1
     }
 
@@ -148,7 +150,11 @@ mod tests {
             meter("measure.frames_per_second = { output = '/m', desire = 10, min = 4, over = 2 }");
         let start = Instant::now();
         meter.start(start);
-        assert_eq!(meter.missed(start + 250 * MS), 0, "it is still in time");
+        assert_eq!(
+            meter.take_missed(start + 250 * MS),
+            0,
+            "it is still in time"
+        );
         assert_eq!(meter.output(start + 250 * MS, Duration::ZERO), None);
         assert_eq!(
             meter.output(start + 329 * MS, Duration::ZERO),
@@ -159,10 +165,14 @@ mod tests {
             Some(99_500 * MS / 1000)
         );
         // 329 and 449 are two arrivals; with one more their mean is 250 ms at 329 + 500.
-        assert_eq!(meter.missed(start + 829 * MS), 0, "it is still in time");
+        assert_eq!(
+            meter.take_missed(start + 829 * MS),
+            0,
+            "it is still in time"
+        );
         assert_eq!(meter.deadline(), Some(start + 829 * MS + PAST));
-        assert_eq!(meter.missed(start + 1100 * MS), 2);
-        // The gap was counted twice already; the frame that ends it begins a new mean.
+        assert_eq!(meter.take_missed(start + 1100 * MS), 2);
+        // The gap was counted twice already; the frame that ends it starts a new mean.
         assert_eq!(meter.output(start + 1100 * MS, Duration::ZERO), None);
         assert_eq!(
             meter.output(start + 1200 * MS, Duration::ZERO),
@@ -177,8 +187,8 @@ mod tests {
         meter.start(start);
         assert_eq!(meter.output(start + 500 * MS, 200 * MS), None);
         assert_eq!(meter.output(start + 1200 * MS, 100 * MS), Some(900 * MS));
-        assert_eq!(meter.missed(start + 2100 * MS), 0);
-        assert_eq!(meter.missed(start + 2100 * MS + PAST), 1);
+        assert_eq!(meter.take_missed(start + 2100 * MS), 0);
+        assert_eq!(meter.take_missed(start + 2100 * MS + PAST), 1);
         assert_eq!(meter.output(start + 2200 * MS, Duration::ZERO), None);
         assert_eq!(
             meter.output(start + 2300 * MS, Duration::ZERO),
@@ -192,7 +202,7 @@ mod tests {
         let start = Instant::now() + Duration::from_secs(100);
         meter.start(start);
         assert_eq!(meter.output(start, 3000 * MS), None);
-        assert_eq!(meter.missed(start), 1);
+        assert_eq!(meter.take_missed(start), 1);
         assert_eq!(meter.output(start + 100 * MS, Duration::ZERO), None);
     }
 
@@ -200,9 +210,9 @@ mod tests {
     fn nothing_is_missed_while_nobody_waits() {
         let mut meter = meter("measure.age = { output = '/m', desire = 0.5, max = 1 }");
         let start = Instant::now();
-        assert_eq!(meter.missed(start + Duration::from_secs(60)), 0);
+        assert_eq!(meter.take_missed(start + Duration::from_secs(60)), 0);
         meter.start(start);
         meter.stop();
-        assert_eq!(meter.missed(start + Duration::from_secs(60)), 0);
+        assert_eq!(meter.take_missed(start + Duration::from_secs(60)), 0);
     }
 }

@@ -1,27 +1,27 @@
-//! How one request went.
+//! The outcome of a request.
 
 use std::time::Duration;
 
-use crate::channel::Channel;
+use crate::channel::RequestChannel;
 use crate::phases::Phases;
-use crate::request::{RequestId, Side, Stamp};
+use crate::request::{RequestId, Responder, Stamp};
 
-/// What is known of a request once the cloud's time of it has counted. It is told again, with the same id, when more
-/// becomes known: an answer that came after T_max.
+/// The outcome of a request, reported once the cloud's time has counted. It is reported again, with the same id, when
+/// more becomes known: an answer that came after T_max.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Outcome {
-    /// The request that was completed.
+pub struct RequestOutcome {
+    /// The request.
     pub request: RequestId,
-    /// What was asked.
-    pub channel: Channel,
-    /// The input's stamp, where answers are recognised by it.
+    /// The channel of the request.
+    pub channel: RequestChannel,
+    /// Stamp of the input, if answers are matched by it.
     pub stamp: Option<Stamp>,
-    /// The cloud's time from asked to answered; none while it has not answered.
+    /// Response time of the cloud; `None` while it has not answered.
     pub cloud: Option<Duration>,
-    /// Whose answer the application was given, and after what time; none while nobody has answered.
-    pub answer: Option<(Side, Duration)>,
-    /// Where the cloud's time went, if that is known.
+    /// The side whose answer was delivered to the application, and its response time; `None` without an answer.
+    pub answer: Option<(Responder, Duration)>,
+    /// Phases of the cloud's time, if known.
     pub phases: Option<Phases>,
-    /// Q now.
+    /// Q at this moment.
     pub q: f64,
 }

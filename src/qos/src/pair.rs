@@ -1,56 +1,57 @@
-//! Which input triggers which outputs, and how the answer is recognised.
+//! Pairs of an input and the outputs that answer it, and how answers are matched.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::request::Key;
+use crate::request::CorrelationKey;
 
-/// How an output finds the input it answers.
+/// How an output is matched to the input that it answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Correlation {
-    /// Both carry `header.stamp`, and the node copies it.
+    /// By `header.stamp`, which both carry and the node copies.
     Stamp,
-    /// The goal of an action and its result: both carry the goal's id.
+    /// By the goal id, which the goal of an action and its result carry.
     Goal,
-    /// One outstanding request per side: the next output answers it; forgotten at T_max.
+    /// By order: one request per side is outstanding at a time, and the next output answers it; it is forgotten at
+    /// T_max.
     Arrival,
 }
 
-/// An input and the outputs it triggers. Written on one line: `/image -> /found, /marked by stamp`.
+/// An input and the outputs that it triggers. Its text form is one line: `/image -> /found, /marked by stamp`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub struct Pair {
+pub struct TopicPair {
     /// Absolute name of the input topic.
     pub input: String,
     /// Absolute names of the output topics; the first one is the answer whose time counts. Never empty.
     pub outputs: Vec<String>,
-    /// How the answer is recognised; none where it is to be found from the types.
+    /// How answers are matched; `None` to derive it from the types.
     pub by: Option<Correlation>,
 }
 
 impl Correlation {
-    /// Whether answers are recognised by this key.
-    pub(crate) fn takes(self, key: &Key) -> bool {
+    /// Returns true if answers can be matched by this key.
+    pub(crate) fn accepts_key(self, key: &CorrelationKey) -> bool {
         match (self, key) {
-            (Self::Stamp, Key::Stamp(stamp)) => !stamp.is_zero(),
-            (Self::Goal, Key::Goal(id)) => !id.is_empty(),
+            (Self::Stamp, CorrelationKey::Stamp(stamp)) => !stamp.is_zero(),
+            (Self::Goal, CorrelationKey::Goal(id)) => !id.is_empty(),
             _ => false,
         }
     }
 }
 
-impl Pair {
-    /// Whether a pair can be written and read with this name: an absolute one of letters, digits, `_` and `/`.
-    pub fn can_name(topic: &str) -> bool {
+impl TopicPair {
+    /// Returns true if the name can be part of a pair: an absolute name of letters, digits, `_` and `/`.
+    pub fn is_valid_topic(topic: &str) -> bool {
         let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '/';
         topic.len() > 1 && topic.starts_with('/') && topic.chars().all(plain)
     }
 
-    /// The same with other names of topics.
-    pub fn renamed(&self, name: impl Fn(&str) -> String) -> Self {
+    /// Returns the pair with each topic name mapped by `name`.
+    pub fn map_names(&self, name: impl Fn(&str) -> String) -> Self {
         Self {
             input: name(&self.input),
             outputs: self.outputs.iter().map(|output| name(output)).collect(),
@@ -69,7 +70,7 @@ impl fmt::Display for Correlation {
     }
 }
 
-impl fmt::Display for Pair {
+impl fmt::Display for TopicPair {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{} -> {}", self.input, self.outputs.join(", "))?;
         match self.by {
@@ -79,7 +80,7 @@ impl fmt::Display for Pair {
     }
 }
 
-impl FromStr for Pair {
+impl FromStr for TopicPair {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -104,7 +105,7 @@ impl FromStr for Pair {
         };
         let topic = |name: &str| {
             let name = name.trim();
-            if Self::can_name(name) {
+            if Self::is_valid_topic(name) {
                 Ok(name.to_owned())
             } else {
                 Err(refuse(&format!(
@@ -120,7 +121,7 @@ impl FromStr for Pair {
     }
 }
 
-impl TryFrom<String> for Pair {
+impl TryFrom<String> for TopicPair {
     type Error = String;
 
     fn try_from(text: String) -> Result<Self, String> {
@@ -128,8 +129,8 @@ impl TryFrom<String> for Pair {
     }
 }
 
-impl From<Pair> for String {
-    fn from(pair: Pair) -> Self {
+impl From<TopicPair> for String {
+    fn from(pair: TopicPair) -> Self {
         pair.to_string()
     }
 }
@@ -140,12 +141,12 @@ mod tests {
 
     #[test]
     fn a_pair_is_one_line() {
-        let pair: Pair = "/image -> /found, /marked by stamp".parse().unwrap();
+        let pair: TopicPair = "/image -> /found, /marked by stamp".parse().unwrap();
         assert_eq!(pair.input, "/image");
         assert_eq!(pair.outputs, ["/found", "/marked"]);
         assert_eq!(pair.by, Some(Correlation::Stamp));
         assert_eq!(pair.to_string(), "/image -> /found, /marked by stamp");
-        let pair: Pair = "/scan->/pose".parse().unwrap();
+        let pair: TopicPair = "/scan->/pose".parse().unwrap();
         assert_eq!((pair.input.as_str(), pair.by), ("/scan", None));
     }
 
@@ -157,7 +158,7 @@ mod tests {
             ("/image -> ", "\"\""),
             ("/image -> /found by luck", "\"luck\""),
         ] {
-            let error = text.parse::<Pair>().unwrap_err();
+            let error = text.parse::<TopicPair>().unwrap_err();
             assert!(error.contains(named), "{text}: {error}");
             assert!(error.contains("write it as"), "{text}: {error}");
         }

@@ -1,4 +1,4 @@
-//! Where the time of a request goes.
+//! The phases of a request's time.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -7,27 +7,27 @@ use serde::{Deserialize, Serialize};
 
 use crate::quantile::nearest_rank;
 
-/// Samples kept: enough for a 99th percentile, 12 kB in all.
+/// Number of samples kept: enough for a 99th percentile, 12 kB in all.
 const KEPT: usize = 512;
 
-/// The parts of one request's time to the cloud's answer. Up and down are the link's own times, without queues.
+/// The phases of one request, up to the cloud's answer. `up` and `down` are the link's own times, without queues.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Phases {
-    /// Robot: taking the message from the application, encoding it.
+    /// On the robot: taking the message from the application and encoding it.
     pub serialise: Duration,
     /// Robot → server.
     pub up: Duration,
-    /// Waiting: in the robot's and the server's queues.
+    /// Waiting in the queues of the robot and the server.
     pub queue: Duration,
-    /// The servant's node.
+    /// Computation in the servant's node.
     pub compute: Duration,
-    /// Server → robot, decoding, handing to the application.
+    /// Server → robot, decoding, and delivery to the application.
     pub down: Duration,
 }
 
 impl Phases {
-    /// The phases by name, in order.
-    pub fn named(&self) -> [(&'static str, Duration); 5] {
+    /// Returns the phases with their names, in order.
+    pub fn by_name(&self) -> [(&'static str, Duration); 5] {
         [
             ("serialise", self.serialise),
             ("up", self.up),
@@ -37,9 +37,9 @@ impl Phases {
         ]
     }
 
-    /// Their sum: the request response time.
+    /// Returns the sum of the phases, the request response time.
     pub fn total(&self) -> Duration {
-        self.named().iter().map(|(_, time)| *time).sum()
+        self.by_name().iter().map(|(_, time)| *time).sum()
     }
 }
 
@@ -58,40 +58,40 @@ pub struct Quantiles {
     pub max: f64,
 }
 
-/// The last requests' phases; older ones are forgotten, so memory is bounded and what is shown is recent.
+/// The phases of the last requests; older ones are dropped, which bounds memory and keeps the figures recent.
 #[derive(Debug, Clone, Default)]
-pub struct PhaseBook {
+pub struct PhaseHistory {
     kept: VecDeque<[u32; 6]>,
 }
 
-impl PhaseBook {
-    /// Notes one request.
+impl PhaseHistory {
+    /// Records the phases of one request.
     pub fn record(&mut self, phases: &Phases) {
         if self.kept.len() == KEPT {
             self.kept.pop_front();
         }
         let microseconds = |time: Duration| u32::try_from(time.as_micros()).unwrap_or(u32::MAX);
-        let [a, b, c, d, e] = phases.named().map(|(_, time)| microseconds(time));
+        let [a, b, c, d, e] = phases.by_name().map(|(_, time)| microseconds(time));
         self.kept
             .push_back([a, b, c, d, e, microseconds(phases.total())]);
     }
 
-    /// Requests that the quantiles are of.
+    /// Returns the number of recorded requests.
     pub fn len(&self) -> usize {
         self.kept.len()
     }
 
-    /// Nothing was noted yet.
+    /// Returns true if nothing was recorded.
     pub fn is_empty(&self) -> bool {
         self.kept.is_empty()
     }
 
-    /// Quantiles (nearest rank) of each phase and of their sum; empty while nothing was noted.
+    /// Returns the quantiles (nearest rank) of each phase and of their sum; empty if nothing was recorded.
     pub fn quantiles(&self) -> Vec<Quantiles> {
         if self.is_empty() {
             return Vec::new();
         }
-        let names = Phases::default().named().map(|(name, _)| name);
+        let names = Phases::default().by_name().map(|(name, _)| name);
         let names = names.into_iter().chain(["total"]).enumerate();
         let of = |(index, name): (usize, &str)| {
             let mut sorted: Vec<u32> = self.kept.iter().map(|sample| sample[index]).collect();
@@ -108,7 +108,7 @@ impl PhaseBook {
         names.map(of).collect()
     }
 
-    /// The phase that takes most of the time, with its share of the whole; none while nothing was noted.
+    /// Returns the phase that takes most of the time, with its share of the total; `None` if nothing was recorded.
     pub fn dominant(&self) -> Option<(&'static str, f64)> {
         let mut sums = [0u64; 6];
         for sample in &self.kept {
@@ -116,7 +116,7 @@ impl PhaseBook {
                 *sum += u64::from(*part);
             }
         }
-        let names = Phases::default().named().map(|(name, _)| name);
+        let names = Phases::default().by_name().map(|(name, _)| name);
         let (name, sum) = names.into_iter().zip(sums).max_by_key(|(_, sum)| *sum)?;
         (sums[5] > 0).then(|| (name, sum as f64 / sums[5] as f64))
     }
@@ -139,7 +139,7 @@ mod tests {
 
     #[test]
     fn quantiles_are_nearest_ranks() {
-        let mut book = PhaseBook::default();
+        let mut book = PhaseHistory::default();
         assert!(book.quantiles().is_empty());
         assert_eq!(book.dominant(), None);
         for compute in 1..=100 {
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn old_requests_are_forgotten() {
-        let mut book = PhaseBook::default();
+        let mut book = PhaseHistory::default();
         for _ in 0..10_000 {
             book.record(&phases(500));
         }

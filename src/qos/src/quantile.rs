@@ -1,6 +1,6 @@
-//! Quantiles of values that are all kept.
+//! Exact quantiles of sorted values.
 
-/// The value that `percent` of a hundred of `sorted` (ascending) do not exceed, by nearest rank; none of none.
+/// Returns the `percent`-th percentile of `sorted` (ascending) by nearest rank; `None` if it is empty.
 pub fn nearest_rank<T: Copy>(sorted: &[T], percent: usize) -> Option<T> {
     let rank = (sorted.len() * percent).div_ceil(100).max(1);
     sorted.get(rank - 1).copied()

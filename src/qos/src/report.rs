@@ -1,84 +1,84 @@
-//! What one node's quality of service looks like, for diagnostics on the robot and `explain` in the cloud.
+//! A report of one node's quality of service, for diagnostics on the robot and `explain` in the cloud.
 
 use serde::{Deserialize, Serialize};
 
-use crate::decider::{Event, LocalState};
+use crate::decider::{LocalState, QosEvent};
 use crate::phases::Quantiles;
-use crate::sla::{Local, Mode};
+use crate::sla::{LocalPolicy, Mode};
 
-/// A snapshot; times are in seconds unless said otherwise.
+/// A snapshot of one node's quality of service; times are in seconds unless noted otherwise.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct QosReport {
     /// T_desire.
     pub t_desire: f64,
     /// T_max.
     pub t_max: f64,
-    /// Satisfaction now.
+    /// Current satisfaction Q.
     pub q: f64,
-    /// Q_t.
+    /// Threshold Q_t.
     pub threshold: f64,
     /// Stateless or stateful.
     pub mode: Mode,
-    /// How the local original is kept.
-    pub local: Local,
-    /// How its process is.
+    /// Policy for the local original.
+    pub local: LocalPolicy,
+    /// State of its process.
     pub local_state: LocalState,
-    /// Requests go to it, too.
+    /// Requests are sent to it as well.
     pub fed: bool,
     /// The link to the cloud is up.
     pub link: bool,
-    /// No time is promised: seconds without a link after which the local original stands in. T_desire, T_max, Q and Q_t
-    /// mean nothing then.
+    /// Without a response-time goal: seconds without a link after which the local original takes over. T_desire, T_max,
+    /// Q and Q_t have no meaning then.
     #[serde(default)]
     pub fallback_after: Option<f64>,
-    /// Which input triggers which outputs, as `/in -> /out by stamp`.
+    /// Pairs of input and outputs, as `/in -> /out by stamp`.
     pub pairs: Vec<String>,
-    /// Since the node began.
-    pub counts: Counts,
-    /// Of the last requests, milliseconds.
+    /// Counts since the node started.
+    pub counts: RequestCounts,
+    /// Quantiles of the last requests' phases, in milliseconds.
     pub phases: Vec<Quantiles>,
-    /// The last decisions, the newest last.
+    /// The last decisions, newest last.
     pub events: Vec<TimedEvent>,
-    /// Stateful: what was lost at the last hand-over, and how many seconds ago that was.
+    /// For a stateful service: what was lost at the last hand-over, and how many seconds ago that was.
     #[serde(default)]
     pub lost: Option<(f64, String)>,
-    /// One sentence: who answers, and why.
+    /// One sentence: which side answers, and why.
     pub summary: String,
 }
 
-/// How requests went.
+/// Counters of requests by outcome.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Counts {
-    /// Calls, goals, and inputs that await an answer.
+pub struct RequestCounts {
+    /// Number of calls, goals, and inputs that await an answer.
     pub requests: u64,
-    /// The cloud answered within T_desire (or the measure kept it).
+    /// Requests that the cloud answered within T_desire (or for which the measure met its goal).
     pub desired: u64,
-    /// The cloud answered within T_max.
+    /// Requests that the cloud answered within T_max.
     pub accepted: u64,
-    /// The cloud did not answer by T_max.
+    /// Requests that the cloud did not answer by T_max.
     pub late: u64,
-    /// Inputs that the cloud left out, because its node was at another one: they count for nothing.
+    /// Inputs that the cloud skipped, because its node was busy with another one; they do not count towards Q.
     #[serde(default)]
     pub left_out: u64,
-    /// Answers that the application got from the cloud.
+    /// Answers from the cloud that were delivered to the application.
     pub from_cloud: u64,
-    /// Answers that the application got from the local original.
+    /// Answers from the local original that were delivered to the application.
     pub from_local: u64,
-    /// Answers that came when the request had one already.
+    /// Answers that arrived when the request had been answered already.
     pub duplicates: u64,
-    /// Requests that passed T_max with no answer of either side.
+    /// Requests that no side had answered by T_max.
     pub unanswered_in_time: u64,
-    /// Requests that were given up, with a reason.
+    /// Requests that failed with a reason.
     pub failed: u64,
-    /// Times the safe-stop message was published.
+    /// Number of safe-stop messages published.
     pub safe_stops: u64,
 }
 
-/// A decision, and when it was taken.
+/// A decision and its age.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TimedEvent {
-    /// Seconds ago.
+    /// Age in seconds.
     pub ago: f64,
-    /// What was decided.
-    pub event: Event,
+    /// The decision.
+    pub event: QosEvent,
 }

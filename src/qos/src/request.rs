@@ -1,14 +1,14 @@
-//! Words about requests that all parts share.
+//! Types that describe requests, shared by all parts.
 
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-/// Names one request within one node.
+/// Identifies one request within one node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct RequestId(pub u64);
 
-/// `header.stamp` as the robot's application wrote it: the key by which an output finds its input.
+/// `header.stamp` as written by the robot's application: the key that matches an output to its input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Stamp {
     /// Seconds.
@@ -18,39 +18,39 @@ pub struct Stamp {
 }
 
 impl Stamp {
-    /// Nobody set it: it tells nothing.
+    /// Returns true if the stamp was not set and identifies nothing.
     pub fn is_zero(self) -> bool {
         self.secs == 0 && self.nsecs == 0
     }
 }
 
-/// By what an answer is recognised.
+/// The key by which an answer is matched to its request.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum Key {
+pub enum CorrelationKey {
     /// The input's stamp, which the node copies.
     Stamp(Stamp),
-    /// The id of an action's goal (actionlib_msgs/GoalID), which its result and feedback carry.
+    /// Id of an action's goal (actionlib_msgs/GoalID), which its result and feedback carry.
     Goal(Arc<str>),
 }
 
-impl From<Stamp> for Key {
+impl From<Stamp> for CorrelationKey {
     fn from(stamp: Stamp) -> Self {
         Self::Stamp(stamp)
     }
 }
 
-/// Who can answer.
+/// A side that can answer requests.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Side {
+pub enum Responder {
     /// The robot's servant.
     Cloud,
     /// The original package on the robot.
     Local,
 }
 
-impl Side {
-    /// For tables of both sides: the cloud first.
+impl Responder {
+    /// Returns the index for tables of both sides; the cloud comes first.
     pub fn index(self) -> usize {
         match self {
             Self::Cloud => 0,
@@ -59,59 +59,59 @@ impl Side {
     }
 }
 
-/// Who is asked at the moment.
+/// The sides that receive requests at the moment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Sides {
+pub struct Responders {
     /// The robot's servant.
     pub cloud: bool,
     /// The original package on the robot.
     pub local: bool,
 }
 
-impl Sides {
-    /// Each of them, the cloud first.
-    pub fn iter(self) -> impl Iterator<Item = Side> {
-        let both = [Side::Cloud, Side::Local].into_iter();
-        both.filter(move |side| self.has(*side))
+impl Responders {
+    /// Returns an iterator over the sides, the cloud first.
+    pub fn iter(self) -> impl Iterator<Item = Responder> {
+        let both = [Responder::Cloud, Responder::Local].into_iter();
+        both.filter(move |side| self.contains(*side))
     }
 
-    /// Whether this side is one of them.
-    pub fn has(self, side: Side) -> bool {
+    /// Returns true if `side` is included.
+    pub fn contains(self, side: Responder) -> bool {
         match side {
-            Side::Cloud => self.cloud,
-            Side::Local => self.local,
+            Responder::Cloud => self.cloud,
+            Responder::Local => self.local,
         }
     }
 }
 
-/// How far one side is with one request.
+/// Progress of one side on one request.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Leg {
-    /// It was not asked.
+pub enum RequestLeg {
+    /// The side was not asked.
     NotAsked,
-    /// It was asked and has not answered.
+    /// The side was asked and has not answered.
     Asked,
-    /// It was asked, but the way to it was lost; an answer may still come if the link resumes.
+    /// The side was asked, but the link to it was lost; an answer may still come if the link resumes.
     Lost,
-    /// It was given it and answered a later one, or was at an earlier one: no answer is awaited of it.
+    /// The side skipped it: it answered a later request, or was busy with an earlier one. No answer is expected.
     LeftOut,
-    /// It answered.
+    /// The side answered.
     Answered,
-    /// It cannot answer.
+    /// The side cannot answer, for this reason.
     Failed(String),
 }
 
-/// Why a side gave no result.
+/// Reason why a side gave no result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Failure {
-    /// The node itself said no: its time counts like that of an answer.
+    /// The node refused the request; its time counts like that of an answer.
     Refused(String),
-    /// It could not be asked, or ended: counts as late at this moment.
+    /// The side could not be reached, or ended; the request counts as late now.
     Unreachable(String),
 }
 
 impl Failure {
-    /// What was said.
+    /// Returns the error text.
     pub fn text(&self) -> &str {
         match self {
             Self::Refused(text) | Self::Unreachable(text) => text,

@@ -1,94 +1,101 @@
-//! The satisfaction algorithm: how content the robot is with the cloud, as one real number Q.
+//! The satisfaction algorithm: rates the cloud by one real number Q.
 
 use std::time::Duration;
 
-/// The cap of Q in thresholds, where an SLA gives none.
+/// Default cap of Q, as a multiple of the threshold.
 pub const DEFAULT_CAP: f64 = 4.0;
 
-/// Q and what moves it.
+/// The satisfaction Q and its parameters.
 ///
-/// After each request, T being the cloud's completion time: T ≤ T_desire adds 2, T ≤ T_max adds 1, anything later
-/// halves Q. Below the threshold Q_t the local original is wanted, above it is not; at Q_t nothing changes.
+/// After each request, with the cloud's completion time T: T ≤ T_desire adds 2, T ≤ T_max adds 1, anything later halves
+/// Q. Below the threshold Q_t the local original is wanted, above it is not; at Q_t nothing changes.
 ///
-/// Q stays below a cap, 4·Q_t unless the SLA says otherwise. Without it a long good time would delay the switch: a surplus
-/// of s needs log2(s) late requests to be forgotten. Below 2^n·Q_t any n late requests in a row bring Q below Q_t.
+/// Q stays below a cap, 4·Q_t unless the SLA sets another. Without it a long good period would delay the switch: a
+/// surplus of s needs log2(s) late requests to decay. With a cap of 2^n·Q_t any n late requests in a row bring Q below
+/// Q_t.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Satisfaction {
     q: f64,
     threshold: f64,
-    /// The greatest value that Q takes.
+    /// Maximum of Q.
     most: f64,
-    /// From here on nothing points to trouble.
+    /// Q at or above which the service counts as free of trouble.
     full: f64,
 }
 
-/// What one request did to Q.
+/// Rating of one request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Step {
+pub enum ResponseGrade {
     /// T ≤ T_desire.
     Desired,
     /// T_desire < T ≤ T_max.
     Accepted,
-    /// T > T_max, or no answer by then.
+    /// T > T_max, or no answer by T_max.
     Late,
 }
 
 impl Satisfaction {
-    /// Starts at `initial`, or right below `cap` where `initial` is more. All are positive, `cap` is greater than
-    /// `threshold` and may be infinite (an [`Sla`](crate::Sla) has checked that).
+    /// Creates the state with Q = `initial`, or right below `cap` if `initial` is larger. All are positive, `cap` is
+    /// greater than `threshold` and may be infinite ([`QosSla`](crate::QosSla) has checked that).
     pub fn new(initial: f64, threshold: f64, cap: f64) -> Self {
-        let most = below(cap);
+        let most = next_below(cap);
         Self {
             q: initial.min(most),
             threshold,
             most,
-            full: most.min(below(DEFAULT_CAP * threshold)),
+            full: most.min(next_below(DEFAULT_CAP * threshold)),
         }
     }
 
-    /// Counts one request that the cloud completed after `t`; `None` where it had not by T_max.
-    pub fn observe(&mut self, t: Option<Duration>, t_desire: Duration, t_max: Duration) -> Step {
+    /// Counts one request that the cloud completed after `t`; `None` if it was not completed by T_max.
+    pub fn observe(
+        &mut self,
+        t: Option<Duration>,
+        t_desire: Duration,
+        t_max: Duration,
+    ) -> ResponseGrade {
         let step = match t {
-            Some(t) if t <= t_desire => Step::Desired,
-            Some(t) if t <= t_max => Step::Accepted,
-            _ => Step::Late,
+            Some(t) if t <= t_desire => ResponseGrade::Desired,
+            Some(t) if t <= t_max => ResponseGrade::Accepted,
+            _ => ResponseGrade::Late,
         };
         self.q = match step {
-            Step::Desired => (self.q + 2.0).min(self.most),
-            Step::Accepted => (self.q + 1.0).min(self.most),
-            Step::Late => self.q / 2.0,
+            ResponseGrade::Desired => (self.q + 2.0).min(self.most),
+            ResponseGrade::Accepted => (self.q + 1.0).min(self.most),
+            ResponseGrade::Late => self.q / 2.0,
         };
         step
     }
 
-    /// Satisfaction now.
+    /// Returns the current Q.
     pub fn q(&self) -> f64 {
         self.q
     }
 
-    /// Q_t.
+    /// Returns the threshold Q_t.
     pub fn threshold(&self) -> f64 {
         self.threshold
     }
 
-    /// Q < Q_t: the local original is to be started.
+    /// Returns true if Q < Q_t: the local original is to be started.
     pub fn wants_local(&self) -> bool {
         self.q < self.threshold
     }
 
-    /// Q > Q_t: the local original is to be stopped.
+    /// Returns true if Q > Q_t: the local original is to be stopped.
     pub fn wants_cloud_alone(&self) -> bool {
         self.q > self.threshold
     }
 
-    /// Q is as high as it gets, or at the default cap where the cap is higher.
+    /// Returns true if Q is at its maximum, or at the default cap if the cap is higher.
     pub fn is_full(&self) -> bool {
         self.q >= self.full
     }
 }
 
-/// The greatest finite number below `x`, which is positive (`f64::next_down` is newer than this crate's minimum Rust).
-pub(crate) fn below(x: f64) -> f64 {
+/// Returns the greatest finite number below `x`, which is positive (`f64::next_down` is newer than this crate's minimum
+/// Rust).
+pub(crate) fn next_below(x: f64) -> f64 {
     f64::from_bits(x.to_bits() - 1)
 }
 
@@ -107,18 +114,30 @@ mod tests {
     #[test]
     fn each_request_moves_q_as_published() {
         let mut satisfaction = Satisfaction::new(8.0, 4.0, 16.0);
-        assert_eq!(satisfaction.observe(ms(100), DESIRE, MAX), Step::Desired);
+        assert_eq!(
+            satisfaction.observe(ms(100), DESIRE, MAX),
+            ResponseGrade::Desired
+        );
         assert_eq!(satisfaction.q(), 10.0);
-        assert_eq!(satisfaction.observe(ms(101), DESIRE, MAX), Step::Accepted);
+        assert_eq!(
+            satisfaction.observe(ms(101), DESIRE, MAX),
+            ResponseGrade::Accepted
+        );
         assert_eq!(satisfaction.q(), 11.0);
-        assert_eq!(satisfaction.observe(ms(300), DESIRE, MAX), Step::Accepted);
+        assert_eq!(
+            satisfaction.observe(ms(300), DESIRE, MAX),
+            ResponseGrade::Accepted
+        );
         assert_eq!(satisfaction.q(), 12.0);
-        assert_eq!(satisfaction.observe(ms(301), DESIRE, MAX), Step::Late);
+        assert_eq!(
+            satisfaction.observe(ms(301), DESIRE, MAX),
+            ResponseGrade::Late
+        );
         assert_eq!(satisfaction.q(), 6.0);
-        assert_eq!(satisfaction.observe(None, DESIRE, MAX), Step::Late);
+        assert_eq!(satisfaction.observe(None, DESIRE, MAX), ResponseGrade::Late);
         assert_eq!(satisfaction.q(), 3.0);
         assert!(satisfaction.wants_local());
-        assert_eq!(satisfaction.observe(None, DESIRE, MAX), Step::Late);
+        assert_eq!(satisfaction.observe(None, DESIRE, MAX), ResponseGrade::Late);
         assert_eq!(satisfaction.q(), 1.5);
     }
 
@@ -142,7 +161,7 @@ mod tests {
                 let after = satisfaction.q();
                 prop_assert!((0.0..factor * threshold).contains(&after), "Q {after}");
                 match step {
-                    Step::Late => prop_assert_eq!(after, before / 2.0),
+                    ResponseGrade::Late => prop_assert_eq!(after, before / 2.0),
                     _ => prop_assert!(after >= before),
                 }
             }

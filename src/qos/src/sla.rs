@@ -1,4 +1,4 @@
-//! What the robot is promised, as written in its parameters, its launch file or its configuration.
+//! The SLA of a robot, as written in its parameters, its launch file or its configuration.
 
 #[cfg(test)]
 mod tests;
@@ -9,57 +9,58 @@ use std::time::Duration;
 
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::pair::Pair;
+use crate::pair::TopicPair;
 use crate::sla_error::SlaError;
-use written::Written;
+use written::RawSla;
 
-/// The promise, and what is done to keep it. Times are written as seconds (`0.3`) or with a unit (`"300ms"`).
+/// Response-time goals of a node and the measures to meet them. Times are written in seconds (`0.3`) or with a unit
+/// (`"300ms"`).
 ///
 /// ```toml
 /// t_desire = 0.1             # desirable response time of the cloud
 /// t_max = 0.3                # maximal acceptable response time
 /// threshold = 4.0            # Q_t: below it the local original is wanted
-/// initial = 8.0              # Q at the beginning; 2·Q_t where it is not given
-/// cap = 16.0                 # Q stays below it; 4·Q_t where it is not given, inf as the algorithm was published
-/// unreached = 3              # without the cloud from the beginning: seconds after which the local original stands in
+/// initial = 8.0              # initial Q (default: 2·Q_t)
+/// cap = 16.0                 # upper bound of Q (default: 4·Q_t; inf for the algorithm as published)
+/// unreached = 3              # seconds without a first contact to the cloud until the local original takes over
 /// mode = "stateless"         # or "stateful": the local original only while the link is down
 /// local = "cold"             # or "warm", or "none"
 /// answers = ["/image -> /people_detect/found"]
 /// safe_stop = { topic = "/cmd_vel", type = "geometry_msgs/Twist", message = {} }
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Sla {
+pub struct QosSla {
     /// T_desire.
     #[serde(serialize_with = "seconds")]
     pub t_desire: Duration,
     /// T_max.
     #[serde(serialize_with = "seconds")]
     pub t_max: Duration,
-    /// Q_t.
+    /// Threshold Q_t.
     pub threshold: f64,
-    /// Q at the beginning.
+    /// Initial Q.
     pub initial: f64,
-    /// Q stays below it; may be infinite.
+    /// Upper bound of Q (exclusive); may be infinite.
     pub cap: f64,
-    /// Where a time is promised: until the cloud is reached for the first time, the local original stands in after so long.
-    /// Nothing can be asked then, because nobody knows yet what the node registers.
+    /// For SLAs with a response time: time without a first contact to the cloud after which the local original takes
+    /// over. Nothing can be asked before that contact, because the interface of the node is not known yet.
     #[serde(serialize_with = "seconds")]
     pub unreached: Duration,
-    /// Whether requests depend on one another.
+    /// Dependence between requests: stateless or stateful.
     pub mode: Mode,
-    /// How the local original is kept.
-    pub local: Local,
-    /// With [`Local::Warm`], from when on its process runs.
-    pub warm: Warm,
-    /// What T is.
+    /// Policy for the local original.
+    pub local: LocalPolicy,
+    /// With [`LocalPolicy::Warm`]: when its process is started.
+    pub warm: WarmStart,
+    /// The quantity that is compared with T_desire and T_max.
     pub measure: Measure,
-    /// Overrides what is found automatically; empty means that nothing but calls and goals is a request.
+    /// Pairs that override the automatic detection; empty means that only calls and goals are requests.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub answers: Option<Vec<Pair>>,
-    /// What is published when nobody answers in time.
+    pub answers: Option<Vec<TopicPair>>,
+    /// Message to publish when no side answers in time.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub safe_stop: Option<SafeStop>,
-    /// Other times for single services, actions and inputs, by name.
+    /// Times of single services, actions and inputs that differ, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub requests: BTreeMap<String, Times>,
 }
@@ -75,105 +76,105 @@ pub struct Times {
     pub t_max: Duration,
 }
 
-/// Whether requests depend on one another.
+/// Dependence between requests.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {
-    /// Each stands alone: both sides may be asked, either may answer.
+    /// Requests are independent: both sides may be asked, and either may answer.
     #[default]
     Stateless,
-    /// Answers depend on earlier requests: one side at a time, the local original only while the link is down.
+    /// Answers depend on earlier requests: one side is asked at a time, the local original only while the link is down.
     Stateful,
 }
 
-/// How the local original is kept.
+/// Policy for the local original.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Local {
-    /// Its process is started and ended as the algorithm says.
+pub enum LocalPolicy {
+    /// The process is started and stopped by the algorithm.
     #[default]
     Cold,
-    /// Its process runs before it is needed and is only fed as the algorithm says.
+    /// The process runs before it is needed, and the algorithm only controls whether it is fed.
     Warm,
-    /// There is none, or it is not to be used.
+    /// No local original is installed or used.
     None,
 }
 
-/// From when on a warm local original runs.
+/// When a warm local original is started.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Warm {
-    /// As long as the node runs.
+pub enum WarmStart {
+    /// It runs as long as the node.
     #[default]
     AtOnce,
-    /// From the first late request until Q is full again.
+    /// It runs from the first late request until Q is full again.
     FirstSign,
 }
 
-/// What T is.
+/// The quantity T that is compared with T_desire and T_max.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
-    /// The response time of requests.
+    /// Response time of requests.
     #[default]
     Rrt,
-    /// The mean interval of the last frames of an output; T_desire and T_max are the inverse rates.
+    /// Mean interval of the last frames of an output; T_desire and T_max are the inverse rates.
     FramesPerSecond {
-        /// The output topic; empty: the one that answers the first request that is found.
+        /// Output topic; empty for the one that answers the first detected request.
         output: String,
-        /// Frames over which the mean is taken.
+        /// Number of frames to average over.
         over: usize,
     },
-    /// How old an output has become when the next one comes, counted from its `header.stamp` where it has one.
+    /// Age that an output has reached when the next one arrives, counted from its `header.stamp` if it has one.
     Age {
-        /// The output topic; empty: the one that answers the first request that is found.
+        /// Output topic; empty for the one that answers the first detected request.
         output: String,
     },
-    /// Nothing, no time was promised: the local original stands in while the link is away.
+    /// No response time: the local original takes over while the link is down.
     Link {
-        /// For so long the link must have been away.
+        /// Time for which the link must have been down.
         #[serde(serialize_with = "seconds")]
         after: Duration,
     },
 }
 
-/// The message that brings the robot to rest.
+/// The message that stops the robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SafeStop {
-    /// Absolute topic name.
+    /// Absolute name of the topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Message type, as `package/Type`.
     #[serde(rename = "type")]
     pub type_name: String,
-    /// Its fields; those not given are zero.
+    /// Fields of the message; omitted ones are zero.
     #[serde(default)]
     pub message: serde_json::Map<String, serde_json::Value>,
 }
 
-impl Sla {
-    /// Reads and checks an SLA. `from` is any serde source: a table of a TOML file, ROS parameters as JSON.
+impl QosSla {
+    /// Parses and checks an SLA. `from` is any serde source: a table of a TOML file, ROS parameters as JSON.
     ///
     /// # Errors
-    /// The first field that is missing, unknown, of another type or out of range.
+    /// Returns the first field that is missing, unknown, of the wrong type or out of range.
     pub fn parse<'de, D: Deserializer<'de>>(from: D) -> Result<Self, SlaError> {
-        let written: Written = serde_path_to_error::deserialize(from).map_err(|error| {
+        let written: RawSla = serde_path_to_error::deserialize(from).map_err(|error| {
             let path = error.path().to_string();
             SlaError {
                 field: if path == "." { "the SLA".into() } else { path },
-                // Some formats add the place in the file as lines of its own.
+                // Some formats append the position in the file on lines of its own.
                 reason: error.into_inner().to_string().trim().replace('\n', " "),
             }
         })?;
         written.check()
     }
 
-    /// No time is promised: the link alone decides about the local original.
-    pub fn is_of_link(&self) -> bool {
+    /// Returns true if the SLA has no response time and only the link decides about the local original.
+    pub fn is_link_based(&self) -> bool {
         matches!(self.measure, Measure::Link { .. })
     }
 
-    /// The times of one service, action or input.
+    /// Returns the times of one service, action or input.
     pub fn times(&self, name: &str) -> Times {
         self.requests.get(name).copied().unwrap_or(Times {
             t_desire: self.t_desire,
@@ -182,9 +183,9 @@ impl Sla {
     }
 }
 
-impl<'de> Deserialize<'de> for Sla {
+impl<'de> Deserialize<'de> for QosSla {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
-        Written::deserialize(from)?
+        RawSla::deserialize(from)?
             .check()
             .map_err(serde::de::Error::custom)
     }

@@ -1,12 +1,12 @@
-//! Why an SLA was refused.
+//! The error of an invalid SLA.
 
-/// One field that cannot be as it is.
+/// An invalid field of an SLA.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {reason}")]
 pub struct SlaError {
     /// Path of the field, such as `t_max` or `measure.age.max`.
     pub field: String,
-    /// What is wrong, and what to write instead.
+    /// The problem, and what to write instead.
     pub reason: String,
 }
 

@@ -1,4 +1,4 @@
-//! Times as people write them: `100ms`, `0.3s`, `0.3` (seconds).
+//! Time spans in text form: `100ms`, `0.3s`, `0.3` (seconds).
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,63 +6,63 @@ use std::time::Duration;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Beyond a day it is a mistake of units, and far below it sums of deadlines cannot overflow.
+/// Maximum span: a longer one is a mistake of units, and sums of deadlines cannot overflow far above it.
 pub(crate) const LONGEST: Duration = Duration::from_secs(86_400);
 
-/// A positive time up to a day, exact to the nanosecond. Written as text such as `"100ms"`; read also as a number of
-/// seconds.
+/// A positive time span of at most a day, exact to the nanosecond. Serialized as text such as `"100ms"`; a number of
+/// seconds is accepted as well.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Span(Duration);
 
-/// The text is not a time.
+/// The error of a text that is no time span.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct NotASpan(String);
+pub struct ParseSpanError(String);
 
-impl fmt::Display for NotASpan {
+impl fmt::Display for ParseSpanError {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             out,
-            "{:?} is not a time between a nanosecond and a day; write seconds, such as 0.3, or 300ms",
+            "{:?} is not a time from a nanosecond to a day; write seconds, such as 0.3, or 300ms",
             self.0
         )
     }
 }
 
-impl std::error::Error for NotASpan {}
+impl std::error::Error for ParseSpanError {}
 
 impl Span {
-    /// A whole number of milliseconds; none where that is nothing, or more than a day.
-    pub fn millis(millis: u64) -> Option<Span> {
-        Span::checked(Duration::from_millis(millis))
+    /// Creates a span from milliseconds; `None` if it is zero or longer than a day.
+    pub fn from_millis(millis: u64) -> Option<Span> {
+        Span::from_duration(Duration::from_millis(millis))
     }
 
-    /// From seconds; none where that is nothing, or more than a day.
-    pub fn seconds(seconds: f64) -> Option<Span> {
+    /// Creates a span from seconds; `None` if it is zero, negative or longer than a day.
+    pub fn from_seconds(seconds: f64) -> Option<Span> {
         Duration::try_from_secs_f64(seconds)
             .ok()
-            .and_then(Span::checked)
+            .and_then(Span::from_duration)
     }
 
-    fn checked(time: Duration) -> Option<Span> {
+    fn from_duration(time: Duration) -> Option<Span> {
         (!time.is_zero() && time <= LONGEST).then_some(Span(time))
     }
 
-    /// As a duration.
+    /// Returns the span as a duration.
     pub fn duration(self) -> Duration {
         self.0
     }
 
-    /// In seconds.
+    /// Returns the span in seconds.
     pub fn as_seconds(self) -> f64 {
         self.0.as_secs_f64()
     }
 }
 
 impl FromStr for Span {
-    type Err = NotASpan;
+    type Err = ParseSpanError;
 
-    fn from_str(text: &str) -> Result<Span, NotASpan> {
-        let refused = || NotASpan(text.to_owned());
+    fn from_str(text: &str) -> Result<Span, ParseSpanError> {
+        let refused = || ParseSpanError(text.to_owned());
         let (number, scale) = match (text.strip_suffix("ms"), text.strip_suffix('s')) {
             (Some(number), _) => (number, 1e3),
             (None, Some(number)) => (number, 1.0),
@@ -70,7 +70,7 @@ impl FromStr for Span {
         };
         let number: f64 = number.trim().parse().map_err(|_| refused())?;
         // A quotient is rounded once, a product with 0.001 twice.
-        Span::seconds(number / scale).ok_or_else(refused)
+        Span::from_seconds(number / scale).ok_or_else(refused)
     }
 }
 
@@ -101,13 +101,13 @@ impl<'de> Deserialize<'de> for Span {
     fn deserialize<D: Deserializer<'de>>(source: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged, expecting = "a time: seconds, or text such as \"300ms\"")]
-        enum Written {
+        enum RawSpan {
             Seconds(f64),
             Text(String),
         }
-        let text = match Written::deserialize(source)? {
-            Written::Seconds(seconds) => seconds.to_string(),
-            Written::Text(text) => text,
+        let text = match RawSpan::deserialize(source)? {
+            RawSpan::Seconds(seconds) => seconds.to_string(),
+            RawSpan::Text(text) => text,
         };
         text.parse().map_err(serde::de::Error::custom)
     }
@@ -138,7 +138,7 @@ mod tests {
             assert_eq!(serde_json::from_str::<Span>(&json).expect("read"), span);
         }
         let seconds: Span = serde_json::from_str("0.25").expect("a number of seconds");
-        assert_eq!(Some(seconds), Span::millis(250));
+        assert_eq!(Some(seconds), Span::from_millis(250));
     }
 
     #[test]
@@ -152,6 +152,9 @@ mod tests {
                 "{refused}"
             );
         }
-        assert_eq!((Span::millis(0), Span::seconds(1e9)), (None, None));
+        assert_eq!(
+            (Span::from_millis(0), Span::from_seconds(1e9)),
+            (None, None)
+        );
     }
 }

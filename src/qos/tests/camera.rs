@@ -1,15 +1,17 @@
-//! A camera at its own rate, an action's goals, and two sides that answer as they can: the governor as a model, over random
-//! times of good and bad links, slow and silent nodes, lost pictures, new servants, crashes, and pairs that become known late.
+//! Model test of the governor: a camera at its own rate, goals of an action, and two sides that answer as they can,
+//! over random periods of good and bad links, slow and silent nodes, lost pictures, new servants, crashes, and pairs
+//! that become known late.
 //!
-//! What holds, by stamp and by arrival, with a cold original, a warm one, and none:
-//! 1. There is no safe stop while anybody answers what it takes within T_max, however much its node leaves out.
-//! 2. Where a node that took every picture begins to leave some out, at most one of them counts as late for that, and at most one
-//!    safe stop is fired.
-//! 3. Where nobody answers any more, the safe stop comes at T_max after the first picture that was not answered; where the
-//!    node left pictures out until then, at T_max after its last answer at the latest.
-//! 4. By stamp nothing is answered by both sides. Of a goal, one result is delivered.
-//! 5. Each request counts once: as desired, accepted, late, or left out. What is left out moves neither Q nor the robot.
-//! 6. Feedback of a goal comes from one side at a time, and goes on after a hand-over.
+//! Properties, matching by stamp and by arrival, with a cold original, a warm one, and none:
+//! 1. There is no safe stop while any side answers what it accepts within T_max, however much its node skips.
+//! 2. When a node that took every picture starts to skip some, at most one of them counts as late for that, and at most
+//!    one safe stop is fired.
+//! 3. When no side answers any more, the safe stop comes T_max after the first picture that was not answered; if the
+//!    node skipped pictures until then, at the latest T_max after its last answer.
+//! 4. By stamp, no picture is answered by both sides. Of a goal, one result is delivered.
+//! 5. Each request counts once: as desired, accepted, late, or left out. What is left out changes neither Q nor the
+//!    robot's motion.
+//! 6. Feedback of a goal comes from one side at a time, and continues after a hand-over.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -17,15 +19,15 @@ use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
 use qos::{
-    Channel, Counts, Effect, Event, Governor, Key, Limits, LocalState, Side, Sides, Sla, Stamp,
-    Verdict,
+    CorrelationKey, DeliveryVerdict, Effect, Governor, LocalState, QosEvent, QosSla,
+    RequestChannel, RequestCounts, Responder, Responders, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
 const T_MAX: u64 = 300;
-/// A cold original is up after so many milliseconds.
+/// Start time of a cold original, milliseconds.
 const STARTS: u64 = 700;
-/// Between two words of feedback, milliseconds.
+/// Interval between feedback messages, milliseconds.
 const FEEDBACK: u64 = 100;
 
 #[derive(Debug, Clone, Copy)]
@@ -34,7 +36,7 @@ enum Sent {
     Goal(u32),
 }
 
-/// A node with a queue of one picture: the newest replaces what waits.
+/// A node with a queue of one picture: the newest replaces the waiting one.
 #[derive(Default)]
 struct Node {
     takes: u64,
@@ -45,15 +47,15 @@ struct Node {
 }
 
 impl Node {
-    fn given(&mut self, sent: Sent) {
+    fn receive(&mut self, sent: Sent) {
         match sent {
             Sent::Picture(number) => self.waiting = Some(number),
             Sent::Goal(number) => drop(self.goals.insert(number)),
         }
     }
 
-    /// What it has answered at this millisecond.
-    fn works(&mut self, t: u64) -> Option<u32> {
+    /// Advances to millisecond `t` and returns the picture answered then.
+    fn step(&mut self, t: u64) -> Option<u32> {
         let done = self.working.take_if(|(_, until)| *until <= t);
         if self.working.is_none() {
             self.working = self.waiting.take().map(|number| (number, t + self.takes));
@@ -61,7 +63,7 @@ impl Node {
         done.filter(|_| !self.is_silent).map(|(number, _)| number)
     }
 
-    fn ends(&mut self) {
+    fn reset(&mut self) {
         (self.waiting, self.working) = (None, None);
         self.goals.clear();
     }
@@ -73,36 +75,41 @@ struct World {
     t: u64,
     is_by_stamp: bool,
     period: u64,
-    /// The way to the cloud and back, milliseconds each.
+    /// One-way delay between robot and cloud, milliseconds.
     delay: u64,
-    /// Each so many pictures one is lost on the way; zero: none.
+    /// One picture in so many is lost on the way; zero for none.
     loses: u32,
     has_link: bool,
     nodes: [Node; 2],
     up: VecDeque<(u64, Sent)>,
     down: VecDeque<(u64, u32)>,
-    /// When the local original will be up, and whether it is.
+    /// Time at which the local original will be up, and whether it is.
     local_up: Option<u64>,
     is_local_up: bool,
     pictures: u32,
-    /// By stamp: how many answers of each side were delivered.
+    /// By stamp: number of delivered answers of each side.
     delivered: BTreeMap<u32, [u32; 2]>,
-    speakers: BTreeMap<u32, Side>,
+    speakers: BTreeMap<u32, Responder>,
     results: BTreeMap<u32, u32>,
     stops: Vec<u64>,
-    /// When anybody answered a picture.
+    /// Times at which any side answered a picture.
     heard: Vec<u64>,
-    /// The camera runs.
+    /// The camera is running.
     films: bool,
 }
 
 impl World {
     fn new(local: &str, by: &str) -> Self {
         let sla = serde_json::json!({
-            "t_desire": 0.1, "t_max": 0.3, "local": local, "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}
+            "t_desire": 0.1, "t_max": 0.3, "local": local,
+            "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}
         });
         let begin = Instant::now();
-        let mut governor = Governor::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let mut governor = Governor::new(
+            QosSla::parse(sla).unwrap(),
+            vec![],
+            RetentionLimits::default(),
+        );
         governor.link_up(begin, false);
         governor.begin(begin);
         let node = || Node {
@@ -131,37 +138,38 @@ impl World {
             heard: Vec::new(),
             films: true,
         };
-        world.obey();
+        world.apply_effects();
         world
     }
 
     fn with_pairs(local: &str, by: &str) -> Self {
         let mut world = Self::new(local, by);
-        world.learns_actions();
-        world.learns_pictures();
+        world.add_action_pair();
+        world.add_picture_pair();
         world
     }
 
-    fn learns_pictures(&mut self) {
+    fn add_picture_pair(&mut self) {
         let by = if self.is_by_stamp { "stamp" } else { "arrival" };
         let pair = format!("/image -> /found by {by}").parse().unwrap();
-        self.governor.learn(self.now(), vec![pair]);
+        self.governor.add_pairs(self.now(), vec![pair]);
     }
 
-    fn learns_actions(&mut self) {
+    fn add_action_pair(&mut self) {
         let pair = "/walk/goal -> /walk/result, /walk/feedback by goal";
-        self.governor.learn(self.now(), vec![pair.parse().unwrap()]);
+        self.governor
+            .add_pairs(self.now(), vec![pair.parse().unwrap()]);
     }
 
     fn now(&self) -> Instant {
         self.begin + MS * self.t as u32
     }
 
-    fn counts(&self) -> Counts {
+    fn counts(&self) -> RequestCounts {
         self.governor.report(self.now()).counts
     }
 
-    fn passes(&mut self, ms: u64) {
+    fn advance(&mut self, ms: u64) {
         for _ in 0..ms {
             self.t += 1;
             self.step();
@@ -171,85 +179,86 @@ impl World {
     fn step(&mut self) {
         if self.local_up.take_if(|at| *at <= self.t).is_some() {
             self.is_local_up = true;
-            self.governor.local(self.now(), LocalState::Ready);
-            self.obey();
+            self.governor.on_local_state(self.now(), LocalState::Ready);
+            self.apply_effects();
         }
         if self.films && self.t % self.period == 0 {
-            self.publishes();
+            self.publish_picture();
         }
-        while let Some(sent) = arrived(&mut self.up, self.t, self.has_link) {
-            self.nodes[0].given(sent);
+        while let Some(sent) = pop_arrived(&mut self.up, self.t, self.has_link) {
+            self.nodes[0].receive(sent);
         }
-        if let Some(number) = self.nodes[0].works(self.t) {
+        if let Some(number) = self.nodes[0].step(self.t) {
             self.down.push_back((self.t + self.delay, number));
         }
-        while let Some(number) = arrived(&mut self.down, self.t, self.has_link) {
-            self.answers(Side::Cloud, number);
+        while let Some(number) = pop_arrived(&mut self.down, self.t, self.has_link) {
+            self.answer(Responder::Cloud, number);
         }
-        if let Some(number) = self.nodes[1].works(self.t).filter(|_| self.is_local_up) {
-            self.answers(Side::Local, number);
+        if let Some(number) = self.nodes[1].step(self.t).filter(|_| self.is_local_up) {
+            self.answer(Responder::Local, number);
         }
         if self.t % FEEDBACK == 0 {
-            self.feeds_back();
+            self.send_feedback();
         }
         while self.governor.deadline().is_some_and(|at| at <= self.now()) {
             self.governor.tick(self.now());
         }
-        self.obey();
+        self.apply_effects();
     }
 
-    fn publishes(&mut self) {
+    fn publish_picture(&mut self) {
         self.pictures += 1;
         let topic: Arc<str> = "/image".into();
-        let key = self.is_by_stamp.then_some(Key::Stamp(Stamp {
+        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp {
             secs: self.pictures,
             nsecs: 0,
         }));
         self.governor
             .input(self.now(), &topic, key, Sent::Picture(self.pictures));
-        self.obey();
+        self.apply_effects();
     }
 
-    fn sends_goal(&mut self, number: u32) {
+    fn send_goal(&mut self, number: u32) {
         let topic: Arc<str> = "/walk/goal".into();
         self.governor
             .input(self.now(), &topic, Some(goal(number)), Sent::Goal(number));
-        self.obey();
+        self.apply_effects();
     }
 
-    fn answers(&mut self, side: Side, number: u32) {
+    fn answer(&mut self, side: Responder, number: u32) {
         self.heard.push(self.t);
-        let key = self.is_by_stamp.then_some(Key::Stamp(Stamp {
+        let key = self.is_by_stamp.then_some(CorrelationKey::Stamp(Stamp {
             secs: number,
             nsecs: 0,
         }));
         if self
             .governor
             .output(self.now(), side, "/found", key, Duration::ZERO)
-            == Verdict::Deliver
+            == DeliveryVerdict::Deliver
         {
             self.delivered.entry(number).or_default()[side.index()] += 1;
         }
-        self.obey();
+        self.apply_effects();
     }
 
-    fn is_there(&self, side: Side) -> bool {
+    fn is_asked(&self, side: Responder) -> bool {
         let sides = self.governor.sides();
         [sides.cloud, sides.local][side.index()]
     }
 
-    fn feeds_back(&mut self) {
-        for side in [Side::Cloud, Side::Local] {
+    fn send_feedback(&mut self) {
+        for side in [Responder::Cloud, Responder::Local] {
             let can_speak = [self.has_link, self.is_local_up][side.index()];
             if self.nodes[side.index()].is_silent || !can_speak {
                 continue;
             }
             for number in self.nodes[side.index()].goals.clone() {
                 let earlier = self.speakers.get(&number).copied();
-                let earlier = earlier.filter(|earlier| self.is_there(*earlier));
-                let may_speak = self.is_there(side) || self.governor.sides() == Sides::default();
+                let earlier = earlier.filter(|earlier| self.is_asked(*earlier));
+                let may_speak =
+                    self.is_asked(side) || self.governor.sides() == Responders::default();
                 let is_heard = may_speak && earlier.is_none_or(|earlier| earlier == side);
-                let is_told = self.says(side, "/walk/feedback", number);
+                let is_told = self.publish_for_goal(side, "/walk/feedback", number);
                 assert_eq!(
                     is_told, is_heard,
                     "goal {number}, {side:?} after {earlier:?}"
@@ -261,73 +270,74 @@ impl World {
         }
     }
 
-    /// A side says something of a goal. True where that is delivered.
-    fn says(&mut self, side: Side, topic: &str, number: u32) -> bool {
+    /// Publishes a message of a goal from one side. Returns true if it is delivered.
+    fn publish_for_goal(&mut self, side: Responder, topic: &str, number: u32) -> bool {
         let key = Some(goal(number));
         let verdict = self
             .governor
             .output(self.now(), side, topic, key, Duration::ZERO);
-        self.obey();
-        verdict == Verdict::Deliver
+        self.apply_effects();
+        verdict == DeliveryVerdict::Deliver
     }
 
-    fn ends_goal(&mut self, side: Side, number: u32) {
-        if self.nodes[side.index()].goals.remove(&number) && self.is_there(side) {
-            let is_told = self.says(side, "/walk/result", number);
+    fn finish_goal(&mut self, side: Responder, number: u32) {
+        if self.nodes[side.index()].goals.remove(&number) && self.is_asked(side) {
+            let is_told = self.publish_for_goal(side, "/walk/result", number);
             *self.results.entry(number).or_default() += u32::from(is_told);
         }
     }
 
-    fn obey(&mut self) {
+    fn apply_effects(&mut self) {
         while let Some(effect) = self.governor.next_effect() {
             match effect {
                 Effect::Give {
                     side,
                     payload,
-                    channel: Channel::Topic(_),
+                    channel: RequestChannel::Topic(_),
                     ..
                 } => match side {
-                    Side::Cloud => {
-                        let is_lost = matches!(payload, Sent::Picture(number) if self.loses > 0 && number % self.loses == 0);
+                    Responder::Cloud => {
+                        let is_lost = matches!(payload, Sent::Picture(number)
+                            if self.loses > 0 && number % self.loses == 0);
                         if !is_lost {
                             self.up.push_back((self.t + self.delay, payload));
                         }
                     }
-                    Side::Local => self.nodes[1].given(payload),
+                    Responder::Local => self.nodes[1].receive(payload),
                 },
-                Effect::Event(Event::Start(_)) => self.local_up = Some(self.t + STARTS),
-                Effect::Event(Event::Stop(_)) => self.local_ends(),
+                Effect::Event(QosEvent::Start(_)) => self.local_up = Some(self.t + STARTS),
+                Effect::Event(QosEvent::Stop(_)) => self.stop_local(),
                 Effect::SafeStop => self.stops.push(self.t),
                 _ => {}
             }
         }
     }
 
-    fn local_ends(&mut self) {
+    fn stop_local(&mut self) {
         (self.local_up, self.is_local_up) = (None, false);
-        self.nodes[1].ends();
+        self.nodes[1].reset();
     }
 
-    fn cut(&mut self) {
+    fn cut_link(&mut self) {
         self.has_link = false;
         self.governor.link_down(self.now());
-        self.obey();
+        self.apply_effects();
     }
 
-    fn restore(&mut self, resumed: bool) {
+    fn restore_link(&mut self, resumed: bool) {
         self.has_link = true;
         if !resumed {
             self.up.clear();
             self.down.clear();
-            self.nodes[0].ends();
+            self.nodes[0].reset();
         }
         self.governor.link_up(self.now(), resumed);
-        self.obey();
+        self.apply_effects();
     }
 }
 
-/// The first of these that is there at `t`, on a way that is open.
-fn arrived<T>(way: &mut VecDeque<(u64, T)>, t: u64, is_open: bool) -> Option<T> {
+/// Pops the first message that has arrived by `t`, if the path is open.
+fn pop_arrived<T>(way: &mut VecDeque<(u64, T)>, t: u64, is_open: bool) -> Option<T> {
     let (at, _) = way.front()?;
     if !is_open || *at > t {
         return None;
@@ -335,8 +345,8 @@ fn arrived<T>(way: &mut VecDeque<(u64, T)>, t: u64, is_open: bool) -> Option<T> 
     way.pop_front().map(|(_, sent)| sent)
 }
 
-fn goal(number: u32) -> Key {
-    Key::Goal(format!("goal {number}").into())
+fn goal(number: u32) -> CorrelationKey {
+    CorrelationKey::Goal(format!("goal {number}").into())
 }
 
 #[test]
@@ -344,7 +354,7 @@ fn a_node_that_takes_64_ms_of_a_30_hz_camera_keeps_its_promise_by_the_cloud() {
     for (by, delay) in [("stamp", 0), ("stamp", 90), ("arrival", 0), ("arrival", 90)] {
         let mut world = World::with_pairs("none", by);
         world.delay = delay;
-        world.passes(10_000);
+        world.advance(10_000);
         let counts = world.counts();
         println!("{by}, {delay} ms each way: {counts:?}");
         assert_eq!(
@@ -370,17 +380,17 @@ fn offline_a_warm_original_that_answers_in_time_stops_nobody() {
         let mut world = World::with_pairs("warm", by);
         world.period = period;
         world.nodes[1].takes = takes;
-        world.passes(3000);
-        world.cut();
-        // Q has to see two requests late: by arrival one after the other.
-        world.passes(3 * T_MAX);
+        world.advance(3000);
+        world.cut_link();
+        // Q needs two late requests: by arrival they come one after the other.
+        world.advance(3 * T_MAX);
         let begun = world.stops.len();
-        world.passes(10_000);
+        world.advance(10_000);
         let counts = world.counts();
         println!("{by}, {period} ms: {begun} stops until the hand-over; {counts:?}");
         assert_eq!(world.stops.len(), begun, "{by}, {period}: {counts:?}");
-        world.restore(true);
-        world.passes(3000);
+        world.restore_link(true);
+        world.advance(3000);
         assert_eq!(world.stops.len(), begun, "{by}, {period}: {counts:?}");
     }
 }
@@ -389,11 +399,11 @@ fn offline_a_warm_original_that_answers_in_time_stops_nobody() {
 fn who_takes_every_picture_and_falls_silent_is_stopped_for_at_t_max() {
     let mut world = World::with_pairs("none", "stamp");
     (world.delay, world.nodes[0].takes) = (50, 10);
-    world.passes(10_000);
+    world.advance(10_000);
     assert_eq!(world.counts().safe_stops, 0);
     world.nodes[0].is_silent = true;
-    world.passes(1000);
-    // Answers that were on their way came yet.
+    world.advance(1000);
+    // Answers in flight still arrived.
     let answered = *world.delivered.keys().last().unwrap();
     let due = u64::from(answered + 1) * world.period + T_MAX + 1;
     assert_eq!(world.stops[0], due, "after picture {answered}");
@@ -404,7 +414,7 @@ fn who_answers_everything_too_late_stops_the_robot() {
     for takes in [10, 64] {
         let mut world = World::with_pairs("none", "stamp");
         (world.delay, world.nodes[0].takes) = (225, takes);
-        world.passes(10_000);
+        world.advance(10_000);
         let counts = world.counts();
         assert!(
             counts.safe_stops > 100 && counts.unanswered_in_time > 100,
@@ -418,10 +428,10 @@ fn a_node_that_becomes_slow_is_late_once_at_most() {
     for takes in [40, 64, 100, 130] {
         let mut world = World::with_pairs("none", "stamp");
         (world.delay, world.nodes[0].takes) = (20, 10);
-        world.passes(10_000);
+        world.advance(10_000);
         assert_eq!(world.counts().left_out, 0);
         world.nodes[0].takes = takes;
-        world.passes(10_000);
+        world.advance(10_000);
         let counts = world.counts();
         println!("{takes} ms: {counts:?}");
         let is_calm = counts.late <= 1 && counts.safe_stops <= 1;
@@ -432,25 +442,29 @@ fn a_node_that_becomes_slow_is_late_once_at_most() {
 #[test]
 fn feedback_goes_on_after_a_hand_over_and_a_long_goal_stops_nobody() {
     let mut world = World::with_pairs("warm", "arrival");
-    world.sends_goal(1);
-    world.passes(60_000);
-    assert_eq!(world.speakers[&1], Side::Cloud);
+    world.send_goal(1);
+    world.advance(60_000);
+    assert_eq!(world.speakers[&1], Responder::Cloud);
     let counts = world.counts();
     let trouble = (counts.late, counts.safe_stops, counts.failed);
     assert_eq!(trouble, (1, 0, 0), "{counts:?}");
-    world.cut();
-    world.passes(2000);
-    assert_eq!(world.speakers[&1], Side::Local, "it was given the goal");
-    world.restore(true);
-    world.passes(5000);
-    assert_eq!(world.speakers[&1], Side::Cloud);
-    world.passes(300_000);
-    world.ends_goal(Side::Cloud, 1);
-    world.ends_goal(Side::Local, 1);
+    world.cut_link();
+    world.advance(2000);
+    assert_eq!(
+        world.speakers[&1],
+        Responder::Local,
+        "it was given the goal"
+    );
+    world.restore_link(true);
+    world.advance(5000);
+    assert_eq!(world.speakers[&1], Responder::Cloud);
+    world.advance(300_000);
+    world.finish_goal(Responder::Cloud, 1);
+    world.finish_goal(Responder::Local, 1);
     assert_eq!(world.results[&1], 1);
 }
 
-/// A time in which nothing changes.
+/// A period with constant conditions.
 #[derive(Debug, Clone)]
 struct Times {
     length: u64,
@@ -470,7 +484,7 @@ enum Link {
     Cut,
 }
 
-fn times() -> impl Strategy<Value = Times> {
+fn any_times() -> impl Strategy<Value = Times> {
     let link = prop_oneof![6 => Just(Link::Up), 1 => Just(Link::Renewed), 2 => Just(Link::Cut)];
     let takes = || prop_oneof![5u64..30, 30u64..130];
     let loses = prop_oneof![3 => Just(0u32), 1 => 2u32..12];
@@ -492,7 +506,7 @@ fn times() -> impl Strategy<Value = Times> {
 }
 
 impl Times {
-    /// All is well, and nobody films any more.
+    /// The final period: everything works, and the camera is off.
     const END: Self = Self {
         length: 0,
         link: Link::Up,
@@ -504,10 +518,10 @@ impl Times {
         sends_goal: false,
     };
 
-    /// Whether what a side takes is answered within T_max, considering what is left out and lost.
-    fn suffices(&self, period: u64, side: Side) -> bool {
+    /// Returns true if the side answers accepted pictures within T_max, allowing for skipped and lost ones.
+    fn answers_in_time(&self, period: u64, side: Responder) -> bool {
         let takes = 2 * self.takes[side.index()] + period;
-        if side == Side::Local {
+        if side == Responder::Local {
             return takes <= T_MAX;
         }
         let is_there = self.link != Link::Cut && !self.is_silent;
@@ -517,13 +531,13 @@ impl Times {
 }
 
 impl World {
-    fn begins(&mut self, times: &Times) {
+    fn enter(&mut self, times: &Times) {
         match times.link {
-            Link::Cut if self.has_link => self.cut(),
-            Link::Up if !self.has_link => self.restore(true),
+            Link::Cut if self.has_link => self.cut_link(),
+            Link::Up if !self.has_link => self.restore_link(true),
             Link::Renewed => {
-                self.cut();
-                self.restore(false);
+                self.cut_link();
+                self.restore_link(false);
             }
             _ => {}
         }
@@ -533,31 +547,31 @@ impl World {
             self.nodes[side].takes = times.takes[side];
         }
         if times.crashes && self.is_local_up {
-            self.local_ends();
+            self.stop_local();
             self.local_up = Some(self.t + STARTS);
-            self.governor.local_crashed(self.now(), "signal 11");
-            self.obey();
+            self.governor.on_local_crash(self.now(), "signal 11");
+            self.apply_effects();
         }
     }
 
-    /// Lets a time pass, and looks for safe stops while somebody answers.
-    fn lives_through(&mut self, times: &Times) -> Result<(), TestCaseError> {
-        self.begins(times);
+    /// Runs one period, and checks that no safe stop is fired while a side answers.
+    fn run_period(&mut self, times: &Times) -> Result<(), TestCaseError> {
+        self.enter(times);
         let (settled, ends) = (self.t + 2 * T_MAX, self.t + times.length);
-        let mut is_stood_in_for = times.suffices(self.period, Side::Local);
+        let mut is_stood_in_for = times.answers_in_time(self.period, Responder::Local);
         while self.t < ends {
-            self.passes(1);
-            is_stood_in_for &= self.is_there(Side::Local);
+            self.advance(1);
+            is_stood_in_for &= self.is_asked(Responder::Local);
         }
-        let answers = is_stood_in_for || times.suffices(self.period, Side::Cloud);
+        let answers = is_stood_in_for || times.answers_in_time(self.period, Responder::Cloud);
         let mut stops = self.stops.iter().filter(|at| **at > settled);
         let stop = stops.next().filter(|_| answers);
         prop_assert!(stop.is_none(), "{:?} in {:?}, until {}", stop, times, ends);
         Ok(())
     }
 
-    /// Whoever is silent is stopped for.
-    fn was_stopped(&self, since: u64) -> Result<(), TestCaseError> {
+    /// Checks that every silence led to a safe stop.
+    fn check_safe_stops(&self, since: u64) -> Result<(), TestCaseError> {
         let t_max = if self.is_by_stamp { T_MAX } else { 2 * T_MAX };
         let patience = t_max + 3 * self.period;
         let heard = self.heard.iter().copied().filter(|at| *at > since);
@@ -573,35 +587,36 @@ impl World {
     }
 }
 
-/// `known`: before which of the times the pairs of the action and of the pictures become known.
-fn live(world: &mut World, all: &[Times], known: [usize; 2]) -> Result<(), TestCaseError> {
+/// Runs a sequence of periods. `known` are the indices of the periods before which the pairs of the action and of the
+/// pictures become known.
+fn run_story(world: &mut World, all: &[Times], known: [usize; 2]) -> Result<(), TestCaseError> {
     let (mut goals, mut since) = (0, None);
     for (index, times) in all.iter().enumerate() {
         if index == known[0] {
-            world.learns_actions();
+            world.add_action_pair();
         }
         if index == known[1] {
             since = Some(world.t);
-            world.learns_pictures();
+            world.add_picture_pair();
         }
         if times.sends_goal && index >= known[0] {
             goals += 1;
-            world.sends_goal(goals);
+            world.send_goal(goals);
         }
-        world.lives_through(times)?;
+        world.run_period(times)?;
     }
     if let Some(since) = since {
-        world.was_stopped(since)?;
+        world.check_safe_stops(since)?;
     }
-    world.begins(&Times::END);
+    world.enter(&Times::END);
     world.films = false;
-    world.passes(2000);
+    world.advance(2000);
     for number in 1..=goals {
-        world.ends_goal(Side::Cloud, number);
-        world.ends_goal(Side::Local, number);
+        world.finish_goal(Responder::Cloud, number);
+        world.finish_goal(Responder::Local, number);
         prop_assert_eq!(world.results.get(&number), Some(&1), "goal {}", number);
     }
-    world.passes(2 * T_MAX);
+    world.advance(2 * T_MAX);
     if world.is_by_stamp && since == Some(0) {
         let mut answered = world.delivered.iter();
         let twice = answered.find(|(_, by)| by[0] + by[1] > 1);
@@ -617,7 +632,7 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(200) })]
     #[test]
     fn whatever_happens(
-        all in prop::collection::vec(times(), 1..10),
+        all in prop::collection::vec(any_times(), 1..10),
         local in prop_oneof![Just("cold"), Just("warm"), Just("none")],
         by in prop_oneof![Just("stamp"), Just("arrival")],
         period in prop_oneof![Just(33u64), Just(50), Just(200)],
@@ -625,6 +640,6 @@ proptest! {
     ) {
         let mut world = World::new(local, by);
         world.period = period;
-        live(&mut world, &all, known)?;
+        run_story(&mut world, &all, known)?;
     }
 }

@@ -1,4 +1,4 @@
-//! Whatever the order of events: each request is answered once or failed once, and Q keeps its bounds.
+//! For any order of events, each request is answered once or failed once, and Q stays within its bounds.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Limits, LocalState, RequestId, Side, Sla, Stamp,
-    Verdict,
+    DeliveryVerdict, Effect, Failure, Governor, LocalState, QosEvent, QosSla, RequestChannel,
+    RequestId, Responder, RetentionLimits, Stamp,
 };
 
 #[derive(Debug, Clone)]
@@ -16,17 +16,18 @@ enum Op {
     Input,
     InputAgain,
     Pass(u64),
-    /// The side answers one of what it was given; which one is taken modulo their number. Kept: it may answer again.
-    Answer(Side, usize, bool),
-    Fail(Side, usize, bool),
+    /// The side answers one of its pending messages; the index is taken modulo their number. With `true` the message
+    /// stays pending and may be answered again.
+    Answer(Responder, usize, bool),
+    Fail(Responder, usize, bool),
     LinkUp(bool),
     LinkDown,
     Local(LocalState),
     Crash,
 }
 
-fn side() -> impl Strategy<Value = Side> {
-    prop_oneof![Just(Side::Cloud), Just(Side::Local)]
+fn side() -> impl Strategy<Value = Responder> {
+    prop_oneof![Just(Responder::Cloud), Just(Responder::Local)]
 }
 
 fn ops() -> impl Strategy<Value = Vec<Op>> {
@@ -52,9 +53,9 @@ fn ops() -> impl Strategy<Value = Vec<Op>> {
     prop::collection::vec(op, 0..200)
 }
 
-/// What one side was given and has not answered, or may answer again.
+/// A message that one side received and has not answered, or may answer again.
 #[derive(Clone, Copy, PartialEq)]
-enum Given {
+enum PendingMessage {
     Call(RequestId),
     Input(Stamp),
 }
@@ -62,7 +63,7 @@ enum Given {
 struct World {
     governor: Governor<Option<Stamp>>,
     now: Instant,
-    given: [Vec<Given>; 2],
+    given: [Vec<PendingMessage>; 2],
     calls: HashMap<RequestId, (u32, u32)>,
     inputs: HashMap<Stamp, (u32, u32)>,
     stamps: u32,
@@ -77,14 +78,14 @@ impl World {
             "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"},
         });
         let pair = format!("/image -> /found, /marked by {by}");
-        // Longer than any run: what comes after that is not recognised any more.
-        let limits = Limits {
+        // Longer than any run: later answers would not be recognised.
+        let limits = RetentionLimits {
             patience: Duration::from_secs(100_000),
-            ..Limits::default()
+            ..RetentionLimits::default()
         };
         let mut world = Self {
             governor: Governor::new(
-                Sla::parse(sla).unwrap(),
+                QosSla::parse(sla).unwrap(),
                 vec![pair.parse().unwrap()],
                 limits,
             ),
@@ -100,7 +101,7 @@ impl World {
         world
     }
 
-    fn obey(&mut self) {
+    fn apply_effects(&mut self) {
         while let Some(effect) = self.governor.next_effect() {
             match effect {
                 Effect::Give {
@@ -110,9 +111,11 @@ impl World {
                     payload,
                 } => {
                     let given = match channel {
-                        Channel::Call(_) => Given::Call(request.expect("calls are requests")),
-                        Channel::Topic(_) => {
-                            Given::Input(payload.expect("inputs carry their stamp"))
+                        RequestChannel::Call(_) => {
+                            PendingMessage::Call(request.expect("calls are requests"))
+                        }
+                        RequestChannel::Topic(_) => {
+                            PendingMessage::Input(payload.expect("inputs carry their stamp"))
                         }
                     };
                     self.given[side as usize].push(given);
@@ -123,14 +126,14 @@ impl World {
                     reason,
                 } => {
                     assert!(!reason.is_empty());
-                    if matches!(channel, Channel::Call(_)) {
+                    if matches!(channel, RequestChannel::Call(_)) {
                         self.calls
                             .get_mut(&request)
                             .expect("only calls made fail")
                             .1 += 1;
                     }
                 }
-                Effect::Event(Event::Stop(_)) => self.given[Side::Local as usize].clear(),
+                Effect::Event(QosEvent::Stop(_)) => self.given[Responder::Local as usize].clear(),
                 Effect::Event(_) | Effect::SafeStop | Effect::Outcome(_) => {}
             }
         }
@@ -138,14 +141,14 @@ impl World {
         assert!((0.0..16.0).contains(&q), "Q is {q}");
     }
 
-    fn answer(&mut self, side: Side, given: Given) {
+    fn answer(&mut self, side: Responder, given: PendingMessage) {
         match given {
-            Given::Call(id) => {
-                if self.governor.answered(self.now, side, id) == Verdict::Deliver {
+            PendingMessage::Call(id) => {
+                if self.governor.on_result(self.now, side, id) == DeliveryVerdict::Deliver {
                     self.calls.get_mut(&id).expect("it was made").0 += 1;
                 }
             }
-            Given::Input(stamp) => {
+            PendingMessage::Input(stamp) => {
                 let verdict = self.governor.output(
                     self.now,
                     side,
@@ -153,16 +156,16 @@ impl World {
                     Some(stamp.into()),
                     Duration::ZERO,
                 );
-                if verdict == Verdict::Deliver {
+                if verdict == DeliveryVerdict::Deliver {
                     let counts = self.inputs.get_mut(&stamp).expect("it was made");
-                    // Each side may say several things to one input, but only one side is heard.
+                    // Each side may answer one input several times, but only one side is delivered.
                     counts.0 |= 1 << side as u32;
                 }
             }
         }
     }
 
-    fn pick(&mut self, side: Side, which: usize, keep: bool) -> Option<Given> {
+    fn pick(&mut self, side: Responder, which: usize, keep: bool) -> Option<PendingMessage> {
         let given = &mut self.given[side as usize];
         if given.is_empty() {
             return None;
@@ -206,7 +209,7 @@ impl World {
                 while let Some(next) = self.governor.deadline().filter(|next| *next <= until) {
                     self.now = self.now.max(next);
                     self.governor.tick(self.now);
-                    self.obey();
+                    self.apply_effects();
                 }
                 self.now = until;
                 self.governor.tick(self.now);
@@ -217,47 +220,47 @@ impl World {
                 }
             }
             Op::Fail(side, which, refused) => {
-                if let Some(Given::Call(id)) = self.pick(side, which, false) {
+                if let Some(PendingMessage::Call(id)) = self.pick(side, which, false) {
                     let why = "because".to_owned();
                     let failure = if refused {
                         Failure::Refused(why)
                     } else {
                         Failure::Unreachable(why)
                     };
-                    self.governor.failed(self.now, side, id, &failure);
+                    self.governor.on_failure(self.now, side, id, &failure);
                 }
             }
             Op::LinkUp(resumed) => {
                 if !resumed {
-                    self.given[Side::Cloud as usize].clear();
+                    self.given[Responder::Cloud as usize].clear();
                 }
                 self.governor.link_up(self.now, resumed);
             }
             Op::LinkDown => self.governor.link_down(self.now),
             Op::Local(state) => {
                 if state != LocalState::Ready {
-                    self.given[Side::Local as usize].clear();
+                    self.given[Responder::Local as usize].clear();
                 }
-                self.governor.local(self.now, state);
+                self.governor.on_local_state(self.now, state);
             }
             Op::Crash => {
-                self.given[Side::Local as usize].clear();
-                self.governor.local_crashed(self.now, "signal 11");
+                self.given[Responder::Local as usize].clear();
+                self.governor.on_local_crash(self.now, "signal 11");
             }
         }
-        self.obey();
+        self.apply_effects();
     }
 
-    /// The link comes up, and whoever was given something answers.
+    /// Brings the link up and lets every side answer what it received.
     fn settle(&mut self) {
-        // Whoever waited for the local original to come up is told.
+        // Requests that waited for the local original are failed.
         self.apply(Op::Local(LocalState::Missing));
         self.apply(Op::LinkDown);
         self.apply(Op::LinkUp(false));
-        for side in [Side::Cloud, Side::Local] {
+        for side in [Responder::Cloud, Responder::Local] {
             while let Some(given) = self.pick(side, 0, false) {
                 self.answer(side, given);
-                self.obey();
+                self.apply_effects();
             }
         }
         self.apply(Op::Pass(200_000_000));
@@ -303,7 +306,9 @@ fn run(world: &mut World, ops: Vec<Op>) -> Result<(), TestCaseError> {
     );
     let text = serde_json::to_string(&report).unwrap();
     prop_assert_eq!(
-        serde_json::from_str::<qos::Report>(&text).unwrap().counts,
+        serde_json::from_str::<qos::QosReport>(&text)
+            .unwrap()
+            .counts,
         counts
     );
     Ok(())

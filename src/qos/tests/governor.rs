@@ -1,11 +1,11 @@
-//! Scenes from a robot's life.
+//! Scenarios for the governor.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::{
-    Channel, Effect, Event, Failure, Governor, Key, Limits, LocalState, Outcome, Phases, RequestId,
-    Side, Sla, Stamp, Verdict, Why,
+    CorrelationKey, DecisionReason, DeliveryVerdict, Effect, Failure, Governor, LocalState, Phases,
+    QosEvent, QosSla, RequestChannel, RequestId, RequestOutcome, Responder, RetentionLimits, Stamp,
 };
 
 const MS: Duration = Duration::from_millis(1);
@@ -13,7 +13,7 @@ const MS: Duration = Duration::from_millis(1);
 struct Robot {
     governor: Governor<&'static str>,
     now: Instant,
-    outcomes: Vec<Outcome>,
+    outcomes: Vec<RequestOutcome>,
 }
 
 impl Robot {
@@ -31,7 +31,11 @@ impl Robot {
                 .parse()
                 .unwrap(),
         ];
-        let mut governor = Governor::new(Sla::parse(sla).unwrap(), pairs, Limits::default());
+        let mut governor = Governor::new(
+            QosSla::parse(sla).unwrap(),
+            pairs,
+            RetentionLimits::default(),
+        );
         let now = Instant::now();
         governor.link_up(now, false);
         governor.begin(now);
@@ -42,8 +46,8 @@ impl Robot {
         }
     }
 
-    /// Time passes, deadlines are met; what was to be done since the last look, in words.
-    fn after(&mut self, ms: u32) -> Vec<String> {
+    /// Advances the time, meets the deadlines, and returns the effects since the last call, in words.
+    fn advance(&mut self, ms: u32) -> Vec<String> {
         let until = self.now + ms * MS;
         while let Some(next) = self.governor.deadline().filter(|next| *next <= until) {
             self.now = self.now.max(next);
@@ -60,10 +64,10 @@ impl Robot {
                 Effect::Give { side, payload, .. } => format!("{payload} to {side:?}"),
                 Effect::Fail { reason, .. } => format!("fail: {reason}"),
                 Effect::SafeStop => "safe stop".into(),
-                Effect::Event(Event::Start(_)) => "start".into(),
-                Effect::Event(Event::Feed(_)) => "feed".into(),
-                Effect::Event(Event::StopFeeding(_)) => "stop feeding".into(),
-                Effect::Event(Event::Stop(_)) => "stop".into(),
+                Effect::Event(QosEvent::Start(_)) => "start".into(),
+                Effect::Event(QosEvent::Feed(_)) => "feed".into(),
+                Effect::Event(QosEvent::StopFeeding(_)) => "stop feeding".into(),
+                Effect::Event(QosEvent::Stop(_)) => "stop".into(),
                 Effect::Event(event) => format!("{event:?}"),
                 Effect::Outcome(outcome) => {
                     self.outcomes.push(outcome);
@@ -81,7 +85,7 @@ impl Robot {
 
     fn goal(&mut self, payload: &'static str) -> RequestId {
         let action: Arc<str> = "/walk".into();
-        let id = Key::Goal(payload.into());
+        let id = CorrelationKey::Goal(payload.into());
         self.governor.goal(self.now, &action, id, payload)
     }
 
@@ -100,13 +104,13 @@ impl Robot {
         self.governor.input(self.now, &name, None, payload);
     }
 
-    fn found(&mut self, side: Side, secs: u32) -> Verdict {
+    fn output_found(&mut self, side: Responder, secs: u32) -> DeliveryVerdict {
         let stamp = Some(Stamp { secs, nsecs: 0 }.into());
         self.governor
             .output(self.now, side, "/found", stamp, Duration::ZERO)
     }
 
-    fn out(&mut self, side: Side) -> Verdict {
+    fn output_plain(&mut self, side: Responder) -> DeliveryVerdict {
         self.governor
             .output(self.now, side, "/out", None, Duration::ZERO)
     }
@@ -124,57 +128,72 @@ fn json(text: &str) -> serde_json::Value {
 fn pictures_under_way_go_to_a_warm_original_as_soon_as_it_is_fed() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 15}"#));
     assert_eq!(robot.effects(), ["start"]);
-    robot.governor.local(robot.now, LocalState::Ready);
-    // Five pictures a second; the network has just become slow.
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
+    // Five pictures per second; the network has just become slow.
     robot.image(1, "first");
-    assert_eq!(robot.after(200), ["first to Cloud"]);
+    assert_eq!(robot.advance(200), ["first to Cloud"]);
     robot.image(2, "second");
-    assert_eq!(robot.after(200), ["second to Cloud"]);
+    assert_eq!(robot.advance(200), ["second to Cloud"]);
     robot.image(3, "third");
     // At 500 ms the second one is late, too: Q is below the threshold, and the third is still fresh.
     assert_eq!(
-        robot.after(101),
+        robot.advance(101),
         ["third to Cloud", "feed", "third to Local"]
     );
-    robot.after(60);
-    assert_eq!(robot.found(Side::Local, 3), Verdict::Deliver);
+    robot.advance(60);
+    assert_eq!(
+        robot.output_found(Responder::Local, 3),
+        DeliveryVerdict::Deliver
+    );
     robot.image(4, "fourth");
-    // It has time for the first one between fresh ones.
+    // It has time for the first one between two fresh ones.
     assert_eq!(
         robot.effects(),
         ["first to Local", "fourth to Cloud", "fourth to Local"]
     );
-    // What the cloud answers late is delivered where nobody has answered, and dropped where somebody has.
-    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
-    assert_eq!(robot.found(Side::Cloud, 3), Verdict::Drop);
+    // A late answer of the cloud is delivered if no side has answered, and dropped otherwise.
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 1),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 3),
+        DeliveryVerdict::Drop
+    );
 }
 
 #[test]
 fn each_request_s_outcome_is_told_and_told_again_when_more_is_known() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.image(1, "picture");
-    robot.after(100);
-    assert_eq!(robot.found(Side::Local, 1), Verdict::Deliver);
+    robot.advance(100);
+    assert_eq!(
+        robot.output_found(Responder::Local, 1),
+        DeliveryVerdict::Deliver
+    );
     robot.effects();
     assert!(
         robot.outcomes.is_empty(),
         "the cloud's time has not counted"
     );
-    robot.after(201);
-    let local = Some((Side::Local, 100 * MS));
+    robot.advance(201);
+    let local = Some((Responder::Local, 100 * MS));
     let told = robot.outcomes.pop().unwrap();
     assert_eq!((told.cloud, told.answer, told.q), (None, local, 1.5));
-    robot.after(99);
+    robot.advance(99);
     let phases = |up: u32| Phases {
         up: up * MS,
         compute: 100 * MS,
         ..Phases::default()
     };
-    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Drop);
-    // Those of another request add up to something else.
-    robot.governor.phases(&phases(50));
-    robot.governor.phases(&phases(300));
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 1),
+        DeliveryVerdict::Drop
+    );
+    // Phases of another request add up to something else.
+    robot.governor.record_phases(&phases(50));
+    robot.governor.record_phases(&phases(300));
     robot.effects();
     let again = robot.outcomes.pop().unwrap();
     assert_eq!(again.request, told.request);
@@ -188,10 +207,10 @@ fn each_request_s_outcome_is_told_and_told_again_when_more_is_known() {
 #[test]
 fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.effects();
     let goal: Arc<str> = "/walk/goal".into();
-    let id = |id: &str| Some(Key::Goal(id.into()));
+    let id = |id: &str| Some(CorrelationKey::Goal(id.into()));
     for (name, payload) in [("one", "first"), ("two", "second")] {
         robot.governor.input(robot.now, &goal, id(name), payload);
     }
@@ -210,17 +229,32 @@ fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
             .governor
             .output(robot.now, side, &topic, id(name), Duration::ZERO)
     };
-    // Feedback of the side that was first with it; results likewise, in whatever order.
-    assert_eq!(output(Side::Cloud, "feedback", "two"), Verdict::Deliver);
-    assert_eq!(output(Side::Local, "feedback", "two"), Verdict::Drop);
-    assert_eq!(output(Side::Local, "result", "two"), Verdict::Deliver);
-    assert_eq!(output(Side::Cloud, "result", "two"), Verdict::Drop);
-    assert_eq!(output(Side::Cloud, "result", "one"), Verdict::Deliver);
+    // Feedback comes from the side that was first; results likewise, in any order.
+    assert_eq!(
+        output(Responder::Cloud, "feedback", "two"),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        output(Responder::Local, "feedback", "two"),
+        DeliveryVerdict::Drop
+    );
+    assert_eq!(
+        output(Responder::Local, "result", "two"),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        output(Responder::Cloud, "result", "two"),
+        DeliveryVerdict::Drop
+    );
+    assert_eq!(
+        output(Responder::Cloud, "result", "one"),
+        DeliveryVerdict::Deliver
+    );
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.from_cloud, counts.from_local), (1, 1));
-    // The cloud was fast twice: its original is fed no more.
+    // The cloud was fast twice: the original is no longer fed.
     assert_eq!(robot.effects(), ["stop feeding"]);
-    // Without an id its server makes one up: it is passed on, and no request.
+    // Without an id the server assigns one: the goal is forwarded and is no request.
     robot.governor.input(robot.now, &goal, id(""), "third");
     assert_eq!(robot.effects(), ["third to Cloud"]);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 2);
@@ -230,12 +264,12 @@ fn a_goal_is_answered_by_the_first_result_that_carries_its_id() {
 fn a_late_answer_does_not_count_again() {
     let mut robot = Robot::new(json(r#"{"local": "none", "initial": 8}"#));
     let id = robot.call("sum");
-    robot.after(301);
+    robot.advance(301);
     assert_eq!(robot.q(), 4.0);
-    robot.after(700);
+    robot.advance(700);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, id),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Cloud, id),
+        DeliveryVerdict::Deliver
     );
     assert_eq!(robot.q(), 4.0);
     assert_eq!(robot.governor.report(robot.now).counts.late, 1);
@@ -244,23 +278,23 @@ fn a_late_answer_does_not_count_again() {
 #[test]
 fn the_clouds_time_counts_though_the_local_answer_won() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 3}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["start", "feed"]);
     let id = robot.call("sum");
-    assert_eq!(robot.after(10), ["sum to Cloud", "sum to Local"]);
+    assert_eq!(robot.advance(10), ["sum to Cloud", "sum to Local"]);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Local, id),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Local, id),
+        DeliveryVerdict::Deliver
     );
     assert_eq!(
         robot.q(),
         3.0,
         "the local answer says nothing about the cloud"
     );
-    robot.after(80);
+    robot.advance(80);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, id),
-        Verdict::Drop
+        robot.governor.on_result(robot.now, Responder::Cloud, id),
+        DeliveryVerdict::Drop
     );
     assert_eq!(robot.q(), 5.0);
     assert_eq!(robot.effects(), ["stop feeding"]);
@@ -269,20 +303,20 @@ fn the_clouds_time_counts_though_the_local_answer_won() {
 #[test]
 fn the_link_is_lost_while_the_local_original_runs() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 5}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     let id = robot.call("sum");
-    robot.after(10);
+    robot.advance(10);
     robot.governor.link_down(robot.now);
-    assert!(robot.after(290).is_empty(), "it may be answered in time");
-    assert_eq!(robot.after(1), ["feed", "sum to Local"]);
+    assert!(robot.advance(290).is_empty(), "it may be answered in time");
+    assert_eq!(robot.advance(1), ["feed", "sum to Local"]);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Local, id),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Local, id),
+        DeliveryVerdict::Deliver
     );
     robot.governor.link_up(robot.now, true);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, id),
-        Verdict::Drop
+        robot.governor.on_result(robot.now, Responder::Cloud, id),
+        DeliveryVerdict::Drop
     );
     assert_eq!(robot.q(), 2.5, "late once, whatever comes");
 }
@@ -293,24 +327,27 @@ fn a_blip_of_the_link_counts_for_nothing_where_the_answers_come_in_time() {
     robot.image(1, "first");
     robot.image(2, "second");
     let sum = robot.call("sum");
-    robot.after(10);
+    robot.advance(10);
     robot.governor.link_down(robot.now);
     robot.image(3, "third");
     let late = robot.call("later sum");
-    // The way to the cloud keeps inputs in their order; a call is not made before it can be.
-    assert_eq!(robot.after(50), ["third to Cloud"]);
+    // The path to the cloud keeps inputs in order; a call is not made before it can be.
+    assert_eq!(robot.advance(50), ["third to Cloud"]);
     assert_eq!(robot.q(), 5.0);
     robot.governor.link_up(robot.now, true);
-    assert_eq!(robot.after(20), ["later sum to Cloud"]);
+    assert_eq!(robot.advance(20), ["later sum to Cloud"]);
     for number in 1..=3 {
-        assert_eq!(robot.found(Side::Cloud, number), Verdict::Deliver);
+        assert_eq!(
+            robot.output_found(Responder::Cloud, number),
+            DeliveryVerdict::Deliver
+        );
     }
     for id in [sum, late] {
-        let verdict = robot.governor.answered(robot.now, Side::Cloud, id);
-        assert_eq!(verdict, Verdict::Deliver);
+        let verdict = robot.governor.on_result(robot.now, Responder::Cloud, id);
+        assert_eq!(verdict, DeliveryVerdict::Deliver);
     }
     assert!(
-        robot.after(10_000).is_empty(),
+        robot.advance(10_000).is_empty(),
         "the original is not started"
     );
     assert_eq!(robot.q(), 15.0);
@@ -323,15 +360,21 @@ fn what_a_blip_delays_beyond_t_max_counts_once_each() {
     let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 15}"#));
     robot.image(1, "first");
     robot.governor.link_down(robot.now);
-    robot.after(200);
+    robot.advance(200);
     robot.image(2, "second");
-    robot.after(101);
+    robot.advance(101);
     assert_eq!(robot.q(), 7.5, "the first is late, the second is not");
     robot.governor.link_up(robot.now, true);
-    assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
-    assert_eq!(robot.found(Side::Cloud, 2), Verdict::Deliver);
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 1),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 2),
+        DeliveryVerdict::Deliver
+    );
     assert_eq!(robot.q(), 8.5);
-    robot.after(10_000);
+    robot.advance(10_000);
     assert_eq!(robot.q(), 8.5);
 }
 
@@ -340,23 +383,32 @@ fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
     let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 5}"#));
     robot.governor.link_down(robot.now);
     robot.input("a");
-    robot.after(20);
+    robot.advance(20);
     robot.input("b");
-    robot.after(20);
+    robot.advance(20);
     robot.governor.link_up(robot.now, true);
-    assert!(robot.after(20).is_empty(), "the link has kept them");
-    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
-    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
-    robot.after(10_000);
+    assert!(robot.advance(20).is_empty(), "the link has kept them");
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver
+    );
+    robot.advance(10_000);
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.requests, counts.late), (1, 0));
-    // A servant that is new is given what it can answer in time.
+    // A new servant receives what it can still answer in time.
     robot.governor.link_down(robot.now);
     robot.input("c");
     assert_eq!(robot.effects(), ["c to Cloud"]);
     robot.governor.link_up(robot.now, false);
     assert_eq!(robot.effects(), ["c to Cloud"]);
-    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver
+    );
     assert_eq!(robot.governor.report(robot.now).counts.late, 0);
 }
 
@@ -364,47 +416,59 @@ fn without_stamps_a_blip_keeps_the_order_and_awaits_one_answer() {
 fn the_link_is_lost_and_there_is_no_local_original() {
     let mut robot = Robot::new(json(r#"{"local": "cold", "initial": 3}"#));
     assert_eq!(robot.effects(), ["start"]);
-    robot.governor.local(robot.now, LocalState::Missing);
-    robot.governor.local(robot.now, LocalState::Missing);
+    robot
+        .governor
+        .on_local_state(robot.now, LocalState::Missing);
+    robot
+        .governor
+        .on_local_state(robot.now, LocalState::Missing);
     assert_eq!(robot.effects(), ["SaidOnceMissing"]);
     let (answered, lost) = (robot.call("first"), robot.call("second"));
-    robot.after(10);
+    robot.advance(10);
     robot.governor.link_down(robot.now);
     assert!(robot.effects().is_empty(), "the link may come back in time");
     robot.governor.link_up(robot.now, true);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, answered),
-        Verdict::Deliver
+        robot
+            .governor
+            .on_result(robot.now, Responder::Cloud, answered),
+        DeliveryVerdict::Deliver
     );
     robot.governor.link_down(robot.now);
-    let words = robot.after(301);
+    let words = robot.advance(301);
     assert_eq!(words.len(), 1, "{words:?}");
     assert!(words[0].contains("the link is down"), "{words:?}");
     assert!(words[0].contains("there is no local original"), "{words:?}");
     robot.governor.link_up(robot.now, true);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, lost),
-        Verdict::Drop
+        robot.governor.on_result(robot.now, Responder::Cloud, lost),
+        DeliveryVerdict::Drop
     );
 }
 
 #[test]
 fn a_call_fails_only_when_both_sides_failed() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.effects();
     let id = robot.call("sum");
     robot.effects();
     let no = Failure::Unreachable("servant ended".into());
-    robot.governor.failed(robot.now, Side::Cloud, id, &no);
+    robot
+        .governor
+        .on_failure(robot.now, Responder::Cloud, id, &no);
     assert!(robot.effects().is_empty());
     let no = Failure::Refused("division by zero".into());
-    robot.governor.failed(robot.now, Side::Local, id, &no);
+    robot
+        .governor
+        .on_failure(robot.now, Responder::Local, id, &no);
     assert_eq!(
         robot.effects(),
         ["fail: cloud: servant ended; local: division by zero"]
     );
-    robot.governor.failed(robot.now, Side::Local, id, &no);
+    robot
+        .governor
+        .on_failure(robot.now, Responder::Local, id, &no);
     assert!(robot.effects().is_empty());
 }
 
@@ -413,7 +477,7 @@ fn stateful_asks_one_side_at_a_time_and_hands_back() {
     let mut robot = Robot::new(json(
         r#"{"local": "warm", "mode": "stateful", "initial": 1}"#,
     ));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.input("a");
     assert_eq!(robot.effects(), ["start", "a to Cloud"]);
     robot.governor.link_down(robot.now);
@@ -424,7 +488,7 @@ fn stateful_asks_one_side_at_a_time_and_hands_back() {
     let report = robot.governor.report(robot.now);
     assert_eq!(
         report.events.last().unwrap().event,
-        Event::StopFeeding(Why::LinkUp)
+        QosEvent::StopFeeding(DecisionReason::LinkUp)
     );
     robot.effects();
     robot.input("c");
@@ -435,27 +499,33 @@ fn stateful_asks_one_side_at_a_time_and_hands_back() {
 fn without_stamps_one_request_is_outstanding_and_forgotten_at_t_max() {
     let mut robot = Robot::new(json(r#"{"local": "none", "initial": 8}"#));
     robot.input("a");
-    robot.after(50);
+    robot.advance(50);
     robot.input("b");
     assert_eq!(
         robot.governor.report(robot.now).counts.requests,
         1,
         "b is fed, but a is outstanding"
     );
-    robot.after(40);
-    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    robot.advance(40);
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver
+    );
     assert_eq!(robot.q(), 10.0);
     assert_eq!(
-        robot.out(Side::Cloud),
-        Verdict::Deliver,
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver,
         "more than one output is none of our business"
     );
     robot.input("c");
-    robot.after(301);
+    robot.advance(301);
     assert_eq!(robot.q(), 5.0);
     robot.input("d");
-    robot.after(100);
-    assert_eq!(robot.out(Side::Cloud), Verdict::Deliver);
+    robot.advance(100);
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Deliver
+    );
     assert_eq!(robot.q(), 7.0);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 3);
 }
@@ -463,14 +533,28 @@ fn without_stamps_one_request_is_outstanding_and_forgotten_at_t_max() {
 #[test]
 fn without_stamps_both_answer_and_one_is_heard() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.input("a");
-    assert_eq!(robot.out(Side::Local), Verdict::Deliver);
-    robot.after(301);
+    assert_eq!(
+        robot.output_plain(Responder::Local),
+        DeliveryVerdict::Deliver
+    );
+    robot.advance(301);
     robot.input("b");
-    assert_eq!(robot.out(Side::Local), Verdict::Deliver);
-    assert_eq!(robot.out(Side::Cloud), Verdict::Drop, "late to a");
-    assert_eq!(robot.out(Side::Cloud), Verdict::Drop, "late to b");
+    assert_eq!(
+        robot.output_plain(Responder::Local),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Drop,
+        "late to a"
+    );
+    assert_eq!(
+        robot.output_plain(Responder::Cloud),
+        DeliveryVerdict::Drop,
+        "late to b"
+    );
 }
 
 #[test]
@@ -478,9 +562,12 @@ fn a_node_that_does_not_copy_stamps_is_noticed() {
     let mut robot = Robot::new(json(r#"{"local": "none"}"#));
     for secs in 1..=12 {
         robot.image(secs, "scan");
-        robot.after(20);
-        assert_eq!(robot.found(Side::Cloud, 1000 + secs), Verdict::Deliver);
-        robot.after(20);
+        robot.advance(20);
+        assert_eq!(
+            robot.output_found(Responder::Cloud, 1000 + secs),
+            DeliveryVerdict::Deliver
+        );
+        robot.advance(20);
     }
     let words = robot.effects();
     let report = robot.governor.report(robot.now);
@@ -488,7 +575,7 @@ fn a_node_that_does_not_copy_stamps_is_noticed() {
         report
             .events
             .iter()
-            .any(|event| event.event == Event::Uncorrelated("/image".into())),
+            .any(|event| event.event == QosEvent::Uncorrelated("/image".into())),
         "{words:?}"
     );
     assert_eq!(report.pairs[0], "/image -> /found by arrival");
@@ -502,12 +589,15 @@ fn the_safe_stop_comes_when_nobody_answers_in_time() {
     let mut robot = Robot::new(json(stop));
     robot.image(1, "picture");
     robot.effects();
-    assert!(robot.after(300).is_empty());
-    assert_eq!(robot.after(1), ["safe stop"]);
+    assert!(robot.advance(300).is_empty());
+    assert_eq!(robot.advance(1), ["safe stop"]);
     robot.image(2, "picture");
-    robot.after(100);
-    assert_eq!(robot.found(Side::Cloud, 2), Verdict::Deliver);
-    assert!(robot.after(1000).is_empty());
+    robot.advance(100);
+    assert_eq!(
+        robot.output_found(Responder::Cloud, 2),
+        DeliveryVerdict::Deliver
+    );
+    assert!(robot.advance(1000).is_empty());
 }
 
 #[test]
@@ -516,22 +606,31 @@ fn frames_per_second_start_the_local_original_and_stop_the_robot() {
         r#"{"measure": {"frames_per_second": {"output": "/found", "desire": 10, "min": 4, "over": 2}},
             "local": "cold", "initial": 5, "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}"#,
     ));
-    robot.governor.wanted(robot.now, "/found", true);
+    robot.governor.set_listened(robot.now, "/found", true);
     for _ in 0..3 {
-        robot.after(100);
-        assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
+        robot.advance(100);
+        assert_eq!(
+            robot.output_found(Responder::Cloud, 1),
+            DeliveryVerdict::Deliver
+        );
     }
     assert_eq!(robot.q(), 9.0);
     // Q 9, 4.5, 2.25
-    assert!(robot.after(400).is_empty(), "a frame now would be in time");
-    assert_eq!(robot.after(1), ["safe stop"]);
-    assert_eq!(robot.after(250), ["safe stop", "start"]);
-    robot.governor.local(robot.now, LocalState::Ready);
-    assert_eq!(robot.effects(), ["feed"]);
-    robot.after(50);
-    assert_eq!(robot.found(Side::Local, 1), Verdict::Deliver);
     assert!(
-        robot.after(200).iter().all(|word| word != "safe stop"),
+        robot.advance(400).is_empty(),
+        "a frame now would be in time"
+    );
+    assert_eq!(robot.advance(1), ["safe stop"]);
+    assert_eq!(robot.advance(250), ["safe stop", "start"]);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
+    assert_eq!(robot.effects(), ["feed"]);
+    robot.advance(50);
+    assert_eq!(
+        robot.output_found(Responder::Local, 1),
+        DeliveryVerdict::Deliver
+    );
+    assert!(
+        robot.advance(200).iter().all(|word| word != "safe stop"),
         "the local original's frames count for that"
     );
 }
@@ -546,19 +645,22 @@ fn a_frame_that_was_on_its_way_when_nobody_listened_any_more_awaits_no_other() {
             r#"{{"measure": {measure}, "local": "cold", "initial": 5,
                 "safe_stop": {{"topic": "/cmd_vel", "type": "geometry_msgs/Twist"}}}}"#
         )));
-        robot.governor.wanted(robot.now, "/found", true);
-        robot.after(100);
-        assert_eq!(robot.found(Side::Cloud, 1), Verdict::Deliver);
-        robot.governor.wanted(robot.now, "/found", false);
-        robot.after(10);
+        robot.governor.set_listened(robot.now, "/found", true);
+        robot.advance(100);
+        assert_eq!(
+            robot.output_found(Responder::Cloud, 1),
+            DeliveryVerdict::Deliver
+        );
+        robot.governor.set_listened(robot.now, "/found", false);
+        robot.advance(10);
         let q = robot.q();
-        let _ = robot.found(Side::Cloud, 2);
-        let done = robot.after(60_000);
+        let _ = robot.output_found(Responder::Cloud, 2);
+        let done = robot.advance(60_000);
         assert!(done.is_empty(), "{measure}: {done:?}");
         assert_eq!(robot.q(), q, "{measure}");
-        // Who listens again is promised frames again.
-        robot.governor.wanted(robot.now, "/found", true);
-        let done = robot.after(300);
+        // A new subscriber is promised frames again.
+        robot.governor.set_listened(robot.now, "/found", true);
+        let done = robot.advance(300);
         assert_eq!(done[0], "safe stop", "{measure}: {done:?}");
     }
 }
@@ -566,29 +668,29 @@ fn a_frame_that_was_on_its_way_when_nobody_listened_any_more_awaits_no_other() {
 #[test]
 fn without_a_promise_no_call_is_remembered_that_is_over() {
     let mut robot = Robot::new(json(r#"{"measure": {"link": {"after": 1}}}"#));
-    // Of those that the cloud answered …
+    // Calls that the cloud answered …
     for _ in 0..100 {
         let id = robot.call("sum");
-        let verdict = robot.governor.answered(robot.now, Side::Cloud, id);
-        assert_eq!(verdict, Verdict::Deliver);
+        let verdict = robot.governor.on_result(robot.now, Responder::Cloud, id);
+        assert_eq!(verdict, DeliveryVerdict::Deliver);
     }
     assert_eq!(robot.governor.deadline(), None);
-    // … those that the local original answered, whom nobody asks the cloud for …
+    // … calls that the local original answered, for which the cloud is never asked …
     robot.governor.link_down(robot.now);
-    robot.after(1000);
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.advance(1000);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     let told = robot.outcomes.len();
     for _ in 0..10_000 {
         let id = robot.call("sum");
-        let verdict = robot.governor.answered(robot.now, Side::Local, id);
-        assert_eq!(verdict, Verdict::Deliver);
+        let verdict = robot.governor.on_result(robot.now, Responder::Local, id);
+        assert_eq!(verdict, DeliveryVerdict::Deliver);
     }
     assert_eq!(robot.governor.deadline(), None);
     robot.effects();
     let outcomes = &robot.outcomes[told..];
     assert_eq!(outcomes.len(), 10_000, "they are told of");
     assert!(outcomes.iter().all(|outcome| outcome.cloud.is_none()));
-    // … and those that nobody waits for any more.
+    // … and calls that nobody waits for any more.
     let id = robot.call("sum");
     robot.governor.cancel(robot.now, id);
     assert_eq!(robot.governor.deadline(), None);
@@ -597,20 +699,20 @@ fn without_a_promise_no_call_is_remembered_that_is_over() {
 #[test]
 fn a_crash_of_the_local_original_brings_calls_back_to_the_cloud() {
     let mut robot = Robot::new(json(r#"{"local": "warm", "initial": 1}"#));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.governor.link_down(robot.now);
     let id = robot.call("sum");
     robot.effects();
     robot.governor.link_up(robot.now, false);
     assert_eq!(robot.effects(), ["sum to Cloud"]);
-    robot.governor.local_crashed(robot.now, "signal 11");
+    robot.governor.on_local_crash(robot.now, "signal 11");
     let words = robot.effects();
     assert_eq!(words, ["Crashed(\"signal 11\")", "stop feeding"]);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, id),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Cloud, id),
+        DeliveryVerdict::Deliver
     );
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["feed"]);
 }
 
@@ -620,20 +722,26 @@ fn what_is_no_request_goes_where_requests_go() {
     let info: Arc<str> = "/camera_info".into();
     robot.governor.input(robot.now, &info, None, "info");
     assert_eq!(robot.effects(), ["start", "info to Cloud"]);
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     robot.effects();
     robot.governor.input(robot.now, &info, None, "info");
     assert_eq!(robot.effects(), ["info to Cloud", "info to Local"]);
     assert_eq!(robot.governor.report(robot.now).counts.requests, 0);
-    // Only one side speaks on topics that answer nothing.
+    // Only one side is delivered on topics that answer nothing.
     let status = |robot: &mut Robot, side| {
         robot
             .governor
             .output(robot.now, side, "/status", None, Duration::ZERO)
     };
-    assert_eq!(status(&mut robot, Side::Local), Verdict::Deliver);
-    assert_eq!(status(&mut robot, Side::Cloud), Verdict::Drop);
-    assert_eq!(Channel::Topic(info.clone()), Channel::Topic(info));
+    assert_eq!(
+        status(&mut robot, Responder::Local),
+        DeliveryVerdict::Deliver
+    );
+    assert_eq!(status(&mut robot, Responder::Cloud), DeliveryVerdict::Drop);
+    assert_eq!(
+        RequestChannel::Topic(info.clone()),
+        RequestChannel::Topic(info)
+    );
 }
 
 #[test]
@@ -643,36 +751,36 @@ fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
     // However slow the cloud is, it answers alone.
     let slow = robot.call("slow");
     assert_eq!(robot.effects(), ["slow to Cloud"]);
-    assert!(robot.after(60_000).is_empty());
+    assert!(robot.advance(60_000).is_empty());
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Cloud, slow),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Cloud, slow),
+        DeliveryVerdict::Deliver
     );
-    // A link that comes back soon changes nothing, and what is told meanwhile waits for it.
+    // A link that comes back soon changes nothing, and messages sent meanwhile wait for it.
     robot.governor.link_down(robot.now);
     robot.governor.input(robot.now, &map, None, "map");
-    assert_eq!(robot.after(2999), ["map to Cloud"]);
+    assert_eq!(robot.advance(2999), ["map to Cloud"]);
     let early = robot.call("early");
     assert!(robot.effects().is_empty());
     robot.governor.link_up(robot.now, true);
-    assert_eq!(robot.after(10_000), ["early to Cloud"]);
-    // One that stays away does.
+    assert_eq!(robot.advance(10_000), ["early to Cloud"]);
+    // One that stays down does.
     robot.governor.link_down(robot.now);
-    assert!(robot.after(2999).is_empty());
-    assert_eq!(robot.after(1), ["start"]);
+    assert!(robot.advance(2999).is_empty());
+    assert_eq!(robot.advance(1), ["start"]);
     let said = |robot: &mut Robot, side| {
         let now = robot.now;
         let governor = &mut robot.governor;
         governor.output(now, side, "/status", None, Duration::ZERO)
     };
-    assert_eq!(said(&mut robot, Side::Local), Verdict::Deliver);
-    robot.governor.local(robot.now, LocalState::Ready);
+    assert_eq!(said(&mut robot, Responder::Local), DeliveryVerdict::Deliver);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     assert_eq!(robot.effects(), ["feed", "early to Local"]);
     robot.governor.input(robot.now, &map, None, "map");
     assert_eq!(robot.effects(), ["map to Local"]);
     assert_eq!(
-        robot.governor.answered(robot.now, Side::Local, early),
-        Verdict::Deliver
+        robot.governor.on_result(robot.now, Responder::Local, early),
+        DeliveryVerdict::Deliver
     );
     let report = robot.governor.report(robot.now);
     assert_eq!(report.fallback_after, Some(3.0));
@@ -680,20 +788,23 @@ fn without_a_promise_the_local_original_stands_in_while_the_link_is_away() {
         report.summary.contains("the local original answers")
             && report
                 .summary
-                .contains("stands in 3 s after the link is lost"),
+                .contains("takes over 3 s after the link is lost"),
         "{}",
         report.summary
     );
     robot.governor.link_up(robot.now, false);
     assert_eq!(robot.effects(), ["stop feeding", "stop"]);
-    assert!(robot.after(86_400_000).is_empty());
+    assert!(robot.advance(86_400_000).is_empty());
 }
 
 #[test]
 fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
     let sla = json(r#"{"measure": {"link": {"after": "500ms"}}}"#);
-    let mut governor =
-        Governor::<&str>::new(Sla::parse(sla).unwrap(), Vec::new(), Limits::default());
+    let mut governor = Governor::<&str>::new(
+        QosSla::parse(sla).unwrap(),
+        Vec::new(),
+        RetentionLimits::default(),
+    );
     let now = Instant::now();
     governor.begin(now);
     assert!(governor.next_effect().is_none());
@@ -701,7 +812,10 @@ fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
     governor.tick(now + 500 * MS);
     let started = governor.next_effect();
     assert!(
-        matches!(started, Some(Effect::Event(Event::Start(Why::LinkDown)))),
+        matches!(
+            started,
+            Some(Effect::Event(QosEvent::Start(DecisionReason::LinkDown)))
+        ),
         "{started:?}"
     );
     assert_eq!(governor.deadline(), None, "said once");
@@ -710,8 +824,11 @@ fn without_a_promise_a_cloud_that_is_never_reached_is_stood_in_for() {
 #[test]
 fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
     let sla = json(r#"{"t_desire": 0.1, "t_max": 0.3, "unreached": "500ms"}"#);
-    let mut governor =
-        Governor::<&str>::new(Sla::parse(sla).unwrap(), Vec::new(), Limits::default());
+    let mut governor = Governor::<&str>::new(
+        QosSla::parse(sla).unwrap(),
+        Vec::new(),
+        RetentionLimits::default(),
+    );
     let now = Instant::now();
     let said = |governor: &mut Governor<&str>| {
         let effects = std::iter::from_fn(|| governor.next_effect());
@@ -725,11 +842,20 @@ fn with_a_promise_a_cloud_that_is_never_reached_is_stood_in_for_too() {
     governor.tick(now + 499 * MS);
     assert!(said(&mut governor).is_empty());
     governor.tick(now + 500 * MS);
-    assert_eq!(said(&mut governor), [Event::Start(Why::LinkDown)]);
-    governor.local(now + 600 * MS, LocalState::Ready);
-    assert_eq!(said(&mut governor), [Event::Feed(Why::LinkDown)]);
+    assert_eq!(
+        said(&mut governor),
+        [QosEvent::Start(DecisionReason::LinkDown)]
+    );
+    governor.on_local_state(now + 600 * MS, LocalState::Ready);
+    assert_eq!(
+        said(&mut governor),
+        [QosEvent::Feed(DecisionReason::LinkDown)]
+    );
     governor.link_up(now + 700 * MS, false);
-    let back = [Event::StopFeeding(Why::LinkUp), Event::Stop(Why::LinkUp)];
+    let back = [
+        QosEvent::StopFeeding(DecisionReason::LinkUp),
+        QosEvent::Stop(DecisionReason::LinkUp),
+    ];
     assert_eq!(said(&mut governor), back);
     // From now on Q decides.
     governor.link_down(now + 800 * MS);
@@ -749,9 +875,9 @@ fn without_a_promise_warm_and_first_sign_are_ready_before_they_are_needed() {
         assert_eq!(robot.effects() == ["start"], begun, "{local}");
         robot.governor.link_down(robot.now);
         assert_eq!(robot.effects() == ["start"], !begun, "{local}");
-        robot.governor.local(robot.now, LocalState::Ready);
-        assert!(robot.after(2999).is_empty(), "{local}");
-        assert_eq!(robot.after(1), ["feed"], "{local}");
+        robot.governor.on_local_state(robot.now, LocalState::Ready);
+        assert!(robot.advance(2999).is_empty(), "{local}");
+        assert_eq!(robot.advance(1), ["feed"], "{local}");
         robot.governor.link_up(robot.now, true);
         let given_up = robot.effects();
         assert_eq!(given_up[0], "stop feeding", "{local}");
@@ -766,24 +892,24 @@ fn a_goal_is_carried_out_while_the_link_is_away() {
     let (goal, call) = (robot.goal("walk"), robot.call("add"));
     assert_eq!(robot.effects(), ["walk to Cloud", "add to Cloud"]);
     robot.governor.link_down(robot.now);
-    let said = robot.after(60_000);
+    let said = robot.advance(60_000);
     assert_eq!(said.len(), 1, "the call alone is given up: {said:?}");
     assert!(said[0].contains("the link is down"), "{said:?}");
     robot.governor.link_up(robot.now, true);
-    let verdict = robot.governor.answered(robot.now, Side::Cloud, call);
-    assert_eq!(verdict, Verdict::Drop);
-    let verdict = robot.governor.answered(robot.now, Side::Cloud, goal);
-    assert_eq!(verdict, Verdict::Deliver);
-    // Another servant knows nothing of it.
+    let verdict = robot.governor.on_result(robot.now, Responder::Cloud, call);
+    assert_eq!(verdict, DeliveryVerdict::Drop);
+    let verdict = robot.governor.on_result(robot.now, Responder::Cloud, goal);
+    assert_eq!(verdict, DeliveryVerdict::Deliver);
+    // Another servant does not know the goal.
     robot.goal("run");
     robot.governor.link_down(robot.now);
     robot.effects();
     robot.governor.link_up(robot.now, false);
     assert_eq!(robot.effects(), ["run to Cloud"]);
-    // Nobody has taken this one.
+    // No side has accepted this one.
     robot.governor.link_down(robot.now);
     robot.goal("jump");
-    let said = robot.after(1000);
+    let said = robot.advance(1000);
     assert!(
         said.iter()
             .any(|said| said.starts_with("fail: cloud: the link is down")),
@@ -795,14 +921,14 @@ fn a_goal_is_carried_out_while_the_link_is_away() {
 fn a_goal_that_the_cloud_was_at_goes_on_at_the_local_original() {
     let sla = r#"{"measure": {"link": {"after": 3}}, "local": "warm"}"#;
     let mut robot = Robot::new(json(sla));
-    robot.governor.local(robot.now, LocalState::Ready);
+    robot.governor.on_local_state(robot.now, LocalState::Ready);
     let goal = robot.goal("walk");
-    assert!(!robot.after(60_000).contains(&"walk to Local".to_owned()));
+    assert!(!robot.advance(60_000).contains(&"walk to Local".to_owned()));
     robot.governor.link_down(robot.now);
-    let said = robot.after(60_000);
+    let said = robot.advance(60_000);
     assert!(said.contains(&"walk to Local".to_owned()), "{said:?}");
-    let verdict = robot.governor.answered(robot.now, Side::Local, goal);
-    assert_eq!(verdict, Verdict::Deliver);
+    let verdict = robot.governor.on_result(robot.now, Responder::Local, goal);
+    assert_eq!(verdict, DeliveryVerdict::Deliver);
 }
 
 #[test]
@@ -812,13 +938,15 @@ fn a_goal_that_nobody_answers_for_minutes_stops_the_robot_once_and_one_that_is_a
     let mut robot = Robot::new(json(stop));
     robot.goal("walk");
     robot.effects();
-    assert_eq!(robot.after(300_000), ["safe stop"]);
+    assert_eq!(robot.advance(300_000), ["safe stop"]);
     let accepted = robot.goal("run");
-    robot.governor.accepted(robot.now, accepted);
+    robot.governor.on_goal_accepted(robot.now, accepted);
     robot.effects();
-    assert!(robot.after(300_000).is_empty());
+    assert!(robot.advance(300_000).is_empty());
     let counts = robot.governor.report(robot.now).counts;
     assert_eq!((counts.unanswered_in_time, counts.late), (1, 2));
-    let verdict = robot.governor.answered(robot.now, Side::Cloud, accepted);
-    assert_eq!(verdict, Verdict::Deliver);
+    let verdict = robot
+        .governor
+        .on_result(robot.now, Responder::Cloud, accepted);
+    assert_eq!(verdict, DeliveryVerdict::Deliver);
 }

@@ -1,19 +1,18 @@
-//! Decisions match the algorithm as it was published, written down as plainly as possible, with the bound on Q that ours has
-//! (see `Satisfaction`). Without the bound it is as published; until that Q reaches the bound the two are the same, and after
-//! it the bound only makes the local original start earlier. What T is under each measure is written down here once more,
-//! millisecond by millisecond.
+//! Checks the decisions against a plain implementation of the published algorithm, extended by the bound on Q (see
+//! `Satisfaction`). Without the bound the two are identical until Q reaches it; after that the bound only makes the
+//! local original start earlier. T under each measure is computed here once more, millisecond by millisecond.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use proptest::prelude::*;
-use qos::{Effect, Event, Governor, Limits, LocalState, Side, Sla, Stamp};
+use qos::{Effect, Governor, LocalState, QosEvent, QosSla, Responder, RetentionLimits, Stamp};
 
 const T_DESIRE: u64 = 100;
 const T_MAX: u64 = 300;
 const THRESHOLD: f64 = 4.0;
-/// Q stays below 4·Q_t.
+/// Upper bound of Q, 4·Q_t.
 const BOUND: f64 = 4.0 * THRESHOLD;
 
 /// The published algorithm. `t` is in milliseconds.
@@ -21,7 +20,7 @@ struct Reference {
     /// T_desire and T_max.
     times: (u64, u64),
     q: f64,
-    /// Q is never above it; infinite as published.
+    /// Maximum of Q; infinite as published.
     most: f64,
     running: bool,
     log: Vec<&'static str>,
@@ -30,7 +29,7 @@ struct Reference {
 impl Reference {
     fn new(initial: f64, most: f64) -> Reference {
         let q = initial.min(most);
-        // Before any request: the promise may be broken from the beginning.
+        // Before any request: the goal may be violated from the start.
         let running = q < THRESHOLD;
         Reference {
             times: (T_DESIRE, T_MAX),
@@ -61,18 +60,18 @@ impl Reference {
     }
 }
 
-fn below(x: f64) -> f64 {
+fn next_below(x: f64) -> f64 {
     f64::from_bits(x.to_bits() - 1)
 }
 
-fn take(governor: &mut Governor<u32>, now: Instant, log: &mut Vec<&'static str>) {
+fn apply_effects(governor: &mut Governor<u32>, now: Instant, log: &mut Vec<&'static str>) {
     while let Some(effect) = governor.next_effect() {
         match effect {
-            Effect::Event(Event::Start(_)) => {
+            Effect::Event(QosEvent::Start(_)) => {
                 log.push("start");
-                governor.local(now, LocalState::Ready);
+                governor.on_local_state(now, LocalState::Ready);
             }
-            Effect::Event(Event::Stop(_)) => log.push("stop"),
+            Effect::Event(QosEvent::Stop(_)) => log.push("stop"),
             _ => {}
         }
     }
@@ -83,7 +82,7 @@ proptest! {
     #[test]
     fn one_request_after_another(
         initial in 0.5f64..20.0,
-        // From a good cloud, whose Q grows beyond the bound, to one that is mostly late.
+        // From a good cloud, whose Q exceeds the bound, to one that is mostly late.
         slowest in 100u64..900,
         shares in prop::collection::vec(0.0f64..1.0, 1..120),
         local_wins in prop::collection::vec(any::<bool>(), 120),
@@ -92,25 +91,25 @@ proptest! {
         let sla = serde_json::json!({
             "t_desire": 0.1, "t_max": 0.3, "threshold": THRESHOLD, "initial": initial, "local": "cold"
         });
-        let mut governor = Governor::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let mut governor = Governor::new(QosSla::parse(sla).unwrap(), vec![], RetentionLimits::default());
         let mut published = Reference::new(initial, f64::INFINITY);
-        let mut bounded = Reference::new(initial, below(BOUND));
+        let mut bounded = Reference::new(initial, next_below(BOUND));
         let mut now = Instant::now();
         let mut log = vec![];
         governor.link_up(now, false);
-        take(&mut governor, now, &mut log);
+        apply_effects(&mut governor, now, &mut log);
         let name: Arc<str> = "/add".into();
         let mut same = initial < BOUND;
         for (t, local_wins) in times.zip(local_wins) {
             let id = governor.call(now, &name, 0);
-            take(&mut governor, now, &mut log);
+            apply_effects(&mut governor, now, &mut log);
             if log.last() == Some(&"start") && local_wins {
                 // The local original's answer is early; the cloud's time counts all the same.
-                let _ = governor.answered(now + Duration::from_millis(t.min(1)), Side::Local, id);
+                let _ = governor.on_result(now + Duration::from_millis(t.min(1)), Responder::Local, id);
             }
             now += Duration::from_millis(t);
-            let _ = governor.answered(now, Side::Cloud, id);
-            take(&mut governor, now, &mut log);
+            let _ = governor.on_result(now, Responder::Cloud, id);
+            apply_effects(&mut governor, now, &mut log);
             published.request_done(t);
             bounded.request_done(t);
             prop_assert_eq!(governor.satisfaction().q(), bounded.q);
@@ -126,13 +125,13 @@ proptest! {
     }
 }
 
-/// Where `up` says for each millisecond whether the link is up: the first one from `at` on in which it is.
+/// Returns the first millisecond from `at` on at which the link is up; `up` holds its state per millisecond.
 fn first_up(up: &[bool], at: u64) -> Option<u64> {
     (at..up.len() as u64).find(|at| up[*at as usize])
 }
 
-/// The link over time, from the lengths of its good and its bad times.
-fn link(times: &[(u64, u64)], length: u64) -> Vec<bool> {
+/// Returns the state of the link per millisecond, from the lengths of its good and bad periods.
+fn link_over_time(times: &[(u64, u64)], length: u64) -> Vec<bool> {
     let spans = times.iter();
     let mut up: Vec<bool> = spans
         .flat_map(|(good, bad)| {
@@ -145,45 +144,45 @@ fn link(times: &[(u64, u64)], length: u64) -> Vec<bool> {
     up
 }
 
-fn sla(written: serde_json::Value) -> Sla {
-    Sla::parse(written).unwrap()
+fn sla(written: serde_json::Value) -> QosSla {
+    QosSla::parse(written).unwrap()
 }
 
-/// A governor that lives millisecond by millisecond.
+/// A governor driven millisecond by millisecond.
 struct World {
     governor: Governor<u32>,
     begun: Instant,
     log: Vec<&'static str>,
-    /// What the cloud was given.
+    /// Requests sent to the cloud.
     given: Vec<u32>,
 }
 
 impl World {
-    fn new(sla: Sla) -> World {
+    fn new(sla: QosSla) -> World {
         let pairs = vec!["/image -> /found by stamp".parse().unwrap()];
-        // An output may have been born before the beginning.
+        // An output may carry a stamp from before the start.
         let begun = Instant::now() + Duration::from_secs(1000);
         let mut world = World {
-            governor: Governor::new(sla, pairs, Limits::default()),
+            governor: Governor::new(sla, pairs, RetentionLimits::default()),
             begun,
             log: vec![],
             given: vec![],
         };
         world.governor.begin(begun);
-        world.obey(begun);
+        world.apply_effects(begun);
         world
     }
 
-    fn obey(&mut self, now: Instant) {
+    fn apply_effects(&mut self, now: Instant) {
         while let Some(effect) = self.governor.next_effect() {
             match effect {
-                Effect::Event(Event::Start(_)) => {
+                Effect::Event(QosEvent::Start(_)) => {
                     self.log.push("start");
-                    self.governor.local(now, LocalState::Ready);
+                    self.governor.on_local_state(now, LocalState::Ready);
                 }
-                Effect::Event(Event::Stop(_)) => self.log.push("stop"),
+                Effect::Event(QosEvent::Stop(_)) => self.log.push("stop"),
                 Effect::Give {
-                    side: Side::Cloud,
+                    side: Responder::Cloud,
                     payload,
                     ..
                 } => self.given.push(payload),
@@ -192,12 +191,12 @@ impl World {
         }
     }
 
-    /// All that is due at this millisecond.
+    /// Handles everything due at this millisecond.
     fn tick(&mut self, at: u64) -> Instant {
         let now = self.begun + Duration::from_millis(at);
         while self.governor.deadline().is_some_and(|due| due <= now) {
             self.governor.tick(now);
-            self.obey(now);
+            self.apply_effects(now);
         }
         now
     }
@@ -217,12 +216,12 @@ fn stamp(number: u32) -> Stamp {
 proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::with_cases(80) })]
 
-    /// Requests that overlap, over a link that is lost and found again: each counts once, by the time that it took.
+    /// Overlapping requests over a link that is lost and restored: each counts once, by its response time.
     #[test]
     fn requests_at_the_same_time_over_a_link_that_is_lost(
         initial in 0.5f64..20.0,
         factor in prop_oneof![Just(f64::INFINITY), 1.1f64..10.0],
-        // The pause before it, how long the cloud takes, whether it is a call.
+        // The pause before the request, the cloud's time, and whether it is a call.
         requests in prop::collection::vec((0u64..150, 1u64..450, any::<bool>()), 1..50),
         times in prop::collection::vec((0u64..800, 1u64..500), 0..8),
     ) {
@@ -237,8 +236,8 @@ proptest! {
             (asked, takes, call)
         }).collect();
         let length = asked + 2000;
-        let up = link(&times, length);
-        // When each answer comes: the request reaches the cloud when there is a link, and so does the answer the robot.
+        let up = link_over_time(&times, length);
+        // Arrival of each answer: the request reaches the cloud while the link is up, and so does the answer the robot.
         let arrivals: Vec<u64> = requests.iter().map(|(asked, takes, _)| {
             let reached = first_up(&up, *asked);
             reached.and_then(|reached| first_up(&up, reached + takes)).unwrap_or(u64::MAX)
@@ -247,12 +246,12 @@ proptest! {
         let mut counted = vec![false; requests.len()];
         let mut answered: Vec<Option<u64>> = vec![None; requests.len()];
         let mut heard: Option<u64> = None;
-        let mut reference = Reference::new(initial, below(cap));
+        let mut reference = Reference::new(initial, next_below(cap));
         let mut world = World::new(sla);
         world.governor.link_up(world.begun, false);
         let (call, image): (Arc<str>, Arc<str>) = ("/add".into(), "/image".into());
         let mut ids = vec![None; requests.len()];
-        // What the cloud was given and has not answered, and since when it has that.
+        // Requests that reached the cloud and are not answered, and since when.
         let mut open: BTreeMap<u32, Option<u64>> = BTreeMap::new();
         for at in 0..length {
             let now = world.tick(at);
@@ -262,7 +261,7 @@ proptest! {
             } else {
                 world.governor.link_down(now);
             }
-            world.obey(now);
+            world.apply_effects(now);
             for number in std::mem::take(&mut world.given) {
                 open.entry(number).or_default();
             }
@@ -275,14 +274,14 @@ proptest! {
                 // It stays, and is not answered again.
                 *reached = Some(u64::MAX / 2);
                 if is_call {
-                    let _ = world.governor.answered(now, Side::Cloud, ids[*number as usize].unwrap());
+                    let _ = world.governor.on_result(now, Responder::Cloud, ids[*number as usize].unwrap());
                 } else {
                     let key = stamp(*number).into();
-                    let _ = world.governor.output(now, Side::Cloud, "/found", Some(key), Duration::ZERO);
+                    let _ = world.governor.output(now, Responder::Cloud, "/found", Some(key), Duration::ZERO);
                 }
-                world.obey(now);
+                world.apply_effects(now);
             }
-            world.obey(now);
+            world.apply_effects(now);
             for number in 0..requests.len() {
                 let (asked, _, is_call) = requests[number];
                 if asked != at {
@@ -295,19 +294,21 @@ proptest! {
                     world.governor.input(now, &image, Some(stamp(payload).into()), payload);
                 }
             }
-            world.obey(now);
+            world.apply_effects(now);
             for number in std::mem::take(&mut world.given) {
                 open.entry(number).or_insert(is_up.then_some(at));
             }
-            // As it was published, late ones first: they were so a nanosecond after the last millisecond. An input is left out,
-            // which counts for nothing, where a later one was answered by then; that is waited for until T_max after the
-            // node was last heard, and for twice T_max at most.
+            // As published, late requests count first: they became late a nanosecond after the last millisecond. An
+            // input is left out, which does not count, if a later one was answered by then; that is waited for until
+            // T_max after the node's last answer, and for at most twice T_max.
             for number in 0..requests.len() {
                 let (asked, _, is_call) = requests[number];
                 if counted[number] || due[number] != at {
                     continue;
                 }
-                let busy_until = heard.filter(|heard| !is_call && *heard >= asked).map(|heard| heard.min(asked + T_MAX) + T_MAX + 1);
+                let busy_until = heard
+                    .filter(|heard| !is_call && *heard >= asked)
+                    .map(|heard| heard.min(asked + T_MAX) + T_MAX + 1);
                 let mut later = requests.iter().zip(&answered).skip(number + 1);
                 let is_before = |answered: &Option<u64>| answered.is_some_and(|answered| answered < at);
                 let is_left_out = !is_call && later.any(|((.., is_call), answered)| !is_call && is_before(answered));
@@ -335,7 +336,7 @@ proptest! {
         }
     }
 
-    /// Frames per second: T is the mean time of the last frames.
+    /// Frames per second: T is the mean interval of the last frames.
     #[test]
     fn frames(
         initial in 0.5f64..20.0,
@@ -347,16 +348,16 @@ proptest! {
             "threshold": THRESHOLD, "initial": initial, "local": "cold",
         })));
         const LONGEST: u64 = 250;
-        let mut reference = Reference::new(initial, below(BOUND));
+        let mut reference = Reference::new(initial, next_below(BOUND));
         reference.times = (T_DESIRE, LONGEST);
         world.governor.link_up(world.begun, false);
-        world.governor.wanted(world.begun, "/found", true);
+        world.governor.set_listened(world.begun, "/found", true);
         let mut due: VecDeque<u64> = pauses.iter().scan(0, |at, pause| {
             *at += pause;
             Some(*at)
         }).collect();
         let mut frames: Vec<u64> = vec![];
-        // When the frame that is awaited was last counted as missing.
+        // Time at which the expected frame was last counted as missing.
         let mut counted: Option<u64> = None;
         for at in 0..due.back().unwrap() + 1000 {
             let now = world.tick(at);
@@ -375,8 +376,8 @@ proptest! {
             }
             if due.front() == Some(&at) {
                 due.pop_front();
-                let _ = world.governor.output(now, Side::Cloud, "/found", None, Duration::ZERO);
-                world.obey(now);
+                let _ = world.governor.output(now, Responder::Cloud, "/found", None, Duration::ZERO);
+                world.apply_effects(now);
                 if counted.take().is_some() {
                     frames.clear();
                 }
@@ -384,7 +385,7 @@ proptest! {
                 let mean_of = over.min(frames.len() - 1) as u64;
                 if mean_of > 0 {
                     let took = at - frames[frames.len() - 1 - mean_of as usize];
-                    // A whole millisecond more where a part of one is.
+                    // Rounded up to whole milliseconds.
                     reference.request_done(took.div_ceil(mean_of));
                 }
             }
@@ -393,7 +394,7 @@ proptest! {
         }
     }
 
-    /// Age: T is how old an output has become when the next one comes.
+    /// Age: T is the age that an output has reached when the next one arrives.
     #[test]
     fn ages(
         initial in 0.5f64..20.0,
@@ -403,9 +404,9 @@ proptest! {
             "measure": {"age": {"output": "/found", "desire": 0.1, "max": 0.3}},
             "threshold": THRESHOLD, "initial": initial, "local": "cold",
         })));
-        let mut reference = Reference::new(initial, below(BOUND));
+        let mut reference = Reference::new(initial, next_below(BOUND));
         world.governor.link_up(world.begun, false);
-        world.governor.wanted(world.begun, "/found", true);
+        world.governor.set_listened(world.begun, "/found", true);
         let mut due: VecDeque<(u64, u64)> = outputs.iter().scan(0, |at, (pause, age)| {
             *at += pause;
             Some((*at, *age))
@@ -425,14 +426,14 @@ proptest! {
             if due.front().is_some_and(|due| due.0 == at) {
                 let age = due.pop_front().unwrap().1;
                 let aged = Duration::from_millis(age);
-                let _ = world.governor.output(now, Side::Cloud, "/found", None, aged);
-                world.obey(now);
+                let _ = world.governor.output(now, Responder::Cloud, "/found", None, aged);
+                world.apply_effects(now);
                 let before = born.replace(at as i64 - age as i64);
                 if let Some(before) = before.filter(|_| counted.take().is_none()) {
                     reference.request_done((at as i64 - before) as u64);
                 }
                 counted = None;
-                // It may be too old when it comes.
+                // It may be too old on arrival.
                 world.tick(at);
                 if is_missing(born, counted) {
                     counted = Some(at);
@@ -444,13 +445,13 @@ proptest! {
         }
     }
 
-    /// No time is promised: the link alone decides.
+    /// Without a response time the link alone decides.
     #[test]
     fn the_link_alone(times in prop::collection::vec((1u64..2000, 1u64..2000), 1..12)) {
         const AFTER: u64 = 1000;
         let mut world = World::new(sla(serde_json::json!({"measure": {"link": {"after": 1}}})));
         let length = times.iter().map(|(down, up)| down + up).sum::<u64>();
-        let down = link(&times, length);
+        let down = link_over_time(&times, length);
         let (mut log, mut since) = (vec![], Some(0));
         for at in 0..length {
             let now = world.tick(at);
@@ -471,7 +472,7 @@ proptest! {
                 }
                 _ => {}
             }
-            world.obey(now);
+            world.apply_effects(now);
             prop_assert_eq!(&world.log, &log, "at {} ms", at);
         }
     }

@@ -1,9 +1,9 @@
-//! Component containers of a servant (ROS 2): what its revision loads into them is loaded as they appear, whenever they do.
+//! Component containers of a servant (ROS 2): loads the revision's components into containers whenever they appear.
 //!
 //! ```text
 //!  graph ─▶ a container of the revision ─▶ started by a stub? ─yes─▶ left alone
 //!                    ▲                          │ no
-//!                    │ it was started again     └─▶ Loading ─▶ Loaded, or Refused and the event component-refused
+//!                    │ it was restarted         └─▶ Loading ─▶ Loaded, or Refused and the event component-refused
 //!                    └───────────────────────────────────────────┘
 //! ```
 
@@ -12,42 +12,43 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros::bus::{Bus, Graph};
-use ros::ros2::composition::{Component, Container};
+use ros::ros2::composition::{Component, ComponentContainer};
 use ros::schema::Registry;
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use crate::links::Nodes;
-use crate::{Linked, Observer, following};
+use crate::links::NodeController;
+use crate::{Observer, StubNode, following};
 
-/// For a container to serve what loads nodes, and for each node to be made: some load what they need then.
+/// Timeout for a container to provide its load service, and for each component to be created; some components load data
+/// then.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// How far a container is.
+/// Loading state of a container.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Load {
-    /// Not all is loaded.
+pub enum ContainerLoad {
+    /// Not everything is loaded.
     Loading,
-    /// These nodes are, by their absolute names.
+    /// Everything is loaded; contains the absolute names of the nodes.
     Loaded(Vec<String>),
-    /// One is not, and why.
+    /// A component could not be loaded, for this reason.
     Refused(String),
 }
 
-/// Containers that run, by name.
-pub type Loads = BTreeMap<String, Load>;
+/// Running containers by name.
+pub type Loads = BTreeMap<String, ContainerLoad>;
 
-/// What is loaded into a servant's containers.
-pub(crate) struct Wanted {
-    /// By the container's name.
+/// Components to load into the containers of a servant.
+pub(crate) struct ComponentPlan {
+    /// Components by container name.
     pub(crate) components: BTreeMap<String, Vec<Component>>,
-    /// Definitions of the image.
+    /// Type definitions of the image.
     pub(crate) registry: Arc<Registry>,
-    /// For what [`Load`] waits for, each time.
+    /// Timeout of each step; see [`ContainerLoad`].
     pub(crate) patience: Duration,
 }
 
-impl Wanted {
+impl ComponentPlan {
     pub(crate) fn new(
         components: BTreeMap<String, Vec<Component>>,
         registry: Arc<Registry>,
@@ -60,102 +61,102 @@ impl Wanted {
     }
 }
 
-/// Has containers load nodes until it is dropped.
-pub(crate) struct Components {
+/// Loads components into containers until it is dropped.
+pub(crate) struct ComponentLoader {
     shown: watch::Receiver<Loads>,
     task: AbortHandle,
 }
 
-impl Drop for Components {
+impl Drop for ComponentLoader {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Components {
-    /// Follows the containers of a servant; none where nothing is loaded. `nodes`: those that stubs have started hold what the
-    /// robot loads into them.
-    pub(crate) fn follow(
+impl ComponentLoader {
+    /// Starts following the containers of a servant; `None` if there is nothing to load. Containers in `nodes` were
+    /// started by stubs and hold what the robot loads into them.
+    pub(crate) fn start(
         bus: &Arc<dyn Bus>,
-        nodes: &Arc<dyn Nodes>,
+        nodes: &Arc<dyn NodeController>,
         observer: &Arc<dyn Observer>,
-        wanted: Wanted,
-    ) -> Option<Components> {
+        wanted: ComponentPlan,
+    ) -> Option<ComponentLoader> {
         if wanted.components.is_empty() {
             return None;
         }
         let shown = watch::Sender::default();
-        let followed = Arc::new(Followed {
+        let followed = Arc::new(ContainerFollower {
             bus: Arc::clone(bus),
             nodes: Arc::clone(nodes),
             observer: Arc::clone(observer),
             wanted,
             shown,
         });
-        Some(Components {
+        Some(ComponentLoader {
             shown: followed.shown.subscribe(),
             task: tokio::spawn(followed.run()).abort_handle(),
         })
     }
 
-    /// How far they are, now and later.
+    /// Returns a watch on the loading states.
     pub(crate) fn loads(&self) -> watch::Receiver<Loads> {
         self.shown.clone()
     }
 }
 
-struct Followed {
+struct ContainerFollower {
     bus: Arc<dyn Bus>,
-    nodes: Arc<dyn Nodes>,
+    nodes: Arc<dyn NodeController>,
     observer: Arc<dyn Observer>,
-    wanted: Wanted,
+    wanted: ComponentPlan,
     shown: watch::Sender<Loads>,
 }
 
-impl Followed {
+impl ContainerFollower {
     async fn run(self: Arc<Self>) {
         let containers = |graph: &Graph| {
             let all = self.wanted.components.keys();
             let there = all.filter(|name| graph.nodes.contains_key(*name));
             there.cloned().collect()
         };
-        let begin = |container: String| Arc::clone(&self).one(container);
+        let begin = |container: String| Arc::clone(&self).load_container(container);
         let gone = |container: &str| {
             self.shown.send_modify(|all| drop(all.remove(container)));
         };
         let (graph, ours) = (self.bus.graph(), self.bus.node());
-        following::each_node(graph, ours, containers, begin, gone).await;
+        following::run_for_each_node(graph, ours, containers, begin, gone).await;
     }
 
-    async fn one(self: Arc<Self>, name: String) {
-        let linked = self.nodes.running().await;
+    async fn load_container(self: Arc<Self>, name: String) {
+        let linked = self.nodes.running_nodes().await;
         let graph = self.bus.graph().borrow().clone();
-        let has = |linked: &Linked| graph.is_of_process(&linked.node.name, &name);
+        let has = |linked: &StubNode| graph.is_in_process(&linked.node.name, &name);
         if linked.iter().any(has) {
             return;
         }
-        self.show(&name, Load::Loading);
-        let load = match self.load(&name).await {
+        self.show_load(&name, ContainerLoad::Loading);
+        let load = match self.load_components(&name).await {
             Ok(loaded) => {
                 tracing::debug!(container = name, ?loaded, "its nodes are loaded");
-                Load::Loaded(loaded)
+                ContainerLoad::Loaded(loaded)
             }
             Err(why) => {
                 let observer = &self.observer;
-                observer.event(api::Level::Error, "component-refused", &why, None);
-                Load::Refused(why)
+                observer.record_event(api::Level::Error, "component-refused", &why, None);
+                ContainerLoad::Refused(why)
             }
         };
-        self.show(&name, load);
+        self.show_load(&name, load);
     }
 
-    async fn load(&self, name: &str) -> Result<Vec<String>, String> {
-        let Wanted {
+    async fn load_components(&self, name: &str) -> Result<Vec<String>, String> {
+        let ComponentPlan {
             components,
             registry,
             patience,
         } = &self.wanted;
-        let container = Container::of(Arc::clone(&self.bus), registry, name);
+        let container = ComponentContainer::new(Arc::clone(&self.bus), registry, name);
         let container = container
             .map_err(|error| format!("nothing can be loaded into the container {name}: {error}"))?;
         let components = components.get(name).map_or(&[][..], Vec::as_slice);
@@ -163,7 +164,7 @@ impl Followed {
         loaded.map_err(|error| error.to_string())
     }
 
-    fn show(&self, name: &str, load: Load) {
+    fn show_load(&self, name: &str, load: ContainerLoad) {
         self.shown
             .send_modify(|all| drop(all.insert(name.to_owned(), load)));
     }

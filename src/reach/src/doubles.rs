@@ -1,72 +1,72 @@
-//! Stand-ins of what is beside a servant's nodes, for unit tests.
+//! Test doubles of the surroundings of a servant's nodes.
 
 use std::time::SystemTime;
 
 use async_trait::async_trait;
-use link::control::{Exit, Node, Request};
+use link::control::{Exit, NodeLaunch, RequestTiming};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
 use tokio::sync::mpsc;
 
-use crate::links::{Nodes, RequestNews};
-use crate::{Linked, Observer};
+use crate::links::{NodeController, RequestUpdate};
+use crate::{Observer, StubNode};
 
-/// The nodes that stubs have started, and nothing else.
+/// Nodes started by stubs, and nothing else.
 #[derive(Default)]
-pub struct Started(Vec<Linked>);
+pub struct StubNodesDouble(Vec<StubNode>);
 
-impl Started {
-    /// The node of this name.
+impl StubNodesDouble {
+    /// Creates a double with one node of this name.
     pub fn node(name: &str) -> Self {
-        let node = Node {
+        let node = NodeLaunch {
             name: name.to_owned(),
-            ..Node::default()
+            ..NodeLaunch::default()
         };
         let given = Vec::new();
-        Self(vec![Linked { node, given }])
+        Self(vec![StubNode { node, given }])
     }
 }
 
 #[async_trait]
-impl Nodes for Started {
-    async fn start(&self, _node: &Node, _run: &str) -> Result<(), String> {
+impl NodeController for StubNodesDouble {
+    async fn start(&self, _node: &NodeLaunch, _run: &str) -> Result<(), String> {
         Ok(())
     }
     async fn signal(&self, _node: &str, _signal: i32) -> Result<(), String> {
         Ok(())
     }
-    async fn ended(&self, _node: &str) -> Exit {
+    async fn wait_exit(&self, _node: &str) -> Exit {
         Exit::default()
     }
     async fn is_running(&self, _node: &str) -> bool {
         false
     }
-    async fn running(&self) -> Vec<Linked> {
+    async fn running_nodes(&self) -> Vec<StubNode> {
         self.0.clone()
     }
-    fn parameters(&self, _node: &Node) -> Vec<(String, ParamValue)> {
+    fn parameters(&self, _node: &NodeLaunch) -> Vec<(String, ParamValue)> {
         Vec::new()
     }
-    fn translate(&self, _node: &Node, text: &str) -> String {
+    fn translate(&self, _node: &NodeLaunch, text: &str) -> String {
         text.to_owned()
     }
-    fn lines(&self, _node: &str) -> mpsc::Receiver<(bool, String)> {
+    fn output_lines(&self, _node: &str) -> mpsc::Receiver<(bool, String)> {
         mpsc::channel(1).1
     }
     fn warn(&self, _kind: &str, _text: &str) {}
 }
 
-/// Events so far: kind and message.
+/// Recorded events: kind and message.
 #[derive(Default)]
-pub struct Events(pub Mutex<Vec<(String, String)>>);
+pub struct RecordedEvents(pub Mutex<Vec<(String, String)>>);
 
-impl Observer for Events {
-    fn fits(&self, _made_of: Option<u64>, _image: &str) -> Result<(), String> {
+impl Observer for RecordedEvents {
+    fn check_stub(&self, _made_of: Option<u64>, _image: &str) -> Result<(), String> {
         Ok(())
     }
-    fn event(&self, _level: api::Level, kind: &str, message: &str, _robot: Option<&str>) {
+    fn record_event(&self, _level: api::Level, kind: &str, message: &str, _robot: Option<&str>) {
         self.0.lock().push((kind.to_owned(), message.to_owned()));
     }
-    fn served_locally(&self, _robot: &str, _node: &str, _at: SystemTime, _why: Option<&str>) {}
-    fn measured(&self, _request: &Request, _news: RequestNews) {}
+    fn on_served_locally(&self, _robot: &str, _node: &str, _at: SystemTime, _why: Option<&str>) {}
+    fn on_request_measured(&self, _request: &RequestTiming, _news: RequestUpdate) {}
 }

@@ -1,7 +1,8 @@
-//! Which hosts a servant may connect to, and at which of their addresses. A name's owner decides what it resolves to: this
-//! machine's loopback, another machine of the lab, or a cloud's metadata service. So each resolved address is checked before
-//! it is connected to ([`Route::permits`]). Public addresses are allowed; others need a line in the configuration
-//! (docs/adr/032). What is allowed is passed on from inside by [`Relays`].
+//! Egress rules: the hosts to which a servant may connect, and at which addresses. The owner of a name decides what it
+//! resolves to, which may be this machine's loopback, another machine of the lab, or a cloud metadata service.
+//! Therefore each resolved address is checked before a connection is made ([`Route::permits`]). Public addresses are
+//! allowed; others require a line in the configuration (docs/adr/032). Allowed connections are forwarded from inside by
+//! [`Relays`].
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
@@ -11,44 +12,44 @@ mod relay;
 
 pub use relay::Relays;
 
-/// What a push has to write.
+/// Syntax of a destination in a push.
 const ASKED: &str = "a HOST:PORT to connect to";
-/// What the configuration has to write.
+/// Syntax of a rule in the configuration.
 const WRITTEN: &str =
     "HOST:PORT, *:PORT, ADDRESS:PORT or ADDRESS/PREFIX:PORT (an IPv6 address in brackets)";
 
-/// Why a way out is not given.
+/// Reason why a route is refused.
 #[derive(Debug, thiserror::Error)]
-pub enum Refused {
-    /// The configuration does not allow it.
+pub enum EgressError {
+    /// No rule of the configuration allows it.
     #[error(
-        "egress {name} is not allowed here; its operator may add it to egress of [allow] in the configuration"
+        "egress {name} is not allowed here; the operator can add it to egress in [allow] of the configuration"
     )]
     NotAllowed {
-        /// The destination, as written.
+        /// Destination as written.
         name: String,
     },
-    /// It cannot be understood.
+    /// Invalid syntax.
     #[error("{name:?} is not {form}")]
     Malformed {
-        /// The destination, as written.
+        /// Destination as written.
         name: String,
-        /// What it should be.
+        /// Expected syntax.
         form: &'static str,
     },
-    /// An address that only its own name allows.
+    /// An internal address, which only a rule naming it would allow.
     #[error(
-        "egress {name} leads to {reach}, which *:{port} does not allow; its operator may name the address in [allow] of the \
-         configuration: egress = [\"{address}:{port}\"]"
+        "egress {name} leads to {reach}, which *:{port} does not allow; the operator can allow the address in [allow] \
+            of the configuration: egress = [\"{address}:{port}\"]"
     )]
     Inward {
-        /// As asked for.
+        /// Destination as requested.
         name: String,
-        /// Its address.
+        /// Address of the destination.
         address: IpAddr,
-        /// Its port.
+        /// Port of the destination.
         port: u16,
-        /// What the address leads to.
+        /// Kind of the address.
         reach: Destination,
     },
 }
@@ -56,60 +57,60 @@ pub enum Refused {
 /// One host and port that a servant may reach.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Route {
-    /// The host, as its push named it.
+    /// Host as named by the push.
     pub host: String,
-    /// The loopback address that the host's name has inside the servant.
+    /// Loopback address that stands for the host inside the servant.
     pub inside: Ipv4Addr,
-    /// The port, inside and outside.
+    /// Port, inside and outside.
     pub port: u16,
-    /// The configuration names this very host.
+    /// A rule names this host explicitly.
     by_name: bool,
-    /// Networks that the configuration names for this port.
-    networks: Vec<Network>,
+    /// Networks that rules name for this port.
+    networks: Vec<EgressNetwork>,
 }
 
-/// One line of `egress` in `[allow]`.
+/// One rule of `egress` in `[allow]`.
 #[derive(Debug, Clone, PartialEq)]
-struct Rule {
-    hosts: Hosts,
+struct EgressRule {
+    hosts: HostPattern,
     port: u16,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-enum Hosts {
-    /// `*`.
+enum HostPattern {
+    /// Any host, `*`.
     Any,
     Name(String),
-    Network(Network),
+    Network(EgressNetwork),
 }
 
-/// Addresses that begin with the same bits.
+/// An IP network in CIDR notation.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Network {
+struct EgressNetwork {
     address: IpAddr,
     prefix: u8,
 }
 
-/// The kind of an address.
+/// Kind of an address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Destination {
     /// An address of the public internet.
     Public,
     /// An address of a private network (10.0.0.0/8, 192.168.0.0/16, fd00::/8, …).
     Private,
-    /// This machine's loopback.
+    /// Loopback of this machine.
     Loopback,
     /// Another address of this machine.
     ThisMachine,
     /// A link-local address (169.254.0.0/16, fe80::/10).
     LinkLocal,
-    /// A metadata service of a cloud (169.254.169.254 and others).
+    /// A cloud metadata service (169.254.169.254 and others).
     Metadata,
     /// 0.0.0.0 or ::.
     Unspecified,
     /// A multicast address.
     Multicast,
-    /// An IPv4 address written as an IPv6 one.
+    /// An IPv4-mapped IPv6 address.
     Mapped,
     /// Any other reserved address.
     Reserved,
@@ -123,7 +124,7 @@ impl fmt::Display for Destination {
             Destination::Loopback => "a loopback address",
             Destination::ThisMachine => "an address of this machine",
             Destination::LinkLocal => "a link-local address",
-            Destination::Metadata => "an address where clouds serve metadata",
+            Destination::Metadata => "a cloud metadata address",
             Destination::Unspecified => "the unspecified address",
             Destination::Multicast => "a multicast address",
             Destination::Mapped => "an IPv4-mapped address",
@@ -132,7 +133,7 @@ impl fmt::Display for Destination {
     }
 }
 
-impl Network {
+impl EgressNetwork {
     fn contains(&self, address: IpAddr) -> bool {
         match (self.address, address) {
             (IpAddr::V4(network), IpAddr::V4(address)) => {
@@ -150,10 +151,10 @@ impl Network {
     }
 }
 
-impl FromStr for Network {
+impl FromStr for EgressNetwork {
     type Err = ();
 
-    fn from_str(text: &str) -> Result<Network, ()> {
+    fn from_str(text: &str) -> Result<EgressNetwork, ()> {
         let (address, prefix) = match text.split_once('/') {
             Some((address, prefix)) => (address, Some(prefix)),
             None => (text, None),
@@ -165,36 +166,36 @@ impl FromStr for Network {
             None => longest,
         };
         (prefix <= longest)
-            .then_some(Network { address, prefix })
+            .then_some(EgressNetwork { address, prefix })
             .ok_or(())
     }
 }
 
-impl FromStr for Rule {
-    type Err = Refused;
+impl FromStr for EgressRule {
+    type Err = EgressError;
 
-    fn from_str(text: &str) -> Result<Rule, Refused> {
-        let malformed = || Refused::Malformed {
+    fn from_str(text: &str) -> Result<EgressRule, EgressError> {
+        let malformed = || EgressError::Malformed {
             name: text.to_owned(),
             form: WRITTEN,
         };
-        let (host, port) = split(text).ok_or_else(malformed)?;
+        let (host, port) = split_host_port(text).ok_or_else(malformed)?;
         let bare = host
             .strip_prefix('[')
             .and_then(|host| host.strip_suffix(']'));
         let hosts = match bare.unwrap_or(host) {
-            "*" => Hosts::Any,
+            "*" => HostPattern::Any,
             host => match host.parse() {
-                Ok(network) => Hosts::Network(network),
-                Err(()) if bare.is_none() && is_name(host) => Hosts::Name(host.to_owned()),
+                Ok(network) => HostPattern::Network(network),
+                Err(()) if bare.is_none() && is_name(host) => HostPattern::Name(host.to_owned()),
                 Err(()) => return Err(malformed()),
             },
         };
-        Ok(Rule { hosts, port })
+        Ok(EgressRule { hosts, port })
     }
 }
 
-fn split(text: &str) -> Option<(&str, u16)> {
+fn split_host_port(text: &str) -> Option<(&str, u16)> {
     let (host, port) = text.rsplit_once(':')?;
     let port = port.parse().ok().filter(|port| *port != 0)?;
     Some((host, port))
@@ -205,27 +206,28 @@ fn is_name(host: &str) -> bool {
     !host.is_empty() && host.chars().all(plain)
 }
 
-/// Refuses a configuration (`egress` in `[allow]`) in which something cannot be understood.
-pub fn check(allowed: &[String]) -> Result<(), Refused> {
+/// Validates the rules of `egress` in `[allow]`.
+pub fn validate(allowed: &[String]) -> Result<(), EgressError> {
     allowed
         .iter()
-        .try_for_each(|text| text.parse::<Rule>().map(drop))
+        .try_for_each(|text| text.parse::<EgressRule>().map(drop))
 }
 
-/// Each host `asked` for, if it is `allowed`. One address inside for each host, so that several can be reached on the same port.
-pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, Refused> {
-    let rules: Vec<Rule> = allowed
+/// Returns the routes to the hosts `asked` for, if they are `allowed`. Each host gets one address inside, so that
+/// several can be reached on the same port.
+pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, EgressError> {
+    let rules: Vec<EgressRule> = allowed
         .iter()
         .map(|text| text.parse())
         .collect::<Result<_, _>>()?;
     let mut hosts: Vec<&str> = Vec::new();
     let mut routes = Vec::new();
     for name in asked {
-        let malformed = || Refused::Malformed {
+        let malformed = || EgressError::Malformed {
             name: name.clone(),
             form: ASKED,
         };
-        let (host, port) = split(name).ok_or_else(malformed)?;
+        let (host, port) = split_host_port(name).ok_or_else(malformed)?;
         if !is_name(host) {
             return Err(malformed());
         }
@@ -236,7 +238,7 @@ pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, Refuse
                 hosts.push(host);
                 hosts.len() - 1
             });
-        // 127.0.1.1 and on: 127.0.0.1 is the servant's own.
+        // 127.0.1.1 and up: 127.0.0.1 is the servant's own.
         let number = u8::try_from(index + 1).map_err(|_| malformed())?;
         routes.push(route(
             name,
@@ -249,10 +251,10 @@ pub fn routes(asked: &[String], allowed: &[String]) -> Result<Vec<Route>, Refuse
     Ok(routes)
 }
 
-/// Names of the hosts `asked` for, if they are `allowed`, each with the address inside that stands for it.
-pub fn hosts(asked: &[String], allowed: &[String]) -> Result<Vec<(IpAddr, String)>, Refused> {
+/// Returns the names of the hosts `asked` for, if they are `allowed`, each with its address inside.
+pub fn hosts(asked: &[String], allowed: &[String]) -> Result<Vec<(IpAddr, String)>, EgressError> {
     let routes = routes(asked, allowed)?.into_iter();
-    // What is an address already has no name.
+    // IP addresses have no name.
     let named = routes.filter(|route| route.host.parse::<IpAddr>().is_err());
     Ok(named
         .map(|route| (IpAddr::V4(route.inside), route.host))
@@ -264,23 +266,24 @@ fn route(
     host: &str,
     port: u16,
     inside: Ipv4Addr,
-    rules: &[Rule],
-) -> Result<Route, Refused> {
+    rules: &[EgressRule],
+) -> Result<Route, EgressError> {
     let literal: Option<IpAddr> = host.parse().ok();
     let of_port = || rules.iter().filter(|rule| rule.port == port);
-    let networks: Vec<Network> = of_port()
+    let networks: Vec<EgressNetwork> = of_port()
         .filter_map(|rule| match rule.hosts {
-            Hosts::Network(network) => Some(network),
+            HostPattern::Network(network) => Some(network),
             _ => None,
         })
         .collect();
-    let by_name = of_port()
-        .any(|rule| matches!(&rule.hosts, Hosts::Name(known) if known.eq_ignore_ascii_case(host)));
-    let any = of_port().any(|rule| rule.hosts == Hosts::Any);
+    let by_name = of_port().any(
+        |rule| matches!(&rule.hosts, HostPattern::Name(known) if known.eq_ignore_ascii_case(host)),
+    );
+    let any = of_port().any(|rule| rule.hosts == HostPattern::Any);
     let in_network =
         literal.is_some_and(|address| networks.iter().any(|network| network.contains(address)));
     if !(any || by_name || in_network) {
-        return Err(Refused::NotAllowed {
+        return Err(EgressError::NotAllowed {
             name: name.to_owned(),
         });
     }
@@ -291,9 +294,9 @@ fn route(
         by_name,
         networks,
     };
-    // What is an address already need not wait for its first connection.
+    // A literal address is checked immediately, not at its first connection.
     match literal.map(|address| (address, route.permits(address))) {
-        Some((address, Err(reach))) => Err(Refused::Inward {
+        Some((address, Err(reach))) => Err(EgressError::Inward {
             name: name.to_owned(),
             address,
             port,
@@ -304,7 +307,8 @@ fn route(
 }
 
 impl Route {
-    /// Whether this address, to which the host was resolved, may be dialled; else what it leads to.
+    /// Returns whether a connection may be made to this address, to which the host was resolved; otherwise the kind of
+    /// the address.
     pub fn permits(&self, address: IpAddr) -> Result<(), Destination> {
         if self
             .networks
@@ -313,9 +317,9 @@ impl Route {
         {
             return Ok(());
         }
-        match reach(address) {
+        match classify_address(address) {
             Destination::Public => Ok(()),
-            // Whoever names a host of their own network means that.
+            // An operator who names a host of their own network means that.
             Destination::Private | Destination::ThisMachine if self.by_name => Ok(()),
             Destination::Loopback
                 if self.by_name && self.host.eq_ignore_ascii_case("localhost") =>
@@ -327,29 +331,29 @@ impl Route {
     }
 }
 
-/// What an address leads to, seen from this machine.
-fn reach(address: IpAddr) -> Destination {
+/// Classifies an address as seen from this machine.
+fn classify_address(address: IpAddr) -> Destination {
     let reach = match address {
-        IpAddr::V4(address) => of_v4(address),
-        IpAddr::V6(address) => of_v6(address),
+        IpAddr::V4(address) => classify_v4(address),
+        IpAddr::V6(address) => classify_v6(address),
     };
     let may_be_ours = matches!(reach, Destination::Public | Destination::Private);
-    if may_be_ours && is_of_this_machine(address) {
+    if may_be_ours && is_local_address(address) {
         Destination::ThisMachine
     } else {
         reach
     }
 }
 
-/// Whether an address is this machine's: the kernel binds only its own addresses.
-fn is_of_this_machine(address: IpAddr) -> bool {
+/// Returns whether an address belongs to this machine: the kernel binds only its own addresses.
+fn is_local_address(address: IpAddr) -> bool {
     std::net::UdpSocket::bind((address, 0)).is_ok()
 }
 
-/// By the registry of special-purpose addresses (IANA, RFC 6890).
-fn of_v4(address: Ipv4Addr) -> Destination {
+/// Classifies an address by the special-purpose address registry (IANA, RFC 6890).
+fn classify_v4(address: Ipv4Addr) -> Destination {
     match address.octets() {
-        // Alibaba's, in the space that RFC 6598 shares out; Oracle's; Azure's, which looks public.
+        // Alibaba's, in the shared space of RFC 6598; Oracle's; Azure's, which looks public.
         [100, 100, 100, 200] | [192, 0, 0, 192] | [168, 63, 129, 16] => Destination::Metadata,
         [169, 254, 169, 253 | 254] | [169, 254, 170, 2 | 23] => Destination::Metadata,
         [169, 254, ..] => Destination::LinkLocal,
@@ -366,12 +370,12 @@ fn of_v4(address: Ipv4Addr) -> Destination {
     }
 }
 
-/// By the registry of special-purpose addresses (IANA, RFC 6890).
-fn of_v6(address: Ipv6Addr) -> Destination {
+/// Classifies an address by the special-purpose address registry (IANA, RFC 6890).
+fn classify_v6(address: Ipv6Addr) -> Destination {
     let segments = address.segments();
     let [.., above, below] = segments;
     let embedded = |above: u16, below: u16| {
-        of_v4(Ipv4Addr::from_bits(
+        classify_v4(Ipv4Addr::from_bits(
             u32::from(above) << 16 | u32::from(below),
         ))
     };
@@ -381,7 +385,7 @@ fn of_v6(address: Ipv6Addr) -> Destination {
         [0, 0, 0, 0, 0, 0xffff, ..] => Destination::Mapped,
         // Amazon's.
         [0xfd00, 0xec2, 0, 0, 0, 0, 0, 0x254] => Destination::Metadata,
-        // Through a translator to IPv4 (RFC 6052), by a relay to IPv4 (RFC 3056).
+        // NAT64 (RFC 6052) and 6to4 (RFC 3056).
         [0x64, 0xff9b, 0, 0, 0, 0, ..] => embedded(above, below),
         [0x2002, above, below, ..] => embedded(above, below),
         [0xfe80..=0xfebf, ..] => Destination::LinkLocal,
@@ -397,17 +401,17 @@ fn of_v6(address: Ipv6Addr) -> Destination {
 mod tests {
     use super::*;
 
-    fn list(written: &[&str]) -> Vec<String> {
+    fn to_strings(written: &[&str]) -> Vec<String> {
         written.iter().map(|text| (*text).to_owned()).collect()
     }
 
-    fn out(allowed: &[&str], asked: &[&str]) -> Result<Vec<Route>, Refused> {
-        routes(&list(asked), &list(allowed))
+    fn resolve_routes(allowed: &[&str], asked: &[&str]) -> Result<Vec<Route>, EgressError> {
+        routes(&to_strings(asked), &to_strings(allowed))
     }
 
-    /// Whether a host that the rules allow may be dialled at an address.
-    fn dials(allowed: &[&str], asked: &str, address: &str) -> bool {
-        let routes = out(allowed, &[asked]).expect("allowed");
+    /// Returns whether a host that the rules allow may be dialled at an address.
+    fn can_dial(allowed: &[&str], asked: &str, address: &str) -> bool {
+        let routes = resolve_routes(allowed, &[asked]).expect("allowed");
         routes[0]
             .permits(address.parse().expect("an address"))
             .is_ok()
@@ -415,7 +419,7 @@ mod tests {
 
     #[test]
     fn each_host_has_an_address_inside() {
-        let routes = out(
+        let routes = resolve_routes(
             &["models.example.org:443", "*:80"],
             &[
                 "models.example.org:443",
@@ -432,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_allowed_is_named_with_the_way_out() {
+    fn refusals_name_the_destination_and_the_remedy() {
         let allowed = ["models.example.org:443", "*:80", "10.1.0.0/16:5000"];
         for (asked, words) in [
             ("a.example:443", "egress a.example:443 is not allowed"),
@@ -443,16 +447,18 @@ mod tests {
             ("*:80", "HOST:PORT"),
             ("127.0.0.1:80", "leads to a loopback address"),
             ("127.0.0.1:80", r#"egress = ["127.0.0.1:80"]"#),
-            ("169.254.169.254:80", "where clouds serve metadata"),
+            ("169.254.169.254:80", "leads to a cloud metadata address"),
         ] {
-            let refused = out(&allowed, &[asked]).expect_err(asked).to_string();
+            let refused = resolve_routes(&allowed, &[asked])
+                .expect_err(asked)
+                .to_string();
             assert!(refused.contains(words), "{refused}");
         }
-        out(&allowed, &["10.1.2.3:5000"]).expect("in the network");
+        resolve_routes(&allowed, &["10.1.2.3:5000"]).expect("in the network");
     }
 
     #[test]
-    fn whatever_a_name_leads_to_inward_is_refused() {
+    fn names_that_resolve_to_internal_addresses_are_refused() {
         for address in [
             "127.0.0.1",
             "127.8.8.8",
@@ -487,7 +493,7 @@ mod tests {
             "fd12:3456::1",
             "ff02::1",
         ] {
-            assert!(!dials(&["*:80"], "a.example:80", address), "{address}");
+            assert!(!can_dial(&["*:80"], "a.example:80", address), "{address}");
         }
         for address in [
             "8.8.8.8",
@@ -495,7 +501,7 @@ mod tests {
             "2606:4700::1111",
             "64:ff9b::808:808",
         ] {
-            assert!(dials(&["*:80"], "a.example:80", address), "{address}");
+            assert!(can_dial(&["*:80"], "a.example:80", address), "{address}");
         }
     }
 
@@ -503,7 +509,7 @@ mod tests {
     fn a_named_host_may_be_of_the_labs_own_network() {
         let named = ["a.lab:80"];
         for address in ["10.0.0.1", "192.168.7.7", "fd12:3456::1", "8.8.8.8"] {
-            assert!(dials(&named, "a.lab:80", address), "{address}");
+            assert!(can_dial(&named, "a.lab:80", address), "{address}");
         }
         for address in [
             "127.0.0.1",
@@ -512,27 +518,27 @@ mod tests {
             "fd00:ec2::254",
             "fe80::1",
         ] {
-            assert!(!dials(&named, "a.lab:80", address), "{address}");
+            assert!(!can_dial(&named, "a.lab:80", address), "{address}");
         }
-        assert!(dials(&["localhost:80"], "localhost:80", "127.0.0.1"));
-        assert!(!dials(&["localhost:80"], "localhost:80", "169.254.1.1"));
+        assert!(can_dial(&["localhost:80"], "localhost:80", "127.0.0.1"));
+        assert!(!can_dial(&["localhost:80"], "localhost:80", "169.254.1.1"));
     }
 
     #[test]
     fn addresses_that_are_named_may_be_reached() {
         let named = ["*:80", "127.0.0.1:80", "[fe80::/10]:80", "10.1.0.0/16:80"];
         for address in ["127.0.0.1", "fe80::7", "10.1.255.255"] {
-            assert!(dials(&named, "a.example:80", address), "{address}");
+            assert!(can_dial(&named, "a.example:80", address), "{address}");
         }
         for address in ["127.0.0.2", "10.2.0.0", "::1", "::ffff:127.0.0.1"] {
-            assert!(!dials(&named, "a.example:80", address), "{address}");
+            assert!(!can_dial(&named, "a.example:80", address), "{address}");
         }
-        assert!(!dials(
+        assert!(!can_dial(
             &["*:80", "10.1.0.0/16:81"],
             "a.example:80",
             "10.1.0.1"
         ));
-        assert!(dials(
+        assert!(can_dial(
             &["*:80", "0.0.0.0/0:80"],
             "a.example:80",
             "127.0.0.1"
@@ -541,11 +547,9 @@ mod tests {
 
     #[test]
     fn an_address_of_this_machine_is_not_the_internet() {
-        // Whatever is bound on loopback is told apart from what is not.
-        assert!(is_of_this_machine("127.0.0.1".parse().expect("an address")));
-        assert!(!is_of_this_machine(
-            "192.0.2.1".parse().expect("an address")
-        ));
+        // Addresses that can be bound are distinguished from those that cannot.
+        assert!(is_local_address("127.0.0.1".parse().expect("an address")));
+        assert!(!is_local_address("192.0.2.1".parse().expect("an address")));
     }
 
     #[test]
@@ -559,13 +563,15 @@ mod tests {
             ":80",
             "::1:80:",
         ] {
-            let refused = check(&list(&["*:80", text])).expect_err(text).to_string();
+            let refused = validate(&to_strings(&["*:80", text]))
+                .expect_err(text)
+                .to_string();
             assert!(
                 refused.contains(text) && refused.contains("HOST:PORT"),
                 "{refused}"
             );
         }
-        check(&list(&[
+        validate(&to_strings(&[
             "*:80",
             "a-b.example:443",
             "[::1]:80",

@@ -1,4 +1,5 @@
-//! Tells the bus of a servant when one of its processes has ended: the engine that waits for it knows that first.
+//! Notifies the bus of a servant when one of its processes has exited; the engine, which waits for the process, knows
+//! first.
 
 use std::sync::Arc;
 
@@ -8,30 +9,30 @@ use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::task::AbortHandle;
 
-/// Tells it until it is dropped.
-pub(crate) struct Endings {
+/// Notifies the bus until it is dropped.
+pub(crate) struct ExitNotifier {
     task: AbortHandle,
 }
 
-impl Drop for Endings {
+impl Drop for ExitNotifier {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Endings {
-    pub(crate) fn follow(events: Receiver<NodeEvent>, bus: Arc<dyn Bus>) -> Endings {
-        let told = follow(events, move || bus.process_ended());
-        Endings {
+impl ExitNotifier {
+    pub(crate) fn start(events: Receiver<NodeEvent>, bus: Arc<dyn Bus>) -> ExitNotifier {
+        let told = forward_exits(events, move || bus.on_process_exit());
+        ExitNotifier {
             task: tokio::spawn(told).abort_handle(),
         }
     }
 }
 
-async fn follow(mut events: Receiver<NodeEvent>, ended: impl Fn()) {
+async fn forward_exits(mut events: Receiver<NodeEvent>, ended: impl Fn()) {
     loop {
         match events.recv().await {
-            // What was missed may have been one.
+            // A missed event may have been an exit.
             Ok(NodeEvent::Exited { .. }) | Err(RecvError::Lagged(_)) => ended(),
             Ok(_) => {}
             Err(RecvError::Closed) => return,
@@ -47,7 +48,7 @@ mod tests {
 
     use super::*;
 
-    fn exited() -> NodeEvent {
+    fn exit_event() -> NodeEvent {
         NodeEvent::Exited {
             node: "/a".into(),
             code: None,
@@ -56,15 +57,15 @@ mod tests {
         }
     }
 
-    /// How often it was told of the end of a process.
-    async fn told(events: &[NodeEvent]) -> usize {
+    /// Returns the number of notifications for these events.
+    async fn count_notifications(events: &[NodeEvent]) -> usize {
         let (sender, receiver) = broadcast::channel(4);
         for event in events {
             sender.send(event.clone()).expect("somebody listens");
         }
         drop(sender);
         let count = AtomicUsize::new(0);
-        follow(receiver, || {
+        forward_exits(receiver, || {
             count.fetch_add(1, Ordering::Relaxed);
         })
         .await;
@@ -75,7 +76,7 @@ mod tests {
     async fn each_end_of_a_process_is_told_and_nothing_else() {
         let started = NodeEvent::Started { node: "/a".into() };
         assert_eq!(
-            told(&[started.clone(), exited(), started, exited()]).await,
+            count_notifications(&[started.clone(), exit_event(), started, exit_event()]).await,
             2
         );
     }
@@ -83,7 +84,7 @@ mod tests {
     #[tokio::test]
     async fn ends_that_were_missed_are_told() {
         let started = || NodeEvent::Started { node: "/a".into() };
-        let events = [exited(), started(), started(), started(), started()];
-        assert_eq!(told(&events).await, 1);
+        let events = [exit_event(), started(), started(), started(), started()];
+        assert_eq!(count_notifications(&events).await, 1);
     }
 }

@@ -1,9 +1,9 @@
-//! How a node ended, in words.
+//! Descriptions of how a node exited.
 
 use servant::engine::NodeExit;
 
-/// How it ended, beginning with a verb; `limits` are its servant's.
-pub fn how_it_ended(exit: &NodeExit, limits: &api::Limits) -> String {
+/// Describes how a node exited, beginning with a verb; `limits` are those of its servant.
+pub fn describe_exit(exit: &NodeExit, limits: &api::Limits) -> String {
     if let Some(error) = &exit.exec_error {
         return format!("could not be executed: {error}");
     }
@@ -76,7 +76,7 @@ mod tests {
             ),
         ];
         for (exit, words) in cases {
-            assert_eq!(how_it_ended(&exit, &limits), words);
+            assert_eq!(describe_exit(&exit, &limits), words);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Tasks beside nodes of a servant: one for each node that is of interest, for as long as it is there.
+//! Runs one task for each node of interest in a servant, for as long as the node exists.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,9 +7,10 @@ use ros::bus::Graph;
 use tokio::sync::watch;
 use tokio::task::{AbortHandle, JoinSet};
 
-/// Begins a task for each node that `of_interest` names, when it appears, and ends it when the node is gone, which `gone` is then
-/// told; but for the node that is `ours`. Comes back when the graph is not told any more; dropping this ends all tasks.
-pub(crate) async fn each_node<F>(
+/// Starts a task when a node named by `of_interest` appears, except the node `ours`, and aborts it when the node is
+/// gone, after which `gone` is called. Returns when the graph is no longer updated; dropping the future aborts all
+/// tasks.
+pub(crate) async fn run_for_each_node<F>(
     mut graph: watch::Receiver<Arc<Graph>>,
     ours: &str,
     of_interest: impl Fn(&Graph) -> Vec<String>,
@@ -18,9 +19,9 @@ pub(crate) async fn each_node<F>(
 ) where
     F: Future<Output = ()> + Send + 'static,
 {
-    // By name and address: a node that was started again begins again.
+    // Keyed by name and address, so that a restarted node gets a new task.
     let mut known: HashMap<(String, String), AbortHandle> = HashMap::new();
-    // They end with this.
+    // Dropped, and thereby aborted, together with this future.
     let mut tasks = JoinSet::new();
     loop {
         let now = Arc::clone(&graph.borrow_and_update());
@@ -57,7 +58,7 @@ mod tests {
 
     use super::*;
 
-    /// Only bounds how long a failing test takes.
+    /// Only limits the duration of a failing test.
     const LONG: Duration = Duration::from_secs(60);
 
     fn graph(nodes: &[(&str, &str)]) -> Arc<Graph> {
@@ -69,10 +70,10 @@ mod tests {
         })
     }
 
-    /// Tells its end.
-    struct Runs(String, mpsc::UnboundedSender<String>);
+    /// Reports when it is dropped.
+    struct TaskProbe(String, mpsc::UnboundedSender<String>);
 
-    impl Drop for Runs {
+    impl Drop for TaskProbe {
         fn drop(&mut self) {
             let _ = self.1.send(format!("ended {}", self.0));
         }
@@ -89,7 +90,7 @@ mod tests {
                 nodes.filter(|name| *name != "/other").cloned().collect()
             };
             let begin = |node: String| {
-                let runs = Runs(node, begun.clone());
+                let runs = TaskProbe(node, begun.clone());
                 async move {
                     let _ = runs.1.send(format!("began {}", runs.0));
                     std::future::pending().await
@@ -98,7 +99,7 @@ mod tests {
             let gone = |node: &str| {
                 let _ = left.send(format!("gone {node}"));
             };
-            each_node(seen, "/ours", of_interest, begin, gone).await;
+            run_for_each_node(seen, "/ours", of_interest, begin, gone).await;
         });
         let mut next = async |count: usize| {
             let mut heard = Vec::new();

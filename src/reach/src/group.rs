@@ -1,5 +1,5 @@
-//! Servants that answer many robots: each request of a robot goes to one of them ([`dispatch`]), its answer to the robot that
-//! asked.
+//! Groups of servants shared by many robots: each request of a robot is dispatched to one of them ([`dispatch`]), and
+//! its response goes to that robot.
 //!
 //! ```text
 //!  robot A ─▶ Bridge, links ─▶ GroupBus A ─┐             ┌─▶ Bus of servant 1
@@ -7,9 +7,9 @@
 //!  robot B ─▶ Bridge, links ─▶ GroupBus B ─┘             └─▶ Bus of servant 2
 //! ```
 //!
-//! A robot reaches the group by buses of its own that show services and actions of the interface, and nothing else: no
-//! topic, no parameter, no node of another robot. Its rosbridge clients have the deployer's names, its stubs those that the
-//! nodes would have on the robot. What can be shared so is told by [`shareable`].
+//! A robot reaches the group through buses of its own, which show the services and actions of the interface and nothing
+//! else: no topic, no parameter, no node of another robot. Its rosbridge clients see the deployer's names, its stubs
+//! the names that the nodes would have on the robot. [`shareable`] decides what can be shared.
 
 mod action_ends;
 mod action_parts;
@@ -40,46 +40,50 @@ use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep_until, timeout};
 
-use dispatch::{Dispatcher, End, Kind, Load, Lost, Member, Order, Robot, Rules, Ticket};
+use dispatch::{
+    AttemptOutcome, DispatchOrder, Dispatcher, GroupLoad, Kind, LossReason, Member, RobotNumber,
+    Rules, Ticket,
+};
 
-use view::View;
+use view::GroupView;
 
-pub use seat::seat;
+pub use seat::open_seat;
 
-/// A servant that did not take a request is asked again when its graph has changed, and not sooner than after this.
+/// Minimum pause before a servant that did not take a request is asked again; after it, a change of its graph is
+/// awaited.
 const PAUSE: Duration = Duration::from_millis(100);
-/// The longest such pause.
+/// Maximum pause, if its graph does not change.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
-/// A mean of less tells of single requests.
+/// Minimum time over which the mean load is computed; shorter spans would reflect single requests.
 const SPAN: Duration = Duration::from_millis(200);
 
-/// What was counted of a group's requests.
+/// Counters of a group's requests.
 #[derive(Debug, Default)]
-pub struct Counts {
-    /// Answered, be it that the node said no.
+pub struct GroupCounters {
+    /// Requests answered, including by an error of the node.
     pub answered: AtomicU64,
-    /// Failed, since their servant was lost or none was there in time.
+    /// Requests failed because their servant was lost or none was available in time.
     pub failed: AtomicU64,
-    /// Asked again after their servant was lost.
+    /// Requests retried after their servant was lost.
     pub asked_again: AtomicU64,
-    /// How many answers were timed lately, and microseconds in all.
+    /// Number of recent responses timed, and sum of their times in microseconds.
     times: Mutex<(u64, u64)>,
-    /// Work of replicas that nobody needed: one more for each answer that came second or was not waited for.
+    /// Redundant work of replicas: responses that came second or were abandoned.
     pub wasted: AtomicU64,
 }
 
-/// Of so many answers the mean is of late; older ones count half.
+/// Number of responses over which the mean is computed; older ones count half.
 const LATELY: u64 = 200;
 
-impl Counts {
-    /// Mean time from a request to its answer, of late.
-    pub fn mean(&self) -> Option<Duration> {
+impl GroupCounters {
+    /// Returns the recent mean response time.
+    pub fn mean_response_time(&self) -> Option<Duration> {
         let (count, micros) = *self.times.lock();
         micros.checked_div(count).map(Duration::from_micros)
     }
 
-    fn answered(&self, took: Duration) {
+    fn record_answer(&self, took: Duration) {
         self.answered.fetch_add(1, Ordering::Relaxed);
         let mut times = self.times.lock();
         if times.0 >= LATELY {
@@ -91,50 +95,50 @@ impl Counts {
 }
 
 /// The servants of one revision that answer together, and the requests of their robots.
-pub struct Group {
+pub struct ServantGroup {
     ros: RosVersion,
     distribution: String,
     interface: Interface,
-    /// What parameters its nodes had when the interface was found, by name.
+    /// Parameter values of the nodes when the interface was recorded, by name.
     values: BTreeMap<String, serde_json::Value>,
     state: Mutex<State>,
-    members: watch::Sender<BTreeMap<Member, Arc<Servant>>>,
-    /// What robots see of the interface as it was deployed.
-    whole: Arc<View>,
-    counts: Counts,
+    members: watch::Sender<BTreeMap<Member, Arc<MemberServant>>>,
+    /// View of the interface as it was deployed.
+    whole: Arc<GroupView>,
+    counts: GroupCounters,
     robots: AtomicU64,
 }
 
-/// What is decided under one lock.
+/// State protected by one lock.
 struct State {
     dispatcher: Dispatcher,
-    doors: HashMap<Ticket, mpsc::UnboundedSender<Told>>,
-    /// Requests times microseconds, and until when they are counted.
+    doors: HashMap<Ticket, mpsc::UnboundedSender<DispatchEvent>>,
+    /// Integral of the number of requests over time in microseconds, and the time up to which it was computed.
     busy: (u128, Instant),
-    /// Requests at a time in the mean, until then.
+    /// Mean number of concurrent requests, and the time up to which it was computed.
     mean: (f64, Instant),
 }
 
-/// What whoever follows a request is told.
-enum Told {
-    Ask(Arc<Servant>),
-    Drop(Arc<Servant>),
-    Fail(Lost),
+/// An event for the owner of a request.
+enum DispatchEvent {
+    Ask(Arc<MemberServant>),
+    Drop(Arc<MemberServant>),
+    Fail(LossReason),
 }
 
-/// One servant.
-struct Servant {
+/// One servant of the group.
+struct MemberServant {
     member: Member,
-    /// The servant's id.
+    /// Servant id.
     id: String,
     bus: Arc<dyn Bus>,
     actions: Mutex<HashMap<String, Arc<dyn ActionClient>>>,
-    /// Why it left.
+    /// Reason why it left.
     gone: OnceLock<String>,
 }
 
-impl Servant {
-    /// The action, to send goals to; opened once.
+impl MemberServant {
+    /// Returns a client of the action, which is opened once.
     fn action(&self, name: &str, of: &Arc<ActionDef>) -> Result<Arc<dyn ActionClient>, BusError> {
         let mut actions = self.actions.lock();
         if let Some(known) = actions.get(name) {
@@ -145,34 +149,34 @@ impl Servant {
         Ok(opened)
     }
 
-    /// The action could not be opened: whoever needs it next opens it anew.
+    /// Forgets an action that could not be opened; the next user opens it again.
     fn forget_action(&self, name: &str) {
         self.actions.lock().remove(name);
     }
 }
 
-impl Group {
-    /// One without servants, for robots of a service with this interface.
+impl ServantGroup {
+    /// Creates a group without servants for robots of a service with this interface.
     pub fn new(
         ros: RosVersion,
         distribution: &str,
         interface: &Interface,
         rules: Rules,
-    ) -> Arc<Group> {
+    ) -> Arc<ServantGroup> {
         let values = interface.parameters.iter().filter_map(|parameter| {
             let value = parameter.value.clone()?;
             Some((parameter.name.clone(), value))
         });
         let values = values.collect();
-        let interface = shareable::shown(interface);
-        let whole = Arc::new(View::whole(ros, &interface));
+        let interface = shareable::shared_interface(interface);
+        let whole = Arc::new(GroupView::deployed(ros, &interface));
         let state = State {
             dispatcher: Dispatcher::new(rules),
             doors: HashMap::new(),
             busy: (0, Instant::now()),
             mean: (0.0, Instant::now()),
         };
-        Arc::new(Group {
+        Arc::new(ServantGroup {
             ros,
             distribution: distribution.to_owned(),
             interface,
@@ -180,17 +184,17 @@ impl Group {
             state: Mutex::new(state),
             members: watch::Sender::default(),
             whole,
-            counts: Counts::default(),
+            counts: GroupCounters::default(),
             robots: AtomicU64::new(0),
         })
     }
 
-    /// A servant answers from now on; gives its number.
+    /// Adds a servant; returns its number.
     pub fn join(&self, id: &str, bus: Arc<dyn Bus>) -> Member {
         let mut servant = None;
         self.members.send_modify(|members| {
             let member = self.robots.fetch_add(1, Ordering::Relaxed);
-            let joins = Arc::new(Servant {
+            let joins = Arc::new(MemberServant {
                 member,
                 id: id.to_owned(),
                 bus,
@@ -205,17 +209,17 @@ impl Group {
         member
     }
 
-    /// A servant is asked no more, and ends what it works at.
+    /// Sends no further requests to a servant, which finishes what it is working on.
     pub fn retire(&self, member: Member) {
         self.decide(|dispatcher| ((), dispatcher.retire(member)));
     }
 
-    /// A servant that was to be asked no more is asked again.
-    pub fn take_back(&self, member: Member) {
-        self.decide(|dispatcher| ((), dispatcher.take_back(member)));
+    /// Sends requests to a retired servant again.
+    pub fn reinstate(&self, member: Member) {
+        self.decide(|dispatcher| ((), dispatcher.reinstate(member)));
     }
 
-    /// A servant is gone, for this reason.
+    /// Removes a servant that is gone for this reason.
     pub fn leave(&self, member: Member, reason: &str) {
         let servant = self.members.borrow().get(&member).cloned();
         if let Some(servant) = servant {
@@ -227,78 +231,78 @@ impl Group {
         });
     }
 
-    /// How much is to be done now.
-    pub fn load(&self) -> Load {
+    /// Returns the current load.
+    pub fn load(&self) -> GroupLoad {
         self.state.lock().dispatcher.load()
     }
 
-    /// Requests that a servant works at.
-    pub fn load_of(&self, member: Member) -> usize {
-        self.state.lock().dispatcher.load_of(member)
+    /// Returns the number of requests a servant is working on.
+    pub fn member_load(&self, member: Member) -> usize {
+        self.state.lock().dispatcher.member_load(member)
     }
 
-    /// How many requests there have been at a time in the mean, since this was asked last: over [`SPAN`] at least, until then what
-    /// it was before.
+    /// Returns the mean number of concurrent requests since the last call, over at least [`SPAN`]; before that, the
+    /// previous value.
     pub fn mean_load(&self) -> f64 {
         let mut state = self.state.lock();
         let now = Instant::now();
         let span = now.saturating_duration_since(state.mean.1);
         if span >= SPAN {
-            state.count(now);
+            state.accumulate_load(now);
             let busy = std::mem::take(&mut state.busy.0);
             state.mean = (busy as f64 / span.as_micros() as f64, now);
         }
         state.mean.0
     }
 
-    /// What was counted.
-    pub fn counts(&self) -> &Counts {
+    /// Returns the counters.
+    pub fn counts(&self) -> &GroupCounters {
         &self.counts
     }
 
-    /// Decides, and tells those whose requests it concerns.
-    fn decide<T>(&self, by: impl FnOnce(&mut Dispatcher) -> (T, Vec<Order>)) -> T {
+    /// Updates the dispatcher and delivers the resulting orders.
+    fn decide<T>(&self, by: impl FnOnce(&mut Dispatcher) -> (T, Vec<DispatchOrder>)) -> T {
         let mut state = self.state.lock();
-        state.count(Instant::now());
+        state.accumulate_load(Instant::now());
         let (done, orders) = by(&mut state.dispatcher);
-        self.tell(&mut state, orders);
+        self.deliver_orders(&mut state, orders);
         done
     }
 
-    fn tell(&self, state: &mut State, orders: Vec<Order>) {
+    fn deliver_orders(&self, state: &mut State, orders: Vec<DispatchOrder>) {
         if orders.is_empty() {
             return;
         }
         let members = self.members.borrow();
         for order in orders {
             let (ticket, told) = match order {
-                Order::Ask(ticket, member) => match members.get(&member) {
-                    Some(servant) => (ticket, Told::Ask(Arc::clone(servant))),
+                DispatchOrder::Ask(ticket, member) => match members.get(&member) {
+                    Some(servant) => (ticket, DispatchEvent::Ask(Arc::clone(servant))),
                     None => continue,
                 },
-                Order::Drop(ticket, member) => match members.get(&member) {
-                    Some(servant) => (ticket, Told::Drop(Arc::clone(servant))),
+                DispatchOrder::Drop(ticket, member) => match members.get(&member) {
+                    Some(servant) => (ticket, DispatchEvent::Drop(Arc::clone(servant))),
                     None => continue,
                 },
-                Order::Fail(ticket, why) => (ticket, Told::Fail(why)),
+                DispatchOrder::Fail(ticket, why) => (ticket, DispatchEvent::Fail(why)),
             };
             if let Some(door) = state.doors.get(&ticket) {
-                // Whoever has stopped listening withdraws it.
+                // An owner that has stopped listening withdraws the request itself.
                 let _ = door.send(told);
             }
         }
     }
 
-    /// Begins to ask for something.
-    fn begin(self: &Arc<Self>, robot: Robot, kind: Kind) -> Errand {
+    /// Queues a request.
+    fn begin_request(self: &Arc<Self>, robot: RobotNumber, kind: Kind) -> PendingRequest {
         let (door, told) = mpsc::unbounded_channel();
         let mut state = self.state.lock();
-        state.count(Instant::now());
+        state.accumulate_load(Instant::now());
         let (ticket, orders) = state.dispatcher.ask(robot, &kind);
         state.doors.insert(ticket, door);
-        self.tell(&mut state, orders);
+        self.deliver_orders(&mut state, orders);
         drop(state);
-        Errand {
+        PendingRequest {
             group: Arc::clone(self),
             kind,
             ticket,
@@ -307,9 +311,9 @@ impl Group {
         }
     }
 
-    /// A servant that did not take a request, or lost it, is asked again soon: a node that is being started again registers its
-    /// services.
-    fn resume_later(self: &Arc<Self>, servant: &Servant, kind: &Kind) {
+    /// Schedules another attempt with a servant that did not take a request or lost it: a restarting node registers its
+    /// services again.
+    fn resume_later(self: &Arc<Self>, servant: &MemberServant, kind: &Kind) {
         let (group, member, kind) = (Arc::downgrade(self), servant.member, kind.clone());
         let mut graph = servant.bus.graph();
         graph.mark_unchanged();
@@ -322,35 +326,36 @@ impl Group {
         });
     }
 
-    /// Calls a service for a robot: one servant, or as many as are to work at it, and the first answer.
+    /// Calls a service for a robot at one or more servants and returns the first response.
     async fn call(
         self: &Arc<Self>,
-        robot: Robot,
+        robot: RobotNumber,
         service: &str,
         digest: &Digest,
         request: Bytes,
         patience: Duration,
     ) -> Result<Bytes, BusError> {
-        type Asked<'a> = BoxFuture<'a, Result<(Arc<Servant>, Result<Bytes, BusError>), Aborted>>;
+        type Asked<'a> =
+            BoxFuture<'a, Result<(Arc<MemberServant>, Result<Bytes, BusError>), Aborted>>;
         let began = Instant::now();
         let deadline = began + patience;
-        let mut errand = self.begin(robot, Kind::Call(service.into()));
+        let mut errand = self.begin_request(robot, Kind::Call(service.into()));
         let mut asked: FuturesUnordered<Asked<'_>> = FuturesUnordered::new();
         let mut handles: Vec<(Member, AbortHandle)> = Vec::new();
-        let mut last: Option<Arc<Servant>> = None;
+        let mut last: Option<Arc<MemberServant>> = None;
         loop {
             tokio::select! {
                 biased;
                 Some(ended) = asked.next(), if !asked.is_empty() => {
                     let Ok((servant, answer)) = ended else { continue };
-                    if errand.ended(&servant, end_of(&answer)) {
-                        self.counts.answered(began.elapsed());
+                    if errand.finish_attempt(&servant, classify_outcome(&answer)) {
+                        self.counts.record_answer(began.elapsed());
                         return answer;
                     }
                     last = Some(servant);
                 }
                 Some(told) = errand.told.recv() => match told {
-                    Told::Ask(servant) => {
+                    DispatchEvent::Ask(servant) => {
                         if last.is_some() {
                             self.counts.asked_again.fetch_add(1, Ordering::Relaxed);
                         }
@@ -366,14 +371,14 @@ impl Group {
                         handles.push((member, handle));
                         asked.push(Box::pin(called));
                     }
-                    Told::Drop(servant) => {
+                    DispatchEvent::Drop(servant) => {
                         let of = handles.iter().filter(|(member, _)| *member == servant.member);
                         of.for_each(|(_, handle)| handle.abort());
                         last = Some(servant);
                     }
-                    Told::Fail(why) => {
+                    DispatchEvent::Fail(why) => {
                         errand.over = true;
-                        return Err(self.failed(service, last.as_deref(), why));
+                        return Err(self.fail_request(service, last.as_deref(), why));
                     }
                 },
                 () = sleep_until(deadline) => {
@@ -387,18 +392,23 @@ impl Group {
         }
     }
 
-    fn failed(&self, service: &str, last: Option<&Servant>, why: Lost) -> BusError {
+    fn fail_request(
+        &self,
+        service: &str,
+        last: Option<&MemberServant>,
+        why: LossReason,
+    ) -> BusError {
         self.counts.failed.fetch_add(1, Ordering::Relaxed);
         BusError::CallFailed {
             service: service.to_owned(),
-            reason: lost_in_words(last, why),
+            reason: describe_loss(last, why),
             fate: CallFate::Unknown,
         }
     }
 }
 
-/// Why a request failed, in words.
-fn lost_in_words(last: Option<&Servant>, why: Lost) -> String {
+/// Describes why a request failed.
+fn describe_loss(last: Option<&MemberServant>, why: LossReason) -> String {
     let who = match last {
         Some(servant) => {
             let reason = servant.gone.get();
@@ -408,56 +418,57 @@ fn lost_in_words(last: Option<&Servant>, why: Lost) -> String {
         None => "its servant".to_owned(),
     };
     match why {
-        Lost::NotAskedAgain => format!(
-            "{who} was lost while it worked at this request, which is not asked again, since it may have been carried out; push the service with --idempotent to have such requests asked again"
+        LossReason::NotAskedAgain => format!(
+            "{who} was lost while it processed this request, which is not retried, since it may have been executed; \
+                push the service with --idempotent to retry such requests"
         ),
-        Lost::AskedOften => format!(
-            "{} servants were lost while they worked at this request, {who} last; it is not asked again",
+        LossReason::AskedOften => format!(
+            "{} servants were lost while they processed this request, {who} last; it is not retried",
             dispatch::ATTEMPTS
         ),
     }
 }
 
-/// What the outcome of a call says of the servant.
-fn end_of(answer: &Result<Bytes, BusError>) -> End {
+/// Classifies the outcome of a call with respect to the servant.
+fn classify_outcome(answer: &Result<Bytes, BusError>) -> AttemptOutcome {
     match answer {
         Err(BusError::CallFailed { fate, .. }) => match fate {
-            CallFate::Answered => End::Answered,
-            CallFate::NotTaken => End::NotTaken,
-            CallFate::Unknown => End::Lost,
+            CallFate::Answered => AttemptOutcome::Answered,
+            CallFate::NotTaken => AttemptOutcome::NotTaken,
+            CallFate::Unknown => AttemptOutcome::Lost,
         },
-        Err(BusError::NoService(_) | BusError::Io { .. }) => End::NotTaken,
-        Err(BusError::Closed) => End::Lost,
-        _ => End::Answered,
+        Err(BusError::NoService(_) | BusError::Io { .. }) => AttemptOutcome::NotTaken,
+        Err(BusError::Closed) => AttemptOutcome::Lost,
+        _ => AttemptOutcome::Answered,
     }
 }
 
 impl State {
-    /// Counts the requests of the time until now.
-    fn count(&mut self, now: Instant) {
-        let Load { waiting, under_way } = self.dispatcher.load();
+    /// Adds the load since the last call to the integral.
+    fn accumulate_load(&mut self, now: Instant) {
+        let GroupLoad { waiting, under_way } = self.dispatcher.load();
         let micros = now.saturating_duration_since(self.busy.1).as_micros();
         self.busy.0 += micros * (waiting + under_way) as u128;
         self.busy.1 = now;
     }
 }
 
-/// A request under way; withdrawn when it is dropped.
-struct Errand {
-    group: Arc<Group>,
+/// A pending request; withdrawn when dropped.
+struct PendingRequest {
+    group: Arc<ServantGroup>,
     kind: Kind,
     ticket: Ticket,
-    told: mpsc::UnboundedReceiver<Told>,
+    told: mpsc::UnboundedReceiver<DispatchEvent>,
     over: bool,
 }
 
-impl Errand {
-    /// A servant's work at it has ended; whether that is the answer.
-    fn ended(&mut self, servant: &Servant, end: End) -> bool {
+impl PendingRequest {
+    /// Reports the end of a servant's work; returns whether its outcome is the response.
+    fn finish_attempt(&mut self, servant: &MemberServant, end: AttemptOutcome) -> bool {
         let ticket = self.ticket;
         let (answered, wasted) = self.group.decide(|dispatcher| {
-            let (answered, orders) = dispatcher.ended(ticket, servant.member, end);
-            let others = |order: &&Order| matches!(order, Order::Drop(of, _) if *of == ticket);
+            let (answered, orders) = dispatcher.finish_attempt(ticket, servant.member, end);
+            let others = |order: &&DispatchOrder| matches!(order, DispatchOrder::Drop(of, _) if *of == ticket);
             let wasted = orders.iter().filter(others).count() as u64;
             ((answered, wasted), orders)
         });
@@ -466,21 +477,21 @@ impl Errand {
             .wasted
             .fetch_add(wasted, Ordering::Relaxed);
         self.over |= answered;
-        if end != End::Answered {
+        if end != AttemptOutcome::Answered {
             self.group.resume_later(servant, &self.kind);
         }
         answered
     }
 }
 
-impl Drop for Errand {
+impl Drop for PendingRequest {
     fn drop(&mut self) {
         let mut state = self.group.state.lock();
         state.doors.remove(&self.ticket);
         if !self.over {
-            state.count(Instant::now());
+            state.accumulate_load(Instant::now());
             let orders = state.dispatcher.withdraw(self.ticket);
-            self.group.tell(&mut state, orders);
+            self.group.deliver_orders(&mut state, orders);
         }
     }
 }
@@ -496,15 +507,15 @@ mod tests {
             replicas: 1,
             idempotent: false,
         };
-        let group = Group::new(RosVersion::One, "noetic", &Interface::default(), rules);
+        let group = ServantGroup::new(RosVersion::One, "noetic", &Interface::default(), rules);
         let second = Duration::from_secs(1);
-        let begin = || group.begin(1, Kind::Call("/work".into()));
+        let begin = || group.begin_request(1, Kind::Call("/work".into()));
         let one = begin();
         tokio::time::sleep(second).await;
         let other = begin();
         tokio::time::sleep(second).await;
         assert_eq!(group.mean_load(), 1.5, "one for a second, two for another");
-        // A moment later nothing else is known.
+        // A moment later the value is still the same.
         drop((one, other));
         tokio::time::sleep(second / 1000).await;
         assert_eq!(group.mean_load(), 1.5);

@@ -4,57 +4,57 @@ use std::any::Any;
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
-use link::control::Node;
-use link::session::Lost;
+use bridge::{Bridge, BridgeOptions, Metrics, SessionEnd, SessionOptions, WaitingConnection};
+use link::control::NodeLaunch;
+use link::session::DisconnectReason;
 use package::interface::Interface;
 use ros::bus::{Bus, Graph};
 use ros::schema::Registry;
-use ros::sizes::Seen;
+use ros::sizes::SizeSummary;
 use tokio::sync::watch;
 
-use crate::components::{Components, Loads};
-use crate::inside::{Inside, Joining, Looked};
-use crate::lifecycle::{Lifecycles, Stages};
-use crate::links::{Hub, HubOptions, LinkStatus, Nodes};
+use crate::components::{ComponentLoader, Loads};
+use crate::inside::{InsideHost, InsideView, JoinFn};
+use crate::lifecycle::{LifecycleDriver, Stages};
+use crate::links::{Hub, HubOptions, LinkStatus, NodeController};
 use crate::tap::Tap;
-use crate::trial::{self, Material, Pace, Replay};
-use crate::{Error, Flow, Linked, Reach, ReachOptions, Stream, Tenant};
+use crate::trial::{self, Material, Replay, ReplayPace};
+use crate::{Error, FlowCounts, Reach, ReachOptions, StubNode, Tenant, UpgradedStream};
 
-/// A bus, the bridge before it, and the hub of its links.
+/// A bus with a bridge and a link hub.
 pub(crate) struct InProcess {
     bus: Arc<dyn Bus>,
     tap: Arc<Tap>,
     bridge: Arc<Bridge>,
-    inside: Inside,
+    inside: InsideHost,
     hub: Arc<Hub>,
-    /// What the robot's stubs have started.
-    nodes: Arc<dyn Nodes>,
-    lifecycles: Option<Lifecycles>,
-    components: Option<Components>,
-    /// What must be there while this is.
+    /// Nodes started by the robot's stubs.
+    nodes: Arc<dyn NodeController>,
+    lifecycles: Option<LifecycleDriver>,
+    components: Option<ComponentLoader>,
+    /// Values kept alive by this one.
     _keeps: Box<dyn Any + Send + Sync>,
 }
 
-/// What clients and links are set before.
-pub(crate) struct Behind {
-    /// The id of the servant, or of the robot's place.
+/// The parts of which an [`InProcess`] is made.
+pub(crate) struct InProcessParts {
+    /// Id of the servant or of the robot's place.
     pub(crate) id: String,
-    /// The bus that rosbridge clients see.
+    /// Bus for rosbridge clients.
     pub(crate) bus: Arc<dyn Bus>,
-    /// The bus that stubs see, with the nodes that they start and end.
-    pub(crate) linked: (Arc<dyn Bus>, Arc<dyn Nodes>),
-    /// The bus of those who look into it.
-    pub(crate) inside: Joining,
+    /// Bus for stubs, and the nodes that they start and stop.
+    pub(crate) linked: (Arc<dyn Bus>, Arc<dyn NodeController>),
+    /// Joins the bus for people who look inside.
+    pub(crate) inside: JoinFn,
     pub(crate) registry: Arc<Registry>,
-    pub(crate) lifecycles: Option<Lifecycles>,
-    pub(crate) components: Option<Components>,
+    pub(crate) lifecycles: Option<LifecycleDriver>,
+    pub(crate) components: Option<ComponentLoader>,
     pub(crate) keeps: Box<dyn Any + Send + Sync>,
 }
 
 impl InProcess {
-    pub(crate) fn new(behind: Behind, options: ReachOptions) -> InProcess {
-        let Behind {
+    pub(crate) fn new(behind: InProcessParts, options: ReachOptions) -> InProcess {
+        let InProcessParts {
             id,
             bus,
             linked: (linked, nodes),
@@ -65,11 +65,12 @@ impl InProcess {
             keeps,
         } = behind;
         let tap = Arc::new(Tap::default());
-        let shown = tap.before(Arc::clone(&bus));
-        // Stubs of a robot that shares its servants see these by names of their own.
-        let linked = match std::ptr::addr_eq(Arc::as_ptr(&bus), Arc::as_ptr(&linked)) {
-            true => Arc::clone(&shown),
-            false => linked,
+        let shown = tap.wrap(Arc::clone(&bus));
+        // Stubs of a robot that shares its servants see them under names of their own.
+        let linked = if std::ptr::addr_eq(Arc::as_ptr(&bus), Arc::as_ptr(&linked)) {
+            Arc::clone(&shown)
+        } else {
+            linked
         };
         let bus = shown;
         let habits = HubOptions {
@@ -90,7 +91,7 @@ impl InProcess {
             ..options.bridge
         };
         InProcess {
-            inside: Inside::new(inside, Arc::clone(&registry), &options),
+            inside: InsideHost::new(inside, Arc::clone(&registry), &options),
             bridge: Bridge::new(Arc::clone(&bus), registry, options),
             bus,
             tap,
@@ -115,21 +116,25 @@ impl Reach for InProcess {
 
     async fn serve_rosbridge(
         &self,
-        client: Waiting<Stream>,
+        client: WaitingConnection<UpgradedStream>,
         options: SessionOptions,
     ) -> SessionEnd {
         self.bridge.serve_waiting(client, options).await
     }
 
-    async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd {
+    async fn serve_inside(
+        &self,
+        client: WaitingConnection<UpgradedStream>,
+        options: SessionOptions,
+    ) -> SessionEnd {
         self.inside.serve(client, options).await
     }
 
-    async fn look_inside(&self) -> Result<Looked, (u16, String)> {
-        self.inside.look().await
+    async fn open_inside(&self) -> Result<InsideView, (u16, String)> {
+        self.inside.open_view().await
     }
 
-    async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost {
+    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8]) -> DisconnectReason {
         self.hub.serve(stream, read_ahead).await
     }
 
@@ -138,19 +143,19 @@ impl Reach for InProcess {
     }
 
     fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
-        self.lifecycles.as_ref().map(Lifecycles::stages)
+        self.lifecycles.as_ref().map(LifecycleDriver::stages)
     }
 
     fn loads(&self) -> Option<watch::Receiver<Loads>> {
-        self.components.as_ref().map(Components::loads)
+        self.components.as_ref().map(ComponentLoader::loads)
     }
 
-    async fn linked(&self) -> Vec<Linked> {
-        self.nodes.running().await
+    async fn stub_nodes(&self) -> Vec<StubNode> {
+        self.nodes.running_nodes().await
     }
 
-    async fn start_linked(&self, node: &Node) -> Result<(), Error> {
-        // Where there are none, the node's own are on its command line.
+    async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
+        // Without global parameters, those of the node are on its command line.
         if let Ok(parameters) = self.bus.parameters() {
             for (key, value) in self.nodes.parameters(node) {
                 parameters.set(&key, value).await?;
@@ -163,17 +168,17 @@ impl Reach for InProcess {
         self.hub.status()
     }
 
-    fn flows(&self) -> Vec<Flow> {
+    fn flows(&self) -> Vec<FlowCounts> {
         let metrics = self.bridge.metrics();
-        // The bridge answers calls that are refused, time out or reach no node, in place of the node.
+        // The bridge itself answers calls that are refused, time out or reach no node.
         let by_bridge = metrics
             .calls_failed
             .get()
             .saturating_sub(metrics.calls_denied.get());
         let answers = metrics.answers.get().saturating_sub(by_bridge);
-        let clients = Flow {
+        let clients = FlowCounts {
             node: String::new(),
-            // What nobody listens to the answers of need not be answered.
+            // Calls whose response nobody waits for need not be answered.
             inputs: metrics.asked.get() + metrics.calls.get(),
             outputs: metrics.received.get() + answers,
         };
@@ -182,14 +187,14 @@ impl Reach for InProcess {
         flows
     }
 
-    fn report(&self, flow: &str, what: &str) {
+    fn warn_flow(&self, flow: &str, what: &str) {
         match flow {
             "" => self.bridge.report(what),
             node => self.hub.warn(node, what),
         }
     }
 
-    fn inputs(&self) -> Vec<(String, Seen)> {
+    fn inputs(&self) -> Vec<(String, SizeSummary)> {
         let mut inputs = self.hub.inputs();
         inputs.extend(self.bridge.inputs());
         inputs
@@ -204,13 +209,13 @@ impl Reach for InProcess {
         service: &str,
         interface: &Interface,
         material: &Material,
-        pace: &Pace,
+        pace: &ReplayPace,
     ) -> Result<Replay, Error> {
         trial::replay(&self.bus, service, interface, material, pace).await
     }
 
-    fn bind(&self, tenant: Weak<dyn Tenant>) {
-        self.nodes.bind(tenant);
+    fn bind_tenant(&self, tenant: Weak<dyn Tenant>) {
+        self.nodes.bind_tenant(tenant);
     }
 
     fn close_sessions(&self, reason: &str) {

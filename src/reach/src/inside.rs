@@ -1,76 +1,83 @@
-//! A servant that people look into: a node of its own in the servant's graph and a bridge on it, both there only while somebody
-//! looks. What people hear, publish and call there passes neither the robot's bridge nor its tap, so that it is no request of the
-//! robot, no session of it and none of its figures; and what the robot publishes is heard there as any node hears it.
+//! Access for people who look inside a servant: a node in the servant's graph with a bridge, both existing only while
+//! somebody looks. Subscriptions, publications and calls made there bypass the robot's bridge and its tap, so they
+//! count neither as requests nor as sessions of the robot nor in its statistics; what the robot publishes is received
+//! there as by any node.
 
 use std::sync::{Arc, Weak};
 
-use bridge::{Bridge, BridgeOptions, Called, SessionEnd, SessionOptions, Waiting};
+use bridge::{
+    Bridge, BridgeOptions, RequestObserver, SessionEnd, SessionOptions, WaitingConnection,
+};
 use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use ros::bus::{Bus, BusError};
 use ros::schema::Registry;
 use tokio::sync::watch;
 
-use crate::Stream;
-use crate::endings::Endings;
+use crate::UpgradedStream;
+use crate::endings::ExitNotifier;
 
-/// WebSocket close code for something that failed here.
+/// WebSocket close code for an internal error.
 const FAILED: u16 = 1011;
 /// WebSocket close code for a servant that ends.
 const ENDS: u16 = 1012;
 
-/// Joins the servant's ROS, once for all who look.
-pub(crate) type Joining =
-    Box<dyn Fn() -> BoxFuture<'static, Result<Joined, BusError>> + Send + Sync>;
+/// Joins the servant's ROS graph, once for all viewers.
+pub(crate) type JoinFn =
+    Box<dyn Fn() -> BoxFuture<'static, Result<JoinedBus, BusError>> + Send + Sync>;
 
-/// A node of ours in the servant's ROS.
-pub(crate) struct Joined {
+/// A node of ours in the servant's ROS graph.
+pub(crate) struct JoinedBus {
     pub(crate) bus: Arc<dyn Bus>,
-    /// Tells it of processes that have ended, where the servant has some.
-    pub(crate) endings: Option<Endings>,
+    /// Notifies the bus of exited processes, if the servant has any.
+    pub(crate) endings: Option<ExitNotifier>,
 }
 
-/// Where people look into one servant.
-pub(crate) struct Inside {
-    join: Joining,
+/// Access to the inside of one servant.
+pub(crate) struct InsideHost {
+    join: JoinFn,
     registry: Arc<Registry>,
     options: BridgeOptions,
-    /// Held while the ROS is joined: two nodes of one name would end each other.
+    /// Held while joining: two nodes with the same name would end each other.
     turn: tokio::sync::Mutex<()>,
     state: Mutex<State>,
 }
 
 #[derive(Default)]
 struct State {
-    /// There while somebody looks.
-    looking: Weak<Looking>,
-    /// Why nobody looks any more.
+    /// Present while somebody looks.
+    looking: Weak<InsideNode>,
+    /// Reason why access is closed.
     closed: watch::Sender<Option<String>>,
 }
 
-/// The node of those who look, and a bridge on it for those who speak rosbridge.
-struct Looking {
+/// The node for viewers, and a bridge on it for those that use rosbridge.
+struct InsideNode {
     bus: Arc<dyn Bus>,
     bridge: Arc<Bridge>,
-    _endings: Option<Endings>,
+    _endings: Option<ExitNotifier>,
 }
 
-/// The servant's ROS as those see it who look, for as long as this lives.
-pub struct Looked {
-    /// Its ROS.
+/// The ROS graph of a servant for a viewer, as long as this lives.
+pub struct InsideView {
+    /// Bus of the servant.
     pub bus: Arc<dyn Bus>,
-    /// Its definitions.
+    /// Type definitions.
     pub registry: Arc<Registry>,
-    /// Why it has ended, once it has.
+    /// Reason why it ended, once it has.
     pub ended: watch::Receiver<Option<String>>,
-    _looking: Arc<Looking>,
+    _looking: Arc<InsideNode>,
 }
 
-impl Inside {
-    /// `options` are those of the robot's bridge.
-    pub(crate) fn new(join: Joining, registry: Arc<Registry>, options: &BridgeOptions) -> Inside {
+impl InsideHost {
+    /// Creates the access; `options` are those of the robot's bridge.
+    pub(crate) fn new(
+        join: JoinFn,
+        registry: Arc<Registry>,
+        options: &BridgeOptions,
+    ) -> InsideHost {
         let options = BridgeOptions {
-            // A page is shown what is newest, and asks for little at once.
+            // A web page shows the newest data and requests little at once.
             topic_messages: 64,
             session_bytes: 8 << 20,
             bus_queue: 32,
@@ -78,11 +85,11 @@ impl Inside {
             max_advertisements: 32,
             max_calls: 32,
             max_call_bytes: 8 << 20,
-            called: Called::default(),
+            called: RequestObserver::default(),
             pair: None,
             ..options.clone()
         };
-        Inside {
+        InsideHost {
             join,
             registry,
             options,
@@ -91,13 +98,13 @@ impl Inside {
         }
     }
 
-    /// Speaks rosbridge with somebody who looks, until it ends.
+    /// Serves a rosbridge client of a viewer until it ends.
     pub(crate) async fn serve(
         &self,
-        mut client: Waiting<Stream>,
+        mut client: WaitingConnection<UpgradedStream>,
         options: SessionOptions,
     ) -> SessionEnd {
-        let (code, reason) = match client.until(self.looking()).await {
+        let (code, reason) = match client.wait_for(self.get_or_join()).await {
             Ok(Ok(looking)) => return looking.bridge.serve_waiting(client, options).await,
             Ok(Err(refused)) => refused,
             Err(left) => return left,
@@ -106,10 +113,10 @@ impl Inside {
         SessionEnd::Closed { code, reason }
     }
 
-    /// The servant's ROS for somebody who looks; else code and reason to close with.
-    pub(crate) async fn look(&self) -> Result<Looked, (u16, String)> {
-        let looking = self.looking().await?;
-        Ok(Looked {
+    /// Returns the servant's ROS graph for a viewer, or the code and reason to close with.
+    pub(crate) async fn open_view(&self) -> Result<InsideView, (u16, String)> {
+        let looking = self.get_or_join().await?;
+        Ok(InsideView {
             bus: Arc::clone(&looking.bus),
             registry: Arc::clone(&self.registry),
             ended: self.state.lock().closed.subscribe(),
@@ -117,7 +124,7 @@ impl Inside {
         })
     }
 
-    /// Ends all who look, and refuses others, with these words.
+    /// Ends all viewers and refuses new ones with this reason.
     pub(crate) fn close(&self, reason: &str) {
         let looking = {
             let state = self.state.lock();
@@ -133,38 +140,38 @@ impl Inside {
         }
     }
 
-    /// The node that is there, or a new one; else code and reason to close with.
-    async fn looking(&self) -> Result<Arc<Looking>, (u16, String)> {
+    /// Returns the existing node or a new one, or the code and reason to close with.
+    async fn get_or_join(&self) -> Result<Arc<InsideNode>, (u16, String)> {
         let _turn = self.turn.lock().await;
-        if let Some(looking) = self.there()? {
+        if let Some(looking) = self.current_session()? {
             return Ok(looking);
         }
         let joined = (self.join)().await;
-        let Joined { bus, endings } =
+        let JoinedBus { bus, endings } =
             joined.map_err(|error| (FAILED, format!("cannot look inside: {error}")))?;
         let registry = Arc::clone(&self.registry);
         let bridge = Bridge::new(Arc::clone(&bus), registry, self.options.clone());
-        let looking = Arc::new(Looking {
+        let looking = Arc::new(InsideNode {
             bus,
             bridge,
             _endings: endings,
         });
         let mut state = self.state.lock();
         // It may have been closed meanwhile.
-        state.check()?;
+        state.check_open()?;
         state.looking = Arc::downgrade(&looking);
         Ok(looking)
     }
 
-    fn there(&self) -> Result<Option<Arc<Looking>>, (u16, String)> {
+    fn current_session(&self) -> Result<Option<Arc<InsideNode>>, (u16, String)> {
         let state = self.state.lock();
-        state.check()?;
+        state.check_open()?;
         Ok(state.looking.upgrade())
     }
 }
 
 impl State {
-    fn check(&self) -> Result<(), (u16, String)> {
+    fn check_open(&self) -> Result<(), (u16, String)> {
         match &*self.closed.borrow() {
             Some(reason) => Err((ENDS, reason.clone())),
             None => Ok(()),
@@ -191,14 +198,14 @@ mod tests {
                 let mut options = JoinOptions::in_domain(0, "/looks");
                 options.network.alone = true;
                 let bus = ros::connect(RosVersion::Two, Arc::new(HostSockets), options).await?;
-                let endings = Some(Endings::follow(events, Arc::clone(&bus)));
-                Ok(Joined { bus, endings })
+                let endings = Some(ExitNotifier::start(events, Arc::clone(&bus)));
+                Ok(JoinedBus { bus, endings })
             })
         };
-        let registry = Arc::new(Registry::of(RosVersion::Two));
-        let inside = Inside::new(Box::new(join), registry, &BridgeOptions::default());
-        let first = inside.look().await.expect("looked");
-        let second = inside.look().await.expect("looked");
+        let registry = Arc::new(Registry::for_version(RosVersion::Two));
+        let inside = InsideHost::new(Box::new(join), registry, &BridgeOptions::default());
+        let first = inside.open_view().await.expect("looked");
+        let second = inside.open_view().await.expect("looked");
         drop(first);
         tokio::task::yield_now().await;
         assert_eq!(events.receiver_count(), 1, "one node, which is told");

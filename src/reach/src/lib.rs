@@ -1,5 +1,5 @@
-//! What a running servant is to a robot: its ROS graph, the rosbridge sessions and the links that use it, nodes that
-//! stubs start and end, ways out, and when its interface is there.
+//! Access of robots to a running servant: its ROS graph, the rosbridge sessions and links that use it, the nodes that
+//! stubs start and stop, egress, and readiness.
 //!
 //! ```text
 //!  container's namespace ─▶ sockets ─▶ Bus ─┬─▶ Bridge ◀─ rosbridge clients
@@ -7,9 +7,9 @@
 //!  hosts outside ◀─ relays ◀─ loopback addresses inside
 //! ```
 //!
-//! It knows one servant at a time (a [`group`] knows those of one shared service), and of the rest of the daemon what
-//! [`Observer`] and [`Tenant`] show. The rest of the daemon knows it as a [`Reach`], which an [`Opener`] gives for a servant of
-//! its engine; [`LocalOpener`] is that of this host.
+//! The crate knows one servant at a time (a [`group`] knows those of one shared service), and of the rest of the daemon
+//! what [`Observer`] and [`Tenant`] show. The daemon uses it through a [`Reach`], which an [`Opener`] opens for a
+//! servant of its engine; [`LocalOpener`] is the one for this host.
 
 #![forbid(unsafe_code)]
 
@@ -46,19 +46,19 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, SystemTime};
 
 use async_trait::async_trait;
-use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, Waiting};
+use bridge::{BridgeOptions, Metrics, SessionEnd, SessionOptions, WaitingConnection};
 use budget::Budget;
 use futures_util::future::BoxFuture;
-use link::control::{Node, Request};
-use link::session::Lost;
+use link::control::{NodeLaunch, RequestTiming};
+use link::session::DisconnectReason;
 use package::interface::Interface;
 use package::inventory::Inventory;
 use ros::bus::{Bus, BusError, Graph, ParamValue, RosVersion};
 use ros::flavour::Flavour;
 use ros::ros2::composition::Component;
 use ros::schema::Registry;
-use ros::sizes::Seen;
-use servant::engine::Servant;
+use ros::sizes::SizeSummary;
+use servant::engine::ServantHandle;
 use servant::spec::NodeSpec;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
@@ -66,168 +66,178 @@ use tokio::sync::watch;
 use components::Loads;
 use egress::Relays;
 use lifecycle::Stages;
-use links::{LinkStatus, RequestNews};
+use links::{LinkStatus, RequestUpdate};
 use tap::Tap;
 
-pub use ends::how_it_ended;
-pub use inside::Looked;
+pub use ends::describe_exit;
+pub use inside::InsideView;
 pub use local::LocalOpener;
 pub use nodes::LinkedNodes;
 pub use request_times::RequestTimes;
-pub use trial::{Gap, Material, Pace, Picture, RECORDED, Replay, fits};
+pub use trial::{Material, Picture, RECORDED, Replay, ReplayPace, RequestGap, check_material};
 
-/// What is recorded of the revision that a servant was started from.
+/// Recorded data of the revision from which a servant was started.
 #[derive(Debug, Clone)]
-pub struct Recorded {
-    /// The service.
+pub struct RecordedRevision {
+    /// Name of the service.
     pub service: String,
-    /// The ROS package that was pushed.
+    /// ROS package that was pushed.
     pub package: String,
-    /// The ROS that the image is built for.
+    /// ROS version and distribution of the image.
     pub flavour: Flavour,
-    /// Environment of every process.
+    /// Environment variables of every process.
     pub environment: BTreeMap<String, String>,
     /// The revision's own nodes.
     pub nodes: Vec<NodeSpec>,
-    /// Parameters that the deployer gave, absolute names.
+    /// Parameters given by the deployer, by absolute name.
     pub parameters: BTreeMap<String, ParamValue>,
-    /// What is loaded into nodes that are component containers, by their names.
+    /// Components to load into component containers, by container name.
     pub components: BTreeMap<String, Vec<Component>>,
-    /// What the image holds.
+    /// Inventory of the image.
     pub inventory: Arc<Inventory>,
     /// Message definitions.
     pub registry: Arc<Registry>,
-    /// `HOST:PORT`s that its nodes were granted.
+    /// Granted egress, as `HOST:PORT`.
     pub egress: Vec<String>,
 }
 
-/// The daemon, as one servant's reach sees it.
+/// The daemon as seen from one servant's reach.
 pub trait Observer: Send + Sync + 'static {
-    /// Whether a stub that was made of the revision of this number, with this image, can use the servant; else why not.
-    fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String>;
-    /// Something that the operator should know of the servant and its robot.
-    fn event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
-    /// From `at` on a node of the robot is served by its local original, and why; none: by the cloud again.
-    fn served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
-    /// This has become known of a request, of one that was answered with the time and its parts.
-    fn measured(&self, request: &Request, news: RequestNews);
+    /// Checks that a stub generated from this revision and image can use the servant; otherwise returns the reason.
+    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), String>;
+    /// Records an event about the servant and its robot for the operator.
+    fn record_event(&self, level: api::Level, kind: &str, message: &str, robot: Option<&str>);
+    /// Records that from `at` on a node of the robot is served by its local original, with the reason; `None`: by the
+    /// cloud again.
+    fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>);
+    /// Records an update about a request; an answered one has its response time and phases.
+    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate);
 }
 
-/// Whom a servant serves: nobody while it is a warm container.
+/// The user of a servant. A warm container has none.
 pub trait Tenant: Send + Sync + 'static {
-    /// The robot's name.
+    /// Returns the name of the robot.
     fn robot(&self) -> &str;
-    /// The servant's limits.
+    /// Returns the limits of the servant.
     fn limits(&self) -> api::Limits;
-    /// From now on the robot's stubs start and end the nodes; whether the revision's own nodes ran before.
+    /// Hands the control of nodes to the robot's stubs; returns whether the revision's own nodes were running before.
     fn take_over(&self) -> bool;
 }
 
-/// Habits of one servant's reach.
+/// Options of one servant's reach.
 #[derive(Debug, Clone)]
 pub struct ReachOptions {
-    /// What its nodes speak.
+    /// ROS version of its nodes.
     pub ros: RosVersion,
-    /// What `$ROS_DISTRO` stands for there, for a ROS that does not tell it; may be empty.
+    /// Value of `$ROS_DISTRO`, for a ROS that does not report it; may be empty.
     pub distribution: String,
-    /// Sessions of rosbridge.
+    /// Options of rosbridge sessions.
     pub bridge: BridgeOptions,
-    /// How long a link outlives its connection.
+    /// Time for which a link outlives its connection.
     pub grace: Duration,
-    /// Memory held for the servant's nodes, links and clients.
+    /// Memory budget for the servant's nodes, links and clients.
     pub budget: Budget,
-    /// Time from the first byte of a message or frame to its last.
+    /// Maximum time from the first to the last byte of a message or frame.
     pub unfinished: Duration,
 }
 
-/// What went to nodes and came from them so far.
+/// Counts of what was sent to nodes and received from them.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Flow {
-    /// The node of a link; nothing: all nodes that rosbridge clients use.
+pub struct FlowCounts {
+    /// Node of a link; empty: all nodes used by rosbridge clients.
     pub node: String,
-    /// Messages, given while somebody listened, and calls.
+    /// Messages, sent while somebody subscribed to an output, and calls.
     pub inputs: u64,
-    /// Messages and answers that came of them.
+    /// Messages and responses received.
     pub outputs: u64,
 }
 
-/// A node that a stub has started.
+/// A node started by a stub.
 #[derive(Debug, Clone)]
-pub struct Linked {
-    /// As the stub said.
-    pub node: Node,
-    /// Parameters that its push gave it.
+pub struct StubNode {
+    /// Description given by the stub.
+    pub node: NodeLaunch,
+    /// Parameters given by its push.
     pub given: Vec<(String, ParamValue)>,
 }
 
-/// A connection behind its upgrade.
-pub type Stream = Box<dyn Io>;
+/// A connection after its WebSocket upgrade.
+pub type UpgradedStream = Box<dyn Io>;
 
-/// What a [`Stream`] can do.
+/// Requirements on an [`UpgradedStream`].
 pub trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 
-/// What a running servant is to robots, wherever it runs: in this process over its namespace, or beside it in a pod, to which
-/// all this is forwarded.
+/// A running servant as seen by robots, independent of where it runs: in this process over its network namespace, or in
+/// a pod to which everything is forwarded.
 #[async_trait]
 pub trait Reach: Send + Sync + 'static {
-    /// Its ROS, for a group whose servants answer together.
+    /// Returns its bus, for a group of servants.
     fn bus(&self) -> Arc<dyn Bus>;
-    /// Nodes, topics and services as they are registered, now and later.
+    /// Returns a watch on its ROS graph.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
-    /// Speaks rosbridge with a client that has waited for the servant, until it ends.
-    async fn serve_rosbridge(&self, client: Waiting<Stream>, options: SessionOptions)
-    -> SessionEnd;
-    /// Speaks rosbridge with somebody who looks into it, until that ends: beside its robot, and none of its sessions.
-    async fn serve_inside(&self, client: Waiting<Stream>, options: SessionOptions) -> SessionEnd;
-    /// Its ROS for somebody who looks into it by another protocol; else code (RFC 6455) and reason to close with.
-    async fn look_inside(&self) -> Result<Looked, (u16, String)>;
-    /// Serves a stub's connection behind its upgrade, until it ends; `read_ahead` was read from it already.
-    async fn serve_link(&self, stream: Stream, read_ahead: &[u8]) -> Lost;
-    /// Where to hear what its robot asks of it; none where nobody can.
+    /// Serves a rosbridge client that has waited for the servant, until it ends.
+    async fn serve_rosbridge(
+        &self,
+        client: WaitingConnection<UpgradedStream>,
+        options: SessionOptions,
+    ) -> SessionEnd;
+    /// Serves a rosbridge client of somebody who looks inside, until it ends. Independent of the robot and not one of
+    /// its sessions.
+    async fn serve_inside(
+        &self,
+        client: WaitingConnection<UpgradedStream>,
+        options: SessionOptions,
+    ) -> SessionEnd;
+    /// Returns its ROS graph for a viewer of another protocol, or the close code (RFC 6455) and reason.
+    async fn open_inside(&self) -> Result<InsideView, (u16, String)>;
+    /// Serves a stub's connection after its upgrade until it ends; `read_ahead` was already read from it.
+    async fn serve_link(&self, stream: UpgradedStream, read_ahead: &[u8]) -> DisconnectReason;
+    /// Returns the tap on the robot's requests, if there is one.
     fn tap(&self) -> Option<Arc<Tap>> {
         None
     }
-    /// How its links are doing, by node.
+    /// Returns the status of its links by node.
     fn links(&self) -> Vec<LinkStatus>;
-    /// Where its nodes are that have a lifecycle, now and later; none where its ROS knows none.
+    /// Returns a watch on the lifecycle states of its nodes; `None` if its ROS version has none.
     fn lifecycles(&self) -> Option<watch::Receiver<Stages>> {
         None
     }
-    /// How far its component containers are, now and later; none where nothing is loaded into any.
+    /// Returns a watch on the loading states of its component containers; `None` if there is nothing to load.
     fn loads(&self) -> Option<watch::Receiver<Loads>> {
         None
     }
-    /// Nodes that stubs have started and that run.
-    async fn linked(&self) -> Vec<Linked> {
+    /// Returns the running nodes that stubs have started.
+    async fn stub_nodes(&self) -> Vec<StubNode> {
         Vec::new()
     }
-    /// Starts a node as a stub would, with the parameters that the push of this servant's revision gives it.
-    async fn start_linked(&self, node: &Node) -> Result<(), Error> {
+    /// Starts a node as a stub would, with the parameters from the push of this servant's revision.
+    async fn start_stub_node(&self, node: &NodeLaunch) -> Result<(), Error> {
         Err(Error::Linked(format!(
-            "{} is started by stubs alone",
+            "{} is started only by stubs",
             node.name
         )))
     }
-    /// What flows, by who uses it.
-    fn flows(&self) -> Vec<Flow> {
+    /// Returns the counts of messages and calls by user.
+    fn flows(&self) -> Vec<FlowCounts> {
         Vec::new()
     }
-    /// Tells whoever uses this [`Flow`] of something that is wrong with it.
-    fn report(&self, _flow: &str, _what: &str) {}
-    /// How large the messages and requests are that its robot sends to nodes, by topic or service.
-    fn inputs(&self) -> Vec<(String, Seen)> {
+    /// Warns the user of this [`FlowCounts`] of a problem.
+    fn warn_flow(&self, _flow: &str, _what: &str) {}
+    /// Returns the sizes of messages and requests from its robot, by topic or service.
+    fn inputs(&self) -> Vec<(String, SizeSummary)> {
         Vec::new()
     }
-    /// What was counted of its rosbridge sessions.
+    /// Returns the metrics of its rosbridge sessions.
     fn metrics(&self) -> &Metrics;
-    /// Messages dropped because a client or the bridge was slow.
-    fn dropped(&self) -> u64 {
+    /// Returns the number of messages dropped because a client or the bridge was slow.
+    fn dropped_count(&self) -> u64 {
         let metrics = self.metrics();
         metrics.dropped.get() + metrics.bus_dropped.get()
     }
-    /// Dropped messages by topic, the most first: of rosbridge clients, and of links at both of their ends.
+    /// Returns the numbers of dropped messages by topic, highest first: of rosbridge clients, and of links at both
+    /// ends.
     fn drops(&self) -> Vec<(String, u64)> {
         let mut topics = self.metrics().drops.all();
         for link in self.links() {
@@ -239,65 +249,65 @@ pub trait Reach: Send + Sync + 'static {
         topics.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
         topics
     }
-    /// Gives it material, and tells what it answers and when.
+    /// Replays material and reports the responses and their times.
     async fn replay(
         &self,
         service: &str,
         interface: &Interface,
         material: &Material,
-        pace: &Pace,
+        pace: &ReplayPace,
     ) -> Result<Replay, Error>;
-    /// From now on it serves this one.
-    fn bind(&self, tenant: Weak<dyn Tenant>);
-    /// Ends every rosbridge session, and refuses new ones, with these words.
+    /// Assigns the servant to a tenant.
+    fn bind_tenant(&self, tenant: Weak<dyn Tenant>);
+    /// Ends all rosbridge sessions and refuses new ones with this reason.
     fn close_sessions(&self, reason: &str);
-    /// Ends every session and every link, and refuses new ones, with these words.
+    /// Ends all sessions and links and refuses new ones with this reason.
     fn close(&self, reason: &str);
 }
 
-/// Reaches servants, wherever their engine has started them.
+/// Opens the reach of servants, wherever their engine has started them.
 #[async_trait]
 pub trait Opener: Send + Sync + 'static {
-    /// Connects to the ROS of a running servant and sets a bridge before it. `recorded` is awaited meanwhile.
+    /// Connects to the ROS graph of a running servant and creates a bridge. `recorded` is awaited concurrently.
     async fn open(
         &self,
-        servant: &Arc<dyn Servant>,
-        recorded: BoxFuture<'_, Recorded>,
+        servant: &Arc<dyn ServantHandle>,
+        recorded: BoxFuture<'_, RecordedRevision>,
         options: ReachOptions,
         observer: Arc<dyn Observer>,
     ) -> Result<Arc<dyn Reach>, Error>;
-    /// Connects to the ROS of a running servant as the node `name`, to find out what its nodes do.
-    async fn look(
+    /// Connects to the ROS graph of a running servant as the node `name`, to observe its nodes.
+    async fn observe(
         &self,
-        servant: &Arc<dyn Servant>,
+        servant: &Arc<dyn ServantHandle>,
         ros: RosVersion,
         name: &str,
         egress: &[String],
-    ) -> Result<Look, Error>;
-    /// Pids of a servant's processes as whoever looks at this machine sees them; none of one that runs elsewhere.
-    fn processes(&self, servant: &str) -> Vec<i32>;
+    ) -> Result<ObservedBus, Error>;
+    /// Returns the pids of a servant's processes in the host's pid namespace; empty if it runs elsewhere.
+    fn process_ids(&self, servant: &str) -> Vec<i32>;
 }
 
-/// A bus of a servant that is looked at; hosts that its nodes connect to are reached for as long as this lives.
-pub struct Look {
-    /// Its ROS.
+/// The bus of an observed servant. Egress of its nodes is relayed as long as this lives.
+pub struct ObservedBus {
+    /// Bus of the servant.
     pub bus: Arc<dyn Bus>,
     _relays: Relays,
 }
 
-/// Why a servant is not reached, or not tried.
+/// Errors of reaching or trying a servant.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Its ROS does not answer.
+    /// The ROS graph does not respond.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// It is none of the engine's that this reaches.
+    /// The servant does not belong to this engine.
     #[error("servant {0} does not run here")]
     Elsewhere(String),
-    /// A node of a stub cannot be started.
+    /// A stub's node cannot be started.
     #[error("{0}")]
     Linked(String),
-    /// It cannot be tried with what was given.
+    /// The material of a trial does not fit.
     #[error("{0}")]
     Trial(String),
 }

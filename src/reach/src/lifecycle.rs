@@ -1,10 +1,10 @@
-//! Nodes of a servant that have a lifecycle (ROS 2): those that nobody else drives are had to configure and activate
-//! themselves as they appear, and in which state each is can be told.
+//! Lifecycle nodes of a servant (ROS 2): configures and activates those that nobody else manages when they appear, and
+//! publishes the state of each.
 //!
 //! ```text
-//!  graph ─▶ a node with a lifecycle ─▶ started by a stub? driven by a manager? past unconfigured? ─yes─▶ left alone ─┐
-//!                                                   │ no                                                           ▼
-//!                                                   └─▶ configure ─▶ activate ─▶ or the event lifecycle-refused ─▶ state
+//!  graph ─▶ a lifecycle node ─▶ started by a stub, managed, or past unconfigured? ─yes─▶ left alone ─────────────┐
+//!                                               │ no                                                             ▼
+//!                                               └─▶ configure ─▶ activate ─▶ or the event lifecycle-refused ─▶ state
 //! ```
 
 use std::collections::BTreeMap;
@@ -12,135 +12,137 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros::bus::{Bus, RosVersion};
-use ros::ros2::lifecycle::{Begun, LifecycleNode, State};
+use ros::ros2::lifecycle::{BeginOutcome, LifecycleNode, State};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use crate::links::Nodes;
-use crate::{Linked, Observer, following};
+use crate::links::NodeController;
+use crate::{Observer, StubNode, following};
 
-/// For one transition: nodes load what they need then.
+/// Timeout of one transition; nodes load data then.
 const PATIENCE: Duration = Duration::from_secs(120);
-/// What the names of the daemon's own nodes begin with.
+/// Prefix of the names of the daemon's own nodes.
 const OURS: &str = "/cloudroid_";
 
-/// Where a node is in its lifecycle.
+/// Lifecycle state of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Stage {
-    /// In ROS's own word: `active`.
+pub struct LifecycleStage {
+    /// Name of the state in ROS: `active`.
     pub state: String,
-    /// Why it is not active: it was told to be, and did not become it.
+    /// Reason why it did not become active when it was told to.
     pub refused: Option<String>,
-    /// It is being told to be: until it is, or somebody else drives it, its robot has nothing of it.
+    /// It is being activated; until it is active or somebody else manages it, its robot gets nothing from it.
     pub begins: bool,
 }
 
-/// Nodes that have a lifecycle, by name.
-pub type Stages = BTreeMap<String, Stage>;
+/// Lifecycle nodes by name.
+pub type Stages = BTreeMap<String, LifecycleStage>;
 
-/// Has nodes begin until it is dropped.
-pub(crate) struct Lifecycles {
+/// Activates lifecycle nodes until it is dropped.
+pub(crate) struct LifecycleDriver {
     shown: watch::Receiver<Stages>,
     task: AbortHandle,
 }
 
-impl Drop for Lifecycles {
+impl Drop for LifecycleDriver {
     fn drop(&mut self) {
         self.task.abort();
     }
 }
 
-impl Lifecycles {
-    /// Follows the nodes of a servant; none where its ROS has no lifecycles. `nodes`: those that stubs have started are for the
-    /// robot to drive.
-    pub(crate) fn follow(
+impl LifecycleDriver {
+    /// Starts following the nodes of a servant; `None` if its ROS version has no lifecycles. Those in `nodes` were
+    /// started by stubs and are managed by the robot.
+    pub(crate) fn start(
         bus: &Arc<dyn Bus>,
-        nodes: &Arc<dyn Nodes>,
+        nodes: &Arc<dyn NodeController>,
         observer: &Arc<dyn Observer>,
-    ) -> Option<Lifecycles> {
+    ) -> Option<LifecycleDriver> {
         if bus.version() == RosVersion::One {
             return None;
         }
         let shown = watch::Sender::default();
-        let followed = Followed {
+        let followed = LifecycleFollower {
             bus: Arc::clone(bus),
             nodes: Arc::clone(nodes),
             observer: Arc::clone(observer),
             shown,
         };
-        Some(Lifecycles {
+        Some(LifecycleDriver {
             shown: followed.shown.subscribe(),
             task: tokio::spawn(Arc::new(followed).run()).abort_handle(),
         })
     }
 
-    /// Those that there are, now and later.
+    /// Returns a watch on the lifecycle nodes.
     pub(crate) fn stages(&self) -> watch::Receiver<Stages> {
         self.shown.clone()
     }
 }
 
-struct Followed {
+struct LifecycleFollower {
     bus: Arc<dyn Bus>,
-    nodes: Arc<dyn Nodes>,
+    nodes: Arc<dyn NodeController>,
     observer: Arc<dyn Observer>,
     shown: watch::Sender<Stages>,
 }
 
-impl Followed {
+impl LifecycleFollower {
     async fn run(self: Arc<Self>) {
-        let begin = |node: String| Arc::clone(&self).one(node);
+        let begin = |node: String| Arc::clone(&self).drive_node(node);
         let gone = |node: &str| self.shown.send_modify(|all| drop(all.remove(node)));
         let (graph, ours) = (self.bus.graph(), self.bus.node());
-        following::each_node(graph, ours, LifecycleNode::all, begin, gone).await;
+        following::run_for_each_node(graph, ours, LifecycleNode::all, begin, gone).await;
     }
 
-    /// Has one node begin, if that is ours to do, and tells its states from then on.
-    async fn one(self: Arc<Self>, name: String) {
-        let node = LifecycleNode::of(Arc::clone(&self.bus), &name);
-        let linked = self.nodes.running().await;
+    /// Activates one node, if that is our task, and publishes its states from then on.
+    async fn drive_node(self: Arc<Self>, name: String) {
+        let node = LifecycleNode::new(Arc::clone(&self.bus), &name);
+        let linked = self.nodes.running_nodes().await;
         let graph = self.bus.graph().borrow().clone();
-        let has = |linked: &Linked| graph.is_of_process(&linked.node.name, &name);
+        let has = |linked: &StubNode| graph.is_in_process(&linked.node.name, &name);
         if !linked.iter().any(has) {
-            self.put(&name, |stage| stage.begins = true);
-            self.begin(&node, &name).await;
-            self.put(&name, |stage| stage.begins = false);
+            self.update_stage(&name, |stage| stage.begins = true);
+            self.activate(&node, &name).await;
+            self.update_stage(&name, |stage| stage.begins = false);
         }
         let changes = node.watch().await;
         match node.state().await {
-            Ok(state) => self.show(&name, state),
-            Err(error) => tracing::debug!(node = name, %error, "its state is not known"),
+            Ok(state) => self.show_state(&name, state),
+            Err(error) => tracing::debug!(node = name, %error, "its state is unknown"),
         }
         match changes {
             Ok(mut changes) => {
                 while let Some(change) = changes.next().await {
-                    self.show(&name, change.to);
+                    self.show_state(&name, change.to);
                 }
             }
-            Err(error) => tracing::debug!(node = name, %error, "it tells no changes of its state"),
+            Err(error) => {
+                tracing::debug!(node = name, %error, "it does not report changes of its state")
+            }
         }
     }
 
-    async fn begin(&self, node: &LifecycleNode, name: &str) {
+    async fn activate(&self, node: &LifecycleNode, name: &str) {
         let ours = |other: &str| other.starts_with(OURS);
         match node.begin(&ours, PATIENCE).await {
-            Ok(Begun::Now) => self.show(name, State::Active),
-            Ok(Begun::Left(state)) => self.show(name, state),
-            Ok(Begun::DrivenBy(driver)) => {
-                tracing::debug!(node = name, driver, "somebody drives it");
+            Ok(BeginOutcome::Now) => self.show_state(name, State::Active),
+            Ok(BeginOutcome::Left(state)) => self.show_state(name, state),
+            Ok(BeginOutcome::DrivenBy(driver)) => {
+                tracing::debug!(node = name, driver, "another program drives it");
             }
             Err(refused) => {
                 let why = refused.to_string();
                 let observer = &self.observer;
-                observer.event(api::Level::Error, "lifecycle-refused", &why, None);
-                self.put(name, |stage| stage.refused = Some(why));
+                observer.record_event(api::Level::Error, "lifecycle-refused", &why, None);
+                self.update_stage(name, |stage| stage.refused = Some(why));
             }
         }
     }
 
-    /// What was refused stands until the node is active: somebody else may have it become that.
-    fn show(&self, name: &str, state: State) {
-        self.put(name, |stage| {
+    /// Shows a state. A refusal is shown until the node is active, which somebody else may achieve.
+    fn show_state(&self, name: &str, state: State) {
+        self.update_stage(name, |stage| {
             stage.state = state.to_string();
             if state == State::Active {
                 stage.refused = None;
@@ -148,11 +150,11 @@ impl Followed {
         });
     }
 
-    /// Changes what is shown of a node, and tells of it if it is another.
-    fn put(&self, name: &str, change: impl FnOnce(&mut Stage)) {
+    /// Changes what is shown of a node, and notifies watchers if it differs.
+    fn update_stage(&self, name: &str, change: impl FnOnce(&mut LifecycleStage)) {
         self.shown.send_if_modified(|all| {
             let before = all.get(name);
-            let mut now = before.cloned().unwrap_or_else(|| Stage {
+            let mut now = before.cloned().unwrap_or_else(|| LifecycleStage {
                 state: State::Unknown.to_string(),
                 refused: None,
                 begins: false,

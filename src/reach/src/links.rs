@@ -1,15 +1,15 @@
-//! The cloud's end of links: one [`Hub`] before each servant, one link for each node that a robot's stub stands for.
+//! The cloud's end of links: one [`Hub`] per servant, one link per node for which a robot's stub stands.
 //!
 //! ```text
 //!  stub ═ WebSocket ═ Session ─┬─ inputs ──▶ Bus.advertise, publish ──▶ the real node
 //!                              ├─ outputs ◀── Bus.subscribe ◀────────── (only while the robot has a listener)
 //!                              ├─ calls ───▶ Bus.call ────────────────▶
-//!                              ├─ lent ◀──── Bus.lend ◀──────────────── (services of the robot, when one looks for them)
+//!                              ├─ lent ◀──── Bus.lend ◀──────────────── (services of the robot, when looked up)
 //!                              ├─ parameters ◀─▶ the servant's parameter server
 //!                              └─ Graph ◀── what the node has registered, as it changes
 //! ```
-//! A link outlives its connections for a grace time. Of an input that several nodes of the servant listen to, one
-//! link is the feeder; what nodes of one servant publish for each other stays inside.
+//! A link outlives its connections for a grace period. If several nodes of the servant subscribe to an input, one link
+//! feeds it; what nodes of one servant publish for each other stays inside.
 
 mod attempts;
 mod duplicates;
@@ -43,51 +43,51 @@ use parking_lot::Mutex;
 use qos::Span;
 use ros::bus::{Bus, Graph, ParamValue, RosVersion};
 use ros::schema::Registry;
-use ros::sizes::{Inputs, Seen};
+use ros::sizes::{InputSizes, SizeSummary};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::runtime::Handle;
 use tokio::sync::{OnceCell, watch};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-use link::control::{FromCloud, Hello, Sla, Welcome};
-use link::packing::decoded_here;
-use link::session::{Lost, SessionOptions, receive_open, send_open};
+use link::control::{FromCloud, Hello, SlaTargets, Welcome};
+use link::packing::supported_codecs;
+use link::session::{DisconnectReason, SessionOptions, receive_open, send_open};
 use link::skew::Skew;
-use link::{Limits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
+use link::{LinkLimits, MAX_CONTROL, MAX_FRAME, MAX_RECORD, MAX_TOLD};
 
-use crate::Flow;
+use crate::FlowCounts;
 use attempts::Attempts;
-use duplicates::Machine;
+use duplicates::RobotMachine;
 use node_link::NodeLink;
-pub use nodes::Nodes;
-pub use requests::RequestNews;
+pub use nodes::NodeController;
+pub use requests::RequestUpdate;
 pub use status::LinkStatus;
-use turns::Turns;
+use turns::NodeTurns;
 
-/// What errors call the memory for hellos.
+/// Name of the memory for hellos in errors.
 const GREETING: &str = "a robot's hello";
-/// For the robot's hello.
+/// Timeout for the robot's hello.
 const HELLO: Duration = Duration::from_secs(10);
-/// For a node of an earlier run to end, before it is killed, and after that.
+/// Signals for stopping a node of an earlier run, with the time after each.
 const STOP: [(i32, Duration); 3] = [
     (2, Duration::from_secs(5)),
     (15, Duration::from_secs(2)),
     (9, Duration::from_secs(5)),
 ];
 
-/// Habits of a hub.
+/// Options of a hub.
 #[derive(Debug, Clone)]
 pub struct HubOptions {
-    /// How long a link outlives its connection.
+    /// Time for which a link outlives its connection.
     pub grace: Duration,
-    /// How long a service may take.
+    /// Timeout of service calls.
     pub call_timeout: Duration,
-    /// How long first messages wait for the node to connect to their topic.
+    /// Time for which first messages wait until the node connects to their topic.
     pub warm_up: Duration,
-    /// Budget for unfinished frames and records of robots; one that does not fit ends its connection.
+    /// Budget for incomplete frames and records of robots; one that does not fit ends its connection.
     pub budget: Budget,
-    /// A frame that was begun and is not complete after this time ends its connection.
+    /// Time after which an incomplete frame ends its connection.
     pub unfinished: Duration,
 }
 
@@ -97,7 +97,7 @@ impl Default for HubOptions {
             grace: Duration::from_secs(30),
             call_timeout: Duration::from_secs(300),
             warm_up: Duration::from_secs(1),
-            budget: Budget::unlimited(),
+            budget: Budget::without_limit(),
             unfinished: Duration::from_secs(300),
         }
     }
@@ -108,33 +108,33 @@ pub struct Hub {
     servant: String,
     bus: Arc<dyn Bus>,
     registry: Arc<Registry>,
-    nodes: Arc<dyn Nodes>,
+    nodes: Arc<dyn NodeController>,
     options: HubOptions,
     links: Mutex<BTreeMap<String, Arc<NodeLink>>>,
-    /// Grows when links come, go, or change what they listen to.
+    /// Incremented when links are added or removed or change their subscriptions.
     changes: watch::Sender<u64>,
-    /// Serialises beginnings and ends of links, node by node.
-    turns: Turns,
-    parameters: parameters::Known,
-    /// Services of the robot are lent already.
+    /// Serializes the start and end of links per node.
+    turns: NodeTurns,
+    parameters: parameters::ParameterMirror,
+    /// Set once services of the robot are being lent.
     lends: OnceCell<()>,
-    /// The robot's clock against ours.
+    /// Difference between the robot's clock and ours.
     skew: Skew,
     attempts: Attempts,
-    /// Machines that were told of each other.
+    /// Pairs of machines that were warned of each other.
     duplicates: Mutex<BTreeSet<(String, String)>>,
-    /// How large what robots send to nodes is.
-    inputs: Inputs,
+    /// Sizes of what robots send to nodes.
+    inputs: InputSizes,
     closed: watch::Sender<Option<String>>,
 }
 
 impl Hub {
-    /// A hub before a servant's ROS.
+    /// Creates a hub on a servant's bus.
     pub fn new(
         servant: &str,
         bus: Arc<dyn Bus>,
         registry: Arc<Registry>,
-        nodes: Arc<dyn Nodes>,
+        nodes: Arc<dyn NodeController>,
         options: HubOptions,
     ) -> Arc<Self> {
         Arc::new(Self {
@@ -145,67 +145,68 @@ impl Hub {
             options,
             links: Mutex::default(),
             changes: watch::Sender::new(0),
-            turns: Turns::default(),
-            parameters: parameters::Known::default(),
+            turns: NodeTurns::default(),
+            parameters: parameters::ParameterMirror::default(),
             lends: OnceCell::new(),
             skew: Skew::default(),
             attempts: Attempts::default(),
             duplicates: Mutex::default(),
-            inputs: Inputs::default(),
+            inputs: InputSizes::default(),
             closed: watch::Sender::new(None),
         })
     }
 
-    /// All links, by node.
+    /// Returns the status of all links by node.
     pub fn status(&self) -> Vec<LinkStatus> {
         let links: Vec<_> = self.links.lock().values().cloned().collect();
         links.iter().map(|link| link.status()).collect()
     }
 
-    /// What went to the nodes of links and came from them.
-    pub fn flows(&self) -> Vec<Flow> {
+    /// Returns the counts of messages and calls of each link.
+    pub fn flows(&self) -> Vec<FlowCounts> {
         let links = self.links.lock();
         links.values().map(|link| link.flow()).collect()
     }
 
-    /// Warns the stub of a node, if there is one.
+    /// Sends a warning to the stub of a node, if there is one.
     pub fn warn(&self, node: &str, what: &str) {
         let link = self.links.lock().get(node).cloned();
         if let Some(link) = link {
-            link.session.report(&FromCloud::Notice {
+            link.session.send_control(&FromCloud::Notice {
                 warning: true,
                 text: what.to_owned(),
             });
         }
     }
 
-    /// How large the messages and requests of each topic and service are that robots send to nodes.
-    pub fn inputs(&self) -> Vec<(String, Seen)> {
-        self.inputs.seen()
+    /// Returns the sizes of messages and requests from robots by topic and service.
+    pub fn inputs(&self) -> Vec<(String, SizeSummary)> {
+        self.inputs.summaries()
     }
 
-    /// Ends every connection with these words, once what waits for its robot was sent (within seconds), and all links.
+    /// Ends all links and closes every connection with this reason, once what is queued for its robot was sent (within
+    /// seconds).
     pub fn close(&self, reason: &str) {
         self.closed.send_replace(Some(reason.to_owned()));
         for link in std::mem::take(&mut *self.links.lock()).into_values() {
-            link.session.end(1012, reason);
-            link.end();
+            link.session.close(1012, reason);
+            link.stop();
         }
     }
 
-    /// Serves one connection behind its WebSocket upgrade, until it ends.
-    pub async fn serve<S>(self: &Arc<Self>, io: S, read_ahead: &[u8]) -> Lost
+    /// Serves one connection after its WebSocket upgrade until it ends.
+    pub async fn serve<S>(self: &Arc<Self>, io: S, read_ahead: &[u8]) -> DisconnectReason
     where
         S: AsyncRead + AsyncWrite + Unpin + Send,
     {
         let mut socket = WebSocket::new(io, read_ahead, MAX_FRAME, MAX_RECORD)
-            .within(&self.options.budget, self.options.unfinished);
-        let mut held = self.options.budget.within(GREETING, MAX_TOLD).permit();
+            .with_budget(&self.options.budget, self.options.unfinished);
+        let mut held = self.options.budget.child(GREETING, MAX_TOLD).permit();
         let opening = receive_open(&mut socket, "hello", &mut held);
         let mut hello: Hello = match timeout(HELLO, opening).await {
             Ok(Ok(hello)) => hello,
-            Ok(Err(lost)) => return refused(&mut socket, lost).await,
-            Err(_) => return Lost::Silent(HELLO),
+            Ok(Err(lost)) => return send_refusal(&mut socket, lost).await,
+            Err(_) => return DisconnectReason::Silent(HELLO),
         };
         if hello.own_bytes() > MAX_CONTROL {
             let error = link::Error::TooMuch {
@@ -213,7 +214,7 @@ impl Hub {
                 bytes: hello.own_bytes() as u64,
                 limit: MAX_CONTROL as u64,
             };
-            return refused(&mut socket, Lost::Protocol(error)).await;
+            return send_refusal(&mut socket, DisconnectReason::Protocol(error)).await;
         }
         let name = hello.node.name.clone();
         let (link, resumed, turn) = match self.attach(&hello).await {
@@ -231,28 +232,28 @@ impl Hub {
                 };
                 let _ = send_open(&mut socket, &welcome).await;
                 socket.queue_close(1008, "refused");
-                let _ = timeout(Duration::from_secs(1), socket.leave(true)).await;
-                return Lost::Closed {
+                let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
+                return DisconnectReason::Closed {
                     code: 1008,
                     reason: refusal.reason,
                 };
             }
         };
-        let mut carrying = Carrying {
+        let mut carrying = ConnectionGuard {
             hub: self,
             link: &link,
             turn,
             is_ended: false,
         };
-        // They have been set in the servant: what is kept of a hello is small.
+        // They have been set in the servant, so little of a hello is kept.
         hello.parameters.clear();
         drop(held);
-        // Whoever comes later than this one takes its place, while it waits for the lease, too.
+        // A later connection replaces this one, even while it waits for the lease.
         let mut kicked = link.kick.subscribe();
         let replaced = kicked.wait_for(|kicks| *kicks != turn);
         let _seat = tokio::select! {
             biased;
-            _ = replaced => return replaced_by_another(),
+            _ = replaced => return replaced_disconnect(),
             lease = link.lease.lock() => lease,
         };
         self.report_duplicates(&link);
@@ -263,8 +264,8 @@ impl Hub {
             received,
             ahead,
             next,
-            codecs: decoded_here(|codec| hello.codecs.iter().any(|name| name == codec.name())),
-            limits: Limits::default(),
+            codecs: supported_codecs(|codec| hello.codecs.iter().any(|name| name == codec.name())),
+            limits: LinkLimits::default(),
             servant: self.servant.clone(),
         };
         let (theirs, theirs_ahead) = hello
@@ -273,10 +274,10 @@ impl Hub {
             .filter(|_| resumed)
             .map_or((0, &[][..]), |resume| (resume.received, &resume.ahead[..]));
         link.session.set_quality(hello.quality);
-        link.session.peer_decodes(&hello.codecs);
-        link.session.peer_takes(hello.limits);
+        link.session.set_peer_codecs(&hello.codecs);
+        link.session.set_peer_limits(hello.limits);
         link.session.reconnect(theirs, theirs_ahead, hello.next);
-        link.requests.connected(Instant::now());
+        link.requests.on_connected(Instant::now());
         if let Err(lost) = send_open(&mut socket, &welcome).await {
             return lost;
         }
@@ -295,31 +296,34 @@ impl Hub {
             };
             match (lost, self.check_open()) {
                 (Some(lost), _) => lost,
-                // The robot is told why.
+                // The robot is told the reason.
                 (None, Err(_)) => running.await,
-                (None, Ok(())) => return replaced_by_another(),
+                (None, Ok(())) => return replaced_disconnect(),
             }
         };
         let is_over = matches!(
             lost,
-            Lost::Closed { code: 1000, .. } | Lost::Ended | Lost::Protocol(_) | Lost::Full(_)
+            DisconnectReason::Closed { code: 1000, .. }
+                | DisconnectReason::Ended
+                | DisconnectReason::Protocol(_)
+                | DisconnectReason::Full(_)
         );
-        if matches!(lost, Lost::Closed { code: 1000, .. }) {
-            self.attempts.ended(&hello.run);
+        if matches!(lost, DisconnectReason::Closed { code: 1000, .. }) {
+            self.attempts.mark_ended(&hello.run);
         }
         if is_over {
-            self.end(&link, turn).await;
-            // Whoever drops this meanwhile has the link expire all the same.
+            self.end_link(&link, turn).await;
+            // If this future is dropped here, the link still expires.
             carrying.is_ended = true;
         }
         lost
     }
 
-    /// The link that the hello means, begun if need be; whether it goes on; and the turn of this connection.
+    /// Finds or starts the link for a hello. Returns whether it was resumed, and the turn of this connection.
     async fn attach(
         self: &Arc<Self>,
         hello: &Hello,
-    ) -> Result<(Arc<NodeLink>, bool, u64), Refusal> {
+    ) -> Result<(Arc<NodeLink>, bool, u64), LinkRefusal> {
         let node = &hello.node.name;
         self.check_ros(hello.ros)?;
         let is_global = match self.bus.version() {
@@ -327,19 +331,19 @@ impl Hub {
             RosVersion::Two => ros::ros2::names::is_global,
         };
         if !is_global(node) {
-            return Err(Refusal::final_(format!(
+            return Err(LinkRefusal::permanent(format!(
                 "{node:?} is not an absolute node name"
             )));
         }
-        let _turn = self.turns.of(node).await;
+        let _turn = self.turns.acquire(node).await;
         self.check_open()?;
         if !self.attempts.is_newest(&hello.run, hello.attempt) {
-            return Err(Refusal {
-                reason: format!("{node} has tried again since, or has ended"),
+            return Err(LinkRefusal {
+                reason: format!("{node} has connected again since, or has ended"),
                 again: true,
             });
         }
-        let machine = Machine::of(hello);
+        let machine = RobotMachine::from_hello(hello);
         let earlier = self.links.lock().get(node).cloned();
         if let Some(link) = earlier {
             let same = link.run == hello.run;
@@ -350,61 +354,64 @@ impl Hub {
                 return Ok((link, true, turn));
             }
             let alive = link.is_connected();
-            if !same && alive && machine.is_of_another_robot(&link.machine) {
-                return Err(Refusal::final_(format!(
+            if !same && alive && machine.is_other_robot(&link.machine) {
+                return Err(LinkRefusal::permanent(format!(
                     "another machine{} is connected as this robot and runs {node}; {}",
-                    link.machine.named(),
+                    link.machine.host_suffix(),
                     duplicates::NEXT
                 )));
             }
             link.kick.send_modify(|kicks| *kicks += 1);
-            self.forget(&link);
+            self.remove_link(&link);
         }
         self.parameters.watch(self).await;
-        lent::begin(self).await;
+        lent::start_lending(self).await;
         let running = self.nodes.is_running(node).await;
         let ours = running && self.is_of_run(node, &hello.run).await;
         if running && !ours {
-            self.stop(node).await;
+            self.stop_node(node).await;
         }
-        self.parameters.take(self, hello).await;
-        let lines = self.nodes.lines(node);
+        self.parameters.copy_from_hello(self, hello).await;
+        let lines = self.nodes.output_lines(node);
         if !ours {
-            self.note_run(node, &hello.run).await;
+            self.record_run(node, &hello.run).await;
             self.nodes
                 .start(&hello.node, &hello.run)
                 .await
-                .map_err(Refusal::final_)?;
+                .map_err(LinkRefusal::permanent)?;
         }
-        let link = NodeLink::begin(self, hello, session_options(&hello.sla), lines);
+        let link = NodeLink::start(self, hello, session_options(&hello.sla), lines);
         self.links.lock().insert(node.clone(), Arc::clone(&link));
-        // Closed while the node was started: nobody else would end this link.
+        // Closed while the node was starting: nobody else would end this link.
         if let Err(refusal) = self.check_open() {
-            self.forget(&link);
+            self.remove_link(&link);
             return Err(refusal);
         }
-        let untold = self.parameters.untold();
+        let untold = self.parameters.take_pending();
         if !untold.is_empty() {
-            link.session.report(&FromCloud::Parameters(untold));
+            link.session.send_control(&FromCloud::Parameters(untold));
         }
-        if let Some(text) = self.nodes.unheeded(hello) {
+        if let Some(text) = self.nodes.describe_unused_settings(hello) {
             let warning = true;
-            link.session.report(&FromCloud::Notice { warning, text });
+            link.session
+                .send_control(&FromCloud::Notice { warning, text });
         }
-        // What the node has set before there was a link to tell.
+        // Parameters that the node has set before there was a link.
         if let Ok(ParamValue::Map(set)) = self.bus.parameter(node).await {
             let set = set
                 .into_iter()
                 .map(|(key, value)| (format!("{node}/{key}"), Some(value)));
-            link.session.report(&FromCloud::Parameters(set.collect()));
+            link.session
+                .send_control(&FromCloud::Parameters(set.collect()));
         }
-        self.changed();
+        self.notify_changed();
         let turn = *link.kick.borrow();
         Ok((link, false, turn))
     }
 
-    /// A robot of the other ROS has nothing that the servant's nodes understand. Earlier stubs do not say; they are of ROS 1.
-    fn check_ros(&self, robot: u8) -> Result<(), Refusal> {
+    /// Checks the ROS version: a robot with the other one has nothing that the servant's nodes understand. Earlier
+    /// stubs do not announce it; they use ROS 1.
+    fn check_ros(&self, robot: u8) -> Result<(), LinkRefusal> {
         let (ours, robot) = (self.bus.version().number(), robot.max(1));
         if ours == robot {
             return Ok(());
@@ -413,15 +420,15 @@ impl Hub {
             "" => format!("servant {}", self.servant),
             service => format!("service {service}"),
         };
-        Err(Refusal::final_(format!(
-            "{service} is of ROS {ours} and this robot is of ROS {robot}, whose messages are others: push the package for ROS {robot} and \
-             install the stub of that service, or start this stub where ROS {ours} is set up"
+        Err(LinkRefusal::permanent(format!(
+            "{service} uses ROS {ours}, but this robot uses ROS {robot}, whose messages differ: push the package for \
+                ROS {robot} and install the stub of that service, or start this stub where ROS {ours} is set up"
         )))
     }
 
-    fn check_open(&self) -> Result<(), Refusal> {
+    fn check_open(&self) -> Result<(), LinkRefusal> {
         match &*self.closed.borrow() {
-            Some(reason) => Err(Refusal {
+            Some(reason) => Err(LinkRefusal {
                 reason: reason.clone(),
                 again: true,
             }),
@@ -429,11 +436,11 @@ impl Hub {
         }
     }
 
-    fn changed(&self) {
+    fn notify_changed(&self) {
         self.changes.send_modify(|changes| *changes += 1);
     }
 
-    /// Whose inputs of this topic are sent: the first link that listens to it.
+    /// Returns the node whose link sends inputs of this topic: the first one that subscribes to it.
     fn feeder(&self, topic: &str) -> Option<String> {
         let links = self.links.lock();
         let mut listening = links.values().filter(|link| link.listens_to(topic));
@@ -443,16 +450,16 @@ impl Hub {
             .map(|link| link.node.clone())
     }
 
-    /// The nodes of other links, with all that their processes are.
+    /// Returns the nodes of other links, with all nodes of their processes.
     fn siblings(&self, graph: &Graph, node: &str) -> Vec<String> {
         let links = self.links.lock();
         let others = links.keys().filter(|name| *name != node);
-        let nodes: BTreeSet<String> = others.flat_map(|name| graph.of_process(name)).collect();
+        let nodes: BTreeSet<String> = others.flat_map(|name| graph.process_nodes(name)).collect();
         nodes.into_iter().collect()
     }
 
-    /// Takes the link out of reach.
-    fn forget(&self, link: &Arc<NodeLink>) {
+    /// Removes the link from the hub.
+    fn remove_link(&self, link: &Arc<NodeLink>) {
         let mut links = self.links.lock();
         if links
             .get(&link.node)
@@ -461,70 +468,71 @@ impl Hub {
             links.remove(&link.node);
         }
         drop(links);
-        link.end();
-        self.changed();
+        link.stop();
+        self.notify_changed();
     }
 
-    /// Ends the link and its node, unless another connection has taken the link up since the one of this turn.
-    async fn end(&self, link: &Arc<NodeLink>, turn: u64) {
-        let _turn = self.turns.of(&link.node).await;
+    /// Ends the link and its node, unless another connection has resumed the link since this turn.
+    async fn end_link(&self, link: &Arc<NodeLink>, turn: u64) {
+        let _turn = self.turns.acquire(&link.node).await;
         let known = self.links.lock().get(&link.node).cloned();
         let current = known.is_some_and(|known| Arc::ptr_eq(&known, link));
         if current && *link.kick.borrow() == turn {
-            self.forget(link);
-            self.stop(&link.node).await;
+            self.remove_link(link);
+            self.stop_node(&link.node).await;
         }
     }
 
-    /// Ends the link unless its robot comes back within the grace time.
-    fn expire(self: &Arc<Self>, link: &Arc<NodeLink>, turn: u64) {
+    /// Ends the link unless its robot reconnects within the grace period.
+    fn expire_later(self: &Arc<Self>, link: &Arc<NodeLink>, turn: u64) {
         let (hub, link) = (Arc::clone(self), Arc::clone(link));
         let mut kicked = link.kick.subscribe();
         tokio::spawn(async move {
             let back = kicked.wait_for(|kicks| *kicks != turn);
             if timeout(hub.options.grace, back).await.is_err() {
-                hub.end(&link, turn).await;
+                hub.end_link(&link, turn).await;
             }
         });
     }
 
-    async fn stop(&self, node: &str) {
+    async fn stop_node(&self, node: &str) {
         for (signal, patience) in STOP {
             if !self.nodes.is_running(node).await || self.nodes.signal(node, signal).await.is_err()
             {
                 return;
             }
-            if timeout(patience, self.nodes.ended(node)).await.is_ok() {
+            if timeout(patience, self.nodes.wait_exit(node)).await.is_ok() {
                 return;
             }
         }
     }
 }
 
-/// A connection that carries a link. However it ends, dropped in the middle of it included, the link expires, unless it was ended for good.
-struct Carrying<'a> {
+/// A connection that carries a link. However it ends, even if the future is dropped, the link expires, unless it was
+/// ended explicitly.
+struct ConnectionGuard<'a> {
     hub: &'a Arc<Hub>,
     link: &'a Arc<NodeLink>,
     turn: u64,
     is_ended: bool,
 }
 
-impl Drop for Carrying<'_> {
+impl Drop for ConnectionGuard<'_> {
     fn drop(&mut self) {
-        // As the daemon ends there is nobody to wait for it.
+        // When the daemon ends there is no runtime to wait.
         if !self.is_ended && Handle::try_current().is_ok() {
-            self.hub.expire(self.link, self.turn);
+            self.hub.expire_later(self.link, self.turn);
         }
     }
 }
 
-struct Refusal {
+struct LinkRefusal {
     reason: String,
     again: bool,
 }
 
-impl Refusal {
-    fn final_(reason: impl Into<String>) -> Self {
+impl LinkRefusal {
+    fn permanent(reason: impl Into<String>) -> Self {
         Self {
             reason: reason.into(),
             again: false,
@@ -532,33 +540,33 @@ impl Refusal {
     }
 }
 
-/// Tells a robot why its hello is not read.
-async fn refused<S>(socket: &mut WebSocket<S>, lost: Lost) -> Lost
+/// Closes the connection with the reason why its hello is not accepted.
+async fn send_refusal<S>(socket: &mut WebSocket<S>, lost: DisconnectReason) -> DisconnectReason
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    if let Some((code, reason)) = lost.goodbye() {
+    if let Some((code, reason)) = lost.close_frame() {
         socket.queue_close(code, &reason);
-        let _ = timeout(Duration::from_secs(1), socket.leave(true)).await;
+        let _ = timeout(Duration::from_secs(1), socket.shutdown(true)).await;
     }
     lost
 }
 
-fn replaced_by_another() -> Lost {
-    Lost::Closed {
+fn replaced_disconnect() -> DisconnectReason {
+    DisconnectReason::Closed {
         code: 1012,
         reason: "the robot came back on another connection".into(),
     }
 }
 
-/// How the cloud watches a link: the robot pings often, so the cloud need not.
-fn session_options(sla: &Sla) -> SessionOptions {
+/// Returns the options with which the cloud supervises a link: the robot pings often, so the cloud need not.
+fn session_options(sla: &SlaTargets) -> SessionOptions {
     SessionOptions {
         ping: Duration::from_secs(5),
         silent: Duration::from_secs(7),
         lost: Duration::from_secs(20),
-        // A robot may tell any number: beyond what a promise can be it promises nothing.
-        max_age: sla.max.and_then(Span::seconds).map(Span::duration),
+        // A robot may send any number; if it is out of range, nothing is promised.
+        max_age: sla.max.and_then(Span::from_seconds).map(Span::duration),
     }
 }
 

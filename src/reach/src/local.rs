@@ -1,4 +1,4 @@
-//! Servants of this host's engine: reached in this process, by sockets in their network namespaces.
+//! Servants of this host's engine, reached in this process through sockets in their network namespaces.
 
 use std::sync::Arc;
 
@@ -7,45 +7,46 @@ use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
 use ros::JoinOptions;
 use ros::bus::RosVersion;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::local::{LocalEngine, LocalServant};
 
-use crate::components::{Components, Wanted};
+use crate::components::{ComponentLoader, ComponentPlan};
 use crate::egress::{self, Relays};
-use crate::endings::Endings;
-use crate::in_process::{Behind, InProcess};
-use crate::inside::Joined;
-use crate::lifecycle::Lifecycles;
-use crate::links::Nodes;
+use crate::endings::ExitNotifier;
+use crate::in_process::{InProcess, InProcessParts};
+use crate::inside::JoinedBus;
+use crate::lifecycle::LifecycleDriver;
+use crate::links::NodeController;
 use crate::nodes::LinkedNodes;
 use crate::sockets::ServantSockets;
-use crate::succession::Participants;
-use crate::{Error, Look, Observer, Opener, Reach, ReachOptions, Recorded, master};
+use crate::succession::DaemonParticipants;
+use crate::{Error, ObservedBus, Observer, Opener, Reach, ReachOptions, RecordedRevision, master};
 
-/// The name of our node in every servant's graph.
+/// Name of our node in every servant's graph.
 const NODE: &str = "/cloudroid_bridge";
 
-/// Reaches the servants of an engine of this host.
+/// Opens the reach of servants of this host's engine.
 pub struct LocalOpener {
     engine: LocalEngine,
-    /// `egress` of what the operator allows.
+    /// Rules of `egress` that the operator allows.
     egress: Vec<String>,
 }
 
 impl LocalOpener {
-    /// For the servants of `engine`; their nodes get to those hosts that are granted to them and in `egress`.
+    /// Creates an opener for the servants of `engine`. Their nodes reach hosts that are granted to them and allowed by
+    /// `egress`.
     pub fn new(engine: LocalEngine, egress: Vec<String>) -> LocalOpener {
         LocalOpener { engine, egress }
     }
 
-    fn local(&self, servant: &Arc<dyn Servant>) -> Result<Arc<LocalServant>, Error> {
+    fn find_servant(&self, servant: &Arc<dyn ServantHandle>) -> Result<Arc<LocalServant>, Error> {
         let id = servant.id();
         let found = self.engine.servant(id);
         found.ok_or_else(|| Error::Elsewhere(id.to_owned()))
     }
 
-    async fn relays(&self, servant: &LocalServant, egress: &[String]) -> Relays {
-        // Not allowed any more: then the servant would not have been started either.
+    async fn open_relays(&self, servant: &LocalServant, egress: &[String]) -> Relays {
+        // If it is no longer allowed, the servant would not have been started either.
         let routes = egress::routes(egress, &self.egress).unwrap_or_default();
         Relays::open(servant.network(), &routes).await
     }
@@ -55,17 +56,17 @@ impl LocalOpener {
 impl Opener for LocalOpener {
     async fn open(
         &self,
-        servant: &Arc<dyn Servant>,
-        recorded: BoxFuture<'_, Recorded>,
+        servant: &Arc<dyn ServantHandle>,
+        recorded: BoxFuture<'_, RecordedRevision>,
         options: ReachOptions,
         observer: Arc<dyn Observer>,
     ) -> Result<Arc<dyn Reach>, Error> {
-        let local = self.local(servant)?;
+        let local = self.find_servant(servant)?;
         let joining = JoinOptions {
             budget: options.budget.clone(),
             unfinished: options.unfinished,
             distribution: options.distribution.clone(),
-            succession: Some(Arc::new(Participants::of(&local))),
+            succession: Some(Arc::new(DaemonParticipants::new(&local))),
             ..JoinOptions::new(master::ADDRESS, NODE)
         };
         let sockets = Arc::new(ServantSockets::new(local.network()));
@@ -79,14 +80,14 @@ impl Opener for LocalOpener {
         let (bus, recorded) = tokio::join!(joined, recorded);
         let bus = bus?;
         let registry = Arc::clone(&recorded.registry);
-        let relays = self.relays(&local, &recorded.egress).await;
-        let wanted = Wanted::new(recorded.components.clone(), Arc::clone(&registry));
-        let endings = Endings::follow(servant.events(), Arc::clone(&bus));
+        let relays = self.open_relays(&local, &recorded.egress).await;
+        let wanted = ComponentPlan::new(recorded.components.clone(), Arc::clone(&registry));
+        let endings = ExitNotifier::start(servant.events(), Arc::clone(&bus));
         let nodes = LinkedNodes::new(recorded, servant, Arc::clone(&observer));
-        let nodes: Arc<dyn Nodes> = Arc::new(nodes);
-        let lifecycles = Lifecycles::follow(&bus, &nodes, &observer);
-        let components = Components::follow(&bus, &nodes, &observer, wanted);
-        let behind = Behind {
+        let nodes: Arc<dyn NodeController> = Arc::new(nodes);
+        let lifecycles = LifecycleDriver::start(&bus, &nodes, &observer);
+        let components = ComponentLoader::start(&bus, &nodes, &observer, wanted);
+        let behind = InProcessParts {
             id: servant.id().to_owned(),
             linked: (Arc::clone(&bus), nodes),
             bus,
@@ -95,8 +96,8 @@ impl Opener for LocalOpener {
                 let joined = ros::connect(ros, Arc::clone(&beside) as _, looking.clone());
                 let joined = async move {
                     let bus = joined.await?;
-                    let endings = Some(Endings::follow(events, Arc::clone(&bus)));
-                    Ok(Joined { bus, endings })
+                    let endings = Some(ExitNotifier::start(events, Arc::clone(&bus)));
+                    Ok(JoinedBus { bus, endings })
                 };
                 joined.boxed()
             }),
@@ -108,24 +109,24 @@ impl Opener for LocalOpener {
         Ok(Arc::new(InProcess::new(behind, options)))
     }
 
-    async fn look(
+    async fn observe(
         &self,
-        servant: &Arc<dyn Servant>,
+        servant: &Arc<dyn ServantHandle>,
         ros: RosVersion,
         name: &str,
         egress: &[String],
-    ) -> Result<Look, Error> {
-        let local = self.local(servant)?;
-        let relays = self.relays(&local, egress).await;
+    ) -> Result<ObservedBus, Error> {
+        let local = self.find_servant(servant)?;
+        let relays = self.open_relays(&local, egress).await;
         let sockets = Arc::new(ServantSockets::new(local.network()));
         let joining = JoinOptions::new(master::ADDRESS, name);
-        Ok(Look {
+        Ok(ObservedBus {
             bus: ros::connect(ros, sockets, joining).await?,
             _relays: relays,
         })
     }
 
-    fn processes(&self, servant: &str) -> Vec<i32> {
+    fn process_ids(&self, servant: &str) -> Vec<i32> {
         let servant = self.engine.servant(servant);
         servant
             .and_then(|servant| servant.processes().ok())

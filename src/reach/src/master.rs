@@ -1,4 +1,4 @@
-//! Where the ROS Master of a servant of ROS 1 is, and how it is configured; nodes of ROS 2 have none.
+//! Address and configuration of the ROS Master of a ROS 1 servant; ROS 2 has none.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -8,13 +8,13 @@ use ros::flavour::{Flavour, Version};
 use ros::ros1::process;
 use serde::{Deserialize, Serialize};
 
-/// Where a servant's ROS Master listens, as seen from inside.
+/// Address of a servant's ROS Master as seen from inside.
 pub const ADDRESS: SocketAddr = process::MASTER;
 
-/// What the daemon hands to the servant's shim through its spec.
+/// Configuration that the daemon passes to the servant's shim in its spec.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 pub struct MasterConfig {
-    /// Whether there is a Master.
+    /// Run a Master (default: true).
     #[serde(default = "yes")]
     pub master: bool,
     /// Parameters set before the first node starts.
@@ -22,7 +22,7 @@ pub struct MasterConfig {
     pub parameters: BTreeMap<String, ParamValue>,
 }
 
-/// Before it was said, every servant had one.
+/// Before this field existed, every servant had a Master.
 fn yes() -> bool {
     true
 }
@@ -36,14 +36,16 @@ impl Default for MasterConfig {
     }
 }
 
-/// [`servant::spec::Spec::resident`]: a Master with these parameters, and those that this ROS sets itself, or none where nodes
-/// find each other without and are told their parameters when they are started.
+/// Returns the value for [`servant::spec::Spec::resident`]: a Master with these parameters and those that this ROS
+/// version sets itself, or none if nodes discover each other and get their parameters when they are started.
 pub fn resident_config(
     flavour: &Flavour,
     parameters: &BTreeMap<String, ParamValue>,
 ) -> serde_json::Value {
     match flavour.ros {
-        Version::Ros1 => serde_json::json!({ "parameters": flavour.parameters(parameters) }),
+        Version::Ros1 => {
+            serde_json::json!({ "parameters": flavour.initial_parameters(parameters) })
+        }
         Version::Ros2 => serde_json::json!({ "master": false }),
     }
 }
@@ -58,7 +60,7 @@ mod tests {
         let flavour = Flavour::default();
         let written = resident_config(&flavour, &parameters);
         let read = MasterConfig::deserialize(&written).expect("what was written");
-        assert_eq!(read.parameters, flavour.parameters(&parameters));
+        assert_eq!(read.parameters, flavour.initial_parameters(&parameters));
         assert!(read.master && MasterConfig::default().master);
     }
 

@@ -1,4 +1,5 @@
-//! What a servant does for its robot's stubs: nodes are started and ended one by one, as roslaunch does on the robot.
+//! Control of a servant's nodes by its robot's stubs: nodes are started and stopped individually, as roslaunch does on
+//! the robot.
 
 mod planned;
 mod told;
@@ -9,53 +10,53 @@ use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
 use futures_util::FutureExt;
-use link::control::{Decision, Exit, Node, Request};
+use link::control::{Decision, Exit, NodeLaunch, RequestTiming};
 use parking_lot::Mutex;
 use ros::bus::ParamValue;
-use ros::flavour::{Identity, Naming};
+use ros::flavour::{Naming, NodeIdentity};
 use ros::ros2::arguments;
-use servant::engine::{LogStart, NodeExit, Servant};
+use servant::engine::{LogStart, NodeExit, ServantHandle};
 use servant::spec::{NodeSpec, RUN};
 use tokio::sync::mpsc;
 
-use crate::links::{Nodes, RequestNews};
-use crate::{Linked, Observer, Recorded, Tenant, how_it_ended};
+use crate::links::{NodeController, RequestUpdate};
+use crate::{Observer, RecordedRevision, StubNode, Tenant, describe_exit};
 
-use planned::Planned;
+use planned::OwnNodes;
 
-pub(crate) use told::Told;
+pub(crate) use told::RobotEvents;
 
-/// Lines that wait for a slow link; more are lost, and stand in the servant's log.
+/// Number of lines queued for a slow link; the others are lost but are in the servant's log.
 const LINES: usize = 256;
 
 /// The nodes of one servant.
 pub struct LinkedNodes {
-    recorded: Recorded,
-    told: Told,
-    container: Arc<dyn Servant>,
-    planned: Planned,
-    /// As they were started last, by name.
-    started: Mutex<BTreeMap<String, Node>>,
+    recorded: RecordedRevision,
+    told: RobotEvents,
+    container: Arc<dyn ServantHandle>,
+    planned: OwnNodes,
+    /// Last started nodes by name.
+    started: Mutex<BTreeMap<String, NodeLaunch>>,
 }
 
 impl LinkedNodes {
-    /// Those of a running container.
+    /// Creates the control of a running container's nodes.
     pub(crate) fn new(
-        recorded: Recorded,
-        container: &Arc<dyn Servant>,
+        recorded: RecordedRevision,
+        container: &Arc<dyn ServantHandle>,
         observer: Arc<dyn Observer>,
     ) -> LinkedNodes {
         LinkedNodes {
             recorded,
-            told: Told::new(container.id(), observer),
+            told: RobotEvents::new(container.id(), observer),
             container: Arc::clone(container),
-            planned: Planned::default(),
+            planned: OwnNodes::default(),
             started: Mutex::default(),
         }
     }
 
-    /// Where the program runs: as on the robot, or where ROS's own default leads.
-    fn directory(&self, node: &Node, program: &str) -> String {
+    /// Returns the working directory of the program: as on the robot, or the default of ROS.
+    fn working_directory(&self, node: &NodeLaunch, program: &str) -> String {
         let overlay = Path::new(&node.share).parent().and_then(Path::parent);
         let beside = overlay
             .is_some_and(|overlay| Path::new(&node.directory).starts_with(overlay.join("lib")));
@@ -67,7 +68,7 @@ impl LinkedNodes {
         if translated != node.directory {
             return translated;
         }
-        let Recorded {
+        let RecordedRevision {
             flavour,
             environment,
             ..
@@ -75,44 +76,49 @@ impl LinkedNodes {
         flavour.home(environment).to_owned()
     }
 
-    /// The revision's own nodes end: a stub's take their place.
-    async fn end_planned(&self, tenant: &dyn Tenant) {
+    /// Ends the revision's own nodes, which a stub's nodes replace.
+    async fn end_own_nodes(&self, tenant: &dyn Tenant) {
         let ending = || planned::end_all(&*self.container, &self.recorded.nodes);
-        self.planned.end(|| tenant.take_over(), ending).await;
+        self.planned.end_once(|| tenant.take_over(), ending).await;
     }
 }
 
-/// The program that a stub's node stands for. A robot says which, so nothing but what the push recorded is run: other
-/// programs of the image, by whatever path, are not.
-pub(crate) fn program<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a String, String> {
+/// Finds the program for a stub's node. Because a robot names it, only programs recorded by the push are run, and no
+/// others of the image by any path.
+pub(crate) fn find_program<'a>(
+    recorded: &'a RecordedRevision,
+    node: &NodeLaunch,
+) -> Result<&'a String, String> {
     let same = node.package == recorded.package;
     let programs = &recorded.inventory.programs;
     let known = programs.get(&node.executable).filter(|_| same);
     known.ok_or_else(|| {
         format!(
-            "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; push it with that node",
+            "service {} was not pushed with the executable {} of package {}: a stub starts what its push recorded; \
+             push it with that node",
             recorded.service, node.executable, node.package
         )
     })
 }
 
-/// The robot's own arguments, then what the deployer gave, then what makes it this node. In ROS 2 (rcl's arguments.c) the later one of
-/// two values of a parameter counts, `--ros-args` may come again while its arguments go on, and `--` ends them; so the deployer's
-/// win over the robot's, whether or not the robot's were ended.
+/// Returns the command line: the robot's own arguments, then the deployer's, then those that give the node its
+/// identity. In ROS 2 (rcl's arguments.c) the later of two values of a parameter counts, `--ros-args` may be repeated
+/// within its arguments, and `--` ends them; so the deployer's values override the robot's, whether or not the robot's
+/// list was ended.
 fn command_line(
     program: &str,
     robots: impl Iterator<Item = String>,
     given: Vec<String>,
-    identity: &Identity,
+    identity: &NodeIdentity,
 ) -> Vec<String> {
     let program = std::iter::once(program.to_owned()).chain(robots);
     let given = given.into_iter().chain(identity.arguments.iter().cloned());
     program.chain(given).collect()
 }
 
-/// The revision's own nodes that run this executable.
-pub(crate) fn running<'a>(
-    recorded: &'a Recorded,
+/// Returns the revision's own nodes that run this executable.
+pub(crate) fn nodes_running<'a>(
+    recorded: &'a RecordedRevision,
     executable: &str,
 ) -> impl Iterator<Item = &'a NodeSpec> {
     recorded.nodes.iter().filter(move |planned| {
@@ -121,15 +127,16 @@ pub(crate) fn running<'a>(
     })
 }
 
-/// What a program is told of its nodes' names: nothing that the robot has not said, but for what the push has told the node that the stub is called by, so that one
-/// whose own name is another each time, say, has one. What it has told others of the same program (`name=` of a second one) is nothing to this one.
-fn told(recorded: &Recorded, node: &Node) -> Naming {
+/// Decides which names are imposed on a program's nodes: none that the robot has not given, except those that the push
+/// has given to the node for which the stub is named, for example because the program's own name is different each
+/// time. Names that the push gave to other nodes of the same program do not apply.
+fn naming_for(recorded: &RecordedRevision, node: &NodeLaunch) -> Naming {
     if !node.named_by_argv {
         return Naming::default();
     }
-    let planned: Vec<_> = running(recorded, &node.executable).collect();
-    match arguments::named_by_program(planned, |planned| &planned.argv) {
-        Some(planned) => recorded.flavour.says_to_all(&planned.argv),
+    let planned: Vec<_> = nodes_running(recorded, &node.executable).collect();
+    match arguments::node_for_stub(planned, |planned| &planned.argv) {
+        Some(planned) => recorded.flavour.global_naming(&planned.argv),
         None => Naming {
             name: false,
             namespace: false,
@@ -138,18 +145,20 @@ fn told(recorded: &Recorded, node: &Node) -> Naming {
 }
 
 #[async_trait]
-impl Nodes for LinkedNodes {
+impl NodeController for LinkedNodes {
     fn service(&self) -> &str {
         &self.recorded.service
     }
 
-    async fn start(&self, node: &Node, run: &str) -> Result<(), String> {
+    async fn start(&self, node: &NodeLaunch, run: &str) -> Result<(), String> {
         let tenant = self.told.tenant()?;
-        self.told.observer().fits(node.revision, &node.image)?;
-        let program = program(&self.recorded, node)?;
-        self.end_planned(&*tenant).await;
-        let says = told(&self.recorded, node);
-        let identity = self.recorded.flavour.of_a_robot(&node.name, says);
+        self.told
+            .observer()
+            .check_stub(node.revision, &node.image)?;
+        let program = find_program(&self.recorded, node)?;
+        self.end_own_nodes(&*tenant).await;
+        let says = naming_for(&self.recorded, node);
+        let identity = self.recorded.flavour.robot_identity(&node.name, says);
         let mut given = self.recorded.parameters.clone();
         given.extend(self.parameters(node));
         let robots = node.argv.iter();
@@ -158,10 +167,10 @@ impl Nodes for LinkedNodes {
         let argv = command_line(
             program,
             robots,
-            flavour.arguments(&node.name, &given),
+            flavour.parameter_arguments(&node.name, &given),
             &identity,
         );
-        let directory = self.directory(node, program);
+        let directory = self.working_directory(node, program);
         let mut environment = identity.environment;
         if !run.is_empty() {
             environment.insert(RUN.to_owned(), run.to_owned());
@@ -181,17 +190,17 @@ impl Nodes for LinkedNodes {
         Ok(())
     }
 
-    fn run(&self, node: &str) -> Option<String> {
-        self.container.run(node)
+    fn last_run(&self, node: &str) -> Option<String> {
+        self.container.run_id(node)
     }
 
-    async fn running(&self) -> Vec<Linked> {
-        let started: Vec<Node> = self.started.lock().values().cloned().collect();
+    async fn running_nodes(&self) -> Vec<StubNode> {
+        let started: Vec<NodeLaunch> = self.started.lock().values().cloned().collect();
         let mut running = Vec::new();
         for node in started {
             if self.is_running(&node.name).await {
                 let given = self.parameters(&node);
-                running.push(Linked { node, given });
+                running.push(StubNode { node, given });
             }
         }
         running
@@ -202,7 +211,7 @@ impl Nodes for LinkedNodes {
         sent.map_err(|error| error.to_string())
     }
 
-    async fn ended(&self, node: &str) -> Exit {
+    async fn wait_exit(&self, node: &str) -> Exit {
         let limits = self
             .told
             .tenant()
@@ -212,7 +221,7 @@ impl Nodes for LinkedNodes {
             Ok(exit) => Exit {
                 code: exit.code,
                 signal: exit.signal,
-                text: format!("{node} {}", how_it_ended(&exit, &limits)),
+                text: format!("{node} {}", describe_exit(&exit, &limits)),
             },
             Err(error) => Exit {
                 text: error.to_string(),
@@ -226,9 +235,9 @@ impl Nodes for LinkedNodes {
         ended.is_none()
     }
 
-    fn parameters(&self, node: &Node) -> Vec<(String, ParamValue)> {
+    fn parameters(&self, node: &NodeLaunch) -> Vec<(String, ParamValue)> {
         let plan = &self.recorded;
-        let Some(planned) = running(plan, &node.executable).next() else {
+        let Some(planned) = nodes_running(plan, &node.executable).next() else {
             return Vec::new();
         };
         let private = format!("{}/", planned.name);
@@ -239,7 +248,7 @@ impl Nodes for LinkedNodes {
         given.collect()
     }
 
-    fn translate(&self, node: &Node, text: &str) -> String {
+    fn translate(&self, node: &NodeLaunch, text: &str) -> String {
         if node.share.is_empty() || !text.contains(&node.share) {
             return text.to_owned();
         }
@@ -251,23 +260,23 @@ impl Nodes for LinkedNodes {
         }
     }
 
-    fn decided(&self, node: &str, decision: &Decision) {
-        self.told.decided(node, decision);
+    fn on_decision(&self, node: &str, decision: &Decision) {
+        self.told.record_decision(node, decision);
     }
 
-    fn measured(&self, request: &Request, news: RequestNews) {
-        self.told.observer().measured(request, news);
+    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
+        self.told.observer().on_request_measured(request, news);
     }
 
     fn warn(&self, kind: &str, text: &str) {
         self.told.warn(kind, text);
     }
 
-    fn bind(&self, tenant: Weak<dyn Tenant>) {
-        self.told.bind(tenant);
+    fn bind_tenant(&self, tenant: Weak<dyn Tenant>) {
+        self.told.bind_tenant(tenant);
     }
 
-    fn lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
+    fn output_lines(&self, node: &str) -> mpsc::Receiver<(bool, String)> {
         let mut all = self.container.follow(LogStart::Now);
         let (sender, lines) = mpsc::channel(LINES);
         let node = node.to_owned();
@@ -276,7 +285,7 @@ impl Nodes for LinkedNodes {
                 tokio::select! {
                     line = all.recv() => match line {
                         Some(line) if line.node == node => {
-                            // The log waits meanwhile: the link alone leaves lines out, and counts them.
+                            // The log waits meanwhile; only the link omits lines, and counts them.
                             if sender.send((line.stream == "stderr", line.line)).await.is_err() {
                                 return;
                             }
@@ -299,8 +308,8 @@ mod tests {
 
     use super::*;
 
-    fn recorded() -> Recorded {
-        Recorded {
+    fn test_revision() -> RecordedRevision {
+        RecordedRevision {
             service: "vision".into(),
             package: "vision".into(),
             flavour: Default::default(),
@@ -322,8 +331,8 @@ mod tests {
         }
     }
 
-    fn asks(package: &str, executable: &str) -> Option<String> {
-        let node = Node {
+    fn program_of(package: &str, executable: &str) -> Option<String> {
+        let node = NodeLaunch {
             name: "/see".into(),
             package: package.into(),
             executable: executable.into(),
@@ -335,15 +344,18 @@ mod tests {
             image: String::new(),
             named_by_argv: false,
         };
-        program(&recorded(), &node).ok().cloned()
+        find_program(&test_revision(), &node).ok().cloned()
     }
 
     #[test]
     fn a_stub_starts_what_its_push_recorded_and_nothing_else() {
         let path = |text: &str| Some(text.to_owned());
-        assert_eq!(asks("vision", "see"), path("/opt/mine/lib/vision/see"));
         assert_eq!(
-            asks("vision", "look.py"),
+            program_of("vision", "see"),
+            path("/opt/mine/lib/vision/see")
+        );
+        assert_eq!(
+            program_of("vision", "look.py"),
             path("/opt/mine/share/vision/scripts/look.py")
         );
         for (package, executable) in [
@@ -357,7 +369,11 @@ mod tests {
             ("../lib/vision", "see"),
             ("/bin", "sh"),
         ] {
-            assert_eq!(asks(package, executable), None, "{package} {executable}");
+            assert_eq!(
+                program_of(package, executable),
+                None,
+                "{package} {executable}"
+            );
         }
     }
 
@@ -370,16 +386,17 @@ mod tests {
                 ..Flavour::default()
             };
             let robots = argv.iter().map(|argument| (*argument).to_owned());
-            let given = flavour.arguments("/camera/see", &given);
-            let identity = flavour.of_a_robot("/camera/see", Naming::default());
+            let given = flavour.parameter_arguments("/camera/see", &given);
+            let identity = flavour.robot_identity("/camera/see", Naming::default());
             command_line("/opt/see", robots, given, &identity).join(" ")
         };
         let robots = ["plain", "--ros-args", "-p", "gain:=1", "-r", "scan:=/front"];
         assert_eq!(
             started(Version::Ros2, &robots),
-            "/opt/see plain --ros-args -p gain:=1 -r scan:=/front --ros-args -p gain:=2 -- --ros-args -r __node:=see -r __ns:=/camera --enclave /cloudroid_link/camera/see"
+            "/opt/see plain --ros-args -p gain:=1 -r scan:=/front --ros-args -p gain:=2 -- --ros-args -r __node:=see \
+             -r __ns:=/camera --enclave /cloudroid_link/camera/see"
         );
-        // Those of ROS 1 are on the parameter server.
+        // In ROS 1 they are on the parameter server.
         assert_eq!(
             started(Version::Ros1, &["_gain:=1", "scan:=/front"]),
             "/opt/see _gain:=1 scan:=/front __name:=see"
@@ -388,7 +405,7 @@ mod tests {
 
     #[test]
     fn nodes_keep_the_names_of_their_program_unless_the_robot_or_the_push_says_others() {
-        let mut recorded = recorded();
+        let mut recorded = test_revision();
         recorded.flavour.ros = Version::Ros2;
         let planned = |argv: &str| NodeSpec {
             name: "/front/see".into(),
@@ -401,13 +418,13 @@ mod tests {
         };
         let mut said = |argv: &[&str], named_by_argv| {
             recorded.nodes = argv.iter().map(|argv| planned(argv)).collect();
-            let node = Node {
+            let node = NodeLaunch {
                 name: "/front/see".into(),
                 executable: "see".into(),
                 named_by_argv,
-                ..Node::default()
+                ..NodeLaunch::default()
             };
-            let Naming { name, namespace } = told(&recorded, &node);
+            let Naming { name, namespace } = naming_for(&recorded, &node);
             (name, namespace)
         };
         let plain = "/opt/mine/lib/vision/see -v";
@@ -420,7 +437,7 @@ mod tests {
         assert_eq!(said(&[&moved], true), (false, true));
         let second = format!("{plain} --ros-args -r see:__node:=see_2");
         assert_eq!(said(&[plain, &second], true), (false, false));
-        // What another of the same program is told it is told alone.
+        // Names given to another node of the same program do not apply to this one.
         assert_eq!(said(&[plain, &renamed], true), (false, false));
         assert_eq!(said(&[&moved, &renamed], true), (false, true));
         let other = "/opt/mine/lib/vision/look.py --ros-args -r __node:=look";

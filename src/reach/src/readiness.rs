@@ -1,13 +1,13 @@
-//! When a servant can be used: when what its interface promises is registered. What only a deployer's supplement promises, of
-//! which no node is known, is not awaited: the push did not see it, and it may come with a robot, or never.
+//! Readiness of a servant: everything that its interface promises is registered. What only a deployer's supplement
+//! promises, without a known node, is not awaited: the push did not see it, and it may appear with a robot or never.
 
 use std::collections::BTreeSet;
 
 use package::interface::{Direction, Interface};
 use ros::bus::Graph;
 
-/// What of `interface` is not in `graph`, in words.
-pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
+/// Describes the endpoints of `interface` that are missing in `graph`.
+pub fn missing_endpoints(interface: &Interface, graph: &Graph) -> Vec<String> {
     let mut missing = Vec::new();
     for topic in interface.topics.iter().filter(|topic| !topic.lazy) {
         let mut nodes = topic.nodes.iter();
@@ -39,7 +39,7 @@ pub fn missing(interface: &Interface, graph: &Graph) -> Vec<String> {
     missing
 }
 
-/// Nodes of the interface that have registered nothing.
+/// Returns the nodes of the interface that have registered nothing.
 pub fn missing_nodes(interface: &Interface, graph: &Graph) -> Vec<String> {
     let topics = interface.topics.iter().flat_map(|topic| &topic.nodes);
     let services = interface.services.iter().map(|service| &service.node);
@@ -55,7 +55,7 @@ pub fn missing_nodes(interface: &Interface, graph: &Graph) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use package::interface::{Action, Service, Topic};
-    use ros::bus::{ActionNodes, NodeEnds, Qos, ServiceType, TopicNodes, WireType};
+    use ros::bus::{ActionNodes, NodeEntities, QosProfile, ServiceType, TopicNodes, WireType};
 
     use super::*;
 
@@ -107,7 +107,7 @@ mod tests {
     fn everything_promised_must_be_there() {
         let mut graph = Graph::default();
         assert_eq!(
-            missing(&interface(), &graph),
+            missing_endpoints(&interface(), &graph),
             [
                 "the publisher of /out",
                 "the subscriber of /in",
@@ -130,13 +130,13 @@ mod tests {
             .nodes
             .insert("/node".into(), "http://localhost:1".into());
         assert_eq!(
-            missing(&interface(), &graph),
+            missing_endpoints(&interface(), &graph),
             ["the subscriber of /in"],
             "another node's end does not count"
         );
         graph.topics.insert("/in".into(), ends(&[], &["/node"]));
         assert!(
-            missing(&interface(), &graph).is_empty(),
+            missing_endpoints(&interface(), &graph).is_empty(),
             "lazy inputs are not awaited"
         );
         assert!(missing_nodes(&interface(), &graph).is_empty());
@@ -147,7 +147,7 @@ mod tests {
         let mut promised = interface();
         promised.late = vec!["/add".into(), "/go".into()];
         assert_eq!(
-            missing(&promised, &Graph::default()),
+            missing_endpoints(&promised, &Graph::default()),
             ["the publisher of /out", "the subscriber of /in"]
         );
     }
@@ -161,13 +161,13 @@ mod tests {
         }];
         promised.services[0].node.clear();
         promised.actions[0].node.clear();
-        assert!(missing(&promised, &Graph::default()).is_empty());
+        assert!(missing_endpoints(&promised, &Graph::default()).is_empty());
         assert!(missing_nodes(&promised, &Graph::default()).is_empty());
     }
 
     /// Tools of ROS 2 show none of these names.
     #[test]
-    fn what_is_hidden_is_there_by_its_nodes_ends() {
+    fn hidden_names_are_found_by_the_endpoints_of_their_nodes() {
         let node = "/_box";
         let promised = Interface {
             topics: vec![
@@ -193,11 +193,11 @@ mod tests {
             ..Interface::default()
         };
         let mut graph = Graph::default();
-        assert_eq!(missing(&promised, &graph).len(), 4);
+        assert_eq!(missing_endpoints(&promised, &graph).len(), 4);
         assert_eq!(missing_nodes(&promised, &graph), [node]);
-        let of = || (WireType::any(), Qos::keep_last(1));
+        let of = || (WireType::any(), QosProfile::keep_last(1));
         let service = |name: &str| (name.to_owned(), ServiceType::new("a/srv/B", "*"));
-        let ends = NodeEnds {
+        let ends = NodeEntities {
             publishers: [("/_box/seen".to_owned(), of())].into(),
             subscribers: [("/_box/told".to_owned(), of())].into(),
             services: [
@@ -205,10 +205,10 @@ mod tests {
                 service("/_box/go/_action/send_goal"),
             ]
             .into(),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         graph.ends.insert(node.into(), ends);
-        assert!(missing(&promised, &graph).is_empty());
+        assert!(missing_endpoints(&promised, &graph).is_empty());
         assert!(missing_nodes(&promised, &graph).is_empty());
     }
 }

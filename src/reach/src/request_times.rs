@@ -1,27 +1,27 @@
-//! How long requests of robots take, and in which phase: histograms by service, for `/metrics`. Each request is told
-//! once; a row for each of them would grow without end, one for each service does not.
+//! Response times of robots' requests and their phases: histograms by service for `/metrics`. Each request is recorded
+//! once; one series per request would grow without limit, one per service does not.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
-use link::control::Request;
+use link::control::RequestTiming;
 use parking_lot::Mutex;
 
-/// Upper bounds, seconds: from a loopback's relay to a link that is all but gone.
+/// Upper bounds in seconds: from a relay on loopback to a link that is almost dead.
 const BOUNDS: [f64; 13] = [
     0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0,
 ];
-/// What stands in for a time that makes no sense, milliseconds: robots are not to be trusted.
+/// Replacement in milliseconds for invalid times; robots are not trusted.
 const LONGEST: f64 = 1e9;
 
 /// Histograms of all services.
 #[derive(Default)]
 pub struct RequestTimes {
-    services: Mutex<BTreeMap<String, Service>>,
+    services: Mutex<BTreeMap<String, ServiceTimes>>,
 }
 
 #[derive(Default)]
-struct Service {
+struct ServiceTimes {
     total: Histogram,
     /// In the order of [`PHASES`].
     phases: [Histogram; 5],
@@ -31,14 +31,14 @@ const PHASES: [&str; 5] = ["serialise", "up", "queue", "compute", "down"];
 
 #[derive(Default)]
 struct Histogram {
-    /// By bound, not summed up; the last: beyond all of them.
+    /// Counts by bound, not cumulative; the last one is for values beyond all bounds.
     counts: [u64; BOUNDS.len() + 1],
     sum: f64,
 }
 
 impl RequestTimes {
-    /// A request of this service was answered by the cloud.
-    pub fn note(&self, service: &str, request: &Request) {
+    /// Records a request of this service that was answered by the cloud.
+    pub fn record(&self, service: &str, request: &RequestTiming) {
         let Some(total) = request.total else {
             return;
         };
@@ -47,7 +47,7 @@ impl RequestTimes {
             Some(known) => known,
             None => services.entry(service.to_owned()).or_default(),
         };
-        service.total.note(total);
+        service.total.record(total);
         let phases = [
             request.serialise,
             request.up,
@@ -55,29 +55,30 @@ impl RequestTimes {
             request.compute,
             request.down,
         ];
-        // Of some answers it is not known.
+        // They are unknown for some responses.
         if phases.iter().any(|time| *time > 0.0) {
             for (histogram, time) in service.phases.iter_mut().zip(phases) {
-                histogram.note(time);
+                histogram.record(time);
             }
         }
     }
 
-    /// Writes them in Prometheus's text format; those of services that are no more are forgotten.
-    pub fn prometheus(&self, out: &mut String, exists: impl Fn(&str) -> bool) {
+    /// Writes the histograms in Prometheus text format and forgets services that no longer exist.
+    pub fn write_prometheus(&self, out: &mut String, exists: impl Fn(&str) -> bool) {
         let mut services = self.services.lock();
         services.retain(|name, _| exists(name));
         // Writing to a String cannot fail.
         let _ = writeln!(
             out,
-            "# HELP cloudroid_request_seconds Time from asked to answered by the cloud: as stubs with an SLA tell it, and between the bridge and the servant of robots that speak rosbridge.\n\
+            "# HELP cloudroid_request_seconds Time from asked to answered by the cloud: as stubs with an SLA tell it, \
+             and between the bridge and the servant of robots that speak rosbridge.\n\
              # TYPE cloudroid_request_seconds histogram"
         );
         for (name, service) in &*services {
             let labels = format!("service=\"{name}\"");
             service
                 .total
-                .prometheus(out, "cloudroid_request_seconds", &labels);
+                .write_prometheus(out, "cloudroid_request_seconds", &labels);
         }
         let _ = writeln!(
             out,
@@ -87,14 +88,14 @@ impl RequestTimes {
         for (name, service) in &*services {
             for (phase, histogram) in PHASES.iter().zip(&service.phases) {
                 let labels = format!("service=\"{name}\",phase=\"{phase}\"");
-                histogram.prometheus(out, "cloudroid_request_phase_seconds", &labels);
+                histogram.write_prometheus(out, "cloudroid_request_phase_seconds", &labels);
             }
         }
     }
 }
 
 impl Histogram {
-    fn note(&mut self, milliseconds: f64) {
+    fn record(&mut self, milliseconds: f64) {
         let sane = milliseconds.is_finite() && milliseconds >= 0.0;
         let seconds = if sane {
             milliseconds.min(LONGEST)
@@ -106,7 +107,7 @@ impl Histogram {
         self.sum += seconds;
     }
 
-    fn prometheus(&self, out: &mut String, name: &str, labels: &str) {
+    fn write_prometheus(&self, out: &mut String, name: &str, labels: &str) {
         let mut count = 0;
         let bounds = BOUNDS.iter().map(f64::to_string).chain(["+Inf".to_owned()]);
         for (bound, more) in bounds.zip(self.counts) {
@@ -125,19 +126,19 @@ mod tests {
     #[test]
     fn requests_are_counted_by_service_and_phase() {
         let times = RequestTimes::default();
-        let request = |total| Request {
+        let request = |total| RequestTiming {
             total: Some(total),
             up: 4.0,
             compute: total - 4.0,
-            ..Request::default()
+            ..RequestTiming::default()
         };
-        times.note("people", &request(90.0));
-        times.note("people", &request(20_000.0));
-        times.note("people", &Request::default());
-        times.note("odd", &request(f64::NAN));
-        times.note("gone", &request(1.0));
+        times.record("people", &request(90.0));
+        times.record("people", &request(20_000.0));
+        times.record("people", &RequestTiming::default());
+        times.record("odd", &request(f64::NAN));
+        times.record("gone", &request(1.0));
         let mut out = String::new();
-        times.prometheus(&mut out, |name| name != "gone");
+        times.write_prometheus(&mut out, |name| name != "gone");
         for line in [
             "# TYPE cloudroid_request_phase_seconds histogram",
             "cloudroid_request_seconds_bucket{service=\"people\",le=\"0.05\"} 0",

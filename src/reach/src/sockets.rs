@@ -1,4 +1,4 @@
-//! Where the two seams meet: sockets for ROS, opened in the network namespace of a servant.
+//! Implementation of the ROS socket interface in the network namespace of a servant.
 
 use std::io;
 use std::net::SocketAddr;
@@ -16,7 +16,7 @@ pub struct ServantSockets {
 }
 
 impl ServantSockets {
-    /// Of the servant with this namespace.
+    /// Creates the sockets of the servant with this namespace.
     pub fn new(netns: &Arc<NetNs>) -> ServantSockets {
         ServantSockets {
             netns: Arc::clone(netns),
@@ -34,11 +34,11 @@ impl ros::net::Sockets for ServantSockets {
         self.netns.listen(address).await
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        self.netns.datagrams(address, shared).await
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        self.netns.bind_udp(address, shared).await
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        self.netns.diagnostics().await.map(Some)
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
+        self.netns.open_sock_diag().await.map(Some)
     }
 }

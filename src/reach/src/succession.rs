@@ -1,5 +1,5 @@
-//! Which participants of DDS this daemon has in a servant's network, written down in the servant's directory. A daemon that is killed
-//! cannot say that they are gone; the next one says it in their names.
+//! Records in the servant's directory which DDS participants this daemon has in a servant's network. A daemon that is
+//! killed cannot announce their departure; the next one does so in their names.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
@@ -11,55 +11,60 @@ use serde::{Deserialize, Serialize};
 use servant::local::LocalServant;
 use tokio::sync::Mutex;
 
-/// So many of earlier daemons are kept, those of the last ones: a daemon may be killed before it has told the others.
+/// Maximum number of participants of earlier daemons that are kept, the latest ones: a daemon may be killed before it
+/// has announced them.
 const EARLIER: usize = 8;
-/// The lease of crate `rtps`'s participants: so long after a daemon has ended somebody may believe in them.
+/// Lease duration of `rtps` participants: others may believe in them this long after a daemon has ended.
 const BELIEVED: Duration = Duration::from_secs(10);
 
-/// Those of one servant.
+/// The participants of the daemon in one servant.
 #[derive(Debug)]
-pub(crate) struct Participants {
+pub(crate) struct DaemonParticipants {
     servant: Arc<LocalServant>,
-    /// None until it was looked what earlier daemons had.
-    known: Mutex<Option<Known>>,
+    /// `None` until the record of earlier daemons was read.
+    known: Mutex<Option<ParticipantLedger>>,
 }
 
 #[derive(Debug)]
-struct Known {
-    left: Left,
+struct ParticipantLedger {
+    left: PersistedParticipants,
     since: Instant,
 }
 
-/// As it is written down.
+/// The persistent record.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-struct Left {
-    /// Which run of the daemon wrote this.
+struct PersistedParticipants {
+    /// Id of the daemon run that wrote this.
     run: u64,
-    /// Of earlier daemons, the oldest first.
+    /// Participants of earlier runs, oldest first.
     earlier: Vec<ParticipantPrefix>,
-    /// Of that run, by the names of their nodes, which are there once.
+    /// Participants of that run by their unique node names.
     own: BTreeMap<String, ParticipantPrefix>,
 }
 
-/// A number that no other run of the daemon has.
+/// Returns an id unique to this run of the daemon.
 fn this_run() -> u64 {
     static RUN: OnceLock<u64> = OnceLock::new();
     *RUN.get_or_init(rand::random)
 }
 
-impl Participants {
-    pub(crate) fn of(servant: &Arc<LocalServant>) -> Participants {
-        Participants {
+impl DaemonParticipants {
+    pub(crate) fn new(servant: &Arc<LocalServant>) -> DaemonParticipants {
+        DaemonParticipants {
             servant: Arc::clone(servant),
             known: Mutex::default(),
         }
     }
 }
 
-impl Known {
-    /// What a run of the daemon finds.
-    fn found(run: u64, mut left: Left, since: Instant) -> Known {
-        // What this run has written is of participants that live.
+impl ParticipantLedger {
+    /// Creates the record of a run from what was read.
+    fn from_persisted(
+        run: u64,
+        mut left: PersistedParticipants,
+        since: Instant,
+    ) -> ParticipantLedger {
+        // Participants recorded by this run are alive.
         if left.run != run {
             left.earlier
                 .extend(std::mem::take(&mut left.own).into_values());
@@ -67,16 +72,16 @@ impl Known {
             left.earlier.drain(..surplus);
             left.run = run;
         }
-        Known { left, since }
+        ParticipantLedger { left, since }
     }
 
-    fn joins(&mut self, node: &str, participant: ParticipantPrefix) -> Left {
+    fn record_join(&mut self, node: &str, participant: ParticipantPrefix) -> PersistedParticipants {
         self.left.own.insert(node.to_owned(), participant);
         self.left.clone()
     }
 
-    /// Of whom others are to be told now that they are gone.
-    fn gone(&self, now: Instant) -> Vec<ParticipantPrefix> {
+    /// Returns the participants whose departure must be announced now.
+    fn gone_participants(&self, now: Instant) -> Vec<ParticipantPrefix> {
         let is_believed = now.duration_since(self.since) < BELIEVED;
         if is_believed {
             self.left.earlier.clone()
@@ -87,28 +92,36 @@ impl Known {
 }
 
 #[async_trait]
-impl Succession for Participants {
-    async fn joins(&self, node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix> {
+impl Succession for DaemonParticipants {
+    async fn record_join(
+        &self,
+        node: &str,
+        participant: ParticipantPrefix,
+    ) -> Vec<ParticipantPrefix> {
         let mut known = self.known.lock().await;
         let known = match &mut *known {
             Some(known) => known,
             none => {
-                let left = self.servant.left().await.unwrap_or_else(|error| {
-                    tracing::warn!(%error, "nodes of ROS 2 may wait for an earlier daemon until its lease is over");
+                let left = self.servant.load_handover().await.unwrap_or_else(|error| {
+                    tracing::warn!(%error, "ROS 2 nodes may wait for an earlier daemon until its lease expires");
                     None
                 });
-                none.insert(Known::found(
+                none.insert(ParticipantLedger::from_persisted(
                     this_run(),
                     left.unwrap_or_default(),
                     Instant::now(),
                 ))
             }
         };
-        // Before it joins: whoever knows it may be told by the next daemon that it is gone.
-        if let Err(error) = self.servant.leave(known.joins(node, participant)).await {
-            tracing::warn!(%error, "nodes of ROS 2 may wait for this daemon after it was killed");
+        // Recorded before it joins, so that the next daemon announces its departure to everybody who knows it.
+        if let Err(error) = self
+            .servant
+            .save_handover(known.record_join(node, participant))
+            .await
+        {
+            tracing::warn!(%error, "ROS 2 nodes may wait for this daemon after it was killed");
         }
-        known.gone(Instant::now())
+        known.gone_participants(Instant::now())
     }
 }
 
@@ -119,44 +132,49 @@ mod tests {
     #[test]
     fn the_next_daemon_is_told_of_every_node_of_the_last_ones() {
         let now = Instant::now();
-        let mut known = Known::found(1, Left::default(), now);
-        assert!(known.gone(now).is_empty());
-        known.joins("/bridge", [1; 12]);
-        known.joins("/inside", [2; 12]);
-        // It comes anew, and had left.
-        let left = known.joins("/inside", [3; 12]);
-        let mut next = Known::found(2, left, now);
-        assert_eq!(next.gone(now), [[1; 12], [3; 12]]);
-        // Killed before it has told anybody.
-        let mut left = next.joins("/bridge", [4; 12]);
+        let mut known = ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now);
+        assert!(known.gone_participants(now).is_empty());
+        known.record_join("/bridge", [1; 12]);
+        known.record_join("/inside", [2; 12]);
+        // It leaves and joins again.
+        let left = known.record_join("/inside", [3; 12]);
+        let mut next = ParticipantLedger::from_persisted(2, left, now);
+        assert_eq!(next.gone_participants(now), [[1; 12], [3; 12]]);
+        // Killed before it has announced anything.
+        let mut left = next.record_join("/bridge", [4; 12]);
         left.earlier.splice(..0, (5..12).map(|number| [number; 12]));
-        let last = Known::found(3, left, now);
+        let last = ParticipantLedger::from_persisted(3, left, now);
         let expected: Vec<_> = (7..12)
             .chain([1, 3, 4])
             .map(|number| [number; 12])
             .collect();
-        assert_eq!(last.gone(now), expected);
+        assert_eq!(last.gone_participants(now), expected);
     }
 
     #[test]
     fn nobody_is_told_that_those_of_this_daemon_are_gone() {
         let now = Instant::now();
-        let left = Known::found(1, Left::default(), now).joins("/bridge", [1; 12]);
-        let mut again = Known::found(1, left, now);
-        assert!(again.gone(now).is_empty());
-        // The next one is told of all.
-        let left = again.joins("/inside", [2; 12]);
-        assert_eq!(Known::found(2, left, now).gone(now), [[1; 12], [2; 12]]);
+        let left = ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now)
+            .record_join("/bridge", [1; 12]);
+        let mut again = ParticipantLedger::from_persisted(1, left, now);
+        assert!(again.gone_participants(now).is_empty());
+        // The next one announces all.
+        let left = again.record_join("/inside", [2; 12]);
+        assert_eq!(
+            ParticipantLedger::from_persisted(2, left, now).gone_participants(now),
+            [[1; 12], [2; 12]]
+        );
     }
 
     #[test]
     fn nobody_is_told_of_those_in_whom_nobody_believes_any_more() {
         let now = Instant::now();
-        let left = Known::found(1, Left::default(), now).joins("/bridge", [1; 12]);
-        let mut next = Known::found(2, left, now);
-        assert_eq!(next.gone(now).len(), 1);
-        assert!(next.gone(now + BELIEVED).is_empty());
-        // They are written down all the same, until later ones take their places.
-        assert_eq!(next.joins("/bridge", [2; 12]).earlier, [[1; 12]]);
+        let left = ParticipantLedger::from_persisted(1, PersistedParticipants::default(), now)
+            .record_join("/bridge", [1; 12]);
+        let mut next = ParticipantLedger::from_persisted(2, left, now);
+        assert_eq!(next.gone_participants(now).len(), 1);
+        assert!(next.gone_participants(now + BELIEVED).is_empty());
+        // They remain recorded until later ones replace them.
+        assert_eq!(next.record_join("/bridge", [2; 12]).earlier, [[1; 12]]);
     }
 }

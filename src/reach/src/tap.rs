@@ -1,6 +1,6 @@
-//! What a robot asks of its servant, and what it is answered, told to whoever compares a candidate with the servant: a [`Bus`] like
-//! the one behind it, before which the bridge and the links stand. Calls and goals pass as they are; whoever listens is told of
-//! them by a queue that never makes them wait. Topics need none of this: they are heard by subscribing.
+//! Reports a robot's requests and their responses to a listener that compares a candidate with the servant. The tap is
+//! a [`Bus`] in front of the actual one, used by the bridge and the links. Calls and goals pass unchanged; the listener
+//! receives them through a queue that never blocks them. Topics need no tap, because they can be subscribed to.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,171 +13,175 @@ use bytes::Bytes;
 use parking_lot::{Mutex, RwLock};
 use ros::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, GoalEnd,
-    GoalEvents, Graph, Hearing, Lending, NodeParameters, Outcome, Publisher, Qos, RosVersion,
-    ServiceHandler, ServiceType, Subscription, WireType,
+    GoalEvents, GoalOutcome, Graph, Lending, NodeParameters, Publisher, PublisherReports,
+    QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription, WireType,
 };
 use ros::ros2::names;
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
 
-/// What waits for whoever listens; more is left out, and counted.
+/// Length of the listener's queue; the excess is omitted and counted.
 const QUEUE: usize = 1024;
 
-/// What a robot asks, or is answered.
+/// A request of a robot or the response to it.
 #[derive(Debug)]
-pub struct Tapped {
-    /// The same of what is asked and of its answer.
+pub struct TapEvent {
+    /// Number that a request and its response have in common.
     pub number: u64,
-    /// When it happened.
+    /// Time of the event.
     pub at: Instant,
-    /// What happens.
-    pub what: What,
+    /// The event.
+    pub what: TapEventKind,
 }
 
-/// What happens to a call or a goal.
+/// An event of a call or goal.
 #[derive(Debug)]
-pub enum What {
-    /// A call goes to a service.
+pub enum TapEventKind {
+    /// A service is called.
     Call {
-        /// Its name.
+        /// Name of the service.
         service: String,
-        /// Serialized.
+        /// Serialized request.
         request: Bytes,
     },
-    /// A goal goes to an action.
+    /// A goal is sent to an action.
     Goal {
-        /// Its name.
+        /// Name of the action.
         action: String,
-        /// Its definition.
+        /// Definition of the action.
         of: Arc<ActionDef>,
-        /// Serialized.
+        /// Serialized goal.
         goal: Bytes,
     },
-    /// The goal is to end.
+    /// The goal is to be cancelled.
     Cancel,
-    /// The robot was answered, after so long; what is not told of any more has no answer that could be compared.
+    /// The robot got a response. A request without this event has no response that could be compared.
     Answered {
-        /// What it was answered.
-        answer: Answer,
-        /// Since it was asked.
+        /// The response.
+        answer: TapAnswer,
+        /// Response time.
         took: Duration,
     },
 }
 
-/// What was answered.
+/// Response to a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Answer {
-    /// A response, or a result with how its goal ended.
-    Given(Option<Outcome>, Bytes),
-    /// The reason why there is none.
+pub enum TapAnswer {
+    /// A response, or a result with the outcome of its goal.
+    Given(Option<GoalOutcome>, Bytes),
+    /// Reason why there is none.
     Refused(String),
-    /// Whoever asked did not wait for it.
+    /// The caller did not wait for it.
     GivenUp,
 }
 
-impl Answer {
-    /// Of a call.
-    pub fn of_call(response: &Result<Bytes, BusError>) -> Answer {
+impl TapAnswer {
+    /// Creates the answer of a call.
+    pub fn from_call(response: &Result<Bytes, BusError>) -> TapAnswer {
         match response {
-            Ok(response) => Answer::Given(None, response.clone()),
-            Err(error) => Answer::Refused(error.to_string()),
+            Ok(response) => TapAnswer::Given(None, response.clone()),
+            Err(error) => TapAnswer::Refused(error.to_string()),
         }
     }
 
-    /// Of a goal.
-    pub fn of_goal(end: &Result<GoalEnd, String>) -> Answer {
+    /// Creates the answer of a goal.
+    pub fn from_goal(end: &Result<GoalEnd, String>) -> TapAnswer {
         match end {
-            Ok(end) => Answer::Given(Some(end.outcome), end.result.clone()),
-            Err(reason) => Answer::Refused(reason.clone()),
+            Ok(end) => TapAnswer::Given(Some(end.outcome), end.result.clone()),
+            Err(reason) => TapAnswer::Refused(reason.clone()),
         }
     }
 
-    /// The same, its bytes counted; none where they may not be held.
-    fn counted(self, budget: &Budget) -> Option<Answer> {
+    /// Charges its bytes to the budget; returns `None` if they do not fit.
+    fn charge(self, budget: &Budget) -> Option<TapAnswer> {
         match self {
-            Answer::Given(outcome, bytes) => {
+            TapAnswer::Given(outcome, bytes) => {
                 let permit = budget.take(bytes.len()).ok()?;
-                Some(Answer::Given(outcome, permit.around(bytes)))
+                Some(TapAnswer::Given(outcome, permit.wrap_bytes(bytes)))
             }
             other => Some(other),
         }
     }
 }
 
-/// Where whoever compares listens to one servant's robot.
+/// The tap on one servant's robot.
 #[derive(Default)]
 pub struct Tap {
-    listener: RwLock<Option<Listener>>,
+    listener: RwLock<Option<TapListener>>,
     numbers: AtomicU64,
 }
 
 #[derive(Clone)]
-struct Listener {
-    told: mpsc::Sender<Tapped>,
+struct TapListener {
+    told: mpsc::Sender<TapEvent>,
     budget: Budget,
     left_out: Arc<AtomicU64>,
 }
 
 /// Listens until it is dropped.
-pub struct Tapping {
-    /// What happens from now on.
-    pub told: mpsc::Receiver<Tapped>,
+pub struct TapReceiver {
+    /// Events from now on.
+    pub told: mpsc::Receiver<TapEvent>,
     tap: Arc<Tap>,
     left_out: Arc<AtomicU64>,
 }
 
-impl Tapping {
-    /// So much was left out: the queue was full, or the budget.
-    pub fn left_out(&self) -> u64 {
+impl TapReceiver {
+    /// Returns the number of events omitted because the queue or the budget was full.
+    pub fn omitted_count(&self) -> u64 {
         self.left_out.load(Ordering::Relaxed)
     }
 }
 
-impl Drop for Tapping {
+impl Drop for TapReceiver {
     fn drop(&mut self) {
         *self.tap.listener.write() = None;
     }
 }
 
 impl Tap {
-    /// Listens from now on; what is told is held in `budget`. None where somebody does.
-    pub fn listen(self: &Arc<Self>, budget: &Budget) -> Option<Tapping> {
+    /// Starts listening; events are charged to `budget`. Returns `None` if there already is a listener.
+    pub fn listen(self: &Arc<Self>, budget: &Budget) -> Option<TapReceiver> {
         let mut listener = self.listener.write();
         if listener.is_some() {
             return None;
         }
         let (sender, told) = mpsc::channel(QUEUE);
         let left_out = Arc::<AtomicU64>::default();
-        *listener = Some(Listener {
+        *listener = Some(TapListener {
             told: sender,
             budget: budget.clone(),
             left_out: Arc::clone(&left_out),
         });
-        Some(Tapping {
+        Some(TapReceiver {
             told,
             tap: Arc::clone(self),
             left_out,
         })
     }
 
-    /// `bus`, with whoever listens here being told of its calls and goals.
-    pub fn before(self: &Arc<Self>, bus: Arc<dyn Bus>) -> Arc<dyn Bus> {
+    /// Wraps `bus` so that the listener receives its calls and goals.
+    pub fn wrap(self: &Arc<Self>, bus: Arc<dyn Bus>) -> Arc<dyn Bus> {
         Arc::new(TappedBus {
             bus,
             tap: Arc::clone(self),
         })
     }
 
-    /// Tells of something that is asked, if anybody listens.
-    fn asked(&self, content: &Bytes, what: impl FnOnce(Bytes) -> What) -> Option<Noted> {
+    /// Reports a request, if there is a listener.
+    fn begin_exchange(
+        &self,
+        content: &Bytes,
+        what: impl FnOnce(Bytes) -> TapEventKind,
+    ) -> Option<TapExchange> {
         let listener = self.listener.read().clone()?;
         let number = self.numbers.fetch_add(1, Ordering::Relaxed);
         let Ok(permit) = listener.budget.take(content.len()) else {
             listener.left_out.fetch_add(1, Ordering::Relaxed);
             return None;
         };
-        let what = what(permit.around(content.clone()));
-        listener.tell(number, what).then(|| Noted {
+        let what = what(permit.wrap_bytes(content.clone()));
+        listener.send(number, what).then(|| TapExchange {
             listener,
             number,
             asked: Instant::now(),
@@ -186,10 +190,10 @@ impl Tap {
     }
 }
 
-impl Listener {
-    fn tell(&self, number: u64, what: What) -> bool {
+impl TapListener {
+    fn send(&self, number: u64, what: TapEventKind) -> bool {
         let at = Instant::now();
-        let told = self.told.try_send(Tapped { number, at, what }).is_ok();
+        let told = self.told.try_send(TapEvent { number, at, what }).is_ok();
         if !told {
             self.left_out.fetch_add(1, Ordering::Relaxed);
         }
@@ -197,41 +201,41 @@ impl Listener {
     }
 }
 
-/// Something that was asked and has no answer yet.
-struct Noted {
-    listener: Listener,
+/// A request that has no response yet.
+struct TapExchange {
+    listener: TapListener,
     number: u64,
     asked: Instant,
     answered: bool,
 }
 
-impl Noted {
-    fn answered(mut self, answer: Answer) {
-        self.tell(answer);
+impl TapExchange {
+    fn answer(mut self, answer: TapAnswer) {
+        self.finish(answer);
     }
 
-    fn tell(&mut self, answer: Answer) {
+    fn finish(&mut self, answer: TapAnswer) {
         self.answered = true;
         let took = self.asked.elapsed();
-        match answer.counted(&self.listener.budget) {
+        match answer.charge(&self.listener.budget) {
             Some(answer) => drop(
                 self.listener
-                    .tell(self.number, What::Answered { answer, took }),
+                    .send(self.number, TapEventKind::Answered { answer, took }),
             ),
             None => {
                 self.listener.left_out.fetch_add(1, Ordering::Relaxed);
-                let answer = Answer::GivenUp;
+                let answer = TapAnswer::GivenUp;
                 self.listener
-                    .tell(self.number, What::Answered { answer, took });
+                    .send(self.number, TapEventKind::Answered { answer, took });
             }
         }
     }
 }
 
-impl Drop for Noted {
+impl Drop for TapExchange {
     fn drop(&mut self) {
         if !self.answered {
-            self.tell(Answer::GivenUp);
+            self.finish(TapAnswer::GivenUp);
         }
     }
 }
@@ -242,15 +246,16 @@ struct TappedBus {
 }
 
 impl TappedBus {
-    fn call_begins(&self, service: &str, request: &Bytes) -> Option<Noted> {
-        // A part of an action of ROS 2: what it answers has stamps in it, and a goal is not compared by its parts.
+    fn begin_call(&self, service: &str, request: &Bytes) -> Option<TapExchange> {
+        // A service of a ROS 2 action: its responses contain stamps, and a goal is not compared by its parts.
         if self.bus.version() == RosVersion::Two && names::is_hidden(service) {
             return None;
         }
-        self.tap.asked(request, |request| What::Call {
-            service: service.to_owned(),
-            request,
-        })
+        self.tap
+            .begin_exchange(request, |request| TapEventKind::Call {
+                service: service.to_owned(),
+                request,
+            })
     }
 }
 
@@ -276,7 +281,7 @@ impl Bus for TappedBus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
         self.bus.subscribe(topic, of, qos).await
     }
@@ -285,7 +290,7 @@ impl Bus for TappedBus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.bus.advertise(topic, of, qos).await
     }
@@ -296,10 +301,10 @@ impl Bus for TappedBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        let noted = self.call_begins(service, &request);
+        let noted = self.begin_call(service, &request);
         let response = self.bus.call(service, request, timeout).await;
         if let Some(noted) = noted {
-            noted.answered(Answer::of_call(&response));
+            noted.answer(TapAnswer::from_call(&response));
         }
         response
     }
@@ -311,10 +316,10 @@ impl Bus for TappedBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        let noted = self.call_begins(service, &request);
+        let noted = self.begin_call(service, &request);
         let response = self.bus.call_typed(service, digest, request, timeout).await;
         if let Some(noted) = noted {
-            noted.answered(Answer::of_call(&response));
+            noted.answer(TapAnswer::from_call(&response));
         }
         response
     }
@@ -371,16 +376,16 @@ impl Bus for TappedBus {
         self.bus.lending()
     }
 
-    fn hearing(&self) -> Option<&dyn Hearing> {
-        self.bus.hearing()
+    fn publisher_reports(&self) -> Option<&dyn PublisherReports> {
+        self.bus.publisher_reports()
     }
 
     fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {
         self.bus.shutdown_requested()
     }
 
-    fn process_ended(&self) {
-        self.bus.process_ended();
+    fn on_process_exit(&self) {
+        self.bus.on_process_exit();
     }
 
     async fn close(&self) {
@@ -388,8 +393,8 @@ impl Bus for TappedBus {
     }
 }
 
-/// Goals that somebody was told of, by their ids.
-type UnderWay = Arc<Mutex<HashMap<String, Noted>>>;
+/// Reported goals by id.
+type UnderWay = Arc<Mutex<HashMap<String, TapExchange>>>;
 
 struct TappedClient {
     client: Box<dyn ActionClient>,
@@ -401,18 +406,18 @@ struct TappedClient {
 
 #[async_trait]
 impl ActionClient for TappedClient {
-    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
-        self.client.ready(patience).await
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError> {
+        self.client.wait_for_server(patience).await
     }
 
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        let noted = self.tap.asked(&goal, |goal| What::Goal {
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+        let noted = self.tap.begin_exchange(&goal, |goal| TapEventKind::Goal {
             action: self.action.clone(),
             of: Arc::clone(&self.of),
             goal,
         });
         let Some(noted) = noted else {
-            return self.client.send(id, goal, events);
+            return self.client.send_goal(id, goal, events);
         };
         self.under_way.lock().insert(id.to_owned(), noted);
         let events = Arc::new(TappedEvents {
@@ -420,14 +425,14 @@ impl ActionClient for TappedClient {
             id: id.to_owned(),
             under_way: Arc::clone(&self.under_way),
         });
-        self.client.send(id, goal, events);
+        self.client.send_goal(id, goal, events);
     }
 
-    fn cancel(&self, id: &str) {
+    fn cancel_goal(&self, id: &str) {
         if let Some(noted) = self.under_way.lock().get(id) {
-            noted.listener.tell(noted.number, What::Cancel);
+            noted.listener.send(noted.number, TapEventKind::Cancel);
         }
-        self.client.cancel(id);
+        self.client.cancel_goal(id);
     }
 }
 
@@ -438,23 +443,23 @@ struct TappedEvents {
 }
 
 impl GoalEvents for TappedEvents {
-    fn accepted(&self) {
-        self.events.accepted();
+    fn on_accepted(&self) {
+        self.events.on_accepted();
     }
 
-    fn cancel_answered(&self, ends: bool) {
-        self.events.cancel_answered(ends);
+    fn on_cancel_response(&self, ends: bool) {
+        self.events.on_cancel_response(ends);
     }
 
-    fn feedback(&self, feedback: Bytes) {
-        self.events.feedback(feedback);
+    fn on_feedback(&self, feedback: Bytes) {
+        self.events.on_feedback(feedback);
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let noted = self.under_way.lock().remove(&self.id);
         if let Some(noted) = noted {
-            noted.answered(Answer::of_goal(&end));
+            noted.answer(TapAnswer::from_goal(&end));
         }
-        self.events.ended(end);
+        self.events.on_ended(end);
     }
 }

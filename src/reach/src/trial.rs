@@ -1,5 +1,5 @@
-//! What a servant makes of recorded requests: it is given a recording or pictures, and what it answers, and when, is told. So
-//! T_desire and T_max can be chosen before a robot is touched ([`api::trial`]), and limits be compared
+//! Replay of recorded requests: gives a recording or images to a servant and reports its responses and their times.
+//! This allows choosing T_desire and T_max before a robot is involved ([`api::trial`]), and comparing limits
 //! ([`api::calibration`]).
 
 mod ears;
@@ -12,84 +12,88 @@ use std::time::{Duration, Instant};
 
 use api::trial::{Fed, Heard, Times, Trial};
 use package::interface::Interface;
-use ros::bag::Recorded;
-use ros::bus::{Bus, Publisher, RosVersion, reaches};
+use ros::bag::BagMessage;
+use ros::bus::{Bus, Publisher, RosVersion, wait_for_connected};
 use ros::schema::Registry;
 use tokio::time::timeout;
 
-pub use pace::{Gap, Pace};
+pub use pace::{ReplayPace, RequestGap};
 pub use picture::Picture;
 
 use crate::Error;
-use ears::Ears;
-use pace::Clock;
-use plan::{Input, Plan};
+use ears::OutputListeners;
+use pace::ReplayClock;
+use plan::{PlannedInput, ReplayPlan};
 
-/// For the servant's nodes to listen, and for the first answer, at least.
+/// Minimum timeout for the servant's nodes to subscribe, and for the first response.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// So much of a recording is used.
+/// Maximum number of messages used from a recording.
 pub const RECORDED: usize = 300;
 const QUEUE: usize = 16;
 
-/// What a servant is given.
+/// Input of a replay.
 #[derive(Debug, Clone)]
 pub enum Material {
-    /// Pictures, one after the other, again and again.
+    /// Images, repeated cyclically.
     Pictures(Vec<Picture>),
     /// A recording.
-    Bag(Vec<Recorded>),
+    Bag(Vec<BagMessage>),
 }
 
-/// What a servant has made of it.
+/// Result of a replay.
 #[derive(Debug, Clone, Default)]
 pub struct Replay {
-    /// What was published to it.
+    /// Messages published to the servant.
     pub inputs: Vec<Fed>,
-    /// Topics of the recording that it has no input for.
+    /// Topics of the recording for which it has no input.
     pub unused: Vec<String>,
-    /// What it published.
+    /// Messages published by the servant.
     pub outputs: Vec<Heard>,
-    /// Size of the largest request, in bytes.
+    /// Size of the largest request in bytes.
     pub largest: usize,
-    /// Requests a second that were to be made; none where each followed the answer before it.
+    /// Intended requests per second; `None` if each followed the response before it.
     pub pace: Option<f64>,
-    /// Requests a second that were made.
+    /// Actual requests per second.
     pub rate: f64,
-    /// Response times of the requests, in their order; none of those that were not answered. The first request is not
-    /// among them: much is made at it.
+    /// Response times of the requests in order; `None` for unanswered ones. The first request is not included, because
+    /// it involves initialization.
     pub times: Vec<Option<Duration>>,
 }
 
-/// Refuses material that a service of this interface has no input for, and an `input` that it does not feed.
-pub fn fits(
+/// Returns an error if a service with this interface has no input for the material, or if the material does not feed
+/// `input`.
+pub fn check_material(
     (service, ros): (&str, RosVersion),
     interface: &Interface,
     material: &Material,
     input: Option<&str>,
 ) -> Result<(), Error> {
-    let registry = registry((service, ros), interface)?;
-    Plan::new(interface, &registry, material, input).map(|_| ())
+    let registry = build_registry((service, ros), interface)?;
+    ReplayPlan::new(interface, &registry, material, input).map(|_| ())
 }
 
-fn registry((service, ros): (&str, RosVersion), interface: &Interface) -> Result<Registry, Error> {
-    Registry::of_definitions(ros, &interface.definitions)
+fn build_registry(
+    (service, ros): (&str, RosVersion),
+    interface: &Interface,
+) -> Result<Registry, Error> {
+    Registry::with_definitions(ros, &interface.definitions)
         .map_err(|error| Error::Trial(format!("a definition of {service}: {error}")))
 }
 
-/// Gives `material` to a servant of the service `service`, which has this interface.
+/// Replays `material` to a servant of `service`, which has this interface.
 pub(crate) async fn replay(
     bus: &Arc<dyn Bus>,
     service: &str,
     interface: &Interface,
     material: &Material,
-    pace: &Pace,
+    pace: &ReplayPace,
 ) -> Result<Replay, Error> {
-    let registry = registry((service, bus.version()), interface)?;
-    let plan = Plan::new(interface, &registry, material, pace.input.as_deref())?;
-    let mut ears = Ears::open(bus, interface).await?;
+    let registry = build_registry((service, bus.version()), interface)?;
+    let plan = ReplayPlan::new(interface, &registry, material, pace.input.as_deref())?;
+    let mut ears = OutputListeners::open(bus, interface).await?;
     let first_answer = pace.answer.max(PATIENCE);
     let mut mouths = Vec::new();
-    for Input {
+    for PlannedInput {
         topic,
         wire_type,
         qos,
@@ -98,21 +102,21 @@ pub(crate) async fn replay(
         let publisher = bus
             .advertise(topic, wire_type.clone(), *qos)
             .await
-            .map_err(failed)?;
-        let listening = reaches(publisher.matched(), 1);
+            .map_err(trial_error)?;
+        let listening = wait_for_connected(publisher.matched_subscribers(), 1);
         if timeout(first_answer, listening).await.is_err() {
             return Err(Error::Trial(format!(
                 "no node of {service} listens to {topic}"
             )));
         }
-        mouths.push(Mouth { publisher, sent: 0 });
+        mouths.push(InputPublisher { publisher, sent: 0 });
     }
     let ends = tokio::time::Instant::now() + pace.whole;
-    let mut clock = Clock::new(plan.length, plan.requests(), pace.gap);
-    let mut done = Done::default();
+    let mut clock = ReplayClock::new(plan.length, plan.requests(), pace.gap);
+    let mut done = ReplayProgress::default();
     let mut warmed_up = false;
     for (turn, item) in plan.items(pace.again).enumerate() {
-        if done.times.len() >= pace.requests || done.is_given_up(pace) {
+        if done.times.len() >= pace.requests || done.should_give_up(pace) {
             break;
         }
         let due = clock.due(turn / plan.items.len(), item.at);
@@ -121,7 +125,7 @@ pub(crate) async fn replay(
         }
         tokio::time::sleep_until(due).await;
         let message = item.content.message(turn, bus.version());
-        ears.forget();
+        ears.drain();
         let asked = Instant::now();
         let mouth = &mut mouths[item.input];
         mouth.publisher.publish(message.clone());
@@ -132,10 +136,10 @@ pub(crate) async fn replay(
         done.largest = done.largest.max(message.len());
         let patience = if warmed_up { pace.answer } else { first_answer };
         let stamp = plan.stamp(item.input, &message, &registry);
-        let answered = ears.answer(patience, stamp, &registry).await;
+        let answered = ears.wait_answer(patience, stamp, &registry).await;
         if std::mem::replace(&mut warmed_up, true) {
             let took = answered.map(|at| at.saturating_duration_since(asked));
-            done.note(asked, took);
+            done.record(asked, took);
         }
     }
     let fed = plan.inputs.iter().zip(&mouths).enumerate();
@@ -145,10 +149,10 @@ pub(crate) async fn replay(
                 topic: input.topic.clone(),
                 type_name: input.wire_type.name.clone(),
                 sent: mouth.sent,
-                from: plan.recorded_for(number),
+                from: plan.source_topics(number),
             })
             .collect(),
-        outputs: ears.heard(&registry),
+        outputs: ears.summarize(&registry),
         unused: plan.unused,
         largest: done.largest,
         pace: clock.pace(),
@@ -157,33 +161,33 @@ pub(crate) async fn replay(
     })
 }
 
-fn failed(error: ros::bus::BusError) -> Error {
+fn trial_error(error: ros::bus::BusError) -> Error {
     Error::Trial(format!("the trial's servant cannot be used: {error}"))
 }
 
-struct Mouth {
+struct InputPublisher {
     publisher: Box<dyn Publisher>,
     sent: usize,
 }
 
-/// Requests that were made.
+/// Requests made so far.
 #[derive(Default)]
-struct Done {
+struct ReplayProgress {
     times: Vec<Option<Duration>>,
     largest: usize,
-    /// When the first and the last of `times` were made.
+    /// Times of the first and the last request in `times`.
     made: Option<(Instant, Instant)>,
 }
 
-impl Done {
-    fn note(&mut self, asked: Instant, took: Option<Duration>) {
+impl ReplayProgress {
+    fn record(&mut self, asked: Instant, took: Option<Duration>) {
         self.times.push(took);
         let (first, _) = self.made.unwrap_or((asked, asked));
         self.made = Some((first, asked));
     }
 
-    /// The last were all in vain.
-    fn is_given_up(&self, pace: &Pace) -> bool {
+    /// Returns whether the last requests were all in vain.
+    fn should_give_up(&self, pace: &ReplayPace) -> bool {
         let in_vain = self.times.iter().rev().take_while(|took| took.is_none());
         pace.in_vain.is_some_and(|most| in_vain.count() >= most)
     }
@@ -200,7 +204,7 @@ impl Done {
 }
 
 impl Replay {
-    /// As a trial of `service`.
+    /// Converts the result to a trial of `service`.
     pub fn into_trial(self, service: &str) -> Trial {
         let times: Vec<Duration> = self.times.iter().flatten().copied().collect();
         Trial {
@@ -210,13 +214,13 @@ impl Replay {
             outputs: self.outputs,
             requests: self.times.len(),
             answered: times.len(),
-            rrt: summed_up(times),
+            rrt: summarize_times(times),
         }
     }
 }
 
-/// Quantiles (nearest rank), and what to begin with.
-fn summed_up(mut times: Vec<Duration>) -> Option<Times> {
+/// Computes quantiles (nearest rank) and suggested initial values.
+fn summarize_times(mut times: Vec<Duration>) -> Option<Times> {
     times.sort();
     let rank = |percent| Some(qos::nearest_rank(&times, percent)?.as_secs_f64() * 1000.0);
     let (p50, p90, max) = (rank(50)?, rank(90)?, rank(100)?);
@@ -237,19 +241,19 @@ mod tests {
     #[test]
     fn suggestions_leave_room() {
         let times = (1..=10).map(|n| Duration::from_millis(n * 10)).collect();
-        let times = summed_up(times).expect("times");
+        let times = summarize_times(times).expect("times");
         assert_eq!((times.p50, times.p90, times.max), (50.0, 90.0, 100.0));
         assert_eq!((times.desire, times.acceptable), (75.0, 180.0));
-        assert_eq!(summed_up(Vec::new()), None);
+        assert_eq!(summarize_times(Vec::new()), None);
     }
 
     #[test]
     fn requests_in_vain_end_a_replay_when_they_come_one_after_the_other() {
-        let pace = Pace {
+        let pace = ReplayPace {
             in_vain: Some(2),
-            ..Pace::once(Duration::ZERO)
+            ..ReplayPace::once(Duration::ZERO)
         };
-        let mut done = Done::default();
+        let mut done = ReplayProgress::default();
         let now = Instant::now();
         let some = Some(Duration::from_millis(1));
         for (number, (took, given_up)) in
@@ -257,10 +261,10 @@ mod tests {
                 .into_iter()
                 .enumerate()
         {
-            done.note(now + Duration::from_millis(100 * number as u64), took);
-            assert_eq!(done.is_given_up(&pace), given_up, "{:?}", done.times);
+            done.record(now + Duration::from_millis(100 * number as u64), took);
+            assert_eq!(done.should_give_up(&pace), given_up, "{:?}", done.times);
         }
         assert!((done.rate() - 10.0).abs() < 1e-9, "{}", done.rate());
-        assert_eq!(Done::default().rate(), 0.0);
+        assert_eq!(ReplayProgress::default().rate(), 0.0);
     }
 }

@@ -1,4 +1,4 @@
-//! Services of the robot for nodes of the servant: a hub before a real Master, and a robot's end made by hand.
+//! Services of the robot for nodes of the servant: a hub with a real Master, and a simulated robot's end.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -7,11 +7,11 @@ use async_trait::async_trait;
 use budget::{Budget, Permit};
 use bytes::Bytes;
 use link::clock::now;
-use link::control::{Exit, FromCloud, FromRobot, Hello, Node, Served, Welcome};
+use link::control::{Exit, FromCloud, FromRobot, Hello, NodeLaunch, ServiceChannel, Welcome};
 use link::record::Record;
 use link::session::{receive_open, send_open};
-use link::{Handler, MAX_FRAME, MAX_RECORD, RobotSession, SessionOptions};
-use reach::links::{Hub, HubOptions, Nodes};
+use link::{MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
+use reach::links::{Hub, HubOptions, NodeController};
 use ros::bus::{Bus, BusError, ParamValue};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -23,39 +23,39 @@ use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
 use ws::WebSocket;
 
-/// Only bounds how long a failing test takes.
+/// Only limits the duration of a failing test.
 const LONG: Duration = Duration::from_secs(120);
 
-/// Nodes that run whatever happens.
-struct Still;
+/// Nodes that are always running.
+struct RunningNodes;
 
 #[async_trait]
-impl Nodes for Still {
-    async fn start(&self, _: &Node, _: &str) -> Result<(), String> {
+impl NodeController for RunningNodes {
+    async fn start(&self, _: &NodeLaunch, _: &str) -> Result<(), String> {
         Ok(())
     }
     async fn signal(&self, _: &str, _: i32) -> Result<(), String> {
         Err("it does not run".to_owned())
     }
-    async fn ended(&self, _: &str) -> Exit {
+    async fn wait_exit(&self, _: &str) -> Exit {
         std::future::pending().await
     }
     async fn is_running(&self, _: &str) -> bool {
         false
     }
-    fn parameters(&self, _: &Node) -> Vec<(String, ParamValue)> {
+    fn parameters(&self, _: &NodeLaunch) -> Vec<(String, ParamValue)> {
         Vec::new()
     }
-    fn translate(&self, _: &Node, text: &str) -> String {
+    fn translate(&self, _: &NodeLaunch, text: &str) -> String {
         text.to_owned()
     }
     fn warn(&self, _: &str, _: &str) {}
-    fn lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
+    fn output_lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
         mpsc::channel(1).1
     }
 }
 
-/// A servant with a node in it.
+/// A servant with a node.
 struct Servant {
     hub: Arc<Hub>,
     bus: Arc<Ros1Bus>,
@@ -72,30 +72,30 @@ async fn servant() -> Servant {
     let registry = Arc::new(Registry::new());
     let options = HubOptions::default();
     Servant {
-        hub: Hub::new("s", bus.clone(), registry, Arc::new(Still), options),
+        hub: Hub::new("s", bus.clone(), registry, Arc::new(RunningNodes), options),
         bus,
         node,
     }
 }
 
-/// What the robot's end is told, that is about services.
+/// Messages to the robot's end about services.
 #[derive(Debug, PartialEq)]
-enum Told {
+enum LinkEvent {
     Lookup(String),
     Call(u32, u32, Bytes),
 }
 
-struct Ear(mpsc::UnboundedSender<Told>);
+struct LinkEventForwarder(mpsc::UnboundedSender<LinkEvent>);
 
-impl Handler<FromCloud> for Ear {
-    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
+impl SessionHandler<FromCloud> for LinkEventForwarder {
+    fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
             Record::Call {
                 id,
                 service,
                 request,
-            } => Told::Call(id, service, request),
-            Record::Control(FromCloud::Lookup { service }) => Told::Lookup(service),
+            } => LinkEvent::Call(id, service, request),
+            Record::Control(FromCloud::Lookup { service }) => LinkEvent::Lookup(service),
             _ => return,
         };
         let _ = self.0.send(told);
@@ -103,15 +103,15 @@ impl Handler<FromCloud> for Ear {
 }
 
 /// The robot's end of a link.
-struct Robot {
+struct ManualRobot {
     session: Arc<RobotSession>,
     hello: Hello,
-    ear: mpsc::UnboundedSender<Told>,
-    told: mpsc::UnboundedReceiver<Told>,
+    ear: mpsc::UnboundedSender<LinkEvent>,
+    told: mpsc::UnboundedReceiver<LinkEvent>,
     running: Option<JoinHandle<()>>,
 }
 
-impl Robot {
+impl ManualRobot {
     fn new(lends: bool) -> Self {
         let options = SessionOptions {
             ping: Duration::from_secs(1),
@@ -124,9 +124,9 @@ impl Robot {
             session: Arc::new(RobotSession::new(options)),
             hello: Hello {
                 run: "run".to_owned(),
-                node: Node {
+                node: NodeLaunch {
                     name: "/node".to_owned(),
-                    ..Node::default()
+                    ..NodeLaunch::default()
                 },
                 lends,
                 ..Hello::default()
@@ -137,8 +137,8 @@ impl Robot {
         }
     }
 
-    /// Connects, or connects again.
-    async fn links(&mut self, servant: &Servant) {
+    /// Connects or reconnects.
+    async fn connect(&mut self, servant: &Servant) {
         let (theirs, ours) = tokio::io::duplex(1 << 16);
         let hub = Arc::clone(&servant.hub);
         tokio::spawn(async move { hub.serve(theirs, &[]).await });
@@ -150,7 +150,7 @@ impl Robot {
             (resume.received, resume.ahead) = (have, ahead);
         }
         send_open(&mut socket, &self.hello).await.unwrap();
-        let mut held = Budget::unlimited().permit();
+        let mut held = Budget::without_limit().permit();
         let welcome = receive_open(&mut socket, "welcome", &mut held)
             .await
             .unwrap();
@@ -166,32 +166,35 @@ impl Robot {
         };
         self.hello.resume.get_or_insert_default().session = session;
         self.session.reconnect(received, &ahead, next);
-        let (session, ear) = (Arc::clone(&self.session), Ear(self.ear.clone()));
+        let (session, ear) = (
+            Arc::clone(&self.session),
+            LinkEventForwarder(self.ear.clone()),
+        );
         self.running = Some(tokio::spawn(async move {
             session.run(&mut socket, &ear).await;
         }));
     }
 
-    /// The connection is gone.
-    async fn is_cut(&mut self) {
+    /// Cuts the connection.
+    async fn disconnect(&mut self) {
         if let Some(running) = self.running.take() {
             running.abort();
             let _ = running.await;
         }
     }
 
-    async fn hears(&mut self) -> Told {
+    async fn next_event(&mut self) -> LinkEvent {
         let told = timeout(LONG, self.told.recv()).await;
         told.expect("something should be told").unwrap()
     }
 
-    /// The next call, by its id: of this channel and with this request. The question whether all is as it was may come
-    /// at any time.
-    async fn is_called(&mut self, channel: u32, request: &str) -> u32 {
+    /// Waits for the next call on this channel with this request; returns its id. A repeated lookup may arrive at any
+    /// time.
+    async fn expect_call(&mut self, channel: u32, request: &str) -> u32 {
         loop {
-            match self.hears().await {
-                Told::Lookup(_) => {}
-                Told::Call(id, of, with) => {
+            match self.next_event().await {
+                LinkEvent::Lookup(_) => {}
+                LinkEvent::Call(id, of, with) => {
                     assert_eq!((of, &with[..]), (channel, request.as_bytes()));
                     return id;
                 }
@@ -199,40 +202,40 @@ impl Robot {
         }
     }
 
-    /// Tells what it has under `/map`.
-    fn has(&self, channel: Option<u32>) {
-        let of = channel.map(|channel| Served {
+    /// Reports what it has under `/map`.
+    fn send_lent(&self, channel: Option<u32>) {
+        let of = channel.map(|channel| ServiceChannel {
             channel,
             name: "/map".to_owned(),
             type_name: "nav_msgs/GetMap".to_owned(),
             md5: "abcd".to_owned(),
-            ..Served::default()
+            ..ServiceChannel::default()
         });
         let service = "/map".to_owned();
-        self.session.report(&FromRobot::Lent { service, of });
+        self.session.send_control(&FromRobot::Lent { service, of });
     }
 }
 
-fn lookup() -> Told {
-    Told::Lookup("/map".to_owned())
+fn lookup() -> LinkEvent {
+    LinkEvent::Lookup("/map".to_owned())
 }
 
-/// A call of `/map` by the node, under way.
-fn calls(servant: &Servant, request: &'static str) -> JoinHandle<Result<Bytes, BusError>> {
+/// Starts a call of `/map` by the node.
+fn call_map(servant: &Servant, request: &'static str) -> JoinHandle<Result<Bytes, BusError>> {
     let node = Arc::clone(&servant.node);
     tokio::spawn(async move { node.call("/map", request.into(), LONG).await })
 }
 
-/// Calls `/map` until something serves it, while the robot does its part: what is answered then. A node that waits for a service
-/// looks fifty times a second (roscpp): nothing tells it of one that is lent.
-async fn is_served(
+/// Calls `/map` until something provides it, with the robot answering, and returns the response. A node that waits for
+/// a service polls fifty times a second (roscpp), because nothing announces one that is lent.
+async fn call_until_served(
     servant: &Servant,
     request: &'static str,
     part: impl Future<Output = ()>,
 ) -> Bytes {
     let called = async {
         loop {
-            match calls(servant, request).await.unwrap() {
+            match call_map(servant, request).await.unwrap() {
                 Err(BusError::NoService(_)) => sleep(Duration::from_millis(20)).await,
                 other => return other.unwrap(),
             }
@@ -245,27 +248,27 @@ async fn is_served(
 #[tokio::test]
 async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
     let servant = servant().await;
-    let mut robot = Robot::new(true);
-    robot.links(&servant).await;
-    // Those who look at the same time share one question.
-    let both = [calls(&servant, "one"), calls(&servant, "one")];
-    assert_eq!(robot.hears().await, lookup());
-    robot.has(Some(5));
+    let mut robot = ManualRobot::new(true);
+    robot.connect(&servant).await;
+    // Concurrent lookups share one request.
+    let both = [call_map(&servant, "one"), call_map(&servant, "one")];
+    assert_eq!(robot.next_event().await, lookup());
+    robot.send_lent(Some(5));
     for _ in &both {
-        let id = robot.is_called(5, "one").await;
+        let id = robot.expect_call(5, "one").await;
         robot.session.answer(id, now(), Ok("two".into()));
     }
     for call in both {
         assert_eq!(call.await.unwrap().unwrap(), "two");
     }
-    // Found, it is not waited for again; what fails, fails with the robot's words.
-    let call = calls(&servant, "three");
-    let id = robot.is_called(5, "three").await;
+    // Once found, it is not awaited again; failures carry the robot's message.
+    let call = call_map(&servant, "three");
+    let id = robot.expect_call(5, "three").await;
     let reason = "not today".to_owned();
     robot.session.answer(id, now(), Err(reason));
     let error = call.await.unwrap().unwrap_err().to_string();
     assert!(error.contains("not today"), "{error}");
-    // Whoever looks a while later has the robot look, too: another may have taken its place.
+    // A later lookup makes the robot check again, because another server may have replaced it.
     let confirmed = async {
         loop {
             let _ = servant.node.service_type("/map").await;
@@ -273,21 +276,21 @@ async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
     };
     let confirmed = async {
         tokio::select! {
-            told = robot.hears() => told,
+            told = robot.next_event() => told,
             () = confirmed => unreachable!("it has no end"),
         }
     };
     assert_eq!(timeout(LONG, confirmed).await.unwrap(), lookup());
-    // The same from another server of the robot: calls go there.
-    robot.has(Some(9));
-    let call = calls(&servant, "again");
-    let id = robot.is_called(9, "again").await;
+    // The same service from another server of the robot: calls go there.
+    robot.send_lent(Some(9));
+    let call = call_map(&servant, "again");
+    let id = robot.expect_call(9, "again").await;
     robot.session.answer(id, now(), Ok("and again".into()));
     assert_eq!(call.await.unwrap().unwrap(), "and again");
-    // Taken back, it is looked for again.
-    robot.has(None);
+    // Once withdrawn, it is looked up again.
+    robot.send_lent(None);
     let gone = loop {
-        match calls(&servant, "four").await.unwrap() {
+        match call_map(&servant, "four").await.unwrap() {
             Err(BusError::NoService(gone)) => break gone,
             // Its connection has not ended yet.
             Err(BusError::CallFailed { reason, .. }) => {
@@ -298,24 +301,24 @@ async fn a_lookup_goes_to_the_robot_and_calls_follow_it() {
     };
     assert_eq!(gone, "/map");
     let answering = async {
-        assert_eq!(robot.hears().await, lookup());
-        robot.has(Some(6));
-        let id = robot.is_called(6, "five").await;
+        assert_eq!(robot.next_event().await, lookup());
+        robot.send_lent(Some(6));
+        let id = robot.expect_call(6, "five").await;
         robot.session.answer(id, now(), Ok("six".into()));
     };
-    // "Not there" holds for a moment.
-    assert_eq!(is_served(&servant, "five", answering).await, "six");
+    // "Not there" is valid for a moment.
+    assert_eq!(call_until_served(&servant, "five", answering).await, "six");
 }
 
 #[tokio::test]
 async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
     let servant = servant().await;
-    let mut robot = Robot::new(true);
-    robot.links(&servant).await;
-    robot.is_cut().await;
+    let mut robot = ManualRobot::new(true);
+    robot.connect(&servant).await;
+    robot.disconnect().await;
     let waits = async || {
         let begun = Instant::now();
-        let called = calls(&servant, "x").await.unwrap();
+        let called = call_map(&servant, "x").await.unwrap();
         assert!(matches!(called, Err(BusError::NoService(_))), "{called:?}");
         begun.elapsed()
     };
@@ -325,51 +328,51 @@ async fn while_the_link_is_down_one_lookup_waits_and_the_next_do_not() {
     let known = graph.wait_for(|graph| graph.sought.contains_key("/map"));
     timeout(LONG, known).await.unwrap().unwrap();
     assert_eq!(servant.hub.status()[0].unserved, ["/map"]);
-    // The question was not lost.
-    robot.links(&servant).await;
-    assert_eq!(robot.hears().await, lookup());
-    robot.has(Some(1));
+    // The lookup was not lost.
+    robot.connect(&servant).await;
+    assert_eq!(robot.next_event().await, lookup());
+    robot.send_lent(Some(1));
     let answering = async {
-        let id = robot.is_called(1, "y").await;
+        let id = robot.expect_call(1, "y").await;
         robot.session.answer(id, now(), Ok("z".into()));
     };
-    assert_eq!(is_served(&servant, "y", answering).await, "z");
+    assert_eq!(call_until_served(&servant, "y", answering).await, "z");
     assert!(servant.hub.status()[0].unserved.is_empty());
 }
 
 #[tokio::test]
 async fn a_lookup_that_is_not_answered_is_asked_again() {
     let servant = servant().await;
-    let mut robot = Robot::new(true);
-    robot.links(&servant).await;
+    let mut robot = ManualRobot::new(true);
+    robot.connect(&servant).await;
     let answering = async {
-        assert_eq!(robot.hears().await, lookup());
+        assert_eq!(robot.next_event().await, lookup());
         // That answer is lost.
-        assert_eq!(robot.hears().await, lookup());
-        robot.has(Some(1));
-        let id = robot.is_called(1, "x").await;
+        assert_eq!(robot.next_event().await, lookup());
+        robot.send_lent(Some(1));
+        let id = robot.expect_call(1, "x").await;
         robot.session.answer(id, now(), Ok("y".into()));
     };
-    assert_eq!(is_served(&servant, "x", answering).await, "y");
+    assert_eq!(call_until_served(&servant, "x", answering).await, "y");
 }
 
 #[tokio::test]
 async fn a_call_outlives_a_cut_and_ends_with_the_link() {
     let servant = servant().await;
-    let mut robot = Robot::new(true);
-    robot.links(&servant).await;
-    let call = calls(&servant, "one");
-    assert_eq!(robot.hears().await, lookup());
-    robot.has(Some(1));
-    let id = robot.is_called(1, "one").await;
-    robot.is_cut().await;
+    let mut robot = ManualRobot::new(true);
+    robot.connect(&servant).await;
+    let call = call_map(&servant, "one");
+    assert_eq!(robot.next_event().await, lookup());
+    robot.send_lent(Some(1));
+    let id = robot.expect_call(1, "one").await;
+    robot.disconnect().await;
     robot.session.answer(id, now(), Ok("two".into()));
-    robot.links(&servant).await;
+    robot.connect(&servant).await;
     assert_eq!(call.await.unwrap().unwrap(), "two");
-    // The robot ends its node in the midst of the next one.
-    let call = calls(&servant, "three");
-    robot.is_called(1, "three").await;
-    robot.session.end(1000, "the robot's node ended");
+    // The robot ends its node during the next call.
+    let call = call_map(&servant, "three");
+    robot.expect_call(1, "three").await;
+    robot.session.close(1000, "the robot's node ended");
     let error = timeout(LONG, call).await.unwrap().unwrap().unwrap_err();
     assert!(
         error.to_string().contains("the link to the robot was lost"),
@@ -380,9 +383,9 @@ async fn a_call_outlives_a_cut_and_ends_with_the_link() {
 #[tokio::test]
 async fn a_robot_that_does_not_lend_is_not_asked() {
     let servant = servant().await;
-    let mut robot = Robot::new(false);
-    robot.links(&servant).await;
-    let called = calls(&servant, "x").await.unwrap();
+    let mut robot = ManualRobot::new(false);
+    robot.connect(&servant).await;
+    let called = call_map(&servant, "x").await.unwrap();
     assert!(matches!(called, Err(BusError::NoService(_))), "{called:?}");
     assert!(robot.told.try_recv().is_err());
 }

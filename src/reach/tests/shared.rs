@@ -1,4 +1,4 @@
-//! Stubs of a service that robots share: a group of two servants with real Masters, and robots' ends made by hand.
+//! Stubs of a shared service: a group of two servants with real Masters, and simulated robots' ends.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Weak};
@@ -8,16 +8,16 @@ use async_trait::async_trait;
 use bridge::BridgeOptions;
 use budget::{Budget, Permit};
 use bytes::Bytes;
-use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, Node, Request, Welcome};
+use link::control::{Exit, FromCloud, FromRobot, Graph, Hello, NodeLaunch, RequestTiming, Welcome};
 use link::record::Record;
 use link::session::{receive_open, send_open};
-use link::{Handler, MAX_FRAME, MAX_RECORD, RobotSession, SessionOptions};
+use link::{MAX_FRAME, MAX_RECORD, RobotSession, SessionHandler, SessionOptions};
 use package::interface::Interface;
 use package::inventory::Inventory;
 use reach::group::dispatch::Rules;
-use reach::group::{Group, seat};
-use reach::links::RequestNews;
-use reach::{Observer, Reach, ReachOptions, Recorded, Tenant};
+use reach::group::{ServantGroup, open_seat};
+use reach::links::RequestUpdate;
+use reach::{Observer, Reach, ReachOptions, RecordedRevision, Tenant};
 use ros::bus::{Bus, ParamValue, RosVersion, ServiceHandler, ServiceType};
 use ros::net::HostSockets;
 use ros::ros1::Ros1Bus;
@@ -29,17 +29,17 @@ use tokio::sync::{Semaphore, mpsc};
 use tokio::time::timeout;
 use ws::WebSocket;
 
-/// Only bounds how long a failing test takes.
+/// Only limits the duration of a failing test.
 const LONG: Duration = Duration::from_secs(120);
 
-/// Answers what it was asked with its servant's name; "long" is never answered.
-struct Worker {
+/// Answers with the request and its servant's name; "long" is never answered.
+struct WorkService {
     servant: &'static str,
     asked: Semaphore,
 }
 
 #[async_trait]
-impl ServiceHandler for Worker {
+impl ServiceHandler for WorkService {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         self.asked.add_permits(1);
         if &request[..] == b"long" {
@@ -53,7 +53,7 @@ impl ServiceHandler for Worker {
 /// A servant of the group.
 struct Member {
     bus: Arc<Ros1Bus>,
-    worker: Arc<Worker>,
+    worker: Arc<WorkService>,
     _node: Arc<Ros1Bus>,
     _serves: Box<dyn Send + Sync>,
 }
@@ -65,7 +65,7 @@ async fn member(servant: &'static str) -> Member {
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
     let (bus, node) = (join("/bridge").await, join("/worker").await);
-    let worker = Arc::new(Worker {
+    let worker = Arc::new(WorkService {
         servant,
         asked: Semaphore::new(0),
     });
@@ -83,18 +83,18 @@ fn work() -> ServiceType {
     ServiceType::new("x_msgs/Work", "0123456789abcdef0123456789abcdef")
 }
 
-struct Nobody;
+struct NullObserver;
 
-impl Observer for Nobody {
-    fn fits(&self, _: Option<u64>, _: &str) -> Result<(), String> {
+impl Observer for NullObserver {
+    fn check_stub(&self, _: Option<u64>, _: &str) -> Result<(), String> {
         Ok(())
     }
-    fn event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
-    fn served_locally(&self, _: &str, _: &str, _: std::time::SystemTime, _: Option<&str>) {}
-    fn measured(&self, _: &Request, _: RequestNews) {}
+    fn record_event(&self, _: api::Level, _: &str, _: &str, _: Option<&str>) {}
+    fn on_served_locally(&self, _: &str, _: &str, _: std::time::SystemTime, _: Option<&str>) {}
+    fn on_request_measured(&self, _: &RequestTiming, _: RequestUpdate) {}
 }
 
-impl Tenant for Nobody {
+impl Tenant for NullObserver {
     fn robot(&self) -> &str {
         "rover"
     }
@@ -106,8 +106,8 @@ impl Tenant for Nobody {
     }
 }
 
-/// A service of one node, `/worker`, that serves `/work`, one of its own, and an action.
-fn group() -> Arc<Group> {
+/// Creates a group with one node, `/worker`, that provides `/work`, a private service, and an action.
+fn group() -> Arc<ServantGroup> {
     let md5 = work().digest.to_string();
     let interface = json!({
         "services": [
@@ -122,14 +122,14 @@ fn group() -> Arc<Group> {
         replicas: 1,
         idempotent: false,
     };
-    Group::new(RosVersion::One, "noetic", &interface, rules)
+    ServantGroup::new(RosVersion::One, "noetic", &interface, rules)
 }
 
-fn recorded() -> Recorded {
+fn test_revision() -> RecordedRevision {
     let node = json!({ "name": "/worker", "argv": ["/opt/lib/works/worker"] });
     let definition = "int32 at\n---\nint32 at\n---\nint32 at\n".to_owned();
     let definitions = [("x_msgs/action/Count".to_owned(), definition)].into();
-    Recorded {
+    RecordedRevision {
         service: "works".into(),
         package: "works".into(),
         flavour: Default::default(),
@@ -146,75 +146,81 @@ fn recorded() -> Recorded {
     }
 }
 
-/// What a robot's end is told.
+/// Messages to a robot's end.
 #[derive(Debug)]
-enum Told {
+enum StubEvent {
     Graph(Graph),
     Answer(u32, Result<Bytes, String>),
     Notice(String),
     Exited(Exit),
 }
 
-struct Ear(mpsc::UnboundedSender<Told>);
+struct StubEventForwarder(mpsc::UnboundedSender<StubEvent>);
 
-impl Handler<FromCloud> for Ear {
-    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
+impl SessionHandler<FromCloud> for StubEventForwarder {
+    fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let told = match record {
-            Record::Answer { id, response, .. } => Told::Answer(id, response),
-            Record::Control(FromCloud::Graph(graph)) => Told::Graph(graph),
-            Record::Control(FromCloud::Notice { text, .. }) => Told::Notice(text),
-            Record::Control(FromCloud::Exited(exit)) => Told::Exited(exit),
+            Record::Answer { id, response, .. } => StubEvent::Answer(id, response),
+            Record::Control(FromCloud::Graph(graph)) => StubEvent::Graph(graph),
+            Record::Control(FromCloud::Notice { text, .. }) => StubEvent::Notice(text),
+            Record::Control(FromCloud::Exited(exit)) => StubEvent::Exited(exit),
             _ => return,
         };
         let _ = self.0.send(told);
     }
 }
 
-/// A robot's place, and the keeper of what it belongs to.
-fn place(group: &Arc<Group>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
+/// Opens a robot's place; also returns its tenant, which must be kept.
+fn place(group: &Arc<ServantGroup>) -> (Arc<dyn Reach>, Arc<dyn Tenant>) {
     let options = ReachOptions {
         ros: RosVersion::One,
         distribution: "noetic".into(),
         bridge: BridgeOptions::default(),
         grace: Duration::from_secs(30),
-        budget: Budget::unlimited(),
+        budget: Budget::without_limit(),
         unfinished: LONG,
     };
-    let reach = seat(group, "place", recorded(), options, Arc::new(Nobody));
-    let tenant: Arc<dyn Tenant> = Arc::new(Nobody);
+    let reach = open_seat(
+        group,
+        "place",
+        test_revision(),
+        options,
+        Arc::new(NullObserver),
+    );
+    let tenant: Arc<dyn Tenant> = Arc::new(NullObserver);
     let weak: Weak<dyn Tenant> = Arc::downgrade(&tenant);
-    reach.bind(weak);
+    reach.bind_tenant(weak);
     (reach, tenant)
 }
 
 /// A stub's end of a link.
 struct Stub {
     session: Arc<RobotSession>,
-    told: mpsc::UnboundedReceiver<Told>,
+    told: mpsc::UnboundedReceiver<StubEvent>,
 }
 
 fn hello(node: &str, argv: &[&str]) -> Hello {
     Hello {
         run: format!("run of {node}"),
-        node: Node {
+        node: NodeLaunch {
             name: node.to_owned(),
             package: "works".to_owned(),
             executable: "worker".to_owned(),
             argv: argv.iter().map(|&argument| argument.to_owned()).collect(),
-            ..Node::default()
+            ..NodeLaunch::default()
         },
         ..Hello::default()
     }
 }
 
-/// Says hello on a new connection; how that is answered.
-async fn says(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
+/// Sends a hello on a new connection; returns the welcome.
+async fn send_hello(reach: &Arc<dyn Reach>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
     let (theirs, ours) = tokio::io::duplex(1 << 16);
     let reach = Arc::clone(reach);
     tokio::spawn(async move { reach.serve_link(Box::new(theirs), &[]).await });
     let mut socket = WebSocket::client(ours, &[], MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
-    let mut held = Budget::unlimited().permit();
+    let mut held = Budget::without_limit().permit();
     let welcome = receive_open(&mut socket, "welcome", &mut held)
         .await
         .unwrap();
@@ -229,7 +235,7 @@ async fn stub(reach: &Arc<dyn Reach>, mut hello: Hello) -> Stub {
         max_age: None,
     }));
     hello.next = session.position().2;
-    let (mut socket, welcome) = says(reach, &hello).await;
+    let (mut socket, welcome) = send_hello(reach, &hello).await;
     let Welcome::Accepted {
         received,
         ahead,
@@ -242,20 +248,21 @@ async fn stub(reach: &Arc<dyn Reach>, mut hello: Hello) -> Stub {
     session.reconnect(received, &ahead, next);
     let (ear, told) = mpsc::unbounded_channel();
     let runs = Arc::clone(&session);
-    tokio::spawn(async move { runs.run(&mut socket, &Ear(ear)).await });
+    tokio::spawn(async move { runs.run(&mut socket, &StubEventForwarder(ear)).await });
     Stub { session, told }
 }
 
 impl Stub {
-    async fn hears(&mut self) -> Told {
+    async fn next_event(&mut self) -> StubEvent {
         let told = timeout(LONG, self.told.recv()).await;
         told.expect("something should be told").unwrap()
     }
 
-    /// The next graph: names of services, of topics that the node listens to, and of topics that it publishes.
-    async fn graph(&mut self) -> (Graph, [BTreeSet<String>; 3]) {
+    /// Returns the next graph: names of services, of topics that the node subscribes to, and of topics that it
+    /// publishes.
+    async fn next_graph(&mut self) -> (Graph, [BTreeSet<String>; 3]) {
         loop {
-            if let Told::Graph(graph) = self.hears().await {
+            if let StubEvent::Graph(graph) = self.next_event().await {
                 let services = graph.services.iter().map(|it| it.name.clone()).collect();
                 let inputs = graph.inputs.iter().map(|it| it.topic.clone()).collect();
                 let outputs = graph.outputs.iter().map(|it| it.topic.clone()).collect();
@@ -264,15 +271,15 @@ impl Stub {
         }
     }
 
-    /// Asks for something; the answer.
-    async fn asks(&mut self, channel: u32, request: &str) -> Result<String, String> {
+    /// Calls a service; returns the response.
+    async fn call(&mut self, channel: u32, request: &str) -> Result<String, String> {
         let asked = self.session.call(channel, request.to_owned().into());
         self.answer(asked).await
     }
 
     async fn answer(&mut self, asked: u32) -> Result<String, String> {
         loop {
-            if let Told::Answer(id, answer) = self.hears().await {
+            if let StubEvent::Answer(id, answer) = self.next_event().await {
                 assert_eq!(id, asked, "of another call");
                 return answer.map(|it| String::from_utf8_lossy(&it).into_owned());
             }
@@ -304,21 +311,21 @@ async fn stubs_have_their_robots_names_and_the_groups_answers() {
     let mut front = hello("/front/hands", &["work:=/plan", "count:=tally"]);
     front.run = "another".to_owned();
     let mut front = stub(&second, front).await;
-    let (graph, names) = plain.graph().await;
+    let (graph, names) = plain.next_graph().await;
     let inputs = set(["/count/cancel", "/count/goal"]);
     let outputs = set(["/count/feedback", "/count/result", "/count/status"]);
     assert_eq!(names, [set(["/work", "/worker/set"]), inputs, outputs]);
-    let (theirs, names) = front.graph().await;
+    let (theirs, names) = front.next_graph().await;
     assert_eq!(names[0], set(["/front/hands/set", "/plan"]));
     assert_eq!(names[1], set(["/front/tally/cancel", "/front/tally/goal"]));
-    // Each call to the servant that has the least to do, each answer to who asked.
+    // Each call goes to the servant with the lowest load, each response to its caller.
     let (work, plan) = (channel(&graph, "/work"), channel(&theirs, "/plan"));
     let mut by = BTreeSet::new();
     for number in 0..4 {
         let asked = [format!("plain {number}"), format!("front {number}")];
         for (stub, channel, words) in [(&mut plain, work, &asked[0]), (&mut front, plan, &asked[1])]
         {
-            let answer = stub.asks(channel, words).await.unwrap();
+            let answer = stub.call(channel, words).await.unwrap();
             let (said, servant) = answer.split_once(" by ").unwrap();
             assert_eq!(said, words);
             by.insert(servant.to_owned());
@@ -339,7 +346,7 @@ async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
         .map(|member| group.join(member.worker.servant, member.bus.clone()));
     let (reach, _tenant) = place(&group);
     let mut stub = stub(&reach, hello("/worker", &[])).await;
-    let work = channel(&stub.graph().await.0, "/work");
+    let work = channel(&stub.next_graph().await.0, "/work");
     let asked = stub.session.call(work, "long".into());
     let has = |at: usize| members[at].worker.asked.acquire();
     let lost = tokio::select! {
@@ -355,7 +362,7 @@ async fn a_call_of_a_stub_at_a_lost_servant_fails_and_the_next_is_answered() {
     );
     assert!(reason.contains("--idempotent"), "{reason}");
     let other = members[1 - lost].worker.servant;
-    let answer = stub.asks(work, "again").await;
+    let answer = stub.call(work, "again").await;
     assert_eq!(answer, Ok(format!("again by {other}")));
 }
 
@@ -365,21 +372,25 @@ async fn a_stub_that_is_told_to_end_takes_its_names_back() {
     let (reach, _tenant) = place(&group);
     let mut one = stub(&reach, hello("/one", &[])).await;
     let mut other = stub(&reach, hello("/other", &["work:=/plan"])).await;
-    assert_eq!(other.graph().await.1[0], set(["/other/set", "/plan"]));
-    assert_eq!(one.graph().await.1[0], set(["/one/set", "/work"]));
-    one.session.report(&FromRobot::Signal { signal: 2 });
+    assert_eq!(other.next_graph().await.1[0], set(["/other/set", "/plan"]));
+    assert_eq!(one.next_graph().await.1[0], set(["/one/set", "/work"]));
+    one.session.send_control(&FromRobot::Signal { signal: 2 });
     let exit = loop {
-        if let Told::Exited(exit) = one.hears().await {
+        if let StubEvent::Exited(exit) = one.next_event().await {
             break exit;
         }
     };
     assert_eq!(exit.code, Some(0), "{exit:?}");
     assert_eq!(reach.links().len(), 2, "its link ends with its stub");
-    // Another signal is none of the node's ends.
-    other.session.report(&FromRobot::Signal { signal: 18 });
-    other.session.report(&FromRobot::Signal { signal: 15 });
+    // Other signals do not end the node.
+    other
+        .session
+        .send_control(&FromRobot::Signal { signal: 18 });
+    other
+        .session
+        .send_control(&FromRobot::Signal { signal: 15 });
     let exit = loop {
-        if let Told::Exited(exit) = other.hears().await {
+        if let StubEvent::Exited(exit) = other.next_event().await {
             break exit;
         }
     };
@@ -395,7 +406,7 @@ async fn what_a_robot_gives_the_shared_node_in_vain_is_told_and_other_programs_a
     gives.parameters = [("worker".to_owned(), own)].into();
     let mut stub = stub(&reach, gives).await;
     let told = loop {
-        if let Told::Notice(told) = stub.hears().await {
+        if let StubEvent::Notice(told) = stub.next_event().await {
             break told;
         }
     };
@@ -404,7 +415,7 @@ async fn what_a_robot_gives_the_shared_node_in_vain_is_told_and_other_programs_a
     }
     let mut stranger = hello("/shell", &[]);
     stranger.node.executable = "sh".to_owned();
-    let (_, welcome) = says(&reach, &stranger).await;
+    let (_, welcome) = send_hello(&reach, &stranger).await;
     match welcome {
         Welcome::Refused { reason, again } => {
             assert!(reason.contains("was not pushed with") && !again, "{reason}");

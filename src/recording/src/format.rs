@@ -1,18 +1,18 @@
-//! Which ROS the messages of a file are of, in the words of MCAP's registry (<https://mcap.dev/spec/registry>), which are
-//! those of Foxglove's protocol, too.
+//! ROS version of a file's messages, by the names of MCAP's registry (<https://mcap.dev/spec/registry>), which
+//! Foxglove's protocol uses as well.
 
-/// How messages and their definitions are written.
+/// Encoding of messages and their definitions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Format {
-    /// As ROS 1 does.
+pub enum RecordingFormat {
+    /// ROS 1.
     #[default]
     Ros1,
-    /// As ROS 2 does.
+    /// ROS 2.
     Ros2,
 }
 
-impl Format {
-    /// What a file is said to be.
+impl RecordingFormat {
+    /// Returns the MCAP profile.
     pub fn profile(self) -> &'static str {
         match self {
             Self::Ros1 => "ros1",
@@ -20,7 +20,7 @@ impl Format {
         }
     }
 
-    /// How messages are written.
+    /// Returns the message encoding.
     pub fn encoding(self) -> &'static str {
         match self {
             Self::Ros1 => "ros1",
@@ -28,7 +28,7 @@ impl Format {
         }
     }
 
-    /// How their definitions are written: the text of the message, followed by those of all that it contains.
+    /// Returns the schema encoding: the message text followed by the texts of all types it contains.
     pub fn schema(self) -> &'static str {
         match self {
             Self::Ros1 => "ros1msg",
@@ -36,8 +36,8 @@ impl Format {
         }
     }
 
-    /// The one whose messages are written so; none where it is neither.
-    pub fn of_encoding(encoding: &str) -> Option<Self> {
+    /// Returns the format with this message encoding, if there is one.
+    pub fn from_encoding(encoding: &str) -> Option<Self> {
         let all = [Self::Ros1, Self::Ros2];
         all.into_iter().find(|one| one.encoding() == encoding)
     }
@@ -49,8 +49,14 @@ mod tests {
 
     #[test]
     fn a_format_is_found_by_how_messages_are_written() {
-        assert_eq!(Format::of_encoding("cdr"), Some(Format::Ros2));
-        assert_eq!(Format::of_encoding("ros1"), Some(Format::Ros1));
-        assert_eq!(Format::of_encoding("json"), None);
+        assert_eq!(
+            RecordingFormat::from_encoding("cdr"),
+            Some(RecordingFormat::Ros2)
+        );
+        assert_eq!(
+            RecordingFormat::from_encoding("ros1"),
+            Some(RecordingFormat::Ros1)
+        );
+        assert_eq!(RecordingFormat::from_encoding("json"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! MCAP files (<https://mcap.dev/spec>) of messages of ROS 1 or of ROS 2, as the bytes that they are.
+//! MCAP files (<https://mcap.dev/spec>) of ROS 1 or ROS 2 messages in their original encoding.
 
 #![deny(unsafe_code)]
 
@@ -11,49 +11,49 @@ use std::path::PathBuf;
 
 use mcap::McapError;
 
-pub use format::Format;
-pub use reader::{Played, Reader};
-pub use writer::{Summary, TopicSummary, Writer};
+pub use format::RecordingFormat;
+pub use reader::{RecordedMessage, RecordingReader};
+pub use writer::{RecordingWriter, Summary, TopicSummary};
 
-/// Why a file cannot be written or read.
+/// Reason why a file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// It cannot be made, as where there is one of this name.
-    #[error("{} cannot be made: {reason}", path.display())]
+    /// The file cannot be created, for example because it exists.
+    #[error("cannot create {}: {reason}", path.display())]
     NotMade {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Underlying error.
         reason: io::Error,
     },
-    /// What was written by then stays.
-    #[error("{} cannot be written to its end: {reason}; what it holds by now can be read", path.display())]
+    /// Writing failed; what was written before remains readable.
+    #[error("{} cannot be completed: {reason}; what was written so far can be read", path.display())]
     Unwritable {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Underlying error.
         reason: McapError,
     },
-    /// It cannot be opened or read.
+    /// The file cannot be opened or read.
     #[error("{} cannot be read: {reason}", path.display())]
     Unreadable {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Underlying error.
         reason: io::Error,
     },
-    /// It is something else.
-    #[error("{} is no MCAP file", path.display())]
+    /// The file is not an MCAP file.
+    #[error("{} is not an MCAP file", path.display())]
     NoRecording {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// It is broken somewhere.
-    #[error("{} cannot be read on: {reason}", path.display())]
+    /// The file is corrupt.
+    #[error("{} cannot be read any further: {reason}", path.display())]
     Broken {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
-        /// How.
+        /// Description of the damage.
         reason: String,
     },
 }

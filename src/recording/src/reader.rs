@@ -1,4 +1,5 @@
-//! Reads messages in the order of the file, a chunk at a time: a file may be larger than memory, and may break off.
+//! MCAP reader. Returns messages in file order, one chunk at a time, because a file may be larger than memory and may
+//! be truncated.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -11,22 +12,22 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 
 use crate::Error;
 
-/// Bytes of a record that are read at most; more is no message.
+/// Maximum size of a record in bytes; a larger one cannot be a message.
 const LARGEST: usize = 1 << 30;
 
-/// A file that is read.
-pub struct Reader {
+/// An MCAP file being read.
+pub struct RecordingReader {
     path: PathBuf,
     file: File,
     records: LinearReader,
     schemas: HashMap<u16, String>,
-    channels: HashMap<u16, Channel>,
+    channels: HashMap<u16, ChannelInfo>,
     ended: bool,
     breaks_off: bool,
 }
 
 #[derive(Clone)]
-struct Channel {
+struct ChannelInfo {
     topic: String,
     encoding: String,
     schema: u16,
@@ -34,20 +35,20 @@ struct Channel {
 
 /// A message of a file.
 #[derive(Debug)]
-pub struct Played {
-    /// Where it was heard.
+pub struct RecordedMessage {
+    /// Topic on which the message was recorded.
     pub topic: String,
-    /// Its type, `package/Type`.
+    /// Message type, `package/Type`.
     pub of: String,
-    /// How it is written: `ros1`, `cdr`.
+    /// Encoding: `ros1` or `cdr`.
     pub encoding: String,
-    /// When it was heard, in nanoseconds.
+    /// Time of recording in nanoseconds since 1970.
     pub time: u64,
-    /// Its bytes.
+    /// Serialized message.
     pub message: Vec<u8>,
 }
 
-impl Reader {
+impl RecordingReader {
     /// Opens a file.
     ///
     /// # Errors
@@ -69,16 +70,16 @@ impl Reader {
         })
     }
 
-    /// Whether the file broke off where it was read to.
-    pub fn breaks_off(&self) -> bool {
+    /// Returns true if the file turned out to be truncated.
+    pub fn is_truncated(&self) -> bool {
         self.breaks_off
     }
 
-    /// The next message.
+    /// Returns the next message, or `None` at the end of the file.
     ///
     /// # Errors
     /// [`Error::Unreadable`], [`Error::NoRecording`], [`Error::Broken`].
-    pub fn next_message(&mut self) -> Result<Option<Played>, Error> {
+    pub fn next_message(&mut self) -> Result<Option<RecordedMessage>, Error> {
         let path = &self.path;
         let broken = |reason: String| Error::Broken {
             path: path.clone(),
@@ -105,7 +106,7 @@ impl Reader {
                             self.schemas.insert(header.id, header.name);
                         }
                         Record::Channel(channel) => {
-                            let known = Channel {
+                            let known = ChannelInfo {
                                 topic: channel.topic,
                                 encoding: channel.message_encoding,
                                 schema: channel.schema_id,
@@ -117,11 +118,11 @@ impl Reader {
                             let channel = channel.ok_or_else(|| {
                                 let id = header.channel_id;
                                 broken(format!(
-                                    "it has a message of channel {id}, and does not describe that"
+                                    "it has a message of channel {id}, which it does not describe"
                                 ))
                             })?;
                             let of = self.schemas.get(&channel.schema);
-                            return Ok(Some(Played {
+                            return Ok(Some(RecordedMessage {
                                 topic: channel.topic,
                                 of: of.cloned().unwrap_or_default(),
                                 encoding: channel.encoding,

@@ -1,4 +1,5 @@
-//! Writes messages as they come. Every second what came is written out: whatever ends this, the file can be read up to there.
+//! MCAP writer. The recorder flushes it every second, so that the file is readable up to the last flush, however the
+//! process ends.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
@@ -9,77 +10,77 @@ use mcap::records::MessageHeader;
 use mcap::{McapError, WriteOptions};
 use serde::Serialize;
 
-use crate::{Error, Format};
+use crate::{Error, RecordingFormat};
 
-/// A file that is being written.
-pub struct Writer {
+/// An MCAP file being written.
+pub struct RecordingWriter {
     path: PathBuf,
-    format: Format,
-    /// The same file, to be asked how large it is: who writes it may not be allowed to look into its directory.
+    format: RecordingFormat,
+    /// Second handle to the file, used to query its size: the process may lack permission to look into the directory.
     asked: File,
-    file: mcap::Writer<Whole>,
-    topics: BTreeMap<u16, Topic>,
+    file: mcap::Writer<ChunkedFile>,
+    topics: BTreeMap<u16, ChannelTotals>,
     /// Bytes of messages since the last flush.
     pending: usize,
 }
 
-/// More bytes of messages than these are not held back.
+/// Number of pending bytes above which the writer flushes.
 const PENDING: usize = 8 << 20;
 
-struct Topic {
+struct ChannelTotals {
     name: String,
     of: String,
     messages: u32,
     bytes: u64,
 }
 
-/// What a file holds.
+/// Summary of a finished file.
 #[derive(Debug, Serialize)]
 pub struct Summary {
-    /// Where it is.
+    /// Path of the file.
     pub file: PathBuf,
-    /// Its size in bytes.
+    /// File size in bytes.
     pub size: u64,
-    /// Of all topics.
+    /// Number of messages on all topics.
     pub messages: u64,
-    /// By name.
+    /// Summary of each topic, sorted by name.
     pub topics: Vec<TopicSummary>,
 }
 
-/// What a file holds of one topic.
+/// Summary of one topic.
 #[derive(Debug, Serialize)]
 pub struct TopicSummary {
-    /// Its name.
+    /// Name of the topic.
     pub topic: String,
-    /// `package/Type`.
+    /// Message type, `package/Type`.
     #[serde(rename = "type")]
     pub of: String,
-    /// How many.
+    /// Number of messages.
     pub messages: u32,
-    /// Of them, before they were compressed.
+    /// Size of the messages in bytes, uncompressed.
     pub bytes: u64,
 }
 
-impl Writer {
-    /// Makes a file that is not there yet.
+impl RecordingWriter {
+    /// Creates a file that must not exist yet.
     ///
     /// # Errors
     /// [`Error::NotMade`], [`Error::Unwritable`].
-    pub fn create(path: &Path, format: Format) -> Result<Self, Error> {
+    pub fn create(path: &Path, format: RecordingFormat) -> Result<Self, Error> {
         let mut options = OpenOptions::new();
         let file = options.write(true).create_new(true).open(path);
         let file = file.map_err(|reason| Error::NotMade {
             path: path.to_owned(),
             reason,
         })?;
-        Self::of(path, file, format)
+        Self::from_file(path, file, format)
     }
 
-    /// Writes into `file`, which is empty, and is at `path`.
+    /// Writes to `file`, which is empty and located at `path`.
     ///
     /// # Errors
     /// [`Error::Unwritable`].
-    pub fn of(path: &Path, file: File, format: Format) -> Result<Self, Error> {
+    pub fn from_file(path: &Path, file: File, format: RecordingFormat) -> Result<Self, Error> {
         let asked = file.try_clone().map_err(|reason| Error::NotMade {
             path: path.to_owned(),
             reason,
@@ -87,7 +88,9 @@ impl Writer {
         let options = WriteOptions::new()
             .profile(format.profile())
             .library(concat!("cloudroid ", env!("CARGO_PKG_VERSION")));
-        let file = options.create(Whole::of(file)).map_err(unwritable(path))?;
+        let file = options
+            .create(ChunkedFile::new(file))
+            .map_err(write_error(path))?;
         Ok(Self {
             path: path.to_owned(),
             format,
@@ -98,19 +101,19 @@ impl Writer {
         })
     }
 
-    /// The channel of a topic whose messages are of type `of`, as `definition` says.
+    /// Returns the channel of a topic whose messages have type `of` with the given `definition`.
     ///
     /// # Errors
-    /// [`Error::Unwritable`], as of what follows.
-    pub fn channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> Result<u16, Error> {
+    /// [`Error::Unwritable`], like the methods below.
+    pub fn add_channel(&mut self, topic: &str, of: &str, definition: &[u8]) -> Result<u16, Error> {
         let schema = self.file.add_schema(of, self.format.schema(), definition);
-        let schema = schema.map_err(unwritable(&self.path))?;
+        let schema = schema.map_err(write_error(&self.path))?;
         let encoding = self.format.encoding();
         let channel = self
             .file
             .add_channel(schema, topic, encoding, &BTreeMap::new());
-        let channel = channel.map_err(unwritable(&self.path))?;
-        self.topics.entry(channel).or_insert_with(|| Topic {
+        let channel = channel.map_err(write_error(&self.path))?;
+        self.topics.entry(channel).or_insert_with(|| ChannelTotals {
             name: topic.to_owned(),
             of: of.to_owned(),
             messages: 0,
@@ -119,8 +122,8 @@ impl Writer {
         Ok(channel)
     }
 
-    /// Adds a message that was heard at `time`, in nanoseconds since 1970.
-    pub fn add(&mut self, channel_id: u16, time: u64, message: &[u8]) -> Result<(), Error> {
+    /// Adds a message received at `time`, in nanoseconds since 1970.
+    pub fn add_message(&mut self, channel_id: u16, time: u64, message: &[u8]) -> Result<(), Error> {
         let mut sequence = 0;
         if let Some(topic) = self.topics.get_mut(&channel_id) {
             sequence = topic.messages;
@@ -134,32 +137,33 @@ impl Writer {
             publish_time: time,
         };
         let written = self.file.write_to_known_channel(&header, message);
-        written.map_err(unwritable(&self.path))?;
+        written.map_err(write_error(&self.path))?;
         self.pending += message.len();
-        match self.pending > PENDING {
-            true => self.flush(),
-            false => Ok(()),
+        if self.pending > PENDING {
+            self.flush()
+        } else {
+            Ok(())
         }
     }
 
-    /// Writes out what has come.
+    /// Flushes pending messages to the file.
     ///
     /// # Errors
     /// [`Error::Unwritable`].
     pub fn flush(&mut self) -> Result<(), Error> {
         self.pending = 0;
-        self.file.flush().map_err(unwritable(&self.path))
+        self.file.flush().map_err(write_error(&self.path))
     }
 
-    /// How many messages there are by now.
+    /// Returns the number of messages written so far.
     pub fn messages(&self) -> u64 {
         let all = self.topics.values();
         all.map(|topic| u64::from(topic.messages)).sum()
     }
 
-    /// Ends the file with its index.
+    /// Finishes the file with its index.
     pub fn finish(mut self) -> Result<Summary, Error> {
-        self.file.finish().map_err(unwritable(&self.path))?;
+        self.file.finish().map_err(write_error(&self.path))?;
         let messages = self.messages();
         let mut topics: Vec<_> = self
             .topics
@@ -182,17 +186,17 @@ impl Writer {
     }
 }
 
-/// A file that is given whole chunks alone, by `flush`: half a chunk with the length of none could not be read, nor what comes before it
-/// by every program.
-struct Whole {
+/// File to which only whole chunks are written, by `flush`. A chunk cut short, with a length of zero, could not be
+/// read, and some programs could not read what precedes it either.
+struct ChunkedFile {
     file: File,
-    /// Where the file ends.
+    /// Offset of the end of the file.
     end: u64,
     next: Cursor<Vec<u8>>,
 }
 
-impl Whole {
-    fn of(file: File) -> Self {
+impl ChunkedFile {
+    fn new(file: File) -> Self {
         Self {
             file,
             end: 0,
@@ -201,7 +205,7 @@ impl Whole {
     }
 }
 
-impl Write for Whole {
+impl Write for ChunkedFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.next.write(bytes)
     }
@@ -213,8 +217,8 @@ impl Write for Whole {
     }
 }
 
-impl Seek for Whole {
-    /// Within what was not flushed yet.
+impl Seek for ChunkedFile {
+    /// Seeks within the data that was not flushed yet.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         let to = match to {
             SeekFrom::Start(at) => match at.checked_sub(self.end) {
@@ -227,7 +231,7 @@ impl Seek for Whole {
     }
 }
 
-fn unwritable(path: &Path) -> impl FnOnce(McapError) -> Error {
+fn write_error(path: &Path) -> impl FnOnce(McapError) -> Error {
     |reason| Error::Unwritable {
         path: path.to_owned(),
         reason,
@@ -237,21 +241,21 @@ fn unwritable(path: &Path) -> impl FnOnce(McapError) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Reader;
+    use crate::RecordingReader;
 
     #[test]
     fn a_file_of_ros_2_says_so() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("two.mcap");
-        let mut writer = Writer::create(&path, Format::Ros2).expect("a new file");
-        let channel = writer.channel("/chatter", "std_msgs/msg/String", b"string data");
+        let mut writer = RecordingWriter::create(&path, RecordingFormat::Ros2).expect("a new file");
+        let channel = writer.add_channel("/chatter", "std_msgs/msg/String", b"string data");
         let message = [0, 1, 0, 0, 2, 0, 0, 0, b'a', 0];
         writer
-            .add(channel.expect("a channel"), 7, &message)
+            .add_message(channel.expect("a channel"), 7, &message)
             .expect("is written");
         writer.finish().expect("an end");
         let bytes = std::fs::read(&path).expect("it is there");
-        // Magic, opcode and length of the header, and its first text.
+        // Magic, opcode and length of the header, then its first string.
         assert_eq!(&bytes[17..25], b"\x04\0\0\0ros2");
         let summary = mcap::Summary::read(&bytes)
             .expect("it is whole")
@@ -263,12 +267,15 @@ mod tests {
             (&*schema.name, &*schema.encoding),
             ("std_msgs/msg/String", "ros2msg")
         );
-        let mut reader = Reader::open(&path).expect("it opens");
+        let mut reader = RecordingReader::open(&path).expect("it opens");
         let played = reader
             .next_message()
             .expect("it is read")
             .expect("a message");
-        assert_eq!(Format::of_encoding(&played.encoding), Some(Format::Ros2));
+        assert_eq!(
+            RecordingFormat::from_encoding(&played.encoding),
+            Some(RecordingFormat::Ros2)
+        );
         assert_eq!((played.time, &*played.message), (7, &message[..]));
     }
 
@@ -276,21 +283,23 @@ mod tests {
     fn what_is_written_is_read_and_a_file_that_breaks_off_up_to_there() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("x.mcap");
-        let mut writer = Writer::create(&path, Format::Ros1).expect("a new file");
-        let text = writer.channel("/chatter", "std_msgs/String", b"string data");
+        let mut writer = RecordingWriter::create(&path, RecordingFormat::Ros1).expect("a new file");
+        let text = writer.add_channel("/chatter", "std_msgs/String", b"string data");
         let text = text.expect("a channel");
-        let same = writer.channel("/chatter", "std_msgs/String", b"string data");
+        let same = writer.add_channel("/chatter", "std_msgs/String", b"string data");
         assert_eq!(same.expect("the same"), text);
         for time in 1..=3 {
             let message = format!("word {time}");
             writer
-                .add(text, time, message.as_bytes())
+                .add_message(text, time, message.as_bytes())
                 .expect("is written");
         }
         writer.flush().expect("is written");
-        // What comes then, in no chunk that is complete, is not there if this is the end.
+        // Messages after this point, in no complete chunk, would be lost if the writer ended here.
         for time in 4..1000 {
-            writer.add(text, time, &[b'x'; 1000]).expect("is written");
+            writer
+                .add_message(text, time, &[b'x'; 1000])
+                .expect("is written");
         }
         let cut = place.path().join("cut.mcap");
         std::fs::copy(&path, &cut).expect("a copy");
@@ -299,14 +308,14 @@ mod tests {
         assert_eq!(summary.topics[0].bytes, 3 * 6 + 996 * 1000);
 
         let read = |path: &Path| {
-            let mut reader = Reader::open(path).expect("it opens");
+            let mut reader = RecordingReader::open(path).expect("it opens");
             let mut found = Vec::new();
             while let Some(played) = reader.next_message().expect("it is read") {
                 assert_eq!(played.topic, "/chatter");
                 assert_eq!(played.of, "std_msgs/String");
                 found.push((played.time, played.message.to_vec()));
             }
-            (found, reader.breaks_off())
+            (found, reader.is_truncated())
         };
         let words: Vec<_> = (1..=3)
             .map(|time| (time, format!("word {time}").into_bytes()))
@@ -314,7 +323,7 @@ mod tests {
         assert_eq!(read(&cut), (words.clone(), true));
         let (all, breaks_off) = read(&path);
         assert_eq!((&all[..3], all.len(), breaks_off), (&words[..], 999, false));
-        // Wherever it is cut, all that came before is read.
+        // Wherever the file is truncated, everything before the cut is readable.
         let whole = std::fs::read(&path).expect("it is there");
         for end in (600..whole.len()).step_by(101) {
             std::fs::write(&cut, &whole[..end]).expect("is written");
@@ -322,7 +331,7 @@ mod tests {
             assert!(breaks_off && all.starts_with(&found), "cut at {end}");
         }
 
-        let error = Writer::create(&path, Format::Ros1)
+        let error = RecordingWriter::create(&path, RecordingFormat::Ros1)
             .err()
             .expect("it is there");
         assert!(error.to_string().contains("exists"), "{error}");

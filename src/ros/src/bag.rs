@@ -1,7 +1,7 @@
-//! Recordings: rosbag files of version 2.0, read front to back (<http://wiki.ros.org/Bags/Format/2.0>).
+//! Recordings: rosbag files of version 2.0, read sequentially (<http://wiki.ros.org/Bags/Format/2.0>).
 //!
-//! Only what replaying needs: messages with their topics, types and times. Indexes are skipped. Chunks must not be
-//! compressed: `rosbag decompress` makes them so.
+//! Reads only what replaying needs: messages with their topics, types and times. Indexes are skipped. Chunks must not
+//! be compressed; `rosbag decompress` converts a file.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -16,43 +16,41 @@ const MESSAGE: u8 = 0x02;
 const CHUNK: u8 = 0x05;
 const CONNECTION: u8 = 0x07;
 
-/// Why a recording cannot be read. Positions are bytes from its beginning.
+/// Error reading a recording. Positions are byte offsets in the file.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BagError {
-    /// Nothing is in it.
+    /// The file is empty.
     #[error("the file is empty")]
     Empty,
-    /// Another kind of file.
-    #[error("this is no rosbag file; one is recorded with: rosbag record TOPIC")]
+    /// The file is not a rosbag.
+    #[error("not a rosbag file; record one with: rosbag record TOPIC")]
     Other,
-    /// An older version.
-    #[error(
-        "this is a rosbag file of an older version than 2.0; it is brought up to date by: rosbag fix"
-    )]
+    /// The file has an older format version.
+    #[error("this is a rosbag file of an older version than 2.0; convert it with: rosbag fix")]
     Version,
-    /// It ends in the middle, or a length in it is wrong.
+    /// The file is truncated, or a length in it is wrong.
     #[error("the recording is cut off or damaged at byte {0}; try: rosbag reindex")]
     Damaged(usize),
-    /// A compressed chunk.
+    /// A chunk is compressed.
     #[error("the recording is compressed ({0}); unpack it first: rosbag decompress FILE")]
     Compressed(String),
 }
 
 /// One recorded message.
 #[derive(Debug, Clone)]
-pub struct Recorded {
-    /// The topic it was recorded on.
+pub struct BagMessage {
+    /// Topic on which it was recorded.
     pub topic: Arc<str>,
-    /// Its type, with the full definition.
+    /// Type of the message, with the full definition.
     pub wire_type: Arc<WireType>,
-    /// When it was received, nanoseconds since 1970.
+    /// Time of reception, in nanoseconds since 1970.
     pub time: u64,
-    /// The message, serialized.
+    /// The serialized message.
     pub bytes: Bytes,
 }
 
-/// At most the first `limit` messages of a recording, in the order of the file.
-pub fn read(file: &Bytes, limit: usize) -> Result<Vec<Recorded>, BagError> {
+/// Reads at most the first `limit` messages of a recording, in file order.
+pub fn read(file: &Bytes, limit: usize) -> Result<Vec<BagMessage>, BagError> {
     if !file.starts_with(MAGIC) {
         return Err(match &file[..] {
             [] => BagError::Empty,
@@ -60,24 +58,24 @@ pub fn read(file: &Bytes, limit: usize) -> Result<Vec<Recorded>, BagError> {
             _ => BagError::Other,
         });
     }
-    let mut reader = Reader {
+    let mut reader = BagReader {
         connections: HashMap::new(),
         messages: Vec::new(),
         limit,
     };
-    reader.records(file, MAGIC.len(), file.len(), true)?;
+    reader.read_records(file, MAGIC.len(), file.len(), true)?;
     Ok(reader.messages)
 }
 
-struct Reader {
+struct BagReader {
     connections: HashMap<u32, (Arc<str>, Arc<WireType>)>,
-    messages: Vec<Recorded>,
+    messages: Vec<BagMessage>,
     limit: usize,
 }
 
-impl Reader {
-    /// The records between two positions; chunks are not nested.
-    fn records(
+impl BagReader {
+    /// Reads the records between two positions; chunks are not nested.
+    fn read_records(
         &mut self,
         file: &Bytes,
         mut at: usize,
@@ -87,33 +85,34 @@ impl Reader {
         while at < end && self.messages.len() < self.limit {
             let began = at;
             let damaged = BagError::Damaged(began);
-            let header = block(file, &mut at, end).ok_or(damaged.clone())?;
-            let data = block(file, &mut at, end).ok_or(damaged.clone())?;
-            let fields = fields(&file[header]).ok_or(damaged.clone())?;
+            let header = take_block(file, &mut at, end).ok_or(damaged.clone())?;
+            let data = take_block(file, &mut at, end).ok_or(damaged.clone())?;
+            let fields = parse_fields(&file[header]).ok_or(damaged.clone())?;
             let op = fields.get("op").and_then(|value| value.first()).copied();
             match op {
                 Some(CHUNK) if chunks => {
-                    let compression = text(&fields, "compression");
+                    let compression = text_field(&fields, "compression");
                     if compression != "none" {
                         return Err(BagError::Compressed(compression));
                     }
-                    self.records(file, data.start, data.end, false)?;
+                    self.read_records(file, data.start, data.end, false)?;
                 }
                 Some(CONNECTION) => {
-                    let number = number(&fields, "conn").ok_or(damaged.clone())?;
-                    let about = self::fields(&file[data]).ok_or(damaged)?;
+                    let number = number_field(&fields, "conn").ok_or(damaged.clone())?;
+                    let about = self::parse_fields(&file[data]).ok_or(damaged)?;
                     let wire_type = WireType::new(
-                        text(&about, "type"),
-                        text(&about, "md5sum"),
-                        text(&about, "message_definition"),
+                        text_field(&about, "type"),
+                        text_field(&about, "md5sum"),
+                        text_field(&about, "message_definition"),
                     );
-                    // As it was subscribed to; the connection's own header may name another before remapping.
-                    let topic = text(&fields, "topic").into();
+                    // The topic as subscribed to; the connection's own header may have another name from before
+                    // remapping.
+                    let topic = text_field(&fields, "topic").into();
                     self.connections
                         .insert(number, (topic, Arc::new(wire_type)));
                 }
                 Some(MESSAGE) => {
-                    let number = number(&fields, "conn").ok_or(damaged.clone())?;
+                    let number = number_field(&fields, "conn").ok_or(damaged.clone())?;
                     let (topic, wire_type) =
                         self.connections.get(&number).ok_or(damaged.clone())?;
                     let time: [u8; 8] = fields
@@ -123,7 +122,7 @@ impl Reader {
                     let [a, b, c, d, e, f, g, h] = time;
                     let seconds = u64::from(u32::from_le_bytes([a, b, c, d]));
                     let nanoseconds = u64::from(u32::from_le_bytes([e, f, g, h]));
-                    self.messages.push(Recorded {
+                    self.messages.push(BagMessage {
                         topic: Arc::clone(topic),
                         wire_type: Arc::clone(wire_type),
                         time: seconds * 1_000_000_000 + nanoseconds,
@@ -137,8 +136,8 @@ impl Reader {
     }
 }
 
-/// The range of what follows its length at `at`, which is moved behind it.
-fn block(file: &[u8], at: &mut usize, end: usize) -> Option<std::ops::Range<usize>> {
+/// Returns the range of the length-prefixed block at `at`, and advances `at` past it.
+fn take_block(file: &[u8], at: &mut usize, end: usize) -> Option<std::ops::Range<usize>> {
     let length: [u8; 4] = file.get(*at..at.checked_add(4)?)?.try_into().ok()?;
     let start = *at + 4;
     let stop = start.checked_add(u32::from_le_bytes(length) as usize)?;
@@ -149,12 +148,12 @@ fn block(file: &[u8], at: &mut usize, end: usize) -> Option<std::ops::Range<usiz
     Some(start..stop)
 }
 
-/// `name=value` pairs, each after its length.
-fn fields(header: &[u8]) -> Option<HashMap<&str, &[u8]>> {
+/// Parses length-prefixed `name=value` pairs.
+fn parse_fields(header: &[u8]) -> Option<HashMap<&str, &[u8]>> {
     let mut fields = HashMap::new();
     let mut at = 0;
     while at < header.len() {
-        let field = &header[block(header, &mut at, header.len())?];
+        let field = &header[take_block(header, &mut at, header.len())?];
         let equals = field.iter().position(|byte| *byte == b'=')?;
         fields.insert(
             std::str::from_utf8(&field[..equals]).ok()?,
@@ -164,12 +163,12 @@ fn fields(header: &[u8]) -> Option<HashMap<&str, &[u8]>> {
     Some(fields)
 }
 
-fn number(fields: &HashMap<&str, &[u8]>, name: &str) -> Option<u32> {
+fn number_field(fields: &HashMap<&str, &[u8]>, name: &str) -> Option<u32> {
     let bytes: [u8; 4] = (*fields.get(name)?).try_into().ok()?;
     Some(u32::from_le_bytes(bytes))
 }
 
-fn text(fields: &HashMap<&str, &[u8]>, name: &str) -> String {
+fn text_field(fields: &HashMap<&str, &[u8]>, name: &str) -> String {
     let bytes = fields.get(name).copied().unwrap_or_default();
     String::from_utf8_lossy(bytes).into_owned()
 }
@@ -272,7 +271,7 @@ mod tests {
                 assert!(messages.len() <= 2);
             }
         }
-        // Every byte changed, too: nothing may panic.
+        // Every byte changed as well: nothing may panic.
         for at in MAGIC.len()..whole.len() {
             let mut changed = whole.clone();
             changed[at] ^= 0xff;

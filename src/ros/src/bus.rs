@@ -1,7 +1,8 @@
-//! The seam behind which a ROS version hides: ROS 1 (Master, TCPROS) or ROS 2 (DDS).
+//! The interface that hides the ROS version from the rest of the code: ROS 1 (Master, TCPROS) or ROS 2 (DDS).
 //!
-//! Messages cross it serialized, reference-counted and never copied per subscriber. What only some ROS versions have is an
-//! extension ([`GlobalParameters`], [`NodeParameters`], [`Lending`], [`Hearing`]) that a bus offers, or not.
+//! Messages cross it serialized and reference-counted; they are never copied per subscriber. Features that only some
+//! ROS versions have are extension traits ([`GlobalParameters`], [`NodeParameters`], [`Lending`], [`PublisherReports`])
+//! that a bus may or may not offer.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -11,7 +12,7 @@ use async_trait::async_trait;
 use bytes::Bytes;
 use tokio::sync::watch;
 
-use crate::ring::{DropCount, Held};
+use crate::ring::{DropCount, RingItem};
 use crate::schema::ActionDef;
 
 mod actions;
@@ -25,32 +26,32 @@ mod qos;
 mod queue;
 mod types;
 
-pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, Outcome};
+pub use actions::{ActionClient, ActionHandler, ActionServer, GoalEnd, GoalEvents, GoalOutcome};
 pub use error::{BusError, CallFate};
-pub use graph::{ActionNodes, Graph, NodeEnds, NodeNames, ParameterUse, TopicNodes};
-pub use lending::{Lender, Lending, Lent, ServiceProvider};
-pub use matched::{Matched, Offer, Peer, PeerId, Refusal, reaches};
+pub use graph::{ActionNodes, Graph, NodeEntities, NodeNames, ParameterUse, TopicNodes};
+pub use lending::{Lender, Lending, LentService, ServiceProvider};
+pub use matched::{IncompatiblePeer, MatchedPeers, Offer, PeerId, TopicPeer, wait_for_connected};
 pub use node_parameters::{
     DoubleRange, IntegerRange, NodeParameters, ParameterDescription, ParameterEvent,
     ParameterEvents, ParameterKind, ParameterNames,
 };
-pub use parameters::{GlobalParameters, ParamChange, ParamChanges, ParamValue};
-pub(crate) use parameters::{ParamTeller, changes_within};
-pub use qos::{Durability, Liveliness, Qos, Reliability};
+pub use parameters::{GlobalParameters, ParamChange, ParamChangeReceiver, ParamValue};
+pub(crate) use parameters::{ParamChangeSender, param_change_channel};
+pub use qos::{QosDurability, QosLiveliness, QosProfile, QosReliability};
 pub use queue::{MessageReceiver, MessageSender, message_queue};
 pub use types::{Digest, ServiceType, WireFormat, WireType};
 
 /// The generations of ROS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum RosVersion {
-    /// Master, TCPROS, actionlib.
+    /// ROS 1: Master, TCPROS, actionlib.
     One,
-    /// DDS.
+    /// ROS 2: DDS.
     Two,
 }
 
 impl RosVersion {
-    /// 1 or 2.
+    /// Returns 1 or 2.
     pub fn number(self) -> u8 {
         match self {
             Self::One => 1,
@@ -61,106 +62,109 @@ impl RosVersion {
 
 /// One serialized message from one publisher.
 #[derive(Debug, Clone)]
-pub struct Message {
-    /// The message without any length prefix.
+pub struct SerializedMessage {
+    /// The serialized message, without a length prefix.
     pub bytes: Bytes,
-    /// What the publisher said it is.
+    /// Type declared by the publisher.
     pub wire_type: Arc<WireType>,
-    /// Who published it.
+    /// The publisher.
     pub publisher: PeerId,
-    /// Whether the publisher is transient-local: a newcomer must be given the last one per publisher.
+    /// True if the publisher is transient-local: a late subscriber must be given its last message.
     pub latching: bool,
 }
 
-impl Held for Message {
-    fn held(&self) -> usize {
+impl RingItem for SerializedMessage {
+    fn memory_size(&self) -> usize {
         self.bytes.len()
     }
 }
 
 /// A live subscription; dropping it unsubscribes.
 pub struct Subscription {
-    /// Messages in the order received per publisher. What this bus itself published is not among them.
+    /// Received messages, in order per publisher. Messages that this bus itself published are not included.
     pub messages: MessageReceiver,
     /// Messages dropped so far because `messages` was full.
     pub dropped: Arc<DropCount>,
-    /// The publishers, now and later.
-    pub matched: watch::Receiver<Matched>,
+    /// The matched publishers, updated as they change.
+    pub matched: watch::Receiver<MatchedPeers>,
     /// Keeps the subscription alive.
     pub guard: Box<dyn Send + Sync>,
 }
 
-/// A topic that this side publishes; dropping it unadvertises, after what is queued was sent.
+/// A topic that this bus publishes. Dropping it unadvertises the topic after the queued messages have been sent.
 pub trait Publisher: Send + Sync {
     /// Sends one serialized message (without length prefix) to every subscriber; never blocks.
     fn publish(&self, bytes: Bytes);
-    /// The subscribers, now and later.
-    fn matched(&self) -> watch::Receiver<Matched>;
-    /// Messages dropped so far because a subscriber of this topic was too slow, summed over subscribers.
-    fn dropped(&self) -> u64 {
+    /// Returns the matched subscribers, updated as they change.
+    fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers>;
+    /// Returns the number of messages dropped so far because a subscriber of this topic was too slow, summed over
+    /// subscribers.
+    fn dropped_count(&self) -> u64 {
         0
     }
 }
 
-/// Answers the calls to one service that this side serves.
+/// Answers the calls to one service that this bus serves.
 #[async_trait]
 pub trait ServiceHandler: Send + Sync + 'static {
-    /// Takes a serialized request, gives a serialized response or the reason why not.
+    /// Handles a serialized request; returns the serialized response or the reason for the failure.
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String>;
 
-    /// What answers a caller that expects the type with this digest, for a handler that serves several types (its own
-    /// is `*`); itself by default.
+    /// Returns the handler for a caller that expects the type with this digest, for handlers that serve several types
+    /// (whose own digest is `*`). `None`, the default, means this handler.
     fn for_type(&self, _digest: &Digest) -> Option<Arc<dyn ServiceHandler>> {
         None
     }
 }
 
-/// Knows whom publishers send to, as they say themselves. A publisher may answer a subscriber before it sends to it: what it
-/// publishes in between, the subscriber does not hear. ROS 1 offers it; where matching is mutual, none is needed.
+/// Reports to whom publishers say they send. A publisher may answer a subscriber before it starts sending to it:
+/// messages it publishes in between never reach the subscriber. Offered by ROS 1; not needed where matching is mutual.
 #[async_trait]
-pub trait Hearing: Send + Sync {
-    /// The connections over which a topic's publishers send to this side: each publisher with its own number of it. One
-    /// that has just been connected to is not among them for a moment.
-    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError>;
+pub trait PublisherReports: Send + Sync {
+    /// Returns the connections over which a topic's publishers send to this node, each as the publisher with its own
+    /// number for the connection. A connection that was just made may be missing for a moment.
+    async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError>;
 }
 
 impl dyn Bus {
-    /// A global parameter, or a whole namespace of them.
+    /// Returns the value of a global parameter or of a whole namespace.
     pub async fn parameter(&self, key: &str) -> Result<ParamValue, BusError> {
         self.parameters()?.get(key).await
     }
 }
 
-/// One servant's (or one robot's) ROS, reached from outside. Names are resolved, absolute ones (`/image`).
+/// One ROS system (a servant's or a robot's), accessed from outside. Names are resolved, that is absolute (`/image`).
 #[async_trait]
 pub trait Bus: Send + Sync + 'static {
-    /// Which ROS it is.
+    /// Returns the ROS version.
     fn version(&self) -> RosVersion;
-    /// The name of the distribution (`noetic`).
+    /// Returns the name of the distribution (`noetic`).
     async fn distribution(&self) -> String;
-    /// The name under which this side is a node; empty where it is none.
+    /// Returns the name under which this bus is a node; empty if it is none.
     fn node(&self) -> &str {
         ""
     }
-    /// Whose nodes' the ends of this side are told to be, where it stands for several (ROS 2); what is not named here is its own node's.
-    fn stands_for(&self, _nodes: BTreeMap<String, NodeNames>) {}
-    /// The graph now and as it changes.
+    /// Sets the nodes to which the endpoints of this bus are attributed, if it represents several (ROS 2). Endpoints
+    /// that are not listed belong to the bus's own node.
+    fn set_represented_nodes(&self, _nodes: BTreeMap<String, NodeNames>) {}
+    /// Returns the graph, updated as it changes.
     fn graph(&self) -> watch::Receiver<Arc<Graph>>;
-    /// Subscribes to messages of type `of` ([`WireType::any`] where it does not matter); publishers that come later are
-    /// connected as they register.
+    /// Subscribes to messages of type `of` ([`WireType::any`] for any type). Publishers that appear later are connected
+    /// as they register.
     async fn subscribe(
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError>;
-    /// Advertises. With [`Durability::TransientLocal`] newcomers are given the last message of this publisher. Each
-    /// advertisement keeps its own, so whoever relays several such publishers of one topic advertises once for each.
+    /// Advertises a topic. With [`QosDurability::TransientLocal`] late subscribers are given the last message of this
+    /// publisher. Each advertisement keeps its own last message, so a relay for several such publishers of one topic
+    /// advertises once for each.
     async fn advertise(
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError>;
     /// Calls a service once; the connection is kept for the next call.
     async fn call(
@@ -172,7 +176,8 @@ pub trait Bus: Send + Sync + 'static {
         self.call_typed(service, &Digest::any(), request, timeout)
             .await
     }
-    /// The same, unless the server's type has meanwhile another digest than the request was serialized by.
+    /// Like [`call`](Self::call), but fails if the server's type no longer has the digest that the request was
+    /// serialized with.
     async fn call_typed(
         &self,
         service: &str,
@@ -180,9 +185,10 @@ pub trait Bus: Send + Sync + 'static {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError>;
-    /// The type of a service, without calling it.
+    /// Returns the type of a service, without calling it.
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError>;
-    /// The type of a topic as its publishers have it, or, where there are none, its subscribers; without subscribing.
+    /// Returns the type of a topic as declared by its publishers or, without any, by its subscribers; does not
+    /// subscribe.
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError>;
     /// Serves a service until the returned guard is dropped.
     async fn serve(
@@ -191,44 +197,44 @@ pub trait Bus: Send + Sync + 'static {
         service_type: ServiceType,
         handler: Arc<dyn ServiceHandler>,
     ) -> Result<Box<dyn Send + Sync>, BusError>;
-    /// An action to send goals to; it is opened in the background.
+    /// Creates a client of an action; its topics or services are opened in the background.
     fn action_client(
         &self,
         action: &str,
         of: &Arc<ActionDef>,
     ) -> Result<Box<dyn ActionClient>, BusError>;
-    /// Serves an action until what is returned is dropped; it is opened in the background.
+    /// Serves an action until the returned value is dropped; it is opened in the background.
     fn serve_action(
         &self,
         action: &str,
         of: &Arc<ActionDef>,
         handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError>;
-    /// The parameters that all nodes share.
+    /// Returns the parameters that all nodes share.
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
         Err(BusError::NotOffered("global parameters"))
     }
-    /// The parameters that each node has of its own.
+    /// Returns access to the parameters of individual nodes.
     fn node_parameters(&self) -> Result<&dyn NodeParameters, BusError> {
         Err(BusError::NotOffered("parameters of nodes"))
     }
-    /// Services of other ROS systems.
+    /// Returns the interface for lending services of other ROS systems.
     fn lending(&self) -> Result<&dyn Lending, BusError> {
         Err(BusError::NotOffered("services of another system"))
     }
-    /// Whom publishers send to; none where [`Subscription::matched`] says all there is to know.
-    fn hearing(&self) -> Option<&dyn Hearing> {
+    /// Returns the publishers' reports; `None` where [`Subscription::matched`] is complete.
+    fn publisher_reports(&self) -> Option<&dyn PublisherReports> {
         None
     }
-    /// Becomes the reason when someone asked this node to end. The bus itself goes on: whether to obey is its owner's
-    /// decision. None where nobody can ask.
+    /// Returns the reason for shutdown, set once another node has asked this node to shut down. The bus keeps running:
+    /// its owner decides whether to comply. `None` where no node can ask.
     fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {
         None
     }
-    /// A process of this system is known to have ended: a bus that finds out by and by which nodes are gone looks at once. Nothing
-    /// to do where they are not found out about in this way.
-    fn process_ended(&self) {}
-    /// Takes back everything registered and closes all connections. What is still held (subscriptions,
-    /// publishers, guards) becomes inert.
+    /// Notifies the bus that a process of this system has exited. A bus that detects vanished nodes by polling polls at
+    /// once; otherwise there is nothing to do.
+    fn on_process_exit(&self) {}
+    /// Takes back everything registered and closes all connections. Subscriptions, publishers and guards that still
+    /// exist become inert.
     async fn close(&self) {}
 }

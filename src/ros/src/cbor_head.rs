@@ -1,6 +1,6 @@
 //! Heads of CBOR items (RFC 8949, section 3).
 
-/// Major types, in place.
+/// Major types, shifted into place.
 pub(crate) const UNSIGNED: u8 = 0 << 5;
 pub(crate) const NEGATIVE: u8 = 1 << 5;
 pub(crate) const BYTES: u8 = 2 << 5;
@@ -8,12 +8,12 @@ pub(crate) const TEXT: u8 = 3 << 5;
 pub(crate) const ARRAY: u8 = 4 << 5;
 pub(crate) const MAP: u8 = 5 << 5;
 pub(crate) const TAG: u8 = 6 << 5;
-/// Booleans, null, floats, and the end of what has no declared length.
+/// Booleans, null, floats, and the break that ends items of indefinite length.
 pub(crate) const SIMPLE: u8 = 7 << 5;
 
 /// Writes an item's head in its shortest form.
 #[inline]
-pub(crate) fn head(out: &mut Vec<u8>, major: u8, value: u64) {
+pub(crate) fn write_head(out: &mut Vec<u8>, major: u8, value: u64) {
     match value {
         0..=23 => out.push(major | value as u8),
         24..=0xff => out.extend_from_slice(&[major | 24, value as u8]),

@@ -1,21 +1,23 @@
-//! Serialized messages of either ROS ⇄ JSON and CBOR, in one pass from input bytes to output buffer.
+//! Conversion between serialized messages of either ROS version and JSON or CBOR, in one pass from input bytes to
+//! output buffer.
 //!
-//! Each [`MessageType`] carries a plan compiled when it was resolved: the literals between values are already
-//! written out, nested messages are flattened, arrays of numbers move as blocks. No tree of values is built.
+//! Each [`MessageType`] carries a plan compiled when it was resolved: the literals between values are already written
+//! out, nested messages are flattened, and arrays of numbers are copied as blocks. No tree of values is built.
 //!
 //! ```text
-//! ROS bytes ── Reader: ROS 1 │ CDR ── walk (plan) ──▶ Format: json_out │ cbor_out │ validate
-//! JSON, CBOR ─ Input: json_in │ cbor_in ──▶ fill (order, defaults, stamps) ── Layout: ROS 1 │ CDR ──▶ ROS bytes
+//! ROS bytes ── SerializedReader: ROS 1 │ CDR ── walk (plan) ──▶ OutputFormat: json_out │ cbor_out │ validate
+//! JSON, CBOR ─ ValueInput: json_in │ cbor_in ──▶ fill (order, defaults, stamps) ── OutputLayout: ROS 1 │ CDR
+//!                                                                              ──▶ ROS bytes
 //! ```
 //!
-//! Which bytes a message has is a matter of its type ([`MessageType::version`]); a message of ROS 2 begins with the
-//! header of its serialization, may be of either order of bytes, and is written little endian.
+//! The serialization follows from the type ([`MessageType::version`]): a message of ROS 2 begins with an encapsulation
+//! header, may have either byte order, and is written little endian.
 //!
-//! What the values look like is rosbridge's: bytes (`uint8[]`, `char[]`, ROS 2's `byte[]`) are base64 in JSON and a byte
-//! string in CBOR, times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (either is understood), other
-//! numeric arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
+//! Values follow rosbridge: bytes (`uint8[]`, `char[]`, ROS 2's `byte[]`) are base64 in JSON and a byte string in CBOR;
+//! times are `{"secs", "nsecs"}` in ROS 1 and `{"sec", "nanosec"}` in ROS 2 (both are accepted as input); other numeric
+//! arrays are lists in JSON and RFC 8746 typed arrays in CBOR.
 //!
-//! On an error the output buffer is left as it was.
+//! On an error the output buffer is left unchanged.
 
 mod cbor_in;
 mod cbor_item;
@@ -53,7 +55,7 @@ pub use json_text::json_value_len;
 pub use stamps::Stamps;
 pub use value::Value;
 
-/// Output beyond which a conversion is given up, unless options say otherwise: 256 MiB.
+/// Default limit of a conversion's output: 256 MiB.
 pub const DEFAULT_MAX_BYTES: usize = 256 << 20;
 
 /// A ROS time since the epoch (or since the start of simulated time).
@@ -61,12 +63,12 @@ pub const DEFAULT_MAX_BYTES: usize = 256 << 20;
 pub struct Time {
     /// Whole seconds.
     pub secs: u32,
-    /// Nanoseconds beyond, below 1e9.
+    /// Nanoseconds of the current second, below 1e9.
     pub nsecs: u32,
 }
 
 impl Time {
-    /// Wall-clock time as ROS counts it.
+    /// Returns the current wall-clock time.
     pub fn now() -> Time {
         Time::from(SystemTime::now())
     }
@@ -82,36 +84,36 @@ impl From<SystemTime> for Time {
     }
 }
 
-/// How NaN and infinities are written in JSON, which has no word for them.
+/// Representation of NaN and infinities in JSON, which has none of its own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum NonFinite {
-    /// `null`, as rosbridge does.
+    /// `null`, as in rosbridge.
     #[default]
     Null,
     /// `"NaN"`, `"Infinity"`, `"-Infinity"`.
     String,
-    /// `NaN`, `Infinity`, `-Infinity`: Python's way, refused by strict parsers.
+    /// `NaN`, `Infinity`, `-Infinity`: as in Python; refused by strict parsers.
     Bare,
 }
 
-/// What to do with a ROS string that is not UTF-8.
+/// Treatment of ROS strings that are not UTF-8.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum InvalidUtf8 {
-    /// U+FFFD in place of each bad sequence.
+    /// Replace each invalid sequence with U+FFFD.
     #[default]
     Replace,
-    /// An error that names the field.
+    /// Return an error that names the field.
     Refuse,
 }
 
-/// How to write JSON.
+/// Options for writing JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct JsonOptions {
-    /// NaN and infinities.
+    /// Representation of NaN and infinities.
     pub non_finite: NonFinite,
-    /// Strings that are not UTF-8.
+    /// Treatment of strings that are not UTF-8.
     pub invalid_utf8: InvalidUtf8,
-    /// Most bytes to write.
+    /// Maximum number of bytes to write.
     pub max_bytes: usize,
 }
 
@@ -125,14 +127,14 @@ impl Default for JsonOptions {
     }
 }
 
-/// How to write CBOR.
+/// Options for writing CBOR.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CborOptions {
-    /// Numeric arrays as RFC 8746 typed arrays, little endian; plain arrays otherwise.
+    /// Write numeric arrays as RFC 8746 typed arrays, little endian; otherwise as plain arrays.
     pub typed_arrays: bool,
-    /// Strings that are not UTF-8.
+    /// Treatment of strings that are not UTF-8.
     pub invalid_utf8: InvalidUtf8,
-    /// Most bytes to write.
+    /// Maximum number of bytes to write.
     pub max_bytes: usize,
 }
 
@@ -146,13 +148,13 @@ impl Default for CborOptions {
     }
 }
 
-/// How to complete what a client left out.
+/// Options for completing partial input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FillOptions {
-    /// The current time: for `"now"` in place of a time, and for a `std_msgs/Header` that is missing from its
-    /// message or has no stamp. Without it both are zero. (ROS 2 counts signed seconds: until 2038.)
+    /// Current time: used for `"now"` in place of a time, and for the stamp of a `std_msgs/Header` that is missing from
+    /// its message or has no stamp. Without it both are zero. (ROS 2 counts signed seconds: until 2038.)
     pub now: Option<Time>,
-    /// Most bytes to write.
+    /// Maximum number of bytes to write.
     pub max_bytes: usize,
 }
 
@@ -177,7 +179,7 @@ pub fn to_json(
     })
 }
 
-/// Appends the message that a JSON object describes, serialized. The whole of `json` must be that one object.
+/// Appends the serialized message that a JSON object describes. `json` must be exactly that object.
 pub fn from_json(
     message: &MessageType,
     json: &[u8],
@@ -201,7 +203,7 @@ pub fn to_cbor(
     })
 }
 
-/// Appends the message that a CBOR map describes, serialized. The whole of `cbor` must be that one map.
+/// Appends the serialized message that a CBOR map describes. `cbor` must be exactly that map.
 pub fn from_cbor(
     message: &MessageType,
     cbor: &[u8],
@@ -215,24 +217,25 @@ pub fn from_cbor(
 
 /// Checks that the bytes are exactly one message of this type.
 pub fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), CodecError> {
-    walk::validate(message, bytes).map_err(|fault| fault.of(message))
+    walk::validate(message, bytes).map_err(|fault| fault.into_codec_error(message))
 }
 
-/// The default message, serialized: zeros, empty strings and arrays, and what a ROS 2 definition says instead.
+/// Returns the default message, serialized: zeros, empty strings and arrays, or the default values of a ROS 2
+/// definition.
 pub fn default_message(message: &MessageType) -> Vec<u8> {
     let mut out = Vec::new();
     let unlimited = FillOptions {
         now: None,
         max_bytes: usize::MAX,
     };
-    // An object without fields is a valid message of any type, so there is nothing to go wrong.
+    // An object without fields is a valid message of any type, so this cannot fail.
     match from_json(message, b"{}", &mut out, &unlimited) {
         Ok(()) => out,
         Err(_) => Vec::new(),
     }
 }
 
-/// The default message as JSON.
+/// Returns the default message as JSON.
 pub fn default_json(message: &MessageType) -> String {
     let mut out = Vec::new();
     let unlimited = JsonOptions {
@@ -245,18 +248,19 @@ pub fn default_json(message: &MessageType) -> String {
     }
 }
 
-/// The stamp of a message whose first field is a `std_msgs/Header`.
+/// Returns the stamp of a message whose first field is a `std_msgs/Header`.
 pub fn header_stamp(message: &MessageType, bytes: &[u8]) -> Option<Time> {
     if !message.has_header() {
         return None;
     }
-    // In ROS 2 the second byte says which order the others are in.
+    // In ROS 2 the second byte gives the byte order of the rest.
     let big_endian = message.version() == RosVersion::Two && bytes.get(1) == Some(&0);
     let word = |at: usize| {
         let word = bytes.get(at..at + 4)?.try_into().ok()?;
-        Some(match big_endian {
-            true => u32::from_be_bytes(word),
-            false => u32::from_le_bytes(word),
+        Some(if big_endian {
+            u32::from_be_bytes(word)
+        } else {
+            u32::from_le_bytes(word)
         })
     };
     Some(Time {
@@ -273,6 +277,6 @@ fn undo_on_error(
     let before = out.len();
     convert(out).map_err(|fault| {
         out.truncate(before);
-        fault.of(message)
+        fault.into_codec_error(message)
     })
 }

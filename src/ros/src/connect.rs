@@ -1,4 +1,4 @@
-//! The one place where a bus is made.
+//! Creation of a bus for a ROS version.
 
 use std::sync::Arc;
 

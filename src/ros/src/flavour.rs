@@ -1,12 +1,12 @@
-//! Which ROS an image is built for, and what follows from it for the processes in it: environment, command line, initial
-//! parameters. What differs between versions of ROS has an arm here and a module in the version's folder.
+//! The ROS that an image is built for, and its consequences for the processes in the image: environment, command line,
+//! initial parameters. What differs between ROS versions has an arm here and a module in the version's folder.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
 use crate::bus::{ParamValue, RosVersion};
-pub use crate::identity::{Called, Identity, Naming};
+pub use crate::identity::{Naming, NodeIdentity, NodeRename};
 use crate::{ros1, ros2};
 
 /// The base that an image is built upon, and its ROS.
@@ -14,13 +14,13 @@ use crate::{ros1, ros2};
 pub struct Flavour {
     /// Name of the base definition: `bookworm-ros1`.
     pub base: String,
-    /// Which ROS its packages speak.
+    /// ROS version of its packages.
     pub ros: Version,
-    /// What `$ROS_DISTRO` stands for: `noetic`, `jazzy`.
+    /// Value of `$ROS_DISTRO`: `noetic`, `jazzy`.
     pub distribution: String,
 }
 
-/// Which ROS images are built for.
+/// The ROS version that an image is built for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Version {
@@ -31,8 +31,8 @@ pub enum Version {
 }
 
 impl Version {
-    /// What its nodes speak.
-    pub fn bus(self) -> RosVersion {
+    /// Returns the ROS version that the nodes speak.
+    pub fn ros_version(self) -> RosVersion {
         match self {
             Version::Ros1 => RosVersion::One,
             Version::Ros2 => RosVersion::Two,
@@ -40,7 +40,7 @@ impl Version {
     }
 }
 
-/// What every image was before flavours were recorded.
+/// The flavour of images built before flavours were recorded.
 impl Default for Flavour {
     fn default() -> Self {
         Self {
@@ -52,7 +52,8 @@ impl Default for Flavour {
 }
 
 impl Flavour {
-    /// Environment of every process of a servant, over the image's own. `home`: where nodes run and keep what they write.
+    /// Returns the environment of every process of a servant, which overrides the image's own. `home`: working
+    /// directory of the nodes, where they also write their files.
     pub fn environment(&self, home: &str) -> BTreeMap<String, String> {
         match self.ros {
             Version::Ros1 => ros1::process::environment(home),
@@ -60,7 +61,7 @@ impl Flavour {
         }
     }
 
-    /// Where nodes run that are not told where, in this environment; empty where it does not say.
+    /// Returns the default working directory of nodes in this environment; empty if it is not set.
     pub fn home<'a>(&self, environment: &'a BTreeMap<String, String>) -> &'a str {
         let variable = match self.ros {
             Version::Ros1 => ros1::process::HOME,
@@ -69,78 +70,86 @@ impl Flavour {
         environment.get(variable).map_or("", String::as_str)
     }
 
-    /// What makes a program the node of this absolute name.
-    pub fn identity(&self, node: &str) -> Identity {
+    /// Returns the arguments and environment that make a program the node of this absolute name.
+    pub fn identity(&self, node: &str) -> NodeIdentity {
         match self.ros {
             Version::Ros1 => ros1::process::identity(node),
             Version::Ros2 => ros2::process::identity(node),
         }
     }
 
-    /// What makes a program a robot's node of this absolute name. In ROS 2 it may be several nodes, and `says` how much of the name they are told:
-    /// what is told is told to all.
-    pub fn of_a_robot(&self, node: &str, says: Naming) -> Identity {
+    /// Returns the arguments and environment that make a program a robot's node of this absolute name. In ROS 2 the
+    /// program may run several nodes; `says` selects the parts of the name to set, which then apply to all of them.
+    pub fn robot_identity(&self, node: &str, says: Naming) -> NodeIdentity {
         match self.ros {
             Version::Ros1 => ros1::process::identity(node),
-            Version::Ros2 => ros2::process::of_a_robot(node, says),
+            Version::Ros2 => ros2::process::robot_identity(node, says),
         }
     }
 
-    /// What of its nodes' names a command line says to all of them, whatever their programs call them.
-    pub fn says_to_all(&self, argv: &[String]) -> Naming {
+    /// Returns the parts of the node name that a command line sets for all nodes of the program.
+    pub fn global_naming(&self, argv: &[String]) -> Naming {
         match self.ros {
             Version::Ros1 => Naming::default(),
-            Version::Ros2 => ros2::arguments::says_to_all(argv),
+            Version::Ros2 => ros2::arguments::global_naming(argv),
         }
     }
 
-    /// What calls a program's nodes by absolute names. In ROS 1 a program is one node, the first; in ROS 2 it may be several, and one that is
-    /// called so already is told nothing.
-    pub fn renamed(&self, nodes: &[Called]) -> Identity {
+    /// Returns the arguments and environment that give a program's nodes their absolute names. In ROS 1 a program is
+    /// one node, the first; in ROS 2 it may be several, and nodes that already have the right name get no argument.
+    pub fn rename_identity(&self, nodes: &[NodeRename]) -> NodeIdentity {
         match self.ros {
             Version::Ros1 => nodes
                 .first()
                 .map(|called| ros1::process::identity(&called.node))
                 .unwrap_or_default(),
-            Version::Ros2 => ros2::process::renamed(nodes),
+            Version::Ros2 => ros2::process::rename_identity(nodes),
         }
     }
 
-    /// Puts an identity's arguments on a command line, so that they count: of several rules for a name the last one does in ROS 1, the first one in
-    /// ROS 2.
-    pub fn put(&self, arguments: Vec<String>, argv: &mut Vec<String>) {
+    /// Inserts an identity's arguments into a command line so that they take effect: of several rules for a name the
+    /// last one applies in ROS 1, the first one in ROS 2.
+    pub fn insert_arguments(&self, arguments: Vec<String>, argv: &mut Vec<String>) {
         let at = match self.ros {
             Version::Ros1 => argv.len(),
-            Version::Ros2 => ros2::process::first_rule(argv),
+            Version::Ros2 => ros2::process::first_rule_position(argv),
         };
         argv.splice(at..at, arguments);
     }
 
-    /// What marks the nodes of a program, so that its own are known in the graph, whatever their names: a namespace in ROS 1, where programs have none
-    /// of their own; an enclave in ROS 2, where one would hide theirs. At the end of a command line it counts. `mark`: an absolute name.
-    pub fn marked(&self, mark: &str) -> Identity {
+    /// Returns what marks the nodes of a program so that they are found in the graph under any name: a namespace in ROS
+    /// 1, where programs set none of their own; an enclave in ROS 2, where a namespace would hide theirs. It takes
+    /// effect at the end of a command line. `mark`: an absolute name.
+    pub fn marker_identity(&self, mark: &str) -> NodeIdentity {
         match self.ros {
             Version::Ros1 => ros1::process::namespace(mark),
-            Version::Ros2 => ros2::process::in_enclave(mark),
+            Version::Ros2 => ros2::process::enclave_identity(mark),
         }
     }
 
-    /// Whether a program may give its nodes a namespace, which this command line does not say.
-    pub fn may_choose_namespace(&self, argv: &[String]) -> bool {
-        self.ros == Version::Ros2 && !ros2::arguments::gives_namespace(argv)
+    /// Returns true if the program may choose the namespace of its nodes because the command line does not set it.
+    pub fn can_choose_namespace(&self, argv: &[String]) -> bool {
+        self.ros == Version::Ros2 && !ros2::arguments::sets_namespace(argv)
     }
 
-    /// Arguments that give the node of this absolute name its parameters, where nodes hold their own (ROS 2); more of them may
-    /// follow, and the last one of a name counts. `all`: absolute names.
-    pub fn arguments(&self, node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<String> {
+    /// Returns the arguments that set the parameters of the node of this absolute name, where parameters belong to
+    /// nodes (ROS 2). Later arguments may override them: the last one for a name applies. `all`: absolute names.
+    pub fn parameter_arguments(
+        &self,
+        node: &str,
+        all: &BTreeMap<String, ParamValue>,
+    ) -> Vec<String> {
         match self.ros {
             Version::Ros1 => Vec::new(),
-            Version::Ros2 => ros2::process::parameters(node, all),
+            Version::Ros2 => ros2::process::parameter_arguments(node, all),
         }
     }
 
-    /// Parameters set before the first node starts: those of the deployer, and those that ROS itself sets.
-    pub fn parameters(&self, given: &BTreeMap<String, ParamValue>) -> BTreeMap<String, ParamValue> {
+    /// Returns the parameters set before the first node starts: the deployer's and those that ROS itself sets.
+    pub fn initial_parameters(
+        &self,
+        given: &BTreeMap<String, ParamValue>,
+    ) -> BTreeMap<String, ParamValue> {
         let mut parameters = match self.ros {
             Version::Ros1 => ros1::process::parameters(&self.distribution),
             Version::Ros2 => BTreeMap::new(),
@@ -167,7 +176,7 @@ mod tests {
             ),
         ] {
             let flavour: Flavour = serde_json::from_str(written).expect("a flavour");
-            assert_eq!((&*flavour.base, flavour.ros.bus()), ("lab", ros));
+            assert_eq!((&*flavour.base, flavour.ros.ros_version()), ("lab", ros));
             assert_eq!(serde_json::to_string(&flavour).expect("JSON"), written);
         }
     }
@@ -176,18 +185,18 @@ mod tests {
     fn parameters_are_given_to_the_master_or_to_each_node() {
         let given = BTreeMap::from([("/see/rate".to_owned(), ParamValue::Int(10))]);
         let one = Flavour::default();
-        let all = one.parameters(&given);
+        let all = one.initial_parameters(&given);
         assert_eq!(all["/see/rate"], ParamValue::Int(10));
         assert_eq!(all["/rosdistro"], ParamValue::String("noetic\n".to_owned()));
-        assert!(one.arguments("/see", &all).is_empty());
+        assert!(one.parameter_arguments("/see", &all).is_empty());
         let two = Flavour {
             ros: Version::Ros2,
             ..Flavour::default()
         };
-        let all = two.parameters(&given);
+        let all = two.initial_parameters(&given);
         assert_eq!(all, given);
         assert_eq!(
-            two.arguments("/see", &all),
+            two.parameter_arguments("/see", &all),
             ["--ros-args", "-p", "rate:=10", "--"]
         );
     }

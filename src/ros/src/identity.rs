@@ -1,26 +1,27 @@
-//! Which node a program is, as its version of ROS is told.
+//! Identity of a program's node in the terms of its ROS version.
 
 use std::collections::BTreeMap;
 
-/// What tells a program which node it is, or in which namespace.
+/// Arguments and environment that set a program's node name or namespace.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Identity {
-    /// To be added to its command line: at its end, or where [`crate::flavour::Flavour::put`] puts them.
+pub struct NodeIdentity {
+    /// Arguments to add to the command line: at its end, or where [`crate::flavour::Flavour::insert_arguments`] puts
+    /// them.
     pub arguments: Vec<String>,
-    /// To be added to its environment.
+    /// Variables to add to the environment.
     pub environment: BTreeMap<String, String>,
 }
 
-/// Which parts of a node's name its program is told.
+/// The parts of a node's name that are set on its command line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Naming {
-    /// Its name, without namespace.
+    /// The name, without namespace.
     pub name: bool,
-    /// Its namespace.
+    /// The namespace.
     pub namespace: bool,
 }
 
-/// All of it.
+/// Sets both parts.
 impl Default for Naming {
     fn default() -> Self {
         Self {
@@ -30,11 +31,11 @@ impl Default for Naming {
     }
 }
 
-/// What a node of a program is called.
+/// The name of a program's node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Called {
-    /// What its program calls it, with a namespace that the program gives it; none where that is another name each time.
+pub struct NodeRename {
+    /// Name used by the program, including a namespace set by the program; `None` if it differs at each start.
     pub own: Option<String>,
-    /// Its absolute name.
+    /// Absolute name to give it.
     pub node: String,
 }

@@ -1,8 +1,8 @@
-//! What ROS speaks, with nothing of containers in it: schemas of messages, codecs between serialized
-//! messages and JSON or CBOR, and the buses that carry them.
+//! The ROS side of Cloudroid, without anything about containers: message schemas, codecs between serialized messages
+//! and JSON or CBOR, and the buses that carry them.
 //!
-//! In: definitions (`.msg`, `.srv`, `.action` texts) and sockets from a [`net::Sockets`].
-//! Out: a [`bus::Bus`] on which serialized messages are published, received and answered.
+//! In: definitions (`.msg`, `.srv`, `.action` texts) and sockets from a [`net::Sockets`]. Out: a [`bus::Bus`] on which
+//! serialized messages are published, received and answered.
 
 pub mod bag;
 pub mod bus;
@@ -26,5 +26,5 @@ pub mod turns;
 
 pub use connect::connect;
 pub use join::JoinOptions;
-pub use network::{DiscoveryServer, Interface, Interfaces, Network};
+pub use network::{DiscoveryNetwork, DiscoveryServer, InterfaceAddress, InterfaceSelection};
 pub use succession::{ParticipantPrefix, Succession};

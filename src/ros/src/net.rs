@@ -1,5 +1,5 @@
-//! Where sockets come from. A servant has a network namespace of its own with nothing but `lo`; the host
-//! side reaches its nodes by making sockets *inside* that namespace and using them outside.
+//! Sources of sockets. A servant has a network namespace of its own with nothing but `lo`; the host side reaches its
+//! nodes by creating sockets *inside* that namespace and using them outside.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -13,73 +13,73 @@ use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use crate::network::Interface;
+use crate::network::InterfaceAddress;
 
-pub use rtps::interfaces;
+pub use rtps::list_interfaces;
 
-/// A place in which TCP sockets can be opened: a servant's network namespace, or the host's own.
+/// A network namespace in which sockets can be opened: a servant's, or the host's own.
 #[async_trait]
 pub trait Sockets: Send + Sync + 'static {
     /// Connects to `address` as seen from inside. `TCP_NODELAY` is set.
     async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream>;
     /// Listens on `address` as seen from inside; port 0 picks a free one.
     async fn listen(&self, address: SocketAddr) -> io::Result<TcpListener>;
-    /// Finds the address of a host name as seen from inside. Unless said otherwise the place has nothing but
-    /// `lo`: every name there means loopback, and no resolver of the host is ever asked.
+    /// Resolves a host name as seen from inside. By default the namespace has nothing but `lo`: every name means
+    /// loopback, and no resolver of the host is ever asked.
     async fn resolve(&self, host: &str, port: u16) -> io::Result<SocketAddr> {
-        let ip = literal(host).unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
+        let ip = parse_literal(host).unwrap_or(IpAddr::V4(Ipv4Addr::LOCALHOST));
         Ok(SocketAddr::new(ip, port))
     }
-    /// A UDP socket bound to `address` as seen from inside; port 0 picks a free one. With `shared` others may be bound to it,
-    /// too, for multicast.
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+    /// Binds a UDP socket to `address` as seen from inside; port 0 picks a free one. With `shared` other sockets may be
+    /// bound to the address as well, for multicast.
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         let _ = shared;
         let what = format!("no datagrams can be received at {address} here");
         Err(io::Error::new(io::ErrorKind::Unsupported, what))
     }
-    /// The interfaces that are up there, with their IPv4 addresses. Unless said otherwise the place has nothing but `lo`.
-    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
-        Ok(vec![Interface::LOOPBACK])
+    /// Returns the interfaces that are up, with their IPv4 addresses. By default there is nothing but `lo`.
+    async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
+        Ok(vec![InterfaceAddress::LOOPBACK])
     }
-    /// A socket by which the kernel tells of the sockets of this place (`NETLINK_SOCK_DIAG`, sock_diag(7)); none where it
-    /// cannot be had.
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+    /// Opens a socket on which the kernel reports the sockets of this namespace (`NETLINK_SOCK_DIAG`, sock_diag(7));
+    /// `None` if that is not available.
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
         Ok(None)
     }
 }
 
-/// For datagrams that have come and were not read yet: pictures come faster than they are read.
+/// Receive buffer for UDP datagrams in bytes: images may arrive faster than they are read.
 const DATAGRAMS: usize = 8 << 20;
-/// Of netlink(7) and sock_diag(7).
+/// Constants of netlink(7) and sock_diag(7).
 const AF_NETLINK: i32 = 16;
 const NETLINK_SOCK_DIAG: i32 = 4;
 
-/// A peer that has said nothing for so long is asked whether it is there.
+/// Idle time after which the kernel probes whether a peer is still there.
 const ASK: Duration = Duration::from_secs(20);
-/// The pause until it is asked again while it does not answer.
+/// Interval between unanswered probes.
 const ASK_AGAIN: Duration = Duration::from_secs(10);
-/// After so long without an answer it is gone. That is also how long it may leave what was sent to it untaken:
-/// a peer that does not read for so long loses its connection.
+/// Time without an answer after which a peer counts as gone. It is also the time for which sent data may stay
+/// unacknowledged: a peer that does not read for this long loses its connection.
 const GONE: Duration = Duration::from_secs(60);
 
-/// Has the kernel end the connection when the peer is gone without a word: its machine has lost power or its network.
-/// Otherwise whoever only reads would wait for ever, and whoever writes for a quarter of an hour.
+/// Makes the kernel end the connection when the peer vanishes silently because its machine lost power or its network.
+/// Otherwise a side that only reads would wait forever, and one that writes for a quarter of an hour.
 ///
-/// Of a peer that is there and idle nothing is asked: its kernel answers for it, even while its process is stopped.
-pub fn watch(stream: &TcpStream) {
+/// An idle but live peer is not affected: its kernel answers the probes, even while its process is stopped.
+pub fn enable_keepalive(stream: &TcpStream) {
     let socket = SockRef::from(stream);
     let asking = TcpKeepalive::new().with_time(ASK).with_interval(ASK_AGAIN);
     let asked = socket
         .set_tcp_keepalive(&asking)
         .and_then(|()| socket.set_tcp_user_timeout(Some(GONE)));
     if let Err(error) = asked {
-        tracing::debug!(%error, "a peer that goes without a word will not be noticed");
+        tracing::debug!(%error, "a peer that disappears silently will not be noticed");
     }
 }
 
-/// Accepts connections and has each served by a task of its own, until dropped, which also ends every connection. At most
-/// `most` are served at a time; further ones wait in the backlog. `what` names the protocol in the log.
-pub(crate) async fn serve_each<F, E>(
+/// Accepts connections and serves each in its own task until dropped, which also ends every connection. At most `most`
+/// connections are served at a time; further ones wait in the backlog. `what` names the protocol in the log.
+pub(crate) async fn serve_connections<F, E>(
     listener: TcpListener,
     most: usize,
     what: &'static str,
@@ -99,7 +99,7 @@ pub(crate) async fn serve_each<F, E>(
                 accepted = listener.accept() => match accepted {
                     Ok((stream, _)) => break stream,
                     Err(error) => {
-                        // Out of file descriptors, mostly: serving must go on once there are some again.
+                        // Mostly out of file descriptors: serving must continue once some are free again.
                         tracing::warn!(%error, "cannot accept a connection of {what}");
                         tokio::time::sleep(Duration::from_millis(100)).await;
                     }
@@ -108,7 +108,7 @@ pub(crate) async fn serve_each<F, E>(
             }
         };
         let _ = stream.set_nodelay(true);
-        watch(&stream);
+        enable_keepalive(&stream);
         let served = serve(stream);
         connections.spawn(async move {
             let _place = place;
@@ -119,8 +119,8 @@ pub(crate) async fn serve_each<F, E>(
     }
 }
 
-/// The address that `host` already is, without asking anybody.
-fn literal(host: &str) -> Option<IpAddr> {
+/// Parses `host` as an IP address literal or `localhost`, without any lookup.
+fn parse_literal(host: &str) -> Option<IpAddr> {
     let bare = host
         .strip_prefix('[')
         .and_then(|rest| rest.strip_suffix(']'))
@@ -147,34 +147,34 @@ impl Sockets for HostSockets {
         TcpListener::bind(address).await
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         let socket = Socket::new(
             Domain::for_address(address),
             Type::DGRAM.nonblocking(),
             None,
         )?;
-        // As much as the machine allows to everybody.
+        // The kernel caps this at the machine's limit.
         socket.set_recv_buffer_size(DATAGRAMS)?;
         socket.set_reuse_address(shared)?;
         socket.bind(&address.into())?;
         UdpSocket::from_std(socket.into())
     }
 
-    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
-        rtps::interfaces()
+    async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
+        rtps::list_interfaces()
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
         let (domain, kind) = (Domain::from(AF_NETLINK), Type::RAW.nonblocking().cloexec());
         let socket = Socket::new(domain, kind, Some(Protocol::from(NETLINK_SOCK_DIAG)))?;
         Ok(Some(socket.into()))
     }
 
     async fn resolve(&self, host: &str, port: u16) -> io::Result<SocketAddr> {
-        if let Some(ip) = literal(host) {
+        if let Some(ip) = parse_literal(host) {
             return Ok(SocketAddr::new(ip, port));
         }
-        // ROS 1 nodes listen on IPv4 unless told otherwise.
+        // ROS 1 nodes listen on IPv4 by default.
         let mut found: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
         found.sort_by_key(|address| !address.is_ipv4());
         found.into_iter().next().ok_or_else(|| {
@@ -186,7 +186,7 @@ impl Sockets for HostSockets {
     }
 }
 
-/// The network namespace of this process where that has nothing but `lo`: every host name means loopback.
+/// The network namespace of this process if it has nothing but `lo`: every host name means loopback.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LoopbackSockets;
 
@@ -200,12 +200,12 @@ impl Sockets for LoopbackSockets {
         HostSockets.listen(address).await
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        HostSockets.datagrams(address, shared).await
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        HostSockets.bind_udp(address, shared).await
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        HostSockets.diagnostics().await
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
+        HostSockets.open_sock_diag().await
     }
 }
 
@@ -216,14 +216,14 @@ mod tests {
     #[tokio::test]
     async fn the_host_has_datagrams_and_tells_of_its_sockets() {
         let loopback = || SocketAddr::from(([127, 0, 0, 1], 0));
-        let one = HostSockets.datagrams(loopback(), false).await.unwrap();
-        let two = HostSockets.datagrams(loopback(), false).await.unwrap();
+        let one = HostSockets.bind_udp(loopback(), false).await.unwrap();
+        let two = HostSockets.bind_udp(loopback(), false).await.unwrap();
         let address = two.local_addr().unwrap();
         one.send_to(b"hello", address).await.unwrap();
         let mut text = [0; 8];
         assert_eq!(two.recv(&mut text).await.unwrap(), 5);
-        assert!(HostSockets.datagrams(address, false).await.is_err());
-        assert!(HostSockets.diagnostics().await.unwrap().is_some());
+        assert!(HostSockets.bind_udp(address, false).await.is_err());
+        assert!(HostSockets.open_sock_diag().await.unwrap().is_some());
     }
 
     #[tokio::test]
@@ -236,7 +236,7 @@ mod tests {
             .connect(listener.local_addr().unwrap())
             .await
             .unwrap();
-        watch(&stream);
+        enable_keepalive(&stream);
         let socket = SockRef::from(&stream);
         assert!(socket.keepalive().unwrap());
         assert_eq!(socket.tcp_keepalive_time().unwrap(), ASK);

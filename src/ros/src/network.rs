@@ -1,30 +1,31 @@
-//! Where nodes of ROS 2 look for each other.
+//! Discovery settings of ROS 2 nodes.
 
 use std::net::SocketAddr;
 
-pub use rtps::{DiscoveryServer, Interface, Interfaces};
+pub use rtps::{DiscoveryServer, InterfaceAddress, InterfaceSelection};
 
-/// Where a node looks for others, and is found by them (ROS 2). By default it is in a servant's network, which has nothing but `lo`.
+/// Where a node discovers others and is discovered by them (ROS 2). The default is a servant's network, which has
+/// nothing but `lo`.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Network {
-    /// In which networks it takes part.
-    pub interfaces: Interfaces,
-    /// Whether others are looked for by multicast; those of this machine are found without it.
+pub struct DiscoveryNetwork {
+    /// Interfaces on which it takes part.
+    pub interfaces: InterfaceSelection,
+    /// True to discover others by multicast; nodes on the same machine are found without it.
     pub multicast: bool,
-    /// Whether it looks for nobody and is found by nobody.
+    /// True to discover no other node and to stay hidden from all.
     pub alone: bool,
-    /// Others that are told of it beside: their ports for discovery, or all those of a host's nodes where the port is 0.
+    /// Additional peers to announce the node to: their discovery ports, or all nodes of a host if the port is 0.
     pub peers: Vec<SocketAddr>,
-    /// Servers of discovery of Fast DDS: where there are some, others are looked for by them alone.
+    /// Fast DDS discovery servers; if there are any, nodes are discovered through them only.
     pub servers: Vec<DiscoveryServer>,
-    /// Whether it has ports that others try without having been told of them.
+    /// True to use the well-known ports, which others try without having been told of them.
     pub well_known: bool,
 }
 
-impl Default for Network {
+impl Default for DiscoveryNetwork {
     fn default() -> Self {
         Self {
-            interfaces: Interfaces::default(),
+            interfaces: InterfaceSelection::default(),
             multicast: true,
             alone: false,
             peers: Vec::new(),

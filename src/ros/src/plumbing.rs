@@ -1,10 +1,11 @@
-//! What ROS itself gives to every node, and no robot asks for: it is no part of a package's interface.
+//! ROS's built-in topics, services and parameters, which every node has and no robot asks for: they are not part of a
+//! package's interface.
 
 use crate::bus::{Graph, RosVersion};
 use crate::ros1::own_parameters;
 use crate::ros2::lifecycle::LifecycleNode;
 
-/// Services below each node of ROS 2: its parameters, its types, its loggers.
+/// Services of every ROS 2 node, below its name: parameters, types, loggers.
 const OF_NODES: [&str; 9] = [
     "get_parameters",
     "set_parameters",
@@ -17,7 +18,7 @@ const OF_NODES: [&str; 9] = [
     "set_logger_levels",
 ];
 
-/// Services by which a node's lifecycle is driven and asked for.
+/// Services that control and query a node's lifecycle.
 const OF_LIFECYCLES: [&str; 5] = [
     "change_state",
     "get_state",
@@ -26,9 +27,9 @@ const OF_LIFECYCLES: [&str; 5] = [
     "get_transition_graph",
 ];
 
-/// Whether a topic is ROS's own: logs, statistics, simulated time, the life lines of nodelets, changes of parameters and of
-/// lifecycles.
-pub fn topic(graph: &Graph, name: &str) -> bool {
+/// Returns true for a built-in topic: logs, statistics, simulated time, heartbeats of nodelets (bond), changes of
+/// parameters and of lifecycles.
+pub fn is_builtin_topic(graph: &Graph, name: &str) -> bool {
     let everybodys = matches!(
         name,
         "/rosout" | "/rosout_agg" | "/statistics" | "/clock" | "/parameter_events"
@@ -36,12 +37,12 @@ pub fn topic(graph: &Graph, name: &str) -> bool {
     let of_type = graph.topics.get(name).map(|topic| topic.type_name.as_str());
     let of_lifecycle = name
         .strip_suffix("/transition_event")
-        .is_some_and(|node| LifecycleNode::is_one(graph, node));
+        .is_some_and(|node| LifecycleNode::has_lifecycle(graph, node));
     everybodys || of_lifecycle || matches!(of_type, Some("bond/Status" | "bond/msg/Status"))
 }
 
-/// Whether a service is ROS's own.
-pub fn service(version: RosVersion, graph: &Graph, name: &str) -> bool {
+/// Returns true for a built-in service.
+pub fn is_builtin_service(version: RosVersion, graph: &Graph, name: &str) -> bool {
     let Some((above, last)) = name.rsplit_once('/') else {
         return false;
     };
@@ -49,15 +50,16 @@ pub fn service(version: RosVersion, graph: &Graph, name: &str) -> bool {
         RosVersion::One => matches!(last, "get_loggers" | "set_logger_level"),
         RosVersion::Two => {
             let own = graph.services.get(name).is_some_and(|node| node == above);
-            let of_lifecycle = OF_LIFECYCLES.contains(&last) && LifecycleNode::is_one(graph, above);
+            let of_lifecycle =
+                OF_LIFECYCLES.contains(&last) && LifecycleNode::has_lifecycle(graph, above);
             own && (OF_NODES.contains(&last) || of_lifecycle)
         }
     }
 }
 
-/// Whether a parameter is ROS's own: of ROS 1 by its absolute name, of ROS 2 by the name that its node has for it.
-pub fn parameter(name: &str) -> bool {
-    own_parameters::every_node_asks_for(name)
+/// Returns true for a built-in parameter. `name` is absolute in ROS 1 and relative to the node in ROS 2.
+pub fn is_builtin_parameter(name: &str) -> bool {
+    own_parameters::is_read_by_every_node(name)
         || matches!(name, "use_sim_time" | "start_type_description_service")
         || name.starts_with("qos_overrides.")
 }
@@ -88,7 +90,7 @@ mod tests {
             ("/see/list_parameters", "/other"),
             ("/add", "/see"),
         ]);
-        let two = |name: &str| service(RosVersion::Two, &graph, name);
+        let two = |name: &str| is_builtin_service(RosVersion::Two, &graph, name);
         for own in [
             "/see/get_parameters",
             "/drive/change_state",
@@ -96,13 +98,13 @@ mod tests {
         ] {
             assert!(two(own), "{own}");
         }
-        // Of a node without a lifecycle, of somebody else, of the package.
+        // A node without a lifecycle, a service of another node, a service of the package.
         for packages in ["/lamp/get_state", "/see/list_parameters", "/add"] {
             assert!(!two(packages), "{packages}");
         }
-        assert!(topic(&graph, "/drive/transition_event"));
-        assert!(!topic(&graph, "/see/transition_event"));
-        assert!(topic(&graph, "/parameter_events"));
+        assert!(is_builtin_topic(&graph, "/drive/transition_event"));
+        assert!(!is_builtin_topic(&graph, "/see/transition_event"));
+        assert!(is_builtin_topic(&graph, "/parameter_events"));
     }
 
     #[test]
@@ -111,14 +113,14 @@ mod tests {
             ("/adder/set_parameters", "/adder"),
             ("/adder/get_loggers", "/adder"),
         ]);
-        let one = |name: &str| service(RosVersion::One, &graph, name);
+        let one = |name: &str| is_builtin_service(RosVersion::One, &graph, name);
         assert!(one("/adder/get_loggers") && !one("/adder/set_parameters"));
         let bond = TopicNodes {
             type_name: "bond/Status".to_owned(),
             ..TopicNodes::default()
         };
         graph.topics.insert("/bond".to_owned(), bond);
-        assert!(topic(&graph, "/bond") && !topic(&graph, "/image"));
+        assert!(is_builtin_topic(&graph, "/bond") && !is_builtin_topic(&graph, "/image"));
     }
 
     #[test]
@@ -128,8 +130,8 @@ mod tests {
             "qos_overrides./parameter_events.publisher.depth",
             "/use_sim_time",
         ] {
-            assert!(parameter(own), "{own}");
+            assert!(is_builtin_parameter(own), "{own}");
         }
-        assert!(!parameter("rate") && !parameter("/see/rate"));
+        assert!(!is_builtin_parameter("rate") && !is_builtin_parameter("/see/rate"));
     }
 }

@@ -1,10 +1,10 @@
-//! Which names a node's command line gives to what its program calls otherwise, in either ROS.
+//! Name remapping by a node's command line, for ROS 1 and ROS 2.
 
 use crate::bus::RosVersion;
-use crate::ros2::arguments::{self, Kind, Renamed};
+use crate::ros2::arguments::{self, Kind, RemapTarget};
 use crate::{ros1, ros2};
 
-/// The remaps of one node: absolute names as its program has them, and those that are registered.
+/// The remappings of one node, from absolute names used by its program to the registered names.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Remaps(Vec<Remap>);
 
@@ -15,9 +15,9 @@ struct Remap {
 }
 
 impl Remaps {
-    /// Reads the remaps of topics from the command line of the node of this absolute name. What no ROS would take
-    /// counts for none.
-    pub fn of(ros: RosVersion, argv: &[String], node: &str) -> Self {
+    /// Parses the remappings of topics from the command line of the node of this absolute name. Arguments that no ROS
+    /// accepts are ignored.
+    pub fn parse(ros: RosVersion, argv: &[String], node: &str) -> Self {
         match ros {
             RosVersion::One => {
                 let given = argv.iter().filter(|word| !word.starts_with('_'));
@@ -25,7 +25,7 @@ impl Remaps {
                     from: ros1::names::resolve(from, node),
                     to: ros1::names::resolve(to, node),
                 };
-                // Of several for one name the last one counts.
+                // If there are several for one name, the last one applies.
                 let given = given
                     .filter_map(|word| word.split_once(":="))
                     .map(remap)
@@ -38,8 +38,8 @@ impl Remaps {
                 let remap = |kind: Kind| match kind {
                     Kind::Rule(rule)
                         if rule.of.is_name()
-                            && rule.of != Renamed::Service
-                            && rule.concerns(own) =>
+                            && rule.of != RemapTarget::Service
+                            && rule.applies_to(own) =>
                     {
                         Some(Remap {
                             from: ros2::names::resolve(&rule.from, node),
@@ -53,13 +53,13 @@ impl Remaps {
         }
     }
 
-    /// The name that is registered for what the program calls `name`.
+    /// Returns the registered name for the program's `name`.
     pub fn apply<'a>(&'a self, name: &'a str) -> &'a str {
         let remap = self.0.iter().find(|remap| remap.from == name);
         remap.map_or(name, |remap| &remap.to)
     }
 
-    /// What the program calls the registered `name`.
+    /// Returns the program's name for the registered `name`.
     pub fn undo<'a>(&'a self, name: &'a str) -> &'a str {
         let remap = self.0.iter().find(|remap| remap.to == name);
         remap.map_or(name, |remap| &remap.from)
@@ -70,9 +70,9 @@ impl Remaps {
 mod tests {
     use super::*;
 
-    fn of(ros: RosVersion, line: &str) -> Remaps {
+    fn parse_remaps(ros: RosVersion, line: &str) -> Remaps {
         let argv: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
-        Remaps::of(ros, &argv, "/front/finder")
+        Remaps::parse(ros, &argv, "/front/finder")
     }
 
     #[test]
@@ -82,7 +82,7 @@ mod tests {
         let two = "3 --ros-args -r image:=/camera/image -r image:=/left -r ~/out:=boxes -p rate:=2 -r __node:=finder \
                    -r other:mask:=/m -r finder:/abs:=other";
         for (ros, line) in [(RosVersion::One, one), (RosVersion::Two, two)] {
-            let remaps = of(ros, line);
+            let remaps = parse_remaps(ros, line);
             for (name, registered) in [
                 ("/front/image", "/camera/image"),
                 ("/front/finder/out", "/front/boxes"),
@@ -95,7 +95,7 @@ mod tests {
             }
         }
         assert_eq!(
-            of(RosVersion::Two, "--ros-args --nonsense"),
+            parse_remaps(RosVersion::Two, "--ros-args --nonsense"),
             Remaps::default()
         );
     }

@@ -1,8 +1,8 @@
-//! A queue of messages that holds at most so many messages and bytes: what is new takes the place of what is oldest.
+//! A queue of messages bounded in messages and bytes: new messages displace the oldest.
 //!
-//! It has no lock, no waiter and no counter of its own. Whatever drops messages gives back a [`Lost`], and whoever holds the
-//! ring adds that to the one counter that its topic is reported by. Where some messages may not go before others, the owner
-//! adds with [`Ring::append`] and says which to drop ([`Ring::trim`]).
+//! It has no lock, waiter or counter of its own. Operations that drop messages return a [`DropTally`], which the owner
+//! of the ring adds to the counter reported for its topic. Where some messages must be kept in preference to others,
+//! the owner adds with [`Ring::append`] and selects what to drop with [`Ring::trim`].
 
 use std::collections::VecDeque;
 use std::ops::AddAssign;
@@ -10,30 +10,30 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 
-/// What a ring holds. Its size may not change while it is held.
-pub trait Held {
-    /// Bytes of memory that it takes while it waits.
-    fn held(&self) -> usize;
+/// An item of a ring. Its size must not change while it is queued.
+pub trait RingItem {
+    /// Returns the bytes of memory that the item uses while it is queued.
+    fn memory_size(&self) -> usize;
 }
 
-impl Held for Bytes {
-    fn held(&self) -> usize {
+impl RingItem for Bytes {
+    fn memory_size(&self) -> usize {
         self.len()
     }
 }
 
-/// How much a ring holds. One message always fits, however large.
+/// Capacity of a ring. One message always fits, whatever its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Bounds {
-    /// Messages; 0 counts as 1.
+pub struct RingBounds {
+    /// Maximum number of messages; 0 counts as 1.
     pub messages: usize,
-    /// Bytes of all messages together.
+    /// Maximum size of all messages together, in bytes.
     pub bytes: usize,
 }
 
-impl Bounds {
-    /// For the queue of a subscriber or publisher: so many messages, and 64 MiB.
-    pub fn messages(messages: usize) -> Self {
+impl RingBounds {
+    /// Creates bounds for the queue of a subscriber or publisher: the given number of messages, and 64 MiB.
+    pub fn with_messages(messages: usize) -> Self {
         Self {
             messages,
             bytes: 64 << 20,
@@ -41,62 +41,62 @@ impl Bounds {
     }
 }
 
-/// Messages that were dropped.
+/// Count of dropped messages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[must_use = "whoever drops messages counts them"]
-pub struct Lost {
-    /// The number of messages.
+pub struct DropTally {
+    /// Number of messages.
     pub messages: u64,
-    /// Their bytes.
+    /// Their size in bytes.
     pub bytes: u64,
 }
 
-impl Lost {
-    /// One message.
-    pub fn one(message: &impl Held) -> Self {
+impl DropTally {
+    /// Creates the tally of a single message.
+    pub fn from_message(message: &impl RingItem) -> Self {
         Self {
             messages: 1,
-            bytes: message.held() as u64,
+            bytes: message.memory_size() as u64,
         }
     }
 }
 
-impl AddAssign for Lost {
+impl AddAssign for DropTally {
     fn add_assign(&mut self, more: Self) {
         self.messages += more.messages;
         self.bytes += more.bytes;
     }
 }
 
-/// Messages dropped so far; outlives the queues that it counts for.
+/// Counter of dropped messages; it outlives the queues that it counts for.
 #[derive(Debug, Default)]
 pub struct DropCount(AtomicU64);
 
 impl DropCount {
-    /// Adds what was lost.
-    pub fn add(&self, lost: Lost) {
+    /// Adds dropped messages.
+    pub fn add(&self, lost: DropTally) {
         if lost.messages > 0 {
             self.0.fetch_add(lost.messages, Ordering::Relaxed);
         }
     }
 
-    /// How many messages it is by now.
+    /// Returns the number of dropped messages so far.
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// Messages in the order in which they came.
+/// Messages in the order in which they were added.
 #[derive(Debug)]
 pub struct Ring<T> {
-    bounds: Bounds,
+    bounds: RingBounds,
     waiting: VecDeque<T>,
     bytes: usize,
 }
 
-impl<T: Held> Ring<T> {
-    /// An empty ring.
-    pub fn new(bounds: Bounds) -> Self {
+impl<T: RingItem> Ring<T> {
+    /// Creates an empty ring.
+    pub fn new(bounds: RingBounds) -> Self {
         Self {
             bounds,
             waiting: VecDeque::new(),
@@ -104,107 +104,107 @@ impl<T: Held> Ring<T> {
         }
     }
 
-    /// An empty ring of which only its owner drops something.
-    pub fn unbounded() -> Self {
-        Self::new(Bounds {
+    /// Creates an empty ring that drops messages only at its owner's request.
+    pub fn new_unbounded() -> Self {
+        Self::new(RingBounds {
             messages: usize::MAX,
             bytes: usize::MAX,
         })
     }
 
-    /// Adds a message at the end; the oldest are dropped for it.
-    pub fn push(&mut self, message: T) -> Lost {
+    /// Adds a message at the end; drops the oldest ones if there is no room.
+    pub fn push(&mut self, message: T) -> DropTally {
         self.append(message);
         let bounds = self.bounds;
         self.trim(|ring| ring.exceeds(bounds).then_some(0))
     }
 
-    /// Adds a message at the end, beyond all bounds.
+    /// Adds a message at the end, ignoring the bounds.
     pub fn append(&mut self, message: T) {
         self.insert(self.waiting.len(), message);
     }
 
-    /// Adds a message before all others, beyond all bounds: one that was taken and could not be sent.
+    /// Adds a message before all others, ignoring the bounds: one that was taken and could not be sent.
     pub fn put_back(&mut self, message: T) {
         self.insert(0, message);
     }
 
-    /// Adds a message before the one at this place, beyond all bounds.
+    /// Inserts a message at index `at`, ignoring the bounds.
     ///
     /// # Panics
-    /// If there are fewer messages.
+    /// If `at` is greater than the number of messages.
     pub fn insert(&mut self, at: usize, message: T) {
-        self.bytes += message.held();
+        self.bytes += message.memory_size();
         self.waiting.insert(at, message);
     }
 
-    /// Drops messages, one by one, as long as `victim` names the place of one.
-    pub fn trim(&mut self, victim: impl Fn(&Self) -> Option<usize>) -> Lost {
-        let mut lost = Lost::default();
+    /// Drops messages one by one for as long as `victim` returns an index.
+    pub fn trim(&mut self, victim: impl Fn(&Self) -> Option<usize>) -> DropTally {
+        let mut lost = DropTally::default();
         while let Some(gone) = victim(self).and_then(|at| self.remove(at)) {
-            lost += Lost::one(&gone);
+            lost += DropTally::from_message(&gone);
         }
         lost
     }
 
-    /// Whether more than these bounds is held.
-    pub fn exceeds(&self, bounds: Bounds) -> bool {
+    /// Returns true if the ring holds more than these bounds allow.
+    pub fn exceeds(&self, bounds: RingBounds) -> bool {
         let count = self.waiting.len();
         count > bounds.messages.max(1) || (count > 1 && self.bytes > bounds.bytes)
     }
 
-    /// Takes the oldest message.
+    /// Removes and returns the oldest message.
     pub fn pop(&mut self) -> Option<T> {
         let oldest = self.waiting.pop_front()?;
-        self.bytes -= oldest.held();
+        self.bytes -= oldest.memory_size();
         Some(oldest)
     }
 
-    /// Takes the message at this place.
+    /// Removes and returns the message at index `at`.
     pub fn remove(&mut self, at: usize) -> Option<T> {
         let taken = self.waiting.remove(at)?;
-        self.bytes -= taken.held();
+        self.bytes -= taken.memory_size();
         Some(taken)
     }
 
-    /// Forgets all messages.
+    /// Removes all messages.
     pub fn clear(&mut self) {
         self.bytes = 0;
         self.waiting.clear();
     }
 
-    /// The messages, oldest first.
+    /// Iterates over the messages, oldest first.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &T> + DoubleEndedIterator + Clone {
         self.waiting.iter()
     }
 
-    /// The oldest message.
+    /// Returns the oldest message.
     pub fn front(&self) -> Option<&T> {
         self.waiting.front()
     }
 
-    /// The newest message.
+    /// Returns the newest message.
     pub fn back(&self) -> Option<&T> {
         self.waiting.back()
     }
 
-    /// How many messages wait.
+    /// Returns the number of messages.
     pub fn len(&self) -> usize {
         self.waiting.len()
     }
 
-    /// Whether none waits.
+    /// Returns true if there are no messages.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }
 
-    /// Bytes of all messages that wait.
+    /// Returns the size of all messages in bytes.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 }
 
-impl<T: Held> Iterator for Ring<T> {
+impl<T: RingItem> Iterator for Ring<T> {
     type Item = T;
 
     fn next(&mut self) -> Option<T> {
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn the_newest_stay() {
-        let mut ring = Ring::new(Bounds::messages(2));
+        let mut ring = Ring::new(RingBounds::with_messages(2));
         let count = DropCount::default();
         for n in 0..5 {
             count.add(ring.push(message(n, 10)));
@@ -235,12 +235,12 @@ mod tests {
 
     #[test]
     fn one_message_always_fits() {
-        let bounds = Bounds {
+        let bounds = RingBounds {
             messages: 0,
             bytes: 10,
         };
         let mut ring = Ring::new(bounds);
-        assert_eq!(ring.push(message(1, 100)), Lost::default());
+        assert_eq!(ring.push(message(1, 100)), DropTally::default());
         let lost = ring.push(message(2, 1));
         assert_eq!((lost.messages, lost.bytes), (1, 100));
         assert_eq!(ring.pop(), Some(message(2, 1)));
@@ -250,29 +250,30 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// Whatever is pushed and taken: nothing is lost uncounted, the order stays, and the bounds hold.
+        /// For any sequence of pushes and removals: no message is lost uncounted, the order is kept and the bounds
+        /// hold.
         #[test]
         fn every_message_is_taken_or_counted(
             messages in 0usize..5,
             bytes in 0usize..60,
             steps in prop::collection::vec((0usize..40, 0..4), 0..200),
         ) {
-            let bounds = Bounds { messages, bytes };
+            let bounds = RingBounds { messages, bytes };
             let mut ring = Ring::new(bounds);
-            let mut added = Lost::default();
-            let mut gone = Lost::default();
+            let mut added = DropTally::default();
+            let mut gone = DropTally::default();
             for (size, step) in steps {
                 let new = message(0, size);
                 let taken = match step {
                     0 => ring.pop(),
                     1 => ring.remove(size % 5),
                     _ => {
-                        added += Lost::one(&new);
+                        added += DropTally::from_message(&new);
                         None
                     }
                 };
                 if let Some(taken) = taken {
-                    gone += Lost::one(&taken);
+                    gone += DropTally::from_message(&taken);
                 }
                 match step {
                     2 => ring.insert(size.min(ring.len()), new),

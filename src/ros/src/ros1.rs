@@ -1,4 +1,4 @@
-//! ROS 1: XML-RPC, Master, TCPROS and the bus made of them.
+//! ROS 1: XML-RPC, the Master, TCPROS, and the bus built on them.
 
 pub mod actions;
 mod bus;

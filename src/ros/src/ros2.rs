@@ -1,4 +1,4 @@
-//! ROS 2: the bus over DDS, by the crate `rtps`.
+//! ROS 2: the bus over DDS, which is provided by the crate `rtps`.
 
 pub mod actions;
 pub mod arguments;
@@ -36,4 +36,4 @@ mod type_hash;
 mod watcher;
 
 pub use bus::Ros2Bus;
-pub(crate) use quality::joined;
+pub(crate) use quality::merge_qos;

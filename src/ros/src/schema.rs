@@ -1,11 +1,11 @@
-//! Definitions of messages, services and actions: `.msg`, `.srv` and `.action` texts in, [`MessageType`]s with
-//! resolved fields, digest and a compiled codec plan out.
+//! Definitions of messages, services and actions: reads `.msg`, `.srv` and `.action` texts and produces
+//! [`MessageType`]s with resolved fields, digest and a compiled codec plan.
 //!
-//! A [`Registry`] is of one version of ROS. ROS 1's grammar, MD5 and full text are those of genmsg
+//! A [`Registry`] belongs to one ROS version. ROS 1's grammar, MD5 and full text are those of genmsg
 //! (<http://wiki.ros.org/msg>), ROS 2's grammar and type hash those of rosidl (REP 2016): both ends of a connection
-//! compare the digest, so it must agree to the bit. What differs is one module each: the grammar (`parse` and
-//! `parse::ros2`), the messages that services and actions bring (`action` and `derived`), the digest (`resolve` and
-//! `description`). Names are `package/Type` in ROS 1 and `package/msg/Type` in ROS 2; either is understood.
+//! compare the digest, so it must agree to the bit. Each difference is confined to one module: the grammar (`parse` and
+//! `parse::ros2`), the messages generated from services and actions (`action` and `derived`), the digest (`resolve` and
+//! `description`). Names are `package/Type` in ROS 1 and `package/msg/Type` in ROS 2; both forms are accepted.
 
 mod action;
 mod derived;
@@ -27,17 +27,17 @@ pub use interface_files::InterfaceFile;
 pub use limits::{MAX_DEPTH, MAX_FIELDS, MAX_MESSAGE_BYTES, MAX_TEXT_BYTES};
 pub use registry::Registry;
 pub use types::{
-    ActionDef, ActionServices, Arity, Base, Bounds, Constant, Field, MessageType, Primitive,
+    ActionDef, ActionServices, Arity, Base, Constant, Field, FieldBounds, MessageType, Primitive,
     ServiceDef,
 };
 
-/// Why a definition cannot be used.
+/// Errors of definitions.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SchemaError {
-    /// Not of the form `package/Type`.
+    /// A name is not of the form `package/Type`.
     #[error("{0:?} is not a type name, write package/Type")]
     BadName(String),
-    /// Nobody has given this definition.
+    /// The definition is unknown.
     #[error("no definition of {0} is known, install the package that has it or supply its text")]
     Unknown(String),
     /// A dependency is missing.
@@ -45,43 +45,43 @@ pub enum SchemaError {
         "{needed_by} needs {name}, of which no definition is known; install the package that has it or supply its text"
     )]
     Missing {
-        /// What is missing.
+        /// Name of the missing definition.
         name: String,
-        /// Which definition mentions it.
+        /// Name of the definition that refers to it.
         needed_by: String,
     },
     /// A message contains itself.
     #[error("{0} contains itself")]
     Cycle(
-        /// The way round, `a/A > a/B > a/A`.
+        /// The cycle, as `a/A > a/B > a/A`.
         String,
     ),
-    /// A line that is not in the language.
+    /// A line has a syntax error.
     #[error("{name} line {line}: {reason}")]
     Syntax {
-        /// Which definition.
+        /// Name of the definition.
         name: String,
-        /// From 1.
+        /// Line number, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The problem.
         reason: String,
     },
-    /// A service without its `---` line, an action without its two.
+    /// A service lacks its `---` line, or an action lacks one of its two.
     #[error("{name} has {found} --- lines instead of {expected}")]
     Sections {
-        /// Which definition.
+        /// Name of the definition.
         name: String,
-        /// How many there must be.
+        /// Required number of lines.
         expected: usize,
-        /// The number found.
+        /// Number of lines found.
         found: usize,
     },
-    /// Larger than any honest definition.
+    /// The definition exceeds a limit.
     #[error("{name} is too large: {reason}")]
     TooLarge {
-        /// Which definition.
+        /// Name of the definition.
         name: String,
-        /// Which limit it breaks.
+        /// The limit exceeded.
         reason: String,
     },
 }

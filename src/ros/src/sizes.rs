@@ -1,4 +1,4 @@
-//! How large the messages of inputs are, as they pass: bytes, and width and height where their types say them.
+//! Sizes of messages at a servant's inputs: bytes, and width and height where the type has them.
 
 mod extent;
 
@@ -11,29 +11,29 @@ use parking_lot::Mutex;
 use crate::schema::MessageType;
 pub use extent::Extent;
 
-/// Inputs of which the sizes are kept; clients name topics as they like.
+/// Maximum number of inputs tracked, because clients choose topic names.
 const MOST: usize = 64;
-/// Of each power of two, so many classes of sizes.
+/// Number of size classes per power of two.
 const PARTS: usize = 4;
 
-/// What was seen of one input.
+/// Size statistics of one input.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Seen {
-    /// Messages.
+pub struct SizeSummary {
+    /// Number of messages.
     pub count: u64,
-    /// Bytes of the largest.
+    /// Size of the largest message in bytes.
     pub largest: u64,
-    /// Half of them have at most so many bytes, a quarter more at most.
+    /// Approximate median size in bytes, rounded up by less than a quarter.
     pub typical: u64,
-    /// The greatest width, in pixels, cells or points; none where the type has none.
+    /// Greatest width in pixels, cells or points; `None` if the type has no width.
     pub width: Option<u64>,
-    /// The greatest height.
+    /// Greatest height; `None` if the type has no height.
     pub height: Option<u64>,
 }
 
-/// What is counted of one input. Never locks.
+/// Size counters of one input; lock-free.
 #[derive(Debug)]
-pub struct Sizes {
+pub struct SizeCounters {
     extent: Option<Extent>,
     largest: AtomicU64,
     width: AtomicU64,
@@ -41,11 +41,11 @@ pub struct Sizes {
     classes: [AtomicU64; 64 * PARTS],
 }
 
-impl Sizes {
-    /// Of messages of this type.
-    pub fn of(message: Option<&MessageType>) -> Sizes {
-        Sizes {
-            extent: message.and_then(Extent::of),
+impl SizeCounters {
+    /// Creates counters for messages of this type.
+    pub fn for_type(message: Option<&MessageType>) -> SizeCounters {
+        SizeCounters {
+            extent: message.and_then(Extent::for_type),
             largest: AtomicU64::new(0),
             width: AtomicU64::new(0),
             height: AtomicU64::new(0),
@@ -53,20 +53,20 @@ impl Sizes {
         }
     }
 
-    /// A message has passed.
-    pub fn note(&self, message: &[u8]) {
+    /// Records a message.
+    pub fn record(&self, message: &[u8]) {
         let bytes = message.len() as u64;
-        self.classes[class(bytes)].fetch_add(1, Ordering::Relaxed);
-        raise(&self.largest, bytes);
+        self.classes[size_class(bytes)].fetch_add(1, Ordering::Relaxed);
+        raise_maximum(&self.largest, bytes);
         let extent = self.extent.as_ref().and_then(|extent| extent.find(message));
         if let Some((width, height)) = extent {
-            raise(&self.width, width);
-            raise(&self.height, height);
+            raise_maximum(&self.width, width);
+            raise_maximum(&self.height, height);
         }
     }
 
-    /// What was seen so far.
-    pub fn seen(&self) -> Seen {
+    /// Returns the statistics so far.
+    pub fn summary(&self) -> SizeSummary {
         let counts = self.classes.each_ref();
         let counts = counts.map(|count| count.load(Ordering::Relaxed));
         let count: u64 = counts.iter().sum();
@@ -76,9 +76,9 @@ impl Sizes {
             passed += more;
             passed >= count.div_ceil(2)
         });
-        let typical = half.map_or(0, bound).min(largest);
+        let typical = half.map_or(0, class_limit).min(largest);
         let side = |side: &AtomicU64| Some(side.load(Ordering::Relaxed)).filter(|side| *side > 0);
-        Seen {
+        SizeSummary {
             count,
             largest,
             typical,
@@ -88,36 +88,36 @@ impl Sizes {
     }
 }
 
-/// Most messages are no larger than one before; looking costs less than writing.
-fn raise(most: &AtomicU64, to: u64) {
+/// Raises a maximum. Most messages are no larger than an earlier one, and a load costs less than a store.
+fn raise_maximum(most: &AtomicU64, to: u64) {
     if most.load(Ordering::Relaxed) < to {
         most.fetch_max(to, Ordering::Relaxed);
     }
 }
 
-/// Sizes of one class differ by less than a quarter.
-fn class(bytes: u64) -> usize {
+/// Returns the size class; sizes within a class differ by less than a quarter.
+fn size_class(bytes: u64) -> usize {
     let bytes = bytes.max(PARTS as u64);
     let power = bytes.ilog2() as usize;
     power * PARTS + (bytes >> (power - 2)) as usize % PARTS
 }
 
-/// The largest size of a class.
-fn bound(class: usize) -> u64 {
+/// Returns the largest size in a class.
+fn class_limit(class: usize) -> u64 {
     let (power, part) = (class / PARTS, (class % PARTS) as u128);
     let next = ((PARTS as u128 + part + 1) << power) / PARTS as u128;
     u64::try_from(next - 1).unwrap_or(u64::MAX)
 }
 
-/// The inputs of one servant, by topic or service.
+/// The size counters of one servant's inputs, by topic or service.
 #[derive(Debug, Default)]
-pub struct Inputs {
-    by_name: Mutex<BTreeMap<String, (String, Arc<Sizes>)>>,
+pub struct InputSizes {
+    by_name: Mutex<BTreeMap<String, (String, Arc<SizeCounters>)>>,
 }
 
-impl Inputs {
-    /// Where the sizes of this input's messages are noted. Of more inputs than are kept it is not looked at.
-    pub fn of(&self, name: &str, message: Option<&MessageType>) -> Arc<Sizes> {
+impl InputSizes {
+    /// Returns the counters for an input. Beyond the maximum number of inputs, the counters are returned but not kept.
+    pub fn for_input(&self, name: &str, message: Option<&MessageType>) -> Arc<SizeCounters> {
         let digest = message.map_or("", MessageType::md5);
         let mut by_name = self.by_name.lock();
         if let Some((known, sizes)) = by_name.get(name) {
@@ -125,7 +125,7 @@ impl Inputs {
                 return Arc::clone(sizes);
             }
         }
-        let sizes = Arc::new(Sizes::of(message));
+        let sizes = Arc::new(SizeCounters::for_type(message));
         if by_name.len() < MOST || by_name.contains_key(name) {
             let entry = (digest.to_owned(), Arc::clone(&sizes));
             by_name.insert(name.to_owned(), entry);
@@ -133,11 +133,11 @@ impl Inputs {
         sizes
     }
 
-    /// What was seen of each.
-    pub fn seen(&self) -> Vec<(String, Seen)> {
+    /// Returns the statistics of all inputs.
+    pub fn summaries(&self) -> Vec<(String, SizeSummary)> {
         let by_name = self.by_name.lock();
         let seen = by_name.iter();
-        seen.map(|(name, (_, sizes))| (name.clone(), sizes.seen()))
+        seen.map(|(name, (_, sizes))| (name.clone(), sizes.summary()))
             .collect()
     }
 }
@@ -159,8 +159,8 @@ mod tests {
             )
             .expect("valid");
         let grid = registry.message("a/Grid").expect("known");
-        let inputs = Inputs::default();
-        let sizes = inputs.of("/map", Some(&grid));
+        let inputs = InputSizes::default();
+        let sizes = inputs.for_input("/map", Some(&grid));
         let message = |width: i32, height: u16, data: usize| {
             let mut bytes = vec![7];
             bytes.extend(width.to_le_bytes());
@@ -170,19 +170,19 @@ mod tests {
             bytes
         };
         for (width, height) in [(30, 20), (10, 50), (-1, 9000)] {
-            sizes.note(&message(width, height, 89));
+            sizes.record(&message(width, height, 89));
         }
-        sizes.note(&message(1, 1, 9989));
-        inputs.of("/text", None).note(b"1234");
-        let seen = inputs.seen();
-        let map = Seen {
+        sizes.record(&message(1, 1, 9989));
+        inputs.for_input("/text", None).record(b"1234");
+        let seen = inputs.summaries();
+        let map = SizeSummary {
             count: 4,
             largest: 10_000,
             typical: 111,
             width: Some(30),
             height: Some(50),
         };
-        let text = Seen {
+        let text = SizeSummary {
             count: 1,
             largest: 4,
             typical: 4,
@@ -190,34 +190,36 @@ mod tests {
             height: None,
         };
         assert_eq!(seen, [("/map".to_owned(), map), ("/text".to_owned(), text)]);
-        assert!(Arc::ptr_eq(&inputs.of("/map", Some(&grid)), &sizes));
-        // Of another type nothing is known yet.
-        let other = inputs.of("/map", None);
-        assert_eq!(other.seen(), Seen::default());
+        assert!(Arc::ptr_eq(&inputs.for_input("/map", Some(&grid)), &sizes));
+        // A new type starts with empty statistics.
+        let other = inputs.for_input("/map", None);
+        assert_eq!(other.summary(), SizeSummary::default());
     }
 
     #[test]
     fn clients_cannot_make_it_grow() {
-        let inputs = Inputs::default();
+        let inputs = InputSizes::default();
         for number in 0..2 * MOST {
-            inputs.of(&format!("/topic{number}"), None).note(b"");
+            inputs
+                .for_input(&format!("/topic{number}"), None)
+                .record(b"");
         }
-        assert_eq!(inputs.seen().len(), MOST);
-        let late = inputs.of("/topic0", None);
-        late.note(b"");
-        assert_eq!(inputs.seen()[0].1.count, 2, "those there are go on");
+        assert_eq!(inputs.summaries().len(), MOST);
+        let late = inputs.for_input("/topic0", None);
+        late.record(b"");
+        assert_eq!(inputs.summaries()[0].1.count, 2, "those there are go on");
     }
 
     proptest! {
         #[test]
         fn half_of_all_are_as_typical_says(mut sizes in prop::collection::vec(0usize..100_000, 1..60)) {
-            let seen = Sizes::of(None);
+            let seen = SizeCounters::for_type(None);
             for size in &sizes {
-                seen.note(&vec![0; *size]);
+                seen.record(&vec![0; *size]);
             }
             sizes.sort_unstable();
             let (median, largest) = (sizes[(sizes.len() - 1) / 2] as u64, sizes[sizes.len() - 1] as u64);
-            let Seen { typical, largest: told, count, .. } = seen.seen();
+            let SizeSummary { typical, largest: told, count, .. } = seen.summary();
             prop_assert_eq!((told, count), (largest, sizes.len() as u64));
             prop_assert!(typical >= median && typical <= largest);
             prop_assert!(typical <= median + median / 4 + 4, "{} {}", typical, median);
@@ -225,8 +227,8 @@ mod tests {
 
         #[test]
         fn classes_follow_each_other(bytes in 4u64..u64::MAX / 2) {
-            let of = class(bytes);
-            prop_assert!(bound(of) >= bytes && (of == 2 * PARTS || bound(of - 1) < bytes));
+            let of = size_class(bytes);
+            prop_assert!(class_limit(of) >= bytes && (of == 2 * PARTS || class_limit(of - 1) < bytes));
         }
     }
 }

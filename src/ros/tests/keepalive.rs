@@ -1,5 +1,5 @@
-//! A peer that has gone without a word is noticed on every connection: the kernel asks after it. In a process of its
-//! own, of whose connections none may be without.
+//! Detection of silently vanished peers on every connection by kernel keepalive. The test runs in its own process,
+//! because it checks all connections of the process.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -9,13 +9,13 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, ParamValue, Qos, ServiceHandler, ServiceType, WireType};
+use ros::bus::{Bus, ParamValue, QosProfile, ServiceHandler, ServiceType, WireType};
 use ros::net::{HostSockets, Sockets};
 use ros::ros1::Ros1Bus;
 use ros::ros1::master::{Master, MasterOptions};
 use tokio::time::timeout;
 
-/// Only bounds how long a failing test takes.
+/// Time limit of a failing test only.
 const LONG: Duration = Duration::from_secs(60);
 
 struct Echo;
@@ -27,7 +27,7 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// Inodes of this process's sockets.
+/// Returns the inodes of this process's sockets.
 fn own_sockets() -> BTreeSet<u64> {
     let inode = |link: &Path| {
         let name = link.to_str()?.strip_prefix("socket:[")?;
@@ -38,8 +38,8 @@ fn own_sockets() -> BTreeSet<u64> {
         .collect()
 }
 
-/// This process's established connections: local and remote port as the kernel writes them, and whether a timer of
-/// theirs asks after the peer (proc(5), net/tcp: state 01, timer 02).
+/// Returns this process's established connections: local and remote port as formatted by the kernel, and whether a
+/// keepalive timer is running (proc(5), net/tcp: state 01, timer 02).
 fn connections() -> Vec<(String, bool)> {
     let own = own_sockets();
     let table = std::fs::read_to_string("/proc/self/net/tcp").unwrap();
@@ -65,12 +65,16 @@ async fn every_connection_notices_when_its_peer_is_gone() {
     let (one, two) = (join("/one").await.unwrap(), join("/two").await.unwrap());
     let wire_type = WireType::new("std_msgs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "");
     let publisher = one
-        .advertise("/said", wire_type.clone(), Qos::keep_last(1).latching(true))
+        .advertise(
+            "/said",
+            wire_type.clone(),
+            QosProfile::keep_last(1).latching(true),
+        )
         .await
         .unwrap();
     publisher.publish(Bytes::new());
     let mut subscription = two
-        .subscribe("/said", wire_type, Qos::keep_last(1))
+        .subscribe("/said", wire_type, QosProfile::keep_last(1))
         .await
         .unwrap();
     let heard = timeout(LONG, subscription.messages.recv()).await;
@@ -84,7 +88,7 @@ async fn every_connection_notices_when_its_peer_is_gone() {
         .set("/p", ParamValue::Int(1))
         .await
         .unwrap();
-    // A connection on which something is under way has another timer until that is acknowledged.
+    // A connection with unacknowledged data has another timer until that is acknowledged.
     let quiet = async {
         loop {
             let all = connections();
@@ -94,7 +98,7 @@ async fn every_connection_notices_when_its_peer_is_gone() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     };
-    // The topic, the service and the Master, both ends of each, and what is kept of XML-RPC.
+    // The topic, the service and the Master, both ends of each, and the kept XML-RPC connections.
     if timeout(LONG, quiet).await.is_err() {
         panic!("some are not asked after: {:?}", connections());
     }

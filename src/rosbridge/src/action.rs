@@ -13,28 +13,28 @@ const ACTION: &str = "an action name";
 const TYPE: &str = "an action type such as \"actionlib_tutorials/Fibonacci\"";
 const GOAL_ID: &str = "the id that the goal was sent with";
 
-/// How a goal ended: the numbers of `action_msgs/GoalStatus`, which the protocol prescribes for ROS 1 too.
+/// Status of a goal: the numbers of `action_msgs/GoalStatus`, which the protocol prescribes for ROS 1 too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum GoalStatus {
-    /// Nobody knows.
+    /// The status is not known.
     Unknown = 0,
-    /// Taken, not begun.
+    /// Accepted, but not started yet.
     Accepted = 1,
-    /// Being done.
+    /// In progress.
     Executing = 2,
-    /// Being given up.
+    /// Being cancelled.
     Canceling = 3,
-    /// Done.
+    /// Completed successfully.
     Succeeded = 4,
-    /// Given up because the client asked.
+    /// Cancelled at the client's request.
     Canceled = 5,
-    /// Given up because the server could not.
+    /// Given up by the server.
     Aborted = 6,
 }
 
 impl GoalStatus {
-    /// From the number on the wire.
+    /// Converts from the number on the wire.
     pub fn from_number(number: i64) -> Option<Self> {
         Some(match number {
             0 => GoalStatus::Unknown,
@@ -49,22 +49,22 @@ impl GoalStatus {
     }
 }
 
-/// "Reach this goal": from the client to an action server, or from the server to a client that is one.
+/// Sends a goal: from the client to an action server, or from the server to a client that is one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SendActionGoal<'a> {
-    /// Names the goal in feedback, result and cancel.
+    /// Id of the goal in feedback, result and cancel.
     pub id: Option<Id<'a>>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
-    /// `package/Name`.
+    /// Type of the action: `package/Name`.
     pub action_type: Cow<'a, str>,
-    /// An object, or a list of values in the goal's order.
+    /// Goal: an object, or a list of values in the order of the goal's fields.
     pub args: Option<Payload<'a>>,
-    /// Whether feedback is wanted.
+    /// Requests feedback.
     pub feedback: bool,
-    /// Longer frames are cut.
+    /// Maximum frame size in bytes; longer frames are fragmented.
     pub fragment_size: Option<usize>,
-    /// How feedback and result are encoded; with `cbor-raw` the goal is too.
+    /// Encoding of feedback and result; with `cbor-raw` also of the goal.
     pub compression: Option<Compression>,
 }
 
@@ -112,12 +112,12 @@ impl<'a> Message<'a> for SendActionGoal<'a> {
     }
 }
 
-/// "The goal is no longer wanted."
+/// Cancels a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CancelActionGoal<'a> {
-    /// The goal.
+    /// Id of the goal.
     pub id: Id<'a>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
 }
 
@@ -145,16 +145,16 @@ impl<'a> Message<'a> for CancelActionGoal<'a> {
     }
 }
 
-/// "So far": from an action server.
+/// Feedback on a goal, from an action server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActionFeedback<'a> {
-    /// The goal.
+    /// Id of the goal.
     pub id: Id<'a>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
-    /// The feedback.
+    /// Feedback message.
     pub values: Payload<'a>,
-    /// `cbor-raw` where `values` holds the ROS serialization (extension).
+    /// Encoding: `cbor-raw` if `values` holds the ROS serialization (extension).
     pub compression: Compression,
 }
 
@@ -185,20 +185,20 @@ impl<'a> Message<'a> for ActionFeedback<'a> {
     }
 }
 
-/// "That is how it ended": from an action server.
+/// Result of a goal, from an action server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ActionResult<'a> {
-    /// The goal.
+    /// Id of the goal.
     pub id: Option<Id<'a>>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
-    /// The result, or, where `result` is false, the reason as a text.
+    /// Result message, or, if `result` is false, the reason as a string.
     pub values: Option<Payload<'a>>,
-    /// How it ended, where it is said.
+    /// Final status, if given.
     pub status: Option<GoalStatus>,
-    /// Whether there is a result.
+    /// True if there is a result.
     pub result: bool,
-    /// `cbor-raw` where `values` holds the ROS serialization (extension).
+    /// Encoding: `cbor-raw` if `values` holds the ROS serialization (extension).
     pub compression: Compression,
 }
 
@@ -252,16 +252,16 @@ impl<'a> Message<'a> for ActionResult<'a> {
     }
 }
 
-/// "I am an action server."
+/// Advertises that the client is an action server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AdvertiseAction<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
-    /// `package/Name`.
+    /// Type of the action: `package/Name`.
     pub type_name: Cow<'a, str>,
-    /// How the client wants the goals (extension).
+    /// Encoding in which the client wants the goals (extension).
     pub compression: Compression,
 }
 
@@ -289,12 +289,12 @@ impl<'a> Message<'a> for AdvertiseAction<'a> {
     }
 }
 
-/// "I am one no longer."
+/// Ends an [`AdvertiseAction`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UnadvertiseAction<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The action's name.
+    /// Name of the action.
     pub action: Cow<'a, str>,
 }
 

@@ -1,5 +1,5 @@
 use super::*;
-use crate::op::tests::{reads, refuses, survives_cbor};
+use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
 fn goal() -> SendActionGoal<'static> {
     SendActionGoal {
@@ -15,20 +15,21 @@ fn goal() -> SendActionGoal<'static> {
 
 #[test]
 fn send_action_goal_is_read_and_checked() {
-    reads(
+    assert_parses(
         r#"{"op":"send_action_goal","id":"send_action_goal:/fibonacci:1","action":"/fibonacci","action_type":"actionlib_tutorials/Fibonacci","args":{"order":5},"feedback":true}"#,
         goal(),
     );
-    survives_cbor(SendActionGoal {
+    assert_survives_cbor(SendActionGoal {
         args: None,
         compression: Some(Compression::CborRaw),
         ..goal()
     });
-    refuses(
+    assert_refused(
         r#"{"op":"send_action_goal","action":"/f"}"#,
-        "send_action_goal: field \"action_type\" is missing, an action type such as \"actionlib_tutorials/Fibonacci\" is expected",
+        "send_action_goal: field \"action_type\" is missing, an action type such as \"actionlib_tutorials/Fibonacci\" \
+         is expected",
     );
-    refuses(
+    assert_refused(
         r#"{"op":"send_action_goal","action":"/f","action_type":"a/B","feedback":"yes"}"#,
         "send_action_goal: field \"feedback\" is \"yes\", true or false is expected",
     );
@@ -40,12 +41,12 @@ fn cancel_action_goal_is_read_and_checked() {
         id: "g1".into(),
         action: "/f".into(),
     };
-    reads(
+    assert_parses(
         r#"{"op":"cancel_action_goal","id":"g1","action":"/f"}"#,
         op.clone(),
     );
-    survives_cbor(op);
-    refuses(
+    assert_survives_cbor(op);
+    assert_refused(
         r#"{"op":"cancel_action_goal","action":"/f"}"#,
         "cancel_action_goal: field \"id\" is missing, the id that the goal was sent with is expected",
     );
@@ -53,7 +54,7 @@ fn cancel_action_goal_is_read_and_checked() {
 
 #[test]
 fn action_feedback_is_read_and_checked() {
-    reads(
+    assert_parses(
         r#"{"op":"action_feedback","id":"g1","action":"/f","values":{"sequence":[0,1]}}"#,
         ActionFeedback {
             id: "g1".into(),
@@ -62,7 +63,7 @@ fn action_feedback_is_read_and_checked() {
             compression: Compression::None,
         },
     );
-    refuses(
+    assert_refused(
         r#"{"op":"action_feedback","id":"g1","action":"/f"}"#,
         "action_feedback: field \"values\" is missing, an object with the message's fields is expected",
     );
@@ -78,7 +79,7 @@ fn action_result_is_read_and_checked() {
         result: true,
         compression: Compression::None,
     };
-    reads(
+    assert_parses(
         r#"{"op":"action_result","id":"g1","action":"/f","values":{"sequence":[0,1]},"status":4,"result":true}"#,
         done.clone(),
     );
@@ -88,16 +89,17 @@ fn action_result_is_read_and_checked() {
         result: false,
         ..done
     };
-    reads(
+    assert_parses(
         r#"{"op":"action_result","id":"g1","action":"/f","result":false}"#,
         failed.clone(),
     );
-    survives_cbor(failed);
-    refuses(
+    assert_survives_cbor(failed);
+    assert_refused(
         r#"{"op":"action_result","action":"/f","status":77,"result":true}"#,
-        "action_result: field \"status\" is 77, a number of action_msgs/GoalStatus (4 succeeded, 5 canceled, 6 aborted) is expected",
+        "action_result: field \"status\" is 77, a number of action_msgs/GoalStatus (4 succeeded, 5 canceled, 6 \
+         aborted) is expected",
     );
-    refuses(
+    assert_refused(
         r#"{"op":"action_result","action":"/f"}"#,
         "action_result: field \"result\" is missing, true or false is expected",
     );
@@ -111,12 +113,12 @@ fn advertise_action_is_read_and_checked() {
         type_name: "actionlib_tutorials/Fibonacci".into(),
         compression: Compression::None,
     };
-    reads(
+    assert_parses(
         r#"{"op":"advertise_action","type":"actionlib_tutorials/Fibonacci","action":"/f"}"#,
         op.clone(),
     );
-    survives_cbor(op);
-    refuses(
+    assert_survives_cbor(op);
+    assert_refused(
         r#"{"op":"advertise_action"}"#,
         "advertise_action: field \"action\" is missing, an action name is expected",
     );
@@ -124,9 +126,9 @@ fn advertise_action_is_read_and_checked() {
         id: None,
         action: "/f".into(),
     };
-    reads(r#"{"op":"unadvertise_action","action":"/f"}"#, op.clone());
-    survives_cbor(op);
-    refuses(
+    assert_parses(r#"{"op":"unadvertise_action","action":"/f"}"#, op.clone());
+    assert_survives_cbor(op);
+    assert_refused(
         r#"{"op":"unadvertise_action","action":{}}"#,
         "unadvertise_action: field \"action\" is {}, an action name is expected",
     );

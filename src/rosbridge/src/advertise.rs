@@ -1,28 +1,29 @@
-//! `advertise`, `unadvertise`: the client will publish on a topic, or will no longer.
+//! `advertise`, `unadvertise`: a client announces that it will publish on a topic, or no longer will.
 
 use std::borrow::Cow;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Id, Problem, Qos, Writer};
+use crate::{Id, Problem, QosRequest, Writer};
 
-/// "I will publish on this topic."
+/// Announces that the client will publish on a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Advertise<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The topic's name.
+    /// Name of the topic.
     pub topic: Cow<'a, str>,
-    /// `package/Type`.
+    /// Type of the messages: `package/Type`.
     pub type_name: Cow<'a, str>,
-    /// Newcomers are given the last message.
+    /// Sends the last message to new subscribers.
     pub latch: bool,
-    /// Messages kept per slow subscriber.
+    /// Number of messages queued for a slow subscriber.
     pub queue_size: Option<u64>,
-    /// What the client's own definition hashes to (MD5, or the type hash of ROS 2), for clients that publish ROS bytes (extension).
+    /// Digest of the client's own definition (MD5, or the type hash of ROS 2), for clients that publish ROS bytes
+    /// (extension).
     pub md5sum: Option<Cow<'a, str>>,
-    /// What the client offers.
-    pub qos: Option<Qos>,
+    /// Quality of service offered by the client.
+    pub qos: Option<QosRequest>,
 }
 
 impl<'a> Message<'a> for Advertise<'a> {
@@ -39,7 +40,7 @@ impl<'a> Message<'a> for Advertise<'a> {
             latch: fields.boolean("latch")?.unwrap_or(false),
             queue_size: fields.count("queue_size", 0, "a number of messages")?,
             md5sum: fields.text("md5sum", "the definition's MD5 in hex, or its type hash,")?,
-            qos: Qos::read(fields)?,
+            qos: QosRequest::read(fields)?,
         })
     }
 
@@ -55,16 +56,16 @@ impl<'a> Message<'a> for Advertise<'a> {
         }
         writer.optional_count("queue_size", self.queue_size);
         writer.optional_text("md5sum", &self.md5sum);
-        Qos::write(self.qos, writer);
+        QosRequest::write(self.qos, writer);
     }
 }
 
-/// "I will publish no longer."
+/// Announces that the client will no longer publish on a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unadvertise<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The topic's name.
+    /// Name of the topic.
     pub topic: Cow<'a, str>,
 }
 
@@ -91,7 +92,7 @@ impl<'a> Message<'a> for Unadvertise<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     fn chatter() -> Advertise<'static> {
         Advertise {
@@ -107,12 +108,12 @@ mod tests {
 
     #[test]
     fn advertise_is_read() {
-        reads(
+        assert_parses(
             r#"{"op":"advertise","id":"advertise:/chatter:1","type":"std_msgs/String","topic":"/chatter","latch":true,"queue_size":100}"#,
             chatter(),
         );
-        survives_cbor(chatter());
-        reads(
+        assert_survives_cbor(chatter());
+        assert_parses(
             r#"{"op":"advertise","topic":"/chatter","type":"std_msgs/String","queue_size":null,"md5sum":"992c"}"#,
             Advertise {
                 id: None,
@@ -126,27 +127,27 @@ mod tests {
 
     #[test]
     fn advertise_is_checked() {
-        refuses(
+        assert_refused(
             r#"{"op":"advertise"}"#,
             "advertise: field \"topic\" is missing, a topic name is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"advertise","topic":"/x"}"#,
             "advertise: field \"type\" is missing, a message type such as \"std_msgs/String\" is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"advertise","topic":"","type":"a/B"}"#,
             "advertise: field \"topic\" is empty, a topic name is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"advertise","topic":"/x","type":"a/B","latch":1}"#,
             "advertise: field \"latch\" is 1, true or false is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"advertise","topic":"/x","type":"a/B","queue_size":-1}"#,
             "advertise: field \"queue_size\" is -1, a number of messages is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"advertise","topic":"/x","type":"a/B","queue_size":1e300}"#,
             "advertise: field \"queue_size\" is 1e300, a number of messages is expected",
         );
@@ -158,12 +159,12 @@ mod tests {
             id: Some(Id::Integer(3)),
             topic: "/chatter".into(),
         };
-        reads(
+        assert_parses(
             r#"{"op":"unadvertise","id":3,"topic":"/chatter"}"#,
             op.clone(),
         );
-        survives_cbor(op);
-        refuses(
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"unadvertise"}"#,
             "unadvertise: field \"topic\" is missing, a topic name is expected",
         );

@@ -6,24 +6,24 @@ use crate::fields::Fields;
 use crate::op::Message;
 use crate::{Id, Problem, Writer};
 
-/// "This is who I am": a MAC over the other fields with a secret shared with a third party.
+/// Credentials: a MAC over the other fields, with a secret shared with a third party.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Auth<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// SHA-512 of secret and the other fields, hex.
+    /// SHA-512 of the secret and the other fields, in hex.
     pub mac: Cow<'a, str>,
-    /// The client's address.
+    /// Address of the client.
     pub client: Cow<'a, str>,
-    /// The server's address.
+    /// Address of the server.
     pub dest: Cow<'a, str>,
-    /// A random text.
+    /// A random string.
     pub rand: Cow<'a, str>,
-    /// When it was asked for, in seconds since 1970.
+    /// Time of the request, in seconds since 1970.
     pub t: i64,
-    /// The client's level.
+    /// Level of the client.
     pub level: Cow<'a, str>,
-    /// When it ends, in seconds since 1970.
+    /// Expiry, in seconds since 1970.
     pub end: i64,
 }
 
@@ -68,7 +68,7 @@ impl<'a> Message<'a> for Auth<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     #[test]
     fn auth_is_read_and_checked() {
@@ -82,16 +82,16 @@ mod tests {
             level: "user".into(),
             end: 1_500_000_060,
         };
-        reads(
+        assert_parses(
             r#"{"op":"auth","mac":"abcd","client":"10.0.0.2","dest":"10.0.0.1","rand":"xyz","t":1500000000,"level":"user","end":1500000060}"#,
             op.clone(),
         );
-        survives_cbor(op);
-        refuses(
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"auth"}"#,
             "auth: field \"mac\" is missing, a hash in hex is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"auth","mac":"a","client":"b","dest":"c","rand":"d","t":"now"}"#,
             "auth: field \"t\" is \"now\", an integer is expected",
         );

@@ -1,8 +1,8 @@
-//! As much CBOR (RFC 8949) as an envelope needs.
+//! The subset of CBOR (RFC 8949) that an envelope needs.
 
 use crate::Problem;
 
-/// Deeper nesting than any ROS message has.
+/// Maximum nesting depth; no ROS message is nested deeper.
 const MAX_DEPTH: usize = 64;
 
 pub(crate) const UNSIGNED: u8 = 0;
@@ -15,7 +15,7 @@ const TAG: u8 = 6;
 const SIMPLE: u8 = 7;
 const BREAK: u8 = 0xff;
 
-fn syntax(at: usize, reason: &'static str) -> Problem {
+fn syntax_error(at: usize, reason: &'static str) -> Problem {
     Problem::Syntax {
         format: "CBOR",
         at,
@@ -23,21 +23,21 @@ fn syntax(at: usize, reason: &'static str) -> Problem {
     }
 }
 
-/// The beginning of an item: its major type and argument; `None` for indefinite length.
+/// Head of an item: its major type and argument; `None` for indefinite length.
 #[derive(Clone, Copy)]
-pub(crate) struct Head {
+pub(crate) struct CborHead {
     pub(crate) major: u8,
     pub(crate) info: u8,
     pub(crate) argument: Option<u64>,
 }
 
-/// A place in a CBOR text.
-pub(crate) struct Cursor<'a> {
+/// A position in a CBOR text.
+pub(crate) struct CborCursor<'a> {
     bytes: &'a [u8],
     at: usize,
 }
 
-impl<'a> Cursor<'a> {
+impl<'a> CborCursor<'a> {
     pub(crate) fn new(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0 }
     }
@@ -45,14 +45,14 @@ impl<'a> Cursor<'a> {
     fn take(&mut self, count: u64) -> Result<&'a [u8], Problem> {
         let rest = &self.bytes[self.at..];
         if count > rest.len() as u64 {
-            return Err(syntax(self.at, "the frame ends too early"));
+            return Err(syntax_error(self.at, "the frame ends too early"));
         }
         let count = count as usize;
         self.at += count;
         Ok(&rest[..count])
     }
 
-    pub(crate) fn head(&mut self) -> Result<Head, Problem> {
+    pub(crate) fn head(&mut self) -> Result<CborHead, Problem> {
         let start = self.at;
         let first = self.take(1)?[0];
         let (major, info) = (first >> 5, first & 0x1f);
@@ -67,16 +67,16 @@ impl<'a> Cursor<'a> {
                 )
             }
             31 if matches!(major, BYTES | TEXT | ARRAY | MAP) => None,
-            _ => return Err(syntax(start, "a reserved length is used")),
+            _ => return Err(syntax_error(start, "a reserved length is used")),
         };
-        Ok(Head {
+        Ok(CborHead {
             major,
             info,
             argument,
         })
     }
 
-    fn at_break(&mut self) -> bool {
+    fn take_break(&mut self) -> bool {
         if self.bytes.get(self.at) == Some(&BREAK) {
             self.at += 1;
             return true;
@@ -84,7 +84,7 @@ impl<'a> Cursor<'a> {
         false
     }
 
-    /// Calls `each` with every key and the slice of its value; the bytes must be one map and nothing more.
+    /// Calls `each` with every key and the slice of its value; the bytes must be exactly one map.
     pub(crate) fn map(
         &mut self,
         mut each: impl FnMut(&'a str, &'a [u8]) -> Result<(), Problem>,
@@ -98,24 +98,24 @@ impl<'a> Cursor<'a> {
             match &mut left {
                 Some(0) => break,
                 Some(count) => *count -= 1,
-                None if self.at_break() => break,
+                None if self.take_break() => break,
                 None => {}
             }
             let start = self.at;
             let key = self.head()?;
-            let Head {
+            let CborHead {
                 major: TEXT,
                 argument: Some(length),
                 ..
             } = key
             else {
-                return Err(syntax(
+                return Err(syntax_error(
                     start,
                     "a field name (a text string of definite length) is expected",
                 ));
             };
             let key = std::str::from_utf8(self.take(length)?)
-                .map_err(|_| syntax(start, "a name is not UTF-8"))?;
+                .map_err(|_| syntax_error(start, "a name is not UTF-8"))?;
             let value = self.at;
             self.skip(0)?;
             each(key, &self.bytes[value..self.at])?;
@@ -123,13 +123,13 @@ impl<'a> Cursor<'a> {
         if self.at == self.bytes.len() {
             Ok(())
         } else {
-            Err(syntax(self.at, "nothing may follow the map"))
+            Err(syntax_error(self.at, "nothing may follow the map"))
         }
     }
 
-    /// The slices of an array's items.
+    /// Returns the slices of an array's items.
     pub(crate) fn list(&mut self) -> Option<Vec<&'a [u8]>> {
-        let Head {
+        let CborHead {
             major: ARRAY,
             argument,
             ..
@@ -138,7 +138,7 @@ impl<'a> Cursor<'a> {
             return None;
         };
         let mut items = Vec::new();
-        while argument.map_or_else(|| !self.at_break(), |count| (items.len() as u64) < count) {
+        while argument.map_or_else(|| !self.take_break(), |count| (items.len() as u64) < count) {
             let start = self.at;
             self.skip(0).ok()?;
             items.push(&self.bytes[start..self.at]);
@@ -148,7 +148,7 @@ impl<'a> Cursor<'a> {
 
     fn skip(&mut self, depth: usize) -> Result<(), Problem> {
         if depth > MAX_DEPTH {
-            return Err(syntax(self.at, "nested deeper than 64 levels"));
+            return Err(syntax_error(self.at, "nested deeper than 64 levels"));
         }
         let start = self.at;
         let head = self.head()?;
@@ -156,11 +156,13 @@ impl<'a> Cursor<'a> {
             (UNSIGNED | NEGATIVE | SIMPLE, _) => Ok(()),
             (BYTES | TEXT, Some(length)) => self.take(length).map(drop),
             (BYTES | TEXT, None) => {
-                while !self.at_break() {
+                while !self.take_break() {
                     let chunk = self.head()?;
                     match chunk.argument {
                         Some(length) if chunk.major == head.major => self.take(length)?,
-                        _ => return Err(syntax(start, "a string has chunks of another kind")),
+                        _ => {
+                            return Err(syntax_error(start, "a string has chunks of another kind"));
+                        }
                     };
                 }
                 Ok(())
@@ -176,7 +178,7 @@ impl<'a> Cursor<'a> {
                         }
                     }
                     None => {
-                        while !self.at_break() {
+                        while !self.take_break() {
                             for _ in 0..each {
                                 self.skip(depth + 1)?;
                             }
@@ -186,11 +188,11 @@ impl<'a> Cursor<'a> {
                 Ok(())
             }
             (TAG, _) => self.skip(depth + 1),
-            _ => Err(syntax(start, "an unknown item")),
+            _ => Err(syntax_error(start, "an unknown item")),
         }
     }
 
-    /// The bytes or text of definite length that begin here (after any tags).
+    /// Reads a byte or text string of definite length (after any tags).
     pub(crate) fn string(&mut self, major: u8) -> Option<&'a [u8]> {
         let mut head = self.head().ok()?;
         while head.major == TAG {
@@ -202,21 +204,21 @@ impl<'a> Cursor<'a> {
         self.take(head.argument?).ok()
     }
 
-    /// The number that begins here.
+    /// Reads a number.
     pub(crate) fn number(&mut self) -> Option<f64> {
         let head = self.head().ok()?;
         let argument = head.argument?;
         match (head.major, head.info) {
             (UNSIGNED, _) => Some(argument as f64),
             (NEGATIVE, _) => Some(-1.0 - argument as f64),
-            (SIMPLE, 25) => Some(half(argument as u16)),
+            (SIMPLE, 25) => Some(half_to_f64(argument as u16)),
             (SIMPLE, 26) => Some(f64::from(f32::from_bits(argument as u32))),
             (SIMPLE, 27) => Some(f64::from_bits(argument)),
             _ => None,
         }
     }
 
-    /// The integer that begins here.
+    /// Reads an integer.
     pub(crate) fn integer(&mut self) -> Option<i64> {
         let head = self.head().ok()?;
         let argument = head.argument?;
@@ -228,8 +230,8 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// IEEE 754 half precision.
-fn half(bits: u16) -> f64 {
+/// Converts IEEE 754 half precision.
+fn half_to_f64(bits: u16) -> f64 {
     let exponent = i32::from(bits >> 10 & 0x1f);
     let mantissa = f64::from(bits & 0x3ff);
     let magnitude = match exponent {
@@ -245,7 +247,7 @@ fn half(bits: u16) -> f64 {
     }
 }
 
-/// Appends the beginning of an item in its shortest form.
+/// Appends the head of an item in its shortest form.
 pub(crate) fn write_head(out: &mut Vec<u8>, major: u8, argument: u64) {
     let major = major << 5;
     match argument {
@@ -287,7 +289,7 @@ mod tests {
 
     fn fields(bytes: &[u8]) -> Result<Vec<(String, Vec<u8>)>, Problem> {
         let mut found = Vec::new();
-        Cursor::new(bytes).map(|key, value| {
+        CborCursor::new(bytes).map(|key, value| {
             found.push((key.to_owned(), value.to_vec()));
             Ok(())
         })?;
@@ -317,7 +319,10 @@ mod tests {
 
     #[test]
     fn broken_cbor_is_refused_and_never_trusted() {
-        assert_eq!(fields(b""), Err(syntax(0, "the frame ends too early")));
+        assert_eq!(
+            fields(b""),
+            Err(syntax_error(0, "the frame ends too early"))
+        );
         assert_eq!(fields(b"\x01"), Err(Problem::NotAnObject("CBOR map")));
         // A byte string that claims 2^63 bytes, an array that claims 2^63 items.
         assert!(fields(b"\xa1\x61a\x5b\x80\0\0\0\0\0\0\0").is_err());
@@ -330,7 +335,7 @@ mod tests {
         deep.extend(std::iter::repeat_n(0x81, 100_000));
         assert_eq!(
             fields(&deep),
-            Err(syntax(68, "nested deeper than 64 levels"))
+            Err(syntax_error(68, "nested deeper than 64 levels"))
         );
     }
 
@@ -348,7 +353,7 @@ mod tests {
             (b"\xfa\x3f\xc0\x00\x00", 1.5),
             (b"\xfb\x3f\xf8\x00\x00\x00\x00\x00\x00", 1.5),
         ] {
-            assert_eq!(Cursor::new(bytes).number(), Some(value));
+            assert_eq!(CborCursor::new(bytes).number(), Some(value));
         }
         for value in [
             0,
@@ -366,7 +371,7 @@ mod tests {
         ] {
             let mut out = Vec::new();
             write_integer(&mut out, value);
-            assert_eq!(Cursor::new(&out).integer(), Some(value));
+            assert_eq!(CborCursor::new(&out).integer(), Some(value));
         }
     }
 }

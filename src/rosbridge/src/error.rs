@@ -1,17 +1,17 @@
-//! What is wrong with a frame, said so that the client's author can fix it.
+//! Errors of frames, worded so that the author of a client can fix them.
 
 use crate::Id;
 
-/// A frame that cannot be understood. Where op and id could still be read they are kept: the status message that
-/// answers names them.
+/// A frame that cannot be understood. Op and id are included if they could be read: the status message that answers the
+/// frame names them.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{}{problem}", prefix(.op))]
 pub struct Error {
-    /// The op, where it could be read.
+    /// The op, if it could be read.
     pub op: Option<String>,
-    /// The interaction's id, where it could be read.
+    /// Id of the interaction, if it could be read.
     pub id: Option<Id<'static>>,
-    /// What is wrong.
+    /// The mistake in the frame.
     pub problem: Problem,
 }
 
@@ -35,7 +35,7 @@ impl From<Problem> for Error {
     }
 }
 
-/// The kinds of mistakes in a frame.
+/// Kinds of mistakes in a frame.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Problem {
     /// Not JSON, or not CBOR.
@@ -43,52 +43,52 @@ pub enum Problem {
     Syntax {
         /// `JSON` or `CBOR`.
         format: &'static str,
-        /// Offset in the frame.
+        /// Byte offset in the frame.
         at: usize,
-        /// What was expected there.
+        /// Description of what was expected there.
         reason: &'static str,
     },
-    /// Valid, but no object.
+    /// Valid, but not an object.
     #[error("a frame must be one {0}")]
     NotAnObject(&'static str),
     /// An object with too many fields to be a rosbridge message.
     #[error("a message has at most {0} fields")]
     TooManyFields(usize),
-    /// No `op`.
+    /// The frame has no `op`.
     #[error("field \"op\" is missing; it must be one of {known}{hint}", known = crate::op::KNOWN.join(", "))]
     NoOp {
-        /// For clients of rosbridge 1.0.
+        /// Hint for clients of rosbridge 1.0.
         hint: &'static str,
     },
-    /// An `op` that the protocol does not know.
+    /// The `op` is not part of the protocol.
     #[error("unknown op {0:?}; known are {known}", known = crate::op::KNOWN.join(", "))]
     UnknownOp(String),
     /// A required field is absent.
     #[error("field {field:?} is missing, {expected} is expected")]
     Missing {
-        /// The field.
+        /// Name of the field.
         field: &'static str,
-        /// What it should be.
+        /// Expected content.
         expected: &'static str,
     },
-    /// A field has a value of another kind.
+    /// A field has a value of the wrong type.
     #[error("field {field:?} is {found}, {expected} is expected")]
     Mistyped {
-        /// The field.
+        /// Name of the field.
         field: &'static str,
-        /// What it should be.
+        /// Expected content.
         expected: &'static str,
-        /// What it is, shortened.
+        /// The value found, shortened.
         found: String,
     },
-    /// A field is longer than it may be.
+    /// A field is longer than allowed.
     #[error("field {field:?} has {length} bytes, at most {limit} are allowed")]
     TooLong {
-        /// The field.
+        /// Name of the field.
         field: &'static str,
-        /// How long it is.
+        /// Length in bytes.
         length: usize,
-        /// How long it may be.
+        /// Maximum length in bytes.
         limit: usize,
     },
 }

@@ -1,13 +1,13 @@
-//! The fields of one message, read by name whatever the format.
+//! The fields of one message, read by name, independent of the format.
 
 use std::borrow::Cow;
 use std::time::Duration;
 
 use crate::{Format, Id, Payload, Problem, cbor, json};
 
-/// No op has more than fifteen.
+/// Maximum number of fields; no op has more than fifteen.
 const MAX_FIELDS: usize = 64;
-/// Names, types and ids are short; what is long is payload.
+/// Maximum length of names, types and ids; only payloads may be longer.
 const MAX_TEXT: usize = 16 * 1024;
 
 /// Names and value slices of an object.
@@ -17,39 +17,39 @@ pub(crate) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    pub(crate) fn of(payload: Payload<'a>) -> Result<Self, Problem> {
+    pub(crate) fn from_payload(payload: Payload<'a>) -> Result<Self, Problem> {
         match payload.format {
             Format::Json => match std::str::from_utf8(payload.bytes) {
-                Ok(text) => Self::of_json(text),
+                Ok(text) => Self::from_json(text),
                 Err(error) => Err(Problem::Syntax {
                     format: "JSON",
                     at: error.valid_up_to(),
                     reason: "the text is not UTF-8",
                 }),
             },
-            Format::Cbor => Self::of_cbor(payload.bytes),
+            Format::Cbor => Self::from_cbor(payload.bytes),
         }
     }
 
-    pub(crate) fn of_json(text: &'a str) -> Result<Self, Problem> {
+    pub(crate) fn from_json(text: &'a str) -> Result<Self, Problem> {
         let mut fields = Self {
             format: Format::Json,
             found: Vec::with_capacity(8),
         };
-        json::Cursor::new(text).object(|key, value| fields.keep(key, value.as_bytes()))?;
+        json::JsonCursor::new(text).object(|key, value| fields.push(key, value.as_bytes()))?;
         Ok(fields)
     }
 
-    pub(crate) fn of_cbor(bytes: &'a [u8]) -> Result<Self, Problem> {
+    pub(crate) fn from_cbor(bytes: &'a [u8]) -> Result<Self, Problem> {
         let mut fields = Self {
             format: Format::Cbor,
             found: Vec::with_capacity(8),
         };
-        cbor::Cursor::new(bytes).map(|key, value| fields.keep(Cow::Borrowed(key), value))?;
+        cbor::CborCursor::new(bytes).map(|key, value| fields.push(Cow::Borrowed(key), value))?;
         Ok(fields)
     }
 
-    fn keep(&mut self, key: Cow<'a, str>, value: &'a [u8]) -> Result<(), Problem> {
+    fn push(&mut self, key: Cow<'a, str>, value: &'a [u8]) -> Result<(), Problem> {
         if self.found.len() == MAX_FIELDS {
             return Err(Problem::TooManyFields(MAX_FIELDS));
         }
@@ -69,13 +69,13 @@ impl<'a> Fields<'a> {
         .is_null()
     }
 
-    /// The value of a field; the last one wins as in every JSON parser, `null` is as good as absent.
+    /// Returns the value of a field. The last one wins, as in every JSON parser; `null` is treated as absent.
     pub(crate) fn get(&self, field: &str) -> Option<&'a [u8]> {
         let (_, value) = self.found.iter().rev().find(|(name, _)| name == field)?;
         (!self.is_null(value)).then_some(*value)
     }
 
-    pub(crate) fn required(
+    pub(crate) fn require(
         &self,
         field: &'static str,
         expected: &'static str,
@@ -83,8 +83,8 @@ impl<'a> Fields<'a> {
         self.get(field).ok_or(Problem::Missing { field, expected })
     }
 
-    /// A value as the client wrote it, shortened.
-    pub(crate) fn shown(&self, value: &[u8]) -> String {
+    /// Describes a value for error messages, shortened.
+    pub(crate) fn describe(&self, value: &[u8]) -> String {
         const SHOWN: usize = 48;
         match self.format {
             Format::Json => {
@@ -95,11 +95,11 @@ impl<'a> Fields<'a> {
                 }
             }
             Format::Cbor => match value.first().map_or(7, |byte| byte >> 5) {
-                cbor::UNSIGNED | cbor::NEGATIVE => cbor::Cursor::new(value)
+                cbor::UNSIGNED | cbor::NEGATIVE => cbor::CborCursor::new(value)
                     .integer()
                     .map_or("a number".to_owned(), |number| number.to_string()),
                 cbor::BYTES => "a byte string".to_owned(),
-                cbor::TEXT => match cbor::Cursor::new(value).string(cbor::TEXT) {
+                cbor::TEXT => match cbor::CborCursor::new(value).string(cbor::TEXT) {
                     Some(text) => format!(
                         "{:?}",
                         String::from_utf8_lossy(&text[..text.len().min(SHOWN)])
@@ -108,14 +108,14 @@ impl<'a> Fields<'a> {
                 },
                 cbor::ARRAY => "an array".to_owned(),
                 cbor::MAP => "a map".to_owned(),
-                _ => cbor::Cursor::new(value)
+                _ => cbor::CborCursor::new(value)
                     .number()
                     .map_or("a simple value".to_owned(), |number| number.to_string()),
             },
         }
     }
 
-    pub(crate) fn mistyped(
+    pub(crate) fn mistyped_error(
         &self,
         field: &'static str,
         expected: &'static str,
@@ -124,7 +124,7 @@ impl<'a> Fields<'a> {
         Problem::Mistyped {
             field,
             expected,
-            found: self.shown(value),
+            found: self.describe(value),
         }
     }
 
@@ -139,13 +139,13 @@ impl<'a> Fields<'a> {
     pub(crate) fn as_number(&self, value: &[u8]) -> Option<f64> {
         match self.format {
             Format::Json => {
-                // Rust's parser takes "inf" and "+1" too; JSON does not.
+                // Rust's parser also accepts "inf" and "+1"; JSON does not.
                 let text = std::str::from_utf8(value).ok()?;
                 matches!(value.first(), Some(b'-' | b'0'..=b'9'))
                     .then(|| text.parse().ok())
                     .flatten()
             }
-            Format::Cbor => cbor::Cursor::new(value).number(),
+            Format::Cbor => cbor::CborCursor::new(value).number(),
         }
     }
 
@@ -154,7 +154,7 @@ impl<'a> Fields<'a> {
             Format::Json => std::str::from_utf8(value)
                 .ok()
                 .and_then(|text| text.parse().ok()),
-            Format::Cbor => cbor::Cursor::new(value).integer(),
+            Format::Cbor => cbor::CborCursor::new(value).integer(),
         };
         // JavaScript and Lua clients may write 5 as 5.0.
         exact.or_else(|| {
@@ -163,7 +163,7 @@ impl<'a> Fields<'a> {
         })
     }
 
-    /// A text of reasonable length.
+    /// Reads a string of limited length.
     pub(crate) fn text(
         &self,
         field: &'static str,
@@ -181,10 +181,10 @@ impl<'a> Fields<'a> {
         }
         self.as_text(value)
             .map(Some)
-            .ok_or_else(|| self.mistyped(field, expected, value))
+            .ok_or_else(|| self.mistyped_error(field, expected, value))
     }
 
-    /// A text that must be there and not be empty.
+    /// Reads a required string, which must not be empty.
     pub(crate) fn required_text(
         &self,
         field: &'static str,
@@ -203,15 +203,15 @@ impl<'a> Fields<'a> {
         Ok(text)
     }
 
-    /// A text of any length: the data of fragments and pictures.
+    /// Reads a required string of any length: the data of fragments and PNGs.
     pub(crate) fn data(
         &self,
         field: &'static str,
         expected: &'static str,
     ) -> Result<Cow<'a, str>, Problem> {
-        let value = self.required(field, expected)?;
+        let value = self.require(field, expected)?;
         self.as_text(value)
-            .ok_or_else(|| self.mistyped(field, expected, value))
+            .ok_or_else(|| self.mistyped_error(field, expected, value))
     }
 
     pub(crate) fn boolean(&self, field: &'static str) -> Result<Option<bool>, Problem> {
@@ -219,7 +219,7 @@ impl<'a> Fields<'a> {
             return Ok(None);
         };
         match self.as_boolean(value) {
-            None => Err(self.mistyped(field, "true or false", value)),
+            None => Err(self.mistyped_error(field, "true or false", value)),
             known => Ok(known),
         }
     }
@@ -232,7 +232,7 @@ impl<'a> Fields<'a> {
         }
     }
 
-    /// An integer not below `least`.
+    /// Reads an integer not below `least`.
     pub(crate) fn count(
         &self,
         field: &'static str,
@@ -244,7 +244,7 @@ impl<'a> Fields<'a> {
         };
         match self.as_integer(value) {
             Some(number) if number >= least => Ok(Some(number.unsigned_abs())),
-            _ => Err(self.mistyped(field, expected, value)),
+            _ => Err(self.mistyped_error(field, expected, value)),
         }
     }
 
@@ -254,10 +254,10 @@ impl<'a> Fields<'a> {
         };
         self.as_integer(value)
             .map(Some)
-            .ok_or_else(|| self.mistyped(field, "an integer", value))
+            .ok_or_else(|| self.mistyped_error(field, "an integer", value))
     }
 
-    /// A duration given as a number of `unit`s.
+    /// Reads a duration given as a number of `unit`s.
     pub(crate) fn duration(
         &self,
         field: &'static str,
@@ -271,7 +271,7 @@ impl<'a> Fields<'a> {
             Some(number) if number >= 0.0 => Ok(Some(
                 Duration::try_from_secs_f64(number * unit.as_secs_f64()).unwrap_or(Duration::MAX),
             )),
-            _ => Err(self.mistyped(field, expected, value)),
+            _ => Err(self.mistyped_error(field, expected, value)),
         }
     }
 
@@ -293,10 +293,10 @@ impl<'a> Fields<'a> {
         })
     }
 
-    /// A payload that must be an object.
+    /// Reads a required payload, which must be an object.
     pub(crate) fn object(&self, field: &'static str) -> Result<Payload<'a>, Problem> {
         const EXPECTED: &str = "an object with the message's fields";
-        let bytes = self.required(field, EXPECTED)?;
+        let bytes = self.require(field, EXPECTED)?;
         let payload = Payload {
             format: self.format,
             bytes,
@@ -304,11 +304,11 @@ impl<'a> Fields<'a> {
         if payload.is_object() {
             Ok(payload)
         } else {
-            Err(self.mistyped(field, EXPECTED, bytes))
+            Err(self.mistyped_error(field, EXPECTED, bytes))
         }
     }
 
-    /// A payload that must be an object where it is present; an empty one otherwise.
+    /// Reads a payload, which must be an object if present; empty otherwise.
     pub(crate) fn object_or_empty(&self, field: &'static str) -> Result<Payload<'a>, Problem> {
         if self.get(field).is_some() {
             return self.object(field);
@@ -319,7 +319,7 @@ impl<'a> Fields<'a> {
         })
     }
 
-    /// A payload that is an object or a list of arguments, where present.
+    /// Reads a payload, which must be an object or a list of arguments if present.
     pub(crate) fn arguments(&self, field: &'static str) -> Result<Option<Payload<'a>>, Problem> {
         let Some(bytes) = self.get(field) else {
             return Ok(None);
@@ -331,7 +331,7 @@ impl<'a> Fields<'a> {
         if payload.is_object() || payload.is_list() {
             Ok(Some(payload))
         } else {
-            Err(self.mistyped(field, "an object, or a list of arguments in order,", bytes))
+            Err(self.mistyped_error(field, "an object, or a list of arguments in order,", bytes))
         }
     }
 }

@@ -1,4 +1,4 @@
-//! `fragment`: parts of a message that was too long for one frame, put together again within bounds.
+//! `fragment`: parts of a message that was too long for one frame, and their bounded reassembly.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -8,16 +8,16 @@ use crate::fields::Fields;
 use crate::op::Message;
 use crate::{Id, Problem, Writer};
 
-/// One part.
+/// One fragment of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Fragment<'a> {
-    /// Which message it belongs to.
+    /// Id of the message it belongs to.
     pub id: Id<'a>,
     /// A piece of that message's JSON text.
     pub data: Cow<'a, str>,
-    /// Which piece, from 0.
+    /// Index of the fragment, from 0.
     pub num: u64,
-    /// The number of fragments.
+    /// Total number of fragments.
     pub total: u64,
 }
 
@@ -53,16 +53,16 @@ impl<'a> Message<'a> for Fragment<'a> {
     }
 }
 
-/// How much unfinished business one client may have.
+/// Limits of one client's incomplete messages.
 #[derive(Debug, Clone, Copy)]
 pub struct FragmentLimits {
-    /// Messages begun and not finished.
+    /// Maximum number of incomplete messages.
     pub messages: usize,
-    /// Fragments of one message.
+    /// Maximum number of fragments of one message.
     pub parts: usize,
-    /// Bytes of all unfinished messages together.
+    /// Maximum bytes of all incomplete messages together.
     pub bytes: usize,
-    /// Time since the last fragment of a message.
+    /// Maximum time since the last fragment of a message.
     pub age: Duration,
 }
 
@@ -77,57 +77,57 @@ impl Default for FragmentLimits {
     }
 }
 
-/// Why a fragment was dropped.
+/// Reason why a fragment was dropped.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FragmentError {
     /// `num` is not below `total`.
     #[error("fragment {num} of {total}: \"num\" must be below \"total\"")]
     Index {
-        /// As sent.
+        /// Index as sent.
         num: u64,
-        /// As sent.
+        /// Total as sent.
         total: u64,
     },
     /// `total` differs from the earlier fragments'.
     #[error("\"total\" is {total}, the earlier fragments said {earlier}; the message is dropped")]
     Total {
-        /// As sent.
+        /// Total as sent.
         total: u64,
-        /// As begun.
+        /// Total of the earlier fragments.
         earlier: usize,
     },
-    /// The same piece again, with other data.
+    /// A fragment was sent again with different data.
     #[error("fragment {0} came twice with different data; the message is dropped")]
     Doubled(u64),
-    /// Too many pieces.
+    /// There are too many fragments.
     #[error("\"total\" is {total}, at most {limit} fragments are allowed")]
     Parts {
-        /// As sent.
+        /// Total as sent.
         total: u64,
-        /// As allowed.
+        /// Maximum number of fragments.
         limit: usize,
     },
-    /// Too many bytes.
+    /// There are too many bytes.
     #[error("unfinished messages hold more than {0} bytes; the message is dropped")]
     Bytes(usize),
 }
 
-struct Partial {
+struct PartialMessage {
     parts: Vec<Option<Box<str>>>,
     missing: usize,
     bytes: usize,
     touched: Instant,
 }
 
-/// The unfinished messages of one client.
+/// The incomplete messages of one client.
 pub struct Fragments {
     limits: FragmentLimits,
-    partial: HashMap<Id<'static>, Partial>,
+    partial: HashMap<Id<'static>, PartialMessage>,
     bytes: usize,
 }
 
 impl Fragments {
-    /// None yet.
+    /// Creates an empty set.
     pub fn new(limits: FragmentLimits) -> Self {
         Self {
             limits,
@@ -136,10 +136,11 @@ impl Fragments {
         }
     }
 
-    /// Takes a fragment; gives the message when it is the last that was missing. Order does not matter.
+    /// Adds a fragment; returns the message when it is complete. The order of fragments does not matter.
     ///
     /// # Errors
-    /// Why it was not taken. Where the fragments contradict one another the whole message is dropped.
+    /// Returns the reason why the fragment was dropped. If fragments contradict each other the whole message is
+    /// dropped.
     pub fn add(
         &mut self,
         fragment: &Fragment<'_>,
@@ -163,12 +164,12 @@ impl Fragments {
         if !self.partial.contains_key(&id) {
             self.make_room();
         }
-        // An unfilled slot costs memory as well as a filled one.
+        // An empty slot uses as much memory as a filled one.
         let slots = total as usize * size_of::<Option<Box<str>>>();
         let mut begun = 0;
         let partial = self.partial.entry(id.clone()).or_insert_with(|| {
             begun = slots;
-            Partial {
+            PartialMessage {
                 parts: vec![None; total as usize],
                 missing: total as usize,
                 bytes: slots,
@@ -207,15 +208,15 @@ impl Fragments {
         Ok(Some(whole))
     }
 
-    /// Bytes held now.
+    /// Returns the bytes held now.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Drops messages whose last fragment is too long ago; gives how many.
+    /// Drops messages whose last fragment is too old; returns their number.
     pub fn forget_old(&mut self, now: Instant) -> usize {
         let age = self.limits.age;
-        let old = |partial: &Partial| now.saturating_duration_since(partial.touched) > age;
+        let old = |partial: &PartialMessage| now.saturating_duration_since(partial.touched) > age;
         let ids: Vec<_> = self
             .partial
             .iter()
@@ -249,7 +250,7 @@ impl Fragments {
     }
 }
 
-/// Cuts a text into pieces of at most `size` bytes (a character wider than that is a piece of its own).
+/// Splits a text into pieces of at most `size` bytes (a wider character is a piece of its own).
 pub fn split_text(text: &str, size: usize) -> impl Iterator<Item = &str> {
     let mut rest = text;
     std::iter::from_fn(move || {

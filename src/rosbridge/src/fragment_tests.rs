@@ -1,5 +1,5 @@
 use super::*;
-use crate::op::tests::{reads, refuses, survives_cbor};
+use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
 fn part(id: &'static str, num: u64, total: u64, data: &'static str) -> Fragment<'static> {
     Fragment {
@@ -21,25 +21,25 @@ fn limits() -> FragmentLimits {
 
 #[test]
 fn fragment_is_read_and_checked() {
-    reads(
+    assert_parses(
         r#"{"op":"fragment","id":"a","data":"{\"op\":","num":0,"total":2}"#,
         part("a", 0, 2, "{\"op\":"),
     );
-    survives_cbor(part("a", 0, 2, "x"));
+    assert_survives_cbor(part("a", 0, 2, "x"));
     let index = "the fragment's index, from 0, is expected";
-    refuses(
+    assert_refused(
         r#"{"op":"fragment","id":"a","data":"x","total":2}"#,
         &format!("fragment: field \"num\" is missing, {index}"),
     );
-    refuses(
+    assert_refused(
         r#"{"op":"fragment","id":"a","data":"x","num":-1,"total":2}"#,
         &format!("fragment: field \"num\" is -1, {index}"),
     );
-    refuses(
+    assert_refused(
         r#"{"op":"fragment","data":"x","num":0,"total":2}"#,
         "fragment: field \"id\" is missing, the id common to all fragments of the message is expected",
     );
-    refuses(
+    assert_refused(
         r#"{"op":"fragment","id":"a","data":"x","num":0,"total":0}"#,
         "fragment: field \"total\" is 0, the number of fragments, 1 or more, is expected",
     );

@@ -1,19 +1,19 @@
-//! The id of an interaction.
+//! Id of an interaction.
 
 use std::borrow::Cow;
 use std::fmt;
 
-/// "An arbitrary string or integer": what answers carry so that the client can match them.
+/// An arbitrary string or integer, repeated in answers so that the client can match them.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Id<'a> {
-    /// The usual kind.
+    /// A string, as most clients use.
     Text(Cow<'a, str>),
-    /// What some clients count with.
+    /// An integer, as used by clients that count.
     Integer(i64),
 }
 
 impl Id<'_> {
-    /// The same, free of the frame.
+    /// Returns an id that does not borrow from the frame.
     pub fn into_owned(self) -> Id<'static> {
         match self {
             Id::Text(text) => Id::Text(Cow::Owned(text.into_owned())),

@@ -1,14 +1,15 @@
-//! As much JSON as an envelope needs: find where each field's value begins and ends, read strings, numbers and
-//! booleans, write strings. What lies inside a payload is only walked over; the codec that knows its type judges it.
+//! The subset of JSON that an envelope needs: finds where the value of each field begins and ends, reads strings,
+//! numbers and booleans, writes strings. The inside of a payload is only skipped; the codec that knows its type checks
+//! it.
 
 use std::borrow::Cow;
 
 use crate::Problem;
 
-/// Deeper nesting than any ROS message has.
+/// Maximum nesting depth; no ROS message is nested deeper.
 const MAX_DEPTH: usize = 128;
 
-fn syntax(at: usize, reason: &'static str) -> Problem {
+fn syntax_error(at: usize, reason: &'static str) -> Problem {
     Problem::Syntax {
         format: "JSON",
         at,
@@ -16,13 +17,13 @@ fn syntax(at: usize, reason: &'static str) -> Problem {
     }
 }
 
-/// A place in a JSON text.
-pub(crate) struct Cursor<'a> {
+/// A position in a JSON text.
+pub(crate) struct JsonCursor<'a> {
     text: &'a str,
     at: usize,
 }
 
-impl<'a> Cursor<'a> {
+impl<'a> JsonCursor<'a> {
     pub(crate) fn new(text: &'a str) -> Self {
         Self { text, at: 0 }
     }
@@ -48,11 +49,11 @@ impl<'a> Cursor<'a> {
             self.at += 1;
             Ok(())
         } else {
-            Err(syntax(self.at, reason))
+            Err(syntax_error(self.at, reason))
         }
     }
 
-    /// Calls `each` with every key and the slice of its value; the text must be one object and nothing more.
+    /// Calls `each` with every key and the slice of its value; the text must be exactly one object.
     pub(crate) fn object(
         &mut self,
         mut each: impl FnMut(Cow<'a, str>, &'a str) -> Result<(), Problem>,
@@ -62,18 +63,18 @@ impl<'a> Cursor<'a> {
             Some(b'[' | b'"' | b'0'..=b'9' | b'-' | b't' | b'f' | b'n') => {
                 return Err(Problem::NotAnObject("JSON object"));
             }
-            _ => return Err(syntax(self.at, "an object is expected")),
+            _ => return Err(syntax_error(self.at, "an object is expected")),
         }
         if self.peek() == Some(b'}') {
             self.at += 1;
         } else {
             loop {
                 if self.peek() != Some(b'"') {
-                    return Err(syntax(self.at, "a field name in quotes is expected"));
+                    return Err(syntax_error(self.at, "a field name in quotes is expected"));
                 }
                 let key = self.value()?;
                 let key = unescape(key)
-                    .ok_or_else(|| syntax(self.at, "a field name has a bad escape"))?;
+                    .ok_or_else(|| syntax_error(self.at, "a field name has a bad escape"))?;
                 self.expect(b':', "a colon is expected")?;
                 let value = self.value()?;
                 each(key, value)?;
@@ -83,17 +84,22 @@ impl<'a> Cursor<'a> {
                         self.at += 1;
                         break;
                     }
-                    _ => return Err(syntax(self.at, "a comma or the object's end is expected")),
+                    _ => {
+                        return Err(syntax_error(
+                            self.at,
+                            "a comma or the object's end is expected",
+                        ));
+                    }
                 }
             }
         }
         match self.peek() {
             None => Ok(()),
-            Some(_) => Err(syntax(self.at, "nothing may follow the object")),
+            Some(_) => Err(syntax_error(self.at, "nothing may follow the object")),
         }
     }
 
-    /// The slices of a list's values.
+    /// Returns the slices of a list's values.
     pub(crate) fn list(&mut self) -> Option<Vec<&'a [u8]>> {
         self.expect(b'[', "a list is expected").ok()?;
         let mut items = Vec::new();
@@ -110,11 +116,11 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The slice of the value that begins here.
+    /// Returns the slice of the value that starts here.
     fn value(&mut self) -> Result<&'a str, Problem> {
         let first = self
             .peek()
-            .ok_or_else(|| syntax(self.at, "a value is expected"))?;
+            .ok_or_else(|| syntax_error(self.at, "a value is expected"))?;
         let start = self.at;
         match first {
             b'"' => self.skip_string()?,
@@ -131,7 +137,7 @@ impl<'a> Cursor<'a> {
                     self.at += 1;
                 }
             }
-            _ => return Err(syntax(start, "a value is expected")),
+            _ => return Err(syntax_error(start, "a value is expected")),
         }
         Ok(&self.text[start..self.at])
     }
@@ -141,11 +147,11 @@ impl<'a> Cursor<'a> {
             self.at += word.len();
             Ok(())
         } else {
-            Err(syntax(self.at, "a value is expected"))
+            Err(syntax_error(self.at, "a value is expected"))
         }
     }
 
-    /// From an opening quote to behind the closing one.
+    /// Skips from an opening quote past the closing one.
     fn skip_string(&mut self) -> Result<(), Problem> {
         let bytes = self.bytes();
         let start = self.at;
@@ -157,12 +163,12 @@ impl<'a> Cursor<'a> {
                     return Ok(());
                 }
                 Some(found) if at + found + 2 <= bytes.len() => at += found + 2,
-                _ => return Err(syntax(start, "a string is not closed")),
+                _ => return Err(syntax_error(start, "a string is not closed")),
             }
         }
     }
 
-    /// From an opening bracket to behind its partner.
+    /// Skips from an opening bracket past the matching one.
     fn skip_nested(&mut self) -> Result<(), Problem> {
         let bytes = self.bytes();
         let start = self.at;
@@ -176,7 +182,7 @@ impl<'a> Cursor<'a> {
                 b'{' | b'[' => {
                     depth += 1;
                     if depth > MAX_DEPTH {
-                        return Err(syntax(self.at, "nested deeper than 128 levels"));
+                        return Err(syntax_error(self.at, "nested deeper than 128 levels"));
                     }
                 }
                 b'}' | b']' => {
@@ -190,11 +196,11 @@ impl<'a> Cursor<'a> {
             }
             self.at += 1;
         }
-        Err(syntax(start, "a bracket is not closed"))
+        Err(syntax_error(start, "a bracket is not closed"))
     }
 }
 
-/// The text of a JSON string (quotes included in `raw`); borrowed where nothing is escaped.
+/// Decodes a JSON string (`raw` includes the quotes); borrows it if nothing is escaped.
 pub(crate) fn unescape(raw: &str) -> Option<Cow<'_, str>> {
     let inner = raw.strip_prefix('"')?.strip_suffix('"')?;
     if memchr::memchr(b'\\', inner.as_bytes()).is_none() {
@@ -221,7 +227,7 @@ pub(crate) fn unescape(raw: &str) -> Option<Cow<'_, str>> {
                 let mut unit = hex4(rest, used)?;
                 used += 4;
                 if (0xd800..0xdc00).contains(&unit) {
-                    // A pair of surrogates makes one character; a lone one makes the replacement character.
+                    // A pair of surrogates is one character; a lone one becomes the replacement character.
                     match rest.get(used..used + 2) {
                         Some("\\u") => {
                             let low = hex4(rest, used + 2)?;
@@ -281,7 +287,7 @@ pub(crate) fn write_string(out: &mut Vec<u8>, text: &str) {
     out.push(b'"');
 }
 
-/// JSON text with every character beyond ASCII escaped, which only stand in its strings.
+/// Escapes all characters of a JSON text beyond ASCII; they can only occur in its strings.
 pub fn to_ascii(json: &str) -> Cow<'_, str> {
     if json.is_ascii() {
         return Cow::Borrowed(json);
@@ -310,7 +316,7 @@ mod tests {
 
     fn fields(text: &str) -> Result<Vec<(String, String)>, Problem> {
         let mut found = Vec::new();
-        Cursor::new(text).object(|key, value| {
+        JsonCursor::new(text).object(|key, value| {
             found.push((key.into_owned(), value.to_owned()));
             Ok(())
         })?;
@@ -354,13 +360,13 @@ mod tests {
             ("{\"a\":tru}", 5, "a value is expected"),
             ("{\"a\":1} x", 8, "nothing may follow the object"),
         ] {
-            assert_eq!(fields(text), Err(syntax(at, reason)), "{text}");
+            assert_eq!(fields(text), Err(syntax_error(at, reason)), "{text}");
         }
         assert_eq!(fields("[1]"), Err(Problem::NotAnObject("JSON object")));
         let deep = format!("{{\"a\":{}{}}}", "[".repeat(100_000), "]".repeat(100_000));
         assert_eq!(
             fields(&deep),
-            Err(syntax(133, "nested deeper than 128 levels"))
+            Err(syntax_error(133, "nested deeper than 128 levels"))
         );
     }
 

@@ -1,8 +1,8 @@
-//! rosbridge protocol v2 as data: frames in, [`Op`]s out, and back. No sockets, no ROS.
+//! rosbridge protocol v2 as data: parses frames into [`Op`]s and prints them. No sockets, no ROS.
 //!
-//! A frame is a JSON object (text) or a CBOR map (binary). Only its envelope is read here; what a message or a
-//! service's arguments hold stays a [`Payload`]: the slice of the frame it stands in, for a codec that knows the
-//! type. So nothing is copied, and there is no tree of values.
+//! A frame is a JSON object (text) or a CBOR map (binary). Only its envelope is read here; a message or a service's
+//! arguments stay a [`Payload`]: the slice of the frame that holds them, for a codec that knows the type. So nothing is
+//! copied, and no tree of values is built.
 //!
 //! ```text
 //! frame ──parse──▶ Op { topic, id, … , msg: Payload } ──▶ the session
@@ -10,8 +10,8 @@
 //! ```
 //!
 //! The protocol is the union of ROSBRIDGE_PROTOCOL.md of the `ros1` and `ros2` branches of rosbridge_suite, with one
-//! extension: `"compression": "cbor-raw"` is understood upwards too (publish, services, actions). There a payload is
-//! `{"bytes": …}` with the ROS serialization in it, as downwards.
+//! extension: `"compression": "cbor-raw"` is also understood from clients (publish, services, actions). Such a payload
+//! is `{"bytes": …}` with the ROS serialization in it, as it is towards clients.
 
 #![forbid(unsafe_code)]
 
@@ -44,12 +44,14 @@ pub use error::{Error, Problem};
 pub use fragment::{Fragment, FragmentError, FragmentLimits, Fragments, split_text};
 pub use id::Id;
 pub use json::to_ascii;
-pub use op::{Frame, Op, is_known_op, text_field, unknown_fields};
+pub use op::{Op, ProtocolFrame, is_known_op, text_field, unknown_fields};
 pub use payload::{Format, Payload, Raw};
 pub use png::{Png, PngError, decode_png, encode_png};
 pub use publish::Publish;
-pub use qos::{Durability, History, Liveliness, Period, Qos, Reliability};
+pub use qos::{
+    DurabilityPolicy, HistoryPolicy, LivelinessPolicy, Period, QosRequest, ReliabilityPolicy,
+};
 pub use service::{AdvertiseService, CallService, ServiceResponse, UnadvertiseService};
-pub use status::{Level, SetLevel, Status};
+pub use status::{SetLevel, Status, StatusLevel};
 pub use subscribe::{Compression, Subscribe, Unsubscribe};
 pub use writer::Writer;

@@ -1,33 +1,33 @@
-//! All ops in one place: which there are, and how a frame becomes one.
+//! The ops of the protocol, and parsing of frames into them.
 
 use std::borrow::Cow;
 
 use crate::fields::Fields;
 use crate::{
     ActionFeedback, ActionResult, Advertise, AdvertiseAction, AdvertiseService, Auth, CallService,
-    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, Qos,
+    CancelActionGoal, Error, Format, Fragment, Id, Payload, Png, Problem, Publish, QosRequest,
     SendActionGoal, ServiceResponse, SetLevel, Status, Subscribe, Unadvertise, UnadvertiseAction,
     UnadvertiseService, Unsubscribe, Writer,
 };
 
 /// One WebSocket message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Frame<'a> {
-    /// JSON.
+pub enum ProtocolFrame<'a> {
+    /// A text frame: JSON.
     Text(&'a str),
-    /// CBOR.
+    /// A binary frame: CBOR.
     Binary(&'a [u8]),
 }
 
-/// What every op has in common.
+/// Common interface of all ops.
 pub(crate) trait Message<'a>: Sized {
-    /// The name in `op`.
+    /// Value of the field `op`.
     const OP: &'static str;
-    /// Every field that the protocol gives it, apart from `op` and `id`.
+    /// All fields that the protocol defines for it, apart from `op` and `id`.
     const FIELDS: &'static [&'static str];
     /// Reads the fields.
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem>;
-    /// The message's `id` field.
+    /// Returns the `id` field.
     fn id(&self) -> Option<&Id<'a>>;
     /// Writes the fields, apart from `op` and `id`.
     fn write(&self, writer: &mut Writer<'_>);
@@ -41,7 +41,7 @@ macro_rules! ops {
             $($(#[doc = $doc])* $name($name<'a>),)*
         }
 
-        /// The names of all ops.
+        /// Names of all ops.
         pub(crate) const KNOWN: &[&str] = &[$(<$name<'static> as Message>::OP,)*];
 
         impl<'a> Op<'a> {
@@ -52,12 +52,12 @@ macro_rules! ops {
                 Err(Problem::UnknownOp(op.chars().take(64).collect()))
             }
 
-            /// The name in `op`.
+            /// Returns the value of the field `op`.
             pub fn name(&self) -> &'static str {
                 match self { $(Op::$name(_) => $name::OP,)* }
             }
 
-            /// The id of the interaction it belongs to.
+            /// Returns the id of the interaction it belongs to.
             pub fn id(&self) -> Option<&Id<'a>> {
                 match self { $(Op::$name(message) => message.id(),)* }
             }
@@ -85,59 +85,59 @@ macro_rules! ops {
     };
 }
 
-// The order is that of frequency: the first are compared first.
+// Sorted by frequency, since they are compared in this order.
 ops! {
-    /// A message on a topic, both ways.
+    /// A message on a topic, in both directions.
     Publish,
-    /// A part of a message that was cut.
+    /// A fragment of a message.
     Fragment,
-    /// A call to a service, both ways.
+    /// A call of a service, in both directions.
     CallService,
-    /// Its answer, both ways.
+    /// The answer to a service call, in both directions.
     ServiceResponse,
-    /// The client wants a topic.
+    /// The client subscribes to a topic.
     Subscribe,
-    /// The client wants it no longer.
+    /// The client ends a subscription.
     Unsubscribe,
-    /// The client will publish.
+    /// The client announces that it will publish.
     Advertise,
-    /// The client will publish no longer.
+    /// The client announces that it will no longer publish.
     Unadvertise,
     /// The client serves a service.
     AdvertiseService,
-    /// The client serves it no longer.
+    /// The client no longer serves a service.
     UnadvertiseService,
-    /// A goal for an action server, both ways.
+    /// A goal for an action server, in both directions.
     SendActionGoal,
-    /// The goal is no longer wanted, both ways.
+    /// Cancellation of a goal, in both directions.
     CancelActionGoal,
-    /// How a goal gets on, both ways.
+    /// Feedback on a goal, in both directions.
     ActionFeedback,
-    /// How a goal ended, both ways.
+    /// Result of a goal, in both directions.
     ActionResult,
     /// The client serves an action.
     AdvertiseAction,
-    /// The client serves it no longer.
+    /// The client no longer serves an action.
     UnadvertiseAction,
-    /// A message packed into a picture.
+    /// A message encoded as a PNG image.
     Png,
-    /// Which status messages the client wants.
+    /// The level of status messages that the client wants.
     SetLevel,
-    /// What the server has to say.
+    /// A status message from the server.
     Status,
     /// Credentials.
     Auth,
 }
 
 impl<'a> Op<'a> {
-    /// Reads one frame.
+    /// Parses one frame.
     ///
     /// # Errors
-    /// What is wrong with it, with the op and id where they could be read.
-    pub fn parse(frame: Frame<'a>) -> Result<Self, Error> {
+    /// Returns the mistake, with the op and id if they could be read.
+    pub fn parse(frame: ProtocolFrame<'a>) -> Result<Self, Error> {
         let fields = match frame {
-            Frame::Text(text) => Fields::of_json(text)?,
-            Frame::Binary(bytes) => Fields::of_cbor(bytes)?,
+            ProtocolFrame::Text(text) => Fields::from_json(text)?,
+            ProtocolFrame::Binary(bytes) => Fields::from_cbor(bytes)?,
         };
         let id = fields.id();
         let known = id.as_ref().ok().cloned().flatten().map(Id::into_owned);
@@ -175,36 +175,37 @@ impl<'a> Op<'a> {
     }
 }
 
-impl<'a> Frame<'a> {
-    /// The frame as one value.
+impl<'a> ProtocolFrame<'a> {
+    /// Returns the frame as one payload.
     pub fn payload(self) -> Payload<'a> {
         match self {
-            Frame::Text(text) => Payload::json(text),
-            Frame::Binary(bytes) => Payload::cbor(bytes),
+            ProtocolFrame::Text(text) => Payload::json(text),
+            ProtocolFrame::Binary(bytes) => Payload::cbor(bytes),
         }
     }
 
-    /// How it is written.
+    /// Returns the format of the frame.
     pub fn format(self) -> Format {
         self.payload().format
     }
 }
 
-/// Whether the protocol has such an op.
+/// Returns whether the protocol has this op.
 pub fn is_known_op(op: &str) -> bool {
     KNOWN.contains(&op)
 }
 
-/// A short text field of a frame, also of one that [`Op::parse`] refuses; none where it is not there or something else.
-pub fn text_field(frame: Frame<'_>, field: &'static str) -> Option<String> {
-    let fields = Fields::of(frame.payload()).ok()?;
+/// Reads a short string field of a frame, even of one that [`Op::parse`] refuses; `None` if the field is absent or
+/// something else.
+pub fn text_field(frame: ProtocolFrame<'_>, field: &'static str) -> Option<String> {
+    let fields = Fields::from_payload(frame.payload()).ok()?;
     Some(fields.text(field, "").ok()??.into_owned())
 }
 
-/// The fields of a frame that its op does not have: harmless, but often a misspelt one. Empty for frames that
+/// Returns the fields of a frame that its op does not define: harmless, but often misspelt. Empty for frames that
 /// [`Op::parse`] refuses.
-pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
-    let Ok(fields) = Fields::of(frame.payload()) else {
+pub fn unknown_fields(frame: ProtocolFrame<'_>) -> Vec<String> {
+    let Ok(fields) = Fields::from_payload(frame.payload()) else {
         return Vec::new();
     };
     let op: Option<Cow<'_, str>> = fields.text("op", "").ok().flatten();
@@ -216,7 +217,7 @@ pub fn unknown_fields(frame: Frame<'_>) -> Vec<String> {
         .filter(|name| !matches!(*name, "op" | "id") && !known.contains(name));
     let mut unknown: Vec<String> = names.map(str::to_owned).collect();
     if known.contains(&"qos") {
-        unknown.extend(Qos::unknown(&fields));
+        unknown.extend(QosRequest::unknown_names(&fields));
     }
     unknown
 }
@@ -236,35 +237,43 @@ pub(crate) mod tests {
         assert_eq!(named, KNOWN);
     }
 
-    /// Checks that `json` is read as `op` and that `op` survives printing and reading in both formats.
+    /// Asserts that `json` is parsed as `op` and that `op` survives printing and parsing in both formats.
     #[track_caller]
-    pub(crate) fn reads(json: &str, op: impl Into<Op<'static>>) {
+    pub(crate) fn assert_parses(json: &str, op: impl Into<Op<'static>>) {
         let op = op.into();
-        assert_eq!(Op::parse(Frame::Text(json)).as_ref(), Ok(&op), "{json}");
+        assert_eq!(
+            Op::parse(ProtocolFrame::Text(json)).as_ref(),
+            Ok(&op),
+            "{json}"
+        );
         let mut printed = Vec::new();
         op.print(&mut printed, Format::Json);
         assert_eq!(
-            Op::parse(Frame::Text(std::str::from_utf8(&printed).unwrap())).as_ref(),
+            Op::parse(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).as_ref(),
             Ok(&op)
         );
-        assert!(unknown_fields(Frame::Text(std::str::from_utf8(&printed).unwrap())).is_empty());
+        assert!(
+            unknown_fields(ProtocolFrame::Text(std::str::from_utf8(&printed).unwrap())).is_empty()
+        );
         serde_json::from_slice::<serde_json::Value>(&printed).unwrap();
     }
 
-    /// Checks that a message without payload survives CBOR.
+    /// Asserts that a message without payload survives CBOR.
     #[track_caller]
-    pub(crate) fn survives_cbor(op: impl Into<Op<'static>>) {
+    pub(crate) fn assert_survives_cbor(op: impl Into<Op<'static>>) {
         let op = op.into();
         let mut printed = Vec::new();
         op.print(&mut printed, Format::Cbor);
-        assert_eq!(Op::parse(Frame::Binary(&printed)).as_ref(), Ok(&op));
+        assert_eq!(Op::parse(ProtocolFrame::Binary(&printed)).as_ref(), Ok(&op));
     }
 
-    /// Checks that `json` is refused with this text.
+    /// Asserts that `json` is refused with this text.
     #[track_caller]
-    pub(crate) fn refuses(json: &str, text: &str) {
+    pub(crate) fn assert_refused(json: &str, text: &str) {
         assert_eq!(
-            Op::parse(Frame::Text(json)).unwrap_err().to_string(),
+            Op::parse(ProtocolFrame::Text(json))
+                .unwrap_err()
+                .to_string(),
             text,
             "{json}"
         );
@@ -272,58 +281,63 @@ pub(crate) mod tests {
 
     #[test]
     fn mistakes_keep_op_and_id() {
-        let error = Op::parse(Frame::Text(r#"{"op":"publish","id":7,"topic":3}"#)).unwrap_err();
+        let error =
+            Op::parse(ProtocolFrame::Text(r#"{"op":"publish","id":7,"topic":3}"#)).unwrap_err();
         assert_eq!(error.op.as_deref(), Some("publish"));
         assert_eq!(error.id, Some(Id::Integer(7)));
         assert_eq!(
             error.to_string(),
             "publish: field \"topic\" is 3, a topic name is expected"
         );
-        let error = Op::parse(Frame::Text(r#"{"op":"dance","id":"x"}"#)).unwrap_err();
+        let error = Op::parse(ProtocolFrame::Text(r#"{"op":"dance","id":"x"}"#)).unwrap_err();
         assert_eq!((error.op, error.id), (None, Some(Id::from("x"))));
     }
 
     #[test]
     fn frames_without_a_known_op_are_refused() {
-        let names = "publish, fragment, call_service, service_response, subscribe, unsubscribe, advertise, unadvertise, \
-                     advertise_service, unadvertise_service, send_action_goal, cancel_action_goal, action_feedback, \
-                     action_result, advertise_action, unadvertise_action, png, set_level, status, auth";
-        refuses(
+        let names = "publish, fragment, call_service, service_response, subscribe, unsubscribe, advertise, \
+                     unadvertise, advertise_service, unadvertise_service, send_action_goal, cancel_action_goal, \
+                     action_feedback, action_result, advertise_action, unadvertise_action, png, set_level, status, \
+                     auth";
+        assert_refused(
             "{}",
             &format!("field \"op\" is missing; it must be one of {names}"),
         );
-        refuses(
+        assert_refused(
             r#"{"op":"dance"}"#,
             &format!("unknown op \"dance\"; known are {names}"),
         );
-        refuses(
+        assert_refused(
             r#"{"op":5}"#,
             "field \"op\" is 5, the name of an operation is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"receiver":"/x","msg":[]}"#,
             &format!(
-                "field \"op\" is missing; it must be one of {names} (this looks like rosbridge 1.0; the server speaks 2.0)"
+                "field \"op\" is missing; it must be one of {names} (this looks like rosbridge 1.0; the server speaks \
+                 2.0)"
             ),
         );
-        refuses("hello", "invalid JSON at byte 0: an object is expected");
-        refuses("[]", "a frame must be one JSON object");
+        assert_refused("hello", "invalid JSON at byte 0: an object is expected");
+        assert_refused("[]", "a frame must be one JSON object");
         assert_eq!(
-            Op::parse(Frame::Binary(b"\x00")).unwrap_err().to_string(),
+            Op::parse(ProtocolFrame::Binary(b"\x00"))
+                .unwrap_err()
+                .to_string(),
             "a frame must be one CBOR map"
         );
-        assert!(Op::parse(Frame::Binary(&[0x13, 0x37, 0xff, 0xfe])).is_err());
+        assert!(Op::parse(ProtocolFrame::Binary(&[0x13, 0x37, 0xff, 0xfe])).is_err());
         let many: String = (0..1000).map(|n| format!("\"f{n}\":0,")).collect();
-        refuses(
+        assert_refused(
             &format!("{{{many}\"op\":\"auth\"}}"),
             "a message has at most 64 fields",
         );
         let long = "x".repeat(20_000);
-        refuses(
+        assert_refused(
             &format!(r#"{{"op":"unsubscribe","topic":"{long}"}}"#),
             "unsubscribe: field \"topic\" has 20002 bytes, at most 16384 are allowed",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"unsubscribe","id":{},"topic":"/x"}"#,
             "unsubscribe: field \"id\" is {}, a string or an integer is expected",
         );
@@ -331,21 +345,26 @@ pub(crate) mod tests {
 
     #[test]
     fn a_text_is_found_in_a_frame_that_is_refused() {
-        let frame = Frame::Text(r#"{"op":"call_service","service":"/add","args":5,"type":7}"#);
+        let frame =
+            ProtocolFrame::Text(r#"{"op":"call_service","service":"/add","args":5,"type":7}"#);
         assert!(Op::parse(frame).is_err());
         assert_eq!(text_field(frame, "service").as_deref(), Some("/add"));
         for field in ["args", "type", "id"] {
             assert_eq!(text_field(frame, field), None, "{field}");
         }
-        assert_eq!(text_field(Frame::Text("{"), "service"), None);
+        assert_eq!(text_field(ProtocolFrame::Text("{"), "service"), None);
     }
 
     #[test]
     fn unknown_fields_are_named() {
-        let frame = Frame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
+        let frame =
+            ProtocolFrame::Text(r#"{"op":"subscribe","id":"1","topic":"/x","trottle_rate":5}"#);
         assert!(Op::parse(frame).is_ok());
         assert_eq!(unknown_fields(frame), ["trottle_rate"]);
         let within = r#"{"op":"subscribe","topic":"/x","qos":{"depth":5,"reliabilty":"reliable"}}"#;
-        assert_eq!(unknown_fields(Frame::Text(within)), ["qos.reliabilty"]);
+        assert_eq!(
+            unknown_fields(ProtocolFrame::Text(within)),
+            ["qos.reliabilty"]
+        );
     }
 }

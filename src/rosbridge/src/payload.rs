@@ -1,4 +1,4 @@
-//! What the envelope carries: a message, a service's arguments, a goal.
+//! Content of an envelope: a message, a service's arguments, a goal.
 
 use std::borrow::Cow;
 
@@ -8,7 +8,7 @@ use crate::cbor;
 use crate::fields::Fields;
 use crate::{Error, Problem};
 
-/// How a frame is written.
+/// Format of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Format {
     /// Text frames.
@@ -17,16 +17,16 @@ pub enum Format {
     Cbor,
 }
 
-/// The slice of a frame that holds a value for a codec that knows its type.
+/// The slice of a frame that holds a value, for a codec that knows its type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Payload<'a> {
-    /// What the bytes are.
+    /// Format of the bytes.
     pub format: Format,
     /// One JSON value (valid UTF-8) or one CBOR item.
     pub bytes: &'a [u8],
 }
 
-/// A message in ROS's own serialization: `{"secs": …, "nsecs": …, "bytes": …}` of `cbor-raw`.
+/// A message in the serialization of ROS: `{"secs": …, "nsecs": …, "bytes": …}` of `cbor-raw`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Raw<'a> {
     /// The serialized message: a slice of a CBOR frame, or decoded from the base64 of a JSON frame.
@@ -34,7 +34,7 @@ pub struct Raw<'a> {
 }
 
 impl<'a> Payload<'a> {
-    /// A JSON payload.
+    /// Creates a JSON payload.
     pub fn json(text: &'a str) -> Self {
         Self {
             format: Format::Json,
@@ -42,7 +42,7 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// A CBOR payload.
+    /// Creates a CBOR payload.
     pub fn cbor(bytes: &'a [u8]) -> Self {
         Self {
             format: Format::Cbor,
@@ -50,7 +50,7 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// Whether it is a list (positional arguments) rather than an object.
+    /// Returns whether it is a list (positional arguments) rather than an object.
     pub fn is_list(&self) -> bool {
         match self.format {
             Format::Json => self.bytes.first() == Some(&b'['),
@@ -61,7 +61,7 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// Whether it is an object.
+    /// Returns whether it is an object.
     pub fn is_object(&self) -> bool {
         match self.format {
             Format::Json => self.bytes.first() == Some(&b'{'),
@@ -72,13 +72,13 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// The names of an object's fields; `None` where it is no object, or has more than any message.
+    /// Returns the names of an object's fields; `None` if it is not an object, or has more fields than any message.
     pub fn keys(&self) -> Option<Vec<String>> {
-        let fields = Fields::of(*self).ok()?;
+        let fields = Fields::from_payload(*self).ok()?;
         Some(fields.names().map(str::to_owned).collect())
     }
 
-    /// Whether it is `null`, which stands for nothing.
+    /// Returns whether it is `null`, which is treated as absent.
     pub fn is_null(&self) -> bool {
         match self.format {
             Format::Json => self.bytes == b"null",
@@ -86,18 +86,18 @@ impl<'a> Payload<'a> {
         }
     }
 
-    /// The text, where it is a string: what a failed `service_response` says.
+    /// Returns the text if it is a string, as in a failed `service_response`.
     pub fn text(&self) -> Option<Cow<'a, str>> {
         match self.format {
             Format::Json => crate::json::unescape(std::str::from_utf8(self.bytes).ok()?),
             Format::Cbor => {
-                let text = cbor::Cursor::new(self.bytes).string(cbor::TEXT)?;
+                let text = cbor::CborCursor::new(self.bytes).string(cbor::TEXT)?;
                 std::str::from_utf8(text).ok().map(Cow::Borrowed)
             }
         }
     }
 
-    /// How many values a list has; `None` where it is no list.
+    /// Returns the length of a list; `None` if it is not a list.
     pub fn list_len(&self) -> Option<usize> {
         Some(self.items()?.len())
     }
@@ -106,15 +106,16 @@ impl<'a> Payload<'a> {
         match self.format {
             Format::Json => {
                 let text = std::str::from_utf8(self.bytes).ok()?;
-                crate::json::Cursor::new(text).list()
+                crate::json::JsonCursor::new(text).list()
             }
-            Format::Cbor => cbor::Cursor::new(self.bytes).list(),
+            Format::Cbor => cbor::CborCursor::new(self.bytes).list(),
         }
     }
 
-    /// A list of positional arguments as an object with these names, in the same format. Names that have no argument
-    /// are left out, as are arguments that have no name. `None` where it is no list, or names more than 23.
-    pub fn named<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Option<Vec<u8>> {
+    /// Converts a list of positional arguments to an object with these names, in the same format. Names without an
+    /// argument are left out, as are arguments without a name. `None` if it is not a list, or has more than 23 named
+    /// arguments.
+    pub fn to_named_object<'n>(&self, names: impl IntoIterator<Item = &'n str>) -> Option<Vec<u8>> {
         let items = self.items()?;
         let mut out = Vec::with_capacity(self.bytes.len() + 16 * items.len());
         let mut writer = crate::Writer::new(&mut out, self.format);
@@ -129,13 +130,13 @@ impl<'a> Payload<'a> {
         Some(out)
     }
 
-    /// Reads it as [`Raw`].
+    /// Parses it as [`Raw`].
     pub fn raw(&self) -> Result<Raw<'a>, Error> {
         const EXPECTED: &str = "the ROS serialization as a byte string (base64 in JSON)";
-        let fields = Fields::of(*self)?;
-        let value = fields.required("bytes", EXPECTED)?;
+        let fields = Fields::from_payload(*self)?;
+        let value = fields.require("bytes", EXPECTED)?;
         let bytes = match self.format {
-            Format::Cbor => cbor::Cursor::new(value)
+            Format::Cbor => cbor::CborCursor::new(value)
                 .string(cbor::BYTES)
                 .map(Cow::Borrowed),
             Format::Json => std::str::from_utf8(value)
@@ -149,7 +150,7 @@ impl<'a> Payload<'a> {
             None => Err(Problem::Mistyped {
                 field: "bytes",
                 expected: EXPECTED,
-                found: fields.shown(value),
+                found: fields.describe(value),
             }
             .into()),
         }
@@ -187,23 +188,30 @@ mod tests {
     #[test]
     fn positional_arguments_get_their_names() {
         let named = Payload::json(r#"[1, "x", {"y":[2]}]"#)
-            .named(["a", "b", "c", "d"])
+            .to_named_object(["a", "b", "c", "d"])
             .unwrap();
         assert_eq!(
             std::str::from_utf8(&named).unwrap(),
             r#"{"a":1,"b":"x","c":{"y":[2]}}"#
         );
-        assert_eq!(Payload::json("[]").named(["a"]).unwrap(), b"{}");
-        assert_eq!(Payload::json("[1,2]").named(["a"]).unwrap(), br#"{"a":1}"#);
+        assert_eq!(Payload::json("[]").to_named_object(["a"]).unwrap(), b"{}");
+        assert_eq!(
+            Payload::json("[1,2]").to_named_object(["a"]).unwrap(),
+            br#"{"a":1}"#
+        );
         assert_eq!(Payload::json("[1,2]").list_len(), Some(2));
         assert_eq!(Payload::json("{}").list_len(), None);
-        assert_eq!(Payload::json("{}").named(["a"]), None);
+        assert_eq!(Payload::json("{}").to_named_object(["a"]), None);
         assert_eq!(
-            Payload::cbor(b"\x82\x01\x61x").named(["a", "b"]).unwrap(),
+            Payload::cbor(b"\x82\x01\x61x")
+                .to_named_object(["a", "b"])
+                .unwrap(),
             b"\xa2\x61a\x01\x61b\x61x"
         );
         assert_eq!(
-            Payload::cbor(b"\x9f\x01\xff").named(["a", "b"]).unwrap(),
+            Payload::cbor(b"\x9f\x01\xff")
+                .to_named_object(["a", "b"])
+                .unwrap(),
             b"\xa1\x61a\x01"
         );
     }

@@ -1,4 +1,4 @@
-//! `png`: a message's text as the pixels of a picture, which compresses it.
+//! `png`: a message's text as the pixels of an image, which compresses it.
 
 use std::borrow::Cow;
 use std::io::Cursor;
@@ -9,19 +9,19 @@ use crate::fields::Fields;
 use crate::op::Message;
 use crate::{Fragment, Id, Problem, Writer};
 
-/// A packed message, or a part of one.
+/// A message encoded as a PNG image, or a part of one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Png<'a> {
-    /// Which message it belongs to, where it is a part.
+    /// Id of the message it belongs to, if it is a part.
     pub id: Option<Id<'a>>,
-    /// The picture in base64, or a piece of that text.
+    /// The image in base64, or a piece of that text.
     pub data: Cow<'a, str>,
-    /// Which piece of how many, where it is one.
+    /// Index and number of the parts, if it is a part.
     pub part: Option<(u64, u64)>,
 }
 
 impl<'a> Png<'a> {
-    /// The part as a fragment of the base64 text.
+    /// Returns a part as a fragment of the base64 text.
     pub fn fragment(&self) -> Option<Fragment<'a>> {
         let ((num, total), id) = (self.part?, self.id.clone()?);
         Some(Fragment {
@@ -85,24 +85,24 @@ impl<'a> Message<'a> for Png<'a> {
     }
 }
 
-/// Why a picture could not be read.
+/// Reason why an image could not be decoded.
 #[derive(Debug, thiserror::Error)]
 pub enum PngError {
     /// `data` is not base64.
     #[error("field \"data\" is not base64")]
     Base64,
-    /// It is no picture.
+    /// It is not a PNG image.
     #[error("field \"data\" is not a PNG picture: {0}")]
     Picture(#[from] png::DecodingError),
-    /// Its pixels are not bytes of text.
+    /// The pixel format is not one that holds text.
     #[error("the picture has {0}, 8 bits of grey, RGB or RGBA are expected")]
     Pixels(String),
-    /// It unpacks to too much.
+    /// The decoded image is too large.
     #[error("the picture unpacks to {found} bytes, at most {limit} are allowed")]
     TooLarge {
-        /// Bytes that it would take.
+        /// Bytes of the decoded image.
         found: u64,
-        /// Bytes that it may take.
+        /// Maximum bytes.
         limit: usize,
     },
     /// The pixels are not UTF-8.
@@ -110,10 +110,10 @@ pub enum PngError {
     Text,
 }
 
-/// The text in a picture given as base64; at most `limit` bytes of it.
+/// Decodes the text of an image given in base64, of at most `limit` bytes.
 ///
 /// # Errors
-/// When it is no such picture, or a bomb.
+/// Fails if it is not such an image, or a decompression bomb.
 pub fn decode_png(data: &str, limit: usize) -> Result<String, PngError> {
     let file = STANDARD
         .decode_to_vec(data.trim_ascii())
@@ -141,7 +141,7 @@ pub fn decode_png(data: &str, limit: usize) -> Result<String, PngError> {
     }
     let mut pixels = vec![0; found as usize];
     reader.next_frame(&mut pixels)?;
-    // The packer pads with line feeds (rosbridge) or zeros.
+    // Encoders pad with line feeds (rosbridge) or zeros.
     let end = pixels
         .iter()
         .rposition(|&byte| byte != b'\n' && byte != 0)
@@ -150,10 +150,10 @@ pub fn decode_png(data: &str, limit: usize) -> Result<String, PngError> {
     String::from_utf8(pixels).map_err(|_| PngError::Text)
 }
 
-/// A picture (base64) that holds a text: nearly square, RGB, padded with line feeds as rosbridge_suite does.
+/// Encodes a text as an image in base64: nearly square, RGB, padded with line feeds as in rosbridge_suite.
 ///
 /// # Errors
-/// When the text is longer than a picture can be.
+/// Fails if the text is longer than an image can be.
 pub fn encode_png(text: &[u8]) -> Result<String, png::EncodingError> {
     let pixels = text.len().div_ceil(3).max(1);
     let width = pixels.isqrt().max(1);
@@ -176,7 +176,7 @@ pub fn encode_png(text: &[u8]) -> Result<String, png::EncodingError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     #[test]
     fn png_is_read_and_checked() {
@@ -185,26 +185,26 @@ mod tests {
             data: "iVBO".into(),
             part: None,
         };
-        reads(r#"{"op":"png","data":"iVBO"}"#, whole.clone());
-        survives_cbor(whole);
+        assert_parses(r#"{"op":"png","data":"iVBO"}"#, whole.clone());
+        assert_survives_cbor(whole);
         let part = Png {
             id: Some("a".into()),
             data: "iVBO".into(),
             part: Some((1, 3)),
         };
-        reads(
+        assert_parses(
             r#"{"op":"png","id":"a","data":"iVBO","num":1,"total":3}"#,
             part,
         );
-        refuses(
+        assert_refused(
             r#"{"op":"png"}"#,
             "png: field \"data\" is missing, a picture in base64 is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"png","id":"a","data":"","num":1}"#,
             "png: field \"total\" is missing, the number of parts, 1 or more, is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"png","data":"","num":1,"total":2}"#,
             "png: field \"id\" is missing, the id common to all parts is expected",
         );

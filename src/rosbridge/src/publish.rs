@@ -4,32 +4,33 @@ use std::borrow::Cow;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Compression, Format, Id, Payload, Problem, Qos, Writer};
+use crate::{Compression, Format, Id, Payload, Problem, QosRequest, Writer};
 
-/// "Here is a message."
+/// A message on a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Publish<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The topic's name.
+    /// Name of the topic.
     pub topic: Cow<'a, str>,
-    /// The message, an empty object where the client gave none; [`Payload::raw`] where `compression` is `cbor-raw`.
+    /// The message; an empty object if the client gave none; [`Payload::raw`] if `compression` is `cbor-raw`.
     pub msg: Payload<'a>,
-    /// What `msg` holds. Upwards `cbor-raw` must be said; downwards the client knows what it asked for.
+    /// Encoding of `msg`. Clients must say `cbor-raw` when they send it; the server does not repeat what a client asked
+    /// for.
     pub compression: Compression,
-    /// Some clients repeat it here instead of in `advertise`.
+    /// Latches, as in `advertise`; some clients repeat it here instead.
     pub latch: bool,
-    /// `package/Type`, where the client has not advertised (extension).
+    /// `package/Type`, if the client has not advertised (extension).
     pub type_name: Option<Cow<'a, str>>,
-    /// What the client offers, where it has not advertised.
-    pub qos: Option<Qos>,
+    /// Quality of service offered, if the client has not advertised.
+    pub qos: Option<QosRequest>,
 }
 
 impl<'a> Publish<'a> {
-    /// Appends a whole frame for a client, the message written in place by `msg`.
+    /// Appends a whole frame for a client; `msg` writes the message in place.
     ///
     /// # Errors
-    /// What `msg` returns; `out` then ends in a torn frame.
+    /// Returns the error of `msg`; `out` then ends in an incomplete frame.
     pub fn print_with<E>(
         out: &mut Vec<u8>,
         format: Format,
@@ -43,7 +44,7 @@ impl<'a> Publish<'a> {
         Ok(())
     }
 
-    /// Appends a whole `cbor-raw` frame: a serialized message and when it was received.
+    /// Appends a whole `cbor-raw` frame: a serialized message and its time of reception.
     pub fn print_raw(out: &mut Vec<u8>, topic: &str, stamp: (u32, u32), bytes: &[u8]) {
         let mut writer = Writer::op(out, Format::Cbor, Self::OP, None);
         writer.text("topic", topic);
@@ -72,7 +73,7 @@ impl<'a> Message<'a> for Publish<'a> {
             compression: Compression::read(fields)?,
             latch: fields.boolean("latch")?.unwrap_or(false),
             type_name: fields.text("type", "a message type such as \"std_msgs/String\"")?,
-            qos: Qos::read(fields)?,
+            qos: QosRequest::read(fields)?,
         })
     }
 
@@ -87,7 +88,7 @@ impl<'a> Message<'a> for Publish<'a> {
         if self.latch {
             writer.boolean("latch", true);
         }
-        Qos::write(self.qos, writer);
+        QosRequest::write(self.qos, writer);
         writer.payload("msg", self.msg);
     }
 }
@@ -95,8 +96,8 @@ impl<'a> Message<'a> for Publish<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses};
-    use crate::{Frame, Op};
+    use crate::op::tests::{assert_parses, assert_refused};
+    use crate::{Op, ProtocolFrame};
 
     fn hello() -> Publish<'static> {
         Publish {
@@ -112,11 +113,11 @@ mod tests {
 
     #[test]
     fn publish_is_read() {
-        reads(
+        assert_parses(
             r#"{"op":"publish","topic":"/chatter","msg":{"data":"hello"}}"#,
             hello(),
         );
-        reads(
+        assert_parses(
             r#"{"msg":{"data":"hello"},"latch":true,"topic":"/chatter","id":"publish:/chatter:1","op":"publish"}"#,
             Publish {
                 id: Some("publish:/chatter:1".into()),
@@ -132,10 +133,10 @@ mod tests {
             msg: Payload::json("{}"),
             ..hello()
         };
-        reads(r#"{"op":"publish","topic":"/chatter"}"#, empty.clone());
-        reads(r#"{"op":"publish","topic":"/chatter","msg":null}"#, empty);
+        assert_parses(r#"{"op":"publish","topic":"/chatter"}"#, empty.clone());
+        assert_parses(r#"{"op":"publish","topic":"/chatter","msg":null}"#, empty);
         let frame = b"\xa2\x62op\x67publish\x65topic\x62/x";
-        let Op::Publish(read) = Op::parse(Frame::Binary(frame)).unwrap() else {
+        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(frame)).unwrap() else {
             panic!("not a publish")
         };
         assert_eq!(read.msg, Payload::cbor(b"\xa0"));
@@ -143,15 +144,15 @@ mod tests {
 
     #[test]
     fn publish_is_checked() {
-        refuses(
+        assert_refused(
             r#"{"op":"publish","msg":{}}"#,
             "publish: field \"topic\" is missing, a topic name is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"publish","topic":"/x","msg":[1,2]}"#,
             "publish: field \"msg\" is [1,2], an object with the message's fields is expected",
         );
-        refuses(
+        assert_refused(
             &format!(
                 r#"{{"op":"publish","topic":"/x","msg":"{}"}}"#,
                 "ü".repeat(100)
@@ -178,7 +179,7 @@ mod tests {
 
         let mut out = Vec::new();
         Publish::print_raw(&mut out, "/chatter", (5, 6), b"\x01\x02");
-        let Op::Publish(read) = Op::parse(Frame::Binary(&out)).unwrap() else {
+        let Op::Publish(read) = Op::parse(ProtocolFrame::Binary(&out)).unwrap() else {
             panic!("not a publish")
         };
         assert_eq!(&*read.msg.raw().unwrap().bytes, b"\x01\x02");

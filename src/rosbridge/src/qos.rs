@@ -1,6 +1,6 @@
-//! `qos` in `advertise`, `publish` and `subscribe`: the quality of service that a client asks for, in the words of ROS 2, as
-//! rosbridge_suite 4 reads it. Policies are words or the numbers of `rmw/types.h`; what a client leaves out, or calls
-//! `system_default`, it does not ask for.
+//! `qos` in `advertise`, `publish` and `subscribe`: the quality of service requested by a client, in the terms of ROS
+//! 2, as read by rosbridge_suite 4. Policies are words or the numbers of `rmw/types.h`; a policy that is left out or
+//! `system_default` is not requested.
 
 use std::time::Duration;
 
@@ -11,141 +11,141 @@ const QOS: &str = "an object such as {\"reliability\": \"best_effort\", \"depth\
 const SECONDS: &str = "a number of seconds, {\"sec\": 0, \"nanosec\": 0} or infinite,";
 const SECONDS_OR_BEST: &str =
     "a number of seconds, {\"sec\": 0, \"nanosec\": 0}, infinite or best_available";
-/// What rmw takes for no end, in seconds: the most that an int64 holds of nanoseconds.
+/// Seconds that rmw treats as infinite: the largest int64 of nanoseconds.
 const NO_END: u64 = i64::MAX as u64 / 1_000_000_000;
 
-/// How many messages are kept for who is slow.
+/// Number of messages kept for slow subscribers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum History {
-    /// The last ones, as many as `depth` says.
+pub enum HistoryPolicy {
+    /// The last ones, up to `depth`.
     KeepLast,
     /// All, as far as there is room.
     KeepAll,
 }
 
-/// Whether messages may be lost on the way.
+/// Delivery guarantee of messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Reliability {
-    /// Sent again until they have come.
+pub enum ReliabilityPolicy {
+    /// Resent until received.
     Reliable,
     /// Sent once.
     BestEffort,
-    /// The better one that the ends there are allow.
+    /// The better one that the existing endpoints support.
     BestAvailable,
 }
 
-/// What newcomers among the subscribers are given.
+/// Messages delivered to new subscribers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Durability {
-    /// Also what was published before.
+pub enum DurabilityPolicy {
+    /// Also those published earlier.
     TransientLocal,
-    /// What is published from then on.
+    /// Only those published from then on.
     Volatile,
-    /// The better one that the ends there are allow.
+    /// The better one that the existing endpoints support.
     BestAvailable,
 }
 
-/// Who says that a publisher is alive.
+/// Assertion that a publisher is alive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Liveliness {
-    /// ROS, for as long as its node is there.
+pub enum LivelinessPolicy {
+    /// The middleware, for as long as the node runs.
     Automatic,
-    /// Its program.
+    /// The publisher's program.
     ManualByTopic,
-    /// The better one that the ends there are allow.
+    /// The better one that the existing endpoints support.
     BestAvailable,
 }
 
-/// A length of time that a policy speaks of.
+/// Duration of a policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Period {
-    /// So long; never zero, by which rmw says nothing.
+    /// A finite duration; never zero, which means unspecified in rmw.
     Of(Duration),
-    /// Without end.
+    /// No limit.
     Infinite,
-    /// The shortest one that the ends there are allow.
+    /// The shortest one that the existing endpoints support.
     BestAvailable,
 }
 
-/// What a client asks for; none of what it leaves to the server.
+/// Policies requested or offered by a client; `None` for those left to the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
-pub struct Qos {
-    /// How many messages are kept.
-    pub history: Option<History>,
-    /// How many with [`History::KeepLast`]; never 0.
+pub struct QosRequest {
+    /// History policy.
+    pub history: Option<HistoryPolicy>,
+    /// Number of messages for [`HistoryPolicy::KeepLast`]; never 0.
     pub depth: Option<usize>,
-    /// Whether messages may be lost.
-    pub reliability: Option<Reliability>,
-    /// What newcomers are given.
-    pub durability: Option<Durability>,
-    /// The longest time between two messages.
+    /// Reliability policy.
+    pub reliability: Option<ReliabilityPolicy>,
+    /// Durability policy.
+    pub durability: Option<DurabilityPolicy>,
+    /// Maximum time between two messages.
     pub deadline: Option<Period>,
-    /// After which time a message is of no use; never [`Period::BestAvailable`].
+    /// Time after which a message is discarded as too old; never [`Period::BestAvailable`].
     pub lifespan: Option<Period>,
-    /// Who says that a publisher is alive.
-    pub liveliness: Option<Liveliness>,
-    /// Within which time.
+    /// Liveliness policy.
+    pub liveliness: Option<LivelinessPolicy>,
+    /// Time within which a publisher must assert its liveliness.
     pub liveliness_lease_duration: Option<Period>,
 }
 
-/// One policy that is chosen by a word.
-struct Policy<T: 'static> {
+/// A policy that is chosen by a keyword.
+struct PolicyField<T: 'static> {
     key: &'static str,
-    /// As problems call it.
+    /// Name of the field in error messages.
     field: &'static str,
     expected: &'static str,
-    /// Words, their numbers, and what they mean; nothing, where that is the server's choice.
+    /// Keywords, their numbers and values; `None` for the server's choice.
     choices: &'static [(&'static str, i64, Option<T>)],
 }
 
-const HISTORY: Policy<History> = Policy {
+const HISTORY: PolicyField<HistoryPolicy> = PolicyField {
     key: "history",
     field: "qos.history",
     expected: "keep_last (1), keep_all (2) or system_default (0)",
     choices: &[
         ("system_default", 0, None),
-        ("keep_last", 1, Some(History::KeepLast)),
-        ("keep_all", 2, Some(History::KeepAll)),
+        ("keep_last", 1, Some(HistoryPolicy::KeepLast)),
+        ("keep_all", 2, Some(HistoryPolicy::KeepAll)),
     ],
 };
 
-const RELIABILITY: Policy<Reliability> = Policy {
+const RELIABILITY: PolicyField<ReliabilityPolicy> = PolicyField {
     key: "reliability",
     field: "qos.reliability",
     expected: "reliable (1), best_effort (2), best_available (4) or system_default (0)",
     choices: &[
         ("system_default", 0, None),
-        ("reliable", 1, Some(Reliability::Reliable)),
-        ("best_effort", 2, Some(Reliability::BestEffort)),
-        ("best_available", 4, Some(Reliability::BestAvailable)),
+        ("reliable", 1, Some(ReliabilityPolicy::Reliable)),
+        ("best_effort", 2, Some(ReliabilityPolicy::BestEffort)),
+        ("best_available", 4, Some(ReliabilityPolicy::BestAvailable)),
     ],
 };
 
-const DURABILITY: Policy<Durability> = Policy {
+const DURABILITY: PolicyField<DurabilityPolicy> = PolicyField {
     key: "durability",
     field: "qos.durability",
     expected: "transient_local (1), volatile (2), best_available (4) or system_default (0)",
     choices: &[
         ("system_default", 0, None),
-        ("transient_local", 1, Some(Durability::TransientLocal)),
-        ("volatile", 2, Some(Durability::Volatile)),
-        ("best_available", 4, Some(Durability::BestAvailable)),
+        ("transient_local", 1, Some(DurabilityPolicy::TransientLocal)),
+        ("volatile", 2, Some(DurabilityPolicy::Volatile)),
+        ("best_available", 4, Some(DurabilityPolicy::BestAvailable)),
     ],
 };
 
-const LIVELINESS: Policy<Liveliness> = Policy {
+const LIVELINESS: PolicyField<LivelinessPolicy> = PolicyField {
     key: "liveliness",
     field: "qos.liveliness",
     expected: "automatic (1), manual_by_topic (3), best_available (5) or system_default (0)",
     choices: &[
         ("system_default", 0, None),
-        ("automatic", 1, Some(Liveliness::Automatic)),
-        ("manual_by_topic", 3, Some(Liveliness::ManualByTopic)),
-        ("best_available", 5, Some(Liveliness::BestAvailable)),
+        ("automatic", 1, Some(LivelinessPolicy::Automatic)),
+        ("manual_by_topic", 3, Some(LivelinessPolicy::ManualByTopic)),
+        ("best_available", 5, Some(LivelinessPolicy::BestAvailable)),
     ],
 };
 
-/// Every name in a `qos` object.
+/// Names allowed in a `qos` object.
 const NAMES: [&str; 9] = [
     "history",
     "depth",
@@ -158,7 +158,7 @@ const NAMES: [&str; 9] = [
     "avoid_ros_namespace_conventions",
 ];
 
-impl<T: Copy + PartialEq + 'static> Policy<T> {
+impl<T: Copy + PartialEq + 'static> PolicyField<T> {
     fn read(&self, fields: &Fields<'_>) -> Result<Option<T>, Problem> {
         let Some(value) = fields.get(self.key) else {
             return Ok(None);
@@ -174,7 +174,7 @@ impl<T: Copy + PartialEq + 'static> Policy<T> {
         };
         match self.choices.iter().find(meant) {
             Some((.., choice)) => Ok(*choice),
-            None => Err(fields.mistyped(self.field, self.expected, value)),
+            None => Err(fields.mistyped_error(self.field, self.expected, value)),
         }
     }
 
@@ -186,34 +186,34 @@ impl<T: Copy + PartialEq + 'static> Policy<T> {
     }
 }
 
-impl Qos {
-    /// The `qos` of an operation, where it has one.
+impl QosRequest {
+    /// Reads the `qos` of an operation, if it has one.
     pub(crate) fn read(fields: &Fields<'_>) -> Result<Option<Self>, Problem> {
         let Some(value) = fields.get("qos") else {
             return Ok(None);
         };
-        let Some(qos) = inner(fields) else {
-            return Err(fields.mistyped("qos", QOS, value));
+        let Some(qos) = qos_fields(fields) else {
+            return Err(fields.mistyped_error("qos", QOS, value));
         };
         let depth = qos.get("depth").map(|value| match qos.as_integer(value) {
-            // More than can be counted is as good as all.
+            // A depth too large for usize means all.
             Some(depth) if depth >= 0 => Ok(usize::try_from(depth).unwrap_or(usize::MAX)),
-            _ => Err(qos.mistyped("qos.depth", "a number of messages, 0 or more,", value)),
+            _ => Err(qos.mistyped_error("qos.depth", "a number of messages, 0 or more,", value)),
         });
         let own_names = qos.get("avoid_ros_namespace_conventions");
         if let Some(value) = own_names.filter(|value| qos.as_boolean(value) != Some(false)) {
             let field = "qos.avoid_ros_namespace_conventions";
-            return Err(qos.mistyped(field, "false (names are those of ROS)", value));
+            return Err(qos.mistyped_error(field, "false (names are those of ROS)", value));
         }
         Ok(Some(Self {
             history: HISTORY.read(&qos)?,
             depth: depth.transpose()?.filter(|depth| *depth > 0),
             reliability: RELIABILITY.read(&qos)?,
             durability: DURABILITY.read(&qos)?,
-            deadline: period(&qos, "deadline", "qos.deadline", true)?,
-            lifespan: period(&qos, "lifespan", "qos.lifespan", false)?,
+            deadline: parse_period(&qos, "deadline", "qos.deadline", true)?,
+            lifespan: parse_period(&qos, "lifespan", "qos.lifespan", false)?,
             liveliness: LIVELINESS.read(&qos)?,
-            liveliness_lease_duration: period(
+            liveliness_lease_duration: parse_period(
                 &qos,
                 "liveliness_lease_duration",
                 "qos.liveliness_lease_duration",
@@ -222,9 +222,9 @@ impl Qos {
         }))
     }
 
-    /// Names in the `qos` of an operation that mean nothing, as `qos.name`.
-    pub(crate) fn unknown(fields: &Fields<'_>) -> Vec<String> {
-        let qos = inner(fields);
+    /// Returns the unknown names in the `qos` of an operation, as `qos.name`.
+    pub(crate) fn unknown_names(fields: &Fields<'_>) -> Vec<String> {
+        let qos = qos_fields(fields);
         let names = qos.iter().flat_map(Fields::names);
         let unknown = names.filter(|name| !NAMES.contains(name));
         unknown.map(|name| format!("qos.{name}")).collect()
@@ -246,13 +246,13 @@ impl Qos {
     }
 }
 
-/// The fields of `qos`; none where it is no object.
-fn inner<'a>(fields: &Fields<'a>) -> Option<Fields<'a>> {
-    Fields::of(fields.payload("qos")?).ok()
+/// Returns the fields of `qos`; `None` if it is not an object.
+fn qos_fields<'a>(fields: &Fields<'a>) -> Option<Fields<'a>> {
+    Fields::from_payload(fields.payload("qos")?).ok()
 }
 
-/// A length of time, nothing where it is zero. `best`: whether it may be the best there is.
-fn period(
+/// Reads a duration; `None` if it is zero. `best`: whether `best_available` is allowed.
+fn parse_period(
     fields: &Fields<'_>,
     key: &'static str,
     field: &'static str,
@@ -272,12 +272,15 @@ fn period(
             Some(long.map_or(Period::Infinite, Period::Of))
         }
         (None, Some(_)) => None,
-        (None, None) => fields.payload(key).and_then(parts).map(Period::Of),
+        (None, None) => fields
+            .payload(key)
+            .and_then(parse_time_parts)
+            .map(Period::Of),
     };
     match read {
         None => {
             let expected = if best { SECONDS_OR_BEST } else { SECONDS };
-            Err(fields.mistyped(field, expected, value))
+            Err(fields.mistyped_error(field, expected, value))
         }
         Some(Period::Of(long)) if long.is_zero() => Ok(None),
         Some(Period::Of(long)) if long.as_secs() >= NO_END => Ok(Some(Period::Infinite)),
@@ -285,9 +288,9 @@ fn period(
     }
 }
 
-/// Seconds and nanoseconds, by either ROS's names.
-fn parts(value: Payload<'_>) -> Option<Duration> {
-    let fields = Fields::of(value).ok()?;
+/// Reads seconds and nanoseconds, by the names of either ROS version.
+fn parse_time_parts(value: Payload<'_>) -> Option<Duration> {
+    let fields = Fields::from_payload(value).ok()?;
     let part = |names: [&str; 3]| {
         let value = names.iter().find_map(|name| fields.get(name))?;
         u64::try_from(fields.as_integer(value)?).ok()

@@ -1,8 +1,8 @@
 use super::*;
-use crate::op::tests::{reads, refuses, survives_cbor};
+use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 use crate::{Advertise, Publish, Subscribe};
 
-fn subscribed(qos: Qos) -> Subscribe<'static> {
+fn subscribe_op(qos: QosRequest) -> Subscribe<'static> {
     Subscribe {
         id: None,
         topic: "/x".into(),
@@ -15,79 +15,79 @@ fn subscribed(qos: Qos) -> Subscribe<'static> {
     }
 }
 
-/// A subscription to `/x` with this `qos`.
-fn with(qos: &str) -> String {
+/// Returns the JSON of a subscription to `/x` with this `qos`.
+fn subscribe_json(qos: &str) -> String {
     format!(r#"{{"op":"subscribe","topic":"/x","qos":{qos}}}"#)
 }
 
 #[track_caller]
-fn means(qos: &str, meant: Qos) {
-    reads(&with(qos), subscribed(meant));
-    survives_cbor(subscribed(meant));
+fn assert_qos(qos: &str, meant: QosRequest) {
+    assert_parses(&subscribe_json(qos), subscribe_op(meant));
+    assert_survives_cbor(subscribe_op(meant));
 }
 
-fn all() -> Qos {
-    Qos {
-        history: Some(History::KeepLast),
+fn all() -> QosRequest {
+    QosRequest {
+        history: Some(HistoryPolicy::KeepLast),
         depth: Some(5),
-        reliability: Some(Reliability::BestEffort),
-        durability: Some(Durability::TransientLocal),
+        reliability: Some(ReliabilityPolicy::BestEffort),
+        durability: Some(DurabilityPolicy::TransientLocal),
         deadline: Some(Period::Of(Duration::from_millis(1500))),
         lifespan: Some(Period::Infinite),
-        liveliness: Some(Liveliness::ManualByTopic),
+        liveliness: Some(LivelinessPolicy::ManualByTopic),
         liveliness_lease_duration: Some(Period::Of(Duration::new(2, 3))),
     }
 }
 
 #[test]
 fn policies_are_words_or_numbers() {
-    means(
+    assert_qos(
         r#"{"history":"keep_last","depth":5,"reliability":"best_effort","durability":"transient_local","deadline":1.5,
             "lifespan":"infinite","liveliness":"manual_by_topic","liveliness_lease_duration":{"sec":2,"nanosec":3},
             "avoid_ros_namespace_conventions":false}"#,
         all(),
     );
-    means(
+    assert_qos(
         r#"{"history":1,"depth":5.0,"reliability":2,"durability":1,"deadline":{"secs":1,"nsecs":500000000},
             "lifespan":1e300,"liveliness":3,"liveliness_lease_duration":{"sec":2,"nsec":3}}"#,
         all(),
     );
-    means(
+    assert_qos(
         r#"{"history":"KEEP_ALL","reliability":"Reliable","durability":"VOLATILE"}"#,
-        Qos {
-            history: Some(History::KeepAll),
-            reliability: Some(Reliability::Reliable),
-            durability: Some(Durability::Volatile),
-            ..Qos::default()
+        QosRequest {
+            history: Some(HistoryPolicy::KeepAll),
+            reliability: Some(ReliabilityPolicy::Reliable),
+            durability: Some(DurabilityPolicy::Volatile),
+            ..QosRequest::default()
         },
     );
-    means(
+    assert_qos(
         r#"{"reliability":4,"durability":"best_available","deadline":"best_available","liveliness":5,
             "liveliness_lease_duration":"best_available"}"#,
-        Qos {
-            reliability: Some(Reliability::BestAvailable),
-            durability: Some(Durability::BestAvailable),
+        QosRequest {
+            reliability: Some(ReliabilityPolicy::BestAvailable),
+            durability: Some(DurabilityPolicy::BestAvailable),
             deadline: Some(Period::BestAvailable),
-            liveliness: Some(Liveliness::BestAvailable),
+            liveliness: Some(LivelinessPolicy::BestAvailable),
             liveliness_lease_duration: Some(Period::BestAvailable),
-            ..Qos::default()
+            ..QosRequest::default()
         },
     );
 }
 
 #[test]
 fn what_says_nothing_leaves_the_choice_to_the_server() {
-    means("{}", Qos::default());
-    means(
+    assert_qos("{}", QosRequest::default());
+    assert_qos(
         r#"{"history":0,"depth":0,"reliability":"system_default","durability":null,"deadline":0,
             "lifespan":{"sec":0,"nanosec":0},"liveliness":"System_Default"}"#,
-        Qos::default(),
+        QosRequest::default(),
     );
     let none = Subscribe {
         qos: None,
-        ..subscribed(Qos::default())
+        ..subscribe_op(QosRequest::default())
     };
-    reads(&with("null"), none);
+    assert_parses(&subscribe_json("null"), none);
 }
 
 #[test]
@@ -98,20 +98,20 @@ fn the_longest_times_are_without_end() {
         r#"{"sec":9223372036854775807,"nanosec":9223372036854775807}"#,
     ] {
         let qos = format!(r#"{{"deadline":{long}}}"#);
-        means(
+        assert_qos(
             &qos,
-            Qos {
+            QosRequest {
                 deadline: Some(Period::Infinite),
-                ..Qos::default()
+                ..QosRequest::default()
             },
         );
     }
-    // As long as can be said.
-    means(
+    // The largest value that can be written.
+    assert_qos(
         r#"{"depth":9000000000000000000}"#,
-        Qos {
+        QosRequest {
             depth: Some(9_000_000_000_000_000_000),
-            ..Qos::default()
+            ..QosRequest::default()
         },
     );
 }
@@ -172,15 +172,15 @@ fn what_cannot_be_meant_is_named_with_what_can() {
             "false (names are those of ROS) is expected",
         ),
     ] {
-        refuses(
-            &with(&format!(r#"{{"{key}":{value}}}"#)),
+        assert_refused(
+            &subscribe_json(&format!(r#"{{"{key}":{value}}}"#)),
             &format!("subscribe: field \"qos.{key}\" is {value}, {expected}"),
         );
     }
     let object = "an object such as {\"reliability\": \"best_effort\", \"depth\": 5} is expected";
     for value in [r#""best_effort""#, "5", r#"{"depth" 5}"#, "[]"] {
-        refuses(
-            &with(value),
+        assert_refused(
+            &subscribe_json(value),
             &format!("subscribe: field \"qos\" is {value}, {object}"),
         );
     }
@@ -188,10 +188,10 @@ fn what_cannot_be_meant_is_named_with_what_can() {
 
 #[test]
 fn publishers_say_what_they_offer() {
-    let qos = Some(Qos {
-        durability: Some(Durability::TransientLocal),
+    let qos = Some(QosRequest {
+        durability: Some(DurabilityPolicy::TransientLocal),
         depth: Some(1),
-        ..Qos::default()
+        ..QosRequest::default()
     });
     let advertise = Advertise {
         id: None,
@@ -202,11 +202,11 @@ fn publishers_say_what_they_offer() {
         md5sum: None,
         qos,
     };
-    reads(
+    assert_parses(
         r#"{"op":"advertise","topic":"/x","type":"a/B","qos":{"durability":"transient_local","depth":1}}"#,
         advertise.clone(),
     );
-    survives_cbor(advertise);
+    assert_survives_cbor(advertise);
     let publish = Publish {
         id: None,
         topic: "/x".into(),
@@ -216,15 +216,15 @@ fn publishers_say_what_they_offer() {
         type_name: None,
         qos,
     };
-    reads(
+    assert_parses(
         r#"{"op":"publish","topic":"/x","msg":{},"qos":{"durability":1,"depth":1}}"#,
         publish,
     );
-    refuses(
+    assert_refused(
         r#"{"op":"publish","topic":"/x","msg":{},"qos":{"depth":{}}}"#,
         "publish: field \"qos.depth\" is {}, a number of messages, 0 or more, is expected",
     );
-    refuses(
+    assert_refused(
         r#"{"op":"advertise","topic":"/x","type":"a/B","qos":7}"#,
         "advertise: field \"qos\" is 7, an object such as {\"reliability\": \"best_effort\", \"depth\": 5} is expected",
     );

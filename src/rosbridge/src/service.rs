@@ -8,22 +8,22 @@ use crate::op::Message;
 use crate::subscribe::fragment_size;
 use crate::{Compression, Id, Payload, Problem, Writer};
 
-/// "Do this": from the client to a service, or from the server to a client that serves one.
+/// Calls a service: from the client, or from the server to a client that serves it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CallService<'a> {
-    /// Comes back in the response.
+    /// Id of the call, repeated in the response.
     pub id: Option<Id<'a>>,
-    /// The service's name (without the old `#id` suffix, which becomes the id).
+    /// Name of the service (without the old `#id` suffix, which becomes the id).
     pub service: Cow<'a, str>,
-    /// `package/Type`, where the client says it.
+    /// `package/Type`, if given.
     pub type_name: Option<Cow<'a, str>>,
-    /// An object, or a list of values in the request's order.
+    /// Arguments: an object, or a list of values in the order of the request's fields.
     pub args: Option<Payload<'a>>,
-    /// How long to wait for the answer.
+    /// Time to wait for the response.
     pub timeout: Option<Duration>,
-    /// A longer answer is cut.
+    /// Maximum frame size in bytes; a longer response is fragmented.
     pub fragment_size: Option<usize>,
-    /// How the answer is encoded; with `cbor-raw` the arguments are too. Absent: as the call.
+    /// Encoding of the response; with `cbor-raw` also of the arguments. If absent, as in the call.
     pub compression: Option<Compression>,
 }
 
@@ -78,7 +78,7 @@ impl<'a> Message<'a> for CallService<'a> {
     }
 }
 
-/// `/service#7` is how old clients wrote a call with id 7.
+/// Splits the id off a name: old clients wrote a call with id 7 as `/service#7`.
 pub(crate) fn split_name<'a>(
     name: Cow<'a, str>,
     id: Option<Id<'a>>,
@@ -97,18 +97,18 @@ pub(crate) fn split_name<'a>(
     (name, id.or(Some(suffix)))
 }
 
-/// The answer to a call.
+/// Response to a service call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceResponse<'a> {
-    /// The call's id.
+    /// Id of the call.
     pub id: Option<Id<'a>>,
-    /// The service's name.
+    /// Name of the service.
     pub service: Cow<'a, str>,
-    /// The response, or, where `result` is false, the reason as a text.
+    /// Response message, or, if `result` is false, the reason as a string.
     pub values: Option<Payload<'a>>,
-    /// Whether the service was done.
+    /// True if the call succeeded.
     pub result: bool,
-    /// `cbor-raw` where `values` holds the ROS serialization (extension).
+    /// Encoding: `cbor-raw` if `values` holds the ROS serialization (extension).
     pub compression: Compression,
 }
 
@@ -143,16 +143,16 @@ impl<'a> Message<'a> for ServiceResponse<'a> {
     }
 }
 
-/// "I serve this."
+/// Advertises that the client serves a service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AdvertiseService<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The service's name.
+    /// Name of the service.
     pub service: Cow<'a, str>,
-    /// `package/Type`.
+    /// Type of the service: `package/Type`.
     pub type_name: Cow<'a, str>,
-    /// How the client wants the calls (extension).
+    /// Encoding in which the client wants the calls (extension).
     pub compression: Compression,
 }
 
@@ -181,12 +181,12 @@ impl<'a> Message<'a> for AdvertiseService<'a> {
     }
 }
 
-/// "I serve it no longer."
+/// Ends an [`AdvertiseService`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UnadvertiseService<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The service's name.
+    /// Name of the service.
     pub service: Cow<'a, str>,
 }
 
@@ -213,7 +213,7 @@ impl<'a> Message<'a> for UnadvertiseService<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     fn add() -> CallService<'static> {
         CallService {
@@ -229,7 +229,7 @@ mod tests {
 
     #[test]
     fn call_service_is_read() {
-        reads(
+        assert_parses(
             r#"{"op":"call_service","id":"call_service:/add:1","service":"/add","type":"rospy_tutorials/AddTwoInts","args":{"a":1,"b":2},"timeout":2.5,"fragment_size":512,"compression":"none"}"#,
             add(),
         );
@@ -242,23 +242,23 @@ mod tests {
             compression: None,
             ..add()
         };
-        reads(r#"{"op":"call_service","service":"/add"}"#, bare.clone());
-        survives_cbor(bare.clone());
-        reads(
+        assert_parses(r#"{"op":"call_service","service":"/add"}"#, bare.clone());
+        assert_survives_cbor(bare.clone());
+        assert_parses(
             r#"{"op":"call_service","service":"/add","args":[1,2]}"#,
             CallService {
                 args: Some(Payload::json("[1,2]")),
                 ..bare.clone()
             },
         );
-        reads(
+        assert_parses(
             r#"{"op":"call_service","service":"/add#33"}"#,
             CallService {
                 id: Some("33".into()),
                 ..bare.clone()
             },
         );
-        reads(
+        assert_parses(
             r#"{"op":"call_service","id":"mine","service":"/add#33"}"#,
             CallService {
                 id: Some("mine".into()),
@@ -269,15 +269,15 @@ mod tests {
 
     #[test]
     fn call_service_is_checked() {
-        refuses(
+        assert_refused(
             r#"{"op":"call_service"}"#,
             "call_service: field \"service\" is missing, a service name is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"call_service","service":"/add","args":"1"}"#,
             "call_service: field \"args\" is \"1\", an object, or a list of arguments in order, is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"call_service","service":"/add","timeout":"soon"}"#,
             "call_service: field \"timeout\" is \"soon\", a number of seconds, 0 or more, is expected",
         );
@@ -292,11 +292,11 @@ mod tests {
             result: true,
             compression: Compression::None,
         };
-        reads(
+        assert_parses(
             r#"{"op":"service_response","id":"service_request:/add:1","service":"/add","values":{"sum":3},"result":true}"#,
             done.clone(),
         );
-        reads(
+        assert_parses(
             r#"{"op":"service_response","service":"/add","values":"no","result":false}"#,
             ServiceResponse {
                 id: None,
@@ -305,15 +305,15 @@ mod tests {
                 ..done.clone()
             },
         );
-        survives_cbor(ServiceResponse {
+        assert_survives_cbor(ServiceResponse {
             values: None,
             ..done
         });
-        refuses(
+        assert_refused(
             r#"{"op":"service_response","service":"/add"}"#,
             "service_response: field \"result\" is missing, true or false is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"service_response","result":true}"#,
             "service_response: field \"service\" is missing, a service name is expected",
         );
@@ -327,12 +327,12 @@ mod tests {
             type_name: "rospy_tutorials/AddTwoInts".into(),
             compression: Compression::None,
         };
-        reads(
+        assert_parses(
             r#"{"op":"advertise_service","type":"rospy_tutorials/AddTwoInts","service":"/add"}"#,
             op.clone(),
         );
-        survives_cbor(op);
-        refuses(
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"advertise_service","service":"/add"}"#,
             "advertise_service: field \"type\" is missing, a service type such as \"std_srvs/Trigger\" is expected",
         );
@@ -340,12 +340,12 @@ mod tests {
             id: None,
             service: "/add".into(),
         };
-        reads(
+        assert_parses(
             r#"{"op":"unadvertise_service","service":"/add"}"#,
             op.clone(),
         );
-        survives_cbor(op);
-        refuses(
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"unadvertise_service","service":[]}"#,
             "unadvertise_service: field \"service\" is [], a service name is expected",
         );

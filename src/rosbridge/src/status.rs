@@ -1,4 +1,4 @@
-//! `status`, `set_level`: what the server has to say, and how much of it the client wants to hear.
+//! `status`, `set_level`: status messages from the server, and the level that the client wants.
 
 use std::borrow::Cow;
 
@@ -6,38 +6,38 @@ use crate::fields::Fields;
 use crate::op::Message;
 use crate::{Id, Problem, Writer};
 
-/// How grave a status is, and, in `set_level`, down to which gravity the client wants to hear.
+/// Severity of a status message; in `set_level` the least severe level to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
-pub enum Level {
-    /// No status message is sent.
+pub enum StatusLevel {
+    /// No status messages are sent.
     None,
-    /// What did not work.
+    /// Failures.
     #[default]
     Error,
-    /// And what worked, though something was odd.
+    /// Also unusual events that are not failures.
     Warning,
-    /// And what worked.
+    /// Also successes.
     Info,
 }
 
-impl Level {
-    /// The name in the protocol.
+impl StatusLevel {
+    /// Returns the name in the protocol.
     pub fn name(self) -> &'static str {
         match self {
-            Level::None => "none",
-            Level::Error => "error",
-            Level::Warning => "warning",
-            Level::Info => "info",
+            StatusLevel::None => "none",
+            StatusLevel::Error => "error",
+            StatusLevel::Warning => "warning",
+            StatusLevel::Info => "info",
         }
     }
 
     fn read(fields: &Fields<'_>) -> Result<Self, Problem> {
         const EXPECTED: &str = "info, warning, error or none";
         match &*fields.required_text("level", EXPECTED)? {
-            "none" => Ok(Level::None),
-            "error" => Ok(Level::Error),
-            "warning" => Ok(Level::Warning),
-            "info" => Ok(Level::Info),
+            "none" => Ok(StatusLevel::None),
+            "error" => Ok(StatusLevel::Error),
+            "warning" => Ok(StatusLevel::Warning),
+            "info" => Ok(StatusLevel::Info),
             other => {
                 let found = format!("{:?}", other.chars().take(48).collect::<String>());
                 Err(Problem::Mistyped {
@@ -50,13 +50,13 @@ impl Level {
     }
 }
 
-/// "Tell me this much."
+/// Sets the level of status messages that are sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SetLevel<'a> {
-    /// The interaction.
+    /// Id of the interaction.
     pub id: Option<Id<'a>>,
-    /// The least grave status to send.
-    pub level: Level,
+    /// Least severe level to send.
+    pub level: StatusLevel,
 }
 
 impl<'a> Message<'a> for SetLevel<'a> {
@@ -66,7 +66,7 @@ impl<'a> Message<'a> for SetLevel<'a> {
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
             id,
-            level: Level::read(fields)?,
+            level: StatusLevel::read(fields)?,
         })
     }
 
@@ -79,14 +79,14 @@ impl<'a> Message<'a> for SetLevel<'a> {
     }
 }
 
-/// "This happened."
+/// A status message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Status<'a> {
-    /// The id of the op it answers.
+    /// Id of the op it answers.
     pub id: Option<Id<'a>>,
-    /// How grave it is.
-    pub level: Level,
-    /// What happened.
+    /// Severity.
+    pub level: StatusLevel,
+    /// Text of the message.
     pub msg: Cow<'a, str>,
 }
 
@@ -97,7 +97,7 @@ impl<'a> Message<'a> for Status<'a> {
     fn read(id: Option<Id<'a>>, fields: &Fields<'a>) -> Result<Self, Problem> {
         Ok(Self {
             id,
-            level: Level::read(fields)?,
+            level: StatusLevel::read(fields)?,
             msg: fields.data("msg", "a text")?,
         })
     }
@@ -115,14 +115,14 @@ impl<'a> Message<'a> for Status<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     #[test]
     fn levels_are_ordered_by_how_much_is_heard() {
         assert!(
-            Level::None < Level::Error
-                && Level::Error < Level::Warning
-                && Level::Warning < Level::Info
+            StatusLevel::None < StatusLevel::Error
+                && StatusLevel::Error < StatusLevel::Warning
+                && StatusLevel::Warning < StatusLevel::Info
         );
     }
 
@@ -130,25 +130,25 @@ mod tests {
     fn status_and_set_level_are_read_and_checked() {
         let op = Status {
             id: Some("x".into()),
-            level: Level::Error,
+            level: StatusLevel::Error,
             msg: "no \"such\" topic".into(),
         };
-        reads(
+        assert_parses(
             r#"{"op":"status","id":"x","level":"error","msg":"no \"such\" topic"}"#,
             op.clone(),
         );
-        survives_cbor(op);
+        assert_survives_cbor(op);
         let op = SetLevel {
             id: None,
-            level: Level::Info,
+            level: StatusLevel::Info,
         };
-        reads(r#"{"op":"set_level","level":"info"}"#, op.clone());
-        survives_cbor(op);
-        refuses(
+        assert_parses(r#"{"op":"set_level","level":"info"}"#, op.clone());
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"set_level","level":"all"}"#,
             "set_level: field \"level\" is \"all\", info, warning, error or none is expected",
         );
-        refuses(
+        assert_refused(
             r#"{"op":"set_level"}"#,
             "set_level: field \"level\" is missing, info, warning, error or none is expected",
         );

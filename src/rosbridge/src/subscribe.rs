@@ -5,15 +5,15 @@ use std::time::Duration;
 
 use crate::fields::Fields;
 use crate::op::Message;
-use crate::{Id, Problem, Qos, Writer};
+use crate::{Id, Problem, QosRequest, Writer};
 
-/// How payloads travel.
+/// Encoding of payloads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub enum Compression {
     /// JSON.
     #[default]
     None,
-    /// JSON packed into a picture.
+    /// JSON encoded as a PNG image.
     Png,
     /// CBOR with typed arrays (RFC 8746).
     Cbor,
@@ -22,7 +22,7 @@ pub enum Compression {
 }
 
 impl Compression {
-    /// The name in the protocol.
+    /// Returns the name in the protocol.
     pub fn name(self) -> &'static str {
         match self {
             Compression::None => "none",
@@ -62,31 +62,31 @@ impl Compression {
     }
 }
 
-/// The `fragment_size` that several ops have.
+/// Reads the field `fragment_size`, which several ops have.
 pub(crate) fn fragment_size(fields: &Fields<'_>) -> Result<Option<usize>, Problem> {
     let size = fields.count("fragment_size", 1, "a number of bytes, 1 or more,")?;
     Ok(size.map(|size| usize::try_from(size).unwrap_or(usize::MAX)))
 }
 
-/// "Send me this topic."
+/// Subscribes to a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Subscribe<'a> {
-    /// Names this subscription, for `unsubscribe`.
+    /// Id of this subscription, for `unsubscribe`.
     pub id: Option<Id<'a>>,
-    /// The topic's name.
+    /// Name of the topic.
     pub topic: Cow<'a, str>,
-    /// `package/Type`; inferred where absent.
+    /// `package/Type`; inferred if absent.
     pub type_name: Option<Cow<'a, str>>,
-    /// Least time between two messages.
+    /// Minimum time between two messages.
     pub throttle_rate: Duration,
-    /// Messages kept while throttled; 0: none.
+    /// Number of messages queued while throttled; 0: none.
     pub queue_length: usize,
-    /// Longer frames are cut.
+    /// Maximum frame size in bytes; longer frames are fragmented.
     pub fragment_size: Option<usize>,
-    /// How messages are encoded.
+    /// Encoding of the messages.
     pub compression: Compression,
-    /// What the client asks of the topic.
-    pub qos: Option<Qos>,
+    /// Quality of service requested.
+    pub qos: Option<QosRequest>,
 }
 
 impl<'a> Message<'a> for Subscribe<'a> {
@@ -116,7 +116,7 @@ impl<'a> Message<'a> for Subscribe<'a> {
             queue_length: usize::try_from(length.unwrap_or(0)).unwrap_or(usize::MAX),
             fragment_size: fragment_size(fields)?,
             compression: Compression::read(fields)?,
-            qos: Qos::read(fields)?,
+            qos: QosRequest::read(fields)?,
         })
     }
 
@@ -135,16 +135,16 @@ impl<'a> Message<'a> for Subscribe<'a> {
         }
         writer.optional_count("fragment_size", self.fragment_size.map(|size| size as u64));
         self.compression.write(writer);
-        Qos::write(self.qos, writer);
+        QosRequest::write(self.qos, writer);
     }
 }
 
-/// "Send it no longer."
+/// Ends one or all subscriptions to a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unsubscribe<'a> {
-    /// Which subscription; all of the topic's where absent.
+    /// Id of the subscription; all of the topic's if absent.
     pub id: Option<Id<'a>>,
-    /// The topic's name.
+    /// Name of the topic.
     pub topic: Cow<'a, str>,
 }
 
@@ -171,7 +171,7 @@ impl<'a> Message<'a> for Unsubscribe<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::op::tests::{reads, refuses, survives_cbor};
+    use crate::op::tests::{assert_parses, assert_refused, assert_survives_cbor};
 
     fn image() -> Subscribe<'static> {
         Subscribe {
@@ -188,16 +188,16 @@ mod tests {
 
     #[test]
     fn subscribe_is_read() {
-        reads(
+        assert_parses(
             r#"{"op":"subscribe","id":"subscribe:/image:1","topic":"/image","type":"sensor_msgs/Image","throttle_rate":100,"queue_length":2,"fragment_size":10000,"compression":"cbor-raw"}"#,
             image(),
         );
-        survives_cbor(image());
-        survives_cbor(Subscribe {
+        assert_survives_cbor(image());
+        assert_survives_cbor(Subscribe {
             throttle_rate: Duration::from_micros(1500),
             ..image()
         });
-        reads(
+        assert_parses(
             r#"{"op":"subscribe","topic":"/image","type":"","throttle_rate":0.0,"fragment_size":null}"#,
             Subscribe {
                 id: None,
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn subscribe_is_checked() {
-        refuses(
+        assert_refused(
             r#"{"op":"subscribe"}"#,
             "subscribe: field \"topic\" is missing, a topic name is expected",
         );
@@ -234,7 +234,7 @@ mod tests {
             ("compression", "7", "none, png, cbor or cbor-raw"),
             ("type", "[]", "a message type such as \"std_msgs/String\""),
         ] {
-            refuses(
+            assert_refused(
                 &format!(r#"{{"op":"subscribe","topic":"/x","{field}":{value}}}"#),
                 &format!("subscribe: field \"{field}\" is {value}, {expected} is expected"),
             );
@@ -247,12 +247,12 @@ mod tests {
             id: Some("a".into()),
             topic: "/image".into(),
         };
-        reads(
+        assert_parses(
             r#"{"op":"unsubscribe","id":"a","topic":"/image"}"#,
             op.clone(),
         );
-        survives_cbor(op);
-        refuses(
+        assert_survives_cbor(op);
+        assert_refused(
             r#"{"op":"unsubscribe"}"#,
             "unsubscribe: field \"topic\" is missing, a topic name is expected",
         );

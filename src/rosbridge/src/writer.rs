@@ -1,13 +1,13 @@
-//! Prints a message field by field, in either format, straight into the buffer that goes to the socket.
+//! Prints a message field by field, in either format, straight into the socket's output buffer.
 
 use std::borrow::Cow;
 
 use crate::{Format, Id, Payload, cbor, json};
 
-/// What a CBOR head of one byte can count.
+/// Largest count that fits into a one-byte CBOR head.
 pub(crate) const MAX_FIELDS: usize = 23;
 
-/// Writes one object. At most 23 fields: more than any op has.
+/// Writes one object of at most 23 fields, more than any op has.
 pub struct Writer<'o> {
     out: &'o mut Vec<u8>,
     format: Format,
@@ -21,7 +21,7 @@ impl<'o> Writer<'o> {
         let start = out.len();
         out.push(match format {
             Format::Json => b'{',
-            // The count is written when it is known.
+            // The count is filled in at the end.
             Format::Cbor => cbor::MAP << 5,
         });
         Self {
@@ -32,7 +32,7 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// Begins a message with this op and, where there is one, id.
+    /// Begins a message with this op and, if given, id.
     pub fn op(out: &'o mut Vec<u8>, format: Format, op: &str, id: Option<&Id<'_>>) -> Self {
         let mut writer = Self::new(out, format);
         writer.text("op", op);
@@ -60,7 +60,7 @@ impl<'o> Writer<'o> {
         debug_assert!(usize::from(self.fields) <= MAX_FIELDS);
     }
 
-    /// A text field.
+    /// Writes a string field.
     pub fn text(&mut self, key: &str, value: &str) {
         self.key(key);
         match self.format {
@@ -69,14 +69,14 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// A text field, where there is one.
+    /// Writes a string field, if there is a value.
     pub fn optional_text(&mut self, key: &str, value: &Option<Cow<'_, str>>) {
         if let Some(value) = value {
             self.text(key, value);
         }
     }
 
-    /// An integer field.
+    /// Writes an integer field.
     pub fn integer(&mut self, key: &str, value: i64) {
         self.key(key);
         match self.format {
@@ -85,14 +85,14 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// A count field, where there is one.
+    /// Writes an integer field, if there is a value.
     pub fn optional_count(&mut self, key: &str, value: Option<u64>) {
         if let Some(value) = value {
             self.integer(key, i64::try_from(value).unwrap_or(i64::MAX));
         }
     }
 
-    /// A number field; it must be finite.
+    /// Writes a number field; it must be finite.
     pub fn number(&mut self, key: &str, value: f64) {
         if value.fract() == 0.0 && value.abs() < 9e15 {
             return self.integer(key, value as i64);
@@ -107,7 +107,7 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// A boolean field.
+    /// Writes a boolean field.
     pub fn boolean(&mut self, key: &str, value: bool) {
         self.key(key);
         match (self.format, value) {
@@ -117,7 +117,7 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// A byte field: a byte string in CBOR, base64 in JSON.
+    /// Writes a byte field: a byte string in CBOR, base64 in JSON.
     pub fn bytes(&mut self, key: &str, value: &[u8]) {
         self.key(key);
         match self.format {
@@ -133,17 +133,17 @@ impl<'o> Writer<'o> {
         }
     }
 
-    /// A payload that is already in this object's format.
+    /// Writes a payload that is already in this object's format.
     ///
     /// # Panics
-    /// When the formats differ: the caller chose the format from the payload.
+    /// Panics if the formats differ: the caller chooses the format of the object from the payload.
     pub fn payload(&mut self, key: &str, payload: Payload<'_>) {
         assert_eq!(payload.format, self.format, "a payload keeps its format");
         self.key(key);
         self.out.extend_from_slice(payload.bytes);
     }
 
-    /// A value that `write` appends in this object's format.
+    /// Writes a field whose value `write` appends in this object's format.
     pub fn value<E>(
         &mut self,
         key: &str,
@@ -153,7 +153,7 @@ impl<'o> Writer<'o> {
         write(self.out)
     }
 
-    /// An object field, whose fields `write` writes.
+    /// Writes an object field, whose fields `write` writes.
     pub fn object(&mut self, key: &str, write: impl FnOnce(&mut Writer<'_>)) {
         self.key(key);
         let mut inner = Writer::new(self.out, self.format);
@@ -161,7 +161,7 @@ impl<'o> Writer<'o> {
         inner.end();
     }
 
-    /// The payload of `cbor-raw`: a serialized message and when it was received.
+    /// Writes the payload of `cbor-raw`: a serialized message and its time of reception.
     pub fn raw(&mut self, key: &str, stamp: Option<(u32, u32)>, bytes: &[u8]) {
         self.key(key);
         let mut inner = Writer::new(self.out, self.format);

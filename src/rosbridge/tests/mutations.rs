@@ -1,9 +1,10 @@
-//! Damaged frames: whatever arrives is read or refused, never more, and what was read can be printed and read again.
+//! Damaged frames: every frame is parsed or refused without panicking, and what was parsed can be printed and parsed
+//! again.
 
 use std::time::{Duration, Instant};
 
 use rosbridge::{
-    Format, FragmentLimits, Fragments, Frame, Op, Payload, decode_png, unknown_fields,
+    Format, FragmentLimits, Fragments, Op, Payload, ProtocolFrame, decode_png, unknown_fields,
 };
 
 const FRAMES: &[&str] = &[
@@ -21,11 +22,11 @@ const FRAMES: &[&str] = &[
     r#"{"op":"auth","mac":"a","client":"b","dest":"c","rand":"d","t":1,"level":"e","end":2}"#,
 ];
 
-/// Numbers that look random and are the same every time (xorshift64).
+/// Deterministic pseudo-random numbers (xorshift64).
 struct Dice(u64);
 
 impl Dice {
-    fn below(&mut self, limit: usize) -> usize {
+    fn next_below(&mut self, limit: usize) -> usize {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
         self.0 ^= self.0 << 17;
@@ -36,14 +37,14 @@ impl Dice {
     fn damage(&mut self, bytes: &mut Vec<u8>) {
         const BYTES: &[u8] =
             b"{}[]\",:\\u0-1.eE+tfn \x00\x1f\x7f\x80\xbf\xc3\xff\x5b\x7b\x9b\xbb\x9f\xbf\xd8\xf9";
-        for _ in 0..=self.below(4) {
-            let at = self.below(bytes.len() + 1);
-            let byte = BYTES[self.below(BYTES.len())];
-            match self.below(4) {
+        for _ in 0..=self.next_below(4) {
+            let at = self.next_below(bytes.len() + 1);
+            let byte = BYTES[self.next_below(BYTES.len())];
+            match self.next_below(4) {
                 0 if at < bytes.len() => bytes[at] = byte,
                 1 if at < bytes.len() => drop(bytes.remove(at)),
                 2 => {
-                    let end = (at + self.below(12)).min(bytes.len());
+                    let end = (at + self.next_below(12)).min(bytes.len());
                     let piece = bytes[at..end].to_vec();
                     bytes.splice(at..at, piece);
                 }
@@ -53,13 +54,13 @@ impl Dice {
     }
 }
 
-/// What was read can be printed and read again.
-fn comes_back(op: &Op<'_>, format: Format) {
+/// Asserts that a parsed op can be printed and parsed again.
+fn assert_round_trip(op: &Op<'_>, format: Format) {
     let mut printed = Vec::new();
     op.print(&mut printed, format);
     let frame = match format {
-        Format::Json => Frame::Text(std::str::from_utf8(&printed).expect("JSON is UTF-8")),
-        Format::Cbor => Frame::Binary(&printed),
+        Format::Json => ProtocolFrame::Text(std::str::from_utf8(&printed).expect("JSON is UTF-8")),
+        Format::Cbor => ProtocolFrame::Binary(&printed),
     };
     assert_eq!(Op::parse(frame).as_ref(), Ok(op), "{printed:?}");
 }
@@ -75,17 +76,17 @@ fn payload_of<'a>(op: &Op<'a>) -> Option<Payload<'a>> {
     }
 }
 
-fn try_all(frame: Frame<'_>, fragments: &mut Fragments) -> bool {
+fn try_all(frame: ProtocolFrame<'_>, fragments: &mut Fragments) -> bool {
     let Ok(op) = Op::parse(frame) else {
         return false;
     };
-    comes_back(&op, frame.format());
+    assert_round_trip(&op, frame.format());
     unknown_fields(frame);
     if let Some(payload) = payload_of(&op) {
         let _ = (
             payload.raw(),
             payload.text(),
-            payload.named(["a", "b", "c"]),
+            payload.to_named_object(["a", "b", "c"]),
         );
     }
     match op {
@@ -110,7 +111,7 @@ fn damaged_json_is_read_or_refused() {
         let mut bytes = FRAMES[round % FRAMES.len()].as_bytes().to_vec();
         dice.damage(&mut bytes);
         let text = String::from_utf8_lossy(&bytes);
-        read += usize::from(try_all(Frame::Text(&text), &mut fragments));
+        read += usize::from(try_all(ProtocolFrame::Text(&text), &mut fragments));
         assert!(fragments.bytes() <= 10_000 + 4 * 100 * 16);
     }
     assert!(read > 1000, "some survive: {read}");
@@ -125,18 +126,18 @@ fn damaged_cbor_is_read_or_refused() {
     for round in 0..60_000 {
         let mut bytes = frames[round % frames.len()].clone();
         dice.damage(&mut bytes);
-        read += usize::from(try_all(Frame::Binary(&bytes), &mut fragments));
+        read += usize::from(try_all(ProtocolFrame::Binary(&bytes), &mut fragments));
     }
     assert!(read > 1000, "some survive: {read}");
 }
 
-/// Those ops whose payloads can be printed without a codec: none, or a map made here.
+/// Converts ops whose payloads can be printed without a codec: none, or a map made here.
 fn to_cbor(text: &str) -> Option<Vec<u8>> {
     const MAP: Payload<'static> = Payload {
         format: Format::Cbor,
         bytes: b"\xa2\x61a\x01\x65bytes\x43\x01\x02\x03",
     };
-    let mut op = Op::parse(Frame::Text(text)).ok()?;
+    let mut op = Op::parse(ProtocolFrame::Text(text)).ok()?;
     match &mut op {
         Op::Publish(op) => op.msg = MAP,
         Op::CallService(op) => op.args = Some(MAP),

@@ -1,4 +1,4 @@
-//! What participants tell of themselves and of their ends (8.5), as data.
+//! Discovery data of participants and endpoints (8.5).
 
 #![forbid(unsafe_code)]
 
@@ -17,48 +17,48 @@ use crate::locator::Locator;
 use crate::qos::EndpointQos;
 use crate::{Guid, GuidPrefix, VendorId};
 
-pub use key::{guid_of_key, key};
+pub use key::{guid_of_key, key_payload};
 
-/// What a participant tells of itself (8.5.3.2).
+/// Discovery data of a participant (8.5.3.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ParticipantData {
-    /// Which one it is.
+    /// GUID prefix of the participant.
     pub prefix: GuidPrefix,
-    /// Which implementation it is of.
+    /// Implementation of the participant.
     pub vendor: VendorId,
-    /// Of the protocol: major and minor.
+    /// Protocol version, major and minor.
     pub version: [u8; 2],
-    /// The domain, where it says.
+    /// Domain id, if announced.
     pub domain: Option<u32>,
-    /// Its name; may be empty.
+    /// Name; may be empty.
     pub name: String,
-    /// What its owner adds; ROS 2 puts `enclave=…;` there.
+    /// User data. ROS 2 stores `enclave=…;` here.
     pub user_data: Bytes,
-    /// Where it hears of ends.
+    /// Metatraffic locators, at which it receives discovery data.
     pub discovery: Vec<Locator>,
-    /// Where its ends receive that say nothing else.
+    /// Default locators of its endpoints.
     pub user: Vec<Locator>,
-    /// Which ends of the protocol it has (9.3.2.12).
+    /// Set of its built-in endpoints (9.3.2.12).
     pub builtin: u32,
-    /// It is gone when it has said nothing for so long; none where it never is.
+    /// Lease duration: the participant is gone after this time without a message; `None`: infinite.
     pub lease: Option<Duration>,
 }
 
-/// What a participant tells of one of its writers or readers (8.5.4.2).
+/// Discovery data of a writer or reader (8.5.4.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EndpointData {
-    /// Which end it is.
+    /// GUID of the endpoint.
     pub guid: Guid,
-    /// The topic's name as DDS has it: `rt/chatter`.
+    /// DDS name of the topic: `rt/chatter`.
     pub topic: String,
-    /// The type's name as DDS has it: `std_msgs::msg::dds_::String_`.
+    /// DDS name of the type: `std_msgs::msg::dds_::String_`.
     pub type_name: String,
-    /// What it offers or asks for.
+    /// Offered or requested QoS.
     pub qos: EndpointQos,
-    /// What its owner adds; ROS 2 puts `typehash=RIHS01_…;` there.
+    /// User data. ROS 2 stores `typehash=RIHS01_…;` here.
     pub user_data: Bytes,
-    /// Where it receives; where its participant's ends do, if empty.
+    /// Locators at which it receives; if empty, the default locators of its participant.
     pub unicast: Vec<Locator>,
-    /// A reader that wants each sample to tell its quality of service.
+    /// The endpoint is a reader that expects each sample to carry inline QoS.
     pub expects_inline_qos: bool,
 }

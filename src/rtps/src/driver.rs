@@ -1,4 +1,5 @@
-//! Moves datagrams between sockets and the engine, and calls it when its time comes. One task for each participant.
+//! Moves datagrams between the sockets and the engine and calls the engine when its timer expires. One task per
+//! participant.
 
 #[cfg(test)]
 mod tests;
@@ -21,73 +22,73 @@ use tokio::io::unix::AsyncFd;
 use tokio::sync::Notify;
 
 use crate::engine::{Datagram, Engine};
-use crate::flow::Flow;
+use crate::flow::FlowControl;
 use crate::locator::MULTICAST;
-use crate::network::Network;
+use crate::network::InterfaceSet;
 
-/// Timers of tokio count in milliseconds, in which a receiver's buffer runs empty several times; hence a timer of the kernel, which
-/// zero would stop.
+/// Minimum duration of the kernel timer, which a duration of zero would disarm. Timers of tokio have a resolution of a
+/// millisecond, in which a receiver's buffer runs empty several times.
 const SHORTEST: Duration = Duration::from_micros(10);
-/// How often it is looked which ports are bound.
+/// Interval at which bound ports are checked.
 pub(crate) const PORTS: Duration = Duration::from_millis(200);
-/// Datagrams that are taken at once from one socket, before others have their turn.
+/// Maximum number of datagrams read from one socket before others get their turn.
 const AT_ONCE: usize = 32;
-/// How long until it is tried again to send where it cannot be awaited that there is room.
+/// Retry interval for sending if waiting for room in the socket buffer is not possible.
 const NO_ROOM: Duration = Duration::from_millis(1);
-/// The longest datagram.
+/// Maximum length of a datagram.
 const LONGEST: usize = 65_536;
-/// A shorter datagram is copied out of the buffer, a longer one takes the buffer with it.
+/// Length below which a datagram is copied out of the buffer; a longer one takes the buffer with it.
 const COPIED: usize = 16 << 10;
 
-/// What is locked together.
+/// State protected by one lock.
 pub(crate) struct Core {
     pub engine: Engine,
-    flow: Flow,
-    /// Out of which interfaces is sent what is said to all.
-    network: Network,
+    flow: FlowControl,
+    /// Interfaces through which multicast datagrams are sent.
+    network: InterfaceSet,
     /// A datagram for which the sending socket had no room.
     stalled: Option<Datagram>,
 }
 
-/// A socket of which is told that something has come, and not that it has room: it would be told after each datagram that was sent, and a
-/// message would wake its participant's task once more.
-type Incoming = AsyncFd<UdpSocket>;
+/// A socket registered for readability only. Writability would be reported after each datagram sent and wake the
+/// participant's task once more per message.
+type ReadableSocket = AsyncFd<UdpSocket>;
 
-/// What a participant, its ends and its task share.
-pub(crate) struct Shared {
+/// State shared by a participant, its endpoints and its task.
+pub(crate) struct DriverState {
     core: Mutex<Core>,
     wake: Notify,
-    /// Where ends are announced.
-    discovery: Incoming,
-    /// Where samples come in, and all goes out.
-    user: Incoming,
-    /// Where participants announce themselves to all.
-    multicast: Option<Incoming>,
+    /// Receives discovery data of endpoints.
+    discovery: ReadableSocket,
+    /// Receives samples; everything is sent from here.
+    user: ReadableSocket,
+    /// Receives multicast announcements of participants.
+    multicast: Option<ReadableSocket>,
 }
 
-/// The sockets of a participant, which do not block.
+/// The non-blocking sockets of a participant.
 pub(crate) struct Sockets {
     pub discovery: UdpSocket,
     pub user: UdpSocket,
     pub multicast: Option<UdpSocket>,
 }
 
-/// Why something waits.
+/// Result of a flush: what sending waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Waits {
+enum FlushOutcome {
     Nothing,
-    /// Receivers have no room; when to look again.
+    /// Receivers have no room; the time after which to check again.
     Receivers(Duration),
-    /// The sending socket has none.
+    /// The sending socket has no room.
     Socket,
 }
 
-impl Shared {
+impl DriverState {
     pub fn new(
         engine: Engine,
-        flow: Flow,
+        flow: FlowControl,
         sockets: Sockets,
-        network: Network,
+        network: InterfaceSet,
     ) -> io::Result<Arc<Self>> {
         let Sockets {
             discovery,
@@ -97,43 +98,43 @@ impl Shared {
         let core = Mutex::new(Core {
             engine,
             flow,
-            network: Network::new(Vec::new()),
+            network: InterfaceSet::new(Vec::new()),
             stalled: None,
         });
         let shared = Self {
             core,
             wake: Notify::new(),
-            discovery: incoming(discovery)?,
-            user: incoming(user)?,
-            multicast: multicast.map(incoming).transpose()?,
+            discovery: register_readable(discovery)?,
+            user: register_readable(user)?,
+            multicast: multicast.map(register_readable).transpose()?,
         };
         shared.join_groups(&mut shared.core.lock(), network);
         Ok(Arc::new(shared))
     }
 
-    /// The interfaces of this machine, as they are now.
-    pub fn network_is(&self, network: Network) {
+    /// Sets the current interfaces of this machine.
+    pub fn set_network(&self, network: InterfaceSet) {
         let mut core = self.core.lock();
         if core.network != network {
             tracing::debug!(?network, "the networks of a DDS participant have changed");
-            core.engine.network_changed(Instant::now(), network.clone());
+            core.engine.set_network(Instant::now(), network.clone());
             self.join_groups(&mut core, network);
             self.wake.notify_one();
         }
     }
 
-    /// Hears what is said to all in each of these networks.
-    fn join_groups(&self, core: &mut Core, network: Network) {
-        core.flow.set_own(network.addresses());
+    /// Joins the multicast group on each interface.
+    fn join_groups(&self, core: &mut Core, network: InterfaceSet) {
+        core.flow.set_local_addresses(network.addresses());
         if let Some(socket) = &self.multicast {
             let socket = SockRef::from(socket.get_ref());
             for address in network.addresses() {
                 match socket.join_multicast_v4(&MULTICAST, &address) {
                     Ok(()) => {}
-                    // It had this address before, and has it again.
+                    // It had this address before and has it again.
                     Err(error) if error.kind() == io::ErrorKind::AddrInUse => {}
                     Err(error) => {
-                        tracing::debug!(%error, %address, "DDS participants are not heard by multicast there");
+                        tracing::debug!(%error, %address, "cannot receive DDS multicast there");
                     }
                 }
             }
@@ -141,24 +142,24 @@ impl Shared {
         core.network = network;
     }
 
-    /// Does something with the engine, and sends at once what can be sent.
-    pub fn with<T>(&self, work: impl FnOnce(Instant, &mut Engine) -> T) -> T {
+    /// Runs `work` on the engine and sends immediately what can be sent.
+    pub fn with_engine<T>(&self, work: impl FnOnce(Instant, &mut Engine) -> T) -> T {
         let mut core = self.core.lock();
         let before = core.engine.tick_at();
         let result = work(Instant::now(), &mut core.engine);
         let waits = self.flush(&mut core);
-        if waits != Waits::Nothing || core.engine.tick_at() < before {
+        if waits != FlushOutcome::Nothing || core.engine.tick_at() < before {
             self.wake.notify_one();
         }
         result
     }
 
-    /// Only looks at it.
-    pub fn look<T>(&self, look: impl FnOnce(&Engine) -> T) -> T {
+    /// Reads from the engine.
+    pub fn read_engine<T>(&self, look: impl FnOnce(&Engine) -> T) -> T {
         look(&self.core.lock().engine)
     }
 
-    fn flush(&self, core: &mut Core) -> Waits {
+    fn flush(&self, core: &mut Core) -> FlushOutcome {
         let Core {
             engine,
             flow,
@@ -168,11 +169,14 @@ impl Shared {
         flow.take_wait();
         loop {
             let next = stalled.take().or_else(|| {
-                engine
-                    .transmit(&mut |to, length, again| flow.room(Instant::now(), to, length, again))
+                engine.transmit(&mut |to, length, again| {
+                    flow.try_reserve(Instant::now(), to, length, again)
+                })
             });
             let Some(datagram) = next else {
-                return flow.take_wait().map_or(Waits::Nothing, Waits::Receivers);
+                return flow
+                    .take_wait()
+                    .map_or(FlushOutcome::Nothing, FlushOutcome::Receivers);
             };
             if datagram.to.ip().is_multicast() {
                 self.send_to_all(&datagram, network);
@@ -183,29 +187,29 @@ impl Shared {
                 Ok(_) => {}
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                     *stalled = Some(datagram);
-                    return Waits::Socket;
+                    return FlushOutcome::Socket;
                 }
-                // A network that is gone, or a receiver that is not there: as if it was lost on the way.
+                // A network that is gone, or a receiver that does not exist: treated as lost in transit.
                 Err(error) => tracing::trace!(%error, to = %datagram.to, "a datagram was not sent"),
             }
         }
     }
 
-    /// Sends a datagram out of each interface. One that cannot be sent is said again with the next announcement.
-    fn send_to_all(&self, datagram: &Datagram, network: &Network) {
+    /// Sends a datagram through each interface. A failed one is repeated by the next announcement.
+    fn send_to_all(&self, datagram: &Datagram, network: &InterfaceSet) {
         let socket = SockRef::from(self.user.get_ref());
         for address in network.addresses() {
             let sent = socket
                 .set_multicast_if_v4(&address)
                 .and_then(|()| socket.send_to_vectored(&datagram.parts(), &datagram.to.into()));
             if let Err(error) = sent {
-                tracing::trace!(%error, %address, "nothing was said to all there");
+                tracing::trace!(%error, %address, "cannot send DDS multicast there");
             }
         }
     }
 
-    /// Takes what has come on a socket.
-    fn take(&self, socket: &Incoming, buffer: &mut Vec<u8>) {
+    /// Reads the datagrams received by a socket and delivers their samples.
+    fn receive_datagrams(&self, socket: &ReadableSocket, buffer: &mut Vec<u8>) {
         let mut came = Vec::with_capacity(AT_ONCE);
         while came.len() < AT_ONCE {
             buffer.resize(LONGEST, 0);
@@ -236,7 +240,7 @@ impl Shared {
             core.engine.take_deliveries()
         };
         for (sink, sample) in deliveries {
-            sink.sample(sample);
+            sink.on_sample(sample);
         }
     }
 
@@ -247,36 +251,38 @@ impl Shared {
             core.engine.take_deliveries()
         };
         for (sink, sample) in deliveries {
-            sink.sample(sample);
+            sink.on_sample(sample);
         }
     }
 
-    /// Looks which ports are bound without waiting until it is time to.
-    pub fn look_now(&self) {
-        self.look_at_ports();
-        // Newcomers are told of us.
+    /// Checks bound ports immediately.
+    pub fn check_ports_now(&self) {
+        self.check_ports();
+        // Newcomers are sent an announcement.
         self.wake.notify_one();
     }
 
-    /// Looks which ports are bound: who has come, and who is gone.
-    fn look_at_ports(&self) {
+    /// Checks which ports are bound, to detect participants that appear and disappear.
+    fn check_ports(&self) {
         let mut core = self.core.lock();
         let Core { engine, flow, .. } = &mut *core;
-        if !flow.sees() {
+        if !flow.has_diagnostics() {
             return;
         }
         let now = Instant::now();
-        flow.tidy(now);
-        match flow.bound(engine.ports_to_look_at()) {
-            Ok(bound) => engine.ports_bound(now, &bound),
-            Err(error) => tracing::debug!(%error, "the ports of a network namespace are not known"),
+        flow.remove_expired(now);
+        match flow.find_bound(engine.watched_ports()) {
+            Ok(bound) => engine.set_bound_ports(now, &bound),
+            Err(error) => {
+                tracing::debug!(%error, "cannot determine the ports of a network namespace")
+            }
         }
     }
 }
 
-/// Drives a participant until it is aborted. Each `look` it is looked which ports are bound.
-pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
-    let timer = match timer() {
+/// Drives a participant until it is aborted. Bound ports are checked at the interval `look`.
+pub(crate) async fn drive(shared: Arc<DriverState>, look: Duration) {
+    let timer = match create_timer() {
         Ok(timer) => timer,
         Err(error) => {
             tracing::error!(%error, "a DDS participant has no timer and will not be served");
@@ -286,14 +292,14 @@ pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
     let mut buffer = Vec::new();
     let mut ports = tokio::time::interval(look);
     ports.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    let sees = shared.core.lock().flow.sees();
+    let sees = shared.core.lock().flow.has_diagnostics();
     loop {
         let (waits, tick_at) = {
             let mut core = shared.core.lock();
             let waits = shared.flush(&mut core);
             (waits, core.engine.tick_at())
         };
-        if let Waits::Receivers(wait) = waits {
+        if let FlushOutcome::Receivers(wait) = waits {
             let nothing = Timespec {
                 tv_sec: 0,
                 tv_nsec: 0,
@@ -309,56 +315,58 @@ pub(crate) async fn drive(shared: Arc<Shared>, look: Duration) {
         }
         let multicast = async {
             match &shared.multicast {
-                Some(socket) => readable(socket).await,
+                Some(socket) => wait_readable(socket).await,
                 None => std::future::pending().await,
             }
         };
         tokio::select! {
-            Ok(socket) = readable(&shared.user) => shared.take(socket, &mut buffer),
-            Ok(socket) = readable(&shared.discovery) => shared.take(socket, &mut buffer),
-            Ok(socket) = multicast => shared.take(socket, &mut buffer),
-            Ok(mut ready) = timer.readable(), if matches!(waits, Waits::Receivers(_)) => {
+            Ok(socket) = wait_readable(&shared.user) => shared.receive_datagrams(socket, &mut buffer),
+            Ok(socket) = wait_readable(&shared.discovery) => shared.receive_datagrams(socket, &mut buffer),
+            Ok(socket) = multicast => shared.receive_datagrams(socket, &mut buffer),
+            Ok(mut ready) = timer.readable(), if matches!(waits, FlushOutcome::Receivers(_)) => {
                 let mut expirations = [0; 8];
                 let _ = rustix::io::read(timer.get_ref(), &mut expirations);
                 ready.clear_ready();
             }
-            () = room(shared.user.get_ref()), if waits == Waits::Socket => {}
+            () = wait_writable(shared.user.get_ref()), if waits == FlushOutcome::Socket => {}
             () = tokio::time::sleep_until(tick_at.into()) => shared.tick(),
             () = shared.wake.notified() => {}
-            _ = ports.tick(), if sees => shared.look_at_ports(),
+            _ = ports.tick(), if sees => shared.check_ports(),
         }
     }
 }
 
-fn incoming(socket: UdpSocket) -> io::Result<Incoming> {
-    // SAFETY: the descriptor belongs to what is returned alone, which never gives it away: it is open as long as it is registered.
+fn register_readable(socket: UdpSocket) -> io::Result<ReadableSocket> {
+    // SAFETY: the returned value is the sole owner of the descriptor and never gives it away, so it is open as long as
+    // it is registered.
     Ok(unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }?)
 }
 
-/// Waits until something has come on a socket, which is then read until nothing is left.
-async fn readable(socket: &Incoming) -> io::Result<&Incoming> {
+/// Waits until a socket is readable. The caller then reads until nothing is left.
+async fn wait_readable(socket: &ReadableSocket) -> io::Result<&ReadableSocket> {
     socket.readable().await?.retain_ready();
     Ok(socket)
 }
 
 /// Waits until a socket has room for a datagram.
-async fn room(socket: &impl AsFd) {
+async fn wait_writable(socket: &impl AsFd) {
     let waited = async {
         let same = socket.as_fd().try_clone_to_owned()?;
-        // SAFETY: as with `incoming`.
+        // SAFETY: as in `register_readable`.
         let same = unsafe { AsyncFd::register_with_interest(same, Interest::WRITABLE) }?;
         same.writable().await?.retain_ready();
         io::Result::Ok(())
     };
     if let Err(error) = waited.await {
-        tracing::debug!(%error, "it is not told when a DDS participant's socket has room");
+        tracing::debug!(%error, "cannot watch for room in the send buffer of a DDS participant's socket");
         tokio::time::sleep(NO_ROOM).await;
     }
 }
 
-fn timer() -> io::Result<AsyncFd<OwnedFd>> {
+fn create_timer() -> io::Result<AsyncFd<OwnedFd>> {
     let flags = TimerfdFlags::NONBLOCK | TimerfdFlags::CLOEXEC;
     let timer = timerfd_create(TimerfdClockId::Monotonic, flags)?;
-    // SAFETY: the descriptor belongs to what is returned alone, which never gives it away: it is open as long as it is registered.
+    // SAFETY: the returned value is the sole owner of the descriptor and never gives it away, so it is open as long as
+    // it is registered.
     Ok(unsafe { AsyncFd::register(timer) }?)
 }

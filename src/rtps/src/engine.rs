@@ -1,10 +1,10 @@
-//! The participant without its sockets and its clock: datagrams and the time go in, datagrams and samples come out.
+//! A participant without sockets and clock: datagrams and the time go in, datagrams and samples come out.
 //!
 //! ```text
-//!   receive ─▶ discovering (who is there) ─▶ matching (what passes between which ends)
+//!   receive ─▶ discovering (who is there) ─▶ matching (which endpoints communicate)
 //!        │                                        │
 //!        ├─▶ readers ─▶ deliveries                ▼
-//!        └─▶ writers ─▶ Wanted ─▶ paths: one for each address ─▶ transmit
+//!        └─▶ writers ─▶ SendRequests ─▶ paths: one per address ─▶ transmit
 //! ```
 
 #![forbid(unsafe_code)]
@@ -33,18 +33,18 @@ use bytes::Bytes;
 use tokio::sync::watch;
 
 pub(crate) use self::discovering::BUILTIN;
-use self::paths::Path;
+use self::paths::DestinationQueue;
 use self::predecessors::Predecessors;
-use self::servers::Via;
+use self::servers::DiscoverySource;
 use crate::discovery::ParticipantData;
 use crate::locator::Ports;
-use crate::network::Network;
-use crate::participant::{Discovered, DiscoveryServer, Ends, Sample, Sink};
-use crate::qos::{Durability, EndpointQos, History};
-use crate::reader::{Bounds, ReaderState};
+use crate::network::InterfaceSet;
+use crate::participant::{DiscoveredGraph, DiscoveryServer, EndpointMatches, ReceivedSample, Sink};
+use crate::qos::{DurabilityKind, EndpointQos, HistoryKind};
+use crate::reader::{ReaderLimits, ReaderState};
 use crate::time::WireTime;
 use crate::wire::DatagramWriter;
-use crate::writer::{Change, Wanted, WriterState};
+use crate::writer::{CacheChange, SendRequests, WriterState};
 use crate::{EntityId, Guid, GuidPrefix, SequenceNumber, VendorId};
 
 /// A datagram to be sent, in parts, so that a fragment is not copied.
@@ -57,7 +57,7 @@ pub(crate) struct Datagram {
 }
 
 impl Datagram {
-    fn whole(to: SocketAddr, writer: DatagramWriter) -> Self {
+    fn from_writer(to: SocketAddr, writer: DatagramWriter) -> Self {
         Self {
             to,
             head: writer.finish(),
@@ -66,7 +66,7 @@ impl Datagram {
         }
     }
 
-    /// What is sent, one part after the other.
+    /// Returns the parts in the order in which they are sent.
     pub fn parts(&self) -> [IoSlice<'_>; 3] {
         [&self.head, &self.body[..], self.tail].map(IoSlice::new)
     }
@@ -74,84 +74,84 @@ impl Datagram {
 
 /// Another participant.
 #[derive(Debug)]
-struct Remote {
+struct RemoteParticipant {
     data: Arc<ParticipantData>,
-    /// Where it hears of ends.
+    /// Address for discovery data.
     discovery: SocketAddr,
-    /// Where its ends receive.
+    /// Default address of its endpoints.
     user: SocketAddr,
-    /// By whom it is known.
-    via: Via,
+    /// How it was discovered.
+    via: DiscoverySource,
     heard: Instant,
-    /// When it was asked first whether it is there, since it was heard last.
+    /// Time at which it was first pinged since it was last heard.
     asked: Option<Instant>,
 }
 
-/// A writer of ours.
+/// A local writer.
 struct LocalWriter {
     state: WriterState,
-    ends: watch::Sender<Arc<Ends>>,
-    /// It was taken back, and is kept until then for those who have not got all of it.
+    ends: watch::Sender<Arc<EndpointMatches>>,
+    /// The writer was dropped and is kept until this time for readers that have not received everything.
     leaves: Option<Instant>,
 }
 
-/// A reader of ours; those of the protocol have no sink.
+/// A local reader; built-in readers have no sink.
 struct LocalReader {
     state: ReaderState,
-    ends: watch::Sender<Arc<Ends>>,
+    ends: watch::Sender<Arc<EndpointMatches>>,
     sink: Option<Arc<dyn Sink>>,
 }
 
-/// How a participant is made.
+/// Configuration of an engine.
 pub(crate) struct Settings {
     pub own: ParticipantData,
     pub ports: Ports,
-    pub bounds: Bounds,
-    /// Where it announces itself to whoever does not know it yet.
+    pub bounds: ReaderLimits,
+    /// Addresses to which announcements are sent in addition to known participants.
     pub announce_to: Vec<SocketAddr>,
-    /// Servers of discovery: where there are some, it announces itself to them alone.
+    /// Discovery servers; if there are any, announcements are sent only to them.
     pub servers: Vec<DiscoveryServer>,
-    pub network: Network,
-    /// Whether it tells nobody of itself, and hears nobody.
+    pub network: InterfaceSet,
+    /// Neither sends announcements nor listens to others.
     pub alone: bool,
-    /// Who ended without a word, and had this participant's lease.
+    /// Participants that ended without a farewell and had the same lease duration.
     pub predecessors: Vec<GuidPrefix>,
 }
 
-/// A participant.
+/// The protocol engine of one participant.
 pub(crate) struct Engine {
     own: ParticipantData,
     ports: Ports,
-    bounds: Bounds,
+    bounds: ReaderLimits,
     announce_to: Vec<SocketAddr>,
     servers: Vec<DiscoveryServer>,
     announcements: i64,
     announce_at: Instant,
     announce_pause: Duration,
-    network: Network,
+    network: InterfaceSet,
     alone: bool,
     predecessors: Predecessors,
-    /// Which of the domain's ports of this machine were bound when they were looked at last.
+    /// Ports of the domain on this machine that were bound at the last check.
     bound: BTreeSet<SocketAddrV4>,
-    remotes: HashMap<GuidPrefix, Remote>,
-    discovered: Discovered,
+    remotes: HashMap<GuidPrefix, RemoteParticipant>,
+    discovered: DiscoveredGraph,
     discovered_changed: bool,
-    told: watch::Sender<Arc<Discovered>>,
+    told: watch::Sender<Arc<DiscoveredGraph>>,
     writers: HashMap<EntityId, LocalWriter>,
     readers: HashMap<EntityId, LocalReader>,
-    /// Which numbers announce our ends, and which take them back.
+    /// Sequence numbers of the samples that announce local endpoints, and of those that dispose of them.
     announced: HashMap<EntityId, SequenceNumber>,
     withdrawn: VecDeque<(EntityId, SequenceNumber)>,
     next_entity: u32,
-    /// Ends whose `Ends` have changed.
+    /// Endpoints whose [`EndpointMatches`] have changed.
     changed_ends: BTreeSet<EntityId>,
     control: VecDeque<Datagram>,
-    paths: BTreeMap<SocketAddr, Path>,
+    paths: BTreeMap<SocketAddr, DestinationQueue>,
     next_path: Option<SocketAddr>,
-    deliveries: Vec<(Arc<dyn Sink>, Sample)>,
+    deliveries: Vec<(Arc<dyn Sink>, ReceivedSample)>,
     tick_at: Instant,
     closed: bool,
-    /// It was said that there are more others than are heard.
+    /// A warning about too many participants or endpoints was logged.
     crowded: bool,
 }
 
@@ -181,7 +181,7 @@ impl Engine {
             alone,
             bound: BTreeSet::new(),
             remotes: HashMap::new(),
-            discovered: Discovered::default(),
+            discovered: DiscoveredGraph::default(),
             discovered_changed: false,
             told: watch::Sender::new(Arc::default()),
             writers: HashMap::new(),
@@ -198,9 +198,9 @@ impl Engine {
             closed: false,
             crowded: false,
         };
-        engine.add_builtin_ends();
+        engine.add_builtin_endpoints();
         if engine.is_client() {
-            engine.add_ends_for_servers(now);
+            engine.add_server_endpoints(now);
         }
         engine
     }
@@ -209,11 +209,11 @@ impl Engine {
         Guid::new(self.own.prefix, EntityId::PARTICIPANT)
     }
 
-    pub fn discovered(&self) -> watch::Receiver<Arc<Discovered>> {
+    pub fn watch_discovered(&self) -> watch::Receiver<Arc<DiscoveredGraph>> {
         self.told.subscribe()
     }
 
-    /// When `tick` is to be called again.
+    /// Returns the time at which [`tick`](Self::tick) is to be called.
     pub fn tick_at(&self) -> Instant {
         self.tick_at
     }
@@ -222,8 +222,8 @@ impl Engine {
         self.tick_at = self.tick_at.min(at);
     }
 
-    /// Samples for sinks, since the last time. They are given on when nobody holds the engine.
-    pub fn take_deliveries(&mut self) -> Vec<(Arc<dyn Sink>, Sample)> {
+    /// Returns the samples for sinks since the last call. They are delivered while the engine is not locked.
+    pub fn take_deliveries(&mut self) -> Vec<(Arc<dyn Sink>, ReceivedSample)> {
         std::mem::take(&mut self.deliveries)
     }
 
@@ -248,14 +248,14 @@ impl Engine {
             }
         }
         for (entity, sample) in announcements {
-            self.announced(now, entity, &sample);
+            self.on_announcement(now, entity, &sample);
         }
         for answer in answers {
-            self.answer(answer);
+            self.send_ack(answer);
         }
         let mut all = Vec::new();
         for (entity, writer) in &mut self.writers {
-            let mut wanted = Wanted::default();
+            let mut wanted = SendRequests::default();
             again = again.min(writer.state.tick(now, &mut wanted).unwrap_or(again));
             all.push((*entity, wanted));
         }
@@ -263,36 +263,36 @@ impl Engine {
             self.enqueue(entity, wanted);
         }
         self.tick_at = again;
-        self.let_go(now);
-        self.tell();
+        self.remove_finished_writers(now);
+        self.publish_changes();
     }
 
-    /// Says good-bye; what is lined up then is the last.
+    /// Announces the departure; datagrams queued now are the last ones.
     pub fn close(&mut self, now: Instant) {
         if !std::mem::replace(&mut self.closed, true) {
-            self.say_goodbye(now);
+            self.announce_departure(now);
         }
     }
 
-    /// Whether readers have all that was written to them.
+    /// Returns whether all readers have received everything written to them.
     pub fn is_settled(&self) -> bool {
         let mut written = self
             .writers
             .iter()
             .filter(|(entity, _)| !entity.is_builtin());
         written.all(|(entity, writer)| {
-            writer.state.is_settled() && !self.paths.values().any(|path| path.holds(*entity))
+            writer.state.is_settled() && !self.paths.values().any(|path| path.has_pending(*entity))
         })
     }
 
-    /// Tells whoever waits, after something was changed from outside.
+    /// Publishes changes that were made from outside.
     #[cfg(test)]
-    pub fn settle(&mut self) {
-        self.tell();
+    pub fn flush_changes(&mut self) {
+        self.publish_changes();
     }
 
-    fn change_of_announcement(payload: Bytes) -> Change {
-        Change {
+    fn announcement_change(payload: Bytes) -> CacheChange {
+        CacheChange {
             payload,
             related: None,
             written: WireTime::from(SystemTime::now()),
@@ -303,8 +303,8 @@ impl Engine {
 
     fn builtin_qos() -> EndpointQos {
         EndpointQos {
-            durability: Durability::TransientLocal,
-            history: History::KeepAll,
+            durability: DurabilityKind::TransientLocal,
+            history: HistoryKind::KeepAll,
             ..EndpointQos::default()
         }
     }

@@ -1,7 +1,7 @@
-//! How full the receivers' buffers are. Peers on this machine receive into buffers of some 200 kB by default, which a picture sent
-//! at the speed of the loopback device overflows; what does not fit is lost without a word. The kernel tells how much of such a
-//! buffer is in use (`NETLINK_SOCK_DIAG`, sock_diag(7)), so that it is filled up to a part, and no further. Where that is not known,
-//! a pace is kept.
+//! Flow control by the fill level of the receivers' buffers. Peers on this machine have receive buffers of about 200 kB
+//! by default, which an image sent at the speed of the loopback device overflows; the excess is lost silently. The
+//! kernel reports how much of such a buffer is in use (`NETLINK_SOCK_DIAG`, sock_diag(7)), so it is filled up to a
+//! fraction. Where the level is unknown, sending is paced.
 
 use std::collections::{BTreeSet, HashMap};
 use std::io::{self, Read, Write};
@@ -11,82 +11,88 @@ use std::time::{Duration, Instant};
 
 use socket2::Socket;
 
-use crate::pace::Pace;
+use crate::pace::Pacer;
 
-/// Of a receiver's buffer so much is used at most; the rest is for others.
+/// Fraction of a receiver's buffer that is used at most; the rest is left to other senders.
 const PART: (usize, usize) = (5, 8);
-/// What may be sent unasked after a pause, to a receiver that had room: it cannot be much of any buffer.
+/// Bytes that may be sent without a query after a pause, to a receiver that had room: a small part of any buffer.
 const UNASKED: usize = 8 << 10;
-/// What was asked counts for so long.
+/// Time for which the result of a query is valid.
 const RECENT: Duration = Duration::from_millis(1);
-/// A receiver without room is looked at again after this time.
+/// Time after which a full receiver is queried again.
 const LOOK_AGAIN: Duration = Duration::from_micros(60);
-/// What the kernel adds to a datagram: its own headers and its record of the packet.
+/// Overhead of a datagram in the kernel: headers and packet record.
 const OVERHEAD: usize = 448;
 const RECORD: usize = 256;
 
-/// What one receiver can take.
+/// Estimate of what a receiver can take.
 #[derive(Debug, Clone, Copy)]
 struct Credit {
     bytes: usize,
     asked: Instant,
-    /// It had no room when it was looked at last: nothing is sent unasked.
+    /// The receiver had no room at the last query, so nothing is sent without another one.
     full: bool,
 }
 
-/// Looks at receivers.
+/// Flow control for all receivers.
 #[derive(Debug)]
-pub(crate) struct Flow {
+pub(crate) struct FlowControl {
     diagnostics: Option<Socket>,
-    /// Addresses of this machine beside the loopback device's.
+    /// Addresses of this machine except those of the loopback device.
     own: BTreeSet<Ipv4Addr>,
     credits: HashMap<SocketAddr, Credit>,
-    pace: Pace,
-    /// When one of those without room is to be looked at again; none where all had room.
+    pace: Pacer,
+    /// Time after which a full receiver is to be queried again; `None` if all had room.
     wait: Option<Duration>,
     answer: Vec<u8>,
 }
 
-impl Flow {
-    /// With a socket of the kernel's diagnostics in the network namespace of the receivers.
+impl FlowControl {
+    /// Creates flow control with a kernel diagnostics socket in the network namespace of the receivers.
     pub fn new(diagnostics: Option<OwnedFd>) -> Self {
         let diagnostics = diagnostics.map(Socket::from);
         if let Some(socket) = &diagnostics {
-            // The kernel answers at once; should it not, nobody is to wait for it.
+            // The kernel answers immediately; if it does not, nobody should wait for it.
             let _ = socket.set_read_timeout(Some(Duration::from_millis(100)));
         }
         Self {
             diagnostics,
             own: BTreeSet::new(),
             credits: HashMap::new(),
-            pace: Pace::default(),
+            pace: Pacer::default(),
             wait: None,
             answer: vec![0; 32 << 10],
         }
     }
 
-    /// Whether the kernel can be asked.
-    pub fn sees(&self) -> bool {
+    /// Returns whether the kernel can be queried.
+    pub fn has_diagnostics(&self) -> bool {
         self.diagnostics.is_some()
     }
 
-    /// These are the addresses of this machine now.
-    pub fn set_own(&mut self, own: impl Iterator<Item = Ipv4Addr>) {
+    /// Sets the current addresses of this machine.
+    pub fn set_local_addresses(&mut self, own: impl Iterator<Item = Ipv4Addr>) {
         self.own = own.collect();
     }
 
-    /// After which time those are to be looked at again that had no room since this was asked last.
+    /// Returns the time after which to query receivers that had no room since the last call.
     pub fn take_wait(&mut self) -> Option<Duration> {
         self.wait.take()
     }
 
-    /// Whether a receiver can take a datagram of so many bytes now; it is counted as sent if so. `again` tells that it has
-    /// asked for it.
-    pub fn room(&mut self, now: Instant, to: SocketAddr, length: usize, again: bool) -> bool {
-        let wait = match self.seen(to) {
-            Some(at) if self.has_room(now, at, length) => return true,
+    /// Returns whether a receiver can take a datagram of this length now, and if so counts it as sent. `again`: the
+    /// receiver has requested it again.
+    pub fn try_reserve(
+        &mut self,
+        now: Instant,
+        to: SocketAddr,
+        length: usize,
+        again: bool,
+    ) -> bool {
+        let wait = match self.local_address(to) {
+            Some(at) if self.reserve_credit(now, at, length) => return true,
             Some(_) => LOOK_AGAIN,
-            None => match self.pace.room(now, to, length, again) {
+            None => match self.pace.try_reserve(now, to, length, again) {
                 Ok(()) => return true,
                 Err(wait) => wait,
             },
@@ -95,16 +101,16 @@ impl Flow {
         false
     }
 
-    /// The address of a receiver whose buffer can be looked at: one of this machine.
-    fn seen(&self, to: SocketAddr) -> Option<SocketAddrV4> {
+    /// Returns the address of a receiver whose buffer can be queried: one on this machine.
+    fn local_address(&self, to: SocketAddr) -> Option<SocketAddrV4> {
         let SocketAddr::V4(at) = to else {
             return None;
         };
         let here = at.ip().is_loopback() || self.own.contains(at.ip());
-        (here && self.sees()).then_some(at)
+        (here && self.has_diagnostics()).then_some(at)
     }
 
-    fn has_room(&mut self, now: Instant, address: SocketAddrV4, length: usize) -> bool {
+    fn reserve_credit(&mut self, now: Instant, address: SocketAddrV4, length: usize) -> bool {
         let to = SocketAddr::V4(address);
         let cost = (length + OVERHEAD).next_power_of_two() + RECORD;
         let credit = self.credits.entry(to).or_insert(Credit {
@@ -123,9 +129,9 @@ impl Flow {
             credit.bytes -= cost;
             return true;
         }
-        let (queued, buffer) = match self.ask(*address.ip(), address.port()) {
+        let (queued, buffer) = match self.query_buffer(*address.ip(), address.port()) {
             Ok(Some(told)) => told,
-            // Nobody is there, or the kernel does not tell: nothing to wait for.
+            // Nobody is there, or the kernel does not answer: nothing to wait for.
             Ok(None) | Err(_) => return true,
         };
         let free = (buffer / PART.1 * PART.0).saturating_sub(queued);
@@ -142,39 +148,40 @@ impl Flow {
         fits
     }
 
-    /// Forgets receivers that nobody sends to.
-    pub fn tidy(&mut self, now: Instant) {
-        self.pace.tidy(now);
+    /// Forgets receivers to which nothing was sent recently.
+    pub fn remove_expired(&mut self, now: Instant) {
+        self.pace.remove_expired(now);
         self.credits.retain(|_, credit| {
             now.saturating_duration_since(credit.asked) < Duration::from_secs(10)
         });
     }
 
-    /// Bytes in use in the buffer of the socket that is bound there, and the buffer's size; none where there is no socket.
-    fn ask(&mut self, ip: Ipv4Addr, port: u16) -> io::Result<Option<(usize, usize)>> {
+    /// Queries the bytes in use and the size of the receive buffer of the socket bound there; `None` if there is no
+    /// socket.
+    fn query_buffer(&mut self, ip: Ipv4Addr, port: u16) -> io::Result<Option<(usize, usize)>> {
         let Some(socket) = &mut self.diagnostics else {
             return Ok(None);
         };
-        socket.write_all(&request(ip, port))?;
+        socket.write_all(&encode_request(ip, port))?;
         let length = socket.read(&mut self.answer)?;
         let mut found = None;
-        for (kind, body) in messages(&self.answer[..length]) {
+        for (kind, body) in split_messages(&self.answer[..length]) {
             if kind == SOCK_DIAG_BY_FAMILY {
-                found = filled(body);
+                found = parse_buffer_usage(body);
             }
         }
         Ok(found)
     }
 
-    /// At which of these addresses of this machine a socket of UDP receives. One is asked for after the other: a list of all
-    /// sockets costs the kernel a walk through a table of thousands of rows.
-    pub fn bound(
+    /// Returns the addresses on this machine at which a UDP socket is bound. They are queried one by one: for a list of
+    /// all sockets the kernel would walk a table of thousands of rows.
+    pub fn find_bound(
         &mut self,
         addresses: impl IntoIterator<Item = SocketAddrV4>,
     ) -> io::Result<BTreeSet<SocketAddrV4>> {
         let mut bound = BTreeSet::new();
         for at in addresses {
-            if self.ask(*at.ip(), at.port())?.is_some() {
+            if self.query_buffer(*at.ip(), at.port())?.is_some() {
                 bound.insert(at);
             }
         }
@@ -186,18 +193,19 @@ const SOCK_DIAG_BY_FAMILY: u16 = 20;
 const NLM_F_REQUEST: u16 = 1;
 const INET_DIAG_SKMEMINFO: u8 = 7;
 
-/// `struct nlmsghdr` and `struct inet_diag_req_v2`: of the socket to which datagrams for this address go.
-fn request(ip: Ipv4Addr, port: u16) -> Vec<u8> {
+/// Encodes `struct nlmsghdr` and `struct inet_diag_req_v2` for the socket that receives at this address.
+fn encode_request(ip: Ipv4Addr, port: u16) -> Vec<u8> {
     const LENGTH: u32 = 16 + 56;
     let mut bytes = Vec::with_capacity(LENGTH as usize);
     bytes.extend(LENGTH.to_ne_bytes());
     bytes.extend(SOCK_DIAG_BY_FAMILY.to_ne_bytes());
     bytes.extend(NLM_F_REQUEST.to_ne_bytes());
     bytes.extend([0; 8]);
-    // AF_INET, IPPROTO_UDP, what is to be told beside, padding; any state.
+    // AF_INET, IPPROTO_UDP, requested extensions, padding; any state.
     bytes.extend([2, 17, 1 << (INET_DIAG_SKMEMINFO - 1), 0]);
     bytes.extend(u32::MAX.to_ne_bytes());
-    // Source port and destination port. For one socket of UDP, the kernel takes the destination for the socket's own address.
+    // Source and destination port. For a single UDP socket, the kernel uses the destination as the socket's own
+    // address.
     bytes.extend(0u16.to_be_bytes());
     bytes.extend(port.to_be_bytes());
     for address in [Ipv4Addr::LOCALHOST, ip] {
@@ -210,8 +218,8 @@ fn request(ip: Ipv4Addr, port: u16) -> Vec<u8> {
     bytes
 }
 
-/// The messages of an answer: kind and body.
-fn messages(mut bytes: &[u8]) -> impl Iterator<Item = (u16, &[u8])> {
+/// Splits an answer into messages: type and body.
+fn split_messages(mut bytes: &[u8]) -> impl Iterator<Item = (u16, &[u8])> {
     std::iter::from_fn(move || {
         let length = u32::from_ne_bytes(bytes.get(..4)?.try_into().ok()?) as usize;
         let kind = u16::from_ne_bytes(bytes.get(4..6)?.try_into().ok()?);
@@ -221,8 +229,8 @@ fn messages(mut bytes: &[u8]) -> impl Iterator<Item = (u16, &[u8])> {
     })
 }
 
-/// Of `struct inet_diag_msg` and its attributes: bytes in use and the size of the buffer.
-fn filled(body: &[u8]) -> Option<(usize, usize)> {
+/// Parses `struct inet_diag_msg` and its attributes: bytes in use and size of the buffer.
+fn parse_buffer_usage(body: &[u8]) -> Option<(usize, usize)> {
     const MESSAGE: usize = 72;
     let number = |bytes: &[u8], at: usize| {
         Some(u32::from_ne_bytes(bytes.get(at..at + 4)?.try_into().ok()?) as usize)
@@ -252,11 +260,11 @@ mod tests {
 
     use super::*;
 
-    fn flow() -> Flow {
+    fn flow() -> FlowControl {
         // AF_NETLINK and NETLINK_SOCK_DIAG.
         let socket = Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4)))
             .expect("a socket of diagnostics");
-        Flow::new(Some(socket.into()))
+        FlowControl::new(Some(socket.into()))
     }
 
     #[test]
@@ -267,7 +275,7 @@ mod tests {
         let mut flow = flow();
         let datagram = [7; 16_000];
         let mut sent = 0;
-        while flow.room(Instant::now(), to, datagram.len(), false) {
+        while flow.try_reserve(Instant::now(), to, datagram.len(), false) {
             sender.send_to(&datagram, to).expect("sending");
             sent += 1;
             assert!(sent < 10_000, "never refused");
@@ -282,7 +290,7 @@ mod tests {
             .count();
         assert_eq!(came, sent, "all that was sent has come");
         assert!(
-            flow.room(Instant::now(), to, datagram.len(), false),
+            flow.try_reserve(Instant::now(), to, datagram.len(), false),
             "there is room again"
         );
     }
@@ -294,13 +302,13 @@ mod tests {
         let to = receiver.local_addr().expect("its address");
         let (mut flow, mut now) = (flow(), Instant::now());
         let datagram = [7; 1000];
-        while flow.room(now, to, datagram.len(), false) {
+        while flow.try_reserve(now, to, datagram.len(), false) {
             sender.send_to(&datagram, to).expect("sending");
         }
         for _ in 0..100 {
             now += 2 * RECENT;
             assert!(
-                !flow.room(now, to, datagram.len(), false),
+                !flow.try_reserve(now, to, datagram.len(), false),
                 "it is still full"
             );
         }
@@ -312,9 +320,9 @@ mod tests {
         let port = receiver.local_addr().expect("its address").port();
         let at = SocketAddrV4::new(Ipv4Addr::LOCALHOST, port);
         let mut flow = flow();
-        assert_eq!(flow.bound([at]).expect("ports"), BTreeSet::from([at]));
+        assert_eq!(flow.find_bound([at]).expect("ports"), BTreeSet::from([at]));
         drop(receiver);
-        assert_eq!(flow.bound([at]).expect("ports"), BTreeSet::new());
+        assert_eq!(flow.find_bound([at]).expect("ports"), BTreeSet::new());
     }
 
     #[test]
@@ -323,6 +331,6 @@ mod tests {
         let to = receiver.local_addr().expect("its address");
         drop(receiver);
         let mut flow = flow();
-        assert!((0..1000).all(|_| flow.room(Instant::now(), to, 16_000, false)));
+        assert!((0..1000).all(|_| flow.try_reserve(Instant::now(), to, 16_000, false)));
     }
 }

@@ -1,4 +1,4 @@
-//! Samples in fragments: how they are cut, and how they are put together again (8.3.8.3, 8.4.14.1).
+//! Fragmentation and reassembly of samples (8.3.8.3, 8.4.14.1).
 
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -9,57 +9,59 @@ use bytes::Bytes;
 use crate::sequence::{FragmentNumber, FragmentSet, SPAN};
 use crate::{SampleIdentity, time::WireTime};
 
-/// Bytes of a sample in one datagram of ours. With all headers such a datagram just fits into the kernel's 16 KiB of memory
-/// for packets: a byte more, and it would count twice as much in its receiver's buffer.
+/// Payload bytes of a fragment. With all headers such a datagram just fits into the kernel's 16 KiB of packet memory;
+/// one byte more would count twice as much in the receiver's buffer.
 pub(crate) const FRAGMENT: usize = 15_872;
 
-/// How many fragments a sample of so many bytes has.
-pub(crate) fn count(length: usize) -> FragmentNumber {
+/// Returns the number of fragments of a sample of this length.
+pub(crate) fn fragment_count(length: usize) -> FragmentNumber {
     FragmentNumber::try_from(length.div_ceil(FRAGMENT)).unwrap_or(FragmentNumber::MAX)
 }
 
-/// Fragments that came before the ones before them: at most so many are kept aside.
+/// Maximum number of out-of-order fragments that are kept.
 const MOST_ASIDE: usize = 4096;
-/// What it takes to keep one of them, beside its bytes.
+/// Overhead of a kept fragment in bytes.
 const KEEPING: usize = 128;
-/// A shorter fragment that is kept aside is copied: it would keep its whole datagram, which may be so much longer.
+/// Length below which an out-of-order fragment is copied; otherwise it would keep its whole datagram, which may be much
+/// longer.
 const COPIED: usize = 32 << 10;
 
-/// A sample that is not whole yet. What it holds grows with the bytes that have come, not with what was announced, and all of it
-/// counts.
+/// An incomplete sample. Its memory grows with the bytes received, not with the announced size, and is charged to the
+/// budget.
 #[derive(Debug)]
 pub(crate) struct Assembly {
     size: usize,
     fragment: usize,
     total: FragmentNumber,
-    /// The first fragments, without a hole.
+    /// The first fragments without a gap.
     whole: Vec<u8>,
-    /// The one that is to come next.
+    /// Number of the next fragment in order.
     next: FragmentNumber,
     aside: BTreeMap<FragmentNumber, Bytes>,
-    /// What `aside` takes.
+    /// Memory of `aside`.
     held_aside: usize,
-    /// Counts `aside`, and the room that `whole` has.
+    /// Permit for `aside` and the capacity of `whole`.
     permit: Permit,
-    /// When the last fragment came.
+    /// Time at which the last fragment was received.
     pub heard: Instant,
     pub related: Option<SampleIdentity>,
     pub written: Option<WireTime>,
 }
 
-/// What became of fragments.
+/// Result of adding fragments.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Progress {
-    /// Some are missing yet.
+    /// Fragments are still missing.
     Missing,
-    /// The sample is whole.
+    /// The sample is complete.
     Whole,
-    /// They do not fit to what was said of the sample, or into the budget.
+    /// The fragments are inconsistent with the sample, or exceed the budget.
     Refused,
 }
 
 impl Assembly {
-    /// Of a sample with so many bytes in fragments of that size; none where that cannot be.
+    /// Creates the assembly of a sample of `size` bytes in fragments of `fragment` bytes; `None` if the sizes are
+    /// invalid.
     pub fn new(
         size: u32,
         fragment: u16,
@@ -87,8 +89,8 @@ impl Assembly {
         })
     }
 
-    /// Takes `count` fragments from number `first` on.
-    pub fn take(
+    /// Adds `count` fragments from number `first` on.
+    pub fn add_fragments(
         &mut self,
         first: FragmentNumber,
         count: u16,
@@ -115,7 +117,7 @@ impl Assembly {
             else {
                 return Progress::Refused;
             };
-            if !self.keep(number, payload.slice(start..end)) {
+            if !self.store(number, payload.slice(start..end)) {
                 return Progress::Refused;
             }
         }
@@ -127,12 +129,12 @@ impl Assembly {
         }
     }
 
-    fn keep(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
+    fn store(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
         if number < self.next || self.aside.contains_key(&number) {
             return true;
         }
         if number > self.next {
-            return self.keep_aside(number, bytes);
+            return self.store_out_of_order(number, bytes);
         }
         if !self.append(&bytes) {
             return false;
@@ -146,31 +148,32 @@ impl Assembly {
         true
     }
 
-    fn keep_aside(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
+    fn store_out_of_order(&mut self, number: FragmentNumber, bytes: Bytes) -> bool {
         let held = bytes.len() + KEEPING;
-        if self.aside.len() >= MOST_ASIDE || !self.count(self.whole.capacity(), held) {
+        if self.aside.len() >= MOST_ASIDE || !self.charge(self.whole.capacity(), held) {
             return false;
         }
         self.held_aside += held;
-        let bytes = match bytes.len() < COPIED {
-            true => Bytes::copy_from_slice(&bytes),
-            false => bytes,
+        let bytes = if bytes.len() < COPIED {
+            Bytes::copy_from_slice(&bytes)
+        } else {
+            bytes
         };
         self.aside.insert(number, bytes);
         true
     }
 
-    /// Counts so much room for the first fragments, and so much more aside; whether it fits.
-    fn count(&mut self, whole: usize, more: usize) -> bool {
+    /// Charges the capacity for the first fragments and additional out-of-order memory; returns whether it fits.
+    fn charge(&mut self, whole: usize, more: usize) -> bool {
         self.permit.resize(whole + self.held_aside + more).is_ok()
     }
 
     fn append(&mut self, bytes: &[u8]) -> bool {
         if self.whole.capacity() - self.whole.len() < bytes.len() {
-            // Twice what has come, at most the whole.
+            // Doubles the capacity, up to the size of the sample.
             let most = self.size - self.whole.len();
             let more = self.whole.len().max(bytes.len()).min(most);
-            if !self.count(self.whole.len() + more, 0) {
+            if !self.charge(self.whole.len() + more, 0) {
                 return false;
             }
             self.whole.reserve_exact(more);
@@ -180,8 +183,8 @@ impl Assembly {
         true
     }
 
-    /// Which fragments are missing among the first 256 from the first missing one on; all that are up to `last`.
-    pub fn missing(&self, last: FragmentNumber) -> FragmentSet {
+    /// Returns the missing fragments up to `last`, among the 256 from the first missing one on.
+    pub fn missing_fragments(&self, last: FragmentNumber) -> FragmentSet {
         let mut set = FragmentSet::empty(self.next);
         let until = last.min(self.total).min(self.next.saturating_add(SPAN - 1));
         for number in self.next..=until {
@@ -192,14 +195,14 @@ impl Assembly {
         set
     }
 
-    /// The whole sample, which counts in its budget until it is dropped.
+    /// Returns the complete sample, which is charged to its budget until it is dropped.
     pub fn into_bytes(self) -> Bytes {
         let Self {
             whole, mut permit, ..
         } = self;
-        // Less than before, if anything: it cannot be refused.
+        // It shrinks if anything, so it cannot be refused.
         let _ = permit.resize(whole.capacity());
-        permit.around(whole)
+        permit.wrap_bytes(whole)
     }
 }
 
@@ -214,7 +217,7 @@ mod tests {
             size,
             fragment,
             1 << 20,
-            Budget::unlimited().permit(),
+            Budget::without_limit().permit(),
             Instant::now(),
         )
     }
@@ -225,15 +228,36 @@ mod tests {
         let mut assembly = assembly(25, 10).expect("a size that fits");
         let now = Instant::now();
         let part = |range: std::ops::Range<usize>| Bytes::copy_from_slice(&sample[range]);
-        assert_eq!(assembly.take(3, 1, &part(20..25), now), Progress::Missing);
         assert_eq!(
-            assembly.missing(u32::MAX).iter().collect::<Vec<_>>(),
+            assembly.add_fragments(3, 1, &part(20..25), now),
+            Progress::Missing
+        );
+        assert_eq!(
+            assembly
+                .missing_fragments(u32::MAX)
+                .iter()
+                .collect::<Vec<_>>(),
             [1, 2]
         );
-        assert_eq!(assembly.take(1, 1, &part(0..10), now), Progress::Missing);
-        assert_eq!(assembly.take(1, 1, &part(0..10), now), Progress::Missing);
-        assert_eq!(assembly.missing(u32::MAX).iter().collect::<Vec<_>>(), [2]);
-        assert_eq!(assembly.take(2, 1, &part(10..20), now), Progress::Whole);
+        assert_eq!(
+            assembly.add_fragments(1, 1, &part(0..10), now),
+            Progress::Missing
+        );
+        assert_eq!(
+            assembly.add_fragments(1, 1, &part(0..10), now),
+            Progress::Missing
+        );
+        assert_eq!(
+            assembly
+                .missing_fragments(u32::MAX)
+                .iter()
+                .collect::<Vec<_>>(),
+            [2]
+        );
+        assert_eq!(
+            assembly.add_fragments(2, 1, &part(10..20), now),
+            Progress::Whole
+        );
         assert_eq!(assembly.into_bytes(), sample);
     }
 
@@ -242,33 +266,33 @@ mod tests {
         let sample: Vec<u8> = (0..25).collect();
         let mut assembly = assembly(25, 10).expect("a size that fits");
         assert_eq!(
-            assembly.take(1, 3, &Bytes::from(sample.clone()), Instant::now()),
+            assembly.add_fragments(1, 3, &Bytes::from(sample.clone()), Instant::now()),
             Progress::Whole
         );
         assert_eq!(assembly.into_bytes(), sample);
     }
 
     #[test]
-    fn what_cannot_be_is_refused() {
+    fn impossible_fragments_are_refused() {
         assert!(assembly(10, 0).is_none());
         assert!(assembly(0, 10).is_none());
         assert!(assembly(2 << 20, 1000).is_none());
         let mut assembly = assembly(25, 10).expect("a size that fits");
         let now = Instant::now();
         assert_eq!(
-            assembly.take(0, 1, &Bytes::from_static(&[0; 10]), now),
+            assembly.add_fragments(0, 1, &Bytes::from_static(&[0; 10]), now),
             Progress::Refused
         );
         assert_eq!(
-            assembly.take(4, 1, &Bytes::from_static(&[0; 10]), now),
+            assembly.add_fragments(4, 1, &Bytes::from_static(&[0; 10]), now),
             Progress::Refused
         );
         assert_eq!(
-            assembly.take(1, 1, &Bytes::from_static(&[0; 9]), now),
+            assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 9]), now),
             Progress::Refused
         );
         assert_eq!(
-            assembly.take(3, 1, &Bytes::from_static(&[0; 8]), now),
+            assembly.add_fragments(3, 1, &Bytes::from_static(&[0; 8]), now),
             Progress::Missing
         );
     }
@@ -278,37 +302,43 @@ mod tests {
         let budget = Budget::new("test", 1000);
         let mut assembly = Assembly::new(1 << 20, 600, 1 << 20, budget.permit(), Instant::now())
             .expect("a size that fits");
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
         let now = Instant::now();
         assert_eq!(
-            assembly.take(1, 1, &Bytes::from_static(&[0; 600]), now),
+            assembly.add_fragments(1, 1, &Bytes::from_static(&[0; 600]), now),
             Progress::Missing
         );
         assert_eq!(
-            assembly.take(2, 1, &Bytes::from_static(&[0; 600]), now),
+            assembly.add_fragments(2, 1, &Bytes::from_static(&[0; 600]), now),
             Progress::Refused
         );
         drop(assembly);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[test]
-    fn what_is_kept_of_short_fragments_counts_as_what_it_takes() {
+    fn stored_short_fragments_are_charged_with_their_overhead() {
         let budget = Budget::new("test", 1 << 20);
         let mut assembly = Assembly::new(1 << 16, 1, 1 << 20, budget.permit(), Instant::now())
             .expect("a size that fits");
         let now = Instant::now();
         let datagram = Bytes::from(vec![0; 60_000]);
         for number in 2..2 + MOST_ASIDE as u32 {
-            assert_eq!(assembly.take(number, 1, &datagram, now), Progress::Missing);
+            assert_eq!(
+                assembly.add_fragments(number, 1, &datagram, now),
+                Progress::Missing
+            );
         }
         assert!(datagram.is_unique(), "a byte keeps its datagram");
-        assert_eq!(budget.used(), MOST_ASIDE * (1 + KEEPING));
-        assert_eq!(assembly.take(1, 1, &datagram, now), Progress::Missing);
+        assert_eq!(budget.used_bytes(), MOST_ASIDE * (1 + KEEPING));
+        assert_eq!(
+            assembly.add_fragments(1, 1, &datagram, now),
+            Progress::Missing
+        );
         assert_eq!(assembly.next, 2 + MOST_ASIDE as u32);
-        assert!(assembly.whole.capacity() <= budget.used());
+        assert!(assembly.whole.capacity() <= budget.used_bytes());
         drop(assembly);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[test]
@@ -318,11 +348,11 @@ mod tests {
             .expect("a size that fits");
         let now = Instant::now();
         for number in [3, 2, 1] {
-            assembly.take(number, 1, &Bytes::from(vec![0; 1000]), now);
+            assembly.add_fragments(number, 1, &Bytes::from(vec![0; 1000]), now);
         }
         let whole = assembly.into_bytes();
-        assert_eq!((whole.len(), budget.used()), (3000, 3000));
+        assert_eq!((whole.len(), budget.used_bytes()), (3000, 3000));
         drop(whole);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 }

@@ -1,10 +1,10 @@
-//! Names of participants and of their ends (8.2.4, 9.3.1).
+//! Identifiers of participants and endpoints (8.2.4, 9.3.1).
 
 use std::fmt;
 
 use crate::SequenceNumber;
 
-/// Which implementation a participant is of (8.3.3.1.3).
+/// Implementation of a participant (8.3.3.1.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct VendorId(pub [u8; 2]);
 
@@ -15,19 +15,19 @@ impl VendorId {
     pub const CYCLONE: Self = Self([1, 16]);
     /// RTI Connext.
     pub const CONNEXT: Self = Self([1, 1]);
-    /// Ours: of no registered implementation.
+    /// This implementation, which is not registered.
     pub const OURS: Self = Self([0xca, 0xfe]);
 }
 
-/// Tells a participant apart: the first twelve bytes of the GUIDs of all its ends.
+/// Identifies a participant: the first twelve bytes of the GUIDs of all its endpoints.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct GuidPrefix(pub [u8; 12]);
 
 impl GuidPrefix {
-    /// Nobody in particular.
+    /// No particular participant.
     pub const UNKNOWN: Self = Self([0; 12]);
 
-    /// Nobody else's: the vendor's two bytes, as implementations have it, and ten at random.
+    /// Creates a unique prefix: two bytes of the vendor, as is the convention, and ten random ones.
     pub fn random() -> Self {
         let mut prefix = [0; 12];
         prefix[..2].copy_from_slice(&VendorId::OURS.0);
@@ -36,38 +36,38 @@ impl GuidPrefix {
     }
 }
 
-/// Tells an end of a participant apart: three bytes of key, one of kind (9.3.1.2).
+/// Identifies an endpoint within a participant: three bytes of key, one of kind (9.3.1.2).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct EntityId(pub [u8; 4]);
 
 impl EntityId {
-    /// Every end that it may concern.
+    /// Any matching endpoint.
     pub const UNKNOWN: Self = Self([0, 0, 0, 0]);
     /// The participant itself.
     pub const PARTICIPANT: Self = Self([0, 0, 1, 0xc1]);
-    /// Who announces participants.
+    /// Writer of participant announcements.
     pub const SPDP_WRITER: Self = Self([0, 1, 0, 0xc2]);
-    /// Who hears of participants.
+    /// Reader of participant announcements.
     pub const SPDP_READER: Self = Self([0, 1, 0, 0xc7]);
-    /// Who announces writers.
+    /// Writer of announcements of writers.
     pub const PUBLICATIONS_WRITER: Self = Self([0, 0, 3, 0xc2]);
-    /// Who hears of writers.
+    /// Reader of announcements of writers.
     pub const PUBLICATIONS_READER: Self = Self([0, 0, 3, 0xc7]);
-    /// Who announces readers.
+    /// Writer of announcements of readers.
     pub const SUBSCRIPTIONS_WRITER: Self = Self([0, 0, 4, 0xc2]);
-    /// Who hears of readers.
+    /// Reader of announcements of readers.
     pub const SUBSCRIPTIONS_READER: Self = Self([0, 0, 4, 0xc7]);
-    /// Who says that its participant is alive (8.4.13).
+    /// Writer of liveliness assertions (8.4.13).
     pub const LIVELINESS_WRITER: Self = Self([0, 2, 0, 0xc2]);
-    /// Who hears that participants are alive.
+    /// Reader of liveliness assertions.
     pub const LIVELINESS_READER: Self = Self([0, 2, 0, 0xc7]);
 
-    /// A writer of ours for a topic without keys.
+    /// Returns the id of a local writer of a topic without keys.
     pub(crate) fn user_writer(number: u32) -> Self {
         Self::user(number, 0x03)
     }
 
-    /// A reader of ours for a topic without keys.
+    /// Returns the id of a local reader of a topic without keys.
     pub(crate) fn user_reader(number: u32) -> Self {
         Self::user(number, 0x04)
     }
@@ -77,33 +77,33 @@ impl EntityId {
         Self([a, b, c, kind])
     }
 
-    /// Whether it is a writer's.
+    /// Returns whether it is the id of a writer.
     pub fn is_writer(self) -> bool {
         matches!(self.0[3] & 0x3f, 0x02 | 0x03)
     }
 
-    /// Whether the protocol itself uses it.
+    /// Returns whether it is the id of a built-in endpoint.
     pub fn is_builtin(self) -> bool {
         self.0[3] & 0xc0 == 0xc0
     }
 }
 
-/// Tells an end apart from all others.
+/// Globally unique identifier of an endpoint.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct Guid {
-    /// Its participant.
+    /// Prefix of its participant.
     pub prefix: GuidPrefix,
-    /// Which of its participant's ends.
+    /// Id within the participant.
     pub entity: EntityId,
 }
 
 impl Guid {
-    /// That end of that participant.
+    /// Creates the GUID of an endpoint of a participant.
     pub fn new(prefix: GuidPrefix, entity: EntityId) -> Self {
         Self { prefix, entity }
     }
 
-    /// The sixteen bytes.
+    /// Returns the sixteen bytes.
     pub fn bytes(self) -> [u8; 16] {
         let mut bytes = [0; 16];
         bytes[..12].copy_from_slice(&self.prefix.0);
@@ -111,7 +111,7 @@ impl Guid {
         bytes
     }
 
-    /// As a number, for keys of maps of others.
+    /// Returns the GUID as a number, for use as a key.
     pub fn number(self) -> u128 {
         u128::from_be_bytes(self.bytes())
     }
@@ -126,12 +126,12 @@ impl From<[u8; 16]> for Guid {
     }
 }
 
-/// One sample of one writer; a reply names its request by it (DDS-RPC 7.8.2).
+/// Identity of a sample; a reply refers to its request by it (DDS-RPC 7.8.2).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct SampleIdentity {
-    /// Who wrote it.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// Its number there.
+    /// Sequence number of the sample.
     pub number: SequenceNumber,
 }
 
@@ -153,7 +153,7 @@ impl fmt::Debug for Guid {
     }
 }
 
-/// As tools show GUIDs: `01.0f.…|0.0.1.c1`.
+/// Formats the GUID as DDS tools do: `01.0f.…|0.0.1.c1`.
 impl fmt::Display for Guid {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let prefix: Vec<String> = self

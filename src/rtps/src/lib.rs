@@ -1,19 +1,19 @@
-//! RTPS 2.5, the protocol by which DDS implementations understand each other: one participant, with raw samples.
+//! RTPS 2.5, the interoperability protocol of DDS: one participant, exchanging raw samples.
 //!
-//! In: datagrams of other participants, and samples (CDR with its header) of whoever holds a [`Writer`].
-//! Out: datagrams, samples of matched writers, and what was discovered.
+//! Input: datagrams of other participants, and samples (CDR with its header) from the owner of a [`DataWriter`].
+//! Output: datagrams, samples of matched writers, and discovery data.
 //!
 //! ```text
-//!   sockets ─▶ driver ─▶ wire::parse ─▶ engine ─▶ discovery ─▶ who is there, what matches
+//!   sockets ─▶ driver ─▶ wire::parse ─▶ engine ─▶ discovery ─▶ participants, matching
 //!              │  ▲                       │
 //!              │  └── datagrams, paced ◀──┤
 //!              │                          ├─▶ readers: one WriterProxy for each matched writer ─▶ samples
 //!              └─ timers ────────────────▶└── writers: history, one ReaderProxy for each matched reader
 //! ```
-//! The engine does no input or output and knows no clock: whoever drives it gives it datagrams and the time. What is not
-//! read: security, content filters, groups, keys of instances; ROS 2 uses none of them.
+//! The engine does no I/O and has no clock: the driver passes datagrams and the time to it. Not supported because ROS 2
+//! does not use them: security, content filters, groups, instance keys.
 //!
-//! Source: OMG DDSI-RTPS 2.5 (formal/22-04-01), whose sections are named where they are carried out.
+//! Source: OMG DDSI-RTPS 2.5 (formal/22-04-01), whose sections are cited where they are implemented.
 
 mod discovery;
 mod driver;
@@ -34,12 +34,13 @@ mod writer;
 
 pub use discovery::{EndpointData, ParticipantData};
 pub use guid::{EntityId, Guid, GuidPrefix, SampleIdentity, VendorId};
-pub use network::{Interface, Interfaces, interfaces};
+pub use network::{InterfaceAddress, InterfaceSelection, list_interfaces};
 pub use participant::{
-    Config, Discovered, DiscoveryServer, Ends, JoinError, Participant, Place, Reader, Sample, Sink,
-    Topic, Writer,
+    Config, DataReader, DataWriter, DiscoveredGraph, DiscoveryServer, EndpointMatches, JoinError,
+    NetworkNamespace, Participant, ReceivedSample, Sink, TopicDescription,
 };
 pub use qos::{
-    Durability, EndpointQos, History, Liveliness, Mismatch, Reliability, Representations,
+    DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, Mismatch, ReliabilityKind,
+    Representations,
 };
 pub use sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};

@@ -1,8 +1,9 @@
-//! Under which addresses this machine is reached, and under which of theirs others are.
+//! Selection of the addresses at which this machine and other participants are reached.
 //!
-//! A robot has several networks, and some come after boot (Wi-Fi). Whoever is on this machine is reached at its loopback address,
-//! whoever is not under that of its addresses from which it was heard, or one in a network that both have. Bridges of containers
-//! have the same address on many machines: one of ours among another machine's addresses does not lead there.
+//! A robot has several networks, some of which appear after boot (Wi-Fi). A participant on this machine is reached at
+//! its loopback address; another one at that of its addresses from which it was heard, or at one in a common network.
+//! Container bridges have the same address on many machines, so one of our own addresses among those of another machine
+//! does not lead there.
 
 #![forbid(unsafe_code)]
 
@@ -15,39 +16,39 @@ use nix::net::if_::InterfaceFlags;
 
 use crate::locator::Locator;
 
-/// Which of a place's addresses a participant uses.
+/// Selects the interfaces that a participant uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Interfaces {
-    /// Those that the place has, also those that come later.
+pub enum InterfaceSelection {
+    /// All interfaces, including those that appear later.
     All,
-    /// These, as far and as soon as the place has them. `127.0.0.1` alone where nobody is outside.
+    /// Interfaces with these addresses, as soon as they exist. Only `127.0.0.1` if nobody outside is to be reached.
     These(Vec<Ipv4Addr>),
 }
 
-impl Default for Interfaces {
-    /// This machine alone.
+impl Default for InterfaceSelection {
+    /// Returns the selection of the loopback device only.
     fn default() -> Self {
         Self::These(vec![Ipv4Addr::LOCALHOST])
     }
 }
 
-/// An interface of a place, by one of its addresses.
+/// An address of a network interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Interface {
-    /// The address.
+pub struct InterfaceAddress {
+    /// IPv4 address.
     pub address: Ipv4Addr,
-    /// How many of its first bits all addresses of its network have: 0 to 32.
+    /// Prefix length of its network: 0 to 32.
     pub prefix: u8,
 }
 
-impl Interface {
+impl InterfaceAddress {
     /// The loopback device.
     pub const LOOPBACK: Self = Self {
         address: Ipv4Addr::LOCALHOST,
         prefix: 8,
     };
 
-    fn shares(&self, other: Ipv4Addr) -> bool {
+    fn contains(&self, other: Ipv4Addr) -> bool {
         let mask = u32::MAX
             .checked_shl(32 - u32::from(self.prefix.min(32)))
             .unwrap_or(0);
@@ -55,11 +56,11 @@ impl Interface {
     }
 }
 
-/// The interfaces that are up in the network namespace of the calling thread, with their IPv4 addresses.
+/// Returns the IPv4 addresses of the interfaces that are up in the network namespace of the calling thread.
 ///
 /// # Errors
-/// The kernel does not tell.
-pub fn interfaces() -> io::Result<Vec<Interface>> {
+/// The kernel does not answer.
+pub fn list_interfaces() -> io::Result<Vec<InterfaceAddress>> {
     let mut found = BTreeSet::new();
     for interface in getifaddrs()? {
         let address = interface
@@ -74,9 +75,9 @@ pub fn interfaces() -> io::Result<Vec<Interface>> {
             .netmask
             .as_ref()
             .and_then(|it| it.as_sockaddr_in());
-        // A connection of two has no network beside its peer.
+        // A point-to-point link has no network besides its peer.
         let prefix = mask.map_or(32, |mask| mask.ip().to_bits().leading_ones());
-        found.insert(Interface {
+        found.insert(InterfaceAddress {
             address: address.ip(),
             prefix: prefix as u8,
         });
@@ -84,14 +85,14 @@ pub fn interfaces() -> io::Result<Vec<Interface>> {
     Ok(found.into_iter().collect())
 }
 
-impl Interfaces {
-    /// Whether nothing but this machine is meant: then nothing comes or goes.
+impl InterfaceSelection {
+    /// Returns whether only this machine is selected, in which case the interfaces never change.
     pub(crate) fn is_loopback(&self) -> bool {
         matches!(self, Self::These(these) if these.iter().all(Ipv4Addr::is_loopback))
     }
 
-    /// Those among them that are meant.
-    pub(crate) fn among(&self, mut found: Vec<Interface>) -> Vec<Interface> {
+    /// Returns the selected ones among these.
+    pub(crate) fn filter(&self, mut found: Vec<InterfaceAddress>) -> Vec<InterfaceAddress> {
         if let Self::These(these) = self {
             found.retain(|interface| these.contains(&interface.address));
         }
@@ -99,17 +100,17 @@ impl Interfaces {
     }
 }
 
-/// The interfaces of a participant, as it knows them now.
+/// The interfaces that a participant currently uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Network {
-    interfaces: Vec<Interface>,
+pub(crate) struct InterfaceSet {
+    interfaces: Vec<InterfaceAddress>,
 }
 
-impl Network {
-    /// With these; with the loopback device where there is none.
-    pub fn new(mut interfaces: Vec<Interface>) -> Self {
+impl InterfaceSet {
+    /// Creates the set; if empty, it contains the loopback device.
+    pub fn new(mut interfaces: Vec<InterfaceAddress>) -> Self {
         if interfaces.is_empty() {
-            interfaces.push(Interface::LOOPBACK);
+            interfaces.push(InterfaceAddress::LOOPBACK);
         }
         Self { interfaces }
     }
@@ -118,49 +119,54 @@ impl Network {
         self.interfaces.iter().map(|interface| interface.address)
     }
 
-    /// Where others reach a port of this machine. The loopback address is told only where there is no other: sent to another
-    /// machine, it would mean that one.
+    /// Returns the locators of a port on this machine. The loopback address is announced only if there is no other,
+    /// because another machine would take it for its own.
     pub fn locators(&self, port: u16) -> Vec<Locator> {
         let outside: Vec<Ipv4Addr> = self.addresses().filter(|ip| !ip.is_loopback()).collect();
-        let told = match outside.is_empty() {
-            true => vec![Ipv4Addr::LOCALHOST],
-            false => outside,
+        let told = if outside.is_empty() {
+            vec![Ipv4Addr::LOCALHOST]
+        } else {
+            outside
         };
         told.into_iter()
             .map(|ip| Locator::from((ip, port)))
             .collect()
     }
 
-    /// Whether an address is this machine's.
-    pub fn is_here(&self, ip: IpAddr) -> bool {
+    /// Returns whether an address is one of this machine.
+    pub fn is_local(&self, ip: IpAddr) -> bool {
         match ip {
             IpAddr::V4(ip) => ip.is_loopback() || self.addresses().any(|own| own == ip),
             IpAddr::V6(ip) => ip.is_loopback(),
         }
     }
 
-    /// Whether an address is this machine's, or in one of its networks.
-    pub fn leads_to(&self, ip: IpAddr) -> bool {
+    /// Returns whether an address is one of this machine or in one of its networks.
+    pub fn is_reachable(&self, ip: IpAddr) -> bool {
         let near = match ip {
-            IpAddr::V4(ip) => self.interfaces.iter().any(|it| it.shares(ip)),
+            IpAddr::V4(ip) => self.interfaces.iter().any(|it| it.contains(ip)),
             IpAddr::V6(_) => false,
         };
-        near || self.is_here(ip)
+        near || self.is_local(ip)
     }
 
-    /// Where to send to whoever tells these locators; `heard` is the address from which it was heard, where that is known. None
-    /// where none of them leads to it.
-    pub fn choose(&self, locators: &[Locator], heard: Option<IpAddr>) -> Option<SocketAddr> {
-        let udp = locators.iter().filter_map(Locator::udp);
+    /// Chooses the address of a participant with these locators; `heard` is the address from which it was heard, if
+    /// known. Returns `None` if none of them leads to it.
+    pub fn choose_address(
+        &self,
+        locators: &[Locator],
+        heard: Option<IpAddr>,
+    ) -> Option<SocketAddr> {
+        let udp = locators.iter().filter_map(Locator::udp_address);
         let told: Vec<SocketAddr> = udp.filter(|it| !it.ip().is_multicast()).collect();
-        let all_here = told.iter().all(|address| self.is_here(address.ip()));
+        let all_here = told.iter().all(|address| self.is_local(address.ip()));
         let is_here = match heard {
-            Some(ip) => self.is_here(ip),
+            Some(ip) => self.is_local(ip),
             None => all_here,
         };
         if is_here {
             let loopback = told.iter().find(|address| address.ip().is_loopback());
-            let own = || told.iter().find(|address| self.is_here(address.ip()));
+            let own = || told.iter().find(|address| self.is_local(address.ip()));
             return loopback.or_else(own).or_else(|| told.first()).copied();
         }
         let outside = told
@@ -171,8 +177,8 @@ impl Network {
                 return 0;
             }
             match address.ip() {
-                ip if self.is_here(ip) => 3,
-                IpAddr::V4(ip) if self.interfaces.iter().any(|it| it.shares(ip)) => 1,
+                ip if self.is_local(ip) => 3,
+                IpAddr::V4(ip) if self.interfaces.iter().any(|it| it.contains(ip)) => 1,
                 _ => 2,
             }
         })
@@ -187,20 +193,20 @@ mod tests {
         text.parse().expect("an address")
     }
 
-    fn network(interfaces: &[(&str, u8)]) -> Network {
-        let of = |(address, prefix): &(&str, u8)| Interface {
+    fn network(interfaces: &[(&str, u8)]) -> InterfaceSet {
+        let of = |(address, prefix): &(&str, u8)| InterfaceAddress {
             address: ip(address),
             prefix: *prefix,
         };
-        Network::new(interfaces.iter().map(of).collect())
+        InterfaceSet::new(interfaces.iter().map(of).collect())
     }
 
-    fn chosen(network: &Network, told: &[&str], heard: Option<&str>) -> Option<String> {
+    fn choose_ip(network: &InterfaceSet, told: &[&str], heard: Option<&str>) -> Option<String> {
         let told: Vec<Locator> = told
             .iter()
             .map(|it| Locator::from((ip(it), 7410)))
             .collect();
-        let chosen = network.choose(&told, heard.map(|heard| ip(heard).into()));
+        let chosen = network.choose_address(&told, heard.map(|heard| ip(heard).into()));
         chosen.map(|address| address.ip().to_string())
     }
 
@@ -213,25 +219,25 @@ mod tests {
             ("172.17.0.1", 16),
         ]);
         let told = ["172.17.0.1", "10.0.9.7", "192.168.1.7", "10.0.0.7"];
-        let to = |heard| chosen(&robot, &told, heard);
+        let to = |heard| choose_ip(&robot, &told, heard);
         assert_eq!(to(Some("10.0.0.7")).as_deref(), Some("10.0.0.7"));
         assert_eq!(to(Some("10.0.9.7")).as_deref(), Some("10.0.9.7"));
-        // By a relay, or through a translation of addresses: one in a network that both have.
+        // Through a relay or NAT: one in a common network.
         assert_eq!(to(None).as_deref(), Some("192.168.1.7"));
         assert_eq!(to(Some("10.0.0.77")).as_deref(), Some("192.168.1.7"));
-        // None that both have: any of the other's.
-        let far = chosen(&robot, &["172.17.0.1", "10.9.9.9"], Some("10.0.0.1"));
+        // No common network: any address of the other machine.
+        let far = choose_ip(&robot, &["172.17.0.1", "10.9.9.9"], Some("10.0.0.1"));
         assert_eq!(far.as_deref(), Some("10.9.9.9"));
-        // Loopback there is not loopback here.
-        assert_eq!(chosen(&robot, &["127.0.0.1"], Some("10.0.0.7")), None);
-        let both = chosen(&robot, &["127.0.0.1", "10.0.0.7"], Some("10.0.0.7"));
+        // The loopback address of another machine is not ours.
+        assert_eq!(choose_ip(&robot, &["127.0.0.1"], Some("10.0.0.7")), None);
+        let both = choose_ip(&robot, &["127.0.0.1", "10.0.0.7"], Some("10.0.0.7"));
         assert_eq!(both.as_deref(), Some("10.0.0.7"));
     }
 
     #[test]
     fn whoever_is_on_this_machine_is_reached_without_its_networks() {
         let robot = network(&[("127.0.0.1", 8), ("10.0.0.5", 24)]);
-        let to = |told: &[&str], heard| chosen(&robot, told, heard);
+        let to = |told: &[&str], heard| choose_ip(&robot, told, heard);
         for heard in [None, Some("127.0.0.1"), Some("10.0.0.5")] {
             let both = to(&["10.0.0.5", "127.0.0.1"], heard);
             assert_eq!(both.as_deref(), Some("127.0.0.1"));
@@ -242,9 +248,9 @@ mod tests {
 
     #[test]
     fn others_are_told_of_loopback_only_where_there_is_nothing_else() {
-        let told = |network: Network| -> Vec<String> {
+        let told = |network: InterfaceSet| -> Vec<String> {
             let locators = network.locators(7411);
-            let udp = locators.iter().filter_map(Locator::udp);
+            let udp = locators.iter().filter_map(Locator::udp_address);
             udp.map(|address| address.to_string()).collect()
         };
         let robot = network(&[("127.0.0.1", 8), ("10.0.0.5", 24), ("10.1.0.5", 24)]);
@@ -255,21 +261,21 @@ mod tests {
 
     #[test]
     fn this_machine_has_a_loopback_device() {
-        let found = interfaces().expect("interfaces");
-        assert!(found.contains(&Interface::LOOPBACK), "{found:?}");
-        let these = Interfaces::default();
-        assert_eq!(these.among(found), [Interface::LOOPBACK]);
-        assert!(these.is_loopback() && !Interfaces::All.is_loopback());
+        let found = list_interfaces().expect("interfaces");
+        assert!(found.contains(&InterfaceAddress::LOOPBACK), "{found:?}");
+        let these = InterfaceSelection::default();
+        assert_eq!(these.filter(found), [InterfaceAddress::LOOPBACK]);
+        assert!(these.is_loopback() && !InterfaceSelection::All.is_loopback());
     }
 
     #[test]
     fn a_network_of_one_address_shares_it_with_nobody() {
-        let one = Interface {
+        let one = InterfaceAddress {
             address: ip("10.0.0.5"),
             prefix: 32,
         };
-        assert!(one.shares(ip("10.0.0.5")) && !one.shares(ip("10.0.0.4")));
-        let all = Interface { prefix: 0, ..one };
-        assert!(!all.shares(ip("10.0.0.4")));
+        assert!(one.contains(ip("10.0.0.5")) && !one.contains(ip("10.0.0.4")));
+        let all = InterfaceAddress { prefix: 0, ..one };
+        assert!(!all.contains(ip("10.0.0.4")));
     }
 }

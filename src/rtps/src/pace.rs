@@ -1,7 +1,8 @@
-//! How fast receivers are sent to whose buffers cannot be seen: those of other machines. Such a buffer holds some 200 kB by default,
-//! and what does not fit is lost without a word; a network is often quicker than whoever reads. So a large sample is spread over a
-//! part of the time until the next one, which is known by how much was sent lately: whoever can read what is sent can read it then. A reliable receiver that asks for much
-//! again is sent to more slowly.
+//! Pacing for receivers whose buffers cannot be queried, on other machines. Such a buffer holds about 200 kB by
+//! default, and the excess is lost silently; a network is often faster than the reader. Therefore a large sample is
+//! spread over a part of the time until the next one, which is estimated from the recent send rate: a receiver that
+//! keeps up with the average then keeps up at any time. A reliable receiver that requests much again is sent to more
+//! slowly.
 
 #![forbid(unsafe_code)]
 
@@ -9,86 +10,87 @@ use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-/// Bytes that are sent at once after a pause: a part of a default buffer, in which the kernel counts some two for each.
+/// Burst size in bytes after a pause: a part of a default buffer, in which the kernel counts about two bytes for each.
 const BURST: f64 = 48.0 * 1024.0;
-/// So much faster than what was sent lately, on the average, a receiver is sent to: the half of the time is left for repairs.
+/// Ratio of the pace to the recent average rate: half of the time is left for repairs.
 const AHEAD: f64 = 2.0;
-/// Bytes per second that a receiver is sent at least, so that single samples do not take long: 0.4 Gbit/s.
+/// Minimum pace in bytes per second, so that single samples do not take long: 0.4 Gbit/s.
 const LEAST: f64 = 50e6;
-/// Bytes per second that no receiver is sent more of.
+/// Maximum pace in bytes per second.
 const MOST: f64 = 1.25e9;
-/// Over which time it is averaged.
+/// Averaging time in seconds.
 const LATELY: f64 = 0.5;
-/// Where more than this part is sent again, the pace is too high.
+/// Fraction of repeated bytes above which the pace is too high.
 const LOST: f64 = 0.05;
-/// How often that is judged, by which factors the pace follows, and what part of it is left in the worst case.
+/// Interval and factors of adjusting the pace, and its lowest fraction.
 const JUDGED: Duration = Duration::from_millis(50);
 const SLOWER: f64 = 0.7;
 const FASTER: f64 = 1.1;
 const SLOWEST: f64 = 0.25;
-/// Receivers to which nothing was sent for so long are forgotten.
+/// Time after which idle receivers are forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(10);
 
-/// What one receiver is sent.
+/// Token bucket of one receiver.
 #[derive(Debug, Clone, Copy)]
-struct Bucket {
-    /// Bytes that may be sent now; below zero they are owed.
+struct TokenBucket {
+    /// Bytes that may be sent now; negative values are a debt.
     tokens: f64,
-    /// Bytes per second that were sent lately.
+    /// Recent send rate in bytes per second.
     sent: f64,
-    /// Those among them that had been lost before.
+    /// Part of this rate that was sent again.
     again: f64,
-    /// What part of the usual pace it keeps up with.
+    /// Fraction of the regular pace that the receiver keeps up with.
     part: f64,
     judged: Instant,
     counted: Instant,
 }
 
-impl Bucket {
+impl TokenBucket {
     fn rate(&self) -> f64 {
         (self.sent * AHEAD).clamp(LEAST, MOST) * self.part
     }
 
-    /// Slows down while much is lost, and becomes faster again while little is.
-    fn judge(&mut self, now: Instant) {
+    /// Slows down while much is lost, and recovers while little is.
+    fn adjust_rate(&mut self, now: Instant) {
         if now.saturating_duration_since(self.judged) < JUDGED {
             return;
         }
         self.judged = now;
-        let change = match self.again > self.sent * LOST {
-            true => SLOWER,
-            false => FASTER,
+        let change = if self.again > self.sent * LOST {
+            SLOWER
+        } else {
+            FASTER
         };
         self.part = (self.part * change).clamp(SLOWEST, 1.0);
     }
 
-    fn pass(&mut self, now: Instant) {
+    fn advance(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.counted).as_secs_f64();
         self.tokens = (self.tokens + passed * self.rate()).min(BURST);
         self.sent *= (-passed / LATELY).exp();
         self.again *= (-passed / (LATELY / 5.0)).exp();
-        self.judge(now);
+        self.adjust_rate(now);
         self.counted = now;
     }
 }
 
-/// The pace of all such receivers.
+/// The token buckets of all receivers.
 #[derive(Debug, Default)]
-pub(crate) struct Pace {
-    buckets: HashMap<SocketAddr, Bucket>,
+pub(crate) struct Pacer {
+    buckets: HashMap<SocketAddr, TokenBucket>,
 }
 
-impl Pace {
-    /// Whether a datagram of so many bytes may be sent now, and is counted as sent; else how long that takes. `again` tells that the
-    /// receiver had asked for it.
-    pub fn room(
+impl Pacer {
+    /// Returns `Ok` if a datagram of this length may be sent now, and counts it as sent; otherwise the time to wait.
+    /// `again`: the receiver has requested it again.
+    pub fn try_reserve(
         &mut self,
         now: Instant,
         to: SocketAddr,
         length: usize,
         again: bool,
     ) -> Result<(), Duration> {
-        let bucket = self.buckets.entry(to).or_insert(Bucket {
+        let bucket = self.buckets.entry(to).or_insert(TokenBucket {
             tokens: BURST,
             sent: 0.0,
             again: 0.0,
@@ -96,7 +98,7 @@ impl Pace {
             judged: now,
             counted: now,
         });
-        bucket.pass(now);
+        bucket.advance(now);
         if bucket.tokens < 0.0 {
             return Err(Duration::from_secs_f64(-bucket.tokens / bucket.rate()));
         }
@@ -107,8 +109,8 @@ impl Pace {
         Ok(())
     }
 
-    /// Forgets receivers that nobody sends to.
-    pub fn tidy(&mut self, now: Instant) {
+    /// Forgets receivers to which nothing was sent recently.
+    pub fn remove_expired(&mut self, now: Instant) {
         self.buckets
             .retain(|_, bucket| now.saturating_duration_since(bucket.counted) < FORGOTTEN);
     }
@@ -120,11 +122,11 @@ mod tests {
 
     const TO: ([u8; 4], u16) = ([10, 0, 0, 7], 7411);
 
-    /// How long a sample takes that is ready at `now`, in datagrams of 16 kB.
-    fn send(pace: &mut Pace, now: &mut Instant, bytes: usize) -> Duration {
+    /// Returns the time it takes to send a sample that is ready at `now`, in datagrams of 16 kB.
+    fn send(pace: &mut Pacer, now: &mut Instant, bytes: usize) -> Duration {
         let begun = *now;
         for _ in 0..bytes.div_ceil(16_000) {
-            while let Err(wait) = pace.room(*now, TO.into(), 16_000, false) {
+            while let Err(wait) = pace.try_reserve(*now, TO.into(), 16_000, false) {
                 *now += wait.max(Duration::from_nanos(1));
             }
         }
@@ -133,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_large_sample_is_spread_and_a_small_one_is_not() {
-        let (mut pace, mut now) = (Pace::default(), Instant::now());
+        let (mut pace, mut now) = (Pacer::default(), Instant::now());
         assert_eq!(send(&mut pace, &mut now, 48_000), Duration::ZERO);
         now += Duration::from_secs(1);
         let alone = send(&mut pace, &mut now, 900_000);
@@ -151,7 +153,7 @@ mod tests {
             (6_000_000, 60),
             (100_000, 100),
         ] {
-            let (mut pace, mut now) = (Pace::default(), Instant::now());
+            let (mut pace, mut now) = (Pacer::default(), Instant::now());
             let mut next = now;
             let mut last = Duration::ZERO;
             for _ in 0..3 * hertz {
@@ -166,16 +168,16 @@ mod tests {
 
     #[test]
     fn a_receiver_that_loses_much_is_sent_to_more_slowly_for_a_while() {
-        let (mut pace, mut now) = (Pace::default(), Instant::now());
+        let (mut pace, mut now) = (Pacer::default(), Instant::now());
         let before = send(&mut pace, &mut now, 900_000);
         for _ in 0..200 {
-            let _ = pace.room(now, TO.into(), 16_000, true);
+            let _ = pace.try_reserve(now, TO.into(), 16_000, true);
             now += Duration::from_millis(5);
         }
         let slow = send(&mut pace, &mut now, 900_000);
         assert!(slow > before * 3, "{before:?}, then {slow:?}");
         for _ in 0..1000 {
-            let _ = pace.room(now, TO.into(), 16_000, false);
+            let _ = pace.try_reserve(now, TO.into(), 16_000, false);
             now += Duration::from_millis(10);
         }
         let after = send(&mut pace, &mut now, 900_000);
@@ -184,9 +186,9 @@ mod tests {
 
     #[test]
     fn receivers_are_forgotten() {
-        let (mut pace, now) = (Pace::default(), Instant::now());
-        let _ = pace.room(now, TO.into(), 100, false);
-        pace.tidy(now + FORGOTTEN);
+        let (mut pace, now) = (Pacer::default(), Instant::now());
+        let _ = pace.try_reserve(now, TO.into(), 100, false);
+        pace.remove_expired(now + FORGOTTEN);
         assert!(pace.buckets.is_empty());
     }
 }

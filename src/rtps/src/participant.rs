@@ -1,4 +1,4 @@
-//! A participant and its ends, as whoever uses this crate holds them.
+//! The public API: participants, readers and writers.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -16,80 +16,81 @@ use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use crate::discovery::{EndpointData, ParticipantData};
-use crate::driver::{PORTS, Shared, Sockets, drive};
+use crate::driver::{DriverState, PORTS, Sockets, drive};
 use crate::engine::{BUILTIN, Engine, Settings};
-use crate::flow::Flow;
+use crate::flow::FlowControl;
 use crate::locator::{MULTICAST, Ports};
-use crate::network::{Interface, Interfaces, Network};
+use crate::network::{InterfaceAddress, InterfaceSelection, InterfaceSet};
 use crate::qos::{EndpointQos, Mismatch};
-use crate::reader::Bounds;
+use crate::reader::ReaderLimits;
 use crate::sequence::SequenceNumber;
 use crate::time::WireTime;
 use crate::{Guid, GuidPrefix, SampleIdentity, VendorId};
 
-/// Where a participant has its sockets: a servant's network namespace, or the host's.
+/// Network namespace in which a participant has its sockets: a servant's, or the host's.
 #[async_trait]
-pub trait Place: Send + Sync + 'static {
-    /// A socket bound to this address as seen from inside; port 0 picks a free one. With `shared` others may be bound to it, too
-    /// (`SO_REUSEADDR`), for multicast.
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket>;
-    /// The interfaces that are up there, with their addresses: see [`interfaces`](crate::interfaces).
-    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
-        Ok(vec![Interface::LOOPBACK])
+pub trait NetworkNamespace: Send + Sync + 'static {
+    /// Binds a UDP socket to this address as seen from inside; port 0 picks a free one. With `shared`, others may bind
+    /// to it as well (`SO_REUSEADDR`), for multicast.
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket>;
+    /// Returns the interfaces that are up in the namespace, with their addresses; see
+    /// [`list_interfaces`](crate::list_interfaces).
+    async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
+        Ok(vec![InterfaceAddress::LOOPBACK])
     }
-    /// A socket of the kernel's diagnostics of sockets (`NETLINK_SOCK_DIAG`) of this place, by which it is seen how full the
-    /// receivers' buffers are; none where it cannot be had, and then samples are sent at a fixed pace.
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+    /// Opens a kernel socket diagnostics socket (`NETLINK_SOCK_DIAG`) in the namespace, with which the fill level of
+    /// receive buffers is queried. Without it, samples are sent at a fixed pace.
+    async fn open_diagnostics(&self) -> io::Result<Option<OwnedFd>> {
         Ok(None)
     }
 }
 
-/// How to join.
+/// Configuration of a participant.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// `ROS_DOMAIN_ID`: 0 to 232.
+    /// `ROS_DOMAIN_ID`, 0 to 232.
     pub domain: u16,
-    /// The participant's name, shown by tools of DDS.
+    /// Name of the participant, shown by DDS tools.
     pub name: String,
-    /// ROS 2: `enclave=/;`.
+    /// User data; ROS 2 uses `enclave=/;`.
     pub user_data: Bytes,
-    /// A sample longer than this is not taken.
+    /// Maximum size of a received sample.
     pub max_sample: usize,
-    /// Where samples that are not whole yet count; what does not fit is not taken.
+    /// Budget for incomplete samples; those that do not fit are dropped.
     pub budget: Budget,
-    /// A sample whose fragments stop coming for so long is given up.
+    /// Time without fragments after which an incomplete sample is dropped.
     pub unfinished: Duration,
-    /// In which networks it takes part: those of this machine's interfaces.
-    pub interfaces: Interfaces,
-    /// Whether others are told of it, and heard, by multicast.
+    /// Interfaces to use.
+    pub interfaces: InterfaceSelection,
+    /// Announce by multicast and listen to multicast announcements.
     pub multicast: bool,
-    /// Whether it tells nobody of itself, and hears nobody.
+    /// Neither announce anything nor listen to others.
     pub alone: bool,
-    /// Whether to take ports that others try without having been told of them (9.6.2.3).
+    /// Use the well-known ports, which others try without an announcement (9.6.2.3).
     pub well_known: bool,
-    /// Where to announce oneself beside: other participants' ports for discovery; those that the first 32 of a machine have, where the port is 0.
+    /// Additional addresses to announce to: discovery ports of other participants; with port 0, the first 32 discovery
+    /// ports of that machine.
     pub peers: Vec<SocketAddr>,
-    /// Servers of discovery of Fast DDS. Where there are some it tells them alone of itself, and hears of others by them: neither by
-    /// multicast nor of peers.
+    /// Fast DDS discovery servers. If there are any, discovery uses only them, neither multicast nor peers.
     pub servers: Vec<DiscoveryServer>,
-    /// Which participant it is to be; one that nobody else is where there is none.
+    /// GUID prefix to use; by default a unique one.
     pub prefix: Option<GuidPrefix>,
-    /// Participants in whose place it comes, which ended without a word: others are told in their name that they are gone. They had
-    /// the lease that this one has.
+    /// Participants that this one replaces and that ended without a farewell: others are told in their names that they
+    /// are gone. They had the same lease duration.
     pub predecessors: Vec<GuidPrefix>,
 }
 
-/// A server of discovery of Fast DDS, as its clients name it.
+/// A Fast DDS discovery server, as clients are configured with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DiscoveryServer {
-    /// Its place in the list of servers, which it is itself told, and is named by.
+    /// Position in the list of servers, with which the server itself is configured; it determines its GUID prefix.
     pub place: u8,
-    /// Where it hears of others.
+    /// Address at which it receives discovery data.
     pub at: SocketAddr,
 }
 
 impl DiscoveryServer {
-    /// Its name, by its place: `44.53.PLACE.5f.45.50.52.4f.53.49.4d.41`.
+    /// Returns its GUID prefix: `44.53.PLACE.5f.45.50.52.4f.53.49.4d.41`.
     pub fn prefix(&self) -> GuidPrefix {
         let mut prefix = *b"DS\0_EPROSIMA";
         prefix[2] = self.place;
@@ -98,16 +99,16 @@ impl DiscoveryServer {
 }
 
 impl Config {
-    /// A participant of this name in a domain.
+    /// Creates the default configuration of a participant in a domain.
     pub fn new(domain: u16, name: impl Into<String>) -> Self {
         Self {
             domain,
             name: name.into(),
             user_data: Bytes::new(),
             max_sample: 256 << 20,
-            budget: Budget::unlimited(),
+            budget: Budget::without_limit(),
             unfinished: Duration::from_secs(30),
-            interfaces: Interfaces::default(),
+            interfaces: InterfaceSelection::default(),
             multicast: true,
             alone: false,
             well_known: false,
@@ -119,15 +120,15 @@ impl Config {
     }
 }
 
-/// Why nothing was joined.
+/// Errors of joining a domain.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
-    /// There is no such domain.
-    #[error("ROS_DOMAIN_ID {0} has no ports: give 0 to 232")]
+    /// Invalid domain id.
+    #[error("ROS_DOMAIN_ID {0} is out of range: use 0 to 232")]
     NoSuchDomain(u16),
-    /// All ports of the domain are taken.
+    /// All ports of the domain are in use.
     #[error(
-        "all 120 participants that fit into ROS_DOMAIN_ID {0} are there: end some of its nodes"
+        "ROS_DOMAIN_ID {0} already has all 120 participants that it can have: stop some of its nodes"
     )]
     Full(u16),
     /// A socket could not be opened.
@@ -135,10 +136,10 @@ pub enum JoinError {
     Socket(#[from] io::Error),
 }
 
-/// Who is there beside us, and with which ends.
+/// Other participants and their endpoints.
 #[derive(Debug, Clone, Default)]
-pub struct Discovered {
-    /// Grows by one with every change.
+pub struct DiscoveredGraph {
+    /// Incremented with every change.
     pub generation: u64,
     /// The other participants.
     pub participants: BTreeMap<GuidPrefix, Arc<ParticipantData>>,
@@ -148,67 +149,67 @@ pub struct Discovered {
     pub readers: BTreeMap<Guid, Arc<EndpointData>>,
 }
 
-/// The ends of others on the topic of one of ours.
+/// The remote endpoints on the topic of a local one.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Ends {
-    /// Those with which samples pass, in the order in which they came.
+pub struct EndpointMatches {
+    /// Matched endpoints, in the order in which they were discovered.
     pub matched: Vec<Arc<EndpointData>>,
-    /// Those among them that have shown that they know this end, too: what is written from then on reaches them.
+    /// Matched endpoints that have shown that they know this endpoint: what is written from now on reaches them.
     pub confirmed: Vec<Guid>,
-    /// Those with which none pass, with the reasons.
+    /// Endpoints with incompatible QoS, with the mismatches.
     pub refused: Vec<(Arc<EndpointData>, Vec<Mismatch>)>,
 }
 
-/// A sample as it came.
+/// A received sample.
 #[derive(Debug, Clone)]
-pub struct Sample {
+pub struct ReceivedSample {
     /// CDR with its header of four bytes.
     pub payload: Bytes,
-    /// Who wrote it.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// Its number there.
+    /// Sequence number.
     pub number: SequenceNumber,
-    /// The request that it answers, or by which it wants to be answered (inline QoS).
+    /// The request that it replies to, or the identity with which a request wants to be answered (inline QoS).
     pub related: Option<SampleIdentity>,
-    /// When it was written, by its writer's clock.
+    /// Source timestamp, on the writer's clock.
     pub written: Option<WireTime>,
-    /// An announcement: the end or participant that is taken back by it.
+    /// For an announcement: the endpoint or participant that it disposes of.
     pub(crate) withdrawn: Option<Guid>,
 }
 
-/// Takes what a reader reads, in the order of each writer. Must not block.
+/// Receives the samples of a reader, in the order of each writer. Must not block.
 pub trait Sink: Send + Sync + 'static {
-    /// A sample.
-    fn sample(&self, sample: Sample);
+    /// Handles a sample.
+    fn on_sample(&self, sample: ReceivedSample);
 }
 
-/// What a topic is called, and what its samples are.
+/// Name and type of a topic.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Topic {
-    /// As DDS has it: `rt/chatter`.
+pub struct TopicDescription {
+    /// DDS name of the topic: `rt/chatter`.
     pub name: String,
-    /// As DDS has it: `std_msgs::msg::dds_::String_`.
+    /// DDS name of the type: `std_msgs::msg::dds_::String_`.
     pub type_name: String,
-    /// ROS 2: `typehash=RIHS01_…;`.
+    /// User data; ROS 2 uses `typehash=RIHS01_…;`.
     pub user_data: Bytes,
 }
 
-/// A participant of a domain. Clones are the same one; when the last one and all its ends are dropped it leaves without a word,
-/// which [`Participant::close`] says.
+/// A participant of a domain. Clones refer to the same participant. When the last one and all its endpoints are
+/// dropped, it leaves without a farewell, which [`Participant::close`] sends.
 #[derive(Clone)]
 pub struct Participant {
-    running: Arc<Running>,
+    running: Arc<ParticipantTask>,
 }
 
-struct Running {
-    shared: Arc<Shared>,
+struct ParticipantTask {
+    shared: Arc<DriverState>,
     task: AbortHandle,
-    /// Looks which interfaces there are.
+    /// Task that watches the interfaces.
     looking: Option<AbortHandle>,
     guid: Guid,
 }
 
-impl Running {
+impl ParticipantTask {
     fn stop(&self) {
         self.task.abort();
         if let Some(looking) = &self.looking {
@@ -217,68 +218,73 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for ParticipantTask {
     fn drop(&mut self) {
         self.stop();
     }
 }
 
-/// How long others may hear nothing until they take this participant for gone.
+/// Lease duration announced to others.
 const LEASE: Duration = Duration::from_secs(10);
 
 impl Participant {
-    /// Joins a domain. Must be called within a tokio runtime, whose task serves it from then on.
+    /// Joins a domain. Must be called within a tokio runtime, on which a task serves the participant from then on.
     ///
     /// # Errors
-    /// There is no such domain, or no socket could be opened.
-    pub async fn join(place: Arc<dyn Place>, config: Config) -> Result<Participant, JoinError> {
-        Self::join_looking(place, config, PORTS).await
+    /// The domain id is invalid, or no socket could be opened.
+    pub async fn join(
+        place: Arc<dyn NetworkNamespace>,
+        config: Config,
+    ) -> Result<Participant, JoinError> {
+        Self::join_with_port_interval(place, config, PORTS).await
     }
 
-    /// The same; each `ports_each` it is looked which ports are bound.
-    pub(crate) async fn join_looking(
-        place: Arc<dyn Place>,
+    /// Joins a domain; bound ports are checked at the interval `ports_each`.
+    pub(crate) async fn join_with_port_interval(
+        place: Arc<dyn NetworkNamespace>,
         config: Config,
         ports_each: Duration,
     ) -> Result<Participant, JoinError> {
-        let ports = Ports::of(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
-        let network = look(&*place, &config.interfaces).await;
+        let ports =
+            Ports::for_domain(config.domain).ok_or(JoinError::NoSuchDomain(config.domain))?;
+        let network = current_interfaces(&*place, &config.interfaces).await;
         let here = match &config.interfaces {
-            Interfaces::These(these) if these.len() == 1 => these[0],
+            InterfaceSelection::These(these) if these.len() == 1 => these[0],
             _ => Ipv4Addr::UNSPECIFIED,
         };
         let (discovery, user) = if config.well_known {
-            well_known(&*place, &config, ports, here).await?
+            bind_well_known(&*place, &config, ports, here).await?
         } else {
             let any = SocketAddr::from((here, 0));
             (
-                place.datagrams(any, false).await?,
-                place.datagrams(any, false).await?,
+                place.bind_udp(any, false).await?,
+                place.bind_udp(any, false).await?,
             )
         };
         let by_itself = !config.alone && config.servers.is_empty();
-        let multicast = match config.multicast && by_itself {
-            true => multicast(&*place, ports).await,
-            false => None,
+        let multicast = if config.multicast && by_itself {
+            bind_multicast(&*place, ports).await
+        } else {
+            None
         };
-        let diagnostics = place.diagnostics().await.unwrap_or_else(|error| {
-            tracing::debug!(%error, "it is not known how full receivers of DDS are");
+        let diagnostics = place.open_diagnostics().await.unwrap_or_else(|error| {
+            tracing::debug!(%error, "cannot read how full the receive buffers of DDS are");
             None
         });
-        let flow = Flow::new(diagnostics);
-        let own = own_data(&config, &network, &discovery, &user)?;
-        let mut announce_to = peers(&config.peers, ports);
+        let flow = FlowControl::new(diagnostics);
+        let own = participant_data(&config, &network, &discovery, &user)?;
+        let mut announce_to = peer_addresses(&config.peers, ports);
         if multicast.is_some() {
             announce_to.push(SocketAddr::from((MULTICAST, ports.discovery_multicast())));
         }
-        if !flow.sees() {
+        if !flow.has_diagnostics() {
             let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-            announce_to.extend(peers(&[here], ports));
+            announce_to.extend(peer_addresses(&[here], ports));
         }
         if !by_itself {
             announce_to.clear();
         }
-        let bounds = Bounds {
+        let bounds = ReaderLimits {
             max_sample: config.max_sample,
             budget: config.budget,
             unfinished: config.unfinished,
@@ -302,14 +308,14 @@ impl Participant {
             user: user.into_std()?,
             multicast: multicast.map(UdpSocket::into_std).transpose()?,
         };
-        let shared = Shared::new(engine, flow, sockets, network)?;
+        let shared = DriverState::new(engine, flow, sockets, network)?;
         let task = tokio::spawn(drive(Arc::clone(&shared), ports_each)).abort_handle();
         let looking = (!config.interfaces.is_loopback()).then(|| {
-            let looking = look_again(Arc::clone(&shared), place, config.interfaces);
+            let looking = watch_interfaces(Arc::clone(&shared), place, config.interfaces);
             tokio::spawn(looking).abort_handle()
         });
         Ok(Participant {
-            running: Arc::new(Running {
+            running: Arc::new(ParticipantTask {
                 shared,
                 task,
                 looking,
@@ -318,24 +324,29 @@ impl Participant {
         })
     }
 
-    /// Which participant it is.
+    /// Returns the GUID of the participant.
     pub fn guid(&self) -> Guid {
         self.running.guid
     }
 
-    /// Who is there beside it.
-    pub fn discovered(&self) -> watch::Receiver<Arc<Discovered>> {
-        self.running.shared.look(Engine::discovered)
+    /// Returns a watch on the other participants.
+    pub fn watch_discovered(&self) -> watch::Receiver<Arc<DiscoveredGraph>> {
+        self.running.shared.read_engine(Engine::watch_discovered)
     }
 
-    /// Reads a topic until what is returned is dropped.
-    pub fn reader(&self, topic: Topic, qos: EndpointQos, sink: Arc<dyn Sink>) -> Reader {
+    /// Creates a reader of a topic. Dropping it removes the reader.
+    pub fn reader(
+        &self,
+        topic: TopicDescription,
+        qos: EndpointQos,
+        sink: Arc<dyn Sink>,
+    ) -> DataReader {
         let (guid, ends) = self
             .running
             .shared
-            .with(|now, engine| engine.add_reader(now, &topic, qos, sink));
-        Reader {
-            end: End {
+            .with_engine(|now, engine| engine.add_reader(now, &topic, qos, sink));
+        DataReader {
+            end: EndpointHandle {
                 running: Arc::clone(&self.running),
                 guid,
                 ends,
@@ -343,14 +354,14 @@ impl Participant {
         }
     }
 
-    /// Writes to a topic until what is returned is dropped.
-    pub fn writer(&self, topic: Topic, qos: EndpointQos) -> Writer {
+    /// Creates a writer of a topic. Dropping it removes the writer.
+    pub fn writer(&self, topic: TopicDescription, qos: EndpointQos) -> DataWriter {
         let (guid, ends) = self
             .running
             .shared
-            .with(|now, engine| engine.add_writer(now, &topic, qos));
-        Writer {
-            end: End {
+            .with_engine(|now, engine| engine.add_writer(now, &topic, qos));
+        DataWriter {
+            end: EndpointHandle {
                 running: Arc::clone(&self.running),
                 guid,
                 ends,
@@ -358,61 +369,71 @@ impl Participant {
         }
     }
 
-    /// A process of this machine is known to have ended: whoever had ports there is gone at once, not when it is time to look at
-    /// ports again. Changes nothing where the kernel cannot be asked.
-    pub fn look_at_ports(&self) {
-        self.running.shared.look_now();
+    /// Reports that a process of this machine has ended, so that its participant is removed immediately and not at the
+    /// next check of bound ports. Has no effect if the kernel cannot be queried.
+    pub fn check_ports(&self) {
+        self.running.shared.check_ports_now();
     }
 
-    /// Returns once readers have all that was written to them.
-    pub async fn settled(&self) {
-        while !self.running.shared.look(Engine::is_settled) {
+    /// Waits until readers have received everything written to them.
+    pub async fn wait_acknowledged(&self) {
+        while !self.running.shared.read_engine(Engine::is_settled) {
             tokio::time::sleep(LOOK).await;
         }
     }
 
-    /// Says good-bye. Ends that are still held become inert.
+    /// Announces the departure. Remaining endpoints become inert.
     pub async fn close(&self) {
-        self.running.shared.with(|now, engine| engine.close(now));
+        self.running
+            .shared
+            .with_engine(|now, engine| engine.close(now));
         self.running.stop();
     }
 }
 
-/// How often it is looked whether all has come, where somebody waits for that.
+/// Interval at which acknowledgements are checked while somebody waits for them.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// How often it is looked which interfaces there are: a network that comes is used after this time.
+/// Interval at which interfaces are checked.
 const INTERFACES: Duration = Duration::from_secs(2);
 
-/// Where nobody tells which participants a machine has, those with the first numbers are told of us; as many as ROS 2's nodes try.
+/// Number of participant numbers to which announcements are sent where bound ports are unknown; as many as ROS 2 nodes
+/// try.
 const UNSEEN: u16 = 32;
 
-/// The interfaces that are meant, as they are now.
-async fn look(place: &dyn Place, meant: &Interfaces) -> Network {
-    if let (Interfaces::These(these), true) = (meant, meant.is_loopback()) {
-        let loopback = |address: &Ipv4Addr| Interface {
+/// Returns the selected interfaces.
+async fn current_interfaces(
+    place: &dyn NetworkNamespace,
+    meant: &InterfaceSelection,
+) -> InterfaceSet {
+    if let (InterfaceSelection::These(these), true) = (meant, meant.is_loopback()) {
+        let loopback = |address: &Ipv4Addr| InterfaceAddress {
             address: *address,
-            ..Interface::LOOPBACK
+            ..InterfaceAddress::LOOPBACK
         };
-        return Network::new(these.iter().map(loopback).collect());
+        return InterfaceSet::new(these.iter().map(loopback).collect());
     }
     let found = place.interfaces().await.unwrap_or_else(|error| {
-        tracing::debug!(%error, "the interfaces of this machine are not known");
+        tracing::debug!(%error, "cannot list the network interfaces of this machine");
         Vec::new()
     });
-    Network::new(meant.among(found))
+    InterfaceSet::new(meant.filter(found))
 }
 
-/// Follows the interfaces of a place.
-async fn look_again(shared: Arc<Shared>, place: Arc<dyn Place>, meant: Interfaces) {
+/// Watches the interfaces of a namespace.
+async fn watch_interfaces(
+    shared: Arc<DriverState>,
+    place: Arc<dyn NetworkNamespace>,
+    meant: InterfaceSelection,
+) {
     loop {
         tokio::time::sleep(INTERFACES).await;
-        shared.network_is(look(&*place, &meant).await);
+        shared.set_network(current_interfaces(&*place, &meant).await);
     }
 }
 
-/// Where to announce oneself to these.
-fn peers(peers: &[SocketAddr], ports: Ports) -> Vec<SocketAddr> {
+/// Returns the addresses to announce to for these peers.
+fn peer_addresses(peers: &[SocketAddr], ports: Ports) -> Vec<SocketAddr> {
     let mut all = Vec::new();
     for peer in peers {
         if peer.port() == 0 {
@@ -425,9 +446,9 @@ fn peers(peers: &[SocketAddr], ports: Ports) -> Vec<SocketAddr> {
     all
 }
 
-/// Sockets at the first free pair of the ports that participants of a domain have (9.6.2.3).
-async fn well_known(
-    place: &dyn Place,
+/// Binds sockets to the first free pair of well-known ports of the domain (9.6.2.3).
+async fn bind_well_known(
+    place: &dyn NetworkNamespace,
     config: &Config,
     ports: Ports,
     here: Ipv4Addr,
@@ -437,9 +458,9 @@ async fn well_known(
             break;
         };
         let discovery = place
-            .datagrams(SocketAddr::from((here, discovery)), false)
+            .bind_udp(SocketAddr::from((here, discovery)), false)
             .await;
-        let user = place.datagrams(SocketAddr::from((here, user)), false).await;
+        let user = place.bind_udp(SocketAddr::from((here, user)), false).await;
         match (discovery, user) {
             (Ok(discovery), Ok(user)) => return Ok((discovery, user)),
             (Err(error), _) | (_, Err(error)) if error.kind() != io::ErrorKind::AddrInUse => {
@@ -451,23 +472,23 @@ async fn well_known(
     Err(JoinError::Full(config.domain))
 }
 
-/// A socket that hears announcements to all, where it is told to in which networks.
-async fn multicast(place: &dyn Place, ports: Ports) -> Option<UdpSocket> {
+/// Binds the socket for multicast announcements; the driver joins the groups.
+async fn bind_multicast(place: &dyn NetworkNamespace, ports: Ports) -> Option<UdpSocket> {
     let at = SocketAddr::from((Ipv4Addr::UNSPECIFIED, ports.discovery_multicast()));
-    let opened = place.datagrams(at, true).await;
-    // What comes by networks of others of this machine is not for us.
+    let opened = place.bind_udp(at, true).await;
+    // Multicast through interfaces joined by other sockets of this machine is not for us.
     let opened = opened.and_then(|socket| {
         SockRef::from(&socket).set_multicast_all_v4(false)?;
         Ok(socket)
     });
     opened
-        .map_err(|error| tracing::debug!(%error, "DDS participants are not heard by multicast"))
+        .map_err(|error| tracing::debug!(%error, "cannot receive DDS multicast"))
         .ok()
 }
 
-fn own_data(
+fn participant_data(
     config: &Config,
-    network: &Network,
+    network: &InterfaceSet,
     discovery: &UdpSocket,
     user: &UdpSocket,
 ) -> io::Result<ParticipantData> {
@@ -486,80 +507,80 @@ fn own_data(
     })
 }
 
-struct End {
-    running: Arc<Running>,
+struct EndpointHandle {
+    running: Arc<ParticipantTask>,
     guid: Guid,
-    ends: watch::Receiver<Arc<Ends>>,
+    ends: watch::Receiver<Arc<EndpointMatches>>,
 }
 
-impl Drop for End {
+impl Drop for EndpointHandle {
     fn drop(&mut self) {
-        // What is taken out is dropped when the engine is free again: a sink may hold other ends.
+        // The returned value is dropped after the engine is unlocked, because a sink may own other endpoints.
         drop(
             self.running
                 .shared
-                .with(|now, engine| engine.remove_end(now, self.guid.entity)),
+                .with_engine(|now, engine| engine.remove_endpoint(now, self.guid.entity)),
         );
     }
 }
 
-/// A reader of ours; dropping it withdraws it.
-pub struct Reader {
-    end: End,
+/// A local reader; dropping it removes it.
+pub struct DataReader {
+    end: EndpointHandle,
 }
 
-impl Reader {
-    /// Which end it is.
+impl DataReader {
+    /// Returns the GUID of the reader.
     pub fn guid(&self) -> Guid {
         self.end.guid
     }
 
-    /// The writers of its topic, now and later.
-    pub fn ends(&self) -> watch::Receiver<Arc<Ends>> {
+    /// Returns a watch on the writers of its topic.
+    pub fn watch_matches(&self) -> watch::Receiver<Arc<EndpointMatches>> {
         self.end.ends.clone()
     }
 }
 
-/// A writer of ours; dropping it withdraws it once its readers have what was written, or after two seconds.
-pub struct Writer {
-    end: End,
+/// A local writer; dropping it removes it once its readers have received everything, or after two seconds.
+pub struct DataWriter {
+    end: EndpointHandle,
 }
 
-impl Writer {
-    /// Which end it is.
+impl DataWriter {
+    /// Returns the GUID of the writer.
     pub fn guid(&self) -> Guid {
         self.end.guid
     }
 
-    /// The readers of its topic, now and later.
-    pub fn ends(&self) -> watch::Receiver<Arc<Ends>> {
+    /// Returns a watch on the readers of its topic.
+    pub fn watch_matches(&self) -> watch::Receiver<Arc<EndpointMatches>> {
         self.end.ends.clone()
     }
 
-    /// Writes a sample: CDR with its header of four bytes. Never waits; its number.
+    /// Writes a sample: CDR with its header of four bytes. Never blocks; returns its sequence number.
     pub fn write(&self, payload: Bytes) -> SequenceNumber {
-        self.put(payload, None)
+        self.write_sample(payload, None)
     }
 
-    /// The same, of a request or reply: with the identity by which both are known.
+    /// Writes a request or reply with the identity that relates them.
     pub fn write_related(&self, payload: Bytes, related: SampleIdentity) -> SequenceNumber {
-        self.put(payload, Some(related))
+        self.write_sample(payload, Some(related))
     }
 
-    fn put(&self, payload: Bytes, related: Option<SampleIdentity>) -> SequenceNumber {
+    fn write_sample(&self, payload: Bytes, related: Option<SampleIdentity>) -> SequenceNumber {
         let entity = self.end.guid.entity;
         self.end
             .running
             .shared
-            .with(|now, engine| engine.write(now, entity, payload, related))
+            .with_engine(|now, engine| engine.write(now, entity, payload, related))
     }
 
-    /// Samples that were given up before all reliable readers had acknowledged them.
-    pub fn dropped(&self) -> u64 {
+    /// Returns the number of samples dropped before all reliable readers had acknowledged them.
+    pub fn dropped_samples(&self) -> u64 {
         self.end
             .running
             .shared
-            .look(|engine| engine.dropped(self.end.guid.entity))
+            .read_engine(|engine| engine.dropped_samples(self.end.guid.entity))
     }
 }
 

@@ -1,67 +1,67 @@
-//! What ends of a topic offer and ask for, and whether that fits (DDS 1.4, 2.2.3).
+//! QoS policies of endpoints, and their compatibility (DDS 1.4, 2.2.3).
 
 use std::fmt;
 use std::time::Duration;
 
-/// Whether samples may be lost on the way.
+/// Reliability policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Reliability {
-    /// Sent once.
+pub enum ReliabilityKind {
+    /// Samples are sent once and may be lost.
     BestEffort,
-    /// Sent again until they have come.
+    /// Samples are sent again until they are acknowledged.
     Reliable,
 }
 
-/// What newcomers among the readers are given.
+/// Durability policy: which samples new readers receive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Durability {
-    /// What is written from then on.
+pub enum DurabilityKind {
+    /// Samples written from then on.
     Volatile,
-    /// Also what the writer still keeps.
+    /// Also those in the writer's history.
     TransientLocal,
-    /// Also what others keep of it.
+    /// Also those kept by other processes.
     Transient,
-    /// Also what was kept on a disk.
+    /// Also those in persistent storage.
     Persistent,
 }
 
-/// How many samples an end keeps.
+/// History policy: how many samples an endpoint keeps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum History {
-    /// The last ones.
+pub enum HistoryKind {
+    /// The last samples, up to this depth.
     KeepLast(u32),
-    /// All, as far as there is room.
+    /// All samples, within the memory limits.
     KeepAll,
 }
 
-/// Who says that a writer is alive.
+/// Liveliness policy: who asserts that a writer is alive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Liveliness {
-    /// Its participant's being there.
+pub enum LivelinessKind {
+    /// The presence of its participant.
     Automatic,
-    /// Anything of its participant that says so.
+    /// Any assertion by its participant.
     ManualByParticipant,
-    /// Itself.
+    /// The writer itself.
     ManualByTopic,
 }
 
-/// How samples are encoded (DDS-XTypes 1.3, 7.6.3.1.1). A writer writes in the first one of its own; a reader reads all of its own.
-/// ROS 2 writes XCDR1, and so do we.
+/// Data representations, the encodings of samples (DDS-XTypes 1.3, 7.6.3.1.1). A writer uses its first one; a reader
+/// accepts all of its own. ROS 2 writes XCDR1, and so do we.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Representations {
     first: u8,
-    /// The bit of each number.
+    /// Bit set of all representation ids.
     all: u8,
 }
 
 impl Representations {
-    /// XCDR1 alone, which holds for whoever says nothing.
+    /// Only XCDR1, which is the default.
     pub const XCDR1: Self = Self { first: 0, all: 1 };
-    /// XCDR2 alone.
+    /// Only XCDR2.
     pub const XCDR2: Self = Self { first: 2, all: 4 };
 
-    /// By their numbers, the first of which a writer writes in; numbers beyond 7 stand for nothing that is known.
-    pub fn of(numbers: &[u16]) -> Self {
+    /// Creates the policy from representation ids, of which a writer uses the first; ids above 7 are unknown.
+    pub fn from_numbers(numbers: &[u16]) -> Self {
         let Some(first) = numbers.first() else {
             return Self::XCDR1;
         };
@@ -73,61 +73,61 @@ impl Representations {
         }
     }
 
-    /// The numbers of all, the first one first.
+    /// Returns all ids, the first one first.
     pub fn numbers(self) -> impl Iterator<Item = u16> {
-        let others = (0..8).filter(move |number| *number != self.first && self.reads(*number));
+        let others = (0..8).filter(move |number| *number != self.first && self.contains(*number));
         std::iter::once(self.first).chain(others).map(u16::from)
     }
 
-    fn reads(self, number: u8) -> bool {
+    fn contains(self, number: u8) -> bool {
         number < 8 && self.all & 1 << number != 0
     }
 }
 
-/// What an end offers (a writer) or asks for (a reader).
+/// QoS offered by a writer or requested by a reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct EndpointQos {
-    /// Whether samples may be lost.
-    pub reliability: Reliability,
-    /// What newcomers are given.
-    pub durability: Durability,
-    /// How many are kept. Peers need not tell it.
-    pub history: History,
-    /// The longest time between two samples; none where that does not matter.
+    /// Reliability policy.
+    pub reliability: ReliabilityKind,
+    /// Durability policy.
+    pub durability: DurabilityKind,
+    /// History policy. Peers need not announce it.
+    pub history: HistoryKind,
+    /// Maximum time between two samples; `None`: unlimited.
     pub deadline: Option<Duration>,
-    /// After so long a sample is of no use; none where it always is. Of writers.
+    /// Time after which a sample of a writer is stale; `None`: never.
     pub lifespan: Option<Duration>,
-    /// Who says that the writer is alive.
-    pub liveliness: Liveliness,
-    /// Within which time; none where that does not matter.
+    /// Liveliness policy.
+    pub liveliness: LivelinessKind,
+    /// Liveliness lease duration; `None`: infinite.
     pub lease: Option<Duration>,
-    /// How samples are encoded.
+    /// Data representations.
     pub representations: Representations,
 }
 
 impl Default for EndpointQos {
     fn default() -> Self {
         Self {
-            reliability: Reliability::Reliable,
-            durability: Durability::Volatile,
-            history: History::KeepLast(10),
+            reliability: ReliabilityKind::Reliable,
+            durability: DurabilityKind::Volatile,
+            history: HistoryKind::KeepLast(10),
             deadline: None,
             lifespan: None,
-            liveliness: Liveliness::Automatic,
+            liveliness: LivelinessKind::Automatic,
             lease: None,
             representations: Representations::XCDR1,
         }
     }
 }
 
-/// A policy in which a reader asks for more than a writer offers: no sample passes between them.
+/// A policy that makes a reader and a writer incompatible: the reader requests more than the writer offers.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Mismatch {
-    /// The policy's name.
+    /// Name of the policy.
     pub policy: &'static str,
-    /// What the writer offers.
+    /// Value offered by the writer.
     pub offered: String,
-    /// What the reader asks for.
+    /// Value requested by the reader.
     pub requested: String,
 }
 
@@ -146,7 +146,8 @@ impl fmt::Display for Mismatch {
 }
 
 impl EndpointQos {
-    /// The policies by which a writer with this and a reader with `requested` do not match; none where they do.
+    /// Returns the policies in which a writer with this QoS does not satisfy a reader with `requested`; empty if they
+    /// are compatible.
     pub fn mismatches(&self, requested: &EndpointQos) -> Vec<Mismatch> {
         let mut found = Vec::new();
         let mut check = |fits: bool, policy, offered: String, requested: String| {
@@ -171,10 +172,10 @@ impl EndpointQos {
             requested.durability.to_string(),
         );
         check(
-            shorter(self.deadline, requested.deadline),
+            is_at_most(self.deadline, requested.deadline),
             "deadline",
-            duration(self.deadline),
-            duration(requested.deadline),
+            format_duration(self.deadline),
+            format_duration(requested.deadline),
         );
         check(
             self.liveliness >= requested.liveliness,
@@ -183,20 +184,20 @@ impl EndpointQos {
             requested.liveliness.to_string(),
         );
         check(
-            shorter(self.lease, requested.lease),
+            is_at_most(self.lease, requested.lease),
             "liveliness lease",
-            duration(self.lease),
-            duration(requested.lease),
+            format_duration(self.lease),
+            format_duration(requested.lease),
         );
         let offered = self.representations;
         check(
-            requested.representations.reads(offered.first),
+            requested.representations.contains(offered.first),
             "data representation",
-            name(u16::from(offered.first)),
+            representation_name(u16::from(offered.first)),
             requested
                 .representations
                 .numbers()
-                .map(name)
+                .map(representation_name)
                 .collect::<Vec<_>>()
                 .join(" or "),
         );
@@ -204,7 +205,7 @@ impl EndpointQos {
     }
 }
 
-fn name(representation: u16) -> String {
+fn representation_name(representation: u16) -> String {
     match representation {
         0 => "XCDR1".to_owned(),
         1 => "XML".to_owned(),
@@ -213,8 +214,8 @@ fn name(representation: u16) -> String {
     }
 }
 
-/// Whether what is offered is at most what is asked for, where none is without end.
-fn shorter(offered: Option<Duration>, requested: Option<Duration>) -> bool {
+/// Returns whether the offered duration is at most the requested one, where `None` is infinite.
+fn is_at_most(offered: Option<Duration>, requested: Option<Duration>) -> bool {
     match (offered, requested) {
         (_, None) => true,
         (None, Some(_)) => false,
@@ -222,15 +223,15 @@ fn shorter(offered: Option<Duration>, requested: Option<Duration>) -> bool {
     }
 }
 
-fn duration(duration: Option<Duration>) -> String {
+fn format_duration(duration: Option<Duration>) -> String {
     match duration {
         None => "infinite".to_owned(),
         Some(duration) => format!("{} s", duration.as_secs_f64()),
     }
 }
 
-/// In the words of ROS 2's tools.
-impl fmt::Display for Reliability {
+/// Formats the value as ROS 2 tools do.
+impl fmt::Display for ReliabilityKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(match self {
             Self::BestEffort => "best_effort",
@@ -239,7 +240,7 @@ impl fmt::Display for Reliability {
     }
 }
 
-impl fmt::Display for Durability {
+impl fmt::Display for DurabilityKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(match self {
             Self::Volatile => "volatile",
@@ -250,7 +251,7 @@ impl fmt::Display for Durability {
     }
 }
 
-impl fmt::Display for Liveliness {
+impl fmt::Display for LivelinessKind {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(match self {
             Self::Automatic => "automatic",
@@ -265,13 +266,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_reader_that_asks_for_more_is_told_what_of() {
+    fn mismatched_policies_are_listed() {
         let offered = EndpointQos {
-            reliability: Reliability::BestEffort,
+            reliability: ReliabilityKind::BestEffort,
             ..EndpointQos::default()
         };
         let requested = EndpointQos {
-            durability: Durability::TransientLocal,
+            durability: DurabilityKind::TransientLocal,
             deadline: Some(Duration::from_millis(500)),
             ..EndpointQos::default()
         };
@@ -291,9 +292,9 @@ mod tests {
         assert_eq!(requested.mismatches(&offered), []);
     }
     #[test]
-    fn a_reader_of_another_encoding_is_told_so() {
+    fn a_mismatched_data_representation_is_listed() {
         let reader = |numbers: &[u16]| EndpointQos {
-            representations: Representations::of(numbers),
+            representations: Representations::from_numbers(numbers),
             ..EndpointQos::default()
         };
         let ours = EndpointQos::default();
@@ -308,7 +309,7 @@ mod tests {
         let expected =
             "data representation: the publisher offers XCDR1, the subscriber asks for XCDR2 or XML";
         assert_eq!(told, [expected]);
-        // A writer writes in its first one only.
+        // A writer uses only its first representation.
         assert_eq!(reader(&[0, 2]).mismatches(&ours), []);
         assert_eq!(reader(&[2, 0]).mismatches(&ours).len(), 1);
     }

@@ -1,8 +1,8 @@
-//! One reader of ours: what has come of each matched writer, and what is missing (8.4.10 to 8.4.12).
+//! A local reader: what was received from each matched writer, and what is missing (8.4.10 to 8.4.12).
 //!
 //! ```text
 //!   DATA, DATA_FRAG ─▶ WriterProxy: in order? ─▶ samples
-//!                          │ no: kept until what is before it has come, or will never come (HEARTBEAT, GAP)
+//!                          │ no: kept until the earlier ones have arrived or will never arrive (HEARTBEAT, GAP)
 //!   HEARTBEAT ─────────────┴─▶ ACKNACK, NACK_FRAG
 //! ```
 
@@ -18,90 +18,91 @@ use budget::Budget;
 
 use crate::discovery::EndpointData;
 use crate::fragments::{Assembly, Progress};
-use crate::participant::Sample;
-use crate::qos::{Durability, Reliability};
+use crate::participant::ReceivedSample;
+use crate::qos::{DurabilityKind, ReliabilityKind};
 use crate::sequence::{FragmentNumber, SPAN, SequenceNumber, SequenceSet};
 use crate::time::WireTime;
 use crate::wire::{DataFrag, NackFrag};
-use crate::writer::Counts;
+use crate::writer::CountFilter;
 use crate::{EntityId, Guid, GuidPrefix, VendorId, wire};
 
-/// A writer that has not told yet what it has is asked so often; each time the pause doubles, up to two seconds.
+/// First and longest interval between requests to a writer that has not announced its samples; each interval is twice
+/// as long as the one before.
 const FIRST_ASK: Duration = Duration::from_millis(10);
 const SELDOM_ASK: Duration = Duration::from_secs(2);
-/// A volatile reader does not wait longer for a writer's first heartbeat: what has come is passed on then.
+/// Time a volatile reader waits for a writer's first heartbeat before it delivers what has arrived.
 const NO_HEARTBEAT: Duration = Duration::from_millis(200);
-/// What was asked for again is asked for once more after this time.
+/// Interval between resend requests for the same sample.
 const ASK_AGAIN: Duration = Duration::from_millis(20);
-/// Fragments of a sample that are on their way are not asked for.
+/// Time after a fragment during which missing fragments are not requested, because they are probably in flight.
 const UNDER_WAY: Duration = Duration::from_millis(5);
-/// What has come is acknowledged so much later.
+/// Delay of an acknowledgement.
 const ACKNOWLEDGE: Duration = Duration::from_millis(5);
-/// Samples of one writer that are put together at the same time. Best-effort writers may lose any of them.
+/// Maximum number of samples of one writer reassembled at the same time. Those of best-effort writers may be lost.
 const MOST_ASSEMBLIES: usize = 8;
-/// Samples that wait for one before them.
+/// Maximum number of samples waiting for an earlier one.
 const MOST_WAITING: usize = SPAN as usize;
-/// What it takes to keep a sample, beside its bytes: many small ones count, too.
+/// Overhead of a kept sample in bytes, which matters for many small ones.
 const KEEPING: usize = 256;
 
-/// What holds for all readers of a participant.
+/// Limits of all readers of a participant.
 #[derive(Debug, Clone)]
-pub(crate) struct Bounds {
+pub(crate) struct ReaderLimits {
     pub max_sample: usize,
     pub budget: Budget,
     pub unfinished: Duration,
 }
 
-/// What a reader answers to a writer.
+/// The response of a reader to a writer.
 #[derive(Debug)]
-pub(crate) struct Answer {
+pub(crate) struct AckResponse {
     pub to: SocketAddr,
     pub prefix: GuidPrefix,
     pub acknack: wire::AckNack,
     pub nack_frags: Vec<NackFrag>,
 }
 
-/// What came of one writer.
+/// Receive state for one writer.
 #[derive(Debug)]
 struct WriterProxy {
     data: Arc<EndpointData>,
     address: SocketAddr,
     vendor: VendorId,
-    /// Both sides are reliable: what is missing is asked for.
+    /// Both sides are reliable, so missing samples are requested.
     reliable: bool,
-    /// The number that is passed on next.
+    /// Number of the next sample to deliver.
     next: SequenceNumber,
-    /// Whether `next` is known: a reliable writer tells it by its first heartbeat.
+    /// `next` is known: a reliable writer announces it with its first heartbeat.
     begun: bool,
     matched: Instant,
-    /// Numbers after `next`: samples, or the word that there is none, which costs hardly anything.
-    waiting: BTreeMap<SequenceNumber, Option<Box<Sample>>>,
+    /// Entries after `next`: a sample, or `None` for a number that has none, which takes almost no memory.
+    waiting: BTreeMap<SequenceNumber, Option<Box<ReceivedSample>>>,
     assemblies: BTreeMap<SequenceNumber, Assembly>,
-    /// The last number that the writer has told of.
+    /// Highest number announced by the writer.
     last: SequenceNumber,
-    heartbeats: Counts,
+    heartbeats: CountFilter,
     acknacks: u32,
     nack_frags: u32,
     answer_at: Option<Instant>,
     pause: Duration,
-    /// It has told something to this reader or to all: it knows this reader, as far as can be known.
+    /// The writer has sent something to this reader or to all, so it knows this reader as far as can be told.
     heard: bool,
 }
 
-/// The state of one reader.
+/// State of one reader.
 #[derive(Debug)]
 pub(crate) struct ReaderState {
     pub own: EndpointData,
-    bounds: Bounds,
+    bounds: ReaderLimits,
     proxies: Vec<WriterProxy>,
-    /// The most that was said to a writer that has gone.
+    /// Highest count sent to a writer that is gone.
     counted: u32,
-    /// Samples that were not taken: too long, or without room for them.
+    /// Number of samples dropped because they were too long or exceeded the budget.
     pub refused: u64,
 }
 
 impl ReaderState {
-    pub fn new(own: EndpointData, bounds: Bounds) -> Self {
+    pub fn new(own: EndpointData, bounds: ReaderLimits) -> Self {
         Self {
             own,
             bounds,
@@ -111,16 +112,16 @@ impl ReaderState {
         }
     }
 
-    /// A writer matches. A reliable one is asked at once what it has.
-    pub fn matched(
+    /// Matches a writer. A reliable one is asked immediately what it has.
+    pub fn add_writer(
         &mut self,
         now: Instant,
         data: Arc<EndpointData>,
         address: SocketAddr,
         vendor: VendorId,
     ) {
-        self.unmatched(data.guid);
-        let both = |qos: Reliability| qos == Reliability::Reliable;
+        self.remove_writer(data.guid);
+        let both = |qos: ReliabilityKind| qos == ReliabilityKind::Reliable;
         let reliable = both(self.own.qos.reliability) && both(data.qos.reliability);
         self.proxies.push(WriterProxy {
             data,
@@ -133,8 +134,8 @@ impl ReaderState {
             waiting: BTreeMap::new(),
             assemblies: BTreeMap::new(),
             last: SequenceNumber(0),
-            heartbeats: Counts::default(),
-            // A writer that is met anew need not know that.
+            heartbeats: CountFilter::default(),
+            // A rediscovered writer may not know that it was gone, so counts continue.
             acknacks: self.counted,
             nack_frags: self.counted,
             answer_at: reliable.then_some(now),
@@ -143,8 +144,8 @@ impl ReaderState {
         });
     }
 
-    /// A writer has gone; whether it was matched.
-    pub fn unmatched(&mut self, writer: Guid) -> bool {
+    /// Removes a writer; returns whether it was matched.
+    pub fn remove_writer(&mut self, writer: Guid) -> bool {
         let before = self.proxies.len();
         let counted = &mut self.counted;
         self.proxies.retain(|proxy| {
@@ -157,26 +158,26 @@ impl ReaderState {
         before != self.proxies.len()
     }
 
-    /// The writers that are matched, in the order in which they came, each with whether it has told anything.
+    /// Returns the matched writers in the order of discovery, each with whether it has confirmed the match.
     pub fn writers(&self) -> impl Iterator<Item = (&Arc<EndpointData>, bool)> {
         self.proxies
             .iter()
             .map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
     }
 
-    fn waits_for_past(&self) -> bool {
-        self.own.qos.durability >= Durability::TransientLocal
+    fn wants_history(&self) -> bool {
+        self.own.qos.durability >= DurabilityKind::TransientLocal
     }
 
-    /// A whole sample. True where this shows for the first time that the writer knows this reader.
-    pub fn data(
+    /// Handles a complete sample. Returns whether it shows for the first time that the writer knows this reader.
+    pub fn on_data(
         &mut self,
         now: Instant,
         writer: Guid,
-        sample: Sample,
-        out: &mut Vec<Sample>,
+        sample: ReceivedSample,
+        out: &mut Vec<ReceivedSample>,
     ) -> bool {
-        let Bounds {
+        let ReaderLimits {
             max_sample, budget, ..
         } = &self.bounds;
         let Some(proxy) = self
@@ -191,38 +192,43 @@ impl ReaderState {
             return false;
         }
         let number = sample.number;
-        match proxy.counted(sample, budget) {
+        match proxy.charge_sample(sample, budget) {
             Some(sample) => {
                 proxy.assemblies.remove(&number);
-                proxy.take(sample, out);
+                proxy.accept(sample, out);
             }
             None => {
                 self.refused += 1;
-                proxy.ask_again(now, number);
+                proxy.schedule_request(now, number);
             }
         }
         !std::mem::replace(&mut proxy.heard, true)
     }
 
-    /// A number without a sample: what it withdraws is of no concern here.
-    pub fn nothing(&mut self, writer: Guid, number: SequenceNumber, out: &mut Vec<Sample>) {
+    /// Handles a number without a sample; what it disposes of does not matter here.
+    pub fn skip_sample(
+        &mut self,
+        writer: Guid,
+        number: SequenceNumber,
+        out: &mut Vec<ReceivedSample>,
+    ) {
         if let Some(proxy) = self
             .proxies
             .iter_mut()
             .find(|proxy| proxy.data.guid == writer)
         {
-            proxy.pass_over(number, out);
+            proxy.skip(number, out);
         }
     }
 
-    /// Fragments of a sample.
-    pub fn data_frag(
+    /// Handles fragments of a sample.
+    pub fn on_data_frag(
         &mut self,
         now: Instant,
         writer: Guid,
         frag: &DataFrag,
         written: Option<WireTime>,
-        out: &mut Vec<Sample>,
+        out: &mut Vec<ReceivedSample>,
     ) -> bool {
         let Some(proxy) = self
             .proxies
@@ -250,11 +256,12 @@ impl ReaderState {
             );
             let Some(assembly) = made else {
                 self.refused += 1;
-                proxy.pass_over(number, out);
+                proxy.skip(number, out);
                 return heard;
             };
             if proxy.assemblies.len() >= MOST_ASSEMBLIES {
-                // Of a best-effort writer the oldest will not be completed; a reliable one sends the newest once more.
+                // The oldest sample of a best-effort writer will not be completed; a reliable writer sends the newest
+                // again.
                 let Some(victim) = (if proxy.reliable {
                     proxy.assemblies.keys().next_back()
                 } else {
@@ -275,25 +282,25 @@ impl ReaderState {
         };
         assembly.related = assembly.related.or(frag.inline.related);
         assembly.written = assembly.written.or(written);
-        match assembly.take(frag.first, frag.count, &frag.payload, now) {
+        match assembly.add_fragments(frag.first, frag.count, &frag.payload, now) {
             Progress::Missing => {}
             Progress::Refused => {
                 self.refused += 1;
                 proxy.assemblies.remove(&number);
                 if proxy.reliable {
-                    // What waits for this one may take the room that it needs; the newest of them is sent once more.
+                    // Queued samples may take the memory that this one needs; the newest of them will be sent again.
                     if proxy.waiting.keys().next_back() > Some(&number) {
                         proxy.waiting.pop_last();
                     }
-                    proxy.ask_again(now, number);
+                    proxy.schedule_request(now, number);
                 }
             }
             Progress::Whole => {
                 if let Some(assembly) = proxy.assemblies.remove(&number) {
                     let (related, written) = (assembly.related, assembly.written);
                     let payload = assembly.into_bytes();
-                    proxy.take(
-                        Sample {
+                    proxy.accept(
+                        ReceivedSample {
                             payload,
                             writer,
                             number,
@@ -307,19 +314,19 @@ impl ReaderState {
             }
         }
         if proxy.reliable && !proxy.assemblies.is_empty() {
-            // Should the rest not come, it is asked for.
-            proxy.ask_again(now, number);
+            // Requests the rest in case it does not arrive.
+            proxy.schedule_request(now, number);
         }
         heard
     }
 
-    /// A writer tells what it has. True where this shows for the first time that it knows this reader.
-    pub fn heartbeat(
+    /// Handles a heartbeat. Returns whether it shows for the first time that the writer knows this reader.
+    pub fn on_heartbeat(
         &mut self,
         now: Instant,
         writer: Guid,
         beat: &wire::Heartbeat,
-        out: &mut Vec<Sample>,
+        out: &mut Vec<ReceivedSample>,
     ) -> bool {
         let Some(proxy) = self
             .proxies
@@ -328,14 +335,14 @@ impl ReaderState {
         else {
             return false;
         };
-        // A first number of 0 or less, or one beyond the last by more than one, is none (8.3.8.6.3).
+        // A first number below 1, or one beyond the last by more than one, is invalid (8.3.8.6.3).
         if !proxy.reliable || beat.first.0 < 1 || beat.last.0 < beat.first.0 - 1 {
             return false;
         }
-        if !proxy.heartbeats.takes(now, beat.count) {
+        if !proxy.heartbeats.accept(now, beat.count) {
             return false;
         }
-        proxy.begin(beat.first, out);
+        proxy.start_at(beat.first, out);
         proxy.last = proxy.last.max(beat.last);
         proxy.skip_to(beat.first, out);
         proxy.pause = FIRST_ASK;
@@ -343,14 +350,14 @@ impl ReaderState {
         if missing {
             proxy.answer_at = Some(now);
         } else if !beat.is_final {
-            // One answer for all heartbeats of this time.
+            // One response for all heartbeats of this interval.
             proxy.answer_at = Some(proxy.answer_at.unwrap_or(now + ACKNOWLEDGE));
         }
         !std::mem::replace(&mut proxy.heard, true)
     }
 
-    /// A writer tells that a sample has so many fragments by now.
-    pub fn heartbeat_frag(&mut self, now: Instant, writer: Guid, beat: &wire::HeartbeatFrag) {
+    /// Handles the announcement of the fragments available of a sample.
+    pub fn on_heartbeat_frag(&mut self, now: Instant, writer: Guid, beat: &wire::HeartbeatFrag) {
         let Some(proxy) = self
             .proxies
             .iter_mut()
@@ -363,8 +370,8 @@ impl ReaderState {
         }
     }
 
-    /// Numbers that will never come.
-    pub fn gap(&mut self, writer: Guid, gap: &wire::Gap, out: &mut Vec<Sample>) {
+    /// Handles numbers that will never be sent.
+    pub fn on_gap(&mut self, writer: Guid, gap: &wire::Gap, out: &mut Vec<ReceivedSample>) {
         let Some(proxy) = self
             .proxies
             .iter_mut()
@@ -384,16 +391,16 @@ impl ReaderState {
                 .0
                 .min(proxy.next.0.saturating_add(MOST_WAITING as i64));
             for number in gap.start.0..until {
-                proxy.none(SequenceNumber(number));
+                proxy.mark_absent(SequenceNumber(number));
             }
         }
         for number in gap.set.iter() {
-            proxy.none(number);
+            proxy.mark_absent(number);
         }
-        proxy.pass_on(out);
+        proxy.deliver_ready(out);
     }
 
-    /// When this writer is to be answered.
+    /// Returns the time at which a response to this writer is due.
     pub fn answer_at(&self, writer: Guid) -> Option<Instant> {
         self.proxies
             .iter()
@@ -401,14 +408,15 @@ impl ReaderState {
             .answer_at
     }
 
-    /// What is due at `now`: answers, and samples that waited for a heartbeat that never came. The time when to call again.
+    /// Collects responses that are due, and samples that waited for a heartbeat in vain. Returns the time of the next
+    /// call.
     pub fn tick(
         &mut self,
         now: Instant,
-        answers: &mut Vec<Answer>,
-        out: &mut Vec<Sample>,
+        answers: &mut Vec<AckResponse>,
+        out: &mut Vec<ReceivedSample>,
     ) -> Option<Instant> {
-        let past = self.waits_for_past();
+        let past = self.wants_history();
         let (own, unfinished) = (self.own.guid.entity, self.bounds.unfinished);
         let mut again: Option<Instant> = None;
         for proxy in &mut self.proxies {
@@ -418,11 +426,11 @@ impl ReaderState {
             if !proxy.begun && !past && now.saturating_duration_since(proxy.matched) >= NO_HEARTBEAT
             {
                 if let Some(first) = proxy.waiting.keys().next().copied() {
-                    proxy.begin(first, out);
+                    proxy.start_at(first, out);
                 }
             }
             if proxy.answer_at.is_some_and(|at| at <= now) {
-                answers.push(proxy.answer(now, own));
+                answers.push(proxy.build_response(now, own));
             }
             let wake = [
                 proxy.answer_at,
@@ -439,43 +447,43 @@ impl ReaderState {
 }
 
 impl WriterProxy {
-    /// The writer has told where it begins.
-    fn begin(&mut self, first: SequenceNumber, out: &mut Vec<Sample>) {
+    /// Sets the first number that the writer has.
+    fn start_at(&mut self, first: SequenceNumber, out: &mut Vec<ReceivedSample>) {
         if !self.begun {
             self.begun = true;
             self.next = self.next.max(first);
-            self.pass_on(out);
+            self.deliver_ready(out);
         }
     }
 
-    /// This number is missing: it is asked for after a while, unless it comes.
-    fn ask_again(&mut self, now: Instant, number: SequenceNumber) {
+    /// Schedules a request for a missing number, unless it arrives before.
+    fn schedule_request(&mut self, now: Instant, number: SequenceNumber) {
         self.last = self.last.max(number);
         self.answer_at = Some(self.answer_at.unwrap_or(now + ASK_AGAIN));
     }
 
-    /// The same sample, counted in the budget if it has to wait for others; none if there is no room for it. A writer that
-    /// never says where it begins, or leaves a hole, would have others kept for as long as it likes.
-    fn counted(&self, sample: Sample, budget: &Budget) -> Option<Sample> {
+    /// Charges a sample to the budget if it must wait for others; `None` if it does not fit. Otherwise a writer that
+    /// never announces its first number, or leaves a gap, could make us keep any amount.
+    fn charge_sample(&self, sample: ReceivedSample, budget: &Budget) -> Option<ReceivedSample> {
         let passes = !self.reliable || self.begun && sample.number <= self.next;
-        if passes || !self.has_place(sample.number) {
+        if passes || !self.can_queue(sample.number) {
             return Some(sample);
         }
         let permit = budget.take(sample.payload.len() + KEEPING).ok()?;
-        // A part of a datagram keeps all of it.
-        let payload = permit.around(sample.payload.to_vec());
-        Some(Sample { payload, ..sample })
+        // A slice of a datagram would keep all of it.
+        let payload = permit.wrap_bytes(sample.payload.to_vec());
+        Some(ReceivedSample { payload, ..sample })
     }
 
-    /// Whether this number would be kept, if it has to wait.
-    fn has_place(&self, number: SequenceNumber) -> bool {
+    /// Returns whether a sample with this number would be queued if it must wait.
+    fn can_queue(&self, number: SequenceNumber) -> bool {
         let far = self.begun && number.0 - self.next.0 >= MOST_WAITING as i64;
         let full = self.waiting.len() >= MOST_WAITING && number != self.next;
         number >= self.next && !far && !full && !self.waiting.contains_key(&number)
     }
 
-    /// Takes a sample that counts in the budget already, or need not wait.
-    fn take(&mut self, sample: Sample, out: &mut Vec<Sample>) {
+    /// Accepts a sample that is charged to the budget or need not wait.
+    fn accept(&mut self, sample: ReceivedSample, out: &mut Vec<ReceivedSample>) {
         let number = sample.number;
         if number < self.next {
             return;
@@ -490,21 +498,21 @@ impl WriterProxy {
         if self.begun && number == self.next {
             self.next = number.next();
             out.push(sample);
-            self.pass_on(out);
-        } else if self.has_place(number) {
+            self.deliver_ready(out);
+        } else if self.can_queue(number) {
             self.waiting.insert(number, Some(Box::new(sample)));
         }
     }
 
-    /// A sample that will not be taken, however often it is sent.
-    fn pass_over(&mut self, number: SequenceNumber, out: &mut Vec<Sample>) {
+    /// Skips a sample that is never accepted, however often it is sent.
+    fn skip(&mut self, number: SequenceNumber, out: &mut Vec<ReceivedSample>) {
         if self.reliable {
-            self.none(number);
-            self.pass_on(out);
+            self.mark_absent(number);
+            self.deliver_ready(out);
         }
     }
 
-    fn none(&mut self, number: SequenceNumber) {
+    fn mark_absent(&mut self, number: SequenceNumber) {
         let near = number >= self.next && number.0 - self.next.0 < MOST_WAITING as i64;
         if near {
             self.assemblies.remove(&number);
@@ -512,13 +520,13 @@ impl WriterProxy {
         }
     }
 
-    /// Nothing before this number will come.
-    fn skip_to(&mut self, first: SequenceNumber, out: &mut Vec<Sample>) {
+    /// Skips all numbers before this one, which will not arrive.
+    fn skip_to(&mut self, first: SequenceNumber, out: &mut Vec<ReceivedSample>) {
         if first <= self.next {
             return;
         }
         let later = self.waiting.split_off(&first);
-        // What has come of the ones before is passed on, in order.
+        // Earlier samples that have arrived are delivered in order.
         out.extend(
             std::mem::replace(&mut self.waiting, later)
                 .into_values()
@@ -527,10 +535,10 @@ impl WriterProxy {
         );
         self.assemblies = self.assemblies.split_off(&first);
         self.next = first;
-        self.pass_on(out);
+        self.deliver_ready(out);
     }
 
-    fn pass_on(&mut self, out: &mut Vec<Sample>) {
+    fn deliver_ready(&mut self, out: &mut Vec<ReceivedSample>) {
         if !self.begun {
             return;
         }
@@ -545,18 +553,18 @@ impl WriterProxy {
         }
     }
 
-    /// What the writer is told: what has come and what is missing.
-    fn answer(&mut self, now: Instant, reader: EntityId) -> Answer {
+    /// Creates the response to the writer: what has arrived and what is missing.
+    fn build_response(&mut self, now: Instant, reader: EntityId) -> AckResponse {
         let writer = self.data.guid.entity;
         self.answer_at = None;
         if !self.begun {
-            // Nothing is acknowledged and nothing is asked for: the writer answers with a heartbeat (8.3.7.1.5). Fast DDS takes
-            // a base of 0 for that, others one of 1.
+            // Acknowledges and requests nothing: the writer answers with a heartbeat (8.3.7.1.5). Fast DDS expects a
+            // base of 0 for that, others a base of 1.
             self.answer_at = Some(now + self.pause);
             self.pause = (self.pause * 2).min(SELDOM_ASK);
             let set =
                 SequenceSet::empty(SequenceNumber(i64::from(self.vendor != VendorId::FAST_DDS)));
-            return self.told(reader, set, false, Vec::new());
+            return self.build_acknack(reader, set, false, Vec::new());
         }
         let mut set = SequenceSet::empty(self.next);
         let until = self
@@ -575,7 +583,7 @@ impl WriterProxy {
             if now.saturating_duration_since(assembly.heard) < UNDER_WAY {
                 continue;
             }
-            let missing = assembly.missing(FragmentNumber::MAX);
+            let missing = assembly.missing_fragments(FragmentNumber::MAX);
             self.nack_frags = self.nack_frags.wrapping_add(1);
             nack_frags.push(NackFrag {
                 reader,
@@ -590,16 +598,16 @@ impl WriterProxy {
             self.pause = (self.pause * 2).min(SELDOM_ASK);
         }
         let is_final = set.is_empty();
-        self.told(reader, set, is_final, nack_frags)
+        self.build_acknack(reader, set, is_final, nack_frags)
     }
 
-    fn told(
+    fn build_acknack(
         &mut self,
         reader: EntityId,
         set: SequenceSet,
         is_final: bool,
         nack_frags: Vec<NackFrag>,
-    ) -> Answer {
+    ) -> AckResponse {
         self.acknacks = self.acknacks.wrapping_add(1);
         let Guid {
             prefix,
@@ -612,7 +620,7 @@ impl WriterProxy {
             count: self.acknacks,
             is_final,
         };
-        Answer {
+        AckResponse {
             to: self.address,
             prefix,
             acknack,

@@ -1,16 +1,16 @@
-//! Numbers of samples and of their fragments, and sets of them (8.3.5.4 to 8.3.5.7).
+//! Sequence and fragment numbers, and sets of them (8.3.5.4 to 8.3.5.7).
 
 use std::fmt;
 
-/// The number of a sample of a writer; the first is 1.
+/// Sequence number of a sample of a writer, starting at 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Default)]
 pub struct SequenceNumber(pub i64);
 
 impl SequenceNumber {
-    /// None: of a request whose sender does not say.
+    /// Unknown: used in a request whose sender does not know its number.
     pub const UNKNOWN: Self = Self(-1 << 32);
 
-    /// The one after it.
+    /// Returns the next number.
     pub fn next(self) -> Self {
         Self(self.0.saturating_add(1))
     }
@@ -22,29 +22,30 @@ impl fmt::Display for SequenceNumber {
     }
 }
 
-/// The number of a fragment of a sample; the first is 1.
+/// Number of a fragment of a sample, starting at 1.
 pub type FragmentNumber = u32;
 
-/// The most numbers that a set can span.
+/// Maximum number of bits of a set.
 pub const SPAN: u32 = 256;
 
-/// Numbers from `base` on, at most 256: bit `i` (the highest bit of the first word is bit 0) stands for `base + i`.
+/// A set of numbers from `base` on, at most 256: bit `i` (bit 0 is the highest bit of the first word) represents `base
+/// + i`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NumberSet<N> {
-    /// What bit 0 stands for. In an acknowledgement all before it have come.
+    /// Number represented by bit 0. In an acknowledgement, all numbers before it have been received.
     pub base: N,
-    /// How many bits there are.
+    /// Number of bits.
     pub bits: u32,
     words: [u32; 8],
 }
 
-/// Numbers of samples.
+/// Set of sequence numbers.
 pub type SequenceSet = NumberSet<SequenceNumber>;
-/// Numbers of fragments.
+/// Set of fragment numbers.
 pub type FragmentSet = NumberSet<FragmentNumber>;
 
 impl<N: Copy> NumberSet<N> {
-    /// None, with this base.
+    /// Creates an empty set with this base.
     pub fn empty(base: N) -> Self {
         Self {
             base,
@@ -53,7 +54,7 @@ impl<N: Copy> NumberSet<N> {
         }
     }
 
-    /// As it came: `bits` and its words, as many as `bits` need; none where they do not fit together.
+    /// Creates a set from its wire format; `None` if `bits` and the number of words do not match.
     pub(crate) fn from_words(base: N, bits: u32, words: &[u32]) -> Option<Self> {
         if bits > SPAN || words.len() != bits.div_ceil(32) as usize {
             return None;
@@ -67,12 +68,12 @@ impl<N: Copy> NumberSet<N> {
         Some(set)
     }
 
-    /// The words that its bits need.
+    /// Returns the words that contain its bits.
     pub(crate) fn words(&self) -> &[u32] {
         &self.words[..self.bits.div_ceil(32) as usize]
     }
 
-    /// Whether there is nothing in it.
+    /// Returns whether the set is empty.
     pub fn is_empty(&self) -> bool {
         self.offsets().next().is_none()
     }
@@ -89,7 +90,7 @@ impl<N: Copy> NumberSet<N> {
 }
 
 impl SequenceSet {
-    /// Adds a number; false where it is further from the base than a set can span.
+    /// Inserts a number; returns `false` if it is too far from the base.
     pub fn insert(&mut self, number: SequenceNumber) -> bool {
         let offset = number.0.saturating_sub(self.base.0);
         let fits = (0..i64::from(SPAN)).contains(&offset);
@@ -99,7 +100,7 @@ impl SequenceSet {
         fits
     }
 
-    /// All numbers in it, in order.
+    /// Returns the numbers in ascending order.
     pub fn iter(&self) -> impl Iterator<Item = SequenceNumber> + '_ {
         self.offsets()
             .map(|offset| SequenceNumber(self.base.0.saturating_add(i64::from(offset))))
@@ -107,7 +108,7 @@ impl SequenceSet {
 }
 
 impl FragmentSet {
-    /// Adds a number; false where it is further from the base than a set can span.
+    /// Inserts a number; returns `false` if it is too far from the base.
     pub fn insert(&mut self, number: FragmentNumber) -> bool {
         let fits = number >= self.base && number - self.base < SPAN;
         if fits {
@@ -116,7 +117,7 @@ impl FragmentSet {
         fits
     }
 
-    /// All numbers in it, in order.
+    /// Returns the numbers in ascending order.
     pub fn iter(&self) -> impl Iterator<Item = FragmentNumber> + '_ {
         self.offsets()
             .map(|offset| self.base.saturating_add(offset))

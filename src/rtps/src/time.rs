@@ -1,26 +1,26 @@
-//! Times and durations on the wire: seconds and a fraction of 2^32 (9.3.2).
+//! Wire format of times and durations: seconds and a fraction of 2^32 (9.3.2).
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-/// A duration as it stands on the wire.
+/// Wire format of a duration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WireDuration {
     /// Whole seconds.
     pub seconds: i32,
-    /// Parts of 2^32 of a second.
+    /// Fraction in units of 2^-32 seconds.
     pub fraction: u32,
 }
 
 impl WireDuration {
-    /// Without end.
+    /// Infinite duration.
     pub const INFINITE: Self = Self {
         seconds: i32::MAX,
         fraction: u32::MAX,
     };
 
-    /// The duration; none where it has no end. A negative one is zero.
+    /// Returns the duration; `None` if it is infinite. Negative durations become zero.
     pub fn finite(self) -> Option<Duration> {
-        // Some write the fraction of an infinite duration as the largest signed number.
+        // Some implementations write the largest signed number as the fraction of an infinite duration.
         if self.seconds == i32::MAX {
             return None;
         }
@@ -42,19 +42,19 @@ impl From<Duration> for WireDuration {
     }
 }
 
-/// A point in time as it stands on the wire: since 1970.
+/// Wire format of a time since the Unix epoch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WireTime {
     /// Whole seconds.
     pub seconds: u32,
-    /// Parts of 2^32 of a second.
+    /// Fraction in units of 2^-32 seconds.
     pub fraction: u32,
 }
 
 impl From<SystemTime> for WireTime {
     fn from(time: SystemTime) -> Self {
         let since = time.duration_since(UNIX_EPOCH).unwrap_or_default();
-        // The wire's clock goes to 2106.
+        // The wire format ends in 2106.
         Self {
             seconds: since.as_secs() as u32,
             fraction: fraction(since.subsec_nanos()),
@@ -62,7 +62,7 @@ impl From<SystemTime> for WireTime {
     }
 }
 
-/// Rounded up: so the same nanoseconds come back, as reading rounds down.
+/// Rounded up, so that the same nanoseconds result when reading rounds down.
 fn fraction(nanoseconds: u32) -> u32 {
     (u64::from(nanoseconds) << 32).div_ceil(1_000_000_000) as u32
 }

@@ -1,7 +1,8 @@
-//! Datagrams of RTPS as bytes, and what they say (8.3, 9.4): [`parse`] reads them, [`DatagramWriter`] writes them.
+//! Wire format of RTPS messages (8.3, 9.4): [`parse`] reads them, [`DatagramWriter`] writes them.
 //!
-//! A datagram is a header and submessages. Those that only tell about the ones after them (who sends, to whom, when) are
-//! carried out here: what is given on is a [`Received`] for each of the others. Payloads are slices of the datagram.
+//! A datagram consists of a header and submessages. Submessages that only provide context for the following ones
+//! (sender, destination, time) are interpreted here; each of the others results in a [`ReceivedSubmessage`]. Payloads
+//! are slices of the datagram.
 
 #![forbid(unsafe_code)]
 
@@ -20,9 +21,9 @@ mod write;
 
 use bytes::Bytes;
 
-pub(crate) use input::Input;
+pub(crate) use input::WireReader;
 pub use liveliness::ParticipantMessage;
-pub(crate) use parameters::{ParameterWriter, list, list_header, parameter, pid};
+pub(crate) use parameters::{ParameterWriter, list_header, next_parameter, parameter_list, pid};
 pub use read::parse;
 pub use write::{DataFragHead, DatagramWriter};
 
@@ -32,251 +33,252 @@ use crate::{
     VendorId,
 };
 
-/// What bytes are not what they should be.
+/// Errors in the wire format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum WireError {
-    /// Another protocol, or a version of RTPS with another layout.
-    #[error("it does not begin as a message of RTPS 2")]
+    /// Another protocol, or an RTPS version with another format.
+    #[error("it does not begin like an RTPS 2 message")]
     NotRtps,
-    /// Something is longer than what holds it.
-    #[error("it is cut short")]
+    /// Truncated data.
+    #[error("it is truncated")]
     Short,
-    /// A number of a sample that there cannot be.
-    #[error("{0} is no number of a sample")]
+    /// Invalid sequence number.
+    #[error("{0} is not a sequence number")]
     Number(i64),
-    /// A set of numbers of more bits than there may be, or with an impossible base.
-    #[error("it has a set of {0} bits, or with a base that there cannot be")]
+    /// A set with too many bits or an invalid base.
+    #[error("it has a set of {0} bits, or with an impossible base")]
     Set(u32),
-    /// A fragment that is not of its sample.
+    /// A fragment that does not belong to its sample.
     #[error(
         "fragments {first} and the {count} from it on are not of a sample of {sample} bytes in pieces of {size}"
     )]
     Fragments {
-        /// The first one's number.
+        /// Number of the first fragment.
         first: FragmentNumber,
-        /// How many they are.
+        /// Number of fragments.
         count: u16,
-        /// How long one is, in bytes.
+        /// Fragment size in bytes.
         size: u16,
-        /// How long the sample is, in bytes.
+        /// Sample size in bytes.
         sample: u32,
     },
-    /// Flags of a submessage that do not go together.
-    #[error("it has flags {0:#04x}, which do not go together")]
+    /// Contradictory flags of a submessage.
+    #[error("it has flags {0:#04x}, which contradict each other")]
     Flags(u8),
-    /// More submessages in one datagram than are read.
+    /// Too many submessages in one datagram.
     #[error("it has more than {MOST_SUBMESSAGES} submessages")]
     TooMany,
-    /// A payload of discovery in another serialization.
+    /// A discovery payload with an unsupported serialization.
     #[error("its serialization is {0:#06x}, not a list of parameters")]
     Serialization(u16),
-    /// A parameter without which the rest must not be used, and which is not known.
-    #[error("it has parameter {0:#06x}, which has to be understood and is not known")]
+    /// An unknown parameter that must be understood for the rest to be used.
+    #[error("it has parameter {0:#06x}, which must be understood but is unknown")]
     NotUnderstood(u16),
-    /// A parameter with a value that there cannot be.
-    #[error("the value of its parameter {0:#06x} is not one")]
+    /// A parameter with an invalid value.
+    #[error("the value of its parameter {0:#06x} is invalid")]
     Value(u16),
-    /// A parameter that has to be there.
+    /// A required parameter is missing.
     #[error("its parameter {0:#06x} is missing")]
     Missing(u16),
 }
 
-/// More submessages of one datagram are not read. The most that peers send together are a few dozen.
+/// Maximum number of submessages read from a datagram. Peers send at most a few dozen together.
 pub const MOST_SUBMESSAGES: usize = 1024;
 
-/// How long the header of a datagram is, in bytes.
+/// Length of the header of a datagram in bytes.
 pub const HEADER: usize = 20;
 
-/// What was read of a datagram: all until its end or its first fault.
+/// The submessages of a datagram up to its end or first error.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Parsed {
-    /// In the order in which they stand there.
-    pub received: Vec<Received>,
-    /// Why the rest was not read (8.3.4.1); what came before it stands.
+    /// Submessages in the order of the datagram.
+    pub received: Vec<ReceivedSubmessage>,
+    /// Why the rest was not read (8.3.4.1); the submessages before it are valid.
     pub fault: Option<WireError>,
 }
 
-/// A submessage, with what the submessages before it in the datagram said.
+/// A submessage with the context given by preceding submessages.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Received {
-    /// Who sent it.
+pub struct ReceivedSubmessage {
+    /// GUID prefix of the sender.
     pub from: GuidPrefix,
-    /// Which implementation that is.
+    /// Implementation of the sender.
     pub vendor: VendorId,
-    /// For whom it is; none where it is for everybody.
+    /// Destination participant; `None`: any.
     pub to: Option<GuidPrefix>,
-    /// When it was written, by its writer's clock.
+    /// Source timestamp, on the writer's clock.
     pub written: Option<WireTime>,
-    /// What it says.
+    /// The submessage.
     pub submessage: Submessage,
 }
 
-/// What one end says to another (8.3.7).
+/// A submessage exchanged between endpoints (8.3.7).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Submessage {
-    /// A whole sample.
+    /// A complete sample.
     Data(Data),
-    /// A part of a sample.
+    /// Fragments of a sample.
     DataFrag(DataFrag),
-    /// Which samples a writer has.
+    /// The samples that a writer has.
     Heartbeat(Heartbeat),
-    /// Which parts of a sample a writer has.
+    /// The fragments of a sample that a writer has.
     HeartbeatFrag(HeartbeatFrag),
-    /// Which samples a reader has and which it misses.
+    /// The samples that a reader has received and misses.
     AckNack(AckNack),
-    /// Which parts of a sample a reader misses.
+    /// The fragments of a sample that a reader misses.
     NackFrag(NackFrag),
-    /// Which samples a reader need not wait for.
+    /// Samples that a reader need not wait for.
     Gap(Gap),
 }
 
-/// A whole sample, or that an instance is no more (8.3.7.2).
+/// A complete sample, or the disposal of an instance (8.3.7.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Data {
-    /// For which reader; UNKNOWN: all that match.
+    /// Destination reader; UNKNOWN: all matched readers.
     pub reader: EntityId,
-    /// Of which writer.
+    /// Sending writer.
     pub writer: EntityId,
-    /// Its number; at least 1.
+    /// Sequence number, at least 1.
     pub number: SequenceNumber,
-    /// What it tells of itself.
+    /// Inline QoS.
     pub inline: InlineQos,
-    /// CDR with its header of four bytes, then up to three bytes that are no part of it; none where it says only what
-    /// `inline` does.
+    /// CDR with its header of four bytes, followed by up to three bytes of padding; `None` if the submessage contains
+    /// only `inline`.
     pub payload: Option<Bytes>,
-    /// The payload is not a sample but only its key.
+    /// The payload is only a key.
     pub key_only: bool,
 }
 
-/// Consecutive fragments of a sample (8.3.7.3). They are what they say: `first` and `count` lie within the sample.
+/// Consecutive fragments of a sample (8.3.7.3). They are valid: `first` and `count` lie within the sample.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DataFrag {
-    /// For which reader; UNKNOWN: all that match.
+    /// Destination reader; UNKNOWN: all matched readers.
     pub reader: EntityId,
-    /// Of which writer.
+    /// Sending writer.
     pub writer: EntityId,
-    /// The sample's number; at least 1.
+    /// Sequence number of the sample, at least 1.
     pub number: SequenceNumber,
-    /// What it tells of itself; not every fragment need have it.
+    /// Inline QoS; not every fragment has it.
     pub inline: InlineQos,
-    /// The first fragment's number; at least 1.
+    /// Number of the first fragment, at least 1.
     pub first: FragmentNumber,
-    /// How many fragments; at least 1.
+    /// Number of fragments, at least 1.
     pub count: u16,
-    /// How long each is but the sample's last, in bytes; at least 1.
+    /// Size of each fragment except the last of the sample in bytes, at least 1.
     pub fragment_size: u16,
-    /// How long the whole sample is with the header of its CDR, in bytes. Nothing was reserved for it.
+    /// Size of the complete sample including its CDR header in bytes. No memory was allocated for it.
     pub sample_size: u32,
-    /// Exactly these fragments' bytes: they begin at `(first - 1) * fragment_size` of the sample.
+    /// Exactly the bytes of these fragments, which start at `(first - 1) * fragment_size` of the sample.
     pub payload: Bytes,
     /// The sample is only a key.
     pub key_only: bool,
 }
 
 impl DataFrag {
-    /// Where the payload begins in its sample, in bytes.
+    /// Returns the offset of the payload in its sample in bytes.
     pub fn offset(&self) -> usize {
-        // At most the length of the sample, as read; what is written is ours.
+        // At most the size of the sample if received; otherwise written by us.
         (u64::from(self.first.saturating_sub(1)) * u64::from(self.fragment_size)) as usize
     }
 }
 
-/// Which samples a writer has (8.3.7.5).
+/// The samples that a writer has (8.3.7.5).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Heartbeat {
-    /// For which reader; UNKNOWN: all that match.
+    /// Destination reader; UNKNOWN: all matched readers.
     pub reader: EntityId,
-    /// Of which writer.
+    /// Sending writer.
     pub writer: EntityId,
-    /// The first sample that it still has; at least 1.
+    /// First available sample, at least 1.
     pub first: SequenceNumber,
-    /// The last one; `first - 1` where it has none.
+    /// Last available sample; `first - 1` if there is none.
     pub last: SequenceNumber,
-    /// Grows with every one; a reader passes over those that it has had.
+    /// Increases with each heartbeat; a reader ignores those that it has already received.
     pub count: u32,
-    /// It need not be answered.
+    /// No response is required.
     pub is_final: bool,
-    /// The writer says that it is alive.
+    /// The writer asserts its liveliness.
     pub liveliness: bool,
 }
 
-/// Which fragments of a sample a writer has (8.3.7.6).
+/// The fragments of a sample that a writer has (8.3.7.6).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct HeartbeatFrag {
-    /// For which reader; UNKNOWN: all that match.
+    /// Destination reader; UNKNOWN: all matched readers.
     pub reader: EntityId,
-    /// Of which writer.
+    /// Sending writer.
     pub writer: EntityId,
-    /// The sample's number; at least 1.
+    /// Sequence number of the sample, at least 1.
     pub number: SequenceNumber,
-    /// It has all from 1 to this one; at least 1.
+    /// Last available fragment, at least 1; all earlier ones are available.
     pub last: FragmentNumber,
-    /// Grows with every one.
+    /// Increases with each submessage of this kind.
     pub count: u32,
 }
 
-/// Which samples a reader has and which it misses (8.3.7.1).
+/// The samples that a reader has received and misses (8.3.7.1).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AckNack {
-    /// Whose it is.
+    /// Sending reader.
     pub reader: EntityId,
-    /// For which writer.
+    /// Destination writer.
     pub writer: EntityId,
-    /// All before the base have come; those in the set are asked for. Base 0 has a reader that has heard nothing yet.
+    /// All numbers before the base have been received; those in the set are requested. A reader that has received
+    /// nothing yet sends a base of 0.
     pub set: SequenceSet,
-    /// Grows with every one.
+    /// Increases with each submessage of this kind.
     pub count: u32,
-    /// It need not be answered with a heartbeat.
+    /// No heartbeat is required in response.
     pub is_final: bool,
 }
 
-/// Which fragments of a sample a reader misses (8.3.7.10).
+/// The fragments of a sample that a reader misses (8.3.7.10).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NackFrag {
-    /// Whose it is.
+    /// Sending reader.
     pub reader: EntityId,
-    /// For which writer.
+    /// Destination writer.
     pub writer: EntityId,
-    /// The sample's number; at least 1.
+    /// Sequence number of the sample, at least 1.
     pub number: SequenceNumber,
-    /// Those that are asked for; the base is at least 1.
+    /// Requested fragments; the base is at least 1.
     pub set: FragmentSet,
-    /// Grows with every one.
+    /// Increases with each submessage of this kind.
     pub count: u32,
 }
 
-/// Which samples a reader need not wait for (8.3.7.4): those from `start` up to the set's base, and those in the set.
-/// From `start` to the base it may be any number of samples.
+/// Samples that a reader need not wait for (8.3.7.4): those from `start` up to the base of the set, which may be any
+/// number of samples, and those in the set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Gap {
-    /// For which reader; UNKNOWN: all that match.
+    /// Destination reader; UNKNOWN: all matched readers.
     pub reader: EntityId,
-    /// Of which writer.
+    /// Sending writer.
     pub writer: EntityId,
-    /// The first one; at least 1.
+    /// First number, at least 1.
     pub start: SequenceNumber,
-    /// Further ones; its base, at least 1, is behind the last one of those from `start` on.
+    /// Further numbers; the base, at least 1, follows the last number of the range from `start`.
     pub set: SequenceSet,
 }
 
-/// What a sample tells of itself before its payload (9.6.4), as far as anybody here asks.
+/// Inline QoS of a sample (9.6.4), as far as it is used here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InlineQos {
-    /// The request that a reply answers, or by which a request wants to be answered.
+    /// The request that a reply answers, or the identity with which a request wants to be answered.
     pub related: Option<SampleIdentity>,
-    /// What has become of its instance: [`Self::DISPOSED`] and [`Self::UNREGISTERED`]; 0: it is alive.
+    /// Status of the instance: [`Self::DISPOSED`] and [`Self::UNREGISTERED`]; 0: alive.
     pub status: u32,
-    /// Its instance. Of what tells of participants and ends, that is their GUID.
+    /// Key hash of the instance. For discovery samples it is the GUID of the participant or endpoint.
     pub key_hash: Option<[u8; 16]>,
 }
 
 impl InlineQos {
-    /// The instance is no more.
+    /// The instance was disposed of.
     pub const DISPOSED: u32 = 1;
-    /// The writer will write of the instance no more.
+    /// The writer will not write the instance any more.
     pub const UNREGISTERED: u32 = 2;
 
-    /// Whether it says that the instance is no more, or that nobody will write of it any more.
+    /// Returns whether the instance was disposed of or unregistered.
     pub fn is_gone(&self) -> bool {
         self.status & (Self::DISPOSED | Self::UNREGISTERED) != 0
     }

@@ -1,8 +1,8 @@
-//! One writer of ours: what it keeps, and how far each matched reader is (8.4.7 to 8.4.9).
+//! A local writer: its history, and the progress of each matched reader (8.4.7 to 8.4.9).
 //!
 //! ```text
-//!   publish ─▶ history ─▶ one item for each address ─▶ path ─▶ DATA, or DATA_FRAG one by one
-//!   ACKNACK ─▶ acknowledged │ asked for again ─▶ items for that reader alone │ gone ─▶ GAP
+//!   publish ─▶ history ─▶ one item per address ─▶ path ─▶ DATA, or DATA_FRAG one by one
+//!   ACKNACK ─▶ acknowledged │ requested again ─▶ items for that reader only │ dropped ─▶ GAP
 //! ```
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -14,98 +14,100 @@ use bytes::Bytes;
 
 use crate::discovery::EndpointData;
 use crate::fragments::{self, FRAGMENT};
-use crate::qos::{Durability, History, Reliability};
+use crate::qos::{DurabilityKind, HistoryKind, ReliabilityKind};
 use crate::sequence::{FragmentNumber, FragmentSet, SequenceNumber, SequenceSet};
 use crate::time::WireTime;
 use crate::{EntityId, Guid, GuidPrefix, SampleIdentity};
 
-/// While a reader has not acknowledged everything it is asked so often whether it has.
+/// Heartbeat interval while a reader has not acknowledged everything.
 const HEARTBEAT: Duration = Duration::from_millis(100);
-/// A reader that has not shown yet that it knows this writer is asked so often; each time the pause doubles.
+/// First heartbeat interval for a reader that has not shown that it knows this writer; the interval doubles each time.
 const FIRST_HEARTBEAT: Duration = Duration::from_millis(10);
-/// Beyond this many bytes the oldest samples are given up, whatever the depth says, except the newest one and those that were begun.
+/// Maximum size of the history in bytes. Beyond it the oldest samples are dropped regardless of the depth, except the
+/// newest one and those that were started.
 const MOST_BYTES: usize = 64 << 20;
 
-/// No further sample in fragments is begun to a reader that has so many bytes of them to acknowledge: it is repaired first, and what
-/// is replaced meanwhile was never begun.
+/// Unacknowledged bytes of fragmented samples beyond which no further one is started for a reader: it is repaired
+/// first, and samples replaced meanwhile were never started.
 const WINDOW: usize = 8 << 20;
 
-/// A sample that is kept.
+/// A sample in the history.
 #[derive(Debug, Clone)]
-pub(crate) struct Change {
-    /// CDR with its header; only its key where something is withdrawn.
+pub(crate) struct CacheChange {
+    /// CDR with its header; only the key for a disposal.
     pub payload: Bytes,
     pub related: Option<SampleIdentity>,
     pub written: WireTime,
-    /// What is withdrawn by this: 0, or the bits of `PID_STATUS_INFO`.
+    /// Status: 0, or the bits of `PID_STATUS_INFO` for a disposal.
     pub status: u32,
     pub key: Option<[u8; 16]>,
 }
 
-/// What is to be sent of one sample, to one address.
+/// A part of a sample to be sent to one address.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Item {
+pub(crate) struct SendItem {
     pub writer: EntityId,
     /// One reader, or `UNKNOWN` for all at the address.
     pub reader: EntityId,
     pub prefix: GuidPrefix,
     pub number: SequenceNumber,
-    /// Of a sample in fragments, the next one to send and the last one; 0 and 0 where it is sent whole.
+    /// The next and the last fragment to send; both 0 for an unfragmented sample.
     pub next: FragmentNumber,
     pub last: FragmentNumber,
 }
 
-/// What a writer wants sent.
+/// Send requests of a writer.
 #[derive(Debug, Default)]
-pub(crate) struct Wanted {
-    /// Samples, in order, each to its address.
-    pub items: Vec<(SocketAddr, Item)>,
-    /// Heartbeats: to which reader, from which number on, whether an answer is wanted.
+pub(crate) struct SendRequests {
+    /// Samples in order, each with its address.
+    pub items: Vec<(SocketAddr, SendItem)>,
+    /// Heartbeats: reader, first number, and whether a response is required.
     pub heartbeats: Vec<(SocketAddr, Guid, SequenceNumber, bool)>,
-    /// Numbers that will never come, for one reader: the first one, and the one after the last. Each run is told by itself, without the set that a
-    /// GAP can have: Fast DDS 2.14.5 looks for what it has of those in the set at the set's base, and where that is a sample of which it has
-    /// fragments, it forgets that by half (`StatefulReader::processGapMsg`). Whoever takes from that reader then tries for ever.
+    /// Numbers that will never be sent, for one reader: the first, and the one after the last. Each range is sent
+    /// separately, without the set of a GAP: for a number in the set, Fast DDS 2.14.5 looks up the sample at the set's
+    /// base, and if it has fragments of that, forgets it partially (`StatefulReader::processGapMsg`). Takes from that
+    /// reader then never return.
     pub gaps: Vec<(SocketAddr, Guid, SequenceNumber, SequenceNumber)>,
 }
 
-/// How far one reader is.
+/// Progress of one reader.
 #[derive(Debug)]
 struct ReaderProxy {
     data: Arc<EndpointData>,
     address: SocketAddr,
     reliable: bool,
-    /// Numbers up to this one do not concern it.
+    /// Numbers up to this one are not relevant to it.
     irrelevant: SequenceNumber,
-    /// It has all up to this one.
+    /// It has received all numbers up to this one.
     acknowledged: SequenceNumber,
-    /// It has answered: it knows this writer.
+    /// It has answered, so it knows this writer.
     heard: bool,
-    /// Asked when it has not answered or acknowledged until then.
+    /// Time of the next heartbeat, unless it answers or acknowledges before.
     ask_at: Option<Instant>,
     pause: Duration,
-    acknacks: Counts,
-    nack_frags: Counts,
+    acknacks: CountFilter,
+    nack_frags: CountFilter,
 }
 
 impl ReaderProxy {
-    /// Whether it has not acknowledged a sample that it is to acknowledge.
-    fn misses(&self, number: SequenceNumber) -> bool {
+    /// Returns whether it still has to acknowledge a sample.
+    fn is_missing(&self, number: SequenceNumber) -> bool {
         self.reliable && self.acknowledged < number && self.irrelevant < number
     }
 }
 
-/// The state of one writer.
+/// State of one writer.
 #[derive(Debug)]
 pub(crate) struct WriterState {
     pub own: EndpointData,
-    history: BTreeMap<SequenceNumber, Change>,
-    /// Samples of which reliable readers have been sent fragments.
+    history: BTreeMap<SequenceNumber, CacheChange>,
+    /// Samples of which fragments were sent to reliable readers.
     begun: BTreeSet<SequenceNumber>,
     bytes: usize,
     last: SequenceNumber,
     proxies: Vec<ReaderProxy>,
     heartbeats: u32,
-    /// Samples that were given up before every reliable reader had acknowledged them.
+    /// Number of samples dropped before every reliable reader had acknowledged them.
     pub dropped: u64,
 }
 
@@ -124,25 +126,25 @@ impl WriterState {
     }
 
     pub fn is_reliable(&self) -> bool {
-        self.own.qos.reliability == Reliability::Reliable
+        self.own.qos.reliability == ReliabilityKind::Reliable
     }
 
-    fn keeps_for_newcomers(&self) -> bool {
-        self.own.qos.durability >= Durability::TransientLocal
+    fn keeps_history(&self) -> bool {
+        self.own.qos.durability >= DurabilityKind::TransientLocal
     }
 
     fn depth(&self) -> usize {
         match self.own.qos.history {
-            History::KeepLast(depth) => depth.max(1) as usize,
-            History::KeepAll => usize::MAX,
+            HistoryKind::KeepLast(depth) => depth.max(1) as usize,
+            HistoryKind::KeepAll => usize::MAX,
         }
     }
 
-    pub fn change(&self, number: SequenceNumber) -> Option<&Change> {
+    pub fn change(&self, number: SequenceNumber) -> Option<&CacheChange> {
         self.history.get(&number)
     }
 
-    /// The first number that is kept; the one after the last where none is.
+    /// Returns the first number in the history, or the one after the last if it is empty.
     pub fn first(&self) -> SequenceNumber {
         self.history
             .keys()
@@ -155,17 +157,22 @@ impl WriterState {
         self.last
     }
 
-    /// Takes the next count for a heartbeat.
+    /// Returns the next heartbeat count.
     pub fn count_heartbeat(&mut self) -> u32 {
         self.heartbeats = self.heartbeats.wrapping_add(1);
         self.heartbeats
     }
 
-    /// Keeps a sample and wants it sent to everybody.
-    pub fn publish(&mut self, now: Instant, change: Change, wanted: &mut Wanted) -> SequenceNumber {
+    /// Adds a sample to the history and requests it to be sent to all readers.
+    pub fn publish(
+        &mut self,
+        now: Instant,
+        change: CacheChange,
+        wanted: &mut SendRequests,
+    ) -> SequenceNumber {
         self.last = self.last.next();
         let number = self.last;
-        let needed = self.keeps_for_newcomers() || !self.proxies.is_empty();
+        let needed = self.keeps_history() || !self.proxies.is_empty();
         if !needed {
             return number;
         }
@@ -180,7 +187,7 @@ impl WriterState {
                 proxy.ask_at = Some(now + HEARTBEAT);
             }
             if told.insert(proxy.address) {
-                let item = item(
+                let item = new_item(
                     &self.own,
                     EntityId::UNKNOWN,
                     proxy.data.guid.prefix,
@@ -193,7 +200,7 @@ impl WriterState {
         number
     }
 
-    /// Takes a sample back that is of no use to newcomers any more: an announcement that a later one replaces.
+    /// Removes a sample that is of no use to new readers: an announcement that was replaced by a later one.
     pub fn forget(&mut self, number: SequenceNumber) {
         self.begun.remove(&number);
         if let Some(change) = self.history.remove(&number) {
@@ -201,57 +208,58 @@ impl WriterState {
         }
     }
 
-    /// Fragments of a sample are sent to an address. It is kept beyond the depth until whoever is to acknowledge it there has: part
-    /// of it may be lost on the way, and a reader that is told that there is no more of it can come to a standstill (Fast DDS 2.14).
-    pub fn begun(&mut self, number: SequenceNumber, address: SocketAddr) {
-        if self.asks(address) && self.history.contains_key(&number) {
+    /// Notes that fragments of a sample are being sent to an address. The sample is kept beyond the depth until the
+    /// reliable readers there have received it: fragments may be lost, and a reader that gets a GAP for a partial
+    /// sample may stall (Fast DDS 2.14).
+    pub fn mark_started(&mut self, number: SequenceNumber, address: SocketAddr) {
+        if self.needs_ack(address) && self.history.contains_key(&number) {
             self.begun.insert(number);
         }
     }
 
-    pub fn is_begun(&self, number: SequenceNumber) -> bool {
+    pub fn is_started(&self, number: SequenceNumber) -> bool {
         self.begun.contains(&number)
     }
 
-    /// Whether those at an address have as much to acknowledge as they may.
+    /// Returns whether the readers at an address have as many unacknowledged bytes as allowed.
     pub fn is_window_full(&self, address: SocketAddr) -> bool {
         let missed = |number: &SequenceNumber| {
             let mut there = self.proxies.iter().filter(|it| it.address == address);
-            there.any(|proxy| proxy.misses(*number))
+            there.any(|proxy| proxy.is_missing(*number))
         };
         let missed = self.begun.iter().filter(|number| missed(number));
         let bytes = missed.filter_map(|number| self.history.get(number));
         bytes.map(|change| change.payload.len()).sum::<usize>() >= WINDOW
     }
 
-    /// Gives up what is beyond the depth, and beyond the memory.
+    /// Drops samples beyond the depth and the memory limit.
     fn trim(&mut self) {
         while self.history.len() > self.depth().max(1) || self.bytes > MOST_BYTES {
-            let Some(number) = self.oldest_to_give_up() else {
+            let Some(number) = self.oldest_droppable() else {
                 break;
             };
-            self.give_up(number);
+            self.drop_sample(number);
         }
     }
 
-    fn oldest_to_give_up(&self) -> Option<SequenceNumber> {
+    fn oldest_droppable(&self) -> Option<SequenceNumber> {
         let waits = |number: &SequenceNumber| {
-            let misses = |proxy: &ReaderProxy| proxy.misses(*number);
+            let misses = |proxy: &ReaderProxy| proxy.is_missing(*number);
             self.begun.contains(number) && self.proxies.iter().any(misses)
         };
         let mut given_up = self.history.keys().filter(|number| !waits(number));
         given_up.find(|number| **number != self.last).copied()
     }
 
-    fn give_up(&mut self, number: SequenceNumber) {
-        let missed = self.proxies.iter().any(|proxy| proxy.misses(number));
+    fn drop_sample(&mut self, number: SequenceNumber) {
+        let missed = self.proxies.iter().any(|proxy| proxy.is_missing(number));
         self.dropped += u64::from(missed);
         self.forget(number);
     }
 
-    /// Lets go of what every reader has, unless newcomers are to be given it.
-    fn let_go(&mut self) {
-        if self.keeps_for_newcomers() {
+    /// Removes samples that every reader has received, unless new readers are to receive them.
+    fn release_acknowledged(&mut self) {
+        if self.keeps_history() {
             self.trim();
             return;
         }
@@ -275,18 +283,18 @@ impl WriterState {
         }
     }
 
-    /// A reader matches. A reliable one is asked at once; one that wants to is given what is kept.
-    pub fn matched(
+    /// Matches a reader. A reliable one gets a heartbeat immediately; one that requests it gets the history.
+    pub fn add_reader(
         &mut self,
         now: Instant,
         data: Arc<EndpointData>,
         address: SocketAddr,
-        wanted: &mut Wanted,
+        wanted: &mut SendRequests,
     ) {
         let guid = data.guid;
-        self.unmatched(guid);
-        let reliable = self.is_reliable() && data.qos.reliability == Reliability::Reliable;
-        let all = self.keeps_for_newcomers() && data.qos.durability >= Durability::TransientLocal;
+        self.remove_reader(guid);
+        let reliable = self.is_reliable() && data.qos.reliability == ReliabilityKind::Reliable;
+        let all = self.keeps_history() && data.qos.durability >= DurabilityKind::TransientLocal;
         let irrelevant = if all { SequenceNumber(0) } else { self.last };
         self.proxies.push(ReaderProxy {
             data,
@@ -297,12 +305,12 @@ impl WriterState {
             heard: false,
             ask_at: reliable.then_some(now + FIRST_HEARTBEAT),
             pause: FIRST_HEARTBEAT,
-            acknacks: Counts::default(),
-            nack_frags: Counts::default(),
+            acknacks: CountFilter::default(),
+            nack_frags: CountFilter::default(),
         });
         if all {
             for (number, change) in &self.history {
-                let item = item(
+                let item = new_item(
                     &self.own,
                     guid.entity,
                     guid.prefix,
@@ -318,37 +326,37 @@ impl WriterState {
         }
     }
 
-    /// A reader has gone; whether it was matched.
-    pub fn unmatched(&mut self, reader: Guid) -> bool {
+    /// Removes a reader; returns whether it was matched.
+    pub fn remove_reader(&mut self, reader: Guid) -> bool {
         let before = self.proxies.len();
         self.proxies.retain(|proxy| proxy.data.guid != reader);
-        self.let_go();
+        self.release_acknowledged();
         before != self.proxies.len()
     }
 
-    /// The readers that are matched, in the order in which they came, each with whether it has shown that it knows this writer.
+    /// Returns the matched readers in the order of discovery, each with whether it has confirmed the match.
     pub fn readers(&self) -> impl Iterator<Item = (&Arc<EndpointData>, bool)> {
         self.proxies
             .iter()
             .map(|proxy| (&proxy.data, proxy.heard || !proxy.reliable))
     }
 
-    /// Up to which number a reader has all; none where it is not matched.
-    pub fn acknowledged(&self, reader: Guid) -> Option<SequenceNumber> {
+    /// Returns the number up to which a reader has received everything; `None` if it is not matched.
+    pub fn last_acknowledged(&self, reader: Guid) -> Option<SequenceNumber> {
         let mut proxies = self.proxies.iter();
         let proxy = proxies.find(|proxy| proxy.data.guid == reader)?;
         Some(proxy.acknowledged)
     }
 
-    /// A reader tells what it has and what it misses; true where that shows for the first time that it knows this writer.
-    pub fn acknack(
+    /// Handles an acknowledgement. Returns whether it shows for the first time that the reader knows this writer.
+    pub fn on_acknack(
         &mut self,
         now: Instant,
         reader: Guid,
         set: &SequenceSet,
         count: u32,
         is_final: bool,
-        wanted: &mut Wanted,
+        wanted: &mut SendRequests,
     ) -> bool {
         let (first, last) = (self.first(), self.last);
         let Some(proxy) = self
@@ -358,7 +366,7 @@ impl WriterState {
         else {
             return false;
         };
-        if !proxy.reliable || !proxy.acknacks.takes(now, count) {
+        if !proxy.reliable || !proxy.acknacks.accept(now, count) {
             return false;
         }
         let known = std::mem::replace(&mut proxy.heard, true);
@@ -372,7 +380,7 @@ impl WriterState {
                 .filter(|_| number > proxy.irrelevant)
             {
                 Some(change) => {
-                    let item = item(
+                    let item = new_item(
                         &self.own,
                         reader.entity,
                         reader.prefix,
@@ -397,19 +405,19 @@ impl WriterState {
         }
         proxy.pause = HEARTBEAT;
         proxy.ask_at = (proxy.acknowledged < last).then_some(now + HEARTBEAT);
-        self.let_go();
+        self.release_acknowledged();
         !known
     }
 
-    /// A reader misses fragments of a sample.
-    pub fn nack_frag(
+    /// Handles a request for fragments of a sample.
+    pub fn on_nack_frag(
         &mut self,
         now: Instant,
         reader: Guid,
         number: SequenceNumber,
         set: &FragmentSet,
         count: u32,
-        wanted: &mut Wanted,
+        wanted: &mut SendRequests,
     ) {
         let Some(proxy) = self
             .proxies
@@ -418,7 +426,7 @@ impl WriterState {
         else {
             return;
         };
-        if !proxy.reliable || !proxy.nack_frags.takes(now, count) {
+        if !proxy.reliable || !proxy.nack_frags.accept(now, count) {
             return;
         }
         let Some(change) = self.history.get(&number) else {
@@ -427,7 +435,7 @@ impl WriterState {
                 .push((proxy.address, reader, number, number.next()));
             return;
         };
-        let total = fragments::count(change.payload.len());
+        let total = fragments::fragment_count(change.payload.len());
         let mut runs: VecDeque<(FragmentNumber, FragmentNumber)> = VecDeque::new();
         for fragment in set.iter().filter(|fragment| (1..=total).contains(fragment)) {
             match runs.back_mut() {
@@ -436,7 +444,7 @@ impl WriterState {
             }
         }
         for (next, last) in runs {
-            let item = Item {
+            let item = SendItem {
                 writer: self.own.guid.entity,
                 reader: reader.entity,
                 prefix: reader.prefix,
@@ -448,8 +456,8 @@ impl WriterState {
         }
     }
 
-    /// Asks the readers that have not acknowledged everything; the time when this is to be called again.
-    pub fn tick(&mut self, now: Instant, wanted: &mut Wanted) -> Option<Instant> {
+    /// Requests heartbeats for readers that have not acknowledged everything; returns the time of the next call.
+    pub fn tick(&mut self, now: Instant, wanted: &mut SendRequests) -> Option<Instant> {
         let (first, last) = (self.first(), self.last);
         for proxy in &mut self.proxies {
             let Some(at) = proxy.ask_at.filter(|at| *at <= now) else {
@@ -470,11 +478,11 @@ impl WriterState {
             });
             proxy.ask_at = Some(at.max(now) + proxy.pause);
         }
-        self.ask_at()
+        self.next_heartbeat_at()
     }
 
-    /// Asks a reader of this participant that has answered before; whether there is one.
-    pub fn ask(&self, participant: GuidPrefix, wanted: &mut Wanted) -> bool {
+    /// Requests a heartbeat for a reader of this participant that has answered before; returns whether there is one.
+    pub fn request_ack(&self, participant: GuidPrefix, wanted: &mut SendRequests) -> bool {
         let mut proxies = self.proxies.iter();
         let Some(proxy) = proxies
             .find(|proxy| proxy.data.guid.prefix == participant && proxy.reliable && proxy.heard)
@@ -488,19 +496,19 @@ impl WriterState {
         true
     }
 
-    /// When `tick` is to be called.
-    pub fn ask_at(&self) -> Option<Instant> {
+    /// Returns the time at which `tick` is to be called.
+    pub fn next_heartbeat_at(&self) -> Option<Instant> {
         self.proxies.iter().filter_map(|proxy| proxy.ask_at).min()
     }
 
-    /// Whether no reader waits for anything.
+    /// Returns whether all readers have received everything.
     pub fn is_settled(&self) -> bool {
         self.proxies
             .iter()
             .all(|proxy| !proxy.reliable || proxy.acknowledged >= self.last)
     }
 
-    /// From which number on a heartbeat to everybody at an address counts.
+    /// Returns the first number of a heartbeat for all readers at an address.
     pub fn relevant_from(&self, address: SocketAddr) -> SequenceNumber {
         let there = self.proxies.iter().filter(|proxy| proxy.address == address);
         let least = there
@@ -510,27 +518,27 @@ impl WriterState {
         self.first().max(least)
     }
 
-    /// Whether somebody at this address is to acknowledge.
-    pub fn asks(&self, address: SocketAddr) -> bool {
+    /// Returns whether a reader at this address must acknowledge.
+    pub fn needs_ack(&self, address: SocketAddr) -> bool {
         self.proxies
             .iter()
             .any(|proxy| proxy.address == address && proxy.reliable)
     }
 }
 
-fn item(
+fn new_item(
     own: &EndpointData,
     reader: EntityId,
     prefix: GuidPrefix,
     number: SequenceNumber,
     length: usize,
-) -> Item {
+) -> SendItem {
     let last = if length > FRAGMENT {
-        fragments::count(length)
+        fragments::fragment_count(length)
     } else {
         0
     };
-    Item {
+    SendItem {
         writer: own.guid.entity,
         reader,
         prefix,
@@ -540,20 +548,21 @@ fn item(
     }
 }
 
-/// The counts of what another end says again and again (8.3.8.1, 8.3.8.6): what comes twice, or late, is told by them.
+/// Filters out duplicate and late submessages by their counts (8.3.8.1, 8.3.8.6).
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Counts {
+pub(crate) struct CountFilter {
     last: Option<(u32, Instant)>,
 }
 
-/// Nothing is so late. Whoever has heard nothing of us for the time of its lease meets us anew, and counts anew.
+/// Time after which any count is accepted: a participant that has heard nothing of us for its lease duration discovers
+/// us anew and restarts its counts.
 const TOO_LATE: Duration = Duration::from_secs(3);
 
-impl Counts {
-    /// Whether what has this count is to be heeded.
-    pub fn takes(&mut self, now: Instant, count: u32) -> bool {
+impl CountFilter {
+    /// Returns whether a submessage with this count is to be processed, and if so records the count.
+    pub fn accept(&mut self, now: Instant, count: u32) -> bool {
         let heeded = self.last.is_none_or(|(before, at)| {
-            newer(count, before) || now.saturating_duration_since(at) > TOO_LATE
+            is_newer(count, before) || now.saturating_duration_since(at) > TOO_LATE
         });
         if heeded {
             self.last = Some((count, now));
@@ -562,7 +571,7 @@ impl Counts {
     }
 }
 
-/// Whether a count comes after another one, though counts begin anew.
-fn newer(count: u32, before: u32) -> bool {
+/// Returns whether a count is newer than another one, with wrap-around.
+fn is_newer(count: u32, before: u32) -> bool {
     count.wrapping_sub(before).wrapping_sub(1) < u32::MAX / 2
 }

@@ -1,4 +1,4 @@
-//! Participants of this process, on the loopback device of this machine.
+//! Participants of this process on the loopback device.
 
 use std::io;
 use std::net::SocketAddr;
@@ -10,18 +10,19 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use rtps::{
-    Config, Durability, EndpointQos, History, Participant, Place, Reliability, Sample, Sink, Topic,
+    Config, DurabilityKind, EndpointQos, HistoryKind, NetworkNamespace, Participant,
+    ReceivedSample, ReliabilityKind, Sink, TopicDescription,
 };
 use socket2::{Domain, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
 use tokio::sync::mpsc;
 
 /// The network namespace of this process.
-struct Here;
+struct TestNamespace;
 
 #[async_trait]
-impl Place for Here {
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+impl NetworkNamespace for TestNamespace {
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         let socket = Socket::new(Domain::IPV4, Type::DGRAM.nonblocking(), None)?;
         socket.set_reuse_address(shared)?;
         socket.set_recv_buffer_size(4 << 20)?;
@@ -29,51 +30,54 @@ impl Place for Here {
         UdpSocket::from_std(socket.into())
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+    async fn open_diagnostics(&self) -> io::Result<Option<OwnedFd>> {
         // AF_NETLINK and NETLINK_SOCK_DIAG.
         let socket = Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4)))?;
         Ok(Some(socket.into()))
     }
 }
 
-/// Passes samples on.
-struct Heard(mpsc::UnboundedSender<Sample>);
+/// Forwards samples to a channel.
+struct SampleForwarder(mpsc::UnboundedSender<ReceivedSample>);
 
-impl Sink for Heard {
-    fn sample(&self, sample: Sample) {
+impl Sink for SampleForwarder {
+    fn on_sample(&self, sample: ReceivedSample) {
         let _ = self.0.send(sample);
     }
 }
 
-fn heard() -> (Arc<Heard>, mpsc::UnboundedReceiver<Sample>) {
+fn sample_channel() -> (
+    Arc<SampleForwarder>,
+    mpsc::UnboundedReceiver<ReceivedSample>,
+) {
     let (sender, receiver) = mpsc::unbounded_channel();
-    (Arc::new(Heard(sender)), receiver)
+    (Arc::new(SampleForwarder(sender)), receiver)
 }
 
-/// A domain that no other test of this process uses.
+/// Returns a domain that no other test of this process uses.
 fn domain() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     100 + (std::process::id() % 16) as u16 * 8 + NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 async fn join(domain: u16) -> Participant {
-    Participant::join(Arc::new(Here), Config::new(domain, "test"))
+    Participant::join(Arc::new(TestNamespace), Config::new(domain, "test"))
         .await
         .expect("a participant")
 }
 
-fn topic(name: &str) -> Topic {
-    Topic {
+fn topic(name: &str) -> TopicDescription {
+    TopicDescription {
         name: format!("rt/{name}"),
         type_name: "std_msgs::msg::dds_::String_".into(),
         user_data: Bytes::new(),
     }
 }
 
-fn qos(reliability: Reliability, depth: u32) -> EndpointQos {
+fn qos(reliability: ReliabilityKind, depth: u32) -> EndpointQos {
     EndpointQos {
         reliability,
-        history: History::KeepLast(depth),
+        history: HistoryKind::KeepLast(depth),
         ..EndpointQos::default()
     }
 }
@@ -84,10 +88,10 @@ fn payload(mark: u8, length: usize) -> Bytes {
     bytes.into()
 }
 
-/// Long enough for everything here, also on a machine that has much else to do.
+/// Long enough for everything here, even on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-async fn next(samples: &mut mpsc::UnboundedReceiver<Sample>) -> Sample {
+async fn next(samples: &mut mpsc::UnboundedReceiver<ReceivedSample>) -> ReceivedSample {
     let next = tokio::time::timeout(PATIENCE, samples.recv()).await;
     next.expect("a sample in time")
         .expect("a reader that lives")
@@ -100,24 +104,24 @@ async fn a_participant_that_comes_later_is_heard() {
     let writer = early.writer(
         topic("chatter"),
         EndpointQos {
-            durability: Durability::TransientLocal,
-            ..qos(Reliability::Reliable, 5)
+            durability: DurabilityKind::TransientLocal,
+            ..qos(ReliabilityKind::Reliable, 5)
         },
     );
     writer.write(payload(1, 100));
     let late = join(domain).await;
-    let (sink, mut samples) = heard();
+    let (sink, mut samples) = sample_channel();
     let reader = late.reader(
         topic("chatter"),
         EndpointQos {
-            durability: Durability::TransientLocal,
-            ..qos(Reliability::Reliable, 5)
+            durability: DurabilityKind::TransientLocal,
+            ..qos(ReliabilityKind::Reliable, 5)
         },
         sink,
     );
     let sample = next(&mut samples).await;
     assert_eq!((sample.payload[4], sample.writer), (1, writer.guid()));
-    let mut ends = writer.ends();
+    let mut ends = writer.watch_matches();
     let confirmed = ends.wait_for(|ends| ends.confirmed == [reader.guid()]);
     tokio::time::timeout(PATIENCE, confirmed)
         .await
@@ -135,12 +139,12 @@ async fn a_participant_that_comes_later_is_heard() {
 async fn large_samples_come_whole_both_ways() {
     let domain = domain();
     let (one, other) = (join(domain).await, join(domain).await);
-    for reliability in [Reliability::Reliable, Reliability::BestEffort] {
+    for reliability in [ReliabilityKind::Reliable, ReliabilityKind::BestEffort] {
         let name = format!("image_{reliability}");
-        let (sink, mut samples) = heard();
+        let (sink, mut samples) = sample_channel();
         let reader = other.reader(topic(&name), qos(reliability, 5), sink);
         let writer = one.writer(topic(&name), qos(reliability, 5));
-        let (mut ends, mut back) = (writer.ends(), reader.ends());
+        let (mut ends, mut back) = (writer.watch_matches(), reader.watch_matches());
         tokio::time::timeout(PATIENCE, ends.wait_for(|ends| ends.confirmed.len() == 1))
             .await
             .expect("in time")
@@ -162,13 +166,13 @@ async fn large_samples_come_whole_both_ways() {
 async fn a_receiver_with_a_small_buffer_loses_nothing() {
     let domain = domain();
     let sender = join(domain).await;
-    let receiver = Participant::join(Arc::new(Small), Config::new(domain, "small"))
+    let receiver = Participant::join(Arc::new(SmallBufferNamespace), Config::new(domain, "small"))
         .await
         .expect("a participant");
-    let (sink, mut samples) = heard();
-    let reader = receiver.reader(topic("image"), qos(Reliability::BestEffort, 5), sink);
-    let writer = sender.writer(topic("image"), qos(Reliability::BestEffort, 5));
-    let (mut ends, mut back) = (writer.ends(), reader.ends());
+    let (sink, mut samples) = sample_channel();
+    let reader = receiver.reader(topic("image"), qos(ReliabilityKind::BestEffort, 5), sink);
+    let writer = sender.writer(topic("image"), qos(ReliabilityKind::BestEffort, 5));
+    let (mut ends, mut back) = (writer.watch_matches(), reader.watch_matches());
     tokio::time::timeout(PATIENCE, ends.wait_for(|ends| ends.matched.len() == 1))
         .await
         .expect("in time")
@@ -185,13 +189,13 @@ async fn a_receiver_with_a_small_buffer_loses_nothing() {
     println!("20 samples of 0.9 MB in {:?}", begin.elapsed());
 }
 
-/// The same place, where receivers have the kernel's default buffer.
-struct Small;
+/// This process's network namespace, with the kernel's default receive buffers.
+struct SmallBufferNamespace;
 
 #[async_trait]
-impl Place for Small {
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        let socket = Here.datagrams(address, shared).await?;
+impl NetworkNamespace for SmallBufferNamespace {
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        let socket = TestNamespace.bind_udp(address, shared).await?;
         socket2::SockRef::from(&socket).set_recv_buffer_size(106_496)?;
         Ok(socket)
     }

@@ -13,22 +13,22 @@ use oci_spec::runtime::{
 
 use crate::container::{ContainerSpec, Profile};
 use crate::quotas::Quotas;
-use crate::rootfs::{COMPILE_USER, Staged};
+use crate::rootfs::{COMPILE_USER, StagedRoot};
 use crate::seccomp;
 
-/// Open files of one process; more only slows down programs that close every number they might have open.
+/// Limit of open files per process; a higher one only slows down programs that close all possible descriptors.
 const OPEN_FILES: u64 = 16_384;
 
-/// Signals that wait for processes of one user of a container; each of its timers counts as one, too.
+/// Limit of pending signals per user of a container; each of its timers counts as one, too.
 pub const PENDING_SIGNALS: u64 = 4096;
 
-/// Bytes of POSIX message queues of one user of a container: what the kernel gives a user by default.
+/// Limit of bytes in POSIX message queues per user of a container: the kernel's default.
 pub const MESSAGE_QUEUES: u64 = 819_200;
 
-/// Instances of inotify of one user of a container: what the kernel gives a user by default.
+/// Limit of inotify instances per user of a container: the kernel's default.
 pub const INOTIFY_INSTANCES: u64 = 128;
 
-/// Pseudoterminals of one container; the host has some thousands for all.
+/// Limit of pseudoterminals per container; the host has some thousands in total.
 pub const TERMINALS: u64 = 64;
 
 const MASKED: [&str; 9] = [
@@ -51,17 +51,17 @@ const READ_ONLY: [&str; 5] = [
     "/proc/sysrq-trigger",
 ];
 
-/// The configuration of the container whose root and volumes are staged. There is no network namespace in it: the creating
-/// process is in the servant's already and the container inherits it. Limits are not in it either: the cgroup is
-/// made, set and read back before. The user namespace is there already, too (see [`crate::idmap::user_namespace`]).
+/// Builds the configuration of a container whose root and volumes are staged. It has no network namespace: the creating
+/// process is in the servant's already, and the container inherits it. It has no limits: the cgroup is created, set and
+/// read back before. The user namespace exists already, too (see [`crate::idmap::create_user_namespace`]).
 pub fn config(
     spec: &ContainerSpec,
-    staged: &Staged,
+    staged: &StagedRoot,
     quotas: &Quotas,
 ) -> Result<OciSpec, OciSpecError> {
     let user = LinuxNamespaceBuilder::default()
         .typ(LinuxNamespaceType::User)
-        // Open in the process that makes the container, and in those that it forks for that.
+        // This descriptor is open in the process that creates the container, and in those it forks for that.
         .path(format!(
             "/proc/self/fd/{}",
             staged.user_namespace.as_raw_fd()
@@ -81,21 +81,21 @@ pub fn config(
         .collect::<Result<Vec<_>, _>>()?;
     let mut linux = LinuxBuilder::default()
         .namespaces(namespaces)
-        // Written by whoever makes the container, who may in its user namespace. Where the host allows each user more, a
-        // container has no more for that.
+        // Written by the process that creates the container, which may do so in its user namespace. A container has no
+        // more than this even if the host allows more per user.
         .sysctl(std::collections::HashMap::from([(
             "user.max_inotify_instances".to_owned(),
             INOTIFY_INSTANCES.to_string(),
         )]))
-        // libcontainer sees no cgroups at all (see rootfs.rs). If ever it did, it must not find anybody here: with an
-        // empty path its cleanup would kill every process of the cgroups that its caller is in, up to the host's.
+        // libcontainer sees no cgroups at all (see rootfs.rs). If it ever did, it must find no process here: with an
+        // empty path its cleanup would kill every process of its caller's cgroups, up to the host's.
         .cgroups_path(Path::new("/cloudroid-unused").join(&spec.id))
-        .seccomp(seccomp::profile(spec.profile)?)
+        .seccomp(seccomp::build_profile(spec.profile)?)
         .masked_paths(MASKED.map(str::to_owned).to_vec())
         .readonly_paths(READ_ONLY.map(str::to_owned).to_vec())
         .build()?;
-    // The builder's own default asks for a device filter, which takes a cgroup to set it in. There is no device in the container but
-    // those that are bound into it, and without CAP_MKNOD on the host none can be made.
+    // The builder's default asks for a device filter, which needs a cgroup. The container has no devices but those
+    // bound into it, and without CAP_MKNOD on the host none can be created.
     linux.set_resources(None);
     SpecBuilder::default()
         .version("1.0.2")
@@ -112,10 +112,9 @@ pub fn config(
         .build()
 }
 
-/// Whom the kernel ends first when the host runs out of memory. The daemon and its shims may be protected by their unit
-/// (OOMScoreAdjust), and that is inherited: what robots run is as any other process of the host, and a build, which can be
-/// made again, goes before.
-/// Who was made easier to end stays so: to go below takes a capability that we may lack.
+/// Returns the OOM score adjustment. The daemon and its shims may be protected by their unit (OOMScoreAdjust), and that
+/// is inherited: so servants are reset to that of ordinary processes, and builds, which can be repeated, are killed
+/// first. A score that was raised stays: lowering it needs a capability that may be missing.
 fn oom_score(profile: Profile) -> i32 {
     let inherited = std::fs::read_to_string("/proc/self/oom_score_adj").unwrap_or_default();
     let least = match profile {
@@ -183,7 +182,8 @@ fn process(spec: &ContainerSpec) -> Result<Process, OciSpecError> {
         .build()
 }
 
-/// At most `wanted`, never more than we have: raising a hard limit takes a capability that we may lack.
+/// Builds a limit of at most `wanted`, and at most our own: raising a hard limit needs a capability that may be
+/// missing.
 fn rlimit(
     kind: PosixRlimitType,
     resource: Resource,
@@ -202,7 +202,7 @@ fn mounts(
     volumes: &[PathBuf],
     quotas: &Quotas,
 ) -> Result<Vec<Mount>, OciSpecError> {
-    let scratch = quotas.scratch(spec.limits.memory);
+    let scratch = quotas.scratch_bytes(spec.limits.memory);
     let safe = ["nosuid", "nodev"];
     let tmpfs = |target: &str, mode: &str, size: u64, extra: &[&str]| {
         let mut options: Vec<String> = safe
@@ -296,7 +296,7 @@ fn mount(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spec::Limits;
+    use crate::spec::ResourceLimits;
 
     fn spec(profile: Profile) -> ContainerSpec {
         ContainerSpec {
@@ -304,9 +304,9 @@ mod tests {
             layers: vec![],
             writable: None,
             profile,
-            limits: Limits {
+            limits: ResourceLimits {
                 memory: Some(64 << 20),
-                ..Limits::default()
+                ..ResourceLimits::default()
             },
             environment: Default::default(),
             nodes: vec![],
@@ -321,7 +321,7 @@ mod tests {
         serde_json::to_value(
             config(
                 &spec(profile),
-                &Staged {
+                &StagedRoot {
                     root: "/r".into(),
                     volumes: vec![],
                     user_namespace: std::fs::File::open("/proc/self/ns/user").unwrap().into(),

@@ -1,16 +1,16 @@
-//! Limits, usage and the certain end of a servant, by control groups of whichever version the host offers.
+//! Limits, usage and reliable termination of a servant, by control groups of the version that the host offers.
 //!
 //! ```text
-//!  v2   PARENT/                  delegated to us, holds no process itself
+//!  v2   PARENT/                  delegated to us, contains no process itself
 //!         ID/                    one servant: its init and its nodes
 //!         ID.shim/               its shim
-//!  v1   OWN/cloudroid/ID/        in each hierarchy that we use, below the cgroup we are in ourselves there
+//!  v1   OWN/cloudroid/ID/        in each hierarchy used, below our own cgroup there
 //!       OWN/cloudroid/ID.shim/   in those of processor time and memory
 //! ```
-//! A servant drives its shim (it asks the ROS Master there, and prints), so the shim has limits, too. They are not the
-//! servant's own: the shim must be able to say that a servant ran out of memory.
+//! A servant can make its shim work (it calls the ROS Master there, and prints), so the shim has limits, too. They are
+//! separate from the servant's: the shim must be able to report that a servant ran out of memory.
 //!
-//! On a hybrid host the controllers are on v1, and the empty v2 hierarchy beside them is still of use: it has
+//! On a hybrid host the controllers are on v1, and the empty v2 hierarchy beside them is still useful: it has
 //! `cgroup.kill`, and counts processor time.
 
 use std::fs;
@@ -22,8 +22,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::container::ContainerSpec;
-use crate::engine::{Enforced, Usage};
-use crate::spec::Limits;
+use crate::engine::{EnforcedLimits, Usage};
+use crate::spec::ResourceLimits;
 
 mod cores;
 mod disk;
@@ -33,35 +33,35 @@ mod v1;
 mod v2;
 
 use files::{read_number, read_pids};
-pub use hosts::Parent;
+pub use hosts::CgroupParent;
 pub use v1::counts_sockets;
 
-/// The directories of one servant.
+/// The cgroup directories of one servant or shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Cgroup {
-    /// 1 or 2; 0 where there is none.
+    /// Cgroup version, 1 or 2; 0 if there is none.
     pub version: u8,
-    /// One for each hierarchy in use.
-    leaves: Vec<Leaf>,
-    /// `MAJOR:MINOR` of the disk that input and output are limited on.
+    /// One directory for each hierarchy in use.
+    leaves: Vec<CgroupDirectory>,
+    /// `MAJOR:MINOR` of the disk whose I/O is limited.
     #[serde(default)]
     disk: Option<String>,
 }
 
 /// A directory in one hierarchy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Leaf {
-    /// Controllers that can be used here.
+struct CgroupDirectory {
+    /// Controllers available here.
     controllers: Vec<String>,
     directory: PathBuf,
-    /// Whether this hierarchy is of the v2 kind.
+    /// True for a v2 hierarchy.
     unified: bool,
 }
 
 impl Cgroup {
-    /// Where the cgroup of a servant is, or would be.
-    pub fn planned(parent: &Parent, spec: &ContainerSpec) -> Self {
-        let asked = |hierarchy: &&hosts::Below| {
+    /// Returns the cgroup of a servant, which need not exist yet.
+    pub fn for_servant(parent: &CgroupParent, spec: &ContainerSpec) -> Self {
+        let asked = |hierarchy: &&hosts::ParentDirectory| {
             let limits = &spec.limits;
             let asked = |controller: &str| match controller {
                 "blkio" => limits.io_read.or(limits.io_write).is_some(),
@@ -74,7 +74,7 @@ impl Cgroup {
             .hierarchies
             .iter()
             .filter(asked)
-            .map(|hierarchy| Leaf {
+            .map(|hierarchy| CgroupDirectory {
                 controllers: hierarchy.controllers.clone(),
                 directory: hierarchy.directory.join(&spec.id),
                 unified: hierarchy.unified,
@@ -82,20 +82,23 @@ impl Cgroup {
         Self {
             version: parent.version,
             leaves: leaves.collect(),
-            disk: spec.layers.first().and_then(|layer| disk::of(layer)),
+            disk: spec
+                .layers
+                .first()
+                .and_then(|layer| disk::whole_disk(layer)),
         }
     }
 
-    /// Where the cgroup of a servant's shim is, or would be.
-    pub fn of_shim(parent: &Parent, id: &str) -> Self {
-        let limits = |hierarchy: &&hosts::Below| {
+    /// Returns the cgroup of a servant's shim, which need not exist yet.
+    pub fn for_shim(parent: &CgroupParent, id: &str) -> Self {
+        let limits = |hierarchy: &&hosts::ParentDirectory| {
             let limits = |name: &String| matches!(name.as_str(), "cpu" | "memory");
             parent.version == 2 || hierarchy.controllers.iter().any(limits)
         };
-        // No id has a dot in it.
+        // Ids contain no dots.
         let leaves = parent.hierarchies.iter().filter(limits).map(|hierarchy| {
             let wanted = ["cpu", "memory"].map(str::to_owned);
-            Leaf {
+            CgroupDirectory {
                 controllers: wanted
                     .into_iter()
                     .filter(|name| hierarchy.controllers.contains(name))
@@ -111,21 +114,21 @@ impl Cgroup {
         }
     }
 
-    /// Makes its directories.
+    /// Creates the directories.
     pub fn create(&self) -> Result<(), Error> {
         for leaf in &self.leaves {
             make_directory(&leaf.directory)
                 .map_err(Error::file("make the cgroup", &leaf.directory))?;
-            if !leaf.unified && leaf.has("cpuset") {
-                v1::hand_down_cores(&leaf.directory)
+            if !leaf.unified && leaf.has_controller("cpuset") {
+                v1::inherit_cpuset(&leaf.directory)
                     .map_err(Error::file("hand cores and memory to", &leaf.directory))?;
             }
         }
         Ok(())
     }
 
-    /// Moves a process into it.
-    pub fn enter(&self, pid: u32) -> Result<(), Error> {
+    /// Moves a process into the cgroup.
+    pub fn add_process(&self, pid: u32) -> Result<(), Error> {
         for leaf in &self.leaves {
             let file = leaf.directory.join("cgroup.procs");
             fs::write(&file, pid.to_string()).map_err(Error::file("move a process into", &file))?;
@@ -133,10 +136,10 @@ impl Cgroup {
         Ok(())
     }
 
-    /// Moves this process into it, which must have one thread.
-    pub fn enter_alone(&self) -> Result<(), Error> {
+    /// Moves this process, which must have one thread, into the cgroup.
+    pub fn add_self(&self) -> Result<(), Error> {
         for leaf in &self.leaves {
-            // A thread that moves itself need not wait for a grace period of the kernel; v2 moves processes only.
+            // A thread that moves itself need not wait for an RCU grace period of the kernel; v2 moves processes only.
             let name = if leaf.unified {
                 "cgroup.procs"
             } else {
@@ -148,31 +151,31 @@ impl Cgroup {
         Ok(())
     }
 
-    /// Sets the limits that are given. A limit that cannot be set is not an error here: what is in force is read back.
-    pub fn set(&self, limits: &Limits) -> Enforced {
+    /// Sets the limits that are given. A limit that cannot be set is no error here: the limits in force are read back.
+    pub fn set_limits(&self, limits: &ResourceLimits) -> EnforcedLimits {
         if self.version == 2 {
             v2::set(self, limits)
         } else {
             v1::set(self, limits)
         }
-        self.enforced()
+        self.enforced_limits()
     }
 
-    /// The limits in force, as the kernel has them.
-    pub fn enforced(&self) -> Enforced {
+    /// Reads the limits in force from the kernel.
+    pub fn enforced_limits(&self) -> EnforcedLimits {
         let limits = if self.version == 2 {
             v2::limits(self)
         } else {
             v1::limits(self)
         };
-        Enforced {
+        EnforcedLimits {
             cgroup_version: self.version,
             limits,
-            shim: Limits::default(),
+            shim: ResourceLimits::default(),
         }
     }
 
-    /// What is used now.
+    /// Reads the current usage.
     pub fn usage(&self) -> Usage {
         let counted = if self.version == 2 {
             v2::usage(self)
@@ -180,7 +183,7 @@ impl Cgroup {
             v1::usage(self)
         };
         let pids = self
-            .file("pids", "pids.current")
+            .control_file("pids", "pids.current")
             .and_then(|file| read_number(&file))
             .unwrap_or(0);
         Usage {
@@ -190,19 +193,19 @@ impl Cgroup {
         }
     }
 
-    /// How many of its processes the kernel has killed for want of memory.
+    /// Returns the number of its processes killed by the kernel because of their memory.
     pub fn oom_kills(&self) -> u64 {
         let name = if self.version == 2 {
             "memory.events"
         } else {
             "memory.oom_control"
         };
-        self.file("memory", name)
+        self.control_file("memory", name)
             .and_then(|file| files::read_field(&file, "oom_kill"))
             .unwrap_or(0)
     }
 
-    /// Host pids of all its processes, init included.
+    /// Returns the host pids of all its processes, init included.
     pub fn processes(&self) -> Vec<i32> {
         self.leaves
             .first()
@@ -210,9 +213,9 @@ impl Cgroup {
             .unwrap_or_default()
     }
 
-    /// Kills every process in it, waits until there is none, and removes it. Blocks, at most for `patience`.
+    /// Kills all its processes, waits until they are gone, and removes it. Blocks for at most `patience`.
     pub fn destroy(&self, patience: Duration) -> Result<(), Error> {
-        self.refuse_to_end_ourselves()?;
+        self.check_not_own()?;
         let deadline = Instant::now() + patience;
         let mut pause = Duration::from_micros(200);
         while self.leaves.iter().any(|leaf| leaf.directory.exists()) {
@@ -235,7 +238,7 @@ impl Cgroup {
             std::thread::sleep(pause);
             pause = (pause * 2).min(Duration::from_millis(20));
         }
-        // On v2 the parent hands controllers down; it goes with the engine.
+        // On v2 the parent distributes the controllers; it is removed with the engine.
         if self.version == 1 {
             self.leaves
                 .iter()
@@ -244,8 +247,8 @@ impl Cgroup {
         Ok(())
     }
 
-    /// A record that names a directory which we are in ourselves is wrong, and following it would end the host's processes.
-    fn refuse_to_end_ourselves(&self) -> Result<(), Error> {
+    /// Refuses a record that names one of our own cgroups: destroying that would kill the host's processes.
+    fn check_not_own(&self) -> Result<(), Error> {
         let own = std::process::id() as i32;
         let wrong = self.leaves.iter().find(|leaf| {
             let processes = read_pids(&leaf.directory);
@@ -260,17 +263,17 @@ impl Cgroup {
         })
     }
 
-    /// Its directories, one in each hierarchy in use.
+    /// Iterates over its directories, one in each hierarchy in use.
     pub(crate) fn directories(&self) -> impl Iterator<Item = &Path> {
         self.leaves.iter().map(|leaf| leaf.directory.as_path())
     }
 
-    /// Whether any of its directories is there.
+    /// Returns whether any of its directories exists.
     pub fn exists(&self) -> bool {
         self.leaves.iter().any(|leaf| leaf.directory.exists())
     }
 
-    /// Kills every process now in it: at once where the kernel can, one after the other in a frozen group elsewhere.
+    /// Kills all its current processes: at once if the kernel can, otherwise one after the other in a frozen group.
     fn kill(&self) {
         let at_once = self.leaves.iter().filter(|leaf| leaf.unified).any(|leaf| {
             let file = leaf.directory.join("cgroup.kill");
@@ -279,7 +282,7 @@ impl Cgroup {
         if at_once {
             return;
         }
-        let freezer = self.file("freezer", "freezer.state");
+        let freezer = self.control_file("freezer", "freezer.state");
         // A group that cannot be frozen may fork faster than we kill; the caller repeats until it is empty.
         let switch = |state: &str| freezer.as_ref().map(|file| fs::write(file, state));
         switch("FROZEN");
@@ -294,22 +297,22 @@ impl Cgroup {
         switch("THAWED");
     }
 
-    /// A control file, when its controller is in use.
-    fn file(&self, controller: &str, name: &str) -> Option<PathBuf> {
+    /// Returns the path of a control file if its controller is in use.
+    fn control_file(&self, controller: &str, name: &str) -> Option<PathBuf> {
         self.leaves
             .iter()
-            .find(|leaf| leaf.has(controller))
+            .find(|leaf| leaf.has_controller(controller))
             .map(|leaf| leaf.directory.join(name))
     }
 }
 
-impl Leaf {
-    fn has(&self, controller: &str) -> bool {
+impl CgroupDirectory {
+    fn has_controller(&self, controller: &str) -> bool {
         self.controllers.iter().any(|known| known == controller)
     }
 }
 
-/// Makes a directory and its parent, which another servant's end may be removing at the same moment.
+/// Creates a directory and its parent, which the end of another servant may be removing at the same moment.
 fn make_directory(directory: &Path) -> io::Result<()> {
     let mut attempts = 0;
     loop {

@@ -1,6 +1,6 @@
-//! What a container of this host is to be: extracted layers, a writable directory, mounts. The local engine makes it of a
-//! [`Spec`](crate::spec::Spec); builds make it themselves. Serializable, because the shim that runs it is another process and
-//! must be able to outlive the daemon: what an earlier version has written must stay readable.
+//! Description of a container on this host: extracted layers, a writable directory, mounts. The local engine creates it
+//! from a [`Spec`](crate::spec::Spec); builds create it directly. Serializable, because the shim that runs it is
+//! another process and can outlive the daemon: records written by earlier versions must stay readable.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -11,51 +11,51 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::spec::{Limits, NodeSpec};
+use crate::spec::{NodeSpec, ResourceLimits};
 
-/// Everything that the shim needs to know of its container.
+/// Everything that the shim needs to know about its container.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ContainerSpec {
-    /// Unique on this host; `[a-z0-9-]`, at most 48 characters. Becomes the host name, the cgroup's and the
-    /// state directory's name.
+    /// Id, unique on this host; `[a-z0-9-]`, at most 48 characters. Used as host name and as name of the cgroup and the
+    /// state directory.
     pub id: String,
     /// Extracted layer trees, lowest first.
     pub layers: Vec<PathBuf>,
-    /// Where changes go. A servant has none (read-only root); a build has a directory that becomes a layer.
+    /// Directory for changes. A servant has none (read-only root); that of a build becomes a layer.
     #[serde(default)]
     pub writable: Option<PathBuf>,
-    /// Which rights its processes have.
+    /// Privileges of its processes.
     pub profile: Profile,
     /// Hard limits.
     #[serde(default)]
-    pub limits: Limits,
+    pub limits: ResourceLimits,
     /// Environment of every process.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,
     /// Processes to start, in order, once the container runs.
     #[serde(default)]
     pub nodes: Vec<NodeSpec>,
-    /// Directories made in `writable` before the first process runs, owned by the compile user (1000:1000).
+    /// Directories to create in `writable` before the first process runs, owned by the compile user (1000:1000).
     #[serde(default)]
     pub owned_directories: Vec<PathBuf>,
     /// Extra mounts, such as model files.
     #[serde(default)]
     pub mounts: Vec<Mount>,
-    /// Names that mean an address of its own loopback, for `/etc/hosts`.
+    /// Host names for `/etc/hosts` that stand for addresses of its own loopback.
     #[serde(default)]
     pub hosts: Vec<(IpAddr, String)>,
-    /// Handed as it is to the shim's resident (the composed ROS Master): initial parameters and the like.
+    /// Opaque configuration of the shim's resident (the ROS Master): initial parameters and the like.
     #[serde(default)]
     pub resident: serde_json::Value,
 }
 
-/// Which rights a container has.
+/// Privileges of a container.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Profile {
-    /// Other people's code for a robot: no capabilities, seccomp allow-list, read-only root, tmpfs scratch.
+    /// Untrusted code for a robot: no capabilities, seccomp allow-list, read-only root, tmpfs scratch.
     Servant,
-    /// Compiling other people's code: as a servant, with a writable root, as uid 1000, without network.
+    /// Compiling untrusted code: as a servant, with a writable root, as uid 1000, without network.
     Compile,
     /// Installing packages (dpkg): CHOWN, DAC_OVERRIDE, FOWNER, FSETID, SETUID, SETGID, SETFCAP; without network.
     Install,
@@ -64,22 +64,23 @@ pub enum Profile {
 /// A bind mount.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Mount {
-    /// On the host.
+    /// Path on the host.
     pub source: PathBuf,
-    /// Inside; absolute.
+    /// Absolute path in the container.
     pub target: PathBuf,
-    /// Whether processes may write there.
+    /// Writable for processes in the container.
     pub writable: bool,
-    /// It is a device node, to be used as such; elsewhere device nodes are dead.
+    /// Allows access to a device node; in other mounts device nodes are disabled.
     #[serde(default)]
     pub device: bool,
-    /// What is mounted, whatever is found at `source` by then; without it `source` is looked up when the servant is made.
+    /// Open source of the mount, which is used whatever is at `source` by then; without it `source` is looked up when
+    /// the servant is created.
     #[serde(skip)]
-    pub opened: Option<Opened>,
+    pub opened: Option<OpenedSource>,
 }
 
 impl Mount {
-    /// Whether it is a directory.
+    /// Returns whether the source is a directory.
     pub(crate) fn is_directory(&self) -> io::Result<bool> {
         let mode = match &self.opened {
             Some(opened) => nix::sys::stat::fstat(opened.as_fd())?.st_mode,
@@ -89,24 +90,24 @@ impl Mount {
     }
 }
 
-/// A file or directory that was opened (O_PATH is enough), to be mounted. Two are equal when they are the same descriptor.
+/// An open file or directory (O_PATH is enough) to be mounted. Two are equal if they are the same descriptor.
 #[derive(Debug, Clone)]
-pub struct Opened(Arc<OwnedFd>);
+pub struct OpenedSource(Arc<OwnedFd>);
 
-impl Opened {
-    /// Takes the descriptor.
+impl OpenedSource {
+    /// Wraps the descriptor.
     pub fn new(descriptor: OwnedFd) -> Self {
         Self(Arc::new(descriptor))
     }
 }
 
-impl AsFd for Opened {
+impl AsFd for OpenedSource {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.0.as_fd()
     }
 }
 
-impl PartialEq for Opened {
+impl PartialEq for OpenedSource {
     fn eq(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0)
     }

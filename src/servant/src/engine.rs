@@ -1,4 +1,5 @@
-//! The seam to whoever starts servants. It speaks of servants alone: no pid, user id, path or namespace of a host.
+//! Interface to the engines that start servants. It speaks of servants only: no pid, user id, path or namespace of a
+//! host.
 
 mod unmet;
 
@@ -10,220 +11,221 @@ use async_trait::async_trait;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{broadcast, mpsc, watch};
 
-use crate::spec::{Limits, NodeSpec, Spec};
+use crate::spec::{NodeSpec, ResourceLimits, Spec};
 
-pub use unmet::missing;
+pub use unmet::missing_limits;
 
-/// Where a servant's container is in its life. (Admission and readiness, which need more knowledge than the
-/// engine has, are the choreographer's.)
+/// State of a servant's container. (Admission and readiness, which need more knowledge than the engine has, are the
+/// choreographer's.)
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "state")]
 pub enum ContainerState {
-    /// Directories, namespaces and cgroup are being made.
+    /// Directories, namespaces and cgroup are being created.
     Creating,
     /// Init runs; nodes are started or starting.
     Running,
-    /// Ended as asked, or because its nodes did.
+    /// Ended on request, or because its nodes did.
     Stopped {
-        /// Why it ended.
+        /// Reason of the end.
         reason: String,
     },
-    /// Could not be started, or died of something that was not asked for (out of memory, init killed).
+    /// Could not be started, or ended unexpectedly (out of memory, init killed).
     Failed {
-        /// What happened and what to do.
+        /// Reason, and what to do.
         reason: String,
     },
 }
 
 impl ContainerState {
-    /// Whether nothing runs any more.
+    /// Returns whether nothing runs any more.
     pub fn is_over(&self) -> bool {
         matches!(self, Self::Stopped { .. } | Self::Failed { .. })
     }
 }
 
-/// What happened to one process of a servant.
+/// An event of one process of a servant.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "event")]
 pub enum NodeEvent {
-    /// It was forked and its program executed.
+    /// The process was forked and its program executed.
     Started {
-        /// The node's name.
+        /// Name of the node.
         node: String,
     },
-    /// Its program could not be executed.
+    /// The program could not be executed.
     ExecFailed {
-        /// The node's name.
+        /// Name of the node.
         node: String,
-        /// Why it could not be executed.
+        /// Reason of the failure.
         reason: String,
     },
-    /// It ended.
+    /// The process ended.
     Exited {
-        /// The node's name.
+        /// Name of the node.
         node: String,
-        /// Exit code, when it exited.
+        /// Exit code, if it exited.
         code: Option<i32>,
-        /// Signal number, when it was killed.
+        /// Signal number, if it was killed by one.
         signal: Option<i32>,
-        /// The kernel killed it for exceeding the memory limit.
+        /// True if the kernel killed it for exceeding the memory limit.
         out_of_memory: bool,
     },
-    /// It will be started again after its delay.
+    /// The process will be restarted after its delay.
     Respawning {
-        /// The node's name.
+        /// Name of the node.
         node: String,
     },
 }
 
-/// How a node ended.
+/// The end of a node.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NodeExit {
-    /// Exit code, when it exited.
+    /// Exit code, if it exited.
     pub code: Option<i32>,
-    /// Signal number, when it was killed.
+    /// Signal number, if it was killed by one.
     pub signal: Option<i32>,
-    /// The kernel killed it for exceeding the memory limit.
+    /// True if the kernel killed it for exceeding the memory limit.
     pub out_of_memory: bool,
-    /// Why its program could not be executed, when so.
+    /// Reason why its program could not be executed, if so.
     pub exec_error: Option<String>,
 }
 
-/// Which limits are in force, as read back from the kernel.
+/// Limits in force, as read back from the kernel.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Enforced {
-    /// 1 or 2; 0 where no controller could be used.
+pub struct EnforcedLimits {
+    /// Cgroup version, 1 or 2; 0 if no controller could be used.
     pub cgroup_version: u8,
-    /// The values in force; none: this host cannot limit it.
-    pub limits: Limits,
-    /// Those of its shim.
+    /// Values in force; `None`: this host cannot limit it.
+    pub limits: ResourceLimits,
+    /// Limits of the shim.
     #[serde(default)]
-    pub shim: Limits,
+    pub shim: ResourceLimits,
 }
 
-/// Usage as the kernel counts it.
+/// Resource usage as counted by the kernel.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Usage {
-    /// Microseconds of CPU so far.
+    /// CPU time so far in microseconds.
     pub cpu_usec: u64,
     /// Bytes of memory now.
     pub memory: u64,
-    /// Of them those of files that were not used lately, which the kernel drops where memory is short.
+    /// Bytes of those that belong to files not used lately, which the kernel drops when memory is short.
     #[serde(default)]
     pub reclaimable: u64,
-    /// Processes and threads now.
+    /// Number of processes and threads now.
     pub pids: u64,
-    /// Processes killed for want of memory so far.
+    /// Number of processes killed for lack of memory so far.
     pub oom_kills: u64,
-    /// Microseconds so far in which it wanted to run and had used its cores up.
+    /// Microseconds so far in which it was throttled: it could have run, but had used up its CPU quota.
     pub throttled_usec: u64,
-    /// How much of the last ten seconds some of it waited for what others used; none where the kernel does not tell.
+    /// Share of the last ten seconds in which some of it waited for resources; `None` if the kernel does not report it.
     pub pressure: Option<Pressure>,
 }
 
-/// One line that a process printed.
+/// One line printed by a process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LogLine {
-    /// Its place in the log, from 0; none for what is said about the log itself.
+    /// Number of the line in the log, from 0; `None` for remarks on the log itself.
     #[serde(default)]
     pub number: Option<u64>,
-    /// When the shim read it.
+    /// Time at which the shim read it.
     pub time: SystemTime,
-    /// Which node printed it.
+    /// Node that printed it.
     pub node: String,
     /// `stdout` or `stderr`.
     pub stream: String,
-    /// Without the line end.
+    /// Text without the line end.
     pub line: String,
 }
 
-/// Where in a log to begin.
+/// Position in a log to start reading from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogStart {
-    /// At the first line that is still there.
+    /// The first line still available.
     First,
-    /// So many lines back.
+    /// This number of lines before the end.
     Last(usize),
-    /// Behind what was printed before.
+    /// The end: only lines printed from now on.
     Now,
 }
 
-/// A servant that an engine runs. Cheap to share; dropping it does not end the servant.
+/// A servant run by an engine. Cheap to share; dropping it does not end the servant.
 #[async_trait]
-pub trait Servant: Send + Sync + 'static {
-    /// The spec's id.
+pub trait ServantHandle: Send + Sync + 'static {
+    /// Returns the id of its spec.
     fn id(&self) -> &str;
-    /// Its state now and as it changes.
+    /// Returns a receiver of its state.
     fn state(&self) -> watch::Receiver<ContainerState>;
-    /// Node events from now on.
+    /// Returns a receiver of node events from now on.
     fn events(&self) -> broadcast::Receiver<NodeEvent>;
-    /// Limits read back from the kernel.
-    fn enforced(&self) -> Enforced;
-    /// Changes the limits that are given and leaves the others; answers what is in force then.
-    async fn set_limits(&self, limits: Limits) -> Result<Enforced, crate::Error>;
-    /// Usage now.
+    /// Returns the limits read back from the kernel.
+    fn enforced_limits(&self) -> EnforcedLimits;
+    /// Changes the limits that are given, keeps the others, and returns those then in force.
+    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, crate::Error>;
+    /// Returns the current usage.
     async fn usage(&self) -> Result<Usage, crate::Error>;
-    /// How long threads of its nodes, and of the processes that serve these, could have run so far and others had the cores,
-    /// summed up; nothing where that is not counted.
-    async fn waited(&self) -> Duration {
+    /// Returns how long so far threads of its nodes, and of the processes that serve them, were runnable but waited for
+    /// a CPU, summed up over threads; zero if that is not counted.
+    async fn cpu_wait_time(&self) -> Duration {
         Duration::ZERO
     }
-    /// Names of the nodes that were ever started in it, or are about to be.
+    /// Returns the names of the nodes that were ever started in it, or are about to be.
     fn nodes(&self) -> Vec<String>;
-    /// For which run of its starter's a node was started last ([`crate::spec::RUN`]); none where nobody said so.
-    fn run(&self, _node: &str) -> Option<String> {
+    /// Returns the run, as named by the caller ([`crate::spec::RUN`]), for which a node was last started; `None` if it
+    /// was not named.
+    fn run_id(&self, _node: &str) -> Option<String> {
         None
     }
-    /// Starts one more node; returns when its program is executed, or with the reason why it could not be.
+    /// Starts another node; returns when its program is executed, or with the reason why it could not be.
     async fn start_node(&self, node: NodeSpec) -> Result<(), crate::Error>;
     /// Sends a signal to a node.
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), crate::Error>;
-    /// Sends a signal to a node that is to end for good: it is not started again, and the servant does not end with
-    /// it, whatever its spec says. So it is from now on even if there is nothing to signal.
+    /// Ends a node for good with a signal: it is not restarted, and the servant does not end with it, whatever its spec
+    /// says. This holds from now on even if there is nothing to signal.
     async fn end_node(&self, node: &str, signal: i32) -> Result<(), crate::Error> {
         self.signal_node(node, signal).await
     }
-    /// Waits for a node to end and tells how; answers at once when it has ended already.
+    /// Waits for a node to end; returns at once if it has ended already.
     async fn wait_node(&self, node: &str) -> Result<NodeExit, crate::Error>;
-    /// The last lines printed, at most so many, oldest first; of one node alone where one is named.
+    /// Returns the last lines printed, at most `last`, oldest first; of one node only if `node` is given.
     async fn logs(&self, last: usize, node: Option<&str>) -> Vec<LogLine>;
-    /// Every line printed, each once, none lost; ends when the container has ended.
+    /// Streams every line printed, each exactly once; ends when the container has ended.
     fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine>;
-    /// Ends it: SIGINT to the nodes, SIGTERM, then SIGKILL to all; returns when nothing is left
-    /// (process, mount, cgroup, directory).
+    /// Stops it: SIGINT to the nodes, SIGTERM, then SIGKILL to all; returns when nothing is left (process, mount,
+    /// cgroup, directory).
     async fn stop(&self) -> Result<(), crate::Error>;
 }
 
-/// A servant that ended while no daemon watched.
+/// A servant that ended while no daemon was running.
 #[derive(Debug, Clone)]
-pub struct Ended {
-    /// The spec's id.
+pub struct EndedServant {
+    /// Id of its spec.
     pub id: String,
-    /// How it ended; none where nothing was left to tell.
+    /// Final state; `None` if there is no record of it.
     pub state: Option<ContainerState>,
 }
 
-/// What an engine found of an earlier daemon's: each servant is in one of the three.
+/// Servants found from an earlier daemon: each is in one of the three lists.
 #[derive(Default)]
-pub struct Adopted {
-    /// Servants that run.
-    pub running: Vec<Arc<dyn Servant>>,
-    /// Servants that have ended. What is left of them is in nobody's way until [`Engine::sweep`] removes it.
-    pub ended: Vec<Ended>,
-    /// What could not be looked at, each with the reason.
+pub struct AdoptedServants {
+    /// Servants that are running.
+    pub running: Vec<Arc<dyn ServantHandle>>,
+    /// Servants that have ended. Their remains are harmless until [`Engine::sweep`] removes them.
+    pub ended: Vec<EndedServant>,
+    /// Servants that could not be examined, each with the reason.
     pub failures: Vec<crate::Error>,
 }
 
 /// Starts and finds servants.
 #[async_trait]
 pub trait Engine: Send + Sync + 'static {
-    /// Starts one; returns once its container runs and its nodes are started or starting.
-    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, crate::Error>;
-    /// Finds those that an earlier daemon left: adopted where they run, else told. Robots wait for it, so nothing is removed.
-    /// Fails only where nothing can be looked at.
-    async fn adopt(&self) -> Result<Adopted, crate::Error>;
-    /// Removes what is left of servants that have ended; answers, with the reasons, what could not be removed.
-    async fn sweep(&self, ended: &[Ended]) -> Vec<crate::Error>;
-    /// Refuses grants that are not allowed or not there; answers, in words, what of them servants will lack.
-    fn check(&self, grants: &Grants) -> Result<Vec<String>, crate::Error>;
+    /// Starts a servant; returns once its container runs and its nodes are started or starting.
+    async fn start(&self, spec: Spec) -> Result<Arc<dyn ServantHandle>, crate::Error>;
+    /// Finds the servants of an earlier daemon: running ones are adopted, the others reported. Robots wait for it, so
+    /// nothing is removed. Fails only if nothing can be examined.
+    async fn adopt(&self) -> Result<AdoptedServants, crate::Error>;
+    /// Removes the remains of servants that have ended; returns errors for what could not be removed.
+    async fn sweep(&self, ended: &[EndedServant]) -> Vec<crate::Error>;
+    /// Refuses grants that are not allowed or do not exist; returns descriptions of what servants will lack of them.
+    fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, crate::Error>;
 }

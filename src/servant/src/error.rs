@@ -1,70 +1,70 @@
-//! What can go wrong when servants are started, reached and ended.
+//! Errors of starting, reaching and ending servants.
 
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Every error of this crate.
+/// An error of this crate.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// A file or directory could not be used.
+    /// A file operation failed.
     #[error("could not {action} {path}: {source}")]
     File {
-        /// What was tried, as a verb.
+        /// Operation that failed, as a verb.
         action: &'static str,
         /// The file or directory.
         path: PathBuf,
         /// Error of the system call.
         source: io::Error,
     },
-    /// The kernel refused a call that names no file.
+    /// A system call without a path failed.
     #[error("{call} failed: {source}")]
     Call {
-        /// The system call, and for what.
+        /// The system call and its purpose.
         call: &'static str,
         /// Error of the system call.
         source: io::Error,
     },
-    /// The spec cannot be run as it is.
+    /// The spec is invalid.
     #[error("servant {id}: {reason}")]
     InvalidSpec {
-        /// The spec's id.
+        /// Id of the spec.
         id: String,
-        /// What to change.
+        /// Description of the fault.
         reason: String,
     },
-    /// A servant of this id is there already.
+    /// A servant with this id exists already.
     #[error("servant {id} exists already: stop it first or choose another id")]
     Exists {
         /// The id.
         id: String,
     },
-    /// It could not be started.
+    /// The servant could not be started.
     #[error("servant {id} could not be started: {reason}")]
     Start {
         /// The id.
         id: String,
-        /// What failed, in the words of whoever tried.
+        /// Reason, as reported by the step that failed.
         reason: String,
     },
-    /// Nothing answers for it any more.
+    /// The servant has ended.
     #[error("servant {id} has ended: {reason}")]
     Ended {
         /// The id.
         id: String,
-        /// How, as far as known.
+        /// Reason, as far as known.
         reason: String,
     },
-    /// Its shim refused a command.
+    /// The shim refused a command.
     #[error("servant {id}: {reason}")]
     Refused {
         /// The id.
         id: String,
-        /// Why it was refused.
+        /// Reason of the refusal.
         reason: String,
     },
-    /// Its shim runs and does not answer.
+    /// The shim runs but does not answer.
     #[error(
-        "servant {id}: its shim does not answer; look whether it is stopped or starved, or end the servant"
+        "servant {id}: its shim does not answer; check whether it is stopped or starved, or stop the servant"
     )]
     Unanswered {
         /// The id.
@@ -73,23 +73,23 @@ pub enum Error {
     /// There is no node of that name.
     #[error("servant {id} has no node {node}: see its nodes in its state")]
     NoNode {
-        /// The servant.
+        /// Id of the servant.
         id: String,
-        /// The name asked for.
+        /// Name that was asked for.
         node: String,
     },
-    /// Something stands among the servants' directories that is none.
-    #[error("{} is no servant's directory and was left alone; move it away", path.display())]
+    /// An entry among the servants' directories is not one of them.
+    #[error("{} is not a servant's directory and was left untouched; move it elsewhere", path.display())]
     Stray {
-        /// Path of the entry that is none of ours.
+        /// Path of the unknown entry.
         path: PathBuf,
     },
-    /// Something of a servant is left after its end.
+    /// Something is left of a servant after its end.
     #[error("servant {id} left {what}: remove it by hand and report this")]
     LeftOver {
-        /// The servant.
+        /// Id of the servant.
         id: String,
-        /// What is left.
+        /// Description of what is left.
         what: String,
     },
     /// A limit could not be put in force although isolation is required.
@@ -97,57 +97,57 @@ pub enum Error {
         "this host does not enforce {missing} ({reason}): enable the controller, or set isolation = \"best-effort\""
     )]
     Isolation {
-        /// Which limits.
+        /// Names of the limits.
         missing: String,
-        /// Why, and with which cgroup version.
+        /// Reason, with the cgroup version.
         reason: String,
     },
-    /// A filesystem does not know idmapped mounts.
+    /// A file system does not support idmapped mounts.
     #[error(
         "{path} is on {filesystem}, which cannot be mounted with shifted user ids ({source}): \
          put the layers on ext4, xfs or btrfs, or use a newer kernel"
     )]
     IdmapUnsupported {
-        /// The layer.
+        /// Path of the layer.
         path: PathBuf,
         /// Type of the file system.
         filesystem: String,
-        /// What the kernel said.
+        /// Error of the kernel.
         source: io::Error,
     },
-    /// No uid range is free.
+    /// All uid ranges are taken.
     #[error(
         "all {ranges} user id ranges from {base} on are taken: stop servants or change uid_base"
     )]
     NoUidRange {
         /// First uid of the first range.
         base: u32,
-        /// How many ranges there are.
+        /// Number of ranges.
         ranges: u32,
     },
-    /// Something is asked for that is not granted.
+    /// Something that is not granted was asked for.
     #[error(transparent)]
     Grant(#[from] crate::local::grants::GrantError),
-    /// The layers of an image cannot be had.
+    /// The layers of an image are not available.
     #[error("image {image} cannot be used: {source}")]
     Image {
-        /// Its digest.
+        /// Digest of the image.
         image: String,
-        /// What the image store said.
+        /// Error of the image store.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// Something that was written by another process is not what it should be.
-    #[error("{path} holds something unexpected: {reason}")]
+    /// A record of another process is malformed.
+    #[error("{path} has unexpected content: {reason}")]
     Malformed {
-        /// The file.
+        /// Path of the record.
         path: PathBuf,
-        /// In which way it is malformed.
+        /// Description of the fault.
         reason: String,
     },
 }
 
 impl Error {
-    /// Wraps an I/O error with what was tried on which path.
+    /// Wraps an I/O error with the operation and the path.
     pub(crate) fn file(
         action: &'static str,
         path: impl AsRef<Path>,
@@ -165,7 +165,7 @@ impl Error {
         move |source| Self::Call { call, source }
     }
 
-    /// The same for nix's errors.
+    /// Wraps a nix error of a system call without a path.
     pub(crate) fn nix(call: &'static str) -> impl FnOnce(nix::Error) -> Self {
         move |source| Self::Call {
             call,

@@ -1,47 +1,47 @@
-//! What the host has, and how much it waits: `/proc/meminfo` and pressure stall information (PSI).
+//! Resources of the host and their pressure: `/proc/meminfo` and pressure stall information (PSI).
 
 use std::fs;
 use std::path::Path;
 
 use api::Pressure;
 
-/// Bytes of memory that the host has; none where `/proc/meminfo` cannot be read.
-pub fn memory() -> Option<u64> {
-    bytes_of("MemTotal:", &fs::read_to_string("/proc/meminfo").ok()?)
+/// Returns the host's total memory in bytes; `None` if `/proc/meminfo` cannot be read.
+pub fn total_memory() -> Option<u64> {
+    parse_meminfo("MemTotal:", &fs::read_to_string("/proc/meminfo").ok()?)
 }
 
-/// Percent of the host's memory that programs could still be given (`MemAvailable`); none where `/proc/meminfo` cannot be
-/// read.
-pub fn memory_available() -> Option<f64> {
+/// Returns the percentage of the host's memory still available to programs (`MemAvailable`); `None` if `/proc/meminfo`
+/// cannot be read.
+pub fn available_memory_percent() -> Option<f64> {
     let meminfo = fs::read_to_string("/proc/meminfo").ok()?;
-    let total = bytes_of("MemTotal:", &meminfo).filter(|total| *total > 0)?;
-    Some(bytes_of("MemAvailable:", &meminfo)? as f64 / total as f64 * 100.0)
+    let total = parse_meminfo("MemTotal:", &meminfo).filter(|total| *total > 0)?;
+    Some(parse_meminfo("MemAvailable:", &meminfo)? as f64 / total as f64 * 100.0)
 }
 
-fn bytes_of(key: &str, meminfo: &str) -> Option<u64> {
+fn parse_meminfo(key: &str, meminfo: &str) -> Option<u64> {
     let line = meminfo.lines().find_map(|line| line.strip_prefix(key))?;
     let kib: u64 = line.trim().strip_suffix("kB")?.trim_end().parse().ok()?;
     Some(kib * 1024)
 }
 
-/// How much the whole host waits; none where its kernel does not tell.
+/// Returns the pressure of the whole host; `None` if the kernel does not report it.
 pub fn pressure() -> Option<Pressure> {
-    pressure_in(Path::new("/proc/pressure"), "")
+    read_pressure(Path::new("/proc/pressure"), "")
 }
 
-/// Percent of the last ten seconds in which nothing could run since all waited for memory (`full avg10`); none where the
-/// kernel does not tell.
-pub fn memory_stalled() -> Option<f64> {
-    avg10("full ", &fs::read_to_string("/proc/pressure/memory").ok()?)
+/// Returns the percentage of the last ten seconds in which everything was stalled on memory (`full avg10`); `None` if
+/// the kernel does not report it.
+pub fn memory_stall_percent() -> Option<f64> {
+    parse_avg10("full ", &fs::read_to_string("/proc/pressure/memory").ok()?)
 }
 
-/// Bytes that were read back from swap since the host was started; none where its kernel does not tell.
-pub fn swapped_in() -> Option<u64> {
-    let pages = pages_in(&fs::read_to_string("/proc/vmstat").ok()?)?;
+/// Returns the bytes read back from swap since boot; `None` if the kernel does not report it.
+pub fn swapped_in_bytes() -> Option<u64> {
+    let pages = parse_swapped_in_pages(&fs::read_to_string("/proc/vmstat").ok()?)?;
     Some(pages.saturating_mul(page_size()))
 }
 
-fn pages_in(vmstat: &str) -> Option<u64> {
+fn parse_swapped_in_pages(vmstat: &str) -> Option<u64> {
     let pages = vmstat
         .lines()
         .find_map(|line| line.strip_prefix("pswpin "))?;
@@ -56,16 +56,16 @@ fn page_size() -> u64 {
         .unwrap_or(4096)
 }
 
-/// Pressure in a directory of a v2 cgroup hierarchy, where it is there without any controller; none where the kernel was
-/// built or booted without.
-pub(crate) fn pressure_of_cgroup(directory: &Path) -> Option<Pressure> {
-    pressure_in(directory, ".pressure")
+/// Reads the pressure of a directory in a v2 cgroup hierarchy, which needs no controller; `None` if the kernel was
+/// built or booted without PSI.
+pub(crate) fn cgroup_pressure(directory: &Path) -> Option<Pressure> {
+    read_pressure(directory, ".pressure")
 }
 
-fn pressure_in(directory: &Path, suffix: &str) -> Option<Pressure> {
+fn read_pressure(directory: &Path, suffix: &str) -> Option<Pressure> {
     let of = |name: &str| {
         let text = fs::read_to_string(directory.join(format!("{name}{suffix}"))).ok()?;
-        avg10("some ", &text)
+        parse_avg10("some ", &text)
     };
     Some(Pressure {
         cpu: of("cpu")?,
@@ -74,8 +74,8 @@ fn pressure_in(directory: &Path, suffix: &str) -> Option<Pressure> {
     })
 }
 
-/// `avg10` of the line of a pressure file that begins so, in percent.
-fn avg10(line: &str, text: &str) -> Option<f64> {
+/// Reads `avg10`, in percent, of the line of a pressure file that starts with `line`.
+fn parse_avg10(line: &str, text: &str) -> Option<f64> {
     let found = text.lines().find_map(|one| one.strip_prefix(line))?;
     found
         .split(' ')
@@ -89,13 +89,14 @@ mod tests {
     #[test]
     fn the_kernels_texts_are_read() {
         let meminfo = "MemTotal:       16316412 kB\nMemFree:         1204 kB\n";
-        assert_eq!(bytes_of("MemTotal:", meminfo), Some(16_316_412 * 1024));
-        assert_eq!(bytes_of("MemTotal:", "MemFree: 1204 kB\n"), None);
-        let pressure = "some avg10=1.53 avg60=0.87 avg300=0.20 total=1\nfull avg10=0.25 avg60=0.00 avg300=0.00 total=0\n";
-        assert_eq!(avg10("some ", pressure), Some(1.53));
-        assert_eq!(avg10("full ", pressure), Some(0.25));
-        assert_eq!(avg10("some ", ""), None);
-        assert_eq!(pages_in("pswpout 1\npswpin 42\n"), Some(42));
-        assert_eq!(pages_in("pswpout 1\n"), None);
+        assert_eq!(parse_meminfo("MemTotal:", meminfo), Some(16_316_412 * 1024));
+        assert_eq!(parse_meminfo("MemTotal:", "MemFree: 1204 kB\n"), None);
+        let pressure = "some avg10=1.53 avg60=0.87 avg300=0.20 total=1\nfull avg10=0.25 avg60=0.00 avg300=0.00 \
+                        total=0\n";
+        assert_eq!(parse_avg10("some ", pressure), Some(1.53));
+        assert_eq!(parse_avg10("full ", pressure), Some(0.25));
+        assert_eq!(parse_avg10("some ", ""), None);
+        assert_eq!(parse_swapped_in_pages("pswpout 1\npswpin 42\n"), Some(42));
+        assert_eq!(parse_swapped_in_pages("pswpout 1\n"), None);
     }
 }

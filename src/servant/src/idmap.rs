@@ -1,5 +1,5 @@
-//! User namespaces: the one that a container lives in, whose map its layers have; and one that nobody lives in, to try out
-//! whether mounts can be shifted.
+//! User namespaces: the one of a container, whose id mapping its layers have; and an empty one to test whether mounts
+//! can be idmapped.
 
 use std::fs::{self, File};
 use std::io;
@@ -17,21 +17,22 @@ use nix::unistd::{ForkResult, Uid, setresuid};
 
 use crate::{Error, bundle, sys};
 
-/// Tries it on the file system that holds `directory`: a detached copy of the mount is made, shifted, and dropped. Nobody
-/// sees it.
+/// Tests idmapped mounts on the file system that holds `directory`: a detached copy of the mount is created, idmapped,
+/// and dropped, invisibly to others.
 ///
 /// # Errors
-/// The file system or the kernel does not know shifted ids, or this process may not use them.
-pub fn try_on(directory: &Path) -> Result<(), Error> {
-    let holder = Holder::new().map_err(Error::call("unshare of a user namespace"))?;
-    let namespace = map(holder.0.id() as i32, (100_000, 65_536))?;
+/// Fails if the file system or the kernel does not support idmapped mounts, or this process may not use them.
+pub fn check_idmap_support(directory: &Path) -> Result<(), Error> {
+    let holder = NamespaceHolder::new().map_err(Error::call("unshare of a user namespace"))?;
+    let namespace = write_id_maps(holder.0.id() as i32, (100_000, 65_536))?;
     let mount = sys::clone_mount(directory).map_err(Error::file("copy the mount of", directory))?;
-    sys::shift_mount(mount.as_fd(), namespace.as_fd())
+    sys::idmap_mount(mount.as_fd(), namespace.as_fd())
         .map_err(Error::file("shift the user ids of", directory))
 }
 
-/// Gives the user namespace of a process its map, from 0 to `count` ids from `first` on; the namespace.
-pub(crate) fn map(pid: i32, (first, count): (u32, u32)) -> Result<OwnedFd, Error> {
+/// Writes the id mapping of a process's user namespace, from 0 to `count` ids starting at `first`; returns the
+/// namespace.
+pub(crate) fn write_id_maps(pid: i32, (first, count): (u32, u32)) -> Result<OwnedFd, Error> {
     for file in ["uid_map", "gid_map"] {
         let path = format!("/proc/{pid}/{file}");
         fs::write(&path, format!("0 {first} {count}\n")).map_err(Error::file("write", &path))?;
@@ -42,23 +43,24 @@ pub(crate) fn map(pid: i32, (first, count): (u32, u32)) -> Result<OwnedFd, Error
         .into())
 }
 
-/// Makes the user namespace of a container, whose root is the first id of `range`. The calling process must have one thread.
+/// Creates the user namespace of a container, whose root is the first id of `range`. The calling process must have one
+/// thread.
 ///
-/// What the kernel counts by user (instances of inotify, signals that wait, message queues, locked memory, processes) it counts
-/// for the user inside and, with that, for whoever made the namespace. Made by root, each container would use up root's
-/// counts of the whole host; so the maker is the first user of the range, who has nothing else. How much all users inside
-/// may have together is what the maker may have.
-pub(crate) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
+/// The kernel counts some resources per user (inotify instances, pending signals, message queues, locked memory,
+/// processes): for the user inside, and also for the creator of the namespace. If root created them, each container
+/// would use up root's limits for the whole host; so the creator is the first user of the range, who owns nothing else.
+/// The creator's limits bound all users inside together.
+pub(crate) fn create_user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
     let pair = || nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"));
     let ((unshared, tell), (wait, release)) = (pair()?, pair()?);
-    // SAFETY: the calling process has one thread; the child makes system calls only.
+    // SAFETY: the calling process has one thread; the child only makes system calls.
     match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork"))? {
         ForkResult::Child => {
             drop(release);
             let errno = unshare_as(range.0).err().map_or(0, |errno| errno as i32);
             let _ = nix::unistd::write(&tell, &errno.to_ne_bytes());
             let _ = nix::unistd::read(&wait, &mut [0]);
-            // SAFETY: ends the child without running what the parent has registered for its own end.
+            // SAFETY: ends the child without running the exit handlers registered by the parent.
             unsafe { libc::_exit(0) }
         }
         ForkResult::Parent { child } => {
@@ -66,7 +68,7 @@ pub(crate) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
             let mut errno = [0; 4];
             let read = nix::unistd::read(&unshared, &mut errno);
             let made = match (read, i32::from_ne_bytes(errno)) {
-                (Ok(4), 0) => map(child.as_raw(), range),
+                (Ok(4), 0) => write_id_maps(child.as_raw(), range),
                 (_, errno) => Err(Error::call("unshare of a user namespace")(
                     io::Error::from_raw_os_error(errno),
                 )),
@@ -78,7 +80,7 @@ pub(crate) fn user_namespace(range: (u32, u32)) -> Result<OwnedFd, Error> {
     }
 }
 
-/// Moves the calling process to a user namespace that `user` has made.
+/// Moves the calling process to a user namespace created by `user`.
 fn unshare_as(user: u32) -> nix::Result<()> {
     for (resource, most) in [
         (Resource::RLIMIT_SIGPENDING, bundle::PENDING_SIGNALS),
@@ -87,8 +89,8 @@ fn unshare_as(user: u32) -> nix::Result<()> {
         let most = getrlimit(resource)?.1.min(most);
         setrlimit(resource, most, most)?;
     }
-    // Another user has no effective capability, but may take back those that are permitted. Where hosts let root alone make
-    // user namespaces, it takes one.
+    // Changing the user clears the effective capabilities, but the permitted ones can be restored. Hosts that let only
+    // root create user namespaces require one.
     let user = Uid::from_raw(user);
     let held = caps::read(None, CapSet::Permitted).map_err(|_| Errno::EPERM)?;
     setresuid(Uid::from_raw(0), user, Uid::from_raw(0))?;
@@ -96,11 +98,11 @@ fn unshare_as(user: u32) -> nix::Result<()> {
     unshare(CloneFlags::CLONE_NEWUSER)
 }
 
-/// A process in a user namespace of its own, which waits to be ended. For programs of several threads: where there is one
-/// thread, a fork is enough (see [`user_namespace`]).
-struct Holder(Child);
+/// A process in its own user namespace that waits to be killed. For programs with several threads; with one thread a
+/// fork is enough (see [`create_user_namespace`]).
+struct NamespaceHolder(Child);
 
-impl Holder {
+impl NamespaceHolder {
     fn new() -> io::Result<Self> {
         let mut command = Command::new("/bin/cat");
         command
@@ -115,7 +117,7 @@ impl Holder {
     }
 }
 
-impl Drop for Holder {
+impl Drop for NamespaceHolder {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();

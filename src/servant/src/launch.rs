@@ -1,14 +1,16 @@
-//! What the daemon leaves in a servant's directory for its shim, and the shim for a later daemon.
+//! Records in a servant's directory: from the daemon to its shim, and from the shim to later daemons.
 //!
-//! | file | written by | holds |
+//! | file | written by | content |
 //! |---|---|---|
-//! | `spec.json` | daemon, before the shim starts | [`Launch`] |
-//! | `runtime.json` | shim, first thing | [`Runtime`]: what to end and remove when the shim cannot |
-//! | `shim.sock` | shim | where a daemon connects |
-//! | `log.jsonl`, `log.jsonl.1` | shim | what nodes printed |
-//! | `shim.log` | shim | its own complaints |
-//! | `exit.json` | shim, last thing | [`Exit`] |
-//! | `daemon.json` | daemon, while it runs | what it has to tell the next daemon ([`crate::local::LocalServant::leave`]) |
+//! | `spec.json` | daemon, before the shim starts | [`LaunchRecord`] |
+//! | `runtime.json` | shim, first thing | [`RuntimeRecord`]: what to end and remove if the shim cannot |
+//! | `shim.sock` | shim | socket for daemons |
+//! | `log.jsonl`, `log.jsonl.1` | shim | output of the nodes |
+//! | `shim.log` | shim | its own error messages |
+//! | `exit.json` | shim, last thing | [`ExitRecord`] |
+//! | `daemon.json` | daemon, while it runs | state for the next daemon ([`LocalServant::save_handover`]) |
+//!
+//! [`LocalServant::save_handover`]: crate::local::LocalServant::save_handover
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -21,51 +23,51 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::Error;
-use crate::cgroup::{Cgroup, Parent};
+use crate::cgroup::{Cgroup, CgroupParent};
 use crate::container::{ContainerSpec, Profile};
 use crate::engine::ContainerState;
-use crate::process::Identity;
+use crate::process::ProcessIdentity;
 use crate::protocol::NodeStatus;
 use crate::quotas::Quotas;
-use crate::spec::Limits;
+use crate::spec::ResourceLimits;
 
-/// [`Launch`]'s file.
+/// File of the [`LaunchRecord`].
 pub const SPEC: &str = "spec.json";
-/// [`Runtime`]'s file.
+/// File of the [`RuntimeRecord`].
 pub const RUNTIME: &str = "runtime.json";
-/// [`Exit`]'s file.
+/// File of the [`ExitRecord`].
 pub const EXIT: &str = "exit.json";
-/// What a daemon leaves for the next one.
+/// File of a daemon's state for the next one.
 pub const DAEMON: &str = "daemon.json";
-/// The shim's socket.
+/// Socket of the shim.
 pub const SOCKET: &str = "shim.sock";
-/// The shim's standard error.
+/// Standard error of the shim.
 pub const SHIM_LOG: &str = "shim.log";
 
 /// Cores that a shim may use, however few its servant has.
 const SHIM_CPUS: f64 = 0.1;
 
-/// Whether a servant may run with less than was asked for.
+/// Policy for servants some of whose limits cannot be enforced.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Isolation {
-    /// Refuse to start when any limit cannot be put in force.
+    /// Refuse to start if any limit cannot be put in force.
     #[default]
     Require,
-    /// Start, and say what is not in force.
+    /// Start, and report the limits that are not in force.
     BestEffort,
 }
 
-/// How long the nodes have to end by themselves.
+/// Time for nodes to end by themselves.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct Grace {
-    /// From SIGINT to SIGTERM.
+pub struct GracePeriods {
+    /// Time from SIGINT to SIGTERM.
     pub interrupt: Duration,
-    /// From SIGTERM to SIGKILL.
+    /// Time from SIGTERM to SIGKILL.
     pub terminate: Duration,
 }
 
-impl Default for Grace {
+impl Default for GracePeriods {
     fn default() -> Self {
         Self {
             interrupt: Duration::from_secs(3),
@@ -76,73 +78,73 @@ impl Default for Grace {
 
 /// Everything a shim needs to know.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Launch {
-    /// With the engine's default limits filled in.
+pub struct LaunchRecord {
+    /// Description of the container, with the engine's default limits filled in.
     pub spec: ContainerSpec,
-    /// First host uid and how many.
+    /// First host uid and number of uids.
     pub uid_range: (u32, u32),
-    /// Where its cgroup is made.
-    pub parent: Parent,
-    /// The shim's own limits; of processor time it never has more than its servant.
+    /// Parent of its cgroup.
+    pub parent: CgroupParent,
+    /// Limits of the shim itself; its processor time is also bounded by its servant's.
     #[serde(default)]
-    pub shim_limits: Limits,
-    /// Bounds of what a servant writes.
+    pub shim_limits: ResourceLimits,
+    /// Bounds on what a servant writes.
     #[serde(default)]
     pub quotas: Quotas,
-    /// Whether every limit must be in force.
+    /// Isolation policy.
     pub isolation: Isolation,
-    /// How long nodes have to end.
-    pub grace: Grace,
-    /// The static init.
+    /// Time for nodes to end by themselves.
+    pub grace: GracePeriods,
+    /// Path of the static init.
     pub init: PathBuf,
 }
 
-impl Launch {
-    /// Bounds of what this container writes.
+impl LaunchRecord {
+    /// Returns the bounds on what this container writes.
     pub(crate) fn quotas(&self) -> Quotas {
         match self.spec.profile {
             Profile::Servant => self.quotas,
-            Profile::Compile | Profile::Install => Quotas::of_build(),
+            Profile::Compile | Profile::Install => Quotas::for_build(),
         }
     }
 
-    /// What the shim may take beside a servant with these limits.
-    pub fn limits_of_shim(&self, servant: &Limits) -> Limits {
+    /// Returns the limits of the shim of a servant with these limits.
+    pub fn shim_limits_for(&self, servant: &ResourceLimits) -> ResourceLimits {
         // The Master must be able to answer at all.
         let most = servant.cpus.map(|cpus| cpus.max(SHIM_CPUS));
         let cpus = self.shim_limits.cpus.into_iter().chain(most);
-        Limits {
+        ResourceLimits {
             cpus: cpus.reduce(f64::min),
             ..self.shim_limits
         }
     }
 }
 
-/// What is left when a shim is gone without a word.
+/// Resources to end and remove if a shim was killed.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Runtime {
-    /// The shim.
-    pub shim: Identity,
-    /// The servant's cgroup.
+pub struct RuntimeRecord {
+    /// Identity of the shim.
+    pub shim: ProcessIdentity,
+    /// Cgroup of the servant.
     pub cgroup: Cgroup,
-    /// The shim's own; none where an earlier version started it.
+    /// Cgroup of the shim; `None` if an earlier version started it.
     #[serde(default)]
     pub shim_cgroup: Option<Cgroup>,
-    /// First host uid and how many.
+    /// First host uid and number of uids.
     pub uid_range: (u32, u32),
 }
 
-/// How a servant ended.
+/// Final record of a servant.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Exit {
-    /// Its last state.
+pub struct ExitRecord {
+    /// Final state.
     pub state: ContainerState,
-    /// Its nodes by name.
+    /// Nodes by name.
     pub nodes: BTreeMap<String, NodeStatus>,
 }
 
-/// Reads a file of ours; none when there is none.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, Error> {
+/// Reads a record; `None` if the file does not exist.
+pub fn read_record<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, Error> {
     let text = match fs::read(path) {
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         result => result.map_err(Error::file("read", path))?,
@@ -154,14 +156,14 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, Error> {
     })
 }
 
-/// Writes a file of ours, whole or not at all.
-pub fn write<T: Serialize>(path: &Path, value: &T) -> Result<(), Error> {
+/// Writes a record atomically.
+pub fn write_record<T: Serialize>(path: &Path, value: &T) -> Result<(), Error> {
     let text = serde_json::to_vec(value).map_err(|error| Error::Malformed {
         path: path.into(),
         reason: error.to_string(),
     })?;
     let half = path.with_extension("half");
-    // It may hold an environment, and with it secrets.
+    // The record may contain an environment with secrets.
     let mut options = fs::File::options();
     options.write(true).create(true).truncate(true).mode(0o600);
     let mut file = options.open(&half).map_err(Error::file("make", &half))?;

@@ -1,6 +1,7 @@
-//! Starts servants. The seam is [`engine`]: an engine is given a [`spec::Spec`] and gives a [`engine::Servant`], whose states,
-//! nodes and log can be watched. All other modules are of the engine of this host ([`local::LocalEngine`]); what it alone
-//! offers (pids, network namespaces, [`sandbox`]es for builds) is on its own types. Knows nothing of ROS and nothing of robots.
+//! Starts servants. The interface is [`engine`]: an engine gets a [`spec::Spec`] and returns a
+//! [`engine::ServantHandle`], whose state, nodes and log can be watched. All other modules belong to the engine of this
+//! host ([`local::LocalEngine`]); its additional features (pids, network namespaces, [`sandbox`]es for builds) are on
+//! its own types. Independent of ROS and of robots.
 //!
 //! ```text
 //!   daemon                     shim (one per servant, outlives the daemon)        container

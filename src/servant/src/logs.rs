@@ -1,8 +1,8 @@
-//! What nodes print: `log.jsonl` in the servant's directory, one JSON object a line ([`LogLine`] with its number), rotated
-//! once to `log.jsonl.1`.
+//! Output of the nodes: `log.jsonl` in the servant's directory, one JSON object per line ([`LogLine`] with its number),
+//! rotated once to `log.jsonl.1`.
 //!
-//! The shim writes ([`Writer`]), whoever wants reads ([`follow`], [`last`]): neither waits for the other. Lines are numbered, so that
-//! a reader who was too slow for the rotation is told how many it missed instead of missing them silently.
+//! The shim writes ([`LogWriter`]), others read ([`follow`], [`read_last`]); neither waits for the other. Lines are
+//! numbered, so that a reader that was too slow for a rotation is told how many lines it missed.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -10,48 +10,48 @@ use std::path::{Path, PathBuf};
 use std::time::{Instant, SystemTime};
 
 use crate::engine::LogLine;
-use crate::quotas::Rate;
+use crate::quotas::RateLimit;
 
 mod follow;
 mod tail;
 mod watches;
 
 pub use follow::follow;
-pub use tail::last;
-pub use watches::Watches;
+pub use tail::read_last;
+pub use watches::DirectoryWatches;
 
-/// The file's name in the servant's directory.
+/// Name of the file in the servant's directory.
 pub const FILE: &str = "log.jsonl";
 
-/// A longer line is cut into several.
+/// Maximum length of a line in bytes; longer ones are split.
 pub const LONGEST_LINE: usize = 16 * 1024;
 
 /// Bytes after which the file is rotated.
 pub const ROTATE_AT: u64 = 16 << 20;
 
-/// What a line takes in the file beside its text, about.
+/// Approximate bytes of a line in the file beside its text.
 const OVERHEAD: usize = 100;
 
-/// Appends lines.
+/// Appends lines to the log.
 #[derive(Debug)]
-pub struct Writer {
+pub struct LogWriter {
     path: PathBuf,
     file: File,
     written: u64,
     rotate_at: u64,
     number: u64,
     failed: bool,
-    rate: Rate,
-    /// Lines and bytes that came faster than that, and are not told of yet.
+    rate: RateLimit,
+    /// Lines and bytes that exceeded the rate and are not reported yet.
     dropped: (u64, u64),
 }
 
-impl Writer {
-    /// Starts an empty log at `path`.
+impl LogWriter {
+    /// Creates an empty log at `path`.
     pub fn create(path: &Path, rotate_at: u64, per_second: u64) -> io::Result<Self> {
         let file = open(path)?;
         Ok(Self {
-            rate: Rate::new(per_second, Instant::now()),
+            rate: RateLimit::new(per_second, Instant::now()),
             dropped: (0, 0),
             path: path.into(),
             file,
@@ -62,27 +62,27 @@ impl Writer {
         })
     }
 
-    /// Appends one line, or drops it where lines come faster than they may: then the first that passes is preceded by how many
-    /// did not. A full disk must not end a servant: what cannot be written is dropped, counted by the gap in
-    /// the numbers, and said once on standard error.
+    /// Appends one line, or drops it if lines exceed the rate limit: then the next line let through is preceded by the
+    /// number of dropped ones. A full disk must not end a servant: a line that cannot be written is dropped, which
+    /// shows as a gap in the numbers, and reported once on standard error.
     pub fn append(&mut self, node: &str, stream: &str, line: &str) {
         let bytes = (line.len() + OVERHEAD) as u64;
-        if !self.rate.passes(bytes, Instant::now()) {
+        if !self.rate.admits(bytes, Instant::now()) {
             self.dropped.0 += 1;
             self.dropped.1 += line.len() as u64;
             return;
         }
-        self.tell_dropped();
+        self.log_dropped();
         self.record(node, stream, line);
     }
 
-    /// Says what was dropped since it was said last.
-    pub fn tell_dropped(&mut self) {
+    /// Logs the number of lines dropped since the last call.
+    pub fn log_dropped(&mut self) {
         let (lines, bytes) = std::mem::take(&mut self.dropped);
         if lines > 0 {
             let told = format!(
-                "{lines} lines ({bytes} bytes) are not in this log: they came faster than {} bytes a second (log_rate in [servant] of \
-                 the configuration)",
+                "{lines} lines ({bytes} bytes) are not in this log: they came faster than {} bytes a second (log_rate \
+                 in [servant] of the configuration)",
                 self.rate.per_second()
             );
             self.record("cloudroid", "stderr", &told);
@@ -117,22 +117,22 @@ impl Writer {
         if self.written > 0 && self.written + text.len() as u64 > self.rotate_at {
             self.rotate()?;
         }
-        // One write, so that a reader never sees half of two lines mixed; half of one it waits for.
+        // A single write, so that readers never see parts of two lines mixed; a partial line they wait for.
         self.file.write_all(&text)?;
         self.written += text.len() as u64;
         Ok(())
     }
 
     fn rotate(&mut self) -> io::Result<()> {
-        fs::rename(&self.path, rotated(&self.path))?;
+        fs::rename(&self.path, rotated_path(&self.path))?;
         self.file = open(&self.path)?;
         self.written = 0;
         Ok(())
     }
 }
 
-/// Where the older half is.
-pub fn rotated(path: &Path) -> PathBuf {
+/// Returns the path of the older, rotated file.
+pub fn rotated_path(path: &Path) -> PathBuf {
     path.with_extension("jsonl.1")
 }
 
@@ -140,14 +140,14 @@ fn open(path: &Path) -> io::Result<File> {
     File::options().create(true).append(true).open(path)
 }
 
-/// Cuts what a process prints into lines.
+/// Splits the output of a process into lines.
 #[derive(Debug, Default)]
-pub struct Lines {
+pub struct LineSplitter {
     rest: Vec<u8>,
 }
 
-impl Lines {
-    /// Takes what was read and gives each line that is complete.
+impl LineSplitter {
+    /// Adds output, and calls `each` for every complete line.
     pub fn push(&mut self, mut bytes: &[u8], mut each: impl FnMut(&str)) {
         while let Some(end) = bytes.iter().position(|byte| *byte == b'\n') {
             self.rest.extend_from_slice(&bytes[..end]);
@@ -162,7 +162,7 @@ impl Lines {
         }
     }
 
-    /// Gives what is left without a line end.
+    /// Calls `each` for the rest if it has no line end.
     pub fn finish(mut self, mut each: impl FnMut(&str)) {
         if !self.rest.is_empty() {
             self.flush(&mut each);
@@ -173,7 +173,7 @@ impl Lines {
         let line = self.rest.strip_suffix(b"\r").unwrap_or(&self.rest);
         each(&String::from_utf8_lossy(line));
         self.rest.clear();
-        // One long line is no reason to hold its memory for the life of the servant.
+        // Releases the memory of a long line, which would otherwise be held for the life of the servant.
         self.rest.shrink_to(1024);
     }
 }
@@ -186,19 +186,19 @@ mod tests {
     fn lines_that_come_too_fast_are_left_out_and_that_is_said() {
         let home = tempfile::tempdir().unwrap();
         let path = home.path().join("log.jsonl");
-        let mut writer = Writer::create(&path, 1 << 20, 1024).unwrap();
+        let mut writer = LogWriter::create(&path, 1 << 20, 1024).unwrap();
         let line = "x".repeat(1000);
         for _ in 0..1000 {
             writer.append("/n", "stdout", &line);
         }
-        writer.tell_dropped();
-        writer.tell_dropped();
+        writer.log_dropped();
+        writer.log_dropped();
         let text = fs::read_to_string(&path).unwrap();
         let lines: Vec<LogLine> = text
             .lines()
             .map(|line| serde_json::from_str(line).unwrap())
             .collect();
-        // Ten seconds' worth, and what came while this ran.
+        // Ten seconds' worth, and what was admitted while this ran.
         let (told, kept): (Vec<_>, Vec<_>) =
             lines.iter().partition(|line| line.node == "cloudroid");
         assert!((9..500).contains(&kept.len()), "{}", kept.len());
@@ -206,7 +206,7 @@ mod tests {
         let left_out: usize = told.iter().filter_map(|line| count(line)).sum();
         assert_eq!(kept.len() + left_out, 1000);
         assert!(told[0].line.contains("log_rate"), "{}", told[0].line);
-        // No number is missing, which would be told as lost.
+        // No number is missing, which would be reported as lost lines.
         let numbers = lines.iter().map(|line| line.number.unwrap());
         assert!(numbers.eq(0..lines.len() as u64));
     }
@@ -215,7 +215,7 @@ mod tests {
     fn lines_come_whole_however_they_are_read() {
         let text = "one\r\n\ntwo \u{e9}\nrest";
         for size in 1..text.len() {
-            let (mut lines, mut seen) = (Lines::default(), Vec::new());
+            let (mut lines, mut seen) = (LineSplitter::default(), Vec::new());
             for part in text.as_bytes().chunks(size) {
                 lines.push(part, |line| seen.push(line.to_owned()));
             }
@@ -230,7 +230,7 @@ mod tests {
 
     #[test]
     fn a_line_without_an_end_is_cut() {
-        let (mut lines, mut lengths) = (Lines::default(), Vec::new());
+        let (mut lines, mut lengths) = (LineSplitter::default(), Vec::new());
         lines.push(&[b'x'; LONGEST_LINE * 2 + 7], |line| {
             lengths.push(line.len())
         });

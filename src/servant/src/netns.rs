@@ -1,5 +1,5 @@
-//! Network namespaces as values. A servant's holds nothing but `lo`; whoever talks to its nodes opens sockets *in*
-//! it and uses them outside, because a socket belongs for ever to the namespace it was made in.
+//! Network namespaces as values. A servant's namespace contains only `lo`; to talk to its nodes, sockets are opened
+//! *in* it and used outside, because a socket stays in the namespace it was created in.
 
 use std::fs::File;
 use std::io;
@@ -16,7 +16,7 @@ use tokio::sync::oneshot;
 
 use crate::Error;
 
-/// A network namespace, kept alive by this value. Two are equal when they are the same namespace.
+/// A network namespace, kept alive by this value. Two values are equal if they are the same namespace.
 #[derive(Debug)]
 pub struct NetNs {
     file: Arc<OwnedFd>,
@@ -39,8 +39,8 @@ impl AsFd for NetNs {
 }
 
 impl NetNs {
-    /// A new one with `lo` up. It belongs to the host's user namespace, so that not even a container's root may
-    /// configure it.
+    /// Creates a namespace with `lo` up. It belongs to the host's user namespace, so that not even root in a container
+    /// may configure it.
     pub fn create() -> Result<Self, Error> {
         in_own_thread(|| {
             unshare(CloneFlags::CLONE_NEWNET)
@@ -50,17 +50,17 @@ impl NetNs {
         })
     }
 
-    /// The one that the calling thread is in.
+    /// Returns the namespace of the calling thread.
     pub fn current() -> Result<Self, Error> {
         Self::from_path("/proc/thread-self/ns/net")
     }
 
-    /// That of a process. The caller makes sure that the pid is still the process it means (by a pidfd).
+    /// Returns the namespace of a process. The caller ensures, by a pidfd, that the pid still belongs to the process.
     pub fn from_pid(pid: i32) -> Result<Self, Error> {
         Self::from_path(&format!("/proc/{pid}/ns/net"))
     }
 
-    /// From an open file of the nsfs.
+    /// Wraps an open file of nsfs.
     pub fn from_fd(fd: OwnedFd) -> Result<Self, Error> {
         let file = File::from(fd);
         let metadata = file
@@ -77,7 +77,7 @@ impl NetNs {
         Self::from_fd(File::open(path).map_err(Error::file("open", path))?.into())
     }
 
-    /// Runs `work` on a thread of its own inside.
+    /// Runs `work` on a separate thread in the namespace.
     pub fn run<T: Send>(&self, work: impl FnOnce() -> T + Send) -> Result<T, Error> {
         in_own_thread(|| {
             setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
@@ -86,13 +86,13 @@ impl NetNs {
         })
     }
 
-    /// Puts the calling thread into it for good.
+    /// Moves the calling thread into the namespace for good.
     pub fn enter(&self) -> Result<(), Error> {
         setns(self.file.as_fd(), CloneFlags::CLONE_NEWNET)
             .map_err(Error::nix("setns to a network namespace"))
     }
 
-    /// Connects to `address` as seen from inside. Only the socket is made there; the connecting is awaited here.
+    /// Connects to `address` as seen from inside. Only the socket is created there; connecting is awaited here.
     pub async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
         let stream = self.socket(address, None).await?.connect(address).await?;
         stream.set_nodelay(true)?;
@@ -104,28 +104,29 @@ impl NetNs {
         self.socket(address, Some(address)).await?.listen(1024)
     }
 
-    /// A UDP socket bound to `address` as seen from inside; port 0 picks a free one. With `shared` others may be bound to
-    /// it, too, for multicast. What has come and was not read has room for 8 MiB, or for as much as the machine allows.
-    pub async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+    /// Opens a UDP socket bound to `address` as seen from inside; port 0 picks a free one. With `shared`, other sockets
+    /// may be bound to it, too, for multicast. The receive buffer is 8 MiB, or as much as the host allows.
+    pub async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         let fd = self.open(Kind::Datagrams { shared }, Some(address)).await?;
         UdpSocket::from_std(std::net::UdpSocket::from(fd))
     }
 
-    /// A socket by which the kernel tells of the sockets inside (sock_diag(7)).
-    pub async fn diagnostics(&self) -> io::Result<OwnedFd> {
+    /// Opens a socket for diagnostics of the sockets inside (sock_diag(7)).
+    pub async fn open_sock_diag(&self) -> io::Result<OwnedFd> {
         self.open(Kind::Diagnostics, None).await
     }
 
-    /// A TCP socket made inside, for addresses of the family of `address`; bound where that is asked for: of ports below
-    /// 1024 that takes a capability.
+    /// Opens a TCP socket inside, for the address family of `address`; bound if `bound` is given, which needs a
+    /// capability for ports below 1024.
     async fn socket(
         &self,
         address: SocketAddr,
         bound: Option<SocketAddr>,
     ) -> io::Result<TcpSocket> {
-        let kind = match address.is_ipv4() {
-            true => Kind::Stream(libc::AF_INET),
-            false => Kind::Stream(libc::AF_INET6),
+        let kind = if address.is_ipv4() {
+            Kind::Stream(libc::AF_INET)
+        } else {
+            Kind::Stream(libc::AF_INET6)
         };
         let fd = self.open(kind, bound).await?;
         Ok(TcpSocket::from_std_stream(std::net::TcpStream::from(fd)))
@@ -133,56 +134,56 @@ impl NetNs {
 
     async fn open(&self, kind: Kind, bound: Option<SocketAddr>) -> io::Result<OwnedFd> {
         let (answer, answered) = oneshot::channel();
-        let order = Order {
+        let order = SocketRequest {
             namespace: self.file.clone(),
             kind,
             bound,
             answer,
         };
         let gone = || io::Error::other("the thread that opens sockets in namespaces has ended");
-        opener().send(order).map_err(|_| gone())?;
+        socket_opener().send(order).map_err(|_| gone())?;
         answered.await.map_err(|_| gone())?
     }
 }
 
-/// What is to be opened.
+/// Kind of socket to open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    /// TCP, of this family.
+    /// TCP, of this address family.
     Stream(i32),
-    /// UDP, of the family of the address that it is bound to.
+    /// UDP, of the address family of the address it is bound to.
     Datagrams {
-        /// Whether others may be bound to it, too.
+        /// Allows other sockets on the same address.
         shared: bool,
     },
     /// `NETLINK_SOCK_DIAG`.
     Diagnostics,
 }
 
-struct Order {
+struct SocketRequest {
     namespace: Arc<OwnedFd>,
     kind: Kind,
     bound: Option<SocketAddr>,
     answer: oneshot::Sender<io::Result<OwnedFd>>,
 }
 
-/// One thread of the process does nothing but enter namespaces and open sockets there. It never goes back, so that
-/// there is no way back that could fail and leave a shared thread in a servant's network.
-fn opener() -> &'static mpsc::Sender<Order> {
-    static OPENER: OnceLock<mpsc::Sender<Order>> = OnceLock::new();
+/// Returns the channel to the one thread of the process that enters namespaces and opens sockets there. It never leaves
+/// a namespace otherwise, since a failure to return would leave a shared thread in a servant's network.
+fn socket_opener() -> &'static mpsc::Sender<SocketRequest> {
+    static OPENER: OnceLock<mpsc::Sender<SocketRequest>> = OnceLock::new();
     OPENER.get_or_init(|| {
-        let (sender, orders) = mpsc::channel::<Order>();
+        let (sender, orders) = mpsc::channel::<SocketRequest>();
         let work = move || {
-            // Where this fails it has more than it needs, as all threads of a program that is not the daemon.
-            let _ = privilege::only(&OPENERS);
+            // On failure it keeps more than it needs, like all threads of programs other than the daemon.
+            let _ = privilege::retain_capabilities(&OPENERS);
             for order in orders {
                 let socket = open_socket(order.namespace.as_fd(), order.kind, order.bound);
-                // Nobody waits any more when the asker was cancelled; the socket then closes.
+                // An error means that the caller was cancelled; the socket is then closed.
                 let _ = order.answer.send(socket);
             }
         };
-        // Where no thread can be started the receiver is dropped and every order is answered with an error.
-        privilege::now(|| {
+        // If no thread can be started, the receiver is dropped and every request is answered with an error.
+        privilege::run_sync(|| {
             let _ = std::thread::Builder::new()
                 .name("netns-sockets".into())
                 .stack_size(64 * 1024)
@@ -192,13 +193,14 @@ fn opener() -> &'static mpsc::Sender<Order> {
     })
 }
 
-/// What entering a namespace takes, and binding to ports below 1024 there, and room for more datagrams than everybody is allowed.
+/// Capabilities for entering namespaces, for binding to ports below 1024 there, and for larger receive buffers than
+/// ordinary users get.
 const OPENERS: [Capability; 3] = [
     Capability::CAP_SYS_ADMIN,
     Capability::CAP_NET_BIND_SERVICE,
     Capability::CAP_NET_ADMIN,
 ];
-/// For datagrams that have come and were not read yet: pictures come faster than they are read.
+/// Bytes of the receive buffer of UDP sockets: images arrive faster than they are read.
 const DATAGRAMS: usize = 8 << 20;
 
 fn open_socket(
@@ -219,14 +221,14 @@ fn open_socket(
     if fd < 0 {
         return Err(io::Error::last_os_error());
     }
-    // SAFETY: opened just now, owned by nobody else.
+    // SAFETY: just opened, owned by nobody else.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
     if let Kind::Datagrams { .. } = kind {
         let forced = setsockopt(&socket, sockopt::RcvBufForce, &DATAGRAMS);
         forced.or_else(|_| setsockopt(&socket, sockopt::RcvBuf, &DATAGRAMS))?;
     }
     if let Some(address) = bound {
-        // Of UDP it lets several sockets have one port.
+        // For UDP it allows several sockets on one port.
         let reuse = !matches!(kind, Kind::Datagrams { shared: false });
         setsockopt(&socket, sockopt::ReuseAddr, &reuse)?;
         bind(fd, &SockaddrStorage::from(address))?;
@@ -247,7 +249,7 @@ fn in_own_thread<T: Send>(work: impl FnOnce() -> Result<T, Error> + Send) -> Res
     })
 }
 
-/// Sets `IFF_UP` on `lo` of the calling thread's namespace (netdevice(7)).
+/// Sets `IFF_UP` on `lo` in the calling thread's namespace (netdevice(7)).
 fn bring_lo_up() -> Result<(), Error> {
     // SAFETY: no pointers.
     let fd = unsafe { libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
@@ -256,7 +258,7 @@ fn bring_lo_up() -> Result<(), Error> {
             io::Error::last_os_error(),
         ));
     }
-    // SAFETY: opened just now, owned by nobody else.
+    // SAFETY: just opened, owned by nobody else.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
     // SAFETY: an all-zero ifreq is valid.
     let mut request: libc::ifreq = unsafe { std::mem::zeroed() };
@@ -302,20 +304,20 @@ mod tests {
     async fn datagrams_meet_inside_and_the_kernel_tells_of_them() {
         let (one, two) = (NetNs::create().unwrap(), NetNs::create().unwrap());
         let loopback = || SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
-        let far = one.datagrams(loopback(), false).await.unwrap();
+        let far = one.bind_udp(loopback(), false).await.unwrap();
         let address = far.local_addr().unwrap();
-        let near = one.datagrams(loopback(), false).await.unwrap();
+        let near = one.bind_udp(loopback(), false).await.unwrap();
         near.send_to(b"hello", address).await.unwrap();
         let mut text = [0; 8];
         assert_eq!(far.recv_from(&mut text).await.unwrap().0, 5);
         assert!(
-            one.datagrams(address, false).await.is_err(),
+            one.bind_udp(address, false).await.is_err(),
             "the port is taken there"
         );
-        two.datagrams(address, false)
+        two.bind_udp(address, false)
             .await
             .expect("it is free elsewhere");
-        one.diagnostics()
+        one.open_sock_diag()
             .await
             .expect("a socket of the kernel's diagnostics");
         let room = nix::sys::socket::getsockopt(&far, sockopt::RcvBuf).unwrap();

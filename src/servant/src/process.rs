@@ -1,4 +1,4 @@
-//! Processes by more than their number.
+//! Processes identified by more than their pid.
 
 use std::fs;
 use std::io;
@@ -8,23 +8,23 @@ use std::sync::OnceLock;
 use serde::{Deserialize, Serialize};
 
 use crate::sys;
-pub use crate::sys::give_back_memory;
+pub use crate::sys::trim_heap;
 
-/// A process that is named in a file: its number alone may be somebody else's by the time it is read.
+/// Identity of a process in a record: its pid alone may have been reused by the time the record is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Identity {
+pub struct ProcessIdentity {
     /// Process id on the host.
     pub pid: i32,
-    /// Clock ticks from boot to its start (proc(5), /proc/PID/stat, field 22).
+    /// Start time in clock ticks since boot (proc(5), /proc/PID/stat, field 22).
     pub start: u64,
-    /// Which boot: the first half of its random id (proc(5), /proc/sys/kernel/random/boot_id). 0, in records of earlier
-    /// versions, is any.
+    /// First half of the random id of the boot (proc(5), /proc/sys/kernel/random/boot_id). 0, in records of earlier
+    /// versions, matches any.
     #[serde(default)]
     pub boot: u64,
 }
 
-/// The first half of this boot's id; 0 where `/proc` does not tell.
-fn boot() -> u64 {
+/// Returns the first half of this boot's id; 0 if `/proc` does not show it.
+fn boot_id() -> u64 {
     static BOOT: OnceLock<u64> = OnceLock::new();
     *BOOT.get_or_init(|| {
         let text = fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
@@ -33,11 +33,11 @@ fn boot() -> u64 {
     })
 }
 
-impl Identity {
-    /// That of a running process.
-    pub fn of(pid: i32) -> io::Result<Self> {
+impl ProcessIdentity {
+    /// Returns the identity of a running process.
+    pub fn from_pid(pid: i32) -> io::Result<Self> {
         let stat = fs::read_to_string(format!("/proc/{pid}/stat"))?;
-        // The name, in parentheses, may hold anything; fields are counted after its end.
+        // The name, in parentheses, may contain anything; fields are counted after its end.
         let start = stat
             .rsplit_once(") ")
             .and_then(|(_, fields)| fields.split(' ').nth(19)?.parse().ok());
@@ -45,39 +45,40 @@ impl Identity {
         Ok(Self {
             pid,
             start,
-            boot: boot(),
+            boot: boot_id(),
         })
     }
 
-    /// Whether a record is of the same process as another.
-    fn is(&self, found: &Self) -> bool {
+    /// Returns whether both are the same process.
+    fn matches(&self, found: &Self) -> bool {
         let boots_known = self.boot != 0 && found.boot != 0;
         (self.pid, self.start) == (found.pid, found.start)
             && (!boots_known || self.boot == found.boot)
     }
 
-    /// Holds on to it; none when it has ended.
-    pub fn open(&self) -> io::Result<Option<OwnedFd>> {
+    /// Opens a pidfd of the process; `None` if it has ended.
+    pub fn open_pidfd(&self) -> io::Result<Option<OwnedFd>> {
         let pidfd = match sys::pidfd_open(self.pid) {
             Err(error) if error.raw_os_error() == Some(libc::ESRCH) => return Ok(None),
             result => result?,
         };
-        // Compared after it was opened: from here on the number is surely that of the process held.
-        match Self::of(self.pid) {
-            Ok(found) if self.is(&found) && !has_ended(&pidfd) => Ok(Some(pidfd)),
+        // Compared after opening: from here on the pid certainly belongs to the process held.
+        match Self::from_pid(self.pid) {
+            Ok(found) if self.matches(&found) && !has_ended(&pidfd) => Ok(Some(pidfd)),
             Ok(_) => Ok(None),
-            Err(error) if is_of_nobody(&error) => Ok(None),
+            Err(error) if is_process_gone(&error) => Ok(None),
             Err(error) => Err(error),
         }
     }
 }
 
-/// Whether reading below `/proc/PID` failed because the process is gone: its directory is not there, or was opened before it went.
-fn is_of_nobody(error: &io::Error) -> bool {
+/// Returns whether reading below `/proc/PID` failed because the process is gone: its directory does not exist, or was
+/// opened before the process ended.
+fn is_process_gone(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::NotFound || error.raw_os_error() == Some(libc::ESRCH)
 }
 
-/// Whether a process has ended, reaped or not: its pidfd is readable then.
+/// Returns whether a process has ended, reaped or not: its pidfd is readable then.
 pub(crate) fn has_ended(pidfd: &OwnedFd) -> bool {
     let mut watched = [nix::poll::PollFd::new(
         pidfd.as_fd(),
@@ -86,7 +87,7 @@ pub(crate) fn has_ended(pidfd: &OwnedFd) -> bool {
     nix::poll::poll(&mut watched, nix::poll::PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
 }
 
-/// The number on the host of a process held by its pidfd (proc(5), /proc/PID/fdinfo).
+/// Returns the host pid of the process held by a pidfd (proc(5), /proc/PID/fdinfo).
 pub(crate) fn pid_of(pidfd: &OwnedFd) -> Option<i32> {
     use std::os::fd::AsRawFd;
     let text = fs::read_to_string(format!("/proc/self/fdinfo/{}", pidfd.as_raw_fd())).ok()?;
@@ -105,28 +106,28 @@ mod tests {
             .stdin(std::process::Stdio::piped())
             .spawn()
             .unwrap();
-        let identity = Identity::of(child.id() as i32).unwrap();
-        let pidfd = identity.open().unwrap().expect("it runs");
+        let identity = ProcessIdentity::from_pid(child.id() as i32).unwrap();
+        let pidfd = identity.open_pidfd().unwrap().expect("it runs");
         assert_eq!(pid_of(&pidfd), Some(identity.pid));
         assert!(!has_ended(&pidfd));
-        let stranger = Identity {
+        let stranger = ProcessIdentity {
             start: identity.start + 1,
             ..identity
         };
-        let of_another_boot = Identity {
+        let of_another_boot = ProcessIdentity {
             boot: identity.boot ^ 1,
             ..identity
         };
         for other in [stranger, of_another_boot] {
-            assert!(other.open().unwrap().is_none(), "{other:?}");
+            assert!(other.open_pidfd().unwrap().is_none(), "{other:?}");
         }
-        // What an earlier version wrote.
+        // Record of an earlier version.
         let text = format!(r#"{{"pid":{},"start":{}}}"#, identity.pid, identity.start);
-        let earlier: Identity = serde_json::from_str(&text).unwrap();
-        assert!(earlier.open().unwrap().is_some());
+        let earlier: ProcessIdentity = serde_json::from_str(&text).unwrap();
+        assert!(earlier.open_pidfd().unwrap().is_some());
         drop(child.stdin.take());
         child.wait().unwrap();
-        assert!(identity.open().unwrap().is_none());
+        assert!(identity.open_pidfd().unwrap().is_none());
         assert!(has_ended(&pidfd));
     }
 }

@@ -1,49 +1,48 @@
-//! What is said over `shim.sock`: JSON, one message a line. A daemon may connect at any time and as often as it
-//! likes; the shim answers each connection with [`FromShim::Hello`], which tells all there is to know, and from
-//! then on with what changes.
+//! Protocol of `shim.sock`: JSON, one message per line. A daemon may connect at any time and repeatedly; the shim
+//! greets each connection with [`ShimMessage::Hello`], which contains the complete state, and then sends changes.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::engine::{ContainerState, Enforced, NodeEvent, NodeExit};
-use crate::process::Identity;
-use crate::spec::{Limits, NodeSpec};
+use crate::engine::{ContainerState, EnforcedLimits, NodeEvent, NodeExit};
+use crate::process::ProcessIdentity;
+use crate::spec::{NodeSpec, ResourceLimits};
 
-/// A node as the shim knows it.
+/// Status of a node as known to the shim.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct NodeStatus {
-    /// Pid on the host while it runs.
+    /// Host pid while it runs.
     pub pid: Option<i32>,
-    /// How it ended last.
+    /// Most recent exit.
     pub exit: Option<NodeExit>,
-    /// How often it was started.
+    /// Number of starts.
     pub starts: u32,
-    /// For which run of its starter's, if that said so ([`crate::spec::RUN`]).
+    /// Run for which it was started, as named by the caller ([`crate::spec::RUN`]).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub run: Option<String>,
 }
 
 impl NodeStatus {
-    /// It has ended and does not run again at this moment.
-    pub fn ended(&self) -> Option<&NodeExit> {
+    /// Returns its exit if it has ended and is not running again.
+    pub fn current_exit(&self) -> Option<&NodeExit> {
         self.exit.as_ref().filter(|_| self.pid.is_none())
     }
 }
 
-/// The container as its shim knows it.
+/// State of the container as known to the shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
-    /// Where it is in its life.
+    /// State of the container.
     #[serde(flatten)]
     pub state: ContainerState,
-    /// Init's pid on the host while it runs.
+    /// Host pid of init while it runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init_pid: Option<i32>,
 }
 
 impl From<ContainerState> for Snapshot {
-    /// Of one without an init.
+    /// Makes a snapshot without an init.
     fn from(state: ContainerState) -> Self {
         Self {
             state,
@@ -52,49 +51,49 @@ impl From<ContainerState> for Snapshot {
     }
 }
 
-/// From the shim.
+/// Message from the shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "type")]
-pub enum FromShim {
-    /// First on every connection.
+pub enum ShimMessage {
+    /// First message on every connection.
     Hello {
-        /// Who speaks.
-        shim: Identity,
-        /// The container.
+        /// Identity of the shim.
+        shim: ProcessIdentity,
+        /// State of the container.
         state: Snapshot,
-        /// Its nodes by name.
+        /// Nodes by name.
         nodes: BTreeMap<String, NodeStatus>,
         /// Limits in force.
-        enforced: Enforced,
+        enforced: EnforcedLimits,
     },
     /// The container's state has changed.
     State {
-        /// The state that it is in now.
+        /// New state.
         state: Snapshot,
     },
     /// Something happened to a node.
     Node {
-        /// What became of the node.
+        /// Event of the node.
         event: NodeEvent,
-        /// How the node is now.
+        /// New status of the node.
         status: NodeStatus,
     },
     /// The limits in force have changed.
     Enforced {
-        /// The limits in force now.
-        enforced: Enforced,
+        /// Limits now in force.
+        enforced: EnforcedLimits,
     },
-    /// An answer to a [`Request`].
+    /// Reply to a [`ShimRequest`].
     Reply {
-        /// Id of the request that is answered.
+        /// Id of the request.
         id: u64,
-        /// None: done. Some: why not.
+        /// Reason of the failure; `None` on success.
         error: Option<String>,
     },
 }
 
 impl NodeEvent {
-    /// Which node it is about.
+    /// Returns the name of the node.
     pub fn node(&self) -> &str {
         match self {
             Self::Started { node }
@@ -105,20 +104,20 @@ impl NodeEvent {
     }
 }
 
-/// To the shim.
+/// Request to the shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Request {
-    /// Returned in the answer.
+pub struct ShimRequest {
+    /// Id repeated in the reply.
     pub id: u64,
-    /// The command.
+    /// Command to carry out.
     pub command: Command,
 }
 
-/// The command.
+/// Command to a shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Command {
-    /// Start one more node.
+    /// Start another node.
     StartNode(NodeSpec),
     /// Send a signal to a node's process group.
     SignalNode {
@@ -126,19 +125,19 @@ pub enum Command {
         node: String,
         /// Signal number.
         signal: i32,
-        /// It ends for good: is not started again, and the servant does not end with it.
+        /// The node ends for good: it is not restarted, and the servant does not end with it.
         #[serde(default)]
         last: bool,
     },
     /// Change limits.
-    SetLimits(Limits),
-    /// End the servant. Answered when it has begun; the end of the connection tells the rest.
+    SetLimits(ResourceLimits),
+    /// End the servant. Answered when the stop has begun; the end of the connection tells the rest.
     Stop,
 }
 
-/// A message as a line.
-pub(crate) fn line<T: Serialize>(message: &T) -> Vec<u8> {
-    // Our own types have string keys only, which is all that could fail.
+/// Encodes a message as a line.
+pub(crate) fn to_line<T: Serialize>(message: &T) -> Vec<u8> {
+    // Our types only have string keys; other keys are all that could fail.
     let mut text = serde_json::to_vec(message).unwrap_or_default();
     text.push(b'\n');
     text
@@ -157,36 +156,39 @@ mod tests {
             out_of_memory: false,
         };
         let messages = [
-            FromShim::State {
+            ShimMessage::State {
                 state: Snapshot {
                     state: ContainerState::Running,
                     init_pid: Some(7),
                 },
             },
-            FromShim::Node {
+            ShimMessage::Node {
                 event,
                 status: NodeStatus::default(),
             },
-            FromShim::Reply {
+            ShimMessage::Reply {
                 id: 1,
                 error: Some("no".into()),
             },
         ];
         for message in &messages {
-            let text = line(message);
+            let text = to_line(message);
             assert_eq!(text.iter().filter(|byte| **byte == b'\n').count(), 1);
-            assert_eq!(serde_json::from_slice::<FromShim>(&text).unwrap(), *message);
+            assert_eq!(
+                serde_json::from_slice::<ShimMessage>(&text).unwrap(),
+                *message
+            );
         }
-        // As every version has written them: a daemon must understand the shims that an earlier one has started.
+        // The format of all versions: a daemon must understand shims started by an earlier one.
         assert_eq!(
-            line(&messages[0]),
+            to_line(&messages[0]),
             b"{\"type\":\"state\",\"state\":{\"state\":\"running\",\"init_pid\":7}}\n"
         );
         let earlier = r#"{"type":"node","event":{"event":"started","node":"/a","pid":9},"status":{"pid":9,"exit":null,"starts":1}}"#;
-        let read: FromShim = serde_json::from_str(earlier).unwrap();
+        let read: ShimMessage = serde_json::from_str(earlier).unwrap();
         let started = NodeEvent::Started { node: "/a".into() };
-        assert!(matches!(read, FromShim::Node { event, .. } if event == started));
-        let request = Request {
+        assert!(matches!(read, ShimMessage::Node { event, .. } if event == started));
+        let request = ShimRequest {
             id: 3,
             command: Command::SignalNode {
                 node: "/a".into(),
@@ -195,7 +197,7 @@ mod tests {
             },
         };
         assert_eq!(
-            serde_json::from_slice::<Request>(&line(&request)).unwrap(),
+            serde_json::from_slice::<ShimRequest>(&to_line(&request)).unwrap(),
             request
         );
     }

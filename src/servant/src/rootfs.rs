@@ -1,9 +1,9 @@
-//! The root of a servant: its layers, each with shifted ids, under one overlay. Made in a mount namespace of the
-//! creating process's own, so that nothing shows on the host and nothing can be left behind; and at a place of that namespace
-//! that the container's root can reach, which the state directory (maybe below `/root`) need not be.
+//! The root of a servant: its layers, each idmapped, under one overlay. It is assembled in a mount namespace of the
+//! creating process, so that nothing is visible on the host and nothing can be left behind; and at a path of that
+//! namespace that the container's root user can reach, which the state directory (possibly below `/root`) need not be.
 //!
-//! Only the lower layers are shifted: an upper directory whose mount is shifted makes the overlay read-only, and a shifted
-//! overlay is refused (kernel 6.1 to 6.18). The upper directory belongs to the servant's root instead.
+//! Only the lower layers are idmapped: an idmapped upper directory makes the overlay read-only, and an idmapped overlay
+//! is refused (kernel 6.1 to 6.18). The upper directory is owned by the servant's root instead.
 
 use std::fs;
 use std::io;
@@ -22,44 +22,44 @@ mod stage;
 
 pub use skeleton::make_skeleton;
 
-/// Ids of the user that compiles, inside.
+/// Uid and gid of the compile user in the container.
 pub const COMPILE_USER: u32 = 1000;
 
-/// What a root is made of.
+/// Components of a root.
 #[derive(Debug, Clone, Copy)]
 pub struct Rootfs<'a> {
-    /// Lowest first.
+    /// Layers, lowest first.
     pub layers: &'a [PathBuf],
-    /// On top of them: mount points, hosts, hostname.
+    /// Topmost read-only layer: mount points, hosts, hostname.
     pub skeleton: &'a Path,
-    /// Where changes go; none for a read-only root.
+    /// Directory for changes; `None` for a read-only root.
     pub upper: Option<&'a Path>,
-    /// First host uid (= gid) and how many.
+    /// First host uid (= gid) and number of ids.
     pub uid_range: (u32, u32),
 }
 
-/// Where things are for the container to be made of. The paths exist in the mount namespace of the calling process only.
+/// Mounts staged for the creation of the container. The paths exist only in the mount namespace of the calling process.
 #[derive(Debug)]
-pub struct Staged {
-    /// The mounted root.
+pub struct StagedRoot {
+    /// Path of the mounted root.
     pub root: PathBuf,
-    /// The sources of the extra mounts, in their order.
+    /// Sources of the extra mounts, in order.
     pub volumes: Vec<PathBuf>,
-    /// The user namespace whose map the layers have, for the container to live in.
+    /// User namespace for the container, with the id mapping of the layers.
     pub user_namespace: OwnedFd,
 }
 
 impl Rootfs<'_> {
-    /// Mounts it and tells where. The calling process must have one thread: it moves to a mount namespace of its own
-    /// and changes its working directory.
-    pub fn mount(&self, volumes: &[Mount]) -> Result<Staged, Error> {
-        // Before the mounts that these are of are another namespace's.
+    /// Mounts the root and returns its paths. The calling process must have one thread: it moves to a new mount
+    /// namespace and changes its working directory.
+    pub fn mount(&self, volumes: &[Mount]) -> Result<StagedRoot, Error> {
+        // Copied before changing the namespace, since the originals belong to the old one.
         let copies = volumes
             .iter()
             .map(stage::copy_volume)
             .collect::<Result<Vec<_>, _>>()?;
-        let stage = stage::enter()?;
-        let shift = idmap::user_namespace(self.uid_range)?;
+        let stage = stage::enter_mount_namespace()?;
+        let shift = idmap::create_user_namespace(self.uid_range)?;
         let (lower, root) = (stage.join("lower"), stage.join("root"));
         for path in [&lower, &root] {
             make_directory(path)?;
@@ -102,7 +102,7 @@ impl Rootfs<'_> {
             stage::attach_volume(volume, copy, &place, &shift).map(|()| place)
         });
         let volumes = volumes.collect::<Result<_, _>>()?;
-        Ok(Staged {
+        Ok(StagedRoot {
             volumes,
             root,
             user_namespace: shift,
@@ -132,7 +132,7 @@ impl Rootfs<'_> {
                         .into(),
             }),
         };
-        // Nothing in a build is worth a flush to disk before it is a layer.
+        // A build's files are not worth flushing to disk before they become a layer.
         Ok(format!(
             ",upperdir={},workdir={},volatile",
             text(upper)?,
@@ -140,15 +140,20 @@ impl Rootfs<'_> {
         ))
     }
 
-    /// Makes directories inside the mounted root that belong to the compiling user; new ones above them to root.
-    pub fn make_owned(&self, root: &Path, directories: &[PathBuf]) -> Result<(), Error> {
+    /// Creates directories inside the mounted root that are owned by the compile user; newly created parents are owned
+    /// by root.
+    pub fn make_owned_directories(
+        &self,
+        root: &Path,
+        directories: &[PathBuf],
+    ) -> Result<(), Error> {
         let opened: OwnedFd = fs::File::open(root)
             .map_err(Error::file("open", root))?
             .into();
         for directory in directories {
             let mut walked = PathBuf::from("/");
             let mut handle = opened.try_clone().map_err(Error::file("open", root))?;
-            for name in directory.components().filter_map(normal) {
+            for name in directory.components().filter_map(normal_component) {
                 walked.push(name);
                 let made = nix::sys::stat::mkdirat(
                     &handle,
@@ -179,13 +184,13 @@ impl Rootfs<'_> {
     }
 }
 
-/// The overlay's scratch directory beside an upper directory, on the same filesystem as it must be.
+/// Returns the overlay's work directory beside an upper directory; it must be on the same file system.
 pub fn work_directory(upper: &Path) -> PathBuf {
     let name = upper.file_name().unwrap_or_default().to_string_lossy();
     upper.with_file_name(format!(".{name}.work"))
 }
 
-fn normal(component: Component<'_>) -> Option<&std::ffi::OsStr> {
+fn normal_component(component: Component<'_>) -> Option<&std::ffi::OsStr> {
     match component {
         Component::Normal(name) => Some(name),
         _ => None,

@@ -1,5 +1,5 @@
-//! Containers for builds. Only an engine of this host has them: what runs in one writes into a directory of this host, and
-//! whoever started it has to know which user ids its files belong to.
+//! Containers for builds. Only the engine of this host has them: a build writes into a directory of this host, and its
+//! caller must know the user ids of its files.
 
 use std::sync::Arc;
 
@@ -7,30 +7,30 @@ use async_trait::async_trait;
 
 use crate::Error;
 use crate::container::ContainerSpec;
-use crate::engine::Servant;
+use crate::engine::ServantHandle;
 use crate::local::LocalEngine;
 
 /// A container for a build.
-pub struct Sandboxed {
-    /// What runs in it.
-    pub servant: Arc<dyn Servant>,
-    /// First host uid (= gid) of its range: what uid 0 inside is outside.
+pub struct SandboxContainer {
+    /// Handle of the running container.
+    pub servant: Arc<dyn ServantHandle>,
+    /// First host uid (= gid) of its range: uid 0 in the container as seen on the host.
     pub uid_offset: u32,
 }
 
 /// Starts containers for builds.
 #[async_trait]
 pub trait Sandbox: Send + Sync + 'static {
-    /// Starts one; returns once its init runs.
-    async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, Error>;
+    /// Starts a container; returns once its init runs.
+    async fn start_sandbox(&self, spec: ContainerSpec) -> Result<SandboxContainer, Error>;
 }
 
 #[async_trait]
 impl Sandbox for LocalEngine {
-    async fn sandbox(&self, spec: ContainerSpec) -> Result<Sandboxed, Error> {
+    async fn start_sandbox(&self, spec: ContainerSpec) -> Result<SandboxContainer, Error> {
         let servant = self.start_container(spec).await?;
         let uid_offset = servant.uid_range().0;
-        Ok(Sandboxed {
+        Ok(SandboxContainer {
             servant,
             uid_offset,
         })

@@ -1,8 +1,8 @@
-//! Which system calls a servant may make: an allow-list as data, and what it becomes in an OCI specification.
+//! System calls that a servant may make: an allow-list as data, and its conversion to an OCI specification.
 //!
-//! What is not listed answers `ENOSYS`, so that a C library that probes for newer calls falls back to older ones. What is
-//! known and refused answers `EPERM`. The usual container lists let a process without capabilities make a user
-//! namespace and mount in it; this one does not.
+//! Calls that are not listed return `ENOSYS`, so that a C library that probes for newer calls falls back to older ones.
+//! Known calls that are refused return `EPERM`. The usual lists of container runtimes let a process without
+//! capabilities create a user namespace and mount in it; this one does not.
 
 use oci_spec::OciSpecError;
 use oci_spec::runtime::{
@@ -12,8 +12,9 @@ use oci_spec::runtime::{
 
 use crate::container::Profile;
 
-/// Allowed whatever their arguments. Not among them: `io_setup` and its like, since the requests that may wait are counted for
-/// the whole host (`fs.aio-max-nr`), which one servant could use up. Programs that find no such call do without.
+/// Calls allowed with any arguments. `io_setup` and its relatives are not among them, since their pending requests are
+/// limited for the whole host (`fs.aio-max-nr`), which one servant could exhaust. Programs that find no such call do
+/// without.
 const ALLOWED: &[&str] = &[
     // files
     "access chdir chmod chown close close_range copy_file_range creat dup dup2 dup3 faccessat faccessat2 fadvise64 \
@@ -24,7 +25,7 @@ const ALLOWED: &[&str] = &[
      readlinkat readv removexattr rename renameat renameat2 rmdir sendfile setxattr splice stat statfs statx symlink \
      symlinkat sync sync_file_range syncfs tee truncate umask unlink unlinkat utime utimensat utimes vmsplice write \
      writev",
-    // waiting
+    // waiting for events
     "epoll_create epoll_create1 epoll_ctl epoll_pwait epoll_pwait2 epoll_wait eventfd eventfd2 inotify_add_watch \
      inotify_init inotify_init1 inotify_rm_watch poll ppoll pselect6 select",
     // memory
@@ -44,7 +45,7 @@ const ALLOWED: &[&str] = &[
     // time
     "alarm clock_getres clock_gettime clock_nanosleep getitimer gettimeofday nanosleep setitimer time timer_create \
      timer_delete timer_getoverrun timer_gettime timer_settime timerfd_create timerfd_gettime timerfd_settime",
-    // talking to one another
+    // communication
     "accept accept4 bind connect getpeername getsockname getsockopt listen mq_getsetattr mq_notify mq_open \
      mq_timedreceive mq_timedsend mq_unlink msgctl msgget msgrcv msgsnd pipe pipe2 recvfrom recvmmsg recvmsg semctl \
      semget semop semtimedop sendmmsg sendmsg sendto setsockopt shmat shmctl shmdt shmget shutdown",
@@ -52,10 +53,10 @@ const ALLOWED: &[&str] = &[
     "getrandom",
 ];
 
-/// Further ones that compilers, package managers and their tests use; none opens a way out.
+/// Further calls that compilers, package managers and their tests use; none allows an escape.
 const BUILDS_TOO: &[&str] = &["mbind", "name_to_handle_at", "set_mempolicy"];
 
-/// Known and refused with `EPERM`.
+/// Known calls that are refused with `EPERM`.
 const REFUSED: &[&str] = &[
     // namespaces and mounts
     "chroot fsconfig fsmount fsopen fspick mount mount_setattr move_mount open_tree pivot_root setns umount2 unshare",
@@ -68,40 +69,40 @@ const REFUSED: &[&str] = &[
      clock_adjtime clock_settime",
 ];
 
-/// The `CLONE_NEW*` flags (sched.h), all of which `clone` must not carry.
+/// The `CLONE_NEW*` flags (sched.h); `clone` must have none of them.
 const CLONE_NEW: u64 = 0x7E02_0000;
 
 /// Socket families: unix, IPv4, IPv6, netlink. Not vsock, which no network namespace confines.
 const FAMILIES: [u64; 4] = [1, 2, 10, 16];
 
-/// Families of pairs: unix. The kernel has others, whose modules it would load for the asking.
+/// Families of socket pairs: unix. For others the kernel would load modules on request.
 const PAIRED: [u64; 1] = [1];
 
-/// Execution domains: Linux, 32-bit addresses' limit, no address randomisation, both, and the question which it is.
+/// Execution domains: Linux, 32-bit address limit, no address randomisation, both, and the query of the current one.
 const PERSONALITIES: [u64; 5] = [0x0, 0x8, 0x2_0000, 0x2_0008, 0xffff_ffff];
 
 const LOW_WORD: u64 = 0xffff_ffff;
 
-/// The names in groups of them.
-fn names(groups: &[&'static str]) -> Vec<&'static str> {
+/// Splits groups of names.
+fn split_names(groups: &[&'static str]) -> Vec<&'static str> {
     groups
         .iter()
         .flat_map(|group| group.split_whitespace())
         .collect()
 }
 
-/// Calls that are refused to all that runs for strangers.
-pub(crate) fn refused() -> impl Iterator<Item = &'static str> {
-    names(REFUSED).into_iter()
+/// Returns the calls that are refused to all untrusted processes.
+pub(crate) fn refused_calls() -> impl Iterator<Item = &'static str> {
+    split_names(REFUSED).into_iter()
 }
 
-/// The profile as part of an OCI specification.
-pub fn profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
-    let mut allowed = names(ALLOWED);
+/// Builds the seccomp profile of an OCI specification.
+pub fn build_profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
+    let mut allowed = split_names(ALLOWED);
     if profile != Profile::Servant {
         allowed.extend(BUILDS_TOO);
     }
-    let mut refused = names(REFUSED);
+    let mut refused = split_names(REFUSED);
     refused.retain(|name| !allowed.contains(name));
     let mut rules = vec![
         rule(&allowed, LinuxSeccompAction::ScmpActAllow, None, vec![])?,
@@ -115,9 +116,9 @@ pub fn profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
             &["clone"],
             LinuxSeccompAction::ScmpActAllow,
             None,
-            vec![masked(0, CLONE_NEW, 0)?],
+            vec![masked_equal(0, CLONE_NEW, 0)?],
         )?,
-        // Its flags are behind a pointer, where no filter can see them; glibc falls back to clone.
+        // Its flags are behind a pointer, which no filter can follow; glibc falls back to clone.
         rule(
             &["clone3"],
             LinuxSeccompAction::ScmpActErrno,
@@ -135,20 +136,20 @@ pub fn profile(profile: Profile) -> Result<LinuxSeccomp, OciSpecError> {
                 &[name],
                 LinuxSeccompAction::ScmpActAllow,
                 None,
-                vec![masked(0, LOW_WORD, *value)?],
+                vec![masked_equal(0, LOW_WORD, *value)?],
             )?);
         }
     }
     LinuxSeccompBuilder::default()
         .default_action(LinuxSeccompAction::ScmpActErrno)
         .default_errno_ret(libc::ENOSYS as u32)
-        .architectures(vec![native()])
+        .architectures(vec![native_arch()])
         .syscalls(rules)
         .build()
 }
 
-/// Only this machine's own calls: an i386 or x32 call ends the process.
-fn native() -> Arch {
+/// Allows only this machine's native calls: an i386 or x32 call ends the process.
+fn native_arch() -> Arch {
     if cfg!(target_arch = "aarch64") {
         Arch::ScmpArchAarch64
     } else {
@@ -173,10 +174,10 @@ fn rule(
     builder.build()
 }
 
-/// `argument & mask == wanted`. The specification says `value` is the mask and `valueTwo` what is wanted; libcontainer
-/// 0.7.0 has them the other way round, and the right way round would let `clone` make user namespaces. Its version is pinned,
-/// and a test makes the real call.
-fn masked(index: usize, mask: u64, wanted: u64) -> Result<LinuxSeccompArg, OciSpecError> {
+/// Builds the condition `argument & mask == wanted`. According to the specification `value` is the mask and `valueTwo`
+/// the wanted value; libcontainer 0.7.0 swaps them, and the specified order would let `clone` create user namespaces.
+/// Its version is pinned, and a test makes the real call.
+fn masked_equal(index: usize, mask: u64, wanted: u64) -> Result<LinuxSeccompArg, OciSpecError> {
     LinuxSeccompArgBuilder::default()
         .index(index)
         .op(LinuxSeccompOperator::ScmpCmpMaskedEq)
@@ -194,23 +195,27 @@ mod tests {
     #[test]
     fn no_call_is_both_allowed_and_refused() {
         for list in [ALLOWED, BUILDS_TOO, REFUSED] {
-            let list = names(list);
+            let list = split_names(list);
             let once: BTreeSet<_> = list.iter().collect();
             assert_eq!(once.len(), list.len(), "a name is listed twice");
         }
-        let refused = names(REFUSED);
-        assert!(names(ALLOWED).iter().all(|name| !refused.contains(name)));
+        let refused = split_names(REFUSED);
+        assert!(
+            split_names(ALLOWED)
+                .iter()
+                .all(|name| !refused.contains(name))
+        );
     }
 
     #[test]
     fn every_profile_refuses_namespaces() {
         for kind in [Profile::Servant, Profile::Compile, Profile::Install] {
-            let text = serde_json::to_string(&profile(kind).unwrap()).unwrap();
+            let text = serde_json::to_string(&build_profile(kind).unwrap()).unwrap();
             for name in
                 "unshare setns mount ptrace keyctl bpf io_uring_setup userfaultfd".split(' ')
             {
                 assert!(
-                    !names(ALLOWED).contains(&name) && !BUILDS_TOO.contains(&name),
+                    !split_names(ALLOWED).contains(&name) && !BUILDS_TOO.contains(&name),
                     "{name}"
                 );
                 assert!(text.contains(name), "{name} is refused by name");

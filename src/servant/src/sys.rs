@@ -6,7 +6,7 @@ use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
-fn check(result: libc::c_long) -> io::Result<libc::c_long> {
+fn check_result(result: libc::c_long) -> io::Result<libc::c_long> {
     if result < 0 {
         Err(io::Error::last_os_error())
     } else {
@@ -14,9 +14,9 @@ fn check(result: libc::c_long) -> io::Result<libc::c_long> {
     }
 }
 
-fn owned(result: libc::c_long) -> io::Result<OwnedFd> {
+fn into_owned_fd(result: libc::c_long) -> io::Result<OwnedFd> {
     // SAFETY: the call returned a new descriptor, which nobody else owns.
-    check(result).map(|fd| unsafe { OwnedFd::from_raw_fd(fd as RawFd) })
+    check_result(result).map(|fd| unsafe { OwnedFd::from_raw_fd(fd as RawFd) })
 }
 
 fn c_path(path: &Path) -> io::Result<CString> {
@@ -24,17 +24,17 @@ fn c_path(path: &Path) -> io::Result<CString> {
         .map_err(|_| io::Error::from(io::ErrorKind::InvalidInput))
 }
 
-/// A descriptor of a process (pidfd_open(2)).
+/// Opens a pidfd (pidfd_open(2)).
 pub(crate) fn pidfd_open(pid: i32) -> io::Result<OwnedFd> {
     // SAFETY: no pointers.
-    owned(unsafe { libc::syscall(libc::SYS_pidfd_open, pid, 0) })
+    into_owned_fd(unsafe { libc::syscall(libc::SYS_pidfd_open, pid, 0) })
 }
 
 /// Sends a signal to exactly that process (pidfd_send_signal(2)).
 pub(crate) fn pidfd_send_signal(pidfd: BorrowedFd<'_>, signal: i32) -> io::Result<()> {
     let none = std::ptr::null::<libc::siginfo_t>();
     // SAFETY: a null siginfo is allowed.
-    check(unsafe {
+    check_result(unsafe {
         libc::syscall(
             libc::SYS_pidfd_send_signal,
             pidfd.as_raw_fd(),
@@ -52,34 +52,38 @@ pub(crate) fn close_range(first: u32, last: u32) -> io::Result<()> {
         return Ok(());
     }
     // SAFETY: no pointers. The caller owns no descriptor in the range.
-    check(unsafe { libc::syscall(libc::SYS_close_range, first, last, 0) }).map(drop)
+    check_result(unsafe { libc::syscall(libc::SYS_close_range, first, last, 0) }).map(drop)
 }
 
-/// A detached copy of the mount at `path` (open_tree(2)).
+/// Returns a detached copy of the mount at `path` (open_tree(2)).
 pub(crate) fn clone_mount(path: &Path) -> io::Result<OwnedFd> {
     let path = c_path(path)?;
     let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC;
     // SAFETY: `path` ends in a zero byte and outlives the call.
-    owned(unsafe { libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags) })
+    into_owned_fd(unsafe {
+        libc::syscall(libc::SYS_open_tree, libc::AT_FDCWD, path.as_ptr(), flags)
+    })
 }
 
-/// A detached copy of the mount of what is open, from there on (open_tree(2)).
-pub(crate) fn clone_opened(opened: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+/// Returns a detached copy of the mount of an open file or directory, from there on (open_tree(2)).
+pub(crate) fn clone_mount_of(opened: BorrowedFd<'_>) -> io::Result<OwnedFd> {
     let flags = libc::OPEN_TREE_CLONE | libc::OPEN_TREE_CLOEXEC | libc::AT_EMPTY_PATH as u32;
-    // SAFETY: an empty path, which is that of the descriptor itself.
-    owned(unsafe { libc::syscall(libc::SYS_open_tree, opened.as_raw_fd(), c"".as_ptr(), flags) })
+    // SAFETY: an empty path, which refers to the descriptor itself.
+    into_owned_fd(unsafe {
+        libc::syscall(libc::SYS_open_tree, opened.as_raw_fd(), c"".as_ptr(), flags)
+    })
 }
 
-/// Shifts the ids of a detached mount by a user namespace's map and makes it read-only (mount_setattr(2)).
-pub(crate) fn shift_mount(mount: BorrowedFd<'_>, user_namespace: BorrowedFd<'_>) -> io::Result<()> {
+/// Applies the id mapping of a user namespace to a detached mount and makes it read-only (mount_setattr(2)).
+pub(crate) fn idmap_mount(mount: BorrowedFd<'_>, user_namespace: BorrowedFd<'_>) -> io::Result<()> {
     let attributes = libc::mount_attr {
         attr_set: libc::MOUNT_ATTR_IDMAP | libc::MOUNT_ATTR_RDONLY | libc::MOUNT_ATTR_NODEV,
         attr_clr: 0,
         propagation: 0,
         userns_fd: user_namespace.as_raw_fd() as u64,
     };
-    // SAFETY: an empty path and a live structure of the stated size.
-    check(unsafe {
+    // SAFETY: an empty path and a live structure of the given size.
+    check_result(unsafe {
         libc::syscall(
             libc::SYS_mount_setattr,
             mount.as_raw_fd(),
@@ -96,7 +100,7 @@ pub(crate) fn shift_mount(mount: BorrowedFd<'_>, user_namespace: BorrowedFd<'_>)
 pub(crate) fn attach_mount(mount: BorrowedFd<'_>, target: &Path) -> io::Result<()> {
     let target = c_path(target)?;
     // SAFETY: both paths end in a zero byte and outlive the call.
-    check(unsafe {
+    check_result(unsafe {
         libc::syscall(
             libc::SYS_move_mount,
             mount.as_raw_fd(),
@@ -116,8 +120,8 @@ pub(crate) fn open_in_root(root: BorrowedFd<'_>, path: &Path) -> io::Result<Owne
     let mut how: libc::open_how = unsafe { std::mem::zeroed() };
     how.flags = (libc::O_DIRECTORY | libc::O_CLOEXEC) as u64;
     how.resolve = libc::RESOLVE_IN_ROOT | libc::RESOLVE_NO_MAGICLINKS;
-    // SAFETY: a path that ends in a zero byte and a live structure of the stated size.
-    owned(unsafe {
+    // SAFETY: a path that ends in a zero byte and a live structure of the given size.
+    into_owned_fd(unsafe {
         libc::syscall(
             libc::SYS_openat2,
             root.as_raw_fd(),
@@ -128,8 +132,8 @@ pub(crate) fn open_in_root(root: BorrowedFd<'_>, path: &Path) -> io::Result<Owne
     })
 }
 
-/// Locks one byte of a file for whoever holds this open file description (fcntl(2), open file description locks).
-/// False when somebody else has it.
+/// Locks one byte of a file for this open file description (fcntl(2), open file description locks). Returns false if
+/// another holds it.
 pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     // SAFETY: an all-zero flock is valid.
     let mut lock: libc::flock = unsafe { std::mem::zeroed() };
@@ -138,7 +142,7 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     lock.l_start = at;
     lock.l_len = 1;
     // SAFETY: a live structure.
-    match check(libc::c_long::from(unsafe {
+    match check_result(libc::c_long::from(unsafe {
         libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &lock)
     })) {
         Ok(_) => Ok(true),
@@ -149,8 +153,8 @@ pub(crate) fn lock_byte(file: BorrowedFd<'_>, at: i64) -> io::Result<bool> {
     }
 }
 
-/// Gives memory of this process that was freed back to the kernel (malloc_trim(3)).
-pub fn give_back_memory() {
+/// Returns freed memory of this process to the kernel (malloc_trim(3)).
+pub fn trim_heap() {
     #[cfg(target_env = "gnu")]
     // SAFETY: no pointers; may be called at any time.
     unsafe {
@@ -162,8 +166,8 @@ pub fn give_back_memory() {
 mod tests {
     use super::*;
 
-    /// Kilobytes of this process that are no file's.
-    fn allocated() -> u64 {
+    /// Returns the anonymous memory of this process in KiB.
+    fn anonymous_memory_kib() -> u64 {
         let status = std::fs::read_to_string("/proc/self/status").expect("/proc");
         let line = status
             .lines()
@@ -177,9 +181,9 @@ mod tests {
         let mut many: Vec<Vec<u8>> = (0..64 << 10).map(|_| vec![1; 1 << 10]).collect();
         let last = many.pop();
         many.clear();
-        let held = allocated();
-        give_back_memory();
-        let left = allocated();
+        let held = anonymous_memory_kib();
+        trim_heap();
+        let left = anonymous_memory_kib();
         assert!(left + (32 << 10) < held, "{left} kB of {held} kB");
         drop(last);
     }

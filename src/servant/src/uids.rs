@@ -1,8 +1,8 @@
-//! Each servant has 65536 user ids that nothing else on the host uses. A range is taken by locking one byte of a file
-//! that all engines of the host share; the lock is held by the shim and ends with it, however that ends.
+//! Allocation of user ids: each servant has 65536 that nothing else on the host uses. A range is taken by locking one
+//! byte of a file shared by all engines of the host; the shim holds the lock, which ends with it, however that ends.
 //!
-//! A file that was removed keeps the locks of those who have it open, and its successor knows nothing of them: so an engine looks
-//! at what its servants' records say, too.
+//! A deleted file keeps the locks of those who have it open, and its successor does not know them: so an engine also
+//! checks its servants' records.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -13,18 +13,22 @@ use std::path::Path;
 
 use crate::{Error, launch, sys};
 
-/// Ids in a range.
+/// Number of ids in a range.
 pub const RANGE: u32 = 65536;
 
-/// Uids that Linux leaves alone end below this one (systemd, docs/UIDS-GIDS.md).
+/// End of the uids that Linux leaves alone (systemd, docs/UIDS-GIDS.md).
 const END: u32 = 0x7ffe_0000;
 
-/// The file that all engines of the host share.
+/// File shared by all engines of the host.
 pub const LOCKS: &str = "/run/cloudroid/uid-ranges";
 
-/// Takes a free range from `base` on, by a lock in the file `path`: its first uid, and the lock to keep. Those whose first uid is
-/// among `held` are passed over, whatever their locks.
-pub fn take(path: &Path, base: u32, held: &BTreeSet<u32>) -> Result<(u32, OwnedFd), Error> {
+/// Takes a free range from `base` on, by a lock in the file `path`; returns its first uid, and the lock to keep. Ranges
+/// whose first uid is in `held` are skipped, whatever their locks.
+pub fn lock_free_range(
+    path: &Path,
+    base: u32,
+    held: &BTreeSet<u32>,
+) -> Result<(u32, OwnedFd), Error> {
     let directory = path.parent().unwrap_or(path);
     fs::create_dir_all(directory).map_err(Error::file("make", directory))?;
     let file: OwnedFd = open(path).map_err(Error::file("open", path))?.into();
@@ -45,26 +49,30 @@ pub fn take(path: &Path, base: u32, held: &BTreeSet<u32>) -> Result<(u32, OwnedF
     })
 }
 
-/// First uids of the ranges that the records below `servants` name, whether their shims run or not: of a servant whose shim was
-/// killed, processes may be left for as long as its directory is.
-pub fn held(servants: &Path) -> Result<BTreeSet<u32>, Error> {
-    /// What is the same in both records.
+/// Returns the first uids of the ranges in the records below `servants`, whether their shims run or not: processes of a
+/// servant whose shim was killed may remain for as long as its directory exists.
+pub fn claimed_ranges(servants: &Path) -> Result<BTreeSet<u32>, Error> {
+    /// The part that both records have in common.
     #[derive(serde::Deserialize)]
-    struct Held {
+    struct UidRangeRecord {
         uid_range: (u32, u32),
     }
     let mut held = BTreeSet::new();
     for entry in fs::read_dir(servants).map_err(Error::file("read", servants))? {
         let directory = entry.map_err(Error::file("read", servants))?.path();
-        // What cannot be read was being written: nothing has those ids yet.
-        let record = |name| launch::read::<Held>(&directory.join(name)).ok().flatten();
+        // An unreadable record was just being written: nothing uses those ids yet.
+        let record = |name| {
+            launch::read_record::<UidRangeRecord>(&directory.join(name))
+                .ok()
+                .flatten()
+        };
         let record = record(launch::RUNTIME).or_else(|| record(launch::SPEC));
         held.extend(record.map(|record| record.uid_range.0));
     }
     Ok(held)
 }
 
-/// For this user alone: whoever can open it can hold any range, by a lock that only reads.
+/// Opens the lock file for this user alone: anybody who can open it could hold any range, even by a read lock.
 fn open(path: &Path) -> io::Result<File> {
     let file = File::options()
         .create(true)
@@ -73,7 +81,7 @@ fn open(path: &Path) -> io::Result<File> {
         .read(true)
         .mode(0o600)
         .open(path)?;
-    // An earlier version made it for all to read.
+    // An earlier version made it readable for all.
     file.set_permissions(fs::Permissions::from_mode(0o600))?;
     Ok(file)
 }
@@ -88,15 +96,15 @@ mod tests {
         let path = place.path().join("uid-ranges");
         let base = END - 2 * RANGE;
         let nobody = BTreeSet::new();
-        let (one, lock) = take(&path, base, &nobody).unwrap();
-        let (two, _other) = take(&path, base, &nobody).unwrap();
+        let (one, lock) = lock_free_range(&path, base, &nobody).unwrap();
+        let (two, _other) = lock_free_range(&path, base, &nobody).unwrap();
         assert_eq!((one, two), (base, base + RANGE));
         assert!(matches!(
-            take(&path, base, &nobody),
+            lock_free_range(&path, base, &nobody),
             Err(Error::NoUidRange { ranges: 2, .. })
         ));
         drop(lock);
-        assert_eq!(take(&path, base, &nobody).unwrap().0, base);
+        assert_eq!(lock_free_range(&path, base, &nobody).unwrap().0, base);
     }
 
     #[test]
@@ -116,9 +124,12 @@ mod tests {
             fs::write(record, record_text.to_string()).unwrap();
         }
         fs::create_dir(servants.join("half-made")).unwrap();
-        let held = held(&servants).unwrap();
+        let held = claimed_ranges(&servants).unwrap();
         assert_eq!(held, BTreeSet::from([base, base + RANGE]));
-        assert_eq!(take(&path, base, &held).unwrap().0, base + 2 * RANGE);
+        assert_eq!(
+            lock_free_range(&path, base, &held).unwrap().0,
+            base + 2 * RANGE
+        );
     }
 
     #[test]

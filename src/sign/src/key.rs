@@ -1,4 +1,4 @@
-//! The server's key, and what robots keep of it.
+//! The server's signing key, and its public key as kept by robots.
 
 use std::fmt;
 use std::fs::OpenOptions;
@@ -14,9 +14,9 @@ use sha2::{Digest, Sha256};
 
 use crate::{Error, wire};
 
-/// What OpenSSH calls such keys.
+/// Name of the key type in OpenSSH.
 pub const ALGORITHM: &str = "ssh-ed25519";
-/// What stands before the 32 bytes of a private key in PKCS #8 (RFC 8410, section 7).
+/// Bytes before the 32 bytes of a private key in PKCS #8 (RFC 8410, section 7).
 const PKCS8: [u8; 16] = [
     0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20,
 ];
@@ -29,8 +29,8 @@ pub struct SigningKey {
 }
 
 impl SigningKey {
-    /// The key in a file, made at the first time. Only its owner may read the file.
-    pub fn of_file(path: &Path) -> Result<SigningKey, Error> {
+    /// Loads the key from a file, creating it the first time. Only the file's owner may read it.
+    pub fn load_or_create(path: &Path) -> Result<SigningKey, Error> {
         let io = |action| {
             let path = path.to_owned();
             move |source| Error::Io {
@@ -43,7 +43,7 @@ impl SigningKey {
             Ok(text) => Self::from_pem(&text).ok_or_else(|| Error::NoKey(path.to_owned())),
             Err(error) if error.kind() == ErrorKind::NotFound => {
                 let (key, text) = Self::generate()?;
-                // Whole or not at all.
+                // Written atomically.
                 let half = path.with_extension("half");
                 let _ = std::fs::remove_file(&half);
                 let mut file = OpenOptions::new()
@@ -62,7 +62,7 @@ impl SigningKey {
         }
     }
 
-    /// A new key, and its PEM form.
+    /// Generates a new key; returns it with its PEM form.
     pub fn generate() -> Result<(SigningKey, String), Error> {
         let mut seed = [0; 32];
         SystemRandom::new()
@@ -84,8 +84,8 @@ impl SigningKey {
         Some(SigningKey { pair })
     }
 
-    /// What others verify by.
-    pub fn public(&self) -> PublicKey {
+    /// Returns the public key, by which others verify.
+    pub fn public_key(&self) -> PublicKey {
         let mut bytes = [0; 32];
         bytes.copy_from_slice(self.pair.public_key().as_ref());
         PublicKey(bytes)
@@ -98,7 +98,7 @@ impl SigningKey {
 
 impl fmt::Debug for SigningKey {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "SigningKey({})", self.public().fingerprint())
+        write!(out, "SigningKey({})", self.public_key().fingerprint())
     }
 }
 
@@ -107,28 +107,28 @@ impl fmt::Debug for SigningKey {
 pub struct PublicKey(pub(crate) [u8; 32]);
 
 impl PublicKey {
-    /// SSH's form of it (RFC 8709, section 4).
-    pub(crate) fn blob(self) -> Vec<u8> {
+    /// Encodes the key in SSH's binary form (RFC 8709, section 4).
+    pub(crate) fn to_blob(self) -> Vec<u8> {
         let mut blob = Vec::new();
-        wire::put(&mut blob, ALGORITHM.as_bytes());
-        wire::put(&mut blob, &self.0);
+        wire::write_string(&mut blob, ALGORITHM.as_bytes());
+        wire::write_string(&mut blob, &self.0);
         blob
     }
 
     pub(crate) fn from_blob(mut blob: &[u8]) -> Option<PublicKey> {
-        let algorithm = wire::take(&mut blob)?;
-        let bytes: [u8; 32] = wire::take(&mut blob)?.try_into().ok()?;
+        let algorithm = wire::read_string(&mut blob)?;
+        let bytes: [u8; 32] = wire::read_string(&mut blob)?.try_into().ok()?;
         (algorithm == ALGORITHM.as_bytes() && blob.is_empty()).then_some(PublicKey(bytes))
     }
 
-    /// As `ssh-keygen -l` prints it.
+    /// Returns the fingerprint, as printed by `ssh-keygen -l`.
     pub fn fingerprint(self) -> String {
-        let hash = Sha256::digest(self.blob());
+        let hash = Sha256::digest(self.to_blob());
         format!("SHA256:{}", STANDARD_NO_PAD.encode_to_string(hash))
     }
 
-    /// A line of OpenSSH's list of allowed signers.
-    pub fn signer(self) -> String {
+    /// Returns the line for OpenSSH's list of allowed signers.
+    pub fn allowed_signers_line(self) -> String {
         format!("cloudroid {self}")
     }
 }
@@ -138,7 +138,7 @@ impl fmt::Display for PublicKey {
         write!(
             out,
             "{ALGORITHM} {}",
-            STANDARD.encode_to_string(self.blob())
+            STANDARD.encode_to_string(self.to_blob())
         )
     }
 }
@@ -147,7 +147,7 @@ impl FromStr for PublicKey {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<PublicKey, Error> {
-        // With or without the algorithm's name before it.
+        // With or without the name of the algorithm before it.
         let encoded = text.trim();
         let encoded = encoded.strip_prefix(ALGORITHM).unwrap_or(encoded).trim();
         STANDARD
@@ -168,13 +168,22 @@ mod tests {
     fn a_key_is_made_once_and_is_its_owners_alone() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("signing.pem");
-        let made = SigningKey::of_file(&path).expect("made").public();
-        assert_eq!(SigningKey::of_file(&path).expect("read").public(), made);
+        let made = SigningKey::load_or_create(&path)
+            .expect("made")
+            .public_key();
+        assert_eq!(
+            SigningKey::load_or_create(&path)
+                .expect("read")
+                .public_key(),
+            made
+        );
         let mode = path.metadata().expect("there").permissions().mode() & 0o7777;
         assert_eq!(mode, 0o600);
         assert_eq!(std::fs::read_dir(place.path()).expect("there").count(), 1);
         std::fs::write(&path, "rubbish").expect("written");
-        let refused = SigningKey::of_file(&path).expect_err("no key").to_string();
+        let refused = SigningKey::load_or_create(&path)
+            .expect_err("no key")
+            .to_string();
         assert!(
             refused.contains("signing.pem holds no ed25519 key"),
             "{refused}"
@@ -184,7 +193,7 @@ mod tests {
     #[test]
     fn a_public_key_is_read_as_it_is_written() {
         let (key, _) = SigningKey::generate().expect("made");
-        let public = key.public();
+        let public = key.public_key();
         let text = public.to_string();
         assert_eq!(text.parse::<PublicKey>().expect("read"), public);
         let bare = text.split(' ').nth(1).expect("two words");

@@ -1,5 +1,5 @@
-//! Ed25519 signatures (RFC 8032) in the form of OpenSSH's `ssh-keygen -Y` (PROTOCOL.sshsig), which robots verify with
-//! what they have.
+//! Ed25519 signatures (RFC 8032) in the format of OpenSSH's `ssh-keygen -Y` (PROTOCOL.sshsig), which robots can verify
+//! with the tools they have.
 //!
 //! ```text
 //!  HOME/signing.pem ─▶ SigningKey ──sign──▶ -----BEGIN SSH SIGNATURE----- ──PublicKey::verify, ssh-keygen -Y verify
@@ -12,49 +12,49 @@ mod signature;
 mod wire;
 
 pub use key::{PublicKey, SigningKey};
-pub use signature::{digest, in_a_line, in_lines};
+pub use signature::{digest, to_armoured_lines, to_single_line};
 
-/// Why a key or a signature is of no use.
+/// An error of a key or signature.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file system refused.
+    /// A file operation failed.
     #[error("cannot {action} {path}: {source}", path = .path.display())]
     Io {
-        /// What was being done.
+        /// Operation that failed.
         action: &'static str,
         /// The key's file.
         path: std::path::PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// The file holds no key.
+    /// The file does not contain a key.
     #[error(
-        "{path} holds no ed25519 key (PKCS #8 in PEM); put the right one back, or remove it to get another, which robots then \
-         have to be told (install.sh --key)",
+        "{path} holds no ed25519 key (PKCS #8 in PEM); restore it, or remove it to create a new one, which robots then \
+            need to know (install.sh --key)",
         path = .0.display()
     )]
     NoKey(std::path::PathBuf),
-    /// No random numbers.
-    #[error("the system gives no random numbers for a key")]
+    /// The system provides no random numbers.
+    #[error("the system provides no random numbers for a key")]
     NoRandom,
-    /// A public key that is none.
-    #[error("\"{0}\" is no ed25519 key; it is written as \"ssh-ed25519 AAAA…\"")]
+    /// Not a valid public key.
+    #[error("\"{0}\" is not an ed25519 key; write it as \"ssh-ed25519 AAAA…\"")]
     NoPublicKey(String),
-    /// What should be a signature is none.
-    #[error("it is no SSH signature by an ed25519 key")]
+    /// Not a valid signature.
+    #[error("not an SSH signature by an ed25519 key")]
     NoSignature,
-    /// It is for something else.
-    #[error("the signature is one of \"{found}\", not of \"{wanted}\"")]
+    /// The signature is for another namespace.
+    #[error("the signature is for \"{found}\", not for \"{wanted}\"")]
     Namespace {
-        /// What it was made for.
+        /// Namespace of the signature.
         found: String,
-        /// What it should have been made for.
+        /// Expected namespace.
         wanted: String,
     },
-    /// It is somebody else's.
-    #[error("it is signed by another key, {0}")]
+    /// The signature is by another key.
+    #[error("it is signed with another key, {0}")]
     OtherKey(PublicKey),
-    /// What is signed is not what is there.
-    #[error("the signature is of other content: it was changed, or broke off on its way")]
+    /// The signature does not match the content.
+    #[error("the signature does not match the content: it was changed or truncated")]
     OtherContent,
 }

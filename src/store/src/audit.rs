@@ -1,33 +1,33 @@
-//! The audit log: only added to, which the database itself sees to (`008-audit.sql`).
+//! The audit log. It is append-only, which the database enforces itself (`008-audit.sql`).
 
 use api::access::Audited;
 use rusqlite::{Connection, Row, params};
 
 use super::{Error, State, now};
 
-/// Records beyond are forgotten, oldest first; the database lets go of no newer ones.
+/// Maximum number of records; older ones are deleted first. The database refuses to delete newer ones.
 const KEPT: i64 = 1_000_000;
 
-/// What is to be recorded.
+/// An audit record to be written.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct NewAudited<'a> {
-    /// Who, with its roles.
+pub struct NewAuditRecord<'a> {
+    /// Principal, with its roles.
     pub who: &'a str,
-    /// From where.
+    /// Origin of the request.
     pub peer: &'a str,
-    /// Which of the policy's actions.
+    /// Policy action.
     pub action: &'a str,
-    /// The request.
+    /// Request method and path.
     pub did: &'a str,
-    /// The object that it was done to.
+    /// Object that the request acted on.
     pub object: &'a str,
-    /// The answer's HTTP status.
+    /// HTTP status of the response.
     pub status: u16,
-    /// So many alike before it were not recorded.
+    /// Number of preceding identical requests that were not recorded.
     pub more: u64,
 }
 
-fn read(row: &Row<'_>) -> rusqlite::Result<Audited> {
+fn read_record(row: &Row<'_>) -> rusqlite::Result<Audited> {
     Ok(Audited {
         id: row.get(0)?,
         time: row.get(1)?,
@@ -41,7 +41,7 @@ fn read(row: &Row<'_>) -> rusqlite::Result<Audited> {
     })
 }
 
-fn insert(connection: &Connection, new: &NewAudited<'_>) -> rusqlite::Result<i64> {
+fn insert(connection: &Connection, new: &NewAuditRecord<'_>) -> rusqlite::Result<i64> {
     let id = connection
         .prepare_cached(
             "INSERT INTO audit (time, who, peer, action, did, object, status, more)
@@ -67,25 +67,25 @@ fn insert(connection: &Connection, new: &NewAudited<'_>) -> rusqlite::Result<i64
 }
 
 impl State {
-    /// Records what somebody did, on disk when this returns; gives its number.
-    pub fn add_audited(&self, new: &NewAudited<'_>) -> Result<i64, Error> {
+    /// Appends an audit record durably and returns its number.
+    pub fn add_audit_record(&self, new: &NewAuditRecord<'_>) -> Result<i64, Error> {
         self.write_durably(|connection| insert(connection, new))
     }
 
-    /// The same without waiting for the disk.
-    pub fn add_audited_soon(&self, new: &NewAudited<'_>) -> Result<i64, Error> {
+    /// Appends an audit record without waiting for the disk, and returns its number.
+    pub fn add_audit_record_without_sync(&self, new: &NewAuditRecord<'_>) -> Result<i64, Error> {
         self.write(|connection| insert(connection, new))
     }
 
-    /// The newest `limit` records after number `since`, oldest first.
-    pub fn audited(&self, since: i64, limit: u32) -> Result<Vec<Audited>, Error> {
+    /// Returns the latest `limit` records after number `since`, oldest first.
+    pub fn audit_records(&self, since: i64, limit: u32) -> Result<Vec<Audited>, Error> {
         self.read_at_length(|connection| {
             connection
                 .prepare_cached(
                     "SELECT id, time, who, peer, action, did, object, status, more FROM
                      (SELECT * FROM audit WHERE id > ?1 ORDER BY id DESC LIMIT ?2) ORDER BY id",
                 )?
-                .query_map(params![since, limit], read)?
+                .query_map(params![since, limit], read_record)?
                 .collect()
         })
     }

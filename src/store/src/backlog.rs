@@ -1,10 +1,12 @@
-//! What is to be written and cannot be: the disk is full, or another program has locked the database.
+//! Queue of writes for the time when the database cannot be written: the disk is full, or another program has locked
+//! it.
 //!
 //! ```text
-//!   writable ──a write fails──▶ unwritable: kept here, in order ──tried every half second──▶ all written, writable
+//!   writable ──a write fails──▶ unwritable: queued in order ──retried every 0.5 s──▶ all written, writable
 //! ```
 //!
-//! Kept is what only tells of what has happened, so that nobody waits for it. Both changes are events themselves.
+//! Only writes that record past events are queued, so that nobody waits for them. Both transitions are events
+//! themselves.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,44 +19,44 @@ use tokio::sync::{Notify, watch};
 
 use super::{State, commit, events, now, wait_for_another};
 
-/// Between attempts to write what is kept.
+/// Interval between attempts to write the queue.
 const AGAIN: Duration = Duration::from_millis(500);
-/// For the connection that a longer statement uses; what tells of the past waits no longer than that.
+/// Maximum time that a queueable write waits for the connection while a longer statement uses it.
 const MOMENT: Duration = Duration::from_millis(100);
-/// More is not kept: the oldest is dropped.
+/// Maximum length of the queue; the oldest writes are dropped first.
 const KEPT: usize = 10_000;
 
-/// Something that can be written later.
+/// A write that can be deferred.
 #[derive(Debug, Clone)]
 pub(super) enum Write {
-    /// An event; it is given its number here.
+    /// An event; its number is assigned when it is queued.
     Event(Event),
     /// A servant has ended.
     ServantGone(String),
-    /// A robot came.
+    /// A robot has connected.
     RobotSeen(String, Millis),
 }
 
-/// What is kept, and how events are numbered.
+/// Queue of deferred writes, and the numbering of events.
 pub(super) struct Backlog {
-    waiting: Mutex<Waiting>,
+    waiting: Mutex<PendingWrites>,
     begun: Notify,
-    /// The number of the last event that can be read.
+    /// Number of the latest readable event.
     last: watch::Sender<i64>,
 }
 
-struct Waiting {
+struct PendingWrites {
     last_event: i64,
     writes: VecDeque<Write>,
     dropped: u64,
-    /// Since when nothing can be written, and why.
+    /// Start and cause of the current outage.
     outage: Option<(Millis, String)>,
 }
 
 impl Backlog {
     pub(super) fn new(last_event: i64) -> Backlog {
         Backlog {
-            waiting: Mutex::new(Waiting {
+            waiting: Mutex::new(PendingWrites {
                 last_event,
                 writes: VecDeque::new(),
                 dropped: 0,
@@ -65,8 +67,8 @@ impl Backlog {
         }
     }
 
-    /// Tells who waits for events of those that can be read now.
-    fn tell(&self, waiting: &Waiting) {
+    /// Notifies those who wait for events of the latest readable one.
+    fn notify_readers(&self, waiting: &PendingWrites) {
         self.last.send_if_modified(|last| {
             let newer = *last < waiting.last_event;
             *last = waiting.last_event;
@@ -74,8 +76,8 @@ impl Backlog {
         });
     }
 
-    /// Events after number `since` that are not written yet.
-    pub(super) fn events(&self, since: i64) -> Vec<Event> {
+    /// Returns the events after number `since` that have not been written yet.
+    pub(super) fn unwritten_events(&self, since: i64) -> Vec<Event> {
         let waiting = self.waiting.lock();
         let event = |write: &Write| match write {
             Write::Event(event) if event.id > since => Some(event.clone()),
@@ -85,8 +87,8 @@ impl Backlog {
     }
 }
 
-impl Waiting {
-    fn keep(&mut self, write: Write) {
+impl PendingWrites {
+    fn push(&mut self, write: Write) {
         if self.writes.len() == KEPT {
             self.writes.pop_front();
             self.dropped += 1;
@@ -94,7 +96,7 @@ impl Waiting {
         self.writes.push_back(write);
     }
 
-    fn event(&mut self, level: Level, kind: &str, message: String) -> Event {
+    fn new_event(&mut self, level: Level, kind: &str, message: String) -> Event {
         self.last_event += 1;
         Event {
             id: self.last_event,
@@ -110,8 +112,8 @@ impl Waiting {
 }
 
 impl State {
-    /// Why nothing can be written now, if so.
-    pub fn unwritable(&self) -> Option<String> {
+    /// Returns why the database currently cannot be written, if so.
+    pub fn outage_message(&self) -> Option<String> {
         let waiting = self.backlog.waiting.lock();
         let (_, why) = waiting.outage.as_ref()?;
         Some(format!(
@@ -120,35 +122,36 @@ impl State {
         ))
     }
 
-    /// The number of the last event, whenever there is a newer one.
+    /// Watches the number of the latest event.
     pub fn watch_events(&self) -> watch::Receiver<i64> {
         self.backlog.last.subscribe()
     }
 
-    /// Writes at once if that needs no waiting, and later otherwise.
-    pub(super) fn write_or_keep(&self, write: Write) {
+    /// Writes immediately if that is possible without waiting; otherwise queues the write.
+    pub(super) fn write_or_queue(&self, write: Write) {
         let mut waiting = self.backlog.waiting.lock();
-        self.write_now_or_keep(&mut waiting, write);
-        self.backlog.tell(&waiting);
+        self.write_or_queue_locked(&mut waiting, write);
+        self.backlog.notify_readers(&waiting);
     }
 
-    fn write_now_or_keep(&self, waiting: &mut Waiting, mut write: Write) {
+    fn write_or_queue_locked(&self, waiting: &mut PendingWrites, mut write: Write) {
         if let Write::Event(event) = &mut write {
             waiting.last_event += 1;
             event.id = waiting.last_event;
         }
         if !waiting.writes.is_empty() {
-            return waiting.keep(write);
+            return waiting.push(write);
         }
-        // Held up by a statement of our own that takes longer, or by another program: that may be over in a moment.
+        // Blocked by a longer statement of this process or by another program; may be over in a moment.
         let Some(mut connection) = self.connection.try_lock_for(MOMENT) else {
-            waiting.keep(write);
+            waiting.push(write);
             return self.backlog.begun.notify_one();
         };
-        let outcome = impatiently(&mut connection, |transaction| apply(transaction, &write));
+        let outcome =
+            commit_without_waiting(&mut connection, |transaction| apply(transaction, &write));
         drop(connection);
         let Err(error) = outcome else { return };
-        waiting.keep(write);
+        waiting.push(write);
         if is_locked(&error) {
             self.backlog.begun.notify_one();
         } else {
@@ -156,8 +159,8 @@ impl State {
         }
     }
 
-    /// Another write has failed: does it tell of more than itself?
-    pub(super) fn write_failed(&self, error: &rusqlite::Error) {
+    /// Begins an outage if the error of a failed write indicates a lasting condition.
+    pub(super) fn on_write_failed(&self, error: &rusqlite::Error) {
         let lasting = is_locked(error)
             || matches!(
                 error.sqlite_error_code(),
@@ -171,36 +174,36 @@ impl State {
         if lasting {
             let mut waiting = self.backlog.waiting.lock();
             self.begin_outage(&mut waiting, error);
-            self.backlog.tell(&waiting);
+            self.backlog.notify_readers(&waiting);
         }
     }
 
-    fn begin_outage(&self, waiting: &mut Waiting, error: &rusqlite::Error) {
+    fn begin_outage(&self, waiting: &mut PendingWrites, error: &rusqlite::Error) {
         if waiting.outage.is_some() {
             return;
         }
-        let why = in_words(error);
+        let why = describe_error(error);
         let message = format!(
-            "the state database {} cannot be written: {why}; servants work on, new ones and pushes are refused, \
-             and events are kept in memory until it can",
+            "the state database {} cannot be written: {why}; servants keep running, new ones and pushes are refused, \
+                and events are kept in memory until it can be written",
             self.path
         );
         tracing::error!("{message}");
         waiting.outage = Some((now(), why));
-        let event = waiting.event(Level::Error, "state-unwritable", message);
-        waiting.keep(Write::Event(event));
+        let event = waiting.new_event(Level::Error, "state-unwritable", message);
+        waiting.push(Write::Event(event));
         self.backlog.begun.notify_one();
     }
 
-    /// Writes what is kept, oldest first; whether nothing is left.
-    fn catch_up(&self) -> bool {
+    /// Writes the queue, oldest first; returns whether it is empty.
+    fn flush(&self) -> bool {
         let mut waiting = self.backlog.waiting.lock();
         let Some(mut connection) = self.connection.try_lock_for(MOMENT) else {
             return false;
         };
         while let Some(write) = waiting.writes.front() {
             if let Err(error) =
-                impatiently(&mut connection, |transaction| apply(transaction, write))
+                commit_without_waiting(&mut connection, |transaction| apply(transaction, write))
             {
                 self.begin_outage(&mut waiting, &error);
                 return false;
@@ -212,15 +215,15 @@ impl State {
         };
         let lost = match waiting.dropped {
             0 => String::new(),
-            dropped => format!("; {dropped} events and records were too many to keep"),
+            dropped => format!("; {dropped} events and records were dropped"),
         };
         let message = format!(
             "the state database {} can be written again, after {:.1} s{lost}",
             self.path,
             now().saturating_sub(since) as f64 / 1000.0
         );
-        let event = waiting.event(Level::Info, "state-writable", message);
-        if impatiently(&mut connection, |transaction| {
+        let event = waiting.new_event(Level::Info, "state-writable", message);
+        if commit_without_waiting(&mut connection, |transaction| {
             events::insert(transaction, &event)
         })
         .is_err()
@@ -229,21 +232,21 @@ impl State {
             return false;
         }
         tracing::info!("{}", event.message);
-        self.backlog.tell(&waiting);
+        self.backlog.notify_readers(&waiting);
         waiting.dropped = 0;
         waiting.outage = None;
         true
     }
 }
 
-/// Writes what is kept as soon as that is possible. Only while something is kept is anything done at intervals.
-pub async fn watch(state: Arc<State>) {
+/// Writes the queue as soon as possible. Polls only while the queue is not empty.
+pub async fn flush_pending_writes(state: Arc<State>) {
     loop {
         state.backlog.begun.notified().await;
         loop {
             tokio::time::sleep(AGAIN).await;
             let state = Arc::clone(&state);
-            let done = tokio::task::spawn_blocking(move || state.catch_up());
+            let done = tokio::task::spawn_blocking(move || state.flush());
             if done.await.unwrap_or(true) {
                 break;
             }
@@ -251,8 +254,8 @@ pub async fn watch(state: Arc<State>) {
     }
 }
 
-/// Writes what `work` writes, all or none, without waiting for others that have the database locked.
-fn impatiently<T>(
+/// Runs `work` in a transaction without waiting for others that have the database locked.
+fn commit_without_waiting<T>(
     connection: &mut Connection,
     work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
 ) -> rusqlite::Result<T> {
@@ -276,7 +279,7 @@ fn apply(connection: &Connection, write: &Write) -> rusqlite::Result<()> {
     }
 }
 
-/// Another has the database, and may give it back at any moment.
+/// Returns whether another connection holds the lock, which it may release at any moment.
 fn is_locked(error: &rusqlite::Error) -> bool {
     matches!(
         error.sqlite_error_code(),
@@ -284,7 +287,7 @@ fn is_locked(error: &rusqlite::Error) -> bool {
     )
 }
 
-fn in_words(error: &rusqlite::Error) -> String {
+fn describe_error(error: &rusqlite::Error) -> String {
     match error.sqlite_error_code() {
         Some(ErrorCode::DiskFull) => "its disk is full".to_owned(),
         _ if is_locked(error) => "another program has locked it".to_owned(),

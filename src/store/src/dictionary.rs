@@ -1,4 +1,4 @@
-//! Rows of services' dictionaries.
+//! Dictionary rows of services.
 
 use api::Measure;
 use api::dictionary::{NewRows, Row};
@@ -7,7 +7,7 @@ use rusqlite::params;
 use super::{Error, State, now, to_json};
 
 impl State {
-    /// All rows of a service, in the order in which they were first written.
+    /// Returns all rows of a service, in the order in which they were first written.
     pub fn dictionary(&self, service: &str) -> Result<Vec<Row>, Error> {
         type Texts = (String, String, String, Option<String>);
         let found: Vec<(i64, f64, Option<u64>, i64, Texts)> = self.read(|connection| {
@@ -26,7 +26,7 @@ impl State {
         rows.map(|(id, value, revision, written, texts)| {
             let (measure, aux, limits, spread) = texts;
             let unreadable = |source| Error::Record {
-                what: format!("row {id} of the dictionary of {service}"),
+                what: format!("entry {id} of the SLA table of {service}"),
                 source,
             };
             Ok(Row {
@@ -46,8 +46,8 @@ impl State {
         .collect()
     }
 
-    /// Writes rows of a service, all or none; on disk when this returns. One of the same measure, value and auxiliary
-    /// parameters takes an earlier one's place, and its number. `revision`: the one that they were measured with.
+    /// Writes rows of a service durably, all or none. A row replaces an earlier one with the same measure, value and
+    /// auxiliary parameters and takes over its number. `revision` is the revision that they were measured with.
     pub fn write_dictionary(
         &self,
         service: &str,
@@ -87,7 +87,7 @@ impl State {
         })
     }
 
-    /// Forgets a row of a service; false when there is none of that number.
+    /// Deletes a row of a service; returns false if it does not exist.
     pub fn remove_from_dictionary(&self, service: &str, id: i64) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute(

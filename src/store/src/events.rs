@@ -1,4 +1,4 @@
-//! The journal.
+//! The event journal.
 
 use api::{Event, Level, Millis};
 use rusqlite::{Connection, params};
@@ -6,46 +6,46 @@ use rusqlite::{Connection, params};
 use super::backlog::Write;
 use super::{Error, State, now};
 
-/// Events beyond are forgotten, oldest first.
+/// Maximum number of events; older ones are deleted first.
 const EVENTS_KEPT: i64 = 10_000;
 
-/// An event about to be written.
+/// Objects that a new event is about.
 #[derive(Debug, Clone, Default)]
 pub struct NewEvent<'a> {
-    /// The service concerned.
+    /// Service concerned.
     pub service: Option<&'a str>,
-    /// The servant concerned.
+    /// Servant concerned.
     pub servant: Option<&'a str>,
-    /// The robot concerned.
+    /// Robot concerned.
     pub robot: Option<&'a str>,
 }
 
-/// Which events are meant; where nothing is said, all.
+/// Selection of events; absent criteria match all.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct EventFilter<'a> {
-    /// Of this kind.
+    /// Kind of event.
     pub kind: Option<&'a str>,
-    /// Of this service.
+    /// Service concerned.
     pub service: Option<&'a str>,
-    /// Of this servant.
+    /// Servant concerned.
     pub servant: Option<&'a str>,
-    /// Of this robot.
+    /// Robot concerned.
     pub robot: Option<&'a str>,
-    /// Those that somebody may be told of who does not see all.
-    pub told: Option<Told<'a>>,
+    /// Restriction to the events that a principal without full access may see.
+    pub told: Option<EventVisibility<'a>>,
 }
 
-/// What somebody who does not see all is told of: events of some services, and of no robot but its own.
+/// Events that a principal without full access may see: those of some services, and of no robot other than its own.
 #[derive(Debug, Clone, Copy)]
-pub struct Told<'a> {
-    /// These services.
+pub struct EventVisibility<'a> {
+    /// Visible services.
     pub services: &'a [String],
-    /// The one robot, if the reader is a robot: events of a service as such are told to all.
+    /// Name of the robot, if the reader is one. Events of a service that concern no robot are visible to all.
     pub own_robot: Option<&'a str>,
 }
 
-impl Told<'_> {
-    fn takes(&self, event: &Event) -> bool {
+impl EventVisibility<'_> {
+    fn matches(&self, event: &Event) -> bool {
         let of_service = event.service.as_ref();
         of_service.is_some_and(|service| self.services.contains(service))
             && self
@@ -55,18 +55,18 @@ impl Told<'_> {
 }
 
 impl EventFilter<'_> {
-    fn takes(&self, event: &Event) -> bool {
+    fn matches(&self, event: &Event) -> bool {
         let is = |wanted: Option<&str>, has: Option<&str>| wanted.is_none() || wanted == has;
         is(self.kind, Some(&event.kind))
             && is(self.service, event.service.as_deref())
             && is(self.servant, event.servant.as_deref())
             && is(self.robot, event.robot.as_deref())
-            && self.told.is_none_or(|told| told.takes(event))
+            && self.told.is_none_or(|told| told.matches(event))
     }
 }
 
-/// The number of the last event ever written; 0 before the first.
-pub(super) fn last(connection: &Connection) -> rusqlite::Result<i64> {
+/// Returns the number of the latest event ever written; 0 before the first.
+pub(super) fn last_event_number(connection: &Connection) -> rusqlite::Result<i64> {
     connection.query_row(
         "SELECT COALESCE((SELECT seq FROM sqlite_sequence WHERE name = 'events'), 0)",
         [],
@@ -74,7 +74,7 @@ pub(super) fn last(connection: &Connection) -> rusqlite::Result<i64> {
     )
 }
 
-/// Writes an event that has its number.
+/// Writes an event that already has its number.
 pub(super) fn insert(connection: &Connection, event: &Event) -> rusqlite::Result<()> {
     connection
         .prepare_cached(
@@ -101,10 +101,10 @@ pub(super) fn insert(connection: &Connection, event: &Event) -> rusqlite::Result
 }
 
 impl State {
-    /// Writes an event into the journal; where nothing can be written now, later.
+    /// Appends an event to the journal, or queues it if the database cannot be written now.
     pub fn add_event(&self, level: Level, kind: &str, message: &str, about: &NewEvent<'_>) {
         let owned = |text: Option<&str>| text.map(str::to_owned);
-        self.write_or_keep(Write::Event(Event {
+        self.write_or_queue(Write::Event(Event {
             id: 0,
             time: now(),
             level,
@@ -116,21 +116,21 @@ impl State {
         }));
     }
 
-    /// The newest `limit` events after number `since`, oldest first.
+    /// Returns the latest `limit` events after number `since`, oldest first.
     pub fn events(&self, since: i64, limit: u32) -> Result<Vec<Event>, Error> {
-        self.events_of(EventFilter::default(), since, limit)
+        self.filtered_events(EventFilter::default(), since, limit)
     }
 
-    /// Of certain events, the newest `limit` after number `since`, oldest first.
-    pub fn events_of(
+    /// Returns the latest `limit` matching events after number `since`, oldest first.
+    pub fn filtered_events(
         &self,
         filter: EventFilter<'_>,
         since: i64,
         limit: u32,
     ) -> Result<Vec<Event>, Error> {
-        // First, so that none is missed that is being written meanwhile.
-        let mut kept = self.backlog.events(since);
-        kept.retain(|event| filter.takes(event));
+        // Read before the written events, so that none is missed that is written in between.
+        let mut kept = self.backlog.unwritten_events(since);
+        kept.retain(|event| filter.matches(event));
         let mut events = self.written_events(filter, since, limit)?;
         let last = events.last().map_or(since, |event| event.id);
         events.extend(kept.into_iter().filter(|event| event.id > last));
@@ -138,15 +138,15 @@ impl State {
         Ok(events.split_off(beyond))
     }
 
-    /// Services that there are events of, by name.
-    pub fn services_of_events(&self) -> Result<Vec<String>, Error> {
+    /// Returns the services with events, sorted by name.
+    pub fn services_with_events(&self) -> Result<Vec<String>, Error> {
         let mut services: Vec<String> = self.read_at_length(|connection| {
             connection
                 .prepare_cached("SELECT DISTINCT service FROM events WHERE service IS NOT NULL")?
                 .query_map([], |row| row.get(0))?
                 .collect()
         })?;
-        let kept = self.backlog.events(0).into_iter();
+        let kept = self.backlog.unwritten_events(0).into_iter();
         services.extend(kept.filter_map(|event| event.service));
         services.sort();
         services.dedup();
@@ -187,7 +187,7 @@ impl State {
                         Ok(Event {
                             id: row.get(0)?,
                             time: row.get::<_, i64>(1)? as Millis,
-                            level: level_of(&row.get::<_, String>(2)?),
+                            level: parse_level(&row.get::<_, String>(2)?),
                             kind: row.get(3)?,
                             service: row.get(4)?,
                             servant: row.get(5)?,
@@ -209,7 +209,7 @@ fn level_name(level: Level) -> &'static str {
     }
 }
 
-fn level_of(name: &str) -> Level {
+fn parse_level(name: &str) -> Level {
     match name {
         "info" => Level::Info,
         "warning" => Level::Warning,
@@ -221,7 +221,7 @@ fn level_of(name: &str) -> Level {
 mod tests {
     use super::*;
 
-    fn about<'a>(service: Option<&'a str>, robot: Option<&'a str>) -> NewEvent<'a> {
+    fn event_about<'a>(service: Option<&'a str>, robot: Option<&'a str>) -> NewEvent<'a> {
         NewEvent {
             service,
             servant: None,
@@ -233,36 +233,46 @@ mod tests {
     fn whoever_sees_little_is_told_the_newest_of_that_however_much_else_there_is() {
         let home = tempfile::tempdir().expect("a directory");
         let state = State::open(&home.path().join("cloudroid.db")).expect("a database");
-        state.add_event(Level::Info, "k", "mine", &about(Some("mine"), Some("r1")));
-        state.add_event(Level::Info, "k", "of mine", &about(Some("mine"), None));
+        state.add_event(
+            Level::Info,
+            "k",
+            "mine",
+            &event_about(Some("mine"), Some("r1")),
+        );
+        state.add_event(
+            Level::Info,
+            "k",
+            "of mine",
+            &event_about(Some("mine"), None),
+        );
         state.add_event(
             Level::Info,
             "k",
             "a friend's",
-            &about(Some("mine"), Some("r2")),
+            &event_about(Some("mine"), Some("r2")),
         );
         for _ in 0..200 {
             state.add_event(
                 Level::Info,
                 "k",
                 "theirs",
-                &about(Some("theirs"), Some("r1")),
+                &event_about(Some("theirs"), Some("r1")),
             );
-            state.add_event(Level::Info, "k", "the machine's", &about(None, None));
+            state.add_event(Level::Info, "k", "the machine's", &event_about(None, None));
         }
         assert_eq!(
-            state.services_of_events().expect("readable"),
+            state.services_with_events().expect("readable"),
             ["mine", "theirs"]
         );
         let told = |services: &[String], own_robot, limit| -> Vec<String> {
             let filter = EventFilter {
-                told: Some(Told {
+                told: Some(EventVisibility {
                     services,
                     own_robot,
                 }),
                 ..EventFilter::default()
             };
-            let events = state.events_of(filter, 0, limit).expect("readable");
+            let events = state.filtered_events(filter, 0, limit).expect("readable");
             events.into_iter().map(|event| event.message).collect()
         };
         let mine = ["mine".to_owned()];
@@ -270,20 +280,25 @@ mod tests {
         assert_eq!(told(&mine, None, 1), ["a friend's"]);
         assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine"]);
         assert!(told(&[], None, 9).is_empty());
-        // Those that cannot be written yet are told alike.
+        // The same holds for events that have not been written yet.
         let locker =
             Connection::open(home.path().join("cloudroid.db")).expect("another connection");
         locker.execute_batch("BEGIN IMMEDIATE").expect("the lock");
-        state.add_event(Level::Info, "k", "kept", &about(Some("mine"), Some("r1")));
+        state.add_event(
+            Level::Info,
+            "k",
+            "kept",
+            &event_about(Some("mine"), Some("r1")),
+        );
         state.add_event(
             Level::Info,
             "k",
             "kept of others",
-            &about(Some("other"), None),
+            &event_about(Some("other"), None),
         );
         assert_eq!(told(&mine, Some("r1"), 9), ["mine", "of mine", "kept"]);
         assert_eq!(
-            state.services_of_events().expect("readable"),
+            state.services_with_events().expect("readable"),
             ["mine", "other", "theirs"]
         );
     }

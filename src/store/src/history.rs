@@ -1,65 +1,70 @@
-//! What servants and the machine did, in steps of seconds, and when robots were served by their local originals. It only tells of the
-//! past: what cannot be written is a gap.
+//! Metrics of servants and of the machine in steps of seconds, and periods in which robots were served by their local
+//! originals. They only record the past: a write that fails leaves a gap.
 
 use api::Millis;
 use api::history::LocalPeriod;
 use rusqlite::{Connection, params};
 
-use super::{Error, State, Told};
+use super::{Error, EventVisibility, State};
 
-/// Servants of which something is kept; beyond, those are forgotten that were seen first.
+/// Maximum number of servants with samples; those seen least recently are deleted first.
 const RECORDED: i64 = 20_000;
-/// Periods that are kept; beyond, the oldest are forgotten.
+/// Maximum number of local periods; older ones are deleted first.
 const PERIODS: i64 = 10_000;
 
-/// What was sampled at one time.
+/// A sample of one servant or of the machine.
 #[derive(Debug, Clone, Copy)]
 pub struct NewSample<'a> {
-    /// The servant's id; empty: the machine.
+    /// Id of the servant; empty for the machine.
     pub servant: &'a str,
-    /// Its service.
+    /// Service of the servant.
     pub service: &'a str,
-    /// Its robot.
+    /// Robot of the servant.
     pub robot: &'a str,
-    /// When the servant was asked for.
+    /// Time when the servant was requested.
     pub began: Millis,
-    /// NaN: none.
+    /// Values; NaN means unknown.
     pub figures: &'a [f32],
 }
 
-/// Something of which there are samples.
+/// A servant, or the machine, that has samples.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RecordedLine {
-    /// Its number here.
+pub struct RecordedSeries {
+    /// Row number.
     pub id: i64,
-    /// The servant's id; empty: the machine.
+    /// Id of the servant; empty for the machine.
     pub servant: String,
-    /// Its service.
+    /// Service of the servant.
     pub service: String,
-    /// Its robot.
+    /// Robot of the servant.
     pub robot: String,
-    /// When the servant was asked for.
+    /// Time when the servant was requested.
     pub began: Millis,
-    /// When it was sampled last.
+    /// Time of the latest sample.
     pub seen: Millis,
 }
 
-/// Whose samples are meant; where nothing is said, all servants'.
+/// Selection of servants with samples; absent criteria match all servants.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct RecordedFilter<'a> {
-    /// Of this servant.
+pub struct SeriesFilter<'a> {
+    /// Id of the servant.
     pub servant: Option<&'a str>,
-    /// Of this service.
+    /// Service of the servant.
     pub service: Option<&'a str>,
-    /// Of this robot.
+    /// Robot of the servant.
     pub robot: Option<&'a str>,
-    /// Those that somebody may be told of who does not see all.
-    pub told: Option<Told<'a>>,
+    /// Restriction to what a principal without full access may see.
+    pub told: Option<EventVisibility<'a>>,
 }
 
 impl State {
-    /// Writes samples of one time and one step, in seconds, all or none.
-    pub fn record(&self, step: u32, time: Millis, samples: &[NewSample<'_>]) -> Result<(), Error> {
+    /// Writes samples of one time and one step (in seconds), all or none.
+    pub fn add_samples(
+        &self,
+        step: u32,
+        time: Millis,
+        samples: &[NewSample<'_>],
+    ) -> Result<(), Error> {
         self.write(|transaction| {
             for sample in samples {
                 let id: i64 = transaction
@@ -88,13 +93,13 @@ impl State {
         })
     }
 
-    /// Forgets the samples of each step (seconds) from before a time, whatever was seen before the last of these times, and local
-    /// periods that ended before it.
+    /// Deletes the samples of each step (in seconds) before its time, series not seen since the earliest of these
+    /// times, and local periods that ended before it.
     pub fn forget_history(&self, before: &[(u32, Millis)]) -> Result<(), Error> {
         let oldest = before.iter().map(|(_, time)| *time).min().unwrap_or(0) as i64;
         self.write(|transaction| {
             for (step, time) in before {
-                // Of each servant by its key: there is no index by time alone.
+                // Deletes by the key of each servant, since there is no index by time alone.
                 transaction
                     .prepare_cached(
                         "DELETE FROM samples WHERE recorded IN (SELECT id FROM recorded) AND step = ?1 AND time < ?2",
@@ -115,14 +120,14 @@ impl State {
         })
     }
 
-    /// Of which servants there are samples since `from`, those that were asked for last first.
-    pub fn recorded(
+    /// Returns the servants with samples since `from`, most recently requested first.
+    pub fn recorded_series(
         &self,
-        filter: RecordedFilter<'_>,
+        filter: SeriesFilter<'_>,
         from: Millis,
         limit: u32,
-    ) -> Result<Vec<RecordedLine>, Error> {
-        let RecordedFilter {
+    ) -> Result<Vec<RecordedSeries>, Error> {
+        let SeriesFilter {
             servant,
             service,
             robot,
@@ -140,7 +145,7 @@ impl State {
                      ORDER BY began DESC, id DESC LIMIT ?5",
                 )?
                 .query_map(params![from as i64, servant, service, robot, limit, services, own_robot], |row| {
-                    Ok(RecordedLine {
+                    Ok(RecordedSeries {
                         id: row.get(0)?,
                         servant: row.get(1)?,
                         service: row.get(2)?,
@@ -153,8 +158,8 @@ impl State {
         })
     }
 
-    /// Services of which there are samples, by name.
-    pub fn services_recorded(&self) -> Result<Vec<String>, Error> {
+    /// Returns the services with samples, sorted by name.
+    pub fn services_with_samples(&self) -> Result<Vec<String>, Error> {
         self.read_at_length(|connection| {
             connection
                 .prepare_cached(
@@ -165,7 +170,8 @@ impl State {
         })
     }
 
-    /// The samples of one step (seconds) with times from `from` to `to`, oldest first; at most `limit`, then the newest.
+    /// Returns the samples of one step (in seconds) from `from` to `to`, oldest first; if there are more than `limit`,
+    /// the latest ones.
     pub fn samples(
         &self,
         recorded: i64,
@@ -193,8 +199,9 @@ impl State {
         })
     }
 
-    /// From `began` on a robot's node is served by its local original. Where that is so already, it stays so.
-    pub fn begin_local(
+    /// Records that a robot's node is served by its local original from `began` on. A period that is already open is
+    /// left unchanged.
+    pub fn begin_local_period(
         &self,
         (service, robot, node): (&str, &str, &str),
         began: Millis,
@@ -212,8 +219,8 @@ impl State {
         })
     }
 
-    /// From `ended` on it is served by the cloud.
-    pub fn end_local(
+    /// Records that a robot's node is served by the cloud again from `ended` on.
+    pub fn end_local_period(
         &self,
         (service, robot, node): (&str, &str, &str),
         ended: Millis,
@@ -229,18 +236,19 @@ impl State {
         })
     }
 
-    /// When a robot was served by its local originals in place of a service, between `from` and `to`, oldest first.
+    /// Returns the periods between `from` and `to` in which a robot was served by its local originals instead of a
+    /// service, oldest first.
     pub fn local_periods(
         &self,
         service: &str,
         robot: &str,
         (from, to): (Millis, Millis),
     ) -> Result<Vec<LocalPeriod>, Error> {
-        self.read(|connection| periods(connection, service, robot, (from, to)))
+        self.read(|connection| read_local_periods(connection, service, robot, (from, to)))
     }
 }
 
-fn periods(
+fn read_local_periods(
     connection: &Connection,
     service: &str,
     robot: &str,
@@ -286,11 +294,15 @@ mod tests {
     fn samples_are_read_as_they_were_written() {
         let (_home, state) = database();
         let samples = [sample("s1", &[1.5, f32::NAN]), sample("s2", &[3.0])];
-        state.record(10, 1_000, &samples).expect("written");
-        state.record(10, 11_000, &samples[..1]).expect("written");
-        state.record(60, 60_000, &samples[..1]).expect("written");
+        state.add_samples(10, 1_000, &samples).expect("written");
+        state
+            .add_samples(10, 11_000, &samples[..1])
+            .expect("written");
+        state
+            .add_samples(60, 60_000, &samples[..1])
+            .expect("written");
         let found = state
-            .recorded(RecordedFilter::default(), 0, 10)
+            .recorded_series(SeriesFilter::default(), 0, 10)
             .expect("read");
         let seen: Vec<_> = found.iter().map(|one| (&*one.servant, one.seen)).collect();
         assert_eq!(seen, [("s2", 1_000), ("s1", 60_000)]);
@@ -302,7 +314,7 @@ mod tests {
         assert_eq!(times(of(1_001, 99_000)), [11_000]);
         let (_, figures) = &of(0, 1_000)[0];
         assert!(figures[0] == 1.5 && figures[1].is_nan(), "{figures:?}");
-        // Only the newest where there are too many.
+        // Only the latest ones if there are too many.
         let newest = state
             .samples(found[1].id, 10, (0, 99_000), 1)
             .expect("read");
@@ -313,25 +325,25 @@ mod tests {
     fn what_is_old_is_forgotten_step_by_step() {
         let (_home, state) = database();
         state
-            .record(60, 1_000, &[sample("old", &[1.0])])
+            .add_samples(60, 1_000, &[sample("old", &[1.0])])
             .expect("written");
         for time in [1_000, 50_000, 90_000] {
             let samples = [sample("s1", &[1.0]), sample("", &[2.0])];
-            state.record(10, time, &samples).expect("written");
-            state.record(60, time, &samples).expect("written");
+            state.add_samples(10, time, &samples).expect("written");
+            state.add_samples(60, time, &samples).expect("written");
         }
         state
             .forget_history(&[(10, 60_000), (60, 20_000)])
             .expect("forgotten");
         let servants = state
-            .recorded(RecordedFilter::default(), 0, 10)
+            .recorded_series(SeriesFilter::default(), 0, 10)
             .expect("read");
         assert_eq!(servants.len(), 1, "the machine is no servant: {servants:?}");
-        let machine = RecordedFilter {
+        let machine = SeriesFilter {
             servant: Some(""),
-            ..RecordedFilter::default()
+            ..SeriesFilter::default()
         };
-        let machine = state.recorded(machine, 0, 10).expect("read");
+        let machine = state.recorded_series(machine, 0, 10).expect("read");
         for id in [servants[0].id, machine[0].id] {
             let count = |step| {
                 state
@@ -348,12 +360,16 @@ mod tests {
         let (_home, state) = database();
         let of = ("adder", "r1", "/adder");
         state
-            .begin_local(of, 10, "the link is down")
+            .begin_local_period(of, 10, "the link is down")
             .expect("written");
-        state.begin_local(of, 20, "Q has fallen").expect("written");
-        state.end_local(of, 30).expect("written");
-        state.end_local(of, 40).expect("written");
-        state.begin_local(of, 50, "Q has fallen").expect("written");
+        state
+            .begin_local_period(of, 20, "Q has fallen")
+            .expect("written");
+        state.end_local_period(of, 30).expect("written");
+        state.end_local_period(of, 40).expect("written");
+        state
+            .begin_local_period(of, 50, "Q has fallen")
+            .expect("written");
         let periods = |from, to| {
             state
                 .local_periods("adder", "r1", (from, to))

@@ -1,4 +1,4 @@
-//! Events: written to the state database and to the daemon's log.
+//! Journal of events, written to the state database and to the daemon's log.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -7,43 +7,43 @@ use api::Level;
 
 use super::{NewEvent, State, millis};
 
-/// Where events go.
+/// Writer of events.
 #[derive(Clone)]
 pub struct Journal {
     state: Arc<State>,
 }
 
 impl Journal {
-    /// Into `state`.
+    /// Creates a journal that writes to `state`.
     pub fn new(state: Arc<State>) -> Journal {
         Journal { state }
     }
 
-    /// As it should be.
+    /// Records an event of normal operation.
     pub fn info(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
         tracing::info!("{message}");
         self.write(Level::Info, kind, message, about);
     }
 
-    /// Worth a look.
+    /// Records an event that deserves attention.
     pub fn warning(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
         tracing::warn!("{message}");
         self.write(Level::Warning, kind, message, about);
     }
 
-    /// Something failed.
+    /// Records a failure.
     pub fn error(&self, kind: &str, message: &str, about: &NewEvent<'_>) {
         tracing::error!("{message}");
         self.write(Level::Error, kind, message, about);
     }
 
-    /// From `at` on a robot's node is served by its local original in place of a service, and why; none: by the cloud again. `of`:
-    /// service, robot, node.
-    pub fn local(&self, of: (&str, &str, &str), at: SystemTime, why: Option<&str>) {
+    /// Records that from `at` on a robot's node is served by its local original, for the reason `why`, or by the cloud
+    /// again if `None`. `of` is the service, robot and node.
+    pub fn record_local_period(&self, of: (&str, &str, &str), at: SystemTime, why: Option<&str>) {
         let at = millis(at);
         let written = match why {
-            Some(why) => self.state.begin_local(of, at, why),
-            None => self.state.end_local(of, at),
+            Some(why) => self.state.begin_local_period(of, at, why),
+            None => self.state.end_local_period(of, at),
         };
         if let Err(error) = written {
             tracing::warn!(

@@ -1,10 +1,11 @@
-//! What must survive: services, their revisions, dictionaries and rollouts, who owns a robot's name, which servant is whose,
-//! tokens, pairings, people and their sessions, rules and the audit log, and the journal of events. SQLite in WAL mode; short statements; one connection that
-//! writes, each time in a transaction ([`State::write`]), and some that only read, which no writer holds up ([`readers`]).
+//! Persistent state: services, their revisions, dictionaries and rollouts, owners of robot names, servants, tokens,
+//! pairings, people and their sessions, policy rules, the audit log and the event journal. SQLite in WAL mode with
+//! short statements: one connection that writes, always in a transaction ([`State::write`]), and several read-only ones
+//! that no writer blocks ([`readers`]).
 //!
-//! Events and servants are written without waiting for the disk (a killed daemon loses none of them, a power cut
-//! perhaps the last); publishing waits for it. What only tells of the past is kept in memory while the disk is full or
-//! another has locked the database ([`backlog`]); what promises something fails then.
+//! Events and servants are written without waiting for the disk (nothing is lost if the daemon is killed, the latest
+//! perhaps in a power failure); publishing waits for the disk. Writes that only record the past are queued in memory
+//! while the disk is full or the database is locked by another program ([`backlog`]); other writes fail.
 
 mod audit;
 mod backlog;
@@ -35,24 +36,24 @@ use parking_lot::Mutex;
 use rusqlite::{Connection, Transaction, TransactionBehavior};
 use serde::Serialize;
 
-pub use audit::NewAudited;
+pub use audit::NewAuditRecord;
 use backlog::Backlog;
-pub use backlog::watch;
-pub use events::{EventFilter, NewEvent, Told};
-pub use history::{NewSample, RecordedFilter, RecordedLine};
+pub use backlog::flush_pending_writes;
+pub use events::{EventFilter, EventVisibility, NewEvent};
+pub use history::{NewSample, RecordedSeries, SeriesFilter};
 pub use journal::Journal;
 pub use pairings::{CodeRecord, PairingRecord};
 pub use people::{AccountEdit, AccountRecord, NewSession, SessionRecord};
-pub use provided::ProvidedRecord;
+pub use provided::FederatedPersonRecord;
 use readers::Readers;
 pub use recordings::RecordingRecord;
 pub use robots::{Owner, TokenHash};
 pub use rules::RuleRecord;
 pub use servants::ServantRecord;
-pub use services::{Plan, RevisionLine, RevisionRecord};
+pub use services::{Plan, RevisionRecord, RevisionSummary};
 pub use tokens::{NewToken, TokenRecord};
 
-/// Steps from an empty database to today's; never edited, only added to.
+/// Migrations from an empty database to the current schema; append-only.
 const MIGRATIONS: [&str; 15] = [
     include_str!("001-start.sql"),
     include_str!("002-limits.sql"),
@@ -71,81 +72,83 @@ const MIGRATIONS: [&str; 15] = [
     include_str!("015-events-by-service.sql"),
 ];
 
-/// What can go wrong.
+/// Errors of the state database.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// SQLite refused.
+    /// Error of SQLite.
     #[error("the state database {path}: {source}")]
     Database {
-        /// Its file.
+        /// Database file.
         path: String,
-        /// What the database said.
+        /// Error returned by SQLite.
         source: rusqlite::Error,
     },
-    /// Written by a later version.
+    /// The database was written by a later version.
     #[error(
-        "the state database {path} is of version {found}, this program knows up to {known}; install the newer cloudroidd"
+        "the state database {path} has version {found}, but this program supports up to {known}; install a newer \
+            cloudroidd"
     )]
     TooNew {
-        /// Its file.
+        /// Database file.
         path: String,
-        /// Its version.
+        /// Schema version of the database.
         found: usize,
-        /// Ours.
+        /// Latest schema version known to this program.
         known: usize,
     },
-    /// A record cannot be read back.
-    #[error("the record of {what} in the state database cannot be read: {source}")]
+    /// A record cannot be decoded.
+    #[error("cannot read the record of {what} in the state database: {source}")]
     Record {
-        /// The table or row.
+        /// Table or row.
         what: String,
-        /// What the database said.
+        /// Error of the decoder.
         source: serde_json::Error,
     },
 }
 
-/// The database.
+/// The state database.
 pub struct State {
     connection: Mutex<Connection>,
     readers: Readers,
     path: String,
     backlog: Backlog,
-    /// Revisions in use, by service and number.
+    /// Cache of revisions in use, by service and revision number.
     revisions: Mutex<HashMap<(String, u64), Arc<RevisionRecord>>>,
 }
 
-/// Now, as the API writes it.
+/// Returns the current time in milliseconds since 1970.
 pub fn now() -> Millis {
     millis(SystemTime::now())
 }
 
-/// `time`, as the API writes it.
+/// Converts a time to milliseconds since 1970.
 pub fn millis(time: SystemTime) -> Millis {
     time.duration_since(UNIX_EPOCH)
         .map_or(0, |since| since.as_millis() as Millis)
 }
 
-/// Opens all files of a database: its first question opens the last of them, and the threads that ask later may open none.
+/// Opens all files of a database: SQLite opens the last of them at the first query, and the threads that query later
+/// may not open files.
 fn open_files(connection: &Connection) -> rusqlite::Result<()> {
     connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
 }
 
-/// What SQLite would say.
-fn cannot_open(error: &std::io::Error) -> rusqlite::Error {
+/// Converts an I/O error to SQLite's error for it.
+fn open_error(error: &std::io::Error) -> rusqlite::Error {
     let code = rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_CANTOPEN);
     rusqlite::Error::SqliteFailure(code, Some(error.to_string()))
 }
 
 impl State {
-    /// Opens the database, making or migrating it.
+    /// Opens the database, creating or migrating it as needed.
     pub fn open(path: &Path) -> Result<State, Error> {
         let name = path.display().to_string();
         let failed = |source| Error::Database {
             path: name.clone(),
             source,
         };
-        // It holds hashes of tokens. SQLite's own files beside it get the rights that this one has.
-        private::open(path).map_err(|error| failed(cannot_open(&error)))?;
+        // The database holds token hashes. SQLite gives its auxiliary files the same permissions.
+        private::open(path).map_err(|error| failed(open_error(&error)))?;
         let mut connection = Connection::open(path).map_err(failed)?;
         connection
             .execute_batch(
@@ -157,7 +160,7 @@ impl State {
             .busy_handler(Some(wait_for_another))
             .map_err(failed)?;
         migrate(&mut connection, &name)?;
-        let last = events::last(&connection).map_err(failed)?;
+        let last = events::last_event_number(&connection).map_err(failed)?;
         open_files(&connection).map_err(failed)?;
         Ok(State {
             connection: Mutex::new(connection),
@@ -168,7 +171,7 @@ impl State {
         })
     }
 
-    /// Writes what `work` writes, all or none: where this returns a value, no crash of the daemon loses it.
+    /// Runs `work` in a transaction: if this returns a value, a crash of the daemon does not lose it.
     fn write<T>(
         &self,
         work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
@@ -176,7 +179,7 @@ impl State {
         self.with_writer(|connection| commit(connection, work))
     }
 
-    /// Writes what `work` writes, all or none: where this returns a value, no cut of the power loses it.
+    /// Runs `work` in a durable transaction: if this returns a value, a power failure does not lose it.
     fn write_durably<T>(
         &self,
         work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
@@ -197,30 +200,30 @@ impl State {
             let mut connection = self
                 .connection
                 .try_lock()
-                .unwrap_or_else(|| aside(|| self.connection.lock()));
+                .unwrap_or_else(|| run_blocking(|| self.connection.lock()));
             work(&mut connection)
         };
         outcome.map_err(|source| {
-            self.write_failed(&source);
-            self.failed(source)
+            self.on_write_failed(&source);
+            self.database_error(source)
         })
     }
 
-    /// Reads by `work` with a connection that no other question is using. Neither a writer nor, while a connection is
-    /// free, a longer question holds this up.
+    /// Runs a query on a connection that no other query is using. It is blocked neither by a writer nor, as long as a
+    /// connection is free, by a longer query.
     fn read<T>(&self, work: impl FnOnce(&Connection) -> rusqlite::Result<T>) -> Result<T, Error> {
-        work(&self.readers.take()).map_err(|source| self.failed(source))
+        work(&self.readers.acquire()).map_err(|source| self.database_error(source))
     }
 
-    /// Reads by `work`, which may look at thousands of rows: the tasks that share this thread go on meanwhile.
+    /// Runs a query that may scan thousands of rows, without blocking other tasks of this thread.
     fn read_at_length<T>(
         &self,
         work: impl FnOnce(&Connection) -> rusqlite::Result<T>,
     ) -> Result<T, Error> {
-        aside(|| self.read(work))
+        run_blocking(|| self.read(work))
     }
 
-    fn failed(&self, source: rusqlite::Error) -> Error {
+    fn database_error(&self, source: rusqlite::Error) -> Error {
         Error::Database {
             path: self.path.clone(),
             source,
@@ -228,35 +231,37 @@ impl State {
     }
 }
 
-/// Runs `work` in a transaction and commits it. SQLite says only at the end of a transaction whether what was written
-/// could be (the disk may be full then), and `INSERT … RETURNING` gives its rows before that: nothing else may end one.
+/// Runs `work` in a transaction and commits it. SQLite reports only at the end of a transaction whether it could be
+/// written (the disk may be full by then), and `INSERT … RETURNING` returns its rows before that; transactions must end
+/// nowhere else.
 fn commit<T>(
     connection: &mut Connection,
     work: impl FnOnce(&Transaction<'_>) -> rusqlite::Result<T>,
 ) -> rusqlite::Result<T> {
-    // Immediate: a transaction that began by reading is refused, without waiting, where another wrote meanwhile.
+    // Immediate: a deferred transaction that began by reading fails without waiting if another one has written
+    // meanwhile.
     let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
     let outcome = work(&transaction)?;
     transaction.commit()?;
     Ok(outcome)
 }
 
-/// For so long another may have the database locked before a statement fails.
+/// Time for which the database may be locked by others before a statement fails.
 const LOCKED: Duration = Duration::from_secs(5);
-/// Between attempts.
+/// Interval between attempts.
 const RETRY: Duration = Duration::from_millis(10);
 
-/// SQLite asks, for the `attempts`th time, whether to wait until another has done with the database.
+/// Busy handler: returns whether SQLite should wait for the lock again after `attempts` attempts.
 fn wait_for_another(attempts: i32) -> bool {
     if RETRY * attempts.unsigned_abs() >= LOCKED {
         return false;
     }
-    aside(|| std::thread::sleep(RETRY));
+    run_blocking(|| std::thread::sleep(RETRY));
     true
 }
 
-/// Waits without holding up the tasks that share this thread.
-fn aside<T>(wait: impl FnOnce() -> T) -> T {
+/// Runs a blocking closure without blocking other tasks of this thread.
+fn run_blocking<T>(wait: impl FnOnce() -> T) -> T {
     use tokio::runtime::{Handle, RuntimeFlavor};
     match Handle::try_current().map(|handle| handle.runtime_flavor()) {
         Ok(RuntimeFlavor::MultiThread) => tokio::task::block_in_place(wait),

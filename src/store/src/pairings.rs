@@ -1,53 +1,53 @@
-//! Pairings of robots, and the codes by which they are made. Of a code itself only its hash is kept.
+//! Pairings of robots, and pairing codes. Only the hash of a code is stored.
 
 use rusqlite::{OptionalExtension, Row, params};
 
 use super::{Error, State, now};
 
-/// A pairing code, as it was given out.
+/// A pairing code.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CodeRecord {
-    /// Its number, never given twice.
+    /// Row number; never reused.
     pub id: i64,
-    /// The robot that it is for.
+    /// Robot that the code is for.
     pub robot: String,
-    /// What the pairing will be for, in the words of whoever decides by it.
+    /// Scope of the resulting pairing, as encoded by the portal.
     pub scope: String,
-    /// When it was made.
+    /// Creation time.
     pub created: u64,
-    /// When it ends.
+    /// Expiry time.
     pub expires: u64,
-    /// When it was used.
+    /// Time of use.
     pub used: Option<u64>,
-    /// When it was taken back.
+    /// Time of cancellation.
     pub cancelled: Option<u64>,
 }
 
-/// A robot that is paired, or was.
+/// A pairing, current or revoked.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PairingRecord {
-    /// Its number, never given twice.
+    /// Row number; never reused.
     pub id: i64,
-    /// The robot.
+    /// Name of the robot.
     pub robot: String,
-    /// What it is for, in the words of whoever decides by it.
+    /// Scope of the pairing, as encoded by the portal.
     pub scope: String,
-    /// SHA-256 of the robot's key; none where another authority than the daemon's signs its certificates.
+    /// SHA-256 of the robot's key; absent if another CA than the daemon's issues its certificates.
     pub key: Option<String>,
-    /// When it was made.
+    /// Creation time.
     pub created: u64,
-    /// The end of the newest certificate.
+    /// Expiry time of the latest certificate.
     pub expires: Option<u64>,
-    /// When the robot came last, to the minute.
+    /// Last connection of the robot, to the minute.
     pub last_used: Option<u64>,
-    /// When it was revoked.
+    /// Time of revocation.
     pub revoked: Option<u64>,
 }
 
 const CODE: &str = "id, robot, scope, created, expires, used, cancelled";
 const PAIRING: &str = "id, robot, scope, key, created, expires, last_used, revoked";
 
-fn code(row: &Row<'_>) -> rusqlite::Result<CodeRecord> {
+fn read_code(row: &Row<'_>) -> rusqlite::Result<CodeRecord> {
     Ok(CodeRecord {
         id: row.get(0)?,
         robot: row.get(1)?,
@@ -59,7 +59,7 @@ fn code(row: &Row<'_>) -> rusqlite::Result<CodeRecord> {
     })
 }
 
-fn pairing(row: &Row<'_>) -> rusqlite::Result<PairingRecord> {
+fn read_pairing(row: &Row<'_>) -> rusqlite::Result<PairingRecord> {
     Ok(PairingRecord {
         id: row.get(0)?,
         robot: row.get(1)?,
@@ -73,7 +73,7 @@ fn pairing(row: &Row<'_>) -> rusqlite::Result<PairingRecord> {
 }
 
 impl State {
-    /// Writes a code for a robot, by its hash; one that the robot had until now is taken back.
+    /// Stores the hash of a new code for a robot; cancels its previous code.
     pub fn add_pairing_code(
         &self,
         robot: &str,
@@ -82,7 +82,7 @@ impl State {
         expires: u64,
     ) -> Result<(), Error> {
         self.write_durably(|transaction| {
-            cancel(transaction, robot)?;
+            cancel_code(transaction, robot)?;
             transaction.execute(
                 "INSERT INTO pairing_codes (robot, hash, scope, created, expires) VALUES (?1, ?2, ?3, ?4, ?5)",
                 params![robot, hash, scope, now(), expires],
@@ -91,35 +91,36 @@ impl State {
         })
     }
 
-    /// The code of this hash.
+    /// Returns the code with this hash.
     pub fn pairing_code(&self, hash: &str) -> Result<Option<CodeRecord>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!("SELECT {CODE} FROM pairing_codes WHERE hash = ?1"))?
-                .query_row([hash], code)
+                .query_row([hash], read_code)
                 .optional()
         })
     }
 
-    /// Codes that could be used at a time.
+    /// Returns the codes that are valid at a time.
     pub fn pairing_codes(&self, at: u64) -> Result<Vec<CodeRecord>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!(
-                    "SELECT {CODE} FROM pairing_codes WHERE used IS NULL AND cancelled IS NULL AND expires > ?1 ORDER BY robot"
+                    "SELECT {CODE} FROM pairing_codes WHERE used IS NULL AND cancelled IS NULL AND expires > ?1 \
+                     ORDER BY robot"
                 ))?
-                .query_map([at], code)?
+                .query_map([at], read_code)?
                 .collect()
         })
     }
 
-    /// Takes a robot's code back; false where it has none that could be used.
+    /// Cancels a robot's code; returns false if it has no valid one.
     pub fn cancel_pairing_code(&self, robot: &str) -> Result<bool, Error> {
-        self.write_durably(|connection| cancel(connection, robot))
+        self.write_durably(|connection| cancel_code(connection, robot))
     }
 
-    /// Uses a code, if it still can be: pairs its robot with a key, in place of the one that it was paired with until now. None
-    /// where somebody else was faster.
+    /// Consumes a code if it is still valid: pairs its robot with a key, replacing its previous pairing. Returns `None`
+    /// if the code is no longer valid.
     pub fn use_pairing_code(
         &self,
         id: i64,
@@ -129,38 +130,39 @@ impl State {
         self.write_durably(|transaction| {
             let used = transaction
                 .prepare_cached(&format!(
-                    "UPDATE pairing_codes SET used = ?2 WHERE id = ?1 AND used IS NULL AND cancelled IS NULL AND expires > ?2
+                    "UPDATE pairing_codes SET used = ?2 WHERE id = ?1 AND used IS NULL AND cancelled IS NULL \
+                     AND expires > ?2
                      RETURNING {CODE}"
                 ))?
-                .query_row(params![id, now()], code)
+                .query_row(params![id, now()], read_code)
                 .optional()?;
             let Some(used) = used else { return Ok(None) };
-            let made = replace(transaction, &used.robot, &used.scope, Some((key, expires)))?;
+            let made = replace_pairing(transaction, &used.robot, &used.scope, Some((key, expires)))?;
             Ok(Some(made))
         })
     }
 
-    /// Pairs a robot whose certificates another authority signs; a code that it has is taken back.
+    /// Pairs a robot whose certificates are issued by another CA; cancels its pairing code.
     pub fn add_pairing(&self, robot: &str, scope: &str) -> Result<PairingRecord, Error> {
         self.write_durably(|transaction| {
-            cancel(transaction, robot)?;
-            let made = replace(transaction, robot, scope, None)?;
+            cancel_code(transaction, robot)?;
+            let made = replace_pairing(transaction, robot, scope, None)?;
             Ok(made)
         })
     }
 
-    /// All pairings there ever were.
+    /// Returns all pairings, including revoked ones.
     pub fn pairings(&self) -> Result<Vec<PairingRecord>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!("SELECT {PAIRING} FROM pairings ORDER BY id"))?
-                .query_map([], pairing)?
+                .query_map([], read_pairing)?
                 .collect()
         })
     }
 
-    /// Remembers the end of a pairing's newest certificate; false where it was revoked.
-    pub fn pairing_renewed(&self, id: i64, expires: u64) -> Result<bool, Error> {
+    /// Records the expiry time of a pairing's latest certificate; returns false if it was revoked.
+    pub fn extend_pairing(&self, id: i64, expires: u64) -> Result<bool, Error> {
         self.write_durably(|connection| {
             let changed = connection.execute(
                 "UPDATE pairings SET expires = max(expires, ?2) WHERE id = ?1 AND revoked IS NULL",
@@ -170,17 +172,17 @@ impl State {
         })
     }
 
-    /// Ends a robot's pairing, and takes back a code that it has; false where there is neither.
+    /// Revokes a robot's pairing and cancels its code; returns false if there is neither.
     pub fn revoke_pairing(&self, robot: &str) -> Result<bool, Error> {
         self.write_durably(|transaction| {
-            let cancelled = cancel(transaction, robot)?;
-            let revoked = revoke(transaction, robot)?;
+            let cancelled = cancel_code(transaction, robot)?;
+            let revoked = revoke_row(transaction, robot)?;
             Ok(cancelled || revoked)
         })
     }
 
-    /// Remembers that a robot came.
-    pub fn pairing_used(&self, id: i64, at: u64) -> Result<(), Error> {
+    /// Records that a robot has connected.
+    pub fn record_pairing_use(&self, id: i64, at: u64) -> Result<(), Error> {
         self.write(|connection| {
             connection.execute(
                 "UPDATE pairings SET last_used = ?2 WHERE id = ?1",
@@ -191,7 +193,7 @@ impl State {
     }
 }
 
-fn cancel(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bool> {
+fn cancel_code(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bool> {
     let changed = connection.execute(
         "UPDATE pairing_codes SET cancelled = ?2 WHERE robot = ?1 AND used IS NULL AND cancelled IS NULL",
         params![robot, now()],
@@ -199,7 +201,7 @@ fn cancel(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bo
     Ok(changed > 0)
 }
 
-fn revoke(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bool> {
+fn revoke_row(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bool> {
     let changed = connection.execute(
         "UPDATE pairings SET revoked = ?2 WHERE robot = ?1 AND revoked IS NULL",
         params![robot, now()],
@@ -207,17 +209,17 @@ fn revoke(connection: &rusqlite::Connection, robot: &str) -> rusqlite::Result<bo
     Ok(changed > 0)
 }
 
-fn replace(
+fn replace_pairing(
     connection: &rusqlite::Connection,
     robot: &str,
     scope: &str,
     key: Option<(&str, u64)>,
 ) -> rusqlite::Result<PairingRecord> {
-    revoke(connection, robot)?;
+    revoke_row(connection, robot)?;
     let (key, expires) = key.unzip();
     connection
         .prepare_cached(&format!(
             "INSERT INTO pairings (robot, scope, key, created, expires) VALUES (?1, ?2, ?3, ?4, ?5) RETURNING {PAIRING}"
         ))?
-        .query_row(params![robot, scope, key, now(), expires], pairing)
+        .query_row(params![robot, scope, key, now(), expires], read_pairing)
 }

@@ -1,94 +1,94 @@
-//! People: accounts with passwords, and sessions of the page. Of a password and of what a session shows only hashes are kept.
+//! User accounts with passwords, and sessions of the web page. Only hashes of passwords and session tokens are stored.
 
 use rusqlite::{OptionalExtension, Row, params};
 
 use super::{Error, State, TokenHash, now};
 
-/// An account.
+/// A user account.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AccountRecord {
-    /// Its number, never given twice.
+    /// Row number; never reused.
     pub id: i64,
-    /// The person's name.
+    /// Name of the user.
     pub name: String,
-    /// The password's hash, in the PHC string format.
+    /// Hash of the password, in the PHC string format.
     pub password: String,
-    /// The person's role, in the words of whoever decides by it.
+    /// Role of the user, as encoded by the portal.
     pub role: String,
-    /// What it is for, likewise.
+    /// Scope of the user, as encoded by the portal.
     pub scope: String,
-    /// When it was made, in milliseconds since 1970, as are all times here.
+    /// Creation time in milliseconds since 1970, as all times here.
     pub created: u64,
-    /// When somebody last signed in by it.
+    /// Last sign-in.
     pub last_login: Option<u64>,
-    /// Since when nobody may sign in by it.
+    /// Time when sign-in was disabled.
     pub disabled: Option<u64>,
-    /// When it was removed.
+    /// Time when the account was removed.
     pub removed: Option<u64>,
 }
 
-/// A session of the page.
+/// A session of the web page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SessionRecord {
-    /// Its number, never given twice.
+    /// Row number; never reused.
     pub id: i64,
-    /// SHA-256 of what its browser shows.
+    /// SHA-256 of the session token.
     pub hash: TokenHash,
-    /// The account by which it was begun; none where a provider said who it is.
+    /// Account of the session; absent if the user was authenticated by an identity provider.
     pub account: Option<i64>,
-    /// The person's name.
+    /// Name of the user.
     pub name: String,
-    /// Its role.
+    /// Role of the user.
     pub role: String,
-    /// What it is for.
+    /// Scope of the user.
     pub scope: String,
-    /// From where it was begun.
+    /// Origin of the session.
     pub peer: String,
-    /// When it was begun.
+    /// Time when the session began.
     pub created: u64,
-    /// When it was shown last, to the minute.
+    /// Last use, to the minute.
     pub last_used: u64,
-    /// When it ends at the latest.
+    /// Latest time at which the session ends.
     pub expires: u64,
-    /// The person whom a provider knows.
+    /// Federated person, if authenticated by an identity provider.
     pub person: Option<i64>,
-    /// Which of its groups the configuration named when it began, as JSON.
+    /// Groups of the person that the configuration named when the session began, as JSON.
     pub groups: Option<String>,
 }
 
-/// A change of an account. What is none stays as it is.
+/// Changes to an account. Absent fields stay unchanged.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AccountEdit<'a> {
-    /// The new password's hash, in the PHC string format.
+    /// Hash of the new password, in the PHC string format.
     pub password: Option<&'a str>,
-    /// The new role, and what it is for.
+    /// New role and scope.
     pub role_and_scope: Option<(&'a str, &'a str)>,
-    /// Whether somebody may sign in by it.
+    /// True to disable sign-in, false to enable it.
     pub is_disabled: Option<bool>,
 }
 
-/// A session to begin.
+/// A session to create.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewSession<'a> {
-    /// SHA-256 of what its browser shows.
+    /// SHA-256 of the session token.
     pub hash: &'a str,
-    /// The account by which it is begun.
+    /// Account of the session.
     pub account: Option<i64>,
-    /// The person's name.
+    /// Name of the user.
     pub name: &'a str,
-    /// Its role.
+    /// Role of the user.
     pub role: &'a str,
-    /// What it is for.
+    /// Scope of the user.
     pub scope: &'a str,
-    /// From where.
+    /// Origin of the session.
     pub peer: &'a str,
-    /// When it ends at the latest.
+    /// Latest time at which the session ends.
     pub expires: u64,
-    /// The person whom a provider knows, with those of its groups that the configuration names, as JSON.
+    /// Federated person, with those of its groups that the configuration names, as JSON.
     pub person: Option<(i64, &'a str)>,
 }
 
-/// Sessions that a person may have at once; the oldest end for newer ones.
+/// Maximum number of sessions per user; the oldest are ended first.
 const MOST_SESSIONS: u32 = 32;
 
 const ACCOUNT: &str = "id, name, password, role, scope, created, last_login, disabled, removed";
@@ -127,7 +127,7 @@ fn read_session(row: &Row<'_>) -> rusqlite::Result<SessionRecord> {
 }
 
 impl State {
-    /// All accounts there ever were, oldest first.
+    /// Returns all accounts, including removed ones, oldest first.
     pub fn accounts(&self) -> Result<Vec<AccountRecord>, Error> {
         self.read(|connection| {
             connection
@@ -137,7 +137,7 @@ impl State {
         })
     }
 
-    /// Records an account, on disk when this returns; false where its name is another account's.
+    /// Creates an account durably; returns false if the name is taken.
     pub fn add_account(
         &self,
         name: &str,
@@ -155,7 +155,7 @@ impl State {
         .map(|changed| changed > 0)
     }
 
-    /// Changes an account and ends all its sessions, both or none; false where there is no such account.
+    /// Changes an account and ends all its sessions, both or neither; returns false if there is no such account.
     fn change_account(
         &self,
         name: &str,
@@ -175,7 +175,7 @@ impl State {
         })
     }
 
-    /// Changes what `edit` names of an account, and ends all its sessions; false where there is no such account.
+    /// Applies `edit` to an account and ends all its sessions; returns false if there is no such account.
     pub fn edit_account(&self, name: &str, edit: &AccountEdit<'_>) -> Result<bool, Error> {
         let (role, scope) = edit.role_and_scope.unzip();
         let disabled = edit.is_disabled.map(|is_disabled| is_disabled.then(now));
@@ -195,7 +195,7 @@ impl State {
         })
     }
 
-    /// Hashes the same password anew: sessions go on.
+    /// Replaces the hash of an unchanged password; sessions are kept.
     pub fn rehash_password(&self, id: i64, before: &str, password: &str) -> Result<(), Error> {
         self.write(|connection| {
             connection.execute(
@@ -206,7 +206,7 @@ impl State {
         .map(|_| ())
     }
 
-    /// Removes an account. That there was one is kept, its password is not.
+    /// Removes an account. A record of it is kept, without its password.
     pub fn remove_account(&self, name: &str) -> Result<bool, Error> {
         self.change_account(name, |transaction, id| {
             transaction.execute(
@@ -216,7 +216,7 @@ impl State {
         })
     }
 
-    /// All sessions.
+    /// Returns all sessions.
     pub fn sessions(&self) -> Result<Vec<SessionRecord>, Error> {
         self.read(|connection| {
             connection
@@ -226,8 +226,8 @@ impl State {
         })
     }
 
-    /// Begins a session, and forgets those that are over; none where its account is not what it was when its password was
-    /// checked (`password`: that hash).
+    /// Creates a session and deletes expired ones. Returns `None` if the account has changed since its password was
+    /// checked; `password` is the hash that was checked.
     pub fn add_session(
         &self,
         new: &NewSession<'_>,
@@ -251,7 +251,8 @@ impl State {
             transaction.execute("DELETE FROM sessions WHERE expires <= ?1", [at])?;
             let made = transaction
                 .prepare_cached(&format!(
-                    "INSERT INTO sessions (hash, account, name, role, scope, peer, created, last_used, expires, person, groups)
+                    "INSERT INTO sessions (hash, account, name, role, scope, peer, created, last_used, expires, \
+                     person, groups)
                      VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?7, ?8, ?9, ?10) RETURNING {SESSION}"
                 ))?
                 .query_row(
@@ -284,8 +285,8 @@ impl State {
         })
     }
 
-    /// Remembers that a session was shown.
-    pub fn session_used(&self, id: i64, at: u64) -> Result<(), Error> {
+    /// Records the use of a session.
+    pub fn record_session_use(&self, id: i64, at: u64) -> Result<(), Error> {
         self.write(|connection| {
             connection.execute(
                 "UPDATE sessions SET last_used = ?2 WHERE id = ?1",
@@ -295,7 +296,7 @@ impl State {
         .map(|_| ())
     }
 
-    /// Ends a session; false where there is none of that number.
+    /// Ends a session; returns false if it does not exist.
     pub fn end_session(&self, id: i64) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute("DELETE FROM sessions WHERE id = ?1", [id])
@@ -303,8 +304,8 @@ impl State {
         .map(|ended| ended > 0)
     }
 
-    /// Ends all sessions of a person; how many there were.
-    pub fn end_sessions_of(&self, name: &str) -> Result<usize, Error> {
+    /// Ends all sessions of a user; returns their number.
+    pub fn end_sessions(&self, name: &str) -> Result<usize, Error> {
         self.write_durably(|connection| {
             connection.execute("DELETE FROM sessions WHERE name = ?1", [name])
         })

@@ -1,20 +1,20 @@
-//! Files and directories that only this user can read: environments of servants, hashes of tokens, pushed sources, logs of
-//! builds (docs/adr/033).
+//! Files and directories that only this user can access: servant environments, token hashes, pushed sources, build logs
+//! (docs/adr/033).
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions};
 use std::io::{self, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 
-/// Rights of groups and others.
+/// Permission bits of group and others.
 const OTHERS: u32 = 0o077;
 
-/// Makes a directory with all above it that is missing.
+/// Creates a directory and its missing parents.
 pub fn make_directory(path: &Path) -> io::Result<()> {
     DirBuilder::new().recursive(true).mode(0o700).create(path)
 }
 
-/// Opens a file for reading and writing, made where it is missing.
+/// Opens a file for reading and writing, creating it if needed.
 pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new()
         .read(true)
@@ -23,12 +23,12 @@ pub fn open(path: &Path) -> io::Result<File> {
         .truncate(false)
         .mode(0o600)
         .open(path)?;
-    close(path)?;
+    restrict_to_owner(path)?;
     Ok(file)
 }
 
-/// Writes a file, whole or not at all, with the directory that it is in.
-pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
+/// Writes a file atomically, creating its directory if needed.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if let Some(directory) = path.parent() {
         make_directory(directory)?;
     }
@@ -40,8 +40,8 @@ pub fn replace(path: &Path, bytes: &[u8]) -> io::Result<()> {
     std::fs::rename(&begun, path)
 }
 
-/// Removes the rights of group and others on a file or directory. Links, and paths that do not exist, are skipped.
-pub fn close(path: &Path) -> io::Result<()> {
+/// Removes the permissions of group and others on a file or directory. Links and missing paths are skipped.
+pub fn restrict_to_owner(path: &Path) -> io::Result<()> {
     let about = match path.symlink_metadata() {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         about => about?,
@@ -56,17 +56,17 @@ pub fn close(path: &Path) -> io::Result<()> {
     }
 }
 
-/// The same for a directory and its entries, down to a number of levels; deeper entries cannot be reached through it
-/// anyway. Entries that `leave` names are skipped.
-pub fn close_below(path: &Path, levels: usize, leave: &dyn Fn(&Path) -> bool) -> io::Result<()> {
-    close(path)?;
+/// Removes the permissions of group and others on a directory and its entries, down to the given number of levels;
+/// deeper entries cannot be reached through it anyway. Entries for which `leave` returns true are skipped.
+pub fn restrict_tree(path: &Path, levels: usize, leave: &dyn Fn(&Path) -> bool) -> io::Result<()> {
+    restrict_to_owner(path)?;
     if levels == 0 || !path.symlink_metadata().is_ok_and(|about| about.is_dir()) {
         return Ok(());
     }
     for entry in std::fs::read_dir(path)? {
         let path = entry?.path();
         if !leave(&path) {
-            close_below(&path, levels - 1, leave)?;
+            restrict_tree(&path, levels - 1, leave)?;
         }
     }
     Ok(())
@@ -97,24 +97,24 @@ mod tests {
         ] {
             std::fs::set_permissions(path(name), Permissions::from_mode(rights)).expect("set");
         }
-        close_below(&path("a"), 2, &|path| path.ends_with("c")).expect("closed");
+        restrict_tree(&path("a"), 2, &|path| path.ends_with("c")).expect("closed");
         assert_eq!(mode(&path("a")), 0o700);
         assert_eq!(mode(&path("a/b")), 0o700);
         assert_eq!(mode(&path("a/b/program")), 0o700);
         assert_eq!(mode(&path("a/b/c")), 0o755, "left alone");
         assert_eq!(mode(&path("outside")), 0o644, "behind a link");
-        close(&path("gone")).expect("nothing to do");
+        restrict_to_owner(&path("gone")).expect("nothing to do");
     }
 
     #[test]
     fn a_file_is_replaced_whole_and_is_its_owners_alone() {
         let place = tempfile::tempdir().expect("a directory");
         let path = place.path().join("a/file.pem");
-        // What a daemon left that was ended meanwhile.
+        // Left behind by a daemon that was interrupted.
         std::fs::create_dir(place.path().join("a")).expect("made");
         std::fs::write(path.with_extension("begun"), "much longer").expect("made");
         for text in ["first", "2nd"] {
-            replace(&path, text.as_bytes()).expect("replaced");
+            write_atomically(&path, text.as_bytes()).expect("replaced");
             assert_eq!(std::fs::read_to_string(&path).expect("there"), text);
             assert_eq!(mode(&path), 0o600);
         }

@@ -1,4 +1,5 @@
-//! Connections that only read. No writer holds them up, and a long question holds up nobody while another is free.
+//! Pool of read-only connections. No writer blocks them, and a long query blocks nobody while another connection is
+//! free.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -6,20 +7,20 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use parking_lot::{Mutex, MutexGuard};
 use rusqlite::Connection;
 
-use super::{aside, open_files, wait_for_another};
+use super::{open_files, run_blocking, wait_for_another};
 
-/// So many questions are answered at once.
+/// Number of connections, and thus of concurrent queries.
 const CONNECTIONS: usize = 4;
 
-/// The connections of one database that only read.
+/// The read-only connections of a database.
 pub(super) struct Readers {
     connections: Vec<Mutex<Connection>>,
-    /// Which one is waited for next where none is free.
+    /// Connection to wait for next if none is free.
     next: AtomicUsize,
 }
 
 impl Readers {
-    /// Opens them all, with their files: the threads that ask later may open none.
+    /// Opens all connections and their files: the threads that query later may not open files.
     pub(super) fn open(path: &Path) -> rusqlite::Result<Readers> {
         let connections = (0..CONNECTIONS).map(|_| open_connection(path).map(Mutex::new));
         Ok(Readers {
@@ -28,12 +29,12 @@ impl Readers {
         })
     }
 
-    /// Takes a connection that is free, or waits for one.
-    pub(super) fn take(&self) -> MutexGuard<'_, Connection> {
+    /// Acquires a free connection, or waits for one.
+    pub(super) fn acquire(&self) -> MutexGuard<'_, Connection> {
         let free = self.connections.iter().find_map(Mutex::try_lock);
         free.unwrap_or_else(|| {
             let turn = self.next.fetch_add(1, Ordering::Relaxed) % CONNECTIONS;
-            aside(|| self.connections[turn].lock())
+            run_blocking(|| self.connections[turn].lock())
         })
     }
 }

@@ -1,37 +1,37 @@
-//! Files of the last seconds of servants.
+//! Index of the recordings of servants' last seconds.
 
 use api::Millis;
 use rusqlite::{Row, params};
 
 use super::{Error, State, to_json};
 
-/// A file, as it is remembered.
+/// A recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecordingRecord {
-    /// Its number, which names the file; 0 in one that is yet to be.
+    /// Recording number, which names the file; 0 before it is stored.
     pub id: u64,
-    /// The service.
+    /// Name of the service.
     pub service: String,
-    /// The robot.
+    /// Name of the robot.
     pub robot: String,
-    /// The servant's id.
+    /// Id of the servant.
     pub servant: String,
-    /// When it was written.
+    /// Time when the file was written.
     pub time: Millis,
-    /// Why it was written.
+    /// Reason for the recording.
     pub why: String,
-    /// From its first message to its last, in milliseconds.
+    /// Duration from the first to the last message, in milliseconds.
     pub span: Millis,
-    /// Messages.
+    /// Number of messages.
     pub messages: u64,
-    /// Bytes of the file.
+    /// Size of the file in bytes.
     pub bytes: u64,
-    /// The topics that it has messages of; none: nobody knows.
+    /// Topics that the file has messages of; absent if unknown.
     pub topics: Option<Vec<String>>,
 }
 
 impl State {
-    /// Remembers a file; its number.
+    /// Adds a recording and returns its number.
     pub fn add_recording(&self, new: &RecordingRecord) -> Result<u64, Error> {
         let topics = new.topics.as_ref();
         let topics = topics
@@ -61,7 +61,7 @@ impl State {
         .map(|id| id as u64)
     }
 
-    /// All files, the newest first.
+    /// Returns all recordings, newest first.
     pub fn recordings(&self) -> Result<Vec<RecordingRecord>, Error> {
         self.read_at_length(|connection| {
             connection
@@ -69,12 +69,12 @@ impl State {
                     "SELECT id, service, robot, servant, time, why, span, messages, bytes, topics
                      FROM recordings ORDER BY id DESC",
                 )?
-                .query_map([], record)?
+                .query_map([], read_recording)?
                 .collect()
         })
     }
 
-    /// Forgets a file; whether it was known.
+    /// Deletes a recording; returns whether it existed.
     pub fn forget_recording(&self, id: u64) -> Result<bool, Error> {
         self.write(|connection| {
             connection.execute("DELETE FROM recordings WHERE id = ?1", [id as i64])
@@ -83,7 +83,7 @@ impl State {
     }
 }
 
-fn record(row: &Row<'_>) -> rusqlite::Result<RecordingRecord> {
+fn read_recording(row: &Row<'_>) -> rusqlite::Result<RecordingRecord> {
     let number = |at: usize| row.get::<_, i64>(at).map(|number| number as u64);
     Ok(RecordingRecord {
         id: number(0)?,
@@ -95,7 +95,7 @@ fn record(row: &Row<'_>) -> rusqlite::Result<RecordingRecord> {
         span: number(6)?,
         messages: number(7)?,
         bytes: number(8)?,
-        // What cannot be read is not known.
+        // A value that cannot be decoded counts as unknown.
         topics: row
             .get::<_, Option<String>>(9)?
             .and_then(|topics| serde_json::from_str(&topics).ok()),
@@ -124,7 +124,7 @@ mod tests {
         };
         record.id = state.add_recording(&record).expect("written");
         assert_eq!(state.recordings().expect("read"), [record.clone()]);
-        // Of files of before nobody knows what they hold.
+        // The topics of earlier recordings are unknown.
         let of_before = "UPDATE recordings SET topics = NULL";
         let changed = state.write(|connection| connection.execute(of_before, []));
         assert_eq!(changed.expect("written"), 1);

@@ -1,31 +1,30 @@
-//! Names of robots and whose they are.
+//! Names of robots and their owners.
 
 use rusqlite::{OptionalExtension, params};
 
 use super::backlog::Write;
 use super::{Error, State, now};
 
-/// SHA-256 of a bearer token, lower-case hex.
+/// SHA-256 of a bearer token, in lower-case hexadecimal.
 pub type TokenHash = String;
-/// To whom a robot's name belongs: a token of the configuration, by its hash, or a principal, in the words of whoever tells
-/// them apart.
+/// Owner of a robot's name: the hash of a configured token, or a principal as encoded by the portal.
 pub type Owner = String;
 
 impl State {
-    /// Binds `robot` to `owner` when it is new, and with `claim` also when nobody owns it yet; then says to whom it
-    /// is bound.
-    pub fn robot_owner(
+    /// Binds `robot` to `owner` if it is new, or with `claim` also if it has no owner yet; returns the owner that it is
+    /// bound to.
+    pub fn claim_robot(
         &self,
         robot: &str,
         owner: Option<&Owner>,
         claim: bool,
     ) -> Result<Option<Owner>, Error> {
-        // Who is known comes in even while nothing can be written.
-        let known = self.known_robot(robot)?;
+        // Known robots can connect even while the database cannot be written.
+        let known = self.find_robot(robot)?;
         if let Some(known) = known
             && (known.is_some() || !claim)
         {
-            self.robot_seen(robot);
+            self.record_robot_seen(robot);
             return Ok(known);
         }
         self.write(|connection| {
@@ -39,7 +38,7 @@ impl State {
         })
     }
 
-    /// Binds a robot's name to `owner`, whoever had it before.
+    /// Binds a robot's name to `owner`, regardless of its previous owner.
     pub fn bind_robot(&self, robot: &str, owner: &Owner) -> Result<(), Error> {
         self.write_durably(|connection| {
             connection.execute(
@@ -51,7 +50,8 @@ impl State {
         .map(|_| ())
     }
 
-    /// Forgets robots bound to owners that are not in `owners` any more, so that their names can be used again.
+    /// Deletes robots bound to owners that are not in `owners`, so that their names can be used again. Returns their
+    /// number.
     pub fn release_robots(&self, owners: &[Owner]) -> Result<usize, Error> {
         let kept = serde_json::Value::from(owners).to_string();
         self.write(|connection| {
@@ -62,13 +62,13 @@ impl State {
         })
     }
 
-    /// To whom a robot's name is bound, if to anybody. Nothing is written.
-    pub fn owner_of_robot(&self, robot: &str) -> Result<Option<Owner>, Error> {
-        Ok(self.known_robot(robot)?.flatten())
+    /// Returns the owner of a robot's name, if any. Writes nothing.
+    pub fn find_robot_owner(&self, robot: &str) -> Result<Option<Owner>, Error> {
+        Ok(self.find_robot(robot)?.flatten())
     }
 
-    /// The row of a robot, if there is one: its owner, if it has one.
-    fn known_robot(&self, robot: &str) -> Result<Option<Option<Owner>>, Error> {
+    /// Returns the row of a robot, if it exists: its owner, if it has one.
+    fn find_robot(&self, robot: &str) -> Result<Option<Option<Owner>>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached("SELECT owner FROM robots WHERE name = ?1")?
@@ -77,8 +77,8 @@ impl State {
         })
     }
 
-    /// Remembers that a robot came.
-    fn robot_seen(&self, robot: &str) {
-        self.write_or_keep(Write::RobotSeen(robot.to_owned(), now()));
+    /// Records that a robot has connected.
+    fn record_robot_seen(&self, robot: &str) {
+        self.write_or_queue(Write::RobotSeen(robot.to_owned(), now()));
     }
 }

@@ -1,14 +1,14 @@
-//! Services on their way from one revision to another: one each, the last, in the words of whoever decides about it.
+//! Rollouts: the latest of each service, in the encoding of the choreographer.
 
 use rusqlite::params;
 
 use super::{Error, State};
 
 impl State {
-    /// Remembers a service's rollout in place of an earlier one.
+    /// Stores a service's rollout, replacing an earlier one.
     pub fn set_rollout(&self, service: &str, rollout: &str) -> Result<(), Error> {
         self.write(|connection| {
-            // A service that was removed meanwhile has none.
+            // Nothing is stored for a service that has been removed meanwhile.
             connection.execute(
                 "INSERT OR REPLACE INTO rollouts (service, rollout)
                  SELECT name, ?2 FROM services WHERE name = ?1",
@@ -18,7 +18,7 @@ impl State {
         .map(|_| ())
     }
 
-    /// The rollouts of all services that had one.
+    /// Returns the latest rollouts of all services.
     pub fn rollouts(&self) -> Result<Vec<(String, String)>, Error> {
         self.read(|connection| {
             connection

@@ -1,23 +1,23 @@
-//! Rules of the policy, in the words of whoever decides by them.
+//! Policy rules, as encoded by the portal.
 
 use rusqlite::{OptionalExtension, Row, params};
 
 use super::{Error, State};
 
-/// A rule.
+/// A policy rule.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RuleRecord {
-    /// Its number, never given twice.
+    /// Rule number; never reused.
     pub id: i64,
-    /// The principals that it is for, as text.
+    /// Principals that the rule applies to, as text.
     pub who: String,
-    /// The services that it is for, as text.
+    /// Service name pattern that the rule applies to, as text.
     pub services: String,
-    /// What is granted, as JSON.
+    /// Permissions granted, as JSON.
     pub allow: String,
 }
 
-fn read(row: &Row<'_>) -> rusqlite::Result<RuleRecord> {
+fn read_rule(row: &Row<'_>) -> rusqlite::Result<RuleRecord> {
     Ok(RuleRecord {
         id: row.get(0)?,
         who: row.get(1)?,
@@ -27,35 +27,35 @@ fn read(row: &Row<'_>) -> rusqlite::Result<RuleRecord> {
 }
 
 impl State {
-    /// All rules, oldest first.
+    /// Returns all rules, oldest first.
     pub fn rules(&self) -> Result<Vec<RuleRecord>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached("SELECT id, who, services, allow FROM rules ORDER BY id")?
-                .query_map([], read)?
+                .query_map([], read_rule)?
                 .collect()
         })
     }
 
-    /// Records a rule, on disk when this returns.
+    /// Adds a rule durably.
     pub fn add_rule(&self, who: &str, services: &str, allow: &str) -> Result<RuleRecord, Error> {
         self.write_durably(|connection| {
             connection
                 .prepare_cached(
                     "INSERT INTO rules (who, services, allow) VALUES (?1, ?2, ?3) RETURNING id, who, services, allow",
                 )?
-                .query_row([who, services, allow], read)
+                .query_row([who, services, allow], read_rule)
         })
     }
 
-    /// Forgets a rule; none where there is none of that number.
+    /// Deletes a rule; returns `None` if it does not exist.
     pub fn remove_rule(&self, id: i64) -> Result<Option<RuleRecord>, Error> {
         self.write_durably(|connection| {
             connection
                 .prepare_cached(
                     "DELETE FROM rules WHERE id = ?1 RETURNING id, who, services, allow",
                 )?
-                .query_row(params![id], read)
+                .query_row(params![id], read_rule)
                 .optional()
         })
     }

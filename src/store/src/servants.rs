@@ -6,29 +6,29 @@ use rusqlite::params;
 use super::backlog::Write;
 use super::{Error, State, to_json};
 
-/// Whose a servant is.
+/// A servant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ServantRecord {
-    /// Its id.
+    /// Servant id.
     pub id: String,
-    /// Its service.
+    /// Service of the servant.
     pub service: String,
-    /// The revision it was started from.
+    /// Revision that the servant was started from.
     pub revision: u64,
-    /// Its robot.
+    /// Robot of the servant.
     pub robot: String,
-    /// The robot named no name.
+    /// True if the robot stated no name.
     pub anonymous: bool,
-    /// When it was asked for.
+    /// Time when the servant was requested.
     pub created: Millis,
-    /// Limits that the operator changed while it lived.
+    /// Limits changed by the operator while the servant was running.
     pub limits: Limits,
-    /// What its robot stated, and what follows; none of one that an earlier version started.
+    /// The robot's statement and the resulting terms; absent for servants started by an earlier version.
     pub terms: Option<Terms>,
 }
 
 impl State {
-    /// Remembers whose a servant is.
+    /// Records a servant.
     pub fn add_servant(&self, servant: &ServantRecord) -> Result<(), Error> {
         let terms = servant.terms.as_ref();
         let terms = terms.map(|terms| to_json(terms, &servant.id)).transpose()?;
@@ -50,7 +50,7 @@ impl State {
         .map(|_| ())
     }
 
-    /// Remembers the limits that a servant was given while it lived.
+    /// Records the limits that a running servant was given.
     pub fn set_servant_limits(&self, id: &str, limits: &Limits) -> Result<(), Error> {
         let limits = to_json(limits, id)?;
         self.write(|connection| {
@@ -62,7 +62,7 @@ impl State {
         .map(|_| ())
     }
 
-    /// Remembers what the robot of a servant states now, and what follows.
+    /// Records the current statement of the servant's robot, and the resulting terms.
     pub fn set_servant_terms(&self, id: &str, terms: &Terms) -> Result<(), Error> {
         let terms = to_json(terms, id)?;
         self.write(|connection| {
@@ -74,16 +74,17 @@ impl State {
         .map(|_| ())
     }
 
-    /// Forgets a servant that has ended; where nothing can be written now, later.
+    /// Deletes a servant that has ended, or queues the deletion if the database cannot be written now.
     pub fn remove_servant(&self, id: &str) {
-        self.write_or_keep(Write::ServantGone(id.to_owned()));
+        self.write_or_queue(Write::ServantGone(id.to_owned()));
     }
 
-    /// All servants that an earlier daemon may have left.
+    /// Returns all servants that an earlier daemon may have left behind.
     pub fn servants(&self) -> Result<Vec<ServantRecord>, Error> {
         self.read(|connection| {
             connection
-                .prepare_cached("SELECT id, service, revision, robot, anonymous, created, limits, terms FROM servants ORDER BY created")?
+                .prepare_cached("SELECT id, service, revision, robot, anonymous, created, limits, terms FROM servants \
+                                 ORDER BY created")?
                 .query_map([], |row| {
                     Ok(ServantRecord {
                         id: row.get(0)?,
@@ -92,7 +93,7 @@ impl State {
                         robot: row.get(3)?,
                         anonymous: row.get(4)?,
                         created: row.get::<_, i64>(5)? as Millis,
-                        // Written by a later version: then the push's own limits apply.
+                        // If written by a later version, the limits of the push apply.
                         limits: serde_json::from_str(&row.get::<_, String>(6)?).unwrap_or_default(),
                         terms: row
                             .get::<_, Option<String>>(7)?

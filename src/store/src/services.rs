@@ -14,97 +14,97 @@ use super::{Error, State, to_json};
 /// A published revision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RevisionRecord {
-    /// Its service.
+    /// Name of the service.
     pub service: String,
-    /// From 1.
+    /// Revision number, starting at 1.
     pub number: u64,
-    /// Digest of its image manifest.
+    /// Digest of the image manifest.
     pub image: String,
-    /// When it was published.
+    /// Time of publication.
     pub published: Millis,
-    /// The ROS package that the service was first made of.
+    /// ROS package that the service was first built from.
     pub package: String,
-    /// The deployer who published the service first: none, where an operator did.
+    /// Deployer who first published the service; absent if it was an operator.
     pub owner: Option<String>,
-    /// What was pushed, in words.
+    /// Human-readable description of what was pushed.
     pub source: String,
-    /// The ROS that its image is built for.
+    /// ROS flavour that the image is built for.
     pub flavour: Flavour,
-    /// How its servants are started.
+    /// Launch plan of its servants.
     pub plan: Plan,
-    /// Its interface, definitions included.
+    /// Interface, with message definitions.
     pub interface: package::interface::Interface,
 }
 
-/// A published revision in short.
+/// Summary of a published revision.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct RevisionLine {
-    /// Its service.
+pub struct RevisionSummary {
+    /// Name of the service.
     pub service: String,
-    /// From 1.
+    /// Revision number, starting at 1.
     pub number: u64,
-    /// Digest of its image manifest.
+    /// Digest of the image manifest.
     pub image: String,
-    /// When it was published.
+    /// Time of publication.
     pub published: Millis,
-    /// What was pushed, in words.
+    /// Human-readable description of what was pushed.
     pub source: String,
 }
 
-/// How servants of a revision are started.
+/// Launch plan of the servants of a revision.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// Environment of every process.
     #[serde(default)]
     pub environment: BTreeMap<String, String>,
-    /// The nodes.
+    /// Nodes to start.
     pub nodes: Vec<servant::spec::NodeSpec>,
-    /// Parameters set before the first node starts, absolute names.
+    /// Parameters set before the first node starts, by absolute name.
     #[serde(default)]
     pub parameters: BTreeMap<String, ros::bus::ParamValue>,
-    /// What is loaded into nodes that are component containers (ROS 2), by their names.
+    /// Components to load into nodes that are component containers (ROS 2), by node name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub components: BTreeMap<String, Vec<ros::ros2::composition::Component>>,
-    /// Limits that the push asked for.
+    /// Limits requested by the push.
     #[serde(default)]
     pub limits: api::Limits,
-    /// The most that robots may ask for.
+    /// Upper limits on what robots may request.
     #[serde(default, skip_serializing_if = "api::Caps::is_empty")]
     pub caps: api::Caps,
-    /// What stubs promise where their robot says nothing.
+    /// Default SLA of stubs whose robot states none.
     #[serde(default, skip_serializing_if = "api::Sla::is_empty")]
     pub sla: api::Sla,
-    /// What the push asked for beyond a container; whether it is allowed is looked at anew at each start.
+    /// Access requested beyond the container; whether it is allowed is checked at each start.
     #[serde(default)]
     pub grants: api::Grants,
-    /// Start a node again when it fails, though it asked for no respawn: nobody else will.
+    /// True to restart failed nodes that requested no respawn, because nothing else would.
     #[serde(default)]
     pub restart: bool,
-    /// Answers depend on earlier requests: stubs are told.
+    /// True if answers depend on earlier requests; passed on to stubs.
     #[serde(default)]
     pub stateful: bool,
-    /// Robots share its servants; none: each robot has a servant of its own.
+    /// How robots share servants; absent if each robot has a servant of its own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shared: Option<api::Shared>,
 }
 
 impl State {
-    /// Makes `revision` the current one of its service, giving it the next number; on disk when this returns. Package and owner
-    /// are those of a service that is new: one that exists keeps its own. `inventory`: what its image holds.
+    /// Publishes `revision` durably as the current one of its service and assigns it the next number. Package and owner
+    /// are recorded for a new service only; an existing one keeps its own. `inventory` is the content of its image.
     pub fn publish(&self, revision: &RevisionRecord, inventory: &Inventory) -> Result<u64, Error> {
-        self.publish_as(revision, inventory, true)
+        self.publish_revision(revision, inventory, true)
     }
 
-    /// The same beside the current revision, if there is one.
-    pub fn publish_beside(
+    /// Publishes `revision` without making it the current one, unless the service is new.
+    pub fn publish_inactive(
         &self,
         revision: &RevisionRecord,
         inventory: &Inventory,
     ) -> Result<u64, Error> {
-        self.publish_as(revision, inventory, false)
+        self.publish_revision(revision, inventory, false)
     }
 
-    fn publish_as(
+    fn publish_revision(
         &self,
         revision: &RevisionRecord,
         inventory: &Inventory,
@@ -115,7 +115,7 @@ impl State {
         let plan = to_json(&revision.plan, &revision.service)?;
         let interface = to_json(&revision.interface, &revision.service)?;
         self.write_durably(|transaction| {
-            // Numbers are never given twice, not even after the service was removed and pushed again.
+            // Numbers are never reused, not even after the service was removed and pushed again.
             let number: u64 = transaction.query_row(
                 "INSERT INTO numbers (service, last) VALUES (?1, 1)
                  ON CONFLICT (service) DO UPDATE SET last = last + 1 RETURNING last",
@@ -153,8 +153,8 @@ impl State {
         })
     }
 
-    /// Makes an earlier (or later) revision the current one; false when there is none of that number.
-    pub fn set_current(&self, service: &str, number: u64) -> Result<bool, Error> {
+    /// Makes another revision the current one; returns false if it does not exist.
+    pub fn set_current_revision(&self, service: &str, number: u64) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?2 WHERE name = ?1
@@ -165,8 +165,13 @@ impl State {
         .map(|changed| changed == 1)
     }
 
-    /// Makes revision `to` the current one where `from` is it, or `to` itself; false where another one is.
-    pub fn replace_current(&self, service: &str, from: u64, to: u64) -> Result<bool, Error> {
+    /// Makes revision `to` the current one if the current one is `from` or `to`; otherwise returns false.
+    pub fn replace_current_revision(
+        &self,
+        service: &str,
+        from: u64,
+        to: u64,
+    ) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute(
                 "UPDATE services SET current = ?3 WHERE name = ?1 AND current IN (?2, ?3)
@@ -177,7 +182,7 @@ impl State {
         .map(|changed| changed == 1)
     }
 
-    /// Forgets a service and its revisions; false when there is none.
+    /// Deletes a service and its revisions; returns false if it does not exist.
     pub fn remove_service(&self, name: &str) -> Result<bool, Error> {
         self.write_durably(|connection| {
             connection.execute("DELETE FROM services WHERE name = ?1", [name])
@@ -185,7 +190,7 @@ impl State {
         .map(|changed| changed == 1)
     }
 
-    /// Names of all services.
+    /// Returns the names of all services.
     pub fn service_names(&self) -> Result<Vec<String>, Error> {
         self.read(|connection| {
             connection
@@ -195,7 +200,7 @@ impl State {
         })
     }
 
-    /// The ROS package that a service was first made of.
+    /// Returns the ROS package that a service was first built from.
     pub fn service_package(&self, name: &str) -> Result<Option<String>, Error> {
         self.read(|connection| {
             connection
@@ -208,7 +213,8 @@ impl State {
         })
     }
 
-    /// The deployer who published a service first: none, where an operator did; outer none, where there is no such service.
+    /// Returns the deployer who first published a service. The outer `None` means that the service does not exist, the
+    /// inner one that an operator published it.
     pub fn service_owner(&self, name: &str) -> Result<Option<Option<String>>, Error> {
         self.read(|connection| {
             connection
@@ -218,8 +224,8 @@ impl State {
         })
     }
 
-    /// The current revision of a service.
-    pub fn current(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, Error> {
+    /// Returns the current revision of a service.
+    pub fn current_revision(&self, service: &str) -> Result<Option<Arc<RevisionRecord>>, Error> {
         let current: Option<u64> = self.read(|connection| {
             connection
                 .prepare_cached("SELECT current FROM services WHERE name = ?1")?
@@ -232,13 +238,13 @@ impl State {
         }
     }
 
-    /// One revision of a service. Revisions do not change: those in use stay in memory.
+    /// Returns a revision of a service. Revisions are immutable; those in use stay in memory.
     pub fn revision(
         &self,
         service: &str,
         number: u64,
     ) -> Result<Option<Arc<RevisionRecord>>, Error> {
-        // Of no revision: the database counts no farther.
+        // There is no such revision: the database cannot represent the number.
         if i64::try_from(number).is_err() {
             return Ok(None);
         }
@@ -286,9 +292,9 @@ impl State {
         let Some((record, (plan, interface, flavour))) = found else {
             return Ok(None);
         };
-        let unreadable = |source| unreadable(service, number, source);
+        let unreadable = |source| unreadable_revision(service, number, source);
         Ok(Some(RevisionRecord {
-            // Revisions of earlier versions have none until their image was asked.
+            // Revisions of earlier versions have no flavour until their image has been inspected.
             flavour: flavour.map_or(Ok(record.flavour), |flavour| {
                 serde_json::from_str(&flavour).map_err(unreadable)
             })?,
@@ -298,7 +304,7 @@ impl State {
         }))
     }
 
-    /// What the image of a revision holds; none for one that was published by a version that did not record it.
+    /// Returns the inventory of a revision's image; `None` if it was published by a version that did not record it.
     pub fn inventory(&self, service: &str, number: u64) -> Result<Option<Inventory>, Error> {
         let found: Option<Option<String>> = self.read(|connection| {
             connection
@@ -313,11 +319,11 @@ impl State {
         };
         serde_json::from_str(&text)
             .map(Some)
-            .map_err(|source| unreadable(service, number, source))
+            .map_err(|source| unreadable_revision(service, number, source))
     }
 
-    /// Records what was not when the revision was published.
-    pub fn complete(
+    /// Records the flavour and inventory of a revision that was published without them.
+    pub fn record_inventory(
         &self,
         service: &str,
         number: u64,
@@ -335,29 +341,29 @@ impl State {
         Ok(())
     }
 
-    /// Current revisions that were published by a version that did not record what their images hold.
-    pub fn incomplete(&self) -> Result<Vec<RevisionLine>, Error> {
-        self.lines(
+    /// Returns the current revisions whose inventory was not recorded at publication.
+    pub fn revisions_without_inventory(&self) -> Result<Vec<RevisionSummary>, Error> {
+        self.query_revisions(
             "JOIN services s ON s.name = service AND s.current = number WHERE inventory IS NULL",
             [],
         )
     }
 
-    /// All revisions of a service in short, newest first.
-    pub fn revisions(&self, service: &str) -> Result<Vec<RevisionLine>, Error> {
-        self.lines("WHERE service = ?1", [service])
+    /// Returns summaries of all revisions of a service, newest first.
+    pub fn revisions(&self, service: &str) -> Result<Vec<RevisionSummary>, Error> {
+        self.query_revisions("WHERE service = ?1", [service])
     }
 
-    /// All revisions of all services in short.
-    pub fn all_revisions(&self) -> Result<Vec<RevisionLine>, Error> {
-        self.lines("", [])
+    /// Returns summaries of all revisions of all services.
+    pub fn all_revisions(&self) -> Result<Vec<RevisionSummary>, Error> {
+        self.query_revisions("", [])
     }
 
-    fn lines(
+    fn query_revisions(
         &self,
         condition: &str,
         values: impl rusqlite::Params,
-    ) -> Result<Vec<RevisionLine>, Error> {
+    ) -> Result<Vec<RevisionSummary>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!(
@@ -365,7 +371,7 @@ impl State {
                      ORDER BY service, number DESC"
                 ))?
                 .query_map(values, |row| {
-                    Ok(RevisionLine {
+                    Ok(RevisionSummary {
                         service: row.get(0)?,
                         number: row.get(1)?,
                         image: row.get(2)?,
@@ -378,7 +384,7 @@ impl State {
     }
 }
 
-fn unreadable(service: &str, number: u64, source: serde_json::Error) -> Error {
+fn unreadable_revision(service: &str, number: u64, source: serde_json::Error) -> Error {
     Error::Record {
         what: format!("revision {number} of {service}"),
         source,

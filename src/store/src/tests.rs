@@ -61,7 +61,7 @@ fn a_published_revision_is_read_back_after_a_restart() {
         Some(inventory)
     );
     let current = state
-        .current("opencv_apps")
+        .current_revision("opencv_apps")
         .expect("readable")
         .expect("there");
     assert_eq!(
@@ -89,13 +89,17 @@ fn rolling_back_needs_a_revision_that_exists() {
     state
         .publish(&revision("a", "sha256:2"), &Inventory::default())
         .expect("published");
-    assert!(state.set_current("a", 1).expect("readable"));
+    assert!(state.set_current_revision("a", 1).expect("readable"));
     assert_eq!(
-        state.current("a").expect("readable").expect("there").image,
+        state
+            .current_revision("a")
+            .expect("readable")
+            .expect("there")
+            .image,
         "sha256:1"
     );
-    assert!(!state.set_current("a", 7).expect("readable"));
-    assert!(!state.set_current("b", 1).expect("readable"));
+    assert!(!state.set_current_revision("a", 7).expect("readable"));
+    assert!(!state.set_current_revision("b", 1).expect("readable"));
     assert_eq!(
         state
             .publish(&revision("a", "sha256:3"), &Inventory::default())
@@ -113,7 +117,7 @@ fn a_removed_service_is_gone_and_its_numbers_are_not_given_again() {
         .expect("published");
     assert!(state.remove_service("a").expect("readable"));
     assert!(!state.remove_service("a").expect("readable"));
-    assert!(state.current("a").expect("readable").is_none());
+    assert!(state.current_revision("a").expect("readable").is_none());
     assert!(state.all_revisions().expect("readable").is_empty());
     assert_eq!(
         state
@@ -128,7 +132,7 @@ fn a_robot_stays_with_whom_it_came_first() {
     let (_directory, state) = state();
     let (mine, theirs) = ("m".repeat(64), "t".repeat(64));
     let owner = |robot: &str, token: Option<&String>, claim| {
-        state.robot_owner(robot, token, claim).expect("readable")
+        state.claim_robot(robot, token, claim).expect("readable")
     };
     assert_eq!(owner("r1", Some(&mine), false), Some(mine.clone()));
     assert_eq!(owner("r1", Some(&theirs), true), Some(mine.clone()));
@@ -225,7 +229,7 @@ fn rows_of_a_dictionary_are_kept_replaced_and_go_with_their_service() {
     );
     let kept = &state.dictionary("a").expect("readable")[0];
     assert_eq!(kept.spread, wide.spread);
-    // The same again takes its place.
+    // An equal row replaces it.
     let cheaper = row(r#"{"measure":"rrt","value":0.1,"aux":{"width":"640"},"limits":{"cpus":1}}"#);
     let rows = new(vec![cheaper.clone()], false);
     assert_eq!((rows.len(), rows[0].0, rows[0].2), (2, 1, Some(1.0)));
@@ -288,7 +292,7 @@ fn events_are_told_apart_by_kind_and_by_whom_they_are_about() {
         state.add_event(Level::Info, kind, &number.to_string(), &about);
     }
     let numbers = |filter, limit| -> Vec<String> {
-        let events = state.events_of(filter, 0, limit).expect("readable");
+        let events = state.filtered_events(filter, 0, limit).expect("readable");
         events.into_iter().map(|event| event.message).collect()
     };
     let all = EventFilter::default();
@@ -330,11 +334,14 @@ fn revisions_of_an_earlier_version_are_kept_and_completed() {
         .expect("written");
     drop(earlier);
     let state = State::open(&path).expect("migrated");
-    let current = state.current("a").expect("readable").expect("there");
+    let current = state
+        .current_revision("a")
+        .expect("readable")
+        .expect("there");
     assert_eq!((current.number, &*current.source), (2, "y"));
     assert_eq!(current.flavour, Flavour::default());
     assert_eq!(state.inventory("a", 2).expect("readable"), None);
-    let incomplete = state.incomplete().expect("readable");
+    let incomplete = state.revisions_without_inventory().expect("readable");
     assert_eq!(
         incomplete
             .iter()
@@ -352,11 +359,19 @@ fn revisions_of_an_earlier_version_are_kept_and_completed() {
         ..Flavour::default()
     };
     state
-        .complete("a", 2, &flavour, &inventory)
+        .record_inventory("a", 2, &flavour, &inventory)
         .expect("written");
-    assert!(state.incomplete().expect("readable").is_empty());
+    assert!(
+        state
+            .revisions_without_inventory()
+            .expect("readable")
+            .is_empty()
+    );
     assert_eq!(state.inventory("a", 2).expect("readable"), Some(inventory));
-    let current = state.current("a").expect("readable").expect("there");
+    let current = state
+        .current_revision("a")
+        .expect("readable")
+        .expect("there");
     assert_eq!(current.flavour, flavour);
     assert_eq!(
         state.inventory("a", 1).expect("readable"),
@@ -395,14 +410,14 @@ async fn what_is_told_while_another_has_the_database_is_kept_and_written_later()
         events.into_iter().map(|event| event.message).collect()
     };
     assert_eq!(messages(&state), ["before", "during"], "told all the same");
-    let watching = tokio::spawn(watch(std::sync::Arc::clone(&state)));
-    while state.unwritable().is_none() {
+    let watching = tokio::spawn(flush_pending_writes(std::sync::Arc::clone(&state)));
+    while state.outage_message().is_none() {
         tokio::task::yield_now().await;
     }
     state.remove_servant("a-1");
     tell("later");
     other.execute_batch("COMMIT").expect("unlocked");
-    while state.unwritable().is_some() {
+    while state.outage_message().is_some() {
         tokio::task::yield_now().await;
     }
     let told = messages(&state);
@@ -430,14 +445,14 @@ async fn what_is_told_while_another_has_the_database_is_kept_and_written_later()
 #[test]
 fn a_known_robot_comes_in_while_nothing_can_be_written() {
     let (directory, state) = state();
-    assert_eq!(state.owner_of_robot("r1").expect("readable"), None);
-    state.robot_owner("r1", None, false).expect("written");
+    assert_eq!(state.find_robot_owner("r1").expect("readable"), None);
+    state.claim_robot("r1", None, false).expect("written");
     let other = Connection::open(directory.path().join("cloudroid.db")).expect("a database");
     other.execute_batch("BEGIN EXCLUSIVE").expect("locked");
-    assert_eq!(state.robot_owner("r1", None, false).expect("known"), None);
-    let refused = state.robot_owner("r2", None, false).expect_err("new");
+    assert_eq!(state.claim_robot("r1", None, false).expect("known"), None);
+    let refused = state.claim_robot("r2", None, false).expect_err("new");
     assert!(refused.to_string().contains("locked"), "{refused}");
-    assert!(state.unwritable().is_some());
+    assert!(state.outage_message().is_some());
 }
 
 #[test]
@@ -468,7 +483,7 @@ fn tokens_are_kept_by_their_hashes_and_a_name_is_one_live_tokens() {
         .expect("written")
         .expect("there");
     assert_eq!((rotated.id, &*rotated.hash), (first.id, "h3"));
-    state.token_used(first.id, 9).expect("written");
+    state.record_token_use(first.id, 9).expect("written");
     assert!(state.revoke_token("r1").expect("written").is_some());
     assert_eq!(state.revoke_token("r1").expect("written"), None, "once");
     assert_eq!(
@@ -540,11 +555,11 @@ fn a_robots_name_can_be_bound_again() {
     let (_directory, state) = state();
     let owner = |name: &str| name.to_owned();
     state
-        .robot_owner("r1", Some(&owner("a")), true)
+        .claim_robot("r1", Some(&owner("a")), true)
         .expect("written");
     state.bind_robot("r1", &owner("robot:r1")).expect("written");
     let found = state
-        .robot_owner("r1", Some(&owner("a")), true)
+        .claim_robot("r1", Some(&owner("a")), true)
         .expect("read");
     assert_eq!(found, Some(owner("robot:r1")));
 }
@@ -552,7 +567,7 @@ fn a_robots_name_can_be_bound_again() {
 #[test]
 fn the_audit_log_is_only_added_to() {
     let (home, state) = state();
-    let did = |object| NewAudited {
+    let did = |object| NewAuditRecord {
         who: "alice (deployer)",
         peer: "10.0.0.3:5000",
         action: "deploy",
@@ -562,15 +577,15 @@ fn the_audit_log_is_only_added_to() {
         more: 0,
     };
     for object in ["one", "two", "three"] {
-        state.add_audited(&did(object)).expect("recorded");
+        state.add_audit_record(&did(object)).expect("recorded");
     }
     let objects = |since, limit| -> Vec<String> {
-        let records = state.audited(since, limit).expect("readable");
+        let records = state.audit_records(since, limit).expect("readable");
         records.into_iter().map(|record| record.object).collect()
     };
     assert_eq!(objects(0, 2), ["two", "three"]);
     assert_eq!(objects(2, 100), ["three"]);
-    // Not even by who has the database open.
+    // Not even by a process that has the database open.
     let connection = Connection::open(home.path().join("cloudroid.db")).expect("opened");
     for statement in [
         "DELETE FROM audit",
@@ -584,7 +599,7 @@ fn the_audit_log_is_only_added_to() {
         assert!(refused.contains("only added to"), "{refused}");
     }
     assert_eq!(objects(0, 100).len(), 3);
-    // Beyond a million the oldest may go.
+    // Beyond a million records the oldest may be deleted.
     connection
         .execute(
             "UPDATE sqlite_sequence SET seq = 1000001 WHERE name = 'audit'",

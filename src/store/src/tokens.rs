@@ -1,50 +1,50 @@
-//! Tokens: whose they are, and for what. Of a token itself only its hash is kept.
+//! Access tokens. Only the hash of a token is stored.
 
 use rusqlite::{OptionalExtension, Row, params};
 
 use super::{Error, State, TokenHash, now};
 
-/// A token, as it was given out.
+/// A token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TokenRecord {
-    /// Its number, never given twice.
+    /// Row number; never reused.
     pub id: i64,
-    /// The principal's name.
+    /// Name of the principal.
     pub name: String,
-    /// SHA-256 of it.
+    /// SHA-256 of the token.
     pub hash: TokenHash,
-    /// The principal's role, in the words of whoever decides by it.
+    /// Role of the principal, as encoded by the portal.
     pub role: String,
-    /// What it is for, likewise.
+    /// Scope of the principal, as encoded by the portal.
     pub scope: String,
-    /// When it was made.
+    /// Creation time.
     pub created: u64,
-    /// When it ends.
+    /// Expiry time.
     pub expires: Option<u64>,
-    /// When it was shown last, to the minute.
+    /// Last use, to the minute.
     pub last_used: Option<u64>,
-    /// When it was revoked.
+    /// Time of revocation.
     pub revoked: Option<u64>,
 }
 
-/// A token to give out.
+/// A token to create.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewToken<'a> {
-    /// The principal's name.
+    /// Name of the principal.
     pub name: &'a str,
-    /// SHA-256 of it.
+    /// SHA-256 of the token.
     pub hash: &'a str,
-    /// Its role.
+    /// Role of the principal.
     pub role: &'a str,
-    /// What it is for.
+    /// Scope of the principal.
     pub scope: &'a str,
-    /// When it ends.
+    /// Expiry time.
     pub expires: Option<u64>,
 }
 
 const COLUMNS: &str = "id, name, hash, role, scope, created, expires, last_used, revoked";
 
-fn read(row: &Row<'_>) -> rusqlite::Result<TokenRecord> {
+fn read_token(row: &Row<'_>) -> rusqlite::Result<TokenRecord> {
     Ok(TokenRecord {
         id: row.get(0)?,
         name: row.get(1)?,
@@ -59,17 +59,17 @@ fn read(row: &Row<'_>) -> rusqlite::Result<TokenRecord> {
 }
 
 impl State {
-    /// All tokens there ever were, oldest first.
+    /// Returns all tokens, including revoked ones, oldest first.
     pub fn tokens(&self) -> Result<Vec<TokenRecord>, Error> {
         self.read(|connection| {
             connection
                 .prepare_cached(&format!("SELECT {COLUMNS} FROM tokens ORDER BY id"))?
-                .query_map([], read)?
+                .query_map([], read_token)?
                 .collect()
         })
     }
 
-    /// Records a token, on disk when this returns; none where its name is another token's, that was not revoked.
+    /// Creates a token durably; returns `None` if an unrevoked token has the same name.
     pub fn add_token(&self, new: &NewToken<'_>) -> Result<Option<TokenRecord>, Error> {
         self.write_durably(|connection| {
             connection
@@ -79,38 +79,38 @@ impl State {
                 ))?
                 .query_row(
                     params![new.name, new.hash, new.role, new.scope, now() as i64, new.expires],
-                    read,
+                    read_token,
                 )
                 .optional()
         })
     }
 
-    /// Gives the token of that name another secret; none where there is no such token, or it was revoked.
+    /// Replaces the secret of a token; returns `None` if it does not exist or was revoked.
     pub fn rotate_token(&self, name: &str, hash: &str) -> Result<Option<TokenRecord>, Error> {
         self.write_durably(|connection| {
             connection
                 .prepare_cached(&format!(
                     "UPDATE tokens SET hash = ?2 WHERE name = ?1 AND revoked IS NULL RETURNING {COLUMNS}"
                 ))?
-                .query_row([name, hash], read)
+                .query_row([name, hash], read_token)
                 .optional()
         })
     }
 
-    /// Ends the token of that name; none where there is no such token, or it was revoked before.
+    /// Revokes a token; returns `None` if it does not exist or was revoked before.
     pub fn revoke_token(&self, name: &str) -> Result<Option<TokenRecord>, Error> {
         self.write_durably(|connection| {
             connection
                 .prepare_cached(&format!(
                     "UPDATE tokens SET revoked = ?2 WHERE name = ?1 AND revoked IS NULL RETURNING {COLUMNS}"
                 ))?
-                .query_row(params![name, now() as i64], read)
+                .query_row(params![name, now() as i64], read_token)
                 .optional()
         })
     }
 
-    /// Remembers that a token was shown.
-    pub fn token_used(&self, id: i64, at: u64) -> Result<(), Error> {
+    /// Records the use of a token.
+    pub fn record_token_use(&self, id: i64, at: u64) -> Result<(), Error> {
         self.write(|connection| {
             connection.execute(
                 "UPDATE tokens SET last_used = ?2 WHERE id = ?1",

@@ -1,5 +1,5 @@
-//! What was answered with success is there after a restart, whichever of SQLite's writes fail: the disk is full for
-//! each n-th of them.
+//! Durability under write errors: an operation that reported success is present after a restart, whichever writes of
+//! SQLite fail. The disk is full for every n-th write.
 
 use std::ffi::{c_int, c_void};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -8,14 +8,14 @@ use nix::errno::Errno;
 use nix::libc;
 use package::inventory::Inventory;
 use rusqlite::ffi;
-use store::{AccountEdit, Error, NewAudited, NewSample, NewSession, NewToken, State};
-use store::{RecordedFilter, RecordingRecord, RevisionRecord};
+use store::{AccountEdit, Error, NewAuditRecord, NewSample, NewSession, NewToken, State};
+use store::{RecordingRecord, RevisionRecord, SeriesFilter};
 
-/// One write of so many fails; 0: none does.
+/// Every n-th write fails; 0 means that none does.
 static FAILING: AtomicU64 = AtomicU64::new(0);
 static WRITES: AtomicU64 = AtomicU64::new(0);
 
-fn is_to_fail() -> bool {
+fn should_fail() -> bool {
     let number = WRITES.fetch_add(1, Ordering::Relaxed);
     match FAILING.load(Ordering::Relaxed) {
         0 => false,
@@ -24,35 +24,35 @@ fn is_to_fail() -> bool {
 }
 
 extern "C" fn write(file: c_int, bytes: *const c_void, count: usize) -> isize {
-    if is_to_fail() {
+    if should_fail() {
         Errno::ENOSPC.set();
         return -1;
     }
-    // SAFETY: SQLite gives what write(2) takes.
+    // SAFETY: SQLite passes the arguments of write(2).
     unsafe { libc::write(file, bytes, count) }
 }
 
 extern "C" fn write_at(file: c_int, bytes: *const c_void, count: usize, offset: i64) -> isize {
-    if is_to_fail() {
+    if should_fail() {
         Errno::ENOSPC.set();
         return -1;
     }
-    // SAFETY: SQLite gives what pwrite(2) takes.
+    // SAFETY: SQLite passes the arguments of pwrite(2).
     unsafe { libc::pwrite(file, bytes, count, offset) }
 }
 
-/// Has SQLite write by the functions above: its VFS of Unix takes others in place of its system calls.
+/// Replaces the write system calls of SQLite's Unix VFS by the functions above.
 fn inject_faults() {
     type Call = unsafe extern "C" fn();
     type Write = extern "C" fn(c_int, *const c_void, usize) -> isize;
     type WriteAt = extern "C" fn(c_int, *const c_void, usize, i64) -> isize;
-    // SAFETY: SQLite calls each with the arguments of the system call of its name, which it has.
+    // SAFETY: SQLite calls each function with the arguments of the system call that it replaces.
     unsafe {
         let write = std::mem::transmute::<Write, Call>(write);
         let write_at = std::mem::transmute::<WriteAt, Call>(write_at);
         let vfs = ffi::sqlite3_vfs_find(std::ptr::null());
         let replace = (*vfs).xSetSystemCall.expect("the VFS of Unix");
-        // The first alone, or the others, by how SQLite was built.
+        // Only the first, or the others, depending on how SQLite was built.
         replace(vfs, c"write".as_ptr(), Some(write));
         replace(vfs, c"pwrite".as_ptr(), Some(write_at));
         replace(vfs, c"pwrite64".as_ptr(), Some(write_at));
@@ -118,7 +118,7 @@ fn live_token(state: &State, name: &str) -> Option<String> {
     live.next().map(|token| token.hash)
 }
 
-fn rule_of(state: &State, who: &str) -> Option<i64> {
+fn find_rule(state: &State, who: &str) -> Option<i64> {
     let mut rules = state.rules().expect("readable").into_iter();
     rules.find(|rule| rule.who == who).map(|rule| rule.id)
 }
@@ -130,7 +130,7 @@ fn is_paired(state: &State, robot: &str) -> bool {
         .any(|pairing| pairing.robot == robot && pairing.revoked.is_none())
 }
 
-fn session_of(state: &State, name: &str) -> Option<i64> {
+fn find_session(state: &State, name: &str) -> Option<i64> {
     let sessions = state.sessions().expect("readable").into_iter();
     sessions
         .filter(|session| session.name == name)
@@ -138,7 +138,7 @@ fn session_of(state: &State, name: &str) -> Option<i64> {
         .next()
 }
 
-fn recording_of(state: &State, robot: &str) -> Option<u64> {
+fn find_recording(state: &State, robot: &str) -> Option<u64> {
     let mut recordings = state.recordings().expect("readable").into_iter();
     recordings
         .find(|recording| recording.robot == robot)
@@ -152,12 +152,12 @@ fn account(state: &State, name: &str) -> Option<String> {
 }
 
 fn is_audited(state: &State, object: &str) -> bool {
-    let audited = state.audited(0, u32::MAX).expect("readable");
+    let audited = state.audit_records(0, u32::MAX).expect("readable");
     audited.iter().any(|record| record.object == object)
 }
 
-/// Something that is asked of the state, by what it makes for itself before nothing can be written, and how one sees that it was
-/// done. All are given the same name, that nothing else has.
+/// An operation on the state: how to prepare it while the database can be written, how to run it, and how to check that
+/// it was done. All objects of one operation share a unique name.
 struct Operation {
     name: &'static str,
     prepare: fn(&State, &str) -> Result<(), Error>,
@@ -188,16 +188,16 @@ const OPERATIONS: &[Operation] = &[
         name: "add a rule",
         prepare: |_, _| Ok(()),
         run: |state, name| state.add_rule(name, "*", "[]").map(drop),
-        is_done: |state, name| rule_of(state, name).is_some(),
+        is_done: |state, name| find_rule(state, name).is_some(),
     },
     Operation {
         name: "remove a rule",
         prepare: |state, name| state.add_rule(name, "*", "[]").map(drop),
-        run: |state, name| match rule_of(state, name) {
+        run: |state, name| match find_rule(state, name) {
             Some(id) => state.remove_rule(id).map(drop),
             None => Ok(()),
         },
-        is_done: |state, name| rule_of(state, name).is_none(),
+        is_done: |state, name| find_rule(state, name).is_none(),
     },
     Operation {
         name: "pair a robot by a code",
@@ -248,20 +248,24 @@ const OPERATIONS: &[Operation] = &[
         name: "begin a session",
         prepare: |_, _| Ok(()),
         run: |state, name| state.add_session(&session(name), None).map(drop),
-        is_done: |state, name| session_of(state, name).is_some(),
+        is_done: |state, name| find_session(state, name).is_some(),
     },
     Operation {
         name: "end a session",
         prepare: |state, name| state.add_session(&session(name), None).map(drop),
-        run: |state, name| state.end_sessions_of(name).map(drop),
-        is_done: |state, name| session_of(state, name).is_none(),
+        run: |state, name| state.end_sessions(name).map(drop),
+        is_done: |state, name| find_session(state, name).is_none(),
     },
     Operation {
         name: "sign somebody in whom a provider knows",
         prepare: |_, _| Ok(()),
-        run: |state, name| state.provided_person("issuer", name, name).map(drop),
+        run: |state, name| {
+            state
+                .sign_in_federated_person("issuer", name, name)
+                .map(drop)
+        },
         is_done: |state, name| {
-            let people = state.provided_people().expect("readable");
+            let people = state.federated_people().expect("readable");
             people.iter().any(|person| person.subject == name)
         },
     },
@@ -270,11 +274,11 @@ const OPERATIONS: &[Operation] = &[
         prepare: |_, _| Ok(()),
         run: |state, name| {
             state
-                .robot_owner(name, Some(&"alice".to_owned()), true)
+                .claim_robot(name, Some(&"alice".to_owned()), true)
                 .map(drop)
         },
         is_done: |state, name| {
-            let owner = state.robot_owner(name, Some(&"bob".to_owned()), false);
+            let owner = state.claim_robot(name, Some(&"bob".to_owned()), false);
             owner.expect("readable").as_deref() == Some("alice")
         },
     },
@@ -288,7 +292,7 @@ const OPERATIONS: &[Operation] = &[
         },
         is_done: |state, name| {
             state.service_owner(name).expect("readable") == Some(Some("alice".to_owned()))
-                && state.current(name).expect("readable").is_some()
+                && state.current_revision(name).expect("readable").is_some()
         },
     },
     Operation {
@@ -299,7 +303,7 @@ const OPERATIONS: &[Operation] = &[
                 .map(drop)
         },
         run: |state, name| state.remove_service(name).map(drop),
-        is_done: |state, name| state.current(name).expect("readable").is_none(),
+        is_done: |state, name| state.current_revision(name).expect("readable").is_none(),
     },
     Operation {
         name: "keep samples",
@@ -312,14 +316,14 @@ const OPERATIONS: &[Operation] = &[
                 began: 1,
                 figures: &[1.0],
             };
-            state.record(10, 1, &[sample])
+            state.add_samples(10, 1, &[sample])
         },
         is_done: |state, name| {
-            let filter = RecordedFilter {
+            let filter = SeriesFilter {
                 servant: Some(name),
-                ..RecordedFilter::default()
+                ..SeriesFilter::default()
             };
-            let recorded = state.recorded(filter, 0, 1).expect("readable");
+            let recorded = state.recorded_series(filter, 0, 1).expect("readable");
             recorded.iter().any(|one| {
                 state
                     .samples(one.id, 10, (0, 9), 9)
@@ -333,39 +337,43 @@ const OPERATIONS: &[Operation] = &[
         name: "remember a recording",
         prepare: |_, _| Ok(()),
         run: |state, name| state.add_recording(&recording(name)).map(drop),
-        is_done: |state, name| recording_of(state, name).is_some(),
+        is_done: |state, name| find_recording(state, name).is_some(),
     },
     Operation {
         name: "forget a recording",
         prepare: |state, name| state.add_recording(&recording(name)).map(drop),
-        run: |state, name| match recording_of(state, name) {
+        run: |state, name| match find_recording(state, name) {
             Some(id) => state.forget_recording(id).map(drop),
             None => Ok(()),
         },
-        is_done: |state, name| recording_of(state, name).is_none(),
+        is_done: |state, name| find_recording(state, name).is_none(),
     },
     Operation {
         name: "add to the audit log",
         prepare: |_, _| Ok(()),
-        run: |state, name| state.add_audited(&audited(name)).map(drop),
+        run: |state, name| state.add_audit_record(&new_audit_record(name)).map(drop),
         is_done: is_audited,
     },
     Operation {
         name: "add to the audit log without waiting for the disk",
         prepare: |_, _| Ok(()),
-        run: |state, name| state.add_audited_soon(&audited(name)).map(drop),
+        run: |state, name| {
+            state
+                .add_audit_record_without_sync(&new_audit_record(name))
+                .map(drop)
+        },
         is_done: is_audited,
     },
 ];
 
-fn audited(object: &str) -> NewAudited<'_> {
-    NewAudited {
+fn new_audit_record(object: &str) -> NewAuditRecord<'_> {
+    NewAuditRecord {
         object,
-        ..NewAudited::default()
+        ..NewAuditRecord::default()
     }
 }
 
-/// Runs all operations of some turns while each n-th write fails, and looks at them after a restart.
+/// Runs all operations several times while every n-th write fails, and checks them after a restart.
 fn check(one_of: u64) {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("cloudroid.db");

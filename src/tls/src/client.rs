@@ -1,6 +1,6 @@
-//! The client's side: whom it trusts. A certificate is accepted whose fingerprint is known, or which an authority has signed that
-//! the client trusts; that one has is remembered. One that signs itself, of a server of which nothing is known, is
-//! remembered (trust on first use, as ssh(1) does).
+//! Client side of TLS: which servers are trusted. A certificate is accepted if its fingerprint is known, or if a
+//! trusted authority has signed it, which is then remembered. A self-signed certificate of an unknown server is
+//! remembered (trust on first use, as in ssh(1)).
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -22,67 +22,71 @@ use tokio_rustls::rustls::{
     CertificateError, ClientConfig, DigitallySignedStruct, Error, RootCertStore, SignatureScheme,
 };
 
-use crate::{Fingerprint, Known, KnownServers};
+use crate::{Fingerprint, KnownIdentity, KnownServers};
 
-/// Whom a client trusts.
+/// Trust settings of a client.
 #[derive(Debug, Clone)]
 pub struct Trust {
-    /// PEM file with certificates of authorities; the system's where absent.
+    /// PEM file with the certificates of trusted authorities (default: the system's).
     pub authorities: Option<PathBuf>,
-    /// The certificate that was named to the client.
+    /// Fingerprint of the server's certificate, given explicitly.
     pub fingerprint: Option<Fingerprint>,
-    /// Those that it has seen; of no account where `authorities` are named.
+    /// Certificates seen before; ignored if `authorities` is set.
     pub known: Option<KnownServers>,
-    /// The command that accepts another certificate, up to its fingerprint.
+    /// Command that accepts a changed certificate, without the fingerprint at its end.
     pub accept: String,
-    /// Where nobody is trusted yet: what to do.
+    /// Advice to the user if no authority is trusted.
     pub advice: &'static str,
-    /// What the client shows of itself to a server that asks for it.
-    pub identity: Option<Arc<Identity>>,
+    /// Certificate to present to servers that ask for one.
+    pub identity: Option<Arc<ClientIdentity>>,
 }
 
-/// A certificate of the client, followed by those that lead from it to an authority, and its key.
-pub struct Identity {
-    /// The certificates.
+/// A client certificate, the chain from it to an authority, and its key.
+pub struct ClientIdentity {
+    /// Certificate chain, the client's own certificate first.
     pub chain: Vec<CertificateDer<'static>>,
-    /// The key of the first one.
+    /// Private key of the first certificate.
     pub key: PrivateKeyDer<'static>,
 }
 
-impl std::fmt::Debug for Identity {
+impl std::fmt::Debug for ClientIdentity {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let shown = self.chain.first().map(Fingerprint::of);
+        let shown = self.chain.first().map(Fingerprint::from_certificate);
         out.debug_tuple("Identity").field(&shown).finish()
     }
 }
 
-/// A connection whose other end is trusted.
-pub struct Connected<S> {
-    /// The connection.
+/// A TLS connection to a trusted server.
+pub struct TrustedConnection<S> {
+    /// The TLS stream.
     pub stream: TlsStream<S>,
-    /// The certificate, where it was seen for the first time and is remembered from now on.
+    /// Fingerprint of the certificate if it was seen for the first time; it has been remembered.
     pub first: Option<Fingerprint>,
 }
 
 impl Trust {
-    /// Speaks TLS over a connection to `host`; `server` is its host and port, by which it is known.
+    /// Performs the TLS handshake with `host`. `server` is its host and port, under which it is remembered.
     pub async fn connect<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
         host: &str,
         server: &str,
-    ) -> io::Result<Connected<S>> {
+    ) -> io::Result<TrustedConnection<S>> {
         let name = ServerName::try_from(host.to_owned()).map_err(io::Error::other)?;
         let provider = Arc::new(ring::default_provider());
-        // Who names a certificate or authorities has said whom to trust.
+        // A given fingerprint or authority file overrides what was remembered.
         let known = self.known.as_ref().filter(|_| self.fingerprint.is_none());
         let seen = known.map(|known| known.find(server)).transpose()?.flatten();
         let expected = match self.fingerprint {
-            Some(named) => Some(Known::Certificate(named)),
+            Some(named) => Some(KnownIdentity::Certificate(named)),
             None if self.authorities.is_none() => seen,
             None => None,
         };
-        let authorities = self.authorities.as_deref().map(read).transpose()?;
+        let authorities = self
+            .authorities
+            .as_deref()
+            .map(read_authorities)
+            .transpose()?;
         let verifier = Arc::new(Verifier {
             provider: Arc::clone(&provider),
             expected,
@@ -112,38 +116,44 @@ impl Trust {
             None => error,
         })?;
         if let (Some(first), Some(known)) = (outcome.first, known) {
-            let kept = known.remember_first(server, Known::Certificate(first))?;
-            if kept != Known::Certificate(first) {
-                return Err(io::Error::other(changed(first, kept, &self.accept)));
+            let kept = known.remember_first(server, KnownIdentity::Certificate(first))?;
+            if kept != KnownIdentity::Certificate(first) {
+                return Err(io::Error::other(describe_mismatch(
+                    first,
+                    kept,
+                    &self.accept,
+                )));
             }
         }
-        let is_new = outcome.by_authority && seen != Some(Known::ByAuthority);
+        let is_new = outcome.by_authority && seen != Some(KnownIdentity::ByAuthority);
         if let Some(known) = known.filter(|_| is_new) {
-            // A home that cannot be written is no reason to refuse a server that an authority speaks for.
-            let _ = known.remember(server, Known::ByAuthority);
+            // An unwritable home directory is no reason to refuse a server whose certificate an authority has signed.
+            let _ = known.remember(server, KnownIdentity::ByAuthority);
         }
-        Ok(Connected {
+        Ok(TrustedConnection {
             stream,
             first: outcome.first,
         })
     }
 }
 
-fn changed(shown: Fingerprint, expected: Known, accept: &str) -> String {
+fn describe_mismatch(shown: Fingerprint, expected: KnownIdentity, accept: &str) -> String {
     let known = match expected {
-        Known::Certificate(expected) => format!("{expected} is the one that is known of it"),
-        Known::ByAuthority => {
-            "an authority spoke for the one that it had, and none does for this".to_owned()
+        KnownIdentity::Certificate(expected) => {
+            format!("the known one is {expected}")
+        }
+        KnownIdentity::ByAuthority => {
+            "the previous one was signed by an authority, and this one is not".to_owned()
         }
     };
     format!(
-        "the server shows the certificate {shown}, and {known}: somebody may stand between; if its operator has replaced \
-         it, accept it with: {accept} {shown}"
+        "the server presents the certificate {shown}, but {known}: the connection may be intercepted; if its operator \
+            has replaced the certificate, accept it with: {accept} {shown}"
     )
 }
 
-/// The authorities of a PEM file.
-fn read(path: &Path) -> io::Result<RootCertStore> {
+/// Reads the authorities of a PEM file.
+fn read_authorities(path: &Path) -> io::Result<RootCertStore> {
     let unreadable = |error: &dyn std::fmt::Display| {
         io::Error::other(format!(
             "ca_file {} holds no certificate: {error}; it should be a PEM file",
@@ -164,8 +174,8 @@ fn read(path: &Path) -> io::Result<RootCertStore> {
     Ok(trusted)
 }
 
-/// Those of the system. One of many that is not understood is no reason to trust none.
-fn of_system() -> RootCertStore {
+/// Loads the system's authorities, skipping those that cannot be parsed.
+fn load_system_authorities() -> RootCertStore {
     let mut trusted = RootCertStore::empty();
     trusted.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
     trusted
@@ -174,47 +184,50 @@ fn of_system() -> RootCertStore {
 #[derive(Debug)]
 struct Verifier {
     provider: Arc<CryptoProvider>,
-    /// What is known of the server.
-    expected: Option<Known>,
-    /// Whether one that signs itself is accepted where nothing is known.
+    /// Identity remembered for the server.
+    expected: Option<KnownIdentity>,
+    /// True if a self-signed certificate of an unknown server is accepted.
     first_use: bool,
-    /// The system's where absent.
+    /// Trusted authorities (default: the system's).
     authorities: Option<RootCertStore>,
     accept: String,
     advice: &'static str,
-    outcome: Mutex<Outcome>,
+    outcome: Mutex<VerifierOutcome>,
 }
 
 #[derive(Debug, Clone, Default)]
-struct Outcome {
+struct VerifierOutcome {
     first: Option<Fingerprint>,
     by_authority: bool,
     refused: Option<String>,
 }
 
 impl Verifier {
-    fn outcome(&self) -> Outcome {
+    fn outcome(&self) -> VerifierOutcome {
         self.outcome
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .clone()
     }
 
-    fn note(&self, outcome: Outcome) {
+    fn record(&self, outcome: VerifierOutcome) {
         *self.outcome.lock().unwrap_or_else(PoisonError::into_inner) = outcome;
     }
 
-    fn by_authorities(
+    fn verify_by_authorities(
         &self,
         certificate: &CertificateDer<'_>,
         intermediates: &[CertificateDer<'_>],
         name: &ServerName<'_>,
         ocsp: &[u8],
         now: UnixTime,
-    ) -> Result<(), Refused> {
-        let roots = self.authorities.clone().unwrap_or_else(of_system);
+    ) -> Result<(), AuthorityRejection> {
+        let roots = self
+            .authorities
+            .clone()
+            .unwrap_or_else(load_system_authorities);
         if roots.is_empty() {
-            return Err(Refused::NobodyTrusted);
+            return Err(AuthorityRejection::NobodyTrusted);
         }
         let builder = WebPkiServerVerifier::builder_with_provider(
             Arc::new(roots),
@@ -222,16 +235,16 @@ impl Verifier {
         );
         let verifier = builder
             .build()
-            .map_err(|error| Refused::By(Error::General(error.to_string())))?;
+            .map_err(|error| AuthorityRejection::By(Error::General(error.to_string())))?;
         verifier
             .verify_server_cert(certificate, intermediates, name, ocsp, now)
             .map(|_| ())
-            .map_err(Refused::By)
+            .map_err(AuthorityRejection::By)
     }
 }
 
-/// Why no authority speaks for a certificate.
-enum Refused {
+/// Reason why no trusted authority vouches for a certificate.
+enum AuthorityRejection {
     NobodyTrusted,
     By(Error),
 }
@@ -245,46 +258,48 @@ impl ServerCertVerifier for Verifier {
         ocsp: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        let shown = Fingerprint::of(certificate);
-        if self.expected == Some(Known::Certificate(shown)) {
+        let shown = Fingerprint::from_certificate(certificate);
+        if self.expected == Some(KnownIdentity::Certificate(shown)) {
             return Ok(ServerCertVerified::assertion());
         }
-        let refused = match self.by_authorities(certificate, intermediates, name, ocsp, now) {
+        let refused = match self.verify_by_authorities(certificate, intermediates, name, ocsp, now)
+        {
             Ok(()) => {
-                self.note(Outcome {
+                self.record(VerifierOutcome {
                     by_authority: true,
-                    ..Outcome::default()
+                    ..VerifierOutcome::default()
                 });
                 return Ok(ServerCertVerified::assertion());
             }
             Err(refused) => refused,
         };
-        // Of one that was signed and has expired, say, its authority's reason says more.
-        let about_itself = self.expected != Some(Known::ByAuthority) || signs_itself(certificate);
+        // For example, the authority's reason tells more if a signed certificate has expired.
+        let about_itself =
+            self.expected != Some(KnownIdentity::ByAuthority) || is_self_signed(certificate);
         if let Some(expected) = self.expected.filter(|_| about_itself) {
-            self.note(Outcome {
-                refused: Some(changed(shown, expected, &self.accept)),
-                ..Outcome::default()
+            self.record(VerifierOutcome {
+                refused: Some(describe_mismatch(shown, expected, &self.accept)),
+                ..VerifierOutcome::default()
             });
             return Err(CertificateError::ApplicationVerificationFailure.into());
         }
-        if self.first_use && signs_itself(certificate) {
-            self.note(Outcome {
+        if self.first_use && is_self_signed(certificate) {
+            self.record(VerifierOutcome {
                 first: Some(shown),
-                ..Outcome::default()
+                ..VerifierOutcome::default()
             });
             return Ok(ServerCertVerified::assertion());
         }
         let (words, error) = match refused {
-            Refused::NobodyTrusted => (
+            AuthorityRejection::NobodyTrusted => (
                 Some(self.advice.to_owned()),
                 CertificateError::UnknownIssuer.into(),
             ),
-            Refused::By(error) => (None, error),
+            AuthorityRejection::By(error) => (None, error),
         };
-        self.note(Outcome {
+        self.record(VerifierOutcome {
             refused: words,
-            ..Outcome::default()
+            ..VerifierOutcome::default()
         });
         Err(error)
     }
@@ -316,16 +331,17 @@ impl ServerCertVerifier for Verifier {
     }
 }
 
-/// Whether nobody but itself speaks for a certificate. That the server has its key, the handshake's signature shows.
-pub fn signs_itself(certificate: &CertificateDer<'_>) -> bool {
+/// Returns true if the certificate is self-issued. The handshake's signature proves that the server holds its key.
+pub fn is_self_signed(certificate: &CertificateDer<'_>) -> bool {
     match webpki::EndEntityCert::try_from(certificate) {
         Ok(read) => read.issuer() == read.subject(),
         Err(_) => false,
     }
 }
 
-/// Whether a certificate is valid for the host of `HOST` or `HOST:PORT` (RFC 9525, section 6), by whomever it is signed.
-pub fn speaks_for(certificate: &CertificateDer<'_>, authority: &str) -> bool {
+/// Returns true if the certificate is valid for the host of `HOST` or `HOST:PORT` (RFC 9525, section 6), whoever
+/// signed it.
+pub fn is_valid_for_host(certificate: &CertificateDer<'_>, authority: &str) -> bool {
     let host = match authority.rsplit_once(':') {
         Some((host, port)) if port.bytes().all(|digit| digit.is_ascii_digit()) => host,
         _ => authority,

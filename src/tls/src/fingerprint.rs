@@ -1,4 +1,4 @@
-//! Fingerprints of certificates: the SHA-256 of their DER, written as `SHA256:` and 64 hexadecimal digits.
+//! Certificate fingerprints: the SHA-256 hash of the DER encoding, written as `SHA256:` and 64 hexadecimal digits.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,22 +7,22 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use tokio_rustls::rustls::pki_types::CertificateDer;
 
-/// What stands before the digits.
+/// Prefix of the digits.
 const PREFIX: &str = "SHA256:";
 
-/// The SHA-256 of a certificate.
+/// SHA-256 fingerprint of a certificate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Fingerprint([u8; 32]);
 
-/// A text that is no fingerprint.
+/// Error for text that is not a fingerprint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is no fingerprint of a certificate; write SHA256: and 64 hexadecimal digits")]
-pub struct NoFingerprint(String);
+#[error("{0:?} is not a certificate fingerprint; write SHA256: and 64 hexadecimal digits")]
+pub struct ParseFingerprintError(String);
 
 impl Fingerprint {
-    /// That of a certificate.
-    pub fn of(certificate: &CertificateDer<'_>) -> Self {
+    /// Computes the fingerprint of a certificate.
+    pub fn from_certificate(certificate: &CertificateDer<'_>) -> Self {
         Self(Sha256::digest(certificate.as_ref()).into())
     }
 }
@@ -34,21 +34,20 @@ impl fmt::Display for Fingerprint {
 }
 
 impl FromStr for Fingerprint {
-    type Err = NoFingerprint;
+    type Err = ParseFingerprintError;
 
-    /// Also takes the form of `openssl x509 -fingerprint -sha256`: capitals, with colons between the bytes.
-    fn from_str(text: &str) -> Result<Self, NoFingerprint> {
-        let wrong = || NoFingerprint(text.to_owned());
+    /// Also accepts the output of `openssl x509 -fingerprint -sha256`: upper case, with colons between the bytes.
+    fn from_str(text: &str) -> Result<Self, ParseFingerprintError> {
+        let wrong = || ParseFingerprintError(text.to_owned());
         let prefix = text.get(..PREFIX.len()).ok_or_else(wrong)?;
         if !prefix.eq_ignore_ascii_case(PREFIX) {
             return Err(wrong());
         }
         let digits = &text[PREFIX.len()..];
-        let digits = match digits.contains(':') {
-            true if digits.split(':').all(|byte| byte.len() == 2) => digits.replace(':', ""),
-            true => return Err(wrong()),
-            false => digits.to_owned(),
-        };
+        if digits.contains(':') && digits.split(':').any(|byte| byte.len() != 2) {
+            return Err(wrong());
+        }
+        let digits = digits.replace(':', "");
         let mut bytes = [0; 32];
         hex::decode_to_slice(digits, &mut bytes).map_err(|_| wrong())?;
         Ok(Self(bytes))
@@ -56,9 +55,9 @@ impl FromStr for Fingerprint {
 }
 
 impl TryFrom<String> for Fingerprint {
-    type Error = NoFingerprint;
+    type Error = ParseFingerprintError;
 
-    fn try_from(text: String) -> Result<Self, NoFingerprint> {
+    fn try_from(text: String) -> Result<Self, ParseFingerprintError> {
         text.parse()
     }
 }
@@ -75,7 +74,7 @@ mod tests {
 
     #[test]
     fn a_fingerprint_is_read_as_it_is_written() {
-        let fingerprint = Fingerprint::of(&CertificateDer::from(b"abc".as_slice()));
+        let fingerprint = Fingerprint::from_certificate(&CertificateDer::from(b"abc".as_slice()));
         // The example of FIPS 180-4.
         let text = "SHA256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
         assert_eq!(fingerprint.to_string(), text);

@@ -1,5 +1,5 @@
-//! Servers whose certificates were seen, as `known_hosts` of ssh(1): a line each, `HOST:PORT SHA256:…`, or
-//! `HOST:PORT authority` where an authority speaks for the certificate.
+//! Known servers, like `known_hosts` of ssh(1): one line each, `HOST:PORT SHA256:…`, or `HOST:PORT authority` if an
+//! authority vouches for the certificate.
 
 use std::fmt;
 use std::fs::{DirBuilder, OpenOptions};
@@ -10,53 +10,52 @@ use std::str::FromStr;
 
 use nix::fcntl::{Flock, FlockArg};
 
-use crate::{Fingerprint, NoFingerprint};
+use crate::{Fingerprint, ParseFingerprintError};
 
-/// What is remembered of a server.
+/// Identity remembered for a server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Known {
-    /// Its certificate.
+pub enum KnownIdentity {
+    /// The server's certificate.
     Certificate(Fingerprint),
-    /// An authority that the client trusts has signed its certificate, which may change, but not to one that nobody has
-    /// signed.
+    /// A trusted authority has signed the certificate. It may change, but not to a self-signed one.
     ByAuthority,
 }
 
-/// The word of [`Known::ByAuthority`].
+/// Text form of [`KnownIdentity::ByAuthority`].
 const AUTHORITY: &str = "authority";
 
-impl fmt::Display for Known {
+impl fmt::Display for KnownIdentity {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Known::Certificate(fingerprint) => fingerprint.fmt(out),
-            Known::ByAuthority => out.write_str(AUTHORITY),
+            KnownIdentity::Certificate(fingerprint) => fingerprint.fmt(out),
+            KnownIdentity::ByAuthority => out.write_str(AUTHORITY),
         }
     }
 }
 
-impl FromStr for Known {
-    type Err = NoFingerprint;
+impl FromStr for KnownIdentity {
+    type Err = ParseFingerprintError;
 
-    fn from_str(written: &str) -> Result<Known, NoFingerprint> {
+    fn from_str(written: &str) -> Result<KnownIdentity, ParseFingerprintError> {
         if written == AUTHORITY {
-            return Ok(Known::ByAuthority);
+            return Ok(KnownIdentity::ByAuthority);
         }
-        written.parse().map(Known::Certificate)
+        written.parse().map(KnownIdentity::Certificate)
     }
 }
 
-/// The file of one user.
+/// File of the servers known to a user.
 #[derive(Debug, Clone)]
 pub struct KnownServers(PathBuf);
 
 impl KnownServers {
-    /// A file.
-    pub fn at(path: PathBuf) -> Self {
+    /// Uses the file at `path`.
+    pub fn new(path: PathBuf) -> Self {
         Self(path)
     }
 
-    /// This user's: `cloudroid/known_servers` below `$XDG_CONFIG_HOME`, or below `~/.config`.
-    pub fn of_user() -> Option<Self> {
+    /// Returns the current user's file: `cloudroid/known_servers` below `$XDG_CONFIG_HOME`, or below `~/.config`.
+    pub fn for_user() -> Option<Self> {
         let variable = |name| {
             std::env::var_os(name)
                 .filter(|value| !value.is_empty())
@@ -67,13 +66,13 @@ impl KnownServers {
         Some(Self(config.join("cloudroid/known_servers")))
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.0
     }
 
-    /// What is remembered of a server, by its host and port.
-    pub fn find(&self, server: &str) -> io::Result<Option<Known>> {
+    /// Returns the identity remembered for a server, given its host and port.
+    pub fn find(&self, server: &str) -> io::Result<Option<KnownIdentity>> {
         let known = self.read()?;
         Ok(known
             .into_iter()
@@ -81,27 +80,27 @@ impl KnownServers {
             .map(|(_, known)| known))
     }
 
-    /// Remembers this of a server, in place of what was remembered.
-    pub fn remember(&self, server: &str, new: Known) -> io::Result<()> {
-        self.change(server, |_| Some(new)).map(|_| ())
+    /// Remembers the identity of a server, replacing the previous one.
+    pub fn remember(&self, server: &str, new: KnownIdentity) -> io::Result<()> {
+        self.update(server, |_| Some(new)).map(|_| ())
     }
 
-    /// The same where nothing is remembered of the server; gives what is remembered then.
-    pub fn remember_first(&self, server: &str, new: Known) -> io::Result<Known> {
-        let known = self.change(server, |known| match known {
+    /// Remembers the identity of a server unless one is known; returns the one that is then remembered.
+    pub fn remember_first(&self, server: &str, new: KnownIdentity) -> io::Result<KnownIdentity> {
+        let known = self.update(server, |known| match known {
             Some(_) => None,
             None => Some(new),
         })?;
         Ok(known.unwrap_or(new))
     }
 
-    /// Writes what `decide` makes of what is known of a server; gives what was known.
-    fn change(
+    /// Applies `decide` to the known identity of a server and writes its result; returns the previous identity.
+    fn update(
         &self,
         server: &str,
-        decide: impl FnOnce(Option<Known>) -> Option<Known>,
-    ) -> io::Result<Option<Known>> {
-        let named = |error| about(&self.0, error);
+        decide: impl FnOnce(Option<KnownIdentity>) -> Option<KnownIdentity>,
+    ) -> io::Result<Option<KnownIdentity>> {
+        let named = |error| with_path(&self.0, error);
         if let Some(directory) = self.0.parent() {
             let mut making = DirBuilder::new();
             making.recursive(true).mode(0o700);
@@ -122,21 +121,21 @@ impl KnownServers {
         Ok(before)
     }
 
-    /// Two programs that remember something at once do it one after the other.
+    /// Serializes concurrent changes by several processes.
     fn lock(&self) -> io::Result<Flock<std::fs::File>> {
-        let file = private(&self.beside("lock"))?;
+        let file = open_private(&self.sibling_path("lock"))?;
         Flock::lock(file, FlockArg::LockExclusive).map_err(|(_, errno)| errno.into())
     }
 
-    fn beside(&self, extension: &str) -> PathBuf {
+    fn sibling_path(&self, extension: &str) -> PathBuf {
         self.0.with_extension(extension)
     }
 
-    fn read(&self) -> io::Result<Vec<(String, Known)>> {
+    fn read(&self) -> io::Result<Vec<(String, KnownIdentity)>> {
         let text = match std::fs::read_to_string(&self.0) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
-            Err(error) => return Err(about(&self.0, error)),
+            Err(error) => return Err(with_path(&self.0, error)),
         };
         let mut known = Vec::new();
         for (at, line) in text.lines().enumerate() {
@@ -149,19 +148,19 @@ impl KnownServers {
                 .and_then(|(server, shown)| Some((server.to_owned(), shown.trim().parse().ok()?)));
             let Some(read) = read else {
                 let words = format!(
-                    "line {} is no HOST:PORT with a fingerprint or the word \"{AUTHORITY}\"; correct or remove it",
+                    "line {} is not HOST:PORT with a fingerprint or the word \"{AUTHORITY}\"; correct or remove it",
                     at + 1
                 );
-                return Err(about(&self.0, io::Error::other(words)));
+                return Err(with_path(&self.0, io::Error::other(words)));
             };
             known.push(read);
         }
         Ok(known)
     }
 
-    fn write(&self, known: &[(String, Known)]) -> io::Result<()> {
-        let begun = self.beside("begun");
-        let mut file = private(&begun)?;
+    fn write(&self, known: &[(String, KnownIdentity)]) -> io::Result<()> {
+        let begun = self.sibling_path("begun");
+        let mut file = open_private(&begun)?;
         file.set_len(0)?;
         for (server, known) in known {
             writeln!(file, "{server} {known}")?;
@@ -171,8 +170,8 @@ impl KnownServers {
     }
 }
 
-/// A file that nobody else reads.
-fn private(path: &Path) -> io::Result<std::fs::File> {
+/// Opens a file that only its owner may read, creating it if necessary.
+fn open_private(path: &Path) -> io::Result<std::fs::File> {
     OpenOptions::new()
         .write(true)
         .create(true)
@@ -181,7 +180,7 @@ fn private(path: &Path) -> io::Result<std::fs::File> {
         .open(path)
 }
 
-fn about(path: &Path, error: io::Error) -> io::Error {
+fn with_path(path: &Path, error: io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("{}: {error}", path.display()))
 }
 
@@ -191,7 +190,7 @@ mod tests {
 
     use super::*;
 
-    fn shown(digit: char) -> Known {
+    fn known_certificate(digit: char) -> KnownIdentity {
         let digits = digit.to_string().repeat(64);
         format!("SHA256:{digits}").parse().unwrap()
     }
@@ -199,8 +198,8 @@ mod tests {
     #[test]
     fn the_first_is_remembered_until_another_is_accepted() {
         let place = tempfile::tempdir().unwrap();
-        let known = KnownServers::at(place.path().join("new/cloudroid/known_servers"));
-        let (one, other) = (shown('1'), shown('2'));
+        let known = KnownServers::new(place.path().join("new/cloudroid/known_servers"));
+        let (one, other) = (known_certificate('1'), known_certificate('2'));
         assert_eq!(known.find("a:1").unwrap(), None);
         assert_eq!(known.remember_first("a:1", one).unwrap(), one);
         assert_eq!(known.remember_first("b:1", other).unwrap(), other);
@@ -210,8 +209,8 @@ mod tests {
         assert_eq!(known.find("a:1").unwrap(), Some(other));
         assert_eq!(known.find("b:1").unwrap(), Some(other));
         assert_eq!(known.find("a:11").unwrap(), None);
-        known.remember("b:1", Known::ByAuthority).unwrap();
-        assert_eq!(known.find("b:1").unwrap(), Some(Known::ByAuthority));
+        known.remember("b:1", KnownIdentity::ByAuthority).unwrap();
+        assert_eq!(known.find("b:1").unwrap(), Some(KnownIdentity::ByAuthority));
         assert_eq!(known.find("a:1").unwrap(), Some(other));
         let mode = known.path().metadata().unwrap().permissions().mode();
         assert_eq!(mode & 0o777, 0o600);
@@ -220,16 +219,16 @@ mod tests {
     #[test]
     fn programs_that_remember_at_once_lose_nothing() {
         let place = tempfile::tempdir().unwrap();
-        let known = KnownServers::at(place.path().join("known_servers"));
+        let known = KnownServers::new(place.path().join("known_servers"));
         std::thread::scope(|scope| {
             for at in 0..16 {
                 let known = &known;
-                scope.spawn(move || known.remember(&format!("s:{at}"), shown('a')));
+                scope.spawn(move || known.remember(&format!("s:{at}"), known_certificate('a')));
             }
         });
         for at in 0..16 {
             let found = known.find(&format!("s:{at}")).unwrap();
-            assert_eq!(found, Some(shown('a')), "{at}");
+            assert_eq!(found, Some(known_certificate('a')), "{at}");
         }
     }
 
@@ -237,7 +236,7 @@ mod tests {
     fn a_damaged_file_is_no_reason_to_trust_anybody() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("known_servers");
-        let known = KnownServers::at(path.clone());
+        let known = KnownServers::new(path.clone());
         for text in [
             "a:1",
             "a:1 SHA256:00",
@@ -248,7 +247,9 @@ mod tests {
             std::fs::write(&path, text).unwrap();
             for refused in [
                 known.find("b:1").map(|_| ()),
-                known.remember_first("b:1", shown('1')).map(|_| ()),
+                known
+                    .remember_first("b:1", known_certificate('1'))
+                    .map(|_| ()),
             ] {
                 let words = refused.expect_err(text).to_string();
                 assert!(words.contains("known_servers: line"), "{words}");

@@ -1,5 +1,5 @@
-//! What the daemon, the command line and robots' programs share of TLS: how a certificate is named, whom a client trusts
-//! (docs/adr/080), and by which line a robot is paired (docs/adr/086).
+//! TLS parts shared by the daemon, the command line and the robots' programs: certificate fingerprints, the client's
+//! trust decisions (docs/adr/080), and the pairing line (docs/adr/086).
 
 #![deny(unsafe_code)]
 
@@ -8,7 +8,7 @@ mod fingerprint;
 mod known;
 mod line;
 
-pub use client::{Connected, Identity, Trust, signs_itself, speaks_for};
-pub use fingerprint::{Fingerprint, NoFingerprint};
-pub use known::{Known, KnownServers};
-pub use line::{CODE, NoLine, PairingLine, is_code};
+pub use client::{ClientIdentity, Trust, TrustedConnection, is_self_signed, is_valid_for_host};
+pub use fingerprint::{Fingerprint, ParseFingerprintError};
+pub use known::{KnownIdentity, KnownServers};
+pub use line::{CODE, PairingLine, ParsePairingLineError, is_code};

@@ -1,5 +1,5 @@
-//! The line by which a robot is paired: what an operator's program prints, and a robot's takes. It is a URI (RFC 3986) without
-//! percent-encoding, so that a shell can take it apart, too.
+//! Pairing line: printed by the operator's program and passed to the robot's. It is a URI (RFC 3986) without
+//! percent-encoding, so that a shell can parse it, too.
 //!
 //! `cloudroid://HOST:PORT/?robot=NAME&fingerprint=SHA256:HEX&key=BASE64URL&code=CODE`
 
@@ -9,32 +9,32 @@ use std::str::FromStr;
 use crate::Fingerprint;
 
 const SCHEME: &str = "cloudroid://";
-/// Letters and digits of a code, of 36 each: 134 bits.
+/// Length of a code in characters out of 36 letters and digits: 134 bits.
 pub const CODE: usize = 26;
-/// Characters of the key: of 51 bytes (RFC 8709, section 4) in base64url (RFC 4648, section 5).
+/// Length of the key in characters: 51 bytes (RFC 8709, section 4) in base64url (RFC 4648, section 5).
 const KEY: usize = 68;
 
-/// What a robot is told to pair with.
+/// Data a robot needs for pairing.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PairingLine {
-    /// The server's host and port, as in a URI.
+    /// Host and port of the server, as in a URI.
     pub server: String,
-    /// The robot's name.
+    /// Name of the robot.
     pub robot: String,
-    /// The certificate that the server shows.
+    /// Fingerprint of the server's certificate.
     pub fingerprint: Fingerprint,
-    /// The key that the server signs stubs by: the second word of `ssh-ed25519 AAAA…`.
+    /// Key with which the server signs stubs: the second word of `ssh-ed25519 AAAA…`.
     pub key: String,
-    /// The pairing code: good once, and for some minutes.
+    /// Pairing code, valid once and for some minutes.
     pub code: String,
 }
 
-/// A text that is no such line.
+/// Error for text that is not a pairing line.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "this is no pairing line: {0}; copy the whole line that cloudroidctl pair ROBOT prints, between single quotes"
+    "not a pairing line: {0}; copy the whole line that cloudroidctl pair ROBOT prints, between single quotes"
 )]
-pub struct NoLine(String);
+pub struct ParsePairingLineError(String);
 
 impl fmt::Display for PairingLine {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -47,61 +47,65 @@ impl fmt::Display for PairingLine {
     }
 }
 
-/// Whether a code can be one.
+/// Returns true if the text has the form of a pairing code.
 pub fn is_code(text: &str) -> bool {
     let digit = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit();
     text.len() == CODE && text.chars().all(digit)
 }
 
 impl FromStr for PairingLine {
-    type Err = NoLine;
+    type Err = ParsePairingLineError;
 
-    fn from_str(text: &str) -> Result<Self, NoLine> {
-        let no = |why: &str| NoLine(why.to_owned());
+    fn from_str(text: &str) -> Result<Self, ParsePairingLineError> {
+        let no = |why: &str| ParsePairingLineError(why.to_owned());
         let text = text.trim_matches([' ', '\n', '\r']);
         if text.chars().any(|c| !c.is_ascii_graphic()) {
-            return Err(no("it has blanks or control characters in it"));
+            return Err(no("it contains spaces or control characters"));
         }
         let rest = text
             .strip_prefix(SCHEME)
             .ok_or_else(|| no("it does not begin with cloudroid://"))?;
         let (server, query) = rest
             .split_once("/?")
-            .ok_or_else(|| no("it breaks off after the server's address"))?;
+            .ok_or_else(|| no("it ends after the server's address"))?;
         let host = |c: char| c.is_ascii_alphanumeric() || ".-_:[]".contains(c);
         let port = server.rsplit_once(':').map(|(_, port)| port.parse::<u16>());
         if !server.chars().all(host) || !matches!(port, Some(Ok(_))) || server.starts_with(':') {
-            return Err(no("the server's address is no HOST:PORT"));
+            return Err(no("the server's address is not HOST:PORT"));
         }
         let mut values = [None; 4];
         const NAMES: [&str; 4] = ["robot", "fingerprint", "key", "code"];
         for pair in query.split('&') {
             let (name, value) = pair.split_once('=').unwrap_or((pair, ""));
             let Some(at) = NAMES.iter().position(|known| *known == name) else {
-                return Err(NoLine(format!(
-                    "it says {name}, which this version does not know"
+                return Err(ParsePairingLineError(format!(
+                    "this version does not know its parameter {name}"
                 )));
             };
             if values[at].replace(value).is_some() {
-                return Err(NoLine(format!("it says {name} twice")));
+                return Err(ParsePairingLineError(format!("it has {name} twice")));
             }
         }
-        let value = |at: usize| values[at].ok_or_else(|| NoLine(format!("it lacks {}", NAMES[at])));
+        let value = |at: usize| {
+            values[at].ok_or_else(|| ParsePairingLineError(format!("it lacks {}", NAMES[at])))
+        };
         let (robot, fingerprint, key, code) = (value(0)?, value(1)?, value(2)?, value(3)?);
         let named = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
         if robot.is_empty() || robot.len() > 64 || !robot.chars().all(named) {
-            return Err(no("robot is no robot's name"));
+            return Err(no("robot is not a robot's name"));
         }
         let fingerprint = fingerprint
             .parse()
-            .map_err(|error: crate::NoFingerprint| NoLine(error.to_string()))?;
+            .map_err(|error: crate::ParseFingerprintError| {
+                ParsePairingLineError(error.to_string())
+            })?;
         let encoded = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
         if key.len() != KEY || !key.chars().all(encoded) {
-            return Err(no("key is no ed25519 key"));
+            return Err(no("key is not an ed25519 key"));
         }
         if !is_code(code) {
-            return Err(NoLine(format!(
-                "its code has {} characters, and one has {CODE} small letters and digits",
+            return Err(ParsePairingLineError(format!(
+                "its code has {} characters, but must have {CODE} lowercase letters and digits",
                 code.len()
             )));
         }
@@ -119,7 +123,7 @@ impl FromStr for PairingLine {
 mod tests {
     use super::*;
 
-    fn line() -> PairingLine {
+    fn pairing_line() -> PairingLine {
         PairingLine {
             server: "lab.example:9090".into(),
             robot: "rover-1".into(),
@@ -131,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_line_is_read_as_it_is_written() {
-        let line = line();
+        let line = pairing_line();
         let text = line.to_string();
         assert!(!text.contains(['+', '%', '\'', ' ']), "{text}");
         assert_eq!(text.parse(), Ok(line.clone()));
@@ -145,12 +149,12 @@ mod tests {
 
     #[test]
     fn what_is_no_line_is_refused_with_what_to_copy() {
-        let good = line().to_string();
+        let good = pairing_line().to_string();
         let with = |old: &str, new: &str| good.replace(old, new);
         for (text, words) in [
             (String::new(), "does not begin with"),
             ("https://lab.example:9090/".into(), "does not begin with"),
-            ("cloudroid://lab.example:9090".into(), "breaks off"),
+            ("cloudroid://lab.example:9090".into(), "ends after"),
             (with("lab.example:9090", "lab.example"), "HOST:PORT"),
             (with("lab.example:9090", "lab.example:99999"), "HOST:PORT"),
             (with("lab.example:9090", ":9090"), "HOST:PORT"),
@@ -159,14 +163,14 @@ mod tests {
             (with("rover-1", "rover\n1"), "control characters"),
             (with("rover-1", "rover\u{1b}[2J"), "control characters"),
             (with("rover-1", "rövér"), "control characters"),
-            (with("rover-1", "a$(reboot)"), "no robot's name"),
-            (with("rover-1", ""), "no robot's name"),
-            (with("rover-1", &"r".repeat(65)), "no robot's name"),
+            (with("rover-1", "a$(reboot)"), "not a robot's name"),
+            (with("rover-1", ""), "not a robot's name"),
+            (with("rover-1", &"r".repeat(65)), "not a robot's name"),
             (with("SHA256:5d", "SHA256:"), "64 hexadecimal digits"),
-            (with("key=AAAA", "key="), "no ed25519 key"),
+            (with("key=AAAA", "key="), "not an ed25519 key"),
             (with("ijklmnop", "ijklmno"), "has 25 characters"),
-            (with("ijklmnop", "ijklmnoP"), "small letters"),
-            (with("&code=", "&kode="), "says kode"),
+            (with("ijklmnop", "ijklmnoP"), "lowercase letters"),
+            (with("&code=", "&kode="), "parameter kode"),
             (format!("{good}&robot=r2"), "robot twice"),
             (good[..good.find("&code").unwrap()].into(), "lacks code"),
         ] {

@@ -1,4 +1,5 @@
-//! What is told to be there: topics as channels, and services, each by a number that is never given twice.
+//! Catalogue of what a viewer was told about: topics (as channels) and services, each with an id that is never
+//! reused.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -6,35 +7,36 @@ use std::sync::Arc;
 use ros::bus::{Graph, WireType};
 use ros::schema::ServiceDef;
 
-/// Topics that a viewer is told of at most, and services.
+/// Limit on the topics, and on the services, advertised to one viewer.
 const MOST: usize = 2_000;
 
-/// What a viewer has been told of.
+/// Topics and services advertised to one viewer.
 #[derive(Default)]
 pub struct Catalogue {
     last: u32,
     channels: BTreeMap<u64, (String, Arc<WireType>)>,
     services: BTreeMap<u32, (String, Arc<ServiceDef>)>,
-    /// Whose types are being asked for.
+    /// Names whose types are being resolved.
     asked: BTreeSet<String>,
 }
 
-/// What has changed in the graph.
+/// Changes in the graph since the last update.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Changes {
-    /// Topics that are new, with their types as registered.
+    /// New topics, with their types as registered.
     pub topics: Vec<(String, String)>,
-    /// Services that are new.
+    /// New services.
     pub services: Vec<String>,
-    /// Channels that are gone.
+    /// Ids of channels whose topics have disappeared.
     pub channels_gone: Vec<u64>,
-    /// Services that are gone.
+    /// Ids of services that have disappeared.
     pub services_gone: Vec<u32>,
 }
 
 impl Catalogue {
-    /// What `graph` has, as far as it `may` be heard, and was not told of, and what is not there any more. `own`: the node that looks.
-    pub fn changes(&mut self, graph: &Graph, own: &str, may: impl Fn(&str) -> bool) -> Changes {
+    /// Compares `graph` with what was advertised: returns new topics that the viewer `may` subscribe to, new
+    /// services, and everything that has disappeared. `own` is the name of this node, which is ignored.
+    pub fn update(&mut self, graph: &Graph, own: &str, may: impl Fn(&str) -> bool) -> Changes {
         let published = |name: &str| {
             let topic = graph.topics.get(name);
             topic.is_some_and(|topic| topic.publishers.iter().any(|node| node != own))
@@ -75,7 +77,8 @@ impl Catalogue {
         changes
     }
 
-    /// The number of a topic whose type is known now; none where it is gone.
+    /// Adds a topic whose type was resolved and returns its channel id; `None` if the topic has disappeared
+    /// meanwhile.
     pub fn add_topic(&mut self, topic: &str, of: Arc<WireType>) -> Option<u64> {
         if !self.asked.remove(topic) {
             return None;
@@ -86,7 +89,7 @@ impl Catalogue {
         Some(id)
     }
 
-    /// The number of a service whose type is known now; none where it is gone.
+    /// Adds a service whose type was resolved and returns its id; `None` if the service has disappeared meanwhile.
     pub fn add_service(&mut self, service: &str, of: Arc<ServiceDef>) -> Option<u32> {
         if !self.asked.remove(service) {
             return None;
@@ -96,12 +99,12 @@ impl Catalogue {
         Some(self.last)
     }
 
-    /// A topic and its type.
+    /// Returns the topic of a channel and its type.
     pub fn channel(&self, id: u64) -> Option<&(String, Arc<WireType>)> {
         self.channels.get(&id)
     }
 
-    /// A service and its type.
+    /// Returns the name of a service and its type.
     pub fn service(&self, id: u32) -> Option<&(String, Arc<ServiceDef>)> {
         self.services.get(&id)
     }
@@ -140,30 +143,30 @@ mod tests {
         };
         let all = graph(&[("/a", "/n"), ("/own", "/viewer"), ("/secret", "/n")]);
         let may = |name: &str| name != "/secret";
-        let first = catalogue.changes(&all, "/viewer", may);
+        let first = catalogue.update(&all, "/viewer", may);
         assert_eq!(names(&first), ["/a"]);
         assert_eq!(
-            catalogue.changes(&all, "/viewer", may),
+            catalogue.update(&all, "/viewer", may),
             Changes::default(),
             "it is asked for"
         );
-        let of = Arc::new(WireType::named("std_msgs/String"));
+        let of = Arc::new(WireType::with_name("std_msgs/String"));
         let id = catalogue
             .add_topic("/a", Arc::clone(&of))
             .expect("asked for");
         assert_eq!(catalogue.add_topic("/a", Arc::clone(&of)), None, "once");
-        assert_eq!(catalogue.changes(&all, "/viewer", may), Changes::default());
-        let gone = catalogue.changes(&graph(&[]), "/viewer", may);
+        assert_eq!(catalogue.update(&all, "/viewer", may), Changes::default());
+        let gone = catalogue.update(&graph(&[]), "/viewer", may);
         assert_eq!(gone.channels_gone, [id]);
-        let again = catalogue.changes(&all, "/viewer", may);
+        let again = catalogue.update(&all, "/viewer", may);
         assert_eq!(names(&again), ["/a"]);
         assert_ne!(
             catalogue.add_topic("/a", of),
             Some(id),
             "a number is given once"
         );
-        // What may not be heard any more is gone, too.
-        let refused = catalogue.changes(&all, "/viewer", |_| false);
+        // A topic whose permission was revoked disappears, too.
+        let refused = catalogue.update(&all, "/viewer", |_| false);
         assert_eq!(refused.channels_gone.len(), 1);
     }
 }

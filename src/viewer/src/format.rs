@@ -1,20 +1,20 @@
-//! How messages are written, and how their definitions are, in the words of the protocol
-//! (<https://mcap.dev/spec/registry> has the same).
+//! Encodings of messages and of their definitions, by the names of the protocol (the same as in
+//! <https://mcap.dev/spec/registry>).
 
 use ros::bus::RosVersion;
 
-/// What a servant's messages are to a viewer.
+/// Encoding names of a servant's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Format {
-    /// How messages, requests and answers are written.
+pub struct ViewerFormat {
+    /// Encoding of messages, requests and responses.
     pub encoding: &'static str,
-    /// How definitions are written: the text of the message, followed by those of all that it contains.
+    /// Encoding of definitions: the message text followed by the texts of all types it contains.
     pub schema: &'static str,
 }
 
-impl Format {
-    /// That of a version of ROS.
-    pub fn of(version: RosVersion) -> Self {
+impl ViewerFormat {
+    /// Returns the encodings of a ROS version.
+    pub fn for_version(version: RosVersion) -> Self {
         match version {
             RosVersion::One => Self {
                 encoding: "ros1",

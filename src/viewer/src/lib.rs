@@ -1,10 +1,10 @@
-//! Viewers (Foxglove, Lichtblick) on a servant's ROS: version 1 of Foxglove's WebSocket protocol, whose messages the crate `foxglove`
-//! reads and writes. Messages of ROS 1 and of ROS 2 pass as the bytes that they are.
+//! Serves viewers (Foxglove, Lichtblick) on a servant's ROS, over version 1 of Foxglove's WebSocket protocol. The
+//! crate `foxglove` parses and writes the protocol's messages; ROS 1 and ROS 2 payloads pass through unchanged.
 //!
 //! ```text
 //!   graph ──▶ catalogue ──advertise──▶ ┐                ┌──▶ publisher ──▶ bus
-//!   bus ──▶ subscription ──▶ queue ──▶ ├─▶ viewer ─▶ what it asks ──▶ call ──▶ bus
-//!           newest win       16        ┘                └──▶ parameters
+//!   bus ──▶ subscription ──▶ queue ──▶ ├─▶ viewer ─▶ its requests ──▶ call ──▶ bus
+//!          keeps newest      16        ┘                └──▶ parameters
 //! ```
 
 #![deny(unsafe_code)]
@@ -21,4 +21,4 @@ mod memory_bus;
 #[cfg(test)]
 mod tests;
 
-pub use session::{DEPTH, PROTOCOLS, Servant, ViewerOptions, serve};
+pub use session::{DEPTH, PROTOCOLS, ViewedServant, ViewerOptions, serve};

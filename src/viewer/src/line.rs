@@ -1,4 +1,5 @@
-//! The WebSocket to one viewer: read while it is written to, pinged, and given up when nothing comes or nothing goes any more.
+//! WebSocket of one viewer: read while it is written to, kept alive by pings, and closed if nothing is received or
+//! sent for too long.
 
 use std::future::poll_fn;
 use std::pin::Pin;
@@ -8,53 +9,54 @@ use std::time::Duration;
 use bytes::Bytes;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Instant, Sleep, timeout};
-use ws::{Message, WebSocket, WsError, frame};
+use ws::{WebSocket, WsError, WsMessage, frame};
 
-/// What is sent to a viewer. Both are payloads of one frame.
-pub enum Frame {
-    /// JSON.
+/// A frame to send to a viewer; each variant holds the payload of one frame.
+pub enum ViewerFrame {
+    /// A JSON message.
     Text(Bytes),
-    /// A message, or an answer.
+    /// A message of a topic, or a service response.
     Binary(Bytes),
 }
 
-/// What came of reading.
-pub enum Read {
-    /// A message of the viewer's: whether it is text, and its bytes.
+/// Result of reading from a viewer.
+pub enum ViewerInput {
+    /// A message and whether it is text.
     Message(bool, Bytes),
-    /// The viewer has said goodbye.
+    /// The viewer sent a close frame.
     Left,
-    /// The connection is gone.
+    /// The connection was lost.
     Lost,
-    /// It has to be closed, with this code (RFC 6455) and reason; whether its bytes can still be told apart.
+    /// The connection must be closed with this code (RFC 6455) and reason. The flag tells whether the frames that
+    /// follow can still be parsed.
     Refused(u16, String, bool),
 }
 
-/// Between two pings.
+/// Interval between pings.
 const PING: Duration = Duration::from_secs(30);
-/// A viewer of which nothing was heard for so long, not even a pong, is gone; so is one that takes nothing for so long.
+/// Timeout after which a viewer is given up that sends nothing, not even a pong, or reads nothing.
 const SILENT: Duration = Duration::from_secs(90);
-/// Bytes that wait for the viewer; while there are more, it is given nothing.
+/// Number of queued bytes above which the viewer is sent no more messages.
 const AHEAD: usize = 1 << 20;
-/// For the last frames.
+/// Timeout for the last frames.
 const GOODBYE: Duration = Duration::from_secs(2);
 
-/// One connection.
-pub struct Line<S> {
+/// The WebSocket to one viewer.
+pub struct ViewerSocket<S> {
     socket: WebSocket<S>,
     received: u64,
     heard: Instant,
     pinged: Instant,
     queued: usize,
-    /// Bytes of what it caused itself, since nothing waited for it.
+    /// Queued bytes of replies, since the queue was last empty.
     answers: usize,
-    /// When the socket last took something, or nothing had to be taken.
+    /// Time when the socket last accepted bytes or the queue was empty.
     took: Instant,
     timer: Pin<Box<Sleep>>,
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
-    /// Of a connection behind its upgrade.
+impl<S: AsyncRead + AsyncWrite + Unpin> ViewerSocket<S> {
+    /// Wraps a connection after its upgrade.
     pub fn new(socket: WebSocket<S>) -> Self {
         let now = Instant::now();
         Self {
@@ -69,48 +71,52 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
         }
     }
 
-    /// Whether it is given more of what flows in the servant.
-    pub fn is_given(&self) -> bool {
-        self.socket.queued() < AHEAD
+    /// Returns true if more of the servant's messages may be queued.
+    pub fn can_send(&self) -> bool {
+        self.socket.bytes_queued() < AHEAD
     }
 
-    /// Whether it is read from: until answers pile up, also while it takes nothing. A viewer that takes nothing before all that it
-    /// sends is taken, and is sent a big message meanwhile, would wait for ever.
-    pub fn is_read(&self) -> bool {
-        self.is_given() || self.answers < AHEAD
+    /// Returns true if messages should be read. This holds until replies pile up, even while the viewer reads
+    /// nothing: a viewer that reads only after sending everything would otherwise deadlock on a large message.
+    pub fn should_read(&self) -> bool {
+        self.can_send() || self.answers < AHEAD
     }
 
-    /// Sends a frame that the viewer caused, such as an answer or a complaint.
-    pub fn answer(&mut self, frame: Frame) {
+    /// Queues a frame that the viewer caused, such as a response or an error.
+    pub fn send_reply(&mut self, frame: ViewerFrame) {
         self.answers += match &frame {
-            Frame::Text(text) => text.len(),
-            Frame::Binary(bytes) => bytes.len(),
+            ViewerFrame::Text(text) => text.len(),
+            ViewerFrame::Binary(bytes) => bytes.len(),
         };
         self.send(frame);
     }
 
-    /// Sends a frame, as far as [`next`](Self::next) is waited for.
-    pub fn send(&mut self, frame: Frame) {
+    /// Queues a frame; [`next`](Self::next) sends it.
+    pub fn send(&mut self, frame: ViewerFrame) {
         match frame {
-            Frame::Text(text) => self.socket.queue(frame::TEXT, text),
-            Frame::Binary(bytes) => self.socket.queue(frame::BINARY, bytes),
+            ViewerFrame::Text(text) => self.socket.queue(frame::TEXT, text),
+            ViewerFrame::Binary(bytes) => self.socket.queue(frame::BINARY, bytes),
         }
     }
 
-    /// Sends what was queued, and gives the next message where one is wanted; comes back without one when the queue has become
-    /// shorter.
-    pub async fn next(&mut self, wanted: bool) -> Option<Read> {
-        let before = self.socket.queued();
+    /// Sends queued frames and reads the next message if `wanted`. Returns `None` once the queue has become shorter.
+    pub async fn next(&mut self, wanted: bool) -> Option<ViewerInput> {
+        let before = self.socket.bytes_queued();
         poll_fn(|cx| self.poll(cx, wanted, before)).await
     }
 
-    fn poll(&mut self, cx: &mut Context<'_>, wanted: bool, before: usize) -> Poll<Option<Read>> {
+    fn poll(
+        &mut self,
+        cx: &mut Context<'_>,
+        wanted: bool,
+        before: usize,
+    ) -> Poll<Option<ViewerInput>> {
         loop {
             let now = Instant::now();
             if let Poll::Ready(Err(_)) = self.socket.poll_flush(cx) {
-                return Poll::Ready(Some(Read::Lost));
+                return Poll::Ready(Some(ViewerInput::Lost));
             }
-            let queued = self.socket.queued();
+            let queued = self.socket.bytes_queued();
             if queued < self.queued || queued == 0 {
                 self.took = now;
             }
@@ -124,40 +130,42 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
             let mut pongs = false;
             if wanted {
                 match self.socket.poll_next(cx) {
-                    Poll::Ready(Ok(Message::Text(bytes))) => {
-                        return Poll::Ready(Some(Read::Message(true, bytes)));
+                    Poll::Ready(Ok(WsMessage::Text(bytes))) => {
+                        return Poll::Ready(Some(ViewerInput::Message(true, bytes)));
                     }
-                    Poll::Ready(Ok(Message::Binary(bytes))) => {
-                        return Poll::Ready(Some(Read::Message(false, bytes)));
+                    Poll::Ready(Ok(WsMessage::Binary(bytes))) => {
+                        return Poll::Ready(Some(ViewerInput::Message(false, bytes)));
                     }
-                    Poll::Ready(Ok(Message::Close(..))) => return Poll::Ready(Some(Read::Left)),
-                    Poll::Ready(Ok(Message::Ping(payload))) => {
+                    Poll::Ready(Ok(WsMessage::Close(..))) => {
+                        return Poll::Ready(Some(ViewerInput::Left));
+                    }
+                    Poll::Ready(Ok(WsMessage::Ping(payload))) => {
                         self.answers += payload.len() + frame::MAX_CONTROL;
                         self.socket.queue(frame::PONG, payload);
                         pongs = true;
                     }
-                    Poll::Ready(Ok(Message::Pong(_))) => pongs = true,
+                    Poll::Ready(Ok(WsMessage::Pong(_))) => pongs = true,
                     Poll::Ready(Err(WsError::Refused { code, reason })) => {
-                        return Poll::Ready(Some(Read::Refused(code, reason, false)));
+                        return Poll::Ready(Some(ViewerInput::Refused(code, reason, false)));
                     }
-                    Poll::Ready(Err(_)) => return Poll::Ready(Some(Read::Lost)),
+                    Poll::Ready(Err(_)) => return Poll::Ready(Some(ViewerInput::Lost)),
                     Poll::Pending => {}
                 }
-                if self.socket.received() != self.received {
-                    self.received = self.socket.received();
+                if self.socket.bytes_received() != self.received {
+                    self.received = self.socket.bytes_received();
                     self.heard = now;
                 }
             }
             if pongs {
                 continue;
             }
-            // Who is not read from cannot be heard.
+            // While nothing is read, silence cannot be measured.
             if wanted && now >= self.heard + SILENT {
-                let reason = format!("nothing was heard for {} s", SILENT.as_secs());
-                return Poll::Ready(Some(Read::Refused(1001, reason, true)));
+                let reason = format!("nothing was received for {} s", SILENT.as_secs());
+                return Poll::Ready(Some(ViewerInput::Refused(1001, reason, true)));
             }
             if now >= self.took + SILENT {
-                return Poll::Ready(Some(Read::Lost));
+                return Poll::Ready(Some(ViewerInput::Lost));
             }
             if now >= self.pinged + PING {
                 self.pinged = now;
@@ -175,15 +183,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Line<S> {
         }
     }
 
-    /// Ends the connection with a code and the reason; `readable`: its bytes can still be told apart.
+    /// Closes the connection with a code and a reason. `readable` tells whether incoming frames can still be parsed.
     pub async fn close(mut self, code: u16, reason: &str, readable: bool) {
         self.socket.queue_close(code, reason);
-        // Who does not take its leave in time, or is gone already, is left alone.
-        let _ = timeout(GOODBYE, self.socket.leave(readable)).await;
+        // A viewer that does not answer in time, or is gone, is not waited for.
+        let _ = timeout(GOODBYE, self.socket.shutdown(readable)).await;
     }
 
-    /// Answers the viewer's goodbye.
-    pub async fn answer_goodbye(mut self) {
+    /// Answers the viewer's close frame.
+    pub async fn reply_close(mut self) {
         self.socket.queue_close(1000, "");
         let _ = timeout(GOODBYE, poll_fn(|cx| self.socket.poll_flush(cx))).await;
     }
@@ -197,8 +205,8 @@ mod tests {
 
     const BIG: usize = 2 << 20;
 
-    /// A masked binary message of a client, with a mask of nothing.
-    fn message() -> Vec<u8> {
+    /// Encodes a binary message of a client with a zero mask.
+    fn masked_message() -> Vec<u8> {
         let mut bytes = vec![0x82, 0x80 | 127];
         bytes.extend_from_slice(&(BIG as u64).to_be_bytes());
         bytes.extend_from_slice(&[0; 4]);
@@ -209,23 +217,23 @@ mod tests {
     #[tokio::test]
     async fn a_viewer_that_writes_before_it_reads_is_read() {
         let (ours, mut theirs) = tokio::io::duplex(4096);
-        let mut line = Line::new(WebSocket::new(ours, b"", 2 * BIG, 2 * BIG));
-        line.send(Frame::Binary(vec![1; BIG].into()));
-        assert!(!line.is_given(), "it has enough");
+        let mut line = ViewerSocket::new(WebSocket::new(ours, b"", 2 * BIG, 2 * BIG));
+        line.send(ViewerFrame::Binary(vec![1; BIG].into()));
+        assert!(!line.can_send(), "it has enough");
         let viewer = tokio::spawn(async move {
-            theirs.write_all(&message()).await.expect("taken");
-            // Nothing is read before.
+            theirs.write_all(&masked_message()).await.expect("taken");
+            // It reads nothing before all is written.
             theirs
         });
         let read = async {
             loop {
-                if let Some(read) = line.next(line.is_read()).await {
+                if let Some(read) = line.next(line.should_read()).await {
                     return read;
                 }
             }
         };
         let read = timeout(Duration::from_secs(20), read).await;
-        let Ok(Read::Message(false, bytes)) = read else {
+        let Ok(ViewerInput::Message(false, bytes)) = read else {
             panic!("it is not read while it takes nothing");
         };
         assert_eq!(bytes.len(), BIG);
@@ -235,9 +243,9 @@ mod tests {
     #[tokio::test]
     async fn a_viewer_whose_answers_pile_up_is_not_read() {
         let (ours, _theirs) = tokio::io::duplex(64);
-        let mut line = Line::new(WebSocket::new(ours, b"", BIG, BIG));
-        assert!(line.is_read() && line.is_given());
-        line.answer(Frame::Text("x".repeat(BIG).into()));
-        assert!(!line.is_read() && !line.is_given());
+        let mut line = ViewerSocket::new(WebSocket::new(ours, b"", BIG, BIG));
+        assert!(line.should_read() && line.can_send());
+        line.send_reply(ViewerFrame::Text("x".repeat(BIG).into()));
+        assert!(!line.should_read() && !line.can_send());
     }
 }

@@ -1,22 +1,27 @@
-//! Parameters as viewers have them: those that all nodes share by their names (ROS 1), those of a node by its name, a dot and what
-//! the node calls them (ROS 2, as other servers of the protocol name them): `/see.rate`.
+//! Parameters as viewers see them: global parameters by name (ROS 1), or node parameters as node name, dot and
+//! parameter name, as other servers of the protocol name them (ROS 2): `/see.rate`.
 
 use std::collections::BTreeMap;
 
 use foxglove::ws_protocol::parameter::{Parameter, ParameterType, ParameterValue};
 use ros::bus::{Bus, BusError, NodeParameters, ParamValue, RosVersion};
 
-/// Parameters by name; all where none is named. What there is not is left out, and so is a node that does not answer.
-pub async fn all(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
+/// Returns the named parameters, or all if none is named. Unknown parameters and nodes that do not respond are
+/// skipped.
+pub async fn get_parameters(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
     match bus.version() {
-        RosVersion::One => shared(bus, names).await,
-        RosVersion::Two => of_nodes(bus, names).await,
+        RosVersion::One => get_shared(bus, names).await,
+        RosVersion::Two => get_from_nodes(bus, names).await,
     }
 }
 
-/// Sets a parameter, or removes it where there is no value.
-pub async fn set(bus: &dyn Bus, name: &str, value: Option<ParameterValue>) -> Result<(), BusError> {
-    let value = value.map(read);
+/// Sets a parameter, or deletes it if there is no value.
+pub async fn set_parameter(
+    bus: &dyn Bus,
+    name: &str,
+    value: Option<ParameterValue>,
+) -> Result<(), BusError> {
+    let value = value.map(from_parameter_value);
     if bus.version() == RosVersion::One {
         let parameters = bus.parameters()?;
         return match value {
@@ -30,7 +35,7 @@ pub async fn set(bus: &dyn Bus, name: &str, value: Option<ParameterValue>) -> Re
     };
     let (node, own) = name
         .split_once('.')
-        .ok_or_else(|| bad("name a node and its parameter, such as /see.rate"))?;
+        .ok_or_else(|| bad("give a node and its parameter, such as /see.rate"))?;
     let changes = vec![(own.to_owned(), value)];
     let done = bus.node_parameters()?.set(node, changes).await?;
     match done.into_iter().next() {
@@ -39,22 +44,23 @@ pub async fn set(bus: &dyn Bus, name: &str, value: Option<ParameterValue>) -> Re
     }
 }
 
-async fn shared(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
+async fn get_shared(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
     let parameters = bus.parameters()?;
-    let names = match names.is_empty() {
-        true => parameters.names().await?,
-        false => names,
+    let names = if names.is_empty() {
+        parameters.names().await?
+    } else {
+        names
     };
     let mut values = Vec::new();
     for name in names {
         if let Ok(value) = parameters.get(&name).await {
-            values.extend(told(&name, &value));
+            values.extend(to_parameter(&name, &value));
         }
     }
     Ok(values)
 }
 
-async fn of_nodes(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
+async fn get_from_nodes(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, BusError> {
     let parameters = bus.node_parameters()?;
     let mut wanted: BTreeMap<String, Vec<String>> = BTreeMap::new();
     if names.is_empty() {
@@ -79,28 +85,33 @@ async fn of_nodes(bus: &dyn Bus, names: Vec<String>) -> Result<Vec<Parameter>, B
     }
     let mut values = Vec::new();
     for (node, names) in wanted {
-        values.extend(of_node(parameters, &node, &names).await);
+        values.extend(get_from_node(parameters, &node, &names).await);
     }
     Ok(values)
 }
 
-async fn of_node(parameters: &dyn NodeParameters, node: &str, names: &[String]) -> Vec<Parameter> {
+async fn get_from_node(
+    parameters: &dyn NodeParameters,
+    node: &str,
+    names: &[String],
+) -> Vec<Parameter> {
     let values = parameters.get(node, names).await.unwrap_or_default();
     let known = names.iter().zip(values);
-    let known = known.filter_map(|(name, value)| told(&format!("{node}.{name}"), &value?));
+    let known = known.filter_map(|(name, value)| to_parameter(&format!("{node}.{name}"), &value?));
     known.collect()
 }
 
-/// As viewers have it; none for what they have no word for.
-pub fn told(name: &str, value: &ParamValue) -> Option<Parameter> {
+/// Converts a value to the protocol's parameter; `None` if the protocol has no representation for it.
+pub fn to_parameter(name: &str, value: &ParamValue) -> Option<Parameter> {
     let (value, hint) = match value {
-        ParamValue::Double(_) => (written(value)?, Some(ParameterType::Float64)),
-        ParamValue::List(all) if is_of_doubles(all) => {
-            (written(value)?, Some(ParameterType::Float64Array))
-        }
-        // What viewers take for text is not told to be bytes.
+        ParamValue::Double(_) => (to_parameter_value(value)?, Some(ParameterType::Float64)),
+        ParamValue::List(all) if is_double_list(all) => (
+            to_parameter_value(value)?,
+            Some(ParameterType::Float64Array),
+        ),
+        // Viewers would take bytes for text.
         ParamValue::Binary(_) => return None,
-        other => (written(other)?, None),
+        other => (to_parameter_value(other)?, None),
     };
     Some(Parameter {
         name: name.to_owned(),
@@ -109,11 +120,11 @@ pub fn told(name: &str, value: &ParamValue) -> Option<Parameter> {
     })
 }
 
-fn is_of_doubles(all: &[ParamValue]) -> bool {
+fn is_double_list(all: &[ParamValue]) -> bool {
     !all.is_empty() && all.iter().all(|one| matches!(one, ParamValue::Double(_)))
 }
 
-fn written(value: &ParamValue) -> Option<ParameterValue> {
+fn to_parameter_value(value: &ParamValue) -> Option<ParameterValue> {
     Some(match value {
         ParamValue::Bool(value) => ParameterValue::Bool(*value),
         ParamValue::Int(value) => ParameterValue::Integer(*value),
@@ -121,26 +132,33 @@ fn written(value: &ParamValue) -> Option<ParameterValue> {
         ParamValue::String(value) => ParameterValue::String(value.clone()),
         ParamValue::Binary(_) | ParamValue::Nil => return None,
         ParamValue::List(all) => {
-            ParameterValue::Array(all.iter().map(written).collect::<Option<_>>()?)
+            ParameterValue::Array(all.iter().map(to_parameter_value).collect::<Option<_>>()?)
         }
         ParamValue::Map(all) => {
-            let one = |(key, value): (&String, &ParamValue)| Some((key.clone(), written(value)?));
+            let one = |(key, value): (&String, &ParamValue)| {
+                Some((key.clone(), to_parameter_value(value)?))
+            };
             ParameterValue::Dict(all.iter().map(one).collect::<Option<_>>()?)
         }
     })
 }
 
-/// As ROS has it.
-pub fn read(value: ParameterValue) -> ParamValue {
+/// Converts a value of the protocol to a ROS parameter value.
+pub fn from_parameter_value(value: ParameterValue) -> ParamValue {
     match value {
         ParameterValue::Integer(value) => ParamValue::Int(value),
         ParameterValue::Float64(value) => ParamValue::Double(value),
         ParameterValue::Bool(value) => ParamValue::Bool(value),
         ParameterValue::String(value) => ParamValue::String(value),
-        ParameterValue::Array(all) => ParamValue::List(all.into_iter().map(read).collect()),
+        ParameterValue::Array(all) => {
+            ParamValue::List(all.into_iter().map(from_parameter_value).collect())
+        }
         ParameterValue::Dict(all) => {
             let all = all.into_iter();
-            ParamValue::Map(all.map(|(key, value)| (key, read(value))).collect())
+            ParamValue::Map(
+                all.map(|(key, value)| (key, from_parameter_value(value)))
+                    .collect(),
+            )
         }
     }
 }
@@ -163,12 +181,12 @@ mod tests {
             list,
             ParamValue::Map(map.into()),
         ] {
-            let told = told("/p", &value).expect("has a word");
-            assert_eq!(read(told.value.expect("a value")), value);
+            let told = to_parameter("/p", &value).expect("has a word");
+            assert_eq!(from_parameter_value(told.value.expect("a value")), value);
         }
-        assert_eq!(told("/p", &ParamValue::Nil), None);
-        assert_eq!(told("/p", &ParamValue::Binary(vec![1])), None);
-        let double = told("/p", &ParamValue::Double(3.0)).expect("has a word");
+        assert_eq!(to_parameter("/p", &ParamValue::Nil), None);
+        assert_eq!(to_parameter("/p", &ParamValue::Binary(vec![1])), None);
+        let double = to_parameter("/p", &ParamValue::Double(3.0)).expect("has a word");
         assert_eq!(double.r#type, Some(ParameterType::Float64));
     }
 }

@@ -1,4 +1,4 @@
-//! One viewer's connection.
+//! Session of one viewer.
 
 mod calling;
 mod connections;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use access::Operation;
-use bridge::Granted;
+use bridge::ClientGrants;
 use budget::{Budget, Exceeded, JsonWeight};
 use bytes::Bytes;
 use foxglove::ws_protocol::JsonMessage;
@@ -33,69 +33,69 @@ use tokio::time::timeout;
 use ws::WebSocket;
 
 use crate::catalogue::Catalogue;
-use crate::format::Format;
-use crate::line::{Frame, Line, Read};
+use crate::format::ViewerFormat;
+use crate::line::{ViewerFrame, ViewerInput, ViewerSocket};
 use crate::parameters;
-use publishing::Published;
-use subscribing::Subscribed;
+use publishing::ViewerPublication;
+use subscribing::ViewerSubscription;
 
-/// Subprotocols that viewers ask for, the newest first. They are of one version: the older name is of the time before the protocol was
-/// part of the SDK.
+/// Supported subprotocols, newest first. Both denote the same version; the older name predates the SDK.
 pub const PROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 
-/// Bytes of a message in JSON: many small things, of which each may have an answer. Publications are binary.
+/// Maximum size of a JSON message in bytes: it may hold many small requests, each with a response. Publications are
+/// binary.
 const LARGEST_TEXT: usize = 1 << 20;
-/// What waits to be sent, in messages; a viewer that reads slowly misses what comes meanwhile.
+/// Number of outgoing messages queued; a slow viewer misses what is published meanwhile.
 const OUTGOING: usize = 16;
-/// Messages of a topic that may wait behind these, as the viewer asks; the newest win.
+/// Range of the per-topic queue size behind these, as requested by the viewer; the newest messages are kept.
 pub const DEPTH: RangeInclusive<usize> = 2..=1000;
-/// For the connections of a topic's subscribers.
+/// Time to wait for the connections of a topic's subscribers.
 const CONNECTS: Duration = Duration::from_secs(2);
-/// Bytes of a message from a viewer.
+/// Maximum size of a message from a viewer in bytes.
 const LARGEST: usize = 16 << 20;
-/// Close codes (RFC 6455): of a servant that ends, and of what is not allowed any more.
+/// Close codes (RFC 6455): the servant has ended; the permission was revoked.
 const ENDED: u16 = 1012;
 const NOT_ALLOWED: u16 = 1008;
 
-/// How a viewer is served.
+/// Options of a viewer's session.
 pub struct ViewerOptions {
-    /// What it sees: a name for people.
+    /// Display name of the server.
     pub name: String,
-    /// What it may.
-    pub granted: Granted,
-    /// What of its messages may be held at once, in bytes.
+    /// Operations granted to the viewer.
+    pub granted: ClientGrants,
+    /// Budget for the bytes of its messages.
     pub budget: Budget,
-    /// Time from the first byte of a message of the viewer's to its last.
+    /// Timeout from the first byte of a viewer's message to its last.
     pub unfinished: Duration,
-    /// How many messages of a topic wait for it.
+    /// Queue size per topic.
     pub depth: usize,
 }
 
-/// What is looked into.
-pub struct Servant {
-    /// Its ROS.
+/// The servant that a viewer is connected to.
+pub struct ViewedServant {
+    /// The servant's ROS bus.
     pub bus: Arc<dyn Bus>,
-    /// Its definitions.
+    /// Message definitions of its image.
     pub registry: Arc<Registry>,
-    /// Why it has ended, once it has.
+    /// Reason why the servant has ended, once it has.
     pub ended: watch::Receiver<Option<String>>,
-    /// Dropped when the viewer has gone.
+    /// Guard, dropped when the viewer has disconnected.
     pub held: Box<dyn Send + Sync>,
 }
 
-/// Serves a viewer behind its upgrade, until it leaves or the servant ends, which is there once `servant` completes, or else refuses
-/// with a code (RFC 6455) and words; `read_ahead` was read from it already.
+/// Serves a viewer after its WebSocket upgrade until it disconnects or the servant ends. `servant` resolves to the
+/// servant, or to a close code (RFC 6455) and a reason. `read_ahead` holds bytes already read from the connection.
 pub async fn serve<S>(
     io: S,
     read_ahead: Bytes,
-    servant: impl Future<Output = Result<Servant, (u16, String)>>,
+    servant: impl Future<Output = Result<ViewedServant, (u16, String)>>,
     options: ViewerOptions,
 ) where
     S: AsyncRead + AsyncWrite + Send + Unpin,
 {
     let socket = WebSocket::new(io, &read_ahead, LARGEST, LARGEST);
-    let mut line = Line::new(socket.within(&options.budget, options.unfinished));
-    let Servant {
+    let mut line = ViewerSocket::new(socket.with_budget(&options.budget, options.unfinished));
+    let ViewedServant {
         bus,
         registry,
         mut ended,
@@ -109,7 +109,7 @@ pub async fn serve<S>(
     let mut graph = bus.graph();
     graph.mark_changed();
     let mut session = Session {
-        format: Format::of(bus.version()),
+        format: ViewerFormat::for_version(bus.version()),
         bus,
         registry,
         granted: options.granted,
@@ -126,88 +126,93 @@ pub async fn serve<S>(
         out,
         found,
     };
-    session.greet(&options.name);
+    session.send_server_info(&options.name);
     let end = loop {
-        session.told.drain(..).for_each(|frame| line.answer(frame));
-        // Who does not read is given nothing more; and asked nothing more, once that makes more answers.
-        let (is_read, is_given) = (line.is_read(), line.is_given());
+        session
+            .told
+            .drain(..)
+            .for_each(|frame| line.send_reply(frame));
+        // A viewer that does not read is sent no more messages; requests are read until their responses pile up.
+        let (is_read, is_given) = (line.should_read(), line.can_send());
         tokio::select! {
             read = line.next(is_read) => match read {
                 None => {}
-                Some(Read::Message(is_text, message)) => session.take(is_text, &message).await,
-                Some(Read::Left) => break End::Left,
-                Some(Read::Lost) => break End::Lost,
-                Some(Read::Refused(code, reason, readable)) => {
-                    break End::Close(code, reason, readable);
+                Some(ViewerInput::Message(is_text, message)) => session.handle_message(is_text, &message).await,
+                Some(ViewerInput::Left) => break ViewerSessionEnd::Left,
+                Some(ViewerInput::Lost) => break ViewerSessionEnd::Lost,
+                Some(ViewerInput::Refused(code, reason, readable)) => {
+                    break ViewerSessionEnd::Close(code, reason, readable);
                 }
             },
             Some(frame) = outgoing.recv(), if is_given => line.send(frame),
-            reason = end(&mut ended) => break End::Close(ENDED, reason, true),
+            reason = wait_for_end(&mut ended) => break ViewerSessionEnd::Close(ENDED, reason, true),
             changed = graph.changed() => {
                 if changed.is_err() {
-                    break End::Close(ENDED, "the servant has ended".to_owned(), true);
+                    break ViewerSessionEnd::Close(ENDED, "the servant has ended".to_owned(), true);
                 }
                 let now = Arc::clone(&graph.borrow_and_update());
-                session.look(&now);
+                session.update_catalogue(&now);
             }
-            Some(found) = types.recv() => session.add(found),
-            Some(ended) = session.tasks.join_next() => session.note(&ended),
-            () = session.granted.changed() => {
-                if let Some(reason) = session.granted.ended() {
-                    break End::Close(NOT_ALLOWED, reason, true);
+            Some(found) = types.recv() => session.advertise_resolved(found),
+            Some(ended) = session.tasks.join_next() => session.on_task_finished(&ended),
+            () = session.granted.wait_changed() => {
+                if let Some(reason) = session.granted.end_reason() {
+                    break ViewerSessionEnd::Close(NOT_ALLOWED, reason, true);
                 }
                 let now = Arc::clone(&graph.borrow_and_update());
-                session.withdraw();
-                session.look(&now);
+                session.drop_revoked();
+                session.update_catalogue(&now);
             }
         }
     };
-    // What it has sent is published, even if it has left by then.
+    // What it has sent is published, even if it has disconnected by then.
     session.subscriptions.clear();
     session.publishers.clear();
     let published = async {
         while session.publishing > 0
             && let Some(ended) = session.tasks.join_next().await
         {
-            session.note(&ended);
+            session.on_task_finished(&ended);
         }
     };
     let _ = timeout(CONNECTS, published).await;
     session.told.drain(..).for_each(|frame| line.send(frame));
     drop((session, held));
     match end {
-        End::Close(code, reason, readable) => line.close(code, &reason, readable).await,
-        // Who waits for the answer knows by it that all is published.
-        End::Left => line.answer_goodbye().await,
-        End::Lost => {}
+        ViewerSessionEnd::Close(code, reason, readable) => {
+            line.close(code, &reason, readable).await
+        }
+        // The answer to its close frame tells the viewer that everything is published.
+        ViewerSessionEnd::Left => line.reply_close().await,
+        ViewerSessionEnd::Lost => {}
     }
 }
 
-/// How a connection ends.
-enum End {
-    /// The viewer has said goodbye.
+/// End of a session.
+enum ViewerSessionEnd {
+    /// The viewer sent a close frame.
     Left,
-    /// It is gone.
+    /// The connection was lost.
     Lost,
-    /// With a code and a reason; whether the viewer's bytes can still be told apart.
+    /// Close with a code and a reason; the flag tells whether incoming frames can still be parsed.
     Close(u16, String, bool),
 }
 
-/// Returns once the servant has ended, why.
-async fn end(ended: &mut watch::Receiver<Option<String>>) -> String {
+/// Waits until the servant has ended and returns the reason.
+async fn wait_for_end(ended: &mut watch::Receiver<Option<String>>) -> String {
     let reason = ended.wait_for(Option::is_some).await;
     let reason = reason.ok().and_then(|reason| reason.clone());
     reason.unwrap_or_else(|| "the servant has ended".to_owned())
 }
 
-/// A type that was asked for.
-enum Found {
+/// A topic or service whose type was resolved.
+enum ResolvedType {
     Topic(String, Arc<WireType>),
     Service(String, Arc<ServiceDef>),
 }
 
-/// What a task of a session has done.
-enum Ended {
+/// A finished task of the session.
+enum FinishedTask {
     Call,
     Published,
     Other,
@@ -215,29 +220,29 @@ enum Ended {
 
 struct Session {
     bus: Arc<dyn Bus>,
-    /// How messages are written, and how their definitions are.
-    format: Format,
+    /// Encodings of messages and their definitions.
+    format: ViewerFormat,
     registry: Arc<Registry>,
-    granted: Granted,
+    granted: ClientGrants,
     catalogue: Catalogue,
-    subscriptions: HashMap<u32, Subscribed>,
-    publishers: HashMap<u32, Published>,
-    tasks: JoinSet<Ended>,
+    subscriptions: HashMap<u32, ViewerSubscription>,
+    publishers: HashMap<u32, ViewerPublication>,
+    tasks: JoinSet<FinishedTask>,
     calls: usize,
     publishing: usize,
-    /// The graph that it was shown last, where it wants to see it.
+    /// Connection graph last sent, if the viewer subscribed to it.
     shows_graph: Option<Arc<Graph>>,
     budget: Budget,
     depth: usize,
-    /// What it is to be told as soon as it can be.
-    told: Vec<Frame>,
-    /// What tasks tell.
-    out: mpsc::Sender<Frame>,
-    found: mpsc::Sender<Found>,
+    /// Replies to send as soon as possible.
+    told: Vec<ViewerFrame>,
+    /// Queue for the frames sent by tasks.
+    out: mpsc::Sender<ViewerFrame>,
+    found: mpsc::Sender<ResolvedType>,
 }
 
 impl Session {
-    fn greet(&mut self, name: &str) {
+    fn send_server_info(&mut self, name: &str) {
         let info = ServerInfo::new(name)
             .with_capabilities([
                 Capability::ClientPublish,
@@ -246,82 +251,83 @@ impl Session {
                 Capability::ConnectionGraph,
             ])
             .with_supported_encodings([self.format.encoding]);
-        self.tell(&info);
+        self.send_json(&info);
     }
 
-    fn tell(&mut self, message: &impl JsonMessage) {
-        self.told.push(Frame::Text(message.to_string().into()));
+    fn send_json(&mut self, message: &impl JsonMessage) {
+        self.told
+            .push(ViewerFrame::Text(message.to_string().into()));
     }
 
-    /// What is to be sent, which counts as the viewer's until it is.
-    fn counted(&self, bytes: impl Into<Bytes>) -> Result<Bytes, Exceeded> {
+    /// Charges outgoing bytes to the viewer's budget until they are sent.
+    fn charge(&self, bytes: impl Into<Bytes>) -> Result<Bytes, Exceeded> {
         let bytes = bytes.into();
-        Ok(self.budget.take(bytes.len())?.around(bytes))
+        Ok(self.budget.take(bytes.len())?.wrap_bytes(bytes))
     }
 
-    fn complain(&mut self, words: impl Into<String>) {
-        self.tell(&Status::error(words));
+    fn send_error(&mut self, words: impl Into<String>) {
+        self.send_json(&Status::error(words));
     }
 
-    /// Tells what has come and gone.
-    fn look(&mut self, graph: &Arc<Graph>) {
+    /// Advertises new topics and services and withdraws those that have disappeared.
+    fn update_catalogue(&mut self, graph: &Arc<Graph>) {
         let grants = self.granted.grants();
         let may = |topic: &str| grants.permits(Operation::Subscribe, topic);
-        let changes = self.catalogue.changes(graph, self.bus.node(), may);
+        let changes = self.catalogue.update(graph, self.bus.node(), may);
         if !changes.channels_gone.is_empty() {
             let gone = &changes.channels_gone;
             self.subscriptions
                 .retain(|_, one| !gone.contains(&one.channel));
-            self.tell(&Unadvertise::new(gone.iter().copied()));
+            self.send_json(&Unadvertise::new(gone.iter().copied()));
         }
         if !changes.services_gone.is_empty() {
-            self.tell(&UnadvertiseServices::new(changes.services_gone));
+            self.send_json(&UnadvertiseServices::new(changes.services_gone));
         }
         for (topic, named) in changes.topics {
             match self.registry.message(&named) {
                 Ok(message) => {
-                    let of = Arc::new(WireType::of(&message));
-                    self.add(Found::Topic(topic, of));
+                    let of = Arc::new(WireType::from_message(&message));
+                    self.advertise_resolved(ResolvedType::Topic(topic, of));
                 }
-                // What is not in the image is told by who publishes it.
-                Err(_) => self.ask_topic(topic),
+                // The publisher tells the definitions of types that are not in the image.
+                Err(_) => self.resolve_topic_type(topic),
             }
         }
         for service in changes.services {
-            self.ask_service(service);
+            self.resolve_service_type(service);
         }
-        self.show_graph(graph);
+        self.send_graph_update(graph);
     }
 
-    fn ask_topic(&mut self, topic: String) {
+    fn resolve_topic_type(&mut self, topic: String) {
         let (bus, found) = (Arc::clone(&self.bus), self.found.clone());
         self.tasks.spawn(async move {
             if let Ok(of) = bus.topic_type(&topic).await
                 && !of.definition.is_empty()
             {
-                let _ = found.send(Found::Topic(topic, Arc::new(of))).await;
+                let _ = found.send(ResolvedType::Topic(topic, Arc::new(of))).await;
             }
-            Ended::Other
+            FinishedTask::Other
         });
     }
 
-    fn ask_service(&mut self, service: String) {
+    fn resolve_service_type(&mut self, service: String) {
         let (bus, found) = (Arc::clone(&self.bus), self.found.clone());
         let registry = Arc::clone(&self.registry);
         self.tasks.spawn(async move {
             if let Ok(of) = bus.service_type(&service).await
                 && let Ok(of) = registry.service(&of.name)
             {
-                let _ = found.send(Found::Service(service, of)).await;
+                let _ = found.send(ResolvedType::Service(service, of)).await;
             }
-            Ended::Other
+            FinishedTask::Other
         });
     }
 
-    /// Tells of a topic or service whose type is known now.
-    fn add(&mut self, found: Found) {
+    /// Advertises a topic or service whose type was resolved.
+    fn advertise_resolved(&mut self, found: ResolvedType) {
         match found {
-            Found::Topic(topic, of) => {
+            ResolvedType::Topic(topic, of) => {
                 let Some(id) = self.catalogue.add_topic(&topic, Arc::clone(&of)) else {
                     return;
                 };
@@ -329,10 +335,10 @@ impl Session {
                 let schema = Schema::new(&of.name, kind, of.definition.as_bytes());
                 let channel = Channel::builder(id, &topic, encoding).with_schema(schema);
                 if let Ok(channel) = channel.build() {
-                    self.tell(&Advertise::new([channel]));
+                    self.send_json(&Advertise::new([channel]));
                 }
             }
-            Found::Service(service, of) => {
+            ResolvedType::Service(service, of) => {
                 let Some(id) = self.catalogue.add_service(&service, Arc::clone(&of)) else {
                     return;
                 };
@@ -347,22 +353,22 @@ impl Session {
                         told.with_response(encoding, schema(response.name(), response.full_text()))
                     });
                 if let Ok(told) = told {
-                    self.tell(&AdvertiseServices::new([told]));
+                    self.send_json(&AdvertiseServices::new([told]));
                 }
             }
         }
     }
 
-    fn note(&mut self, ended: &Result<Ended, JoinError>) {
+    fn on_task_finished(&mut self, ended: &Result<FinishedTask, JoinError>) {
         match ended {
-            Ok(Ended::Call) => self.calls -= 1,
-            Ok(Ended::Published) => self.publishing -= 1,
+            Ok(FinishedTask::Call) => self.calls -= 1,
+            Ok(FinishedTask::Published) => self.publishing -= 1,
             _ => {}
         }
     }
 
-    /// Ends what is not granted any more.
-    fn withdraw(&mut self) {
+    /// Ends subscriptions and publications whose permission was revoked.
+    fn drop_revoked(&mut self) {
         let grants = self.granted.grants();
         let may = |operation, name: &str| grants.permits(operation, name);
         self.subscriptions
@@ -371,19 +377,19 @@ impl Session {
             .retain(|_, one| may(Operation::Publish, &one.topic));
     }
 
-    async fn take(&mut self, is_text: bool, message: &[u8]) {
+    async fn handle_message(&mut self, is_text: bool, message: &[u8]) {
         if is_text && message.len() > LARGEST_TEXT {
-            return self.complain(format!(
-                "this message has {} bytes of JSON, and {LARGEST_TEXT} are read at most",
+            return self.send_error(format!(
+                "this message has {} bytes of JSON, but at most {LARGEST_TEXT} are allowed",
                 message.len()
             ));
         }
         let mut held = self.budget.permit();
         if is_text {
-            // Values of parameters are read by what serde derives for a type of the protocol's crate.
-            let weight = JsonWeight::of(message).bytes_if_copied();
+            // Parameter values are parsed by the serde derive of the protocol crate's type.
+            let weight = JsonWeight::estimate(message).bytes_if_copied();
             if let Err(full) = held.count(weight) {
-                return self.complain(format!("this message is not read: {full}"));
+                return self.send_error(format!("this message is not read: {full}"));
             }
         }
         let message = if is_text {
@@ -395,7 +401,7 @@ impl Session {
         };
         let message = match message {
             Ok(message) => message,
-            Err(error) => return self.complain(format!("this is no message: {error}")),
+            Err(error) => return self.send_error(format!("not a valid message: {error}")),
         };
         match message {
             ClientMessage::Subscribe(wanted) => {
@@ -423,58 +429,58 @@ impl Session {
             }
             ClientMessage::ServiceCallRequest(call) => self.call(call).await,
             ClientMessage::GetParameters(wanted) => {
-                // As it is for clients of rosbridge.
+                // The same permission as for rosbridge clients.
                 if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/get_param") {
-                    return self.complain(refused);
+                    return self.send_error(refused);
                 }
-                self.tell_parameters(wanted.parameter_names, wanted.id)
+                self.send_parameters(wanted.parameter_names, wanted.id)
                     .await;
             }
             ClientMessage::SetParameters(wanted) => self.set_parameters(wanted).await,
             ClientMessage::SubscribeConnectionGraph => {
                 self.shows_graph = Some(Arc::default());
                 let now = Arc::clone(&self.bus.graph().borrow());
-                self.show_graph(&now);
+                self.send_graph_update(&now);
             }
             ClientMessage::UnsubscribeConnectionGraph => self.shows_graph = None,
             _ => {
-                let words = "this server does not do that: see its capabilities";
-                self.complain(words);
+                let words = "this server does not support that: see its capabilities";
+                self.send_error(words);
             }
         }
     }
 
-    /// All of them where none is named.
-    async fn tell_parameters(&mut self, names: Vec<String>, id: Option<String>) {
-        match parameters::all(&*self.bus, names).await {
+    /// Sends the named parameters, or all if none is named.
+    async fn send_parameters(&mut self, names: Vec<String>, id: Option<String>) {
+        match parameters::get_parameters(&*self.bus, names).await {
             Ok(values) => {
                 let told = ParameterValues::new(values);
                 let told = match id {
                     Some(id) => told.with_id(id),
                     None => told,
                 };
-                match self.counted(told.to_string()) {
-                    Ok(told) => self.told.push(Frame::Text(told)),
-                    Err(full) => self.complain(format!("parameters: {full}")),
+                match self.charge(told.to_string()) {
+                    Ok(told) => self.told.push(ViewerFrame::Text(told)),
+                    Err(full) => self.send_error(format!("parameters: {full}")),
                 }
             }
-            Err(error) => self.complain(format!("parameters cannot be read: {error}")),
+            Err(error) => self.send_error(format!("parameters cannot be read: {error}")),
         }
     }
 
     async fn set_parameters(&mut self, wanted: client::SetParameters) {
         if let Err(refused) = self.granted.check(Operation::Call, "/rosapi/set_param") {
-            return self.complain(refused);
+            return self.send_error(refused);
         }
         let mut names = Vec::new();
         for one in wanted.parameters {
-            if let Err(error) = parameters::set(&*self.bus, &one.name, one.value).await {
-                self.complain(format!("{} cannot be set: {error}", one.name));
+            if let Err(error) = parameters::set_parameter(&*self.bus, &one.name, one.value).await {
+                self.send_error(format!("{} cannot be set: {error}", one.name));
             }
             names.push(one.name);
         }
         if wanted.id.is_some() && !names.is_empty() {
-            self.tell_parameters(names, wanted.id).await;
+            self.send_parameters(names, wanted.id).await;
         }
     }
 }

@@ -1,13 +1,16 @@
-//! A viewer of a servant of ROS 2.
+//! Tests with a viewer of a ROS 2 servant.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use bridge::Granted;
+use bridge::ClientGrants;
 use budget::Budget;
 use bytes::Bytes;
-use ros::bus::{Bus, ParamValue, Qos, RosVersion, ServiceHandler, ServiceType, WireType, reaches};
+use ros::bus::{
+    Bus, ParamValue, QosProfile, RosVersion, ServiceHandler, ServiceType, WireType,
+    wait_for_connected,
+};
 use ros::schema::Registry;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
@@ -16,17 +19,17 @@ use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
 use crate::memory_bus::MemorySystem;
-use crate::{Servant, ViewerOptions, serve};
+use crate::{ViewedServant, ViewerOptions, serve};
 
-/// Only bounds how long a failing test takes.
+/// Only limits how long a failing test takes.
 const LONG: Duration = Duration::from_secs(30);
 
-/// The other end of a WebSocket, without its upgrade.
+/// Client end of a WebSocket, without the upgrade.
 struct Viewer(DuplexStream);
 
 impl Viewer {
-    /// A frame of less than 64 KiB, with a mask of nothing.
-    async fn sends(&mut self, opcode: u8, payload: &[u8]) {
+    /// Sends a frame of less than 64 KiB with a zero mask.
+    async fn send(&mut self, opcode: u8, payload: &[u8]) {
         let length = u16::try_from(payload.len()).expect("a short frame");
         let length = length.to_be_bytes();
         let head = [0x80 | opcode, 0x80 | 126, length[0], length[1], 0, 0, 0, 0];
@@ -34,7 +37,7 @@ impl Viewer {
         self.0.write_all(&frame).await.expect("taken");
     }
 
-    async fn frame(&mut self) -> (u8, Vec<u8>) {
+    async fn next_frame(&mut self) -> (u8, Vec<u8>) {
         let opcode = self.0.read_u8().await.expect("a frame") & 0x0f;
         let length = match self.0.read_u8().await.expect("a length") {
             126 => usize::from(self.0.read_u16().await.expect("a length")),
@@ -46,11 +49,11 @@ impl Viewer {
         (opcode, payload)
     }
 
-    /// The next text with this operation.
-    async fn told(&mut self, op: &str) -> Value {
+    /// Returns the next text message with this operation.
+    async fn next_text(&mut self, op: &str) -> Value {
         let told = async {
             loop {
-                let (opcode, payload) = self.frame().await;
+                let (opcode, payload) = self.next_frame().await;
                 if opcode != 1 {
                     continue;
                 }
@@ -65,8 +68,8 @@ impl Viewer {
     }
 }
 
-/// A viewer of the system, with this budget, and what serves it.
-fn looks(
+/// Connects a viewer to the system with this budget; also returns the task that serves it.
+fn open_viewer(
     system: &Arc<MemorySystem>,
     registry: Arc<Registry>,
     budget: &Budget,
@@ -74,7 +77,7 @@ fn looks(
     let (ours, theirs) = tokio::io::duplex(1 << 16);
     let bus: Arc<dyn Bus> = system.join("/cloudroid_inside");
     let (ends, ended) = watch::channel(None);
-    let servant = Servant {
+    let servant = ViewedServant {
         bus,
         registry,
         ended,
@@ -82,7 +85,7 @@ fn looks(
     };
     let options = ViewerOptions {
         name: "lab".to_owned(),
-        granted: Granted::always(access::Grants::everything()),
+        granted: ClientGrants::fixed(access::Grants::everything()),
         budget: budget.clone(),
         unfinished: LONG,
         depth: 2,
@@ -91,7 +94,7 @@ fn looks(
     (Viewer(theirs), tokio::spawn(serving))
 }
 
-/// Answers with a picture of a megabyte.
+/// Service handler that responds with an image of one megabyte.
 struct Pictures;
 
 #[async_trait]
@@ -107,37 +110,37 @@ impl ServiceHandler for Pictures {
 async fn answers_to_calls_count_as_the_viewers() {
     let definitions = [("lab/srv/Shoot", "---\nuint8[] data\n")];
     let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
-    let registry = Registry::of_definitions(RosVersion::Two, &definitions.into()).expect("valid");
+    let registry = Registry::with_definitions(RosVersion::Two, &definitions.into()).expect("valid");
     let registry = Arc::new(registry);
-    let of = ServiceType::of(&registry.service("lab/Shoot").expect("defined"));
+    let of = ServiceType::from_service(&registry.service("lab/Shoot").expect("defined"));
     let system = Arc::new(MemorySystem::default());
     let node = system.join("/see");
     let serving = node.serve("/shoot", of, Arc::new(Pictures));
     let _serving = serving.await.expect("served");
     for (limit, is_answered) in [(4 << 20, true), (1 << 20, false)] {
         let budget = Budget::new("viewer x", limit);
-        let (mut viewer, serving) = looks(&system, Arc::clone(&registry), &budget);
-        let told = viewer.told("advertiseServices").await;
+        let (mut viewer, serving) = open_viewer(&system, Arc::clone(&registry), &budget);
+        let told = viewer.next_text("advertiseServices").await;
         let id = told["services"][0]["id"].as_u64().expect("a number") as u32;
         let mut call = vec![2];
         for number in [id, 9, 3] {
             call.extend_from_slice(&number.to_le_bytes());
         }
         call.extend_from_slice(b"cdr\0\x01\0\0\0");
-        viewer.sends(2, &call).await;
+        viewer.send(2, &call).await;
         if is_answered {
-            let (opcode, answer) = timeout(LONG, viewer.frame()).await.expect("an answer");
+            let (opcode, answer) = timeout(LONG, viewer.next_frame()).await.expect("an answer");
             assert_eq!((opcode, answer[0]), (2, 3));
             assert!(answer.len() > 1 << 20);
         } else {
-            let failure = viewer.told("serviceCallFailure").await;
+            let failure = viewer.next_text("serviceCallFailure").await;
             let words = failure["message"].as_str().expect("a text");
             assert!(words.contains("the memory for viewer x"), "{words}");
         }
-        assert!(budget.refused() == u64::from(!is_answered));
+        assert!(budget.refusal_count() == u64::from(!is_answered));
         drop(viewer);
         serving.await.expect("it ends");
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 }
 
@@ -145,8 +148,8 @@ async fn answers_to_calls_count_as_the_viewers() {
 async fn what_would_take_too_much_is_not_read() {
     let system = Arc::new(MemorySystem::default());
     let budget = Budget::new("viewer x", 16 << 20);
-    let (mut viewer, _serving) = looks(&system, Arc::default(), &budget);
-    // The crate that reads it would copy all the ones for each of the lists around them.
+    let (mut viewer, _serving) = open_viewer(&system, Arc::default(), &budget);
+    // Deserializing this would copy all the ones once for each enclosing list.
     let value = format!(
         "{}{}1{}",
         "[".repeat(100),
@@ -155,8 +158,8 @@ async fn what_would_take_too_much_is_not_read() {
     );
     let set =
         format!(r#"{{"op":"setParameters","parameters":[{{"name":"/see.a","value":{value}}}]}}"#);
-    viewer.sends(1, set.as_bytes()).await;
-    let status = viewer.told("status").await;
+    viewer.send(1, set.as_bytes()).await;
+    let status = viewer.next_text("status").await;
     let words = status["message"].as_str().expect("a text");
     assert!(words.contains("this message is not read"), "{words}");
     assert!(words.contains("the memory for viewer x"), "{words}");
@@ -169,23 +172,23 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
         ("lab/msg/Where", "float64 x\n"),
     ];
     let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
-    let registry = Registry::of_definitions(RosVersion::Two, &definitions.into()).expect("valid");
+    let registry = Registry::with_definitions(RosVersion::Two, &definitions.into()).expect("valid");
     let registry = Arc::new(registry);
-    let of = WireType::of(&registry.message("lab/msg/Seen").expect("defined"));
+    let of = WireType::from_message(&registry.message("lab/msg/Seen").expect("defined"));
     let system = Arc::new(MemorySystem::default());
     let node = system.join("/see");
     let seen = node
-        .advertise("/seen", of, Qos::keep_last(1))
+        .advertise("/seen", of, QosProfile::keep_last(1))
         .await
         .expect("advertised");
     let parameters = node.node_parameters().expect("offered");
     let rate = vec![("camera.rate".to_owned(), Some(ParamValue::Double(2.5)))];
     parameters.set("/see", rate).await.expect("set");
 
-    let (mut viewer, serving) = looks(&system, registry, &Budget::unlimited());
-    let info = viewer.told("serverInfo").await;
+    let (mut viewer, serving) = open_viewer(&system, registry, &Budget::without_limit());
+    let info = viewer.next_text("serverInfo").await;
     assert_eq!(info["supportedEncodings"], json!(["cdr"]));
-    let told = viewer.told("advertise").await;
+    let told = viewer.next_text("advertise").await;
     let channel = &told["channels"][0];
     assert_eq!(channel["topic"], "/seen");
     assert_eq!(channel["encoding"], "cdr");
@@ -197,20 +200,20 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
 
     let id = channel["id"].clone();
     let wanted = json!({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": id}]});
-    viewer.sends(1, wanted.to_string().as_bytes()).await;
-    timeout(LONG, reaches(seen.matched(), 1))
+    viewer.send(1, wanted.to_string().as_bytes()).await;
+    timeout(LONG, wait_for_connected(seen.matched_subscribers(), 1))
         .await
         .expect("it subscribes");
     let message = [0, 1, 0, 0, 0, 0, 0, 0];
     seen.publish(Bytes::copy_from_slice(&message));
-    let (opcode, frame) = timeout(LONG, viewer.frame()).await.expect("a message");
-    // The operation, the subscription, the time, and the message as it is.
+    let (opcode, frame) = timeout(LONG, viewer.next_frame()).await.expect("a message");
+    // Opcode, subscription id, time, then the unchanged message.
     assert_eq!((opcode, frame[0], &frame[1..5]), (2, 1, &[7, 0, 0, 0][..]));
     assert_eq!(&frame[13..], &message);
 
     let wanted = json!({"op": "getParameters", "parameterNames": [], "id": "x"});
-    viewer.sends(1, wanted.to_string().as_bytes()).await;
-    let told = viewer.told("parameterValues").await;
+    viewer.send(1, wanted.to_string().as_bytes()).await;
+    let told = viewer.next_text("parameterValues").await;
     let rate = &told["parameters"][0];
     assert_eq!(
         (&rate["name"], &rate["value"]),
@@ -219,8 +222,8 @@ async fn messages_of_ros_2_are_told_as_cdr_with_their_definitions() {
     let wanted = json!({
         "op": "setParameters", "id": "y", "parameters": [{"name": "/see.camera.rate", "value": 4}],
     });
-    viewer.sends(1, wanted.to_string().as_bytes()).await;
-    let told = viewer.told("parameterValues").await;
+    viewer.send(1, wanted.to_string().as_bytes()).await;
+    let told = viewer.next_text("parameterValues").await;
     assert_eq!(told["parameters"][0]["value"], json!(4.0), "{told}");
     drop(viewer);
     serving.await.expect("it ends");

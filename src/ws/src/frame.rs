@@ -2,37 +2,37 @@
 
 use super::WsError;
 
-/// Goes on where the last frame ended.
+/// Opcode of a frame that continues the message of the previous one.
 pub const CONTINUATION: u8 = 0;
-/// UTF-8.
+/// Opcode of a text message (UTF-8).
 pub const TEXT: u8 = 1;
-/// Bytes.
+/// Opcode of a binary message.
 pub const BINARY: u8 = 2;
-/// The end, with code and reason.
+/// Opcode of a close frame, which carries a code and a reason.
 pub const CLOSE: u8 = 8;
-/// Wants a pong.
+/// Opcode of a ping.
 pub const PING: u8 = 9;
-/// Answers a ping.
+/// Opcode of a pong, the answer to a ping.
 pub const PONG: u8 = 10;
 
-/// Longest payload of a control frame.
+/// Largest payload of a control frame, in bytes.
 pub const MAX_CONTROL: usize = 125;
 
-/// What precedes a frame's payload.
+/// Header of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header {
-    /// The message ends with this frame.
+    /// Set on the last frame of a message.
     pub last: bool,
     /// The opcode (RFC 6455, 5.2).
     pub opcode: u8,
-    /// From clients only.
+    /// Mask of the payload. Clients mask their frames, servers do not.
     pub mask: Option<[u8; 4]>,
-    /// Bytes of payload.
+    /// Length of the payload in bytes.
     pub length: u64,
 }
 
 impl Header {
-    /// Reads a header from the beginning of `bytes` and says how long it is; `None` while it is not all there.
+    /// Parses a header at the beginning of `bytes` and returns it with its own length; `None` while it is incomplete.
     pub fn parse(bytes: &[u8]) -> Result<Option<(Header, usize)>, WsError> {
         let [first, second, rest @ ..] = bytes else {
             return Ok(None);
@@ -88,7 +88,7 @@ impl Header {
         )))
     }
 
-    /// Appends the header of a whole frame, with the mask if it has one.
+    /// Appends the header of an unfragmented frame, with its mask if there is one.
     pub fn write(out: &mut bytes::BytesMut, opcode: u8, length: usize, mask: Option<[u8; 4]>) {
         let masked = if mask.is_some() { 0x80 } else { 0 };
         out.extend_from_slice(&[0x80 | opcode]);
@@ -107,9 +107,9 @@ impl Header {
     }
 }
 
-/// Takes a client's mask off (or puts one on).
+/// Removes a client's mask from a payload, or applies it.
 pub fn unmask(payload: &mut [u8], mask: [u8; 4]) {
-    // Long enough for the widest vector registers; the compiler makes one instruction of each.
+    // As long as the widest vector registers: the compiler emits one instruction for each block.
     let wide: [u8; 64] = std::array::from_fn(|at| mask[at % 4]);
     let mut blocks = payload.chunks_exact_mut(64);
     for block in &mut blocks {

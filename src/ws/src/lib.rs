@@ -1,12 +1,12 @@
-//! Either end of a WebSocket (RFC 6455) behind its upgrade.
+//! Either end of a WebSocket (RFC 6455) after its upgrade.
 //!
-//! Written for the portal because the data path must not copy a big message once more: payloads go to the socket
-//! from where they were encoded (one vectored write for header and payload), and come from it in a buffer of their
-//! own that the ROS message is cut from. Reading and writing are polled separately, so one task can do both. A robot's
-//! link is the client's end of the same.
+//! Written for the portal because the data path must not copy a large message once more: payloads go to the socket from
+//! the buffer they were encoded into (one vectored write for header and payload), and are received into a buffer of
+//! their own that the ROS message is sliced from. Reading and writing are polled separately, so one task can do both. A
+//! robot's link uses the client's end.
 //!
-//! What the peer has begun to send counts in a [`Budget`] of whoever it is: a message that does not fit ends the connection
-//! with close code 1013, one that is not complete in time with 1008.
+//! A message that is being received counts against the [`Budget`] of its sender: a message that does not fit ends the
+//! connection with close code 1013, one that is not complete in time with 1008.
 
 #![forbid(unsafe_code)]
 
@@ -29,37 +29,37 @@ use frame::Header;
 
 /// Payloads up to this size are copied behind their headers, so that many go into one write.
 const COPIED: usize = 8 * 1024;
-/// Least room for a read.
+/// Smallest free space in the buffer for a read, in bytes.
 const READ_SIZE: usize = 32 * 1024;
-/// Room made for a payload before any of it has come; more is added as it comes.
+/// Space reserved for a payload before any of it has arrived; more is added as it arrives.
 const READ_AHEAD: usize = 4 << 20;
-/// Slices in one write.
+/// Largest number of slices in one vectored write.
 const MAX_SLICES: usize = 16;
 
-/// What the peer sent.
+/// A message from the peer.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Message {
-    /// Not yet checked to be UTF-8.
+pub enum WsMessage {
+    /// A text message, not yet checked to be UTF-8.
     Text(Bytes),
-    /// A whole message.
+    /// A binary message.
     Binary(Bytes),
-    /// To be answered by a pong with the same payload.
+    /// A ping, to be answered by a pong with the same payload.
     Ping(Bytes),
     /// The answer to a ping.
     Pong(Bytes),
-    /// Code (1005 where there is none) and reason.
+    /// A close frame: code (1005 if it has none) and reason.
     Close(u16, String),
 }
 
-/// Why a connection cannot go on.
+/// Reason why a connection cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum WsError {
-    /// The peer breaks the protocol or a limit; the code says which.
+    /// The peer violates the protocol or a limit.
     #[error("{reason}")]
     Refused {
-        /// The close code to send.
+        /// Close code to send.
         code: u16,
-        /// What is wrong.
+        /// Description of the violation.
         reason: String,
     },
     /// The socket failed.
@@ -71,7 +71,7 @@ pub enum WsError {
 }
 
 impl WsError {
-    /// The peer breaks the protocol (1002).
+    /// Creates the error for a protocol violation (1002).
     pub fn protocol(reason: &str) -> Self {
         WsError::Refused {
             code: 1002,
@@ -87,38 +87,38 @@ impl WsError {
     }
 }
 
-/// What unfinished messages may take, besides their length.
-struct Unfinished {
-    /// For the message that is being received, until the next one is asked for.
+/// Limits of the message that is being received, besides its length: memory and time.
+struct ReceiveBudget {
+    /// Memory of the message that is being received, held until the next one is polled for.
     permit: Permit,
     patience: Duration,
-    /// When the message that is being received must be complete.
+    /// Time by which the message that is being received must be complete.
     deadline: Option<Instant>,
     timer: Option<Pin<Box<Sleep>>>,
 }
 
-/// A connection.
+/// A WebSocket connection, of the server or the client.
 pub struct WebSocket<S> {
     io: S,
-    /// A client masks what it sends, with bits from here; a server takes nothing that is not masked.
-    masks: Option<Masks>,
+    /// Generator of the masks of a client's frames; a server has none and accepts masked frames only.
+    masks: Option<MaskGenerator>,
     max_frame: usize,
     max_message: usize,
     read: BytesMut,
     header: Option<Header>,
-    /// Opcode and beginning of a message that comes in several frames.
+    /// Opcode and beginning of a fragmented message.
     partial: Option<(u8, BytesMut)>,
-    /// What was queued, in order; `tail` is the last of it, still growing.
+    /// Queued bytes in the order of sending; `tail` is the last chunk, which still grows.
     write: VecDeque<Bytes>,
     tail: BytesMut,
     queued: usize,
     received: u64,
-    unfinished: Option<Unfinished>,
+    unfinished: Option<ReceiveBudget>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
-    /// The server's end. `read_ahead` came from the client behind its handshake; longer frames and messages than
-    /// these (bytes) end the connection.
+    /// Creates the server's end. `read_ahead` are the bytes that the client sent behind its handshake; frames and
+    /// messages longer than `max_frame` and `max_message` (bytes) end the connection.
     pub fn new(io: S, read_ahead: &[u8], max_frame: usize, max_message: usize) -> Self {
         Self {
             io,
@@ -136,10 +136,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
-    /// Has what is received count in `budget`, from a message's first byte until the next message is asked for; and gives
-    /// each message so much time from its first byte to its last.
-    pub fn within(mut self, budget: &Budget, patience: Duration) -> Self {
-        self.unfinished = Some(Unfinished {
+    /// Counts received data against `budget`, from the first byte of a message until the next message is polled for,
+    /// and limits the time from a message's first byte to its last to `patience`.
+    pub fn with_budget(mut self, budget: &Budget, patience: Duration) -> Self {
+        self.unfinished = Some(ReceiveBudget {
             permit: budget.permit(),
             patience,
             deadline: None,
@@ -148,7 +148,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         self
     }
 
-    /// The client's end; `seed` is what its masks are made from, a random number.
+    /// Creates the client's end; `seed` is a random number for its masks.
     pub fn client(
         io: S,
         read_ahead: &[u8],
@@ -157,21 +157,21 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         seed: u64,
     ) -> Self {
         Self {
-            masks: Some(Masks(seed | 1)),
+            masks: Some(MaskGenerator(seed | 1)),
             ..Self::new(io, read_ahead, max_frame, max_message)
         }
     }
 
-    /// The stream below.
+    /// Returns the underlying stream.
     pub fn get_ref(&self) -> &S {
         &self.io
     }
 
-    /// The next message; after an error there is none.
-    pub fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<Message, WsError>> {
+    /// Polls for the next message. Must not be called again after an error.
+    pub fn poll_next(&mut self, cx: &mut Context<'_>) -> Poll<Result<WsMessage, WsError>> {
         if self.partial.is_none() && self.header.is_none() {
-            // The last message has been taken, or none was begun.
-            self.unfinished.iter_mut().for_each(Unfinished::over);
+            // The previous message has been handled, or this is the first one.
+            self.unfinished.iter_mut().for_each(ReceiveBudget::reset);
         }
         loop {
             if self.header.is_none() {
@@ -189,8 +189,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             self.make_room()?;
             let Poll::Ready(read) = poll_read_buf(Pin::new(&mut self.io), cx, &mut self.read)
             else {
-                ready!(self.poll_late(cx));
-                return Poll::Ready(Err(self.late()));
+                ready!(self.poll_deadline(cx));
+                return Poll::Ready(Err(self.deadline_error()));
             };
             let read = read?;
             if read == 0 {
@@ -200,8 +200,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
-    /// Bytes received so far, those of an unfinished message included; not those that were read ahead.
-    pub fn received(&self) -> u64 {
+    /// Returns the number of bytes received so far, including those of an unfinished message and excluding
+    /// `read_ahead`.
+    pub fn bytes_received(&self) -> u64 {
         self.received
     }
 
@@ -223,8 +224,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Ok(Some(header))
     }
 
-    /// Ready when the message that was begun should have been complete.
-    fn poll_late(&mut self, cx: &mut Context<'_>) -> Poll<()> {
+    /// Ready when the deadline of the message that is being received has passed.
+    fn poll_deadline(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         let begun = self.header.is_some() || self.partial.is_some() || !self.read.is_empty();
         let Some(unfinished) = self.unfinished.as_mut().filter(|_| begun) else {
             return Poll::Pending;
@@ -235,7 +236,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         let timer = unfinished
             .timer
             .get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
-        // One timer for all messages: where it was set for an earlier one it is put off when it fires.
+        // One timer serves all messages: if it was set for an earlier one, it is reset when it fires.
         loop {
             ready!(timer.as_mut().poll(cx));
             if Instant::now() >= deadline {
@@ -245,7 +246,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
-    fn late(&self) -> WsError {
+    fn deadline_error(&self) -> WsError {
         let patience = self
             .unfinished
             .as_ref()
@@ -287,14 +288,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         &mut self,
         header: Header,
         mut payload: BytesMut,
-    ) -> Result<Option<Message>, WsError> {
+    ) -> Result<Option<WsMessage>, WsError> {
         if let Some(mask) = header.mask {
             frame::unmask(&mut payload, mask);
         }
         match header.opcode {
-            frame::PING => return Ok(Some(Message::Ping(payload.freeze()))),
-            frame::PONG => return Ok(Some(Message::Pong(payload.freeze()))),
-            frame::CLOSE => return close_message(&payload).map(Some),
+            frame::PING => return Ok(Some(WsMessage::Ping(payload.freeze()))),
+            frame::PONG => return Ok(Some(WsMessage::Pong(payload.freeze()))),
+            frame::CLOSE => return parse_close(&payload).map(Some),
             _ => {}
         }
         let (opcode, whole) = match (self.partial.take(), header.opcode) {
@@ -331,14 +332,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
         let whole = whole.freeze();
         Ok(Some(if opcode == frame::TEXT {
-            Message::Text(whole)
+            WsMessage::Text(whole)
         } else {
-            Message::Binary(whole)
+            WsMessage::Binary(whole)
         }))
     }
 
-    /// Bytes queued and not yet taken by the socket.
-    pub fn queued(&self) -> usize {
+    /// Returns the number of bytes that are queued and not yet written to the socket.
+    pub fn bytes_queued(&self) -> usize {
         self.queued
     }
 
@@ -346,9 +347,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     pub fn queue(&mut self, opcode: u8, payload: Bytes) {
         let before = self.tail.len();
         if let Some(masks) = &mut self.masks {
-            let mask = masks.next();
+            let mask = masks.next_mask();
             Header::write(&mut self.tail, opcode, payload.len(), Some(mask));
-            // The mask makes a copy of any payload.
+            // Masking copies the payload in any case.
             let start = self.tail.len();
             self.tail.extend_from_slice(&payload);
             frame::unmask(&mut self.tail[start..], mask);
@@ -365,7 +366,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         }
     }
 
-    /// Queues a close frame; the reason is cut to what fits.
+    /// Queues a close frame; the reason is truncated to what fits.
     pub fn queue_close(&mut self, code: u16, reason: &str) {
         let mut end = reason.len().min(frame::MAX_CONTROL - 2);
         while !reason.is_char_boundary(end) {
@@ -380,7 +381,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         self.queue(frame::CLOSE, payload.freeze());
     }
 
-    /// Ready when all that was queued is in the socket.
+    /// Ready when all queued frames have been written to the socket.
     pub fn poll_flush(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         if !self.tail.is_empty() {
             self.write.push_back(self.tail.split().freeze());
@@ -410,14 +411,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Pin::new(&mut self.io).poll_flush(cx)
     }
 
-    /// Sends what is queued (a close frame last), and waits for the client's; where its bytes cannot be told apart
-    /// any more, for the end of the connection. Without that the client might see a reset instead of the reason.
-    pub async fn leave(&mut self, readable: bool) -> Result<(), WsError> {
+    /// Sends the queued frames (a close frame last) and waits for the peer's close frame; if the incoming bytes can no
+    /// longer be parsed (`readable` is false), waits for the end of the connection. Without this the client might see a
+    /// reset instead of the reason.
+    pub async fn shutdown(&mut self, readable: bool) -> Result<(), WsError> {
         poll_fn(|cx| self.poll_flush(cx)).await?;
         if readable {
             loop {
                 match poll_fn(|cx| self.poll_next(cx)).await {
-                    Ok(Message::Close(..)) | Err(WsError::Eof) => return Ok(()),
+                    Ok(WsMessage::Close(..)) | Err(WsError::Eof) => return Ok(()),
                     Ok(_) => {}
                     Err(error) => return Err(error),
                 }
@@ -434,20 +436,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 }
 
-impl Unfinished {
-    /// Nothing is unfinished now.
-    fn over(&mut self) {
+impl ReceiveBudget {
+    /// Releases the memory and the deadline after a message.
+    fn reset(&mut self) {
         let _ = self.permit.resize(0);
         self.deadline = None;
     }
 }
 
-/// Masks of a client's frames. They keep a script in a browser from choosing the bytes on the wire; a program that
-/// chooses its own bytes anyway needs them to be valid, not secret (xorshift64).
-struct Masks(u64);
+/// Generator of the masks of a client's frames (xorshift64). Masks keep a script in a browser from choosing the bytes
+/// on the wire; a program that chooses its own bytes anyway needs them to be valid, not secret.
+struct MaskGenerator(u64);
 
-impl Masks {
-    fn next(&mut self) -> [u8; 4] {
+impl MaskGenerator {
+    fn next_mask(&mut self) -> [u8; 4] {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;
         self.0 ^= self.0 << 17;
@@ -456,13 +458,13 @@ impl Masks {
     }
 }
 
-fn close_message(payload: &[u8]) -> Result<Message, WsError> {
+fn parse_close(payload: &[u8]) -> Result<WsMessage, WsError> {
     match payload {
-        [] => Ok(Message::Close(1005, String::new())),
+        [] => Ok(WsMessage::Close(1005, String::new())),
         [high, low, reason @ ..] => {
             let code = u16::from_be_bytes([*high, *low]);
             match std::str::from_utf8(reason) {
-                Ok(reason) if is_sendable(code) => Ok(Message::Close(code, reason.to_owned())),
+                Ok(reason) if is_sendable(code) => Ok(WsMessage::Close(code, reason.to_owned())),
                 _ => Err(WsError::protocol(
                     "a close frame has no valid code and reason",
                 )),
@@ -472,7 +474,7 @@ fn close_message(payload: &[u8]) -> Result<Message, WsError> {
     }
 }
 
-/// Codes that may stand in a close frame (RFC 6455, section 7.4).
+/// Returns whether a code may be sent in a close frame (RFC 6455, section 7.4).
 fn is_sendable(code: u16) -> bool {
     matches!(code, 1000..=1003 | 1007..=1014 | 3000..=4999)
 }

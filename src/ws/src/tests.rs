@@ -7,7 +7,7 @@ use super::*;
 
 const LIMIT: usize = 1 << 20;
 
-/// Our end and one of tungstenite's.
+/// Returns our end and one of tungstenite's.
 async fn pair() -> (
     WebSocket<tokio::io::DuplexStream>,
     WebSocketStream<tokio::io::DuplexStream>,
@@ -17,7 +17,7 @@ async fn pair() -> (
     (WebSocket::new(ours, b"", LIMIT, LIMIT), theirs)
 }
 
-async fn next(socket: &mut WebSocket<tokio::io::DuplexStream>) -> Result<Message, WsError> {
+async fn next(socket: &mut WebSocket<tokio::io::DuplexStream>) -> Result<WsMessage, WsError> {
     poll_fn(|cx| socket.poll_next(cx)).await
 }
 
@@ -44,18 +44,18 @@ async fn messages_of_all_sizes_cross_unchanged_both_ways() {
         for size in sizes {
             assert_eq!(
                 next(&mut ours).await.unwrap(),
-                Message::Binary(vec![7; size].into())
+                WsMessage::Binary(vec![7; size].into())
             );
             assert_eq!(
                 next(&mut ours).await.unwrap(),
-                Message::Text("ü".repeat(size / 2).into())
+                WsMessage::Text("ü".repeat(size / 2).into())
             );
         }
         for size in sizes {
             ours.queue(frame::BINARY, vec![9; size].into());
         }
         poll_fn(|cx| ours.poll_flush(cx)).await.unwrap();
-        assert_eq!(ours.queued(), 0);
+        assert_eq!(ours.bytes_queued(), 0);
     };
     tokio::join!(there, here);
 }
@@ -69,12 +69,12 @@ async fn control_frames_and_close_cross() {
         .unwrap();
     assert_eq!(
         next(&mut ours).await.unwrap(),
-        Message::Ping(Bytes::from_static(b"p"))
+        WsMessage::Ping(Bytes::from_static(b"p"))
     );
     theirs.close(None).await.unwrap();
     assert_eq!(
         next(&mut ours).await.unwrap(),
-        Message::Close(1005, String::new())
+        WsMessage::Close(1005, String::new())
     );
     ours.queue_close(1009, &"ü".repeat(100));
     poll_fn(|cx| ours.poll_flush(cx)).await.unwrap();
@@ -89,7 +89,7 @@ async fn control_frames_and_close_cross() {
     assert!(matches!(next(&mut ours).await, Err(WsError::Eof)));
 }
 
-/// What our end says to these bytes.
+/// Returns the error with which our end refuses these bytes.
 async fn refusal(bytes: &[u8]) -> (u16, String) {
     let (io, _keep) = tokio::io::duplex(64);
     let mut socket = WebSocket::new(io, bytes, 1000, 1500);
@@ -99,7 +99,7 @@ async fn refusal(bytes: &[u8]) -> (u16, String) {
     }
 }
 
-fn masked(first: u8, length: u16) -> Vec<u8> {
+fn masked_frame(first: u8, length: u16) -> Vec<u8> {
     let mut bytes = vec![first, 0x80 | 126];
     bytes.extend_from_slice(&length.to_be_bytes());
     bytes.resize(8 + usize::from(length), 0);
@@ -109,7 +109,7 @@ fn masked(first: u8, length: u16) -> Vec<u8> {
 #[tokio::test]
 async fn limits_and_rules_are_kept() {
     assert_eq!(
-        refusal(&masked(0x81, 1001)).await,
+        refusal(&masked_frame(0x81, 1001)).await,
         (
             1009,
             "a frame of 1001 bytes is over the limit of 1000".into()
@@ -125,7 +125,7 @@ async fn limits_and_rules_are_kept() {
             format!("a frame of {} bytes is over the limit of 1000", u64::MAX)
         )
     );
-    let parts = [masked(0x01, 800), masked(0x80, 800)].concat();
+    let parts = [masked_frame(0x01, 800), masked_frame(0x80, 800)].concat();
     assert_eq!(
         refusal(&parts).await,
         (
@@ -137,9 +137,9 @@ async fn limits_and_rules_are_kept() {
         refusal(&[0x81, 0x00]).await,
         (1002, "a client's frames must be masked".into())
     );
-    assert_eq!(refusal(&masked(0x80, 1)).await.0, 1002);
+    assert_eq!(refusal(&masked_frame(0x80, 1)).await.0, 1002);
     assert_eq!(
-        refusal(&[masked(0x01, 1), masked(0x01, 1)].concat())
+        refusal(&[masked_frame(0x01, 1), masked_frame(0x01, 1)].concat())
             .await
             .0,
         1002
@@ -151,21 +151,21 @@ async fn limits_and_rules_are_kept() {
 #[tokio::test]
 async fn parts_make_one_message_with_control_frames_between() {
     let bytes = [
-        masked(0x01, 2),
-        masked(0x89, 0),
-        masked(0x00, 2),
-        masked(0x80, 2),
+        masked_frame(0x01, 2),
+        masked_frame(0x89, 0),
+        masked_frame(0x00, 2),
+        masked_frame(0x80, 2),
     ]
     .concat();
     let (io, _keep) = tokio::io::duplex(64);
     let mut socket = WebSocket::new(io, &bytes, 1000, 1000);
     assert_eq!(
         next(&mut socket).await.unwrap(),
-        Message::Ping(Bytes::new())
+        WsMessage::Ping(Bytes::new())
     );
     assert_eq!(
         next(&mut socket).await.unwrap(),
-        Message::Text(vec![0; 6].into())
+        WsMessage::Text(vec![0; 6].into())
     );
 }
 
@@ -182,7 +182,7 @@ async fn a_client_s_end_is_understood_by_servers() {
         let answered = theirs.send(Theirs::binary(vec![9; size]));
         let (sent, received) = tokio::join!(answered, next(&mut ours));
         sent.unwrap();
-        assert_eq!(received.unwrap(), Message::Binary(vec![9; size].into()));
+        assert_eq!(received.unwrap(), WsMessage::Binary(vec![9; size].into()));
     }
 }
 
@@ -197,12 +197,15 @@ async fn what_has_come_of_an_unfinished_message_is_counted() {
             .await
             .unwrap();
         let polled = poll_fn(|cx| Poll::Ready(ours.poll_next(cx))).await;
-        assert_eq!((ours.received(), polled.is_ready()), (sent, sent == 11));
+        assert_eq!(
+            (ours.bytes_received(), polled.is_ready()),
+            (sent, sent == 11)
+        );
     }
 }
 
-/// The header of a client's frame, its mask zero.
-fn begun(length: u64, last: bool) -> Vec<u8> {
+/// Returns the header of a client's frame with a mask of zeros.
+fn frame_header(length: u64, last: bool) -> Vec<u8> {
     let mut header = vec![if last { 0x82 } else { 0x02 }, 0xff];
     header.extend(length.to_be_bytes());
     header.extend([0; 4]);
@@ -219,10 +222,10 @@ async fn unfinished_messages_take_no_more_than_their_budget() {
         let (ours, mut theirs) = tokio::io::duplex(64 << 10);
         let limit = 64 << 20;
         let mut socket =
-            WebSocket::new(ours, b"", limit, limit).within(&budget, Duration::from_secs(3600));
+            WebSocket::new(ours, b"", limit, limit).with_budget(&budget, Duration::from_secs(3600));
         sockets.spawn(async move {
             let sending = async {
-                theirs.write_all(&begun(3 << 20, false)).await?;
+                theirs.write_all(&frame_header(3 << 20, false)).await?;
                 theirs.write_all(&vec![7; 3 << 20]).await?;
                 std::future::pending::<io::Result<()>>().await
             };
@@ -232,17 +235,17 @@ async fn unfinished_messages_take_no_more_than_their_budget() {
             }
         });
     }
-    // Eight of them fit at most.
+    // At most eight of them fit.
     for _ in 0..12 {
         let refused = sockets.join_next().await.unwrap().unwrap().unwrap_err();
         let WsError::Refused { code: 1013, reason } = refused else {
             panic!("{refused}");
         };
         assert!(reason.contains("the memory for client x"), "{reason}");
-        assert!(budget.used() <= budget.limit());
+        assert!(budget.used_bytes() <= budget.limit());
     }
     sockets.shutdown().await;
-    assert_eq!(budget.used(), 0);
+    assert_eq!(budget.used_bytes(), 0);
 }
 
 #[tokio::test]
@@ -250,20 +253,21 @@ async fn a_message_counts_until_the_next_is_asked_for() {
     let budget = Budget::new("client x", 2 << 20);
     let (ours, theirs) = tokio::io::duplex(4096);
     let mut theirs = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
-    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).within(&budget, Duration::from_secs(60));
+    let mut ours =
+        WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&budget, Duration::from_secs(60));
     tokio::spawn(async move {
         for size in [1 << 20, 10, 1 << 20] {
             theirs.send(Theirs::binary(vec![7; size])).await.unwrap();
         }
         std::future::pending::<()>().await
     });
-    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(big)) if big.len() == 1 << 20));
-    assert!(budget.used() >= 1 << 20, "it is being handled");
-    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(small)) if small.len() == 10));
-    assert_eq!(budget.used(), 0, "small ones do not count");
-    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(big)) if big.len() == 1 << 20));
+    assert!(matches!(next(&mut ours).await, Ok(WsMessage::Binary(big)) if big.len() == 1 << 20));
+    assert!(budget.used_bytes() >= 1 << 20, "it is being handled");
+    assert!(matches!(next(&mut ours).await, Ok(WsMessage::Binary(small)) if small.len() == 10));
+    assert_eq!(budget.used_bytes(), 0, "small ones do not count");
+    assert!(matches!(next(&mut ours).await, Ok(WsMessage::Binary(big)) if big.len() == 1 << 20));
     drop(ours);
-    assert_eq!(budget.used(), 0);
+    assert_eq!(budget.used_bytes(), 0);
 }
 
 #[tokio::test]
@@ -271,17 +275,21 @@ async fn a_message_that_stays_unfinished_ends_the_connection() {
     use tokio::io::AsyncWriteExt as _;
     let (ours, mut theirs) = tokio::io::duplex(4096);
     let patience = Duration::from_millis(30);
-    let mut ours = WebSocket::new(ours, b"", LIMIT, LIMIT).within(&Budget::unlimited(), patience);
-    // A whole message, and idleness as long as it likes.
-    let mut whole = begun(2, true);
+    let mut ours =
+        WebSocket::new(ours, b"", LIMIT, LIMIT).with_budget(&Budget::without_limit(), patience);
+    // A whole message, and then idleness for longer than the time limit.
+    let mut whole = frame_header(2, true);
     whole.extend(b"ab");
     theirs.write_all(&whole).await.unwrap();
-    assert!(matches!(next(&mut ours).await, Ok(Message::Binary(_))));
+    assert!(matches!(next(&mut ours).await, Ok(WsMessage::Binary(_))));
     let idle = tokio::time::timeout(patience * 3, next(&mut ours)).await;
     assert!(idle.is_err(), "{idle:?}");
-    // Half a message, a byte of it now and then.
+    // An unfinished message, one byte at a time.
     let dripping = tokio::spawn(async move {
-        theirs.write_all(&begun(100_000, true)).await.unwrap();
+        theirs
+            .write_all(&frame_header(100_000, true))
+            .await
+            .unwrap();
         while theirs.write_all(b"x").await.is_ok() {
             tokio::time::sleep(patience / 3).await;
         }

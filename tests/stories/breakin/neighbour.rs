@@ -1,4 +1,4 @@
-//! Another computer of the network: it reaches the portal's port, and has no token.
+//! Another computer in the network, which reaches the portal's port and has no token.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -7,30 +7,30 @@ use std::process::Command;
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::daemon::Daemon;
-use support::deployer::{Outcome, path_str, run};
+use support::deployer::{CommandOutcome, path_str, run};
 use support::patience::tell_patience;
 use support::world::world;
 use support::{Verdict, binaries};
 
-use super::scene::state;
-use crate::access::token;
+use super::scene::server_state;
+use crate::access::create_token;
 use crate::people::{self, PASSWORD};
-use crate::tokens::routes;
+use crate::tokens::read_routes;
 
-/// A network namespace that is joined to this machine's by a cable, while it lives.
-struct Network {
+/// A network namespace connected to this machine's own, until drop.
+struct NeighbourNetwork {
     name: String,
-    /// This machine's end, and its address.
+    /// Device of this machine, and its address.
     end: String,
     address: String,
 }
 
-impl Network {
-    fn new() -> anyhow::Result<Network> {
+impl NeighbourNetwork {
+    fn new() -> anyhow::Result<NeighbourNetwork> {
         let id = std::process::id();
-        // Of a range for examples (RFC 5737): no other story uses it.
+        // From a range for documentation (RFC 5737) that no other story uses.
         let low = id % 60 * 4;
-        let network = Network {
+        let network = NeighbourNetwork {
             name: format!("cloudroid-neighbour-{id}"),
             end: format!("cn{id}"),
             address: format!("198.51.100.{}", low + 1),
@@ -51,13 +51,13 @@ impl Network {
             &["-n", name, "addr", "add", &theirs, "dev", &there],
             &["-n", name, "link", "set", &there, "up"],
         ] {
-            run(Command::new("ip").args(words))?.succeeded()?;
+            run(Command::new("ip").args(words))?.expect_success()?;
         }
         Ok(network)
     }
 
-    /// Runs a program there.
-    fn runs(&self, program: &Path, arguments: &[&str]) -> anyhow::Result<Outcome> {
+    /// Runs a program in the namespace.
+    fn run(&self, program: &Path, arguments: &[&str]) -> anyhow::Result<CommandOutcome> {
         run(tell_patience(&mut Command::new("ip"))
             .args(["netns", "exec", &self.name])
             .arg(program)
@@ -65,14 +65,15 @@ impl Network {
     }
 }
 
-impl Drop for Network {
+impl Drop for NeighbourNetwork {
     fn drop(&mut self) {
         let _ = run(Command::new("ip").args(["link", "del", &self.end]));
         let _ = run(Command::new("ip").args(["netns", "del", &self.name]));
     }
 }
 
-/// Certificates that nobody trusts, each with its key: by another authority, by itself, and by a robot's own certificate.
+/// Creates certificates that are not trusted, each with its key: signed by another authority, by itself, and by a
+/// robot's certificate.
 const CERTIFICATES: &str = r#"
 new="-newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
 openssl req -x509 $new -keyout self.key -out self.pem -days 2 -subj /CN=robot:rover1 -addext subjectAltName=URI:robot:rover1
@@ -85,17 +86,17 @@ for by in ca robot; do
 done
 "#;
 
-/// Robot rover2 is paired: its certificate and key, and what else somebody could make of them, by what they are.
-fn certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
+/// Pairs robot rover2; returns its certificate and key, and forged ones, by name.
+fn make_certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
     let made = daemon
         .deployer()
-        .asks(&["pair", "rover2", "--services", "none_*"])?;
+        .run_json(&["pair", "rover2", "--services", "none_*"])?;
     let line = made["line"].as_str().context("a line")?;
     let own = place.join("own");
     run(Command::new(binaries::path("stubs/x86_64/cloudroid-stub"))
         .args(["pair", line])
         .env("CLOUDROID_IDENTITY", &own))?
-    .succeeded()?;
+    .expect_success()?;
     let kept = std::fs::read_dir(own.join("paired"))?
         .next()
         .context("a pairing")??;
@@ -107,11 +108,11 @@ fn certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
         format!("{}-----END CERTIFICATE-----\n", &text[begin..end]),
     )?;
     std::fs::copy(own.join("robot.key"), place.join("robot.key"))?;
-    // The other authority has the name of the daemon's.
+    // The other authority has the same name as the daemon's.
     let issuer = run(Command::new("openssl")
         .args(["x509", "-noout", "-issuer", "-nameopt", "compat", "-in"])
         .arg(place.join("robot.pem")))?
-    .succeeded()?;
+    .expect_success()?;
     let authority = issuer
         .stdout
         .trim()
@@ -129,7 +130,7 @@ fn certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
             },
         )
         .current_dir(place))?
-    .succeeded()?;
+    .expect_success()?;
     let pair = |certificate: &str, key: &str| -> [PathBuf; 2] {
         [place.join(certificate), place.join(key)]
     };
@@ -143,8 +144,9 @@ fn certificates(daemon: &Daemon, place: &Path) -> anyhow::Result<Value> {
     }))
 }
 
-/// Where the daemon listens: lines of the kernel's tables (proc(5)) whose socket is one of its own, by protocol and address.
-fn listens(pid: i32) -> anyhow::Result<BTreeSet<String>> {
+/// Returns the daemon's listening sockets by protocol and address: lines of the kernel's tables (proc(5)) that belong
+/// to its descriptors.
+fn listening_addresses(pid: i32) -> anyhow::Result<BTreeSet<String>> {
     let mut own = BTreeSet::new();
     for entry in std::fs::read_dir(format!("/proc/{pid}/fd"))?.flatten() {
         if let Ok(link) = std::fs::read_link(entry.path()) {
@@ -166,8 +168,9 @@ fn listens(pid: i32) -> anyhow::Result<BTreeSet<String>> {
     Ok(found)
 }
 
-/// What may come of an attempt; none: anything but what was asked for.
-fn may_come(name: &str, came: &str) -> bool {
+/// Returns whether `came` is an acceptable result of an attempt; for attempts without a rule, anything but the
+/// requested data is.
+fn is_allowed_outcome(name: &str, came: &str) -> bool {
     let refused = came.starts_with("refused") || came == "ended";
     match name.split(' ').next().unwrap_or_default() {
         "plain" => came == "400",
@@ -176,7 +179,7 @@ fn may_come(name: &str, came: &str) -> bool {
         "header" => came == "401" || came == "400",
         "name" => came == "401",
         "protocols" => refused || came == "401",
-        // An alert of TLS, or that https is spoken here.
+        // A TLS alert, or the remark that the port speaks https.
         "bytes" => refused || came == "400" || came.starts_with("15"),
         "renegotiation" => refused,
         "health" => came == "200",
@@ -185,7 +188,7 @@ fn may_come(name: &str, came: &str) -> bool {
     }
 }
 
-/// What is answered to everybody.
+/// Routes that answer everyone.
 const OPEN: [(&str, &str); 10] = [
     ("ANY /", "200"),
     ("GET /", "200"),
@@ -201,21 +204,22 @@ const OPEN: [(&str, &str); 10] = [
 ];
 
 pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
-    let network = Network::new()?;
+    let network = NeighbourNetwork::new()?;
     let daemon = world()
-        .own("breakin-neighbour")
+        .setup("breakin-neighbour")
         .listen(&format!("{}:0", network.address))
         .config(
             "tokens = [\"open sesame\"]\n[tls]\nserve = \"tls\"\n[portal]\nhandshake = \"5s\"\n",
         )
         .start()?;
-    token(&daemon, &["chief", "--role", "admin"])?;
-    people::account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?.succeeded()?;
+    create_token(&daemon, &["chief", "--role", "admin"])?;
+    people::run_account(&daemon, &["create", "alice", "--role", "admin"], PASSWORD)?
+        .expect_success()?;
     let place = world().directory("neighbour")?;
-    let certificates = certificates(&daemon, place.path())?;
-    let before = state(&daemon)?;
+    let certificates = make_certificates(&daemon, place.path())?;
+    let before = server_state(&daemon)?;
     let (host, port) = daemon.address.rsplit_once(':').context("a port")?;
-    let routes: Vec<_> = routes()?
+    let routes: Vec<_> = read_routes()?
         .into_iter()
         .map(|(method, path)| {
             (
@@ -237,11 +241,11 @@ pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
     });
     let script = binaries::checkout().join("tests/stories/breakin/neighbour.py");
     let told = network
-        .runs(
+        .run(
             &binaries::python(),
             &[path_str(&script), &asked.to_string()],
         )?
-        .succeeded()?;
+        .expect_success()?;
     let mut tried = 0;
     for line in told.stdout.lines() {
         let one: Value = serde_json::from_str(line).with_context(|| line.to_owned())?;
@@ -250,17 +254,17 @@ pub fn a_neighbour_gets_no_further_than_the_door() -> Verdict {
             one["came"].as_str().unwrap_or_default(),
         );
         let open = OPEN.contains(&(name, came));
-        ensure!(open || may_come(name, came), "{name}: {came}");
+        ensure!(open || is_allowed_outcome(name, came), "{name}: {came}");
         tried += 1;
     }
-    ensure!(state(&daemon)? == before, "{before:#}");
-    // There is no other door.
-    let doors = listens(daemon.pid())?;
+    ensure!(server_state(&daemon)? == before, "{before:#}");
+    // There is no other listening socket.
+    let doors = listening_addresses(daemon.pid())?;
     ensure!(
         doors.len() == 1 && doors.iter().all(|door| door.starts_with("tcp ")),
         "{doors:?}"
     );
     println!("{tried} attempts");
-    ensure!(tried > 180, "{tried}: {}", told.said());
+    ensure!(tried > 180, "{tried}: {}", told.output());
     Ok(())
 }

@@ -1,46 +1,46 @@
-//! Who has a token, and wants more: robots, deployers, viewers, operators.
+//! Holders of tokens who want more: robots, deployers, viewers, operators.
 
 use anyhow::ensure;
 use serde_json::json;
 use support::Verdict;
 
-use super::scene::{Attempt, Scene};
+use super::scene::{BreakinScene, RequestAttempt};
 use super::{people, sockets};
 
-/// Refused as what it may not do.
+/// Statuses of requests that are not permitted.
 const NO: &[u16] = &[403];
-/// Where what is asked for has no such form, or is nowhere.
+/// Statuses of malformed requests and unknown addresses.
 const NOWHERE: &[u16] = &[400, 403, 404, 405, 414];
 
-/// Administration: for admins alone.
-pub fn administration<'a>() -> Vec<Attempt<'a>> {
+/// Administration, which is for admins only.
+pub fn administration_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     let new =
         |role: &str| json!({"name": "mallory", "role": role, "services": ["*"], "robot": "r1"});
     let person = json!({"name": "mallory", "password": "long enough a password", "role": "admin"});
     let rule = |who: &str| json!({"who": who, "services": "*", "allow": ["*:/**"]});
     let mut attempts: Vec<_> = ["admin", "operator", "deployer", "robot", "viewer"]
         .into_iter()
-        .map(|role| Attempt::new("POST", "/api/v1/tokens", NO).body(new(role)))
+        .map(|role| RequestAttempt::new("POST", "/api/v1/tokens", NO).body(new(role)))
         .collect();
     attempts.extend([
-        Attempt::new("POST", "/api/v1/accounts", NO).body(person),
-        Attempt::new("PATCH", "/api/v1/accounts/carol", NO).body(json!({"role": "admin"})),
-        Attempt::new("PATCH", "/api/v1/accounts/carol", NO)
+        RequestAttempt::new("POST", "/api/v1/accounts", NO).body(person),
+        RequestAttempt::new("PATCH", "/api/v1/accounts/carol", NO).body(json!({"role": "admin"})),
+        RequestAttempt::new("PATCH", "/api/v1/accounts/carol", NO)
             .body(json!({"password": "four loud orange engines"})),
-        Attempt::new("DELETE", "/api/v1/accounts/carol", NO),
-        Attempt::new("DELETE", "/api/v1/accounts/carol/sessions", NO),
-        Attempt::new("POST", "/api/v1/policy", NO).body(rule("narrow")),
-        Attempt::new("POST", "/api/v1/policy", NO).body(rule("role:viewer")),
-        Attempt::new("DELETE", "/api/v1/policy/1", NO),
-        Attempt::new("DELETE", "/api/v1/tokens/chief", NO),
-        // Of one that is over it is not told that it is.
-        Attempt::new("DELETE", "/api/v1/tokens/over", NO),
-        Attempt::new("DELETE", "/api/v1/tokens/nobody", NO),
+        RequestAttempt::new("DELETE", "/api/v1/accounts/carol", NO),
+        RequestAttempt::new("DELETE", "/api/v1/accounts/carol/sessions", NO),
+        RequestAttempt::new("POST", "/api/v1/policy", NO).body(rule("narrow")),
+        RequestAttempt::new("POST", "/api/v1/policy", NO).body(rule("role:viewer")),
+        RequestAttempt::new("DELETE", "/api/v1/policy/1", NO),
+        RequestAttempt::new("DELETE", "/api/v1/tokens/chief", NO),
+        // For a revoked token the response does not say that it is revoked.
+        RequestAttempt::new("DELETE", "/api/v1/tokens/over", NO),
+        RequestAttempt::new("DELETE", "/api/v1/tokens/nobody", NO),
     ]);
     for name in [
         "chief", "olga", "alice", "rover", "eve", "over", "nobody", "*",
     ] {
-        attempts.push(Attempt::new(
+        attempts.push(RequestAttempt::new(
             "POST",
             format!("/api/v1/tokens/{name}/rotate"),
             NO,
@@ -54,65 +54,65 @@ pub fn administration<'a>() -> Vec<Attempt<'a>> {
         "audit",
         "audit?follow=true",
     ] {
-        attempts.push(Attempt::new("GET", format!("/api/v1/{path}"), NO));
-        attempts.push(Attempt::new("HEAD", format!("/api/v1/{path}"), NO));
+        attempts.push(RequestAttempt::new("GET", format!("/api/v1/{path}"), NO));
+        attempts.push(RequestAttempt::new("HEAD", format!("/api/v1/{path}"), NO));
     }
     attempts
 }
 
-/// The machine, and pairing: for operators.
-fn operation<'a>() -> Vec<Attempt<'a>> {
+/// The machine, and pairing, which are for operators.
+fn operation_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     let robot = |name: &str| json!({"robot": name, "services": ["*"]});
     vec![
-        Attempt::new("GET", "/api/v1/pairings", NO),
-        Attempt::new("POST", "/api/v1/pairings", NO).body(robot("r1")),
-        Attempt::new("POST", "/api/v1/pairings", NO).body(robot("mallory")),
-        Attempt::new("DELETE", "/api/v1/pairings/r1", NO),
-        Attempt::new("DELETE", "/api/v1/pairings/r1/code", NO),
-        Attempt::new("DELETE", "/api/v1/servants", NO),
-        Attempt::new("DELETE", "/api/v1/servants?service=", NO),
-        Attempt::new("DELETE", "/api/v1/servants?service=*", NO),
-        Attempt::new("DELETE", "/api/v1/servants?service=vault", NO),
-        Attempt::new(
+        RequestAttempt::new("GET", "/api/v1/pairings", NO),
+        RequestAttempt::new("POST", "/api/v1/pairings", NO).body(robot("r1")),
+        RequestAttempt::new("POST", "/api/v1/pairings", NO).body(robot("mallory")),
+        RequestAttempt::new("DELETE", "/api/v1/pairings/r1", NO),
+        RequestAttempt::new("DELETE", "/api/v1/pairings/r1/code", NO),
+        RequestAttempt::new("DELETE", "/api/v1/servants", NO),
+        RequestAttempt::new("DELETE", "/api/v1/servants?service=", NO),
+        RequestAttempt::new("DELETE", "/api/v1/servants?service=*", NO),
+        RequestAttempt::new("DELETE", "/api/v1/servants?service=vault", NO),
+        RequestAttempt::new(
             "DELETE",
             "/api/v1/servants?service=adder_py&service=vault",
             &[400, 403],
         ),
-        // Through TLS and by the robot that shows its certificate alone.
-        Attempt::new("POST", "/api/v1/renew", &[400]).body(json!({"request": "x"})),
-        Attempt::new("POST", "/api/v1/pair", &[400])
+        // Only through TLS, and by the robot that shows its certificate.
+        RequestAttempt::new("POST", "/api/v1/renew", &[400]).body(json!({"request": "x"})),
+        RequestAttempt::new("POST", "/api/v1/pair", &[400])
             .body(json!({"robot": "r1", "code": "a".repeat(26), "request": "x"})),
     ]
 }
 
-/// What changes a service or its servants, or tells what its nodes print.
-fn changes<'a>(service: &str, servant: &str) -> Vec<Attempt<'a>> {
+/// Requests that change a service or its servants, or return the output of its nodes.
+fn change_attempts<'a>(service: &str, servant: &str) -> Vec<RequestAttempt<'a>> {
     let of = |path: &str| format!("/api/v1/services/{service}{path}");
     let servant = |path: &str| format!("/api/v1/servants/{servant}{path}");
     let row = json!({"rows": [], "replace": true});
     vec![
-        Attempt::new("DELETE", of(""), NO),
-        Attempt::new("POST", of("/rollback"), NO),
-        Attempt::new("POST", of("/rollback"), NO).body(json!({"revision": 1})),
-        Attempt::new("POST", of("/rollout"), NO).body(json!("abort")),
-        Attempt::new("POST", of("/trial?kind=bag"), NO),
-        Attempt::new("POST", of("/calibration"), NO),
-        Attempt::new("POST", of("/shadow"), NO).body(json!({"robot": "r1"})),
-        Attempt::new("PUT", of("/sla"), NO).body(row),
-        Attempt::new("DELETE", of("/sla/1"), NO),
-        Attempt::new("GET", servant("/logs"), NO),
-        Attempt::new("GET", servant("/logs?follow=true"), NO),
-        Attempt::new("HEAD", servant("/logs"), NO),
-        Attempt::new("POST", servant("/recording"), NO),
-        Attempt::new("GET", of("/record"), NO),
-        Attempt::new("PATCH", servant(""), NO).body(json!({"cpus": 0.01})),
-        Attempt::new("DELETE", servant(""), NO),
-        Attempt::new("DELETE", format!("/api/v1/servants?service={service}"), NO),
-        pushes(json!({"name": service}), NO),
+        RequestAttempt::new("DELETE", of(""), NO),
+        RequestAttempt::new("POST", of("/rollback"), NO),
+        RequestAttempt::new("POST", of("/rollback"), NO).body(json!({"revision": 1})),
+        RequestAttempt::new("POST", of("/rollout"), NO).body(json!("abort")),
+        RequestAttempt::new("POST", of("/trial?kind=bag"), NO),
+        RequestAttempt::new("POST", of("/calibration"), NO),
+        RequestAttempt::new("POST", of("/shadow"), NO).body(json!({"robot": "r1"})),
+        RequestAttempt::new("PUT", of("/sla"), NO).body(row),
+        RequestAttempt::new("DELETE", of("/sla/1"), NO),
+        RequestAttempt::new("GET", servant("/logs"), NO),
+        RequestAttempt::new("GET", servant("/logs?follow=true"), NO),
+        RequestAttempt::new("HEAD", servant("/logs"), NO),
+        RequestAttempt::new("POST", servant("/recording"), NO),
+        RequestAttempt::new("GET", of("/record"), NO),
+        RequestAttempt::new("PATCH", servant(""), NO).body(json!({"cpus": 0.01})),
+        RequestAttempt::new("DELETE", servant(""), NO),
+        RequestAttempt::new("DELETE", format!("/api/v1/servants?service={service}"), NO),
+        push_attempt(json!({"name": service}), NO),
     ]
 }
 
-fn pushes<'a>(options: serde_json::Value, status: &'a [u16]) -> Attempt<'a> {
+fn push_attempt<'a>(options: serde_json::Value, status: &'a [u16]) -> RequestAttempt<'a> {
     let mut options = options;
     options["nodes"] = json!(["x"]);
     let text: String = options
@@ -120,11 +120,11 @@ fn pushes<'a>(options: serde_json::Value, status: &'a [u16]) -> Attempt<'a> {
         .bytes()
         .map(|byte| format!("%{byte:02x}"))
         .collect();
-    Attempt::new("POST", format!("/api/v1/push?options={text}"), status)
+    RequestAttempt::new("POST", format!("/api/v1/push?options={text}"), status)
 }
 
-/// What is told of a service to those who see it.
-fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
+/// Information about a service for those who may see it.
+fn read_attempts<'a>(service: &str, image: &str, servant: &str) -> Vec<RequestAttempt<'a>> {
     let mut attempts: Vec<_> = [
         "",
         "/interface",
@@ -134,7 +134,7 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
         "/sla/explain?rrt=1s",
     ]
     .into_iter()
-    .map(|path| Attempt::new("GET", format!("/api/v1/services/{service}{path}"), NO))
+    .map(|path| RequestAttempt::new("GET", format!("/api/v1/services/{service}{path}"), NO))
     .collect();
     for path in [
         format!("/v2/{service}/tags/list"),
@@ -152,16 +152,16 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
         format!("/api/v1/servants/{servant}/goals"),
         format!("/foxglove/{servant}"),
     ] {
-        attempts.push(Attempt::new("HEAD", path.clone(), NO));
-        attempts.push(Attempt::new("GET", path, NO));
+        attempts.push(RequestAttempt::new("HEAD", path.clone(), NO));
+        attempts.push(RequestAttempt::new("GET", path, NO));
     }
-    // Of another service's image, by way of one's own.
-    attempts.push(Attempt::new(
+    // A blob of another service's image, requested through the own one.
+    attempts.push(RequestAttempt::new(
         "GET",
         format!("/v2/adder_py/manifests/{image}"),
         &[404],
     ));
-    attempts.push(Attempt::new(
+    attempts.push(RequestAttempt::new(
         "GET",
         format!("/v2/adder_py/blobs/{image}"),
         &[404],
@@ -169,8 +169,8 @@ fn reads<'a>(service: &str, image: &str, servant: &str) -> Vec<Attempt<'a>> {
     attempts
 }
 
-/// Ways to write an address that lead elsewhere than they look.
-fn paths<'a>() -> Vec<Attempt<'a>> {
+/// Paths that refer to something other than they seem to.
+fn path_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     [
         "/api/v1/services/%76ault",
         "/api/v1/services/%2576ault",
@@ -235,19 +235,23 @@ fn paths<'a>() -> Vec<Attempt<'a>> {
         "/api/v1/push/../tokens",
     ]
     .into_iter()
-    .map(|path| Attempt::new("GET", path, NOWHERE))
+    .map(|path| RequestAttempt::new("GET", path, NOWHERE))
     .collect()
 }
 
-/// Methods that are none of the row's, and ways to say another than is written.
-fn methods<'a>() -> Vec<Attempt<'a>> {
+/// Methods that the route does not have, and ways to override the method.
+fn method_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     const REFUSED: &[u16] = &[400, 403, 404, 405];
     let mut attempts = Vec::new();
     for method in [
         "OPTIONS", "TRACE", "PUT", "PATCH", "PROPFIND", "DELETE ", "delete", "GETX",
     ] {
-        attempts.push(Attempt::new(method.trim(), "/api/v1/tokens", REFUSED));
-        attempts.push(Attempt::new(
+        attempts.push(RequestAttempt::new(
+            method.trim(),
+            "/api/v1/tokens",
+            REFUSED,
+        ));
+        attempts.push(RequestAttempt::new(
             method.trim(),
             "/api/v1/services/vault",
             REFUSED,
@@ -258,13 +262,16 @@ fn methods<'a>() -> Vec<Attempt<'a>> {
         "X-HTTP-Method",
         "X-Method-Override",
     ] {
+        attempts.push(
+            RequestAttempt::new("POST", "/api/v1/services/vault", REFUSED).header(header, "DELETE"),
+        );
         attempts
-            .push(Attempt::new("POST", "/api/v1/services/vault", REFUSED).header(header, "DELETE"));
-        attempts.push(Attempt::new("GET", "/api/v1/policy/1", REFUSED).header(header, "DELETE"));
+            .push(RequestAttempt::new("GET", "/api/v1/policy/1", REFUSED).header(header, "DELETE"));
     }
     for header in ["X-Original-URL", "X-Rewrite-URL", "X-Forwarded-Uri"] {
-        attempts
-            .push(Attempt::new("GET", "/nowhere/at/all", REFUSED).header(header, "/api/v1/tokens"));
+        attempts.push(
+            RequestAttempt::new("GET", "/nowhere/at/all", REFUSED).header(header, "/api/v1/tokens"),
+        );
     }
     for (header, value) in [
         ("X-Forwarded-For", "127.0.0.1"),
@@ -278,7 +285,7 @@ fn methods<'a>() -> Vec<Attempt<'a>> {
         ("X-Robot", "r9"),
         ("Authorization", "Bearer"),
     ] {
-        attempts.push(Attempt::new("GET", "/api/v1/tokens", REFUSED).header(header, value));
+        attempts.push(RequestAttempt::new("GET", "/api/v1/tokens", REFUSED).header(header, value));
     }
     for query in [
         "_method=DELETE",
@@ -288,12 +295,12 @@ fn methods<'a>() -> Vec<Attempt<'a>> {
         "as=chief",
         "user=root",
     ] {
-        attempts.push(Attempt::new(
+        attempts.push(RequestAttempt::new(
             "POST",
             format!("/api/v1/services/vault?{query}"),
             REFUSED,
         ));
-        attempts.push(Attempt::new(
+        attempts.push(RequestAttempt::new(
             "GET",
             format!("/api/v1/tokens?{query}"),
             REFUSED,
@@ -302,11 +309,11 @@ fn methods<'a>() -> Vec<Attempt<'a>> {
     attempts
 }
 
-/// What a deployer may not publish, nor how.
-fn publishing<'a>() -> Vec<Attempt<'a>> {
+/// Names and options that a deployer may not publish with.
+fn publish_attempts<'a>() -> Vec<RequestAttempt<'a>> {
     const BAD: &[u16] = &[400, 403, 409, 422];
     let mut attempts = Vec::new();
-    // Outside its scope, the system's, and such as look like another's.
+    // Outside of its scope, reserved by the system, or similar to another name.
     for name in [
         "vault",
         "other",
@@ -332,10 +339,10 @@ fn publishing<'a>() -> Vec<Attempt<'a>> {
         "adder.py",
         "",
     ] {
-        attempts.push(pushes(json!({"name": name}), BAD));
+        attempts.push(push_attempt(json!({"name": name}), BAD));
     }
-    attempts.push(pushes(json!({"name": "a".repeat(100_000 / 30)}), BAD));
-    // More than it may give: directories and devices of the server, ways out, limits, somebody else's name.
+    attempts.push(push_attempt(json!({"name": "a".repeat(100_000 / 30)}), BAD));
+    // Options that it may not grant: directories and devices of the server, egress, limits, another owner.
     for options in [
         json!({"name": "adder_new", "owner": "chief"}),
         json!({"name": "adder_new", "grants": {"volumes": ["/:/host"]}}),
@@ -348,14 +355,21 @@ fn publishing<'a>() -> Vec<Attempt<'a>> {
         json!({"name": "adder_new", "limits": {"memory": "1000T"}}),
         json!({"name": "adder_new", "sla": {"class": "gold"}}),
     ] {
-        attempts.push(pushes(options, BAD));
+        attempts.push(push_attempt(options, BAD));
     }
-    // What is found out on the way is the last line of the answer.
+    // Errors during the push are reported in the last line of the response.
     for base in ["../../etc", "/etc/shadow"] {
-        attempts.push(pushes(json!({"name": "adder_new", "base": base}), &[200]));
+        attempts.push(push_attempt(
+            json!({"name": "adder_new", "base": base}),
+            &[200],
+        ));
     }
-    attempts.push(Attempt::new("POST", "/api/v1/push?options=%7B", &[400]));
-    attempts.push(Attempt::new(
+    attempts.push(RequestAttempt::new(
+        "POST",
+        "/api/v1/push?options=%7B",
+        &[400],
+    ));
+    attempts.push(RequestAttempt::new(
         "POST",
         "/api/v1/push?options=%7B%22name%22%3A1%7D",
         &[400],
@@ -363,11 +377,11 @@ fn publishing<'a>() -> Vec<Attempt<'a>> {
     attempts
 }
 
-/// Tokens that are none, and such as are shown beside another.
-fn showing<'a>(scene: &Scene) -> Vec<Attempt<'a>> {
+/// Invalid tokens, and tokens shown next to another one.
+fn token_attempts<'a>(scene: &BreakinScene) -> Vec<RequestAttempt<'a>> {
     const NOBODY: &[u16] = &[401, 429];
     let tokens = &scene.tokens;
-    let at = |path: &str| Attempt::new("GET", path, NOBODY);
+    let at = |path: &str| RequestAttempt::new("GET", path, NOBODY);
     let mut attempts = vec![
         at("/api/v1/tokens").bearer(&tokens.over),
         at("/api/v1/tokens").header("Authorization", format!("Basic {}", tokens.admin)),
@@ -383,46 +397,46 @@ fn showing<'a>(scene: &Scene) -> Vec<Attempt<'a>> {
         at(&format!("/api/v1/tokens;token={}", tokens.admin)),
         at(&format!("/api/v1/tokens#?token={}", tokens.admin)),
     ];
-    // The better way counts, whoever the other shows.
+    // The more secure way of showing a token takes precedence, whatever the other one contains.
     for (header, query) in [(&tokens.eve, &tokens.admin), (&tokens.rover, &tokens.admin)] {
         let path = format!("/api/v1/tokens?token={query}");
-        attempts.push(Attempt::new("GET", path, NO).bearer(header));
+        attempts.push(RequestAttempt::new("GET", path, NO).bearer(header));
         let path = format!("/api/v1/tokens?token={header}&token={query}");
-        attempts.push(Attempt::new("GET", path, NO));
-        let twice = Attempt::new("GET", "/api/v1/tokens", &[400, 403]);
+        attempts.push(RequestAttempt::new("GET", path, NO));
+        let twice = RequestAttempt::new("GET", "/api/v1/tokens", &[400, 403]);
         attempts.push(twice.bearer(header).bearer(query));
     }
     attempts
 }
 
 pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
-    let mut scene = Scene::new("breakin")?;
+    let mut scene = BreakinScene::new("breakin")?;
     let tokens = &scene.tokens;
     let [r1, r2, r9] = &scene.servants;
     let kept = [r9.as_str(), scene.image.as_str()];
     let fail = |who: &str, token: &str, kept: &[&str], attempts| {
         scene.all_fail(who, Some(token), kept, attempts)
     };
-    // Who sees none of vault.
+    // Principals who may not see vault.
     for (who, token) in [
         ("a robot", &tokens.rover),
         ("a viewer", &tokens.eve),
         ("a deployer", &tokens.alice),
     ] {
-        fail(who, token, &kept, reads("vault", &scene.image, r9))?;
-        fail(who, token, &kept, paths())?;
-        fail(who, token, &kept, changes("vault", r9))?;
+        fail(who, token, &kept, read_attempts("vault", &scene.image, r9))?;
+        fail(who, token, &kept, path_attempts())?;
+        fail(who, token, &kept, change_attempts("vault", r9))?;
     }
-    // Who may change nothing of what it sees.
+    // Principals who may not change anything that they see.
     for (who, token) in [
         ("a robot", &tokens.rover),
         ("a viewer", &tokens.eve),
         ("a viewer of all", &tokens.oscar),
         ("a deployer whose it is not", &tokens.bob),
     ] {
-        fail(who, token, &[], changes("adder_py", r1))?;
-        fail(who, token, &[], operation())?;
-        fail(who, token, &[], methods())?;
+        fail(who, token, &[], change_attempts("adder_py", r1))?;
+        fail(who, token, &[], operation_attempts())?;
+        fail(who, token, &[], method_attempts())?;
     }
     for (who, token) in [
         ("an operator", &tokens.operator),
@@ -430,29 +444,29 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
         ("a robot", &tokens.rover),
         ("a viewer of all", &tokens.oscar),
     ] {
-        fail(who, token, &[], administration())?;
+        fail(who, token, &[], administration_attempts())?;
     }
-    fail("a deployer", &tokens.alice, &kept, operation())?;
-    fail("a deployer", &tokens.alice, &kept, publishing())?;
-    // A robot sees its own servant alone, though the other's service is its own, too.
+    fail("a deployer", &tokens.alice, &kept, operation_attempts())?;
+    fail("a deployer", &tokens.alice, &kept, publish_attempts())?;
+    // A robot sees only its own servant, although it may use the other's service as well.
     let beside = [r2.as_str()];
     let others = ["", "/logs", "/inside"]
-        .map(|path| Attempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
+        .map(|path| RequestAttempt::new("GET", format!("/api/v1/servants/{r2}{path}"), NO));
     fail("a robot", &tokens.rover, &beside, others.into())?;
     fail(
         "a robot",
         &tokens.rover,
         &beside,
         vec![
-            Attempt::new("GET", "/api/v1/servants", &[200]),
-            Attempt::new("GET", "/api/v1/servants?robot=r2", &[200]),
-            Attempt::new("GET", "/api/v1/events?limit=1000", &[200]),
-            Attempt::new("GET", format!("/api/v1/events?servant={r2}"), &[200]),
-            Attempt::new("GET", "/api/v1/events?robot=r2", &[200]),
-            Attempt::new("GET", "/api/v1/services/adder_py", &[200]),
-            Attempt::new("GET", "/api/v1/services/adder_py/fit?cpus=100", &[200, 422]),
-            Attempt::new("GET", "/api/v1/robots/r2/explain", NO),
-            Attempt::new("GET", "/api/v1/back-offs", &[200]),
+            RequestAttempt::new("GET", "/api/v1/servants", &[200]),
+            RequestAttempt::new("GET", "/api/v1/servants?robot=r2", &[200]),
+            RequestAttempt::new("GET", "/api/v1/events?limit=1000", &[200]),
+            RequestAttempt::new("GET", format!("/api/v1/events?servant={r2}"), &[200]),
+            RequestAttempt::new("GET", "/api/v1/events?robot=r2", &[200]),
+            RequestAttempt::new("GET", "/api/v1/services/adder_py", &[200]),
+            RequestAttempt::new("GET", "/api/v1/services/adder_py/fit?cpus=100", &[200, 422]),
+            RequestAttempt::new("GET", "/api/v1/robots/r2/explain", NO),
+            RequestAttempt::new("GET", "/api/v1/back-offs", &[200]),
         ],
     )?;
     for (who, token) in [("a robot", &tokens.rover), ("a viewer", &tokens.eve)] {
@@ -465,18 +479,18 @@ pub fn nobody_gets_beyond_its_role_and_scope() -> Verdict {
         ];
         let mut lists: Vec<_> = lists
             .into_iter()
-            .map(|path| Attempt::new("GET", format!("/api/v1/{path}"), &[200]))
+            .map(|path| RequestAttempt::new("GET", format!("/api/v1/{path}"), &[200]))
             .collect();
-        lists.push(Attempt::new("GET", "/stubs", &[200]));
-        lists.push(Attempt::new("GET", "/v2/_catalog", &[200]));
+        lists.push(RequestAttempt::new("GET", "/stubs", &[200]));
+        lists.push(RequestAttempt::new("GET", "/v2/_catalog", &[200]));
         fail(who, token, &["vault", r9], lists)?;
     }
-    scene.all_fail("who shows it badly", None, &kept, showing(&scene))?;
+    scene.all_fail("who shows it badly", None, &kept, token_attempts(&scene))?;
     people::cannot_be_made_to_ask(&scene)?;
     sockets::nobody_is_somebody_else(&scene)?;
     sockets::nobody_uses_what_it_is_not_granted(&scene)?;
-    scene.goes_on()?;
-    println!("{} attempts", scene.tried());
-    ensure!(scene.tried() > 1000, "{}", scene.tried());
+    scene.expect_robots_working()?;
+    println!("{} attempts", scene.attempt_count());
+    ensure!(scene.attempt_count() > 1000, "{}", scene.attempt_count());
     Ok(())
 }

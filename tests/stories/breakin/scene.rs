@@ -1,4 +1,4 @@
-//! A server at work, what it holds, and attempts that must leave it as it was.
+//! A working server, its state, and attempts that must not change the state.
 
 use std::cell::Cell;
 
@@ -8,51 +8,52 @@ use support::daemon::Daemon;
 use support::robot::Robot;
 use support::world::{TELLER, world};
 
-use crate::access::{pushes_adder, token};
+use crate::access::{create_token, push_adder};
 use crate::people;
 
-/// What an attempt must not be told, whoever makes it.
+/// Texts that must not occur in the response to any attempt.
 const SECRETS: [&str; 3] = ["SQLite format", "PRIVATE KEY", "root:"];
 
-/// Attempts after which it is looked whether something has changed.
+/// Number of attempts after which the state is compared.
 const TOGETHER: usize = 25;
 
-/// Who has a token.
-pub struct Tokens {
+/// Tokens of the principals.
+pub struct SceneTokens {
     pub admin: String,
     pub operator: String,
-    /// `adder_py` is hers.
+    /// The deployer who owns `adder_py`.
     pub alice: String,
-    /// A deployer of what is nobody's yet.
+    /// A deployer without services.
     pub bob: String,
     /// Robot r1 at `adder_py`.
     pub rover: String,
     /// Robot r2 at `adder_py`.
     pub other: String,
-    /// Robot r3 at `adder_py`, which may only listen to `/rosout`.
+    /// Robot r3 at `adder_py`, which may only subscribe to `/rosout`.
     pub narrow: String,
     /// A viewer of `adder*`.
     pub eve: String,
     /// A viewer of everything.
     pub oscar: String,
-    /// Revoked.
+    /// A revoked token.
     pub over: String,
 }
 
-/// The server: `adder_py` with the robots r1 and r2 at work, and `vault`, which concerns none of those who try, with r9.
-pub struct Scene {
+/// The server: `adder_py` with the working robots r1 and r2, and `vault` with r9, to which none of the attacking
+/// principals has access.
+pub struct BreakinScene {
     pub daemon: Daemon,
-    pub tokens: Tokens,
+    pub tokens: SceneTokens,
     /// Servants of r1 and r2 at `adder_py`, and of r9 at `vault`.
     pub servants: [String; 3],
-    /// The image of `vault`, by its digest.
+    /// Digest of the image of `vault`.
     pub image: String,
     at_work: Vec<Robot>,
     tried: Cell<usize>,
 }
 
-/// One request: what it is, and with which statuses it may be answered.
-pub struct Attempt<'a> {
+/// A request, with the acceptable statuses of its response.
+pub struct RequestAttempt<'a> {
     pub method: &'a str,
     pub path: String,
     pub headers: Vec<(&'a str, String)>,
@@ -60,9 +61,9 @@ pub struct Attempt<'a> {
     pub status: &'a [u16],
 }
 
-impl<'a> Attempt<'a> {
+impl<'a> RequestAttempt<'a> {
     pub fn new(method: &'a str, path: impl Into<String>, status: &'a [u16]) -> Self {
-        Attempt {
+        RequestAttempt {
             method,
             path: path.into(),
             headers: Vec::new(),
@@ -86,8 +87,8 @@ impl<'a> Attempt<'a> {
     }
 }
 
-/// Keeps of each entry of a list what no request that only reads changes.
-fn lasting(list: &Value, keys: &[&str]) -> Value {
+/// Keeps those fields of a list's entries that reading requests do not change.
+fn without_volatile(list: &Value, keys: &[&str]) -> Value {
     let entries = list.as_array().cloned().unwrap_or_default();
     let kept = entries.into_iter().map(|mut entry| {
         if let Some(entry) = entry.as_object_mut() {
@@ -98,8 +99,9 @@ fn lasting(list: &Value, keys: &[&str]) -> Value {
     Value::Array(kept.collect())
 }
 
-/// What the server holds: services with their revisions and dictionaries, servants with their limits, and who may do what.
-pub fn state(daemon: &Daemon) -> anyhow::Result<Value> {
+/// Returns the state of the server: services with their revisions and dictionaries, servants with their limits, and
+/// access control.
+pub fn server_state(daemon: &Daemon) -> anyhow::Result<Value> {
     let mut services = Vec::new();
     for service in daemon
         .api("/api/v1/services")?
@@ -111,7 +113,9 @@ pub fn state(daemon: &Daemon) -> anyhow::Result<Value> {
         let rows = daemon.api(&format!("/api/v1/services/{name}/sla"))?;
         services.push(json!([name, detail["revisions"], rows]));
     }
-    let all = |path: &str, keys: &[&str]| Ok::<_, anyhow::Error>(lasting(&daemon.api(path)?, keys));
+    let all = |path: &str, keys: &[&str]| {
+        Ok::<_, anyhow::Error>(without_volatile(&daemon.api(path)?, keys))
+    };
     Ok(json!({
         "services": services,
         "servants": all("/api/v1/servants", &["id", "service", "robot", "limits"])?,
@@ -122,10 +126,10 @@ pub fn state(daemon: &Daemon) -> anyhow::Result<Value> {
     }))
 }
 
-impl Scene {
-    pub fn new(name: &str) -> anyhow::Result<Scene> {
-        let daemon = world().own(name).start()?;
-        let made = |words: &[&str]| token(&daemon, words);
+impl BreakinScene {
+    pub fn new(name: &str) -> anyhow::Result<BreakinScene> {
+        let daemon = world().setup(name).start()?;
+        let made = |words: &[&str]| create_token(&daemon, words);
         let robot = |name: &str, robot: &str, services: &str| {
             made(&[
                 name,
@@ -140,7 +144,7 @@ impl Scene {
         let scoped = |name: &str, role: &str, services: &str| {
             made(&[name, "--role", role, "--service", services])
         };
-        let tokens = Tokens {
+        let tokens = SceneTokens {
             admin: made(&["chief", "--role", "admin"])?,
             operator: made(&["olga", "--role", "operator"])?,
             alice: scoped("alice", "deployer", "adder*")?,
@@ -158,17 +162,17 @@ impl Scene {
             &["token", "revoke", "over"][..],
             &["policy", "allow", "narrow", "subscribe:/rosout"],
         ] {
-            deployer.types(typed)?.succeeded()?;
+            deployer.run(typed)?.expect_success()?;
         }
-        pushes_adder(&daemon, &tokens.alice, &[])?.succeeded()?;
+        push_adder(&daemon, &tokens.alice, &[])?.expect_success()?;
         let vault = [&["--name", "vault"], TELLER.arguments].concat();
-        deployer.pushes(TELLER.name, &vault)?.succeeded()?;
-        people::account(
+        deployer.push(TELLER.name, &vault)?.expect_success()?;
+        people::run_account(
             &daemon,
             &["create", "carol", "--role", "operator"],
             people::PASSWORD,
         )?
-        .succeeded()?;
+        .expect_success()?;
         let mut at_work = Vec::new();
         for (service, token) in [
             ("adder_py", &tokens.rover),
@@ -176,7 +180,7 @@ impl Scene {
             ("vault", &keeper),
         ] {
             let mut robot = daemon.robot(&format!("{service}?token={token}"))?;
-            robot.calls("/rosapi/get_time", json!({}))?;
+            robot.call("/rosapi/get_time", json!({}))?;
             at_work.push(robot);
         }
         let servant = |service: &str, robot: &str| {
@@ -192,7 +196,7 @@ impl Scene {
         let image = vault["revisions"][0]["image"]
             .as_str()
             .context("an image")?;
-        Ok(Scene {
+        Ok(BreakinScene {
             image: image.to_owned(),
             daemon,
             tokens,
@@ -202,24 +206,25 @@ impl Scene {
         })
     }
 
-    /// How many attempts were made.
-    pub fn tried(&self) -> usize {
+    /// Returns the number of attempts so far.
+    pub fn attempt_count(&self) -> usize {
         self.tried.get()
     }
 
-    pub fn counts(&self) {
+    pub fn count_attempt(&self) {
         self.tried.set(self.tried.get() + 1);
     }
 
-    /// Makes attempts as somebody; each is answered as it says, and tells nothing of what is kept from them.
+    /// Makes attempts as a principal; checks the status of each response, and that it contains no information that is
+    /// kept from the principal.
     pub fn all_fail(
         &self,
         who: &str,
         token: Option<&str>,
         kept: &[&str],
-        attempts: Vec<Attempt<'_>>,
+        attempts: Vec<RequestAttempt<'_>>,
     ) -> anyhow::Result<()> {
-        let before = state(&self.daemon)?;
+        let before = server_state(&self.daemon)?;
         let mut since = Vec::new();
         for attempt in attempts {
             let mut headers: Vec<(&str, &str)> = attempt
@@ -237,14 +242,14 @@ impl Scene {
             );
             let (status, head, body) = self
                 .daemon
-                .sends(attempt.method, &attempt.path, &headers, &attempt.body)
+                .request_with_body(attempt.method, &attempt.path, &headers, &attempt.body)
                 .with_context(|| what.clone())?;
             ensure!(
                 attempt.status.contains(&status),
                 "{what} was answered with {status}: {body}"
             );
             for secret in SECRETS.iter().chain(kept) {
-                // What was asked for stands in the refusal.
+                // The refusal may repeat the request.
                 let told = (head.clone() + &body).replace(&attempt.path, "");
                 ensure!(
                     attempt.path.contains(secret) || !told.contains(secret),
@@ -252,18 +257,18 @@ impl Scene {
                 );
             }
             since.push(what);
-            // What is held takes longer to tell than what is tried.
+            // Reading the state takes longer than an attempt.
             if since.len() == TOGETHER {
-                self.is_as(&before, &mut since)?;
+                self.expect_unchanged(&before, &mut since)?;
             }
-            self.counts();
+            self.count_attempt();
         }
-        self.is_as(&before, &mut since)
+        self.expect_unchanged(&before, &mut since)
     }
 
-    /// Refuses a state other than that before these attempts.
-    fn is_as(&self, before: &Value, since: &mut Vec<String>) -> anyhow::Result<()> {
-        let after = state(&self.daemon)?;
+    /// Fails if the state differs from that before these attempts.
+    fn expect_unchanged(&self, before: &Value, since: &mut Vec<String>) -> anyhow::Result<()> {
+        let after = server_state(&self.daemon)?;
         ensure!(
             after == *before,
             "one of {since:#?} changed {before:#} into {after:#}"
@@ -272,10 +277,10 @@ impl Scene {
         Ok(())
     }
 
-    /// The robots that were at work still are.
-    pub fn goes_on(&mut self) -> anyhow::Result<()> {
+    /// Checks that the robots are still working.
+    pub fn expect_robots_working(&mut self) -> anyhow::Result<()> {
         for robot in &mut self.at_work {
-            let answer = robot.calls("/rosapi/get_time", json!({}))?;
+            let answer = robot.call("/rosapi/get_time", json!({}))?;
             ensure!(answer["result"] == true, "{answer}");
         }
         Ok(())

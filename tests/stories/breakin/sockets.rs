@@ -1,19 +1,19 @@
-//! Robots' connections: who one is there is what the token says, from beginning to end.
+//! Connections of robots: the identity is that of the token, for the whole connection.
 
 use anyhow::{Context, bail, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
 use support::robot::Robot;
 
-use super::scene::{Scene, state};
+use super::scene::{BreakinScene, server_state};
 
-/// What a robot shows when it connects: the address behind the server's, and headers.
-type Shown<'a> = (String, Vec<(&'a str, String)>);
+/// Credentials in a handshake: the path of the URL, and headers.
+type HandshakeCredentials<'a> = (String, Vec<(&'a str, String)>);
 
-/// Connecting as another robot, to another service, in another class, or by another's token.
-pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
+/// Connecting as another robot, to another service, in another class, or with another's token.
+pub fn nobody_is_somebody_else(scene: &BreakinScene) -> Verdict {
     let tokens = &scene.tokens;
-    let before = state(&scene.daemon)?;
+    let before = server_state(&scene.daemon)?;
     let bearer = |token: &str| vec![("Authorization", format!("Bearer {token}"))];
     let offer = |token: &str| {
         (
@@ -21,7 +21,7 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
             format!("rosbridge, bearer.{token}"),
         )
     };
-    let mut attempts: Vec<(Shown<'_>, &[u16])> = Vec::new();
+    let mut attempts: Vec<(HandshakeCredentials<'_>, &[u16])> = Vec::new();
     let rover = &tokens.rover;
     for path in [
         "adder_py?robot=r2",
@@ -51,7 +51,7 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
     ] {
         attempts.push(((path.to_owned(), bearer(rover)), &[400, 403, 404, 405]));
     }
-    // Two tokens at once: the better way counts, for whom it names and for nothing else.
+    // Two tokens at once: the one shown in the more secure way counts, with its own rights only.
     for (path, headers) in [
         (
             format!("adder_py?robot=r2&token={}", tokens.other),
@@ -80,7 +80,8 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
     ] {
         attempts.push(((path, headers), &[400, 403]));
     }
-    // Who may look, may not connect; who may publish is no robot elsewhere, nor takes another's name.
+    // Principals who may view may not connect; those who may publish are no robots of other services, and cannot take
+    // another robot's name.
     for token in [&tokens.eve, &tokens.oscar] {
         for path in [
             "adder_py",
@@ -101,7 +102,8 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
     ] {
         attempts.push(((path.to_owned(), bearer(token)), &[403]));
     }
-    // Nor is another's servant looked into by who does not see it: by no token, and as a robot by none but its own.
+    // A servant cannot be looked into without permission to see it: not without a token, and as a robot only with its
+    // own.
     let [r1, r2, r9] = &scene.servants;
     for (servant, token, status) in [
         (r2, Some(rover), &[403][..]),
@@ -133,7 +135,7 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
             attempts.push(((path, headers.clone()), status));
         }
     }
-    // A stub's protocol is no other door.
+    // The stub's protocol has the same checks.
     let stub = ("Sec-WebSocket-Protocol", link::SUBPROTOCOL.to_owned());
     for (path, token, status) in [
         ("vault?robot=r1", Some(rover), &[403][..]),
@@ -153,16 +155,16 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
             .map(|(name, value)| (*name, value.as_str()))
             .collect();
         let url = scene.daemon.url(&path);
-        match Robot::try_connect_showing(&url, &headers) {
+        match Robot::try_connect_with_headers(&url, &headers) {
             Ok(_) => bail!("{path} {headers:?} was let in"),
             Err(refusal) => ensure!(
                 status.contains(&refusal.status),
                 "{path} {headers:?}: {refusal}"
             ),
         }
-        scene.counts();
+        scene.count_attempt();
     }
-    // Nobody by the address, and then somebody: for itself alone.
+    // Without a token in the URL, and with an auth message later: only as the robot of the token.
     for (path, token) in [
         ("vault", rover),
         ("vault?robot=r9", rover),
@@ -173,28 +175,31 @@ pub fn nobody_is_somebody_else(scene: &Scene) -> Verdict {
         ("nothing_such", rover),
     ] {
         let mut robot = scene.daemon.robot(path)?;
-        robot.says(json!({"op": "auth", "mac": token}))?;
-        let close = robot.hears_close().with_context(|| path.to_owned())?;
+        robot.send(json!({"op": "auth", "mac": token}))?;
+        let close = robot.wait_for_close().with_context(|| path.to_owned())?;
         ensure!(u16::from(close.code) == 1008, "{path}: {close:?}");
-        scene.counts();
+        scene.count_attempt();
     }
-    ensure!(state(&scene.daemon)? == before, "{before:#}");
+    ensure!(server_state(&scene.daemon)? == before, "{before:#}");
     Ok(())
 }
 
-/// A robot that may listen to `/rosout` alone, and tries the rest by other names and in other forms.
-pub fn nobody_uses_what_it_is_not_granted(scene: &Scene) -> Verdict {
+/// A robot that may only subscribe to `/rosout`, and tries the other operations with other names and in other forms.
+pub fn nobody_uses_what_it_is_not_granted(scene: &BreakinScene) -> Verdict {
     let tokens = &scene.tokens;
     let mut robot = scene
         .daemon
         .robot(&format!("adder_py?token={}", tokens.narrow))?;
-    // Who it is was said; saying that it is an admin, again and again, changes nothing.
+    // It has authenticated already; authenticating again as an admin changes nothing.
     for who in [&tokens.admin, &tokens.other, &tokens.narrow] {
-        robot.says(json!({"op": "auth", "mac": who}))?;
+        robot.send(json!({"op": "auth", "mac": who}))?;
     }
     let call =
         |service: &str| json!({"op": "call_service", "service": service, "args": {"a": 1, "b": 2}});
-    let fragment = |message: &Value, num: usize, total: usize, data: &str| json!({"op": "fragment", "id": message["id"], "num": num, "total": total, "data": data});
+    let fragment = |message: &Value, num: usize, total: usize, data: &str| {
+        json!({"op": "fragment",
+        "id": message["id"], "num": num, "total": total, "data": data})
+    };
     let mut number = 0;
     for service in [
         "/add_two",
@@ -227,21 +232,21 @@ pub fn nobody_uses_what_it_is_not_granted(scene: &Scene) -> Verdict {
             let mut message = call(service);
             message["id"] = format!("n{number}").into();
             let text = message.to_string();
-            // Where no character is cut.
+            // At a character boundary.
             let middle = text.char_indices().nth(text.chars().count() / 2);
             let (head, tail) = text.split_at(middle.map_or(0, |(at, _)| at));
             match form {
-                "whole" => robot.says(message.clone())?,
-                "one fragment" => robot.says(fragment(&message, 0, 1, &text))?,
+                "whole" => robot.send(message.clone())?,
+                "one fragment" => robot.send(fragment(&message, 0, 1, &text))?,
                 "fragments" => {
-                    robot.says(fragment(&message, 1, 2, tail))?;
-                    // Between them a message that is granted.
-                    robot.says(json!({"op": "subscribe", "topic": "/rosout"}))?;
-                    robot.says(fragment(&message, 0, 2, head))?;
+                    robot.send(fragment(&message, 1, 2, tail))?;
+                    // An operation that is granted, in between.
+                    robot.send(json!({"op": "subscribe", "topic": "/rosout"}))?;
+                    robot.send(fragment(&message, 0, 2, head))?;
                 }
-                _ => robot.says(json!({"op": "png", "data": text}))?,
+                _ => robot.send(json!({"op": "png", "data": text}))?,
             }
-            scene.counts();
+            scene.count_attempt();
         }
     }
     for (operation, names) in [
@@ -290,20 +295,20 @@ pub fn nobody_uses_what_it_is_not_granted(scene: &Scene) -> Verdict {
         let mut message = names;
         message["op"] = operation.into();
         message["id"] = "other".into();
-        robot.says(message)?;
-        scene.counts();
+        robot.send(message)?;
+        scene.count_attempt();
     }
-    // Answers keep their order: what was not refused before this one was not done either.
-    robot.says(json!({"op": "call_service", "service": "/rosapi/get_time", "id": "last"}))?;
+    // Answers are in order: an operation that was not refused before this answer was not executed either.
+    robot.send(json!({"op": "call_service", "service": "/rosapi/get_time", "id": "last"}))?;
     let done = |said: &Value| {
         said["op"] == "service_response" && said["result"] == true && said["id"] != "last"
     };
-    robot.hears("the last answer", |said| said["id"] == "last")?;
+    robot.wait_for("the last answer", |said| said["id"] == "last")?;
     ensure!(
         robot.has_not_heard(done)?,
         "something was done that is not granted"
     );
-    // Nor by what it may ask is it told of more than it may use.
+    // Queries do not reveal more than it may use.
     for (asked, arguments) in [
         ("/rosapi/services", json!({})),
         ("/rosapi/topics", json!({})),
@@ -320,12 +325,12 @@ pub fn nobody_uses_what_it_is_not_granted(scene: &Scene) -> Verdict {
         ("/rosapi/node_details", json!({"node": "/adder"})),
         ("/rosapi/get_param_names", json!({})),
     ] {
-        let told = robot.calls(asked, arguments)?;
+        let told = robot.call(asked, arguments)?;
         ensure!(
             !told["values"].to_string().contains("add_two"),
             "{asked}: {told}"
         );
-        scene.counts();
+        scene.count_attempt();
     }
     Ok(())
 }

@@ -1,39 +1,39 @@
-//! Requests that are read in one way here and in another there: by this server, by a proxy in front of it, by who wrote the
-//! guard. Each asks for what only an admin may, and none is answered.
+//! Requests that are parsed differently by different parties: this server, a proxy in front of it, the author of the
+//! access check. Each requests something that only an admin may do, and none is executed.
 
 use anyhow::{Context, ensure};
 use support::Verdict;
-use support::wire::{answers, statuses};
+use support::wire::{exchange_with, statuses};
 use support::world::world;
 
-use super::scene::state;
-use crate::access::token;
+use super::scene::server_state;
+use crate::access::create_token;
 
 const TOKEN: &str = "open sesame";
 
-/// What is sent, and the statuses with which it may be answered: each answer has one of them.
+/// Bytes to send, and the acceptable statuses of all responses.
 #[derive(Clone)]
-struct Sent {
+struct RawRequest {
     bytes: Vec<u8>,
     status: &'static [u16],
 }
 
-fn sent(text: impl Into<Vec<u8>>, status: &'static [u16]) -> Sent {
-    Sent {
+fn raw_request(text: impl Into<Vec<u8>>, status: &'static [u16]) -> RawRequest {
+    RawRequest {
         bytes: text.into(),
         status,
     }
 }
 
-/// Would revoke a token if it were answered.
+/// A request that would revoke a token.
 const REVOKE: &str = "DELETE /api/v1/tokens/chief HTTP/1.1\r\nHost: localhost\r\n";
 const CLOSE: &str = "Connection: close\r\n\r\n";
 
-/// Whose first line leads elsewhere than it looks.
-fn targets() -> Vec<Sent> {
+/// Requests whose first line refers to something other than it seems to.
+fn target_requests() -> Vec<RawRequest> {
     const NO: &[u16] = &[400, 401, 404, 405, 414, 431, 505];
-    let line = |line: &str| sent(format!("{line}\r\nHost: localhost\r\n{CLOSE}"), NO);
-    let mut all: Vec<Sent> = [
+    let line = |line: &str| raw_request(format!("{line}\r\nHost: localhost\r\n{CLOSE}"), NO);
+    let mut all: Vec<RawRequest> = [
         "GET http://localhost/api/v1/tokens HTTP/1.1",
         "GET http://evil.example/api/v1/tokens HTTP/1.1",
         "GET http://open%20sesame@localhost/api/v1/tokens HTTP/1.1",
@@ -76,7 +76,7 @@ fn targets() -> Vec<Sent> {
     .into_iter()
     .map(line)
     .collect();
-    // A fragment is no part of a request; what stands before it is answered to everybody.
+    // A fragment is not part of a request; the path before it is open to everyone.
     all.retain(|sent| !sent.bytes.starts_with(b"GET /healthz#"));
     for length in [9_000, 70_000, 400_000] {
         let long = "x".repeat(length);
@@ -86,11 +86,11 @@ fn targets() -> Vec<Sent> {
     all
 }
 
-/// Whose header is malformed, or says something twice.
-fn headers() -> Vec<Sent> {
+/// Requests with malformed or contradictory headers.
+fn header_requests() -> Vec<RawRequest> {
     const NO: &[u16] = &[400, 401, 429, 431];
-    let header = |text: String| sent(format!("{REVOKE}{text}\r\n{CLOSE}"), NO);
-    let mut all: Vec<Sent> = [
+    let header = |text: String| raw_request(format!("{REVOKE}{text}\r\n{CLOSE}"), NO);
+    let mut all: Vec<RawRequest> = [
         "Host: 127.0.0.1",
         "Host: evil.example\r\nHost: localhost",
         "Host : localhost",
@@ -125,21 +125,22 @@ fn headers() -> Vec<Sent> {
         "x".repeat(60_000)
     )));
     all.push(header(format!("Cookie: {}", "cloudroid=x; ".repeat(2_000))));
-    all.push(sent(
-        [&b"DELETE /api/v1/tokens/chief HTTP/1.1\r\nHost: localhost\r\nX: \xff\xfe\r\nAuthorization: Bearer \xff\r\n"[..], CLOSE.as_bytes()].concat(),
+    all.push(raw_request(
+        [&b"DELETE /api/v1/tokens/chief HTTP/1.1\r\nHost: localhost\r\nX: \xff\xfe\r\nAuthorization: \
+            Bearer \xff\r\n"[..], CLOSE.as_bytes()].concat(),
         NO,
     ));
-    // Lines that end otherwise.
-    all.push(sent(
+    // Unusual line endings.
+    all.push(raw_request(
         "DELETE /api/v1/tokens/chief HTTP/1.1\nHost: localhost\nConnection: close\n\n",
         NO,
     ));
     all
 }
 
-/// A second request in the body of the first, where the two lengths of that differ; and behind one that became something else.
-fn smuggled() -> Vec<Sent> {
-    // Each answer is one of those to a request without a token.
+/// A second request in the body of the first, with contradictory lengths of the body; and one after an upgrade.
+fn smuggling_requests() -> Vec<RawRequest> {
+    // Each response is one to a request without a token.
     const NO: &[u16] = &[200, 400, 401, 405, 411, 413, 501];
     let hidden = format!("{REVOKE}{CLOSE}");
     let length = hidden.len();
@@ -160,7 +161,10 @@ fn smuggled() -> Vec<Sent> {
             "Transfer-Encoding : chunked\r\n",
             "Transfer-Encoding:\u{b}chunked\r\n",
         ] {
-            all.push(sent(format!("{line}{framing}\r\n0\r\n\r\n{hidden}"), NO));
+            all.push(raw_request(
+                format!("{line}{framing}\r\n0\r\n\r\n{hidden}"),
+                NO,
+            ));
         }
         for lengths in [
             format!("Content-Length: 0\r\nContent-Length: {length}\r\n"),
@@ -171,7 +175,7 @@ fn smuggled() -> Vec<Sent> {
             "Content-Length: 0x0\r\n".to_owned(),
             "Content-Length: 99999999999999999999\r\n".to_owned(),
         ] {
-            all.push(sent(format!("{line}{lengths}\r\n{hidden}"), NO));
+            all.push(raw_request(format!("{line}{lengths}\r\n{hidden}"), NO));
         }
         for chunk in [
             "0;x=\"\r\n\r\n",
@@ -180,32 +184,36 @@ fn smuggled() -> Vec<Sent> {
             "fffffffffffffffff\r\n",
             "1\r\nxx",
         ] {
-            all.push(sent(
+            all.push(raw_request(
                 format!("{line}Transfer-Encoding: chunked\r\n\r\n{chunk}{hidden}"),
                 NO,
             ));
         }
-        // The next on the same connection is asked who it is, too.
-        all.push(sent(format!("{line}Content-Length: 0\r\n\r\n{hidden}"), NO));
+        // The next request on the same connection is authenticated as well.
+        all.push(raw_request(
+            format!("{line}Content-Length: 0\r\n\r\n{hidden}"),
+            NO,
+        ));
     }
     all
 }
 
 pub fn nothing_is_smuggled_past_who_asks() -> Verdict {
     let daemon = world()
-        .own("breakin-wire")
+        .setup("breakin-wire")
         .config(&format!(
             "tokens = [{TOKEN:?}]\n[portal]\nhandshake = \"2s\"\n"
         ))
         .start()?;
-    let chief = token(&daemon, &["chief", "--role", "admin"])?;
-    let before = state(&daemon)?;
-    let all = [targets(), headers(), smuggled()].concat();
+    let chief = create_token(&daemon, &["chief", "--role", "admin"])?;
+    let before = server_state(&daemon)?;
+    let all = [target_requests(), header_requests(), smuggling_requests()].concat();
     let mut tried = 0;
     for sent in all {
         let shown = String::from_utf8_lossy(&sent.bytes);
         let shown: String = shown.chars().take(200).collect();
-        let heard = answers(&daemon.address, &sent.bytes).with_context(|| format!("{shown:?}"))?;
+        let heard =
+            exchange_with(&daemon.address, &sent.bytes).with_context(|| format!("{shown:?}"))?;
         for status in statuses(&heard) {
             ensure!(
                 sent.status.contains(&status),
@@ -215,12 +223,12 @@ pub fn nothing_is_smuggled_past_who_asks() -> Verdict {
         ensure!(!heard.contains("chief"), "{shown:?}: {heard}");
         tried += 1;
     }
-    ensure!(state(&daemon)? == before, "something was changed");
-    // The same with the token would have been done.
+    ensure!(server_state(&daemon)? == before, "something was changed");
+    // The same request with a token is executed.
     let good = format!("{REVOKE}Authorization: Bearer {chief}\r\n{CLOSE}");
-    let heard = answers(&daemon.address, good.as_bytes())?;
+    let heard = exchange_with(&daemon.address, good.as_bytes())?;
     ensure!(statuses(&heard) == [200], "{heard}");
-    ensure!(state(&daemon)? != before);
+    ensure!(server_state(&daemon)? != before);
     println!("{tried} attempts");
     ensure!(tried > 150, "{tried}");
     Ok(())

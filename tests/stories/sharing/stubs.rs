@@ -11,7 +11,7 @@ use anyhow::{Context, ensure};
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use ros::bus::{
-    ActionClient, Bus, BusError, GoalEnd, GoalEvents, Graph, Outcome, RosVersion, Subscription,
+    ActionClient, Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, Graph, RosVersion, Subscription,
 };
 use ros::codec::{from_json, to_json};
 use ros::schema::{MessageType, Registry};
@@ -19,61 +19,61 @@ use serde_json::{Value, json};
 use support::daemon::Daemon;
 use support::deployer::run;
 use support::patience::{patience, scale, tell_patience, wait_for};
-use support::site::{Running, Site, registered};
+use support::site::{NodeProcess, Site, registrations};
 use support::{Verdict, binaries};
 use tokio::sync::mpsc;
 
-use super::{OF_TWO, Sharer, fails, ready, sends_goal};
+use super::{OF_TWO, SharerNode, kill_shim, ready_count, send_goal};
 
-/// A call of ROS 2 that fails is not answered; so long one is waited for that may be such, where nothing else runs.
+/// Time to wait for a call of ROS 2 that may have failed, because failed calls are not answered; on an idle machine.
 const UNANSWERED: Duration = Duration::from_secs(10);
 
-fn serialized(of: &MessageType, values: &Value) -> anyhow::Result<Bytes> {
+fn serialize(of: &MessageType, values: &Value) -> anyhow::Result<Bytes> {
     let mut out = Vec::new();
     let text = values.to_string();
     from_json(of, text.as_bytes(), &mut out, &Default::default())?;
     Ok(out.into())
 }
 
-fn values(of: &MessageType, bytes: &[u8]) -> anyhow::Result<Value> {
+fn deserialize(of: &MessageType, bytes: &[u8]) -> anyhow::Result<Value> {
     let mut out = Vec::new();
     to_json(of, bytes, &mut out, &Default::default())?;
     Ok(serde_json::from_slice(&out)?)
 }
 
-/// A robot with a stub of the service, and an application of its own.
-struct Linked {
-    sharer: Sharer,
+/// A robot with a stub of the service, and an application.
+struct StubbedRobot {
+    sharer: SharerNode,
     registry: Registry,
     name: &'static str,
-    /// As the robot has them: the node, its service, its action.
+    /// Names on the robot: the node, its service, its action.
     node: &'static str,
     work: &'static str,
     count: &'static str,
     site: Site,
     app: Arc<dyn Bus>,
-    stub: Running,
+    stub: NodeProcess,
 }
 
-impl Linked {
+impl StubbedRobot {
     fn new(
         daemon: &Daemon,
-        sharer: Sharer,
+        sharer: SharerNode,
         name: &'static str,
         argv: &[&str],
         [node, work, count]: [&'static str; 3],
-    ) -> anyhow::Result<Linked> {
-        let site = Site::of(sharer.ros)?;
-        let app = site.joins("/app")?;
+    ) -> anyhow::Result<StubbedRobot> {
+        let site = Site::with_ros(sharer.ros)?;
+        let app = site.join("/app")?;
         let toml = format!(
             "server = \"ws://{}\"\nservice = \"{}\"\nrobot = \"{name}\"\nlocal = \"none\"\ndesire = 30.0\nmax = 60.0\n",
             daemon.address, sharer.service
         );
-        let stub = site.stub_with(&toml, sharer.service, "sharer", argv)?;
-        let all = |graph: &Graph| has(sharer.ros, graph, node).len() >= 6;
-        site.until(&app, "what the node serves", all)
-            .with_context(|| format!("the stub said:\n{}", stub.said()))?;
-        Ok(Linked {
+        let stub = site.start_stub_with_config(&toml, sharer.service, "sharer", argv)?;
+        let all = |graph: &Graph| registrations_in(sharer.ros, graph, node).len() >= 6;
+        site.wait_for_graph(&app, "what the node serves", all)
+            .with_context(|| format!("the stub said:\n{}", stub.output()))?;
+        Ok(StubbedRobot {
             sharer,
             registry: sharer.registry()?,
             name,
@@ -86,9 +86,9 @@ impl Linked {
         })
     }
 
-    /// What the node of the original would have.
-    fn expected(&self) -> BTreeSet<String> {
-        let Linked { work, count, .. } = self;
+    /// Returns the registrations that the original's node would have.
+    fn expected_registrations(&self) -> BTreeSet<String> {
+        let StubbedRobot { work, count, .. } = self;
         let lines = match self.sharer.ros {
             RosVersion::One => [
                 format!("publishes {count}/feedback [sharer_cpp/CountActionFeedback]"),
@@ -112,15 +112,15 @@ impl Linked {
         lines.into()
     }
 
-    /// The request to work.
-    fn request(&self, who: &str, seconds: f64) -> anyhow::Result<Bytes> {
+    /// Serializes a request to work.
+    fn work_request(&self, who: &str, seconds: f64) -> anyhow::Result<Bytes> {
         let of = self.registry.service(self.sharer.work)?;
-        serialized(&of.request, &json!({"who": who, "seconds": seconds}))
+        serialize(&of.request, &json!({"who": who, "seconds": seconds}))
     }
 
-    /// Who was answered, and by which servant; nobody where it was not.
-    fn works(&self, who: &str, seconds: f64) -> anyhow::Result<Option<(String, String)>> {
-        let request = self.request(who, seconds)?;
+    /// Calls the service; returns whose request was answered and by which servant, or `None` without an answer.
+    fn call_work(&self, who: &str, seconds: f64) -> anyhow::Result<Option<(String, String)>> {
+        let request = self.work_request(who, seconds)?;
         let time = match self.sharer.ros {
             RosVersion::One => patience(),
             RosVersion::Two => scale(UNANSWERED),
@@ -135,65 +135,67 @@ impl Linked {
             }
         };
         let of = self.registry.service(self.sharer.work)?;
-        let answer = values(&of.response, &answer)?;
+        let answer = deserialize(&of.response, &answer)?;
         let word = |name: &str| answer[name].as_str().unwrap_or_default().to_owned();
         Ok(Some((word("who"), word("where"))))
     }
 
-    /// Feedback, as it comes on the robot.
-    fn hears_feedback(&self) -> anyhow::Result<Subscription> {
+    /// Subscribes to the feedback on the robot.
+    fn subscribe_to_feedback(&self) -> anyhow::Result<Subscription> {
         let topic = match self.sharer.ros {
             RosVersion::One => format!("{}/feedback", self.count),
             RosVersion::Two => format!("{}/_action/feedback", self.count),
         };
-        let heard = self.site.hears(&self.app, &topic)?;
-        self.site.fed(&heard, 1)?;
+        let heard = self.site.subscribe(&self.app, &topic)?;
+        self.site.wait_for_publishers(&heard, 1)?;
         Ok(heard)
     }
 
     /// Sends a goal to count.
-    fn counts(&self, id: &str, to: i32) -> anyhow::Result<Counting> {
+    fn send_count_goal(&self, id: &str, to: i32) -> anyhow::Result<CountGoal> {
         let of = self.registry.action(self.sharer.count)?;
-        let goal = serialized(&of.goal, &json!({"who": self.name, "to": to}))?;
+        let goal = serialize(&of.goal, &json!({"who": self.name, "to": to}))?;
         let (told, events) = mpsc::unbounded_channel();
         let _runtime = self.site.runtime.enter();
         let client = self.app.action_client(self.count, &of)?;
-        self.site.runtime.block_on(client.ready(patience()))?;
-        client.send(id, goal, Arc::new(Ear(told)));
-        Ok(Counting { client, events })
+        self.site
+            .runtime
+            .block_on(client.wait_for_server(patience()))?;
+        client.send_goal(id, goal, Arc::new(GoalEndListener(told)));
+        Ok(CountGoal { client, events })
     }
 
-    /// The end of a goal, and its result.
-    fn end(&self, counting: &mut Counting) -> anyhow::Result<(Outcome, Value)> {
+    /// Waits for the end of a goal; returns the outcome and the result.
+    fn wait_for_end(&self, counting: &mut CountGoal) -> anyhow::Result<(GoalOutcome, Value)> {
         let ended = wait_for(counting.events.recv());
         let ended = self.site.runtime.block_on(ended).context("a result")?;
         let end = ended.context("an end")?.map_err(anyhow::Error::msg)?;
         let of = self.registry.action(self.sharer.count)?;
-        Ok((end.outcome, values(&of.result, &end.result)?))
+        Ok((end.outcome, deserialize(&of.result, &end.result)?))
     }
 }
 
-/// A goal of an application.
-struct Counting {
+/// A goal of the application.
+struct CountGoal {
     client: Box<dyn ActionClient>,
     events: mpsc::UnboundedReceiver<Result<GoalEnd, String>>,
 }
 
-/// Tells of the end of a goal.
-struct Ear(mpsc::UnboundedSender<Result<GoalEnd, String>>);
+/// Receives the end of a goal.
+struct GoalEndListener(mpsc::UnboundedSender<Result<GoalEnd, String>>);
 
-impl GoalEvents for Ear {
-    fn feedback(&self, _feedback: Bytes) {}
+impl GoalEvents for GoalEndListener {
+    fn on_feedback(&self, _feedback: Bytes) {}
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let _ = self.0.send(end);
     }
 }
 
-/// What a node has, as lines that can be compared.
-fn has(ros: RosVersion, graph: &Graph, node: &str) -> BTreeSet<String> {
+/// Returns the registrations of a node as comparable lines.
+fn registrations_in(ros: RosVersion, graph: &Graph, node: &str) -> BTreeSet<String> {
     if ros == RosVersion::One {
-        return registered(graph, node);
+        return registrations(graph, node);
     }
     let Some(ends) = graph.ends.get(node) else {
         return BTreeSet::new();
@@ -210,8 +212,8 @@ fn has(ros: RosVersion, graph: &Graph, node: &str) -> BTreeSet<String> {
 pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
     ros: RosVersion,
 ) -> Verdict {
-    let sharer = Sharer::of(ros);
-    let daemon = sharer.pushed("sharing-stubs", "", &["--min", "2", "--max", "2"])?;
+    let sharer = SharerNode::for_ros(ros);
+    let daemon = sharer.start_daemon("sharing-stubs", "", &["--min", "2", "--max", "2"])?;
     let (front, other): (&[&str], &[&str]) = match ros {
         RosVersion::One => (
             &["__ns:=/front", "__name:=hands"],
@@ -219,7 +221,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
         ),
         RosVersion::Two => (
             &["--ros-args", "-r", "__ns:=/front", "-r", "__node:=hands"],
-            // Whose speed the deployer has set. An action of ROS 2 is not remapped.
+            // The deployer has set its speed. An action of ROS 2 cannot be remapped.
             &[
                 "--ros-args",
                 "-r",
@@ -235,7 +237,7 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
         RosVersion::One => "/tally",
         RosVersion::Two => "/count",
     };
-    let linked = |name, argv: &[&str], names| Linked::new(&daemon, sharer, name, argv, names);
+    let linked = |name, argv: &[&str], names| StubbedRobot::new(&daemon, sharer, name, argv, names);
     let mut plain = linked("plain", &[], ["/sharer", "/work", "/count"])?;
     let front = linked(
         "front",
@@ -243,61 +245,65 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
         ["/front/hands", "/front/work", "/front/count"],
     )?;
     let other = linked("other", other, ["/sharer", "/plan", tally])?;
-    // The names of the original, and its types.
+    // The names and types of the original.
     for robot in [&plain, &front, &other] {
         let graph = robot.app.graph().borrow().clone();
-        let found = has(ros, &graph, robot.node);
-        ensure!(found == robot.expected(), "{}: {found:#?}", robot.name);
+        let found = registrations_in(ros, &graph, robot.node);
+        ensure!(
+            found == robot.expected_registrations(),
+            "{}: {found:#?}",
+            robot.name
+        );
     }
-    // What would change the node for all is not heeded, and that is said.
-    other.stub.says("is not heeded")?;
-    other.stub.says("speed")?;
-    let before = sharer.group(&daemon, "two servants", |group| ready(group) == 2)?;
+    // Settings that would change the node for all robots are ignored, with a warning.
+    other.stub.wait_for_output("is ignored")?;
+    other.stub.wait_for_output("speed")?;
+    let before = sharer.wait_for_group(&daemon, "two servants", |group| ready_count(group) == 2)?;
     ensure!(before["robots"] == 3, "{before:#}");
 
-    // Goals do not meet: each robot hears of its own alone.
+    // Goals are separate: each robot gets feedback for its own only.
     for robot in [&plain, &front] {
-        let mut feedback = robot.hears_feedback()?;
-        let mut goals = [&plain, &front].map(|robot| robot.counts("mine", 5));
+        let mut feedback = robot.subscribe_to_feedback()?;
+        let mut goals = [&plain, &front].map(|robot| robot.send_count_goal("mine", 5));
         for (robot, goal) in [&plain, &front].into_iter().zip(&mut goals) {
             let goal = goal
                 .as_mut()
                 .map_err(|error| anyhow::anyhow!("{error:#}"))?;
-            let end = robot.end(goal)?;
+            let end = robot.wait_for_end(goal)?;
             let result = json!({"who": robot.name, "all": [1, 2, 3, 4, 5]});
-            ensure!(end == (Outcome::Succeeded, result), "{end:?}");
+            ensure!(end == (GoalOutcome::Succeeded, result), "{end:?}");
         }
-        let first = robot.site.next(&mut feedback)?;
+        let first = robot.site.next_message(&mut feedback)?;
         let mut all = vec![first];
         all.extend(std::iter::from_fn(|| feedback.messages.try_recv()));
         let foreign = all.iter().find(|it| !contains(&it.bytes, robot.name));
         ensure!(foreign.is_none(), "{}: {foreign:?}", robot.name);
     }
-    let mut endless = front.counts("endless", 100_000)?;
-    sharer.busy(&daemon)?;
-    endless.client.cancel("endless");
-    let end = front.end(&mut endless)?;
-    ensure!(end.0 == Outcome::Canceled, "{end:?}");
+    let mut endless = front.send_count_goal("endless", 100_000)?;
+    sharer.wait_for_busy_servant(&daemon)?;
+    endless.client.cancel_goal("endless");
+    let end = front.wait_for_end(&mut endless)?;
+    ensure!(end.0 == GoalOutcome::Canceled, "{end:?}");
 
-    // One has a call that its servant will not end.
-    let request = plain.request("plain", 3600.0)?;
+    // One of them has a call that its servant does not finish.
+    let request = plain.work_request("plain", 3600.0)?;
     let long = {
         let app = Arc::clone(&plain.app);
         let call = async move { app.call("/work", request, patience()).await };
         plain.site.runtime.spawn(call)
     };
-    let victim = sharer.busy(&daemon)?;
+    let victim = sharer.wait_for_busy_servant(&daemon)?;
     let killed = Arc::new(AtomicBool::new(false));
     let working: Vec<_> = [front, other]
         .into_iter()
         .map(|robot| {
             let killed = Arc::clone(&killed);
-            thread::spawn(move || -> anyhow::Result<(Linked, usize)> {
+            thread::spawn(move || -> anyhow::Result<(StubbedRobot, usize)> {
                 let (mut answered, mut after) = (0, 0);
                 while after < 5 {
                     after += usize::from(killed.load(Ordering::SeqCst));
                     let who = format!("{} {answered}", robot.name);
-                    if let Some((said, _)) = robot.works(&who, 0.01)? {
+                    if let Some((said, _)) = robot.call_work(&who, 0.01)? {
                         ensure!(said == who, "not its own: {said}");
                         answered += 1;
                     }
@@ -306,12 +312,12 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
             })
         })
         .collect();
-    sharer.group(&daemon, "answers of both", |group| {
+    sharer.wait_for_group(&daemon, "answers of both", |group| {
         group["answered"].as_u64() > Some(20)
     })?;
-    fails(&daemon, &victim)?;
-    sharer.group(&daemon, "another in its place", |group| {
-        ready(group) == 2 && !group["servants"].to_string().contains(&victim)
+    kill_shim(&daemon, &victim)?;
+    sharer.wait_for_group(&daemon, "another in its place", |group| {
+        ready_count(group) == 2 && !group["servants"].to_string().contains(&victim)
     })?;
     killed.store(true, Ordering::SeqCst);
     match ros {
@@ -324,10 +330,10 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
                 "{words}"
             );
         }
-        // A service of ROS 2 cannot answer that it failed: the robot's log says it.
+        // A service of ROS 2 cannot report a failure; the robot's log does.
         RosVersion::Two => {
-            plain.stub.says("--idempotent")?;
-            plain.stub.says(&victim)?;
+            plain.stub.wait_for_output("--idempotent")?;
+            plain.stub.wait_for_output(&victim)?;
             long.abort();
         }
     }
@@ -337,17 +343,25 @@ pub fn stubs_of_three_robots_use_two_servants_and_one_of_these_is_killed(
             .map_err(|_| anyhow::anyhow!("a robot panicked"))??;
         ensure!(answered > 0, "{} was never answered", robot.name);
     }
-    let still = plain.works("still", 0.0)?;
+    let still = plain.call_work("still", 0.0)?;
     let answers = |(said, place): &(String, String)| said == "still" && *place != victim;
     ensure!(still.as_ref().is_some_and(answers), "{still:?}");
-    // A launcher's way to end it.
+    // The signal with which launchers end nodes.
     plain.stub.signal(Signal::SIGINT)?;
-    let status = plain.stub.ends()?;
-    ensure!(status.code() == Some(0), "{status}: {}", plain.stub.said());
-    plain.site.until(&plain.app, "an empty graph", |graph| {
-        has(ros, graph, plain.node).is_empty()
+    let status = plain.stub.wait_for_exit()?;
+    ensure!(
+        status.code() == Some(0),
+        "{status}: {}",
+        plain.stub.output()
+    );
+    plain
+        .site
+        .wait_for_graph(&plain.app, "an empty graph", |graph| {
+            registrations_in(ros, graph, plain.node).is_empty()
+        })?;
+    sharer.wait_for_group(&daemon, "two servants still", |group| {
+        ready_count(group) == 2
     })?;
-    sharer.group(&daemon, "two servants still", |group| ready(group) == 2)?;
     Ok(())
 }
 
@@ -355,46 +369,46 @@ fn contains(message: &[u8], text: &str) -> bool {
     String::from_utf8_lossy(message).contains(text)
 }
 
-/// The rclpy application of a robot; what it tells.
-fn application(linked: &Linked, daemon: &Daemon, what: &str) -> anyhow::Result<Value> {
+/// Runs the rclpy application of a robot and returns its output.
+fn run_application(linked: &StubbedRobot, daemon: &Daemon, what: &str) -> anyhow::Result<Value> {
     let (site, sharer) = (&linked.site, linked.sharer);
-    // It needs the image's messages.
+    // It needs the message types of the image.
     let python = ("application", "application");
-    let prefix = site.installs_original(daemon, sharer.service, python, "python3")?;
+    let prefix = site.install_original(daemon, sharer.service, python, "python3")?;
     let text = std::fs::read_to_string(binaries::checkout().join("tests/robots/shares_ros2.py"))?;
     let mut command = Command::new(prefix.join("lib/application/application"));
     command.args(["-c", &text, what]);
-    site.system.is_of(&mut command);
-    let told = run(tell_patience(&mut command))?.succeeded();
-    let told = told.with_context(|| format!("the stub said:\n{}", linked.stub.said()))?;
+    site.system.configure(&mut command);
+    let told = run(tell_patience(&mut command))?.expect_success();
+    let told = told.with_context(|| format!("the stub said:\n{}", linked.stub.output()))?;
     serde_json::from_str(&told.stdout).context(told.stdout)
 }
 
 pub fn an_application_of_rclpy_shares_one_servant_with_another_robot() -> Verdict {
     let sharer = OF_TWO;
-    let daemon = sharer.pushed("sharing-rclpy", "", &["--max", "1"])?;
+    let daemon = sharer.start_daemon("sharing-rclpy", "", &["--max", "1"])?;
     let names = ["/sharer", "/work", "/count"];
-    let linked = Linked::new(&daemon, sharer, "linked", &[], names)?;
-    // Another robot's goal is at the only servant.
-    let mut two = sharer.robot(&daemon, "two")?;
-    sends_goal(
+    let linked = StubbedRobot::new(&daemon, sharer, "linked", &[], names)?;
+    // The only servant executes a goal of another robot.
+    let mut two = sharer.connect(&daemon, "two")?;
+    send_goal(
         &mut two,
         sharer,
         "long",
         json!({"who": "two", "to": 100_000}),
     )?;
-    two.hears("feedback", |value| value["op"] == "action_feedback")?;
-    let told = application(&linked, &daemon, "waiting")?;
-    // It is accepted to wait for its turn, as its status says, and can be cancelled meanwhile.
+    two.wait_for("feedback", |value| value["op"] == "action_feedback")?;
+    let told = run_application(&linked, &daemon, "waiting")?;
+    // It is accepted and waits, as its status says, and can be cancelled meanwhile.
     let expected = json!({
         "work": "rclpy", "accepted": true, "status": "ACCEPTED",
         "canceled": {"canceling": 1, "code": 0}, "end": "CANCELED",
     });
     ensure!(told == expected, "{told:#}");
-    two.says(json!({"op": "cancel_action_goal", "id": "long", "action": "/count"}))?;
-    two.hears("its end", |value| value["op"] == "action_result")?;
-    let told = application(&linked, &daemon, "free")?;
-    // What the node refuses is refused: a goal, a wish that one should end.
+    two.send(json!({"op": "cancel_action_goal", "id": "long", "action": "/count"}))?;
+    two.wait_for("its end", |value| value["op"] == "action_result")?;
+    let told = run_application(&linked, &daemon, "free")?;
+    // The node rejects a goal, and a request to cancel one.
     let expected = json!({
         "work": "rclpy",
         "counted": {"end": "SUCCEEDED", "all": [1, 2, 3], "at": [1, 2, 3]},

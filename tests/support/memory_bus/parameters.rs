@@ -1,4 +1,4 @@
-//! Parameters of nodes: what is set that a node does not have it has from then on, but no value becomes one of another kind.
+//! Parameters of nodes: setting an unknown parameter declares it, and a value never changes its type.
 
 use async_trait::async_trait;
 use ros::bus::{
@@ -9,7 +9,7 @@ use tokio::sync::mpsc;
 
 use super::MemoryBus;
 
-/// Who is told of changes.
+/// Receivers of changes.
 pub(super) type Watchers = Vec<mpsc::UnboundedSender<ParameterEvent>>;
 
 /// Changes of one node, or of all.
@@ -29,15 +29,15 @@ impl ParameterEvents for Events {
         }
     }
 
-    fn dropped(&self) -> u64 {
+    fn dropped_count(&self) -> u64 {
         0
     }
 }
 
-/// The value as a parameter takes it that has another one.
+/// Converts a new value to the type of the present one.
 fn fitting(held: &ParamValue, given: ParamValue) -> Result<ParamValue, String> {
     match (held, given) {
-        // Nothing is lost by that.
+        // This conversion is lossless.
         (ParamValue::Double(_), ParamValue::Int(given)) => Ok(ParamValue::Double(given as f64)),
         (held, given) if std::mem::discriminant(held) == std::mem::discriminant(&given) => {
             Ok(given)
@@ -98,7 +98,11 @@ impl NodeParameters for MemoryBus {
         })
     }
 
-    async fn set_together(&self, _node: &str, _changes: Vec<ParamChange>) -> Result<(), BusError> {
+    async fn set_atomically(
+        &self,
+        _node: &str,
+        _changes: Vec<ParamChange>,
+    ) -> Result<(), BusError> {
         Err(BusError::NotOffered("changes of several parameters"))
     }
 

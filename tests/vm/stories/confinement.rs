@@ -1,20 +1,20 @@
-//! The stories of burglary and of grants, on a machine with nothing but cgroup v2.
+//! The stories of burglary and of grants, on a machine with cgroup v2 only.
 
 use std::net::TcpListener;
 use std::path::Path;
 
 use anyhow::Context;
-use support::grants::{KIND, Specification, are_there_and_no_more, lay_out};
+use support::grants::{CdiSpecification, KIND, check_grants, create_models};
 use support::{Verdict, burglary};
 
 use crate::machine::daemon;
 
-/// Where `tests/vm/home` says that the volume and the way out are.
+/// Volume and egress address, as configured in `tests/vm/home`.
 const MODELS: &str = "/run/cloudroid-vm/models";
 const OUT: &str = "127.0.0.1:8098";
 
-/// Lines for `[allow]`.
-pub fn allowed() -> String {
+/// Returns lines of the `[allow]` section.
+pub fn allow_config() -> String {
     format!("devices = [\"{KIND}=*\"]\nvolumes = [\"{MODELS}\"]\negress = [\"{OUT}\"]")
 }
 
@@ -31,15 +31,15 @@ pub fn neighbours_are_not_reached() -> Verdict {
 }
 
 pub fn a_service_is_given_what_its_operator_allows() -> Verdict {
-    let _specification = Specification::write(KIND)?;
-    lay_out(Path::new(MODELS))?;
+    let _specification = CdiSpecification::write(KIND)?;
+    create_models(Path::new(MODELS))?;
     let listener = TcpListener::bind(OUT)?;
     let mut robot = daemon()?.robot("granted?robot=given")?;
-    are_there_and_no_more(&mut robot, &listener)?;
+    check_grants(&mut robot, &listener)?;
     daemon()?
         .deployer()
-        .types(&["stop", "--service", "granted"])?
-        .succeeded()?;
+        .run(&["stop", "--service", "granted"])?
+        .expect_success()?;
     let place = Path::new(MODELS)
         .parent()
         .context("a directory of its own")?;

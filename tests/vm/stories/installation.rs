@@ -1,4 +1,4 @@
-//! Installing the package, and removing it.
+//! Installation and removal of the package.
 
 use std::path::Path;
 
@@ -8,80 +8,80 @@ use support::robot::Robot;
 use support::{Verdict, leftovers, procfs};
 
 use crate::confinement;
-use crate::machine::{HOME, SERVANTS, daemon, main_pid, property, types};
+use crate::machine::{HOME, SERVANTS, daemon, main_pid, property, run_program};
 
-/// A clean machine, a package, a running service that has everything it needs.
+/// Installs the package on a clean machine, which results in a running service with everything it needs.
 pub fn installs() -> Verdict {
     let package = std::fs::read_dir("/stage")?
         .flatten()
         .map(|entry| entry.path())
         .find(|path| path.extension().is_some_and(|end| end == "deb"))
         .context("a package to install")?;
-    types("dpkg", &["-i", &package.to_string_lossy()])?;
+    run_program("dpkg", &["-i", &package.to_string_lossy()])?;
     ensure!(property("cloudroid.service", "ActiveState")? == "active");
-    // Containers made ahead would be in the way of stories that count what is there.
+    // Containers of the warm pool would disturb stories that count servants.
     let configuration = "/etc/cloudroid/cloudroid.toml";
     let text = std::fs::read_to_string(configuration)?;
     ensure!(text.contains("#: warm_pool = 8"), "{text}");
     let text = text.replace("#: warm_pool = 8", "warm_pool = 0");
     let text = text.replace(
         "[allow]\n",
-        &format!("[allow]\n{}\n", confinement::allowed()),
+        &format!("[allow]\n{}\n", confinement::allow_config()),
     );
     std::fs::write(configuration, text)?;
-    types("systemctl", &["restart", "cloudroid"])?;
+    run_program("systemctl", &["restart", "cloudroid"])?;
     ensure!(property("cloudroid.service", "Type")? == "notify");
     ensure!(property("cloudroid.service", "WatchdogUSec")? != "0");
     ensure!(property("cloudroid-servants.service", "ActiveState")? == "active");
     let daemon = daemon()?;
-    let status = daemon.deployer().asks(&["status"])?;
+    let status = daemon.deployer().run_json(&["status"])?;
     ensure!(status["pid"] == main_pid()?, "{status:#}");
     ensure!(
         status["isolation"]["cgroup_version"] == 2 && status["isolation"]["missing"] == json!([]),
         "{status:#}"
     );
-    let doctor = daemon.deployer().asks(&["doctor"])?;
+    let doctor = daemon.deployer().run_json(&["doctor"])?;
     for check in doctor["checks"].as_array().context("checks")? {
         ensure!(check["status"] != "missing", "{check:#}");
     }
     Ok(())
 }
 
-/// Every servant is ended, and only the state is left.
+/// Removes the package: every servant is ended, and only the state is left.
 pub fn removes() -> Verdict {
     let daemon = daemon()?;
     let _robot = daemon
         .robot("greeter_cpp?robot=last")?
-        .calls("/greeter/count", json!({}))?;
+        .call("/greeter/count", json!({}))?;
     let id = daemon.servant_of("greeter_cpp", "last")?["id"].clone();
-    // As a build would leave them, for the story after this one.
-    types(
+    // As a build would leave them, for the next story.
+    run_program(
         "sh",
         &[
             "-c",
             &format!("mkdir {BUILT} && cp -r /usr/bin/cloudroid* /usr/lib/cloudroid/* {BUILT}"),
         ],
     )?;
-    let log = types("dpkg", &["--purge", "cloudroid"])?;
+    let log = run_program("dpkg", &["--purge", "cloudroid"])?;
     nothing_but_the_state_is_left(id.as_str().context("an id")?).context(log)
 }
 
-/// Programs as a build leaves them.
+/// Directory of programs, as a build leaves them.
 const BUILT: &str = "/var/built";
 
-/// What `make install` runs once it has built, and `make uninstall`.
+/// Runs the scripts that `make install`, after building, and `make uninstall` run.
 pub fn installs_and_removes_without_a_package() -> Verdict {
     let script = |name: &str| format!("/stage/source/scripts/{name}");
-    let said = types(&script("install"), &[BUILT, "", "/usr/local"])?;
+    let said = run_program(&script("install"), &[BUILT, "", "/usr/local"])?;
     ensure!(said.contains("installed and running"), "{said}");
     ensure!(property("cloudroid.service", "ActiveState")? == "active");
     ensure!(
         property("cloudroid.service", "FragmentPath")?.starts_with("/usr/local/"),
         "another unit runs"
     );
-    // The programs are elsewhere now, and so is what the stories call.
+    // The programs and the command that stories call are now in another directory.
     let asks = |arguments: &[&str]| -> anyhow::Result<serde_json::Value> {
-        let told = types(
+        let told = run_program(
             "/usr/local/bin/cloudroidctl",
             &[&["--format", "json"], arguments].concat(),
         )?;
@@ -91,11 +91,11 @@ pub fn installs_and_removes_without_a_package() -> Verdict {
     ensure!(status["pid"] == main_pid()?, "{status:#}");
     let address = status["listen"].as_str().context("an address")?;
     let mut robot = Robot::connect(&format!("ws://{address}/greeter_cpp?robot=made"))?;
-    ensure!(robot.calls("/greeter/count", json!({}))?["result"] == true);
+    ensure!(robot.call("/greeter/count", json!({}))?["result"] == true);
     let servants = asks(&["servants"])?;
     let id = servants[0]["id"].as_str().context("an id")?.to_owned();
-    let said = types(&script("uninstall"), &["/usr/local"])?;
-    types("rm", &["-r", BUILT, "/etc/cloudroid"])?;
+    let said = run_program(&script("uninstall"), &["/usr/local"])?;
+    run_program("rm", &["-r", BUILT, "/etc/cloudroid"])?;
     nothing_but_the_state_is_left(&id).context(said)
 }
 
@@ -109,7 +109,7 @@ fn nothing_but_the_state_is_left(id: &str) -> Verdict {
         leftovers::cgroups(&[id.to_owned()]).is_empty(),
         "cgroups of servants are left"
     );
-    let found = types(
+    let found = run_program(
         "find",
         &[
             "/etc",

@@ -1,4 +1,4 @@
-//! What the kernel enforces, and what is told of it.
+//! Limits that the kernel enforces, and how they are reported.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -6,40 +6,40 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
-use support::burglar::tries;
+use support::burglar::try_attempt;
 use support::daemon::Daemon;
 use support::patience::Deadline;
 
-use crate::machine::{SERVANTS, control, daemon};
+use crate::machine::{SERVANTS, daemon, read_control_file};
 
-/// The id of a robot's servant.
-fn id(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<String> {
+/// Returns the id of a robot's servant.
+fn servant_id(daemon: &Daemon, service: &str, robot: &str) -> anyhow::Result<String> {
     let servant = daemon.servant_of(service, robot)?;
     Ok(servant["id"].as_str().context("an id")?.to_owned())
 }
 
-fn set(daemon: &Daemon, id: &str, flags: &[&str]) -> anyhow::Result<Value> {
-    daemon.deployer().asks(&[&["set", id], flags].concat())
+fn set_limits(daemon: &Daemon, id: &str, flags: &[&str]) -> anyhow::Result<Value> {
+    daemon.deployer().run_json(&[&["set", id], flags].concat())
 }
 
 pub fn limits_are_in_the_kernels_own_files() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=limited")?;
-    robot.calls("/rosapi/get_time", json!({}))?;
+    robot.call("/rosapi/get_time", json!({}))?;
     let servant = daemon.servant_of("small", "limited")?;
     let id = servant["id"].as_str().context("an id")?;
     ensure!(servant["cgroup_version"] == 2, "{servant:#}");
-    ensure!(control(id, "cpu.max")? == "50000 100000");
+    ensure!(read_control_file(id, "cpu.max")? == "50000 100000");
     ensure!(
-        control(id, "cpu.weight")? == "500",
+        read_control_file(id, "cpu.weight")? == "500",
         "as much as is promised"
     );
-    ensure!(control(id, "memory.max")? == (96 << 20).to_string());
-    ensure!(control(id, "memory.swap.max")? == "0");
-    ensure!(control(id, "memory.oom.group")? == "1");
-    ensure!(control(id, "pids.max")? == servant["enforced"]["pids"].to_string());
-    // Everything, while it works.
-    let changed = set(
+    ensure!(read_control_file(id, "memory.max")? == (96 << 20).to_string());
+    ensure!(read_control_file(id, "memory.swap.max")? == "0");
+    ensure!(read_control_file(id, "memory.oom.group")? == "1");
+    ensure!(read_control_file(id, "pids.max")? == servant["enforced"]["pids"].to_string());
+    // All limits at once, while it works.
+    let changed = set_limits(
         &daemon,
         id,
         &[
@@ -61,13 +61,13 @@ pub fn limits_are_in_the_kernels_own_files() -> Verdict {
             "300",
         ],
     )?;
-    ensure!(control(id, "cpu.max")? == "75000 100000");
-    ensure!(control(id, "cpu.weight")? == "300");
-    ensure!(control(id, "memory.max")? == (128 << 20).to_string());
-    ensure!(control(id, "memory.high")? == (100 << 20).to_string());
-    ensure!(control(id, "pids.max")? == "99");
-    ensure!(control(id, "cpuset.cpus")? == "1");
-    let io = control(id, "io.max")?;
+    ensure!(read_control_file(id, "cpu.max")? == "75000 100000");
+    ensure!(read_control_file(id, "cpu.weight")? == "300");
+    ensure!(read_control_file(id, "memory.max")? == (128 << 20).to_string());
+    ensure!(read_control_file(id, "memory.high")? == (100 << 20).to_string());
+    ensure!(read_control_file(id, "pids.max")? == "99");
+    ensure!(read_control_file(id, "cpuset.cpus")? == "1");
+    let io = read_control_file(id, "io.max")?;
     ensure!(io.contains("rbps=5242880 wbps=3145728"), "{io}");
     ensure!(
         changed["enforced"]
@@ -77,18 +77,18 @@ pub fn limits_are_in_the_kernels_own_files() -> Verdict {
             }),
         "{changed:#}"
     );
-    robot.calls("/rosapi/get_time", json!({}))?;
-    daemon.deployer().types(&["stop", id])?.succeeded()?;
+    robot.call("/rosapi/get_time", json!({}))?;
+    daemon.deployer().run(&["stop", id])?.expect_success()?;
     Ok(())
 }
 
 pub fn cores_are_shared_out_as_asked() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("burglar_cpp?robot=burner")?;
-    tries(&mut robot, "burn", "2")?;
-    let id = id(&daemon, "burglar_cpp", "burner")?;
+    try_attempt(&mut robot, "burn", "2")?;
+    let id = servant_id(&daemon, "burglar_cpp", "burner")?;
     let used = || -> anyhow::Result<f64> {
-        let stat = control(&id, "cpu.stat")?;
+        let stat = read_control_file(&id, "cpu.stat")?;
         let usage = stat
             .lines()
             .find_map(|line| line.strip_prefix("usage_usec "));
@@ -96,12 +96,12 @@ pub fn cores_are_shared_out_as_asked() -> Verdict {
     };
     let mut told = Vec::new();
     for cores in [0.2, 0.5, 1.5] {
-        set(&daemon, &id, &["--cpus", &cores.to_string()])?;
-        // Usage and time are read one after the other, and a busy host stretches what lies between: the share is between
-        // the usage over the longest time that may have passed and over the shortest.
+        set_limits(&daemon, &id, &["--cpus", &cores.to_string()])?;
+        // Usage and time are read one after the other, and a busy host may delay the second read: the share lies
+        // between the usage divided by the longest and by the shortest time that may have passed.
         let look = || Ok::<_, anyhow::Error>((Instant::now(), used()?, Instant::now()));
         let began = look()?;
-        // What is measured is a share of time: some has to pass.
+        // A share of time can only be measured over some time.
         std::thread::sleep(Duration::from_secs(4));
         let ended = look()?;
         let spent = ended.1 - began.1;
@@ -135,21 +135,21 @@ pub fn cores_are_shared_out_as_asked() -> Verdict {
             "{metrics}"
         );
     }
-    tries(&mut robot, "rest", "")?;
+    try_attempt(&mut robot, "rest", "")?;
     Ok(())
 }
 
 pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     let daemon = daemon()?;
     let mut promised = daemon.robot("burglar_cpp?robot=burner")?;
-    tries(&mut promised, "rest", "")?;
-    let id = id(&daemon, "burglar_cpp", "burner")?;
-    set(&daemon, &id, &["--cpus", "1", "--cpu-weight", "100"])?;
-    // The best of some, each time: whatever else the machine below this one does only adds.
+    try_attempt(&mut promised, "rest", "")?;
+    let id = servant_id(&daemon, "burglar_cpp", "burner")?;
+    set_limits(&daemon, &id, &["--cpus", "1", "--cpu-weight", "100"])?;
+    // The best of several measurements each, because other load below this machine only adds to them.
     let mut work = || -> anyhow::Result<f64> {
         let mut best = f64::INFINITY;
         for _ in 0..6 {
-            let took = tries(&mut promised, "work", "20000000")?.report;
+            let took = try_attempt(&mut promised, "work", "20000000")?.report;
             best = best.min(took.parse::<f64>()? / 1e6);
         }
         Ok(best)
@@ -159,21 +159,21 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     for number in 0..4 {
         neighbours.push(daemon.robot(&format!("burglar_cpp?robot=greedy{number}"))?);
     }
-    // All are there before the first makes the others slow.
+    // All start before the first one slows down the others.
     for what in ["rest", "burn"] {
         for neighbour in &mut neighbours {
-            tries(neighbour, what, "2")?;
+            try_attempt(neighbour, what, "2")?;
         }
     }
     let without = work()?;
-    // The promise counts once its weight is not taken away from it.
-    set(&daemon, &id, &["--cpu-weight", "1000"])?;
+    // The promise is effective as long as its weight is not lowered.
+    set_limits(&daemon, &id, &["--cpu-weight", "1000"])?;
     let with = work()?;
     println!("        alone {alone:.2} s, without a promise {without:.2} s, with one {with:.2} s");
     for neighbour in &mut neighbours {
-        tries(neighbour, "rest", "")?;
+        try_attempt(neighbour, "rest", "")?;
     }
-    // The machine below may have been busier while it was alone.
+    // The host may have been busier during the measurement alone.
     let alone = alone.min(with);
     ensure!(
         without > alone * 1.5,
@@ -185,24 +185,24 @@ pub fn a_promised_servant_is_held_up_by_no_greedy_neighbours() -> Verdict {
     );
     daemon
         .deployer()
-        .types(&["stop", "--service", "burglar_cpp"])?
-        .succeeded()?;
+        .run(&["stop", "--service", "burglar_cpp"])?
+        .expect_success()?;
     Ok(())
 }
 
 pub fn who_takes_too_much_memory_is_told_so() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=hungry")?;
-    robot.says(json!({"op": "set_level", "level": "warning"}))?;
-    robot.says(json!({"op": "call_service", "service": "/burglar/try", "args": {"what": "take", "argument": "400"}}))?;
-    let status = robot.hears_status("memory")?;
+    robot.send(json!({"op": "set_level", "level": "warning"}))?;
+    robot.send(json!({"op": "call_service", "service": "/burglar/try", "args": {"what": "take", "argument": "400"}}))?;
+    let status = robot.wait_for_status("memory")?;
     ensure!(
         status["msg"]
             .as_str()
             .is_some_and(|text| text.contains("96M")),
         "the limit is named: {status}"
     );
-    let events = daemon.deployer().asks(&["events"])?;
+    let events = daemon.deployer().run_json(&["events"])?;
     let told = events.as_array().context("events")?.iter().any(|event| {
         event["kind"] == "out-of-memory"
             && event["message"]
@@ -216,23 +216,23 @@ pub fn who_takes_too_much_memory_is_told_so() -> Verdict {
 pub fn a_fork_bomb_ends_when_its_servant_does() -> Verdict {
     let daemon = daemon()?;
     let mut robot = daemon.robot("small?robot=bomber")?;
-    robot.calls("/rosapi/get_time", json!({}))?;
-    let id = id(&daemon, "small", "bomber")?;
-    set(&daemon, &id, &["--pids", "100"])?;
-    tries(&mut robot, "bomb", "")?;
+    robot.call("/rosapi/get_time", json!({}))?;
+    let id = servant_id(&daemon, "small", "bomber")?;
+    set_limits(&daemon, &id, &["--pids", "100"])?;
+    try_attempt(&mut robot, "bomb", "")?;
     let deadline = Deadline::begin();
-    while control(&id, "pids.current")?.parse::<u64>()? < 95 && !deadline.is_over() {
+    while read_control_file(&id, "pids.current")?.parse::<u64>()? < 95 && !deadline.is_over() {
         std::thread::yield_now();
     }
     ensure!(
-        control(&id, "pids.current")?.parse::<u64>()? <= 100,
+        read_control_file(&id, "pids.current")?.parse::<u64>()? <= 100,
         "the limit holds"
     );
-    // Others do not notice.
+    // Other servants are not affected.
     daemon
         .robot("greeter_cpp?robot=calm")?
-        .calls("/greeter/count", json!({}))?;
-    daemon.deployer().types(&["stop", &id])?.succeeded()?;
+        .call("/greeter/count", json!({}))?;
+    daemon.deployer().run(&["stop", &id])?.expect_success()?;
     ensure!(
         !Path::new(SERVANTS).join(&id).exists(),
         "its cgroup is gone"

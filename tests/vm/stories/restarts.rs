@@ -1,4 +1,4 @@
-//! The daemon ends and begins again; robots notice no more than a lost connection.
+//! Restarts of the daemon, which robots only notice as a lost connection.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
@@ -10,48 +10,48 @@ use support::daemon::Daemon;
 use support::patience::Deadline;
 use support::robot::Robot;
 
-use crate::machine::{HOME, daemon, main_pid, types};
+use crate::machine::{HOME, daemon, main_pid, run_program};
 
-/// By whose locks it is known which user ids are taken.
+/// Directory of locks that show which user ids are in use.
 const LOCKS: &str = "/run/cloudroid/uid-ranges";
 
 fn count(robot: &mut Robot) -> anyhow::Result<Option<u64>> {
-    let answer = robot.calls("/greeter/count", json!({"reset": false}))?;
+    let answer = robot.call("/greeter/count", json!({"reset": false}))?;
     Ok(answer["values"]["count"].as_u64())
 }
 
-/// Has a name greeted. This machine is slow: the node may be connected later than publications wait for it.
-fn greets(robot: &mut Robot) -> Verdict {
+/// Has a name greeted. On this slow machine the node may connect later than publications are kept for it.
+fn greet(robot: &mut Robot) -> Verdict {
     let before = count(robot)?;
-    robot.says(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
+    robot.send(json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}))?;
     let deadline = Deadline::begin();
     while count(robot)? == before {
         deadline.check(|| "the node hears nothing".to_owned())?;
-        robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
+        robot.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
     }
     Ok(())
 }
 
-/// Greets before and after the daemon is ended by `end`, and finds the node that counted.
-fn counted_over(robot: &str, end: fn() -> Verdict) -> Verdict {
+/// Greets before and after `end` ends the daemon, and checks that the same node has counted both.
+fn greet_across(robot: &str, end: fn() -> Verdict) -> Verdict {
     let first = daemon()?;
     let path = format!("greeter_cpp?robot={robot}");
     let mut before = first.robot(&path)?;
-    greets(&mut before)?;
+    greet(&mut before)?;
     let counted = count(&mut before)?;
     let servant = first.servant_of("greeter_cpp", robot)?;
     let old = main_pid()?;
     end()?;
-    let second = Daemon::of_another(Path::new(HOME), Some(old))?;
+    let second = Daemon::attach(Path::new(HOME), Some(old))?;
     let mut after = second.robot(&path)?;
     // Latched before, and still known to the node.
-    after.subscribes("/greeter/greeting")?;
-    let latched: Value = after.hears_on("/greeter/greeting")?;
+    after.subscribe("/greeter/greeting")?;
+    let latched: Value = after.next_message_on("/greeter/greeting")?;
     ensure!(
         latched["count"].as_u64() >= counted,
         "{latched} after {counted:?}"
     );
-    greets(&mut after)?;
+    greet(&mut after)?;
     ensure!(count(&mut after)? > counted, "the node has counted on");
     let same = second.servant_of("greeter_cpp", robot)?;
     ensure!(
@@ -63,8 +63,8 @@ fn counted_over(robot: &str, end: fn() -> Verdict) -> Verdict {
 }
 
 pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Verdict {
-    counted_over("killed", || {
-        types(
+    greet_across("killed", || {
+        run_program(
             "systemctl",
             &["kill", "--kill-whom=main", "-s", "KILL", "cloudroid"],
         )
@@ -73,12 +73,12 @@ pub fn a_killed_daemon_is_started_again_and_finds_its_servants() -> Verdict {
 }
 
 pub fn a_restart_loses_nothing() -> Verdict {
-    counted_over("restarted", || {
-        types("systemctl", &["restart", "cloudroid"]).map(|_| ())
+    greet_across("restarted", || {
+        run_program("systemctl", &["restart", "cloudroid"]).map(|_| ())
     })
 }
 
-/// The first user id of a servant on the host, as the kernel has it.
+/// Returns the first user id of a servant on the host, from the kernel.
 fn user_id(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     let servant = daemon.servant_of("greeter_cpp", robot)?;
     let pid = servant["pids"]
@@ -97,14 +97,14 @@ pub fn after_a_restart_of_the_unit_no_two_servants_have_the_same_user_ids() -> V
     count(&mut before)?;
     let locks = std::fs::metadata(LOCKS)?.ino();
     let old = main_pid()?;
-    // Stopped and started again, as a package does on an upgrade: the directory below /run would be gone in between.
-    types("systemctl", &["stop", "cloudroid"])?;
+    // Stopped and started like in a package upgrade, during which the directory below /run would disappear.
+    run_program("systemctl", &["stop", "cloudroid"])?;
     ensure!(
         std::fs::metadata(LOCKS).is_ok_and(|kept| kept.ino() == locks),
         "the locks of servants that go on were removed"
     );
-    types("systemctl", &["start", "cloudroid"])?;
-    let second = Daemon::of_another(Path::new(HOME), Some(old))?;
+    run_program("systemctl", &["start", "cloudroid"])?;
+    let second = Daemon::attach(Path::new(HOME), Some(old))?;
     let mut after = second.robot("greeter_cpp?robot=newer")?;
     count(&mut after)?;
     let (older, newer) = (user_id(&second, "older")?, user_id(&second, "newer")?);

@@ -1,33 +1,33 @@
-//! What robots state becomes what the kernel enforces, and what the kernel enforces is what keeps it.
+//! The statements of robots become limits that the kernel enforces, and the limits ensure that the statements hold.
 
 use std::time::Instant;
 
 use anyhow::{Context, ensure};
 use serde_json::{Value, json};
 use support::Verdict;
-use support::burglar::tries;
+use support::burglar::try_attempt;
 use support::daemon::Daemon;
 use support::robot::Robot;
 
-use crate::machine::{control, daemon};
+use crate::machine::{daemon, read_control_file};
 
 const SERVICE: &str = "burglar_cpp";
-/// One request: so many rounds.
+/// Work of a request, in rounds of computation.
 const WORK: &str = "30000000";
-/// Requests of one share.
+/// Number of requests for a share.
 const REQUESTS: usize = 8;
 const NEIGHBOURS: usize = 6;
 
-/// The id of a robot's servant.
-fn id(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
+/// Returns the id of a robot's servant.
+fn servant_id(daemon: &Daemon, robot: &str) -> anyhow::Result<String> {
     let servant = daemon.servant_of(SERVICE, robot)?;
     Ok(servant["id"].as_str().context("an id")?.to_owned())
 }
 
-/// From the request's leaving to the answer's coming, as the robot sees it.
+/// Measures a request as the robot sees it, from sending it to receiving the answer.
 fn response_time(robot: &mut Robot) -> anyhow::Result<f64> {
     let asked = Instant::now();
-    tries(robot, "work", WORK)?;
+    try_attempt(robot, "work", WORK)?;
     Ok(asked.elapsed().as_secs_f64())
 }
 
@@ -36,8 +36,8 @@ fn median(mut times: Vec<f64>) -> f64 {
     times[times.len() / 2]
 }
 
-/// How many of so many requests were answered within `t_max`.
-fn within(robot: &mut Robot, t_max: f64) -> anyhow::Result<usize> {
+/// Returns how many of `REQUESTS` requests were answered within `t_max`.
+fn count_in_time(robot: &mut Robot, t_max: f64) -> anyhow::Result<usize> {
     let mut met = 0;
     for _ in 0..REQUESTS {
         met += usize::from(response_time(robot)? <= t_max);
@@ -45,7 +45,7 @@ fn within(robot: &mut Robot, t_max: f64) -> anyhow::Result<usize> {
     Ok(met)
 }
 
-/// Writes what a core and a quarter of one reach, and gives both, in seconds.
+/// Writes the response times reached with one core and with a quarter of a core; returns both, in seconds.
 fn write_rows(daemon: &Daemon) -> anyhow::Result<(f64, f64)> {
     let mut alone = daemon.robot(&format!("{SERVICE}?robot=alone&cpus=1"))?;
     response_time(&mut alone)?;
@@ -54,38 +54,41 @@ fn write_rows(daemon: &Daemon) -> anyhow::Result<(f64, f64)> {
     let slow = fast * 4.0;
     for (value, cpus) in [(fast, "1"), (slow, "0.25")] {
         let value = format!("{value:.3}");
-        let written = daemon.deployer().asks(&[
+        let written = daemon.deployer().run_json(&[
             "sla", "set", SERVICE, "--rrt", &value, "--cpus", cpus, "--memory", "64M",
         ])?;
         ensure!(written.as_array().is_some(), "{written:#}");
     }
-    let servant = id(daemon, "alone")?;
-    daemon.deployer().types(&["stop", &servant])?.succeeded()?;
+    let servant = servant_id(daemon, "alone")?;
+    daemon
+        .deployer()
+        .run(&["stop", &servant])?
+        .expect_success()?;
     Ok((fast, slow))
 }
 
 fn remove_rows(daemon: &Daemon) -> Verdict {
-    let rows = daemon.deployer().asks(&["sla", "list", SERVICE])?;
+    let rows = daemon.deployer().run_json(&["sla", "list", SERVICE])?;
     for row in rows.as_array().context("rows")? {
         let number = row["id"].to_string();
         daemon
             .deployer()
-            .types(&["sla", "rm", SERVICE, &number])?
-            .succeeded()?;
+            .run(&["sla", "rm", SERVICE, &number])?
+            .expect_success()?;
     }
     Ok(())
 }
 
-/// Of what a robot wishes for, it accepts so many times as much.
+/// Ratio of the accepted to the desired response time.
 const ACCEPTS: f64 = 2.0;
 
-/// A robot with an SLA.
+/// Connects a robot with an SLA.
 fn robot(daemon: &Daemon, name: &str, rrt: f64) -> anyhow::Result<Robot> {
     let (rrt, max) = (format!("{rrt:.3}"), format!("{:.3}", rrt * ACCEPTS));
     daemon.robot(&format!("{SERVICE}?robot={name}&rrt={rrt}&max_rrt={max}"))
 }
 
-fn told(daemon: &Daemon, name: &str) -> anyhow::Result<Value> {
+fn find_servant(daemon: &Daemon, name: &str) -> anyhow::Result<Value> {
     daemon.servant_of(SERVICE, name)
 }
 
@@ -95,68 +98,75 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
     let mut swift = robot(&daemon, "swift", fast)?;
     let mut patient = robot(&daemon, "patient", slow)?;
     for robot in [&mut swift, &mut patient] {
-        tries(robot, "rest", "")?;
+        try_attempt(robot, "rest", "")?;
     }
-    let (swifts, patients) = (id(&daemon, "swift")?, id(&daemon, "patient")?);
-    let at_first = (control(&swifts, "cpu.max")?, control(&patients, "cpu.max")?);
+    let (swifts, patients) = (
+        servant_id(&daemon, "swift")?,
+        servant_id(&daemon, "patient")?,
+    );
+    let at_first = (
+        read_control_file(&swifts, "cpu.max")?,
+        read_control_file(&patients, "cpu.max")?,
+    );
     println!(
         "        cpu.max of swift: {}; of patient: {}",
         at_first.0, at_first.1
     );
-    // On a slow machine the controller may have given them more by now.
+    // On a slow machine the controller may have raised them by now.
     let (of_swift, of_patient) = (quota(&swifts)?, quota(&patients)?);
     ensure!(
         of_swift >= 100_000 && (25_000..of_swift).contains(&of_patient),
         "{at_first:?}: {:#} {:#}",
-        told(&daemon, "swift")?,
-        told(&daemon, "patient")?
+        find_servant(&daemon, "swift")?,
+        find_servant(&daemon, "patient")?
     );
     for (robot, cpus) in [("swift", 1.0), ("patient", 0.25)] {
-        let row = told(&daemon, robot)?["terms"]["rows"][0]["limits"]["cpus"].clone();
+        let row = find_servant(&daemon, robot)?["terms"]["rows"][0]["limits"]["cpus"].clone();
         ensure!(row == cpus, "{robot}: {row}");
     }
-    ensure!(control(&swifts, "memory.max")? == (64 << 20).to_string());
-    // One that asks for the same and states nothing: no row gives it limits, and no promise.
+    ensure!(read_control_file(&swifts, "memory.max")? == (64 << 20).to_string());
+    // A robot with the same requests that states nothing: no row gives it limits or a promise.
     let mut plain = daemon.robot(&format!("{SERVICE}?robot=plain"))?;
-    tries(&mut plain, "rest", "")?;
+    try_attempt(&mut plain, "rest", "")?;
     let mut neighbours = Vec::new();
     for number in 0..NEIGHBOURS {
         neighbours.push(daemon.robot(&format!("{SERVICE}?robot=greedy{number}"))?);
     }
-    // All are there before the first makes the others slow.
+    // All start before the first one slows down the others.
     for what in ["rest", "burn"] {
         for neighbour in &mut neighbours {
-            tries(neighbour, what, "2")?;
+            try_attempt(neighbour, what, "2")?;
         }
     }
     let t_max = fast * ACCEPTS;
-    // One after the other and again, so that whatever else the machine below this one does meets both.
+    // Alternating, so that other load on the host affects both alike.
     let (mut with, mut without, mut asked) = (0, 0, 0);
     for _ in 0..3 {
-        with += within(&mut swift, t_max)?;
-        without += within(&mut plain, t_max)?;
+        with += count_in_time(&mut swift, t_max)?;
+        without += count_in_time(&mut plain, t_max)?;
         asked += REQUESTS;
-        // Those that nobody asks meanwhile answer the daemon's pings when they read, as robots do all the time.
+        // Robots without requests answer the daemon's pings only when they read, as robots do all the time.
         for idle in neighbours.iter_mut().chain([&mut patient]) {
-            idle.calls("/rosapi/get_time", json!({}))?;
+            idle.call("/rosapi/get_time", json!({}))?;
         }
     }
     let share = |met: usize| 100.0 * met as f64 / asked as f64;
     println!(
-        "        T_max {:.0} ms beside {NEIGHBOURS} greedy neighbours: {:.0} % of requests within it with the row's limits, {:.0} % of a robot that has none",
+        "        T_max {:.0} ms beside {NEIGHBOURS} greedy neighbours: {:.0} % of requests within it with the row's \
+         limits, {:.0} % of a robot that has none",
         t_max * 1000.0,
         share(with),
         share(without)
     );
     for neighbour in &mut neighbours {
-        tries(neighbour, "rest", "")?;
+        try_attempt(neighbour, "rest", "")?;
     }
     daemon
         .deployer()
-        .types(&["stop", "--service", SERVICE])?
-        .succeeded()?;
+        .run(&["stop", "--service", SERVICE])?
+        .expect_success()?;
     remove_rows(&daemon)?;
-    // How many are in time hangs on the machine below this one, too; that limits make the difference does not.
+    // The number of requests in time depends on the host as well; that limits make the difference does not.
     ensure!(
         share(with) >= share(without) + 30.0,
         "the row's limits change nothing"
@@ -164,12 +174,12 @@ pub fn what_robots_state_becomes_what_the_kernel_enforces_and_is_kept() -> Verdi
     Ok(())
 }
 
-/// Of a request that takes a core all of its time, so long.
+/// Work of a request that uses a core for its whole duration.
 const LITTLE_WORK: &str = "3000000";
 
-/// Microseconds of each period that a servant may use.
+/// Returns the microseconds of each period that a servant may use.
 fn quota(id: &str) -> anyhow::Result<u64> {
-    let max = control(id, "cpu.max")?;
+    let max = read_control_file(id, "cpu.max")?;
     let quota = max.split(' ').next().unwrap_or_default();
     quota.parse().with_context(|| format!("cpu.max is {max}"))
 }
@@ -179,18 +189,21 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     let mut alone = daemon.robot(&format!("{SERVICE}?robot=alone&cpus=1"))?;
     let little = |robot: &mut Robot| -> anyhow::Result<f64> {
         let asked = Instant::now();
-        tries(robot, "work", LITTLE_WORK)?;
+        try_attempt(robot, "work", LITTLE_WORK)?;
         Ok(asked.elapsed().as_secs_f64())
     };
     little(&mut alone)?;
     let times: anyhow::Result<Vec<f64>> = (0..7).map(|_| little(&mut alone)).collect();
     let took = median(times?);
-    let servant = id(&daemon, "alone")?;
-    daemon.deployer().types(&["stop", &servant])?.succeeded()?;
+    let servant = servant_id(&daemon, "alone")?;
+    daemon
+        .deployer()
+        .run(&["stop", &servant])?
+        .expect_success()?;
     let mut plain = daemon.robot(&format!("{SERVICE}?robot=plain"))?;
-    tries(&mut plain, "rest", "1")?;
-    let unmoved = quota(&id(&daemon, "plain")?)?;
-    // With a quarter of a core it takes four times as long. Its robot speaks rosbridge: the daemon measures its calls.
+    try_attempt(&mut plain, "rest", "1")?;
+    let unmoved = quota(&servant_id(&daemon, "plain")?)?;
+    // With a quarter of a core it takes four times as long. Its robot uses rosbridge, so the daemon measures its calls.
     let accepts = format!("{:.4}", took * 2.0);
     let near = format!("{SERVICE}?robot=near&cpus=0.25&max_rrt={accepts}");
     let mut near = daemon.robot(&near)?;
@@ -200,15 +213,15 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
         (&mut owner, "burn"),
         (&mut plain, "burn"),
     ] {
-        tries(robot, what, "1")?;
+        try_attempt(robot, what, "1")?;
     }
     let ids = [
-        id(&daemon, "near")?,
-        id(&daemon, "owner")?,
-        id(&daemon, "plain")?,
+        servant_id(&daemon, "near")?,
+        servant_id(&daemon, "owner")?,
+        servant_id(&daemon, "plain")?,
     ];
     let quotas = || -> anyhow::Result<Vec<u64>> { ids.iter().map(|id| quota(id)).collect() };
-    // What two of them are promised, and what the third has without a controller.
+    // The promises of two of them, and the limit of the third without the controller.
     let at_first = vec![25_000, 25_000, unmoved];
     let mut seen = Vec::new();
     let mut promises_hold = |now: &[u64]| -> anyhow::Result<()> {
@@ -218,7 +231,7 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
         ensure!(now[0] >= 25_000 && now[1] == 25_000, "{seen:?}");
         Ok(())
     };
-    support::until("cores for the one that is near", || {
+    support::wait_until("cores for the one that is near", || {
         little(&mut near)?;
         let now = quotas()?;
         promises_hold(&now)?;
@@ -239,17 +252,17 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
             .as_str()
             .unwrap_or_default()
     );
-    let shown = told_of(&daemon, "near", "response")?;
+    let shown = servant_field(&daemon, "near", "response")?;
     ensure!(shown["requests"].as_u64() > Some(0), "{shown}");
-    // It asks no more, and gives back what it had.
+    // The robot makes no more requests and gives back what it had gained.
     let mut last = quotas()?;
-    // Far more steps than it takes, if it comes to rest at all.
+    // Far more steps than needed, if the limits settle at all.
     for _ in 0..100 {
         if last == at_first {
             break;
         }
-        // Half of it at each step, some seconds apart.
-        last = support::until("less, until it is what it was promised", || {
+        // Half of the difference at each step, with some seconds between steps.
+        last = support::wait_until("less, until it is what it was promised", || {
             let now = quotas()?;
             promises_hold(&now)?;
             Ok(if now == last {
@@ -262,16 +275,16 @@ pub fn the_controller_moves_cores_and_nobody_loses_what_was_promised() -> Verdic
     ensure!(last == at_first, "it does not come to rest: {seen:?}");
     println!("        cpu.max of near, owner, plain: {seen:?}");
     for robot in [&mut owner, &mut plain] {
-        tries(robot, "rest", "")?;
+        try_attempt(robot, "rest", "")?;
     }
     daemon
         .deployer()
-        .types(&["stop", "--service", SERVICE])?
-        .succeeded()
+        .run(&["stop", "--service", SERVICE])?
+        .expect_success()
         .map(|_| ())
 }
 
-/// A field of what is told of a robot's servant.
-fn told_of(daemon: &Daemon, robot: &str, field: &str) -> anyhow::Result<Value> {
-    Ok(told(daemon, robot)?[field].clone())
+/// Returns a field of a robot's servant.
+fn servant_field(daemon: &Daemon, robot: &str, field: &str) -> anyhow::Result<Value> {
+    Ok(find_servant(daemon, robot)?[field].clone())
 }

@@ -40,7 +40,7 @@ export const token = {
   set: (value: string) => (value ? sessionStorage.setItem(TOKEN, value) : sessionStorage.removeItem(TOKEN)),
 };
 
-const noAnswer = () => new Problem(0, 'no answer', 'the daemon does not answer', 'look whether cloudroidd runs and can be reached; this page goes on by itself when it does');
+const noAnswer = () => new Problem(0, 'no answer', 'the daemon does not answer', 'check that cloudroidd is running and reachable; this page reconnects automatically');
 
 /** Asks, and gives the answer if it is none of refusal. */
 export async function fetched(path: string, options: RequestInit = {}, base = '/api/v1'): Promise<Response> {

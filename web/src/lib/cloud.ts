@@ -44,7 +44,7 @@ export function points(cloud: Cloud): Points {
   const reads = (field: Field | undefined) => field && reader(view, little, field.datatype);
   const [readX, readY, readZ] = [reads(x), reads(y), reads(z)];
   const beyond = fields.find((field) => field.offset + (SIZES[field.datatype] ?? 0) > step);
-  if (!readX || !readY || beyond) throw new Error(`field ${(beyond ?? x).name} of the cloud lies beyond its points of ${step} bytes, or has a type that there is not`);
+  if (!readX || !readY || beyond) throw new Error(`field ${(beyond ?? x).name} of the cloud lies beyond its points of ${step} bytes, or has an unknown type`);
   const rgb = named('rgb') ?? named('rgba');
   const intensity = named('intensity') ?? named('intensities');
   const shade = rgb ? undefined : (intensity ?? z);

@@ -80,10 +80,10 @@ export function bytes(text: string, length: number): { value?: number[] | string
   let count = found.length;
   if (found.some((byte) => !(byte <= 255))) {
     found = text.trim();
-    if (!/^[A-Za-z0-9+/]+={0,2}$/.test(found) || found.length % 4 === 1) return { wrong: 'write numbers from 0 to 255 with spaces between, or base64' };
+    if (!/^[A-Za-z0-9+/]+={0,2}$/.test(found) || found.length % 4 === 1) return { wrong: 'write numbers from 0 to 255 separated by spaces, or base64' };
     count = Math.floor((found.replace(/=+$/, '').length * 3) / 4);
   }
-  if (length > 0 && count !== length) return { wrong: `it has ${length} bytes, and this is ${count}` };
+  if (length > 0 && count !== length) return { wrong: `it must have ${length} bytes, not ${count}` };
   return { value: found, count };
 }
 

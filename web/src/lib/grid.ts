@@ -34,5 +34,5 @@ const figure = (value: number) => String(+value.toFixed(3));
 export function words({ header, info: { width, height, resolution, origin } }: Grid): string {
   const turned = (2 * Math.atan2(origin.orientation.z, origin.orientation.w) * 180) / Math.PI;
   const { x, y } = origin.position;
-  return `${width} × ${height} cells of ${figure(resolution)} m: ${figure(width * resolution)} × ${figure(height * resolution)} m; origin (lower left) at ${figure(x)}, ${figure(y)} m${Math.abs(turned) > 0.05 ? `, turned by ${figure(turned)}°` : ''} of ${header.frame_id || 'no frame'}`;
+  return `${width} × ${height} cells of ${figure(resolution)} m: ${figure(width * resolution)} × ${figure(height * resolution)} m; origin (lower left) at ${figure(x)}, ${figure(y)} m${Math.abs(turned) > 0.05 ? `, rotated by ${figure(turned)}°` : ''} of ${header.frame_id || 'no frame'}`;
 }

@@ -68,7 +68,7 @@ class Live {
         }
       }
       if (stop.aborted) return;
-      this.trouble ??= new Problem(0, 'no answer', 'the connection to the daemon was lost', 'this page connects again by itself');
+      this.trouble ??= new Problem(0, 'no answer', 'the connection to the daemon was lost', 'this page reconnects automatically');
       pause = Date.now() - began > LATEST ? SOONEST : Math.min(pause * 2, LATEST);
       await new Promise((resolve) => setTimeout(resolve, pause));
     }

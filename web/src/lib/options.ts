@@ -12,53 +12,53 @@ export interface Field {
 }
 
 /** What is told of every push. */
-export const PARAMETERS: Field = { key: 'params', label: 'Parameters, KEY=VALUE, one a line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 };
-export const NAME: Field = { key: 'name', label: "Name of the service; the package's by default", flag: '--name' };
-export const NODES: Field = { key: 'nodes', label: 'Programs, each with its arguments, one a line', flag: '--node', example: 'people_detect', lines: 2 };
-export const LAUNCH: Field = { key: 'launch', label: 'Launch file, as roslaunch finds it in the package', flag: '--launch', example: 'my.launch' };
-export const ARGUMENTS: Field = { key: 'args', label: 'Its arguments, KEY:=VALUE, one a line', flag: '--arg', lines: 2 };
+export const PARAMETERS: Field = { key: 'params', label: 'Parameters, KEY=VALUE, one per line; global ones begin with /', flag: '--param', example: 'debug_view=false', lines: 2 };
+export const NAME: Field = { key: 'name', label: "Service name (default: the package's)", flag: '--name' };
+export const NODES: Field = { key: 'nodes', label: 'Programs with their arguments, one per line', flag: '--node', example: 'people_detect', lines: 2 };
+export const LAUNCH: Field = { key: 'launch', label: 'Launch file of the package, as for roslaunch', flag: '--launch', example: 'my.launch' };
+export const ARGUMENTS: Field = { key: 'args', label: 'Launch arguments, KEY:=VALUE, one per line', flag: '--arg', lines: 2 };
 
 /** What is told of some, by what it is about. */
 export const GROUPS: { title: string; fields: Field[] }[] = [
-  { title: 'Limits of a servant', fields: [
-    { key: 'cpus', label: "Cores that it may use, and is promised; the server's default", flag: '--cpus', example: '1.5' },
-    { key: 'cpu_weight', label: 'Its share when cores are scarce, 1 to 10000; 100 by default', flag: '--cpu-weight', example: '100' },
-    { key: 'cpuset', label: 'Cores that it may run on; all by default', flag: '--cpuset', example: '0-3,6' },
-    { key: 'memory', label: "Memory that it may use, and is promised; the server's default", flag: '--memory', example: '512M' },
-    { key: 'memory_high', label: 'Memory above which it is slowed down', flag: '--memory-high', example: '400M' },
-    { key: 'pids', label: "Processes and threads; the server's default", flag: '--pids', example: '512' },
-    { key: 'io_read', label: 'Bytes a second that it may read from disk', flag: '--io-read', example: '10M' },
-    { key: 'io_write', label: 'Bytes a second that it may write to disk', flag: '--io-write', example: '10M' },
+  { title: 'Limits of an instance (servant)', fields: [
+    { key: 'cpus', label: "CPU limit and reservation, in cores (default: the server's)", flag: '--cpus', example: '1.5' },
+    { key: 'cpu_weight', label: 'CPU share under contention, 1 to 10000 (default: 100)', flag: '--cpu-weight', example: '100' },
+    { key: 'cpuset', label: 'Cores to run on (default: all)', flag: '--cpuset', example: '0-3,6' },
+    { key: 'memory', label: "Memory limit and reservation (default: the server's)", flag: '--memory', example: '512M' },
+    { key: 'memory_high', label: 'Memory above which it is throttled', flag: '--memory-high', example: '400M' },
+    { key: 'pids', label: "Processes and threads (default: the server's)", flag: '--pids', example: '512' },
+    { key: 'io_read', label: 'Disk read limit, bytes per second', flag: '--io-read', example: '10M' },
+    { key: 'io_write', label: 'Disk write limit, bytes per second', flag: '--io-write', example: '10M' },
   ] },
-  { title: 'What robots may ask for, and are promised', fields: [
-    { key: 'max_cpus', label: 'Cores that a robot may ask for at most', flag: '--max-cpus', example: '2' },
-    { key: 'max_memory', label: 'Memory that a robot may ask for at most', flag: '--max-memory', example: '2G' },
-    { key: 'rrt', label: 'T_desire of stubs whose robot promises nothing', flag: '--rrt', example: '100ms' },
-    { key: 'max_rrt', label: 'T_max of such stubs; T_desire by default', flag: '--max-rrt', example: '300ms' },
+  { title: 'What robots may request', fields: [
+    { key: 'max_cpus', label: 'Maximum cores that a robot may request', flag: '--max-cpus', example: '2' },
+    { key: 'max_memory', label: 'Maximum memory that a robot may request', flag: '--max-memory', example: '2G' },
+    { key: 'rrt', label: 'Default target response time (T_desire), for robots that set none', flag: '--rrt', example: '100ms' },
+    { key: 'max_rrt', label: 'Default maximum response time (T_max), for robots that set none (default: T_desire)', flag: '--max-rrt', example: '300ms' },
   ] },
-  { title: 'How it takes the place of the revision before', fields: [
-    { key: 'canary', label: 'Robots that it serves first; all at once by default', flag: '--canary', example: '10%' },
-    { key: 'bound', label: 'By how much a canary may be worse, as a part; 0.1 by default', flag: '--bound', example: '0.1' },
-    { key: 'samples', label: 'Requests of each before they are compared; 20 by default', flag: '--samples', example: '20' },
-    { key: 'promote_after', label: 'Time after which a canary that was not worse stays; when you say so by default', flag: '--promote-after', example: '30m' },
-    { key: 'deadline', label: 'Time until servants of other revisions end; when their robots leave by default', flag: '--deadline', example: '10m' },
+  { title: 'Rollout from the previous revision', fields: [
+    { key: 'canary', label: 'Robots served by it first (default: all at once)', flag: '--canary', example: '10%' },
+    { key: 'bound', label: 'Allowed regression of a canary (default: 0.1 = 10 %)', flag: '--bound', example: '0.1' },
+    { key: 'samples', label: 'Requests to each revision before they are compared (default: 20)', flag: '--samples', example: '20' },
+    { key: 'promote_after', label: 'Promote automatically after (default: only by hand)', flag: '--promote-after', example: '30m' },
+    { key: 'deadline', label: 'Stop servants of other revisions after (default: when their robots leave)', flag: '--deadline', example: '10m' },
   ] },
-  { title: 'Where robots share its servants', fields: [
-    { key: 'min', label: 'Servants that there are at least; 1 by default', flag: '--min', example: '1' },
-    { key: 'max', label: 'Servants that there are at most; 4 by default', flag: '--max', example: '4' },
-    { key: 'replicas', label: 'Servants that work at the same call; 1 by default', flag: '--replicas', example: '2' },
-    { key: 'calls', label: 'Calls that one servant has under way at most; 8 by default', flag: '--calls', example: '8' },
+  { title: 'Servants shared by robots', fields: [
+    { key: 'min', label: 'Minimum servants (default: 1)', flag: '--min', example: '1' },
+    { key: 'max', label: 'Maximum servants (default: 4)', flag: '--max', example: '4' },
+    { key: 'replicas', label: 'Servants that work on the same call (default: 1)', flag: '--replicas', example: '2' },
+    { key: 'calls', label: 'Concurrent calls per servant (default: 8)', flag: '--calls', example: '8' },
   ] },
-  { title: 'What it needs', fields: [
-    { key: 'base', label: "Base image definition; the server's default", flag: '--base' },
-    { key: 'remaps', label: 'Names to remap, FROM:=TO, one a line', flag: '--remap', lines: 2 },
-    { key: 'map', label: 'Dependencies by hand, KEY=DEBIAN-PACKAGE, one a line', flag: '--map', lines: 2 },
-    { key: 'with', label: 'Debian or ROS packages to add, one a line', flag: '--with', lines: 2 },
-    { key: 'interface', label: 'What to add to the interface, as TOML or JSON', flag: '--interface', lines: 3 },
-    { key: 'requests', label: 'Which input is answered by which output, INPUT=OUTPUT, one a line; as found by default', flag: '--request', example: '/image=/boxes', lines: 2 },
-    { key: 'devices', label: 'Devices by their CDI names, one a line; where the operator allows them', flag: '--device', example: 'nvidia.com/gpu=0', lines: 2 },
-    { key: 'volumes', label: 'Directories of the server to read, SOURCE:TARGET, one a line; where allowed', flag: '--volume', lines: 2 },
-    { key: 'egress', label: 'Hosts to reach, HOST:PORT, one a line; where allowed', flag: '--egress', lines: 2 },
+  { title: 'Dependencies and permissions', fields: [
+    { key: 'base', label: "Base image definition (default: the server's)", flag: '--base' },
+    { key: 'remaps', label: 'Names to remap, FROM:=TO, one per line', flag: '--remap', lines: 2 },
+    { key: 'map', label: 'Dependencies mapped by hand, KEY=DEBIAN-PACKAGE, one per line', flag: '--map', lines: 2 },
+    { key: 'with', label: 'Additional Debian or ROS packages, one per line', flag: '--with', lines: 2 },
+    { key: 'interface', label: 'Additional interface, as TOML or JSON', flag: '--interface', lines: 3 },
+    { key: 'requests', label: 'Which output answers which input, INPUT=OUTPUT, one per line (default: as detected)', flag: '--request', example: '/image=/boxes', lines: 2 },
+    { key: 'devices', label: 'Devices by CDI name, one per line; where the operator allows them', flag: '--device', example: 'nvidia.com/gpu=0', lines: 2 },
+    { key: 'volumes', label: 'Server directories to read, SOURCE:TARGET, one per line; where allowed', flag: '--volume', lines: 2 },
+    { key: 'egress', label: 'Hosts to reach, HOST:PORT, one per line; where allowed', flag: '--egress', lines: 2 },
   ] },
 ];
 
@@ -104,7 +104,7 @@ export function options(values: Values, chosen: Chosen): Options {
     const written = text(key);
     if (written === undefined) return undefined;
     const number = Number(written);
-    if (!Number.isFinite(number) || number < 0) throw new Error(`${label}: ${JSON.stringify(written)} is no number`);
+    if (!Number.isFinite(number) || number < 0) throw new Error(`${label}: ${JSON.stringify(written)} is not a number`);
     return number;
   };
   const time = (key: string, label: string) => {
@@ -112,7 +112,7 @@ export function options(values: Values, chosen: Chosen): Options {
     if (written === undefined) return undefined;
     const [, number, unit] = /^([0-9.]+)\s*([a-z]*)$/.exec(written) ?? [];
     const seconds = Number(number) * (SECONDS[unit ?? '?'] ?? NaN);
-    if (!Number.isFinite(seconds)) throw new Error(`${label}: ${JSON.stringify(written)} is no time; write a number with ms, s, m or h, such as 10m`);
+    if (!Number.isFinite(seconds)) throw new Error(`${label}: ${JSON.stringify(written)} is not a time; write a number with ms, s, m or h, such as 10m`);
     return seconds;
   };
   const map = (key: string, sign: string, label: string) => {
@@ -135,7 +135,7 @@ export function options(values: Values, chosen: Chosen): Options {
     params: params.length ? Object.fromEntries(params) : undefined,
     args: chosen.run === 'launch' ? map('args', ':=', 'Arguments') : undefined,
     remaps: map('remaps', ':=', 'Remapped names'),
-    map: map('map', '=', 'Dependencies by hand'),
+    map: map('map', '=', 'Dependencies mapped by hand'),
     with: list(values.with),
     interface: text('interface'),
     requests: list(values.requests),

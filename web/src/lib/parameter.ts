@@ -6,14 +6,14 @@ export function kind(text: string): { kind?: string; wrong?: string } {
   try {
     value = JSON.parse(text);
   } catch (error) {
-    return { wrong: `this is no JSON (a text stands in "quotes"): ${(error as Error).message}` };
+    return { wrong: `not valid JSON (strings need "quotes"): ${(error as Error).message}` };
   }
-  if (value === null) return { wrong: 'null is no value of a parameter; remove the parameter instead' };
+  if (value === null) return { wrong: 'a parameter cannot be null; remove it instead' };
   if (Array.isArray(value)) return { kind: 'a list' };
   switch (typeof value) {
     case 'boolean': return { kind: 'true or false' };
-    case 'string': return { kind: 'a text' };
-    case 'number': return { kind: /[.eE]/.test(text) ? 'a number with a fraction' : 'a whole number' };
+    case 'string': return { kind: 'a string' };
+    case 'number': return { kind: /[.eE]/.test(text) ? 'a floating-point number' : 'an integer' };
     default: return { kind: 'a dictionary' };
   }
 }

@@ -76,7 +76,7 @@ function scaled({ width, height, encoding, is_bigendian, step, data }: Image, by
     out[to + 3] = 255;
   }
   if (!depth) return '';
-  if (most < least) return ': no depth is known';
+  if (most < least) return ': no valid depth';
   const metres = (one: number) => (encoding === '16UC1' ? one / 1000 : one).toFixed(2);
   return `: depths of ${metres(least)} m (black) to ${metres(most)} m (white); blue: unknown`;
 }

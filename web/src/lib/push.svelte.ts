@@ -77,11 +77,11 @@ class Push {
     this.#stop = stop;
     try {
       const query = encodeURIComponent(JSON.stringify(options));
-      if (query.length > LONGEST) throw Problem.here(`the options are ${query.length} bytes long, which is too much`, 'shorten the interface or the parameters');
+      if (query.length > LONGEST) throw Problem.here(`the options are ${query.length} bytes long, too many for one request`, 'shorten the interface or the parameters');
       // The first word of the daemon ends the sending.
       const gone = (done: number, total: number) => { if (this.steps.length === 1) this.progress = { unit: 'bytes', done, total }; };
       for await (const line of exchanged(`/push?options=${query}`, body, stop.signal, gone)) if (line) this.#take(JSON.parse(line));
-      if (!this.done && !this.problem) throw Problem.here('the daemon broke off', 'see its log, and whether it runs');
+      if (!this.done && !this.problem) throw Problem.here('the daemon closed the connection', 'check that it is running, and see its log');
     } catch (error) {
       if (stop.signal.aborted) this.cancelled = true;
       else this.problem = error;

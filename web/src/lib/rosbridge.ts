@@ -29,9 +29,9 @@ export interface Hearing {
 
 /** What to do about what was refused, or has failed, inside. */
 function refusal(words: string): Problem {
-  if (words.includes('not granted')) return Problem.here(words, 'to see a service is to listen there: ask its operator to do this, or for a rule that grants it (Access, Policy)');
-  if (/no definition|not known|does not exist|not advertised/.test(words)) return Problem.here(words, 'see what there is in the lists of this page');
-  return Problem.here(words, 'correct what was sent, and see what the node says of it in the servant’s log');
+  if (words.includes('not granted')) return Problem.here(words, 'viewers can listen only: ask an operator to do this, or for a rule that grants it (Access, Policy)');
+  if (/no definition|not known|does not exist|not advertised/.test(words)) return Problem.here(words, 'choose one from the lists on this page');
+  return Problem.here(words, 'correct the request, and see the node’s messages in the servant’s log');
 }
 
 export class Rosbridge {
@@ -55,7 +55,7 @@ export class Rosbridge {
     this.ready = new Promise((resolve, reject) => {
       this.#socket.onopen = () => resolve();
       this.#socket.onclose = (event) => {
-        const problem = Problem.here(event.reason || 'the connection into the servant was refused or lost', 'who you are must be allowed to see its service, and few pages may look into one servant at once; load the page again to try once more');
+        const problem = Problem.here(event.reason || 'the connection to the servant was refused or lost', 'you need permission to see its service, and only a few pages can look into a servant at once; reload the page to try again');
         for (const { reject } of this.#calls.values()) reject(problem);
         this.#calls.clear();
         reject(problem);
@@ -75,7 +75,7 @@ export class Rosbridge {
       this.#goals.delete(id);
       const good = message.result === true && message.status === 4;
       if (message.result !== true && typeof message.values === 'string') goal?.refused(refusal(message.values));
-      else goal?.result(ENDS[message.status as number] ?? 'did not come to an end', message.values, good);
+      else goal?.result(ENDS[message.status as number] ?? 'did not finish', message.values, good);
     } else if (message.op === 'service_response') {
       const call = this.#calls.get(id);
       this.#calls.delete(id);

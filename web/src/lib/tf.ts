@@ -66,14 +66,14 @@ export class Frames {
       }
       if (at !== undefined && way.includes(at)) {
         const loop = way.slice(way.indexOf(at)).reverse();
-        said.push(`${[...loop, loop[0]].join(' → ')} is a loop: none of these has a place`);
+        said.push(`${[...loop, loop[0]].join(' → ')} is a loop: these frames have no position`);
       }
       for (const name of way) seen.add(name);
     }
     const roots = this.roots();
-    if (roots.length > 1) said.push(`${roots.join(', ')}: nothing relates these to each other`);
+    if (roots.length > 1) said.push(`${roots.join(', ')}: no transform connects these frames`);
     for (const { name, parent, others } of [...this.frames.values()].sort((a, b) => (a.name < b.name ? -1 : 1))) {
-      if (others.length) said.push(`${name} is given the parents ${[parent, ...others].sort().join(' and ')}: its place jumps between them`);
+      if (others.length) said.push(`${name} has the parents ${[parent, ...others].sort().join(' and ')}: its position jumps between them`);
     }
     return said;
   }

@@ -4,43 +4,43 @@ use std::net::{SocketAddr, TcpListener};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_report::Report;
+use bench_report::BenchReport;
 use support::daemon::Daemon;
 use support::robot::Robot;
 use tokio_tungstenite::tungstenite;
 
-use super::joined;
+use super::join_thread;
 use crate::greeters;
 
-/// How long they do, from so many threads.
+/// Duration of the load, and number of threads that create it.
 const TIME: Duration = Duration::from_secs(5);
 const THREADS: usize = 4;
 
-/// Robots that connect and leave, a second.
+/// Robots that connect and leave, per second.
 #[derive(Debug)]
-pub(super) struct Coming {
+pub(super) struct ConnectResult {
     daemon: f64,
     bare: f64,
 }
 
-pub(super) fn measure(daemon: &Daemon) -> Result<Coming> {
+pub(super) fn measure(daemon: &Daemon) -> Result<ConnectResult> {
     let bare = accept_upgrades()?;
-    Ok(Coming {
-        daemon: connections_a_second(&daemon.address, &greeters::path("crowd"))?,
-        bare: connections_a_second(&bare.to_string(), "")?,
+    Ok(ConnectResult {
+        daemon: connections_per_second(&daemon.address, &greeters::robot_path("crowd"))?,
+        bare: connections_per_second(&bare.to_string(), "")?,
     })
 }
 
-impl Coming {
-    pub(super) fn tell(&self, report: &mut Report) {
+impl ConnectResult {
+    pub(super) fn add_figures(&self, report: &mut BenchReport) {
         report
             .figure("robots that connect and leave", "/s", self.daemon)
-            .beside("a WebSocket server with nothing behind it", self.bare)
+            .relative_to("a WebSocket server with nothing behind it", self.bare)
             .note(format!("{THREADS} at a time"));
     }
 }
 
-/// Accepts upgrades, and nothing else, until this program ends.
+/// Starts a server that accepts upgrades, and nothing else, until this program ends.
 fn accept_upgrades() -> Result<SocketAddr> {
     let listener = TcpListener::bind("127.0.0.1:0")?;
     let address = listener.local_addr()?;
@@ -56,20 +56,22 @@ fn accept_upgrades() -> Result<SocketAddr> {
     Ok(address)
 }
 
-fn connections_a_second(address: &str, path: &str) -> Result<f64> {
+fn connections_per_second(address: &str, path: &str) -> Result<f64> {
     let url = format!("ws://{address}/{path}");
     let began = Instant::now();
     let come = || -> Result<u32> {
         let mut count = 0;
         while began.elapsed() < TIME {
-            Robot::connect(&url)?.leaves()?;
+            Robot::connect(&url)?.leave()?;
             count += 1;
         }
         Ok(count)
     };
     let counts = std::thread::scope(|scope| {
         let all: Vec<_> = (0..THREADS).map(|_| scope.spawn(come)).collect();
-        all.into_iter().map(joined).collect::<Result<Vec<u32>>>()
+        all.into_iter()
+            .map(join_thread)
+            .collect::<Result<Vec<u32>>>()
     })?;
     Ok(f64::from(counts.iter().sum::<u32>()) / began.elapsed().as_secs_f64())
 }

@@ -1,56 +1,56 @@
-//! Connections that say nothing.
+//! Idle connections.
 
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use support::daemon::Daemon;
 
-use crate::crowd::Crowd;
+use crate::crowd::IdleCrowd;
 use crate::greeters::{self, SILENCE};
-use crate::milliseconds::part;
+use crate::milliseconds::quantile;
 use crate::resources::Resources;
 
-/// So many.
+/// Number of idle connections.
 const IDLE: usize = 1000;
-/// Between another robot's calls.
+/// Interval between the calls of another robot.
 const PACE: Duration = Duration::from_millis(50);
 
-/// A thousand that say nothing.
+/// Results with a thousand idle connections.
 #[derive(Debug)]
-pub(super) struct Idle {
+pub(super) struct IdleResult {
     answered: usize,
-    /// Kilobytes of the daemon's memory for each.
+    /// Memory of the daemon per connection, in kilobytes.
     kilobytes: f64,
-    /// Times of another robot's calls without them and beside them.
+    /// Durations of another robot's calls without the idle connections and with them.
     alone: Vec<Duration>,
     beside: Vec<Duration>,
 }
 
-pub(super) fn measure(daemon: &Daemon) -> Result<Idle> {
-    let alone = call_for(daemon, SILENCE / 2)?;
-    let before = Resources::of(daemon.pid())?;
-    let crowd = Crowd::connect(&daemon.url(&greeters::path("crowd")), IDLE)?;
-    // Longer than who answers no pings is let stay.
-    let beside = call_for(daemon, SILENCE * 3 / 2)?;
-    let grown = Resources::of(daemon.pid())?.anonymous - before.anonymous;
-    Ok(Idle {
-        answered: crowd.ask()?,
+pub(super) fn measure(daemon: &Daemon) -> Result<IdleResult> {
+    let alone = time_calls(daemon, SILENCE / 2)?;
+    let before = Resources::read(daemon.pid())?;
+    let crowd = IdleCrowd::connect(&daemon.url(&greeters::robot_path("crowd")), IDLE)?;
+    // Longer than the time after which clients that answer no pings are disconnected.
+    let beside = time_calls(daemon, SILENCE * 3 / 2)?;
+    let grown = Resources::read(daemon.pid())?.anonymous - before.anonymous;
+    Ok(IdleResult {
+        answered: crowd.ask_and_leave()?,
         kilobytes: grown * 1e3 / IDLE as f64,
         alone,
         beside,
     })
 }
 
-impl Idle {
-    pub(super) fn tell(&self, report: &mut Report) {
+impl IdleResult {
+    pub(super) fn add_figures(&self, report: &mut BenchReport) {
         report
             .figure(
                 format!("idle WebSockets of {IDLE} that are answered"),
                 "",
                 self.answered as f64,
             )
-            .reach(Target::AtLeast(IDLE as f64))
+            .require(Target::AtLeast(IDLE as f64))
             .note(format!(
                 "after {:?}; {:.0} kB of the daemon's memory for each",
                 SILENCE * 3 / 2,
@@ -60,26 +60,26 @@ impl Idle {
             .figure(
                 format!("a call beside {IDLE} idle WebSockets, p99"),
                 "ms",
-                part(&self.beside, 0.99),
+                quantile(&self.beside, 0.99),
             )
-            .beside("without them", part(&self.alone, 0.99))
-            .reach(Target::RatioAtMost(2.0))
+            .relative_to("without them", quantile(&self.alone, 0.99))
+            .require(Target::RatioAtMost(2.0))
             .note(format!(
                 "p50 {:.2} ms beside {:.2} ms",
-                part(&self.beside, 0.5),
-                part(&self.alone, 0.5)
+                quantile(&self.beside, 0.5),
+                quantile(&self.alone, 0.5)
             ));
     }
 }
 
-/// Calls as another robot again and again for a while; returns how long each took.
-fn call_for(daemon: &Daemon, time: Duration) -> Result<Vec<Duration>> {
-    let mut robot = daemon.robot(&greeters::path("polite"))?;
-    greeters::count(&mut robot)?;
+/// Calls as another robot for `time`; returns the duration of each call.
+fn time_calls(daemon: &Daemon, time: Duration) -> Result<Vec<Duration>> {
+    let mut robot = daemon.robot(&greeters::robot_path("polite"))?;
+    greeters::greeting_count(&mut robot)?;
     let (began, mut times) = (Instant::now(), Vec::new());
     while began.elapsed() < time {
         let asked = Instant::now();
-        greeters::count(&mut robot)?;
+        greeters::greeting_count(&mut robot)?;
         times.push(asked.elapsed());
         std::thread::sleep(PACE);
     }

@@ -3,110 +3,113 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail};
-use bench_report::{Report, Target};
+use bench_report::{BenchReport, Target};
 use serde_json::json;
 use support::daemon::Daemon;
 use support::robot::Robot;
 
-use super::joined;
+use super::join_thread;
 use crate::greeters;
-use crate::milliseconds::part;
+use crate::milliseconds::quantile;
 use crate::resources::Resources;
 
-/// So many. They answer no pings, either, and are let go for that: what is published for them is, before that.
+/// Number of clients that never read. They do not answer pings either and are disconnected for that, but the messages
+/// are published before.
 const READERS: usize = 100;
 const TIME: Duration = Duration::from_secs(6);
-/// The robot whose they are.
+/// Robot to which they belong.
 const UNREAD: &str = "unread";
-/// A message, in bytes, and the pause after each. Some ten of them wait for each reader and count as its client's, who publishes, too: were
-/// they larger, it would be let go for that.
+/// Size of a message in bytes, and the pause after each. About ten messages are queued for each reader and count
+/// against the memory budget of their client, which is the publisher as well: larger ones would cause its
+/// disconnection.
 const MESSAGE: usize = 1 << 16;
 const PACE: Duration = Duration::from_millis(50);
-/// Megabytes of the default budget of a client, which these are together; see `benches/memory` for what a process takes beside it.
+/// Default memory budget of a client, which all these connections share, in megabytes; see `benches/memory` for the
+/// further memory of a process.
 const CLIENT: f64 = 268.0;
 const OVERHEAD: f64 = 1.5;
 
-/// A hundred that never read.
+/// Results with a hundred clients that never read.
 #[derive(Debug)]
-pub(super) struct Unread {
-    /// Resident megabytes of the daemon before they were there.
+pub(super) struct UnreadResult {
+    /// Resident memory of the daemon before they connected, in megabytes.
     before: f64,
-    for_nobody: Published,
-    for_readers: Published,
+    for_nobody: PublishingSample,
+    for_readers: PublishingSample,
 }
 
-/// What was seen while something was published.
+/// Measurements made while messages were published.
 #[derive(Debug)]
-struct Published {
+struct PublishingSample {
     messages: u32,
-    /// Times of another robot's calls.
+    /// Durations of another robot's calls.
     times: Vec<Duration>,
-    /// Resident megabytes of the daemon, at most.
+    /// Peak resident memory of the daemon, in megabytes.
     most: f64,
 }
 
-pub(super) fn measure(daemon: &Daemon) -> Result<Unread> {
-    let path = greeters::path(UNREAD);
-    let for_nobody = publish_beside(daemon)?;
+pub(super) fn measure(daemon: &Daemon) -> Result<UnreadResult> {
+    let path = greeters::robot_path(UNREAD);
+    let for_nobody = publish_and_call(daemon)?;
     let mut readers = Vec::new();
     for _ in 0..READERS {
-        let mut reader = Robot::on_a_short_line(&daemon.url(&path), &[])?;
-        reader.subscribes("/unread")?;
-        reader.calls("/rosapi/get_time", json!({}))?;
+        let mut reader = Robot::connect_with_small_buffer(&daemon.url(&path), &[])?;
+        reader.subscribe("/unread")?;
+        reader.call("/rosapi/get_time", json!({}))?;
         readers.push(reader);
     }
-    let before = Resources::of(daemon.pid())?.resident;
-    let for_readers = publish_beside(daemon)?;
-    Ok(Unread {
+    let before = Resources::read(daemon.pid())?.resident;
+    let for_readers = publish_and_call(daemon)?;
+    Ok(UnreadResult {
         before,
         for_nobody,
         for_readers,
     })
 }
 
-/// Publishes for a while, and calls as another robot meanwhile.
-fn publish_beside(daemon: &Daemon) -> Result<Published> {
-    let mut publisher = daemon.robot(&greeters::path(UNREAD))?;
-    publisher.says(json!({"op": "advertise", "topic": "/unread", "type": "std_msgs/String"}))?;
-    publisher.calls("/rosapi/get_time", json!({}))?;
+/// Publishes for a while and makes calls as another robot meanwhile.
+fn publish_and_call(daemon: &Daemon) -> Result<PublishingSample> {
+    let mut publisher = daemon.robot(&greeters::robot_path(UNREAD))?;
+    publisher.send(json!({"op": "advertise", "topic": "/unread", "type": "std_msgs/String"}))?;
+    publisher.call("/rosapi/get_time", json!({}))?;
     let message =
         json!({"op": "publish", "topic": "/unread", "msg": {"data": "x".repeat(MESSAGE)}});
-    let mut robot = daemon.robot(&greeters::path("polite"))?;
-    greeters::count(&mut robot)?;
+    let mut robot = daemon.robot(&greeters::robot_path("polite"))?;
+    greeters::greeting_count(&mut robot)?;
     let (began, mut times, mut most) = (Instant::now(), Vec::new(), 0.0_f64);
     let publish = || -> Result<u32> {
         let mut messages = 0;
         while began.elapsed() < TIME {
-            if let Err(error) = publisher.says(message.clone()) {
-                bail!("{error:#}: {:?}", publisher.hears_close());
+            if let Err(error) = publisher.send(message.clone()) {
+                bail!("{error:#}: {:?}", publisher.wait_for_close());
             }
             messages += 1;
             std::thread::sleep(PACE);
         }
-        // Its connection stands, and the daemon has taken all of it.
-        publisher.calls("/rosapi/get_time", json!({}))?;
+        // The publisher is still connected, and the daemon has received all its messages.
+        publisher.call("/rosapi/get_time", json!({}))?;
         Ok(messages)
     };
     let messages = std::thread::scope(|scope| {
         let publishing = scope.spawn(publish);
         while began.elapsed() < TIME {
             let asked = Instant::now();
-            greeters::count(&mut robot)?;
+            greeters::greeting_count(&mut robot)?;
             times.push(asked.elapsed());
-            most = most.max(Resources::of(daemon.pid())?.resident);
+            most = most.max(Resources::read(daemon.pid())?.resident);
         }
-        joined(publishing)
+        join_thread(publishing)
     })?;
-    Ok(Published {
+    Ok(PublishingSample {
         messages,
         times,
         most,
     })
 }
 
-impl Unread {
-    pub(super) fn tell(&self, report: &mut Report) {
-        let Published {
+impl UnreadResult {
+    pub(super) fn add_figures(&self, report: &mut BenchReport) {
+        let PublishingSample {
             messages,
             times,
             most,
@@ -117,8 +120,8 @@ impl Unread {
                 "MB",
                 *most,
             )
-            .beside("before they were there", self.before)
-            .reach(Target::AtMost((self.before + OVERHEAD * CLIENT).round()))
+            .relative_to("before they were there", self.before)
+            .require(Target::AtMost((self.before + OVERHEAD * CLIENT).round()))
             .note(format!(
                 "resident; {messages} messages of {MESSAGE} bytes were published"
             ));
@@ -126,16 +129,16 @@ impl Unread {
             .figure(
                 format!("a call beside {READERS} clients that never read, p99"),
                 "ms",
-                part(times, 0.99),
+                quantile(times, 0.99),
             )
-            .beside(
+            .relative_to(
                 "while the same is published for nobody",
-                part(&self.for_nobody.times, 0.99),
+                quantile(&self.for_nobody.times, 0.99),
             )
             .note(format!(
                 "p50 {:.2} ms beside {:.2} ms",
-                part(times, 0.5),
-                part(&self.for_nobody.times, 0.5)
+                quantile(times, 0.5),
+                quantile(&self.for_nobody.times, 0.5)
             ));
     }
 }

@@ -1,4 +1,4 @@
-//! Twenty robots by what they do, and an operator who looks.
+//! The load: twenty robots of several kinds, and an operator who queries the API.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,40 +21,40 @@ const TALKERS: usize = 4;
 const RETURNERS: usize = 4;
 const NAMELESS: usize = 2;
 const LINKED: usize = 2;
-/// Between two things that one of them does.
+/// Interval between two actions of a robot.
 const PACE: Duration = Duration::from_millis(100);
-/// The same for who comes again, or comes without a name and is given a servant for itself.
+/// Interval for robots that return, or have no name and are given a servant of their own.
 const VISIT: Duration = Duration::from_secs(2);
-/// The same for an operator.
+/// Interval for the operator.
 const LOOK: Duration = Duration::from_secs(1);
-/// Bytes of what a talker publishes and hears again.
+/// Size in bytes of a message that a talker publishes and receives.
 const MESSAGE: usize = 100_000;
 
-/// What they have come to.
+/// Results of all robots.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     pub(super) done: u64,
-    /// What failed, in words.
+    /// Failures, in words.
     pub(super) failures: Vec<String>,
-    /// Callers' calls: when each was made, and how long it took.
-    pub(super) calls: Vec<Call>,
+    /// Calls of the callers: time and duration.
+    pub(super) calls: Vec<CallSample>,
 }
 
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Call {
+pub(super) struct CallSample {
     pub(super) made: Instant,
     pub(super) took: Duration,
 }
 
-/// All of them at work.
-pub(super) struct Load<'a> {
+/// All robots at work.
+pub(super) struct MixedLoad<'a> {
     daemon: &'a Daemon,
     over: AtomicBool,
     tally: Mutex<Tally>,
 }
 
-impl<'a> Load<'a> {
-    pub(super) fn of(daemon: &'a Daemon) -> Self {
+impl<'a> MixedLoad<'a> {
+    pub(super) fn new(daemon: &'a Daemon) -> Self {
         Self {
             daemon,
             over: AtomicBool::new(false),
@@ -62,41 +62,41 @@ impl<'a> Load<'a> {
         }
     }
 
-    /// Has all of them work, each in a thread of its own, until [`Load::end`].
+    /// Starts all robots, each on a thread of its own; they work until [`MixedLoad::end`].
     pub(super) fn start<'scope>(&'scope self, scope: &'scope Scope<'scope, '_>) {
         for number in 0..CALLERS {
-            scope.spawn(move || self.call(&format!("caller-{number}")));
+            scope.spawn(move || self.run_caller(&format!("caller-{number}")));
         }
         for number in 0..TALKERS {
-            scope.spawn(move || self.talk(&format!("talker-{number}")));
+            scope.spawn(move || self.run_talker(&format!("talker-{number}")));
         }
         for number in 0..RETURNERS {
-            scope.spawn(move || self.come_again(&format!("returner-{number}")));
+            scope.spawn(move || self.run_returner(&format!("returner-{number}")));
         }
         for _ in 0..NAMELESS {
-            scope.spawn(|| self.come_once());
+            scope.spawn(|| self.run_visitor());
         }
         scope.spawn(|| {
-            if let Err(error) = self.link() {
+            if let Err(error) = self.run_links() {
                 self.fail("robots with stubs", &error);
             }
         });
-        scope.spawn(|| self.look());
+        scope.spawn(|| self.run_operator());
     }
 
-    /// Says that it is over.
+    /// Ends the load.
     pub(super) fn end(&self) {
         self.over.store(true, Ordering::Relaxed);
     }
 
-    /// What they had come to in the end.
+    /// Returns the results.
     pub(super) fn into_tally(self) -> Result<Tally> {
         self.tally
             .into_inner()
             .map_err(|_| anyhow!("a robot panicked"))
     }
 
-    fn note(&self, note: impl FnOnce(&mut Tally)) {
+    fn record(&self, note: impl FnOnce(&mut Tally)) {
         if let Ok(mut tally) = self.tally.lock() {
             note(&mut tally);
         }
@@ -104,21 +104,21 @@ impl<'a> Load<'a> {
 
     fn fail(&self, who: &str, error: &anyhow::Error) {
         eprintln!("{who}: {error:#}");
-        self.note(|tally| tally.failures.push(format!("{who}: {error:#}")));
+        self.record(|tally| tally.failures.push(format!("{who}: {error:#}")));
     }
 
-    /// Does something again and again until it is over.
+    /// Repeats an action until the load ends.
     fn repeat(&self, who: &str, pause: Duration, mut act: impl FnMut() -> Result<()>) {
         while !self.over.load(Ordering::Relaxed) {
             match act() {
-                Ok(()) => self.note(|tally| tally.done += 1),
+                Ok(()) => self.record(|tally| tally.done += 1),
                 Err(error) => self.fail(who, &error),
             }
             std::thread::sleep(pause);
         }
     }
 
-    /// The same by one connection, for as long as that works.
+    /// Repeats an action on one connection for as long as that works.
     fn repeat_connected(
         &self,
         robot: &str,
@@ -130,7 +130,7 @@ impl<'a> Load<'a> {
             let mut connected = match connection.take() {
                 Some(connected) => connected,
                 None => {
-                    let mut connected = self.connect(&greeters::path(robot))?;
+                    let mut connected = self.connect(&greeters::robot_path(robot))?;
                     begin(&mut connected)?;
                     connected
                 }
@@ -145,22 +145,22 @@ impl<'a> Load<'a> {
         Robot::connect(&self.daemon.url(path))
     }
 
-    /// Calls the service, says whom to greet, sets a parameter and asks for topics.
-    fn call(&self, robot: &str) {
+    /// Calls the service, publishes a name, sets a parameter and queries topics.
+    fn run_caller(&self, robot: &str) {
         let begin = |robot: &mut Robot| {
-            robot.says(
+            robot.send(
                 json!({"op": "advertise", "topic": "/greeter/name", "type": "std_msgs/String"}),
             )
         };
         self.repeat_connected(robot, begin, |robot| {
             let made = Instant::now();
-            greeters::count(robot)?;
+            greeters::greeting_count(robot)?;
             let took = made.elapsed();
-            self.note(|tally| tally.calls.push(Call { made, took }));
-            robot.says(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
+            self.record(|tally| tally.calls.push(CallSample { made, took }));
+            robot.send(json!({"op": "publish", "topic": "/greeter/name", "msg": {"data": "x"}}))?;
             let set = json!({"name": "/kept", "value": "[1, 2]"});
-            let set = robot.calls("/rosapi/set_param", set)?;
-            let topics = robot.calls("/rosapi/topics", json!({}))?;
+            let set = robot.call("/rosapi/set_param", set)?;
+            let topics = robot.call("/rosapi/topics", json!({}))?;
             ensure!(
                 set["result"] == true && topics["result"] == true,
                 "{set} {topics}"
@@ -169,55 +169,55 @@ impl<'a> Load<'a> {
         });
     }
 
-    /// Hears what it publishes, which is much.
-    fn talk(&self, robot: &str) {
+    /// Receives its own publications, which are large.
+    fn run_talker(&self, robot: &str) {
         let begin = |robot: &mut Robot| {
-            robot.says(json!({"op": "advertise", "topic": "/talk", "type": "std_msgs/String"}))?;
-            robot.subscribes("/talk")
+            robot.send(json!({"op": "advertise", "topic": "/talk", "type": "std_msgs/String"}))?;
+            robot.subscribe("/talk")
         };
         let message =
             json!({"op": "publish", "topic": "/talk", "msg": {"data": "x".repeat(MESSAGE)}});
         self.repeat_connected(robot, begin, |robot| {
             let is_it = |heard: &serde_json::Value| heard["topic"] == "/talk";
-            robot.says_until(&message, "its own words", is_it)?;
+            robot.send_until(&message, "its own words", is_it)?;
             Ok(())
         });
     }
 
-    /// Leaves, and comes again to what it had subscribed to.
-    fn come_again(&self, robot: &str) {
-        let path = format!("{}&resume=a-secret-of-{robot}", greeters::path(robot));
+    /// Leaves and resumes its session with the previous subscriptions.
+    fn run_returner(&self, robot: &str) {
+        let path = format!("{}&resume=a-secret-of-{robot}", greeters::robot_path(robot));
         self.repeat(robot, VISIT, || {
             let mut robot = self.connect(&path)?;
-            robot.subscribes("/greeter/greeting")?;
-            greeters::count(&mut robot)?;
-            robot.leaves()
+            robot.subscribe("/greeter/greeting")?;
+            greeters::greeting_count(&mut robot)?;
+            robot.leave()
         });
     }
 
-    /// Comes without a name, so that its servant ends when it leaves.
-    fn come_once(&self) {
+    /// Connects without a name, so that its servant ends when it leaves.
+    fn run_visitor(&self) {
         self.repeat("a robot without a name", VISIT, || {
             let mut robot = self.connect(greeters::SERVICE)?;
-            greeters::count(&mut robot)?;
-            robot.leaves()
+            greeters::greeting_count(&mut robot)?;
+            robot.leave()
         });
     }
 
-    /// Calls by stubs.
-    fn link(&self) -> Result<()> {
+    /// Makes calls through stubs.
+    fn run_links(&self) -> Result<()> {
         let (site, twin) = (Site::new()?, Twin::greeter(RosVersion::One));
         let app = site.node("/app")?;
-        let ask = |number: usize| twins::count(&site, &app, &format!("/link{number}"));
+        let ask = |number: usize| twins::greeting_count(&site, &app, &format!("/link{number}"));
         let mut stubs = Vec::new();
         for number in 0..LINKED {
             let argv = twin.argv(&format!("link{number}"), &[]);
             let robot = format!("soaked-{number}");
             let stub = twin.stub(&site, (&self.daemon.address, &robot), "", &argv)?;
-            support::until("a link", || {
+            support::wait_until("a link", || {
                 Ok(ask(number).map_err(|error| format!("{error:#}")))
             })
-            .with_context(|| stub.said())?;
+            .with_context(|| stub.output())?;
             stubs.push(stub);
         }
         self.repeat("robots with stubs", PACE, || {
@@ -226,8 +226,8 @@ impl<'a> Load<'a> {
         Ok(())
     }
 
-    /// Looks at all there is to see.
-    fn look(&self) {
+    /// Queries everything that the API offers.
+    fn run_operator(&self) {
         let paths = ["status", "services", "servants", "events?limit=100"];
         self.repeat("an operator", LOOK, || {
             for path in paths {

@@ -1,5 +1,5 @@
-//! What the servant's node received of pictures whose codec loses something: `cloudroidctl record` hears it in the servant, and each picture
-//! is compared with the one that was sent.
+//! Images that the servant's node received with a lossy codec: `cloudroidctl record` records them in the servant, and
+//! each one is compared with the image that was sent.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -14,59 +14,60 @@ use serde::{Deserialize, Serialize};
 use support::binaries;
 use support::daemon::Daemon;
 
-use super::{CLASS, PACKAGE, Sources, What, plan};
+use super::{CLASS, PACKAGE, StreamSources, StreamSpec, robot_plan};
 use crate::deadline;
-use crate::place::Place;
-use crate::recording::{Recording, header};
+use crate::place::RobotSandbox;
+use crate::recording::{Recording, read_header};
 use crate::robot::{FIRST, WARM_UP};
 use crate::statistics::psnr;
 
-/// Between two tries to record a servant that is not there yet.
+/// Interval between attempts to record a servant that does not exist yet.
 const AGAIN: Duration = Duration::from_millis(200);
-/// For a recording to end that was asked to.
+/// Maximum time for a recording to end after it was asked to.
 const END: Duration = Duration::from_secs(60);
-/// Bytes of a picture.
+/// Bytes of an image.
 const PIXELS: usize = 640 * 480 * 3;
 
-/// Pictures as they came.
+/// Quality of the received images.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct Received {
-    /// Of each picture that has changed, dB.
+pub(super) struct ReceivedPictures {
+    /// Peak signal-to-noise ratio of each image that has changed, in dB.
     pub(super) psnr: Vec<f64>,
-    /// Pictures that came as they were sent.
+    /// Number of images that arrived unchanged.
     pub(super) exact: usize,
 }
 
-/// Sends such a stream, and hears it in the servant.
-pub(super) fn measure(sources: &Sources, what: &What) -> Result<Received> {
+/// Sends such a stream and records it in the servant.
+pub(super) fn measure(sources: &StreamSources, what: &StreamSpec) -> Result<ReceivedPictures> {
     let workshop = sources.workshop;
     let directory = workshop.directory()?;
-    let plan = plan(sources, what, directory.path())?;
+    let plan = robot_plan(sources, what, directory.path())?;
     let file = directory.path().join("received.mcap");
-    let place = Place::new(&workshop.daemon.address, CLASS, what.network)?;
+    let place = RobotSandbox::new(&workshop.daemon.address, CLASS, what.network)?;
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
-        let recorder = scope.spawn(|| records(workshop.daemon, &file, &over));
-        let ran = place.runs(&plan, directory.path());
+        let recorder = scope.spawn(|| start_recording(workshop.daemon, &file, &over));
+        let ran = place.run(&plan, directory.path());
         over.store(true, Ordering::Relaxed);
         let recorder = recorder.join().expect("the thread does not panic");
-        let ended = recorder.and_then(ends);
+        let ended = recorder.and_then(stop_recording);
         ran?;
         ended
     })?;
     let recording = Recording::read(&plan.recording)?;
     let steps = recording.steps(&plan.request);
-    let mut reader = ::recording::Reader::open(&file)?;
-    let mut received = Received::default();
+    let mut reader = ::recording::RecordingReader::open(&file)?;
+    let mut received = ReceivedPictures::default();
     while let Some(played) = reader.next_message()? {
-        let number = header(&played.message).and_then(|header| header.stamp.0.checked_sub(FIRST));
+        let number =
+            read_header(&played.message).and_then(|header| header.stamp.0.checked_sub(FIRST));
         let Some(number) = number.map(|number| number as usize) else {
             continue;
         };
         if number >= what.length.settle && played.topic == plan.request {
             let step = steps.get(WARM_UP + number);
             let sent = step.context("a picture that was never sent")?;
-            received.adds(&sent.request.bytes, &played.message)?;
+            received.add(&sent.request.bytes, &played.message)?;
         }
     }
     ensure!(
@@ -76,8 +77,8 @@ pub(super) fn measure(sources: &Sources, what: &What) -> Result<Received> {
     Ok(received)
 }
 
-impl Received {
-    fn adds(&mut self, sent: &[u8], came: &[u8]) -> Result<()> {
+impl ReceivedPictures {
+    fn add(&mut self, sent: &[u8], came: &[u8]) -> Result<()> {
         let pixels = |message: &[u8]| {
             let begin = message.len().checked_sub(PIXELS);
             begin.map(|begin| message[begin..].to_vec())
@@ -92,8 +93,8 @@ impl Received {
     }
 }
 
-/// Starts to record, once there is a servant.
-fn records(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
+/// Starts the recording as soon as there is a servant.
+fn start_recording(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
     loop {
         let mut child = Command::new(binaries::path("cloudroidctl"))
             .args(["record", PACKAGE, "--topic", "/image", "-o"])
@@ -107,12 +108,12 @@ fn records(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
         let mut said = BufReader::new(child.stderr.take().context("piped")?);
         let mut line = String::new();
         said.read_line(&mut line)?;
-        if line.contains("Ctrl-C ends it") {
-            // Nobody waits for the rest, and a full pipe would stop it.
+        if line.contains("stop with Ctrl-C") {
+            // The remaining output is discarded, because a full pipe would block the program.
             std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
             return Ok(child);
         }
-        // Whatever else it said, it does not record.
+        // With any other output, it does not record.
         let _ = child.kill();
         child.wait()?;
         ensure!(
@@ -124,10 +125,10 @@ fn records(daemon: &Daemon, file: &Path, over: &AtomicBool) -> Result<Child> {
     }
 }
 
-/// Ends the recording as Ctrl-C does.
-fn ends(mut child: Child) -> Result<()> {
+/// Ends the recording with SIGINT, as Ctrl-C does.
+fn stop_recording(mut child: Child) -> Result<()> {
     kill(Pid::from_raw(i32::try_from(child.id())?), Signal::SIGINT)?;
-    let status = deadline::ends(&mut child, "cloudroidctl record", END)?;
+    let status = deadline::wait_for_exit(&mut child, "cloudroidctl record", END)?;
     ensure!(status.success(), "cloudroidctl record ended with {status}");
     Ok(())
 }
@@ -139,12 +140,12 @@ mod tests {
     #[test]
     fn exact_pictures_have_no_noise() {
         let picture = |shade: u8| [vec![7; 60], vec![shade; PIXELS]].concat();
-        let mut received = Received::default();
-        received.adds(&picture(9), &picture(9)).expect("pictures");
-        received.adds(&picture(9), &picture(10)).expect("pictures");
+        let mut received = ReceivedPictures::default();
+        received.add(&picture(9), &picture(9)).expect("pictures");
+        received.add(&picture(9), &picture(10)).expect("pictures");
         assert_eq!(received.exact, 1);
-        // A mean squared error of 1: 20 lg 255.
+        // For a mean squared error of 1: 20 lg 255.
         assert!((received.psnr[0] - 48.1308).abs() < 1e-3, "{received:?}");
-        assert!(received.adds(&picture(9), &[0; 3]).is_err());
+        assert!(received.add(&picture(9), &[0; 3]).is_err());
     }
 }

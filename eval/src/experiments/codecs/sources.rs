@@ -1,4 +1,4 @@
-//! What is sent, and what the published codecs alone make of it.
+//! Messages to send, and the results of codecs on them without a network.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -11,15 +11,15 @@ use serde::{Deserialize, Serialize};
 use support::people::picture;
 
 use super::{CLASS, Kind};
-use crate::cells::{Cells, Measured};
+use crate::cells::{CachedResult, RunCache};
 use crate::deadline;
-use crate::examples::{Input, LASER_SLAM, Where, Workshop};
-use crate::place::{Network, Place};
+use crate::examples::{EvalFixtures, ExecutionSite, InputRecording, LASER_SLAM};
+use crate::place::{NetworkProfile, RobotSandbox};
 use crate::recording::Recording;
-use crate::stream::{self, Head};
-use crate::trace::Grid;
+use crate::stream::{self, StreamHeader};
+use crate::trace::MapGrid;
 
-/// Photographs of Debian's opencv-doc, in colour.
+/// Colour photographs of Debian's opencv-doc.
 const PHOTOGRAPHS: [&str; 6] = [
     "aloeL.jpg",
     "baboon.jpg",
@@ -30,89 +30,96 @@ const PHOTOGRAPHS: [&str; 6] = [
 ];
 const PLACE: &str = "/usr/share/doc/opencv-doc/examples/data";
 const SIZE: (u32, u32) = (640, 480);
-/// Scans of the drive from which the map is made, and every how manieth.
+/// Number of scans of the drive from which the map is built, and the interval between them.
 const SCANS: (usize, usize) = (150, 3);
-/// Cells of the large map's side, as gmapping has them.
+/// Cells per side of the large map, as gmapping uses them.
 const LARGE: usize = 4000;
-/// How often a file's messages are sent at the most.
+/// Maximum number of times that the messages of a file are sent.
 const ROUNDS: usize = 50;
 /// Bytes of a serialized map before its cells.
 const HEAD: usize = 99;
-/// Messages that codecs alone are tried with.
+/// Number of messages for codecs without a network.
 const TRIED: usize = 6;
 
-/// For scaling one photograph.
+/// Maximum time to scale one photograph.
 const LONGEST: Duration = Duration::from_secs(60);
 
-/// Where messages come from.
-pub(super) struct Sources<'a> {
-    pub(super) cells: &'a Cells,
-    pub(super) workshop: &'a Workshop<'a>,
+/// Sources of the messages.
+pub(super) struct StreamSources<'a> {
+    pub(super) cells: &'a RunCache,
+    pub(super) workshop: &'a EvalFixtures<'a>,
 }
 
-/// What codecs made of messages, in this process.
+/// Results of codecs in this process.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Alone {
-    pub(super) codecs: Vec<Made>,
-    /// The share of a map's cells that is known.
+pub(super) struct OfflineResult {
+    pub(super) codecs: Vec<CodecOutput>,
+    /// Fraction of a map's cells that are known.
     pub(super) known: Option<f64>,
 }
 
-/// What one codec made of them.
+/// Result of one codec.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Made {
+pub(super) struct CodecOutput {
     pub(super) codec: String,
-    /// Nobody else has it.
+    /// True if the codec is our own.
     pub(super) ours: bool,
     /// Bytes of messages and of frames.
     pub(super) bytes: [u64; 2],
 }
 
-impl Sources<'_> {
-    /// A file of messages of this kind.
+impl StreamSources<'_> {
+    /// Writes a file of messages of this kind.
     pub(super) fn recording(&self, kind: Kind, directory: &Path) -> Result<PathBuf> {
         if kind == Kind::Video {
-            return self.workshop.recording(Input::Pictures);
+            return self.workshop.recording(InputRecording::Pictures);
         }
         let path = directory.join("sent.messages");
         match kind {
             Kind::Video | Kind::Pictures => {
-                stream::write(&path, &Head::of_pictures(ROUNDS), &photographs()?)?;
+                stream::write(&path, &StreamHeader::for_pictures(ROUNDS), &photographs()?)?;
             }
-            Kind::Map => {
-                stream::write(&path, &Head::of_maps(ROUNDS), &[serialized(&self.map()?)?])?
-            }
+            Kind::Map => stream::write(
+                &path,
+                &StreamHeader::for_maps(ROUNDS),
+                &[serialize_grid(&self.source_map()?)?],
+            )?,
             Kind::LargeMap => {
-                let large = in_the_middle(&self.map()?, LARGE)?;
-                stream::write(&path, &Head::of_maps(ROUNDS), &[serialized(&large)?])?;
+                let large = centre_in_grid(&self.source_map()?, LARGE)?;
+                stream::write(
+                    &path,
+                    &StreamHeader::for_maps(ROUNDS),
+                    &[serialize_grid(&large)?],
+                )?;
             }
         }
         Ok(path)
     }
 
-    /// The map that laser_slam makes of the recorded drive.
-    fn map(&self) -> Result<Grid> {
+    /// Returns the map that laser_slam builds from the recorded drive.
+    fn source_map(&self) -> Result<MapGrid> {
         let map = self
             .cells
             .measure("codecs source map", &(CLASS, SCANS), || {
-                self.workshop.publishes(&LASER_SLAM)?;
+                self.workshop.publish(&LASER_SLAM)?;
                 let directory = self.workshop.directory()?;
                 let mut plan =
                     self.workshop
-                        .plan(&LASER_SLAM, Where::Outsourced, directory.path())?;
+                        .plan(&LASER_SLAM, ExecutionSite::Outsourced, directory.path())?;
                 (plan.most, plan.every) = SCANS;
-                let place = Place::new(&self.workshop.daemon.address, CLASS, Network::Lan)?;
-                let (trace, _) = place.runs(&plan, directory.path())?;
+                let place =
+                    RobotSandbox::new(&self.workshop.daemon.address, CLASS, NetworkProfile::Lan)?;
+                let (trace, _) = place.run(&plan, directory.path())?;
                 trace.map.context("laser_slam published no map")
             })?;
         match map {
-            Measured::Done(map) => Ok(map),
-            Measured::Missing(why) => anyhow::bail!("there is no map to be sent: {why}"),
+            CachedResult::Done(map) => Ok(map),
+            CachedResult::Missing(why) => anyhow::bail!("there is no map to be sent: {why}"),
         }
     }
 
-    /// What the published codecs alone, and ours, make of such messages.
-    pub(super) fn alone(&self, kind: Kind) -> Result<Alone> {
+    /// Encodes such messages with the published codecs and with ours.
+    pub(super) fn encode_offline(&self, kind: Kind) -> Result<OfflineResult> {
         let directory = self.workshop.directory()?;
         let path = self.recording(kind, directory.path())?;
         let recording = Recording::read(&path)?;
@@ -138,23 +145,23 @@ impl Sources<'_> {
                 bytes[0] += message.len() as u64;
                 bytes[1] += frame.len() as u64;
             }
-            Made {
+            CodecOutput {
                 codec: codec.to_string(),
                 ours: *codec == made,
                 bytes,
             }
         };
-        Ok(Alone {
+        Ok(OfflineResult {
             codecs: codecs.iter().map(one).collect(),
             known: messages
                 .first()
                 .filter(|_| kind.is_map())
-                .map(|message| known(&message[message.len().min(HEAD)..])),
+                .map(|message| known_share(&message[message.len().min(HEAD)..])),
         })
     }
 }
 
-/// Pictures that have nothing to do with one another.
+/// Returns unrelated photographs.
 fn photographs() -> Result<Vec<Bytes>> {
     let read = |name: &&str| {
         let path = Path::new(PLACE).join(name);
@@ -183,14 +190,14 @@ fn photographs() -> Result<Vec<Bytes>> {
     PHOTOGRAPHS.iter().map(read).collect()
 }
 
-/// The share of cells that are known.
-fn known(cells: &[u8]) -> f64 {
+/// Returns the fraction of known cells.
+fn known_share(cells: &[u8]) -> f64 {
     let known = cells.iter().filter(|cell| **cell != u8::MAX).count();
     known as f64 / cells.len().max(1) as f64
 }
 
-/// `nav_msgs/OccupancyGrid`.
-fn serialized(grid: &Grid) -> Result<Bytes> {
+/// Serializes a `nav_msgs/OccupancyGrid`.
+fn serialize_grid(grid: &MapGrid) -> Result<Bytes> {
     let mut bytes = Vec::with_capacity(grid.cells.len() + 100);
     let words = |bytes: &mut Vec<u8>, words: &[u32]| {
         words
@@ -214,8 +221,8 @@ fn serialized(grid: &Grid) -> Result<Bytes> {
     Ok(bytes.into())
 }
 
-/// A map of `side` x `side` cells with this one in its middle; what is around it is unknown.
-fn in_the_middle(grid: &Grid, side: usize) -> Result<Grid> {
+/// Returns a map of `side` x `side` cells with `grid` at its centre; the cells around it are unknown.
+fn centre_in_grid(grid: &MapGrid, side: usize) -> Result<MapGrid> {
     ensure!(
         grid.width <= side && grid.height <= side && grid.cells.len() == grid.width * grid.height,
         "a map of {} x {} cells is no part of one of {side} x {side}",
@@ -229,7 +236,7 @@ fn in_the_middle(grid: &Grid, side: usize) -> Result<Grid> {
         cells[at..at + grid.width].copy_from_slice(from);
     }
     let moved = |origin: f64, by: usize| origin - by as f64 * grid.resolution;
-    Ok(Grid {
+    Ok(MapGrid {
         width: side,
         height: side,
         resolution: grid.resolution,
@@ -242,8 +249,8 @@ fn in_the_middle(grid: &Grid, side: usize) -> Result<Grid> {
 mod tests {
     use super::*;
 
-    fn small() -> Grid {
-        Grid {
+    fn small_grid() -> MapGrid {
+        MapGrid {
             width: 2,
             height: 1,
             resolution: 0.5,
@@ -254,21 +261,21 @@ mod tests {
 
     #[test]
     fn a_map_stands_in_the_middle_of_a_larger_one() {
-        let large = in_the_middle(&small(), 4).expect("it fits");
+        let large = centre_in_grid(&small_grid(), 4).expect("it fits");
         assert_eq!(large.cells[4..8], [-1, 0, 100, -1]);
         assert_eq!(large.cells.iter().filter(|cell| **cell == -1).count(), 14);
         assert_eq!(large.origin, [0.5, 1.5]);
-        assert!(in_the_middle(&small(), 1).is_err());
+        assert!(centre_in_grid(&small_grid(), 1).is_err());
     }
 
     #[test]
     fn a_map_is_what_the_codec_takes_for_one() {
-        let bytes = serialized(&small()).expect("a message");
+        let bytes = serialize_grid(&small_grid()).expect("a message");
         assert_eq!(bytes[HEAD..], [0, 100]);
-        assert!((known(&[255, 0, 100, 255]) - 0.5).abs() < 1e-9);
-        // Of two cells no frame is smaller than the message.
-        let large = in_the_middle(&small(), 64).expect("it fits");
-        let bytes = serialized(&large).expect("a message");
+        assert!((known_share(&[255, 0, 100, 255]) - 0.5).abs() < 1e-9);
+        // With only two cells no frame would be smaller than the message.
+        let large = centre_in_grid(&small_grid(), 64).expect("it fits");
+        let bytes = serialize_grid(&large).expect("a message");
         let mut frame = Vec::new();
         let encoded = Encoder::new(Schema::OccupancyGrid).encode(Codec::Grid, &bytes, &mut frame);
         assert_eq!(encoded.codec, Codec::Grid, "it fell back");

@@ -6,13 +6,13 @@ use crate::plots::{self, Series};
 
 use super::model::Model;
 use super::told::PUBLISHED;
-use super::{Found, Use, total};
+use super::{LimitUse, ProgramFit, total_time};
 
-/// The model, points that were fitted, and points that were held back.
-pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
-    let of = |of: Use| {
+/// Draws the model, the fitted points, and the points that were held back.
+pub(super) fn draw_curve(one: &ProgramFit, model: &Model) -> Result<String> {
+    let of = |of: LimitUse| {
         let chosen = one.points.iter().filter(move |point| point.2 == of);
-        chosen.map(|point| (point.0, total(point.1))).collect()
+        chosen.map(|point| (point.0, total_time(point.1))).collect()
     };
     let cores = || one.points.iter().map(|point| point.0);
     let (least, most) = (
@@ -20,13 +20,15 @@ pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
         cores().fold(model.most, f64::max),
     );
     let steps = (0..=300).map(|step| least + (most - least) * f64::from(step) / 300.0);
-    let curve = steps.map(|cores| (cores, model.cautious(cores))).collect();
-    // Points stand upon the curve.
+    let curve = steps
+        .map(|cores| (cores, model.predict_cautious(cores)))
+        .collect();
+    // Points are drawn above the curve.
     let series = [
         Series::new("model", curve),
-        Series::new("fitted", of(Use::Fitted)),
-        Series::new(Use::Inside.name(), of(Use::Inside)),
-        Series::new(Use::Beyond.name(), of(Use::Beyond)),
+        Series::new("fitted", of(LimitUse::Fitted)),
+        Series::new(LimitUse::Inside.name(), of(LimitUse::Inside)),
+        Series::new(LimitUse::Beyond.name(), of(LimitUse::Beyond)),
     ];
     plots::points(
         one.name(),
@@ -37,8 +39,8 @@ pub(super) fn curve(one: &Found, model: &Model) -> Result<String> {
     )
 }
 
-/// Times as fast as natively on the class Pi, by cores: predicted, and what the publication reached.
-pub(super) fn factors(found: &[Found]) -> Vec<Series> {
+/// Speedup over the native run on a Raspberry Pi by number of cores: predicted, and as published.
+pub(super) fn speedup_series(found: &[ProgramFit]) -> Vec<Series> {
     let mut series = Vec::new();
     for one in found {
         let Some((model, native)) = one.model.zip(one.native) else {
@@ -52,12 +54,12 @@ pub(super) fn factors(found: &[Found]) -> Vec<Series> {
         };
         series.push(Series::new(
             format!("{}: cautious", one.name()),
-            over(Model::cautious),
+            over(Model::predict_cautious),
         ));
         if model.threads > 1 {
             series.push(Series::new(
                 format!("{}: bound", one.name()),
-                over(Model::bound),
+                over(Model::predict_bound),
             ));
         }
     }

@@ -1,58 +1,61 @@
-//! Response times as sums of parts, each of which is modelled by itself: the greater part of a response may be work that cores share, and the
-//! rest is not.
+//! A model of response times as sums of parts, each modelled separately: some parts of a response are work that cores
+//! share, the others are not.
 
 use crate::statistics::{Point, RrtModel, mean};
 use crate::trace::Trace;
 
-/// Names of [`Parts`], in their order.
+/// Names of [`ResponseParts`], in their order.
 pub const NAMES: [&str; 4] = [
     "acquisition",
     "computation",
     "rendering",
     "transport and waiting",
 ];
-/// Which of them is the algorithm itself.
+/// Index of the algorithm itself.
 const COMPUTATION: usize = 1;
-/// A part whose cores end this near to the greatest limit that was measured has shown no end.
+/// If a part's number of useful cores is at least this fraction of the greatest measured limit, no limit of parallelism
+/// was observed.
 const NEAR: f64 = 0.97;
 
-/// Means over all requests of one run, seconds: what the package tells of its own time, and what is left of the response time.
-pub type Parts = [f64; 4];
+/// Means over all requests of one run, in seconds: the durations that the package reports, and the rest of the response
+/// time.
+pub type ResponseParts = [f64; 4];
 
-/// Those of a run; none unless the package told its parts.
-pub fn parts(trace: &Trace) -> Option<Parts> {
+/// Returns the parts of a run; `None` if the package did not report durations.
+pub fn mean_parts(trace: &Trace) -> Option<ResponseParts> {
     let both = trace
         .requests
         .iter()
         .filter_map(|one| Some((one.response?, one.phases?)));
-    let all: Vec<Parts> = both
+    let all: Vec<ResponseParts> = both
         .map(|(response, phases)| {
             let told = [phases.acquisition, phases.computation, phases.rendering];
             let rest = response - told.iter().sum::<f64>();
             [told[0], told[1], told[2], rest]
         })
         .collect();
-    let mut means = Parts::default();
+    let mut means = ResponseParts::default();
     for (index, part) in means.iter_mut().enumerate() {
         *part = mean(&all.iter().map(|one| one[index]).collect::<Vec<_>>())?;
     }
     Some(means)
 }
 
-/// One model for each part.
+/// A model of each part.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Model {
-    /// In the order of [`NAMES`].
+    /// Models in the order of [`NAMES`].
     pub parts: [RrtModel; 4],
-    /// The greatest number of cores that it was fitted to.
+    /// Greatest number of cores to which the model was fitted.
     pub most: f64,
-    /// Threads that the program computed with.
+    /// Number of threads of the computation.
     pub threads: usize,
 }
 
 impl Model {
-    /// Fitted to (cores, parts) of runs of a program with so many threads. None unless there are three runs with at least two numbers of cores.
-    pub fn fit(runs: &[(f64, Parts)], threads: usize) -> Option<Self> {
+    /// Fits the model to (cores, parts) of runs of a program with `threads` threads. Returns `None` unless there are
+    /// three runs with at least two different numbers of cores.
+    pub fn fit(runs: &[(f64, ResponseParts)], threads: usize) -> Option<Self> {
         let of = |index: usize| {
             let points: Vec<Point> = runs
                 .iter()
@@ -68,26 +71,28 @@ impl Model {
         })
     }
 
-    /// Mean response time with so many cores, seconds. More cores than were measured give nothing more: nothing measured says that they do.
-    pub fn cautious(&self, cores: f64) -> f64 {
+    /// Predicts the mean response time with `cores` cores, in seconds. More cores than were measured give no further
+    /// improvement, because no measurement shows one.
+    pub fn predict_cautious(&self, cores: f64) -> f64 {
         self.parts
             .iter()
             .map(|part| part.predict(&point(cores, 0.0)))
             .sum()
     }
 
-    /// The same if the computation's work can be divided among all cores, however many, as among the first ones: less cannot come out by this
-    /// model. Of a program with one thread it is the cautious one. Where points showed an end of what cores give, it may have been the
-    /// machine's, so the bound goes beyond it.
-    pub fn bound(&self, cores: f64) -> f64 {
+    /// Lower bound of the prediction: assumes that the work of the computation can be divided among any number of cores
+    /// as among the first ones. With one thread it equals the cautious prediction. If the measured points showed a
+    /// limit of parallelism, that may have been the machine's, so the bound goes beyond it.
+    pub fn predict_bound(&self, cores: f64) -> f64 {
         let computation = self.parts[COMPUTATION];
         if self.threads < 2 || cores <= computation.parallel {
-            return self.cautious(cores);
+            return self.predict_cautious(cores);
         }
-        self.cautious(cores) - computation.work / computation.parallel + computation.work / cores
+        self.predict_cautious(cores) - computation.work / computation.parallel
+            + computation.work / cores
     }
 
-    /// Whether more cores gave nothing more before the greatest number that was measured.
+    /// Returns whether more cores stopped helping below the greatest measured number.
     pub fn has_end(&self) -> bool {
         self.parts[COMPUTATION].parallel < NEAR * self.most
     }
@@ -96,7 +101,7 @@ impl Model {
 fn point(cores: f64, rrt: f64) -> Point {
     Point {
         cores,
-        // What the network takes is in the parts that were measured.
+        // The parts that were measured include the network.
         round_trip: 0.0,
         bytes_up: 0.0,
         bytes_down: 0.0,
@@ -108,14 +113,14 @@ fn point(cores: f64, rrt: f64) -> Point {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trace::{Phases, Request};
+    use crate::trace::{ComputationPhases, RequestSample};
 
-    fn near(one: f64, other: f64) {
+    fn assert_near(one: f64, other: f64) {
         assert!((one - other).abs() < 1e-6, "{one} is not {other}");
     }
 
     /// 1 ms and 2 core seconds of computation that `parallel` cores share, 50 ms of transport.
-    fn runs(parallel: f64) -> Vec<(f64, Parts)> {
+    fn runs(parallel: f64) -> Vec<(f64, ResponseParts)> {
         [0.25, 0.5, 1.0, 2.0]
             .map(|cores: f64| (cores, [0.001, 2.0 / cores.min(parallel), 0.0, 0.05]))
             .to_vec()
@@ -123,21 +128,25 @@ mod tests {
 
     #[test]
     fn what_is_left_is_transport() {
-        let request = |response, computation| Request {
+        let request = |response, computation| RequestSample {
             response: Some(response),
-            phases: Some(Phases {
+            phases: Some(ComputationPhases {
                 acquisition: 0.01,
                 computation,
                 rendering: 0.02,
             }),
-            ..Request::default()
+            ..RequestSample::default()
         };
         let mut trace = Trace::default();
-        assert_eq!(parts(&trace), None);
-        trace.requests = vec![request(0.5, 0.4), request(0.7, 0.6), Request::default()];
-        let found = parts(&trace).expect("two are known");
+        assert_eq!(mean_parts(&trace), None);
+        trace.requests = vec![
+            request(0.5, 0.4),
+            request(0.7, 0.6),
+            RequestSample::default(),
+        ];
+        let found = mean_parts(&trace).expect("two are known");
         for (one, other) in found.into_iter().zip([0.01, 0.5, 0.02, 0.07]) {
-            near(one, other);
+            assert_near(one, other);
         }
     }
 
@@ -145,29 +154,29 @@ mod tests {
     fn work_that_was_shared_may_go_on_to_be() {
         let model = Model::fit(&runs(8.0), 2).expect("four limits");
         assert!(!model.has_end());
-        near(model.cautious(0.8), 0.051 + 2.5);
-        // Two cores were measured, so four give no less.
-        near(model.cautious(4.0), 0.051 + 1.0);
-        near(model.bound(4.0), 0.051 + 0.5);
-        near(model.bound(1.0), model.cautious(1.0));
-        near(model.bound(f64::INFINITY), 0.051);
+        assert_near(model.predict_cautious(0.8), 0.051 + 2.5);
+        // Measured with up to two cores, so four are predicted to be as fast.
+        assert_near(model.predict_cautious(4.0), 0.051 + 1.0);
+        assert_near(model.predict_bound(4.0), 0.051 + 0.5);
+        assert_near(model.predict_bound(1.0), model.predict_cautious(1.0));
+        assert_near(model.predict_bound(f64::INFINITY), 0.051);
     }
 
     #[test]
     fn one_thread_needs_one_core() {
         let model = Model::fit(&runs(1.0), 1).expect("four limits");
         assert!(model.has_end());
-        near(model.cautious(4.0), 0.051 + 2.0);
-        near(model.bound(32.0), 0.051 + 2.0);
+        assert_near(model.predict_cautious(4.0), 0.051 + 2.0);
+        assert_near(model.predict_bound(32.0), 0.051 + 2.0);
     }
 
-    /// Two threads that gained nothing above one core: it may have been the machine's end.
+    /// Two threads that gained nothing above one core, which may have been the machine's limit.
     #[test]
     fn the_bound_goes_beyond_an_end_that_was_seen() {
         let model = Model::fit(&runs(1.0), 2).expect("four limits");
         assert!(model.has_end());
-        near(model.cautious(4.0), 0.051 + 2.0);
-        near(model.bound(4.0), 0.051 + 0.5);
+        assert_near(model.predict_cautious(4.0), 0.051 + 2.0);
+        assert_near(model.predict_bound(4.0), 0.051 + 0.5);
     }
 
     #[test]

@@ -1,25 +1,25 @@
-//! Maps beside each other, as pixels: all show the same place, and have a bar that tells their scale.
+//! Images of maps side by side: all show the same area and have a scale bar.
 
 use anyhow::{Context, Result};
 
-use crate::trace::Grid;
+use crate::trace::MapGrid;
 
-/// Length of the bar, metres.
+/// Length of the scale bar, in metres.
 pub const BAR: f64 = 5.0;
-/// Between two maps and around the bar, pixels.
+/// Space between two maps and around the bar, in pixels.
 const MARGIN: usize = 12;
-/// Of the bar, pixels.
+/// Thickness of the bar, in pixels.
 const THICK: usize = 6;
-/// What is not known.
+/// Shade of unknown cells.
 const UNKNOWN: u8 = 205;
-/// Between maps.
+/// Shade between maps.
 const BACKGROUND: u8 = 255;
 
-/// Two in a row, north up, of the place that any of them knows: free white, occupied black, unknown grey. Pixels are as large as the first
-/// map's cells.
-pub fn maps(maps: &[&Grid]) -> Result<Vec<u8>> {
+/// Draws maps, two in a row, north up, over the area that any of them knows: free white, occupied black, unknown grey.
+/// Pixels are as large as the cells of the first map.
+pub fn draw_maps(maps: &[&MapGrid]) -> Result<Vec<u8>> {
     let side = maps.first().context("a map to draw")?.resolution;
-    let (from, to) = crop(maps).context("a map that knows something")?;
+    let (from, to) = known_bounds(maps).context("a map that knows something")?;
     let count = |axis: usize| ((to[axis] - from[axis]) / side).round().max(1.0) as usize;
     let (width, height) = (count(0), count(1));
     let columns = maps.len().min(2);
@@ -48,8 +48,8 @@ pub fn maps(maps: &[&Grid]) -> Result<Vec<u8>> {
     png(&pixels, whole_width, whole_height)
 }
 
-/// The rectangle of what is known by any map: x and y of its least corner and of its greatest, metres.
-fn crop(maps: &[&Grid]) -> Option<([f64; 2], [f64; 2])> {
+/// Returns the bounding box of the cells known to any map: least and greatest x and y, in metres.
+fn known_bounds(maps: &[&MapGrid]) -> Option<([f64; 2], [f64; 2])> {
     let mut found: Option<([f64; 2], [f64; 2])> = None;
     for map in maps {
         for (at, cell) in map.cells.iter().enumerate() {
@@ -70,8 +70,8 @@ fn crop(maps: &[&Grid]) -> Option<([f64; 2], [f64; 2])> {
     found
 }
 
-/// What a map says of a place; nothing beyond its edges.
-fn cell(map: &Grid, x: f64, y: f64) -> Option<i8> {
+/// Returns the cell of a map at a position; `None` outside its edges.
+fn cell(map: &MapGrid, x: f64, y: f64) -> Option<i8> {
     let index = |value: f64, axis: usize, count: usize| {
         let at = ((value - map.origin[axis]) / map.resolution).floor();
         (at >= 0.0 && at < count as f64).then_some(at as usize)
@@ -101,8 +101,8 @@ fn png(pixels: &[u8], width: usize, height: usize) -> Result<Vec<u8>> {
 mod tests {
     use super::*;
 
-    fn drawn(all: &[&Grid]) -> (usize, usize, Vec<u8>) {
-        let file = maps(all).expect("a picture");
+    fn decode_drawing(all: &[&MapGrid]) -> (usize, usize, Vec<u8>) {
+        let file = draw_maps(all).expect("a picture");
         let mut reader = png::Decoder::new(std::io::Cursor::new(file))
             .read_info()
             .expect("a PNG");
@@ -111,8 +111,8 @@ mod tests {
         (frame.width as usize, frame.height as usize, pixels)
     }
 
-    fn map(origin: [f64; 2]) -> Grid {
-        Grid {
+    fn map(origin: [f64; 2]) -> MapGrid {
+        MapGrid {
             width: 3,
             height: 3,
             resolution: 1.0,
@@ -123,10 +123,10 @@ mod tests {
 
     #[test]
     fn a_map_is_drawn_north_up_without_what_is_unknown() {
-        let (width, height, pixels) = drawn(&[&map([0.0, 0.0])]);
+        let (width, height, pixels) = decode_drawing(&[&map([0.0, 0.0])]);
         assert_eq!((width, height), (2, 2 + 2 * MARGIN + THICK));
         assert_eq!(pixels[..4], [0, 205, 255, 0]);
-        // Of a bar longer than the map, as much as there is place for.
+        // A bar longer than the map is truncated.
         let bar = (2 + MARGIN) * 2;
         assert_eq!(pixels[bar - 1..bar + 1], [255, 0]);
     }
@@ -134,7 +134,7 @@ mod tests {
     #[test]
     fn maps_beside_each_other_show_the_same_place() {
         let (one, other) = (map([0.0, 0.0]), map([1.0, 0.0]));
-        let (width, _, pixels) = drawn(&[&one, &other]);
+        let (width, _, pixels) = decode_drawing(&[&one, &other]);
         assert_eq!(width, 3 + MARGIN + 3);
         assert_eq!(pixels[..3], [0, 205, 205]);
         assert_eq!(pixels[3 + MARGIN..width], [205, 0, 205]);
@@ -144,7 +144,7 @@ mod tests {
     fn a_map_that_knows_nothing_is_not_drawn() {
         let mut nothing = map([0.0, 0.0]);
         nothing.cells.fill(-1);
-        assert!(maps(&[&nothing]).is_err());
-        assert!(maps(&[]).is_err());
+        assert!(draw_maps(&[&nothing]).is_err());
+        assert!(draw_maps(&[]).is_err());
     }
 }

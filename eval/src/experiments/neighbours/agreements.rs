@@ -1,6 +1,7 @@
-//! Robots of one machine that accept different response times: what share of each one's requests is in time, with the controller and
-//! with the limits that were promised. All are promised the same part of the machine. Every other robot, beginning with the first, asks
-//! again as soon as it is answered and accepts less than its part gives; the others ask seldom and accept more.
+//! Robots of one machine that accept different response times: the fraction of each robot's requests that are in time,
+//! with the controller and with fixed limits as promised. All robots are promised an equal share of the machine. Every
+//! other robot, beginning with the first, calls again as soon as it is answered and accepts a shorter response time
+//! than its share allows; the others call rarely and accept a longer one.
 
 use std::time::{Duration, Instant};
 
@@ -9,26 +10,26 @@ use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 
 use super::AGAIN;
-use crate::cells::{Cells, Measured};
-use crate::deadline::Meeting;
-use crate::experiments::crowd::{self, Controller, LONG, Yard};
+use crate::cells::{CachedResult, RunCache};
+use crate::deadline::TimedBarrier;
+use crate::experiments::crowd::{self, Controller, CrowdDaemon, LONG};
 use crate::plots::{self, Bar};
-use crate::section::{Missing, Section, Table};
+use crate::section::{MissingMeasurement, Section, Table};
 use crate::statistics::{mean, quantile};
-use crate::words::{known, milliseconds, ratio};
+use crate::words::{milliseconds, or_dash, ratio};
 
-/// The part of its requests that must be in time for a robot to count.
+/// Fraction of a robot's requests that must be in time for the robot to count.
 const IN_TIME: f64 = 0.95;
-/// Seconds between an answer and the next request of those that ask seldom.
+/// Seconds between an answer and the next request of robots that call rarely.
 const SELDOM: f64 = 1.0;
-/// For servants that start beside one another, each within the two minutes of its daemon.
+/// Maximum time for servants to start together, each within its daemon's limit of two minutes.
 const START: Duration = Duration::from_secs(300);
-/// Both ways, in the order of the tables.
+/// Controller off and on, in the order of the tables.
 const BOTH: [Controller; 2] = [Controller::Off, Controller::On];
 
-/// What a run depends on.
+/// Inputs of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-struct Plan {
+struct AgreementPlan {
     controller: Controller,
     robots: usize,
     settles: f64,
@@ -37,40 +38,44 @@ struct Plan {
     cores: f64,
 }
 
-/// What a robot had.
+/// Measurements of a robot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(super) struct Had {
-    /// T_max that it stated, seconds.
+pub(super) struct RobotOutcome {
+    /// T_max that it stated, in seconds.
     accepts: f64,
-    /// Whether it asked without a pause.
+    /// True if it calls without a pause.
     eager: bool,
-    /// Of its requests, seconds.
+    /// Response times, in seconds.
     times: Vec<f64>,
 }
 
-impl Had {
-    /// The share of its requests that was in time; none where it made none.
-    fn share(&self) -> Option<f64> {
+impl RobotOutcome {
+    /// Returns the fraction of its requests that were in time; `None` if it made none.
+    fn share_in_time(&self) -> Option<f64> {
         let in_time = self.times.iter().filter(|time| **time <= self.accepts);
         (!self.times.is_empty()).then(|| in_time.count() as f64 / self.times.len() as f64)
     }
 
-    fn in_time(&self) -> bool {
-        self.share().is_some_and(|share| share >= IN_TIME)
+    fn is_in_time(&self) -> bool {
+        self.share_in_time().is_some_and(|share| share >= IN_TIME)
     }
 }
 
-/// All runs.
-pub(super) struct Runs(Vec<(Plan, Measured<Vec<Had>>)>);
+/// Results of all runs.
+pub(super) struct AgreementRuns(Vec<(AgreementPlan, CachedResult<Vec<RobotOutcome>>)>);
 
-pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
+pub(super) fn measure(
+    cells: &RunCache,
+    yard: &mut CrowdDaemon,
+    quick: bool,
+) -> Result<AgreementRuns> {
     let robots: &[usize] = if quick { &[4] } else { &[2, 4, 8] };
-    // The controller looks once a second, at what requests took in the last ten.
+    // Once a second the controller examines the requests of the last ten seconds.
     let (settles, lasts) = if quick { (1.0, 1.5) } else { (12.0, 9.0) };
     let mut runs = Vec::new();
     for controller in BOTH {
         for robots in robots.iter().copied() {
-            let plan = Plan {
+            let plan = AgreementPlan {
                 controller,
                 robots,
                 settles,
@@ -80,30 +85,32 @@ pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Run
             };
             let name = format!("agreements {robots} controller {}", controller.name());
             let measured = cells.measure(&name, &plan, || {
-                let daemon = yard.cleared(controller)?;
-                crowd::publishes(daemon, LONG)?;
-                beside_each_other(daemon, &plan)
+                let daemon = yard.without_servants(controller)?;
+                crowd::publish(daemon, LONG)?;
+                run_robots(daemon, &plan)
             })?;
             runs.push((plan, measured));
         }
     }
-    Ok(Runs(runs))
+    Ok(AgreementRuns(runs))
 }
 
-/// What one robot is promised, and what eager and patient ones accept, seconds.
-fn terms(robots: usize, cores: f64, work: f64) -> (f64, f64, f64) {
-    // Rounded down: together no more is promised than there is.
+/// Returns the cores that each robot is promised, and the seconds that eager and patient robots accept.
+fn agreement_terms(robots: usize, cores: f64, work: f64) -> (f64, f64, f64) {
+    // Rounded down so that the promises never add up to more than the machine has.
     let part = (cores / robots as f64 * 1000.0).floor() / 1000.0;
-    // With twice its part an eager one is in time, if that is not more than its one thread can use.
+    // With twice its share an eager robot is in time, unless that is more than its single thread can use.
     let eager = (work / (2.0 * part) * 1.4).max(work * 1.6);
     (part, eager, work / part * 4.0 + 0.2)
 }
 
-fn beside_each_other(daemon: &Daemon, plan: &Plan) -> Result<Vec<Had>> {
-    let (part, eager, patient) = terms(plan.robots, plan.cores, f64::from(plan.work) / 1e3);
-    // All begin together: one that is measured while another's servant still starts has its cores, or lacks them.
-    let ready = Meeting::of(plan.robots);
-    let one = |number: usize| -> Result<Had> {
+fn run_robots(daemon: &Daemon, plan: &AgreementPlan) -> Result<Vec<RobotOutcome>> {
+    let (part, eager, patient) =
+        agreement_terms(plan.robots, plan.cores, f64::from(plan.work) / 1e3);
+    // All start together: a robot measured while another's servant is still starting would have that servant's cores,
+    // or lack them.
+    let ready = TimedBarrier::new(plan.robots);
+    let one = |number: usize| -> Result<RobotOutcome> {
         let is_eager = number % 2 == 0;
         let (accepts, pause) = if is_eager {
             (eager, 0.0)
@@ -111,18 +118,18 @@ fn beside_each_other(daemon: &Daemon, plan: &Plan) -> Result<Vec<Had>> {
             (patient, SELDOM)
         };
         let states = format!("&cpus={part:.3}&max_rrt={:.0}ms", accepts * 1e3);
-        let joined = crowd::joins(daemon, LONG, &format!("r{number}"), &states);
-        let joined = joined.and_then(|mut robot| crowd::call(&mut robot).map(|_| robot));
-        let met = ready.waits(START);
-        // Why one has failed tells more than that the others waited for it.
+        let joined = crowd::join(daemon, LONG, &format!("r{number}"), &states);
+        let joined = joined.and_then(|mut robot| crowd::time_call(&mut robot).map(|_| robot));
+        let met = ready.wait(START);
+        // The error of the robot that failed says more than the timeout of the others.
         let mut robot = joined?;
         met?;
         let from = Instant::now() + Duration::from_secs_f64(plan.settles);
         let to = from + Duration::from_secs_f64(plan.lasts);
-        Ok(Had {
+        Ok(RobotOutcome {
             accepts,
             eager: is_eager,
-            times: crowd::calls(&mut robot, (from, to), || pause)?,
+            times: crowd::time_calls(&mut robot, (from, to), || pause)?,
         })
     };
     std::thread::scope(|scope| {
@@ -136,10 +143,12 @@ fn beside_each_other(daemon: &Daemon, plan: &Plan) -> Result<Vec<Had>> {
     })
 }
 
-pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
+pub(super) fn add_to_section(runs: &AgreementRuns, section: &mut Section) -> Result<()> {
     section.differs.push(format!(
-        "Mixed agreements: robots with equal promises of cores ask for {} ms of one. Every other one asks again at once and accepts \
-         less (max_rrt) than its promise gives; the others ask each second and accept more. A robot counts as served in time if {:.0} % \
+        "Mixed agreements: robots with equal promises of cores ask for {} ms of one. Every other one asks again at \
+         once and accepts \
+         less (max_rrt) than its promise gives; the others ask each second and accept more. A robot counts as served \
+         in time if {:.0} % \
          of its requests are.",
         LONG.milliseconds,
         IN_TIME * 100.0
@@ -157,19 +166,20 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
         ],
     );
     let mut bars = Vec::new();
-    for robots in runs.numbers() {
-        let both = BOTH.map(|controller| runs.of(controller, robots));
+    for robots in runs.fleet_sizes() {
+        let both = BOTH.map(|controller| runs.find_run(controller, robots));
         for number in 0..robots {
             let each = both.map(|all| all.and_then(|all| all.get(number)));
             let Some(had) = each.iter().copied().flatten().next() else {
                 continue;
             };
-            let share = |had: Option<&Had>| {
-                let share = had.and_then(Had::share);
-                known(share, |share| format!("{:.0}", share * 100.0))
+            let share = |had: Option<&RobotOutcome>| {
+                let share = had.and_then(RobotOutcome::share_in_time);
+                or_dash(share, |share| format!("{:.0}", share * 100.0))
             };
-            let long =
-                |had: Option<&Had>| milliseconds(had.and_then(|had| quantile(&had.times, 0.95)));
+            let long = |had: Option<&RobotOutcome>| {
+                milliseconds(had.and_then(|had| quantile(&had.times, 0.95)))
+            };
             table.push([
                 format!("{} of {robots}", number + 1),
                 if had.eager { "at once" } else { "seldom" }.to_owned(),
@@ -185,59 +195,69 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
             bars.push(Bar {
                 group: format!("{robots} robots"),
                 name: format!("controller {}", controller.name()),
-                value: counted(all) as f64,
+                value: count_in_time(all) as f64,
                 spread: None,
             });
         }
     }
     for (plan, measured) in &runs.0 {
-        if let Measured::Missing(why) = measured {
+        if let CachedResult::Missing(why) = measured {
             let what = format!(
                 "{} robots with mixed agreements, controller {}",
                 plan.robots,
                 plan.controller.name()
             );
-            section.missing.push(Missing::new(what, why, AGAIN));
+            section
+                .missing
+                .push(MissingMeasurement::new(what, why, AGAIN));
         }
     }
     section.tables.push(table);
     let caption = "Robots that are served in time, with mixed agreements";
     let drawing = plots::bars(caption, "robots in time", &bars, false)?;
-    section.drawing("agreements", caption, drawing);
-    runs.find(section);
+    section.add_drawing("agreements", caption, drawing);
+    runs.add_findings(section);
     Ok(())
 }
 
-/// Robots in time.
-fn counted(all: &[Had]) -> usize {
-    all.iter().filter(|had| had.in_time()).count()
+/// Counts the robots in time.
+fn count_in_time(all: &[RobotOutcome]) -> usize {
+    all.iter().filter(|had| had.is_in_time()).count()
 }
 
-impl Runs {
-    fn numbers(&self) -> Vec<usize> {
+impl AgreementRuns {
+    fn fleet_sizes(&self) -> Vec<usize> {
         let mut numbers: Vec<usize> = self.0.iter().map(|(plan, _)| plan.robots).collect();
         numbers.sort_unstable();
         numbers.dedup();
         numbers
     }
 
-    fn of(&self, controller: Controller, robots: usize) -> Option<&Vec<Had>> {
+    fn find_run(&self, controller: Controller, robots: usize) -> Option<&Vec<RobotOutcome>> {
         let mut all = self.0.iter();
         let found = all.find(|(plan, _)| plan.controller == controller && plan.robots == robots);
-        found?.1.done()
+        found?.1.value()
     }
 
-    fn find(&self, section: &mut Section) {
+    fn add_findings(&self, section: &mut Section) {
         let (mut counts, mut of) = ([0; 2], 0);
         let mut eager: [Vec<f64>; 2] = Default::default();
-        for robots in self.numbers() {
-            let [Some(off), Some(on)] = BOTH.map(|controller| self.of(controller, robots)) else {
+        for robots in self.fleet_sizes() {
+            let [Some(off), Some(on)] = BOTH.map(|controller| self.find_run(controller, robots))
+            else {
                 continue;
             };
-            counts = [counts[0] + counted(off), counts[1] + counted(on)];
+            counts = [
+                counts[0] + count_in_time(off),
+                counts[1] + count_in_time(on),
+            ];
             of += robots;
             for (shares, all) in eager.iter_mut().zip([off, on]) {
-                shares.extend(all.iter().filter(|had| had.eager).filter_map(Had::share));
+                shares.extend(
+                    all.iter()
+                        .filter(|had| had.eager)
+                        .filter_map(RobotOutcome::share_in_time),
+                );
             }
         }
         if of == 0 {
@@ -245,10 +265,12 @@ impl Runs {
         }
         let [off, on] = counts;
         section.findings.push(format!(
-            "Of {of} robots with mixed agreements in all runs, {off} were served in time with fixed limits and {on} with the controller{}",
+            "Of {of} robots with mixed agreements in all runs, {off} were served in time with fixed limits and {on} \
+             with the controller{}",
             match on.cmp(&off) {
                 std::cmp::Ordering::Greater if off > 0 => format!(
-                    ": {} times as many, because what those that ask seldom leave is given to those that are near what they accept.",
+                    ": {} times as many, because what those that ask seldom leave is given to those that are near what \
+                     they accept.",
                     ratio(Some(on as f64 / off as f64))
                 ),
                 std::cmp::Ordering::Greater =>
@@ -258,12 +280,14 @@ impl Runs {
                 std::cmp::Ordering::Equal =>
                     ": the controller won no robot here, which is worse than hoped.".to_owned(),
                 std::cmp::Ordering::Less =>
-                    ", which is worse than hoped: robots lost what they had while cores were moved to others.".to_owned(),
+                    ", which is worse than hoped: robots lost what they had while cores were moved to \
+                     others.".to_owned(),
             }
         ));
         if let [Some(off), Some(on)] = eager.map(|shares| mean(&shares)) {
             section.findings.push(format!(
-                "Of the requests of those that ask at once and accept less than they were promised, {:.0} % were in time with fixed \
+                "Of the requests of those that ask at once and accept less than they were promised, {:.0} % were in \
+                 time with fixed \
                  limits and {:.0} % with the controller (mean of the robots' shares).",
                 off * 100.0,
                 on * 100.0
@@ -276,16 +300,16 @@ impl Runs {
 mod tests {
     use super::*;
 
-    fn had(accepts: f64, times: &[f64]) -> Had {
-        Had {
+    fn outcome(accepts: f64, times: &[f64]) -> RobotOutcome {
+        RobotOutcome {
             accepts,
             eager: true,
             times: times.to_vec(),
         }
     }
 
-    fn runs(off: Vec<Had>, on: Vec<Had>) -> Runs {
-        let plan = |controller| Plan {
+    fn test_runs(off: Vec<RobotOutcome>, on: Vec<RobotOutcome>) -> AgreementRuns {
+        let plan = |controller| AgreementPlan {
             controller,
             robots: 2,
             settles: 1.0,
@@ -293,37 +317,41 @@ mod tests {
             work: 50,
             cores: 2.0,
         };
-        Runs(vec![
-            (plan(Controller::Off), Measured::Done(off)),
-            (plan(Controller::On), Measured::Done(on)),
+        AgreementRuns(vec![
+            (plan(Controller::Off), CachedResult::Done(off)),
+            (plan(Controller::On), CachedResult::Done(on)),
         ])
     }
 
     #[test]
     fn shares_are_of_what_was_asked() {
-        assert_eq!(had(0.1, &[0.05, 0.1, 0.2, 0.3]).share(), Some(0.5));
-        assert_eq!(had(0.1, &[]).share(), None);
-        assert!(!had(0.1, &[]).in_time() && had(0.1, &[0.1]).in_time());
+        assert_eq!(
+            outcome(0.1, &[0.05, 0.1, 0.2, 0.3]).share_in_time(),
+            Some(0.5)
+        );
+        assert_eq!(outcome(0.1, &[]).share_in_time(), None);
+        assert!(!outcome(0.1, &[]).is_in_time() && outcome(0.1, &[0.1]).is_in_time());
     }
 
-    /// Two cores, eight robots: a quarter each, so that 50 ms take 200 ms; with twice that 100 ms, and 40 % more are accepted.
+    /// Two cores, eight robots: a quarter each, so that 50 ms take 200 ms, and 100 ms with twice the share; 40 % more
+    /// are accepted.
     #[test]
     fn eager_robots_accept_less_than_their_part_gives() {
-        let (part, eager, patient) = terms(8, 2.0, 0.05);
+        let (part, eager, patient) = agreement_terms(8, 2.0, 0.05);
         assert_eq!(part, 0.25);
         assert!((eager - 0.14).abs() < 1e-9 && (patient - 1.0).abs() < 1e-9);
-        assert_eq!(terms(3, 2.0, 0.05).0, 0.666);
+        assert_eq!(agreement_terms(3, 2.0, 0.05).0, 0.666);
     }
 
     #[test]
     fn the_controllers_gain_is_counted() {
-        let (good, bad) = (had(0.1, &[0.05]), had(0.1, &[0.3]));
+        let (good, bad) = (outcome(0.1, &[0.05]), outcome(0.1, &[0.3]));
         let mut section = Section::new(9, "a", "b");
-        let gained = runs(
+        let gained = test_runs(
             vec![good.clone(), bad.clone()],
             vec![good.clone(), good.clone()],
         );
-        tell(&gained, &mut section).expect("it is told");
+        add_to_section(&gained, &mut section).expect("it is told");
         let found = &section.findings[0];
         assert!(
             found.contains("1 were served") && found.contains("2.0 times as many"),
@@ -337,8 +365,8 @@ mod tests {
             section.findings
         );
         let mut section = Section::new(9, "a", "b");
-        tell(
-            &runs(vec![good.clone(), good], vec![bad.clone(), bad]),
+        add_to_section(
+            &test_runs(vec![good.clone(), good], vec![bad.clone(), bad]),
             &mut section,
         )
         .expect("it is told");

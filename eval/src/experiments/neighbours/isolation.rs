@@ -1,4 +1,4 @@
-//! A robot that asks now and then, beside neighbours that compute without end.
+//! A robot that calls now and then, next to neighbours that compute without end.
 
 use std::time::{Duration, Instant};
 
@@ -7,35 +7,36 @@ use serde::{Deserialize, Serialize};
 use support::daemon::Daemon;
 
 use super::AGAIN;
-use crate::cells::{Cells, Measured};
-use crate::experiments::crowd::{self, Controller, ENDLESS, SHORT, Service, Yard};
+use crate::cells::{CachedResult, RunCache};
+use crate::experiments::crowd::{self, Controller, CrowdDaemon, ENDLESS, SHORT, WorkerService};
 use crate::plots::{self, Series};
-use crate::section::{Missing, Section, Table};
+use crate::section::{MissingMeasurement, Section, Table};
 use crate::statistics::{mean, quantile};
 use crate::words::{digits, milliseconds, ratio};
 
-/// What the robot is promised, and what each neighbour, as parts of the machine: with eight neighbours that is nearly all of it.
+/// Fraction of the machine that the robot is promised, and that of each neighbour; with eight neighbours they add up to
+/// nearly all of it.
 const PARTS: (f64, f64) = (0.45, 0.06);
-/// `cpu.weight` of somebody for each core of a promise, as the daemon sets it.
+/// `cpu.weight` per promised core, as the daemon sets it.
 const WEIGHT: f64 = 1000.0;
-/// How many times as long as another the mean without neighbours may be, where policies cannot differ.
+/// Ratio up to which means without neighbours count as equal; there the policies should not differ.
 const ALIKE: f64 = 1.25;
 /// Seconds between an answer and the robot's next request.
 const PAUSE: f64 = 0.02;
 
-/// How servants are kept apart.
+/// How servants are isolated from each other.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Policy {
-    /// Each may use what it was promised, and has the weight of it: what robots get who state cores.
+enum IsolationPolicy {
+    /// Each may use what it was promised, with a corresponding weight: the treatment of robots that state cores.
     Limits,
-    /// The same weights, and no limits.
+    /// Weights as with `Limits`, but no limits.
     Weights,
-    /// All are equal.
+    /// Equal weights without limits.
     None,
 }
 
-impl Policy {
+impl IsolationPolicy {
     const ALL: [Self; 3] = [Self::Limits, Self::Weights, Self::None];
 
     fn name(self) -> &'static str {
@@ -47,10 +48,10 @@ impl Policy {
     }
 }
 
-/// What a point depends on.
+/// Inputs of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-struct Plan {
-    policy: Policy,
+struct IsolationPlan {
+    policy: IsolationPolicy,
     neighbours: usize,
     settles: f64,
     lasts: f64,
@@ -58,25 +59,29 @@ struct Plan {
     cores: f64,
 }
 
-/// A point of the figure.
+/// Measurements of a point of the figure.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(super) struct Beside {
-    /// The robot's response times, seconds.
+pub(super) struct IsolationPoint {
+    /// Response times of the robot, in seconds.
     times: Vec<f64>,
     /// Cores that all neighbours together used meanwhile.
     neighbours_cores: f64,
 }
 
-/// All points.
-pub(super) struct Runs(Vec<(Plan, Measured<Beside>)>);
+/// Results of all points.
+pub(super) struct IsolationRuns(Vec<(IsolationPlan, CachedResult<IsolationPoint>)>);
 
-pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Runs> {
+pub(super) fn measure(
+    cells: &RunCache,
+    yard: &mut CrowdDaemon,
+    quick: bool,
+) -> Result<IsolationRuns> {
     let neighbours: &[usize] = if quick { &[0, 2] } else { &[0, 1, 2, 4, 8] };
     let (settles, lasts) = if quick { (0.3, 1.2) } else { (1.5, 7.0) };
     let mut points = Vec::new();
-    for policy in Policy::ALL {
+    for policy in IsolationPolicy::ALL {
         for neighbours in neighbours.iter().copied() {
-            let plan = Plan {
+            let plan = IsolationPlan {
                 policy,
                 neighbours,
                 settles,
@@ -86,62 +91,64 @@ pub(super) fn measure(cells: &Cells, yard: &mut Yard, quick: bool) -> Result<Run
             };
             let name = format!("neighbours {} {neighbours}", policy.name());
             let measured = cells.measure(&name, &plan, || {
-                let daemon = yard.cleared(Controller::Off)?;
-                crowd::publishes(daemon, SHORT)?;
-                crowd::publishes(daemon, ENDLESS)?;
-                beside(daemon, &plan)
+                let daemon = yard.without_servants(Controller::Off)?;
+                crowd::publish(daemon, SHORT)?;
+                crowd::publish(daemon, ENDLESS)?;
+                measure_point(daemon, &plan)
             })?;
             points.push((plan, measured));
         }
     }
-    Ok(Runs(points))
+    Ok(IsolationRuns(points))
 }
 
-fn beside(daemon: &Daemon, plan: &Plan) -> Result<Beside> {
-    let joins = |service: Service, name: &str, part: f64| {
+fn measure_point(daemon: &Daemon, plan: &IsolationPlan) -> Result<IsolationPoint> {
+    let joins = |service: WorkerService, name: &str, part: f64| {
         let promised = part * plan.cores;
         let states = match plan.policy {
-            Policy::Limits => format!("&cpus={promised:.3}"),
-            Policy::Weights | Policy::None => String::new(),
+            IsolationPolicy::Limits => format!("&cpus={promised:.3}"),
+            IsolationPolicy::Weights | IsolationPolicy::None => String::new(),
         };
-        let robot = crowd::joins(daemon, service, name, &states)?;
-        if plan.policy == Policy::Weights {
+        let robot = crowd::join(daemon, service, name, &states)?;
+        if plan.policy == IsolationPolicy::Weights {
             let servant = daemon.servant_of(service.name, name)?;
             let id = servant["id"].as_str().context("a servant's id")?;
             let weight = format!("{:.0}", promised * WEIGHT);
             let set = ["set", id, "--cpu-weight", &weight];
-            daemon.deployer().types(&set)?.succeeded()?;
+            daemon.deployer().run(&set)?.expect_success()?;
         }
         Ok(robot)
     };
     let mut measured = joins(SHORT, "measured", PARTS.0)?;
-    crowd::call(&mut measured)?;
+    crowd::time_call(&mut measured)?;
     let mut neighbours = (0..plan.neighbours)
         .map(|number| joins(ENDLESS, &format!("greedy{number}"), PARTS.1))
         .collect::<Result<Vec<_>>>()?;
-    // When all are there: servants start slowly beside others that compute.
+    // Starts once all are connected, because servants start slowly next to busy ones.
     for neighbour in &mut neighbours {
-        crowd::begins(neighbour)?;
+        crowd::begin_call(neighbour)?;
     }
     let lasts = |seconds: f64| {
         let now = Instant::now();
         (now, now + Duration::from_secs_f64(seconds))
     };
-    crowd::calls(&mut measured, lasts(plan.settles), || PAUSE)?;
+    crowd::time_calls(&mut measured, lasts(plan.settles), || PAUSE)?;
     let (before, begun) = (crowd::usage(daemon, ENDLESS)?, Instant::now());
-    let times = crowd::calls(&mut measured, lasts(plan.lasts), || PAUSE)?;
+    let times = crowd::time_calls(&mut measured, lasts(plan.lasts), || PAUSE)?;
     let used = crowd::usage(daemon, ENDLESS)?.0 - before.0;
-    Ok(Beside {
+    Ok(IsolationPoint {
         times,
         neighbours_cores: used / begun.elapsed().as_secs_f64(),
     })
 }
 
-pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
+pub(super) fn add_to_section(runs: &IsolationRuns, section: &mut Section) -> Result<()> {
     let plan = &runs.0[0].0;
     section.differs.push(format!(
-        "Greedy neighbours: the robot asks for {} ms of a core, {:.0} ms after each answer; each neighbour's node computes without end. \
-         Limits: the robot is promised {:.2} cores and each neighbour {:.2}, and none may use more. Weights only: the same cpu.weight \
+        "Greedy neighbours: the robot asks for {} ms of a core, {:.0} ms after each answer; each neighbour's node \
+         computes without end. \
+         Limits: the robot is promised {:.2} cores and each neighbour {:.2}, and none may use more. Weights only: the \
+         same cpu.weight \
          ({:.0} and {:.0}), without limits. None: all are equal.",
         plan.work,
         PAUSE * 1e3,
@@ -164,16 +171,16 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
     );
     for (plan, measured) in &runs.0 {
         match measured {
-            Measured::Done(beside) => table.push([
+            CachedResult::Done(beside) => table.push([
                 plan.policy.name().to_owned(),
                 plan.neighbours.to_string(),
                 beside.times.len().to_string(),
                 milliseconds(quantile(&beside.times, 0.5)),
                 milliseconds(quantile(&beside.times, 0.95)),
-                ratio(runs.slower(plan.policy, plan.neighbours, 0.5)),
+                ratio(runs.slowdown(plan.policy, plan.neighbours, 0.5)),
                 digits(beside.neighbours_cores),
             ]),
-            Measured::Missing(why) => section.missing.push(Missing::new(
+            CachedResult::Missing(why) => section.missing.push(MissingMeasurement::new(
                 format!("{} neighbours, {}", plan.neighbours, plan.policy.name()),
                 why,
                 AGAIN,
@@ -185,8 +192,8 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
         ("neighbours-median", 0.5, "median"),
         ("neighbours-95", 0.95, "95 %"),
     ] {
-        let series =
-            Policy::ALL.map(|policy| Series::new(policy.name(), runs.line(policy, fraction)));
+        let series = IsolationPolicy::ALL
+            .map(|policy| Series::new(policy.name(), runs.quantile_line(policy, fraction)));
         let caption = format!("Response time of a robot beside greedy neighbours, {name}");
         let drawing = plots::lines(
             &caption,
@@ -195,43 +202,43 @@ pub(super) fn tell(runs: &Runs, section: &mut Section) -> Result<()> {
             &series,
             false,
         )?;
-        section.drawing(id, caption, drawing);
+        section.add_drawing(id, caption, drawing);
     }
-    runs.find(section);
+    runs.add_findings(section);
     Ok(())
 }
 
-impl Runs {
-    fn at(&self, policy: Policy, neighbours: usize) -> Option<&Beside> {
+impl IsolationRuns {
+    fn find_point(&self, policy: IsolationPolicy, neighbours: usize) -> Option<&IsolationPoint> {
         let mut all = self.0.iter();
         let found = all.find(|(plan, _)| plan.policy == policy && plan.neighbours == neighbours);
-        found?.1.done()
+        found?.1.value()
     }
 
-    /// Milliseconds by neighbours.
-    fn line(&self, policy: Policy, fraction: f64) -> Vec<(f64, f64)> {
+    /// Returns a quantile of the response time in milliseconds by number of neighbours.
+    fn quantile_line(&self, policy: IsolationPolicy, fraction: f64) -> Vec<(f64, f64)> {
         let of_policy = self.0.iter().filter(|(plan, _)| plan.policy == policy);
         let points = of_policy.filter_map(|(plan, measured)| {
-            let time = quantile(&measured.done()?.times, fraction)?;
+            let time = quantile(&measured.value()?.times, fraction)?;
             Some((plan.neighbours as f64, time * 1e3))
         });
         points.collect()
     }
 
-    /// How many times as long as without neighbours.
-    fn slower(&self, policy: Policy, neighbours: usize, fraction: f64) -> Option<f64> {
-        let time = |neighbours| quantile(&self.at(policy, neighbours)?.times, fraction);
+    /// Returns the ratio to the response time without neighbours.
+    fn slowdown(&self, policy: IsolationPolicy, neighbours: usize, fraction: f64) -> Option<f64> {
+        let time = |neighbours| quantile(&self.find_point(policy, neighbours)?.times, fraction);
         Some(time(neighbours)? / time(0)?)
     }
 
-    fn find(&self, section: &mut Section) {
+    fn add_findings(&self, section: &mut Section) {
         let most = self.0.iter().map(|(plan, _)| plan.neighbours).max();
         let Some(most) = most.filter(|most| *most > 0) else {
             return;
         };
         let mut parts = Vec::new();
-        for policy in Policy::ALL {
-            let times = [0.5, 0.95].map(|fraction| self.slower(policy, most, fraction));
+        for policy in IsolationPolicy::ALL {
+            let times = [0.5, 0.95].map(|fraction| self.slowdown(policy, most, fraction));
             if let [Some(median), Some(long)] = times {
                 parts.push(format!(
                     "{}: the median is {} times that alone, the 95 % value {} times",
@@ -247,8 +254,14 @@ impl Runs {
                 parts.join("; ")
             ));
         }
-        let used = |policy| self.at(policy, most).map(|beside| beside.neighbours_cores);
-        if let (Some(limits), Some(weights)) = (used(Policy::Limits), used(Policy::Weights)) {
+        let used = |policy| {
+            self.find_point(policy, most)
+                .map(|beside| beside.neighbours_cores)
+        };
+        if let (Some(limits), Some(weights)) = (
+            used(IsolationPolicy::Limits),
+            used(IsolationPolicy::Weights),
+        ) {
             let idle = if weights > limits {
                 "; what the robot does not use is left idle with limits"
             } else {
@@ -260,32 +273,36 @@ impl Runs {
                 digits(weights)
             ));
         }
-        let alone: Vec<f64> = Policy::ALL
+        let alone: Vec<f64> = IsolationPolicy::ALL
             .iter()
-            .filter_map(|policy| mean(&self.at(*policy, 0)?.times))
+            .filter_map(|policy| mean(&self.find_point(*policy, 0)?.times))
             .collect();
         let spread = alone.iter().copied().fold(0.0, f64::max)
             / alone.iter().copied().fold(f64::INFINITY, f64::min);
         if spread > ALIKE {
             section.findings.push(format!(
-                "Alone, the three policies should be equal, and differ by {:.0} %: the machine did something else meanwhile, so that \
+                "Alone, the three policies should be equal, and differ by {:.0} %: the machine did something else \
+                 meanwhile, so that \
                  nothing is said of which is better. make eval ONLY=9 FRESH=1 measures again.",
                 (spread - 1.0) * 100.0
             ));
             return;
         }
-        let [Some(limits), Some(weights)] =
-            [Policy::Limits, Policy::Weights].map(|policy| self.slower(policy, most, 0.95))
+        let [Some(limits), Some(weights)] = [IsolationPolicy::Limits, IsolationPolicy::Weights]
+            .map(|policy| self.slowdown(policy, most, 0.95))
         else {
             return;
         };
         let ahead = |times: f64, of: f64| times > of * 1.1;
         section.findings.push(if ahead(weights, limits) {
-            "By their 95 % values, limits protect the robot better than weights alone: neighbours that have used up their part leave their cores at once, while \
-             weights let them run whenever the robot pauses, and a core is taken back from them only at the scheduler's next decision."
+            "By their 95 % values, limits protect the robot better than weights alone: neighbours that have used up \
+             their part leave their cores at once, while \
+             weights let them run whenever the robot pauses, and a core is taken back from them only at the \
+             scheduler's next decision."
                 .to_owned()
         } else if ahead(limits, weights) {
-            "By their 95 % values, weights alone protect the robot better than limits in this run, which is worse than hoped: the robot itself, or its \
+            "By their 95 % values, weights alone protect the robot better than limits in this run, which is worse than \
+             hoped: the robot itself, or its \
              neighbours all at once, begin each period of the limit with their whole part of it."
                 .to_owned()
         } else {
@@ -298,11 +315,14 @@ impl Runs {
 mod tests {
     use super::*;
 
-    fn runs(limits: [f64; 2], weights: [f64; 2], none: [f64; 2]) -> Runs {
+    fn test_runs(limits: [f64; 2], weights: [f64; 2], none: [f64; 2]) -> IsolationRuns {
         let mut points = Vec::new();
-        for (policy, times) in Policy::ALL.into_iter().zip([limits, weights, none]) {
+        for (policy, times) in IsolationPolicy::ALL
+            .into_iter()
+            .zip([limits, weights, none])
+        {
             for (neighbours, time) in [0, 8].into_iter().zip(times) {
-                let plan = Plan {
+                let plan = IsolationPlan {
                     policy,
                     neighbours,
                     settles: 1.0,
@@ -310,25 +330,27 @@ mod tests {
                     work: 8,
                     cores: 2.0,
                 };
-                let beside = Beside {
+                let beside = IsolationPoint {
                     times: vec![time; 3],
                     neighbours_cores: 1.5,
                 };
-                points.push((plan, Measured::Done(beside)));
+                points.push((plan, CachedResult::Done(beside)));
             }
         }
-        Runs(points)
+        IsolationRuns(points)
     }
 
     #[test]
     fn the_three_policies_are_compared() {
         let mut section = Section::new(9, "a", "b");
-        let measured = runs([0.01, 0.011], [0.01, 0.02], [0.01, 0.05]);
-        tell(&measured, &mut section).expect("it is told");
+        let measured = test_runs([0.01, 0.011], [0.01, 0.02], [0.01, 0.05]);
+        add_to_section(&measured, &mut section).expect("it is told");
         assert_eq!(
             section.findings[0],
-            "Beside 8 greedy neighbours, limits: the median is 1.1 times that alone, the 95 % value 1.1 times; weights only: the \
-             median is 2.0 times that alone, the 95 % value 2.0 times; none: the median is 5.0 times that alone, the 95 % value 5.0 times."
+            "Beside 8 greedy neighbours, limits: the median is 1.1 times that alone, the 95 % value 1.1 times; weights \
+             only: the \
+             median is 2.0 times that alone, the 95 % value 2.0 times; none: the median is 5.0 times that alone, the \
+             95 % value 5.0 times."
         );
         assert!(
             section.findings[2].starts_with("By their 95 % values, limits protect"),
@@ -342,8 +364,8 @@ mod tests {
     #[test]
     fn what_is_worse_than_hoped_is_said() {
         let mut section = Section::new(9, "a", "b");
-        let measured = runs([0.01, 0.03], [0.01, 0.02], [0.01, 0.05]);
-        tell(&measured, &mut section).expect("it is told");
+        let measured = test_runs([0.01, 0.03], [0.01, 0.02], [0.01, 0.05]);
+        add_to_section(&measured, &mut section).expect("it is told");
         assert!(
             section.findings[2].contains("worse than hoped"),
             "{:?}",
@@ -354,8 +376,8 @@ mod tests {
     #[test]
     fn policies_are_not_compared_on_a_machine_that_was_not_quiet() {
         let mut section = Section::new(9, "a", "b");
-        let measured = runs([0.01, 0.03], [0.01, 0.02], [0.02, 0.05]);
-        tell(&measured, &mut section).expect("it is told");
+        let measured = test_runs([0.01, 0.03], [0.01, 0.02], [0.02, 0.05]);
+        add_to_section(&measured, &mut section).expect("it is told");
         assert!(
             section.findings[2].contains("differ by 100 %"),
             "{:?}",
@@ -366,10 +388,10 @@ mod tests {
 
     #[test]
     fn a_point_that_is_missing_is_named() {
-        let mut measured = runs([0.01, 0.03], [0.01, 0.02], [0.02, 0.05]);
-        measured.0[1].1 = Measured::Missing("no room".to_owned());
+        let mut measured = test_runs([0.01, 0.03], [0.01, 0.02], [0.02, 0.05]);
+        measured.0[1].1 = CachedResult::Missing("no room".to_owned());
         let mut section = Section::new(9, "a", "b");
-        tell(&measured, &mut section).expect("it is told");
+        add_to_section(&measured, &mut section).expect("it is told");
         assert_eq!(section.missing[0].what, "8 neighbours, limits");
         assert!(
             !section.findings[0].contains("limits:"),

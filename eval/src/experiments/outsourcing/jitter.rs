@@ -1,16 +1,16 @@
-//! Experiment 5: how much response times differ from request to request.
+//! Experiment 5: variation of response times.
 
 use anyhow::Result;
 
-use super::{Run, SetUp, examples, find, missing};
-use crate::place::Network;
+use super::{OutsourcingRun, OutsourcingSetUp, add_missing, examples, find_run};
+use crate::place::NetworkProfile;
 use crate::plots;
 use crate::section::{Section, Table};
 use crate::statistics::{mean, quantile, standard_deviation};
 use crate::words::milliseconds;
 
-/// Experiment 5.
-pub fn jitter(runs: &[Run]) -> Result<Section> {
+/// Creates the section of experiment 5.
+pub fn jitter(runs: &[OutsourcingRun]) -> Result<Section> {
     let mut section = Section::new(
         5,
         "jitter",
@@ -18,7 +18,9 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
     );
     section.published =
         "Fig. 6 of the publication: jitter of response times, native and outsourced.".to_owned();
-    section.differs = vec!["The network itself has no jitter here (LAN, WAN): what is shown is that of the packages, the portal and this machine's scheduler. A robot that has a quarter of a core is stopped by the kernel for most of each tenth of a second, which is jitter, too.".to_owned()];
+    section.differs = vec!["The network itself has no jitter here (LAN, WAN): what is shown is that of the packages, \
+        the portal and this machine's scheduler. A robot that has a quarter of a core is stopped by the kernel for \
+        most of each tenth of a second, which is jitter, too.".to_owned()];
     let mut table = Table::new(
         "Response times, milliseconds",
         [
@@ -34,7 +36,7 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
         ],
     );
     for run in runs {
-        let Some((trace, _)) = run.measured.done() else {
+        let Some((trace, _)) = run.measured.value() else {
             continue;
         };
         let responses = trace.responses();
@@ -54,9 +56,9 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
             at(0.95),
             at(0.99),
         ]);
-        let native = find(runs, run.example.name, run.class, SetUp::Native);
-        if let (SetUp::Behind(network), Some((native, _))) = (run.set_up, native) {
-            let told = steadier(run, network, &native.responses(), &responses);
+        let native = find_run(runs, run.example.name, run.class, OutsourcingSetUp::Native);
+        if let (OutsourcingSetUp::Behind(network), Some((native, _))) = (run.set_up, native) {
+            let told = steadiness_finding(run, network, &native.responses(), &responses);
             section.findings.extend(told);
         }
     }
@@ -65,21 +67,27 @@ pub fn jitter(runs: &[Run]) -> Result<Section> {
         let of = runs.iter().filter(|run| run.example.name == example.name);
         let series = of.filter_map(|run| {
             let name = format!("{}, {}", run.class.name(), run.set_up.name());
-            Some((name, run.measured.done()?.0.responses()))
+            Some((name, run.measured.value()?.0.responses()))
         });
         let series: Vec<(String, Vec<f64>)> = series.collect();
-        section.drawing(
+        section.add_drawing(
             format!("jitter-{}", example.name),
             format!("{}: share of requests answered within a time", example.name),
             plots::distribution(example.name, "response time (s)", &series, true)?,
         );
     }
-    missing(&mut section, runs);
+    add_missing(&mut section, runs);
     Ok(section)
 }
 
-/// By the standard deviations natively and outsourced, and where that is not less, by what nine in ten requests differ by.
-fn steadier(run: &Run, network: Network, native: &[f64], here: &[f64]) -> Option<String> {
+/// Compares the variation natively and outsourced: by the standard deviations and, where that of the outsourced run is
+/// not smaller, by the range of nine in ten requests.
+fn steadiness_finding(
+    run: &OutsourcingRun,
+    network: NetworkProfile,
+    native: &[f64],
+    here: &[f64],
+) -> Option<String> {
     let [on_robot, outsourced] = [native, here].map(standard_deviation);
     let (on_robot, outsourced) = on_robot.zip(outsourced)?;
     let most = |all: &[f64]| Some(quantile(all, 0.95)? - quantile(all, 0.05)?);
@@ -87,14 +95,16 @@ fn steadier(run: &Run, network: Network, native: &[f64], here: &[f64]) -> Option
     let why = match most(native).zip(most(here)) {
         _ if less => String::new(),
         Some((native, here)) if here < native => format!(
-            ": worse than hoped, and by few requests, as from 5 % to 95 % they differ by {} ms and on the robot by {} ms",
+            ": worse than hoped, and by few requests, as from 5 % to 95 % they differ by {} ms and on the robot by {} \
+             ms",
             milliseconds(Some(here)),
             milliseconds(Some(native))
         ),
         _ => ": worse than hoped".to_owned(),
     };
     Some(format!(
-        "{} by {}: response times {} outsourced (standard deviation {} ms) than on a robot of the class {} ({} ms){why}.",
+        "{} by {}: response times {} outsourced (standard deviation {} ms) than on a robot of the class {} ({} \
+         ms){why}.",
         run.example.name,
         network.name(),
         if less { "differ less" } else { "differ more" },
@@ -107,14 +117,14 @@ fn steadier(run: &Run, network: Network, native: &[f64], here: &[f64]) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::experiments::outsourcing::tests::run;
+    use crate::experiments::outsourcing::tests::test_run;
 
     #[test]
     fn jitter_is_compared_with_that_of_the_robot() {
         let runs = [
-            run(SetUp::Native, &[0.3, 0.5]),
-            run(SetUp::Behind(Network::Lan), &[0.1, 0.1]),
-            run(SetUp::Behind(Network::Wan), &[0.1, 0.9]),
+            test_run(OutsourcingSetUp::Native, &[0.3, 0.5]),
+            test_run(OutsourcingSetUp::Behind(NetworkProfile::Lan), &[0.1, 0.1]),
+            test_run(OutsourcingSetUp::Behind(NetworkProfile::Wan), &[0.1, 0.9]),
         ];
         let section = jitter(&runs).expect("a section");
         let [lan, wan] = &section.findings[..] else {
@@ -133,8 +143,8 @@ mod tests {
         let mut few = vec![0.1; 100];
         few[99] = 9.0;
         let runs = [
-            run(SetUp::Native, &[0.3, 0.5]),
-            run(SetUp::Behind(Network::Wan), &few),
+            test_run(OutsourcingSetUp::Native, &[0.3, 0.5]),
+            test_run(OutsourcingSetUp::Behind(NetworkProfile::Wan), &few),
         ];
         let section = jitter(&runs).expect("a section");
         let told = &section.findings[0];

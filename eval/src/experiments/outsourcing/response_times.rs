@@ -1,32 +1,33 @@
-//! Experiment 2: response times natively and outsourced, and how many times as fast.
+//! Experiment 2: response times natively and outsourced, and the speedup.
 
 use anyhow::Result;
 
-use super::{Run, SetUp, examples, find, missing};
-use crate::place::Network;
+use super::{OutsourcingRun, OutsourcingSetUp, add_missing, examples, find_run};
+use crate::place::NetworkProfile;
 use crate::plots::{self, Series};
 use crate::section::{Section, Table};
 use crate::statistics::{mean, quantile};
 use crate::trace::Trace;
-use crate::words::{known, milliseconds, ratio};
+use crate::words::{milliseconds, or_dash, ratio};
 
-/// The largest factor in the publication's Fig. 5.
+/// Largest factor in Fig. 5 of the publication.
 const PUBLISHED: u32 = 25;
 
-/// Experiment 2.
-pub fn response_times(runs: &[Run]) -> Result<Section> {
+/// Creates the section of experiment 2.
+pub fn response_times(runs: &[OutsourcingRun]) -> Result<Section> {
     let mut section = Section::new(
         2,
         "outsourcing",
         "Native and outsourced, on two kinds of robots",
     );
-    section.published = "Fig. 5 of the publication: response times per request and accumulated times of RGBD-SLAM, RTAB-Map and SSD on a \
+    section.published = "Fig. 5 of the publication: response times per request and accumulated times of RGBD-SLAM, \
+        RTAB-Map and SSD on a \
         Raspberry Pi and on an ultrabook, native and outsourced: outsourced they were up to 25 times as fast."
         .to_owned();
-    section.differs = differs();
+    section.differs = differences();
     let network = runs
         .iter()
-        .find_map(|run| Some(&run.measured.done()?.1.network));
+        .find_map(|run| Some(&run.measured.value()?.1.network));
     section
         .differs
         .extend(network.map(|network| format!("Packets are delayed by {network}.")));
@@ -49,11 +50,11 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
         ],
     );
     for run in runs {
-        let Some((trace, cost)) = run.measured.done() else {
+        let Some((trace, cost)) = run.measured.value() else {
             continue;
         };
         let responses = trace.responses();
-        let native = find(runs, run.example.name, run.class, SetUp::Native);
+        let native = find_run(runs, run.example.name, run.class, OutsourcingSetUp::Native);
         let native = native.map(|(trace, _)| trace.responses());
         let median = quantile(&responses, 0.5);
         let times =
@@ -65,22 +66,23 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
             run.class.name().to_owned(),
             run.set_up.name().to_owned(),
             trace.requests.len().to_string(),
-            trace.answered().to_string(),
+            trace.answered_count().to_string(),
             milliseconds(median),
             milliseconds(quantile(&responses, 0.95)),
             format!("{:.1}", responses.iter().sum::<f64>()),
             ratio(faster),
             ratio(by_means),
-            published(run.set_up),
+            published_factor(run.set_up),
             format!("{:.1}", cost.robot_cpu),
-            known(trace.carried_each(1), |ways| {
+            or_dash(trace.bytes_per_request(1), |ways| {
                 format!("{:.0}", ways[0] + ways[1])
             }),
         ]);
-        if let (Some(both), SetUp::Behind(network)) = (faster.zip(by_means), run.set_up) {
+        if let (Some(both), OutsourcingSetUp::Behind(network)) = (faster.zip(by_means), run.set_up)
+        {
             section.findings.push(finding(run, network, both));
         }
-        let lost = trace.requests.len() - trace.answered();
+        let lost = trace.requests.len() - trace.answered_count();
         if lost > 0 {
             section.findings.push(format!(
                 "{}, {}, {}: {lost} of {} requests were never answered, and times are those of the others.",
@@ -95,66 +97,78 @@ pub fn response_times(runs: &[Run]) -> Result<Section> {
     for example in examples(runs) {
         let series = |of: fn(&Trace) -> Vec<(f64, f64)>| -> Vec<Series> {
             let done = runs.iter().filter(|run| run.example.name == example.name);
-            let one = |run: &Run| {
+            let one = |run: &OutsourcingRun| {
                 Some(Series {
                     name: format!("{}, {}", run.class.name(), run.set_up.name()),
-                    points: of(&run.measured.done()?.0),
+                    points: of(&run.measured.value()?.0),
                 })
             };
             done.filter_map(one).collect()
         };
         let title = format!("{} (stands for {})", example.name, example.stands_for);
-        section.drawing(
+        section.add_drawing(
             format!("outsourcing-{}", example.name),
             format!("{title}: response time of each request"),
-            plots::lines(&title, "request", "response time (s)", &series(each), true)?,
+            plots::lines(
+                &title,
+                "request",
+                "response time (s)",
+                &series(numbered_responses),
+                true,
+            )?,
         );
-        section.drawing(
+        section.add_drawing(
             format!("outsourcing-{}-accumulated", example.name),
             format!("{title}: accumulated response times"),
             plots::lines(
                 &title,
                 "request",
                 "accumulated response times (s)",
-                &series(accumulated),
+                &series(accumulate),
                 false,
             )?,
         );
     }
-    missing(&mut section, runs);
+    add_missing(&mut section, runs);
     Ok(section)
 }
 
-/// How many times as fast as on the robot the publication's packages were (Fig. 5), of which its largest number is known to us.
-fn published(set_up: SetUp) -> String {
+/// Returns the speedup of the publication's packages over the robot (Fig. 5); only its largest number is known to us.
+fn published_factor(set_up: OutsourcingSetUp) -> String {
     match set_up {
-        SetUp::Native => "1".to_owned(),
-        SetUp::Behind(_) => format!("up to {PUBLISHED}"),
+        OutsourcingSetUp::Native => "1".to_owned(),
+        OutsourcingSetUp::Behind(_) => format!("up to {PUBLISHED}"),
     }
 }
 
-fn differs() -> Vec<String> {
+fn differences() -> Vec<String> {
     [
-        "The published packages are not packaged for this system: laser_slam (scan matching), graph_slam (a graph of poses, whose steps take longer as it grows) and object_detector (a neural network) stand in; the SLAM packages work on a recorded drive of MRPT.",
-        "A Raspberry Pi is a quarter of a core of this machine and 1 GiB, an ultrabook half a core and 4 GiB; the cloud has one core for each servant. With that few cores no factor of 25 can come about: one core is four times a quarter.",
+        "The published packages are not packaged for this system: laser_slam (scan matching), graph_slam (a graph of \
+         poses, whose steps take longer as it grows) and object_detector (a neural network) stand in; the SLAM \
+         packages work on a recorded drive of MRPT.",
+        "A Raspberry Pi is a quarter of a core of this machine and 1 GiB, an ultrabook half a core and 4 GiB; the \
+         cloud has one core for each servant. With that few cores no factor of 25 can come about: one core is four \
+         times a quarter.",
         &format!(
             "Networks are delays, rates and losses between two namespaces of this machine (LAN: {}; WAN: {}).",
-            Network::Lan.told(),
-            Network::Wan.told()
+            NetworkProfile::Lan.describe(),
+            NetworkProfile::Wan.describe()
         ),
-        "The model of cores beside this predicts means, because only means follow a limit of a fraction of a core: the column by means is to be compared with it.",
+        "The model of cores beside this predicts means, because only means follow a limit of a fraction of a core: the \
+         column by means is to be compared with it.",
     ]
     .map(str::to_owned)
     .to_vec()
 }
 
-/// By the factors of medians and of means, which may disagree where few requests take long.
-fn finding(run: &Run, network: Network, (medians, means): (f64, f64)) -> String {
+/// Reports the ratios of medians and of means, which may disagree if few requests take long.
+fn finding(run: &OutsourcingRun, network: NetworkProfile, (medians, means): (f64, f64)) -> String {
     let (name, class, network) = (run.example.name, run.class.name(), network.name());
     let [by_medians, by_means] = [medians, means].map(|times| ratio(Some(times)));
     if medians >= 1.0 {
         return format!(
-            "{name} answers {by_medians} times as fast outsourced by {network} as on a robot of the class {class} (medians; by means {by_means} times)."
+            "{name} answers {by_medians} times as fast outsourced by {network} as on a robot of the class {class} \
+             (medians; by means {by_means} times)."
         );
     }
     let why = if means < 1.0 {
@@ -163,37 +177,45 @@ fn finding(run: &Run, network: Network, (medians, means): (f64, f64)) -> String 
         ": most requests are quicker on the robot, the slowest ones in the cloud"
     };
     format!(
-        "{name} answers more slowly outsourced by {network} than on a robot of the class {class} ({by_medians} times as fast by medians, {by_means} times by means){why}."
+        "{name} answers more slowly outsourced by {network} than on a robot of the class {class} ({by_medians} times \
+         as fast by medians, {by_means} times by means){why}."
     )
 }
 
-fn each(trace: &Trace) -> Vec<(f64, f64)> {
+fn numbered_responses(trace: &Trace) -> Vec<(f64, f64)> {
     let known = (1..).zip(&trace.requests);
-    let point =
-        |(number, one): (u32, &crate::trace::Request)| Some((f64::from(number), one.response?));
+    let point = |(number, one): (u32, &crate::trace::RequestSample)| {
+        Some((f64::from(number), one.response?))
+    };
     known.filter_map(point).collect()
 }
 
-fn accumulated(trace: &Trace) -> Vec<(f64, f64)> {
+fn accumulate(trace: &Trace) -> Vec<(f64, f64)> {
     let mut sum = 0.0;
     let add = |(number, response)| {
         sum += response;
         (number, sum)
     };
-    each(trace).into_iter().map(add).collect()
+    numbered_responses(trace).into_iter().map(add).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::experiments::outsourcing::tests::run;
+    use crate::experiments::outsourcing::tests::test_run;
 
     #[test]
     fn how_much_faster_is_by_the_medians() {
         let runs = [
-            run(SetUp::Native, &[0.3, 0.4, 0.5]),
-            run(SetUp::Behind(Network::Lan), &[0.1, 0.1, 0.9]),
-            run(SetUp::Behind(Network::Wan), &[0.8, 0.8, 0.8]),
+            test_run(OutsourcingSetUp::Native, &[0.3, 0.4, 0.5]),
+            test_run(
+                OutsourcingSetUp::Behind(NetworkProfile::Lan),
+                &[0.1, 0.1, 0.9],
+            ),
+            test_run(
+                OutsourcingSetUp::Behind(NetworkProfile::Wan),
+                &[0.8, 0.8, 0.8],
+            ),
         ];
         let section = response_times(&runs).expect("a section");
         let faster: Vec<&str> = section.tables[0]
@@ -218,8 +240,8 @@ mod tests {
 
     #[test]
     fn accumulated_times_are_sums() {
-        let Run { measured, .. } = run(SetUp::Native, &[1.0, 2.0, 3.0]);
-        let sums = accumulated(&measured.done().expect("it is").0);
+        let OutsourcingRun { measured, .. } = test_run(OutsourcingSetUp::Native, &[1.0, 2.0, 3.0]);
+        let sums = accumulate(&measured.value().expect("it is").0);
         assert_eq!(sums, [(1.0, 1.0), (2.0, 3.0), (3.0, 6.0)]);
     }
 }

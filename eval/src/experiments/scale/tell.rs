@@ -1,4 +1,4 @@
-//! What the report says of the points.
+//! Section of the report on scaling.
 
 mod model;
 
@@ -6,49 +6,49 @@ use std::collections::BTreeMap;
 
 use anyhow::Result;
 
-use super::{Plan, Point, Runs, THINK};
-use crate::cells::Measured;
+use super::{ScalePlan, ScalePoint, ScaleRuns, THINK};
+use crate::cells::CachedResult;
 use crate::experiments::crowd::SHORT;
 use crate::plots::{self, Series};
-use crate::section::{Missing, Section, Table};
-use crate::statistics::{Node, Observed, mean, median, quantile};
-use crate::words::{digits, known, milliseconds, ratio};
+use crate::section::{MissingMeasurement, Section, Table};
+use crate::statistics::{NodeModel, QueueObservation, mean, median, quantile};
+use crate::words::{digits, milliseconds, or_dash, ratio};
 
-/// How many times as long as alone the median is where the curve counts as bent.
+/// Ratio to the median of a single robot from which on response times count as risen.
 const BENT: f64 = 2.0;
-/// From this share on, a resource counts as used up.
+/// Use of a resource from which on it counts as exhausted.
 const FULL: f64 = 0.85;
-/// From this share of the cores' time on, others disturb the run.
+/// Use of the cores by other programs from which on a run counts as disturbed.
 const OTHERS: f64 = 0.25;
 const MEGA: f64 = 1e6;
 
-/// A point, with what it is for.
-struct Told<'a> {
-    plan: &'a Plan,
-    point: &'a Point,
-    /// The model was fitted without it.
+/// A point, and its use in the model.
+struct ReportedPoint<'a> {
+    plan: &'a ScalePlan,
+    point: &'a ScalePoint,
+    /// True if the point was held back when the model was fitted.
     held_back: bool,
 }
 
-impl Told<'_> {
+impl ReportedPoint<'_> {
     fn robots(&self) -> f64 {
         self.plan.robots as f64
     }
 
-    fn mean(&self) -> Option<f64> {
+    fn mean_response(&self) -> Option<f64> {
         mean(&self.point.times)
     }
 
-    fn observed(&self) -> Option<Observed> {
-        Some(Observed {
+    fn observation(&self) -> Option<QueueObservation> {
+        Some(QueueObservation {
             robots: self.plan.robots as u64,
-            response: self.mean()?,
-            busy: self.point.used.requests() / self.plan.cores,
+            response: self.mean_response()?,
+            busy: self.point.used.request_cores() / self.plan.cores,
         })
     }
 
-    /// Memory of a robot, bytes: what the machine has less, or what the control groups say where that is more.
-    fn memory(&self) -> f64 {
+    /// Memory per robot in bytes: the decrease of available memory, or the servants' cgroups if that is more.
+    fn memory_per_robot(&self) -> f64 {
         self.point.taken.max(self.point.servants_memory) / self.robots()
     }
 
@@ -56,24 +56,25 @@ impl Told<'_> {
         cores * self.point.lasted / self.point.times.len() as f64 * 1e3
     }
 
-    /// The share of the cores' time that was used.
-    fn busy(&self) -> f64 {
+    /// Returns the fraction of core time in use.
+    fn busy_share(&self) -> f64 {
         self.point.used.machine / self.plan.cores
     }
 
-    /// The same of what requests did not use: other programs, and the kernel where it works for nobody.
-    fn others(&self) -> f64 {
-        (self.point.used.machine - self.point.used.requests()) / self.plan.cores
+    /// Returns the fraction of core time used by other programs, and by the kernel on behalf of none.
+    fn other_share(&self) -> f64 {
+        (self.point.used.machine - self.point.used.request_cores()) / self.plan.cores
     }
 }
 
-/// What the report says.
-pub fn section(runs: &Runs) -> Result<Section> {
+/// Creates the section of the report.
+pub fn section(runs: &ScaleRuns) -> Result<Section> {
     let mut section = Section::new(10, "scale", "How many robots a node serves");
     section.published = "Starting a servant took over 5 s.".to_owned();
     section.differs = vec![
         format!(
-            "Each robot is a connection of one process on the same machine, pauses for {:.0} ms on average after each answer, and has a \
+            "Each robot is a connection of one process on the same machine, pauses for {:.0} ms on average after each \
+             answer, and has a \
              servant of its own, of a node that computes for {} ms of a core at each call and needs little memory.",
             THINK * 1e3,
             SHORT.milliseconds
@@ -83,12 +84,12 @@ pub fn section(runs: &Runs) -> Result<Section> {
     let mut told = Vec::new();
     for (index, (plan, measured)) in runs.0.iter().enumerate() {
         match measured {
-            Measured::Done(point) => told.push(Told {
+            CachedResult::Done(point) => told.push(ReportedPoint {
                 plan,
                 point,
                 held_back: index % 2 == 1,
             }),
-            Measured::Missing(why) => section.missing.push(Missing::new(
+            CachedResult::Missing(why) => section.missing.push(MissingMeasurement::new(
                 format!("{} robots", plan.robots),
                 why,
                 "make eval ONLY=10 tries it again",
@@ -99,16 +100,16 @@ pub fn section(runs: &Runs) -> Result<Section> {
         return Ok(section);
     }
     let fitted = told.iter().filter(|one| !one.held_back);
-    let fitted: Option<Vec<Observed>> = fitted.map(Told::observed).collect();
-    let node = fitted.and_then(|all| Node::fit(&all, told[0].plan.cores, told[0].plan.think));
-    starts(&told, &mut section)?;
-    points(&told, node.as_ref(), &mut section);
-    costs(&told, &mut section)?;
-    bend(&told, node.as_ref(), &mut section);
-    disturbed(&told, &mut section);
+    let fitted: Option<Vec<QueueObservation>> = fitted.map(ReportedPoint::observation).collect();
+    let node = fitted.and_then(|all| NodeModel::fit(&all, told[0].plan.cores, told[0].plan.think));
+    add_starts(&told, &mut section)?;
+    add_points(&told, node.as_ref(), &mut section);
+    add_costs(&told, &mut section)?;
+    add_bend(&told, node.as_ref(), &mut section);
+    add_disturbance(&told, &mut section);
     match &node {
-        Some(node) => model::tell(&told, node, &mut section)?,
-        None => section.missing.push(Missing::new(
+        Some(node) => model::add_model(&told, node, &mut section)?,
+        None => section.missing.push(MissingMeasurement::new(
             "the queueing model",
             "fewer than two of the points that determine it were measured",
             "make eval ONLY=10",
@@ -117,9 +118,9 @@ pub fn section(runs: &Runs) -> Result<Section> {
     Ok(section)
 }
 
-/// The start of each robot's servant, by the robot's number. Where an evaluation was cut off, all robots came anew after it: of those that
-/// were started twice, the first start counts.
-fn first_starts(told: &[Told]) -> BTreeMap<usize, f64> {
+/// Start time of each robot's servant, by the robot's number. After an interrupted evaluation all robots reconnect: of
+/// two starts, the first counts.
+fn first_starts(told: &[ReportedPoint]) -> BTreeMap<usize, f64> {
     let mut all = BTreeMap::new();
     for (number, time) in told.iter().flat_map(|one| &one.point.starts) {
         all.entry(*number).or_insert(*time);
@@ -127,7 +128,7 @@ fn first_starts(told: &[Told]) -> BTreeMap<usize, f64> {
     all
 }
 
-fn starts(told: &[Told], section: &mut Section) -> Result<()> {
+fn add_starts(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
     let all = first_starts(told);
     let times: Vec<f64> = all.values().copied().collect();
     let mut table = Table::new(
@@ -141,7 +142,7 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
         table.push([
             name.to_owned(),
             "over 5".to_owned(),
-            known(value, digits),
+            or_dash(value, digits),
             times.len().to_string(),
         ]);
     }
@@ -154,7 +155,7 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
             .collect(),
     )];
     let drawing = plots::points(caption, "servants on the node", "start (s)", &series, false)?;
-    section.drawing("scale-starts", caption, drawing);
+    section.add_drawing("scale-starts", caption, drawing);
     let tenth = (times.len() / 10).max(1);
     let which = match tenth {
         1 => "one".to_owned(),
@@ -166,7 +167,8 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
     );
     if let (Some(first), Some(last)) = (first, last) {
         section.findings.push(format!(
-            "A new servant has answered its robot's first call after {} ms on an empty node (the first {which}) and after {} ms on a full one (the last {which}), {} times as long; over 5 s were published.",
+            "A new servant has answered its robot's first call after {} ms on an empty node (the first {which}) and \
+             after {} ms on a full one (the last {which}), {} times as long; over 5 s were published.",
             milliseconds(Some(first)),
             milliseconds(Some(last)),
             ratio(Some(last / first))
@@ -175,7 +177,7 @@ fn starts(told: &[Told], section: &mut Section) -> Result<()> {
     Ok(())
 }
 
-fn points(told: &[Told], node: Option<&Node>, section: &mut Section) {
+fn add_points(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Section) {
     let mut table = Table::new(
         "Response times",
         [
@@ -191,9 +193,9 @@ fn points(told: &[Told], node: Option<&Node>, section: &mut Section) {
         ],
     );
     for one in told {
-        let predicted = node.map(|node| node.at(one.plan.robots as u64).response);
+        let predicted = node.map(|node| node.predict(one.plan.robots as u64).response);
         let error = predicted
-            .zip(one.mean())
+            .zip(one.mean_response())
             .map(|(predicted, mean)| predicted / mean - 1.0);
         table.push([
             one.plan.robots.to_string(),
@@ -201,16 +203,16 @@ fn points(told: &[Told], node: Option<&Node>, section: &mut Section) {
             digits(one.point.times.len() as f64 / one.point.lasted),
             milliseconds(median(&one.point.times)),
             milliseconds(quantile(&one.point.times, 0.95)),
-            milliseconds(one.mean()),
+            milliseconds(one.mean_response()),
             milliseconds(predicted),
-            known(error, |error| format!("{:+.1}", error * 100.0)),
-            format!("{:.0}", one.busy() * 100.0),
+            or_dash(error, |error| format!("{:+.1}", error * 100.0)),
+            format!("{:.0}", one.busy_share() * 100.0),
         ]);
     }
     section.tables.push(table);
 }
 
-fn costs(told: &[Told], section: &mut Section) -> Result<()> {
+fn add_costs(told: &[ReportedPoint], section: &mut Section) -> Result<()> {
     let mut table = Table::new(
         "What a robot costs",
         [
@@ -234,7 +236,7 @@ fn costs(told: &[Told], section: &mut Section) -> Result<()> {
         ]);
     }
     section.tables.push(table);
-    let line = |name: &str, bytes: fn(&Point) -> f64| {
+    let line = |name: &str, bytes: fn(&ScalePoint) -> f64| {
         let points = told
             .iter()
             .map(|one| (one.robots(), bytes(one.point) / MEGA));
@@ -246,12 +248,12 @@ fn costs(told: &[Told], section: &mut Section) -> Result<()> {
         line("control groups of servants", |point| point.servants_memory),
     ];
     let drawing = plots::lines(caption, "robots", "memory (MB)", &series, false)?;
-    section.drawing("scale-memory", caption, drawing);
+    section.add_drawing("scale-memory", caption, drawing);
     Ok(())
 }
 
-/// Where the response time begins to grow, and what is used up there.
-fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
+/// Reports where the response time begins to rise, and which resource is exhausted there.
+fn add_bend(told: &[ReportedPoint], node: Option<&NodeModel>, section: &mut Section) {
     let times: Vec<Option<f64>> = told.iter().map(|one| median(&one.point.times)).collect();
     let Some(alone) = times[0] else { return };
     let bent = times
@@ -261,35 +263,38 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
     let memory = 1.0 - at.point.left.0 / at.point.left.1;
     let state = format!(
         "the cores are {:.0} % busy, and {:.0} % of the memory is used",
-        at.busy() * 100.0,
+        at.busy_share() * 100.0,
         memory * 100.0
     );
-    let knee = node.map(Node::knee).map(|knee| {
+    let knee = node.map(NodeModel::knee).map(|knee| {
         format!(" By the model robots begin to wait for one another at {knee:.0} robots.")
     });
     let knee = knee.unwrap_or_default();
     let last = &told[told.len() - 1];
     let room = format!(
         "memory, {} MB for each robot, would be enough for {} robots",
-        digits(last.memory() / MEGA),
-        model::room(last)
+        digits(last.memory_per_robot() / MEGA),
+        model::robots_in_memory(last)
     );
     let times_alone = ratio(times[bent.unwrap_or(0)].map(|time| time / alone));
     let robots = at.plan.robots;
     section.findings.push(if bent.is_none() {
         format!(
-            "Up to {robots} robots the curve does not bend: the median is {} times that of {}; {state}, and {room}.{knee}",
+            "Up to {robots} robots the curve does not bend: the median is {} times that of {}; {state}, and \
+             {room}.{knee}",
             ratio(times[times.len() - 1].map(|time| time / alone)),
             told[0].plan.robots,
         )
-    } else if at.busy() >= FULL && at.others() >= OTHERS {
+    } else if at.busy_share() >= FULL && at.other_share() >= OTHERS {
         format!(
-            "At {robots} robots the median is {times_alone} times that alone, but other programs used {:.0} % of the cores' time: {state}.{knee}",
-            at.others() * 100.0
+            "At {robots} robots the median is {times_alone} times that alone, but other programs used {:.0} % of the \
+             cores' time: {state}.{knee}",
+            at.other_share() * 100.0
         )
-    } else if at.busy() >= FULL {
+    } else if at.busy_share() >= FULL {
         format!(
-            "At {robots} robots the median is {times_alone} times that alone, because the processor is used up: {state}; {room}.{knee}"
+            "At {robots} robots the median is {times_alone} times that alone, because the processor is used up: \
+             {state}; {room}.{knee}"
         )
     } else if memory >= FULL {
         format!(
@@ -297,18 +302,23 @@ fn bend(told: &[Told], node: Option<&Node>, section: &mut Section) {
         )
     } else {
         format!(
-            "At {robots} robots the median is {times_alone} times that alone, although {state}: requests come by chance and wait for \
+            "At {robots} robots the median is {times_alone} times that alone, although {state}: requests come by \
+             chance and wait for \
              each other before the cores are used up; {room}.{knee}"
         )
     });
 }
 
-/// Figures of a machine that was not quiet are said to be such.
-fn disturbed(told: &[Told], section: &mut Section) {
-    let most = told.iter().map(Told::others).fold(0.0, f64::max);
+/// Adds a remark if the machine was not quiet.
+fn add_disturbance(told: &[ReportedPoint], section: &mut Section) {
+    let most = told
+        .iter()
+        .map(ReportedPoint::other_share)
+        .fold(0.0, f64::max);
     if most >= OTHERS {
         section.findings.push(format!(
-            "Other programs used up to {:.0} % of the cores' time meanwhile: response times, the memory that the machine has less and \
+            "Other programs used up to {:.0} % of the cores' time meanwhile: response times, the memory that the \
+             machine has less and \
              the model's error are worse than on a quiet machine. make eval ONLY=10 FRESH=1 measures again.",
             most * 100.0
         ));

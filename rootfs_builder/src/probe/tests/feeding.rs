@@ -1,4 +1,4 @@
-//! Nodes that show all of themselves only once they have been given what they wait for.
+//! Nodes that register their complete interface only once they have been given what they wait for.
 
 use bytes::Bytes;
 use ros::codec::{self, FillOptions};
@@ -30,20 +30,21 @@ const SURROUNDINGS: [(&str, &str); 8] = [
     ("rosgraph_msgs/msg/Clock", "time clock\n"),
     (
         "rosgraph_msgs/msg/Log",
-        "Header header\nbyte level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\nstring[] topics\n",
+        "Header header\nbyte level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n\
+         string[] topics\n",
     ),
     ("std_msgs/msg/Empty", ""),
 ];
 
-async fn lab() -> Lab {
-    let mut lab = Lab::new().await;
+async fn new_fixture() -> MasterFixture {
+    let mut lab = MasterFixture::new().await;
     lab.definitions
         .extend(SURROUNDINGS.map(|(key, text)| (key.to_owned(), text.to_owned())));
     lab.registry = Arc::new(Registry::from_definitions(&lab.definitions).expect("valid"));
     lab
 }
 
-/// What a node in a task needs of the lab.
+/// Parts of the fixture for a node in a separate task.
 #[derive(Clone)]
 struct Node {
     bus: Arc<Ros1Bus>,
@@ -51,7 +52,7 @@ struct Node {
 }
 
 impl Node {
-    fn of(lab: &Lab) -> Self {
+    fn for_fixture(lab: &MasterFixture) -> Self {
         Self {
             bus: lab.node.clone(),
             registry: lab.registry.clone(),
@@ -60,7 +61,7 @@ impl Node {
 
     fn wire(&self, name: &str) -> WireType {
         let message = self.registry.message(name).expect("defined");
-        WireType::of(&message)
+        WireType::from_message(&message)
     }
 
     async fn hears(&self, topic: &str, type_name: &str) -> Subscription {
@@ -69,19 +70,19 @@ impl Node {
             name => self.wire(name),
         };
         self.bus
-            .subscribe(topic, wanted, Qos::keep_last(10))
+            .subscribe(topic, wanted, QosProfile::keep_last(10))
             .await
             .expect("subscribed")
     }
 
     async fn tells(&self, topic: &str, wire_type: WireType) -> Box<dyn Publisher> {
         self.bus
-            .advertise(topic, wire_type, Qos::keep_last(1))
+            .advertise(topic, wire_type, QosProfile::keep_last(1))
             .await
             .expect("advertised")
     }
 
-    /// Waits until the transforms name a frame.
+    /// Waits until the transforms contain a frame.
     async fn knows(&self, transforms: &mut Subscription, frame: &str) {
         loop {
             let message = transforms.messages.recv().await.expect("told");
@@ -98,8 +99,8 @@ impl Node {
 
 #[tokio::test]
 async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole() {
-    let lab = lab().await;
-    let node = Node::of(&lab);
+    let lab = new_fixture().await;
+    let node = Node::for_fixture(&lab);
     let base = ros::bus::ParamValue::String("chassis".into());
     lab.node
         .parameters()
@@ -112,17 +113,17 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
         node.knows(&mut transforms, "chassis").await;
         let mut clock = node.hears("/clock", "rosgraph_msgs/Clock").await;
         clock.messages.recv().await.expect("told");
-        // As waitForService does.
+        // Like waitForService.
         let mut polls = tokio::time::interval(Duration::from_millis(20));
         while node.bus.service_type("/where").await.is_err() {
             polls.tick().await;
         }
         let mut map = node.hears("/map", "std_msgs/String").await;
         map.messages.recv().await.expect("told");
-        // One was enough, as after wait_for_message.
+        // A single message, as with wait_for_message.
         drop(map);
         let turn = node.registry.action("lab/Turn").expect("defined");
-        // As move_base does: it sends itself goals.
+        // Like move_base, which sends goals to itself.
         let own_goals = node
             .tells("/turn/goal", node.wire(turn.action_goal.name()))
             .await;
@@ -147,7 +148,7 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
         ..lab.options(&["/package"])
     };
     let found = lab
-        .probed_with(&options, std::future::pending())
+        .run_probe_with(&options, std::future::pending())
         .await
         .expect("found");
     let interface = &found.interface;
@@ -163,7 +164,7 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
         .map(|action| action.name.as_str())
         .collect();
     assert_eq!(actions, ["/turn"]);
-    // A servant is ready without it: it comes with what the robot gives.
+    // Not required for a ready servant: it appears with the robot's input.
     assert_eq!(interface.late, ["/turn"]);
     let needs: Vec<_> = interface
         .needs
@@ -177,8 +178,8 @@ async fn a_node_that_waits_for_transforms_time_a_service_and_a_map_is_seen_whole
 
 #[tokio::test]
 async fn frames_are_heard_in_complaints() {
-    let lab = lab().await;
-    let node = Node::of(&lab);
+    let lab = new_fixture().await;
+    let node = Node::for_fixture(&lab);
     let mut transforms = node.hears("/tf", "tf2_msgs/TFMessage").await;
     let log = node.tells("/rosout", node.wire("rosgraph_msgs/Log")).await;
     let complaining = tokio::spawn(async move {
@@ -206,7 +207,7 @@ async fn frames_are_heard_in_complaints() {
         (node.tells("/planned", wire).await, log)
     });
     let found = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect("found");
     let planned = found
@@ -230,15 +231,15 @@ async fn frames_are_heard_in_complaints() {
 
 #[tokio::test]
 async fn a_node_that_ends_of_what_it_is_given_is_published_as_it_was_seen() {
-    let lab = lab().await;
-    let node = Node::of(&lab);
+    let lab = new_fixture().await;
+    let node = Node::for_fixture(&lab);
     let mut fragile = node.hears("/fragile", "std_msgs/String").await;
     let exited = async move {
         fragile.messages.recv().await.expect("told");
         "/package was ended by signal 11".to_owned()
     };
     let found = lab
-        .probed(&["/package"], exited)
+        .run_probe(&["/package"], exited)
         .await
         .expect("found all the same");
     assert_eq!(found.interface.topics[0].name, "/fragile");
@@ -250,8 +251,8 @@ async fn a_node_that_ends_of_what_it_is_given_is_published_as_it_was_seen() {
 #[tokio::test]
 async fn a_relay_has_the_type_that_is_stated_or_any() {
     for stated in [None, Some("std_msgs/String")] {
-        let lab = lab().await;
-        let node = Node::of(&lab);
+        let lab = new_fixture().await;
+        let node = Node::for_fixture(&lab);
         let mut heard = node.hears("/in", "*").await;
         let relaying = tokio::spawn(async move {
             let message = heard.messages.recv().await.expect("told");
@@ -267,7 +268,7 @@ async fn a_relay_has_the_type_that_is_stated_or_any() {
             ..lab.options(&["/package"])
         };
         let found = lab
-            .probed_with(&options, std::future::pending())
+            .run_probe_with(&options, std::future::pending())
             .await
             .expect("found");
         let topics: Vec<_> = found
@@ -293,12 +294,12 @@ async fn a_relay_has_the_type_that_is_stated_or_any() {
 
 #[tokio::test]
 async fn an_interface_without_anything_in_it_is_told() {
-    let lab = lab().await;
+    let lab = new_fixture().await;
     let _log = lab
         .advertises("/rosout", lab.wire("rosgraph_msgs/Log"), false)
         .await;
     let found = lab
-        .probed(&["/package"], std::future::pending())
+        .run_probe(&["/package"], std::future::pending())
         .await
         .expect("found");
     let told = |warning: &String| {
@@ -311,8 +312,8 @@ async fn an_interface_without_anything_in_it_is_told() {
 
 #[tokio::test]
 async fn outputs_that_carry_the_stamp_of_an_input_answer_it() {
-    let lab = lab().await;
-    let node = Node::of(&lab);
+    let lab = new_fixture().await;
+    let node = Node::for_fixture(&lab);
     let stamped = "geometry_msgs/TransformStamped";
     let _switch = node.hears("/a_switch", "std_msgs/Empty").await;
     let _unanswered = node.hears("/another", stamped).await;
@@ -322,13 +323,13 @@ async fn outputs_that_carry_the_stamp_of_an_input_answer_it() {
     let answering = tokio::spawn(async move {
         while let Some(image) = images.messages.recv().await {
             boxes.publish(image.bytes);
-            // Stamped, too, with a time of its own.
+            // Also stamped, but with a time of its own.
             beat.publish(bytes::Bytes::from_static(&[7; 200]));
         }
     });
-    let found = lab.probed(&["/package"], std::future::pending()).await;
+    let found = lab.run_probe(&["/package"], std::future::pending()).await;
     let watched = found.expect("found").watched;
-    let expected = Watched {
+    let expected = ObservedAnswer {
         input: "/image".to_owned(),
         output: "/boxes".to_owned(),
     };

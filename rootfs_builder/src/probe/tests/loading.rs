@@ -1,4 +1,4 @@
-//! Component containers, in memory: what is loaded into them is looked at as any node.
+//! Component containers in memory: loaded components are probed like any node.
 
 use ros::bus::RosVersion;
 use serde_json::json;
@@ -16,14 +16,14 @@ fn component(plugin: &str, name: &str) -> Component {
     }
 }
 
-async fn probed(
+async fn run_probe(
     system: &Arc<MemorySystem>,
     components: Vec<Component>,
     patience: Duration,
-) -> Result<Found, ProbeError> {
+) -> Result<ProbeResult, ProbeError> {
     let definitions = DEFINITIONS.map(|(key, text)| (key.to_owned(), text.to_owned()));
     let definitions = definitions.into();
-    let registry = Registry::of_definitions(RosVersion::Two, &definitions).expect("valid");
+    let registry = Registry::with_definitions(RosVersion::Two, &definitions).expect("valid");
     let options = ProbeOptions {
         patience,
         settle: Duration::from_millis(50),
@@ -57,7 +57,7 @@ async fn a_container_loads_its_nodes_before_they_are_looked_at() {
         ..component("talk::Talker", "see")
     };
     let components = vec![first, component("talk::Talker", "")];
-    probed(&system, components, LONG).await.expect("found");
+    run_probe(&system, components, LONG).await.expect("found");
     assert_eq!(container.names(), ["/front/see", "/talker"]);
     let asked = container.loaded.lock().asked[0].clone();
     for (field, expected) in [
@@ -84,7 +84,7 @@ async fn what_is_not_loaded_is_told_with_the_containers_words() {
         component("talk::Walker", "go"),
         component("talk::Talker", "late"),
     ];
-    let error = probed(&system, components, LONG)
+    let error = run_probe(&system, components, LONG)
         .await
         .expect_err("refused");
     assert_eq!(
@@ -101,7 +101,7 @@ async fn a_node_that_loads_nothing_is_told_with_how_long_was_waited() {
     let _node = system.join("/box");
     let components = vec![component("talk::Talker", "see")];
     let patience = Duration::from_millis(200);
-    let error = probed(&system, components, patience)
+    let error = run_probe(&system, components, patience)
         .await
         .expect_err("late");
     let words = error.to_string();

@@ -1,10 +1,10 @@
-//! Nodes of ROS 2, in memory.
+//! ROS 2 nodes in memory.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use bytes::Bytes;
 use package::interface::{Durability, Reliability};
-use ros::bus::{ParamValue, Reliability as OnBus, RosVersion};
+use ros::bus::{ParamValue, QosReliability as OnBus, RosVersion};
 use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use serde_json::{Value, json};
 
@@ -28,20 +28,20 @@ const DEFINITIONS: [(&str, &str); 8] = [
     ("lifecycle_msgs/srv/GetState", "---\nState current_state\n"),
 ];
 
-/// Definitions of an image, and a system whose nodes tell nothing but digests.
-struct Two {
+/// Definitions of an image, and a system whose nodes report only digests.
+struct Ros2System {
     definitions: BTreeMap<String, String>,
     registry: Arc<Registry>,
     system: Arc<MemorySystem>,
 }
 
-impl Two {
+impl Ros2System {
     fn new() -> Self {
         let transition = ("lifecycle_msgs/msg/Transition", "uint8 id\nstring label\n");
         let all = DEFINITIONS.into_iter().chain([transition]);
         let definitions = all.map(|(key, text)| (key.to_owned(), text.to_owned()));
         let definitions: BTreeMap<String, String> = definitions.collect();
-        let registry = Registry::of_definitions(RosVersion::Two, &definitions).expect("valid");
+        let registry = Registry::with_definitions(RosVersion::Two, &definitions).expect("valid");
         Self {
             definitions,
             registry: Arc::new(registry),
@@ -50,14 +50,14 @@ impl Two {
     }
 
     fn wire(&self, name: &str) -> WireType {
-        WireType::of(&self.registry.message(name).expect("defined"))
+        WireType::from_message(&self.registry.message(name).expect("defined"))
     }
 
     fn service(&self, name: &str) -> ServiceType {
-        ServiceType::of(&self.registry.service(name).expect("defined"))
+        ServiceType::from_service(&self.registry.service(name).expect("defined"))
     }
 
-    async fn probed(&self, nodes: &[&str]) -> Result<Found, ProbeError> {
+    async fn run_probe(&self, nodes: &[&str]) -> Result<ProbeResult, ProbeError> {
         let nodes = nodes.iter().map(|&node| node.to_owned()).collect();
         let options = ProbeOptions {
             patience: Duration::from_secs(5),
@@ -71,7 +71,7 @@ impl Two {
     }
 }
 
-/// Whatever is asked, nothing but zeros.
+/// Handler that always answers with zeros.
 struct Zeros;
 
 #[async_trait::async_trait]
@@ -85,18 +85,18 @@ impl ServiceHandler for Zeros {
 
 #[tokio::test]
 async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() {
-    let two = Two::new();
+    let two = Ros2System::new();
     let node = two.system.join_demanding("/see");
     let seen = two.wire("lab/msg/Seen");
-    let weak = Qos {
+    let weak = QosProfile {
         reliability: OnBus::BestEffort,
-        ..Qos::keep_last(1)
+        ..QosProfile::keep_last(1)
     };
     let _out = node
         .advertise("/seen", seen.clone(), weak)
         .await
         .expect("a topic");
-    let latched = Qos::keep_last(1).latching(true);
+    let latched = QosProfile::keep_last(1).latching(true);
     let string = two.wire("std_msgs/msg/String");
     let mut input = node
         .subscribe("/map", string.clone(), latched)
@@ -133,7 +133,7 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     });
     parameters.set("/see", set.into()).await.expect("set");
 
-    let found = two.probed(&["/see"]).await.expect("found");
+    let found = two.run_probe(&["/see"]).await.expect("found");
     let interface = found.interface;
     let topic = |name: &str| {
         let mut topics = interface.topics.iter();
@@ -151,7 +151,7 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     assert_eq!(topic("/seen").md5, seen.digest.to_string());
     let asked = topic("/map").qos.expect("told");
     assert_eq!(asked.durability, Durability::TransientLocal);
-    // It asks for what is latched, and was given it.
+    // It requests a latched message and got it.
     assert!(input.messages.try_recv().is_some(), "{:?}", found.warnings);
     let services: Vec<&str> = interface
         .services
@@ -195,7 +195,8 @@ async fn qualities_and_parameters_are_found_and_what_every_node_has_is_hidden() 
     );
 }
 
-/// Drives a node as rclcpp does: configure, then activate, which begins its work; `refuses` is the transition that fails.
+/// A lifecycle node as in rclcpp: configured, then activated, which starts its work; `refuses` is the transition that
+/// fails.
 struct Stages {
     registry: Arc<Registry>,
     node: Arc<MemoryBus>,
@@ -219,20 +220,23 @@ impl Stages {
         }
         self.state.store(state + 1, Ordering::SeqCst);
         if label == "activate" {
-            let of = WireType::of(
+            let of = WireType::from_message(
                 &self
                     .registry
                     .message("std_msgs/msg/String")
                     .expect("defined"),
             );
-            let publisher = self.node.advertise("/driven", of, Qos::keep_last(1)).await;
+            let publisher = self
+                .node
+                .advertise("/driven", of, QosProfile::keep_last(1))
+                .await;
             *self.working.lock() = Some(publisher.expect("advertised"));
         }
         true
     }
 }
 
-/// One of its services.
+/// One of its lifecycle services.
 struct Stage(Arc<Stages>, &'static str);
 
 #[async_trait::async_trait]
@@ -260,8 +264,12 @@ impl ServiceHandler for Stage {
     }
 }
 
-/// A node that can be driven, in this state; what is returned keeps its services.
-async fn driven(two: &Two, refuses: &'static str, state: u8) -> (Arc<Stages>, impl Sized) {
+/// Starts a lifecycle node in this state; the returned guard keeps its services alive.
+async fn start_lifecycle_node(
+    two: &Ros2System,
+    refuses: &'static str,
+    state: u8,
+) -> (Arc<Stages>, impl Sized) {
     let node = two.system.join("/drive");
     let stages = Arc::new(Stages {
         registry: Arc::clone(&two.registry),
@@ -284,9 +292,9 @@ async fn driven(two: &Two, refuses: &'static str, state: u8) -> (Arc<Stages>, im
 
 #[tokio::test]
 async fn a_node_with_a_lifecycle_is_activated_and_its_services_are_its_lifecycle() {
-    let two = Two::new();
-    let (stages, _served) = driven(&two, "", 1).await;
-    let interface = two.probed(&["/drive"]).await.expect("found").interface;
+    let two = Ros2System::new();
+    let (stages, _served) = start_lifecycle_node(&two, "", 1).await;
+    let interface = two.run_probe(&["/drive"]).await.expect("found").interface;
     assert_eq!(stages.state()["current_state"]["label"], "active");
     assert_eq!(interface.lifecycle, ["/drive"]);
     assert_eq!(interface.services, []);
@@ -306,10 +314,10 @@ async fn a_node_that_does_not_activate_is_named_with_the_transition() {
             "/drive does not activate: /drive did not activate, and is inactive now",
         ),
     ] {
-        let two = Two::new();
-        let (_stages, _served) = driven(&two, refuses, 1).await;
+        let two = Ros2System::new();
+        let (_stages, _served) = start_lifecycle_node(&two, refuses, 1).await;
         let error = two
-            .probed(&["/drive"])
+            .run_probe(&["/drive"])
             .await
             .expect_err("refused")
             .to_string();
@@ -319,20 +327,20 @@ async fn a_node_that_does_not_activate_is_named_with_the_transition() {
 
 #[tokio::test]
 async fn a_node_that_somebody_drives_is_left_to_it() {
-    let two = Two::new();
-    let (stages, _served) = driven(&two, "", 1).await;
+    let two = Ros2System::new();
+    let (stages, _served) = start_lifecycle_node(&two, "", 1).await;
     let manager = two.system.join("/manager");
     let _drives = manager.seek(
         "/drive/change_state",
         two.service("lifecycle_msgs/srv/ChangeState"),
     );
-    let found = two.probed(&["/drive"]).await.expect("found");
+    let found = two.run_probe(&["/drive"]).await.expect("found");
     assert_eq!(stages.state()["current_state"]["label"], "unconfigured");
     assert_eq!(found.interface.lifecycle, ["/drive"]);
 
-    let two = Two::new();
-    let (stages, _served) = driven(&two, "", 2).await;
-    let found = two.probed(&["/drive"]).await.expect("found");
+    let two = Ros2System::new();
+    let (stages, _served) = start_lifecycle_node(&two, "", 2).await;
+    let found = two.run_probe(&["/drive"]).await.expect("found");
     assert_eq!(stages.state()["current_state"]["label"], "inactive");
     let told = found
         .warnings
@@ -345,21 +353,21 @@ async fn a_node_that_somebody_drives_is_left_to_it() {
 async fn actions_bring_the_definitions_that_their_parts_refer_to() {
     struct Nothing;
     impl ros::bus::ActionHandler for Nothing {
-        fn goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+        fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
             Ok(())
         }
-        fn cancel(&self, _id: &str) {}
-        fn failed(&self, reason: &str) {
+        fn on_cancel(&self, _id: &str) {}
+        fn on_failed(&self, reason: &str) {
             panic!("{reason}");
         }
     }
-    let two = Two::new();
+    let two = Ros2System::new();
     let node = two.system.join("/see");
     let turn = two.registry.action("lab/action/Turn").expect("defined");
     let _served = node
         .serve_action("/turn", &turn, Arc::new(Nothing))
         .expect("served");
-    let interface = two.probed(&["/see"]).await.expect("found").interface;
+    let interface = two.run_probe(&["/see"]).await.expect("found").interface;
     let actions: Vec<_> = interface
         .actions
         .iter()

@@ -1,31 +1,31 @@
-//! Service level agreements: what is to be kept of which measure.
+//! Service level agreements: desired and acceptable values of each measure.
 
 use serde::{Deserialize, Serialize};
 
 use super::Span;
 use super::Unstatable;
 
-/// Frames per second beyond which it is a mistake of units.
+/// Maximum rate in frames per second; larger values are assumed to be in the wrong unit.
 const MOST_FPS: f64 = 1e6;
 
-/// What is to be kept.
+/// Measure of an SLA.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Measure {
-    /// The request response time, in seconds: less is better.
+    /// Request response time in seconds; less is better.
     Rrt,
-    /// The rate of an output, in frames per second: more is better.
+    /// Rate of an output in frames per second; more is better.
     Fps,
-    /// The age of an output, in seconds: less is better.
+    /// Age of an output in seconds; less is better.
     Age,
 }
 
 impl Measure {
-    /// Every measure.
+    /// All measures.
     pub const ALL: [Measure; 3] = [Measure::Rrt, Measure::Fps, Measure::Age];
 
-    /// Its key.
+    /// Returns the key of the measure.
     pub fn name(self) -> &'static str {
         match self {
             Measure::Rrt => "rrt",
@@ -34,7 +34,7 @@ impl Measure {
         }
     }
 
-    /// Whether `value` is at least as good as `than`.
+    /// Returns whether `value` is at least as good as `than`.
     pub fn reaches(self, value: f64, than: f64) -> bool {
         match self {
             Measure::Rrt | Measure::Age => value <= than,
@@ -42,73 +42,73 @@ impl Measure {
         }
     }
 
-    /// A value with its unit, as it is written behind the measure's key.
-    pub fn print(self, value: f64) -> String {
-        match (self, Span::seconds(value)) {
+    /// Formats a value with its unit, as it is written after the measure's key.
+    pub fn format_value(self, value: f64) -> String {
+        match (self, Span::from_seconds(value)) {
             (Measure::Rrt | Measure::Age, Some(span)) => span.to_string(),
             _ => value.to_string(),
         }
     }
 
-    /// Reads a value: seconds for times.
-    pub fn read(self, text: &str) -> Result<f64, String> {
+    /// Parses a value; times are in seconds.
+    pub fn parse_value(self, text: &str) -> Result<f64, String> {
         match self {
             Measure::Rrt | Measure::Age => text
                 .parse::<Span>()
                 .map(Span::as_seconds)
                 .map_err(|error| error.to_string()),
-            Measure::Fps => rate(text),
+            Measure::Fps => parse_rate(text),
         }
     }
 }
 
-/// A service level agreement; nothing of it need be given.
+/// A service level agreement. All fields are optional.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(utoipa::ToSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Sla {
-    /// T_desire: the request response time that is wished for.
+    /// T_desire: desired request response time.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub rrt: Option<Span>,
-    /// T_max: the longest that is acceptable.
+    /// T_max: longest acceptable request response time.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub max_rrt: Option<Span>,
-    /// The rate of an output that is wished for, frames per second.
+    /// Desired rate of an output, in frames per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fps: Option<f64>,
-    /// The least that is acceptable.
+    /// Lowest acceptable rate of an output, in frames per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub min_fps: Option<f64>,
-    /// The age of an output that is wished for.
+    /// Desired age of an output.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub age: Option<Span>,
-    /// The greatest that is acceptable.
+    /// Highest acceptable age of an output.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schema(value_type = Option<String>))]
     pub max_age: Option<Span>,
 }
 
-/// One measure of an SLA.
+/// Goal for one measure of an SLA.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Goal {
-    /// What is measured.
+    /// The measure.
     pub measure: Measure,
-    /// What is wished for: seconds, or frames per second.
+    /// Desired value: seconds, or frames per second.
     pub desire: f64,
-    /// What is acceptable; never better than `desire`.
+    /// Acceptable value; never better than `desire`.
     pub bound: f64,
 }
 
 impl Sla {
-    /// Whether nothing is given.
+    /// Returns whether nothing is given.
     pub fn is_empty(&self) -> bool {
         *self == Sla::default()
     }
 
-    /// What is to be kept. Where one of desire and bound is given, it is both.
+    /// Returns the goals. If only one of desire and bound is given, it is used for both.
     pub fn goals(&self) -> Vec<Goal> {
         let seconds = |span: Option<Span>| span.map(Span::as_seconds);
         let goal = |measure, desire: Option<f64>, bound: Option<f64>| {
@@ -127,7 +127,7 @@ impl Sla {
         all.into_iter().flatten().collect()
     }
 
-    /// Refuses an SLA that contradicts itself.
+    /// Rejects a contradictory SLA.
     pub fn check(&self) -> Result<(), Unstatable> {
         let refused = |key: &str, reason: String| Err(Unstatable::new(key, reason));
         if let (Some(rrt), Some(max)) = (self.rrt, self.max_rrt)
@@ -153,13 +153,13 @@ impl Sla {
         }
         for (key, value) in [("fps", self.fps), ("min_fps", self.min_fps)] {
             if let Some(value) = value {
-                rate(&value.to_string()).map_err(|reason| Unstatable::new(key, reason))?;
+                parse_rate(&value.to_string()).map_err(|reason| Unstatable::new(key, reason))?;
             }
         }
         Ok(())
     }
 
-    /// The stricter of both, measure by measure.
+    /// Returns the stricter of both, measure by measure.
     pub fn stricter(self, other: Sla) -> Sla {
         let (rrt, max_rrt) = stricter(
             (self.rrt, self.max_rrt),
@@ -187,12 +187,12 @@ impl Sla {
     }
 }
 
-/// A desire and a bound of one measure.
+/// Desired and acceptable value of one measure.
 type Pair<T> = (Option<T>, Option<T>);
 
-/// The better desire and the better bound of two.
+/// Returns the better desired value and the better bound of two pairs.
 fn stricter<T: Copy>(one: Pair<T>, other: Pair<T>, better: fn(T, T) -> T) -> Pair<T> {
-    // Where one of desire and bound is given, it is both.
+    // If only one of desire and bound is given, it is used for both.
     let whole = |(desire, bound): Pair<T>| Some((desire.or(bound)?, bound.or(desire)?));
     match (whole(one), whole(other)) {
         (Some(a), Some(b)) => (Some(better(a.0, b.0)), Some(better(a.1, b.1))),
@@ -201,8 +201,8 @@ fn stricter<T: Copy>(one: Pair<T>, other: Pair<T>, better: fn(T, T) -> T) -> Pai
     }
 }
 
-/// Reads frames per second.
-pub(super) fn rate(text: &str) -> Result<f64, String> {
+/// Parses a rate in frames per second.
+pub(super) fn parse_rate(text: &str) -> Result<f64, String> {
     let rate = text.parse().ok();
     rate.filter(|rate| *rate > 0.0 && *rate <= MOST_FPS)
         .ok_or_else(|| {

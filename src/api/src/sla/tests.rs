@@ -23,8 +23,8 @@ fn all_that_can_be_stated_is_read() {
         ("token", "secret"),
     ])
     .expect("valid");
-    assert_eq!(stated.sla.rrt, Span::millis(100));
-    assert_eq!(stated.sla.max_rrt, Span::millis(300));
+    assert_eq!(stated.sla.rrt, Span::from_millis(100));
+    assert_eq!(stated.sla.max_rrt, Span::from_millis(300));
     assert_eq!(
         (stated.sla.fps, stated.sla.min_fps),
         (Some(10.0), Some(5.0))
@@ -37,7 +37,8 @@ fn all_that_can_be_stated_is_read() {
     assert_eq!(stated.aux["width"], "640");
     assert_eq!(
         stated.to_string(),
-        "rrt=100ms max_rrt=300ms fps=10 min_fps=5 age=500ms max_age=2s class=interactive cpus=1.5 memory=1G aux.width=640"
+        "rrt=100ms max_rrt=300ms fps=10 min_fps=5 age=500ms max_age=2s class=interactive cpus=1.5 \
+         memory=1G aux.width=640"
     );
     let none = read(&[("robot", "rover1"), ("v", "1")]).expect("nothing is stated");
     assert!(none.is_empty());
@@ -70,14 +71,14 @@ fn what_cannot_be_stated_is_named_with_the_reason_and_what_to_write() {
         ),
         ("memory", "1K", &["memory = 1K is too little", "4M"]),
         ("aux.", "1", &["aux.", "write aux.KEY=VALUE"]),
-        ("aux.a b", "1", &["aux.a b names no auxiliary parameter"]),
+        ("aux.a b", "1", &["aux.a b is not an auxiliary parameter"]),
         (
             "aux.width",
             "",
             &["aux.width has no value", "aux.width=640"],
         ),
         ("aux.width", "\u{7}", &["aux.width has no value"]),
-        // Mistyped keys.
+        // Misspelled keys.
         ("max-rrt", "1", &["max-rrt is not a key; write max_rrt"]),
         ("RRT", "1", &["RRT is not a key; write rrt"]),
         ("desire", "1", &["desire is not a key; write rrt"]),
@@ -154,7 +155,7 @@ fn several_of_one_robot_get_what_the_strictest_needs() {
         ("aux.width", "1920"),
         ("aux.model", "b"),
     ]);
-    let both = one.with(other, |one, _| one == "fast");
+    let both = one.merge(other, |one, _| one == "fast");
     assert_eq!(
         both.to_string(),
         "rrt=100ms max_rrt=100ms fps=5 class=fast cpus=1 memory=1G aux.model=a aux.width=1920"
@@ -162,10 +163,10 @@ fn several_of_one_robot_get_what_the_strictest_needs() {
     both.sla.check().expect("in order");
 }
 
-fn stated() -> impl Strategy<Value = Stated> {
+fn any_stated() -> impl Strategy<Value = Stated> {
     let span =
         || proptest::option::of((1u64..86_400_000_000_000).prop_map(|nanos| nanos as f64 / 1e9));
-    // Exact in binary: serde_json's reading of others may be off by the last digit.
+    // Exactly representable in binary: serde_json may parse other values with an error in the last digit.
     let eighths = |most: u32| (1..most).prop_map(|n| f64::from(n) / 8.0);
     let rate = || proptest::option::of(eighths(8_000_000));
     let aux = proptest::collection::btree_map("[a-zA-Z0-9_.-]{1,8}", "[!-~]{1,8}", 0..4);
@@ -178,8 +179,8 @@ fn stated() -> impl Strategy<Value = Stated> {
     )
         .prop_map(
             |((rrt, max_rrt, fps, min_fps, age, max_age), class, cpus, memory, aux)| {
-                let span = |seconds: Option<f64>| seconds.and_then(Span::seconds);
-                // A desire is no weaker than its bound.
+                let span = |seconds: Option<f64>| seconds.and_then(Span::from_seconds);
+                // A desired value is at least as strict as its bound.
                 let within = |desire: Option<f64>, bound: Option<f64>| {
                     desire.map(|desire| bound.map_or(desire, |bound| bound.min(desire)))
                 };
@@ -204,15 +205,15 @@ fn stated() -> impl Strategy<Value = Stated> {
 
 proptest! {
     #[test]
-    fn what_is_printed_is_read_again(stated in stated()) {
-        prop_assert_eq!(Stated::read(stated.pairs()), Ok(stated.clone()));
+    fn what_is_printed_is_read_again(stated in any_stated()) {
+        prop_assert_eq!(Stated::read(stated.to_pairs()), Ok(stated.clone()));
         let json = serde_json::to_string(&stated).unwrap();
         prop_assert_eq!(serde_json::from_str::<Stated>(&json).unwrap(), stated);
     }
 
     #[test]
-    fn together_none_is_promised_less_than_alone(one in stated(), other in stated()) {
-        let both = one.clone().with(other.clone(), |_, _| false);
+    fn together_none_is_promised_less_than_alone(one in any_stated(), other in any_stated()) {
+        let both = one.clone().merge(other.clone(), |_, _| false);
         prop_assert_eq!(both.sla.check(), Ok(()));
         for goal in one.sla.goals().into_iter().chain(other.sla.goals()) {
             let goals = both.sla.goals();

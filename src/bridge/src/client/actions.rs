@@ -1,4 +1,4 @@
-//! The ops on actions.
+//! Ops on actions.
 
 mod answering;
 mod goals;
@@ -13,61 +13,61 @@ use ros::schema::ActionDef;
 use rosbridge::Id;
 use tokio_util::sync::CancellationToken;
 
-use super::{Client, take_chosen};
-use crate::lacking::explain;
-use crate::names::sought;
+use super::{BridgeClient, remove_matching};
+use crate::lacking::explain_schema_error;
+use crate::names::lookup_name;
 use goals::ActionClient;
 use server::ActionServer;
 
-/// The actions a client uses and serves.
+/// The actions that a client uses and serves.
 #[derive(Default)]
 pub(super) struct Actions {
-    /// Those it sends goals to, by action name.
+    /// Actions it sends goals to, by name.
     used: HashMap<String, Arc<ActionClient>>,
-    /// Goals under way, by what the server calls them.
-    goals: HashMap<String, UnderWayGoal>,
-    /// Those it serves, by action name.
+    /// Goals in progress, by the server's id.
+    goals: HashMap<String, ActiveGoal>,
+    /// Actions it serves, by name.
     served: HashMap<String, Arc<ActionServer>>,
 }
 
 /// A goal that can be cancelled.
-struct UnderWayGoal {
-    /// The action's name.
+struct ActiveGoal {
+    /// Name of the action.
     action: String,
-    /// What the client calls it, by which it cancels it.
+    /// Id used by the client, for cancelling.
     id: Option<Id<'static>>,
     /// Cancelled before it was sent.
     recalled: CancellationToken,
 }
 
 impl Actions {
-    /// Removes those of these names that the client serves.
+    /// Removes the served actions whose names match.
     pub(super) fn take_served(
         &mut self,
         chosen: impl Fn(&str) -> bool,
     ) -> Vec<(String, Arc<ActionServer>)> {
-        take_chosen(&mut self.served, chosen)
+        remove_matching(&mut self.served, chosen)
     }
 
-    /// Goals under way at actions of these names, as their servers call them, with those.
-    pub(super) fn goals_at(&self, chosen: impl Fn(&str) -> bool) -> Vec<(String, String)> {
+    /// Returns the goals in progress of actions whose names match: the server's id and the action.
+    pub(super) fn goals_of_actions(&self, chosen: impl Fn(&str) -> bool) -> Vec<(String, String)> {
         let goals = self.goals.iter().filter(|(_, goal)| chosen(&goal.action));
         goals
             .map(|(goal_id, goal)| (goal_id.clone(), goal.action.clone()))
             .collect()
     }
 
-    /// What the server calls the goal that the client calls `id`.
-    fn goal_of(&self, id: &Id<'_>) -> Option<String> {
-        let named = |goal: &UnderWayGoal| goal.id.as_ref() == Some(id);
+    /// Returns the server's id of the goal with the client's `id`.
+    fn find_goal_id(&self, id: &Id<'_>) -> Option<String> {
+        let named = |goal: &ActiveGoal| goal.id.as_ref() == Some(id);
         let mut goals = self.goals.iter();
         goals.find_map(|(goal_id, goal)| named(goal).then(|| goal_id.clone()))
     }
 }
 
-impl Client {
+impl BridgeClient {
     fn action_def(&self, action: &str, type_name: &str) -> Result<Arc<ActionDef>, String> {
-        let name = sought(self.version(), type_name);
+        let name = lookup_name(self.version(), type_name);
         let registry = &self.shared.registry;
         let def = registry.action(&name);
         let def = def.or_else(|error| match name.strip_suffix("Action") {
@@ -75,6 +75,11 @@ impl Client {
             Some(short) if self.version() == RosVersion::One => registry.action(short),
             _ => Err(error),
         });
-        def.map_err(|error| format!("action {action}: {}", explain(self.version(), error)))
+        def.map_err(|error| {
+            format!(
+                "action {action}: {}",
+                explain_schema_error(self.version(), error)
+            )
+        })
     }
 }

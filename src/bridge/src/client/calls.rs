@@ -15,22 +15,22 @@ use ros::schema::{MessageType, ServiceDef};
 use rosbridge::{CallService, Compression, Format, Id, Payload, Writer};
 
 use super::decoding::decode_args;
-use super::{Client, Reply, print_format};
-use crate::lacking::explain;
-use crate::names::{digest_word, is_same_type, other_type, spelled};
+use super::{BridgeClient, ReplyTarget, payload_format};
+use crate::lacking::explain_schema_error;
+use crate::names::{digest_word, is_same_type, ros_type_name, type_mismatch};
 use crate::own::{self, OwnService};
-use crate::sample::Frame;
+use crate::sample::EncodedFrame;
 
-/// A service of the bridge's own has what its arguments hold so often, at most, beside what is read of them: in its answer, and on the
-/// way of that.
+/// Maximum number of copies of the arguments of a call that the bridge answers itself, beside the parsed form: in its
+/// answer, and while that is sent.
 const COPIES: usize = 3;
 
-/// A call, free of the frame it came in.
-struct Call {
+/// A call, independent of its frame.
+struct ServiceCall {
     service: String,
-    /// As the client wrote it: that is what it looks for in the answer.
+    /// Name as the client wrote it, which it expects in the answer.
     written: String,
-    /// The type that the client says.
+    /// Type given by the client.
     said: Option<String>,
     id: Option<Id<'static>>,
     args: Option<(Format, Bytes)>,
@@ -39,11 +39,11 @@ struct Call {
     fragment_size: Option<usize>,
 }
 
-impl Call {
-    fn reply(&self) -> Reply {
-        Reply {
+impl ServiceCall {
+    fn reply(&self) -> ReplyTarget {
+        ReplyTarget {
             id: self.id.clone(),
-            format: print_format(self.compression),
+            format: payload_format(self.compression),
         }
     }
 
@@ -55,11 +55,11 @@ impl Call {
     }
 }
 
-impl Client {
+impl BridgeClient {
     pub(super) fn call_service(
         self: &Arc<Self>,
         op: CallService<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         self.shared.metrics.calls.add(1);
         let compression = op.compression.unwrap_or(match reply.format {
@@ -67,7 +67,7 @@ impl Client {
             Format::Cbor => Compression::Cbor,
         });
         let args = op.args;
-        let call = Call {
+        let call = ServiceCall {
             service: String::new(),
             written: op.service.clone().into_owned(),
             said: op.type_name.map(Cow::into_owned),
@@ -84,15 +84,15 @@ impl Client {
         };
         let (service, guard) = match self
             .resolve(&op.service)
-            .and_then(|service| Ok((service, self.begin(args)?)))
+            .and_then(|service| Ok((service, self.begin_call(args)?)))
         {
             Ok(found) => found,
             Err(reason) => {
-                self.call_failed(&call, &reason);
+                self.answer_call_failed(&call, &reason);
                 return Ok(());
             }
         };
-        let call = Call {
+        let call = ServiceCall {
             service: service.into_owned(),
             ..call
         };
@@ -100,15 +100,15 @@ impl Client {
         let mut call = Box::pin(async move {
             let _guard = guard;
             let answered = tokio::select! {
-                () = client.ended() => return,
+                () = client.wait_ended() => return,
                 answered = client.answer(&call) => answered,
             };
             match answered {
                 Ok(frame) => client.send_as(frame, call.compression, call.fragment_size),
-                Err(reason) => client.call_failed(&call, &reason),
+                Err(reason) => client.answer_call_failed(&call, &reason),
             }
         });
-        // The request goes out at once; a task that waits for the answer is made while the node works on it.
+        // The request is sent at once; the task that waits for the answer is spawned while the node handles it.
         if call
             .as_mut()
             .poll(&mut Context::from_waker(Waker::noop()))
@@ -119,16 +119,19 @@ impl Client {
         Ok(())
     }
 
-    async fn answer(&self, call: &Call) -> Result<Frame, String> {
-        self.serves_itself(&call.service).await;
+    async fn answer(&self, call: &ServiceCall) -> Result<EncodedFrame, String> {
+        self.wait_own_service(&call.service).await;
         let bus = &self.shared.bus;
         let server = bus.graph().borrow().services.get(&call.service).cloned();
-        let own = server.is_none().then(|| own::find(&call.service)).flatten();
+        let own = server
+            .is_none()
+            .then(|| own::find_own_service(&call.service))
+            .flatten();
         if !own.as_ref().is_some_and(|own| own.is_filtered()) {
-            self.granted().check(Operation::Call, &call.service)?;
+            self.client_grants().check(Operation::Call, &call.service)?;
         }
         if let Some(own) = own {
-            return self.answer_ourselves(call, &*own).await;
+            return self.call_own_service(call, &*own).await;
         }
         let service_type = self
             .shared
@@ -140,8 +143,8 @@ impl Client {
             .shared
             .registry
             .service(&service_type.name)
-            .map_err(|error| explain(self.version(), error));
-        let def = def.and_then(|def| match differing(&service_type, &def) {
+            .map_err(|error| explain_schema_error(self.version(), error));
+        let def = def.and_then(|def| match differing_digests(&service_type, &def) {
             None => Ok(def),
             Some((theirs, ours)) => Err(format!(
                 "service {} has type {} with {} {theirs} there and {ours} here",
@@ -151,11 +154,11 @@ impl Client {
             )),
         });
         if let Ok(def) = &def {
-            self.report_surplus(&call.reply(), "call_service", &def.request, call.args());
+            self.warn_surplus_args(&call.reply(), "call_service", &def.request, call.args());
         }
-        let other = self.other_type(call, &service_type.name);
+        let other = self.declared_type_mismatch(call, &service_type.name);
         let request = match (&def, call.compression, call.args()) {
-            // Its bytes might be read as anything.
+            // Its bytes could be misinterpreted.
             (_, Compression::CborRaw, _) if other.is_some() => {
                 return Err(other.unwrap_or_default());
             }
@@ -167,7 +170,7 @@ impl Client {
                 }
                 request
             }
-            // ROS bytes both ways need no definition.
+            // ROS bytes in both directions need no definition.
             (Err(_), Compression::CborRaw, Some(args)) => Bytes::from(
                 args.raw()
                     .map_err(|error| error.to_string())?
@@ -177,17 +180,20 @@ impl Client {
             (Err(reason), ..) => return Err(reason.clone()),
         };
         let of = def.as_ref().ok().map(|def| &*def.request);
-        self.shared.inputs.of(&call.service, of).note(&request);
+        self.shared
+            .inputs
+            .for_input(&call.service, of)
+            .record(&request);
         let asked = Instant::now();
         let response = self
             .shared
             .bus
             .call(&call.service, request, call.timeout)
             .await;
-        // What the robot's own clients serve says nothing of the servant.
+        // Services of the robot's own clients say nothing about the servant.
         if server.is_none_or(|server| server != bus.node()) {
             let took = response.is_ok().then(|| asked.elapsed());
-            self.shared.options.called.tell(took);
+            self.shared.options.called.record(took);
         }
         let response = response.map_err(|error| {
             if matches!(
@@ -204,32 +210,33 @@ impl Client {
         self.response_frame(call, def.as_deref().ok(), &response)
     }
 
-    /// That the client says another type than the service has. As rosbridge_suite does, a call whose arguments fit is made.
-    fn other_type(&self, call: &Call, theirs: &str) -> Option<String> {
+    /// Returns the mismatch if the client gives another type than the service has. As in rosbridge_suite, a call whose
+    /// arguments fit is made anyway.
+    fn declared_type_mismatch(&self, call: &ServiceCall, theirs: &str) -> Option<String> {
         let said = call
             .said
             .as_deref()
             .filter(|said| !is_same_type(said, theirs))?;
         let service = format!("service {}", call.service);
-        Some(other_type(
+        Some(type_mismatch(
             &service,
             theirs,
-            &spelled(self.version(), said, "srv"),
+            &ros_type_name(self.version(), said, "srv"),
         ))
     }
 
     /// Waits for the registration of a service that this client has advertised and calls itself.
-    async fn serves_itself(&self, service: &str) {
-        let registered = self.services.lock().registered(service);
+    async fn wait_own_service(&self, service: &str) {
+        let registered = self.services.lock().registration(service);
         if let Some(mut registered) = registered {
             let known = registered.wait_for(|registered| *registered);
             let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
         }
     }
 
-    /// Waits until what this client advertised before is known to ROS: its own operations are carried out in order, as it
-    /// sees them. Not for long; what cannot be registered is told by a status.
-    async fn is_registered(&self) {
+    /// Waits until everything this client has advertised is registered in ROS, so that its own operations appear to it
+    /// in order. Waits only briefly; a failed registration is reported by a status message.
+    async fn wait_registered(&self) {
         let topics: Vec<String> = self
             .topic_publishers
             .lock()
@@ -251,27 +258,31 @@ impl Client {
         let _ = tokio::time::timeout(self.shared.options.warm_up, known).await;
     }
 
-    /// Answers a call of a service of the bridge's own.
-    async fn answer_ourselves(&self, call: &Call, own: &dyn OwnService) -> Result<Frame, String> {
-        if own.shows_graph() {
-            self.is_registered().await;
+    /// Answers a call of one of the bridge's own services.
+    async fn call_own_service(
+        &self,
+        call: &ServiceCall,
+        own: &dyn OwnService,
+    ) -> Result<EncodedFrame, String> {
+        if own.reads_graph() {
+            self.wait_registered().await;
         }
         let def = own.definition(&self.shared)?;
-        let args = self.own_args(call, &def)?;
+        let args = self.own_service_args(call, &def)?;
         let mut held = self.budget.permit();
-        let counted = held.count(JsonWeight::of(&args).bytes + COPIES * args.len());
+        let counted = held.count(JsonWeight::estimate(&args).bytes + COPIES * args.len());
         counted.map_err(|full| format!("field \"args\": {full}"))?;
-        let grants = self.granted().grants();
+        let grants = self.client_grants().grants();
         let caller = own::Caller {
             grants: &grants,
             budget: &self.budget,
         };
         let values = own.answer(&self.shared, &args, &caller).await?;
-        self.own_frame(call, &def, &values)
+        self.own_service_frame(call, &def, &values)
     }
 
-    /// The arguments of a call that the bridge answers, as a JSON object.
-    fn own_args(&self, call: &Call, def: &ServiceDef) -> Result<Bytes, String> {
+    /// Returns the arguments of a call that the bridge answers, as a JSON object.
+    fn own_service_args(&self, call: &ServiceCall, def: &ServiceDef) -> Result<Bytes, String> {
         match (call.args(), &call.args) {
             (None, _) => Ok(Bytes::from_static(b"{}")),
             (Some(args), Some((Format::Json, bytes)))
@@ -288,8 +299,13 @@ impl Client {
         }
     }
 
-    /// The answer to such a call, from JSON.
-    fn own_frame(&self, call: &Call, def: &ServiceDef, values: &[u8]) -> Result<Frame, String> {
+    /// Builds the answer to such a call from JSON.
+    fn own_service_frame(
+        &self,
+        call: &ServiceCall,
+        def: &ServiceDef,
+        values: &[u8],
+    ) -> Result<EncodedFrame, String> {
         if matches!(call.compression, Compression::None | Compression::Png) {
             return answer_frame(call, Format::Json, |out| {
                 out.extend_from_slice(values);
@@ -306,11 +322,11 @@ impl Client {
 
     fn response_frame(
         &self,
-        call: &Call,
+        call: &ServiceCall,
         def: Option<&ServiceDef>,
         response: &Bytes,
-    ) -> Result<Frame, String> {
-        let format = print_format(call.compression);
+    ) -> Result<EncodedFrame, String> {
+        let format = payload_format(call.compression);
         let Some(def) = def.filter(|_| call.compression != Compression::CborRaw) else {
             let mut out = Vec::with_capacity(response.len() + 128);
             let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
@@ -319,7 +335,7 @@ impl Client {
             writer.raw("values", None, response);
             writer.boolean("result", true);
             writer.end();
-            return Ok(Frame::new(format, out));
+            return Ok(EncodedFrame::new(format, out));
         };
         answer_frame(call, format, |out| {
             self.print_payload(&def.response, response, format, out)
@@ -350,40 +366,40 @@ impl Client {
         printed.map_err(|error| error.to_string())
     }
 
-    fn call_failed(&self, call: &Call, reason: &str) {
+    fn answer_call_failed(&self, call: &ServiceCall, reason: &str) {
         self.shared.metrics.calls_failed.add(1);
         tracing::debug!(client = %self.name, service = %call.written, "call failed: {reason}");
-        let format = print_format(call.compression);
+        let format = payload_format(call.compression);
         let mut out = Vec::with_capacity(256);
         let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
         writer.text("service", &call.written);
         writer.text("values", reason);
         writer.boolean("result", false);
         writer.end();
-        self.send_frame(Frame::new(format, out), call.fragment_size, true);
+        self.send_frame(EncodedFrame::new(format, out), call.fragment_size, true);
     }
 }
 
-/// The digests, there and here, by which a server's type is another than the one that is known: of the service, or of its
-/// requests or responses, whichever the server tells.
-fn differing(theirs: &ServiceType, def: &ServiceDef) -> Option<(Digest, Digest)> {
-    let ours = ServiceType::of(def);
+/// Returns the digests, there and here, that differ between a server's type and the known one: of the service, or of
+/// its request or response, whichever the server announces.
+fn differing_digests(theirs: &ServiceType, def: &ServiceDef) -> Option<(Digest, Digest)> {
+    let ours = ServiceType::from_service(def);
     let told = [&theirs.digest, &theirs.request, &theirs.response];
     let known = [ours.digest, ours.request, ours.response];
     let mut pairs = told.into_iter().cloned().zip(known);
-    pairs.find(|(theirs, ours)| !theirs.agrees(ours))
+    pairs.find(|(theirs, ours)| !theirs.is_compatible_with(ours))
 }
 
 fn answer_frame<E>(
-    call: &Call,
+    call: &ServiceCall,
     format: Format,
     values: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
-) -> Result<Frame, E> {
+) -> Result<EncodedFrame, E> {
     let mut out = Vec::with_capacity(256);
     let mut writer = Writer::op(&mut out, format, "service_response", call.id.as_ref());
     writer.text("service", &call.written);
     writer.value("values", values)?;
     writer.boolean("result", true);
     writer.end();
-    Ok(Frame::new(format, out))
+    Ok(EncodedFrame::new(format, out))
 }

@@ -1,4 +1,4 @@
-//! What clients send, as serialized messages.
+//! Conversion of clients' payloads to serialized messages.
 
 use bytes::Bytes;
 use ros::codec::{self, FillOptions, Time};
@@ -8,7 +8,7 @@ use rosbridge::{Compression, Format, Payload};
 /// Raw messages shorter than this are copied: a slice would keep the whole read buffer alive.
 const SLICED: usize = 16 * 1024;
 
-/// A payload as serialized message.
+/// Converts a payload to a serialized message.
 pub(super) fn decode(
     message_type: &MessageType,
     payload: Payload<'_>,
@@ -29,7 +29,7 @@ pub(super) fn decode(
         now: Some(Time::now()),
         ..FillOptions::default()
     };
-    // Base64 shrinks by a quarter; everything else that matters does by more.
+    // Base64 shrinks by a quarter; everything else of relevance by more.
     let mut out = Vec::with_capacity(payload.bytes.len() / 4 * 3 + 64);
     let decoded = match payload.format {
         Format::Json => codec::from_json(message_type, payload.bytes, &mut out, &options),
@@ -39,8 +39,8 @@ pub(super) fn decode(
     Ok(Bytes::from(out))
 }
 
-/// Arguments of a service or goal, an object or a list, as serialized message; none are all defaults, and what a list
-/// has too many is left out.
+/// Converts the arguments of a service or goal, an object or a list, to a serialized message; without arguments all
+/// fields have defaults, and surplus values of a list are dropped.
 pub(super) fn decode_args(
     message_type: &MessageType,
     args: Option<Payload<'_>>,
@@ -54,7 +54,7 @@ pub(super) fn decode_args(
         Some(list) if list.is_list() && compression != Compression::CborRaw => {
             let fields = message_type.fields();
             let named = list
-                .named(fields.iter().map(|field| field.name.as_str()))
+                .to_named_object(fields.iter().map(|field| field.name.as_str()))
                 .ok_or("field \"args\" is a list of too many values; name them in an object")?;
             decode(
                 message_type,

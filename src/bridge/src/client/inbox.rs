@@ -1,18 +1,18 @@
-//! Messages that come in several, or packed in others: fragments, and pictures that hold text.
+//! Messages in several parts or wrapped in others: fragments, and PNG images that contain text.
 
 use std::sync::Arc;
 use std::time::Instant;
 
 use budget::{Budget, Exceeded, Permit};
-use rosbridge::{Fragment, Fragments, Frame as Incoming, Png};
+use rosbridge::{Fragment, Fragments, Png, ProtocolFrame as Incoming};
 
-use super::Client;
-use crate::shared::Shared;
+use super::BridgeClient;
+use crate::shared::BridgeShared;
 
-/// Messages packed in pictures in fragments in pictures: nobody needs more.
+/// Maximum nesting of fragments and PNG images.
 const MAX_WRAPPING: usize = 4;
 
-/// What one connection has to remember besides: messages not yet complete.
+/// Incomplete messages of one connection.
 pub(crate) struct Inbox {
     fragments: Fragments,
     pictures: Fragments,
@@ -20,7 +20,7 @@ pub(crate) struct Inbox {
 }
 
 impl Inbox {
-    pub(crate) fn new(shared: &Shared, budget: &Budget) -> Self {
+    pub(crate) fn new(shared: &BridgeShared, budget: &Budget) -> Self {
         let limits = shared.options.fragments;
         Self {
             fragments: Fragments::new(limits),
@@ -29,14 +29,14 @@ impl Inbox {
         }
     }
 
-    /// Counts unfinished messages of the client in its budget.
+    /// Counts the client's incomplete messages in its budget.
     pub(crate) fn count(&mut self) -> Result<(), Exceeded> {
         let held = self.fragments.bytes() + self.pictures.bytes();
         self.permit.resize(held)
     }
 }
 
-impl Client {
+impl BridgeClient {
     pub(super) fn fragment(
         self: &Arc<Self>,
         inbox: &mut Inbox,
@@ -48,7 +48,7 @@ impl Client {
             .add(op, Instant::now())
             .map_err(|error| error.to_string())?;
         if let Some(text) = whole {
-            self.unwrapped(inbox, &text, wrapping)?;
+            self.handle_unwrapped(inbox, &text, wrapping)?;
         }
         Ok(())
     }
@@ -69,12 +69,12 @@ impl Client {
         if let Some(data) = whole {
             let text = rosbridge::decode_png(&data, self.shared.options.max_png)
                 .map_err(|error| error.to_string())?;
-            self.unwrapped(inbox, &text, wrapping)?;
+            self.handle_unwrapped(inbox, &text, wrapping)?;
         }
         Ok(())
     }
 
-    fn unwrapped(
+    fn handle_unwrapped(
         self: &Arc<Self>,
         inbox: &mut Inbox,
         text: &str,
@@ -85,7 +85,7 @@ impl Client {
                 "messages within messages go {MAX_WRAPPING} deep at most"
             ));
         }
-        self.frame(inbox, Incoming::Text(text), None, wrapping + 1);
+        self.handle_frame(inbox, Incoming::Text(text), None, wrapping + 1);
         Ok(())
     }
 }

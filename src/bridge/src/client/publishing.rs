@@ -6,74 +6,74 @@ use std::sync::{Arc, Weak};
 use access::Operation;
 use bytes::Bytes;
 use ros::schema::MessageType;
-use rosbridge::{Advertise, Compression, Format, Id, Level, Payload, Publish, Unadvertise};
+use rosbridge::{Advertise, Compression, Format, Id, Payload, Publish, StatusLevel, Unadvertise};
 
 use super::decoding::decode;
-use super::{Client, Reply, take_chosen};
-use crate::lacking::explain;
-use crate::names::{digest_word, is_same_type, other_type, sought, spelled};
-use crate::quality::{Offer, offered};
+use super::{BridgeClient, ReplyTarget, remove_matching};
+use crate::lacking::explain_schema_error;
+use crate::names::{digest_word, is_same_type, lookup_name, ros_type_name, type_mismatch};
+use crate::quality::{PublisherOffer, publication_offer};
 use crate::tf;
-use crate::topic_publisher::{Notified, TopicPublisher};
+use crate::topic_publisher::{PublisherEvents, TopicPublisher};
 
-/// Messages on one topic that wait until its type is known.
+/// Maximum number of messages on one topic that wait until its type is known.
 const MAX_UNTYPED: usize = 64;
-/// Bytes of all such messages of one client; one message may have more.
+/// Maximum bytes of all such messages of one client; a single message may be larger.
 const MAX_UNTYPED_BYTES: usize = 16 << 20;
 
-/// A client's topics, by their absolute names.
+/// Topics of a client, by absolute name.
 #[derive(Default)]
 pub(super) struct TopicPublishers {
-    open: HashMap<String, Advertised>,
+    open: HashMap<String, AdvertisedTopic>,
     untyped: HashMap<String, Vec<Untyped>>,
-    /// Topics of which the client has been told why nothing can be published on them.
+    /// Topics for which the client was told why nothing can be published.
     told: HashSet<String>,
 }
 
-/// A topic that is published on until it has been unadvertised as often as it was advertised.
-pub(super) struct Advertised {
+/// A topic that is published until it has been unadvertised as often as it was advertised.
+pub(super) struct AdvertisedTopic {
     topic_publisher: Arc<TopicPublisher>,
-    /// Those of its advertisements; none where it was only published on.
+    /// Ids of its advertisements; empty if it was only published on.
     ids: HashSet<Option<Id<'static>>>,
 }
 
 impl TopicPublishers {
-    /// How many advertisements there are.
+    /// Returns the number of advertisements.
     fn count(&self) -> usize {
         let known = self.open.values();
         known.map(|known| known.ids.len().max(1)).sum()
     }
 
-    /// Removes those of these topics, and what waits for their types.
-    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Advertised)> {
+    /// Removes the topics that match, and the messages that wait for their types.
+    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, AdvertisedTopic)> {
         self.untyped.retain(|topic, _| !chosen(topic));
         self.told.retain(|topic| !chosen(topic));
-        take_chosen(&mut self.open, chosen)
+        remove_matching(&mut self.open, chosen)
     }
 
-    /// Names of the topics advertised.
+    /// Returns the names of the advertised topics.
     pub(super) fn topics(&self) -> impl Iterator<Item = &str> {
         self.open.keys().map(String::as_str)
     }
 }
 
-/// Passes on to a client what it must know of a topic that it publishes.
-struct Advertiser {
-    client: Weak<Client>,
+/// Reports events of an advertised topic to its client.
+struct AdvertiseNotifier {
+    client: Weak<BridgeClient>,
     topic: String,
-    reply: Reply,
+    reply: ReplyTarget,
 }
 
-impl Notified for Advertiser {
-    fn failed(&self, reason: &str) {
+impl PublisherEvents for AdvertiseNotifier {
+    fn on_failed(&self, reason: &str) {
         if let Some(client) = self.client.upgrade() {
             let gone = client.topic_publishers.lock().open.remove(&self.topic);
             drop(gone);
-            self.refused(reason);
+            self.on_refused(reason);
         }
     }
 
-    fn refused(&self, reason: &str) {
+    fn on_refused(&self, reason: &str) {
         if let Some(client) = self.client.upgrade() {
             let text = format!("advertise: topic {}: {reason}", self.topic);
             client.error(&self.reply, &text);
@@ -81,27 +81,27 @@ impl Notified for Advertiser {
     }
 }
 
-/// A message whose topic's type is being asked for.
+/// A message whose topic's type is being looked up.
 struct Untyped {
     format: Format,
     payload: Bytes,
     compression: Compression,
-    offer: Offer,
-    reply: Reply,
+    offer: PublisherOffer,
+    reply: ReplyTarget,
 }
 
-impl Client {
+impl BridgeClient {
     pub(super) fn advertise(
         self: &Arc<Self>,
         op: &Advertise<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let topic = self.resolve(&op.topic)?;
-        self.granted().check(Operation::Publish, &topic)?;
+        self.client_grants().check(Operation::Publish, &topic)?;
         let message_type = self
             .publishable_type(&topic, &op.type_name)
             .inspect_err(|_| {
-                self.note_told(&topic);
+                self.mark_reported(&topic);
             })?;
         if let Some(digest) = op
             .md5sum
@@ -115,30 +115,34 @@ impl Client {
                 message_type.digest()
             ));
         }
-        let offer = offered(self.version(), op.qos, op.latch, op.queue_size);
-        self.open_outlet(&topic, message_type, offer, reply, true)?;
-        self.report_unheard("advertise", op.qos, false, reply);
+        let offer = publication_offer(self.version(), op.qos, op.latch, op.queue_size);
+        self.open_publisher(&topic, message_type, offer, reply, true)?;
+        self.warn_ignored_qos("advertise", op.qos, false, reply);
         self.info(reply, &format!("advertise: advertised {topic}"));
         Ok(())
     }
 
-    pub(super) fn unadvertise(&self, op: &Unadvertise<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn unadvertise(
+        &self,
+        op: &Unadvertise<'_>,
+        reply: &ReplyTarget,
+    ) -> Result<(), String> {
         let topic = self.resolve(&op.topic)?;
         let mut topic_publishers = self.topic_publishers.lock();
         topic_publishers.told.remove(&*topic);
         let known = topic_publishers.open.get_mut(&*topic);
-        // Without an id all of the client's advertisements are meant.
+        // Without an id, all advertisements of the client are meant.
         let left = known.map(|known| match reply.id {
             None => Some(0),
             Some(_) => known.ids.remove(&reply.id).then_some(known.ids.len()),
         });
         let (gone, warning) = match left {
             None => (None, Some("this client does not advertise")),
-            Some(None) => (None, Some("no advertisement with this id is there of")),
+            Some(None) => (None, Some("there is no advertisement with this id of")),
             Some(Some(0)) => (topic_publishers.open.remove(&*topic), None),
             Some(Some(_)) => (None, None),
         };
-        // The topic_publisher goes outside of the lock.
+        // The publisher is dropped outside of the lock.
         drop(topic_publishers);
         match (&gone, warning) {
             (_, Some(warning)) => self.warn(reply, &format!("unadvertise: {warning} {topic}")),
@@ -154,7 +158,7 @@ impl Client {
         Ok(())
     }
 
-    /// The type by that name, if the topic may be published with it.
+    /// Returns the type of this name, if the topic may be published with it.
     fn publishable_type(&self, topic: &str, type_name: &str) -> Result<Arc<MessageType>, String> {
         let version = self.version();
         let graph = self.shared.bus.graph().borrow().clone();
@@ -165,47 +169,48 @@ impl Client {
         let other =
             |theirs: &&str| !matches!(*theirs, "" | "*") && !is_same_type(theirs, type_name);
         if let Some(theirs) = theirs.filter(other) {
-            let name = spelled(version, type_name, "msg");
-            return Err(other_type(&format!("topic {topic}"), theirs, &name));
+            let name = ros_type_name(version, type_name, "msg");
+            return Err(type_mismatch(&format!("topic {topic}"), theirs, &name));
         }
         self.shared
             .registry
-            .message(&sought(version, type_name))
-            .map_err(|error| format!("topic {topic}: {}", explain(version, error)))
+            .message(&lookup_name(version, type_name))
+            .map_err(|error| format!("topic {topic}: {}", explain_schema_error(version, error)))
     }
 
-    /// The client is being told why nothing can be published on a topic. Gives whether it had been before.
-    fn note_told(&self, topic: &str) -> bool {
+    /// Marks that the client is told why nothing can be published on a topic; returns whether it was told before.
+    fn mark_reported(&self, topic: &str) -> bool {
         let mut topic_publishers = self.topic_publishers.lock();
-        // Topics whose names never end must not fill the memory.
+        // An endless number of topic names must not fill the memory.
         if topic_publishers.told.len() >= self.shared.options.max_advertisements {
             topic_publishers.told.clear();
         }
         !topic_publishers.told.insert(topic.to_owned())
     }
 
-    /// Gives the reason why a message cannot be published with the first such message of its topic: more of them may
-    /// come by the hundred.
+    /// Returns the reason why a message cannot be published, but only for the first such message of its topic: hundreds
+    /// of them may follow.
     fn report_once(&self, topic: &str, reason: String) -> Result<(), String> {
-        match self.note_told(topic) {
-            false => Err(reason),
-            true => Ok(()),
+        if self.mark_reported(topic) {
+            Ok(())
+        } else {
+            Err(reason)
         }
     }
 
-    fn open_outlet(
+    fn open_publisher(
         self: &Arc<Self>,
         topic: &str,
         message_type: Arc<MessageType>,
-        offer: Offer,
-        reply: &Reply,
+        offer: PublisherOffer,
+        reply: &ReplyTarget,
         advertised: bool,
     ) -> Result<Arc<TopicPublisher>, String> {
         let limit = self.shared.options.max_advertisements;
         let id = advertised.then(|| reply.id.clone());
         let mut topic_publishers = self.topic_publishers.lock();
-        // Under the lock: what is taken back meanwhile is taken after this.
-        self.granted().check(Operation::Publish, topic)?;
+        // Checked under the lock, so that a concurrent revocation comes after this.
+        self.client_grants().check(Operation::Publish, topic)?;
         let count = topic_publishers.count();
         let known = topic_publishers.open.get_mut(topic);
         if let Some(known) = &known
@@ -234,17 +239,17 @@ impl Client {
         }
         ids.extend(id);
         topic_publishers.told.remove(topic);
-        let notified = Arc::new(Advertiser {
+        let notified = Arc::new(AdvertiseNotifier {
             client: Arc::downgrade(self),
             topic: topic.to_owned(),
             reply: reply.clone(),
         });
         if topic == tf::GOAL_TOPIC {
-            self.shared.republisher.listen(&self.shared);
+            self.shared.republisher.listen_for_goals(&self.shared);
         }
         let topic_publisher =
             TopicPublisher::open(&self.shared, topic, message_type, offer, notified);
-        let opened = Advertised {
+        let opened = AdvertisedTopic {
             topic_publisher: topic_publisher.clone(),
             ids,
         };
@@ -257,7 +262,7 @@ impl Client {
     pub(super) fn publish(
         self: &Arc<Self>,
         op: Publish<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
         source: Option<&Bytes>,
     ) -> Result<(), String> {
         let topic = self.resolve(&op.topic)?;
@@ -270,15 +275,15 @@ impl Client {
         let topic_publisher = match known {
             Some(topic_publisher) => topic_publisher,
             None => match self
-                .granted()
+                .client_grants()
                 .check(Operation::Publish, &topic)
-                .and_then(|()| self.type_to_publish(&topic, &op))
+                .and_then(|()| self.publish_type(&topic, &op))
             {
                 Ok(Some(message_type)) => {
-                    let offer = offered(self.version(), op.qos, op.latch, None);
-                    self.open_outlet(&topic, message_type, offer, reply, false)?
+                    let offer = publication_offer(self.version(), op.qos, op.latch, None);
+                    self.open_publisher(&topic, message_type, offer, reply, false)?
                 }
-                Ok(None) => return self.publish_later(&topic, &op, reply),
+                Ok(None) => return self.defer_publish(&topic, &op, reply),
                 Err(reason) => return self.report_once(&topic, reason),
             },
         };
@@ -290,19 +295,19 @@ impl Client {
         )
         .map_err(|reason| format!("topic {topic}: {reason}"))?;
         topic_publisher.publish(bytes);
-        if op.compression != Compression::CborRaw && self.hears(Level::Warning) {
-            self.report_defaults(&topic, &topic_publisher.message_type, op.msg, reply);
+        if op.compression != Compression::CborRaw && self.wants_level(StatusLevel::Warning) {
+            self.warn_defaulted_fields(&topic, &topic_publisher.message_type, op.msg, reply);
         }
         Ok(())
     }
 
-    /// Names the message's own fields that were left out; not a header, which clients may leave to the server.
-    fn report_defaults(
+    /// Warns about missing fields of the message; except a header, which clients may leave to the server.
+    fn warn_defaulted_fields(
         &self,
         topic: &str,
         message_type: &MessageType,
         msg: Payload<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) {
         let Some(given) = msg.keys() else { return };
         let headers = usize::from(message_type.has_header());
@@ -316,13 +321,13 @@ impl Client {
             let missing = missing.join(", ");
             self.warn(
                 reply,
-                &format!("publish: topic {topic}: defaults stand for {missing}"),
+                &format!("publish: topic {topic}: using defaults for {missing}"),
             );
         }
     }
 
-    /// What to publish as without having advertised: the type said, or the topic's.
-    fn type_to_publish(
+    /// Returns the type for publishing without advertising: the given one, or the topic's.
+    fn publish_type(
         &self,
         topic: &str,
         op: &Publish<'_>,
@@ -344,18 +349,18 @@ impl Client {
         }
     }
 
-    /// Keeps a message until the nodes have said what type the topic has.
-    fn publish_later(
+    /// Keeps a message until the nodes have announced the type of the topic.
+    fn defer_publish(
         self: &Arc<Self>,
         topic: &str,
         op: &Publish<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let waiting = Untyped {
             format: op.msg.format,
             payload: Bytes::copy_from_slice(op.msg.bytes),
             compression: op.compression,
-            offer: offered(self.version(), op.qos, op.latch, None),
+            offer: publication_offer(self.version(), op.qos, op.latch, None),
             reply: reply.clone(),
         };
         let mut topic_publishers = self.topic_publishers.lock();
@@ -367,7 +372,8 @@ impl Client {
             .sum();
         if waiting_bytes > 0 && waiting_bytes + waiting.payload.len() > MAX_UNTYPED_BYTES {
             return Err(format!(
-                "topic {topic} has no known type yet, and {waiting_bytes} bytes wait for one already; advertise it first"
+                "topic {topic} has no known type yet, and {waiting_bytes} bytes wait for one already; advertise it \
+                 first"
             ));
         }
         if let Some(others) = topic_publishers.untyped.get_mut(topic) {
@@ -386,7 +392,7 @@ impl Client {
         let (client, topic) = (self.clone(), topic.to_owned());
         tokio::spawn(async move {
             let asked = tokio::select! {
-                () = client.ended() => return,
+                () = client.wait_ended() => return,
                 asked = client.shared.bus.topic_type(&topic) => asked,
             };
             let waiting = client
@@ -399,7 +405,7 @@ impl Client {
             let found = found.and_then(|wire| client.publishable_type(&topic, &wire.name));
             for message in waiting {
                 let done = found.clone().and_then(|message_type| {
-                    let topic_publisher = client.open_outlet(
+                    let topic_publisher = client.open_publisher(
                         &topic,
                         message_type,
                         message.offer,
@@ -419,7 +425,7 @@ impl Client {
                     Ok(())
                 });
                 if let Err(reason) = done
-                    && !client.note_told(&topic)
+                    && !client.mark_reported(&topic)
                 {
                     client.error(&message.reply, &format!("publish: topic {topic}: {reason}"));
                 }

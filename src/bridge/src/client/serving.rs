@@ -13,65 +13,65 @@ use tokio::sync::{oneshot, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::decoding::decode_args;
-use super::{Client, Reply, print_format, take_chosen};
-use crate::lacking::explain;
-use crate::names::sought;
-use crate::sample::Frame;
+use super::{BridgeClient, ReplyTarget, payload_format, remove_matching};
+use crate::lacking::explain_schema_error;
+use crate::names::lookup_name;
+use crate::sample::EncodedFrame;
 
-/// What a client serves, and the calls it has not answered yet.
+/// Services of a client, and the calls it has not answered yet.
 #[derive(Default)]
-pub(super) struct Services {
-    served: HashMap<String, Served>,
-    requests: HashMap<String, Request>,
+pub(super) struct ClientServices {
+    served: HashMap<String, ServedService>,
+    requests: HashMap<String, PendingCall>,
 }
 
-impl Services {
+impl ClientServices {
     pub(super) fn len(&self) -> usize {
         self.served.len()
     }
 
-    /// Removes those of these names; their unanswered calls fail.
-    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, Served)> {
+    /// Removes the services whose names match; their unanswered calls fail.
+    pub(super) fn take(&mut self, chosen: impl Fn(&str) -> bool) -> Vec<(String, ServedService)> {
         self.requests.retain(|_, request| !chosen(&request.service));
-        take_chosen(&mut self.served, chosen)
+        remove_matching(&mut self.served, chosen)
     }
 
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.served.keys().map(String::as_str)
     }
 
-    /// Whether a service of this client is registered by now, and when it will be.
-    pub(super) fn registered(&self, service: &str) -> Option<watch::Receiver<bool>> {
+    /// Returns a receiver that tells whether a service of this client is registered.
+    pub(super) fn registration(&self, service: &str) -> Option<watch::Receiver<bool>> {
         Some(self.served.get(service)?.registered.clone())
     }
 }
 
-pub(super) struct Served {
+pub(super) struct ServedService {
     number: u64,
-    /// Closed without having been true where that failed.
+    /// Registration state; closed without having been true if the registration failed.
     registered: watch::Receiver<bool>,
     /// Ends the task that holds the registration.
     _stop: DropGuard,
 }
 
-struct Request {
+struct PendingCall {
     service: String,
     def: Arc<ServiceDef>,
     answer: oneshot::Sender<Result<Bytes, String>>,
 }
 
-/// Passes calls to the client.
-struct Handler {
-    client: Weak<Client>,
+/// Forwards calls to the client.
+struct CallHandler {
+    client: Weak<BridgeClient>,
     service: String,
-    /// As the client wrote it.
+    /// Name as the client wrote it.
     written: String,
     def: Arc<ServiceDef>,
     compression: Compression,
 }
 
 #[async_trait]
-impl ServiceHandler for Handler {
+impl ServiceHandler for CallHandler {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let gone = || format!("the client that serves {} is gone", self.service);
         let client = self.client.upgrade().ok_or_else(gone)?;
@@ -83,13 +83,13 @@ impl ServiceHandler for Handler {
         );
         let frame = self.frame(&client, &id, &request)?;
         let (answer, answered) = oneshot::channel();
-        let request = Request {
+        let request = PendingCall {
             service: self.service.clone(),
             def: self.def.clone(),
             answer,
         };
         client.services.lock().requests.insert(id.clone(), request);
-        let _forget = Forget {
+        let _forget = ForgetOnDrop {
             client: self.client.clone(),
             id,
         };
@@ -107,9 +107,14 @@ impl ServiceHandler for Handler {
     }
 }
 
-impl Handler {
-    fn frame(&self, client: &Client, id: &str, request: &Bytes) -> Result<Frame, String> {
-        let format = print_format(self.compression);
+impl CallHandler {
+    fn frame(
+        &self,
+        client: &BridgeClient,
+        id: &str,
+        request: &Bytes,
+    ) -> Result<EncodedFrame, String> {
+        let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + request.len());
         let mut writer = Writer::op(&mut out, format, "call_service", Some(&Id::from(id)));
         writer.text("service", &self.written);
@@ -123,17 +128,17 @@ impl Handler {
             })?;
         }
         writer.end();
-        Ok(Frame::new(format, out))
+        Ok(EncodedFrame::new(format, out))
     }
 }
 
-/// Forgets a request whose caller waits no longer.
-struct Forget {
-    client: Weak<Client>,
+/// Removes a call when its caller no longer waits.
+struct ForgetOnDrop {
+    client: Weak<BridgeClient>,
     id: String,
 }
 
-impl Drop for Forget {
+impl Drop for ForgetOnDrop {
     fn drop(&mut self) {
         if let Some(client) = self.client.upgrade() {
             client.services.lock().requests.remove(&self.id);
@@ -141,19 +146,24 @@ impl Drop for Forget {
     }
 }
 
-impl Client {
+impl BridgeClient {
     pub(super) fn advertise_service(
         self: &Arc<Self>,
         op: &AdvertiseService<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let service = self.resolve(&op.service)?.into_owned();
-        self.granted().check(Operation::Advertise, &service)?;
+        self.client_grants().check(Operation::Advertise, &service)?;
         let def = self
             .shared
             .registry
-            .service(&sought(self.version(), &op.type_name))
-            .map_err(|error| format!("service {service}: {}", explain(self.version(), error)))?;
+            .service(&lookup_name(self.version(), &op.type_name))
+            .map_err(|error| {
+                format!(
+                    "service {service}: {}",
+                    explain_schema_error(self.version(), error)
+                )
+            })?;
         let limit = self.shared.options.max_advertisements;
         let number = self.shared.next_number();
         let stop = CancellationToken::new();
@@ -164,7 +174,7 @@ impl Client {
             ));
         }
         let (now_registered, registered) = watch::channel(false);
-        let served = Served {
+        let served = ServedService {
             number,
             registered,
             _stop: stop.clone().drop_guard(),
@@ -181,7 +191,7 @@ impl Client {
         }
         drop(earlier);
         self.warn_of_takeover(&service, reply);
-        let handler = Arc::new(Handler {
+        let handler = Arc::new(CallHandler {
             client: Arc::downgrade(self),
             service: service.clone(),
             written: op.service.clone().into_owned(),
@@ -191,11 +201,11 @@ impl Client {
         let (client, reply) = (Arc::downgrade(self), reply.clone());
         let shared = self.shared.clone();
         tokio::spawn(async move {
-            let service_type = ServiceType::of(&def);
-            // An earlier handler of this client lets go at once; another client's does not.
+            let service_type = ServiceType::from_service(&def);
+            // An earlier handler of this client is released at once; another client's is not.
             let patience = std::time::Duration::from_secs(1);
             let entered =
-                tokio::time::timeout(patience, shared.registrations.enter(&service)).await;
+                tokio::time::timeout(patience, shared.registrations.acquire(&service)).await;
             let Ok(registration) = entered else {
                 if let Some(client) = client.upgrade() {
                     client
@@ -238,8 +248,9 @@ impl Client {
         Ok(())
     }
 
-    /// Who registers a service last has it: the node that served it until now is called no more.
-    fn warn_of_takeover(&self, service: &str, reply: &Reply) {
+    /// Warns that the client takes over a service: the last registration wins, so the node that served it is no longer
+    /// called.
+    fn warn_of_takeover(&self, service: &str, reply: &ReplyTarget) {
         let bus = &self.shared.bus;
         let graph = bus.graph().borrow().clone();
         if let Some(node) = graph.services.get(service)
@@ -248,7 +259,7 @@ impl Client {
             self.warn(
                 reply,
                 &format!(
-                    "advertise_service: {service} was served by {node}, this client takes its place"
+                    "advertise_service: {service} was served by {node}, this client replaces it"
                 ),
             );
         }
@@ -257,7 +268,7 @@ impl Client {
     pub(super) fn unadvertise_service(
         &self,
         op: &UnadvertiseService<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let service = self.resolve(&op.service)?;
         let mut services = self.services.lock();
@@ -274,7 +285,7 @@ impl Client {
             .collect();
         drop(services);
         for request in unanswered {
-            // The caller may have given up.
+            // An error means that the caller has given up.
             let _ = request.answer.send(Err(format!(
                 "{service} was unadvertised before it answered"
             )));
@@ -292,11 +303,11 @@ impl Client {
         Ok(())
     }
 
-    /// The client's answer to that call cannot be used: the call fails, so that its caller does not wait for ever.
-    pub(super) fn response_is_lost(&self, id: &str, reason: &str) {
+    /// Fails the call whose answer from the client is unusable, so that its caller does not wait forever.
+    pub(super) fn fail_lost_response(&self, id: &str, reason: &str) {
         let request = self.services.lock().requests.remove(id);
-        if let Some(Request { answer, .. }) = request {
-            // The caller may have given up.
+        if let Some(PendingCall { answer, .. }) = request {
+            // An error means that the caller has given up.
             let _ = answer.send(Err(format!("the client's answer cannot be used: {reason}")));
         }
     }
@@ -328,12 +339,12 @@ impl Client {
             }
             Some(_) => {}
         }
-        let Some(Request { def, answer, .. }) = services.requests.remove(&id) else {
+        let Some(PendingCall { def, answer, .. }) = services.requests.remove(&id) else {
             return Ok(());
         };
         drop(services);
-        // Who says no says why in a text. Clients of the first rosbridge also say no and give values all the same:
-        // there the caller gets the values.
+        // A failure has a reason as text. Clients of the first rosbridge return failure with values: then the caller
+        // gets the values.
         let has_values = op
             .values
             .is_some_and(|values| values.is_object() || values.is_list());
@@ -343,11 +354,11 @@ impl Client {
                 .and_then(|values| values.text())
                 .unwrap_or_default();
             let reason = if reason.is_empty() {
-                format!("service {service} said no")
+                format!("service {service} failed without a reason")
             } else {
                 reason.into_owned()
             };
-            // The caller may have given up.
+            // An error means that the caller has given up.
             let _ = answer.send(Err(reason));
             return Ok(());
         }

@@ -5,56 +5,56 @@ use std::sync::{Arc, Weak};
 use std::time::Instant;
 
 use access::Operation;
-use ros::bus::{Qos, RosVersion};
+use ros::bus::{QosProfile, RosVersion};
 use ros::schema::MessageType;
-use rosbridge::{Compression, Format, Id, Level, Subscribe, Unsubscribe};
+use rosbridge::{Compression, Format, Id, StatusLevel, Subscribe, Unsubscribe};
 
-use super::{Client, Reply};
-use crate::fanout::{Listener, Listening};
-use crate::lacking::explain;
-use crate::names::{is_same_type, other_type, sought, spelled};
+use super::{BridgeClient, ReplyTarget};
+use crate::fanout::{Listener, ListenerGuard};
+use crate::lacking::explain_schema_error;
+use crate::names::{is_same_type, lookup_name, ros_type_name, type_mismatch};
 use crate::outbox::{Outbox, TopicKey};
-use crate::quality::{asked, most, queue_length};
-use crate::sample::Sample;
-use crate::topic_queue::{Subscriptions, Wishes};
+use crate::quality::{merge_qos, queue_length, subscription_qos};
+use crate::sample::TopicSample;
+use crate::topic_queue::{SubscriptionOptions, Subscriptions};
 
-/// A client's topics, by the name it uses.
-pub(super) type Subscribed = HashMap<Arc<str>, TopicSubscription>;
+/// Subscriptions of a client, by the topic name that it uses.
+pub(super) type ClientSubscriptions = HashMap<Arc<str>, TopicSubscription>;
 
 pub(super) struct TopicSubscription {
     key: TopicKey,
     subscriptions: Subscriptions,
-    /// What each of them asks of publishers.
-    asked: HashMap<Option<Id<'static>>, Qos>,
-    /// The topic's type, where it was known.
+    /// Quality of service that each of them requests from publishers.
+    asked: HashMap<Option<Id<'static>>, QosProfile>,
+    /// Type of the topic, if it was known.
     expected: Option<Arc<MessageType>>,
-    listening: Listening,
+    listening: ListenerGuard,
     listener: Arc<TopicListener>,
 }
 
 impl TopicSubscription {
-    /// Its queue in the outbox.
+    /// Returns the key of its queue in the outbox.
     pub(super) fn key(&self) -> TopicKey {
         self.key
     }
 }
 
-/// Puts a topic's messages into the client's queue.
+/// Puts messages of a topic into the client's queue.
 struct TopicListener {
     outbox: Arc<Outbox>,
     key: TopicKey,
     hears_clients: bool,
-    client: Weak<Client>,
+    client: Weak<BridgeClient>,
     topic: Arc<str>,
-    /// The type the client asked for, where it did.
+    /// Type that the client asked for, if any.
     wanted: Option<String>,
     id: Option<Id<'static>>,
     format: Format,
 }
 
 impl TopicListener {
-    /// The type of a message, where it is not the one that the client asked for.
-    fn misfit<'s>(&self, sample: &'s Sample) -> Option<&'s str> {
+    /// Returns the type of a message if it is not the one that the client asked for.
+    fn mismatched_type<'s>(&self, sample: &'s TopicSample) -> Option<&'s str> {
         let offered = sample.wire_type.name.as_str();
         let wanted = self.wanted.as_deref()?;
         (offered != "*" && !is_same_type(wanted, offered)).then_some(offered)
@@ -62,16 +62,16 @@ impl TopicListener {
 }
 
 impl Listener for TopicListener {
-    fn sample(&self, sample: &Arc<Sample>, replay: bool) {
+    fn on_sample(&self, sample: &Arc<TopicSample>, replay: bool) {
         if !self.hears_clients && sample.local {
             return;
         }
-        match self.misfit(sample) {
-            None => self.outbox.sample(self.key, sample.clone(), replay),
-            Some(offered) if self.outbox.may_complain(self.key, Instant::now()) => {
+        match self.mismatched_type(sample) {
+            None => self.outbox.push_sample(self.key, sample.clone(), replay),
+            Some(offered) if self.outbox.should_report(self.key, Instant::now()) => {
                 let wanted = self.wanted.as_deref().unwrap_or_default();
-                self.failed(&format!(
-                    "{} publishes {offered} there, not {wanted}; its messages are left out",
+                self.on_failed(&format!(
+                    "{} publishes {offered} there, not {wanted}; its messages are dropped",
                     sample.publisher
                 ));
             }
@@ -79,39 +79,39 @@ impl Listener for TopicListener {
         }
     }
 
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         if let Some(client) = self.client.upgrade() {
             let text = format!("subscribe: topic {}: {reason}", self.topic);
-            client.status(Level::Error, self.id.clone(), self.format, &text);
+            client.send_status(StatusLevel::Error, self.id.clone(), self.format, &text);
         }
     }
 
-    fn refused(&self, reason: &str) {
-        self.failed(reason);
+    fn on_refused(&self, reason: &str) {
+        self.on_failed(reason);
     }
 }
 
-impl Client {
+impl BridgeClient {
     pub(super) fn subscribe(
         self: &Arc<Self>,
         op: Subscribe<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let name = self.resolve(&op.topic)?;
-        self.granted().check(Operation::Subscribe, &name)?;
+        self.client_grants().check(Operation::Subscribe, &name)?;
         let expected = self.expected_type(&name, &op)?;
-        let wishes = Wishes {
+        let wishes = SubscriptionOptions {
             throttle_rate: op.throttle_rate,
             queue_length: queue_length(&op),
             fragment_size: op.fragment_size,
             compression: op.compression,
         };
-        let qos = asked(op.qos, self.shared.options.bus_queue);
+        let qos = subscription_qos(op.qos, self.shared.options.bus_queue);
         let wanted = op
             .type_name
             .as_deref()
             .filter(|name| *name != "*")
-            .map(|name| spelled(self.version(), name, "msg").into_owned());
+            .map(|name| ros_type_name(self.version(), name, "msg").into_owned());
         let limit = self.shared.options.max_subscriptions;
         let mut subscribed = self.subscriptions.lock();
         let all: usize = subscribed
@@ -136,7 +136,7 @@ impl Client {
             }
             known.subscriptions.insert(reply.id.clone(), wishes);
             known.asked.insert(reply.id.clone(), qos);
-            if !self.apply_wishes(known) {
+            if !self.apply_options(known) {
                 known.listening.fanout().replay(known.listener.as_ref());
             }
         } else {
@@ -152,7 +152,7 @@ impl Client {
                 id: reply.id.clone(),
                 format: reply.format,
             });
-            let fanout = self.shared.fanout_of(&name, expected.as_deref(), qos);
+            let fanout = self.shared.fanout_with_qos(&name, expected.as_deref(), qos);
             let listening = fanout.listen(listener.clone());
             let subscriptions = Subscriptions::from([(reply.id.clone(), wishes)]);
             subscribed.insert(
@@ -168,12 +168,12 @@ impl Client {
             );
         }
         drop(subscribed);
-        self.report_unheard("subscribe", op.qos, true, reply);
+        self.warn_ignored_qos("subscribe", op.qos, true, reply);
         self.info(reply, &format!("subscribe: subscribed to {name}"));
         Ok(())
     }
 
-    /// The type the client may expect, where anybody knows it; an error where it expects the wrong one.
+    /// Returns the type that the client may expect, if it is known; fails if the client expects another.
     fn expected_type(
         &self,
         topic: &str,
@@ -191,46 +191,55 @@ impl Client {
         match (wanted, actual) {
             (None, None) if nodes.is_none() => {
                 return Err(format!(
-                    "topic {topic} does not exist; say its \"type\" to wait for it, /rosapi/topics lists those that do"
+                    "topic {topic} does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing \
+                        topics"
                 ));
             }
             (Some(wanted), Some(actual)) if !is_same_type(wanted, actual) => {
-                let wanted = spelled(version, wanted, "msg");
-                return Err(other_type(&format!("topic {topic}"), actual, &wanted));
+                let wanted = ros_type_name(version, wanted, "msg");
+                return Err(type_mismatch(&format!("topic {topic}"), actual, &wanted));
             }
             _ => {}
         }
         let is_published = nodes.is_some_and(|nodes| !nodes.publishers.is_empty());
-        // As the servant writes it, where it does.
+        // As the servant spells it, if it does.
         let Some(name) = actual.or(wanted) else {
             return Ok(None);
         };
-        match self.shared.registry.message(&sought(version, name)) {
+        match self.shared.registry.message(&lookup_name(version, name)) {
             Ok(found) => Ok(Some(found)),
-            // For ROS bytes none is needed, and a publisher of ROS 1 brings its own along.
+            // Not needed for ROS bytes, and a publisher of ROS 1 sends its own.
             Err(_) if op.compression == Compression::CborRaw => Ok(None),
             Err(_) if version == RosVersion::One && is_published => Ok(None),
-            Err(error) => Err(format!("topic {topic}: {}", explain(version, error))),
+            Err(error) => Err(format!(
+                "topic {topic}: {}",
+                explain_schema_error(version, error)
+            )),
         }
     }
 
-    /// Gives the topic what its subscriptions want together. Whether it is listened to anew, and so hears what was kept.
-    fn apply_wishes(&self, known: &mut TopicSubscription) -> bool {
-        if let Some(merged) = Wishes::merged(known.subscriptions.values()) {
+    /// Applies the combined options of a topic's subscriptions. Returns whether it listens to another fanout now, and
+    /// so receives latched messages.
+    fn apply_options(&self, known: &mut TopicSubscription) -> bool {
+        if let Some(merged) = SubscriptionOptions::merge(known.subscriptions.values()) {
             self.outbox.change_topic(known.key, merged);
         }
         let fanout = known.listening.fanout();
-        let asked = most(known.asked.values());
-        let Some(qos) = asked.filter(|qos| !fanout.serves(qos)) else {
+        let asked = merge_qos(known.asked.values());
+        let Some(qos) = asked.filter(|qos| !fanout.serves_qos(qos)) else {
             return false;
         };
         let expected = known.expected.as_deref();
-        let fanout = self.shared.fanout_of(&fanout.topic, expected, qos);
+        let fanout = self.shared.fanout_with_qos(&fanout.topic, expected, qos);
         known.listening = fanout.listen(known.listener.clone());
         true
     }
 
-    pub(super) fn unsubscribe(&self, op: &Unsubscribe<'_>, reply: &Reply) -> Result<(), String> {
+    pub(super) fn unsubscribe(
+        &self,
+        op: &Unsubscribe<'_>,
+        reply: &ReplyTarget,
+    ) -> Result<(), String> {
         let mut subscribed = self.subscriptions.lock();
         let Some(known) = subscribed.get_mut(&*op.topic) else {
             drop(subscribed);
@@ -263,7 +272,7 @@ impl Client {
                 self.outbox.remove_topic(known.key);
             }
         } else {
-            self.apply_wishes(known);
+            self.apply_options(known);
         }
         self.info(
             reply,

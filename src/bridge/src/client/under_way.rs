@@ -1,4 +1,4 @@
-//! Calls and goals of a client that are under way: so many at once, with so many bytes of arguments.
+//! Calls and goals of a client that are in progress: limits on their number and on the bytes of their arguments.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -6,18 +6,18 @@ use std::sync::atomic::Ordering;
 use budget::{Permit, UNCOUNTED};
 use rosbridge::Payload;
 
-use super::Client;
+use super::BridgeClient;
 
-/// One call or goal under way.
-pub(super) struct UnderWay {
-    client: Arc<Client>,
-    /// Of its arguments.
+/// Guard of a call or goal in progress.
+pub(super) struct InFlightGuard {
+    client: Arc<BridgeClient>,
+    /// Bytes of its arguments.
     bytes: usize,
-    /// For those, where the client has more of them than nobody counts.
+    /// Permit for those bytes, if the client's total is above the uncounted size.
     _permit: Option<Permit>,
 }
 
-impl Drop for UnderWay {
+impl Drop for InFlightGuard {
     fn drop(&mut self) {
         self.client.under_way.fetch_sub(1, Ordering::Relaxed);
         self.client
@@ -26,22 +26,26 @@ impl Drop for UnderWay {
     }
 }
 
-impl Client {
-    /// Counts a call or goal with these arguments as under way until the guard is dropped.
-    pub(super) fn begin(self: &Arc<Self>, args: Option<Payload<'_>>) -> Result<UnderWay, String> {
+impl BridgeClient {
+    /// Counts a call or goal with these arguments as in progress until the guard is dropped.
+    pub(super) fn begin_call(
+        self: &Arc<Self>,
+        args: Option<Payload<'_>>,
+    ) -> Result<InFlightGuard, String> {
         let options = &self.shared.options;
         let limit = options.max_calls;
         let bytes = args.map_or(0, |args| args.bytes.len());
         let before = self.under_way.fetch_add(1, Ordering::Relaxed);
         let bytes_before = self.under_way_bytes.fetch_add(bytes, Ordering::Relaxed);
-        let mut guard = UnderWay {
+        let mut guard = InFlightGuard {
             client: self.clone(),
             bytes,
             _permit: None,
         };
         if bytes_before > 0 && bytes_before.saturating_add(bytes) > options.max_call_bytes {
             return Err(format!(
-                "field \"args\" has {bytes} bytes, with those of calls and goals under way more than {}; wait for some to end",
+                "field \"args\" has {bytes} bytes, which together with the calls and goals under way is more than {}; \
+                    wait for some to end",
                 options.max_call_bytes
             ));
         }
@@ -51,7 +55,7 @@ impl Client {
             ));
         }
         if bytes_before.saturating_add(bytes) > UNCOUNTED {
-            // They wait for a servant, perhaps for long.
+            // They wait for a servant, possibly for long.
             let permit = self.budget.take(bytes);
             guard._permit = Some(permit.map_err(|full| format!("field \"args\": {full}"))?);
         }

@@ -1,29 +1,30 @@
-//! What a client has and may not have any more, because its operator has changed what it is granted.
+//! Revocation of what a client uses but is no longer granted, after a change by its operator.
 
 use access::{Grants, Operation};
-use rosbridge::{Format, Level};
+use rosbridge::{Format, StatusLevel};
 
-use super::Client;
+use super::BridgeClient;
 
-impl Client {
-    /// Takes back what is not granted any more, and tells the client what. Calls that nodes work on already are answered.
-    pub(crate) fn withdraw(&self) {
-        let grants = self.granted().grants();
+impl BridgeClient {
+    /// Revokes what is no longer granted, and reports it to the client. Calls that nodes already handle are still
+    /// answered.
+    pub(crate) fn revoke_ungranted(&self) {
+        let grants = self.client_grants().grants();
         if grants.is_everything() {
             return;
         }
-        for (operation, name) in self.take_back(&grants) {
+        for (operation, name) in self.remove_ungranted(&grants) {
             let operation = operation.name();
             let text =
-                format!("{operation}:{name} is not granted to this client any more and was ended");
-            self.status(Level::Error, None, Format::Json, &text);
+                format!("{operation}:{name} is no longer granted to this client and was ended");
+            self.send_status(StatusLevel::Error, None, Format::Json, &text);
         }
     }
 
-    fn take_back(&self, grants: &Grants) -> Vec<(Operation, String)> {
+    fn remove_ungranted(&self, grants: &Grants) -> Vec<(Operation, String)> {
         let mut told = Vec::new();
         let lacks = |operation, name: &str| !grants.permits(operation, name);
-        // Dropped outside of the locks: what is dropped may want them.
+        // Dropped outside of the locks, since the values may take them in their drops.
         let mut subscriptions = self.subscriptions.lock();
         let written: Vec<_> = subscriptions
             .keys()
@@ -68,7 +69,7 @@ impl Client {
 
         let mut actions = self.actions.lock();
         let served = actions.take_served(|action| lacks(Operation::Advertise, action));
-        let goals = actions.goals_at(|action| lacks(Operation::Call, action));
+        let goals = actions.goals_of_actions(|action| lacks(Operation::Call, action));
         drop(actions);
         told.extend(
             served
@@ -77,7 +78,7 @@ impl Client {
         );
         drop(served);
         for (goal_id, action) in goals {
-            // One that has ended meanwhile need not be cancelled.
+            // Fails if it has ended meanwhile.
             if self.cancel_goal(&goal_id) {
                 told.push((Operation::Call, action));
             }

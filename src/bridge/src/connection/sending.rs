@@ -1,5 +1,5 @@
-//! From what waits for a client to frames in its socket: control first, long ones in fragments, samples encoded at the
-//! last moment.
+//! Moves queued data of a client into its socket as frames: control messages first, long ones in fragments, samples
+//! encoded at the last moment.
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -7,21 +7,25 @@ use std::time::Instant;
 
 use budget::{Exceeded, UNCOUNTED};
 use bytes::Bytes;
-use rosbridge::{Compression, Format, Level};
+use rosbridge::{Compression, Format, StatusLevel};
 use tokio::io::{AsyncRead, AsyncWrite};
 use ws::frame;
 
-use super::{Connection, MOVED, SOCKET_FULL, Stop};
-use crate::cut::Cuts;
-use crate::outbox::{Control, Outgoing, TopicKey};
-use crate::sample::{Frame, Sample};
+use super::{BridgeConnection, MOVED, SOCKET_FULL, StopReason};
+use crate::cut::Fragmenter;
+use crate::outbox::{ControlMessage, Outgoing, TopicKey};
+use crate::sample::{EncodedFrame, TopicSample};
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
-    /// Moves what waits into the socket. Ready when there is nothing left, pending when the socket takes no more.
-    pub(super) fn write(&mut self, cx: &mut Context<'_>, now: Instant) -> Poll<Result<(), Stop>> {
+impl<S: AsyncRead + AsyncWrite + Unpin> BridgeConnection<S> {
+    /// Moves queued frames into the socket. Ready when none is left, pending when the socket accepts no more.
+    pub(super) fn write(
+        &mut self,
+        cx: &mut Context<'_>,
+        now: Instant,
+    ) -> Poll<Result<(), StopReason>> {
         loop {
-            while self.socket.queued() < SOCKET_FULL && self.moved < MOVED {
-                let next = self.next_frame(now).map_err(|full| Stop::Close {
+            while self.socket.bytes_queued() < SOCKET_FULL && self.moved < MOVED {
+                let next = self.next_frame(now).map_err(|full| StopReason::Close {
                     code: 1013,
                     reason: format!("a fragment cannot be sent: {full}"),
                     readable: true,
@@ -35,10 +39,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 self.moved += bytes.len();
                 self.socket.queue(opcode, bytes);
             }
-            if self.socket.queued() == 0 {
+            if self.socket.bytes_queued() == 0 {
                 return Poll::Ready(Ok(()));
             }
-            ready!(self.socket.poll_flush(cx)).map_err(|error| Stop::Lost {
+            ready!(self.socket.poll_flush(cx)).map_err(|error| StopReason::Lost {
                 reason: error.to_string(),
                 heard_all: false,
             })?;
@@ -53,9 +57,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
         loop {
             let next = if self.cuts.is_full() {
-                // One that would be cut, too, waits in its queue, which is bounded.
-                let whole =
-                    |control: &Control| !Cuts::is_long(&control.frame, control.fragment_size);
+                // A control message that would be fragmented as well waits in its queue, which is bounded.
+                let whole = |control: &ControlMessage| {
+                    !Fragmenter::is_long(&control.frame, control.fragment_size)
+                };
                 let control = self.client.outbox.next_control_if(whole);
                 control.map(Outgoing::Control)
             } else {
@@ -64,8 +69,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             let frame = match next {
                 None => return self.next_fragment(),
                 Some(Outgoing::Control(control)) => {
-                    self.remember(&control, now);
-                    let cut = self.cuts.cut(&control.frame, control.fragment_size, None);
+                    self.retain_answer(&control, now);
+                    let cut = self
+                        .cuts
+                        .add_if_long(&control.frame, control.fragment_size, None);
                     (!cut).then_some(control.frame)
                 }
                 Some(Outgoing::Sample {
@@ -76,11 +83,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                     fragment_size,
                 }) => {
                     let frame = self.encode(key, &sample, &topic, compression, now);
-                    let cut = frame
-                        .as_ref()
-                        .is_some_and(|frame| self.cuts.cut(frame, fragment_size, Some(key)));
+                    let cut = frame.as_ref().is_some_and(|frame| {
+                        self.cuts.add_if_long(frame, fragment_size, Some(key))
+                    });
                     if cut {
-                        self.client.outbox.sending_fragments(self.number, key);
+                        self.client.outbox.hold_topic(self.number, key);
                     }
                     frame.filter(|_| !cut)
                 }
@@ -97,11 +104,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             return Ok(None);
         };
         if let Some(key) = done {
-            self.client.outbox.fragments_sent(self.number, key);
+            self.client.outbox.release_topic(self.number, key);
         }
         // A copy of a part of the message.
         if bytes.len() > UNCOUNTED {
-            bytes = self.client.budget.take(bytes.len())?.around(bytes);
+            bytes = self.client.budget.take(bytes.len())?.wrap_bytes(bytes);
         }
         Ok(Some((frame::TEXT, bytes)))
     }
@@ -109,30 +116,37 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     fn encode(
         &self,
         key: TopicKey,
-        sample: &Arc<Sample>,
+        sample: &Arc<TopicSample>,
         topic: &Arc<str>,
         compression: Compression,
         now: Instant,
-    ) -> Option<Frame> {
+    ) -> Option<EncodedFrame> {
         let shared = &self.client.shared;
         let made = sample.frame(compression, topic, &shared.options, &shared.metrics);
         let held = made.and_then(|frame| {
-            // Its bytes are shared with other clients; as long as this one does not read them it is this one that holds them.
-            let held = match frame.is_big() {
-                true => self.client.budget.alone().take(frame.bytes.len()).map(Some),
-                false => Ok(None),
+            // The bytes are shared with other clients; for as long as this client does not read them they count in its
+            // budget.
+            let held = if frame.is_big() {
+                self.client
+                    .budget
+                    .without_parents()
+                    .take(frame.bytes.len())
+                    .map(Some)
+            } else {
+                Ok(None)
             };
             match held {
-                Ok(permit) => Ok(frame.holding(permit)),
-                Err(full) => Err(Arc::from(format!("a message is left out: {full}"))),
+                Ok(permit) => Ok(frame.with_permit(permit)),
+                Err(full) => Err(Arc::from(format!("a message was dropped: {full}"))),
             }
         });
         match held {
             Ok(frame) => Some(frame),
             Err(reason) => {
-                if self.client.outbox.may_complain(key, now) {
+                if self.client.outbox.should_report(key, now) {
                     let text = format!("subscribe: topic {topic}: {reason}");
-                    self.client.status(Level::Error, None, Format::Json, &text);
+                    self.client
+                        .send_status(StatusLevel::Error, None, Format::Json, &text);
                 }
                 None
             }

@@ -1,12 +1,12 @@
-//! The definitions of rosapi's services, so that they can be called in CBOR and ROS bytes as well, and be asked for
-//! like any other service's. They are the union of what rosapi offers in ROS 1 and in ROS 2 (Jazzy).
+//! Definitions of rosapi's services, so that they can be called in CBOR and ROS bytes as well, and be queried like
+//! those of any other service. They are the union of rosapi in ROS 1 and in ROS 2 (Jazzy).
 
 use std::sync::OnceLock;
 
 use ros::bus::RosVersion;
 use ros::schema::Registry;
 
-/// Name below `/rosapi/` and name of the type in its package.
+/// Name below `/rosapi/`, and name of the type in its package.
 pub(super) const SERVICES: &[(&str, &str)] = &[
     ("action_feedback_details", "ActionFeedbackDetails"),
     ("action_goal_details", "ActionGoalDetails"),
@@ -41,12 +41,12 @@ pub(super) const SERVICES: &[(&str, &str)] = &[
     ("topics_for_type", "TopicsForType"),
 ];
 
-const TYPE_DEF: &str = "string type\nstring[] fieldnames\nstring[] fieldtypes\nint32[] fieldarraylen\nstring[] examples\n\
-     string[] constnames\nstring[] constvalues\n";
+const TYPE_DEF: &str = "string type\nstring[] fieldnames\nstring[] fieldtypes\nint32[] fieldarraylen\n\
+                        string[] examples\nstring[] constnames\nstring[] constvalues\n";
 
 const DETAILS: &str = "string type\n---\nTypeDef[] typedefs\n";
 
-/// Services that are the same in both ROSes, by the names of their types.
+/// Services that are the same in both versions of ROS, by the names of their types.
 const TEXTS: &[(&str, &str)] = &[
     ("ActionFeedbackDetails", DETAILS),
     ("ActionGoalDetails", DETAILS),
@@ -86,7 +86,7 @@ const TEXTS: &[(&str, &str)] = &[
     ("TopicsForType", "string type\n---\nstring[] topics\n"),
 ];
 
-/// Those of ROS 1 alone.
+/// Services of ROS 1 only.
 const OF_ONE: &[(&str, &str)] = &[
     ("DeleteParam", "string name\n---\n"),
     (
@@ -97,8 +97,8 @@ const OF_ONE: &[(&str, &str)] = &[
     ("SetParam", "string name\nstring value\n---\n"),
 ];
 
-/// Those of ROS 2 alone. A default of a parameter was dropped by later versions of rosapi, which say instead whether a
-/// parameter was there.
+/// Services of ROS 2 only. Later versions of rosapi have dropped the default of a parameter, and return instead whether
+/// it exists.
 const OF_TWO: &[(&str, &str)] = &[
     (
         "DeleteParam",
@@ -115,7 +115,7 @@ const OF_TWO: &[(&str, &str)] = &[
     ),
 ];
 
-/// Where the types of rosapi are.
+/// Returns the package of rosapi's types.
 fn package(version: RosVersion) -> &'static str {
     match version {
         RosVersion::One => "rosapi",
@@ -123,7 +123,7 @@ fn package(version: RosVersion) -> &'static str {
     }
 }
 
-/// The full name of a service's type, as its ROS writes it.
+/// Returns the full name of a service's type, as spelled by its ROS.
 pub(super) fn type_name(version: RosVersion, srv: &str) -> String {
     let package = package(version);
     match version {
@@ -132,7 +132,7 @@ pub(super) fn type_name(version: RosVersion, srv: &str) -> String {
     }
 }
 
-/// rosapi's own definitions.
+/// Returns rosapi's own definitions.
 pub(super) fn registry(version: RosVersion) -> &'static Registry {
     static ONE: OnceLock<Registry> = OnceLock::new();
     static TWO: OnceLock<Registry> = OnceLock::new();
@@ -142,7 +142,7 @@ pub(super) fn registry(version: RosVersion) -> &'static Registry {
     };
     registry.get_or_init(|| {
         let package = package(version);
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         let services = TEXTS.iter().chain(own);
         let services = services.map(|(srv, text)| (format!("{package}/srv/{srv}"), *text));
         let type_def = (format!("{package}/msg/TypeDef"), TYPE_DEF);
@@ -169,7 +169,7 @@ mod tests {
                 assert_eq!(found.name, name);
             }
         }
-        // As rosbridge_suite's generated code has it.
+        // As in rosbridge_suite's generated code.
         assert_eq!(
             registry(RosVersion::One)
                 .service("rosapi/Topics")

@@ -1,4 +1,4 @@
-//! What the graph of nodes, topics and services says.
+//! Answers from the graph of nodes, topics and services.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -10,31 +10,31 @@ use ros::bus::{Graph, RosVersion, TopicNodes};
 use ros::schema::Registry;
 use serde_json::{Value, json};
 
-use super::{NODE, Service, with_own};
+use super::{NODE, RosapiService, find_with_own};
 use crate::names::is_same_type;
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 use crate::{presence, tf};
 
-/// Services asked for their type at once.
+/// Number of services queried for their type concurrently.
 const ASKED_AT_ONCE: usize = 16;
 
-/// Where every node of ROS tells its log, rosapi's included.
+/// Topic of every node's log, including rosapi's.
 const ROSOUT: &str = "/rosout";
 
-/// Nobody has said yet: rosapi writes it so.
-fn told(type_name: &str) -> &str {
+/// Returns the type; empty if it is not announced yet, as in rosapi.
+fn type_or_empty(type_name: &str) -> &str {
     if type_name == "*" { "" } else { type_name }
 }
 
-fn type_of(nodes: &TopicNodes) -> &str {
-    told(&nodes.type_name)
+fn topic_type_name(nodes: &TopicNodes) -> &str {
+    type_or_empty(&nodes.type_name)
 }
 
-/// The graph with the topics that the bridge answers for, unless a node of the servant does.
+/// Returns the graph with the topics that the bridge publishes itself, unless a node of the servant does.
 pub(super) fn with_own_topics(version: RosVersion, graph: &Graph) -> Graph {
     let mut graph = graph.clone();
     let ours = TopicNodes::default;
-    republishes_transforms(version, &mut graph);
+    add_tf_action(version, &mut graph);
     let nodes = graph.topics.entry(ROSOUT.to_owned()).or_insert_with(ours);
     if matches!(nodes.type_name.as_str(), "" | "*") {
         let type_name = match version {
@@ -55,8 +55,8 @@ pub(super) fn with_own_topics(version: RosVersion, graph: &Graph) -> Graph {
     graph
 }
 
-/// Adds the action that sends transforms, unless a node serves it: with its topics, where actions are made of such.
-fn republishes_transforms(version: RosVersion, graph: &mut Graph) {
+/// Adds the action that sends transforms, unless a node serves it; in ROS 1 with its topics.
+fn add_tf_action(version: RosVersion, graph: &mut Graph) {
     let is_served = match version {
         RosVersion::One => {
             let status = graph.topics.get(tf::STATUS_TOPIC);
@@ -79,22 +79,25 @@ fn republishes_transforms(version: RosVersion, graph: &mut Graph) {
     for (topic, type_name, published) in tf::TOPICS {
         let nodes = graph.topics.entry(topic.to_owned()).or_default();
         nodes.type_name = type_name.to_owned();
-        let end = match published {
-            true => &mut nodes.publishers,
-            false => &mut nodes.subscribers,
+        let end = if published {
+            &mut nodes.publishers
+        } else {
+            &mut nodes.subscribers
         };
         end.push(NODE.to_owned());
     }
 }
 
-/// What of the graph a client with these grants is shown: the names that it may do something with, and the nodes behind them.
-pub(super) fn shown(mut graph: Graph, grants: &Grants) -> Graph {
+/// Filters the graph for a client with these grants: keeps the names that it may use, and the nodes behind them.
+pub(super) fn filter_by_grants(mut graph: Graph, grants: &Grants) -> Graph {
     if grants.is_everything() {
         return graph;
     }
-    graph.topics.retain(|topic, _| grants.shows(topic));
-    graph.services.retain(|service, _| grants.shows(service));
-    graph.actions.retain(|action, _| grants.shows(action));
+    graph.topics.retain(|topic, _| grants.permits_any(topic));
+    graph
+        .services
+        .retain(|service, _| grants.permits_any(service));
+    graph.actions.retain(|action, _| grants.permits_any(action));
     let ends = graph
         .topics
         .values()
@@ -106,14 +109,14 @@ pub(super) fn shown(mut graph: Graph, grants: &Grants) -> Graph {
         .cloned()
         .collect();
     graph.nodes.retain(|node, _| behind.contains(node));
-    // Nothing that is told to clients is made of them.
+    // Not part of any answer to clients.
     graph.ends.clear();
     graph
 }
 
 pub(super) fn topics(graph: &Graph) -> Value {
     let topics: Vec<_> = graph.topics.keys().collect();
-    let types: Vec<_> = graph.topics.values().map(type_of).collect();
+    let types: Vec<_> = graph.topics.values().map(topic_type_name).collect();
     json!({ "topics": topics, "types": types })
 }
 
@@ -133,8 +136,8 @@ pub(super) fn topics_and_raw_types(
 ) -> Value {
     let mut answer = topics(graph);
     let texts = graph.topics.values().map(|nodes| {
-        let found = with_own(version, registry, |registry| {
-            registry.message(type_of(nodes))
+        let found = find_with_own(version, registry, |registry| {
+            registry.message(topic_type_name(nodes))
         });
         found
             .map(|found| found.full_text().to_owned())
@@ -145,7 +148,7 @@ pub(super) fn topics_and_raw_types(
 }
 
 pub(super) fn topic_type(graph: &Graph, topic: &str) -> Value {
-    json!({ "type": graph.topics.get(topic).map_or("", type_of) })
+    json!({ "type": graph.topics.get(topic).map_or("", topic_type_name) })
 }
 
 pub(super) fn publishers(graph: &Graph, topic: &str) -> Value {
@@ -173,7 +176,7 @@ pub(super) fn node_details(graph: &Graph, node: &str) -> Value {
     let served = graph.services.iter().filter(|(_, server)| *server == node);
     let mut services: Vec<String> = served.map(|(service, _)| service.clone()).collect();
     if node == NODE {
-        services.extend(Service::all().map(Service::full_name));
+        services.extend(RosapiService::all().map(RosapiService::full_name));
     }
     json!({
         "subscribing": topics(|nodes| &nodes.subscribers),
@@ -190,7 +193,7 @@ pub(super) fn action_servers(graph: &Graph) -> Value {
 
 pub(super) fn action_type(graph: &Graph, action: &str) -> Value {
     let known = graph.actions.get(action);
-    json!({ "type": known.map_or("", |nodes| told(&nodes.type_name)) })
+    json!({ "type": known.map_or("", |nodes| type_or_empty(&nodes.type_name)) })
 }
 
 fn all_services(graph: &Graph) -> BTreeSet<String> {
@@ -198,7 +201,7 @@ fn all_services(graph: &Graph) -> BTreeSet<String> {
         .services
         .keys()
         .cloned()
-        .chain(Service::all().map(Service::full_name))
+        .chain(RosapiService::all().map(RosapiService::full_name))
         .collect()
 }
 
@@ -206,21 +209,21 @@ pub(super) fn services(graph: &Graph) -> Value {
     json!({ "services": all_services(graph) })
 }
 
-fn server<'g>(graph: &'g Graph, service: &str) -> &'g str {
+fn service_server<'g>(graph: &'g Graph, service: &str) -> &'g str {
     match graph.services.get(service) {
         Some(node) => node,
-        None if Service::find(service).is_some() => NODE,
+        None if RosapiService::find(service).is_some() => NODE,
         None => "",
     }
 }
 
 pub(super) fn service_node(graph: &Graph, service: &str) -> Value {
-    json!({ "node": server(graph, service) })
+    json!({ "node": service_server(graph, service) })
 }
 
-/// Where ROS 2 has no addresses, all nodes are on the servant's own host.
+/// In ROS 2, which has no addresses, all nodes are on the servant's own host.
 pub(super) fn service_host(graph: &Graph, version: RosVersion, service: &str) -> Value {
-    let node = server(graph, service);
+    let node = service_server(graph, service);
     let address = match (version, node) {
         (_, "") => "",
         (RosVersion::Two, _) | (_, NODE) => "localhost",
@@ -230,10 +233,10 @@ pub(super) fn service_host(graph: &Graph, version: RosVersion, service: &str) ->
     json!({ "host": host.split([':', '/']).next().unwrap_or_default() })
 }
 
-/// A service's type; empty where it cannot be had, as rosapi answers.
-async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
+/// Looks up the type of a service; empty if it is not available, as in rosapi.
+async fn find_type(shared: &Arc<BridgeShared>, service: &str) -> String {
     let served = shared.bus.graph().borrow().services.contains_key(service);
-    match Service::find(service) {
+    match RosapiService::find(service) {
         Some(own) if !served => own.type_name(shared.bus.version()),
         _ => {
             let found = shared
@@ -245,16 +248,24 @@ async fn find_type(shared: &Arc<Shared>, service: &str) -> String {
     }
 }
 
-pub(super) async fn service_type(shared: &Arc<Shared>, service: &str, grants: &Grants) -> Value {
-    // Asked of the node, which need not be in the graph that is shown.
-    if Service::find(service).is_none() && !grants.shows(service) {
+pub(super) async fn service_type(
+    shared: &Arc<BridgeShared>,
+    service: &str,
+    grants: &Grants,
+) -> Value {
+    // The type is queried from the node, independently of the filtered graph.
+    if RosapiService::find(service).is_none() && !grants.permits_any(service) {
         return json!({ "type": "" });
     }
     json!({ "type": find_type(shared, service).await })
 }
 
-/// All services of a type, sorted.
-async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<String> {
+/// Returns all services of a type, sorted.
+async fn services_of_type(
+    shared: &Arc<BridgeShared>,
+    graph: &Graph,
+    type_name: &str,
+) -> Vec<String> {
     let asked = all_services(graph).into_iter().map(|service| {
         let shared = shared.clone();
         async move {
@@ -274,22 +285,22 @@ async fn of_type(shared: &Arc<Shared>, graph: &Graph, type_name: &str) -> Vec<St
 }
 
 pub(super) async fn services_for_type(
-    shared: &Arc<Shared>,
+    shared: &Arc<BridgeShared>,
     graph: &Graph,
     type_name: &str,
 ) -> Value {
-    json!({ "services": of_type(shared, graph, type_name).await })
+    json!({ "services": services_of_type(shared, graph, type_name).await })
 }
 
 pub(super) async fn service_providers(
-    shared: &Arc<Shared>,
+    shared: &Arc<BridgeShared>,
     graph: &Graph,
     type_name: &str,
 ) -> Value {
-    let services = of_type(shared, graph, type_name).await;
+    let services = services_of_type(shared, graph, type_name).await;
     let providers: Vec<_> = services
         .iter()
-        .map(|service| server(graph, service))
+        .map(|service| service_server(graph, service))
         .collect();
     json!({ "providers": providers })
 }

@@ -1,5 +1,5 @@
-//! Parameters of nodes, as ROS 2 has them: their names are `node:parameter`. Values travel as JSON text, since a service's
-//! fields have fixed types.
+//! Parameters of nodes, as in ROS 2: their names are `node:parameter`. Values are passed as JSON text, since the fields
+//! of a service have fixed types.
 
 use std::sync::Arc;
 
@@ -10,24 +10,24 @@ use ros::bus::{BusError, NodeParameters, ParamValue};
 use serde_json::{Value, json};
 
 use super::Args;
-use super::params::{Given, default, failed, written};
+use super::params::{GivenValue, bus_error_text, parse_default, to_json_text};
 use crate::names::resolve;
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 
-/// Nodes asked for their parameters at once.
+/// Number of nodes queried for their parameters concurrently.
 const ASKED_AT_ONCE: usize = 16;
 
 /// A parameter of a node.
-struct Named {
+struct NodeParam {
     node: String,
     parameter: String,
 }
 
-/// The parameter that is meant.
-fn named(shared: &Shared, args: &Args) -> Result<Named, String> {
+/// Parses the name of the requested parameter.
+fn parse_name(shared: &BridgeShared, args: &Args) -> Result<NodeParam, String> {
     const EXPECTED: &str = "a node and its parameter such as \"/camera:exposure\" is expected";
     match args.name.split_once(':') {
-        Some((node, parameter)) if !parameter.is_empty() => Ok(Named {
+        Some((node, parameter)) if !parameter.is_empty() => Ok(NodeParam {
             node: resolve(shared.bus.version(), node)?.into_owned(),
             parameter: parameter.to_owned(),
         }),
@@ -39,55 +39,65 @@ fn named(shared: &Shared, args: &Args) -> Result<Named, String> {
     }
 }
 
-/// The parameters of nodes.
-fn of_nodes(shared: &Shared) -> Result<&dyn NodeParameters, String> {
-    shared.bus.node_parameters().map_err(failed)
+/// Returns the interface to the parameters of nodes.
+fn node_parameters(shared: &BridgeShared) -> Result<&dyn NodeParameters, String> {
+    shared.bus.node_parameters().map_err(bus_error_text)
 }
 
-/// Whether the node that was asked is not there: it has no such parameter either.
+/// Returns whether the queried node does not exist; then it has no such parameter either.
 fn is_absence(error: &BusError) -> bool {
     matches!(error, BusError::NoService(_) | BusError::NoParam(_))
 }
 
-/// The value of a parameter; nothing where the node, or the parameter, is not there.
-async fn value_of(shared: &Shared, of: &Named) -> Result<Option<ParamValue>, String> {
-    let parameters = of_nodes(shared)?;
+/// Reads a parameter; `None` if the node or the parameter does not exist.
+async fn read_value(shared: &BridgeShared, of: &NodeParam) -> Result<Option<ParamValue>, String> {
+    let parameters = node_parameters(shared)?;
     let names = [of.parameter.clone()];
     match parameters.get(&of.node, &names).await {
         Ok(values) => Ok(values.into_iter().next().flatten()),
         Err(error) if is_absence(&error) => Ok(None),
-        Err(error) => Err(failed(error)),
+        Err(error) => Err(bus_error_text(error)),
     }
 }
 
-/// Why a parameter has no value.
-fn absent(shared: &Shared, Named { node, parameter }: &Named) -> String {
+/// Explains why a parameter has no value.
+fn absence_reason(shared: &BridgeShared, NodeParam { node, parameter }: &NodeParam) -> String {
     let graph = shared.bus.graph().borrow().clone();
-    match graph.nodes.contains_key(node) {
-        true => format!("node {node} has no parameter {parameter}"),
-        false => format!("there is no node {node}; /rosapi/nodes lists those that are"),
+    if graph.nodes.contains_key(node) {
+        format!("node {node} has no parameter {parameter}")
+    } else {
+        format!("there is no node {node}; /rosapi/nodes lists the existing ones")
     }
 }
 
-pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let of = named(shared, args)?;
-    let value = match value_of(shared, &of).await? {
-        Some(value) => Some(written(&value)?),
-        None => default(args)?,
+pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let of = parse_name(shared, args)?;
+    let value = match read_value(shared, &of).await? {
+        Some(value) => Some(to_json_text(&value)?),
+        None => parse_default(args)?,
     };
-    // Whether it is there is said by later versions of rosapi; clients of earlier ones read a null.
+    // Later versions of rosapi return whether it exists; clients of earlier ones read a null.
     Ok(match value {
         Some(value) => json!({ "value": value, "successful": true, "reason": "" }),
-        None => json!({ "value": "null", "successful": false, "reason": absent(shared, &of) }),
+        None => {
+            json!({ "value": "null", "successful": false, "reason": absence_reason(shared, &of) })
+        }
     })
 }
 
-/// Changes a parameter; without a value it is removed.
-async fn change(shared: &Shared, of: Named, value: Option<ParamValue>) -> Result<Value, String> {
-    let parameters = of_nodes(shared)?;
-    let Named { node, parameter } = of;
+/// Changes a parameter, or removes it if `value` is `None`.
+async fn change(
+    shared: &BridgeShared,
+    of: NodeParam,
+    value: Option<ParamValue>,
+) -> Result<Value, String> {
+    let parameters = node_parameters(shared)?;
+    let NodeParam { node, parameter } = of;
     let changes = vec![(parameter.clone(), value)];
-    let done = parameters.set(&node, changes).await.map_err(failed)?;
+    let done = parameters
+        .set(&node, changes)
+        .await
+        .map_err(bus_error_text)?;
     match done.into_iter().next() {
         Some(Ok(())) => Ok(json!({ "successful": true, "reason": "" })),
         Some(Err(reason)) => Err(format!("node {node} refuses {parameter}: {reason}")),
@@ -96,32 +106,32 @@ async fn change(shared: &Shared, of: Named, value: Option<ParamValue>) -> Result
 }
 
 pub(super) async fn set(
-    shared: &Arc<Shared>,
+    shared: &Arc<BridgeShared>,
     args: &Args,
     budget: &Budget,
 ) -> Result<Value, String> {
-    let of = named(shared, args)?;
-    let given = Given::read(args, budget)?;
+    let of = parse_name(shared, args)?;
+    let given = GivenValue::read(args, budget)?;
     change(shared, of, Some(given.value)).await
 }
 
-pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let of = named(shared, args)?;
-    Ok(json!({ "exists": value_of(shared, &of).await?.is_some() }))
+pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let of = parse_name(shared, args)?;
+    Ok(json!({ "exists": read_value(shared, &of).await?.is_some() }))
 }
 
-pub(super) async fn delete(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let of = named(shared, args)?;
-    match value_of(shared, &of).await? {
+pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let of = parse_name(shared, args)?;
+    match read_value(shared, &of).await? {
         Some(_) => change(shared, of, None).await,
-        // As rosapi has it: it is not there afterwards.
+        // As in rosapi: the parameter does not exist afterwards.
         None => Ok(json!({ "successful": true, "reason": "" })),
     }
 }
 
-/// Those of all nodes that can be asked for them; who does not answer is left out.
-pub(super) async fn names(shared: &Arc<Shared>) -> Result<Value, String> {
-    of_nodes(shared)?;
+/// Returns the parameters of all nodes that offer them; nodes that do not answer are left out.
+pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, String> {
+    node_parameters(shared)?;
     let graph = shared.bus.graph().borrow().clone();
     let own = shared.bus.node();
     let nodes = graph.nodes.keys().filter(|node| *node != own);

@@ -1,4 +1,4 @@
-//! The parameter server of ROS 1. Values travel as JSON text, since a service's fields have fixed types.
+//! The parameter server of ROS 1. Values are passed as JSON text, since the fields of a service have fixed types.
 
 use std::sync::Arc;
 
@@ -9,9 +9,9 @@ use serde_json::{Value, json};
 
 use super::Args;
 use crate::names::resolve;
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 
-fn key(args: &Args) -> Result<String, String> {
+fn param_name(args: &Args) -> Result<String, String> {
     match args.name.as_str() {
         "" => Err("field \"name\" is missing, a parameter's name is expected".to_owned()),
         "/" => Ok("/".to_owned()),
@@ -19,15 +19,15 @@ fn key(args: &Args) -> Result<String, String> {
     }
 }
 
-pub(super) fn failed(error: BusError) -> String {
+pub(super) fn bus_error_text(error: BusError) -> String {
     error.to_string()
 }
 
-/// Bytes of a default, at most. A caller that gives a longer one need not have it sent to itself.
+/// Maximum bytes of a default. A caller need not have a longer one sent back to itself.
 const LONGEST_DEFAULT: usize = 1 << 20;
 
-/// What a caller wants in place of a parameter that is not there, as JSON; none where it does not say.
-pub(super) fn default(args: &Args) -> Result<Option<String>, String> {
+/// Returns the default given by the caller for a missing parameter, as JSON; `None` if there is none.
+pub(super) fn parse_default(args: &Args) -> Result<Option<String>, String> {
     let (field, default) = match args.default.as_str() {
         "" => ("default_value", args.default_value.as_str()),
         default => ("default", default),
@@ -41,59 +41,59 @@ pub(super) fn default(args: &Args) -> Result<Option<String>, String> {
             default.len()
         ));
     }
-    // It is looked at, not read: a tree of it would take many times its bytes.
+    // Only validated: a parsed tree would take many times its bytes.
     let json = serde_json::from_str::<IgnoredAny>(default);
     Ok(Some(match json {
         Ok(_) => default.trim().to_owned(),
-        // A default that is no JSON is a text.
+        // A default that is not JSON is a string.
         Err(_) => Value::from(default).to_string(),
     }))
 }
 
-/// A value as JSON text.
-pub(super) fn written(value: &ParamValue) -> Result<String, String> {
+/// Formats a value as JSON text.
+pub(super) fn to_json_text(value: &ParamValue) -> Result<String, String> {
     serde_json::to_string(value).map_err(|error| error.to_string())
 }
 
-pub(super) async fn get(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let value = match shared.bus.parameter(&key(args)?).await {
-        Ok(value) => written(&value)?,
-        Err(BusError::NoParam(_)) => default(args)?.unwrap_or_else(|| "null".to_owned()),
-        Err(error) => return Err(failed(error)),
+pub(super) async fn get(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let value = match shared.bus.parameter(&param_name(args)?).await {
+        Ok(value) => to_json_text(&value)?,
+        Err(BusError::NoParam(_)) => parse_default(args)?.unwrap_or_else(|| "null".to_owned()),
+        Err(error) => return Err(bus_error_text(error)),
     };
     Ok(json!({ "value": value }))
 }
 
-/// A value that a caller gives, which counts as the caller's while this exists.
-pub(super) struct Given {
+/// A value given by a caller, which counts in the caller's budget while this exists.
+pub(super) struct GivenValue {
     pub(super) value: ParamValue,
     _held: Permit,
 }
 
-/// The value is read into a tree, and a document is made of that tree for the Master or the node.
+/// Number of trees per value: it is parsed into one, and a document is built from that for the Master or the node.
 const TREES: usize = 2;
 
-impl Given {
-    /// Reads it.
+impl GivenValue {
+    /// Parses the value.
     ///
     /// # Errors
-    /// It is no JSON, holds null, is larger or deeper than a value may be, or has no room in `budget`.
+    /// Fails if it is not JSON, contains null, is larger or deeper than allowed, or has no room in `budget`.
     pub(super) fn read(args: &Args, budget: &Budget) -> Result<Self, String> {
         let mut held = budget.permit();
-        let weight = JsonWeight::of(args.value.as_bytes());
+        let weight = JsonWeight::estimate(args.value.as_bytes());
         let counted = held.count(TREES * weight.bytes);
         counted.map_err(|full| format!("field \"value\": {full}"))?;
         let value = serde_json::from_str(&args.value);
-        let value = value.map_err(|error| unreadable(&args.value, &error))?;
+        let value = value.map_err(|error| value_error(&args.value, &error))?;
         Ok(Self { value, _held: held })
     }
 }
 
-/// Why a value is none.
-fn unreadable(text: &str, error: &serde_json::Error) -> String {
+/// Explains why a value is invalid.
+fn value_error(text: &str, error: &serde_json::Error) -> String {
     let shown: String = text.chars().take(48).collect();
     let given = serde_json::from_str::<Value>(text);
-    match given.as_ref().map(|given| null_in(given, String::new())) {
+    match given.as_ref().map(|given| find_null(given, String::new())) {
         Ok(Some(place)) if place.is_empty() => {
             "field \"value\" is null, which no ROS parameter can be; call delete_param to remove one".to_owned()
         }
@@ -108,62 +108,62 @@ fn unreadable(text: &str, error: &serde_json::Error) -> String {
 }
 
 pub(super) async fn set(
-    shared: &Arc<Shared>,
+    shared: &Arc<BridgeShared>,
     args: &Args,
     budget: &Budget,
 ) -> Result<Value, String> {
-    let (key, given) = (key(args)?, Given::read(args, budget)?);
-    let parameters = shared.bus.parameters().map_err(failed)?;
+    let (key, given) = (param_name(args)?, GivenValue::read(args, budget)?);
+    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
     let set = parameters.set(&key, given.value);
-    set.await.map_err(failed)?;
+    set.await.map_err(bus_error_text)?;
     Ok(json!({}))
 }
 
-/// The place of the first null in a value, from its top: `/robot/arms/0`.
-fn null_in(value: &Value, place: String) -> Option<String> {
+/// Returns the path of the first null in a value: `/robot/arms/0`.
+fn find_null(value: &Value, place: String) -> Option<String> {
     match value {
         Value::Null => Some(place),
         Value::Array(items) => items
             .iter()
             .enumerate()
-            .find_map(|(at, item)| null_in(item, format!("{place}/{at}"))),
+            .find_map(|(at, item)| find_null(item, format!("{place}/{at}"))),
         Value::Object(members) => members
             .iter()
-            .find_map(|(name, member)| null_in(member, format!("{place}/{name}"))),
+            .find_map(|(name, member)| find_null(member, format!("{place}/{name}"))),
         _ => None,
     }
 }
 
-pub(super) async fn has(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(failed)?;
-    Ok(json!({ "exists": parameters.has(&key(args)?).await.map_err(failed)? }))
+pub(super) async fn has(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
+    Ok(json!({ "exists": parameters.has(&param_name(args)?).await.map_err(bus_error_text)? }))
 }
 
-pub(super) async fn search(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(failed)?;
+pub(super) async fn search(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
     let found = parameters.search("/", args.name.trim_start_matches('/'));
-    let found = found.await.map_err(failed)?;
+    let found = found.await.map_err(bus_error_text)?;
     Ok(json!({ "global_name": found.unwrap_or_default() }))
 }
 
-pub(super) async fn delete(shared: &Arc<Shared>, args: &Args) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(failed)?;
-    match parameters.delete(&key(args)?).await {
+pub(super) async fn delete(shared: &Arc<BridgeShared>, args: &Args) -> Result<Value, String> {
+    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
+    match parameters.delete(&param_name(args)?).await {
         Ok(()) | Err(BusError::NoParam(_)) => Ok(json!({})),
-        Err(error) => Err(failed(error)),
+        Err(error) => Err(bus_error_text(error)),
     }
 }
 
-pub(super) async fn names(shared: &Arc<Shared>) -> Result<Value, String> {
-    let parameters = shared.bus.parameters().map_err(failed)?;
-    Ok(json!({ "names": parameters.names().await.map_err(failed)? }))
+pub(super) async fn names(shared: &Arc<BridgeShared>) -> Result<Value, String> {
+    let parameters = shared.bus.parameters().map_err(bus_error_text)?;
+    Ok(json!({ "names": parameters.names().await.map_err(bus_error_text)? }))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn of(value: &str) -> Args {
+    fn args_with_value(value: &str) -> Args {
         Args {
             value: value.to_owned(),
             ..Args::default()
@@ -174,21 +174,21 @@ mod tests {
     fn a_value_that_is_given_counts_while_it_exists() {
         let budget = Budget::new("client x", 64 << 20);
         let list = format!("[{}1]", "1,".repeat(10_000));
-        let given = Given::read(&of(&list), &budget).expect("there is room");
-        assert!(budget.used() > 10_000 * size_of::<ParamValue>());
+        let given = GivenValue::read(&args_with_value(&list), &budget).expect("there is room");
+        assert!(budget.used_bytes() > 10_000 * size_of::<ParamValue>());
         drop(given);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
         // Less than a megabyte.
         let maps = format!("[{}1]", r#"{"":1},"#.repeat(100_000));
-        let full = Given::read(&of(&maps), &budget).err();
+        let full = GivenValue::read(&args_with_value(&maps), &budget).err();
         let full = full.expect("it has no room");
         assert!(full.contains("the memory for client x"), "{full}");
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[test]
     fn a_value_that_ros_cannot_have_is_refused_with_its_reason() {
-        let budget = Budget::unlimited();
+        let budget = Budget::without_limit();
         let deep = format!("{}1{}", "[".repeat(101), "]".repeat(101));
         for (value, words) in [
             ("null", "call delete_param"),
@@ -197,7 +197,7 @@ mod tests {
             ("", "JSON text (a boolean"),
             (deep.as_str(), "more than 100 deep"),
         ] {
-            let refused = Given::read(&of(value), &budget).err();
+            let refused = GivenValue::read(&args_with_value(value), &budget).err();
             let refused = refused.expect(value);
             assert!(refused.contains(words), "{refused}");
         }
@@ -206,7 +206,7 @@ mod tests {
     #[test]
     fn a_default_is_sent_as_it_was_given() {
         let of = |default: &str| {
-            super::default(&Args {
+            super::parse_default(&Args {
                 default: default.to_owned(),
                 ..Args::default()
             })

@@ -1,4 +1,4 @@
-//! `rosapi/TypeDef`: a type and all it contains, field by field, as rosapi of either ROS tells it.
+//! `rosapi/TypeDef`: a type and all it contains, field by field, in the format of rosapi in either ROS.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -10,14 +10,14 @@ use ros::schema::{
 };
 use serde_json::{Value, json};
 
-use super::with_own;
-use crate::lacking::explain;
-use crate::names::{plain_type, sought};
+use super::find_with_own;
+use crate::lacking::explain_schema_error;
+use crate::names::{lookup_name, short_type_name};
 
-/// A part of an action.
-pub(super) type Part = fn(&ActionDef) -> &Arc<MessageType>;
+/// Accessor of a part of an action.
+pub(super) type ActionPart = fn(&ActionDef) -> &Arc<MessageType>;
 
-/// Where definitions are looked up: the servant's, of its ROS.
+/// The definitions to search: the servant's, of its ROS.
 #[derive(Clone, Copy)]
 pub(super) struct Definitions<'r> {
     pub(super) version: RosVersion,
@@ -25,30 +25,32 @@ pub(super) struct Definitions<'r> {
 }
 
 impl Definitions<'_> {
-    /// A message.
+    /// Describes a message.
     pub(super) fn message(self, type_name: &str) -> Result<Value, String> {
         if self.version == RosVersion::One
-            && let Some(special) = special(&plain_type(type_name))
+            && let Some(special) = time_typedef(&short_type_name(type_name))
         {
             return Ok(json!({ "typedefs": [special] }));
         }
-        if Primitive::named(self.version, type_name).is_some() || is_of_idl(type_name) {
+        if Primitive::from_versioned_name(self.version, type_name).is_some()
+            || is_idl_primitive(type_name)
+        {
             return Ok(json!({ "typedefs": [] }));
         }
         self.details(type_name, |registry, name| registry.message(name))
     }
 
-    /// The request of a service.
+    /// Describes the request of a service.
     pub(super) fn request(self, type_name: &str) -> Result<Value, String> {
-        self.of_service(type_name, |service| &service.request)
+        self.service_part(type_name, |service| &service.request)
     }
 
-    /// The response of a service.
+    /// Describes the response of a service.
     pub(super) fn response(self, type_name: &str) -> Result<Value, String> {
-        self.of_service(type_name, |service| &service.response)
+        self.service_part(type_name, |service| &service.response)
     }
 
-    fn of_service(
+    fn service_part(
         self,
         type_name: &str,
         part: fn(&ServiceDef) -> &Arc<MessageType>,
@@ -58,8 +60,8 @@ impl Definitions<'_> {
         })
     }
 
-    /// A part of an action.
-    pub(super) fn of_action(self, type_name: &str, part: Part) -> Result<Value, String> {
+    /// Describes a part of an action.
+    pub(super) fn action_part(self, type_name: &str, part: ActionPart) -> Result<Value, String> {
         self.details(type_name, |registry, name| {
             registry.action(name).map(|action| part(&action).clone())
         })
@@ -70,11 +72,11 @@ impl Definitions<'_> {
         type_name: &str,
         find: impl Fn(&Registry, &str) -> Result<Arc<MessageType>, SchemaError>,
     ) -> Result<Value, String> {
-        let name = sought(self.version, type_name);
-        let found = with_own(self.version, self.registry, |registry| {
+        let name = lookup_name(self.version, type_name);
+        let found = find_with_own(self.version, self.registry, |registry| {
             find(registry, &name)
         });
-        let found = found.map_err(|error| explain(self.version, error))?;
+        let found = found.map_err(|error| explain_schema_error(self.version, error))?;
         Ok(typedefs(&found))
     }
 }
@@ -85,7 +87,7 @@ fn typedefs(message: &Arc<MessageType>) -> Value {
     json!({ "typedefs": found })
 }
 
-/// The type, then those of its fields, each once, in the order in which they are met.
+/// Collects the type, then those of its fields, each once, in the order of their occurrence.
 fn collect(message: &Arc<MessageType>, seen: &mut HashSet<String>, found: &mut Vec<Value>) {
     if !seen.insert(message.name().to_owned()) {
         return;
@@ -95,7 +97,7 @@ fn collect(message: &Arc<MessageType>, seen: &mut HashSet<String>, found: &mut V
         match &field.base {
             Base::Message(inner) => collect(inner, seen, found),
             Base::Primitive(primitive) => {
-                if let Some(special) = special(primitive.name())
+                if let Some(special) = time_typedef(primitive.name())
                     && seen.insert(primitive.name().to_owned())
                 {
                     found.push(special);
@@ -117,9 +119,9 @@ fn typedef(message: &MessageType) -> Value {
         }
     };
     json!({
-        "type": plain_type(message.name()),
+        "type": short_type_name(message.name()),
         "fieldnames": fields.iter().map(|field| &field.name).collect::<Vec<_>>(),
-        "fieldtypes": fields.iter().map(|field| type_of(version, field)).collect::<Vec<_>>(),
+        "fieldtypes": fields.iter().map(|field| rosapi_type_name(version, field)).collect::<Vec<_>>(),
         "fieldarraylen": fields.iter().map(|field| array_length(field.arity)).collect::<Vec<_>>(),
         "examples": fields.iter().map(|field| example(field, &defaults)).collect::<Vec<_>>(),
         "constnames": constants.iter().map(|constant| &constant.name).collect::<Vec<_>>(),
@@ -127,11 +129,13 @@ fn typedef(message: &MessageType) -> Value {
     })
 }
 
-/// How rosapi calls the type of a field: in ROS 2 by IDL's names.
-fn type_of(version: RosVersion, field: &Field) -> String {
+/// Returns the name of a field's type in rosapi: in ROS 2 that of IDL.
+fn rosapi_type_name(version: RosVersion, field: &Field) -> String {
     let name = match (version, &field.base) {
         (RosVersion::One, _) => return field.type_name.clone(),
-        (RosVersion::Two, Base::Message(inner)) => return plain_type(inner.name()).into_owned(),
+        (RosVersion::Two, Base::Message(inner)) => {
+            return short_type_name(inner.name()).into_owned();
+        }
         (RosVersion::Two, Base::Primitive(_)) => field.type_name.as_str(),
     };
     let of_idl = match name {
@@ -145,12 +149,12 @@ fn type_of(version: RosVersion, field: &Field) -> String {
     of_idl.to_owned()
 }
 
-/// Whether rosapi of ROS 2 calls a type so that needs no definition.
-fn is_of_idl(name: &str) -> bool {
+/// Returns whether rosapi of ROS 2 uses this name for a type without a definition.
+fn is_idl_primitive(name: &str) -> bool {
     matches!(name, "boolean" | "octet" | "float" | "double")
 }
 
-/// -1 for a single value, 0 for any number of them.
+/// Returns -1 for a single value, 0 for a list of any length, or the fixed length.
 fn array_length(arity: Arity) -> i64 {
     match arity {
         Arity::One => -1,
@@ -159,7 +163,7 @@ fn array_length(arity: Arity) -> i64 {
     }
 }
 
-/// As Python prints the default; `defaults` are those of all fields where not all are zeros.
+/// Formats the default as Python prints it; `defaults` are those of all fields if not all are zeros.
 fn example(field: &Field, defaults: &Value) -> String {
     let zero = match (field.arity, &field.base) {
         (Arity::Variable | Arity::Fixed(_), _) => return "[]".to_owned(),
@@ -180,8 +184,8 @@ fn example(field: &Field, defaults: &Value) -> String {
     }
 }
 
-/// ROS 1's times, which have no definition.
-fn special(name: &str) -> Option<Value> {
+/// Describes the time types of ROS 1, which have no definition.
+fn time_typedef(name: &str) -> Option<Value> {
     matches!(name, "time" | "duration").then(|| {
         json!({
             "type": name,

@@ -1,6 +1,6 @@
 use super::*;
 
-fn of(registry: &Registry, version: RosVersion) -> Definitions<'_> {
+fn definitions_of(registry: &Registry, version: RosVersion) -> Definitions<'_> {
     Definitions { version, registry }
 }
 
@@ -23,7 +23,7 @@ fn a_type_is_described_with_all_it_contains() {
     registry
         .insert("x/msg/Inner", "duration wait\nstring name\n")
         .unwrap();
-    let one = of(&registry, RosVersion::One);
+    let one = definitions_of(&registry, RosVersion::One);
     let answer = one.message("x/msg/Pair").unwrap();
     assert_eq!(
         types(&answer),
@@ -51,7 +51,7 @@ fn a_type_is_described_with_all_it_contains() {
 
 #[test]
 fn in_ros_2_types_have_the_names_of_idl_and_their_defaults() {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     registry
         .insert(
             "x/msg/Pair",
@@ -62,7 +62,7 @@ fn in_ros_2_types_have_the_names_of_idl_and_their_defaults() {
     registry
         .insert("x/msg/Inner", "builtin_interfaces/Duration wait\n")
         .unwrap();
-    let two = of(&registry, RosVersion::Two);
+    let two = definitions_of(&registry, RosVersion::Two);
     for name in ["x/msg/Pair", "x/Pair"] {
         let answer = two.message(name).unwrap();
         assert_eq!(
@@ -100,11 +100,11 @@ fn in_ros_2_types_have_the_names_of_idl_and_their_defaults() {
 #[test]
 fn services_are_described_by_halves() {
     for version in [RosVersion::One, RosVersion::Two] {
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         registry
             .insert("x/srv/Add", "int64 a\nint64 b\n---\nint64 sum\n")
             .unwrap();
-        let definitions = of(&registry, version);
+        let definitions = definitions_of(&registry, version);
         for name in ["x/Add", "x/srv/Add"] {
             let asked = definitions.request(name).unwrap();
             let expected = match version {
@@ -113,7 +113,7 @@ fn services_are_described_by_halves() {
             };
             assert_eq!(asked["typedefs"][0]["type"], expected);
             assert_eq!(asked["typedefs"][0]["fieldnames"], json!(["a", "b"]));
-            // By that name it is known, too.
+            // It can be queried by that name, too.
             assert_eq!(definitions.message(expected).unwrap(), asked);
             assert_eq!(
                 definitions.response(name).unwrap()["typedefs"][0]["fieldnames"],
@@ -122,13 +122,13 @@ fn services_are_described_by_halves() {
         }
     }
     let registry = Registry::new();
-    let own = of(&registry, RosVersion::One).response("rosapi/Topics");
+    let own = definitions_of(&registry, RosVersion::One).response("rosapi/Topics");
     assert_eq!(
         own.unwrap()["typedefs"][0]["fieldnames"],
         json!(["topics", "types"])
     );
-    let registry = Registry::of(RosVersion::Two);
-    let own = of(&registry, RosVersion::Two).response("rosapi_msgs/srv/Topics");
+    let registry = Registry::for_version(RosVersion::Two);
+    let own = definitions_of(&registry, RosVersion::Two).response("rosapi_msgs/srv/Topics");
     assert_eq!(
         own.unwrap()["typedefs"][0]["fieldnames"],
         json!(["topics", "types"])
@@ -138,26 +138,26 @@ fn services_are_described_by_halves() {
 #[test]
 fn actions_are_described_by_their_parts() {
     for version in [RosVersion::One, RosVersion::Two] {
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         registry
             .insert(
                 "x/action/Count",
                 "int32 to\n---\nint32[] all\n---\nint32 at\n",
             )
             .unwrap();
-        let definitions = of(&registry, version);
-        let parts: [(Part, &str); 3] = [
+        let definitions = definitions_of(&registry, version);
+        let parts: [(ActionPart, &str); 3] = [
             (|action| &action.goal, "to"),
             (|action| &action.result, "all"),
             (|action| &action.feedback, "at"),
         ];
         for (part, field) in parts {
             for name in ["x/Count", "x/action/Count"] {
-                let told = definitions.of_action(name, part).unwrap();
+                let told = definitions.action_part(name, part).unwrap();
                 assert_eq!(told["typedefs"][0]["fieldnames"], json!([field]));
             }
         }
-        let unknown = definitions.of_action("x/Lost", parts[0].0).unwrap_err();
+        let unknown = definitions.action_part("x/Lost", parts[0].0).unwrap_err();
         assert!(unknown.contains("Lost is known here"), "{unknown}");
     }
 }

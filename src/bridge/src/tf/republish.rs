@@ -1,4 +1,4 @@
-//! Who asked for which transforms, by the service and by the topics of the action.
+//! Requests for transforms, by the service and by the topics of the action.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock, Weak};
@@ -6,30 +6,30 @@ use std::sync::{Arc, OnceLock, Weak};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Message, PeerId, RosVersion, WireType};
+use ros::bus::{PeerId, RosVersion, SerializedMessage, WireType};
 use ros::codec::{self, JsonOptions, Time};
-use ros::ros1::actions::messages::{self, GoalId, GoalState, Status};
+use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
 use ros::schema::{MessageType, ServiceDef};
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::sending::{Wanted, check, heard_on, send};
-use super::{Buffer, SharedBuffer, array_name, package};
-use crate::fanout::{Listener, Listening};
+use super::sending::{TransformRequest, check_limits, newest_listener_on, send_transforms};
+use super::{SharedBuffer, TransformBuffer, array_name, package};
+use crate::fanout::{Listener, ListenerGuard};
 use crate::own::{Caller, OwnService};
-use crate::sample::Sample;
-use crate::shared::Shared;
+use crate::sample::TopicSample;
+use crate::shared::BridgeShared;
 
-/// The service.
+/// Name of the service.
 pub(crate) const SERVICE: &str = "/republish_tfs";
-/// Where goals of the action come from.
+/// Topic of the action's goals.
 pub(crate) const GOAL_TOPIC: &str = "/tf2_web_republisher/goal";
 const CANCEL_TOPIC: &str = "/tf2_web_republisher/cancel";
 const FEEDBACK_TOPIC: &str = "/tf2_web_republisher/feedback";
 const RESULT_TOPIC: &str = "/tf2_web_republisher/result";
 pub(crate) const STATUS_TOPIC: &str = "/tf2_web_republisher/status";
 
-/// The action's topics in ROS 1: their types, and whether they are published by the action's server or to it.
+/// Topics of the action in ROS 1, their types, and whether the action's server publishes them.
 pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
     (
         GOAL_TOPIC,
@@ -49,19 +49,19 @@ pub(crate) const TOPICS: [(&str, &str, bool); 5] = [
     ),
     (STATUS_TOPIC, "actionlib_msgs/GoalStatusArray", true),
 ];
-/// Beginning of the names of topics made for callers of the service.
+/// Prefix of the topics created for callers of the service.
 const TOPIC_PREFIX: &str = "/tf_repub_";
-/// The action, and the node that seems to publish.
+/// Name of the action, and of the node that appears to publish.
 pub(crate) const ACTION: &str = "/tf2_web_republisher";
 
-/// One bridge's republisher.
+/// The republisher of a bridge.
 #[derive(Default)]
 pub(crate) struct Republisher {
     buffer: SharedBuffer,
     topics: Mutex<HashMap<String, DropGuard>>,
     goals: Mutex<HashMap<String, DropGuard>>,
     /// Set when a client first uses the action.
-    listening: OnceLock<[Listening; 2]>,
+    listening: OnceLock<[ListenerGuard; 2]>,
 }
 
 /// The service `/republish_tfs`.
@@ -69,7 +69,7 @@ pub(crate) struct RepublishTfs;
 
 #[async_trait]
 impl OwnService for RepublishTfs {
-    fn definition(&self, shared: &Shared) -> Result<Arc<ServiceDef>, String> {
+    fn definition(&self, shared: &BridgeShared) -> Result<Arc<ServiceDef>, String> {
         let name = format!("{}/RepublishTFs", package(shared.bus.version()));
         let found = shared.registry.service(&name);
         found.map_err(|error| error.to_string())
@@ -77,7 +77,7 @@ impl OwnService for RepublishTfs {
 
     async fn answer(
         &self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         args: &[u8],
         _: &Caller<'_>,
     ) -> Result<Vec<u8>, String> {
@@ -86,23 +86,23 @@ impl OwnService for RepublishTfs {
 }
 
 impl Republisher {
-    /// The type of a topic that was made for a caller.
+    /// Returns the type of a topic created for a caller.
     pub(crate) fn type_name(&self, version: RosVersion, topic: &str) -> Option<&'static str> {
         (topic.starts_with(TOPIC_PREFIX) && self.topics.lock().contains_key(topic))
             .then(|| array_name(version))
     }
 
-    /// Answers a call of the service; request and response in JSON.
-    fn call(&self, shared: &Arc<Shared>, request: &[u8]) -> Result<Vec<u8>, String> {
-        let wanted: Wanted =
+    /// Answers a call of the service; request and response are JSON.
+    fn call(&self, shared: &Arc<BridgeShared>, request: &[u8]) -> Result<Vec<u8>, String> {
+        let wanted: TransformRequest =
             serde_json::from_slice(request).map_err(|error| format!("args: {error}"))?;
-        check(&wanted, self.topics.lock().len())?;
+        check_limits(&wanted, self.topics.lock().len())?;
         let topic = format!("{TOPIC_PREFIX}{}", shared.next_number());
         let stop = CancellationToken::new();
         self.topics
             .lock()
             .insert(topic.clone(), stop.clone().drop_guard());
-        let patience = wanted.patience();
+        let patience = wanted.topic_timeout();
         let (name, message_type) = (
             topic.clone(),
             shared.registry.message(array_name(shared.bus.version())),
@@ -110,7 +110,7 @@ impl Republisher {
         let message_type = message_type.map_err(|error| error.to_string())?;
         let mut heard = Instant::now();
         let of = message_type.clone();
-        let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
+        let deliver = move |shared: &Arc<BridgeShared>, transforms: Option<Vec<u8>>| {
             let live = shared.live_fanouts(&name);
             if !live.is_empty() {
                 heard = Instant::now();
@@ -121,18 +121,18 @@ impl Republisher {
                     fanout.deliver(message.clone(), true);
                 }
             }
-            // Nobody has listened for as long as the caller said: it is gone.
+            // Nobody has listened for the time given by the caller: it is gone.
             let gone = heard.elapsed() > patience;
             if gone {
                 shared.republisher.topics.lock().remove(&name);
             }
             !gone
         };
-        tokio::spawn(send(
+        tokio::spawn(send_transforms(
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            (heard_on(&topic), of),
+            (newest_listener_on(&topic), of),
             stop,
             deliver,
         ));
@@ -141,8 +141,8 @@ impl Republisher {
             .into_bytes())
     }
 
-    /// A client is about to send goals: listens to them, if nobody else does.
-    pub(crate) fn listen(&self, shared: &Arc<Shared>) {
+    /// Listens to goals when a client is about to send some, unless a node serves them.
+    pub(crate) fn listen_for_goals(&self, shared: &Arc<BridgeShared>) {
         let graph = shared.bus.graph().borrow().clone();
         let served = graph
             .topics
@@ -159,7 +159,7 @@ impl Republisher {
             return;
         };
         let listener = |cancels| {
-            Arc::new(Goals {
+            Arc::new(GoalListener {
                 shared: Arc::downgrade(shared),
                 cancels,
             })
@@ -170,17 +170,17 @@ impl Republisher {
         let cancels = shared
             .fanout(CANCEL_TOPIC, Some(&cancel))
             .listen(listener(true));
-        // Whoever comes second has listened in vain, and stops.
+        // The loser of a race drops its listeners.
         let _ = self.listening.set([goals, cancels]);
     }
 
-    pub(super) fn buffer(&self, shared: &Arc<Shared>) -> Arc<Buffer> {
-        self.buffer.get(|| Buffer::new(shared))
+    pub(super) fn buffer(&self, shared: &Arc<BridgeShared>) -> Arc<TransformBuffer> {
+        self.buffer.get(|| TransformBuffer::new(shared))
     }
 
     fn begin(
         &self,
-        shared: &Arc<Shared>,
+        shared: &Arc<BridgeShared>,
         goal: GoalId,
         body: &[u8],
         publisher: PeerId,
@@ -192,39 +192,43 @@ impl Republisher {
         let mut json = Vec::new();
         codec::to_json(&action.goal, body, &mut json, &JsonOptions::default())
             .map_err(|error| error.to_string())?;
-        let wanted: Wanted = serde_json::from_slice(&json).map_err(|error| error.to_string())?;
-        check(&wanted, self.goals.lock().len())?;
+        let wanted: TransformRequest =
+            serde_json::from_slice(&json).map_err(|error| error.to_string())?;
+        check_limits(&wanted, self.goals.lock().len())?;
         let stop = CancellationToken::new();
         self.goals
             .lock()
             .insert(goal.id.clone(), stop.clone().drop_guard());
         let of = action.feedback.clone();
-        let deliver = move |shared: &Arc<Shared>, transforms: Option<Vec<u8>>| {
+        let deliver = move |shared: &Arc<BridgeShared>, transforms: Option<Vec<u8>>| {
             if let Some(transforms) = transforms {
-                let bytes =
-                    messages::write_state(Time::now(), &state(&goal, Status::Active), &transforms);
+                let bytes = messages::write_state(
+                    Time::now(),
+                    &goal_state(&goal, ActionlibStatus::Active),
+                    &transforms,
+                );
                 shared.deliver(FEEDBACK_TOPIC, &message(&action.action_feedback, bytes));
             }
             // The goal of a client that is gone is given up.
-            let alive = shared.has_outlet(GOAL_TOPIC, &publisher);
+            let alive = shared.has_publisher(GOAL_TOPIC, &publisher);
             if !alive {
                 shared.republisher.goals.lock().remove(&goal.id);
             }
             alive
         };
-        tokio::spawn(send(
+        tokio::spawn(send_transforms(
             Arc::downgrade(shared),
             self.buffer(shared),
             wanted,
-            (heard_on(FEEDBACK_TOPIC), of),
+            (newest_listener_on(FEEDBACK_TOPIC), of),
             stop,
             deliver,
         ));
         Ok(())
     }
 
-    /// Ends a goal, or with an empty id all of them.
-    fn cancel(&self, shared: &Arc<Shared>, goal: &GoalId) {
+    /// Cancels a goal, or all of them if the id is empty.
+    fn cancel(&self, shared: &Arc<BridgeShared>, goal: &GoalId) {
         let mut goals = self.goals.lock();
         let ended: Vec<String> = match goal.id.as_str() {
             "" => goals.drain().map(|(id, _)| id).collect(),
@@ -242,13 +246,17 @@ impl Republisher {
                 id,
                 ..GoalId::default()
             };
-            let bytes = messages::write_state(Time::now(), &state(&goal, Status::Preempted), &[]);
+            let bytes = messages::write_state(
+                Time::now(),
+                &goal_state(&goal, ActionlibStatus::Preempted),
+                &[],
+            );
             shared.deliver(RESULT_TOPIC, &message(&action.action_result, bytes));
         }
     }
 }
 
-fn state(goal: &GoalId, status: Status) -> GoalState {
+fn goal_state(goal: &GoalId, status: ActionlibStatus) -> GoalState {
     GoalState {
         goal: goal.clone(),
         status,
@@ -256,23 +264,23 @@ fn state(goal: &GoalId, status: Status) -> GoalState {
     }
 }
 
-fn message(message_type: &MessageType, bytes: Bytes) -> Message {
-    Message {
+fn message(message_type: &MessageType, bytes: Bytes) -> SerializedMessage {
+    SerializedMessage {
         bytes,
-        wire_type: Arc::new(WireType::of(message_type)),
+        wire_type: Arc::new(WireType::from_message(message_type)),
         publisher: ACTION.into(),
         latching: false,
     }
 }
 
-/// Hears goals, or their cancelling.
-struct Goals {
-    shared: Weak<Shared>,
+/// Listens to goals, or to their cancellation.
+struct GoalListener {
+    shared: Weak<BridgeShared>,
     cancels: bool,
 }
 
-impl Listener for Goals {
-    fn sample(&self, sample: &Arc<Sample>, _replay: bool) {
+impl Listener for GoalListener {
+    fn on_sample(&self, sample: &Arc<TopicSample>, _replay: bool) {
         // Nodes have a republisher of their own, or none.
         let Some(shared) = self.shared.upgrade().filter(|_| sample.local) else {
             return;
@@ -287,11 +295,11 @@ impl Listener for Goals {
                     .republisher
                     .begin(&shared, goal, &body, sample.publisher.clone())
         {
-            tracing::debug!("a request for transforms is refused: {reason}");
+            tracing::debug!("a request for transforms was refused: {reason}");
         }
     }
 
-    fn failed(&self, reason: &str) {
-        tracing::debug!("goals for transforms cannot be heard: {reason}");
+    fn on_failed(&self, reason: &str) {
+        tracing::debug!("cannot receive goals for transforms: {reason}");
     }
 }

@@ -1,4 +1,4 @@
-//! What callers and goals ask for, and its sending.
+//! Requests by callers and goals, and the sending of transforms.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -9,20 +9,20 @@ use ros::schema::MessageType;
 use serde::Deserialize;
 use tokio_util::sync::CancellationToken;
 
-use super::buffer::Found;
+use super::buffer::FramePose;
 use super::transform::Transform;
-use super::{Buffer, buffer, write_transforms};
+use super::{TransformBuffer, buffer, write_transforms};
 use crate::clock;
-use crate::shared::Shared;
+use crate::shared::BridgeShared;
 
-/// Requests served at once.
+/// Maximum number of requests served at once.
 const MAX_REQUESTS: usize = 1000;
 const MAX_SOURCES: usize = 1000;
 
-/// What a caller or goal asks for.
+/// A request of a caller or goal.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(default)]
-pub(super) struct Wanted {
+pub(super) struct TransformRequest {
     source_frames: Vec<String>,
     target_frame: String,
     angular_thres: f64,
@@ -40,7 +40,7 @@ struct Timeout {
     nsecs: i64,
 }
 
-impl Default for Wanted {
+impl Default for TransformRequest {
     fn default() -> Self {
         Self {
             source_frames: Vec::new(),
@@ -53,9 +53,9 @@ impl Default for Wanted {
     }
 }
 
-impl Wanted {
-    /// How long a topic that nobody listens to is kept.
-    pub(super) fn patience(&self) -> Duration {
+impl TransformRequest {
+    /// Returns how long a topic without listeners is kept.
+    pub(super) fn topic_timeout(&self) -> Duration {
         let Timeout { secs, nsecs } = self.timeout;
         let patience = Duration::new(
             u64::try_from(secs).unwrap_or(0),
@@ -65,8 +65,8 @@ impl Wanted {
     }
 }
 
-/// Refuses what is too much.
-pub(super) fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
+/// Refuses requests above the limits.
+pub(super) fn check_limits(wanted: &TransformRequest, requests: usize) -> Result<(), String> {
     if wanted.source_frames.len() > MAX_SOURCES {
         return Err(format!(
             "source_frames has {} entries, at most {MAX_SOURCES} are allowed",
@@ -81,8 +81,10 @@ pub(super) fn check(wanted: &Wanted, requests: usize) -> Result<(), String> {
     Ok(())
 }
 
-/// Who listens to this topic: its newest listener.
-pub(super) fn heard_on(topic: &str) -> impl Fn(&Shared) -> Option<u64> + Send + use<> {
+/// Returns a function that finds the newest listener of this topic.
+pub(super) fn newest_listener_on(
+    topic: &str,
+) -> impl Fn(&BridgeShared) -> Option<u64> + Send + use<> {
     let topic = topic.to_owned();
     move |shared| {
         let live = shared.live_fanouts(&topic);
@@ -92,15 +94,15 @@ pub(super) fn heard_on(topic: &str) -> impl Fn(&Shared) -> Option<u64> + Send + 
     }
 }
 
-/// Gives `deliver` what has changed for those who hear it, at the rate asked for, until that says no or `stop` is cancelled.
-/// `heard_by` says who came last of those, if anybody did.
-pub(super) async fn send(
-    shared: Weak<Shared>,
-    buffer: Arc<Buffer>,
-    wanted: Wanted,
-    (heard_by, of): (impl Fn(&Shared) -> Option<u64>, Arc<MessageType>),
+/// Sends changed transforms to `deliver` at the requested rate, until it returns false or `stop` is cancelled.
+/// `heard_by` returns the newest of its listeners, if there is any.
+pub(super) async fn send_transforms(
+    shared: Weak<BridgeShared>,
+    buffer: Arc<TransformBuffer>,
+    wanted: TransformRequest,
+    (heard_by, of): (impl Fn(&BridgeShared) -> Option<u64>, Arc<MessageType>),
     stop: CancellationToken,
-    mut deliver: impl FnMut(&Arc<Shared>, Option<Vec<u8>>) -> bool,
+    mut deliver: impl FnMut(&Arc<BridgeShared>, Option<Vec<u8>>) -> bool,
 ) {
     let rate = if wanted.rate > 0.0 {
         wanted.rate.clamp(0.01, 1000.0)
@@ -109,7 +111,7 @@ pub(super) async fn send(
     };
     let mut ticks = tokio::time::interval(Duration::from_secs_f64(1.0 / rate));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    let target = buffer::plain(&wanted.target_frame);
+    let target = buffer::strip_slash(&wanted.target_frame);
     let mut sent: HashMap<&str, Transform> = HashMap::new();
     let mut known = None;
     loop {
@@ -120,7 +122,7 @@ pub(super) async fn send(
         let Some(shared) = shared.upgrade() else {
             return;
         };
-        // Callers learn the topic's name from the answer and listen only then; whoever comes late wants to hear all.
+        // Callers learn the topic's name from the answer and listen only then; a new listener needs all transforms.
         let newest = heard_by(&shared);
         if newest != known {
             known = newest;
@@ -136,9 +138,9 @@ pub(super) async fn send(
         for source in wanted
             .source_frames
             .iter()
-            .map(|source| buffer::plain(source))
+            .map(|source| buffer::strip_slash(source))
         {
-            let Some(Found {
+            let Some(FramePose {
                 transform: now,
                 time,
             }) = buffer.find(target, source)
@@ -154,10 +156,11 @@ pub(super) async fn send(
                 changed.push((target, source, now, time));
             }
         }
-        // What never moves is there now, too.
-        let now = match changed.iter().any(|(.., time)| time.is_none()) {
-            true => clock::now(&shared).await,
-            false => Time::default(),
+        // Static transforms have the current time.
+        let now = if changed.iter().any(|(.., time)| time.is_none()) {
+            clock::now(&shared).await
+        } else {
+            Time::default()
         };
         let changed: Vec<_> = changed
             .into_iter()
@@ -165,9 +168,10 @@ pub(super) async fn send(
                 (target, source, transform, time.unwrap_or(now))
             })
             .collect();
-        let transforms = match changed.is_empty() {
-            true => None,
-            false => write_transforms(&of, changed).ok(),
+        let transforms = if changed.is_empty() {
+            None
+        } else {
+            write_transforms(&of, changed).ok()
         };
         if !deliver(&shared, transforms) {
             return;

@@ -13,8 +13,8 @@ impl Transform {
         rotation: [0.0, 0.0, 0.0, 1.0],
     };
 
-    /// The composition: first `other`, then this transform.
-    pub(super) fn after(&self, other: &Transform) -> Transform {
+    /// Returns the composition: first `other`, then this transform.
+    pub(super) fn compose(&self, other: &Transform) -> Transform {
         let moved = rotate(self.rotation, other.translation);
         Transform {
             translation: std::array::from_fn(|at| moved[at] + self.translation[at]),
@@ -31,7 +31,7 @@ impl Transform {
         }
     }
 
-    /// How far apart two are: metres, radians.
+    /// Returns the distance between two transforms: metres, radians.
     pub(super) fn distance(&self, other: &Transform) -> (f64, f64) {
         let squares = (0..3).map(|at| (self.translation[at] - other.translation[at]).powi(2));
         let dot: f64 = (0..4)
@@ -40,8 +40,8 @@ impl Transform {
         (squares.sum::<f64>().sqrt(), 2.0 * dot.abs().min(1.0).acos())
     }
 
-    /// With a rotation of length one; nothing where it has none.
-    pub(super) fn normalized(mut self) -> Option<Transform> {
+    /// Returns the transform with a normalized rotation; `None` if that is impossible.
+    pub(super) fn normalize(mut self) -> Option<Transform> {
         let length = self
             .rotation
             .iter()
@@ -89,23 +89,23 @@ mod tests {
     };
 
     #[track_caller]
-    fn same(one: &Transform, other: &Transform) {
+    fn assert_close(one: &Transform, other: &Transform) {
         let (metres, radians) = one.distance(other);
         assert!(metres < 1e-9 && radians < 1e-6, "{one:?} {other:?}");
     }
 
     #[test]
     fn transforms_are_chained_and_undone() {
-        let twice = TURN.after(&TURN);
-        same(
+        let twice = TURN.compose(&TURN);
+        assert_close(
             &twice,
             &Transform {
                 translation: [1.0, 1.0, 0.0],
                 rotation: [0.0, 0.0, 1.0, 0.0],
             },
         );
-        same(&twice.after(&twice.inverse()), &Transform::IDENTITY);
-        same(&TURN.inverse().after(&TURN), &Transform::IDENTITY);
+        assert_close(&twice.compose(&twice.inverse()), &Transform::IDENTITY);
+        assert_close(&TURN.inverse().compose(&TURN), &Transform::IDENTITY);
     }
 
     #[test]
@@ -121,16 +121,16 @@ mod tests {
             rotation: [0.0; 4],
             ..TURN
         };
-        assert_eq!(flat.normalized(), None);
+        assert_eq!(flat.normalize(), None);
         let far = Transform {
             translation: [f64::NAN, 0.0, 0.0],
             ..TURN
         };
-        assert_eq!(far.normalized(), None);
+        assert_eq!(far.normalize(), None);
         let long = Transform {
             rotation: [0.0, 0.0, 0.0, 7.0],
             ..TURN
         };
-        assert_eq!(long.normalized().unwrap().rotation, [0.0, 0.0, 0.0, 1.0]);
+        assert_eq!(long.normalize().unwrap().rotation, [0.0, 0.0, 0.0, 1.0]);
     }
 }

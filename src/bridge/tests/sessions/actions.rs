@@ -1,4 +1,4 @@
-//! Actions both ways.
+//! Actions in both directions.
 
 use bridge::{BridgeOptions, SessionOptions};
 use serde_json::{Value, json};
@@ -24,10 +24,11 @@ pub(super) async fn serve(client: &mut Client) {
 }
 
 fn goal(id: &str, args: Value) -> Value {
-    json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": COUNT, "args": args, "feedback": true})
+    json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": COUNT, "args": args,
+        "feedback": true})
 }
 
-/// A client that is an action server and one that uses it, each behind a bridge of its own or both behind one.
+/// Pairs of a client that serves an action and one that uses it, behind one bridge or two.
 async fn pairs(world: &World) -> Vec<(Client, Client)> {
     let other = world.another_bridge().await;
     vec![
@@ -61,11 +62,13 @@ async fn a_goal_goes_with_feedback_to_its_result() {
             user.json().await,
             json!({"op": "action_feedback", "id": "g", "action": "/count", "values": {"at": 2}})
         );
-        let result = json!({"op": "action_result", "id": id, "action": "/count", "values": {"all": [1, 2, 3]}, "status": 4, "result": true});
+        let result = json!({"op": "action_result", "id": id, "action": "/count", "values": {"all": [1, 2, 3]},
+            "status": 4, "result": true});
         server.send(result.clone()).await;
         assert_eq!(
             user.json().await,
-            json!({"op": "action_result", "id": "g", "action": "/count", "values": {"all": [1, 2, 3]}, "status": 4, "result": true})
+            json!({"op": "action_result", "id": "g", "action": "/count", "values": {"all": [1, 2, 3]}, "status": 4,
+                "result": true})
         );
         server.send(result).await;
         assert!(server.refusal().await.contains("has no goal with id"));
@@ -82,7 +85,7 @@ async fn a_goal_goes_with_feedback_to_its_result() {
         );
         assert_eq!(answer.get("text"), None, "{answer}");
 
-        // It fails and says why, or how far it has come.
+        // A failure with its reason, or with a partial result.
         for (values, text, all) in [
             (
                 json!("no more fingers"),
@@ -93,7 +96,8 @@ async fn a_goal_goes_with_feedback_to_its_result() {
         ] {
             user.send(goal("why", json!([5]))).await;
             let asked = server.json().await;
-            server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": values, "result": false})).await;
+            server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": values,
+                "result": false})).await;
             let answer = user.json().await;
             assert_eq!(
                 (&answer["id"], &answer["status"]),
@@ -102,7 +106,7 @@ async fn a_goal_goes_with_feedback_to_its_result() {
             assert_eq!((&answer["text"], &answer["values"]["all"]), (&text, &all));
         }
 
-        // What it says cannot be understood.
+        // An answer that cannot be parsed.
         user.send(goal("lost", json!([5]))).await;
         let asked = server.json().await;
         server
@@ -119,7 +123,7 @@ async fn a_goal_goes_with_feedback_to_its_result() {
         let text = answer["text"].as_str().unwrap();
         assert!(text.contains("\"result\" is missing"), "{text}");
 
-        // It is cancelled.
+        // The goal is cancelled.
         user.send(goal("i", json!({"to": 9}))).await;
         let asked = server.json().await;
         user.send(goal("i", json!({"to": 9}))).await;
@@ -134,10 +138,11 @@ async fn a_goal_goes_with_feedback_to_its_result() {
             cancel,
             json!({"op": "cancel_action_goal", "id": asked["id"], "action": "/count"})
         );
-        server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {}, "status": 5, "result": true})).await;
+        server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {}, "status": 5,
+            "result": true})).await;
         assert_eq!(user.json().await["status"], 5);
 
-        // The server goes in the middle.
+        // The server leaves in the middle.
         user.send(goal("j", json!({"to": 9}))).await;
         server.json().await;
         server
@@ -158,7 +163,7 @@ async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
         action_timeout: std::time::Duration::from_millis(50),
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     let mut user = world.client().await;
     user.send(goal("g", json!({"to": 3}))).await;
     let answer = user.json().await;
@@ -172,7 +177,7 @@ async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
     );
     user.send(goal("g", json!({"from": 3}))).await;
     let answer = user.json().await;
-    let goal_type = world.either("x_msgs/CountGoal", "x_msgs/action/Count_Goal");
+    let goal_type = world.by_version("x_msgs/CountGoal", "x_msgs/action/Count_Goal");
     assert_eq!(
         answer["values"],
         format!("field from of {goal_type}: there is no such field")
@@ -205,16 +210,19 @@ async fn goals_that_cannot_be_sent_are_answered_with_the_reason() {
 #[tokio::test]
 async fn a_goal_of_another_type_is_answered_at_once_with_both() {
     let world = World::new().await;
-    let dig = |id: &str| json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Dig", "args": {"to": 3}});
+    let dig = |id: &str| {
+        json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Dig",
+        "args": {"to": 3}})
+    };
     let expected = format!(
         "action /count has type {}, not {}; use the type that it has",
         world.full_name(COUNT, "action"),
         world.full_name("x_msgs/Dig", "action")
     );
     for (mut server, mut user) in pairs(&world).await {
-        // One waits for a server, and one comes when it is there.
+        // One goal waits for a server, and one is sent when it is available.
         user.send(dig("early")).await;
-        user.settled().await;
+        user.sync().await;
         serve(&mut server).await;
         for id in ["early", "late"] {
             if id == "late" {
@@ -226,7 +234,7 @@ async fn a_goal_of_another_type_is_answered_at_once_with_both() {
                 (&json!(id), &json!(expected), &json!(false))
             );
         }
-        // And the right one gets through all the same.
+        // The right one still gets through.
         user.send(goal("right", json!({"to": 3}))).await;
         assert_eq!(server.json().await["args"], json!({"to": 3}));
         server
@@ -234,7 +242,7 @@ async fn a_goal_of_another_type_is_answered_at_once_with_both() {
             .await;
         assert_eq!(user.json().await["id"], "right");
         world
-            .in_graph(|graph| {
+            .wait_for_graph(|graph| {
                 let action = graph.actions.get("/count");
                 action.is_none_or(|action| action.servers.is_empty())
             })
@@ -252,9 +260,10 @@ async fn a_goal_that_is_cancelled_before_its_server_is_there_is_never_sent() {
         .await;
     assert_eq!(
         user.json().await,
-        json!({"op": "action_result", "id": "g", "action": "/count", "values": {"all": []}, "status": 5, "result": true})
+        json!({"op": "action_result", "id": "g", "action": "/count", "values": {"all": []}, "status": 5,
+            "result": true})
     );
-    // The server comes, and hears of the next goal only.
+    // The server appears, and receives only the next goal.
     let mut server = world.client().await;
     serve(&mut server).await;
     user.send(goal("h", json!({"to": 4}))).await;

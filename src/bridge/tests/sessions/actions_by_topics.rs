@@ -1,4 +1,4 @@
-//! Actions of ROS 1 by their topics, as clients of roslibjs use them.
+//! Actions of ROS 1 by their topics, as used by clients of roslibjs.
 
 use serde_json::{Value, json};
 
@@ -23,7 +23,8 @@ async fn the_topics_of_an_action_can_be_used_directly_too() {
     .await;
     let asked = server.json().await;
     assert_eq!(asked["args"], json!({"to": 1}));
-    server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": [1]}, "result": true})).await;
+    server.send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": [1]},
+        "result": true})).await;
     let result = user.json().await;
     assert_eq!(
         result["msg"]["status"],
@@ -54,10 +55,10 @@ async fn a_cancel_that_is_faster_than_its_goal_is_kept() {
     let id = |id: &str, secs: u32| json!({"stamp": {"secs": secs, "nsecs": 0}, "id": id});
     let publish = |topic: &str, msg: Value| json!({"op": "publish", "topic": topic, "msg": msg});
     let sent = |id: Value| publish("/count/goal", json!({"goal_id": id, "goal": {"to": 1}}));
-    // By the time up to which all are cancelled, and by its id.
+    // By the time up to which all are cancelled, and by id.
     user.send(publish("/count/cancel", id("", 5))).await;
     user.send(publish("/count/cancel", id("early", 0))).await;
-    // The server has heard of both once it lists the second.
+    // The server has received both once it lists the second.
     user.send(json!({
         "op": "subscribe", "topic": "/count/status", "type": "actionlib_msgs/GoalStatusArray",
     }))
@@ -77,7 +78,7 @@ async fn a_cancel_that_is_faster_than_its_goal_is_kept() {
             result = user.json().await;
         }
         assert_eq!(result["msg"]["status"]["goal_id"]["id"], name);
-        // Recalled: it was never begun.
+        // Recalled: it was never started.
         assert_eq!(result["msg"]["status"]["status"], 8, "{result}");
     }
     user.send(sent(id("new", 6))).await;

@@ -1,5 +1,5 @@
-//! Fields that are missing, of the wrong kind, unknown or far too long; fragments that make no sense; pictures that are
-//! bombs. All are answered by name and reason, and the connection lives.
+//! Fields that are missing, of the wrong type, unknown or far too long; fragments that make no sense; PNG bombs. All
+//! are answered with the field's name and the reason, and the connection stays open.
 
 use rosbridge::Format;
 use serde_json::{Value, json};
@@ -7,7 +7,7 @@ use tokio_tungstenite::tungstenite::Message;
 
 use super::support::{Client, World};
 
-/// A correct message of each op with all its fields, but without an id; and the fields that it means nothing without.
+/// Returns a correct message of each op with all its fields except the id; and its required fields.
 fn messages() -> Vec<(Value, &'static [&'static str])> {
     vec![
         (
@@ -45,7 +45,8 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
             &["service", "result"],
         ),
         (
-            json!({"op": "send_action_goal", "action": "/f", "action_type": "x_msgs/Count", "args": {}, "feedback": true,
+            json!({"op": "send_action_goal", "action": "/f", "action_type": "x_msgs/Count", "args": {},
+                "feedback": true,
                 "fragment_size": 1000, "compression": "none"}),
             &["action", "action_type"],
         ),
@@ -90,20 +91,20 @@ fn messages() -> Vec<(Value, &'static [&'static str])> {
     ]
 }
 
-/// Fields that hold messages: whether those fit is the type's affair.
+/// Returns whether a field contains a message, which is checked by its type.
 fn is_payload(op: &str, field: &str) -> bool {
     matches!(field, "values" | "args") || (op == "publish" && field == "msg")
 }
 
-/// The message with an id, and that field as it is there.
-fn with(message: &Value, field: &str, value: Value) -> Value {
+/// Returns the message with an id, and with this value of a field.
+fn with_field(message: &Value, field: &str, value: Value) -> Value {
     let mut changed = message.clone();
     changed["id"] = "q".into();
     changed[field] = value;
     changed
 }
 
-/// Sends it, and gives the status messages that came of it.
+/// Sends a message, and returns the status messages that answer it.
 async fn answers(client: &mut Client, message: &Value, format: Format) -> Vec<String> {
     let marker =
         json!({"op": "call_service", "id": "marker", "service": "/rosapi/get_ros_version"});
@@ -122,7 +123,7 @@ async fn answers(client: &mut Client, message: &Value, format: Format) -> Vec<St
         let heard: Value = match client.next().await {
             Message::Text(text) => serde_json::from_str(&text).unwrap(),
             Message::Binary(bytes) => {
-                // Statuses only: the marker's answer may hold what JSON has not.
+                // Statuses only: the marker's answer may contain what JSON cannot express.
                 ciborium::from_reader(&*bytes).unwrap()
             }
             other => panic!("{other:?}"),
@@ -136,8 +137,8 @@ async fn answers(client: &mut Client, message: &Value, format: Format) -> Vec<St
     }
 }
 
-/// Sends each, and checks that a status names op and field and shows no more of the value than is of use.
-async fn are_refused_by_name(cases: Vec<(Value, &str)>) {
+/// Sends each message, and checks that a status names op and field and shows only a useful part of the value.
+async fn assert_refused_by_name(cases: Vec<(Value, &str)>) {
     let world = World::new().await;
     for format in [Format::Json, Format::Cbor] {
         let mut client = world.client().await;
@@ -161,13 +162,13 @@ async fn a_field_that_is_missing_is_named() {
     let mut cases = Vec::new();
     for (message, needed) in &messages {
         for field in *needed {
-            cases.push((with(message, field, Value::Null), *field));
-            let mut lacking = with(message, field, Value::Null);
+            cases.push((with_field(message, field, Value::Null), *field));
+            let mut lacking = with_field(message, field, Value::Null);
             lacking.as_object_mut().unwrap().remove(*field);
             cases.push((lacking, field));
         }
     }
-    are_refused_by_name(cases).await;
+    assert_refused_by_name(cases).await;
 }
 
 #[tokio::test]
@@ -182,19 +183,19 @@ async fn a_field_of_another_kind_is_named() {
             .chain(["id"])
             .filter(|field| *field != "op")
         {
-            // An object is wrong for every field but those that are payloads, and a number is wrong for these. A
-            // response that fails may say anything why.
+            // An object is wrong for every field but payloads, and a number is wrong for these. The reason of a failed
+            // response may be anything.
             let wrong = match field {
                 "values" if op != "action_feedback" => continue,
                 field if is_payload(op, field) => json!(7),
-                // Of this one, too, names that mean nothing are ignored.
+                // Unknown names are ignored in this field, too.
                 "qos" => json!([{"depth": 1}]),
                 _ => json!({"x": [1, 2]}),
             };
-            cases.push((with(message, field, wrong), field));
+            cases.push((with_field(message, field, wrong), field));
         }
     }
-    are_refused_by_name(cases).await;
+    assert_refused_by_name(cases).await;
 }
 
 #[tokio::test]
@@ -214,11 +215,11 @@ async fn a_policy_that_cannot_be_meant_is_named() {
         ] {
             let mut qos = json!({});
             qos[policy] = value;
-            cases.push((with(message, "qos", qos), field));
+            cases.push((with_field(message, "qos", qos), field));
         }
     }
     assert_eq!(cases.len(), 3 * 7);
-    are_refused_by_name(cases).await;
+    assert_refused_by_name(cases).await;
 }
 
 #[tokio::test]
@@ -232,19 +233,19 @@ async fn a_number_out_of_range_is_named() {
             }
             let mut wrong = vec![json!(-1), json!(-1e300)];
             if !matches!(field.as_str(), "throttle_rate" | "timeout") {
-                // Those may have a part, and be as long as they like.
+                // These may be fractional and arbitrarily large.
                 wrong.extend([json!(0.5), json!(1e300), json!(u64::MAX)]);
             }
             if message["op"] == "auth" {
                 wrong.retain(|value| !value.is_i64());
             }
             for value in wrong {
-                cases.push((with(message, field, value), field.as_str()));
+                cases.push((with_field(message, field, value), field.as_str()));
             }
         }
     }
     assert!(cases.len() > 30, "{}", cases.len());
-    are_refused_by_name(cases).await;
+    assert_refused_by_name(cases).await;
 }
 
 #[tokio::test]
@@ -256,22 +257,28 @@ async fn a_huge_field_is_refused_and_not_repeated() {
         let op = message["op"].as_str().unwrap();
         let fields = message.as_object().unwrap();
         for (field, value) in fields {
-            // Pieces of messages may be long. What a client says of itself is no answer's business.
+            // Pieces of messages may be long. A client's own status is not answered.
             let told = !matches!(field.as_str(), "op" | "data") && op != "status";
             if told && value.is_string() {
-                cases.push((with(message, field, long.clone().into()), field.as_str()));
+                cases.push((
+                    with_field(message, field, long.clone().into()),
+                    field.as_str(),
+                ));
             }
         }
-        cases.push((with(message, "id", long.clone().into()), "id"));
+        cases.push((with_field(message, "id", long.clone().into()), "id"));
         // Instead of a number, or of a message.
         for (field, value) in fields.iter().filter(|(_, value)| !value.is_string()) {
             if op != "status" && !(field == "values" && op != "action_feedback") {
                 let _ = value;
-                cases.push((with(message, field, long.clone().into()), field.as_str()));
+                cases.push((
+                    with_field(message, field, long.clone().into()),
+                    field.as_str(),
+                ));
             }
         }
     }
-    are_refused_by_name(cases).await;
+    assert_refused_by_name(cases).await;
 }
 
 #[tokio::test]
@@ -289,13 +296,18 @@ async fn a_field_too_many_is_told_as_a_warning() {
         }
         let said = answers(
             &mut client,
-            &with(&message, "colour", "red".into()),
+            &with_field(&message, "colour", "red".into()),
             Format::Json,
         )
         .await;
         let told = format!("{op}: field \"colour\" is not known and was ignored");
         assert!(said.contains(&told), "{op}: {said:?}");
-        let said = answers(&mut client, &with(&message, &long, 1.into()), Format::Json).await;
+        let said = answers(
+            &mut client,
+            &with_field(&message, &long, 1.into()),
+            Format::Json,
+        )
+        .await;
         let told = format!("{op}: field \"{}\" is not known", &long[..48]);
         assert!(
             said.iter().any(|text| text.starts_with(&told)),
@@ -309,7 +321,10 @@ async fn fragments_that_make_no_sense_cost_only_themselves() {
     let world = World::new().await;
     let mut client = world.client().await;
     let call = r#"{"op":"call_service","id":"whole","service":"/rosapi/get_ros_version"}"#;
-    let part = |num: u64, total: u64, data: &str| json!({"op": "fragment", "id": "f", "num": num, "total": total, "data": data});
+    let part = |num: u64, total: u64, data: &str| {
+        json!({"op": "fragment", "id": "f", "num": num, "total": total,
+        "data": data})
+    };
     let (first, second) = call.split_at(20);
     // Out of order, and one of them twice.
     client.send(part(1, 2, second)).await;
@@ -334,7 +349,7 @@ async fn fragments_that_make_no_sense_cost_only_themselves() {
             .await
             .contains("the earlier fragments said")
     );
-    // Begun a thousand times and never ended: the oldest are forgotten, nothing grows.
+    // Started a thousand times and never completed: the oldest are dropped, nothing grows.
     for number in 0..1000 {
         let id = format!("never {number}");
         client
@@ -344,17 +359,17 @@ async fn fragments_that_make_no_sense_cost_only_themselves() {
     client.send(part(0, 2, first)).await;
     client.send(part(1, 2, second)).await;
     assert_eq!(client.json().await["id"], "whole");
-    // What they hold together makes no message.
+    // Together they do not form a valid message.
     client.send(part(0, 1, "{\"op\":")).await;
     assert!(client.refusal().await.contains("invalid JSON"));
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
 async fn a_picture_that_unpacks_to_gigabytes_is_refused_unread() {
     let world = World::new().await;
     let mut client = world.client().await;
-    // 2 GB of line feeds in two megabytes of base64 are not needed: the header alone says how much it would be.
+    // 2 GB of line feeds in two megabytes of base64 are not needed: the header alone announces the size.
     let small = rosbridge::encode_png(b"{}").unwrap();
     let mut file = base64_simd::STANDARD.decode_to_vec(small).unwrap();
     file[16..24].copy_from_slice(&[0, 0, 0x75, 0x30, 0, 0, 0x75, 0x30]);
@@ -367,10 +382,10 @@ async fn a_picture_that_unpacks_to_gigabytes_is_refused_unread() {
         refusal.starts_with("png: ") && refusal.contains("2700000000 bytes"),
         "{refusal}"
     );
-    client.settled().await;
+    client.sync().await;
 }
 
-/// As PNG's chunks end with it.
+/// The checksum at the end of a PNG chunk.
 fn crc32(bytes: &[u8]) -> u32 {
     !bytes.iter().fold(u32::MAX, |sum, &byte| {
         (0..8).fold(sum ^ u32::from(byte), |sum, _| {
@@ -398,5 +413,5 @@ async fn deep_nesting_is_refused_in_json_and_in_cbor() {
     client.send_binary(deep).await;
     let refusal = String::from_utf8_lossy(&client.binary().await).into_owned();
     assert!(refusal.contains("nested deeper"), "{refusal}");
-    client.settled().await;
+    client.sync().await;
 }

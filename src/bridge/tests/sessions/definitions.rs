@@ -1,4 +1,4 @@
-//! Definitions that come with messages, as publishers of ROS 1 send them.
+//! Definitions that are sent with messages, as by publishers of ROS 1.
 
 use serde_json::json;
 
@@ -17,7 +17,7 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
         &*world.node,
         "/told",
         wire_type(definition),
-        ros::bus::Qos::keep_last(1).latching(true),
+        ros::bus::QosProfile::keep_last(1).latching(true),
     )
     .await
     .unwrap();
@@ -26,13 +26,15 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
         &*world.node,
         "/mute",
         wire_type(String::new()),
-        ros::bus::Qos::keep_last(1).latching(true),
+        ros::bus::QosProfile::keep_last(1).latching(true),
     )
     .await
     .unwrap();
     mute.publish(bytes);
     world
-        .in_graph(|graph| graph.topics.contains_key("/told") && graph.topics.contains_key("/mute"))
+        .wait_for_graph(|graph| {
+            graph.topics.contains_key("/told") && graph.topics.contains_key("/mute")
+        })
         .await;
     let mut client = world.client().await;
     for topic in ["/told", "/mute"] {
@@ -52,7 +54,7 @@ async fn a_publisher_with_another_definition_is_read_by_its_own() {
             assert!(text.starts_with(&expected), "{heard}");
         }
     }
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -65,13 +67,13 @@ async fn types_that_only_the_publisher_knows_are_learnt_from_it() {
         &*world.node,
         "/new",
         wire_type,
-        ros::bus::Qos::keep_last(1).latching(true),
+        ros::bus::QosProfile::keep_last(1).latching(true),
     )
     .await
     .unwrap();
     publisher.publish(vec![1, 0, 0, 0, 1, 0, 0, 0, b'x'].into());
     world
-        .in_graph(|graph| graph.topics.contains_key("/new"))
+        .wait_for_graph(|graph| graph.topics.contains_key("/new"))
         .await;
     let mut client = world.client().await;
     client

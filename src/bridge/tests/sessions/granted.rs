@@ -1,25 +1,25 @@
-//! What a client is granted, and what happens when that changes.
+//! Grants of a client, and their changes.
 
 use std::sync::Arc;
 
-use access::{Grants, Standing};
+use access::{ConnectionAccess, Grants};
 use async_trait::async_trait;
-use bridge::{Granted, SessionEnd, SessionOptions};
+use bridge::{ClientGrants, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::watch;
 
-use super::support::{World, connected, patiently};
+use super::support::{World, wait_connected, with_timeout};
 
-fn standing(allow: &[&str]) -> Standing {
+fn standing(allow: &[&str]) -> ConnectionAccess {
     let grants = allow.iter().map(|text| text.parse().expect("a grant"));
-    Standing::Granted(Arc::new(Grants::new(grants)))
+    ConnectionAccess::Granted(Arc::new(Grants::new(grants)))
 }
 
-fn with(granted: watch::Receiver<Standing>) -> SessionOptions {
+fn options_with(granted: watch::Receiver<ConnectionAccess>) -> SessionOptions {
     SessionOptions {
-        granted: Granted::by(granted),
+        granted: ClientGrants::from_standing(granted),
         ..SessionOptions::default()
     }
 }
@@ -40,13 +40,13 @@ async fn each_operation_is_refused_that_is_not_granted() {
         .node_publishes("/text", "std_msgs/String", false)
         .await;
     let (_sender, granted) = watch::channel(standing(&["subscribe:/other"]));
-    let mut client = world.client_with(with(granted)).await;
+    let mut client = world.client_with(options_with(granted)).await;
     for (op, grant) in [
         (
             json!({"op": "subscribe", "topic": "/text"}),
             "subscribe:/text",
         ),
-        // As a relative name, too.
+        // By a relative name, too.
         (
             json!({"op": "subscribe", "topic": "text"}),
             "subscribe:/text",
@@ -125,13 +125,13 @@ async fn rosapi_tells_of_names_alone_that_its_caller_may_use() {
     let served = |name: &'static str| {
         world
             .node
-            .serve(name, ServiceType::of(&def), Arc::new(Nothing))
+            .serve(name, ServiceType::from_service(&def), Arc::new(Nothing))
     };
     let _services = (
         served("/detect").await.expect("served"),
         served("/hidden").await.expect("served"),
     );
-    // The bridge sees them: one to whom everything is granted is told of them.
+    // The bridge knows them: a client with all grants sees them.
     let mut free = world.client().await;
     for (service, names) in [
         ("topics", ["/camera/image", "/secret"]),
@@ -147,7 +147,7 @@ async fn rosapi_tells_of_names_alone_that_its_caller_may_use() {
         }
     }
     let (_sender, granted) = watch::channel(standing(&["subscribe:/camera/**", "call:/detect"]));
-    let mut client = world.client_with(with(granted)).await;
+    let mut client = world.client_with(options_with(granted)).await;
     let mut ask = async |service: &str, args: serde_json::Value| {
         let call =
             json!({"op": "call_service", "service": format!("/rosapi/{service}"), "args": args});
@@ -187,7 +187,7 @@ async fn what_is_not_granted_any_more_is_taken_back_at_once() {
         .await;
     let mut numbers = world.node_subscribes("/number", "std_msgs/Int32").await;
     let (sender, granted) = watch::channel(standing(&["*:**"]));
-    let mut client = world.client_with(with(granted)).await;
+    let mut client = world.client_with(options_with(granted)).await;
     for topic in ["/text", "/kept"] {
         client
             .send(json!({"op": "subscribe", "topic": topic}))
@@ -199,14 +199,14 @@ async fn what_is_not_granted_any_more_is_taken_back_at_once() {
     client
         .send(json!({"op": "publish", "topic": "/number", "msg": {"data": 1}}))
         .await;
-    assert!(patiently(numbers.messages.recv()).await.is_some());
-    connected(text.as_ref(), 1).await;
-    connected(kept.as_ref(), 1).await;
+    assert!(with_timeout(numbers.messages.recv()).await.is_some());
+    wait_connected(text.as_ref(), 1).await;
+    wait_connected(kept.as_ref(), 1).await;
     client
         .send(json!({"op": "advertise_service", "service": "/mine", "type": "x_msgs/Nothing"}))
         .await;
     world
-        .in_graph(|graph| graph.services.contains_key("/mine"))
+        .wait_for_graph(|graph| graph.services.contains_key("/mine"))
         .await;
     sender.send_replace(standing(&["subscribe:/kept"]));
     let mut told = Vec::new();
@@ -220,12 +220,12 @@ async fn what_is_not_granted_any_more_is_taken_back_at_once() {
         .zip(["advertise:/mine", "publish:/number", "subscribe:/text"])
     {
         assert!(
-            told.starts_with(&format!("{grant} is not granted to this client any more")),
+            told.starts_with(&format!("{grant} is no longer granted to this client")),
             "{told}"
         );
     }
     world
-        .in_graph(|graph| !graph.services.contains_key("/mine"))
+        .wait_for_graph(|graph| !graph.services.contains_key("/mine"))
         .await;
     text.publish(world.message("std_msgs/String", json!({"data": "lost"})));
     kept.publish(world.message("std_msgs/String", json!({"data": "heard"})));
@@ -247,13 +247,13 @@ async fn what_is_not_granted_any_more_is_taken_back_at_once() {
 async fn a_connection_whose_token_is_over_ends_with_the_reason() {
     let world = World::new().await;
     let (sender, granted) = watch::channel(standing(&["*:**"]));
-    let mut client = world.client_with(with(granted)).await;
+    let mut client = world.client_with(options_with(granted)).await;
     client
         .send(json!({"op": "call_service", "service": "/rosapi/get_time"}))
         .await;
     client.json().await;
-    sender.send_replace(Standing::Ended("this token was revoked".into()));
-    let closed = client.closed().await;
+    sender.send_replace(ConnectionAccess::Ended("this token was revoked".into()));
+    let closed = client.expect_close().await;
     assert_eq!(closed, (1008, "this token was revoked".to_owned()));
 }
 
@@ -262,11 +262,11 @@ async fn who_comes_back_has_what_the_new_connection_is_granted() {
     let world = World::new().await;
     let resumable = |granted| SessionOptions {
         resume: Some("secret".to_owned()),
-        ..with(granted)
+        ..options_with(granted)
     };
     let (first, granted) = watch::channel(standing(&["*:**"]));
     let client = world.client_with(resumable(granted)).await;
-    assert!(matches!(client.lose().await, SessionEnd::Lost(_)));
+    assert!(matches!(client.abort().await, SessionEnd::Lost(_)));
     drop(first);
 
     let (sender, granted) = watch::channel(standing(&["call:/rosapi/get_time"]));
@@ -281,8 +281,8 @@ async fn who_comes_back_has_what_the_new_connection_is_granted() {
             .is_some_and(|words| words.contains("not granted")),
         "{refused}"
     );
-    sender.send_replace(Standing::Ended("this token was revoked".into()));
-    let closed = client.closed().await;
+    sender.send_replace(ConnectionAccess::Ended("this token was revoked".into()));
+    let closed = client.expect_close().await;
     assert_eq!(closed, (1008, "this token was revoked".to_owned()));
 }
 
@@ -293,7 +293,7 @@ async fn a_goal_is_cancelled_with_its_grant_whether_it_has_an_id_or_not() {
         let mut server = world.client().await;
         super::actions::serve(&mut server).await;
         let (sender, granted) = watch::channel(standing(&["*:**"]));
-        let mut client = world.client_with(with(granted)).await;
+        let mut client = world.client_with(options_with(granted)).await;
         let mut goal = json!({"op": "send_action_goal", "action": "/count", "action_type": "x_msgs/Count",
                               "args": {"to": 1}});
         if let Some(id) = id {
@@ -310,7 +310,7 @@ async fn a_goal_is_cancelled_with_its_grant_whether_it_has_an_id_or_not() {
             "{id:?}"
         );
         let told = client.json().await;
-        let words = "call:/count is not granted to this client any more";
+        let words = "call:/count is no longer granted to this client";
         assert!(
             told["msg"]
                 .as_str()
@@ -326,7 +326,7 @@ async fn what_is_refused_is_told_to_whoever_records_it() {
     let (_sender, granted) = watch::channel(standing(&["subscribe:/other"]));
     let (told, mut heard) = tokio::sync::mpsc::unbounded_channel();
     let options = SessionOptions {
-        granted: Granted::by(granted).telling(move |operation| {
+        granted: ClientGrants::from_standing(granted).with_refusal_observer(move |operation| {
             let _ = told.send(operation.to_owned());
         }),
         ..SessionOptions::default()
@@ -338,7 +338,7 @@ async fn what_is_refused_is_told_to_whoever_records_it() {
     let call = json!({"op": "call_service", "service": "/nothing", "id": "c"});
     client.send(call).await;
     for operation in ["subscribe:/text", "call:/nothing"] {
-        let refused = patiently(heard.recv()).await.expect("told");
+        let refused = with_timeout(heard.recv()).await.expect("told");
         assert_eq!(refused, operation);
     }
 }

@@ -1,8 +1,9 @@
-//! What clients and nodes see of a bridge, with clients that speak WebSocket by another implementation than the bridge's:
-//! over ROS 1 (a real Master, a real node on its own bus, real TCPROS on loopback), and over a bus in memory that behaves as
-//! ROS 2 does, with its messages. Sessions over ROS 2 itself, with nodes of rclpy, are in `src/reach/tests/ros2/rosbridge.rs`.
+//! Sessions as seen by clients and nodes of a bridge, with clients that use another WebSocket implementation than the
+//! bridge: over ROS 1 (a real Master, a real node on its own bus, real TCPROS on loopback), and over an in-memory bus
+//! that behaves like ROS 2, with its messages. Sessions over ROS 2 itself, with nodes of rclpy, are in
+//! `src/reach/tests/ros2/rosbridge.rs`.
 
-// The same tests, for two ROSes.
+// The same tests, for both versions of ROS.
 #![allow(clippy::duplicate_mod)]
 
 #[path = "../../../../tests/support/memory_bus.rs"]

@@ -1,4 +1,4 @@
-//! Limits, slow clients, rubbish, goodbyes.
+//! Limits, slow clients, malformed input, closing.
 
 use std::time::Duration;
 
@@ -6,7 +6,7 @@ use bridge::{BridgeOptions, SessionEnd, refuse};
 use serde_json::json;
 use tokio_tungstenite::tungstenite::protocol::Message;
 
-use super::support::{World, connected, patient, patiently};
+use super::support::{World, patient, wait_connected, with_timeout};
 
 #[tokio::test]
 async fn rubbish_is_answered_and_the_connection_lives() {
@@ -41,10 +41,10 @@ async fn rubbish_is_answered_and_the_connection_lives() {
             .await
             .contains("nested deeper than 128 levels")
     );
-    client.settled().await;
+    client.sync().await;
     client.send_binary(vec![0xff; 100]).await;
     client.binary().await;
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -100,16 +100,16 @@ async fn the_client_hears_what_it_asked_to_hear() {
         .send(json!({"op": "set_level", "level": "none"}))
         .await;
     client.send_text("rubbish").await;
-    client.settled().await;
+    client.sync().await;
     client
         .send(json!({"op": "set_level", "level": "loud"}))
         .await;
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
 async fn a_frame_over_the_limit_closes_with_the_reason() {
-    let world = World::with(BridgeOptions {
+    let world = World::with_options(BridgeOptions {
         max_frame: 1000,
         ..patient()
     })
@@ -121,7 +121,7 @@ async fn a_frame_over_the_limit_closes_with_the_reason() {
         "a frame of 1001 bytes is over the limit of 1000"
     );
     assert_eq!(
-        client.closed().await,
+        client.expect_close().await,
         (
             1009,
             "a frame of 1001 bytes is over the limit of 1000".into()
@@ -142,7 +142,7 @@ async fn text_that_is_not_utf8_closes_with_the_reason() {
     );
     client.send_raw(Message::Frame(frame)).await.unwrap();
     assert_eq!(
-        client.closed().await,
+        client.expect_close().await,
         (1007, "a text frame is not UTF-8".into())
     );
 }
@@ -155,14 +155,14 @@ async fn a_silent_client_is_pinged_and_then_left() {
         close_timeout: Duration::from_millis(50),
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     // Never polled, so it answers no ping.
     let silent = world.client().await;
-    let end = patiently(silent.session).await.unwrap();
+    let end = with_timeout(silent.session).await.unwrap();
     let SessionEnd::Closed { code: 1001, reason } = end else {
         panic!("{end:?}")
     };
-    assert!(reason.starts_with("nothing was heard for "), "{reason}");
+    assert!(reason.starts_with("nothing was received for "), "{reason}");
 }
 
 #[tokio::test]
@@ -170,12 +170,12 @@ async fn goodbyes_are_returned() {
     let world = World::new().await;
     let mut sessions = world.bridge.sessions();
     let mut client = world.client().await;
-    patiently(sessions.wait_for(|count| count.connected == 1))
+    with_timeout(sessions.wait_for(|count| count.connected == 1))
         .await
         .unwrap();
     client.send_raw(Message::Close(None)).await.unwrap();
-    assert_eq!(client.closed().await, (1005, String::new()));
-    let end = patiently(client.session).await.unwrap();
+    assert_eq!(client.expect_close().await, (1005, String::new()));
+    let end = with_timeout(client.session).await.unwrap();
     assert_eq!(
         end,
         SessionEnd::Client {
@@ -183,7 +183,7 @@ async fn goodbyes_are_returned() {
             reason: String::new()
         }
     );
-    patiently(sessions.wait_for(|count| count.connected == 0))
+    with_timeout(sessions.wait_for(|count| count.connected == 0))
         .await
         .unwrap();
 }
@@ -192,16 +192,16 @@ async fn goodbyes_are_returned() {
 async fn when_the_servant_is_gone_every_session_is_told() {
     let world = World::new().await;
     let mut client = world.client().await;
-    client.settled().await;
+    client.sync().await;
     world.bridge.close("the servant's node has died");
     assert_eq!(client.refusal().await, "the servant's node has died");
     assert_eq!(
-        client.closed().await,
+        client.expect_close().await,
         (1012, "the servant's node has died".into())
     );
     let mut late = world.client().await;
     assert_eq!(late.refusal().await, "the servant's node has died");
-    assert_eq!(late.closed().await.0, 1012);
+    assert_eq!(late.expect_close().await.0, 1012);
 }
 
 #[tokio::test]
@@ -214,7 +214,7 @@ async fn a_connection_without_servant_is_refused_with_a_status() {
     ));
     let role = tokio_tungstenite::tungstenite::protocol::Role::Client;
     let mut socket = tokio_tungstenite::WebSocketStream::from_raw_socket(ours, role, None).await;
-    let status = patiently(futures_util::StreamExt::next(&mut socket))
+    let status = with_timeout(futures_util::StreamExt::next(&mut socket))
         .await
         .unwrap()
         .unwrap();
@@ -224,7 +224,7 @@ async fn a_connection_without_servant_is_refused_with_a_status() {
             .unwrap()
             .contains("no room for another servant")
     );
-    let Message::Close(Some(close)) = patiently(futures_util::StreamExt::next(&mut socket))
+    let Message::Close(Some(close)) = with_timeout(futures_util::StreamExt::next(&mut socket))
         .await
         .unwrap()
         .unwrap()
@@ -232,12 +232,12 @@ async fn a_connection_without_servant_is_refused_with_a_status() {
         panic!("not closed")
     };
     assert_eq!(u16::from(close.code), 1013);
-    // The close frame is answered when the client is polled on.
-    while patiently(futures_util::StreamExt::next(&mut socket))
+    // The close frame is answered when the client is polled further.
+    while with_timeout(futures_util::StreamExt::next(&mut socket))
         .await
         .is_some()
     {}
-    patiently(refusing).await.unwrap();
+    with_timeout(refusing).await.unwrap();
 }
 
 #[tokio::test]
@@ -248,7 +248,7 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
         max_encoded: 3 << 20,
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     let publisher = world
         .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
         .await;
@@ -256,12 +256,12 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
     client
         .send(json!({"op": "subscribe", "topic": "/big"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
     let bytes = |length: usize| {
         let mut message = (length as u32).to_le_bytes().to_vec();
         message.resize(4 + length, 7);
-        world.serialized(&message)
+        world.serialize(&message)
     };
     publisher.publish(bytes(1 << 20));
     let heard = client.json().await;
@@ -270,15 +270,15 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
             .as_str()
             .is_some_and(|data| data.len() > 1 << 20)
     );
-    // As base64 it is more than may be.
+    // Too large as base64.
     publisher.publish(bytes(5 << 19));
     let told = client.json().await;
     assert!(
         told["op"] == "status" && told["msg"].as_str().unwrap().contains("/big"),
         "{told}"
     );
-    // Others hold what there is for the servant.
-    let others = budget.take(budget.left()).unwrap();
+    // Others use up the servant's budget.
+    let others = budget.take(budget.available()).unwrap();
     publisher.publish(bytes(1 << 20));
     publisher.publish(bytes(10));
     let small = client.json().await;
@@ -295,8 +295,8 @@ async fn what_json_takes_counts_for_the_servant_and_is_left_out_beyond() {
             .is_some_and(|data| data.len() > 1 << 20)
     );
     drop(client);
-    patiently(async {
-        while budget.used() > 0 {
+    with_timeout(async {
+        while budget.used_bytes() > 0 {
             tokio::task::yield_now().await;
         }
     })
@@ -318,9 +318,9 @@ async fn fragments_that_do_not_fit_close_the_connection() {
     }
     let reason = client.refusal().await;
     assert!(reason.contains("the memory for client x"), "{reason}");
-    assert_eq!(client.closed().await.0, 1013);
-    patiently(client.session).await.unwrap();
-    assert_eq!(budget.used(), 0);
+    assert_eq!(client.expect_close().await.0, 1013);
+    with_timeout(client.session).await.unwrap();
+    assert_eq!(budget.used_bytes(), 0);
 }
 
 #[tokio::test]
@@ -330,7 +330,7 @@ async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
         session_bytes: 2 << 20,
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     let publisher = world
         .node_publishes("/big", "std_msgs/UInt8MultiArray", false)
         .await;
@@ -339,9 +339,9 @@ async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
         client
             .send(json!({"op": "subscribe", "topic": "/big", "compression": "cbor-raw"}))
             .await;
-        client.settled().await;
+        client.sync().await;
     }
-    connected(publisher.as_ref(), 1).await;
+    wait_connected(publisher.as_ref(), 1).await;
     let sizes = 200_000..200_200;
     for size in sizes.clone() {
         let mut message = (size as u32).to_le_bytes().to_vec();
@@ -351,7 +351,7 @@ async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
         assert!(frame.len() > size);
     }
     let metrics = world.bridge.metrics();
-    // 5 messages of 200 kB wait for the slow client, one is in its socket.
+    // 5 messages of 200 kB are queued for the slow client, one is in its socket.
     assert!(metrics.dropped.get() >= 190, "{}", metrics.dropped.get());
     assert!(metrics.dropped_bytes.get() >= 190 * 200_000);
     let mut last = 0;
@@ -359,7 +359,7 @@ async fn a_client_that_does_not_read_costs_bounded_memory_and_delays_nobody() {
         last = slow.binary().await.len();
     }
     assert!(last > sizes.end - 1, "the newest wins");
-    slow.settled().await;
+    slow.sync().await;
 }
 
 #[tokio::test]
@@ -402,21 +402,21 @@ async fn ten_thousand_subscriptions_are_too_many() {
         }
     }
     for client in [&mut broad, &mut deep] {
-        client.settled().await;
+        client.sync().await;
     }
-    // No more of them have reached ROS; and who gives one up may have another.
+    // No more of them have reached ROS; a client that gives one up may have another.
     let named = |graph: &ros::bus::Graph| {
         let topics = graph.topics.keys().filter(|topic| topic.starts_with("/t"));
         topics.count()
     };
-    world.in_graph(|graph| named(graph) == 1001).await;
+    world.wait_for_graph(|graph| named(graph) == 1001).await;
     broad
         .send(json!({"op": "unsubscribe", "topic": "/t0"}))
         .await;
     broad
         .send(json!({"op": "subscribe", "topic": "/other", "type": "std_msgs/String"}))
         .await;
-    broad.settled().await;
+    broad.sync().await;
 }
 
 #[tokio::test]
@@ -426,12 +426,12 @@ async fn answers_in_fragments_wait_in_the_queue_that_is_bounded() {
         close_timeout: Duration::from_secs(60),
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     let mut client = world.client().await;
     let call = json!({"op": "call_service", "service": "/rosapi/message_details",
         "args": {"type": "x_msgs/Place"}, "fragment_size": 10});
     let mut asked = 0;
-    // It reads two thousand fragments, some twenty answers, for every ninety that it asks for.
+    // It reads two thousand fragments, some twenty answers, for every ninety calls.
     'open: while asked < 2000 {
         for _ in 0..90 {
             // A connection that is being closed may be gone already.
@@ -444,7 +444,7 @@ async fn answers_in_fragments_wait_in_the_queue_that_is_bounded() {
                 tokio::task::yield_now().await;
             }
         };
-        // Once it is being closed nothing more is taken.
+        // Once it is being closed nothing more is read.
         let _ = tokio::time::timeout(Duration::from_millis(200), taken).await;
         for _ in 0..2000 {
             if let Message::Close(_) = client.next().await {
@@ -453,7 +453,7 @@ async fn answers_in_fragments_wait_in_the_queue_that_is_bounded() {
         }
     }
     assert!(asked < 2000, "{asked} answers are kept");
-    let end = client.lose().await;
+    let end = client.abort().await;
     assert!(
         matches!(end, SessionEnd::Closed { code: 1008, .. }),
         "{end:?}"

@@ -1,4 +1,4 @@
-//! What waits for clients that do not read counts in budgets until it is written.
+//! Data queued for clients that do not read counts in budgets until it is written.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,11 +10,11 @@ use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::{Value, json};
 
-use super::support::{Client, World, connected, patient, patiently};
+use super::support::{Client, World, patient, wait_connected, with_timeout};
 
 const MIB: usize = 1 << 20;
 
-/// The daemon's budget, a servant's and a client's.
+/// Budgets of the daemon, a servant and a client.
 struct Budgets {
     daemon: Budget,
     servant: Budget,
@@ -25,14 +25,14 @@ impl Budgets {
     fn new(client: usize) -> Self {
         let daemon = Budget::new("the daemon", 64 * MIB);
         Self {
-            servant: daemon.within("servant x", 32 * MIB),
-            client: daemon.within("client x", client),
+            servant: daemon.child("servant x", 32 * MIB),
+            client: daemon.child("client x", client),
             daemon,
         }
     }
 
     async fn world(&self) -> World {
-        World::with(BridgeOptions {
+        World::with_options(BridgeOptions {
             budget: self.servant.clone(),
             ..patient()
         })
@@ -47,15 +47,18 @@ impl Budgets {
         world.client_with(options).await
     }
 
-    async fn are_empty(&self) {
-        until(|| self.daemon.used() == 0).await;
-        assert_eq!((self.client.used(), self.servant.used()), (0, 0));
+    async fn assert_empty(&self) {
+        wait_until(|| self.daemon.used_bytes() == 0).await;
+        assert_eq!(
+            (self.client.used_bytes(), self.servant.used_bytes()),
+            (0, 0)
+        );
     }
 }
 
-/// There is no event for what a budget counts.
-async fn until(condition: impl Fn() -> bool) {
-    patiently(async {
+/// Polls, since budgets have no events.
+async fn wait_until(condition: impl Fn() -> bool) {
+    with_timeout(async {
         while !condition() {
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
@@ -66,20 +69,20 @@ async fn until(condition: impl Fn() -> bool) {
 fn bytes(world: &World, length: usize) -> Bytes {
     let mut message = (length as u32).to_le_bytes().to_vec();
     message.resize(4 + length, 7);
-    world.serialized(&message)
+    world.serialize(&message)
 }
 
 fn length(message: &Value) -> usize {
     message["msg"]["data"].as_str().map_or(0, str::len)
 }
 
-async fn subscribed(client: &mut Client, fragment_size: Option<usize>) {
+async fn subscribe_big(client: &mut Client, fragment_size: Option<usize>) {
     let mut subscribe = json!({"op": "subscribe", "topic": "/big"});
     if let Some(size) = fragment_size {
         subscribe["fragment_size"] = size.into();
     }
     client.send(subscribe).await;
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -91,13 +94,13 @@ async fn a_message_counts_for_its_client_until_it_is_read() {
         .await;
     for fragment_size in [None, Some(10_000), Some(MIB)] {
         let mut client = budgets.client(&world).await;
-        subscribed(&mut client, fragment_size).await;
-        connected(publisher.as_ref(), 1).await;
+        subscribe_big(&mut client, fragment_size).await;
+        wait_connected(publisher.as_ref(), 1).await;
         publisher.publish(bytes(&world, 2 * MIB));
-        until(|| budgets.client.used() > 2 * MIB).await;
-        // What the servant's budget counted while it was encoded is not what it lacks for others.
-        until(|| budgets.servant.used() == 0).await;
-        assert!(budgets.daemon.used() > 2 * MIB);
+        wait_until(|| budgets.client.used_bytes() > 2 * MIB).await;
+        // The servant's budget only counted the message while it was being encoded.
+        wait_until(|| budgets.servant.used_bytes() == 0).await;
+        assert!(budgets.daemon.used_bytes() > 2 * MIB);
         match fragment_size {
             None => assert!(length(&client.json().await) > 2 * MIB),
             Some(_) => loop {
@@ -108,8 +111,8 @@ async fn a_message_counts_for_its_client_until_it_is_read() {
                 }
             },
         }
-        client.settled().await;
-        budgets.are_empty().await;
+        client.sync().await;
+        budgets.assert_empty().await;
     }
 }
 
@@ -126,16 +129,17 @@ async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() 
     }
     let mut quick = world.client().await;
     for client in slow.iter_mut().chain([&mut quick]) {
-        subscribed(client, None).await;
+        subscribe_big(client, None).await;
     }
-    connected(publisher.as_ref(), 1).await;
+    wait_connected(publisher.as_ref(), 1).await;
     publisher.publish(bytes(&world, 2 * MIB));
     assert!(length(&quick.json().await) > 2 * MIB);
-    // Base64 makes 2.7 MiB of it: there is room for two. The others' were dropped from their queue, or left out.
-    until(|| budgets.client.refused() >= 4).await;
-    assert!(budgets.client.used() <= 8 * MIB);
-    // Who has it holds the same bytes.
-    until(|| budgets.daemon.used() < 3 * MIB).await;
+    // In base64 it is 2.7 MiB: there is room for two. Messages of the others were dropped, from their queue or before
+    // it.
+    wait_until(|| budgets.client.refusal_count() >= 4).await;
+    assert!(budgets.client.used_bytes() <= 8 * MIB);
+    // Clients that have it hold the same bytes.
+    wait_until(|| budgets.daemon.used_bytes() < 3 * MIB).await;
     let mut whole = 0;
     for client in &mut slow {
         let call = json!({"op": "call_service", "id": "end", "service": "/rosapi/get_ros_version"});
@@ -153,7 +157,7 @@ async fn connections_that_read_nothing_hold_no_more_than_their_clients_budget() 
         }
     }
     assert!((1..=2).contains(&whole), "{whole}");
-    budgets.are_empty().await;
+    budgets.assert_empty().await;
 }
 
 #[tokio::test]
@@ -168,9 +172,9 @@ async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budge
         client
             .send(json!({"op": "subscribe", "topic": "/big", "compression": "cbor-raw"}))
             .await;
-        client.settled().await;
+        client.sync().await;
     }
-    connected(publisher.as_ref(), 1).await;
+    wait_connected(publisher.as_ref(), 1).await;
     // Some count for the daemon by themselves, some do not.
     let mut newest = 0;
     for size in (0..200).map(|number| 10_000 + number + number % 2 * 100_000) {
@@ -178,16 +182,16 @@ async fn messages_that_wait_for_a_client_give_way_to_each_other_within_its_budge
         newest = quick.binary().await.len();
         assert!(newest > size);
     }
-    assert!(budgets.client.used() > MIB);
+    assert!(budgets.client.used_bytes() > MIB);
     assert!(world.bridge.metrics().dropped.get() > 0);
-    assert!(budgets.client.used() <= 2 * MIB);
-    // The newest is among those that stayed.
+    assert!(budgets.client.used_bytes() <= 2 * MIB);
+    // The newest is among those that were kept.
     while slow.next().await.into_data().len() < newest {}
-    slow.settled().await;
-    budgets.are_empty().await;
+    slow.sync().await;
+    budgets.assert_empty().await;
 }
 
-/// Always says the same.
+/// A service with a constant answer.
 struct Says(Bytes);
 
 #[async_trait]
@@ -199,7 +203,8 @@ impl ServiceHandler for Says {
 
 #[tokio::test]
 async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
-    // Answers that count by themselves, and those that count together: some are in the pipe, some fit, then one does not.
+    // Answers that count by themselves, and those that count together: some are in the pipe, some fit, then one does
+    // not.
     for (size, calls) in [(200_000, 8), (30_000, 40)] {
         let budgets = Budgets::new(300_000);
         let world = budgets.world().await;
@@ -207,22 +212,22 @@ async fn who_asks_and_does_not_read_the_answers_loses_the_connection() {
         let words = json!({"words": "x".repeat(size)});
         let say = world.registry.service("x_msgs/Say").unwrap();
         let words = world.message(say.response.name(), words);
-        let of = ServiceType::of(&say);
+        let of = ServiceType::from_service(&say);
         let served = world.node.serve("/long", of, Arc::new(Says(words)));
         let _served = served.await.unwrap();
         world
-            .in_graph(|graph| graph.services.contains_key("/long"))
+            .wait_for_graph(|graph| graph.services.contains_key("/long"))
             .await;
         for _ in 0..calls {
             client
                 .send(json!({"op": "call_service", "service": "/long"}))
                 .await;
         }
-        until(|| budgets.client.refused() > 0).await;
-        let (code, reason) = client.closed().await;
+        wait_until(|| budgets.client.refusal_count() > 0).await;
+        let (code, reason) = client.expect_close().await;
         assert_eq!(code, 1013, "{reason}");
         assert!(reason.contains("the memory for client x"), "{reason}");
-        patiently(client.session).await.unwrap();
-        budgets.are_empty().await;
+        with_timeout(client.session).await.unwrap();
+        budgets.assert_empty().await;
     }
 }

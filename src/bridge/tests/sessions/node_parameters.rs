@@ -1,4 +1,4 @@
-//! Parameters that belong to nodes, as ROS 2 has them.
+//! Parameters that belong to nodes, as in ROS 2.
 
 use ros::bus::{Bus, ParamValue};
 use serde_json::{Value, json};
@@ -6,8 +6,8 @@ use serde_json::{Value, json};
 use super::rosapi::ask;
 use super::support::World;
 
-/// The node has these parameters.
-async fn declares(world: &World, parameters: &[(&str, ParamValue)]) {
+/// Sets parameters of the node.
+async fn declare(world: &World, parameters: &[(&str, ParamValue)]) {
     let changes = parameters.iter();
     let changes = changes.map(|(name, value)| ((*name).to_owned(), Some(value.clone())));
     let node = Bus::node_parameters(&*world.node).unwrap();
@@ -15,7 +15,7 @@ async fn declares(world: &World, parameters: &[(&str, ParamValue)]) {
     assert!(done.iter().all(Result::is_ok), "{done:?}");
 }
 
-fn parsed(answer: &Value) -> Value {
+fn parse_value(answer: &Value) -> Value {
     serde_json::from_str(answer["value"].as_str().unwrap()).unwrap()
 }
 
@@ -23,7 +23,7 @@ fn parsed(answer: &Value) -> Value {
 async fn parameters_are_those_of_nodes() {
     let world = World::new().await;
     let exposures = ParamValue::List(vec![ParamValue::Int(1), ParamValue::Int(2)]);
-    declares(
+    declare(
         &world,
         &[
             ("rate", ParamValue::Double(1.5)),
@@ -35,12 +35,12 @@ async fn parameters_are_those_of_nodes() {
     let mut client = world.client().await;
     for (name, value) in [
         ("/node:rate", json!(1.5)),
-        // As ROS 2's tools take it.
+        // In the format of ROS 2's tools.
         ("node:camera.exposures", json!([1, 2])),
         ("/node:frame", json!("map")),
     ] {
         let got = ask(&mut client, "get_param", json!({"name": name})).await;
-        assert_eq!(parsed(&got), value);
+        assert_eq!(parse_value(&got), value);
         assert_eq!(
             (&got["successful"], &got["reason"]),
             (&json!(true), &json!(""))
@@ -53,7 +53,7 @@ async fn parameters_are_those_of_nodes() {
         names,
         json!({"names": ["/node:camera.exposures", "/node:frame", "/node:rate"]})
     );
-    // JavaScript writes 5.0 so.
+    // JavaScript writes 5.0 like this.
     let set = json!({"name": "/node:rate", "value": "5"});
     let done = json!({"successful": true, "reason": ""});
     assert_eq!(ask(&mut client, "set_param", set).await, done);
@@ -70,13 +70,13 @@ async fn parameters_are_those_of_nodes() {
 #[tokio::test]
 async fn what_is_not_there_is_said_and_has_its_default() {
     let world = World::new().await;
-    declares(&world, &[("rate", ParamValue::Int(1))]).await;
+    declare(&world, &[("rate", ParamValue::Int(1))]).await;
     let mut client = world.client().await;
     for (name, reason) in [
         ("/node:none", "node /node has no parameter none"),
         (
             "/gone:rate",
-            "there is no node /gone; /rosapi/nodes lists those that are",
+            "there is no node /gone; /rosapi/nodes lists the existing ones",
         ),
     ] {
         let got = ask(&mut client, "get_param", json!({"name": name})).await;
@@ -96,7 +96,7 @@ async fn what_is_not_there_is_said_and_has_its_default() {
 #[tokio::test]
 async fn what_cannot_be_done_with_a_parameter_is_answered_with_the_reason() {
     let world = World::new().await;
-    declares(&world, &[("rate", ParamValue::Int(1))]).await;
+    declare(&world, &[("rate", ParamValue::Int(1))]).await;
     let mut client = world.client().await;
     for (service, args, reason) in [
         (
@@ -127,7 +127,7 @@ async fn what_cannot_be_done_with_a_parameter_is_answered_with_the_reason() {
         (
             "search_param",
             json!({"name": "rate"}),
-            "global parameters are not offered by this ROS",
+            "global parameters are not offered by this version of ROS",
         ),
     ] {
         client

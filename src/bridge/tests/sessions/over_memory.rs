@@ -1,4 +1,4 @@
-//! Sessions over a bus of ROS 2, in memory.
+//! Sessions over an in-memory bus of ROS 2.
 
 #[path = "actions.rs"]
 mod actions;

@@ -1,4 +1,4 @@
-//! Parameters that all nodes share, as ROS 1 has them.
+//! Parameters shared by all nodes, as in ROS 1.
 
 use bridge::SessionOptions;
 use budget::Budget;
@@ -64,8 +64,8 @@ async fn parameters_are_set_found_and_deleted() {
     );
 }
 
-/// What a client is told that calls a service of rosapi in vain.
-async fn refused(client: &mut Client, service: &str, args: Value) -> String {
+/// Returns the error of a failed call of a rosapi service.
+async fn call_refused(client: &mut Client, service: &str, args: Value) -> String {
     let service = format!("/rosapi/{service}");
     let call = json!({"op": "call_service", "service": service, "args": args});
     client.send(call).await;
@@ -83,16 +83,16 @@ async fn what_a_parameter_becomes_counts_in_the_clients_budget() {
         ..SessionOptions::default()
     };
     let mut client = world.client_with(options).await;
-    // A hundred kilobytes that take megabytes.
+    // A hundred kilobytes that take megabytes when parsed.
     let maps = |count: usize| format!("[{}1]", r#"{"a":1},"#.repeat(count));
     let set = json!({"name": "/p", "value": maps(10_000)});
     assert_eq!(ask(&mut client, "set_param", set).await, json!({}));
     // A megabyte that would take a hundred of them.
     let set = json!({"name": "/p", "value": maps(120_000)});
-    let words = refused(&mut client, "set_param", set).await;
+    let words = call_refused(&mut client, "set_param", set).await;
     assert!(words.contains("the memory for client x"), "{words}");
     let get = json!({"name": "/none", "default": "1".repeat(2 << 20)});
-    let words = refused(&mut client, "get_param", get).await;
+    let words = call_refused(&mut client, "get_param", get).await;
     assert!(words.contains("at most 1048576 are taken"), "{words}");
     assert_eq!(
         ask(&mut client, "has_param", json!({"name": "/p"})).await,

@@ -3,7 +3,7 @@
 use rosbridge::{Compression, Format, Op, Publish};
 use serde_json::{Value, json};
 
-use super::support::{World, patiently};
+use super::support::{World, with_timeout};
 
 #[tokio::test]
 async fn what_is_published_right_behind_advertise_arrives() {
@@ -21,9 +21,9 @@ async fn what_is_published_right_behind_advertise_arrives() {
     client
         .send(json!({"op": "unadvertise", "topic": "/text"}))
         .await;
-    client.lose().await;
+    client.abort().await;
     for number in 0..20 {
-        let message = patiently(heard.messages.recv()).await.unwrap();
+        let message = with_timeout(heard.messages.recv()).await.unwrap();
         assert_eq!(
             world.json("std_msgs/String", &message.bytes),
             json!({"data": format!("{number}")})
@@ -42,25 +42,25 @@ async fn missing_fields_are_filled_and_missing_stamps_are_now() {
     client
         .send(json!({"op": "publish", "topic": "/place", "msg": {"x": 2}}))
         .await;
-    let message = patiently(heard.messages.recv()).await.unwrap();
+    let message = with_timeout(heard.messages.recv()).await.unwrap();
     let value = world.json("x_msgs/Place", &message.bytes);
     assert_eq!(
         (&value["x"], &value["near"], &value["tags"]),
         (&json!(2.0), &json!([]), &json!([]))
     );
     assert!(world.seconds(&value["header"]["stamp"]) > 1_500_000_000);
-    // Who wants to know is told.
+    // Clients that want to know are told.
     client
         .send(json!({"op": "set_level", "level": "warning"}))
         .await;
     client
         .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": {"x": 2, "near": []}}))
         .await;
-    // The header is the server's affair, as the protocol says.
+    // The header is the server's responsibility, according to the protocol.
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "p", "level": "warning",
-            "msg": "publish: topic /place: defaults stand for \"tags\""})
+            "msg": "publish: topic /place: using defaults for \"tags\""})
     );
 }
 
@@ -69,14 +69,14 @@ async fn without_advertise_the_type_is_the_topics() {
     let world = World::new().await;
     let mut heard = world.node_subscribes("/text", "std_msgs/String").await;
     world
-        .in_graph(|graph| graph.topics.contains_key("/text"))
+        .wait_for_graph(|graph| graph.topics.contains_key("/text"))
         .await;
     let mut client = world.client().await;
-    client.settled().await;
+    client.sync().await;
     client
         .send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}}))
         .await;
-    let message = patiently(heard.messages.recv()).await.unwrap();
+    let message = with_timeout(heard.messages.recv()).await.unwrap();
     assert_eq!(
         message.bytes,
         world.message("std_msgs/String", json!({"data": "x"}))
@@ -128,18 +128,18 @@ async fn ros_bytes_pass_through_untouched_and_are_checked() {
     };
     client.send_binary(frame(&message)).await;
     assert_eq!(
-        patiently(heard.messages.recv()).await.unwrap().bytes,
+        with_timeout(heard.messages.recv()).await.unwrap().bytes,
         message
     );
     client.send_binary(frame(&message[..1000])).await;
     let status = client.binary().await;
-    let Op::Status(status) = Op::parse(rosbridge::Frame::Binary(&status)).unwrap() else {
+    let Op::Status(status) = Op::parse(rosbridge::ProtocolFrame::Binary(&status)).unwrap() else {
         panic!("{status:?}")
     };
     assert_eq!(status.id, Some("p1".into()));
     let expected = format!(
         "publish: topic /bytes: field data of {}: ",
-        world.spelled("std_msgs/UInt8MultiArray")
+        world.message_name("std_msgs/UInt8MultiArray")
     );
     assert!(status.msg.starts_with(&expected), "{}", status.msg);
     client
@@ -159,12 +159,12 @@ async fn a_client_latches_for_nodes_and_clients_that_come_later() {
         json!({"qos": {"durability": "transient_local"}}),
         json!({"qos": {"durability": 1, "depth": 1, "reliability": 1, "history": 1}}),
     ] {
-        latches(words).await;
+        assert_latches(words).await;
     }
 }
 
-/// A client that advertises in these words latches.
-async fn latches(words: Value) {
+/// Asserts that a client that advertises with these fields latches.
+async fn assert_latches(words: Value) {
     let world = World::new().await;
     let mut client = world.client().await;
     let mut advertise = json!({"op": "advertise", "topic": "/map", "type": "std_msgs/Int32"});
@@ -175,24 +175,24 @@ async fn latches(words: Value) {
     client
         .send(json!({"op": "publish", "topic": "/map", "msg": {"data": 42}}))
         .await;
-    client.settled().await;
+    client.sync().await;
     let mut late = world.client().await;
     late.send(json!({"op": "subscribe", "topic": "/map"})).await;
     assert_eq!(late.json().await["msg"], json!({"data": 42}));
     let mut heard = world.node_subscribes("/map", "std_msgs/Int32").await;
     assert_eq!(
-        patiently(heard.messages.recv()).await.unwrap().bytes,
-        world.serialized(&[42, 0, 0, 0])
+        with_timeout(heard.messages.recv()).await.unwrap().bytes,
+        world.serialize(&[42, 0, 0, 0])
     );
     client
         .send(json!({"op": "unadvertise", "topic": "/map"}))
         .await;
-    client.settled().await;
+    client.sync().await;
     let mut later = world.client().await;
     later
         .send(json!({"op": "subscribe", "topic": "/map", "type": "std_msgs/Int32"}))
         .await;
-    later.settled().await;
+    later.sync().await;
 }
 
 #[tokio::test]
@@ -200,10 +200,10 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
     let world = World::new().await;
     let _heard = world.node_subscribes("/text", "std_msgs/String").await;
     world
-        .in_graph(|graph| graph.topics.contains_key("/text"))
+        .wait_for_graph(|graph| graph.topics.contains_key("/text"))
         .await;
     let mut client = world.client().await;
-    client.settled().await;
+    client.sync().await;
     client
         .send(json!({"op": "advertise", "topic": "/place", "type": "x_msgs/Place"}))
         .await;
@@ -217,7 +217,7 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
             .send(json!({"op": "publish", "id": "p", "topic": "/place", "msg": msg}))
             .await;
         let text = client.refusal().await;
-        let of = world.spelled("x_msgs/Place");
+        let of = world.message_name("x_msgs/Place");
         let expected = format!("publish: topic /place: field {field} of {of}: ");
         assert!(text.starts_with(&expected), "{text}");
     }
@@ -227,8 +227,9 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
     assert_eq!(
         client.refusal().await,
         format!(
-            "advertise: topic /lost: no definition of {} is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too",
-            world.spelled("x_msgs/Lost")
+            "advertise: topic /lost: no definition of {} is known here; the deployer of this service can add it: \
+                cloudroidctl push … of a workspace that also has x_msgs",
+            world.message_name("x_msgs/Lost")
         )
     );
     client
@@ -238,8 +239,8 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
         client.refusal().await,
         format!(
             "advertise: topic /text has type {}, not {}; use the type that it has",
-            world.spelled("std_msgs/String"),
-            world.spelled("std_msgs/Int32")
+            world.message_name("std_msgs/String"),
+            world.message_name("std_msgs/Int32")
         )
     );
     client
@@ -258,7 +259,7 @@ async fn what_does_not_fit_is_refused_by_field_and_the_connection_lives() {
             .await
             .starts_with("publish: topic /place: ")
     );
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -272,11 +273,11 @@ async fn a_message_that_is_left_out_is_one_of_defaults() {
     client
         .send(json!({"op": "publish", "topic": "/place"}))
         .await;
-    let message = patiently(heard.messages.recv()).await.unwrap();
+    let message = with_timeout(heard.messages.recv()).await.unwrap();
     let value = world.json("x_msgs/Place", &message.bytes);
     assert_eq!((&value["x"], &value["tags"]), (&json!(0.0), &json!([])));
     assert!(world.seconds(&value["header"]["stamp"]) > 1_500_000_000);
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -296,11 +297,11 @@ async fn stamps_may_be_written_as_in_either_ros() {
         client
             .send(json!({"op": "publish", "topic": "/place", "msg": {"header": header}}))
             .await;
-        let message = patiently(heard.messages.recv()).await.unwrap();
+        let message = with_timeout(heard.messages.recv()).await.unwrap();
         let value = world.json("x_msgs/Place", &message.bytes);
         assert_eq!(value["header"]["stamp"], world.time(5, 6));
     }
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -320,20 +321,20 @@ async fn a_topic_stays_until_its_last_advertisement_is_taken_back() {
     client.send(unadvertise("other")).await;
     assert_eq!(
         client.json().await["msg"],
-        "unadvertise: no advertisement with this id is there of /text"
+        "unadvertise: there is no advertisement with this id of /text"
     );
     client.send(unadvertise("one")).await;
     client
         .send(json!({"op": "publish", "topic": "/text", "msg": {"data": "x"}}))
         .await;
-    patiently(heard.messages.recv()).await.unwrap();
-    client.settled().await;
+    with_timeout(heard.messages.recv()).await.unwrap();
+    client.sync().await;
     world
-        .in_graph(|graph| !graph.topics["/text"].publishers.is_empty())
+        .wait_for_graph(|graph| !graph.topics["/text"].publishers.is_empty())
         .await;
     client.send(unadvertise("two")).await;
     world
-        .in_graph(|graph| graph.topics["/text"].publishers.is_empty())
+        .wait_for_graph(|graph| graph.topics["/text"].publishers.is_empty())
         .await;
     client.send(unadvertise("two")).await;
     assert_eq!(
@@ -341,20 +342,20 @@ async fn a_topic_stays_until_its_last_advertisement_is_taken_back() {
         "unadvertise: this client does not advertise /text"
     );
 
-    // Without an id all of them are meant.
+    // Without an id, all of them are meant.
     for id in ["one", "two"] {
         client
             .send(json!({"op": "advertise", "id": id, "topic": "/text", "type": "std_msgs/String"}))
             .await;
     }
     world
-        .in_graph(|graph| !graph.topics["/text"].publishers.is_empty())
+        .wait_for_graph(|graph| !graph.topics["/text"].publishers.is_empty())
         .await;
     client
         .send(json!({"op": "unadvertise", "topic": "/text"}))
         .await;
     world
-        .in_graph(|graph| graph.topics["/text"].publishers.is_empty())
+        .wait_for_graph(|graph| graph.topics["/text"].publishers.is_empty())
         .await;
 }
 
@@ -365,16 +366,16 @@ async fn why_nothing_can_be_published_is_said_once() {
     client
         .send(json!({"op": "advertise", "topic": "/plan", "type": "nav_msgs/Path"}))
         .await;
-    let hint = world.either(
+    let hint = world.by_version(
         "--with ros-nav-msgs",
-        "of a workspace that has nav_msgs, too",
+        "of a workspace that also has nav_msgs",
     );
     assert_eq!(
         client.refusal().await,
         format!(
-            "advertise: topic /plan: no definition of {} is known here; \
-             whoever deploys this service can add it: cloudroidctl push … {hint}",
-            world.spelled("nav_msgs/Path")
+            "advertise: topic /plan: no definition of {} is known here; the deployer of this service can add it: \
+                cloudroidctl push … {hint}",
+            world.message_name("nav_msgs/Path")
         )
     );
     let typed = json!({"op": "publish", "topic": "/route", "type": "nav_msgs/Path", "msg": {}});
@@ -383,10 +384,10 @@ async fn why_nothing_can_be_published_is_said_once() {
         client.send(untyped.clone()).await;
         client.send(typed.clone()).await;
     }
-    // The one of the topic that was advertised has been said; of the other it is said now.
+    // The error of the topic that was advertised has been reported; the other one is reported now.
     assert!(client.refusal().await.contains(hint));
-    client.settled().await;
-    // Who asks again is told again.
+    client.sync().await;
+    // A client that asks again is told again.
     client
         .send(json!({"op": "unadvertise", "topic": "/route"}))
         .await;

@@ -1,15 +1,15 @@
-//! What clients say of the quality of service, and what comes of it where ends must match.
+//! Quality of service requested by clients, and its effect where endpoints must match.
 
-use ros::bus::{Bus, Qos};
+use ros::bus::{Bus, QosProfile};
 use serde_json::json;
 
-use super::support::{World, connected, patiently};
+use super::support::{World, wait_connected, with_timeout};
 
 #[tokio::test]
 async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
     let world = World::new().await;
     let node = world.system.join_demanding("/mapper");
-    let qos = Qos::keep_last(10).latching(true);
+    let qos = QosProfile::keep_last(10).latching(true);
     let of = world.wire_type("std_msgs/Int32");
     let mut heard = node.subscribe("/map", of, qos).await.unwrap();
     let mut client = world.client().await;
@@ -23,14 +23,16 @@ async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "a", "level": "error", "msg":
-            "advertise: topic /map: nothing passes between /mapper and this client: durability: the publisher offers volatile, the subscriber asks for transient_local (publisher: reliable, volatile; subscriber: reliable, transient_local)"})
+            "advertise: topic /map: no messages pass between /mapper and this client: durability: the publisher offers \
+                volatile, the subscriber asks for transient_local (publisher: reliable, volatile; subscriber: \
+                reliable, transient_local)"})
     );
-    client.settled().await;
-    // It is no reason to wait for it either.
+    client.sync().await;
+    // Nor is it waited for.
     client.send(publish.clone()).await;
-    client.settled().await;
+    client.sync().await;
     assert!(heard.messages.is_empty());
-    // Offered what it asks for, it hears.
+    // It receives messages if offered what it requests.
     client
         .send(
             json!({"op": "advertise", "id": "a", "topic": "/map", "type": "std_msgs/msg/Int32",
@@ -38,9 +40,9 @@ async fn a_subscriber_that_asks_for_more_is_named_once_with_what_both_say() {
         )
         .await;
     client.send(publish).await;
-    let message = patiently(heard.messages.recv()).await.unwrap();
-    assert_eq!(message.bytes, world.serialized(&[7, 0, 0, 0]));
-    client.settled().await;
+    let message = with_timeout(heard.messages.recv()).await.unwrap();
+    assert_eq!(message.bytes, world.serialize(&[7, 0, 0, 0]));
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -53,20 +55,20 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
     let volatile =
         json!({"op": "subscribe", "id": "new", "topic": "/map", "qos": {"durability": "volatile"}});
     eager.send(volatile.clone()).await;
-    eager.settled().await;
-    // Who says nothing is given all there is, whatever others want of the same topic.
+    eager.sync().await;
+    // A client that requests nothing gets everything, whatever others request for the same topic.
     late.send(json!({"op": "subscribe", "topic": "/map"})).await;
     assert_eq!(late.json().await["msg"], json!({"data": 1}));
-    connected(publisher.as_ref(), 2).await;
+    wait_connected(publisher.as_ref(), 2).await;
     publisher.publish(message(2));
     for client in [&mut eager, &mut late] {
         assert_eq!(client.json().await["msg"], json!({"data": 2}));
     }
-    // Nor is what came meanwhile, to another that says so.
+    // Nor does another client with that request get what was published meanwhile.
     let mut another = world.client().await;
     another.send(volatile).await;
-    another.settled().await;
-    // A client's subscriptions are given what satisfies all of them.
+    another.sync().await;
+    // A client's subscriptions get what satisfies all of them.
     eager
         .send(json!({"op": "subscribe", "id": "old", "topic": "/map"}))
         .await;
@@ -74,16 +76,16 @@ async fn who_wants_nothing_old_is_given_nothing_old() {
     publisher.publish(message(3));
     for client in [&mut eager, &mut another, &mut late] {
         assert_eq!(client.json().await["msg"], json!({"data": 3}));
-        client.settled().await;
+        client.sync().await;
     }
-    // And no more than that: what it asks for goes with the subscription.
+    // And no more than that: a request ends with its subscription.
     eager
         .send(json!({"op": "unsubscribe", "id": "old", "topic": "/map"}))
         .await;
-    eager.settled().await;
+    eager.sync().await;
     publisher.publish(message(4));
     assert_eq!(eager.json().await["msg"], json!({"data": 4}));
-    eager.settled().await;
+    eager.sync().await;
 }
 
 #[tokio::test]
@@ -100,12 +102,13 @@ async fn what_a_subscription_cannot_ask_for_is_told_as_a_warning() {
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "s", "level": "warning", "msg":
-            "subscribe: \"qos.deadline\", \"qos.liveliness\" left out: publishers are heard whatever they offer of that"})
+            "subscribe: \"qos.deadline\", \"qos.liveliness\" ignored: subscriptions here accept whatever publishers \
+                offer there"})
     );
     client
         .send(json!({"op": "advertise", "topic": "/y", "type": "std_msgs/String", "qos": qos}))
         .await;
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -114,15 +117,15 @@ async fn clients_that_expect_different_types_of_one_topic_each_hear_theirs() {
     let (mut text, mut number) = (world.client().await, world.client().await);
     let subscribe = |type_name| json!({"op": "subscribe", "topic": "/late", "type": type_name});
     text.send(subscribe("std_msgs/String")).await;
-    text.settled().await;
-    // It is the publisher who says what the topic is.
+    text.sync().await;
+    // The publisher determines the type of the topic.
     let publisher = world.node_publishes("/late", "std_msgs/Int32", false).await;
     let told = text.refusal().await;
     assert!(told.contains("std_msgs/msg/Int32"), "{told}");
     number.send(subscribe("std_msgs/Int32")).await;
-    number.settled().await;
-    connected(publisher.as_ref(), 1).await;
+    number.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
     publisher.publish(world.message("std_msgs/Int32", json!({"data": 7})));
     assert_eq!(number.json().await["msg"], json!({"data": 7}));
-    text.settled().await;
+    text.sync().await;
 }

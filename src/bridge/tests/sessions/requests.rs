@@ -1,24 +1,24 @@
-//! How long requests take, as the daemon is told.
+//! Durations of requests, as reported to the daemon.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge::{BridgeOptions, Called};
+use bridge::{BridgeOptions, RequestObserver};
 use bytes::Bytes;
 use ros::bus::{ServiceHandler, ServiceType};
 use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::actions::serve;
-use super::support::{Client, World, connected, patient, patiently};
+use super::support::{Client, World, patient, wait_connected, with_timeout};
 
 type Told = mpsc::UnboundedReceiver<Option<Duration>>;
 
-/// Options of a bridge whose requests are told, and where. `pair`: the topics on which clients ask.
-fn telling(pair: Option<&str>) -> (BridgeOptions, Told) {
+/// Returns options of a bridge that reports requests, and the receiver. `pair`: the topics of requests.
+fn observed_options(pair: Option<&str>) -> (BridgeOptions, Told) {
     let (sender, told) = mpsc::unbounded_channel();
     let options = BridgeOptions {
-        called: Called::by(move |took| {
+        called: RequestObserver::new(move |took| {
             let _ = sender.send(took);
         }),
         pair: pair.map(|pair| pair.parse().unwrap()),
@@ -28,10 +28,10 @@ fn telling(pair: Option<&str>) -> (BridgeOptions, Told) {
 }
 
 async fn next(told: &mut Told) -> Option<Duration> {
-    patiently(told.recv()).await.unwrap()
+    with_timeout(told.recv()).await.unwrap()
 }
 
-/// Gives the second number back, and refuses calls whose first is not 0; so many bytes stand in front of both.
+/// Returns the second number, and refuses calls whose first is not 0; `self.0` is the number of bytes before both.
 struct Refuses(usize);
 
 #[async_trait::async_trait]
@@ -47,32 +47,35 @@ impl ServiceHandler for Refuses {
 
 #[tokio::test]
 async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() {
-    let (options, mut told) = telling(None);
-    let world = World::with(options).await;
+    let (options, mut told) = observed_options(None);
+    let world = World::with_options(options).await;
     let def = world.registry.service("x_msgs/Add").unwrap();
     let _served = world
         .node
         .serve(
             "/add",
-            ServiceType::of(&def),
-            Arc::new(Refuses(world.either(0, 4))),
+            ServiceType::from_service(&def),
+            Arc::new(Refuses(world.by_version(0, 4))),
         )
         .await
         .unwrap();
     let there = |graph: &ros::bus::Graph| graph.services.contains_key("/add");
-    world.in_graph(there).await;
+    world.wait_for_graph(there).await;
     let (mut client, mut own) = (world.client().await, world.client().await);
     let call = |service: &str, a: u8| json!({"op": "call_service", "service": service, "args": {"a": a, "b": 2}});
     // Answered by another client of the same robot.
     own.send(json!({"op": "advertise_service", "service": "/own", "type": "x_msgs/Add"}))
         .await;
     let there = |graph: &ros::bus::Graph| graph.services.contains_key("/own");
-    world.in_graph(there).await;
-    client.settled().await;
+    world.wait_for_graph(there).await;
+    client.sync().await;
     client.send(call("/own", 0)).await;
     let asked = own.json().await;
-    own.send(json!({"op": "service_response", "id": asked["id"], "service": "/own", "values": {"sum": 1}, "result": true}))
-        .await;
+    own.send(
+        json!({"op": "service_response", "id": asked["id"], "service": "/own", "values": {"sum": 1},
+        "result": true}),
+    )
+    .await;
     assert_eq!(client.json().await["result"], true);
     for (a, answered) in [(0, true), (1, false)] {
         client.send(call("/add", a)).await;
@@ -84,30 +87,34 @@ async fn calls_of_the_servants_services_are_told_and_those_of_clients_are_not() 
 
 #[tokio::test]
 async fn goals_are_told_but_for_those_that_their_client_cancels() {
-    let (options, mut told) = telling(None);
-    let world = World::with(options).await;
+    let (options, mut told) = observed_options(None);
+    let world = World::with_options(options).await;
     let other = world.another_bridge().await;
     let mut server = Client::connect(&other, Default::default()).await;
     serve(&mut server).await;
     let mut user = world.client().await;
     for (id, result, succeeds) in [("g", true, true), ("h", false, false)] {
-        user.send(json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Count", "args": {"to": 3}}))
+        user.send(json!({"op": "send_action_goal", "id": id, "action": "/count", "action_type": "x_msgs/Count",
+            "args": {"to": 3}}))
             .await;
         let asked = server.json().await;
         server
-            .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 4, "result": result}))
+            .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []},
+                "status": 4, "result": result}))
             .await;
         assert_eq!(user.json().await["id"], id);
         assert_eq!(next(&mut told).await.is_some(), succeeds, "{id}");
     }
-    user.send(json!({"op": "send_action_goal", "id": "c", "action": "/count", "action_type": "x_msgs/Count", "args": {"to": 3}}))
+    user.send(json!({"op": "send_action_goal", "id": "c", "action": "/count", "action_type": "x_msgs/Count",
+        "args": {"to": 3}}))
         .await;
     let asked = server.json().await;
     user.send(json!({"op": "cancel_action_goal", "id": "c", "action": "/count"}))
         .await;
     assert_eq!(server.json().await["op"], "cancel_action_goal");
     server
-        .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 5, "result": true}))
+        .send(json!({"op": "action_result", "id": asked["id"], "action": "/count", "values": {"all": []}, "status": 5,
+            "result": true}))
         .await;
     assert_eq!(user.json().await["id"], "c");
     assert!(told.try_recv().is_err(), "its end was its client's choice");
@@ -115,8 +122,8 @@ async fn goals_are_told_but_for_those_that_their_client_cancels() {
 
 #[tokio::test]
 async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
-    let (options, mut told) = telling(Some("/place -> /found by stamp"));
-    let world = World::with(options).await;
+    let (options, mut told) = observed_options(Some("/place -> /found by stamp"));
+    let world = World::with_options(options).await;
     let mut asked = world.node_subscribes("/place", "x_msgs/Place").await;
     let found = world.node_publishes("/found", "x_msgs/Place", false).await;
     let mut client = world.client().await;
@@ -126,22 +133,22 @@ async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
         .await;
     let place = |secs: u32| json!({"header": {"stamp": {"secs": secs, "nsecs": 5}}});
     let publish = |secs| json!({"op": "publish", "topic": "/place", "msg": place(secs)});
-    // What waits for the node to connect is no time of the node's.
+    // Time that a message waits for the node to connect is not the node's.
     client.send(publish(1)).await;
-    patiently(asked.messages.recv()).await.unwrap();
-    client.settled().await;
+    with_timeout(asked.messages.recv()).await.unwrap();
+    client.sync().await;
     assert_eq!(metrics.asked.get(), 0, "nobody hears an answer");
     client
         .send(json!({"op": "subscribe", "topic": "/found"}))
         .await;
-    client.settled().await;
-    connected(&*found, 1).await;
+    client.sync().await;
+    wait_connected(&*found, 1).await;
     for secs in [2, 3] {
         client.send(publish(secs)).await;
-        patiently(asked.messages.recv()).await.unwrap();
+        with_timeout(asked.messages.recv()).await.unwrap();
     }
     assert_eq!(metrics.asked.get(), 2);
-    // The first was not noted, of the next ones each is answered once; the fourth was never asked.
+    // The first was not recorded, each of the next ones is answered once; the fourth was never requested.
     for secs in [1, 3, 2, 2, 4] {
         found.publish(world.message("x_msgs/Place", place(secs)));
         assert_eq!(client.json().await["op"], "publish");
@@ -153,6 +160,6 @@ async fn messages_that_the_servant_answers_are_told_once_they_reach_it() {
         .send(json!({"op": "unsubscribe", "topic": "/found"}))
         .await;
     client.send(publish(5)).await;
-    client.settled().await;
+    client.sync().await;
     assert_eq!(metrics.asked.get(), 2, "nobody hears an answer any more");
 }

@@ -11,7 +11,7 @@ use ros::codec;
 use serde_json::json;
 use tokio::sync::Notify;
 
-use super::support::{World, connected, patient, patiently};
+use super::support::{World, patient, wait_connected, with_timeout};
 
 fn with_token(token: &str) -> SessionOptions {
     SessionOptions {
@@ -20,7 +20,7 @@ fn with_token(token: &str) -> SessionOptions {
     }
 }
 
-/// Gives this answer when it is let go.
+/// A service that answers when it is released.
 struct Gated(Arc<Notify>, Bytes);
 
 #[async_trait]
@@ -40,7 +40,7 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     let mut heard = world.node_subscribes("/number", "std_msgs/Int32").await;
     let def = world.registry.service("x_msgs/Nothing").unwrap();
     let gate = Arc::new(Notify::new());
-    let service_type = ServiceType::of(&def);
+    let service_type = ServiceType::from_service(&def);
     let answer = codec::default_message(&def.response).into();
     let _served = world
         .node
@@ -52,7 +52,7 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
         .await
         .unwrap();
     world
-        .in_graph(|graph| graph.services.contains_key("/gated"))
+        .wait_for_graph(|graph| graph.services.contains_key("/gated"))
         .await;
 
     let mut client = world.client_with(with_token("secret")).await;
@@ -68,12 +68,12 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
     client
         .send(json!({"op": "call_service", "id": "c", "service": "/gated"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
-    assert!(patiently(heard.messages.recv()).await.is_some());
-    assert!(matches!(client.lose().await, SessionEnd::Lost(_)));
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
+    assert!(with_timeout(heard.messages.recv()).await.is_some());
+    assert!(matches!(client.abort().await, SessionEnd::Lost(_)));
     let mut sessions = world.bridge.sessions();
-    patiently(sessions.wait_for(|count| count.away == 1 && count.connected == 0))
+    with_timeout(sessions.wait_for(|count| count.away == 1 && count.connected == 0))
         .await
         .unwrap();
 
@@ -82,7 +82,7 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
 
     // Another client does not find them.
     let mut stranger = world.client_with(with_token("guess")).await;
-    stranger.settled().await;
+    stranger.sync().await;
 
     let mut client = world.client_with(with_token("secret")).await;
     let mut got =
@@ -93,11 +93,14 @@ async fn subscriptions_advertisements_and_calls_outlive_the_socket() {
         .send(json!({"op": "publish", "topic": "/number", "msg": {"data": 2}}))
         .await;
     assert_eq!(
-        patiently(heard.messages.recv()).await.unwrap().bytes,
-        world.serialized(&[2, 0, 0, 0])
+        with_timeout(heard.messages.recv()).await.unwrap().bytes,
+        world.serialize(&[2, 0, 0, 0])
     );
-    client.settled().await;
-    assert_eq!(publisher.matched().borrow().connected(), 1);
+    client.sync().await;
+    assert_eq!(
+        publisher.matched_subscribers().borrow().connected_count(),
+        1
+    );
     assert_eq!(world.bridge.metrics().resumed.get(), 1);
 }
 
@@ -107,23 +110,23 @@ async fn the_newer_connection_takes_over() {
     let mut old = world.client_with(with_token("secret")).await;
     old.send(json!({"op": "subscribe", "topic": "/x", "type": "std_msgs/String"}))
         .await;
-    old.settled().await;
+    old.sync().await;
     let mut new = world.client_with(with_token("secret")).await;
     assert_eq!(
-        old.closed().await,
+        old.expect_close().await,
         (
             4001,
             "a newer connection has taken this session over".into()
         )
     );
-    old.lose().await;
+    old.abort().await;
     new.send(json!({"op": "advertise", "topic": "/x", "type": "std_msgs/String"}))
         .await;
     new.send(json!({"op": "publish", "topic": "/x", "msg": {"data": "mine"}}))
         .await;
     assert_eq!(new.json().await["msg"]["data"], "mine");
     let mut sessions = world.bridge.sessions();
-    patiently(sessions.wait_for(|count| count.away == 0 && count.connected == 1))
+    with_timeout(sessions.wait_for(|count| count.away == 0 && count.connected == 1))
         .await
         .unwrap();
 }
@@ -134,7 +137,7 @@ async fn who_does_not_come_back_in_time_has_lost_everything() {
         resume_grace: Duration::from_millis(50),
         ..patient()
     };
-    let world = World::with(options).await;
+    let world = World::with_options(options).await;
     let publisher = world
         .node_publishes("/text", "std_msgs/String", false)
         .await;
@@ -142,14 +145,18 @@ async fn who_does_not_come_back_in_time_has_lost_everything() {
     client
         .send(json!({"op": "subscribe", "topic": "/text"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
-    client.lose().await;
-    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
-        .await
-        .unwrap();
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
+    client.abort().await;
+    with_timeout(
+        publisher
+            .matched_subscribers()
+            .wait_for(|now| now.connected_count() == 0),
+    )
+    .await
+    .unwrap();
     let mut client = world.client_with(with_token("secret")).await;
-    client.settled().await;
+    client.sync().await;
     assert_eq!(world.bridge.metrics().resumed.get(), 0);
 }
 
@@ -163,10 +170,14 @@ async fn a_client_without_token_leaves_nothing_behind() {
     client
         .send(json!({"op": "subscribe", "topic": "/text"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
-    client.lose().await;
-    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
-        .await
-        .unwrap();
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
+    client.abort().await;
+    with_timeout(
+        publisher
+            .matched_subscribers()
+            .wait_for(|now| now.connected_count() == 0),
+    )
+    .await
+    .unwrap();
 }

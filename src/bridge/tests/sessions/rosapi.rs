@@ -1,7 +1,7 @@
-//! What the bridge answers about the ROS system.
+//! Answers of the bridge about the ROS system.
 
 use ros::bus::RosVersion;
-use rosbridge::{CallService, Compression, Format, Frame, Op};
+use rosbridge::{CallService, Compression, Format, Op, ProtocolFrame};
 use serde_json::{Value, json};
 
 use super::support::{Client, World};
@@ -42,7 +42,7 @@ async fn topics_nodes_and_services_are_found() {
         .send(json!({"op": "set_level", "level": "error"}))
         .await;
     world
-        .in_graph(|graph| {
+        .wait_for_graph(|graph| {
             graph.services.contains_key("/add") && graph.topics.contains_key("/number")
         })
         .await;
@@ -53,7 +53,7 @@ async fn topics_nodes_and_services_are_found() {
     ) {}
 
     let topics = ask(&mut client, "topics", json!({})).await;
-    // The bridge's own among them, as where nodes of rosbridge publish them.
+    // Includes the bridge's own, as if nodes of rosbridge published them.
     let shown = [
         "/client_count",
         "/connected_clients",
@@ -66,9 +66,9 @@ async fn topics_nodes_and_services_are_found() {
         "/tf2_web_republisher/result",
         "/tf2_web_republisher/status",
     ];
-    // In ROS 2 actions are no topics.
-    assert_eq!(topics["topics"], json!(shown[..world.either(10, 5)]));
-    assert_eq!(topics["types"][2], world.spelled("std_msgs/Int32"));
+    // In ROS 2 actions are not topics.
+    assert_eq!(topics["topics"], json!(shown[..world.by_version(10, 5)]));
+    assert_eq!(topics["types"][2], world.message_name("std_msgs/Int32"));
     if world.version() == RosVersion::One {
         assert_eq!(topics["types"][9], "actionlib_msgs/GoalStatusArray");
     }
@@ -77,7 +77,7 @@ async fn topics_nodes_and_services_are_found() {
     assert_eq!(raw["typedefs_full_text"][4], "string data\n");
     assert_eq!(
         ask(&mut client, "topic_type", json!({"topic": "/text"})).await,
-        json!({"type": world.spelled("std_msgs/String")})
+        json!({"type": world.message_name("std_msgs/String")})
     );
     assert_eq!(
         ask(&mut client, "topic_type", json!({"topic": "/none"})).await,
@@ -112,7 +112,7 @@ async fn topics_nodes_and_services_are_found() {
     );
     assert_eq!(
         ask(&mut client, "service_type", json!(["/rosapi/topics"])).await,
-        json!({"type": world.either("rosapi/Topics", "rosapi_msgs/srv/Topics")})
+        json!({"type": world.by_version("rosapi/Topics", "rosapi_msgs/srv/Topics")})
     );
     assert_eq!(
         ask(&mut client, "service_type", json!({"service": "/no"})).await,
@@ -167,7 +167,7 @@ async fn topics_nodes_and_services_are_found() {
     );
     let time = ask(&mut client, "get_time", json!({})).await;
     assert!(world.seconds(&time["time"]) > 1_500_000_000);
-    // By roslibpy's name for them in either ROS.
+    // By roslibpy's names in either ROS.
     assert!(time["time"]["secs"].as_u64().unwrap() > 1_500_000_000);
 }
 
@@ -202,7 +202,7 @@ async fn actions_and_interfaces_are_found() {
         "std_msgs/msg/String",
         "x_msgs/srv/Add",
         "x_msgs/action/Count",
-        world.either("rosapi/srv/Topics", "rosapi_msgs/srv/Topics"),
+        world.by_version("rosapi/srv/Topics", "rosapi_msgs/srv/Topics"),
     ] {
         assert!(holds(&interfaces["interfaces"], name), "{name}");
     }
@@ -230,7 +230,7 @@ async fn who_is_connected_can_be_followed() {
         (&clients[0]["ip_address"], &clients[1]["ip_address"]),
         (&json!("10.0.0.1"), &json!("10.0.0.2"))
     );
-    other.lose().await;
+    other.abort().await;
     assert_eq!(client.json().await["msg"], json!({"data": 1}));
 }
 
@@ -238,8 +238,11 @@ async fn who_is_connected_can_be_followed() {
 async fn questions_that_make_no_sense_are_answered_with_the_reason() {
     let world = World::new().await;
     let mut client = world.client().await;
-    let parameter = world.either("/p", "/node:p");
-    let unknown = format!("no definition of {} is known", world.spelled("x_msgs/Lost"));
+    let parameter = world.by_version("/p", "/node:p");
+    let unknown = format!(
+        "no definition of {} is known",
+        world.message_name("x_msgs/Lost")
+    );
     for (service, args, reason) in [
         (
             "set_param",
@@ -304,7 +307,7 @@ async fn rosapi_speaks_cbor_and_ros_bytes_too() {
         .print(&mut out, Format::Cbor);
         client.send_binary(out).await;
         let answer = client.binary().await;
-        let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+        let Op::ServiceResponse(answer) = Op::parse(ProtocolFrame::Binary(&answer)).unwrap() else {
             panic!("{answer:?}")
         };
         let values = answer.values.unwrap();
@@ -313,10 +316,10 @@ async fn rosapi_speaks_cbor_and_ros_bytes_too() {
         let (version, distro) = (&version[..], distro.as_bytes());
         match compression {
             Compression::CborRaw => {
-                // In ROS 2 lengths are aligned, and count the zero that ends a text.
-                let length = world.either(&b"\x06\0\0\0"[..], &b"\0\0\0\x07\0\0\0"[..]);
-                let end = world.either(&b""[..], &b"\0"[..]);
-                let expected = world.serialized(&[version, length, distro, end].concat());
+                // In ROS 2 lengths are aligned, and include the terminating zero of a string.
+                let length = world.by_version(&b"\x06\0\0\0"[..], &b"\0\0\0\x07\0\0\0"[..]);
+                let end = world.by_version(&b""[..], &b"\0"[..]);
+                let expected = world.serialize(&[version, length, distro, end].concat());
                 assert_eq!(&*values.raw().unwrap().bytes, expected);
             }
             _ => {
@@ -334,7 +337,7 @@ async fn rosapi_tells_its_log_as_every_node_does() {
     let rosout = json!({"topic": "/rosout"});
     let publishers = ask(&mut client, "publishers", rosout.clone()).await;
     assert_eq!(publishers["publishers"], json!(["/rosapi"]));
-    let log = world.either("rosgraph_msgs/Log", "rcl_interfaces/msg/Log");
+    let log = world.by_version("rosgraph_msgs/Log", "rcl_interfaces/msg/Log");
     assert_eq!(ask(&mut client, "topic_type", rosout).await["type"], log);
     let found = ask(&mut client, "topics_for_type", json!({"type": log})).await;
     assert_eq!(found["topics"], json!(["/rosout"]));

@@ -1,4 +1,4 @@
-//! Services both ways.
+//! Services in both directions.
 
 use std::sync::Arc;
 
@@ -6,22 +6,22 @@ use async_trait::async_trait;
 use bridge::{BridgeOptions, SessionOptions};
 use bytes::Bytes;
 use ros::bus::{Digest, RosVersion, ServiceHandler, ServiceType};
-use rosbridge::{CallService, Compression, Format, Frame, Op, Payload};
+use rosbridge::{CallService, Compression, Format, Op, Payload, ProtocolFrame};
 use serde_json::{Value, json};
 use tokio::sync::Notify;
 
-use super::support::{PATIENCE, World, patient, patiently};
+use super::support::{PATIENCE, World, patient, with_timeout};
 
-/// Adds; waits first where told to.
+/// A service that adds; it can be made to wait first.
 struct Add {
     gate: Option<Arc<Notify>>,
-    /// Bytes in front of the values of a message.
+    /// Bytes before the values of a message.
     header: usize,
 }
 
 impl Add {
     fn new(world: &World, gate: Option<Arc<Notify>>) -> Arc<Self> {
-        let header = world.either(0, 4);
+        let header = world.by_version(0, 4);
         Arc::new(Self { gate, header })
     }
 }
@@ -41,7 +41,7 @@ impl ServiceHandler for Add {
     }
 }
 
-async fn serves(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn Send + Sync> {
+async fn serve_add(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn Send + Sync> {
     let guard = world
         .node
         .serve(
@@ -52,7 +52,7 @@ async fn serves(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn
         .await
         .unwrap();
     world
-        .in_graph(|graph| graph.services.contains_key(name))
+        .wait_for_graph(|graph| graph.services.contains_key(name))
         .await;
     guard
 }
@@ -60,14 +60,14 @@ async fn serves(world: &World, name: &str, gate: Option<Arc<Notify>>) -> Box<dyn
 #[tokio::test]
 async fn a_service_is_called_with_names_by_position_and_with_nothing() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     for (args, sum) in [
         (json!({"a": 1, "b": 2}), 3),
         (json!([4, 5]), 9),
         (json!([7]), 7),
         (json!([]), 0),
-        // What is too much is left out, as rosbridge does.
+        // Surplus values are dropped, as in rosbridge.
         (json!([1, 2, 3]), 3),
     ] {
         client.send(json!({"op": "call_service", "id": 5, "service": "add", "args": args, "type": "x_msgs/Add"})).await;
@@ -86,14 +86,14 @@ async fn a_service_is_called_with_names_by_position_and_with_nothing() {
 #[tokio::test]
 async fn calls_fail_with_a_reason() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     let max = i64::MAX;
     let no_field = format!(
         "field c of {}: there is no such field",
         world.request_name("x_msgs/Add")
     );
-    let not_a_name = world.either(
+    let not_a_name = world.by_version(
         "\"/1add\" is not a ROS name: letters, digits, _ and / are allowed, a letter comes first",
         "\"/1add\" is not a ROS name: letters, digits, _ and / are allowed, no part begins with a digit",
     );
@@ -133,8 +133,8 @@ async fn calls_fail_with_a_reason() {
 async fn a_slow_call_holds_up_no_other_and_ends_by_its_timeout() {
     let world = World::new().await;
     let gate = Arc::new(Notify::new());
-    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
-    let _fast = serves(&world, "/fast", None).await;
+    let _slow = serve_add(&world, "/slow", Some(gate.clone())).await;
+    let _fast = serve_add(&world, "/fast", None).await;
     let mut client = world.client().await;
     client
         .send(json!({"op": "call_service", "id": "slow", "service": "/slow", "args": [1, 2]}))
@@ -164,13 +164,13 @@ async fn a_slow_call_holds_up_no_other_and_ends_by_its_timeout() {
 
 #[tokio::test]
 async fn too_many_calls_at_once_are_refused() {
-    let world = World::with(BridgeOptions {
+    let world = World::with_options(BridgeOptions {
         max_calls: 2,
         ..patient()
     })
     .await;
     let gate = Arc::new(Notify::new());
-    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
+    let _slow = serve_add(&world, "/slow", Some(gate.clone())).await;
     let mut client = world.client().await;
     for id in 0..3 {
         client
@@ -194,21 +194,21 @@ async fn too_many_calls_at_once_are_refused() {
 
 #[tokio::test]
 async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
-    let world = World::with(BridgeOptions {
+    let world = World::with_options(BridgeOptions {
         max_call_bytes: 10_000,
         ..patient()
     })
     .await;
     let gate = Arc::new(Notify::new());
-    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
-    let _fast = serves(&world, "/fast", None).await;
+    let _slow = serve_add(&world, "/slow", Some(gate.clone())).await;
+    let _fast = serve_add(&world, "/fast", None).await;
     let mut client = world.client().await;
     let padded = |service: &str, id: &str, padding: usize| {
         let call = json!({"op": "call_service", "id": id, "service": service, "args": [1, 2]});
         call.to_string()
             .replace("[1", &format!("[{}1", " ".repeat(padding)))
     };
-    // One alone may have more than that.
+    // A single call may have more than that.
     client.send_text(&padded("/slow", "first", 20_000)).await;
     client.send_text(&padded("/fast", "second", 5_000)).await;
     let answer = client.json().await;
@@ -218,7 +218,8 @@ async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
     );
     assert_eq!(
         answer["values"],
-        "field \"args\" has 5005 bytes, with those of calls and goals under way more than 10000; wait for some to end"
+        "field \"args\" has 5005 bytes, which together with the calls and goals under way is more than 10000; wait for \
+            some to end"
     );
     gate.notify_one();
     assert_eq!(client.json().await["values"], json!({"sum": 3}));
@@ -228,9 +229,9 @@ async fn calls_that_hold_too_many_bytes_are_refused_until_others_end() {
 
 #[tokio::test]
 async fn what_waits_for_an_answer_counts_in_the_clients_budget() {
-    let world = World::with(patient()).await;
+    let world = World::with_options(patient()).await;
     let gate = Arc::new(Notify::new());
-    let _slow = serves(&world, "/slow", Some(gate.clone())).await;
+    let _slow = serve_add(&world, "/slow", Some(gate.clone())).await;
     let budget = budget::Budget::new("client x", 350_000);
     let mut client = world
         .client_with(SessionOptions {
@@ -245,15 +246,15 @@ async fn what_waits_for_an_answer_counts_in_the_clients_budget() {
     for _ in 0..10 {
         client.send_text(&call).await;
     }
-    // Each answer that comes now is a refusal: nobody has opened the gate.
+    // Each answer now is a refusal: nobody has opened the gate.
     for _ in 0..7 {
         let answer = client.json().await;
         assert_eq!(answer["result"], false);
         let words = answer["values"].as_str().expect("a reason");
         assert!(words.contains("memory for client x"), "{words}");
     }
-    patiently(async {
-        while budget.used() > 0 {
+    with_timeout(async {
+        while budget.used_bytes() > 0 {
             gate.notify_one();
             tokio::task::yield_now().await;
         }
@@ -264,8 +265,8 @@ async fn what_waits_for_an_answer_counts_in_the_clients_budget() {
 #[tokio::test]
 async fn a_service_of_another_definition_is_not_called() {
     let world = World::new().await;
-    // In ROS 2 ends need not tell the digest of the service itself.
-    let odd = world.either(
+    // In ROS 2 endpoints need not announce the digest of the service itself.
+    let odd = world.by_version(
         "0123456789abcdef0123456789abcdef".to_owned(),
         format!("RIHS01_{}", "01".repeat(32)),
     );
@@ -293,7 +294,7 @@ async fn a_service_of_another_definition_is_not_called() {
         .await
         .unwrap();
     world
-        .in_graph(|graph| graph.services.contains_key("/odd"))
+        .wait_for_graph(|graph| graph.services.contains_key("/odd"))
         .await;
     let mut client = world.client().await;
     client
@@ -308,20 +309,23 @@ async fn a_service_of_another_definition_is_not_called() {
             world.digest_word()
         )
     );
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
 async fn a_call_that_says_another_type_is_answered_with_both_where_it_does_not_fit() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     let other = format!(
         "service /add has type {}, not {}; use the type that it has",
         world.full_name("x_msgs/Add", "srv"),
         world.full_name("x_msgs/Say", "srv")
     );
-    let call = |args: Value| json!({"op": "call_service", "id": "c", "service": "/add", "type": "x_msgs/Say", "args": args});
+    let call = |args: Value| {
+        json!({"op": "call_service", "id": "c", "service": "/add", "type": "x_msgs/Say",
+        "args": args})
+    };
     client.send(call(json!({"words": "hello"}))).await;
     let answer = client.json().await;
     assert_eq!(
@@ -334,7 +338,7 @@ async fn a_call_that_says_another_type_is_answered_with_both_where_it_does_not_f
     let answer = client.binary().await;
     let answer = String::from_utf8_lossy(&answer);
     assert!(answer.contains(&other), "{answer}");
-    // As with rosbridge_suite, which does not look at what the client says.
+    // As in rosbridge_suite, which ignores the type given by the client.
     client
         .send(json!({"op": "set_level", "level": "warning"}))
         .await;
@@ -352,7 +356,7 @@ async fn what_a_client_has_advertised_is_there_for_what_it_asks_next() {
     let world = World::new().await;
     let mut client = world.client().await;
     for round in 0..20 {
-        // Each service twice: taken back and advertised anew, as clients do between their tests.
+        // Each service twice: unadvertised and advertised again, as clients do between their tests.
         let (topic, service) = (format!("/topic{round}"), format!("/service{}", round / 2));
         client
             .send(json!({"op": "advertise", "topic": topic, "type": "std_msgs/String"}))
@@ -387,7 +391,7 @@ async fn what_a_client_has_advertised_is_there_for_what_it_asks_next() {
 #[tokio::test]
 async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     let call = |args: &[u8], compression: Option<Compression>| {
         let mut out = Vec::new();
@@ -407,11 +411,11 @@ async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
         .send_binary(call(b"\xa2\x61a\x01\x61b\x02", None))
         .await;
     let answer = client.binary().await;
-    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+    let Op::ServiceResponse(answer) = Op::parse(ProtocolFrame::Binary(&answer)).unwrap() else {
         panic!("{answer:?}")
     };
     assert_eq!(answer.values, Some(Payload::cbor(b"\xa1\x63sum\x03")));
-    let request = world.serialized(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+    let request = world.serialize(&[1, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
     let mut args = b"\xa1\x65bytes".to_vec();
     args.push(0x40 + request.len() as u8);
     args.extend_from_slice(&request);
@@ -419,13 +423,13 @@ async fn calls_in_cbor_and_ros_bytes_are_answered_alike() {
         .send_binary(call(&args, Some(Compression::CborRaw)))
         .await;
     let answer = client.binary().await;
-    let Op::ServiceResponse(answer) = Op::parse(Frame::Binary(&answer)).unwrap() else {
+    let Op::ServiceResponse(answer) = Op::parse(ProtocolFrame::Binary(&answer)).unwrap() else {
         panic!("{answer:?}")
     };
     assert_eq!(answer.compression, Compression::CborRaw);
     assert_eq!(
         *answer.values.unwrap().raw().unwrap().bytes,
-        world.serialized(&[3, 0, 0, 0, 0, 0, 0, 0])
+        world.serialize(&[3, 0, 0, 0, 0, 0, 0, 0])
     );
     client
         .send(
@@ -459,7 +463,7 @@ async fn a_client_serves_and_each_call_is_answered_once() {
         .send(json!({"op": "set_level", "level": "error"}))
         .await;
     let call = |request: &[u8]| {
-        let (node, request) = (world.node.clone(), world.serialized(request));
+        let (node, request) = (world.node.clone(), world.serialize(request));
         tokio::spawn(async move { node.call("/twice", request, PATIENCE).await })
     };
     let first = call(&[1; 16]);
@@ -472,20 +476,22 @@ async fn a_client_serves_and_each_call_is_answered_once() {
         request["args"],
         json!({"a": 0x0101010101010101i64, "b": 0x0101010101010101i64})
     );
-    let answer = json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 6}, "result": true});
+    let answer = json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 6},
+        "result": true});
     server.send(answer.clone()).await;
     assert_eq!(
-        patiently(first).await.unwrap().unwrap(),
-        world.serialized(&[6, 0, 0, 0, 0, 0, 0, 0])
+        with_timeout(first).await.unwrap().unwrap(),
+        world.serialize(&[6, 0, 0, 0, 0, 0, 0, 0])
     );
     server.send(answer).await;
     assert!(server.refusal().await.contains("waits for an answer"));
 
     let failing = call(&[0; 16]);
     let request = server.json().await;
-    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": "not today", "result": false})).await;
+    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": "not today",
+        "result": false})).await;
     assert!(
-        patiently(failing)
+        with_timeout(failing)
             .await
             .unwrap()
             .unwrap_err()
@@ -493,26 +499,28 @@ async fn a_client_serves_and_each_call_is_answered_once() {
             .contains("not today")
     );
 
-    // As clients of the first rosbridge do: what was computed counts.
+    // As clients of the first rosbridge do: the values count.
     let modest = call(&[0; 16]);
     let request = server.json().await;
-    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 7}, "result": false})).await;
-    let computed = patiently(modest).await.unwrap().unwrap();
+    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": 7},
+        "result": false})).await;
+    let computed = with_timeout(modest).await.unwrap().unwrap();
     assert_eq!(world.values(&computed)[0], 7);
 
     let misfit = call(&[0; 16]);
     let request = server.json().await;
-    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": "x"}, "result": true})).await;
+    server.send(json!({"op": "service_response", "id": request["id"], "service": "/twice", "values": {"sum": "x"},
+        "result": true})).await;
     let response = world.registry.service("x_msgs/Add").unwrap();
     let expected = format!("field sum of {}", response.response.name());
     assert!(server.refusal().await.contains(&expected));
-    assert!(patiently(misfit).await.unwrap().is_err());
+    assert!(with_timeout(misfit).await.unwrap().is_err());
 
     let left = call(&[0; 16]);
     server.json().await;
-    server.lose().await;
+    server.abort().await;
     assert!(
-        patiently(left)
+        with_timeout(left)
             .await
             .unwrap()
             .unwrap_err()
@@ -520,7 +528,7 @@ async fn a_client_serves_and_each_call_is_answered_once() {
             .contains("/twice")
     );
     world
-        .in_graph(|graph| !graph.services.contains_key("/twice"))
+        .wait_for_graph(|graph| !graph.services.contains_key("/twice"))
         .await;
 }
 
@@ -562,7 +570,7 @@ async fn services_are_advertised_anew_and_taken_back() {
             .contains("/s is not advertised by this client")
     );
 
-    // One client calls what another serves.
+    // One client calls a service of another.
     other
         .send(json!({"op": "call_service", "id": "n", "service": "/s"}))
         .await;
@@ -587,14 +595,14 @@ async fn services_are_advertised_anew_and_taken_back() {
         .await;
     assert_eq!(other.json().await["result"], false);
     world
-        .in_graph(|graph| !graph.services.contains_key("/s"))
+        .wait_for_graph(|graph| !graph.services.contains_key("/s"))
         .await;
 }
 
 #[tokio::test]
 async fn arguments_that_are_too_many_are_told_as_a_warning() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     client
         .send(json!({"op": "set_level", "level": "warning"}))
@@ -606,7 +614,7 @@ async fn arguments_that_are_too_many_are_told_as_a_warning() {
     assert_eq!(
         client.json().await,
         json!({"op": "status", "id": "c", "level": "warning",
-            "msg": format!("call_service: {request} has 2 fields, the last 2 of \"args\" were left out")})
+            "msg": format!("call_service: {request} has 2 fields, the last 2 of \"args\" were ignored")})
     );
     assert_eq!(client.json().await["values"], json!({"sum": 3}));
 }
@@ -640,7 +648,7 @@ async fn a_call_that_cannot_be_read_is_answered_all_the_same() {
         expected["values"] = json!(reason);
         assert_eq!(client.json().await, expected);
     }
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -652,7 +660,7 @@ async fn who_answers_with_nonsense_keeps_no_caller_waiting() {
         .send(json!({"op": "advertise_service", "service": "/add", "type": "x_msgs/Add"}))
         .await;
     world
-        .in_graph(|graph| graph.services.contains_key("/add"))
+        .wait_for_graph(|graph| graph.services.contains_key("/add"))
         .await;
     for (answer, reason) in [
         (json!({"values": {"sum": 3}}), "field \"result\" is missing"),
@@ -689,7 +697,7 @@ async fn who_answers_with_nonsense_keeps_no_caller_waiting() {
 #[tokio::test]
 async fn who_takes_over_a_service_of_a_node_is_warned() {
     let world = World::new().await;
-    let _served = serves(&world, "/add", None).await;
+    let _served = serve_add(&world, "/add", None).await;
     let mut client = world.client().await;
     client
         .send(json!({"op": "set_level", "level": "warning"}))
@@ -707,6 +715,6 @@ async fn who_takes_over_a_service_of_a_node_is_warned() {
     assert_eq!(
         client.json().await,
         json!({"op": "status", "level": "warning",
-            "msg": "advertise_service: /add was served by /node, this client takes its place"})
+            "msg": "advertise_service: /add was served by /node, this client replaces it"})
     );
 }

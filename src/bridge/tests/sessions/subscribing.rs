@@ -5,10 +5,10 @@ use std::time::Duration;
 use bridge::{BridgeOptions, SessionOptions};
 use ros::bus::RosVersion;
 use ros::codec::{self, FillOptions};
-use rosbridge::{Frame, Op};
+use rosbridge::{Op, ProtocolFrame};
 use serde_json::json;
 
-use super::support::{World, connected, patient};
+use super::support::{World, patient, wait_connected};
 
 #[tokio::test]
 async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
@@ -27,8 +27,8 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
         client
             .send(json!({"op": "subscribe", "topic": "/place", "compression": compression}))
             .await;
-        client.settled().await;
-        connected(publisher.as_ref(), 1).await;
+        client.sync().await;
+        wait_connected(publisher.as_ref(), 1).await;
         publisher.publish(bytes.clone());
         match compression {
             "none" => assert_eq!(
@@ -39,7 +39,7 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
                 let packed = client.json().await;
                 assert_eq!(packed["op"], "png");
                 let text = rosbridge::decode_png(packed["data"].as_str().unwrap(), 10_000).unwrap();
-                // Browsers take each byte for a character.
+                // Browsers interpret each byte as a character.
                 assert!(text.is_ascii(), "{text}");
                 let unpacked: serde_json::Value = serde_json::from_str(&text).unwrap();
                 assert_eq!(
@@ -49,7 +49,7 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
             }
             _ => {
                 let frame = client.binary().await;
-                let Op::Publish(publish) = Op::parse(Frame::Binary(&frame)).unwrap() else {
+                let Op::Publish(publish) = Op::parse(ProtocolFrame::Binary(&frame)).unwrap() else {
                     panic!("{frame:?}")
                 };
                 assert_eq!(publish.topic, "/place");
@@ -72,10 +72,10 @@ async fn a_node_publishes_and_the_client_hears_it_in_every_encoding() {
         client
             .send(json!({"op": "unsubscribe", "topic": "/place"}))
             .await;
-        client.settled().await;
-        client.lose().await;
-        let mut subscribers = publisher.matched();
-        super::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
+        client.sync().await;
+        client.abort().await;
+        let mut subscribers = publisher.matched_subscribers();
+        super::support::with_timeout(subscribers.wait_for(|now| now.connected_count() == 0))
             .await
             .unwrap();
     }
@@ -91,8 +91,8 @@ async fn long_messages_come_in_fragments_where_asked_for() {
     client
         .send(json!({"op": "subscribe", "topic": "/text", "fragment_size": 50}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
     let long = "äöü ".repeat(100);
     publisher.publish(world.message("std_msgs/String", json!({"data": long})));
     let mut text = String::new();
@@ -130,13 +130,13 @@ async fn each_latching_publisher_is_replayed_to_a_newcomer() {
         heard.sort();
         assert_eq!(heard, ["\"one\"", "\"two\""]);
     }
-    // Who subscribes once more, under another id, hears them too.
+    // Another subscription with another id receives them, too.
     clients[0]
         .send(json!({"op": "subscribe", "id": "again", "topic": "/latched"}))
         .await;
     clients[0].json().await;
     clients[0].json().await;
-    clients[0].settled().await;
+    clients[0].sync().await;
 }
 
 #[tokio::test]
@@ -151,10 +151,10 @@ async fn subscribers_share_an_encoding() {
         client
             .send(json!({"op": "subscribe", "topic": "/text", "compression": compression}))
             .await;
-        client.settled().await;
+        client.sync().await;
         clients.push(client);
     }
-    connected(publisher.as_ref(), 1).await;
+    wait_connected(publisher.as_ref(), 1).await;
     publisher.publish(world.message("std_msgs/String", json!({"data": "x"})));
     for client in &mut clients {
         client.next().await;
@@ -176,26 +176,26 @@ async fn subscriptions_are_ended_one_by_one_or_all_at_once() {
     client
         .send(json!({"op": "subscribe", "id": "b", "topic": "/text", "compression": "cbor"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
     let message = world.message("std_msgs/String", json!({"data": "x"}));
     publisher.publish(message.clone());
     client.binary().await;
     client
         .send(json!({"op": "unsubscribe", "id": "b", "topic": "/text"}))
         .await;
-    client.settled().await;
+    client.sync().await;
     publisher.publish(message.clone());
     client.json().await;
     client
         .send(json!({"op": "unsubscribe", "topic": "/text"}))
         .await;
-    client.settled().await;
-    let mut subscribers = publisher.matched();
-    super::support::patiently(subscribers.wait_for(|now| now.connected() == 0))
+    client.sync().await;
+    let mut subscribers = publisher.matched_subscribers();
+    super::support::with_timeout(subscribers.wait_for(|now| now.connected_count() == 0))
         .await
         .unwrap();
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -210,7 +210,8 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "subscribe: topic /nothing does not exist; say its \"type\" to wait for it, /rosapi/topics lists those that do"
+        "subscribe: topic /nothing does not exist; give its \"type\" to wait for it; /rosapi/topics lists existing \
+            topics"
     );
     client
         .send(json!({"op": "subscribe", "topic": "/nothing", "type": "x_msgs/Lost"}))
@@ -218,8 +219,9 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
     assert_eq!(
         client.refusal().await,
         format!(
-            "subscribe: topic /nothing: no definition of {} is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has x_msgs, too",
-            world.spelled("x_msgs/Lost")
+            "subscribe: topic /nothing: no definition of {} is known here; the deployer of this service can add it: \
+                cloudroidctl push … of a workspace that also has x_msgs",
+            world.message_name("x_msgs/Lost")
         )
     );
     client
@@ -229,8 +231,8 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
         client.refusal().await,
         format!(
             "subscribe: topic /text has type {}, not {}; use the type that it has",
-            world.spelled("std_msgs/String"),
-            world.spelled("std_msgs/Int32")
+            world.message_name("std_msgs/String"),
+            world.message_name("std_msgs/Int32")
         )
     );
     client
@@ -242,7 +244,7 @@ async fn what_cannot_be_subscribed_to_is_refused_with_the_next_step() {
             .await
             .starts_with("subscribe: \"/no spaces\" is not a ROS name")
     );
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -255,13 +257,13 @@ async fn a_node_that_sends_rubbish_is_named_and_harms_nobody() {
     client
         .send(json!({"op": "subscribe", "topic": "/text"}))
         .await;
-    client.settled().await;
-    connected(publisher.as_ref(), 1).await;
+    client.sync().await;
+    wait_connected(publisher.as_ref(), 1).await;
     for _ in 0..100 {
-        publisher.publish(world.serialized(&[0xff, 0xff, 0xff, 0xff, b'x']));
+        publisher.publish(world.serialize(&[0xff, 0xff, 0xff, 0xff, b'x']));
     }
     let text = client.refusal().await;
-    let of = world.spelled("std_msgs/String");
+    let of = world.message_name("std_msgs/String");
     let expected = format!("subscribe: topic /text: field data of {of}: ");
     assert!(text.starts_with(&expected), "{text}");
     assert!(text.ends_with("(from /node)"), "{text}");
@@ -276,43 +278,45 @@ async fn a_later_publisher_of_another_type_is_named_and_left_out() {
     client
         .send(json!({"op": "subscribe", "id": "s", "topic": "/late", "type": "std_msgs/String"}))
         .await;
-    client.settled().await;
+    client.sync().await;
     let other = world.another_node("/other").await;
     let wrong = world
         .publishes(&*other, "/late", "std_msgs/Int32", false)
         .await;
-    // In ROS 2 ends of other types do not even meet.
+    // In ROS 2 endpoints of different types do not even match.
     if world.version() == RosVersion::One {
-        connected(wrong.as_ref(), 1).await;
+        wait_connected(wrong.as_ref(), 1).await;
     }
     for _ in 0..100 {
         wrong.publish(world.message("std_msgs/Int32", json!({"data": 7})));
     }
     let status = client.json().await;
     let theirs = world.wire_type("std_msgs/Int32");
-    let expected = world.either(
-        "subscribe: topic /late: /other publishes std_msgs/Int32 there, not std_msgs/String; its messages are left out".to_owned(),
+    let expected = world.by_version(
+        "subscribe: topic /late: /other publishes std_msgs/Int32 there, not std_msgs/String; \
+            its messages are dropped".to_owned(),
         format!(
-            "subscribe: topic /late: nothing passes between /other and this client: its type is {theirs} there and std_msgs/msg/String * here"
+            "subscribe: topic /late: no messages pass between /other and this client: its type is {theirs} there and \
+                std_msgs/msg/String * here"
         ),
     );
     assert_eq!(
         status,
         json!({"op": "status", "id": "s", "level": "error", "msg": expected})
     );
-    // The right one is heard, and the wrong one not complained about again and again.
+    // The right one is received, and the wrong one is not reported again and again.
     let right = world
         .node_publishes("/late", "std_msgs/String", false)
         .await;
-    connected(right.as_ref(), 1).await;
+    wait_connected(right.as_ref(), 1).await;
     right.publish(world.message("std_msgs/String", json!({"data": "well"})));
     assert_eq!(client.json().await["msg"]["data"], "well");
-    // The same client cannot want both.
+    // The same client cannot request both.
     client
         .send(json!({"op": "subscribe", "id": "t", "topic": "/late", "type": "std_msgs/Int32"}))
         .await;
     assert!(client.refusal().await.contains("/late"));
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -328,7 +332,7 @@ async fn clients_hear_each_other_and_themselves_but_links_do_not() {
     let subscribe = json!({"op": "subscribe", "topic": "chatter", "type": "std_msgs/String"});
     for client in [&mut speaker, &mut hearer, &mut link] {
         client.send(subscribe.clone()).await;
-        client.settled().await;
+        client.sync().await;
     }
     speaker
         .send(json!({"op": "advertise", "topic": "/chatter", "type": "std_msgs/String"}))
@@ -342,7 +346,7 @@ async fn clients_hear_each_other_and_themselves_but_links_do_not() {
             json!({"op": "publish", "topic": "chatter", "msg": {"data": "hi"}})
         );
     }
-    link.settled().await;
+    link.sync().await;
 }
 
 #[tokio::test]
@@ -353,7 +357,7 @@ async fn the_end_of_a_burst_comes_by_itself() {
         idle_timeout: Duration::ZERO,
         ..patient()
     };
-    let world = World::with(quiet).await;
+    let world = World::with_options(quiet).await;
     let publisher = world
         .node_publishes("/number", "std_msgs/Int32", false)
         .await;
@@ -362,8 +366,8 @@ async fn the_end_of_a_burst_comes_by_itself() {
         client
             .send(json!({"op": "subscribe", "topic": "/number", "throttle_rate": 20, "queue_length": 2}))
             .await;
-        client.settled().await;
-        connected(publisher.as_ref(), 1).await;
+        client.sync().await;
+        wait_connected(publisher.as_ref(), 1).await;
         for number in 1..=10 {
             publisher.publish(world.message("std_msgs/Int32", json!({"data": number})));
         }

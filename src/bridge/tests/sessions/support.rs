@@ -1,4 +1,4 @@
-//! The world in which the tests happen.
+//! Environment of the tests.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,7 +8,9 @@ use bridge::{Bridge, BridgeOptions, SessionEnd, SessionOptions};
 use bytes::Bytes;
 use futures_util::{SinkExt, StreamExt};
 use ros::JoinOptions;
-use ros::bus::{Bus, Graph, Publisher, Qos, RosVersion, ServiceType, Subscription, WireType};
+use ros::bus::{
+    Bus, Graph, Publisher, QosProfile, RosVersion, ServiceType, Subscription, WireType,
+};
 use ros::codec::{self, FillOptions, JsonOptions};
 use ros::net::HostSockets;
 use ros::ros1::master::{Master, MasterOptions};
@@ -23,7 +25,7 @@ use tokio_tungstenite::tungstenite::protocol::{Message, Role, WebSocketConfig};
 
 use crate::memory_bus::MemorySystem;
 
-/// Only bounds how long a failing test takes.
+/// Bounds the duration of a failing test.
 pub const PATIENCE: Duration = Duration::from_secs(120);
 
 const DEFINITIONS: &[(&str, &str)] = &[
@@ -45,7 +47,7 @@ const DEFINITIONS: &[(&str, &str)] = &[
     ("x_msgs/action/Dig", "int32 to\n---\n---\n"),
 ];
 
-/// Options with which nothing is given up because the machine is busy.
+/// Returns options with which nothing is given up on a busy machine.
 pub fn patient() -> BridgeOptions {
     BridgeOptions {
         idle_timeout: PATIENCE,
@@ -57,20 +59,20 @@ pub fn patient() -> BridgeOptions {
     }
 }
 
-/// A ROS system that nodes join.
+/// A ROS system that nodes can join.
 #[async_trait]
 pub trait System: Sized + Send + Sync + 'static {
-    /// Which ROS its nodes speak.
+    /// ROS version of its nodes.
     const VERSION: RosVersion;
-    /// The host that its nodes seem to run on.
+    /// Host that its nodes appear to run on.
     const HOST: &str;
-    /// A new one.
+    /// Starts a new system.
     async fn start() -> Self;
     /// Joins it as a node of this name.
     async fn join(&self, node: &str) -> Arc<dyn Bus>;
 }
 
-/// A real Master, real TCPROS on loopback.
+/// A real Master, and real TCPROS on loopback.
 pub struct Ros1 {
     address: std::net::SocketAddr,
     master: JoinHandle<()>,
@@ -123,22 +125,22 @@ impl System for Arc<MemorySystem> {
 /// A ROS system with a node in it, and a bridge.
 pub struct World<S> {
     pub bridge: Arc<Bridge>,
-    /// The servant's node.
+    /// Node of the servant.
     pub node: Arc<dyn Bus>,
     pub registry: Arc<Registry>,
     pub system: S,
-    /// As the bridge sees it.
+    /// The graph as the bridge sees it.
     seen: watch::Receiver<Arc<Graph>>,
 }
 
 impl<S: System> World<S> {
     pub async fn new() -> Self {
-        Self::with(patient()).await
+        Self::with_options(patient()).await
     }
 
-    pub async fn with(options: BridgeOptions) -> Self {
+    pub async fn with_options(options: BridgeOptions) -> Self {
         let system = S::start().await;
-        let registry = Registry::of(S::VERSION);
+        let registry = Registry::for_version(S::VERSION);
         for (key, text) in DEFINITIONS {
             registry.insert(key, text).unwrap();
         }
@@ -156,35 +158,35 @@ impl<S: System> World<S> {
         }
     }
 
-    /// The host that nodes seem to run on.
+    /// Returns the host that nodes appear to run on.
     pub fn host(&self) -> &'static str {
         S::HOST
     }
 
-    /// Which ROS it is.
+    /// Returns the ROS version.
     pub fn version(&self) -> RosVersion {
         S::VERSION
     }
 
-    /// The first in ROS 1, the second in ROS 2.
-    pub fn either<T>(&self, one: T, two: T) -> T {
+    /// Returns the first value in ROS 1, the second in ROS 2.
+    pub fn by_version<T>(&self, one: T, two: T) -> T {
         match S::VERSION {
             RosVersion::One => one,
             RosVersion::Two => two,
         }
     }
 
-    /// The name of a message's type, `package/Type`, as its ROS writes it.
-    pub fn spelled(&self, name: &str) -> String {
+    /// Returns the name of a message's type, `package/Type`, as spelled by its ROS.
+    pub fn message_name(&self, name: &str) -> String {
         self.full_name(name, "msg")
     }
 
-    /// The same for a service's type (`srv`) or an action's (`action`).
+    /// Returns the name of a service's type (`srv`) or an action's (`action`), as spelled by its ROS.
     pub fn full_name(&self, name: &str, kind: &str) -> String {
-        self.either(name.to_owned(), name.replacen('/', &format!("/{kind}/"), 1))
+        self.by_version(name.to_owned(), name.replacen('/', &format!("/{kind}/"), 1))
     }
 
-    /// The name of a request's type, of a service `package/Type`.
+    /// Returns the name of the request's type of a service `package/Type`.
     pub fn request_name(&self, service: &str) -> String {
         self.registry
             .service(service)
@@ -194,46 +196,46 @@ impl<S: System> World<S> {
             .to_owned()
     }
 
-    /// The type of a service, `package/Type`.
+    /// Returns the type of a service, `package/Type`.
     pub fn service_type(&self, service: &str) -> ServiceType {
-        ServiceType::of(&self.registry.service(service).unwrap())
+        ServiceType::from_service(&self.registry.service(service).unwrap())
     }
 
-    /// What tells definitions apart.
+    /// Returns the term for what identifies a definition.
     pub fn digest_word(&self) -> &'static str {
-        self.either("MD5", "type hash")
+        self.by_version("MD5", "type hash")
     }
 
-    /// A stamp in JSON.
+    /// Returns a stamp in JSON.
     pub fn time(&self, secs: u32, nsecs: u32) -> Value {
-        self.either(
+        self.by_version(
             serde_json::json!({"secs": secs, "nsecs": nsecs}),
             serde_json::json!({"sec": secs, "nanosec": nsecs}),
         )
     }
 
-    /// The seconds of a stamp in JSON.
+    /// Returns the seconds of a stamp in JSON.
     pub fn seconds(&self, stamp: &Value) -> u64 {
-        stamp[self.either("secs", "sec")].as_u64().unwrap()
+        stamp[self.by_version("secs", "sec")].as_u64().unwrap()
     }
 
-    /// Values one after the other, little endian and aligned, as a serialized message.
-    pub fn serialized(&self, values: &[u8]) -> Bytes {
-        let header = self.either(&b""[..], &b"\0\x01\0\0"[..]);
+    /// Returns values in sequence, little-endian and aligned, as a serialized message.
+    pub fn serialize(&self, values: &[u8]) -> Bytes {
+        let header = self.by_version(&b""[..], &b"\0\x01\0\0"[..]);
         [header, values].concat().into()
     }
 
-    /// The values of a serialized message.
+    /// Returns the values of a serialized message.
     pub fn values<'b>(&self, bytes: &'b [u8]) -> &'b [u8] {
-        &bytes[self.either(0, 4)..]
+        &bytes[self.by_version(0, 4)..]
     }
 
-    /// Another node.
+    /// Joins another node.
     pub async fn another_node(&self, name: &str) -> Arc<dyn Bus> {
         self.system.join(name).await
     }
 
-    /// A bridge of its own at the same Master.
+    /// Creates another bridge with the same Master.
     pub async fn another_bridge(&self) -> Arc<Bridge> {
         Bridge::new(
             self.another_node("/other_bridge").await,
@@ -250,7 +252,7 @@ impl<S: System> World<S> {
         Client::connect(&self.bridge, options).await
     }
 
-    /// Serialized from JSON.
+    /// Serializes a message from JSON.
     pub fn message(&self, type_name: &str, json: Value) -> Bytes {
         let message_type = self.registry.message(type_name).unwrap();
         let mut out = Vec::new();
@@ -273,7 +275,7 @@ impl<S: System> World<S> {
 
     pub fn wire_type(&self, type_name: &str) -> WireType {
         let message_type = self.registry.message(type_name).unwrap();
-        WireType::of(&message_type)
+        WireType::from_message(&message_type)
     }
 
     pub async fn node_publishes(
@@ -296,43 +298,51 @@ impl<S: System> World<S> {
             .advertise(
                 topic,
                 self.wire_type(type_name),
-                Qos::keep_last(10_000).latching(latch),
+                QosProfile::keep_last(10_000).latching(latch),
             )
             .await
             .unwrap();
-        self.in_graph(|graph| graph.topics.contains_key(topic))
+        self.wait_for_graph(|graph| graph.topics.contains_key(topic))
             .await;
         publisher
     }
 
     pub async fn node_subscribes(&self, topic: &str, type_name: &str) -> Subscription {
         self.node
-            .subscribe(topic, self.wire_type(type_name), Qos::keep_last(10_000))
+            .subscribe(
+                topic,
+                self.wire_type(type_name),
+                QosProfile::keep_last(10_000),
+            )
             .await
             .unwrap()
     }
 
-    /// Waits until both the node and the bridge see the graph so.
-    pub async fn in_graph(&self, condition: impl Fn(&Graph) -> bool) {
+    /// Waits until the graph satisfies the condition for both the node and the bridge.
+    pub async fn wait_for_graph(&self, condition: impl Fn(&Graph) -> bool) {
         for mut graph in [self.node.graph(), self.seen.clone()] {
-            let seen = patiently(graph.wait_for(|graph| condition(graph))).await;
+            let seen = with_timeout(graph.wait_for(|graph| condition(graph))).await;
             seen.unwrap();
         }
     }
 }
 
-/// Waits for something that must come.
-pub async fn patiently<F: Future>(future: F) -> F::Output {
+/// Waits for something that must happen.
+pub async fn with_timeout<F: Future>(future: F) -> F::Output {
     tokio::time::timeout(PATIENCE, future)
         .await
         .expect("it did not happen in time")
 }
 
-/// Waits until somebody has connected to a publisher.
-pub async fn connected(publisher: &dyn Publisher, count: usize) {
-    patiently(publisher.matched().wait_for(|now| now.connected() >= count))
-        .await
-        .unwrap();
+/// Waits until `count` subscribers have connected to a publisher.
+pub async fn wait_connected(publisher: &dyn Publisher, count: usize) {
+    with_timeout(
+        publisher
+            .matched_subscribers()
+            .wait_for(|now| now.connected_count() >= count),
+    )
+    .await
+    .unwrap();
 }
 
 /// A client of the bridge.
@@ -360,13 +370,13 @@ impl Client {
     }
 
     pub async fn send_text(&mut self, text: &str) {
-        patiently(self.socket.send(Message::text(text)))
+        with_timeout(self.socket.send(Message::text(text)))
             .await
             .unwrap();
     }
 
     pub async fn send_binary(&mut self, bytes: Vec<u8>) {
-        patiently(self.socket.send(Message::binary(bytes)))
+        with_timeout(self.socket.send(Message::binary(bytes)))
             .await
             .unwrap();
     }
@@ -375,13 +385,13 @@ impl Client {
         &mut self,
         message: Message,
     ) -> Result<(), tokio_tungstenite::tungstenite::Error> {
-        patiently(self.socket.send(message)).await
+        with_timeout(self.socket.send(message)).await
     }
 
-    /// The next WebSocket message, whatever it is.
+    /// Receives the next WebSocket message except pings and pongs.
     pub async fn next(&mut self) -> Message {
         loop {
-            match patiently(self.socket.next())
+            match with_timeout(self.socket.next())
                 .await
                 .expect("the connection ended")
                 .unwrap()
@@ -392,7 +402,7 @@ impl Client {
         }
     }
 
-    /// The next text message.
+    /// Receives the next text message.
     pub async fn text(&mut self) -> String {
         match self.next().await {
             Message::Text(text) => text.to_string(),
@@ -400,12 +410,12 @@ impl Client {
         }
     }
 
-    /// The next message, in JSON.
+    /// Receives the next message, in JSON.
     pub async fn json(&mut self) -> Value {
         serde_json::from_str(&self.text().await).unwrap()
     }
 
-    /// The next binary message.
+    /// Receives the next binary message.
     pub async fn binary(&mut self) -> Bytes {
         match self.next().await {
             Message::Binary(bytes) => bytes,
@@ -413,7 +423,7 @@ impl Client {
         }
     }
 
-    /// Checks that the next message is a status error, and gives its text.
+    /// Asserts that the next message is a status at level error, and returns its text.
     pub async fn refusal(&mut self) -> String {
         let status = self.json().await;
         assert_eq!(
@@ -424,30 +434,32 @@ impl Client {
         status["msg"].as_str().unwrap().to_owned()
     }
 
-    /// Checks that the server has understood everything sent so far and lives.
-    pub async fn settled(&mut self) {
-        self.send(serde_json::json!({"op": "call_service", "id": "settled", "service": "/rosapi/get_ros_version"})).await;
+    /// Asserts that the server has handled everything sent so far, and that the connection is open.
+    pub async fn sync(&mut self) {
+        self.send(serde_json::json!({"op": "call_service", "id": "settled",
+            "service": "/rosapi/get_ros_version"}))
+            .await;
         let answer = self.json().await;
         assert_eq!(answer["id"], "settled", "{answer}");
     }
 
     /// Waits for the close frame, and answers it.
-    pub async fn closed(&mut self) -> (u16, String) {
+    pub async fn expect_close(&mut self) -> (u16, String) {
         let close = loop {
             if let Message::Close(close) = self.next().await {
                 break close;
             }
         };
         // The server may have gone without waiting for it.
-        let _ = patiently(self.socket.flush()).await;
+        let _ = with_timeout(self.socket.flush()).await;
         close.map_or((1005, String::new()), |close| {
             (close.code.into(), close.reason.to_string())
         })
     }
 
-    /// Breaks the connection without a word.
-    pub async fn lose(self) -> SessionEnd {
+    /// Drops the connection without closing it.
+    pub async fn abort(self) -> SessionEnd {
         drop(self.socket);
-        patiently(self.session).await.unwrap()
+        with_timeout(self.session).await.unwrap()
     }
 }

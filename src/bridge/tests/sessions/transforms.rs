@@ -1,9 +1,9 @@
-//! The interface of tf2_web_republisher, as roslibjs's and roslibpy's TF clients use it.
+//! The interface of tf2_web_republisher, as used by the TF clients of roslibjs and roslibpy.
 
 use ros::bus::Publisher;
 use serde_json::{Value, json};
 
-use super::support::{Client, World, connected, patiently};
+use super::support::{Client, World, wait_connected, with_timeout};
 
 const TF: &str = "geometry_msgs/TransformStamped[] transforms\n";
 
@@ -14,7 +14,7 @@ pub(super) async fn tf_publisher(world: &World) -> Box<dyn Publisher> {
         .await
 }
 
-fn moved(world: &World, publisher: &dyn Publisher, child: &str, x: f64) {
+fn publish_transform(world: &World, publisher: &dyn Publisher, child: &str, x: f64) {
     let transform = json!({
         "header": {"frame_id": "world", "stamp": world.time(1_000_000, 5)},
         "child_frame_id": child,
@@ -23,19 +23,19 @@ fn moved(world: &World, publisher: &dyn Publisher, child: &str, x: f64) {
     publisher.publish(world.message("tf2_msgs/TFMessage", json!({"transforms": [transform]})));
 }
 
-pub(super) fn wanted(frame: &str) -> Value {
+pub(super) fn transform_args(frame: &str) -> Value {
     json!({
         "source_frames": [frame], "target_frame": "/world",
         "angular_thres": 0.1, "trans_thres": 0.5, "rate": 100.0,
     })
 }
 
-/// Where the republisher's types are.
+/// Returns the package of the republisher's types.
 fn package(world: &World) -> &'static str {
-    world.either("tf2_web_republisher", "tf2_web_republisher_interfaces")
+    world.by_version("tf2_web_republisher", "tf2_web_republisher_interfaces")
 }
 
-/// A call of the service.
+/// Returns a call of the service.
 fn republish(world: &World, args: &Value) -> Value {
     let type_name = format!("{}/RepublishTFs", package(world));
     json!({"op": "call_service", "service": "/republish_tfs", "type": type_name, "args": args})
@@ -54,21 +54,21 @@ pub(super) fn x_of(world: &World, transforms: &Value) -> f64 {
         ),
         (&json!("world"), &json!("turtle"))
     );
-    // It was there then, whenever it is told.
+    // The time of the transform, whenever it is sent.
     assert_eq!(transforms[0]["header"]["stamp"], world.time(1_000_000, 5));
     transforms[0]["transform"]["translation"]["x"]
         .as_f64()
         .unwrap()
 }
 
-/// Repeats what has no other sign of having arrived than its effect.
+/// Repeats a message whose arrival only shows by its effect.
 pub(super) async fn until_heard(
     world: &World,
     publisher: &dyn Publisher,
     client: &mut Client,
 ) -> Value {
-    connected(publisher, 1).await;
-    moved(world, publisher, "turtle", 1.0);
+    wait_connected(publisher, 1).await;
+    publish_transform(world, publisher, "turtle", 1.0);
     client.json().await
 }
 
@@ -77,7 +77,7 @@ async fn a_topic_made_for_the_caller_says_what_has_moved() {
     let world = World::new().await;
     let publisher = tf_publisher(&world).await;
     let mut client = world.client().await;
-    let mut args = wanted("turtle");
+    let mut args = transform_args("turtle");
     args["timeout"] = world.time(2, 0);
     client.send(republish(&world, &args)).await;
     let answer = client.json().await;
@@ -90,8 +90,8 @@ async fn a_topic_made_for_the_caller_says_what_has_moved() {
         (&topic, 1.0)
     );
     // Too little, then enough.
-    moved(&world, publisher.as_ref(), "turtle", 1.2);
-    moved(&world, publisher.as_ref(), "turtle", 3.0);
+    publish_transform(&world, publisher.as_ref(), "turtle", 1.2);
+    publish_transform(&world, publisher.as_ref(), "turtle", 3.0);
     let moved = client.json().await;
     assert_eq!(x_of(&world, &moved["msg"]["transforms"]), 3.0);
 }
@@ -101,11 +101,13 @@ async fn what_does_not_move_is_told_to_who_listens_late_and_to_who_listens_again
     let world = World::new().await;
     let publisher = tf_publisher(&world).await;
     let mut client = world.client().await;
-    client.send(republish(&world, &wanted("turtle"))).await;
+    client
+        .send(republish(&world, &transform_args("turtle")))
+        .await;
     let topic = client.json().await["values"]["topic_name"].clone();
-    connected(publisher.as_ref(), 1).await;
-    moved(&world, publisher.as_ref(), "turtle", 1.0);
-    // It has been told when somebody else has heard it.
+    wait_connected(publisher.as_ref(), 1).await;
+    publish_transform(&world, publisher.as_ref(), "turtle", 1.0);
+    // It has been sent when another client has received it.
     let mut other = world.client().await;
     other.send(subscribe(&world, &topic)).await;
     let told = other.json().await;
@@ -117,14 +119,14 @@ async fn what_does_not_move_is_told_to_who_listens_late_and_to_who_listens_again
         client
             .send(json!({"op": "unsubscribe", "topic": topic}))
             .await;
-        client.settled().await;
+        client.sync().await;
     }
 }
 
 fn goal(world: &World) -> Value {
     let type_name = format!("{}/TFSubscription", package(world));
     json!({"op": "send_action_goal", "id": "g", "action": "/tf2_web_republisher", "action_type": type_name,
-        "args": wanted("turtle"), "feedback": true})
+        "args": transform_args("turtle"), "feedback": true})
 }
 
 #[tokio::test]
@@ -139,7 +141,7 @@ async fn a_goal_carries_transforms_as_feedback_until_it_is_cancelled() {
         (&json!("action_feedback"), &json!("g"))
     );
     assert_eq!(x_of(&world, &heard["values"]["transforms"]), 1.0);
-    moved(&world, publisher.as_ref(), "turtle", 3.0);
+    publish_transform(&world, publisher.as_ref(), "turtle", 3.0);
     let heard = client.json().await;
     assert_eq!(x_of(&world, &heard["values"]["transforms"]), 3.0);
     client
@@ -151,9 +153,13 @@ async fn a_goal_carries_transforms_as_feedback_until_it_is_cancelled() {
             "result": true})
     );
     // Nobody needs /tf any more.
-    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
-        .await
-        .unwrap();
+    with_timeout(
+        publisher
+            .matched_subscribers()
+            .wait_for(|now| now.connected_count() == 0),
+    )
+    .await
+    .unwrap();
 }
 
 #[tokio::test]
@@ -162,9 +168,13 @@ async fn the_goals_of_a_client_that_is_gone_are_given_up() {
     let publisher = tf_publisher(&world).await;
     let mut client = world.client().await;
     client.send(goal(&world)).await;
-    connected(publisher.as_ref(), 1).await;
-    client.lose().await;
-    patiently(publisher.matched().wait_for(|now| now.connected() == 0))
-        .await
-        .unwrap();
+    wait_connected(publisher.as_ref(), 1).await;
+    client.abort().await;
+    with_timeout(
+        publisher
+            .matched_subscribers()
+            .wait_for(|now| now.connected_count() == 0),
+    )
+    .await
+    .unwrap();
 }

@@ -1,9 +1,9 @@
-//! Connections whose servant is not there yet.
+//! Connections whose servant is not ready yet.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge::{BridgeOptions, SessionEnd, SessionOptions, Waiting};
+use bridge::{BridgeOptions, SessionEnd, SessionOptions, WaitingConnection};
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
 use tokio::io::DuplexStream;
@@ -11,51 +11,54 @@ use tokio::sync::oneshot;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role};
 
-use super::support::{World, patiently};
+use super::support::{World, with_timeout};
 
 type Socket = WebSocketStream<DuplexStream>;
 
-/// A connection that waits, and its client's end.
-async fn connection(options: &BridgeOptions) -> (Waiting<DuplexStream>, Socket) {
+/// Creates a waiting connection, and its client's end.
+async fn connection(options: &BridgeOptions) -> (WaitingConnection<DuplexStream>, Socket) {
     let (ours, theirs) = tokio::io::duplex(64 * 1024);
     let client = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
-    (Waiting::new(ours, b"", options), client)
+    (WaitingConnection::new(ours, b"", options), client)
 }
 
 async fn next(client: &mut Socket) -> Message {
-    patiently(client.next()).await.expect("a message").unwrap()
+    with_timeout(client.next())
+        .await
+        .expect("a message")
+        .unwrap()
 }
 
 #[tokio::test]
 async fn who_leaves_is_answered_at_once_and_needs_nothing_any_more() {
     let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
-    // The servant never comes; `given_up` tells when nobody waits for it any more.
+    // The servant never becomes ready; `given_up` completes when nobody waits for it any more.
     let (place, given_up) = oneshot::channel::<()>();
     let waits = tokio::spawn(async move {
         let servant = async {
             let _place = place;
             std::future::pending::<()>().await
         };
-        waiting.until(servant).await
+        waiting.wait_for(servant).await
     });
     client.send(Message::Ping("p".into())).await.unwrap();
     assert_eq!(next(&mut client).await, Message::Pong("p".into()));
     client.close(None).await.unwrap();
     assert_eq!(next(&mut client).await, Message::Close(None));
-    let end = patiently(waits).await.unwrap().unwrap_err();
+    let end = with_timeout(waits).await.unwrap().unwrap_err();
     assert!(
         matches!(end, SessionEnd::Client { code: 1005, .. }),
         "{end:?}"
     );
-    assert!(patiently(given_up).await.is_err());
+    assert!(with_timeout(given_up).await.is_err());
 }
 
 #[tokio::test]
 async fn who_is_gone_without_a_word_needs_nothing_any_more() {
     let (mut waiting, client) = connection(&BridgeOptions::default()).await;
-    let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+    let waits = tokio::spawn(async move { waiting.wait_for(std::future::pending::<()>()).await });
     drop(client);
-    let end = patiently(waits).await.unwrap().unwrap_err();
+    let end = with_timeout(waits).await.unwrap().unwrap_err();
     assert!(matches!(end, SessionEnd::Lost(_)), "{end:?}");
 
     // Nor does one whose line is dead.
@@ -66,7 +69,7 @@ async fn who_is_gone_without_a_word_needs_nothing_any_more() {
         ..BridgeOptions::default()
     };
     let (mut waiting, _silent) = connection(&impatient).await;
-    let end = patiently(waiting.until(std::future::pending::<()>())).await;
+    let end = with_timeout(waiting.wait_for(std::future::pending::<()>())).await;
     assert!(
         matches!(end, Err(SessionEnd::Closed { code: 1001, .. })),
         "{end:?}"
@@ -81,7 +84,7 @@ async fn what_was_said_meanwhile_is_carried_out_in_order() {
     let (come, servant) = oneshot::channel();
     let bridge = world.bridge.clone();
     let session = tokio::spawn(async move {
-        let bridge: Arc<bridge::Bridge> = waiting.until(servant).await.unwrap().unwrap();
+        let bridge: Arc<bridge::Bridge> = waiting.wait_for(servant).await.unwrap().unwrap();
         bridge
             .serve_waiting(waiting, SessionOptions::default())
             .await
@@ -93,7 +96,7 @@ async fn what_was_said_meanwhile_is_carried_out_in_order() {
         ))
         .await
         .unwrap();
-    // More than the socket holds: nothing of it is lost.
+    // More than the socket holds: none of it is lost.
     let padding = "x".repeat(40_000);
     let messages = 60;
     let (mut sending, mut receiving) = client.split();
@@ -105,21 +108,21 @@ async fn what_was_said_meanwhile_is_carried_out_in_order() {
         }
         sending
     });
-    // It is read before there is a servant: a ping in the middle would be answered, too.
+    // It is read before the servant is ready: a ping in the middle would be answered, too.
     let mut ahead = world.client().await;
-    ahead.settled().await;
+    ahead.sync().await;
     come.send(bridge).ok().unwrap();
     for number in 0..messages {
-        let message = patiently(heard.messages.recv()).await.unwrap();
+        let message = with_timeout(heard.messages.recv()).await.unwrap();
         let data = world.json("std_msgs/String", &message.bytes)["data"].clone();
         let data = data.as_str().unwrap();
         assert_eq!(data.trim_end_matches('x'), number.to_string());
     }
-    let mut sending = patiently(talk).await.unwrap();
+    let mut sending = with_timeout(talk).await.unwrap();
     sending.send(Message::Close(None)).await.unwrap();
-    let closed = patiently(receiving.next()).await.unwrap().unwrap();
+    let closed = with_timeout(receiving.next()).await.unwrap().unwrap();
     assert_eq!(closed, Message::Close(None));
-    patiently(session).await.unwrap();
+    with_timeout(session).await.unwrap();
 }
 
 #[tokio::test]
@@ -132,15 +135,15 @@ async fn who_cannot_have_a_servant_is_told_why() {
         panic!("not closed")
     };
     assert_eq!(u16::from(close.code), 1013);
-    while patiently(client.next()).await.is_some() {}
-    patiently(refusing).await.unwrap();
+    while with_timeout(client.next()).await.is_some() {}
+    with_timeout(refusing).await.unwrap();
 }
 
-/// Says the same so often.
+/// Sends the same message this many times.
 async fn say(client: &mut Socket, message: &Value, times: usize) {
     for _ in 0..times {
         let message = Message::text(message.to_string());
-        patiently(client.send(message)).await.unwrap();
+        with_timeout(client.send(message)).await.unwrap();
     }
 }
 
@@ -152,7 +155,7 @@ async fn who_has_said_much_is_heard_all_the_same() {
     let (ready, readiness) = oneshot::channel::<()>();
     let bridge = Arc::clone(&world.bridge);
     let served = tokio::spawn(async move {
-        waiting.until(readiness).await.unwrap().unwrap();
+        waiting.wait_for(readiness).await.unwrap().unwrap();
         bridge
             .serve_waiting(waiting, SessionOptions::default())
             .await
@@ -163,21 +166,21 @@ async fn who_has_said_much_is_heard_all_the_same() {
     say(&mut client, &publish, 11_000).await;
     client.send(Message::Ping("p".into())).await.unwrap();
     let told = next(&mut client).await.into_text().unwrap();
-    assert!(told.contains("publish: too much waits"), "{told}");
+    assert!(told.contains("publish: too many messages wait"), "{told}");
     assert_eq!(next(&mut client).await, Message::Pong("p".into()));
     ready.send(()).unwrap();
-    let message = patiently(heard.messages.recv()).await.unwrap();
+    let message = with_timeout(heard.messages.recv()).await.unwrap();
     assert_eq!(world.json("std_msgs/String", &message.bytes)["data"], "x");
     client.close(None).await.unwrap();
-    while patiently(client.next()).await.is_some() {}
-    patiently(served).await.unwrap();
+    while with_timeout(client.next()).await.is_some() {}
+    with_timeout(served).await.unwrap();
 
     // And may leave.
     let (mut waiting, mut client) = connection(&BridgeOptions::default()).await;
-    let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+    let waits = tokio::spawn(async move { waiting.wait_for(std::future::pending::<()>()).await });
     say(&mut client, &publish, 11_000).await;
     client.close(None).await.unwrap();
-    let end = patiently(waits).await.unwrap().unwrap_err();
+    let end = with_timeout(waits).await.unwrap().unwrap_err();
     assert!(matches!(end, SessionEnd::Client { .. }), "{end:?}");
 }
 
@@ -189,14 +192,15 @@ async fn who_asks_for_more_than_is_kept_is_refused_with_a_reason() {
         (400_000, 4, "the memory for client x"),
     ] {
         let (waiting, mut client) = connection(&BridgeOptions::default()).await;
-        let mut waiting = waiting.within(&budget);
-        let waits = tokio::spawn(async move { waiting.until(std::future::pending::<()>()).await });
+        let mut waiting = waiting.with_budget(&budget);
+        let waits =
+            tokio::spawn(async move { waiting.wait_for(std::future::pending::<()>()).await });
         let call =
             json!({"op": "call_service", "service": "/s", "args": {"x": "x".repeat(length)}});
         say(&mut client, &call, times).await;
         let told = next(&mut client).await.into_text().unwrap();
         assert!(told.contains(reason), "{told}");
-        let end = patiently(async {
+        let end = with_timeout(async {
             while let Some(Ok(_)) = client.next().await {}
             waits.await.unwrap().unwrap_err()
         })
@@ -205,6 +209,6 @@ async fn who_asks_for_more_than_is_kept_is_refused_with_a_reason() {
             matches!(end, SessionEnd::Closed { code: 1013, .. }),
             "{end:?}"
         );
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 }

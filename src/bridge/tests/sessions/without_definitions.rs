@@ -1,7 +1,7 @@
-//! Types whose definitions do not come with messages, as in ROS 2: the servant's own are all there are.
+//! Types whose definitions are not sent with messages, as in ROS 2: only the servant's own exist.
 
-use ros::bus::{Bus, Digest, Qos, WireType};
-use rosbridge::{Frame, Op};
+use ros::bus::{Bus, Digest, QosProfile, WireType};
+use rosbridge::{Op, ProtocolFrame};
 use serde_json::json;
 
 use super::support::World;
@@ -13,12 +13,12 @@ async fn a_topic_whose_type_nobody_has_defined_is_refused_by_name_but_as_ros_byt
         name: "y_msgs/msg/New".to_owned(),
         ..world.wire_type("std_msgs/Int32")
     };
-    let qos = Qos::keep_last(1).latching(true);
+    let qos = QosProfile::keep_last(1).latching(true);
     let publisher = Bus::advertise(&*world.node, "/new", of, qos).await.unwrap();
-    let message = world.serialized(&[7, 0, 0, 0]);
+    let message = world.serialize(&[7, 0, 0, 0]);
     publisher.publish(message.clone());
     world
-        .in_graph(|graph| graph.topics.contains_key("/new"))
+        .wait_for_graph(|graph| graph.topics.contains_key("/new"))
         .await;
     let mut client = world.client().await;
     for type_name in [None, Some("y_msgs/New")] {
@@ -27,17 +27,18 @@ async fn a_topic_whose_type_nobody_has_defined_is_refused_by_name_but_as_ros_byt
             .await;
         assert_eq!(
             client.refusal().await,
-            "subscribe: topic /new: no definition of y_msgs/msg/New is known here; whoever deploys this service can add it: cloudroidctl push … of a workspace that has y_msgs, too"
+            "subscribe: topic /new: no definition of y_msgs/msg/New is known here; the deployer of this service can \
+                add it: cloudroidctl push … of a workspace that also has y_msgs"
         );
     }
     client
         .send(json!({"op": "subscribe", "topic": "/new", "compression": "cbor-raw"}))
         .await;
     let frame = client.binary().await;
-    let Op::Publish(heard) = Op::parse(Frame::Binary(&frame)).unwrap() else {
+    let Op::Publish(heard) = Op::parse(ProtocolFrame::Binary(&frame)).unwrap() else {
         panic!("{frame:?}")
     };
-    // As they were on the wire, the header of their serialization included.
+    // As they were on the wire, including the header of their serialization.
     assert_eq!(*heard.msg.raw().unwrap().bytes, message);
 }
 
@@ -50,11 +51,11 @@ async fn a_publisher_of_another_type_hash_is_named() {
         digest: theirs.clone(),
         ..ours.clone()
     };
-    let qos = Qos::keep_last(1).latching(true);
+    let qos = QosProfile::keep_last(1).latching(true);
     let publisher = Bus::advertise(&*world.node, "/tag", of, qos).await.unwrap();
     publisher.publish(world.message("x_msgs/Tag", json!({"name": "x"})));
     world
-        .in_graph(|graph| graph.topics.contains_key("/tag"))
+        .wait_for_graph(|graph| graph.topics.contains_key("/tag"))
         .await;
     let mut client = world.client().await;
     client
@@ -67,7 +68,7 @@ async fn a_publisher_of_another_type_hash_is_named() {
             ours.digest
         )
     );
-    client.settled().await;
+    client.sync().await;
 }
 
 #[tokio::test]
@@ -79,7 +80,9 @@ async fn who_uses_an_action_by_topics_is_told_the_operation() {
         .await;
     assert_eq!(
         client.refusal().await,
-        "advertise: topic /count/goal: no definition of x_msgs/msg/CountActionGoal is known here: actions of ROS 1 are made of topics with such messages, and this servant speaks ROS 2; use send_action_goal and advertise_action"
+        "advertise: topic /count/goal: no definition of x_msgs/msg/CountActionGoal is known here: ROS 1 actions \
+            consist of topics with such messages, but this servant uses ROS 2; use send_action_goal and \
+            advertise_action"
     );
-    client.settled().await;
+    client.sync().await;
 }

@@ -1,11 +1,11 @@
-//! What becomes of what an earlier daemon left.
+//! Decides about containers that an earlier daemon left.
 
-/// A container that runs although this daemon did not start it.
+/// A running container that this daemon did not start.
 #[derive(Debug, Clone, Copy)]
-pub struct Found {
-    /// The database knows it as a robot's servant.
+pub struct LeftoverContainer {
+    /// The database lists it as a robot's servant.
     pub recorded: bool,
-    /// The database knows it as one that was ready for a robot that had not come.
+    /// The database lists it as kept ready for a robot that had not come.
     pub nobodys: bool,
     /// The revision that it was started from is known.
     pub published: bool,
@@ -13,46 +13,46 @@ pub struct Found {
     pub empty: bool,
 }
 
-/// What becomes of it.
+/// The fate of a left container.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fate {
-    /// It is its robot's servant, as before.
+pub enum LeftoverFate {
+    /// It stays its robot's servant.
     Kept,
-    /// It is ended, and nobody is told: of the warm pool, or killed before it had nodes.
+    /// It is ended without an event: it belonged to the warm pool, or was killed before it had nodes.
     Unused,
-    /// It is ended, and its end is told.
+    /// It is ended with an event.
     Unknown,
 }
 
-/// What becomes of one.
-pub fn fate(found: Found) -> Fate {
+/// Decides what is done with a left container.
+pub fn decide_fate(found: LeftoverContainer) -> LeftoverFate {
     match found {
-        Found { nobodys: true, .. } => Fate::Unused,
-        Found {
+        LeftoverContainer { nobodys: true, .. } => LeftoverFate::Unused,
+        LeftoverContainer {
             recorded: true,
             published: true,
             ..
-        } => Fate::Kept,
-        Found {
+        } => LeftoverFate::Kept,
+        LeftoverContainer {
             recorded: false,
             empty: true,
             ..
-        } => Fate::Unused,
-        _ => Fate::Unknown,
+        } => LeftoverFate::Unused,
+        _ => LeftoverFate::Unknown,
     }
 }
 
-/// A node that was started in it.
+/// A node that was started in the container.
 #[derive(Debug, Clone, Copy)]
-pub struct Started {
-    /// It has the name of one of the revision's own nodes, as a stub's node has where its robot gives no other.
+pub struct StartedNode {
+    /// It has the name of one of the revision's own nodes, like a stub's node whose robot gives no other name.
     pub planned: bool,
-    /// Whoever started it said for which run, as stubs do.
+    /// The run was stated when it was started, as stubs do.
     pub run: bool,
 }
 
-/// Whether its robot's stubs start and end its nodes. Those of earlier versions do not say for which run.
-pub fn is_linked(started: &[Started]) -> bool {
+/// Returns true if the robot's stubs start and end its nodes. Stubs of earlier versions do not state the run.
+pub fn is_linked(started: &[StartedNode]) -> bool {
     started.iter().any(|node| node.run) || !started.iter().any(|node| node.planned)
 }
 
@@ -66,16 +66,16 @@ mod tests {
             (&[][..], true),
             (&[(false, true)], true),
             (&[(false, false)], true),
-            // One of the package's nodes, under the name that it always has; the package may have others.
+            // One of the package's nodes, under its default name; the package may have others.
             (&[(true, true)], true),
             (&[(true, false), (true, true)], true),
             (&[(true, false), (true, false)], false),
         ] {
-            let nodes = started.iter().map(|(planned, run)| Started {
+            let nodes = started.iter().map(|(planned, run)| StartedNode {
                 planned: *planned,
                 run: *run,
             });
-            let nodes: Vec<Started> = nodes.collect();
+            let nodes: Vec<StartedNode> = nodes.collect();
             assert_eq!(is_linked(&nodes), linked, "{started:?}");
         }
     }
@@ -83,24 +83,24 @@ mod tests {
     #[test]
     fn what_was_left_is_kept_for_its_robot_or_ended() {
         for (recorded, nobodys, published, empty, expected) in [
-            (true, false, true, false, Fate::Kept),
-            // Its stubs have started none yet.
-            (true, false, true, true, Fate::Kept),
-            (true, false, false, false, Fate::Unknown),
-            (true, false, false, true, Fate::Unknown),
-            (false, false, false, true, Fate::Unused),
-            (false, false, true, true, Fate::Unused),
-            (false, false, false, false, Fate::Unknown),
-            (true, true, true, false, Fate::Unused),
-            (true, true, false, false, Fate::Unused),
+            (true, false, true, false, LeftoverFate::Kept),
+            // Its stubs have started no node yet.
+            (true, false, true, true, LeftoverFate::Kept),
+            (true, false, false, false, LeftoverFate::Unknown),
+            (true, false, false, true, LeftoverFate::Unknown),
+            (false, false, false, true, LeftoverFate::Unused),
+            (false, false, true, true, LeftoverFate::Unused),
+            (false, false, false, false, LeftoverFate::Unknown),
+            (true, true, true, false, LeftoverFate::Unused),
+            (true, true, false, false, LeftoverFate::Unused),
         ] {
-            let found = Found {
+            let found = LeftoverContainer {
                 recorded,
                 nobodys,
                 published,
                 empty,
             };
-            assert_eq!(fate(found), expected, "{found:?}");
+            assert_eq!(decide_fate(found), expected, "{found:?}");
         }
     }
 }

@@ -1,6 +1,6 @@
-//! Cores and memory, in exact numbers.
+//! Amounts of cores and memory, in exact numbers.
 
-/// Cores (in thousandths, so that sums are exact) and memory.
+/// An amount of cores (in thousandths, so that sums are exact) and memory.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Amount {
     /// Thousandths of a core.
@@ -10,13 +10,13 @@ pub struct Amount {
 }
 
 impl Amount {
-    /// No memory and no cores.
+    /// No cores and no memory.
     pub const NONE: Amount = Amount {
         millicpus: 0,
         memory: 0,
     };
 
-    /// From cores and bytes.
+    /// Creates an amount from cores and bytes.
     pub fn new(cpus: f64, memory: u64) -> Amount {
         Amount {
             millicpus: (cpus * 1000.0).round() as u64,
@@ -24,12 +24,12 @@ impl Amount {
         }
     }
 
-    /// Cores.
+    /// Returns the number of cores.
     pub fn cpus(self) -> f64 {
         self.millicpus as f64 / 1000.0
     }
 
-    /// Both together.
+    /// Returns the saturating sum.
     pub fn plus(self, other: Amount) -> Amount {
         Amount {
             millicpus: self.millicpus.saturating_add(other.millicpus),
@@ -37,7 +37,7 @@ impl Amount {
         }
     }
 
-    /// So many of them.
+    /// Returns the saturating product with `count`.
     pub fn times(self, count: u64) -> Amount {
         Amount {
             millicpus: self.millicpus.saturating_mul(count),
@@ -45,7 +45,7 @@ impl Amount {
         }
     }
 
-    /// What is left of it, down to nothing.
+    /// Returns the difference, at least zero.
     pub fn minus(self, other: Amount) -> Amount {
         Amount {
             millicpus: self.millicpus.saturating_sub(other.millicpus),
@@ -53,7 +53,7 @@ impl Amount {
         }
     }
 
-    /// The more of both, of cores and of memory.
+    /// Returns the maximum of cores and of memory.
     pub fn max(self, other: Amount) -> Amount {
         Amount {
             millicpus: self.millicpus.max(other.millicpus),
@@ -61,7 +61,7 @@ impl Amount {
         }
     }
 
-    /// Whether it is no more than `free`, of cores and of memory.
+    /// Returns true if neither cores nor memory exceed `free`.
     pub fn fits(self, free: Amount) -> bool {
         self.millicpus <= free.millicpus && self.memory <= free.memory
     }

@@ -1,57 +1,58 @@
-//! When a servant that failed may be started again: at once after the first failure, then after pauses that double (truncated
-//! exponential back-off, as in IEEE 802.3).
+//! Back-off for failed servants: at once after the first failure, then after pauses that double (truncated exponential
+//! back-off, as in IEEE 802.3).
 
 use std::time::{Duration, Instant};
 
-/// After the second failure in a row.
+/// Pause after the second failure in a row.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(300);
-/// The same where the pause is that of several robots, and what one of them sent may have ended the servant.
+/// Longest pause if several robots share it, because one of them may have caused the failure with its messages.
 const LONGEST_SHARED: Duration = Duration::from_secs(4);
-/// A servant that was ready for so long before it failed had recovered, and so had a node that ran for so long.
+/// Time after which a ready servant, or a running node, counts as recovered from earlier failures.
 pub const RECOVERED: Duration = Duration::from_secs(60);
 /// Time after a failure's pause until the failure is forgotten.
 const FORGOTTEN: Duration = Duration::from_secs(600);
 
-/// Failures of one robot's servants of one revision, one after the other.
+/// Consecutive failures of one robot's servants of one revision.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Failing {
-    /// Of which revision.
+pub struct FailureStreak {
+    /// The failing revision.
     pub revision: u64,
-    /// How often in a row.
+    /// Number of failures in a row.
     pub failures: u32,
-    /// What happened last, beginning with a verb.
+    /// The last failure, as a phrase that starts with a verb.
     pub reason: String,
-    /// Not before this moment is one started again.
+    /// Earliest time of the next start.
     pub again: Instant,
 }
 
-/// A servant of `revision` has failed at `now`, after it was ready for `ready_for` if it ever was. `shared`: the pause is that of
-/// several robots.
+/// Records that a servant of `revision` has failed at `now`, after being ready for `ready_for` if it ever was.
+/// `shared`: the pause applies to several robots.
 pub fn after_failure(
-    before: Option<&Failing>,
+    before: Option<&FailureStreak>,
     (revision, shared): (u64, bool),
     ready_for: Option<Duration>,
     reason: &str,
     now: Instant,
-) -> Failing {
-    let counts = |before: &&Failing| {
+) -> FailureStreak {
+    let counts = |before: &&FailureStreak| {
         let recovered = ready_for.is_some_and(|time| time >= RECOVERED);
         before.revision == revision && !recovered && !is_forgotten(before, now)
     };
     let failures = before
         .filter(counts)
         .map_or(1, |before| before.failures.saturating_add(1));
-    // One that was never ready has met no robot.
-    let longest = match shared && ready_for.is_some() {
-        true => LONGEST_SHARED,
-        false => LONGEST_PAUSE,
+    // A servant that was never ready has met no robot.
+    let longest = if shared && ready_for.is_some() {
+        LONGEST_SHARED
+    } else {
+        LONGEST_PAUSE
     };
     let pause = match failures {
         1 => Duration::ZERO,
-        n => doubled(FIRST_PAUSE, n - 2, longest),
+        n => double_pause(FIRST_PAUSE, n - 2, longest),
     };
-    Failing {
+    FailureStreak {
         revision,
         failures,
         reason: reason.to_owned(),
@@ -59,24 +60,24 @@ pub fn after_failure(
     }
 }
 
-/// A pause that was `first` and has doubled so many times.
-pub(super) fn doubled(first: Duration, times: u32, longest: Duration) -> Duration {
+/// Returns `first`, doubled `times` times, and at most `longest`.
+pub(super) fn double_pause(first: Duration, times: u32, longest: Duration) -> Duration {
     let pause = first.checked_mul(2u32.saturating_pow(times));
     pause.map_or(longest, |pause| pause.min(longest))
 }
 
-/// How long a servant of `revision` may not be started, if so.
-pub fn refusal(of: &Failing, revision: u64, now: Instant) -> Option<Duration> {
+/// Returns how long a servant of `revision` may not be started yet, if so.
+pub fn remaining_pause(of: &FailureStreak, revision: u64, now: Instant) -> Option<Duration> {
     let left = of.again.saturating_duration_since(now);
     (of.revision == revision && !left.is_zero()).then_some(left)
 }
 
-/// Whether it is too long ago to count.
-pub fn is_forgotten(of: &Failing, now: Instant) -> bool {
+/// Returns true if the failures are too long ago to count.
+pub fn is_forgotten(of: &FailureStreak, now: Instant) -> bool {
     now >= of.again + FORGOTTEN
 }
 
-/// The seconds that are left, rounded up: whoever comes after them is not too early.
+/// Returns the remaining seconds, rounded up, so that a retry after them is not too early.
 pub fn seconds(left: Duration) -> u64 {
     left.as_millis().div_ceil(1000) as u64
 }
@@ -90,7 +91,7 @@ mod tests {
     #[test]
     fn pauses_double_until_the_longest_and_begin_anew() {
         let mut now = Instant::now();
-        let mut failing: Option<Failing> = None;
+        let mut failing: Option<FailureStreak> = None;
         let mut fails = |revision, ready_for, after| {
             let next = after_failure(failing.as_ref(), (revision, false), ready_for, "died", now);
             let pause = (next.again - now).as_secs();
@@ -113,7 +114,7 @@ mod tests {
     fn no_robot_keeps_others_that_share_its_pause_away_for_long() {
         let now = Instant::now();
         let failing = |ready_for| {
-            let mut before: Option<Failing> = None;
+            let mut before: Option<FailureStreak> = None;
             for _ in 0..20 {
                 let next = after_failure(before.as_ref(), (1, true), ready_for, "died", now);
                 before = Some(next);
@@ -128,15 +129,15 @@ mod tests {
     fn only_the_revision_that_fails_waits() {
         let now = Instant::now();
         let second = Duration::from_secs(1);
-        let failing = Failing {
+        let failing = FailureStreak {
             revision: 2,
             failures: 3,
             reason: "died".into(),
             again: now + second,
         };
-        assert_eq!(refusal(&failing, 2, now), Some(second));
-        assert_eq!(refusal(&failing, 1, now), None);
-        assert_eq!(refusal(&failing, 2, now + second), None);
+        assert_eq!(remaining_pause(&failing, 2, now), Some(second));
+        assert_eq!(remaining_pause(&failing, 1, now), None);
+        assert_eq!(remaining_pause(&failing, 2, now + second), None);
     }
 
     proptest! {
@@ -145,13 +146,13 @@ mod tests {
             gaps in prop::collection::vec(0u64..900, 1..30),
         ) {
             let mut now = Instant::now();
-            let mut before: Option<Failing> = None;
+            let mut before: Option<FailureStreak> = None;
             for gap in gaps {
                 let next = after_failure(before.as_ref(), (1, false), None, "died", now);
                 let pause = next.again - now;
                 prop_assert!(pause <= LONGEST_PAUSE);
                 prop_assert_eq!(pause.is_zero(), next.failures == 1);
-                prop_assert_eq!(refusal(&next, 1, now), (!pause.is_zero()).then_some(pause));
+                prop_assert_eq!(remaining_pause(&next, 1, now), (!pause.is_zero()).then_some(pause));
                 if let Some(before) = before.filter(|before| !is_forgotten(before, now)) {
                     prop_assert_eq!(next.failures, before.failures + 1);
                 }

@@ -1,33 +1,34 @@
-//! At which limits a service is measured, when that is enough, and which rows of the dictionary follow from it.
+//! Decides at which limits a service is measured, when to stop, and which dictionary rows follow.
 
 use std::collections::BTreeMap;
 
-use api::calibration::{Point, TimeSpread, rounded_up};
+use api::calibration::{Point, TimeSpread, round_up_to_two_digits};
 use api::dictionary::{Row, Spread};
 use api::{Limits, Measure, Size};
 
-/// The smallest limit of a ladder, in thousandths of a core.
+/// Smallest limit of a ladder, in thousandths of a core.
 const SMALLEST: u64 = 100;
-/// Each limit of a ladder is so many times the one before.
+/// Factor between consecutive limits of a ladder.
 const STEP: f64 = 1.5;
-/// Times that are less than this share of the best so far are better; anything above may be chance.
+/// Times below this fraction of the best so far count as better; anything above may be chance.
 const BETTER: f64 = 0.9;
-/// The ladder ends when so many limits, one after the other, made nothing better.
+/// Number of limits in a row without improvement after which the ladder ends.
 const PATIENCE: usize = 2;
-/// Fewer answers say nothing of a 95th percentile.
+/// Minimum number of answers for a meaningful 95th percentile.
 pub(crate) const FEWEST: usize = 10;
-/// At least such a share of the requests must be answered, and such a share of the recording's pace be kept.
+/// Minimum fraction of the requests that must be answered, and of the recording's pace that must be kept.
 const ENOUGH: f64 = 0.95;
-/// Percent that proposed memory lies above the peak, which is looked for only now and then.
+/// Margin of the proposed memory above the peak, in percent; the peak is only sampled.
 pub(crate) const MARGIN: u64 = 25;
-/// The least that it lies above.
+/// Minimum margin, in bytes.
 const LEAST_MARGIN: u64 = 16 << 20;
 
-/// Limits to measure at, in cores, fewest first: a geometric ladder that ends with `most`, which are thousandths of a core.
-pub(crate) fn ladder(most: u64) -> Vec<f64> {
+/// Returns the limits to measure at, in cores, fewest first: a geometric ladder that ends with `most`, in thousandths
+/// of a core.
+pub(crate) fn limit_ladder(most: u64) -> Vec<f64> {
     let mut rungs = Vec::new();
     let mut rung = SMALLEST as f64;
-    // Another rung just below the last would tell nothing.
+    // A rung just below the last would add nothing.
     while rung * (1.0 + STEP) / 2.0 < most as f64 {
         rungs.push((rung / 10.0).round() / 100.0);
         rung *= STEP;
@@ -36,37 +37,40 @@ pub(crate) fn ladder(most: u64) -> Vec<f64> {
     rungs
 }
 
-/// What is measured next.
+/// The next step of a calibration.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Next {
-    /// At this limit, in cores.
+pub(crate) enum NextMeasurement {
+    /// Measure at this limit, in cores.
     Measure(f64),
-    /// Nothing more is measured, for this reason.
+    /// Stop measuring, for this reason.
     Enough(String),
 }
 
-/// What comes after what was `measured`, in the ladder's order. Limits that somebody `named` are all measured.
-pub(crate) fn next(ladder: &[f64], named: bool, measured: &[Point]) -> Next {
+/// Returns the next step after the `measured` points, which are in the ladder's order. Limits that were `named`
+/// explicitly are all measured.
+pub(crate) fn next_measurement(ladder: &[f64], named: bool, measured: &[Point]) -> NextMeasurement {
     let Some(limit) = ladder.get(measured.len()) else {
         let last = ladder.last().copied().unwrap_or_default();
-        return Next::Enough(if named {
-            "all limits that were named are measured".to_owned()
+        return NextMeasurement::Enough(if named {
+            "all given limits are measured".to_owned()
         } else {
-            format!("{last} cores are all that this machine can promise now")
+            format!("{last} cores are all that is available on this machine now")
         });
     };
     match elbow(measured) {
-        Some(elbow) if !named => Next::Enough(format!("more than {elbow} cores make it no faster")),
-        _ => Next::Measure(*limit),
+        Some(elbow) if !named => NextMeasurement::Enough(format!(
+            "it does not get faster with more than {elbow} cores"
+        )),
+        _ => NextMeasurement::Measure(*limit),
     }
 }
 
-/// The limit behind which [`PATIENCE`] others made nothing better.
+/// Returns the limit after which [`PATIENCE`] others brought no improvement.
 fn elbow(measured: &[Point]) -> Option<f64> {
     let mut best: Option<(f64, TimeSpread)> = None;
     let mut idle = 0;
     for point in measured {
-        let Some(spread) = point.compute.filter(|_| answers(point)) else {
+        let Some(spread) = point.compute.filter(|_| has_enough_answers(point)) else {
             continue;
         };
         match &mut best {
@@ -84,15 +88,15 @@ fn is_better(new: &TimeSpread, best: &TimeSpread) -> bool {
     new.p50 < best.p50 * BETTER || new.p95 < best.p95 * BETTER
 }
 
-/// Enough of its requests were answered.
-fn answers(point: &Point) -> bool {
+/// Returns true if enough of the point's requests were answered.
+fn has_enough_answers(point: &Point) -> bool {
     point.answered >= FEWEST && point.answered as f64 >= point.requests as f64 * ENOUGH
 }
 
-/// Rows that follow from what was measured, fewest cores first. Each is faster than all that are cheaper. None is of a limit
-/// at which requests were left unanswered or the recording's `pace` (requests a second) was not kept: there they would queue
-/// without end.
-pub(crate) fn propose(
+/// Returns the rows that follow from the measurements, fewest cores first. Each is faster than all cheaper ones. Limits
+/// at which requests were left unanswered or the recording's `pace` (requests per second) was not kept are skipped:
+/// requests would queue without bound there.
+pub(crate) fn propose_rows(
     points: &[Point],
     pace: Option<f64>,
     network: TimeSpread,
@@ -101,7 +105,7 @@ pub(crate) fn propose(
 ) -> Vec<Row> {
     let mut usable: Vec<(&Point, TimeSpread)> = points
         .iter()
-        .filter(|point| answers(point) && keeps(point, pace))
+        .filter(|point| has_enough_answers(point) && keeps_pace(point, pace))
         .filter_map(|point| Some((point, point.compute?)))
         .collect();
     usable.sort_by(|(one, _), (other, _)| one.cpus.total_cmp(&other.cpus));
@@ -116,7 +120,7 @@ pub(crate) fn propose(
         rows.push(Row {
             id: 0,
             measure: Measure::Rrt,
-            value: rounded_up(p95) / 1000.0,
+            value: round_up_to_two_digits(p95) / 1000.0,
             aux: aux.clone(),
             limits: Limits {
                 cpus: Some(point.cpus),
@@ -135,11 +139,11 @@ pub(crate) fn propose(
     rows
 }
 
-fn keeps(point: &Point, pace: Option<f64>) -> bool {
+fn keeps_pace(point: &Point, pace: Option<f64>) -> bool {
     pace.is_none_or(|pace| point.rate >= pace * ENOUGH)
 }
 
-/// Memory for a servant whose peak was `peak`: [`MARGIN`] more, in whole MiB.
+/// Returns the memory for a servant with this peak: [`MARGIN`] percent more, in whole MiB.
 pub(crate) fn with_margin(peak: Size) -> Size {
     let margin = (peak.0 / 100 * MARGIN).max(LEAST_MARGIN);
     Size((peak.0 + margin).next_multiple_of(1 << 20))
@@ -175,43 +179,49 @@ mod tests {
             (130, &[0.1, 0.13]),
             (50, &[0.05]),
         ] {
-            assert_eq!(ladder(most), rungs, "{most}");
+            assert_eq!(limit_ladder(most), rungs, "{most}");
         }
     }
 
     #[test]
     fn a_ladder_ends_behind_its_elbow() {
-        let rungs = ladder(4000);
+        let rungs = limit_ladder(4000);
         let mut measured = Vec::new();
-        // A program of one thread that needs 100 ms: no faster than a core.
+        // A single-threaded program that needs 100 ms: no faster than on one core.
         let ended = loop {
-            match next(&rungs, false, &measured) {
-                Next::Measure(cpus) => {
+            match next_measurement(&rungs, false, &measured) {
+                NextMeasurement::Measure(cpus) => {
                     let time = 100.0 / f64::min(cpus, 1.0);
                     measured.push(point(cpus, time, time * 1.1));
                 }
-                Next::Enough(why) => break why,
+                NextMeasurement::Enough(why) => break why,
             }
         };
-        assert_eq!(ended, "more than 1.14 cores make it no faster");
+        assert_eq!(ended, "it does not get faster with more than 1.14 cores");
         assert_eq!(measured.last().map(|point| point.cpus), Some(2.56));
-        // Who names limits is given all of them.
-        assert_eq!(next(&rungs, true, &measured), Next::Measure(4.0));
+        // Explicitly named limits are all measured.
         assert_eq!(
-            next(&[1.0], false, &[point(1.0, 5.0, 6.0)]),
-            Next::Enough("1 cores are all that this machine can promise now".into())
+            next_measurement(&rungs, true, &measured),
+            NextMeasurement::Measure(4.0)
+        );
+        assert_eq!(
+            next_measurement(&[1.0], false, &[point(1.0, 5.0, 6.0)]),
+            NextMeasurement::Enough("1 cores are all that is available on this machine now".into())
         );
     }
 
     #[test]
     fn limits_at_which_nothing_is_answered_are_no_elbow() {
-        let rungs = ladder(4000);
+        let rungs = limit_ladder(4000);
         let dead = Point {
             requests: 3,
             ..Point::default()
         };
         let measured = [dead, dead, dead, dead];
-        assert_eq!(next(&rungs, false, &measured), Next::Measure(rungs[4]));
+        assert_eq!(
+            next_measurement(&rungs, false, &measured),
+            NextMeasurement::Measure(rungs[4])
+        );
     }
 
     #[test]
@@ -239,7 +249,7 @@ mod tests {
             max: 90.0,
         };
         let aux = BTreeMap::from([("width".to_owned(), "640".to_owned())]);
-        let rows = propose(&points, Some(10.0), network, Size(7), &aux);
+        let rows = propose_rows(&points, Some(10.0), network, Size(7), &aux);
         let told: Vec<_> = rows
             .iter()
             .map(|row| {
@@ -258,8 +268,8 @@ mod tests {
         assert_eq!((row.measure, &row.aux), (Measure::Rrt, &aux));
         assert_eq!(row.limits.memory, Some(Size(7)));
         assert_eq!(row.spread.map(|spread| spread.requests), Some(40));
-        // Where requests follow answers, nothing queues.
-        let rows = propose(&points, None, TimeSpread::default(), Size(7), &aux);
+        // If each request follows the previous answer, nothing queues.
+        let rows = propose_rows(&points, None, TimeSpread::default(), Size(7), &aux);
         assert_eq!(rows.len(), 3);
     }
 
@@ -280,7 +290,7 @@ mod tests {
             (99.1, 100.0),
             (0.0, 0.001),
         ] {
-            assert_eq!(rounded_up(time), rounded, "{time}");
+            assert_eq!(round_up_to_two_digits(time), rounded, "{time}");
         }
     }
 
@@ -289,7 +299,7 @@ mod tests {
 
         #[test]
         fn ladders_rise_to_the_most_and_never_above(most in 1u64..200_000) {
-            let rungs = ladder(most);
+            let rungs = limit_ladder(most);
             prop_assert!(rungs.windows(2).all(|pair| pair[0] < pair[1]), "{rungs:?}");
             prop_assert_eq!(rungs.last().copied(), Some(most as f64 / 1000.0));
         }
@@ -308,7 +318,7 @@ mod tests {
                     ..point(millicpus as f64 / 1000.0, p50, p50 * factor)
                 })
                 .collect();
-            let rows = propose(&points, pace, TimeSpread::default(), Size(1), &BTreeMap::new());
+            let rows = propose_rows(&points, pace, TimeSpread::default(), Size(1), &BTreeMap::new());
             let told: Vec<(f64, f64, Spread)> = rows
                 .iter()
                 .map(|row| (row.limits.cpus.unwrap_or(0.0), row.value, row.spread.expect("measured")))
@@ -318,14 +328,15 @@ mod tests {
                 prop_assert!(pair[0].2.p95 > pair[1].2.p95, "{told:?}");
                 prop_assert!(pair[0].1 >= pair[1].1, "{told:?}");
             }
-            let usable: Vec<&Point> = points.iter().filter(|point| answers(point) && keeps(point, pace)).collect();
+            let usable: Vec<&Point> = points.iter().filter(|point| has_enough_answers(point) && keeps_pace(point,
+                pace)).collect();
             let p95 = |point: &Point| point.compute.map_or(f64::INFINITY, |compute| compute.p95) / 1000.0;
             for (cpus, value, spread) in &told {
                 prop_assert!(*value >= spread.p95 - 1e-9 && *value <= spread.p95 * 1.1 + 1e-9, "{told:?}");
                 prop_assert!(spread.requests >= FEWEST as u64);
                 prop_assert!(usable.iter().any(|point| point.cpus == *cpus && p95(point) == spread.p95), "{told:?}");
             }
-            // The fastest of all is among them, or one so near that it may be chance.
+            // The fastest point is among them, or one so close that it may be chance.
             let best = usable.iter().map(|point| p95(point)).fold(f64::INFINITY, f64::min);
             let proposed = told.last().map_or(f64::INFINITY, |(_, _, spread)| spread.p95);
             prop_assert!(best.is_infinite() || proposed * BETTER <= best + 1e-9, "{best} {told:?}");

@@ -1,50 +1,50 @@
-//! Which idle servants are ended, and which pushes give back what they have, so that others find capacity.
+//! Decides which idle servants are ended, and which pushes give their capacity back, to make room for waiting requests.
 
 use super::admission::Ticket;
-use super::{Amount, End, Servant};
+use super::{Amount, ServantFacts, StopOrder};
 
-/// How much more would have to be free.
+/// Capacity that would have to be freed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Lacking {
-    /// For all who wait.
+pub struct Shortage {
+    /// For all waiting requests.
     pub all: Amount,
-    /// For the robot that is first.
+    /// For the first waiting robot.
     pub first_robot: Amount,
 }
 
-/// A push that was admitted.
+/// An admitted push.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Push {
-    /// Its ticket.
+pub struct PushPromise {
+    /// Ticket of the push.
     pub ticket: Ticket,
-    /// What it is promised.
+    /// The promised amount.
     pub has: Amount,
-    /// It was told to give that back.
+    /// It was asked to give the amount back.
     pub gives_way: bool,
 }
 
-/// What is done for those who wait.
+/// Measures to make room for waiting requests.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Room<'a> {
+pub struct RoomPlan<'a> {
     /// Servants to end.
-    pub ends: Vec<End<'a>>,
-    /// Pushes that are to give back what they have.
+    pub ends: Vec<StopOrder<'a>>,
+    /// Pushes that are to give their capacity back.
     pub give_way: Vec<Ticket>,
 }
 
-/// Idle servants to end, those first that have been idle longest, until there will be capacity for all who wait. Where that is
-/// not enough for the robot that is first, pushes give way whose capacity makes up for it, those first that came last.
+/// Chooses idle servants to end, longest idle first, until there will be capacity for all waiting requests. If that is
+/// not enough for the first robot, pushes whose capacity makes up for it give way, latest first.
 pub fn make_room<'a>(
-    lacking: Lacking,
-    servants: impl Iterator<Item = Servant<'a>>,
-    pushes: &[Push],
-) -> Room<'a> {
-    let Lacking {
+    lacking: Shortage,
+    servants: impl Iterator<Item = ServantFacts<'a>>,
+    pushes: &[PushPromise],
+) -> RoomPlan<'a> {
+    let Shortage {
         all: mut lacking,
         mut first_robot,
     } = lacking;
     if lacking == Amount::NONE {
-        return Room::default();
+        return RoomPlan::default();
     }
     let mut idle = Vec::new();
     for servant in servants {
@@ -52,7 +52,7 @@ pub fn make_room<'a>(
             continue;
         };
         if servant.ending {
-            // What it has is about to be free.
+            // Its capacity is about to be free.
             lacking = lacking.minus(has);
             first_robot = first_robot.minus(has);
         } else if let Some(until) = servant.idle_until {
@@ -66,15 +66,15 @@ pub fn make_room<'a>(
     idle.sort_unstable_by_key(|(until, id, _)| (*until, *id));
     let mut ends = Vec::new();
     for (_, id, has) in idle {
-        // It may have none of what is lacking.
+        // It may hold none of the missing resource.
         if lacking.minus(has) != lacking {
             lacking = lacking.minus(has);
             first_robot = first_robot.minus(has);
-            let reason = "its room was needed";
-            ends.push(End { id, reason });
+            let reason = "its capacity was needed";
+            ends.push(StopOrder { id, reason });
         }
     }
-    let mut stay: Vec<&Push> = pushes.iter().filter(|push| !push.gives_way).collect();
+    let mut stay: Vec<&PushPromise> = pushes.iter().filter(|push| !push.gives_way).collect();
     stay.sort_unstable_by_key(|push| std::cmp::Reverse(push.ticket));
     let mut give_way = Vec::new();
     for push in stay {
@@ -84,19 +84,19 @@ pub fn make_room<'a>(
         }
     }
     if first_robot != Amount::NONE {
-        // It would be in vain.
+        // It would not be enough.
         give_way.clear();
     }
-    Room { ends, give_way }
+    RoomPlan { ends, give_way }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const fn servant(id: &str, millicpus: u64, idle_until: Option<u64>) -> Servant<'_> {
+    const fn servant(id: &str, millicpus: u64, idle_until: Option<u64>) -> ServantFacts<'_> {
         let memory = 0;
-        Servant {
+        ServantFacts {
             id,
             revision: 1,
             connections: 0,
@@ -112,12 +112,12 @@ mod tests {
         let oldest = servant("oldest", 500, Some(10));
         let middle = servant("middle", 500, Some(20));
         let busy = servant("busy", 500, None);
-        let queued = Servant {
+        let queued = ServantFacts {
             promised: None,
             ..servant("queued", 0, Some(1))
         };
         let useless = servant("useless", 0, Some(5));
-        let ending = Servant {
+        let ending = ServantFacts {
             ending: true,
             ..servant("ending", 1000, None)
         };
@@ -135,28 +135,28 @@ mod tests {
                 millicpus: lacking,
                 memory: 0,
             };
-            let lacking = Lacking {
+            let lacking = Shortage {
                 all: lacking,
-                ..Lacking::default()
+                ..Shortage::default()
             };
             let room = make_room(lacking, idle.into_iter().chain(extra), &[]);
             let ids: Vec<&str> = room.ends.iter().map(|end| end.id).collect();
             assert_eq!(ids, expected, "{lacking:?}");
         }
-        let lacking = Lacking {
+        let lacking = Shortage {
             all: Amount {
                 millicpus: 0,
                 memory: 1,
             },
-            ..Lacking::default()
+            ..Shortage::default()
         };
         let room = make_room(lacking, idle.into_iter(), &[]);
-        assert_eq!(room, Room::default(), "none has any");
+        assert_eq!(room, RoomPlan::default(), "none has any");
     }
 
     #[test]
     fn pushes_give_way_to_the_first_robot_where_that_helps() {
-        let push = |ticket, memory, gives_way| Push {
+        let push = |ticket, memory, gives_way| PushPromise {
             ticket,
             has: Amount {
                 millicpus: 10,
@@ -165,7 +165,7 @@ mod tests {
             gives_way,
         };
         let idle = servant("idle", 100, Some(1));
-        let idle = Servant {
+        let idle = ServantFacts {
             promised: Some(Amount::new(0.1, 50)),
             ..idle
         };
@@ -187,7 +187,7 @@ mod tests {
                 millicpus: 0,
                 memory: lacks,
             };
-            let lacking = Lacking {
+            let lacking = Shortage {
                 all: first_robot.plus(Amount::new(0.0, 1000)),
                 first_robot,
             };

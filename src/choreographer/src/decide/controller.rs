@@ -1,174 +1,174 @@
-//! Moves cores between the servants of a machine while they work: those near the time that their robots accept at most get
-//! what others do not need. Nobody gets less than it was promised.
+//! Moves cores between the running servants of a machine: servants whose response times approach what their robots
+//! accept get cores that others do not need. No servant gets less than it was promised.
 //!
-//! Two settings of the kernel are moved. `cpu.weight` says who runs first where all want to: a thousand for each core that is
-//! promised, and for each one that is given beyond. What is given beyond is never more than what nobody is promised, so that
-//! a promise holds in the same moment in which its servant wants it, whatever was given to others. `cpu.max` bounds what a
-//! servant takes: it is raised in steps for a servant that is near, lowered for neighbours without a stated time while one
-//! is, and taken back when it is over.
+//! Two kernel settings are adjusted. `cpu.weight` determines who runs first under contention: a thousand for each
+//! promised core, and for each one granted beyond. The sum of the extra grants never exceeds the unpromised cores, so
+//! that a servant gets what it was promised as soon as it wants it, whatever was granted to others. `cpu.max` limits a
+//! servant: it is raised in steps for a servant that is near its limit, lowered for neighbours without a stated time
+//! while one is near, and restored afterwards.
 //!
-//! Sources of the ideas: water filling for max-min fair shares ([`super::shares`]); additive increase and multiplicative
-//! decrease (AIMD; Chiu and Jain, 1989) for the steps; two thresholds and a time to hold against flapping (a Schmitt
-//! trigger with a dwell time).
+//! Background: water filling for max-min fair shares ([`super::shares`]); additive increase and multiplicative decrease
+//! (AIMD; Chiu and Jain, 1989) for the steps; two thresholds and a hold time against flapping (a Schmitt trigger with a
+//! dwell time).
 //!
-//! Where the cores do not suffice for all that are near, some of them leave what nobody was promised to the others
+//! If the cores do not suffice for all servants that are near, some of them yield the unpromised cores to the others
 //! ([`yielding`]).
 //!
-//! What a robot waits for on the network is not helped by cores. So a servant is near only where its own share of the time
-//! (waiting and computing in the cloud) is not small.
+//! Cores do not help against network delay. So a servant is near only if its own share of the time (queueing and
+//! computing in the cloud) is not small.
 
 mod yielding;
 
 use std::time::{Duration, Instant};
 
-use super::shares::{Claim, fill};
+use super::shares::{Claim, fill_shares};
 
-/// Near: requests take this part of the time that is accepted at most, …
+/// A servant becomes near when its requests take this fraction of the accepted time, …
 const NEAR: f64 = 0.85;
-/// … and no longer, when they take this part.
+/// … and stops being near below this fraction.
 const FAR: f64 = 0.7;
-/// A servant whose requests spend less than this part of their time in the cloud is not helped by cores.
+/// Minimum fraction of the requests' time spent in the cloud for cores to help.
 const OURS: f64 = 0.2;
-/// Where no request is measured: part of the time in which it wanted to run and had used up its cores, or others had
-/// them.
+/// If no request is measured: fraction of the time in which the servant was runnable but throttled, or waited for cores
+/// used by others.
 const HINDERED: f64 = 0.1;
-/// What was done for a servant that was near is taken back when it has not been for so long, and what was taken from others
-/// is given back.
+/// Time after which the measures for a servant that is no longer near are reverted.
 pub const HOLD: Duration = Duration::from_secs(5);
-/// Twice as long for each time that it was near again soon after, up to so often.
+/// Maximum number of doublings of [`HOLD`], one for each time that the servant was near again soon after.
 const DOUBLED: u32 = 6;
-/// Soon: within so many times what was waited before.
+/// "Soon" means within this multiple of the time waited before.
 const SOON: u32 = 4;
-/// A servant that is near gets this part more at each look, at least [`STEP`].
+/// Divisor: a near servant gets this fraction more at each step, at least [`STEP`].
 const GROWTH: u64 = 4;
-/// Thousandths of a core.
+/// Minimum step, in thousandths of a core.
 const STEP: u64 = 100;
-/// Nobody is left with less than this: it is to answer, if slowly. Thousandths of a core.
+/// Minimum for any servant, in thousandths of a core, so that it still answers, if slowly.
 const LEAST: u64 = 50;
-/// What is used now may be a quarter more in the next moment.
+/// Divisor of the headroom: usage may rise by a quarter in the next moment.
 const HEADROOM: u64 = 4;
-/// Changes by less than this part are left, …
+/// Divisor: changes smaller than this fraction are skipped, …
 const DEADBAND: u64 = 10;
-/// … and by less than this part those that lead back to what is had without a controller.
+/// … and this one for changes that restore the original setting.
 const ALMOST: u64 = 50;
 
-/// What a robot accepts, milliseconds; neither, where it stated something else than times of requests.
+/// Response times that a robot accepts, in milliseconds; both `None` if it stated something else than times of
+/// requests.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Goal {
+pub struct ResponseGoal {
     /// T_desire.
     pub desire: Option<f64>,
     /// T_max.
     pub max: Option<f64>,
 }
 
-impl Goal {
-    /// What is not to be exceeded: T_max, or T_desire where that alone is stated.
-    pub fn bound(self) -> Option<f64> {
+impl ResponseGoal {
+    /// Returns the time that is not to be exceeded: T_max, or T_desire if only that is stated.
+    pub fn upper_bound(self) -> Option<f64> {
         self.max.or(self.desire).filter(|bound| *bound > 0.0)
     }
 }
 
-/// What requests took lately, milliseconds (the time that 19 of 20 did not exceed).
+/// 95th percentiles of recent response times, in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
-    /// From asked to answered.
+pub struct MeasuredTimes {
+    /// From request to answer.
     pub total: f64,
-    /// Of that, waiting and computing in the cloud.
+    /// The part of it spent queueing and computing in the cloud.
     pub cloud: f64,
 }
 
-/// What the controller remembers of a servant from one look to the next.
+/// The controller's state about a servant between two rounds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct History {
-    /// When it was near last; none while it has never been, or that is over.
+pub struct ControlHistory {
+    /// Last time it was near; `None` if it has never been, or that is over.
     near: Option<Instant>,
-    /// When that was over last.
+    /// Last time at which that ended.
     over: Option<Instant>,
-    /// So often it was near again soon after.
+    /// Number of times it was near again soon after.
     again: u32,
-    /// When its `cpu.max` was raised last, …
+    /// Last time its `cpu.max` was raised, …
     raised: Option<Instant>,
     /// … and lowered.
     lowered: Option<Instant>,
-    /// Since when it leaves what nobody was promised to others that are near; none while it does not.
+    /// Time since which it yields the unpromised cores to other near servants; `None` while it does not.
     yielded: Option<Instant>,
-    /// So often it tried again in vain.
+    /// Number of retries in vain.
     vain: u32,
 }
 
-impl History {
-    /// Since when requests tell what its cores do for it.
-    pub fn raised(self) -> Option<Instant> {
+impl ControlHistory {
+    /// Returns the time since which requests reflect its current cores.
+    pub fn raised_at(self) -> Option<Instant> {
         self.raised
     }
 }
 
-/// A servant that works. Cores are in thousandths.
+/// Input about a running servant. Cores are in thousandths.
 #[derive(Debug, Clone, Copy)]
-pub struct Facts<'a> {
-    /// Its id.
+pub struct ControlFacts<'a> {
+    /// Id of the servant.
     pub id: &'a str,
-    /// Cores promised because somebody asked for them; 0 where nobody did.
+    /// Cores promised on request; 0 if none were requested.
     pub promised: u64,
     /// `cpu.max` without a controller.
     pub limit: u64,
     /// `cpu.weight` without a controller.
     pub plain: u64,
-    /// The most that it may ever have.
+    /// Maximum that it may ever have.
     pub ceiling: u64,
-    /// Somebody asked for this weight, which stays.
+    /// The weight was requested explicitly and stays.
     pub weighed: bool,
-    /// `cpu.max` as it is.
+    /// Current `cpu.max`.
     pub quota: u64,
-    /// `cpu.weight` as it is.
+    /// Current `cpu.weight`.
     pub weight: u64,
-    /// Cores used since the last look, where that is known.
+    /// Cores used since the last round, if known.
     pub used: Option<u64>,
-    /// Part of the time since the last look in which it wanted to run and had used up its `cpu.max`.
+    /// Fraction of the time since the last round in which it was runnable but throttled by `cpu.max`.
     pub throttled: f64,
-    /// Part of the last ten seconds in which something in it waited for a core.
+    /// Fraction of the last ten seconds in which a task in it waited for a core.
     pub waited: f64,
-    /// What its robot accepts, where that is stated.
-    pub goal: Option<Goal>,
-    /// What its robot's requests took, where that is known.
-    pub measured: Option<Measured>,
-    /// What was remembered of it.
-    pub history: History,
+    /// Response times that its robot accepts, if stated.
+    pub goal: Option<ResponseGoal>,
+    /// Response times of its robot's requests, if known.
+    pub measured: Option<MeasuredTimes>,
+    /// State from the last round.
+    pub history: ControlHistory,
 }
 
-/// What becomes of a servant.
+/// Decision about a servant.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Outcome {
-    /// Its new `cpu.max`, if that changes.
+pub struct ControlDecision {
+    /// New `cpu.max`, if it changes.
     pub quota: Option<u64>,
-    /// Its new `cpu.weight`, if that changes.
+    /// New `cpu.weight`, if it changes.
     pub weight: Option<u64>,
-    /// Why, where something changes.
+    /// Reason for the change, if any.
     pub reason: String,
-    /// To be remembered.
-    pub history: History,
+    /// State for the next round.
+    pub history: ControlHistory,
 }
 
-/// What a servant is in the eyes of the others.
+/// Role of a servant in the distribution of cores.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
-    /// It is near what its robot accepts at most, or was until just now: gets what others do not need.
+    /// It is near the accepted time, or was until just now: it gets cores that others do not need.
     Near,
-    /// Its robot said what it accepts, and gets it.
+    /// The servant's robot has stated a goal, and it is met.
     Content,
-    /// Nobody said anything, or it yields to others that are near: gets what is left.
+    /// It has no goal, or yields to near servants: it gets the remaining cores.
     Rest,
 }
 
-impl Facts<'_> {
-    /// Whether it is near now. Once it is, it takes a greater distance not to be.
+impl ControlFacts<'_> {
+    /// Returns true if it is near now; the threshold for leaving this state is lower.
     fn is_near(&self) -> bool {
         let Some(goal) = self.goal else {
             return false;
         };
         let was = self.history.near.is_some();
-        match self.measured.zip(goal.bound()) {
-            Some((Measured { total, cloud }, bound)) => {
+        match self.measured.zip(goal.upper_bound()) {
+            Some((MeasuredTimes { total, cloud }, bound)) => {
                 let threshold = if was { FAR } else { NEAR };
                 total >= bound * threshold && cloud >= total * OURS
             }
@@ -179,26 +179,27 @@ impl Facts<'_> {
         }
     }
 
-    /// What it needs, as far as can be seen from what it uses; all that it has, where that is not known.
-    fn needs(&self) -> u64 {
+    /// Returns the estimated need for cores, based on usage; its whole quota if the usage is unknown.
+    fn estimated_need(&self) -> u64 {
         match self.used {
             Some(used) => used + used / HEADROOM + LEAST,
             None => self.quota,
         }
     }
 
-    /// More cores would be used.
+    /// Returns true if it would use more cores.
     fn is_held_up(&self) -> bool {
         self.throttled >= HINDERED
             || self.waited >= HINDERED
-            || (self.used.is_some() && self.needs() >= self.quota)
+            || (self.used.is_some() && self.estimated_need() >= self.quota)
     }
 
-    /// It would not be near with so little: it uses no more, or its requests, computed so much longer, are still in time.
-    fn spares(&self, less: u64) -> bool {
-        match (self.measured, self.goal.and_then(Goal::bound)) {
-            _ if self.needs() <= less => true,
-            (Some(Measured { total, cloud }), Some(bound)) => {
+    /// Returns true if it would not be near with the reduced quota: it uses no more, or its requests would still be in
+    /// time with proportionally longer computation.
+    fn can_spare(&self, less: u64) -> bool {
+        match (self.measured, self.goal.and_then(ResponseGoal::upper_bound)) {
+            _ if self.estimated_need() <= less => true,
+            (Some(MeasuredTimes { total, cloud }), Some(bound)) => {
                 let longer = cloud * self.quota as f64 / less.max(1) as f64;
                 total - cloud + longer < bound * NEAR
             }
@@ -211,10 +212,13 @@ impl Facts<'_> {
     }
 }
 
-/// Shares of all servants on a machine with so many `cores` (thousandths), in their order.
-pub fn control(cores: u64, servants: &[Facts<'_>], now: Instant) -> Vec<Outcome> {
-    let mut histories: Vec<History> = servants.iter().map(|one| remembered(one, now)).collect();
-    yielding::decide(cores, servants, &mut histories, now);
+/// Returns the decisions for all servants on a machine with so many `cores` (thousandths), in their order.
+pub fn control(cores: u64, servants: &[ControlFacts<'_>], now: Instant) -> Vec<ControlDecision> {
+    let mut histories: Vec<ControlHistory> = servants
+        .iter()
+        .map(|one| update_history(one, now))
+        .collect();
+    yielding::update_yields(cores, servants, &mut histories, now);
     let roles: Vec<Role> = servants
         .iter()
         .zip(&histories)
@@ -230,23 +234,23 @@ pub fn control(cores: u64, servants: &[Facts<'_>], now: Instant) -> Vec<Outcome>
         .zip(&roles)
         .find(|(_, role)| **role == Role::Near);
     let near = near.map(|(one, _)| one.id);
-    let quotas = quotas(cores, servants, &roles, near.is_some(), now);
-    let weights = weights(cores, servants, &roles, &quotas);
+    let quotas = cpu_quotas(cores, servants, &roles, near.is_some(), now);
+    let weights = cpu_weights(cores, servants, &roles, &quotas);
     let all = servants.iter().zip(&roles).zip(histories);
     all.zip(quotas.iter().zip(weights))
         .map(|(((one, role), history), (quota, weight))| {
-            outcome(one, *role, history, (*quota, weight), near, now)
+            to_decision(one, *role, history, (*quota, weight), near, now)
         })
         .collect()
 }
 
-/// What is known of it with this look: it is near, was until just now, or is not.
-fn remembered(one: &Facts<'_>, now: Instant) -> History {
+/// Updates the state of a servant with this round.
+fn update_history(one: &ControlFacts<'_>, now: Instant) -> ControlHistory {
     let mut history = one.history;
     let hold = HOLD * 2u32.pow(history.again);
     if one.is_near() {
         if history.near.is_none() {
-            let soon = elapsed(history.over, now) < hold * SOON;
+            let soon = elapsed_since(history.over, now) < hold * SOON;
             history.again = if soon {
                 DOUBLED.min(history.again + 1)
             } else {
@@ -254,59 +258,64 @@ fn remembered(one: &Facts<'_>, now: Instant) -> History {
             };
         }
         history.near = Some(now);
-    } else if history.near.is_some() && elapsed(history.near, now) >= hold {
+    } else if history.near.is_some() && elapsed_since(history.near, now) >= hold {
         history.near = None;
         history.over = Some(now);
     }
     history
 }
 
-fn elapsed(since: Option<Instant>, now: Instant) -> Duration {
+fn elapsed_since(since: Option<Instant>, now: Instant) -> Duration {
     since.map_or(Duration::MAX, |since| now.saturating_duration_since(since))
 }
 
-/// `cpu.max` for each.
-fn quotas(
+/// Returns `cpu.max` for each servant.
+fn cpu_quotas(
     cores: u64,
-    servants: &[Facts<'_>],
+    servants: &[ControlFacts<'_>],
     roles: &[Role],
     any_near: bool,
     now: Instant,
 ) -> Vec<u64> {
     let all = || servants.iter().zip(roles);
     if !any_near {
-        return all().map(|(one, _)| back(one, now)).collect();
+        return all().map(|(one, _)| restored_quota(one, now)).collect();
     }
-    // What those need whose robots have what they want comes first, then those that are near, then all others.
+    // Satisfied servants come first, then those that are near, then all others.
     let content = all().filter(|(_, role)| **role == Role::Content);
     let needed = content.fold(0u64, |sum, (one, _)| {
-        sum.saturating_add(one.needs().min(one.quota))
+        sum.saturating_add(one.estimated_need().min(one.quota))
     });
     let beyond = cores.saturating_sub(needed);
-    let near = |one: &Facts<'_>| match one.is_near() && one.is_held_up() {
-        true => wish(one),
-        false => one.needs().min(one.quota).max(one.promised),
+    let near = |one: &ControlFacts<'_>| {
+        if one.is_near() && one.is_held_up() {
+            raised_quota(one)
+        } else {
+            one.estimated_need().min(one.quota).max(one.promised)
+        }
     };
-    let for_near = share(beyond, all(), Role::Near, near);
+    let for_near = fill_role(beyond, all(), Role::Near, near);
     let given = all()
         .zip(&for_near)
         .filter(|((_, role), _)| **role == Role::Near);
     let given = given.fold(0u64, |sum, (_, share)| sum.saturating_add(*share));
     let left = cores.saturating_sub(needed).saturating_sub(given);
-    let for_rest = share(left, all(), Role::Rest, |one| one.needs().min(one.limit));
+    let for_rest = fill_role(left, all(), Role::Rest, |one| {
+        one.estimated_need().min(one.limit)
+    });
     all()
         .zip(for_near.into_iter().zip(for_rest))
         .map(|((one, role), (_, rest))| match role {
-            // What it has it keeps while it is near: what others need more is theirs by weight. So it is between those that
-            // are near: each is bounded by what the others do not need, and none by its share of that, since one that is
-            // throttled waits for the rest of a period although cores are idle.
+            // A near servant keeps its quota: others that need more get it by weight. The same holds between near
+            // servants: each is limited by what the others do not need, and none by its share of that, since a
+            // throttled servant waits for the rest of a period although cores are idle.
             Role::Near => near(one)
                 .min(beyond)
                 .max(one.quota.min(one.ceiling))
                 .max(one.promised),
-            Role::Content => back(one, now),
+            Role::Content => restored_quota(one, now),
             Role::Rest if one.used.is_none() => one.quota.max(one.promised),
-            // At most halved at once.
+            // At most halved in one step.
             Role::Rest => rest
                 .max(one.quota / 2)
                 .min(one.quota)
@@ -316,52 +325,61 @@ fn quotas(
         .collect()
 }
 
-/// What a servant that is near would like: a step more than it has, up to what it may have.
-fn wish(one: &Facts<'_>) -> u64 {
+/// Returns the quota a near servant would like: one step more, up to its ceiling.
+fn raised_quota(one: &ControlFacts<'_>) -> u64 {
     let more = one.quota.saturating_add(STEP.max(one.quota / GROWTH));
     more.min(one.ceiling).max(one.promised)
 }
 
-/// Water filling among those with this role; others get nothing here.
-fn share<'a, 'b: 'a>(
+/// Distributes `capacity` by water filling among the servants with this role; others get nothing here.
+fn fill_role<'a, 'b: 'a>(
     capacity: u64,
-    all: impl Iterator<Item = (&'a Facts<'b>, &'a Role)>,
+    all: impl Iterator<Item = (&'a ControlFacts<'b>, &'a Role)>,
     role: Role,
-    wants: impl Fn(&Facts<'_>) -> u64,
+    wants: impl Fn(&ControlFacts<'_>) -> u64,
 ) -> Vec<u64> {
     let claims: Vec<Claim> = all
-        .map(|(one, its)| match *its == role {
-            true => Claim {
-                floor: one.floor(),
-                wants: wants(one),
-            },
-            false => Claim { floor: 0, wants: 0 },
+        .map(|(one, its)| {
+            if *its == role {
+                Claim {
+                    floor: one.floor(),
+                    wants: wants(one),
+                }
+            } else {
+                Claim { floor: 0, wants: 0 }
+            }
         })
         .collect();
-    fill(capacity, &claims)
+    fill_shares(capacity, &claims)
 }
 
-/// On the way back to what it has without a controller: what it was given beyond is halved, as far as its requests are
-/// answered in time without; what it was taken is given back by doubling. Neither before [`HOLD`] has passed since the opposite.
-fn back(one: &Facts<'_>, now: Instant) -> u64 {
+/// Returns the next quota on the way back to the setting without a controller: an extra grant is halved as long as
+/// requests stay in time; a reduction is reverted by doubling. Neither starts before [`HOLD`] has passed since the
+/// opposite change.
+fn restored_quota(one: &ControlFacts<'_>, now: Instant) -> u64 {
     let to = one.limit.max(one.promised);
-    if one.quota > to && elapsed(one.history.raised, now) >= HOLD {
+    if one.quota > to && elapsed_since(one.history.raised, now) >= HOLD {
         let beyond = (one.quota - to) / 2;
         let less = to + if beyond > STEP { beyond } else { 0 };
-        return if one.spares(less) { less } else { one.quota };
+        return if one.can_spare(less) { less } else { one.quota };
     }
-    if one.quota < to && elapsed(one.history.lowered, now) >= HOLD {
+    if one.quota < to && elapsed_since(one.history.lowered, now) >= HOLD {
         return one.quota.saturating_add(STEP.max(one.quota)).min(to);
     }
     one.quota.max(one.promised)
 }
 
-/// `cpu.weight` for each: a thousand for each core that it is promised or given beyond.
-fn weights(cores: u64, servants: &[Facts<'_>], roles: &[Role], quotas: &[u64]) -> Vec<u64> {
+/// Returns `cpu.weight` for each servant: a thousand per promised core, and per core granted beyond.
+fn cpu_weights(
+    cores: u64,
+    servants: &[ControlFacts<'_>],
+    roles: &[Role],
+    quotas: &[u64],
+) -> Vec<u64> {
     let promised = servants
         .iter()
         .fold(0u64, |sum, one| sum.saturating_add(one.promised));
-    // Where nobody is promised any, none is to be protected.
+    // If no cores are promised, none need protection.
     let open = promised == 0 && !roles.contains(&Role::Near);
     let free = if open {
         u64::MAX
@@ -372,7 +390,7 @@ fn weights(cores: u64, servants: &[Facts<'_>], roles: &[Role], quotas: &[u64]) -
     let of = |first: bool| -> Vec<Claim> {
         all()
             .map(|((one, role), quota)| {
-                // What it was given before it keeps until that is taken back.
+                // It keeps an earlier extra grant until that is reverted.
                 let raised = *role == Role::Near || *quota > one.limit.max(one.promised);
                 let wants = match (raised, first) {
                     (true, true) => one.plain.max(*quota).saturating_sub(one.promised),
@@ -383,40 +401,45 @@ fn weights(cores: u64, servants: &[Facts<'_>], roles: &[Role], quotas: &[u64]) -
             })
             .collect()
     };
-    let near = fill(free, &of(true));
-    let rest = fill(free.saturating_sub(near.iter().sum()), &of(false));
+    let near = fill_shares(free, &of(true));
+    let rest = fill_shares(free.saturating_sub(near.iter().sum()), &of(false));
     servants
         .iter()
         .zip(near.into_iter().zip(rest))
-        .map(|(one, (near, rest))| match one.weighed {
-            true => one.weight,
-            false => (one.promised + near + rest).clamp(1, 10_000),
+        .map(|(one, (near, rest))| {
+            if one.weighed {
+                one.weight
+            } else {
+                (one.promised + near + rest).clamp(1, 10_000)
+            }
         })
         .collect()
 }
 
-/// What of it is a change, and why.
-fn outcome(
-    one: &Facts<'_>,
+/// Turns the new settings into a decision: which of them are changes, and why.
+fn to_decision(
+    one: &ControlFacts<'_>,
     role: Role,
-    mut history: History,
+    mut history: ControlHistory,
     (quota, weight): (u64, u64),
     near: Option<&str>,
     now: Instant,
-) -> Outcome {
-    let quota = Some(quota).filter(|quota| differs(one.quota, *quota, one.limit.max(one.promised)));
-    let weight = Some(weight).filter(|weight| differs(one.weight, *weight, one.plain));
+) -> ControlDecision {
+    let quota =
+        Some(quota).filter(|quota| is_worthwhile(one.quota, *quota, one.limit.max(one.promised)));
+    let weight = Some(weight).filter(|weight| is_worthwhile(one.weight, *weight, one.plain));
     match quota {
         Some(quota) if quota > one.quota => history.raised = Some(now),
         Some(_) => history.lowered = Some(now),
         None => {}
     }
     let changes = quota.is_some() || weight.is_some();
-    let reason = match changes {
-        true => reason(one, role, near, weight),
-        false => String::new(),
+    let reason = if changes {
+        change_reason(one, role, near, weight)
+    } else {
+        String::new()
     };
-    Outcome {
+    ControlDecision {
         quota,
         weight,
         reason,
@@ -424,32 +447,37 @@ fn outcome(
     }
 }
 
-/// Whether a change is worth it: it is no small one, or it leads to what is had without a controller.
-fn differs(is: u64, to_be: u64, without: u64) -> bool {
+/// Returns true if a change is worthwhile: it is not small, or restores the setting without a controller.
+fn is_worthwhile(is: u64, to_be: u64, without: u64) -> bool {
     let part = if to_be == without { ALMOST } else { DEADBAND };
     is != to_be && is.abs_diff(to_be).saturating_mul(part) >= is
 }
 
-fn reason(one: &Facts<'_>, role: Role, near: Option<&str>, weight: Option<u64>) -> String {
+fn change_reason(
+    one: &ControlFacts<'_>,
+    role: Role,
+    near: Option<&str>,
+    weight: Option<u64>,
+) -> String {
     match (role, near) {
-        (Role::Near, _) => match (one.measured, one.goal.and_then(Goal::bound)) {
+        (Role::Near, _) => match (one.measured, one.goal.and_then(ResponseGoal::upper_bound)) {
             (Some(measured), Some(bound)) => format!(
-                "its requests take {:.0} ms of the {bound:.0} ms that its robot accepts",
+                "its requests take {:.0} ms; its robot accepts {bound:.0} ms",
                 measured.total
             ),
             _ => format!(
-                "its robot has stated what it accepts, and it was held up in {:.0} % of the time",
+                "its robot has set a goal, and it was throttled {:.0} % of the time",
                 one.throttled.max(one.waited) * 100.0
             ),
         },
         (_, None) if weight.is_some_and(|weight| weight < one.plain) => {
-            "the cores are promised to other servants".to_owned()
+            "the cores are reserved for other servants".to_owned()
         }
-        (Role::Content, None) => "its requests are answered in time without".to_owned(),
+        (Role::Content, None) => "its requests are answered in time without more".to_owned(),
         (Role::Content | Role::Rest, Some(near)) => {
-            format!("servant {near} needs cores that this one is not promised")
+            format!("servant {near} needs cores that are not reserved for this one")
         }
-        (Role::Rest, None) => "no other servant needs them now".to_owned(),
+        (Role::Rest, None) => "no other servant needs the cores now".to_owned(),
     }
 }
 

@@ -1,67 +1,67 @@
-//! What a servant needs: from the limits that somebody asked for to the limits that it gets and to what is promised to it.
+//! Derives a servant's limits and its promise from the requested limits.
 
 use api::{Limits, Terms};
 
 use super::Amount;
 
-/// The weight of a servant that is promised no cores: the kernel's default.
+/// Weight of a servant without promised cores: the kernel's default.
 const LEAST_WEIGHT: u64 = 100;
 
-/// Limits of a servant, and where they come from.
+/// Limits of a servant by their source.
 #[derive(Debug, Clone)]
-pub struct Asked {
-    /// By the operator, of the servant at work: a promise.
+pub struct LimitSources {
+    /// Set by the operator at run time; promised.
     pub set: Limits,
-    /// By its robot and by whoever pushed the package: a promise.
+    /// Set by its robot and by the push of its package; promised.
     pub terms: Terms,
-    /// Where they said nothing.
+    /// Defaults for the rest.
     pub default: Limits,
 }
 
-impl Asked {
-    /// Those that are promised to it.
-    pub fn promised(&self) -> Limits {
+impl LimitSources {
+    /// Returns the promised limits.
+    pub fn promised_limits(&self) -> Limits {
         self.set.or(self.terms.limits)
     }
 
-    /// The limits that it is to have.
+    /// Returns the limits that it is to have.
     pub fn limits(&self) -> Limits {
-        with_weight(self.promised()).or(self.default)
+        with_default_weight(self.promised_limits()).or(self.default)
     }
 }
 
-/// Whoever is promised cores gets them before those who are not: a weight of a thousand for each core, where others have
-/// a hundred in all, unless a weight was asked for.
-pub fn with_weight(asked: Limits) -> Limits {
+/// Adds the default weight of servants with promised cores, which get them before others: a thousand for each core,
+/// while others have a hundred in all. A requested weight stays.
+pub fn with_default_weight(asked: Limits) -> Limits {
     Limits {
-        cpu_weight: asked.cpu_weight.or(asked.cpus.map(weight_of)),
+        cpu_weight: asked.cpu_weight.or(asked.cpus.map(weight_for_cpus)),
         ..asked
     }
 }
 
-/// These limits with no more weight than cores are promised by them: what a deployer asks for may not outweigh what others are
-/// promised.
+/// Bounds the weight to the one of the promised cores, so that a deployer's service does not outweigh the promises to
+/// others.
 pub fn with_bounded_weight(asked: Limits) -> Limits {
     Limits {
         cpu_weight: asked
             .cpu_weight
-            .map(|weight| weight.min(most_weight(&asked))),
+            .map(|weight| weight.min(max_weight(&asked))),
         ..asked
     }
 }
 
-/// The most weight that these limits may have without an operator's word.
-pub fn most_weight(asked: &Limits) -> u64 {
-    asked.cpus.map_or(LEAST_WEIGHT, weight_of)
+/// Returns the maximum weight of these limits without an operator's permission.
+pub fn max_weight(asked: &Limits) -> u64 {
+    asked.cpus.map_or(LEAST_WEIGHT, weight_for_cpus)
 }
 
-fn weight_of(cpus: f64) -> u64 {
+fn weight_for_cpus(cpus: f64) -> u64 {
     ((cpus * 1000.0).round() as u64).clamp(LEAST_WEIGHT, 10_000)
 }
 
-/// What of the machine is promised to a servant of these limits: what they say, else of `reserve`, which is cores and
-/// bytes.
-pub fn promised(asked: &Limits, reserve: (f64, u64)) -> Amount {
+/// Returns the capacity promised to a servant with these limits; resources without a limit are taken from `reserve`,
+/// which is cores and bytes.
+pub fn promised_amount(asked: &Limits, reserve: (f64, u64)) -> Amount {
     Amount::new(
         asked.cpus.unwrap_or(reserve.0),
         asked.memory.map_or(reserve.1, |memory| memory.0),
@@ -80,7 +80,7 @@ mod tests {
                 cpu_weight,
                 ..Limits::default()
             };
-            with_weight(asked).cpu_weight
+            with_default_weight(asked).cpu_weight
         };
         for (cpus, asked, gets) in [
             (None, None, None),
@@ -127,7 +127,7 @@ mod tests {
             (None, Some(9), Amount::new(0.25, 9)),
             (Some(0.1), Some(0), Amount::new(0.1, 0)),
         ] {
-            assert_eq!(promised(&of(cpus, memory), reserve), gets);
+            assert_eq!(promised_amount(&of(cpus, memory), reserve), gets);
         }
     }
 }

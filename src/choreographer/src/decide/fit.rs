@@ -1,41 +1,43 @@
-//! Whether one more servant would fit, what that would cost the others in cores and in time, and how many more would.
+//! Predicts whether one more servant would fit, what it would cost the others in cores and time, and how many more
+//! would fit.
 
-use super::admission::Book;
-use super::capacity::{Lacking, make_room};
-use super::controller::Measured;
-use super::shares::{Claim, fill};
-use super::{Amount, Servant};
+use super::admission::AdmissionLedger;
+use super::capacity::{Shortage, make_room};
+use super::controller::MeasuredTimes;
+use super::shares::{Claim, fill_shares};
+use super::{Amount, ServantFacts};
 
-/// A servant that works, and what of the cores it uses.
+/// A running servant and its use of cores.
 #[derive(Debug, Clone, Copy)]
 pub struct Neighbour<'a> {
-    /// As decisions about several servants see it.
-    pub servant: Servant<'a>,
-    /// Thousandths of a core, on the average over the last seconds.
+    /// The servant, as seen by decisions about several servants.
+    pub servant: ServantFacts<'a>,
+    /// Used cores in thousandths, averaged over the last seconds.
     pub uses: u64,
-    /// What its requests took lately, where that is known.
-    pub measured: Option<Measured>,
+    /// Recent response times, if known.
+    pub measured: Option<MeasuredTimes>,
 }
 
-/// How one more would fit.
+/// Prediction for one more servant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
     /// It would be admitted at once.
     pub now: bool,
     /// Ids of idle servants that would be ended for it.
     pub ends: Vec<String>,
-    /// What would be lacking then; nothing where it would be admitted.
+    /// Capacity that would still be missing; zero if it would be admitted.
     pub lacking: Amount,
-    /// What of the cores others would lose if the new one used all that it is promised.
-    pub costs: Vec<Cost>,
-    /// So many of its kind would fit, one after the other, idle servants being ended for them; none: as many as one likes.
+    /// Cores that other servants would lose if the new one used all of its promise.
+    pub costs: Vec<NeighbourCost>,
+    /// Number of such servants that would fit, one after the other, with idle servants ended for them; `None` for any
+    /// number.
     pub more: Option<u64>,
-    /// What would be lacking for one more than these.
+    /// Capacity missing for one more than these.
     pub beyond: Amount,
 }
 
 impl Fit {
-    /// Of one that needs nothing.
+    /// Prediction for a servant that needs no capacity.
     pub const NOTHING: Fit = Fit {
         now: true,
         ends: Vec::new(),
@@ -46,32 +48,32 @@ impl Fit {
     };
 }
 
-/// What one more would cost another servant.
+/// Cost of one more servant to another one.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Cost {
-    /// Its id.
+pub struct NeighbourCost {
+    /// Id of the other servant.
     pub id: String,
-    /// Thousandths of a core that it uses.
+    /// Cores that it uses, in thousandths.
     pub uses: u64,
-    /// What it would have left of that: at least what it is promised, as far as it uses that.
+    /// Cores that it would keep: at least its promise, as far as it uses that.
     pub left: u64,
-    /// What 19 of 20 of its requests did not exceed lately, and would not then: milliseconds. None where nothing is known, or
-    /// where it would get no time at all.
+    /// 95th percentiles of its response times, now and then, in milliseconds. `None` if unknown, or if it would get no
+    /// cores at all.
     pub times: Option<(f64, f64)>,
 }
 
-/// How one more of this priority that is promised `wanted` would fit on a machine of so many `cores` (thousandths): these exist, whatever is
-/// promised of them.
+/// Predicts how one more servant of this priority that is promised `wanted` would fit on a machine of so many `cores`
+/// (thousandths); these exist, whatever is promised of them.
 pub fn fit(
     (wanted, priority): (Amount, i32),
-    book: &Book,
+    book: &AdmissionLedger,
     cores: u64,
     others: &[Neighbour<'_>],
 ) -> Fit {
-    let free = book.capacity().minus(book.promised());
+    let free = book.capacity().minus(book.promised_total());
     let spoken_for = book.wanted_before(priority);
     let lacking = wanted.plus(spoken_for).minus(free);
-    let asked = Lacking {
+    let asked = Shortage {
         all: lacking,
         first_robot: Amount::NONE,
     };
@@ -83,10 +85,11 @@ pub fn fit(
         leave.fold(Amount::NONE, Amount::plus)
     };
     let ends: Vec<&str> = room.ends.iter().map(|end| end.id).collect();
-    let lacking = match wanted.fits(book.capacity()) {
-        true => lacking.minus(comes_free(&ends)),
-        // Whatever ends, it never will.
-        false => wanted.minus(book.capacity()),
+    let lacking = if wanted.fits(book.capacity()) {
+        lacking.minus(comes_free(&ends))
+    } else {
+        // It would not fit even if all others ended.
+        wanted.minus(book.capacity())
     };
     let fits = lacking == Amount::NONE;
     let idle = others
@@ -94,18 +97,19 @@ pub fn fit(
         .filter(|other| other.servant.idle_until.is_some());
     let idle: Vec<&str> = idle.map(|other| other.servant.id).collect();
     let usable = free.plus(comes_free(&idle)).minus(spoken_for);
-    let more = times(usable, wanted);
+    let more = count_parts(usable, wanted);
     Fit {
         now: fits
             && ends.is_empty()
-            && book.stalled().is_none()
+            && book.stall_reason().is_none()
             && wanted.plus(spoken_for).fits(free),
-        ends: match fits {
-            true => ends.iter().map(|id| (*id).to_owned()).collect(),
-            false => Vec::new(),
+        ends: if fits {
+            ends.iter().map(|id| (*id).to_owned()).collect()
+        } else {
+            Vec::new()
         },
         lacking,
-        costs: costs(wanted, cores, others),
+        costs: neighbour_costs(wanted, cores, others),
         more,
         beyond: more.map_or(Amount::NONE, |more| {
             wanted.times(more.saturating_add(1)).minus(usable)
@@ -113,8 +117,8 @@ pub fn fit(
     }
 }
 
-/// What each would lose that loses something.
-fn costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<Cost> {
+/// Returns the costs of the servants that would lose something.
+fn neighbour_costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<NeighbourCost> {
     let claim = |other: &Neighbour<'_>| Claim {
         floor: other.servant.promised.unwrap_or_default().millicpus,
         wants: other.uses,
@@ -124,32 +128,32 @@ fn costs(wanted: Amount, cores: u64, others: &[Neighbour<'_>]) -> Vec<Cost> {
         wants: wanted.millicpus,
     };
     let claims: Vec<Claim> = others.iter().map(claim).chain([new]).collect();
-    let shares = fill(cores, &claims);
+    let shares = fill_shares(cores, &claims);
     let pairs = others.iter().zip(shares);
     pairs
         .filter(|(other, left)| *left < other.uses)
-        .map(|(other, left)| Cost {
+        .map(|(other, left)| NeighbourCost {
             id: other.servant.id.to_owned(),
             uses: other.uses,
             left,
             times: other
                 .measured
-                .and_then(|measured| slower(measured, other.uses, left)),
+                .and_then(|measured| slowed_times(measured, other.uses, left)),
         })
         .collect()
 }
 
-/// What requests take, and would take with what is left of the cores: what they wait and compute in the cloud grows as the
-/// cores shrink, what is spent on the way does not.
-fn slower(measured: Measured, uses: u64, left: u64) -> Option<(f64, f64)> {
-    let Measured { total, cloud } = measured;
+/// Returns the response times now and with the remaining cores: the part in the cloud grows as the cores shrink, the
+/// part on the network does not.
+fn slowed_times(measured: MeasuredTimes, uses: u64, left: u64) -> Option<(f64, f64)> {
+    let MeasuredTimes { total, cloud } = measured;
     let cloud = cloud.clamp(0.0, total);
     let then = total - cloud + cloud * uses as f64 / left as f64;
     (left > 0).then_some((total, then))
 }
 
-/// How often `part` is in `whole`.
-fn times(whole: Amount, part: Amount) -> Option<u64> {
+/// Returns how often `part` fits into `whole`.
+fn count_parts(whole: Amount, part: Amount) -> Option<u64> {
     let cores = whole.millicpus.checked_div(part.millicpus);
     let memory = whole.memory.checked_div(part.memory);
     cores.into_iter().chain(memory).min()
@@ -160,11 +164,11 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::decide::admission::Ask;
+    use crate::decide::admission::AdmissionRequest;
 
-    fn other(id: &str, promised: f64, uses: u64, idle_until: Option<u64>) -> Neighbour<'_> {
+    fn neighbour(id: &str, promised: f64, uses: u64, idle_until: Option<u64>) -> Neighbour<'_> {
         Neighbour {
-            servant: Servant {
+            servant: ServantFacts {
                 id,
                 revision: 1,
                 connections: 0,
@@ -177,20 +181,20 @@ mod tests {
         }
     }
 
-    /// A machine of four cores with these promises, and what robots wait for.
-    fn book(promised: f64, waits: Option<f64>) -> Book {
-        let mut book = Book::new(Amount::new(4.0, 1000), 8);
+    /// Returns a machine of four cores with these promises and a waiting robot's request.
+    fn book(promised: f64, waits: Option<f64>) -> AdmissionLedger {
+        let mut book = AdmissionLedger::new(Amount::new(4.0, 1000), 8);
         book.promise(Amount::new(promised, 0));
         if let Some(cpus) = waits {
-            let _ = book.ask(1, Ask::robot(Amount::new(cpus, 0), 0));
+            let _ = book.request(1, AdmissionRequest::robot(Amount::new(cpus, 0), 0));
         }
         book
     }
 
     #[test]
     fn one_more_fits_now_after_others_or_not() {
-        let idle = other("idle", 1.0, 0, Some(9));
-        let busy = other("busy", 2.0, 2000, None);
+        let idle = neighbour("idle", 1.0, 0, Some(9));
+        let busy = neighbour("busy", 2.0, 2000, None);
         let both = [idle, busy];
         for (wanted, waits, now, ends, lacking, more, beyond) in [
             (1.0, None, true, vec![], 0.0, Some(2), 1.0),
@@ -216,16 +220,16 @@ mod tests {
             );
         }
         let mut stalls = book(3.0, None);
-        stalls.stall(Some("it swaps".into()));
+        stalls.set_stall(Some("it swaps".into()));
         assert!(!fit((Amount::new(0.5, 0), 0), &stalls, 4000, &both).now);
     }
 
     #[test]
     fn others_lose_what_they_use_beyond_their_promise() {
         let others = [
-            other("modest", 1.0, 500, None),
-            other("greedy", 0.0, 3500, None),
-            other("kept", 1.0, 1000, None),
+            neighbour("modest", 1.0, 500, None),
+            neighbour("greedy", 0.0, 3500, None),
+            neighbour("kept", 1.0, 1000, None),
         ];
         let cost = |wanted| {
             let fit = fit((Amount::new(wanted, 0), 0), &book(2.0, None), 4000, &others);
@@ -238,12 +242,12 @@ mod tests {
             "they lack cores already"
         );
         assert_eq!(cost(1.5), [("greedy".to_owned(), 1000)]);
-        // Times grow with what is spent in the cloud.
+        // Times grow with the part spent in the cloud.
         let times = |uses, promised, total, cloud| {
-            let measured = Some(Measured { total, cloud });
+            let measured = Some(MeasuredTimes { total, cloud });
             let one = Neighbour {
                 measured,
-                ..other("one", promised, uses, None)
+                ..neighbour("one", promised, uses, None)
             };
             let fit = fit((Amount::new(3.0, 0), 0), &book(0.0, None), 4000, &[one]);
             fit.costs[0].times
@@ -251,18 +255,18 @@ mod tests {
         for (uses, promised, total, cloud, then) in [
             (2000, 0.0, 100.0, 60.0, Some((100.0, 160.0))),
             (2000, 0.0, 100.0, 0.0, Some((100.0, 100.0))),
-            // Its robot told nonsense.
+            // Its robot reported nonsense.
             (2000, 0.0, 100.0, 1e9, Some((100.0, 200.0))),
             (4000, 0.0, 100.0, 100.0, Some((100.0, 400.0))),
         ] {
             assert_eq!(times(uses, promised, total, cloud), then, "{uses} {cloud}");
         }
-        let nothing = Measured {
+        let nothing = MeasuredTimes {
             total: 1.0,
             cloud: 1.0,
         };
-        assert_eq!(slower(nothing, 5, 0), None, "for ever");
-        let others = [other("small", 0.0, 100, None)];
+        assert_eq!(slowed_times(nothing, 5, 0), None, "for ever");
+        let others = [neighbour("small", 0.0, 100, None)];
         let fit = fit((Amount::new(1.0, 0), 0), &book(0.0, None), 4000, &others);
         assert_eq!(fit.costs, []);
     }
@@ -273,15 +277,16 @@ mod tests {
             sizes in prop::collection::vec(0u64..2000, 0..6),
             wanted in 1u64..3000,
         ) {
-            let mut book = Book::new(Amount::new(4.0, 0), 8);
+            let mut book = AdmissionLedger::new(Amount::new(4.0, 0), 8);
             for (ticket, size) in (1..).zip(sizes) {
-                let _ = book.ask(ticket, Ask::robot(Amount { millicpus: size, memory: 0 }, 0));
+                let _ = book.request(ticket, AdmissionRequest::robot(Amount { millicpus: size, memory: 0 }, 0));
             }
             let wanted = Amount { millicpus: wanted, memory: 0 };
             let fit = fit((wanted, 0), &book, 4000, &[]);
             let mut ticket = 100;
             let mut admitted = 0;
-            while book.ask(ticket, Ask::robot(wanted, 0)).0 == crate::decide::admission::Verdict::Admitted {
+            while book.request(ticket, AdmissionRequest::robot(wanted,
+                0)).0 == crate::decide::admission::AdmissionVerdict::Admitted {
                 ticket += 1;
                 admitted += 1;
             }

@@ -1,36 +1,36 @@
-//! How many robots are about to ask for a service, and how many containers made ahead that takes.
+//! Forecasts how many robots will ask for a service, and how many containers must be made ahead for them.
 //!
-//! Arrivals are counted in intervals and forecast by linear exponential smoothing (C. C. Holt, *Forecasting seasonals and
-//! trends by exponentially weighted moving averages*, ONR memorandum 52, 1957; Int. J. Forecasting 20, 2004). A pool of
-//! containers, each replaced a lead time after it was taken, is a loss system where an arrival that finds none does without:
-//! its share is Erlang's B of the pool's size and of the arrivals in a lead time (W. Karush, *A queuing model for an inventory
-//! problem*, Operations Research 5, 1957).
+//! Arrivals are counted per interval and forecast by linear exponential smoothing (C. C. Holt, *Forecasting seasonals
+//! and trends by exponentially weighted moving averages*, ONR memorandum 52, 1957; Int. J. Forecasting 20, 2004). A
+//! pool of containers, each replaced a lead time after it was taken, is a loss system in which an arrival that finds no
+//! container does without: its share is Erlang's B of the pool's size and of the arrivals in a lead time (W. Karush, *A
+//! queuing model for an inventory problem*, Operations Research 5, 1957).
 
 use std::time::{Duration, Instant};
 
-/// Arrivals are counted in intervals of this length.
+/// Length of an interval in which arrivals are counted.
 pub const INTERVAL: Duration = Duration::from_secs(10);
 /// Weight of the last interval in the level.
 const LEVEL: f64 = 0.5;
 /// Weight of the last change of the level in the trend.
 const TREND: f64 = 0.1;
-/// After so many intervals without an arrival nothing is expected any more.
+/// Number of intervals without an arrival after which nothing is expected any more.
 const FORGOTTEN: u32 = 30;
-/// Most containers that are asked for, whatever the arrivals.
+/// Maximum number of containers, whatever the arrivals.
 const MOST: usize = 64;
 
-/// The arrivals of one service's robots.
+/// Arrival statistics of one service's robots.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Arrivals {
-    /// When the interval began that is being counted.
+    /// Start of the current interval.
     begun: Instant,
     count: u32,
-    /// Arrivals in an interval, and how much more they become with each; none before the first interval is over.
+    /// Smoothed arrivals per interval and their trend; `None` before the first interval is over.
     smoothed: Option<(f64, f64)>,
 }
 
 impl Arrivals {
-    /// None so far.
+    /// Starts without arrivals.
     pub fn new(now: Instant) -> Arrivals {
         Arrivals {
             begun: now,
@@ -39,21 +39,21 @@ impl Arrivals {
         }
     }
 
-    /// A robot came.
-    pub fn arrived(&mut self, now: Instant) {
-        *self = self.at(now);
+    /// Records the arrival of a robot.
+    pub fn record_arrival(&mut self, now: Instant) {
+        *self = self.advanced_to(now);
         self.count = self.count.saturating_add(1);
     }
 
-    /// Arrivals that are expected in a second. A burst counts before its interval is over.
-    pub fn expected(&self, now: Instant) -> f64 {
-        let of = self.at(now);
+    /// Returns the expected arrivals per second. A burst counts before its interval is over.
+    pub fn expected_rate(&self, now: Instant) -> f64 {
+        let of = self.advanced_to(now);
         let forecast = of.smoothed.map_or(0.0, |(level, trend)| level + trend);
         forecast.max(f64::from(of.count)) / INTERVAL.as_secs_f64()
     }
 
-    /// With all intervals smoothed that are over.
-    fn at(&self, now: Instant) -> Arrivals {
+    /// Returns the statistics with all finished intervals smoothed.
+    fn advanced_to(&self, now: Instant) -> Arrivals {
         let mut of = *self;
         let over = now.saturating_duration_since(of.begun).as_secs() / INTERVAL.as_secs();
         let over = u32::try_from(over).unwrap_or(u32::MAX);
@@ -75,15 +75,16 @@ impl Arrivals {
     }
 }
 
-/// Erlang's B: the share of arrivals that find none of `containers`, where `offered` come in the time in which one is replaced.
-pub fn loss(containers: usize, offered: f64) -> f64 {
+/// Returns Erlang's B: the fraction of arrivals that find none of `containers`, with `offered` arrivals per replacement
+/// time.
+pub fn erlang_b(containers: usize, offered: f64) -> f64 {
     (1..=containers).fold(1.0, |loss, n| offered * loss / (n as f64 + offered * loss))
 }
 
-/// The fewest containers with which no more than `share` of the arrivals find none.
-pub fn containers(offered: f64, share: f64) -> usize {
+/// Returns the fewest containers with which at most `share` of the arrivals find none.
+pub fn containers_needed(offered: f64, share: f64) -> usize {
     (0..MOST)
-        .find(|n| loss(*n, offered) <= share)
+        .find(|n| erlang_b(*n, offered) <= share)
         .unwrap_or(MOST)
 }
 
@@ -93,16 +94,16 @@ mod tests {
 
     use super::*;
 
-    /// What is expected after intervals with so many arrivals each.
-    fn after(counts: &[u32]) -> f64 {
+    /// Returns the forecast after intervals with these numbers of arrivals.
+    fn forecast_after(counts: &[u32]) -> f64 {
         let begun = Instant::now();
         let mut arrivals = Arrivals::new(begun);
         for (interval, count) in counts.iter().enumerate() {
             for _ in 0..*count {
-                arrivals.arrived(begun + INTERVAL * interval as u32);
+                arrivals.record_arrival(begun + INTERVAL * interval as u32);
             }
         }
-        arrivals.expected(begun + INTERVAL * counts.len() as u32) * INTERVAL.as_secs_f64()
+        arrivals.expected_rate(begun + INTERVAL * counts.len() as u32) * INTERVAL.as_secs_f64()
     }
 
     #[test]
@@ -115,18 +116,18 @@ mod tests {
             (&[4, 8], 6.2),
             (&[4, 0], 1.8),
         ] {
-            let is = after(counts);
+            let is = forecast_after(counts);
             assert!((is - expected).abs() < 1e-9, "{counts:?}: {is}");
         }
         let begun = Instant::now();
         let mut burst = Arrivals::new(begun);
-        (0..9).for_each(|_| burst.arrived(begun));
-        assert!((burst.expected(begun) - 0.9).abs() < 1e-9, "at once");
+        (0..9).for_each(|_| burst.record_arrival(begun));
+        assert!((burst.expected_rate(begun) - 0.9).abs() < 1e-9, "at once");
         let later = begun + INTERVAL * (FORGOTTEN + 1);
-        assert_eq!(burst.expected(later), 0.0);
+        assert_eq!(burst.expected_rate(later), 0.0);
     }
 
-    /// Figures of any table of Erlang's B.
+    /// Values from tables of Erlang's B.
     #[test]
     fn the_loss_is_erlangs() {
         for (containers, offered, expected) in [
@@ -136,14 +137,14 @@ mod tests {
             (5, 3.0, 0.1101),
             (10, 5.0, 0.0184),
         ] {
-            let is = loss(containers, offered);
+            let is = erlang_b(containers, offered);
             assert!((is - expected).abs() < 5e-5, "{containers} {offered}: {is}");
         }
-        assert_eq!(containers(0.0, 0.05), 1);
-        assert_eq!(containers(0.0, 1.0), 0);
-        assert_eq!(containers(1.0, 0.2), 2);
-        assert_eq!(containers(5.0, 0.02), 10);
-        assert_eq!(containers(1e9, 0.02), MOST);
+        assert_eq!(containers_needed(0.0, 0.05), 1);
+        assert_eq!(containers_needed(0.0, 1.0), 0);
+        assert_eq!(containers_needed(1.0, 0.2), 2);
+        assert_eq!(containers_needed(5.0, 0.02), 10);
+        assert_eq!(containers_needed(1e9, 0.02), MOST);
     }
 
     proptest! {
@@ -154,12 +155,12 @@ mod tests {
         ) {
             let most = counts.iter().copied().max().unwrap_or(0);
             let mut counts = counts;
-            let busy = after(&counts);
+            let busy = forecast_after(&counts);
             prop_assert!(busy >= 0.0 && busy.is_finite());
             prop_assert!(busy <= f64::from(most) * 2.0, "a trend is no explosion: {busy}");
             counts.extend(std::iter::repeat_n(0, quiet as usize));
             if quiet > FORGOTTEN {
-                prop_assert_eq!(after(&counts), 0.0);
+                prop_assert_eq!(forecast_after(&counts), 0.0);
             }
         }
 
@@ -170,11 +171,11 @@ mod tests {
             containers in 0usize..40,
             share in 0.001f64..0.5,
         ) {
-            prop_assert!(loss(containers + 1, offered) <= loss(containers, offered));
-            let need = super::containers(offered, share);
-            prop_assert!(super::containers(offered + more, share) >= need);
-            prop_assert!(need == MOST || loss(need, offered) <= share);
-            prop_assert!(need == 0 || loss(need - 1, offered) > share, "one too many");
+            prop_assert!(erlang_b(containers + 1, offered) <= erlang_b(containers, offered));
+            let need = super::containers_needed(offered, share);
+            prop_assert!(super::containers_needed(offered + more, share) >= need);
+            prop_assert!(need == MOST || erlang_b(need, offered) <= share);
+            prop_assert!(need == 0 || erlang_b(need - 1, offered) > share, "one too many");
         }
     }
 }

@@ -1,94 +1,99 @@
-//! How many servants answer the robots that share a service.
+//! Decides how many servants answer the robots that share a service.
 //!
-//! What counts is how many requests there are at a time in the mean, waiting or under way: by Little's law (L = λW) the
-//! arrivals times how long each takes, so that both a higher rate and slower answers show in it. A node that answers one call
-//! after the other is busy all the time at one.
+//! The load is the mean number of requests in the system, waiting or in service: by Little's law (L = λW) the arrival
+//! rate times the response time, so that both a higher rate and slower answers show in it. A node that answers one call
+//! after the other is fully busy at one.
 //!
-//! | requests at a time, of `n` servants | for | then |
+//! | mean requests, with `n` servants | for | then |
 //! |---|---|---|
-//! | more than 1.5 n | a second | one more, up to the most |
-//! | more than n, and answers take longer than was promised | a second | one more: they wait for each other |
-//! | fewer than 0.7 (n - 1) | `calm` | one fewer, down to the least |
+//! | more than 1.5 n | a second | one more, up to the maximum |
+//! | more than n, and answers are later than desired | a second | one more: requests wait for each other |
+//! | fewer than 0.7 (n - 1) | `calm` | one fewer, down to the minimum |
 //!
-//! One more servant makes the first bound of `n + 1`, and the last one is below half of it, so that a load that stays as it is
-//! never makes a group grow and shrink in turns. While a servant starts, nothing else changes. Where one more is wanted and one
-//! retires, which may take as long as its last request, that one is taken back. A servant that could not be started is tried
-//! again after a pause.
+//! One more servant raises the first bound to that of `n + 1`, and the last one is below half of it, so that a constant
+//! load never makes a group grow and shrink in turns. While a servant starts, nothing else changes. If one more is
+//! wanted while one retires, which may take as long as its last request, the retiring one is kept. A servant that could
+//! not be started is tried again after a pause.
 
 use std::time::{Duration, Instant};
 
-/// Requests for each servant, above which one more is started.
+/// Requests per servant above which one more is started.
 const MANY: f64 = 1.5;
-/// The same where answers are late.
+/// Requests per servant above which one more is started if answers are late.
 const LATE: f64 = 1.0;
-/// Requests for each servant but one, below which that one retires.
+/// Requests per remaining servant below which one retires.
 const FEW: f64 = 0.7;
-/// How long there must be many.
+/// Time for which the load must be high.
 const STEADY: Duration = Duration::from_secs(1);
-/// After a servant could not be started.
+/// Pause after a servant could not be started.
 const PAUSE: Duration = Duration::from_secs(5);
-/// Places of one group that their robots have left, and that are kept for when these come back.
+/// Number of places in a group that are kept for robots that left and may come back.
 pub(crate) const LEFT: usize = 256;
 
-/// A group at one moment.
+/// Snapshot of a group.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Facts {
-    /// Servants at least, and at most.
+pub(crate) struct GroupFacts {
+    /// Minimum and maximum number of servants.
     pub(crate) bounds: (usize, usize),
-    /// Servants that can be asked.
+    /// Number of servants that accept requests.
     pub(crate) ready: usize,
-    /// Servants that will be.
+    /// Number of servants that are starting.
     pub(crate) starting: usize,
-    /// Servants that end what they work at.
+    /// Number of servants that finish their last requests.
     pub(crate) retiring: usize,
-    /// Requests at a time, in the mean since the moment before.
+    /// Mean number of requests in the system since the last snapshot.
     pub(crate) requests: f64,
-    /// How long they take in the mean, and how long they may, where that is known.
+    /// Mean response time, and the maximum, if known.
     pub(crate) time: Option<(Duration, Duration)>,
-    /// When a servant could not be started, or was lost before it was ready.
+    /// Last time a servant could not be started, or was lost before it was ready.
     pub(crate) failed: Option<Instant>,
-    /// How long there must be few requests before a servant retires.
+    /// Time for which the load must be low before a servant retires.
     pub(crate) calm: Duration,
 }
 
-/// What is to be done.
+/// A change of a group's servants.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Step {
-    /// One more servant, for this reason.
+pub(crate) enum GroupAction {
+    /// Start one more servant, for this reason.
     Start(String),
-    /// The one that retires is asked again, for this reason.
+    /// Keep the retiring servant after all, for this reason.
     TakeBack(String),
-    /// One retires, for this reason.
+    /// Retire one servant, for this reason.
     Retire(String),
 }
 
-/// Since when it has been so.
+/// Times since which the load has been high or low.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Since {
+pub(crate) struct LoadSince {
     many: Option<Instant>,
     few: Option<Instant>,
 }
 
-/// What is to be done now, and since when there have been many or few requests, to be given back the next time.
-pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, Since) {
+/// Decides what is to be done now; also returns the times since which the load has been high or low, to be passed in
+/// the next time.
+pub(crate) fn decide_group(
+    facts: &GroupFacts,
+    since: LoadSince,
+    now: Instant,
+) -> (Option<GroupAction>, LoadSince) {
     let (least, most) = facts.bounds;
     let (least, most) = (least.max(1), most.max(least).max(1));
     let there = facts.ready + facts.starting;
     let rests = facts.failed.is_some_and(|failed| now < failed + PAUSE);
     let one_more = |reason: String| match facts.retiring {
-        0 => (!rests).then_some(Step::Start(reason)),
-        _ => Some(Step::TakeBack(reason)),
+        0 => (!rests).then_some(GroupAction::Start(reason)),
+        _ => Some(GroupAction::TakeBack(reason)),
     };
     if there < least {
-        // The first servants are started at once, all of them.
+        // The first servants are started all at once.
         let reason = match there {
             0 => "a robot asks for the service".to_owned(),
-            _ => format!("{least} servants are wanted at least"),
+            _ => format!("the minimum is {least} servants"),
         };
-        return (one_more(reason), Since::default());
+        return (one_more(reason), LoadSince::default());
     }
     if facts.starting > 0 {
-        return (None, Since::default());
+        return (None, LoadSince::default());
     }
     let servants = facts.ready as f64;
     let late = facts
@@ -96,7 +101,7 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
         .filter(|(takes, may)| takes > may && facts.requests > LATE * servants);
     let many = facts.requests > MANY * servants || late.is_some();
     let few = facts.requests < FEW * (servants - 1.0);
-    let since = Since {
+    let since = LoadSince {
         many: many.then(|| since.many.unwrap_or(now)),
         few: few.then(|| since.few.unwrap_or(now)),
     };
@@ -106,25 +111,27 @@ pub(crate) fn look(facts: &Facts, since: Since, now: Instant) -> (Option<Step>, 
         let requests = facts.requests;
         let reason = match late {
             Some((takes, may)) => format!(
-                "{requests:.1} requests at a time wait for each other at {there} servants: they take {takes:.0?} instead of {may:.0?}"
+                "{requests:.1} concurrent requests delay each other at {there} servants: they take {takes:.0?} instead \
+                    of {may:.0?}"
             ),
-            None => format!("{requests:.1} requests at a time are many for {there} servants"),
+            None => format!("{requests:.1} concurrent requests are many for {there} servants"),
         };
-        return (one_more(reason), Since::default());
+        return (one_more(reason), LoadSince::default());
     }
     if has_been(since.few, facts.calm) && there > least {
         let reason = format!(
-            "{:.1} requests at a time are few for {there} servants",
+            "{:.1} concurrent requests are few for {there} servants",
             facts.requests
         );
-        return (Some(Step::Retire(reason)), Since::default());
+        return (Some(GroupAction::Retire(reason)), LoadSince::default());
     }
     (None, since)
 }
 
-/// Which of the places that robots have left (until when each is kept, and its id) are given up: those that were left first. A
-/// place takes no capacity, so that nothing else bounds how many there are, and robots are free to give themselves new names.
-pub(crate) fn given_up(mut left: Vec<(u64, &str)>) -> Vec<&str> {
+/// Chooses which of the places that robots have left (with the time until which each is kept, and its id) are given up:
+/// those left first. A place takes no capacity, so nothing else bounds their number, and robots are free to give
+/// themselves new names.
+pub(crate) fn expired_places(mut left: Vec<(u64, &str)>) -> Vec<&str> {
     left.sort_unstable();
     left.truncate(left.len().saturating_sub(LEFT));
     left.into_iter().map(|(_, id)| id).collect()
@@ -139,8 +146,8 @@ mod tests {
     const CALM: Duration = Duration::from_secs(30);
     const LOOKS: Duration = Duration::from_millis(250);
 
-    fn facts(ready: usize, requests: f64) -> Facts {
-        Facts {
+    fn facts(ready: usize, requests: f64) -> GroupFacts {
+        GroupFacts {
             bounds: (1, 4),
             ready,
             starting: 0,
@@ -152,19 +159,19 @@ mod tests {
         }
     }
 
-    /// What happens when it stays so for `long`.
-    fn after(facts: Facts, long: Duration) -> Option<Step> {
+    /// Returns the decision after the facts have stayed the same for `long`.
+    fn action_after(facts: GroupFacts, long: Duration) -> Option<GroupAction> {
         let began = Instant::now();
-        let (_, since) = look(&facts, Since::default(), began);
-        look(&facts, since, began + long).0
+        let (_, since) = decide_group(&facts, LoadSince::default(), began);
+        decide_group(&facts, since, began + long).0
     }
 
     #[test]
     fn what_makes_a_group_grow_and_shrink() {
-        let words = |step: Option<Step>| match step {
-            Some(Step::Start(reason)) => format!("start: {reason}"),
-            Some(Step::TakeBack(reason)) => format!("take back: {reason}"),
-            Some(Step::Retire(reason)) => format!("retire: {reason}"),
+        let words = |step: Option<GroupAction>| match step {
+            Some(GroupAction::Start(reason)) => format!("start: {reason}"),
+            Some(GroupAction::TakeBack(reason)) => format!("take back: {reason}"),
+            Some(GroupAction::Retire(reason)) => format!("retire: {reason}"),
             None => String::new(),
         };
         let late = (Duration::from_millis(300), Duration::from_millis(200));
@@ -172,32 +179,32 @@ mod tests {
         for (facts, long, expected) in [
             (facts(0, 0.0), LOOKS, "start: a robot asks for the service"),
             (
-                Facts {
+                GroupFacts {
                     bounds: (2, 4),
                     ..facts(1, 0.0)
                 },
                 LOOKS,
-                "start: 2 servants are wanted at least",
+                "start: the minimum is 2 servants",
             ),
             (facts(1, 1.4), CALM, ""),
             (facts(1, 2.0), LOOKS, ""),
             (
                 facts(1, 2.0),
                 STEADY,
-                "start: 2.0 requests at a time are many for 1 servants",
+                "start: 2.0 concurrent requests are many for 1 servants",
             ),
             (facts(4, 90.0), CALM, ""),
             (
-                Facts {
+                GroupFacts {
                     time: Some(late),
                     ..facts(2, 2.5)
                 },
                 STEADY,
-                "start: 2.5 requests at a time wait for each other at 2 servants: they take 300ms instead of 200ms",
+                "start: 2.5 concurrent requests delay each other at 2 servants: they take 300ms instead of 200ms",
             ),
-            // Slow, but nobody waits for anybody: another servant is no faster.
+            // Slow, but without queueing: another servant is no faster.
             (
-                Facts {
+                GroupFacts {
                     time: Some(late),
                     ..facts(2, 1.5)
                 },
@@ -208,38 +215,38 @@ mod tests {
             (
                 facts(2, 0.6),
                 CALM,
-                "retire: 0.6 requests at a time are few for 2 servants",
+                "retire: 0.6 concurrent requests are few for 2 servants",
             ),
             (facts(2, 0.8), CALM, ""),
             (facts(1, 0.0), CALM, ""),
             (
-                Facts {
+                GroupFacts {
                     starting: 1,
                     ..facts(1, 9.0)
                 },
                 CALM,
                 "",
             ),
-            // One that retires may take for ever: the group grows and shrinks all the same.
+            // A retiring servant may take for ever: the group grows and shrinks nevertheless.
             (
-                Facts {
+                GroupFacts {
                     retiring: 1,
                     ..facts(2, 0.0)
                 },
                 CALM,
-                "retire: 0.0 requests at a time are few for 2 servants",
+                "retire: 0.0 concurrent requests are few for 2 servants",
             ),
             (
-                Facts {
+                GroupFacts {
                     retiring: 1,
                     failed: Some(now),
                     ..facts(1, 10.0)
                 },
                 STEADY,
-                "take back: 10.0 requests at a time are many for 1 servants",
+                "take back: 10.0 concurrent requests are many for 1 servants",
             ),
             (
-                Facts {
+                GroupFacts {
                     retiring: 1,
                     ..facts(0, 0.0)
                 },
@@ -247,7 +254,7 @@ mod tests {
                 "take back: a robot asks for the service",
             ),
             (
-                Facts {
+                GroupFacts {
                     failed: Some(now),
                     ..facts(0, 0.0)
                 },
@@ -255,24 +262,24 @@ mod tests {
                 "",
             ),
         ] {
-            assert_eq!(words(after(facts, long)), expected, "{facts:?}");
+            assert_eq!(words(action_after(facts, long)), expected, "{facts:?}");
         }
     }
 
-    /// Plays a group for as many looks as there are loads; servants start at once. How often it grew and shrank.
+    /// Simulates a group with a load per round; servants start at once. Returns how often it grew and shrank.
     fn play(ready: &mut usize, loads: &[f64]) -> (usize, usize) {
-        let (mut since, mut now) = (Since::default(), Instant::now());
+        let (mut since, mut now) = (LoadSince::default(), Instant::now());
         let mut steps = (0, 0);
         for load in loads {
             now += LOOKS;
-            let (step, next) = look(&facts(*ready, *load), since, now);
+            let (step, next) = decide_group(&facts(*ready, *load), since, now);
             since = next;
             match step {
-                Some(Step::Start(_) | Step::TakeBack(_)) => {
+                Some(GroupAction::Start(_) | GroupAction::TakeBack(_)) => {
                     *ready += 1;
                     steps.0 += 1;
                 }
-                Some(Step::Retire(_)) => {
+                Some(GroupAction::Retire(_)) => {
                     *ready -= 1;
                     steps.1 += 1;
                 }
@@ -292,9 +299,9 @@ mod tests {
             left.map(|(until, id)| (until as u64, id.as_str()))
                 .collect()
         };
-        assert_eq!(given_up(left(LEFT)), Vec::<&str>::new());
+        assert_eq!(expired_places(left(LEFT)), Vec::<&str>::new());
         let last = [&*ids[LEFT + 1], &*ids[LEFT]];
-        assert_eq!(given_up(left(LEFT + 2)), last);
+        assert_eq!(expired_places(left(LEFT + 2)), last);
     }
 
     proptest! {

@@ -1,73 +1,73 @@
-//! Whether nodes hang: they are given inputs and answer none of them for many times the T_max that their robot stated.
+//! Detects hung nodes: nodes that receive inputs and answer none of them for many times their robot's T_max.
 
 use std::time::{Duration, Instant};
 
-/// Fewer inputs without an answer are no sign: a node need not answer each.
+/// Minimum number of unanswered inputs for a sign of trouble: a node need not answer each.
 const INPUTS: u64 = 3;
-/// Nothing hangs for less, however short its T_max.
+/// Minimum time after which a node counts as hung, however short its T_max.
 const LEAST: Duration = Duration::from_secs(1);
 
-/// What went to nodes and came from them so far.
+/// Cumulative messages to and from nodes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Flow {
-    /// Messages and calls that they were given.
+    /// Number of messages and calls that they received.
     pub inputs: u64,
-    /// Messages and answers that they gave.
+    /// Number of messages and answers that they sent.
     pub outputs: u64,
-    /// How often one of them was started.
+    /// Number of starts of any of them.
     pub starts: u64,
 }
 
-/// What was seen of a flow so far.
+/// State of the watch over a flow.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Watched {
-    /// As it was when there was an output last.
+pub struct FlowWatch {
+    /// The flow at the time of the last output.
     answered: Flow,
-    /// Outputs before one of them was started last, as far as that was seen.
+    /// Number of outputs before the last start, as far as known.
     outputs_before: u64,
-    /// When the first input was seen that came after it.
+    /// Time at which the first later input was seen.
     since: Option<Instant>,
-    /// It was told that they hang, and there was no output since.
+    /// The hang was reported, and there was no output since.
     told: bool,
 }
 
-/// Nodes hang.
+/// A detected hang.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Hung {
-    /// So many inputs are not answered.
+pub struct HungNodes {
+    /// Number of unanswered inputs.
     pub inputs: u64,
-    /// The first of them since so long.
+    /// Time since the first of them.
     pub since: Duration,
 }
 
-impl Watched {
-    /// Whether it was told that they hang, and there was no output since.
-    pub fn hangs(&self) -> bool {
+impl FlowWatch {
+    /// Returns true if the hang was reported, and there was no output since.
+    pub fn is_reported_hung(&self) -> bool {
         self.told
     }
 }
 
-/// Looks at a flow again: what is to be remembered, and whether it is to be told that the nodes hang, which it is once until
-/// there is an output again. Nodes that never had an output may have none; nor do those that were started again and still load
-/// what they need.
-pub fn look(
-    before: Option<Watched>,
+/// Evaluates a flow: returns the new state, and the hang if it is to be reported now, which happens once until there is
+/// an output again. Nodes that never had an output may have none; nor may restarted ones that still load what they
+/// need.
+pub fn observe_flow(
+    before: Option<FlowWatch>,
     flow: Flow,
     patience: Duration,
     now: Instant,
-) -> (Watched, Option<Hung>) {
-    let fresh = Watched {
+) -> (FlowWatch, Option<HungNodes>) {
+    let fresh = FlowWatch {
         answered: flow,
         outputs_before: match before {
             Some(before) if before.answered.starts != flow.starts => flow.outputs,
-            // Those of other nodes, or of a bridge that was opened anew.
+            // Outputs of other nodes, or of a reopened bridge.
             Some(before) if before.outputs_before <= flow.outputs => before.outputs_before,
             _ => 0,
         },
         since: None,
         told: false,
     };
-    let same = |before: &Watched| {
+    let same = |before: &FlowWatch| {
         before.answered.outputs == flow.outputs
             && before.answered.inputs <= flow.inputs
             && before.answered.starts == flow.starts
@@ -82,7 +82,7 @@ pub fn look(
     let since = now - *watched.since.get_or_insert(now);
     let hangs = !watched.told && inputs >= INPUTS && since >= patience.max(LEAST);
     watched.told |= hangs;
-    (watched, hangs.then_some(Hung { inputs, since }))
+    (watched, hangs.then_some(HungNodes { inputs, since }))
 }
 
 #[cfg(test)]
@@ -93,8 +93,8 @@ mod tests {
 
     const PATIENCE: Duration = Duration::from_secs(3);
 
-    /// Looked at every second: at which second it is told that they hang.
-    fn told(flows: &[(u64, u64)]) -> Vec<usize> {
+    /// Evaluates the flows once per second; returns the seconds at which a hang is reported.
+    fn seconds_reported(flows: &[(u64, u64)]) -> Vec<usize> {
         let begun = Instant::now();
         let mut watched = None;
         let mut told = Vec::new();
@@ -105,7 +105,7 @@ mod tests {
                 starts: 0,
             };
             let now = begun + Duration::from_secs(second as u64);
-            let (next, hung) = look(watched, flow, PATIENCE, now);
+            let (next, hung) = observe_flow(watched, flow, PATIENCE, now);
             watched = Some(next);
             told.extend(hung.map(|_| second));
         }
@@ -126,10 +126,10 @@ mod tests {
             (&[(1, 1), (3, 1), (3, 1), (3, 1), (4, 1), (4, 1)], &[4]),
             // An answer every now and then.
             (&[(1, 1), (9, 1), (9, 1), (9, 2), (19, 2), (19, 2)], &[]),
-            // It was started again.
+            // It was restarted.
             (&[(9, 9), (3, 9), (6, 9), (6, 9), (6, 9), (6, 9)], &[5]),
         ] {
-            assert_eq!(told(flows), expected, "{flows:?}");
+            assert_eq!(seconds_reported(flows), expected, "{flows:?}");
         }
         let begun = Instant::now();
         let flow = |inputs| Flow {
@@ -137,9 +137,9 @@ mod tests {
             outputs: 1,
             starts: 0,
         };
-        let (watched, _) = look(None, flow(1), Duration::ZERO, begun);
-        let (watched, _) = look(Some(watched), flow(9), Duration::ZERO, begun);
-        let (_, hung) = look(Some(watched), flow(9), Duration::ZERO, begun + LEAST / 2);
+        let (watched, _) = observe_flow(None, flow(1), Duration::ZERO, begun);
+        let (watched, _) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun);
+        let (_, hung) = observe_flow(Some(watched), flow(9), Duration::ZERO, begun + LEAST / 2);
         assert_eq!(hung, None, "not for so short a time");
     }
 
@@ -154,13 +154,13 @@ mod tests {
                 starts,
             };
             let now = begun + Duration::from_secs(second.into());
-            let (next, hung) = look(watched, flow, PATIENCE, now);
+            let (next, hung) = observe_flow(watched, flow, PATIENCE, now);
             watched = Some(next);
             hung.is_some()
         };
         assert!(!hangs(0, 9, 9, 1));
         assert!(!hangs(1, 19, 9, 1));
-        // It has crashed, and loads its model while inputs go on.
+        // It has crashed, and loads its model while inputs continue.
         for second in 2..60 {
             assert!(!hangs(second, u64::from(second) * 10, 9, 2), "{second}");
         }
@@ -182,7 +182,7 @@ mod tests {
                 sum = (sum.0 + inputs, sum.1 + outputs * u64::from(*inputs == 3));
                 sum
             }).collect();
-            let told = told(&flows);
+            let told = seconds_reported(&flows);
             for pair in told.windows(2) {
                 prop_assert!(flows[pair[0]].1 < flows[pair[1]].1, "told again");
             }

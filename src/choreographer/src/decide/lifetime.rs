@@ -1,112 +1,113 @@
-//! How long a servant is waited for, and how long it is kept.
+//! Decides how long a servant is waited for, and how long it is kept.
 
 use std::time::{Duration, Instant};
 
-/// When nothing changes for so long although something of the interface is missing, it is not coming: of a servant that
-/// was adopted, whose nodes may have been told to take it away, and of a revision that has kept robots waiting in vain.
+/// Time without changes after which the missing part of an interface is considered permanent: for an adopted servant,
+/// whose nodes may have been told to remove it, and for a revision that has kept robots waiting in vain.
 pub const SETTLED: Duration = Duration::from_secs(5);
 
-/// How far a servant has come.
+/// Stage of a servant's life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Stage {
+pub enum ServantStage {
     /// It waits for capacity.
     Queued,
     /// It has capacity, and nothing runs.
     Admitted,
-    /// It has a container, and its interface is not there.
+    /// It has a container, and its interface is not registered yet.
     Starting,
     /// It can be used.
     Ready,
 }
 
-/// What decides whether a servant is needed.
+/// Input for deciding whether a servant is needed.
 #[derive(Debug, Clone, Copy)]
 pub struct Tenancy {
-    /// How far it has come.
-    pub stage: Stage,
-    /// An earlier daemon started it.
+    /// Stage of its life.
+    pub stage: ServantStage,
+    /// It was started by an earlier daemon.
     pub adopted: bool,
-    /// Its robot named no name, and cannot come back to it.
+    /// The robot gave no name and cannot come back to it.
     pub anonymous: bool,
-    /// Connections that use it.
+    /// Number of connections.
     pub connections: usize,
-    /// Since when there has been none, of a servant that is ready.
+    /// Time since which a ready servant has had no connection.
     pub idle_since: Option<Instant>,
-    /// How long it is kept without a connection.
+    /// Time for which it is kept without a connection.
     pub grace: Duration,
 }
 
-/// Whether a servant is needed.
+/// Decision whether a servant is kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Need {
-    /// As long as nothing of its tenancy changes.
+pub enum Retention {
+    /// It is kept as long as its tenancy does not change.
     Stays,
-    /// Nobody uses it; it is kept until then.
+    /// It is unused and kept until this time.
     Until(Instant),
-    /// No longer, with the reason.
+    /// It is no longer needed, for this reason.
     Over(String),
 }
 
-/// Whether a servant is needed at `now`. Robots that can come back find it within their grace time, however far it has come
-/// once it was admitted.
-pub fn needed(of: &Tenancy, now: Instant) -> Need {
-    let left = |words: &str| Need::Over(format!("its robot left{words}"));
+/// Decides whether a servant is needed at `now`. Robots that can come back find it within their grace time, whatever
+/// its stage once it was admitted.
+pub fn retention(of: &Tenancy, now: Instant) -> Retention {
+    let left = |words: &str| Retention::Over(format!("its robot left{words}"));
     match of.stage {
-        _ if of.connections > 0 => Need::Stays,
-        Stage::Queued => left(" before there was room"),
-        Stage::Admitted if of.anonymous => left(" before it was started"),
-        Stage::Starting if of.anonymous && !of.adopted => left(" before it was ready"),
-        Stage::Admitted | Stage::Starting => Need::Stays,
-        Stage::Ready => {
+        _ if of.connections > 0 => Retention::Stays,
+        ServantStage::Queued => left(" while it was queued"),
+        ServantStage::Admitted if of.anonymous => left(" before it was started"),
+        ServantStage::Starting if of.anonymous && !of.adopted => left(" before it was ready"),
+        ServantStage::Admitted | ServantStage::Starting => Retention::Stays,
+        ServantStage::Ready => {
             let until = of.idle_since.unwrap_or(now) + of.grace;
             match of.grace.as_secs() {
-                _ if now < until => Need::Until(until),
+                _ if now < until => Retention::Until(until),
                 0 => left(""),
-                seconds => Need::Over(format!("no robot was connected for {seconds} s")),
+                seconds => Retention::Over(format!("no robot was connected for {seconds} s")),
             }
         }
     }
 }
 
-/// What decides whether a servant can be used.
+/// Input for deciding whether a servant can be used.
 #[derive(Debug, Clone, Copy)]
-pub struct Shown<'a> {
-    /// What of its interface is not registered, in words.
+pub struct InterfaceStatus<'a> {
+    /// Missing parts of its interface, in words.
     pub missing: &'a [String],
-    /// Its nodes that have registered nothing.
+    /// Nodes that have registered nothing.
     pub nodes_missing: &'a [String],
-    /// More is to come: its nodes may take all the time of a start between their registration and their first topic.
+    /// More may come: the nodes may take all the time of a start between their registration and their first topic.
     pub patient: bool,
-    /// When what is registered changed last.
+    /// Time of the last registration change.
     pub changed: Instant,
-    /// Until when it has to be ready.
+    /// Deadline for becoming ready.
     pub deadline: Instant,
-    /// What that is from its start on.
+    /// Duration of that limit, counted from its start.
     pub limit: Duration,
 }
 
-/// Whether a servant can be used.
+/// Decision whether a servant can be used.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Readiness {
-    /// All of its interface is there.
+    /// The interface is complete.
     Ready,
-    /// All that is coming is there.
+    /// Parts of the interface are missing and not expected any more.
     Incomplete,
-    /// Not before something changes; at this time it is decided anew.
+    /// It waits for a change; at this time it is evaluated again.
     Waits(Instant),
-    /// It has failed, with the reason.
+    /// It has failed, for this reason.
     Late(String),
 }
 
-/// Whether a servant can be used at `now`. Topics can come and go with what a node is told; nodes cannot.
-pub fn readiness(of: &Shown<'_>, now: Instant) -> Readiness {
+/// Decides whether a servant can be used at `now`. Topics may come and go depending on a node's inputs; nodes may not.
+pub fn readiness(of: &InterfaceStatus<'_>, now: Instant) -> Readiness {
     if of.missing.is_empty() {
         return Readiness::Ready;
     }
     let nodes_there = of.nodes_missing.is_empty();
-    let until = match of.patient || !nodes_there {
-        true => of.deadline,
-        false => of.deadline.min(of.changed + SETTLED),
+    let until = if of.patient || !nodes_there {
+        of.deadline
+    } else {
+        of.deadline.min(of.changed + SETTLED)
     };
     if now < until {
         Readiness::Waits(until)
@@ -133,39 +134,39 @@ mod tests {
     #[test]
     fn a_servant_is_kept_for_as_long_as_its_robot_can_come_back() {
         let now = Instant::now();
-        let over = |words: &str| Need::Over(words.to_owned());
+        let over = |words: &str| Retention::Over(words.to_owned());
         let (long, short) = (Some(now - GRACE), Some(now - GRACE / 3));
-        let waits = Need::Until(now + GRACE * 2 / 3);
+        let waits = Retention::Until(now + GRACE * 2 / 3);
         for (stage, anonymous, idle_since, expected) in [
             (
-                Stage::Queued,
+                ServantStage::Queued,
                 false,
                 None,
-                over("its robot left before there was room"),
+                over("its robot left while it was queued"),
             ),
             (
-                Stage::Queued,
+                ServantStage::Queued,
                 true,
                 None,
-                over("its robot left before there was room"),
+                over("its robot left while it was queued"),
             ),
-            (Stage::Admitted, false, None, Need::Stays),
+            (ServantStage::Admitted, false, None, Retention::Stays),
             (
-                Stage::Admitted,
+                ServantStage::Admitted,
                 true,
                 None,
                 over("its robot left before it was started"),
             ),
-            (Stage::Starting, false, None, Need::Stays),
+            (ServantStage::Starting, false, None, Retention::Stays),
             (
-                Stage::Starting,
+                ServantStage::Starting,
                 true,
                 None,
                 over("its robot left before it was ready"),
             ),
-            (Stage::Ready, false, short, waits),
+            (ServantStage::Ready, false, short, waits),
             (
-                Stage::Ready,
+                ServantStage::Ready,
                 false,
                 long,
                 over("no robot was connected for 60 s"),
@@ -179,29 +180,29 @@ mod tests {
                 idle_since,
                 grace: GRACE,
             };
-            assert_eq!(needed(&tenancy, now), expected, "{tenancy:?}");
+            assert_eq!(retention(&tenancy, now), expected, "{tenancy:?}");
             let used = Tenancy {
                 connections: 1,
                 ..tenancy
             };
-            assert_eq!(needed(&used, now), Need::Stays, "{used:?}");
+            assert_eq!(retention(&used, now), Retention::Stays, "{used:?}");
             let adopted = Tenancy {
                 adopted: true,
                 ..tenancy
             };
-            if stage == Stage::Starting {
-                assert_eq!(needed(&adopted, now), Need::Stays, "{adopted:?}");
+            if stage == ServantStage::Starting {
+                assert_eq!(retention(&adopted, now), Retention::Stays, "{adopted:?}");
             }
         }
         let no_grace = Tenancy {
-            stage: Stage::Ready,
+            stage: ServantStage::Ready,
             adopted: false,
             anonymous: true,
             connections: 0,
             idle_since: Some(now),
             grace: Duration::ZERO,
         };
-        assert_eq!(needed(&no_grace, now), over("its robot left"));
+        assert_eq!(retention(&no_grace, now), over("its robot left"));
     }
 
     #[test]
@@ -223,7 +224,7 @@ mod tests {
             (&topic, &node, true, 29, waits(30)),
             (&topic, &node, true, 30, Readiness::Late(late.to_owned())),
         ] {
-            let shown = Shown {
+            let shown = InterfaceStatus {
                 missing,
                 nodes_missing: nodes,
                 patient,
@@ -237,11 +238,12 @@ mod tests {
     }
 
     proptest! {
-        /// What is decided for a time holds until then, and what is over stays over.
+        /// A decision with a time holds until then, and an end is final.
         #[test]
         fn time_takes_nothing_back(
             stage in prop_oneof![
-                Just(Stage::Queued), Just(Stage::Admitted), Just(Stage::Starting), Just(Stage::Ready)
+                Just(ServantStage::Queued), Just(ServantStage::Admitted), Just(ServantStage::Starting),
+                    Just(ServantStage::Ready)
             ],
             adopted: bool,
             anonymous: bool,
@@ -265,7 +267,7 @@ mod tests {
             };
             let missing = ["the service /s".to_owned()];
             let nodes_missing = vec!["/node".to_owned(); nodes];
-            let shown = Shown {
+            let shown = InterfaceStatus {
                 missing: &missing,
                 nodes_missing: &nodes_missing,
                 patient,
@@ -275,19 +277,19 @@ mod tests {
             };
             let mut times = times;
             times.sort_unstable();
-            let mut needs: Option<Need> = None;
+            let mut needs: Option<Retention> = None;
             let mut waits: Option<Readiness> = None;
             for seconds in times {
                 let now = at(idle + seconds);
-                let need = needed(&tenancy, now);
-                prop_assert_eq!(&need, &needed(&tenancy, now));
+                let need = retention(&tenancy, now);
+                prop_assert_eq!(&need, &retention(&tenancy, now));
                 match (&needs, &need) {
-                    (Some(Need::Until(then)), _) if now < *then => prop_assert_eq!(&need, needs.as_ref().unwrap()),
-                    (Some(Need::Until(_)), _) => prop_assert!(matches!(need, Need::Over(_))),
+                    (Some(Retention::Until(then)), _) if now < *then => prop_assert_eq!(&need, needs.as_ref().unwrap()),
+                    (Some(Retention::Until(_)), _) => prop_assert!(matches!(need, Retention::Over(_))),
                     (Some(before), _) => prop_assert_eq!(before, &need),
-                    (None, Need::Until(then)) => {
+                    (None, Retention::Until(then)) => {
                         prop_assert!(now < *then);
-                        prop_assert!(matches!(needed(&tenancy, *then), Need::Over(_)));
+                        prop_assert!(matches!(retention(&tenancy, *then), Retention::Over(_)));
                     }
                     (None, _) => {}
                 }

@@ -1,45 +1,45 @@
-//! Auxiliary parameters that are measured: how large what a robot sends to nodes is.
+//! Auxiliary parameters that are measured: the size of what a robot sends to nodes.
 //!
-//! | key | is |
+//! | key | value |
 //! |---|---|
-//! | `bytes` | the largest message or request of all inputs |
-//! | `width`, `height` | the greatest of all inputs whose types say them: pictures, clouds, grids |
-//! | `NAME.bytes`, `NAME.width`, `NAME.height` | the same of one topic or service; `/` within its name is written `.` |
-//! | `NAME.typical` | what half of its messages do not exceed |
+//! | `bytes` | size of the largest message or request of all inputs |
+//! | `width`, `height` | maximum over all inputs whose types have them: pictures, clouds, grids |
+//! | `NAME.bytes`, `NAME.width`, `NAME.height` | the same for one topic or service; `/` in its name is written `.` |
+//! | `NAME.typical` | median size of its messages |
 //!
-//! Each is known once [`ENOUGH`] messages have passed, or [`PATIENCE`] after the first; of all inputs, once each of them is. What
-//! was measured only grows: a servant is not made small between two large pictures.
+//! Each is known after [`ENOUGH`] messages, or [`PATIENCE`] after the first; those over all inputs, once each input is
+//! known. Measured values only grow: a servant is not shrunk between two large pictures.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use api::dictionary::Row;
 use api::sla::check_aux;
-use ros::sizes::Seen;
+use ros::sizes::SizeSummary;
 
 use super::dictionary::Aux;
 
-/// So many messages of an input tell how large the others are.
+/// Number of messages of an input after which its sizes are known.
 pub const ENOUGH: u64 = 8;
-/// After the first message of an input that sends fewer, such as a map.
+/// Time after the first message at which the sizes of an input that sends fewer, such as a map, are known.
 pub const PATIENCE: Duration = Duration::from_secs(5);
 
-/// What was seen of one input.
+/// Measurements of one input.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Input {
-    /// Topic or service.
+pub struct MeasuredInput {
+    /// Name of the topic or service.
     pub name: String,
-    /// Its messages.
-    pub seen: Seen,
-    /// Since the first of them.
+    /// Sizes of its messages.
+    pub seen: SizeSummary,
+    /// Time since the first message.
     pub known: Duration,
 }
 
-/// The parameters that follow, of those that rows name.
-pub fn measured(inputs: &[Input], rows: &[Row]) -> Aux {
+/// Returns the resulting parameters, as far as rows name them.
+pub fn aux_from_inputs(inputs: &[MeasuredInput], rows: &[Row]) -> Aux {
     let mut all = BTreeMap::new();
-    let used: Vec<&Input> = inputs.iter().filter(|input| input.seen.count > 0).collect();
-    let settled = |input: &Input| input.seen.count >= ENOUGH || input.known >= PATIENCE;
+    let used: Vec<&MeasuredInput> = inputs.iter().filter(|input| input.seen.count > 0).collect();
+    let settled = |input: &MeasuredInput| input.seen.count >= ENOUGH || input.known >= PATIENCE;
     let whole = used.iter().all(|input| settled(input));
     for input in used {
         if !settled(input) {
@@ -69,8 +69,8 @@ pub fn measured(inputs: &[Input], rows: &[Row]) -> Aux {
         .collect()
 }
 
-/// What was measured `before` with what is `now`: the greater of both.
-pub fn grown(before: &Aux, now: Aux) -> Aux {
+/// Merges the parameters measured `before` and `now`: the larger value of each.
+pub fn merge_max(before: &Aux, now: Aux) -> Aux {
     let mut all = before.clone();
     for (key, value) in now {
         let number = |text: &String| text.parse::<u64>().ok();
@@ -100,10 +100,10 @@ mod tests {
         row
     }
 
-    fn input(name: &str, count: u64, largest: u64, width: Option<u64>) -> Input {
-        Input {
+    fn input(name: &str, count: u64, largest: u64, width: Option<u64>) -> MeasuredInput {
+        MeasuredInput {
             name: name.to_owned(),
-            seen: Seen {
+            seen: SizeSummary {
                 count,
                 largest,
                 typical: largest / 2,
@@ -114,7 +114,7 @@ mod tests {
         }
     }
 
-    fn of(pairs: &[(&str, &str)]) -> Aux {
+    fn aux_of(pairs: &[(&str, &str)]) -> Aux {
         let pairs = pairs.iter();
         pairs
             .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
@@ -125,7 +125,7 @@ mod tests {
     fn what_rows_name_is_told_once_it_is_known() {
         let camera = input("/camera/image", 8, 1000, Some(640));
         let few = input("/map", 7, 5000, Some(900));
-        let map = Input {
+        let map = MeasuredInput {
             known: PATIENCE,
             ..few.clone()
         };
@@ -133,44 +133,47 @@ mod tests {
         let text = input("/text", 9, 10, None);
         let keys = ["width", "bytes", "camera.image.typical", "text.width"];
         for (inputs, told) in [
-            (vec![], of(&[])),
-            (vec![silent.clone()], of(&[])),
+            (vec![], aux_of(&[])),
+            (vec![silent.clone()], aux_of(&[])),
             (
                 vec![camera.clone(), silent],
-                of(&[
+                aux_of(&[
                     ("bytes", "1000"),
                     ("camera.image.typical", "500"),
                     ("width", "640"),
                 ]),
             ),
-            // Of the map it is not known yet how large it is.
+            // The size of the map is not known yet.
             (
                 vec![camera.clone(), few],
-                of(&[("camera.image.typical", "500")]),
+                aux_of(&[("camera.image.typical", "500")]),
             ),
             (
                 vec![camera.clone(), map, text],
-                of(&[
+                aux_of(&[
                     ("bytes", "5000"),
                     ("camera.image.typical", "500"),
                     ("width", "900"),
                 ]),
             ),
         ] {
-            assert_eq!(measured(&inputs, &[row(&keys)]), told, "{inputs:?}");
+            assert_eq!(aux_from_inputs(&inputs, &[row(&keys)]), told, "{inputs:?}");
         }
-        assert_eq!(measured(std::slice::from_ref(&camera), &[]), of(&[]));
+        assert_eq!(
+            aux_from_inputs(std::slice::from_ref(&camera), &[]),
+            aux_of(&[])
+        );
         // A name that no row can have.
         let odd = input("/a b", 8, 1, None);
-        assert_eq!(measured(&[odd], &[row(&["a b.bytes"])]), of(&[]));
+        assert_eq!(aux_from_inputs(&[odd], &[row(&["a b.bytes"])]), aux_of(&[]));
     }
 
     #[test]
     fn what_was_measured_stays_until_it_is_more() {
-        let before = of(&[("bytes", "1000"), ("width", "640")]);
-        let now = of(&[("bytes", "999"), ("height", "7"), ("width", "1280")]);
-        let after = of(&[("bytes", "1000"), ("height", "7"), ("width", "1280")]);
-        assert_eq!(grown(&before, now), after);
+        let before = aux_of(&[("bytes", "1000"), ("width", "640")]);
+        let now = aux_of(&[("bytes", "999"), ("height", "7"), ("width", "1280")]);
+        let after = aux_of(&[("bytes", "1000"), ("height", "7"), ("width", "1280")]);
+        assert_eq!(merge_max(&before, now), after);
     }
 
     proptest! {
@@ -183,15 +186,15 @@ mod tests {
             let rows = [row(&["bytes", "width", "a.bytes", "b.c.width", "d.typical"])];
             let mut known = Aux::new();
             for look in looks {
-                let inputs: Vec<Input> = names.iter().zip(look)
+                let inputs: Vec<MeasuredInput> = names.iter().zip(look)
                     .map(|(name, (count, largest, width))| input(name, count, largest, width))
                     .collect();
-                let now = measured(&inputs, &rows);
+                let now = aux_from_inputs(&inputs, &rows);
                 let number = |aux: &Aux, key: &str| aux.get(key).map(|text| text.parse::<u64>().expect("a number"));
                 if let (Some(all), Some(one)) = (number(&now, "bytes"), number(&now, "a.bytes")) {
                     prop_assert!(one <= all);
                 }
-                let after = grown(&known, now.clone());
+                let after = merge_max(&known, now.clone());
                 for key in rows[0].aux.keys() {
                     prop_assert!(number(&after, key) >= number(&known, key));
                     prop_assert!(number(&after, key) >= number(&now, key));

@@ -1,93 +1,93 @@
-//! What the end of a node means for its servant.
+//! Decides what the exit of a node means for its servant.
 
 use std::time::Duration;
 
-use super::back_off::{RECOVERED, doubled};
+use super::back_off::{RECOVERED, double_pause};
 
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// Failures in a row after which it is given up.
+/// Number of failures in a row after which a node is given up.
 const ATTEMPTS: u32 = 6;
 
-/// What is known of a servant where one of its nodes has ended.
+/// State of the servant whose node has exited.
 #[derive(Debug, Clone, Copy)]
-pub struct Crew {
-    /// Its nodes are started and ended by a robot's stubs.
+pub struct NodeExitContext {
+    /// The nodes are started and ended by a robot's stubs.
     pub linked: bool,
-    /// It is ready.
+    /// The servant is ready.
     pub ready: bool,
-    /// Nodes that fail are started again.
+    /// Failed nodes are restarted.
     pub restarts: bool,
-    /// Nodes that run or will run again, with this one.
+    /// Number of nodes that run or will run again, including this one.
     pub alive: usize,
 }
 
-/// The end of a node.
+/// Exit of a node.
 #[derive(Debug, Clone, Copy)]
-pub struct Ended<'a> {
-    /// Its name.
+pub struct EndedNode<'a> {
+    /// Name of the node.
     pub node: &'a str,
-    /// In words, beginning with a verb.
+    /// How it ended, as a phrase that starts with a verb.
     pub how: &'a str,
     /// It did not exit with status 0.
     pub failed: bool,
-    /// The servant needed more memory than its limit.
+    /// The servant exceeded its memory limit.
     pub out_of_memory: bool,
-    /// How long it ran.
+    /// Time for which it ran.
     pub ran: Duration,
-    /// Its failures in a row before this one.
+    /// Number of failures in a row before this one.
     pub failures: u32,
 }
 
 /// An event about a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Event {
-    /// Its kind.
+pub struct NodeReport {
+    /// Kind of the event.
     pub kind: &'static str,
-    /// In words.
+    /// Human-readable message.
     pub message: String,
 }
 
-/// What happens next.
+/// Action after the exit of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Next {
-    /// Nothing follows.
+pub enum NodeExitAction {
+    /// Nothing is to be done.
     Nothing,
-    /// The servant works on without the node.
-    Without(Event),
-    /// The node is started again.
+    /// The servant continues without the node.
+    Without(NodeReport),
+    /// The node is restarted.
     Restart {
-        /// After this time.
+        /// Pause before the restart.
         after: Duration,
-        /// Its failures in a row, with this one.
+        /// Number of failures in a row, including this one.
         failures: u32,
-        /// To be told.
-        event: Event,
+        /// Event to report.
+        event: NodeReport,
     },
     /// The servant has failed.
     Fail {
-        /// To be told before.
-        event: Option<Event>,
-        /// Beginning with a verb.
+        /// Event to report before.
+        event: Option<NodeReport>,
+        /// Reason, as a phrase that starts with a verb.
         reason: String,
     },
 }
 
-/// What happens after a node has ended.
-pub fn after(crew: Crew, end: Ended<'_>) -> Next {
-    let Ended { node, how, .. } = end;
-    let fail = |reason| Next::Fail {
+/// Decides what happens after a node has exited.
+pub fn decide_after_exit(crew: NodeExitContext, end: EndedNode<'_>) -> NodeExitAction {
+    let EndedNode { node, how, .. } = end;
+    let fail = |reason| NodeExitAction::Fail {
         event: None,
         reason,
     };
-    let event = |kind, message| Event { kind, message };
+    let event = |kind, message| NodeReport { kind, message };
     if crew.linked {
-        // A stub took its place.
-        return Next::Nothing;
+        // A stub manages the nodes.
+        return NodeExitAction::Nothing;
     }
     if end.out_of_memory {
-        // What it knew is lost, and it would do the same again: its robot is told and begins anew.
-        return Next::Fail {
+        // Its state is lost, and a restarted node would do the same again: the robot is told and starts anew.
+        return NodeExitAction::Fail {
             event: Some(event("out-of-memory", format!("{node} {how}"))),
             reason: format!("lost {node}: it {how}"),
         };
@@ -96,34 +96,28 @@ pub fn after(crew: Crew, end: Ended<'_>) -> Next {
         return fail(format!("did not become ready: {node} {how}"));
     }
     if end.failed && crew.restarts {
-        let (failures, pause) = back_off(end.failures, end.ran);
+        let (failures, pause) = restart_pause(end.failures, end.ran);
         let Some(after) = pause else {
-            return fail(format!("gave {node} up: it {how}, again and again"));
+            return fail(format!("gave up on {node}: it {how} repeatedly"));
         };
-        let message = format!(
-            "{node} {how}; it is started again in {} ms",
-            after.as_millis()
-        );
-        return Next::Restart {
+        let message = format!("{node} {how}; restart in {} ms", after.as_millis());
+        return NodeExitAction::Restart {
             after,
             failures,
             event: event("node-failed", message),
         };
     }
     if crew.alive <= 1 {
-        return fail(format!("has no node left: {node} {how}"));
+        return fail(format!("has no running nodes left: {node} {how}"));
     }
-    Next::Without(event("node-ended", format!("{node} {how}")))
+    NodeExitAction::Without(event("node-ended", format!("{node} {how}")))
 }
 
-/// A node failed after it ran for `ran`, and `failures` times in a row before: how often in a row now, and how long to wait
-/// before it is started again, or none when it is given up.
-fn back_off(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
-    let failures = match ran >= RECOVERED {
-        true => 1,
-        false => failures + 1,
-    };
-    let pause = || doubled(FIRST_PAUSE, failures - 1, LONGEST_PAUSE);
+/// Returns the number of failures in a row, including the one of a node that ran for `ran`, and the pause before its
+/// restart; `None` if it is given up.
+fn restart_pause(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
+    let failures = if ran >= RECOVERED { 1 } else { failures + 1 };
+    let pause = || double_pause(FIRST_PAUSE, failures - 1, LONGEST_PAUSE);
     (failures, (failures <= ATTEMPTS).then(pause))
 }
 
@@ -131,14 +125,14 @@ fn back_off(failures: u32, ran: Duration) -> (u32, Option<Duration>) {
 mod tests {
     use super::*;
 
-    const CREW: Crew = Crew {
+    const CREW: NodeExitContext = NodeExitContext {
         linked: false,
         ready: true,
         restarts: true,
         alive: 2,
     };
 
-    const END: Ended<'_> = Ended {
+    const END: EndedNode<'_> = EndedNode {
         node: "/a",
         how: "exited with status 1",
         failed: true,
@@ -149,39 +143,39 @@ mod tests {
 
     #[test]
     fn what_the_end_of_a_node_means() {
-        let done = Ended {
+        let done = EndedNode {
             failed: false,
             how: "exited with status 0",
             ..END
         };
-        let killed = Ended {
+        let killed = EndedNode {
             out_of_memory: true,
             how: "was killed",
             ..END
         };
-        let starting = Crew {
+        let starting = NodeExitContext {
             ready: false,
             ..CREW
         };
-        let last = Crew { alive: 1, ..CREW };
-        let fragile = Crew {
+        let last = NodeExitContext { alive: 1, ..CREW };
+        let fragile = NodeExitContext {
             restarts: false,
             ..CREW
         };
-        let linked = Crew {
+        let linked = NodeExitContext {
             linked: true,
             ready: false,
             ..CREW
         };
         let in_words = |next| match next {
-            Next::Nothing => "nothing".to_owned(),
-            Next::Without(event) => format!("{}: {}", event.kind, event.message),
-            Next::Restart { event, .. } => format!("{}: {}", event.kind, event.message),
-            Next::Fail {
+            NodeExitAction::Nothing => "nothing".to_owned(),
+            NodeExitAction::Without(event) => format!("{}: {}", event.kind, event.message),
+            NodeExitAction::Restart { event, .. } => format!("{}: {}", event.kind, event.message),
+            NodeExitAction::Fail {
                 event: None,
                 reason,
             } => format!("it {reason}"),
-            Next::Fail {
+            NodeExitAction::Fail {
                 event: Some(event),
                 reason,
             } => format!("{}, it {reason}", event.kind),
@@ -190,7 +184,7 @@ mod tests {
             (
                 CREW,
                 END,
-                "node-failed: /a exited with status 1; it is started again in 500 ms",
+                "node-failed: /a exited with status 1; restart in 500 ms",
             ),
             (CREW, done, "node-ended: /a exited with status 0"),
             (CREW, killed, "out-of-memory, it lost /a: it was killed"),
@@ -204,28 +198,36 @@ mod tests {
             (
                 last,
                 END,
-                "node-failed: /a exited with status 1; it is started again in 500 ms",
+                "node-failed: /a exited with status 1; restart in 500 ms",
             ),
-            (last, done, "it has no node left: /a exited with status 0"),
+            (
+                last,
+                done,
+                "it has no running nodes left: /a exited with status 0",
+            ),
             (linked, END, "nothing"),
             (linked, killed, "nothing"),
         ] {
-            assert_eq!(in_words(after(crew, end)), expected, "{crew:?} {end:?}");
+            assert_eq!(
+                in_words(decide_after_exit(crew, end)),
+                expected,
+                "{crew:?} {end:?}"
+            );
         }
     }
 
-    /// The pauses before a node that runs so long each time is started again, until it is given up.
+    /// Returns the pauses before the restarts of a node with these run times, and whether it is given up.
     fn pauses(runs: impl IntoIterator<Item = Duration>) -> (Vec<Duration>, bool) {
         let mut failures = 0;
         let mut pauses = Vec::new();
         for ran in runs {
-            let end = Ended {
+            let end = EndedNode {
                 ran,
                 failures,
                 ..END
             };
-            match after(CREW, end) {
-                Next::Restart {
+            match decide_after_exit(CREW, end) {
+                NodeExitAction::Restart {
                     after,
                     failures: now,
                     ..
@@ -233,11 +235,8 @@ mod tests {
                     failures = now;
                     pauses.push(after);
                 }
-                Next::Fail { reason, .. } => {
-                    assert_eq!(
-                        reason,
-                        "gave /a up: it exited with status 1, again and again"
-                    );
+                NodeExitAction::Fail { reason, .. } => {
+                    assert_eq!(reason, "gave up on /a: it exited with status 1 repeatedly");
                     return (pauses, true);
                 }
                 other => panic!("{other:?}"),

@@ -1,29 +1,29 @@
-//! Which servant a robot is given: the one that it has, or a new one.
+//! Decides which servant a robot gets: its existing one, or a new one.
 
-use super::warm_pool::Warm;
-use super::{End, Servant};
+use super::warm_pool::WarmContainer;
+use super::{ServantFacts, StopOrder};
 
-/// What a robot that asks for a service is given.
+/// Placement of a robot that requests a service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Placement<'a> {
-    /// The servant that it has, which is named by its id.
+    /// The robot's existing servant, by id.
     Keep(&'a str),
-    /// A new one.
+    /// A new servant.
     Start {
-        /// The one that it has is ended before.
-        ends: Option<End<'a>>,
-        /// The new one is made of the service's container in the warm pool, unless that is gone when it is needed.
+        /// The robot's existing servant, to be ended first.
+        ends: Option<StopOrder<'a>>,
+        /// Use the service's container in the warm pool, unless that is gone when it is needed.
         warm: bool,
     },
 }
 
-/// `has` is the servant that this robot is given for this service so far, `warm` the service's container in the warm pool.
-/// The revision that is published now has the number `current` and this `image`.
+/// Decides the placement. `has` is the robot's existing servant of this service, `warm` the service's container in the
+/// warm pool. The current revision has the number `current` and this `image`.
 ///
-/// A robot that is connected keeps the revision that it works with. A servant that is being ended is given to nobody.
+/// A connected robot keeps its revision. A servant that is being ended is not given to a robot.
 pub fn place<'a>(
-    has: Option<&Servant<'a>>,
-    warm: Option<&Warm<'_>>,
+    has: Option<&ServantFacts<'a>>,
+    warm: Option<&WarmContainer<'_>>,
     current: u64,
     image: &str,
 ) -> Placement<'a> {
@@ -32,12 +32,12 @@ pub fn place<'a>(
         if servant.revision == current || servant.connections > 0 {
             return Placement::Keep(servant.id);
         }
-        ends = Some(End {
+        ends = Some(StopOrder {
             id: servant.id,
-            reason: "another revision takes its place",
+            reason: "replaced by another revision",
         });
     }
-    let warm = warm.is_some_and(|warm| warm.runs && warm.is_of(current, image));
+    let warm = warm.is_some_and(|warm| warm.runs && warm.is_from(current, image));
     Placement::Start { ends, warm }
 }
 
@@ -47,9 +47,9 @@ mod tests {
 
     #[test]
     fn a_robot_keeps_its_servant_until_another_revision_or_its_end() {
-        let end = End {
+        let end = StopOrder {
             id: "one",
-            reason: "another revision takes its place",
+            reason: "replaced by another revision",
         };
         let start = |ends| Placement::Start { ends, warm: false };
         for (revision, connections, ending, expected) in [
@@ -60,7 +60,7 @@ mod tests {
             (2, 1, true, start(None)),
             (1, 0, true, start(None)),
         ] {
-            let has = Servant {
+            let has = ServantFacts {
                 id: "one",
                 revision,
                 connections,
@@ -82,7 +82,7 @@ mod tests {
             // Of a service that was removed and published anew.
             (2, "sha256:1", true, false),
         ] {
-            let warm = Warm {
+            let warm = WarmContainer {
                 id: "two",
                 service: "detect",
                 revision,

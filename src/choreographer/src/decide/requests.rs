@@ -1,19 +1,19 @@
-//! On which topics robots ask a servant and are answered.
+//! Finds the topics on which robots send requests to a servant and receive answers.
 
 use package::interface::{Direction, Interface};
 use package::requests::Reason;
-use qos::{Correlation, Pair};
+use qos::{Correlation, TopicPair};
 use ros::bus::RosVersion;
 
-/// The input whose messages are requests and the outputs that answer them, where the interface has one such pair and leaves
-/// no doubt which. By stamps there is none. Where the next output would be the answer, there has to be one input and one
-/// output, and nothing else to ask, unless the deployer says so: what a node publishes at its own pace would be taken
-/// for an answer.
-pub fn asked_by_topic(ros: RosVersion, interface: &Interface) -> Option<Pair> {
+/// Returns the pair of the input whose messages are requests and the outputs that answer them, if the interface has
+/// exactly one unambiguous pair. Stamps make a pair unambiguous. If the next output would be the answer, there must be
+/// one input and one output, and nothing else to request, unless the deployer declares the pair: messages that a node
+/// publishes at its own pace would be taken for answers.
+pub fn find_topic_request(ros: RosVersion, interface: &Interface) -> Option<TopicPair> {
     let mut requests = interface.decided_requests(ros);
     let request = requests.pop().filter(|_| requests.is_empty())?;
     let mut pair = request.pair;
-    // A latched output tells a state.
+    // A latched output represents a state.
     let is_latched = |name: &String| {
         let mut topics = interface.topics.iter();
         topics.any(|it| it.direction == Direction::Output && it.latched && it.name == *name)
@@ -35,7 +35,7 @@ pub fn asked_by_topic(ros: RosVersion, interface: &Interface) -> Option<Pair> {
 mod tests {
     use super::*;
 
-    /// An interface with these topics, each `<` or `>` with its name and type, and these services.
+    /// Returns an interface with these topics, each `<` or `>` with its name and type, and these services.
     fn interface(topics: &[&str], services: &[&str]) -> Interface {
         let topics = topics.iter().map(|topic| {
             let (end, rest) = topic.split_at(1);
@@ -65,7 +65,7 @@ mod tests {
         let mut two = interface(&["</in x/msg/Stamped", ">/out x/msg/Stamped"], &["/ask"]);
         let header = "builtin_interfaces/Time stamp\nstring frame_id\n".to_owned();
         two.definitions.insert("std_msgs/msg/Header".into(), header);
-        let found = asked_by_topic(RosVersion::Two, &two).map(|pair| pair.to_string());
+        let found = find_topic_request(RosVersion::Two, &two).map(|pair| pair.to_string());
         assert_eq!(found.as_deref(), Some("/in -> /out by stamp"));
     }
 
@@ -77,7 +77,7 @@ mod tests {
                 &[][..],
                 "/in -> /out by stamp",
             ),
-            // With stamps others do not matter.
+            // With stamps other topics do not matter.
             (
                 &[
                     "</in x/Stamped",
@@ -110,11 +110,11 @@ mod tests {
             (&["</in x/Text", ">/state_latched x/Text"], &[], ""),
             (&["</in x/Text"], &[], ""),
             (&[">/out x/Text"], &[], ""),
-            // Nobody knows what it is.
+            // The type is unknown.
             (&["</in x/Missing", ">/out x/Text"], &[], ""),
             (&[], &["/ask"], ""),
         ] {
-            let found = asked_by_topic(RosVersion::One, &interface(topics, services));
+            let found = find_topic_request(RosVersion::One, &interface(topics, services));
             let words = found.map(|pair| pair.to_string()).unwrap_or_default();
             assert_eq!(words, expected, "{topics:?} {services:?}");
         }

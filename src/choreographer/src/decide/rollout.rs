@@ -1,10 +1,11 @@
-//! Which robots a new revision serves first, and when it is taken back, promoted, or takes the others' place.
+//! Decides which robots a new revision serves first, and when it is rolled back, promoted, or replaces the others.
 //!
-//! A canary is compared with the revision that it is to follow while requests come, so that the comparison ends as soon as it
-//! can, and looking often makes no wrong verdict likelier: shares of failures by confidence bounds that hold at all times
-//! together (Chernoff's bound with the divergence of Kullback and Leibler, as in A. Garivier and O. Cappé, *The KL-UCB algorithm*,
-//! COLT 2011; the level divided over the looks as by D. A. Darling and H. Robbins, *Confidence sequences*, PNAS 58, 1967), response
-//! times by the sign test (the share of requests that are slower than the other's median) with the same bounds.
+//! A canary is compared with the stable revision while requests arrive, so that the comparison ends as early as
+//! possible, and evaluating it often does not make a wrong verdict likelier: failure rates by confidence bounds that
+//! hold at all times together (Chernoff's bound with the divergence of Kullback and Leibler, as in A. Garivier and O.
+//! Cappé, *The KL-UCB algorithm*, COLT 2011; the level divided over the evaluations as by D. A. Darling and H. Robbins,
+//! *Confidence sequences*, PNAS 58, 1967), response times by the sign test (the fraction of requests that are slower
+//! than the other's median) with the same bounds.
 
 use std::f64::consts::PI;
 use std::fmt;
@@ -16,43 +17,44 @@ use sha2::{Digest as _, Sha256};
 
 use super::sketch::Sketch;
 
-/// The chance that a canary is taken back that is no worse, over the whole rollout: shared by three comparisons of two bounds.
+/// Probability that an equally good canary is rolled back, over the whole rollout: divided among three comparisons of
+/// two bounds.
 const LEVEL: f64 = 0.05 / 6.0;
-/// Servants of the candidate before their failures count.
+/// Minimum number of servants of the candidate before their failures count.
 const SERVANTS: u64 = 3;
 
-/// How often something was tried and failed.
+/// Number of attempts and failures.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Tries {
-    /// The number of tries.
+pub struct AttemptCounts {
+    /// Number of attempts.
     pub all: u64,
-    /// Those that failed.
+    /// Number of failed attempts.
     pub failed: u64,
 }
 
-impl Tries {
-    /// Counts one try.
-    pub fn note(&mut self, failed: bool) {
+impl AttemptCounts {
+    /// Counts one attempt.
+    pub fn record(&mut self, failed: bool) {
         self.all += 1;
         self.failed += u64::from(failed);
     }
 }
 
-/// What was seen of one revision.
+/// Statistics of one revision.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Seen {
-    /// Its servants: ready, or failed.
-    pub servants: Tries,
-    /// Requests to them.
-    pub requests: Tries,
-    /// Response times of those that were answered, milliseconds.
+pub struct RevisionStats {
+    /// Servants that became ready, or failed.
+    pub servants: AttemptCounts,
+    /// Requests to its servants.
+    pub requests: AttemptCounts,
+    /// Response times of the answered requests, in milliseconds.
     pub times: Sketch,
 }
 
-impl Seen {
-    /// As it is shown.
-    pub fn shown(&self) -> Arm {
+impl RevisionStats {
+    /// Returns the statistics as shown by the API.
+    pub fn to_arm(&self) -> Arm {
         Arm {
             servants: self.servants.all,
             servants_failed: self.servants.failed,
@@ -64,36 +66,36 @@ impl Seen {
     }
 }
 
-/// A service on its way from one revision to another. It is written into the database as it is.
+/// A rollout of a service from one revision to another. It is stored in the database in this form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rollout {
     /// The revision that was the current one.
     pub stable: u64,
-    /// The revision that is to be.
+    /// The revision that is to become the current one.
     pub candidate: u64,
-    /// How far it has come.
+    /// State of the rollout.
     pub state: RolloutState,
-    /// The reason of the state.
+    /// Reason of the state.
     pub reason: String,
-    /// When it began.
+    /// Time of its start.
     pub started: Millis,
-    /// When its state changed last.
+    /// Time of its last state change.
     pub changed: Millis,
-    /// On which terms.
+    /// Terms of the rollout.
     pub terms: RolloutTerms,
-    /// Robots that were given the candidate, where their number is limited.
+    /// Robots that were given the candidate, if their number is limited.
     #[serde(default)]
     pub robots: Vec<String>,
-    /// What was seen of the stable revision.
+    /// Statistics of the stable revision.
     #[serde(default)]
-    pub of_stable: Seen,
-    /// What was seen of the candidate.
+    pub of_stable: RevisionStats,
+    /// Statistics of the candidate.
     #[serde(default)]
-    pub of_candidate: Seen,
+    pub of_candidate: RevisionStats,
 }
 
 impl Rollout {
-    /// The state after its candidate has become the current revision.
+    /// Returns the state after the candidate has become the current revision.
     pub fn after_promotion(&self) -> RolloutState {
         match self.terms.deadline {
             Some(_) => RolloutState::Draining,
@@ -102,38 +104,43 @@ impl Rollout {
     }
 }
 
-/// Which revision a robot is given.
+/// The revision that a robot gets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Given {
-    /// The current one.
+pub enum AssignedRevision {
+    /// The current revision.
     Current,
     /// The candidate.
     Candidate,
-    /// The candidate, and the robot is one more of those that were given it.
+    /// The candidate, and the robot is to be added to those that were given it.
     CandidateFromNow,
 }
 
-/// Which revision of `service` a robot is given. The same robot gets the same answer for as long as the rollout goes on.
-pub fn given(of: &Rollout, service: &str, robot: &str) -> Given {
+/// Decides which revision of `service` a robot gets. The same robot gets the same answer as long as the rollout lasts.
+pub fn assign_revision(of: &Rollout, service: &str, robot: &str) -> AssignedRevision {
     let Some(share) = of.terms.canary.filter(|_| of.state == RolloutState::Canary) else {
-        return Given::Current;
+        return AssignedRevision::Current;
     };
     match share {
-        Share::Robots(_) if of.robots.iter().any(|known| known == robot) => Given::Candidate,
-        Share::Robots(most) if of.robots.len() < most as usize => Given::CandidateFromNow,
-        Share::Robots(_) => Given::Current,
+        Share::Robots(_) if of.robots.iter().any(|known| known == robot) => {
+            AssignedRevision::Candidate
+        }
+        Share::Robots(most) if of.robots.len() < most as usize => {
+            AssignedRevision::CandidateFromNow
+        }
+        Share::Robots(_) => AssignedRevision::Current,
         Share::Percent(percent) => {
-            let part = hash(&[service, robot], of.candidate) as f64 / u64::MAX as f64;
-            match part * 100.0 < percent {
-                true => Given::Candidate,
-                false => Given::Current,
+            let part = stable_hash(&[service, robot], of.candidate) as f64 / u64::MAX as f64;
+            if part * 100.0 < percent {
+                AssignedRevision::Candidate
+            } else {
+                AssignedRevision::Current
             }
         }
     }
 }
 
-/// The same on every machine and in every version: the first bytes of a SHA-256 sum.
-fn hash(words: &[&str], number: u64) -> u64 {
+/// Returns a hash that is stable across machines and versions: the first bytes of a SHA-256 digest.
+fn stable_hash(words: &[&str], number: u64) -> u64 {
     let mut sum = Sha256::new();
     for word in words {
         sum.update((word.len() as u64).to_le_bytes());
@@ -145,160 +152,168 @@ fn hash(words: &[&str], number: u64) -> u64 {
     u64::from_le_bytes(first)
 }
 
-/// What becomes of a rollout now.
+/// Next step of a rollout.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Step {
+pub enum RolloutStep {
     /// Nothing changes.
     Stays,
-    /// The time to promote the candidate has come, and this is missing.
-    Waits(Wait),
-    /// The candidate is taken back, for this reason.
+    /// The time to promote the candidate has come, but this is missing.
+    Waits(PromotionBlocker),
+    /// The candidate is rolled back, for this reason.
     RollsBack(String),
     /// The candidate becomes the current revision, for this reason.
     Promotes(String),
-    /// Servants of other revisions than the candidate end.
+    /// Servants of other revisions than the candidate are ended.
     EndsOthers,
 }
 
-/// What a canary waits for whose time to be promoted has come.
+/// Reason why the promotion of a canary whose time has come is delayed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Wait {
-    /// No servant of it serves a robot.
+pub enum PromotionBlocker {
+    /// None of its servants serves a robot.
     Servant,
-    /// It was asked too seldom to know how it answers.
+    /// It received too few requests to judge its answers.
     Requests {
-        /// So often it was asked.
+        /// Number of requests it received.
         seen: u64,
-        /// So often it must be.
+        /// Number of requests required.
         needed: u64,
     },
-    /// It fails more often than the bound allows, and the stable revision was asked too seldom to compare the two.
+    /// It fails more often than the bound allows, and the stable revision received too few requests to compare the two.
     Comparison {
-        /// So many of the candidate's requests failed.
-        failed: Tries,
-        /// So often the stable revision was asked.
+        /// Requests and failures of the candidate.
+        failed: AttemptCounts,
+        /// Number of requests that the stable revision received.
         seen: u64,
-        /// So often it must be.
+        /// Number of requests required.
         needed: u64,
     },
 }
 
-impl Wait {
-    /// Whether somebody who was told of the other knows this one, too: only numbers have changed.
-    pub fn is_like(&self, other: &Wait) -> bool {
+impl PromotionBlocker {
+    /// Returns true if both differ only in their numbers, so that the second is not news.
+    pub fn is_same_kind(&self, other: &PromotionBlocker) -> bool {
         std::mem::discriminant(self) == std::mem::discriminant(other)
     }
 }
 
-impl fmt::Display for Wait {
+impl fmt::Display for PromotionBlocker {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Wait::Servant => write!(out, "no servant of it serves a robot yet"),
-            Wait::Requests { seen, needed } => write!(
+            PromotionBlocker::Servant => write!(out, "none of its servants serves a robot yet"),
+            PromotionBlocker::Requests { seen, needed } => write!(
                 out,
-                "it was asked {seen} times and {needed} are needed to know that it answers (--samples)"
+                "it has had {seen} requests of the {needed} required (--samples)"
             ),
-            Wait::Comparison {
+            PromotionBlocker::Comparison {
                 failed,
                 seen,
                 needed,
             } => write!(
                 out,
-                "{} of its {} requests failed, and the previous revision was asked {seen} times of the {needed} that are needed to compare \
-                 them (--samples)",
+                "{} of its {} requests failed, but the previous revision has had {seen} requests of the {needed} \
+                    required for a comparison (--samples)",
                 failed.failed, failed.all
             ),
         }
     }
 }
 
-/// What is missing before a candidate whose time has come is promoted.
-fn missing(stable: &Seen, candidate: &Seen, terms: &RolloutTerms) -> Option<Wait> {
+/// Returns what is missing before a candidate whose time has come is promoted.
+fn promotion_blocker(
+    stable: &RevisionStats,
+    candidate: &RevisionStats,
+    terms: &RolloutTerms,
+) -> Option<PromotionBlocker> {
     if candidate.servants.all <= candidate.servants.failed {
-        return Some(Wait::Servant);
+        return Some(PromotionBlocker::Servant);
     }
     let (needed, requests) = (u64::from(terms.samples.max(1)), candidate.requests);
     if requests.all < needed {
-        return Some(Wait::Requests {
+        return Some(PromotionBlocker::Requests {
             seen: requests.all,
             needed,
         });
     }
     let seen = stable.requests.all;
     let fails = requests.failed as f64 > terms.bound * requests.all as f64;
-    (seen < needed && fails).then_some(Wait::Comparison {
+    (seen < needed && fails).then_some(PromotionBlocker::Comparison {
         failed: requests,
         seen,
         needed,
     })
 }
 
-/// What becomes of a rollout at `now`.
-pub fn step(of: &Rollout, now: Millis) -> Step {
+/// Decides the next step of a rollout at `now`.
+pub fn next_step(of: &Rollout, now: Millis) -> RolloutStep {
     let since = |seconds: f64| now.saturating_sub(of.changed) as f64 >= seconds * 1000.0;
     match of.state {
         RolloutState::Canary => {
             let (stable, candidate) = (&of.of_stable, &of.of_candidate);
-            if let Some(reason) = worse(stable, candidate, &of.terms) {
-                return Step::RollsBack(reason);
+            if let Some(reason) = regression(stable, candidate, &of.terms) {
+                return RolloutStep::RollsBack(reason);
             }
             let Some(after) = of.terms.promote_after.filter(|after| since(*after)) else {
-                return Step::Stays;
+                return RolloutStep::Stays;
             };
-            if let Some(wait) = missing(stable, candidate, &of.terms) {
-                return Step::Waits(wait);
+            if let Some(wait) = promotion_blocker(stable, candidate, &of.terms) {
+                return RolloutStep::Waits(wait);
             }
             let seen = candidate.requests.all;
-            Step::Promotes(format!(
+            RolloutStep::Promotes(format!(
                 "it was not worse within {after} s and {seen} requests"
             ))
         }
-        RolloutState::Draining if of.terms.deadline.is_none_or(since) => Step::EndsOthers,
-        _ => Step::Stays,
+        RolloutState::Draining if of.terms.deadline.is_none_or(since) => RolloutStep::EndsOthers,
+        _ => RolloutStep::Stays,
     }
 }
 
-/// In what the candidate is worse than the stable revision by more than the terms allow, if it is.
-pub fn worse(stable: &Seen, candidate: &Seen, terms: &RolloutTerms) -> Option<String> {
+/// Returns in what respect the candidate is worse than the stable revision by more than the terms allow, if it is.
+pub fn regression(
+    stable: &RevisionStats,
+    candidate: &RevisionStats,
+    terms: &RolloutTerms,
+) -> Option<String> {
     let (bound, samples) = (terms.bound, u64::from(terms.samples.max(1)));
-    let percent = |tries: Tries| 100.0 * tries.failed as f64 / tries.all.max(1) as f64;
-    let says = |what: &str, candidate: Tries, stable: Tries| {
+    let percent = |tries: AttemptCounts| 100.0 * tries.failed as f64 / tries.all.max(1) as f64;
+    let says = |what: &str, candidate: AttemptCounts, stable: AttemptCounts| {
         format!(
-            "{:.0} % of its {} {what} failed, of the revision before {:.0} % of {}",
+            "{:.0} % of its {} {what} failed; previous revision: {:.0} % of {}",
             percent(candidate),
             candidate.all,
             percent(stable),
             stable.all
         )
     };
-    // A revision that was pushed has started once: the stable one's servants count as sound where nothing else was seen.
+    // A pushed revision has started once: the stable one's servants count as sound if nothing else was seen.
     let starts = percent(stable.servants) / 100.0;
     let (servants, requests) = (candidate.servants, candidate.requests);
-    if servants.all >= SERVANTS && lower(servants) > starts + bound {
+    if servants.all >= SERVANTS && lower_bound(servants) > starts + bound {
         return Some(says("servants", servants, stable.servants));
     }
     if requests.all < samples || stable.requests.all < samples {
         return None;
     }
-    if lower(requests) > upper(stable.requests) + bound {
+    if lower_bound(requests) > upper_bound(stable.requests) + bound {
         return Some(says("requests", requests, stable.requests));
     }
     let median = stable.times.quantile(0.5)?;
-    let slow = Tries {
+    let slow = AttemptCounts {
         all: candidate.times.count(),
-        failed: candidate.times.above(median * (1.0 + bound)),
+        failed: candidate.times.count_above(median * (1.0 + bound)),
     };
-    if slow.all >= samples && lower(slow) > 0.5 {
+    if slow.all >= samples && lower_bound(slow) > 0.5 {
         return Some(format!(
-            "its median response time is {:.0} ms, that of the revision before {median:.0} ms",
+            "its p50 response time is {:.0} ms; previous revision: {median:.0} ms",
             candidate.times.quantile(0.5).unwrap_or_default()
         ));
     }
     None
 }
 
-/// Divergence of Kullback and Leibler between two coins.
-fn divergence(p: f64, q: f64) -> f64 {
+/// Returns the Kullback–Leibler divergence between two Bernoulli distributions.
+fn kl_divergence(p: f64, q: f64) -> f64 {
     let part = |p: f64, q: f64| match p {
         0.0 => 0.0,
         _ if q <= 0.0 => f64::INFINITY,
@@ -307,9 +322,9 @@ fn divergence(p: f64, q: f64) -> f64 {
     part(p, q) + part(1.0 - p, 1.0 - q)
 }
 
-/// What the divergence of the true share from the one that was seen may be, so that it is that of no look with a chance above
-/// [`LEVEL`].
-fn allowed(tries: Tries) -> f64 {
+/// Returns the maximum divergence of the true rate from the observed one, such that over all evaluations together the
+/// probability of exceeding it is at most [`LEVEL`].
+fn max_divergence(tries: AttemptCounts) -> f64 {
     let n = tries.all as f64;
     ((n * n * PI * PI / 6.0) / LEVEL).ln() / n
 }
@@ -317,30 +332,31 @@ fn allowed(tries: Tries) -> f64 {
 fn bisect(mut inside: f64, mut outside: f64, seen: f64, allowed: f64) -> f64 {
     for _ in 0..60 {
         let middle = f64::midpoint(inside, outside);
-        match divergence(seen, middle) <= allowed {
-            true => inside = middle,
-            false => outside = middle,
+        if kl_divergence(seen, middle) <= allowed {
+            inside = middle
+        } else {
+            outside = middle
         }
     }
     outside
 }
 
-/// The share of failures is no smaller than this.
-pub fn lower(tries: Tries) -> f64 {
+/// Returns a lower confidence bound of the failure rate.
+pub fn lower_bound(tries: AttemptCounts) -> f64 {
     if tries.all == 0 {
         return 0.0;
     }
     let seen = tries.failed as f64 / tries.all as f64;
-    bisect(seen, 0.0, seen, allowed(tries))
+    bisect(seen, 0.0, seen, max_divergence(tries))
 }
 
-/// The share of failures is no greater than this.
-pub fn upper(tries: Tries) -> f64 {
+/// Returns an upper confidence bound of the failure rate.
+pub fn upper_bound(tries: AttemptCounts) -> f64 {
     if tries.all == 0 {
         return 1.0;
     }
     let seen = tries.failed as f64 / tries.all as f64;
-    bisect(seen, 1.0, seen, allowed(tries))
+    bisect(seen, 1.0, seen, max_divergence(tries))
 }
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
-//! What is the same in the answers of a servant and of a candidate: fields of a message ([`differences`]), messages of two
-//! sequences ([`Pairing`]), and all of it together ([`Tally`], [`verdict`]).
+//! Compares the answers of a servant and of a candidate: fields of a message ([`differences`]), messages of two
+//! sequences ([`Pairing`]), and the overall result ([`Tally`], [`overall_verdict`]).
 
 mod fields;
 mod pairing;
@@ -10,17 +10,17 @@ use api::calibration::TimeSpread;
 use api::shadow::{Compared, FieldDifference, Kind, Verdict};
 
 use fields::FIELDS;
-pub(crate) use fields::{Differing, Tolerance, differences};
-pub(crate) use pairing::{Paired, Pairing, Side, WINDOW};
+pub(crate) use fields::{DifferingField, Tolerance, differences};
+pub(crate) use pairing::{Pairing, PairingResult, ShadowSide, WINDOW};
 
-/// Response times that are kept of each side.
+/// Maximum number of response times kept of each side.
 const TIMES: usize = 50_000;
-/// Fewer times say nothing of a median.
+/// Minimum number of times for a meaningful median.
 const FEWEST: usize = 10;
-/// A median that is longer by less is no slower, in milliseconds: the way to the candidate is longer by a hop.
+/// Tolerance of the median, in milliseconds: the path to the candidate is longer by a hop.
 const SLACK: f64 = 1.0;
 
-/// What is known of one topic, service or action.
+/// Comparison of one topic, service or action.
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     row: Compared,
@@ -30,7 +30,7 @@ pub(crate) struct Tally {
 }
 
 impl Tally {
-    pub(crate) fn of(kind: Kind, name: &str) -> Tally {
+    pub(crate) fn new(kind: Kind, name: &str) -> Tally {
         Tally {
             row: Compared {
                 kind,
@@ -41,21 +41,21 @@ impl Tally {
         }
     }
 
-    /// Both have answered.
-    pub(crate) fn pair(&mut self, differing: Vec<Differing>) {
+    /// Records a pair of answers and their differences.
+    pub(crate) fn record_pair(&mut self, differing: Vec<DifferingField>) {
         if differing.is_empty() {
             self.row.equal += 1;
             return;
         }
         self.row.different += 1;
         let mut counted = Vec::new();
-        for Differing {
+        for DifferingField {
             field,
             present,
             candidate,
         } in differing
         {
-            // Elements of an array have one name.
+            // Elements of an array share one name.
             if counted.contains(&field) {
                 continue;
             }
@@ -74,37 +74,37 @@ impl Tally {
         }
     }
 
-    pub(crate) fn missing(&mut self) {
+    pub(crate) fn record_missing(&mut self) {
         self.row.missing += 1;
     }
 
-    pub(crate) fn surplus(&mut self) {
+    pub(crate) fn record_surplus(&mut self) {
         self.row.surplus += 1;
     }
 
-    /// How long a request took, in milliseconds.
-    pub(crate) fn time(&mut self, side: Side, time: f64) {
+    /// Records the response time of a request, in milliseconds.
+    pub(crate) fn record_time(&mut self, side: ShadowSide, time: f64) {
         let times = match side {
-            Side::Present => &mut self.present,
-            Side::Candidate => &mut self.candidate,
+            ShadowSide::Present => &mut self.present,
+            ShadowSide::Candidate => &mut self.candidate,
         };
         if times.len() < TIMES {
             times.push(time);
         }
     }
 
-    pub(crate) fn shown(self) -> Compared {
+    pub(crate) fn into_compared(self) -> Compared {
         let mut fields: Vec<FieldDifference> = self.fields.into_values().collect();
         fields.sort_by(|one, other| (other.answers, &one.field).cmp(&(one.answers, &other.field)));
         Compared {
-            present: TimeSpread::of(self.present),
-            candidate: TimeSpread::of(self.candidate),
+            present: TimeSpread::from_samples(self.present),
+            candidate: TimeSpread::from_samples(self.candidate),
             fields,
             ..self.row
         }
     }
 
-    /// Whether its median is longer than `bound` allows.
+    /// Returns true if the candidate's median is longer than `bound` allows.
     fn is_slower(row: &Compared, bound: f64) -> bool {
         let enough = row.answers() >= FEWEST as u64;
         match (&row.present, &row.candidate) {
@@ -116,8 +116,12 @@ impl Tally {
     }
 }
 
-/// What it all comes to; `failed` is why the candidate ended by itself.
-pub(crate) fn verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (Verdict, String) {
+/// Returns the overall verdict; `failed` is the reason why the candidate ended unexpectedly.
+pub(crate) fn overall_verdict(
+    rows: &[Compared],
+    failed: Option<&str>,
+    bound: f64,
+) -> (Verdict, String) {
     if let Some(reason) = failed {
         return (Verdict::Failed, format!("the candidate {reason}"));
     }
@@ -126,7 +130,7 @@ pub(crate) fn verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (V
     if answers == 0 {
         return (
             Verdict::Nothing,
-            "nothing was answered that could be compared".to_owned(),
+            "there were no answers to compare".to_owned(),
         );
     }
     if unequal > 0 {
@@ -137,10 +141,7 @@ pub(crate) fn verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (V
             .collect();
         return (
             Verdict::Different,
-            format!(
-                "{unequal} of {answers} answers are not the same: {}",
-                of.join(", ")
-            ),
+            format!("{unequal} of {answers} answers differ: {}", of.join(", ")),
         );
     }
     let slower: Vec<String> = rows
@@ -149,7 +150,7 @@ pub(crate) fn verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (V
         .filter_map(|row| {
             let (present, candidate) = (row.present?, row.candidate?);
             Some(format!(
-                "{} takes {:.1} ms instead of {:.1} ms (median)",
+                "{} takes {:.1} ms instead of {:.1} ms (p50)",
                 row.name, candidate.p50, present.p50
             ))
         })
@@ -159,7 +160,7 @@ pub(crate) fn verdict(rows: &[Compared], failed: Option<&str>, bound: f64) -> (V
     }
     (
         Verdict::Equal,
-        format!("{answers} answers are the same, and took no longer"),
+        format!("{answers} answers are equal and not slower"),
     )
 }
 

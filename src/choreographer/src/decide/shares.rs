@@ -1,33 +1,34 @@
-//! How much of the cores each gets where they do not suffice for all: max-min fair shares by water filling
-//! (Bertsekas and Gallager, Data Networks, 1992, section 6.5.2), above a floor for each.
+//! Max-min fair shares by water filling (Bertsekas and Gallager, Data Networks, 1992, section 6.5.2), above a floor for
+//! each claimant.
 
-/// What one is to get at least, and what it can use. Thousandths of a core.
+/// A claim: minimum and usable maximum, in thousandths of a core.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Claim {
-    /// At least so much, as far as it wants that.
+    /// Minimum share, as far as it is wanted.
     pub floor: u64,
-    /// No more than that.
+    /// Maximum share.
     pub wants: u64,
 }
 
 impl Claim {
-    /// What it gets where the water stands so high.
-    fn at(self, level: u64) -> u64 {
+    /// Returns the share at this water level.
+    fn share_at(self, level: u64) -> u64 {
         self.wants.min(self.floor.max(level))
     }
 }
 
-/// Shares of `capacity`, in the order of the claims. Nobody gets more than it wants, and nobody less than its floor or what
-/// it wants, even where the floors exceed the capacity. What is left above the floors goes to those who have least.
-pub fn fill(capacity: u64, claims: &[Claim]) -> Vec<u64> {
-    let level = level(capacity, claims);
-    claims.iter().map(|claim| claim.at(level)).collect()
+/// Returns the shares of `capacity`, in the order of the claims. No share exceeds what is wanted, and none is below the
+/// floor or what is wanted, even if the floors exceed the capacity. The rest above the floors goes to those with the
+/// smallest shares.
+pub fn fill_shares(capacity: u64, claims: &[Claim]) -> Vec<u64> {
+    let level = water_level(capacity, claims);
+    claims.iter().map(|claim| claim.share_at(level)).collect()
 }
 
-/// The greatest level at which the shares fit.
-fn level(capacity: u64, claims: &[Claim]) -> u64 {
+/// Returns the greatest level at which the shares fit.
+fn water_level(capacity: u64, claims: &[Claim]) -> u64 {
     let used = |level: u64| {
-        let shares = claims.iter().map(|claim| claim.at(level));
+        let shares = claims.iter().map(|claim| claim.share_at(level));
         shares.fold(0u64, u64::saturating_add)
     };
     let (mut fits, mut over) = (0, claims.iter().map(|claim| claim.wants).max().unwrap_or(0));
@@ -36,9 +37,10 @@ fn level(capacity: u64, claims: &[Claim]) -> u64 {
     }
     while over - fits > 1 {
         let middle = fits + (over - fits) / 2;
-        match used(middle) <= capacity {
-            true => fits = middle,
-            false => over = middle,
+        if used(middle) <= capacity {
+            fits = middle
+        } else {
+            over = middle
         }
     }
     fits
@@ -65,7 +67,7 @@ mod tests {
             ),
             (3000, vec![(2000, 4000), (0, 4000)], vec![2000, 1000]),
             (3000, vec![(2000, 100), (0, 4000)], vec![100, 2900]),
-            // Floors are kept where they exceed what there is.
+            // Floors are kept even if they exceed the capacity.
             (
                 1000,
                 vec![(800, 4000), (700, 4000), (0, 9)],
@@ -74,7 +76,11 @@ mod tests {
             (1000, vec![], vec![]),
         ] {
             let all: Vec<_> = claims.iter().copied().map(claim).collect();
-            assert_eq!(fill(capacity, &all), expected, "{capacity} {claims:?}");
+            assert_eq!(
+                fill_shares(capacity, &all),
+                expected,
+                "{capacity} {claims:?}"
+            );
         }
     }
 
@@ -84,15 +90,15 @@ mod tests {
             capacity in 0u64..20_000,
             claims in prop::collection::vec((0u64..5000, 0u64..9000).prop_map(claim), 0..12),
         ) {
-            let shares = fill(capacity, &claims);
+            let shares = fill_shares(capacity, &claims);
             let floors: u64 = claims.iter().map(|claim| claim.floor.min(claim.wants)).sum();
             let sum: u64 = shares.iter().sum();
             prop_assert!(sum <= capacity.max(floors));
             for (claim, share) in claims.iter().zip(&shares) {
                 prop_assert!(*share <= claim.wants && *share >= claim.floor.min(claim.wants));
             }
-            // Whoever has less than it wants has no less than anyone who has more than its floor, but for what cannot be
-            // divided; and then nothing is left.
+            // Whoever has less than it wants has at least as much as anyone above its floor, up to indivisible
+            // remainders, and nothing is left over.
             for (claim, share) in claims.iter().zip(&shares).filter(|(claim, share)| claim.wants > **share) {
                 prop_assert!(sum + claims.len() as u64 >= capacity, "{claim:?} lacks what is left");
                 for (other, has) in claims.iter().zip(&shares) {

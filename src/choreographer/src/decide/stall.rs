@@ -1,46 +1,46 @@
-//! Whether the machine stalls: it swaps, or all that runs waits for memory. Then nobody more is admitted.
+//! Detects a stalled machine: it swaps, or everything waits for memory. Nothing more is admitted then.
 //!
-//! Memory is never promised twice, but peaks are not promised, and the machine has other users. What the kernel counts of
-//! waiting says when that went wrong (pressure stall information, kernel documentation, accounting/psi): `full` of memory is
-//! the time in which nothing could run because all waited for memory. Servants that wait at limits of their own count there,
-//! too, where nothing else runs; so it says something of the machine only while its memory is short.
+//! Memory is never promised twice, but peaks are not promised, and the machine has other users. The kernel's pressure
+//! stall information (kernel documentation, accounting/psi) shows when that went wrong: `full` of memory is the
+//! fraction of time in which nothing could run because everything waited for memory. Servants that wait at their own
+//! limits count as well if nothing else runs; so it says something about the machine only while its memory is short.
 
 use std::time::{Duration, Instant};
 
-/// Percent of the last ten seconds in which all waited for memory: from so much on the machine stalls.
+/// Percentage of the last ten seconds in which everything waited for memory, from which on the machine stalls.
 const STALLS: f64 = 10.0;
-/// Percent below which it does not stall any more.
+/// Percentage below which it no longer stalls.
 const FLOWS: f64 = 5.0;
-/// Percent of its memory that can still be given: with so much it is not the machine that stalls.
+/// Percentage of available memory from which on the machine itself is not short of memory.
 const PLENTY: f64 = 25.0;
-/// Bytes a second read from swap: from so many on it swaps.
+/// Bytes per second read from swap, from which on the machine swaps.
 const SWAPS: f64 = (1 << 20) as f64;
-/// Bytes a second below which it does not swap any more.
+/// Bytes per second below which it no longer swaps.
 const SETTLED: f64 = SWAPS / 4.0;
-/// It has ended when it has not been there for so long.
+/// Time without signs after which a stall has ended.
 const QUIET: Duration = Duration::from_secs(5);
 
-/// What the kernel tells.
+/// Readings of the kernel.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Reading {
-    /// `full avg10` of memory, percent; none where the kernel does not tell.
+pub struct PressureReading {
+    /// `full avg10` of memory in percent; `None` if the kernel does not provide it.
     pub memory_full: Option<f64>,
-    /// `MemAvailable`, percent of all memory; none where the kernel does not tell.
+    /// `MemAvailable` in percent of all memory; `None` if the kernel does not provide it.
     pub available: Option<f64>,
-    /// Bytes a second read from swap since the last reading.
+    /// Bytes per second read from swap since the last reading.
     pub swapped_in: f64,
 }
 
-/// Whether the machine stalls, from one reading to the next.
+/// State of the stall detection between readings.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Stall {
-    /// When a reading last said so, while it stalls.
+pub struct StallDetector {
+    /// Time of the last reading that showed a stall, while stalled.
     seen: Option<Instant>,
 }
 
-impl Stall {
-    /// Why nobody is admitted at `now`, if so.
-    pub fn judge(&mut self, reading: Reading, now: Instant) -> Option<String> {
+impl StallDetector {
+    /// Returns the reason why nothing is admitted at `now`, if so.
+    pub fn judge(&mut self, reading: PressureReading, now: Instant) -> Option<String> {
         let full = reading.memory_full.unwrap_or(0.0);
         let (stalls, swaps) = match self.seen {
             None => (STALLS, SWAPS),
@@ -49,18 +49,18 @@ impl Stall {
         let short = reading.available.is_none_or(|percent| percent < PLENTY);
         let why = if short && full >= stalls {
             format!(
-                "this machine stalls: in {full:.0} % of the last 10 s everything waited for memory"
+                "this machine stalls: all tasks waited for memory in {full:.0} % of the last 10 s"
             )
         } else if reading.swapped_in >= swaps {
             let bytes = reading.swapped_in.max(0.0) as u64;
             format!(
-                "this machine swaps: it reads {} a second back into memory",
+                "this machine swaps: it reads {} per second from swap",
                 api::Size(bytes)
             )
         } else {
             match self.seen {
                 Some(seen) if now.saturating_duration_since(seen) < QUIET => {
-                    return Some("this machine stalled just now".to_owned());
+                    return Some("this machine stalled a moment ago".to_owned());
                 }
                 _ => {
                     self.seen = None;
@@ -79,8 +79,8 @@ mod tests {
 
     use super::*;
 
-    fn reading(memory_full: f64, swapped_in: f64) -> Reading {
-        Reading {
+    fn reading(memory_full: f64, swapped_in: f64) -> PressureReading {
+        PressureReading {
             memory_full: Some(memory_full),
             available: Some(3.0),
             swapped_in,
@@ -90,11 +90,11 @@ mod tests {
     #[test]
     fn servants_that_wait_at_their_own_limits_are_not_the_machine() {
         for (available, stalls) in [(Some(80.0), false), (Some(24.9), true), (None, true)] {
-            let of = Reading {
+            let of = PressureReading {
                 available,
                 ..reading(90.0, 0.0)
             };
-            let why = Stall::default().judge(of, Instant::now());
+            let why = StallDetector::default().judge(of, Instant::now());
             assert_eq!(why.is_some(), stalls, "{available:?}: {why:?}");
         }
     }
@@ -102,19 +102,19 @@ mod tests {
     #[test]
     fn it_begins_at_one_bound_and_ends_at_a_lower_one() {
         let began = Instant::now();
-        let mut stall = Stall::default();
+        let mut stall = StallDetector::default();
         for (second, of, expected) in [
             (0, reading(9.9, SWAPS - 1.0), None),
-            (1, Reading::default(), None),
-            (2, reading(12.4, 0.0), Some("stalls: in 12 %")),
-            (3, reading(5.0, 0.0), Some("stalls: in 5 %")),
+            (1, PressureReading::default(), None),
+            (2, reading(12.4, 0.0), Some("waited for memory in 12 %")),
+            (3, reading(5.0, 0.0), Some("waited for memory in 5 %")),
             (
                 4,
                 reading(4.9, SETTLED),
-                Some("swaps: it reads 256K a second"),
+                Some("swaps: it reads 256K per second"),
             ),
-            (5, reading(0.0, 0.0), Some("just now")),
-            (8, reading(4.9, 0.0), Some("just now")),
+            (5, reading(0.0, 0.0), Some("a moment ago")),
+            (8, reading(4.9, 0.0), Some("a moment ago")),
             (9, reading(4.9, 0.0), None),
             (10, reading(9.9, 0.0), None),
             (11, reading(0.0, SWAPS), Some("swaps")),
@@ -132,7 +132,7 @@ mod tests {
         #[test]
         fn it_does_not_come_and_go(readings in prop::collection::vec((0.0f64..20.0, 0.0f64..2.0), 1..200)) {
             let began = Instant::now();
-            let mut stall = Stall::default();
+            let mut stall = StallDetector::default();
             let mut ended: Option<u64> = None;
             let mut before = false;
             let mut last = 0;

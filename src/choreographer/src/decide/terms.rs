@@ -1,18 +1,19 @@
-//! On which terms a robot has a servant: from what its clients state, its class and its service to the limits that are promised
-//! to it.
+//! Derives the terms of a robot's servant, its promised limits, from what the robot's clients state, its class and its
+//! service.
 //!
-//! What several clients of one robot state (its stubs, each for a node; rosbridge clients) is for one servant: the
-//! strictest counts ([`Stated::with`]). The limits follow from, the first that says something:
+//! The statements of several clients of one robot (its stubs, each for a node; rosbridge clients) apply to one servant:
+//! the strictest counts ([`Stated::merge`]). The limits come from the first of these sources that provides them:
 //!
-//! 1. `cpus` and `memory` that are stated outright,
-//! 2. the rows of the service's dictionary that are taken for the goals of the SLA ([`super::dictionary`]); of several goals what is
-//!    enough for all,
+//! 1. `cpus` and `memory` stated explicitly,
+//! 2. the dictionary rows chosen for the goals of the SLA ([`super::dictionary`]); with several goals, enough for all
+//!    of them,
 //! 3. the push of the service,
 //! 4. the limits of the class.
 //!
-//! An SLA by default is that of the class, where no SLA and no resources are stated. What is stated is bounded by the caps of
-//! the class and of the service; the deployer's own limits are not. A goal that the robot states and that cannot be met is
-//! refused, with what can be; one of its class, or beside resources that it states outright, is not: it gets the best there is.
+//! The class provides the default SLA, if neither an SLA nor resources are stated. Statements are bounded by the caps
+//! of the class and of the service; the deployer's own limits are not. A stated goal that cannot be met is refused,
+//! with a possible alternative; a goal of the class, or one beside explicitly stated resources, is not: it gets the
+//! best available row.
 
 mod caps;
 mod explanation;
@@ -25,109 +26,121 @@ use api::{Caps, Limits, Sla, Stated, Terms};
 
 use super::Amount;
 use super::demand::with_bounded_weight;
-use super::dictionary::{Aux, Choice, Shelf};
-use crate::options::{Class, DEFAULT_CLASS};
-use caps::Bounds;
-pub use caps::{Cap, Capper};
+use super::dictionary::{Aux, DictionaryView, RowChoice};
+use crate::options::{ClassOptions, DEFAULT_CLASS};
+use caps::RobotCaps;
+pub use caps::{Cap, CapSource};
 pub use explanation::explain;
 
-/// What terms are made from, beside what is stated.
+/// The context from which terms are derived, apart from the statements.
 #[derive(Debug, Clone, Copy)]
 pub struct Offer<'a> {
     /// The service.
     pub service: &'a str,
-    /// Limits that its push asked for.
+    /// Limits requested by its push.
     pub limits: Limits,
-    /// A deployer owns it: the weight that its push and its rows ask for is at most what is promised.
+    /// The service belongs to a deployer: the weight requested by its push and rows is bounded by its promise.
     pub is_deployers: bool,
-    /// What its robots may ask for.
+    /// Caps on what its robots may request.
     pub caps: Caps,
     /// All classes, by name.
-    pub classes: &'a BTreeMap<String, Class>,
+    pub classes: &'a BTreeMap<String, ClassOptions>,
     /// The service's dictionary.
     pub rows: &'a [Row],
-    /// Auxiliary parameters that sessions of the robot have measured; what it states comes before.
+    /// Auxiliary parameters measured by the robot's sessions; stated ones take precedence.
     pub measured: &'a Aux,
-    /// What is set aside for a servant for which nobody asks anything: cores and bytes.
+    /// Reserve for a servant without any limits: cores and bytes.
     pub reserve: (f64, u64),
-    /// What the machine has for servants.
+    /// Capacity of the machine for servants.
     pub capacity: Amount,
 }
 
-/// Why a robot cannot have a servant on its terms.
+/// The error of terms that cannot be granted.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Untenable {
+pub enum TermsError {
     /// The configuration has no such class.
     #[error("class = {name:?} is not one of the configuration's classes")]
     UnknownClass {
-        /// Stated.
+        /// The stated name.
         name: String,
-        /// Names that exist.
+        /// Existing names.
         exists: Vec<String>,
     },
-    /// More than its class or its service allows.
-    #[error("{} = {asked} is more than this robot may ask for: {cap}", cap.resource)]
+    /// The statement exceeds a cap of the class or the service.
+    #[error("{} = {asked} is more than this robot may request: {cap}", cap.resource)]
     Capped {
-        /// What was stated.
+        /// The stated value.
         asked: String,
-        /// What bounds it.
+        /// The cap that it exceeds.
         cap: Box<Cap>,
     },
-    /// The row that would do is more than it may have.
-    #[error("{goal}{} needs {needs}, which is more {} than this robot may have: {cap}", assumed_in_words(assumed), cap.resource)]
+    /// The sufficient row exceeds a cap.
+    #[error(
+        "{goal}{} needs {needs}, which is more {} than this robot may have: {cap}",
+        assumed_in_words(assumed), cap.resource
+    )]
     Beyond {
-        /// What was stated, such as `rrt 100ms`.
+        /// The stated goal, such as `rrt 100ms`.
         goal: String,
-        /// Auxiliary parameters that nobody stated, with the values that need most.
+        /// Auxiliary parameters that were not stated, with the most demanding values.
         assumed: Aux,
-        /// Limits, and the row that says so.
+        /// Required limits, with the row.
         needs: String,
-        /// What bounds them.
+        /// The cap that they exceed.
         cap: Box<Cap>,
-        /// What would fit, as it would be stated.
+        /// A goal that would fit, in the form of a statement.
         fits: Option<String>,
     },
-    /// No row does.
-    #[error("{service} does not reach {goal}{}: {}", for_what(assumed), best.as_deref().map_or("its dictionary has no row for it".to_owned(), |best| format!("the best that it may have is {best}")))]
+    /// No row suffices.
+    #[error(
+        "{service} does not reach {goal}{}: {}", for_what(assumed),
+        best.as_deref().map_or(
+            "its SLA table has no entry for it".to_owned(),
+            |best| format!("the best permitted is {best}")
+        )
+    )]
     Unmet {
         /// The service.
         service: String,
-        /// What was stated.
+        /// The stated goal.
         goal: String,
-        /// Auxiliary parameters for which there is none.
+        /// Auxiliary parameters for which no row suffices.
         assumed: Aux,
-        /// The best that can be had, with the row that says so.
+        /// The best available value, with its row.
         best: Option<String>,
-        /// What would fit, as it would be stated.
+        /// A goal that would fit, in the form of a statement.
         fits: Option<String>,
     },
 }
 
-/// What follows from what is stated, beside the limits.
-struct Reading<'a> {
+/// Intermediate result of deriving terms, apart from the limits.
+struct TermsContext<'a> {
     together: Stated,
-    class: Option<(&'a str, &'a Class)>,
-    bounds: Bounds,
-    /// Limits where neither resources nor rows say anything.
+    class: Option<(&'a str, &'a ClassOptions)>,
+    bounds: RobotCaps,
+    /// Limits if neither resources nor rows apply.
     own: Limits,
     aux: Aux,
-    /// Those of them that it did not state.
+    /// The auxiliary parameters that were measured and not stated.
     measured: Aux,
     sla: Sla,
-    /// A goal that cannot be met is refused.
+    /// A goal that cannot be met is an error.
     strict: bool,
 }
 
-impl<'a> Reading<'a> {
-    fn of(stated: &BTreeMap<String, Stated>, offer: &Offer<'a>) -> Result<Reading<'a>, Untenable> {
+impl<'a> TermsContext<'a> {
+    fn from_stated(
+        stated: &BTreeMap<String, Stated>,
+        offer: &Offer<'a>,
+    ) -> Result<TermsContext<'a>, TermsError> {
         let priority = |name: &str| offer.classes.get(name).map(|class| class.priority);
         let prefer = |one: &str, other: &str| priority(one) > priority(other);
         let together = stated
             .values()
             .cloned()
-            .reduce(|one, other| one.with(other, prefer))
+            .reduce(|one, other| one.merge(other, prefer))
             .unwrap_or_default();
-        let class = class(together.class.as_deref(), offer.classes)?;
+        let class = find_class(together.class.as_deref(), offer.classes)?;
         let by_class = class.map_or(Limits::default(), |(_, class)| class.limits);
         let mut measured = offer.measured.clone();
         measured.retain(|key, _| !together.aux.contains_key(key));
@@ -138,8 +151,8 @@ impl<'a> Reading<'a> {
             Some((_, class)) if together.sla.is_empty() && !direct => (class.sla, false),
             _ => (together.sla, true),
         };
-        Ok(Reading {
-            bounds: Bounds::of(class, offer),
+        Ok(TermsContext {
+            bounds: RobotCaps::for_class(class, offer),
             own: offer.limits.or(by_class),
             strict: stated_sla && !direct,
             together,
@@ -150,8 +163,8 @@ impl<'a> Reading<'a> {
         })
     }
 
-    fn shelf(&'a self, offer: &Offer<'a>) -> Shelf<'a> {
-        Shelf {
+    fn dictionary_view(&'a self, offer: &Offer<'a>) -> DictionaryView<'a> {
+        DictionaryView {
             rows: offer.rows,
             aux: &self.aux,
             own: self.own,
@@ -160,8 +173,8 @@ impl<'a> Reading<'a> {
         }
     }
 
-    /// Resources that are stated outright.
-    fn direct(&self) -> Limits {
+    /// Returns the explicitly stated resources.
+    fn stated_resources(&self) -> Limits {
         Limits {
             cpus: self.together.cpus,
             memory: self.together.memory,
@@ -170,57 +183,62 @@ impl<'a> Reading<'a> {
     }
 }
 
-/// The terms for what the clients of one robot state, by node. Same input, same output.
-pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Terms, Untenable> {
-    let reading = Reading::of(stated, offer)?;
+/// Derives the terms for the statements of one robot's clients, by node. Deterministic.
+pub fn compute_terms(
+    stated: &BTreeMap<String, Stated>,
+    offer: &Offer<'_>,
+) -> Result<Terms, TermsError> {
+    let reading = TermsContext::from_stated(stated, offer)?;
     reading.bounds.check(&reading.together)?;
-    let (direct, own) = (reading.direct(), reading.own);
+    let (direct, own) = (reading.stated_resources(), reading.own);
     let mut why = Vec::new();
     if direct != Limits::default() {
-        why.push(format!("{} as stated", in_words(&direct)));
+        why.push(format!("{} as requested", limits_in_words(&direct)));
     }
     let (mut rows, mut by_rows): (Vec<Row>, Option<Limits>) = (Vec::new(), None);
     for goal in reading.sla.goals() {
-        let shelf = reading.shelf(offer);
-        let choice = shelf.choose(&goal, |row| reading.bounds.against(row, &shelf).is_none());
+        let shelf = reading.dictionary_view(offer);
+        let choice = shelf.choose(&goal, |row| {
+            reading.bounds.exceeded_by(row, &shelf).is_none()
+        });
         let (row, reason) = match choice {
-            Choice::Silent => {
+            RowChoice::Silent => {
                 let name = goal.measure.name();
                 let service = offer.service;
                 why.push(format!(
-                    "the dictionary of {service} says nothing of {name}"
+                    "the SLA table of {service} has no entry for {name}"
                 ));
                 continue;
             }
-            Choice::Taken {
+            RowChoice::Taken {
                 row,
                 desired,
                 assumed,
-            } => (row, taken(&goal, row, desired, &assumed)),
-            Choice::Unmet {
+            } => (row, taken_reason(&goal, row, desired, &assumed)),
+            RowChoice::Unmet {
                 best: Some(row), ..
-            } if !reading.strict => (row, format!("{} is the best there is", named(row))),
-            Choice::Unmet { .. } if !reading.strict => {
-                why.push(format!("no row for {} applies", words_of(&goal)));
+            } if !reading.strict => (row, format!("{} is the best available", row_in_words(row))),
+            RowChoice::Unmet { .. } if !reading.strict => {
+                why.push(format!("no entry for {} applies", goal_in_words(&goal)));
                 continue;
             }
-            Choice::Unmet {
+            RowChoice::Unmet {
                 best,
                 beyond,
                 assumed,
-            } => return Err(unmet(&goal, best, beyond, assumed, offer, &reading)),
+            } => return Err(unmet_error(&goal, best, beyond, assumed, offer, &reading)),
         };
         let enough = row.limits.or(own);
-        by_rows = Some(by_rows.map_or(enough, |sum| sum.most(enough)));
+        by_rows = Some(by_rows.map_or(enough, |sum| sum.combine_max(enough)));
         why.push(reason);
         rows.push(row.clone());
     }
     if !rows.is_empty() && !reading.measured.is_empty() {
-        let measured = pairs_of(&reading.measured);
-        why.push(format!("its messages were measured: {measured}"));
+        let measured = aux_pairs(&reading.measured);
+        why.push(format!("measured from its messages: {measured}"));
     }
     let limits = direct.or(by_rows.unwrap_or(own));
-    // The weight of a class is an operator's.
+    // The weight of a class was set by an operator.
     let asks = |limits: &Limits| limits.cpu_weight.is_some();
     let by_deployer = asks(&offer.limits) || rows.iter().any(|row| asks(&row.limits));
     let limits = if offer.is_deployers && by_deployer {
@@ -239,103 +257,104 @@ pub fn terms(stated: &BTreeMap<String, Stated>, offer: &Offer<'_>) -> Result<Ter
     })
 }
 
-/// Why a row is taken.
-fn taken(goal: &Goal, row: &Row, desired: bool, assumed: &Aux) -> String {
-    let reason = match desired {
-        true => "is the cheapest that reaches",
-        false => "is the best that is acceptable for",
+/// Returns the reason why a row is taken.
+fn taken_reason(goal: &Goal, row: &Row, desired: bool, assumed: &Aux) -> String {
+    let reason = if desired {
+        "is the cheapest that reaches"
+    } else {
+        "is the best acceptable entry for"
     };
     let measure = goal.measure;
-    let wished = measure.print(goal.desire);
+    let wished = measure.format_value(goal.desire);
     format!(
         "{} {reason} {} {wished}{}",
-        named(row),
+        row_in_words(row),
         measure.name(),
         for_what(assumed)
     )
 }
 
-fn unmet(
+fn unmet_error(
     goal: &Goal,
     best: Option<&Row>,
     beyond: Option<&Row>,
     assumed: Aux,
     offer: &Offer<'_>,
-    reading: &Reading<'_>,
-) -> Untenable {
+    reading: &TermsContext<'_>,
+) -> TermsError {
     let measure = goal.measure;
-    let fits = best.map(|row| format!("{}={}", measure.name(), measure.print(row.value)));
-    let goal = words_of(goal);
-    let shelf = reading.shelf(offer);
-    let beyond = beyond.and_then(|row| Some((row, reading.bounds.against(row, &shelf)?)));
+    let fits = best.map(|row| format!("{}={}", measure.name(), measure.format_value(row.value)));
+    let goal = goal_in_words(goal);
+    let shelf = reading.dictionary_view(offer);
+    let beyond = beyond.and_then(|row| Some((row, reading.bounds.exceeded_by(row, &shelf)?)));
     match beyond {
-        Some((row, cap)) => Untenable::Beyond {
+        Some((row, cap)) => TermsError::Beyond {
             goal,
             assumed,
-            needs: named(row),
+            needs: row_in_words(row),
             cap: Box::new(cap),
             fits,
         },
-        None => Untenable::Unmet {
+        None => TermsError::Unmet {
             service: offer.service.to_owned(),
             goal,
-            assumed: match assumed.is_empty() {
-                true => reading.aux.clone(),
-                false => assumed,
+            assumed: if assumed.is_empty() {
+                reading.aux.clone()
+            } else {
+                assumed
             },
-            best: best.map(named),
+            best: best.map(row_in_words),
             fits,
         },
     }
 }
 
-/// What of a goal must be kept.
-fn words_of(goal: &Goal) -> String {
+/// Returns the bound of a goal in words.
+fn goal_in_words(goal: &Goal) -> String {
     let measure = goal.measure;
-    format!("{} {}", measure.name(), measure.print(goal.bound))
+    format!("{} {}", measure.name(), measure.format_value(goal.bound))
 }
 
-/// A row for people.
-pub(crate) fn named(row: &Row) -> String {
-    match in_words(&row.limits).as_str() {
-        "" => format!("row {} ({row}: the service's own limits)", row.id),
-        limits => format!("row {} ({row}: {limits})", row.id),
+/// Returns a human-readable form of a row.
+pub(crate) fn row_in_words(row: &Row) -> String {
+    match limits_in_words(&row.limits).as_str() {
+        "" => format!("entry {} ({row}: the service's own limits)", row.id),
+        limits => format!("entry {} ({row}: {limits})", row.id),
     }
 }
 
-/// What was assumed since nobody stated it.
+/// Returns the assumed parameters that were not stated, in words.
 fn assumed_in_words(assumed: &Aux) -> String {
-    match assumed.is_empty() {
-        true => String::new(),
-        false => format!(
-            " with {}, which is assumed since it is not stated,",
-            pairs_of(assumed)
-        ),
+    if assumed.is_empty() {
+        String::new()
+    } else {
+        format!(" with {} (assumed because not given)", aux_pairs(assumed))
     }
 }
 
-/// What was assumed of auxiliary parameters, behind what it is about.
+/// Returns the assumed auxiliary parameters as a suffix.
 fn for_what(assumed: &Aux) -> String {
-    match assumed.is_empty() {
-        true => String::new(),
-        false => format!(" with {}", pairs_of(assumed)),
+    if assumed.is_empty() {
+        String::new()
+    } else {
+        format!(" with {}", aux_pairs(assumed))
     }
 }
 
-/// Auxiliary parameters as they would be stated.
-pub(crate) fn pairs_of(aux: &Aux) -> String {
+/// Returns auxiliary parameters in the form of a statement.
+pub(crate) fn aux_pairs(aux: &Aux) -> String {
     let pairs = aux.iter().map(|(key, value)| format!("aux.{key}={value}"));
     pairs.collect::<Vec<_>>().join(" ")
 }
 
-/// The class that a robot is in: the one that it names, else the default one where there is one.
-fn class<'a>(
+/// Returns the class of a robot: the one that it names, or the default one if it exists.
+fn find_class<'a>(
     named: Option<&str>,
-    classes: &'a BTreeMap<String, Class>,
-) -> Result<Option<(&'a str, &'a Class)>, Untenable> {
+    classes: &'a BTreeMap<String, ClassOptions>,
+) -> Result<Option<(&'a str, &'a ClassOptions)>, TermsError> {
     let found = classes.get_key_value(named.unwrap_or(DEFAULT_CLASS));
     match (named, found) {
-        (Some(name), None) => Err(Untenable::UnknownClass {
+        (Some(name), None) => Err(TermsError::UnknownClass {
             name: name.to_owned(),
             exists: classes.keys().cloned().collect(),
         }),
@@ -343,10 +362,10 @@ fn class<'a>(
     }
 }
 
-/// Limits for people, by the names of the flags that set them.
-pub(crate) fn in_words(limits: &Limits) -> String {
+/// Returns a human-readable form of limits, by the names of their flags.
+pub(crate) fn limits_in_words(limits: &Limits) -> String {
     let set = limits
-        .named()
+        .flag_values()
         .map(|(name, value)| format!("{name} {value}"));
     set.collect::<Vec<_>>().join(", ")
 }

@@ -1,18 +1,19 @@
-//! Which refusals are told of: a robot that asks again and again, or under ever new names, does not fill the journal.
+//! Limits the reporting of refusals: a robot that asks again and again, or under ever new names, does not fill the
+//! journal.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-/// The length of a window.
+/// Length of a window.
 const WINDOW: Duration = Duration::from_secs(60);
-/// Robots of a service that are told of in one window at most, each once.
+/// Maximum number of robots of a service reported in one window, each once.
 const ROBOTS: usize = 20;
-/// Services of which it is remembered.
+/// Maximum number of services remembered.
 const SERVICES: usize = 1000;
 
-/// What was told of lately.
+/// Recently reported refusals.
 #[derive(Debug, Default)]
-pub struct Told {
+pub struct RefusalLog {
     services: BTreeMap<String, Window>,
 }
 
@@ -23,9 +24,10 @@ struct Window {
     left_out: u64,
 }
 
-impl Told {
-    /// A robot of a service is refused: whether that is told, and of how many before it was not.
-    pub fn tell(&mut self, service: &str, robot: &str, now: Instant) -> Option<u64> {
+impl RefusalLog {
+    /// Records the refusal of a robot; returns the number of unreported refusals before it if this one is to be
+    /// reported.
+    pub fn record_refusal(&mut self, service: &str, robot: &str, now: Instant) -> Option<u64> {
         let over = |window: &Window| now.saturating_duration_since(window.began) >= WINDOW;
         if !self.services.contains_key(service) && self.services.len() >= SERVICES {
             self.services.retain(|_, window| !over(window));
@@ -56,11 +58,11 @@ impl Told {
     }
 }
 
-/// Behind what is told: how many before it were not.
-pub fn left_out(count: u64) -> String {
+/// Returns the suffix of a report that gives the number of unreported refusals.
+pub fn suppressed_note(count: u64) -> String {
     match count {
         0 => String::new(),
-        count => format!(" ({count} more refusals of this service were not told before)"),
+        count => format!(" ({count} more refusals of this service were not reported)"),
     }
 }
 
@@ -73,7 +75,7 @@ mod tests {
     #[test]
     fn each_robot_is_told_of_once_and_then_how_often_it_was_not() {
         let began = Instant::now();
-        let mut told = Told::default();
+        let mut told = RefusalLog::default();
         let second = Duration::from_secs(1);
         for (robot, after, tells) in [
             ("a", 0, Some(0)),
@@ -85,25 +87,32 @@ mod tests {
             ("a", 121, Some(0)),
         ] {
             let now = began + second * after;
-            assert_eq!(told.tell("s", robot, now), tells, "{robot} {after}");
+            assert_eq!(
+                told.record_refusal("s", robot, now),
+                tells,
+                "{robot} {after}"
+            );
         }
-        assert_eq!(told.tell("other", "a", began), Some(0));
+        assert_eq!(told.record_refusal("other", "a", began), Some(0));
         assert_eq!(
-            (left_out(0).as_str(), left_out(2).contains("2 more")),
+            (
+                suppressed_note(0).as_str(),
+                suppressed_note(2).contains("2 more")
+            ),
             ("", true)
         );
     }
 
     #[test]
     fn it_does_not_grow() {
-        let mut told = Told::default();
+        let mut told = RefusalLog::default();
         let now = Instant::now();
         for number in 0..SERVICES + 2 {
-            let tells = told.tell(&number.to_string(), "a", now);
+            let tells = told.record_refusal(&number.to_string(), "a", now);
             assert_eq!(tells.is_some(), number < SERVICES, "{number}");
         }
-        // Those that are over make room.
-        assert_eq!(told.tell("late", "a", now + WINDOW), Some(0));
+        // Expired ones make room.
+        assert_eq!(told.record_refusal("late", "a", now + WINDOW), Some(0));
         assert_eq!(told.services.len(), 1);
     }
 
@@ -112,14 +121,14 @@ mod tests {
         fn however_many_are_refused_few_are_told_and_none_is_forgotten(
             asks in prop::collection::vec((0u8..2, 0u16..400, 0u64..3000), 1..600),
         ) {
-            let mut told = Told::default();
+            let mut told = RefusalLog::default();
             let mut now = Instant::now();
             let (mut tells, mut counted, mut passed) = ([0usize; 2], 0u64, Duration::ZERO);
             let all = asks.len() as u64;
             for (service, robot, pause) in asks {
                 now += Duration::from_millis(pause);
                 passed += Duration::from_millis(pause);
-                if let Some(more) = told.tell(&service.to_string(), &robot.to_string(), now) {
+                if let Some(more) = told.record_refusal(&service.to_string(), &robot.to_string(), now) {
                     tells[service as usize] += 1;
                     counted += more;
                 }

@@ -1,54 +1,54 @@
-//! What is made ahead of the robots that will ask: containers, and of some of them the nodes, too.
+//! Decides what is prepared before robots ask: containers, and in some of them the nodes.
 
 use std::time::Duration;
 
-use super::{End, forecast};
+use super::{StopOrder, forecast};
 
-/// Bytes that a container without nodes is counted with (some 3 MB were measured).
+/// Bytes counted for a container without nodes (some 3 MB were measured).
 pub const CONTAINER: u64 = 4 << 20;
-/// So many of the arrivals may find no container.
+/// Fraction of arrivals that may find no container.
 const LOSS: f64 = 0.05;
-/// A pool is made smaller only where even fewer would find none: the sizes between are left as they are.
+/// Fraction of arrivals without a container below which a pool is shrunk; sizes in between are left alone.
 const KEPT_LOSS: f64 = 0.01;
 
 /// A container of the warm pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Warm<'a> {
-    /// Its id.
+pub struct WarmContainer<'a> {
+    /// Id of the container.
     pub id: &'a str,
     /// The service whose servant it can become.
     pub service: &'a str,
     /// The revision that it was made from.
     pub revision: u64,
-    /// The revision's image.
+    /// Image of the revision.
     pub image: &'a str,
-    /// It has not ended, nor has a node in it.
+    /// Neither it nor a node in it has ended.
     pub runs: bool,
     /// The revision's nodes were started in it, under their default names.
     pub nodes: bool,
 }
 
-impl Warm<'_> {
-    /// Whether it was made from this revision of its service.
-    pub fn is_of(&self, revision: u64, image: &str) -> bool {
+impl WarmContainer<'_> {
+    /// Returns true if it was made from this revision of its service.
+    pub fn is_from(&self, revision: u64, image: &str) -> bool {
         self.revision == revision && self.image == image
     }
 }
 
-/// The container for a robot that asks for this revision: one with nodes where it takes them as they are (`default_names`),
-/// else, and where there is none, one without. The one that was made first is the furthest.
-pub fn choose<'a>(
-    pool: impl Iterator<Item = Warm<'a>>,
+/// Chooses the container for a robot that requests this revision: one with nodes if the robot takes them unchanged
+/// (`default_names`), otherwise, or if there is none, one without. The oldest container is the most advanced one.
+pub fn choose_container<'a>(
+    pool: impl Iterator<Item = WarmContainer<'a>>,
     (service, revision, image): (&str, u64, &str),
     default_names: bool,
-) -> Option<Warm<'a>> {
-    let fits = |warm: &Warm<'_>| {
+) -> Option<WarmContainer<'a>> {
+    let fits = |warm: &WarmContainer<'_>| {
         warm.service == service
             && warm.runs
-            && warm.is_of(revision, image)
+            && warm.is_from(revision, image)
             && (default_names || !warm.nodes)
     };
-    let mut best: Option<Warm<'a>> = None;
+    let mut best: Option<WarmContainer<'a>> = None;
     for warm in pool.filter(fits) {
         if best.is_none_or(|best| warm.nodes && !best.nodes) {
             best = Some(warm);
@@ -57,9 +57,9 @@ pub fn choose<'a>(
     best
 }
 
-/// The `count` services of `published` that are to have containers: those asked for last first, `asked_for` having the last
-/// one last, then those that nobody has asked for.
-pub fn deserving(published: &[String], asked_for: &[String], count: usize) -> Vec<String> {
+/// Returns the `count` services of `published` that are to have containers: most recently requested first (`asked_for`
+/// has the latest one last), then those that were never requested.
+pub fn deserving_services(published: &[String], asked_for: &[String], count: usize) -> Vec<String> {
     let asked = asked_for.iter().rev().filter(|it| published.contains(it));
     let mut order: Vec<String> = Vec::new();
     for service in asked.chain(published) {
@@ -70,46 +70,47 @@ pub fn deserving(published: &[String], asked_for: &[String], count: usize) -> Ve
     order
 }
 
-/// What is known of a service that deserves containers.
+/// Demand of a service that is to have containers.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Demand {
-    /// Robots that are expected in a second.
+pub struct PoolDemand {
+    /// Expected robots per second.
     pub rate: f64,
-    /// From a container's taking to the next one's readiness.
+    /// Time from taking a container until the next one is ready.
     pub lead: Duration,
-    /// Bytes that are promised to a servant; none where its nodes may not run ahead.
+    /// Bytes promised to a servant; `None` if its nodes may not run ahead.
     pub nodes: Option<u64>,
 }
 
-/// What all that is made ahead may take.
+/// Budget for everything that is prepared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Budget {
-    /// Bytes.
+pub struct PoolBudget {
+    /// Memory in bytes.
     pub memory: u64,
-    /// Containers whose nodes run.
+    /// Number of containers with running nodes.
     pub nodes: usize,
 }
 
-/// How many containers a service is to have.
+/// Pool size of a service.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Size {
-    /// So many are made.
+pub struct PoolSize {
+    /// Number of containers to make.
     pub makes: usize,
-    /// So many may stay.
+    /// Number of containers that may stay.
     pub keeps: usize,
-    /// Of those made, so many have nodes.
+    /// Number of those made that have nodes.
     pub nodes: usize,
 }
 
-/// The sizes of the services' pools, in their order, the most deserving first.
+/// Returns the pool sizes of the services, in their order, most deserving first.
 ///
-/// Each has one container while there is memory. Further ones go, one by one, to whoever spares most robots a wait by it, until
-/// few enough would wait: the loss falls ever more slowly with each (Erlang's B is convex in the number), so that this is the
-/// best division (B. Fox, *Discrete optimization via marginal analysis*, Management Science 13, 1966).
-pub fn sizes(demands: &[Demand], budget: Budget) -> Vec<Size> {
+/// Each service gets one container while there is memory. Further ones go, one by one, to the service where they spare
+/// most robots a wait, until few enough would wait: the loss falls ever more slowly with each (Erlang's B is convex in
+/// the number), so this is the optimal division (B. Fox, *Discrete optimization via marginal analysis*, Management
+/// Science 13, 1966).
+pub fn pool_sizes(demands: &[PoolDemand], budget: PoolBudget) -> Vec<PoolSize> {
     let mut left = budget.memory;
     let mut nodes_left = budget.nodes;
-    let mut sizes = vec![Size::default(); demands.len()];
+    let mut sizes = vec![PoolSize::default(); demands.len()];
     let mut take = |cost: u64| {
         let has = left >= cost;
         left -= if has { cost } else { 0 };
@@ -135,8 +136,8 @@ pub fn sizes(demands: &[Demand], budget: Budget) -> Vec<Size> {
     loop {
         let spared = |index: usize| {
             let (has, offered) = (sizes[index].makes, offered[index]);
-            let waits = forecast::loss(has, offered);
-            let spared = demands[index].rate * (waits - forecast::loss(has + 1, offered));
+            let waits = forecast::erlang_b(has, offered);
+            let spared = demands[index].rate * (waits - forecast::erlang_b(has + 1, offered));
             (has > 0 && waits > LOSS).then_some((index, spared))
         };
         let most = (0..sizes.len())
@@ -157,7 +158,7 @@ pub fn sizes(demands: &[Demand], budget: Budget) -> Vec<Size> {
     }
     for (size, offered) in sizes.iter_mut().zip(offered) {
         size.keeps = size.makes;
-        let enough = forecast::containers(offered, KEPT_LOSS);
+        let enough = forecast::containers_needed(offered, KEPT_LOSS);
         while size.keeps > 0 && size.keeps < enough && take(CONTAINER) {
             size.keeps += 1;
         }
@@ -167,47 +168,50 @@ pub fn sizes(demands: &[Demand], budget: Budget) -> Vec<Size> {
 
 /// A published revision that is to have containers in the warm pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Wanted<'a> {
-    /// Its service.
+pub struct WantedPool<'a> {
+    /// The service.
     pub service: &'a str,
-    /// Its number.
+    /// Revision number.
     pub revision: u64,
-    /// Its image.
+    /// Image of the revision.
     pub image: &'a str,
-    /// The number of containers.
-    pub size: Size,
+    /// Pool size.
+    pub size: PoolSize,
 }
 
-impl Wanted<'_> {
-    fn has(&self, warm: &Warm<'_>) -> bool {
-        warm.service == self.service && warm.is_of(self.revision, self.image)
+impl WantedPool<'_> {
+    fn includes(&self, warm: &WarmContainer<'_>) -> bool {
+        warm.service == self.service && warm.is_from(self.revision, self.image)
     }
 }
 
-/// Those of `pool` that end: of none of the wanted revisions, not running, or more than are wanted. Of those it is the ones
-/// without nodes that were made last.
-pub fn stale<'a>(pool: &[Warm<'a>], wanted: &[Wanted<'_>]) -> Vec<End<'a>> {
+/// Returns the containers of `pool` to end: of none of the wanted revisions, not running, or too many. Of the latter,
+/// those without nodes that were made last come first.
+pub fn stale_containers<'a>(
+    pool: &[WarmContainer<'a>],
+    wanted: &[WantedPool<'_>],
+) -> Vec<StopOrder<'a>> {
     let mut ends = Vec::new();
-    let mut end = |warm: &Warm<'a>, reason| {
-        ends.push(End {
+    let mut end = |warm: &WarmContainer<'a>, reason| {
+        ends.push(StopOrder {
             id: warm.id,
             reason,
         });
     };
     for warm in pool {
-        match wanted.iter().any(|wanted| wanted.has(warm)) {
-            _ if !warm.runs => end(warm, "it does not run"),
-            false => end(warm, "its revision is not wanted"),
-            true => {}
+        if !warm.runs {
+            end(warm, "it is not running");
+        } else if !wanted.iter().any(|wanted| wanted.includes(warm)) {
+            end(warm, "its revision is not needed");
         }
     }
     for wanted in wanted {
-        let mut of: Vec<&Warm<'a>> = pool
+        let mut of: Vec<&WarmContainer<'a>> = pool
             .iter()
-            .filter(|warm| warm.runs && wanted.has(warm))
+            .filter(|warm| warm.runs && wanted.includes(warm))
             .collect();
         let with = of.iter().filter(|warm| warm.nodes).count();
-        // Memory is what nodes cost: they end as soon as they are too many.
+        // Nodes cost memory: they end as soon as there are too many.
         let (mut nodes, mut all) = (with.saturating_sub(wanted.size.nodes), of.len());
         of.reverse();
         of.sort_by_key(|warm| warm.nodes);
@@ -224,28 +228,28 @@ pub fn stale<'a>(pool: &[Warm<'a>], wanted: &[Wanted<'_>]) -> Vec<End<'a>> {
     ends
 }
 
-/// What is done so that one of the wanted revisions has its containers.
+/// Containers or nodes that a wanted revision is missing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Missing<'a> {
-    /// So many containers are made.
+pub enum PoolShortage<'a> {
+    /// So many containers are to be made.
     Containers(usize),
-    /// The nodes are started in this one.
+    /// The nodes are to be started in this container.
     Nodes(&'a str),
-    /// Nothing is to be done.
+    /// Nothing is missing.
     Nothing,
 }
 
-/// What one of the wanted revisions lacks, `pool` being without those that end.
-pub fn missing<'a>(pool: &[Warm<'a>], wanted: &Wanted<'_>) -> Missing<'a> {
-    let of: Vec<&Warm<'a>> = pool.iter().filter(|warm| wanted.has(warm)).collect();
+/// Returns what a wanted revision is missing; `pool` excludes the containers that end.
+pub fn pool_shortage<'a>(pool: &[WarmContainer<'a>], wanted: &WantedPool<'_>) -> PoolShortage<'a> {
+    let of: Vec<&WarmContainer<'a>> = pool.iter().filter(|warm| wanted.includes(warm)).collect();
     if of.len() < wanted.size.makes {
-        return Missing::Containers(wanted.size.makes - of.len());
+        return PoolShortage::Containers(wanted.size.makes - of.len());
     }
     let with = of.iter().filter(|warm| warm.nodes).count();
     let first = of.iter().find(|warm| !warm.nodes);
     match first {
-        Some(warm) if with < wanted.size.nodes => Missing::Nodes(warm.id),
-        _ => Missing::Nothing,
+        Some(warm) if with < wanted.size.nodes => PoolShortage::Nodes(warm.id),
+        _ => PoolShortage::Nothing,
     }
 }
 
@@ -255,7 +259,7 @@ mod tests {
 
     use super::*;
 
-    const WARM: Warm<'_> = Warm {
+    const WARM: WarmContainer<'_> = WarmContainer {
         id: "it",
         service: "a",
         revision: 2,
@@ -264,12 +268,12 @@ mod tests {
         nodes: false,
     };
 
-    fn wanted(makes: usize, keeps: usize, nodes: usize) -> Wanted<'static> {
-        Wanted {
+    fn wanted_pool(makes: usize, keeps: usize, nodes: usize) -> WantedPool<'static> {
+        WantedPool {
             service: "a",
             revision: 2,
             image: "sha256:2",
-            size: Size {
+            size: PoolSize {
                 makes,
                 keeps,
                 nodes,
@@ -288,19 +292,19 @@ mod tests {
             (names(&["c"]), 0, &[]),
             (names(&["c"]), 9, &["c", "a", "b", "d"]),
         ] {
-            let order = deserving(&published, &asked_for, count);
+            let order = deserving_services(&published, &asked_for, count);
             assert_eq!(order, expected, "{asked_for:?}");
         }
     }
 
     #[test]
     fn a_robot_gets_nodes_only_where_it_takes_them_as_they_are() {
-        let named = |id, nodes| Warm { id, nodes, ..WARM };
-        let dead = Warm {
+        let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
+        let dead = WarmContainer {
             runs: false,
             ..named("dead", true)
         };
-        let older = Warm {
+        let older = WarmContainer {
             revision: 1,
             ..named("older", true)
         };
@@ -311,9 +315,9 @@ mod tests {
             named("first", true),
             named("second", true),
         ];
-        let id = |pool: &[Warm<'static>], default_names| {
+        let id = |pool: &[WarmContainer<'static>], default_names| {
             let of = ("a", 2, "sha256:2");
-            choose(pool.iter().copied(), of, default_names).map(|warm| warm.id)
+            choose_container(pool.iter().copied(), of, default_names).map(|warm| warm.id)
         };
         assert_eq!(id(&pool, true), Some("first"));
         assert_eq!(id(&pool, false), Some("bare"));
@@ -321,42 +325,42 @@ mod tests {
         assert_eq!(id(&pool[3..], false), None);
         assert_eq!(id(&pool[..2], true), None);
         // Of a service that was removed and published anew.
-        assert!(choose(pool.into_iter(), ("a", 2, "sha256:1"), true).is_none());
-        assert!(choose(pool.into_iter(), ("b", 2, "sha256:2"), true).is_none());
+        assert!(choose_container(pool.into_iter(), ("a", 2, "sha256:1"), true).is_none());
+        assert!(choose_container(pool.into_iter(), ("b", 2, "sha256:2"), true).is_none());
     }
 
     #[test]
     fn containers_end_that_do_not_run_are_not_wanted_or_too_many() {
-        let ends = |pool: &[Warm<'static>], wanted| {
-            let ends = stale(pool, &[wanted]);
+        let ends = |pool: &[WarmContainer<'static>], wanted| {
+            let ends = stale_containers(pool, &[wanted]);
             ends.into_iter().map(|end| end.id).collect::<Vec<_>>()
         };
-        let one = wanted(1, 1, 0);
+        let one = wanted_pool(1, 1, 0);
         for (warm, stays) in [
             (WARM, true),
             (
-                Warm {
+                WarmContainer {
                     runs: false,
                     ..WARM
                 },
                 false,
             ),
             (
-                Warm {
+                WarmContainer {
                     revision: 1,
                     ..WARM
                 },
                 false,
             ),
             (
-                Warm {
+                WarmContainer {
                     image: "sha256:1",
                     ..WARM
                 },
                 false,
             ),
             (
-                Warm {
+                WarmContainer {
                     service: "b",
                     ..WARM
                 },
@@ -365,38 +369,44 @@ mod tests {
         ] {
             assert_eq!(ends(&[warm], one).is_empty(), stays, "{warm:?}");
         }
-        let named = |id, nodes| Warm { id, nodes, ..WARM };
+        let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
         let pool = [
             named("n1", true),
             named("b1", false),
             named("b2", false),
             named("n2", true),
         ];
-        assert_eq!(ends(&pool, wanted(1, 4, 2)), [] as [&str; 0]);
-        assert_eq!(ends(&pool, wanted(1, 3, 2)), ["b2"]);
-        assert_eq!(ends(&pool, wanted(1, 4, 1)), ["n2"]);
-        assert_eq!(ends(&pool, wanted(1, 1, 1)), ["b2", "b1", "n2"]);
-        assert_eq!(ends(&pool, wanted(0, 0, 0)), ["b2", "b1", "n2", "n1"]);
+        assert_eq!(ends(&pool, wanted_pool(1, 4, 2)), [] as [&str; 0]);
+        assert_eq!(ends(&pool, wanted_pool(1, 3, 2)), ["b2"]);
+        assert_eq!(ends(&pool, wanted_pool(1, 4, 1)), ["n2"]);
+        assert_eq!(ends(&pool, wanted_pool(1, 1, 1)), ["b2", "b1", "n2"]);
+        assert_eq!(ends(&pool, wanted_pool(0, 0, 0)), ["b2", "b1", "n2", "n1"]);
     }
 
     #[test]
     fn containers_are_made_first_and_then_their_nodes() {
-        let named = |id, nodes| Warm { id, nodes, ..WARM };
-        let lacks = |pool: &[Warm<'static>], wanted| missing(pool, &wanted);
-        assert_eq!(lacks(&[], wanted(2, 2, 1)), Missing::Containers(2));
+        let named = |id, nodes| WarmContainer { id, nodes, ..WARM };
+        let lacks = |pool: &[WarmContainer<'static>], wanted| pool_shortage(pool, &wanted);
         assert_eq!(
-            lacks(&[named("n", true)], wanted(2, 2, 1)),
-            Missing::Containers(1)
+            lacks(&[], wanted_pool(2, 2, 1)),
+            PoolShortage::Containers(2)
+        );
+        assert_eq!(
+            lacks(&[named("n", true)], wanted_pool(2, 2, 1)),
+            PoolShortage::Containers(1)
         );
         let two = [named("one", false), named("two", false)];
-        assert_eq!(lacks(&two, wanted(2, 2, 1)), Missing::Nodes("one"));
-        assert_eq!(lacks(&two, wanted(1, 2, 0)), Missing::Nothing);
+        assert_eq!(
+            lacks(&two, wanted_pool(2, 2, 1)),
+            PoolShortage::Nodes("one")
+        );
+        assert_eq!(lacks(&two, wanted_pool(1, 2, 0)), PoolShortage::Nothing);
         let warm = [named("n", true), named("b", false)];
-        assert_eq!(lacks(&warm, wanted(2, 2, 1)), Missing::Nothing);
-        assert_eq!(lacks(&warm, wanted(2, 2, 2)), Missing::Nodes("b"));
+        assert_eq!(lacks(&warm, wanted_pool(2, 2, 1)), PoolShortage::Nothing);
+        assert_eq!(lacks(&warm, wanted_pool(2, 2, 2)), PoolShortage::Nodes("b"));
     }
 
-    const DEMAND: Demand = Demand {
+    const DEMAND: PoolDemand = PoolDemand {
         rate: 0.0,
         lead: Duration::from_secs(1),
         nodes: Some(64 << 20),
@@ -404,13 +414,13 @@ mod tests {
 
     #[test]
     fn pools_are_as_big_as_arrivals_need_and_memory_allows() {
-        let busy = |rate| Demand { rate, ..DEMAND };
-        let budget = |containers, nodes| Budget {
+        let busy = |rate| PoolDemand { rate, ..DEMAND };
+        let budget = |containers, nodes| PoolBudget {
             memory: containers * CONTAINER + nodes as u64 * (64 << 20),
             nodes,
         };
-        let makes = |demands: &[Demand], budget| {
-            let sizes = sizes(demands, budget);
+        let makes = |demands: &[PoolDemand], budget| {
+            let sizes = pool_sizes(demands, budget);
             let of = sizes.iter().map(|size| (size.makes, size.nodes));
             of.collect::<Vec<_>>()
         };
@@ -420,7 +430,7 @@ mod tests {
         // Erlang's B of one in a lead time: 5 % with four.
         assert_eq!(makes(&[busy(1.0), DEMAND], budget(99, 0))[0], (4, 0));
         assert_eq!(makes(&[DEMAND, busy(1.0)], budget(4, 0)), [(1, 0), (3, 0)]);
-        let nobodys = Demand {
+        let nobodys = PoolDemand {
             nodes: None,
             ..busy(1.0)
         };
@@ -435,27 +445,27 @@ mod tests {
             memory in 0u64..600,
             nodes in 0usize..5,
         ) {
-            let demands: Vec<Demand> = services.iter().map(|(rate, lead, nodes)| Demand {
+            let demands: Vec<PoolDemand> = services.iter().map(|(rate, lead, nodes)| PoolDemand {
                 rate: *rate,
                 lead: Duration::from_millis(*lead),
                 nodes: nodes.map(|mib| mib << 20),
             }).collect();
-            let budget = Budget { memory: memory << 20, nodes };
-            let sizes = super::sizes(&demands, budget);
-            prop_assert_eq!(&sizes, &super::sizes(&demands, budget));
+            let budget = PoolBudget { memory: memory << 20, nodes };
+            let sizes = super::pool_sizes(&demands, budget);
+            prop_assert_eq!(&sizes, &super::pool_sizes(&demands, budget));
             let mut costs = 0;
             for (size, demand) in sizes.iter().zip(&demands) {
                 prop_assert!(size.makes <= size.keeps && size.nodes <= size.makes);
                 prop_assert!(size.nodes == 0 || demand.nodes.is_some());
                 costs += size.keeps as u64 * CONTAINER + size.nodes as u64 * demand.nodes.unwrap_or(0);
                 let offered = demand.rate * demand.lead.as_secs_f64();
-                // What is made is not ended again, and no size is between for ever.
-                prop_assert!(size.makes <= forecast::containers(offered, LOSS).max(1));
-                prop_assert!(size.keeps <= forecast::containers(offered, KEPT_LOSS).max(1));
+                // A new container is not ended again, and no size stays in between for ever.
+                prop_assert!(size.makes <= forecast::containers_needed(offered, LOSS).max(1));
+                prop_assert!(size.keeps <= forecast::containers_needed(offered, KEPT_LOSS).max(1));
             }
             prop_assert!(costs <= budget.memory);
             prop_assert!(sizes.iter().map(|size| size.nodes).sum::<usize>() <= nodes);
-            // Who is more deserving has one first.
+            // More deserving services get one first.
             let has: Vec<bool> = sizes.iter().map(|size| size.makes > 0).collect();
             prop_assert!(has.is_sorted_by(|one, other| one >= other));
         }
@@ -468,27 +478,28 @@ mod tests {
             nodes in 0usize..5,
         ) {
             let names: Vec<String> = (0..99).map(|n| n.to_string()).collect();
-            let mut pool: Vec<Warm<'_>> = pool.iter().zip(&names).map(|((runs, nodes, revision), id)| Warm {
+            let mut pool: Vec<WarmContainer<'_>> = pool.iter().zip(&names).map(|((runs, nodes, revision),
+                id)| WarmContainer {
                 id, runs: *runs, nodes: *nodes, revision: *revision, ..WARM
             }).collect();
-            let wanted = wanted(makes, makes + more, nodes.min(makes));
+            let wanted = wanted_pool(makes, makes + more, nodes.min(makes));
             let mut next = 50;
             for round in 0.. {
                 prop_assert!(round < 12, "it does not settle");
-                let ends = stale(&pool, &[wanted]);
+                let ends = stale_containers(&pool, &[wanted]);
                 let ended: Vec<&str> = ends.iter().map(|end| end.id).collect();
                 prop_assert!(ended.iter().all(|id| pool.iter().any(|warm| warm.id == *id)));
                 prop_assert!(round == 0 || ended.is_empty(), "what was made is ended");
                 let before = pool.len();
                 pool.retain(|warm| !ended.contains(&warm.id));
                 prop_assert_eq!(pool.len() + ended.len(), before, "one is ended twice");
-                match missing(&pool, &wanted) {
-                    Missing::Nothing => break,
-                    Missing::Nodes(id) => {
+                match pool_shortage(&pool, &wanted) {
+                    PoolShortage::Nothing => break,
+                    PoolShortage::Nodes(id) => {
                         pool.iter_mut().filter(|warm| warm.id == id).for_each(|warm| warm.nodes = true);
                     }
-                    Missing::Containers(count) => for _ in 0..count {
-                        pool.push(Warm { id: &names[next], ..WARM });
+                    PoolShortage::Containers(count) => for _ in 0..count {
+                        pool.push(WarmContainer { id: &names[next], ..WARM });
                         next += 1;
                     },
                 }

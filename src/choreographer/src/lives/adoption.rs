@@ -1,47 +1,49 @@
-//! Servants that an earlier daemon left: taken over, or forgotten.
+//! Takes over, or removes, servants that an earlier daemon left.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use api::Limits;
-use servant::engine::{Adopted, ContainerState, Ended, Servant};
+use servant::engine::{AdoptedServants, ContainerState, EndedServant, ServantHandle};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::task::JoinHandle;
 
-use super::driver::{self, Beginning};
+use super::driver::{self, ServantSource};
 use super::waiting::Permit;
 use super::warm_pool::NOBODY;
 use crate::Error;
-use crate::decide::adoption::{Fate, Found, Started, fate, is_linked};
-use crate::decide::demand::Asked;
+use crate::decide::adoption::{
+    LeftoverContainer, LeftoverFate, StartedNode, decide_fate, is_linked,
+};
+use crate::decide::demand::LimitSources;
 use crate::{Choreographer, Handle};
 
-/// It was kept ready for a robot that had not come.
-fn is_nobodys(record: &ServantRecord) -> bool {
+/// Returns true if it was kept ready for a robot that had not come.
+fn is_unassigned(record: &ServantRecord) -> bool {
     record.robot == NOBODY
 }
 
-/// What an earlier daemon left.
-pub struct Inheritance {
-    /// How many servants were taken over.
+/// Result of adopting what an earlier daemon left.
+pub struct AdoptionResult {
+    /// Number of adopted servants.
     pub adopted: usize,
-    /// Ends and removes what is of no use, beside everything else; robots need not wait for it.
+    /// Background task that ends and removes the rest; robots need not wait for it.
     pub removal: JoinHandle<()>,
 }
 
-/// A container that runs and is nobody's any more.
-struct Useless {
-    servant: Arc<dyn Servant>,
-    fate: Fate,
-    /// What it has is promised to nobody else before it has ended.
+/// A running container that belongs to no robot any more.
+struct UnneededContainer {
+    servant: Arc<dyn ServantHandle>,
+    fate: LeftoverFate,
+    /// Keeps its capacity reserved until it has ended.
     _permit: Permit,
 }
 
 impl Choreographer {
-    /// Takes over the servants that an earlier daemon left, and forgets those that are gone.
-    pub async fn adopt(&self) -> Result<Inheritance, Error> {
+    /// Adopts the servants that an earlier daemon left, and forgets those that are gone.
+    pub async fn adopt(&self) -> Result<AdoptionResult, Error> {
         let inner = &self.inner;
-        let Adopted {
+        let AdoptedServants {
             running,
             ended,
             failures,
@@ -63,25 +65,25 @@ impl Choreographer {
                 Some(record) => inner.state.revision(&record.service, record.revision)?,
                 None => None,
             };
-            let fate = fate(Found {
+            let fate = decide_fate(LeftoverContainer {
                 recorded: record.is_some(),
-                nobodys: record.as_ref().is_some_and(is_nobodys),
+                nobodys: record.as_ref().is_some_and(is_unassigned),
                 published: revision.is_some(),
                 empty: servant.nodes().is_empty(),
             });
             match (fate, record, revision) {
-                (Fate::Kept, Some(record), Some(revision)) => {
+                (LeftoverFate::Kept, Some(record), Some(revision)) => {
                     self.adopt_one(record, revision, servant);
                     adopted += 1;
                 }
                 (fate, _, revision) => {
                     let had = revision.map_or(Limits::default(), |revision| {
-                        inner.of_push(&revision).promised()
+                        inner.push_limits(&revision).promised_limits()
                     });
-                    useless.push(Useless {
+                    useless.push(UnneededContainer {
                         servant,
                         fate,
-                        _permit: inner.admission.adopt(inner.promised(&had)),
+                        _permit: inner.admission.adopt(inner.promised_amount(&had)),
                     });
                 }
             }
@@ -91,24 +93,24 @@ impl Choreographer {
         let removal = tokio::spawn(async move {
             let ends = useless.into_iter().map(|useless| whole.end(useless));
             let ends = futures_util::future::join_all(ends);
-            // One that takes its time to end keeps nothing of the others from being removed.
+            // A slow end does not delay the removal of the others.
             let (_, failures) = tokio::join!(ends, whole.inner.engine.sweep(&ended));
             for error in failures {
                 whole.report_leftover(&error);
             }
         });
-        Ok(Inheritance { adopted, removal })
+        Ok(AdoptionResult { adopted, removal })
     }
 
     fn report_leftover(&self, error: &servant::Error) {
-        let message = format!("what an earlier daemon left could not be removed: {error}");
+        let message = format!("cannot remove leftovers of a previous daemon: {error}");
         let about = NewEvent::default();
         let journal = &self.inner.journal;
         journal.warning("servant-leftover", &message, &about);
     }
 
-    /// Forgets servants that are gone, and tells how they ended.
-    fn forget(&self, records: HashMap<String, ServantRecord>, ended: &[Ended]) {
+    /// Forgets servants that are gone, and reports how they ended.
+    fn forget(&self, records: HashMap<String, ServantRecord>, ended: &[EndedServant]) {
         let inner = &self.inner;
         let ends: HashMap<&str, Option<&ContainerState>> = ended
             .iter()
@@ -116,7 +118,7 @@ impl Choreographer {
             .collect();
         for gone in records.into_values() {
             inner.state.remove_servant(&gone.id);
-            if is_nobodys(&gone) {
+            if is_unassigned(&gone) {
                 continue;
             }
             let why = match ends.get(gone.id.as_str()).copied().flatten() {
@@ -128,7 +130,7 @@ impl Choreographer {
             inner.journal.warning(
                 "servant-lost",
                 &format!(
-                    "servant {} of {} for {} ended while no daemon ran{why}",
+                    "servant {} of {} for {} ended while the daemon was not running{why}",
                     gone.id, gone.service, gone.robot
                 ),
                 &NewEvent {
@@ -140,20 +142,20 @@ impl Choreographer {
         }
     }
 
-    /// Ends a container that nobody needs. What cannot be removed of it is told, and is in nobody's way.
-    async fn end(&self, useless: Useless) {
+    /// Ends an unneeded container. What cannot be removed of it is reported and does no harm.
+    async fn end(&self, useless: UnneededContainer) {
         let (inner, servant) = (&self.inner, &useless.servant);
         let about = NewEvent {
             servant: Some(servant.id()),
             ..NewEvent::default()
         };
-        if useless.fate != Fate::Unused {
+        if useless.fate != LeftoverFate::Unused {
             let id = servant.id();
-            let message = format!("ended servant {id}, which belongs to no service any more");
+            let message = format!("ended servant {id} because its service no longer exists");
             inner.journal.warning("servant-unknown", &message, &about);
         }
         if let Err(error) = servant.stop().await {
-            let message = format!("servant {} could not be cleaned up: {error}", servant.id());
+            let message = format!("cannot clean up servant {}: {error}", servant.id());
             inner.journal.error("servant-leftover", &message, &about);
         }
         inner.state.remove_servant(servant.id());
@@ -163,15 +165,15 @@ impl Choreographer {
         &self,
         record: ServantRecord,
         revision: Arc<RevisionRecord>,
-        servant: Arc<dyn Servant>,
+        servant: Arc<dyn ServantHandle>,
     ) {
         let inner = &self.inner;
-        let of_push = || inner.of_push(&revision);
-        let asked = Asked {
+        let of_push = || inner.push_limits(&revision);
+        let asked = LimitSources {
             set: record.limits,
             ..record
                 .terms
-                .map_or_else(of_push, |terms| inner.asked(terms))
+                .map_or_else(of_push, |terms| inner.limit_sources(terms))
         };
         let key = (record.service, record.robot.clone());
         let handle = Arc::new(Handle::new(
@@ -183,9 +185,9 @@ impl Choreographer {
             record.created,
         ));
         let planned = &handle.revision.plan.nodes;
-        let started = servant.nodes().into_iter().map(|name| Started {
+        let started = servant.nodes().into_iter().map(|name| StartedNode {
             planned: planned.iter().any(|node| node.name == name),
-            run: servant.run(&name).is_some(),
+            run: servant.run_id(&name).is_some(),
         });
         if is_linked(&started.collect::<Vec<_>>()) {
             handle.set_linked();
@@ -195,11 +197,13 @@ impl Choreographer {
             servants.all.insert(record.id, Arc::clone(&handle));
             servants.given.insert(key, Arc::clone(&handle));
         }
-        let permit = inner.admission.adopt(inner.promised(&handle.asked()));
+        let permit = inner
+            .admission
+            .adopt(inner.promised_amount(&handle.requested_limits()));
         tokio::spawn(driver::drive(
             Arc::clone(inner),
             handle,
-            Beginning::Adopted(servant, Some(permit)),
+            ServantSource::Adopted(servant, Some(permit)),
         ));
     }
 }

@@ -1,4 +1,4 @@
-//! Remembers which robots' servants fail, and when each may be started again.
+//! Tracks which robots' servants fail, and when each may be started again.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -7,37 +7,39 @@ use parking_lot::Mutex;
 use store::RevisionRecord;
 use tokio::time::Instant;
 
-use super::Inner;
+use super::ChoreographerInner;
 use crate::Error;
-use crate::decide::back_off::{Failing, RECOVERED, after_failure, is_forgotten, refusal, seconds};
+use crate::decide::back_off::{
+    FailureStreak, RECOVERED, after_failure, is_forgotten, remaining_pause, seconds,
+};
 use crate::lives::handle::{Failure, Handle};
 
-/// Robots without a name are one here: each has a name of its own, and would never meet its pause.
+/// Common key of robots without a name: each has a name of its own, and would never see its pause.
 const NAMELESS: &str = "~";
-/// What is remembered of so many robots is looked through for what can be forgotten.
+/// Number of entries from which on expired ones are removed.
 const MANY: usize = 256;
 
-/// By service and robot.
+/// Failures by service and robot.
 #[derive(Default)]
 pub(crate) struct BackOffs {
-    failing: Mutex<HashMap<(String, String), Failing>>,
+    failing: Mutex<HashMap<(String, String), FailureStreak>>,
 }
 
 impl BackOffs {
-    /// What refuses a servant of this revision to the robot now.
-    pub(crate) fn refusal(
+    /// Returns the failures that forbid a servant of this revision for the robot now, with the remaining pause.
+    pub(crate) fn find_refusal(
         &self,
         service: &str,
         robot: &str,
         revision: &RevisionRecord,
-    ) -> Option<(Failing, Duration)> {
+    ) -> Option<(FailureStreak, Duration)> {
         let failing = self.failing.lock();
         let known = failing.get(&(service.to_owned(), robot.to_owned()))?;
-        let left = refusal(known, revision.number, Instant::now().into_std())?;
+        let left = remaining_pause(known, revision.number, Instant::now().into_std())?;
         Some((known.clone(), left))
     }
 
-    /// Whether the last servant of this revision for the robot has failed, and that is not forgotten.
+    /// Returns true if the robot's last servant of this revision has failed and that is not forgotten.
     pub(crate) fn is_failing(&self, service: &str, robot: &str, revision: &RevisionRecord) -> bool {
         let failing = self.failing.lock();
         let known = failing.get(&(service.to_owned(), robot.to_owned()));
@@ -46,15 +48,15 @@ impl BackOffs {
         })
     }
 
-    /// A servant has failed; gives what follows.
-    pub(crate) fn failed(
+    /// Records the failure of a servant; returns the resulting state.
+    pub(crate) fn record_failure(
         &self,
         service: &str,
         robot: &str,
         revision: &RevisionRecord,
         ready_for: Option<Duration>,
         reason: &str,
-    ) -> Failing {
+    ) -> FailureStreak {
         let now = Instant::now().into_std();
         let mut failing = self.failing.lock();
         if failing.len() >= MANY {
@@ -67,24 +69,25 @@ impl BackOffs {
         next
     }
 
-    /// The robot's servants do not fail any more.
-    pub(crate) fn recovered(&self, service: &str, robot: &str) {
+    /// Clears the failures of the robot's servants.
+    pub(crate) fn clear(&self, service: &str, robot: &str) {
         let key = (service.to_owned(), robot.to_owned());
         self.failing.lock().remove(&key);
     }
 }
 
-/// Under which name a robot's failures are remembered. Those of a measurement (`~try-…`), which may look for where a servant
-/// fails, are no robot's.
-fn key(robot: &str, anonymous: bool) -> &str {
-    match anonymous && !robot.contains('-') {
-        true => NAMELESS,
-        false => robot,
+/// Returns the key of a robot's failures. A measurement (`~try-…`), which may look for the limits at which a servant
+/// fails, is no robot.
+fn back_off_key(robot: &str, anonymous: bool) -> &str {
+    if anonymous && !robot.contains('-') {
+        NAMELESS
+    } else {
+        robot
     }
 }
 
-impl Inner {
-    /// Refuses a servant that has failed again and again until its pause is over.
+impl ChoreographerInner {
+    /// Refuses a servant that has failed repeatedly until its pause is over.
     pub(crate) fn check_back_off(
         &self,
         revision: &RevisionRecord,
@@ -94,7 +97,7 @@ impl Inner {
         let service = &revision.service;
         let known = self
             .back_offs
-            .refusal(service, key(robot, anonymous), revision);
+            .find_refusal(service, back_off_key(robot, anonymous), revision);
         match known {
             None => Ok(()),
             Some((failing, again)) => Err(Error::BackOff {
@@ -107,44 +110,44 @@ impl Inner {
         }
     }
 
-    /// Takes in how a servant's life ended.
+    /// Records how a servant's life ended.
     pub(super) fn note_end(&self, handle: &Handle, outcome: &Result<String, Failure>) {
         let (service, revision) = (handle.service(), &handle.revision);
-        let robot = key(&handle.robot, handle.anonymous);
+        let robot = back_off_key(&handle.robot, handle.anonymous);
         let ready_for = handle.ready_for();
         let reason = match outcome {
-            // With so little memory it was measured, and robots are given more.
+            // It was measured with little memory, and robots are given more.
             Err(_) if handle.was_out_of_memory() && handle.gives_way() => return,
             Err(Failure::Broken { reason, .. }) => reason,
             Ok(_) if ready_for.is_some_and(|time| time >= RECOVERED) => {
-                return self.back_offs.recovered(service, robot);
+                return self.back_offs.clear(service, robot);
             }
             _ => return,
         };
         let failing = self
             .back_offs
-            .failed(service, robot, revision, ready_for, reason);
+            .record_failure(service, robot, revision, ready_for, reason);
         let now = Instant::now().into_std();
-        if let Some(left) = refusal(&failing, revision.number, now) {
+        if let Some(left) = remaining_pause(&failing, revision.number, now) {
             let message = format!(
-                "servants of {service} for {} have failed {} times in a row; the next is started in {} s at the earliest",
+                "servants of {service} for {} have failed {} times in a row; next start in {} s at the earliest",
                 handle.robot,
                 failing.failures,
                 seconds(left),
             );
-            let about = handle.about();
+            let about = handle.event_context();
             self.journal.warning("servant-back-off", &message, &about);
         }
     }
 
-    /// All whose pause is not over.
+    /// Returns all entries whose pause is not over.
     pub(crate) fn back_offs(&self) -> Vec<api::BackOff> {
         let now = Instant::now().into_std();
         let failing = self.back_offs.failing.lock();
         let mut all: Vec<api::BackOff> = failing
             .iter()
             .filter_map(|((service, robot), known)| {
-                let left = refusal(known, known.revision, now)?;
+                let left = remaining_pause(known, known.revision, now)?;
                 Some(api::BackOff {
                     service: service.clone(),
                     robot: robot.clone(),

@@ -1,4 +1,4 @@
-//! Measures a service at several limits: one servant, which serves no robot, is given the same requests at each.
+//! Calibrates a service: measures one servant without a robot at several limits, with the same requests at each.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,125 +8,126 @@ use api::Size;
 use api::calibration::{Calibration, CalibrationEvent, CalibrationOptions, Point, TimeSpread};
 use api::trial::Fed;
 use budget::Permit;
-use reach::{Gap, Material, Pace, Reach, Replay};
-use servant::engine::Servant;
+use reach::{Material, Reach, Replay, ReplayPace, RequestGap};
+use servant::engine::ServantHandle;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
 use crate::decide::Amount;
-use crate::decide::calibration::{self as decide, Next};
+use crate::decide::calibration::{self as decide, NextMeasurement};
 use crate::lives::driver::GAVE_WAY;
 use crate::lives::handle::Handle;
-use crate::{Choreographer, Error, Measured};
+use crate::{Choreographer, Error, MeasuredServant};
 
-/// Requests at each limit where nobody says how many.
+/// Default number of requests at each limit.
 const REQUESTS: usize = 40;
-/// How long one limit may take, and one answer.
+/// Maximum time for one limit, and for one answer.
 const WHOLE: Duration = Duration::from_secs(60);
 const ANSWER: Duration = Duration::from_secs(10);
-/// So many requests in vain, one after the other, are enough at a limit.
+/// Number of unanswered requests in a row after which a limit is given up.
 const IN_VAIN: usize = 3;
-/// Cores where the push and who measures name none: what was measured becomes a promise, and all cores of the machine promised to
-/// one robot would leave the others none.
+/// Default cores if neither the push nor the caller names any: the measured limit becomes a promise, and promising all
+/// cores to one robot would leave none for the others.
 const CORES: f64 = 1.0;
-/// Thousandths of a core below which no servant is limited.
+/// Minimum limit of a servant, in thousandths of a core.
 const LEAST: u64 = 10;
-/// How long the end of its servant is waited for.
+/// Time to wait for the end of the servant.
 const ENDS: Duration = Duration::from_secs(10);
-/// How often its memory is looked at.
+/// Interval between samples of its memory.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What its servant is named after, where a robot's name stands.
+/// Purpose in the name of the servant, in place of a robot's name.
 const PURPOSE: &str = "calibrate";
 
 impl Handle {
-    /// Whether what it is promised is given back where a robot needs it, as that of a push is.
+    /// Returns true if its capacity is given back when a robot needs it, like a push's.
     pub(crate) fn gives_way(&self) -> bool {
         let measured = self.robot.strip_prefix('~');
         let is_measured = measured.is_some_and(|name| name.starts_with(PURPOSE));
         self.is_candidate() || (self.anonymous && is_measured)
     }
 
-    /// A robot needed what it was promised.
-    fn gave_way(&self) -> bool {
+    /// Returns true if it was ended because a robot needed its capacity.
+    fn has_given_way(&self) -> bool {
         self.life().ended.as_deref() == Some(GAVE_WAY)
     }
 }
 
-/// What a service is measured with.
-pub struct Requests {
-    /// What is replayed.
+/// Requests for calibrating a service.
+pub struct CalibrationRequests {
+    /// Recorded material to replay.
     pub material: Material,
-    /// What the network and the stub of a robot added to each of its requests.
+    /// Time that the network and the robot's stub added to each request.
     pub network: Option<TimeSpread>,
-    /// Counts the material for whoever sent it.
+    /// Memory permit that accounts for the material.
     pub permit: Permit,
 }
 
 impl Choreographer {
-    /// Measures the current revision of a service at several limits and proposes rows of the dictionary; writes none. What
-    /// happens is told to `events` as it does, but not the end. The servant is ended however this future is dropped.
+    /// Measures the current revision of a service at several limits and proposes rows of the dictionary, without
+    /// writing them. Progress is reported to `events`, but not the end. The servant is ended even if this future is
+    /// dropped.
     pub async fn calibrate(
         &self,
         service: &str,
-        requests: Requests,
+        requests: CalibrationRequests,
         options: &CalibrationOptions,
         events: &mpsc::Sender<CalibrationEvent>,
     ) -> Result<Calibration, Error> {
-        let revision = self.inner.catalogue.current(service)?;
-        reach::fits(
-            (service, revision.flavour.ros.bus()),
+        let revision = self.inner.catalogue.current_revision(service)?;
+        reach::check_material(
+            (service, revision.flavour.ros.ros_version()),
             &revision.interface,
             &requests.material,
             options.input.as_deref(),
         )?;
-        // Set, not stated: what robots may ask for at most bounds no measurement.
+        // Set, not stated: caps on robots do not limit measurements.
         let set = api::Limits {
             memory: options.memory,
             ..api::Limits::default()
         };
-        // Whoever names limits hears of one that is never possible before anything is started.
+        // An impossible limit is reported before anything is started.
         if let Some(least) = options.cpus.iter().copied().min_by(f64::total_cmp) {
             self.check_limits(&api::Limits {
                 cpus: Some(least),
                 ..set
             })?;
         }
-        let measured = self.measured(service, PURPOSE, set)?;
+        let measured = self.start_measured(service, PURPOSE, set)?;
         let found = self
-            .measures(&measured, service, requests, options, events)
+            .run_calibration(&measured, service, requests, options, events)
             .await;
-        // What is measured next finds the room that this had.
+        // The next measurement finds the capacity that this one had.
         let handle = Arc::clone(measured.lease.handle());
         drop(measured);
-        let _ = timeout(ENDS, handle.ended()).await;
+        let _ = timeout(ENDS, handle.wait_ended()).await;
         found
     }
 
-    async fn measures(
+    async fn run_calibration(
         &self,
-        measured: &Measured,
+        measured: &MeasuredServant,
         service: &str,
-        requests: Requests,
+        requests: CalibrationRequests,
         options: &CalibrationOptions,
         events: &mpsc::Sender<CalibrationEvent>,
     ) -> Result<Calibration, Error> {
         let step = async |title: String| {
-            // Whoever asked has gone: then this is dropped soon.
+            // If the caller is gone, this future is dropped soon.
             let _ = events.send(CalibrationEvent::Step { title }).await;
         };
         let gave_way = |error| match measured.lease.handle() {
-            handle if handle.gave_way() => Error::Calibration(format!(
-                "measuring {service} was given up before it came to anything: {GAVE_WAY}; calibrate on a machine with more room, \
-                 or name smaller limits with --cpus"
+            handle if handle.has_given_way() => Error::Calibration(format!(
+                "the measurement of {service} was aborted without a result: {GAVE_WAY}; calibrate on a larger machine, \
+                    or pass smaller limits with --cpus"
             )),
             handle => out_of_memory(handle).unwrap_or(error),
         };
         step(format!("starting a servant of {service} to measure")).await;
-        measured.lease.admitted().await.map_err(gave_way)?;
-        let reach = measured.lease.ready().await.map_err(gave_way)?;
+        measured.lease.wait_admitted().await.map_err(gave_way)?;
+        let reach = measured.lease.wait_ready().await.map_err(gave_way)?;
         let ladder = self.limits_for(measured, options)?;
-        let mut measuring = Measuring {
+        let mut measuring = CalibrationRun {
             choreographer: self,
             measured,
             reach: &*reach,
@@ -143,15 +144,15 @@ impl Choreographer {
         };
         let named = options.own || !options.cpus.is_empty();
         loop {
-            let cpus = match decide::next(&ladder, named, &measuring.sum.points) {
-                Next::Measure(cpus) => cpus,
-                Next::Enough(why) => {
+            let cpus = match decide::next_measurement(&ladder, named, &measuring.sum.points) {
+                NextMeasurement::Measure(cpus) => cpus,
+                NextMeasurement::Enough(why) => {
                     measuring.sum.ended = why;
                     break;
                 }
             };
             step(format!("measuring with {cpus} cores")).await;
-            match measuring.at(cpus, &requests.material).await {
+            match measuring.measure_at(cpus, &requests.material).await {
                 Ok((point, mut times)) => {
                     if !options.times {
                         times.clear();
@@ -160,11 +161,11 @@ impl Choreographer {
                     let _ = events.send(event).await;
                 }
                 Err(error) if measuring.sum.points.is_empty() => return Err(gave_way(error)),
-                Err(_) if measured.lease.handle().gave_way() => {
+                Err(_) if measured.lease.handle().has_given_way() => {
                     measuring.sum.ended = format!("{GAVE_WAY}; calibrate again for more");
                     break;
                 }
-                // Room that others have taken meanwhile.
+                // Others have taken the capacity meanwhile.
                 Err(Error::Full(refused)) => {
                     measuring.sum.ended = refused.to_string();
                     break;
@@ -172,8 +173,8 @@ impl Choreographer {
                 Err(error) => return Err(error),
             }
         }
-        let calibration = measuring.proposed();
-        // Whoever asks the servant now sends as much again, and has no more memory than before.
+        let calibration = measuring.into_proposal();
+        // The caller may now send as much to the servant, and has no more memory than before.
         drop(requests);
         if let Some(seconds) = options.keep {
             let kept = CalibrationEvent::Kept {
@@ -181,20 +182,20 @@ impl Choreographer {
                 calibration: Box::new(calibration.clone()),
             };
             let _ = events.send(kept).await;
-            // Whoever asked ends it sooner, by which this is dropped.
-            let _ = timeout(Duration::from_secs_f64(seconds), measured.lease.over()).await;
+            // The caller may end it sooner, by dropping this future.
+            let _ = timeout(Duration::from_secs_f64(seconds), measured.lease.wait_over()).await;
         }
         Ok(calibration)
     }
 
-    /// At which limits it is measured: those that are named, else up to all that can be promised to it now.
+    /// Returns the limits to measure: the named ones, or up to all that can be promised now.
     fn limits_for(
         &self,
-        measured: &Measured,
+        measured: &MeasuredServant,
         options: &CalibrationOptions,
     ) -> Result<Vec<f64>, Error> {
         if options.own {
-            let asked = measured.lease.handle().asked().cpus;
+            let asked = measured.lease.handle().requested_limits().cpus;
             return Ok(vec![asked.unwrap_or(self.inner.options.cores.min(CORES))]);
         }
         if !options.cpus.is_empty() {
@@ -203,36 +204,43 @@ impl Choreographer {
             named.dedup();
             return Ok(named);
         }
-        let (capacity, promised, _) = self.admission().look();
-        let own = self.inner.promised(&measured.lease.handle().asked());
+        let (capacity, promised, _) = self.admission().snapshot();
+        let own = self
+            .inner
+            .promised_amount(&measured.lease.handle().requested_limits());
         let most = capacity.minus(promised.minus(own)).millicpus;
         if most < LEAST {
             let service = measured.lease.handle().service();
             return Err(Error::Calibration(format!(
-                "there is no room to measure {service}: {} cores are promised to nobody; end servants that are not \
-                 needed, or name the limits with --cpus",
+                "no capacity to measure {service}: {} cores are free; stop unneeded servants, or pass smaller limits \
+                    with --cpus",
                 most as f64 / 1000.0
             )));
         }
-        Ok(decide::ladder(most))
+        Ok(decide::limit_ladder(most))
     }
 }
 
-/// One calibration.
-struct Measuring<'a> {
+/// A calibration in progress.
+struct CalibrationRun<'a> {
     choreographer: &'a Choreographer,
-    measured: &'a Measured,
+    measured: &'a MeasuredServant,
     reach: &'a dyn Reach,
-    pace: Pace,
-    /// No limit was named: it is measured as well where this machine limits no cores.
+    pace: ReplayPace,
+    /// No limit was named: it is measured even if this machine does not limit cores.
     own: bool,
     aux: BTreeMap<String, String>,
     sum: Calibration,
 }
 
-impl Measuring<'_> {
-    /// Measures at one limit, and notes it; also the times of the requests that were answered, in milliseconds.
-    async fn at(&mut self, cpus: f64, material: &Material) -> Result<(Point, Vec<f64>), Error> {
+impl CalibrationRun<'_> {
+    /// Measures at one limit and records the point; returns it with the times of the answered requests, in
+    /// milliseconds.
+    async fn measure_at(
+        &mut self,
+        cpus: f64,
+        material: &Material,
+    ) -> Result<(Point, Vec<f64>), Error> {
         let handle = self.measured.lease.handle();
         let change = api::Limits {
             cpus: Some(cpus),
@@ -243,14 +251,14 @@ impl Measuring<'_> {
             .container()
             .ok_or(Error::Internal("measuring a servant"))?;
         let own = self.own;
-        let in_force = || match container.enforced().limits.cpus {
+        let in_force = || match container.enforced_limits().limits.cpus {
             Some(enforced) => Amount::new(enforced, 0) == Amount::new(cpus, 0),
             None => own,
         };
         if !in_force() {
             return Err(Error::Calibration(format!(
-                "this machine does not limit a servant to {cpus} cores, so that limits cannot be compared; \
-                 see what it lacks with: cloudroidctl doctor"
+                "this machine cannot limit a servant to {cpus} cores, so limits cannot be compared; see what is \
+                    missing with: cloudroidctl doctor"
             )));
         }
         let before = container.usage().await?;
@@ -258,30 +266,30 @@ impl Measuring<'_> {
         let interface = &handle.revision.interface;
         let replay = tokio::select! {
             biased;
-            error = self.measured.lease.over() => return Err(error),
+            error = self.measured.lease.wait_over() => return Err(error),
             replay = self.reach.replay(&self.sum.service, interface, material, &self.pace) => replay?,
-            never = watch(&*container, &mut memory) => match never {},
+            never = track_memory(&*container, &mut memory) => match never {},
         };
-        // A node that is started again by itself does not end its servant.
+        // A node that is restarted by itself does not end its servant.
         if let Some(error) = out_of_memory(handle) {
             return Err(error);
         }
         if !in_force() {
             return Err(Error::Calibration(format!(
-                "somebody has changed the limits of servant {} while it was measured; calibrate again",
+                "the limits of servant {} were changed during the measurement; calibrate again",
                 handle.id
             )));
         }
         let after = container.usage().await?;
         memory = memory.max(in_use(&after));
-        // The first request is not among the times, but costs as the others do.
+        // The first request is not among the times, but costs as much as the others.
         let made = (replay.times.len() + 1) as f64;
         let each = |before: u64, after: u64| after.saturating_sub(before) as f64 / 1000.0 / made;
         let point = Point {
             cpus,
             requests: replay.times.len(),
             answered: replay.times.iter().flatten().count(),
-            compute: TimeSpread::of(milliseconds(&replay)),
+            compute: TimeSpread::from_samples(milliseconds(&replay)),
             running: each(before.cpu_usec, after.cpu_usec),
             throttled: each(before.throttled_usec, after.throttled_usec),
             rate: replay.rate,
@@ -311,16 +319,16 @@ impl Measuring<'_> {
         }
     }
 
-    fn proposed(self) -> Calibration {
+    fn into_proposal(self) -> Calibration {
         let mut sum = self.sum;
         let memory = decide::with_margin(sum.memory_peak);
         let network = sum.network.unwrap_or_default();
-        sum.rows = decide::propose(&sum.points, sum.pace, network, memory, &self.aux);
+        sum.rows = decide::propose_rows(&sum.points, sum.pace, network, memory, &self.aux);
         sum
     }
 }
 
-/// What to say of a servant that was ended by the kernel for want of memory.
+/// Returns the error if the kernel has killed the servant for lack of memory.
 fn out_of_memory(handle: &Handle) -> Option<Error> {
     let memory = handle.limits().memory?;
     handle.was_out_of_memory().then(|| Error::OutOfMemory {
@@ -330,15 +338,17 @@ fn out_of_memory(handle: &Handle) -> Option<Error> {
     })
 }
 
-fn pace(options: &CalibrationOptions) -> Pace {
-    Pace {
+fn pace(options: &CalibrationOptions) -> ReplayPace {
+    ReplayPace {
         input: options.input.clone(),
         requests: options.requests.unwrap_or(REQUESTS),
         again: true,
         gap: match options.rate {
-            Some(rate) => Gap::Rate(rate),
-            None if options.fast || options.source == api::calibration::Source::Frames => Gap::None,
-            None => Gap::Recorded,
+            Some(rate) => RequestGap::Rate(rate),
+            None if options.fast || options.source == api::calibration::Source::Frames => {
+                RequestGap::None
+            }
+            None => RequestGap::Recorded,
         },
         answer: ANSWER,
         whole: WHOLE,
@@ -346,8 +356,8 @@ fn pace(options: &CalibrationOptions) -> Pace {
     }
 }
 
-/// What lies between a robot and the node: as given, else as the robot measured it.
-fn network(requests: &Requests, options: &CalibrationOptions) -> Option<TimeSpread> {
+/// Returns the time between a robot and the node: as given, or as measured by the robot.
+fn network(requests: &CalibrationRequests, options: &CalibrationOptions) -> Option<TimeSpread> {
     let given = options.network.map(|time| TimeSpread {
         p50: time,
         p95: time,
@@ -361,12 +371,12 @@ fn milliseconds(replay: &Replay) -> Vec<f64> {
     times.map(|time| time.as_secs_f64() * 1000.0).collect()
 }
 
-/// Notes the most memory that is in use, for as long as this is awaited.
-async fn watch(container: &dyn Servant, most: &mut u64) -> std::convert::Infallible {
+/// Tracks the peak of memory in use while awaited.
+async fn track_memory(container: &dyn ServantHandle, most: &mut u64) -> std::convert::Infallible {
     let mut looks = tokio::time::interval(LOOK);
     loop {
         looks.tick().await;
-        // One that has ended is noticed elsewhere.
+        // An ended servant is noticed elsewhere.
         if let Ok(usage) = container.usage().await {
             *most = in_use(&usage).max(*most);
         }

@@ -1,5 +1,5 @@
-//! Records what a robot sends to its servant, beside the nodes that it is meant for: by a node of its own in the servant's
-//! graph, which publishes nothing. The robot is answered as before, and by nobody else.
+//! Records what a robot sends to its servant, by an additional node in the servant's graph, which publishes nothing.
+//! The robot is answered as before.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -7,74 +7,75 @@ use std::time::{Duration, SystemTime};
 use api::Phase;
 use api::calibration::TimeSpread;
 use budget::{Budget, Permit};
-use link::control::Request;
+use link::control::RequestTiming;
 use package::interface::Direction;
 use reach::Material;
-use ros::bag::Recorded;
-use ros::bus::{Bus, Qos, Subscription, WireType};
+use ros::bag::BagMessage;
+use ros::bus::{Bus, QosProfile, Subscription, WireType};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, timeout_at};
 
-use super::calibration::Requests;
+use super::calibration::CalibrationRequests;
 use crate::{Choreographer, Error, Handle};
 
-/// The name of the recording node.
+/// Name of the recording node.
 const NODE: &str = "/cloudroid_recorder";
 const QUEUE: usize = 64;
 
-/// When a recording is long enough.
+/// Bounds of a recording.
 #[derive(Debug, Clone, Copy)]
-pub struct Bounds {
-    /// How long it records at most.
+pub struct CaptureBounds {
+    /// Maximum duration.
     pub time: Duration,
-    /// Most bytes that it records.
+    /// Maximum number of bytes.
     pub bytes: usize,
-    /// Most messages that it records.
+    /// Maximum number of messages.
     pub messages: usize,
 }
 
 impl Choreographer {
-    /// What `robot` sends to its servant of `service` now; the messages are held in `budget` for as long as they are there.
+    /// Records what `robot` sends to its servant of `service`; the messages count in `budget` as long as they exist.
     pub async fn capture(
         &self,
         service: &str,
         robot: &str,
-        bounds: Bounds,
+        bounds: CaptureBounds,
         budget: &Budget,
-    ) -> Result<Requests, Error> {
-        let handle = self.serving(service, robot)?;
+    ) -> Result<CalibrationRequests, Error> {
+        let handle = self.find_serving(service, robot)?;
         let container = handle
             .container()
             .ok_or_else(|| not_served(service, robot))?;
         let revision = &handle.revision;
         let opener = &self.inner.opener;
-        // It connects to no host outside.
+        // It connects to no external host.
         let look = opener
-            .look(&container, revision.flavour.ros.bus(), NODE, &[])
+            .observe(&container, revision.flavour.ros.ros_version(), NODE, &[])
             .await?;
         let mut recording = Recording::begin(&look.bus, &handle).await?;
         let mut permit = budget.permit();
-        let messages = recording.until(bounds, &mut permit).await;
+        let messages = recording.record_until(bounds, &mut permit).await;
         if messages.is_empty() {
             let seconds = bounds.time.as_secs_f64();
             return Err(Error::Calibration(format!(
-                "robot {robot} sent nothing to {service} within {seconds} s; begin when it sends, or take a recording (--bag)"
+                "robot {robot} sent nothing to {service} within {seconds} s; start while it sends, or use a recording \
+                    (--bag)"
             )));
         }
         let links = handle
             .reach()
             .map(|reach| reach.links())
             .unwrap_or_default();
-        Ok(Requests {
+        Ok(CalibrationRequests {
             material: Material::Bag(messages),
-            network: between(links.iter().flat_map(|link| &link.requests)),
+            network: network_times(links.iter().flat_map(|link| &link.requests)),
             permit,
         })
     }
 
-    /// The servant that works for a robot.
-    fn serving(&self, service: &str, robot: &str) -> Result<Arc<Handle>, Error> {
-        self.inner.catalogue.current(service)?;
+    /// Returns the ready servant of a robot.
+    fn find_serving(&self, service: &str, robot: &str) -> Result<Arc<Handle>, Error> {
+        self.inner.catalogue.current_revision(service)?;
         let of_it = |handle: &Arc<Handle>| {
             handle.service() == service
                 && handle.robot == robot
@@ -87,20 +88,20 @@ impl Choreographer {
 
 fn not_served(service: &str, robot: &str) -> Error {
     Error::Calibration(format!(
-        "robot {robot} does not use {service} now; see who does with: cloudroidctl servants"
+        "robot {robot} does not use {service} now; see which robots do with: cloudroidctl servants"
     ))
 }
 
-/// Serialising and the network, as the robot's stubs have measured them; none where it has no stub or was not answered yet. Queues
-/// are left out: how long they are depends on the limits.
-fn between<'a>(requests: impl Iterator<Item = &'a Request>) -> Option<TimeSpread> {
+/// Returns the time for serialising and the network, as measured by the robot's stubs; `None` without a stub or an
+/// answer. Queueing is excluded: it depends on the limits.
+fn network_times<'a>(requests: impl Iterator<Item = &'a RequestTiming>) -> Option<TimeSpread> {
     let answered = requests.filter(|request| request.total.is_some());
-    TimeSpread::of(answered.map(|it| it.serialise + it.up + it.down).collect())
+    TimeSpread::from_samples(answered.map(|it| it.serialise + it.up + it.down).collect())
 }
 
-/// All inputs, each heard by a task.
+/// Subscriptions to all inputs, one task each.
 struct Recording {
-    heard: mpsc::Receiver<Recorded>,
+    heard: mpsc::Receiver<BagMessage>,
     tasks: Vec<tokio::task::AbortHandle>,
 }
 
@@ -114,18 +115,22 @@ impl Recording {
         let topics = handle.revision.interface.topics.iter();
         for topic in topics.filter(|topic| topic.direction == Direction::Input) {
             let subscribed = bus
-                .subscribe(&topic.name, WireType::any(), Qos::keep_last(QUEUE))
+                .subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE))
                 .await;
             let subscription = subscribed.map_err(reach::Error::from)?;
             let name: Arc<str> = topic.name.as_str().into();
-            let task = tokio::spawn(hear(name, subscription, sender.clone()));
+            let task = tokio::spawn(record_topic(name, subscription, sender.clone()));
             recording.tasks.push(task.abort_handle());
         }
         Ok(recording)
     }
 
-    /// The messages from now on, until one of the bounds is reached or no more may be held.
-    async fn until(&mut self, bounds: Bounds, permit: &mut Permit) -> Vec<Recorded> {
+    /// Records messages until one of the bounds is reached or the memory budget is exhausted.
+    async fn record_until(
+        &mut self,
+        bounds: CaptureBounds,
+        permit: &mut Permit,
+    ) -> Vec<BagMessage> {
         let ends = Instant::now() + bounds.time;
         let (mut messages, mut bytes) = (Vec::new(), 0);
         while messages.len() < bounds.messages {
@@ -148,10 +153,14 @@ impl Drop for Recording {
     }
 }
 
-async fn hear(topic: Arc<str>, mut subscription: Subscription, heard: mpsc::Sender<Recorded>) {
+async fn record_topic(
+    topic: Arc<str>,
+    mut subscription: Subscription,
+    heard: mpsc::Sender<BagMessage>,
+) {
     while let Some(message) = subscription.messages.recv().await {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
-        let recorded = Recorded {
+        let recorded = BagMessage {
             topic: Arc::clone(&topic),
             wire_type: message.wire_type,
             time: now.map_or(0, |since| since.as_nanos() as u64),
@@ -169,23 +178,23 @@ mod tests {
 
     #[test]
     fn a_robots_network_is_what_is_neither_queue_nor_node() {
-        let request = |up, total| Request {
+        let request = |up, total| RequestTiming {
             total,
             serialise: 1.0,
             up,
             queue: 500.0,
             compute: 900.0,
             down: 2.0,
-            ..Request::default()
+            ..RequestTiming::default()
         };
-        // One that the cloud never answered tells nothing of the way down.
+        // An unanswered request says nothing about the way down.
         let requests = [
             request(4.0, Some(1407.0)),
             request(800.0, None),
             request(7.0, Some(1410.0)),
         ];
-        let network = between(requests.iter()).expect("two were answered");
+        let network = network_times(requests.iter()).expect("two were answered");
         assert_eq!((network.p50, network.p95), (7.0, 10.0));
-        assert_eq!(between([].iter()), None);
+        assert_eq!(network_times([].iter()), None);
     }
 }

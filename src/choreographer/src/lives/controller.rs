@@ -1,5 +1,5 @@
-//! Looks once a second at the machine and at the servants that work, and carries out what is decided: nobody is admitted while
-//! the machine stalls, and cores are moved to those who are near what their robots accept.
+//! Watches the machine and the running servants once per second, and carries out the decisions: admission stops while
+//! the machine stalls, and cores are moved to servants near what their robots accept.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,65 +8,67 @@ use std::time::Duration;
 
 use api::{Limits, Phase};
 use futures_util::future::join_all;
-use servant::engine::{Servant, Usage};
+use servant::engine::{ServantHandle, Usage};
 use servant::host;
 use store::NewEvent;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
-use super::Inner;
+use super::ChoreographerInner;
 use super::limits::PLAIN_WEIGHT;
 use super::visits::Visits;
-use crate::decide::controller::{Facts, Goal, History, Outcome, control};
-use crate::decide::stall::{Reading, Stall};
+use crate::decide::controller::{
+    ControlDecision, ControlFacts, ControlHistory, ResponseGoal, control,
+};
+use crate::decide::stall::{PressureReading, StallDetector};
 use crate::engine_limits;
 use crate::lives::handle::Handle;
 
-/// Between two looks.
+/// Interval between two rounds.
 const LOOK: Duration = Duration::from_secs(1);
-/// For one servant to tell what it uses, or to take other limits.
+/// Timeout for one servant to report its usage, or to apply limits.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// What stubs told is looked at once in so many looks.
+/// Number of rounds between checks of what stubs have reported.
 const LINKED: u64 = 10;
 
-/// What is remembered from one look to the next.
+/// State between two rounds.
 #[derive(Default)]
-struct Watch {
+struct ControllerWatch {
     looks: u64,
-    servants: HashMap<String, Seen>,
-    stall: Stall,
+    servants: HashMap<String, ControlRecord>,
+    stall: StallDetector,
     swapped_in: Option<(Instant, u64)>,
-    /// Servants whose cores are being moved.
+    /// Changes of servants' cores in progress.
     moves: Visits<()>,
 }
 
-/// What is remembered of a servant.
+/// State about one servant.
 #[derive(Default)]
-struct Seen {
-    history: History,
-    /// What it had used by then; none where nobody looked.
+struct ControlRecord {
+    history: ControlHistory,
+    /// Usage at the last sample; `None` without a sample.
     usage: Option<(Instant, Usage)>,
-    /// What its stubs told when their nodes were linked.
-    linked: Option<Goal>,
+    /// Response times reported by its stubs when their nodes were linked.
+    linked: Option<ResponseGoal>,
 }
 
-/// A servant that was looked at. Cores are in thousandths.
-struct Looked {
+/// A sampled servant. Cores are in thousandths.
+struct WorkingServant {
     handle: Arc<Handle>,
-    container: Arc<dyn Servant>,
+    container: Arc<dyn ServantHandle>,
     limits: Limits,
     asked: Limits,
-    /// As they are in force.
-    enforced: servant::spec::Limits,
+    /// The limits in force.
+    enforced: servant::spec::ResourceLimits,
     used: Option<u64>,
     throttled: f64,
     waited: f64,
-    goal: Option<Goal>,
-    history: History,
+    goal: Option<ResponseGoal>,
+    history: ControlHistory,
 }
 
-/// Looks, for ever.
-pub(crate) async fn watch(inner: Arc<Inner>) {
-    let mut watch = Watch::default();
+/// Runs the watch until the daemon ends.
+pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
+    let mut watch = ControllerWatch::default();
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
@@ -74,58 +76,58 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
         if inner.is_ending() {
             return;
         }
-        let reading = watch.read();
+        let reading = watch.read_pressure();
         inner.note_stall(watch.stall.judge(reading, Instant::now().into_std()));
-        let looked = watch.look(&inner).await;
+        let looked = watch.observe(&inner).await;
         if inner.options.controller {
             watch.control(&inner, looked);
         }
     }
 }
 
-impl Inner {
-    /// From now on nobody is admitted, for this reason, or those who fit are again.
+impl ChoreographerInner {
+    /// Stalls admission for this reason, or resumes it, and reports the change.
     pub(crate) fn note_stall(&self, why: Option<String>) {
         let words = why.clone();
-        if !self.admission.stall(why) {
+        if !self.admission.set_stall(why) {
             return;
         }
         let about = NewEvent::default();
         match words {
             Some(why) => {
-                let message = format!("{why}; no servant is admitted until that is over");
+                let message = format!("{why}; no servant is admitted until this is over");
                 self.journal.warning("machine-stalled", &message, &about);
             }
             None => {
-                let message = "this machine stalls no longer; servants are admitted again";
+                let message = "this machine no longer stalls; servants are admitted again";
                 self.journal.info("machine-recovered", message, &about);
             }
         }
     }
 }
 
-impl Watch {
-    fn read(&mut self) -> Reading {
+impl ControllerWatch {
+    fn read_pressure(&mut self) -> PressureReading {
         let now = Instant::now();
-        let swapped_in = host::swapped_in();
+        let swapped_in = host::swapped_in_bytes();
         let before = std::mem::replace(&mut self.swapped_in, swapped_in.map(|bytes| (now, bytes)));
         let rate = swapped_in.zip(before).map(|(bytes, (then, earlier))| {
             let seconds = now.saturating_duration_since(then).as_secs_f64();
             bytes.saturating_sub(earlier) as f64 / seconds.max(LOOK.as_secs_f64())
         });
-        Reading {
-            memory_full: host::memory_stalled(),
-            available: host::memory_available(),
+        PressureReading {
+            memory_full: host::memory_stall_percent(),
+            available: host::available_memory_percent(),
             swapped_in: rate.unwrap_or(0.0),
         }
     }
 
-    /// Servants that work; with what they used since the last look, if any of their robots has stated what it accepts.
-    async fn look(&mut self, inner: &Inner) -> Vec<Looked> {
+    /// Samples the running servants; also their usage, if any of their robots has stated what it accepts.
+    async fn observe(&mut self, inner: &ChoreographerInner) -> Vec<WorkingServant> {
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
         inner
             .recent
-            .keep(|id| handles.iter().any(|handle| handle.id == id));
+            .retain(|id| handles.iter().any(|handle| handle.id == id));
         let fresh = self.looks % LINKED == 0;
         self.looks += 1;
         let mut before = std::mem::take(&mut self.servants);
@@ -139,18 +141,24 @@ impl Watch {
             let fresh = fresh || known.is_none();
             let mut seen = known.unwrap_or_default();
             if fresh {
-                seen.linked = linked(&handle);
+                seen.linked = linked_goal(&handle);
             }
             working.push((handle, container, seen));
         }
         let goals: Vec<_> = working
             .iter()
-            .map(|(handle, _, seen)| goal(inner, handle).or(seen.linked))
+            .map(|(handle, _, seen)| response_goal(inner, handle).or(seen.linked))
             .collect();
-        // Looking costs something, too.
-        let usages = match goals.iter().any(Option::is_some) {
-            true => join_all(working.iter().map(|(_, container, _)| usage(container))).await,
-            false => working.iter().map(|_| None).collect(),
+        // Sampling has a cost.
+        let usages = if goals.iter().any(Option::is_some) {
+            join_all(
+                working
+                    .iter()
+                    .map(|(_, container, _)| read_usage(container)),
+            )
+            .await
+        } else {
+            working.iter().map(|_| None).collect()
         };
         let now = Instant::now();
         let mut all = Vec::new();
@@ -159,14 +167,14 @@ impl Watch {
         {
             let rates = usage.as_ref().zip(seen.usage.as_ref());
             let rates =
-                rates.and_then(|(usage, (then, before))| rates_of(before, usage, now - *then));
+                rates.and_then(|(usage, (then, before))| usage_rates(before, usage, now - *then));
             let pressure = usage.as_ref().and_then(|usage| usage.pressure);
             seen.usage = usage.map(|usage| (now, usage));
             let (used, throttled) = rates.unzip();
-            all.push(Looked {
+            all.push(WorkingServant {
                 limits: handle.limits(),
-                asked: handle.asked(),
-                enforced: container.enforced().limits,
+                asked: handle.requested_limits(),
+                enforced: container.enforced_limits().limits,
                 used,
                 throttled: throttled.unwrap_or_default(),
                 waited: pressure.map_or(0.0, |pressure| pressure.cpu / 100.0),
@@ -177,19 +185,19 @@ impl Watch {
             });
             self.servants.insert(handle.id.clone(), seen);
         }
-        // Decisions are the same for the same servants.
+        // Deterministic order, for the same decisions on the same servants.
         all.sort_unstable_by(|one, other| one.handle.id.cmp(&other.handle.id));
         all
     }
 
     /// Moves cores.
-    fn control(&mut self, inner: &Arc<Inner>, mut looked: Vec<Looked>) {
-        self.moves.take_over();
+    fn control(&mut self, inner: &Arc<ChoreographerInner>, mut looked: Vec<WorkingServant>) {
+        self.moves.take_finished();
         let cores = millicpus(inner.options.cores);
-        // What this host cannot limit is not moved.
+        // Cores that this host cannot limit are not moved.
         looked.retain(|one| one.enforced.cpus.is_some());
         let now = Instant::now().into_std();
-        let facts: Vec<Facts<'_>> = looked
+        let facts: Vec<ControlFacts<'_>> = looked
             .iter()
             .map(|one| one.facts(inner, cores, now))
             .collect();
@@ -208,13 +216,13 @@ impl Watch {
     }
 }
 
-/// What it has used so far; none where it does not say so in time.
-pub(super) async fn usage(container: &Arc<dyn Servant>) -> Option<Usage> {
+/// Returns its usage so far; `None` if it does not report it in time.
+pub(super) async fn read_usage(container: &Arc<dyn ServantHandle>) -> Option<Usage> {
     timeout(PATIENCE, container.usage()).await.ok()?.ok()
 }
 
-/// Thousandths of a core that were used meanwhile, and the part of the time throttled; none where no time has passed.
-pub(super) fn rates_of(before: &Usage, usage: &Usage, passed: Duration) -> Option<(u64, f64)> {
+/// Returns the cores used meanwhile, in thousandths, and the fraction of time throttled; `None` if no time has passed.
+pub(super) fn usage_rates(before: &Usage, usage: &Usage, passed: Duration) -> Option<(u64, f64)> {
     let seconds = passed.as_secs_f64();
     let of = |now: u64, before: u64| now.saturating_sub(before) as f64 / 1e6 / seconds;
     let used = of(usage.cpu_usec, before.cpu_usec) * 1000.0;
@@ -222,19 +230,24 @@ pub(super) fn rates_of(before: &Usage, usage: &Usage, passed: Duration) -> Optio
     (seconds > 0.0).then(|| (used.round() as u64, throttled.min(1.0)))
 }
 
-impl Looked {
-    fn facts(&self, inner: &Inner, cores: u64, now: std::time::Instant) -> Facts<'_> {
+impl WorkingServant {
+    fn facts(
+        &self,
+        inner: &ChoreographerInner,
+        cores: u64,
+        now: std::time::Instant,
+    ) -> ControlFacts<'_> {
         let limit = self.limits.cpus.map_or(cores, millicpus);
         let promised = self.asked.cpus.map_or(0, millicpus);
-        Facts {
+        ControlFacts {
             id: &self.handle.id,
             promised,
             limit,
             plain: self.limits.cpu_weight.unwrap_or(PLAIN_WEIGHT),
-            // Who was promised nothing has what the operator allows those.
+            // A servant without a promise has what the operator allows.
             ceiling: match promised {
                 0 => limit,
-                _ => inner.cap(&self.handle).min(cores).max(limit),
+                _ => inner.max_cores(&self.handle).min(cores).max(limit),
             },
             weighed: self.asked.cpu_weight.is_some(),
             quota: self.enforced.cpus.map_or(limit, millicpus),
@@ -243,19 +256,19 @@ impl Looked {
             throttled: self.throttled,
             waited: self.waited,
             goal: self.goal,
-            // What was asked before its cores were raised says nothing of what they do for it.
+            // Requests sent before its cores were raised say nothing about their effect.
             measured: inner
                 .recent
-                .since(&self.handle.id, self.history.raised(), now),
+                .p95_since(&self.handle.id, self.history.raised_at(), now),
             history: self.history,
         }
     }
 
-    async fn carry_out(&self, inner: &Inner, outcome: &Outcome) {
+    async fn carry_out(&self, inner: &ChoreographerInner, outcome: &ControlDecision) {
         let handle = &self.handle;
-        let _turn = handle.limits_turn().await;
-        // Somebody has changed what it is to have: it is looked at again.
-        if handle.asked() != self.asked || handle.is_ending() {
+        let _turn = handle.lock_limits().await;
+        // Its limits have been changed: it is evaluated again in the next round.
+        if handle.requested_limits() != self.asked || handle.is_ending() {
             return;
         }
         let limits = Limits {
@@ -275,15 +288,17 @@ impl Looked {
                     outcome.reason
                 );
                 let journal = &inner.journal;
-                journal.info("cores-moved", &message, &handle.about());
+                journal.info("cores-moved", &message, &handle.event_context());
             }
-            // One that ends just now is told of elsewhere.
-            Ok(Err(error)) => tracing::debug!("cores of servant {} stay: {error}", handle.id),
-            Err(_) => tracing::warn!("servant {} does not take other limits", handle.id),
+            // A servant that is ending is reported elsewhere.
+            Ok(Err(error)) => {
+                tracing::debug!("cannot change the cores of servant {}: {error}", handle.id)
+            }
+            Err(_) => tracing::warn!("servant {} does not accept other limits", handle.id),
         }
     }
 
-    fn in_words(&self, outcome: &Outcome) -> String {
+    fn in_words(&self, outcome: &ControlDecision) -> String {
         let cores = |millicpus: u64| millicpus as f64 / 1000.0;
         let quota = outcome.quota.map(|quota| {
             let was = self.enforced.cpus.unwrap_or_default();
@@ -301,8 +316,8 @@ impl Looked {
     }
 }
 
-/// What its robot accepts: the strictest of what was stated before it was admitted, else its class's.
-pub(crate) fn goal(inner: &Inner, handle: &Handle) -> Option<Goal> {
+/// Returns the response times that its robot accepts: the strictest of its statements, or its class's.
+pub(crate) fn response_goal(inner: &ChoreographerInner, handle: &Handle) -> Option<ResponseGoal> {
     let terms = handle.terms();
     let stated = terms.stated.values();
     let mut slas: Vec<api::Sla> = stated.clone().map(|stated| stated.sla).collect();
@@ -315,20 +330,20 @@ pub(crate) fn goal(inner: &Inner, handle: &Handle) -> Option<Goal> {
     }
     let seconds = |span: Option<api::Span>| span.map(api::Span::as_seconds);
     let times = slas.iter();
-    strictest(times.map(|sla| (seconds(sla.rrt), seconds(sla.max_rrt))))
+    strictest_goal(times.map(|sla| (seconds(sla.rrt), seconds(sla.max_rrt))))
 }
 
-/// What stubs of an earlier version say when their node is linked.
-fn linked(handle: &Handle) -> Option<Goal> {
+/// Returns the response times reported by stubs of an earlier version when their node was linked.
+fn linked_goal(handle: &Handle) -> Option<ResponseGoal> {
     let reach = handle.reach().filter(|_| handle.is_linked())?;
     let links = reach.links();
     let slas = links.iter().map(|link| &link.sla);
-    let slas = slas.filter(|sla| **sla != link::control::Sla::default());
-    strictest(slas.map(|sla| (sla.desire, sla.max)))
+    let slas = slas.filter(|sla| **sla != link::control::SlaTargets::default());
+    strictest_goal(slas.map(|sla| (sla.desire, sla.max)))
 }
 
-/// The strictest of T_desire and T_max, in seconds; none of no SLA.
-fn strictest(slas: impl Iterator<Item = (Option<f64>, Option<f64>)>) -> Option<Goal> {
+/// Returns the strictest of T_desire and T_max, given in seconds; `None` without an SLA.
+fn strictest_goal(slas: impl Iterator<Item = (Option<f64>, Option<f64>)>) -> Option<ResponseGoal> {
     let milliseconds = |seconds: Option<f64>| {
         let sane = seconds.filter(|seconds| seconds.is_finite() && *seconds > 0.0);
         sane.map(|seconds| seconds * 1000.0)
@@ -337,19 +352,19 @@ fn strictest(slas: impl Iterator<Item = (Option<f64>, Option<f64>)>) -> Option<G
         (Some(one), Some(other)) => Some(one.min(other)),
         (one, other) => one.or(other),
     };
-    slas.map(|(desire, max)| Goal {
+    slas.map(|(desire, max)| ResponseGoal {
         desire: milliseconds(desire),
         max: milliseconds(max),
     })
-    .reduce(|one, other| Goal {
+    .reduce(|one, other| ResponseGoal {
         desire: least(one.desire, other.desire),
         max: least(one.max, other.max),
     })
 }
 
-impl Inner {
-    /// The most cores that its robot may have, in thousandths: what its class and its service allow.
-    fn cap(&self, handle: &Handle) -> u64 {
+impl ChoreographerInner {
+    /// Returns the maximum number of cores for its robot, in thousandths, by its class and its service.
+    fn max_cores(&self, handle: &Handle) -> u64 {
         let terms = handle.terms();
         let class = terms
             .class

@@ -1,4 +1,4 @@
-//! The task of one servant: from asked for to gone. It alone changes the servant's state.
+//! The task of one servant, from its request to its end. It alone changes the servant's state.
 
 use std::convert::Infallible;
 use std::pin::pin;
@@ -7,36 +7,40 @@ use std::sync::{Arc, Weak};
 use api::Phase;
 use futures_util::FutureExt;
 use reach::Reach;
-use servant::engine::{ContainerState, Servant};
+use servant::engine::{ContainerState, ServantHandle};
 use tokio::time::Instant;
 
-use super::lifetime::{interface_there, unneeded};
-use super::nodes::Nodes;
+use super::lifetime::{wait_for_interface, wait_unneeded};
+use super::nodes::NodeSupervisor;
 use super::waiting::Permit;
-use super::warm_pool::{self, Warm};
-use super::{Inner, group, limits, starting};
-use crate::decide::admission::Ask;
+use super::warm_pool::{self, WarmServant};
+use super::{ChoreographerInner, group, limits, starting};
+use crate::decide::admission::AdmissionRequest;
 use crate::lives::handle::{Failure, Handle};
-use crate::with_last_words;
+use crate::with_last_log_line;
 
-/// Lines of the log that explain a failure.
+/// Number of log lines attached to a failure.
 const LOG_LINES: usize = 20;
 
-/// Why a servant that gives way to robots was ended for one.
-pub(crate) const GAVE_WAY: &str = "a robot needs its room";
+/// Reason for ending a servant whose capacity a robot needs.
+pub(crate) const GAVE_WAY: &str = "a robot needs this capacity";
 
-/// How a servant begins.
-pub(crate) enum Beginning {
-    /// A robot asked for it; it may have been made but for its nodes.
-    Asked(Option<Warm>),
-    /// An earlier daemon started it.
-    Adopted(Arc<dyn Servant>, Option<Permit>),
+/// Origin of a servant.
+pub(crate) enum ServantSource {
+    /// Requested by a robot; possibly from a warm container.
+    Asked(Option<WarmServant>),
+    /// Started by an earlier daemon.
+    Adopted(Arc<dyn ServantHandle>, Option<Permit>),
 }
 
-/// Runs the servant's life to its end and cleans up after it.
-pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning: Beginning) {
+/// Runs the servant's life to its end and cleans up.
+pub(crate) async fn drive(
+    inner: Arc<ChoreographerInner>,
+    handle: Arc<Handle>,
+    mut beginning: ServantSource,
+) {
     let mut permit = None;
-    let outcome = live(&inner, &handle, &mut beginning, &mut permit).await;
+    let outcome = run_life(&inner, &handle, &mut beginning, &mut permit).await;
     inner.retire(&handle);
     inner.note_end(&handle, &outcome);
     inner.rollouts.note_gone(&handle);
@@ -56,20 +60,20 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     if let Some(container) = handle.container()
         && let Err(error) = container.stop().await
     {
-        let message = format!("servant {} could not be cleaned up: {error}", handle.id);
+        let message = format!("cannot clean up servant {}: {error}", handle.id);
         inner
             .journal
-            .error("servant-leftover", &message, &handle.about());
+            .error("servant-leftover", &message, &handle.event_context());
     }
     inner.state.remove_servant(&handle.id);
     drop(permit);
     inner.forget(&handle);
-    // Whoever is first in the queue now may need more than that.
+    // The request that is first in the queue now may need more than that.
     inner.make_room();
-    if let Beginning::Asked(Some(warm)) = beginning {
+    if let ServantSource::Asked(Some(warm)) = beginning {
         warm_pool::give_back(&inner, warm).await;
     }
-    inner.warm_pool.look();
+    inner.warm_pool.wake();
     handle.set_phase(if outcome.is_ok() {
         Phase::Stopped
     } else {
@@ -77,15 +81,19 @@ pub(crate) async fn drive(inner: Arc<Inner>, handle: Arc<Handle>, mut beginning:
     });
 }
 
-/// Writes why the servant ended into the journal; gives the words for its robots.
-fn report_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>) -> String {
+/// Writes the reason of the servant's end to the journal; returns the message for its robots.
+fn report_end(
+    inner: &ChoreographerInner,
+    handle: &Handle,
+    outcome: &Result<String, Failure>,
+) -> String {
     let who = format!(
         "servant {} of {} for {}",
         handle.id,
         handle.service(),
         handle.robot
     );
-    let (journal, about) = (&inner.journal, handle.about());
+    let (journal, about) = (&inner.journal, handle.event_context());
     match outcome {
         Ok(reason) => {
             journal.info(
@@ -104,35 +112,35 @@ fn report_end(inner: &Inner, handle: &Handle, outcome: &Result<String, Failure>)
             refused.to_string()
         }
         Err(Failure::Broken { reason, log }) => {
-            let reason = with_last_words(reason, log);
+            let reason = with_last_log_line(reason, log);
             journal.error("servant-failed", &format!("{who} {reason}"), &about);
             format!("the servant {reason}")
         }
     }
 }
 
-/// From asked for to why it ended as it should, or why it failed.
-async fn live(
-    inner: &Arc<Inner>,
+/// Runs the life of a servant; returns the reason of its regular end, or its failure.
+async fn run_life(
+    inner: &Arc<ChoreographerInner>,
     handle: &Arc<Handle>,
-    beginning: &mut Beginning,
+    beginning: &mut ServantSource,
     kept: &mut Option<Permit>,
 ) -> Result<String, Failure> {
     if let Some(rules) = handle.revision.plan.shared.filter(|_| handle.is_place()) {
-        return group::sit(inner, handle, rules).await;
+        return group::run_place(inner, handle, rules).await;
     }
     let (container, reach, fresh) = match beginning {
-        Beginning::Asked(warm) => {
+        ServantSource::Asked(warm) => {
             let ahead = warm.as_mut().and_then(|warm| warm.permit.take());
             let permit = tokio::select! {
                 permit = admit(inner, handle, ahead) => permit?,
-                reason = handle.end_asked() => return Ok(reason),
-                reason = unneeded(inner, handle, true) => return Ok(reason),
+                reason = handle.wait_end_requested() => return Ok(reason),
+                reason = wait_unneeded(inner, handle, true) => return Ok(reason),
             };
             handle.set_promise(permit.promise());
             *kept = Some(permit);
             handle.set_phase(Phase::Admitted);
-            if let Some(reason) = unneeded(inner, handle, true).now_or_never() {
+            if let Some(reason) = wait_unneeded(inner, handle, true).now_or_never() {
                 return Ok(reason);
             }
             starting::record(inner, handle)?;
@@ -142,7 +150,7 @@ async fn live(
                 None => (starting::start(inner, handle).await?, None, true),
             }
         }
-        Beginning::Adopted(container, permit) => {
+        ServantSource::Adopted(container, permit) => {
             if let Some(permit) = permit.as_ref() {
                 handle.set_promise(permit.promise());
             }
@@ -153,38 +161,38 @@ async fn live(
     handle.set_container(Arc::clone(&container));
     handle.set_phase(Phase::Created);
     if !fresh {
-        limits::take_back(inner, handle, &*container).await;
+        limits::restore_cores(inner, handle, &*container).await;
     }
     starting::report_unmet(inner, handle, &container);
     let permit = kept.as_ref();
-    let mut nodes = Nodes::new(inner, handle, &container);
+    let mut nodes = NodeSupervisor::new(inner, handle, &container);
     let mut supervised = pin!(run(inner, handle, &container, reach, &mut nodes, fresh));
     tokio::select! {
-        // A node's end says more than that of its container, and comes first where both come at once.
+        // A node's exit says more than that of its container, and takes precedence.
         biased;
         outcome = &mut supervised => outcome.map(|never| match never {}),
-        reason = handle.end_asked() => Ok(reason),
-        failure = container_over(&container) => Err(failure),
-        reason = unneeded(inner, handle, fresh) => Ok(reason),
-        () = is_needed(permit) => Ok(GAVE_WAY.to_owned()),
+        reason = handle.wait_end_requested() => Ok(reason),
+        failure = wait_container_over(&container) => Err(failure),
+        reason = wait_unneeded(inner, handle, fresh) => Ok(reason),
+        () = wait_needed(permit) => Ok(GAVE_WAY.to_owned()),
     }
 }
 
-/// Comes back when a robot needs what was promised to a servant that gives way.
-async fn is_needed(permit: Option<&Permit>) {
+/// Waits until a robot needs the capacity of a servant that gives way.
+async fn wait_needed(permit: Option<&Permit>) {
     match permit {
-        Some(permit) => permit.is_needed().await,
+        Some(permit) => permit.wait_needed().await,
         None => std::future::pending().await,
     }
 }
 
-/// Reaches the servant's ROS, waits for its interface, and then until it fails.
+/// Connects to the servant's ROS, waits for its interface, and then until it fails.
 async fn run(
-    inner: &Arc<Inner>,
+    inner: &Arc<ChoreographerInner>,
     handle: &Arc<Handle>,
-    container: &Arc<dyn Servant>,
+    container: &Arc<dyn ServantHandle>,
     reached: Option<Arc<dyn Reach>>,
-    nodes: &mut Nodes<'_>,
+    nodes: &mut NodeSupervisor<'_>,
     fresh: bool,
 ) -> Result<Infallible, Failure> {
     let deadline = Instant::now() + inner.options.start;
@@ -193,11 +201,11 @@ async fn run(
         None => starting::reach(inner, handle, container, deadline).await?,
     };
     let tenant: Weak<Handle> = Arc::downgrade(handle);
-    reach.bind(tenant);
+    reach.bind_tenant(tenant);
     handle.set_reach(Arc::clone(&reach));
     handle.set_phase(Phase::Starting);
     tokio::select! {
-        ready = interface_there(inner, handle, &*reach, deadline, fresh), if !handle.is_linked() => ready?,
+        ready = wait_for_interface(inner, handle, &*reach, deadline, fresh), if !handle.is_linked() => ready?,
         () = std::future::ready(()), if handle.is_linked() => {}
         failure = nodes.supervise() => return Err(failure),
     }
@@ -205,7 +213,7 @@ async fn run(
     if fresh && !handle.is_candidate() {
         inner.rollouts.note_servant(handle, false);
     }
-    inner.warm_pool.look();
+    inner.warm_pool.wake();
     let took = store::now().saturating_sub(handle.created);
     let message = if fresh {
         format!(
@@ -222,7 +230,7 @@ async fn run(
             handle.robot
         )
     };
-    let about = handle.about();
+    let about = handle.event_context();
     inner.journal.info(
         if fresh {
             "servant-ready"
@@ -235,40 +243,41 @@ async fn run(
     Err(nodes.supervise().await)
 }
 
-/// `ahead` was promised to the servant before it had a robot: then that is what the robot is promised.
+/// Waits for admission. `ahead` is a promise from before the servant had a robot, which then applies to the robot.
 async fn admit(
-    inner: &Arc<Inner>,
+    inner: &Arc<ChoreographerInner>,
     handle: &Handle,
     ahead: Option<Permit>,
 ) -> Result<Permit, Failure> {
     let deadline = inner.options.deadline;
-    let wanted = inner.promised(&handle.asked());
-    // One that gives way has to be known as such.
+    let wanted = inner.promised_amount(&handle.requested_limits());
+    // A servant that gives way must be registered as such.
     if let Some(permit) = ahead.filter(|_| !handle.gives_way())
         && permit.promise().change(wanted).is_ok()
     {
         return Ok(permit);
     }
-    let ask = match handle.gives_way() {
-        true => Ask::push(wanted),
-        false => Ask::robot(wanted, handle.priority()),
+    let ask = if handle.gives_way() {
+        AdmissionRequest::push(wanted)
+    } else {
+        AdmissionRequest::robot(wanted, handle.priority())
     };
     let make_room = || inner.make_room();
     let admission = &inner.admission;
-    // A robot that named no name is nobody's when it comes back.
+    // A robot without a name cannot be recognised when it comes back.
     let who = format!("{} {}", handle.service(), handle.robot);
     let who = (!handle.anonymous).then_some(&*who);
-    let admitted = admission.admit_as(who, ask, deadline, handle.stands(), make_room);
+    let admitted = admission.admit_as(who, ask, deadline, handle.standing_sender(), make_room);
     admitted.await.map_err(Failure::Full)
 }
 
-/// Comes back when the container has ended, which nobody asked for.
-async fn container_over(container: &Arc<dyn Servant>) -> Failure {
+/// Waits until the container has ended unexpectedly.
+async fn wait_container_over(container: &Arc<dyn ServantHandle>) -> Failure {
     let mut states = container.state();
     match states.wait_for(ContainerState::is_over).await.as_deref() {
-        Ok(ContainerState::Stopped { reason }) => Failure::broken(format!("ended: {reason}")),
-        Ok(ContainerState::Failed { reason }) => Failure::broken(format!("failed: {reason}")),
-        _ => Failure::broken("was lost by the engine"),
+        Ok(ContainerState::Stopped { reason }) => Failure::from_reason(format!("ended: {reason}")),
+        Ok(ContainerState::Failed { reason }) => Failure::from_reason(format!("failed: {reason}")),
+        _ => Failure::from_reason("was lost by the container engine"),
     }
 }
 

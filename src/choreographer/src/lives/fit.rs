@@ -1,4 +1,4 @@
-//! Whether one more servant would fit: collects the facts for [`decide::fit`](crate::decide::fit).
+//! Predicts whether one more servant would fit: collects the facts for [`decide::fit`](crate::decide::fit).
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -7,47 +7,49 @@ use api::Measure;
 use futures_util::future::join_all;
 use tokio::time::Instant;
 
-use super::controller::{goal, rates_of, usage};
+use super::controller::{read_usage, response_goal, usage_rates};
 use super::warm_facts;
 use crate::decide::Amount;
-use crate::decide::controller::{Goal, Measured};
+use crate::decide::controller::{MeasuredTimes, ResponseGoal};
 use crate::decide::fit::{Fit, Neighbour, fit};
 use crate::{Choreographer, Error};
 
-/// How long is looked at what others use.
+/// Duration of sampling the usage of others.
 const LOOKS: Duration = Duration::from_millis(300);
 
 impl Choreographer {
-    /// How one more servant of a service, for a robot that states this, would fit beside those that live now.
+    /// Predicts how one more servant of a service, for a robot with this statement, would fit beside the live ones.
     pub async fn fit(&self, service: &str, stated: api::Stated) -> Result<api::Fit, Error> {
         let inner = &self.inner;
-        let revision = inner.catalogue.current(service)?;
-        let stated = match stated.is_empty() {
-            true => BTreeMap::new(),
-            false => [(String::new(), stated)].into(),
+        let revision = inner.catalogue.current_revision(service)?;
+        let stated = if stated.is_empty() {
+            BTreeMap::new()
+        } else {
+            [(String::new(), stated)].into()
         };
         let terms = inner.terms(&stated, &revision)?;
         let priority = terms.priority;
         let expected = terms.rows.iter().find(|row| row.measure == Measure::Rrt);
         let expected = expected.map(|row| api::Expected {
             rrt: row.value,
-            from: format!("row {} of the dictionary", row.id),
+            from: format!("entry {} of the SLA table", row.id),
         });
         let shared = revision.plan.shared.is_some();
-        // A group's servants are no robot's.
-        let asked = match shared {
-            true => inner.of_push(&revision),
-            false => inner.asked(terms),
+        // A group's servants belong to no robot.
+        let asked = if shared {
+            inner.push_limits(&revision)
+        } else {
+            inner.limit_sources(terms)
         };
-        let uses = self.uses().await;
-        let warm = inner.warm_pool.promised(inner);
+        let uses = self.measure_uses().await;
+        let warm = inner.warm_pool.promised_servants(inner);
         let servants = inner.servants.lock();
         let now = Instant::now().into_std();
         let of_robots = servants.all.values().filter(|handle| !handle.is_place());
         let neighbours = of_robots.clone().map(|handle| Neighbour {
             servant: inner.facts(handle),
             uses: uses.get(&handle.id).copied().unwrap_or_default(),
-            measured: inner.recent.of(&handle.id, now),
+            measured: inner.recent.p95(&handle.id, now),
         });
         let ahead = warm_facts(&warm).map(|servant| Neighbour {
             servant,
@@ -58,13 +60,13 @@ impl Choreographer {
         let of_service = of_robots.filter(|handle| handle.service() == service);
         let group = of_service.clone().filter(|handle| !handle.is_ending());
         let group = shared.then(|| group.count() as u64);
-        let measured = of_service.filter_map(|handle| inner.recent.of(&handle.id, now));
-        let expected = expected.or_else(|| as_others(service, measured));
-        let book = inner.admission.book();
+        let measured = of_service.filter_map(|handle| inner.recent.p95(&handle.id, now));
+        let expected = expected.or_else(|| expected_from_others(service, measured));
+        let book = inner.admission.ledger();
         let wanted = match group {
-            // One more robot is one more of theirs.
+            // One more robot shares the existing servants.
             Some(1..) => Amount::NONE,
-            _ => inner.promised(&asked.promised()),
+            _ => inner.promised_amount(&asked.promised_limits()),
         };
         let cores = (inner.options.cores * 1000.0).round() as u64;
         let fit = match group {
@@ -72,7 +74,10 @@ impl Choreographer {
             _ => fit((wanted, priority), &book, cores, &others),
         };
         let cores = |millicpus: u64| millicpus as f64 / 1000.0;
-        let (waiting, free) = (book.waiting(), book.capacity().minus(book.promised()));
+        let (waiting, free) = (
+            book.waiting_count(),
+            book.capacity().minus(book.promised_total()),
+        );
         let costs = fit.costs.into_iter().filter_map(|cost| {
             let handle = servants.all.get(&cost.id)?;
             let seconds = |milliseconds: f64| milliseconds / 1000.0;
@@ -84,7 +89,9 @@ impl Choreographer {
                 left: cores(cost.left),
                 rrt: cost.times.map(|(now, _)| seconds(now)),
                 later: cost.times.map(|(_, then)| seconds(then)),
-                accepts: goal(inner, handle).and_then(Goal::bound).map(seconds),
+                accepts: response_goal(inner, handle)
+                    .and_then(ResponseGoal::upper_bound)
+                    .map(seconds),
             })
         });
         Ok(api::Fit {
@@ -93,9 +100,9 @@ impl Choreographer {
             free_cpus: free.cpus(),
             free_memory: api::Size(free.memory),
             waiting,
-            stalled: book.stalled().map(str::to_owned),
+            stalled: book.stall_reason().map(str::to_owned),
             never: book.check(wanted).err().map(|refused| refused.to_string()),
-            full: book.full().filter(|_| !fit.now).is_some(),
+            full: book.full_queue_len().filter(|_| !fit.now).is_some(),
             now: fit.now,
             ends: fit.ends,
             lacking_cpus: fit.lacking.cpus(),
@@ -109,17 +116,17 @@ impl Choreographer {
         })
     }
 
-    /// Thousandths of a core that each servant uses now, by id.
-    async fn uses(&self) -> HashMap<String, u64> {
+    /// Samples the cores that each servant uses now, in thousandths, by id.
+    async fn measure_uses(&self) -> HashMap<String, u64> {
         let all = self.servants().into_iter();
         let looking = all.filter_map(|handle| {
             let container = handle.container()?;
             Some(async move {
-                let before = usage(&container).await?;
+                let before = read_usage(&container).await?;
                 let began = Instant::now();
                 tokio::time::sleep(LOOKS).await;
-                let after = usage(&container).await?;
-                let (used, _) = rates_of(&before, &after, began.elapsed())?;
+                let after = read_usage(&container).await?;
+                let (used, _) = usage_rates(&before, &after, began.elapsed())?;
                 Some((handle.id.clone(), used))
             })
         });
@@ -127,8 +134,11 @@ impl Choreographer {
     }
 }
 
-/// What robots of the same service wait for their answers now: the median of them.
-fn as_others(service: &str, measured: impl Iterator<Item = Measured>) -> Option<api::Expected> {
+/// Returns the expected response time: the median over robots of the same service.
+fn expected_from_others(
+    service: &str,
+    measured: impl Iterator<Item = MeasuredTimes>,
+) -> Option<api::Expected> {
     let mut totals: Vec<f64> = measured.map(|measured| measured.total).collect();
     totals.sort_unstable_by(f64::total_cmp);
     let median = totals.get(totals.len() / 2)?;
@@ -138,6 +148,6 @@ fn as_others(service: &str, measured: impl Iterator<Item = Measured>) -> Option<
     };
     Some(api::Expected {
         rrt: median / 1000.0,
-        from: format!("what {robots} of {service} measured lately"),
+        from: format!("recent measurements of {robots} of {service}"),
     })
 }

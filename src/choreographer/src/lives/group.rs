@@ -1,6 +1,7 @@
-//! Services that robots share. Each robot has a servant of its own in name only: a place in the group ([`places`]), which ends as a
-//! servant does when its robot stays away. The group's servants are ordinary ones whose robot is the group; its task ([`keep`])
-//! starts and ends them as [`group`](crate::decide::group) decides, and lives while there is a place.
+//! Services that robots share. Each robot has a servant in name only: a place in the group ([`places`]), which ends
+//! like a servant when its robot stays away. The group's servants are ordinary ones whose robot is the group; its task
+//! ([`run_group`]) starts and ends them as [`group`](crate::decide::group) decides, and lives as long as there is a
+//! place.
 //!
 //! ```text
 //!  robot ─▶ Handle (place) ─▶ seat ─┐                        ┌─▶ Lease ─▶ Handle `~group-1-1` ─▶ container
@@ -17,86 +18,88 @@ use std::time::Duration;
 
 use api::{GroupServant, Shared};
 use parking_lot::Mutex;
-use reach::group::Group;
+use reach::group::ServantGroup;
 use reach::group::dispatch::Rules;
 use store::RevisionRecord;
 use tokio::sync::{Notify, watch};
 use tokio::time::Instant;
 
-use super::Inner;
+use super::ChoreographerInner;
 use crate::Choreographer;
-use crate::decide::group::{Facts, Since, Step, look};
+use crate::decide::group::{GroupAction, GroupFacts, LoadSince, decide_group};
 use crate::lives::handle::{Failure, Handle};
 
 use members::SharedServant;
-use places::Place;
+use places::GroupPlace;
 
-pub(super) use places::sit;
-pub(crate) use places::{is_of_no_robot, is_place};
+pub(super) use places::run_place;
+pub(crate) use places::{is_internal_robot, is_place};
 
-/// A group's load is looked at so often.
+/// Interval between evaluations of a group's load.
 const LOOKS: Duration = Duration::from_millis(250);
-/// Why the servants of a group end that has no robot.
+/// Reason for ending the servants of a group without robots.
 const UNUSED: &str = "no robot uses the service";
 
 /// All groups, by service and revision.
 #[derive(Default)]
 pub(crate) struct Groups {
-    all: Mutex<HashMap<(String, u64), Arc<Shares>>>,
+    all: Mutex<HashMap<(String, u64), Arc<SharedGroup>>>,
 }
 
-/// A group, and what its robots wait for.
-struct Shares {
-    group: Arc<Group>,
+/// A group of servants, and the state its robots wait for.
+struct SharedGroup {
+    group: Arc<ServantGroup>,
     revision: Arc<RevisionRecord>,
     rules: Shared,
-    state: watch::Sender<Stage>,
+    state: watch::Sender<GroupStage>,
     seats: watch::Sender<usize>,
     servants: Mutex<Vec<SharedServant>>,
-    /// Something has happened to a servant.
+    /// The state of a servant has changed.
     look: Notify,
 }
 
-/// How far a group is.
+/// Stage of a group.
 #[derive(Debug, Clone)]
-enum Stage {
+enum GroupStage {
     /// None of its servants has capacity.
     Queued,
-    /// SharedServant has.
+    /// A servant has capacity.
     Admitted,
-    /// SharedServant answers.
+    /// A servant answers.
     Ready,
-    /// None answers, or ever will.
+    /// No servant answers, or ever will.
     Over(Failure),
 }
 
 impl Groups {
-    fn enter(&self, inner: &Arc<Inner>, handle: &Handle, rules: Shared) -> Place {
+    fn join(&self, inner: &Arc<ChoreographerInner>, handle: &Handle, rules: Shared) -> GroupPlace {
         let revision = &handle.revision;
         let mut all = self.all.lock();
         let key = (revision.service.clone(), revision.number);
         let known = all.get(&key).cloned();
-        let over = |shares: &Arc<Shares>| matches!(*shares.state.borrow(), Stage::Over(_));
+        let over =
+            |shares: &Arc<SharedGroup>| matches!(*shares.state.borrow(), GroupStage::Over(_));
         let shares = match known.filter(|known| !over(known)) {
             Some(known) => known,
             None => {
-                let shares = Arc::new(Shares::new(revision, rules));
+                let shares = Arc::new(SharedGroup::new(revision, rules));
                 all.insert(key, Arc::clone(&shares));
-                tokio::spawn(keep(Arc::clone(inner), Arc::clone(&shares)));
+                tokio::spawn(run_group(Arc::clone(inner), Arc::clone(&shares)));
                 shares
             }
         };
-        Place::new(shares)
+        GroupPlace::new(shares)
     }
 
-    /// Forgets a group that nobody uses, or that is over; whether that was so.
-    fn leave(&self, shares: &Arc<Shares>) -> bool {
+    /// Removes a group that is unused or over; returns true if so.
+    fn remove_if_unused(&self, shares: &Arc<SharedGroup>) -> bool {
         let mut all = self.all.lock();
-        let over = matches!(*shares.state.borrow(), Stage::Over(_));
+        let over = matches!(*shares.state.borrow(), GroupStage::Over(_));
         if !over && *shares.seats.borrow() > 0 {
             return false;
         }
-        // Under the lock: a robot that comes now begins a group, which must not find these and lose them.
+        // Under the lock: a robot that comes now creates a new group, which must not take these servants over and lose
+        // them.
         for one in shares.servants.lock().iter() {
             one.lease.handle().end(UNUSED);
         }
@@ -111,24 +114,24 @@ impl Groups {
     }
 }
 
-impl Shares {
-    fn new(revision: &Arc<RevisionRecord>, shared: Shared) -> Shares {
+impl SharedGroup {
+    fn new(revision: &Arc<RevisionRecord>, shared: Shared) -> SharedGroup {
         let rules = Rules {
             window: shared.calls as usize,
             replicas: shared.replicas as usize,
             idempotent: shared.idempotent,
         };
         let flavour = &revision.flavour;
-        Shares {
-            group: Group::new(
-                flavour.ros.bus(),
+        SharedGroup {
+            group: ServantGroup::new(
+                flavour.ros.ros_version(),
                 &flavour.distribution,
                 &revision.interface,
                 rules,
             ),
             revision: Arc::clone(revision),
             rules: shared,
-            state: watch::Sender::new(Stage::Queued),
+            state: watch::Sender::new(GroupStage::Queued),
             seats: watch::Sender::new(0),
             servants: Mutex::default(),
             look: Notify::new(),
@@ -141,7 +144,9 @@ impl Shares {
             id: one.lease.handle().id.clone(),
             ready: one.member.is_some(),
             retiring: one.retiring,
-            under_way: one.member.map_or(0, |member| self.group.load_of(member)),
+            under_way: one
+                .member
+                .map_or(0, |member| self.group.member_load(member)),
         });
         let counts = self.group.counts();
         api::Group {
@@ -153,13 +158,15 @@ impl Shares {
             failed: counts.failed.load(Ordering::Relaxed),
             asked_again: counts.asked_again.load(Ordering::Relaxed),
             wasted: counts.wasted.load(Ordering::Relaxed),
-            mean_ms: counts.mean().map(|mean| mean.as_secs_f64() * 1000.0),
+            mean_ms: counts
+                .mean_response_time()
+                .map(|mean| mean.as_secs_f64() * 1000.0),
         }
     }
 }
 
 impl Choreographer {
-    /// What robots share of a service: its groups, the newest revision first.
+    /// Returns the groups of a service, newest revision first.
     pub fn groups(&self, service: &str) -> Vec<api::Group> {
         let all = self.inner.groups.all.lock();
         let of = all
@@ -173,34 +180,36 @@ impl Choreographer {
 }
 
 /// Starts and ends the servants of a group, until no robot has a place in it or none of them answers.
-async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
+async fn run_group(inner: Arc<ChoreographerInner>, shares: Arc<SharedGroup>) {
     let mut seats = shares.seats.subscribe();
-    let (mut since, mut failed) = (Since::default(), None);
+    let (mut since, mut failed) = (LoadSince::default(), None);
     let over = loop {
         if let Some(failure) = members::observe(&inner, &shares) {
             failed = Some(Instant::now());
-            // A robot is told at once; it comes again, and so does the group.
+            // The robot is told at once; it comes again, and a new group starts.
             if shares.servants.lock().is_empty() {
                 break Some(failure);
             }
         }
-        if *seats.borrow_and_update() == 0 && inner.groups.leave(&shares) {
+        if *seats.borrow_and_update() == 0 && inner.groups.remove_if_unused(&shares) {
             break None;
         }
-        places::give_up_places(&inner, &shares);
-        let facts = facts(&inner, &shares, failed);
-        let (step, next) = look(&facts, since, Instant::now().into_std());
+        places::end_excess_places(&inner, &shares);
+        let facts = group_facts(&inner, &shares, failed);
+        let (step, next) = decide_group(&facts, since, Instant::now().into_std());
         since = next;
         let acts = step.is_some();
         match step {
-            Some(Step::Start(reason)) => {
-                let begun = members::begin(&inner, &shares, &reason);
+            Some(GroupAction::Start(reason)) => {
+                let begun = members::start_servant(&inner, &shares, &reason);
                 if !begun {
-                    break Some(Failure::broken("was not started: the daemon is ending"));
+                    break Some(Failure::from_reason(
+                        "was not started: the daemon is ending",
+                    ));
                 }
             }
-            Some(Step::TakeBack(reason)) => members::take_back(&inner, &shares, &reason),
-            Some(Step::Retire(reason)) => members::retire(&inner, &shares, &reason),
+            Some(GroupAction::TakeBack(reason)) => members::take_back(&inner, &shares, &reason),
+            Some(GroupAction::Retire(reason)) => members::retire(&inner, &shares, &reason),
             None => {}
         }
         if !acts {
@@ -212,8 +221,8 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
         }
     };
     if let Some(failure) = over {
-        shares.state.send_replace(Stage::Over(failure));
-        inner.groups.leave(&shares);
+        shares.state.send_replace(GroupStage::Over(failure));
+        inner.groups.remove_if_unused(&shares);
     }
     for one in std::mem::take(&mut *shares.servants.lock()) {
         if let Some(member) = one.member {
@@ -222,18 +231,22 @@ async fn keep(inner: Arc<Inner>, shares: Arc<Shares>) {
     }
 }
 
-fn facts(inner: &Inner, shares: &Shares, failed: Option<Instant>) -> Facts {
-    let desired = places::desired(inner, shares);
+fn group_facts(
+    inner: &ChoreographerInner,
+    shares: &SharedGroup,
+    failed: Option<Instant>,
+) -> GroupFacts {
+    let desired = places::shortest_desired_time(inner, shares);
     let servants = shares.servants.lock();
     let count =
         |which: &dyn Fn(&SharedServant) -> bool| servants.iter().filter(|one| which(one)).count();
-    Facts {
+    GroupFacts {
         bounds: (shares.rules.min as usize, shares.rules.max as usize),
         ready: count(&|one| one.member.is_some() && !one.retiring),
         starting: count(&|one| one.member.is_none() && !one.retiring),
         retiring: count(&|one| one.retiring),
         requests: shares.group.mean_load(),
-        time: shares.group.counts().mean().zip(desired),
+        time: shares.group.counts().mean_response_time().zip(desired),
         failed: failed.map(Instant::into_std),
         calm: inner.options.grace,
     }

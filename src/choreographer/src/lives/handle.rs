@@ -1,4 +1,4 @@
-//! A servant as everybody but its driver sees it.
+//! A servant as seen by everyone but its driver.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -13,19 +13,19 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::Error;
-use crate::decide::admission::Refused;
-use crate::decide::demand::Asked;
-use crate::lives::waiting::{Promise, Standing};
+use crate::decide::admission::AdmissionError;
+use crate::decide::demand::LimitSources;
+use crate::lives::waiting::{Promise, QueueStanding};
 use store::{NewEvent, RevisionRecord};
 
-/// Why a servant failed.
+/// Reason for a servant's failure.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Failure {
-    /// There was no room for it.
-    Full(Refused),
-    /// Anything else.
+    /// There was no capacity for it.
+    Full(AdmissionError),
+    /// Another reason.
     Broken {
-        /// What happened, beginning with a verb.
+        /// The failure, as a phrase that starts with a verb.
         reason: String,
         /// Last lines of its log.
         log: Vec<String>,
@@ -33,8 +33,8 @@ pub enum Failure {
 }
 
 impl Failure {
-    /// Without a log.
-    pub fn broken(reason: impl Into<String>) -> Failure {
+    /// Creates a failure without a log.
+    pub fn from_reason(reason: impl Into<String>) -> Failure {
         Failure::Broken {
             reason: reason.into(),
             log: Vec::new(),
@@ -42,19 +42,19 @@ impl Failure {
     }
 }
 
-/// Where a servant is in its life.
+/// Lifecycle state of a servant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Life {
-    /// The state.
+    /// Current phase.
     pub phase: Phase,
     /// Set as soon as it has failed, while it is still being cleaned up.
     pub failure: Option<Failure>,
-    /// Why it was ended, when that was asked for.
+    /// Reason why it was ended, if that was requested.
     pub ended: Option<String>,
 }
 
 impl Life {
-    /// Why it is ending or has ended.
+    /// Returns the reason why it is ending or has ended.
     pub fn reason(&self) -> Option<String> {
         match &self.failure {
             Some(Failure::Full(refused)) => Some(refused.to_string()),
@@ -68,60 +68,60 @@ impl Life {
     }
 }
 
-/// One of the clients of a robot, or several that are not told apart.
-struct User {
+/// A client of a robot, or several that are not told apart.
+struct ClientConnections {
     connections: usize,
-    /// Since when there are so many.
+    /// Time of the last change of the number of connections.
     since: Instant,
 }
 
-/// A servant.
+/// Handle of a servant.
 pub struct Handle {
-    /// Its id.
+    /// Id of the servant.
     pub id: String,
-    /// Its robot.
+    /// Name of the robot.
     pub robot: String,
-    /// The robot named no name; nobody can come back to this servant.
+    /// The robot gave no name and cannot come back to this servant.
     pub anonymous: bool,
-    /// What it is started from.
+    /// Revision that it is started from.
     pub revision: Arc<RevisionRecord>,
-    /// When it was asked for.
+    /// Time of the request.
     pub created: Millis,
-    stands: watch::Sender<Option<Standing>>,
+    stands: watch::Sender<Option<QueueStanding>>,
     life: watch::Sender<Life>,
-    asked: Mutex<Asked>,
+    asked: Mutex<LimitSources>,
     limits_turn: tokio::sync::Mutex<()>,
     promise: OnceLock<Promise>,
     ready_since: OnceLock<Instant>,
     connections: watch::Sender<usize>,
-    /// Whose they are: of a stub its node, of rosbridge clients nothing.
-    users: Mutex<HashMap<String, User>>,
-    /// Who has stated something and was not connected since then has left.
+    /// Connections by client: the node of a stub, or an empty name for rosbridge clients.
+    users: Mutex<HashMap<String, ClientConnections>>,
+    /// A client with a statement but no connection since then has left.
     began: Instant,
     /// 0: not idle.
     idle_until: AtomicU64,
-    /// Its nodes are started and ended by a robot's stubs.
+    /// A robot's stubs start and end its nodes.
     linked: AtomicBool,
-    /// The kernel has ended one of its nodes for want of memory.
+    /// The kernel has killed one of its nodes for lack of memory.
     out_of_memory: AtomicBool,
     down: Mutex<Vec<api::NodeDown>>,
-    /// What of its nodes hangs, in words, by who uses them.
+    /// Hung nodes, in words, by the client that uses them.
     hung: Mutex<BTreeMap<String, String>>,
-    /// How often its nodes were started, as far as that was seen.
+    /// Number of observed starts by node.
     starts: Mutex<HashMap<String, u64>>,
     end: CancellationToken,
     end_reason: OnceLock<String>,
-    container: OnceLock<Arc<dyn servant::engine::Servant>>,
+    container: OnceLock<Arc<dyn servant::engine::ServantHandle>>,
     reach: Mutex<Option<Arc<dyn Reach>>>,
 }
 
 impl Handle {
-    /// A servant that has been asked for.
+    /// Creates the handle of a requested servant.
     pub(crate) fn new(
         id: String,
         robot: String,
         anonymous: bool,
-        asked: Asked,
+        asked: LimitSources,
         revision: Arc<RevisionRecord>,
         created: Millis,
     ) -> Handle {
@@ -157,65 +157,65 @@ impl Handle {
         }
     }
 
-    /// The kernel has ended one of its nodes for want of memory.
+    /// Records that the kernel has killed one of its nodes for lack of memory.
     pub(crate) fn note_out_of_memory(&self) {
         self.out_of_memory.store(true, Ordering::Relaxed);
     }
 
-    /// Whether the kernel has ended one of its nodes for want of memory.
+    /// Returns true if the kernel has killed one of its nodes for lack of memory.
     pub(crate) fn was_out_of_memory(&self) -> bool {
         self.out_of_memory.load(Ordering::Relaxed)
     }
 
-    /// Its service.
+    /// Returns the name of the service.
     pub fn service(&self) -> &str {
         &self.revision.service
     }
 
-    /// The limits that it is to have.
+    /// Returns the limits that it is to have.
     pub fn limits(&self) -> Limits {
         self.asked.lock().limits()
     }
 
-    /// Those of them that somebody asked for, which are promised to it.
-    pub fn asked(&self) -> Limits {
-        self.asked.lock().promised()
+    /// Returns the requested limits, which are promised to it.
+    pub fn requested_limits(&self) -> Limits {
+        self.asked.lock().promised_limits()
     }
 
-    /// Those that would be promised to it after this change, with no weight but one that somebody set.
-    pub fn asked_after(&self, change: Limits) -> Limits {
+    /// Returns the limits that would be promised after this change, with no weight but an explicitly set one.
+    pub fn requested_limits_after(&self, change: Limits) -> Limits {
         let asked = self.asked.lock();
         Limits {
             cpu_weight: change.cpu_weight.or(asked.set.cpu_weight),
-            ..change.or(asked.promised())
+            ..change.or(asked.promised_limits())
         }
     }
 
-    /// What its robot stated, and what follows.
+    /// Returns the terms: its robot's statements and the consequences.
     pub fn terms(&self) -> Terms {
         self.asked.lock().terms.clone()
     }
 
-    /// Who has the greater one is served first.
+    /// Returns the priority of its robot; greater ones are served first.
     pub fn priority(&self) -> i32 {
         self.asked.lock().terms.priority
     }
 
-    /// All limits that somebody asked for, by who did.
-    pub(crate) fn all_asked(&self) -> Asked {
+    /// Returns all requested limits by source.
+    pub(crate) fn limit_sources(&self) -> LimitSources {
         self.asked.lock().clone()
     }
 
-    pub(crate) fn set_asked(&self, asked: Asked) {
+    pub(crate) fn set_limit_sources(&self, asked: LimitSources) {
         *self.asked.lock() = asked;
     }
 
-    /// Whoever changes its limits holds this.
-    pub(crate) async fn limits_turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
+    /// Locks the limits for a change.
+    pub(crate) async fn lock_limits(&self) -> tokio::sync::MutexGuard<'_, ()> {
         self.limits_turn.lock().await
     }
 
-    /// What it is promised, once it was admitted.
+    /// Returns its promise, once it was admitted.
     pub(crate) fn promise(&self) -> Option<&Promise> {
         self.promise.get()
     }
@@ -224,18 +224,18 @@ impl Handle {
         let _ = self.promise.set(promise);
     }
 
-    /// Where it stands among those that wait to be admitted, now and later; none where it does not wait.
-    pub fn watch_standing(&self) -> watch::Receiver<Option<Standing>> {
+    /// Watches its position in the admission queue; `None` while it does not wait.
+    pub fn watch_standing(&self) -> watch::Receiver<Option<QueueStanding>> {
         self.stands.subscribe()
     }
 
-    /// Where that is told.
-    pub(crate) fn stands(&self) -> watch::Sender<Option<Standing>> {
+    /// Returns the sender of its position in the queue.
+    pub(crate) fn standing_sender(&self) -> watch::Sender<Option<QueueStanding>> {
         self.stands.clone()
     }
 
-    /// What its events are about.
-    pub fn about(&self) -> NewEvent<'_> {
+    /// Returns the context of its events.
+    pub fn event_context(&self) -> NewEvent<'_> {
         NewEvent {
             service: Some(self.service()),
             servant: Some(&self.id),
@@ -243,37 +243,37 @@ impl Handle {
         }
     }
 
-    /// The present state of its life.
+    /// Returns the current lifecycle state.
     pub fn life(&self) -> Life {
         self.life.borrow().clone()
     }
 
-    /// The state of its life, and each change.
+    /// Watches the lifecycle state.
     pub fn watch(&self) -> watch::Receiver<Life> {
         self.life.subscribe()
     }
 
-    /// Connections that use it now.
+    /// Returns the current number of connections.
     pub fn connections(&self) -> usize {
         *self.connections.borrow()
     }
 
-    /// Whether a robot's stubs start and end its nodes.
+    /// Returns true if a robot's stubs start and end its nodes.
     pub fn is_linked(&self) -> bool {
         self.linked.load(Ordering::Relaxed)
     }
 
-    /// From now on they do; whether they did not before.
+    /// Marks its nodes as managed by stubs; returns true if they were not before.
     pub fn set_linked(&self) -> bool {
         !self.linked.swap(true, Ordering::Relaxed)
     }
 
-    /// Its container, once made.
-    pub fn container(&self) -> Option<Arc<dyn servant::engine::Servant>> {
+    /// Returns its container, once made.
+    pub fn container(&self) -> Option<Arc<dyn servant::engine::ServantHandle>> {
         self.container.get().cloned()
     }
 
-    /// Refuses a robot's place in a group, which never has a container.
+    /// Returns an error for a robot's place in a group, which never has a container.
     pub fn check_container(&self) -> Result<(), Error> {
         if !self.is_place() {
             return Ok(());
@@ -285,22 +285,22 @@ impl Handle {
         })
     }
 
-    /// Its ROS and its bridge, once reached.
+    /// Returns access to its ROS and its bridge, once reached.
     pub fn reach(&self) -> Option<Arc<dyn Reach>> {
         self.reach.lock().clone()
     }
 
-    /// When it is ended if nobody connects before.
+    /// Returns the time at which it is ended unless a client connects before.
     pub fn idle_until(&self) -> Option<Millis> {
         Some(self.idle_until.load(Ordering::Relaxed)).filter(|until| *until > 0)
     }
 
-    /// Its nodes that failed and are not started again yet.
-    pub fn down(&self) -> Vec<api::NodeDown> {
+    /// Returns its failed nodes that are not restarted yet.
+    pub fn nodes_down(&self) -> Vec<api::NodeDown> {
         self.down.lock().clone()
     }
 
-    /// Of `node`: until when it is down, with its failures in a row; none: it is not any more.
+    /// Sets the failures in a row of `node` and the time until its restart; `None` if it is not down any more.
     pub(crate) fn set_down(&self, node: &str, until: Option<(u32, Duration)>) {
         let mut down = self.down.lock();
         down.retain(|one| one.node != node);
@@ -311,17 +311,17 @@ impl Handle {
         }));
     }
 
-    /// Its nodes that hang: which, and what they leave unanswered.
-    pub fn hung(&self) -> Vec<String> {
+    /// Returns its hung nodes, with what they leave unanswered.
+    pub fn hung_nodes(&self) -> Vec<String> {
         self.hung.lock().values().cloned().collect()
     }
 
-    /// That is all of them, by who uses them.
+    /// Replaces the hung nodes, by the client that uses them.
     pub(crate) fn set_hung(&self, hung: BTreeMap<String, String>) {
         *self.hung.lock() = hung;
     }
 
-    /// How often the node was started, as far as that was seen; without a name: all of them.
+    /// Returns the number of observed starts of the node; of all nodes for an empty name.
     pub(crate) fn starts(&self, node: &str) -> u64 {
         let starts = self.starts.lock();
         match node {
@@ -334,32 +334,32 @@ impl Handle {
         *self.starts.lock().entry(node.to_owned()).or_default() += 1;
     }
 
-    /// Asks for its end. The first reason stays.
+    /// Requests its end. The first reason is kept.
     pub fn end(&self, reason: &str) {
         let _ = self.end_reason.set(reason.to_owned());
         self.end.cancel();
     }
 
-    /// Whether its end has been asked for.
+    /// Returns true if its end has been requested.
     pub fn is_ending(&self) -> bool {
         self.end.is_cancelled()
     }
 
-    /// Comes back when its end is asked for, with the reason.
-    pub(crate) async fn end_asked(&self) -> String {
+    /// Waits until its end is requested; returns the reason.
+    pub(crate) async fn wait_end_requested(&self) -> String {
         self.end.cancelled().await;
         self.end_reason.get().cloned().unwrap_or_default()
     }
 
-    /// Comes back when nothing is left of it.
-    pub async fn ended(&self) {
+    /// Waits until nothing is left of it.
+    pub async fn wait_ended(&self) {
         let mut life = self.watch();
         let _ = life
             .wait_for(|life| matches!(life.phase, Phase::Stopped | Phase::Failed))
             .await;
     }
 
-    /// How long it has been ready, if it ever was.
+    /// Returns how long it has been ready, if it ever was.
     pub(crate) fn ready_for(&self) -> Option<Duration> {
         self.ready_since.get().map(Instant::elapsed)
     }
@@ -381,7 +381,7 @@ impl Handle {
         });
     }
 
-    pub(crate) fn set_container(&self, container: Arc<dyn servant::engine::Servant>) {
+    pub(crate) fn set_container(&self, container: Arc<dyn servant::engine::ServantHandle>) {
         let _ = self.container.set(container);
     }
 
@@ -389,7 +389,7 @@ impl Handle {
         *self.reach.lock() = Some(reach);
     }
 
-    /// Nobody reaches its ROS from here on; gives what was there.
+    /// Withdraws access to its ROS; returns the previous access.
     pub(crate) fn take_reach(&self) -> Option<Arc<dyn Reach>> {
         self.reach.lock().take()
     }
@@ -398,10 +398,10 @@ impl Handle {
         self.idle_until.store(until.unwrap_or(0), Ordering::Relaxed);
     }
 
-    /// Counts one more connection of this client of the robot.
-    pub(crate) fn enters(&self, who: &str) {
+    /// Adds a connection of this client of the robot.
+    pub(crate) fn add_connection(&self, who: &str) {
         let mut users = self.users.lock();
-        let user = users.entry(who.to_owned()).or_insert(User {
+        let user = users.entry(who.to_owned()).or_insert(ClientConnections {
             connections: 0,
             since: Instant::now(),
         });
@@ -409,22 +409,22 @@ impl Handle {
         self.connections.send_modify(|count| *count += 1);
     }
 
-    /// Counts one connection of this client less.
-    pub(crate) fn leaves(&self, who: &str) {
+    /// Removes a connection of this client.
+    pub(crate) fn remove_connection(&self, who: &str) {
         let mut users = self.users.lock();
         if let Some(user) = users.get_mut(who) {
             user.connections -= 1;
             user.since = Instant::now();
         }
         let asked = self.asked.lock();
-        // How long the others are away says nothing.
+        // For the others, the time away does not matter.
         users.retain(|who, user| user.connections > 0 || asked.terms.stated.contains_key(who));
         drop(asked);
         self.connections.send_modify(|count| *count -= 1);
     }
 
-    /// Who has stated something and has been away for so long.
-    pub(crate) fn away_for(&self, time: Duration) -> Vec<String> {
+    /// Returns the clients with a statement that have been away for this time.
+    pub(crate) fn clients_away_for(&self, time: Duration) -> Vec<String> {
         let users = self.users.lock();
         let asked = self.asked.lock();
         let is_away = |who: &&String| match users.get(*who) {
@@ -435,12 +435,12 @@ impl Handle {
         stated.filter(is_away).cloned().collect()
     }
 
-    /// The number of connections now and later.
+    /// Watches the number of connections.
     pub(crate) fn watch_connections(&self) -> watch::Receiver<usize> {
         self.connections.subscribe()
     }
 
-    /// Why a servant whose life is over cannot be used.
+    /// Returns the error of using a servant whose life is over.
     pub(crate) fn error(&self, life: &Life) -> Error {
         match &life.failure {
             Some(Failure::Full(refused)) => Error::Full(refused.clone()),

@@ -1,4 +1,4 @@
-//! Looks for nodes that hang, tells of them, and starts them again where the operator wants that.
+//! Watches for hung nodes, reports them, and restarts them if configured.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -7,25 +7,25 @@ use std::time::Duration;
 use api::{Phase, Sla, Stated, Terms};
 use tokio::time::Instant;
 
-use super::Inner;
+use super::ChoreographerInner;
 use super::visits::Visits;
-use crate::decide::hung::{Flow, Hung, Watched, look};
+use crate::decide::hung::{Flow, FlowWatch, HungNodes, observe_flow};
 use crate::lives::handle::Handle;
-use crate::options::{self, Class};
+use crate::options::{self, ClassOptions};
 
-/// Between two looks.
+/// Interval between two rounds.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Looks, for ever.
-pub(crate) async fn keep(inner: Arc<Inner>) {
-    if inner.options.hung == options::Hung::Ignore {
+/// Runs the watch forever.
+pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
+    if inner.options.hung == options::HungPolicy::Ignore {
         return;
     }
-    let mut watched: HashMap<(String, String), (Watched, String)> = HashMap::new();
+    let mut watched: HashMap<(String, String), (FlowWatch, String)> = HashMap::new();
     let mut kills = Visits::default();
     loop {
         tokio::time::sleep(LOOK).await;
-        kills.take_over();
+        kills.take_finished();
         let servants: Vec<Arc<Handle>> = {
             let servants = inner.servants.lock();
             servants.all.values().cloned().collect()
@@ -36,8 +36,8 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                 continue;
             }
             let terms = handle.terms();
-            let by_class = by_class(&terms, &inner.options.classes);
-            // Without a time there is nothing to measure by.
+            let by_class = class_sla(&terms, &inner.options.classes);
+            // Without a T_max there is no criterion.
             let accepted = |who: &str| {
                 let own = terms.stated.get(who).map(|stated| stated.sla);
                 let sla = own.filter(|sla| !sla.is_empty()).or(by_class)?;
@@ -57,9 +57,9 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                     starts: handle.starts(&key.1),
                 };
                 let (before, mut words) = watched.remove(&key).unzip();
-                let (after, hung) = look(before, seen, patience, Instant::now().into_std());
+                let (after, hung) = observe_flow(before, seen, patience, Instant::now().into_std());
                 if let Some(hung) = hung {
-                    let tidings = act(&inner, &handle, &key.1, hung);
+                    let tidings = handle_hung(&inner, &handle, &key.1, hung);
                     if let Some(killed) = tidings.kills {
                         // Several nodes of a servant may hang at once.
                         let visit = format!("{} {}", handle.id, key.1);
@@ -68,7 +68,7 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
                     words = Some(tidings.words);
                 }
                 let words = words.unwrap_or_default();
-                if after.hangs() {
+                if after.is_reported_hung() {
                     hanging.insert(key.1.clone(), words.clone());
                 }
                 next.insert(key, (after, words));
@@ -79,30 +79,35 @@ pub(crate) async fn keep(inner: Arc<Inner>) {
     }
 }
 
-/// The SLA of a robot that states neither one nor resources.
-fn by_class(terms: &Terms, classes: &BTreeMap<String, Class>) -> Option<Sla> {
+/// Returns the class's SLA, for a robot that states neither an SLA nor resources.
+fn class_sla(terms: &Terms, classes: &BTreeMap<String, ClassOptions>) -> Option<Sla> {
     let says = |one: &Stated| !one.sla.is_empty() || one.cpus.is_some() || one.memory.is_some();
     let class = classes.get(terms.class.as_ref()?)?;
     (!terms.stated.values().any(says)).then_some(class.sla)
 }
 
-/// Nodes hang.
-struct Tidings {
-    /// What hangs.
+/// Consequence of a detected hang.
+struct HungAction {
+    /// Description of what hangs.
     words: String,
-    /// The node that is to be killed for it.
+    /// The node to kill, if any.
     kills: Option<String>,
 }
 
-/// Tells that nodes hang. `node`: that of a stub; nothing: those that rosbridge clients use.
-fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> Tidings {
+/// Reports hung nodes. `node`: the node of a stub; empty for those used by rosbridge clients.
+fn handle_hung(
+    inner: &ChoreographerInner,
+    handle: &Handle,
+    node: &str,
+    hung: HungNodes,
+) -> HungAction {
     let own = &handle.revision.plan.nodes;
     let nodes: Vec<&str> = match node {
         "" => own.iter().map(|node| &*node.name).collect(),
         node => vec![node],
     };
-    let restarts = inner.options.hung == options::Hung::Restart;
-    // A stub's node is its robot's, which starts it again or not.
+    let restarts = inner.options.hung == options::HungPolicy::Restart;
+    // The stub's robot decides whether its node is restarted.
     let again = |name: &str| {
         let known = own.iter().find(|node| node.name == name);
         !node.is_empty() || handle.revision.plan.restart || known.is_some_and(|it| it.respawn)
@@ -110,13 +115,13 @@ fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> Tidings {
     let kills = restarts && matches!(&*nodes, [one] if again(one));
     let next = match &*nodes {
         _ if !restarts => {
-            "look at its log, or let such nodes be started again: hung = \"restart\" in [servant]"
+            "see its log, or have hung nodes restarted: hung = \"restart\" in [servant]"
         }
-        [_] if kills => "it is killed, and started again as after any failure",
+        [_] if kills => "it is killed and restarted as after a failure",
         [_] => {
-            "it is not killed, since its launch file says nothing of respawn and it would stay away"
+            "it is not killed, because its launch file does not set respawn and it would not be restarted"
         }
-        _ => "which of them hangs is not known, and none is started again",
+        _ => "it is unknown which of them hangs, so none is restarted",
     };
     let what = format!(
         "{} answered none of {} inputs in {:.1} s",
@@ -127,12 +132,12 @@ fn act(inner: &Inner, handle: &Handle, node: &str, hung: Hung) -> Tidings {
     let message = format!("servant {}: {what}; {next}", handle.id);
     inner
         .journal
-        .warning("node-hung", &message, &handle.about());
+        .warning("node-hung", &message, &handle.event_context());
     if let Some(reach) = handle.reach() {
-        reach.report(node, &format!("servant {}: {what}", handle.id));
+        reach.warn_flow(node, &format!("servant {}: {what}", handle.id));
     }
     let killed = nodes.first().filter(|_| kills);
-    Tidings {
+    HungAction {
         kills: killed.map(|node| (*node).to_owned()),
         words: what,
     }

@@ -1,4 +1,4 @@
-//! Leases: the right to use a servant. While a servant has one it is not idle.
+//! Leases: the right to use a servant. A servant with a lease is not idle.
 
 use std::sync::Arc;
 
@@ -6,79 +6,79 @@ use api::{Phase, Stated};
 use reach::Reach;
 
 use crate::Error;
-use crate::lives::Inner;
+use crate::lives::ChoreographerInner;
 use crate::lives::handle::{Handle, Life};
 
-/// The right to use a servant; while one lives the servant is not idle.
+/// The right to use a servant; a servant with a lease is not idle.
 pub struct Lease {
     handle: Arc<Handle>,
     who: String,
-    /// Terms that are to be agreed upon before it is used: those of a servant that was there.
-    anew: Option<Anew>,
+    /// Statement to be applied before an existing servant is used.
+    anew: Option<NewStatement>,
 }
 
-/// What a client states to a servant that was there.
-pub(crate) struct Anew {
-    pub(crate) inner: Arc<Inner>,
+/// A client's statement to an existing servant.
+pub(crate) struct NewStatement {
+    pub(crate) inner: Arc<ChoreographerInner>,
     pub(crate) stated: Stated,
 }
 
 impl Lease {
-    /// Counts one more connection in, of this one of the robot's clients. Only under the choreographer's lock.
+    /// Adds a connection of this client of the robot. Only under the choreographer's lock.
     pub(crate) fn new(handle: Arc<Handle>, who: &str) -> Lease {
-        handle.enters(who);
+        handle.add_connection(who);
         let (who, anew) = (who.to_owned(), None);
         Lease { handle, who, anew }
     }
 
-    /// With what its client states to a servant that was there.
-    pub(crate) fn stating(mut self, anew: Anew) -> Lease {
+    /// Adds the client's statement to an existing servant.
+    pub(crate) fn with_statement(mut self, anew: NewStatement) -> Lease {
         self.anew = (!anew.stated.is_empty()).then_some(anew);
         self
     }
 
-    /// The servant.
+    /// Returns the handle of the servant.
     pub fn handle(&self) -> &Arc<Handle> {
         &self.handle
     }
 
-    /// Waits until there is room for the servant. Where one was there and the client states something else than before,
-    /// it is resized in place; an error says what would fit, and the servant keeps what it had.
-    pub async fn admitted(&self) -> Result<(), Error> {
-        self.reached(Phase::Admitted).await?;
-        let Some(Anew { inner, stated }) = &self.anew else {
+    /// Waits until the servant is admitted. If it existed before and the client states something new, it is resized in
+    /// place; an error says what would fit, and the servant keeps its limits.
+    pub async fn wait_admitted(&self) -> Result<(), Error> {
+        self.wait_phase(Phase::Admitted).await?;
+        let Some(NewStatement { inner, stated }) = &self.anew else {
             return Ok(());
         };
-        // Until then its limits are those that it begins with.
-        self.reached(Phase::Created).await?;
+        // Before that phase its limits are those that it starts with.
+        self.wait_phase(Phase::Created).await?;
         let (inner, handle) = (Arc::clone(inner), Arc::clone(&self.handle));
         let (who, stated) = (self.who.clone(), stated.clone());
-        // Its client may go away meanwhile; what is begun is done.
-        let agreed = tokio::spawn(async move { inner.agree(&handle, &who, &stated).await });
+        // The client may go away meanwhile; a change in progress is completed.
+        let agreed = tokio::spawn(async move { inner.agree_terms(&handle, &who, &stated).await });
         agreed
             .await
             .map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
-    /// Waits until the servant's interface is there.
-    pub async fn ready(&self) -> Result<Arc<dyn Reach>, Error> {
-        self.admitted().await?;
-        self.reached(Phase::Ready).await?;
+    /// Waits until the servant's interface is registered.
+    pub async fn wait_ready(&self) -> Result<Arc<dyn Reach>, Error> {
+        self.wait_admitted().await?;
+        self.wait_phase(Phase::Ready).await?;
         self.handle
             .reach()
             .ok_or(Error::Internal("reaching a ready servant"))
     }
 
-    /// Comes back when the servant has failed or is ended, with the reason.
-    pub(crate) async fn over(&self) -> Error {
+    /// Waits until the servant has failed or is ended; returns the reason.
+    pub(crate) async fn wait_over(&self) -> Error {
         let mut life = self.handle.watch();
         match life.wait_for(Life::is_over).await {
             Ok(life) => self.handle.error(&life),
-            Err(_) => Error::Internal("waiting for a servant's end"),
+            Err(_) => Error::Internal("waiting for a servant to end"),
         }
     }
 
-    async fn reached(&self, phase: Phase) -> Result<(), Error> {
+    async fn wait_phase(&self, phase: Phase) -> Result<(), Error> {
         let mut life = self.handle.watch();
         let Ok(life) = life
             .wait_for(|life| life.is_over() || life.phase >= phase)
@@ -96,6 +96,6 @@ impl Lease {
 
 impl Drop for Lease {
     fn drop(&mut self) {
-        self.handle.leaves(&self.who);
+        self.handle.remove_connection(&self.who);
     }
 }

@@ -1,5 +1,5 @@
-//! What a client states ends with it: when none of its connections came back within the grace time, its servant has the terms of
-//! the clients that are left.
+//! Ends the statements of clients that have left: if none of a client's connections comes back within the grace time,
+//! its servant gets the terms of the remaining clients.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,18 +8,18 @@ use std::time::Duration;
 use api::Phase;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::Inner;
-use super::measuring::Refusal;
+use super::ChoreographerInner;
+use super::measuring::ResizeRefusal;
 use super::visits::Visits;
 use crate::Error;
 use crate::lives::handle::Handle;
 
-/// Between two looks.
+/// Interval between two rounds.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Looks, for ever.
-pub(crate) async fn watch(inner: Arc<Inner>) {
-    let mut refusals: HashMap<String, Refusal> = HashMap::new();
+/// Runs the watch until the daemon ends.
+pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
+    let mut refusals: HashMap<String, ResizeRefusal> = HashMap::new();
     let mut visits: Visits<(Arc<Handle>, Result<(), Error>)> = Visits::default();
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -29,17 +29,18 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
         if inner.is_ending() {
             return;
         }
-        for (id, (handle, outcome)) in visits.take_over() {
-            let refused = Refusal::after(refusals.remove(&id), outcome, &inner, &handle);
+        for (id, (handle, outcome)) in visits.take_finished() {
+            let refused =
+                ResizeRefusal::from_outcome(refusals.remove(&id), outcome, &inner, &handle);
             refusals.extend(refused.map(|refused| (id, refused)));
         }
         let handles: Vec<Arc<Handle>> = inner.servants.lock().all.values().cloned().collect();
         let has_left = |handle: &Arc<Handle>| {
             handle.life().phase == Phase::Ready
                 && !handle.is_ending()
-                // Where all have left, the servant itself ends.
+                // If all have left, the servant itself ends.
                 && handle.connections() > 0
-                && !handle.away_for(grace).is_empty()
+                && !handle.clients_away_for(grace).is_empty()
         };
         let left: Vec<Arc<Handle>> = handles.into_iter().filter(has_left).collect();
         refusals.retain(|id, _| left.iter().any(|handle| handle.id == *id));

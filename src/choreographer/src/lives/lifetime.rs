@@ -1,24 +1,26 @@
-//! Carries out what is decided of a servant's lifetime: waits until it can be used, and until nobody needs it.
+//! Carries out decisions about a servant's lifetime: waits until it can be used, and until it is not needed any more.
 
 use std::sync::Arc;
 
 use api::Phase;
 use package::interface::Interface;
 use reach::Reach;
-use reach::components::{Load, Loads};
+use reach::components::{ContainerLoad, Loads};
 use reach::lifecycle::Stages;
-use reach::readiness::{missing, missing_nodes};
+use reach::readiness::{missing_endpoints, missing_nodes};
 use tokio::sync::watch;
 use tokio::time::{Instant, timeout_at};
 
-use super::Inner;
-use crate::decide::lifetime::{Need, Readiness, Shown, Stage, Tenancy, needed, readiness};
+use super::ChoreographerInner;
+use crate::decide::lifetime::{
+    InterfaceStatus, Readiness, Retention, ServantStage, Tenancy, readiness, retention,
+};
 use crate::lives::handle::{Failure, Handle};
 
-/// Waits until everything that the interface promises is registered. Nodes may take their time between their
-/// registration and their first topic: all that the servant's start may take.
-pub(super) async fn interface_there(
-    inner: &Inner,
+/// Waits until the whole interface is registered. Nodes may take the full start time of the servant between their
+/// registration and their first topic.
+pub(super) async fn wait_for_interface(
+    inner: &ChoreographerInner,
     handle: &Handle,
     reach: &dyn Reach,
     deadline: Instant,
@@ -31,23 +33,25 @@ pub(super) async fn interface_there(
     let mut changed = Instant::now();
     loop {
         let graph = graphs.borrow_and_update().clone();
-        if let Some(refused) = lifecycles.as_mut().and_then(refused) {
-            return Err(Failure::broken(format!("is of no use: {refused}")));
+        if let Some(refused) = lifecycles.as_mut().and_then(find_refused) {
+            return Err(Failure::from_reason(format!("is unusable: {refused}")));
         }
-        let loading = match loads.as_mut().map(still_loading) {
-            Some(Err(refused)) => return Err(Failure::broken(format!("is of no use: {refused}"))),
+        let loading = match loads.as_mut().map(loading_containers) {
+            Some(Err(refused)) => {
+                return Err(Failure::from_reason(format!("is unusable: {refused}")));
+            }
             loading => loading.and_then(Result::ok).unwrap_or_default(),
         };
-        let mut missing = missing(interface, &graph);
+        let mut missing = missing_endpoints(interface, &graph);
         let mut nodes_missing = missing_nodes(interface, &graph);
         if let Some(stages) = &lifecycles {
-            missing.extend(beginning(&stages.borrow()));
+            missing.extend(inactive_nodes(&stages.borrow()));
         }
         for container in loading {
-            missing.push(format!("what is loaded into {container}"));
+            missing.push(format!("the components of {container}"));
             nodes_missing.push(format!("the nodes of {container}"));
         }
-        let shown = Shown {
+        let shown = InterfaceStatus {
             missing: &missing,
             nodes_missing: &nodes_missing,
             patient: fresh && !inner.incomplete.lock().contains(image),
@@ -62,51 +66,51 @@ pub(super) async fn interface_there(
                 inner.incomplete.lock().insert(image.clone());
                 let missing = missing.join(", ");
                 let message = format!("servant {} is ready without {missing}", handle.id);
-                let about = handle.about();
+                let about = handle.event_context();
                 inner
                     .journal
                     .warning("interface-incomplete", &message, &about);
                 return Ok(());
             }
-            Readiness::Late(reason) => return Err(Failure::broken(reason)),
+            Readiness::Late(reason) => return Err(Failure::from_reason(reason)),
         };
         tokio::select! {
             shown = timeout_at(until, graphs.changed()) => match shown {
                 Ok(Ok(())) => changed = Instant::now(),
-                Ok(Err(_)) => return Err(Failure::broken("lost its ROS")),
+                Ok(Err(_)) => return Err(Failure::from_reason("lost its ROS Master or domain")),
                 Err(_) => {}
             },
-            // A node that becomes active is about to show more.
-            () = changes(&mut lifecycles) => changed = Instant::now(),
-            () = changes(&mut loads) => changed = Instant::now(),
+            // A node that becomes active is about to register more.
+            () = wait_changed(&mut lifecycles) => changed = Instant::now(),
+            () = wait_changed(&mut loads) => changed = Instant::now(),
         }
     }
 }
 
-/// Why a node with a lifecycle does not do its work, if one does not.
-fn refused(stages: &mut watch::Receiver<Stages>) -> Option<String> {
+/// Returns why a lifecycle node refuses to become active, if one does.
+fn find_refused(stages: &mut watch::Receiver<Stages>) -> Option<String> {
     let stages = stages.borrow_and_update();
     stages.values().find_map(|stage| stage.refused.clone())
 }
 
-/// Nodes that are on their way to be active, as something that is missing.
-fn beginning(stages: &Stages) -> impl Iterator<Item = String> {
+/// Returns nodes on their way to being active, as missing parts.
+fn inactive_nodes(stages: &Stages) -> impl Iterator<Item = String> {
     let begin = stages.iter().filter(|(_, stage)| stage.begins);
     begin.map(|(node, _)| format!("the node {node}, which is not active yet"))
 }
 
-/// Containers that have not loaded all of their nodes; else why one does not load one.
-fn still_loading(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>, String> {
+/// Returns the component containers that have not loaded all of their nodes; an error if one refuses to.
+fn loading_containers(loads: &mut watch::Receiver<Loads>) -> Result<Vec<String>, String> {
     let loads = loads.borrow_and_update();
     let loading = loads.iter().filter_map(|(container, load)| match load {
-        Load::Loading => Some(Ok(container.clone())),
-        Load::Refused(why) => Some(Err(why.clone())),
-        Load::Loaded(_) => None,
+        ContainerLoad::Loading => Some(Ok(container.clone())),
+        ContainerLoad::Refused(why) => Some(Err(why.clone())),
+        ContainerLoad::Loaded(_) => None,
     });
     loading.collect()
 }
 
-async fn changes<T>(of: &mut Option<watch::Receiver<T>>) {
+async fn wait_changed<T>(of: &mut Option<watch::Receiver<T>>) {
     let changed = match of {
         Some(of) => of.changed().await,
         None => return std::future::pending().await,
@@ -116,25 +120,30 @@ async fn changes<T>(of: &mut Option<watch::Receiver<T>>) {
     }
 }
 
-/// Comes back when nobody needs the servant any more, with the reason. It is given to nobody from then on.
-pub(super) async fn unneeded(inner: &Arc<Inner>, handle: &Arc<Handle>, fresh: bool) -> String {
+/// Waits until the servant is not needed any more; returns the reason. It is withdrawn from its robot then.
+pub(super) async fn wait_unneeded(
+    inner: &Arc<ChoreographerInner>,
+    handle: &Arc<Handle>,
+    fresh: bool,
+) -> String {
     let times = &inner.options;
-    let grace = match handle.anonymous {
-        true => times.anonymous_grace,
-        false => times.grace,
+    let grace = if handle.anonymous {
+        times.anonymous_grace
+    } else {
+        times.grace
     };
     let (mut connections, mut life) = (handle.watch_connections(), handle.watch());
     let mut idle_since = None;
     loop {
         let now = Instant::now();
         let stage = match life.borrow_and_update().phase {
-            Phase::Requested => Stage::Queued,
-            Phase::Admitted => Stage::Admitted,
-            Phase::Created | Phase::Starting => Stage::Starting,
-            _ => Stage::Ready,
+            Phase::Requested => ServantStage::Queued,
+            Phase::Admitted => ServantStage::Admitted,
+            Phase::Created | Phase::Starting => ServantStage::Starting,
+            _ => ServantStage::Ready,
         };
         let count = *connections.borrow_and_update();
-        let idle = stage == Stage::Ready && count == 0;
+        let idle = stage == ServantStage::Ready && count == 0;
         let was_idle = idle_since.is_some();
         idle_since = idle.then(|| idle_since.unwrap_or(now.into_std()));
         let tenancy = Tenancy {
@@ -145,15 +154,15 @@ pub(super) async fn unneeded(inner: &Arc<Inner>, handle: &Arc<Handle>, fresh: bo
             idle_since,
             grace,
         };
-        let until = match needed(&tenancy, now.into_std()) {
-            Need::Stays => None,
-            Need::Until(until) => Some(Instant::from_std(until)),
-            Need::Over(reason) => {
+        let until = match retention(&tenancy, now.into_std()) {
+            Retention::Stays => None,
+            Retention::Until(until) => Some(Instant::from_std(until)),
+            Retention::Over(reason) => {
                 if inner.retire_if_idle(handle) {
                     handle.set_idle_until(None);
                     return reason;
                 }
-                // Somebody came just now.
+                // A client has just connected.
                 continue;
             }
         };
@@ -162,7 +171,7 @@ pub(super) async fn unneeded(inner: &Arc<Inner>, handle: &Arc<Handle>, fresh: bo
             handle.set_idle_until(millis);
         }
         if idle && !was_idle {
-            // Somebody may have been waiting for longer.
+            // A request may have been waiting longer.
             inner.make_room();
         }
         tokio::select! {
@@ -179,14 +188,14 @@ mod tests {
 
     #[test]
     fn a_node_that_is_not_active_yet_is_missing() {
-        let stage = |begins| reach::lifecycle::Stage {
+        let stage = |begins| reach::lifecycle::LifecycleStage {
             state: "inactive".to_owned(),
             refused: None,
             begins,
         };
         let stages = [("/arm", stage(true)), ("/eye", stage(false))];
         let stages = Stages::from(stages.map(|(node, stage)| (node.to_owned(), stage)));
-        let missing: Vec<String> = beginning(&stages).collect();
+        let missing: Vec<String> = inactive_nodes(&stages).collect();
         assert_eq!(missing, ["the node /arm, which is not active yet"]);
     }
 }

@@ -1,63 +1,64 @@
-//! Changes the limits of a servant while it works: because the operator says so, or because its robot states something else
-//! than before.
+//! Changes the limits of a running servant: on the operator's request, or because its robot states something new.
 
 use std::time::Duration;
 
 use api::{Limits, Size, Stated, Terms};
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::spec::UNLIMITED;
 
-use super::Inner;
-use crate::decide::demand::{Asked, with_weight};
-use crate::decide::measured::{Input, grown, measured};
-use crate::decide::terms::{Untenable, in_words, pairs_of, terms};
-use crate::decide::told::left_out;
-use crate::error::{STATING, Unchanged};
-use crate::limits::limits_of;
+use super::ChoreographerInner;
+use crate::decide::demand::{LimitSources, with_default_weight};
+use crate::decide::measured::{MeasuredInput, aux_from_inputs, merge_max};
+use crate::decide::terms::{TermsError, aux_pairs, compute_terms, limits_in_words};
+use crate::decide::told::suppressed_note;
+use crate::error::{ResizeError, STATING};
+use crate::limits::to_api_limits;
 use crate::lives::handle::Handle;
 use crate::{Choreographer, Error, ServantRequest, engine_limits};
 use store::NewEvent;
 use tokio::time::{Instant, timeout};
 
-/// For one servant to take other limits.
+/// Timeout for one servant to apply limits.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// `cpu.weight` where nobody has asked for one.
+/// Default of `cpu.weight`.
 pub(super) const PLAIN_WEIGHT: u64 = 100;
 
 impl Choreographer {
-    /// Changes the limits that are given, of a servant that runs; what is promised to it changes with them.
+    /// Changes the given limits of a running servant, and its promise with them.
     pub async fn set_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
         let (whole, id) = (self.clone(), id.to_owned());
-        // Whoever asks may go away meanwhile; what is begun is done.
-        let set = tokio::spawn(async move { whole.set(&id, change).await });
+        // The caller may go away meanwhile; a change in progress is completed.
+        let set = tokio::spawn(async move { whole.apply_limits(&id, change).await });
         set.await
             .map_err(|_| Error::Internal("changing a servant's limits"))?
     }
 
-    async fn set(&self, id: &str, change: Limits) -> Result<(), Error> {
+    async fn apply_limits(&self, id: &str, change: Limits) -> Result<(), Error> {
         let handle = self.servant(id)?;
         handle.check_container()?;
-        // One change after the other: what is promised, in force and remembered must be of the same.
-        let _turn = handle.limits_turn().await;
-        let before = handle.all_asked();
-        let after = Asked {
+        // One change at a time: the promise, the limits in force and the stored limits must agree.
+        let _turn = handle.lock_limits().await;
+        let before = handle.limit_sources();
+        let after = LimitSources {
             set: change.or(before.set),
             ..before
         };
         let inner = &self.inner;
         let set = after.set;
-        let in_force = inner.resize(&handle, with_weight(change), after).await?;
+        let in_force = inner
+            .resize(&handle, with_default_weight(change), after)
+            .await?;
         inner.state.set_servant_limits(id, &set)?;
         let message = format!("servant {id}: limits changed to {in_force}");
         inner
             .journal
-            .info("limits-changed", &message, &handle.about());
+            .info("limits-changed", &message, &handle.event_context());
         Ok(())
     }
 }
 
-impl Inner {
-    /// Tells of a robot that is refused for what it states.
+impl ChoreographerInner {
+    /// Reports a robot that is refused for its statement.
     pub(crate) fn report_refused(&self, request: &ServantRequest, error: &Error) {
         let (service, robot) = (&request.service, &request.robot);
         let about = NewEvent {
@@ -67,14 +68,16 @@ impl Inner {
         };
         self.report_terms_refused(service, robot, &about, || {
             let stated = &request.stated;
-            format!("robot {robot} states {stated} to {service} and is refused: {error}")
+            format!("robot {robot} requests {stated} of {service} and is refused: {error}")
         });
     }
 
-    /// Tells of a servant that keeps what it has, although its robot states or sends something else.
+    /// Reports a servant that keeps its limits although its robot states or sends something else.
     pub(crate) fn report_not_resized(&self, handle: &Handle, error: &Error) {
         let (service, robot) = (handle.service(), &handle.robot);
-        self.report_terms_refused(service, robot, &handle.about(), || error.to_string());
+        self.report_terms_refused(service, robot, &handle.event_context(), || {
+            error.to_string()
+        });
     }
 
     fn report_terms_refused(
@@ -85,31 +88,36 @@ impl Inner {
         message: impl FnOnce() -> String,
     ) {
         let now = Instant::now().into_std();
-        let told = self.refusals.lock().tell(service, robot, now);
+        let told = self.refusals.lock().record_refusal(service, robot, now);
         if let Some(before) = told {
-            let message = message() + &left_out(before);
+            let message = message() + &suppressed_note(before);
             self.journal.warning("terms-refused", &message, about);
         }
     }
 
-    /// Gives a servant that runs what its robot states now, by one of its clients. Where that cannot be, it keeps what it
-    /// has.
-    pub(crate) async fn agree(
+    /// Applies the new statement of one of the robot's clients to a running servant. If that is impossible, it keeps
+    /// its limits.
+    pub(crate) async fn agree_terms(
         &self,
         handle: &Handle,
         who: &str,
         stated: &Stated,
     ) -> Result<(), Error> {
-        let agreed = self.agreed(handle, who, stated).await;
+        let agreed = self.apply_statement(handle, who, stated).await;
         if let Err(error @ Error::NotResized { .. }) = &agreed {
             self.report_not_resized(handle, error);
         }
         agreed
     }
 
-    async fn agreed(&self, handle: &Handle, who: &str, stated: &Stated) -> Result<(), Error> {
-        let _turn = handle.limits_turn().await;
-        let before = handle.all_asked();
+    async fn apply_statement(
+        &self,
+        handle: &Handle,
+        who: &str,
+        stated: &Stated,
+    ) -> Result<(), Error> {
+        let _turn = handle.lock_limits().await;
+        let before = handle.limit_sources();
         let mut all = before.terms.stated.clone();
         if all.insert(who.to_owned(), stated.clone()).as_ref() == Some(stated) {
             // Another connection of the same client was faster.
@@ -120,44 +128,52 @@ impl Inner {
                 servant: handle.id.clone(),
                 service: handle.service().to_owned(),
                 stated: stated.to_string(),
-                reason: Box::new(Unchanged::Many),
+                reason: Box::new(ResizeError::Many),
             });
         }
         let measured = before.terms.measured.clone();
-        let terms = self.offering(&handle.revision, |_| measured, |offer| terms(&all, offer))?;
+        let terms = self.with_offer(
+            &handle.revision,
+            |_| measured,
+            |offer| compute_terms(&all, offer),
+        )?;
         let why = stated.to_string();
-        let changed = self.renew(handle, before, terms, &why).await?;
+        let changed = self.apply_terms(handle, before, terms, &why).await?;
         if !handle.is_place() {
-            let states = handle.terms().stated_in_words();
-            self.report_changed(handle, changed, &format!("its robot states {states}"));
+            let states = handle.terms().describe_stated();
+            self.report_changed(handle, changed, &format!("its robot requests {states}"));
         }
         Ok(())
     }
 
-    /// Has a servant that runs forget what those of its robot's clients stated that have been away for the grace time. Where it
-    /// cannot be made smaller, it keeps what it has.
+    /// Removes the statements of clients that have been away for the grace time from a running servant. If it cannot be
+    /// made smaller, it keeps its limits.
     pub(crate) async fn forget_stated(
         &self,
         handle: &Handle,
         grace: Duration,
     ) -> Result<(), Error> {
-        // Whoever is back by now waits for this turn, and states it again.
-        let _turn = handle.limits_turn().await;
-        let away = handle.away_for(grace);
-        let before = handle.all_asked();
+        // A client that is back by now waits for this lock, and states it again.
+        let _turn = handle.lock_limits().await;
+        let away = handle.clients_away_for(grace);
+        let before = handle.limit_sources();
         let mut left = before.terms.stated.clone();
         left.retain(|who, _| !away.contains(who));
         if left.len() == before.terms.stated.len() {
             return Ok(());
         }
         let measured = before.terms.measured.clone();
-        let terms = self.offering(&handle.revision, |_| measured, |offer| terms(&left, offer))?;
-        let away: Vec<&str> = away.iter().map(|who| client(who)).collect();
+        let terms = self.with_offer(
+            &handle.revision,
+            |_| measured,
+            |offer| compute_terms(&left, offer),
+        )?;
+        let away: Vec<&str> = away.iter().map(|who| client_in_words(who)).collect();
         let why = format!("its robot's clients without {}", away.join(", "));
-        let changed = self.renew(handle, before, terms, &why).await?;
+        let changed = self.apply_terms(handle, before, terms, &why).await?;
         if !handle.is_place() {
             let why = format!(
-                "what {} stated ended {} s after that had left",
+                "the requests of {} expired {} s after it left",
                 away.join(", "),
                 grace.as_secs_f64()
             );
@@ -166,25 +182,31 @@ impl Inner {
         Ok(())
     }
 
-    /// Gives a servant that runs what the dictionary says of messages as large as those that its robot sends. Where that
-    /// cannot be, it keeps what it has.
-    pub(crate) async fn measured(&self, handle: &Handle, inputs: &[Input]) -> Result<(), Error> {
-        let _turn = handle.limits_turn().await;
-        let before = handle.all_asked();
+    /// Applies the dictionary's rows for the measured message sizes to a running servant. If that is impossible, it
+    /// keeps its limits.
+    pub(crate) async fn apply_measured(
+        &self,
+        handle: &Handle,
+        inputs: &[MeasuredInput],
+    ) -> Result<(), Error> {
+        let _turn = handle.lock_limits().await;
+        let before = handle.limit_sources();
         let known = &before.terms.measured;
-        let anew = self.offering(
+        let anew = self.with_offer(
             &handle.revision,
-            |rows| grown(known, measured(inputs, rows)),
+            |rows| merge_max(known, aux_from_inputs(inputs, rows)),
             |offer| {
-                let terms = || terms(&before.terms.stated, offer);
-                (offer.measured != known).then(|| (pairs_of(offer.measured), terms()))
+                let terms = || compute_terms(&before.terms.stated, offer);
+                (offer.measured != known).then(|| (aux_pairs(offer.measured), terms()))
             },
         )?;
         let Some((sends, terms)) = anew else {
             return Ok(());
         };
         let why = format!("messages of {sends}");
-        let changed = self.renew(handle, before.clone(), terms, &why).await?;
+        let changed = self
+            .apply_terms(handle, before.clone(), terms, &why)
+            .await?;
         if changed.is_some() {
             self.report_changed(handle, changed, &format!("its robot sends {why}"));
         }
@@ -196,22 +218,22 @@ impl Inner {
         let message = match from {
             Some(earlier) => format!(
                 "servant {id}: {why}; limits changed from {} to {}",
-                in_words(&earlier),
-                in_words(&handle.limits()),
+                limits_in_words(&earlier),
+                limits_in_words(&handle.limits()),
             ),
-            None => format!("servant {id}: {why}; its limits stay"),
+            None => format!("servant {id}: {why}; its limits are unchanged"),
         };
         self.journal
-            .info("terms-changed", &message, &handle.about());
+            .info("terms-changed", &message, &handle.event_context());
     }
 
-    /// Gives a servant these terms, for what `why` says; the limits that it had, where they change. Only in its
-    /// [`Handle::limits_turn`].
-    async fn renew(
+    /// Applies these terms to a servant, for the reason `why`; returns the previous limits if they change. Requires
+    /// [`Handle::lock_limits`].
+    async fn apply_terms(
         &self,
         handle: &Handle,
-        before: Asked,
-        terms: Result<Terms, Untenable>,
+        before: LimitSources,
+        terms: Result<Terms, TermsError>,
         why: &str,
     ) -> Result<Option<Limits>, Error> {
         let refused = |reason| Error::NotResized {
@@ -220,110 +242,121 @@ impl Inner {
             stated: why.to_owned(),
             reason: Box::new(reason),
         };
-        let terms = terms.map_err(|untenable| refused(Unchanged::Untenable(untenable)))?;
-        let after = Asked {
+        let terms = terms.map_err(|untenable| refused(ResizeError::Untenable(untenable)))?;
+        let after = LimitSources {
             terms,
             ..before.clone()
         };
         if handle.is_place() {
-            // It has no container; what it wishes of its SLA, the group heeds.
-            handle.set_asked(after);
+            // It has no container; the group takes the goals of its SLA into account.
+            handle.set_limit_sources(after);
             return Ok(None);
         }
         let (earlier, told) = (before.limits(), after.terms.clone());
-        let change = changed(&earlier, &after.limits(), self.options.cores);
+        let change = limit_changes(&earlier, &after.limits(), self.options.cores);
         if let (Some(wanted), Some(container)) = (change.memory, handle.container())
             && earlier.memory.is_none_or(|earlier| wanted < earlier)
             && let Ok(usage) = container.usage().await
             && wanted.0 < usage.memory
         {
             let used = Size(usage.memory);
-            return Err(refused(Unchanged::Used { used, wanted }));
+            return Err(refused(ResizeError::Used { used, wanted }));
         }
         let resized = change != Limits::default();
         if resized {
             let resized = self.resize(handle, change, after).await;
             resized.map_err(|error| match error {
-                Error::Full(full) => refused(Unchanged::Full(full)),
+                Error::Full(full) => refused(ResizeError::Full(full)),
                 error => error,
             })?;
         } else {
-            handle.set_asked(after);
+            handle.set_limit_sources(after);
         }
         self.state.set_servant_terms(&handle.id, &told)?;
         Ok(resized.then_some(earlier))
     }
 
-    /// Gives a servant the limits of `change`, and promises `after` to it; all or nothing. Only in its
-    /// [`Handle::limits_turn`]. Gives what is in force then.
-    async fn resize(&self, handle: &Handle, change: Limits, after: Asked) -> Result<String, Error> {
+    /// Applies the limits of `change` to a servant and promises `after` to it; all or nothing. Requires
+    /// [`Handle::lock_limits`]. Returns the limits in force afterwards.
+    async fn resize(
+        &self,
+        handle: &Handle,
+        change: Limits,
+        after: LimitSources,
+    ) -> Result<String, Error> {
         let unreached = || Error::Servant {
             service: handle.service().to_owned(),
             robot: handle.robot.clone(),
-            reason: "does not run, so that its limits cannot be changed".to_owned(),
+            reason: "is not running, so its limits cannot be changed".to_owned(),
             log: Vec::new(),
         };
         let container = handle.container().ok_or_else(unreached)?;
         let promise = handle.promise().ok_or_else(unreached)?;
-        let before = handle.all_asked();
+        let before = handle.limit_sources();
         let (has, wanted) = (
-            self.promised(&before.promised()),
-            self.promised(&after.promised()),
+            self.promised_amount(&before.promised_limits()),
+            self.promised_amount(&after.promised_limits()),
         );
-        // What is more is promised before the kernel gives it, and what is less given to others only once the kernel has
-        // taken it: else more would be promised than there is where it refuses.
+        // An increase is promised before the kernel grants it, and a decrease is released only after the kernel has
+        // applied it: otherwise more would be promised than there is if the kernel refuses.
         promise.change(has.max(wanted))?;
         if let Err(error) = container.set_limits(engine_limits(&change)).await {
-            // What the kernel took of it before it refused the rest is taken back.
-            let back = changed(&change, &before.limits(), self.options.cores);
+            // What the kernel applied before it refused the rest is reverted.
+            let back = limit_changes(&change, &before.limits(), self.options.cores);
             let _ = container.set_limits(engine_limits(&back)).await;
             promise.change(has)?;
             return Err(error.into());
         }
-        handle.set_asked(after);
+        handle.set_limit_sources(after);
         promise.change(wanted)?;
-        Ok(in_words(&limits_of(&container.enforced().limits)))
+        Ok(limits_in_words(&to_api_limits(
+            &container.enforced_limits().limits,
+        )))
     }
 }
 
-/// Who states something, for people: a stub by its node.
-fn client(who: &str) -> &str {
+/// Returns a human-readable name of a client: a stub by its node.
+fn client_in_words(who: &str) -> &str {
     match who {
         "" => "a rosbridge client",
         node => node,
     }
 }
 
-/// Gives a container that was made with the limits `made` those of the servant that it becomes.
-pub(super) async fn fit(
-    container: &dyn Servant,
+/// Changes the limits of a container from `made` to those of its servant.
+pub(super) async fn fit_container(
+    container: &dyn ServantHandle,
     made: &Limits,
     limits: &Limits,
     cores: f64,
 ) -> Result<(), servant::Error> {
-    let change = changed(made, limits, cores);
+    let change = limit_changes(made, limits, cores);
     if change != Limits::default() {
         container.set_limits(engine_limits(&change)).await?;
     }
     Ok(())
 }
 
-/// Gives a servant that was adopted what it was promised, where an earlier daemon's controller has moved its cores and this one
-/// moves none.
-pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Servant) {
-    let (has, wanted) = (container.enforced().limits, handle.limits());
-    // What this host cannot limit was not moved.
+/// Restores the promised cores of an adopted servant, if an earlier daemon's controller has moved them and this daemon
+/// has no controller.
+pub(super) async fn restore_cores(
+    inner: &ChoreographerInner,
+    handle: &Handle,
+    container: &dyn ServantHandle,
+) {
+    let (has, wanted) = (container.enforced_limits().limits, handle.limits());
+    // Cores that this host cannot limit were not moved.
     if inner.options.controller || has.cpus.is_none() {
         return;
     }
-    let _turn = handle.limits_turn().await;
+    let _turn = handle.lock_limits().await;
     let before = Limits {
-        // Of one that may have all cores nothing is taken back.
+        // A servant that may have all cores has nothing to restore.
         cpus: has.cpus.filter(|_| wanted.cpus.is_some()),
         cpu_weight: has.cpu_weight,
         ..Limits::default()
     };
-    let change = changed(
+    let change = limit_changes(
         &before,
         &Limits {
             cpus: wanted.cpus,
@@ -335,34 +368,34 @@ pub(super) async fn take_back(inner: &Inner, handle: &Handle, container: &dyn Se
     if change == Limits::default() {
         return;
     }
-    let (id, about) = (&handle.id, handle.about());
+    let (id, about) = (&handle.id, handle.event_context());
     match timeout(PATIENCE, container.set_limits(engine_limits(&change))).await {
         Ok(Ok(_)) => {
             let message = format!(
-                "servant {id} of {} for {}: back from {} to {}: no controller moves cores any more",
+                "servant {id} of {} for {}: back from {} to {}: the controller is off",
                 handle.service(),
                 handle.robot,
-                in_words(&before),
-                in_words(&change),
+                limits_in_words(&before),
+                limits_in_words(&change),
             );
             inner.journal.info("cores-moved", &message, &about);
         }
         Ok(Err(error)) => {
-            let message = format!("servant {id} keeps cores that a controller has moved: {error}");
+            let message = format!("servant {id} keeps cores set by the controller: {error}");
             inner.journal.warning("limits-unmet", &message, &about);
         }
         Err(_) => {
             let message =
-                format!("servant {id} keeps cores that a controller has moved: it does not answer");
+                format!("servant {id} keeps cores set by the controller: it does not answer");
             inner.journal.warning("limits-unmet", &message, &about);
         }
     }
 }
 
-/// What has to be set for a servant of the limits `before` to have those of `after`: what is the same is left out, since some
-/// limits, such as a cpuset on cgroup v1, cannot be set again. What `after` says nothing of is none again, all of this
-/// machine's `cores`, and the kernel's weight; a cpuset stays.
-fn changed(before: &Limits, after: &Limits, cores: f64) -> Limits {
+/// Returns the limits to set to change `before` into `after`: equal ones are left out, since some limits, such as a
+/// cpuset on cgroup v1, cannot be set again. Limits that `after` omits are lifted: all of this machine's `cores`, and
+/// the kernel's default weight; a cpuset stays.
+fn limit_changes(before: &Limits, after: &Limits, cores: f64) -> Limits {
     let unlimited = Limits {
         cpus: Some(cores),
         cpu_weight: Some(PLAIN_WEIGHT),
@@ -373,7 +406,7 @@ fn changed(before: &Limits, after: &Limits, cores: f64) -> Limits {
         io_write: Some(Size(UNLIMITED)),
         cpuset: None,
     };
-    after.or(before.and(unlimited)).without(*before)
+    after.or(before.and(unlimited)).without_equal(*before)
 }
 
 #[cfg(test)]
@@ -409,10 +442,10 @@ mod tests {
             io_write: size(7),
             cpuset: None,
         };
-        assert_eq!(changed(&before, &after, 4.0), change);
+        assert_eq!(limit_changes(&before, &after, 4.0), change);
         let nothing = Limits::default();
-        assert_eq!(changed(&before, &before, 4.0), nothing);
-        assert_eq!(changed(&nothing, &nothing, 4.0), nothing);
-        assert_eq!(changed(&nothing, &after, 4.0), after);
+        assert_eq!(limit_changes(&before, &before, 4.0), nothing);
+        assert_eq!(limit_changes(&nothing, &nothing, 4.0), nothing);
+        assert_eq!(limit_changes(&nothing, &after, 4.0), after);
     }
 }

@@ -1,53 +1,53 @@
-//! Looks once a second at how large what robots send is, and gives their servants what that costs by the dictionary.
+//! Samples the message sizes of robots once per second, and applies the dictionary's rows for them to their servants.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use api::Phase;
-use ros::sizes::Seen;
+use ros::sizes::SizeSummary;
 use tokio::time::{Instant, MissedTickBehavior, interval};
 
-use super::Inner;
+use super::ChoreographerInner;
 use super::visits::Visits;
 use crate::Error;
-use crate::decide::measured::Input;
+use crate::decide::measured::MeasuredInput;
 use crate::lives::handle::Handle;
 
-/// Between two looks.
+/// Interval between two rounds.
 const LOOK: Duration = Duration::from_secs(1);
-/// Where a servant could not be given what its robot's messages cost, it is tried again.
+/// Interval between attempts to apply the rows to a servant.
 const AGAIN: Duration = Duration::from_secs(10);
 
-/// What is remembered of a servant.
+/// State about one servant.
 #[derive(Default)]
-struct Watched {
-    /// When the first message of each input was seen.
+struct InputWatch {
+    /// Time of the first message by input.
     first: HashMap<String, Instant>,
-    /// As its terms were made of it.
-    known: Vec<Input>,
-    refused: Option<Refusal>,
+    /// The inputs from which its terms were derived.
+    known: Vec<MeasuredInput>,
+    refused: Option<ResizeRefusal>,
 }
 
-/// A servant could not be given what is right for it.
-pub(super) struct Refusal {
+/// A refused change of a servant's limits.
+pub(super) struct ResizeRefusal {
     at: Instant,
     why: String,
 }
 
-impl Refusal {
-    /// It is to be tried again.
+impl ResizeRefusal {
+    /// Returns true if the change is to be tried again.
     pub(super) fn is_due(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.at) >= AGAIN
     }
 
-    /// What is remembered after one more try; a refusal is told unless it says what the one before has said.
-    pub(super) fn after(
-        before: Option<Refusal>,
+    /// Returns the state after another attempt; a refusal is reported unless it equals the previous one.
+    pub(super) fn from_outcome(
+        before: Option<ResizeRefusal>,
         outcome: Result<(), Error>,
-        inner: &Inner,
+        inner: &ChoreographerInner,
         handle: &Handle,
-    ) -> Option<Refusal> {
+    ) -> Option<ResizeRefusal> {
         match outcome {
             Ok(()) => None,
             Err(error @ Error::NotResized { .. }) => {
@@ -55,27 +55,27 @@ impl Refusal {
                 if before.is_none_or(|before| before.why != why) {
                     inner.report_not_resized(handle, &error);
                 }
-                Some(Refusal { at, why })
+                Some(ResizeRefusal { at, why })
             }
-            // One that ends just now is told of elsewhere.
+            // A servant that is ending is reported elsewhere.
             Err(error) => {
-                tracing::debug!("servant {} stays as it is: {error}", handle.id);
+                tracing::debug!("servant {} is unchanged: {error}", handle.id);
                 None
             }
         }
     }
 }
 
-/// A servant was to be given what its robot's messages cost.
-struct Given {
+/// Result of applying the measured sizes to a servant.
+struct ResizeOutcome {
     handle: Arc<Handle>,
-    inputs: Vec<Input>,
+    inputs: Vec<MeasuredInput>,
     outcome: Result<(), Error>,
 }
 
-/// Looks, for ever.
-pub(crate) async fn watch(inner: Arc<Inner>) {
-    let mut watched: HashMap<String, Watched> = HashMap::new();
+/// Runs the watch until the daemon ends.
+pub(crate) async fn watch(inner: Arc<ChoreographerInner>) {
+    let mut watched: HashMap<String, InputWatch> = HashMap::new();
     let mut visits = Visits::default();
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -84,7 +84,7 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
         if inner.is_ending() {
             return;
         }
-        for (id, given) in visits.take_over() {
+        for (id, given) in visits.take_finished() {
             if let Some(watched) = watched.get_mut(&id) {
                 watched.note(given, &inner);
             }
@@ -95,7 +95,7 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
             if handle.life().phase != Phase::Ready || handle.is_ending() || handle.is_place() {
                 continue;
             }
-            // Of what nobody wishes for there is nothing to look up.
+            // Without goals there is nothing to look up.
             let terms = handle.terms();
             if terms.stated.is_empty() && terms.class.is_none() {
                 continue;
@@ -106,8 +106,8 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
                 if let Some(inputs) = inputs.filter(|_| visits.can_begin(&handle.id)) {
                     let (id, inner) = (handle.id.clone(), Arc::clone(&inner));
                     visits.begin(&id, async move {
-                        let outcome = inner.measured(&handle, &inputs).await;
-                        Given {
+                        let outcome = inner.apply_measured(&handle, &inputs).await;
+                        ResizeOutcome {
                             handle,
                             inputs,
                             outcome,
@@ -119,37 +119,42 @@ pub(crate) async fn watch(inner: Arc<Inner>) {
     }
 }
 
-impl Watched {
-    /// What was seen, where the servant is to be given what it costs.
-    fn look(&mut self, seen: Vec<(String, Seen)>, now: Instant) -> Option<Vec<Input>> {
+impl InputWatch {
+    /// Returns the measured inputs if they are to be applied to the servant.
+    fn look(
+        &mut self,
+        seen: Vec<(String, SizeSummary)>,
+        now: Instant,
+    ) -> Option<Vec<MeasuredInput>> {
         let inputs = self.inputs(seen, now);
         let again = self.refused.as_ref().is_some_and(|it| it.is_due(now));
         (self.known != inputs || again).then_some(inputs)
     }
 
-    fn note(&mut self, given: Given, inner: &Inner) {
-        let Given {
+    fn note(&mut self, given: ResizeOutcome, inner: &ChoreographerInner) {
+        let ResizeOutcome {
             handle,
             inputs,
             outcome,
         } = given;
         self.known = inputs;
-        self.refused = Refusal::after(self.refused.take(), outcome, inner, &handle);
+        self.refused = ResizeRefusal::from_outcome(self.refused.take(), outcome, inner, &handle);
     }
 
-    /// What was seen, without what changes with each message and says nothing new.
-    fn inputs(&mut self, seen: Vec<(String, Seen)>, now: Instant) -> Vec<Input> {
+    /// Returns the measured inputs, without values that change with each message and carry no news.
+    fn inputs(&mut self, seen: Vec<(String, SizeSummary)>, now: Instant) -> Vec<MeasuredInput> {
         use crate::decide::measured::{ENOUGH, PATIENCE};
         let seen = seen.into_iter().filter(|(_, seen)| seen.count > 0);
         seen.map(|(name, seen)| {
             let first = *self.first.entry(name.clone()).or_insert(now);
             let known = now.saturating_duration_since(first).min(PATIENCE);
-            Input {
-                known: match known < PATIENCE {
-                    true => Duration::ZERO,
-                    false => known,
+            MeasuredInput {
+                known: if known < PATIENCE {
+                    Duration::ZERO
+                } else {
+                    known
                 },
-                seen: Seen {
+                seen: SizeSummary {
                     count: seen.count.min(ENOUGH),
                     ..seen
                 },

@@ -1,4 +1,4 @@
-//! The nodes of one servant: who ended, and who is started again.
+//! Supervises the nodes of one servant: handles exits and restarts.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,44 +7,46 @@ use api::Phase;
 use futures_util::StreamExt;
 use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
-use reach::how_it_ended;
-use servant::engine::{NodeEvent, NodeExit, Servant};
+use reach::describe_exit;
+use servant::engine::{NodeEvent, NodeExit, ServantHandle};
 use servant::spec::NodeSpec;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::time::Instant;
 
-use super::Inner;
-use crate::decide::nodes::{Crew, Ended, Event, Next, after};
+use super::ChoreographerInner;
+use crate::decide::nodes::{
+    EndedNode, NodeExitAction, NodeExitContext, NodeReport, decide_after_exit,
+};
 use crate::lives::handle::{Failure, Handle};
 
-/// Lines of a node's log that explain its failure.
+/// Number of a node's log lines attached to its failure.
 const LOG_LINES: usize = 20;
 
-type Exit<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
+type NodeExitFuture<'a> = BoxFuture<'a, (NodeSpec, Instant, Result<NodeExit, servant::Error>)>;
 
-/// The servant's nodes: who ended, and who is started again. A node that asked for `respawn` is the engine's.
-pub(crate) struct Nodes<'a> {
-    inner: &'a Inner,
+/// Supervisor of the servant's nodes. A node with `respawn` is restarted by the engine.
+pub(crate) struct NodeSupervisor<'a> {
+    inner: &'a ChoreographerInner,
     handle: &'a Handle,
-    container: &'a Arc<dyn Servant>,
-    running: FuturesUnordered<Exit<'a>>,
+    container: &'a Arc<dyn ServantHandle>,
+    running: FuturesUnordered<NodeExitFuture<'a>>,
     pausing: FuturesUnordered<BoxFuture<'a, NodeSpec>>,
-    /// How often in a row a node has failed.
+    /// Failures in a row by node.
     failures: HashMap<String, u32>,
     events: tokio::sync::broadcast::Receiver<NodeEvent>,
-    /// How those that the engine starts again ended last.
+    /// Last exits of the nodes that the engine restarts.
     ends: HashMap<String, String>,
-    /// Nodes that still run or will run again.
+    /// Number of nodes that run or will run again.
     alive: usize,
 }
 
-impl<'a> Nodes<'a> {
+impl<'a> NodeSupervisor<'a> {
     pub(crate) fn new(
-        inner: &'a Inner,
+        inner: &'a ChoreographerInner,
         handle: &'a Handle,
-        container: &'a Arc<dyn Servant>,
-    ) -> Nodes<'a> {
-        let nodes = Nodes {
+        container: &'a Arc<dyn ServantHandle>,
+    ) -> NodeSupervisor<'a> {
+        let nodes = NodeSupervisor {
             inner,
             handle,
             container,
@@ -79,12 +81,12 @@ impl<'a> Nodes<'a> {
         }));
     }
 
-    /// Comes back when the servant has lost a node that it cannot do without.
+    /// Waits until the servant has lost a node that it cannot do without.
     pub(crate) async fn supervise(&mut self) -> Failure {
         loop {
             tokio::select! {
                 Some((node, began, exit)) = self.running.next() => {
-                    if let Err(failure) = self.ended(node, began, exit).await {
+                    if let Err(failure) = self.on_exit(node, began, exit).await {
                         return failure;
                     }
                 }
@@ -94,7 +96,7 @@ impl<'a> Nodes<'a> {
                     }
                 }
                 event = self.events.recv() => match event {
-                    Ok(event) => self.happened(event),
+                    Ok(event) => self.on_node_event(event),
                     Err(RecvError::Lagged(_)) => {}
                     Err(RecvError::Closed) => std::future::pending().await,
                 },
@@ -102,8 +104,8 @@ impl<'a> Nodes<'a> {
         }
     }
 
-    /// Takes in what the engine tells of its own accord.
-    fn happened(&mut self, event: NodeEvent) {
+    /// Handles an event of the engine.
+    fn on_node_event(&mut self, event: NodeEvent) {
         let (node, exit) = match event {
             NodeEvent::Exited {
                 node,
@@ -134,8 +136,8 @@ impl<'a> Nodes<'a> {
                 let delay = delay.map_or(0.0, |node| node.respawn_delay);
                 let how = self.ends.remove(&node);
                 let how = how.as_deref().unwrap_or("ended");
-                let message = format!("{node} {how} and is started again after {delay} s");
-                return self.report(&Event {
+                let message = format!("{node} {how} and is restarted after {delay} s");
+                return self.report(&NodeReport {
                     kind: "node-respawned",
                     message,
                 });
@@ -150,12 +152,12 @@ impl<'a> Nodes<'a> {
             .filter(|one| one.respawn)
             .any(|one| one.name == node)
         {
-            let how = how_it_ended(&exit, &self.handle.limits());
+            let how = describe_exit(&exit, &self.handle.limits());
             self.ends.insert(node, how);
         }
     }
 
-    async fn ended(
+    async fn on_exit(
         &mut self,
         node: NodeSpec,
         began: Instant,
@@ -166,14 +168,14 @@ impl<'a> Nodes<'a> {
         if exit.out_of_memory {
             self.handle.note_out_of_memory();
         }
-        let how = how_it_ended(&exit, &self.handle.limits());
-        let crew = Crew {
+        let how = describe_exit(&exit, &self.handle.limits());
+        let crew = NodeExitContext {
             linked: self.handle.is_linked(),
             ready: self.handle.life().phase >= Phase::Ready,
             restarts: self.handle.revision.plan.restart,
             alive: self.alive,
         };
-        let end = Ended {
+        let end = EndedNode {
             node: &node.name,
             how: &how,
             failed: exit.code != Some(0),
@@ -181,14 +183,14 @@ impl<'a> Nodes<'a> {
             ran: began.elapsed(),
             failures: self.failures.get(&node.name).copied().unwrap_or_default(),
         };
-        match after(crew, end) {
-            Next::Nothing => Ok(()),
-            Next::Without(event) => {
+        match decide_after_exit(crew, end) {
+            NodeExitAction::Nothing => Ok(()),
+            NodeExitAction::Without(event) => {
                 self.alive -= 1;
                 self.report(&event);
                 Ok(())
             }
-            Next::Restart {
+            NodeExitAction::Restart {
                 after,
                 failures,
                 event,
@@ -202,7 +204,7 @@ impl<'a> Nodes<'a> {
                 }));
                 Ok(())
             }
-            Next::Fail { event, reason } => {
+            NodeExitAction::Fail { event, reason } => {
                 event.iter().for_each(|event| self.report(event));
                 Err(self.failure(&node, reason).await)
             }
@@ -212,23 +214,20 @@ impl<'a> Nodes<'a> {
     async fn restart(&mut self, node: NodeSpec) -> Result<(), Failure> {
         self.handle.set_down(&node.name, None);
         if self.handle.is_linked() {
-            // A stub took its place while it paused.
+            // A stub took over while it paused.
             return Ok(());
         }
         match self.container.start_node(node.clone()).await {
             Ok(()) => {
                 if self.handle.is_linked() {
-                    // Or just now.
+                    // A stub took over just now.
                     let _ = self.container.end_node(&node.name, libc::SIGINT).await;
                 }
                 self.watch(node);
                 Ok(())
             }
             Err(error) => Err(self
-                .failure(
-                    &node,
-                    format!("could not start {} again: {error}", node.name),
-                )
+                .failure(&node, format!("cannot restart {}: {error}", node.name))
                 .await),
         }
     }
@@ -241,9 +240,9 @@ impl<'a> Nodes<'a> {
         }
     }
 
-    fn report(&self, event: &Event) {
+    fn report(&self, event: &NodeReport) {
         let message = format!("servant {}: {}", self.handle.id, event.message);
-        let about = self.handle.about();
+        let about = self.handle.event_context();
         self.inner.journal.warning(event.kind, &message, &about);
     }
 }

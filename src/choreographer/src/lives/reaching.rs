@@ -1,67 +1,67 @@
-//! Reaching what runs in a container: what is recorded of its revision, and what it tells of itself.
+//! Connects to the ROS in containers, and records what servants and robots report.
 
 use std::sync::Arc;
 use std::time::SystemTime;
 
 use api::Level;
-use bridge::{BridgeOptions, Called};
-use catalogue::{Catalogue, Known};
-use link::control::Request;
-use reach::links::RequestNews;
-use reach::{Observer, Reach, ReachOptions, Recorded, RequestTimes};
-use servant::engine::Servant;
+use bridge::{BridgeOptions, RequestObserver};
+use catalogue::{Catalogue, RevisionContents};
+use link::control::RequestTiming;
+use reach::links::RequestUpdate;
+use reach::{Observer, Reach, ReachOptions, RecordedRevision, RequestTimes};
+use servant::engine::ServantHandle;
 use store::{Journal, NewEvent, RevisionRecord};
 use tokio::time::Instant;
 
-use super::Inner;
-use super::recent::Recent;
+use super::ChoreographerInner;
+use super::recent::RecentRequests;
 use super::rollouts::Rollouts;
-use crate::decide::requests::asked_by_topic;
+use crate::decide::requests::find_topic_request;
 
 /// Connects to the ROS of a container that was started from `revision`.
 pub(crate) async fn open(
-    inner: &Inner,
+    inner: &ChoreographerInner,
     revision: &Arc<RevisionRecord>,
-    container: &Arc<dyn Servant>,
+    container: &Arc<dyn ServantHandle>,
 ) -> Result<Arc<dyn Reach>, reach::Error> {
-    let (options, observer) = habits(inner, revision, container.id());
+    let (options, observer) = reach_options(inner, revision, container.id());
     let recorded = Box::pin(async {
-        let known = inner.catalogue.known(revision).await;
-        // What runs is to be reached all the same.
+        let known = inner.catalogue.revision_contents(revision).await;
+        // A running container is to be reached nevertheless.
         let known = known.unwrap_or_else(|error| {
             tracing::warn!(
-                "what the image of {} holds is not known: {error}",
+                "the contents of the image of {} are unknown: {error}",
                 revision.service
             );
-            Known::default()
+            RevisionContents::default()
         });
-        recorded(revision, known)
+        recorded_revision(revision, known)
     });
     let opener = &inner.opener;
     opener.open(container, recorded, options, observer).await
 }
 
-/// How a servant, or a robot's place in a group, is reached, and who hears of what it and its robot tell.
-pub(crate) fn habits(
-    inner: &Inner,
+/// Returns the options for reaching a servant, or a robot's place in a group, and the observer of its reports.
+pub(crate) fn reach_options(
+    inner: &ChoreographerInner,
     revision: &Arc<RevisionRecord>,
     id: &str,
 ) -> (ReachOptions, Arc<dyn Observer>) {
     let memory = &inner.memory;
-    let measures = Measures::of(inner, revision, id);
+    let measures = RequestRecorder::new(inner, revision, id);
     let options = ReachOptions {
-        ros: revision.flavour.ros.bus(),
+        ros: revision.flavour.ros.ros_version(),
         distribution: revision.flavour.distribution.clone(),
         bridge: BridgeOptions {
-            called: measures.called(),
-            pair: asked_by_topic(revision.flavour.ros.bus(), &revision.interface),
+            called: measures.rosbridge_observer(),
+            pair: find_topic_request(revision.flavour.ros.ros_version(), &revision.interface),
             ..inner.options.bridge.clone()
         },
         grace: inner.options.grace,
         budget: memory.servant(id),
         unfinished: memory.unfinished,
     };
-    let reports = Reports {
+    let reports = ServantObserver {
         id: id.to_owned(),
         revision: Arc::clone(revision),
         catalogue: Arc::clone(&inner.catalogue),
@@ -71,18 +71,22 @@ pub(crate) fn habits(
     (options, Arc::new(reports))
 }
 
-/// Where the times of requests to one servant are noted: for the controller, rollouts, and whoever looks.
-pub(crate) struct Measures {
+/// Records the times of requests to one servant: for the controller, rollouts, and subscribers.
+pub(crate) struct RequestRecorder {
     servant: String,
     revision: Arc<RevisionRecord>,
     request_times: Arc<RequestTimes>,
-    recent: Arc<Recent>,
+    recent: Arc<RecentRequests>,
     rollouts: Arc<Rollouts>,
 }
 
-impl Measures {
-    pub(crate) fn of(inner: &Inner, revision: &Arc<RevisionRecord>, servant: &str) -> Arc<Self> {
-        Arc::new(Measures {
+impl RequestRecorder {
+    pub(crate) fn new(
+        inner: &ChoreographerInner,
+        revision: &Arc<RevisionRecord>,
+        servant: &str,
+    ) -> Arc<Self> {
+        Arc::new(RequestRecorder {
             servant: servant.to_owned(),
             revision: Arc::clone(revision),
             request_times: Arc::clone(&inner.request_times),
@@ -91,48 +95,51 @@ impl Measures {
         })
     }
 
-    /// This has become known of a request, which took so many milliseconds in the cloud.
-    fn note(&self, request: &Request, cloud: f64, news: RequestNews) {
+    /// Records news about a request, which took `cloud` milliseconds in the cloud.
+    fn record(&self, request: &RequestTiming, cloud: f64, news: RequestUpdate) {
         let service = &self.revision.service;
-        self.request_times.note(service, request);
+        self.request_times.record(service, request);
         if let Some(total) = request.total {
             let now = Instant::now().into_std();
-            self.recent.note(&self.servant, total, cloud, now);
+            self.recent.record(&self.servant, total, cloud, now);
         }
         let (rollouts, revision) = (&self.rollouts, self.revision.number);
         match (news, request.total) {
-            (RequestNews::Late, _) | (_, None) => rollouts.note_request(service, revision, None),
-            (RequestNews::Answered, total) => rollouts.note_request(service, revision, total),
-            (RequestNews::AnsweredLate, Some(total)) => {
+            (RequestUpdate::Late, _) | (_, None) => rollouts.note_request(service, revision, None),
+            (RequestUpdate::Answered, total) => rollouts.note_request(service, revision, total),
+            (RequestUpdate::AnsweredLate, Some(total)) => {
                 rollouts.note_late_answer(service, revision, total);
             }
         }
     }
 
-    /// Hears of the requests of rosbridge's clients. The time between them and the bridge is not known: what is measured is a
-    /// little less than what robots see, and all of it is the cloud's.
-    pub(crate) fn called(self: &Arc<Self>) -> Called {
+    /// Returns an observer of rosbridge clients' requests. The time between client and bridge is unknown: the measured
+    /// time is slightly less than what robots see, and all of it counts as the cloud's.
+    pub(crate) fn rosbridge_observer(self: &Arc<Self>) -> RequestObserver {
         let measures = Arc::clone(self);
-        Called::by(move |took| {
+        RequestObserver::new(move |took| {
             let total = took.map(|took| took.as_secs_f64() * 1e3);
-            let request = Request {
+            let request = RequestTiming {
                 total,
-                ..Request::default()
+                ..RequestTiming::default()
             };
             let cloud = total.unwrap_or_default();
-            measures.note(&request, cloud, RequestNews::Answered);
+            measures.record(&request, cloud, RequestUpdate::Answered);
         })
     }
 }
 
-/// What is recorded of a revision, and found in its image.
-pub(crate) fn recorded(revision: &RevisionRecord, known: Known) -> Recorded {
-    let Known {
+/// Combines what is recorded of a revision with what was found in its image.
+pub(crate) fn recorded_revision(
+    revision: &RevisionRecord,
+    known: RevisionContents,
+) -> RecordedRevision {
+    let RevisionContents {
         inventory,
         registry,
     } = known;
     let plan = &revision.plan;
-    Recorded {
+    RecordedRevision {
         service: revision.service.clone(),
         package: revision.package.clone(),
         flavour: revision.flavour.clone(),
@@ -146,21 +153,22 @@ pub(crate) fn recorded(revision: &RevisionRecord, known: Known) -> Recorded {
     }
 }
 
-/// Who hears of what a servant and its robot tell.
-struct Reports {
+/// Observer of the reports of a servant and its robot.
+struct ServantObserver {
     id: String,
     revision: Arc<RevisionRecord>,
     catalogue: Arc<Catalogue>,
     journal: Journal,
-    measures: Arc<Measures>,
+    measures: Arc<RequestRecorder>,
 }
 
-impl Observer for Reports {
-    fn fits(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
-        self.catalogue.fits(&self.revision, made_of, image)
+impl Observer for ServantObserver {
+    fn check_stub(&self, made_of: Option<u64>, image: &str) -> Result<(), String> {
+        self.catalogue
+            .check_stub_compatibility(&self.revision, made_of, image)
     }
 
-    fn event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {
+    fn record_event(&self, level: Level, kind: &str, message: &str, robot: Option<&str>) {
         let about = NewEvent {
             service: Some(&self.revision.service),
             servant: Some(&self.id),
@@ -173,13 +181,14 @@ impl Observer for Reports {
         }
     }
 
-    fn served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>) {
+    fn on_served_locally(&self, robot: &str, node: &str, at: SystemTime, why: Option<&str>) {
         let service = &self.revision.service;
-        self.journal.local((service, robot, node), at, why);
+        self.journal
+            .record_local_period((service, robot, node), at, why);
     }
 
-    fn measured(&self, request: &Request, news: RequestNews) {
+    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
         let cloud = request.queue + request.compute;
-        self.measures.note(request, cloud, news);
+        self.measures.record(request, cloud, news);
     }
 }

@@ -1,5 +1,5 @@
-//! Brings services from one revision to another: robots are given the one or the other, what comes of it is counted, and what is
-//! decided of that is carried out, told and written into the database, so that the next daemon goes on with it.
+//! Runs rollouts: assigns robots to the stable revision or the candidate, counts results, and carries the decisions
+//! out. State is reported and stored in the database, so that the next daemon continues it.
 
 mod orders;
 
@@ -14,67 +14,69 @@ use tokio::sync::Notify;
 
 pub use orders::check_terms;
 
-use super::Inner;
-use crate::decide::rollout::{Given, Rollout, Step, Wait, given, step};
+use super::ChoreographerInner;
+use crate::decide::rollout::{
+    AssignedRevision, PromotionBlocker, Rollout, RolloutStep, assign_revision, next_step,
+};
 use crate::lives::handle::Handle;
 use crate::request::serves_no_robot;
 use crate::{Error, ServantRequest};
 
-/// Between two looks at what was counted.
+/// Interval between evaluations.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Of all services that had one: the last.
+/// The last rollout of each service.
 #[derive(Default)]
 pub(crate) struct Rollouts {
-    /// Held for moments only: each request is counted here.
-    kept: Mutex<Kept>,
-    /// Held from reading what is kept until it is written, so that what is written last is the newest.
+    /// Held only briefly: each request is counted here.
+    kept: Mutex<RolloutTable>,
+    /// Held from reading the table until it is written, so that the last write is the newest.
     writing: Mutex<()>,
-    /// Held while a rollout begins, takes a step or is ordered to.
+    /// Held while a rollout starts, takes a step or executes an order.
     turn: tokio::sync::Mutex<()>,
-    /// One has begun.
+    /// Signals that a rollout has started.
     begun: Notify,
 }
 
 #[derive(Default)]
-struct Kept {
+struct RolloutTable {
     by_service: BTreeMap<String, Rollout>,
-    /// Services whose counts or robots are not written yet.
+    /// Services with unwritten counts or robots.
     changed: BTreeSet<String>,
-    /// What canaries wait for whose time to be promoted has come, by service.
-    waits: BTreeMap<String, Wait>,
+    /// Blockers of canaries whose promotion time has come, by service.
+    waits: BTreeMap<String, PromotionBlocker>,
 }
 
-fn goes_on(of: &Rollout) -> bool {
+fn is_ongoing(of: &Rollout) -> bool {
     matches!(of.state, RolloutState::Canary | RolloutState::Draining)
 }
 
 impl Rollouts {
-    /// A request to a servant of this revision was answered after so many milliseconds, or failed.
+    /// Records that a request to a servant of this revision was answered after so many milliseconds, or failed.
     pub(crate) fn note_request(&self, service: &str, revision: u64, millis: Option<f64>) {
-        self.note(service, revision, |seen| {
-            seen.requests.note(millis.is_none());
-            millis.into_iter().for_each(|time| seen.times.note(time));
+        self.record(service, revision, |seen| {
+            seen.requests.record(millis.is_none());
+            millis.into_iter().for_each(|time| seen.times.record(time));
         });
     }
 
-    /// A request that counts as failed, since it was late, was answered after all, after so many milliseconds.
+    /// Records the late answer of a request that counts as failed.
     pub(crate) fn note_late_answer(&self, service: &str, revision: u64, millis: f64) {
-        self.note(service, revision, |seen| seen.times.note(millis));
+        self.record(service, revision, |seen| seen.times.record(millis));
     }
 
-    /// A servant has become ready, or has failed. One that is measured may be given limits that no servant can do with, and
-    /// does not count.
+    /// Records that a servant became ready or failed. A measured servant does not count, since its limits may be too
+    /// low for any servant.
     pub(crate) fn note_servant(&self, handle: &Handle, failed: bool) {
         if serves_no_robot(&handle.robot, handle.anonymous) {
             return;
         }
-        self.note(handle.service(), handle.revision.number, |seen| {
-            seen.servants.note(failed);
+        self.record(handle.service(), handle.revision.number, |seen| {
+            seen.servants.record(failed);
         });
     }
 
-    /// A robot without a name is gone: it does not come back, and another takes its place in the canary.
+    /// Frees the canary's place of a robot without a name, which does not come back.
     pub(crate) fn note_gone(&self, handle: &Handle) {
         let mut kept = self.kept.lock();
         let rollout = kept.by_service.get_mut(handle.service());
@@ -87,11 +89,11 @@ impl Rollouts {
         }
     }
 
-    fn note(
+    fn record(
         &self,
         service: &str,
         revision: u64,
-        change: impl FnOnce(&mut crate::decide::rollout::Seen),
+        change: impl FnOnce(&mut crate::decide::rollout::RevisionStats),
     ) {
         let mut kept = self.kept.lock();
         let Some(rollout) = kept.by_service.get_mut(service) else {
@@ -107,8 +109,8 @@ impl Rollouts {
         kept.changed.insert(service.to_owned());
     }
 
-    /// The robot is given the candidate from now on.
-    pub(crate) fn takes_canary(&self, service: &str, robot: &str) {
+    /// Assigns the candidate to the robot.
+    pub(crate) fn add_canary_robot(&self, service: &str, robot: &str) {
         let mut kept = self.kept.lock();
         if let Some(rollout) = kept.by_service.get_mut(service) {
             rollout.robots.push(robot.to_owned());
@@ -116,7 +118,7 @@ impl Rollouts {
         }
     }
 
-    /// Revisions that serve robots besides the current ones, each with its service.
+    /// Returns the canary revisions, each with its service.
     pub(crate) fn candidates(&self) -> Vec<(String, u64)> {
         let kept = self.kept.lock();
         let canaries = kept.by_service.iter();
@@ -127,8 +129,8 @@ impl Rollouts {
     }
 }
 
-impl Inner {
-    /// Reads what an earlier daemon had begun.
+impl ChoreographerInner {
+    /// Loads the rollouts of an earlier daemon.
     pub(crate) fn read_rollouts(&self) -> Result<(), Error> {
         for (service, text) in self.state.rollouts()? {
             match serde_json::from_str(&text) {
@@ -136,22 +138,23 @@ impl Inner {
                     let mut kept = self.rollouts.kept.lock();
                     kept.by_service.insert(service, rollout);
                 }
-                // Of a later version: the current revision serves all.
-                Err(error) => tracing::warn!("the rollout of {service} cannot be read: {error}"),
+                // Written by a later version: the current revision serves all.
+                Err(error) => tracing::warn!("cannot read the rollout of {service}: {error}"),
             }
         }
         self.rollouts.begun.notify_one();
         Ok(())
     }
 
-    /// The revision that a robot is given, and whether it is one more that is given the candidate. That is so once
-    /// [`Rollouts::takes_canary`] is told: a robot that is refused, or keeps another servant, takes no place of a canary.
+    /// Returns the revision for a robot, and whether it is newly assigned to the candidate. The assignment takes effect
+    /// with [`Rollouts::add_canary_robot`]: a robot that is refused, or keeps another servant, does not use up a
+    /// canary's place.
     pub(crate) fn revision_for(
         &self,
         request: &ServantRequest,
     ) -> Result<(Arc<RevisionRecord>, bool), Error> {
         let (service, robot) = (&request.service, &request.robot);
-        let current = self.catalogue.current(service)?;
+        let current = self.catalogue.current_revision(service)?;
         if serves_no_robot(robot, request.anonymous) {
             return Ok((current, false));
         }
@@ -161,10 +164,10 @@ impl Inner {
             let Some(rollout) = rollout.filter(|rollout| rollout.stable == current.number) else {
                 return Ok((current, false));
             };
-            match given(rollout, service, robot) {
-                Given::Current => return Ok((current, false)),
-                Given::Candidate => (rollout.candidate, false),
-                Given::CandidateFromNow => (rollout.candidate, true),
+            match assign_revision(rollout, service, robot) {
+                AssignedRevision::Current => return Ok((current, false)),
+                AssignedRevision::Candidate => (rollout.candidate, false),
+                AssignedRevision::CandidateFromNow => (rollout.candidate, true),
             }
         };
         Ok(match self.state.revision(service, candidate)? {
@@ -173,13 +176,13 @@ impl Inner {
         })
     }
 
-    /// What the canary of a service waits for whose time to be promoted has come.
-    fn rollout_waits(&self, service: &str) -> Option<Wait> {
+    /// Returns what blocks the promotion of a service's canary.
+    fn promotion_blocker(&self, service: &str) -> Option<PromotionBlocker> {
         self.rollouts.kept.lock().waits.get(service).copied()
     }
 
-    /// Notes what a canary waits for, and tells of it when that is another thing than before.
-    fn set_rollout_waits(&self, service: &str, candidate: u64, wait: Option<Wait>) {
+    /// Sets what blocks the promotion of a canary, and reports it if that is new.
+    fn set_promotion_blocker(&self, service: &str, candidate: u64, wait: Option<PromotionBlocker>) {
         let before = {
             let waits = &mut self.rollouts.kept.lock().waits;
             match wait {
@@ -187,7 +190,7 @@ impl Inner {
                 None => waits.remove(service),
             }
         };
-        let news = wait.filter(|wait| !before.is_some_and(|before| before.is_like(wait)));
+        let news = wait.filter(|wait| !before.is_some_and(|before| before.is_same_kind(wait)));
         if let Some(wait) = news {
             let message = format!("revision {candidate} of {service} is not promoted yet: {wait}");
             let about = NewEvent {
@@ -208,7 +211,7 @@ impl Inner {
         Ok(self.state.set_rollout(service, &text)?)
     }
 
-    /// Writes the counts and robots that have changed. What cannot be written is tried again.
+    /// Writes changed counts and robots. Failed writes are retried.
     pub(crate) fn write_changed(&self) {
         let changed = std::mem::take(&mut self.rollouts.kept.lock().changed);
         for service in changed {
@@ -217,13 +220,13 @@ impl Inner {
                 continue;
             };
             if let Err(error) = self.write_rollout(&service, &rollout) {
-                tracing::warn!("the counts of the rollout of {service} are not written: {error}");
+                tracing::warn!("cannot write the counts of the rollout of {service}: {error}");
                 self.rollouts.kept.lock().changed.insert(service);
             }
         }
     }
 
-    /// A rollout that begins takes the place of the last one of its service.
+    /// Adds a new rollout, which replaces the last one of its service.
     fn add_rollout(&self, service: &str, rollout: Rollout) -> Result<(), Error> {
         {
             let _writing = self.rollouts.writing.lock();
@@ -231,12 +234,12 @@ impl Inner {
             let mut kept = self.rollouts.kept.lock();
             kept.by_service.insert(service.to_owned(), rollout.clone());
         }
-        self.tell_rollout(service, &rollout);
+        self.report_rollout(service, &rollout);
         Ok(())
     }
 
-    /// Sets the state of a rollout that goes on and is of this candidate, in the database first; then tells of it. Whether there
-    /// is such a one.
+    /// Sets the state of an ongoing rollout of this candidate, in the database first, and reports it. Returns false if
+    /// there is no such rollout.
     fn set_rollout_state(
         &self,
         service: &str,
@@ -247,7 +250,7 @@ impl Inner {
         let next = {
             let _writing = self.rollouts.writing.lock();
             let rollout = self.rollout(service);
-            let Some(mut next) = rollout.filter(|it| it.candidate == candidate && goes_on(it))
+            let Some(mut next) = rollout.filter(|it| it.candidate == candidate && is_ongoing(it))
             else {
                 return Ok(false);
             };
@@ -257,26 +260,26 @@ impl Inner {
             self.write_rollout(service, &next)?;
             let mut kept = self.rollouts.kept.lock();
             if let Some(rollout) = kept.by_service.get_mut(service) {
-                // What was counted meanwhile stays.
+                // Counts from the meantime are kept.
                 (rollout.state, rollout.changed) = (next.state, next.changed);
                 rollout.reason.clone_from(&next.reason);
             }
             kept.waits.remove(service);
             next
         };
-        self.tell_rollout(service, &next);
+        self.report_rollout(service, &next);
         Ok(true)
     }
 
-    fn tell_rollout(&self, service: &str, rollout: &Rollout) {
+    fn report_rollout(&self, service: &str, rollout: &Rollout) {
         let (candidate, reason) = (rollout.candidate, &rollout.reason);
         let (kind, what) = match rollout.state {
             RolloutState::Canary => ("rollout-started", "serves its first robots"),
             RolloutState::Draining => ("rollout-promoted", "serves all new robots"),
             RolloutState::Promoted => ("rollout-promoted", "serves all robots"),
-            RolloutState::RolledBack => ("rollout-rolled-back", "was taken back"),
-            RolloutState::Aborted => ("rollout-aborted", "was taken back"),
-            RolloutState::Replaced => ("rollout-replaced", "is on its way no longer"),
+            RolloutState::RolledBack => ("rollout-rolled-back", "was rolled back"),
+            RolloutState::Aborted => ("rollout-aborted", "was rolled back"),
+            RolloutState::Replaced => ("rollout-replaced", "was replaced"),
         };
         let message = format!("revision {candidate} of {service} {what}: {reason}");
         let about = NewEvent {
@@ -287,7 +290,7 @@ impl Inner {
             RolloutState::RolledBack => self.journal.warning(kind, &message, &about),
             _ => self.journal.info(kind, &message, &about),
         }
-        self.warm_pool.look();
+        self.warm_pool.wake();
     }
 
     fn end_servants(&self, service: &str, reason: &str, of: impl Fn(u64) -> bool) {
@@ -298,7 +301,7 @@ impl Inner {
         }
     }
 
-    /// Takes a canary back: its robots get the revision before when they come back.
+    /// Rolls a canary back: its robots get the previous revision when they come back.
     fn take_back(
         &self,
         service: &str,
@@ -307,14 +310,14 @@ impl Inner {
         reason: &str,
     ) -> Result<(), Error> {
         if self.set_rollout_state(service, candidate, state, reason)? {
-            let words = format!("its revision was taken back: {reason}");
+            let words = format!("its revision was rolled back: {reason}");
             self.end_servants(service, &words, |revision| revision == candidate);
         }
         Ok(())
     }
 
-    /// A canary becomes the current revision. The turn is held: nobody takes it back meanwhile. Where another revision was
-    /// published meanwhile, that one stays.
+    /// Promotes a canary to the current revision. The caller holds the turn, so it is not rolled back meanwhile. If
+    /// another revision was published meanwhile, that one stays.
     async fn promote(&self, service: &str, canary: &Rollout, reason: &str) -> Result<(), Error> {
         let (stable, candidate) = (canary.stable, canary.candidate);
         if !self.catalogue.promote(service, stable, candidate).await? {
@@ -326,31 +329,31 @@ impl Inner {
         Ok(())
     }
 
-    /// Does what is to be done about the rollout of a service now.
+    /// Takes the next step of a service's rollout.
     async fn take_step(&self, service: &str) -> Result<(), Error> {
         let _turn = self.rollouts.turn.lock().await;
-        // Somebody else may have had the turn before.
+        // It may have changed before the turn was acquired.
         let Some(rollout) = self.rollout(service) else {
             return Ok(());
         };
         let candidate = rollout.candidate;
-        let step = step(&rollout, store::now());
+        let step = next_step(&rollout, store::now());
         let wait = match step {
-            Step::Waits(wait) => Some(wait),
+            RolloutStep::Waits(wait) => Some(wait),
             _ => None,
         };
-        self.set_rollout_waits(service, candidate, wait);
+        self.set_promotion_blocker(service, candidate, wait);
         match step {
-            Step::Stays | Step::Waits(_) => {}
-            Step::RollsBack(reason) => {
+            RolloutStep::Stays | RolloutStep::Waits(_) => {}
+            RolloutStep::RollsBack(reason) => {
                 self.take_back(service, candidate, RolloutState::RolledBack, &reason)?;
             }
-            Step::Promotes(reason) => self.promote(service, &rollout, &reason).await?,
-            Step::EndsOthers => {
-                let reason = "the others' deadline is over";
+            RolloutStep::Promotes(reason) => self.promote(service, &rollout, &reason).await?,
+            RolloutStep::EndsOthers => {
+                let reason = "the deadline of the other revisions has passed";
                 if self.set_rollout_state(service, candidate, RolloutState::Promoted, reason)? {
                     let words =
-                        format!("its deadline is over: revision {candidate} takes its place");
+                        format!("its deadline has passed: revision {candidate} replaces it");
                     self.end_servants(service, &words, |revision| revision != candidate);
                 }
             }
@@ -359,23 +362,24 @@ impl Inner {
     }
 }
 
-/// Looks after the rollouts that go on, for ever.
-pub(crate) async fn keep(inner: Arc<Inner>) {
+/// Runs the ongoing rollouts forever.
+pub(crate) async fn run_rollouts(inner: Arc<ChoreographerInner>) {
     loop {
         inner.write_changed();
         let on_the_way: Vec<String> = {
             let kept = inner.rollouts.kept.lock();
-            let going = kept.by_service.iter().filter(|(_, it)| goes_on(it));
+            let going = kept.by_service.iter().filter(|(_, it)| is_ongoing(it));
             going.map(|(service, _)| service.clone()).collect()
         };
         for service in &on_the_way {
             if let Err(error) = inner.take_step(service).await {
-                tracing::warn!("the rollout of {service} does not go on: {error}");
+                tracing::warn!("cannot continue the rollout of {service}: {error}");
             }
         }
-        match on_the_way.is_empty() {
-            true => inner.rollouts.begun.notified().await,
-            false => tokio::time::sleep(LOOK).await,
+        if on_the_way.is_empty() {
+            inner.rollouts.begun.notified().await
+        } else {
+            tokio::time::sleep(LOOK).await
         }
     }
 }

@@ -1,12 +1,12 @@
-//! Gives what a robot asks of its servant to a candidate, too, and compares what comes of it. The candidate is a servant of
-//! another revision that is given to nobody: what it answers is heard here alone.
+//! Sends a robot's requests to a candidate as well, and compares the results. The candidate is a servant of another
+//! revision without a robot: its answers are only used here.
 //!
 //! ```text
-//!  robot ⇄ bridge, links ─ tap ─▶ servant            heard by a node of its own: topics in, topics out
+//!  robot ⇄ bridge, links ─ tap ─▶ servant            observed by an extra node: topics in, topics out
 //!                           │ calls, goals              │
 //!                           └──────────┐   ┌────────────┘
 //!                                      ▼   ▼
-//!                                     mirror ⇄ candidate ─▶ what differs
+//!                                     mirror ⇄ candidate ─▶ differences
 //! ```
 
 mod exchanges;
@@ -25,28 +25,28 @@ use store::RevisionRecord;
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use super::driver::{self, Beginning};
-use crate::decide::demand::Asked;
+use super::driver::{self, ServantSource};
+use crate::decide::demand::LimitSources;
 use crate::lives::handle::Handle;
-use crate::{Choreographer, Error, Lease, Measured};
+use crate::{Choreographer, Error, Lease, MeasuredServant};
 
 use mirror::Mirror;
 
-/// Before the name of a candidate where a robot's name stands: no robot can have it.
+/// Prefix of a candidate's name, in place of a robot's name: no robot can have it.
 const NAMED: &str = "~shadow-";
-/// How often it is looked whether a robot uses the service.
+/// Interval between checks whether a robot uses the service.
 const LOOK: Duration = Duration::from_millis(200);
 
 impl Handle {
-    /// Whether it is a candidate beside a robot's servant.
+    /// Returns true if it is a candidate beside a robot's servant.
     pub(crate) fn is_candidate(&self) -> bool {
         self.robot.starts_with(NAMED)
     }
 }
 
 impl Choreographer {
-    /// Compares a revision of a service with what a robot uses. What happens is told to `events` as it does, but not the end;
-    /// what is held meanwhile counts in `budget`. The candidate is ended however this future is dropped.
+    /// Compares a revision of a service with the one that a robot uses. Progress is reported to `events`, but not the
+    /// end; data held meanwhile counts in `budget`. The candidate is ended even if this future is dropped.
     pub async fn shadow(
         &self,
         service: &str,
@@ -55,7 +55,7 @@ impl Choreographer {
         events: &mpsc::Sender<ShadowEvent>,
     ) -> Result<Shadow, Error> {
         let step = async |title: String| {
-            // Whoever asked has gone: then this is dropped soon.
+            // If the caller is gone, this future is dropped soon.
             let _ = events.send(ShadowEvent::Step { title }).await;
         };
         let revision = self.candidate_of(service, options)?;
@@ -72,8 +72,8 @@ impl Choreographer {
         ))
         .await;
         let candidate = self.start_candidate(&present, revision)?;
-        candidate.lease.admitted().await?;
-        let reach = candidate.lease.ready().await?;
+        candidate.lease.wait_admitted().await?;
+        let reach = candidate.lease.wait_ready().await?;
         if present.is_linked() {
             linked::start(&present, &*reach).await?;
         }
@@ -82,13 +82,13 @@ impl Choreographer {
         Ok(mirror.run().await)
     }
 
-    /// The revision that is to be compared, if it may be.
+    /// Returns the revision to compare, if that is allowed.
     fn candidate_of(
         &self,
         service: &str,
         options: &ShadowOptions,
     ) -> Result<Arc<RevisionRecord>, Error> {
-        self.inner.catalogue.current(service)?;
+        self.inner.catalogue.current_revision(service)?;
         let number = options.revision;
         let Some(revision) = self.inner.state.revision(service, number)? else {
             return Err(Error::Shadow(format!(
@@ -100,14 +100,15 @@ impl Choreographer {
         if acts && !options.acting {
             let what = [&grants.egress[..], &grants.devices[..]].concat();
             return Err(Error::Shadow(format!(
-                "revision {number} of {service} is granted {}: a candidate would use it beside the robot's servant; say --acting if that does no harm",
+                "revision {number} of {service} is granted {}: a candidate would use it beside the robot's servant; \
+                    pass --acting if this is safe",
                 what.join(", ")
             )));
         }
         Ok(revision)
     }
 
-    /// The servant of the robot that is named, or of any, if it can be compared with.
+    /// Returns the servant of the named robot, or of any, if it can be compared with.
     fn robot_for(
         &self,
         service: &str,
@@ -125,12 +126,13 @@ impl Choreographer {
         for handle in servants.iter().filter(of_it) {
             if handle.revision.number == options.revision {
                 why.get_or_insert(format!(
-                    "robot {} uses revision {} of {service} already",
+                    "robot {} already uses revision {} of {service}",
                     handle.robot, options.revision
                 ));
             } else if handle.is_linked() && handle.is_place() {
                 why.get_or_insert(format!(
-                    "robot {} shares {service} by stubs, which know it by names of their own; of those that share it, only robots that speak rosbridge are compared with",
+                    "robot {} uses the shared service {service} through stubs, which use other names; for shared \
+                        services only rosbridge robots can be compared with",
                     handle.robot
                 ));
             } else {
@@ -165,23 +167,23 @@ impl Choreographer {
                     "used"
                 };
                 return Err(Error::Shadow(format!(
-                    "{who} {used} {service} within {} s; see who does with: cloudroidctl servants",
+                    "{who} {used} {service} within {} s; see which robots do with: cloudroidctl servants",
                     options.seconds
                 )));
             }
         }
     }
 
-    /// A servant of this revision with the limits of the present one. Of cores it is promised what is set aside for servants that
-    /// ask for none, as the probe of a push is; memory is promised in full.
+    /// Starts a servant of this revision with the limits of the present one. It is promised the reserved cores of
+    /// servants without limits, like the probe of a push; memory is promised in full.
     fn start_candidate(
         &self,
         present: &Handle,
         revision: Arc<RevisionRecord>,
-    ) -> Result<Measured, Error> {
+    ) -> Result<MeasuredServant, Error> {
         let inner = &self.inner;
         let limits = present.limits();
-        let asked = Asked {
+        let asked = LimitSources {
             set: api::Limits::default(),
             terms: api::Terms {
                 limits: api::Limits {
@@ -214,8 +216,8 @@ impl Choreographer {
         tokio::spawn(driver::drive(
             Arc::clone(inner),
             handle,
-            Beginning::Asked(None),
+            ServantSource::Asked(None),
         ));
-        Ok(Measured { lease })
+        Ok(MeasuredServant { lease })
     }
 }

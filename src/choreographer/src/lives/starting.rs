@@ -1,23 +1,23 @@
-//! From a servant that has capacity to one that can be reached: its container is made, or taken from the warm pool.
+//! Starts admitted servants: their container is made, or taken from the warm pool.
 
 use std::sync::Arc;
 
 use futures_util::future::join_all;
 use reach::Reach;
 use reach::master::resident_config;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::spec::{NodeSpec, Spec};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 use tokio::time::{Instant, timeout_at};
 
-use super::warm_pool::Warm;
-use super::{Inner, limits, reaching};
-use crate::decide::terms::in_words;
+use super::warm_pool::WarmServant;
+use super::{ChoreographerInner, limits, reaching};
+use crate::decide::terms::limits_in_words;
 use crate::lives::handle::{Failure, Handle};
 use crate::{Error, engine_limits};
 
-/// Writes down that the servant is, before it runs: a daemon killed now finds it again.
-pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
+/// Records the servant before it runs: a daemon that is killed now finds it again.
+pub(super) fn record(inner: &ChoreographerInner, handle: &Handle) -> Result<(), Failure> {
     let record = ServantRecord {
         id: handle.id.clone(),
         service: handle.service().to_owned(),
@@ -25,38 +25,42 @@ pub(super) fn record(inner: &Inner, handle: &Handle) -> Result<(), Failure> {
         robot: handle.robot.clone(),
         anonymous: handle.anonymous,
         created: handle.created,
-        limits: handle.all_asked().set,
+        limits: handle.limit_sources().set,
         terms: Some(handle.terms()),
     };
     let added = inner.state.add_servant(&record);
-    added.map_err(|error| could_not_start(error.into()))
+    added.map_err(|error| start_failure(error.into()))
 }
 
 pub(super) async fn start(
-    inner: &Arc<Inner>,
+    inner: &Arc<ChoreographerInner>,
     handle: &Arc<Handle>,
-) -> Result<Arc<dyn Servant>, Failure> {
-    let nodes = planned(handle);
-    let spec = spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes);
-    let started = inner.engine.start(spec.map_err(could_not_start)?).await;
-    started.map_err(|error| could_not_start(error.into()))
+) -> Result<Arc<dyn ServantHandle>, Failure> {
+    let nodes = initial_nodes(handle);
+    let spec = container_spec(inner, &handle.id, &handle.revision, &handle.limits(), nodes);
+    let started = inner.engine.start(spec.map_err(start_failure)?).await;
+    started.map_err(|error| start_failure(error.into()))
 }
 
-/// The nodes to begin with: those of a robot's stubs come one by one.
-fn planned(handle: &Handle) -> Vec<NodeSpec> {
+/// Returns the nodes to start with: those of a robot's stubs are started one by one later.
+fn initial_nodes(handle: &Handle) -> Vec<NodeSpec> {
     if handle.is_linked() {
         return Vec::new();
     }
     handle.revision.plan.nodes.clone()
 }
 
-/// Makes a warm container the robot's: gives it the robot's limits, and starts the nodes where it was made without. None if
-/// it has ended meanwhile, and then nothing is left of it.
-pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>) -> Option<Warm> {
+/// Assigns a warm container to the robot: applies the robot's limits, and starts the nodes if it was made without.
+/// Returns `None`, with nothing left of it, if it has ended meanwhile.
+pub(super) async fn use_warm(
+    inner: &ChoreographerInner,
+    handle: &Handle,
+    warm: Option<WarmServant>,
+) -> Option<WarmServant> {
     let warm = warm?;
     let limits = handle.limits();
     if let Err(error) =
-        limits::fit(&*warm.container, &warm.limits, &limits, inner.options.cores).await
+        limits::fit_container(&*warm.container, &warm.limits, &limits, inner.options.cores).await
     {
         tracing::debug!("a warm container cannot be given {limits:?}: {error}");
         warm.end(inner).await;
@@ -65,11 +69,14 @@ pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>)
     if warm.nodes {
         return Some(warm);
     }
-    // In their order and without waiting for one another. A program that cannot be executed is refused here, and
-    // looked at where the ends of nodes are.
-    let nodes = planned(handle).into_iter();
+    // In order and without waiting for one another. A program that cannot be executed is refused here, and handled with
+    // the exits of nodes.
+    let nodes = initial_nodes(handle).into_iter();
     let started = join_all(nodes.map(|node| warm.container.start_node(node))).await;
-    let lost = |outcome: &Result<(), servant::Error>| matches!(outcome, Err(error) if !matches!(error, servant::Error::Refused { .. }));
+    let lost = |outcome: &Result<(), servant::Error>| {
+        matches!(outcome, Err(error)
+        if !matches!(error, servant::Error::Refused { .. }))
+    };
     if started.iter().any(lost) {
         warm.end(inner).await;
         return None;
@@ -77,39 +84,39 @@ pub(super) async fn use_warm(inner: &Inner, handle: &Handle, warm: Option<Warm>)
     Some(warm)
 }
 
-fn could_not_start(error: Error) -> Failure {
-    Failure::broken(format!("could not be started: {error}"))
+fn start_failure(error: Error) -> Failure {
+    Failure::from_reason(format!("could not be started: {error}"))
 }
 
-/// Reaches the ROS in the container and sets a bridge before it.
+/// Connects to the ROS in the container and puts a bridge in front of it.
 pub(super) async fn reach(
-    inner: &Arc<Inner>,
+    inner: &Arc<ChoreographerInner>,
     handle: &Arc<Handle>,
-    container: &Arc<dyn Servant>,
+    container: &Arc<dyn ServantHandle>,
     deadline: Instant,
 ) -> Result<Arc<dyn Reach>, Failure> {
     let late = |_| {
         let limit = inner.options.start.as_secs();
-        Failure::broken(format!(
-            "could not be reached within {limit} s: its ROS did not come up"
+        Failure::from_reason(format!(
+            "could not be reached within {limit} s: its ROS did not start"
         ))
     };
     timeout_at(deadline, reaching::open(inner, &handle.revision, container))
         .await
         .map_err(late)?
-        .map_err(|error| Failure::broken(format!("cannot be reached: {error}")))
+        .map_err(|error| Failure::from_reason(format!("cannot be reached: {error}")))
 }
 
-/// What the engine is to make: a servant of this revision, with these nodes.
-pub(super) fn spec(
-    inner: &Inner,
+/// Returns the engine's specification of a servant of this revision, with these nodes.
+pub(super) fn container_spec(
+    inner: &ChoreographerInner,
     id: &str,
     revision: &RevisionRecord,
     limits: &api::Limits,
     nodes: Vec<NodeSpec>,
 ) -> Result<Spec, Error> {
     let plan = &revision.plan;
-    for what in inner.engine.check(&plan.grants)? {
+    for what in inner.engine.check_grants(&plan.grants)? {
         let about = NewEvent {
             service: Some(&revision.service),
             servant: Some(id),
@@ -129,36 +136,44 @@ pub(super) fn spec(
     })
 }
 
-/// What its robot stated, if anything, and what follows.
-pub(super) fn report_terms(inner: &Inner, handle: &Handle) {
+/// Reports what its robot stated, if anything, and the consequences.
+pub(super) fn report_terms(inner: &ChoreographerInner, handle: &Handle) {
     let terms = handle.terms();
     if terms.stated.is_empty() {
         return;
     }
-    let promised = match in_words(&handle.asked()) {
-        none if none.is_empty() => "no more than others".to_owned(),
+    let promised = match limits_in_words(&handle.requested_limits()) {
+        none if none.is_empty() => "the default limits".to_owned(),
         limits => limits,
     };
     let message = format!(
-        "servant {} of {}: its robot states {}; it is promised {promised} ({})",
+        "servant {} of {}: its robot requests {}; reserved: {promised} ({})",
         handle.id,
         handle.service(),
-        terms.stated_in_words(),
+        terms.describe_stated(),
         terms.why.join("; "),
     );
-    inner.journal.info("terms", &message, &handle.about());
+    inner
+        .journal
+        .info("terms", &message, &handle.event_context());
 }
 
-/// Of limits that somebody asked for and that are not in force; that of the others the daemon has warned at its start.
-pub(super) fn report_unmet(inner: &Inner, handle: &Handle, container: &Arc<dyn Servant>) {
-    let unmet = container.enforced().unmet(&engine_limits(&handle.asked()));
+/// Reports requested limits that are not in force; the daemon has warned about the others at its start.
+pub(super) fn report_unmet(
+    inner: &ChoreographerInner,
+    handle: &Handle,
+    container: &Arc<dyn ServantHandle>,
+) {
+    let unmet = container
+        .enforced_limits()
+        .unmet_limits(&engine_limits(&handle.requested_limits()));
     if !unmet.is_empty() {
         let message = format!(
-            "servant {} runs without a limit that was asked for: {}",
+            "servant {} runs without a requested limit: {}",
             handle.id,
             unmet.join(", ")
         );
-        let about = handle.about();
+        let about = handle.event_context();
         inner.journal.warning("limits-unmet", &message, &about);
     }
 }

@@ -1,17 +1,17 @@
-//! What is done once in a while for many servants, each at its own pace: one that does not answer keeps no other waiting.
+//! Periodic work on many servants in parallel: one that does not answer delays no other.
 
 use std::collections::HashMap;
 use std::future::Future;
 
 use tokio::task::{Id, JoinSet};
 
-/// Servants that are visited beside each other; more wait for the next look.
+/// Maximum number of concurrent visits; more servants wait for the next round.
 const AT_ONCE: usize = 64;
 
-/// Visits to servants that are under way, at most one to each. Dropping it ends them.
+/// Visits to servants in progress, at most one per servant. Aborted on drop.
 pub(super) struct Visits<T> {
     tasks: JoinSet<T>,
-    /// To the servants of these ids.
+    /// Ids of the visited servants by task.
     servants: HashMap<Id, String>,
 }
 
@@ -25,12 +25,12 @@ impl<T> Default for Visits<T> {
 }
 
 impl<T: Send + 'static> Visits<T> {
-    /// Whether this servant can be visited now: it is not being visited, and there are not too many visits.
+    /// Returns true if this servant can be visited now: it is not being visited, and there are not too many visits.
     pub(super) fn can_begin(&self, servant: &str) -> bool {
         self.servants.len() < AT_ONCE && self.servants.values().all(|id| id != servant)
     }
 
-    /// Begins a visit, if it [can begin](Self::can_begin).
+    /// Starts a visit, if it [can begin](Self::can_begin).
     pub(super) fn begin(&mut self, servant: &str, visit: impl Future<Output = T> + Send + 'static) {
         if self.can_begin(servant) {
             let task = self.tasks.spawn(visit).id();
@@ -38,8 +38,8 @@ impl<T: Send + 'static> Visits<T> {
         }
     }
 
-    /// What the visits gave that are over, each with the servant's id. One that has panicked gives nothing.
-    pub(super) fn take_over(&mut self) -> Vec<(String, T)> {
+    /// Returns the results of the finished visits, each with the servant's id. A panicked visit has no result.
+    pub(super) fn take_finished(&mut self) -> Vec<(String, T)> {
         let mut over = Vec::new();
         while let Some(ended) = self.tasks.try_join_next_with_id() {
             let (task, outcome) = match ended {
@@ -74,7 +74,7 @@ mod tests {
         visits.begin("panics", async { panic!("it is to be seen in the log") });
         assert!(!visits.can_begin("stuck") && !visits.can_begin("a") && visits.can_begin("b"));
         pass().await;
-        assert_eq!(visits.take_over(), [("a".to_owned(), 2)]);
+        assert_eq!(visits.take_finished(), [("a".to_owned(), 2)]);
         assert!(!visits.can_begin("stuck") && visits.can_begin("a") && visits.can_begin("panics"));
     }
 
@@ -86,7 +86,7 @@ mod tests {
         }
         assert_eq!(visits.tasks.len(), AT_ONCE);
         pass().await;
-        assert_eq!(visits.take_over().len(), AT_ONCE);
+        assert_eq!(visits.take_finished().len(), AT_ONCE);
         assert!(visits.can_begin("the next"));
     }
 }

@@ -1,5 +1,4 @@
-//! Carries out what is decided of admission: keeps the book under a lock, has those who wait wait, and tells them where they
-//! stand.
+//! Carries out admission decisions: keeps the ledger under a lock, lets requests wait, and reports their positions.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -12,65 +11,69 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::decide::Amount;
-use crate::decide::admission::{Admitted, Ask, Book, Origin, Position, Refused, Ticket, Verdict};
-use crate::decide::capacity::{Lacking, Push};
+use crate::decide::admission::{
+    AdmissionError, AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, Origin,
+    Position, Ticket,
+};
+use crate::decide::capacity::{PushPromise, Shortage};
 
-/// A robot that waited in vain, or whose connection broke meanwhile, and asks again within this time stands where it stood.
+/// Time within which a robot that waited in vain, or lost its connection meanwhile, keeps its position when it asks
+/// again.
 const KEPT: Duration = Duration::from_secs(30);
-/// Places that are kept at most.
+/// Maximum number of kept positions.
 const MOST_KEPT: usize = 1000;
 
-/// The machine's capacity for servants, shared by all who ask for some.
+/// The machine's capacity for servants, shared by all requesters.
 #[derive(Clone)]
 pub struct Admission {
-    desk: Arc<Mutex<Desk>>,
+    desk: Arc<Mutex<AdmissionState>>,
 }
 
-struct Desk {
-    book: Book,
-    /// Where those who wait are told.
-    doors: HashMap<Ticket, Door>,
-    /// Pushes that were admitted.
-    pushes: HashMap<Ticket, Working>,
-    /// Of robots that waited in vain, or went away while they waited.
-    kept: HashMap<String, Kept>,
+struct AdmissionState {
+    book: AdmissionLedger,
+    /// Waiting requests by ticket.
+    doors: HashMap<Ticket, WaitingRequest>,
+    /// Admitted pushes.
+    pushes: HashMap<Ticket, PushWork>,
+    /// Positions of robots that waited in vain, or went away while waiting.
+    kept: HashMap<String, KeptPosition>,
     tickets: Ticket,
 }
 
-/// The place of one that does not wait just now.
-struct Kept {
+/// The position of a robot that does not wait at the moment.
+struct KeptPosition {
     ticket: Ticket,
     overtaken: u32,
     since: Instant,
 }
 
-struct Door {
+struct WaitingRequest {
     opens: oneshot::Sender<Permit>,
     origin: Origin,
-    stands: watch::Sender<Option<Standing>>,
+    stands: watch::Sender<Option<QueueStanding>>,
 }
 
-struct Working {
-    /// Its promise, which may have been changed.
+struct PushWork {
+    /// The push's promise, which may have been changed.
     has: Arc<Mutex<Option<Amount>>>,
     gives_way: CancellationToken,
 }
 
-/// Where a robot stands that waits, and why nobody is admitted, if so.
+/// Position of a waiting robot, and the reason of a stall, if any.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Standing {
-    /// Its place.
+pub struct QueueStanding {
+    /// Position in the queue.
     pub place: Position,
-    /// What the machine itself waits for, in words.
+    /// Reason of a stall, in words.
     pub stalled: Option<String>,
 }
 
-impl fmt::Display for Standing {
+impl fmt::Display for QueueStanding {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.stalled {
             Some(why) => write!(
                 out,
-                "{why}, and admits nobody meanwhile; this robot is {}",
+                "{why}, so no robot is admitted; this robot is {}",
                 self.place
             ),
             None => write!(out, "this machine is full; this robot is {}", self.place),
@@ -78,29 +81,29 @@ impl fmt::Display for Standing {
     }
 }
 
-/// A promise kept until dropped.
+/// A promise of capacity, released on drop.
 pub struct Permit {
     promise: Promise,
-    /// A push's.
+    /// Set for a push.
     work: Option<(Ticket, CancellationToken)>,
 }
 
-/// How much is promised by a permit. Promises nothing once that is dropped.
+/// The amount promised by a permit. Nothing is promised any more once the permit is dropped.
 #[derive(Clone)]
 pub struct Promise {
-    /// Locked only while the desk is.
+    /// Locked only while the state is locked.
     amount: Arc<Mutex<Option<Amount>>>,
     admission: Admission,
 }
 
 impl Permit {
-    /// How much it promises, to be changed.
+    /// Returns its promise, which can be changed.
     pub fn promise(&self) -> Promise {
         self.promise.clone()
     }
 
-    /// Comes back when a robot needs what a push was promised: it is to be given back soon, and asked for again.
-    pub async fn is_needed(&self) {
+    /// Waits until a robot needs the capacity of a push: it should be given back soon, and requested again.
+    pub async fn wait_needed(&self) {
         match &self.work {
             Some((_, gives_way)) => gives_way.cancelled().await,
             None => std::future::pending().await,
@@ -109,14 +112,14 @@ impl Permit {
 }
 
 impl Promise {
-    /// Promises `wanted` instead, if what is more is free.
-    pub fn change(&self, wanted: Amount) -> Result<(), Refused> {
-        self.admission.decide(|book| {
+    /// Changes the promise to `wanted`, if the increase is free.
+    pub fn change(&self, wanted: Amount) -> Result<(), AdmissionError> {
+        self.admission.update(|book| {
             let mut amount = self.amount.lock();
             let Some(promised) = *amount else {
                 return (Ok(()), Vec::new());
             };
-            match book.change(promised, wanted) {
+            match book.change_promise(promised, wanted) {
                 Ok(admitted) => {
                     *amount = Some(wanted);
                     (Ok(()), admitted)
@@ -139,7 +142,7 @@ impl Drop for Permit {
         if let Some((ticket, _)) = self.work {
             admission.desk.lock().pushes.remove(&ticket);
         }
-        admission.decide(|book| {
+        admission.update(|book| {
             let amount = amount.lock().take().unwrap_or_default();
             ((), book.release(amount))
         });
@@ -147,10 +150,10 @@ impl Drop for Permit {
 }
 
 impl Admission {
-    /// A machine with `capacity` for servants, before which at most `queue` robots may wait.
+    /// Creates the admission control of a machine with `capacity` for servants and a queue of at most `queue` robots.
     pub fn new(capacity: Amount, queue: usize) -> Admission {
-        let desk = Desk {
-            book: Book::new(capacity, queue),
+        let desk = AdmissionState {
+            book: AdmissionLedger::new(capacity, queue),
             doors: HashMap::new(),
             pushes: HashMap::new(),
             kept: HashMap::new(),
@@ -161,35 +164,48 @@ impl Admission {
         }
     }
 
-    /// Decides and records in one go; then gives those who were admitted for it their permits, and tells the others where
-    /// they stand.
-    fn decide<T>(&self, decision: impl FnOnce(&mut Book) -> (T, Vec<Admitted>)) -> T {
+    /// Decides and records atomically; then issues permits to the admitted requests, and reports the positions of the
+    /// others.
+    fn update<T>(
+        &self,
+        decision: impl FnOnce(&mut AdmissionLedger) -> (T, Vec<AdmittedRequest>),
+    ) -> T {
         let mut desk = self.desk.lock();
         let (outcome, admitted) = decision(&mut desk.book);
-        let told = self.admitted(&mut desk, admitted);
-        desk.tell();
+        let told = self.issue_permits(&mut desk, admitted);
+        desk.update_standings();
         drop(desk);
-        hand_over(told);
+        deliver_permits(told);
         outcome
     }
 
-    /// Permits for those who were admitted, and where to hand them over.
-    fn admitted(&self, desk: &mut Desk, admitted: Vec<Admitted>) -> Vec<(Option<Door>, Permit)> {
+    /// Creates permits for the admitted requests, with their recipients.
+    fn issue_permits(
+        &self,
+        desk: &mut AdmissionState,
+        admitted: Vec<AdmittedRequest>,
+    ) -> Vec<(Option<WaitingRequest>, Permit)> {
         let mut told = Vec::new();
-        for Admitted { ticket, amount } in admitted {
-            // One that stops waiting just now has none any more.
+        for AdmittedRequest { ticket, amount } in admitted {
+            // A request that has just stopped waiting has none any more.
             let door = desk.doors.remove(&ticket);
             let origin = door.as_ref().map_or(Origin::Robot, |door| door.origin);
-            told.push((door, self.permit(desk, ticket, origin, amount)));
+            told.push((door, self.new_permit(desk, ticket, origin, amount)));
         }
         told
     }
 
-    fn permit(&self, desk: &mut Desk, ticket: Ticket, origin: Origin, has: Amount) -> Permit {
-        let promise = self.promise(has);
+    fn new_permit(
+        &self,
+        desk: &mut AdmissionState,
+        ticket: Ticket,
+        origin: Origin,
+        has: Amount,
+    ) -> Permit {
+        let promise = self.new_promise(has);
         let work = (origin == Origin::Push).then(|| {
             let gives_way = CancellationToken::new();
-            let working = Working {
+            let working = PushWork {
                 has: Arc::clone(&promise.amount),
                 gives_way: gives_way.clone(),
             };
@@ -199,50 +215,50 @@ impl Admission {
         Permit { promise, work }
     }
 
-    fn promise(&self, amount: Amount) -> Promise {
+    fn new_promise(&self, amount: Amount) -> Promise {
         Promise {
             amount: Arc::new(Mutex::new(Some(amount))),
             admission: self.clone(),
         }
     }
 
-    /// What there is, what is promised of it, and how many wait.
-    pub fn look(&self) -> (Amount, Amount, usize) {
+    /// Returns the capacity, the promised part, and the number of waiting requests.
+    pub fn snapshot(&self) -> (Amount, Amount, usize) {
         let desk = self.desk.lock();
         let book = &desk.book;
-        (book.capacity(), book.promised(), book.waiting())
+        (book.capacity(), book.promised_total(), book.waiting_count())
     }
 
-    /// Why nobody is admitted now, if so.
-    pub fn stalled(&self) -> Option<String> {
-        self.desk.lock().book.stalled().map(str::to_owned)
+    /// Returns the reason why admission is stalled, if so.
+    pub fn stall_reason(&self) -> Option<String> {
+        self.desk.lock().book.stall_reason().map(str::to_owned)
     }
 
-    /// From now on nobody is admitted, for this reason, or those who fit are again; whether that is new.
-    pub(crate) fn stall(&self, why: Option<String>) -> bool {
-        self.decide(|book| {
-            let new = book.stalled().is_some() != why.is_some();
-            (new, book.stall(why))
+    /// Stalls admission for this reason, or resumes it; returns true if that is new.
+    pub(crate) fn set_stall(&self, why: Option<String>) -> bool {
+        self.update(|book| {
+            let new = book.stall_reason().is_some() != why.is_some();
+            (new, book.set_stall(why))
         })
     }
 
-    /// The book as it is now.
-    pub(crate) fn book(&self) -> Book {
+    /// Returns a copy of the ledger.
+    pub(crate) fn ledger(&self) -> AdmissionLedger {
         self.desk.lock().book.clone()
     }
 
-    /// How much more would have to be free for those who wait, and what pushes have.
-    pub(crate) fn lacking(&self) -> (Lacking, Vec<Push>) {
+    /// Returns how much more capacity would have to be free, and the admitted pushes.
+    pub(crate) fn shortage(&self) -> (Shortage, Vec<PushPromise>) {
         let desk = self.desk.lock();
-        let pushes = desk.pushes.iter().map(|(ticket, working)| Push {
+        let pushes = desk.pushes.iter().map(|(ticket, working)| PushPromise {
             ticket: *ticket,
             has: working.has.lock().unwrap_or_default(),
             gives_way: working.gives_way.is_cancelled(),
         });
-        (desk.book.lacking(), pushes.collect())
+        (desk.book.shortage(), pushes.collect())
     }
 
-    /// Asks these pushes for what they have.
+    /// Asks these pushes to give their capacity back.
     pub(crate) fn give_way(&self, pushes: &[Ticket]) {
         let desk = self.desk.lock();
         for push in pushes.iter().filter_map(|ticket| desk.pushes.get(ticket)) {
@@ -250,55 +266,56 @@ impl Admission {
         }
     }
 
-    /// Refuses what would never fit.
-    pub fn check(&self, wanted: Amount) -> Result<(), Refused> {
+    /// Refuses a request that exceeds the capacity of the machine.
+    pub fn check(&self, wanted: Amount) -> Result<(), AdmissionError> {
         self.desk.lock().book.check(wanted)
     }
 
-    /// Takes `wanted` even where it is not free: for servants that run already.
+    /// Takes `wanted` even if it is not free: for servants that run already.
     pub(crate) fn adopt(&self, wanted: Amount) -> Permit {
         self.desk.lock().book.promise(wanted);
         Permit {
-            promise: self.promise(wanted),
+            promise: self.new_promise(wanted),
             work: None,
         }
     }
 
-    /// Whether nobody waits, and the machine does not stall.
-    pub(crate) fn is_calm(&self) -> bool {
-        self.desk.lock().book.is_calm()
+    /// Returns true if no request waits and the machine does not stall.
+    pub(crate) fn is_uncontended(&self) -> bool {
+        self.desk.lock().book.is_uncontended()
     }
 
-    /// Takes `wanted` for something that nobody waits for, where it is free and nobody waits at all.
-    pub(crate) fn admit_now(&self, wanted: Amount) -> Option<Permit> {
+    /// Takes `wanted` for background work, if it is free and no request waits.
+    pub(crate) fn try_admit(&self, wanted: Amount) -> Option<Permit> {
         let spare = self.desk.lock().book.take_spare(wanted);
         spare.then(|| Permit {
-            promise: self.promise(wanted),
+            promise: self.new_promise(wanted),
             work: None,
         })
     }
 
-    /// Takes what is asked for, waiting at most `deadline`, and tells by `stands` where it stands meanwhile. Calls `on_wait`
-    /// when it is not to be had at once.
+    /// Takes the requested amount, waiting at most `deadline`, and reports its position by `stands` meanwhile. Calls
+    /// `on_wait` if it is not available at once.
     pub(crate) async fn admit(
         &self,
-        ask: Ask,
+        ask: AdmissionRequest,
         deadline: Duration,
-        stands: watch::Sender<Option<Standing>>,
+        stands: watch::Sender<Option<QueueStanding>>,
         on_wait: impl FnOnce(),
-    ) -> Result<Permit, Refused> {
+    ) -> Result<Permit, AdmissionError> {
         self.admit_as(None, ask, deadline, stands, on_wait).await
     }
 
-    /// The same for `who`: where it has waited in vain lately, or has gone away while it waited, it stands where it stood.
+    /// Like [`admit`](Self::admit), for the requester `who`: if it has waited in vain lately, or went away while
+    /// waiting, it keeps its position.
     pub(crate) async fn admit_as(
         &self,
         who: Option<&str>,
-        ask: Ask,
+        ask: AdmissionRequest,
         deadline: Duration,
-        stands: watch::Sender<Option<Standing>>,
+        stands: watch::Sender<Option<QueueStanding>>,
         on_wait: impl FnOnce(),
-    ) -> Result<Permit, Refused> {
+    ) -> Result<Permit, AdmissionError> {
         let standing = stands.subscribe();
         let (mut waiting, admitted) = {
             let mut desk = self.desk.lock();
@@ -307,37 +324,37 @@ impl Admission {
             let (ticket, (verdict, others)) = match kept {
                 Some(kept) => (
                     kept.ticket,
-                    desk.book.ask_again(kept.ticket, ask, kept.overtaken),
+                    desk.book.request_again(kept.ticket, ask, kept.overtaken),
                 ),
                 None => {
                     desk.tickets += 1;
                     let ticket = desk.tickets;
-                    (ticket, desk.book.ask(ticket, ask))
+                    (ticket, desk.book.request(ticket, ask))
                 }
             };
-            let told = self.admitted(&mut desk, others);
+            let told = self.issue_permits(&mut desk, others);
             let outcome = match verdict {
-                Verdict::Admitted => {
-                    Err(Ok(self.permit(&mut desk, ticket, ask.origin, ask.wanted)))
-                }
-                Verdict::Refused(refused) => Err(Err(refused)),
-                Verdict::Waits => {
+                AdmissionVerdict::Admitted => Err(Ok(
+                    self.new_permit(&mut desk, ticket, ask.origin, ask.wanted)
+                )),
+                AdmissionVerdict::Refused(refused) => Err(Err(refused)),
+                AdmissionVerdict::Waits => {
                     let (opens, admitted) = oneshot::channel();
-                    let door = Door {
+                    let door = WaitingRequest {
                         opens,
                         origin: ask.origin,
                         stands,
                     };
                     desk.doors.insert(ticket, door);
-                    desk.tell();
+                    desk.update_standings();
                     Ok((ticket, admitted))
                 }
             };
             drop(desk);
-            hand_over(told);
+            deliver_permits(told);
             match outcome {
                 Ok((ticket, admitted)) => {
-                    let waiting = Waiting {
+                    let waiting = QueuedTicket {
                         admission: self,
                         ticket,
                         who,
@@ -355,14 +372,14 @@ impl Admission {
             }
             _ => {
                 let standing = standing.borrow().clone();
-                Err(late(deadline, standing, self.stalled()))
+                Err(timeout_error(deadline, standing, self.stall_reason()))
             }
         }
     }
 }
 
-/// Not under the lock: a permit may be dropped at once, since nobody waits any more.
-fn hand_over(told: Vec<(Option<Door>, Permit)>) {
+/// Delivers permits. Not under the lock: a permit may be dropped at once, if its recipient has stopped waiting.
+fn deliver_permits(told: Vec<(Option<WaitingRequest>, Permit)>) {
     for (door, permit) in told {
         if let Some(door) = door {
             door.stands.send_replace(None);
@@ -371,22 +388,26 @@ fn hand_over(told: Vec<(Option<Door>, Permit)>) {
     }
 }
 
-/// What is told to one who waited in vain.
-fn late(waited: Duration, standing: Option<Standing>, stalled: Option<String>) -> Refused {
+/// Returns the error of a request that waited in vain.
+fn timeout_error(
+    waited: Duration,
+    standing: Option<QueueStanding>,
+    stalled: Option<String>,
+) -> AdmissionError {
     let place = standing.map(|standing| standing.place);
     match stalled {
-        Some(why) => Refused::Stalled { why, waited, place },
-        None => Refused::Deadline { waited, place },
+        Some(why) => AdmissionError::Stalled { why, waited, place },
+        None => AdmissionError::Deadline { waited, place },
     }
 }
 
-impl Desk {
-    /// Keeps the place of one that waits, or was admitted and has not heard of it, for when it asks again.
-    fn keep(&mut self, who: &str, ticket: Ticket) {
-        let overtaken = self.book.overtaken(ticket).unwrap_or(0);
+impl AdmissionState {
+    /// Keeps the position of a request that waits, or was admitted without being notified, for its next attempt.
+    fn keep_position(&mut self, who: &str, ticket: Ticket) {
+        let overtaken = self.book.overtaken_count(ticket).unwrap_or(0);
         self.kept.retain(|_, kept| kept.since.elapsed() < KEPT);
         if self.kept.len() < MOST_KEPT {
-            let kept = Kept {
+            let kept = KeptPosition {
                 ticket,
                 overtaken,
                 since: Instant::now(),
@@ -395,15 +416,15 @@ impl Desk {
         }
     }
 
-    /// Tells robots that wait where they stand now, where that has changed.
-    fn tell(&self) {
-        for (ticket, place) in self.book.places() {
+    /// Reports the positions of waiting robots, if they have changed.
+    fn update_standings(&self) {
+        for (ticket, place) in self.book.queue_positions() {
             let Some(door) = self.doors.get(&ticket) else {
                 continue;
             };
-            let stands = Some(Standing {
+            let stands = Some(QueueStanding {
                 place,
-                stalled: self.book.stalled().map(str::to_owned),
+                stalled: self.book.stall_reason().map(str::to_owned),
             });
             door.stands.send_if_modified(|before| {
                 let changed = *before != stands;
@@ -414,25 +435,26 @@ impl Desk {
     }
 }
 
-/// One that waits. When it stops waiting, those behind it may fit.
-struct Waiting<'a> {
+/// A waiting request. When it stops waiting, those behind it may fit.
+struct QueuedTicket<'a> {
     admission: &'a Admission,
     ticket: Ticket,
-    /// Whose place is kept when it stops.
+    /// The requester whose position is kept when it stops waiting.
     who: Option<&'a str>,
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for QueuedTicket<'_> {
     fn drop(&mut self) {
         let door = {
             let mut desk = self.admission.desk.lock();
             if let Some(who) = self.who {
-                desk.keep(who, self.ticket);
+                desk.keep_position(who, self.ticket);
             }
             desk.doors.remove(&self.ticket)
         };
-        self.admission.decide(|book| ((), book.leave(self.ticket)));
-        // A permit that was handed over to nobody is dropped with it, which locks the desk.
+        self.admission
+            .update(|book| ((), book.withdraw(self.ticket)));
+        // A permit that was not received is dropped with it, which locks the state.
         drop(door);
     }
 }
@@ -447,14 +469,14 @@ mod tests {
         Admission::new(Amount::new(2.0, 1000), 4)
     }
 
-    /// A robot that asks for so many cores.
+    /// Requests these cores for a robot.
     async fn robot(
         room: &Admission,
         cpus: f64,
         patience: Duration,
         on_wait: impl FnOnce(),
-    ) -> Result<Permit, Refused> {
-        let ask = Ask::robot(Amount::new(cpus, 0), 0);
+    ) -> Result<Permit, AdmissionError> {
+        let ask = AdmissionRequest::robot(Amount::new(cpus, 0), 0);
         room.admit(ask, patience, watch::Sender::new(None), on_wait)
             .await
     }
@@ -467,11 +489,11 @@ mod tests {
         let second = robot(&room, 1.0, SECOND, || drop(first.take()));
         let second = second.await.expect("it came free");
         assert_eq!(
-            room.look(),
+            room.snapshot(),
             (Amount::new(2.0, 1000), Amount::new(1.0, 0), 0)
         );
         drop(second);
-        assert_eq!(room.look().1, Amount::NONE);
+        assert_eq!(room.snapshot().1, Amount::NONE);
     }
 
     #[tokio::test(start_paused = true)]
@@ -483,10 +505,10 @@ mod tests {
         let (big, small) = tokio::join!(big, small);
         assert_eq!(
             big.expect_err("never free").to_string(),
-            "this machine is full; no room came free within 1 s; it was number 1 of 2 that wait"
+            "this machine is full; no capacity became free within 1 s; it was number 1 of 2 waiting"
         );
         small.expect("fits once the big one has gone");
-        assert_eq!(room.look().2, 0, "nobody waits any more");
+        assert_eq!(room.snapshot().2, 0, "nobody waits any more");
     }
 
     #[tokio::test(start_paused = true)]
@@ -494,13 +516,16 @@ mod tests {
         let room = machine();
         let all = robot(&room, 2.0, SECOND, || {}).await.expect("it is free");
         let asks = |who, patience| {
-            let (stands, ask) = (watch::Sender::new(None), Ask::robot(Amount::new(1.0, 0), 0));
+            let (stands, ask) = (
+                watch::Sender::new(None),
+                AdmissionRequest::robot(Amount::new(1.0, 0), 0),
+            );
             let (watched, room) = (stands.subscribe(), room.clone());
             let waiting =
                 async move { room.admit_as(Some(who), ask, patience, stands, || {}).await };
             (watched, waiting)
         };
-        let place = |stands: &watch::Receiver<Option<Standing>>| {
+        let place = |stands: &watch::Receiver<Option<QueueStanding>>| {
             let stands = stands.borrow();
             stands.as_ref().map(|stands| stands.place.place)
         };
@@ -515,7 +540,7 @@ mod tests {
             assert_eq!((place(&stands), place(&other)), (Some(1), Some(2)));
         });
         again.expect_err("nothing is free");
-        // Too late, and as somebody else.
+        // Too late, and under another name.
         tokio::time::sleep(KEPT).await;
         for who in ["a", "c"] {
             let (stands, again) = asks(who, SECOND);
@@ -534,7 +559,10 @@ mod tests {
         let room = machine();
         let mut all = Some(robot(&room, 2.0, SECOND, || {}).await.expect("it is free"));
         let asks = |who: &'static str| {
-            let (stands, ask) = (watch::Sender::new(None), Ask::robot(Amount::new(2.0, 0), 0));
+            let (stands, ask) = (
+                watch::Sender::new(None),
+                AdmissionRequest::robot(Amount::new(2.0, 0), 0),
+            );
             let (watched, room) = (stands.subscribe(), room.clone());
             let waiting = async move {
                 let admitted = room.admit_as(Some(who), ask, SECOND * 100, stands, || {});
@@ -542,11 +570,11 @@ mod tests {
             };
             (watched, tokio::spawn(waiting))
         };
-        let place = |stands: &watch::Receiver<Option<Standing>>| {
+        let place = |stands: &watch::Receiver<Option<QueueStanding>>| {
             let stands = stands.borrow();
             stands.as_ref().map(|stands| stands.place.place)
         };
-        // The second time it is admitted before it hears of it.
+        // The second time it is admitted before it is notified.
         for is_admitted in [false, true] {
             let (_, first) = asks("a");
             tokio::task::yield_now().await;
@@ -562,7 +590,7 @@ mod tests {
             let (stands, again) = asks("a");
             tokio::task::yield_now().await;
             if is_admitted {
-                // The other has what came free, and it is the next.
+                // The other one got what came free, and it is the next.
                 assert_eq!(place(&stands), Some(1));
                 drop(behind.await.expect("no panic"));
                 again.await.expect("no panic").expect("it comes free");
@@ -575,15 +603,15 @@ mod tests {
                 tokio::time::sleep(KEPT).await;
             }
         }
-        assert_eq!(room.look().2, 0);
+        assert_eq!(room.snapshot().2, 0);
     }
 
     #[tokio::test(start_paused = true)]
     async fn kept_places_are_few() {
         let room = Admission::new(Amount::new(0.0, 0), 2 * MOST_KEPT);
         let waits = (0..MOST_KEPT + 10).map(|number| {
-            let (room, ask) = (room.clone(), Ask::robot(Amount::NONE, 0));
-            room.stall(Some("it swaps".into()));
+            let (room, ask) = (room.clone(), AdmissionRequest::robot(Amount::NONE, 0));
+            room.set_stall(Some("it swaps".into()));
             async move {
                 let who = format!("robot {number}");
                 let stands = watch::Sender::new(None);
@@ -607,12 +635,12 @@ mod tests {
                 _ = &mut gone => panic!("nothing is free"),
                 () = tokio::task::yield_now() => {}
             }
-            assert_eq!(room.look().2, 1);
-            // Admitted, and gone before it hears of it.
+            assert_eq!(room.snapshot().2, 1);
+            // Admitted, and gone before it is notified.
             drop(all);
-            assert_eq!(room.look().1, Amount::new(1.0, 0));
+            assert_eq!(room.snapshot().1, Amount::new(1.0, 0));
         }
-        assert_eq!((room.look().1, room.look().2), (Amount::NONE, 0));
+        assert_eq!((room.snapshot().1, room.snapshot().2), (Amount::NONE, 0));
     }
 
     #[tokio::test(start_paused = true)]
@@ -622,39 +650,42 @@ mod tests {
         let wait = |priority| {
             let (room, stands) = (room.clone(), watch::Sender::new(None));
             let watched = stands.subscribe();
-            let ask = Ask::robot(Amount::new(1.0, 0), priority);
+            let ask = AdmissionRequest::robot(Amount::new(1.0, 0), priority);
             let waiting =
                 tokio::spawn(async move { room.admit(ask, SECOND * 60, stands, || {}).await });
             (watched, waiting)
         };
-        let told = |stands: &mut watch::Receiver<Option<Standing>>| {
-            stands.borrow_and_update().as_ref().map(Standing::to_string)
+        let told = |stands: &mut watch::Receiver<Option<QueueStanding>>| {
+            stands
+                .borrow_and_update()
+                .as_ref()
+                .map(QueueStanding::to_string)
         };
         let (mut first, first_waits) = wait(0);
         first.changed().await.expect("it is told");
         let words = told(&mut first).unwrap_or_default();
         assert_eq!(
             words,
-            "this machine is full; this robot is number 1 of 1 that wait"
+            "this machine is full; this robot is number 1 of 1 waiting"
         );
         let (mut second, second_waits) = wait(1);
         second.changed().await.expect("it is told");
         assert!(told(&mut second).is_some_and(|words| words.contains("number 1 of 2")));
         first.changed().await.expect("it was overtaken");
         assert!(told(&mut first).is_some_and(|words| words.contains("number 2 of 2")));
-        assert!(room.stall(Some("this machine swaps".into())));
+        assert!(room.set_stall(Some("this machine swaps".into())));
         assert!(
-            !room.stall(Some("this machine swaps more".into())),
+            !room.set_stall(Some("this machine swaps more".into())),
             "that is not new"
         );
         drop(all);
         first.changed().await.expect("the machine stalls");
         let words = told(&mut first).unwrap_or_default();
         assert!(
-            words.starts_with("this machine swaps more, and admits nobody meanwhile"),
+            words.starts_with("this machine swaps more, so no robot is admitted"),
             "{words}"
         );
-        assert!(room.stall(None));
+        assert!(room.set_stall(None));
         first_waits.await.expect("no panic").expect("it fits");
         second_waits.await.expect("no panic").expect("it fits");
         assert_eq!(told(&mut first), None);
@@ -663,46 +694,46 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn who_waits_in_vain_for_a_machine_that_stalls_is_told_that() {
         let room = machine();
-        room.stall(Some("this machine swaps".into()));
+        room.set_stall(Some("this machine swaps".into()));
         let refused = robot(&room, 1.0, SECOND, || {})
             .await
             .expect_err("nobody is admitted");
         assert_eq!(
             refused.to_string(),
-            "this machine swaps; this did not end within 1 s; it was number 1 of 1 that wait"
+            "this machine swaps; this did not end within 1 s; it was number 1 of 1 waiting"
         );
     }
 
     #[tokio::test(start_paused = true)]
     async fn a_push_is_told_when_a_robot_needs_what_it_has() {
         let room = machine();
-        let push = Ask::push(Amount::new(0.0, 600));
+        let push = AdmissionRequest::push(Amount::new(0.0, 600));
         let push = room.admit(push, SECOND, watch::Sender::new(None), || {});
         let push = push.await.expect("it is free");
-        let robot = Ask::robot(Amount::new(0.0, 500), 0);
+        let robot = AdmissionRequest::robot(Amount::new(0.0, 500), 0);
         let waits = room.admit(robot, SECOND * 60, watch::Sender::new(None), || {
-            let (lacking, pushes) = room.lacking();
+            let (lacking, pushes) = room.shortage();
             assert_eq!(lacking.first_robot, Amount::new(0.0, 100));
             assert_eq!(pushes.len(), 1);
             room.give_way(&[pushes[0].ticket]);
-            assert!(room.lacking().1[0].gives_way);
+            assert!(room.shortage().1[0].gives_way);
         });
         let gives = async {
-            push.is_needed().await;
+            push.wait_needed().await;
             drop(push);
         };
         let (robot, ()) = tokio::join!(waits, gives);
         let _robot = robot.expect("the push gave way");
-        assert!(room.lacking().1.is_empty());
+        assert!(room.shortage().1.is_empty());
     }
 
     #[tokio::test(start_paused = true)]
     async fn what_a_push_has_is_what_it_is_promised_now() {
         let room = machine();
-        let push = Ask::push(Amount::new(0.1, 100));
+        let push = AdmissionRequest::push(Amount::new(0.1, 100));
         let push = room.admit(push, SECOND, watch::Sender::new(None), || {});
         let push = push.await.expect("it is free");
-        let has = || room.lacking().1[0].has;
+        let has = || room.shortage().1[0].has;
         for now in [Amount::new(1.9, 100), Amount::new(0.5, 200)] {
             push.promise().change(now).expect("it is free");
             assert_eq!(has(), now);
@@ -719,17 +750,17 @@ mod tests {
         let two = robot(&room, 0.5, SECOND, || {}).await.expect("it is free");
         let promise = one.promise();
         promise.change(Amount::new(1.5, 90)).expect("just so");
-        assert_eq!(room.look().1, Amount::new(2.0, 90));
+        assert_eq!(room.snapshot().1, Amount::new(2.0, 90));
         let refused = promise
             .change(Amount::new(1.6, 90))
             .expect_err("more than is left")
             .to_string();
         assert!(refused.contains("1.5 cores"), "{refused}");
-        assert_eq!(room.look().1, Amount::new(2.0, 90));
+        assert_eq!(room.snapshot().1, Amount::new(2.0, 90));
         promise.change(Amount::new(0.1, 1)).expect("less");
         drop(one);
         promise.change(Amount::new(1.0, 1)).expect("nobody's");
         drop(two);
-        assert_eq!(room.look().1, Amount::NONE);
+        assert_eq!(room.snapshot().1, Amount::NONE);
     }
 }

@@ -1,42 +1,42 @@
-//! Cores that are moved while servants work, and a machine that stalls, told with the engine in memory.
+//! Tests of moving cores while servants work, and of a stalling machine, with the in-memory engine.
 
 use super::servants::World;
 use super::*;
-use crate::lives::reaching::Measures;
+use crate::lives::reaching::RequestRecorder;
 
-/// A servant that is ready, of a robot that states this.
+/// Returns a lease of a ready servant, whose robot states this.
 async fn ready(daemon: &Choreographer, robot: &str, query: &[(&str, &str)]) -> Lease {
     let stated = api::Stated::read(query.iter().copied()).expect("valid");
-    let request = ServantRequest::new("greet", robot).stating(stated);
+    let request = ServantRequest::new("greet", robot).with_stated(stated);
     let lease = daemon.ensure(request).expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     lease
 }
 
 fn cpus(lease: &Lease) -> Option<f64> {
     let container = lease.handle().container().expect("it runs");
-    container.enforced().limits.cpus
+    container.enforced_limits().limits.cpus
 }
 
-/// Requests of its rosbridge clients take so long.
-fn takes(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
+/// Records requests of its rosbridge clients with these times.
+fn record_requests(daemon: &Choreographer, lease: &Lease, milliseconds: f64) {
     let handle = lease.handle();
-    let measures = Measures::of(&daemon.inner, &handle.revision, &handle.id);
+    let measures = RequestRecorder::new(&daemon.inner, &handle.revision, &handle.id);
     for _ in 0..3 {
         let took = Duration::from_secs_f64(milliseconds / 1e3);
-        measures.called().tell(Some(took));
+        measures.rosbridge_observer().record(Some(took));
     }
 }
 
-/// Seconds pass until it has as many cores as wanted, in each of which its requests take so long.
-async fn until(
+/// Advances the time until it has the wanted cores; in each second its requests take this long.
+async fn run_until_cpus(
     daemon: &Choreographer,
     lease: &Lease,
     milliseconds: f64,
     wanted: impl Fn(f64) -> bool,
 ) {
     for _ in 0..120 {
-        takes(daemon, lease, milliseconds);
+        record_requests(daemon, lease, milliseconds);
         tokio::time::sleep(Duration::from_secs(1)).await;
         if cpus(lease).is_some_and(&wanted) {
             return;
@@ -51,21 +51,21 @@ async fn one_that_is_near_gets_more_than_its_promise_and_gives_it_back() {
     world.publish("greet", "/greet", |_| {});
     let daemon = world.daemon();
     daemon.keep_watch();
-    // So little that it is held up by it, whatever it uses.
+    // So little that it is throttled, whatever it uses.
     let near = [("cpus", "0.02"), ("max_rrt", "100ms")];
     let near = ready(&daemon, "near", &near).await;
     let other = ready(&daemon, "other", &[("cpus", "0.5")]).await;
     assert_eq!(cpus(&near), Some(0.02));
-    until(&daemon, &near, 95.0, |cpus| cpus > 0.02).await;
-    let told = world.told("cores-moved");
+    run_until_cpus(&daemon, &near, 95.0, |cpus| cpus > 0.02).await;
+    let told = world.event_messages("cores-moved");
     let words = told.last().map(String::as_str).unwrap_or_default();
     assert!(words.contains("cpu.max 0.02 → 0.12 cores"), "{words}");
-    assert!(words.contains("95 ms of the 100 ms"), "{words}");
-    assert!(daemon.moves() > 0);
-    until(&daemon, &near, 5.0, |cpus| cpus == 0.02).await;
+    assert!(words.contains("95 ms; its robot accepts 100 ms"), "{words}");
+    assert!(daemon.move_count() > 0);
+    run_until_cpus(&daemon, &near, 5.0, |cpus| cpus == 0.02).await;
     assert_eq!(cpus(&other), Some(0.5), "nobody has less than was promised");
     assert_eq!(
-        daemon.admission().look().1.cpus(),
+        daemon.admission().snapshot().1.cpus(),
         0.52,
         "promises are as they were"
     );
@@ -80,10 +80,10 @@ async fn without_a_controller_limits_stay_as_they_were_asked_for() {
     let near = [("cpus", "0.02"), ("max_rrt", "100ms")];
     let near = ready(&daemon, "near", &near).await;
     for _ in 0..30 {
-        takes(&daemon, &near, 99.0);
+        record_requests(&daemon, &near, 99.0);
         tokio::time::sleep(Duration::from_secs(1)).await;
     }
-    assert_eq!((cpus(&near), daemon.moves()), (Some(0.02), 0));
+    assert_eq!((cpus(&near), daemon.move_count()), (Some(0.02), 0));
 }
 
 #[tokio::test(start_paused = true)]
@@ -102,21 +102,21 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     let plain = ready(&first, "plain", &[]).await;
     let limits = |lease: &Lease| {
         let container = world.engine.servant(&lease.handle().id).expect("it runs");
-        let limits = servant::engine::Servant::enforced(&*container).limits;
+        let limits = servant::engine::ServantHandle::enforced_limits(&*container).limits;
         (limits.cpus, limits.cpu_weight)
     };
     let mut before = [&moved, &left, &plain].map(limits);
     assert_eq!(before[0], (Some(0.25), Some(250)));
     for (lease, cpus, cpu_weight) in [(&moved, 1.5, 1500), (&plain, 0.05, 1)] {
         let container = lease.handle().container().expect("it runs");
-        let moves = servant::spec::Limits {
+        let moves = servant::spec::ResourceLimits {
             cpus: Some(cpus),
             cpu_weight: Some(cpu_weight),
             ..Default::default()
         };
         container.set_limits(moves).await.expect("it takes them");
     }
-    // One that moves cores itself goes on from what is.
+    // A daemon with a controller continues from the current state.
     let next = daemon(true);
     let inherited = next.adopt().await.expect("adopted");
     assert_eq!(inherited.adopted, 3);
@@ -135,10 +135,10 @@ async fn what_a_controller_has_moved_goes_back_where_the_next_daemon_has_none() 
     assert_eq!(inherited.adopted, 3);
     inherited.removal.await.expect("no panic");
     there(&last).await;
-    // What the kernel gives whom nobody gave a weight.
+    // The kernel's default weight.
     before[2].1 = Some(100);
     assert_eq!([&moved, &left, &plain].map(limits), before);
-    let told = world.told("cores-moved");
+    let told = world.event_messages("cores-moved");
     assert_eq!(told.len(), 2, "{told:?}");
     let words = "back from cpus 1.5, cpu-weight 1500 to cpus 0.25, cpu-weight 250";
     assert!(told.iter().any(|it| it.contains(words)), "{told:?}");
@@ -169,10 +169,10 @@ async fn a_machine_that_stalls_admits_nobody_and_says_so() {
     let fit = fit.expect("a service");
     assert_eq!((fit.now, fit.stalled.is_some()), (false, true));
     inner.note_stall(None);
-    lease.ready().await.expect("it is admitted");
+    lease.wait_ready().await.expect("it is admitted");
     let told = (
-        world.told("machine-stalled"),
-        world.told("machine-recovered"),
+        world.event_messages("machine-stalled"),
+        world.event_messages("machine-recovered"),
     );
     assert_eq!((told.0.len(), told.1.len()), (1, 1), "{told:?}");
     assert!(

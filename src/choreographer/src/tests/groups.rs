@@ -1,4 +1,4 @@
-//! Services that robots share, told with the engine in memory.
+//! Tests of shared services, with the in-memory engine.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::AtomicUsize;
@@ -8,7 +8,7 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use in_memory::Process;
 use ros::bus::{
-    ActionClient, ActionHandler, Bus, BusError, GoalEnd, GoalEvents, Outcome, ServiceHandler,
+    ActionClient, ActionHandler, Bus, BusError, GoalEnd, GoalEvents, GoalOutcome, ServiceHandler,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::Semaphore;
@@ -19,7 +19,7 @@ use crate::decide::group::LEFT;
 
 const LONG: Duration = Duration::from_secs(600);
 
-/// Answers what it was asked, with its servant's id; each answer takes a permit.
+/// A service that echoes its request with its servant's id; each answer takes a permit.
 struct Echo {
     servant: String,
     answers: Arc<Semaphore>,
@@ -36,19 +36,19 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// Takes goals, ends none, and does not care when they are cancelled.
+/// An action server that accepts goals, ends none, and ignores cancellation.
 struct Deaf(Arc<AtomicUsize>);
 
 impl ActionHandler for Deaf {
-    fn goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
         self.0.fetch_add(1, Ordering::SeqCst);
         Ok(())
     }
-    fn cancel(&self, _id: &str) {}
-    fn failed(&self, _reason: &str) {}
+    fn on_cancel(&self, _id: &str) {}
+    fn on_failed(&self, _reason: &str) {}
 }
 
-/// The action that it serves.
+/// Returns the type of the action.
 fn count() -> Arc<ActionDef> {
     let text = "int32 to\n---\nint32 at\n---\nint32 at\n".to_owned();
     let definitions = [("x_msgs/action/Count".to_owned(), text)].into();
@@ -56,18 +56,18 @@ fn count() -> Arc<ActionDef> {
     registry.action("x_msgs/Count").expect("an action")
 }
 
-/// The ends of a client's goals.
+/// Results of a client's goals.
 #[derive(Default)]
 struct Ends(Mutex<Vec<Result<GoalEnd, String>>>);
 
 impl GoalEvents for Ends {
-    fn feedback(&self, _feedback: Bytes) {}
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_feedback(&self, _feedback: Bytes) {}
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         self.0.lock().push(end);
     }
 }
 
-/// A world in which `/echo` can be called, as often as there are permits, and `/count` takes goals.
+/// A world in which `/echo` can be called as often as there are permits, and `/count` accepts goals.
 struct Shop {
     world: World,
     answers: Arc<Semaphore>,
@@ -114,22 +114,22 @@ impl Shop {
 }
 
 impl Shop {
-    /// Ends a servant as a failing machine would; comes back when the group knows.
-    async fn loses(&self, servant: &str) {
+    /// Ends a servant like a failing machine; returns when the group knows.
+    async fn lose_servant(&self, servant: &str) {
         let container = self.world.engine.servant(servant).expect("it runs");
         container.fail("its power went");
-        while self.world.told("shared-servant-lost").is_empty() {
+        while self.world.event_messages("shared-servant-lost").is_empty() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     }
 }
 
-/// A robot that has come.
+/// Connects a robot.
 async fn robot(daemon: &Choreographer, name: &str) -> (Lease, Arc<dyn Bus>) {
     let lease = daemon
         .ensure(ServantRequest::new("echo", name))
         .expect("a lease");
-    let bus = lease.ready().await.expect("ready").bus();
+    let bus = lease.wait_ready().await.expect("ready").bus();
     (lease, bus)
 }
 
@@ -139,20 +139,20 @@ async fn call(bus: &Arc<dyn Bus>, words: &str) -> Result<String, String> {
     Ok(String::from_utf8_lossy(&answer).into_owned())
 }
 
-/// A client of `/count` that has sent so many goals.
-async fn counts(bus: &Arc<dyn Bus>, goals: usize) -> (Box<dyn ActionClient>, Arc<Ends>) {
+/// Returns a client of `/count` that has sent this number of goals.
+async fn send_goals(bus: &Arc<dyn Bus>, goals: usize) -> (Box<dyn ActionClient>, Arc<Ends>) {
     let client = bus.action_client("/count", &count()).expect("an action");
-    client.ready(LONG).await.expect("it is served");
+    client.wait_for_server(LONG).await.expect("it is served");
     let ends = Arc::<Ends>::default();
     for number in 0..goals {
         let goal = Bytes::from_static(&[1, 0, 0, 0]);
-        client.send(&number.to_string(), goal, ends.clone());
+        client.send_goal(&number.to_string(), goal, ends.clone());
     }
     (client, ends)
 }
 
-/// Waits until the group is so.
-async fn until(daemon: &Choreographer, is: impl Fn(&api::Group) -> bool) -> api::Group {
+/// Waits until the group satisfies `is`.
+async fn wait_for_group(daemon: &Choreographer, is: impl Fn(&api::Group) -> bool) -> api::Group {
     loop {
         let groups = daemon.groups("echo");
         if let Some(group) = groups.into_iter().find(|group| is(group)) {
@@ -197,7 +197,7 @@ async fn a_place_has_no_limits_of_its_own() {
     let refused = daemon.set_limits(&lease.handle().id, change).await;
     let refused = refused.expect_err("it has no container").to_string();
     assert!(
-        refused.contains("the place of robot r1 at echo"),
+        refused.contains("the reservation of robot r1 at the shared service echo"),
         "{refused}"
     );
 }
@@ -215,20 +215,20 @@ async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() 
         async move { robot(&daemon, &format!("r{number}")).await }
     });
     let robots = join_all(robots).await;
-    let group = until(&daemon, |group| ready(group) == 2).await;
+    let group = wait_for_group(&daemon, |group| ready(group) == 2).await;
     assert_eq!((group.robots, shop.world.engine.servants().len()), (20, 2));
     let calls = robots.iter().enumerate().flat_map(|(number, (_, bus))| {
         (0..5).map(move |call| (format!("r{number} c{call}"), Arc::clone(bus)))
     });
     let calls = calls.map(|(words, bus)| async move { (call(&bus, &words).await, words) });
     let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
-    // Some are answered, some under way, the others wait.
+    // Some are answered, some in progress, the others wait.
     shop.answers.add_permits(30);
-    until(&daemon, |group| group.answered == 30).await;
+    wait_for_group(&daemon, |group| group.answered == 30).await;
     let victim = &shop.world.engine.servants()[0];
     let container = shop.world.engine.servant(victim).expect("it runs");
     container.fail("its power went");
-    until(&daemon, |group| ready(group) == 2 && group.failed > 0).await;
+    wait_for_group(&daemon, |group| ready(group) == 2 && group.failed > 0).await;
     shop.answers.add_permits(1000);
     let answers = calls.await.expect("no panic");
     let mut failed = 0;
@@ -250,12 +250,12 @@ async fn twenty_robots_share_two_servants_and_one_of_these_ends_in_the_middle() 
             }
         }
     }
-    // What the lost one had; nothing of what waited.
+    // The requests of the lost servant; none of the waiting ones.
     assert_eq!(failed, 8);
     assert_eq!(by.values().sum::<usize>(), 92);
     assert_eq!(by.len(), 3, "{by:?}");
     assert_eq!(shop.asked.load(Ordering::SeqCst), 100);
-    assert_eq!(shop.world.told("shared-servant-lost").len(), 1);
+    assert_eq!(shop.world.event_messages("shared-servant-lost").len(), 1);
 }
 
 #[tokio::test(start_paused = true)]
@@ -268,23 +268,23 @@ async fn what_a_lost_servant_had_is_asked_again_where_that_may_be() {
     });
     let daemon = shop.world.daemon();
     let (_lease, bus) = robot(&daemon, "r1").await;
-    until(&daemon, |group| ready(group) == 2).await;
+    wait_for_group(&daemon, |group| ready(group) == 2).await;
     let calls = (0..10).map(|number| {
         let bus = Arc::clone(&bus);
         async move { call(&bus, &number.to_string()).await }
     });
     let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
-    until(&daemon, |group| {
+    wait_for_group(&daemon, |group| {
         group.servants.iter().all(|it| it.under_way == 5)
     })
     .await;
     let victim = &shop.world.engine.servants()[0];
-    shop.loses(victim).await;
+    shop.lose_servant(victim).await;
     shop.answers.add_permits(100);
     for answer in calls.await.expect("no panic") {
         assert!(answer.is_ok(), "{answer:?}");
     }
-    let group = until(&daemon, |_| true).await;
+    let group = wait_for_group(&daemon, |_| true).await;
     assert_eq!(
         (group.answered, group.failed, group.asked_again),
         (10, 0, 5)
@@ -306,17 +306,17 @@ async fn a_group_grows_under_load_and_shrinks_after_it() {
         async move { call(&bus, &number.to_string()).await }
     });
     let calls = tokio::spawn(join_all(calls.collect::<Vec<_>>()));
-    let group = until(&daemon, |group| ready(group) == 3).await;
+    let group = wait_for_group(&daemon, |group| ready(group) == 3).await;
     assert_eq!(group.waiting, 14, "each works at two");
-    let grown = shop.world.told("shared-servant");
+    let grown = shop.world.event_messages("shared-servant");
     assert!(
-        grown[1].contains("requests at a time are many"),
+        grown[1].contains("concurrent requests are many"),
         "{grown:?}"
     );
     shop.answers.add_permits(100);
     assert!(calls.await.expect("no panic").iter().all(Result::is_ok));
-    until(&daemon, |group| group.servants.len() == 1).await;
-    let shrunk = shop.world.told("shared-servant-retires");
+    wait_for_group(&daemon, |group| group.servants.len() == 1).await;
+    let shrunk = shop.world.event_messages("shared-servant-retires");
     assert_eq!(shrunk.len(), 2, "{shrunk:?}");
     // The last one works until the robot stays away.
     assert!(call(&bus, "still").await.is_ok());
@@ -338,7 +338,7 @@ async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
     });
     let daemon = shop.world.daemon();
     let (_lease, bus) = robot(&daemon, "r1").await;
-    until(&daemon, |group| ready(group) == 2).await;
+    wait_for_group(&daemon, |group| ready(group) == 2).await;
     let calls = tokio::spawn({
         let bus = Arc::clone(&bus);
         async move { call(&bus, "one").await }
@@ -353,15 +353,15 @@ async fn of_replicas_the_first_answers_and_what_that_costs_is_shown() {
         let bus = Arc::clone(&bus);
         async move { call(&bus, "two").await }
     });
-    until(&daemon, |group| {
+    wait_for_group(&daemon, |group| {
         group.servants.iter().all(|it| it.under_way == 1)
     })
     .await;
     let victim = &shop.world.engine.servants()[0];
-    shop.loses(victim).await;
+    shop.lose_servant(victim).await;
     shop.answers.add_permits(100);
     assert!(calls.await.expect("no panic").is_ok());
-    let group = until(&daemon, |group| group.answered == 2).await;
+    let group = wait_for_group(&daemon, |group| group.answered == 2).await;
     assert_eq!((group.failed, group.asked_again, group.wasted), (0, 0, 1));
 }
 
@@ -370,24 +370,24 @@ async fn a_group_that_does_not_start_says_why_and_is_started_anew() {
     let shop = Shop::new(api::Shared::default());
     shop.world
         .engine
-        .breaks("sha256:echo", "the registry is away");
+        .break_image("sha256:echo", "the registry is away");
     let daemon = shop.world.daemon();
     let lease = daemon
         .ensure(ServantRequest::new("echo", "r1"))
         .expect("a lease");
     let refused = lease
-        .ready()
+        .wait_ready()
         .await
         .err()
         .expect("it cannot start")
         .to_string();
     assert!(refused.contains("the registry is away"), "{refused}");
-    lease.handle().ended().await;
+    lease.handle().wait_ended().await;
     let lease = daemon
         .ensure(ServantRequest::new("echo", "r1"))
         .expect("a lease");
-    assert!(lease.ready().await.is_err(), "it was tried again");
-    assert_eq!(shop.world.engine.started().len(), 2);
+    assert!(lease.wait_ready().await.is_err(), "it was tried again");
+    assert_eq!(shop.world.engine.started_specs().len(), 2);
 }
 
 #[tokio::test(start_paused = true)]
@@ -418,12 +418,12 @@ async fn robots_of_ever_new_names_leave_no_more_places_than_are_kept() {
     let (last, _) = robot(&daemon, "last").await;
     let id = last.handle().id.clone();
     drop(last);
-    until(&daemon, |group| group.robots <= LEFT + 1).await;
+    wait_for_group(&daemon, |group| group.robots <= LEFT + 1).await;
     assert!(
         began.elapsed() < options().grace,
         "all of them were kept until their time was over"
     );
-    // Who left last finds its place, and who stayed was not disturbed.
+    // The robot that left last finds its place, and the one that stayed was not disturbed.
     let (last, _) = robot(&daemon, "last").await;
     assert_eq!(last.handle().id, id);
     shop.answers.add_permits(1);
@@ -440,7 +440,7 @@ async fn servants_of_a_group_are_no_robots_that_arrive() {
     let daemon = shop.world.daemon_with(|options| options.warm_pool = 8);
     daemon.keep_warm_pool();
     let (_lease, _bus) = robot(&daemon, "r1").await;
-    until(&daemon, |group| ready(group) == 8).await;
+    wait_for_group(&daemon, |group| ready(group) == 8).await;
     for _ in 0..100 {
         tokio::time::sleep(Duration::from_millis(100)).await;
         let (ahead, _) = daemon.warm_pool();
@@ -455,10 +455,10 @@ async fn what_is_measured_of_a_shared_service_is_a_servant_of_its_own() {
     let daemon = shop.world.daemon();
     let request = ServantRequest::new("echo", "~calibrate-1").anonymous();
     let lease = daemon.ensure(request).expect("a lease");
-    let bus = lease.ready().await.expect("ready").bus();
+    let bus = lease.wait_ready().await.expect("ready").bus();
     shop.answers.add_permits(1);
     assert!(call(&bus, "measured").await.is_ok());
-    // Limits of a container are changed, and no robot's call meets the measurement.
+    // Limits of a container are changed, and no robot's call reaches the measured servant.
     assert!(lease.handle().container().is_some());
     assert!(daemon.groups("echo").is_empty());
 }
@@ -472,8 +472,8 @@ async fn a_goal_that_its_node_does_not_end_holds_up_others_only_while_its_robot_
     let daemon = shop.world.daemon();
     let (_one, one) = robot(&daemon, "one").await;
     let (_two, two) = robot(&daemon, "two").await;
-    let (client, _) = counts(&one, 1).await;
-    let (_other, _) = counts(&two, 1).await;
+    let (client, _) = send_goals(&one, 1).await;
+    let (_other, _) = send_goals(&two, 1).await;
     tokio::time::sleep(LONG).await;
     assert_eq!(shop.goals.load(Ordering::SeqCst), 1, "the robot's alone");
     drop(client);
@@ -491,13 +491,13 @@ async fn a_robot_has_no_more_than_so_many_goals() {
     let shop = Shop::new(api::Shared::default());
     let daemon = shop.world.daemon();
     let (_one, bus) = robot(&daemon, "one").await;
-    let (client, ends) = counts(&bus, 300).await;
-    // One with an id that another has.
-    client.send("7", Bytes::from_static(&[1, 0, 0, 0]), ends.clone());
+    let (client, ends) = send_goals(&bus, 300).await;
+    // A goal with an id that another one has.
+    client.send_goal("7", Bytes::from_static(&[1, 0, 0, 0]), ends.clone());
     tokio::time::sleep(LONG).await;
     assert_eq!(shop.goals.load(Ordering::SeqCst), 256);
     let ends = ends.0.lock();
     let rejected = ends.iter().flatten();
-    let rejected = rejected.filter(|end| end.outcome == Outcome::Rejected);
+    let rejected = rejected.filter(|end| end.outcome == GoalOutcome::Rejected);
     assert_eq!((ends.len(), rejected.count()), (45, 45), "{ends:?}");
 }

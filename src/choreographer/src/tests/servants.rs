@@ -1,4 +1,4 @@
-//! Lives of servants from beginning to end, told with the engine in memory.
+//! Tests of servants' lives from start to end, with the in-memory engine.
 
 use std::future::pending;
 
@@ -11,20 +11,20 @@ mod ahead;
 mod hung;
 mod rollouts;
 
-/// A request for a servant of greet by this robot, which states this.
-pub(super) fn stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
+/// Returns a request of this robot for a servant of `greet`, with this statement.
+pub(super) fn request_stating(robot: &str, query: &[(&str, &str)]) -> ServantRequest {
     let stated = api::Stated::read(query.iter().copied()).expect("valid");
-    ServantRequest::new("greet", robot).stating(stated)
+    ServantRequest::new("greet", robot).with_stated(stated)
 }
 
-/// A lease of a servant that is ready.
+/// Returns a lease of a ready servant.
 pub(super) async fn ready(daemon: &Choreographer, request: ServantRequest) -> Lease {
     let lease = daemon.ensure(request).expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     lease
 }
 
-/// A machine, and what outlives a daemon on it.
+/// A machine, with everything that outlives a daemon on it.
 pub(super) struct World {
     home: tempfile::TempDir,
     pub(super) state: Arc<State>,
@@ -52,12 +52,12 @@ impl World {
         }
     }
 
-    /// A daemon on it, which promises a core to each servant and has two.
+    /// Starts a daemon, which promises a core to each servant and has two.
     pub(super) fn daemon(&self) -> Choreographer {
         self.daemon_with(|_| {})
     }
 
-    /// The same with other options.
+    /// Starts a daemon with other options.
     pub(super) fn daemon_with(&self, change: impl FnOnce(&mut Options)) -> Choreographer {
         let mut options = Options {
             warm_pool: 0,
@@ -76,7 +76,7 @@ impl World {
         )
     }
 
-    /// A revision of a service of one node, `/greeter`, that runs `program` and publishes a topic.
+    /// Returns a revision of a service with one node, `/greeter`, that runs `program` and publishes a topic.
     fn record(service: &str, program: &str) -> RevisionRecord {
         let mut record = revision(&format!("sha256:{service}"), 1.0);
         record.service = service.to_owned();
@@ -89,7 +89,7 @@ impl World {
         record
     }
 
-    /// Publishes a service of one node, `/greeter`, that runs `program` and publishes a topic.
+    /// Publishes a service with one node, `/greeter`, that runs `program` and publishes a topic.
     pub(super) fn publish(
         &self,
         service: &str,
@@ -102,8 +102,8 @@ impl World {
         published.expect("published");
     }
 
-    /// Messages of events of a kind.
-    pub(super) fn told(&self, kind: &str) -> Vec<String> {
+    /// Returns the messages of events of a kind.
+    pub(super) fn event_messages(&self, kind: &str) -> Vec<String> {
         let mut events = self.state.events(0, 1000).expect("events");
         events.retain(|event| event.kind == kind);
         events.into_iter().map(|event| event.message).collect()
@@ -115,8 +115,8 @@ fn node(program: &str) -> NodeSpec {
     serde_json::from_value(node).expect("a node")
 }
 
-/// What keeps a servant from becoming ready, or ends it: the words, and its log.
-fn broken(error: Error) -> (String, Vec<String>) {
+/// Returns the reason and the log of a servant that does not become ready, or has failed.
+fn failure_parts(error: Error) -> (String, Vec<String>) {
     match error {
         Error::Servant { reason, log, .. } => (reason, log),
         other => panic!("{other}"),
@@ -124,7 +124,7 @@ fn broken(error: Error) -> (String, Vec<String>) {
 }
 
 async fn failure(lease: &Lease) -> String {
-    lease.handle().ended().await;
+    lease.handle().wait_ended().await;
     lease.handle().life().reason().expect("a reason")
 }
 
@@ -136,13 +136,13 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    let reach = lease.ready().await.expect("ready");
+    let reach = lease.wait_ready().await.expect("ready");
     assert!(reach.graph().borrow().nodes.contains_key("/greeter"));
     let handle = Arc::clone(lease.handle());
     let shown = daemon.describe(&handle).await;
     assert_eq!((shown.phase, shown.connections), (Phase::Ready, 1));
     assert_eq!(shown.usage.expect("it runs").pids, 1);
-    assert_eq!(world.engine.started()[0].image, "sha256:greet");
+    assert_eq!(world.engine.started_specs()[0].image, "sha256:greet");
     // Back within the grace time, and then not.
     drop(lease);
     let lease = daemon
@@ -150,10 +150,10 @@ async fn a_servant_is_ready_with_its_interface_and_ends_when_its_robot_stays_awa
         .expect("a lease");
     assert!(Arc::ptr_eq(lease.handle(), &handle), "the same servant");
     drop(lease);
-    handle.ended().await;
+    handle.wait_ended().await;
     assert_eq!(handle.life().phase, Phase::Stopped);
     assert!(world.engine.servants().is_empty(), "nothing is left");
-    assert_eq!(world.told("servant-stopped").len(), 1);
+    assert_eq!(world.event_messages("servant-stopped").len(), 1);
 }
 
 #[tokio::test(start_paused = true)]
@@ -169,13 +169,13 @@ async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    let (reason, log) = broken(lease.ready().await.err().expect("it failed"));
+    let (reason, log) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("/greeter exited with status 3"), "{reason}");
     assert_eq!(log, ["no model in /models"]);
     let lease = daemon
         .ensure(ServantRequest::new("other", "r1"))
         .expect("a lease");
-    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("there is no program /missing"), "{reason}");
 }
 
@@ -183,12 +183,14 @@ async fn a_node_that_ends_before_it_is_ready_is_told_with_its_last_words() {
 async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    world.engine.breaks("sha256:greet", "the registry is away");
+    world
+        .engine
+        .break_image("sha256:greet", "the registry is away");
     let daemon = world.daemon();
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.ends_with("the registry is away"), "{reason}");
     let camera = api::Grants {
         devices: vec!["lab.org/camera=0".to_owned()],
@@ -202,18 +204,18 @@ async fn what_cannot_be_started_and_what_is_not_granted_is_told_as_such() {
     let lease = daemon
         .ensure(ServantRequest::new("see", "r1"))
         .expect("a lease");
-    let (reason, _) = broken(lease.ready().await.err().expect("it failed"));
+    let (reason, _) = failure_parts(lease.wait_ready().await.err().expect("it failed"));
     assert!(reason.contains("lab.org/camera=0"), "{reason}");
     world.engine.allow(camera.clone());
     let lease = daemon
         .ensure(ServantRequest::new("see", "r2"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
-    let started = world.engine.started();
+    lease.wait_ready().await.expect("ready");
+    let started = world.engine.started_specs();
     assert_eq!(started.last().expect("it was started").grants, camera);
 }
 
-/// Greets, fails once it was heard, and never recovers.
+/// A program that greets, then fails once it was heard, and never recovers.
 async fn fails(process: Process, after: Duration) -> i32 {
     process.advertise("/greeting", "std_msgs/String");
     tokio::time::sleep(after).await;
@@ -230,10 +232,10 @@ async fn a_failing_node_is_started_again_after_pauses_and_then_given_up() {
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     let reason = failure(&lease).await;
-    assert!(reason.contains("gave /greeter up"), "{reason}");
-    let told = world.told("node-failed");
+    assert!(reason.contains("gave up on /greeter"), "{reason}");
+    let told = world.event_messages("node-failed");
     let pauses: Vec<_> = told
         .iter()
         .filter_map(|text| text.rsplit_once(" in "))
@@ -262,7 +264,7 @@ async fn a_respawning_node_is_the_engines_and_its_servant_lives_on() {
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    let reach = lease.ready().await.expect("ready");
+    let reach = lease.wait_ready().await.expect("ready");
     let mut graph = reach.graph();
     let there = |graph: &Arc<ros::bus::Graph>| graph.nodes.contains_key("/greeter");
     graph
@@ -270,7 +272,7 @@ async fn a_respawning_node_is_the_engines_and_its_servant_lives_on() {
         .await
         .expect("a graph");
     graph.wait_for(there).await.expect("a graph");
-    let told = world.told("node-respawned");
+    let told = world.event_messages("node-respawned");
     assert!(
         told[0].contains("exited with status 7") && told[0].contains("after 2 s"),
         "{told:?}"
@@ -302,7 +304,7 @@ async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it()
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     let id = lease.handle().id.clone();
     let enforced = async || {
         let shown = daemon.describe(lease.handle()).await;
@@ -320,7 +322,7 @@ async fn limits_are_changed_while_it_runs_and_more_memory_than_allowed_ends_it()
     sender.send_modify(|times| *times += 1);
     let reason = failure(&lease).await;
     assert!(reason.contains("250"), "{reason}");
-    assert_eq!(world.told("out-of-memory").len(), 1);
+    assert_eq!(world.event_messages("out-of-memory").len(), 1);
 }
 
 #[tokio::test(start_paused = true)]
@@ -332,24 +334,24 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
         let lease = daemon
             .ensure(ServantRequest::new("greet", robot))
             .expect("a lease");
-        lease.ready().await.expect("ready");
+        lease.wait_ready().await.expect("ready");
         lease
     };
     let (first, _second) = (ready("r1").await, ready("r2").await);
     let third = daemon
         .ensure(ServantRequest::new("greet", "r3"))
         .expect("a lease");
-    let waiting = tokio::time::timeout(Duration::from_secs(1), third.admitted());
+    let waiting = tokio::time::timeout(Duration::from_secs(1), third.wait_admitted());
     waiting.await.expect_err("there are two cores");
     let ended = Arc::clone(first.handle());
     drop(first);
-    third.ready().await.expect("ready");
+    third.wait_ready().await.expect("ready");
     assert_eq!(ended.life().phase, Phase::Stopped);
     // Nobody leaves this time.
     let fourth = daemon
         .ensure(ServantRequest::new("greet", "r4"))
         .expect("a lease");
-    let refused = fourth.ready().await.err().expect("no room");
+    let refused = fourth.wait_ready().await.err().expect("no room");
     assert!(matches!(refused, Error::Full(_)), "{refused}");
 }
 
@@ -357,7 +359,7 @@ async fn who_finds_no_room_waits_until_an_idle_servant_has_ended() {
 async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    // A daemon of its own runtime, which dies with all its tasks; the engine's nodes do not.
+    // A daemon with its own runtime, which dies with all its tasks; the engine's nodes do not.
     let daemon = world.daemon();
     let died = tokio::task::spawn_blocking(move || {
         let runtime = tokio::runtime::Runtime::new().expect("a runtime");
@@ -367,7 +369,7 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
                 let lease = daemon
                     .ensure(ServantRequest::new("greet", robot))
                     .expect("a lease");
-                lease.ready().await.expect("ready");
+                lease.wait_ready().await.expect("ready");
                 ids.push(lease.handle().id.clone());
                 // It dies before its robots leave.
                 std::mem::forget(lease);
@@ -385,9 +387,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     let inherited = next.adopt().await.expect("it starts");
     assert_eq!(inherited.adopted, 1);
     inherited.removal.await.expect("no panic");
-    let left = world.told("servant-leftover");
+    let left = world.event_messages("servant-leftover");
     assert!(left.len() == 1 && left[0].contains("half-made"), "{left:?}");
-    let lost = world.told("servant-lost");
+    let lost = world.event_messages("servant-lost");
     assert!(
         lost.len() == 1 && lost[0].contains(&ids[1]) && lost[0].ends_with("its node was killed"),
         "{lost:?}"
@@ -396,9 +398,9 @@ async fn what_an_earlier_daemon_left_is_adopted_one_by_one() {
     let lease = next
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     assert_eq!(lease.handle().id, ids[0]);
-    assert_eq!(world.engine.started().len(), 2);
+    assert_eq!(world.engine.started_specs().len(), 2);
     next.stop("the test is over", |_| true).await;
     assert!(world.engine.servants().is_empty());
 }
@@ -419,7 +421,7 @@ async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
     };
     // As often as would make a robot without a name wait.
     for _ in 0..5 {
-        let measured = daemon.measured("greet", "calibrate", little);
+        let measured = daemon.start_measured("greet", "calibrate", little);
         let measured = measured.expect("it is not held up");
         let reason = failure(&measured.lease).await;
         assert!(reason.contains("50M"), "{reason}");
@@ -428,7 +430,7 @@ async fn want_of_memory_while_it_is_measured_keeps_no_robot_waiting() {
     assert!(daemon.back_offs().is_empty());
     let nameless = ServantRequest::new("greet", "~abc").anonymous();
     let lease = daemon.ensure(nameless).expect("a lease");
-    lease.ready().await.expect("it has all memory");
+    lease.wait_ready().await.expect("it has all memory");
     assert!(!lease.handle().was_out_of_memory());
 }
 
@@ -444,15 +446,17 @@ async fn what_robots_may_ask_for_at_most_bounds_no_measurement() {
         memory,
         ..api::Stated::default()
     };
-    let robot = ServantRequest::new("greet", "r1").stating(stated);
+    let robot = ServantRequest::new("greet", "r1").with_stated(stated);
     let refused = daemon.ensure(robot).err().expect("it is more");
     assert!(matches!(refused, Error::Terms(_)), "{refused}");
     let set = api::Limits {
         memory,
         ..api::Limits::default()
     };
-    let measured = daemon.measured("greet", "calibrate", set).expect("a lease");
-    measured.lease.ready().await.expect("ready");
+    let measured = daemon
+        .start_measured("greet", "calibrate", set)
+        .expect("a lease");
+    measured.lease.wait_ready().await.expect("ready");
     assert_eq!(measured.lease.handle().limits().memory, memory);
-    assert_eq!(daemon.admission().look().1.memory, 64 << 20, "promised");
+    assert_eq!(daemon.admission().snapshot().1.memory, 64 << 20, "promised");
 }

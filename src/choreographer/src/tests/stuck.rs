@@ -1,20 +1,20 @@
-//! Servants whose shims do not answer beside others, told with the engine in memory.
+//! Tests of servants whose shims do not answer, beside others, with the in-memory engine.
 
-use servant::engine::Servant as _;
+use servant::engine::ServantHandle as _;
 
-use super::servants::{World, ready, stating};
+use super::servants::{World, ready, request_stating};
 use super::*;
-use crate::options::Hung;
+use crate::options::HungPolicy;
 
 const SECOND: Duration = Duration::from_secs(1);
-/// Of each kind: in whatever order they are looked at, one that is stuck comes before one that is not.
+/// Number of each kind: in any order, a stuck servant comes before one that is not.
 const EACH: usize = 4;
 
 fn container(world: &World, lease: &Lease) -> Arc<in_memory::MemoryServant> {
     world.engine.servant(&lease.handle().id).expect("it runs")
 }
 
-/// Robots whose servants answer, and as many whose servants do not from now on.
+/// Starts robots whose servants answer, and as many whose servants stop answering now.
 async fn robots(
     world: &World,
     daemon: &Choreographer,
@@ -22,8 +22,8 @@ async fn robots(
 ) -> (Vec<Lease>, Vec<Lease>) {
     let (mut sound, mut stuck) = (Vec::new(), Vec::new());
     for number in 0..EACH {
-        sound.push(ready(daemon, stating(&format!("sound{number}"), query)).await);
-        stuck.push(ready(daemon, stating(&format!("stuck{number}"), query)).await);
+        sound.push(ready(daemon, request_stating(&format!("sound{number}"), query)).await);
+        stuck.push(ready(daemon, request_stating(&format!("stuck{number}"), query)).await);
     }
     for lease in &stuck {
         container(world, lease).stuck.send_replace(true);
@@ -39,7 +39,7 @@ async fn what_clients_stated_that_left_ends_although_other_servants_are_stuck() 
     daemon.keep_watch();
     let by = |lease: &Lease| {
         let robot = lease.handle().robot.clone();
-        stating(&robot, &[("cpus", "0.2")]).by_stub("/two")
+        request_stating(&robot, &[("cpus", "0.2")]).with_stub("/two")
     };
     let (sound, stuck) = robots(&world, &daemon, &[("cpus", "0.1")]).await;
     let mut second = Vec::new();
@@ -54,7 +54,7 @@ async fn what_clients_stated_that_left_ends_although_other_servants_are_stuck() 
     }
     drop(second);
     tokio::time::sleep(daemon.inner.options.grace + SECOND * 3).await;
-    let cpus = |lease: &Lease| container(&world, lease).enforced().limits.cpus;
+    let cpus = |lease: &Lease| container(&world, lease).enforced_limits().limits.cpus;
     for lease in &sound {
         assert_eq!(cpus(lease), Some(0.1), "{}", lease.handle().robot);
     }
@@ -62,7 +62,7 @@ async fn what_clients_stated_that_left_ends_although_other_servants_are_stuck() 
         assert_eq!(cpus(lease), Some(0.2), "{}", lease.handle().robot);
         container(&world, lease).stuck.send_replace(false);
     }
-    // They are given it as soon as they answer.
+    // They are resized as soon as they answer.
     tokio::time::sleep(SECOND).await;
     for lease in &stuck {
         assert_eq!(cpus(lease), Some(0.1), "{}", lease.handle().robot);
@@ -74,7 +74,7 @@ async fn nodes_that_hang_are_ended_although_other_servants_are_stuck() {
     let world = World::new();
     world.publish("greet", "/greet", |record| record.plan.restart = true);
     let daemon = world.daemon_with(|options| {
-        (options.hung, options.hung_after) = (Hung::Restart, 5.0);
+        (options.hung, options.hung_after) = (HungPolicy::Restart, 5.0);
     });
     daemon.watch_nodes();
     let query = [("cpus", "0.1"), ("max_rrt", "300ms")];
@@ -89,18 +89,18 @@ async fn nodes_that_hang_are_ended_although_other_servants_are_stuck() {
             container(&world, lease).flow.lock().0 += 10;
         }
     }
-    assert_eq!(world.told("node-hung").len(), 2 * EACH);
+    assert_eq!(world.event_messages("node-hung").len(), 2 * EACH);
     assert_eq!(
-        world.told("node-failed").len(),
+        world.event_messages("node-failed").len(),
         EACH,
         "each that answers was ended"
     );
-    // A servant that does not answer is told of, and watched as before.
+    // A servant that does not answer is reported, and watched as before.
     for lease in &stuck {
         container(&world, lease).stuck.send_replace(false);
     }
     tokio::time::sleep(SECOND).await;
-    assert_eq!(world.told("node-failed").len(), 2 * EACH);
+    assert_eq!(world.event_messages("node-failed").len(), 2 * EACH);
 }
 
 #[tokio::test(start_paused = true)]
@@ -114,13 +114,16 @@ async fn cores_are_moved_although_other_servants_are_stuck() {
     let takes = |lease: &Lease| {
         let handle = lease.handle();
         let inner = &daemon.inner;
-        let measures = crate::lives::reaching::Measures::of(inner, &handle.revision, &handle.id);
+        let measures =
+            crate::lives::reaching::RequestRecorder::new(inner, &handle.revision, &handle.id);
         for _ in 0..3 {
-            measures.called().tell(Some(Duration::from_millis(95)));
+            measures
+                .rosbridge_observer()
+                .record(Some(Duration::from_millis(95)));
         }
     };
-    let moved = |lease: &Lease| container(&world, lease).enforced().limits.cpus > Some(0.02);
-    // Each second there is a look; one that does not answer is waited for five.
+    let moved = |lease: &Lease| container(&world, lease).enforced_limits().limits.cpus > Some(0.02);
+    // There is a round each second; a servant that does not answer is waited for five seconds.
     let mut seconds = 0;
     while !sound.iter().all(moved) {
         assert!(seconds < 5, "they wait for those that are stuck");

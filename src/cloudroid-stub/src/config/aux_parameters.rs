@@ -1,4 +1,4 @@
-//! Auxiliary parameters, as a robot's configuration states them.
+//! Auxiliary parameters in a robot's configuration.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 /// A number or a text.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged, expecting = "a number or a text")]
+#[serde(untagged, expecting = "a number or a string")]
 pub enum Scalar {
     /// A number.
     Number(f64),
@@ -27,17 +27,17 @@ impl std::fmt::Display for Scalar {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(
     untagged,
-    expecting = "a table such as { width = 640 }, or text such as \"width=640\""
+    expecting = "a table such as { width = 640 }, or a string such as \"width=640\""
 )]
 pub enum Aux {
-    /// By name.
+    /// Values by name.
     Table(BTreeMap<String, Scalar>),
-    /// Pairs with spaces between them.
+    /// Pairs separated by spaces.
     Text(String),
 }
 
 impl Aux {
-    /// Names and values; why it is not such a list.
+    /// Returns names and values; the error describes the invalid part.
     pub fn pairs(&self) -> Result<Vec<(String, String)>, String> {
         match self {
             Self::Table(table) => Ok(table

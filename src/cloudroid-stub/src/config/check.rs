@@ -1,21 +1,21 @@
-//! What no type can say of a configuration's values, each and together.
+//! Checks of a configuration's values, alone and together, that types cannot express.
 
-use super::{Codec, Config, MOST};
+use super::{CodecSetting, Config, MOST};
 use crate::terms;
 
-/// A key whose value cannot be.
+/// A key with an invalid value.
 #[derive(Debug, thiserror::Error)]
 #[error("{key} {reason}")]
-pub(super) struct Wrong {
+pub(super) struct InvalidSetting {
     pub(super) key: &'static str,
-    /// The reason, and what to do.
+    /// Reason, and what to do.
     reason: String,
 }
 
 impl Config {
-    /// What no type can say.
-    pub(super) fn check(&self) -> Result<(), Wrong> {
-        let wrong = |key, reason| Err(Wrong { key, reason });
+    /// Checks the values of all keys.
+    pub(super) fn check(&self) -> Result<(), InvalidSetting> {
+        let wrong = |key, reason| Err(InvalidSetting { key, reason });
         for (key, value) in [
             ("desire", self.desire),
             ("max", self.max),
@@ -54,7 +54,8 @@ impl Config {
         {
             if desired < least {
                 let reason = format!(
-                    "({desired}) is less than frames_per_second ({least}), which is the least that will do; raise it, or lower frames_per_second"
+                    "({desired}) is less than frames_per_second ({least}), the minimum rate; raise it, or lower \
+                        frames_per_second"
                 );
                 return wrong("desired_frames_per_second", reason);
             }
@@ -75,18 +76,18 @@ impl Config {
         Ok(())
     }
 
-    /// What must hold once all that say something have been heard.
-    pub(super) fn check_whole(&self) -> Result<(), Wrong> {
+    /// Checks the combination of keys, after all sources have been merged.
+    pub(super) fn check_combined(&self) -> Result<(), InvalidSetting> {
         let without = |key, other| {
             let reason = format!("is given without {other}; set {other}, too, or remove {key}");
-            Err(Wrong { key, reason })
+            Err(InvalidSetting { key, reason })
         };
-        if self.quality.is_some() && self.codec != Codec::Jpeg {
+        if self.quality.is_some() && self.codec != CodecSetting::Jpeg {
             return without("quality", "codec = \"jpeg\"");
         }
         if self.request.is_some() && self.requests.is_some() {
             let reason = "and requests are both given; remove one".to_owned();
-            return Err(Wrong {
+            return Err(InvalidSetting {
                 key: "request",
                 reason,
             });

@@ -1,5 +1,5 @@
-//! What ROS parameters say instead of `stub.toml`. In ROS 1: `cloudroid/KEY` in the node's own namespace, or in one around it,
-//! where it holds for all nodes of that namespace; the nearest wins. In ROS 2: the node's own `cloudroid.KEY`.
+//! ROS parameters that override `stub.toml`. In ROS 1: `cloudroid/KEY` in the node's own namespace, or in one around
+//! it, where it holds for all nodes of that namespace; the nearest wins. In ROS 2: the node's own `cloudroid.KEY`.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -8,22 +8,23 @@ use ros::bus::ParamValue;
 use toml::{Table, Value};
 
 use super::Config;
-use super::sources::with;
+use super::sources::apply_overrides;
 
-/// A group's name: what comes after the namespace.
+/// Name of the group of parameters, after the namespace.
 const GROUP: &str = "cloudroid";
 
 /// The settings of one namespace (ROS 1), or of the node (ROS 2).
-pub struct Group {
-    /// The parameter that holds them, such as `/front/cloudroid`; none for the node's own of ROS 2.
+pub struct ParameterGroup {
+    /// Name of the parameter that holds them, such as `/front/cloudroid`; `None` for the node's own parameters in ROS
+    /// 2.
     pub name: Option<String>,
-    /// By key.
+    /// Values by key.
     pub settings: BTreeMap<String, ParamValue>,
 }
 
-impl Group {
-    /// The parameter that gives a key, and how that is taken back.
-    fn giver(&self, key: &str) -> (String, String) {
+impl ParameterGroup {
+    /// Returns the name of the parameter that sets a key, and how to remove it.
+    fn source(&self, key: &str) -> (String, String) {
         match &self.name {
             Some(name) => {
                 let giver = format!("{name}/{key}");
@@ -38,9 +39,9 @@ impl Group {
     }
 }
 
-/// The parameters that may hold settings for a node, the nearest last: `/cloudroid`, `/front/cloudroid`,
-/// `/front/reporter/cloudroid`.
-pub fn groups(node: &str) -> Vec<String> {
+/// Returns the names of the parameters that may hold settings for a node, the nearest last: `/cloudroid`,
+/// `/front/cloudroid`, `/front/reporter/cloudroid`.
+pub fn group_names(node: &str) -> Vec<String> {
     let ends = node.match_indices('/').map(|(at, _)| at).skip(1);
     let namespaces = std::iter::once("").chain(ends.map(|at| &node[..at]));
     let namespaces = namespaces.chain([node.trim_end_matches('/')]);
@@ -50,21 +51,21 @@ pub fn groups(node: &str) -> Vec<String> {
 }
 
 impl Config {
-    /// With some keys given otherwise by these groups, the nearest last.
+    /// Returns the configuration with the overrides of these groups, the nearest last.
     ///
     /// # Errors
-    /// The parameter that cannot be as it is, why not, and what to do.
-    pub fn with_parameters(&self, given: &[Group]) -> anyhow::Result<Config> {
+    /// A parameter has an invalid value; the error names it, the reason and what to do.
+    pub fn with_parameters(&self, given: &[ParameterGroup]) -> anyhow::Result<Config> {
         let mut table = Table::try_from(self)?;
-        // Who has given a key.
+        // Sources of the keys.
         let mut givers: HashMap<&str, (String, String)> = HashMap::new();
         for group in given {
             for (key, value) in &group.settings {
-                let (giver, removal) = group.giver(key);
+                let (giver, removal) = group.source(key);
                 let refused = |reason: &str| {
-                    let value = shown(value);
+                    let value = format_value(value);
                     anyhow::anyhow!(
-                        "parameter {giver} is {value}: {reason}; set it otherwise, or {removal}"
+                        "parameter {giver} is {value}: {reason}; correct it, or {removal}"
                     )
                 };
                 let given = Value::try_from(value).map_err(|error| refused(&error.to_string()))?;
@@ -76,7 +77,7 @@ impl Config {
             }
         }
         let config: Config = table.clone().try_into()?;
-        if let Err(wrong) = config.check().and_then(|()| config.check_whole()) {
+        if let Err(wrong) = config.check().and_then(|()| config.check_combined()) {
             let other = match wrong.key {
                 "desire" => "max",
                 "max" => "desire",
@@ -88,33 +89,33 @@ impl Config {
             let giver = givers.get(wrong.key).or_else(|| givers.get(other));
             match giver {
                 Some((giver, removal)) => {
-                    bail!("parameter {giver}: {wrong}; set it otherwise, or {removal}")
+                    bail!("parameter {giver}: {wrong}; correct it, or {removal}")
                 }
                 None => return Err(wrong.into()),
             }
         }
-        with(table, std::iter::empty())
+        apply_overrides(table, std::iter::empty())
     }
 }
 
-fn shown(value: &ParamValue) -> String {
+fn format_value(value: &ParamValue) -> String {
     match value {
         ParamValue::String(text) => format!("{text:?}"),
         ParamValue::Int(number) => number.to_string(),
         ParamValue::Double(number) => number.to_string(),
         ParamValue::Bool(yes) => yes.to_string(),
-        _ => "no single value".to_owned(),
+        _ => "not a single value".to_owned(),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Local;
+    use crate::config::LocalMode;
 
-    fn group(name: &str, settings: &[(&str, ParamValue)]) -> Group {
+    fn group(name: &str, settings: &[(&str, ParamValue)]) -> ParameterGroup {
         let settings = settings.iter();
-        Group {
+        ParameterGroup {
             name: Some(name.to_owned()),
             settings: settings
                 .map(|(key, value)| ((*key).to_owned(), value.clone()))
@@ -122,7 +123,7 @@ mod tests {
         }
     }
 
-    fn config(given: &[Group]) -> anyhow::Result<Config> {
+    fn config(given: &[ParameterGroup]) -> anyhow::Result<Config> {
         let file: Config = toml::from_str("server = 'ws://cloud:9090'\nservice = 's'\n")?;
         file.with_parameters(given)
     }
@@ -133,9 +134,12 @@ mod tests {
 
     #[test]
     fn a_node_is_in_its_namespaces() {
-        assert_eq!(groups("/reporter"), ["/cloudroid", "/reporter/cloudroid"]);
         assert_eq!(
-            groups("/a/b/reporter"),
+            group_names("/reporter"),
+            ["/cloudroid", "/reporter/cloudroid"]
+        );
+        assert_eq!(
+            group_names("/a/b/reporter"),
             [
                 "/cloudroid",
                 "/a/cloudroid",
@@ -164,7 +168,7 @@ mod tests {
         ])
         .unwrap();
         assert_eq!((config.desire, config.max), (Some(0.5), Some(1.0)));
-        assert_eq!(config.local, Local::FirstSign);
+        assert_eq!(config.local, LocalMode::FirstSign);
     }
 
     #[test]
@@ -226,7 +230,7 @@ mod tests {
             ),
             (
                 vec![("max", ParamValue::List(vec![]))],
-                vec!["max is no single value", "f64"],
+                vec!["max is not a single value", "f64"],
             ),
         ] {
             let error = config(&[group("/front/cloudroid", &settings)]).unwrap_err();

@@ -1,4 +1,4 @@
-//! Where a configuration comes from: `stub.toml`, and what the environment and ROS parameters say instead.
+//! Sources of a configuration: `stub.toml`, overridden by the environment and by ROS parameters.
 
 use std::path::Path;
 
@@ -8,33 +8,33 @@ use toml::{Table, Value};
 use super::{Config, FILE};
 use crate::address::Address;
 
-/// Reads `stub.toml` in `share` with what the environment says instead.
-pub fn read(
+/// Reads `stub.toml` in `share`, with the overrides of the environment.
+pub fn load(
     share: &Path,
     environment: impl Iterator<Item = (String, String)>,
 ) -> anyhow::Result<Config> {
     let path = share.join(FILE);
     let text = std::fs::read_to_string(&path).with_context(|| {
         format!(
-            "cannot read {}: the stub's package is not complete; install it again",
+            "cannot read {}: the stub's package is incomplete; install it again",
             path.display()
         )
     })?;
     let table: Table = toml::from_str(&text).with_context(|| format!("{}", path.display()))?;
-    with(
+    apply_overrides(
         table,
-        environment.filter_map(|(name, value)| Some((key_of(&name)?, value))),
+        environment.filter_map(|(name, value)| Some((key_for_variable(&name)?, value))),
     )
-    .with_context(|| format!("{} with CLOUDROID_* of the environment", path.display()))
+    .with_context(|| format!("{} with CLOUDROID_* environment variables", path.display()))
 }
 
-/// The key that an environment variable stands for.
-pub(super) fn key_of(variable: &str) -> Option<String> {
+/// Returns the key that an environment variable sets.
+pub(super) fn key_for_variable(variable: &str) -> Option<String> {
     let key = variable.strip_prefix("CLOUDROID_")?.to_ascii_lowercase();
     KEYS.contains(&key.as_str()).then_some(key)
 }
 
-/// All keys. Other variables that begin with CLOUDROID_ are not the stub's.
+/// All keys. Other variables with the prefix CLOUDROID_ are not the stub's.
 const KEYS: [&str; 33] = [
     "server",
     "service",
@@ -71,16 +71,16 @@ const KEYS: [&str; 33] = [
     "quality",
 ];
 
-/// The file's table with some keys given otherwise, as text.
-pub(super) fn with(
+/// Builds a configuration from a table with overrides, which are texts.
+pub(super) fn apply_overrides(
     mut table: Table,
     instead: impl Iterator<Item = (String, String)>,
 ) -> anyhow::Result<Config> {
     for (key, text) in instead {
-        table.insert(key, value_of(&text));
+        table.insert(key, parse_value(&text));
     }
     let mut config: Config = table.try_into()?;
-    // The parts that share them write them as whole numbers too.
+    // Normalize the server's address: no trailing slashes.
     while config.server.ends_with('/') {
         config.server.pop();
     }
@@ -89,8 +89,8 @@ pub(super) fn with(
     Ok(config)
 }
 
-/// A value as TOML would read it, or else as text.
-fn value_of(text: &str) -> Value {
+/// Parses a value as TOML would; anything else is a text.
+fn parse_value(text: &str) -> Value {
     match text.trim() {
         "true" => Value::Boolean(true),
         "false" => Value::Boolean(false),

@@ -1,6 +1,6 @@
 use toml::Table;
 
-use super::sources::{key_of, with};
+use super::sources::{apply_overrides, key_for_variable};
 use super::*;
 
 const FILE: &str = "server = 'ws://cloud:9090/'\nservice = 'opencv_apps'\ndesire = 0.1\nmax = 1\n";
@@ -9,7 +9,7 @@ fn config(instead: &[(&str, &str)]) -> anyhow::Result<Config> {
     let instead = instead
         .iter()
         .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
-    with(toml::from_str(FILE)?, instead)
+    apply_overrides(toml::from_str(FILE)?, instead)
 }
 
 #[test]
@@ -17,19 +17,25 @@ fn the_file_is_enough() {
     let config = config(&[]).unwrap();
     assert_eq!(config.server, "ws://cloud:9090");
     assert_eq!((config.desire, config.max), (Some(0.1), Some(1.0)));
-    assert_eq!((config.local, config.codec), (Local::Cold, Codec::Auto));
+    assert_eq!(
+        (config.local, config.codec),
+        (LocalMode::Cold, CodecSetting::Auto)
+    );
     let local = toml::from_str::<Config>(&format!("{FILE}local = 'first-sign'"));
-    assert_eq!(local.unwrap().local, Local::FirstSign);
+    assert_eq!(local.unwrap().local, LocalMode::FirstSign);
 }
 
 #[test]
 fn the_environment_says_otherwise() {
-    assert_eq!(key_of("CLOUDROID_LOCAL").as_deref(), Some("local"));
-    assert_eq!(key_of("CLOUDROID_HOME"), None);
+    assert_eq!(
+        key_for_variable("CLOUDROID_LOCAL").as_deref(),
+        Some("local")
+    );
+    assert_eq!(key_for_variable("CLOUDROID_HOME"), None);
     let config = config(&[("local", "warm"), ("max", "0.5"), ("stateful", "true")]).unwrap();
     assert_eq!(
         (config.local, config.max, config.stateful),
-        (Local::Warm, Some(0.5), true)
+        (LocalMode::Warm, Some(0.5), true)
     );
 }
 
@@ -42,18 +48,25 @@ fn a_codec_that_one_side_has_not_is_named_with_what_to_do() {
             .collect::<Vec<_>>()
     };
     let with = |codec: &str| config(&[("codec", codec)]).unwrap().codec;
-    assert_eq!(with("auto").unmet(&[]), None);
-    assert_eq!(with("jpeg").unmet(&has(&["raw", "jpeg"])), None);
-    let unmet = with("jpeg").unmet(&has(&["raw"])).unwrap();
+    assert_eq!(with("auto").unsupported_reason(&[]), None);
+    assert_eq!(
+        with("jpeg").unsupported_reason(&has(&["raw", "jpeg"])),
+        None
+    );
+    let unmet = with("jpeg").unsupported_reason(&has(&["raw"])).unwrap();
     assert!(
-        unmet.contains("codec = \"jpeg\" is not known to the server"),
+        unmet.contains("codec = \"jpeg\" is not supported by the server"),
         "{unmet}"
     );
-    let unmet = with("video").unmet(&has(&["raw"])).unwrap();
+    let unmet = with("video").unsupported_reason(&has(&["raw"])).unwrap();
     assert!(unmet.contains("codec = \"video\" is not"), "{unmet}");
     assert!(unmet.contains("set codec = \"jpeg\""), "{unmet}");
-    let built = with("video").unmet(&has(&["raw", "video"]));
-    assert_eq!(built.is_none(), codec::Codec::Video.is_built(), "{built:?}");
+    let built = with("video").unsupported_reason(&has(&["raw", "video"]));
+    assert_eq!(
+        built.is_none(),
+        codec::Codec::Video.is_available(),
+        "{built:?}"
+    );
 }
 
 #[test]
@@ -97,8 +110,8 @@ fn nonsense_is_named() {
     }
 }
 
-/// `key = value` and comments, as a file shows its settings.
-fn shown(lines: &str) -> Table {
+/// Parses the `key = value` lines of a file, without comments.
+fn parse_settings(lines: &str) -> Table {
     let settings = lines.lines().filter(|line| line.contains(" = "));
     toml::from_str(&settings.collect::<Vec<_>>().join("\n")).unwrap()
 }
@@ -120,15 +133,15 @@ fn what_comments_show_as_defaults_are_the_defaults() {
     let minimal: Config = toml::from_str("server = 'ws://s'\nservice = 's'").unwrap();
     let mut defaults = Table::try_from(&minimal).unwrap();
     let sla = serde_json::json!({"t_desire": 1, "t_max": 1});
-    let sla = qos::Sla::parse(sla).unwrap();
+    let sla = qos::QosSla::parse(sla).unwrap();
     defaults.insert("threshold".to_owned(), sla.threshold.into());
     defaults.insert("initial".to_owned(), sla.initial.into());
     defaults.insert("cap".to_owned(), sla.cap.into());
     defaults.insert("request".to_owned(), "auto".into());
-    // What they show beside defaults is by way of example.
+    // The values of these keys are examples, not defaults.
     defaults.retain(|key, _| !["server", "service", "nodes"].contains(&key));
     for (whose, text) in [("the code's", own), ("stub.toml's", handed_out)] {
-        let mut all = shown(&text);
+        let mut all = parse_settings(&text);
         let mut seen = 0;
         for (key, default) in &defaults {
             if let Some(shown) = all.get(key) {
@@ -137,7 +150,7 @@ fn what_comments_show_as_defaults_are_the_defaults() {
             }
         }
         assert!(seen >= 3, "{whose} comments show {seen} defaults");
-        // And all that they show can be written so.
+        // All values that the comments show are valid.
         for (key, value) in [("server", "ws://s"), ("service", "s")] {
             all.insert(key.to_owned(), value.into());
         }

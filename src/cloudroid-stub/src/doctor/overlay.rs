@@ -1,4 +1,4 @@
-//! The robot's side: does the stub come before the original, and where is that.
+//! Checks of the robot: whether the stub comes before the original, and where the original is.
 
 mod ament;
 mod catkin;
@@ -9,30 +9,32 @@ use anyhow::Context;
 use ros::bus::RosVersion;
 
 use super::Check;
-use crate::arguments::{Doctor, Node};
+use crate::arguments::{NodeArgs, StubDoctorArgs};
 use crate::config::Config;
 use crate::network::Variable;
 use crate::original;
 use crate::revision::Revision;
 
-/// Which stub is examined.
+/// The stub that is examined.
 #[derive(Debug, Clone)]
 pub struct ExaminedStub {
-    /// Its `share/PKG`.
+    /// Its directory `share/PKG`.
     pub share: PathBuf,
     /// The ROS package.
     pub package: String,
 }
 
 impl ExaminedStub {
-    /// As asked for; without `--share`, by where this program is: `lib/PKG/cloudroid-stub`.
-    pub fn of(asked: &Doctor) -> anyhow::Result<ExaminedStub> {
+    /// Returns the stub that the arguments name; without `--share`, determined from the path of this program,
+    /// `lib/PKG/cloudroid-stub`.
+    pub fn from_args(asked: &StubDoctorArgs) -> anyhow::Result<ExaminedStub> {
         let share = match &asked.share {
             Some(share) => share.clone(),
             None => {
-                let program = std::env::current_exe().context("cannot find this very program")?;
-                beside(&program).context(
-                    "this program does not stand in a stub's lib/PKG: say which stub with --share DIR",
+                let program =
+                    std::env::current_exe().context("cannot find the path of this program")?;
+                find_share(&program).context(
+                    "this program is not in a stub's lib/PKG: name the stub with --share DIR",
                 )?
             }
         };
@@ -41,35 +43,35 @@ impl ExaminedStub {
             .package
             .clone()
             .or_else(name)
-            .context("say which package with --package PKG")?;
+            .context("name the package with --package PKG")?;
         Ok(ExaminedStub { share, package })
     }
 
-    /// The command that changes its settings.
+    /// Returns the command that changes the stub's settings.
     pub fn installer(&self) -> String {
         format!("sh {}-stub/install.sh", self.package)
     }
 
-    /// The install space that it is in.
+    /// Returns the install space of the stub.
     pub fn overlay(&self) -> PathBuf {
         let overlay = original::overlay(&self.share);
         overlay.canonicalize().unwrap_or(overlay)
     }
 
-    /// The service's revision that the stub was made of.
+    /// Returns the service's revision that the stub was made of.
     pub fn revision(&self) -> Option<u64> {
         Revision::read(&self.share).revision
     }
 }
 
-fn beside(program: &Path) -> Option<PathBuf> {
+fn find_share(program: &Path) -> Option<PathBuf> {
     let directory = program.parent()?;
     let prefix = directory.parent()?.parent()?;
     let share = prefix.join("share").join(directory.file_name()?);
     share.join(crate::config::FILE).is_file().then_some(share)
 }
 
-/// All checks of the robot, with variables from `variable`.
+/// Runs all checks of the robot, with the environment of `variable`.
 pub async fn checks(stub: &ExaminedStub, config: &Config, variable: Variable<'_>) -> Vec<Check> {
     let revision = Revision::read(&stub.share);
     let mut checks = match revision.ros() {
@@ -77,31 +79,31 @@ pub async fn checks(stub: &ExaminedStub, config: &Config, variable: Variable<'_>
         RosVersion::Two => ament::checks(stub, variable).await,
     };
     for node in revision.outsourced {
-        checks.push(local(stub, config, node, variable));
+        checks.push(original_check(stub, config, node, variable));
     }
     checks
 }
 
-/// Whether a directory on a search path is this one, whatever leads there.
-fn is(entry: &Path, directory: &Path) -> bool {
-    // A slash at its end is left out.
+/// Returns whether an entry of a search path is this directory, after resolving links.
+fn is_same_directory(entry: &Path, directory: &Path) -> bool {
+    // The comparison of paths ignores the trailing slash.
     entry
         .canonicalize()
         .is_ok_and(|entry| entry == directory.join(""))
 }
 
-/// What finds a package anywhere else than in the stub.
-fn shadowed(name: &str, first: Option<&PathBuf>, stub: &ExaminedStub) -> Check {
+/// Returns the check's result if a package is found elsewhere than in the stub.
+fn shadowed_check(name: &str, first: Option<&PathBuf>, stub: &ExaminedStub) -> Check {
     let found = match first {
-        Some(other) => format!("{name} names {} before this stub", other.display()),
-        None => format!("{name} does not name this stub"),
+        Some(other) => format!("{name} has {} before this stub", other.display()),
+        None => format!("{name} does not include this stub"),
     };
     let setup = stub.overlay().join("setup.sh");
     let fix = format!(". {}, after every other setup file", setup.display());
     Check::bad("shadowing", found, fix)
 }
 
-fn found(stub: &ExaminedStub) -> Check {
+fn found_check(stub: &ExaminedStub) -> Check {
     let overlay = stub.overlay();
     Check::good(
         "shadowing",
@@ -109,13 +111,13 @@ fn found(stub: &ExaminedStub) -> Check {
     )
 }
 
-fn local(
+fn original_check(
     stub: &ExaminedStub,
     config: &Config,
     node: String,
     variable: &dyn Fn(&str) -> Option<String>,
 ) -> Check {
-    let wanted = Node {
+    let wanted = NodeArgs {
         package: stub.package.clone(),
         node,
         share: stub.share.clone(),
@@ -123,12 +125,13 @@ fn local(
     let name = &wanted.node;
     match original::find(&wanted, variable) {
         Some(path) => Check::good("original", format!("{name} is {}", path.display())),
-        None if config.local == crate::config::Local::None => {
-            Check::good("original", format!("{name} runs in the cloud only, as set"))
-        }
+        None if config.local == crate::config::LocalMode::None => Check::good(
+            "original",
+            format!("{name} runs in the cloud only, as configured"),
+        ),
         None => Check::warning(
             "original",
-            format!("{name} is not installed on this robot: it runs in the cloud only"),
+            format!("{name} is not installed on this robot, so it runs in the cloud only"),
             format!(
                 "install the package {}, or set local = \"none\" in {}",
                 stub.package,
@@ -148,8 +151,8 @@ mod tests {
         let share = root.path().join("share/p");
         std::fs::create_dir_all(&share).expect("made");
         let program = root.path().join("lib/p/cloudroid-stub");
-        assert_eq!(beside(&program), None, "no settings");
+        assert_eq!(find_share(&program), None, "no settings");
         std::fs::write(share.join("stub.toml"), "").expect("written");
-        assert_eq!(beside(&program), Some(share));
+        assert_eq!(find_share(&program), Some(share));
     }
 }

@@ -1,5 +1,5 @@
-//! The server's side: is it reached, does it know the token and the service, does its clock agree, do big answers
-//! come through.
+//! Checks of the server: whether it is reachable, knows the token and the service, has a synchronized clock, and can
+//! send large responses.
 
 use std::time::{Duration, UNIX_EPOCH};
 
@@ -11,14 +11,15 @@ use crate::config::Config;
 use crate::http;
 use crate::resolver;
 
-/// The clock is asked so often; the quickest answer counts.
+/// Number of requests for the clock; the one with the shortest round trip is used.
 const SAMPLES: usize = 5;
-/// A difference that is worth fixing. Stamps are set right on the link, but people read logs of both sides.
+/// Clock difference in seconds that is worth fixing. Stamps are corrected on the link, but people compare logs of both
+/// sides.
 const IN_STEP: f64 = 0.1;
 
-/// All checks of the server. When it is not reached there is but one.
+/// Runs all checks of the server. If it is unreachable, there is only one.
 pub async fn checks(config: &Config, stub: &ExaminedStub) -> Vec<Check> {
-    let portal = match Portal::find(config, stub).await {
+    let portal = match PortalProbe::find(config, stub).await {
         Ok(portal) => portal,
         Err(check) => return vec![*check],
     };
@@ -36,7 +37,7 @@ pub async fn checks(config: &Config, stub: &ExaminedStub) -> Vec<Check> {
             return vec![Check::bad("server", found, portal.other_server())];
         }
         Err(error) => {
-            let found = format!("{} is not reached: {error}", config.server);
+            let found = format!("{} cannot be reached: {error}", config.server);
             return vec![Check::bad("server", found, portal.other_server())];
         }
     };
@@ -46,14 +47,14 @@ pub async fn checks(config: &Config, stub: &ExaminedStub) -> Vec<Check> {
     checks
 }
 
-struct Portal {
-    server: http::Server,
+struct PortalProbe {
+    server: http::HttpServer,
     token: Option<String>,
     installer: String,
 }
 
-impl Portal {
-    async fn find(config: &Config, stub: &ExaminedStub) -> Result<Portal, Box<Check>> {
+impl PortalProbe {
+    async fn find(config: &Config, stub: &ExaminedStub) -> Result<PortalProbe, Box<Check>> {
         let installer = stub.installer();
         let fix = format!("{installer} --server ws://HOST:9090");
         let bad = |found: String, fix: String| Box::new(Check::bad("server", found, fix));
@@ -69,11 +70,11 @@ impl Portal {
             let fix = format!("{installer} --pair 'LINE'");
             Box::new(Check::bad("pairing", format!("{error:#}"), fix))
         })?;
-        // Who is paired shows its certificate.
+        // A paired robot presents its certificate instead.
         let token = token.filter(|token| !token.is_empty() && trust.identity.is_none());
         match resolver::resolve(&address.host).await {
-            Ok(ip) => Ok(Portal {
-                server: http::Server {
+            Ok(ip) => Ok(PortalProbe {
+                server: http::HttpServer {
                     address,
                     ip,
                     trust,
@@ -86,12 +87,12 @@ impl Portal {
         }
     }
 
-    async fn get(&self, path: &str) -> std::io::Result<http::Answer> {
+    async fn get(&self, path: &str) -> std::io::Result<http::HttpAnswer> {
         http::get(&self.server, path, self.token.as_deref()).await
     }
 
-    /// An address for people.
-    fn link(&self, path: &str) -> String {
+    /// Returns a URL for people.
+    fn url(&self, path: &str) -> String {
         let scheme = if self.server.address.secure {
             "https"
         } else {
@@ -104,7 +105,7 @@ impl Portal {
         format!("{} --server ws://HOST:9090", self.installer)
     }
 
-    /// The token and the service, by asking for the one with the other.
+    /// Checks the token and the service, by requesting the service with the token.
     async fn service(&self, config: &Config, stub: &ExaminedStub) -> Check {
         let name = &config.service;
         let answer = match self.get(&format!("/api/v1/services/{name}")).await {
@@ -122,7 +123,7 @@ impl Portal {
             401 | 403 => {
                 let given = match self.token {
                     Some(_) => "the token is refused",
-                    None => "the server wants a token",
+                    None => "the server requires a token",
                 };
                 let fix = format!("{} --token TOKEN", self.installer);
                 return Check::bad("token", format!("{given}: {words}"), fix);
@@ -141,23 +142,25 @@ impl Portal {
         match (there, stub.revision()) {
             (Some(there), Some(here)) if there != here => Check::warning(
                 "service",
-                format!("{name} is at revision {there}, this stub is of revision {here}"),
                 format!(
-                    "fetch it again: {}",
-                    self.link(&format!("/stubs/{name}.tar.gz"))
+                    "{name} is at revision {there}, but this stub was made from revision {here}"
+                ),
+                format!(
+                    "download it again: {}",
+                    self.url(&format!("/stubs/{name}.tar.gz"))
                 ),
             ),
             _ => {
                 let by = match self.server.trust.identity {
-                    Some(_) => format!("this robot is paired as {}", config.robot()),
-                    None => "the token is good".to_owned(),
+                    Some(_) => format!("this robot is paired as {}", config.robot_id()),
+                    None => "the token is valid".to_owned(),
                 };
                 Check::good("service", format!("{name} is published, {by}"))
             }
         }
     }
 
-    /// Half of the way there and back is what cannot be told from a difference.
+    /// Compares the clocks; the uncertainty is half of the round trip.
     async fn clock(&self) -> Check {
         let mut best: Option<(Duration, f64)> = None;
         for _ in 0..SAMPLES {
@@ -178,40 +181,42 @@ impl Portal {
         let Some((waited, ahead)) = best else {
             return Check::warning(
                 "clock",
-                "the server does not tell its time",
-                "bring the server to this stub's version",
+                "the server does not report its time",
+                "update the server to this stub's version",
             );
         };
         let unsure = waited.as_secs_f64() / 2.0;
         let found = format!(
-            "the server's is {:.1} ms {} (give or take {:.1} ms)",
+            "the server's clock is {:.1} ms {} (±{:.1} ms)",
             ahead.abs() * 1000.0,
             if ahead < 0.0 { "behind" } else { "ahead" },
             unsure * 1000.0
         );
         if ahead.abs() > IN_STEP + unsure {
-            Check::warning("clock", found, "sudo apt install chrony, on both sides")
+            Check::warning(
+                "clock",
+                found,
+                "sudo apt install chrony, on the robot and on the server",
+            )
         } else {
             Check::good("clock", found)
         }
     }
 
-    /// Where packets of the link's size are lost on the way, small answers come and big ones never do.
+    /// Checks that large responses arrive: if packets of the link's MTU are lost on the way, small responses arrive and
+    /// large ones never do.
     async fn mtu(&self) -> Check {
         match self.get("/api/v1/openapi.json").await {
             Ok(answer) => {
                 let mtu = answer
                     .mtu
                     .map_or_else(|| "not known".to_owned(), |mtu| format!("{mtu} bytes"));
-                let found = format!(
-                    "{mtu}; an answer of {} bytes came through",
-                    answer.body.len()
-                );
+                let found = format!("{mtu}; received a response of {} bytes", answer.body.len());
                 Check::good("mtu", found)
             }
             Err(error) => Check::bad(
                 "mtu",
-                format!("small answers come and a big one does not: {error}"),
+                format!("small responses arrive, but a large one does not: {error}"),
                 "sudo ip link set dev INTERFACE mtu 1280",
             ),
         }

@@ -9,14 +9,14 @@ use tokio::net::{TcpListener, TcpStream};
 use super::*;
 use crate::testing::{SOON, World};
 
-/// As they are, but for the long ones.
-const QUICK: Pauses = Pauses {
+/// The defaults, with a short interval after refusals.
+const QUICK: RetryPauses = RetryPauses {
     refused: Duration::from_millis(20),
     ..PAUSES
 };
 
-/// What a robot asks on its next connection, and the connection.
-async fn asked(listener: &TcpListener) -> (String, TcpStream) {
+/// Returns the robot's next request and its connection.
+async fn next_request(listener: &TcpListener) -> (String, TcpStream) {
     let (mut stream, _) = listener.accept().await.unwrap();
     let mut head = Vec::new();
     while !head.ends_with(b"\r\n\r\n") {
@@ -25,21 +25,22 @@ async fn asked(listener: &TcpListener) -> (String, TcpStream) {
     (String::from_utf8(head).unwrap(), stream)
 }
 
-/// Accepts the next connection and the link on it; how the robot wants to go on.
-async fn welcomes(listener: &TcpListener) -> (Option<String>, WebSocket<TcpStream>) {
-    let (head, mut stream) = asked(listener).await;
+/// Accepts the next connection and its link; returns the session that the robot wants to resume, and the connection.
+async fn accept_link(listener: &TcpListener) -> (Option<String>, WebSocket<TcpStream>) {
+    let (head, mut stream) = next_request(listener).await;
     let key = head.split("Sec-WebSocket-Key: ").nth(1).unwrap();
     let key = key.lines().next().unwrap();
     let guid = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
     let accept = STANDARD.encode_to_string(Sha1::digest(format!("{key}{guid}")));
     let answer = format!(
-        "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: {accept}\r\n\
+        "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: \
+         {accept}\r\n\
          Sec-WebSocket-Protocol: {}\r\n\r\n",
         link::SUBPROTOCOL
     );
     stream.write_all(answer.as_bytes()).await.unwrap();
     let mut socket = WebSocket::new(stream, &[], MAX_FRAME, MAX_RECORD);
-    let mut held = Budget::unlimited().permit();
+    let mut held = Budget::without_limit().permit();
     let hello: Hello = receive_open(&mut socket, "hello", &mut held).await.unwrap();
     let welcome = Welcome::Accepted {
         session: "session".to_owned(),
@@ -49,29 +50,29 @@ async fn welcomes(listener: &TcpListener) -> (Option<String>, WebSocket<TcpStrea
         next: 1,
         codecs: Vec::new(),
         servant: "servant".to_owned(),
-        limits: link::Limits::default(),
+        limits: link::LinkLimits::default(),
     };
     send_open(&mut socket, &welcome).await.unwrap();
     (hello.resume.map(|resume| resume.session), socket)
 }
 
-async fn refuses(listener: &TcpListener) {
-    let (_, mut stream) = asked(listener).await;
+async fn refuse_link(listener: &TcpListener) {
+    let (_, mut stream) = next_request(listener).await;
     let answer = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 5\r\n\r\nnever";
     stream.write_all(answer).await.unwrap();
 }
 
-/// Keeps a link to a server that behaves so; why it is kept no more, if the server is not done before.
-async fn keeps(serves: impl AsyncFnOnce(&TcpListener)) -> Option<String> {
+/// Keeps a link to a server with this behaviour; returns why the link ended, unless the server is done before.
+async fn run_against(serves: impl AsyncFnOnce(&TcpListener)) -> Option<String> {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let server = format!("ws://{}", listener.local_addr().unwrap());
     let settings = format!("server = {server:?}\nservice = 'any'\nrobot = 'r'");
     let config: Config = toml::from_str(&settings).unwrap();
     let world = World::new(RosVersion::One).await;
     let node = world.node("/node").await;
-    let mirror = Mirror::start(node, "label".to_owned(), run::session(&config), SOON);
+    let mirror = Mirror::start(node, "label".to_owned(), run::new_session(&config), SOON);
     let mut hello = Hello::default();
-    let keeping = keep_with(&config, &mirror, &mut hello, &QUICK);
+    let keeping = run_link_with(&config, &mirror, &mut hello, &QUICK);
     let ended = async {
         tokio::select! {
             reason = keeping => Some(reason),
@@ -83,11 +84,11 @@ async fn keeps(serves: impl AsyncFnOnce(&TcpListener)) -> Option<String> {
 
 #[tokio::test]
 async fn what_was_accepted_once_is_asked_for_again_when_it_is_refused() {
-    let reason = keeps(async |listener| {
-        drop(welcomes(listener).await);
-        refuses(listener).await;
-        refuses(listener).await;
-        let (resumed, _socket) = welcomes(listener).await;
+    let reason = run_against(async |listener| {
+        drop(accept_link(listener).await);
+        refuse_link(listener).await;
+        refuse_link(listener).await;
+        let (resumed, _socket) = accept_link(listener).await;
         assert_eq!(resumed.as_deref(), Some("session"));
     });
     assert_eq!(reason.await, None);
@@ -95,8 +96,8 @@ async fn what_was_accepted_once_is_asked_for_again_when_it_is_refused() {
 
 #[tokio::test]
 async fn what_is_refused_at_first_is_not_asked_for_again() {
-    let reason = keeps(async |listener| {
-        refuses(listener).await;
+    let reason = run_against(async |listener| {
+        refuse_link(listener).await;
         std::future::pending().await
     });
     let reason = reason.await.unwrap();
@@ -105,12 +106,12 @@ async fn what_is_refused_at_first_is_not_asked_for_again() {
 
 #[tokio::test(start_paused = true)]
 async fn a_link_that_is_lost_as_soon_as_it_is_accepted_is_tried_ever_more_seldom() {
-    let mut pace = Pace::default();
+    let mut pace = RetryPace::default();
     let mut waited = async |accepted: Instant| {
         let lost = Instant::now();
-        pace.lost(Some(accepted), &PAUSES);
+        pace.on_link_lost(Some(accepted), &PAUSES);
         pace.wait(PAUSES.away).await;
-        pace.begin();
+        pace.start_attempt();
         lost.elapsed()
     };
     for _ in 0..8 {

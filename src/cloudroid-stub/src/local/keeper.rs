@@ -1,5 +1,5 @@
-//! Keeps the promise for one node: carries out what [`qos::Governor`] decides, on the link, the local original and
-//! the application.
+//! Keeps the promise for one node: executes the decisions of [`qos::Governor`] on the link, the local original and the
+//! application.
 
 mod context;
 mod effects;
@@ -18,118 +18,123 @@ use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use qos::{
-    Event, Failure, Governor, HandOver, Ledger, Limits, LocalState, Mode, Outcome, Pair, Phases,
-    RequestId, SafeStop, Side, Sla, Verdict,
+    DeliveryVerdict, Failure, Governor, HandOver, HandOverLedger, LocalState, Mode, Phases,
+    QosEvent, QosSla, RequestId, RequestOutcome, Responder, RetentionLimits, SafeStop, TopicPair,
 };
-use ros::bus::{Message, WireType};
+use ros::bus::{SerializedMessage, WireType};
 use tokio::sync::{Notify, mpsc, oneshot};
 use tokio::time::sleep_until;
 
-use super::original::{Interface, News, Original};
-use super::remembered::Remembered;
-use super::stamp::{Stamps, age};
-use context::Context;
-use goals::Goals;
-use kept::{KeptInput, KeptInputs};
+use super::original::{ExpectedInterface, Original, OriginalEvent};
+use super::remembered::RememberedSettings;
+use super::stamp::{StampReader, age};
+use context::LocalContext;
+use goals::KeeperGoals;
+use kept::{RetainedInput, RetainedInputs};
 
-/// The way to the servant.
+/// The connection to the servant.
 pub trait Cloud: Send + Sync + 'static {
     /// Sends an input; never blocks.
-    fn publish(&self, topic: &str, message: &Message);
-    /// Sends a call; its answer comes by [`Keeper::cloud_answered`] under the same id.
+    fn publish(&self, topic: &str, message: &SerializedMessage);
+    /// Sends a call; its answer arrives in [`Keeper::on_cloud_answer`] with the same id.
     fn call(&self, request: RequestId, service: &str, bytes: Bytes);
-    /// Sends a call that is not measured, and gives its answer. While the link is away that waits.
-    fn ask(&self, service: &str, bytes: Bytes) -> Answer;
+    /// Makes a call that is not measured and returns its answer. Waits while the link is down.
+    fn call_unmeasured(&self, service: &str, bytes: Bytes) -> PendingAnswer;
 }
 
-/// What a call of one side will come to.
-pub type Answer = BoxFuture<'static, Result<Bytes, Failure>>;
+/// The pending answer of a call to one side.
+pub type PendingAnswer = BoxFuture<'static, Result<Bytes, Failure>>;
 
 /// The robot's nodes.
 pub trait Application: Send + Sync + 'static {
     /// Publishes an output of the local original.
-    fn deliver(&self, topic: &str, message: Message);
-    /// The local original has latched this while it does not speak for the node: its last word, once it does.
-    fn latched(&self, topic: &str, message: Message);
-    /// Publishes the safe-stop message: nobody has answered in time.
+    fn deliver(&self, topic: &str, message: SerializedMessage);
+    /// Stores a message that the local original has latched while it does not speak for the node, to be published when
+    /// it does.
+    fn on_latched_output(&self, topic: &str, message: SerializedMessage);
+    /// Publishes the safe-stop message: neither side has answered in time.
     fn safe_stop(&self, stop: &SafeStop);
-    /// A decision about the local original.
-    fn decided(&self, event: &Event);
-    /// A stateful service: who goes on, and without what.
-    fn handed_over(&self, over: &HandOver);
-    /// The side that goes on was not given these calls and goals, of a service that is not stateful: most lose nothing by that.
-    fn lacks(&self, over: &HandOver);
-    /// How a request went.
-    fn told(&self, outcome: &Outcome);
+    /// Reports a decision about the local original.
+    fn on_decision(&self, event: &QosEvent);
+    /// Reports a hand-over of a stateful service: the side that continues, and the messages that it did not receive.
+    fn on_hand_over(&self, over: &HandOver);
+    /// Reports calls and goals that the continuing side of a stateless service did not receive; most services lose
+    /// nothing by that.
+    fn on_missed_requests(&self, over: &HandOver);
+    /// Reports the outcome of a request.
+    fn on_outcome(&self, outcome: &RequestOutcome);
 }
 
-/// What a request carries.
+/// Content of a request.
 #[derive(Debug, Clone)]
 pub enum Payload {
     /// An input message.
-    Input(Arc<KeptInput>),
+    Input(Arc<RetainedInput>),
     /// A serialized service request.
     Call(Bytes),
-    /// A goal of an action that is made of calls (ROS 2).
-    Goal(Arc<goals::Sent>),
+    /// A goal of an action that consists of service calls (ROS 2).
+    Goal(Arc<goals::GoalRequest>),
 }
 
-/// One node's keeper. Its tasks end with it, and so does the local original.
+/// The keeper of one node's promise. Its tasks and the local original end with it.
 pub struct Keeper {
     state: Mutex<State>,
     cloud: Arc<dyn Cloud>,
     robot: Arc<dyn Application>,
     original: Option<Arc<Original>>,
-    /// What the node was told to be.
-    remembered: Arc<Remembered>,
-    /// Of that the cloud was not told something.
+    /// Settings that the node was given, to be repeated to a new process or servant.
+    remembered: Arc<RememberedSettings>,
+    /// Set if a setting has not reached the cloud.
     cloud_missed: AtomicBool,
     safe_stop: Option<SafeStop>,
     ending: AtomicBool,
-    /// The next deadline may have changed.
+    /// Notified when the next deadline may have changed.
     wake: Arc<Notify>,
     this: Weak<Self>,
 }
 
 struct State {
     governor: Governor<Payload>,
-    context: Context,
-    kept: KeptInputs,
-    stamps: Stamps,
-    /// What each side was given: of a stateful service all, of any other the calls and goals, each of which may switch how a node behaves.
-    ledger: Ledger,
+    context: LocalContext,
+    kept: RetainedInputs,
+    stamps: StampReader,
+    /// Record of the messages that each side received: for a stateful service all, otherwise calls and goals, which may
+    /// change a node's mode.
+    ledger: HandOverLedger,
     is_stateful: bool,
-    /// What was lost at the last hand-over.
+    /// Losses of the last hand-over.
     lost: Option<(Instant, String)>,
     callers: HashMap<RequestId, oneshot::Sender<Result<Bytes, String>>>,
-    goals: Goals,
+    goals: KeeperGoals,
 }
 
 impl Keeper {
-    /// Begins, with the link down. Without an `original` the cloud is alone; where no time is promised that is said when
-    /// it would be needed, else at once.
+    /// Starts the keeper, with the link down. Without an `original` there is only the cloud; if no time is promised
+    /// this is reported when the original would be needed, otherwise at once.
     pub fn start(
-        sla: Sla,
-        pairs: Vec<Pair>,
-        original: Option<(Original, mpsc::UnboundedReceiver<News>)>,
+        sla: QosSla,
+        pairs: Vec<TopicPair>,
+        original: Option<(Original, mpsc::UnboundedReceiver<OriginalEvent>)>,
         cloud: Arc<dyn Cloud>,
         robot: Arc<dyn Application>,
     ) -> Arc<Self> {
         let (original, news) = original.unzip();
-        let promised = !sla.is_of_link();
+        let promised = !sla.is_link_based();
         let safe_stop = sla.safe_stop.clone();
         let state = State {
-            ledger: Ledger::default(),
+            ledger: HandOverLedger::default(),
             is_stateful: sla.mode == Mode::Stateful,
             lost: None,
-            context: Context::of(&pairs),
-            kept: KeptInputs::default(),
-            governor: Governor::new(sla, pairs, Limits::default()),
-            stamps: Stamps::default(),
+            context: LocalContext::new(&pairs),
+            kept: RetainedInputs::default(),
+            governor: Governor::new(sla, pairs, RetentionLimits::default()),
+            stamps: StampReader::default(),
             callers: HashMap::new(),
-            goals: Goals::default(),
+            goals: KeeperGoals::default(),
         };
-        let remembered = original.as_ref().map(|original| original.remembered());
+        let remembered = original
+            .as_ref()
+            .map(|original| original.remembered_settings());
         let keeper = Arc::new_cyclic(|this| Self {
             state: Mutex::new(state),
             cloud,
@@ -142,21 +147,28 @@ impl Keeper {
             wake: Arc::default(),
             this: this.clone(),
         });
-        tokio::spawn(keep_time(Arc::downgrade(&keeper), keeper.wake.clone()));
+        tokio::spawn(run_timer(Arc::downgrade(&keeper), keeper.wake.clone()));
         match news {
-            Some(news) => drop(tokio::spawn(listen(Arc::downgrade(&keeper), news))),
-            None if promised => keeper.missing(),
+            Some(news) => drop(tokio::spawn(process_original_events(
+                Arc::downgrade(&keeper),
+                news,
+            ))),
+            None if promised => keeper.report_missing_original(),
             None => {}
         }
-        keeper.with(|state, now| state.governor.begin(now));
+        keeper.update(|state, now| state.governor.begin(now));
         keeper
     }
 
-    /// More of the interface has become known.
-    pub async fn learn(&self, pairs: Vec<Pair>, interface: Interface) -> anyhow::Result<()> {
-        self.with(|state, now| {
+    /// Adds newly known parts of the interface.
+    pub async fn learn(
+        &self,
+        pairs: Vec<TopicPair>,
+        interface: ExpectedInterface,
+    ) -> anyhow::Result<()> {
+        self.update(|state, now| {
             state.context.learn(&pairs);
-            state.governor.learn(now, pairs);
+            state.governor.add_pairs(now, pairs);
         });
         match &self.original {
             Some(original) => original.adapt(interface).await,
@@ -164,7 +176,7 @@ impl Keeper {
         }
     }
 
-    /// These types have become known, which messages of ROS 2 have without their definitions.
+    /// Adds newly known types, since ROS 2 messages have no definitions of their types.
     pub fn learn_types<'a>(&self, types: impl Iterator<Item = &'a WireType>) {
         let mut state = self.state.lock();
         for wire_type in types {
@@ -172,74 +184,79 @@ impl Keeper {
         }
     }
 
-    /// The local original, where there is one.
+    /// Returns the local original, if there is one.
     pub fn original(&self) -> Option<&Arc<Original>> {
         self.original.as_ref()
     }
 
-    fn missing(&self) {
-        self.with(|state, now| state.governor.local(now, LocalState::Missing));
+    fn report_missing_original(&self) {
+        self.update(|state, now| state.governor.on_local_state(now, LocalState::Missing));
     }
 
-    /// The local original is given messages, too.
+    /// Returns whether the local original is fed messages.
     pub fn is_local_fed(&self) -> bool {
         self.state.lock().governor.sides().local
     }
 
-    /// Somebody on the robot listens to an output, or nobody does.
-    pub fn wanted(&self, output: &str, wanted: bool) {
-        self.with(|state, now| state.governor.wanted(now, output, wanted));
+    /// Records whether an output has subscribers on the robot.
+    pub fn set_wanted(&self, output: &str, wanted: bool) {
+        self.update(|state, now| state.governor.set_listened(now, output, wanted));
     }
 
-    /// The application calls a service. When the caller goes, so does the request.
+    /// Handles a service call of the application. The request is cancelled if the returned future is dropped.
     pub async fn call(
         self: &Arc<Self>,
         service: &Arc<str>,
         request: Bytes,
     ) -> Result<Bytes, String> {
         let (sender, answer) = oneshot::channel();
-        let id = self.with(|state, now| {
-            state.ledger.told(now, service);
+        let id = self.update(|state, now| {
+            state.ledger.record_input(now, service);
             let id = state.governor.call(now, service, Payload::Call(request));
             state.callers.insert(id, sender);
             id
         });
-        let waiting = Waiting { keeper: self, id };
+        let waiting = CallGuard { keeper: self, id };
         let answer = answer.await;
         drop(waiting);
         answer.unwrap_or_else(|_| Err("the node is ending".to_owned()))
     }
 
-    /// The cloud answered a call.
-    pub fn cloud_answered(
+    /// Handles an answer of the cloud to a call.
+    pub fn on_cloud_answer(
         &self,
         id: RequestId,
         result: Result<Bytes, Failure>,
         phases: Option<Phases>,
     ) {
-        self.answered(Side::Cloud, id, result, phases);
+        self.on_answer(Responder::Cloud, id, result, phases);
     }
 
-    /// The servant's node published. True where the application is to have it.
-    pub fn cloud_output(&self, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
-        self.output(Side::Cloud, topic, message, phases)
+    /// Handles a message that the servant's node has published; returns whether to publish it to the application.
+    pub fn on_cloud_output(
+        &self,
+        topic: &str,
+        message: &SerializedMessage,
+        phases: Option<Phases>,
+    ) -> bool {
+        self.on_output(Responder::Cloud, topic, message, phases)
     }
 
-    /// The link is up; `resumed`: what was sent will be answered yet.
+    /// Handles a link that is up; `resumed` is set if earlier requests will still be answered.
     pub fn link_up(&self, resumed: bool) {
-        self.with(|state, now| {
+        self.update(|state, now| {
             state.ledger.link_up(resumed);
             state.governor.link_up(now, resumed);
         });
-        self.tell_cloud(resumed);
+        self.replay_to_cloud(resumed);
     }
 
-    /// The link is down.
+    /// Handles a link that is down.
     pub fn link_down(&self) {
-        self.with(|state, now| state.governor.link_down(now));
+        self.update(|state, now| state.governor.link_down(now));
     }
 
-    /// The node is ending: the local original ends, too, and is not started again. roslaunch's signal has reached it
+    /// Ends the local original for good, because the node is ending. roslaunch's signal has reached its process
     /// already, so its end is no crash.
     pub fn end(&self) {
         self.ending.store(true, Ordering::Relaxed);
@@ -248,61 +265,70 @@ impl Keeper {
         }
     }
 
-    /// How it stands.
-    pub fn report(&self) -> qos::Report {
+    /// Returns the state of the promise.
+    pub fn report(&self) -> qos::QosReport {
         let (state, now) = (self.state.lock(), Instant::now());
         let lost = state.lost.as_ref();
-        qos::Report {
+        qos::QosReport {
             lost: lost.map(|(at, text)| ((now - *at).as_secs_f64(), text.clone())),
             ..state.governor.report(now)
         }
     }
 
-    fn output(&self, side: Side, topic: &str, message: &Message, phases: Option<Phases>) -> bool {
-        let verdict = self.with(|state, now| {
-            let stamp = state.stamps.of(message).filter(|stamp| !stamp.is_zero());
+    fn on_output(
+        &self,
+        side: Responder,
+        topic: &str,
+        message: &SerializedMessage,
+        phases: Option<Phases>,
+    ) -> bool {
+        let verdict = self.update(|state, now| {
+            let stamp = state
+                .stamps
+                .read_stamp(message)
+                .filter(|stamp| !stamp.is_zero());
             let age = stamp.map(age).unwrap_or_default();
-            let key = goals::key_of_feedback(topic, message);
+            let key = goals::feedback_key(topic, message);
             let key = key.or_else(|| state.stamps.key(message));
             let verdict = state.governor.output(now, side, topic, key, age);
             if let Some(phases) = phases {
-                state.governor.phases(&phases);
+                state.governor.record_phases(&phases);
             }
             verdict
         });
-        verdict == Verdict::Deliver
+        verdict == DeliveryVerdict::Deliver
     }
 
-    fn answered(
+    fn on_answer(
         &self,
-        side: Side,
+        side: Responder,
         id: RequestId,
         result: Result<Bytes, Failure>,
         phases: Option<Phases>,
     ) {
-        self.with(|state, now| {
+        self.update(|state, now| {
             match result {
                 Ok(bytes) => {
-                    if state.governor.answered(now, side, id) == Verdict::Deliver {
+                    if state.governor.on_result(now, side, id) == DeliveryVerdict::Deliver {
                         state.reply(id, Ok(bytes));
                     }
                 }
-                Err(failure) => state.governor.failed(now, side, id, &failure),
+                Err(failure) => state.governor.on_failure(now, side, id, &failure),
             }
             if let Some(phases) = phases {
-                state.governor.phases(&phases);
+                state.governor.record_phases(&phases);
             }
         });
     }
 
-    /// Time has passed; gives the next deadline.
+    /// Advances the governor's time and returns its next deadline.
     fn tick(&self) -> Option<Instant> {
         self.change(|state, now| state.governor.tick(now));
         self.state.lock().governor.deadline()
     }
 
-    /// Something happened: changes the state, does what follows, and has the deadline looked at again.
-    fn with<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
+    /// Changes the state, applies the effects and wakes the timer to check the deadline.
+    fn update<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
         let result = self.change(change);
         self.wake.notify_one();
         result
@@ -317,16 +343,16 @@ impl State {
     }
 }
 
-/// Cancels a request whose caller has gone.
-struct Waiting<'a> {
+/// Cancels a request whose caller is gone.
+struct CallGuard<'a> {
     keeper: &'a Keeper,
     id: RequestId,
 }
 
-impl Drop for Waiting<'_> {
+impl Drop for CallGuard<'_> {
     fn drop(&mut self) {
         let id = self.id;
-        self.keeper.with(|state, now| {
+        self.keeper.update(|state, now| {
             if state.callers.remove(&id).is_some() {
                 state.governor.cancel(now, id);
             }
@@ -335,7 +361,7 @@ impl Drop for Waiting<'_> {
 }
 
 /// Wakes the governor at its deadlines.
-async fn keep_time(keeper: Weak<Keeper>, wake: Arc<Notify>) {
+async fn run_timer(keeper: Weak<Keeper>, wake: Arc<Notify>) {
     loop {
         let Some(deadline) = keeper.upgrade().map(|keeper| keeper.tick()) else {
             return;
@@ -350,25 +376,28 @@ async fn keep_time(keeper: Weak<Keeper>, wake: Arc<Notify>) {
     }
 }
 
-/// Takes what the local original says.
-async fn listen(keeper: Weak<Keeper>, mut news: mpsc::UnboundedReceiver<News>) {
+/// Handles the events of the local original.
+async fn process_original_events(
+    keeper: Weak<Keeper>,
+    mut news: mpsc::UnboundedReceiver<OriginalEvent>,
+) {
     while let Some(news) = news.recv().await {
         let Some(keeper) = keeper.upgrade() else {
             return;
         };
         match news {
-            News::State(local) => keeper.with(|state, now| {
-                state.context.is_now(local);
-                state.governor.local(now, local);
+            OriginalEvent::State(local) => keeper.update(|state, now| {
+                state.context.set_state(local);
+                state.governor.on_local_state(now, local);
             }),
-            News::Crashed(reason) => {
-                keeper.with(|state, now| state.governor.local_crashed(now, &reason))
+            OriginalEvent::Crashed(reason) => {
+                keeper.update(|state, now| state.governor.on_local_crash(now, &reason))
             }
-            News::Output(topic, message) => {
-                if keeper.output(Side::Local, &topic, &message, None) {
+            OriginalEvent::Output(topic, message) => {
+                if keeper.on_output(Responder::Local, &topic, &message, None) {
                     keeper.robot.deliver(&topic, message);
                 } else if message.latching {
-                    keeper.robot.latched(&topic, message);
+                    keeper.robot.on_latched_output(&topic, message);
                 }
             }
         }

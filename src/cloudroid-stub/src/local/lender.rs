@@ -1,4 +1,4 @@
-//! The robot's services, for the local original: it has a Master of its own, at which the robot's nodes are not
+//! Lends the robot's services to the local original: it has a Master of its own, where the robot's nodes are not
 //! registered.
 
 use std::sync::Arc;
@@ -6,23 +6,23 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use ros::bus::{Bus, BusError, Digest, Lender, Lent, ServiceHandler};
+use ros::bus::{Bus, BusError, Digest, Lender, LentService, ServiceHandler};
 use tokio::sync::watch;
 
-/// Longer than any goal is waited for.
+/// Time limit for the result of a goal, longer than any goal takes.
 const GOAL: Duration = Duration::from_secs(24 * 3600);
 
-/// Lends what is served on the robot, but by the node that is stood in for.
-pub struct Robot {
+/// Lends the services of the robot, except those of the node that the stub stands in for.
+pub struct RobotLender {
     bus: Arc<dyn Bus>,
     node: String,
     limit: Duration,
-    /// Connections are never ended from here: a call that finds nobody fails with the reason.
+    /// Never set: connections are not closed by this side, and a call without a server fails with the reason.
     open: watch::Sender<bool>,
 }
 
-impl Robot {
-    /// A service may take `limit`.
+impl RobotLender {
+    /// Creates a lender whose calls may take `limit`.
     pub fn new(node: &str, bus: &Arc<dyn Bus>, limit: Duration) -> Self {
         Self {
             bus: Arc::clone(bus),
@@ -34,15 +34,15 @@ impl Robot {
 }
 
 #[async_trait]
-impl Lender for Robot {
-    async fn find(&self, service: &str, _node: &str) -> Option<Lent> {
+impl Lender for RobotLender {
+    async fn find_service(&self, service: &str, _node: &str) -> Option<LentService> {
         let provider = self.bus.lending().ok()?.provider(service).await.ok()?;
-        // Its own would come back to it.
+        // The node's own services must not be lent to itself.
         if provider.node == self.node {
             return None;
         }
-        Some(Lent {
-            handler: Arc::new(Passing {
+        Some(LentService {
+            handler: Arc::new(ForwardedService {
                 bus: Arc::clone(&self.bus),
                 service: service.to_owned(),
                 limit: self.limit,
@@ -54,8 +54,8 @@ impl Lender for Robot {
     }
 }
 
-/// Passes calls of one service to the robot.
-struct Passing {
+/// Forwards calls of one service to the robot.
+struct ForwardedService {
     bus: Arc<dyn Bus>,
     service: String,
     limit: Duration,
@@ -63,29 +63,30 @@ struct Passing {
 }
 
 #[async_trait]
-impl ServiceHandler for Passing {
+impl ServiceHandler for ForwardedService {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let (service, digest) = (&self.service, &self.digest);
-        let limit = limit(service, self.limit);
+        let limit = call_limit_for(service, self.limit);
         let called = self.bus.call_typed(service, digest, request, limit);
         called.await.map_err(|error| match error {
             BusError::CallFailed { reason, .. } => reason,
-            error @ BusError::Timeout { .. } => took_too_long(&error),
+            error @ BusError::Timeout { .. } => report_timeout(&error),
             other => other.to_string(),
         })
     }
 }
 
-/// How long a service of the robot may take that has this limit. The result of a goal (ROS 2) takes as long as the goal.
-pub fn limit(service: &str, limit: Duration) -> Duration {
-    match service.ends_with("/_action/get_result") {
-        true => limit.max(GOAL),
-        false => limit,
+/// Returns the time limit for a call of a robot's service. The result of a goal (ROS 2) may take as long as the goal.
+pub fn call_limit_for(service: &str, limit: Duration) -> Duration {
+    if service.ends_with("/_action/get_result") {
+        limit.max(GOAL)
+    } else {
+        limit
     }
 }
 
-/// What is said of a service of the robot that has not answered within its limit, to who called it and in the log.
-pub fn took_too_long(error: &BusError) -> String {
+/// Logs that a robot's service has not answered within its limit, and returns the message for the caller.
+pub fn report_timeout(error: &BusError) -> String {
     let reason = format!("{error}; where it needs longer, raise call_limit in stub.toml");
     tracing::warn!("{reason}");
     reason

@@ -1,4 +1,4 @@
-//! The local original as its user sees it: start, stop, feed, call; its state and its outputs come back.
+//! Interface of the local original: start, stop, feed, call; its state and its outputs are reported as events.
 //!
 //! ```text
 //!             start          registered, listens to its requests
@@ -18,107 +18,108 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use qos::{Failure, LocalState};
 use ros::bus::{
-    Bus, BusError, Matched, Message, ParamValue, PeerId, Publisher, Qos, Reliability, WireType,
-    reaches,
+    Bus, BusError, MatchedPeers, ParamValue, PeerId, Publisher, QosProfile, QosReliability,
+    SerializedMessage, WireType, wait_for_connected,
 };
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-use super::keeper::Answer;
-use super::latched::Latched;
-use super::private_system::{Changes, PrivateSystem, Registered};
-use super::process::Program;
-use super::remembered::Remembered;
-use runner::Runner;
+use super::keeper::PendingAnswer;
+use super::latched::LatchedRelay;
+use super::private_system::{GraphChanges, PrivateSystem, RegisteredInterface};
+use super::process::OriginalProgram;
+use super::remembered::RememberedSettings;
+use runner::OriginalRunner;
 
-/// Messages kept per topic: what waits longer is old.
+/// Queue length for each topic, in messages: older ones are outdated.
 pub const QUEUE: usize = 16;
-/// Longer than any call of a local service is waited for.
+/// Time limit for a call of a local service, longer than any call takes.
 const CALL: Duration = Duration::from_secs(24 * 3600);
-/// How long the original may take to register all of the interface once its node is registered; another version of it may
-/// lack a part.
+/// Time allowed for the original to register its whole interface after its node is registered; another version of it
+/// may lack a part.
 const SETTLE: Duration = Duration::from_secs(3);
 
-/// What the original needs.
+/// Setup of the local original.
 #[derive(Debug, Clone)]
-pub struct Setting {
-    /// Its executable, arguments and environment; none where no original is installed.
-    pub program: Option<Program>,
-    /// Its absolute node name.
+pub struct OriginalSetup {
+    /// Its executable, arguments and environment; `None` if no original is installed.
+    pub program: Option<OriginalProgram>,
+    /// Absolute name of its node.
     pub node: String,
-    /// The domain of the robot's nodes (ROS 2), which is not the original's.
+    /// Domain of the robot's nodes (ROS 2), which the original must not use.
     pub domain: Option<u16>,
-    /// How long it may take to listen to its requests once its node is registered. What it waits for may never come; then it is
-    /// given them all the same.
+    /// Time allowed for it to subscribe to its requests after its node is registered. It may wait for something that
+    /// never happens; after this time it is fed requests all the same.
     pub patience: Duration,
 }
 
-/// What is known of the node's interface. It is ready when it listens to its requests, and has registered the rest or has had
-/// time to. What it may itself wait for before it listens to requests is given to it from its first moment ([`Keeper`](super::Keeper)).
+/// Known interface of the node. The original is ready when it subscribes to its requests and has registered the rest,
+/// or has had the time to. Inputs that it may wait for before it subscribes to requests are fed to it from its start
+/// ([`Keeper`](super::Keeper)).
 #[derive(Debug, Clone, Default)]
-pub struct Interface {
-    /// What it listens to.
+pub struct ExpectedInterface {
+    /// Topics that it subscribes to.
     pub inputs: BTreeMap<String, WireType>,
-    /// What it asks for of inputs, where that is told (ROS 2).
-    pub asked: BTreeMap<String, Qos>,
-    /// Of the inputs, its requests: it listens to them before it is ready.
+    /// Quality of service that it requests for inputs, if known (ROS 2).
+    pub asked: BTreeMap<String, QosProfile>,
+    /// Inputs that are requests: the original is not ready before it subscribes to them.
     pub awaited: BTreeSet<String>,
-    /// What it publishes.
+    /// Topics that it publishes.
     pub outputs: Vec<String>,
-    /// What it serves.
+    /// Services that it offers.
     pub services: Vec<String>,
-    /// Of all this, what lies below further nodes of its process: their names may be others in each of its lives (a listener to transforms has a random one), so
-    /// that nothing of it is waited for that is not awaited, and that no longer than for the rest.
+    /// Names of the above that belong to further nodes of its process. These may differ in each run (a transform
+    /// listener has a random name), so only requests among them are waited for, and no longer than for the rest.
     pub of_others: BTreeSet<String>,
 }
 
-impl Interface {
-    /// Whether this is waited for, as long as things have time to be registered.
-    pub(super) fn waits_for(&self, name: &str) -> bool {
+impl ExpectedInterface {
+    /// Returns whether the original is expected to register this name, within the time for registrations.
+    pub(super) fn is_expected(&self, name: &str) -> bool {
         self.awaited.contains(name) || !self.of_others.contains(name)
     }
 
-    /// Whether it is not ready before it listens to this, as long as that may take.
-    fn must_listen_to(&self, topic: &str) -> bool {
+    /// Returns whether the original is not ready before it subscribes to this topic, however long that takes.
+    fn is_required_input(&self, topic: &str) -> bool {
         self.awaited.contains(topic) && !self.of_others.contains(topic)
     }
 }
 
-/// What comes back.
+/// An event of the local original.
 #[derive(Debug)]
-pub enum News {
+pub enum OriginalEvent {
     /// Its state has changed.
     State(LocalState),
-    /// It ended by itself and will be started again.
+    /// Its process ended unexpectedly and will be restarted.
     Crashed(String),
-    /// It published on this topic.
-    Output(Arc<str>, Message),
+    /// It published a message on this topic.
+    Output(Arc<str>, SerializedMessage),
 }
 
-/// A handle; dropping it ends the process.
+/// Handle of the local original; the process ends when it is dropped.
 pub struct Original {
-    /// The node's name.
+    /// Name of the node.
     node: String,
-    orders: mpsc::UnboundedSender<Order>,
+    orders: mpsc::UnboundedSender<OriginalCommand>,
     system: Arc<PrivateSystem>,
     publishers: Publishers,
     sources: Sources,
-    latched: Latched,
+    latched: LatchedRelay,
     expected: Expected,
-    remembered: Arc<Remembered>,
-    news: mpsc::UnboundedSender<News>,
+    remembered: Arc<RememberedSettings>,
+    news: mpsc::UnboundedSender<OriginalEvent>,
     tasks: Mutex<Tasks>,
 }
 
-/// The inputs that it is given.
+/// Publishers of the original's inputs.
 type Publishers = Arc<Mutex<HashMap<String, Box<dyn Publisher>>>>;
-/// Who publishes each output.
-type Sources = Arc<Mutex<HashMap<String, watch::Receiver<Matched>>>>;
-/// What the node is expected to register.
-type Expected = Arc<Mutex<Interface>>;
+/// Publishers that the original's outputs are matched with.
+type Sources = Arc<Mutex<HashMap<String, watch::Receiver<MatchedPeers>>>>;
+/// Interface that the node is expected to register.
+type Expected = Arc<Mutex<ExpectedInterface>>;
 
-enum Order {
+enum OriginalCommand {
     Start,
     Stop,
 }
@@ -134,15 +135,15 @@ impl Drop for Tasks {
 }
 
 impl Original {
-    /// Prepares everything but the process: the private ROS system, inputs advertised, outputs subscribed to. Inputs
-    /// fed without being named in `interface` may lose their first message. Parameters are those of `robot`, and so are
-    /// services, which may take `limit`.
+    /// Prepares everything except the process: creates the private ROS system, advertises inputs, and subscribes to
+    /// outputs. An input that `interface` does not name may lose its first message. Parameters and services are those
+    /// of `robot`; a service may take `limit`.
     pub async fn new(
-        setting: Setting,
-        interface: Interface,
+        setting: OriginalSetup,
+        interface: ExpectedInterface,
         robot: Arc<dyn Bus>,
         limit: Duration,
-    ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<News>)> {
+    ) -> anyhow::Result<(Self, mpsc::UnboundedReceiver<OriginalEvent>)> {
         let system = PrivateSystem::new(&*robot, setting.domain).await?;
         let system = Arc::new(system);
         system.lend(&setting.node, &robot, limit).await?;
@@ -151,10 +152,10 @@ impl Original {
         let sources = Arc::default();
         let expected = Expected::default();
         let remembered = Arc::default();
-        let latched = Latched::begin(&system);
+        let latched = LatchedRelay::start(&system);
         let (orders, taken) = mpsc::unbounded_channel();
         let node = setting.node.clone();
-        let runner = Runner {
+        let runner = OriginalRunner {
             setting,
             system: system.clone(),
             robot,
@@ -181,8 +182,8 @@ impl Original {
         Ok((original, received))
     }
 
-    /// Advertises and subscribes to what is new in the interface.
-    pub async fn adapt(&self, interface: Interface) -> anyhow::Result<()> {
+    /// Advertises and subscribes to new parts of the interface.
+    pub async fn adapt(&self, interface: ExpectedInterface) -> anyhow::Result<()> {
         *self.expected.lock() = interface.clone();
         for output in interface.outputs {
             if self.sources.lock().contains_key(&output) {
@@ -194,7 +195,7 @@ impl Original {
                 .subscribe(
                     &output,
                     WireType::any(),
-                    Qos::keep_last(QUEUE).latching(true),
+                    QosProfile::keep_last(QUEUE).latching(true),
                 )
                 .await?;
             self.sources
@@ -202,10 +203,14 @@ impl Original {
                 .insert(output.clone(), subscription.matched.clone());
             let (topic, news): (Arc<str>, _) = (output.into(), self.news.clone());
             let task = tokio::spawn(async move {
-                // All of it, or the guard would stay behind and end the subscription.
+                // Capture the whole subscription: a part of it would leave its guard behind, which would end the
+                // subscription.
                 let subscription = &mut { subscription };
                 while let Some(message) = subscription.messages.recv().await {
-                    if news.send(News::Output(topic.clone(), message)).is_err() {
+                    if news
+                        .send(OriginalEvent::Output(topic.clone(), message))
+                        .is_err()
+                    {
                         return;
                     }
                 }
@@ -214,8 +219,8 @@ impl Original {
         }
         for (topic, wire_type) in interface.inputs {
             let asked = interface.asked.get(&topic);
-            if hears_plain(asked) && !self.publishers.lock().contains_key(&topic) {
-                let qos = offered(asked);
+            if accepts_volatile(asked) && !self.publishers.lock().contains_key(&topic) {
+                let qos = offered_qos(asked);
                 let publisher = advertise(&self.system, &topic, &wire_type, qos).await?;
                 self.publishers.lock().insert(topic, publisher);
             }
@@ -223,76 +228,78 @@ impl Original {
         Ok(())
     }
 
-    /// What it is told at each start.
-    pub fn remembered(&self) -> Arc<Remembered> {
+    /// Returns the settings that are replayed at each start.
+    pub fn remembered_settings(&self) -> Arc<RememberedSettings> {
         Arc::clone(&self.remembered)
     }
 
-    /// What it has registered, with types.
-    pub async fn registered(&self) -> Registered {
-        self.system.registered_by(&self.node).await
+    /// Returns the registered interface, with types.
+    pub async fn registered_interface(&self) -> RegisteredInterface {
+        self.system.registered_interface(&self.node).await
     }
 
-    /// Changes with whatever is registered.
-    pub fn registrations(&self) -> Changes {
+    /// Returns a receiver of changes of the registrations.
+    pub fn registration_changes(&self) -> GraphChanges {
         self.system.changes()
     }
 
-    /// Returns once the process is connected to all inputs, or has had time to be.
-    pub async fn connected(&self) {
+    /// Returns when the process is connected to all inputs, or after the time allowed for that.
+    pub async fn wait_connected(&self) {
         let ends: Vec<_> = {
             let inputs = self.publishers.lock();
-            inputs.values().map(|input| input.matched()).collect()
+            inputs
+                .values()
+                .map(|input| input.matched_subscribers())
+                .collect()
         };
         let all = async {
             for end in ends {
-                reaches(end, 1).await;
+                wait_for_connected(end, 1).await;
             }
         };
         let _ = timeout(SETTLE, all).await;
     }
 
-    /// A publisher has latched this message. The process gets it at once if it runs, and at each start.
-    pub fn latch(&self, topic: &Arc<str>, message: &Message) {
-        self.latched.keep(topic, message);
+    /// Adds a latched message of a publisher. The process receives it now if it runs, and at each start.
+    pub fn latch(&self, topic: &Arc<str>, message: &SerializedMessage) {
+        self.latched.push(topic, message);
     }
 
-    /// This publisher of a topic has gone; its latched message is dropped.
+    /// Discards the latched message of a publisher that has ended.
     pub fn unlatch(&self, topic: &Arc<str>, publisher: &PeerId) {
-        self.latched.forget(topic, publisher);
+        self.latched.remove_publisher(topic, publisher);
     }
 
-    /// A parameter of the robot has changed, or was deleted: nodes of ROS 1 share them. Those of a process are the robot's when it
-    /// starts; this is for one that runs.
+    /// Changes or deletes a parameter, because it has changed on the robot: ROS 1 nodes share parameters. A process
+    /// starts with the robot's; this is for one that runs.
     pub async fn change_parameter(&self, name: &str, value: Option<ParamValue>) {
         if let Err(error) = self.system.change_parameter(name, value).await {
-            tracing::debug!(name, %error, "the local original is not told of a parameter");
+            tracing::debug!(name, %error, "cannot set a parameter of the local original");
         }
     }
 
-    /// Starts the process, if it does not run.
+    /// Starts the process, unless it runs.
     pub fn start(&self) {
-        let _ = self.orders.send(Order::Start);
+        let _ = self.orders.send(OriginalCommand::Start);
     }
 
     /// Ends the process, if it runs.
     pub fn stop(&self) {
-        let _ = self.orders.send(Order::Stop);
+        let _ = self.orders.send(OriginalCommand::Stop);
     }
 
-    /// Gives it a message. A topic that was not named in advance is advertised first, and its message may be too
-    /// early.
-    pub fn feed(&self, topic: &str, message: &Message) {
+    /// Feeds it a message. A topic that was not named in advance is advertised first, and the message may be lost.
+    pub fn feed(&self, topic: &str, message: &SerializedMessage) {
         if let Some(publisher) = self.publishers.lock().get(topic) {
             publisher.publish(message.bytes.clone());
             return;
         }
         let asked = self.expected.lock().asked.get(topic).copied();
-        if !hears_plain(asked.as_ref()) {
+        if !accepts_volatile(asked.as_ref()) {
             return;
         }
         let (system, publishers) = (self.system.clone(), self.publishers.clone());
-        let qos = offered(asked.as_ref());
+        let qos = offered_qos(asked.as_ref());
         let (topic, message) = (topic.to_owned(), message.clone());
         tokio::spawn(async move {
             match advertise(&system, &topic, &message.wire_type, qos).await {
@@ -300,18 +307,20 @@ impl Original {
                     publisher.publish(message.bytes);
                     publishers.lock().entry(topic).or_insert(publisher);
                 }
-                Err(error) => tracing::debug!(topic, %error, "the local original is not fed"),
+                Err(error) => {
+                    tracing::debug!(topic, %error, "cannot publish to the local original")
+                }
             }
         });
     }
 
-    /// Calls one of its services, however long it takes.
-    pub fn call(&self, service: &str, request: Bytes) -> Answer {
+    /// Calls one of its services, without a time limit.
+    pub fn call(&self, service: &str, request: Bytes) -> PendingAnswer {
         call(self.system.bus().clone(), service, request)
     }
 }
 
-fn call(bus: Arc<dyn Bus>, service: &str, request: Bytes) -> Answer {
+fn call(bus: Arc<dyn Bus>, service: &str, request: Bytes) -> PendingAnswer {
     let service = service.to_owned();
     Box::pin(async move {
         let answer = bus.call(&service, request, CALL).await;
@@ -326,22 +335,23 @@ async fn advertise(
     system: &PrivateSystem,
     topic: &str,
     wire_type: &WireType,
-    qos: Qos,
+    qos: QosProfile,
 ) -> Result<Box<dyn Publisher>, BusError> {
     system.bus().advertise(topic, wire_type.clone(), qos).await
 }
 
-/// Whether a node that asks for this hears what is not latched. One that asks for what is hears nothing else (ROS 2).
-fn hears_plain(asked: Option<&Qos>) -> bool {
+/// Returns whether a node with this request receives messages that are not latched. In ROS 2, one that requests latched
+/// messages receives no others.
+fn accepts_volatile(asked: Option<&QosProfile>) -> bool {
     asked.is_none_or(|asked| !asked.is_latching())
 }
 
-/// What an input is advertised with, so that it is heard by a node that asks for this. All hear a reliable one; of what is said of
-/// time, an end of ROS 2 asks for as much as it names.
-fn offered(asked: Option<&Qos>) -> Qos {
-    let plain = Qos::keep_last(QUEUE);
-    asked.map_or(plain, |asked| Qos {
-        reliability: Reliability::Reliable,
+/// Returns the quality of service for advertising an input to a node with this request. All nodes accept a reliable
+/// publisher; deadlines and the like must match what a ROS 2 node requests.
+fn offered_qos(asked: Option<&QosProfile>) -> QosProfile {
+    let plain = QosProfile::keep_last(QUEUE);
+    asked.map_or(plain, |asked| QosProfile {
+        reliability: QosReliability::Reliable,
         depth: QUEUE,
         ..*asked
     })

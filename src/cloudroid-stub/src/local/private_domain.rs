@@ -1,8 +1,8 @@
-//! The private system of a local original of ROS 2: a domain of DDS that nobody else on this machine is in, on loopback.
+//! Private system of a local original for ROS 2: a DDS domain on loopback that no other node of this machine is in.
 //!
-//! Two domains do not hear each other, so nothing of the original's reaches the robot's nodes, and nothing of theirs reaches it. The
-//! process is told by its environment which domain it is in, and that nodes are on this machine alone; its command line stays as
-//! it is.
+//! Nodes of different domains do not communicate, so nothing of the original reaches the robot's nodes, and vice versa.
+//! The process gets the domain, and the restriction to this machine, from its environment; its command line is not
+//! changed.
 
 use std::net::{Ipv4Addr, UdpSocket};
 use std::os::linux::net::SocketAddrExt;
@@ -13,21 +13,21 @@ use anyhow::{Context, bail};
 use rand::seq::SliceRandom;
 use ros::bus::{Bus, RosVersion};
 use ros::net::HostSockets;
-use ros::{JoinOptions, Network};
+use ros::{DiscoveryNetwork, JoinOptions};
 
 use super::private_system::{NODE, Variables};
 
-/// The domains to choose from. The ports of those beyond are among those that the kernel gives away, and 0 is everybody's.
+/// Domains to choose from. The ports of higher ones are in the kernel's ephemeral range, and 0 is the default domain.
 const DOMAINS: std::ops::RangeInclusive<u16> = 1..=101;
-/// Ports of domains (RTPS 2.5, 9.6.1.1): of the first domain, between two domains, and, within a domain, of multicast and of the
-/// first participants.
+/// Ports of domains (RTPS 2.5, 9.6.1.1): of the first domain, between two domains, and the offsets of multicast and of
+/// the first participants within a domain.
 const FIRST_PORT: u16 = 7400;
 const PORTS: u16 = 250;
 const OFFSETS: [u16; 5] = [0, 1, 10, 11, 12];
-/// Distributions that know nothing of ranges of discovery; later ones warn of the variable.
+/// Distributions without discovery ranges; later ones warn about the variable.
 const LOCALHOST_ONLY: [&str; 5] = ["dashing", "eloquent", "foxy", "galactic", "humble"];
-/// Which nodes are looked for where, and settings of the networks of DDS: they are about the robot's. A profile that binds a node
-/// to a network card, say, would keep it from this system.
+/// Variables that select discovery peers and configure the networks of DDS for the robot. A profile that binds a node
+/// to a network interface, for example, would separate it from this system.
 const OF_NETWORKS: [&str; 7] = [
     "ROS_DISCOVERY_SERVER",
     "ROS_SUPER_CLIENT",
@@ -38,23 +38,23 @@ const OF_NETWORKS: [&str; 7] = [
     "CYCLONEDDS_URI",
 ];
 
-/// A domain; it is free for others when this ends.
+/// A domain, which is released when this is dropped.
 pub struct PrivateDomain {
     id: u16,
-    /// By which other stubs know that it is taken.
+    /// Abstract socket by which other stubs see that the domain is taken.
     _taken: UnixListener,
 }
 
 impl PrivateDomain {
-    /// Takes one, with a node there. `taken` is the robot's.
+    /// Takes a domain and joins it as a node. `taken` is the robot's domain.
     pub async fn new(taken: Option<u16>) -> anyhow::Result<(Self, Arc<dyn Bus>)> {
         let domain = Self::take(taken)?;
         let options = JoinOptions {
             distribution: std::env::var("ROS_DISTRO").unwrap_or_default(),
-            // Nodes that look on this machine alone ask at the ports that the first of it take.
-            network: Network {
+            // Nodes that look on this machine only send to the ports of its first participants.
+            network: DiscoveryNetwork {
                 well_known: true,
-                ..Network::default()
+                ..DiscoveryNetwork::default()
             },
             ..JoinOptions::in_domain(domain.id, NODE)
         };
@@ -63,16 +63,16 @@ impl PrivateDomain {
         Ok((domain, bus))
     }
 
-    /// Its number.
+    /// Returns the id of the domain.
     #[cfg(test)]
     pub fn id(&self) -> u16 {
         self.id
     }
 
-    /// Any that nobody is in.
+    /// Takes a domain without participants.
     pub fn take(taken: Option<u16>) -> anyhow::Result<Self> {
         let mut free: Vec<u16> = DOMAINS.filter(|id| Some(*id) != taken).collect();
-        // Stubs that are started together do not try the same ones.
+        // Stubs that start together try different domains.
         free.shuffle(&mut rand::rng());
         for id in free {
             let name = SocketAddr::from_abstract_name(format!("cloudroid-domain-{id}"))?;
@@ -84,19 +84,20 @@ impl PrivateDomain {
             }
         }
         bail!(
-            "no ROS domain from {} to {} is free for the local original: each has nodes on this machine; end some of them, or set local = \"none\" in stub.toml",
+            "no ROS domain from {} to {} is free for the local original: each has nodes on this machine; stop some of \
+                them, or set local = \"none\" in stub.toml",
             DOMAINS.start(),
             DOMAINS.end()
         )
     }
 
-    /// What a process is told by, so that its nodes are here.
+    /// Returns the variables that put the nodes of a process into this domain.
     pub fn environment(&self) -> Variables {
         let distribution = std::env::var("ROS_DISTRO").unwrap_or_default();
-        self.environment_of(&distribution)
+        self.environment_for(&distribution)
     }
 
-    fn environment_of(&self, distribution: &str) -> Variables {
+    fn environment_for(&self, distribution: &str) -> Variables {
         let only = LOCALHOST_ONLY.contains(&distribution);
         let mut variables: Variables = vec![
             ("ROS_DOMAIN_ID", Some(self.id.to_string().into())),
@@ -108,7 +109,7 @@ impl PrivateDomain {
     }
 }
 
-/// Whether no participant of this machine is in the domain: its first ones take the ports that are looked at.
+/// Returns whether no participant of this machine is in the domain: its first ones would have taken the checked ports.
 fn is_free(id: u16) -> bool {
     OFFSETS.into_iter().all(|offset| {
         let port = FIRST_PORT + PORTS * id + offset;
@@ -139,7 +140,7 @@ mod tests {
     fn a_process_is_told_the_domain_and_nothing_of_the_robot_s_networks() {
         let domain = PrivateDomain::take(None).unwrap();
         let value = |distribution: &str, name: &str| {
-            let all = domain.environment_of(distribution);
+            let all = domain.environment_for(distribution);
             let found = all.into_iter().find(|(known, _)| *known == name);
             found.expect("it is set or unset").1
         };

@@ -1,4 +1,4 @@
-//! The private system of a local original of ROS 1: a Master on loopback.
+//! Private system of a local original for ROS 1: a Master on loopback.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tokio::task::AbortHandle;
 use super::private_system::{NODE, Variables};
 use crate::parameters;
 
-/// A Master; it ends with this.
+/// A Master, which ends when this is dropped.
 pub struct PrivateMaster {
     uri: String,
     master: Master,
@@ -23,7 +23,7 @@ pub struct PrivateMaster {
 }
 
 impl PrivateMaster {
-    /// Makes it, with a node there. Only this machine can reach it.
+    /// Starts the Master and joins it as a node. Only this machine can reach it.
     pub async fn new() -> anyhow::Result<(Self, Arc<dyn Bus>)> {
         let loopback = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
         let listener = HostSockets
@@ -51,7 +51,7 @@ impl PrivateMaster {
         Ok((made, bus as Arc<dyn Bus>))
     }
 
-    /// What a process is told by, so that its nodes are here.
+    /// Returns the variables that put the nodes of a process into this system.
     pub fn environment(&self) -> Variables {
         vec![
             ("ROS_MASTER_URI", Some((&self.uri).into())),
@@ -60,10 +60,10 @@ impl PrivateMaster {
         ]
     }
 
-    /// Takes the robot's parameters over: all of them, because a node reads those of its neighbours, too
-    /// (image_proc's are siblings).
+    /// Copies the robot's parameters: all of them, because a node may read those of its neighbours (image_proc reads
+    /// those of siblings).
     pub async fn copy_parameters(&self, from: &dyn Bus) -> anyhow::Result<()> {
-        let all = parameters::all(from)
+        let all = parameters::read_all(from)
             .await
             .context("the robot's parameters")?;
         for (name, value) in all {
@@ -72,19 +72,19 @@ impl PrivateMaster {
         Ok(())
     }
 
-    /// What is registered.
+    /// Returns the current registrations.
     pub fn graph(&self) -> Graph {
         self.master.graph()
     }
 
-    /// Changes with whatever is registered.
+    /// Returns a receiver of changes of the registrations.
     pub fn generation(&self) -> watch::Receiver<u64> {
         self.master.generation()
     }
 
-    /// A process ended: its registrations are dropped.
+    /// Drops the registrations of a process that has ended.
     pub async fn process_exited(&self) {
-        self.master.process_exited().await;
+        self.master.on_process_exit().await;
     }
 }
 

@@ -1,5 +1,5 @@
-//! The private ROS system of the local original, of the robot's ROS: a Master of the stub's own, or a domain of its own. Only this
-//! machine can reach it, and the stub's own node there is the only way in or out.
+//! Private ROS system of the local original, of the robot's ROS version: a Master of the stub, or a domain of its own.
+//! Only this machine can reach it, and the stub's own node is the only connection to it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsString;
@@ -8,64 +8,64 @@ use std::time::Duration;
 
 use anyhow::Context;
 use ros::bus::{
-    Bus, BusError, Graph, NodeNames, ParamValue, Qos, RosVersion, ServiceType, WireType,
+    Bus, BusError, Graph, NodeNames, ParamValue, QosProfile, RosVersion, ServiceType, WireType,
 };
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use super::lender::Robot;
-use super::original::Interface;
+use super::lender::RobotLender;
+use super::original::ExpectedInterface;
 use super::private_domain::PrivateDomain;
 use super::private_master::PrivateMaster;
 use crate::seen;
 
-/// The stub's name in it.
+/// Name of the stub's node in it.
 pub(super) const NODE: &str = "/cloudroid_stub";
-/// A topic of ROS 2 that every node publishes.
+/// Topic that every ROS 2 node publishes.
 const EVENTS: &str = "/parameter_events";
-/// For a node whose process has ended to be gone from the graph.
+/// Time allowed for a node to disappear from the graph after its process has ended.
 const GONE: Duration = Duration::from_secs(5);
 
-/// A topic of a node, with its quality of service where ends tell that (ROS 2).
-pub type RegisteredTopic = (String, WireType, Option<Qos>);
+/// A topic of a node, with its quality of service if known (ROS 2).
+pub type RegisteredTopic = (String, WireType, Option<QosProfile>);
 
-/// What a process has registered.
+/// Registrations of a process.
 #[derive(Debug, Clone, Default)]
-pub struct Registered {
-    /// What it publishes.
+pub struct RegisteredInterface {
+    /// Topics that it publishes.
     pub outputs: Vec<RegisteredTopic>,
-    /// What it subscribes to.
+    /// Topics that it subscribes to.
     pub inputs: Vec<RegisteredTopic>,
-    /// What it serves.
+    /// Services that it offers.
     pub services: Vec<(String, ServiceType)>,
-    /// Which of all this is whose, where it is several nodes (ROS 2).
+    /// Names by node, if there are several nodes (ROS 2).
     pub nodes: BTreeMap<String, NodeNames>,
 }
 
-/// Variables of a process, each with its value, or none where it is to be unset.
+/// Environment variables of a process with their values; `None` unsets a variable.
 pub type Variables = Vec<(&'static str, Option<OsString>)>;
 
-/// A ROS system and a node in it; both end with it.
+/// A private ROS system and a node in it; both end when this is dropped.
 pub struct PrivateSystem {
-    place: Place,
+    place: SystemBackend,
     bus: Arc<dyn Bus>,
 }
 
-enum Place {
+enum SystemBackend {
     Master(PrivateMaster),
     Domain(PrivateDomain),
 }
 
-/// Tells of changes of a graph.
-pub enum Changes {
-    /// Of a Master.
+/// Receiver of changes of a graph.
+pub enum GraphChanges {
+    /// Changes of a Master's registrations.
     Generations(watch::Receiver<u64>),
-    /// Of a domain.
+    /// Changes of a domain's graph.
     Graphs(watch::Receiver<Arc<Graph>>),
 }
 
-impl Changes {
-    /// Returns with the next change; false where there will be none.
+impl GraphChanges {
+    /// Waits for the next change; false if there will be none.
     pub async fn next(&mut self) -> bool {
         let changed = match self {
             Self::Generations(changes) => changes.changed().await,
@@ -76,56 +76,56 @@ impl Changes {
 }
 
 impl PrivateSystem {
-    /// Makes one for a robot of this ROS.
+    /// Creates a system for a robot of this ROS version.
     pub async fn new(robot: &dyn Bus, taken: Option<u16>) -> anyhow::Result<Self> {
         match robot.version() {
             RosVersion::One => {
                 let (master, bus) = PrivateMaster::new().await?;
-                let place = Place::Master(master);
+                let place = SystemBackend::Master(master);
                 Ok(Self { place, bus })
             }
             RosVersion::Two => {
                 let (domain, bus) = PrivateDomain::new(taken).await?;
-                let place = Place::Domain(domain);
+                let place = SystemBackend::Domain(domain);
                 Ok(Self { place, bus })
             }
         }
     }
 
-    /// The stub's node in it.
+    /// Returns the stub's node in it.
     pub fn bus(&self) -> &Arc<dyn Bus> {
         &self.bus
     }
 
-    /// What a process is told by, so that its nodes are here.
+    /// Returns the variables that put the nodes of a process into this system.
     pub fn environment(&self) -> Variables {
         match &self.place {
-            Place::Master(master) => master.environment(),
-            Place::Domain(domain) => domain.environment(),
+            SystemBackend::Master(master) => master.environment(),
+            SystemBackend::Domain(domain) => domain.environment(),
         }
     }
 
-    /// What `node` calls that is served elsewhere on the robot.
+    /// Lends `node` the services that it calls and that others offer on the robot.
     pub async fn lend(
         &self,
         node: &str,
         robot: &Arc<dyn Bus>,
         limit: Duration,
     ) -> anyhow::Result<()> {
-        let lender = Arc::new(Robot::new(node, robot, limit));
+        let lender = Arc::new(RobotLender::new(node, robot, limit));
         let lent = async { self.bus.lending()?.lend(lender).await };
         lent.await.context("lending services to the local original")
     }
 
-    /// Takes over what nodes of the robot share, where its ROS has such a thing.
+    /// Copies the parameters that nodes of the robot share, if its ROS version has such.
     pub async fn copy_parameters(&self, from: &dyn Bus) -> anyhow::Result<()> {
         match &self.place {
-            Place::Master(master) => master.copy_parameters(from).await,
-            Place::Domain(_) => Ok(()),
+            SystemBackend::Master(master) => master.copy_parameters(from).await,
+            SystemBackend::Domain(_) => Ok(()),
         }
     }
 
-    /// A parameter that nodes of the robot share has changed, or was deleted.
+    /// Changes or deletes a parameter that nodes of the robot share.
     pub async fn change_parameter(
         &self,
         name: &str,
@@ -138,24 +138,24 @@ impl PrivateSystem {
         }
     }
 
-    /// What is registered.
+    /// Returns the current registrations.
     pub fn graph(&self) -> Arc<Graph> {
         match &self.place {
-            Place::Master(master) => Arc::new(master.graph()),
-            Place::Domain(_) => Arc::clone(&self.bus.graph().borrow()),
+            SystemBackend::Master(master) => Arc::new(master.graph()),
+            SystemBackend::Domain(_) => Arc::clone(&self.bus.graph().borrow()),
         }
     }
 
-    /// Changes with whatever is registered.
-    pub fn changes(&self) -> Changes {
+    /// Returns a receiver of changes of the registrations.
+    pub fn changes(&self) -> GraphChanges {
         match &self.place {
-            Place::Master(master) => Changes::Generations(master.generation()),
-            Place::Domain(_) => Changes::Graphs(self.bus.graph()),
+            SystemBackend::Master(master) => GraphChanges::Generations(master.generation()),
+            SystemBackend::Domain(_) => GraphChanges::Graphs(self.bus.graph()),
         }
     }
 
-    /// Returns once the graph is as it is wanted.
-    async fn until(&self, wanted: impl Fn(&Graph) -> bool) {
+    /// Waits until the graph satisfies a condition.
+    async fn wait_until(&self, wanted: impl Fn(&Graph) -> bool) {
         let mut changes = self.changes();
         while !wanted(&self.graph()) {
             if !changes.next().await {
@@ -164,12 +164,12 @@ impl PrivateSystem {
         }
     }
 
-    /// Returns once a node of this name is registered.
-    pub async fn registered(&self, node: &str) {
-        self.until(|graph| seen::is_there(graph, node)).await;
+    /// Waits until a node of this name is registered.
+    pub async fn wait_for_node(&self, node: &str) {
+        self.wait_until(|graph| seen::has_node(graph, node)).await;
     }
 
-    /// The nodes that the process of `node` has become, which in ROS 2 may be several: nobody else is here.
+    /// Returns the nodes of the process of `node`, in ROS 2 possibly several: no other process is here.
     pub fn nodes_of(&self, graph: &Graph, node: &str) -> BTreeSet<String> {
         let mut nodes = BTreeSet::from([node.to_owned()]);
         if self.bus.version() == RosVersion::Two {
@@ -179,19 +179,19 @@ impl PrivateSystem {
         nodes
     }
 
-    /// Returns once the process of `node` has registered all of this.
-    pub async fn registers(&self, node: &str, all: &Interface) {
-        self.until(|graph| has_all(graph, &self.nodes_of(graph, node), all))
+    /// Waits until the process of `node` has registered the whole interface.
+    pub async fn wait_for_interface(&self, node: &str, all: &ExpectedInterface) {
+        self.wait_until(|graph| has_interface(graph, &self.nodes_of(graph, node), all))
             .await;
     }
 
-    /// What the process of `node` has registered, as far as its types can be told.
-    pub async fn registered_by(&self, node: &str) -> Registered {
+    /// Returns the registered interface of the process of `node`, as far as its types are known.
+    pub async fn registered_interface(&self, node: &str) -> RegisteredInterface {
         let graph = self.graph();
         if self.bus.version() == RosVersion::Two {
-            return by_ends(&graph, node, &self.nodes_of(&graph, node));
+            return interface_from_ends(&graph, node, &self.nodes_of(&graph, node));
         }
-        let mut registered = Registered::default();
+        let mut registered = RegisteredInterface::default();
         for topic in graph.topics.keys() {
             let says = seen::publishes(&graph, node, topic);
             let listens = seen::subscribes(&graph, node, topic);
@@ -220,25 +220,25 @@ impl PrivateSystem {
         registered
     }
 
-    /// The process of `node` has ended: returns once its registrations are gone.
+    /// Waits until the registrations of `node` are gone, after its process has ended.
     pub async fn process_exited(&self, node: &str) {
         match &self.place {
-            Place::Master(master) => master.process_exited().await,
-            // Its ports are free, which is seen in a moment.
-            Place::Domain(_) => {
-                let gone = self.until(|graph| !seen::is_there(graph, node));
+            SystemBackend::Master(master) => master.process_exited().await,
+            // Its ports are closed, which is detected after a moment.
+            SystemBackend::Domain(_) => {
+                let gone = self.wait_until(|graph| !seen::has_node(graph, node));
                 if timeout(GONE, gone).await.is_err() {
-                    tracing::warn!(node, "its process has ended, and its node is still there");
+                    tracing::warn!(node, "its process has ended, but its node is still visible");
                 }
             }
         }
     }
 }
 
-/// Whether these nodes have what is waited for.
-fn has_all(graph: &Graph, nodes: &BTreeSet<String>, all: &Interface) -> bool {
+/// Returns whether these nodes have registered everything that is expected.
+fn has_interface(graph: &Graph, nodes: &BTreeSet<String>, all: &ExpectedInterface) -> bool {
     let any = |has: fn(&Graph, &str, &str) -> bool, name: &str| {
-        !all.waits_for(name) || nodes.iter().any(|node| has(graph, node, name))
+        !all.is_expected(name) || nodes.iter().any(|node| has(graph, node, name))
     };
     let listens = |topic: &String| any(seen::subscribes, topic);
     let says = |topic: &String| any(seen::publishes, topic);
@@ -248,20 +248,22 @@ fn has_all(graph: &Graph, nodes: &BTreeSet<String>, all: &Interface) -> bool {
         && all.services.iter().all(serves)
 }
 
-/// What the ends of the process of `node` in ROS 2 tell. Parameter events are for everybody, and each node publishes its own.
-fn by_ends(graph: &Graph, node: &str, nodes: &BTreeSet<String>) -> Registered {
-    let ends = graph.ends_of(nodes);
+/// Returns the interface of the process of `node` from its ROS 2 endpoints. Parameter events are left out: every node
+/// publishes its own, and they are for all nodes.
+fn interface_from_ends(graph: &Graph, node: &str, nodes: &BTreeSet<String>) -> RegisteredInterface {
+    let ends = graph.merged_endpoints(nodes);
     let names = nodes.iter().filter_map(|node| {
         let mut names = graph.ends.get(node)?.names();
         names.subscribes.remove(EVENTS);
         Some((node.clone(), names))
     });
     let names: BTreeMap<String, NodeNames> = names.collect();
-    let topic =
-        |(topic, (of, qos)): (&String, &(WireType, Qos))| (topic.clone(), of.clone(), Some(*qos));
+    let topic = |(topic, (of, qos)): (&String, &(WireType, QosProfile))| {
+        (topic.clone(), of.clone(), Some(*qos))
+    };
     let inputs = ends.subscribers.iter();
     let services = ends.services.iter();
-    Registered {
+    RegisteredInterface {
         outputs: ends.publishers.iter().map(topic).collect(),
         inputs: inputs
             .filter(|(topic, _)| *topic != EVENTS)
@@ -270,9 +272,10 @@ fn by_ends(graph: &Graph, node: &str, nodes: &BTreeSet<String>) -> Registered {
         services: services
             .map(|(service, of)| (service.clone(), of.clone()))
             .collect(),
-        nodes: match names.keys().all(|name| name == node) {
-            true => BTreeMap::new(),
-            false => names,
+        nodes: if names.keys().all(|name| name == node) {
+            BTreeMap::new()
+        } else {
+            names
         },
     }
 }
@@ -290,24 +293,24 @@ mod tests {
             ..Graph::default()
         };
         let nodes = BTreeSet::from(["/see".to_owned()]);
-        let mut all = Interface {
+        let mut all = ExpectedInterface {
             services: ["/see/set", "/tf_1/get_type_description"]
                 .map(str::to_owned)
                 .into(),
-            ..Interface::default()
+            ..ExpectedInterface::default()
         };
-        assert!(!has_all(&graph, &nodes, &all));
+        assert!(!has_interface(&graph, &nodes, &all));
         all.of_others = [all.services[1].clone()].into();
-        assert!(has_all(&graph, &nodes, &all));
-        // But what is to be given to it is.
+        assert!(has_interface(&graph, &nodes, &all));
+        // A request is waited for.
         let goal = "/see/goal".to_owned();
         all.inputs = [(goal.clone(), WireType::any())].into();
         all.of_others.insert(goal.clone());
-        assert!(has_all(&graph, &nodes, &all));
+        assert!(has_interface(&graph, &nodes, &all));
         all.awaited = [goal].into();
-        assert!(!has_all(&graph, &nodes, &all));
+        assert!(!has_interface(&graph, &nodes, &all));
         all.awaited.clear();
         all.services.push("/see/more".to_owned());
-        assert!(!has_all(&graph, &nodes, &all));
+        assert!(!has_interface(&graph, &nodes, &all));
     }
 }

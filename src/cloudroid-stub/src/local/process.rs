@@ -1,4 +1,4 @@
-//! The original's process: in the stub's process group, so roslaunch's signals reach it, too.
+//! Process of the original: in the stub's process group, so that roslaunch's signals reach it, too.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -12,27 +12,27 @@ use tokio::time::timeout;
 
 use super::private_system::Variables;
 
-/// roslaunch's order and patience, shorter: the robot's application is not concerned any more.
+/// Signals and waiting times as in roslaunch, but shorter: the robot's application does not depend on it any more.
 const ESCALATION: [(Signal, Duration); 2] = [
     (Signal::SIGINT, Duration::from_secs(5)),
     (Signal::SIGTERM, Duration::from_secs(2)),
 ];
 
-/// What is run.
+/// Program of the original.
 #[derive(Debug, Clone)]
-pub struct Program {
+pub struct OriginalProgram {
     /// The executable.
     pub path: PathBuf,
     /// Arguments of the executable.
     pub argv: Vec<String>,
-    /// Variables that differ from the stub's own.
+    /// Environment variables that differ from the stub's.
     pub environment: Vec<(&'static str, OsString)>,
 }
 
-impl Program {
-    /// Starts it in the system that these variables tell of. It is killed when what is returned is dropped, and by the kernel when the calling thread ends
-    /// without that: a stub that is killed leaves nobody behind who computes for no one. So the caller is a thread that
-    /// lasts as long as the stub does.
+impl OriginalProgram {
+    /// Starts it in the ROS system of these variables. It is killed when the returned handle is dropped, and by the
+    /// kernel when the calling thread ends without that: a stub that is killed leaves no useless process behind. So the
+    /// calling thread must live as long as the stub.
     #[allow(unsafe_code)]
     pub fn spawn(&self, place: &Variables) -> anyhow::Result<Child> {
         let mut command = Command::new(&self.path);
@@ -48,12 +48,11 @@ impl Program {
             };
         }
         let stub = nix::unistd::getpid();
-        // SAFETY: between fork and exec two system calls are made, both of which a signal handler may make, and nothing
-        // is allocated.
+        // SAFETY: two system calls are made between fork and exec, both async-signal-safe, and nothing is allocated.
         unsafe {
             command.pre_exec(move || {
                 nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
-                // It may have ended before it was to be told of.
+                // The stub may have ended before the death signal was set.
                 if nix::unistd::getppid() == stub {
                     Ok(())
                 } else {
@@ -70,13 +69,13 @@ impl Program {
     }
 }
 
-/// Ends it as roslaunch would.
-pub async fn end(child: &mut Child) {
+/// Ends the process as roslaunch would.
+pub async fn terminate(child: &mut Child) {
     for (signal, patience) in ESCALATION {
         let Some(pid) = child.id().and_then(|pid| i32::try_from(pid).ok()) else {
             return;
         };
-        // It is not reaped yet, so the number is still its own.
+        // The process is not reaped yet, so the pid is still its own.
         let _ = kill(Pid::from_raw(pid), signal);
         if timeout(patience, child.wait()).await.is_ok() {
             return;
@@ -85,8 +84,8 @@ pub async fn end(child: &mut Child) {
     let _ = child.kill().await;
 }
 
-/// How a process ended, in words.
-pub fn ended(status: std::io::Result<std::process::ExitStatus>) -> String {
+/// Describes how a process ended.
+pub fn describe_exit(status: std::io::Result<std::process::ExitStatus>) -> String {
     match status {
         Ok(status) => status.to_string(),
         Err(error) => error.to_string(),

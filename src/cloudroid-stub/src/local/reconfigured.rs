@@ -1,10 +1,11 @@
-//! What a request of `dynamic_reconfigure/Reconfigure` (ROS 1) sets: its names, without their values.
+//! Parameter names in a request of `dynamic_reconfigure/Reconfigure` (ROS 1), without their values.
 
-/// The names that a request sets, joined; none of what is no such request. Clients send some parameters of a node or all of them.
-pub fn names(request: &[u8]) -> Option<Vec<u8>> {
-    let mut rest = Rest(request);
+/// Returns the concatenated names that a request sets; `None` if it is no such request. Clients send some parameters of
+/// a node, or all of them.
+pub fn parameter_names(request: &[u8]) -> Option<Vec<u8>> {
+    let mut rest = ByteReader(request);
     let mut names = Vec::new();
-    // bools, ints, strs, doubles; then groups, which set nothing by themselves.
+    // bools, ints, strs, doubles; then groups, which set nothing themselves.
     for value in [Some(1), Some(4), None, Some(8)] {
         for _ in 0..rest.number()? {
             names.extend_from_slice(rest.text()?);
@@ -23,9 +24,9 @@ pub fn names(request: &[u8]) -> Option<Vec<u8>> {
     rest.0.is_empty().then_some(names)
 }
 
-struct Rest<'a>(&'a [u8]);
+struct ByteReader<'a>(&'a [u8]);
 
-impl<'a> Rest<'a> {
+impl<'a> ByteReader<'a> {
     fn take(&mut self, count: usize) -> Option<&'a [u8]> {
         let (taken, rest) = self.0.split_at_checked(count)?;
         self.0 = rest;
@@ -51,7 +52,7 @@ mod tests {
         [&length, text.as_bytes()].concat()
     }
 
-    /// Sets a speed and a frame, in a group.
+    /// Returns a request that sets a speed and a frame, in a group.
     fn request(speed: f64, frame: &str) -> Vec<u8> {
         let [none, one] = [0_u32, 1].map(u32::to_le_bytes);
         let strings = [&one[..], &text("frame"), &text(frame)].concat();
@@ -63,13 +64,16 @@ mod tests {
     #[test]
     fn the_same_parameters_have_the_same_names_whatever_their_values() {
         let whole = request(1.0, "map");
-        assert_eq!(names(&whole).unwrap(), b"frame\0speed\0");
-        assert_eq!(names(&request(2.0, "odom")), names(&whole));
-        // Whatever is cut off or goes on is none.
+        assert_eq!(parameter_names(&whole).unwrap(), b"frame\0speed\0");
+        assert_eq!(
+            parameter_names(&request(2.0, "odom")),
+            parameter_names(&whole)
+        );
+        // A truncated or longer message is no request.
         for end in 0..whole.len() {
-            assert_eq!(names(&whole[..end]), None, "{end}");
+            assert_eq!(parameter_names(&whole[..end]), None, "{end}");
         }
-        assert_eq!(names(&[&whole[..], &[0]].concat()), None);
-        assert_eq!(names(&[255; 64]), None);
+        assert_eq!(parameter_names(&[&whole[..], &[0]].concat()), None);
+        assert_eq!(parameter_names(&[255; 64]), None);
     }
 }

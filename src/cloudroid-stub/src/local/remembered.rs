@@ -1,5 +1,5 @@
-//! What a node was told to be: its parameters (of ROS 1 by dynamic_reconfigure) and the state of its life (ROS 2). One side was told, and the other one is when it
-//! begins: a new process of the local original, or another servant.
+//! Settings of a node: its parameters (in ROS 1 by dynamic_reconfigure) and its lifecycle state (ROS 2). They are sent
+//! to one side and replayed to the other when it starts: a new process of the local original, or another servant.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,55 +10,55 @@ use parking_lot::Mutex;
 use tokio::sync::OwnedMutexGuard;
 use tokio::time::timeout;
 
-use super::keeper::Answer;
+use super::keeper::PendingAnswer;
 use super::reconfigured;
 use super::service_use::ServiceUse;
 
-/// Requests that are kept; a slider that sets one parameter over and over is one of them.
+/// Largest number of requests that are kept; repeated changes of one parameter, as by a slider, count once.
 const MOST: usize = 256;
-/// For a node to do what it is told.
+/// Time allowed for a node to answer a request.
 pub(super) const PATIENCE: Duration = Duration::from_secs(10);
-/// Where a message begins behind CDR's header.
+/// Offset of a message behind the CDR header.
 const BEGIN: usize = 4;
-/// States (`lifecycle_msgs/msg/State`) in which a node can be told to configure, and to activate itself.
+/// Lifecycle states (`lifecycle_msgs/msg/State`) in which a node can be configured, and activated.
 const UNCONFIGURED: u8 = 1;
 const INACTIVE: u8 = 2;
 
-/// What was told last. A node may be told anew while it is told something new: one of the two comes first to each service, and what is
-/// told anew is what holds by then.
+/// The last settings of a node. A new setting may be made during a replay: for each service one of the two comes first,
+/// and the replay uses the settings that are current by then.
 #[derive(Debug, Default)]
-pub struct Remembered {
-    all: Mutex<All>,
+pub struct RememberedSettings {
+    all: Mutex<RememberedState>,
     turns: Mutex<HashMap<String, Arc<tokio::sync::Mutex<()>>>>,
 }
 
-/// While it lives, nobody else tells the node something by the same service.
-pub type Turn = Option<OwnedMutexGuard<()>>;
+/// Guard that excludes other requests to the same service.
+pub type ServiceTurn = Option<OwnedMutexGuard<()>>;
 
 #[derive(Debug, Default)]
-struct All {
-    /// In the order in which they were told.
-    sets: Vec<Set>,
-    /// How many were told.
+struct RememberedState {
+    /// In the order of the requests.
+    sets: Vec<RememberedSet>,
+    /// Total number of requests.
     told: u64,
-    /// What led from the beginning to where the node is.
-    way: Vec<Step>,
+    /// Transitions from the initial to the current lifecycle state.
+    way: Vec<LifecycleStep>,
 }
 
-/// Something that was set by this service.
+/// A setting made by a request to this service.
 #[derive(Debug, Clone)]
-struct Set {
-    /// Counted from 1, over all that was told.
+struct RememberedSet {
+    /// Number of the request, counted from 1 over all settings.
     number: u64,
     service: String,
-    /// What is set: a parameter, or all that the request says.
+    /// Key of the setting: the name of the parameter, or the whole request.
     target: Vec<u8>,
     request: Bytes,
 }
 
-/// A transition that the node was told by this service.
+/// A lifecycle transition requested by this service.
 #[derive(Debug, Clone, PartialEq)]
-struct Step {
+struct LifecycleStep {
     service: String,
     transition: Transition,
     request: Bytes,
@@ -73,9 +73,10 @@ enum Transition {
     Other,
 }
 
-impl Remembered {
-    /// Whoever holds this tells the node by this service; one that does not answer is waited for no longer than that takes at most.
-    pub async fn turn(&self, service: &str) -> Turn {
+impl RememberedSettings {
+    /// Waits for the exclusive right to send to this service, but no longer than a request to a node that does not
+    /// answer may take.
+    pub async fn acquire_turn(&self, service: &str) -> ServiceTurn {
         let turn = {
             let mut turns = self.turns.lock();
             Arc::clone(turns.entry(service.to_owned()).or_default())
@@ -83,20 +84,20 @@ impl Remembered {
         timeout(PATIENCE, turn.lock_owned()).await.ok()
     }
 
-    /// The node was told this.
-    pub fn note(&self, service: &str, what: &ServiceUse, request: &Bytes) {
+    /// Records a request that was sent to the node.
+    pub fn record(&self, service: &str, what: &ServiceUse, request: &Bytes) {
         let all = &mut *self.all.lock();
         let service = service.to_owned();
         match what {
             ServiceUse::Set => {
-                let target = target(request);
+                let target = set_target(request);
                 all.sets
                     .retain(|known| known.service != service || known.target != target);
                 if all.sets.len() == MOST {
                     all.sets.remove(0);
                 }
                 all.told += 1;
-                all.sets.push(Set {
+                all.sets.push(RememberedSet {
                     number: all.told,
                     service,
                     target,
@@ -104,8 +105,8 @@ impl Remembered {
                 });
             }
             ServiceUse::Transition => {
-                let transition = Transition::of(request);
-                let step = Step {
+                let transition = Transition::parse(request);
+                let step = LifecycleStep {
                     service,
                     transition,
                     request: request.clone(),
@@ -118,7 +119,7 @@ impl Remembered {
                     }
                     Transition::Deactivate => all.way.truncate(1),
                     Transition::Cleanup => all.way.clear(),
-                    // It ends with that, or knows itself what it means.
+                    // It ends the node, or only the node knows its meaning.
                     Transition::Other => {}
                 }
             }
@@ -126,46 +127,52 @@ impl Remembered {
         }
     }
 
-    /// The first thing that was set after the one of this number, as it holds now.
-    fn next_set(&self, after: u64) -> Option<Set> {
+    /// Returns the first current setting with a number greater than `after`.
+    fn next_set(&self, after: u64) -> Option<RememberedSet> {
         let all = self.all.lock();
         let mut sets = all.sets.iter();
         sets.find(|set| set.number > after).cloned()
     }
 
-    /// Tells a node that has begun anew, which is called by `ask`. What it refuses, it would have refused before.
-    pub async fn tell(&self, ask: impl Fn(&str, Bytes) -> Answer) {
+    /// Replays the settings to a new node, which is called by `ask`. A request that it refuses would have been refused
+    /// before.
+    pub async fn replay(&self, ask: impl Fn(&str, Bytes) -> PendingAnswer) {
         let told =
             async |service: &str, request: Bytes| match timeout(PATIENCE, ask(service, request))
                 .await
             {
                 Ok(Ok(answer)) => Some(answer),
                 Ok(Err(failure)) => {
-                    tracing::debug!(service, reason = failure.text(), "not told to a node anew");
+                    tracing::debug!(
+                        service,
+                        reason = failure.text(),
+                        "cannot repeat a request to a restarted node"
+                    );
                     None
                 }
                 Err(_) => {
-                    tracing::warn!(service, "a node that has begun anew does not answer");
+                    tracing::warn!(service, "a restarted node does not answer");
                     None
                 }
             };
-        // Whatever is set meanwhile comes behind, and so last to the node, too: one request may set what others do.
+        // Settings that are made meanwhile have higher numbers, so the node receives them last: one request may set
+        // what others do.
         let mut last = 0;
         while let Some(next) = self.next_set(last) {
-            let _turn = self.turn(&next.service).await;
+            let _turn = self.acquire_turn(&next.service).await;
             last = next.number;
-            let holds = |set: &Set| set.number == next.number;
+            let holds = |set: &RememberedSet| set.number == next.number;
             if self.all.lock().sets.iter().any(holds) {
                 told(&next.service, next.request).await;
             }
         }
         let way = self.all.lock().way.clone();
         for step in way {
-            let _turn = self.turn(&step.service).await;
+            let _turn = self.acquire_turn(&step.service).await;
             if !self.all.lock().way.contains(&step) {
                 continue;
             }
-            // A transition that does not lead on from where they are makes nodes of rclpy end.
+            // An invalid transition would end an rclpy node.
             let states = step.service.replace("change_state", "get_state");
             let state = told(&states, EMPTY.into()).await;
             let from = match step.transition {
@@ -179,13 +186,14 @@ impl Remembered {
     }
 }
 
-/// A request without fields: CDR fills it with one byte.
+/// A request without fields: CDR pads it with one byte.
 const EMPTY: &[u8] = &[0, 1, 0, 0, 0];
 
 impl Transition {
-    /// By its label where there is one, as nodes read it, else by its number (`lifecycle_msgs/msg/Transition`).
-    fn of(request: &[u8]) -> Self {
-        match (text(request, BEGIN + 4), request.get(BEGIN)) {
+    /// Parses a transition by its label if it has one, as nodes do, otherwise by its id
+    /// (`lifecycle_msgs/msg/Transition`).
+    fn parse(request: &[u8]) -> Self {
+        match (read_string(request, BEGIN + 4), request.get(BEGIN)) {
             (Some(b"configure"), _) => Self::Configure,
             (Some(b"activate"), _) => Self::Activate,
             (Some(b"deactivate"), _) => Self::Deactivate,
@@ -199,27 +207,27 @@ impl Transition {
     }
 }
 
-/// What a request sets: the parameter, where it is one, else all that it says.
-fn target(request: &Bytes) -> Vec<u8> {
-    if let Some(names) = reconfigured::names(request) {
+/// Returns the key of a setting: the name of the parameter, or the whole request.
+fn set_target(request: &Bytes) -> Vec<u8> {
+    if let Some(names) = reconfigured::parameter_names(request) {
         return names;
     }
-    match (number(request, BEGIN), text(request, BEGIN + 4)) {
+    match (read_u32(request, BEGIN), read_string(request, BEGIN + 4)) {
         (Some(1), Some(name)) => name.to_vec(),
         _ => request.to_vec(),
     }
 }
 
-/// A number at this place, in little endian, as all of ROS 2 writes.
-fn number(message: &[u8], at: usize) -> Option<u32> {
+/// Reads a number at this offset, in little endian, as all ROS 2 implementations write it.
+fn read_u32(message: &[u8], at: usize) -> Option<u32> {
     let little = message.get(1)? & 1 == 1;
     let bytes = message.get(at..at + 4)?.try_into().ok()?;
     little.then(|| u32::from_le_bytes(bytes))
 }
 
-/// A string at this place, without its end.
-fn text(message: &[u8], at: usize) -> Option<&[u8]> {
-    let length = usize::try_from(number(message, at)?).ok()?;
+/// Reads a string at this offset, without its terminator.
+fn read_string(message: &[u8], at: usize) -> Option<&[u8]> {
+    let length = usize::try_from(read_u32(message, at)?).ok()?;
     let begin = at + 4;
     message.get(begin..begin.checked_add(length.checked_sub(1)?)?)
 }
@@ -230,7 +238,7 @@ mod tests {
 
     use super::*;
 
-    /// A request with one parameter of this name, and something behind it.
+    /// Returns a request with one parameter of this name and some value.
     fn set(name: &str, value: u8) -> Bytes {
         let length = u32::try_from(name.len() + 1).unwrap().to_le_bytes();
         let text = [&length[..], name.as_bytes(), &[0, value]].concat();
@@ -243,13 +251,13 @@ mod tests {
         [&[0, 1, 0, 0, id, 0, 0, 0][..], &text].concat().into()
     }
 
-    /// Services, and what they were asked.
+    /// Services, and the requests that they received.
     type Heard = Vec<(String, Bytes)>;
 
-    /// What a node is told that is in this state at first.
-    async fn told(all: &Remembered, state: u8) -> Heard {
+    /// Replays to a node that is in this state initially, and returns its requests.
+    async fn replayed_requests(all: &RememberedSettings, state: u8) -> Heard {
         let heard: Arc<Mutex<(u8, Heard)>> = Arc::new(Mutex::new((state, vec![])));
-        all.tell(|service, request| {
+        all.replay(|service, request| {
             let mut heard = heard.lock();
             let state = heard.0;
             if service.ends_with("get_state") {
@@ -265,9 +273,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_node_that_begins_anew_is_told_what_holds() {
-        let all = Remembered::default();
+        let all = RememberedSettings::default();
         for (name, value) in [("max", 1), ("min", 2), ("max", 3)] {
-            all.note("/n/set_parameters", &ServiceUse::Set, &set(name, value));
+            all.record("/n/set_parameters", &ServiceUse::Set, &set(name, value));
         }
         let steps = [
             change(1, ""),
@@ -276,32 +284,34 @@ mod tests {
             change(3, ""),
         ];
         for step in &steps {
-            all.note("/n/change_state", &ServiceUse::Transition, step);
+            all.record("/n/change_state", &ServiceUse::Transition, step);
         }
         let sets = [set("min", 2), set("max", 3)].map(|it| ("/n/set_parameters".to_owned(), it));
         let way = [&steps[0], &steps[3]].map(|it| ("/n/change_state".to_owned(), it.clone()));
-        let everything = told(&all, UNCONFIGURED).await;
+        let everything = replayed_requests(&all, UNCONFIGURED).await;
         assert_eq!(everything, [&sets[..], &way[..]].concat());
-        // Somebody else has it go on already.
-        assert_eq!(told(&all, 3).await, sets);
-        all.note(
+        // Another client has already advanced the state.
+        assert_eq!(replayed_requests(&all, 3).await, sets);
+        all.record(
             "/n/change_state",
             &ServiceUse::Transition,
             &change(2, "cleanup"),
         );
-        assert_eq!(told(&all, UNCONFIGURED).await, sets);
+        assert_eq!(replayed_requests(&all, UNCONFIGURED).await, sets);
         for number in 0..1000 {
             let name = format!("p{number}");
-            all.note("/n/set_parameters", &ServiceUse::Set, &set(&name, 0));
+            all.record("/n/set_parameters", &ServiceUse::Set, &set(&name, 0));
         }
-        assert_eq!(told(&all, UNCONFIGURED).await.len(), MOST);
+        assert_eq!(replayed_requests(&all, UNCONFIGURED).await.len(), MOST);
     }
 
     #[tokio::test]
     async fn what_is_set_while_a_node_is_told_anew_holds_in_the_end() {
-        let all = Arc::new(Remembered::default());
+        let all = Arc::new(RememberedSettings::default());
         let service = "/n/set_parameters";
-        let note = |all: &Remembered, request: &Bytes| all.note(service, &ServiceUse::Set, request);
+        let note = |all: &RememberedSettings, request: &Bytes| {
+            all.record(service, &ServiceUse::Set, request)
+        };
         let [speed, both, faster, slow] = [
             set("speed", 1),
             change(7, "both"),
@@ -312,16 +322,16 @@ mod tests {
         note(&all, &both);
         note(&all, &slow);
         let (heard, asked) = (Arc::new(Mutex::new(Vec::new())), Arc::new(Mutex::new(None)));
-        all.tell(|_, request| {
+        all.replay(|_, request| {
             let first = heard.lock().is_empty();
             heard.lock().push(request);
             if first {
-                // While the first is on its way somebody sets something, and waits for the turn.
+                // During the first request, another client makes a setting and waits for its turn.
                 let (setting, heard, faster) = (all.clone(), heard.clone(), faster.clone());
                 let set = tokio::spawn(async move {
-                    let _turn = setting.turn(service).await;
+                    let _turn = setting.acquire_turn(service).await;
                     heard.lock().push(faster.clone());
-                    setting.note(service, &ServiceUse::Set, &faster);
+                    setting.record(service, &ServiceUse::Set, &faster);
                 });
                 *asked.lock() = Some(set);
             }
@@ -331,7 +341,8 @@ mod tests {
             })
         })
         .await;
-        // The old value came first, and none of it after the new one; what may set it, too, came between.
+        // The old value came first and was not repeated after the new one; the other request, which may set the same
+        // parameter, came in between.
         let heard = heard.lock().clone();
         assert_eq!(heard, [speed, faster.clone(), both, slow, faster]);
     }

@@ -1,25 +1,25 @@
-//! What a service of the node is to the promise: its own, or one of those that make up an action (ROS 2) or manage the node.
+//! The use of a service of the node: its own, or one of those that make up an action (ROS 2) or manage the node.
 
 use std::sync::Arc;
 
-use link::control::Served;
+use link::control::ServiceChannel;
 use ros::bus::RosVersion;
 
-/// What stands between an action's name and those of its parts.
+/// Separates an action's name from the names of its topics and services.
 const ACTION: &str = "/_action/";
 
-/// What a service is for.
+/// Use of a service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ServiceUse {
     /// Requests of the application, which are measured.
     Request,
-    /// Asks about the node itself, whoever answers for it: parameters, state, types.
+    /// Queries about the node itself (parameters, state, types), which either side can answer.
     Look,
-    /// Sets parameters of the node, or the levels of its log.
+    /// Sets parameters of the node, or its log levels.
     Set,
-    /// Has the node go to another state of its life.
+    /// Changes the lifecycle state of the node.
     Transition,
-    /// Sends goals of this action.
+    /// Sends goals to this action.
     SendGoal(Arc<str>),
     /// Fetches results of this action.
     GetResult(Arc<str>),
@@ -28,8 +28,8 @@ pub enum ServiceUse {
 }
 
 impl ServiceUse {
-    /// That of a service of a node of this ROS. Names may be remapped; types say what is meant.
-    pub fn of(served: &Served, version: RosVersion) -> Self {
+    /// Classifies a service of a node of this ROS version, by its type, since names may be remapped.
+    pub fn classify(served: &ServiceChannel, version: RosVersion) -> Self {
         if version == RosVersion::One {
             return match served.type_name.as_str() {
                 "dynamic_reconfigure/Reconfigure" => Self::Set,
@@ -71,12 +71,12 @@ mod tests {
     #[test]
     fn what_manages_a_node_is_no_request_of_its_application() {
         let of = |name: &str, type_name: &str, version| {
-            let served = Served {
+            let served = ServiceChannel {
                 name: name.to_owned(),
                 type_name: type_name.to_owned(),
-                ..Served::default()
+                ..ServiceChannel::default()
             };
-            ServiceUse::of(&served, version)
+            ServiceUse::classify(&served, version)
         };
         let two = |name, type_name| of(name, type_name, RosVersion::Two);
         let fib: Arc<str> = "/ns/fib".into();
@@ -89,7 +89,7 @@ mod tests {
         assert_eq!(two("/n/set_parameters", set), ServiceUse::Set);
         let change = two("/n/change_state", "lifecycle_msgs/srv/ChangeState");
         assert_eq!(change, ServiceUse::Transition);
-        // A name alone says nothing, and of ROS 1 one type alone is about the node.
+        // A name alone means nothing, and in ROS 1 only one type manages the node.
         assert_eq!(two("/n/set_parameters", "a/srv/Set"), ServiceUse::Request);
         let one = of("/fib/_action/send_goal", "a/Send", RosVersion::One);
         assert_eq!(one, ServiceUse::Request);

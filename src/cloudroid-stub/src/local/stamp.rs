@@ -1,28 +1,28 @@
-//! What answers are recognised by, read from serialized messages without decoding the rest.
+//! Keys that correlate answers, read from serialized messages without decoding the rest.
 
 use std::collections::HashMap;
 use std::time::Duration;
 
-use qos::{Key, Stamp};
-use ros::bus::{Digest, Message, RosVersion, WireFormat, WireType};
+use qos::{CorrelationKey, Stamp};
+use ros::bus::{Digest, RosVersion, SerializedMessage, WireFormat, WireType};
 use ros::codec;
 use ros::ros1::actions;
 use ros::schema::Registry;
 
-/// Knows for each type whether it begins with a header.
+/// Records for each type whether it begins with a header.
 #[derive(Debug)]
-pub struct Stamps {
-    /// Where headers of each ROS have their stamp: 1, 2.
+pub struct StampReader {
+    /// Position of the stamp in a header: ROS 1, ROS 2.
     headers: [codec::Stamps; 2],
     stamped: HashMap<Digest, bool>,
 }
 
-impl Default for Stamps {
+impl Default for StampReader {
     fn default() -> Self {
         let header = |version| {
-            let header = Registry::of(version).message("std_msgs/Header");
+            let header = Registry::for_version(version).message("std_msgs/Header");
             header
-                .map(|header| codec::Stamps::of(&header))
+                .map(|header| codec::Stamps::for_type(&header))
                 .unwrap_or_default()
         };
         Self {
@@ -32,8 +32,8 @@ impl Default for Stamps {
     }
 }
 
-impl Stamps {
-    /// A type has become known, which messages of ROS 2 have without its definition.
+impl StampReader {
+    /// Adds the definition of a type, since ROS 2 messages do not carry it.
     pub fn learn(&mut self, wire_type: &WireType) {
         if !wire_type.definition.is_empty() {
             let stamped = is_stamped(wire_type);
@@ -41,25 +41,25 @@ impl Stamps {
         }
     }
 
-    /// The id of an action's goal, in goals, results and feedback of ROS 1; else the stamp.
-    pub fn key(&mut self, message: &Message) -> Option<Key> {
+    /// Returns the goal id for goals, results and feedback of ROS 1 actions, otherwise the stamp.
+    pub fn key(&mut self, message: &SerializedMessage) -> Option<CorrelationKey> {
         if message.wire_type.format == WireFormat::Ros1
             && actions::carries_goal_id(&message.wire_type.name)
         {
             let id = actions::messages::goal_id(&message.bytes)?;
-            return Some(Key::Goal(id.into()));
+            return Some(CorrelationKey::Goal(id.into()));
         }
-        self.of(message).map(Key::Stamp)
+        self.read_stamp(message).map(CorrelationKey::Stamp)
     }
 
-    /// The stamp of a message whose type begins with `std_msgs/Header`.
-    pub fn of(&mut self, message: &Message) -> Option<Stamp> {
+    /// Returns the stamp of a message whose type begins with `std_msgs/Header`.
+    pub fn read_stamp(&mut self, message: &SerializedMessage) -> Option<Stamp> {
         let wire_type = &message.wire_type;
         let stamped = match self.stamped.get(&wire_type.digest) {
             Some(stamped) => *stamped,
             None => {
                 self.learn(wire_type);
-                // A type whose definition has not come may be known later.
+                // The definition of this type may still become known.
                 is_stamped(wire_type)
             }
         };
@@ -75,7 +75,7 @@ impl Stamps {
     }
 }
 
-/// Whether the first field is a header: by the definition, or, before that has come, by the custom of naming such types.
+/// Returns whether the first field is a header: by the definition, or, as long as it is unknown, by naming convention.
 pub fn is_stamped(wire_type: &WireType) -> bool {
     if wire_type.definition.is_empty() {
         let (package, name) = wire_type.name.split_once('/').unwrap_or_default();
@@ -87,7 +87,7 @@ pub fn is_stamped(wire_type: &WireType) -> bool {
         .map(|line| line.split('#').next().unwrap_or_default().trim());
     let first = fields
         .filter(|line| !line.is_empty())
-        // Constants are not fields. A bound (ROS 2) is none.
+        // Constants are not fields; the `<=` of a bound (ROS 2) does not make a constant.
         .find(|line| !line.replace("<=", "").contains('='));
     let kind = first.and_then(|line| line.split_whitespace().next());
     matches!(
@@ -96,7 +96,7 @@ pub fn is_stamped(wire_type: &WireType) -> bool {
     )
 }
 
-/// How long ago a stamp was, by this machine's clock; zero for stamps of the future.
+/// Returns the age of a stamp by this machine's clock; zero for stamps in the future.
 pub fn age(stamp: Stamp) -> Duration {
     let now = Duration::from_nanos(u64::try_from(link::clock::now()).unwrap_or_default());
     now.saturating_sub(Duration::new(
@@ -111,11 +111,11 @@ mod tests {
 
     use super::*;
 
-    /// 3 s and 4 ns, in a header of ROS 2.
+    /// 3 s and 4 ns, in a ROS 2 header.
     const STAMPED: [u8; 16] = [0, 1, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0, 0, 0, 0, 0];
 
-    fn message(of: &WireType, bytes: &'static [u8]) -> Message {
-        Message {
+    fn message(of: &WireType, bytes: &'static [u8]) -> SerializedMessage {
+        SerializedMessage {
             bytes: bytes.into(),
             wire_type: Arc::new(of.clone()),
             publisher: "/app".into(),
@@ -123,24 +123,24 @@ mod tests {
         }
     }
 
-    fn of_two(name: &str, digest: &str, definition: &str) -> WireType {
-        WireType::new(name, digest, definition).written_by(RosVersion::Two)
+    fn ros2_type(name: &str, digest: &str, definition: &str) -> WireType {
+        WireType::new(name, digest, definition).with_version(RosVersion::Two)
     }
 
     #[test]
     fn stamps_of_ros_2_stand_behind_the_header_of_cdr() {
-        let mut stamps = Stamps::default();
-        let untold = of_two("p/msg/Found", "RIHS01_1", "");
-        let stamp = |stamps: &mut Stamps, of: &WireType| stamps.key(&message(of, &STAMPED));
+        let mut stamps = StampReader::default();
+        let untold = ros2_type("p/msg/Found", "RIHS01_1", "");
+        let stamp = |stamps: &mut StampReader, of: &WireType| stamps.key(&message(of, &STAMPED));
         assert_eq!(stamp(&mut stamps, &untold), None);
-        // Its publisher does not tell what it is; the cloud does.
+        // The publisher does not send the definition; the cloud does.
         let definition = "uint8 ALL=1\nstd_msgs/Header header\nstring<=8 name\n";
-        stamps.learn(&of_two("p/msg/Found", "RIHS01_1", definition));
-        let expected = Key::Stamp(Stamp { secs: 3, nsecs: 4 });
+        stamps.learn(&ros2_type("p/msg/Found", "RIHS01_1", definition));
+        let expected = CorrelationKey::Stamp(Stamp { secs: 3, nsecs: 4 });
         assert_eq!(stamp(&mut stamps, &untold), Some(expected.clone()));
-        let image = of_two("sensor_msgs/msg/Image", "RIHS01_2", "");
+        let image = ros2_type("sensor_msgs/msg/Image", "RIHS01_2", "");
         assert_eq!(stamp(&mut stamps, &image), Some(expected));
-        let named = of_two(
+        let named = ros2_type(
             "p/msg/Named",
             "RIHS01_3",
             "string<=8 name\nstd_msgs/Header h\n",

@@ -1,4 +1,5 @@
-//! With a real process (an ordinary node of either ROS, `examples/relay.rs`), and real Masters and domains.
+//! Tests with a real process (an ordinary node of either ROS version, `examples/relay.rs`) and real Masters and
+//! domains.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -7,15 +8,21 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use qos::{Event, HandOver, LocalState, Outcome, RequestId, SafeStop, Sla};
-use ros::bus::{Bus, Message, ParamValue, RosVersion, ServiceHandler, ServiceType, WireType};
+use qos::{HandOver, LocalState, QosEvent, QosSla, RequestId, RequestOutcome, SafeStop};
+use ros::bus::{
+    Bus, ParamValue, RosVersion, SerializedMessage, ServiceHandler, ServiceType, WireType,
+};
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use super::original::News;
-use super::process::Program;
-use super::{Answer, Application, Cloud, Interface, Keeper, Original, Setting};
-use crate::testing::{SOON, World, read, stories, string, string_type, text, written};
+use super::original::OriginalEvent;
+use super::process::OriginalProgram;
+use super::{
+    Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer,
+};
+use crate::testing::{
+    SOON, World, decode_string, encode_string, message_text, stories, string_message, string_type,
+};
 
 stories! {
     of_ros_1 = One:
@@ -42,13 +49,13 @@ stories! {
         a_call_is_answered_by_the_local_original_when_the_link_is_lost;
 }
 
-/// A robot with a node on it, and, in ROS 1, a parameter.
-pub struct Robot {
+/// A robot with one node and, in ROS 1, one parameter.
+pub struct TestRobot {
     pub world: World,
     pub bus: Arc<dyn Bus>,
 }
 
-pub async fn robot(ros: RosVersion) -> Robot {
+pub async fn robot(ros: RosVersion) -> TestRobot {
     let world = World::new(ros).await;
     let bus = world.node("/robot").await;
     if let Ok(parameters) = bus.parameters() {
@@ -56,10 +63,10 @@ pub async fn robot(ros: RosVersion) -> Robot {
         let name = "/ns/relay_sibling/greeting";
         parameters.set(name, greeting).await.unwrap();
     }
-    Robot { world, bus }
+    TestRobot { world, bus }
 }
 
-/// The example stands beside the tests: `target/PROFILE/{examples,deps}`.
+/// Returns the path of the example, which is built beside the tests: `target/PROFILE/{examples,deps}`.
 fn relay() -> PathBuf {
     let tests = std::env::current_exe().unwrap();
     let path = tests.ancestors().nth(2).unwrap().join("examples/relay");
@@ -71,8 +78,8 @@ fn relay() -> PathBuf {
     path
 }
 
-/// `/ns/relay`, from `/ns/in` to `/absolute/out`.
-pub fn setting(world: &World, argv: &[&str]) -> Setting {
+/// Returns the setup of `/ns/relay`, which reads `/ns/in` and publishes `/absolute/out`.
+pub fn relay_setup(world: &World, argv: &[&str]) -> OriginalSetup {
     let names = match world.domain() {
         None => "in:=/ns/in out:=/absolute/out __name:=relay",
         Some(_) => {
@@ -86,8 +93,8 @@ pub fn setting(world: &World, argv: &[&str]) -> Setting {
         None => environment.push(("ROS_NAMESPACE", "/ns".into())),
         Some(_) => argv.extend(["-p", "greeting:=hello "].map(str::to_owned)),
     }
-    Setting {
-        program: Some(Program {
+    OriginalSetup {
+        program: Some(OriginalProgram {
             path: relay(),
             argv,
             environment,
@@ -98,31 +105,37 @@ pub fn setting(world: &World, argv: &[&str]) -> Setting {
     }
 }
 
-async fn an_original(robot: &Robot, setting: Setting) -> (Original, mpsc::UnboundedReceiver<News>) {
+async fn new_original(
+    robot: &TestRobot,
+    setting: OriginalSetup,
+) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
     let string = string_type(robot.bus.version());
     let input = |topic: &str| (topic.to_owned(), string.clone());
-    let interface = Interface {
+    let interface = ExpectedInterface {
         inputs: BTreeMap::from(["/ns/in", "/pose"].map(input)),
         awaited: BTreeSet::from(["/ns/in".to_owned()]),
         outputs: vec!["/absolute/out".into()],
-        ..Interface::default()
+        ..ExpectedInterface::default()
     };
     Original::new(setting, interface, robot.bus.clone(), SOON)
         .await
         .unwrap()
 }
 
-/// The same, of the relay with these arguments.
-pub async fn a_relay(robot: &Robot, argv: &[&str]) -> (Original, mpsc::UnboundedReceiver<News>) {
-    an_original(robot, setting(&robot.world, argv)).await
+/// Creates an original that runs the relay with these arguments.
+pub async fn new_relay(
+    robot: &TestRobot,
+    argv: &[&str],
+) -> (Original, mpsc::UnboundedReceiver<OriginalEvent>) {
+    new_original(robot, relay_setup(&robot.world, argv)).await
 }
 
-async fn state(news: &mut mpsc::UnboundedReceiver<News>, wanted: LocalState) {
+async fn wait_for_state(news: &mut mpsc::UnboundedReceiver<OriginalEvent>, wanted: LocalState) {
     let waiting = async {
         while let Some(said) = news.recv().await {
             match said {
-                News::State(state) if state == wanted => return,
-                News::Crashed(reason) => panic!("it crashed: {reason}"),
+                OriginalEvent::State(state) if state == wanted => return,
+                OriginalEvent::Crashed(reason) => panic!("it crashed: {reason}"),
                 _ => {}
             }
         }
@@ -131,11 +144,11 @@ async fn state(news: &mut mpsc::UnboundedReceiver<News>, wanted: LocalState) {
     timeout(SOON, waiting).await.unwrap();
 }
 
-async fn output(news: &mut mpsc::UnboundedReceiver<News>) -> String {
+async fn next_output(news: &mut mpsc::UnboundedReceiver<OriginalEvent>) -> String {
     let waiting = async {
         loop {
-            if let News::Output(_, message) = news.recv().await.unwrap() {
-                return text(&message);
+            if let OriginalEvent::Output(_, message) = news.recv().await.unwrap() {
+                return message_text(&message);
             }
         }
     };
@@ -144,13 +157,13 @@ async fn output(news: &mut mpsc::UnboundedReceiver<News>) -> String {
 
 async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it(ros: RosVersion) {
     let robot = robot(ros).await;
-    let (original, mut news) = a_relay(&robot, &[]).await;
+    let (original, mut news) = new_relay(&robot, &[]).await;
     original.start();
     original.start();
-    state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string(ros, "world"));
+    wait_for_state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string_message(ros, "world"));
     assert_eq!(
-        output(&mut news).await,
+        next_output(&mut news).await,
         "hello world",
         "it has its parameters"
     );
@@ -175,25 +188,25 @@ async fn it_answers_under_its_own_names_and_the_robot_sees_nothing_of_it(ros: Ro
         );
     }
     original.stop();
-    state(&mut news, LocalState::Stopped).await;
+    wait_for_state(&mut news, LocalState::Stopped).await;
     original.start();
-    state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string(ros, "again"));
-    assert_eq!(output(&mut news).await, "hello again");
+    wait_for_state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string_message(ros, "again"));
+    assert_eq!(next_output(&mut news).await, "hello again");
 }
 
-/// The same, of a publisher that latches.
-fn latched(ros: RosVersion, publisher: &str, text: &str) -> Message {
-    Message {
+/// Returns a string message of a publisher that latches.
+fn latched_message(ros: RosVersion, publisher: &str, text: &str) -> SerializedMessage {
+    SerializedMessage {
         publisher: publisher.into(),
         latching: true,
-        ..string(ros, text)
+        ..string_message(ros, text)
     }
 }
 
 async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(ros: RosVersion) {
     let robot = robot(ros).await;
-    let (original, mut news) = a_relay(&robot, &["patient", "keeps"]).await;
+    let (original, mut news) = new_relay(&robot, &["patient", "keeps"]).await;
     let topic: Arc<str> = "/ns/in".into();
     for (publisher, said) in [
         ("/one", "old"),
@@ -201,7 +214,7 @@ async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(
         ("/two", "frames"),
         ("/gone", "lost"),
     ] {
-        original.latch(&topic, &latched(ros, publisher, said));
+        original.latch(&topic, &latched_message(ros, publisher, said));
     }
     original.unlatch(&topic, &"/gone".into());
     for (left, wanted) in [
@@ -214,14 +227,14 @@ async fn a_cold_start_is_given_what_each_publisher_has_latched_and_has_not_left(
         original.start();
         let mut heard = BTreeSet::new();
         while heard.len() < wanted.len() {
-            heard.insert(output(&mut news).await);
+            heard.insert(next_output(&mut news).await);
         }
         assert_eq!(heard, wanted.into_iter().map(str::to_owned).collect());
-        // Nothing more came before this.
-        original.latch(&topic, &latched(ros, "/one", "map"));
-        assert_eq!(output(&mut news).await, "hello map");
+        // Nothing else came before this.
+        original.latch(&topic, &latched_message(ros, "/one", "map"));
+        assert_eq!(next_output(&mut news).await, "hello map");
         original.stop();
-        state(&mut news, LocalState::Stopped).await;
+        wait_for_state(&mut news, LocalState::Stopped).await;
     }
 }
 
@@ -229,42 +242,42 @@ async fn what_is_latched_while_the_link_is_away_reaches_both_sides(ros: RosVersi
     let robot = robot(ros).await;
     let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
     let (told, mut hears) = mpsc::unbounded_channel();
-    let cloud = Arc::new(Silent::default());
+    let cloud = Arc::new(SilentCloud::default());
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec![],
-        Some(a_relay(&robot, &["patient", "keeps"]).await),
+        Some(new_relay(&robot, &["patient", "keeps"]).await),
         cloud.clone(),
-        Arc::new(Listener(told)),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
-    keeper.input(&topic, latched(ros, "/map_server", "map"));
-    keeper.input(&topic, string(ros, "scan"));
+    keeper.on_input(&topic, latched_message(ros, "/map_server", "map"));
+    keeper.on_input(&topic, string_message(ros, "scan"));
     assert_eq!(cloud.inputs.lock().len(), 2);
-    assert!(hears.try_recv().is_err(), "the cloud is alone");
+    assert!(hears.try_recv().is_err(), "only the cloud answers");
     keeper.link_down();
     let mut heard = Vec::new();
     while !heard.contains(&"hello map".to_owned()) || !heard.contains(&"feed".to_owned()) {
         heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
     }
     assert!(!heard.contains(&"hello scan".to_owned()), "{heard:?}");
-    keeper.input(&topic, latched(ros, "/map_server", "another map"));
-    keeper.input(&topic, string(ros, "another scan"));
+    keeper.on_input(&topic, latched_message(ros, "/map_server", "another map"));
+    keeper.on_input(&topic, string_message(ros, "another scan"));
     for wanted in ["hello another map", "hello another scan"] {
         while !heard.iter().any(|heard| heard == wanted) {
             heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
         }
     }
-    // What another node of the servant takes up is for the original all the same.
-    keeper.overheard(&topic, string(ros, "a sibling's scan"));
-    keeper.overheard(&topic, latched(ros, "/sibling", "a sibling's map"));
+    // Messages from another node of the servant reach the original, too.
+    keeper.on_overheard_input(&topic, string_message(ros, "a sibling's scan"));
+    keeper.on_overheard_input(&topic, latched_message(ros, "/sibling", "a sibling's map"));
     for wanted in ["hello a sibling's scan", "hello a sibling's map"] {
         while !heard.iter().any(|heard| heard == wanted) {
             heard.push(timeout(SOON, hears.recv()).await.unwrap().unwrap());
         }
     }
-    let sent: Vec<String> = cloud.inputs.lock().iter().map(text).collect();
+    let sent: Vec<String> = cloud.inputs.lock().iter().map(message_text).collect();
     assert_eq!(
         sent,
         ["map", "scan", "another map"],
@@ -284,25 +297,25 @@ async fn what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests(ros:
     let (told, mut hears) = mpsc::unbounded_channel();
     let waits = ["awaits=/pose", "awaits-latched=/map"];
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
-        Some(a_relay(&robot, &waits).await),
-        Arc::new(Silent::default()),
-        Arc::new(Listener(told)),
+        Some(new_relay(&robot, &waits).await),
+        Arc::new(SilentCloud::default()),
+        Arc::new(RecordingApplication(told)),
     );
-    keeper.input(&"/map".into(), latched(ros, "/map_server", "map"));
-    // Where nobody was ever reached the original stands in at once.
+    keeper.on_input(&"/map".into(), latched_message(ros, "/map_server", "map"));
+    // If the cloud was never reached, the original takes over at once.
     keeper.link_down();
     let topic: Arc<str> = "/ns/in".into();
-    keeper.input(&topic, string(ros, "world"));
-    // Its pose is said again and again, as transforms are.
+    keeper.on_input(&topic, string_message(ros, "world"));
+    // The pose is published repeatedly, as transforms are.
     let mut due = tokio::time::interval(Duration::from_millis(20));
     let mut heard = Vec::new();
     let waiting = async {
         while heard.last().map(String::as_str) != Some("hello world") {
             tokio::select! {
                 said = hears.recv() => heard.push(said.unwrap()),
-                _ = due.tick() => keeper.input(&"/pose".into(), string(ros, "pose")),
+                _ = due.tick() => keeper.on_input(&"/pose".into(), string_message(ros, "pose")),
             }
         }
     };
@@ -313,18 +326,18 @@ async fn what_a_node_waits_for_reaches_it_before_it_listens_to_its_requests(ros:
 
 async fn a_node_that_waits_for_what_does_not_come_is_taken_for_ready_in_the_end(ros: RosVersion) {
     let robot = robot(ros).await;
-    let mut setting = setting(&robot.world, &["awaits=/pose"]);
+    let mut setting = relay_setup(&robot.world, &["awaits=/pose"]);
     setting.patience = Duration::from_millis(200);
-    let (original, mut news) = an_original(&robot, setting).await;
+    let (original, mut news) = new_original(&robot, setting).await;
     original.start();
-    state(&mut news, LocalState::Ready).await;
-    original.feed("/pose", &string(ros, "pose"));
+    wait_for_state(&mut news, LocalState::Ready).await;
+    original.feed("/pose", &string_message(ros, "pose"));
     let mut due = tokio::time::interval(Duration::from_millis(20));
     let answered = async {
         loop {
             tokio::select! {
-                said = output(&mut news) => return said,
-                _ = due.tick() => original.feed("/ns/in", &string(ros, "world")),
+                said = next_output(&mut news) => return said,
+                _ = due.tick() => original.feed("/ns/in", &string_message(ros, "world")),
             }
         }
     };
@@ -336,20 +349,23 @@ async fn a_stateful_hand_over_says_what_is_lost() {
     let robot = robot(RosVersion::One).await;
     let sla = serde_json::json!({"t_desire": 10, "t_max": 20, "mode": "stateful"});
     let (told, mut hears) = mpsc::unbounded_channel();
-    let cloud = Arc::new(Silent::default());
+    let cloud = Arc::new(SilentCloud::default());
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec![],
-        Some(a_relay(&robot, &["patient"]).await),
+        Some(new_relay(&robot, &["patient"]).await),
         cloud.clone(),
-        Arc::new(Listener(told)),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
-    // What is latched reaches both: nothing of it is lost.
-    keeper.input(&topic, latched(RosVersion::One, "/map_server", "map"));
+    // Latched messages reach both sides, so none is lost.
+    keeper.on_input(
+        &topic,
+        latched_message(RosVersion::One, "/map_server", "map"),
+    );
     for _ in 0..3 {
-        keeper.input(&topic, string(RosVersion::One, "scan"));
+        keeper.on_input(&topic, string_message(RosVersion::One, "scan"));
     }
     let mut heard = Vec::new();
     let mut until = async |wanted: &str| {
@@ -361,21 +377,21 @@ async fn a_stateful_hand_over_says_what_is_lost() {
     until("local lacks 3 of /ns/in").await;
     let lost = keeper.report().lost.unwrap().1;
     assert!(
-        lost.contains("the local original goes on without"),
+        lost.contains("the local original takes over without"),
         "{lost}"
     );
     for _ in 0..2 {
-        keeper.input(&topic, string(RosVersion::One, "another scan"));
+        keeper.on_input(&topic, string_message(RosVersion::One, "another scan"));
     }
     keeper.link_up(true);
     until("cloud lacks 2 of /ns/in").await;
-    // The servant that comes now is another one.
+    // The next servant is another one.
     keeper.link_down();
     until("feed").await;
     keeper.link_up(false);
     until("cloud lacks 5 of /ns/in").await;
     let lost = keeper.report().lost.unwrap().1;
-    assert!(lost.contains("a new servant goes on without"), "{lost}");
+    assert!(lost.contains("a new servant takes over without"), "{lost}");
 }
 
 #[tokio::test]
@@ -383,13 +399,13 @@ async fn a_hand_over_names_calls_and_goals_that_the_other_side_was_given() {
     let robot = robot(RosVersion::One).await;
     let sla = serde_json::json!({"measure": {"link": {"after": 0.05}}});
     let (told, mut hears) = mpsc::unbounded_channel();
-    let cloud = Arc::new(Silent::default());
+    let cloud = Arc::new(SilentCloud::default());
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec!["/mux/goal -> /mux/result by goal".parse().unwrap()],
-        Some(a_relay(&robot, &[]).await),
+        Some(new_relay(&robot, &[]).await),
         cloud.clone(),
-        Arc::new(Listener(told)),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     let service: Arc<str> = "/mux/select".into();
@@ -401,16 +417,17 @@ async fn a_hand_over_names_calls_and_goals_that_the_other_side_was_given() {
         tokio::task::yield_now().await;
     }
     let id = cloud.calls.lock()[0];
-    keeper.cloud_answered(id, Ok(Bytes::new()), None);
+    keeper.on_cloud_answer(id, Ok(Bytes::new()), None);
     timeout(SOON, call).await.unwrap().unwrap().unwrap();
-    // A goal without an id is no request, and is given to the cloud all the same; what is no command switches nothing.
-    let goal = WireType::named("mux_msgs/SwitchActionGoal");
-    let goal = Message {
+    // A goal without an id is not a request, but the cloud receives it all the same. Plain messages are not listed in
+    // the hand-over.
+    let goal = WireType::with_name("mux_msgs/SwitchActionGoal");
+    let goal = SerializedMessage {
         wire_type: Arc::new(goal),
-        ..string(RosVersion::One, "")
+        ..string_message(RosVersion::One, "")
     };
-    keeper.input(&"/mux/goal".into(), goal);
-    keeper.input(&"/ns/in".into(), string(RosVersion::One, "scan"));
+    keeper.on_input(&"/mux/goal".into(), goal);
+    keeper.on_input(&"/ns/in".into(), string_message(RosVersion::One, "scan"));
     keeper.link_down();
     let mut heard = String::new();
     while !heard.starts_with("local lacks") {
@@ -429,11 +446,11 @@ async fn where_nothing_is_promised_a_missing_original_is_told_when_it_is_needed(
     let sla = serde_json::json!({"measure": {"link": {"after": 0.02}}});
     let (told, mut hears) = mpsc::unbounded_channel();
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec![],
         None,
-        Arc::new(Silent::default()),
-        Arc::new(Listener(told)),
+        Arc::new(SilentCloud::default()),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     assert!(hears.try_recv().is_err());
@@ -452,17 +469,20 @@ async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over(ros: R
         .await
         .unwrap();
     let limit = Duration::from_millis(100);
-    let relay = setting(&robot.world, &["patient"]);
-    let original = Original::new(relay, Interface::default(), robot.bus, limit);
+    let relay = relay_setup(&robot.world, &["patient"]);
+    let original = Original::new(relay, ExpectedInterface::default(), robot.bus, limit);
     let (original, mut news) = original.await.unwrap();
-    let interface = Interface {
+    let interface = ExpectedInterface {
         outputs: vec!["/absolute/out".into()],
-        ..Interface::default()
+        ..ExpectedInterface::default()
     };
     original.adapt(interface).await.unwrap();
-    original.latch(&"/ns/in".into(), &latched(ros, "/app", "ask /hangs"));
+    original.latch(
+        &"/ns/in".into(),
+        &latched_message(ros, "/app", "ask /hangs"),
+    );
     original.start();
-    let answer = output(&mut news).await;
+    let answer = next_output(&mut news).await;
     assert!(
         answer.contains("service /hangs did not answer within 100ms")
             && answer.contains("call_limit"),
@@ -470,7 +490,7 @@ async fn a_service_of_the_robot_that_hangs_is_named_when_its_time_is_over(ros: R
     );
 }
 
-/// Takes a call, and that is all.
+/// Accepts a call and never answers.
 struct Hangs;
 
 #[async_trait::async_trait]
@@ -480,7 +500,7 @@ impl ServiceHandler for Hangs {
     }
 }
 
-/// Answers with these words, or with this reason.
+/// Answers with this text, or fails with this reason.
 struct Says(Result<&'static str, &'static str>);
 
 #[async_trait::async_trait]
@@ -492,9 +512,9 @@ impl ServiceHandler for Says {
 
 async fn it_calls_what_the_robot_serves(ros: RosVersion) {
     let robot = robot(ros).await;
-    let (original, mut news) = a_relay(&robot, &[]).await;
+    let (original, mut news) = new_relay(&robot, &[]).await;
     original.start();
-    state(&mut news, LocalState::Ready).await;
+    wait_for_state(&mut news, LocalState::Ready).await;
     let mut served = Vec::new();
     for (name, says) in [("/secret", Ok("42")), ("/silent", Err("it is a secret"))] {
         let of = ServiceType::new("tests/Says", "0123456789abcdef0123456789abcdef");
@@ -506,61 +526,61 @@ async fn it_calls_what_the_robot_serves(ros: RosVersion) {
         ("ask /silent", "it is a secret"),
         ("ask /nobody", "service /nobody has no server"),
     ] {
-        original.feed("/ns/in", &string(ros, asked));
-        let answer = output(&mut news).await;
+        original.feed("/ns/in", &string_message(ros, asked));
+        let answer = next_output(&mut news).await;
         assert!(answer.contains(wanted), "{answer}");
     }
 }
 
 async fn it_is_told_of_parameters_that_change_while_it_runs(ros: RosVersion) {
     let robot = robot(ros).await;
-    let (original, mut news) = a_relay(&robot, &[]).await;
+    let (original, mut news) = new_relay(&robot, &[]).await;
     original.start();
-    state(&mut news, LocalState::Ready).await;
+    wait_for_state(&mut news, LocalState::Ready).await;
     let late = ParamValue::String("late".into());
     for (value, wanted) in [(Some(late), "late"), (None, "/speed")] {
         original.change_parameter("/speed", value).await;
-        original.feed("/ns/in", &string(ros, "get /speed"));
-        let said = output(&mut news).await;
+        original.feed("/ns/in", &string_message(ros, "get /speed"));
+        let said = next_output(&mut news).await;
         assert!(said.contains(wanted), "{said}");
     }
 }
 
 async fn a_crash_is_told_and_it_comes_back(ros: RosVersion) {
     let robot = robot(ros).await;
-    let (original, mut news) = a_relay(&robot, &["crash-on=boom"]).await;
+    let (original, mut news) = new_relay(&robot, &["crash-on=boom"]).await;
     original.start();
-    state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string(ros, "boom"));
+    wait_for_state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string_message(ros, "boom"));
     let crashed = async {
         loop {
-            if let News::Crashed(reason) = news.recv().await.unwrap() {
+            if let OriginalEvent::Crashed(reason) = news.recv().await.unwrap() {
                 return reason;
             }
         }
     };
     let reason = timeout(SOON, crashed).await.unwrap();
     assert!(reason.contains('3'), "{reason}");
-    state(&mut news, LocalState::Ready).await;
-    original.feed("/ns/in", &string(ros, "world"));
-    assert_eq!(output(&mut news).await, "hello world");
+    wait_for_state(&mut news, LocalState::Ready).await;
+    original.feed("/ns/in", &string_message(ros, "world"));
+    assert_eq!(next_output(&mut news).await, "hello world");
 }
 
 async fn what_cannot_run_is_said(ros: RosVersion) {
     let robot = robot(ros).await;
-    let mut missing = setting(&robot.world, &[]);
+    let mut missing = relay_setup(&robot.world, &[]);
     missing.program = None;
-    let (original, mut news) = an_original(&robot, missing).await;
+    let (original, mut news) = new_original(&robot, missing).await;
     original.start();
-    state(&mut news, LocalState::Missing).await;
+    wait_for_state(&mut news, LocalState::Missing).await;
 
-    let mut broken = setting(&robot.world, &[]);
+    let mut broken = relay_setup(&robot.world, &[]);
     broken.program.as_mut().unwrap().path = "/nonexistent/relay".into();
-    let (original, mut news) = an_original(&robot, broken).await;
+    let (original, mut news) = new_original(&robot, broken).await;
     original.start();
     let said = async {
         loop {
-            if let News::Crashed(reason) = news.recv().await.unwrap() {
+            if let OriginalEvent::Crashed(reason) = news.recv().await.unwrap() {
                 return reason;
             }
         }
@@ -569,15 +589,15 @@ async fn what_cannot_run_is_said(ros: RosVersion) {
     assert!(reason.contains("/nonexistent/relay"), "{reason}");
 }
 
-/// A cloud that takes everything and answers when told.
+/// A cloud that accepts everything and answers only when the test says so.
 #[derive(Default)]
-struct Silent {
-    inputs: Mutex<Vec<Message>>,
+struct SilentCloud {
+    inputs: Mutex<Vec<SerializedMessage>>,
     calls: Mutex<Vec<RequestId>>,
 }
 
-impl Cloud for Silent {
-    fn publish(&self, _: &str, message: &Message) {
+impl Cloud for SilentCloud {
+    fn publish(&self, _: &str, message: &SerializedMessage) {
         self.inputs.lock().push(message.clone());
     }
 
@@ -585,33 +605,33 @@ impl Cloud for Silent {
         self.calls.lock().push(request);
     }
 
-    fn ask(&self, _: &str, _: Bytes) -> Answer {
+    fn call_unmeasured(&self, _: &str, _: Bytes) -> PendingAnswer {
         Box::pin(std::future::pending())
     }
 }
 
-struct Listener(mpsc::UnboundedSender<String>);
+struct RecordingApplication(mpsc::UnboundedSender<String>);
 
-impl Application for Listener {
-    fn deliver(&self, _: &str, message: Message) {
-        let _ = self.0.send(text(&message));
+impl Application for RecordingApplication {
+    fn deliver(&self, _: &str, message: SerializedMessage) {
+        let _ = self.0.send(message_text(&message));
     }
 
-    fn latched(&self, _: &str, message: Message) {
-        let _ = self.0.send(format!("kept: {}", text(&message)));
+    fn on_latched_output(&self, _: &str, message: SerializedMessage) {
+        let _ = self.0.send(format!("kept: {}", message_text(&message)));
     }
 
     fn safe_stop(&self, stop: &SafeStop) {
         let _ = self.0.send(format!("stop on {}", stop.topic));
     }
 
-    fn decided(&self, event: &Event) {
+    fn on_decision(&self, event: &QosEvent) {
         let name = format!("{event:?}");
         let name = name.split('(').next().unwrap();
         let _ = self.0.send(name.to_lowercase());
     }
 
-    fn handed_over(&self, over: &HandOver) {
+    fn on_hand_over(&self, over: &HandOver) {
         let missed = over.missed.iter();
         let missed = missed.map(|missed| format!("{} of {}", missed.count, missed.name));
         let missed = missed.collect::<Vec<_>>().join(", ");
@@ -619,11 +639,11 @@ impl Application for Listener {
         let _ = self.0.send(format!("{to} lacks {missed}"));
     }
 
-    fn lacks(&self, over: &HandOver) {
-        self.handed_over(over);
+    fn on_missed_requests(&self, over: &HandOver) {
+        self.on_hand_over(over);
     }
 
-    fn told(&self, _: &Outcome) {}
+    fn on_outcome(&self, _: &RequestOutcome) {}
 }
 
 async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_again(
@@ -635,22 +655,22 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
         "safe_stop": {"topic": "/cmd_vel", "type": "geometry_msgs/Twist"},
     });
     let (told, mut hears) = mpsc::unbounded_channel();
-    let cloud = Arc::new(Silent::default());
+    let cloud = Arc::new(SilentCloud::default());
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec!["/ns/in -> /absolute/out by arrival".parse().unwrap()],
-        Some(a_relay(&robot, &[]).await),
+        Some(new_relay(&robot, &[]).await),
         cloud.clone(),
-        Arc::new(Listener(told)),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     let topic: Arc<str> = "/ns/in".into();
-    keeper.input(&topic, string(ros, "lost"));
+    keeper.on_input(&topic, string_message(ros, "lost"));
     for expected in ["stop on /cmd_vel", "start", "feed"] {
         let heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
         assert_eq!(heard, expected);
     }
-    keeper.input(&topic, string(ros, "world"));
+    keeper.on_input(&topic, string_message(ros, "world"));
     let mut heard = String::new();
     while heard != "hello world" {
         heard = timeout(SOON, hears.recv()).await.unwrap().unwrap();
@@ -660,12 +680,12 @@ async fn the_cloud_falls_silent_and_the_local_original_answers_until_it_speaks_a
         2,
         "the cloud is asked all the time"
     );
-    // The cloud answers again, in time, until Q is above its threshold.
+    // The cloud answers in time again, until Q is above its threshold.
     let stopped = async {
         while heard != "stop" {
-            keeper.input(&topic, string(ros, "x"));
-            keeper.cloud_output("/absolute/out", &string(ros, "cloud"), None);
-            // What the original answers to them may be too late to be heard.
+            keeper.on_input(&topic, string_message(ros, "x"));
+            keeper.on_cloud_output("/absolute/out", &string_message(ros, "cloud"), None);
+            // The answers of the original may be too late to be published.
             tokio::task::yield_now().await;
             while heard != "stop" {
                 match hears.try_recv() {
@@ -688,19 +708,19 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost(ros: Ros
     let robot = robot(ros).await;
     let sla = serde_json::json!({"t_desire": 0.05, "t_max": 0.1, "local": "warm", "initial": 5});
     let (told, mut hears) = mpsc::unbounded_channel();
-    let cloud = Arc::new(Silent::default());
+    let cloud = Arc::new(SilentCloud::default());
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec![],
-        Some(a_relay(&robot, &[]).await),
+        Some(new_relay(&robot, &[]).await),
         cloud.clone(),
-        Arc::new(Listener(told)),
+        Arc::new(RecordingApplication(told)),
     );
     keeper.link_up(false);
     let service: Arc<str> = "/ns/relay/echo".into();
     let call = {
         let (keeper, service) = (keeper.clone(), service.clone());
-        tokio::spawn(async move { keeper.call(&service, written(ros, "request")).await })
+        tokio::spawn(async move { keeper.call(&service, encode_string(ros, "request")).await })
     };
     while cloud.calls.lock().is_empty() {
         tokio::task::yield_now().await;
@@ -708,10 +728,10 @@ async fn a_call_is_answered_by_the_local_original_when_the_link_is_lost(ros: Ros
     assert_eq!(hears.recv().await.unwrap(), "start");
     keeper.link_down();
     let answer = timeout(SOON, call).await.unwrap().unwrap();
-    let answer = answer.map(|answer| read(ros, &answer));
+    let answer = answer.map(|answer| decode_string(ros, &answer));
     assert_eq!(answer.as_deref(), Ok("request"));
     let id = cloud.calls.lock()[0];
-    keeper.cloud_answered(id, Ok(Bytes::from_static(b"late")), None);
+    keeper.on_cloud_answer(id, Ok(Bytes::from_static(b"late")), None);
     assert_eq!(keeper.report().counts.from_local, 1);
 }
 
@@ -720,11 +740,11 @@ async fn without_a_local_original_a_call_fails_with_the_reason() {
     let sla = serde_json::json!({"t_desire": 0.01, "t_max": 0.02});
     let (told, mut hears) = mpsc::unbounded_channel();
     let keeper = Keeper::start(
-        Sla::parse(sla).unwrap(),
+        QosSla::parse(sla).unwrap(),
         vec![],
         None,
-        Arc::new(Silent::default()),
-        Arc::new(Listener(told)),
+        Arc::new(SilentCloud::default()),
+        Arc::new(RecordingApplication(told)),
     );
     let error = timeout(SOON, keeper.call(&"/add".into(), Bytes::new()))
         .await

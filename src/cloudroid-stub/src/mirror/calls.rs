@@ -1,4 +1,4 @@
-//! What the real node serves: served on the robot under this node's name.
+//! Services of the real node, served on the robot under this node's name.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -6,19 +6,19 @@ use std::sync::{Arc, Weak};
 use async_trait::async_trait;
 use bytes::Bytes;
 use link::clock::now;
-use link::control::Served;
+use link::control::ServiceChannel;
 use parking_lot::Mutex;
 use qos::{Failure, RequestId};
 use ros::bus::ServiceHandler;
 use tokio::sync::{oneshot, watch};
 
 use super::{Mirror, reports};
-use crate::local::{Answer, Keeper, ServiceUse};
+use crate::local::{Keeper, PendingAnswer, ServiceUse};
 
-/// Services by name, and calls under way.
+/// Services by name, and pending calls.
 #[derive(Default)]
 pub struct Calls {
-    services: Mutex<HashMap<String, Service>>,
+    services: Mutex<HashMap<String, MirroredService>>,
     waiting: Mutex<HashMap<u32, oneshot::Sender<Result<Bytes, Failure>>>>,
     /// Calls that the keeper has made: the link's id → the keeper's.
     kept: Mutex<HashMap<u32, (RequestId, i64)>>,
@@ -26,17 +26,17 @@ pub struct Calls {
     early: Mutex<Vec<(RequestId, String, Bytes)>>,
 }
 
-struct Service {
-    /// As it was told.
-    told: Served,
-    /// Its number in this session; none until the cloud has told it.
+struct MirroredService {
+    /// The service as the cloud reported it.
+    told: ServiceChannel,
+    /// Channel number in this session; `None` until the cloud has reported it.
     channel: Arc<watch::Sender<Option<u32>>>,
     _serving: Box<dyn Send + Sync>,
 }
 
 impl Calls {
-    /// The cloud has answered.
-    pub fn answered(
+    /// Handles an answer of the cloud.
+    pub fn on_answer(
         &self,
         mirror: &Mirror,
         id: u32,
@@ -46,9 +46,9 @@ impl Calls {
         let kept = self.kept.lock().remove(&id);
         if let (Some(keeper), Some((request, asked))) = (mirror.keeper(), kept) {
             let clock = mirror.session().clock();
-            let phases =
-                clock.map(|clock| reports::of_call([asked, taken, given, arrived], clock.offset));
-            keeper.cloud_answered(request, response.map_err(Failure::Refused), phases);
+            let phases = clock
+                .map(|clock| reports::call_phases([asked, taken, given, arrived], clock.offset));
+            keeper.on_cloud_answer(request, response.map_err(Failure::Refused), phases);
             return;
         }
         if let Some(caller) = self.waiting.lock().remove(&id) {
@@ -56,22 +56,22 @@ impl Calls {
         }
     }
 
-    /// Another session begins: its channels are not known yet, and the numbers of the last one may mean other services.
-    pub fn renew(&self) {
+    /// Resets the channels at the start of another session, in which the numbers may mean other services.
+    pub fn reset_channels(&self) {
         for service in self.services.lock().values() {
             service.channel.send_replace(None);
         }
     }
 
-    /// All calls under way have failed.
-    pub fn fail(&self, keeper: Option<&Arc<Keeper>>, reason: &str) {
+    /// Fails all pending calls.
+    pub fn fail_all(&self, keeper: Option<&Arc<Keeper>>, reason: &str) {
         let kept = std::mem::take(&mut *self.kept.lock());
         let early = std::mem::take(&mut *self.early.lock());
         if let Some(keeper) = keeper {
             let kept = kept.into_values().map(|(request, _)| request);
             for request in kept.chain(early.into_iter().map(|(request, ..)| request)) {
                 let failure = Failure::Unreachable(reason.to_owned());
-                keeper.cloud_answered(request, Err(failure), None);
+                keeper.on_cloud_answer(request, Err(failure), None);
             }
         }
         for (_, caller) in self.waiting.lock().drain() {
@@ -79,14 +79,20 @@ impl Calls {
         }
     }
 
-    /// Calls on behalf of the keeper.
-    pub fn kept(&self, mirror: &Mirror, request: RequestId, service: &str, bytes: Bytes) {
+    /// Makes a call on behalf of the keeper.
+    pub fn call_for_keeper(
+        &self,
+        mirror: &Mirror,
+        request: RequestId,
+        service: &str,
+        bytes: Bytes,
+    ) {
         let services = self.services.lock();
         let Some(known) = services.get(service) else {
             drop(services);
             if let Some(keeper) = mirror.keeper() {
                 let gone = format!("the node does not serve {service} any more");
-                keeper.cloud_answered(request, Err(Failure::Unreachable(gone)), None);
+                keeper.on_cloud_answer(request, Err(Failure::Unreachable(gone)), None);
             }
             return;
         };
@@ -100,13 +106,13 @@ impl Calls {
         kept.insert(id, (request, now()));
     }
 
-    /// Calls what is not measured, and gives the answer. Waits until the cloud has told of the service.
-    pub fn ask(&self, mirror: &Mirror, service: &str, request: Bytes) -> Answer {
+    /// Makes a call that is not measured and returns the answer. Waits until the cloud has reported the service.
+    pub fn call_unmeasured(&self, mirror: &Mirror, service: &str, request: Bytes) -> PendingAnswer {
         let known = self.services.lock();
         match known.get(service) {
             Some(known) => {
                 let channel = known.channel.subscribe();
-                Box::pin(asked(mirror.this.clone(), channel, request))
+                Box::pin(call_on_channel(mirror.this.clone(), channel, request))
             }
             None => {
                 let gone = format!("the node does not serve {service} any more");
@@ -115,21 +121,22 @@ impl Calls {
         }
     }
 
-    /// Serves what is new and takes back what is gone, unless it `keeps` that for the time being. `told`: the channels
-    /// are the cloud's, else it knows of none yet.
+    /// Serves new services and stops serving those that are not listed, unless `keeps` is set. `told` is set if the
+    /// channels are the cloud's; otherwise the cloud knows of none yet.
     pub async fn apply(
         &self,
         mirror: &Arc<Mirror>,
-        services: &[Served],
+        services: &[ServiceChannel],
         (told, keeps): (bool, bool),
     ) {
         let version = mirror.bus.version();
         self.services.lock().retain(|name, service| {
             let listed = services.iter().find(|served| served.name == *name);
             // More of a type may have become known.
-            let same = |served: &Served| {
-                let of = |served: &Served| served.service_type(version);
-                served.type_name == service.told.type_name && of(served).agrees(&of(&service.told))
+            let same = |served: &ServiceChannel| {
+                let of = |served: &ServiceChannel| served.service_type(version);
+                served.type_name == service.told.type_name
+                    && of(served).is_compatible_with(&of(&service.told))
             };
             listed.map_or(keeps, same)
         });
@@ -139,16 +146,16 @@ impl Calls {
                 continue;
             }
             let channel = Arc::new(watch::Sender::new(told.then_some(served.channel)));
-            let handler = Arc::new(Forward {
+            let handler = Arc::new(ForwardingHandler {
                 mirror: Arc::downgrade(mirror),
                 name: served.name.as_str().into(),
-                what: ServiceUse::of(served, version),
+                what: ServiceUse::classify(served, version),
                 channel: channel.clone(),
             });
             let service_type = served.service_type(version);
             match mirror.bus.serve(&served.name, service_type, handler).await {
                 Ok(serving) => {
-                    let service = Service {
+                    let service = MirroredService {
                         told: served.clone(),
                         channel,
                         _serving: serving,
@@ -161,13 +168,13 @@ impl Calls {
             }
         }
         for (request, service, bytes) in std::mem::take(&mut *self.early.lock()) {
-            self.kept(mirror, request, &service, bytes);
+            self.call_for_keeper(mirror, request, &service, bytes);
         }
     }
 }
 
-/// Calls the cloud by a channel that it may not have told yet.
-async fn asked(
+/// Calls the cloud on a channel that may not have been reported yet.
+async fn call_on_channel(
     mirror: Weak<Mirror>,
     mut channels: watch::Receiver<Option<u32>>,
     request: Bytes,
@@ -178,7 +185,8 @@ async fn asked(
         let known = channels.wait_for(Option::is_some).await;
         drop(known.map_err(|_| ended())?);
         let mirror = mirror.upgrade().ok_or_else(ended)?;
-        // The answer may come at once: it must find its caller. A session that begins now fails all that wait.
+        // The answer may come at once, so the caller is entered before. A session that begins now fails all pending
+        // calls.
         let mut waiting = mirror.calls.waiting.lock();
         let Some(channel) = *channels.borrow() else {
             continue;
@@ -187,14 +195,14 @@ async fn asked(
         waiting.insert(id, sender);
         break id;
     };
-    let abandoned = Abandoned { mirror, id };
+    let abandoned = AbandonedCall { mirror, id };
     let answer = answer.await.unwrap_or_else(|_| Err(ended()));
     drop(abandoned);
     answer
 }
 
-/// Passes calls to the cloud, or to who keeps the promise.
-struct Forward {
+/// Forwards calls to the cloud, or to the keeper of the promise.
+struct ForwardingHandler {
     mirror: Weak<Mirror>,
     name: Arc<str>,
     what: ServiceUse,
@@ -202,7 +210,7 @@ struct Forward {
 }
 
 #[async_trait]
-impl ServiceHandler for Forward {
+impl ServiceHandler for ForwardingHandler {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let keeper = {
             let mirror = self.mirror.upgrade();
@@ -211,12 +219,12 @@ impl ServiceHandler for Forward {
         };
         let Some(keeper) = keeper else {
             let channels = self.channel.subscribe();
-            let answer = asked(self.mirror.clone(), channels, request).await;
+            let answer = call_on_channel(self.mirror.clone(), channels, request).await;
             return answer.map_err(|failure| failure.text().to_owned());
         };
         match &self.what {
             ServiceUse::Request => keeper.call(&self.name, request).await,
-            ServiceUse::Look => keeper.pass(&self.name, request).await,
+            ServiceUse::Look => keeper.forward(&self.name, request).await,
             ServiceUse::Set | ServiceUse::Transition => {
                 keeper.manage(&self.name, &self.what, request).await
             }
@@ -227,13 +235,13 @@ impl ServiceHandler for Forward {
     }
 }
 
-/// Forgets a call whose caller has gone.
-struct Abandoned {
+/// Removes a call whose caller is gone.
+struct AbandonedCall {
     mirror: Weak<Mirror>,
     id: u32,
 }
 
-impl Drop for Abandoned {
+impl Drop for AbandonedCall {
     fn drop(&mut self) {
         if let Some(mirror) = self.mirror.upgrade() {
             mirror.calls.waiting.lock().remove(&self.id);

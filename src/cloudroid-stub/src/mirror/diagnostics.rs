@@ -1,23 +1,24 @@
-//! `/diagnostics` (diagnostic_msgs/DiagnosticArray): how a node's promise stands, where robots show such things.
+//! The `/diagnostics` topic (diagnostic_msgs/DiagnosticArray), which shows the state of a node's promise to the usual
+//! tools of robots.
 //!
-//! A node of its own publishes it, `NODE_cloudroid`: the stub's node looks like the original's.
+//! A separate node, `NODE_cloudroid`, publishes it, because the stub's node looks like the original's.
 
 use std::sync::Arc;
 
 use bytes::Bytes;
-use qos::{Local, LocalState, Report};
-use ros::bus::{Bus, BusError, Publisher, Qos, RosVersion, WireType};
+use qos::{LocalPolicy, LocalState, QosReport};
+use ros::bus::{Bus, BusError, Publisher, QosProfile, RosVersion, WireType};
 use ros::codec::{self, FillOptions, Time};
 use ros::schema::{MessageType, Registry};
 use serde_json::json;
 
 const TOPIC: &str = "/diagnostics";
-/// DiagnosticStatus' levels.
+/// Levels of DiagnosticStatus.
 const OK: u8 = 0;
 const WARN: u8 = 1;
 const ERROR: u8 = 2;
 
-/// The same in both ROSes, but for headers, which each has of its own.
+/// Message definitions, the same in ROS 1 and 2 except for the header, which each version defines itself.
 const DEFINITIONS: [(&str, &str); 3] = [
     (
         "diagnostic_msgs/msg/DiagnosticArray",
@@ -31,24 +32,24 @@ const DEFINITIONS: [(&str, &str); 3] = [
     ("diagnostic_msgs/msg/KeyValue", "string key\nstring value\n"),
 ];
 
-/// One node's entry in `/diagnostics`.
+/// The entry of one node in `/diagnostics`.
 pub struct Diagnostics {
     publisher: Box<dyn Publisher>,
-    /// The entry's name.
+    /// Name of the entry.
     name: String,
-    /// The robot's id.
+    /// Id of the robot.
     robot: String,
     sequence: u32,
     schema: Arc<MessageType>,
 }
 
 impl Diagnostics {
-    /// Advertises it on `bus`, for the node of this name.
+    /// Advertises the topic on `bus`, for the node of this name.
     pub async fn new(bus: &Arc<dyn Bus>, node: &str, robot: &str) -> Result<Self, BusError> {
         let schema = schema(bus.version());
-        let of = WireType::of(&schema);
+        let of = WireType::from_message(&schema);
         Ok(Self {
-            publisher: bus.advertise(TOPIC, of, Qos::keep_last(2)).await?,
+            publisher: bus.advertise(TOPIC, of, QosProfile::keep_last(2)).await?,
             name: format!("{}: cloudroid", node.trim_start_matches('/')),
             robot: robot.to_owned(),
             sequence: 0,
@@ -57,15 +58,15 @@ impl Diagnostics {
     }
 
     /// Publishes the state of the promise.
-    pub fn publish(&mut self, report: &Report) {
+    pub fn publish(&mut self, report: &QosReport) {
         self.sequence = self.sequence.wrapping_add(1);
-        let bytes = array(&self.schema, self.sequence, &self.name, &self.robot, report);
+        let bytes = encode_array(&self.schema, self.sequence, &self.name, &self.robot, report);
         self.publisher.publish(bytes);
     }
 }
 
 fn schema(version: RosVersion) -> Arc<MessageType> {
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     let known = DEFINITIONS
         .iter()
         .try_for_each(|(key, text)| registry.insert(key, text))
@@ -76,11 +77,13 @@ fn schema(version: RosVersion) -> Arc<MessageType> {
     }
 }
 
-/// How bad it is: nobody answers; somebody does, but not as wished for; the cloud keeps its promise.
-fn level(report: &Report) -> u8 {
+/// Returns the level: `OK` if the cloud keeps its promise, `WARN` if a node answers but not as desired, `ERROR` if none
+/// answers.
+fn level(report: &QosReport) -> u8 {
     let unpromised = report.fallback_after.is_some();
     let wished_for = report.link && (unpromised || report.q >= report.threshold);
-    let in_its_place = report.local != Local::None && report.local_state != LocalState::Missing;
+    let in_its_place =
+        report.local != LocalPolicy::None && report.local_state != LocalState::Missing;
     if wished_for {
         OK
     } else if report.link || report.fed || in_its_place {
@@ -90,7 +93,7 @@ fn level(report: &Report) -> u8 {
     }
 }
 
-fn values(report: &Report) -> Vec<(String, String)> {
+fn values(report: &QosReport) -> Vec<(String, String)> {
     let counts = &report.counts;
     let yes = |it: bool| if it { "yes" } else { "no" }.to_owned();
     let promise = match report.fallback_after {
@@ -146,7 +149,13 @@ fn values(report: &Report) -> Vec<(String, String)> {
     values
 }
 
-fn array(of: &MessageType, sequence: u32, name: &str, robot: &str, report: &Report) -> Bytes {
+fn encode_array(
+    of: &MessageType,
+    sequence: u32,
+    name: &str,
+    robot: &str,
+    report: &QosReport,
+) -> Bytes {
     let Time { secs, nsecs } = Time::now();
     let value = |(key, value)| json!({ "key": key, "value": value });
     let header = match of.version() {
@@ -176,7 +185,7 @@ fn array(of: &MessageType, sequence: u32, name: &str, robot: &str, report: &Repo
 #[cfg(test)]
 mod tests {
     use super::*;
-    use qos::{Governor, Limits, Sla};
+    use qos::{Governor, QosSla, RetentionLimits};
     use std::time::Instant;
 
     #[test]
@@ -184,9 +193,13 @@ mod tests {
         let known = schema(RosVersion::Two);
         assert_eq!(known.name(), "diagnostic_msgs/msg/DiagnosticArray");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
-        let governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let governor = Governor::<()>::new(
+            QosSla::parse(sla).unwrap(),
+            vec![],
+            RetentionLimits::default(),
+        );
         let report = governor.report(Instant::now());
-        let told = array(&known, 1, "detect: cloudroid", "rover1", &report);
+        let told = encode_array(&known, 1, "detect: cloudroid", "rover1", &report);
         assert_eq!(told[..4], [0, 1, 0, 0]);
         let mut json = Vec::new();
         ros::codec::to_json(&known, &told, &mut json, &Default::default()).unwrap();
@@ -200,9 +213,13 @@ mod tests {
         let known = schema(RosVersion::One);
         assert_eq!(known.md5(), "60810da900de1dd6ddd437c3503511da");
         let sla = serde_json::json!({"t_desire": 0.1, "t_max": 0.3, "local": "none"});
-        let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let mut governor = Governor::<()>::new(
+            QosSla::parse(sla).unwrap(),
+            vec![],
+            RetentionLimits::default(),
+        );
         let now = Instant::now();
-        let down = array(
+        let down = encode_array(
             &known,
             7,
             "detect: cloudroid",
@@ -222,7 +239,11 @@ mod tests {
         governor.link_up(now, false);
         assert_eq!(level(&governor.report(now)), OK);
         let sla = serde_json::json!({"measure": {"link": {"after": 3}}, "initial": 1});
-        let mut governor = Governor::<()>::new(Sla::parse(sla).unwrap(), vec![], Limits::default());
+        let mut governor = Governor::<()>::new(
+            QosSla::parse(sla).unwrap(),
+            vec![],
+            RetentionLimits::default(),
+        );
         governor.begin(now);
         let down = governor.report(now);
         let after = (

@@ -1,58 +1,58 @@
-//! What the real node listens to: subscribed to on the robot under this node's name, and sent up.
+//! Topics that the real node subscribes to: subscribed to on the robot under this node's name, and sent to the cloud.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
-use link::Quality;
+use link::DeliveryMode;
 use link::clock::now;
-use link::control::{FromRobot, Input, Wanted};
+use link::control::{FromRobot, InputChannel, RequestedInput};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
-use ros::bus::{Digest, Matched, Message, Peer, PeerId, Qos, WireType};
+use ros::bus::{Digest, MatchedPeers, PeerId, QosProfile, SerializedMessage, TopicPeer, WireType};
 use tokio::task::AbortHandle;
 
 use super::Mirror;
 
-/// Messages that the bus keeps while the link is busy.
+/// Queue length on the bus while the link is busy, in messages.
 const QUEUE: usize = 256;
 
-/// Before a subscription that was refused is tried again.
+/// Delay before a refused subscription is tried again.
 const REFUSED: Duration = Duration::from_secs(1);
 
 /// Inputs by topic.
 #[derive(Default)]
 pub struct Inputs {
-    topics: Mutex<HashMap<String, Topic>>,
-    channels: Mutex<HashMap<String, Channels>>,
+    topics: Mutex<HashMap<String, InputTopic>>,
+    channels: Mutex<HashMap<String, TopicChannels>>,
     next: AtomicU32,
 }
 
-struct Topic {
-    wanted: Wanted,
+struct InputTopic {
+    wanted: RequestedInput,
     feed: Arc<AtomicBool>,
     reading: AbortHandle,
 }
 
-impl Drop for Topic {
+impl Drop for InputTopic {
     fn drop(&mut self) {
         self.reading.abort();
     }
 }
 
 impl Inputs {
-    /// Subscribes to what is new and takes back what is gone, unless it `keeps` that for the time being.
-    pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[Wanted], keeps: bool) {
-        // The local original must not become deaf, whatever the servant's node listens to.
+    /// Subscribes to new inputs and unsubscribes from those that are not listed, unless `keeps` is set.
+    pub fn apply(&self, mirror: &Arc<Mirror>, inputs: &[RequestedInput], keeps: bool) {
+        // The local original must keep receiving, whatever the servant's node subscribes to.
         let others_need = keeps || mirror.keeper().is_some_and(|keeper| keeper.is_local_fed());
         let mut topics = self.topics.lock();
         topics.retain(|name, topic| {
             let listed = inputs.iter().find(|wanted| wanted.topic == *name);
-            listed.map_or(others_need, |wanted| suffices(&topic.wanted, wanted))
+            listed.map_or(others_need, |wanted| satisfies(&topic.wanted, wanted))
         });
-        // Subscribed to anew, a topic gets new channels.
+        // A topic that is subscribed to anew gets new channels.
         self.channels.lock().retain(|name, channels| {
             let stays = topics.contains_key(name);
             if !stays {
@@ -66,14 +66,14 @@ impl Inputs {
                     self.send_latched(mirror, &wanted.topic);
                     topic.feed.store(wanted.feed, Ordering::Relaxed);
                     if wanted.feed {
-                        self.expect(mirror, &wanted.topic);
+                        self.open_expected(mirror, &wanted.topic);
                     }
                     continue;
                 }
                 None => {
                     let feed = Arc::new(AtomicBool::new(wanted.feed));
-                    let reading = read(Arc::downgrade(mirror), wanted.clone(), feed.clone());
-                    let topic = Topic {
+                    let reading = read_input(Arc::downgrade(mirror), wanted.clone(), feed.clone());
+                    let topic = InputTopic {
                         wanted: wanted.clone(),
                         feed,
                         reading: tokio::spawn(reading).abort_handle(),
@@ -84,7 +84,7 @@ impl Inputs {
         }
     }
 
-    /// Gives a new servant what publishers have latched: they do not send it again.
+    /// Sends latched messages to a new servant, since their publishers do not send them again.
     fn send_latched(&self, mirror: &Mirror, topic: &str) {
         let kept = match self.channels.lock().get_mut(topic) {
             Some(channels) => std::mem::take(&mut channels.to_send_again),
@@ -95,8 +95,8 @@ impl Inputs {
         }
     }
 
-    /// Sends a message up.
-    pub fn send(&self, mirror: &Mirror, topic: &str, message: &Message) {
+    /// Sends a message to the cloud.
+    pub fn send(&self, mirror: &Mirror, topic: &str, message: &SerializedMessage) {
         let born = now();
         let channel = {
             let mut channels = self.channels.lock();
@@ -108,14 +108,14 @@ impl Inputs {
                 let publisher = message.publisher.clone();
                 channels.latched.insert(publisher, message.clone());
             }
-            channels.of(
+            channels.channel_for(
                 mirror,
                 topic,
                 (&message.publisher, message.latching),
                 &message.wire_type,
             )
         };
-        let quality = Quality::of(&message.wire_type.name, message.latching);
+        let quality = DeliveryMode::for_type(&message.wire_type.name, message.latching);
         let data = Data {
             channel,
             encoded: false,
@@ -129,27 +129,28 @@ impl Inputs {
         mirror.session().publish(data, quality);
     }
 
-    /// Opens the topic for who will publish it: in the cloud the node is connected then when the first message comes.
-    fn expect(&self, mirror: &Mirror, topic: &str) {
-        // While the cloud is away, nothing is put down for it that it may never be asked for.
+    /// Opens channels for the topic's prospective publishers, so that the node in the cloud is already connected when
+    /// the first message arrives.
+    fn open_expected(&self, mirror: &Mirror, topic: &str) {
+        // While the link is down nothing is queued for the cloud, which may never ask for it.
         if !mirror.session().is_up() {
             return;
         }
         let siblings = mirror.siblings.read().clone();
         if let Some(channels) = self.channels.lock().get_mut(topic) {
             let mut offered = channels.offered.clone();
-            // Other nodes of the servant hear each other inside.
+            // Other nodes of the servant reach each other inside it.
             offered.retain(|publisher, _| !siblings.contains(publisher.node()));
             for (publisher, of) in offered {
-                channels.of(mirror, topic, (&publisher, false), &of);
+                channels.channel_for(mirror, topic, (&publisher, false), &of);
             }
         }
     }
 
-    /// These are there now, and will publish this.
-    fn offered(&self, topic: &str, present: &Matched) {
-        let stream = |peer: &Peer| {
-            // What is latched comes at once.
+    /// Records the connected publishers and their types.
+    fn set_offered(&self, topic: &str, present: &MatchedPeers) {
+        let stream = |peer: &TopicPeer| {
+            // Latched messages arrive at once.
             let offer = peer.offer.as_ref().filter(|offer| !offer.latching)?;
             let known = offer.wire_type.name != "*";
             known.then(|| (peer.id.clone(), offer.wire_type.clone()))
@@ -163,24 +164,24 @@ impl Inputs {
         channels.offered = connected.filter_map(stream).collect();
     }
 
-    /// Only these publishers of a topic are left: what the cloud was given of others is taken back.
-    fn left(&self, mirror: &Mirror, topic: &str, present: &Matched) {
+    /// Closes the channels of publishers that are no longer present.
+    fn remove_absent(&self, mirror: &Mirror, topic: &str, present: &MatchedPeers) {
         if let Some(channels) = self.channels.lock().get_mut(topic) {
-            channels.left(mirror, present);
+            channels.remove_absent(mirror, present);
         }
     }
 
-    /// How many channels are open, and how many messages are kept since they are latched.
+    /// Returns the number of open channels and of retained latched messages.
     #[cfg(test)]
-    pub fn known(&self) -> (usize, usize) {
+    pub fn counts(&self) -> (usize, usize) {
         let channels = self.channels.lock();
         let open = channels.values().map(|of| of.by_publisher.len()).sum();
         (open, channels.values().map(|of| of.latched.len()).sum())
     }
 
-    /// Another session begins: the cloud knows no channel any more. What is subscribed to on the robot stays so, or
-    /// the local original would miss messages.
-    pub fn renew(&self) {
+    /// Resets the channels at the start of another session, in which the cloud knows none. The subscriptions on the
+    /// robot stay, or the local original would miss messages.
+    pub fn reset_channels(&self) {
         for channels in self.channels.lock().values_mut() {
             channels.by_publisher.clear();
             channels.to_send_again = channels.latched.clone();
@@ -188,9 +189,9 @@ impl Inputs {
     }
 }
 
-/// Whether a subscription that was made for one wish does for another: whoever asks for more hears those who offer less, too, and
-/// what was heard once is not to come again.
-fn suffices(made: &Wanted, wanted: &Wanted) -> bool {
+/// Returns whether a subscription made for one request satisfies another. A subscriber with stricter requests also
+/// receives from publishers that offer less, but what was received once is not sent again.
+fn satisfies(made: &RequestedInput, wanted: &RequestedInput) -> bool {
     let enough = match (&made.qos, &wanted.qos) {
         (Some(made), Some(wanted)) => {
             (made.transient_local || !wanted.transient_local)
@@ -202,7 +203,11 @@ fn suffices(made: &Wanted, wanted: &Wanted) -> bool {
     made.md5 == wanted.md5 && enough
 }
 
-async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicBool>) {
+async fn read_input(
+    mirror: std::sync::Weak<Mirror>,
+    wanted: RequestedInput,
+    feed: Arc<AtomicBool>,
+) {
     let Some(bus) = mirror.upgrade().map(|mirror| mirror.bus.clone()) else {
         return;
     };
@@ -211,10 +216,11 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         None => return,
     };
     let qos = match &wanted.qos {
-        // Publishers of ROS 2 log whom they do not suit: no more is asked for than the node does.
-        Some(qos) => qos.to_qos(QUEUE),
-        // Whatever is latched goes to the cloud, too.
-        None => Qos::keep_last(QUEUE).latching(true),
+        // ROS 2 publishers log subscribers with incompatible quality of service, so no more is requested than the node
+        // requests.
+        Some(qos) => qos.to_bus(QUEUE),
+        // Latched messages are sent to the cloud, too.
+        None => QosProfile::keep_last(QUEUE).latching(true),
     };
     let mut told = false;
     let mut subscription = loop {
@@ -231,36 +237,36 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
     let Some(refused) = mirror.upgrade().map(|mirror| {
         let dropped = Arc::clone(&subscription.dropped);
         mirror.drops.watch(&wanted.topic, Cause::Busy, dropped);
-        mirror.refusals.end(&wanted.topic)
+        mirror.refusals.register_end(&wanted.topic)
     }) else {
         return;
     };
     let topic: Arc<str> = wanted.topic.as_str().into();
     let mut present = subscription.matched.clone();
-    // Who is there already is no change.
+    // The initial state is not reported as a change.
     present.mark_changed();
     let mut latching: BTreeSet<PeerId> = BTreeSet::new();
-    // Who is there, as it has changed: looked at when all that had come by then was read.
-    let mut changed: Option<Matched> = None;
+    // The changed set of publishers, handled after all messages received before it.
+    let mut changed: Option<MatchedPeers> = None;
     loop {
         let message = tokio::select! {
-            // Who has left has sent all that it had before.
+            // A publisher that has left has sent all of its messages before.
             biased;
             message = subscription.messages.recv() => message,
             () = std::future::ready(()), if changed.is_some() => {
                 let (Some(mirror), Some(present)) = (mirror.upgrade(), changed.take()) else {
                     return;
                 };
-                // First, or one that has left might be expected again.
-                mirror.inputs.offered(&topic, &present);
-                mirror.inputs.left(&mirror, &topic, &present);
+                // Set first, or channels would be opened again for a publisher that has left.
+                mirror.inputs.set_offered(&topic, &present);
+                mirror.inputs.remove_absent(&mirror, &topic, &present);
                 if feed.load(Ordering::Relaxed) {
-                    mirror.inputs.expect(&mirror, &topic);
+                    mirror.inputs.open_expected(&mirror, &topic);
                 }
                 latching.retain(|publisher| {
                     let stays = present.contains(publisher);
                     if let Some(keeper) = mirror.keeper().filter(|_| !stays) {
-                        keeper.left(&topic, publisher);
+                        keeper.on_publisher_left(&topic, publisher);
                     }
                     stays
                 });
@@ -271,7 +277,7 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
                     return;
                 }
                 let now = present.borrow_and_update().clone();
-                refused.meets(&now);
+                refused.update(&now);
                 changed = Some(now);
                 continue;
             }
@@ -279,56 +285,57 @@ async fn read(mirror: std::sync::Weak<Mirror>, wanted: Wanted, feed: Arc<AtomicB
         let (Some(message), Some(mirror)) = (message, mirror.upgrade()) else {
             return;
         };
-        // One that has left meanwhile: what is opened for its last message is closed again behind it.
+        // The publisher has left in the meantime: the channel that is opened for its last message is closed afterwards.
         if !present.borrow().contains(&message.publisher) {
             changed = Some(present.borrow().clone());
         }
         if message.latching && !latching.contains(&message.publisher) {
             latching.insert(message.publisher.clone());
         }
-        // Other nodes of the servant hear each other inside. Their originals on the robot do not.
+        // Other nodes of the servant reach each other inside it. Their originals on the robot do not.
         let inside = mirror.siblings.read().contains(message.publisher.node());
         match (mirror.keeper(), !inside && feed.load(Ordering::Relaxed)) {
-            (Some(keeper), true) => keeper.input(&topic, message),
-            (Some(keeper), false) => keeper.overheard(&topic, message),
+            (Some(keeper), true) => keeper.on_input(&topic, message),
+            (Some(keeper), false) => keeper.on_overheard_input(&topic, message),
             (None, true) => mirror.inputs.send(&mirror, &topic, &message),
             (None, false) => {}
         }
     }
 }
 
-/// A channel for all publishers that do not latch, and one for each that does: what each has latched is kept.
+/// Channels of a topic: one shared by all publishers that do not latch, and one for each publisher that does, whose
+/// last message is retained.
 #[derive(Default)]
-struct Channels {
-    by_publisher: HashMap<(Option<PeerId>, Digest), Channel>,
-    /// What each publisher has latched last.
-    latched: HashMap<PeerId, Message>,
-    /// Of that, what a new servant was not given yet.
-    to_send_again: HashMap<PeerId, Message>,
-    /// What those publish who are connected and do not latch.
+struct TopicChannels {
+    by_publisher: HashMap<(Option<PeerId>, Digest), OpenChannel>,
+    /// Last latched message of each publisher.
+    latched: HashMap<PeerId, SerializedMessage>,
+    /// Latched messages that a new servant has not received yet.
+    to_send_again: HashMap<PeerId, SerializedMessage>,
+    /// Types of the connected publishers that do not latch.
     offered: HashMap<PeerId, Arc<WireType>>,
 }
 
-struct Channel {
+struct OpenChannel {
     number: u32,
-    /// Who has sent by it.
+    /// Publishers that have sent on this channel.
     publishers: BTreeSet<PeerId>,
 }
 
-impl Channels {
-    /// The cloud is told that nothing more comes by any of them.
+impl TopicChannels {
+    /// Reports the channels as closed to the cloud.
     fn close(&mut self, mirror: &Mirror) {
         for (_, channel) in self.by_publisher.drain() {
-            mirror.session().closes(channel.number);
+            mirror.session().close_channel(channel.number);
         }
     }
 
-    /// Forgets publishers that are not among these.
-    fn left(&mut self, mirror: &Mirror, present: &Matched) {
+    /// Removes publishers that are not present.
+    fn remove_absent(&mut self, mirror: &Mirror, present: &MatchedPeers) {
         self.by_publisher.retain(|_, channel| {
             channel.publishers.retain(|name| present.contains(name));
             if channel.publishers.is_empty() {
-                mirror.session().closes(channel.number);
+                mirror.session().close_channel(channel.number);
             }
             !channel.publishers.is_empty()
         });
@@ -336,8 +343,8 @@ impl Channels {
         self.latched.retain(|name, _| present.contains(name));
     }
 
-    /// The number of the channel of this publisher, which latches or does not.
-    fn of(
+    /// Returns the channel number for this publisher, depending on whether it latches.
+    fn channel_for(
         &mut self,
         mirror: &Mirror,
         topic: &str,
@@ -347,23 +354,26 @@ impl Channels {
         let key = (latching.then(|| publisher.clone()), of.digest.clone());
         let known = self.by_publisher.entry(key).or_insert_with(|| {
             let channel = mirror.inputs.next.fetch_add(1, Ordering::Relaxed);
-            // Publishers of ROS 2 do not tell it; the cloud may have.
-            let definition = match of.definition.is_empty() {
-                true => mirror.wire_type(&of.name, of.digest.as_str()).definition,
-                false => of.definition.clone(),
+            // ROS 2 publishers do not send the definition; the cloud may have it.
+            let definition = if of.definition.is_empty() {
+                mirror.wire_type(&of.name, of.digest.as_str()).definition
+            } else {
+                of.definition.clone()
             };
-            mirror.session().report(&FromRobot::Open(Input {
-                channel,
-                topic: topic.to_owned(),
-                type_name: of.name.clone(),
-                md5: of.digest.to_string(),
-                definition,
-                latching,
-                qos: None,
-            }));
-            let schema = codec::Schema::of(&of.name, of.digest.as_str());
-            mirror.session().opens(channel, topic, schema);
-            Channel {
+            mirror
+                .session()
+                .send_control(&FromRobot::Open(InputChannel {
+                    channel,
+                    topic: topic.to_owned(),
+                    type_name: of.name.clone(),
+                    md5: of.digest.to_string(),
+                    definition,
+                    latching,
+                    qos: None,
+                }));
+            let schema = codec::Schema::for_type(&of.name, of.digest.as_str());
+            mirror.session().open_channel(channel, topic, schema);
+            OpenChannel {
                 number: channel,
                 publishers: BTreeSet::new(),
             }

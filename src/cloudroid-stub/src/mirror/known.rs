@@ -1,30 +1,30 @@
-//! What a mirror knows of the interface that the local original is to have.
+//! The mirror's record of the interface that the local original is to have.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use link::control::Graph;
-use qos::Pair;
-use ros::bus::{Qos, WireType};
+use qos::TopicPair;
+use ros::bus::{QosProfile, WireType};
 
-use super::requests::{self, Request};
+use super::requests::{self, RequestPattern};
 use crate::local;
 
-/// What is known of the interface so far: lazy inputs become known later, and do not go again.
+/// The interface known so far; lazy inputs become known later, and stay.
 #[derive(Default)]
-pub struct Known {
+pub struct KnownInterface {
     pub(super) inputs: BTreeMap<String, WireType>,
-    /// The quality of service that the node asks for, where that is told.
-    pub(super) asked: BTreeMap<String, Qos>,
+    /// Requested quality of service of the inputs, if reported.
+    pub(super) asked: BTreeMap<String, QosProfile>,
     pub(super) outputs: BTreeMap<String, WireType>,
-    /// What lies below a further node of the process → that node.
+    /// Names below another node of the process → that node.
     pub(super) of_others: BTreeMap<String, String>,
     pub(super) told: BTreeSet<String>,
 }
 
-impl Known {
-    /// Adds what the graph of the node `own` lists. Once it is `settled`, what lies below a further node that it does not list is forgotten: it had a name
-    /// of one life, and the next one has another.
-    pub(super) fn note(
+impl KnownInterface {
+    /// Adds the interface listed by the graph of the node `own`. Once it is `settled`, names below other nodes that it
+    /// does not list are removed: such nodes get a new name each time they start.
+    pub(super) fn add_graph(
         &mut self,
         graph: &Graph,
         own: &str,
@@ -36,7 +36,7 @@ impl Known {
             let found = wire_type(&input.type_name, &input.md5);
             self.inputs.insert(input.topic.clone(), found);
             if let Some(qos) = &input.qos {
-                let asked = qos.to_qos(local::QUEUE);
+                let asked = qos.to_bus(local::QUEUE);
                 self.asked.insert(input.topic.clone(), asked);
             }
         }
@@ -48,10 +48,10 @@ impl Known {
         let outputs = graph.outputs.iter().map(|output| &output.topic);
         let services = graph.services.iter().map(|service| &service.name);
         for name in inputs.chain(outputs).chain(services) {
-            if is_below(name, own) {
+            if is_private_name(name, own) {
                 continue;
             }
-            if let Some(other) = graph.nodes.keys().find(|node| is_below(name, node)) {
+            if let Some(other) = graph.nodes.keys().find(|node| is_private_name(name, node)) {
                 self.of_others.insert(name.clone(), other.clone());
             }
         }
@@ -68,12 +68,12 @@ impl Known {
         }
     }
 
-    /// The pairs of those requests whose topics exist, and of actions that none of them names.
-    pub(super) fn pairs(&self, requests: &[Request]) -> Vec<Pair> {
-        let mut pairs: Vec<Pair> = Vec::new();
-        for found in requests.iter().filter_map(|request| request.pair(self)) {
+    /// Returns the pairs of the requests whose topics exist, and of actions that no request names.
+    pub(super) fn pairs(&self, requests: &[RequestPattern]) -> Vec<TopicPair> {
+        let mut pairs: Vec<TopicPair> = Vec::new();
+        for found in requests.iter().filter_map(|request| request.resolve(self)) {
             match pairs.iter_mut().find(|pair| pair.input == found.input) {
-                // Nodes of one program may answer the same input.
+                // Several nodes of one program may answer the same input.
                 Some(pair) => {
                     let outputs = found.outputs.into_iter();
                     let new: Vec<_> = outputs
@@ -84,7 +84,7 @@ impl Known {
                 None => pairs.push(found),
             }
         }
-        for action in requests::actions(self) {
+        for action in requests::action_pairs(self) {
             if !pairs.iter().any(|pair| pair.input == action.input) {
                 pairs.push(action);
             }
@@ -93,15 +93,15 @@ impl Known {
     }
 }
 
-/// Whether the name is a private one of the node (`~/get_parameters`).
-fn is_below(name: &str, node: &str) -> bool {
+/// Returns whether the name is a private one of the node (`~/get_parameters`).
+fn is_private_name(name: &str, node: &str) -> bool {
     name.strip_prefix(node)
         .is_some_and(|rest| rest.starts_with('/'))
 }
 
 #[cfg(test)]
 mod tests {
-    use link::control::{Has, Output, Served, Wanted};
+    use link::control::{NodeEndpoints, OutputChannel, RequestedInput, ServiceChannel};
 
     use super::*;
 
@@ -109,21 +109,21 @@ mod tests {
     fn what_lies_below_further_nodes_is_of_a_life_of_theirs() {
         let graph = |nodes: &[&str], lies: &[&str]| {
             let names = lies.iter().map(ToString::to_string);
-            let input = |topic| Wanted {
+            let input = |topic| RequestedInput {
                 topic,
                 type_name: "std_msgs/msg/String".to_owned(),
                 feed: true,
-                ..Wanted::default()
+                ..RequestedInput::default()
             };
-            let output = |topic| Output {
+            let output = |topic| OutputChannel {
                 topic,
-                ..Output::default()
+                ..OutputChannel::default()
             };
-            let service = |name: String| Served {
+            let service = |name: String| ServiceChannel {
                 name: format!("{name}/get_type_description"),
-                ..Served::default()
+                ..ServiceChannel::default()
             };
-            let node = |name: &&str| ((*name).to_owned(), Has::default());
+            let node = |name: &&str| ((*name).to_owned(), NodeEndpoints::default());
             Graph {
                 inputs: names.clone().map(input).collect(),
                 outputs: names.clone().map(output).collect(),
@@ -132,10 +132,10 @@ mod tests {
                 ..Graph::default()
             }
         };
-        let of = |name: &str, _: &str| WireType::named(name);
-        let mut known = Known::default();
+        let of = |name: &str, _: &str| WireType::with_name(name);
+        let mut known = KnownInterface::default();
         let mut note = |nodes: &[&str], lies: &[&str], settled| {
-            known.note(&graph(nodes, lies), "/see", settled, of);
+            known.add_graph(&graph(nodes, lies), "/see", settled, of);
             let topics: Vec<_> = known.outputs.keys().cloned().collect();
             assert_eq!(topics, known.inputs.keys().cloned().collect::<Vec<_>>());
             (
@@ -155,7 +155,7 @@ mod tests {
         );
         let others = "/tf_1/x /tf_1/x/get_type_description".to_owned();
         assert_eq!(found, ("/see/eye/scan /tf /tf_1/x".to_owned(), others));
-        // Not before all had time to come again; what is lazy stays.
+        // Nothing is removed before all nodes had time to register again; lazy names stay.
         let found = note(&["/see", "/tf_2"], &["/tf_2/x"], false);
         assert_eq!(found.0, "/see/eye/scan /tf /tf_1/x /tf_2/x");
         let found = note(&["/see", "/tf_2"], &[], true);

@@ -1,4 +1,4 @@
-//! Services of the robot that nodes in the cloud call. They are looked up here when a node there looks for them, and
+//! Services of the robot that nodes in the cloud call. They are looked up here when such a node looks for them, and
 //! watched from then on.
 
 use std::collections::HashMap;
@@ -7,22 +7,22 @@ use std::sync::{Arc, Weak};
 
 use budget::Permit;
 use link::RobotSession;
-use link::control::{FromRobot, Served};
-use link::record::Called;
+use link::control::{FromRobot, ServiceChannel};
+use link::record::ReceivedCall;
 use parking_lot::Mutex;
 use ros::bus::{BusError, CallFate, Digest, Graph, ServiceProvider};
 
 use super::Mirror;
 use crate::{local, seen};
 
-/// What the cloud was told of.
+/// Services that were reported to the cloud.
 #[derive(Default)]
 pub struct LentServices {
-    services: Mutex<HashMap<String, Service>>,
+    services: Mutex<HashMap<String, LentEntry>>,
     next: AtomicU32,
 }
 
-struct Service {
+struct LentEntry {
     channel: u32,
     /// The node that serves it.
     node: String,
@@ -30,12 +30,13 @@ struct Service {
 }
 
 impl LentServices {
-    /// Another session begins: the cloud knows of none.
-    pub fn renew(&self) {
+    /// Clears the services at the start of another session, in which the cloud knows none.
+    pub fn clear(&self) {
         self.services.lock().clear();
     }
 
-    /// The cloud asks for a service. It is told in any case; what it asks counts as its own until then.
+    /// Looks up a service for the cloud and always reports the result. Until then the request counts against the
+    /// cloud's budget.
     pub fn look_up(&self, mirror: &Mirror, service: String, held: Permit) {
         let (this, session) = (mirror.this.clone(), mirror.session());
         tokio::spawn(async move {
@@ -43,11 +44,11 @@ impl LentServices {
             let Some(mirror) = this.upgrade() else { return };
             let found = async { mirror.bus.lending()?.provider(&service).await }.await;
             let found = found.map_err(|error| error.to_string());
-            let found = found.and_then(|provider| mirror.can_lend(&service, provider));
+            let found = found.and_then(|provider| mirror.check_lendable(&service, provider));
             let provider = match found {
                 Ok(provider) => Some(provider),
                 Err(reason) => {
-                    tracing::debug!(service, reason, "not lent to the cloud");
+                    tracing::debug!(service, reason, "not offered to the cloud");
                     None
                 }
             };
@@ -63,7 +64,7 @@ impl LentServices {
         provider: Option<ServiceProvider>,
     ) {
         let mut services = self.services.lock();
-        // Another session has begun, and with it another count.
+        // Another session has begun, and with it another numbering.
         if !Arc::ptr_eq(session, &mirror.session()) {
             return;
         }
@@ -73,8 +74,8 @@ impl LentServices {
             let same = same.filter(|known| known.node == provider.node && known.digest == *digest);
             let channel = same.map(|known| known.channel);
             let channel = channel.unwrap_or_else(|| self.next.fetch_add(1, Ordering::Relaxed));
-            let served = Served::of(channel, &service, &provider.service_type);
-            let known = Service {
+            let served = ServiceChannel::new(channel, &service, &provider.service_type);
+            let known = LentEntry {
                 channel: served.channel,
                 node: provider.node,
                 digest: provider.service_type.digest,
@@ -85,12 +86,12 @@ impl LentServices {
         if of.is_none() {
             services.remove(&service);
         }
-        session.report(&FromRobot::Lent { service, of });
+        session.send_control(&FromRobot::Lent { service, of });
     }
 
-    /// Calls on behalf of the cloud; the request counts as the cloud's until it is answered.
-    pub fn call(&self, mirror: &Mirror, call: Called) {
-        let Called {
+    /// Makes a call on behalf of the cloud; until it is answered, the request counts against the cloud's budget.
+    pub fn call(&self, mirror: &Mirror, call: ReceivedCall) {
+        let ReceivedCall {
             id,
             service: channel,
             request,
@@ -106,41 +107,41 @@ impl LentServices {
                 .map(|(name, service)| (name.clone(), service.digest.clone()))
         };
         let Some((name, digest)) = known else {
-            let gone = "nobody on the robot serves this any more".to_owned();
+            let gone = "no node on the robot serves this any more".to_owned();
             return session.answer(id, arrived, Err(gone));
         };
         let this = mirror.this.clone();
-        // A service may take long, and its session may be replaced meanwhile.
+        // A call may take long, and its session may be replaced in the meantime.
         let session = Arc::downgrade(&session);
         tokio::spawn(async move {
             let _held = held;
             let Some(mirror) = this.upgrade() else { return };
-            let limit = local::limit(&name, mirror.call_limit);
+            let limit = local::call_limit_for(&name, mirror.call_limit);
             let called = mirror.bus.call_typed(&name, &digest, request, limit).await;
-            if called.as_ref().is_err_and(is_of_the_provider) {
+            if called.as_ref().is_err_and(is_provider_failure) {
                 mirror
                     .lent
                     .withdraw(&mirror, |service| service.channel == channel);
             }
             let called = called.map_err(|error| match error {
                 BusError::CallFailed { reason, .. } => reason,
-                error @ BusError::Timeout { .. } => local::took_too_long(&error),
+                error @ BusError::Timeout { .. } => local::report_timeout(&error),
                 other => other.to_string(),
             });
-            // By the session that it came by: the ids of another mean other calls.
+            // Answered on the session that the call came from: in another one its id means another call.
             if let Some(session) = session.upgrade() {
                 session.answer(id, arrived, called);
             }
         });
     }
 
-    /// Tells the cloud that these are gone. When a node there looks for one again, so does the robot.
-    fn withdraw(&self, mirror: &Mirror, gone: impl Fn(&Service) -> bool) {
+    /// Reports to the cloud that these services are gone. When a node there looks for one again, the robot does too.
+    fn withdraw(&self, mirror: &Mirror, gone: impl Fn(&LentEntry) -> bool) {
         let mut services = self.services.lock();
         services.retain(|name, service| {
             let gone = gone(service);
             if gone {
-                mirror.session().report(&FromRobot::Lent {
+                mirror.session().send_control(&FromRobot::Lent {
                     service: name.clone(),
                     of: None,
                 });
@@ -149,10 +150,10 @@ impl LentServices {
         });
     }
 
-    fn compare(&self, mirror: &Mirror, graph: &Graph) {
+    fn withdraw_missing(&self, mirror: &Mirror, graph: &Graph) {
         let services = self.services.lock();
         let elsewhere =
-            |(name, service): &(&String, &Service)| !seen::serves(graph, &service.node, name);
+            |(name, service): &(&String, &LentEntry)| !seen::serves(graph, &service.node, name);
         let gone: Vec<u32> = services
             .iter()
             .filter(elsewhere)
@@ -166,20 +167,20 @@ impl LentServices {
 }
 
 impl Mirror {
-    /// What is served by the servant itself must not come back to it.
-    fn can_lend(
+    /// Returns an error for a service of the servant itself, which must not be lent back to it.
+    fn check_lendable(
         &self,
         service: &str,
         provider: ServiceProvider,
     ) -> Result<ServiceProvider, String> {
         let own = provider.node == self.bus.node();
         if own || provider.label.as_ref() == Some(&self.label) {
-            return Err(format!("{service} is served by this very servant"));
+            return Err(format!("{service} is served by this servant itself"));
         }
-        // Stubs of an earlier version do not tell.
+        // Stubs of an earlier version send no label.
         if self.siblings.read().contains(&provider.node) {
             return Err(format!(
-                "{service} is served by a sibling, {}",
+                "{service} is served by another stub, {}",
                 provider.node
             ));
         }
@@ -187,8 +188,9 @@ impl Mirror {
     }
 }
 
-/// Whether a call failed since who serves is not who did, or is not there: whoever answers that it failed, is.
-fn is_of_the_provider(error: &BusError) -> bool {
+/// Returns whether a call failed because the provider is another one or gone. A provider that answers with a failure is
+/// present.
+fn is_provider_failure(error: &BusError) -> bool {
     match error {
         BusError::CallFailed { fate, .. } => *fate != CallFate::Answered,
         BusError::Closed => false,
@@ -196,8 +198,8 @@ fn is_of_the_provider(error: &BusError) -> bool {
     }
 }
 
-/// Tells the cloud when a service that it was told of has gone, until the mirror ends.
-pub async fn follow(mirror: Weak<Mirror>) {
+/// Reports services to the cloud that have gone, until the mirror ends.
+pub async fn watch_graph(mirror: Weak<Mirror>) {
     let Some(mut graphs) = mirror.upgrade().map(|mirror| mirror.bus.graph()) else {
         return;
     };
@@ -206,7 +208,7 @@ pub async fn follow(mirror: Weak<Mirror>) {
             return;
         };
         let graph = graphs.borrow_and_update().clone();
-        mirror.lent.compare(&mirror, &graph);
+        mirror.lent.withdraw_missing(&mirror, &graph);
     }
 }
 
@@ -243,12 +245,12 @@ mod tests {
         for (error, taken_back) in [
             (failed(CallFate::Answered), false),
             (failed(CallFate::NotTaken), true),
-            // The connection to its node broke in the middle of the call.
+            // The connection to the provider broke during the call.
             (failed(CallFate::Unknown), true),
             (BusError::NoService("/map".to_owned()), true),
             (BusError::Closed, false),
         ] {
-            assert_eq!(is_of_the_provider(&error), taken_back, "{error:?}");
+            assert_eq!(is_provider_failure(&error), taken_back, "{error:?}");
         }
     }
 
@@ -289,7 +291,7 @@ mod tests {
             let _serving = bus.serve(&name, of, Arc::new(Echo)).await.unwrap();
             let provider = own.provider(&name).await.unwrap();
             assert_eq!(provider.node, node);
-            let can = mirror.can_lend(&name, provider);
+            let can = mirror.check_lendable(&name, provider);
             assert_eq!(can.is_ok(), lent, "{node}: {can:?}");
         }
     }

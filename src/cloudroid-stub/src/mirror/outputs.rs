@@ -1,4 +1,4 @@
-//! What the real node publishes: advertised on the robot under this node's name.
+//! Topics that the real node publishes, advertised on the robot under this node's name.
 
 mod topic;
 
@@ -7,35 +7,35 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
-use link::control::{FromRobot, Output};
+use link::control::{FromRobot, OutputChannel};
 use link::drops::Cause;
 use link::record::Data;
 use parking_lot::Mutex;
-use qos::Side;
-use ros::bus::{Message, WireType};
+use qos::Responder;
+use ros::bus::{SerializedMessage, WireType};
 
-use self::topic::Topic;
+use self::topic::OutputTopic;
 use super::{Mirror, reports};
 
-/// The channel of outputs that the cloud has not told of.
+/// Channel of outputs that the cloud has not reported.
 pub const NOWHERE: u32 = u32::MAX;
 
 /// Outputs, by topic and by channel.
 #[derive(Default)]
 pub struct Outputs {
-    topics: Mutex<HashMap<String, Arc<Topic>>>,
-    channels: Mutex<HashMap<u32, Arc<Topic>>>,
+    topics: Mutex<HashMap<String, Arc<OutputTopic>>>,
+    channels: Mutex<HashMap<u32, Arc<OutputTopic>>>,
 }
 
 impl Outputs {
     /// Publishes a message of the cloud.
-    pub fn take(&self, mirror: &Mirror, data: Data, arrived: i64) {
+    pub fn publish_cloud(&self, mirror: &Mirror, data: Data, arrived: i64) {
         let Some(topic) = self.channels.lock().get(&data.channel).cloned() else {
             return;
         };
         let mut heard = true;
         if let Some(keeper) = mirror.keeper() {
-            let message = Message {
+            let message = SerializedMessage {
                 bytes: data.message.clone(),
                 wire_type: topic.wire_type.clone(),
                 publisher: topic.cloud.clone(),
@@ -44,62 +44,62 @@ impl Outputs {
             let phases = mirror
                 .session()
                 .clock()
-                .and_then(|clock| reports::of_output(&data, arrived, clock.offset));
-            heard = keeper.cloud_output(&topic.name, &message, phases);
+                .and_then(|clock| reports::output_phases(&data, arrived, clock.offset));
+            heard = keeper.on_cloud_output(&topic.name, &message, phases);
         }
-        topic.take(Side::Cloud, data.message, data.latching, heard);
+        topic.on_message(Responder::Cloud, data.message, data.latching, heard);
     }
 
-    /// The local original has published; `heard`: it answers for the node.
-    pub fn take_local(&self, topic: &str, message: Message, heard: bool) {
+    /// Publishes a message of the local original; `heard` is set if it speaks for the node.
+    pub fn publish_local(&self, topic: &str, message: SerializedMessage, heard: bool) {
         let topic = self.topics.lock().get(topic).cloned();
         if let Some(topic) = topic {
-            topic.take(Side::Local, message.bytes, message.latching, heard);
+            topic.on_message(Responder::Local, message.bytes, message.latching, heard);
         }
     }
 
-    /// This side speaks for the node from now on.
-    pub fn speaks(&self, side: Side) {
+    /// Sets the side that speaks for the node from now on.
+    pub fn set_active_side(&self, side: Responder) {
         for topic in self.all() {
-            topic.speaks(side);
+            topic.set_active_side(side);
         }
     }
 
-    /// The local original has ended; its latched messages are dropped.
-    pub fn local_ended(&self) {
+    /// Handles the end of the local original, whose latched messages are discarded.
+    pub fn on_local_ended(&self) {
         for topic in self.all() {
-            topic.local_ended();
+            topic.on_local_ended();
         }
     }
 
-    fn all(&self) -> Vec<Arc<Topic>> {
+    fn all(&self) -> Vec<Arc<OutputTopic>> {
         self.topics.lock().values().cloned().collect()
     }
 
-    /// The topic of a channel.
-    pub fn topic_of(&self, channel: u32) -> Option<String> {
+    /// Returns the name of a channel's topic.
+    pub fn topic_name(&self, channel: u32) -> Option<String> {
         let channels = self.channels.lock();
         channels.get(&channel).map(|topic| topic.name.clone())
     }
 
-    /// Publishes a message of this side, on a topic that is advertised.
+    /// Publishes a message of this side, on an advertised topic.
     pub fn publish(&self, topic: &str, message: Bytes) {
         if let Some(topic) = self.topics.lock().get(topic) {
             topic.publisher().publish(message);
         }
     }
 
-    /// The type of an output.
+    /// Returns the type of an output.
     pub fn wire_type(&self, topic: &str) -> Option<Arc<WireType>> {
         let topics = self.topics.lock();
         topics.get(topic).map(|topic| topic.wire_type.clone())
     }
 
-    /// Advertises what is new and takes back what is gone, unless it `keeps` that for the time being.
-    pub async fn apply(&self, mirror: &Arc<Mirror>, outputs: &[Output], keeps: bool) {
+    /// Advertises new outputs and removes those that are not listed, unless `keeps` is set.
+    pub async fn apply(&self, mirror: &Arc<Mirror>, outputs: &[OutputChannel], keeps: bool) {
         self.topics.lock().retain(|name, topic| {
             let listed = outputs.iter().find(|output| output.topic == *name);
-            listed.map_or(keeps, |output| topic.is(output))
+            listed.map_or(keeps, |output| topic.matches_output(output))
         });
         let mut channels = HashMap::new();
         for output in outputs {
@@ -112,24 +112,33 @@ impl Outputs {
                 },
             };
             *topic.channel.lock() = output.channel;
-            // Siblings may have changed, so who counts as a listener; a new session knows of none.
-            count(mirror, &topic);
+            // The siblings may have changed and with them the number of subscribers; a new session knows no numbers.
+            watch_listeners(mirror, &topic);
             channels.insert(output.channel, topic);
         }
         channels.remove(&NOWHERE);
         *self.channels.lock() = channels;
     }
 
-    async fn advertise(&self, mirror: &Arc<Mirror>, output: &Output) -> Option<Arc<Topic>> {
+    async fn advertise(
+        &self,
+        mirror: &Arc<Mirror>,
+        output: &OutputChannel,
+    ) -> Option<Arc<OutputTopic>> {
         let of = mirror.wire_type(&output.type_name, &output.md5);
-        match Topic::advertise(&*mirror.bus, output, of).await {
+        match OutputTopic::advertise(&*mirror.bus, output, of).await {
             Ok(topic) => {
                 let topic = Arc::new(topic);
                 let counted = Arc::downgrade(&topic);
-                mirror.drops.ask(&output.topic, Cause::Slow, move || {
-                    let topic = counted.upgrade();
-                    (topic.as_ref().map_or(0, |it| it.dropped()), topic.is_none())
-                });
+                mirror
+                    .drops
+                    .watch_with(&output.topic, Cause::Slow, move || {
+                        let topic = counted.upgrade();
+                        (
+                            topic.as_ref().map_or(0, |it| it.dropped_count()),
+                            topic.is_none(),
+                        )
+                    });
                 self.topics
                     .lock()
                     .insert(output.topic.clone(), topic.clone());
@@ -143,21 +152,21 @@ impl Outputs {
     }
 }
 
-/// Tells the cloud how many listen, now and whenever that changes.
-fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
+/// Reports the number of subscribers to the cloud, now and at every change.
+fn watch_listeners(mirror: &Arc<Mirror>, topic: &Arc<OutputTopic>) {
     let (mirror, of) = (Arc::downgrade(mirror), Arc::downgrade(topic));
-    let mut subscribers = topic.publisher().matched();
+    let mut subscribers = topic.publisher().matched_subscribers();
     let refused = mirror
         .upgrade()
-        .map(|mirror| mirror.refusals.end(&topic.name));
-    // Not the topic itself: it is taken back when nobody but this task would hold it.
+        .map(|mirror| mirror.refusals.register_end(&topic.name));
+    // The task must not hold the topic itself, which is removed when only this task would still hold it.
     let news = Arc::clone(&topic.news);
     let task = tokio::spawn(async move {
         let mut told = None;
         loop {
             let matched = subscribers.borrow_and_update().clone();
             if let Some(end) = &refused {
-                end.meets(&matched);
+                end.update(&matched);
             }
             {
                 let (Some(mirror), Some(topic)) = (mirror.upgrade(), of.upgrade()) else {
@@ -171,20 +180,22 @@ fn count(mirror: &Arc<Mirror>, topic: &Arc<Topic>) {
                     told = Some(count);
                     topic.listeners.store(count, Ordering::Relaxed);
                     if let Some(keeper) = mirror.keeper() {
-                        keeper.wanted(&topic.name, count > 0);
+                        keeper.set_wanted(&topic.name, count > 0);
                     }
                     if count == 0 {
-                        topic.is_left(mirror.keeper().is_some_and(|keeper| keeper.is_local_fed()));
+                        topic.on_no_subscribers(
+                            mirror.keeper().is_some_and(|keeper| keeper.is_local_fed()),
+                        );
                     }
                     let channel = *topic.channel.lock();
                     if channel != NOWHERE {
                         mirror
                             .session()
-                            .report(&FromRobot::Listeners { channel, count });
+                            .send_control(&FromRobot::Listeners { channel, count });
                     }
                 }
-                if topic.keep_latched(&*mirror.bus).await {
-                    subscribers = topic.publisher().matched();
+                if topic.advertise_pending(&*mirror.bus).await {
+                    subscribers = topic.publisher().matched_subscribers();
                     continue;
                 }
             }

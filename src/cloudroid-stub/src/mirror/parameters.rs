@@ -1,4 +1,5 @@
-//! Parameters: the robot's go to the cloud at the beginning and as they change; what the real node sets comes back.
+//! Parameters: the robot's are sent to the cloud at the start and when they change; those that the real node sets come
+//! back.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,24 +10,24 @@ use ros::bus::{ParamChange, ParamValue};
 
 use super::Mirror;
 use crate::parameters;
-use ros::ros1::own_parameters::is_of_master;
+use ros::ros1::own_parameters::is_set_by_master;
 
-/// What was set here in the cloud's name: it does not go back.
+/// Parameters set here on behalf of the cloud, which are not sent back.
 #[derive(Default)]
 pub struct Parameters {
     set: Echoes,
 }
 
 impl Parameters {
-    fn is_news(&self, key: &str, value: Option<&ParamValue>) -> bool {
+    fn should_send(&self, key: &str, value: Option<&ParamValue>) -> bool {
         let is_echo = self.set.is_echo(key, value) && value.is_some();
-        !is_of_master(key) && !is_echo
+        !is_set_by_master(key) && !is_echo
     }
 }
 
-/// All parameters now, and from now on their changes go to the cloud.
-pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
-    // Nodes of ROS 2 share no parameters, and are told their own on the command line.
+/// Returns all parameters and starts to forward their changes to the cloud.
+pub async fn start_sync(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
+    // ROS 2 nodes share no parameters; theirs are on the command line.
     if mirror.bus.parameters().is_err() {
         return BTreeMap::new();
     }
@@ -42,35 +43,38 @@ pub async fn begin(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
                     if let Some(original) = mirror.keeper().and_then(|keeper| keeper.original()) {
                         original.change_parameter(&key, value.clone()).await;
                     }
-                    if mirror.parameters.is_news(&key, value.as_ref())
-                        && parameters::can_be_carried(key.trim_end_matches('/'), &mut value)
+                    if mirror.parameters.should_send(&key, value.as_ref())
+                        && parameters::make_transferable(key.trim_end_matches('/'), &mut value)
                     {
                         let changes = vec![(key, value)];
-                        mirror.session().report(&FromRobot::Parameters(changes));
+                        mirror
+                            .session()
+                            .send_control(&FromRobot::Parameters(changes));
                     }
                 }
             });
         }
         Err(error) => tracing::warn!(
-            "parameters that change later do not reach the cloud: {error}; fix those that are named next, then start this node again"
+            "later parameter changes do not reach the cloud: {error}; correct the parameters named next, then restart \
+                this node"
         ),
     }
-    all(mirror).await
+    read_all(mirror).await
 }
 
-/// All parameters now.
-pub async fn all(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
-    match parameters::all(&*mirror.bus).await {
+/// Returns all parameters.
+pub async fn read_all(mirror: &Arc<Mirror>) -> BTreeMap<String, ParamValue> {
+    match parameters::read_all(&*mirror.bus).await {
         Ok(all) => all,
         Err(error) => {
-            tracing::warn!(%error, "the robot's parameters cannot be read");
+            tracing::warn!(%error, "cannot read the robot's parameters");
             BTreeMap::new()
         }
     }
 }
 
-/// What the real node has set.
-pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
+/// Applies changes that the real node has made.
+pub async fn apply_changes(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
     let Ok(parameters) = mirror.bus.parameters() else {
         return;
     };
@@ -87,7 +91,7 @@ pub async fn change(mirror: &Arc<Mirror>, changes: Vec<ParamChange>) {
             None => parameters.delete(&key).await,
         };
         if let Err(error) = done {
-            tracing::debug!(key, %error, "a parameter of the node cannot be set on the robot");
+            tracing::debug!(key, %error, "cannot set a parameter of the node on the robot");
         }
     }
 }

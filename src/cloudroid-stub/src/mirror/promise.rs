@@ -8,24 +8,26 @@ use link::RobotSession;
 use link::control::Graph;
 use parking_lot::Mutex;
 use qos::{
-    Correlation, Event, Failure, HandOver, Local, Mode, Outcome, Pair, RequestId, SafeStop, Side,
-    Sla, Warm,
+    Correlation, Failure, HandOver, LocalPolicy, Mode, QosEvent, QosSla, RequestId, RequestOutcome,
+    Responder, SafeStop, TopicPair, WarmStart,
 };
-use ros::bus::{Bus, Message};
+use ros::bus::{Bus, SerializedMessage};
 use serde_json::json;
 
 use super::Mirror;
 use super::diagnostics::Diagnostics;
-use super::known::Known;
+use super::known::KnownInterface;
 use super::reports::{self, Reports};
-use super::requests::Request;
-use super::safe_stop::{self, Stop};
+use super::requests::RequestPattern;
+use super::safe_stop::{self, SafeStopPublisher};
 use crate::config::{self, Config};
-use crate::local::{Answer, Application, Cloud, Interface, Keeper, Original, Setting};
+use crate::local::{
+    Application, Cloud, ExpectedInterface, Keeper, Original, OriginalSetup, PendingAnswer,
+};
 
-/// The SLA that a configuration states. Where it promises nothing the local original stands in while the link is away;
-/// none where there is to be no local original either.
-pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
+/// Returns the SLA that a configuration states. If it promises nothing, the local original runs while the link is down;
+/// if it excludes a local original as well, returns `None`.
+pub fn sla(config: &Config) -> anyhow::Result<Option<QosSla>> {
     let mut sla = serde_json::Map::new();
     let output = config.output.clone().unwrap_or_default();
     match (config.frames_per_second, config.age) {
@@ -34,7 +36,7 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
                 sla.insert("t_desire".into(), desire.into());
                 sla.insert("t_max".into(), max.into());
             }
-            _ if config.local == config::Local::None => return Ok(None),
+            _ if config.local == config::LocalMode::None => return Ok(None),
             _ => {
                 let measure = json!({"link": {"after": config.fallback_after}});
                 sla.insert("measure".into(), measure);
@@ -68,8 +70,10 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
             sla.insert(name.into(), value.into());
         }
     }
-    if config.promises() {
-        let unreached = config.fallback_after.max(config.longest().unwrap_or(0.0));
+    if config.has_promise() {
+        let unreached = config
+            .fallback_after
+            .max(config.promise_timeout().unwrap_or(0.0));
         sla.insert("unreached".into(), unreached.into());
     }
     let mode = if config.stateful {
@@ -78,13 +82,13 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
         Mode::Stateless
     };
     let local = match config.local {
-        config::Local::Cold => Local::Cold,
-        config::Local::Warm => Local::Warm,
-        config::Local::FirstSign => {
-            sla.insert("warm".into(), json!(Warm::FirstSign));
-            Local::Warm
+        config::LocalMode::Cold => LocalPolicy::Cold,
+        config::LocalMode::Warm => LocalPolicy::Warm,
+        config::LocalMode::FirstSign => {
+            sla.insert("warm".into(), json!(WarmStart::FirstSign));
+            LocalPolicy::Warm
         }
-        config::Local::None => Local::None,
+        config::LocalMode::None => LocalPolicy::None,
     };
     sla.insert("mode".into(), json!(mode));
     sla.insert("local".into(), json!(local));
@@ -106,14 +110,14 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
             .collect();
         sla.insert("requests".into(), serde_json::Value::Object(times));
     }
-    let mut sla = Sla::parse(serde_json::Value::Object(sla))?;
+    let mut sla = QosSla::parse(serde_json::Value::Object(sla))?;
     if config.cap == Some(f64::INFINITY) {
         sla.cap = f64::INFINITY;
     }
     sla.safe_stop = config.safe_stop.as_ref().map(|stop| match stop {
-        config::SafeStop::Message(stop) => stop.clone(),
-        // Its type is known once the node has advertised it.
-        config::SafeStop::Output(topic) => SafeStop {
+        config::SafeStopConfig::Message(stop) => stop.clone(),
+        // Its type becomes known when the node advertises it.
+        config::SafeStopConfig::Output(topic) => SafeStop {
             topic: topic.clone(),
             type_name: String::new(),
             message: serde_json::Map::new(),
@@ -123,35 +127,39 @@ pub fn sla(config: &Config) -> anyhow::Result<Option<Sla>> {
 }
 
 impl Mirror {
-    /// Keeps the promise of `sla` from now on, or stands by for a lost link where it promises nothing, with the local original that `setting` tells of; how it stands is
-    /// shown by `diagnostics`. Where `sla` does not say which input is answered by which output, it is as `decided` at
-    /// the push. A safe stop of a declared type is published by `watcher`.
-    pub async fn promise(
+    /// Keeps the promise of `sla` from now on, or, if it promises nothing, only prepares for a lost link, with the
+    /// local original that `setting` describes. `diagnostics` shows its state. If `sla` does not define which input is
+    /// answered by which output, the pairs `decided` at the push are used. `watcher` publishes a safe stop of a
+    /// declared type.
+    pub async fn start_promise(
         self: &Arc<Self>,
-        sla: Sla,
-        setting: Setting,
-        decided: Vec<Request>,
+        sla: QosSla,
+        setting: OriginalSetup,
+        decided: Vec<RequestPattern>,
         diagnostics: Diagnostics,
         watcher: &Arc<dyn Bus>,
     ) -> anyhow::Result<()> {
-        // Where nothing is promised, what is not installed is not missed before it is needed.
-        let useless = sla.local == Local::None || (sla.is_of_link() && setting.program.is_none());
+        // If nothing is promised, an original that is not installed is not reported before it is needed.
+        let useless =
+            sla.local == LocalPolicy::None || (sla.is_link_based() && setting.program.is_none());
         let original = if useless {
             None
         } else {
-            let interface = Interface::default();
+            let interface = ExpectedInterface::default();
             let robot = self.bus.clone();
             let original = Original::new(setting, interface, robot, self.call_limit);
             Some(original.await.context("the local original")?)
         };
-        let of_link = sla.is_of_link();
-        let way = Arc::new(Way(Arc::downgrade(self)));
+        let of_link = sla.is_link_based();
+        let way = Arc::new(MirrorAdapter(Arc::downgrade(self)));
         let stated = sla.answers.as_ref();
-        let stated = stated.map(|pairs| pairs.iter().map(Request::stated).collect());
+        let stated = stated.map(|pairs| pairs.iter().map(RequestPattern::from_pair).collect());
         let sla_stop = sla.safe_stop.clone();
         let keeper = Keeper::start(sla, Vec::new(), original, way.clone(), way);
         let stop = match sla_stop {
-            Some(stop) if !stop.type_name.is_empty() => Some(Stop::new(&stop, watcher).await?),
+            Some(stop) if !stop.type_name.is_empty() => {
+                Some(SafeStopPublisher::new(&stop, watcher).await?)
+            }
             _ => None,
         };
         let _ = self.promise.set(Promise {
@@ -163,21 +171,22 @@ impl Mirror {
             stop,
         });
         let mirror = Arc::downgrade(self);
-        tokio::spawn(super::stand_in::follow(
+        tokio::spawn(super::stand_in::run_stand_in(
             mirror.clone(),
             Arc::downgrade(&keeper),
         ));
-        tokio::spawn(follow(mirror.clone(), keeper));
-        tokio::spawn(reports::report(mirror, diagnostics));
+        tokio::spawn(watch_link(mirror.clone(), keeper));
+        tokio::spawn(reports::report_loop(mirror, diagnostics));
         Ok(())
     }
 
-    /// Who keeps the promise, where there is one.
+    /// Returns the keeper of the promise, if there is one.
     pub fn keeper(&self) -> Option<&Arc<Keeper>> {
         self.promise.get().map(|promise| &promise.keeper)
     }
 
-    /// The graph has changed: the topics of more requests may exist. `settled`: what it does not list is gone.
+    /// Handles a change of the graph, after which the topics of more requests may exist. If `settled`, what it does not
+    /// list is gone.
     pub(super) async fn learn(&self, graph: &Graph, settled: bool) {
         let Some(promise) = self.promise.get() else {
             return;
@@ -185,7 +194,7 @@ impl Mirror {
         let (pairs, interface) = {
             let mut known = promise.known.lock();
             let wire_type = |name: &str, md5: &str| self.wire_type(name, md5);
-            known.note(graph, self.bus.node(), settled, wire_type);
+            known.add_graph(graph, self.bus.node(), settled, wire_type);
             let types = known.inputs.values().chain(known.outputs.values());
             promise.keeper.learn_types(types);
             let mut pairs = known.pairs(&promise.requests);
@@ -195,13 +204,13 @@ impl Mirror {
                 && known.told.insert(String::new())
             {
                 tracing::warn!(
-                    "this node has none of the topics that the service's push found to be answered: their times are not judged; say which are, with \
-                     request = \"/INPUT -> /OUTPUT\" in stub.toml"
+                    "this node has none of the request topics that the push found, so response times are not measured; \
+                        name them with request = \"/INPUT -> /OUTPUT\" in stub.toml"
                 );
             }
             if promise.of_link {
-                // A goal is done by one side or the other; of all else only who speaks counts.
-                let of_action = |pair: &Pair| pair.by == Some(Correlation::Goal);
+                // A goal is executed by one side only; of all other messages, only those of the side that speaks count.
+                let of_action = |pair: &TopicPair| pair.by == Some(Correlation::Goal);
                 pairs.retain(of_action);
             }
             for pair in &pairs {
@@ -210,7 +219,7 @@ impl Mirror {
                 }
             }
             let answered = |name: &&String| pairs.iter().any(|pair| pair.input == **name);
-            let interface = Interface {
+            let interface = ExpectedInterface {
                 inputs: known.inputs.clone(),
                 asked: known.asked.clone(),
                 awaited: known.inputs.keys().filter(answered).cloned().collect(),
@@ -225,34 +234,34 @@ impl Mirror {
             (pairs, interface)
         };
         if let Err(error) = promise.keeper.learn(pairs, interface).await {
-            tracing::warn!("the local original cannot be fed: {error:#}");
+            tracing::warn!("cannot send requests to the local original: {error:#}");
         }
     }
 }
 
-/// What a mirror holds of it.
+/// The mirror's part of a promise.
 pub struct Promise {
     keeper: Arc<Keeper>,
-    /// No time is promised: the link alone decides.
+    /// No time is promised: only the state of the link decides.
     of_link: bool,
-    /// Which inputs are answered by which outputs.
-    requests: Vec<Request>,
-    known: Mutex<Known>,
+    /// Inputs and the outputs that answer them.
+    requests: Vec<RequestPattern>,
+    known: Mutex<KnownInterface>,
     pub(super) reports: Reports,
-    /// Ready to be published; none where it is zeros on an output of the node.
-    stop: Option<Stop>,
+    /// Ready to be published; `None` if the safe stop is a zero message on an output of the node.
+    stop: Option<SafeStopPublisher>,
 }
 
 impl Promise {
-    /// Who keeps it.
+    /// Returns the keeper of the promise.
     pub fn keeper(&self) -> &Arc<Keeper> {
         &self.keeper
     }
 }
 
-/// Tells the keeper whether the link is up, over all sessions.
-async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
-    // The session that was up last: what it carried is answered yet when it is up again.
+/// Reports the state of the link to the keeper, across sessions.
+async fn watch_link(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
+    // The session that was up last; if it comes up again, its pending requests are still answered.
     let mut before: Weak<RobotSession> = Weak::new();
     let Some(mut sessions) = mirror.upgrade().map(|mirror| mirror.sessions()) else {
         return;
@@ -260,7 +269,7 @@ async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
     drop(mirror);
     loop {
         let session = sessions.borrow_and_update().clone();
-        let mut up = session.up();
+        let mut up = session.watch_up();
         let this = Arc::downgrade(&session);
         drop(session);
         if *up.borrow_and_update() {
@@ -269,7 +278,7 @@ async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
         } else {
             keeper.link_down();
         }
-        // One that was replaced may live on for what still answers by it.
+        // A replaced session may stay alive for pending answers.
         tokio::select! {
             _ = up.changed() => {}
             replaced = sessions.changed() => if replaced.is_err() { return },
@@ -277,11 +286,11 @@ async fn follow(mirror: Weak<Mirror>, keeper: Arc<Keeper>) {
     }
 }
 
-/// The ways out of a keeper.
-struct Way(Weak<Mirror>);
+/// Implements [`Cloud`] and [`Application`] for a keeper.
+struct MirrorAdapter(Weak<Mirror>);
 
-impl Cloud for Way {
-    fn publish(&self, topic: &str, message: &Message) {
+impl Cloud for MirrorAdapter {
+    fn publish(&self, topic: &str, message: &SerializedMessage) {
         if let Some(mirror) = self.0.upgrade() {
             mirror.inputs.send(&mirror, topic, message);
         }
@@ -289,13 +298,15 @@ impl Cloud for Way {
 
     fn call(&self, request: RequestId, service: &str, bytes: Bytes) {
         if let Some(mirror) = self.0.upgrade() {
-            mirror.calls.kept(&mirror, request, service, bytes);
+            mirror
+                .calls
+                .call_for_keeper(&mirror, request, service, bytes);
         }
     }
 
-    fn ask(&self, service: &str, bytes: Bytes) -> Answer {
+    fn call_unmeasured(&self, service: &str, bytes: Bytes) -> PendingAnswer {
         match self.0.upgrade() {
-            Some(mirror) => mirror.calls.ask(&mirror, service, bytes),
+            Some(mirror) => mirror.calls.call_unmeasured(&mirror, service, bytes),
             None => Box::pin(async {
                 let ending = "the node is ending".to_owned();
                 Err(Failure::Unreachable(ending))
@@ -304,16 +315,16 @@ impl Cloud for Way {
     }
 }
 
-impl Application for Way {
-    fn deliver(&self, topic: &str, message: Message) {
+impl Application for MirrorAdapter {
+    fn deliver(&self, topic: &str, message: SerializedMessage) {
         if let Some(mirror) = self.0.upgrade() {
-            mirror.outputs.take_local(topic, message, true);
+            mirror.outputs.publish_local(topic, message, true);
         }
     }
 
-    fn latched(&self, topic: &str, message: Message) {
+    fn on_latched_output(&self, topic: &str, message: SerializedMessage) {
         if let Some(mirror) = self.0.upgrade() {
-            mirror.outputs.take_local(topic, message, false);
+            mirror.outputs.publish_local(topic, message, false);
         }
     }
 
@@ -326,73 +337,73 @@ impl Application for Way {
             .get()
             .and_then(|promise| promise.stop.as_ref());
         if let Some(ready) = ready {
-            tracing::warn!("nobody answered in time: safe stop on {}", stop.topic);
+            tracing::warn!("no answer in time: safe stop on {}", stop.topic);
             return ready.publish();
         }
         match mirror
             .outputs
             .wire_type(&stop.topic)
-            .map(|of| safe_stop::zeros(&of))
+            .map(|of| safe_stop::zero_message(&of))
         {
             Some(Ok(bytes)) => {
-                tracing::warn!("nobody answered in time: safe stop on {}", stop.topic);
+                tracing::warn!("no answer in time: safe stop on {}", stop.topic);
                 mirror.outputs.publish(&stop.topic, bytes);
             }
             Some(Err(reason)) => tracing::error!("no safe stop on {}: {reason}", stop.topic),
-            None => tracing::error!("no safe stop: {} is no output of this node", stop.topic),
+            None => tracing::error!("no safe stop: {} is not an output of this node", stop.topic),
         }
     }
 
-    fn told(&self, outcome: &Outcome) {
+    fn on_outcome(&self, outcome: &RequestOutcome) {
         if let Some(promise) = self
             .0
             .upgrade()
             .as_ref()
             .and_then(|mirror| mirror.promise.get())
         {
-            promise.reports.note(outcome);
+            promise.reports.record_outcome(outcome);
         }
     }
 
-    fn handed_over(&self, over: &HandOver) {
+    fn on_hand_over(&self, over: &HandOver) {
         tracing::warn!("{over}");
         let mirror = self.0.upgrade();
         if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
-            promise.reports.handed_over(over);
+            promise.reports.record_hand_over(over);
         }
     }
 
-    fn lacks(&self, over: &HandOver) {
+    fn on_missed_requests(&self, over: &HandOver) {
         tracing::info!(
-            "{over}: a mode or a priority that one of them has switched is not switched there; where it has to be, ask for it again"
+            "{over}: a mode or priority that was changed there is not changed here; if it is needed, set it again"
         );
     }
 
-    fn decided(&self, event: &Event) {
+    fn on_decision(&self, event: &QosEvent) {
         let mirror = self.0.upgrade();
         if let Some(promise) = mirror.as_ref().and_then(|mirror| mirror.promise.get()) {
-            promise.reports.decided(event);
+            promise.reports.record_decision(event);
         }
         if let Some(mirror) = &mirror {
             match event {
-                Event::Feed(_) => mirror.outputs.speaks(Side::Local),
-                Event::StopFeeding(_) => mirror.outputs.speaks(Side::Cloud),
-                Event::Stop(_) | Event::Crashed(_) => mirror.outputs.local_ended(),
+                QosEvent::Feed(_) => mirror.outputs.set_active_side(Responder::Local),
+                QosEvent::StopFeeding(_) => mirror.outputs.set_active_side(Responder::Cloud),
+                QosEvent::Stop(_) | QosEvent::Crashed(_) => mirror.outputs.on_local_ended(),
                 _ => {}
             }
         }
         match event {
-            Event::Start(why) => tracing::info!(?why, "the local original is started"),
-            Event::Feed(why) => tracing::warn!(?why, "the local original answers, too"),
-            Event::StopFeeding(why) => tracing::info!(?why, "the cloud answers alone"),
-            Event::Stop(why) => tracing::info!(?why, "the local original is stopped"),
-            Event::SaidOnceMissing => {
-                tracing::warn!("there is no local original: the cloud is alone")
+            QosEvent::Start(why) => tracing::info!(?why, "the local original is started"),
+            QosEvent::Feed(why) => tracing::warn!(?why, "the local original answers, too"),
+            QosEvent::StopFeeding(why) => tracing::info!(?why, "the cloud answers alone"),
+            QosEvent::Stop(why) => tracing::info!(?why, "the local original is stopped"),
+            QosEvent::SaidOnceMissing => {
+                tracing::warn!("there is no local original: only the cloud answers")
             }
-            Event::Crashed(reason) => tracing::warn!("the local original ended: {reason}"),
-            Event::Uncorrelated(input) => {
+            QosEvent::Crashed(reason) => tracing::warn!("the local original ended: {reason}"),
+            QosEvent::Uncorrelated(input) => {
                 tracing::warn!(
-                    "no output carries the stamps of {input}: the next one is taken for the answer"
+                    "no output carries the stamps of {input}: the next output counts as the answer"
                 );
             }
         }
@@ -404,42 +415,42 @@ mod tests {
     use super::*;
     use qos::Measure;
 
-    fn promised(lines: &str) -> anyhow::Result<Option<Sla>> {
+    fn parse_sla(lines: &str) -> anyhow::Result<Option<QosSla>> {
         let file = format!("server = 'ws://here'\nservice = 's'\n{lines}");
         sla(&toml::from_str(&file)?)
     }
 
     #[test]
     fn a_promise_is_about_times_or_frames_or_age() {
-        assert_eq!(promised("local = 'none'").unwrap(), None);
-        let nothing = promised("").unwrap().unwrap();
+        assert_eq!(parse_sla("local = 'none'").unwrap(), None);
+        let nothing = parse_sla("").unwrap().unwrap();
         let after = std::time::Duration::from_secs(3);
         assert_eq!(nothing.measure, Measure::Link { after });
-        let own = promised("fallback_after = 0.5\nlocal = 'warm'")
+        let own = parse_sla("fallback_after = 0.5\nlocal = 'warm'")
             .unwrap()
             .unwrap();
         let after = std::time::Duration::from_millis(500);
         assert_eq!(
             (own.measure, own.local),
-            (Measure::Link { after }, Local::Warm)
+            (Measure::Link { after }, LocalPolicy::Warm)
         );
-        let sign = promised("desire = 0.1\nmax = 0.3\nlocal = 'first-sign'").unwrap();
+        let sign = parse_sla("desire = 0.1\nmax = 0.3\nlocal = 'first-sign'").unwrap();
         let sign = sign.map(|sla| (sla.local, sla.warm));
-        assert_eq!(sign, Some((Local::Warm, Warm::FirstSign)));
-        let times = promised("desire = 0.1\nmax = 0.3\nstateful = true")
+        assert_eq!(sign, Some((LocalPolicy::Warm, WarmStart::FirstSign)));
+        let times = parse_sla("desire = 0.1\nmax = 0.3\nstateful = true")
             .unwrap()
             .unwrap();
         assert_eq!((times.measure, times.mode), (Measure::Rrt, Mode::Stateful));
-        let frames = promised("frames_per_second = 4.0").unwrap().unwrap();
+        let frames = parse_sla("frames_per_second = 4.0").unwrap().unwrap();
         assert_eq!(frames.t_max.as_millis(), 250);
         assert_eq!(frames.t_desire, frames.t_max, "as ever: kept or not");
-        let band = promised("frames_per_second = 4.0\ndesired_frames_per_second = 10").unwrap();
+        let band = parse_sla("frames_per_second = 4.0\ndesired_frames_per_second = 10").unwrap();
         let band = band.map(|sla| (sla.t_desire.as_millis(), sla.t_max.as_millis()));
         assert_eq!(band, Some((100, 250)));
-        let age = promised("age = 2.0\noutput = '/map'").unwrap().unwrap();
+        let age = parse_sla("age = 2.0\noutput = '/map'").unwrap().unwrap();
         let output = "/map".to_owned();
         assert_eq!(age.measure, Measure::Age { output });
-        let band = promised("age = 2.0\ndesired_age = 0.5").unwrap();
+        let band = parse_sla("age = 2.0\ndesired_age = 0.5").unwrap();
         let band = band.map(|sla| (sla.t_desire.as_millis(), sla.t_max.as_millis()));
         assert_eq!(band, Some((500, 2000)));
         for (lines, named) in [
@@ -448,7 +459,7 @@ mod tests {
             ("age = 2.0\nmax = 1.0", "response times"),
             ("age = 2.0\noutput = 'map'", "slash"),
         ] {
-            let error = format!("{:#}", promised(lines).unwrap_err());
+            let error = format!("{:#}", parse_sla(lines).unwrap_err());
             assert!(error.contains(named), "{error}");
         }
     }
@@ -456,13 +467,14 @@ mod tests {
     #[test]
     fn requests_and_the_cap_are_as_written() {
         let lines = "desire = 0.1\nmax = 0.3\nthreshold = 2\n";
-        let own = |more: &str| promised(&format!("{lines}{more}")).map(Option::unwrap);
+        let own = |more: &str| parse_sla(&format!("{lines}{more}")).map(Option::unwrap);
         assert_eq!(own("").unwrap().cap, 8.0);
         assert_eq!(own("cap = 5").unwrap().cap, 5.0);
         assert_eq!(own("cap = inf").unwrap().cap, f64::INFINITY);
         let low = format!("{:#}", own("cap = 2").unwrap_err());
         assert!(low.contains("cap: 2 is not above threshold (2)"), "{low}");
-        let pairs = "requests = ['/a -> /b', { request = '/c -> /d', desire = 1, max = 2 }, { request = '/s', desire = 3, max = 4 }]";
+        let pairs = "requests = ['/a -> /b', { request = '/c -> /d', desire = 1, max = 2 }, \
+                     { request = '/s', desire = 3, max = 4 }]";
         let sla = own(pairs).unwrap();
         let answers = sla.answers.as_ref().unwrap();
         let shown: Vec<String> = answers.iter().map(ToString::to_string).collect();
@@ -481,7 +493,7 @@ mod tests {
     fn a_safe_stop_is_an_output_or_any_message() {
         let lines = "desire = 1.0\nmax = 1.0\nsafe_stop =";
         let stop = |text: &str| {
-            let sla = promised(&format!("{lines} {text}")).unwrap().unwrap();
+            let sla = parse_sla(&format!("{lines} {text}")).unwrap().unwrap();
             sla.safe_stop.unwrap()
         };
         assert_eq!(stop("'/cmd_vel'").type_name, "");

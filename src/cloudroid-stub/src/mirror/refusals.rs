@@ -1,80 +1,81 @@
-//! Ends of the robot's topics with which no messages pass, since they ask for what is not offered. The robot's log has them by the bus; the
-//! cloud is told all that there are now, for whoever explains.
+//! Endpoints of the robot's topics with incompatible quality of service, which exchange no messages. The bus reports
+//! them in the robot's log; the cloud receives the current list, for `cloudroidctl explain`.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
 use std::time::Duration;
 
-use link::control::{FromRobot, Refused};
+use link::control::{FromRobot, IncompatibleEndpoint};
 use parking_lot::Mutex;
-use ros::bus::Matched;
+use ros::bus::MatchedPeers;
 
 use super::Mirror;
 
-/// Between two looks.
+/// Interval between checks.
 const PERIOD: Duration = Duration::from_secs(1);
 
-/// By the numbers of our own ends.
+/// Incompatible endpoints by the numbers of the local ones.
 #[derive(Default)]
 pub struct Refusals {
-    known: Mutex<BTreeMap<u64, Vec<Refused>>>,
+    known: Mutex<BTreeMap<u64, Vec<IncompatibleEndpoint>>>,
     next: AtomicU64,
 }
 
-/// One of our own ends; when it goes, so does what was known of it.
-pub struct End {
+/// A local endpoint; dropping it removes its incompatible peers.
+pub struct LocalEnd {
     refusals: Arc<Refusals>,
     number: u64,
     topic: String,
 }
 
 impl Refusals {
-    /// A further end of ours.
-    pub fn end(self: &Arc<Self>, topic: &str) -> End {
-        End {
+    /// Adds a local endpoint.
+    pub fn register_end(self: &Arc<Self>, topic: &str) -> LocalEnd {
+        LocalEnd {
             refusals: Arc::clone(self),
             number: self.next.fetch_add(1, Ordering::Relaxed),
             topic: topic.to_owned(),
         }
     }
 
-    /// All there are, each once.
-    fn all(&self) -> Vec<Refused> {
+    /// Returns all current incompatible endpoints without duplicates.
+    fn current(&self) -> Vec<IncompatibleEndpoint> {
         let known = self.known.lock();
-        let mut all: Vec<Refused> = known.values().flatten().cloned().collect();
+        let mut all: Vec<IncompatibleEndpoint> = known.values().flatten().cloned().collect();
         all.sort();
         all.dedup();
-        all.truncate(Refused::MOST);
+        all.truncate(IncompatibleEndpoint::MOST);
         all
     }
 }
 
-impl End {
-    /// Who is at the other end now.
-    pub fn meets(&self, matched: &Matched) {
-        let refused = matched.refused.iter().map(|refusal| Refused {
+impl LocalEnd {
+    /// Replaces the incompatible peers of the endpoint.
+    pub fn update(&self, matched: &MatchedPeers) {
+        let refused = matched.refused.iter().map(|refusal| IncompatibleEndpoint {
             topic: self.topic.clone(),
             node: refusal.peer.node().to_owned(),
             why: refusal.why.clone(),
         });
-        let refused: Vec<Refused> = refused.collect();
+        let refused: Vec<IncompatibleEndpoint> = refused.collect();
         let mut known = self.refusals.known.lock();
-        match refused.is_empty() {
-            true => known.remove(&self.number),
-            false => known.insert(self.number, refused),
+        if refused.is_empty() {
+            known.remove(&self.number)
+        } else {
+            known.insert(self.number, refused)
         };
     }
 }
 
-impl Drop for End {
+impl Drop for LocalEnd {
     fn drop(&mut self) {
         self.refusals.known.lock().remove(&self.number);
     }
 }
 
-/// Until the mirror is gone.
-pub async fn report(mirror: Weak<Mirror>) {
+/// Reports incompatible endpoints until the mirror is gone.
+pub async fn report_loop(mirror: Weak<Mirror>) {
     let mut told = (Weak::new(), Vec::new());
     loop {
         tokio::time::sleep(PERIOD).await;
@@ -82,17 +83,17 @@ pub async fn report(mirror: Weak<Mirror>) {
             return;
         };
         let session = mirror.session();
-        // What waits for a link that is away would be one report more with each change.
+        // While the link is down, every change would queue another report.
         if !session.is_up() {
             continue;
         }
         if !Weak::ptr_eq(&told.0, &Arc::downgrade(&session)) {
-            // Another session's cloud was told nothing yet.
+            // The cloud of another session has received no report yet.
             told = (Arc::downgrade(&session), Vec::new());
         }
-        let all = mirror.refusals.all();
+        let all = mirror.refusals.current();
         if told.1 != all {
-            session.report(&FromRobot::Refused(all.clone()));
+            session.send_control(&FromRobot::Refused(all.clone()));
             told.1 = all;
         }
     }
@@ -100,36 +101,40 @@ pub async fn report(mirror: Weak<Mirror>) {
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::{PeerId, Refusal};
+    use ros::bus::{IncompatiblePeer, PeerId};
 
     use super::*;
 
-    fn refusing(node: &str) -> Matched {
-        Matched {
-            refused: vec![Refusal {
+    fn refusing(node: &str) -> MatchedPeers {
+        MatchedPeers {
+            refused: vec![IncompatiblePeer {
                 peer: PeerId::new(node, 1),
                 why: "reliability".to_owned(),
             }],
-            ..Matched::default()
+            ..MatchedPeers::default()
         }
     }
 
     #[test]
     fn what_no_longer_stands_is_no_longer_told() {
         let refusals = Arc::new(Refusals::default());
-        let [seen, scan] = ["/seen", "/scan"].map(|topic| refusals.end(topic));
-        let again = refusals.end("/seen");
+        let [seen, scan] = ["/seen", "/scan"].map(|topic| refusals.register_end(topic));
+        let again = refusals.register_end("/seen");
         for end in [&seen, &scan, &again] {
-            end.meets(&refusing("/viewer"));
+            end.update(&refusing("/viewer"));
         }
         let told = |refusals: &Refusals| -> Vec<String> {
-            refusals.all().into_iter().map(|one| one.topic).collect()
+            refusals
+                .current()
+                .into_iter()
+                .map(|one| one.topic)
+                .collect()
         };
         assert_eq!(told(&refusals), ["/scan", "/seen"]);
-        scan.meets(&Matched::default());
+        scan.update(&MatchedPeers::default());
         drop(seen);
         assert_eq!(told(&refusals), ["/seen"], "by the other end");
         drop(again);
-        assert!(refusals.all().is_empty());
+        assert!(refusals.current().is_empty());
     }
 }

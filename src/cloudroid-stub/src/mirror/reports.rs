@@ -1,38 +1,38 @@
-//! How requests went, for whoever wants to know: each in the log (`CLOUDROID_LOG=info,requests=debug`), once a second to the
+//! Reports on the outcome of requests: each one in the log (`CLOUDROID_LOG=info,requests=debug`), once a second to the
 //! cloud (`cloudroidctl explain`) and on the robot's `/diagnostics`.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-use link::control::{Decision, FromRobot, Request};
+use link::control::{Decision, FromRobot, RequestTiming};
 use link::record::Data;
 use parking_lot::Mutex;
-use qos::{Channel, Event, HandOver, Outcome, Phases, Side, Why};
+use qos::{DecisionReason, HandOver, Phases, QosEvent, RequestChannel, RequestOutcome, Responder};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::Mirror;
 use super::diagnostics::Diagnostics;
 
-/// Between reports: the usual rate of `/diagnostics`.
+/// Interval between reports, the usual rate of `/diagnostics`.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Requests that wait for the next report, at most: while the link is down nobody takes them.
+/// Maximum number of requests that wait for the next report; while the link is down none is sent.
 const WAITING: usize = 512;
-/// And decisions.
+/// Maximum number of decisions that wait.
 const DECISIONS: usize = 32;
 
 /// Requests that were not reported yet.
 #[derive(Default)]
 pub struct Reports {
-    waiting: Mutex<Vec<Request>>,
+    waiting: Mutex<Vec<RequestTiming>>,
     decisions: Mutex<VecDeque<(Instant, Decision)>>,
 }
 
 impl Reports {
-    /// A request's outcome is known, or more of it.
-    pub fn note(&self, outcome: &Outcome) {
+    /// Records the outcome of a request, or adds to it.
+    pub fn record_outcome(&self, outcome: &RequestOutcome) {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
-        let (Channel::Call(name) | Channel::Topic(name)) = &outcome.channel;
+        let (RequestChannel::Call(name) | RequestChannel::Topic(name)) = &outcome.channel;
         let answer = outcome
             .answer
             .map(|(side, after)| (side, milliseconds(after)));
@@ -43,7 +43,7 @@ impl Reports {
         tracing::debug!(target: "requests", id, %name, ?stamp, ?answer, ?cloud, q, ?phases);
         let part =
             |of: fn(&Phases) -> Duration| phases.as_ref().map_or(0.0, |all| milliseconds(of(all)));
-        let request = Request {
+        let request = RequestTiming {
             id,
             name: name.to_string(),
             total: cloud,
@@ -52,7 +52,7 @@ impl Reports {
             queue: part(|phases| phases.queue),
             compute: part(|phases| phases.compute),
             down: part(|phases| phases.down),
-            local: matches!(outcome.answer, Some((Side::Local, _))),
+            local: matches!(outcome.answer, Some((Responder::Local, _))),
             satisfaction: q,
         };
         let mut waiting = self.waiting.lock();
@@ -66,16 +66,16 @@ impl Reports {
 }
 
 impl Reports {
-    /// Something was decided about the local original.
-    pub fn decided(&self, event: &Event) {
-        if let Some(decision) = decision(event) {
-            self.tell(decision);
+    /// Records a decision about the local original.
+    pub fn record_decision(&self, event: &QosEvent) {
+        if let Some(decision) = to_decision(event) {
+            self.push_decision(decision);
         }
     }
 
-    /// One side goes on in place of the other, without some of what that was given.
-    pub fn handed_over(&self, over: &HandOver) {
-        self.tell(Decision {
+    /// Records a hand-over in which the continuing side did not receive some of the messages.
+    pub fn record_hand_over(&self, over: &HandOver) {
+        self.push_decision(Decision {
             kind: "state-lost".to_owned(),
             warning: true,
             text: over.to_string(),
@@ -83,7 +83,7 @@ impl Reports {
         });
     }
 
-    fn tell(&self, decision: Decision) {
+    fn push_decision(&self, decision: Decision) {
         let mut decisions = self.decisions.lock();
         if decisions.len() == DECISIONS {
             decisions.pop_front();
@@ -91,7 +91,7 @@ impl Reports {
         decisions.push_back((Instant::now(), decision));
     }
 
-    /// What was decided and not told yet.
+    /// Returns the decisions that were not reported yet.
     fn take_decisions(&self) -> Vec<Decision> {
         let decisions = std::mem::take(&mut *self.decisions.lock());
         let told = |(at, decision): (Instant, Decision)| Decision {
@@ -102,35 +102,35 @@ impl Reports {
     }
 }
 
-/// What the cloud is to know of; that a process starts or ends is the robot's own affair.
-fn decision(event: &Event) -> Option<Decision> {
+/// Returns the decision if it is relevant for the cloud; starts and stops of the process are internal to the robot.
+fn to_decision(event: &QosEvent) -> Option<Decision> {
     let (kind, warning, text) = match event {
-        Event::Feed(Why::LinkDown) => (
+        QosEvent::Feed(DecisionReason::LinkDown) => (
             "local-takes-over",
             true,
             "the local original takes over: the link is down".to_owned(),
         ),
-        Event::StopFeeding(Why::LinkUp) => (
+        QosEvent::StopFeeding(DecisionReason::LinkUp) => (
             "local-hands-back",
             false,
             "the local original hands back: the link is up again".to_owned(),
         ),
-        Event::Feed(Why::Satisfaction { q }) => (
+        QosEvent::Feed(DecisionReason::Satisfaction { q }) => (
             "local-answers-too",
             true,
             format!("the local original answers, too: Q has fallen to {q:.1}"),
         ),
-        Event::StopFeeding(Why::Satisfaction { q }) => (
+        QosEvent::StopFeeding(DecisionReason::Satisfaction { q }) => (
             "cloud-answers-alone",
             false,
             format!("the cloud answers alone again: Q has risen to {q:.1}"),
         ),
-        Event::SaidOnceMissing => (
+        QosEvent::SaidOnceMissing => (
             "local-missing",
             true,
-            "there is no local original: the cloud is alone".to_owned(),
+            "there is no local original: only the cloud answers".to_owned(),
         ),
-        Event::Crashed(reason) => (
+        QosEvent::Crashed(reason) => (
             "local-crashed",
             true,
             format!("the local original ended: {reason}"),
@@ -146,11 +146,11 @@ fn decision(event: &Event) -> Option<Decision> {
 }
 
 /// Reports until the node ends.
-pub async fn report(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
+pub async fn report_loop(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
     let mut due = interval(PERIOD);
     due.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    // Of which session, and how many messages it had not sent.
-    let mut told = (Weak::new(), link::Dropped::default());
+    // The session of the last report, and the number of messages that it had not sent.
+    let mut told = (Weak::new(), link::SkipCounts::default());
     loop {
         due.tick().await;
         let Some(mirror) = mirror.upgrade() else {
@@ -163,56 +163,57 @@ pub async fn report(mirror: Weak<Mirror>, mut diagnostics: Diagnostics) {
         if session.is_up() {
             let requests = std::mem::take(&mut *promise.reports.waiting.lock());
             if !requests.is_empty() {
-                session.report(&FromRobot::Requests(requests));
+                session.send_control(&FromRobot::Requests(requests));
             }
-            let (of, dropped) = (Arc::downgrade(&session), session.dropped());
+            let (of, dropped) = (Arc::downgrade(&session), session.skip_counts());
             if !Weak::ptr_eq(&told.0, &of) {
-                told = (of, link::Dropped::default());
+                told = (of, link::SkipCounts::default());
             }
             if told.1 != dropped {
                 told.1 = dropped;
-                session.report(&FromRobot::Unsent {
+                session.send_control(&FromRobot::Unsent {
                     replaced: dropped.replaced,
                     stale: dropped.stale,
                 });
             }
             let decisions = promise.reports.take_decisions();
             if !decisions.is_empty() {
-                session.report(&FromRobot::Decided(decisions));
+                session.send_control(&FromRobot::Decided(decisions));
             }
         }
         diagnostics.publish(&promise.keeper().report());
     }
 }
 
-fn span(from: i64, to: i64) -> Duration {
-    // Clocks of two machines are not known exactly: a short way may come out as a negative one.
+fn elapsed_between(from: i64, to: i64) -> Duration {
+    // The offset of two machines' clocks is not exact: a short time may come out negative.
     Duration::from_nanos(u64::try_from(to.saturating_sub(from)).unwrap_or(0))
 }
 
-/// Where the time went of the input that an output may answer. `offset` is the cloud's clock minus the robot's,
+/// Returns the phases of an input that an output may answer. `offset` is the cloud's clock minus the robot's, in
 /// nanoseconds.
-pub fn of_output(data: &Data, arrived: i64, offset: i64) -> Option<Phases> {
+pub fn output_phases(data: &Data, arrived: i64, offset: i64) -> Option<Phases> {
     let input = data.answered?;
     let encoding = |microseconds: u32| Duration::from_micros(microseconds.into());
-    let waited = span(input.born, input.left).saturating_sub(encoding(input.serialise));
-    let waited_there = span(data.born, data.left).saturating_sub(encoding(data.serialise));
+    let waited = elapsed_between(input.born, input.left).saturating_sub(encoding(input.serialise));
+    let waited_there =
+        elapsed_between(data.born, data.left).saturating_sub(encoding(data.serialise));
     Some(Phases {
         serialise: encoding(input.serialise) + encoding(data.serialise),
-        up: span(input.left, input.taken - offset),
-        queue: waited + span(input.taken, input.given) + waited_there,
-        compute: span(input.given, data.born),
-        down: span(data.left - offset, arrived),
+        up: elapsed_between(input.left, input.taken - offset),
+        queue: waited + elapsed_between(input.taken, input.given) + waited_there,
+        compute: elapsed_between(input.given, data.born),
+        down: elapsed_between(data.left - offset, arrived),
     })
 }
 
-/// The same of a call: when it was asked (robot's clock), had arrived and was answered (cloud's), and its answer had
-/// come (robot's). What it waited on the way counts as the way.
-pub fn of_call([asked, taken, given, arrived]: [i64; 4], offset: i64) -> Phases {
+/// Returns the phases of a call from four times: request sent (robot's clock), received and answered (cloud's clock),
+/// answer received (robot's clock). Time spent in queues counts as transfer.
+pub fn call_phases([asked, taken, given, arrived]: [i64; 4], offset: i64) -> Phases {
     Phases {
-        up: span(asked, taken - offset),
-        compute: span(taken, given),
-        down: span(given - offset, arrived),
+        up: elapsed_between(asked, taken - offset),
+        compute: elapsed_between(taken, given),
+        down: elapsed_between(given - offset, arrived),
         ..Phases::default()
     }
 }
@@ -220,19 +221,19 @@ pub fn of_call([asked, taken, given, arrived]: [i64; 4], offset: i64) -> Phases 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use link::record::Answered;
+    use link::record::InputTiming;
 
     const MS: i64 = 1_000_000;
 
     #[test]
     fn decisions_wait_until_they_are_told_and_the_oldest_give_way() {
         let reports = Reports::default();
-        reports.decided(&Event::Start(Why::LinkDown));
+        reports.record_decision(&QosEvent::Start(DecisionReason::LinkDown));
         assert_eq!(reports.take_decisions(), [], "a process is no decision");
         for number in 0..DECISIONS {
-            reports.decided(&Event::Crashed(format!("signal {number}")));
+            reports.record_decision(&QosEvent::Crashed(format!("signal {number}")));
         }
-        reports.decided(&Event::Feed(Why::LinkDown));
+        reports.record_decision(&QosEvent::Feed(DecisionReason::LinkDown));
         let told = reports.take_decisions();
         assert_eq!(told.len(), DECISIONS);
         assert!(told[0].text.ends_with("signal 1"), "{told:?}");
@@ -252,7 +253,7 @@ mod tests {
             born: offset + 130 * MS,
             left: offset + 135 * MS,
             serialise: 2000,
-            answered: Some(Answered {
+            answered: Some(InputTiming {
                 born: 0,
                 serialise: 3000,
                 left: 5 * MS,
@@ -261,7 +262,7 @@ mod tests {
             }),
             message: bytes::Bytes::new(),
         };
-        let phases = of_output(&data, 140 * MS, offset).unwrap();
+        let phases = output_phases(&data, 140 * MS, offset).unwrap();
         let ms = Duration::from_millis;
         assert_eq!(
             phases,
@@ -274,7 +275,7 @@ mod tests {
             }
         );
         assert_eq!(phases.total(), ms(140));
-        let call = of_call([0, offset + 2 * MS, offset + 9 * MS, 10 * MS], offset);
+        let call = call_phases([0, offset + 2 * MS, offset + 9 * MS, 10 * MS], offset);
         assert_eq!((call.up, call.compute, call.down), (ms(2), ms(7), ms(1)));
     }
 }

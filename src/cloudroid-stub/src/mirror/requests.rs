@@ -1,26 +1,26 @@
-//! Which input is answered by which output: decided when the service was pushed, or stated by the robot's owner.
-//! Nothing is guessed here; a decided request counts once its topics exist under the names that they have on this
+//! Pairs of inputs and the outputs that answer them, decided when the service was pushed, or stated by the robot's
+//! owner. Nothing is guessed here; a decided request applies as soon as its topics exist under their names on this
 //! robot.
 
-use qos::{Correlation, Pair};
+use qos::{Correlation, TopicPair};
 use ros::remaps::Remaps;
 
-use super::known::Known;
+use super::known::KnownInterface;
 use crate::local;
-use crate::revision::Answered;
-use crate::robot::Robot;
+use crate::revision::DecidedRequest;
+use crate::robot::LaunchedNode;
 
-/// A request, each of its topics by the names that it may have on this robot, the likeliest first.
+/// A request, with the possible names of each of its topics on this robot, the most likely first.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Request {
+pub struct RequestPattern {
     input: Vec<String>,
     outputs: Vec<Vec<String>>,
     by: Option<Correlation>,
 }
 
-impl Request {
-    /// Of topics as they are called on this robot.
-    pub fn stated(pair: &Pair) -> Self {
+impl RequestPattern {
+    /// Returns the pattern of a pair whose topics have their names on this robot.
+    pub fn from_pair(pair: &TopicPair) -> Self {
         Self {
             input: vec![pair.input.clone()],
             outputs: pair.outputs.iter().map(|name| vec![name.clone()]).collect(),
@@ -28,17 +28,25 @@ impl Request {
         }
     }
 
-    /// Those that the push has decided of this executable, as they are on this robot.
-    pub fn decided(all: &[Answered], executable: &str, robot: &Robot) -> Vec<Self> {
-        let remaps = Remaps::of(robot.ros, &robot.argv, &robot.node);
-        let is_of_it = |of: &&Answered| of.program.as_deref().is_none_or(|of| of == executable);
-        let request = |of: &Answered| {
-            let pair = of.request.parse::<Pair>();
+    /// Returns the patterns of the requests that the push has decided for this executable, with the names on this
+    /// robot.
+    pub fn from_revision(
+        all: &[DecidedRequest],
+        executable: &str,
+        robot: &LaunchedNode,
+    ) -> Vec<Self> {
+        let remaps = Remaps::parse(robot.ros, &robot.argv, &robot.node);
+        let is_of_it =
+            |of: &&DecidedRequest| of.program.as_deref().is_none_or(|of| of == executable);
+        let request = |of: &DecidedRequest| {
+            let pair = of.request.parse::<TopicPair>();
             let pair = pair.inspect_err(|error| {
-                tracing::warn!("revision.toml: {error}; this request is not judged");
+                tracing::warn!(
+                    "revision.toml: {error}; response times of this request are not measured"
+                );
             });
             let pair = pair.ok()?;
-            let names = |name: &String| names(name, &of.node, &robot.node, &remaps);
+            let names = |name: &String| candidate_names(name, &of.node, &robot.node, &remaps);
             Some(Self {
                 input: names(&pair.input),
                 outputs: pair.outputs.iter().map(names).collect(),
@@ -48,8 +56,8 @@ impl Request {
         all.iter().filter(is_of_it).filter_map(request).collect()
     }
 
-    /// The pair that it is, once its input and its answer exist; further outputs join it when they do.
-    pub(super) fn pair(&self, known: &Known) -> Option<Pair> {
+    /// Returns the pair as soon as its input and its answer exist; further outputs are added when they exist.
+    pub(super) fn resolve(&self, known: &KnownInterface) -> Option<TopicPair> {
         let input = self
             .input
             .iter()
@@ -65,12 +73,12 @@ impl Request {
             .chain(&outputs)
             .all(|(_, of)| local::is_stamped(of));
         let by = match (self.by, is_stamped) {
-            // What has no stamp here cannot be recognised by it.
+            // Messages without a stamp cannot be matched by it.
             (None, true) => Correlation::Stamp,
             (None | Some(Correlation::Stamp), false) => Correlation::Arrival,
             (Some(by), _) => by,
         };
-        Some(Pair {
+        Some(TopicPair {
             input: input.0.clone(),
             outputs: outputs.into_iter().map(|(name, _)| name.clone()).collect(),
             by: Some(by),
@@ -78,9 +86,9 @@ impl Request {
     }
 }
 
-/// What a topic of the node `then` (at the push) may be called by the node `now`: a program's own word for it is not
-/// known, so it may lie below its node, in its namespace, or anywhere.
-fn names(name: &str, then: &str, now: &str, remaps: &Remaps) -> Vec<String> {
+/// Returns the possible names, for the node `now`, of a topic of the node `then` (at the push). The name within the
+/// program is unknown, so it may be private, relative to the namespace, or absolute.
+fn candidate_names(name: &str, then: &str, now: &str, remaps: &Remaps) -> Vec<String> {
     let namespace = |node: &str| {
         node.rsplit_once('/')
             .map_or("", |(above, _)| above)
@@ -102,8 +110,9 @@ fn names(name: &str, then: &str, now: &str, remaps: &Remaps) -> Vec<String> {
     names
 }
 
-/// Each action of ROS 1 is a pair by its protocol: its goal, and the result and feedback that carry the goal's id.
-pub(super) fn actions(known: &Known) -> impl Iterator<Item = Pair> {
+/// Returns a pair for each ROS 1 action, defined by its protocol: the goal is answered by the result and the feedback
+/// that carry its id.
+pub(super) fn action_pairs(known: &KnownInterface) -> impl Iterator<Item = TopicPair> {
     known.inputs.iter().filter_map(|(goal, of)| {
         let action = goal.strip_suffix("/goal")?;
         of.name.strip_suffix("ActionGoal")?;
@@ -114,7 +123,7 @@ pub(super) fn actions(known: &Known) -> impl Iterator<Item = Pair> {
         let has_result = outputs
             .first()
             .is_some_and(|output| output.ends_with("/result"));
-        has_result.then(|| Pair {
+        has_result.then(|| TopicPair {
             input: goal.clone(),
             outputs,
             by: Some(Correlation::Goal),
@@ -128,19 +137,19 @@ mod tests {
 
     use super::*;
 
-    fn known(inputs: &[&str], outputs: &[&str]) -> Known {
+    fn known_interface(inputs: &[&str], outputs: &[&str]) -> KnownInterface {
         let topic = |text: &&str| {
             let (name, of) = text.split_once(' ').unwrap_or((text, "std_msgs/String"));
-            (name.to_owned(), WireType::named(of))
+            (name.to_owned(), WireType::with_name(of))
         };
-        Known {
+        KnownInterface {
             inputs: inputs.iter().map(topic).collect(),
             outputs: outputs.iter().map(topic).collect(),
-            ..Known::default()
+            ..KnownInterface::default()
         }
     }
 
-    fn shown(requests: &[Request], known: &Known) -> Vec<String> {
+    fn pair_texts(requests: &[RequestPattern], known: &KnownInterface) -> Vec<String> {
         let pairs = known.pairs(requests).into_iter();
         pairs.map(|pair| pair.to_string()).collect()
     }
@@ -148,7 +157,7 @@ mod tests {
     #[test]
     fn decided_requests_count_as_soon_as_their_topics_exist_in_whatever_order() {
         let stated = ["/image -> /boxes, /view", "/word -> /said"];
-        let stated = stated.map(|pair| Request::stated(&pair.parse().unwrap()));
+        let stated = stated.map(|pair| RequestPattern::from_pair(&pair.parse().unwrap()));
         let image = "/image sensor_msgs/Image";
         let boxes = "/boxes geometry_msgs/PoseStamped";
         let all = [
@@ -174,57 +183,63 @@ mod tests {
                 } else {
                     &[]
                 };
-                let found = shown(&stated, &known(&seen[0], &seen[1]));
+                let found = pair_texts(&stated, &known_interface(&seen[0], &seen[1]));
                 assert_eq!(found, expected, "{order:?} {seen:?}");
             }
         }
         let view = "/view sensor_msgs/Image";
-        let grown = known(&[image, "/word"], &[boxes, view, "/said"]);
+        let grown = known_interface(&[image, "/word"], &[boxes, view, "/said"]);
         assert_eq!(
-            shown(&stated, &grown),
+            pair_texts(&stated, &grown),
             [
                 "/image -> /boxes, /view by stamp",
                 "/word -> /said by arrival"
             ]
         );
         // A view alone is no answer.
-        assert!(shown(&stated, &known(&[image], &[view])).is_empty());
+        assert!(pair_texts(&stated, &known_interface(&[image], &[view])).is_empty());
     }
 
     #[test]
     fn a_stamp_counts_where_both_ends_have_one() {
-        let stated = |text: &str| [Request::stated(&text.parse().unwrap())];
-        let words = known(&["/in"], &["/out"]);
+        let stated = |text: &str| [RequestPattern::from_pair(&text.parse().unwrap())];
+        let words = known_interface(&["/in"], &["/out"]);
         for text in [
             "/in -> /out by stamp",
             "/in -> /out by arrival",
             "/in -> /out",
         ] {
-            assert_eq!(shown(&stated(text), &words), ["/in -> /out by arrival"]);
+            assert_eq!(
+                pair_texts(&stated(text), &words),
+                ["/in -> /out by arrival"]
+            );
         }
-        let image = known(&["/in sensor_msgs/Image"], &["/out sensor_msgs/Image"]);
+        let image = known_interface(&["/in sensor_msgs/Image"], &["/out sensor_msgs/Image"]);
         assert_eq!(
-            shown(&stated("/in -> /out by arrival"), &image),
+            pair_texts(&stated("/in -> /out by arrival"), &image),
             ["/in -> /out by arrival"]
         );
     }
 
     #[test]
     fn actions_are_pairs_by_their_protocol() {
-        let walk = known(
+        let walk = known_interface(
             &["/walk/goal p/WalkActionGoal", "/walk/cancel", "/scan"],
             &["/walk/status", "/walk/result", "/walk/feedback"],
         );
         assert_eq!(
-            shown(&[], &walk),
+            pair_texts(&[], &walk),
             ["/walk/goal -> /walk/result, /walk/feedback by goal"]
         );
-        let own = Request::stated(&"/walk/goal -> /walk/result by goal".parse().unwrap());
-        assert_eq!(shown(&[own], &walk), ["/walk/goal -> /walk/result by goal"]);
+        let own = RequestPattern::from_pair(&"/walk/goal -> /walk/result by goal".parse().unwrap());
+        assert_eq!(
+            pair_texts(&[own], &walk),
+            ["/walk/goal -> /walk/result by goal"]
+        );
         assert!(
-            shown(
+            pair_texts(
                 &[],
-                &known(&["/walk/goal p/WalkActionGoal"], &["/walk/feedback"])
+                &known_interface(&["/walk/goal p/WalkActionGoal"], &["/walk/feedback"])
             )
             .is_empty()
         );
@@ -239,9 +254,9 @@ mod tests {
                     line: &str,
                     inputs: &[&str],
                     outputs: &[&str]| {
-            let robot = Robot {
+            let robot = LaunchedNode {
                 ros,
-                place: crate::robot::Place::Master {
+                place: crate::robot::RosLocation::Master {
                     host: String::new(),
                     port: 0,
                     own: None,
@@ -252,26 +267,27 @@ mod tests {
                 parameters: Default::default(),
                 sim_time: false,
             };
-            let of = |program: Option<&str>| Answered {
+            let of = |program: Option<&str>| DecidedRequest {
                 node: then.to_owned(),
                 program: program.map(str::to_owned),
                 request: request.to_owned(),
             };
-            let none = Request::decided(&[of(Some("other"))], "find", &robot);
+            let none = RequestPattern::from_revision(&[of(Some("other"))], "find", &robot);
             assert!(none.is_empty(), "of another program");
-            let unreadable = Answered {
+            let unreadable = DecidedRequest {
                 request: "/a by magic".to_owned(),
                 ..of(None)
             };
             let all = [unreadable, of(Some("find"))];
-            shown(
-                &Request::decided(&all, "find", &robot),
-                &known(inputs, outputs),
+            pair_texts(
+                &RequestPattern::from_revision(&all, "find", &robot),
+                &known_interface(inputs, outputs),
             )
             .join("; ")
         };
         let one = RosVersion::One;
-        // As at the push; in a namespace, by a name of its own, remapped; and a name that is absolute in the program.
+        // Same name as at the push; in a namespace; with its own name; remapped; and a name that is absolute in the
+        // program.
         let request = "/image -> /finder/found by arrival";
         let there = |now, line, input, output: &str| {
             find(one, "/finder", request, now, line, &[input], &[output])
@@ -324,7 +340,7 @@ mod tests {
             ),
             "/camera -> /boxes by arrival"
         );
-        // Nobody knows whose it was.
+        // The node that had the topic is unknown.
         assert_eq!(
             find(
                 one,

@@ -1,4 +1,4 @@
-//! The message that brings the robot to rest when nobody answers in time.
+//! The message that stops the robot when neither side answers in time.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -6,10 +6,10 @@ use std::sync::Arc;
 use anyhow::{Context, bail};
 use bytes::Bytes;
 use qos::SafeStop;
-use ros::bus::{Bus, Publisher, Qos, RosVersion, WireType};
+use ros::bus::{Bus, Publisher, QosProfile, RosVersion, WireType};
 use ros::schema::{MessageType, Registry, SchemaError};
 
-/// The usual one; robots without development packages have no definitions at all.
+/// The usual type, built in because robots without development packages have no definitions.
 const TWIST: [(&str, &str); 2] = [
     (
         "geometry_msgs/msg/Twist",
@@ -21,38 +21,43 @@ const TWIST: [(&str, &str); 2] = [
     ),
 ];
 
-/// Advertised and serialized ahead: listeners are connected when it is needed.
-pub struct Stop {
+/// Publisher of the safe-stop message, advertised and serialized in advance so that subscribers are connected when it
+/// is needed.
+pub struct SafeStopPublisher {
     publisher: Box<dyn Publisher>,
     bytes: Bytes,
 }
 
-impl Stop {
-    /// For a message whose type is given, whoever else publishes on its topic.
+impl SafeStopPublisher {
+    /// Advertises the topic for a message with a declared type, whichever other publishers it has.
     pub async fn new(stop: &SafeStop, bus: &Arc<dyn Bus>) -> anyhow::Result<Self> {
         let version = bus.version();
-        let of = definition(version, &stop.type_name, &shares(version))
+        let of = find_type(version, &stop.type_name, &share_directories(version))
             .with_context(|| format!("safe_stop: {} is not known on this robot", stop.type_name))?;
         let json = serde_json::to_vec(&stop.message)?;
         let mut bytes = Vec::new();
         ros::codec::from_json(&of, &json, &mut bytes, &Default::default())
-            .with_context(|| format!("safe_stop: its message is no {}", stop.type_name))?;
+            .with_context(|| format!("safe_stop: its message is not a {}", stop.type_name))?;
         Ok(Self {
             publisher: bus
-                .advertise(&stop.topic, WireType::of(&of), Qos::keep_last(1))
+                .advertise(
+                    &stop.topic,
+                    WireType::from_message(&of),
+                    QosProfile::keep_last(1),
+                )
                 .await?,
             bytes: bytes.into(),
         })
     }
 
-    /// Publishes the safe message.
+    /// Publishes the safe-stop message.
     pub fn publish(&self) {
         self.publisher.publish(self.bytes.clone());
     }
 }
 
-/// A message of zeros; of ROS 2, of what its definition gives fields that nobody sets.
-pub fn zeros(wire_type: &WireType) -> Result<Bytes, String> {
+/// Returns a zero message; for ROS 2, with the defaults of the type's definition.
+pub fn zero_message(wire_type: &WireType) -> Result<Bytes, String> {
     let of = wire_type.schema().map_err(|error| error.to_string())?;
     if of.version() == RosVersion::One {
         return Ok(vec![0; of.min_size()].into());
@@ -63,8 +68,8 @@ pub fn zeros(wire_type: &WireType) -> Result<Bytes, String> {
     Ok(bytes.into())
 }
 
-/// Directories that hold packages' definitions.
-fn shares(version: RosVersion) -> Vec<PathBuf> {
+/// Returns the directories that hold definitions of packages.
+fn share_directories(version: RosVersion) -> Vec<PathBuf> {
     let named = |name: &str| -> Vec<PathBuf> {
         let value = std::env::var_os(name).unwrap_or_default();
         std::env::split_paths(&value).collect()
@@ -78,13 +83,13 @@ fn shares(version: RosVersion) -> Vec<PathBuf> {
     shares
 }
 
-/// A type with all it contains, from the robot's packages.
-fn definition(
+/// Finds a type and all that it contains in the robot's packages.
+fn find_type(
     version: RosVersion,
     type_name: &str,
     shares: &[PathBuf],
 ) -> anyhow::Result<Arc<MessageType>> {
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     for (key, text) in TWIST {
         registry.insert(key, text)?;
     }
@@ -94,7 +99,7 @@ fn definition(
         let package = wanted.split('/').next().unwrap_or_default().to_owned();
         if !read.contains(&package) {
             for share in shares {
-                insert(&registry, share, &package)?;
+                insert_package(&registry, share, &package)?;
             }
             read.push(package);
         }
@@ -106,7 +111,7 @@ fn definition(
     }
 }
 
-fn insert(registry: &Registry, share: &Path, package: &str) -> anyhow::Result<()> {
+fn insert_package(registry: &Registry, share: &Path, package: &str) -> anyhow::Result<()> {
     let Ok(files) = std::fs::read_dir(share.join(package).join("msg")) else {
         return Ok(());
     };
@@ -140,13 +145,13 @@ mod tests {
             std::fs::write(path, text).unwrap();
         }
         let shares = [place.path().to_owned()];
-        let of_one = |name: &str, shares: &[PathBuf]| definition(RosVersion::One, name, shares);
+        let of_one = |name: &str, shares: &[PathBuf]| find_type(RosVersion::One, name, shares);
         assert_eq!(of_one("a_msgs/Halt", &shares).unwrap().min_size(), 49);
         let twist = of_one("geometry_msgs/Twist", &[]).unwrap();
         assert_eq!(twist.md5(), "9f195f881246fdfa2798d1d3eebca84a");
         assert!(of_one("c_msgs/None", &shares).is_err());
-        // The same files, and other names and hashes.
-        let of_two = |name: &str| definition(RosVersion::Two, name, &shares).unwrap();
+        // The same files result in other names and hashes.
+        let of_two = |name: &str| find_type(RosVersion::Two, name, &shares).unwrap();
         assert_eq!(of_two("a_msgs/Halt").name(), "a_msgs/msg/Halt");
         let twist = of_two("geometry_msgs/msg/Twist");
         assert_eq!(
@@ -157,8 +162,8 @@ mod tests {
 
     #[test]
     fn zeros_of_ros_2_are_cdr() {
-        let of = definition(RosVersion::Two, "geometry_msgs/Twist", &[]).unwrap();
-        let zeros = zeros(&WireType::of(&of)).unwrap();
+        let of = find_type(RosVersion::Two, "geometry_msgs/Twist", &[]).unwrap();
+        let zeros = zero_message(&WireType::from_message(&of)).unwrap();
         assert_eq!(zeros.len(), 4 + 6 * 8);
         assert_eq!(
             (&zeros[..4], zeros[4..].iter().max()),

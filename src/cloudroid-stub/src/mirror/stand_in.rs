@@ -1,25 +1,25 @@
-//! Registers on the robot what the local original registers in its private ROS system, while the cloud was never reached
-//! and so has not said what the node registers.
+//! Registers on the robot the interface that the local original registers in its private ROS system, as long as the
+//! cloud was never reached and has not sent the interface of the node.
 
 use std::sync::{Arc, Weak};
 
-use link::control::{self, Graph, Output, Served, Wanted};
-use ros::bus::{Qos, ServiceType, WireType};
+use link::control::{self, Graph, OutputChannel, RequestedInput, ServiceChannel};
+use ros::bus::{QosProfile, ServiceType, WireType};
 
 use super::outputs::NOWHERE;
 use super::{KnownType, Mirror};
-use crate::local::{Keeper, Original, Registered};
+use crate::local::{Keeper, Original, RegisteredInterface};
 
-/// Registers on the robot what the local original registers, until the cloud has said what the node registers.
-pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
-    // Not held while nothing changes: the original ends with its keeper.
+/// Registers the interface of the local original on the robot until the cloud has sent the node's interface.
+pub async fn run_stand_in(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
+    // Not held while nothing changes, because the original ends with its keeper.
     let original = || keeper.upgrade()?.original().cloned();
-    let Some(mut changes) = original().map(|original| original.registrations()) else {
+    let Some(mut changes) = original().map(|original| original.registration_changes()) else {
         return;
     };
     while changes.next().await {
         let Some(original) = original() else { return };
-        let registered = original.registered().await;
+        let registered = original.registered_interface().await;
         let Some(mirror) = mirror.upgrade() else {
             return;
         };
@@ -30,9 +30,13 @@ pub async fn follow(mirror: Weak<Mirror>, keeper: Weak<Keeper>) {
 }
 
 impl Mirror {
-    /// Registers this in place of the cloud's interface; false once the cloud has sent its own. Nothing is unregistered: the
-    /// original may have ended because the cloud is there, and the cloud's interface follows.
-    async fn stand_in(self: &Arc<Self>, original: &Original, registered: Registered) -> bool {
+    /// Registers this in place of the cloud's interface; returns false once the cloud has sent its own. Nothing is
+    /// unregistered: the original may have ended because the cloud was reached, and its interface follows.
+    async fn stand_in(
+        self: &Arc<Self>,
+        original: &Original,
+        registered: RegisteredInterface,
+    ) -> bool {
         let mut applied = self.applied.lock().await;
         if applied.graph.is_some() {
             return false;
@@ -44,22 +48,22 @@ impl Mirror {
             let (of, _held) = (wire_type.clone(), None);
             self.types.lock().insert(key, KnownType { of, _held });
         }
-        let told = |qos: Option<Qos>| qos.as_ref().map(control::Qos::of);
-        let output = |(topic, of, qos): (String, WireType, Option<Qos>)| Output {
+        let told = |qos: Option<QosProfile>| qos.as_ref().map(control::WireQos::from_bus);
+        let output = |(topic, of, qos): (String, WireType, Option<QosProfile>)| OutputChannel {
             channel: NOWHERE,
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
             qos: told(qos),
         };
-        let input = |(topic, of, qos): (String, WireType, Option<Qos>)| Wanted {
+        let input = |(topic, of, qos): (String, WireType, Option<QosProfile>)| RequestedInput {
             topic,
             type_name: of.name,
             md5: of.digest.to_string(),
             feed: true,
             qos: told(qos),
         };
-        let serves = |(name, of): (String, ServiceType)| Served::of(NOWHERE, &name, &of);
+        let serves = |(name, of): (String, ServiceType)| ServiceChannel::new(NOWHERE, &name, &of);
         let graph = Graph {
             outputs: registered.outputs.into_iter().map(output).collect(),
             inputs: registered.inputs.into_iter().map(input).collect(),
@@ -70,11 +74,11 @@ impl Mirror {
             ..Graph::default()
         };
         applied.nodes = registered.nodes;
-        self.bus.stands_for(applied.nodes.clone());
-        // What it says has somewhere to go before it is heard, and what it is given comes once it listens.
+        self.bus.set_represented_nodes(applied.nodes.clone());
+        // Outputs first, so that messages of the original can be published, and inputs once it has subscribed.
         self.outputs.apply(self, &graph.outputs, true).await;
         self.learn(&graph, false).await;
-        original.connected().await;
+        original.wait_connected().await;
         self.inputs.apply(self, &graph.inputs, true);
         self.calls.apply(self, &graph.services, (false, true)).await;
         true

@@ -1,14 +1,14 @@
-//! Where `ros2 run` and launch files find an executable (ROS 2): in `lib/PKG` of an install space, where console scripts of Python
-//! packages are, too.
+//! Finds executables as `ros2 run` and launch files do (ROS 2): in `lib/PKG` of an install space, which also holds
+//! console scripts of Python packages.
 
 use std::path::{Path, PathBuf};
 
-use super::{Search, below_package, is_executable};
+use super::{OriginalSearch, find_below, is_executable};
 
-/// The next executable of this name after the stub.
-pub fn find(search: &Search<'_>) -> Option<PathBuf> {
+/// Returns the next executable of this name after the stub.
+pub fn find(search: &OriginalSearch<'_>) -> Option<PathBuf> {
     let mut prefixes = search.entries("AMENT_PREFIX_PATH");
-    // What colcon built: one install space for all packages, or one for each.
+    // Output of colcon: one install space for all packages, or one for each.
     for installed in search.entries("COLCON_PREFIX_PATH") {
         prefixes.push(installed.join(&search.node.package));
         prefixes.push(installed);
@@ -17,21 +17,21 @@ pub fn find(search: &Search<'_>) -> Option<PathBuf> {
     prefixes.iter().find_map(|prefix| in_prefix(prefix, search))
 }
 
-fn in_prefix(prefix: &Path, search: &Search<'_>) -> Option<PathBuf> {
+fn in_prefix(prefix: &Path, search: &OriginalSearch<'_>) -> Option<PathBuf> {
     let node = search.node;
     let direct = prefix.join("lib").join(&node.package).join(&node.node);
     if is_executable(&direct) {
         return Some(direct);
     }
-    // Programs that a package shares have launchers in the stub, too.
-    below_package(&prefix.join("share").join(&node.package), &node.node)
+    // Programs in a package's share directory have launchers in the stub, too.
+    find_below(&prefix.join("share").join(&node.package), &node.node)
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::tests::executable;
-    use super::super::{find, without};
-    use crate::arguments::Node;
+    use super::super::{find, without_overlay};
+    use crate::arguments::NodeArgs;
 
     #[test]
     fn the_next_install_space_is_found_and_the_stub_is_not() {
@@ -53,7 +53,7 @@ mod tests {
         std::fs::create_dir_all(&share).unwrap();
         std::fs::write(share.join("revision.toml"), "ros = 2\n").unwrap();
         let found = |node: &str, ament: &[&std::path::Path], colcon: &[&std::path::Path]| {
-            let node = Node {
+            let node = NodeArgs {
                 package: "p".into(),
                 node: node.into(),
                 share: share.clone(),
@@ -65,7 +65,7 @@ mod tests {
             find(&node, &|name| match name {
                 "AMENT_PREFIX_PATH" => list(ament),
                 "COLCON_PREFIX_PATH" => list(colcon),
-                // ROS 1's.
+                // A ROS 1 variable.
                 "CMAKE_PREFIX_PATH" => list(&[&merged]),
                 _ => None,
             })
@@ -88,6 +88,6 @@ mod tests {
         );
         assert_eq!(found("node", &[&stub, &other], &[]), None);
         let left = std::env::join_paths([&stub, &merged]).unwrap();
-        assert_eq!(without(&left, &stub), Some(merged.into_os_string()));
+        assert_eq!(without_overlay(&left, &stub), Some(merged.into_os_string()));
     }
 }

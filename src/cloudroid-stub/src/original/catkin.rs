@@ -1,12 +1,12 @@
-//! Where rosrun and roslaunch find an executable (ROS 1).
+//! Finds executables as rosrun and roslaunch do (ROS 1).
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-use super::{DEPTH, Search, below_package, children, is_executable};
+use super::{DEPTH, OriginalSearch, children, find_below, is_executable};
 
-/// The next executable of this name after the stub.
-pub fn find(search: &Search<'_>) -> Option<PathBuf> {
+/// Returns the next executable of this name after the stub.
+pub fn find(search: &OriginalSearch<'_>) -> Option<PathBuf> {
     let node = search.node;
     let mut prefixes = search.entries("CMAKE_PREFIX_PATH");
     prefixes.retain(|prefix| prefix.join(".catkin").exists());
@@ -23,20 +23,18 @@ pub fn find(search: &Search<'_>) -> Option<PathBuf> {
                 .into_iter()
                 .flat_map(|source| packages(&source, &node.package)),
         );
-        below
-            .iter()
-            .find_map(|place| below_package(place, &node.node))
+        below.iter().find_map(|place| find_below(place, &node.node))
     });
     in_prefixes.or_else(|| {
         search
             .entries("ROS_PACKAGE_PATH")
             .iter()
             .flat_map(|entry| packages(entry, &node.package))
-            .find_map(|place| below_package(&place, &node.node))
+            .find_map(|place| find_below(&place, &node.node))
     })
 }
 
-/// The source spaces of a development space.
+/// Returns the source spaces of a development space.
 fn sources(prefix: &Path) -> Vec<PathBuf> {
     let listed = std::fs::read_to_string(prefix.join(".catkin")).unwrap_or_default();
     listed
@@ -47,7 +45,7 @@ fn sources(prefix: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Directories at or below `root` that hold the package.
+/// Returns the directories at or below `root` that contain the package.
 fn packages(root: &Path, package: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut open = VecDeque::from([(root.to_owned(), 0)]);
@@ -74,7 +72,7 @@ fn packages(root: &Path, package: &str) -> Vec<PathBuf> {
 mod tests {
     use super::super::find;
     use super::super::tests::executable;
-    use crate::arguments::Node;
+    use crate::arguments::NodeArgs;
 
     #[test]
     fn the_next_workspace_is_found_and_the_stub_is_not() {
@@ -85,7 +83,7 @@ mod tests {
             std::fs::create_dir_all(prefix.join("share/a_package_of_the_test")).unwrap();
             std::fs::write(prefix.join(".catkin"), "").unwrap();
         }
-        let node = Node {
+        let node = NodeArgs {
             package: "a_package_of_the_test".into(),
             node: "node".into(),
             share: stub.join("share/a_package_of_the_test"),
@@ -111,7 +109,7 @@ mod tests {
             "<package><name>a_package_of_the_test</name></package>",
         )
         .unwrap();
-        let node = Node {
+        let node = NodeArgs {
             package: "a_package_of_the_test".into(),
             node: "node.py".into(),
             share: root.path().join("stub/share/a_package_of_the_test"),

@@ -1,4 +1,5 @@
-//! The robot's own key (ECDSA, P-256): made here, and of it nothing leaves but its public half, with requests that it has signed.
+//! The robot's private key (ECDSA, P-256), generated here. Only its public half leaves the robot, in requests signed
+//! with the key.
 
 use std::io::Read;
 use std::os::unix::fs::PermissionsExt;
@@ -10,77 +11,85 @@ use ring::signature::{ECDSA_P256_SHA256_ASN1_SIGNING, EcdsaKeyPair};
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
 
-use super::{about, request, write_whole};
+use super::{file_error, request, write_atomically};
 
-/// The key.
-pub struct Key {
+/// The private key of this robot.
+pub struct RobotKey {
     pair: EcdsaKeyPair,
     /// PKCS #8 (RFC 5958).
     written: PrivatePkcs8KeyDer<'static>,
 }
 
-impl Key {
-    /// Reads a key that nobody else can.
-    pub fn read(path: &Path) -> anyhow::Result<Key> {
+impl RobotKey {
+    /// Reads a key that no other user can read.
+    pub fn read(path: &Path) -> anyhow::Result<RobotKey> {
         let mut file = std::fs::File::open(path).map_err(|error| match error.kind() {
-            std::io::ErrorKind::PermissionDenied => about(
+            std::io::ErrorKind::PermissionDenied => file_error(
                 path,
-                "this robot's key cannot be read by this user; run the nodes as the user who paired the robot, or pair it as this one: \
-                 cloudroid-stub pair 'LINE'",
+                "this user cannot read this robot's key; run the nodes as the user who paired the robot, or pair it as \
+                    this user: cloudroid-stub pair 'LINE'",
             ),
-            _ => about(path, format!("this robot's key cannot be read: {error}; pair the robot again: cloudroid-stub pair 'LINE'")),
+            _ => file_error(path, format!("cannot read this robot's key: {error}; pair the robot again: cloudroid-stub \
+                pair 'LINE'")),
         })?;
         let mode = file
             .metadata()
-            .map_err(|error| about(path, error))?
+            .map_err(|error| file_error(path, error))?
             .permissions()
             .mode();
         if mode & 0o077 != 0 {
-            return Err(about(
+            return Err(file_error(
                 path,
                 format!(
-                    "others can read this robot's key; if nobody has: chmod 600 {}",
+                    "other users can read this robot's key; restrict it with: chmod 600 {}",
                     path.display()
                 ),
             ));
         }
         let mut text = String::new();
         file.read_to_string(&mut text)
-            .map_err(|error| about(path, error))?;
+            .map_err(|error| file_error(path, error))?;
         let read = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes());
-        let key = read.map_err(|error| error.to_string()).and_then(Key::of);
+        let key = read
+            .map_err(|error| error.to_string())
+            .and_then(RobotKey::from_pkcs8);
         key.map_err(|error| {
-            about(path, format!("this is no key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"))
+            file_error(
+                path,
+                format!(
+                    "not a valid key ({error}); remove it, and pair the robot again: cloudroid-stub pair 'LINE'"
+                ),
+            )
         })
     }
 
-    fn of(written: PrivatePkcs8KeyDer<'static>) -> Result<Key, String> {
+    fn from_pkcs8(written: PrivatePkcs8KeyDer<'static>) -> Result<RobotKey, String> {
         let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
         let pair = EcdsaKeyPair::from_pkcs8(kind, written.secret_pkcs8_der(), &random)
             .map_err(|error| error.to_string())?;
-        Ok(Key { pair, written })
+        Ok(RobotKey { pair, written })
     }
 
-    /// Makes one.
-    pub fn make(path: &Path) -> anyhow::Result<Key> {
-        let unmade = |error: &dyn std::fmt::Display| anyhow!("cannot make a key: {error}");
+    /// Generates a key and writes it to the file.
+    pub fn generate(path: &Path) -> anyhow::Result<RobotKey> {
+        let unmade = |error: &dyn std::fmt::Display| anyhow!("cannot create a key: {error}");
         let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
         let made = EcdsaKeyPair::generate_pkcs8(kind, &random).map_err(|error| unmade(&error))?;
         let written = PrivatePkcs8KeyDer::from(made.as_ref().to_vec());
-        let key = Key::of(written).map_err(|error| unmade(&error))?;
+        let key = RobotKey::from_pkcs8(written).map_err(|error| unmade(&error))?;
         let text = request::pem("PRIVATE KEY", key.written.secret_pkcs8_der());
-        write_whole(path, &text)?;
+        write_atomically(path, &text)?;
         Ok(key)
     }
 
-    /// A request for a certificate, in PEM.
-    pub fn request(&self, robot: &str) -> anyhow::Result<String> {
+    /// Returns a certificate request in PEM.
+    pub fn certificate_request(&self, robot: &str) -> anyhow::Result<String> {
         request::request(&self.pair, &format!("robot:{robot}"))
-            .map_err(|error| anyhow!("cannot make a request for a certificate: {error}"))
+            .map_err(|error| anyhow!("cannot create a certificate request: {error}"))
     }
 
-    /// For TLS.
-    pub fn to_show(&self) -> PrivateKeyDer<'static> {
+    /// Returns the private key for TLS.
+    pub fn private_key(&self) -> PrivateKeyDer<'static> {
         self.written.clone_key().into()
     }
 }

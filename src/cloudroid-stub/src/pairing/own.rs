@@ -1,4 +1,4 @@
-//! The directory of a robot's own key and certificates.
+//! The directory of a robot's key and certificates.
 
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -10,31 +10,32 @@ use tls::KnownServers;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 
-use super::key::Key;
-use super::{about, write_whole};
+use super::key::RobotKey;
+use super::{file_error, write_atomically};
 use crate::address::Address;
 
-/// The directory.
+/// The directory with the key and certificates of this robot.
 #[derive(Debug, Clone)]
-pub struct Own(pub PathBuf);
+pub struct IdentityDirectory(pub PathBuf);
 
 /// A certificate of this robot for one server.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Certificate {
-    /// The name that the robot is paired by.
+pub struct PairedCertificate {
+    /// Name that the robot is paired under.
     pub robot: String,
-    /// When it came, by the robot's clock: milliseconds since 1970. The server's may tell another time.
+    /// Time at which the certificate was received, by the robot's clock, in milliseconds since 1970. The server's clock
+    /// may differ.
     pub received: u64,
-    /// For how long it is good, in milliseconds.
+    /// Validity in milliseconds.
     pub lifetime: u64,
     /// The certificate, in PEM.
     pub certificate: String,
 }
 
-/// What a server answers.
+/// Answer of a server to a pairing or renewal.
 #[derive(Deserialize)]
-struct Answer {
+struct CertificateAnswer {
     robot: String,
     certificate: String,
     issued: u64,
@@ -47,11 +48,11 @@ pub fn now() -> u64 {
         .map_or(0, |since| since.as_millis() as u64)
 }
 
-impl Certificate {
-    /// Reads what a server has answered.
-    pub fn read(answer: &[u8]) -> anyhow::Result<Certificate> {
-        let answer: Answer = serde_json::from_slice(answer)?;
-        let read = Certificate {
+impl PairedCertificate {
+    /// Parses the answer of a server.
+    pub fn read(answer: &[u8]) -> anyhow::Result<PairedCertificate> {
+        let answer: CertificateAnswer = serde_json::from_slice(answer)?;
+        let read = PairedCertificate {
             robot: answer.robot,
             received: now(),
             lifetime: answer.expires.saturating_sub(answer.issued),
@@ -61,23 +62,23 @@ impl Certificate {
         Ok(read)
     }
 
-    /// For TLS.
+    /// Returns the certificate chain for TLS.
     pub fn chain(&self) -> anyhow::Result<Vec<CertificateDer<'static>>> {
         let chain = CertificateDer::pem_slice_iter(self.certificate.as_bytes())
             .collect::<Result<Vec<_>, _>>()
-            .context("the certificate is no PEM")?;
-        anyhow::ensure!(!chain.is_empty(), "there is no certificate");
+            .context("the certificate is not in PEM format")?;
+        anyhow::ensure!(!chain.is_empty(), "no certificate found");
         Ok(chain)
     }
 
-    /// How long it is good.
+    /// Returns the validity of the certificate.
     pub fn lifetime(&self) -> Duration {
         Duration::from_millis(self.lifetime)
     }
 
-    /// How long until it is to be renewed: at two thirds of its life. At once, too, where the robot's clock was set back, since
-    /// nobody knows how long ago it came.
-    pub fn due(&self, now: u64) -> Duration {
+    /// Returns the time until the certificate is to be renewed, at two thirds of its validity. Zero if the robot's
+    /// clock was set back, because its age is then unknown.
+    pub fn renewal_delay(&self, now: u64) -> Duration {
         let Some(age) = now.checked_sub(self.received) else {
             return Duration::ZERO;
         };
@@ -85,79 +86,89 @@ impl Certificate {
     }
 }
 
-impl Own {
-    /// The robot's key.
-    pub fn key(&self) -> PathBuf {
+impl IdentityDirectory {
+    /// Returns the path of the robot's key.
+    pub fn key_path(&self) -> PathBuf {
         self.0.join("robot.key")
     }
 
-    /// The file of the certificate for a server.
-    fn of_server(&self, address: &Address) -> PathBuf {
+    /// Returns the path of the certificate for a server.
+    fn certificate_path(&self, address: &Address) -> PathBuf {
         self.0
             .join("paired")
-            .join(format!("{}.toml", address.known_as()))
+            .join(format!("{}.toml", address.known_server_name()))
     }
 
-    /// Servers whose certificates are known.
+    /// Returns the servers whose certificates are known.
     pub fn known_servers(&self) -> KnownServers {
-        KnownServers::at(self.0.join("known_servers"))
+        KnownServers::new(self.0.join("known_servers"))
     }
 
-    /// The key, made where there is none yet.
-    pub fn make_key(&self) -> anyhow::Result<Key> {
-        let path = self.key();
+    /// Loads the key, or generates it if there is none.
+    pub fn load_or_create_key(&self) -> anyhow::Result<RobotKey> {
+        let path = self.key_path();
         match path.symlink_metadata() {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Key::make(&path),
-            _ => Key::read(&path),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => RobotKey::generate(&path),
+            _ => RobotKey::read(&path),
         }
     }
 
-    /// The certificate for a server; none where the robot is not paired with it.
-    pub fn certificate(&self, address: &Address) -> anyhow::Result<Option<Certificate>> {
-        let path = self.of_server(address);
+    /// Loads the certificate for a server; `None` if the robot is not paired with it.
+    pub fn load_certificate(&self, address: &Address) -> anyhow::Result<Option<PairedCertificate>> {
+        let path = self.certificate_path(address);
         let text = match std::fs::read_to_string(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            // Nothing is kept there for this user.
+            // This user has no such directory.
             Err(error) if error.kind() == std::io::ErrorKind::NotADirectory => return Ok(None),
             Err(error) => {
                 let words = format!(
-                    "this robot's certificate cannot be read: {error}; run the nodes as the user who paired the robot"
+                    "cannot read this robot's certificate: {error}; run the nodes as the user who paired the robot"
                 );
-                return Err(about(&path, words));
+                return Err(file_error(&path, words));
             }
         };
         toml::from_str(&text).map(Some).map_err(|error| {
-            let words = format!("this is no certificate as cloudroid-stub pair writes it ({}); pair the robot again", error.message());
-            about(&path, words)
+            let words = format!(
+                "not a certificate file of cloudroid-stub pair ({}); pair the robot again",
+                error.message()
+            );
+            file_error(&path, words)
         })
     }
 
-    /// Keeps a certificate in place of the one before, which stays until this one is written.
-    pub fn keep(&self, address: &Address, certificate: &Certificate) -> anyhow::Result<()> {
-        write_whole(&self.of_server(address), &toml::to_string(certificate)?)
+    /// Stores a certificate, replacing the previous one atomically.
+    pub fn store_certificate(
+        &self,
+        address: &Address,
+        certificate: &PairedCertificate,
+    ) -> anyhow::Result<()> {
+        write_atomically(
+            &self.certificate_path(address),
+            &toml::to_string(certificate)?,
+        )
     }
 
-    /// Keeps the key that a server signs stubs by, as install.sh reads it.
+    /// Adds the key that a server signs stubs with to the file that install.sh reads.
     pub fn trust_signer(&self, key: &str) -> anyhow::Result<()> {
         let path = self.0.join("servers.pub");
         let line = format!("cloudroid ssh-ed25519 {key}");
         let mut text = match std::fs::read_to_string(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => String::new(),
-            Err(error) => return Err(about(&path, error)),
+            Err(error) => return Err(file_error(&path, error)),
         };
         if text.lines().any(|known| known == line) {
             return Ok(());
         }
         text.push_str(&line);
         text.push('\n');
-        write_whole(&path, &text)
+        write_atomically(&path, &text)
     }
 
-    /// The right to renew the certificate for a server; none while another stub does.
-    pub fn lock(&self, address: &Address) -> Option<Flock<std::fs::File>> {
-        let path = self.of_server(address).with_extension("lock");
+    /// Acquires the lock to renew the certificate for a server; `None` while another stub holds it.
+    pub fn lock_renewal(&self, address: &Address) -> Option<Flock<std::fs::File>> {
+        let path = self.certificate_path(address).with_extension("lock");
         let file = std::fs::OpenOptions::new()
             .write(true)
             .create(true)

@@ -1,5 +1,5 @@
-//! Renews the robot's certificate, at two thirds of its life, over a connection that shows it. The stubs of a robot do it one at a
-//! time, and each takes what another has brought.
+//! Renews the robot's certificate, at two thirds of its validity, over a connection that presents it. The stubs of a
+//! robot take turns, and each uses the certificate that another has fetched.
 
 use std::time::Duration;
 
@@ -7,36 +7,36 @@ use anyhow::{Context, bail};
 use serde_json::json;
 use tokio::time::sleep;
 
-use super::key::Key;
-use super::of;
-use super::own::{Certificate, Own, now};
+use super::key::RobotKey;
+use super::locate_identity;
+use super::own::{IdentityDirectory, PairedCertificate, now};
 use crate::address::Address;
 use crate::config::Config;
 use crate::http;
 use crate::resolver;
 
-/// It is looked at least so often whether there is anything to renew: a robot may be paired, or its clock be set, while the stub runs.
+/// Maximum interval between checks: while the stub runs, the robot may be paired or its clock be set.
 const LATEST: Duration = Duration::from_secs(600);
-/// After a renewal that failed: a twelfth of the certificate's life, between these.
+/// Delay after a failed renewal: a twelfth of the certificate's validity, at least this and at most `LATEST`.
 const SOONEST: Duration = Duration::from_millis(200);
 const PAUSES: u32 = 12;
 
-/// Renews the certificate for the server of a configuration whenever it is time; never comes back.
-pub async fn keep_renewed(config: Config) {
-    let Some((own, address)) = of(&config) else {
+/// Renews the certificate for the configured server whenever it is due; never returns.
+pub async fn run_renewal(config: Config) {
+    let Some((own, address)) = locate_identity(&config) else {
         return std::future::pending().await;
     };
     let mut told = String::new();
     loop {
-        let certificate = match own.certificate(&address) {
+        let certificate = match own.load_certificate(&address) {
             Ok(Some(certificate)) => certificate,
-            // What is wrong with it is said where the server is connected to.
+            // Problems with it are reported when the server is connected to.
             Ok(None) | Err(_) => {
                 sleep(LATEST).await;
                 continue;
             }
         };
-        let due = certificate.due(now());
+        let due = certificate.renewal_delay(now());
         if due > Duration::ZERO {
             sleep(due.min(LATEST)).await;
             continue;
@@ -54,9 +54,7 @@ pub async fn keep_renewed(config: Config) {
             Err(error) => {
                 let words = format!("{error:#}");
                 if words != told {
-                    tracing::warn!(
-                        "the certificate of this robot cannot be renewed: {words}; trying again"
-                    );
+                    tracing::warn!("cannot renew this robot's certificate: {words}; trying again");
                     told = words;
                 }
                 sleep((certificate.lifetime() / PAUSES).clamp(SOONEST, LATEST)).await;
@@ -65,30 +63,30 @@ pub async fn keep_renewed(config: Config) {
     }
 }
 
-/// Asks for another certificate; false where another stub does, or has.
+/// Requests a new certificate; returns false if another stub does so, or has done so.
 async fn renew(
     config: &Config,
-    own: &Own,
+    own: &IdentityDirectory,
     address: &Address,
-    old: &Certificate,
+    old: &PairedCertificate,
 ) -> anyhow::Result<bool> {
-    let Some(_alone) = own.lock(address) else {
+    let Some(_alone) = own.lock_renewal(address) else {
         sleep(SOONEST).await;
         return Ok(false);
     };
-    if own.certificate(address)?.as_ref() != Some(old) {
+    if own.load_certificate(address)?.as_ref() != Some(old) {
         return Ok(false);
     }
-    let key = Key::read(&own.key())?;
-    let server = http::Server {
+    let key = RobotKey::read(&own.key_path())?;
+    let server = http::HttpServer {
         ip: resolver::resolve(&address.host).await?,
         address: address.clone(),
         trust: config.trust()?,
         only: None,
     };
-    let asks = json!({ "request": key.request(&old.robot)? });
+    let asks = json!({ "request": key.certificate_request(&old.robot)? });
     let answer = http::post(&server, "/api/v1/renew", &asks).await;
-    let answer = answer.map_err(|error| match crate::stream::refused_certificate(&error) {
+    let answer = answer.map_err(|error| match crate::stream::certificate_refusal(&error) {
         Some(words) => anyhow::anyhow!("{} refuses this robot: {words}", config.server),
         None => error.into(),
     })?;
@@ -97,11 +95,11 @@ async fn renew(
             "{} answers {}: {}",
             config.server,
             answer.status,
-            answer.words()
+            answer.problem_text()
         );
     }
-    let new = Certificate::read(&answer.body)
-        .with_context(|| format!("what {} answers is no certificate", config.server))?;
-    own.keep(address, &new)?;
+    let new = PairedCertificate::read(&answer.body)
+        .with_context(|| format!("the response of {} is not a certificate", config.server))?;
+    own.store_certificate(address, &new)?;
     Ok(true)
 }

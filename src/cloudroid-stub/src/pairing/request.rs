@@ -1,6 +1,6 @@
-//! A request for a certificate (PKCS #10, RFC 2986), written in DER (X.690, section 10): a name and a key of P-256 (RFC 5480), signed
-//! by the key. No more is asked for; everything else of a certificate the server decides. Crates that write them want a later
-//! compiler than robots' programs are built with.
+//! A certificate request (PKCS #10, RFC 2986) in DER (X.690, section 10): a name and a P-256 key (RFC 5480), signed
+//! with the key. It asks for nothing else; the server decides everything else about the certificate. Crates that write
+//! such requests require a later compiler than robots' programs are built with.
 
 use ring::error::Unspecified;
 use ring::rand::SystemRandom;
@@ -15,17 +15,17 @@ const SEQUENCE: u8 = 0x30;
 const SET: u8 = 0x31;
 const ATTRIBUTES: u8 = 0xa0;
 
-/// Object identifiers, encoded: id-at-commonName (2.5.4.3), id-ecPublicKey (1.2.840.10045.2.1), secp256r1 (1.2.840.10045.3.1.7) and
-/// ecdsa-with-SHA256 (1.2.840.10045.4.3.2).
+/// Encoded object identifiers: id-at-commonName (2.5.4.3), id-ecPublicKey (1.2.840.10045.2.1), secp256r1
+/// (1.2.840.10045.3.1.7) and ecdsa-with-SHA256 (1.2.840.10045.4.3.2).
 const COMMON_NAME: &[u8] = &[0x55, 0x04, 0x03];
 const EC_PUBLIC_KEY: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x02, 0x01];
 const P256: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x03, 0x01, 0x07];
 const ECDSA_WITH_SHA256: &[u8] = &[0x2a, 0x86, 0x48, 0xce, 0x3d, 0x04, 0x03, 0x02];
 
-/// Letters of a line (RFC 7468, section 2).
+/// Characters per line (RFC 7468, section 2).
 const LINE: usize = 64;
 
-/// Tag, length and contents.
+/// Encodes tag, length and contents.
 fn element(tag: u8, contents: &[&[u8]]) -> Vec<u8> {
     let contents = contents.concat();
     let length = contents.len().to_be_bytes();
@@ -42,7 +42,7 @@ fn element(tag: u8, contents: &[&[u8]]) -> Vec<u8> {
     written
 }
 
-/// All of its bits.
+/// Encodes a bit string without unused bits.
 fn bits(bytes: &[u8]) -> Vec<u8> {
     element(BIT_STRING, &[&[0], bytes])
 }
@@ -51,7 +51,7 @@ fn identifier(encoded: &[u8]) -> Vec<u8> {
     element(OBJECT_IDENTIFIER, &[encoded])
 }
 
-/// A request of a key (P-256) for a common name, in PEM.
+/// Returns a certificate request for a P-256 key and a common name, in PEM.
 pub fn request(key: &EcdsaKeyPair, name: &str) -> Result<String, Unspecified> {
     let name = element(UTF8_STRING, &[name.as_bytes()]);
     let named = element(SEQUENCE, &[&identifier(COMMON_NAME), &name]);
@@ -69,7 +69,7 @@ pub fn request(key: &EcdsaKeyPair, name: &str) -> Result<String, Unspecified> {
     Ok(pem("CERTIFICATE REQUEST", &signed))
 }
 
-/// Textual encoding (RFC 7468).
+/// Returns the textual encoding (RFC 7468).
 pub fn pem(label: &str, der: &[u8]) -> String {
     let text = base64_simd::STANDARD.encode_to_string(der);
     let mut written = format!("-----BEGIN {label}-----\n");
@@ -92,11 +92,11 @@ mod tests {
         let (kind, random) = (&ECDSA_P256_SHA256_ASN1_SIGNING, SystemRandom::new());
         let made = EcdsaKeyPair::generate_pkcs8(kind, &random).expect("made");
         let key = EcdsaKeyPair::from_pkcs8(kind, made.as_ref(), &random).expect("a key");
-        // Lengths of one byte, of two and of three.
+        // Lengths encoded in one, two and three bytes.
         for length in [1, 40, 60, 127, 128, 300] {
             let name = "n".repeat(length);
             let text = request(&key, &name).expect("signed");
-            // Its signature is verified, too.
+            // Reading verifies the signature, too.
             let read = CertificateSigningRequestParams::from_pem(&text).expect("read");
             let names: Vec<_> = read.params.distinguished_name.iter().collect();
             let [(DnType::CommonName, rcgen::DnValue::Utf8String(found))] = names[..] else {

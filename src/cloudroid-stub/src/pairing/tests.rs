@@ -2,9 +2,9 @@ use std::os::unix::fs::PermissionsExt;
 
 use super::*;
 
-fn own() -> (tempfile::TempDir, Own) {
+fn test_directory() -> (tempfile::TempDir, IdentityDirectory) {
     let place = tempfile::tempdir().unwrap();
-    let own = Own(place.path().join("cloudroid"));
+    let own = IdentityDirectory(place.path().join("cloudroid"));
     (place, own)
 }
 
@@ -16,12 +16,12 @@ fn address() -> Address {
     Address::parse("wss://lab.example:9090").unwrap()
 }
 
-fn certificate() -> Certificate {
+fn certificate() -> PairedCertificate {
     let key = rcgen::KeyPair::generate().unwrap();
     let made = rcgen::CertificateParams::default()
         .self_signed(&key)
         .unwrap();
-    Certificate {
+    PairedCertificate {
         robot: "r1".into(),
         received: 10_000,
         lifetime: 9_000,
@@ -31,33 +31,43 @@ fn certificate() -> Certificate {
 
 #[test]
 fn a_key_is_made_once_and_is_its_owners_alone() {
-    let (_place, own) = own();
-    let made = own.make_key().unwrap().to_show();
-    assert_eq!(own.make_key().unwrap().to_show(), made);
-    assert_eq!((mode(&own.key()), mode(&own.0)), (0o600, 0o700));
-    let request = Key::read(&own.key()).unwrap().request("r1").unwrap();
+    let (_place, own) = test_directory();
+    let made = own.load_or_create_key().unwrap().private_key();
+    assert_eq!(own.load_or_create_key().unwrap().private_key(), made);
+    assert_eq!((mode(&own.key_path()), mode(&own.0)), (0o600, 0o700));
+    let request = RobotKey::read(&own.key_path())
+        .unwrap()
+        .certificate_request("r1")
+        .unwrap();
     assert!(request.contains("BEGIN CERTIFICATE REQUEST"), "{request}");
 }
 
 #[test]
 fn a_key_that_others_can_read_or_nobody_is_refused_with_what_to_type() {
-    let (_place, own) = own();
-    own.make_key().unwrap();
+    let (_place, own) = test_directory();
+    own.load_or_create_key().unwrap();
     for open in [0o640, 0o604, 0o660, 0o644] {
-        std::fs::set_permissions(own.key(), PermissionsExt::from_mode(open)).unwrap();
-        let refused = own.make_key().err().expect("open").to_string();
-        let command = format!("chmod 600 {}", own.key().display());
+        std::fs::set_permissions(own.key_path(), PermissionsExt::from_mode(open)).unwrap();
+        let refused = own.load_or_create_key().err().expect("open").to_string();
+        let command = format!("chmod 600 {}", own.key_path().display());
         assert!(refused.contains(&command), "{refused}");
     }
-    std::fs::set_permissions(own.key(), PermissionsExt::from_mode(0o600)).unwrap();
-    std::fs::write(own.key(), "rubbish").unwrap();
-    let refused = own.make_key().err().expect("no key").to_string();
+    std::fs::set_permissions(own.key_path(), PermissionsExt::from_mode(0o600)).unwrap();
+    std::fs::write(own.key_path(), "rubbish").unwrap();
+    let refused = own
+        .load_or_create_key()
+        .err()
+        .expect("not a valid key")
+        .to_string();
     assert!(
-        refused.contains("no key") && refused.contains("pair the robot again"),
+        refused.contains("not a valid key") && refused.contains("pair the robot again"),
         "{refused}"
     );
-    std::fs::remove_file(own.key()).unwrap();
-    let refused = Key::read(&own.key()).err().expect("none").to_string();
+    std::fs::remove_file(own.key_path()).unwrap();
+    let refused = RobotKey::read(&own.key_path())
+        .err()
+        .expect("none")
+        .to_string();
     assert!(
         refused.contains("robot.key") && refused.contains("pair the robot again"),
         "{refused}"
@@ -66,15 +76,18 @@ fn a_key_that_others_can_read_or_nobody_is_refused_with_what_to_type() {
 
 #[test]
 fn a_certificate_is_kept_by_server_and_renewed_at_two_thirds_of_its_life() {
-    let (_place, own) = own();
-    assert_eq!(own.certificate(&address()).unwrap(), None);
+    let (_place, own) = test_directory();
+    assert_eq!(own.load_certificate(&address()).unwrap(), None);
     let kept = certificate();
-    own.keep(&address(), &kept).unwrap();
-    assert_eq!(own.certificate(&address()).unwrap(), Some(kept.clone()));
+    own.store_certificate(&address(), &kept).unwrap();
+    assert_eq!(
+        own.load_certificate(&address()).unwrap(),
+        Some(kept.clone())
+    );
     let other = Address::parse("wss://lab.example:9091").unwrap();
-    assert_eq!(own.certificate(&other).unwrap(), None);
-    let due = |now| kept.due(now).as_millis();
-    // The clock was set back, in the last case.
+    assert_eq!(own.load_certificate(&other).unwrap(), None);
+    let due = |now| kept.renewal_delay(now).as_millis();
+    // In the last case the clock was set back.
     assert_eq!(
         [
             due(10_000),
@@ -91,7 +104,7 @@ fn a_certificate_is_kept_by_server_and_renewed_at_two_thirds_of_its_life() {
     assert_eq!(left.len(), 1, "nothing half-made is left");
     for damaged in ["", "rubbish", "robot = 3"] {
         std::fs::write(&path, damaged).unwrap();
-        let refused = own.certificate(&address()).unwrap_err().to_string();
+        let refused = own.load_certificate(&address()).unwrap_err().to_string();
         assert!(refused.contains("pair the robot again"), "{refused}");
     }
 }
@@ -99,7 +112,7 @@ fn a_certificate_is_kept_by_server_and_renewed_at_two_thirds_of_its_life() {
 #[test]
 fn what_is_no_answer_is_no_certificate() {
     let good = serde_json::json!({"robot": "r", "certificate": certificate().certificate, "issued": 1, "expires": 5});
-    let read = |value: &serde_json::Value| Certificate::read(value.to_string().as_bytes());
+    let read = |value: &serde_json::Value| PairedCertificate::read(value.to_string().as_bytes());
     assert_eq!(read(&good).unwrap().lifetime, 4);
     for (key, value) in [
         ("certificate", "rubbish"),
@@ -114,7 +127,7 @@ fn what_is_no_answer_is_no_certificate() {
 
 #[test]
 fn signers_are_kept_once_each() {
-    let (_place, own) = own();
+    let (_place, own) = test_directory();
     for key in ["AAAA1", "AAAA2", "AAAA1"] {
         own.trust_signer(key).unwrap();
     }
@@ -127,8 +140,8 @@ fn signers_are_kept_once_each() {
 
 #[test]
 fn a_robot_that_is_paired_has_the_name_that_it_was_paired_by() {
-    let (place, own) = own();
-    own.keep(&address(), &certificate()).unwrap();
+    let (place, own) = test_directory();
+    own.store_certificate(&address(), &certificate()).unwrap();
     let settings = |server: &str, more: &str| -> Config {
         let text = format!(
             "server = {server:?}\nservice = 's'\nidentity = {:?}\n{more}",
@@ -137,21 +150,21 @@ fn a_robot_that_is_paired_has_the_name_that_it_was_paired_by() {
         toml::from_str(&text).unwrap()
     };
     let paired = settings("wss://lab.example:9090", "");
-    assert_eq!(paired.robot(), "r1");
+    assert_eq!(paired.robot_id(), "r1");
     assert_eq!(
-        settings("wss://lab.example:9090", "robot = 'r2'").robot(),
+        settings("wss://lab.example:9090", "robot = 'r2'").robot_id(),
         "r2"
     );
-    // Without TLS nothing is shown, and nobody asks.
+    // Without TLS no certificate is requested or presented.
     assert!(
-        identity(&settings("ws://lab.example:9090", ""))
+        load_identity(&settings("ws://lab.example:9090", ""))
             .unwrap()
             .is_none()
     );
-    // The key is gone.
-    let refused = identity(&paired).unwrap_err().to_string();
+    // The key is missing.
+    let refused = load_identity(&paired).unwrap_err().to_string();
     assert!(refused.contains("robot.key"), "{refused}");
-    own.make_key().unwrap();
-    assert!(identity(&paired).unwrap().is_some());
+    own.load_or_create_key().unwrap();
+    assert!(load_identity(&paired).unwrap().is_some());
     drop(place);
 }

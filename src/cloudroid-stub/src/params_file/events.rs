@@ -1,18 +1,18 @@
-//! YAML as it is read from its beginning to its end, each part with its line.
+//! YAML events in the order of the text, each with its line.
 
 use saphyr_parser::{Event, Parser, StrInput};
 
-/// What is wrong with a text.
+/// A syntax or content error in a text.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
-    /// Counted from 1.
+    /// Line number, starting at 1.
     pub line: usize,
-    /// The reason.
+    /// Reason for the error.
     pub reason: String,
 }
 
 impl Problem {
-    /// In this line, for this reason.
+    /// Creates an error for this line and reason.
     pub fn new(line: usize, reason: impl Into<String>) -> Problem {
         Problem {
             line,
@@ -21,16 +21,16 @@ impl Problem {
     }
 }
 
-/// The parts of a text.
-pub struct Events<'a>(Parser<'a, StrInput<'a>>);
+/// A reader of the YAML events in a text.
+pub struct YamlEvents<'a>(Parser<'a, StrInput<'a>>);
 
-impl<'a> Events<'a> {
-    /// Those of this text.
-    pub fn of(text: &'a str) -> Events<'a> {
-        Events(Parser::new_from_str(text))
+impl<'a> YamlEvents<'a> {
+    /// Creates a reader of this text.
+    pub fn new(text: &'a str) -> YamlEvents<'a> {
+        YamlEvents(Parser::new_from_str(text))
     }
 
-    /// The next one, and its line; at the end [`Event::StreamEnd`] again and again.
+    /// Returns the next event and its line; after the end, always [`Event::StreamEnd`].
     pub fn next(&mut self) -> Result<(Event<'a>, usize), Problem> {
         match self.0.next_event() {
             Some(Ok((event, span))) => Ok((event, span.start.line())),

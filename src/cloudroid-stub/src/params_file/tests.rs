@@ -6,9 +6,9 @@ fn sections(text: &str) -> Sections {
     sections
 }
 
-/// What the node is given, as JSON.
-fn given(text: &str, node: &str) -> String {
-    serde_json::to_string(&sections(text).of(node)).expect("JSON")
+/// Returns the parameters of the node, as JSON.
+fn node_parameters(text: &str, node: &str) -> String {
+    serde_json::to_string(&sections(text).for_node(node)).expect("JSON")
 }
 
 #[test]
@@ -35,11 +35,11 @@ other:
     rate: 11
 ";
     assert_eq!(
-        given(text, "/see"),
+        node_parameters(text, "/see"),
         r#"{"gains.i":3,"gains.p":1.0,"names":["left","1"],"quoted":"yes","text":"two\nlines\n","use_sim_time":true}"#
     );
     assert_eq!(
-        given(text, "/front/see"),
+        node_parameters(text, "/front/see"),
         r#"{"gains.i":2,"gains.p":1.0,"rate":10,"use_sim_time":true}"#
     );
 }
@@ -57,12 +57,12 @@ fn a_file_that_launch_wrote_is_read() {
     - 2.0
 ";
     assert_eq!(
-        given(text, "/front/people"),
+        node_parameters(text, "/front/people"),
         r#"{"cloudroid.max":0.3,"n":"1","s":"on","x.y":[1.0,2.0]}"#
     );
 }
 
-/// As rclpy 7.1 takes them.
+/// Verified against rclpy 7.1.
 #[test]
 fn patterns_name_nodes() {
     for (nodes, node, named) in [
@@ -81,20 +81,20 @@ fn patterns_name_nodes() {
         ("c", "/a/c", false),
         ("a/c", "/a/c", true),
     ] {
-        assert_eq!(matches(nodes, node), named, "{nodes} {node}");
+        assert_eq!(matches_node(nodes, node), named, "{nodes} {node}");
     }
 }
 
 #[test]
 fn the_later_section_counts_and_a_pattern_stays_where_it_was_first_seen() {
-    let of = |text: &str| given(text, "/see");
+    let of = |text: &str| node_parameters(text, "/see");
     let value = |nodes: &str, value: u8| format!("{nodes}:\n  ros__parameters:\n    a: {value}\n");
     assert_eq!(of(&(value("see", 1) + &value("/**", 2))), r#"{"a":2}"#);
     assert_eq!(of(&(value("/**", 1) + &value("see", 2))), r#"{"a":2}"#);
     let mut sections = sections(&(value("/**", 1) + &value("see", 2)));
-    // As -p a:=3 behind the file: it is of /**, which comes before the node's own.
+    // Equivalent to `-p a:=3` after the file: it belongs to /**, which comes before the node's own section.
     sections.set("/**", "a".into(), ParamValue::Int(3));
-    assert_eq!(sections.of("/see")["a"], ParamValue::Int(2));
+    assert_eq!(sections.for_node("/see")["a"], ParamValue::Int(2));
     assert_eq!(
         of(&(value("see", 1) + "---\n" + &value("see", 4))),
         r#"{"a":4}"#
@@ -104,54 +104,50 @@ fn the_later_section_counts_and_a_pattern_stays_where_it_was_first_seen() {
     }
 }
 
-/// Each of these ends a node of rclpy 7.1 with an error, too, but for the nested list.
+/// Each of these makes a node of rclpy 7.1 fail, too, except for the nested list.
 #[test]
 fn what_is_no_parameters_file_is_named_with_its_line() {
     let deep = "a: {".repeat(200);
     for (text, line, said) in [
-        ("see:\n  a: 1\n", 2, "a has a value before ros__parameters"),
-        ("see: 1\n", 1, "see has a value before"),
-        ("ros__parameters:\n  a: 1\n", 1, "below no name of a node"),
+        ("see:\n  a: 1\n", 2, "a has a value without ros__parameters"),
+        ("see: 1\n", 1, "see has a value without"),
+        ("ros__parameters:\n  a: 1\n", 1, "not below a node name"),
         (
             "see:\n  ros__parameters:\n    a:\n    b: 1\n",
             3,
-            "a: there is no value",
+            "a: the value is missing",
         ),
         (
             "see:\n  ros__parameters:\n    a: [1, 2.0]\n",
             3,
-            "a: a list holds values of one type",
+            "a: the values of a list must have one type",
         ),
         (
             "see:\n  ros__parameters:\n    a: [[1]]\n",
             3,
-            "a: a list holds values, and no lists",
+            "a: a list cannot contain lists",
         ),
         (
             "see:\n  ros__parameters:\n    a: &x 1\n    b: *x\n",
             4,
-            "b: ROS 2 reads no aliases",
+            "b: ROS 2 does not support aliases",
         ),
-        (
-            "see:\n  ros__parameters:\n",
-            2,
-            "nothing below ros__parameters",
-        ),
+        ("see:\n  ros__parameters:\n", 2, "ros__parameters is empty"),
         ("see:\n  ros__parameters:\n\ta: 1\n", 3, ""),
-        ("- 1\n", 1, "no name of a node"),
-        ("text\n", 1, "no name of a node"),
+        ("- 1\n", 1, "expected a node name"),
+        ("text\n", 1, "expected a node name"),
         (
             "s ee:\n  ros__parameters:\n    a: 1\n",
             1,
-            "\"s ee\" is no name of a node",
+            "\"s ee\" is not a valid node name",
         ),
         (
             "see:\n  ros__parameters: {[a]: 1}\n",
             2,
-            "a name stands before each colon",
+            "expected a name before each colon",
         ),
         ("see:\n  ros__parameters:\n    a: \"1\n", 0, ""),
-        (&deep, 1, "within each other"),
+        (&deep, 1, "nested groups"),
     ] {
         let problem = Sections::default().parse(text).expect_err(text);
         assert!(problem.reason.contains(said), "{text}: {problem:?}");

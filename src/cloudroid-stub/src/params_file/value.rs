@@ -1,9 +1,9 @@
-//! Values of parameters as rcl reads them from YAML: which type a scalar has follows from how it is written.
+//! Parameter values, read from YAML as rcl does: the type of a scalar follows from its notation.
 
 use ros::bus::ParamValue;
 use saphyr_parser::{Event, ScalarStyle, Tag};
 
-use super::events::{Events, Problem};
+use super::events::{Problem, YamlEvents};
 
 const TRUE: [&str; 11] = [
     "Y", "y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON",
@@ -12,21 +12,21 @@ const FALSE: [&str; 11] = [
     "N", "n", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF",
 ];
 
-/// The value in an argument `-p NAME:=VALUE`.
+/// Parses the value of an argument `-p NAME:=VALUE`.
 ///
 /// # Errors
-/// Why it is none.
-pub fn of_text(text: &str) -> Result<ParamValue, String> {
+/// The reason why it is not a value.
+pub fn parse_text(text: &str) -> Result<ParamValue, String> {
     let mut found = None;
-    let mut events = Events::of(text);
+    let mut events = YamlEvents::new(text);
     let mut read = || {
         loop {
             let (event, line) = events.next()?;
             match event {
                 Event::StreamStart | Event::DocumentStart(_) | Event::DocumentEnd => {}
                 Event::StreamEnd => return Ok(()),
-                event if found.is_none() => found = Some(of_event(event, line, &mut events)?),
-                _ => return Err(Problem::new(line, "it is more than one value")),
+                event if found.is_none() => found = Some(parse_event(event, line, &mut events)?),
+                _ => return Err(Problem::new(line, "expected a single value")),
             }
         }
     };
@@ -34,30 +34,30 @@ pub fn of_text(text: &str) -> Result<ParamValue, String> {
     found.ok_or_else(|| NO_VALUE.to_owned())
 }
 
-/// What is said where nothing stands.
-pub const NO_VALUE: &str = "there is no value; an empty text is written \"\"";
+/// Reason that is reported if the value is missing.
+pub const NO_VALUE: &str = "the value is missing; write an empty string as \"\"";
 
-/// The value that begins with this event.
-pub fn of_event(
+/// Parses the value that begins with this event.
+pub fn parse_event(
     event: Event<'_>,
     line: usize,
-    events: &mut Events<'_>,
+    events: &mut YamlEvents<'_>,
 ) -> Result<ParamValue, Problem> {
     match event {
         Event::Scalar(text, style, _, tag) => scalar(&text, style, tag.as_deref(), line),
         Event::SequenceStart(..) => list(events),
         Event::Alias(_) => Err(Problem::new(
             line,
-            "ROS 2 reads no aliases: write the value out",
+            "ROS 2 does not support aliases: write the value",
         )),
         _ => Err(Problem::new(
             line,
-            "a value is a number, a truth value, a text, or a list of such",
+            "expected a number, a boolean, a string, or a list of these",
         )),
     }
 }
 
-fn list(events: &mut Events<'_>) -> Result<ParamValue, Problem> {
+fn list(events: &mut YamlEvents<'_>) -> Result<ParamValue, Problem> {
     let mut items: Vec<ParamValue> = Vec::new();
     loop {
         let (event, line) = events.next()?;
@@ -65,10 +65,7 @@ fn list(events: &mut Events<'_>) -> Result<ParamValue, Problem> {
             Event::SequenceEnd => return Ok(ParamValue::List(items)),
             Event::Scalar(text, style, _, tag) => scalar(&text, style, tag.as_deref(), line)?,
             _ => {
-                return Err(Problem::new(
-                    line,
-                    "a list holds values, and no lists or groups",
-                ));
+                return Err(Problem::new(line, "a list cannot contain lists or groups"));
             }
         };
         let same =
@@ -76,7 +73,7 @@ fn list(events: &mut Events<'_>) -> Result<ParamValue, Problem> {
         if !items.first().is_none_or(same) {
             return Err(Problem::new(
                 line,
-                "a list holds values of one type; write 1.0 for a whole number among others",
+                "the values of a list must have one type; write 1.0 for a whole number among floating-point numbers",
             ));
         }
         items.push(item);
@@ -104,22 +101,22 @@ fn plain(text: &str) -> ParamValue {
     if TRUE.contains(&text) || FALSE.contains(&text) {
         return ParamValue::Bool(TRUE.contains(&text));
     }
-    if let Some(whole) = whole(text) {
+    if let Some(whole) = parse_integer(text) {
         return ParamValue::Int(whole);
     }
-    double(text).map_or_else(|| ParamValue::String(text.to_owned()), ParamValue::Double)
+    parse_double(text).map_or_else(|| ParamValue::String(text.to_owned()), ParamValue::Double)
 }
 
-fn signed(text: &str) -> (bool, &str) {
+fn split_sign(text: &str) -> (bool, &str) {
     match text.strip_prefix('-') {
         Some(rest) => (true, rest),
         None => (false, text.strip_prefix('+').unwrap_or(text)),
     }
 }
 
-/// As C reads it (`strtol` with base 0): `0x10` is 16 and `010` is 8.
-fn whole(text: &str) -> Option<i64> {
-    let (negative, digits) = signed(text);
+/// Parses an integer as C does (`strtol` with base 0): `0x10` is 16 and `010` is 8.
+fn parse_integer(text: &str) -> Option<i64> {
+    let (negative, digits) = split_sign(text);
     let hexadecimal = digits
         .strip_prefix("0x")
         .or_else(|| digits.strip_prefix("0X"));
@@ -135,9 +132,9 @@ fn whole(text: &str) -> Option<i64> {
     i64::try_from(if negative { -value } else { value }).ok()
 }
 
-/// As C reads it (`strtod`), and YAML's own infinities.
-fn double(text: &str) -> Option<f64> {
-    let (negative, rest) = signed(text);
+/// Parses a floating-point number as C does (`strtod`), and YAML's infinities.
+fn parse_double(text: &str) -> Option<f64> {
+    let (negative, rest) = split_sign(text);
     let sign = if negative { -1.0 } else { 1.0 };
     match rest {
         ".inf" | ".Inf" | ".INF" => return Some(sign * f64::INFINITY),
@@ -146,19 +143,19 @@ fn double(text: &str) -> Option<f64> {
     }
     let hexadecimal = rest.strip_prefix("0x").or_else(|| rest.strip_prefix("0X"));
     if let Some(digits) = hexadecimal {
-        return Some(sign * hexadecimal_double(digits)?);
+        return Some(sign * parse_hexadecimal_double(digits)?);
     }
     if rest.starts_with(['+', '-']) {
         return None;
     }
     let value: f64 = rest.parse().ok()?;
-    // What is too large for a double is a text to rcl.
+    // A number too large for a double is a string for rcl.
     let overflowed = value.is_infinite() && rest.contains(|c: char| c.is_ascii_digit());
     (!overflowed).then_some(sign * value)
 }
 
-/// `1.8p3` is 12.
-fn hexadecimal_double(text: &str) -> Option<f64> {
+/// Parses the digits after `0x`: `1.8p3` is 12.
+fn parse_hexadecimal_double(text: &str) -> Option<f64> {
     let (mantissa, exponent) = match text.split_once(['p', 'P']) {
         Some((mantissa, exponent)) => (mantissa, exponent.parse().ok()?),
         None => (text, 0),
@@ -180,7 +177,7 @@ fn hexadecimal_double(text: &str) -> Option<f64> {
 mod tests {
     use super::*;
 
-    /// All of these were given to rclpy 7.1, which took them for the same.
+    /// Verified against rclpy 7.1.
     #[test]
     fn scalars_have_the_type_that_rcl_gives_them() {
         use ParamValue::{Bool, Double, Int, String};
@@ -217,25 +214,25 @@ mod tests {
             ("''", text("")),
             ("+-1", text("+-1")),
         ] {
-            assert_eq!(of_text(written), Ok(value), "{written}");
+            assert_eq!(parse_text(written), Ok(value), "{written}");
         }
     }
 
     #[test]
     fn lists_are_of_one_type() {
-        let list = of_text("[1, 0x10]").expect("a list");
+        let list = parse_text("[1, 0x10]").expect("a list");
         let expected = [ParamValue::Int(1), ParamValue::Int(16)];
         assert_eq!(list, ParamValue::List(expected.into()));
-        assert_eq!(of_text("[]"), Ok(ParamValue::List(vec![])));
+        assert_eq!(parse_text("[]"), Ok(ParamValue::List(vec![])));
         for (text, said) in [
             ("[1, 2.0]", "one type"),
-            ("[[1]]", "no lists"),
-            ("{a: 1}", "a value is"),
-            ("", "no value"),
+            ("[[1]]", "cannot contain lists"),
+            ("{a: 1}", "expected a number"),
+            ("", "the value is missing"),
             ("\"", "quote"),
             ("[1, 2", "expected ',' or ']'"),
         ] {
-            let reason = of_text(text).expect_err(text);
+            let reason = parse_text(text).expect_err(text);
             assert!(reason.contains(said), "{text}: {reason}");
         }
     }

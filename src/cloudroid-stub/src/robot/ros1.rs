@@ -1,4 +1,4 @@
-//! Command lines of roslaunch: arguments, remaps, private parameters, and `__name:=` and the like.
+//! Command lines of roslaunch: arguments, remaps, private parameters, and special keys such as `__name:=`.
 
 use std::collections::BTreeMap;
 
@@ -6,14 +6,14 @@ use anyhow::{Context, bail};
 use ros::bus::RosVersion;
 use ros::ros1::names::{self, PeerUri};
 
-use super::{Place, Robot};
+use super::{LaunchedNode, RosLocation};
 use crate::network::Variable;
 
-/// Where the Master is when nothing is said.
+/// Default address of the Master.
 const MASTER: &str = "http://localhost:11311";
 
-/// As [`Robot::read`].
-pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<Robot> {
+/// Implements [`LaunchedNode::read`] for ROS 1.
+pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Result<LaunchedNode> {
     let set = |name| variable(name).filter(|value| !value.is_empty());
     let mut namespace = set("ROS_NAMESPACE").unwrap_or_default();
     let mut name = usual.to_owned();
@@ -31,19 +31,19 @@ pub fn read(argv: &[String], usual: &str, variable: Variable<'_>) -> anyhow::Res
         }
     }
     if name.contains('/') {
-        bail!("__name:={name} holds a slash; use __ns:= or ROS_NAMESPACE for the namespace");
+        bail!("__name:={name} contains a slash; use __ns:= or ROS_NAMESPACE for the namespace");
     }
     let node = names::canonical(&format!("{namespace}/{name}"));
     if !names::is_global(&node) {
-        bail!("{node:?} is not a name that ROS allows for a node");
+        bail!("{node:?} is not a valid ROS node name");
     }
     let place = PeerUri::parse(&master, "http")
         .with_context(|| format!("ROS_MASTER_URI is {master:?}; it should look like {MASTER}"))?;
     let mut original_argv = passed.clone();
     original_argv.push(format!("__name:={name}"));
-    Ok(Robot {
+    Ok(LaunchedNode {
         ros: RosVersion::One,
-        place: Place::Master {
+        place: RosLocation::Master {
             host: place.host,
             port: place.port,
             own,
@@ -62,7 +62,7 @@ mod tests {
 
     use super::*;
 
-    fn read(argv: &[&str], environment: &[(&str, &str)]) -> anyhow::Result<Robot> {
+    fn read(argv: &[&str], environment: &[(&str, &str)]) -> anyhow::Result<LaunchedNode> {
         let argv: Vec<String> = argv.iter().map(|&argument| argument.to_owned()).collect();
         super::read(&argv, "usual", &|name| {
             let found = environment.iter().find(|(variable, _)| *variable == name);
@@ -89,14 +89,14 @@ mod tests {
         assert_eq!(robot.node, "/front/people");
         assert_eq!(robot.argv, ["3", "image:=/camera/image", "_threshold:=2"]);
         assert_eq!(robot.original_argv[3..], ["__name:=people"]);
-        let place = Place::Master {
+        let place = RosLocation::Master {
             host: "brain".into(),
             port: 1234,
             own: None,
         };
         assert_eq!(robot.place, place);
         assert_eq!(
-            robot.for_the_cloud("p", "x", Path::new("")).namespace,
+            robot.to_cloud_node("p", "x", Path::new("")).namespace,
             "/front"
         );
     }
@@ -104,7 +104,7 @@ mod tests {
     #[test]
     fn without_any_the_usual_ones_hold() {
         let robot = read(&[], &[("ROS_IP", "10.0.0.2")]).unwrap();
-        let place = Place::Master {
+        let place = RosLocation::Master {
             host: "localhost".into(),
             port: 11311,
             own: Some("10.0.0.2".into()),
@@ -113,7 +113,7 @@ mod tests {
             (robot.node.as_str(), robot.place.clone()),
             ("/usual", place)
         );
-        assert_eq!(robot.for_the_cloud("p", "x", Path::new("")).namespace, "");
+        assert_eq!(robot.to_cloud_node("p", "x", Path::new("")).namespace, "");
     }
 
     #[test]

@@ -1,76 +1,77 @@
-//! Command lines of ROS 2: what names the node, and what its parameters are, with the files that are on the robot only.
+//! ROS 2 command lines: the node's name and parameters, including those in files, which exist on the robot only.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::bail;
 use ros::bus::{ParamValue, RosVersion};
-use ros::ros2::arguments::{self, BEGIN, END, Kind, Part, Renamed, Rule};
+use ros::ros2::arguments::{self, BEGIN, CommandLinePart, END, Kind, RemapRule, RemapTarget};
 use ros::ros2::{names, process};
 
-use super::{Place, Robot, Usual};
+use super::{DefaultName, LaunchedNode, RosLocation};
 use crate::network::{self, Variable};
 use crate::params_file::{Sections, value};
 
-/// Parameters that begin so are settings of the stub.
+/// Prefix of parameters that are settings of the stub.
 pub const SETTINGS: &str = "cloudroid.";
-/// All nodes of a process.
+/// Pattern for all nodes of a process.
 const ALL: &str = "/**";
-/// A file of this robot, by which rcl's logging is set.
+/// Option that names a file of this robot, which configures rcl's logging.
 const LOG_CONFIG_FILE: &str = "--log-config-file";
 
-/// As [`Robot::read`]. The usual name has a namespace (`/camera/detector`) where the program gives its node one. Of a program of several nodes
-/// it is that of the first.
+/// Implements [`LaunchedNode::read`] for ROS 2. The default name has a namespace (`/camera/detector`) if the program
+/// sets one. For a program with several nodes it is the name of the first.
 pub async fn read(
     argv: &[String],
-    usual: Usual<'_>,
+    usual: DefaultName<'_>,
     variable: Variable<'_>,
-) -> anyhow::Result<Robot> {
+) -> anyhow::Result<LaunchedNode> {
     let parts = arguments::parse(argv)?;
     let (above, name) = usual.name.rsplit_once('/').unwrap_or(("", usual.name));
-    let node = named(&parts, above, name)?;
-    let sections = sections(&parts)?;
-    let parameters = sections.of(&node);
-    let (id, network) = network::network(variable).await?;
-    Ok(Robot {
+    let node = node_name(&parts, above, name)?;
+    let sections = read_sections(&parts)?;
+    let parameters = sections.for_node(&node);
+    let (id, network) = network::read_network(variable).await?;
+    Ok(LaunchedNode {
         ros: RosVersion::Two,
-        place: Place::Domain { id, network },
-        argv: for_the_cloud(&parts, &node, !usual.by_program, &parameters),
-        original_argv: for_the_original(parts),
+        place: RosLocation::Domain { id, network },
+        argv: cloud_arguments(&parts, &node, !usual.by_program, &parameters),
+        original_argv: original_arguments(parts),
         sim_time: parameters.get("use_sim_time") == Some(&ParamValue::Bool(true)),
         node,
         parameters,
     })
 }
 
-/// The node's name with its namespace. Of several rules the first one counts; what the program says, where there is none.
-fn named(parts: &[Part], above: &str, usual: &str) -> anyhow::Result<String> {
-    let of = |renamed: Renamed, node: &str| {
-        let rules = parts.iter().filter_map(rule);
-        let mut rules = rules.filter(|rule| rule.of == renamed && rule.concerns(node));
+/// Returns the node's name with its namespace. The first matching rule applies; without one, the program's own name.
+fn node_name(parts: &[CommandLinePart], above: &str, usual: &str) -> anyhow::Result<String> {
+    let of = |renamed: RemapTarget, node: &str| {
+        let rules = parts.iter().filter_map(as_rule);
+        let mut rules = rules.filter(|rule| rule.of == renamed && rule.applies_to(node));
         rules.next().map(|rule| rule.to.clone())
     };
-    let name = of(Renamed::Node, usual).unwrap_or_else(|| usual.to_owned());
-    // rcl looks for the namespace of the name that it has found.
-    let namespace = of(Renamed::Namespace, &name).unwrap_or_else(|| above.to_owned());
+    let name = of(RemapTarget::Node, usual).unwrap_or_else(|| usual.to_owned());
+    // rcl looks up the namespace by the name that it has found.
+    let namespace = of(RemapTarget::Namespace, &name).unwrap_or_else(|| above.to_owned());
     let node = format!("{}/{name}", namespace.trim_end_matches('/'));
     if !names::is_global(&node) {
         bail!(
-            "{node:?} is not a name that ROS 2 allows for a node; set nodes = {{ \"EXECUTABLE\" = \"NAME\" }} (or \"/NAMESPACE/NAME\") in stub.toml, or give --ros-args -r __node:=NAME"
+            "{node:?} is not a valid ROS 2 node name; set nodes = {{ \"EXECUTABLE\" = \"NAME\" }} \
+                (or \"/NAMESPACE/NAME\") in stub.toml, or pass --ros-args -r __node:=NAME"
         );
     }
     Ok(node)
 }
 
-fn rule(part: &Part) -> Option<&Rule> {
+fn as_rule(part: &CommandLinePart) -> Option<&RemapRule> {
     match &part.kind {
         Kind::Rule(rule) => Some(rule),
         _ => None,
     }
 }
 
-/// All parameters that the command line gives to any node, in rcl's order.
-fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
+/// Returns all parameters that the command line sets for any node, in rcl's order.
+fn read_sections(parts: &[CommandLinePart]) -> anyhow::Result<Sections> {
     let mut sections = Sections::default();
     for part in parts {
         match &part.kind {
@@ -79,8 +80,9 @@ fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
                     Some(node) => format!("/{node}"),
                     None => ALL.to_owned(),
                 };
-                let value = value::of_text(&given.value);
-                let value = value.map_err(|reason| arguments::no_value(&part.words, &reason))?;
+                let value = value::parse_text(&given.value);
+                let value =
+                    value.map_err(|reason| arguments::invalid_value(&part.words, &reason))?;
                 sections.set(&nodes, given.name.clone(), value);
             }
             Kind::File(path) => sections.read(Path::new(path))?,
@@ -90,10 +92,10 @@ fn sections(parts: &[Part]) -> anyhow::Result<Sections> {
     Ok(sections)
 }
 
-/// The program's own arguments, and then one group of ROS's. `told`: all of its nodes are called as `node` that no rule names, since it is not known what
-/// the program calls them.
-fn for_the_cloud(
-    parts: &[Part],
+/// Returns the program's own arguments, followed by one group of ROS arguments. If `told` is set, all of its nodes
+/// without a renaming rule are named `node`, because the names that the program sets are unknown.
+fn cloud_arguments(
+    parts: &[CommandLinePart],
     node: &str,
     told: bool,
     parameters: &BTreeMap<String, ParamValue>,
@@ -109,13 +111,13 @@ fn for_the_cloud(
             Kind::Rule(_) if is_for_ros => given.extend(part.words.clone()),
             Kind::Rule(_) => own.extend(part.words.clone()),
             Kind::Setting if part.words[0] == LOG_CONFIG_FILE => tracing::warn!(
-                "{LOG_CONFIG_FILE} {} is a file of this robot: the node in the cloud logs as it does without it",
+                "{LOG_CONFIG_FILE} {} is a file on this robot, so the node in the cloud ignores it",
                 part.words[1]
             ),
             Kind::Setting => given.extend(part.words.clone()),
-            // A program may be several nodes.
-            Kind::Parameter(of) if of.is_of_another(node) => others.extend(part.words.clone()),
-            // Below, with those of files.
+            // A program may create several nodes.
+            Kind::Parameter(of) if of.is_for_other_node(node) => others.extend(part.words.clone()),
+            // Added below, together with those of files.
             Kind::Parameter(_) | Kind::File(_) => {}
         }
     }
@@ -129,16 +131,17 @@ fn for_the_cloud(
         if name.starts_with(SETTINGS) {
             continue;
         }
-        if !arguments::is_parameter(name) {
+        if !arguments::is_parameter_name(name) {
             tracing::warn!(
-                "parameter {name} cannot be given on a command line: the node in the cloud has its default; rename it with letters, digits, _ and dots"
+                "parameter {name} cannot be passed on a command line, so the node in the cloud uses its default; \
+                    rename it with letters, digits, _ and dots"
             );
             continue;
         }
         given.push("-p".to_owned());
         given.push(format!("{name}:={}", process::yaml(value)));
     }
-    // Of several for one node the later ones count.
+    // If several match one node, the later ones apply.
     given.extend(others);
     if !given.is_empty() {
         own.push(BEGIN.to_owned());
@@ -148,9 +151,12 @@ fn for_the_cloud(
     own
 }
 
-/// As given, but for the stub's settings. Those in files the original does not ask for.
-fn for_the_original(parts: Vec<Part>) -> Vec<String> {
-    let is_setting = |part: &Part| matches!(&part.kind, Kind::Parameter(given) if given.name.starts_with(SETTINGS));
+/// Returns the arguments without the stub's settings. The original ignores those in files.
+fn original_arguments(parts: Vec<CommandLinePart>) -> Vec<String> {
+    let is_setting = |part: &CommandLinePart| {
+        matches!(&part.kind,
+        Kind::Parameter(given) if given.name.starts_with(SETTINGS))
+    };
     let given = parts.into_iter().filter(|part| !is_setting(part));
     given.flat_map(|part| part.words).collect()
 }
@@ -159,21 +165,21 @@ fn for_the_original(parts: Vec<Part>) -> Vec<String> {
 mod tests {
     use super::*;
 
-    async fn read(line: &str) -> anyhow::Result<Robot> {
-        read_of("usual", line).await
+    async fn read(line: &str) -> anyhow::Result<LaunchedNode> {
+        read_with_name("usual", line).await
     }
 
-    /// Of a program that calls its node so.
-    async fn read_of(usual: &str, line: &str) -> anyhow::Result<Robot> {
+    /// Reads the command line of a program whose default node name is `usual`.
+    async fn read_with_name(usual: &str, line: &str) -> anyhow::Result<LaunchedNode> {
         let argv: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
         let variable = |name: &str| match name {
             "ROS_DOMAIN_ID" => Some("7".to_owned()),
             "ROS_AUTOMATIC_DISCOVERY_RANGE" => Some("LOCALHOST".to_owned()),
-            // ROS 1's.
+            // A ROS 1 variable.
             "ROS_NAMESPACE" => Some("/ignored".to_owned()),
             _ => None,
         };
-        let usual = Usual {
+        let usual = DefaultName {
             name: usual,
             by_program: true,
         };
@@ -198,7 +204,7 @@ mod tests {
         }
         let robot = read("").await.expect("a robot");
         assert!(
-            matches!(robot.place, Place::Domain { id: 7, .. }),
+            matches!(robot.place, RosLocation::Domain { id: 7, .. }),
             "{robot:?}"
         );
         assert!(robot.argv.is_empty() && robot.original_argv.is_empty());
@@ -214,16 +220,16 @@ mod tests {
             ("--ros-args -r usual:__ns:=/front", "/front/usual"),
             ("--ros-args -r other:__ns:=/front", "/camera/usual"),
         ] {
-            let robot = read_of("/camera/usual", line).await.expect(line);
+            let robot = read_with_name("/camera/usual", line).await.expect(line);
             assert_eq!(robot.node, node, "{line}");
-            // The program may be several nodes, of which each takes the rules that concern it.
+            // The program may create several nodes, each of which applies the rules that match it.
             let expected = match line {
                 "" => Vec::new(),
                 line => line.split(' ').chain(["--"]).collect(),
             };
             assert_eq!(robot.argv, expected, "{line}");
         }
-        assert!(read_of("camera/usual", "").await.is_err());
+        assert!(read_with_name("camera/usual", "").await.is_err());
     }
 
     #[tokio::test]
@@ -240,7 +246,7 @@ mod tests {
             ),
         ] {
             let words: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
-            let usual = Usual {
+            let usual = DefaultName {
                 name: "guess",
                 by_program: false,
             };
@@ -252,8 +258,8 @@ mod tests {
     #[tokio::test]
     async fn further_nodes_of_the_program_have_their_own_parameters() {
         let line = "--ros-args -p tenor:high:=true -p rate:=1 -p alto:rate:=2 --param tenor:cloudroid.max:=0.5";
-        let robot = read_of("alto", line).await.expect("a robot");
-        // That of the first one, which has to be all's, does not count for one that has its own.
+        let robot = read_with_name("alto", line).await.expect("a robot");
+        // A setting of the first node, which applies to all, does not override a node's own.
         let expected =
             "--ros-args -p rate:=2 -p tenor:high:=true --param tenor:cloudroid.max:=0.5 --";
         assert_eq!(robot.argv.join(" "), expected);
@@ -315,7 +321,7 @@ people:
         let original = line.replace("-p cloudroid.max:=0.3 ", "");
         let original: Vec<&str> = original.split_whitespace().collect();
         assert_eq!(robot.original_argv, original);
-        // Without its namespace the same file says other things.
+        // Without the namespace another section of the same file matches.
         let line = format!("--ros-args -r __node:=people --params-file {file}");
         let robot = read(&line).await.expect("a robot");
         assert_eq!(robot.parameters["rate"], ParamValue::Int(2));
@@ -335,18 +341,18 @@ people:
                 "/nowhere/p.yaml",
             ),
             ("--ros-args -p a", "-p a"),
-            ("--ros-args -p a:=", "-p a:=: there is no value"),
+            ("--ros-args -p a:=", "-p a:=: the value is missing"),
             ("--ros-args -p a:={b:1}", "-p a:={b:1}"),
             (
                 "--ros-args -p a:=[1,x]",
-                "-p a:=[1,x]: a list holds values of one type",
+                "-p a:=[1,x]: the values of a list must have one type",
             ),
         ] {
             let error = format!("{:#}", read(line).await.expect_err(line));
             assert!(error.contains(said), "{line}: {error}");
         }
         let argv = ["--ros-args".to_owned()];
-        let usual = Usual {
+        let usual = DefaultName {
             name: "9",
             by_program: false,
         };
@@ -354,7 +360,7 @@ people:
             .await
             .expect_err("no name");
         assert!(
-            error.to_string().contains("\"/9\" is not a name"),
+            error.to_string().contains("\"/9\" is not a valid"),
             "{error}"
         );
     }

@@ -1,4 +1,4 @@
-//! Reading a password: from a terminal that does not show it, or from standard input.
+//! Reads a password from a terminal without echo, or from standard input.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -6,7 +6,7 @@ use std::io::{self, BufRead, BufReader, Read, Write};
 use anyhow::{Context, bail};
 use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
 
-/// More than any password that the daemon takes, with the end of its line.
+/// Limit of the input in bytes: longer than any password that the daemon accepts, with the end of its line.
 const LONGEST: u64 = 4096;
 
 fn first_line(from: impl Read) -> io::Result<String> {
@@ -16,51 +16,55 @@ fn first_line(from: impl Read) -> io::Result<String> {
     Ok(line.strip_suffix('\r').unwrap_or(line).to_owned())
 }
 
-/// A terminal that shows nothing of what is typed; shows it again when this is dropped.
-struct Silent<'a> {
+/// Turns the echo of a terminal off, and on again when dropped.
+struct EchoGuard<'a> {
     terminal: &'a File,
     before: Termios,
 }
 
-impl<'a> Silent<'a> {
-    fn new(terminal: &'a File) -> anyhow::Result<Silent<'a>> {
+impl<'a> EchoGuard<'a> {
+    fn new(terminal: &'a File) -> anyhow::Result<EchoGuard<'a>> {
         let before = tcgetattr(terminal)?;
         let mut silent = before.clone();
         silent.local_flags.remove(LocalFlags::ECHO);
         silent.local_flags.insert(LocalFlags::ECHONL);
         tcsetattr(terminal, SetArg::TCSAFLUSH, &silent)?;
-        Ok(Silent { terminal, before })
+        Ok(EchoGuard { terminal, before })
     }
 }
 
-impl Drop for Silent<'_> {
+impl Drop for EchoGuard<'_> {
     fn drop(&mut self) {
         let _ = tcsetattr(self.terminal, SetArg::TCSAFLUSH, &self.before);
     }
 }
 
-/// A new password: asked for twice at the terminal, or the first line of standard input.
-pub fn read(stdin: bool) -> anyhow::Result<String> {
+/// Reads a new password: prompts twice at the terminal, or reads the first line of standard input.
+pub fn read_password(stdin: bool) -> anyhow::Result<String> {
     if stdin {
         let password = first_line(io::stdin()).context("cannot read standard input")?;
         if password.is_empty() {
-            bail!("standard input has no password in its first line");
+            bail!("the first line of standard input is empty; it must be the password");
         }
         return Ok(password);
     }
-    let terminal = File::options().read(true).write(true).open("/dev/tty").context(
-        "there is no terminal to ask for a password at; give it on standard input with --password-stdin",
-    )?;
-    let silent = Silent::new(&terminal).context("the terminal cannot be kept from showing it")?;
+    let terminal = File::options()
+        .read(true)
+        .write(true)
+        .open("/dev/tty")
+        .context(
+            "no terminal to ask for a password; give it on standard input with --password-stdin",
+        )?;
+    let silent = EchoGuard::new(&terminal).context("cannot turn off the terminal's echo")?;
     let asks = |words: &str| -> anyhow::Result<String> {
         (&terminal).write_all(words.as_bytes())?;
         Ok(first_line(&terminal)?)
     };
     let password = asks("Password: ")?;
-    let again = asks("The same again: ")?;
+    let again = asks("Repeat the password: ")?;
     drop(silent);
     if password != again {
-        bail!("these were two different passwords; nothing was changed");
+        bail!("the passwords differ; nothing was changed");
     }
     Ok(password)
 }

@@ -1,5 +1,5 @@
-//! The curve of a calibration, as SVG: response time over cores, both logarithmic; the span from the median to the 95th
-//! percentile shaded, proposed rows ringed.
+//! The curve of a calibration, as SVG: response time over cores, both logarithmic; the range from the median to the
+//! 95th percentile is shaded, and proposed rows are circled.
 
 use std::fmt::Write;
 
@@ -8,14 +8,14 @@ use api::calibration::{Point, TimeSpread};
 
 pub(crate) const WIDTH: f64 = 640.0;
 pub(crate) const HEIGHT: f64 = 360.0;
-/// Around the panel: left, top, and what is left for labels on the right and below.
+/// Margins around the panel, for the title and the labels.
 pub(crate) const LEFT: f64 = 70.0;
 pub(crate) const TOP: f64 = 50.0;
 pub(crate) const RIGHT: f64 = 30.0;
 pub(crate) const BOTTOM: f64 = 50.0;
 pub(crate) const BLUE: &str = "#0a6ebd";
 
-/// A logarithmic axis from one value to another, over a stretch of the picture.
+/// A logarithmic axis that maps a range of values to a range of coordinates.
 pub(crate) struct Axis {
     from: f64,
     to: f64,
@@ -24,8 +24,8 @@ pub(crate) struct Axis {
 }
 
 impl Axis {
-    /// That shows all `values`, with some room around.
-    pub(crate) fn around(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Axis {
+    /// Creates an axis that covers all positive `values` with some margin.
+    pub(crate) fn from_values(values: impl Iterator<Item = f64>, start: f64, end: f64) -> Axis {
         let positive = values.filter(|value| value.is_finite() && *value > 0.0);
         let (least, most) = positive.fold((f64::INFINITY, 0.0f64), |(least, most), value| {
             (least.min(value), most.max(value))
@@ -43,13 +43,13 @@ impl Axis {
         }
     }
 
-    /// Where a value stands.
-    pub(crate) fn at(&self, value: f64) -> f64 {
+    /// Returns the coordinate of a value.
+    pub(crate) fn position(&self, value: f64) -> f64 {
         let share = (value.max(self.from) / self.from).ln() / (self.to / self.from).ln();
         self.start + (self.end - self.start) * share
     }
 
-    /// 1, 2 and 5 times the powers of ten that it shows.
+    /// Returns the ticks within the range: 1, 2 and 5 times powers of ten.
     pub(crate) fn ticks(&self) -> Vec<f64> {
         let powers = self.from.log10().floor() as i32..=self.to.log10().ceil() as i32;
         powers
@@ -60,7 +60,7 @@ impl Axis {
 }
 
 impl Axis {
-    /// Its ticks; where these are fewer than four, multiples of a round step.
+    /// Returns the ticks, or multiples of a round step if there are fewer than four.
     pub(crate) fn fine_ticks(&self) -> Vec<f64> {
         let ticks = self.ticks();
         let span = self.to - self.from;
@@ -78,76 +78,81 @@ impl Axis {
     }
 }
 
-/// The whole picture.
+/// Draws the calibration as an SVG document.
 pub fn draw(calibration: &Calibration) -> String {
     let measured: Vec<(&Point, TimeSpread)> = calibration
         .points
         .iter()
-        .filter_map(|point| Some((point, with(point.compute?, calibration.network))))
+        .filter_map(|point| Some((point, add_network(point.compute?, calibration.network))))
         .collect();
-    let x = Axis::around(
+    let x = Axis::from_values(
         calibration.points.iter().map(|point| point.cpus),
         LEFT,
         LEFT + WIDTH,
     );
     let times = measured.iter().flat_map(|(_, time)| [time.p50, time.p95]);
-    let y = Axis::around(times, TOP + HEIGHT, TOP);
+    let y = Axis::from_values(times, TOP + HEIGHT, TOP);
     let mut out = String::new();
     let (width, height) = (LEFT + WIDTH + RIGHT, TOP + HEIGHT + BOTTOM);
-    put(
+    push_line(
         &mut out,
         format_args!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\" \
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+             font-family=\"sans-serif\" \
              font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>"
         ),
     );
     let title = format!(
-        "{}, revision {}: response time over cores",
+        "{}, revision {}: response time by CPU cores",
         calibration.service, calibration.revision
     );
-    text(&mut out, (LEFT, 20.0), "start", &title);
-    grid(&mut out, &x, &y);
-    band(&mut out, &x, &y, &measured);
+    push_text(&mut out, (LEFT, 20.0), "start", &title);
+    draw_grid(&mut out, &x, &y);
+    draw_band(&mut out, &x, &y, &measured);
     for (point, time) in &measured {
-        let (cx, cy) = (x.at(point.cpus), y.at(time.p95));
-        put(
+        let (cx, cy) = (x.position(point.cpus), y.position(time.p95));
+        push_line(
             &mut out,
             format_args!(
-                "<circle cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"3\" fill=\"{BLUE}\"><title>{} cores: {:.1} ms (median), {:.1} ms \
-                 (95 %), {} of {} answered</title></circle>",
+                "<circle cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"3\" fill=\"{BLUE}\"><title>{} cores: p50 {:.1} ms, p95 \
+                    {:.1} ms, {} of {} answered</title></circle>",
                 point.cpus, time.p50, time.p95, point.answered, point.requests
             ),
         );
     }
     for row in &calibration.rows {
         let p95 = row.spread.map_or(row.value, |spread| spread.p95);
-        let (cx, cy) = (x.at(row.limits.cpus.unwrap_or(0.0)), y.at(p95 * 1000.0));
-        put(
+        let (cx, cy) = (
+            x.position(row.limits.cpus.unwrap_or(0.0)),
+            y.position(p95 * 1000.0),
+        );
+        push_line(
             &mut out,
             format_args!(
-                "<circle class=\"row\" cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"7\" fill=\"none\" stroke=\"#2a9d4a\" stroke-width=\"2\"/>"
+                "<circle class=\"row\" cx=\"{cx:.1}\" cy=\"{cy:.1}\" r=\"7\" fill=\"none\" stroke=\"#2a9d4a\" \
+                 stroke-width=\"2\"/>"
             ),
         );
-        text(
+        push_text(
             &mut out,
             (cx + 9.0, cy - 6.0),
             "start",
-            &row.measure.print(row.value),
+            &row.measure.format_value(row.value),
         );
     }
-    let legend = "line: 95th percentile; shaded: down to the median; ringed: proposed rows";
-    text(&mut out, (LEFT, 38.0), "start", legend);
-    text(
+    let legend = "line: p95; shaded: p50 to p95; ringed: proposed entries";
+    push_text(&mut out, (LEFT, 38.0), "start", legend);
+    push_text(
         &mut out,
         (LEFT + WIDTH / 2.0, height - 12.0),
         "middle",
         "cores",
     );
-    text(&mut out, (8.0, TOP - 8.0), "start", "ms");
+    push_text(&mut out, (8.0, TOP - 8.0), "start", "ms");
     out + "</svg>\n"
 }
 
-fn with(compute: TimeSpread, network: Option<TimeSpread>) -> TimeSpread {
+fn add_network(compute: TimeSpread, network: Option<TimeSpread>) -> TimeSpread {
     let network = network.unwrap_or_default();
     TimeSpread {
         p50: compute.p50 + network.p50,
@@ -156,9 +161,9 @@ fn with(compute: TimeSpread, network: Option<TimeSpread>) -> TimeSpread {
     }
 }
 
-fn grid(out: &mut String, x: &Axis, y: &Axis) {
+fn draw_grid(out: &mut String, x: &Axis, y: &Axis) {
     let line = |out: &mut String, from: (f64, f64), to: (f64, f64)| {
-        put(
+        push_line(
             out,
             format_args!(
                 "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"#ddd\"/>",
@@ -167,20 +172,25 @@ fn grid(out: &mut String, x: &Axis, y: &Axis) {
         );
     };
     for tick in x.ticks() {
-        let at = x.at(tick);
+        let at = x.position(tick);
         line(out, (at, TOP), (at, TOP + HEIGHT));
-        text(out, (at, TOP + HEIGHT + 16.0), "middle", &number(tick));
+        push_text(
+            out,
+            (at, TOP + HEIGHT + 16.0),
+            "middle",
+            &format_number(tick),
+        );
     }
     for tick in y.ticks() {
-        let at = y.at(tick);
+        let at = y.position(tick);
         line(out, (LEFT, at), (LEFT + WIDTH, at));
-        text(out, (LEFT - 6.0, at + 4.0), "end", &number(tick));
+        push_text(out, (LEFT - 6.0, at + 4.0), "end", &format_number(tick));
     }
 }
 
-/// From the median to the 95th percentile, and the line of the latter.
-fn band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)]) {
-    let at = |cpus: f64, time: f64| format!("{:.1},{:.1}", x.at(cpus), y.at(time));
+/// Draws the range from the median to the 95th percentile, and the line of the latter.
+fn draw_band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)]) {
+    let at = |cpus: f64, time: f64| format!("{:.1},{:.1}", x.position(cpus), y.position(time));
     let above: Vec<String> = measured
         .iter()
         .map(|(point, time)| at(point.cpus, time.p95))
@@ -189,7 +199,7 @@ fn band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)])
     let below: Vec<String> = below
         .map(|(point, time)| at(point.cpus, time.p50))
         .collect();
-    put(
+    push_line(
         out,
         format_args!(
             "<polygon points=\"{} {}\" fill=\"{BLUE}\" fill-opacity=\"0.15\"/>\n\
@@ -201,26 +211,26 @@ fn band(out: &mut String, x: &Axis, y: &Axis, measured: &[(&Point, TimeSpread)])
     );
 }
 
-/// Without what powers of ten leave behind the digits.
-pub(crate) fn number(value: f64) -> String {
+/// Formats a number without floating-point noise.
+pub(crate) fn format_number(value: f64) -> String {
     ((value * 1e6).round() / 1e6).to_string()
 }
 
-/// Words at a place; `anchor` as SVG has it.
-pub(crate) fn text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
+/// Adds a text at a position; `anchor` is a value of SVG's text-anchor.
+pub(crate) fn push_text(out: &mut String, (x, y): (f64, f64), anchor: &str, words: &str) {
     let words = words
         .replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;");
-    put(
+    push_line(
         out,
         format_args!("<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\">{words}</text>"),
     );
 }
 
-/// One more line of the picture.
-pub(crate) fn put(out: &mut String, line: std::fmt::Arguments) {
-    // Writing to a String does not fail.
+/// Adds a line to the document.
+pub(crate) fn push_line(out: &mut String, line: std::fmt::Arguments) {
+    // Writing to a String cannot fail.
     let _ = writeln!(out, "{line}");
 }
 
@@ -267,7 +277,7 @@ mod tests {
         }
     }
 
-    /// Values of an attribute in the order in which they stand.
+    /// Returns the values of an attribute in document order.
     fn values(svg: &str, element: &str, attribute: &str) -> Vec<f64> {
         let lines = svg.lines().filter(|line| line.starts_with(element));
         lines
@@ -283,7 +293,7 @@ mod tests {
         let svg = draw(&calibration());
         assert!(svg.contains("&lt;people&gt; &amp; dogs"), "{svg}");
         let (x, y) = (values(&svg, "<circle", "cx"), values(&svg, "<circle", "cy"));
-        // Three that answered, and one ring around the last of them.
+        // Three points that were answered, and one circle around the last of them.
         assert_eq!((x.len(), y.len()), (4, 4), "{svg}");
         assert!(x[..3].is_sorted() && y[..3].is_sorted(), "{x:?} {y:?}");
         assert_eq!((x[2], y[2]), (x[3], y[3]));
@@ -307,7 +317,7 @@ mod tests {
             ..calibration()
         };
         let svg = draw(&lifted);
-        assert!(svg.contains("150.0 ms (median), 200.0 ms"), "{svg}");
+        assert!(svg.contains("p50 150.0 ms, p95 200.0 ms"), "{svg}");
     }
 
     #[test]

@@ -1,4 +1,5 @@
-//! What is refused before anything is sent or started: services that a recording cannot ask, and cores that no servant can have.
+//! Checks before anything is sent or started: services that cannot be evaluated with a recording, and numbers of cores
+//! that no servant can have.
 
 use std::path::Path;
 
@@ -6,29 +7,29 @@ use anyhow::bail;
 use api::interface::Direction;
 use api::{Problem, ServiceDetail};
 
-use super::Eval;
-use crate::client::{Client, escaped};
+use super::EvalArgs;
+use crate::client::{DaemonClient, percent_encode};
 
-impl Eval {
-    /// Refuses cores that no servant here can have, before minutes of measuring.
-    pub(super) async fn check_room(&self, client: &Client) -> anyhow::Result<()> {
+impl EvalArgs {
+    /// Refuses numbers of cores that no servant can have here, before minutes are spent on measuring.
+    pub(super) async fn check_capacity(&self, client: &DaemonClient) -> anyhow::Result<()> {
         for (flag, cpus) in [("--robot-cpus", self.robot_cpus), ("--cpus", self.cpus)] {
             let Some(cpus) = cpus else { continue };
             let path = format!(
                 "/api/v1/services/{}/fit?cpus={cpus}",
-                escaped(&self.service)
+                percent_encode(&self.service)
             );
-            // What robots may ask for is no matter here; what cannot be said is said when it is measured.
+            // Caps for robots do not apply here; any other error is reported by the measurement itself.
             let fit = client.get::<api::Fit>(&path).await;
             let never = fit
                 .ok()
                 .and_then(|fit| fit.never)
-                .filter(|why| is_too_big(why));
+                .filter(|why| exceeds_machine(why));
             if let Some(why) = never {
                 return Err(Problem {
                     status: 422,
-                    detail: format!("{flag} {cpus} cannot be measured, now and later: {why}"),
-                    next: Some(format!("name fewer with {flag}")),
+                    detail: format!("{flag} {cpus} can never be measured on this machine: {why}"),
+                    next: Some(format!("pass fewer cores with {flag}")),
                     ..Problem::default()
                 }
                 .into());
@@ -37,28 +38,28 @@ impl Eval {
         Ok(())
     }
 
-    /// The service, where a recording can hold its requests.
-    pub(super) async fn check(&self, client: &Client) -> anyhow::Result<ServiceDetail> {
+    /// Returns the service, if its requests can be in a recording.
+    pub(super) async fn check(&self, client: &DaemonClient) -> anyhow::Result<ServiceDetail> {
         let name = &self.service;
         let path = Path::new(name);
-        // A service may have the name of a directory that lies here.
+        // A service may have the same name as a local directory.
         if name.contains('/') || matches!(&**name, "." | "..") {
             bail!(
-                "{name} is a directory, and services are evaluated: publish it first with: cloudroidctl push {name}; \
-                 then: cloudroidctl eval NAME --bag {}",
+                "{name} is a directory, not a service: publish it first with: cloudroidctl push {name}; then: \
+                    cloudroidctl eval NAME --bag {}",
                 self.bag.display()
             );
         }
-        let address = format!("/api/v1/services/{}", escaped(name));
+        let address = format!("/api/v1/services/{}", percent_encode(name));
         let asked = client.get(&address).await;
-        let service: ServiceDetail = asked.map_err(unpublished(name, path.is_dir()))?;
+        let service: ServiceDetail = asked.map_err(explain_not_found(name, path.is_dir()))?;
         let interface = &service.interface;
         if let Some(named) = &self.output {
             let outputs = interface.topics.iter();
             let outputs = outputs.filter(|topic| topic.direction == Direction::Output);
             let outputs: Vec<&str> = outputs.map(|topic| topic.name.as_str()).collect();
             if !outputs.contains(&named.as_str()) {
-                return Err(unusable(format!(
+                return Err(invalid_input(format!(
                     "{name} has no output {named}; its outputs are: {}",
                     outputs.join(", ")
                 )));
@@ -72,21 +73,23 @@ impl Eval {
                 .map(|service| service.name.as_str())
                 .chain(interface.actions.iter().map(|action| action.name.as_str()))
                 .collect();
-            match calls.is_empty() {
-                true => bail!("{name} has no inputs, so that there is nothing to ask it"),
-                false => bail!(
-                    "requests of {name} are calls and goals ({}), and a recording holds messages of topics alone: measure them at their \
-                     robot with: cloudroidctl explain ROBOT; and write rows with: cloudroidctl sla set --spread",
+            if calls.is_empty() {
+                bail!("{name} has no inputs, so no request can be sent to it")
+            } else {
+                bail!(
+                    "the requests of {name} are service calls and action goals ({}), but a recording has topic \
+                        messages only: measure them on their robot with: cloudroidctl explain ROBOT; and write entries \
+                        with: cloudroidctl sla set --spread",
                     calls.join(", ")
-                ),
+                )
             }
         }
         Ok(service)
     }
 }
 
-/// What cannot be used as it is given.
-pub(super) fn unusable(detail: String) -> anyhow::Error {
+/// Returns the problem for invalid input.
+pub(super) fn invalid_input(detail: String) -> anyhow::Error {
     Problem {
         status: 400,
         detail,
@@ -95,20 +98,26 @@ pub(super) fn unusable(detail: String) -> anyhow::Error {
     .into()
 }
 
-/// Whether it is the machine that is too small, of all reasons why a servant is never admitted.
-fn is_too_big(why: &str) -> bool {
+/// Returns whether a servant is never admitted because the machine is too small.
+fn exceeds_machine(why: &str) -> bool {
     why.contains("does not fit on this machine")
 }
 
-/// What to do about a service that is not there.
-fn unpublished(name: &str, is_directory: bool) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
-    let next = match is_directory {
-        true => format!(
-            "{name} is a directory here, and services are evaluated: publish it first with: cloudroidctl push {name}; or name one of those"
-        ),
-        false => format!(
-            "name one of those, or publish the package first: cloudroidctl push DIRECTORY --name {name} (--apt {name}, where Debian has it)"
-        ),
+/// Returns a function that adds advice to the error about an unknown service.
+fn explain_not_found(
+    name: &str,
+    is_directory: bool,
+) -> impl FnOnce(anyhow::Error) -> anyhow::Error {
+    let next = if is_directory {
+        format!(
+            "{name} is a directory here, not a service: publish it first with: cloudroidctl push {name}; or name one \
+                of those"
+        )
+    } else {
+        format!(
+            "name one of those, or publish the package first: cloudroidctl push DIRECTORY --name {name} (--apt {name}, \
+                if Debian has it)"
+        )
     };
     move |error| match error.downcast::<Problem>() {
         Ok(problem) if problem.status == 404 => Problem {
@@ -133,7 +142,7 @@ mod tests {
                 next: Some("see the list".to_owned()),
                 ..Problem::default()
             };
-            let told = unpublished("people", is_directory)(problem.into());
+            let told = explain_not_found("people", is_directory)(problem.into());
             told.downcast::<Problem>()
                 .expect("a problem")
                 .next

@@ -1,4 +1,5 @@
-//! Measuring the two sides: the daemon asks one at the limits of the robot, and the outsourced one is asked over the network, too.
+//! Measures the two sides: the daemon runs one with the robot's limits, and the outsourced one is also asked over the
+//! network.
 
 use std::time::Duration;
 
@@ -10,35 +11,35 @@ use futures_util::StreamExt;
 use http_body_util::{BodyExt, Full};
 use hyper::Method;
 
-use super::Eval;
-use super::probe::{self, Asked, Probe};
-use super::robot::Robot;
-use super::side::Side;
+use super::EvalArgs;
+use super::probe::{self, NetworkProbe, ProbeOutcome};
+use super::robot::RobotResources;
+use super::side::SideResult;
 use super::verdict::Evaluation;
-use crate::calibrate::in_a_line;
-use crate::client::{self, Client, escaped};
-use crate::output::{self, Format};
+use crate::calibrate::format_point;
+use crate::client::{self, DaemonClient, percent_encode};
+use crate::output::{self, OutputFormat};
 
-/// Seconds for which the outsourced servant stays for what is asked over the network: each request may take as long as the
+/// Time that the outsourced servant is kept for the requests over the network, in seconds: each may take as long as the
 /// daemon waits for one.
 const KEEP: f64 = 180.0;
-/// How often, and how often at most, it is looked whether its servant has gone.
+/// Interval and largest number of looks whether the servant is gone.
 const LOOK: Duration = Duration::from_millis(50);
 const LOOKS: usize = 200;
 
-impl Eval {
+impl EvalArgs {
     pub(super) async fn measure(
         &self,
-        client: &Client,
-        format: Format,
+        client: &DaemonClient,
+        format: OutputFormat,
         file: Bytes,
-        recorded: &[ros::bag::Recorded],
+        recorded: &[ros::bag::BagMessage],
         service: &ServiceDetail,
     ) -> anyhow::Result<Evaluation> {
-        let robot = Robot::new(self.robot, self.robot_cpus, self.robot_memory);
+        let robot = RobotResources::new(self.robot, self.robot_cpus, self.robot_memory);
         let tell = |words: &str| match format {
-            Format::Json => Ok(()),
-            Format::Table => output::line(words),
+            OutputFormat::Json => Ok(()),
+            OutputFormat::Table => output::line(words),
         };
         tell(&format!("== native: as on {robot}"))?;
         let options = CalibrationOptions {
@@ -46,9 +47,16 @@ impl Eval {
             memory: Some(robot.memory),
             ..self.options()
         };
-        let native = match self.ask(client, options, file.clone(), &tell).await {
-            Ok(measured) => Side::native(&measured.calibration, measured.times, &robot),
-            Err(error) => Side::starved(&robot, out_of_memory(for_robot(error))?),
+        let native = match self
+            .run_calibration(client, options, file.clone(), &tell)
+            .await
+        {
+            Ok(measured) => {
+                SideResult::from_calibration(&measured.calibration, measured.times, &robot)
+            }
+            Err(error) => {
+                SideResult::out_of_memory(&robot, out_of_memory_reason(rename_robot_flags(error))?)
+            }
         };
         tell("== outsourced")?;
         let options = CalibrationOptions {
@@ -57,15 +65,15 @@ impl Eval {
             keep: Some(KEEP),
             ..self.options()
         };
-        // Its servant lives for as long as this does.
-        let measured = self.ask(client, options, file, &tell).await?;
+        // The servant lives as long as `measured`.
+        let measured = self.run_calibration(client, options, file, &tell).await?;
         let servant = measured.servant.as_deref();
-        let place = servant.map(|servant| format!("/api/v1/servants/{}", escaped(servant)));
-        let limits = limits(client, place.as_deref()).await;
+        let place = servant.map(|servant| format!("/api/v1/servants/{}", percent_encode(servant)));
+        let limits = fetch_limits(client, place.as_deref()).await;
         let asked = match &measured.servant {
-            Some(servant) if answers(&measured.calibration) => {
-                tell("   the same over the network, from here")?;
-                let probe = Probe {
+            Some(servant) if has_answers(&measured.calibration) => {
+                tell("   the same requests over the network, from this machine")?;
+                let probe = NetworkProbe {
                     service,
                     calibration: &measured.calibration,
                     recorded,
@@ -74,37 +82,35 @@ impl Eval {
                     fast: self.fast,
                     requests: self.requests.unwrap_or(probe::REQUESTS),
                 };
-                match probe.ask(client, servant).await {
+                match probe.run(client, servant).await {
                     Ok(asked) => asked,
-                    Err(error) => Asked::broken(format!("{error:#}")),
+                    Err(error) => ProbeOutcome::from_failure(format!("{error:#}")),
                 }
             }
-            // Nor would it answer from here.
-            _ => Asked::unanswered(point(&measured.calibration).requests),
+            // It would not answer from here either.
+            _ => ProbeOutcome::without_answers(only_point(&measured.calibration).requests),
         };
-        let now = self::limits(client, place.as_deref()).await;
+        let now = self::fetch_limits(client, place.as_deref()).await;
         if now.is_some() && now != limits {
-            bail!(
-                "somebody has changed the limits of the servant while it was measured; evaluate again"
-            );
+            bail!("the servant's limits were changed during the measurement; evaluate again");
         }
-        let mut outsourced = Side::outsourced(&measured.calibration, &asked, self.network);
+        let mut outsourced = SideResult::from_probe(&measured.calibration, &asked, self.network);
         outsourced.memory_limit = limits.and_then(|limits| limits.memory);
         if let Some(rrt) = outsourced.rrt {
             tell(&format!(
-                "   {} of {} answered: {:.1} ms (median), {:.1} ms (95 %)",
+                "   {} of {} answered: p50 {:.1} ms, p95 {:.1} ms",
                 outsourced.answered, outsourced.requests, rrt.p50, rrt.p95
             ))?;
         }
-        // Whoever evaluates next finds the room that this had.
-        let Measured {
+        // The next evaluation needs this servant's capacity.
+        let MeasuredCalibration {
             calibration,
             events,
             ..
         } = measured;
         drop(events);
         if let Some(place) = &place {
-            gone(client, place).await;
+            wait_until_gone(client, place).await;
         }
         Ok(Evaluation::new(
             &calibration,
@@ -125,24 +131,25 @@ impl Eval {
         }
     }
 
-    /// Has the daemon measure at one limit; the servant stays until what is returned is dropped, where it was to be kept.
-    async fn ask(
+    /// Has the daemon measure at one limit. If the servant was to be kept, it lives until the returned value is
+    /// dropped.
+    async fn run_calibration(
         &self,
-        client: &Client,
+        client: &DaemonClient,
         options: CalibrationOptions,
         file: Bytes,
         tell: &dyn Fn(&str) -> anyhow::Result<()>,
-    ) -> anyhow::Result<Measured> {
+    ) -> anyhow::Result<MeasuredCalibration> {
         let path = format!(
             "/api/v1/services/{}/calibration?options={}",
-            escaped(&self.service),
-            escaped(&serde_json::to_string(&options)?)
+            percent_encode(&self.service),
+            percent_encode(&serde_json::to_string(&options)?)
         );
         let body = Full::new(file)
             .map_err(|never| match never {})
             .boxed_unsync();
         let answer = client.send(Method::POST, &path, body).await?;
-        let mut events = Box::pin(client::lines(answer));
+        let mut events = Box::pin(client::json_lines(answer));
         let mut measured = Vec::new();
         while let Some(event) = events.next().await {
             let (calibration, servant) = match event? {
@@ -157,40 +164,40 @@ impl Eval {
                     continue;
                 }
                 CalibrationEvent::Measured { times, point } => {
-                    tell(&format!("   {}", in_a_line(&point)))?;
+                    tell(&format!("   {}", format_point(&point)))?;
                     measured = times;
                     continue;
                 }
             };
-            return Ok(Measured {
+            return Ok(MeasuredCalibration {
                 calibration: *calibration,
                 times: measured,
                 servant,
                 events,
             });
         }
-        bail!("the daemon broke off the measurement; nothing was written")
+        bail!("the daemon aborted the measurement; nothing was written")
     }
 }
 
-/// What the daemon has measured at one limit.
-struct Measured {
+/// Result of the daemon's measurement at one limit.
+struct MeasuredCalibration {
     calibration: Calibration,
-    /// Of requests that were answered, in milliseconds.
+    /// Response times of the answered requests, in milliseconds.
     times: Vec<f64>,
-    /// It stays for as long as the events are there.
+    /// Id of the servant, which is kept until `events` is dropped.
     servant: Option<String>,
     events: std::pin::Pin<Box<dyn futures_util::Stream<Item = anyhow::Result<CalibrationEvent>>>>,
 }
 
-/// What a servant is limited to, where it is there.
-async fn limits(client: &Client, place: Option<&str>) -> Option<api::Limits> {
+/// Returns the limits of a servant, if it exists.
+async fn fetch_limits(client: &DaemonClient, place: Option<&str>) -> Option<api::Limits> {
     let servant = client.get::<Servant>(place?).await;
     servant.ok().map(|servant| servant.limits)
 }
 
-/// Comes back when the servant has gone, or is not told to go.
-async fn gone(client: &Client, place: &str) {
+/// Returns when the servant is gone, or after ten seconds.
+async fn wait_until_gone(client: &DaemonClient, place: &str) {
     for _ in 0..LOOKS {
         if client.get::<Servant>(place).await.is_err() {
             return;
@@ -199,8 +206,8 @@ async fn gone(client: &Client, place: &str) {
     }
 }
 
-/// A problem of the side that stands for the robot names the option that is its.
-fn for_robot(error: anyhow::Error) -> anyhow::Error {
+/// Renames `--cpus` to `--robot-cpus` in a problem of the native side.
+fn rename_robot_flags(error: anyhow::Error) -> anyhow::Error {
     let named = |words: String| words.replace(" --cpus", " --robot-cpus");
     match error.downcast::<Problem>() {
         Ok(problem) => Problem {
@@ -213,17 +220,18 @@ fn for_robot(error: anyhow::Error) -> anyhow::Error {
     }
 }
 
-/// At the only limit.
-pub(super) fn point(calibration: &Calibration) -> Point {
+/// Returns the only measured point.
+pub(super) fn only_point(calibration: &Calibration) -> Point {
     calibration.points.first().copied().unwrap_or_default()
 }
 
-fn answers(calibration: &Calibration) -> bool {
-    point(calibration).answered > 0
+fn has_answers(calibration: &Calibration) -> bool {
+    only_point(calibration).answered > 0
 }
 
-/// Why the kernel has ended a servant; every other error is none of the robot's.
-fn out_of_memory(error: anyhow::Error) -> anyhow::Result<String> {
+/// Returns the reason if the kernel killed the servant for lack of memory; passes on any other error, which has nothing
+/// to do with the robot.
+fn out_of_memory_reason(error: anyhow::Error) -> anyhow::Result<String> {
     match error.downcast_ref::<Problem>() {
         Some(problem) if problem.kind == OUT_OF_MEMORY => Ok(problem.detail.clone()),
         _ => Err(error),
@@ -241,10 +249,10 @@ mod tests {
             detail: "needs more than 1G".to_owned(),
             ..Problem::default()
         };
-        let told = out_of_memory(problem("urn:cloudroid:out-of-memory").into());
+        let told = out_of_memory_reason(problem("urn:cloudroid:out-of-memory").into());
         assert_eq!(told.expect("an answer"), "needs more than 1G");
-        out_of_memory(problem("urn:cloudroid:full").into()).expect_err("no answer");
-        out_of_memory(anyhow::anyhow!("broken")).expect_err("no answer");
+        out_of_memory_reason(problem("urn:cloudroid:full").into()).expect_err("no answer");
+        out_of_memory_reason(anyhow::anyhow!("broken")).expect_err("no answer");
     }
 
     #[test]
@@ -254,7 +262,7 @@ mod tests {
             next: Some("push it with smaller --cpus".into()),
             ..Problem::default()
         };
-        let told = for_robot(problem.into());
+        let told = rename_robot_flags(problem.into());
         let told = told.downcast::<Problem>().expect("a problem");
         assert!(told.detail.ends_with("with --robot-cpus"), "{told}");
         assert_eq!(

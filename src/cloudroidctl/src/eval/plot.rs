@@ -1,58 +1,66 @@
-//! The distribution of response times, native against outsourced, as SVG: the share of requests that were answered within a time, which
-//! is logarithmic.
+//! The distributions of response times, native and outsourced, as SVG: the share of requests that were answered within
+//! a time, on a logarithmic time axis.
 
 use std::path::Path;
 
-use crate::calibrate::curve::{Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, WIDTH, number, put, text};
-use crate::eval::side::Side;
+use crate::calibrate::curve::{
+    Axis, BLUE, BOTTOM, HEIGHT, LEFT, RIGHT, WIDTH, format_number, push_line, push_text,
+};
+use crate::eval::side::SideResult;
 use crate::eval::verdict::Evaluation;
 
 const ORANGE: &str = "#d95f02";
-/// Above the panel: two lines of a title, and one for each side.
+/// Top margin of the panel: two lines of title and one for each side.
 const TOP: f64 = 95.0;
-/// Longer words of a title are cut.
+/// Longest part of a title in characters; the rest is cut.
 const LONGEST: usize = 60;
 
-/// The whole picture.
+/// Draws the evaluation as an SVG document.
 pub fn draw(of: &Evaluation) -> String {
     let times = of.native.times.iter().chain(&of.outsourced.times);
-    let x = Axis::around(times.copied(), LEFT, LEFT + WIDTH);
+    let x = Axis::from_values(times.copied(), LEFT, LEFT + WIDTH);
     let (width, height) = (LEFT + WIDTH + RIGHT, TOP + HEIGHT + BOTTOM);
     let mut out = String::new();
-    put(
+    push_line(
         &mut out,
         format_args!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\" \
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+             font-family=\"sans-serif\" \
              font-size=\"12\">\n<rect width=\"100%\" height=\"100%\" fill=\"white\"/>"
         ),
     );
     let title = format!(
-        "{}, revision {}: share of requests answered within a time",
+        "{}, revision {}: fraction of requests answered within a time",
         of.service, of.revision
     );
-    text(&mut out, (LEFT, 20.0), "start", &title);
-    text(&mut out, (LEFT, 38.0), "start", &conditions(of));
-    grid(&mut out, &x);
+    push_text(&mut out, (LEFT, 20.0), "start", &title);
+    push_text(&mut out, (LEFT, 38.0), "start", &conditions(of));
+    draw_grid(&mut out, &x);
     for (side, colour, class, legend) in [
         (&of.native, ORANGE, "native", 60.0),
         (&of.outsourced, BLUE, "outsourced", 78.0),
     ] {
-        distribution(&mut out, &x, side, colour, class);
-        put(
+        draw_distribution(&mut out, &x, side, colour, class);
+        push_line(
             &mut out,
             format_args!(
                 "<rect x=\"{LEFT:.1}\" y=\"{:.1}\" width=\"10\" height=\"10\" fill=\"{colour}\"/>",
                 legend - 9.0
             ),
         );
-        text(&mut out, (LEFT + 15.0, legend), "start", &told(class, side));
+        push_text(
+            &mut out,
+            (LEFT + 15.0, legend),
+            "start",
+            &legend_text(class, side),
+        );
     }
     let (middle, below) = (LEFT + WIDTH / 2.0, height - 12.0);
-    text(&mut out, (middle, below), "middle", "response time, ms");
+    push_text(&mut out, (middle, below), "middle", "response time, ms");
     out + "</svg>\n"
 }
 
-/// What was measured with what.
+/// Returns the conditions of the measurement, for the title.
 fn conditions(of: &Evaluation) -> String {
     let bag = Path::new(&of.bag).file_name();
     let bag: String = bag.map_or(String::new(), |name| {
@@ -62,7 +70,7 @@ fn conditions(of: &Evaluation) -> String {
         .robot
         .map(|robot| format!("{robot}; "))
         .unwrap_or_default();
-    let network = match of.network.filter(|network| network.adds()) {
+    let network = match of.network.filter(|network| network.has_effect()) {
         Some(network) => format!("added network: {network}"),
         None => "no network added".to_owned(),
     };
@@ -70,25 +78,25 @@ fn conditions(of: &Evaluation) -> String {
     format!("{robot}{bag}, {requests} requests; {network}")
 }
 
-fn told(name: &str, side: &Side) -> String {
+fn legend_text(name: &str, side: &SideResult) -> String {
     match (&side.out_of_memory, side.rrt) {
         (Some(_), _) => format!("{name}: out of memory"),
         (None, None) => format!("{name}: none of {} answered", side.requests),
         (None, Some(rrt)) => format!(
-            "{name}, {} cores: {:.1} ms (median), {:.1} ms (95 %)",
+            "{name}, {} cores: p50 {:.1} ms, p95 {:.1} ms",
             side.cpus, rrt.p50, rrt.p95
         ),
     }
 }
 
-/// Where a share of all requests stands.
-fn height(share: f64) -> f64 {
+/// Returns the y coordinate of a share of all requests.
+fn share_to_y(share: f64) -> f64 {
     TOP + HEIGHT * (1.0 - share)
 }
 
-fn grid(out: &mut String, x: &Axis) {
+fn draw_grid(out: &mut String, x: &Axis) {
     let mut line = |x1: f64, y1: f64, x2: f64, y2: f64| {
-        put(
+        push_line(
             out,
             format_args!(
                 "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"#ddd\"/>"
@@ -97,23 +105,23 @@ fn grid(out: &mut String, x: &Axis) {
     };
     let shares = [0.0, 0.25, 0.5, 0.75, 0.95, 1.0];
     for tick in x.fine_ticks() {
-        line(x.at(tick), TOP, x.at(tick), TOP + HEIGHT);
+        line(x.position(tick), TOP, x.position(tick), TOP + HEIGHT);
     }
     for share in shares {
-        line(LEFT, height(share), LEFT + WIDTH, height(share));
+        line(LEFT, share_to_y(share), LEFT + WIDTH, share_to_y(share));
     }
     for tick in x.fine_ticks() {
-        let at = (x.at(tick), TOP + HEIGHT + 16.0);
-        text(out, at, "middle", &number(tick));
+        let at = (x.position(tick), TOP + HEIGHT + 16.0);
+        push_text(out, at, "middle", &format_number(tick));
     }
     for share in shares {
-        let at = (LEFT - 6.0, height(share) + 4.0);
-        text(out, at, "end", &format!("{:.0} %", share * 100.0));
+        let at = (LEFT - 6.0, share_to_y(share) + 4.0);
+        push_text(out, at, "end", &format!("{:.0} %", share * 100.0));
     }
 }
 
-/// Up by one step at each time. Requests that were never answered keep it below 100 %.
-fn distribution(out: &mut String, x: &Axis, side: &Side, colour: &str, class: &str) {
+/// Draws one step up at each response time. Requests without an answer keep the line below 100 %.
+fn draw_distribution(out: &mut String, x: &Axis, side: &SideResult, colour: &str, class: &str) {
     let mut times = side.times.clone();
     times.sort_by(f64::total_cmp);
     let all = side.requests.max(times.len()) as f64;
@@ -121,13 +129,13 @@ fn distribution(out: &mut String, x: &Axis, side: &Side, colour: &str, class: &s
     for (below, time) in times.iter().enumerate() {
         for answered in [below, below + 1] {
             let share = answered as f64 / all;
-            points.push(format!("{:.1},{:.1}", x.at(*time), height(share)));
+            points.push(format!("{:.1},{:.1}", x.position(*time), share_to_y(share)));
         }
     }
     if points.is_empty() {
         return;
     }
-    put(
+    push_line(
         out,
         format_args!(
             "<polyline class=\"{class}\" points=\"{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"2\"/>",
@@ -140,14 +148,14 @@ fn distribution(out: &mut String, x: &Axis, side: &Side, colour: &str, class: &s
 mod tests {
     use super::*;
 
-    fn side(times: &[f64], requests: usize) -> Side {
-        Side {
+    fn side(times: &[f64], requests: usize) -> SideResult {
+        SideResult {
             cpus: 0.25,
             requests,
             answered: times.len(),
-            rrt: api::calibration::TimeSpread::of(times.to_vec()),
+            rrt: api::calibration::TimeSpread::from_samples(times.to_vec()),
             times: times.to_vec(),
-            ..Side::default()
+            ..SideResult::default()
         }
     }
 
@@ -185,17 +193,14 @@ mod tests {
             );
         }
         assert!(outsourced[3].0 < native[0].0, "it is faster: {svg}");
-        // Three of four, and all.
+        // Three of four requests, and all of them.
         assert_eq!(native[5].1, TOP + HEIGHT / 4.0);
         assert_eq!(outsourced[3].1, TOP);
-        assert!(
-            svg.contains("native, 0.25 cores: 500.0 ms (median)"),
-            "{svg}"
-        );
+        assert!(svg.contains("native, 0.25 cores: p50 500.0 ms"), "{svg}");
     }
 
-    /// Places of words, by what they contain.
-    fn place(svg: &str, words: &str) -> (f64, f64) {
+    /// Returns the position of the text that contains these words.
+    fn text_position(svg: &str, words: &str) -> (f64, f64) {
         let line = svg.lines().find(|line| line.contains(words));
         let line = line.unwrap_or_else(|| panic!("{words}: {svg}"));
         let part = |name: &str| {
@@ -221,7 +226,10 @@ mod tests {
             outsourced: side(&[193.0, 201.0], 2),
             ..Evaluation::default()
         });
-        let (native, outsourced) = (place(&svg, ">native, "), place(&svg, ">outsourced, "));
+        let (native, outsourced) = (
+            text_position(&svg, ">native, "),
+            text_position(&svg, ">outsourced, "),
+        );
         assert!(
             native.0 == outsourced.0 && native.1 + 12.0 <= outsourced.1,
             "{svg}"
@@ -243,9 +251,9 @@ mod tests {
     #[test]
     fn a_side_without_answers_is_told_and_not_drawn() {
         let svg = draw(&Evaluation {
-            native: Side {
+            native: SideResult {
                 out_of_memory: Some("x".into()),
-                ..Side::default()
+                ..SideResult::default()
             },
             outsourced: side(&[], 3),
             ..Evaluation::default()

@@ -1,5 +1,6 @@
-//! Asks a servant over the network that lies between here and the daemon, as a robot does: requests and answers are the bytes that
-//! they are, in a WebSocket of the portal. Which input each recorded topic goes to, the daemon has said when it replayed the same.
+//! Sends requests to a servant over the network between this machine and the daemon, as a robot does: requests and
+//! answers are serialized messages in a WebSocket of the portal. The mapping of recorded topics to inputs is the one
+//! that the daemon reported when it replayed the same recording.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
@@ -12,69 +13,69 @@ use foxglove::ws_protocol::client::advertise::Channel;
 use foxglove::ws_protocol::client::{Advertise, MessageData, Subscribe, Subscription};
 use foxglove::ws_protocol::schema::Schema;
 use foxglove::ws_protocol::server::ServerMessage;
-use ros::bag::Recorded;
+use ros::bag::BagMessage;
 use ros::codec::{Time, header_stamp};
 use ros::schema::Registry;
 use tokio::time::{Instant, timeout_at};
 
-use crate::client::{Client, escaped};
-use crate::inside::{self, Inside};
+use crate::client::{DaemonClient, percent_encode};
+use crate::inside::{self, FoxgloveSession};
 use crate::output;
 
-/// So much of a recording is used, as by the daemon.
+/// Number of messages of a recording that are used, as by the daemon.
 pub const RECORDED: usize = 300;
-/// Requests where nobody says how many, as with the daemon.
+/// Default number of requests, as by the daemon.
 pub const REQUESTS: usize = 40;
-/// How long an answer is waited for, and how long all may take.
+/// Time allowed for one answer, and for all requests.
 const ANSWER: Duration = Duration::from_secs(10);
 const WHOLE: Duration = Duration::from_secs(60);
-/// So many requests in vain, one after the other, are enough.
+/// Number of consecutive unanswered requests after which the probe stops.
 const IN_VAIN: usize = 3;
-/// Until one was answered, a request is made again after this and twice the longest time at the node: a node may begin to listen only when
-/// it is listened to, and the first messages are lost.
+/// Until one request was answered, each is repeated after this time plus twice the longest response time at the node: a
+/// node may subscribe only when it has subscribers itself, so the first messages are lost.
 const AGAIN: Duration = Duration::from_millis(500);
-/// Longer pauses of a recording are cut to this.
+/// Longer pauses of a recording are shortened to this.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-/// Messages of a topic that wait in the daemon.
+/// Length of the daemon's queue for each topic.
 const DEPTH: usize = 16;
 
-/// What came of it.
+/// Outcome of a probe.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Asked {
-    /// Times of the requests in milliseconds, from here to here; none of those that were not answered. The first that was answered is
-    /// not among them, nor those before it; where none was answered, all are.
+pub struct ProbeOutcome {
+    /// Response times in milliseconds, measured here; `None` for requests that were not answered. The first answered
+    /// request and those before it are not included, unless none was answered.
     pub times: Vec<Option<f64>>,
-    /// Bytes of the largest request.
+    /// Size of the largest request in bytes.
     pub request: usize,
-    /// Bytes of the largest answer.
+    /// Size of the largest answer in bytes.
     pub answer: usize,
-    /// The input that was asked.
+    /// Input that was sent the requests.
     pub asked: Option<String>,
-    /// The output that answered.
+    /// Output that answered.
     pub answered_by: Option<String>,
-    /// Why they ended before all were made.
+    /// Reason why the probe stopped before all requests were sent.
     pub broken: Option<String>,
 }
 
-impl Asked {
-    /// So many requests, none of which was answered.
-    pub fn unanswered(requests: usize) -> Asked {
-        Asked {
+impl ProbeOutcome {
+    /// Creates the outcome of requests of which none was answered.
+    pub fn without_answers(requests: usize) -> ProbeOutcome {
+        ProbeOutcome {
             times: vec![None; requests],
-            ..Asked::default()
+            ..ProbeOutcome::default()
         }
     }
 
-    /// It came to nothing.
-    pub fn broken(why: String) -> Asked {
-        Asked {
+    /// Creates the outcome of a probe that failed before its first request.
+    pub fn from_failure(why: String) -> ProbeOutcome {
+        ProbeOutcome {
             broken: Some(why),
-            ..Asked::default()
+            ..ProbeOutcome::default()
         }
     }
 
-    /// Notes a request. Until one was answered (`warm`), topics are being connected.
-    fn note(&mut self, took: Option<f64>, warm: &mut bool) {
+    /// Records a request. Until one was answered (`warm`), topics are still being connected.
+    fn record(&mut self, took: Option<f64>, warm: &mut bool) {
         if took.is_some() && !std::mem::replace(warm, true) {
             self.times.clear();
         } else {
@@ -83,21 +84,21 @@ impl Asked {
     }
 }
 
-/// What is asked.
-pub struct Probe<'a> {
-    /// The service.
+/// Parameters of a probe.
+pub struct NetworkProbe<'a> {
+    /// Service under test.
     pub service: &'a ServiceDetail,
-    /// What the daemon has measured with the same recording.
+    /// The daemon's measurement with the same recording.
     pub calibration: &'a Calibration,
-    /// The recording.
-    pub recorded: &'a [Recorded],
-    /// The input whose messages are the requests; none: the first that the recording feeds.
+    /// Messages of the recording.
+    pub recorded: &'a [BagMessage],
+    /// Input whose messages are the requests; `None` for the first that the recording feeds.
     pub input: Option<&'a str>,
-    /// The output whose messages are the answers; none: that whose message comes first.
+    /// Output whose messages are the answers; `None` for the first one to publish.
     pub output: Option<&'a str>,
-    /// Each request follows the answer before it.
+    /// Send each request as soon as the previous one is answered.
     pub fast: bool,
-    /// Requests whose times are wanted.
+    /// Number of requests to measure.
     pub requests: usize,
 }
 
@@ -107,23 +108,25 @@ struct Definitions {
     definitions: BTreeMap<String, String>,
 }
 
-impl Probe<'_> {
-    /// Asks, and waits for the answers.
-    pub async fn ask(&self, client: &Client, servant: &str) -> anyhow::Result<Asked> {
-        let name = escaped(&self.calibration.service);
+impl NetworkProbe<'_> {
+    /// Sends the requests and waits for the answers.
+    pub async fn run(&self, client: &DaemonClient, servant: &str) -> anyhow::Result<ProbeOutcome> {
+        let name = percent_encode(&self.calibration.service);
         let path = format!("/api/v1/services/{name}/interface");
         let Definitions { definitions } = client.get(&path).await?;
-        let registry = Registry::from_definitions(&definitions)
-            .with_context(|| format!("a definition of {}", self.calibration.service))?;
-        let round = Round::of(self.calibration, self.recorded, self.input, self.fast);
+        let registry = Registry::from_definitions(&definitions).with_context(|| {
+            format!("invalid message definition of {}", self.calibration.service)
+        })?;
+        let round =
+            ReplayRound::from_recording(self.calibration, self.recorded, self.input, self.fast);
         if round.items.is_empty() {
             bail!(
-                "nothing of the recording goes to an input of {}",
+                "the recording has no messages for an input of {}",
                 self.calibration.service
             );
         }
-        let mut line = Line {
-            inside: Inside::attach(client, servant, DEPTH).await?,
+        let mut line = ProbeConnection {
+            inside: FoxgloveSession::attach(client, servant, DEPTH).await?,
             service: self.service,
             output: self.output,
             registry,
@@ -132,22 +135,22 @@ impl Probe<'_> {
         };
         line.open(self.calibration).await?;
         let input = self.calibration.inputs.get(round.request);
-        let mut asked = Asked {
+        let mut asked = ProbeOutcome {
             asked: input.map(|input| input.topic.clone()),
-            ..Asked::default()
+            ..ProbeOutcome::default()
         };
-        // What was answered before stays measured.
-        if let Err(error) = self.asks(&mut line, &round, &mut asked).await {
+        // Requests that were answered before an error stay in the outcome.
+        if let Err(error) = self.send_requests(&mut line, &round, &mut asked).await {
             asked.broken = Some(format!("{error:#}"));
         }
         Ok(asked)
     }
 
-    async fn asks(
+    async fn send_requests(
         &self,
-        line: &mut Line<'_>,
-        round: &Round,
-        asked: &mut Asked,
+        line: &mut ProbeConnection<'_>,
+        round: &ReplayRound,
+        asked: &mut ProbeOutcome,
     ) -> anyhow::Result<()> {
         let ends = Instant::now() + WHOLE;
         let mut began = Instant::now();
@@ -160,11 +163,11 @@ impl Probe<'_> {
             let item = &round.items[turn % round.items.len()];
             let lap = u32::try_from(turn / round.items.len())?;
             let due = began + round.length * lap + item.at;
-            // Of time that was lost, no more is made up for than lies between two requests.
+            // Lost time is made up for by at most one interval between requests.
             began += now
                 .saturating_duration_since(due)
-                .saturating_sub(round.gap());
-            line.wait(due).await?;
+                .saturating_sub(round.request_interval());
+            line.drain_until(due).await?;
             let mut since = Instant::now();
             let given_up = since + ANSWER;
             line.publish(item, given_up).await?;
@@ -177,10 +180,10 @@ impl Probe<'_> {
                 let patience = if warm {
                     ANSWER
                 } else {
-                    again(self.calibration)
+                    retry_interval(self.calibration)
                 };
                 let until = given_up.min(since + patience);
-                let answer = line.answer(stamp, until).await?;
+                let answer = line.wait_for_answer(stamp, until).await?;
                 if answer.is_some() || until >= given_up {
                     break answer;
                 }
@@ -190,55 +193,55 @@ impl Probe<'_> {
             in_vain = if answer.is_some() { 0 } else { in_vain + 1 };
             if let Some(answer) = &answer {
                 asked.answer = asked.answer.max(answer.bytes);
-                asked.answered_by = line.named(answer.output);
+                asked.answered_by = line.output_name(answer.output);
             }
             let took = answer.map(|answer| (answer.at - since).as_secs_f64() * 1000.0);
-            asked.note(took, &mut warm);
+            asked.record(took, &mut warm);
         }
         Ok(())
     }
 }
 
-/// After which a request is made again that nobody may have heard.
-fn again(calibration: &Calibration) -> Duration {
-    let longest = super::measure::point(calibration).compute;
+/// Returns the time after which a request is repeated that may not have been received.
+fn retry_interval(calibration: &Calibration) -> Duration {
+    let longest = super::measure::only_point(calibration).compute;
     let longest = longest.map_or(0.0, |compute| compute.max);
     AGAIN + Duration::from_secs_f64(longest * 2.0 / 1000.0).min(ANSWER)
 }
 
 /// An answer.
-struct Answer {
+struct ProbeAnswer {
     at: Instant,
-    /// Number of the subscription.
+    /// Id of the subscription.
     output: u32,
     bytes: usize,
 }
 
-/// The recording's messages that go to an input, once.
-struct Round {
-    items: Vec<Item>,
-    /// Number of the input whose messages are requests.
+/// One round of the recording's messages that go to an input.
+struct ReplayRound {
+    items: Vec<ReplayMessage>,
+    /// Index of the input whose messages are requests.
     request: usize,
-    /// From the first message to the first of the next round.
+    /// Time from the first message to the first of the next round.
     length: Duration,
 }
 
-struct Item {
-    /// Number among the inputs that the daemon has fed.
+struct ReplayMessage {
+    /// Index of the input, among those that the daemon has fed.
     input: usize,
     at: Duration,
     bytes: Bytes,
 }
 
-impl Round {
-    fn of(
+impl ReplayRound {
+    fn from_recording(
         calibration: &Calibration,
-        recorded: &[Recorded],
+        recorded: &[BagMessage],
         request: Option<&str>,
         fast: bool,
-    ) -> Round {
+    ) -> ReplayRound {
         let inputs = &calibration.inputs;
-        let mut round = Round {
+        let mut round = ReplayRound {
             items: Vec::new(),
             request: request
                 .and_then(|named| inputs.iter().position(|input| input.topic == named))
@@ -258,7 +261,7 @@ impl Round {
                 round.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
                 before = Some(message.time.max(before.unwrap_or(0)));
             }
-            round.items.push(Item {
+            round.items.push(ReplayMessage {
                 input,
                 at: round.length,
                 bytes: message.bytes.clone(),
@@ -270,40 +273,40 @@ impl Round {
         round
     }
 
-    /// Between two requests.
-    fn gap(&self) -> Duration {
+    /// Returns the mean interval between two requests.
+    fn request_interval(&self) -> Duration {
         let requests = self.items.iter().filter(|item| item.input == self.request);
         self.length / u32::try_from(requests.count().max(1)).unwrap_or(u32::MAX)
     }
 }
 
-/// The connection to the servant.
-struct Line<'a> {
-    inside: Inside,
+/// Connection to the servant.
+struct ProbeConnection<'a> {
+    inside: FoxgloveSession,
     service: &'a ServiceDetail,
-    /// The only output that is listened to.
+    /// Output to subscribe to; `None` for all that are not latched.
     output: Option<&'a str>,
     registry: Registry,
-    /// Names and types of outputs that are listened to, by subscription.
+    /// Names and types of the subscribed outputs, by subscription id.
     outputs: HashMap<u32, (String, String)>,
-    /// The output whose messages answer requests that have no stamp.
+    /// Output whose messages answer requests without a stamp.
     answering: Option<u32>,
 }
 
-impl Line<'_> {
-    /// Listens to the outputs, and advertises the inputs.
+impl ProbeConnection<'_> {
+    /// Subscribes to the outputs and advertises the inputs.
     async fn open(&mut self, calibration: &Calibration) -> anyhow::Result<()> {
-        // The daemon tells which topics there are as soon as one has come.
+        // The daemon advertises its topics when a client has connected.
         let deadline = Instant::now() + ANSWER;
         while self.outputs.is_empty() {
             if Instant::now() >= deadline {
                 bail!(
-                    "{} of {} is not published where it could be heard from here",
+                    "cannot receive {} of {}: the daemon does not advertise it to this client",
                     self.output.unwrap_or("any output"),
                     calibration.service
                 );
             }
-            self.heard(deadline).await?;
+            self.process_next(deadline).await?;
         }
         for (number, input) in (0..).zip(&calibration.inputs) {
             let format = self.inside.format;
@@ -315,20 +318,20 @@ impl Line<'_> {
         Ok(())
     }
 
-    async fn publish(&mut self, item: &Item, deadline: Instant) -> anyhow::Result<()> {
+    async fn publish(&mut self, item: &ReplayMessage, deadline: Instant) -> anyhow::Result<()> {
         let message = MessageData::new(u32::try_from(item.input)?, &item.bytes[..]);
         match timeout_at(deadline, self.inside.send(&message)).await {
             Ok(sent) => sent,
-            // Half of a message may be on its way.
+            // The message may have been sent in part.
             Err(_) => bail!(
-                "a request of {} was not taken within {} s",
+                "a request of {} was not sent within {} s",
                 Size(item.bytes.len() as u64),
                 ANSWER.as_secs()
             ),
         }
     }
 
-    fn named(&self, output: u32) -> Option<String> {
+    fn output_name(&self, output: u32) -> Option<String> {
         self.outputs.get(&output).map(|(name, _)| name.clone())
     }
 
@@ -336,21 +339,21 @@ impl Line<'_> {
         header_stamp(&*self.registry.message(type_name).ok()?, bytes)
     }
 
-    /// Until then, what comes answers nothing; also what has come by now.
-    async fn wait(&mut self, due: Instant) -> anyhow::Result<()> {
-        while self.next(due).await?.is_some() {}
+    /// Processes messages until `due`; none of them is an answer. Also clears messages that have arrived by now.
+    async fn drain_until(&mut self, due: Instant) -> anyhow::Result<()> {
+        while self.next_message(due).await?.is_some() {}
         Ok(())
     }
 
-    /// When the answer came, and its bytes: the first output with the request's stamp, or, where either has none, the next on the
-    /// topic that answered the first request.
-    async fn answer(
+    /// Waits for the answer to a request: the first output with the request's stamp, or, if either has no stamp, the
+    /// next message on the topic that answered the first request.
+    async fn wait_for_answer(
         &mut self,
         asked: Option<Time>,
         deadline: Instant,
-    ) -> anyhow::Result<Option<Answer>> {
+    ) -> anyhow::Result<Option<ProbeAnswer>> {
         loop {
-            let Some(heard) = self.next(deadline).await? else {
+            let Some(heard) = self.next_message(deadline).await? else {
                 return Ok(None);
             };
             let Some((number, at, bytes)) = heard else {
@@ -363,7 +366,7 @@ impl Line<'_> {
                 _ => *self.answering.get_or_insert(number) == number,
             };
             if answers {
-                return Ok(Some(Answer {
+                return Ok(Some(ProbeAnswer {
                     at,
                     output: number,
                     bytes: bytes.len(),
@@ -372,38 +375,39 @@ impl Line<'_> {
         }
     }
 
-    async fn heard(&mut self, deadline: Instant) -> anyhow::Result<()> {
-        self.next(deadline).await.map(drop)
+    async fn process_next(&mut self, deadline: Instant) -> anyhow::Result<()> {
+        self.next_message(deadline).await.map(drop)
     }
 
-    /// The next that comes until then; none when it is time. Within it, a message of an output.
-    async fn next(
+    /// Returns the next event before the deadline, `None` at the deadline. The inner value is a message of an output,
+    /// if the event is one.
+    async fn next_message(
         &mut self,
         deadline: Instant,
     ) -> anyhow::Result<Option<Option<(u32, Instant, Vec<u8>)>>> {
-        let Ok(message) = timeout_at(deadline, self.inside.next_at()).await else {
+        let Ok(message) = timeout_at(deadline, self.inside.next_timed()).await else {
             return Ok(None);
         };
         let Some((at, message)) = message? else {
-            bail!("the measured servant has ended while it was asked over the network")
+            bail!("the servant ended during the measurement over the network")
         };
-        match inside::read(&message) {
+        match inside::parse_message(&message) {
             Some(ServerMessage::MessageData(told)) => {
                 return Ok(Some(Some((told.subscription_id, at, told.data.to_vec()))));
             }
             Some(ServerMessage::Advertise(told)) => {
                 for channel in told.channels {
-                    self.listen(channel.id, &channel.topic).await?;
+                    self.subscribe(channel.id, &channel.topic).await?;
                 }
             }
-            Some(ServerMessage::Status(told)) => output::complain(&told.message),
+            Some(ServerMessage::Status(told)) => output::eprint_line(&told.message),
             _ => {}
         }
         Ok(Some(None))
     }
 
-    async fn listen(&mut self, channel: u64, topic: &str) -> anyhow::Result<()> {
-        // Latched outputs tell a state; they answer nothing.
+    async fn subscribe(&mut self, channel: u64, topic: &str) -> anyhow::Result<()> {
+        // Latched outputs publish a state and answer no request.
         let output = self.service.interface.topics.iter().find(|known| {
             known.direction == Direction::Output
                 && known.name == *topic
@@ -427,8 +431,8 @@ mod tests {
 
     use super::*;
 
-    fn recorded(topic: &str, type_name: &str, millis: u64) -> Recorded {
-        Recorded {
+    fn recorded_message(topic: &str, type_name: &str, millis: u64) -> BagMessage {
+        BagMessage {
             topic: topic.into(),
             wire_type: Arc::new(WireType::new(type_name, "x", "")),
             time: millis * 1_000_000,
@@ -436,7 +440,7 @@ mod tests {
         }
     }
 
-    fn fed(topic: &str, type_name: &str, from: &[&str]) -> Fed {
+    fn fed_input(topic: &str, type_name: &str, from: &[&str]) -> Fed {
         Fed {
             topic: topic.into(),
             type_name: type_name.into(),
@@ -448,8 +452,8 @@ mod tests {
     #[test]
     fn requests_before_the_first_answer_count_where_none_comes() {
         let noted = |all: &[Option<f64>]| {
-            let (mut asked, mut warm) = (Asked::default(), false);
-            all.iter().for_each(|took| asked.note(*took, &mut warm));
+            let (mut asked, mut warm) = (ProbeOutcome::default(), false);
+            all.iter().for_each(|took| asked.record(*took, &mut warm));
             asked.times
         };
         assert_eq!(noted(&[None; 3]), [None; 3]);
@@ -462,7 +466,8 @@ mod tests {
 
     #[test]
     fn the_first_request_is_made_again_soon_but_not_before_a_slow_node_can_answer() {
-        let again = |compute: f64| again(&crate::eval::side::tests::calibration(1.0, compute, 20));
+        let again =
+            |compute: f64| retry_interval(&crate::eval::side::tests::calibration(1.0, compute, 20));
         assert_eq!(again(24.0), AGAIN + Duration::from_millis(48));
         assert!(again(4000.0) > Duration::from_secs(8));
     }
@@ -471,19 +476,19 @@ mod tests {
     fn recorded_messages_go_where_the_daemon_sent_them_at_their_pace() {
         let calibration = Calibration {
             inputs: vec![
-                fed("/say", "std_msgs/String", &["/chatter"]),
-                fed("/count", "std_msgs/Int32", &[]),
+                fed_input("/say", "std_msgs/String", &["/chatter"]),
+                fed_input("/count", "std_msgs/Int32", &[]),
             ],
             ..Calibration::default()
         };
         let bag = [
-            recorded("/chatter", "std_msgs/String", 1000),
-            recorded("/tf", "tf2_msgs/TFMessage", 1050),
-            recorded("/count", "std_msgs/Int32", 1100),
-            // After a minute of nothing.
-            recorded("/chatter", "std_msgs/String", 61_100),
+            recorded_message("/chatter", "std_msgs/String", 1000),
+            recorded_message("/tf", "tf2_msgs/TFMessage", 1050),
+            recorded_message("/count", "std_msgs/Int32", 1100),
+            // After a minute without messages.
+            recorded_message("/chatter", "std_msgs/String", 61_100),
         ];
-        let round = Round::of(&calibration, &bag, Some("/count"), false);
+        let round = ReplayRound::from_recording(&calibration, &bag, Some("/count"), false);
         let told: Vec<(usize, u128)> = round
             .items
             .iter()
@@ -491,8 +496,8 @@ mod tests {
             .collect();
         assert_eq!(told, [(0, 0), (1, 100), (0, 1100)]);
         assert_eq!((round.request, round.length.as_millis()), (1, 1650));
-        assert_eq!(round.gap().as_millis(), 1650);
-        let fast = Round::of(&calibration, &bag, None, true);
+        assert_eq!(round.request_interval().as_millis(), 1650);
+        let fast = ReplayRound::from_recording(&calibration, &bag, None, true);
         assert_eq!((fast.request, fast.length), (0, Duration::ZERO));
         assert!(fast.items.iter().all(|item| item.at.is_zero()));
     }

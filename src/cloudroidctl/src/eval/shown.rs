@@ -1,17 +1,17 @@
-//! An evaluation for people.
+//! Prints an evaluation for people.
 
 use std::path::Path;
 
 use api::Size;
 use api::calibration::TimeSpread;
 
-use super::side::Side;
+use super::side::SideResult;
 use super::verdict::Evaluation;
-use crate::calibrate::rows;
+use crate::calibrate::print_rows;
 use crate::output::{self, Table};
-use crate::trial::renamed;
+use crate::trial::describe_renamed_topics;
 
-/// Shows it.
+/// Prints the evaluation.
 pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
     output::line("")?;
     response_times(of)?;
@@ -20,19 +20,19 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
     if let Some(words) = messages(&of.outsourced) {
         output::line(&words)?;
     }
-    if let Some(network) = of.network.filter(|network| network.adds()) {
+    if let Some(network) = of.network.filter(|network| network.has_effect()) {
         output::line(&format!(
-            "UP and DOWN are a network of {network}, which was not there: it is added"
+            "UP and DOWN are calculated, not measured: a network of {network} is added"
         ))?;
     }
-    for words in renamed(&of.inputs) {
+    for words in describe_renamed_topics(&of.inputs) {
         output::line(&words)?;
     }
     if !of.unused.is_empty() {
         output::line(&format!("not used: {}", of.unused.join(", ")))?;
     }
     output::line(&format!(
-        "native has been measured on cores of this server; a robot's own cores are slower, if they are other ones\nplot: {}\n",
+        "native was measured on this server's cores; a robot with slower cores takes longer\nplot: {}\n",
         plot.display()
     ))?;
     output::line(&of.verdict)?;
@@ -45,11 +45,11 @@ pub fn print(of: &Evaluation, plot: &Path) -> anyhow::Result<()> {
         output::line(&format!("    {line}"))?;
     }
     output::line("")?;
-    rows(std::slice::from_ref(&sla.row))
+    print_rows(std::slice::from_ref(&sla.row))
 }
 
-/// What went over the network: the largest of both.
-fn messages(outsourced: &Side) -> Option<String> {
+/// Returns the sizes of the largest request and answer over the network.
+fn messages(outsourced: &SideResult) -> Option<String> {
     let answered_by = outsourced.answered_by.as_deref()?;
     let (request, answer) = outsourced.bytes;
     let size = |bytes: usize| Size(bytes as u64);
@@ -61,7 +61,7 @@ fn messages(outsourced: &Side) -> Option<String> {
     ))
 }
 
-fn sides(of: &Evaluation) -> [(&'static str, &Side); 2] {
+fn sides(of: &Evaluation) -> [(&'static str, &SideResult); 2] {
     [("native", &of.native), ("outsourced", &of.outsourced)]
 }
 
@@ -105,7 +105,7 @@ fn phases(of: &Evaluation) -> anyhow::Result<()> {
         "DOWN MS",
         "COMPUTE MS",
         "RUNNING MS",
-        "HELD UP MS",
+        "THROTTLED MS",
     ]);
     for (name, side) in sides(of) {
         let cells = side.phases.map(|phases| {

@@ -1,83 +1,87 @@
-//! One side of an evaluation: what was measured of it, and the parts of its requests' time.
+//! One side of an evaluation: its measurement, and the phases of its requests.
 
 use api::calibration::TimeSpread;
 use api::{Calibration, Size};
 use serde::Serialize;
 
-use super::measure::point;
-use super::network::Network;
-use super::probe::Asked;
-use super::robot::Robot;
+use super::measure::only_point;
+use super::network::AddedNetwork;
+use super::probe::ProbeOutcome;
+use super::robot::RobotResources;
 
-/// Such a share of the recording's pace is to be kept, and of the requests to be answered.
+/// Share of the recording's rate that must be reached, and of the requests that must be answered.
 const ENOUGH: f64 = 0.95;
-/// Fewer answers say nothing of a 95th percentile.
+/// Smallest number of answers for a meaningful 95th percentile.
 const FEWEST: usize = 10;
 
-/// One side.
+/// Result of one side.
 #[derive(Debug, Clone, Default, Serialize)]
-pub struct Side {
-    /// Cores that it had.
+pub struct SideResult {
+    /// Cores of the servant.
     pub cpus: f64,
-    /// Memory that it was limited to.
+    /// Memory limit of the servant.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_limit: Option<Size>,
-    /// Why the kernel has ended it.
+    /// Reason why the kernel killed the servant for lack of memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub out_of_memory: Option<String>,
-    /// Why it was not measured over the network.
+    /// Reason why the measurement over the network failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub broken: Option<String>,
-    /// Requests.
+    /// Number of requests.
     pub requests: usize,
-    /// Of them were answered.
+    /// Number of answered requests.
     pub answered: usize,
     /// Response times, as the robot would see them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rrt: Option<TimeSpread>,
-    /// The medians' parts.
+    /// Phases of the median response time.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub phases: Option<Phases>,
-    /// Requests a second that were made, as far as that is known.
+    /// Achieved request rate in Hz, if known.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rate: Option<f64>,
-    /// The most memory that was in use.
+    /// Peak memory use.
     pub memory: Size,
-    /// Size of the largest request, and of the largest answer where it was heard from here.
+    /// Sizes of the largest request and of the largest answer received here, in bytes.
     pub bytes: (usize, usize),
-    /// The input that was asked from here.
+    /// Input that was sent requests from here.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub asked: Option<String>,
-    /// The output that answered, where it was heard from here.
+    /// Output whose answers were received here.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub answered_by: Option<String>,
-    /// Of each answered request.
+    /// Response times of the answered requests.
     pub times: Vec<f64>,
 }
 
-/// Parts of a request's time.
+/// Phases of a request, in milliseconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Phases {
-    /// Up by the added network; none where requests cross none.
+    /// Upload through the added network; `None` if requests cross no network.
     pub up: Option<f64>,
-    /// Between here and the servant's node, both ways: what is over of the median when that of the node is taken away. None where
-    /// nothing is over: the medians are of two runs.
+    /// Transport between this machine and the servant's node, both ways: the median response time minus the median at
+    /// the node. `None` if the difference is not positive, as the medians are of two runs.
     pub transport: Option<f64>,
-    /// Down by the added network.
+    /// Download through the added network.
     pub down: Option<f64>,
-    /// From the request's arrival at the node to its answer (median).
+    /// Time from the request's arrival at the node to its answer (median).
     pub compute: f64,
-    /// Of it processor time, on average, summed over cores.
+    /// Processor time in `compute`, on average, summed over cores.
     pub running: f64,
-    /// Of it held up by the limit of cores, on average, summed over the threads' cores.
+    /// Time in `compute` that the CPU limit throttled, on average, summed over the threads' cores.
     pub held_up: f64,
 }
 
-impl Side {
-    /// With as much as the robot has. Its requests cross no network.
-    pub fn native(calibration: &Calibration, times: Vec<f64>, robot: &Robot) -> Side {
-        let point = point(calibration);
-        Side {
+impl SideResult {
+    /// Returns the result of a measurement with the robot's resources. Its requests cross no network.
+    pub fn from_calibration(
+        calibration: &Calibration,
+        times: Vec<f64>,
+        robot: &RobotResources,
+    ) -> SideResult {
+        let point = only_point(calibration);
+        SideResult {
             cpus: point.cpus,
             memory_limit: Some(robot.memory),
             requests: point.requests,
@@ -93,31 +97,35 @@ impl Side {
             memory: point.memory,
             bytes: (calibration.largest.0 as usize, 0),
             times,
-            ..Side::default()
+            ..SideResult::default()
         }
     }
 
-    /// It did not get along with the robot's memory.
-    pub fn starved(robot: &Robot, why: String) -> Side {
-        Side {
+    /// Returns the result of a servant that the robot's memory does not suffice for.
+    pub fn out_of_memory(robot: &RobotResources, why: String) -> SideResult {
+        SideResult {
             cpus: robot.cpus,
             memory_limit: Some(robot.memory),
             out_of_memory: Some(why),
-            ..Side::default()
+            ..SideResult::default()
         }
     }
 
-    /// As it was heard over the network, with what `network` adds.
-    pub fn outsourced(calibration: &Calibration, asked: &Asked, network: Option<Network>) -> Side {
-        let point = point(calibration);
+    /// Returns the result as seen over the network, plus the delays of `network`.
+    pub fn from_probe(
+        calibration: &Calibration,
+        asked: &ProbeOutcome,
+        network: Option<AddedNetwork>,
+    ) -> SideResult {
+        let point = only_point(calibration);
         let (up, down) = network.map_or((0.0, 0.0), |network| {
             (
-                network.one_way(asked.request),
-                network.one_way(asked.answer),
+                network.one_way_millis(asked.request),
+                network.one_way_millis(asked.answer),
             )
         });
         let heard: Vec<f64> = asked.times.iter().flatten().copied().collect();
-        let seen = TimeSpread::of(heard.clone());
+        let seen = TimeSpread::from_samples(heard.clone());
         let times: Vec<f64> = heard.iter().map(|time| time + up + down).collect();
         let phases = point.compute.map(|compute| Phases {
             up: seen.and(Some(up)),
@@ -129,12 +137,12 @@ impl Side {
             running: point.running,
             held_up: point.throttled,
         });
-        Side {
+        SideResult {
             cpus: point.cpus,
             broken: asked.broken.clone(),
             requests: asked.times.len(),
             answered: times.len(),
-            rrt: TimeSpread::of(times.clone()),
+            rrt: TimeSpread::from_samples(times.clone()),
             phases,
             rate: Some(point.rate),
             memory: point.memory,
@@ -142,17 +150,17 @@ impl Side {
             asked: asked.asked.clone(),
             answered_by: asked.answered_by.clone(),
             times,
-            ..Side::default()
+            ..SideResult::default()
         }
     }
 
-    /// Whether its times say something.
-    pub fn answers_enough(&self) -> bool {
+    /// Returns whether there are enough answers for the times to be meaningful.
+    pub fn has_enough_answers(&self) -> bool {
         self.answered >= FEWEST && self.answered as f64 >= self.requests as f64 * ENOUGH
     }
 
-    /// Whether it keeps the recording's pace, one request after the other.
-    pub fn keeps(&self, pace: Option<f64>) -> bool {
+    /// Returns whether one request after the other keeps up with the recording's rate.
+    pub fn keeps_pace(&self, pace: Option<f64>) -> bool {
         pace.is_none_or(|pace| {
             let possible = self.rrt.map_or(0.0, |rrt| 1000.0 / rrt.p50);
             possible >= pace * ENOUGH
@@ -169,13 +177,13 @@ pub(super) mod tests {
     use api::{Limits, Measure};
 
     use super::*;
-    use crate::eval::robot::Class;
+    use crate::eval::robot::RobotClass;
 
-    pub(in crate::eval) fn robot() -> Robot {
-        Robot::new(Class::Pi, None, None)
+    pub(in crate::eval) fn robot() -> RobotResources {
+        RobotResources::new(RobotClass::Pi, None, None)
     }
 
-    /// Twenty requests that took so long each at the node.
+    /// Returns a calibration of twenty requests with this response time at the node, in milliseconds.
     pub(in crate::eval) fn calibration(cpus: f64, compute: f64, answered: usize) -> Calibration {
         let spread = TimeSpread {
             p50: compute,
@@ -211,22 +219,22 @@ pub(super) mod tests {
         }
     }
 
-    pub(in crate::eval) fn asked(time: f64) -> Asked {
-        Asked {
+    pub(in crate::eval) fn probe_outcome(time: f64) -> ProbeOutcome {
+        ProbeOutcome {
             times: vec![Some(time); 20],
             request: 125_000,
-            ..Asked::default()
+            ..ProbeOutcome::default()
         }
     }
 
     #[test]
     fn a_network_is_added_to_what_was_measured_and_told_apart_from_it() {
-        let side = Side::outsourced(
+        let side = SideResult::from_probe(
             &calibration(1.0, 40.0, 20),
-            &asked(45.0),
+            &probe_outcome(45.0),
             "lan".parse().ok(),
         );
-        // 1 ms up and 10 ms for a megabit; 1 ms down.
+        // 1 ms plus 10 ms for a megabit up; 1 ms down.
         let phases = side.phases.expect("phases");
         let is = |part: Option<f64>, time: f64| part.is_some_and(|part| (part - time).abs() < 1e-9);
         assert!(is(phases.up, 11.0) && is(phases.down, 1.0), "{phases:?}");
@@ -241,13 +249,14 @@ pub(super) mod tests {
 
     #[test]
     fn a_difference_of_two_runs_that_is_not_positive_is_not_shown() {
-        let side = Side::outsourced(&calibration(1.0, 40.0, 20), &asked(38.0), None);
+        let side = SideResult::from_probe(&calibration(1.0, 40.0, 20), &probe_outcome(38.0), None);
         let phases = side.phases.expect("phases");
         assert_eq!((phases.transport, phases.compute), (None, 40.0));
         let told = serde_json::to_value(phases).expect("plain data");
         assert!(told["transport"].is_null(), "{told}");
         // Native requests cross no network.
-        let native = Side::native(&calibration(0.25, 40.0, 20), vec![40.0; 20], &robot());
+        let native =
+            SideResult::from_calibration(&calibration(0.25, 40.0, 20), vec![40.0; 20], &robot());
         let phases = native.phases.expect("phases");
         assert_eq!(
             (phases.up, phases.transport, phases.down),
@@ -257,8 +266,8 @@ pub(super) mod tests {
 
     #[test]
     fn what_the_daemon_has_measured_is_kept_where_asking_over_the_network_fails() {
-        let asked = Asked::broken("the daemon broke the connection".into());
-        let side = Side::outsourced(&calibration(1.0, 40.0, 20), &asked, None);
+        let asked = ProbeOutcome::from_failure("the daemon broke the connection".into());
+        let side = SideResult::from_probe(&calibration(1.0, 40.0, 20), &asked, None);
         assert_eq!(side.phases.map(|phases| phases.compute), Some(40.0));
         assert_eq!((side.rrt, side.broken), (None, asked.broken));
     }

@@ -1,4 +1,4 @@
-//! The package as the body of a request: packed while it is sent, nothing of it kept.
+//! The package as a request body: packed while it is sent, without a temporary file.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -13,46 +13,46 @@ use http_body_util::{BodyExt, Full, StreamBody};
 use hyper::body::Frame;
 use tokio::sync::mpsc;
 
-use crate::client::Body;
+use crate::client::RequestBody;
 
-/// How far packing may run ahead of sending.
+/// Size and number of chunks that packing may be ahead of sending.
 const CHUNK: usize = 256 << 10;
 const CHUNKS_AHEAD: usize = 8;
-/// How deep a package.xml is looked for.
+/// Depth of the search for a package.xml.
 const DEPTH: usize = 6;
-/// Directories that hold nothing of a package.
+/// Directories that never belong to a package.
 const LEFT_OUT: [&str; 5] = [".git", ".hg", ".svn", ".catkin_tools", "__pycache__"];
-/// Beside `src` of a workspace: what catkin or colcon made of it.
+/// Directories beside `src` of a workspace that catkin or colcon generate.
 const MADE_OF_IT: [&str; 6] = ["build", "devel", "install", "log", "logs", "build_isolated"];
 
-/// The packing under way.
+/// Handle of the thread that packs the archive.
 #[derive(Debug)]
 pub struct Packing {
     failure: std::sync::mpsc::Receiver<anyhow::Error>,
 }
 
 impl Packing {
-    /// Why it failed, if it did.
-    pub fn error(self) -> Option<anyhow::Error> {
+    /// Returns the error of packing, if it failed.
+    pub fn into_error(self) -> Option<anyhow::Error> {
         self.failure.try_recv().ok()
     }
 }
 
-/// No package: `--apt`.
-pub fn nothing() -> Body {
+/// Returns an empty body, for `--apt`.
+pub fn empty_body() -> RequestBody {
     Full::default()
         .map_err(|never| match never {})
         .boxed_unsync()
 }
 
-/// The archive of a directory, or an archive as it is.
-pub fn of(path: &Path) -> anyhow::Result<(Body, Packing)> {
+/// Returns the archive of a directory, or an existing archive, as a body.
+pub fn request_body(path: &Path) -> anyhow::Result<(RequestBody, Packing)> {
     let metadata =
         std::fs::metadata(path).with_context(|| format!("cannot push {}", path.display()))?;
     if metadata.is_dir() && !holds_package(path, DEPTH)? {
         bail!(
-            "{} holds no package.xml; push the directory of a ROS package, a workspace or an install space, \
-             or take a packaged one with --apt NAME",
+            "{} contains no package.xml; push the directory of a ROS package, a workspace or an install space, or a \
+                Debian package with --apt NAME",
             path.display()
         );
     }
@@ -69,7 +69,7 @@ pub fn of(path: &Path) -> anyhow::Result<(Body, Packing)> {
             let error = error.context(format!("cannot pack {}", source.display()));
             let torn = io::Error::other(error.to_string());
             let _ = failed.try_send(error);
-            // The body ends in an error, so the daemon does not take a torn archive for a whole one.
+            // The body ends with an error, so that the daemon does not accept a truncated archive.
             let _ = chunks.blocking_send(Err(torn));
         }
     });
@@ -103,25 +103,25 @@ fn holds_package(directory: &Path, depth: usize) -> anyhow::Result<bool> {
 
 fn copy(archive: &Path, chunks: &Chunks) -> anyhow::Result<()> {
     let mut file = std::fs::File::open(archive)?;
-    let mut sender = Sender::new(chunks);
+    let mut sender = ChunkWriter::new(chunks);
     io::copy(&mut file, &mut sender)?;
     sender.flush()?;
     Ok(())
 }
 
 fn pack(root: &Path, chunks: &Chunks) -> anyhow::Result<()> {
-    let encoder = GzEncoder::new(Sender::new(chunks), Compression::fast());
+    let encoder = GzEncoder::new(ChunkWriter::new(chunks), Compression::fast());
     let mut archive = tar::Builder::new(encoder);
     archive.follow_symlinks(false);
     archive.mode(tar::HeaderMode::Deterministic);
     let workspace = root.join("src").is_dir() && !root.join("package.xml").exists();
-    add(&mut archive, root, &PathBuf::new(), workspace)?;
+    add_directory(&mut archive, root, &PathBuf::new(), workspace)?;
     archive.into_inner()?.finish()?.flush()?;
     Ok(())
 }
 
-fn add(
-    archive: &mut tar::Builder<GzEncoder<Sender<'_>>>,
+fn add_directory(
+    archive: &mut tar::Builder<GzEncoder<ChunkWriter<'_>>>,
     root: &Path,
     relative: &Path,
     workspace: bool,
@@ -148,35 +148,35 @@ fn add(
             .append_path_with_name(&path, &inside)
             .with_context(|| format!("{}", path.display()))?;
         if kind.is_dir() {
-            add(archive, root, &inside, false)?;
+            add_directory(archive, root, &inside, false)?;
         }
     }
     Ok(())
 }
 
-/// `catkin_init_workspace` links `src/CMakeLists.txt` to a file of catkin's own, out of the tree; nothing of the
-/// package is in it.
+/// Returns whether a link is `src/CMakeLists.txt` of `catkin_init_workspace`, which points to a file of catkin outside
+/// of the workspace and contains nothing of the package.
 fn is_catkins_toplevel(link: &Path) -> bool {
     std::fs::read_link(link)
         .is_ok_and(|target| target.is_absolute() && target.ends_with("catkin/cmake/toplevel.cmake"))
 }
 
-/// Gathers writes into chunks and sends them, waiting while too many are under way.
-struct Sender<'a> {
+/// Collects writes into chunks and sends them; blocks while too many are pending.
+struct ChunkWriter<'a> {
     chunks: &'a Chunks,
     pending: Vec<u8>,
 }
 
-impl<'a> Sender<'a> {
+impl<'a> ChunkWriter<'a> {
     fn new(chunks: &'a Chunks) -> Self {
-        Sender {
+        ChunkWriter {
             chunks,
             pending: Vec::with_capacity(CHUNK),
         }
     }
 }
 
-impl Write for Sender<'_> {
+impl Write for ChunkWriter<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.pending.extend_from_slice(bytes);
         if self.pending.len() >= CHUNK {
@@ -192,6 +192,6 @@ impl Write for Sender<'_> {
         let chunk = std::mem::replace(&mut self.pending, Vec::with_capacity(CHUNK));
         self.chunks
             .blocking_send(Ok(chunk.into()))
-            .map_err(|_| io::Error::new(io::ErrorKind::BrokenPipe, "the daemon takes no more"))
+            .map_err(|_| io::Error::new(io::ErrorKind::BrokenPipe, "the daemon stopped reading"))
     }
 }

@@ -1,5 +1,4 @@
-//! What a push does, shown as it happens: bars on a terminal, plain lines otherwise, the events themselves as
-//! JSON lines.
+//! Progress of a push: bars on a terminal, plain lines otherwise, or the events as JSON lines.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -8,29 +7,29 @@ use api::{PushEvent, Size};
 use foreign::terminal;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::output::{self, Format};
+use crate::output::{self, OutputFormat};
 
-/// On a plain output, progress is said at most so often.
+/// Shortest interval between lines of progress without a terminal.
 const PLAIN_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Shows one push.
-pub struct Progress {
-    format: Format,
+/// Prints the progress of a push.
+pub struct PushProgress {
+    format: OutputFormat,
     began: Instant,
-    /// On a terminal.
+    /// Progress bar on a terminal.
     bar: Option<ProgressBar>,
     said: Instant,
 }
 
-impl Progress {
-    /// For standard output as it is.
-    pub fn new(format: Format) -> Progress {
-        let bar = (format == Format::Table && std::io::stderr().is_terminal()).then(|| {
+impl PushProgress {
+    /// Creates the progress for the current standard output.
+    pub fn new(format: OutputFormat) -> PushProgress {
+        let bar = (format == OutputFormat::Table && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new_spinner();
             bar.enable_steady_tick(Duration::from_millis(120));
             bar
         });
-        Progress {
+        PushProgress {
             format,
             began: Instant::now(),
             bar,
@@ -38,9 +37,9 @@ impl Progress {
         }
     }
 
-    /// Shows one event.
+    /// Prints an event.
     pub fn show(&mut self, event: &PushEvent) -> anyhow::Result<()> {
-        if self.format == Format::Json {
+        if self.format == OutputFormat::Json {
             return output::json_line(event);
         }
         match event {
@@ -129,7 +128,7 @@ impl Progress {
     }
 }
 
-impl Drop for Progress {
+impl Drop for PushProgress {
     fn drop(&mut self) {
         self.finish();
     }

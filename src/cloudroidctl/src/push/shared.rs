@@ -1,34 +1,35 @@
-//! Flags of a service that robots share.
+//! Flags of a service whose servants robots share.
 
 use api::Shared;
 
-/// How robots share a service.
+/// Settings for sharing the servants of a service.
 #[derive(Debug, Clone, Copy, Default, clap::Args)]
 pub struct SharedFlags {
-    /// Robots share the service's servants: each call and each goal goes to the one with the fewest. For packages that
-    /// answer services and actions and keep nothing of what they are asked; others are refused.
+    /// Robots share the service's servants: each call and goal goes to the servant with the fewest. Only for packages
+    /// with services and actions that keep no state between requests; others are refused.
     #[arg(long, conflicts_with = "stateful")]
     shared: bool,
-    /// Servants that there are at least while a robot uses the service; 1 by default.
+    /// Smallest number of servants while a robot uses the service (default: 1).
     #[arg(long, value_name = "N", requires = "shared")]
     min: Option<u32>,
-    /// Servants that there are at most; 4 by default.
+    /// Largest number of servants (default: 4).
     #[arg(long, value_name = "M", requires = "shared")]
     max: Option<u32>,
-    /// A request may be carried out twice: one whose servant was lost is asked again at another.
+    /// Requests may be executed twice: a request whose servant was lost is repeated on another.
     #[arg(long, requires = "shared")]
     idempotent: bool,
-    /// So many servants work at the same call, and the first answer is taken; implies --idempotent, and --min as many.
+    /// Number of servants that execute each call, of which the first answer is used; implies --idempotent, and --min of
+    /// at least N.
     #[arg(long, value_name = "N", requires = "shared")]
     replicas: Option<u32>,
-    /// Calls that one servant has under way at most, 8 by default; the rest wait for whichever is free first.
+    /// Largest number of concurrent calls per servant (default: 8); further calls wait for the first free servant.
     #[arg(long, value_name = "N", requires = "shared")]
     calls: Option<u32>,
 }
 
 impl SharedFlags {
-    /// What they ask for, if anything.
-    pub fn asked(&self) -> Option<Shared> {
+    /// Returns the settings, if `--shared` is given.
+    pub fn shared_settings(&self) -> Option<Shared> {
         let fine = Shared::default();
         let replicas = self.replicas.unwrap_or(fine.replicas);
         let min = self.min.unwrap_or(fine.min.max(replicas));

@@ -1,4 +1,5 @@
-//! A certificate of an authority that is asked by ACME (RFC 8555): kept in the home, and renewed when two thirds of its time are over.
+//! A certificate obtained from an authority by ACME (RFC 8555): kept in the home and renewed after two thirds of its
+//! lifetime.
 
 mod account;
 mod order;
@@ -15,42 +16,48 @@ use tokio::net::TcpListener;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 
-use super::{DIRECTORY, Pair, read};
+use super::{ChainAndKey, DIRECTORY, read_chain_and_key};
 use crate::config;
 use crate::home::Home;
 
-/// The certificate with those that lead to the authority, and its key.
+/// File of the certificate chain and its key.
 const CERTIFICATE: &str = "acme.pem";
-/// The clock is looked at so often: it may be set, and the machine may have slept.
+/// Interval between looks at the clock: it may be set, and the machine may have slept.
 const LOOK: Duration = Duration::from_secs(3600);
-/// The longest time between two attempts.
+/// Longest time between two attempts.
 const LONGEST_RETRY: Duration = Duration::from_secs(6 * 3600);
 
-/// What the home has, with the path of its file: a certificate that is good now, and for all names.
-pub fn kept(acme: &config::Acme, directory: &Path) -> Option<(PathBuf, Pair)> {
+/// Loads the certificate of the home with the path of its file, if it is valid now and covers all names.
+pub fn load_certificate(
+    acme: &config::AcmeConfig,
+    directory: &Path,
+) -> Option<(PathBuf, ChainAndKey)> {
     let path = directory.join(CERTIFICATE);
     if !path.exists() {
         return None;
     }
-    let pair = match read(&path, &path) {
+    let pair = match read_chain_and_key(&path, &path) {
         Ok(pair) => pair,
         Err(error) => {
-            tracing::warn!("{error}; another certificate is asked for");
+            tracing::warn!("{error}; requesting a new certificate");
             return None;
         }
     };
     let certificate = pair.0.first()?;
-    let good = authority::period(certificate).is_ok_and(|period| store::now() < period.until);
-    (good && is_for_all(certificate, &acme.names)).then_some((path, pair))
+    let good =
+        authority::read_validity(certificate).is_ok_and(|period| store::now() < period.until);
+    (good && covers_all(certificate, &acme.names)).then_some((path, pair))
 }
 
-fn is_for_all(certificate: &CertificateDer<'_>, names: &[String]) -> bool {
-    names.iter().all(|name| tls::speaks_for(certificate, name))
+fn covers_all(certificate: &CertificateDer<'_>, names: &[String]) -> bool {
+    names
+        .iter()
+        .all(|name| tls::is_valid_for_host(certificate, name))
 }
 
-/// Listens where the authority looks, if that is not the portal's own port.
+/// Binds the address that the authority connects to, if that is not the portal's own port.
 pub async fn listen_for_challenges(
-    acme: Option<&config::Acme>,
+    acme: Option<&config::AcmeConfig>,
 ) -> anyhow::Result<Option<TcpListener>> {
     let Some(address) = acme.and_then(|acme| acme.challenge_listen) else {
         return Ok(None);
@@ -61,17 +68,22 @@ pub async fn listen_for_challenges(
     Ok(Some(listener))
 }
 
-/// Keeps the certificate good.
+/// Keeps the certificate valid by renewing it in time.
 pub struct Renewal {
     app: Arc<App>,
-    acme: config::Acme,
+    acme: config::AcmeConfig,
     directory: PathBuf,
     looked_at: SocketAddr,
 }
 
 impl Renewal {
-    /// For a daemon that listens at `listen`.
-    pub fn new(app: Arc<App>, acme: config::Acme, home: &Home, listen: SocketAddr) -> Renewal {
+    /// Creates the renewal for a daemon that listens at `listen`.
+    pub fn new(
+        app: Arc<App>,
+        acme: config::AcmeConfig,
+        home: &Home,
+        listen: SocketAddr,
+    ) -> Renewal {
         let looked_at = acme.challenge_listen.unwrap_or(listen);
         Renewal {
             app,
@@ -81,19 +93,19 @@ impl Renewal {
         }
     }
 
-    /// Asks for a certificate whenever one is due, until the daemon ends.
-    pub async fn keep(self) {
+    /// Requests a certificate whenever one is due, until the daemon ends.
+    pub async fn run(self) {
         let journal = Journal::new(Arc::clone(&self.app.state));
         let about = NewEvent::default();
         loop {
-            self.until_due().await;
+            self.wait_until_due().await;
             let mut pause = self.acme.retry.0;
             while let Err(error) = self.renew().await {
                 let fingerprint = self.app.tls.as_ref().map(|tls| tls.fingerprint());
                 let shown = fingerprint.map_or_else(String::new, |print| print.to_string());
                 let message = format!(
-                    "{} was asked for a certificate of {}, and there is none: {error:#}; it is asked again in {} s, and {shown} is \
-                     shown until then",
+                    "{} did not issue a certificate for {}: {error:#}; next attempt in {} s, until then the portal \
+                        uses {shown}",
                     self.acme.directory,
                     self.acme.names.join(", "),
                     pause.as_secs(),
@@ -104,7 +116,7 @@ impl Renewal {
             }
             if let Some(tls) = &self.app.tls {
                 let message = format!(
-                    "the portal shows a certificate for {} that {} has signed: {}",
+                    "the portal now uses a certificate for {}, signed by {}: {}",
                     self.acme.names.join(", "),
                     self.acme.directory,
                     tls.fingerprint()
@@ -114,12 +126,13 @@ impl Renewal {
         }
     }
 
-    /// Waits until two thirds of the certificate's time are over. Where there is none, or one for other names, that is now.
-    async fn until_due(&self) {
+    /// Waits until two thirds of the certificate's lifetime have passed; returns at once if there is no certificate for
+    /// these names.
+    async fn wait_until_due(&self) {
         loop {
             let (acme, directory) = (self.acme.clone(), self.directory.clone());
-            let kept = privilege::run(async move { kept(&acme, &directory) }).await;
-            let due = kept.and_then(|(_, (chain, _))| due(chain.first()?));
+            let kept = privilege::run(async move { load_certificate(&acme, &directory) }).await;
+            let due = kept.and_then(|(_, (chain, _))| renewal_time(chain.first()?));
             let left = due.unwrap_or(0).saturating_sub(store::now());
             if left == 0 {
                 return;
@@ -130,13 +143,13 @@ impl Renewal {
 
     async fn renew(&self) -> anyhow::Result<()> {
         let Some(tls) = &self.app.tls else {
-            bail!("no TLS is spoken");
+            bail!("TLS is off");
         };
-        let account = account::of_home(&self.acme, &self.directory).await?;
-        let made = order::certificate(&account, &self.acme.names, tls, self.looked_at).await;
-        // Nobody looks any more.
-        tls.answer(Vec::new()).map_err(said)?;
-        if made.as_ref().is_err_and(account::is_unknown) {
+        let account = account::load_or_create(&self.acme, &self.directory).await?;
+        let made = order::order_certificate(&account, &self.acme.names, tls, self.looked_at).await;
+        // The challenges are over.
+        tls.set_challenges(Vec::new()).map_err(to_anyhow)?;
+        if made.as_ref().is_err_and(account::is_unknown_account) {
             account::forget(&self.directory).await?;
         }
         let made = made?;
@@ -145,30 +158,30 @@ impl Renewal {
         let keep = path.clone();
         let (chain, key) = privilege::run(async move {
             let first = CertificateDer::from_pem_slice(text.as_bytes())
-                .context("the authority's answer is no certificate")?;
-            authority::period(&first).map_err(anyhow::Error::msg)?;
-            private::replace(&keep, text.as_bytes())
-                .with_context(|| format!("cannot keep it in {}", keep.display()))?;
-            Ok::<Pair, anyhow::Error>(read(&keep, &keep)?)
+                .context("the authority's response is not a certificate")?;
+            authority::read_validity(&first).map_err(anyhow::Error::msg)?;
+            private::write_atomically(&keep, text.as_bytes())
+                .with_context(|| format!("cannot write it to {}", keep.display()))?;
+            Ok::<ChainAndKey, anyhow::Error>(read_chain_and_key(&keep, &keep)?)
         })
         .await?;
         if let Some(first) = chain.first()
-            && !is_for_all(first, &self.acme.names)
+            && !covers_all(first, &self.acme.names)
         {
-            bail!("the authority has signed a certificate for other names");
+            bail!("the authority's certificate is for other names");
         }
-        tls.show(chain, key).map_err(said)
+        tls.replace_certificate(chain, key).map_err(to_anyhow)
     }
 }
 
-/// Its words have those of its cause.
-fn said(error: TlsError) -> anyhow::Error {
+/// Converts the error without its source, whose text it contains already.
+fn to_anyhow(error: TlsError) -> anyhow::Error {
     anyhow::Error::msg(error.to_string())
 }
 
-/// When a certificate is to be renewed, in milliseconds since 1970.
-fn due(certificate: &CertificateDer<'_>) -> Option<u64> {
-    let period = authority::period(certificate).ok()?;
+/// Returns the time at which a certificate is to be renewed, in milliseconds since 1970.
+fn renewal_time(certificate: &CertificateDer<'_>) -> Option<u64> {
+    let period = authority::read_validity(certificate).ok()?;
     Some(period.from + period.until.saturating_sub(period.from) / 3 * 2)
 }
 
@@ -180,34 +193,34 @@ mod tests {
 
     const NAME: &str = "robots.lab.example";
 
-    /// Keeps a certificate for a name and some years in a directory.
-    fn keep(directory: &Path, name: &str, years: (i32, i32)) {
+    /// Writes a certificate for a name and a range of years to a directory.
+    fn write_certificate(directory: &Path, name: &str, years: (i32, i32)) {
         let mut params = CertificateParams::new([name.to_owned()]).expect("a name");
         params.not_before = date_time_ymd(years.0, 1, 1);
         params.not_after = date_time_ymd(years.1, 1, 1);
         let key = KeyPair::generate().expect("a key");
         let certificate = params.self_signed(&key).expect("a certificate");
         let text = certificate.pem() + &key.serialize_pem();
-        private::replace(&directory.join(CERTIFICATE), text.as_bytes()).expect("kept");
+        private::write_atomically(&directory.join(CERTIFICATE), text.as_bytes()).expect("kept");
     }
 
-    fn acme() -> config::Acme {
-        config::Acme {
+    fn acme() -> config::AcmeConfig {
+        config::AcmeConfig {
             names: vec![NAME.to_owned()],
-            ..config::Acme::default()
+            ..config::AcmeConfig::default()
         }
     }
 
     #[test]
     fn what_is_kept_is_shown_while_it_is_good() {
         let home = tempfile::tempdir().expect("a directory");
-        let shown = || kept(&acme(), home.path()).is_some();
+        let shown = || load_certificate(&acme(), home.path()).is_some();
         assert!(!shown(), "there is none");
-        keep(home.path(), NAME, (2000, 2100));
+        write_certificate(home.path(), NAME, (2000, 2100));
         assert!(shown());
-        keep(home.path(), NAME, (2000, 2001));
+        write_certificate(home.path(), NAME, (2000, 2001));
         assert!(!shown(), "it has ended");
-        keep(home.path(), "other.lab.example", (2000, 2100));
+        write_certificate(home.path(), "other.lab.example", (2000, 2100));
         assert!(!shown(), "of another name");
         std::fs::write(home.path().join(CERTIFICATE), "half").expect("written");
         assert!(!shown(), "no certificate");
@@ -216,16 +229,16 @@ mod tests {
     #[test]
     fn it_is_renewed_when_two_thirds_of_its_time_are_over() {
         let home = tempfile::tempdir().expect("a directory");
-        keep(home.path(), NAME, (2000, 2003));
-        let pair = read(
+        write_certificate(home.path(), NAME, (2000, 2003));
+        let pair = read_chain_and_key(
             &home.path().join(CERTIFICATE),
             &home.path().join(CERTIFICATE),
         )
         .expect("a pair");
-        let due = due(pair.0.first().expect("a certificate")).expect("a time");
+        let due = renewal_time(pair.0.first().expect("a certificate")).expect("a time");
         let year = 365 * 86_400_000;
         let begin = 946_684_800_000;
-        // One of the three has a day more; the last second is part of it.
+        // One of the three years has a day more; the last second belongs to the period.
         let expected = begin + 2 * year + 86_400_000 * 2 / 3;
         assert!(due.abs_diff(expected) <= 1_000, "{due} {expected}");
     }

@@ -1,4 +1,4 @@
-//! The operator's certificate and revocation lists: read again when their files change.
+//! The operator's certificate and revocation lists, reloaded when their files change.
 
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -8,45 +8,46 @@ use std::time::Duration;
 use portal::App;
 use store::{Journal, NewEvent};
 
-use super::{Error, read, revoke};
+use super::{Error, load_revocation_lists, read_chain_and_key};
 
-/// How often it is looked whether the files are others.
+/// Interval between looks at the files.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Which version of a file it is.
+/// Version of a file: its device, inode, size and modification time.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Version(Option<(u64, u64, u64, i64, i64)>);
+struct FileVersion(Option<(u64, u64, u64, i64, i64)>);
 
-impl Version {
-    fn of(path: &Path) -> Version {
+impl FileVersion {
+    fn stat(path: &Path) -> FileVersion {
         let about = std::fs::metadata(path).ok();
-        Version(about.map(|about| {
+        FileVersion(about.map(|about| {
             let (at, fraction) = (about.mtime(), about.mtime_nsec());
             (about.dev(), about.ino(), about.size(), at, fraction)
         }))
     }
 }
 
-/// Files that belong together.
-struct Files {
+/// Files that are loaded together.
+struct WatchedFiles {
     paths: Vec<PathBuf>,
-    /// As they were when they were read last, and at the last look.
-    read: Vec<Version>,
-    before: Vec<Version>,
+    /// Versions at the last load, and at the last look.
+    read: Vec<FileVersion>,
+    before: Vec<FileVersion>,
 }
 
-impl Files {
-    fn new(paths: Vec<PathBuf>) -> Files {
+impl WatchedFiles {
+    fn new(paths: Vec<PathBuf>) -> WatchedFiles {
         let now = versions(&paths);
-        Files {
+        WatchedFiles {
             paths,
             read: now.clone(),
             before: now,
         }
     }
 
-    /// Comes back when they have changed, and have then been the same for a while, because they are not written at once.
-    async fn changed(&mut self) {
+    /// Returns when the files have changed and have then stayed the same for one interval: they are not written
+    /// atomically.
+    async fn wait_for_change(&mut self) {
         loop {
             tokio::time::sleep(LOOK).await;
             let now = versions(&self.paths);
@@ -59,57 +60,61 @@ impl Files {
     }
 }
 
-fn versions(paths: &[PathBuf]) -> Vec<Version> {
-    paths.iter().map(|path| Version::of(path)).collect()
+fn versions(paths: &[PathBuf]) -> Vec<FileVersion> {
+    paths.iter().map(|path| FileVersion::stat(path)).collect()
 }
 
-/// Shows the operator's certificate anew whenever its files have changed. What cannot be used is told of, and the one before goes on
-/// being shown.
-pub async fn keep(app: Arc<App>, certificate: PathBuf, key: PathBuf) {
+/// Reloads the operator's certificate whenever its files have changed. A certificate that cannot be used is reported in
+/// an event, and the previous one stays in use.
+pub async fn watch_certificate(app: Arc<App>, certificate: PathBuf, key: PathBuf) {
     let Some(tls) = &app.tls else { return };
     let journal = Journal::new(Arc::clone(&app.state));
-    let mut files = Files::new(vec![certificate.clone(), key.clone()]);
+    let mut files = WatchedFiles::new(vec![certificate.clone(), key.clone()]);
     loop {
-        files.changed().await;
-        let shown = read(&certificate, &key).and_then(|(chain, key)| {
-            tls.show(chain, key).map_err(|source| Error::Unusable {
-                path: certificate.clone(),
-                source,
-            })
+        files.wait_for_change().await;
+        let shown = read_chain_and_key(&certificate, &key).and_then(|(chain, key)| {
+            tls.replace_certificate(chain, key)
+                .map_err(|source| Error::Unusable {
+                    path: certificate.clone(),
+                    source,
+                })
         });
         let about = NewEvent::default();
         match shown {
             Ok(()) => {
                 let message = format!(
-                    "the portal shows another certificate: {}",
+                    "the portal now uses another certificate: {}",
                     tls.fingerprint()
                 );
                 journal.info("certificate-shown", &message, &about);
             }
             Err(error) => {
-                let message = format!("{error}; the one before is shown on: {}", tls.fingerprint());
+                let message = format!(
+                    "{error}; the portal still uses the previous certificate: {}",
+                    tls.fingerprint()
+                );
                 journal.warning("certificate-refused", &message, &about);
             }
         }
     }
 }
 
-/// Reads the revocation lists of the lab's own authorities whenever their file has changed. Where it cannot be read, what it named before is
-/// refused on, and that is told.
-pub async fn keep_lists(app: Arc<App>, path: PathBuf) {
+/// Reloads the revocation lists of the lab's own authorities whenever their file has changed. If it cannot be read, an
+/// event is written and the previous lists stay in force.
+pub async fn watch_revocation_lists(app: Arc<App>, path: PathBuf) {
     let Some(tls) = &app.tls else { return };
     let journal = Journal::new(Arc::clone(&app.state));
-    let mut files = Files::new(vec![path.clone()]);
+    let mut files = WatchedFiles::new(vec![path.clone()]);
     loop {
-        files.changed().await;
+        files.wait_for_change().await;
         let about = NewEvent::default();
-        match revoke(tls, &path) {
+        match load_revocation_lists(tls, &path) {
             Ok(()) => {
-                let message = format!("revocation lists were read again: {}", path.display());
+                let message = format!("revocation lists reloaded: {}", path.display());
                 journal.info("revocations-read", &message, &about);
             }
             Err(error) => {
-                let message = format!("{error}; the lists before count on");
+                let message = format!("{error}; the previous lists stay in force");
                 journal.warning("revocations-refused", &message, &about);
             }
         }

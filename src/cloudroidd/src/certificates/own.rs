@@ -1,4 +1,4 @@
-//! The certificate that the daemon makes for itself, once.
+//! The self-signed certificate that the daemon makes for itself, once.
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -7,29 +7,30 @@ use portal::Tls;
 use rcgen::{CertificateParams, DnType, KeyPair};
 use store::private;
 
-use super::{Error, Pair, read};
+use super::{ChainAndKey, Error, read_chain_and_key};
 use crate::config;
 
-/// The certificate and its key.
+/// File of the certificate and its key.
 const OWN: &str = "own.pem";
 
-/// What the home has of it, made at the first time, with the path of its file.
-pub fn kept(
+/// Loads the certificate from the home, created at first use, with the path of its file.
+pub fn load_or_create(
     directory: &Path,
-    config: &config::Tls,
+    config: &config::TlsConfig,
     listen: SocketAddr,
-) -> Result<(PathBuf, Pair), Error> {
+) -> Result<(PathBuf, ChainAndKey), Error> {
     let path = directory.join(OWN);
     if !path.exists() {
-        make(&path, names(&config.names, listen))?;
+        create(&path, certificate_names(&config.names, listen))?;
     }
-    let pair = read(&path, &path)?;
+    let pair = read_chain_and_key(&path, &path)?;
     Ok((path, pair))
 }
 
-/// The daemon's certificate is made once, since clients have its fingerprint: names that are configured later are not in it.
-pub fn warn_of_other_names(tls: &Tls, configured: &[String]) {
-    let is_other = |name: &&str| !tls.speaks_for(name);
+/// Warns if names are configured that the certificate does not have. It is made once only, since clients know it by its
+/// fingerprint.
+pub fn warn_of_missing_names(tls: &Tls, configured: &[String]) {
+    let is_other = |name: &&str| !tls.is_valid_for_host(name);
     let others: Vec<&str> = configured
         .iter()
         .map(String::as_str)
@@ -37,16 +38,16 @@ pub fn warn_of_other_names(tls: &Tls, configured: &[String]) {
         .collect();
     if !others.is_empty() {
         tracing::warn!(
-            "the daemon's certificate was made before names in [tls] had {}: clients that know its fingerprint do not mind; \
-             for those that look at names, stop the daemon, remove tls/{OWN} of its home and start it (every client then has \
-             to accept the new one, with cloudroidctl trust)",
+            "the daemon's certificate lacks {}, which names in [tls] has now: clients that trust its fingerprint are \
+                not affected; for those that verify names, stop the daemon, remove tls/{OWN} in its home and start it \
+                (every client must then accept the new certificate with cloudroidctl trust)",
             others.join(", ")
         );
     }
 }
 
-/// By which names and addresses this machine may be reached.
-fn names(configured: &[String], listen: SocketAddr) -> Vec<String> {
+/// Returns the names and addresses by which this machine may be reached.
+fn certificate_names(configured: &[String], listen: SocketAddr) -> Vec<String> {
     let mut names = configured.to_vec();
     let host = nix::unistd::gethostname();
     names.extend(host.ok().and_then(|name| name.into_string().ok()));
@@ -60,9 +61,9 @@ fn names(configured: &[String], listen: SocketAddr) -> Vec<String> {
     names
 }
 
-/// Makes a certificate that signs itself, and keeps it with its key. It has no end (RFC 5280, section 4.1.2.5): who trusts it
-/// has its fingerprint, and would have to be told of another.
-fn make(path: &Path, names: Vec<String>) -> Result<(), Error> {
+/// Makes a self-signed certificate and writes it with its key. It does not expire (RFC 5280, section 4.1.2.5): clients
+/// know it by its fingerprint and would have to be told of a new one.
+fn create(path: &Path, names: Vec<String>) -> Result<(), Error> {
     let all = names.join(", ");
     let unmade = |source| Error::Unmade { names: all, source };
     let made = || -> Result<String, rcgen::Error> {
@@ -76,7 +77,7 @@ fn make(path: &Path, names: Vec<String>) -> Result<(), Error> {
         Ok(certificate.pem() + &key.serialize_pem())
     };
     let text = made().map_err(unmade)?;
-    private::replace(path, text.as_bytes()).map_err(|source| Error::Unkept {
+    private::write_atomically(path, text.as_bytes()).map_err(|source| Error::Unkept {
         path: path.to_owned(),
         source,
     })

@@ -1,4 +1,4 @@
-//! `[tls.acme]`: a certificate of an authority that is asked by ACME (RFC 8555).
+//! `[tls.acme]`: a certificate obtained from an authority by ACME (RFC 8555).
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -9,29 +9,29 @@ use serde::Deserialize;
 
 use super::Time;
 
-/// Which certificate is asked for, and of whom.
+/// Names of the certificate, and the authority to ask.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Acme {
+pub struct AcmeConfig {
     /// Names of this machine in the public DNS.
     pub names: Vec<String>,
-    /// Whether the authority's terms of service are agreed to.
+    /// Agreement to the authority's terms of service; must be true.
     pub accept_terms: bool,
-    /// Whom the authority may write to: `mailto:…`.
+    /// Contact addresses for the authority: `mailto:…`.
     pub contact: Vec<String>,
-    /// Its directory (RFC 8555, section 7.1.1); that of Let's Encrypt by default.
+    /// Directory URL of the authority (RFC 8555, section 7.1.1; default: Let's Encrypt).
     pub directory: String,
-    /// PEM file of the authorities by whom the directory's server is known; the system's by default.
+    /// PEM file of the authorities by which the directory server's certificate is checked (default: the system's).
     pub authorities: Option<PathBuf>,
-    /// Where the authority looks whether a name leads here, if port 443 does not lead to the portal itself.
+    /// Address for the authority's challenges, if port 443 does not lead to the portal itself.
     pub challenge_listen: Option<SocketAddr>,
-    /// How long after a failure it is asked again; twice as long each further time, up to 6 hours.
+    /// Pause after a failed attempt, doubled each time up to 6 hours.
     pub retry: Time,
 }
 
-impl Default for Acme {
+impl Default for AcmeConfig {
     fn default() -> Self {
-        Acme {
+        AcmeConfig {
             names: Vec::new(),
             accept_terms: false,
             contact: Vec::new(),
@@ -43,25 +43,25 @@ impl Default for Acme {
     }
 }
 
-impl Acme {
+impl AcmeConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         if self.names.is_empty() {
             bail!("names is missing: the names in the public DNS that lead to this machine");
         }
         if let Some(name) = self.names.iter().find(|name| !is_name(name)) {
             bail!(
-                "names has {name:?}: an authority that looks at port 443 gives certificates for whole names, as robots.lab.example; \
-                 addresses, wildcards and names without a dot need a certificate of another kind (certificate and key of [tls])"
+                "names has {name:?}: only full domain names such as robots.lab.example can be verified through port \
+                    443; for addresses, wildcards and names without a dot set certificate and key in [tls]"
             );
         }
         let directory = self.directory.parse::<portal::Uri>().ok();
         let usable = directory.as_ref().is_some_and(|uri| {
-            let here = uri.host().is_some_and(outbound::is_this_machine);
+            let here = uri.host().is_some_and(outbound::is_loopback_host);
             uri.scheme_str() == Some("https") || here && uri.scheme_str() == Some("http")
         });
         if !usable {
             bail!(
-                "directory = {:?} is no address of a directory; write https://HOST/PATH",
+                "directory = {:?} is not the URL of an ACME directory; write https://HOST/PATH",
                 self.directory
             );
         }
@@ -70,24 +70,26 @@ impl Acme {
             .iter()
             .find(|contact| !contact.starts_with("mailto:"))
         {
-            bail!("contact has {contact:?}; write \"mailto:NAME@HOST\"");
+            bail!(
+                "contact has {contact:?}, which is not a mail address; write \"mailto:NAME@HOST\""
+            );
         }
         if !self.accept_terms {
             bail!(
-                "accept_terms is missing: the authority at {} gives certificates to those who agree to its terms of service; \
-                 read them, then write accept_terms = true",
+                "accept_terms is missing: the authority at {} requires agreement to its terms of service; read them, \
+                    then write accept_terms = true",
                 self.directory
             );
         }
         if self.retry.0.is_zero() {
-            bail!("retry = 0 would ask without end; write a time such as \"10m\"");
+            bail!("retry = 0 would retry without a pause; write a time such as \"10m\"");
         }
         Ok(())
     }
 }
 
-/// Whether a name may be one of the public DNS (RFC 1123, section 2.1): labels of letters, digits and hyphens, two at least, the last
-/// of which is no number.
+/// Returns whether a name may be in the public DNS (RFC 1123, section 2.1): at least two labels of letters, digits and
+/// hyphens, the last one not a number.
 fn is_name(name: &str) -> bool {
     let labels: Vec<&str> = name.split('.').collect();
     let is_label = |label: &&str| {
@@ -108,8 +110,8 @@ fn is_name(name: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn refused(text: &str) -> String {
-        let acme: Acme = toml::from_str(text).expect("well-formed");
+    fn refusal(text: &str) -> String {
+        let acme: AcmeConfig = toml::from_str(text).expect("well-formed");
         acme.check().expect_err(text).to_string()
     }
 
@@ -135,14 +137,14 @@ mod tests {
             ),
             ("accept_terms = true\nnames = [\"a.b\"]\nretry = 0", "retry"),
         ] {
-            let refused = refused(text);
+            let refused = refusal(text);
             assert!(refused.contains(words), "{refused}");
         }
     }
 
     #[test]
     fn names_and_agreement_are_enough() {
-        let acme: Acme =
+        let acme: AcmeConfig =
             toml::from_str("names = [\"robots.lab.example\"]\naccept_terms = true").expect("read");
         acme.check().expect("complete");
         assert!(acme.directory.starts_with("https://"));

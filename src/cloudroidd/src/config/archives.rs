@@ -1,16 +1,16 @@
-//! Where the packages of bases come from, where that is not this host's own apt sources.
+//! Package archives of the bases, instead of this host's own apt sources.
 
 use std::collections::BTreeMap;
 
 use anyhow::bail;
 use serde::Deserialize;
 
-/// Lines of a sources.list (sources.list(5)) for each base that is named.
+/// Lines of a sources.list (sources.list(5)), by base.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(transparent)]
-pub struct Archives(BTreeMap<String, Vec<String>>);
+pub struct ArchivesConfig(BTreeMap<String, Vec<String>>);
 
-/// Options by which apt would take what nobody has signed, or what was signed by a key that is weak.
+/// Options that would make apt accept packages that are unsigned or signed by a weak key.
 const UNSIGNED: [&str; 4] = [
     "trusted=",
     "allow-insecure=",
@@ -18,24 +18,26 @@ const UNSIGNED: [&str; 4] = [
     "allow-downgrade-to-insecure=",
 ];
 
-impl Archives {
+impl ArchivesConfig {
     pub fn check(&self) -> anyhow::Result<()> {
         for (base, lines) in &self.0 {
             if lines.is_empty() {
                 bail!(
-                    "{base} = [] names no archive; leave it out to have this host's own, or write lines of a sources.list"
+                    "{base} = [] names no archive; omit it to use this host's archives, or write lines of a \
+                        sources.list"
                 );
             }
             for line in lines {
                 let whole = line.starts_with("deb ") && !line.contains(['\n', '\r']);
                 if !whole {
                     bail!(
-                        "{base} = [{line:?}] is no line of a sources.list; write such as \"deb [signed-by=FILE] ADDRESS SUITE COMPONENT\""
+                        "{base} = [{line:?}] is not a line of a sources.list; write a line such as \"deb \
+                            [signed-by=FILE] ADDRESS SUITE COMPONENT\""
                     );
                 }
                 if let Some(option) = UNSIGNED.iter().find(|option| line.contains(*option)) {
                     bail!(
-                        "{option} for {base} would take packages that nobody has signed; name the key ring by signed-by=FILE"
+                        "{option} for {base} would accept unsigned packages; name the key ring with signed-by=FILE"
                     );
                 }
             }
@@ -43,7 +45,7 @@ impl Archives {
         Ok(())
     }
 
-    /// As the builder takes them.
+    /// Returns the sources as the builder takes them.
     pub fn sources(&self) -> rootfs_builder::Sources {
         rootfs_builder::Sources(self.0.clone())
     }
@@ -53,8 +55,8 @@ impl Archives {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> anyhow::Result<Archives> {
-        let archives: Archives = toml::from_str(text)?;
+    fn read(text: &str) -> anyhow::Result<ArchivesConfig> {
+        let archives: ArchivesConfig = toml::from_str(text)?;
         archives.check()?;
         Ok(archives)
     }
@@ -69,14 +71,14 @@ mod tests {
     #[test]
     fn what_would_be_taken_without_a_signature_is_refused() {
         for (text, words) in [
-            ("a = []", "leave it out"),
+            ("a = []", "omit it"),
             (
                 "a = [\"http://mirror.example noble main\"]",
                 "signed-by=FILE",
             ),
             (
                 "a = [\"deb http://x noble main\\ndeb [trusted=yes] http://y noble main\"]",
-                "no line",
+                "not a line",
             ),
             (
                 "a = [\"deb [arch=amd64 trusted=yes] http://mirror.example noble main\"]",

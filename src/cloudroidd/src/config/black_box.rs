@@ -1,4 +1,4 @@
-//! `[black_box]`: what of servants is kept for when something goes wrong.
+//! `[black_box]`: recording of the last seconds of servants, kept for when something goes wrong.
 
 use std::time::Duration;
 
@@ -9,28 +9,28 @@ use serde::Deserialize;
 
 use super::Time;
 
-/// Longer than this is a recording (`cloudroidctl record`).
+/// Longest time that is kept; for longer times there are recordings (`cloudroidctl record`).
 const LONGEST: Duration = Duration::from_secs(3600);
 
-/// The last seconds of what flows in servants.
+/// The last seconds of the messages in servants.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct BlackBox {
-    /// So much of each servant; 0: nothing.
+pub struct BlackBoxConfig {
+    /// Time that is kept of each servant; 0 disables the recording.
     pub seconds: Time,
-    /// Bytes of each servant's messages.
+    /// Memory for each servant's messages, in bytes.
     pub memory: Size,
-    /// Topics, or beginnings of topics before a last `*`.
+    /// Topics, or prefixes of topics that end with `*`.
     pub topics: Vec<String>,
-    /// Files at most.
+    /// Largest number of files.
     pub files: u64,
-    /// Bytes of all files at most.
+    /// Largest size of all files together, in bytes.
     pub disk: Size,
 }
 
-impl Default for BlackBox {
+impl Default for BlackBoxConfig {
     fn default() -> Self {
-        BlackBox {
+        BlackBoxConfig {
             seconds: Time::seconds(0),
             memory: Size(64 << 20),
             topics: vec!["*".to_owned()],
@@ -40,8 +40,8 @@ impl Default for BlackBox {
     }
 }
 
-impl BlackBox {
-    /// As the portal has it.
+impl BlackBoxConfig {
+    /// Returns the options as the portal takes them.
     pub fn options(&self) -> BlackBoxOptions {
         BlackBoxOptions {
             span: self.seconds.0,
@@ -52,28 +52,29 @@ impl BlackBox {
         }
     }
 
-    /// `servant`: what one servant's messages may hold, all together.
+    /// Checks the values. `servant` is the memory limit of one servant's messages.
     pub(super) fn check(&self, servant: Size) -> anyhow::Result<()> {
         if self.seconds.0 > LONGEST {
             bail!(
-                "seconds is more than an hour; for longer times there is cloudroidctl record SERVANT -o FILE"
+                "seconds is more than an hour; for longer recordings use cloudroidctl record SERVANT -o FILE"
             );
         }
         if self.memory.0 == 0 || self.files == 0 || self.disk.0 == 0 {
             bail!(
-                "memory, files or disk of 0 would keep nothing; to keep nothing, write seconds = 0"
+                "memory, files or disk of 0 would record nothing; to turn recording off, write seconds = 0"
             );
         }
         if self.memory.0 > servant.0 {
             bail!(
-                "memory = \"{}\" is more than a servant may hold, which is \"{}\" (servant of [memory])",
+                "memory = \"{}\" is more than the limit per servant, \"{}\" (servant of [memory])",
                 self.memory,
                 servant
             );
         }
         if let Some(topic) = self.topics.iter().find(|topic| !is_pattern(topic)) {
             bail!(
-                "{topic:?} is no topic; write one that begins with \"/\", one with a \"*\" at its end, or \"*\" for all"
+                "{topic:?} is not a topic; write a name that begins with \"/\", a prefix that ends with \"*\", \
+                    or \"*\" for all"
             );
         }
         Ok(())
@@ -92,7 +93,7 @@ mod tests {
     #[test]
     fn what_makes_no_sense_is_refused() {
         let check = |text: &str| {
-            let read = toml::from_str::<BlackBox>(text).expect("well-formed");
+            let read = toml::from_str::<BlackBoxConfig>(text).expect("well-formed");
             read.check(Size(256 << 20))
                 .map_err(|refused| refused.to_string())
         };
@@ -103,11 +104,11 @@ mod tests {
         );
         for (text, expected) in [
             ("seconds = \"2h\"", "more than an hour"),
-            ("memory = 0", "keep nothing"),
-            ("files = 0", "keep nothing"),
-            ("memory = \"1G\"", "more than a servant may hold"),
-            ("topics = [\"tf\"]", "\"tf\" is no topic"),
-            ("topics = [\"/a*b*\"]", "is no topic"),
+            ("memory = 0", "record nothing"),
+            ("files = 0", "record nothing"),
+            ("memory = \"1G\"", "more than the limit per servant"),
+            ("topics = [\"tf\"]", "\"tf\" is not a topic"),
+            ("topics = [\"/a*b*\"]", "is not a topic"),
         ] {
             let refused = check(text).expect_err(text);
             assert!(refused.contains(expected), "{refused}");

@@ -1,4 +1,4 @@
-//! `[capacity]`: what of this machine may be promised to servants.
+//! `[capacity]`: resources of this machine that may be promised to servants.
 
 use anyhow::bail;
 use api::Size;
@@ -7,37 +7,37 @@ use serde::Deserialize;
 use super::Time;
 use crate::machine;
 
-/// What of this machine may be promised to servants.
+/// Resources of this machine that may be promised to servants.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Capacity {
-    /// Cores to promise; all of the machine's by default.
+pub struct CapacityConfig {
+    /// Cores to promise (default: all of the machine's).
     pub cpus: Option<f64>,
-    /// How often each core may be promised, on the average. Memory is promised once.
+    /// Factor by which the cores may be promised more than once, on average. Memory is never overcommitted.
     pub overcommit: f64,
-    /// Whether cores are moved between servants while they work.
+    /// Moving of cores between servants while they work.
     pub controller: Controller,
-    /// Memory to promise; nine tenths of the machine's by default.
+    /// Memory to promise (default: nine tenths of the machine's).
     pub memory: Option<Size>,
-    /// Robots that may wait for capacity.
+    /// Largest number of robots that wait for capacity.
     pub queue: usize,
-    /// How long each may wait.
+    /// Longest time that a robot waits for capacity.
     pub deadline: Time,
 }
 
-/// Whether the controller works.
+/// Setting of the controller, which moves cores between servants.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Controller {
-    /// Those near what their robots accept at most get what others do not need.
+    /// Servants that are close to the limit their robots accept get cores that others do not need.
     On,
-    /// Limits stay as they were asked for.
+    /// Limits stay as they were requested.
     Off,
 }
 
-impl Default for Capacity {
+impl Default for CapacityConfig {
     fn default() -> Self {
-        Capacity {
+        CapacityConfig {
             cpus: None,
             overcommit: 1.0,
             controller: Controller::On,
@@ -48,22 +48,23 @@ impl Default for Capacity {
     }
 }
 
-impl Capacity {
-    /// Beyond this nobody has what was promised.
+impl CapacityConfig {
+    /// Largest overcommit; beyond it no promise can be kept.
     const MOST_OVERCOMMIT: f64 = 100.0;
 
     pub(super) fn check(&self) -> anyhow::Result<()> {
         let most = Self::MOST_OVERCOMMIT;
         if !(1.0..=most).contains(&self.overcommit) {
             bail!(
-                "overcommit = {} is not between 1 and {most}; 1 promises each core once, 1.5 promises half of them twice",
+                "overcommit = {} is not between 1 and {most}; 1 reserves each core once, 1.5 reserves half of them \
+                    twice",
                 self.overcommit
             );
         }
         Ok(())
     }
 
-    /// Cores that there are for servants.
+    /// Returns the number of cores that may be promised to servants.
     pub fn cores(&self) -> f64 {
         self.cpus.unwrap_or_else(machine::cores)
     }

@@ -8,26 +8,26 @@ use serde::Deserialize;
 /// A class of robots.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Class {
-    /// Who has the greater one is served first; 0 without a class.
+pub struct ClassConfig {
+    /// Priority: robots of a class with a greater one are served first (0 without a class).
     pub priority: i32,
-    /// Cores that a robot may ask for.
+    /// Largest number of cores that a robot may request.
     pub max_cpus: Option<f64>,
-    /// Memory that a robot may ask for.
+    /// Largest amount of memory that a robot may request.
     pub max_memory: Option<Size>,
-    /// The SLA of robots that state neither one nor resources.
+    /// SLA of robots that state neither an SLA nor resources.
     pub sla: Sla,
-    /// Limits where neither the robot nor the push says anything.
+    /// Limits if neither the robot nor the push sets any.
     pub limits: Limits,
 }
 
-impl Class {
-    /// Priorities are from minus this to this.
+impl ClassConfig {
+    /// Largest priority, and with a minus sign the smallest.
     const PRIORITIES: i32 = 1000;
 
-    /// Refuses a class that cannot be, or that contradicts itself.
+    /// Refuses a class with invalid or contradictory values.
     pub(super) fn check(&self, name: &str) -> anyhow::Result<()> {
-        if let Err(reason) = api::sla::name(name) {
+        if let Err(reason) = api::sla::check_name(name) {
             bail!("class {reason}");
         }
         let most = Self::PRIORITIES;
@@ -79,11 +79,11 @@ mod tests {
         )
         .expect("valid");
         config.check().expect("they work together");
-        let classes = config.choreographer().classes;
+        let classes = config.choreographer_options().classes;
         assert_eq!(classes["default"].caps.memory, Some(Size(1 << 30)));
         let urgent = &classes["urgent"];
         assert_eq!((urgent.priority, urgent.limits.cpus), (10, Some(0.5)));
-        assert_eq!(urgent.sla.max_rrt, api::Span::millis(300));
+        assert_eq!(urgent.sla.max_rrt, api::Span::from_millis(300));
         for (text, words) in [
             ("[class.\"a b\"]", &["[class.a b]", "is not a name"][..]),
             (

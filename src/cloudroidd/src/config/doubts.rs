@@ -1,39 +1,40 @@
-//! What is configured beyond the machine: it is allowed, and worth a warning.
+//! Warnings about settings that exceed the machine: they are allowed, but cannot be kept.
 
 use api::Size;
 
 use super::Config;
-use crate::machine::Has;
+use crate::machine::MachineResources;
 
 impl Config {
-    /// What this machine cannot keep, each with what to write instead.
-    pub fn doubts(&self, has: Has) -> Vec<String> {
-        let Has { cores, memory } = has;
+    /// Returns a warning for each setting that exceeds this machine, with what to write instead.
+    pub fn machine_warnings(&self, has: MachineResources) -> Vec<String> {
+        let MachineResources { cores, memory } = has;
         let mut doubts = Vec::new();
         let capacity = &self.capacity;
         if let Some(cpus) = capacity.cpus.filter(|cpus| *cpus > cores) {
             doubts.push(format!(
-                "[capacity] cpus = {cpus} is more than the {cores} cores of this machine, so that promises are not kept; leave it out, \
-                 or write overcommit where cores are to be promised more than once"
+                "[capacity] cpus = {cpus} is more than the {cores} cores of this machine, so servants get less than is \
+                    reserved; omit it, or set overcommit to reserve cores more than once"
             ));
         }
         if let Some(size) = capacity.memory.filter(|size| size.0 > memory) {
             doubts.push(format!(
-                "[capacity] memory = {size} is more than the {} of this machine, so that servants are killed that keep within theirs; \
-                 leave it out: nine tenths are promised then",
+                "[capacity] memory = {size} is more than the {} of this machine, so servants can be killed within \
+                    their limits; omit it to use nine tenths of the memory",
                 Size(memory)
             ));
         }
         if let Some(cpus) = self.limits.cpus.filter(|cpus| *cpus > cores) {
             doubts.push(format!(
-                "[limits] cpus = {cpus} limits nothing: this machine has {cores} cores"
+                "[limits] cpus = {cpus} has no effect: this machine has {cores} cores"
             ));
         }
         let promised = capacity.cpus.unwrap_or(cores) * capacity.overcommit;
         let reserve = self.servant.reserve_cpus;
         if reserve > promised {
             doubts.push(format!(
-                "[servant] reserve_cpus = {reserve} is more than the {promised} cores of [capacity]: no servant is started that asks for none"
+                "[servant] reserve_cpus = {reserve} is more than the {promised} cores of [capacity]: servants that \
+                    request no cores cannot start"
             ));
         }
         doubts
@@ -46,11 +47,11 @@ mod tests {
 
     #[test]
     fn what_is_beyond_the_machine_is_named() {
-        let has = Has {
+        let has = MachineResources {
             cores: 2.0,
             memory: 16 << 30,
         };
-        let doubts = |text: &str| Config::parse(text).expect("valid").doubts(has);
+        let doubts = |text: &str| Config::parse(text).expect("valid").machine_warnings(has);
         for fits in [
             "",
             "[capacity]\ncpus = 2\nmemory = \"16G\"\novercommit = 3\n[limits]\ncpus = 2\n[servant]\nreserve_cpus = 6.0",
@@ -66,7 +67,7 @@ mod tests {
                 "[capacity]\nmemory = \"1T\"",
                 "is more than the 16G of this machine",
             ),
-            ("[limits]\ncpus = 99", "[limits] cpus = 99 limits nothing"),
+            ("[limits]\ncpus = 99", "[limits] cpus = 99 has no effect"),
             (
                 "[capacity]\ncpus = 1\n[servant]\nreserve_cpus = 1.5",
                 "[servant] reserve_cpus = 1.5 is more than the 1 cores",

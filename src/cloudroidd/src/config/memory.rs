@@ -1,4 +1,4 @@
-//! `[memory]`: limits of memory outside of servants' containers.
+//! `[memory]`: memory limits outside of servants' containers.
 
 use anyhow::bail;
 use api::Size;
@@ -6,27 +6,28 @@ use serde::Deserialize;
 
 use super::Time;
 
-/// Limits of memory outside of servants' containers: in the daemon, and in shims.
+/// Memory limits outside of servants' containers: in the daemon and in shims.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Memory {
-    /// All clients and servants together, in the daemon; by default a quarter of the machine's memory, at most 1G.
+pub struct MemoryConfig {
+    /// Memory for all clients and servants together in the daemon (default: a quarter of the machine's memory, at most
+    /// 1G).
     pub daemon: Option<Size>,
-    /// One client: its unfinished messages, and bodies of its requests.
+    /// Memory for one client: its unfinished messages and the bodies of its requests.
     pub client: Size,
-    /// One servant: unfinished messages of its nodes and links, and JSON or CBOR made of its messages.
+    /// Memory for one servant: unfinished messages of its nodes and links, and its messages converted to JSON or CBOR.
     pub servant: Size,
-    /// Time from the first byte of a message, frame or body to its last.
+    /// Longest time from the first byte of a message, frame or body to its last.
     pub unfinished: Time,
-    /// Memory of one servant's shim, in a cgroup of its own.
+    /// Memory of one servant's shim, which has a cgroup of its own.
     pub shim: Size,
-    /// Cores of one servant's shim; limited to its servant's, but never to less than 0.1.
+    /// Cores of one servant's shim: at most its servant's, but never less than 0.1.
     pub shim_cpus: f64,
 }
 
-impl Default for Memory {
+impl Default for MemoryConfig {
     fn default() -> Self {
-        Memory {
+        MemoryConfig {
             daemon: None,
             client: Size(256 << 20),
             servant: Size(256 << 20),
@@ -37,8 +38,8 @@ impl Default for Memory {
     }
 }
 
-impl Memory {
-    /// Bytes below which nothing works.
+impl MemoryConfig {
+    /// Smallest memory limit in bytes with which the daemon works.
     const LEAST: u64 = 1 << 20;
     const LEAST_FOR_A_SHIM: u64 = 32 << 20;
 
@@ -52,12 +53,15 @@ impl Memory {
             ("shim", self.shim, least),
         ] {
             if size.0 < least {
-                bail!("{name} = {size} is too little; at least {}", Size(least));
+                bail!(
+                    "{name} = {size} is too little; write at least {}",
+                    Size(least)
+                );
             }
         }
         if self.unfinished.0.is_zero() {
             bail!(
-                "unfinished = 0 would refuse whatever does not come at once; write a time such as \"5m\""
+                "unfinished = 0 would refuse every message that arrives in parts; write a time such as \"5m\""
             );
         }
         if !(self.shim_cpus.is_finite() && (0.1..=64.0).contains(&self.shim_cpus)) {

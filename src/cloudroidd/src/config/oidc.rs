@@ -1,4 +1,4 @@
-//! `[oidc]`: an identity provider that knows people, and what its groups may do.
+//! `[oidc]`: an identity provider for people, and the roles of its groups.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -16,30 +16,31 @@ const LONGEST: u64 = 4096;
 /// An identity provider.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Oidc {
-    /// Its issuer identifier.
+pub struct OidcConfig {
+    /// Issuer identifier of the provider.
     pub issuer: String,
-    /// As people know it: on the page's link.
+    /// Display name for the link on the sign-in page (default: the issuer's host).
     pub name: Option<String>,
-    /// As whom it knows this server.
+    /// Client id of this server at the provider.
     pub client_id: String,
-    /// The file of the secret by which this server proves that; none: a public client.
+    /// File of the client secret (default: none, a public client).
     pub client_secret_file: Option<PathBuf>,
-    /// The portal's address, as people's browsers have it: `https://HOST[:PORT]`.
+    /// Public address of the portal in people's browsers: `https://HOST[:PORT]`.
     pub redirect: String,
-    /// What is asked for besides `openid`.
+    /// Scopes that are requested besides `openid` (default: `profile`).
     #[serde(default = "profile")]
     pub scopes: Vec<String>,
-    /// The claim that has a person's groups.
+    /// Claim that contains a person's groups (default: `groups`).
     #[serde(default = "groups")]
     pub groups_claim: String,
-    /// The claim that has a person's name.
+    /// Claim that contains a person's name (default: `preferred_username`).
     #[serde(default = "preferred_username")]
     pub name_claim: String,
-    /// PEM file of the authorities that the provider's certificate is checked by, which everybody may read; the system's by default.
+    /// PEM file of the authorities by which the provider's certificate is checked; must be world-readable (default: the
+    /// system's).
     pub authorities: Option<PathBuf>,
-    /// What people of a group may do.
-    pub roles: BTreeMap<String, Given>,
+    /// Roles of the provider's groups.
+    pub roles: BTreeMap<String, RoleGrant>,
 }
 
 fn profile() -> Vec<String> {
@@ -54,59 +55,58 @@ fn preferred_username() -> String {
     "preferred_username".to_owned()
 }
 
-/// A role, and for which services where it is for some.
+/// A role, either for all services or limited to some.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(untagged)]
-pub enum Given {
-    /// For all services.
+pub enum RoleGrant {
+    /// A role for all services.
     Whole(Role),
-    /// For some.
-    Scoped(Scoped),
+    /// A role for some services.
+    Scoped(ScopedRole),
 }
 
-/// A role that is for some services.
+/// A role that is limited to some services.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Scoped {
+pub struct ScopedRole {
     role: Role,
     #[serde(default)]
     services: Vec<Glob>,
 }
 
-impl Given {
+impl RoleGrant {
     fn parts(&self) -> (Role, &[Glob]) {
         match self {
-            Given::Whole(role) => (*role, &[]),
-            Given::Scoped(scoped) => (scoped.role, &scoped.services),
+            RoleGrant::Whole(role) => (*role, &[]),
+            RoleGrant::Scoped(scoped) => (scoped.role, &scoped.services),
         }
     }
 
     fn check(&self, group: &str) -> anyhow::Result<()> {
         let (role, services) = self.parts();
         if role == Role::Robot {
-            bail!(
-                "{group:?} cannot be robot: people are no robots; robots are paired, or have tokens"
-            );
+            bail!("{group:?} cannot have the role robot: robots are paired, or have tokens");
         }
         match (role.is_scoped(), services.is_empty()) {
             (true, true) => bail!(
-                "a {role} is for services that are named: write {group:?} = {{ role = \"{role}\", services = [\"lab_*\"] }}, or \"*\" for all"
+                "the role {role} needs a list of services: write {group:?} = {{ role = \"{role}\", services = \
+                    [\"lab_*\"] }}, or \"*\" for all"
             ),
             (false, false) => bail!(
-                "an {role} is for all services: write {group:?} = \"{role}\", or choose another role"
+                "the role {role} is for all services: write {group:?} = \"{role}\", or choose another role"
             ),
             _ => Ok(()),
         }
     }
 }
 
-fn secret(path: &Path) -> anyhow::Result<String> {
+fn read_secret(path: &Path) -> anyhow::Result<String> {
     let file = std::fs::File::open(path)
         .with_context(|| format!("cannot read client_secret_file {}", path.display()))?;
     let mode = file.metadata()?.permissions().mode();
     ensure!(
         mode & 0o007 == 0,
-        "client_secret_file {} can be read by every user of this machine; close it with: chmod 600 {}",
+        "client_secret_file {} can be read by every user of this machine; restrict it with: chmod 600 {}",
         path.display(),
         path.display()
     );
@@ -117,13 +117,13 @@ fn secret(path: &Path) -> anyhow::Result<String> {
     let secret = text.trim();
     ensure!(
         !secret.is_empty() && text.len() as u64 <= LONGEST,
-        "client_secret_file {} should have the secret alone, which the provider shows for this client",
+        "client_secret_file {} must contain only this client's secret from the provider",
         path.display()
     );
     Ok(secret.to_owned())
 }
 
-impl Oidc {
+impl OidcConfig {
     fn origin(&self) -> &str {
         self.redirect.trim_end_matches('/')
     }
@@ -131,7 +131,7 @@ impl Oidc {
     fn roles(&self) -> oidc::Roles {
         let groups = self.roles.iter().map(|(name, given)| {
             let (role, services) = given.parts();
-            oidc::Group {
+            oidc::RoleGroup {
                 name: name.clone(),
                 role,
                 services: services.to_vec(),
@@ -158,30 +158,34 @@ impl Oidc {
         let host = self.origin().split_once("://").map_or("", |(_, host)| host);
         ensure!(
             !host.is_empty() && !host.contains(['/', '?', '#', '@']),
-            "redirect = {:?} should be the portal's address alone, as browsers have it: \"https://HOST:PORT\"",
+            "redirect = {:?} must be only the portal's address as used in browsers: \"https://HOST:PORT\"",
             self.redirect
         );
         ensure!(
             !self.client_id.is_empty(),
-            "client_id is empty; write the one by which the provider knows this server"
+            "client_id is empty; write the client ID of this server at the provider"
         );
         ensure!(
             !self.roles.is_empty(),
-            "roles is empty, and nobody could sign in; name a group: roles = {{ \"robot-admins\" = \"admin\" }}"
+            "roles is empty, so nobody could sign in; name a group: roles = {{ \"robot-admins\" = \"admin\" }}"
         );
         for (group, given) in &self.roles {
             given.check(group).context("roles")?;
         }
         match &self.client_secret_file {
-            Some(path) => secret(path).map(|_| ()),
+            Some(path) => read_secret(path).map(|_| ()),
             None => Ok(()),
         }
     }
 
-    /// As the portal has it, with its secret.
-    pub fn provider(&self) -> anyhow::Result<IdentityProvider> {
+    /// Returns the provider with its secret, as the portal takes it.
+    pub fn identity_provider(&self) -> anyhow::Result<IdentityProvider> {
         let mut settings = self.settings();
-        settings.client_secret = self.client_secret_file.as_deref().map(secret).transpose()?;
+        settings.client_secret = self
+            .client_secret_file
+            .as_deref()
+            .map(read_secret)
+            .transpose()?;
         let host = self.issuer.split("://").nth(1).unwrap_or(&self.issuer);
         let host = host.split('/').next().unwrap_or(host);
         Ok(IdentityProvider {
@@ -201,7 +205,7 @@ mod tests {
     const GOOD: &str = "issuer = \"https://id.lab.example/realms/lab\"\nclient_id = \"cloudroid\"\n\
                         redirect = \"https://robots.lab.example:9090/\"\n";
 
-    fn read(more: &str) -> Oidc {
+    fn read(more: &str) -> OidcConfig {
         toml::from_str(&format!("{GOOD}{more}")).expect("well-formed")
     }
 
@@ -211,10 +215,10 @@ mod tests {
             "roles = { admins = \"admin\", students = { role = \"viewer\", services = [\"lab_*\", \"demo\"] } }",
         );
         read.check().expect("good");
-        let made = read.provider().expect("good");
+        let made = read.identity_provider().expect("good");
         assert_eq!(made.name, "id.lab.example");
         assert_eq!(made.origin, "https://robots.lab.example:9090");
-        let of = |group: &str| made.roles.of(&[group.to_owned()]);
+        let of = |group: &str| made.roles.grant_for_groups(&[group.to_owned()]);
         assert_eq!(of("admins").expect("a role").role, Role::Admin);
         assert_eq!(of("students").expect("a role").services.len(), 2);
         assert!(of("others").is_none());
@@ -240,7 +244,7 @@ mod tests {
             ("roles = {}", "nobody could sign in"),
             ("roles = { a = \"viewer\" }", "services = "),
             ("roles = { a = { role = \"deployer\" } }", "services = "),
-            ("roles = { a = \"robot\" }", "no robots"),
+            ("roles = { a = \"robot\" }", "cannot have the role robot"),
             (
                 "roles = { a = { role = \"admin\", services = [\"x\"] } }",
                 "for all services",
@@ -250,15 +254,15 @@ mod tests {
             assert!(refused.contains(words), "{text}: {refused}");
         }
         for (from, to, words) in [
-            ("https://id.lab", "http://id.lab", "this machine alone"),
+            ("https://id.lab", "http://id.lab", "only for this machine"),
             ("https://id.lab", "ldap://id.lab", "https://"),
-            ("realms/lab", "realms/lab?x=1", "without query"),
-            ("https://robots", "http://robots", "this machine alone"),
-            (":9090/", ":9090/portal", "address alone"),
+            ("realms/lab", "realms/lab?x=1", "without a query"),
+            ("https://robots", "http://robots", "only for this machine"),
+            (":9090/", ":9090/portal", "only the portal's address"),
             ("\"cloudroid\"", "\"\"", "client_id"),
         ] {
             let text = format!("{GOOD}{admins}").replace(from, to);
-            let read: Oidc = toml::from_str(&text).expect("well-formed");
+            let read: OidcConfig = toml::from_str(&text).expect("well-formed");
             let refused = format!("{:#}", read.check().expect_err(to));
             assert!(refused.contains(words), "{to}: {refused}");
         }
@@ -267,7 +271,7 @@ mod tests {
             "roles = { a = \"king\" }",
             "roles = { a = { role = \"admin\", x = 1 } }",
         ] {
-            toml::from_str::<Oidc>(&format!("{GOOD}{text}")).expect_err(text);
+            toml::from_str::<OidcConfig>(&format!("{GOOD}{text}")).expect_err(text);
         }
     }
 
@@ -279,7 +283,7 @@ mod tests {
             std::fs::write(&path, text).expect("written");
             let mode = std::fs::Permissions::from_mode(mode);
             std::fs::set_permissions(&path, mode).expect("set");
-            secret(&path).map_err(|error| format!("{error:#}"))
+            read_secret(&path).map_err(|error| format!("{error:#}"))
         };
         assert_eq!(written("geheim\n", 0o600), Ok("geheim".into()));
         assert_eq!(written("geheim", 0o640), Ok("geheim".into()));
@@ -288,10 +292,10 @@ mod tests {
         assert!(!open.contains("geheim"), "{open}");
         for text in ["", " \n", &"x".repeat(5000)] {
             let refused = written(text, 0o600).expect_err("none");
-            assert!(refused.contains("the secret alone"), "{refused}");
+            assert!(refused.contains("only this client's secret"), "{refused}");
         }
         std::fs::remove_file(&path).expect("removed");
-        let gone = secret(&path).expect_err("gone").to_string();
+        let gone = read_secret(&path).expect_err("gone").to_string();
         assert!(gone.contains("client_secret_file"), "{gone}");
     }
 }

@@ -1,20 +1,19 @@
-//! What of the file is whose: the options of each crate.
+//! Conversion of the configuration into the options of each crate.
 
 use api::{Caps, Size};
 use bridge::BridgeOptions;
 use choreographer::MemoryOptions;
 
-use super::{Class, Config, Controller, Hung, NonFinite, Push};
+use super::{ClassConfig, Config, Controller, Hung, NonFinite, PushConfig};
 use crate::machine;
 
-/// Without a configured limit the daemon uses at most this part (a quarter) of the machine's memory, and at most
-/// `MOST` bytes.
+/// Default limit of the daemon's memory: one `PART`th (a quarter) of the machine's, and at most `MOST` bytes.
 const PART: u64 = 4;
 const MOST: u64 = 1 << 30;
 
 impl Config {
-    /// What of it is the choreographer's.
-    pub fn choreographer(&self) -> choreographer::Options {
+    /// Returns the choreographer's options.
+    pub fn choreographer_options(&self) -> choreographer::Options {
         let (servant, memory) = (&self.servant, &self.memory);
         let daemon = memory.daemon.map(|size| size.0);
         choreographer::Options {
@@ -22,7 +21,7 @@ impl Config {
             classes: self
                 .class
                 .iter()
-                .map(|(name, class)| (name.clone(), of(class)))
+                .map(|(name, class)| (name.clone(), to_choreographer_class(class)))
                 .collect(),
             cores: self.capacity.cores().min(machine::cores()),
             controller: self.capacity.controller == Controller::On,
@@ -36,14 +35,14 @@ impl Config {
             warm_memory: servant.warm_memory.0,
             warm_nodes: servant.warm_nodes,
             hung: match servant.hung {
-                Hung::Ignore => choreographer::Hung::Ignore,
-                Hung::Report => choreographer::Hung::Report,
-                Hung::Restart => choreographer::Hung::Restart,
+                Hung::Ignore => choreographer::HungPolicy::Ignore,
+                Hung::Report => choreographer::HungPolicy::Report,
+                Hung::Restart => choreographer::HungPolicy::Restart,
             },
             hung_after: servant.hung_after,
             bridge: bridge_options(self),
             memory: MemoryOptions {
-                daemon: daemon.unwrap_or_else(|| (machine::most_memory() / PART).min(MOST)),
+                daemon: daemon.unwrap_or_else(|| (machine::usable_memory() / PART).min(MOST)),
                 client: memory.client.0,
                 servant: memory.servant.0,
                 unfinished: memory.unfinished.0,
@@ -51,8 +50,8 @@ impl Config {
         }
     }
 
-    /// What of it is for pushes.
-    pub fn push(&self) -> push::Options {
+    /// Returns the options for pushes.
+    pub fn push_options(&self) -> push::Options {
         let push = &self.push;
         push::Options {
             archive: push.archive,
@@ -70,11 +69,11 @@ impl Config {
         }
     }
 
-    /// What of it is the portal's.
-    pub fn portal(&self) -> portal::Options {
+    /// Returns the portal's options.
+    pub fn portal_options(&self) -> portal::Options {
         portal::Options {
             origins: self.origins.clone(),
-            // They were checked before anything was started.
+            // `check` has validated them before anything was started.
             proxies: self.proxies().unwrap_or_default(),
             default_service: self.default_service.clone(),
             default_robot: self.default_robot.clone(),
@@ -86,20 +85,20 @@ impl Config {
     }
 }
 
-impl Push {
-    /// Limits of each container of a build.
-    pub fn limits(&self) -> servant::spec::Limits {
-        servant::spec::Limits {
+impl PushConfig {
+    /// Returns the limits of each container of a build.
+    pub fn limits(&self) -> servant::spec::ResourceLimits {
+        servant::spec::ResourceLimits {
             cpus: self.cpus,
             memory: self.memory.map(|memory| memory.0),
             pids: Some(self.pids),
-            ..servant::spec::Limits::default()
+            ..servant::spec::ResourceLimits::default()
         }
     }
 }
 
-fn of(class: &Class) -> choreographer::Class {
-    choreographer::Class {
+fn to_choreographer_class(class: &ClassConfig) -> choreographer::ClassOptions {
+    choreographer::ClassOptions {
         priority: class.priority,
         caps: Caps {
             cpus: class.max_cpus,
@@ -110,7 +109,7 @@ fn of(class: &Class) -> choreographer::Class {
     }
 }
 
-/// What the configuration says of bridges.
+/// Returns the options of bridges.
 fn bridge_options(config: &Config) -> BridgeOptions {
     let bytes = |size: Size| usize::try_from(size.0).unwrap_or(usize::MAX);
     BridgeOptions {

@@ -1,42 +1,42 @@
-//! `[people]`: how long who has signed in stays so.
+//! `[people]`: lifetime of people's sessions.
 
 use std::time::Duration;
 
 use anyhow::bail;
-use portal::Lasting;
+use portal::SessionLifetimes;
 use serde::Deserialize;
 
 use super::Time;
 
-/// The shortest that either may be: uses are written to the disk to the minute.
+/// Shortest lifetime of either kind: the time of last use is stored with a resolution of one minute.
 const SHORTEST: Duration = Duration::from_secs(120);
-/// And the longest, which browsers keep no cookie beyond (RFC 6265bis, section 5.5).
+/// Longest lifetime of either kind: browsers keep no cookie longer (RFC 6265bis, section 5.5).
 const LONGEST: Duration = Duration::from_secs(400 * 86_400);
 
-/// People's sessions.
+/// Lifetimes of people's sessions.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct People {
-    /// After which a session ends, whatever is done.
+pub struct PeopleConfig {
+    /// Time after which a session ends, however active it is.
     pub session: Time,
-    /// After which it ends where nothing is asked.
+    /// Time without requests after which a session ends.
     pub idle: Time,
 }
 
-impl Default for People {
+impl Default for PeopleConfig {
     fn default() -> Self {
-        let Lasting { most, idle } = Lasting::default();
-        People {
+        let SessionLifetimes { most, idle } = SessionLifetimes::default();
+        PeopleConfig {
             session: Time(most),
             idle: Time(idle),
         }
     }
 }
 
-impl People {
-    /// As the portal has it.
-    pub fn lasting(&self) -> Lasting {
-        Lasting {
+impl PeopleConfig {
+    /// Returns the lifetimes as the portal takes them.
+    pub fn session_lifetimes(&self) -> SessionLifetimes {
+        SessionLifetimes {
             most: self.session.0,
             idle: self.idle.0,
         }
@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn times_that_make_no_sense_are_refused() {
-        let read = |text: &str| toml::from_str::<People>(text).expect("well-formed");
+        let read = |text: &str| toml::from_str::<PeopleConfig>(text).expect("well-formed");
         read("session = \"8h\"\nidle = \"10m\"")
             .check()
             .expect("good");

@@ -1,34 +1,34 @@
-//! `[portal]`: what clients may do to the port.
+//! `[portal]`: limits of clients' connections.
 
 use anyhow::bail;
 use api::Size;
 use serde::Deserialize;
 
-use super::{Time, begins};
+use super::{Time, check_nonzero};
 
-/// What clients may do to the port.
+/// Limits of clients' connections.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Portal {
-    /// Biggest WebSocket message, its frames together.
+pub struct PortalConfig {
+    /// Largest WebSocket message, all frames together.
     pub max_message: Size,
-    /// Biggest WebSocket frame.
+    /// Largest WebSocket frame.
     pub max_frame: Size,
-    /// Time between pings; 0: none are sent.
+    /// Interval between pings; 0 sends none.
     pub ping: Time,
-    /// A connection from which nothing came for so long, not even a pong, is closed; 0: never.
+    /// Time without any data, not even a pong, after which a connection is closed; 0 disables this.
     pub idle: Time,
-    /// Bytes of JSON or CBOR that one message of a servant may become; a bigger one is not sent.
+    /// Largest size of one message encoded as JSON or CBOR; a larger one is not sent.
     pub max_encoded: Size,
-    /// How NaN and infinities are written in JSON.
+    /// Representation of NaN and infinities in JSON.
     pub non_finite: NonFinite,
-    /// How long a request's header may take, and the `auth` message where one is awaited.
+    /// Longest time for a request's header, and for the `auth` message if one is expected.
     pub handshake: Time,
-    /// How long connections may take to end when the daemon ends.
+    /// Time that connections have to end when the daemon ends.
     pub drain: Time,
 }
 
-/// What JSON has no word for.
+/// Representation in JSON of numbers that it cannot express.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NonFinite {
@@ -36,13 +36,13 @@ pub enum NonFinite {
     Null,
     /// `"NaN"`, `"Infinity"`, `"-Infinity"`.
     Text,
-    /// `NaN`, `Infinity`, `-Infinity`: Python's words, refused by strict parsers.
+    /// `NaN`, `Infinity`, `-Infinity`: as Python writes them, refused by strict parsers.
     Bare,
 }
 
-impl Default for Portal {
+impl Default for PortalConfig {
     fn default() -> Self {
-        Portal {
+        PortalConfig {
             max_message: Size(64 << 20),
             max_frame: Size(64 << 20),
             max_encoded: Size(64 << 20),
@@ -55,13 +55,13 @@ impl Default for Portal {
     }
 }
 
-impl Portal {
+impl PortalConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         if [self.max_encoded, self.max_message, self.max_frame].contains(&Size(0)) {
             bail!(
                 "[portal] of the configuration: a limit of 0 would refuse every message; write a size such as \"64M\""
             );
         }
-        begins("[portal] handshake", self.handshake, "10s")
+        check_nonzero("[portal] handshake", self.handshake, "10s")
     }
 }

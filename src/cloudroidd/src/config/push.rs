@@ -1,4 +1,4 @@
-//! `[push]`: how big pushes may be, and what building them may take.
+//! `[push]`: limits of pushes and their builds.
 
 use anyhow::bail;
 use api::{Limits, Size};
@@ -7,47 +7,47 @@ use serde::Deserialize;
 
 use super::Time;
 
-/// How big pushes may be, and what building them may take.
+/// Limits of pushes and their builds.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Push {
-    /// Bytes of the archive as sent.
+pub struct PushConfig {
+    /// Largest archive as sent, in bytes.
     pub archive: Size,
-    /// Bytes of the files in it, unpacked.
+    /// Largest total size of the unpacked files, in bytes.
     pub unpacked: Size,
-    /// How many files the archive may have.
+    /// Largest number of files in the archive.
     pub entries: u64,
-    /// How long the nodes may take to show their interface.
+    /// Time that the nodes have to show their interface.
     pub probe: Time,
-    /// How long the archive may pause while it is sent.
+    /// Longest pause while the archive is sent.
     pub stall: Time,
-    /// Bytes of the archive that must come in a second, on the average over times of `stall`; 0 for any.
+    /// Lowest rate at which the archive must arrive, in bytes per second, averaged over `stall`; 0 accepts any.
     pub min_rate: Size,
-    /// Pushes that are built at once; others wait.
+    /// Largest number of pushes that are built concurrently; others wait.
     pub at_once: usize,
-    /// Pushes that may wait.
+    /// Largest number of pushes that wait.
     pub queue: usize,
-    /// Time from the start of a push's build (after waiting) to its end.
+    /// Longest time from the start of a push's build (after waiting) to its end.
     pub time: Time,
-    /// Bytes of a push's files while it is built; each file counts at least 4 KiB.
+    /// Disk space of a push's files while it is built; each file counts at least 4 KiB.
     pub disk: Size,
-    /// Bytes that stay free on the disks that pushes write to, though no more than a twentieth of a disk.
+    /// Space that stays free on the disks that pushes write to, but at most a twentieth of a disk.
     pub free: Size,
-    /// Bytes of the images of all services of one deployer; 0 for any.
+    /// Largest total size of the images of one deployer's services; 0 for no limit.
     pub per_deployer: Size,
-    /// Bytes of layers and packages in the cache of builds.
+    /// Size of the build cache for layers and packages.
     pub cache: Size,
-    /// Cores of each container of a build; as many as servants leave when not set.
+    /// Cores of each build container (default: those that servants leave).
     pub cpus: Option<f64>,
-    /// Memory of each; half of the machine's when not set.
+    /// Memory of each build container (default: half of the machine's).
     pub memory: Option<Size>,
-    /// Processes and threads of each.
+    /// Processes and threads of each build container.
     pub pids: u64,
 }
 
-impl Default for Push {
+impl Default for PushConfig {
     fn default() -> Self {
-        Push {
+        PushConfig {
             archive: Size(2 << 30),
             unpacked: Size(8 << 30),
             entries: 500_000,
@@ -68,7 +68,7 @@ impl Default for Push {
     }
 }
 
-impl Push {
+impl PushConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         if self.at_once == 0 {
             bail!("at_once = 0 would let no push be built; write at least 1");

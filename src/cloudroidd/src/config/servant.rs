@@ -1,61 +1,61 @@
-//! `[servant]`: the life of a servant.
+//! `[servant]`: lifetime and resources of servants.
 
 use anyhow::bail;
 use api::Size;
 use serde::Deserialize;
 use servant::quotas::Quotas;
 
-use super::{Time, begins};
+use super::{Time, check_nonzero};
 
-/// The life of a servant.
+/// Lifetime and resources of servants.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Servant {
-    /// Cores promised to a servant whose push asked for none.
+pub struct ServantConfig {
+    /// Cores promised to a servant whose push requests none.
     pub reserve_cpus: f64,
-    /// Memory promised to a servant whose push asked for none.
+    /// Memory promised to a servant whose push requests none.
     pub reserve_memory: Size,
-    /// How long a servant may take from its request to ready.
+    /// Longest time from a servant's request until it is ready.
     pub start: Time,
-    /// How long a robot's servant is kept after its last connection.
+    /// Time that a robot's servant is kept after its last connection.
     pub grace: Time,
-    /// The same for connections that named no robot.
+    /// Time that a servant is kept for connections that named no robot.
     pub anonymous_grace: Time,
-    /// Most services, those used last, that have containers made before a robot asks; how many each has is decided from the
-    /// robots that come.
+    /// Largest number of services, the most recently used ones, that have containers prepared before a robot asks; the
+    /// number for each service follows from the arrivals of robots.
     #[serde(alias = "spares")]
     pub warm_pool: usize,
-    /// Memory that all of those may take.
+    /// Memory for all prepared containers.
     pub warm_memory: Size,
-    /// Most of them in which the nodes run, too.
+    /// Largest number of prepared containers in which the nodes run, too.
     pub warm_nodes: usize,
-    /// What is done about nodes that are given inputs and answer none.
+    /// Reaction to nodes that get inputs and answer none.
     pub hung: Hung,
-    /// They hang that answer nothing for so many times the T_max that their robot stated.
+    /// Factor of the robot's stated T_max: nodes that answer nothing for that long count as hung.
     pub hung_after: f64,
-    /// Bytes of each file system that a servant writes; half of its memory by default.
+    /// Size of each file system that a servant writes to, in bytes (default: half of its memory).
     pub scratch: Option<Size>,
-    /// Files, directories and links in each of them.
+    /// Largest number of files, directories and links in each of these file systems.
     pub inodes: u64,
-    /// Bytes a second of its log, on the average.
+    /// Rate of a servant's log in bytes per second, on average.
     pub log_rate: Size,
 }
 
-/// What is done about nodes that hang.
+/// Reaction to hung nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Hung {
-    /// Hung nodes are left alone, and no event says so.
+    /// Hung nodes are ignored, without an event.
     Ignore,
-    /// An event says so.
+    /// An event is written.
     Report,
-    /// An event says so, and the nodes are started again.
+    /// An event is written and the nodes are restarted.
     Restart,
 }
 
-impl Default for Servant {
+impl Default for ServantConfig {
     fn default() -> Self {
-        Servant {
+        ServantConfig {
             reserve_cpus: 0.01,
             reserve_memory: Size(64 << 20),
             start: Time::seconds(30),
@@ -73,23 +73,24 @@ impl Default for Servant {
     }
 }
 
-impl Servant {
+impl ServantConfig {
     pub(super) fn check(&self) -> anyhow::Result<()> {
         if !(self.hung_after >= 1.0 && self.hung_after <= 1e6) {
             bail!(
-                "[servant] hung_after = {} in the configuration is no number of times; write one from 1 to 1000000, such as 10",
+                "[servant] hung_after = {} in the configuration is out of range; write 1 to 1000000, such as 10",
                 self.hung_after
             );
         }
-        // To the kernel, none is no limit.
+        // The kernel takes 0 for "no limit".
         if self.scratch.is_some_and(|scratch| scratch.0 < 1 << 20)
             || self.inodes < 256
             || self.log_rate.0 < 1 << 10
         {
             bail!(
-                "[servant] of the configuration: programs need a scratch of at least 1M, 256 inodes, and a log_rate of at least 1K"
+                "[servant] of the configuration: scratch must be at least 1M, inodes at least 256, and log_rate at \
+                    least 1K"
             );
         }
-        begins("[servant] start", self.start, "30s")
+        check_nonzero("[servant] start", self.start, "30s")
     }
 }

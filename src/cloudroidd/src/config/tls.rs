@@ -1,4 +1,4 @@
-//! `[tls]`: where TLS is spoken, and with which certificate.
+//! `[tls]`: use of TLS, and the certificate.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -7,35 +7,35 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use serde::Deserialize;
 
-use super::Acme;
+use super::AcmeConfig;
 use super::time::Time;
 
 /// TLS of the portal.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Tls {
-    /// Where it is spoken.
-    pub serve: Serve,
-    /// PEM file of the certificate, followed by those that lead from it to an authority. Without one the daemon makes its own.
+pub struct TlsConfig {
+    /// Addresses on which TLS is used.
+    pub serve: TlsMode,
+    /// PEM file of the certificate chain, the certificate first (default: the daemon makes its own).
     pub certificate: Option<PathBuf>,
-    /// PEM file of its key.
+    /// PEM file of the certificate's key.
     pub key: Option<PathBuf>,
-    /// Names and addresses of this machine that the certificate which the daemon makes is to have, besides those that it knows.
+    /// Additional names and addresses of this machine for the certificate that the daemon makes.
     pub names: Vec<String>,
-    /// How long robots' certificates are good that the daemon signs; the robots renew them in time.
+    /// Lifetime of the robots' certificates that the daemon signs; robots renew them in time.
     pub robot_certificates: Time,
-    /// PEM file of authorities of the lab's own that sign robots' certificates, besides the daemon's.
+    /// PEM file of the lab's own authorities that sign robots' certificates, besides the daemon's.
     pub client_authorities: Option<PathBuf>,
     /// PEM file of revocation lists (RFC 5280) of these authorities.
     pub client_revocations: Option<PathBuf>,
-    /// Whom the daemon asks for its certificate.
-    pub acme: Option<Acme>,
+    /// Authority to obtain the certificate from.
+    pub acme: Option<AcmeConfig>,
 }
 
-impl Default for Tls {
+impl Default for TlsConfig {
     fn default() -> Self {
-        Tls {
-            serve: Serve::default(),
+        TlsConfig {
+            serve: TlsMode::default(),
             certificate: None,
             key: None,
             names: Vec::new(),
@@ -47,78 +47,77 @@ impl Default for Tls {
     }
 }
 
-/// Certificates have whole seconds.
+/// Shortest lifetime: certificates have a resolution of one second.
 const SHORTEST: Duration = Duration::from_secs(1);
 
-/// Where TLS is spoken.
+/// Addresses on which TLS is used.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Serve {
-    /// Beyond loopback, and wherever a certificate is named.
+pub enum TlsMode {
+    /// Beyond loopback, and everywhere if a certificate is configured.
     #[default]
     Auto,
-    /// On loopback, too.
+    /// Everywhere, including loopback.
     Tls,
-    /// Nowhere: everybody on the way reads what is sent.
+    /// Nowhere: anybody on the network path can read the traffic.
     PlainTextBeyondLoopback,
 }
 
-impl Tls {
-    /// Whether a portal that listens at an address speaks it.
-    pub fn is_spoken(&self, listen: SocketAddr) -> bool {
+impl TlsConfig {
+    /// Returns whether a portal that listens at an address uses TLS.
+    pub fn is_enabled(&self, listen: SocketAddr) -> bool {
         match self.serve {
-            Serve::Auto => self.is_named() || !listen.ip().is_loopback(),
-            Serve::Tls => true,
-            Serve::PlainTextBeyondLoopback => false,
+            TlsMode::Auto => self.has_certificate() || !listen.ip().is_loopback(),
+            TlsMode::Tls => true,
+            TlsMode::PlainTextBeyondLoopback => false,
         }
     }
 
-    /// Whether there is a certificate that is not the daemon's own.
-    fn is_named(&self) -> bool {
+    /// Returns whether a certificate other than the daemon's own is configured.
+    fn has_certificate(&self) -> bool {
         self.certificate.is_some() || self.acme.is_some()
     }
 
-    /// The files of the operator's own certificate and key.
-    pub fn files(&self) -> Option<(PathBuf, PathBuf)> {
+    /// Returns the files of the operator's certificate and key.
+    pub fn certificate_files(&self) -> Option<(PathBuf, PathBuf)> {
         self.certificate.clone().zip(self.key.clone())
     }
 
     pub(super) fn check(&self) -> anyhow::Result<()> {
         match (&self.certificate, &self.key) {
             (Some(_), None) => {
-                bail!("certificate is of no use without key; name the file of its key, too")
+                bail!("certificate needs key; set key to the file of its private key")
             }
             (None, Some(_)) => {
-                bail!("key is of no use without certificate; name the file of its certificate, too")
+                bail!("key needs certificate; set certificate to the file of its certificate")
             }
             _ => {}
         }
         if let Some(acme) = &self.acme {
             acme.check().context("[tls.acme]")?;
             if self.certificate.is_some() {
-                bail!(
-                    "certificate names one that is there, and [tls.acme] asks for another; remove one of both"
-                );
+                bail!("certificate and [tls.acme] exclude each other; remove one of them");
             }
         }
-        if self.serve == Serve::PlainTextBeyondLoopback && self.is_named() {
+        if self.serve == TlsMode::PlainTextBeyondLoopback && self.has_certificate() {
             bail!(
-                "serve = \"plain-text-beyond-loopback\" shows nobody the certificate; remove one of both"
+                "serve = \"plain-text-beyond-loopback\" does not use the certificate; remove one of them"
             );
         }
-        if self.is_named() && !self.names.is_empty() {
+        if self.has_certificate() && !self.names.is_empty() {
             bail!(
-                "names are for the certificate that the daemon makes, and another is named; remove one of both"
+                "names is only for the daemon's own certificate, but another one is set; remove one of them"
             );
         }
         if self.client_revocations.is_some() && self.client_authorities.is_none() {
             bail!(
-                "client_revocations names lists of authorities that client_authorities does not name; name them, too"
+                "client_revocations needs client_authorities; set it to the authorities of those lists"
             );
         }
         if self.robot_certificates.0 < SHORTEST {
             bail!(
-                "robot_certificates is {:?}, and robots have to renew them in time; make it 1s at least, 168h is usual",
+                "robot_certificates is {:?}, too short for robots to renew their certificates; write at least 1s, \
+                    usually 168h",
                 self.robot_certificates.0
             );
         }
@@ -130,7 +129,7 @@ impl Tls {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Tls {
+    fn read(text: &str) -> TlsConfig {
         toml::from_str(text).expect("well-formed")
     }
 
@@ -154,7 +153,7 @@ mod tests {
                 ("192.0.2.1:1", beyond),
             ] {
                 let listen = listen.parse().expect("an address");
-                assert_eq!(tls.is_spoken(listen), spoken, "{text:?} at {listen}");
+                assert_eq!(tls.is_enabled(listen), spoken, "{text:?} at {listen}");
             }
             tls.check().expect(text);
         }
@@ -163,7 +162,7 @@ mod tests {
     #[test]
     fn what_cannot_be_together_is_refused() {
         for (text, words) in [
-            ("certificate = \"c\"", "file of its key"),
+            ("certificate = \"c\"", "set key to the file"),
             ("key = \"k\"", "file of its certificate"),
             ("client_revocations = \"r\"", "client_authorities"),
             (
@@ -183,7 +182,7 @@ mod tests {
                 "names = [\"n\"]\ncertificate = \"c\"\nkey = \"k\"",
                 "remove one",
             ),
-            ("robot_certificates = \"500ms\"", "1s at least"),
+            ("robot_certificates = \"500ms\"", "at least 1s"),
         ] {
             let refused = format!("{:#}", read(text).check().expect_err(text));
             assert!(refused.contains(words), "{refused}");

@@ -1,11 +1,11 @@
-//! What the parser of the configuration says, in words of the configuration.
+//! Error messages of the parser, translated into the terms of the configuration file.
 
-/// Names of types in messages of `toml` and `serde`, and what is to be written.
+/// Texts in messages of `toml` and `serde` that name types, and their replacements.
 const WORDS: [(&str, &str); 14] = [
-    ("expected usize", "expected a whole number from 0 on"),
-    ("expected u64", "expected a whole number from 0 on"),
-    ("expected u32", "expected a whole number from 0 on"),
-    ("expected u16", "expected a whole number from 0 on"),
+    ("expected usize", "expected a whole number, 0 or greater"),
+    ("expected u64", "expected a whole number, 0 or greater"),
+    ("expected u32", "expected a whole number, 0 or greater"),
+    ("expected u16", "expected a whole number, 0 or greater"),
     ("expected i32", "expected a whole number"),
     ("expected i64", "expected a whole number"),
     ("expected f64", "expected a number"),
@@ -15,22 +15,22 @@ const WORDS: [(&str, &str); 14] = [
         "expected a list, such as [\"one\", \"two\"]",
     ),
     ("expected a map", "expected a table, such as [limits]"),
-    ("wanted string or table", "expected a word in quotes"),
+    ("wanted string or table", "expected a string in quotes"),
     ("invalid type: ", ""),
     (
         "data did not match any variant of untagged enum Written",
-        "expected a number or a text in quotes",
+        "expected a number or a string in quotes",
     ),
-    ("unit variant", "a word alone"),
+    ("unit variant", "a plain string"),
 ];
 
-/// The message of an error, without the names of this program's types.
+/// Returns an error message without the names of this program's types.
 pub(super) fn plain(message: &str) -> String {
     let mut text = message.to_owned();
     for (theirs, ours) in WORDS {
         text = text.replace(theirs, ours);
     }
-    // A section's name here is its type's, in lower case.
+    // A section's name in the message is its type's name in lower case.
     while let Some(at) = text.find("expected struct ") {
         let rest = &text[at + "expected struct ".len()..];
         let end = rest.find(|c: char| !c.is_alphanumeric());
@@ -49,13 +49,16 @@ mod tests {
         for (text, words) in [
             (
                 "[capacity]\nqueue = \"many\"",
-                "expected a whole number from 0 on",
+                "expected a whole number, 0 or greater",
             ),
             (
                 "[capacity]\nqueue = -1",
-                "expected a whole number from 0 on",
+                "expected a whole number, 0 or greater",
             ),
-            ("[capacity]\ncontroller = true", "expected a word in quotes"),
+            (
+                "[capacity]\ncontroller = true",
+                "expected a string in quotes",
+            ),
             ("[capacity]\novercommit = \"two\"", "expected a number"),
             ("[class]\nurgent = 3", "expected a table"),
             ("class = 3", "expected a table"),
@@ -63,7 +66,7 @@ mod tests {
             ("tokens = 3", "expected a list"),
             (
                 "[servant]\ngrace = true",
-                "expected a number or a text in quotes",
+                "expected a number or a string in quotes",
             ),
             ("[class.urgent]\npriority = 1.5", "expected a whole number"),
         ] {
@@ -75,7 +78,7 @@ mod tests {
             ] {
                 assert!(!message.contains(theirs), "{text}: {message}");
             }
-            // It still says where.
+            // The message still names the line.
             assert!(message.contains("line "), "{message}");
         }
     }

@@ -1,4 +1,4 @@
-//! Which cgroup controllers can limit servants here.
+//! Detection of the cgroup controllers that can limit servants.
 
 use std::path::Path;
 
@@ -6,28 +6,29 @@ use api::{Check, CheckStatus};
 
 const NAME: &str = "cgroup";
 
-const FIX: &str = "boot with systemd.unified_cgroup_hierarchy=1, and give the daemon its controllers (Delegate=yes)";
+const FIX: &str = "boot with systemd.unified_cgroup_hierarchy=1, and delegate the controllers to the daemon \
+    (Delegate=yes)";
 
-/// What was found.
+/// Available cgroup controllers.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Found {
-    /// 1 or 2; 0 where no controller can be used.
+pub struct CgroupSupport {
+    /// cgroup version, 1 or 2; 0 if no controller can be used.
     pub version: u8,
-    /// Limits that cannot be set. Buffers of sockets are not among them: they are told of, and no reason not to start.
+    /// Limits that cannot be set. Socket buffers are not included: they are reported, but are no reason not to start.
     pub missing: Vec<String>,
-    /// The reason, for people.
+    /// Reason for people.
     pub why: String,
 }
 
-/// The check for people.
+/// Runs the check for people.
 pub fn check() -> Check {
-    let found = find();
+    let found = detect();
     if found.version == 1 && found.missing.is_empty() && !counts_sockets() {
         return Check {
             name: NAME.to_owned(),
             status: CheckStatus::Warning,
-            found: "version 1: cpu, memory and pids can be limited, but this kernel does not count buffers of sockets: \
-                    what servants send one another and do not read may use up the machine's memory"
+            found: "version 1: cpu, memory and pids can be limited, but this kernel does not account for socket \
+                buffers: unread messages between servants may use up the machine's memory"
                 .to_owned(),
             fix: Some(FIX.to_owned()),
         };
@@ -38,11 +39,12 @@ pub fn check() -> Check {
     };
     let text = match (found.version, found.missing.is_empty()) {
         (0, _) => format!(
-            "no controller can be used, servants are not limited: {}",
+            "no controller is usable, servants are not limited: {}",
             found.why
         ),
         (1, true) => {
-            "version 1: cpu, memory and pids can be limited, buffers of sockets beside memory; it has no memory.high"
+            "version 1: cpu, memory and pids can be limited, socket buffers separately from memory; memory.high is not \
+                available"
                 .to_owned()
         }
         (version, true) => format!("version {version}: cpu, memory and pids can be limited"),
@@ -61,14 +63,14 @@ pub fn check() -> Check {
     }
 }
 
-/// Whether buffers of sockets can be limited where memory can be, on version 1.
+/// Returns whether socket buffers can be limited, on version 1 beside memory.
 fn counts_sockets() -> bool {
     let mounts = std::fs::read_to_string("/proc/self/mounts").unwrap_or_default();
     let place = memory_hierarchy(&mounts);
     place.is_some_and(|place| servant::cgroup::counts_sockets(Path::new(place)))
 }
 
-/// Where the hierarchy of version 1 is mounted that limits memory.
+/// Returns the mount point of the version 1 hierarchy that limits memory.
 fn memory_hierarchy(mounts: &str) -> Option<&str> {
     mounts.lines().find_map(|line| {
         let fields: Vec<&str> = line.split(' ').collect();
@@ -82,20 +84,20 @@ fn memory_hierarchy(mounts: &str) -> Option<&str> {
     })
 }
 
-/// Looks at the mounted hierarchies.
-pub fn find() -> Found {
+/// Inspects the mounted hierarchies.
+pub fn detect() -> CgroupSupport {
     let mounts = std::fs::read_to_string("/proc/self/mounts").unwrap_or_default();
     let unified = std::fs::read_to_string("/sys/fs/cgroup/cgroup.controllers").ok();
-    judge(&mounts, unified.as_deref())
+    classify(&mounts, unified.as_deref())
 }
 
-/// The limits and the v1 hierarchies or v2 controllers that set them.
+/// Limits, by the names of the v1 hierarchies or v2 controllers that set them.
 const LIMITS: [&str; 3] = ["cpu", "memory", "pids"];
 
-fn judge(mounts: &str, unified: Option<&str>) -> Found {
+fn classify(mounts: &str, unified: Option<&str>) -> CgroupSupport {
     if let Some(controllers) = unified {
         let there: Vec<&str> = controllers.split_whitespace().collect();
-        return found(
+        return build_support(
             2,
             |limit| there.contains(&limit),
             "the controller is not enabled at the root of the hierarchy",
@@ -120,16 +122,16 @@ fn judge(mounts: &str, unified: Option<&str>) -> Found {
             .any(|options| options.split(',').any(|option| option == limit))
     };
     if LIMITS.iter().any(|limit| mounted(limit)) {
-        return found(1, mounted, "the controller's hierarchy is not mounted");
+        return build_support(1, mounted, "the controller's hierarchy is not mounted");
     }
-    found(
+    build_support(
         0,
         |_| false,
-        "neither /sys/fs/cgroup nor a hierarchy of version 1 offers one",
+        "no usable hierarchy in /sys/fs/cgroup, of version 1 or 2",
     )
 }
 
-fn found(version: u8, there: impl Fn(&str) -> bool, why: &str) -> Found {
+fn build_support(version: u8, there: impl Fn(&str) -> bool, why: &str) -> CgroupSupport {
     let missing: Vec<String> = LIMITS
         .iter()
         .filter(|limit| !there(limit))
@@ -140,7 +142,7 @@ fn found(version: u8, there: impl Fn(&str) -> bool, why: &str) -> Found {
     } else {
         why.to_owned()
     };
-    Found {
+    CgroupSupport {
         version,
         missing,
         why,
@@ -162,14 +164,14 @@ mod tests {
             memory_hierarchy("cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n"),
             None
         );
-        let v1 = judge(hybrid, None);
+        let v1 = classify(hybrid, None);
         assert_eq!((v1.version, v1.missing), (1, vec!["pids".to_owned()]));
-        let v2 = judge(
+        let v2 = classify(
             "cgroup2 /sys/fs/cgroup cgroup2 rw 0 0\n",
             Some("cpuset cpu io memory pids\n"),
         );
         assert_eq!((v2.version, v2.missing.len()), (2, 0));
-        let none = judge("proc /proc proc rw 0 0\n", None);
+        let none = classify("proc /proc proc rw 0 0\n", None);
         assert_eq!((none.version, none.missing.len()), (0, 3));
     }
 }

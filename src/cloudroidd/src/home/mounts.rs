@@ -1,5 +1,6 @@
-//! File systems that are mounted below a directory of the home. No daemon of this version mounts anything there; one that was killed by an
-//! earlier version during a bootstrap has left /proc, /sys and the host's own /dev/shm in the half-made base.
+//! File systems that are mounted below a directory of the home. This version of the daemon mounts nothing there; an
+//! earlier version that was killed during a bootstrap has left /proc, /sys and the host's own /dev/shm in the
+//! unfinished base.
 
 use std::ffi::OsString;
 use std::os::unix::ffi::OsStringExt;
@@ -7,39 +8,42 @@ use std::path::{Path, PathBuf};
 
 use nix::mount::{MntFlags, umount2};
 
-use super::{HomeError, io};
+use super::{HomeError, io_error};
 
-/// The mounts that the calling thread sees.
+/// Mount table of the calling thread.
 const TABLE: &str = "/proc/thread-self/mountinfo";
 
-/// Detaches all that is mounted below `directory`, but not what is mounted at it.
+/// Detaches everything that is mounted below `directory`, but not what is mounted at `directory` itself.
 pub(super) fn detach_below(directory: &Path) -> Result<(), HomeError> {
-    let directory = directory.canonicalize().map_err(io("resolve", directory))?;
-    let table = std::fs::read(TABLE).map_err(io("read", Path::new(TABLE)))?;
-    // The last one first: what is mounted on another mount comes after it.
-    for point in points_below(&table, &directory).into_iter().rev() {
+    let directory = directory
+        .canonicalize()
+        .map_err(io_error("resolve", directory))?;
+    let table = std::fs::read(TABLE).map_err(io_error("read", Path::new(TABLE)))?;
+    // In reverse order: a mount on another mount comes after it in the table.
+    for point in mount_points_below(&table, &directory).into_iter().rev() {
         tracing::warn!(
-            "detaching what an earlier daemon left mounted at {}",
+            "detaching the mount of a previous daemon at {}",
             point.display()
         );
         let flags = MntFlags::MNT_DETACH | MntFlags::UMOUNT_NOFOLLOW;
-        umount2(&point, flags).map_err(|errno| io("detach", &point)(errno.into()))?;
+        umount2(&point, flags).map_err(|errno| io_error("detach", &point)(errno.into()))?;
     }
     Ok(())
 }
 
-/// Mount points below a directory by the text of /proc/self/mountinfo (proc_pid_mountinfo(5)), in the order of that.
-fn points_below(table: &[u8], directory: &Path) -> Vec<PathBuf> {
+/// Returns the mount points below a directory, in the order of the text of /proc/self/mountinfo
+/// (proc_pid_mountinfo(5)).
+fn mount_points_below(table: &[u8], directory: &Path) -> Vec<PathBuf> {
     let lines = table.split(|&byte| byte == b'\n');
     let points = lines.filter_map(|line| line.split(|&byte| byte == b' ').nth(4));
     points
-        .map(unescaped)
+        .map(unescape)
         .filter(|point| point != directory && point.starts_with(directory))
         .collect()
 }
 
-/// A path as it is: spaces, tabs, line ends and backslashes are written `\NNN`, in octal.
-fn unescaped(mut written: &[u8]) -> PathBuf {
+/// Decodes a path of the table: spaces, tabs, newlines and backslashes are written as `\NNN`, in octal.
+fn unescape(mut written: &[u8]) -> PathBuf {
     let mut path = Vec::with_capacity(written.len());
     while let Some((&byte, rest)) = written.split_first() {
         let digits = rest.get(..3).filter(|_| byte == b'\\');
@@ -72,12 +76,12 @@ mod tests {
             21 20 8:2 / /h/build rw - ext4 /dev/sdb1 rw\n\
             22 21 0:5 / /h/build/a\\040b\\134/sys rw - sysfs sysfs rw\n\
             23 20 0:6 / /h/builds/c rw - tmpfs none rw\n";
-        let found = points_below(table, Path::new("/h/build"));
+        let found = mount_points_below(table, Path::new("/h/build"));
         assert_eq!(found, [Path::new("/h/build/a b\\/sys")]);
     }
 
-    /// Does `work` on a thread whose mounts nobody else sees.
-    fn apart(work: impl FnOnce() + Send) {
+    /// Runs `work` on a thread in a private mount namespace.
+    fn in_private_mount_namespace(work: impl FnOnce() + Send) {
         std::thread::scope(|scope| {
             let apart = scope.spawn(|| {
                 unshare(CloneFlags::CLONE_NEWNS).expect("a mount namespace; run this test as root");
@@ -99,15 +103,15 @@ mod tests {
         let build = home.path().join("build/push 1");
         let point = build.join("base-1/tree/dev/shm");
         std::fs::create_dir_all(&point).expect("made");
-        apart(|| {
+        in_private_mount_namespace(|| {
             let bind = MsFlags::MS_BIND;
             mount(Some(&hosts), &point, None::<&str>, bind, None::<&str>).expect("mounted");
-            // On that one, another.
+            // Another mount, on top of that one.
             let below = point.join("below");
             std::fs::create_dir(&below).expect("made");
             let (kind, no_flags) = (Some("tmpfs"), MsFlags::empty());
             mount(Some("none"), &below, kind, no_flags, None::<&str>).expect("mounted");
-            super::super::sweep_builds(&home.half_made_builds());
+            super::super::sweep_builds(&home.leftover_builds());
             assert!(!build.exists(), "it is swept");
         });
         assert!(hosts.join("theirs").exists(), "the host's files stay");

@@ -1,35 +1,35 @@
-//! Coordinates guessed from coordinates.
+//! Predicts coordinates from other coordinates.
 //!
-//! - A depth camera computes x = (u - cx)·z/f: within a column of pixels, x/z is one number. Likewise y/z in a row.
-//! - A spinning laser computes z = r·sin ω and √(x² + y²) = r·cos ω: for one laser, their quotient is one number; and
-//!   from shot to shot y/x hardly moves.
-//! - Where nothing is known, the last point of the same laser is nearer than the last point.
+//! - A depth camera computes x = (u - cx)·z/f: within a column of pixels x/z is constant. Likewise y/z in a row.
+//! - A spinning laser computes z = r·sin ω and √(x² + y²) = r·cos ω: for one laser their quotient is constant, and from
+//!   shot to shot y/x hardly changes.
+//! - Otherwise the last point of the same laser is nearer than the last point.
 //!
-//! The quotient is learned from the points before. Everything is IEEE arithmetic (products, quotients, square roots),
-//! so both sides learn the very same, whatever processors they have.
+//! The quotient is learned from earlier points. Everything is IEEE arithmetic (products, quotients, square roots), so
+//! both sides learn exactly the same, whatever their processors.
 
-use super::Known;
+use super::ReferenceColumns;
 use crate::Error;
-use crate::column::{Shape, ordered, unordered};
+use crate::column::{Shape, from_ordered_bits, to_ordered_bits};
 use crate::predict::{unzigzag, zigzag};
 
-/// What the quotient is taken to.
+/// Denominator of the quotient.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Reference {
-    /// Nothing: the last value is the guess.
+    /// None: the last value is the prediction.
     Last,
-    /// The first coordinate told.
+    /// The first coded coordinate.
     First,
-    /// The second.
+    /// The second coded coordinate.
     Second,
     /// √(first² + second²)
     Both,
 }
 
-/// Lasers told apart; more of them than any scanner has share quotients.
+/// Number of lasers that are told apart; more than any scanner has share quotients.
 const RINGS: usize = 1024;
 
-/// Which points share a quotient.
+/// The points that share a quotient.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 enum Sharing {
     /// The whole cloud: the last point counts.
@@ -42,9 +42,9 @@ enum Sharing {
     Ring,
 }
 
-/// A way to guess a coordinate.
+/// A way to predict a coordinate.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(super) struct Guess {
+pub(super) struct CoordinatePredictor {
     reference: Reference,
     sharing: Sharing,
 }
@@ -57,7 +57,7 @@ const REFERENCES: [Reference; 4] = [
 ];
 const SHARINGS: [Sharing; 4] = [Sharing::All, Sharing::Column, Sharing::Row, Sharing::Ring];
 
-impl Guess {
+impl CoordinatePredictor {
     fn all() -> impl Iterator<Item = Self> {
         REFERENCES.into_iter().flat_map(|reference| {
             SHARINGS
@@ -66,8 +66,8 @@ impl Guess {
         })
     }
 
-    /// Whether it is of use at all, with what is known.
-    fn applies(self, known: &Known, shape: Shape) -> bool {
+    /// Returns true if the predictor can be useful with the known columns.
+    fn is_applicable(self, known: &ReferenceColumns, shape: Shape) -> bool {
         let needed = match self.reference {
             Reference::Last => 0,
             Reference::First => 1,
@@ -86,7 +86,7 @@ impl Guess {
         (self.reference as u8) << 4 | self.sharing as u8
     }
 
-    pub(super) fn named(name: u8, known: &Known) -> Result<Self, Error> {
+    pub(super) fn from_name(name: u8, known: &ReferenceColumns) -> Result<Self, Error> {
         let guess = Self::all().find(|guess| guess.name() == name);
         guess
             .filter(|guess| match guess.reference {
@@ -98,9 +98,9 @@ impl Guess {
             .ok_or(Error::Corrupt("a guess from what is not known"))
     }
 
-    /// The reference of point `index`, as float and as bits to repeat when it is no number.
+    /// Returns the denominator for point `index`, as a float and as bits to repeat if it is not a number.
     #[inline(always)]
-    fn reference(self, known: &Known, index: usize) -> (f64, u32) {
+    fn reference(self, known: &ReferenceColumns, index: usize) -> (f64, u32) {
         let coordinate = |which: usize| {
             let bits = known.coordinates[which][index];
             (f64::from(f32::from_bits(bits)), bits)
@@ -119,24 +119,24 @@ impl Guess {
 
 /// A quotient learned from the points that share it.
 #[derive(Clone, Copy, Default)]
-struct Learned {
+struct LearnedRatio {
     quotient: f64,
     points: u32,
 }
 
-/// Guesses point after point, learning from each.
+/// Predicts point after point, learning from each.
 struct Tracker<'a> {
-    guess: Guess,
-    known: &'a Known,
+    guess: CoordinatePredictor,
+    known: &'a ReferenceColumns,
     width: usize,
-    learned: Vec<Learned>,
-    last: Learned,
-    /// How many points the mean reaches back.
+    learned: Vec<LearnedRatio>,
+    last: LearnedRatio,
+    /// Number of points that the mean covers.
     memory: u32,
 }
 
 impl<'a> Tracker<'a> {
-    fn new(guess: Guess, known: &'a Known, shape: Shape) -> Self {
+    fn new(guess: CoordinatePredictor, known: &'a ReferenceColumns, shape: Shape) -> Self {
         let (width, height) = match shape {
             Shape::Picture { width, height } => (width, height),
             Shape::Sequence(length) => (length, 1),
@@ -155,8 +155,8 @@ impl<'a> Tracker<'a> {
             guess,
             known,
             width,
-            learned: vec![Learned::default(); slots],
-            last: Learned::default(),
+            learned: vec![LearnedRatio::default(); slots],
+            last: LearnedRatio::default(),
             memory,
         }
     }
@@ -175,7 +175,7 @@ impl<'a> Tracker<'a> {
         }
     }
 
-    /// Guesses the bits of point `index`; `tell` turns the guess into the truth, from which to learn.
+    /// Predicts the bits of point `index`; `tell` turns the prediction into the true value, from which to learn.
     #[inline(always)]
     fn next(&mut self, index: usize, tell: impl FnOnce(u32) -> u32) {
         let slot = self.slot(index);
@@ -186,7 +186,7 @@ impl<'a> Tracker<'a> {
         }
         let usable = reference.is_finite() && reference != 0.0;
         let product = (learned.quotient * reference) as f32;
-        // The bits of what is no number differ between processors.
+        // The bits of NaN differ between processors.
         let guessed = if usable && !product.is_nan() {
             product.to_bits()
         } else {
@@ -202,13 +202,20 @@ impl<'a> Tracker<'a> {
     }
 }
 
-/// How far every point is from its guess, in floats between.
-pub(super) fn differences(bits: &[u32], guess: Guess, known: &Known, shape: Shape) -> Vec<u32> {
+/// Returns the distance of every point from its prediction, in representable floats.
+pub(super) fn differences(
+    bits: &[u32],
+    guess: CoordinatePredictor,
+    known: &ReferenceColumns,
+    shape: Shape,
+) -> Vec<u32> {
     let mut tracker = Tracker::new(guess, known, shape);
     let mut differences = Vec::with_capacity(bits.len());
     for (index, &bits) in bits.iter().enumerate() {
         tracker.next(index, |guessed| {
-            differences.push(zigzag(ordered(bits).wrapping_sub(ordered(guessed)) as i32));
+            differences.push(zigzag(
+                to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)) as i32,
+            ));
             bits
         });
     }
@@ -216,12 +223,19 @@ pub(super) fn differences(bits: &[u32], guess: Guess, known: &Known, shape: Shap
 }
 
 /// The inverse of [`differences`].
-pub(super) fn restore(differences: &[u32], guess: Guess, known: &Known, shape: Shape) -> Vec<u32> {
+pub(super) fn restore(
+    differences: &[u32],
+    guess: CoordinatePredictor,
+    known: &ReferenceColumns,
+    shape: Shape,
+) -> Vec<u32> {
     let mut tracker = Tracker::new(guess, known, shape);
     let mut bits = Vec::with_capacity(differences.len());
     for (index, &difference) in differences.iter().enumerate() {
         tracker.next(index, |guessed| {
-            let truth = unordered(ordered(guessed).wrapping_add(unzigzag(difference) as u32));
+            let truth = from_ordered_bits(
+                to_ordered_bits(guessed).wrapping_add(unzigzag(difference) as u32),
+            );
             bits.push(truth);
             truth
         });
@@ -229,8 +243,8 @@ pub(super) fn restore(differences: &[u32], guess: Guess, known: &Known, shape: S
     bits
 }
 
-/// How many points are looked at to choose: four rows of a picture, within bounds.
-fn some(bits: &[u32], shape: Shape) -> usize {
+/// Returns the number of points to sample for the choice: four rows of a picture, within bounds.
+fn sample_size(bits: &[u32], shape: Shape) -> usize {
     let rows = match shape {
         Shape::Picture { width, .. } => 4 * width,
         Shape::Sequence(_) => 0,
@@ -238,18 +252,23 @@ fn some(bits: &[u32], shape: Shape) -> usize {
     rows.clamp(2048, 8192).min(bits.len())
 }
 
-/// The guess that leaves less than the column's own neighbours do; `None` when none does.
-pub(super) fn choose(bits: &[u32], known: &Known, shape: Shape) -> Option<Guess> {
-    let some = some(bits, shape);
+/// Returns the predictor that leaves less than the column's own neighbours do; `None` if none does.
+pub(super) fn choose(
+    bits: &[u32],
+    known: &ReferenceColumns,
+    shape: Shape,
+) -> Option<CoordinatePredictor> {
+    let some = sample_size(bits, shape);
     let mut best = (plain_cost(&bits[..some], shape), None);
-    for guess in Guess::all().filter(|guess| guess.applies(known, shape)) {
+    for guess in CoordinatePredictor::all().filter(|guess| guess.is_applicable(known, shape)) {
         let mut tracker = Tracker::new(guess, known, shape);
         let mut cost = 0u64;
         for (index, &bits) in bits[..some].iter().enumerate() {
             tracker.next(index, |guessed| {
                 // The first half is for learning.
                 let counts = u64::from(index >= some / 2);
-                cost += counts * size(ordered(bits).wrapping_sub(ordered(guessed)));
+                cost += counts
+                    * bit_length(to_ordered_bits(bits).wrapping_sub(to_ordered_bits(guessed)));
                 bits
             });
         }
@@ -260,11 +279,11 @@ pub(super) fn choose(bits: &[u32], known: &Known, shape: Shape) -> Option<Guess>
     best.1
 }
 
-fn size(difference: u32) -> u64 {
+fn bit_length(difference: u32) -> u64 {
     u64::from(32 - zigzag(difference as i32).leading_zeros())
 }
 
-/// What the second half of a column costs when guessed from its neighbours.
+/// Returns the cost of the second half of a column when predicted from its neighbours.
 fn plain_cost(sample: &[u32], shape: Shape) -> u64 {
     let half = (sample.len() / 2).max(1);
     if let Some(scale) = crate::scale::Scale::find(sample) {
@@ -274,22 +293,22 @@ fn plain_cost(sample: &[u32], shape: Shape) -> u64 {
                 .multiple(pair[1])
                 .wrapping_sub(scale.multiple(pair[0]))
         };
-        return multiples.map(|pair| size(step(pair) as u32)).sum();
+        return multiples.map(|pair| bit_length(step(pair) as u32)).sum();
     }
     let above = match shape {
         Shape::Picture { width, .. } => width,
         Shape::Sequence(_) => 1,
     };
-    let order = |index: usize| ordered(sample[index]);
+    let order = |index: usize| to_ordered_bits(sample[index]);
     let cost = |index: usize| {
-        let west = size(order(index).wrapping_sub(order(index - 1)));
+        let west = bit_length(order(index).wrapping_sub(order(index - 1)));
         if index <= above {
             return west;
         }
         let plane = order(index - 1)
             .wrapping_add(order(index - above))
             .wrapping_sub(order(index - above - 1));
-        west.min(size(order(index).wrapping_sub(plane)))
+        west.min(bit_length(order(index).wrapping_sub(plane)))
     };
     (half..sample.len()).map(cost).sum()
 }

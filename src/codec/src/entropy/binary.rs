@@ -1,14 +1,14 @@
-//! An adaptive binary range coder: few decisions, no tables to send.
+//! An adaptive binary range coder, for few decisions; no tables are sent.
 //!
-//! Each decision has a [`Bit`] that learns its probability at two speeds; the range is split by their mean.
+//! Each decision has an [`AdaptiveBit`] that learns its probability at two speeds; the range is split by their mean.
 
 use crate::Error;
 
-/// The probability, in 1/65536, that a decision is a zero: a fast learner and a slow one.
+/// The probability, in 1/65536, that a decision is a zero, as a fast and a slow estimate.
 ///
-/// Both begin as plain averages (the n-th decision weighs about 1/n) until they have reached their own speed.
+/// Both start as plain averages (the n-th decision weighs about 1/n) until they have reached their own speed.
 #[derive(Clone, Copy)]
-pub(crate) struct Bit {
+pub(crate) struct AdaptiveBit {
     fast: u16,
     slow: u16,
     seen: u8,
@@ -17,7 +17,7 @@ pub(crate) struct Bit {
 const FAST: u32 = 5;
 const SLOW: u32 = 7;
 
-impl Default for Bit {
+impl Default for AdaptiveBit {
     fn default() -> Self {
         Self {
             fast: 1 << 15,
@@ -27,15 +27,15 @@ impl Default for Bit {
     }
 }
 
-impl Bit {
-    /// In 1/65536, never 0 nor 1.
+impl AdaptiveBit {
+    /// Returns the probability of a zero in 1/65536, never 0 or 1.
     #[inline]
-    fn zero(self) -> u32 {
+    fn zero_probability(self) -> u32 {
         ((u32::from(self.fast) + u32::from(self.slow)) >> 1).clamp(24, 65_536 - 24)
     }
 
     #[inline]
-    fn learn(&mut self, one: bool) {
+    fn update(&mut self, one: bool) {
         let speed = (u32::from(self.seen) + 2).ilog2();
         self.seen += u8::from(self.seen < (1 << SLOW) - 2);
         let (fast, slow) = (speed.min(FAST), speed.min(SLOW));
@@ -49,7 +49,7 @@ impl Bit {
     }
 }
 
-/// Carries propagate into bytes already written, so the output is kept until the end.
+/// Encodes decisions. Carries propagate into bytes already written, so the output is kept until the end.
 pub(crate) struct BinaryEncoder {
     low: u64,
     range: u32,
@@ -66,9 +66,9 @@ impl BinaryEncoder {
     }
 
     #[inline]
-    pub(crate) fn put(&mut self, bit: &mut Bit, one: bool) {
-        let split = ((u64::from(self.range) * u64::from(bit.zero())) >> 16) as u32;
-        bit.learn(one);
+    pub(crate) fn put(&mut self, bit: &mut AdaptiveBit, one: bool) {
+        let split = ((u64::from(self.range) * u64::from(bit.zero_probability())) >> 16) as u32;
+        bit.update(one);
         self.narrow(split, one);
     }
 
@@ -81,11 +81,11 @@ impl BinaryEncoder {
             self.range = split;
         }
         while self.range < 1 << 24 {
-            self.shift();
+            self.shift_out();
         }
     }
 
-    fn shift(&mut self) {
+    fn shift_out(&mut self) {
         if self.low >> 32 != 0 {
             for byte in self.out.iter_mut().rev() {
                 *byte = byte.wrapping_add(1);
@@ -100,13 +100,13 @@ impl BinaryEncoder {
     }
 
     pub(crate) fn finish(mut self) -> Vec<u8> {
-        // Any number in low..low + range ends the stream; take the one with the most zeros below, and drop those.
+        // Any number in low..low + range ends the stream; take the one with the most trailing zeros, and drop those.
         let top = (self.low + u64::from(self.range) - 1) & !0x00ff_ffff;
         if top >= self.low {
             self.low = top;
         }
         for _ in 0..4 {
-            self.shift();
+            self.shift_out();
         }
         while self.out.last() == Some(&0) {
             self.out.pop();
@@ -115,7 +115,7 @@ impl BinaryEncoder {
     }
 }
 
-/// Reads what [`BinaryEncoder`] wrote; past the end there are zeros.
+/// Decodes what [`BinaryEncoder`] wrote; zeros follow the end.
 pub(crate) struct BinaryDecoder<'a> {
     code: u32,
     range: u32,
@@ -132,13 +132,13 @@ impl<'a> BinaryDecoder<'a> {
             missing: 0,
         };
         for _ in 0..4 {
-            this.code = this.code << 8 | this.next();
+            this.code = this.code << 8 | this.next_byte();
         }
         this
     }
 
     #[inline]
-    fn next(&mut self) -> u32 {
+    fn next_byte(&mut self) -> u32 {
         match self.bytes.split_first() {
             Some((&first, rest)) => {
                 self.bytes = rest;
@@ -152,10 +152,10 @@ impl<'a> BinaryDecoder<'a> {
     }
 
     #[inline]
-    pub(crate) fn get(&mut self, bit: &mut Bit) -> bool {
-        let split = ((u64::from(self.range) * u64::from(bit.zero())) >> 16) as u32;
+    pub(crate) fn get(&mut self, bit: &mut AdaptiveBit) -> bool {
+        let split = ((u64::from(self.range) * u64::from(bit.zero_probability())) >> 16) as u32;
         let one = self.narrow(split);
-        bit.learn(one);
+        bit.update(one);
         one
     }
 
@@ -170,7 +170,7 @@ impl<'a> BinaryDecoder<'a> {
         }
         while self.range < 1 << 24 {
             self.range <<= 8;
-            self.code = self.code << 8 | self.next();
+            self.code = self.code << 8 | self.next_byte();
         }
         one
     }
@@ -192,7 +192,7 @@ mod tests {
     fn decisions_come_back_and_likely_ones_are_cheap() {
         let decision = |index: u32| index.wrapping_mul(2_654_435_761) >> 25 == 0;
         let mut encoder = BinaryEncoder::new();
-        let (mut bit, mut other) = (Bit::default(), Bit::default());
+        let (mut bit, mut other) = (AdaptiveBit::default(), AdaptiveBit::default());
         for index in 0..100_000 {
             encoder.put(&mut bit, decision(index));
             if index % 100 == 0 {
@@ -203,7 +203,7 @@ mod tests {
         // One in 128: 0.066 bits each by Shannon.
         assert!(bytes.len() < 100_000 * 75 / 8000 + 20, "{}", bytes.len());
         let mut decoder = BinaryDecoder::new(&bytes);
-        let (mut bit, mut other) = (Bit::default(), Bit::default());
+        let (mut bit, mut other) = (AdaptiveBit::default(), AdaptiveBit::default());
         for index in 0..100_000 {
             assert_eq!(decoder.get(&mut bit), decision(index), "{index}");
             if index % 100 == 0 {

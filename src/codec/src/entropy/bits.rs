@@ -1,6 +1,6 @@
-//! Plain bits, written and read from the front.
+//! Bit streams, written and read from the front.
 
-/// Packs bits low end first.
+/// Writes bits, least significant first.
 #[derive(Default)]
 pub(crate) struct BitWriter {
     bytes: Vec<u8>,
@@ -9,7 +9,7 @@ pub(crate) struct BitWriter {
 }
 
 impl BitWriter {
-    /// With room for so many bytes before it has to grow.
+    /// Creates a writer with capacity for `bytes` bytes.
     pub(crate) fn with_capacity(bytes: usize) -> Self {
         Self {
             bytes: Vec::with_capacity(bytes),
@@ -17,7 +17,7 @@ impl BitWriter {
         }
     }
 
-    /// Appends the low `count` bits of `value`; at most 32, the rest of `value` zero.
+    /// Appends the low `count` bits of `value`, at most 32; the rest of `value` must be zero.
     #[inline(always)]
     pub(crate) fn put(&mut self, value: u32, count: u32) {
         debug_assert!(count <= 32 && (count == 32 || value >> count == 0));
@@ -31,7 +31,7 @@ impl BitWriter {
         }
     }
 
-    /// Appends the low bits of every value, at most 32 of each: as [`BitWriter::put`], without a branch.
+    /// Appends the low bits of every value, at most 32 of each, like [`BitWriter::put`] but without branches.
     #[inline]
     pub(crate) fn put_low(&mut self, values: &[u32], counts: &[u8]) {
         const SOME: usize = 64;
@@ -48,7 +48,7 @@ impl BitWriter {
                 count &= 7;
             };
             let low = |value: u32, bits: u8| u64::from(value) & ((1 << (bits & 63)) - 1);
-            // Each waits for the one before, so two go as one where they fit.
+            // Each depends on the one before, so two are written as one where they fit.
             let mut done = 0;
             if counts.iter().copied().max().unwrap_or(0) <= 16 {
                 for (values, counts) in values.chunks_exact(2).zip(counts.chunks_exact(2)) {
@@ -65,7 +65,7 @@ impl BitWriter {
         (self.pending, self.count) = (pending, count);
     }
 
-    /// Elias' gamma code of a number ≥ 1.
+    /// Appends the Elias gamma code of a number ≥ 1.
     pub(crate) fn put_gamma(&mut self, value: u32) {
         let length = 31 - value.leading_zeros();
         self.put(0, length);
@@ -73,7 +73,7 @@ impl BitWriter {
         self.put(value & !(1 << length), length);
     }
 
-    /// Rice code: `value >> k` in unary, then the low `k` bits.
+    /// Appends the Rice code of `value`: `value >> k` in unary, then the low `k` bits.
     pub(crate) fn put_rice(&mut self, value: u32, k: u32) {
         let mut unary = value >> k;
         while unary > 30 {
@@ -92,7 +92,7 @@ impl BitWriter {
     }
 }
 
-/// Reads what [`BitWriter`] wrote. Past the end there are zeros, and [`BitReader::overran`] tells.
+/// Reads what [`BitWriter`] wrote. Zeros follow the end, and [`BitReader::has_overrun`] reports reading past it.
 #[derive(Clone, Copy, Default)]
 pub(crate) struct BitReader<'a> {
     bytes: &'a [u8],
@@ -136,7 +136,7 @@ impl<'a> BitReader<'a> {
         }
     }
 
-    /// The next `count` bits; at most 32.
+    /// Returns the next `count` bits, at most 32.
     #[inline]
     pub(crate) fn take(&mut self, count: u32) -> u32 {
         if self.count < count {
@@ -148,37 +148,37 @@ impl<'a> BitReader<'a> {
         value
     }
 
-    /// Whether more bits were taken than there were.
-    pub(crate) fn overran(&self) -> bool {
+    /// Returns true if more bits were read than there were.
+    pub(crate) fn has_overrun(&self) -> bool {
         self.missing > self.count
     }
 
-    /// The counterpart of [`BitWriter::put_gamma`]; `None` when it is longer than any number.
+    /// Reads what [`BitWriter::put_gamma`] wrote; `None` if it is longer than any number.
     pub(crate) fn take_gamma(&mut self) -> Option<u32> {
         let mut length = 0;
         while self.take(1) == 0 {
             length += 1;
-            if length > 31 || self.overran() {
+            if length > 31 || self.has_overrun() {
                 return None;
             }
         }
         Some((1 << length) | self.take(length))
     }
 
-    /// The counterpart of [`BitWriter::put_rice`]; `None` when the unary part exceeds `limit`.
+    /// Reads what [`BitWriter::put_rice`] wrote; `None` if the unary part exceeds `limit`.
     pub(crate) fn take_rice(&mut self, k: u32, limit: u32) -> Option<u32> {
         let mut high = 0;
         while self.take(1) == 0 {
             high += 1;
-            if high > limit >> k || self.overran() {
+            if high > limit >> k || self.has_overrun() {
                 return None;
             }
         }
         Some((high << k) | self.take(k))
     }
 
-    /// How many bytes were touched, rounded up: where the next block begins.
-    pub(crate) fn used(&self) -> usize {
+    /// Returns the number of bytes read, rounded up: the start of the next block.
+    pub(crate) fn bytes_used(&self) -> usize {
         self.next - (self.count.saturating_sub(self.missing) / 8) as usize
     }
 }
@@ -206,8 +206,8 @@ mod tests {
             assert_eq!(reader.take_rice(4, 200), Some(i));
         }
         assert_eq!(reader.take(32), u32::MAX);
-        assert_eq!(reader.used(), length);
-        assert!(!reader.overran());
+        assert_eq!(reader.bytes_used(), length);
+        assert!(!reader.has_overrun());
     }
 
     #[test]
@@ -231,9 +231,9 @@ mod tests {
     fn reading_past_the_end_is_noticed() {
         let mut reader = BitReader::new(&[0xff]);
         assert_eq!(reader.take(8), 0xff);
-        assert!(!reader.overran());
+        assert!(!reader.has_overrun());
         assert_eq!(reader.take(1), 0);
-        assert!(reader.overran());
+        assert!(reader.has_overrun());
         assert_eq!(BitReader::new(&[]).take_gamma(), None);
     }
 }

@@ -1,25 +1,25 @@
-//! How often each symbol occurs in each context, made to fit a power of two, and written compactly.
+//! Symbol counts per context, normalised to a power of two and written compactly.
 
 use super::bits::{BitReader, BitWriter};
 use crate::Error;
 
-/// Symbols of one context.
+/// Number of symbols of one context.
 pub(crate) const SYMBOLS: usize = 256;
-/// Contexts of one model.
+/// Number of contexts of one model.
 pub(crate) const CONTEXTS: usize = 32;
-/// The largest table: 2^11 states per context.
+/// Logarithm of the largest table: 2^11 states per context.
 pub(crate) const MAX_LOG: u32 = 11;
 
-/// In which order a table lists its symbols: from the likely to the unlikely, so that the list ends early.
+/// The order in which a table lists its symbols: from likely to unlikely, so that the list ends early.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(crate) enum Order {
+pub(crate) enum SymbolOrder {
     /// Symbols are small numbers.
     Natural,
     /// Symbols are signed differences modulo 256: 0, -1, 1, -2, 2, …
     Signed,
 }
 
-impl Order {
+impl SymbolOrder {
     fn symbol(self, rank: usize) -> usize {
         match self {
             Self::Natural => rank,
@@ -28,11 +28,11 @@ impl Order {
     }
 }
 
-/// Counts of one context: either none at all, or a sum of exactly 2^log.
-pub(crate) type Counts = [u16; SYMBOLS];
+/// Counts of one context: all zero, or with a sum of exactly 2^log.
+pub(crate) type SymbolCounts = [u16; SYMBOLS];
 
-/// The table size worth its header for that many symbols.
-pub(crate) fn log_for(symbols: usize) -> u32 {
+/// Returns the logarithm of the table size that is worth its header for that many symbols.
+pub(crate) fn table_log(symbols: usize) -> u32 {
     match symbols {
         0..0x800 => 8,
         0x800..0x1000 => 9,
@@ -41,8 +41,8 @@ pub(crate) fn log_for(symbols: usize) -> u32 {
     }
 }
 
-/// Scales `histogram` to a sum of 2^log, keeping every symbol that occurs. All zero stays all zero.
-pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
+/// Scales `histogram` to a sum of 2^log, keeping every symbol that occurs. An all-zero histogram stays all zero.
+pub(crate) fn normalise(histogram: &[u32], log: u32) -> SymbolCounts {
     let mut counts = [0u16; SYMBOLS];
     let total: u64 = histogram.iter().map(|&count| u64::from(count)).sum();
     if total == 0 {
@@ -51,7 +51,7 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
     let size = 1i32 << log;
     let last = histogram.iter().rposition(|&count| count > 0).unwrap_or(0);
     let histogram = &histogram[..=last];
-    // Symbols too rare for a state get one all the same; the others share what is left.
+    // Symbols too rare for a state get one nevertheless; the others share the rest.
     let rare = (total >> (log + 1)) as u32;
     let (mut few, mut few_total) = (0i32, 0u64);
     for &count in histogram {
@@ -73,15 +73,15 @@ pub(crate) fn normalise(histogram: &[u32], log: u32) -> Counts {
     if left + i32::from(counts[largest]) > i32::from(counts[largest]) / 2 {
         counts[largest] = (i32::from(counts[largest]) + left) as u16;
     } else {
-        give_back(&mut counts, left);
+        remove_excess(&mut counts, left);
     }
     counts
 }
 
-/// Rounding up took too much: takes it back where a single state matters least.
+/// Removes the excess of rounding up where a single state matters least.
 #[cold]
-fn give_back(counts: &mut Counts, mut left: i32) {
-    // Symbols in proportion to what they have above one.
+fn remove_excess(counts: &mut SymbolCounts, mut left: i32) {
+    // From each symbol in proportion to its count above one.
     let above: i32 = counts
         .iter()
         .map(|&count| i32::from(count.saturating_sub(1)))
@@ -101,8 +101,9 @@ fn give_back(counts: &mut Counts, mut left: i32) {
     }
 }
 
-/// Writes the counts of one context: Rice codes whose parameter follows the counts before, runs of zeros apart.
-pub(crate) fn write(counts: &Counts, order: Order, log: u32, out: &mut BitWriter) {
+/// Writes the counts of one context: Rice codes whose parameter adapts to the counts before, with runs of zeros coded
+/// separately.
+pub(crate) fn write(counts: &SymbolCounts, order: SymbolOrder, log: u32, out: &mut BitWriter) {
     let total: u32 = counts.iter().map(|&count| u32::from(count)).sum();
     out.put(u32::from(total > 0), 1);
     if total == 0 {
@@ -128,7 +129,11 @@ pub(crate) fn write(counts: &Counts, order: Order, log: u32, out: &mut BitWriter
 }
 
 /// Reads what [`write`] wrote.
-pub(crate) fn read(order: Order, log: u32, input: &mut BitReader<'_>) -> Result<Counts, Error> {
+pub(crate) fn read(
+    order: SymbolOrder,
+    log: u32,
+    input: &mut BitReader<'_>,
+) -> Result<SymbolCounts, Error> {
     const BAD: Error = Error::Corrupt("a table of counts that does not add up");
     let mut counts = [0u16; SYMBOLS];
     if input.take(1) == 0 {
@@ -138,7 +143,7 @@ pub(crate) fn read(order: Order, log: u32, input: &mut BitReader<'_>) -> Result<
     let mut average = left / 4;
     let mut rank = 0;
     while left > 0 {
-        if rank >= SYMBOLS || input.overran() {
+        if rank >= SYMBOLS || input.has_overrun() {
             return Err(BAD);
         }
         let count = input
@@ -173,7 +178,7 @@ fn rice_parameter(average: u32) -> u32 {
 mod tests {
     use super::*;
 
-    fn round_trip(histogram: &[u32; SYMBOLS], log: u32, order: Order) -> Counts {
+    fn round_trip(histogram: &[u32; SYMBOLS], log: u32, order: SymbolOrder) -> SymbolCounts {
         let counts = normalise(histogram, log);
         let mut writer = BitWriter::default();
         write(&counts, order, log, &mut writer);
@@ -188,7 +193,7 @@ mod tests {
         let mut histogram = [1u32; SYMBOLS];
         histogram[7] = 1_000_000;
         for log in [8, 9, 11] {
-            let counts = round_trip(&histogram, log, Order::Natural);
+            let counts = round_trip(&histogram, log, SymbolOrder::Natural);
             assert!(counts.iter().all(|&count| count > 0));
             assert_eq!(
                 counts.iter().map(|&count| u32::from(count)).sum::<u32>(),
@@ -200,20 +205,20 @@ mod tests {
     #[test]
     fn a_single_symbol_and_none_at_all() {
         let mut histogram = [0u32; SYMBOLS];
-        assert_eq!(round_trip(&histogram, 9, Order::Signed), [0; SYMBOLS]);
+        assert_eq!(round_trip(&histogram, 9, SymbolOrder::Signed), [0; SYMBOLS]);
         histogram[255] = 3;
-        assert_eq!(round_trip(&histogram, 9, Order::Signed)[255], 512);
+        assert_eq!(round_trip(&histogram, 9, SymbolOrder::Signed)[255], 512);
     }
 
     #[test]
     fn signed_order_is_a_permutation() {
         let mut seen = [false; SYMBOLS];
         for rank in 0..SYMBOLS {
-            seen[Order::Signed.symbol(rank)] = true;
+            seen[SymbolOrder::Signed.symbol(rank)] = true;
         }
         assert!(seen.iter().all(|&seen| seen));
         assert_eq!(
-            [0, 1, 2].map(|rank| Order::Signed.symbol(rank)),
+            [0, 1, 2].map(|rank| SymbolOrder::Signed.symbol(rank)),
             [0, 255, 1]
         );
     }

@@ -1,19 +1,18 @@
 //! Tabled asymmetric numeral systems, several lanes at a time.
 //!
-//! A *lane* is a run of symbols with a state and a bit stream of its own; the tables are shared. Lanes are coded in
-//! lockstep because one lane alone waits for its own last symbol most of the time: three or four hide each other's
-//! latency. Encoding runs from the last symbol to the first and the decoder reads the bits from the end, so both
-//! visit every bit once.
+//! A *lane* is a run of symbols with its own state and bit stream; the tables are shared. Lanes are coded in lockstep
+//! because a single lane mostly waits for its own last symbol: three or four hide each other's latency. Encoding runs
+//! from the last symbol to the first and the decoder reads the bits from the end, so both visit every bit once.
 //!
-//! A symbol travels as `context << 8 | symbol`.
+//! A symbol is represented by its key `context << 8 | symbol`.
 
 use super::bits::{BitReader, BitWriter};
-use super::counts::{self, Counts, MAX_LOG, Order, SYMBOLS};
+use super::counts::{self, MAX_LOG, SYMBOLS, SymbolCounts, SymbolOrder};
 use crate::Error;
 
-/// How often each key occurs.
+/// Counts of each key.
 ///
-/// Even and odd places are counted apart: the same key twice in a row would wait for its own last count.
+/// Even and odd positions are counted separately: the same key twice in a row would wait for its own last count.
 pub(crate) struct Histogram([Vec<u32>; 2]);
 
 impl Histogram {
@@ -43,7 +42,7 @@ impl Histogram {
     }
 }
 
-/// Which symbol each state of one context belongs to, every symbol's states spread evenly.
+/// Returns the symbol of each state of one context, with every symbol's states spread evenly.
 fn spread(counts: &[u16], log: u32) -> [u8; 1 << MAX_LOG] {
     let size = 1usize << log;
     let step = (size >> 1) + (size >> 3) + 3;
@@ -58,21 +57,22 @@ fn spread(counts: &[u16], log: u32) -> [u8; 1 << MAX_LOG] {
     symbols
 }
 
-/// Everything the encoder needs of a model, made from the counts of its symbols.
-pub(crate) struct Encoder {
+/// The encoder's tables, built from the counts of the symbols.
+pub(crate) struct TansEncoder {
     log: u32,
-    /// Per key: what to add to the state so that its high half is the number of bits to shed; where its states begin.
+    /// Per key: the addend after which the state's high half is the number of bits to shed, and the start of its
+    /// states.
     shed: Vec<(u32, i32)>,
-    /// The state after, by context and position.
+    /// The next state, by context and position.
     next: Vec<u16>,
 }
 
-impl Encoder {
+impl TansEncoder {
     /// Builds the tables and writes their description to `out`.
-    pub(crate) fn new(histogram: Histogram, order: Order, out: &mut Vec<u8>) -> Self {
+    pub(crate) fn new(histogram: Histogram, order: SymbolOrder, out: &mut Vec<u8>) -> Self {
         let histogram = histogram.counts();
         let total: usize = histogram.iter().map(|&count| count as usize).sum();
-        let log = counts::log_for(total);
+        let log = counts::table_log(total);
         let contexts = histogram.len() / SYMBOLS;
         let mut description = BitWriter::default();
         description.put(log - 8, 2);
@@ -90,7 +90,7 @@ impl Encoder {
         this
     }
 
-    fn fill(&mut self, context: usize, counts: &Counts) {
+    fn fill(&mut self, context: usize, counts: &SymbolCounts) {
         let size = 1usize << self.log;
         let base = context << self.log;
         let mut starts = [0usize; SYMBOLS];
@@ -120,7 +120,7 @@ impl Encoder {
 
     /// Encodes lanes of equal length, each to its own output.
     pub(crate) fn encode<const N: usize>(&self, lanes: [&[u16]; N]) -> [Vec<u8>; N] {
-        /// Four symbols shed at most 44 bits, which 64 hold beside the seven left over.
+        /// Four symbols shed at most 44 bits, which fit into 64 beside the seven left over.
         const BATCH: usize = 4;
         let length = lanes[0].len();
         let (shed, next) = (&self.shed[..], &self.next[..]);
@@ -183,7 +183,7 @@ impl Encoder {
     }
 }
 
-/// Takes one symbol into a state, shedding bits.
+/// Encodes one symbol into a state, shedding bits.
 #[inline(always)]
 fn step(
     key: u16,
@@ -207,17 +207,17 @@ fn grow(out: &mut Vec<u8>) {
 }
 
 /// The decoder's tables. An entry holds `next state << 16 | symbol << 8 | bits`.
-pub(crate) struct Decoder {
+pub(crate) struct TansDecoder {
     log: u32,
     entries: Vec<u32>,
 }
 
-impl Decoder {
-    /// Reads the description of a model of `contexts` contexts; returns how many bytes it took.
+impl TansDecoder {
+    /// Reads the description of a model of `contexts` contexts; returns the number of bytes read as well.
     pub(crate) fn read(
         bytes: &[u8],
         contexts: usize,
-        order: Order,
+        order: SymbolOrder,
     ) -> Result<(Self, usize), Error> {
         let mut input = BitReader::new(bytes);
         let log = input.take(2) + 8;
@@ -229,15 +229,15 @@ impl Decoder {
             let counts = counts::read(order, log, &mut input)?;
             this.fill(context, &counts);
         }
-        if input.overran() {
+        if input.has_overrun() {
             return Err(Error::Truncated);
         }
-        Ok((this, input.used()))
+        Ok((this, input.bytes_used()))
     }
 
-    fn fill(&mut self, context: usize, counts: &Counts) {
+    fn fill(&mut self, context: usize, counts: &SymbolCounts) {
         if counts.iter().all(|&count| count == 0) {
-            // Never used by an honest encoder: the zeros here decode to symbol 0 without bits.
+            // Never used by a correct encoder: the zeros here decode to symbol 0 without bits.
             return;
         }
         let base = context << self.log;
@@ -251,17 +251,17 @@ impl Decoder {
         }
     }
 
-    /// Where a context's entries begin, to be or-ed with a state.
+    /// Returns the start of a context's entries, to be or-ed with a state.
     pub(crate) fn base(&self, context: usize) -> u16 {
         (context << self.log) as u16
     }
 
-    /// A lane to be decoded with these tables.
-    pub(crate) fn lane<'a>(&self, bytes: &'a [u8]) -> Result<Lane<'a>, Error> {
-        Lane::new(bytes, self.log)
+    /// Opens a lane for decoding with these tables.
+    pub(crate) fn lane<'a>(&self, bytes: &'a [u8]) -> Result<LaneReader<'a>, Error> {
+        LaneReader::new(bytes, self.log)
     }
 
-    /// Decodes one symbol in the context that begins at `base`.
+    /// Decodes one symbol in the context whose entries start at `base`.
     #[inline(always)]
     pub(crate) fn symbol(&self, base: u16, bits: &mut Window) -> u8 {
         let entry = self.entries[usize::from(base) | bits.state as usize];
@@ -272,7 +272,7 @@ impl Decoder {
     }
 }
 
-/// The part of a lane that inner loops hold in registers: the state, and the next bits.
+/// The part of a lane that inner loops keep in registers: the state and the next bits.
 ///
 /// The bits are the topmost ones; a one marks their end.
 #[derive(Clone, Copy)]
@@ -281,20 +281,20 @@ pub(crate) struct Window {
     bits: u64,
 }
 
-/// One lane's bits, read from the end.
-pub(crate) struct Lane<'a> {
+/// Reads the bits of one lane from the end.
+pub(crate) struct LaneReader<'a> {
     bytes: &'a [u8],
-    /// Where the window's lowest bit lies in `bytes`; negative when the window reaches beyond the front.
+    /// Position of the window's lowest bit in `bytes`; negative if the window reaches beyond the front.
     below: isize,
     window: Window,
 }
 
-/// How many symbols may be decoded between two [`Lane::refill`]s: 56 bits are enough for five of eleven.
+/// Number of symbols that may be decoded between two [`LaneReader::refill`]s: 56 bits are enough for five of eleven.
 pub(crate) const BATCH: usize = 4;
-/// Bits in a window after a refill.
+/// Number of bits in a window after a refill.
 const FILLED: isize = 56;
 
-impl<'a> Lane<'a> {
+impl<'a> LaneReader<'a> {
     fn new(bytes: &'a [u8], log: u32) -> Result<Self, Error> {
         let last = *bytes.last().ok_or(Error::Truncated)?;
         if last == 0 {
@@ -316,17 +316,17 @@ impl<'a> Lane<'a> {
         Ok(lane)
     }
 
-    /// The window as it was left.
+    /// Returns the window as it was last stored.
     pub(crate) fn window(&self) -> Window {
         self.window
     }
 
-    /// Leaves the window for later.
-    pub(crate) fn leave(&mut self, window: Window) {
+    /// Stores the window for later.
+    pub(crate) fn set_window(&mut self, window: Window) {
         self.window = window;
     }
 
-    /// Fills a window up: loads the eight bytes that hold the highest unread bits.
+    /// Refills a window: loads the eight bytes that hold the highest unread bits.
     #[inline(always)]
     pub(crate) fn refill(&mut self, window: Window) -> Window {
         let end = self.below + 63 - window.bits.trailing_zeros() as isize;
@@ -336,7 +336,7 @@ impl<'a> Lane<'a> {
             .and_then(|first| self.bytes.get(first..)?.first_chunk())
         {
             Some(word) => u64::from_le_bytes(*word),
-            None => self.front(last),
+            None => self.read_front(last),
         };
         self.below = end - FILLED;
         let spare = (last * 8 - end) as u32;
@@ -346,9 +346,9 @@ impl<'a> Lane<'a> {
         }
     }
 
-    /// Beyond the front there are zeros; [`Lane::finish`] tells whether they were used.
+    /// Reads the word at the front, padded with zeros; [`LaneReader::finish`] reports whether they were used.
     #[cold]
-    fn front(&self, last: isize) -> u64 {
+    fn read_front(&self, last: isize) -> u64 {
         let mut word = [0u8; 8];
         if (1..8).contains(&last) {
             word[8 - last as usize..].copy_from_slice(&self.bytes[..last as usize]);
@@ -356,7 +356,7 @@ impl<'a> Lane<'a> {
         u64::from_le_bytes(word)
     }
 
-    /// Whether the lane ended where its encoder began, every bit read and none invented.
+    /// Checks that the lane ended where its encoder began, with every bit read and none invented.
     pub(crate) fn finish(&self) -> Result<(), Error> {
         let end = self.below + 63 - self.window.bits.trailing_zeros() as isize;
         if self.window.state == 0 && end == 0 {
@@ -378,7 +378,7 @@ mod tests {
         histogram
     }
 
-    fn decode(decoder: &Decoder, stream: &[u8], keys: &[u16]) -> Result<(), Error> {
+    fn decode(decoder: &TansDecoder, stream: &[u8], keys: &[u16]) -> Result<(), Error> {
         let mut lane = decoder.lane(stream)?;
         let mut window = lane.window();
         let mut same = true;
@@ -389,17 +389,17 @@ mod tests {
                 same &= u16::from(symbol) == key & 0xff;
             }
         }
-        lane.leave(window);
+        lane.set_window(window);
         lane.finish()?;
         assert!(same);
         Ok(())
     }
 
-    fn round_trip(lanes: [&[u16]; 3], contexts: usize, order: Order) -> usize {
+    fn round_trip(lanes: [&[u16]; 3], contexts: usize, order: SymbolOrder) -> usize {
         let mut table = Vec::new();
-        let encoder = Encoder::new(histogram(&lanes, contexts), order, &mut table);
+        let encoder = TansEncoder::new(histogram(&lanes, contexts), order, &mut table);
         let streams = encoder.encode(lanes);
-        let (decoder, used) = Decoder::read(&table, contexts, order).unwrap();
+        let (decoder, used) = TansDecoder::read(&table, contexts, order).unwrap();
         assert_eq!(used, table.len());
         for (keys, stream) in lanes.iter().zip(&streams) {
             decode(&decoder, stream, keys).unwrap();
@@ -407,8 +407,8 @@ mod tests {
         table.len() + streams.iter().map(Vec::len).sum::<usize>()
     }
 
-    /// Numbers that are small more often than not.
-    fn skewed(count: usize, seed: u64) -> Vec<u16> {
+    /// Returns keys whose symbols are mostly small.
+    fn skewed_keys(count: usize, seed: u64) -> Vec<u16> {
         let mut state = seed;
         (0..count)
             .map(|index| {
@@ -424,9 +424,13 @@ mod tests {
     #[test]
     fn lanes_come_back() {
         for count in [0, 1, 2, 3, 100, 5000, 40_000] {
-            let lanes = [skewed(count, 1), skewed(count, 2), skewed(count, 3)];
-            let size = round_trip([&lanes[0], &lanes[1], &lanes[2]], 5, Order::Natural);
-            // The numbers hold two bits each.
+            let lanes = [
+                skewed_keys(count, 1),
+                skewed_keys(count, 2),
+                skewed_keys(count, 3),
+            ];
+            let size = round_trip([&lanes[0], &lanes[1], &lanes[2]], 5, SymbolOrder::Natural);
+            // The symbols hold two bits each.
             assert!(
                 size < 3 * count / 4 + count / 50 + 300,
                 "{count} symbols took {size} bytes"
@@ -437,25 +441,25 @@ mod tests {
     #[test]
     fn one_symbol_only_costs_nothing() {
         let lane = vec![0x01ff; 10_000];
-        assert!(round_trip([&lane, &lane, &lane], 2, Order::Signed) < 16);
+        assert!(round_trip([&lane, &lane, &lane], 2, SymbolOrder::Signed) < 16);
     }
 
     #[test]
     fn all_symbols_of_all_contexts() {
         let lane: Vec<u16> = (0..(CONTEXTS * SYMBOLS) as u16).collect();
-        round_trip([&lane, &lane, &lane], CONTEXTS, Order::Signed);
+        round_trip([&lane, &lane, &lane], CONTEXTS, SymbolOrder::Signed);
     }
 
     #[test]
     fn a_lane_cut_short_is_noticed() {
-        let lane = skewed(1000, 4);
+        let lane = skewed_keys(1000, 4);
         let mut table = Vec::new();
-        let encoder = Encoder::new(histogram(&[&lane], 5), Order::Natural, &mut table);
+        let encoder = TansEncoder::new(histogram(&[&lane], 5), SymbolOrder::Natural, &mut table);
         let [stream] = encoder.encode([&lane]);
-        let (decoder, _) = Decoder::read(&table, 5, Order::Natural).unwrap();
+        let (decoder, _) = TansDecoder::read(&table, 5, SymbolOrder::Natural).unwrap();
         assert!(decode(&decoder, &stream[10..], &lane).is_err());
         assert!(decoder.lane(&[]).is_err());
         assert!(decoder.lane(&[1, 0]).is_err());
-        assert!(Decoder::read(&table[..3], 5, Order::Natural).is_err());
+        assert!(TansDecoder::read(&table[..3], 5, SymbolOrder::Natural).is_err());
     }
 }

@@ -1,40 +1,40 @@
-//! The cells of a grid that differ from its background, by an adaptive binary coder.
+//! Codes the cells of a grid that differ from its background, by an adaptive binary coder.
 //!
-//! The grid is cut into tiles of 64×64 cells and those into blocks of 8×8. A tile, then a block, is either background
-//! or not; a block that is not may be of one value throughout. Only in the remaining blocks cells are told one by
-//! one, row by row across all blocks of a band, each in the context of its neighbours: how, is for a [`Tell`].
+//! The grid is divided into tiles of 64×64 cells and those into blocks of 8×8. A tile, then a block, is either
+//! background or not; a block that is not may be uniform. Only in the remaining blocks are cells coded one by one, row
+//! by row across all blocks of a band, each in the context of its neighbours; a [`CellModel`] defines how.
 
 use crate::Error;
-use crate::entropy::binary::{BinaryDecoder, BinaryEncoder, Bit};
-use crate::layout::Grid;
+use crate::entropy::binary::{AdaptiveBit, BinaryDecoder, BinaryEncoder};
+use crate::layout::GridLayout;
 use std::ops::Range;
 
 const TILE: usize = 64;
 const BLOCK: usize = 8;
-/// What a block of one value is guessed to be where nothing is known.
+/// Prediction of a uniform block without known neighbours.
 const UNKNOWN: u8 = 255;
 
-/// How values are told: by their class, or by their rank among many.
-pub(super) trait Tell {
-    /// The value of a block of one value.
-    fn uniform<S: Side>(&mut self, side: &mut S, guess: u8, known: u8) -> u8;
-    /// The cell at `place`.
-    fn cell<S: Side>(&mut self, side: &mut S, place: Place, known: u8) -> u8;
+/// A model that codes values: by their class, or by their rank among many.
+pub(super) trait CellModel {
+    /// Codes the value of a uniform block.
+    fn uniform<S: CellCoder>(&mut self, side: &mut S, guess: u8, known: u8) -> u8;
+    /// Codes the cell at `place`.
+    fn cell<S: CellCoder>(&mut self, side: &mut S, place: CellPosition, known: u8) -> u8;
 }
 
-/// Where a cell is.
+/// Position of a cell.
 #[derive(Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct CellPosition {
     pub(super) x: usize,
     pub(super) y: usize,
     width: usize,
     background: u8,
 }
 
-impl Place {
-    /// The cell `left` columns to the left and `up` rows above; outside of the grid, background.
+impl CellPosition {
+    /// Returns the cell `left` columns to the left and `up` rows above; outside the grid, the background.
     #[inline(always)]
-    pub(super) fn near(self, cells: &[u8], left: isize, up: usize) -> u8 {
+    pub(super) fn neighbour(self, cells: &[u8], left: isize, up: usize) -> u8 {
         let column = self.x.wrapping_add_signed(-left);
         if column < self.width && up <= self.y {
             cells[(self.y - up) * self.width + column]
@@ -44,35 +44,35 @@ impl Place {
     }
 }
 
-/// The decisions' probabilities that are of blocks.
+/// Probabilities of the decisions about blocks.
 #[derive(Default)]
-struct Blocks {
-    tiles: [Bit; 4],
-    differs: [Bit; 4],
-    uniform: [Bit; 4],
+struct BlockBits {
+    tiles: [AdaptiveBit; 4],
+    differs: [AdaptiveBit; 4],
+    uniform: [AdaptiveBit; 4],
 }
 
-/// An encoder or a decoder. One walk over the grid serves both: where it asks for what it codes, the encoder looks at
-/// its cells and the decoder at its bits.
-pub(super) trait Side {
+/// An encoder or a decoder. One walk over the grid serves both: where it asks for a decision, the encoder looks at its
+/// cells and the decoder at its bits.
+pub(super) trait CellCoder {
     const ENCODES: bool;
-    /// Codes a decision; `known` is what it is, if this side encodes.
-    fn bit(&mut self, bit: &mut Bit, known: bool) -> bool;
+    /// Codes a decision; `known` is its value if this side encodes.
+    fn bit(&mut self, bit: &mut AdaptiveBit, known: bool) -> bool;
     fn cells(&self) -> &[u8];
-    /// Sets cells to what was coded.
+    /// Sets cells to the coded value.
     fn set(&mut self, cells: Range<usize>, value: u8);
 }
 
-struct Encoding<'a> {
+struct CellEncoder<'a> {
     coder: BinaryEncoder,
     cells: &'a [u8],
 }
 
-impl Side for Encoding<'_> {
+impl CellCoder for CellEncoder<'_> {
     const ENCODES: bool = true;
 
     #[inline(always)]
-    fn bit(&mut self, bit: &mut Bit, known: bool) -> bool {
+    fn bit(&mut self, bit: &mut AdaptiveBit, known: bool) -> bool {
         self.coder.put(bit, known);
         known
     }
@@ -86,16 +86,16 @@ impl Side for Encoding<'_> {
     fn set(&mut self, _: Range<usize>, _: u8) {}
 }
 
-struct Decoding<'a> {
+struct CellDecoder<'a> {
     coder: BinaryDecoder<'a>,
     cells: &'a mut [u8],
 }
 
-impl Side for Decoding<'_> {
+impl CellCoder for CellDecoder<'_> {
     const ENCODES: bool = false;
 
     #[inline(always)]
-    fn bit(&mut self, bit: &mut Bit, _: bool) -> bool {
+    fn bit(&mut self, bit: &mut AdaptiveBit, _: bool) -> bool {
         self.coder.get(bit)
     }
 
@@ -110,44 +110,52 @@ impl Side for Decoding<'_> {
     }
 }
 
-/// Appends `cells` as they differ from `background`; tells how many are in blocks that do.
-pub(super) fn encode<T: Tell>(
+/// Appends the differences of `cells` from `background`; returns the number of cells in blocks that differ.
+pub(super) fn encode<T: CellModel>(
     cells: &[u8],
-    layout: &Grid,
+    layout: &GridLayout,
     background: u8,
     tell: T,
     out: &mut Vec<u8>,
 ) -> usize {
-    let side = Encoding {
+    let side = CellEncoder {
         coder: BinaryEncoder::new(),
         cells,
     };
-    let walk = walk(side, layout, background, tell);
+    let walk = walk_grid(side, layout, background, tell);
     out.extend_from_slice(&walk.side.coder.finish());
     walk.told
 }
 
-/// Turns `cells`, which are all `background`, into what was encoded.
-pub(super) fn decode<T: Tell>(
+/// Decodes into `cells`, which are all `background`.
+pub(super) fn decode<T: CellModel>(
     bytes: &[u8],
-    layout: &Grid,
+    layout: &GridLayout,
     background: u8,
     tell: T,
     cells: &mut [u8],
 ) -> Result<(), Error> {
-    let side = Decoding {
+    let side = CellDecoder {
         coder: BinaryDecoder::new(bytes),
         cells,
     };
-    walk(side, layout, background, tell).side.coder.finish()
+    walk_grid(side, layout, background, tell)
+        .side
+        .coder
+        .finish()
 }
 
-fn walk<S: Side, T: Tell>(side: S, layout: &Grid, background: u8, tell: T) -> Walk<S, T> {
+fn walk_grid<S: CellCoder, T: CellModel>(
+    side: S,
+    layout: &GridLayout,
+    background: u8,
+    tell: T,
+) -> GridWalk<S, T> {
     let (width, height) = (layout.width, layout.height);
-    let mut walk = Walk {
+    let mut walk = GridWalk {
         side,
         tell,
-        bits: Blocks::default(),
+        bits: BlockBits::default(),
         background,
         width,
         plain: vec![background; width],
@@ -157,13 +165,13 @@ fn walk<S: Side, T: Tell>(side: S, layout: &Grid, background: u8, tell: T) -> Wa
     };
     for top in (0..height).step_by(TILE) {
         let bottom = (top + TILE).min(height);
-        walk.tiles(top..bottom);
+        walk.code_tiles(top..bottom);
         for first in (top..bottom).step_by(BLOCK) {
             let band = first..(first + BLOCK).min(bottom);
             if walk.tiles.contains(&true) {
-                walk.blocks(band.clone());
+                walk.code_blocks(band.clone());
                 for y in band {
-                    walk.row(y);
+                    walk.code_row(y);
                 }
             } else {
                 walk.blocks.fill(State::Same);
@@ -175,39 +183,39 @@ fn walk<S: Side, T: Tell>(side: S, layout: &Grid, background: u8, tell: T) -> Wa
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum State {
-    /// Background throughout.
+    /// All background.
     Same,
-    /// Of one value.
+    /// All of one value.
     Uniform,
-    /// Told cell by cell.
+    /// Coded cell by cell.
     Mixed,
 }
 
-struct Walk<S, T> {
+struct GridWalk<S, T> {
     side: S,
     tell: T,
-    bits: Blocks,
+    bits: BlockBits,
     background: u8,
     width: usize,
     /// A row of background.
     plain: Vec<u8>,
-    /// Which tiles of the band are not all background.
+    /// Tiles of the band that are not all background.
     tiles: Vec<bool>,
     blocks: Vec<State>,
-    /// Cells in blocks that differ.
+    /// Number of cells in blocks that differ.
     told: usize,
 }
 
-impl<S: Side, T: Tell> Walk<S, T> {
-    fn row_of(&self, y: usize) -> &[u8] {
+impl<S: CellCoder, T: CellModel> GridWalk<S, T> {
+    fn row_cells(&self, y: usize) -> &[u8] {
         &self.side.cells()[y * self.width..(y + 1) * self.width]
     }
 
-    fn tiles(&mut self, rows: Range<usize>) {
+    fn code_tiles(&mut self, rows: Range<usize>) {
         let mut changed = vec![false; self.tiles.len()];
         if S::ENCODES {
             for y in rows {
-                let (new, old) = (self.row_of(y), &self.plain[..]);
+                let (new, old) = (self.row_cells(y), &self.plain[..]);
                 if new != old {
                     for (tile, (new, old)) in changed
                         .iter_mut()
@@ -226,22 +234,22 @@ impl<S: Side, T: Tell> Walk<S, T> {
         }
     }
 
-    /// Codes which blocks of a band differ, and fills those of one value.
-    fn blocks(&mut self, rows: Range<usize>) {
+    /// Codes which blocks of a band differ, and fills the uniform ones.
+    fn code_blocks(&mut self, rows: Range<usize>) {
         let mut left = State::Same;
         for block in 0..self.blocks.len() {
             let above = self.blocks[block];
             let mut state = State::Same;
             if self.tiles[block * BLOCK / TILE] {
                 let columns = block * BLOCK..((block + 1) * BLOCK).min(self.width);
-                state = self.block(columns, rows.clone(), left, above);
+                state = self.code_block(columns, rows.clone(), left, above);
             }
             self.blocks[block] = state;
             left = state;
         }
     }
 
-    fn block(
+    fn code_block(
         &mut self,
         columns: Range<usize>,
         rows: Range<usize>,
@@ -253,7 +261,7 @@ impl<S: Side, T: Tell> Walk<S, T> {
         if S::ENCODES {
             let first = self.side.cells()[at];
             for y in rows.clone() {
-                let new = &self.row_of(y)[columns.clone()];
+                let new = &self.row_cells(y)[columns.clone()];
                 differs |= new != &self.plain[columns.clone()];
                 uniform &= new.iter().all(|&cell| cell == first);
             }
@@ -272,7 +280,7 @@ impl<S: Side, T: Tell> Walk<S, T> {
         {
             return State::Mixed;
         }
-        // The cells of a mixed block to the left are told only later.
+        // The cells of a mixed block to the left are coded only later.
         let guess = match (left, rows.start) {
             (State::Uniform, _) => self.side.cells()[at - 1],
             (_, 1..) => self.side.cells()[at - self.width],
@@ -290,19 +298,19 @@ impl<S: Side, T: Tell> Walk<S, T> {
     }
 
     /// Codes the cells of row `y` in mixed blocks.
-    fn row(&mut self, y: usize) {
+    fn code_row(&mut self, y: usize) {
         for block in 0..self.blocks.len() {
             if self.blocks[block] == State::Mixed {
                 let columns = block * BLOCK..((block + 1) * BLOCK).min(self.width);
-                columns.for_each(|x| self.cell(x, y));
+                columns.for_each(|x| self.code_cell(x, y));
             }
         }
     }
 
     #[inline(always)]
-    fn cell(&mut self, x: usize, y: usize) {
+    fn code_cell(&mut self, x: usize, y: usize) {
         let at = y * self.width + x;
-        let place = Place {
+        let place = CellPosition {
             x,
             y,
             width: self.width,

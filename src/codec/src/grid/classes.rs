@@ -1,15 +1,15 @@
-//! Cells of three values: unknown, free, occupied. Others are told in full.
+//! Model for cells of three values: unknown, free, occupied. Others are coded in full.
 
-use super::cells::{Place, Side, Tell};
-use crate::entropy::binary::Bit;
+use super::cells::{CellCoder, CellModel, CellPosition};
+use crate::entropy::binary::AdaptiveBit;
 
-/// Unknown, free, occupied.
+/// Values with a class of their own: unknown, free, occupied.
 const KNOWN: [u8; 3] = [255, 0, 100];
-/// The class of every other value.
+/// Class of all other values.
 const OTHER: u8 = 3;
 
-/// Whether a grid has so many values besides the known three that it is better told as a picture.
-pub(super) fn shaded(cells: &[u8], background: u8) -> bool {
+/// Returns true if a grid has so many values besides the three known ones that it is better coded as shades.
+pub(super) fn has_many_shades(cells: &[u8], background: u8) -> bool {
     let (mut others, mut told) = (0usize, 0usize);
     for pair in cells.windows(2).step_by((cells.len() / 16_384).max(1)) {
         if pair != [background; 2] {
@@ -30,47 +30,47 @@ const CLASSES: [u8; 256] = {
     classes
 };
 
-/// Contexts of a cell: six neighbours' classes.
+/// Number of contexts of a cell: the classes of six neighbours.
 const CONTEXTS: usize = 1 << 12;
 
-/// The decisions' probabilities.
-pub(super) struct Classes {
-    uniform: [Bit; 4],
-    /// Per context: is it another value than guessed? One outside the known three? Which?
-    cells: Vec<[Bit; 4]>,
+/// Probabilities of the decisions.
+pub(super) struct ClassModel {
+    uniform: [AdaptiveBit; 4],
+    /// Per context: is it a value other than predicted? One outside the known three? Which?
+    cells: Vec<[AdaptiveBit; 4]>,
     /// A value in full, bit by bit, each in the context of those before.
-    values: Vec<Bit>,
+    values: Vec<AdaptiveBit>,
 }
 
-impl Classes {
+impl ClassModel {
     pub(super) fn new() -> Self {
         Self {
             uniform: Default::default(),
             cells: vec![Default::default(); CONTEXTS],
-            values: vec![Bit::default(); 256],
+            values: vec![AdaptiveBit::default(); 256],
         }
     }
 }
 
-impl Tell for Classes {
-    fn uniform<S: Side>(&mut self, side: &mut S, guess: u8, known: u8) -> u8 {
-        value(side, &mut self.uniform, &mut self.values, guess, known)
+impl CellModel for ClassModel {
+    fn uniform<S: CellCoder>(&mut self, side: &mut S, guess: u8, known: u8) -> u8 {
+        code_value(side, &mut self.uniform, &mut self.values, guess, known)
     }
 
     #[inline(always)]
-    fn cell<S: Side>(&mut self, side: &mut S, place: Place, known: u8) -> u8 {
+    fn cell<S: CellCoder>(&mut self, side: &mut S, place: CellPosition, known: u8) -> u8 {
         let cells = side.cells();
-        let west = place.near(cells, 1, 0);
+        let west = place.neighbour(cells, 1, 0);
         let context = context([
             west,
-            place.near(cells, 0, 1),
-            place.near(cells, 1, 1),
-            place.near(cells, -1, 1),
-            place.near(cells, 2, 0),
-            place.near(cells, 0, 2),
+            place.neighbour(cells, 0, 1),
+            place.neighbour(cells, 1, 1),
+            place.neighbour(cells, -1, 1),
+            place.neighbour(cells, 2, 0),
+            place.neighbour(cells, 0, 2),
         ]);
         let bits = &mut self.cells[context];
-        value(side, bits, &mut self.values, west, known)
+        code_value(side, bits, &mut self.values, west, known)
     }
 }
 
@@ -81,12 +81,12 @@ fn context<const N: usize>(neighbours: [u8; N]) -> usize {
     })
 }
 
-/// Codes a cell: as guessed, one of the known values, or any other.
+/// Codes a cell: as predicted, one of the known values, or any other.
 #[inline(always)]
-fn value<S: Side>(
+fn code_value<S: CellCoder>(
     side: &mut S,
-    bits: &mut [Bit; 4],
-    values: &mut [Bit],
+    bits: &mut [AdaptiveBit; 4],
+    values: &mut [AdaptiveBit],
     guess: u8,
     known: u8,
 ) -> u8 {
@@ -94,7 +94,7 @@ fn value<S: Side>(
         return guess;
     }
     if side.bit(&mut bits[1], CLASSES[usize::from(known)] == OTHER) {
-        return full(side, values, known);
+        return code_full_value(side, values, known);
     }
     let mut candidates = KNOWN.into_iter().filter(|&value| value != guess);
     let (first, second) = (
@@ -111,7 +111,7 @@ fn value<S: Side>(
 }
 
 #[cold]
-fn full<S: Side>(side: &mut S, values: &mut [Bit], known: u8) -> u8 {
+fn code_full_value<S: CellCoder>(side: &mut S, values: &mut [AdaptiveBit], known: u8) -> u8 {
     let mut node = 1usize;
     for shift in (0..8).rev() {
         let one = side.bit(&mut values[node], (known >> shift) & 1 != 0);

@@ -1,30 +1,31 @@
-//! Cells of many shades, as mappers leave them that count how often each cell was seen free or occupied: few values,
-//! the rungs of a ladder, each next to others by chance.
+//! Model for cells of many shades, as left by mappers that count how often each cell was seen free or occupied: few
+//! values, the rungs of a ladder, each next to others by chance.
 //!
-//! A cell is told as its rank among the grid's values, in the context of its neighbours' ranks: that to the left, that
-//! above, and, roughly, those beside the latter. The rank is told by decisions down a tree in which values that are
-//! common are near the root, and in which values of either side of a decision are neighbours on the ladder.
+//! A cell is coded as its rank among the grid's values, in the context of its neighbours' ranks: left, above, and,
+//! roughly, those beside the latter. The rank is coded by decisions down a tree in which common values are near the
+//! root, and in which the values on either side of a decision are neighbours on the ladder.
 //!
-//! Told in front: `count of values · (value · weight)…`.
+//! Header: `count of values · (value · weight)…`.
 
-use super::cells::{Place, Side, Tell};
+use super::cells::{CellCoder, CellModel, CellPosition};
 use crate::Error;
-use crate::entropy::binary::Bit;
-use crate::wire::Cursor;
+use crate::entropy::binary::AdaptiveBit;
+use crate::wire::FrameCursor;
 
-/// Grids of more values are pictures.
+/// Maximum number of values; grids with more are coded as pictures.
 pub(super) const MOST: usize = 64;
-/// Decisions of all contexts together, at most: they take six bytes each, and a decoder has two MiB for tables.
+/// Maximum number of decisions of all contexts together: they take six bytes each, and a decoder has two MiB for
+/// tables.
 const BITS: usize = 330_000;
-/// In a node, what is a value and no further node.
+/// Mark of a leaf, which is a value and not a node.
 const LEAF: u16 = 1 << 8;
 
-/// The values of a grid, in the order of the ladder, and how common each is.
-pub(super) struct Values(Vec<(u8, u8)>);
+/// The values of a grid, in ladder order, and how common each is.
+pub(super) struct LadderValues(Vec<(u8, u8)>);
 
-impl Values {
-    /// Those of `cells`; most of what is `background` does not count.
-    pub(super) fn of(cells: &[u8], background: u8) -> Self {
+impl LadderValues {
+    /// Returns the values of `cells`; most of the `background` is not counted.
+    pub(super) fn from_cells(cells: &[u8], background: u8) -> Self {
         const STEP: usize = 64;
         let mut counts = [0u64; 256];
         counts[usize::from(background)] = 1;
@@ -54,7 +55,7 @@ impl Values {
             .for_each(|&(value, weight)| out.extend_from_slice(&[value, weight]));
     }
 
-    pub(super) fn read(input: &mut Cursor<'_>) -> Result<Self, Error> {
+    pub(super) fn read(input: &mut FrameCursor<'_>) -> Result<Self, Error> {
         let count = usize::from(input.byte()?);
         if count == 0 || count > MOST {
             return Err(Error::Corrupt("a grid of no values, or of too many"));
@@ -71,26 +72,26 @@ impl Values {
     }
 }
 
-/// A count in one byte: its logarithm to the base of two, in quarters.
+/// Returns a count in one byte: its binary logarithm, in quarters.
 fn weight(count: u64) -> u8 {
     let whole = count.ilog2();
     ((whole as u8) << 2) | (((count << 2) >> whole) & 3) as u8
 }
 
-/// What a weight stands for, in quarters; that of counts beyond any grid's is as large as theirs.
-fn common(weight: u8) -> u64 {
+/// Returns the count that a weight stands for, in quarters; counts beyond any grid's are all the same.
+fn weight_value(weight: u8) -> u64 {
     u64::from(4 | (weight & 3)) << (weight >> 2).min(48)
 }
 
-/// A decision: whether the rank is `from` or more, and what is next if not, and if.
+/// A decision: whether the rank is `from` or more, and the next node for no and yes.
 #[derive(Clone, Copy)]
-struct Node {
+struct TreeNode {
     from: u8,
     next: [u16; 2],
 }
 
-/// Makes the tree of the values `first` to `end`; which node it is, or which value.
-fn tree(weights: &[u64], first: usize, end: usize, nodes: &mut Vec<Node>) -> u16 {
+/// Builds the tree of the values `first` to `end`; returns its root, a node or a value.
+fn build_tree(weights: &[u64], first: usize, end: usize, nodes: &mut Vec<TreeNode>) -> u16 {
     if end - first == 1 {
         return LEAF | first as u16;
     }
@@ -104,47 +105,52 @@ fn tree(weights: &[u64], first: usize, end: usize, nodes: &mut Vec<Node>) -> u16
         }
     }
     let node = nodes.len();
-    nodes.push(Node {
+    nodes.push(TreeNode {
         from: from as u8,
         next: [0; 2],
     });
-    let next = [(first, from), (from, end)].map(|(first, end)| tree(weights, first, end, nodes));
+    let next =
+        [(first, from), (from, end)].map(|(first, end)| build_tree(weights, first, end, nodes));
     nodes[node].next = next;
     node as u16
 }
 
 /// Probabilities of a grid's decisions.
-pub(super) struct Ladder {
+pub(super) struct LadderModel {
     values: Vec<u8>,
     rank: [u8; 256],
-    /// A value's rank as contexts have it: of many values, some are alike there.
+    /// Rank of a value in contexts: with many values, some share one.
     rough: [u8; 256],
     roughs: usize,
-    nodes: Vec<Node>,
+    nodes: Vec<TreeNode>,
     root: u16,
-    bits: Vec<Bit>,
-    uniform: Bit,
+    bits: Vec<AdaptiveBit>,
+    uniform: AdaptiveBit,
 }
 
-/// Contexts by the neighbours' rough ranks.
-fn contexts(roughs: usize) -> usize {
-    roughs * roughs * beside(roughs)
+/// Returns the number of contexts for this many rough ranks.
+fn context_count(roughs: usize) -> usize {
+    roughs * roughs * corner_count(roughs)
 }
 
-/// What the two neighbours beside that above can be, together and by fours.
-fn beside(roughs: usize) -> usize {
+/// Returns the number of values of the two neighbours beside the one above, summed and in steps of four.
+fn corner_count(roughs: usize) -> usize {
     (2 * (roughs - 1) / 4) + 1
 }
 
-impl Ladder {
-    pub(super) fn new(values: &Values) -> Self {
+impl LadderModel {
+    pub(super) fn new(values: &LadderValues) -> Self {
         let count = values.count();
-        let weights: Vec<u64> = values.0.iter().map(|&(_, weight)| common(weight)).collect();
+        let weights: Vec<u64> = values
+            .0
+            .iter()
+            .map(|&(_, weight)| weight_value(weight))
+            .collect();
         let mut nodes = Vec::with_capacity(count);
-        let root = tree(&weights, 0, count, &mut nodes);
+        let root = build_tree(&weights, 0, count, &mut nodes);
         let mut roughs = count;
-        // One context more is that of blocks of one value.
-        while (contexts(roughs) + 1) * nodes.len() > BITS {
+        // One more context is that of uniform blocks.
+        while (context_count(roughs) + 1) * nodes.len() > BITS {
             roughs -= 1;
         }
         let (mut rank, mut rough) = ([0; 256], [0; 256]);
@@ -157,15 +163,15 @@ impl Ladder {
             rank,
             rough,
             roughs,
-            bits: vec![Bit::default(); (contexts(roughs) + 1) * nodes.len()],
+            bits: vec![AdaptiveBit::default(); (context_count(roughs) + 1) * nodes.len()],
             nodes,
             root,
-            uniform: Bit::default(),
+            uniform: AdaptiveBit::default(),
         }
     }
 
     #[inline(always)]
-    fn value<S: Side>(&mut self, side: &mut S, context: usize, known: u8) -> u8 {
+    fn code_value<S: CellCoder>(&mut self, side: &mut S, context: usize, known: u8) -> u8 {
         let count = self.nodes.len();
         let bits = &mut self.bits[context * count..(context + 1) * count];
         let known = self.rank[usize::from(known)];
@@ -179,22 +185,24 @@ impl Ladder {
     }
 }
 
-impl Tell for Ladder {
-    fn uniform<S: Side>(&mut self, side: &mut S, guess: u8, known: u8) -> u8 {
+impl CellModel for LadderModel {
+    fn uniform<S: CellCoder>(&mut self, side: &mut S, guess: u8, known: u8) -> u8 {
         if side.bit(&mut self.uniform, known != guess) {
-            self.value(side, contexts(self.roughs), known)
+            self.code_value(side, context_count(self.roughs), known)
         } else {
             guess
         }
     }
 
     #[inline(always)]
-    fn cell<S: Side>(&mut self, side: &mut S, place: Place, known: u8) -> u8 {
+    fn cell<S: CellCoder>(&mut self, side: &mut S, place: CellPosition, known: u8) -> u8 {
         let cells = side.cells();
-        let rough = |left, up| usize::from(self.rough[usize::from(place.near(cells, left, up))]);
+        let rough =
+            |left, up| usize::from(self.rough[usize::from(place.neighbour(cells, left, up))]);
         let corners = (rough(1, 1) + rough(-1, 1)) / 4;
-        let context = (rough(1, 0) * self.roughs + rough(0, 1)) * beside(self.roughs) + corners;
-        self.value(side, context, known)
+        let context =
+            (rough(1, 0) * self.roughs + rough(0, 1)) * corner_count(self.roughs) + corners;
+        self.code_value(side, context, known)
     }
 }
 
@@ -212,42 +220,42 @@ mod tests {
                 _ => 1,
             })
             .collect();
-        let values = Values::of(&cells, 255);
+        let values = LadderValues::from_cells(&cells, 255);
         let mut bytes = Vec::new();
         values.write(&mut bytes);
-        let back = Values::read(&mut Cursor::new(&bytes)).unwrap();
+        let back = LadderValues::read(&mut FrameCursor::new(&bytes)).unwrap();
         assert_eq!(back.0, values.0);
         assert_eq!(
             back.0.iter().map(|pair| pair.0).collect::<Vec<u8>>(),
             [255, 1, 13, 35]
         );
-        let ladder = Ladder::new(&back);
+        let ladder = LadderModel::new(&back);
         // Unknown or above, then 1 or above, then the others.
         assert_eq!(ladder.nodes[usize::from(ladder.root)].next[0] & LEAF, 0);
         assert_eq!(ladder.nodes.len(), 3);
         bytes.swap(1, 3);
-        assert!(Values::read(&mut Cursor::new(&bytes)).is_err());
+        assert!(LadderValues::read(&mut FrameCursor::new(&bytes)).is_err());
         for bad in [&[0][..], &[65], &[2, 1, 1]] {
-            assert!(Values::read(&mut Cursor::new(bad)).is_err());
+            assert!(LadderValues::read(&mut FrameCursor::new(bad)).is_err());
         }
     }
 
     #[test]
     fn weights_are_near_to_the_counts() {
         for count in (1..100).chain([1000, 123_456, 16_000_000, u64::from(u32::MAX)]) {
-            let (told, exact) = (common(weight(count)), 4 * count);
+            let (told, exact) = (weight_value(weight(count)), 4 * count);
             assert!(told <= exact && 5 * told >= 4 * exact, "{count}: {told}");
         }
-        assert!((0..=255).map(common).sum::<u64>() < u64::MAX / 8);
+        assert!((0..=255).map(weight_value).sum::<u64>() < u64::MAX / 8);
     }
 
     #[test]
     fn tables_stay_below_two_megabytes() {
         for count in 1..=MOST {
-            let values = Values((0..count).map(|at| (at as u8, 4)).collect());
-            let ladder = Ladder::new(&values);
+            let values = LadderValues((0..count).map(|at| (at as u8, 4)).collect());
+            let ladder = LadderModel::new(&values);
             assert!(
-                ladder.bits.len() * size_of::<Bit>() < (2 << 20) - (1 << 16),
+                ladder.bits.len() * size_of::<AdaptiveBit>() < (2 << 20) - (1 << 16),
                 "{count}"
             );
             assert!(ladder.roughs >= count.min(16), "{count}: {}", ladder.roughs);

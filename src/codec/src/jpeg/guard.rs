@@ -1,8 +1,8 @@
-//! Checks a stream before the JPEG library reads it: only features that our encoder uses, and only a picture of exactly the
-//! declared size, because the library allocates memory for the size in the stream.
+//! Checks a stream before the JPEG library reads it: only features that our encoder uses, and only a picture of exactly
+//! the declared size, because the library allocates memory for the size in the stream.
 
 use crate::Error;
-use crate::wire::Cursor;
+use crate::wire::FrameCursor;
 
 const START: u8 = 0xd8;
 const END: u8 = 0xd9;
@@ -21,7 +21,7 @@ pub(super) fn check(
     height: usize,
     colours: usize,
 ) -> Result<(), Error> {
-    let mut input = Cursor::new(stream);
+    let mut input = FrameCursor::new(stream);
     if input.take(2)? != [0xff, START] {
         return Err(BAD);
     }
@@ -30,7 +30,7 @@ pub(super) fn check(
         let &[0xff, marker] = input.take(2)? else {
             return Err(BAD);
         };
-        let length = big(input.take(2)?);
+        let length = read_u16_be(input.take(2)?);
         let segment = input.take(length.checked_sub(2).ok_or(BAD)?)?;
         match marker {
             JFIF | HUFFMAN | QUANTISERS => {}
@@ -40,8 +40,8 @@ pub(super) fn check(
                     return Err(BAD);
                 };
                 let told = size.len() == 5 + 3 * colours
-                    && big(&size[..2]) == height
-                    && big(&size[2..4]) == width
+                    && read_u16_be(&size[..2]) == height
+                    && read_u16_be(&size[2..4]) == width
                     && usize::from(size[4]) == colours;
                 if !told {
                     return Err(Error::Corrupt("a JPEG of another size than declared"));
@@ -51,18 +51,18 @@ pub(super) fn check(
                 if segment.first().copied().map(usize::from) != Some(colours) {
                     return Err(BAD);
                 }
-                return one_scan(input.take_rest());
+                return check_scan(input.take_rest());
             }
             _ => return Err(BAD),
         }
     }
 }
 
-/// The rest of a picture: its samples, and its end.
-fn one_scan(samples: &[u8]) -> Result<(), Error> {
+/// Checks the rest of a picture: its samples and its end marker.
+fn check_scan(samples: &[u8]) -> Result<(), Error> {
     let (samples, end) = samples.split_last_chunk::<2>().ok_or(BAD)?;
     let mut bytes = samples.iter();
-    // What looks like a marker is none.
+    // Stuffed bytes look like markers and are none.
     while let Some(&byte) = bytes.next() {
         if byte == 0xff && bytes.next() != Some(&0) {
             return Err(BAD);
@@ -75,7 +75,7 @@ fn one_scan(samples: &[u8]) -> Result<(), Error> {
     }
 }
 
-/// Two bytes, the higher one first.
-fn big(bytes: &[u8]) -> usize {
+/// Reads two bytes, big endian.
+fn read_u16_be(bytes: &[u8]) -> usize {
     usize::from(bytes[0]) << 8 | usize::from(bytes[1])
 }

@@ -1,8 +1,8 @@
-//! Between interleaved colour and planes of luma and halved chroma.
+//! Converts between interleaved colour and planes of luma and halved chroma.
 //!
-//! Full range BT.601, as JPEG uses it: both ends are ours, and the limited range would only cost precision.
+//! Full-range BT.601, as in JPEG: both ends are ours, and the limited range would only cost precision.
 
-/// Planes of an even width and height, as H.264 wants them; a picture's odd last column or row is repeated.
+/// Planes of an even width and height, as H.264 requires; the odd last column or row of a picture is repeated.
 #[derive(Default)]
 pub(super) struct Planes {
     pub(super) width: usize,
@@ -12,9 +12,9 @@ pub(super) struct Planes {
     pub(super) red: Vec<u8>,
 }
 
-/// Where the colours lie in a pixel.
+/// Order of the colours in a pixel.
 #[derive(Clone, Copy)]
-pub(super) struct Order {
+pub(super) struct ChannelOrder {
     pub(super) channels: usize,
     pub(super) red_first: bool,
 }
@@ -25,7 +25,7 @@ impl Planes {
         &mut self,
         width: usize,
         height: usize,
-        order: Order,
+        order: ChannelOrder,
         rows: impl Iterator<Item = &'a [u8]>,
     ) {
         self.width = width.next_multiple_of(2);
@@ -42,16 +42,16 @@ impl Planes {
             last = rows.next().unwrap_or(last);
             let luma = &mut self.luma[y * self.width..(y + 1) * self.width];
             match (order.channels, order.red_first) {
-                (3, true) => split::<3, true>(last, luma, &mut sums),
-                (3, false) => split::<3, false>(last, luma, &mut sums),
-                (_, true) => split::<4, true>(last, luma, &mut sums),
-                (_, false) => split::<4, false>(last, luma, &mut sums),
+                (3, true) => split_row::<3, true>(last, luma, &mut sums),
+                (3, false) => split_row::<3, false>(last, luma, &mut sums),
+                (_, true) => split_row::<4, true>(last, luma, &mut sums),
+                (_, false) => split_row::<4, false>(last, luma, &mut sums),
             }
             if y % 2 == 1 {
                 let row = y / 2 * half..(y / 2 + 1) * half;
                 let planes = self.blue[row.clone()].iter_mut().zip(&mut self.red[row]);
                 for ((blue, red), sum) in planes.zip(&mut sums) {
-                    // The sums are of four pixels in 1/65536.
+                    // The sums cover four pixels, in 1/65536.
                     let mean = |sum: i32| (((sum + (1 << 17)) >> 18) + 128).clamp(0, 255) as u8;
                     (*blue, *red) = (mean(sum[0]), mean(sum[1]));
                     *sum = [0; 2];
@@ -61,8 +61,8 @@ impl Planes {
     }
 }
 
-/// One row: luma, and chroma added up for pairs.
-fn split<const C: usize, const RED_FIRST: bool>(
+/// Splits one row: luma, and chroma summed over pairs.
+fn split_row<const C: usize, const RED_FIRST: bool>(
     row: &[u8],
     luma: &mut [u8],
     sums: &mut [[i32; 2]],
@@ -101,8 +101,14 @@ fn split<const C: usize, const RED_FIRST: bool>(
     }
 }
 
-/// Writes one row of pixels from planes; alpha is left alone.
-pub(super) fn join(luma: &[u8], blue: &[u8], red: &[u8], order: Order, row: &mut [u8]) {
+/// Writes one row of pixels from planes; alpha is unchanged.
+pub(super) fn join_row_pair(
+    luma: &[u8],
+    blue: &[u8],
+    red: &[u8],
+    order: ChannelOrder,
+    row: &mut [u8],
+) {
     match (order.channels, order.red_first) {
         (3, true) => join_row::<3, true>(luma, blue, red, row),
         (3, false) => join_row::<3, false>(luma, blue, red, row),
@@ -145,7 +151,7 @@ mod tests {
     fn smooth_colours_come_back_nearly() {
         for (channels, red_first) in [(3, true), (3, false), (4, true), (4, false)] {
             for (width, height) in [(16, 8), (15, 7), (1, 1)] {
-                let order = Order {
+                let order = ChannelOrder {
                     channels,
                     red_first,
                 };
@@ -159,7 +165,7 @@ mod tests {
                 for y in 0..height {
                     let half = planes.width / 2;
                     let mut row = data[y * width * channels..(y + 1) * width * channels].to_vec();
-                    join(
+                    join_row_pair(
                         &planes.luma[y * planes.width..][..width],
                         &planes.blue[y / 2 * half..][..half],
                         &planes.red[y / 2 * half..][..half],
@@ -178,7 +184,7 @@ mod tests {
     #[test]
     fn grey_is_exact() {
         let data: Vec<u8> = (0..=255).flat_map(|value| [value; 3]).collect();
-        let order = Order {
+        let order = ChannelOrder {
             channels: 3,
             red_first: true,
         };

@@ -1,7 +1,7 @@
-//! What is let through to the video library: only streams of the kind our encoder makes, of the declared size.
+//! Checks streams before the video library reads them: only those of the kind our encoder makes, of the declared size.
 //!
-//! A sequence parameter set (H.264, 7.3.2.1.1) tells the picture's size, and the library makes room for what it tells.
-//! So it is read here first.
+//! A sequence parameter set (H.264, 7.3.2.1.1) declares the picture's size, and the library allocates memory for it. So
+//! it is read here first.
 
 use crate::Error;
 use crate::entropy::bits::BitReader;
@@ -20,7 +20,8 @@ pub(super) fn check(stream: &[u8], width: usize, height: usize) -> Result<(), Er
         match unit.first().ok_or(BAD)? & 0x1f {
             // Slices; picture parameter sets.
             1 | 5 | 8 => {}
-            7 if size(&unit[1..]).ok_or(BAD)? == (width.div_ceil(16), height.div_ceil(16)) => {}
+            7 if picture_size(&unit[1..]).ok_or(BAD)?
+                == (width.div_ceil(16), height.div_ceil(16)) => {}
             _ => return Err(BAD),
         }
         match rest.get(end + 3..) {
@@ -31,10 +32,10 @@ pub(super) fn check(stream: &[u8], width: usize, height: usize) -> Result<(), Er
     }
 }
 
-/// Bits with the most significant first, as H.264 has them.
-struct Bits<'a>(BitReader<'a>, u32, u32);
+/// Reads bits, most significant first, as in H.264.
+struct MsbBitReader<'a>(BitReader<'a>, u32, u32);
 
-impl Bits<'_> {
+impl MsbBitReader<'_> {
     fn bit(&mut self) -> u32 {
         if self.2 == 0 {
             self.1 = self.0.take(8);
@@ -48,8 +49,8 @@ impl Bits<'_> {
         (0..count).fold(0, |value, _| value << 1 | self.bit())
     }
 
-    /// Exp-Golomb, at most 16 bits: nothing in our sets needs more.
-    fn number(&mut self) -> Option<u32> {
+    /// Reads an Exp-Golomb number of at most 16 bits: our sets need no more.
+    fn exp_golomb(&mut self) -> Option<u32> {
         let mut length = 0;
         while self.bit() == 0 {
             length += 1;
@@ -61,36 +62,36 @@ impl Bits<'_> {
     }
 }
 
-/// Width and height in macroblocks of a baseline sequence parameter set with few reference pictures.
-fn size(set: &[u8]) -> Option<(usize, usize)> {
+/// Returns the width and height in macroblocks of a baseline sequence parameter set with few reference pictures.
+fn picture_size(set: &[u8]) -> Option<(usize, usize)> {
     let mut plain = Vec::with_capacity(set.len());
     for &byte in set {
-        // A three after two zeros only keeps start codes apart.
+        // A three after two zeros only prevents false start codes.
         if byte != 3 || !plain.ends_with(&[0, 0]) {
             plain.push(byte);
         }
     }
-    let mut bits = Bits(BitReader::new(&plain), 0, 0);
+    let mut bits = MsbBitReader(BitReader::new(&plain), 0, 0);
     if bits.bits(8) != 66 {
         return None;
     }
     bits.bits(16);
-    // Its number; the frame number's size.
-    (bits.number()? < 32).then_some(())?;
-    (bits.number()? <= 12).then_some(())?;
-    // The picture order's kind; ours have 0 or 2.
-    match bits.number()? {
+    // The set's id; the size of the frame number.
+    (bits.exp_golomb()? < 32).then_some(())?;
+    (bits.exp_golomb()? <= 12).then_some(())?;
+    // The picture order count type; ours is 0 or 2.
+    match bits.exp_golomb()? {
         0 => {
-            (bits.number()? <= 12).then_some(())?;
+            (bits.exp_golomb()? <= 12).then_some(())?;
         }
         2 => {}
         _ => return None,
     }
-    let references = bits.number()?;
+    let references = bits.exp_golomb()?;
     bits.bit();
-    let (width, height) = (bits.number()? + 1, bits.number()? + 1);
+    let (width, height) = (bits.exp_golomb()? + 1, bits.exp_golomb()? + 1);
     // Frames only, no fields.
-    (bits.bit() == 1 && references <= 4 && !bits.0.overran())
+    (bits.bit() == 1 && references <= 4 && !bits.0.has_overrun())
         .then_some((width as usize, height as usize))
 }
 
@@ -98,7 +99,7 @@ fn size(set: &[u8]) -> Option<(usize, usize)> {
 mod tests {
     use super::*;
 
-    /// A baseline set of 48×36 macroblocks with one reference picture.
+    /// Returns a baseline set of 48×36 macroblocks with one reference picture.
     fn set() -> Vec<u8> {
         let mut text = String::from("01000010" /* 66 */);
         text.push_str("0000000000011110");

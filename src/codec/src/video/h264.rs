@@ -1,12 +1,12 @@
-//! Cisco's OpenH264, as a library: constant quality, no delay, one thread.
+//! Binding to Cisco's OpenH264: constant quality, no delay, one thread.
 
 use super::VideoOptions;
-use super::colour::{self, Order, Planes};
+use super::colour::{self, ChannelOrder, Planes};
 use super::guard;
 use crate::Error;
-use crate::layout::{Image, Pixel};
+use crate::layout::{ImageLayout, Pixel};
 use crate::rows::{put_alpha, put_padding, take_alpha, take_padding};
-use crate::wire::{Cursor, Ends, put_varint};
+use crate::wire::{FrameCursor, MessageEnds, put_varint};
 use openh264::OpenH264API;
 use openh264::decoder::{Decoder, DecoderConfig};
 use openh264::encoder::{
@@ -16,14 +16,14 @@ use openh264::encoder::{
 use openh264::formats::{YUVSlices, YUVSource};
 use std::fmt;
 
-/// What the library can do at most.
+/// Maximum picture size of the library, pixels.
 const LONG_SIDE: usize = 3840;
 const SHORT_SIDE: usize = 2160;
-/// Least width and height that the library takes, pixels.
+/// Minimum width and height of the library, pixels.
 const SMALLEST: usize = 16;
 
-/// The layout, if it is a colour picture the library can take.
-fn order(layout: &Image) -> Option<Order> {
+/// Returns the channel order, if the layout is a colour picture that the library accepts.
+fn channel_order(layout: &ImageLayout) -> Option<ChannelOrder> {
     let Pixel::Bytes(channels @ 3..=4) = layout.pixel else {
         return None;
     };
@@ -34,7 +34,7 @@ fn order(layout: &Image) -> Option<Order> {
     let fits = width.max(height) <= LONG_SIDE
         && width.min(height) <= SHORT_SIDE
         && width.min(height) >= SMALLEST;
-    fits.then_some(Order {
+    fits.then_some(ChannelOrder {
         channels,
         red_first: layout.red_first,
     })
@@ -68,14 +68,14 @@ impl VideoEncoder {
     pub(super) fn encode(
         &mut self,
         message: &[u8],
-        layout: &Image,
+        layout: &ImageLayout,
         out: &mut Vec<u8>,
     ) -> Option<()> {
-        let order = order(layout)?;
+        let order = channel_order(layout)?;
         let data = layout.data(message);
         let rows = || {
             data.chunks_exact(layout.step)
-                .map(|line| &line[..layout.row()])
+                .map(|line| &line[..layout.row_bytes()])
         };
         self.planes.fill(layout.width, layout.height, order, rows());
         if self.size != (self.planes.width, self.planes.height) {
@@ -84,7 +84,7 @@ impl VideoEncoder {
         }
         let encoder = match &mut self.encoder {
             Some(encoder) => encoder,
-            none => none.insert(start(self.options)?),
+            none => none.insert(open_encoder(self.options)?),
         };
         let half = self.planes.width / 2;
         let source = YUVSlices::new(
@@ -102,8 +102,8 @@ impl VideoEncoder {
             FrameType::IPMixed | FrameType::Skip | FrameType::Invalid => return None,
         };
         self.number += 1;
-        Ends::around(message, layout.head, layout.tail).put(out);
-        put_padding(data, layout.row(), layout.step, out);
+        MessageEnds::from_message(message, layout.head, layout.tail).put(out);
+        put_padding(data, layout.row_bytes(), layout.step, out);
         put_varint(out, self.number);
         out.push(key.into());
         if order.channels == 4 {
@@ -114,7 +114,7 @@ impl VideoEncoder {
     }
 }
 
-fn start(options: VideoOptions) -> Option<Encoder> {
+fn open_encoder(options: VideoOptions) -> Option<Encoder> {
     let quantiser = options.quantiser.min(51);
     let config = EncoderConfig::new()
         .profile(Profile::Baseline)
@@ -144,7 +144,7 @@ impl fmt::Debug for VideoEncoder {
 #[derive(Default)]
 pub(super) struct VideoDecoder {
     decoder: Option<Decoder>,
-    /// The number of the frame that the next one may refer to.
+    /// Number of the frame that the next one may refer to.
     last: Option<u64>,
     size: (usize, usize),
 }
@@ -152,14 +152,15 @@ pub(super) struct VideoDecoder {
 impl VideoDecoder {
     pub(super) fn decode(
         &mut self,
-        input: &mut Cursor<'_>,
+        input: &mut FrameCursor<'_>,
         total: usize,
         out: &mut Vec<u8>,
     ) -> Result<(), Error> {
-        let (layout, ends) = Image::take(input, total)?;
-        let order = order(&layout).ok_or(Error::Corrupt("a video of pictures that are none"))?;
+        let (layout, ends) = ImageLayout::take(input, total)?;
+        let order =
+            channel_order(&layout).ok_or(Error::Corrupt("a video of pictures that are none"))?;
         let data = ends.restore(layout.step * layout.height, out);
-        take_padding(input, data, layout.row(), layout.step)?;
+        take_padding(input, data, layout.row_bytes(), layout.step)?;
         let number = input.varint()?;
         let key = input.byte()? == 1;
         if order.channels == 4 {
@@ -172,7 +173,7 @@ impl VideoDecoder {
         );
         guard::check(stream, size.0, size.1)?;
         if key {
-            // Every keyframe starts afresh: nothing a lost or hostile frame left behind can matter.
+            // Every keyframe starts afresh: nothing that a lost or hostile frame left behind can matter.
             self.decoder = None;
         } else if self.last != number.checked_sub(1) || self.size != size || self.decoder.is_none()
         {
@@ -197,12 +198,12 @@ impl VideoDecoder {
         }
         let (strides, half) = (picture.strides(), size.0 / 2);
         for (y, line) in data.chunks_exact_mut(layout.step).enumerate() {
-            colour::join(
+            colour::join_row_pair(
                 &picture.y()[y * strides.0..][..layout.width],
                 &picture.u()[y / 2 * strides.1..][..half],
                 &picture.v()[y / 2 * strides.2..][..half],
                 order,
-                &mut line[..layout.row()],
+                &mut line[..layout.row_bytes()],
             );
         }
         self.last = Some(number);

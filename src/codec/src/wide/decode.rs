@@ -1,24 +1,25 @@
-//! The decoder's inner loops.
+//! Inner loops of the decoder.
 //!
-//! Every sample waits for the one to its left. So lanes run in lockstep, what the row above says is worked out before
-//! in vector code, and buffers are small arrays whose size the compiler knows.
+//! Every sample depends on the one to its left. So lanes run in lockstep, the contribution of the row above is computed
+//! before in vector code, and buffers are small arrays whose size the compiler knows.
 
-use super::{MISSING, RESIDUALS, Wide, gap_context, merge, row_kind};
+use super::{MISSING, RESIDUALS, Wide, gap_context, merge_shift, row_kind};
 use crate::Error;
 use crate::entropy::bits::BitReader;
-use crate::entropy::counts::{CONTEXTS, Order};
-use crate::entropy::tans::{BATCH, Decoder, Lane};
+use crate::entropy::counts::{CONTEXTS, SymbolOrder};
+use crate::entropy::tans::{BATCH, LaneReader, TansDecoder};
 use crate::padded::Padded;
-use crate::predict::{EASE, Kind, Predictor, Sample, with_predictor};
-use crate::wire::Cursor;
+use crate::predict::{EASE, Kind, PlaneSample, Predictor, with_predictor};
+use crate::wire::FrameCursor;
 
-impl<T: Sample> Wide<T> {
+impl<T: PlaneSample> Wide<T> {
     /// Decodes into samples (and gaps) of the shape they were encoded with.
-    pub(crate) fn decode(&mut self, input: &mut Cursor<'_>) -> Result<(), Error> {
+    pub(crate) fn decode(&mut self, input: &mut FrameCursor<'_>) -> Result<(), Error> {
         let kind = Kind::read(input.byte()?)?;
-        let shift = merge(self.samples.count());
+        let shift = merge_shift(self.samples.count());
         let mut rest = *input;
-        let (tables, used) = Decoder::read(rest.take_rest(), CONTEXTS >> shift, Order::Natural)?;
+        let (tables, used) =
+            TansDecoder::read(rest.take_rest(), CONTEXTS >> shift, SymbolOrder::Natural)?;
         input.take(used)?;
         let bases = std::array::from_fn(|context| tables.base(context >> shift));
         let model = Model { bases, tables };
@@ -29,11 +30,13 @@ impl<T: Sample> Wide<T> {
                 .map(|missing| &mut missing.lanes[group.clone()]);
             let planes = &mut self.samples.lanes[group];
             match (planes, gaps) {
-                ([a], None) => model.group::<T, 1>(kind, [a], None, input)?,
-                ([a], Some([x])) => model.group(kind, [a], Some([x]), input)?,
-                ([a, b, c, d], None) => model.group::<T, 4>(kind, [a, b, c, d], None, input)?,
+                ([a], None) => model.decode_group::<T, 1>(kind, [a], None, input)?,
+                ([a], Some([x])) => model.decode_group(kind, [a], Some([x]), input)?,
+                ([a, b, c, d], None) => {
+                    model.decode_group::<T, 4>(kind, [a, b, c, d], None, input)?
+                }
                 ([a, b, c, d], Some([x, y, z, w])) => {
-                    model.group(kind, [a, b, c, d], Some([x, y, z, w]), input)?;
+                    model.decode_group(kind, [a, b, c, d], Some([x, y, z, w]), input)?;
                 }
                 _ => unreachable!("one plane makes one lane or four, and gaps have its shape"),
             }
@@ -43,23 +46,23 @@ impl<T: Sample> Wide<T> {
 }
 
 struct Model {
-    tables: Decoder,
+    tables: TansDecoder,
     bases: [u16; CONTEXTS],
 }
 
-/// The streams of `N` lanes.
+/// Streams of `N` lanes.
 struct Streams<'a, const N: usize> {
-    lanes: [Lane<'a>; N],
+    lanes: [LaneReader<'a>; N],
     plain: [BitReader<'a>; N],
 }
 
 impl Model {
-    fn group<T: Sample, const N: usize>(
+    fn decode_group<T: PlaneSample, const N: usize>(
         &self,
         kind: Kind,
         mut planes: [&mut Padded<T>; N],
         gaps: Option<[&mut Padded<u8>; N]>,
-        input: &mut Cursor<'_>,
+        input: &mut FrameCursor<'_>,
     ) -> Result<(), Error> {
         let mut lanes = Vec::with_capacity(N);
         let mut plain = [BitReader::default(); N];
@@ -73,21 +76,28 @@ impl Model {
         let mut streams = Streams { lanes, plain };
         match gaps {
             None => {
-                // Never looked at.
+                // Never read.
                 let mut none: [Padded<u8>; N] = std::array::from_fn(|_| Padded::sequence(0));
-                self.rows::<T, N, false>(kind, &mut planes, &mut none.each_mut(), &mut streams);
+                self.decode_rows::<T, N, false>(
+                    kind,
+                    &mut planes,
+                    &mut none.each_mut(),
+                    &mut streams,
+                );
             }
-            Some(mut gaps) => self.rows::<T, N, true>(kind, &mut planes, &mut gaps, &mut streams),
+            Some(mut gaps) => {
+                self.decode_rows::<T, N, true>(kind, &mut planes, &mut gaps, &mut streams)
+            }
         }
-        streams.lanes.iter().try_for_each(Lane::finish)?;
-        if streams.plain.iter().any(BitReader::overran) {
+        streams.lanes.iter().try_for_each(LaneReader::finish)?;
+        if streams.plain.iter().any(BitReader::has_overrun) {
             Err(Error::Truncated)
         } else {
             Ok(())
         }
     }
 
-    fn rows<T: Sample, const N: usize, const GAPS: bool>(
+    fn decode_rows<T: PlaneSample, const N: usize, const GAPS: bool>(
         &self,
         kind: Kind,
         planes: &mut [&mut Padded<T>; N],
@@ -97,12 +107,14 @@ impl Model {
         if planes[0].is_sequence() {
             match kind {
                 Kind::Zero => {
-                    sequence::<crate::predict::Zero, T, N, GAPS>(self, planes, gaps, streams)
+                    decode_sequence::<crate::predict::Zero, T, N, GAPS>(self, planes, gaps, streams)
                 }
                 Kind::Line => {
-                    sequence::<crate::predict::Line, T, N, GAPS>(self, planes, gaps, streams)
+                    decode_sequence::<crate::predict::Line, T, N, GAPS>(self, planes, gaps, streams)
                 }
-                _ => sequence::<crate::predict::West, T, N, GAPS>(self, planes, gaps, streams),
+                _ => {
+                    decode_sequence::<crate::predict::West, T, N, GAPS>(self, planes, gaps, streams)
+                }
             }
             return;
         }
@@ -113,11 +125,11 @@ impl Model {
     }
 }
 
-/// Samples decoded at a time.
+/// Number of samples decoded at a time.
 const CHUNK: usize = 16 * BATCH;
 
-/// What the row above says about a chunk.
-struct Above<T> {
+/// The contribution of the row above to a chunk.
+struct WideRowAbove<T> {
     ease: [u32; CHUNK],
     corner: [T; CHUNK],
     north: [T; CHUNK],
@@ -125,7 +137,7 @@ struct Above<T> {
     gaps: [u8; CHUNK],
 }
 
-impl<T: Sample> Above<T> {
+impl<T: PlaneSample> WideRowAbove<T> {
     fn new() -> Self {
         let none = [T::default(); CHUNK];
         Self {
@@ -137,9 +149,9 @@ impl<T: Sample> Above<T> {
         }
     }
 
-    /// `row` begins one sample left of the chunk and ends one to the right.
+    /// Loads the row above; `row` begins one sample left of the chunk and ends one to the right.
     #[inline(always)]
-    fn look<P: Predictor>(&mut self, row: &[T]) {
+    fn load<P: Predictor>(&mut self, row: &[T]) {
         let length = (row.len() - 2).min(CHUNK);
         let (corner, north, east) = (&row[..length], &row[1..=length], &row[2..length + 2]);
         self.corner[..length].copy_from_slice(corner);
@@ -152,7 +164,7 @@ impl<T: Sample> Above<T> {
 }
 
 #[inline(never)]
-fn row<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
+fn row<P: Predictor, T: PlaneSample, const N: usize, const GAPS: bool>(
     model: &Model,
     planes: &mut [&mut Padded<T>; N],
     gaps: &mut [&mut Padded<u8>; N],
@@ -160,7 +172,7 @@ fn row<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
     y: usize,
 ) {
     let (width, start, lag) = (planes[0].width, planes[0].start(y), planes[0].lag);
-    let mut windows = streams.lanes.each_ref().map(Lane::window);
+    let mut windows = streams.lanes.each_ref().map(LaneReader::window);
     let mut plain = streams.plain;
     let mut west = [T::default(); N];
     let mut gap = [0u8; N];
@@ -172,14 +184,14 @@ fn row<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
             gap[lane] = gaps[lane].samples[start - 1];
         }
     }
-    let mut above: [Above<T>; N] = std::array::from_fn(|_| Above::new());
+    let mut above: [WideRowAbove<T>; N] = std::array::from_fn(|_| WideRowAbove::new());
     let mut here = [[T::default(); CHUNK]; N];
     let mut missing = [[0u8; CHUNK]; N];
     let mut x = 0;
     while x < width {
         let length = (width - x).min(CHUNK);
         for lane in 0..N {
-            above[lane].look::<P>(&planes[lane].samples[start + x - lag - 1..][..length + 2]);
+            above[lane].load::<P>(&planes[lane].samples[start + x - lag - 1..][..length + 2]);
             if GAPS {
                 let row = &gaps[lane].samples[start + x - lag..][..length];
                 above[lane].gaps[..length].copy_from_slice(row);
@@ -228,13 +240,13 @@ fn row<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
     }
     streams.plain = plain;
     for lane in 0..N {
-        streams.lanes[lane].leave(windows[lane]);
+        streams.lanes[lane].set_window(windows[lane]);
     }
 }
 
 /// Decodes sequences, in which the neighbours above are the samples just decoded.
 #[inline(never)]
-fn sequence<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
+fn decode_sequence<P: Predictor, T: PlaneSample, const N: usize, const GAPS: bool>(
     model: &Model,
     planes: &mut [&mut Padded<T>; N],
     gaps: &mut [&mut Padded<u8>; N],
@@ -242,9 +254,9 @@ fn sequence<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
 ) {
     const { assert!((EASE as usize) < CONTEXTS) };
     let (width, start) = (planes[0].width, planes[0].start(0));
-    let mut windows = streams.lanes.each_ref().map(Lane::window);
+    let mut windows = streams.lanes.each_ref().map(LaneReader::window);
     let mut plain = streams.plain;
-    // The last samples, the newest first, and which of them are missing.
+    // The last samples, newest first, and which of them are missing.
     let mut last = [[T::default(); 3]; N];
     let mut gap = [[0u8; 2]; N];
     for at in 0..width {
@@ -277,6 +289,6 @@ fn sequence<P: Predictor, T: Sample, const N: usize, const GAPS: bool>(
     }
     streams.plain = plain;
     for lane in 0..N {
-        streams.lanes[lane].leave(windows[lane]);
+        streams.lanes[lane].set_window(windows[lane]);
     }
 }

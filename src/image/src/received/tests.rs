@@ -3,7 +3,7 @@ use std::os::unix::fs::PermissionsExt;
 use super::*;
 use crate::{Refusal, TreeOptions};
 
-struct Place {
+struct ReceiveFixture {
     root: tempfile::TempDir,
     image: Image,
     store: Store,
@@ -14,8 +14,8 @@ fn store(root: &Path, name: &str) -> Store {
     Store::open(&place.join("images"), &place.join("layers")).expect("a store")
 }
 
-/// A store with an image of two layers.
-fn place() -> Place {
+/// Creates a store with an image of two layers.
+fn new_fixture() -> ReceiveFixture {
     let root = tempfile::tempdir().expect("a directory");
     let store = store(root.path(), "one");
     let mut layers = Vec::new();
@@ -35,23 +35,23 @@ fn place() -> Place {
     let digest = store.put_image(&spec).expect("an image");
     store.tag("one:1", &digest).expect("a tag");
     let image = store.image(&digest).expect("it is there");
-    Place { root, image, store }
+    ReceiveFixture { root, image, store }
 }
 
-impl Place {
+impl ReceiveFixture {
     fn layout(&self) -> Tree {
         Tree::open(self.store.images_dir()).expect("a layout")
     }
 
-    /// By a store that has nothing yet.
-    fn refused(&self, limits: &Limits) -> Error {
+    /// Receives the layout into an empty store, which fails.
+    fn receive_refusal(&self, limits: &Limits) -> Error {
         let empty = tempfile::tempdir_in(self.root.path()).expect("a directory");
         let other = store(empty.path(), "other");
         let refused = other.receive(&self.layout(), limits);
         refused.expect_err("it is refused")
     }
 
-    /// Where the blob of the upper layer is.
+    /// Returns the path of the blob of the upper layer.
     fn upper(&self) -> PathBuf {
         let digest = self.image.spec.layers[1].digest;
         self.store.images_dir().join(blob_path(&digest))
@@ -60,7 +60,7 @@ impl Place {
 
 #[test]
 fn an_image_of_another_store_is_the_same_here() {
-    let place = place();
+    let place = new_fixture();
     let other = store(place.root.path(), "other");
     assert!(is_layout(&place.layout()));
     let received = other
@@ -71,14 +71,14 @@ fn an_image_of_another_store_is_the_same_here() {
     assert_eq!(received.known, [false, false]);
     assert_eq!(received.annotations[oci::REF_NAME], "one:1");
     for layer in &received.image.spec.layers {
-        let tree = other.extracted(&layer.diff_id).expect("extracted");
+        let tree = other.ensure_extracted(&layer.diff_id).expect("extracted");
         assert!(tree.join("opt").is_dir());
     }
     let again = other
         .receive(&place.layout(), &Limits::default())
         .expect("good");
     assert_eq!(again.known, [true, true]);
-    // A layer that is there is nobody's who does not send it.
+    // A layer in the store may not be used by those who do not send it.
     std::fs::remove_file(place.upper()).expect("removed");
     let refused = other.receive(&place.layout(), &Limits::default());
     let refused = refused.expect_err("it is not sent").to_string();
@@ -91,7 +91,7 @@ fn an_image_of_another_store_is_the_same_here() {
 
 #[test]
 fn a_layout_that_is_not_what_it_says_is_refused_with_the_reason() {
-    let place = place();
+    let place = new_fixture();
     let blob = std::fs::read(place.upper()).expect("read");
     let lower = place.image.spec.layers[0].digest;
     let lower = place.store.images_dir().join(blob_path(&lower));
@@ -100,28 +100,28 @@ fn a_layout_that_is_not_what_it_says_is_refused_with_the_reason() {
         std::fs::write(place.upper(), content).expect("written");
     };
     set(&std::fs::read(lower).expect("read"));
-    let refused = place.refused(&Limits::default()).to_string();
+    let refused = place.receive_refusal(&Limits::default()).to_string();
     assert!(refused.contains("has the content of"), "{refused}");
     set(&blob[..blob.len() / 2]);
-    let refused = place.refused(&Limits::default());
+    let refused = place.receive_refusal(&Limits::default());
     assert!(matches!(refused, Error::Archive { .. }), "{refused}");
     std::fs::remove_file(place.upper()).expect("removed");
-    let refused = place.refused(&Limits::default()).to_string();
+    let refused = place.receive_refusal(&Limits::default()).to_string();
     assert!(refused.contains("is missing"), "{refused}");
-    // A link is no blob, wherever it leads.
+    // A link is not accepted as a blob, wherever it points.
     std::os::unix::fs::symlink("/etc/passwd", place.upper()).expect("linked");
-    let refused = place.refused(&Limits::default());
+    let refused = place.receive_refusal(&Limits::default());
     assert!(matches!(refused, Error::Unreceivable { .. }), "{refused}");
     let index = place.store.images_dir().join("index.json");
     std::fs::write(index, r#"{"schemaVersion": 2, "manifests": []}"#).expect("written");
-    let refused = place.refused(&Limits::default()).to_string();
-    assert!(refused.contains("holds 0 images"), "{refused}");
+    let refused = place.receive_refusal(&Limits::default()).to_string();
+    assert!(refused.contains("contains 0 images"), "{refused}");
 }
 
 #[test]
 fn layers_hold_no_more_than_is_allowed() {
-    let place = place();
-    let of = |limits: Limits| match place.refused(&limits) {
+    let place = new_fixture();
+    let of = |limits: Limits| match place.receive_refusal(&limits) {
         Error::Archive { problem, .. } => problem,
         other => panic!("{other}"),
     };
@@ -140,25 +140,26 @@ fn layers_hold_no_more_than_is_allowed() {
 #[test]
 fn extended_headers_of_layers_are_bounded_too() {
     use crate::tar_reader::tests::{archive, extension};
-    let place = place();
+    let place = new_fixture();
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     io::Write::write_all(&mut gzip, &archive(&vec![extension(10_000); 9])).expect("packed");
     std::fs::remove_file(place.upper()).expect("removed");
     std::fs::write(place.upper(), gzip.finish().expect("packed")).expect("written");
-    let refused = place.refused(&Limits::default()).to_string();
+    let refused = place.receive_refusal(&Limits::default()).to_string();
     assert!(refused.contains("extended headers"), "{refused}");
 }
 
-/// The engine's threads have what is strangers' read by others: these find what they need, and what is written has its owner.
+/// Threads of the engine have untrusted data parsed by unprivileged threads: these can access what they need, and
+/// written files have the right owner.
 #[test]
 fn an_image_is_taken_in_by_a_daemon_whose_readers_have_no_rights() {
-    let place = place();
-    // Nobody but root gets there.
+    let place = new_fixture();
+    // Only root has access there.
     let closed = std::fs::Permissions::from_mode(0o700);
     std::fs::set_permissions(place.root.path(), closed).expect("set");
     let other = store(place.root.path(), "other");
     let (layout, expected) = (place.layout(), place.image.digest);
-    let received = crate::by_engine(move || other.receive(&layout, &Limits::default()));
+    let received = crate::run_as_engine(move || other.receive(&layout, &Limits::default()));
     assert_eq!(received.expect("good").image.digest, expected);
 }
 
@@ -176,14 +177,14 @@ fn the_same_layer_twice_is_refused() {
     };
     let digest = store.put_image(&twice).expect("an image");
     let image = store.image(&digest).expect("it is there");
-    let place = Place { root, image, store };
-    let refused = place.refused(&Limits::default()).to_string();
+    let place = ReceiveFixture { root, image, store };
+    let refused = place.receive_refusal(&Limits::default()).to_string();
     assert!(refused.contains("same layer twice"), "{refused}");
 }
 
 #[test]
 fn what_is_refused_leaves_no_layer() {
-    let place = place();
+    let place = new_fixture();
     let [lower, upper] = place.image.spec.layers[..] else {
         panic!("two layers")
     };
@@ -197,7 +198,7 @@ fn what_is_refused_leaves_no_layer() {
 
 #[test]
 fn a_layer_in_another_blob_changes_no_image_of_this_store() {
-    let place = place();
+    let place = new_fixture();
     let lower = place.image.spec.layers[0];
     let path = place.store.images_dir().join(blob_path(&lower.digest));
     let mut content = Vec::new();

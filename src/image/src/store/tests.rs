@@ -1,4 +1,4 @@
-//! The store as its users see it, with real trees and real archives.
+//! Tests of the public interface of the store, with real trees and archives.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -13,12 +13,12 @@ use crate::tar_reader::TarReader;
 use crate::tar_writer::TarWriter;
 use crate::{ImageSpec, LayerInfo, Mtime, TreeOptions};
 
-struct World {
+struct StoreFixture {
     directory: tempfile::TempDir,
     store: Store,
 }
 
-impl World {
+impl StoreFixture {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let store = open(directory.path());
@@ -29,7 +29,7 @@ impl World {
         self.directory.path().join(name)
     }
 
-    /// Puts a layer of these entries into the store, whatever they are, without extracting it.
+    /// Adds a layer of arbitrary entries to the store without extracting it.
     fn layer(&self, entries: &[(Entry, &str)]) -> LayerInfo {
         let mut writer = TarWriter::new(Vec::new());
         for (entry, content) in entries {
@@ -38,7 +38,7 @@ impl World {
                 ..entry.clone()
             };
             writer
-                .file(&entry, content.as_bytes(), &mut [0; 64])
+                .write_file(&entry, content.as_bytes(), &mut [0; 64])
                 .unwrap();
         }
         let path = self.path("imported.tar.gz");
@@ -59,7 +59,7 @@ impl World {
             .unwrap()
     }
 
-    /// Names in the store that are neither a blob nor anything else that belongs there.
+    /// Returns the names of files in the store that do not belong there.
     fn leftovers(&self) -> Vec<String> {
         let both = [self.store.images_dir(), self.store.layers_dir()];
         let names = both
@@ -96,7 +96,7 @@ fn link(name: &str, kind: Kind, target: &str) -> Entry {
     }
 }
 
-/// Names, kinds and links in a layer's blob.
+/// Returns names, kinds and links in a layer's blob.
 fn entries(store: &Store, layer: &LayerInfo) -> Vec<Entry> {
     let blob = store.blob(&layer.digest).unwrap().unwrap();
     assert_eq!(blob.size, layer.size);
@@ -115,8 +115,8 @@ fn names(entries: &[Entry]) -> Vec<&str> {
         .collect()
 }
 
-/// A tree with everything in it, its files made in the order of `seed`.
-fn everything(tree: &Path, seed: usize) {
+/// Writes a tree with files of all kinds, created in the order of `seed`.
+fn write_sample_tree(tree: &Path, seed: usize) {
     let mut steps: Vec<Box<dyn Fn()>> = Vec::new();
     for name in [
         "usr/bin/b",
@@ -149,12 +149,12 @@ fn everything(tree: &Path, seed: usize) {
 
 #[test]
 fn the_same_tree_gives_the_same_layer() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layers: Vec<LayerInfo> = (0..3)
         .map(|seed| {
             let tree = world.path(&format!("tree{seed}"));
             std::fs::create_dir(&tree).unwrap();
-            everything(&tree, seed);
+            write_sample_tree(&tree, seed);
             world
                 .store
                 .layer_from_tree(&tree, &TreeOptions::default())
@@ -169,7 +169,7 @@ fn the_same_tree_gives_the_same_layer() {
     assert_eq!(names(&found), sorted);
     assert!(found.iter().all(|entry| entry.mtime == 0));
     assert!(!names(&found).contains(&"socket"));
-    // The first path in order is the file, whichever was made first.
+    // The first path in order is the file, whichever was created first.
     let same = found
         .iter()
         .find(|entry| entry.name == b"usr/bin/a")
@@ -183,15 +183,15 @@ fn the_same_tree_gives_the_same_layer() {
 
 #[test]
 fn a_layer_comes_back_as_the_tree_it_was() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
-    everything(&tree, 1);
+    write_sample_tree(&tree, 1);
     let options = TreeOptions {
         mtime: Mtime::Fixed(1_700_000_000),
         ..TreeOptions::default()
     };
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
-    let extracted = world.store.extracted(&layer.diff_id).unwrap();
+    let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
     assert_eq!(
         extracted,
         world.store.layers_dir().join(layer.diff_id.hex())
@@ -211,7 +211,7 @@ fn a_layer_comes_back_as_the_tree_it_was() {
     );
     let long = extracted.join("d".repeat(120)).join("n".repeat(200));
     assert_eq!(std::fs::read_to_string(long).unwrap(), "long");
-    // Packed again, it is the same layer.
+    // Packed again, it gives the same layer.
     assert_eq!(
         world.store.layer_from_tree(&extracted, &options).unwrap(),
         layer
@@ -220,7 +220,7 @@ fn a_layer_comes_back_as_the_tree_it_was() {
 
 #[test]
 fn what_is_excluded_is_not_in_the_layer() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     for name in [
         "var/log/dpkg.log",
@@ -253,7 +253,7 @@ fn what_is_excluded_is_not_in_the_layer() {
 
 #[test]
 fn times_can_be_kept_up_to_a_date() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("old"), "x");
     write(&tree.join("new"), "x");
@@ -276,7 +276,7 @@ fn times_can_be_kept_up_to_a_date() {
     assert_eq!(times, [2_000_000, 1_000_000]);
 }
 
-/// An overlay's upper directory: `gone` deleted, `fresh` emptied, `new` made.
+/// Writes the upper directory of an overlay: `gone` deleted, `fresh` emptied, `new` created.
 fn upper(tree: &Path) {
     write(&tree.join("new"), "x");
     write(&tree.join("fresh/inside"), "x");
@@ -293,7 +293,7 @@ fn upper(tree: &Path) {
 
 #[test]
 fn deletions_in_an_overlay_become_whiteouts_and_back() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("upper");
     std::fs::create_dir(&tree).unwrap();
     upper(&tree);
@@ -316,7 +316,7 @@ fn deletions_in_an_overlay_become_whiteouts_and_back() {
     assert_eq!(found[4].xattrs, [(b"user.kept".to_vec(), b"v".to_vec())]);
     assert!(found[1].xattrs.is_empty());
 
-    let extracted = world.store.extracted(&layer.diff_id).unwrap();
+    let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
     let gone = std::fs::symlink_metadata(extracted.join("gone")).unwrap();
     assert!(gone.file_type().is_char_device() && gone.rdev() == 0);
     assert_eq!(
@@ -327,7 +327,7 @@ fn deletions_in_an_overlay_become_whiteouts_and_back() {
 
 #[test]
 fn a_staged_tree_is_the_one_that_is_extracted() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("upper");
     std::fs::create_dir(&tree).unwrap();
     upper(&tree);
@@ -338,8 +338,8 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
         ..TreeOptions::default()
     };
     let (diff_id, bytes) = world.store.stage_tree(&tree, &options).unwrap();
-    // It can be stood on before there is a blob.
-    let staged = world.store.extracted(&diff_id).unwrap();
+    // It can be used before its blob exists.
+    let staged = world.store.ensure_extracted(&diff_id).unwrap();
     assert!(staged.join("fresh/inside").exists() && !staged.join("left").exists());
     assert_eq!(world.store.layer(&diff_id).unwrap(), None);
     assert!(
@@ -359,9 +359,9 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
     );
     let layer = world.store.layer_from_tree(&tree, &options).unwrap();
     assert_eq!((layer.diff_id, layer.unpacked), (diff_id, bytes));
-    // What the blob holds is what was staged: extracted from it, it packs to the same.
+    // The blob contains what was staged: extracted from it, the tree packs to the same layer.
     world.store.discard_tree(&diff_id).unwrap();
-    let extracted = world.store.extracted(&diff_id).unwrap();
+    let extracted = world.store.ensure_extracted(&diff_id).unwrap();
     let unchanged = TreeOptions {
         overlay_upper: true,
         ..TreeOptions::default()
@@ -370,7 +370,7 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
         world.store.layer_from_tree(&extracted, &unchanged).unwrap(),
         layer
     );
-    // Staging what is there already changes nothing.
+    // Staging an existing layer changes nothing.
     assert_eq!(
         world.store.stage_tree(&extracted, &unchanged).unwrap(),
         (diff_id, bytes)
@@ -380,7 +380,7 @@ fn a_staged_tree_is_the_one_that_is_extracted() {
 
 #[test]
 fn a_tree_that_cannot_be_packed_is_not_staged() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("usr/.wh.x"), "x");
     let error = world
@@ -397,7 +397,7 @@ fn a_tree_that_cannot_be_packed_is_not_staged() {
 
 #[test]
 fn a_tree_that_would_be_misread_is_refused() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("usr/.wh.x"), "x");
     let error = world
@@ -422,11 +422,11 @@ fn a_tree_that_would_be_misread_is_refused() {
 
 #[test]
 fn owners_and_capabilities_leave_the_user_namespace() {
-    // Only root can make files of others.
+    // Only root can create files of other owners.
     if !is_root() {
         return;
     }
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     for (name, uid) in [("mapped", 101_000), ("daemons", 0)] {
         write(&tree.join(name), "x");
@@ -457,7 +457,7 @@ fn owners_and_capabilities_leave_the_user_namespace() {
 
     let extracted = world
         .store
-        .extracted(&layer.diff_id)
+        .ensure_extracted(&layer.diff_id)
         .unwrap()
         .join("mapped");
     assert_eq!(extracted.metadata().unwrap().uid(), 1000);
@@ -470,7 +470,7 @@ fn owners_and_capabilities_leave_the_user_namespace() {
 
 #[test]
 fn a_hostile_layer_writes_only_into_its_own_tree() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let outside = world.path("outside");
     std::fs::create_dir(&outside).unwrap();
     let outside = outside.to_str().unwrap();
@@ -501,7 +501,7 @@ fn a_hostile_layer_writes_only_into_its_own_tree() {
             "",
         ),
     ]);
-    let tree = world.store.extracted(&layer.diff_id).unwrap();
+    let tree = world.store.ensure_extracted(&layer.diff_id).unwrap();
     assert!(files::list(Path::new(outside)).unwrap().is_empty());
     assert_eq!(
         std::fs::read_to_string(tree.join(&outside[1..]).join("x")).unwrap(),
@@ -526,7 +526,7 @@ fn a_hostile_layer_writes_only_into_its_own_tree() {
 
 #[test]
 fn a_layer_that_cannot_be_extracted_leaves_nothing() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let bad = [
         (file("a/../../x"), "goes up with '..'"),
         (
@@ -547,7 +547,7 @@ fn a_layer_that_cannot_be_extracted_leaves_nothing() {
         let layer = world.layer(&[(file("good"), "x"), (entry, "")]);
         let error = world
             .store
-            .extracted(&layer.diff_id)
+            .ensure_extracted(&layer.diff_id)
             .unwrap_err()
             .to_string();
         assert!(error.contains(problem), "{error}");
@@ -561,7 +561,7 @@ fn a_layer_that_cannot_be_extracted_leaves_nothing() {
 
 #[test]
 fn whiteouts_meet_their_namesakes_in_one_layer() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let directory = |name: &str| Entry::new(name, Kind::Directory, 0o755);
     let layer = world.layer(&[
         (file(".wh.first"), ""),
@@ -573,7 +573,7 @@ fn whiteouts_meet_their_namesakes_in_one_layer() {
         (file("kept"), "x"),
         (file(".wh.kept"), ""),
     ]);
-    let tree = world.store.extracted(&layer.diff_id).unwrap();
+    let tree = world.store.ensure_extracted(&layer.diff_id).unwrap();
     let options = TreeOptions {
         overlay_upper: true,
         ..TreeOptions::default()
@@ -594,9 +594,9 @@ fn whiteouts_meet_their_namesakes_in_one_layer() {
 
 #[test]
 fn many_threads_ask_for_one_layer() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
-    everything(&tree, 2);
+    write_sample_tree(&tree, 2);
     let made = || {
         world
             .store
@@ -610,9 +610,9 @@ fn many_threads_ask_for_one_layer() {
             .to_vec()
     });
     assert!(layers.iter().all(|layer| layer == &layers[0]));
-    // A second store stands for a second process.
+    // A second store represents a second process.
     let other = open(world.directory.path());
-    let extract = |store: &Store| store.extracted(&layers[0].diff_id).unwrap();
+    let extract = |store: &Store| store.ensure_extracted(&layers[0].diff_id).unwrap();
     std::thread::scope(|scope| {
         let own = [(); 3].map(|()| scope.spawn(|| extract(&world.store)));
         let others = [(); 3].map(|()| scope.spawn(|| extract(&other)));
@@ -626,19 +626,19 @@ fn many_threads_ask_for_one_layer() {
 
 #[test]
 fn damaged_content_never_becomes_a_tree() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layer = world.layer(&[(file("a"), "x")]);
     let other = world.layer(&[(file("b"), "x")]);
-    // A record that promises another content.
+    // A record with another diff-id.
     let wrong = LayerInfo {
         digest: other.digest,
         size: other.size,
         ..layer
     };
-    files::write_whole(&world.store.record_path(&layer.diff_id), &json(&wrong)).unwrap();
+    files::write_atomically(&world.store.record_path(&layer.diff_id), &to_json(&wrong)).unwrap();
     let error = world
         .store
-        .extracted(&layer.diff_id)
+        .ensure_extracted(&layer.diff_id)
         .unwrap_err()
         .to_string();
     assert!(
@@ -651,11 +651,11 @@ fn damaged_content_never_becomes_a_tree() {
 
 #[test]
 fn layers_go_out_and_come_in_unchanged() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layer = world.layer(&[(file("a"), "x")]);
     let cached = world.path("cached.tar.gz");
     world.store.export_layer(&layer.diff_id, &cached).unwrap();
-    let second = World::new();
+    let second = StoreFixture::new();
     assert_eq!(second.store.layer(&layer.diff_id).unwrap(), None);
     assert_eq!(second.store.import_layer(&cached).unwrap(), layer);
     let tree = second.store.layers_dir().join(layer.diff_id.hex());
@@ -675,7 +675,7 @@ fn layers_go_out_and_come_in_unchanged() {
 
 #[test]
 fn what_is_no_layer_is_not_imported() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let path = world.path("x.tar.gz");
     std::fs::write(&path, "plain").unwrap();
     let error = world.store.import_layer(&path).unwrap_err().to_string();
@@ -696,7 +696,7 @@ fn what_is_no_layer_is_not_imported() {
     std::fs::write(&path, &whole[..whole.len() - 9]).unwrap();
     let error = world.store.import_layer(&path).unwrap_err().to_string();
     assert!(
-        error.contains("x.tar.gz: the archive is cut off"),
+        error.contains("x.tar.gz: the archive is truncated"),
         "{error}"
     );
     let missing = world
@@ -709,8 +709,12 @@ fn what_is_no_layer_is_not_imported() {
         "{missing}"
     );
     assert!(world.leftovers().is_empty());
-    let unknown = Digest::of("unknown");
-    let error = world.store.extracted(&unknown).unwrap_err().to_string();
+    let unknown = Digest::compute("unknown");
+    let error = world
+        .store
+        .ensure_extracted(&unknown)
+        .unwrap_err()
+        .to_string();
     assert!(
         error.contains(&unknown.to_string()) && error.contains("is not in the store"),
         "{error}"
@@ -731,7 +735,7 @@ fn spec(layers: &[LayerInfo]) -> ImageSpec {
 
 #[test]
 fn images_have_names_and_keep_them() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layers = [
         world.layer(&[(file("a"), "x")]),
         world.layer(&[(file("b"), "x")]),
@@ -743,7 +747,7 @@ fn images_have_names_and_keep_them() {
     world.store.tag("opencv_apps:latest", &image).unwrap();
     world.store.tag("opencv_apps:latest", &other).unwrap();
     world.store.tag("opencv_apps:latest", &other).unwrap();
-    // Of two tags of one image each is known as such: the index is written anew for neither.
+    // Both tags of one image are recognised: the index is rewritten for neither.
     world.store.tag("opencv_apps:2", &image).unwrap();
     let index = || {
         std::fs::metadata(world.store.images_dir().join("index.json"))
@@ -779,7 +783,7 @@ fn images_have_names_and_keep_them() {
         (manifest.digest, &manifest.media_type[..]),
         (image, oci::MEDIA_MANIFEST)
     );
-    assert_eq!(Digest::of(&manifest.bytes), image);
+    assert_eq!(Digest::compute(&manifest.bytes), image);
 
     assert!(reopened.untag("opencv_apps:latest").unwrap());
     assert!(!reopened.untag("opencv_apps:latest").unwrap());
@@ -788,14 +792,14 @@ fn images_have_names_and_keep_them() {
 
 #[test]
 fn bad_names_and_unknown_images_are_refused() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layer = world.layer(&[(file("a"), "x")]);
     let image = world.store.put_image(&spec(&[layer])).unwrap();
     for name in ["", "../x", "a b", "ä", &"x".repeat(256), &image.to_string()] {
         let error = world.store.tag(name, &image).unwrap_err().to_string();
         assert!(error.contains("is not a tag"), "{error}");
     }
-    let unknown = Digest::of("unknown");
+    let unknown = Digest::compute("unknown");
     let error = world.store.tag("x:1", &unknown).unwrap_err().to_string();
     assert!(error.contains(&unknown.to_string()), "{error}");
     assert!(world.store.image(&unknown).is_err());
@@ -811,7 +815,7 @@ fn bad_names_and_unknown_images_are_refused() {
 
 #[test]
 fn many_threads_and_stores_tag_at_once() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let image = world
         .store
         .put_image(&spec(&[world.layer(&[(file("a"), "x")])]))
@@ -832,7 +836,7 @@ fn many_threads_and_stores_tag_at_once() {
 
 #[test]
 fn what_nobody_needs_goes_and_the_rest_stays() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let shared = world.layer(&[(file("shared"), "x")]);
     let old = world.layer(&[(file("old"), "x")]);
     let new = world.layer(&[(file("new"), "x")]);
@@ -842,7 +846,7 @@ fn what_nobody_needs_goes_and_the_rest_stays() {
     world.store.tag("s:1", &first).unwrap();
     world.store.tag("s:2", &second).unwrap();
     for layer in [shared, old, new, in_use] {
-        world.store.extracted(&layer.diff_id).unwrap();
+        world.store.ensure_extracted(&layer.diff_id).unwrap();
     }
     let keep = BTreeSet::from([in_use.diff_id]);
     let swept = world.store.gc(&keep).unwrap();
@@ -870,13 +874,13 @@ fn what_nobody_needs_goes_and_the_rest_stays() {
 
     world.store.untag("s:2").unwrap();
     world.store.gc(&BTreeSet::new()).unwrap();
-    assert!(files::list(&world.store.blobs()).unwrap().is_empty());
+    assert!(files::list(&world.store.blobs_dir()).unwrap().is_empty());
     assert!(world.store.images().unwrap().is_empty());
 }
 
 #[test]
 fn images_outlive_the_directory_of_layers() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layer = world.layer(&[(file("a"), "x")]);
     world.store.put_image(&spec(&[layer])).unwrap();
     std::fs::remove_dir_all(world.store.layers_dir()).unwrap();
@@ -888,12 +892,18 @@ fn images_outlive_the_directory_of_layers() {
             ..layer
         })
     );
-    assert!(store.extracted(&layer.diff_id).unwrap().join("a").exists());
+    assert!(
+        store
+            .ensure_extracted(&layer.diff_id)
+            .unwrap()
+            .join("a")
+            .exists()
+    );
 }
 
 #[test]
 fn a_check_names_what_is_damaged_and_what_is_missing() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let damaged = world.layer(&[(file("a"), "x")]);
     let missing = world.layer(&[(file("b"), "x")]);
     let image = world.store.put_image(&spec(&[damaged, missing])).unwrap();
@@ -923,13 +933,13 @@ fn a_check_names_what_is_damaged_and_what_is_missing() {
 
 #[test]
 fn a_start_sweeps_what_a_crash_or_power_failure_left() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let layer = world.layer(&[(file("a"), "x")]);
-    let tree = world.store.extracted(&layer.diff_id).unwrap();
+    let tree = world.store.ensure_extracted(&layer.diff_id).unwrap();
     std::fs::write(world.store.images_dir().join("tmp-1"), "half a blob").unwrap();
     write(&world.store.layers_dir().join("tmp-2/usr/x"), "half a tree");
     // Marked by an earlier boot: its files may be empty now.
-    let lost = Digest::of("lost");
+    let lost = Digest::compute("lost");
     write(&world.store.tree_path(&lost).join("empty"), "");
     let mark = world
         .store
@@ -970,12 +980,12 @@ fn strange_directories_are_left_alone() {
     .unwrap();
     std::fs::write(images.join("index.json"), "{").unwrap();
     let error = Store::open(&images, &layers).unwrap_err().to_string();
-    assert!(error.contains("index.json does not parse"), "{error}");
+    assert!(error.contains("index.json: "), "{error}");
 }
 
 #[test]
 fn nobody_else_may_enter() {
-    let world = World::new();
+    let world = StoreFixture::new();
     for directory in [world.store.images_dir(), world.store.layers_dir()] {
         assert_eq!(
             directory.metadata().unwrap().permissions().mode() & 0o777,
@@ -984,8 +994,8 @@ fn nobody_else_may_enter() {
     }
 }
 
-/// Runs the test `name` again in a mount namespace where `DISK` is a file system of 2 MB; the place in it is given
-/// there, nothing here.
+/// Runs the test `name` again in a mount namespace in which `DISK` is a file system of 2 MB; returns a directory on it
+/// there, and `None` here.
 fn on_a_small_disk(name: &str) -> Option<PathBuf> {
     const DISK: &str = "CLOUDROID_TEST_SMALL_DISK";
     if let Some(disk) = std::env::var_os(DISK) {
@@ -1022,7 +1032,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     let store = open(&disk);
     let elsewhere = tempfile::tempdir().unwrap();
     let tree = elsewhere.path().join("tree");
-    // Does not compress, so neither blob nor tree fits.
+    // Incompressible, so neither blob nor tree fits.
     let mut state = 1_u64;
     let noise: Vec<u8> = (0..6 << 20)
         .map(|_| {
@@ -1050,7 +1060,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
                 "{names:?}"
             );
         }
-        assert!(files::list(&store.blobs()).unwrap().is_empty());
+        assert!(files::list(&store.blobs_dir()).unwrap().is_empty());
         text
     };
     told(
@@ -1081,7 +1091,7 @@ fn a_full_disk_is_told_and_leaves_nothing() {
     let layer = store
         .layer_from_tree(&tree, &TreeOptions::default())
         .unwrap();
-    let error = store.extracted(&layer.diff_id).unwrap_err();
+    let error = store.ensure_extracted(&layer.diff_id).unwrap_err();
     let text = error.to_string();
     assert!(
         matches!(
@@ -1103,13 +1113,13 @@ fn a_full_disk_is_told_and_leaves_nothing() {
         )
         .is_ok()
     );
-    // There is room again for small things.
-    files::write_whole(&disk.join("small"), &[0; 4096]).unwrap();
+    // There is room again for small files.
+    files::write_atomically(&disk.join("small"), &[0; 4096]).unwrap();
 }
 
 #[test]
 fn packing_and_extracting_end_when_they_are_cancelled() {
-    let world = World::new();
+    let world = StoreFixture::new();
     let tree = world.path("tree");
     write(&tree.join("a/b"), "content");
     let layer = world
@@ -1119,16 +1129,16 @@ fn packing_and_extracting_end_when_they_are_cancelled() {
     let cancel = foreign::cancel::Cancel::default();
     cancel.cancel();
     write(&tree.join("a/c"), "more");
-    cancel.during(|| {
+    cancel.run(|| {
         world
             .store
             .layer_from_tree(&tree, &TreeOptions::default())
             .unwrap_err();
-        world.store.extracted(&layer.diff_id).unwrap_err();
+        world.store.ensure_extracted(&layer.diff_id).unwrap_err();
     });
     assert_eq!(world.leftovers(), Vec::<String>::new());
-    // What was cancelled is done when it is wanted again.
-    let extracted = world.store.extracted(&layer.diff_id).unwrap();
+    // Cancelled work succeeds when it is requested again.
+    let extracted = world.store.ensure_extracted(&layer.diff_id).unwrap();
     assert_eq!(
         std::fs::read_to_string(extracted.join("a/b")).unwrap(),
         "content"

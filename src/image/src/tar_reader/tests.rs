@@ -2,7 +2,7 @@ use tar::EntryType;
 
 use super::*;
 
-/// A header as anybody may write it, and its content.
+/// Returns an arbitrary header with its content.
 pub(crate) fn member(kind: EntryType, name: &str, content: &[u8]) -> Vec<u8> {
     let mut header = Header::new_ustar();
     header.set_entry_type(kind);
@@ -16,12 +16,12 @@ pub(crate) fn member(kind: EntryType, name: &str, content: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Pax records of attributes without a value: the most memory for their length.
+/// Returns pax records of attributes without values: the most memory for their length.
 fn attributes(count: usize) -> Vec<u8> {
     b"19 SCHILY.xattr.a=\n".repeat(count)
 }
 
-/// A file after `extensions`, and the end mark.
+/// Returns an archive of a file preceded by `extensions`, with an end mark.
 pub(crate) fn archive(extensions: &[Vec<u8>]) -> Vec<u8> {
     let mut bytes = extensions.concat();
     bytes.extend(member(EntryType::Regular, "f", b"content"));
@@ -29,15 +29,15 @@ pub(crate) fn archive(extensions: &[Vec<u8>]) -> Vec<u8> {
     bytes
 }
 
-/// A pax header of so many attributes.
+/// Returns a pax header with `count` attributes.
 pub(crate) fn extension(count: usize) -> Vec<u8> {
     member(EntryType::XHeader, "pax", &attributes(count))
 }
 
 fn refusal(archive: &[u8]) -> String {
     match TarReader::new(archive).next_entry() {
-        Err(Stop::Refused(problem)) => problem.to_string(),
-        Err(Stop::Source(error)) => panic!("{error}"),
+        Err(ReadStop::Refused(problem)) => problem.to_string(),
+        Err(ReadStop::Source(error)) => panic!("{error}"),
         Ok(entry) => panic!(
             "it is read: {}",
             entry.map_or(0, |entry| entry.xattrs.len())

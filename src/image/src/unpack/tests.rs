@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use super::*;
 use crate::tar_writer::TarWriter;
 
-/// An archive in the making; the writer checks nothing, so it can hold anything.
+/// Builder of an archive; the writer checks nothing, so it can contain anything.
 struct Archive(TarWriter<Vec<u8>>);
 
 impl Archive {
@@ -16,7 +16,7 @@ impl Archive {
         let mut entry = Entry::new(name.as_ref(), Kind::File, 0o644);
         entry.size = content.len() as u64;
         self.0
-            .file(&entry, content.as_bytes(), &mut [0; 512])
+            .write_file(&entry, content.as_bytes(), &mut [0; 512])
             .unwrap();
         self
     }
@@ -24,7 +24,7 @@ impl Archive {
     fn entry(mut self, name: &str, kind: Kind, link: &str) -> Self {
         let mut entry = Entry::new(name, kind, 0o755);
         entry.link = link.into();
-        self.0.header(&entry).unwrap();
+        self.0.write_header(&entry).unwrap();
         self
     }
 
@@ -45,23 +45,23 @@ impl Archive {
     }
 }
 
-struct Place {
+struct UnpackFixture {
     _directory: tempfile::TempDir,
     destination: PathBuf,
 }
 
-fn place() -> Place {
+fn new_fixture() -> UnpackFixture {
     let directory = tempfile::tempdir().unwrap();
     let destination = directory.path().join("push");
-    Place {
+    UnpackFixture {
         _directory: directory,
         destination,
     }
 }
 
-/// The message of a refusal, after which nothing may be left.
+/// Returns the message of a refusal, after checking that nothing is left.
 fn refusal_within(bytes: &[u8], limits: &Limits) -> String {
-    let place = place();
+    let place = new_fixture();
     let error = unpack(bytes, &place.destination, limits).unwrap_err();
     assert!(
         !place.destination.exists(),
@@ -81,13 +81,13 @@ fn assert_says(message: &str, parts: &[&str]) {
     }
 }
 
-fn gzipped(bytes: &[u8]) -> Vec<u8> {
+fn gzip(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     encoder.write_all(bytes).unwrap();
     encoder.finish().unwrap()
 }
 
-fn ordinary() -> Vec<u8> {
+fn ordinary_archive() -> Vec<u8> {
     let long = format!("pkg/{}/{}.msg", "d".repeat(90), "n".repeat(200));
     let mut archive = Archive::new()
         .directory("./")
@@ -99,18 +99,21 @@ fn ordinary() -> Vec<u8> {
         .file(long, "int32 x");
     let mut script = Entry::new("pkg/scripts/run", Kind::File, 0o4775);
     script.size = 2;
-    archive.0.file(&script, &b"#!"[..], &mut [0; 16]).unwrap();
+    archive
+        .0
+        .write_file(&script, &b"#!"[..], &mut [0; 16])
+        .unwrap();
     archive.bytes()
 }
 
 #[test]
 fn an_ordinary_archive_arrives_gzip_or_not() {
-    for bytes in [ordinary(), gzipped(&ordinary())] {
-        let place = place();
+    for bytes in [ordinary_archive(), gzip(&ordinary_archive())] {
+        let place = new_fixture();
         let done = unpack(&bytes[..], &place.destination, &Limits::default()).unwrap();
         assert_eq!(
             done,
-            Unpacked {
+            UnpackStats {
                 entries: 8,
                 bytes: 10 + 7 + 2
             }
@@ -141,14 +144,14 @@ fn owners_left_blank_are_root_and_owners_that_are_no_numbers_refused() {
     let with_owner = |owner: &[u8; 8]| {
         let mut bytes = Archive::new().file("package.xml", "<package/>").bytes();
         bytes[108..116].copy_from_slice(owner);
-        // The checksum is of the header with spaces in the checksum's own field.
+        // The checksum is computed with spaces in the checksum field.
         bytes[148..156].fill(b' ');
         let sum: u32 = bytes[..512].iter().map(|byte| u32::from(*byte)).sum();
         bytes[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
         bytes
     };
     for blank in [b"\0\0\0\0\0\0\0\0", b"        "] {
-        let place = place();
+        let place = new_fixture();
         unpack(
             with_owner(blank).as_slice(),
             &place.destination,
@@ -163,10 +166,20 @@ fn owners_left_blank_are_root_and_owners_that_are_no_numbers_refused() {
 
 #[test]
 fn an_empty_destination_is_taken_and_a_full_one_left_alone() {
-    let place = place();
+    let place = new_fixture();
     std::fs::create_dir(&place.destination).unwrap();
-    unpack(&ordinary()[..], &place.destination, &Limits::default()).unwrap();
-    let error = unpack(&ordinary()[..], &place.destination, &Limits::default()).unwrap_err();
+    unpack(
+        &ordinary_archive()[..],
+        &place.destination,
+        &Limits::default(),
+    )
+    .unwrap();
+    let error = unpack(
+        &ordinary_archive()[..],
+        &place.destination,
+        &Limits::default(),
+    )
+    .unwrap_err();
     assert_says(&error.to_string(), &["cannot unpack into", "not empty"]);
     assert!(place.destination.join("pkg/package.xml").exists());
 }
@@ -218,19 +231,19 @@ fn symbolic_links_that_leave_are_refused() {
             &[name, "leaves the archive"],
         );
     }
-    // p/q/up is p/q itself, so going up three times from there leaves, though its text does not say so.
+    // p/q/up is p/q itself, so going up three times from there leaves the tree, though its text does not show it.
     let sly = Archive::new()
         .symlink("p/q/up", ".")
         .symlink("p/q/x", "up/../../..");
     assert_says(&refusal(sly), &["\"p/q/x\"", "leaves the archive"]);
-    // What is not there cannot be judged.
+    // A missing target cannot be checked.
     let dangling = Archive::new().symlink("p/x", "not-there/../../..");
     assert_says(&refusal(dangling), &["\"p/x\"", "leaves the archive"]);
 }
 
 #[test]
 fn links_that_stay_are_fine_even_if_they_lead_nowhere() {
-    let place = place();
+    let place = new_fixture();
     let archive = Archive::new()
         .symlink("a/b/up", "../..")
         .symlink("later", "a/b/real")
@@ -259,7 +272,7 @@ fn hard_links_that_leave_or_lead_nowhere_are_refused() {
         &refusal(Archive::new().directory("d").hardlink("l", "d")),
         &["\"l\"", "no earlier file"],
     );
-    // Elsewhere the same relative target means something else.
+    // The same relative target means something else there.
     let moved = Archive::new()
         .symlink("a/b/c", "../../x")
         .hardlink("c", "a/b/c");
@@ -316,7 +329,7 @@ fn one_name_is_one_thing() {
 
 #[test]
 fn names_that_cannot_be_are_refused() {
-    // Beyond 100 bytes the name goes into a pax record, which can hold NUL.
+    // Beyond 100 bytes the name goes into a pax record, which can contain NUL.
     let nul = [&b"a\0"[..], &[b'x'; 120]].concat();
     assert_says(
         &refusal(Archive::new().file(nul, "")),
@@ -328,7 +341,7 @@ fn names_that_cannot_be_are_refused() {
     );
     assert_says(
         &refusal(Archive::new().file("long/".repeat(300), "")),
-        &["1500 bytes long, and 1024"],
+        &["1500 bytes long; the limit is 1024"],
     );
 }
 
@@ -345,10 +358,10 @@ fn too_much_is_refused() {
     };
     assert_says(
         &refusal_within(&archive, &limits),
-        &["\"c\" is one too many", "at most 2 entries"],
+        &["\"c\" exceeds the limit", "limit of 2 entries"],
     );
 
-    let bomb = gzipped(
+    let bomb = gzip(
         &Archive::new()
             .file("small", "x")
             .file("zeros", &"0".repeat(5 << 20))
@@ -361,7 +374,7 @@ fn too_much_is_refused() {
     };
     assert_says(
         &refusal_within(&bomb, &limits),
-        &["\"zeros\"", "larger than the 1048 kB"],
+        &["\"zeros\"", "larger than the limit of 1048 kB"],
     );
 
     let exact = Archive::new().file("a", "1").bytes();
@@ -369,7 +382,7 @@ fn too_much_is_refused() {
         bytes: exact.len() as u64,
         ..Limits::default()
     };
-    assert!(unpack(&exact[..], &place().destination, &limits).is_ok());
+    assert!(unpack(&exact[..], &new_fixture().destination, &limits).is_ok());
 }
 
 #[test]
@@ -381,18 +394,18 @@ fn an_archive_that_is_cut_off_is_refused() {
     // In a header, in a content, in the padding, and where only the end mark is missing.
     for length in [300, 512 + 100, 3 * 512 + 100, 3 * 512 + 700, 5 * 512] {
         let message = refusal_within(&whole[..length], &Limits::default());
-        assert_says(&message, &["cut off after entry"]);
+        assert_says(&message, &["truncated after entry"]);
     }
-    let packed = gzipped(&whole);
+    let packed = gzip(&whole);
     for length in [packed.len() - 1, packed.len() / 2, 5] {
         assert_says(
             &refusal_within(&packed[..length], &Limits::default()),
-            &["cut off after entry"],
+            &["truncated after entry"],
         );
     }
     assert_says(
         &refusal_within(b"", &Limits::default()),
-        &["cut off after entry \"\""],
+        &["truncated after entry \"\""],
     );
 }
 
@@ -400,18 +413,18 @@ fn an_archive_that_is_cut_off_is_refused() {
 fn what_is_no_archive_is_refused() {
     assert_says(
         &refusal_within(&[b'x'; 2048], &Limits::default()),
-        &["does not read", "checksum"],
+        &["cannot read the archive", "checksum"],
     );
     assert_says(
         &refusal_within(&[0x28, 0xb5, 0x2f, 0xfd, 0, 0], &Limits::default()),
         &["zstd", "tar.gz"],
     );
-    let mut damaged = gzipped(&Archive::new().file("a", &"0123456789".repeat(500)).bytes());
+    let mut damaged = gzip(&Archive::new().file("a", &"0123456789".repeat(500)).bytes());
     let middle = damaged.len() - 6;
     damaged[middle] ^= 0xff;
     assert_says(
         &refusal_within(&damaged, &Limits::default()),
-        &["does not read"],
+        &["cannot read the archive"],
     );
 }
 
@@ -424,7 +437,7 @@ fn sparse_files_and_endless_headers_are_refused() {
     let mut archive = Archive::new();
     let mut endless = Entry::new("x", Kind::Other(b'x'), 0o644);
     endless.size = 1 << 32;
-    archive.0.header(&endless).unwrap();
+    archive.0.write_header(&endless).unwrap();
     assert_says(&refusal(archive), &["extended headers of 4294967296 bytes"]);
 }
 
@@ -437,7 +450,7 @@ fn a_source_that_fails_leaves_nothing() {
         }
     }
     let archive = Archive::new().file("a", "1").bytes();
-    let place = place();
+    let place = new_fixture();
     let error = unpack(
         (&archive[..600]).chain(Fails),
         &place.destination,
@@ -464,8 +477,11 @@ fn extended_headers_count_as_entries() {
         entries,
         ..Limits::default()
     };
-    let place = place();
+    let place = new_fixture();
     let unpacked = unpack(&bytes[..], &place.destination, &within(6)).unwrap();
     assert_eq!(unpacked.entries, 3);
-    assert_says(&refusal_within(&bytes, &within(5)), &["three", "at most 5"]);
+    assert_says(
+        &refusal_within(&bytes, &within(5)),
+        &["three", "limit of 5"],
+    );
 }

@@ -1,43 +1,44 @@
-//! Limits the bytes that wait for the peer: of messages that must all arrive (latched messages, messages of actions), which are
-//! within the limit not dropped in favour of newer ones; and of everything, in the budget of the session's owner.
+//! Limits on the bytes queued for the peer: for messages that must all be delivered (latched messages, messages of
+//! actions), which within the limit are not replaced by newer ones; and for everything, in the budget of the session's
+//! owner.
 
 use ::budget::{Exceeded, UNCOUNTED};
-use ros::ring::{Held, Ring};
+use ros::ring::{Ring, RingItem};
 
-use super::lanes::Lane;
-use super::{Out, Outgoing};
+use super::lanes::RecordLane;
+use super::{Outgoing, OutgoingRecord};
 use crate::drops::Cause;
 use crate::limits::EACH;
 
-/// Bytes below which a topic's messages are not dropped, as long as another topic has more than its last message.
+/// Number of bytes below which a topic's messages are not dropped while another topic holds more than its last message.
 const LITTLE: usize = 1 << 20;
 
-/// Whether a message may be kept beside so many bytes of others; a single message may have any size.
-pub(super) fn has_room(kept: usize, out: &Out) -> bool {
-    kept == 0 || kept + out.held() <= EACH
+/// Returns whether a message may be kept in addition to `kept` bytes. A single message may have any size.
+pub(super) fn has_room(kept: usize, out: &OutgoingRecord) -> bool {
+    kept == 0 || kept + out.memory_size() <= EACH
 }
 
-/// How many of them wait on a topic, and their bytes.
-fn load(waiting: &Ring<Out>) -> (usize, usize) {
-    let all = waiting.iter().filter(|out| out.counts());
+/// Returns the number of irreplaceable messages queued on a topic and their total size in bytes.
+fn required_load(waiting: &Ring<OutgoingRecord>) -> (usize, usize) {
+    let all = waiting.iter().filter(|out| out.is_irreplaceable());
     all.fold((0, 0), |(count, bytes), out| {
-        (count + 1, bytes + out.held())
+        (count + 1, bytes + out.memory_size())
     })
 }
 
-impl Out {
-    /// It is a message that no newer one replaces.
-    fn counts(&self) -> bool {
+impl OutgoingRecord {
+    /// Returns whether it is a message that no newer one may replace.
+    fn is_irreplaceable(&self) -> bool {
         self.each && !self.closes
     }
 }
 
 impl Outgoing {
-    /// Whether a message of `bytes` bytes may be queued. Where there is no room it takes the place of older ones of its topic;
-    /// without any it is dropped.
-    pub(super) fn takes_message(&mut self, channel: u32, bytes: usize) -> bool {
+    /// Makes room for a message of `bytes` bytes by dropping older messages of its topic. Returns `false`, counting the
+    /// message as dropped, if there is none left to drop.
+    pub(super) fn make_room(&mut self, channel: u32, bytes: usize) -> bool {
         loop {
-            if self.count_more(bytes).is_ok() {
+            if self.charge(bytes).is_ok() {
                 return true;
             }
             let waiting = self.topics.get_mut(&channel).filter(|all| all.len() > 1);
@@ -53,25 +54,25 @@ impl Outgoing {
         }
     }
 
-    /// Bytes that wait, are under way, and are kept.
-    fn held(&self) -> usize {
+    /// Returns the number of bytes queued, in flight and kept.
+    fn buffered_bytes(&self) -> usize {
         let topics: usize = self.topics.values().map(Ring::bytes).sum();
         let sending = self.sending.iter().map(|sending| &sending.out);
-        // Of other lanes it counts there until the peer has it.
-        let sending = sending.filter(|out| out.lane == Lane::Data);
+        // Records of other lanes are counted there until they are acknowledged.
+        let sending = sending.filter(|out| out.lane == RecordLane::Data);
         let under_way: usize = sending
             .chain(self.encoding.messages())
-            .map(Held::held)
+            .map(RingItem::memory_size)
             .sum();
         let waiting = self.lanes.bytes() + self.lines.bytes() + topics;
         waiting + under_way + self.retransmit.bytes + self.retransmit.big
     }
 
-    /// Counts `bytes` more. The sum is made only when enough has come together.
-    pub(super) fn count_more(&mut self, bytes: usize) -> Result<(), Exceeded> {
+    /// Charges `bytes` to the budget. The total is recomputed only after enough has accumulated.
+    pub(super) fn charge(&mut self, bytes: usize) -> Result<(), Exceeded> {
         let uncounted = self.uncounted + bytes;
         if uncounted > UNCOUNTED {
-            self.permit.count(self.held() + bytes)?;
+            self.permit.count(self.buffered_bytes() + bytes)?;
             self.uncounted = 0;
         } else {
             self.uncounted = uncounted;
@@ -79,26 +80,31 @@ impl Outgoing {
         Ok(())
     }
 
-    /// Gives back what is held no more.
-    pub(super) fn count_less(&mut self) {
+    /// Returns memory that is no longer in use to the budget.
+    pub(super) fn release_unused(&mut self) {
         if self.permit.bytes() > 0 {
-            // Less always fits.
-            let _ = self.permit.count(self.held().min(self.permit.bytes()));
+            // A smaller amount always fits.
+            let _ = self
+                .permit
+                .count(self.buffered_bytes().min(self.permit.bytes()));
         }
     }
 
-    /// Drops messages until the limit is kept, after one of `channel` was added: first messages that newer ones follow, then
-    /// any, each time of the topic with the most bytes. The newest message stays.
-    pub(super) fn keep_to_budget(&mut self, channel: u32) {
+    /// Drops messages until the limit is observed, after one was added to `channel`: first messages that are followed
+    /// by newer ones, then any, each time from the topic with the most bytes. The newest message stays.
+    pub(super) fn enforce_budget(&mut self, channel: u32) {
         loop {
-            let topics = self.topics.iter().map(|(of, waiting)| (*of, load(waiting)));
+            let topics = self
+                .topics
+                .iter()
+                .map(|(of, waiting)| (*of, required_load(waiting)));
             let topics: Vec<(u32, (usize, usize))> = topics.collect();
             let all: usize = topics.iter().map(|(_, (_, bytes))| bytes).sum();
             let last = self.topics.get(&channel).and_then(Ring::back);
-            if all - last.map_or(0, Held::held).min(all) <= EACH {
+            if all - last.map_or(0, RingItem::memory_size).min(all) <= EACH {
                 return;
             }
-            // One that is followed by newer ones goes first.
+            // Topics with more than one message come first.
             let others = topics
                 .iter()
                 .filter(|(of, (count, _))| *of != channel || *count > 1);
@@ -108,7 +114,7 @@ impl Outgoing {
             let Some(waiting) = self.topics.get_mut(&of) else {
                 return;
             };
-            let oldest = waiting.iter().position(Out::counts);
+            let oldest = waiting.iter().position(OutgoingRecord::is_irreplaceable);
             if oldest.and_then(|at| waiting.remove(at)).is_none() {
                 return;
             }

@@ -5,30 +5,30 @@ use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::out::Out;
+use super::out::OutgoingRecord;
 use crate::record::{ENCODED, FLAGS_AT, SERIALISE_AT};
 
-/// Smaller messages are not worth it.
+/// Minimum size of a message worth encoding, in bytes.
 const WORTH_IT: usize = 1024;
 
-/// The message that is being encoded, and which others are to be.
+/// The message that is being encoded, and the channels whose messages may be encoded.
 #[derive(Debug, Default)]
 pub(crate) struct Encoding {
-    /// Messages of these channels, while it `pays`.
+    /// Channels whose messages are encoded while it `pays`.
     channels: BTreeSet<u32>,
     pays: bool,
-    /// And whether someone has taken that on.
-    message: Option<(Out, bool)>,
-    done: Option<Out>,
+    /// The message, and whether an encoder has taken it.
+    message: Option<(OutgoingRecord, bool)>,
+    done: Option<OutgoingRecord>,
 }
 
 impl Encoding {
-    /// Messages of this channel may be encoded.
+    /// Allows messages of this channel to be encoded.
     pub(crate) fn add(&mut self, channel: u32) {
         self.channels.insert(channel);
     }
 
-    /// A channel whose messages may not be encoded ahead any more.
+    /// No longer encodes messages of this channel.
     pub(super) fn remove(&mut self, channel: u32) {
         self.channels.remove(&channel);
     }
@@ -38,13 +38,13 @@ impl Encoding {
         &self.channels
     }
 
-    /// Whether encoding pays.
-    pub(crate) fn set_pays(&mut self, pays: bool) {
+    /// Sets whether encoding is worthwhile.
+    pub(crate) fn set_enabled(&mut self, pays: bool) {
         self.pays = pays;
     }
 
-    /// Whether this message is to be encoded.
-    pub(super) fn wants(&self, out: &Out) -> bool {
+    /// Returns whether this message is to be encoded.
+    pub(super) fn should_encode(&self, out: &OutgoingRecord) -> bool {
         let flags = out.head.get(FLAGS_AT);
         self.pays
             && out.payload.len() >= WORTH_IT
@@ -54,18 +54,18 @@ impl Encoding {
                 .is_some_and(|channel| self.channels.contains(&channel))
     }
 
-    pub(super) fn begin(&mut self, out: Out) {
+    pub(super) fn begin(&mut self, out: OutgoingRecord) {
         self.message = Some((out, false));
     }
 
-    /// A message to be encoded now: its channel, itself, and whether it must be understood alone.
+    /// Takes the message to be encoded now: its channel, its payload, and whether it must be decodable on its own.
     pub(crate) fn take(&mut self) -> Option<(u32, Bytes, bool)> {
         let (out, taken) = self.message.as_mut().filter(|(_, taken)| !taken)?;
         *taken = true;
         Some((out.channel?, out.payload.clone(), out.each))
     }
 
-    /// It was encoded; none: it goes as it is.
+    /// Stores the encoded message; `None`: it is sent unencoded.
     pub(crate) fn finish(&mut self, frame: Option<(Bytes, Duration)>) {
         let Some((mut out, _)) = self.message.take() else {
             return;
@@ -87,12 +87,15 @@ impl Encoding {
         self.done = Some(out);
     }
 
-    /// The message that was encoded, if it `may` go.
-    pub(super) fn take_done(&mut self, may: impl FnOnce(&mut Out) -> bool) -> Option<Out> {
+    /// Takes the encoded message, if it `may` be sent.
+    pub(super) fn take_encoded(
+        &mut self,
+        may: impl FnOnce(&mut OutgoingRecord) -> bool,
+    ) -> Option<OutgoingRecord> {
         self.done.take_if(may)
     }
 
-    pub(super) fn is_done(&self) -> bool {
+    pub(super) fn has_encoded(&self) -> bool {
         self.done.is_some()
     }
 
@@ -101,24 +104,24 @@ impl Encoding {
     }
 
     pub(super) fn is_empty(&self) -> bool {
-        !self.is_done() && !self.is_busy()
+        !self.has_encoded() && !self.is_busy()
     }
 
-    /// The messages that are and were encoded.
-    pub(super) fn messages(&self) -> impl Iterator<Item = &Out> {
+    /// Returns the message being encoded and the encoded one.
+    pub(super) fn messages(&self) -> impl Iterator<Item = &OutgoingRecord> {
         self.message.iter().map(|(out, _)| out).chain(&self.done)
     }
 
-    /// Gives them back.
-    pub(super) fn give_up(&mut self) -> impl Iterator<Item = Out> + use<> {
+    /// Removes both messages and returns them.
+    pub(super) fn drain(&mut self) -> impl Iterator<Item = OutgoingRecord> + use<> {
         let message = self.message.take().map(|(out, _)| out);
         message.into_iter().chain(self.done.take())
     }
 
-    /// The channel is gone; says whether a message of it was encoded in vain.
+    /// Forgets a channel and returns whether an encoded message was discarded.
     pub(super) fn forget(&mut self, channel: u32) -> bool {
         self.remove(channel);
-        let of_it = |out: &mut Out| out.channel == Some(channel);
+        let of_it = |out: &mut OutgoingRecord| out.channel == Some(channel);
         self.done.take_if(of_it).is_some()
     }
 }

@@ -1,35 +1,35 @@
-//! Which record may leave beside those that are under way.
+//! Decides which record may be sent while others are in flight.
 
 use std::collections::{BTreeMap, VecDeque};
 
-use super::lanes::{Lane, Lanes};
-use super::out::Out;
-use super::{SMALL, Sending};
-use crate::limits::Limits;
+use super::lanes::{RecordLane, RecordLanes};
+use super::out::OutgoingRecord;
+use super::{InFlightRecord, SMALL};
+use crate::limits::LinkLimits;
 
-/// Streams that messages and long answers leave to control and calls.
+/// Streams reserved for control records and calls, which messages and long responses may not use.
 const RESERVED: usize = 2;
 
-/// What is under way and waits, as far as others must wait for it.
+/// The records in flight and queued for which others must wait.
 pub(super) struct Gate<'a> {
-    sending: &'a VecDeque<Sending>,
-    lanes: &'a Lanes,
-    /// By channel: the last order that was told before its first message.
+    sending: &'a VecDeque<InFlightRecord>,
+    lanes: &'a RecordLanes,
+    /// By channel: the last control record that was pushed before its first message.
     openings: &'a BTreeMap<u32, u64>,
-    /// The first order that has not left as a whole.
+    /// The first control record that has not been sent completely.
     untold: Option<u64>,
-    peer: Limits,
+    peer: LinkLimits,
 }
 
 impl<'a> Gate<'a> {
     pub(super) fn new(
-        sending: &'a VecDeque<Sending>,
-        lanes: &'a Lanes,
+        sending: &'a VecDeque<InFlightRecord>,
+        lanes: &'a RecordLanes,
         openings: &'a BTreeMap<u32, u64>,
-        peer: Limits,
+        peer: LinkLimits,
     ) -> Self {
         let started = sending.iter().map(|sending| &sending.out);
-        let started = started.filter(|out| out.lane == Lane::Control);
+        let started = started.filter(|out| out.lane == RecordLane::Control);
         let untold = started.map(|out| out.order).chain(lanes.next_control());
         Self {
             sending,
@@ -40,14 +40,15 @@ impl<'a> Gate<'a> {
         }
     }
 
-    /// Whether a record may leave: it overtakes none that it may not, and the peer takes one more.
-    pub(super) fn lets(&self, out: &Out) -> bool {
+    /// Returns whether a record may be sent: it overtakes none that it must not overtake, and the peer accepts one
+    /// more.
+    pub(super) fn allows(&self, out: &OutgoingRecord) -> bool {
         let mut started = self.sending.iter().map(|sending| &sending.out);
-        started.all(|other| out.passes(other)) && self.is_open(out) && self.has_room(out)
+        started.all(|other| out.may_overtake(other)) && self.is_open(out) && self.has_room(out)
     }
 
-    /// Whether the peer has been told of its channel before; a channel is closed after its goals.
-    fn is_open(&self, out: &Out) -> bool {
+    /// Returns whether the channel has been announced to the peer; a channel is closed after its goals.
+    fn is_open(&self, out: &OutgoingRecord) -> bool {
         let Some(channel) = out.channel else {
             return true;
         };
@@ -58,17 +59,18 @@ impl<'a> Gate<'a> {
 
     fn has_goal(&self, channel: u32) -> bool {
         let mut started = self.sending.iter().map(|sending| &sending.out);
-        let is_goal = |out: &Out| out.lane == Lane::Calls && out.channel == Some(channel);
+        let is_goal =
+            |out: &OutgoingRecord| out.lane == RecordLane::Calls && out.channel == Some(channel);
         started.any(is_goal) || self.lanes.has_goal(channel)
     }
 
-    /// Whether the peer takes it beside what is under way: one always.
-    fn has_room(&self, out: &Out) -> bool {
+    /// Returns whether the peer accepts the record in addition to those in flight; one is always accepted.
+    fn has_room(&self, out: &OutgoingRecord) -> bool {
         if out.len() <= SMALL || self.sending.is_empty() {
             return true;
         }
         let reserved = match out.lane {
-            Lane::Control | Lane::Calls => 0,
+            RecordLane::Control | RecordLane::Calls => 0,
             _ => RESERVED,
         };
         let lengths = self.sending.iter().map(|sending| sending.out.len());

@@ -1,66 +1,67 @@
-//! The lanes of records that must come, and that of lines.
+//! The lanes of records that must be delivered, and the lane of printed lines.
 
-use ros::ring::{Bounds, Held, Ring};
+use ros::ring::{Ring, RingBounds, RingItem};
 
-use super::out::Out;
+use super::out::OutgoingRecord;
 use crate::control::FromCloud;
 use crate::limits::{ANSWERS, CALLS, CONTROL, LINES};
 use crate::record::Record;
 
-/// Where a record waits. One record of a lane is under way at a time, of data one of each topic, so none overtakes another of its lane.
+/// The queue to which a record belongs. One record of each lane (of the data lane: of each topic) is in flight at a
+/// time, so that none overtakes another of its lane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Lane {
-    /// What the ends tell each other.
+pub(super) enum RecordLane {
+    /// Control messages.
     Control,
-    /// Calls, goals, and what cancels them.
+    /// Calls, goals and their cancellations.
     Calls,
-    /// Answers that go in one piece: whose they are stands in them, so they need not wait for long ones.
+    /// Responses in one piece. They carry the id of their call, so they need not wait for long responses.
     Answers,
-    /// Answers in several pieces.
+    /// Responses in several pieces.
     LongAnswers,
-    /// Messages of topics.
+    /// Topic messages.
     Data,
-    /// Lines that a node has printed.
+    /// Lines printed by a node.
     Lines,
 }
 
-/// A line is sent beside other records when so many times its bytes of those have gone.
+/// Share of lines on a busy link: one byte of lines per this many bytes of other records.
 const LINES_SHARE: usize = 16;
-/// Bytes of lines that may follow each other after a time without any.
+/// Maximum burst of lines in bytes after a time without any.
 const MOST_CREDIT: usize = 16 << 10;
 
-/// Records that wait, are under way or are kept until the peer has them.
+/// Records that are queued, in flight or unacknowledged.
 #[derive(Debug, Clone, Copy, Default)]
-struct Load {
+struct LaneLoad {
     records: usize,
     bytes: usize,
 }
 
-/// The lanes of control, of calls and goals, and of answers.
+/// The lanes of control messages, of calls and goals, and of responses.
 #[derive(Debug)]
-pub(super) struct Lanes {
-    waiting: [Ring<Out>; 4],
-    loads: [Load; 4],
+pub(super) struct RecordLanes {
+    waiting: [Ring<OutgoingRecord>; 4],
+    loads: [LaneLoad; 4],
 }
 
-impl Default for Lanes {
+impl Default for RecordLanes {
     fn default() -> Self {
         Self {
-            waiting: std::array::from_fn(|_| Ring::unbounded()),
+            waiting: std::array::from_fn(|_| Ring::new_unbounded()),
             loads: Default::default(),
         }
     }
 }
 
-impl Lanes {
-    /// What of these is kept, and how much of it at most: both lanes of answers together.
-    fn load(&self, lane: Lane) -> (Load, &'static str, Bounds) {
+impl RecordLanes {
+    /// Returns the load of a lane, the name of its records and its limit; both lanes of responses count together.
+    fn load(&self, lane: RecordLane) -> (LaneLoad, &'static str, RingBounds) {
         let [control, calls, short, long] = self.loads;
         match lane {
-            Lane::Control => (control, "orders", CONTROL),
-            Lane::Calls => (calls, "calls", CALLS),
+            RecordLane::Control => (control, "orders", CONTROL),
+            RecordLane::Calls => (calls, "calls", CALLS),
             _ => {
-                let both = Load {
+                let both = LaneLoad {
                     records: short.records + long.records,
                     bytes: short.bytes + long.bytes,
                 };
@@ -69,58 +70,58 @@ impl Lanes {
         }
     }
 
-    /// Why no more records of a lane may be kept beside those that are, if this one has so many bytes.
-    pub(super) fn refuse(&self, lane: Lane, bytes: usize) -> Option<String> {
+    /// Returns why another record of this size may not be kept in a lane.
+    pub(super) fn overflow_reason(&self, lane: RecordLane, bytes: usize) -> Option<String> {
         let (load, what, bounds) = self.load(lane);
         let is_full = load.records >= bounds.messages
             || (load.records > 0 && load.bytes + bytes > bounds.bytes);
         is_full.then(|| {
-            let Load { records, bytes } = load;
+            let LaneLoad { records, bytes } = load;
             format!("{records} {what} of {bytes} bytes wait for it or are not acknowledged")
         })
     }
 
-    /// Adds a record that is kept from now on.
-    pub(super) fn push(&mut self, out: Out) {
+    /// Queues a record; it is kept until it is acknowledged.
+    pub(super) fn push(&mut self, out: OutgoingRecord) {
         let load = &mut self.loads[out.lane as usize];
         load.records += 1;
-        load.bytes += out.held();
+        load.bytes += out.memory_size();
         self.waiting[out.lane as usize].append(out);
     }
 
-    /// Adds one that has not come, before the others.
-    pub(super) fn put_back(&mut self, out: Out) {
+    /// Queues a record that was not received, in front of the others.
+    pub(super) fn put_back(&mut self, out: OutgoingRecord) {
         self.waiting[out.lane as usize].put_back(out);
     }
 
-    /// The peer has this one.
-    pub(super) fn let_go(&mut self, out: &Out) {
+    /// Releases a record that the peer has acknowledged.
+    pub(super) fn release(&mut self, out: &OutgoingRecord) {
         if let Some(load) = self.loads.get_mut(out.lane as usize) {
             load.records -= 1;
-            load.bytes -= out.held();
+            load.bytes -= out.memory_size();
         }
     }
 
-    /// The lane of the record that was pushed first, of the first ones of all lanes that `may` go.
-    pub(super) fn first(&self, may: impl Fn(&Out) -> bool) -> Option<Lane> {
+    /// Returns the lane of the oldest record, among the first ones of all lanes that `may` be sent.
+    pub(super) fn first_ready(&self, may: impl Fn(&OutgoingRecord) -> bool) -> Option<RecordLane> {
         let firsts = self.waiting.iter().filter_map(Ring::front);
         let first = firsts.filter(|out| may(out)).min_by_key(|out| out.order)?;
         Some(first.lane)
     }
 
-    pub(super) fn take(&mut self, lane: Lane) -> Option<Out> {
+    pub(super) fn take(&mut self, lane: RecordLane) -> Option<OutgoingRecord> {
         self.waiting[lane as usize].pop()
     }
 
-    /// The next order to be told.
+    /// Returns the order number of the next control record.
     pub(super) fn next_control(&self) -> Option<u64> {
-        let first = self.waiting[Lane::Control as usize].front();
+        let first = self.waiting[RecordLane::Control as usize].front();
         first.map(|out| out.order)
     }
 
-    /// Whether a goal of this channel waits.
+    /// Returns whether a goal of this channel is queued.
     pub(super) fn has_goal(&self, channel: u32) -> bool {
-        let mut calls = self.waiting[Lane::Calls as usize].iter();
+        let mut calls = self.waiting[RecordLane::Calls as usize].iter();
         calls.any(|out| out.channel == Some(channel))
     }
 
@@ -128,61 +129,70 @@ impl Lanes {
         self.waiting.iter().all(Ring::is_empty)
     }
 
-    /// Bytes of all that is kept.
+    /// Returns the number of bytes kept in all lanes.
     pub(super) fn bytes(&self) -> usize {
         self.loads.iter().map(|load| load.bytes).sum()
     }
 }
 
-/// Lines of a node: the oldest are left out where they are too many, and they take a small share of a link on which something else waits.
+/// The lines printed by a node: the oldest are omitted if there are too many, and they get a small share of a busy
+/// link.
 #[derive(Debug)]
-pub(super) struct Lines {
-    waiting: Ring<Out>,
-    /// Bytes that may go beside what waits.
+pub(super) struct LineQueue {
+    waiting: Ring<OutgoingRecord>,
+    /// Bytes of lines that may be sent ahead of other queued records.
     credit: usize,
 }
 
-impl Default for Lines {
+impl Default for LineQueue {
     fn default() -> Self {
         Self {
-            waiting: Ring::unbounded(),
+            waiting: Ring::new_unbounded(),
             credit: 0,
         }
     }
 }
 
-impl Lines {
-    pub(super) fn push(&mut self, line: Out) {
+impl LineQueue {
+    pub(super) fn push(&mut self, line: OutgoingRecord) {
         self.waiting.append(line);
         let mut left_out = 0;
         while self.waiting.exceeds(LINES) {
-            left_out += self.waiting.pop().map_or(0, |oldest| oldest.lines());
+            left_out += self.waiting.pop().map_or(0, |oldest| oldest.line_count());
         }
-        self.leave_out(left_out);
+        self.note_omitted(left_out);
     }
 
-    /// Adds one that has not come, before the others.
-    pub(super) fn put_back(&mut self, line: Out) {
+    /// Queues a line that was not received, in front of the others.
+    pub(super) fn put_back(&mut self, line: OutgoingRecord) {
         self.waiting.put_back(line);
     }
 
-    /// Has it told that lines before the others will not come.
-    pub(super) fn leave_out(&mut self, lines: i64) {
+    /// Notes that lines in front of the queue are omitted, so that the peer is told.
+    pub(super) fn note_omitted(&mut self, lines: i64) {
         if lines > 0 {
-            let told = self.waiting.front().is_some_and(|first| first.must_come());
+            let told = self
+                .waiting
+                .front()
+                .is_some_and(|first| first.is_required());
             let told = told.then(|| self.waiting.pop()).flatten();
-            let more = told.map_or(0, |told| told.lines());
-            self.waiting.put_back(Out::left_out(lines + more));
+            let more = told.map_or(0, |told| told.line_count());
+            self.waiting
+                .put_back(OutgoingRecord::omission_notice(lines + more));
         }
     }
 
-    /// So many bytes of something else were sent.
-    pub(super) fn earn(&mut self, bytes: usize) {
+    /// Credits lines with their share of other bytes sent.
+    pub(super) fn earn_credit(&mut self, bytes: usize) {
         self.credit = (self.credit + bytes / LINES_SHARE).min(MOST_CREDIT);
     }
 
-    /// The next line, if it `may` go. `is_alone`: nothing else can.
-    pub(super) fn take(&mut self, is_alone: bool, may: impl Fn(&Out) -> bool) -> Option<Out> {
+    /// Takes the next line, if it `may` be sent. `is_alone`: nothing else can be sent.
+    pub(super) fn take(
+        &mut self,
+        is_alone: bool,
+        may: impl Fn(&OutgoingRecord) -> bool,
+    ) -> Option<OutgoingRecord> {
         let first = self.waiting.front().filter(|out| may(out))?;
         let length = first.len().min(MOST_CREDIT);
         if !is_alone && length > self.credit {
@@ -201,26 +211,27 @@ impl Lines {
     }
 }
 
-impl Out {
-    /// What is told in place of lines that do not come.
-    fn left_out(lines: i64) -> Self {
+impl OutgoingRecord {
+    /// Creates the notice that replaces omitted lines.
+    fn omission_notice(lines: i64) -> Self {
         let noun = if lines == 1 { "line" } else { "lines" };
         let line = FromCloud::Line {
             error: true,
             text: format!(
-                "[{lines} {noun} of the node left out here: it prints more than the link carries; the server has its whole log]"
+                "[{lines} {noun} of the node omitted here: it prints more than the link carries; the server has its \
+                    complete log]"
             ),
         };
         let json = serde_json::to_vec(&line).unwrap_or_default();
         Self {
             each: true,
             born: lines,
-            ..Self::of(&Record::Control(json.into()), Lane::Lines)
+            ..Self::new(&Record::Control(json.into()), RecordLane::Lines)
         }
     }
 
-    /// How many lines of the node it stands for.
-    fn lines(&self) -> i64 {
+    /// Returns the number of the node's lines that this record stands for.
+    fn line_count(&self) -> i64 {
         self.born.max(1)
     }
 }

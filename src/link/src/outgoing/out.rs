@@ -1,29 +1,30 @@
-//! A record on its way out, in the pieces in which it goes.
+//! An outgoing record and the pieces in which it is sent.
 
 use bytes::{BufMut, Bytes, BytesMut};
-use ros::ring::Held;
+use ros::ring::RingItem;
 use ros::ros1::actions;
 
 use super::SMALL;
-use super::lanes::Lane;
+use super::lanes::RecordLane;
 use crate::record::Record;
 
-/// How a message may be treated.
+/// Delivery guarantee of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quality {
-    /// A newer one may take its place.
+pub enum DeliveryMode {
+    /// A newer message may replace it.
     Newest,
-    /// Every one counts (latched messages, results): never dropped for its age.
+    /// Every message is delivered (latched messages, results): it is never dropped because of its age.
     Each,
-    /// Every one counts, and none comes before another one of any topic that was sent before it (goals, and what cancels them), nor before a
-    /// call.
+    /// Every message is delivered, in order with those of all topics of this mode (goals and their cancellations) and
+    /// with calls.
     InOrder,
 }
 
-impl Quality {
-    /// How a message of this type is treated: goals, what cancels them, and what comes of them are no stream of which the newest would do.
-    pub fn of(type_name: &str, is_latching: bool) -> Self {
-        if actions::commands(type_name) {
+impl DeliveryMode {
+    /// Returns the mode for messages of a type: goals, their cancellations and their results are not a stream of which
+    /// only the newest message matters.
+    pub fn for_type(type_name: &str, is_latching: bool) -> Self {
+        if actions::is_command_type(type_name) {
             Self::InOrder
         } else if is_latching || actions::carries_goal_id(type_name) {
             Self::Each
@@ -34,33 +35,33 @@ impl Quality {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) struct Out {
+pub(crate) struct OutgoingRecord {
     pub(super) head: BytesMut,
     pub(super) payload: Bytes,
     pub(super) born: i64,
-    /// Every one counts.
+    /// Must not be replaced by a newer message.
     pub(super) each: bool,
-    pub(super) lane: Lane,
-    /// Counts all records of the session in the order in which they were pushed.
+    pub(super) lane: RecordLane,
+    /// Sequence number over all records of the session, in the order in which they were pushed.
     pub(super) order: u64,
-    /// Of a message, and of what closes its channel.
+    /// Channel of a message, or of the record that closes it.
     pub(super) channel: Option<u32>,
-    /// The message before it was encoded, where each one counts: it may come damaged.
+    /// The message before it was encoded, if it must be delivered: it may arrive damaged.
     pub(super) plain: Option<Bytes>,
-    /// No message: the last record of its channel, which tells that there will be no more.
+    /// Not a message but the last record of its channel, which announces that it is closed.
     pub(super) closes: bool,
 }
 
-impl Held for Out {
-    /// With the message before it was encoded.
-    fn held(&self) -> usize {
+impl RingItem for OutgoingRecord {
+    /// Includes the message before it was encoded.
+    fn memory_size(&self) -> usize {
         self.len() + self.plain.as_ref().map_or(0, Bytes::len)
     }
 }
 
-impl Out {
-    pub(super) fn of(record: &Record, lane: Lane) -> Self {
-        let (head, payload) = record.parts();
+impl OutgoingRecord {
+    pub(super) fn new(record: &Record, lane: RecordLane) -> Self {
+        let (head, payload) = record.to_parts();
         let (channel, born) = match record {
             Record::Data(data) => (Some(data.channel), data.born),
             _ => (None, 0),
@@ -78,36 +79,36 @@ impl Out {
         }
     }
 
-    /// Bytes of the record.
+    /// Returns the length of the record in bytes.
     pub(super) fn len(&self) -> usize {
         self.head.len() + self.payload.len()
     }
 
     pub(super) fn is_big(&self) -> bool {
-        self.held() > SMALL
+        self.memory_size() > SMALL
     }
 
-    /// It must come, but for the limits of its lane.
-    pub(super) fn must_come(&self) -> bool {
+    /// Returns whether it must be delivered, within the limits of its lane.
+    pub(super) fn is_required(&self) -> bool {
         match self.lane {
-            Lane::Data => self.closes,
-            // What tells of others that were left out.
-            Lane::Lines => self.each,
+            RecordLane::Data => self.closes,
+            // The notice about omitted lines.
+            RecordLane::Lines => self.each,
             _ => true,
         }
     }
 
-    /// Whether it may come before another record that is under way.
-    pub(super) fn passes(&self, other: &Self) -> bool {
+    /// Returns whether it may arrive before another record that is in flight.
+    pub(super) fn may_overtake(&self, other: &Self) -> bool {
         match self.lane {
             _ if self.lane != other.lane => true,
-            Lane::LongAnswers => true,
-            Lane::Data => self.channel != other.channel,
+            RecordLane::LongAnswers => true,
+            RecordLane::Data => self.channel != other.channel,
             _ => false,
         }
     }
 
-    /// Bytes from `at` on, at most `length`.
+    /// Returns the bytes from `at` on, at most `length`.
     pub(super) fn piece(&self, at: usize, length: usize) -> Bytes {
         let end = (at + length).min(self.len());
         let head = self.head.len();

@@ -1,13 +1,13 @@
 use super::*;
 
-fn both() -> (Packing, Packing) {
-    let (mut robot, cloud) = (Packing::default(), Packing::default());
-    robot.peer_decodes(&decoded_here(|_| false));
+fn codec_pair() -> (SessionCodecs, SessionCodecs) {
+    let (mut robot, cloud) = (SessionCodecs::default(), SessionCodecs::default());
+    robot.set_peer_codecs(&supported_codecs(|_| false));
     robot.add(1, Schema::OccupancyGrid);
     (robot, cloud)
 }
 
-/// A grid of 40×40 cells, known up to `wall`.
+/// An occupancy grid of 40×40 cells, known up to cell `wall`.
 fn grid(wall: usize) -> Bytes {
     let mut message = vec![0; 24];
     message.extend_from_slice(&0.5_f32.to_le_bytes());
@@ -19,40 +19,40 @@ fn grid(wall: usize) -> Bytes {
     message.into()
 }
 
-fn pack(packing: &mut Packing, wall: usize, alone: bool) -> Bytes {
-    let job = packing.job(1, grid(wall), alone, Some(1e5)).unwrap();
+fn encode(packing: &mut SessionCodecs, wall: usize, alone: bool) -> Bytes {
+    let job = packing.encode_job(1, grid(wall), alone, Some(1e5)).unwrap();
     let packed = job.run();
-    packing.done(packed)
+    packing.finish(packed)
 }
 
 #[test]
 fn a_message_that_is_being_encoded_when_its_connection_is_lost_spoils_none_after_it() {
-    let (mut robot, mut cloud) = both();
+    let (mut robot, mut cloud) = codec_pair();
     for wall in (100..1500).step_by(7) {
-        let job = robot.job(1, grid(wall), false, Some(1e5)).unwrap();
-        // What becomes of every fifth is not waited for: its connection is gone, and its encoder with it.
+        let job = robot.encode_job(1, grid(wall), false, Some(1e5)).unwrap();
+        // Every fifth job is abandoned: its connection is lost, and its encoder with it.
         if wall % 5 == 0 {
             drop(job.run());
             robot.reconnect();
             continue;
         }
-        let frame = robot.done(job.run());
-        let (message, answer) = cloud.unpack(1, &frame);
+        let frame = robot.finish(job.run());
+        let (message, answer) = cloud.decode(1, &frame);
         assert!(message.unwrap() == grid(wall), "{wall}");
         if let Some(answer) = answer {
-            robot.answered(1, answer);
+            robot.on_answer(1, answer);
         }
     }
 }
 
 #[test]
 fn every_grid_is_understood_alone() {
-    let (mut robot, mut cloud) = both();
+    let (mut robot, mut cloud) = codec_pair();
     for wall in (100..1500).step_by(7) {
-        let frame = pack(&mut robot, wall, wall % 3 == 0);
-        let mut stranger = Packing::default();
+        let frame = encode(&mut robot, wall, wall % 3 == 0);
+        let mut stranger = SessionCodecs::default();
         for receiver in [&mut stranger, &mut cloud] {
-            let (message, answer) = receiver.unpack(1, &frame);
+            let (message, answer) = receiver.decode(1, &frame);
             assert!(message.unwrap() == grid(wall), "{wall}");
             assert_eq!(answer, None);
         }
@@ -61,34 +61,37 @@ fn every_grid_is_understood_alone() {
 
 #[test]
 fn pictures_lose_detail_only_where_both_ends_say_so() {
-    let names = |welcome: fn(Codec) -> bool| decoded_here(welcome);
+    let names = |welcome: fn(Codec) -> bool| supported_codecs(welcome);
     assert!(
         names(|_| false)
             .iter()
             .all(|name| name != "jpeg" && name != "video")
     );
     assert!(names(|codec| codec == Codec::Jpeg).contains(&"jpeg".to_owned()));
-    // What is not built is not promised.
+    // Codecs that are not built in are not announced.
     let video = names(|codec| codec == Codec::Video).contains(&"video".to_owned());
-    assert_eq!(video, Codec::Video.is_built());
-    let mut robot = Packing::new(Some(Duration::from_millis(400)));
+    assert_eq!(video, Codec::Video.is_available());
+    let mut robot = SessionCodecs::new(Some(Duration::from_millis(400)));
     robot.set_quality(Some(50));
-    robot.peer_decodes(&names(|codec| codec == Codec::Jpeg));
+    robot.set_peer_codecs(&names(|codec| codec == Codec::Jpeg));
     assert_eq!(robot.lossy, Some(Codec::Jpeg));
     robot.add(1, Schema::Image);
-    // Of a link that needs a second for a picture as it is, the fastest lossless codec takes longer than T_max allows.
+    // On a link that needs a second for an uncompressed image, the fastest lossless codec takes longer than T_max
+    // allows.
     let mut used = Vec::new();
     for number in 0..60 {
-        let job = robot.job(1, noisy(number), false, Some(60e3)).unwrap();
-        let frame = robot.done(job.run());
+        let job = robot
+            .encode_job(1, noisy(number), false, Some(60e3))
+            .unwrap();
+        let frame = robot.finish(job.run());
         used.push(codec::peek(&frame).unwrap().codec);
-        let (message, _) = Packing::default().unpack(1, &frame);
+        let (message, _) = SessionCodecs::default().decode(1, &frame);
         assert_eq!(message.unwrap().len(), noisy(number).len());
     }
     assert_eq!(used.last(), Some(&Codec::Jpeg), "{used:?}");
 }
 
-/// A picture in which lossless codecs find little.
+/// An image that lossless codecs cannot compress well.
 fn noisy(number: u32) -> Bytes {
     let mut message = vec![0; 12];
     message.extend([0; 4]);
@@ -106,24 +109,24 @@ fn noisy(number: u32) -> Bytes {
 
 #[test]
 fn encoding_pays_where_the_link_is_slow_and_the_peer_decodes() {
-    let (robot, cloud) = both();
-    assert!(robot.pays(Some(2.5e6)));
-    assert!(!robot.pays(Some(1e9)) && !robot.pays(None));
+    let (robot, cloud) = codec_pair();
+    assert!(robot.is_worthwhile(Some(2.5e6)));
+    assert!(!robot.is_worthwhile(Some(1e9)) && !robot.is_worthwhile(None));
     assert!(
-        !cloud.pays(Some(2.5e6)),
+        !cloud.is_worthwhile(Some(2.5e6)),
         "it was not told what its peer decodes"
     );
-    let mut old = Packing::default();
-    old.peer_decodes(&["raw".to_owned(), "zstd".to_owned()]);
-    assert!(!old.pays(Some(2.5e6)));
+    let mut old = SessionCodecs::default();
+    old.set_peer_codecs(&["raw".to_owned(), "zstd".to_owned()]);
+    assert!(!old.is_worthwhile(Some(2.5e6)));
 }
 
 #[test]
 fn broken_frames_are_refused() {
-    let mut cloud = Packing::default();
+    let mut cloud = SessionCodecs::default();
     for frame in [&[][..], &[0xff, 1, 1, 1], &[0x10, 2, 1, 0xff]] {
-        let (message, answer) = cloud.unpack(1, frame);
+        let (message, answer) = cloud.decode(1, frame);
         assert!(message.is_err());
-        assert_eq!(answer, Some(Answer::Damaged));
+        assert_eq!(answer, Some(ReceiverFeedback::Damaged));
     }
 }

@@ -11,73 +11,75 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, Sleep, sleep_until, timeout};
-use ws::{Message, WebSocket, WsError, frame as opcode};
+use ws::{WebSocket, WsError, WsMessage, frame as opcode};
 
-use super::{Handler, Lost, Session, SessionOptions};
+use super::{DisconnectReason, Session, SessionHandler, SessionOptions};
 use crate::Error;
-use crate::clock::{Sample, now};
-use crate::control::Order;
-use crate::frame::{Frame, Received};
-use crate::packing::Packed;
+use crate::clock::{ClockSample, now};
+use crate::control::ControlMessage;
+use crate::frame::{Frame, ReceiveProgress};
+use crate::packing::EncodedMessage;
 use crate::record::Record;
 
-/// Acknowledged at the latest after so many records, and bytes.
+/// Number of records and bytes after which an acknowledgement is sent.
 const ACK_AFTER: (u32, u64) = (64, 64 * 1024);
-/// After so many messages in a row those who pass them on have their turn, or their queues would overflow.
+/// Number of messages in a row after which other tasks get a turn, or the queues of those that forward them would
+/// overflow.
 const IN_A_ROW: u32 = 32;
-/// Bytes that a call takes beside its request, until it is answered.
+/// Memory overhead of a call in bytes, until it is answered.
 const CALL: usize = 1024;
-/// For the peer to take what still waits when this side ends the session: without a sign of it, and at most.
+/// Time for the peer to receive what is queued when this end closes the session: without a sign of the peer, and in
+/// total.
 const TAKES: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(10));
-/// For its close frame after that.
+/// Time for the peer's close frame after that.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// Exchanges made at once on a new connection, to know the peer's clock.
+/// Number of pings sent immediately on a new connection to measure the peer's clock.
 const FIRST_PINGS: u32 = 6;
 
-impl<O: Order> Session<O> {
-    /// Carries the session over a connection that was opened, until that ends.
-    pub async fn run<S, H>(&self, socket: &mut WebSocket<S>, handler: &H) -> Lost
+impl<O: ControlMessage> Session<O> {
+    /// Carries the session over an opened connection until the connection ends.
+    pub async fn run<S, H>(&self, socket: &mut WebSocket<S>, handler: &H) -> DisconnectReason
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler<O::OfPeer> + ?Sized,
+        H: SessionHandler<O::FromPeer> + ?Sized,
     {
         let lost = {
-            // Nothing carries the session any more when this future is dropped, either.
-            let _down = Down(&self.up);
-            match self.carry(socket, handler).await {
+            // The session is also no longer carried when this future is dropped.
+            let _down = DownGuard(&self.up);
+            match self.run_connection(socket, handler).await {
                 Ok(never) => match never {},
                 Err(lost) => lost,
             }
         };
         let goodbye = match &lost {
-            Lost::Ended => {
+            DisconnectReason::Ended => {
                 let ending = &self.state.lock().ending;
                 ending
                     .as_ref()
                     .map(|ending| (ending.code, ending.reason.clone()))
             }
-            Lost::Closed { code, .. } => Some((*code, String::new())),
-            lost => lost.goodbye(),
+            DisconnectReason::Closed { code, .. } => Some((*code, String::new())),
+            lost => lost.close_frame(),
         };
         if let Some((code, reason)) = goodbye {
             socket.queue_close(code, &reason);
-            let is_closed = matches!(lost, Lost::Closed { .. });
-            let _ = timeout(FAREWELL, socket.leave(!is_closed)).await;
+            let is_closed = matches!(lost, DisconnectReason::Closed { .. });
+            let _ = timeout(FAREWELL, socket.shutdown(!is_closed)).await;
         }
         lost
     }
 
-    async fn carry<S, H>(
+    async fn run_connection<S, H>(
         &self,
         socket: &mut WebSocket<S>,
         handler: &H,
-    ) -> Result<std::convert::Infallible, Lost>
+    ) -> Result<std::convert::Infallible, DisconnectReason>
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler<O::OfPeer> + ?Sized,
+        H: SessionHandler<O::FromPeer> + ?Sized,
     {
-        let mut connection = Connection::new();
-        let mut job: Option<JoinHandle<Packed>> = None;
+        let mut connection = SessionConnection::new();
+        let mut job: Option<JoinHandle<EncodedMessage>> = None;
         let mut tick = pin!(sleep_until(connection.next_tick(&self.options)));
         connection.ping(self, socket);
         self.up.send_if_modified(|up| !std::mem::replace(up, true));
@@ -85,41 +87,41 @@ impl<O: Order> Session<O> {
             let mut woken = pin!(self.wake.notified());
             let event = poll_fn(|cx| {
                 loop {
-                    self.fill(socket);
+                    self.fill_socket(socket);
                     if job.is_none() {
-                        job = self.pack();
+                        job = self.start_encoding();
                     }
                     let polled = job.as_mut().map(|job| Pin::new(job).poll(cx));
                     if let Some(Poll::Ready(packed)) = polled {
                         job = None;
-                        self.packed(packed.ok());
+                        self.finish_encoding(packed.ok());
                         continue;
                     }
-                    if socket.queued() == 0 {
+                    if socket.bytes_queued() == 0 {
                         break;
                     }
                     match socket.poll_flush(cx) {
                         Poll::Ready(Ok(())) => {}
                         Poll::Ready(Err(error)) => {
-                            return Poll::Ready(Event::Message(Err(error.into())));
+                            return Poll::Ready(ConnectionEvent::Message(Err(error.into())));
                         }
                         Poll::Pending => break,
                     }
                 }
-                if self.has_ended(&connection, socket.queued()) {
-                    return Poll::Ready(Event::Ended);
+                if self.is_finished(&connection, socket.bytes_queued()) {
+                    return Poll::Ready(ConnectionEvent::Ended);
                 }
                 if let Poll::Ready(message) = socket.poll_next(cx) {
-                    return Poll::Ready(Event::Message(message));
+                    return Poll::Ready(ConnectionEvent::Message(message));
                 }
                 if woken.as_mut().poll(cx).is_ready() {
-                    return Poll::Ready(Event::Woken);
+                    return Poll::Ready(ConnectionEvent::Woken);
                 }
-                tick.as_mut().poll(cx).map(|()| Event::Tick)
+                tick.as_mut().poll(cx).map(|()| ConnectionEvent::Tick)
             })
             .await;
             match event {
-                Event::Message(message) => {
+                ConnectionEvent::Message(message) => {
                     connection.heard = Instant::now();
                     connection.in_a_row += 1;
                     if connection.in_a_row == IN_A_ROW {
@@ -127,37 +129,37 @@ impl<O: Order> Session<O> {
                         tokio::task::yield_now().await;
                     }
                     self.up.send_if_modified(|up| !std::mem::replace(up, true));
-                    match message.map_err(socket_lost)? {
-                        Message::Binary(bytes) => {
-                            self.take(socket, &mut connection, bytes, handler)?;
+                    match message.map_err(disconnect_reason)? {
+                        WsMessage::Binary(bytes) => {
+                            self.handle_frame(socket, &mut connection, bytes, handler)?;
                         }
-                        Message::Ping(payload) => socket.queue(opcode::PONG, payload),
-                        Message::Pong(_) => {}
-                        Message::Text(_) => {
+                        WsMessage::Ping(payload) => socket.queue(opcode::PONG, payload),
+                        WsMessage::Pong(_) => {}
+                        WsMessage::Text(_) => {
                             return Err(Error::Protocol("text, where frames are binary").into());
                         }
-                        Message::Close(code, reason) => {
-                            return Err(Lost::Closed { code, reason });
+                        WsMessage::Close(code, reason) => {
+                            return Err(DisconnectReason::Closed { code, reason });
                         }
                     }
                 }
-                Event::Woken => {
-                    if let Some(reason) = self.state.lock().out.is_full() {
-                        return Err(Lost::Full(reason.to_owned()));
+                ConnectionEvent::Woken => {
+                    if let Some(reason) = self.state.lock().out.overflow_reason() {
+                        return Err(DisconnectReason::Full(reason.to_owned()));
                     }
                     if self.asked.swap(false, Ordering::Relaxed) {
                         connection.ping(self, socket);
                     }
-                    if let Some(by) = self.ends_by(&connection) {
+                    if let Some(by) = self.close_deadline(&connection) {
                         let first = by.min(tick.deadline());
                         Sleep::reset(tick.as_mut(), first);
                     }
                 }
-                Event::Ended => return Err(Lost::Ended),
-                Event::Tick => {
+                ConnectionEvent::Ended => return Err(DisconnectReason::Ended),
+                ConnectionEvent::Tick => {
                     let silence = connection.heard.elapsed();
                     if silence >= self.options.lost {
-                        return Err(Lost::Silent(silence));
+                        return Err(DisconnectReason::Silent(silence));
                     }
                     if silence >= self.options.silent {
                         self.up.send_if_modified(|up| std::mem::replace(up, false));
@@ -166,31 +168,31 @@ impl<O: Order> Session<O> {
                         connection.ping(self, socket);
                     }
                     let next = connection.next_tick(&self.options);
-                    let by = self.ends_by(&connection).unwrap_or(next);
+                    let by = self.close_deadline(&connection).unwrap_or(next);
                     Sleep::reset(tick.as_mut(), next.min(by));
                 }
             }
         }
     }
 
-    /// Whether this side has ended the session and the peer has all that waited, or had time enough.
-    fn has_ended(&self, connection: &Connection, queued: usize) -> bool {
-        let by = self.ends_by(connection);
+    /// Returns whether this end has closed the session and the peer has received everything queued, or had enough time.
+    fn is_finished(&self, connection: &SessionConnection, queued: usize) -> bool {
+        let by = self.close_deadline(connection);
         let is_through = || queued == 0 && self.state.lock().out.is_empty();
         by.is_some_and(|by| by <= Instant::now() || is_through())
     }
 
-    /// When what the peer does not take is given up, where this side has ended the session.
-    fn ends_by(&self, connection: &Connection) -> Option<Instant> {
+    /// Returns the time at which undelivered records are given up, if this end has closed the session.
+    fn close_deadline(&self, connection: &SessionConnection) -> Option<Instant> {
         let ended = self.state.lock().ending.as_ref()?.at.max(connection.begun);
         let (unheard, most) = TAKES;
         Some((connection.heard.max(ended) + unheard).min(ended + most))
     }
 
-    fn fill<S: AsyncRead + AsyncWrite + Unpin>(&self, socket: &mut WebSocket<S>) {
+    fn fill_socket<S: AsyncRead + AsyncWrite + Unpin>(&self, socket: &mut WebSocket<S>) {
         let mut state = self.state.lock();
         let low_water = state.out.low_water();
-        while socket.queued() < low_water {
+        while socket.bytes_queued() < low_water {
             let Some(frame) = state.out.next(now()) else {
                 return;
             };
@@ -198,22 +200,22 @@ impl<O: Order> Session<O> {
         }
     }
 
-    fn take<S, H>(
+    fn handle_frame<S, H>(
         &self,
         socket: &mut WebSocket<S>,
-        connection: &mut Connection,
+        connection: &mut SessionConnection,
         bytes: Bytes,
         handler: &H,
     ) -> Result<(), Error>
     where
         S: AsyncRead + AsyncWrite + Unpin,
-        H: Handler<O::OfPeer> + ?Sized,
+        H: SessionHandler<O::FromPeer> + ?Sized,
     {
         let arrived = now();
         let record = match Frame::decode(bytes)? {
             Frame::Whole { number, record } => {
                 connection.unacknowledged += u32::from(number != 0);
-                self.state.lock().incoming.whole(number, record)?
+                self.state.lock().incoming.receive_whole(number, record)?
             }
             Frame::Begin {
                 stream,
@@ -223,17 +225,17 @@ impl<O: Order> Session<O> {
             } => {
                 connection.unacknowledged += u32::from(number != 0);
                 let incoming = &mut self.state.lock().incoming;
-                incoming.begin(stream, number, total, &bytes)?
+                incoming.receive_begin(stream, number, total, &bytes)?
             }
             Frame::More { stream, bytes } => {
-                let whole = self.state.lock().incoming.more(stream, &bytes)?;
-                // The end of a big one tells how fast the link is.
+                let whole = self.state.lock().incoming.receive_more(stream, &bytes)?;
+                // The end of a big record shows how fast the link is.
                 connection.big_came = whole.is_some();
                 whole
             }
             Frame::Ping { sent, received } => {
-                self.acknowledged(received);
-                let received = self.received(connection);
+                self.on_acknowledged(received);
+                let received = self.take_progress(connection);
                 let pong = Frame::Pong {
                     sent,
                     arrived,
@@ -249,15 +251,15 @@ impl<O: Order> Session<O> {
                 left,
                 received,
             } => {
-                self.acknowledged(received);
-                let sample = Sample::new(sent, there, left, arrived);
+                self.on_acknowledged(received);
+                let sample = ClockSample::new(sent, there, left, arrived);
                 let best = {
                     let clock = &mut self.state.lock().clock;
                     clock.add(sample);
                     clock.best()
                 };
                 if let Some(best) = best {
-                    handler.clock(best);
+                    handler.on_clock_sample(best);
                 }
                 connection.pongs += 1;
                 self.pongs.send_modify(|pongs| *pongs += 1);
@@ -267,11 +269,11 @@ impl<O: Order> Session<O> {
                 None
             }
             Frame::Ack(received) => {
-                self.acknowledged(received);
+                self.on_acknowledged(received);
                 None
             }
             Frame::Damaged { channel, born } => {
-                self.came_damaged(channel, born);
+                self.on_damaged(channel, born);
                 None
             }
             Frame::Open(_) => return Err(Error::Protocol("a second opening frame")),
@@ -282,11 +284,11 @@ impl<O: Order> Session<O> {
             let understood = match record {
                 Record::Data(data) => {
                     let channel = data.channel;
-                    match self.unpacked(data) {
+                    match self.decode_message(data) {
                         Ok(data) => Some(Record::Data(data)),
                         Err(told) => {
-                            handler.undecodable(channel);
-                            // Before an acknowledgement can make the peer forget the message.
+                            handler.on_undecodable(channel);
+                            // Sent before an acknowledgement can make the peer discard the message.
                             if let Some(frame) = told {
                                 socket.queue(opcode::BINARY, frame.encode());
                             }
@@ -299,57 +301,57 @@ impl<O: Order> Session<O> {
                 } => match self.called.take(CALL + request.len()) {
                     Ok(permit) => {
                         held = permit;
-                        record.read(|_| Ok::<_, Error>(None))?
+                        record.try_map_control(|_| Ok::<_, Error>(None))?
                     }
                     Err(full) => {
                         self.answer(id, arrived, Err(full.to_string()));
                         None
                     }
                 },
-                record => record.read(|json| self.understood(&json, &mut held))?,
+                record => record.try_map_control(|json| self.parse_control(&json, &mut held))?,
             };
             if let Some(record) = understood {
-                handler.record(record, held, arrived);
+                handler.on_record(record, held, arrived);
             }
         }
-        let come = self.state.lock().incoming.received().bytes;
+        let come = self.state.lock().incoming.progress().bytes;
         if std::mem::take(&mut connection.big_came)
             || connection.unacknowledged >= ACK_AFTER.0
             || come - connection.acknowledged_bytes >= ACK_AFTER.1
         {
-            let ack = Frame::Ack(self.received(connection));
+            let ack = Frame::Ack(self.take_progress(connection));
             socket.queue(opcode::BINARY, ack.encode());
         }
         Ok(())
     }
 
-    /// What has come, about to be told.
-    fn received(&self, connection: &mut Connection) -> Received {
-        let received = self.state.lock().incoming.received();
+    /// Returns the receive progress, which the caller sends to the peer.
+    fn take_progress(&self, connection: &mut SessionConnection) -> ReceiveProgress {
+        let received = self.state.lock().incoming.progress();
         connection.unacknowledged = 0;
         connection.acknowledged_bytes = received.bytes;
         received
     }
 }
 
-/// Says that the session is not carried any more, once it is dropped.
-struct Down<'a>(&'a watch::Sender<bool>);
+/// Marks the session as disconnected when dropped.
+struct DownGuard<'a>(&'a watch::Sender<bool>);
 
-impl Drop for Down<'_> {
+impl Drop for DownGuard<'_> {
     fn drop(&mut self) {
         self.0.send_replace(false);
     }
 }
 
-enum Event {
-    Message(Result<Message, WsError>),
+enum ConnectionEvent {
+    Message(Result<WsMessage, WsError>),
     Woken,
     Ended,
     Tick,
 }
 
-/// What belongs to one connection.
-struct Connection {
+/// State of one connection.
+struct SessionConnection {
     begun: Instant,
     heard: Instant,
     pinged: Instant,
@@ -360,7 +362,7 @@ struct Connection {
     in_a_row: u32,
 }
 
-impl Connection {
+impl SessionConnection {
     fn new() -> Self {
         Self {
             begun: Instant::now(),
@@ -374,7 +376,8 @@ impl Connection {
         }
     }
 
-    /// The next ping, or the moment at which the peer will have been silent for too long: not a ping later.
+    /// Returns the time of the next ping, or the time at which the peer will have been silent for too long, if that is
+    /// earlier.
     fn next_tick(&self, options: &SessionOptions) -> Instant {
         let limits = [options.silent, options.lost].map(|limit| self.heard + limit);
         let now = Instant::now();
@@ -384,11 +387,11 @@ impl Connection {
 
     fn ping<S: AsyncRead + AsyncWrite + Unpin>(
         &mut self,
-        session: &Session<impl Order>,
+        session: &Session<impl ControlMessage>,
         socket: &mut WebSocket<S>,
     ) {
         self.pinged = Instant::now();
-        let received = session.received(self);
+        let received = session.take_progress(self);
         let ping = Frame::Ping {
             sent: now(),
             received,
@@ -397,9 +400,11 @@ impl Connection {
     }
 }
 
-pub(super) fn socket_lost(error: WsError) -> Lost {
+pub(super) fn disconnect_reason(error: WsError) -> DisconnectReason {
     match error {
-        WsError::Refused { code, reason } => Lost::Protocol(Error::Refused { code, reason }),
-        error => Lost::Socket(error.to_string()),
+        WsError::Refused { code, reason } => {
+            DisconnectReason::Protocol(Error::Refused { code, reason })
+        }
+        error => DisconnectReason::Socket(error.to_string()),
     }
 }

@@ -1,20 +1,20 @@
-//! What a slow link carries is made smaller on its way out, and as it was on its way in.
+//! Encoding of outgoing messages on a slow link, and decoding of incoming ones.
 
 use budget::{JsonWeight, Permit};
-use codec::Answer;
+use codec::ReceiverFeedback;
 use tokio::task::JoinHandle;
 
 use super::{Session, State};
 use crate::Error;
-use crate::control::{self, Between, Control, Order};
+use crate::control::{self, Control, ControlMessage, SessionMessage};
 use crate::frame::Frame;
-use crate::incoming::too_much;
-use crate::packing::Packed;
+use crate::incoming::limit_error;
+use crate::packing::EncodedMessage;
 use crate::record::Data;
 
-impl<O: Order> Session<O> {
-    /// Begins to encode the next message that is to be, on another thread.
-    pub(super) fn pack(&self) -> Option<JoinHandle<Packed>> {
+impl<O: ControlMessage> Session<O> {
+    /// Starts encoding the next message on another thread.
+    pub(super) fn start_encoding(&self) -> Option<JoinHandle<EncodedMessage>> {
         let mut state = self.state.lock();
         let State {
             out,
@@ -23,7 +23,7 @@ impl<O: Order> Session<O> {
             ..
         } = &mut *state;
         let (channel, message, alone) = out.encoding.take()?;
-        let Some(job) = packing.job(channel, message, alone, throughput.known()) else {
+        let Some(job) = packing.encode_job(channel, message, alone, throughput.estimate()) else {
             out.encoding.finish(None);
             self.wake.notify_one();
             return None;
@@ -31,22 +31,22 @@ impl<O: Order> Session<O> {
         Some(tokio::task::spawn_blocking(move || job.run()))
     }
 
-    pub(super) fn packed(&self, packed: Option<Packed>) {
+    pub(super) fn finish_encoding(&self, packed: Option<EncodedMessage>) {
         let state = &mut *self.state.lock();
         let frame = packed.map(|packed| {
             let took = packed.took;
-            (state.packing.done(packed), took)
+            (state.packing.finish(packed), took)
         });
         state.out.encoding.finish(frame);
     }
 
-    /// A message as it was before it was encoded; where that cannot be told, what the peer is to be told at once.
-    pub(super) fn unpacked(&self, mut data: Data) -> Result<Data, Option<Frame>> {
+    /// Decodes a message. If that fails, returns the frame to send to the peer immediately, if any.
+    pub(super) fn decode_message(&self, mut data: Data) -> Result<Data, Option<Frame>> {
         if !data.encoded {
             return Ok(data);
         }
         let channel = data.channel;
-        let (message, answer) = self.state.lock().packing.unpack(channel, &data.message);
+        let (message, answer) = self.state.lock().packing.decode(channel, &data.message);
         let error = match message {
             Ok(message) => {
                 data.message = message;
@@ -56,13 +56,13 @@ impl<O: Order> Session<O> {
             Err(error) => error,
         };
         match answer {
-            Some(Answer::Keyframe) => {
+            Some(ReceiverFeedback::Keyframe) => {
                 tracing::debug!(channel, %error, "a message cannot be decoded");
-                self.ask_for_keyframe(channel);
+                self.request_keyframe(channel);
                 Err(None)
             }
-            Some(Answer::Damaged) => {
-                tracing::warn!(channel, %error, "a message came damaged");
+            Some(ReceiverFeedback::Damaged) => {
+                tracing::warn!(channel, %error, "a message arrived damaged");
                 let born = data.born;
                 Err(Some(Frame::Damaged { channel, born }))
             }
@@ -73,35 +73,36 @@ impl<O: Order> Session<O> {
         }
     }
 
-    /// A message came to the peer otherwise than it was: its topic does without that codec from now on.
-    pub(super) fn came_damaged(&self, channel: u32, born: i64) {
+    /// Handles a message that arrived damaged at the peer: its topic is no longer encoded with that codec.
+    pub(super) fn on_damaged(&self, channel: u32, born: i64) {
         let mut state = self.state.lock();
-        state.packing.answered(channel, Answer::Damaged);
-        let again = state.out.again(channel, born);
+        state.packing.on_answer(channel, ReceiverFeedback::Damaged);
+        let again = state.out.resend_damaged(channel, born);
         let topic = state.topics.get(&channel).cloned().unwrap_or_default();
         drop(state);
         let then = if again { "; it is sent again" } else { "" };
-        tracing::warn!(topic, "a message came damaged at the other end{then}");
+        tracing::warn!(topic, "a message arrived damaged at the other end{then}");
     }
 
-    /// What the peer orders, unless its session tells this one something. The order counts in `held`, from before it is read.
-    pub(super) fn understood(
+    /// Parses a control record. Returns `None` for a message between the sessions, which is handled here. The record is
+    /// charged to `held` before it is parsed.
+    pub(super) fn parse_control(
         &self,
         json: &[u8],
         held: &mut Permit,
-    ) -> Result<Option<O::OfPeer>, Error> {
-        let limit = control::longest(json);
+    ) -> Result<Option<O::FromPeer>, Error> {
+        let limit = control::max_control_length(json);
         if json.len() > limit {
-            return Err(too_much("a control record", json.len(), limit));
+            return Err(limit_error("a control record", json.len(), limit));
         }
-        held.resize(JsonWeight::of(json).bytes)?;
+        held.resize(JsonWeight::estimate(json).bytes)?;
         match Control::read(json) {
             Ok(Control::Order(order)) => return Ok(Some(order)),
-            Ok(Control::Between(Between::Keyframe { channel })) => {
+            Ok(Control::Between(SessionMessage::Keyframe { channel })) => {
                 let packing = &mut self.state.lock().packing;
-                packing.answered(channel, Answer::Keyframe);
+                packing.on_answer(channel, ReceiverFeedback::Keyframe);
             }
-            Err(error) => tracing::debug!(%error, "the other end tells something unknown"),
+            Err(error) => tracing::debug!(%error, "the other end sent something unknown"),
         }
         Ok(None)
     }

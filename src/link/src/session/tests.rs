@@ -3,7 +3,7 @@ use std::sync::Arc;
 
 use tokio::io::duplex;
 use tokio::sync::mpsc;
-use ws::{Message, WebSocket};
+use ws::{WebSocket, WsMessage};
 
 use super::*;
 use crate::frame::Frame;
@@ -12,13 +12,13 @@ use crate::{MAX_FRAME, MAX_RECORD};
 mod ends;
 mod lanes;
 
-/// Either end: which orders it gives does not matter here.
+/// Either end; the type of its control messages does not matter here.
 type Session = RobotSession;
 
-struct To(mpsc::UnboundedSender<Record<FromCloud>>);
+struct RecordSender(mpsc::UnboundedSender<Record<FromCloud>>);
 
-impl Handler<FromCloud> for To {
-    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
+impl SessionHandler<FromCloud> for RecordSender {
+    fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let _ = self.0.send(record);
     }
 }
@@ -56,7 +56,7 @@ fn data(channel: u32, size: usize) -> Data {
     }
 }
 
-/// Tells each what the other has, as hello and welcome do.
+/// Exchanges what each end has received, as hello and welcome do.
 fn open(robot: &Session, cloud: &Session) {
     let (robot_has, robot_ahead, robot_next) = robot.position();
     let (cloud_has, cloud_ahead, cloud_next) = cloud.position();
@@ -83,7 +83,7 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
         for n in 0..CALLS {
             let request = if n % 100 == 0 { 100_000 } else { 10 };
             calling.call(1, vec![0; request].into());
-            calling.publish(data(1, 50_000), Quality::Newest);
+            calling.publish(data(1, 50_000), DeliveryMode::Newest);
             tokio::task::yield_now().await;
         }
     });
@@ -96,7 +96,7 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
                 _ => break,
             }
         }
-        // What is answered twice comes before the answer to what is asked now.
+        // Duplicate responses arrive before the response to the current call.
         let last = asking.call(1, Bytes::new());
         while let Some(record) = answers.recv().await {
             match record {
@@ -111,14 +111,17 @@ async fn calls_are_answered_once_however_often_the_link_is_cut() {
     while !collected.is_finished() {
         open(&robot, &cloud);
         let (mut at_robot, mut at_cloud) = sockets();
-        let (to_robot, to_cloud) = (To(to_robot.clone()), To(to_cloud.clone()));
+        let (to_robot, to_cloud) = (
+            RecordSender(to_robot.clone()),
+            RecordSender(to_cloud.clone()),
+        );
         let both = async {
             tokio::join!(
                 robot.run(&mut at_robot, &to_robot),
                 cloud.run(&mut at_cloud, &to_cloud)
             )
         };
-        // Cut in the middle of whatever is on its way; ever later, for a busy machine may carry next to nothing so soon.
+        // Cut at an arbitrary point, later each time, because a busy machine may transfer almost nothing at first.
         round += 1;
         let later = Duration::from_micros(300 * (round % 40 + 1)) * (1 + round as u32 / 100);
         let _ = tokio::time::timeout(later, both).await;
@@ -140,18 +143,18 @@ async fn a_peer_gives_a_sign_when_it_is_asked_for_one() {
         }))
     };
     let (robot, cloud) = (quiet(), quiet());
-    let nobody = To(mpsc::unbounded_channel().0);
+    let nobody = RecordSender(mpsc::unbounded_channel().0);
     let limit = Duration::from_millis(200);
-    assert!(!robot.is_there(limit).await, "there is no connection");
+    assert!(!robot.probe(limit).await, "there is no connection");
     open(&robot, &cloud);
     let (mut at_robot, mut at_cloud) = sockets();
     let asking = async {
-        // Those of the beginning are over.
+        // The initial pings are over.
         while *robot.pongs.borrow() < 6 {
             tokio::task::yield_now().await;
         }
         for _ in 0..3 {
-            assert!(robot.is_there(Duration::from_secs(60)).await);
+            assert!(robot.probe(Duration::from_secs(60)).await);
         }
     };
     tokio::select! {
@@ -159,8 +162,8 @@ async fn a_peer_gives_a_sign_when_it_is_asked_for_one() {
         lost = cloud.run(&mut at_cloud, &nobody) => panic!("{lost}"),
         () = asking => {}
     }
-    // A peer that holds the connection and says nothing any more. Signs that it gave before may still be on their way.
-    let asking = async { while robot.is_there(limit).await {} };
+    // The peer holds the connection but sends nothing any more. Earlier pongs may still be in flight.
+    let asking = async { while robot.probe(limit).await {} };
     tokio::select! {
         lost = robot.run(&mut at_robot, &nobody) => panic!("{lost}"),
         silent = timeout(Duration::from_secs(60), asking) => silent.expect("it gives no sign any more"),
@@ -175,9 +178,9 @@ async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
     }
     let (to_robot, mut answers) = mpsc::unbounded_channel();
     let (to_cloud, mut calls) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (To(to_robot), To(to_cloud));
+    let (to_robot, to_cloud) = (RecordSender(to_robot), RecordSender(to_cloud));
     open(&robot, &cloud);
-    // Over two connections: the numbers are told at their beginning, too.
+    // Over two connections, because the numbers are also exchanged at their beginning.
     for connection in 0..2 {
         let (mut at_robot, mut at_cloud) = sockets();
         let asking = async {
@@ -206,13 +209,13 @@ async fn a_link_that_has_carried_four_billion_records_is_not_deaf() {
     assert!(robot.position().2 > 1 << 32, "the numbers have passed 2^32");
 }
 
-/// A peer whose clock is `ahead` nanoseconds ahead of this machine's: it answers three pings, and then stays connected
-/// without a word.
+/// A peer whose clock is `ahead` nanoseconds ahead of this machine's. It answers three pings and then stays connected
+/// silently.
 async fn answers_ahead(socket: &mut WebSocket<tokio::io::DuplexStream>, ahead: i64) {
     let mut pongs = 0;
     while pongs < 3 {
         let message = poll_fn(|cx| socket.poll_next(cx)).await.unwrap();
-        let Message::Binary(bytes) = message else {
+        let WsMessage::Binary(bytes) = message else {
             panic!("{message:?}")
         };
         let arrived = now() + ahead;
@@ -238,15 +241,15 @@ async fn a_clock_an_hour_ahead_is_measured_and_a_silent_peer_is_noticed() {
     let (sender, _records) = mpsc::unbounded_channel();
     open(&robot, &cloud);
     let (mut at_robot, mut at_cloud) = sockets();
-    let mut up = robot.up();
-    let to_robot = To(sender);
+    let mut up = robot.watch_up();
+    let to_robot = RecordSender(sender);
     let running = robot.run(&mut at_robot, &to_robot);
     tokio::select! {
         lost = running => panic!("{lost}"),
         () = async {
             let is_up = async { up.wait_for(|up| *up).await.map(drop).unwrap() };
             tokio::join!(answers_ahead(&mut at_cloud, HOUR), is_up);
-            // Still connected, but it says nothing more.
+            // Still connected, but silent.
             up.wait_for(|up| !*up).await.unwrap();
         } => {}
     }
@@ -257,19 +260,19 @@ async fn a_clock_an_hour_ahead_is_measured_and_a_silent_peer_is_noticed() {
     );
 }
 
-/// A link that carries nothing any more and does not say so: how long it takes until that is noticed, and until the
-/// connection is given up.
-async fn noticed(options: SessionOptions) -> (Duration, Duration) {
+/// Measures a link that silently carries nothing any more: the time until it is detected, and the time until the
+/// connection is closed.
+async fn measure_detection(options: SessionOptions) -> (Duration, Duration) {
     let max = options.silent;
     let (robot, cloud) = (Session::new(options), session());
     let (sender, _records) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (To(sender.clone()), To(sender));
+    let (to_robot, to_cloud) = (RecordSender(sender.clone()), RecordSender(sender));
     open(&robot, &cloud);
     let (mut at_robot, mut at_cloud) = sockets();
-    let mut up = robot.up();
+    let mut up = robot.watch_up();
     let running = robot.run(&mut at_robot, &to_robot);
     let watching = async {
-        // For a while all is well; then, between two pings, nobody is there to answer.
+        // The link works for a while; then, between two pings, the peer stops answering.
         tokio::select! {
             lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
             () = tokio::time::sleep(max * 7 + max / 3) => {}
@@ -280,7 +283,7 @@ async fn noticed(options: SessionOptions) -> (Duration, Duration) {
         (cut, cut.elapsed())
     };
     let (lost, (cut, noticed)) = tokio::join!(running, watching);
-    assert!(matches!(lost, Lost::Silent(_)), "{lost}");
+    assert!(matches!(lost, DisconnectReason::Silent(_)), "{lost}");
     (noticed, cut.elapsed())
 }
 
@@ -290,9 +293,9 @@ async fn a_silent_link_is_noticed_within_t_max() {
         let max = Duration::from_millis(milliseconds);
         let options = SessionOptions::for_silence(max, None);
         let (ping, lost) = (options.ping, options.lost);
-        let (noticed, given_up) = noticed(options).await;
+        let (noticed, given_up) = measure_detection(options).await;
         assert!(noticed <= max, "{noticed:?} for {max:?}");
-        // Silence is counted from the last word, which was a ping before the cut at most.
+        // Silence is measured from the last message, which was at most a ping before the cut.
         assert!(
             given_up <= lost && given_up + ping >= lost,
             "{given_up:?} for {max:?}: {ping:?}, {lost:?}"
@@ -305,15 +308,15 @@ async fn a_call_is_not_lost_when_a_welcome_is() {
     let (robot, cloud) = (session(), session());
     let (to_robot, _answers) = mpsc::unbounded_channel();
     let (to_cloud, mut calls) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (To(to_robot), To(to_cloud));
+    let (to_robot, to_cloud) = (RecordSender(to_robot), RecordSender(to_cloud));
     robot.call(1, Bytes::from_static(b"asked"));
-    // It leaves and does not arrive.
+    // It is sent and not received.
     open(&robot, &cloud);
     let (mut at_robot, at_cloud) = sockets();
     let gone = robot.run(&mut at_robot, &to_robot);
     let _ = tokio::time::timeout(Duration::from_millis(20), gone).await;
     drop(at_cloud);
-    // The cloud hears a hello, and its welcome is lost; the next one is not.
+    // The cloud receives a hello and its welcome is lost; the next one is not.
     let (has, ahead, next) = robot.position();
     cloud.reconnect(has, &ahead, next);
     open(&robot, &cloud);
@@ -326,7 +329,7 @@ async fn a_call_is_not_lost_when_a_welcome_is() {
     }
 }
 
-/// A picture with something to save in it.
+/// A compressible image.
 fn picture(number: u8) -> Bytes {
     let mut message = vec![number, 0, 0, 0];
     message.extend([0; 8]);
@@ -346,16 +349,16 @@ fn picture(number: u8) -> Bytes {
 #[tokio::test]
 async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     let (robot, cloud) = (session(), session());
-    let codecs = crate::packing::decoded_here(|_| false);
-    robot.peer_decodes(&codecs);
-    cloud.peer_decodes(&codecs);
-    robot.opens(1, "/image", codec::Schema::Image);
+    let codecs = crate::packing::supported_codecs(|_| false);
+    robot.set_peer_codecs(&codecs);
+    cloud.set_peer_codecs(&codecs);
+    robot.open_channel(1, "/image", codec::Schema::Image);
     open(&robot, &cloud);
     let (near, mut slow) = duplex(1 << 12);
     let (mut slower, far) = duplex(1 << 12);
     let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);
     let mut at_cloud = WebSocket::new(far, b"", MAX_FRAME, MAX_RECORD);
-    // Some MB/s: what is in the pipe passes every millisecond.
+    // Some MB/s: what is in the pipe is forwarded every millisecond.
     tokio::spawn(async move {
         let (mut up, mut down) = tokio::io::split(&mut slow);
         let (mut from, mut to) = tokio::io::split(&mut slower);
@@ -372,14 +375,14 @@ async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     });
     let (to_robot, _records) = mpsc::unbounded_channel();
     let (to_cloud, mut records) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (To(to_robot), To(to_cloud));
+    let (to_robot, to_cloud) = (RecordSender(to_robot), RecordSender(to_cloud));
     let sending = async {
         let mut encoded = 0;
         for number in 0..=255 {
             let mut picture_data = data(1, 0);
             picture_data.message = picture(number);
             let before = robot.traffic().0;
-            robot.publish(picture_data, Quality::Newest);
+            robot.publish(picture_data, DeliveryMode::Newest);
             let Some(Record::Data(came)) = records.recv().await else {
                 panic!("a picture should come");
             };
@@ -399,7 +402,7 @@ async fn over_a_slow_link_pictures_are_made_smaller_and_arrive_as_they_were() {
     }
 }
 
-/// A map of 80×80 cells, as a message.
+/// An occupancy grid of 80×80 cells as a message.
 fn map() -> Bytes {
     let mut message = vec![0; 24];
     message.extend_from_slice(&0.5_f32.to_le_bytes());
@@ -411,17 +414,17 @@ fn map() -> Bytes {
     message.into()
 }
 
-/// Counts what it is told of, and keeps what comes.
-struct Counting(
+/// Counts undecodable messages and collects records.
+struct CountingHandler(
     mpsc::UnboundedSender<Record<FromCloud>>,
     std::sync::atomic::AtomicUsize,
 );
 
-impl Handler<FromCloud> for Counting {
-    fn record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
+impl SessionHandler<FromCloud> for CountingHandler {
+    fn on_record(&self, record: Record<FromCloud>, _held: Permit, _arrived: i64) {
         let _ = self.0.send(record);
     }
-    fn undecodable(&self, _channel: u32) {
+    fn on_undecodable(&self, _channel: u32) {
         self.1.fetch_add(1, Ordering::Relaxed);
     }
 }
@@ -429,11 +432,11 @@ impl Handler<FromCloud> for Counting {
 #[tokio::test]
 async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_again() {
     let (robot, cloud) = (session(), session());
-    robot.peer_decodes(&crate::packing::decoded_here(|_| false));
-    robot.opens(1, "/map", codec::Schema::OccupancyGrid);
+    robot.set_peer_codecs(&crate::packing::supported_codecs(|_| false));
+    robot.open_channel(1, "/map", codec::Schema::OccupancyGrid);
     open(&robot, &cloud);
-    // As over a slow link.
-    robot.state.lock().out.encoding.set_pays(true);
+    // As on a slow link.
+    robot.state.lock().out.encoding.set_enabled(true);
     let (near, mut damaging) = duplex(1 << 16);
     let (mut beyond, far) = duplex(1 << 16);
     let mut at_robot = WebSocket::client(near, b"", MAX_FRAME, MAX_RECORD, 7);
@@ -445,7 +448,7 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
             let (mut buffer, mut damaged) = (vec![0; 1 << 16], false);
             loop {
                 let read = tokio::io::AsyncReadExt::read(&mut up, &mut buffer).await?;
-                // One bit of the map, which is longer than all else.
+                // Flips one bit of the map, which is longer than everything else.
                 if read > 300 && !damaged {
                     damaged = true;
                     buffer[read / 2] ^= 4;
@@ -458,11 +461,14 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
     });
     let (to_robot, _records) = mpsc::unbounded_channel();
     let (to_cloud, mut records) = mpsc::unbounded_channel();
-    let (to_robot, to_cloud) = (To(to_robot), Counting(to_cloud, Default::default()));
+    let (to_robot, to_cloud) = (
+        RecordSender(to_robot),
+        CountingHandler(to_cloud, Default::default()),
+    );
     let mut latched = data(1, 0);
     latched.latching = true;
     latched.message = map();
-    robot.publish(latched, Quality::Each);
+    robot.publish(latched, DeliveryMode::Each);
     tokio::select! {
         lost = robot.run(&mut at_robot, &to_robot) => panic!("{lost}"),
         lost = cloud.run(&mut at_cloud, &to_cloud) => panic!("{lost}"),
@@ -477,33 +483,39 @@ async fn a_latched_map_that_is_damaged_on_its_way_is_not_given_out_and_comes_aga
     assert_eq!(to_cloud.1.load(Ordering::Relaxed), 1, "it was told of");
 }
 
-/// Keeps orders, as one does who is slow to obey.
+/// Keeps control messages like a slow consumer.
 #[derive(Default)]
-struct Slow(Mutex<Vec<(Record<FromCloud>, Permit)>>, Notify);
+struct SlowHandler(Mutex<Vec<(Record<FromCloud>, Permit)>>, Notify);
 
-impl Handler<FromCloud> for Slow {
-    fn record(&self, record: Record<FromCloud>, held: Permit, _arrived: i64) {
+impl SessionHandler<FromCloud> for SlowHandler {
+    fn on_record(&self, record: Record<FromCloud>, held: Permit, _arrived: i64) {
         self.0.lock().push((record, held));
         self.1.notify_one();
     }
 }
 
-/// How the link ends at the end that is given orders, which may hold `limit` bytes.
-async fn told(limit: usize, orders: impl IntoIterator<Item = Bytes>) -> (Lost, usize, Budget) {
+/// Sends control records to an end with a budget of `limit` bytes, and returns how its link ends.
+async fn deliver_control(
+    limit: usize,
+    orders: impl IntoIterator<Item = Bytes>,
+) -> (DisconnectReason, usize, Budget) {
     let budget = Budget::new("robot x", limit);
     let told = Arc::new(
         Arc::into_inner(session())
             .expect("the only one")
-            .within(&budget),
+            .with_budget(&budget),
     );
     let tells = session();
     open(&told, &tells);
     let (mut at_told, mut at_teller) = sockets();
     for json in orders {
-        tells.push(&Record::Control(json), Quality::Each);
+        tells.push(&Record::Control(json), DeliveryMode::Each);
     }
-    tells.end(1000, "all is told");
-    let (slow, nobody) = (Slow::default(), To(mpsc::unbounded_channel().0));
+    tells.close(1000, "all is told");
+    let (slow, nobody) = (
+        SlowHandler::default(),
+        RecordSender(mpsc::unbounded_channel().0),
+    );
     let (lost, _) = tokio::join!(
         told.run(&mut at_told, &slow),
         tells.run(&mut at_teller, &nobody)
@@ -515,11 +527,14 @@ async fn told(limit: usize, orders: impl IntoIterator<Item = Bytes>) -> (Lost, u
 #[tokio::test]
 async fn orders_count_until_they_are_obeyed() {
     let line = Bytes::from_static(br#"{"line":{"error":false,"text":"a"}}"#);
-    let (lost, kept, budget) = told(1 << 20, vec![line.clone(); 100]).await;
-    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
-    assert_eq!((kept, budget.used()), (100, 0));
-    let (lost, kept, _) = told(1 << 20, vec![line; 10_000]).await;
-    let Lost::Protocol(Error::Exceeded(_)) = lost else {
+    let (lost, kept, budget) = deliver_control(1 << 20, vec![line.clone(); 100]).await;
+    assert!(
+        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
+        "{lost}"
+    );
+    assert_eq!((kept, budget.used_bytes()), (100, 0));
+    let (lost, kept, _) = deliver_control(1 << 20, vec![line; 10_000]).await;
+    let DisconnectReason::Protocol(Error::Exceeded(_)) = lost else {
         panic!("all of them wait at once: {lost}");
     };
     assert!((100..5000).contains(&kept), "{kept} were kept");
@@ -531,11 +546,14 @@ async fn an_order_is_as_long_as_it_may_be() {
         let text = "x".repeat(length);
         Bytes::from(format!(r#"{{"line":{{"error":false,"text":"{text}"}}}}"#))
     };
-    let (lost, kept, _) = told(64 << 20, [line(crate::MAX_CONTROL - 100)]).await;
-    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+    let (lost, kept, _) = deliver_control(64 << 20, [line(crate::MAX_CONTROL - 100)]).await;
+    assert!(
+        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
+        "{lost}"
+    );
     assert_eq!(kept, 1);
-    let (lost, kept, _) = told(64 << 20, [line(crate::MAX_CONTROL)]).await;
-    let Lost::Protocol(error @ Error::TooMuch { .. }) = lost else {
+    let (lost, kept, _) = deliver_control(64 << 20, [line(crate::MAX_CONTROL)]).await;
+    let DisconnectReason::Protocol(error @ Error::TooMuch { .. }) = lost else {
         panic!("it is too long: {lost}");
     };
     assert!(
@@ -546,18 +564,21 @@ async fn an_order_is_as_long_as_it_may_be() {
     // Parameters may be long texts.
     let text = "x".repeat(4 << 20);
     let parameters = format!(r#"{{"parameters":[["/robot_description","{text}"]]}}"#);
-    let (lost, kept, _) = told(64 << 20, [parameters.into()]).await;
-    assert!(matches!(lost, Lost::Closed { code: 1000, .. }), "{lost}");
+    let (lost, kept, _) = deliver_control(64 << 20, [parameters.into()]).await;
+    assert!(
+        matches!(lost, DisconnectReason::Closed { code: 1000, .. }),
+        "{lost}"
+    );
     assert_eq!(kept, 1);
 }
 
 #[tokio::test]
 async fn parameters_are_read_if_what_they_become_has_room() {
-    // Each map of one member is seven bytes of text, and hundreds of memory.
+    // Each map with one entry takes seven bytes of text and hundreds of bytes of memory.
     let maps = vec![r#"{"a":1}"#; 100_000].join(",");
     let parameters = Bytes::from(format!(r#"{{"parameters":[["/a",[{maps}]]]}}"#));
-    let (lost, kept, _) = told(usize::MAX, [parameters]).await;
-    let Lost::Protocol(Error::Exceeded(full)) = lost else {
+    let (lost, kept, _) = deliver_control(usize::MAX, [parameters]).await;
+    let DisconnectReason::Protocol(Error::Exceeded(full)) = lost else {
         panic!("it takes more than a session may: {lost}");
     };
     assert_eq!((kept, full.limit), (0, MAX_TOLD));
@@ -571,7 +592,7 @@ async fn a_hello_is_read_if_what_it_becomes_has_room() {
     let budget = Budget::new("robot x", 64 << 20);
     for (limit, is_read) in [(64 << 20, true), (4 << 20, false)] {
         at_robot.queue(ws::frame::BINARY, Frame::Open(hello.clone()).encode());
-        let mut held = budget.within("hello", limit).permit();
+        let mut held = budget.child("hello", limit).permit();
         let hello = receive_open::<_, crate::control::Hello>(&mut at_cloud, "hello", &mut held);
         let (sent, hello) = tokio::join!(poll_fn(|cx| at_robot.poll_flush(cx)), hello);
         sent.expect("sent");
@@ -587,12 +608,12 @@ async fn a_hello_is_read_if_what_it_becomes_has_room() {
 
 #[tokio::test]
 async fn calls_count_until_they_are_answered() {
-    // Half of it is for calls: what is under way shall not suffer from them.
+    // Half of the budget is for calls, so that records in flight are not affected.
     let budget = Budget::new("robot x", 2 << 20);
     let asked = Arc::new(
         Arc::into_inner(session())
             .expect("the only one")
-            .within(&budget),
+            .with_budget(&budget),
     );
     let asks = session();
     open(&asked, &asks);
@@ -600,8 +621,8 @@ async fn calls_count_until_they_are_answered() {
     for _ in 0..10 {
         asks.call(1, vec![1; 200 << 10].into());
     }
-    let (slow, (to, mut answers)) = (Slow::default(), mpsc::unbounded_channel());
-    let to = To(to);
+    let (slow, (to, mut answers)) = (SlowHandler::default(), mpsc::unbounded_channel());
+    let to = RecordSender(to);
     let answered = async {
         let Some(Record::Answer { response, .. }) = answers.recv().await else {
             panic!("one does not fit");
@@ -616,7 +637,7 @@ async fn calls_count_until_they_are_answered() {
     assert!(reason.contains("the memory for calls"), "{reason}");
     let kept = slow.0.into_inner();
     assert_eq!(kept.len(), 5);
-    assert!(budget.used() >= 5 * (200 << 10));
+    assert!(budget.used_bytes() >= 5 * (200 << 10));
     drop((kept, asked));
-    assert_eq!(budget.used(), 0);
+    assert_eq!(budget.used_bytes(), 0);
 }

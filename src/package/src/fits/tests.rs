@@ -2,10 +2,10 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Packages of a workspace, by name and what their package.xml says besides.
-struct Place(tempfile::TempDir);
+/// A workspace of packages, given by name and additional elements of their package.xml.
+struct FitsFixture(tempfile::TempDir);
 
-impl Place {
+impl FitsFixture {
     fn new(packages: &[(&str, &str)]) -> Self {
         let place = Self(tempfile::tempdir().expect("a directory"));
         for (name, rest) in packages {
@@ -22,11 +22,11 @@ impl Place {
         self
     }
 
-    fn fits(&self) -> Result<Fits, Error> {
-        of(self.0.path(), &distributions())
+    fn fits(&self) -> Result<RosSupport, Error> {
+        detect(self.0.path(), &distributions())
     }
 
-    fn refused(&self) -> String {
+    fn refusal(&self) -> String {
         self.fits().expect_err("refused").to_string()
     }
 }
@@ -50,10 +50,10 @@ fn build_type(name: &str) -> String {
 }
 
 /// 1, 2, or 0 for either.
-fn number(fits: &Fits) -> u8 {
+fn number(fits: &RosSupport) -> u8 {
     match fits {
-        Fits::Either => 0,
-        Fits::Only { version, .. } => version.number(),
+        RosSupport::Either => 0,
+        RosSupport::Only { version, .. } => version.number(),
     }
 }
 
@@ -66,7 +66,7 @@ const BOTH: &str = "<buildtool_depend condition='$ROS_VERSION == 1'>catkin</buil
 fn the_build_type_tells_the_version() {
     for (rest, expected, because) in [
         (build_type("catkin"), 1, "has build type catkin"),
-        // Nothing said means catkin.
+        // The default is catkin.
         (String::new(), 1, "has build type catkin"),
         (
             "<buildtool_depend>catkin</buildtool_depend>".to_owned(),
@@ -101,7 +101,7 @@ fn the_build_type_tells_the_version() {
             "is built with rosidl",
         ),
         (BOTH.to_owned(), 0, ""),
-        // Of one distribution of a version alone.
+        // With one distribution of a version only.
         (
             "<export><build_type condition='$ROS_DISTRO == humble'>ament_cmake</build_type>\
              <build_type condition='$ROS_DISTRO != humble'>other</build_type></export>"
@@ -110,9 +110,9 @@ fn the_build_type_tells_the_version() {
             "has build type ament_cmake",
         ),
     ] {
-        let fits = Place::new(&[("p", &rest)]).fits().expect("it fits");
+        let fits = FitsFixture::new(&[("p", &rest)]).fits().expect("it fits");
         assert_eq!(number(&fits), expected, "{rest}");
-        if let Fits::Only {
+        if let RosSupport::Only {
             package,
             because: why,
             ..
@@ -125,12 +125,12 @@ fn the_build_type_tells_the_version() {
 
 #[test]
 fn two_flavours_name_both_packages() {
-    let place = Place::new(&[
+    let place = FitsFixture::new(&[
         ("a_both", BOTH),
         ("b_talker", &build_type("catkin")),
         ("c_listener", &build_type("ament_python")),
     ]);
-    let text = place.refused();
+    let text = place.refusal();
     for words in [
         "b_talker has build type catkin (ROS 1)",
         "c_listener has build type ament_python (ROS 2)",
@@ -144,9 +144,9 @@ fn two_flavours_name_both_packages() {
 
 #[test]
 fn what_nothing_builds_is_told_with_its_file() {
-    let text = Place::new(&[("p", &build_type("bazel"))]).refused();
+    let text = FitsFixture::new(&[("p", &build_type("bazel"))]).refusal();
     assert!(
-        text.contains("src/p/package.xml: build type bazel is built by no base"),
+        text.contains("src/p/package.xml: no base supports build type bazel"),
         "{text}"
     );
     for (tool, add) in [
@@ -155,40 +155,40 @@ fn what_nothing_builds_is_told_with_its_file() {
         ("ament_python", "<build_type>ament_python</build_type>"),
     ] {
         let rest = format!("<buildtool_depend>{tool}</buildtool_depend>");
-        let text = Place::new(&[("p", &rest)]).refused();
+        let text = FitsFixture::new(&[("p", &rest)]).refusal();
         assert!(text.contains(tool) && text.contains(add), "{text}");
     }
-    // A mistake in a condition is one whatever the version.
-    let text = Place::new(&[("p", "<depend condition='$X'>y</depend>")]).refused();
-    assert!(text.contains("condition \"$X\" does not parse"), "{text}");
+    // An error in a condition is an error for every version.
+    let text = FitsFixture::new(&[("p", "<depend condition='$X'>y</depend>")]).refusal();
+    assert!(text.contains("invalid condition \"$X\""), "{text}");
 }
 
 #[test]
 fn install_spaces_are_of_the_tools_that_made_them() {
     let manifest = "<package><name>p</name></package>";
-    let place = Place(tempfile::tempdir().expect("a directory"));
+    let place = FitsFixture(tempfile::tempdir().expect("a directory"));
     place
         .write(".catkin", "")
         .write("setup.sh", "")
         .write("share/p/package.xml", manifest);
     let fits = place.fits().expect("a space");
     assert!(
-        fits.has(RosVersion::One) && !fits.has(RosVersion::Two),
+        fits.supports(RosVersion::One) && !fits.supports(RosVersion::Two),
         "{fits:?}"
     );
-    let place = Place(tempfile::tempdir().expect("a directory"));
+    let place = FitsFixture(tempfile::tempdir().expect("a directory"));
     place
         .write("share/ament_index/resource_index/packages/p", "")
         .write("share/p/package.xml", manifest);
     let fits = place.fits().expect("a space");
     assert!(
-        fits.has(RosVersion::Two) && !fits.has(RosVersion::One),
+        fits.supports(RosVersion::Two) && !fits.supports(RosVersion::One),
         "{fits:?}"
     );
 }
 
-/// A package of a kind: 0 of either version, 1 and 2 of one.
-fn of_kind(kind: u8) -> String {
+/// Returns the package.xml of a package that supports both versions (0), or one of them (1, 2).
+fn package_of_kind(kind: u8) -> String {
     match kind {
         0 => BOTH.to_owned(),
         1 => build_type("catkin"),
@@ -199,23 +199,24 @@ fn of_kind(kind: u8) -> String {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// A workspace fits what all of its packages fit, in whatever order they are, and is refused if that is nothing.
+    /// A workspace supports the versions that all its packages support, regardless of their order, and is rejected if
+    /// there is none.
     #[test]
     fn a_workspace_fits_what_all_its_packages_fit(kinds in prop::collection::vec(0u8..3, 1..6)) {
         let rests: Vec<(String, String)> = kinds
             .iter()
             .enumerate()
-            .map(|(index, kind)| (format!("p{index}"), of_kind(*kind)))
+            .map(|(index, kind)| (format!("p{index}"), package_of_kind(*kind)))
             .collect();
         let packages: Vec<(&str, &str)> =
             rests.iter().map(|(name, rest)| (&**name, &**rest)).collect();
-        let found = Place::new(&packages).fits();
+        let found = FitsFixture::new(&packages).fits();
         let (one, two) = (kinds.contains(&1), kinds.contains(&2));
         match found {
             Ok(fits) => {
                 prop_assert!(!(one && two));
-                prop_assert_eq!(fits.has(RosVersion::One), !two);
-                prop_assert_eq!(fits.has(RosVersion::Two), !one);
+                prop_assert_eq!(fits.supports(RosVersion::One), !two);
+                prop_assert_eq!(fits.supports(RosVersion::Two), !one);
             }
             Err(Error::TwoFlavours { .. }) => prop_assert!(one && two),
             Err(other) => prop_assert!(false, "{}", other),

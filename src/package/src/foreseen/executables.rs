@@ -1,4 +1,4 @@
-//! Programs that build files install in plain words.
+//! Executables that build files install by literal, unconditional statements.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -10,50 +10,50 @@ use crate::cmake::{self, Command};
 use crate::read;
 use crate::workspace::Package;
 
-/// The largest build file that is read.
+/// Maximum size of a build file in bytes.
 const MAX_BYTES: u64 = 1 << 20;
-/// How deep `add_subdirectory` is followed, and how many files are read.
+/// Maximum depth of `add_subdirectory`, and maximum number of files read.
 const MAX_DEPTH: usize = 8;
 const MAX_FILES: usize = 200;
 
-/// Words by which a build file decides otherwise where its programs are, or whether they are made.
+/// Words in a build file that change where executables are installed, or whether they are built.
 const UNCLEAR: [&str; 3] = [
     "RUNTIME_OUTPUT_DIRECTORY",
     "OUTPUT_NAME",
     "EXCLUDE_FROM_ALL",
 ];
 
-/// Commands between which and their ends nothing is certain.
+/// Commands that begin a block whose content is conditional.
 const BLOCKS: [&str; 6] = ["if", "foreach", "while", "function", "macro", "block"];
 
-/// What a package's build files show.
+/// Result of scanning a package's build files.
 #[derive(Debug, Default)]
-pub(super) struct Shown {
-    /// Names of programs, with variables that are not known.
+pub(super) struct BuildFileScan {
+    /// Names of executables, which may contain unknown variables.
     pub(super) programs: BTreeSet<String>,
     /// Directories of the package that are installed as a whole.
     pub(super) launch_directories: Vec<String>,
-    /// A launch file may be made or renamed.
+    /// True if launch files may be generated or renamed.
     pub(super) mentions_launch: bool,
 }
 
-/// Reads the build files of a package.
-pub(super) fn of(root: &Path, package: &Package, version: RosVersion) -> Shown {
-    let mut reading = Reading {
+/// Scans the build files of a package.
+pub(super) fn scan_package(root: &Path, package: &Package, version: RosVersion) -> BuildFileScan {
+    let mut reading = BuildFileReader {
         root,
         package: &package.path,
         name: &package.manifest.name,
         version,
-        shown: Shown::default(),
+        shown: BuildFileScan::default(),
         targets: BTreeSet::new(),
         has_place: version == RosVersion::Two,
         is_unclear: package.manifest.build_type == "cmake",
         files: 0,
     };
     if package.manifest.build_type == "ament_python" {
-        reading.python();
+        reading.read_setup_py();
     } else {
-        reading.file(&package.path, MAX_DEPTH);
+        reading.read_cmake_lists(&package.path, MAX_DEPTH);
     }
     if reading.is_unclear {
         reading.shown.programs.clear();
@@ -62,26 +62,27 @@ pub(super) fn of(root: &Path, package: &Package, version: RosVersion) -> Shown {
     reading.shown
 }
 
-struct Reading<'a> {
+struct BuildFileReader<'a> {
     root: &'a Path,
     package: &'a Path,
     name: &'a str,
     version: RosVersion,
-    shown: Shown,
-    /// Programs that are compiled.
+    shown: BuildFileScan,
+    /// Targets that are executables.
     targets: BTreeSet<String>,
-    /// Programs that are compiled from here on are where `rosrun` looks: `catkin_package` says so.
+    /// True if executables from here on are installed where `rosrun` looks, because `catkin_package` has been called.
     has_place: bool,
     is_unclear: bool,
     files: usize,
 }
 
-impl Reading<'_> {
-    /// Reads the `CMakeLists.txt` of a directory, and those that it adds; gives whether what comes after it is certain.
-    fn file(&mut self, directory: &Path, depth: usize) -> bool {
+impl BuildFileReader<'_> {
+    /// Reads the `CMakeLists.txt` of a directory and its subdirectories; returns whether the statements after it are
+    /// certain to be executed.
+    fn read_cmake_lists(&mut self, directory: &Path, depth: usize) -> bool {
         self.files += 1;
         let path = self.root.join(directory).join("CMakeLists.txt");
-        let text = read::text_inside(self.root, &path, MAX_BYTES);
+        let text = read::read_text(self.root, &path, MAX_BYTES);
         let Ok(text) = text else {
             return false;
         };
@@ -94,24 +95,26 @@ impl Reading<'_> {
         };
         self.shown.mentions_launch |= text.contains(launch);
         let mut open = 0_usize;
-        for command in cmake::commands(&text) {
+        for command in cmake::parse_commands(&text) {
             if BLOCKS.contains(&command.name.as_str()) {
                 open += 1;
             } else if let Some(block) = command.name.strip_prefix("end")
                 && BLOCKS.contains(&block)
             {
                 open = open.saturating_sub(1);
-            } else if command.name == "return" || command.name == "include" && is_own(&command) {
-                // What follows may not be reached, or be in other hands.
+            } else if command.name == "return"
+                || command.name == "include" && includes_own_file(&command)
+            {
+                // The following statements may not be reached, or may be affected by other files.
                 return false;
-            } else if open == 0 && !self.command(&command, directory, depth) {
+            } else if open == 0 && !self.apply_command(&command, directory, depth) {
                 return false;
             }
         }
         true
     }
 
-    fn command(&mut self, command: &Command, directory: &Path, depth: usize) -> bool {
+    fn apply_command(&mut self, command: &Command, directory: &Path, depth: usize) -> bool {
         let arguments = command.arguments.as_slice();
         match (command.name.as_str(), arguments) {
             ("catkin_package", _) => self.has_place = true,
@@ -120,7 +123,7 @@ impl Reading<'_> {
                     .iter()
                     .any(|word| word == "IMPORTED" || word == "ALIAS");
                 if is_made && self.has_place {
-                    let target = self.named(target);
+                    let target = self.expand_project_name(target);
                     if self.version == RosVersion::One {
                         self.shown.programs.insert(target.clone());
                     }
@@ -128,24 +131,24 @@ impl Reading<'_> {
                 }
             }
             ("add_subdirectory", [inner]) if depth > 0 && !inner.contains('$') => {
-                return self.file(&directory.join(inner), depth - 1);
+                return self.read_cmake_lists(&directory.join(inner), depth - 1);
             }
             ("install" | "catkin_install_python", [kind, rest @ ..]) => {
-                self.install(kind, rest, directory);
+                self.apply_install(kind, rest, directory);
             }
             _ => {}
         }
         true
     }
 
-    fn install(&mut self, kind: &str, arguments: &[String], directory: &Path) {
+    fn apply_install(&mut self, kind: &str, arguments: &[String], directory: &Path) {
         let Some(at) = arguments.iter().position(|word| word == "DESTINATION") else {
             return;
         };
         let Some(destination) = arguments.get(at + 1) else {
             return;
         };
-        let destination = self.named(destination.trim_end_matches('/'));
+        let destination = self.expand_project_name(destination.trim_end_matches('/'));
         let of_programs = [
             "${CATKIN_PACKAGE_BIN_DESTINATION}".to_owned(),
             format!("lib/{}", self.name),
@@ -164,7 +167,7 @@ impl Reading<'_> {
             "TARGETS" if of_programs.contains(&destination) => {
                 let is_for_others = |word: &String| word == "ARCHIVE" || word == "LIBRARY";
                 if !listed.iter().any(is_for_others) {
-                    let names = listed.iter().map(|target| self.named(target));
+                    let names = listed.iter().map(|target| self.expand_project_name(target));
                     let names: Vec<String> =
                         names.filter(|name| self.targets.contains(name)).collect();
                     self.shown.programs.extend(names);
@@ -183,40 +186,41 @@ impl Reading<'_> {
         }
     }
 
-    /// With the project's name, by which many targets and places are named.
-    fn named(&self, text: &str) -> String {
+    /// Expands the project name, which many targets and destinations contain.
+    fn expand_project_name(&self, text: &str) -> String {
         text.replace("${PROJECT_NAME}", self.name)
     }
 
     fn has_file(&self, path: &Path) -> bool {
-        let found = Tree::open(self.root).and_then(|tree| tree.file_following(path, MAX_BYTES));
+        let found =
+            Tree::open(self.root).and_then(|tree| tree.read_file_following(path, MAX_BYTES));
         found.is_ok_and(|file| file.is_some())
     }
 
-    /// Reads the programs that `setup.py` lists, if `setup.cfg` has them installed where `ros2 run` looks.
-    fn python(&mut self) {
+    /// Reads the executables listed in `setup.py`, if `setup.cfg` installs them where `ros2 run` looks.
+    fn read_setup_py(&mut self) {
         let text = |name: &str| {
             let path: PathBuf = self.root.join(self.package).join(name);
-            read::text_inside(self.root, &path, MAX_BYTES).unwrap_or_default()
+            read::read_text(self.root, &path, MAX_BYTES).unwrap_or_default()
         };
         let (setup, places) = (text("setup.py"), text("setup.cfg"));
         self.shown.mentions_launch |= setup.contains("launch");
         if places.contains(&format!("/lib/{}", self.name)) {
-            self.shown.programs.extend(scripts(&setup));
+            self.shown.programs.extend(console_scripts(&setup));
         }
     }
 }
 
-/// Whether a file of the package itself is included, and not a module of CMake.
-fn is_own(command: &Command) -> bool {
+/// Returns whether the command includes a file of the package itself rather than a CMake module.
+fn includes_own_file(command: &Command) -> bool {
     command
         .arguments
         .first()
         .is_some_and(|file| file.contains(['/', '.', '$']))
 }
 
-/// Names before `=` in the list of `console_scripts`, which must be one of texts alone.
-fn scripts(setup: &str) -> Vec<String> {
+/// Returns the names before `=` in the list of `console_scripts`; empty unless it consists of string literals only.
+fn console_scripts(setup: &str) -> Vec<String> {
     let Some((_, rest)) = setup.split_once("console_scripts") else {
         return Vec::new();
     };

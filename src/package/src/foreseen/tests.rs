@@ -1,10 +1,10 @@
 use super::*;
 use crate::condition::Variables;
-use crate::workspace::{Pushed, inspect};
+use crate::workspace::{PushedDirectory, inspect};
 
-struct Place(tempfile::TempDir);
+struct SourceFixture(tempfile::TempDir);
 
-impl Place {
+impl SourceFixture {
     fn new() -> Self {
         Self(tempfile::tempdir().expect("a directory"))
     }
@@ -24,23 +24,24 @@ impl Place {
         self.write(&format!("src/{name}/CMakeLists.txt"), build)
     }
 
-    fn foresee(&self, version: RosVersion) -> Foreseen {
-        let variables = Variables::ros(version.number(), "any");
-        let Pushed::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace")
+    fn scan(&self, version: RosVersion) -> SourceScan {
+        let variables = Variables::for_distribution(version.number(), "any");
+        let PushedDirectory::Source(workspace) =
+            inspect(self.0.path(), &variables).expect("a workspace")
         else {
             panic!("sources")
         };
-        foresee(&workspace, version)
+        scan_sources(&workspace, version)
     }
 
     fn must_be_chosen(&self, version: RosVersion) -> bool {
-        self.foresee(version).must_be_chosen()
+        self.scan(version).must_be_chosen()
     }
 }
 
-/// A package of ROS 1 with two programs, as its build file goes on.
-fn of_one(rest: &str) -> Place {
-    let place = Place::new();
+/// Creates a ROS 1 package with two executables whose build file continues with `rest`.
+fn ros1_package(rest: &str) -> SourceFixture {
+    let place = SourceFixture::new();
     let build = format!(
         "project(ekf)\nfind_package(catkin REQUIRED)\ncatkin_package()\n\
          add_executable(${{PROJECT_NAME}} src/ekf.cpp)\n{rest}\n"
@@ -55,17 +56,17 @@ const WTF: &str =
 
 #[test]
 fn several_programs_and_launch_files_must_be_chosen_from() {
-    let place = of_one(WTF);
+    let place = ros1_package(WTF);
     place
         .write("src/ekf/launch/a.launch", "")
         .write("src/ekf/example.launch", "")
         .write("src/ekf/test/test.launch", "");
-    let foreseen = place.foresee(RosVersion::One);
+    let foreseen = place.scan(RosVersion::One);
     assert_eq!(foreseen.executables, ["ekf", "wtf.py"]);
     assert_eq!(foreseen.launch_files, ["example.launch", "launch/a.launch"]);
     assert!(foreseen.must_be_chosen());
-    // Those of several packages are as many.
-    let place = of_one("add_executable(${NODE}_b b.cpp)");
+    // Executables of several packages count together.
+    let place = ros1_package("add_executable(${NODE}_b b.cpp)");
     place.package(
         "other",
         "catkin",
@@ -75,7 +76,7 @@ fn several_programs_and_launch_files_must_be_chosen_from() {
         "src/other/src/driver/CMakeLists.txt",
         "add_executable(driver driver.cpp)",
     );
-    let foreseen = place.foresee(RosVersion::One);
+    let foreseen = place.scan(RosVersion::One);
     assert_eq!(foreseen.executables, ["ekf", "driver"]);
     assert!(foreseen.must_be_chosen(), "{foreseen:?}");
 }
@@ -99,26 +100,29 @@ fn where_a_push_may_work_nothing_is_asked() {
         "install(PROGRAMS ${SCRIPTS} DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})",
         "add_subdirectory(gone)",
     ] {
-        assert!(!of_one(rest).must_be_chosen(RosVersion::One), "{rest}");
+        assert!(
+            !ros1_package(rest).must_be_chosen(RosVersion::One),
+            "{rest}"
+        );
     }
-    // A single launch file is taken, and others may be made.
-    let launch = of_one(WTF);
+    // A single launch file is used, and others may be generated.
+    let launch = ros1_package(WTF);
     launch.write("src/ekf/launch/a.launch", "");
     assert!(!launch.must_be_chosen(RosVersion::One));
-    let made = of_one(WTF);
+    let made = ros1_package(WTF);
     made.write("src/ekf/a.launch.in", "");
     assert!(!made.must_be_chosen(RosVersion::One));
-    let renamed = of_one(&format!("{WTF}\nconfigure_file(a.xml a.launch)"));
+    let renamed = ros1_package(&format!("{WTF}\nconfigure_file(a.xml a.launch)"));
     assert!(!renamed.must_be_chosen(RosVersion::One));
-    // Without catkin's word on it, programs are anywhere; what cannot be read shows nothing.
+    // Without `catkin_package` executables may be installed anywhere; unreadable files are ignored.
     for build in ["project(p)", "\u{0}((", ""] {
-        let place = Place::new();
+        let place = SourceFixture::new();
         let build =
             format!("{build}\nadd_executable(a a.cpp)\nadd_executable(b b.cpp)\ncatkin_package()");
         place.package("p", "catkin", &build);
         assert!(!place.must_be_chosen(RosVersion::One), "{build:?}");
     }
-    let plain = Place::new();
+    let plain = SourceFixture::new();
     let two = "catkin_package()\nadd_executable(a a.cpp)\nadd_executable(b b.cpp)";
     plain.package("p", "cmake", two);
     assert!(!plain.must_be_chosen(RosVersion::One));
@@ -145,19 +149,19 @@ fn of_ros_2_what_is_installed_counts() {
             &["launch/x.launch.py", "launch/deep/y.launch.xml"],
             true,
         ),
-        // What else a launch directory has may be one.
+        // Other files of a launch directory may be launch files.
         (
             format!("{both}{installed}{launch}"),
             &["launch/x.py"],
             false,
         ),
     ] {
-        let place = Place::new();
+        let place = SourceFixture::new();
         place.package("p", "ament_cmake", &build);
         for file in files {
             place.write(&format!("src/p/{file}"), "");
         }
-        let foreseen = place.foresee(RosVersion::Two);
+        let foreseen = place.scan(RosVersion::Two);
         assert_eq!(foreseen.must_be_chosen(), expected, "{build}{foreseen:?}");
     }
 }
@@ -178,12 +182,12 @@ fn scripts_of_python_are_those_that_are_listed_as_texts() {
         ("more", places, &[]),
         ("[]", places, &[]),
     ] {
-        let place = Place::new();
+        let place = SourceFixture::new();
         place
             .package("p", "ament_python", "")
             .write("src/p/setup.py", &setup(list))
             .write("src/p/setup.cfg", places);
-        let foreseen = place.foresee(RosVersion::Two);
+        let foreseen = place.scan(RosVersion::Two);
         assert_eq!(foreseen.executables, expected, "{list}");
         assert_eq!(foreseen.must_be_chosen(), expected.len() > 1, "{list}");
     }

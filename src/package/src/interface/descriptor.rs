@@ -1,50 +1,49 @@
-//! What a node says of its parameters, where nodes have them (ROS 2).
+//! Parameter descriptors (ROS 2).
 
 use ros::bus::{ParameterDescription, ParameterKind};
 use serde::{Deserialize, Serialize};
 use serde_json::Number;
 
-/// What a node says of one of its parameters.
+/// Descriptor of a node's parameter.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Descriptor {
-    /// What it holds: `bool`, `integer`, `double`, `string`, or a list of them, `byte_array` among those; empty where it
-    /// holds nothing yet.
+    /// Type: `bool`, `integer`, `double`, `string`, or an array of these, including `byte_array`; empty if not set.
     #[serde(rename = "type", skip_serializing_if = "String::is_empty")]
     pub kind: String,
-    /// For people.
+    /// Human-readable description.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub description: String,
-    /// What else its value must be, for people.
+    /// Human-readable additional constraints.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub constraints: String,
-    /// It keeps the value that it was started with.
+    /// True if the parameter cannot be changed after the node has started.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub read_only: bool,
-    /// It may come to hold what is of another type.
+    /// True if the parameter may change its type.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub dynamic_typing: bool,
-    /// Between which numbers its value is.
+    /// Range of allowed values.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub range: Option<Range>,
 }
 
-/// The numbers that a parameter may hold, the ends included: whole ones of an integer.
+/// Range of allowed values, bounds included; integers for an integer parameter.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Range {
-    /// The smallest; none where there is no bound.
+    /// Minimum; absent if unbounded.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub from: Option<Number>,
-    /// The largest; none where there is no bound.
+    /// Maximum; absent if unbounded.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub to: Option<Number>,
-    /// The distance of one to the next, counted from the smallest; none where all between the ends will do.
+    /// Step between allowed values, counted from the minimum; absent if all values in the range are allowed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub step: Option<Number>,
 }
 
-/// Texts longer than this are cut: they are told to every client.
+/// Maximum length of a text in characters; longer ones are truncated, since they are sent to every client.
 const LONGEST_TEXT: usize = 2000;
 
 impl From<ParameterDescription> for Descriptor {
@@ -57,16 +56,16 @@ impl From<ParameterDescription> for Descriptor {
         let integers = said.integer_range.map(|range| Range {
             from: Some(range.from.into()),
             to: Some(range.to.into()),
-            // TOML's integers are signed.
+            // TOML integers are signed.
             step: i64::try_from(range.step)
                 .ok()
                 .filter(|step| *step != 0)
                 .map(Number::from),
         });
         Self {
-            kind: word(said.kind).to_owned(),
-            description: shortened(said.description),
-            constraints: shortened(said.constraints),
+            kind: kind_name(said.kind).to_owned(),
+            description: truncate(said.description),
+            constraints: truncate(said.constraints),
             read_only: said.read_only,
             dynamic_typing: said.dynamic_typing,
             range: match said.kind {
@@ -77,8 +76,8 @@ impl From<ParameterDescription> for Descriptor {
     }
 }
 
-/// As ROS 2's tools call it.
-fn word(kind: ParameterKind) -> &'static str {
+/// Returns the type name used by ROS 2's tools.
+fn kind_name(kind: ParameterKind) -> &'static str {
     match kind {
         ParameterKind::NotSet => "",
         ParameterKind::Bool => "bool",
@@ -93,7 +92,7 @@ fn word(kind: ParameterKind) -> &'static str {
     }
 }
 
-fn shortened(text: String) -> String {
+fn truncate(text: String) -> String {
     match text.char_indices().nth(LONGEST_TEXT) {
         Some((end, _)) => format!("{}…", &text[..end]),
         None => text,
@@ -135,6 +134,6 @@ mod tests {
         let written = toml::to_string(&whole).expect("TOML");
         assert_eq!(toml::from_str::<Descriptor>(&written), Ok(whole));
         let long = "ä".repeat(LONGEST_TEXT + 1);
-        assert_eq!(shortened(long).chars().count(), LONGEST_TEXT + 1);
+        assert_eq!(truncate(long).chars().count(), LONGEST_TEXT + 1);
     }
 }

@@ -1,4 +1,4 @@
-//! Quality of service of topics, in the words of ROS 2's tools.
+//! Quality of service of topics, in the terms of ROS 2's tools.
 
 use std::fmt;
 use std::time::Duration;
@@ -6,64 +6,64 @@ use std::time::Duration;
 use ros::bus;
 use serde::{Deserialize, Serialize};
 
-/// What publishers of a topic offer, or its subscribers ask for. How many messages they keep is not told to others. Times
-/// are seconds; none where that is not said.
+/// QoS offered by the publishers of a topic or requested by its subscribers. The history depth is not announced to
+/// others. Times are in seconds; absent if unspecified.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Qos {
-    /// Whether messages may be lost on the way.
+    /// Reliability policy.
     pub reliability: Reliability,
-    /// What newcomers among the subscribers are given.
+    /// Durability policy.
     pub durability: Durability,
-    /// The longest time between two messages.
+    /// Maximum time between two messages.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub deadline: Option<f64>,
-    /// After so long a message is of no use.
+    /// Time after which a message expires.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lifespan: Option<f64>,
-    /// Who says that a publisher is alive.
+    /// Liveliness policy.
     pub liveliness: Liveliness,
-    /// Within which time.
+    /// Liveliness lease duration.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lease: Option<f64>,
 }
 
-/// Whether messages may be lost on the way; what comes later is more.
+/// Reliability policy, in ascending order of strictness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Reliability {
-    /// Sent once.
+    /// Messages may be lost.
     BestEffort,
-    /// Sent again until they have come.
+    /// Lost messages are retransmitted.
     #[default]
     Reliable,
 }
 
-/// What newcomers are given; what comes later is more.
+/// Durability policy, in ascending order of strictness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Durability {
-    /// What is published from then on.
+    /// New subscribers get only messages published after they subscribe.
     #[default]
     Volatile,
-    /// Also what was published last.
+    /// New subscribers also get the latest messages published earlier.
     TransientLocal,
 }
 
-/// Who says that a publisher is alive; what comes later is more.
+/// Liveliness policy, in ascending order of strictness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Liveliness {
-    /// ROS, for as long as its node is there.
+    /// The publisher is alive as long as its node is.
     #[default]
     Automatic,
-    /// What it publishes.
+    /// The publisher is alive as long as it publishes.
     ManualByTopic,
 }
 
 impl Qos {
-    /// What both offer: whoever asks for that hears either of them.
-    pub fn least(self, other: Self) -> Self {
+    /// Returns the QoS that both offer: a subscriber that requests it receives from either of them.
+    pub fn common_offer(self, other: Self) -> Self {
         Self {
             reliability: self.reliability.min(other.reliability),
             durability: self.durability.min(other.durability),
@@ -74,8 +74,8 @@ impl Qos {
         }
     }
 
-    /// What both ask for: whoever offers that is heard by either of them.
-    pub fn most(self, other: Self) -> Self {
+    /// Returns the QoS that satisfies both requests: a publisher that offers it is received by either of them.
+    pub fn common_request(self, other: Self) -> Self {
         Self {
             reliability: self.reliability.max(other.reliability),
             durability: self.durability.max(other.durability),
@@ -86,54 +86,54 @@ impl Qos {
         }
     }
 
-    /// For an end of ours that keeps so many messages.
-    pub fn on_bus(&self, depth: usize) -> bus::Qos {
+    /// Converts to the QoS of an endpoint of ours with this history depth.
+    pub fn to_bus_qos(&self, depth: usize) -> bus::QosProfile {
         let time = |seconds: Option<f64>| Duration::try_from_secs_f64(seconds?).ok();
-        bus::Qos {
+        bus::QosProfile {
             reliability: match self.reliability {
-                Reliability::Reliable => bus::Reliability::Reliable,
-                Reliability::BestEffort => bus::Reliability::BestEffort,
+                Reliability::Reliable => bus::QosReliability::Reliable,
+                Reliability::BestEffort => bus::QosReliability::BestEffort,
             },
             durability: match self.durability {
-                Durability::Volatile => bus::Durability::Volatile,
-                Durability::TransientLocal => bus::Durability::TransientLocal,
+                Durability::Volatile => bus::QosDurability::Volatile,
+                Durability::TransientLocal => bus::QosDurability::TransientLocal,
             },
             depth,
             deadline: time(self.deadline),
             lifespan: time(self.lifespan),
             liveliness: match self.liveliness {
-                Liveliness::Automatic => bus::Liveliness::Automatic,
-                Liveliness::ManualByTopic => bus::Liveliness::ManualByTopic,
+                Liveliness::Automatic => bus::QosLiveliness::Automatic,
+                Liveliness::ManualByTopic => bus::QosLiveliness::ManualByTopic,
             },
             lease: time(self.lease),
         }
     }
 }
 
-impl From<&bus::Qos> for Qos {
-    fn from(of: &bus::Qos) -> Self {
+impl From<&bus::QosProfile> for Qos {
+    fn from(of: &bus::QosProfile) -> Self {
         let seconds = |time: Option<Duration>| time.map(|time| time.as_secs_f64());
         Self {
             reliability: match of.reliability {
-                bus::Reliability::Reliable => Reliability::Reliable,
-                bus::Reliability::BestEffort => Reliability::BestEffort,
+                bus::QosReliability::Reliable => Reliability::Reliable,
+                bus::QosReliability::BestEffort => Reliability::BestEffort,
             },
             durability: match of.durability {
-                bus::Durability::Volatile => Durability::Volatile,
-                bus::Durability::TransientLocal => Durability::TransientLocal,
+                bus::QosDurability::Volatile => Durability::Volatile,
+                bus::QosDurability::TransientLocal => Durability::TransientLocal,
             },
             deadline: seconds(of.deadline),
             lifespan: seconds(of.lifespan),
             liveliness: match of.liveliness {
-                bus::Liveliness::Automatic => Liveliness::Automatic,
-                bus::Liveliness::ManualByTopic => Liveliness::ManualByTopic,
+                bus::QosLiveliness::Automatic => Liveliness::Automatic,
+                bus::QosLiveliness::ManualByTopic => Liveliness::ManualByTopic,
             },
             lease: seconds(of.lease),
         }
     }
 }
 
-/// For people; what is as usual is left out beside the first two.
+/// Writes a human-readable form; the policies after the first two only if they are not the default.
 impl fmt::Display for Qos {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self.reliability {
@@ -161,7 +161,7 @@ impl fmt::Display for Qos {
     }
 }
 
-/// None is for ever.
+/// Returns the longer time; `None` means infinite.
 fn longest(one: Option<f64>, other: Option<f64>) -> Option<f64> {
     Some(one?.max(other?))
 }
@@ -190,14 +190,14 @@ mod tests {
             ..Qos::default()
         };
         assert_eq!(
-            strict.least(loose),
+            strict.common_offer(loose),
             Qos {
                 reliability: Reliability::BestEffort,
                 ..Qos::default()
             }
         );
         assert_eq!(
-            strict.most(loose),
+            strict.common_request(loose),
             Qos {
                 lease: Some(2.0),
                 ..strict
@@ -215,12 +215,12 @@ mod tests {
             lease: Some(1.25),
             ..Qos::default()
         };
-        assert_eq!(Qos::from(&qos.on_bus(7)), qos);
+        assert_eq!(Qos::from(&qos.to_bus_qos(7)), qos);
         let impossible = Qos {
             deadline: Some(f64::INFINITY),
             ..qos
         };
-        assert_eq!(impossible.on_bus(7).deadline, None);
+        assert_eq!(impossible.to_bus_qos(7).deadline, None);
         assert_eq!(
             qos.to_string(),
             "best_effort, volatile, liveliness manual_by_topic, deadline 0.5 s, lifespan 3 s, liveliness lease 1.25 s"

@@ -1,11 +1,11 @@
 use super::*;
 use crate::condition::Variables;
-use crate::workspace::{Pushed, inspect};
+use crate::workspace::{PushedDirectory, inspect};
 
-struct Place(tempfile::TempDir);
+struct InterfaceFixture(tempfile::TempDir);
 
-impl Place {
-    /// A package of interfaces, `demo`, whose build file lists these.
+impl InterfaceFixture {
+    /// Creates a package of interfaces, `demo`, whose build file lists these.
     fn new(listed: &str, files: &[(&str, &str)]) -> Self {
         let place = Self(tempfile::tempdir().expect("a directory"));
         let manifest = "<package format='3'><name>demo</name>\
@@ -27,8 +27,9 @@ impl Place {
     }
 
     fn check(&self) -> Result<(), Error> {
-        let variables = Variables::ros(2, "jazzy");
-        let Pushed::Source(workspace) = inspect(self.0.path(), &variables).expect("a workspace")
+        let variables = Variables::for_distribution(2, "jazzy");
+        let PushedDirectory::Source(workspace) =
+            inspect(self.0.path(), &variables).expect("a workspace")
         else {
             panic!("sources")
         };
@@ -45,7 +46,7 @@ impl Place {
         check(&workspace, &known)
     }
 
-    fn refused(&self) -> String {
+    fn refusal(&self) -> String {
         self.check().expect_err("refused").to_string()
     }
 }
@@ -53,7 +54,7 @@ impl Place {
 #[test]
 fn interfaces_in_all_languages_are_read() {
     let idl = "module demo { module msg { struct Natural { int32 x; }; }; };";
-    let place = Place::new(
+    let place = InterfaceFixture::new(
         "\"msg/Seen.msg\" \"msg/Natural.idl\" \"srv/Ask.srv\" \"action/Go.action\"",
         &[
             (
@@ -73,22 +74,22 @@ fn interfaces_in_all_languages_are_read() {
 
 #[test]
 fn a_type_without_definition_is_named_with_its_file() {
-    let place = Place::new("msg/Seen.msg", &[("msg/Seen.msg", "nav_msgs/Path path\n")]);
-    let text = place.refused();
+    let place = InterfaceFixture::new("msg/Seen.msg", &[("msg/Seen.msg", "nav_msgs/Path path\n")]);
+    let text = place.refusal();
     for words in [
         "src/demo/msg/Seen.msg: ",
-        "nav_msgs/msg/Path, of which there is no definition",
+        "nav_msgs/msg/Path, which has no definition",
         "name the package nav_msgs",
     ] {
         assert!(text.contains(words), "{text}");
     }
-    // In a service and an action, too, and by way of another message.
+    // Also in a service and an action, and through another message.
     for (file, text) in [
         ("srv/Ask.srv", "---\nnav_msgs/Path path\n"),
         ("action/Go.action", "---\n---\nWay way\n"),
     ] {
         let way = ("msg/Way.msg", "nav_msgs/Path path\n");
-        let text = Place::new(file, &[(file, text), way]).refused();
+        let text = InterfaceFixture::new(file, &[(file, text), way]).refusal();
         assert!(
             text.contains(file) && text.contains("nav_msgs/msg/Path"),
             "{text}"
@@ -112,7 +113,7 @@ fn a_mistake_is_told_with_file_and_line() {
             "msg/Nature.idl: line 1: ",
         ),
     ] {
-        let told = Place::new(file, &[(file, text)]).refused();
+        let told = InterfaceFixture::new(file, &[(file, text)]).refusal();
         assert!(told.contains(words), "{file}: {told}");
     }
 }
@@ -121,33 +122,33 @@ fn a_mistake_is_told_with_file_and_line() {
 fn only_what_is_built_is_looked_at() {
     let broken = ("msg/Broken.msg", "!!!\n");
     let good = ("msg/Good.msg", "int32 x\n");
-    Place::new("msg/Good.msg", &[good, broken])
+    InterfaceFixture::new("msg/Good.msg", &[good, broken])
         .check()
         .expect("good");
-    // A name that ends like another one is another one.
-    Place::new("msg/Good.msg msg/UnBroken.msg", &[good, broken])
+    // A name with the same ending is another name.
+    InterfaceFixture::new("msg/Good.msg msg/UnBroken.msg", &[good, broken])
         .check()
         .expect("good");
-    // Where none is named the build file looks for them.
-    let text = Place::new("${files}", &[good, broken]).refused();
+    // If none is named, the build file finds them by a pattern.
+    let text = InterfaceFixture::new("${files}", &[good, broken]).refusal();
     assert!(text.contains("msg/Broken.msg"), "{text}");
-    // Without code of them nothing is wrong.
-    let place = Place::new("", &[broken]);
+    // Without code generation nothing is checked.
+    let place = InterfaceFixture::new("", &[broken]);
     place.write("src/demo/CMakeLists.txt", "project(demo)");
     place.check().expect("not built");
 }
 
 #[test]
 fn links_and_endless_files_are_not_read() {
-    let place = Place::new("msg/Big.msg", &[("msg/Good.msg", "int32 x\n")]);
+    let place = InterfaceFixture::new("msg/Big.msg", &[("msg/Good.msg", "int32 x\n")]);
     place.write("src/demo/msg/Big.msg", &"#".repeat(300 << 10));
     assert!(
-        place.refused().contains("larger than"),
+        place.refusal().contains("larger than"),
         "{}",
-        place.refused()
+        place.refusal()
     );
     let (place, outside) = (
-        Place::new("msg/Out.msg", &[("msg/Good.msg", "int32 x\n")]),
+        InterfaceFixture::new("msg/Out.msg", &[("msg/Good.msg", "int32 x\n")]),
         tempfile::tempdir().expect("a directory"),
     );
     std::fs::write(outside.path().join("Out.msg"), "secret!").expect("written");
@@ -156,7 +157,7 @@ fn links_and_endless_files_are_not_read() {
         place.0.path().join("src/demo/msg/Out.msg"),
     )
     .expect("linked");
-    let text = place.refused();
+    let text = place.refusal();
     assert!(
         text.contains("leads out of") && !text.contains("secret"),
         "{text}"

@@ -3,14 +3,14 @@
 use std::collections::BTreeSet;
 
 use crate::Error;
-use crate::merged::Merged;
+use crate::merged::MergedDirectory;
 
-/// How deep below `share/PACKAGE/launch` files are looked for.
+/// Maximum depth of the search below `share/PACKAGE/launch`.
 const MAX_DEPTH: usize = 4;
-/// Files of one package that are told.
+/// Maximum number of files reported for a package.
 const MAX_FILES: usize = 1000;
 
-/// Ends of names by which launch files are known wherever they are: of ROS 1, and those of ROS 2's parsers.
+/// File name suffixes of launch files in any directory: of ROS 1, and of ROS 2's parsers.
 const ENDS: [&str; 5] = [
     ".launch",
     "launch.py",
@@ -18,11 +18,11 @@ const ENDS: [&str; 5] = [
     "launch.yaml",
     "launch.yml",
 ];
-/// In a directory of that name these are launch files, too.
+/// Further suffixes of launch files in a directory `launch`.
 const EXTENSIONS: [&str; 4] = [".py", ".xml", ".yaml", ".yml"];
 
-/// Those of a package, by their paths below `own`, its directory in `share`.
-pub(super) fn files(own: &Merged) -> Result<BTreeSet<String>, Error> {
+/// Returns the launch files of a package as paths below `own`, its share directory.
+pub(super) fn find_launch_files(own: &MergedDirectory) -> Result<BTreeSet<String>, Error> {
     let mut found = BTreeSet::new();
     for (name, level) in own.names()? {
         let Ok(name) = String::from_utf8(name) else {
@@ -31,14 +31,14 @@ pub(super) fn files(own: &Merged) -> Result<BTreeSet<String>, Error> {
         if is_launch_file(&name) && !level.is_deletion(name.as_bytes()) {
             found.insert(name);
         } else if name == "launch" {
-            below(&own.below(b"launch")?, &name, MAX_DEPTH, &mut found)?;
+            collect_launch_files(&own.open_child(b"launch")?, &name, MAX_DEPTH, &mut found)?;
         }
     }
     Ok(found)
 }
 
-fn below(
-    directory: &Merged,
+fn collect_launch_files(
+    directory: &MergedDirectory,
     path: &str,
     depth: usize,
     found: &mut BTreeSet<String>,
@@ -51,10 +51,10 @@ fn below(
             return Ok(());
         }
         let inner = format!("{path}/{text}");
-        let inside = directory.below(&name)?;
+        let inside = directory.open_child(&name)?;
         if inside.exists() {
             if depth > 0 {
-                below(&inside, &inner, depth - 1, found)?;
+                collect_launch_files(&inside, &inner, depth - 1, found)?;
             }
         } else if (is_launch_file(&text) || EXTENSIONS.iter().any(|end| text.ends_with(end)))
             && !text.starts_with("__")

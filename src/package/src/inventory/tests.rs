@@ -23,18 +23,18 @@ impl Layers {
         ["low", "high"].map(|layer| self.0.path().join(layer))
     }
 
-    fn take(&self, environment: &[(&str, &str)], commands: &[&[&str]]) -> Inventory {
+    fn collect_inventory(&self, environment: &[(&str, &str)], commands: &[&[&str]]) -> Inventory {
         let owned = |(key, value): &(&str, &str)| ((*key).to_owned(), (*value).to_owned());
         let environment = environment.iter().map(owned).collect();
         let words = |command: &&[&str]| command.iter().map(|word| (*word).to_owned()).collect();
         let commands: Vec<Vec<String>> = commands.iter().map(words).collect();
         let commands: Vec<&[String]> = commands.iter().map(Vec::as_slice).collect();
-        let of = Published {
+        let of = SearchHints {
             package: "p",
             environment: &environment,
             commands: &commands,
         };
-        Inventory::take(&self.paths(), of).expect("taken")
+        Inventory::scan(&self.paths(), of).expect("taken")
     }
 }
 
@@ -71,7 +71,7 @@ fn install_spaces_are_in_the_order_in_which_nodes_search_them() {
         ),
         ("ROS_PACKAGE_PATH", "/opt/mine/share:/opt/other/share"),
     ];
-    let taken = layers.take(&environment, &[&["/opt/alone/lib/p/run"]]);
+    let taken = layers.collect_inventory(&environment, &[&["/opt/alone/lib/p/run"]]);
     assert_eq!(
         taken.prefixes,
         [
@@ -93,12 +93,12 @@ fn packages_have_directories_and_programs() {
         .file("low/usr/lib/q/old", 0o755)
         .file("low/usr/lib/other/tool", 0o755);
     symlink("node", layers.place("high/usr/lib/p/alias")).expect("linked");
-    let taken = layers.take(&[("CMAKE_PREFIX_PATH", "/opt/mine:/usr")], &[]);
-    let installed = |share: &str, lib: &str, executables: &[&str]| Installed {
+    let taken = layers.collect_inventory(&[("CMAKE_PREFIX_PATH", "/opt/mine:/usr")], &[]);
+    let installed = |share: &str, lib: &str, executables: &[&str]| InstalledPackage {
         share: share.into(),
         lib: lib.into(),
         executables: executables.iter().map(|name| (*name).to_owned()).collect(),
-        ..Installed::default()
+        ..InstalledPackage::default()
     };
     let expected = [
         (
@@ -116,13 +116,13 @@ fn packages_have_directories_and_programs() {
 fn what_nodes_run_of_the_package_can_be_started_by_a_stub() {
     let layers = layers();
     layers.file("low/usr/lib/p/model", 0o644);
-    let taken = layers.take(
+    let taken = layers.collect_inventory(
         &[],
         &[
             &["/usr/bin/nice", "-n", "5", "/usr/lib/p/node", "__name:=n"],
             &["/usr/share/p/scripts/tool.py", "x:=/lib/p/y"],
             &["/usr/lib/q/other"],
-            // Data that a node is given is no program.
+            // A data file among the arguments of a node is not an executable.
             &[
                 "/usr/lib/map_server/map_server",
                 "/usr/share/p/maps/map.yaml",
@@ -153,7 +153,7 @@ fn programs_are_told_from_data() {
     ] {
         symlink(target, layers.place(name)).expect("linked");
     }
-    let stack = merged::open(&layers.paths()).expect("opened");
+    let stack = merged::open_layers(&layers.paths()).expect("opened");
     for (path, expected) in [
         ("/usr/lib/p/node", Some(true)),
         ("/usr/share/p/scripts/tool.py", Some(true)),
@@ -179,16 +179,16 @@ fn a_prefix_cannot_lead_out_of_the_layers() {
         .file("secret/share/p/package.xml", 0o600)
         .file("secret/lib/p/tool", 0o755);
     let paths = "/../secret:../secret:/usr/../../secret:/..";
-    let taken = layers.take(&[("CMAKE_PREFIX_PATH", paths)], &[]);
+    let taken = layers.collect_inventory(&[("CMAKE_PREFIX_PATH", paths)], &[]);
     assert_eq!(taken.prefixes, ["/usr"]);
     assert_eq!(taken.packages["p"].share, "/usr/share/p");
-    // Nor can endless ones keep the daemon busy.
+    // Nor can excessive directories keep the daemon busy.
     let many: Vec<String> = (0..10_000).map(|number| format!("/{number}")).collect();
-    let taken = layers.take(&[("CMAKE_PREFIX_PATH", &many.join(":"))], &[]);
+    let taken = layers.collect_inventory(&[("CMAKE_PREFIX_PATH", &many.join(":"))], &[]);
     assert_eq!(taken.prefixes, Vec::<String>::new());
 }
 
-/// Packages of ROS 2 in a merged space, one in an isolated space, and a base below `/opt/ros`.
+/// Creates ROS 2 packages in a merged space, one in an isolated space, and a base below `/opt/ros`.
 fn layers_of_two() -> Layers {
     let layers = Layers(tempfile::tempdir().expect("a directory"));
     let index = "share/ament_index/resource_index";
@@ -210,7 +210,7 @@ fn layers_of_two() -> Layers {
         .file("high/opt/mine/share/p/launch/notes.txt", 0o644)
         .file("high/opt/mine/share/p/top_launch.xml", 0o644)
         .file("high/opt/mine/share/p/params.yaml", 0o644)
-        // What console_scripts of setup.py become.
+        // The form of console_scripts of a setup.py once installed.
         .file("high/opt/mine/lib/p/talker", 0o755)
         .file(
             "high/opt/mine/lib/python3.11/site-packages/p/talker.py",
@@ -225,7 +225,8 @@ const OF_TWO: (&str, &str) = ("AMENT_PREFIX_PATH", "/opt/mine:/opt/apart/q:/opt/
 
 #[test]
 fn packages_of_ros_2_are_those_of_aments_index() {
-    let taken = layers_of_two().take(&[OF_TWO, ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy")], &[]);
+    let taken =
+        layers_of_two().collect_inventory(&[OF_TWO, ("CMAKE_PREFIX_PATH", "/opt/ros/jazzy")], &[]);
     assert_eq!(
         taken.prefixes[..3],
         ["/opt/mine", "/opt/apart/q", "/opt/ros/jazzy"]
@@ -259,7 +260,7 @@ fn component_libraries_are_told() {
     let text = "p::Talker;lib/libtalker.so\np::Bad;../../etc/shadow\nnonsense\nrm -rf;lib/x.so\n\
                 p::ns::Other;lib/libtalker.so\n";
     std::fs::write(layers.place(path), text).expect("written");
-    let taken = layers.take(&[OF_TWO], &[]);
+    let taken = layers.collect_inventory(&[OF_TWO], &[]);
     let expected = [
         ("p::Talker", "/opt/mine/lib/libtalker.so"),
         ("p::ns::Other", "/opt/mine/lib/libtalker.so"),
@@ -272,7 +273,7 @@ fn component_libraries_are_told() {
 #[test]
 fn what_an_earlier_version_recorded_is_read() {
     let recorded = r#"{"share":"/usr/share/p","lib":"/usr/lib/p","executables":["node"]}"#;
-    let read: Installed = serde_json::from_str(recorded).expect("read");
+    let read: InstalledPackage = serde_json::from_str(recorded).expect("read");
     assert!(read.launch_files.is_empty() && read.components.is_empty());
     assert_eq!(serde_json::to_string(&read).expect("written"), recorded);
 }
@@ -281,7 +282,7 @@ fn what_an_earlier_version_recorded_is_read() {
 fn configurations_of_parameters_are_no_executables() {
     let layers = layers();
     layers.file("low/usr/lib/p/DWAPlanner.cfg", 0o755);
-    let taken = layers.take(&[], &[]);
+    let taken = layers.collect_inventory(&[], &[]);
     let executables: Vec<&str> = taken.packages["p"]
         .executables
         .iter()

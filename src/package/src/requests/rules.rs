@@ -1,25 +1,25 @@
-//! Pairs the inputs and outputs of one node: by what was seen, and where nothing was, by types and names.
+//! Rules that pair the inputs and outputs of a node: by observed answers, otherwise by types and names.
 
 use std::collections::BTreeSet;
 
-use qos::{Correlation, Pair};
+use qos::{Correlation, TopicPair};
 
-use super::{Reason, Watched};
+use super::{ObservedAnswer, Reason};
 
-/// One end of a topic, as the rules need it.
+/// Properties of a topic used by the rules.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct End {
+pub(super) struct TopicEnd {
     pub(super) name: String,
-    /// `package/Type`, of whichever ROS.
+    /// Type as `package/Type`, for both ROS versions.
     pub(super) type_name: String,
-    /// The type begins with a `std_msgs/Header`.
+    /// True if the type begins with a `std_msgs/Header`.
     pub(super) is_stamped: bool,
     pub(super) is_latched: bool,
-    /// The type is defined; that of a relay's ends is not.
+    /// True if the type is defined; false for the topics of a relay.
     pub(super) is_known: bool,
 }
 
-/// Topics that every node or many nodes have and that are nobody's request or answer.
+/// Common topics that are neither requests nor answers.
 const HOUSEKEEPING: [&str; 9] = [
     "/clock",
     "/tf",
@@ -37,11 +37,11 @@ const HOUSEKEEPING_ENDINGS: [&str; 7] = [
     "/bond",
     "/camera_info",
     "/transition_event",
-    // Of ROS 2's actions, whose goals and results are calls.
+    // Topics of ROS 2 actions, whose goals and results are calls.
     "/_action/feedback",
     "/_action/status",
 ];
-/// Types that accompany data, configure or trigger nothing.
+/// Types that accompany data or configure nodes, and trigger nothing.
 const COMPANIONS: [&str; 7] = [
     "sensor_msgs/CameraInfo",
     "tf2_msgs/TFMessage",
@@ -51,7 +51,7 @@ const COMPANIONS: [&str; 7] = [
     "bond/Status",
     "rosgraph_msgs/Clock",
 ];
-/// Sensor data: where there is such an input, it is the one that triggers.
+/// Types of sensor data: such an input is the trigger if there is one.
 const DATA: [&str; 9] = [
     "sensor_msgs/Image",
     "sensor_msgs/CompressedImage",
@@ -63,32 +63,32 @@ const DATA: [&str; 9] = [
     "sensor_msgs/Range",
     "audio_common_msgs/AudioData",
 ];
-/// Types that switch something on or off: an input of another type is the one that triggers.
+/// Types of switches: an input of another type takes precedence as the trigger.
 const SWITCHES: [&str; 2] = ["std_msgs/Bool", "std_msgs/Empty"];
-/// Words in names of pictures that accompany other pictures.
+/// Words in the names of images that accompany other images.
 const ACCOMPANYING: [&str; 4] = ["depth", "disparity", "mask", "confidence"];
 
-/// The pairs of one node, each with the reason.
+/// Returns the pairs of a node and how they were determined.
 ///
-/// An input whose stamp was seen on outputs is answered by those. Of the rest one input is the trigger: sensor data
-/// before other types, with a stamp before without, switches last, then by name. With a stamp on both ends its answers
-/// are all stamped outputs, and that whose type is neither the input's nor a picture (those are views for people) is
-/// the one whose time counts. Without, it is whatever output comes next.
-pub(super) fn pairs(
-    inputs: &[End],
-    outputs: &[End],
-    watched: &BTreeSet<Watched>,
-) -> Vec<(Pair, Reason)> {
-    let mut triggers: Vec<&End> = inputs.iter().filter(|end| !is_housekeeping(end)).collect();
-    triggers.sort_by_key(|end| (rank(end), is_accompanying(end), end.name.as_str()));
-    let mut answers: Vec<&End> = outputs.iter().filter(|end| !is_housekeeping(end)).collect();
+/// An input whose stamp was observed on outputs is answered by those. Of the remaining inputs one is the trigger:
+/// sensor data before other types, with a stamp before without, switches last, then by name. If trigger and outputs
+/// have stamps, its answers are all stamped outputs; the response time is that of the output whose type is neither the
+/// input's nor an image (images are visualizations). Otherwise the next output of any kind is the answer.
+pub(super) fn pair_topics(
+    inputs: &[TopicEnd],
+    outputs: &[TopicEnd],
+    watched: &BTreeSet<ObservedAnswer>,
+) -> Vec<(TopicPair, Reason)> {
+    let mut triggers: Vec<&TopicEnd> = inputs.iter().filter(|end| !is_housekeeping(end)).collect();
+    triggers.sort_by_key(|end| (trigger_rank(end), is_accompanying(end), end.name.as_str()));
+    let mut answers: Vec<&TopicEnd> = outputs.iter().filter(|end| !is_housekeeping(end)).collect();
     let inputs = triggers.len();
     let mut pairs = Vec::new();
     let mut best_watched = u8::MAX;
     let mut unanswered = Vec::new();
     for trigger in triggers {
-        let carried = |output: &&End| {
-            let answer = Watched {
+        let carried = |output: &&TopicEnd| {
+            let answer = ObservedAnswer {
                 input: trigger.name.clone(),
                 output: output.name.clone(),
             };
@@ -96,22 +96,22 @@ pub(super) fn pairs(
         };
         let (seen, rest) = answers.into_iter().partition(carried);
         answers = rest;
-        match pair(trigger, seen, Correlation::Stamp) {
+        match make_pair(trigger, seen, Correlation::Stamp) {
             Some(pair) => {
-                best_watched = best_watched.min(rank(trigger));
+                best_watched = best_watched.min(trigger_rank(trigger));
                 pairs.push((pair, Reason::Watched));
             }
             None => unanswered.push(trigger),
         }
     }
-    // A likelier input than those that were seen to be answered, or nothing was seen.
+    // The trigger is likelier than the inputs with observed answers, or nothing was observed.
     let likelier = unanswered
         .first()
-        .filter(|trigger| rank(trigger) < best_watched);
+        .filter(|trigger| trigger_rank(trigger) < best_watched);
     match likelier {
         Some(trigger) => pairs.extend(guess(trigger, inputs, answers)),
         None => {
-            // Views that were not published for what the push gave.
+            // Visualizations that were not published for the messages sent by the push.
             if let [(pair, _)] = &mut pairs[..] {
                 let views = answers.into_iter().filter(|end| end.is_stamped);
                 pair.outputs.extend(views.map(|end| end.name.clone()));
@@ -121,9 +121,13 @@ pub(super) fn pairs(
     pairs
 }
 
-/// The likeliest answers to the likeliest of so many inputs.
-fn guess(trigger: &End, inputs: usize, answers: Vec<&End>) -> Option<(Pair, Reason)> {
-    let stamped: Vec<&End> = answers
+/// Guesses the answers to the most likely of `inputs` inputs.
+fn guess(
+    trigger: &TopicEnd,
+    inputs: usize,
+    answers: Vec<&TopicEnd>,
+) -> Option<(TopicPair, Reason)> {
+    let stamped: Vec<&TopicEnd> = answers
         .iter()
         .copied()
         .filter(|end| end.is_stamped)
@@ -131,8 +135,8 @@ fn guess(trigger: &End, inputs: usize, answers: Vec<&End>) -> Option<(Pair, Reas
     let (answers, by) = if trigger.is_stamped && !stamped.is_empty() {
         (stamped, Correlation::Stamp)
     } else {
-        // A latched output tells a state; it is the answer where there is no other.
-        let passing: Vec<&End> = answers
+        // A latched output represents a state; it is the answer only if there is no other.
+        let passing: Vec<&TopicEnd> = answers
             .iter()
             .copied()
             .filter(|end| !end.is_latched)
@@ -145,30 +149,34 @@ fn guess(trigger: &End, inputs: usize, answers: Vec<&End>) -> Option<(Pair, Reas
     } else {
         Reason::Guessed
     };
-    Some((pair(trigger, answers, by)?, reason))
+    Some((make_pair(trigger, answers, by)?, reason))
 }
 
-/// The pair of these topics; none without an output.
-fn pair(trigger: &End, mut answers: Vec<&End>, by: Correlation) -> Option<Pair> {
-    answers.sort_by_key(|end| (is_view(end, trigger), end.is_latched, end.name.as_str()));
+/// Creates the pair of these topics; `None` without an output.
+fn make_pair(
+    trigger: &TopicEnd,
+    mut answers: Vec<&TopicEnd>,
+    by: Correlation,
+) -> Option<TopicPair> {
+    answers.sort_by_key(|end| (view_rank(end, trigger), end.is_latched, end.name.as_str()));
     if by == Correlation::Arrival {
-        // Any output would do, and one of them has to be the answer.
+        // Any output would be an answer, so a single one must be chosen.
         answers.truncate(1);
     }
     let is_known = trigger.is_known && answers.iter().all(|end| end.is_known);
     let outputs: Vec<String> = answers.iter().map(|end| end.name.clone()).collect();
-    (!outputs.is_empty()).then(|| Pair {
+    (!outputs.is_empty()).then(|| TopicPair {
         input: trigger.name.clone(),
         outputs,
-        // Else the robot sees which types they have there.
+        // Otherwise the robot determines it from the types that the topics have there.
         by: is_known.then_some(by),
     })
 }
 
-/// Whether a topic is no request and no answer, whatever else there is. Nodes may call topics as no ROS allows; what is decided could not be
-/// read again with such a name.
-fn is_housekeeping(end: &End) -> bool {
-    !Pair::can_name(&end.name)
+/// Returns whether a topic is never a request or an answer. Nodes may use topic names that ROS does not allow; a pair
+/// with such a name could not be parsed again.
+fn is_housekeeping(end: &TopicEnd) -> bool {
+    !TopicPair::is_valid_topic(&end.name)
         || HOUSEKEEPING.contains(&end.name.as_str())
         || HOUSEKEEPING_ENDINGS
             .iter()
@@ -176,8 +184,8 @@ fn is_housekeeping(end: &End) -> bool {
         || COMPANIONS.contains(&end.type_name.as_str())
 }
 
-/// The less, the likelier a message is a request.
-fn rank(end: &End) -> u8 {
+/// Returns the rank of an input as a request; lower is likelier.
+fn trigger_rank(end: &TopicEnd) -> u8 {
     let is_data = DATA.contains(&end.type_name.as_str());
     match (is_data, end.is_stamped) {
         (true, true) => 0,
@@ -188,14 +196,14 @@ fn rank(end: &End) -> u8 {
     }
 }
 
-fn is_accompanying(end: &End) -> bool {
+fn is_accompanying(end: &TopicEnd) -> bool {
     let name = end.name.to_lowercase();
     ACCOMPANYING.iter().any(|word| name.contains(word))
 }
 
-fn is_view(output: &End, input: &End) -> u8 {
+fn view_rank(output: &TopicEnd, input: &TopicEnd) -> u8 {
     let is_picture =
         output.type_name.ends_with("/Image") || output.type_name.ends_with("/CompressedImage");
-    // A picture for a picture may be the result (rectified, say), but never where there is another result.
+    // An image for an image may be the result (a rectified one, for example), but not if there is another result.
     u8::from(output.type_name == input.type_name) + u8::from(is_picture)
 }

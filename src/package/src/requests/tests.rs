@@ -14,9 +14,10 @@ const STAMPED: [&str; 9] = [
     "sensor_msgs/PointCloud2",
 ];
 
-/// An interface of these topics, `<` an input and `>` an output, each with its type; `!` behind the name: latched.
+/// Creates an interface of topics with their types: `<` is an input, `>` an output, and `!` after the name means
+/// latched.
 fn interface(topics: &[&str]) -> Interface {
-    of_nodes(
+    interface_of_nodes(
         &topics
             .iter()
             .map(|topic| (*topic, "/node"))
@@ -24,7 +25,7 @@ fn interface(topics: &[&str]) -> Interface {
     )
 }
 
-fn of_nodes(topics: &[(&str, &str)]) -> Interface {
+fn interface_of_nodes(topics: &[(&str, &str)]) -> Interface {
     let mut interface = Interface::default();
     let header = "uint32 seq\ntime stamp\nstring frame_id\n";
     let mut define = |name: &str, text: &str| {
@@ -64,21 +65,25 @@ fn of_nodes(topics: &[(&str, &str)]) -> Interface {
     interface
 }
 
-fn seen(answers: &[(&str, &str)]) -> BTreeSet<Watched> {
-    let watched = |(input, output): &(&str, &str)| Watched {
+fn observed_answers(answers: &[(&str, &str)]) -> BTreeSet<ObservedAnswer> {
+    let watched = |(input, output): &(&str, &str)| ObservedAnswer {
         input: (*input).to_owned(),
         output: (*output).to_owned(),
     };
     answers.iter().map(watched).collect()
 }
 
-fn shown(requests: &[Request]) -> Vec<String> {
+fn display_requests(requests: &[Request]) -> Vec<String> {
     let shown = |request: &Request| format!("{} {:?}", request.pair, request.reason);
     requests.iter().map(shown).collect()
 }
 
-fn decided(topics: &[&str], answers: &[(&str, &str)]) -> Vec<String> {
-    shown(&decide(RosVersion::One, &interface(topics), &seen(answers)))
+fn decide_and_display(topics: &[&str], answers: &[(&str, &str)]) -> Vec<String> {
+    display_requests(&decide_requests(
+        RosVersion::One,
+        &interface(topics),
+        &observed_answers(answers),
+    ))
 }
 
 #[test]
@@ -153,7 +158,7 @@ fn by_rule_data_answers_before_switches_and_results_before_views() {
         (&["</in std_msgs/String"], &[]),
         (&["</tf tf2_msgs/TFMessage", ">/out std_msgs/String"], &[]),
     ] {
-        assert_eq!(decided(topics, &[]), expected, "{topics:?}");
+        assert_eq!(decide_and_display(topics, &[]), expected, "{topics:?}");
     }
 }
 
@@ -168,7 +173,10 @@ fn topics_of_ros_2_that_every_node_has_answer_nothing() {
         ">/parameter_events rcl_interfaces/ParameterEvent",
         ">/rosout rosgraph_msgs/Log",
     ];
-    assert_eq!(decided(&topics, &[]), ["/in -> /out by arrival Alone"]);
+    assert_eq!(
+        decide_and_display(&topics, &[]),
+        ["/in -> /out by arrival Alone"]
+    );
     let two = Interface {
         topics: vec![Topic {
             type_name: "sensor_msgs/msg/Image".to_owned(),
@@ -176,14 +184,14 @@ fn topics_of_ros_2_that_every_node_has_answer_nothing() {
         }],
         ..Interface::default()
     };
-    let ends = Ends::of(RosVersion::Two, &two);
+    let ends = TopicEnds::from_interface(RosVersion::Two, &two);
     assert_eq!(ends.topics[0].1.type_name, "sensor_msgs/Image");
 }
 
 #[test]
 fn what_was_seen_counts_before_rules() {
     for (topics, answers, expected) in [
-        // By name the other one would be the trigger.
+        // By name, the other one would be the trigger.
         (
             &[
                 "</a/image sensor_msgs/Image",
@@ -208,7 +216,7 @@ fn what_was_seen_counts_before_rules() {
                 "/right -> /r by stamp Watched",
             ],
         ),
-        // A node that passes on whatever comes: an output answers one input.
+        // A node that forwards everything: an output answers a single input.
         (
             &[
                 "</left sensor_msgs/Image",
@@ -218,7 +226,7 @@ fn what_was_seen_counts_before_rules() {
             &[("/left", "/out"), ("/right", "/out")],
             &["/left -> /out by stamp Watched"],
         ),
-        // Nothing is found in an empty picture; the echo of a pose is not what matters.
+        // Nothing is detected in an empty image; the echo of a pose is irrelevant.
         (
             &[
                 "</image sensor_msgs/Image",
@@ -232,7 +240,7 @@ fn what_was_seen_counts_before_rules() {
                 "/image -> /boxes by stamp Guessed",
             ],
         ),
-        // Depth is looked at with the picture, and answered by nothing of its own.
+        // The depth image is processed together with the image and has no answer of its own.
         (
             &[
                 "</depth sensor_msgs/Image",
@@ -244,12 +252,12 @@ fn what_was_seen_counts_before_rules() {
             &["/rgb -> /boxes, /debug by stamp Watched"],
         ),
     ] {
-        assert_eq!(decided(topics, answers), expected, "{topics:?}");
+        assert_eq!(decide_and_display(topics, answers), expected, "{topics:?}");
     }
 }
 
 proptest! {
-    /// Whatever is registered first, and whatever was recorded first.
+    /// The result does not depend on the order of registration or recording.
     #[test]
     fn the_order_of_topics_does_not_matter(topics in Just(vec![
         "</depth_enable std_msgs/Bool",
@@ -258,41 +266,41 @@ proptest! {
         ">/boxes p/Stamped",
         ">/debug sensor_msgs/Image",
     ]).prop_shuffle()) {
-        prop_assert_eq!(decided(&topics, &[]), ["/camera/rgb -> /boxes, /debug by stamp Guessed"]);
+        prop_assert_eq!(decide_and_display(&topics, &[]), ["/camera/rgb -> /boxes, /debug by stamp Guessed"]);
         let answers = [("/camera/depth", "/boxes")];
-        prop_assert_eq!(decided(&topics, &answers), ["/camera/depth -> /boxes, /debug by stamp Watched"]);
+        prop_assert_eq!(decide_and_display(&topics, &answers), ["/camera/depth -> /boxes, /debug by stamp Watched"]);
     }
 }
 
 #[test]
 fn each_node_has_its_own_requests() {
-    let interface = of_nodes(&[
+    let interface = interface_of_nodes(&[
         ("</image sensor_msgs/Image", "/finder"),
         (">/boxes p/Stamped", "/finder"),
         ("</boxes p/Stamped", "/tracker"),
         (">/tracks p/Stamped", "/tracker"),
     ]);
-    let found = decide(RosVersion::One, &interface, &BTreeSet::new());
+    let found = decide_requests(RosVersion::One, &interface, &BTreeSet::new());
     assert_eq!(
-        shown(&found),
+        display_requests(&found),
         [
             "/image -> /boxes by stamp Alone",
             "/boxes -> /tracks by stamp Alone"
         ]
     );
     assert_eq!((&*found[0].node, &*found[1].node), ("/finder", "/tracker"));
-    // Topics of a supplement may be anybody's.
+    // Topics of a supplement may belong to any node.
     let mut stated = interface;
     for topic in &mut stated.topics {
         topic.nodes.clear();
     }
-    let found = decide(RosVersion::One, &stated, &BTreeSet::new());
+    let found = decide_requests(RosVersion::One, &stated, &BTreeSet::new());
     assert_eq!(found[0].node, "");
 }
 
 #[test]
 fn the_deployer_says_otherwise_or_is_told_what_there_is() {
-    let interface = of_nodes(&[
+    let interface = interface_of_nodes(&[
         ("</switch std_msgs/Bool", "/one"),
         ("</image sensor_msgs/Image", "/one"),
         (">/boxes p/Stamped", "/one"),
@@ -300,27 +308,29 @@ fn the_deployer_says_otherwise_or_is_told_what_there_is() {
         ("</in std_msgs/String", "/two"),
         (">/out std_msgs/String", "/two"),
     ]);
-    let decided = decide(RosVersion::One, &interface, &BTreeSet::new());
+    let decided = decide_requests(RosVersion::One, &interface, &BTreeSet::new());
     let says = |stated: &[&str]| {
-        let stated: Vec<Pair> = stated
+        let stated: Vec<TopicPair> = stated
             .iter()
             .map(|text| text.parse().expect("a pair"))
             .collect();
-        state(RosVersion::One, &interface, &stated, decided.clone())
+        apply_stated(RosVersion::One, &interface, &stated, decided.clone())
     };
     assert_eq!(
-        shown(&says(&["/switch -> /words"]).expect("fine")),
+        display_requests(&says(&["/switch -> /words"]).expect("fine")),
         [
             "/switch -> /words by arrival Stated",
             "/in -> /out by arrival Alone"
         ]
     );
     assert_eq!(
-        shown(&says(&["/image -> /boxes"]).expect("fine"))[0],
+        display_requests(&says(&["/image -> /boxes"]).expect("fine"))[0],
         "/image -> /boxes by stamp Stated"
     );
     assert_eq!(
-        shown(&says(&["/image -> /boxes by arrival", "/switch -> /words"]).expect("fine"))[..2],
+        display_requests(
+            &says(&["/image -> /boxes by arrival", "/switch -> /words"]).expect("fine")
+        )[..2],
         [
             "/image -> /boxes by arrival Stated",
             "/switch -> /words by arrival Stated"
@@ -330,17 +340,17 @@ fn the_deployer_says_otherwise_or_is_told_what_there_is() {
     for (stated, words) in [
         (
             &["/imge -> /boxes"][..],
-            "/imge is no input of this service; its inputs are /switch, /image, /in",
+            "/imge is not an input of this service; its inputs are /switch, /image, /in",
         ),
         (
             &["/image -> /image"],
-            "/image is no output of this service; its outputs are /boxes, /words, /out",
+            "/image is not an output of this service; its outputs are /boxes, /words, /out",
         ),
         (
             &["/switch -> /boxes by stamp"],
             "/switch is a std_msgs/Bool, which has no header.stamp",
         ),
-        (&["/image -> /boxes by goal"], "leave it out"),
+        (&["/image -> /boxes by goal"], "remove it"),
         (
             &["/image -> /boxes", "/switch -> /boxes"],
             "/boxes is named twice",
@@ -353,7 +363,7 @@ fn the_deployer_says_otherwise_or_is_told_what_there_is() {
         let error = says(stated).expect_err("refused").to_string();
         assert!(error.contains(words), "{error}");
     }
-    let none = state(
+    let none = apply_stated(
         RosVersion::One,
         &Interface::default(),
         &["/a -> /b".parse().expect("a pair")],
@@ -373,7 +383,10 @@ fn what_was_recorded_before_has_its_requests_decided_now() {
     let text = serde_json::to_string(&old).expect("plain data");
     assert!(!text.contains("requests"), "as before");
     let found = old.decided_requests(RosVersion::One);
-    assert_eq!(shown(&found), ["/image -> /boxes by stamp Alone"]);
+    assert_eq!(
+        display_requests(&found),
+        ["/image -> /boxes by stamp Alone"]
+    );
     let new = Interface {
         requests: Some(Vec::new()),
         ..old
@@ -398,8 +411,8 @@ fn what_could_not_be_read_again_is_not_decided() {
         ">/out std_msgs/String",
         ">/o,ut std_msgs/String",
     ];
-    assert_eq!(decided(&odd, &[]), [""; 0]);
-    // Whatever a record has, the rest of it is read.
+    assert_eq!(decide_and_display(&odd, &[]), [""; 0]);
+    // Other fields of a record are still read.
     let unreadable =
         r#"{"requests": [{"pair": "/camera-1/image -> /out", "reason": "alone"}], "topics": []}"#;
     let read: Interface = serde_json::from_str(unreadable).unwrap();
@@ -416,7 +429,8 @@ fn the_words_name_the_option() {
     let guess = request(Reason::Guessed).to_string();
     assert_eq!(
         guess,
-        "an answer on /boxes is counted against /image (a guess by types and names, since no answer was seen); change it with --request INPUT=OUTPUT"
+        "answers on /boxes count for /image (a guess by types and names, because no answer was seen); change it with \
+            --request INPUT=OUTPUT"
     );
     assert!(!request(Reason::Stated).to_string().contains("change it"));
 }

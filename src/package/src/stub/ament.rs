@@ -1,54 +1,58 @@
-//! What makes a stub of ROS 2 an install space of ament: the index that tools find packages by, and set-up files for its search path.
+//! Files that make a ROS 2 stub an ament install space: the resource index by which tools find packages, and setup
+//! files for its search path.
 //!
-//! Tools look each resource of the index up by itself, in the first install space that has it. What the stub registers therefore
-//! stands for it alone; what it does not (plugins, type support) is found in the original's, where that is installed.
+//! Tools look up each resource of the index separately, in the first install space that contains it. So an entry of the
+//! stub hides only itself; other resources (plugins, type support) are found in the original, if that is installed.
 
 use std::collections::BTreeSet;
 
-use super::{About, Content, Contents, Files, Words, plain};
+use super::{Content, Contents, Files, RosTerms, StubInfo, text_file};
 
 const INDEX: &str = "share/ament_index/resource_index";
 const SETUP_SH: &str = include_str!("inside/ament/setup.sh");
 const SETUP_BASH: &str = include_str!("inside/setup.bash");
 const SETUP_ZSH: &str = include_str!("inside/setup.zsh");
 
-/// Endings of files of the environment that an install space has for each package: they name places in the image.
+/// Suffixes of a package's environment hooks in an install space, which contain paths of the image.
 const ENVIRONMENT: [&str; 5] = [".sh", ".bash", ".zsh", ".ps1", ".dsv"];
 
-/// What texts call things.
-pub(super) const WORDS: Words = Words {
+/// Terms of ROS 2.
+pub(super) const WORDS: RosTerms = RosTerms {
     run: "ros2 run",
-    order: "because a workspace that is sourced later is searched first",
+    order: "because the workspace that is sourced last is searched first",
     plugins: "Components of this package cannot be loaded into\na container that runs on the robot",
     settings: "a parameter of the node (-p cloudroid.max:=0.3, or `cloudroid: {max: 0.3}` in a parameters file)",
 };
 
-/// Files beside those of the package.
-pub(super) fn files(about: &About<'_>, contents: &Contents) -> Files {
+/// Returns the files in addition to those of the package.
+pub(super) fn index_files(about: &StubInfo<'_>, contents: &Contents) -> Files {
     let package = about.package;
     let mut files = Files::new();
-    // colcon's tools source local_setup files, people the others; here nothing stands behind this install space.
+    // colcon's tools source the local_setup files, people the others; this install space has no underlay.
     for name in ["setup", "local_setup"] {
         for (ending, text) in [("sh", SETUP_SH), ("bash", SETUP_BASH), ("zsh", SETUP_ZSH)] {
-            files.insert(format!("{name}.{ending}"), plain(text));
+            files.insert(format!("{name}.{ending}"), text_file(text));
         }
     }
     let mut register = |kind: &str, text: &str| {
-        files.insert(format!("{INDEX}/{kind}/{package}"), plain(text));
+        files.insert(format!("{INDEX}/{kind}/{package}"), text_file(text));
     };
     register("packages", "");
-    let interfaces = interfaces(about, contents);
+    let interfaces = interface_list(about, contents);
     if !interfaces.is_empty() {
         register("rosidl_interfaces", &interfaces);
     }
     if !contents.components.is_empty() {
-        register("rclcpp_components", &refusing(about, &contents.components));
+        register(
+            "rclcpp_components",
+            &unloadable_components(about, &contents.components),
+        );
     }
     files
 }
 
-/// Files of messages, services and actions, as rosidl lists them.
-fn interfaces(about: &About<'_>, contents: &Contents) -> String {
+/// Lists the files of messages, services and actions in rosidl's format.
+fn interface_list(about: &StubInfo<'_>, contents: &Contents) -> String {
     let shared = contents.share.keys().filter(|path| {
         let kinds = ["msg", "srv", "action"];
         let (Some((kind, name)), Some((_, ending))) = (path.split_once('/'), path.rsplit_once('.'))
@@ -66,10 +70,11 @@ fn interfaces(about: &About<'_>, contents: &Contents) -> String {
     all.into_iter().map(|path| path + "\n").collect()
 }
 
-/// Components of an outsourced package cannot be loaded into a container that runs on the robot. The original may be installed
-/// beside the stub, and its library would be loaded silently, so the stub registers the same classes in a library that nobody has,
-/// whose name is the explanation: containers print it, and answer with it. What they read is one `CLASS;LIBRARY` for each line.
-fn refusing(about: &About<'_>, classes: &BTreeSet<String>) -> String {
+/// Registers the component classes of an outsourced package so that they cannot be loaded into a container on the
+/// robot. The original may be installed besides the stub, and its library would be loaded silently, so the stub
+/// registers the same classes in a nonexistent library whose name is the explanation: containers print it and return it
+/// in their response. The format is `CLASS;LIBRARY`, one per line.
+fn unloadable_components(about: &StubInfo<'_>, classes: &BTreeSet<String>) -> String {
     let library = format!(
         "{} runs in the cloud: its components cannot be loaded into a container on this robot - \
          start its executables, or let the server run the launch file",
@@ -79,8 +84,8 @@ fn refusing(about: &About<'_>, classes: &BTreeSet<String>) -> String {
     lines.collect()
 }
 
-/// Every name that has a launcher in `lib/PACKAGE`, the only place where ROS 2 looks for programs.
-pub(super) fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
+/// Returns the names of all launchers in `lib/PACKAGE`, the only directory in which ROS 2 looks for executables.
+pub(super) fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String> {
     contents
         .executables
         .union(about.outsourced)
@@ -88,8 +93,8 @@ pub(super) fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<St
         .collect()
 }
 
-/// Whether a shared file belongs to the image's install space, and not to the package.
-pub(super) fn is_of_the_install_space(path: &str, content: &Content) -> bool {
+/// Returns whether a shared file belongs to the image's install space rather than to the package.
+pub(super) fn belongs_to_install_space(path: &str, content: &Content) -> bool {
     if matches!(content, Content::Link(_)) {
         return false;
     }
@@ -99,7 +104,7 @@ pub(super) fn is_of_the_install_space(path: &str, content: &Content) -> bool {
         .find_map(|ending| name.strip_suffix(ending));
     match top {
         "" => matches!(ending, Some("local_setup" | "package")),
-        // As ament and colcon call the directories of their hooks.
+        // Directories of the hooks of ament and colcon.
         "environment" | "hook" => ending.is_some(),
         _ => false,
     }

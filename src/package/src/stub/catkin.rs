@@ -1,46 +1,46 @@
-//! What makes a stub of ROS 1 an install space of catkin: catkin's marker, and set-up files for both of its search paths.
+//! Files that make a ROS 1 stub a catkin install space: catkin's marker, and setup files for both of its search paths.
 
 use std::collections::BTreeSet;
 
-use super::{About, Contents, Files, Words, nodelets, plain};
+use super::{Contents, Files, RosTerms, StubInfo, nodelets, text_file};
 
 const SETUP_SH: &str = include_str!("inside/setup.sh");
 const SETUP_BASH: &str = include_str!("inside/setup.bash");
 const SETUP_ZSH: &str = include_str!("inside/setup.zsh");
 
-/// What texts call things.
-pub(super) const WORDS: Words = Words {
+/// Terms of ROS 1.
+pub(super) const WORDS: RosTerms = RosTerms {
     run: "rosrun",
     order: "because sourcing another catkin workspace removes it again",
     plugins: "Nodelets of this package cannot be loaded into a\nmanager that runs on the robot",
     settings: "a parameter of the node or of a namespace around it (~cloudroid/max)",
 };
 
-/// Files beside those of the package.
-pub(super) fn files() -> Files {
+/// Returns the files in addition to those of the package.
+pub(super) fn setup_files() -> Files {
     [
         (".catkin", ""),
         ("setup.sh", SETUP_SH),
         ("setup.bash", SETUP_BASH),
         ("setup.zsh", SETUP_ZSH),
     ]
-    .map(|(name, text)| (name.to_owned(), plain(text)))
+    .map(|(name, text)| (name.to_owned(), text_file(text)))
     .into()
 }
 
-/// Shared files that give way to others.
-pub(super) fn replaced(about: &About<'_>, contents: &mut Contents) {
+/// Replaces shared files that must differ in the stub.
+pub(super) fn replace_plugin_lists(about: &StubInfo<'_>, contents: &mut Contents) {
     for path in nodelets::plugin_lists(&contents.share) {
         if let Some(content) = contents.share.remove(&path) {
             contents
                 .share
-                .insert(path, nodelets::refusing(about, content));
+                .insert(path, nodelets::unloadable_plugin_list(about, content));
         }
     }
 }
 
-/// Every name that has a launcher in `lib/PACKAGE`: those of the image, and those outsourced.
-pub(super) fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<String> {
+/// Returns the names of all launchers in `lib/PACKAGE`: executables of the image, and outsourced ones.
+pub(super) fn launcher_names(about: &StubInfo<'_>, contents: &Contents) -> BTreeSet<String> {
     let in_share = |name: &String| {
         contents
             .share
@@ -48,7 +48,8 @@ pub(super) fn executables(about: &About<'_>, contents: &Contents) -> BTreeSet<St
             .any(|path| path.rsplit('/').next() == Some(name.as_str()))
     };
     let mut names = contents.executables.clone();
-    // One that is a shared script has its launcher in the script's place: of two executables of one name roslaunch takes neither.
+    // The launcher of a shared script is in place of the script: roslaunch accepts neither of two executables with the
+    // same name.
     names.extend(
         about
             .outsourced

@@ -1,53 +1,53 @@
-//! What an image holds of a package: its executables, as recorded, and all that it shares.
+//! Files of a package in an image: its executables, as recorded, and its share directory.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path};
 
 use crate::Error;
-use crate::inventory::Installed;
-use crate::merged::{self, Level, Merged};
+use crate::inventory::InstalledPackage;
+use crate::merged::{self, LayerDirectory, MergedDirectory};
 
-/// The largest single file: meshes and maps are shared, too.
+/// Maximum size of a file in bytes; meshes and maps are shared as well.
 const MAX_BYTES: u64 = 64 << 20;
-/// All files together.
+/// Maximum total size of all files in bytes.
 const MAX_TOTAL: usize = 256 << 20;
 const MAX_FILES: usize = 20_000;
-/// Directories below a package's.
+/// Maximum depth of directories in a package's share directory.
 const MAX_DEPTH: usize = 16;
 
-/// What an image holds of a package.
+/// Files of a package in an image.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Contents {
-    /// Names in `lib/PACKAGE`.
+    /// Names of the executables in `lib/PACKAGE`.
     pub executables: BTreeSet<String>,
-    /// Everything below `share/PACKAGE`, by path from there.
+    /// Files below `share/PACKAGE`, by relative path.
     pub share: BTreeMap<String, Content>,
-    /// Classes of nodes for component containers (ROS 2).
+    /// Component classes (ROS 2).
     pub components: BTreeSet<String>,
 }
 
 /// A file, or a link that stays within the package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Content {
-    /// A file.
+    /// A regular file.
     File {
-        /// Its bytes.
+        /// Content.
         bytes: Vec<u8>,
-        /// Somebody may execute it.
+        /// True if it is executable.
         executable: bool,
     },
-    /// A symbolic link to another path, relative to its own directory.
+    /// A symbolic link, relative to its own directory.
     Link(String),
 }
 
 impl Contents {
     /// Reads a package from a stack of extracted layers, given lowest first.
     ///
-    /// What is no file, and links that lead out of the package, are left out.
-    pub fn read<L: AsRef<Path>>(layers: &[L], package: &Installed) -> Result<Self, Error> {
+    /// Special files, and links that leave the package, are left out.
+    pub fn read<L: AsRef<Path>>(layers: &[L], package: &InstalledPackage) -> Result<Self, Error> {
         let mut share = BTreeMap::new();
-        let directory = Merged::at(&merged::open(layers)?, &package.share)?;
-        let mut reader = Reader {
+        let directory = MergedDirectory::open_path(&merged::open_layers(layers)?, &package.share)?;
+        let mut reader = ShareReader {
             share: &mut share,
             total: 0,
         };
@@ -60,13 +60,18 @@ impl Contents {
     }
 }
 
-struct Reader<'a> {
+struct ShareReader<'a> {
     share: &'a mut BTreeMap<String, Content>,
     total: usize,
 }
 
-impl Reader<'_> {
-    fn directory(&mut self, directory: &Merged, path: &str, depth: usize) -> Result<(), Error> {
+impl ShareReader<'_> {
+    fn directory(
+        &mut self,
+        directory: &MergedDirectory,
+        path: &str,
+        depth: usize,
+    ) -> Result<(), Error> {
         for (name, level) in directory.names()? {
             let Ok(text) = std::str::from_utf8(&name) else {
                 continue;
@@ -79,16 +84,16 @@ impl Reader<'_> {
             } else {
                 format!("{path}/{text}")
             };
-            if let Some(content) = content(level, &name, path)? {
+            if let Some(content) = read_content(level, &name, path)? {
                 self.add(level, at, content)?;
             } else if depth < MAX_DEPTH {
-                self.directory(&directory.below(&name)?, &at, depth + 1)?;
+                self.directory(&directory.open_child(&name)?, &at, depth + 1)?;
             }
         }
         Ok(())
     }
 
-    fn add(&mut self, level: &Level, path: String, content: Content) -> Result<(), Error> {
+    fn add(&mut self, level: &LayerDirectory, path: String, content: Content) -> Result<(), Error> {
         if let Content::File { bytes, .. } = &content {
             self.total += bytes.len();
         }
@@ -104,19 +109,25 @@ impl Reader<'_> {
     }
 }
 
-fn content(level: &Level, name: &[u8], directory: &str) -> Result<Option<Content>, Error> {
+fn read_content(
+    level: &LayerDirectory,
+    name: &[u8],
+    directory: &str,
+) -> Result<Option<Content>, Error> {
     if let Some(file) = level.file(name, MAX_BYTES)? {
         return Ok(Some(Content::File {
             bytes: file.bytes,
             executable: file.executable,
         }));
     }
-    let target = level.link(name).filter(|target| stays(target, directory));
+    let target = level
+        .link(name)
+        .filter(|target| stays_inside(target, directory));
     Ok(target.and_then(|target| Some(Content::Link(target.to_str()?.to_owned()))))
 }
 
-/// Whether a link in `directory` (from the package's own) leads to somewhere in the package.
-fn stays(target: &Path, directory: &str) -> bool {
+/// Returns whether a link in `directory` (relative to the package's) stays in the package.
+fn stays_inside(target: &Path, directory: &str) -> bool {
     let mut depth = directory.split('/').filter(|part| !part.is_empty()).count();
     for part in target.components() {
         match part {
@@ -154,11 +165,11 @@ mod tests {
 
         fn read(&self) -> Contents {
             let layers = [self.0.path().join("low"), self.0.path().join("high")];
-            let package = Installed {
+            let package = InstalledPackage {
                 share: "/usr/share/p".into(),
                 lib: "/usr/lib/p".into(),
                 executables: ["node".to_owned()].into(),
-                ..Installed::default()
+                ..InstalledPackage::default()
             };
             Contents::read(&layers, &package).expect("read")
         }

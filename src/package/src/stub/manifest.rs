@@ -1,18 +1,18 @@
-//! The list of all that a stub's archive holds. `install.sh` makes the same list of what it finds, with `find` and
+//! List of all files in a stub's archive. `install.sh` creates the same list of the files it finds, with `find` and
 //! `sha256sum`, and compares them byte by byte.
 
 use sha2::{Digest, Sha256};
 
 use super::{Content, Files};
 
-/// The list's name in the archive.
+/// Name of the list in the archive.
 pub const MANIFEST: &str = "MANIFEST";
-/// Its signature's name.
+/// Name of the list's signature.
 pub const SIGNATURE: &str = "MANIFEST.sig";
-/// The server's key, as OpenSSH lists signers.
+/// Public key of the server in OpenSSH's allowed-signers format.
 pub const SIGNER: &str = "server.pub";
 
-/// One line for each file (`x` where it may be executed) and link, sorted by bytes.
+/// Returns the list: one line for each file (`x` if executable) and link, sorted bytewise.
 pub fn manifest(files: &Files) -> String {
     let mut lines: Vec<String> = files
         .iter()
@@ -20,10 +20,11 @@ pub fn manifest(files: &Files) -> String {
             Content::File { bytes, executable } => {
                 let kind = if *executable { 'x' } else { '-' };
                 let hash = hex::encode(Sha256::digest(bytes));
-                // As sha256sum writes such names.
-                match path.contains('\\') {
-                    false => format!("{kind} {hash}  ./{path}\n"),
-                    true => format!("{kind} \\{hash}  ./{}\n", path.replace('\\', "\\\\")),
+                // The escaping that sha256sum uses for such names.
+                if path.contains('\\') {
+                    format!("{kind} \\{hash}  ./{}\n", path.replace('\\', "\\\\"))
+                } else {
+                    format!("{kind} {hash}  ./{path}\n")
                 }
             }
             Content::Link(target) => format!("l ./{path} -> {target}\n"),

@@ -1,25 +1,25 @@
-//! What of a package's shared files a robot gets: what its launch files, parameters and messages are made of. Sources, what
-//! they were compiled with, and files that their author hid are of no use to an interface, and may tell what is nobody's business.
+//! Selection of the shared files that a robot gets: those that launch files, parameters and messages consist of.
+//! Sources, build files and hidden files are not needed for an interface and may be confidential.
 
-/// Directories of a package's top that only its author needs.
+/// Top-level directories of a package that only its author needs.
 const DIRECTORIES: [&str; 5] = ["include", "cmake", "build", "devel", "debian"];
-/// Those in which launch files find what they read beside sources and data of tests.
+/// Directories in which launch files may find what they read besides sources and test data.
 const MIXED: [&str; 3] = ["src", "test", "tests"];
-/// Endings of what launch files read.
+/// Suffixes of files that are read by launch files.
 const READ: [&str; 11] = [
     ".launch", ".xml", ".yaml", ".yml", ".json", ".urdf", ".xacro", ".srdf", ".sdf", ".rviz",
     ".test",
 ];
 const NAMES: [&str; 4] = ["CMakeLists.txt", "Makefile", "setup.py", "Dockerfile"];
-/// Endings of sources, and of what compilers and editors leave.
+/// Suffixes of sources, and of files left behind by compilers and editors.
 const ENDINGS: [&str; 16] = [
     ".c", ".cc", ".cpp", ".cxx", ".h", ".hh", ".hpp", ".hxx", ".o", ".a", ".pyc", ".pyo", ".bak",
     ".orig", ".swp", "~",
 ];
 
-/// Whether a robot gets a file below `share/PACKAGE`. Programs stay where they are: rosrun finds them there.
+/// Returns whether a robot gets a file below `share/PACKAGE`. Executables are kept, since rosrun finds them there.
 pub fn is_needed(path: &str, executable: bool) -> bool {
-    // No tool writes names with control characters into a list that another reads back.
+    // The tools cannot exchange lists with names that contain control characters.
     if path.chars().any(char::is_control) || path.split('/').any(|part| part.starts_with('.')) {
         return false;
     }

@@ -1,12 +1,12 @@
-//! Nodelets of an outsourced package cannot be loaded into a manager that runs on the robot. The original may be
-//! installed beside the stub, and its library would be loaded silently, so the stub's plugin lists name a library
-//! that nobody has, whose name is the explanation: pluginlib and nodelet print it.
+//! Nodelets of an outsourced package must not be loaded into a manager on the robot. The original may be installed
+//! besides the stub, and its library would be loaded silently, so the stub's plugin lists name a nonexistent library
+//! whose name is the explanation: pluginlib and nodelet print it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{About, Content};
+use super::{Content, StubInfo};
 
-/// Plugin lists of nodelets that the package exports, by path in its share directory.
+/// Returns the nodelet plugin lists exported by the package, as paths in its share directory.
 pub(super) fn plugin_lists(share: &BTreeMap<String, Content>) -> BTreeSet<String> {
     let Some(Content::File { bytes, .. }) = share.get("package.xml") else {
         return BTreeSet::new();
@@ -27,13 +27,13 @@ pub(super) fn plugin_lists(share: &BTreeMap<String, Content>) -> BTreeSet<String
         .collect()
 }
 
-/// A plugin list with the same classes, none of which can be loaded.
-pub(super) fn refusing(about: &About<'_>, content: Content) -> Content {
+/// Returns a plugin list with the same classes, none of which can be loaded.
+pub(super) fn unloadable_plugin_list(about: &StubInfo<'_>, content: Content) -> Content {
     let Content::File { bytes, .. } = &content else {
         return content;
     };
     let text = String::from_utf8_lossy(bytes);
-    // A list that is no XML loads nothing either.
+    // A list that is not XML loads nothing either.
     let Ok(document) = roxmltree::Document::parse(&text) else {
         return content;
     };
@@ -49,7 +49,7 @@ pub(super) fn refusing(about: &About<'_>, content: Content) -> Content {
         list.push_str("  <class");
         for name in ["name", "type", "base_class_type"] {
             if let Some(value) = class.attribute(name) {
-                list.push_str(&format!(" {name}=\"{}\"", escaped(value)));
+                list.push_str(&format!(" {name}=\"{}\"", escape_xml(value)));
             }
         }
         list.push_str("/>\n");
@@ -61,7 +61,7 @@ pub(super) fn refusing(about: &About<'_>, content: Content) -> Content {
     }
 }
 
-fn escaped(text: &str) -> String {
+fn escape_xml(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('"', "&quot;")

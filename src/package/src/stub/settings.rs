@@ -1,42 +1,41 @@
-//! `stub.toml`, which the robot's owner may change, and `revision.toml`, which says what the archive was made of.
+//! `stub.toml`, which the robot's owner may edit, and `revision.toml`, which describes what the archive was built from.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use super::{About, Answered, Words};
+use super::{ProgramRequest, RosTerms, StubInfo};
 
-/// The robot's settings, with what may be added.
-pub(super) fn stub(about: &About<'_>) -> String {
+/// Returns the robot's settings, with the available options as comments.
+pub(super) fn stub_toml(about: &StubInfo<'_>) -> String {
     #[derive(Serialize)]
-    struct Where<'a> {
+    struct StubSettings<'a> {
         server: &'a str,
         #[serde(skip_serializing_if = "Option::is_none")]
         fingerprint: Option<&'a str>,
         service: &'a str,
         stateful: bool,
     }
-    let known = Where {
+    let known = StubSettings {
         server: &about.portal.address,
         fingerprint: about.portal.fingerprint.as_deref(),
         service: about.service,
         stateful: about.stateful,
     };
     let known = toml::to_string(&known).expect("texts and a word are TOML");
-    let words = Words::of(about.ros);
+    let words = RosTerms::for_ros(about.ros);
     format!(
-        "# How this robot uses the service {}. Each key can also be given by the environment (CLOUDROID_MAX=0.3) or by\n\
-         # {}. `{} {} cloudroid-stub doctor` checks it.\n\
-         {known}{SETTINGS}",
+        "# How this robot uses the service {}. Each key can also be set by an environment variable (CLOUDROID_MAX=0.3) \
+            or by\n# {}. `{} {} cloudroid-stub doctor` checks it.\n{known}{SETTINGS}",
         about.service, words.settings, words.run, about.package
     )
 }
 
-/// What may be set; the stub's own tests compare what it says of defaults with the stub's.
+/// Available options; tests of the stub compare the stated defaults with the actual ones.
 const SETTINGS: &str = include_str!("inside/settings.toml");
 
-/// What the archive was made of.
-pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> String {
+/// Returns the description of what the archive was built from.
+pub(super) fn revision_toml(about: &StubInfo<'_>, executables: &BTreeSet<String>) -> String {
     #[derive(Serialize)]
     struct Revision<'a> {
         ros: u8,
@@ -52,9 +51,9 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
         #[serde(skip_serializing_if = "Option::is_none")]
         defaults: Option<Defaults>,
         #[serde(skip_serializing_if = "<[_]>::is_empty")]
-        requests: &'a [Answered],
+        requests: &'a [ProgramRequest],
     }
-    /// What holds where the robot says nothing: not in `stub.toml`, which an installation keeps.
+    /// Defaults if the robot states nothing: not in `stub.toml`, which is preserved by an installation.
     #[derive(Serialize)]
     struct Defaults {
         desire: f64,
@@ -75,6 +74,6 @@ pub(super) fn revision(about: &About<'_>, executables: &BTreeSet<String>) -> Str
     };
     let text = toml::to_string(&revision).expect("texts and a number are TOML");
     format!(
-        "# What this stub was made of. Written by the server; changing it changes nothing.\n{text}"
+        "# What this stub was made from. Written by the server; changes have no effect.\n{text}"
     )
 }

@@ -46,15 +46,15 @@ fn contents() -> Contents {
     }
 }
 
-fn composed(outsourced: &[&str]) -> Files {
-    composed_of(outsourced, contents())
+fn compose_stub(outsourced: &[&str]) -> Files {
+    compose_stub_from(outsourced, contents())
 }
 
-fn composed_of(outsourced: &[&str], contents: Contents) -> Files {
-    composed_for(RosVersion::One, outsourced, contents)
+fn compose_stub_from(outsourced: &[&str], contents: Contents) -> Files {
+    compose_stub_for(RosVersion::One, outsourced, contents)
 }
 
-fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
+fn compose_stub_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Files {
     let outsourced = outsourced.iter().map(|name| (*name).to_owned()).collect();
     let mut interface = Interface {
         topics: vec![Topic {
@@ -72,7 +72,7 @@ fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Fil
     for key in ["p/msg/T", "std_msgs/msg/Header", "p/msg/../X"] {
         interface.definitions.insert(key.into(), "int32 x\n".into());
     }
-    let about = About {
+    let about = StubInfo {
         ros,
         service: "serves",
         package: "p",
@@ -87,7 +87,7 @@ fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Fil
         names: &[("node".to_owned(), "names_itself".to_owned())].into(),
         interface: &interface,
         stateful: true,
-        requests: &[Answered {
+        requests: &[ProgramRequest {
             node: "/node".into(),
             program: Some("node".into()),
             request: "/in -> /out by stamp".parse().expect("a pair"),
@@ -99,7 +99,7 @@ fn composed_for(ros: RosVersion, outsourced: &[&str], contents: Contents) -> Fil
 
 #[test]
 fn every_executable_has_a_launcher_and_only_outsourced_ones_run_in_the_cloud() {
-    let files = composed(&["node", "tool.py"]);
+    let files = compose_stub(&["node", "tool.py"]);
     let node = text(&files["lib/p/node"]);
     assert!(
         node.contains("cloudroid-stub run --package 'p' --node 'node' --share"),
@@ -107,7 +107,7 @@ fn every_executable_has_a_launcher_and_only_outsourced_ones_run_in_the_cloud() {
     );
     assert!(node.contains("prefix=$here/../..\n"), "{node}");
     assert!(text(&files["lib/p/helper_node"]).contains("exec-original"));
-    // A shared script that is outsourced gives way where it is; one that is not stays what it was.
+    // An outsourced shared script is replaced in place; others are left unchanged.
     let tool = text(&files["share/p/scripts/tool.py"]);
     assert!(
         tool.contains(" run ") && tool.contains("prefix=$here/../../..\n"),
@@ -118,19 +118,19 @@ fn every_executable_has_a_launcher_and_only_outsourced_ones_run_in_the_cloud() {
         "#!/usr/bin/python3"
     );
     assert!(!files.contains_key("lib/p/tool.py"), "two would be found");
-    // Machine code is of the server's architecture.
+    // Machine code is for the server's architecture.
     assert!(text(&files["share/p/bin/helper"]).contains("exec-original"));
 }
 
 #[test]
 fn an_outsourced_name_that_the_image_has_not_gets_a_launcher_too() {
-    let files = composed(&["made_up"]);
+    let files = compose_stub(&["made_up"]);
     assert!(text(&files["lib/p/made_up"]).contains(" run "));
 }
 
 #[test]
 fn all_that_is_shared_is_there() {
-    let files = composed(&["node"]);
+    let files = compose_stub(&["node"]);
     assert_eq!(text(&files["share/p/package.xml"]), PACKAGE_XML);
     assert_eq!(text(&files["share/p/launch/a.launch"]), "<launch/>");
     assert_eq!(
@@ -163,7 +163,7 @@ fn all_that_is_shared_is_there() {
 
 #[test]
 fn settings_and_origin_are_told_in_toml() {
-    let files = composed(&["node"]);
+    let files = compose_stub(&["node"]);
     let stub: toml::Table = text(&files["share/p/stub.toml"]).parse().expect("TOML");
     assert_eq!(stub["server"].as_str(), Some("wss://here:9090"));
     assert_eq!(stub["fingerprint"].as_str(), Some("SHA256:00"));
@@ -187,7 +187,7 @@ fn settings_and_origin_are_told_in_toml() {
 
 #[test]
 fn no_placeholder_is_left_and_the_same_input_gives_the_same_files() {
-    let files = composed(&["node"]);
+    let files = compose_stub(&["node"]);
     for (path, content) in &files {
         for word in text(content).split(|c: char| !(c.is_ascii_uppercase() || c == '@')) {
             let left =
@@ -195,12 +195,12 @@ fn no_placeholder_is_left_and_the_same_input_gives_the_same_files() {
             assert!(!left, "{path}: {word}");
         }
     }
-    assert_eq!(files, composed(&["node"]));
+    assert_eq!(files, compose_stub(&["node"]));
 }
 
 #[test]
 fn nodelets_name_a_library_that_says_why() {
-    let files = composed(&["node"]);
+    let files = compose_stub(&["node"]);
     let list = text(&files["share/p/nodelets.xml"]);
     let document = roxmltree::Document::parse(list).expect("XML");
     let library = document.root_element();
@@ -224,7 +224,7 @@ fn nodelets_name_a_library_that_says_why() {
 #[test]
 fn without_a_manifest_there_is_no_stub() {
     let interface = Interface::default();
-    let about = About {
+    let about = StubInfo {
         ros: RosVersion::One,
         service: "p",
         package: "p",
@@ -243,25 +243,25 @@ fn without_a_manifest_there_is_no_stub() {
     assert!(error.to_string().contains("no package.xml of p"), "{error}");
 }
 
-/// A program that prints what it was called with.
+/// A program that prints its arguments.
 const PROGRAM_OF_TESTS: &str = "#!/bin/sh\nfor word; do printf '%s\\n' \"$word\"; done\n";
 
-/// A stub as it lies on a robot, signed.
-fn unpacked(files: &Files) -> tempfile::TempDir {
-    unpacked_of(files, &sign::SigningKey::generate().expect("made").0)
+/// Unpacks a signed stub, as on a robot.
+fn unpack_stub(files: &Files) -> tempfile::TempDir {
+    unpack_signed_by(files, &sign::SigningKey::generate().expect("made").0)
 }
 
-fn unpacked_of(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir {
+fn unpack_signed_by(files: &Files, key: &sign::SigningKey) -> tempfile::TempDir {
     let place = tempfile::tempdir().expect("a directory");
     write_signed(files, key, place.path());
     place
 }
 
-/// Writes what an archive is unpacked to.
+/// Writes the files of an unpacked archive.
 fn write_signed(files: &Files, key: &sign::SigningKey, place: &std::path::Path) {
     let mut files = files.clone();
     files.insert(format!("lib/p/{PROGRAM}"), file(PROGRAM_OF_TESTS, true));
-    let signer = format!("{}\n", key.public().signer());
+    let signer = format!("{}\n", key.public_key().allowed_signers_line());
     files.insert(SIGNER.into(), file(&signer, false));
     let list = manifest(&files);
     let digest = sign::digest(&mut list.as_bytes()).expect("read");
@@ -288,10 +288,10 @@ fn write(files: &Files, place: &std::path::Path) {
 }
 
 fn run(script: &std::path::Path, arguments: &[&str]) -> std::process::Output {
-    run_by(script, arguments, "/usr/bin:/bin")
+    run_with_path(script, arguments, "/usr/bin:/bin")
 }
 
-fn run_by(script: &std::path::Path, arguments: &[&str], path: &str) -> std::process::Output {
+fn run_with_path(script: &std::path::Path, arguments: &[&str], path: &str) -> std::process::Output {
     let mut shell = std::process::Command::new("sh");
     let directory = script.parent().expect("in a directory");
     shell
@@ -305,7 +305,7 @@ fn run_by(script: &std::path::Path, arguments: &[&str], path: &str) -> std::proc
 #[test]
 fn a_launcher_gives_its_nodes_name_on_whatever_is_in_it() {
     let name = "x'$(touch ran)'y";
-    let stub = unpacked(&composed(&["node", name]));
+    let stub = unpack_stub(&compose_stub(&["node", name]));
     let output = run(&stub.path().join("lib/p").join(name), &["--flag"]);
     let words = String::from_utf8(output.stdout).expect("text");
     assert!(words.lines().any(|word| word == name), "{words}");
@@ -314,19 +314,18 @@ fn a_launcher_gives_its_nodes_name_on_whatever_is_in_it() {
 
 proptest::proptest! {
     #![proptest_config(proptest::prelude::ProptestConfig::with_cases(24))]
-    /// Names that a shell could misunderstand, outsourced and not.
+    /// Names with characters that are special in a shell, outsourced or not.
     #[test]
     fn launchers_quote_every_name(name in r#"[-a'"$`\\(){}\[\]*?~#!;&|<> @=%\.é]{1,12}"#, outsourced: bool) {
         proptest::prop_assume!(name != "." && name != ".." && !name.starts_with('.'));
-        let files = match outsourced {
-            true => composed(&[&name]),
-            false => {
-                let mut contents = contents();
+        let files = if outsourced {
+compose_stub(&[&name])
+} else {
+let mut contents = contents();
                 contents.executables.insert(name.clone());
-                composed_of(&["node"], contents)
-            }
-        };
-        let stub = unpacked(&files);
+                compose_stub_from(&["node"], contents)
+};
+        let stub = unpack_stub(&files);
         let before = std::fs::read_dir(stub.path().join("lib/p")).expect("there").count();
         let output = run(&stub.path().join("lib/p").join(&name), &["a b", "$c"]);
         let words = String::from_utf8(output.stdout).expect("text");
@@ -339,7 +338,7 @@ proptest::proptest! {
     }
 }
 
-/// A directory in which `ssh-keygen` is of a version that verifies nothing, so that Python does.
+/// Creates a directory with an `ssh-keygen` that cannot verify signatures, so that Python is used instead.
 fn old_openssh() -> tempfile::TempDir {
     use std::os::unix::fs::PermissionsExt;
     let place = tempfile::tempdir().expect("a directory");
@@ -349,18 +348,21 @@ fn old_openssh() -> tempfile::TempDir {
     place
 }
 
-/// What somebody does to an unpacked stub on its way.
+/// Manipulation of an unpacked stub in transit.
 type Meddling = fn(&std::path::Path);
 
 #[test]
 fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
     use std::os::unix::fs::PermissionsExt;
-    fn ran(place: &std::path::Path) -> String {
+    fn run_and_read(place: &std::path::Path) -> String {
         format!("#!/bin/sh\ntouch {}/ran\n", place.display())
     }
     let table: [(Meddling, &str); 11] = [
         (
-            |at| std::fs::write(at.join(format!("lib/p/{PROGRAM}")), ran(at)).expect("written"),
+            |at| {
+                std::fs::write(at.join(format!("lib/p/{PROGRAM}")), run_and_read(at))
+                    .expect("written")
+            },
             "./lib/p/cloudroid-stub",
         ),
         (
@@ -416,7 +418,7 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
             "the signature is not the server's",
         ),
         (
-            // The list changed with the file, and signed as nothing else.
+            // The list was changed together with the file, and signed for another purpose.
             |at| {
                 let path = at.join(MANIFEST);
                 let text = std::fs::read_to_string(&path).expect("read");
@@ -430,10 +432,10 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
     let target = prefix.path().join("overlay");
     for (meddle, words) in table {
         for path in ["/usr/bin:/bin", &old] {
-            let stub = unpacked(&composed(&["node"]));
+            let stub = unpack_stub(&compose_stub(&["node"]));
             meddle(stub.path());
             let arguments = ["--prefix", target.to_str().expect("text")];
-            let output = run_by(&stub.path().join("install.sh"), &arguments, path);
+            let output = run_with_path(&stub.path().join("install.sh"), &arguments, path);
             let told = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(
                 !output.status.success() && told.contains(words),
@@ -449,8 +451,11 @@ fn what_the_server_did_not_sign_is_named_and_nothing_of_it_runs() {
 fn the_key_that_is_known_is_the_one_that_counts() {
     let key = || sign::SigningKey::generate().expect("made").0;
     let (server, other) = (key(), key());
-    let files = composed(&["node"]);
-    let (stub, strangers) = (unpacked_of(&files, &server), unpacked_of(&files, &other));
+    let files = compose_stub(&["node"]);
+    let (stub, strangers) = (
+        unpack_signed_by(&files, &server),
+        unpack_signed_by(&files, &other),
+    );
     let old = old_openssh();
     let old = format!("{}:/usr/bin:/bin", old.path().display());
     for path in ["/usr/bin:/bin", &old] {
@@ -459,11 +464,11 @@ fn the_key_that_is_known_is_the_one_that_counts() {
         let target = target.to_str().expect("text");
         let install = |stub: &tempfile::TempDir, more: &[&str]| {
             let arguments = [&["--prefix", target], more].concat();
-            let output = run_by(&stub.path().join("install.sh"), &arguments, path);
+            let output = run_with_path(&stub.path().join("install.sh"), &arguments, path);
             let told = String::from_utf8_lossy(&output.stderr).into_owned();
             (output.status.success(), told)
         };
-        let refused = install(&strangers, &["--key", &server.public().to_string()]);
+        let refused = install(&strangers, &["--key", &server.public_key().to_string()]);
         assert!(
             !refused.0 && refused.1.contains("signed by another key"),
             "{refused:?}"
@@ -473,26 +478,26 @@ fn the_key_that_is_known_is_the_one_that_counts() {
             !refused.0 && refused.1.contains("neither a key"),
             "{refused:?}"
         );
-        // Trusted at the first time, and said so; from then on it is that one.
+        // Trusted on first use, with a message; from then on the same key is required.
         let first = install(&stub, &[]);
         assert!(
-            first.0 && first.1.contains(&server.public().to_string()),
+            first.0 && first.1.contains(&server.public_key().to_string()),
             "{first:?}"
         );
         assert_eq!(install(&stub, &[]), (true, String::new()));
         let refused = install(&strangers, &[]);
         assert!(
-            !refused.0 && refused.1.contains("if the server was set up anew"),
+            !refused.0 && refused.1.contains("if the server was reinstalled"),
             "{refused:?}"
         );
         assert!(
-            refused.1.contains(&other.public().to_string()),
+            refused.1.contains(&other.public_key().to_string()),
             "{refused:?}"
         );
-        // Somebody who has asked the other server's operator.
-        assert!(install(&strangers, &["--key", &other.public().to_string()]).0);
+        // The user has asked the operator of the other server.
+        assert!(install(&strangers, &["--key", &other.public_key().to_string()]).0);
         assert!(install(&strangers, &[]).0, "it is that server's by now");
-        // The first one's key is known in the overlay still, and not good for what another server's is.
+        // The overlay still contains the first server's key, which does not verify the other server's files.
         let refused = install(&stub, &[]);
         assert!(
             !refused.0 && refused.1.contains("signed by another key"),
@@ -512,8 +517,8 @@ fn the_key_that_is_known_is_the_one_that_counts() {
 #[test]
 fn what_is_installed_has_the_modes_that_it_must_have() {
     use std::os::unix::fs::PermissionsExt;
-    let stub = unpacked(&composed(&["node"]));
-    // Unpacked by somebody who closes everything, and by a tool that opens everything.
+    let stub = unpack_stub(&compose_stub(&["node"]));
+    // Unpacked with a restrictive umask, and by a tool that makes everything accessible.
     for (path, mode) in [
         ("lib/p/node", 0o700),
         ("share/p/package.xml", 0o666),
@@ -563,9 +568,9 @@ fn what_is_installed_has_the_modes_that_it_must_have() {
 #[test]
 fn a_robots_token_is_its_own_whatever_the_package_brings() {
     use std::os::unix::fs::PermissionsExt;
-    let mut files = composed(&["node"]);
+    let mut files = compose_stub(&["node"]);
     files.insert("share/p/token".into(), file("the package's", false));
-    let stub = unpacked(&files);
+    let stub = unpack_stub(&files);
     let prefix = tempfile::tempdir().expect("a directory");
     let target = prefix.path().join("overlay");
     let target = target.to_str().expect("text");
@@ -592,7 +597,7 @@ fn a_package_brings_no_settings_and_no_token() {
             .share
             .insert(name.into(), file("the package's", false));
     }
-    let files = composed_of(&["node"], contents);
+    let files = compose_stub_from(&["node"], contents);
     let brought: Vec<&String> = files
         .keys()
         .filter(|path| path.contains("token") || path.contains("ca.pem"))
@@ -613,14 +618,14 @@ fn a_robot_gets_no_sources_and_nothing_hidden() {
         contents.share.insert(name.into(), file("", false));
     }
     contents.executables.insert("a\nb".into());
-    let files = composed_of(&["node"], contents);
+    let files = compose_stub_from(&["node"], contents);
     let brought = ["src/", ".git", ".env", "\n"];
     let found = files
         .keys()
         .find(|path| brought.iter().any(|part| path.contains(part)));
     assert_eq!(found, None);
-    // Names that sha256sum writes in a way of its own are listed as it lists them.
-    let stub = unpacked(&files);
+    // Names that sha256sum escapes are listed with the same escaping.
+    let stub = unpack_stub(&files);
     let prefix = tempfile::tempdir().expect("a directory");
     let arguments = ["--prefix", prefix.path().to_str().expect("text")];
     let output = run(&stub.path().join("install.sh"), &arguments);

@@ -1,8 +1,8 @@
 use super::*;
 
-struct Place(tempfile::TempDir);
+struct WorkspaceFixture(tempfile::TempDir);
 
-impl Place {
+impl WorkspaceFixture {
     fn new() -> Self {
         Self(tempfile::tempdir().unwrap())
     }
@@ -14,7 +14,7 @@ impl Place {
         self
     }
 
-    /// A package of format 2 in `directory` that depends on `needs`.
+    /// Creates a package of format 2 in `directory` that depends on `needs`.
     fn package(&self, directory: &str, name: &str, needs: &[&str]) -> &Self {
         let needs: String = needs
             .iter()
@@ -33,15 +33,15 @@ impl Place {
         self
     }
 
-    fn inspect(&self) -> Result<Pushed, Error> {
-        inspect(self.0.path(), &Variables::ros(1, "noetic"))
+    fn inspect(&self) -> Result<PushedDirectory, Error> {
+        inspect(self.0.path(), &Variables::for_distribution(1, "noetic"))
     }
 
-    fn refused(&self) -> String {
+    fn refusal(&self) -> String {
         self.inspect().unwrap_err().to_string()
     }
 
-    fn found(&self) -> Vec<(String, String)> {
+    fn found_packages(&self) -> Vec<(String, String)> {
         let pushed = self.inspect().unwrap();
         let packages = pushed.packages().iter();
         packages
@@ -59,12 +59,12 @@ fn pairs(expected: &[(&str, &str)]) -> Vec<(String, String)> {
 
 #[test]
 fn one_package() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package(".", "single", &["roscpp"])
         .package("nested", "not_looked_at", &[]);
-    assert_eq!(place.found(), pairs(&[("single", "")]));
-    let external = place.inspect().unwrap().external();
+    assert_eq!(place.found_packages(), pairs(&[("single", "")]));
+    let external = place.inspect().unwrap().external_dependencies();
     let names: Vec<_> = external
         .iter()
         .map(|external| external.name.as_str())
@@ -80,7 +80,7 @@ fn one_package() {
 
 #[test]
 fn a_workspace_in_build_order() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package("src/a", "a", &["z_msgs", "roscpp"])
         .package("src/stack/b", "b", &["a"])
@@ -88,14 +88,14 @@ fn a_workspace_in_build_order() {
         .package("src/stack/z/test/inner", "inner", &[])
         .package("elsewhere/c", "c", &[]);
     assert_eq!(
-        place.found(),
+        place.found_packages(),
         pairs(&[
             ("z_msgs", "src/stack/z"),
             ("a", "src/a"),
             ("b", "src/stack/b")
         ])
     );
-    let external = place.inspect().unwrap().external();
+    let external = place.inspect().unwrap().external_dependencies();
     assert!(external.iter().all(|external| external.name != "z_msgs"));
     assert_eq!(
         external
@@ -110,17 +110,17 @@ fn a_workspace_in_build_order() {
 
 #[test]
 fn packages_side_by_side_without_src() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package("a", "a", &[])
         .package("b", "b", &[])
         .package(".hidden/c", "c", &[]);
-    assert_eq!(place.found(), pairs(&[("a", "a"), ("b", "b")]));
+    assert_eq!(place.found_packages(), pairs(&[("a", "a"), ("b", "b")]));
 }
 
 #[test]
 fn ignored_and_built_directories_are_left_out() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place.package("src/a", "a", &[]);
     for (directory, mark) in [
         ("x", "CATKIN_IGNORE"),
@@ -132,50 +132,50 @@ fn ignored_and_built_directories_are_left_out() {
             .package(&format!("src/{directory}/a"), "a", &[])
             .write(&format!("src/{directory}/{mark}"), "");
     }
-    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
+    assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
 }
 
 #[test]
 fn links_are_followed_inside_only() {
-    let outside = Place::new();
+    let outside = WorkspaceFixture::new();
     outside.package("o", "o", &[]);
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place.package("repos/a", "a", &[]);
     place
         .link("../repos/a", "src/a")
         .link("..", "src/circle")
         .link(outside.0.path().join("o"), "src/o");
-    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
-    let place = Place::new();
+    assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
+    let place = WorkspaceFixture::new();
     place.link(outside.0.path().join("o/package.xml"), "src/o/package.xml");
     assert!(
-        place.refused().contains("leads out of"),
+        place.refusal().contains("leads out of"),
         "{}",
-        place.refused()
+        place.refusal()
     );
 }
 
 #[test]
 fn two_packages_of_one_name_are_refused() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package("src/a", "same", &[])
         .package("src/b", "same", &[]);
-    let text = place.refused();
+    let text = place.refusal();
     assert!(text.contains("\"same\": src/a and src/b"), "{text}");
 }
 
 #[test]
 fn packages_that_need_each_other_are_refused() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package("src/a", "a", &["b"])
         .package("src/b", "b", &["c"])
         .package("src/c", "c", &["b"]);
-    let text = place.refused();
+    let text = place.refusal();
     assert!(text.contains("b needs c needs b"), "{text}");
-    // To run each other is no problem, nor is naming oneself.
-    let place = Place::new();
+    // Mutual exec dependencies are allowed, and so is a dependency on itself.
+    let place = WorkspaceFixture::new();
     place.package("src/a", "a", &["a"]);
     place.write(
         "src/b/package.xml",
@@ -185,23 +185,26 @@ fn packages_that_need_each_other_are_refused() {
         "src/a/package.xml",
         "<package format='2'><name>a</name><build_depend>a</build_depend><exec_depend>b</exec_depend></package>",
     );
-    assert_eq!(place.found(), pairs(&[("a", "src/a"), ("b", "src/b")]));
+    assert_eq!(
+        place.found_packages(),
+        pairs(&[("a", "src/a"), ("b", "src/b")])
+    );
 }
 
 #[test]
 fn a_directory_without_packages_is_told_what_was_looked_for() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place.write("README", "x");
-    let text = place.refused();
+    let text = place.refusal();
     assert!(
-        text.contains("is no ROS package: there is no package.xml in it or anywhere below it"),
+        text.contains("is not a ROS package: no package.xml in it or anywhere below it"),
         "{text}"
     );
     assert!(text.contains("give the directory of a package"), "{text}");
     place.write("src/CATKIN_IGNORE", "");
-    let text = place.refused();
+    let text = place.refusal();
     assert!(
-        text.contains("below its src") && text.contains("1 directories hold"),
+        text.contains("below its src") && text.contains("1 directories were skipped"),
         "{text}"
     );
     let missing = inspect(&place.0.path().join("missing"), &Variables::default())
@@ -222,9 +225,9 @@ fn a_directory_without_packages_is_told_what_was_looked_for() {
 
 #[test]
 fn malformed_xml_names_its_file() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place.write("src/bad/package.xml", "<package>\n<name>x</nam></package>");
-    let text = place.refused();
+    let text = place.refusal();
     assert!(text.contains("src/bad/package.xml, line 2"), "{text}");
 }
 
@@ -234,7 +237,7 @@ const SETUP: &str = "#!/usr/bin/env sh\n# since this file is sourced ...\n\
 #[test]
 fn an_install_space_and_where_it_was_built_for() {
     for below in ["", "install/"] {
-        let place = Place::new();
+        let place = WorkspaceFixture::new();
         place
             .write(&format!("{below}.catkin"), "")
             .write(&format!("{below}setup.sh"), SETUP);
@@ -242,7 +245,7 @@ fn an_install_space_and_where_it_was_built_for() {
             .package(&format!("{below}share/b"), "b", &["a"])
             .package(&format!("{below}share/a"), "a", &[]);
         place.write(&format!("{below}share/doc/readme"), "");
-        let Pushed::Installed(space) = place.inspect().unwrap() else {
+        let PushedDirectory::Installed(space) = place.inspect().unwrap() else {
             panic!("not an install space")
         };
         assert_eq!(
@@ -270,12 +273,12 @@ fn an_install_space_that_names_no_usable_place() {
         ": ${_CATKIN_SETUP_DIR:=/a/../../etc}",
         ": ${_CATKIN_SETUP_DIR:=/a;rm}",
     ] {
-        let place = Place::new();
+        let place = WorkspaceFixture::new();
         place
             .write(".catkin", "")
             .write("setup.sh", script)
             .package("share/a", "a", &[]);
-        let Pushed::Installed(space) = place.inspect().unwrap() else {
+        let PushedDirectory::Installed(space) = place.inspect().unwrap() else {
             panic!("not an install space")
         };
         assert_eq!(space.prefix, None, "{script}");
@@ -284,45 +287,45 @@ fn an_install_space_that_names_no_usable_place() {
 
 #[test]
 fn sources_win_over_their_own_install_space() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .package("src/a", "a", &[])
         .write("install/.catkin", "")
         .write("install/setup.sh", SETUP);
     place.package("install/share/a", "a", &[]);
-    assert_eq!(place.found(), pairs(&[("a", "src/a")]));
+    assert_eq!(place.found_packages(), pairs(&[("a", "src/a")]));
 }
 
 #[test]
 fn a_devel_space_and_an_empty_install_space_are_refused() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
         .write(".catkin", "/home/me/ws/src")
         .write("setup.sh", SETUP);
     assert!(
-        place.refused().contains("is a devel space"),
+        place.refusal().contains("is a devel space"),
         "{}",
-        place.refused()
+        place.refusal()
     );
     place.write(".catkin", "");
     assert!(
-        place.refused().contains("without a share/*/package.xml"),
+        place.refusal().contains("has no share/*/package.xml"),
         "{}",
-        place.refused()
+        place.refusal()
     );
 }
 
-/// What colcon's `local_setup.sh` says of where it is.
+/// Prefix statement in colcon's `local_setup.sh`.
 const COLCON: &str = "# generated\n_colcon_prefix_sh_COLCON_CURRENT_PREFIX=\"/home/me/ws/install\"\n\
                       if [ -z \"$COLCON_CURRENT_PREFIX\" ]; then\n";
-/// What colcon's `setup.sh` says.
+/// Prefix statement in colcon's `setup.sh`.
 const COLCON_CHAIN: &str = "_colcon_prefix_chain_sh_COLCON_CURRENT_PREFIX=/home/me/ws/install\n";
-/// What ament's own `local_setup.sh` says.
+/// Prefix statement in ament's own `local_setup.sh`.
 const AMENT: &str = ": ${AMENT_CURRENT_PREFIX:=\"/opt/mine\"}\n";
 
-impl Place {
-    /// A package of ROS 2 in a prefix.
-    fn indexed(&self, prefix: &str, name: &str) -> &Self {
+impl WorkspaceFixture {
+    /// Creates a ROS 2 package in a prefix.
+    fn write_indexed_package(&self, prefix: &str, name: &str) -> &Self {
         self.write(
             &format!("{prefix}share/ament_index/resource_index/packages/{name}"),
             "",
@@ -332,8 +335,8 @@ impl Place {
 
     fn space(&self) -> InstallSpace {
         match self.inspect().unwrap() {
-            Pushed::Installed(space) => space,
-            Pushed::Source(_) => panic!("not an install space"),
+            PushedDirectory::Installed(space) => space,
+            PushedDirectory::Source(_) => panic!("not an install space"),
         }
     }
 }
@@ -363,14 +366,14 @@ fn install_spaces_of_ros_2_in_either_layout() {
                 Some("/home/me/ws/install"),
             ),
         ] {
-            let place = Place::new();
+            let place = WorkspaceFixture::new();
             place.write(&format!("{below}{script}"), text);
             for name in ["b", "a"] {
                 let of_package = match layout {
                     Layout::Isolated => format!("{below}{name}/"),
                     _ => below.to_owned(),
                 };
-                place.indexed(&of_package, name);
+                place.write_indexed_package(&of_package, name);
             }
             let space = place.space();
             assert_eq!(space.layout, layout, "{below}{script}");
@@ -392,23 +395,23 @@ fn install_spaces_of_ros_2_in_either_layout() {
 
 #[test]
 fn sources_side_by_side_are_no_isolated_space() {
-    let place = Place::new();
-    // A repository may hold an index among its tests.
+    let place = WorkspaceFixture::new();
+    // A repository may contain an index among its tests.
     place
         .package("a", "a", &[])
         .write("b/share/ament_index/resource_index/packages/x", "")
         .package("b", "b", &[]);
-    assert_eq!(place.found(), pairs(&[("a", "a"), ("b", "b")]));
+    assert_eq!(place.found_packages(), pairs(&[("a", "a"), ("b", "b")]));
 }
 
 #[test]
 fn a_space_that_leads_back_to_its_sources_is_refused() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place
-        .indexed("", "talker")
+        .write_indexed_package("", "talker")
         .write("local_setup.sh", COLCON)
         .write("share/talker/hook/pythonpath_develop.sh", "");
-    let text = place.refused();
+    let text = place.refusal();
     assert!(
         text.contains("--symlink-install") && text.contains("push the workspace"),
         "{text}"
@@ -417,18 +420,18 @@ fn a_space_that_leads_back_to_its_sources_is_refused() {
 
 #[test]
 fn an_index_without_package_xml_is_no_package() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     place.write("share/ament_index/resource_index/packages/x", "");
     assert!(
-        place.refused().contains("without a share/*/package.xml"),
+        place.refusal().contains("has no share/*/package.xml"),
         "{}",
-        place.refused()
+        place.refusal()
     );
 }
 
 #[test]
 fn members_of_a_group_come_before_those_that_need_it() {
-    let place = Place::new();
+    let place = WorkspaceFixture::new();
     let write = |name: &str, rest: &str| {
         let text = format!("<package format='3'><name>{name}</name>{rest}</package>");
         place.write(&format!("src/{name}/package.xml"), &text);
@@ -450,8 +453,8 @@ fn members_of_a_group_come_before_those_that_need_it() {
         ("z_msgs", "src/z_msgs"),
         ("a_bridge", "src/a_bridge"),
     ];
-    assert_eq!(place.found(), pairs(&expected));
-    // A member that needs the group needs the others, and not itself.
+    assert_eq!(place.found_packages(), pairs(&expected));
+    // A member that needs the group needs the other members, not itself.
     write(
         "m_msgs",
         "<member_of_group>rosidl_interface_packages</member_of_group>\
@@ -462,5 +465,5 @@ fn members_of_a_group_come_before_those_that_need_it() {
         ("m_msgs", "src/m_msgs"),
         ("a_bridge", "src/a_bridge"),
     ];
-    assert_eq!(place.found(), pairs(&expected));
+    assert_eq!(place.found_packages(), pairs(&expected));
 }

@@ -1,22 +1,22 @@
-//! What follows from what is known of a robot: causes, and what to do about each.
+//! Derives causes from what is known of a robot, and what to do about each.
 
 use api::explain::{Cause, Link, Served, Weight};
 use api::{Event, Phase};
 
-/// Shares and differences from which on something is worth saying.
+/// Thresholds above which a share or difference is reported.
 const THROTTLED: f64 = 0.05;
 const WAITS: f64 = 10.0;
 const CLOCK_APART: f64 = 100.0;
 const LATE: f64 = 0.05;
 const QUEUED: f64 = 0.25;
-/// Milliseconds: less is no queue.
+/// In milliseconds; less does not count as a queue.
 const QUEUE: f64 = 5.0;
 const LEFT_OUT: f64 = 0.1;
-/// The event of a stateful hand-over.
+/// Kind of the event of a stateful hand-over.
 const STATE_LOST: &str = "state-lost";
 
-/// What follows from all that, the weightiest first.
-pub(super) fn causes(
+/// Derives all causes, the most serious first.
+pub(super) fn find_causes(
     servants: &[Served],
     events: &[Event],
     failing: &[api::BackOff],
@@ -27,7 +27,8 @@ pub(super) fn causes(
     for one in failing {
         let left = one.again.saturating_sub(store::now()).div_ceil(1000);
         let what = format!(
-            "its servants of {} have failed {} times in a row (the last one {}); the next is started in {left} s at the earliest",
+            "its servants of {} failed {} times in a row (the last one {}); the next start is in {left} s at the \
+                earliest",
             one.service, one.failures, one.reason
         );
         let next = format!(
@@ -39,16 +40,16 @@ pub(super) fn causes(
     if servants.is_empty() {
         let last = events.last().map(|event| event.message.as_str());
         let what = match last {
-            Some(last) => format!("it has no servant; the last that happened: {last}"),
+            Some(last) => format!("it has no servant; last event: {last}"),
             None => "it has no servant".to_owned(),
         };
-        let next = "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned();
+        let next = "run on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned();
         say(Weight::Blocks, what, next);
     }
     for served in servants {
-        of_servant(served, &mut say);
+        add_servant_causes(served, &mut say);
         for link in &served.links {
-            of_link(served, link, &mut say);
+            add_link_causes(served, link, &mut say);
         }
     }
     for rollout in waiting {
@@ -62,13 +63,13 @@ pub(super) fn causes(
             ),
         );
     }
-    // Only the last one: what was lost before that is of an earlier state.
+    // Only the last event: earlier losses concern an earlier state.
     let lost = events.iter().rev().find(|event| event.kind == STATE_LOST);
     if let Some(lost) = lost {
         say(
             Weight::Hint,
             lost.message.clone(),
-            "where that matters begin anew: start its nodes again, or set local = \"none\" so that the cloud alone answers"
+            "if that matters, restart its nodes, or set local = \"none\" so that only the cloud answers"
                 .to_owned(),
         );
     }
@@ -76,11 +77,11 @@ pub(super) fn causes(
     causes
 }
 
-fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
+fn add_servant_causes(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
     let servant = &served.servant;
     let id = &servant.id;
     if servant.phase != Phase::Ready {
-        let reason = servant.reason.as_deref().unwrap_or("no reason is known");
+        let reason = servant.reason.as_deref().unwrap_or("unknown reason");
         let weight = match servant.phase {
             Phase::Failed | Phase::Stopped => Weight::Blocks,
             _ => Weight::Slows,
@@ -96,7 +97,7 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
         say(
             Weight::Blocks,
             format!(
-                "{} of {id} failed {} times in a row and is started again in {left} s",
+                "{} of {id} failed {} times in a row and restarts in {left} s",
                 down.node, down.failures
             ),
             format!("cloudroidctl logs {id}"),
@@ -107,15 +108,15 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
             Weight::Blocks,
             format!("{id} hangs: {hangs}"),
             format!(
-                "cloudroidctl logs {id}; where such nodes are to be started again: hung = \"restart\" in [servant]"
+                "cloudroidctl logs {id}; to restart such nodes automatically: hung = \"restart\" in [servant]"
             ),
         );
     }
     if servant.connections == 0 {
         say(
             Weight::Blocks,
-            format!("nothing of the robot is connected to {id}"),
-            "look on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned(),
+            format!("the robot is not connected to {id}"),
+            "run on the robot: rosrun PACKAGE cloudroid-stub doctor".to_owned(),
         );
     }
     if served.throttled > THROTTLED {
@@ -127,7 +128,7 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
         say(
             Weight::Slows,
             format!(
-                "{id} is held back by its CPU limit{limit} for {:.0} % of the time",
+                "{id} is throttled by its CPU limit{limit} for {:.0} % of the time",
                 served.throttled * 100.0
             ),
             format!("give {} more cores: push it with --cpus N", servant.service),
@@ -142,7 +143,7 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
         ]
     });
     for (what, share) in waits.into_iter().flatten() {
-        // Being held back by one's own limit counts as waiting for a core, too.
+        // Throttling by the servant's own limit also counts as waiting for a core.
         let by_itself = what == "a core" && served.throttled > THROTTLED;
         if share > WAITS && !by_itself {
             say(
@@ -156,7 +157,7 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
     if killed > 0 {
         say(
             Weight::Slows,
-            format!("{killed} processes of {id} were killed for want of memory"),
+            format!("{killed} processes of {id} were killed because they ran out of memory"),
             format!(
                 "give {} more memory: push it with --memory SIZE",
                 servant.service
@@ -167,34 +168,35 @@ fn of_servant(served: &Served, say: &mut impl FnMut(Weight, String, String)) {
         say(
             Weight::Hint,
             format!(
-                "{} messages of {id} were dropped because a reader was slow",
+                "{} messages of {id} were dropped because a subscriber was slow",
                 servant.dropped
             ),
-            "lower the rate of what is subscribed to, or compress it".to_owned(),
+            "lower the rate of the subscribed topics, or compress them".to_owned(),
         );
     }
 }
 
-fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+fn add_link_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
     let node = &link.node;
     if !link.up {
         say(
             Weight::Blocks,
             match link.fallback_after {
                 Some(after) => format!(
-                    "the link of {node} is down; where the original is installed on the robot, it stands in after {:.1} s",
+                    "the link of {node} is down; if the original is installed on the robot, it takes over after {:.1} \
+                        s",
                     after / 1000.0
                 ),
                 None => format!("the link of {node} is down"),
             },
-            "look on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
+            "run on the robot: rosrun PACKAGE cloudroid-stub doctor --only server".to_owned(),
         );
     }
     if !link.duplicates.is_empty() {
         say(
             Weight::Blocks,
             format!(
-                "another machine ({}) is connected as this robot, beside that of {node}",
+                "another machine ({}) is connected as this robot, besides the one that runs {node}",
                 link.duplicates.join(", ")
             ),
             "give one of them another id: `robot` in stub.toml, or CLOUDROID_ROBOT".to_owned(),
@@ -203,22 +205,24 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
     for topic in &link.unfed {
         say(
             Weight::Blocks,
-            format!("{node} listens to {topic}, which nobody on the robot publishes"),
-            format!("remap it to the topic that is meant: {topic}:=/THE/TOPIC"),
+            format!("{node} subscribes to {topic}, which no node on the robot publishes"),
+            format!("remap it to the intended topic: {topic}:=/THE/TOPIC"),
         );
     }
     for service in &link.unserved {
         say(
             Weight::Hint,
-            format!("{node} looked for the service {service}, which nobody served"),
-            format!("start what serves it on the robot, or remap it: {service}:=/THE/SERVICE"),
+            format!("{node} looked for the service {service}, which no node serves"),
+            format!(
+                "start a node that serves it on the robot, or remap it: {service}:=/THE/SERVICE"
+            ),
         );
     }
     for refused in &link.refused {
         say(
             Weight::Hint,
             refused.clone(),
-            "have the subscriber ask for no more than the publisher offers (ros2 topic info -v shows both)"
+            "let the subscriber request no more than the publisher offers (ros2 topic info -v shows both)"
                 .to_owned(),
         );
     }
@@ -233,12 +237,12 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             "sudo apt install chrony, on both sides".to_owned(),
         );
     }
-    of_queue(served, link, say);
+    add_queue_causes(served, link, say);
     for drop in &link.drops {
         say(
             Weight::Hint,
             drop.clone(),
-            "send less (a lower rate, codec = \"jpeg\"), or give the topic's reader a longer queue"
+            "send less (a lower rate, codec = \"jpeg\"), or give the topic's subscriber a longer queue"
                 .to_owned(),
         );
     }
@@ -254,7 +258,7 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
         say(
             Weight::Slows,
             format!(
-                "{} of the last {} requests of {node} passed T_max{max}{part}",
+                "{} of the last {} requests of {node} exceeded T_max{max}{part}",
                 link.late, link.requests
             ),
             next,
@@ -272,16 +276,17 @@ fn of_link(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, St
             ),
             match link.fallback_after {
                 Some(_) => {
-                    "it stands in while the link is away, and hands back by itself".to_owned()
+                    "it takes over while the link is down, and stops automatically when it is back"
+                        .to_owned()
                 }
-                None => "it stops by itself when the cloud keeps T_max again".to_owned(),
+                None => "it stops automatically when the cloud meets T_max again".to_owned(),
             },
         );
     }
 }
 
-/// Inputs come faster than the node takes them.
-fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
+/// Reports inputs that arrive faster than the node processes them.
+fn add_queue_causes(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, String)) {
     let node = &link.node;
     let next = || {
         format!(
@@ -295,7 +300,8 @@ fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, S
         say(
             Weight::Slows,
             format!(
-                "requests queue before {node}: {queue:.0} ms of {total:.0} ms, while it needs {compute:.0} ms for one"
+                "requests wait {queue:.0} ms of {total:.0} ms in the queue of {node}, which needs {compute:.0} ms for \
+                    one"
             ),
             next(),
         );
@@ -304,17 +310,19 @@ fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, S
         say(
             Weight::Slows,
             format!(
-                "{} inputs of {node} were not sent in the last minute: the link was busy until newer ones came",
+                "{} inputs of {node} were not sent in the last minute: the link was busy until newer ones arrived",
                 link.unsent
             ),
-            "lower their rate, or look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
+            "lower their rate, or check the robot's network; codec = \"jpeg\" in stub.toml \
+                makes pictures smaller"
+                .to_owned(),
         );
     }
     if link.left_out as f64 > LEFT_OUT * link.given as f64 {
         say(
             Weight::Slows,
             format!(
-                "{node} has left out {} of its last {} inputs: newer ones came before it was done",
+                "{node} skipped {} of its last {} inputs: newer ones arrived before it was done",
                 link.left_out, link.given
             ),
             next(),
@@ -322,26 +330,30 @@ fn of_queue(served: &Served, link: &Link, say: &mut impl FnMut(Weight, String, S
     }
 }
 
-/// Where the time goes, and what helps there.
+/// Returns the phase that takes most of the time, and what helps against it.
 fn blame(served: &Served, link: &Link) -> (String, String) {
     let Some(part) = &link.late_in else {
         return (
-            "; of these none was answered".to_owned(),
-            "see the robot's log, and what else is named here".to_owned(),
+            "; none of these was answered".to_owned(),
+            "see the robot's log and the other causes listed here".to_owned(),
         );
     };
     let text = format!(
-        "; most of the time goes into {} ({:.0} ms)",
+        "; most of the time is spent in {} ({:.0} ms)",
         part.name, part.p50
     );
     let next = match part.name.as_str() {
-        "up" | "down" => "look at the robot's network; codec = \"jpeg\" in stub.toml sends pictures in less".to_owned(),
-        "queue" => "requests come faster than they are answered: lower their rate, or give more cores with --cpus".to_owned(),
+        "up" | "down" => "check the robot's network; codec = \"jpeg\" in stub.toml makes \
+            pictures smaller"
+            .to_owned(),
+        "queue" => "requests arrive faster than they are answered: lower their rate, or give more \
+                    cores with --cpus"
+            .to_owned(),
         "compute" => format!(
             "the node itself is slow: push {} with more --cpus, or raise T_max",
             served.servant.service
         ),
-        _ => "the robot itself is busy: see top there".to_owned(),
+        _ => "the robot itself is busy: run top there".to_owned(),
     };
     (text, next)
 }

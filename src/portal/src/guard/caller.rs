@@ -1,4 +1,4 @@
-//! The other end of a connection, and who asks there.
+//! The peer of a connection and the caller of a request.
 
 use std::fmt;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -7,129 +7,137 @@ use std::sync::Arc;
 use access::Principal;
 use tokio_rustls::rustls::pki_types::CertificateDer;
 
-use crate::principals::{Identity, Shown};
+use crate::principals::{CallerIdentity, Credential};
 use crate::strangers::Stranger;
 
-/// The other end of a connection.
+/// The peer of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Peer {
-    /// An address.
+pub enum ConnectionPeer {
+    /// A TCP address.
     Tcp(SocketAddr),
-    /// A user of this machine.
+    /// A user of this machine, on the Unix socket.
     Unix(User),
 }
 
-/// A user of this machine, by the kernel's word.
+/// A user of this machine, identified by the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct User {
-    /// The number.
+    /// User id.
     pub uid: u32,
-    /// Whether the process was in the group whose members are admins when it connected.
+    /// True if the process was in the admin group when it connected.
     pub is_member: bool,
 }
 
-impl fmt::Display for Peer {
+impl fmt::Display for ConnectionPeer {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Peer::Tcp(address) => address.fmt(out),
-            Peer::Unix(user) => write!(out, "user {}", user.uid),
+            ConnectionPeer::Tcp(address) => address.fmt(out),
+            ConnectionPeer::Unix(user) => write!(out, "user {}", user.uid),
         }
     }
 }
 
-impl Peer {
-    /// Its address; users of this machine are at its own.
+impl ConnectionPeer {
+    /// Returns the IP address; loopback for users of this machine.
     pub fn ip(&self) -> IpAddr {
         match self {
-            Peer::Tcp(address) => address.ip(),
-            Peer::Unix(_) => Ipv4Addr::LOCALHOST.into(),
+            ConnectionPeer::Tcp(address) => address.ip(),
+            ConnectionPeer::Unix(_) => Ipv4Addr::LOCALHOST.into(),
         }
     }
 
-    /// The name of its memory budget: its IP address or, for connections from this machine (a proxy's), its robot's name.
-    pub fn client(&self, robot: Option<&str>) -> String {
+    /// Returns the name of the memory budget: the IP address or, for connections from this machine (such as a
+    /// proxy's), the robot's name.
+    pub fn budget_name(&self, robot: Option<&str>) -> String {
         match (self, robot) {
-            (Peer::Tcp(address), _) if !address.ip().is_loopback() => address.ip().to_string(),
+            (ConnectionPeer::Tcp(address), _) if !address.ip().is_loopback() => {
+                address.ip().to_string()
+            }
             (_, Some(robot)) => robot.to_owned(),
-            (Peer::Tcp(address), None) => address.ip().to_string(),
-            (Peer::Unix(user), None) => format!("user {}", user.uid),
+            (ConnectionPeer::Tcp(address), None) => address.ip().to_string(),
+            (ConnectionPeer::Unix(user), None) => format!("user {}", user.uid),
         }
     }
 }
 
-/// What is known of a connection before its first request.
+/// Properties of a connection before its first request.
 #[derive(Debug, Clone)]
-pub struct Connection {
-    /// The other end.
-    pub peer: Peer,
-    /// Whether nobody on the way can overhear or change what is sent: through TLS, or on this machine's own socket.
+pub struct PortalConnection {
+    /// The peer.
+    pub peer: ConnectionPeer,
+    /// True if the connection cannot be intercepted: it uses TLS, or this machine's own socket.
     pub secure: bool,
-    /// Whether a proxy that the operator named asks for somebody else, whose address the peer is then.
+    /// True if a trusted proxy forwards for a client, whose address the peer then is.
     pub forwarded: bool,
-    /// The certificates that the client has shown in TLS, its own first; none where it showed none.
+    /// Client certificates presented in TLS, the client's own first; empty if there were none.
     pub certificates: Arc<[CertificateDer<'static>]>,
-    /// Its place among those on which nobody has shown who asks; none for users of this machine, who are told apart by the kernel.
+    /// Slot among the unauthenticated connections; `None` for users of this machine, whom the kernel identifies.
     pub stranger: Option<Arc<Stranger>>,
 }
 
-impl Connection {
-    /// One without TLS.
-    pub fn plain(peer: Peer) -> Connection {
-        Connection {
+impl PortalConnection {
+    /// Creates a connection without TLS.
+    pub fn without_tls(peer: ConnectionPeer) -> PortalConnection {
+        PortalConnection {
             peer,
-            secure: matches!(peer, Peer::Unix(_)),
+            secure: matches!(peer, ConnectionPeer::Unix(_)),
             forwarded: false,
             certificates: Arc::default(),
             stranger: None,
         }
     }
 
-    /// Counts it among strangers no more.
+    /// Removes it from the unauthenticated connections.
     pub(crate) fn admit(&self) {
         if let Some(stranger) = &self.stranger {
             stranger.admit();
         }
     }
 
-    /// Comes back when newer connections of strangers need its place.
-    pub(crate) async fn dropped(&self) {
+    /// Waits until the connection must make way for newer unauthenticated ones.
+    pub(crate) async fn wait_until_dropped(&self) {
         match &self.stranger {
-            Some(stranger) => stranger.dropped().await,
+            Some(stranger) => stranger.wait_until_dropped().await,
             None => std::future::pending().await,
         }
     }
 }
 
-/// Who asks.
+/// The caller of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Caller {
-    /// From where.
-    pub peer: Peer,
-    /// Whether nobody on the way can overhear or change what is sent.
+    /// The peer.
+    pub peer: ConnectionPeer,
+    /// True if the connection cannot be intercepted.
     pub secure: bool,
-    /// Whether a proxy that the operator named asks for it.
+    /// True if a trusted proxy forwards the request.
     pub forwarded: bool,
-    /// Who. Nobody gets the page, `/healthz`, and a WebSocket on which it must first send `auth`.
-    pub who: Identity,
+    /// Identity of the caller. Without one, only the page, `/healthz` and a WebSocket that must first send `auth` are
+    /// available.
+    pub who: CallerIdentity,
 }
 
 impl Caller {
-    /// Whether it has said who it is, where that is asked for.
+    /// Returns true if the caller is identified, where that is required.
     pub fn is_known(&self) -> bool {
         !self.who.principal.roles.is_empty()
     }
 
-    pub(crate) fn new(connection: &Connection, principal: Principal, shown: Shown) -> Caller {
-        let who = Identity {
+    pub(crate) fn new(
+        connection: &PortalConnection,
+        principal: Principal,
+        shown: Credential,
+    ) -> Caller {
+        let who = CallerIdentity {
             principal: Arc::new(principal),
             shown,
             token: None,
             owner: None,
         };
-        Caller::by(connection, who)
+        Caller::from_identity(connection, who)
     }
 
-    pub(super) fn by(connection: &Connection, who: Identity) -> Caller {
+    pub(super) fn from_identity(connection: &PortalConnection, who: CallerIdentity) -> Caller {
         Caller {
             peer: connection.peer,
             secure: connection.secure,

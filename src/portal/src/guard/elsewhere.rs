@@ -1,5 +1,5 @@
-//! Requests that come from elsewhere by way of this machine: those of other sites' pages, in the browser of a user of it, and those that a
-//! proxy passes on.
+//! Checks on requests that pass through this machine: from pages of other sites in a local user's browser, and
+//! forwarded by a proxy.
 
 use std::net::IpAddr;
 
@@ -8,7 +8,7 @@ use axum::http::{HeaderMap, header};
 use super::header_text;
 use crate::errors::Error;
 
-/// Refuses what is addressed to another machine (DNS rebinding).
+/// Refuses requests addressed to another host (DNS rebinding).
 pub(super) fn check_host(headers: &HeaderMap) -> Result<(), Error> {
     let host = header_text(headers, header::HOST).unwrap_or_default();
     if is_loopback_host(without_port(host)) {
@@ -16,14 +16,14 @@ pub(super) fn check_host(headers: &HeaderMap) -> Result<(), Error> {
     }
     Err(Error::Foreign {
         what: format!(
-            "the request is addressed to {host:?}, but this portal serves this machine alone"
+            "the request is addressed to {host:?}, but this portal serves only this machine"
         ),
         next: "use 127.0.0.1 or localhost, or configure tokens, as a proxy in front of it needs"
             .to_owned(),
     })
 }
 
-/// Refuses pages of other machines, but for those of origins that are allowed.
+/// Refuses pages of other machines, except from allowed origins.
 pub(super) fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<(), Error> {
     let Some(origin) = header_text(headers, header::ORIGIN) else {
         return Ok(());
@@ -44,28 +44,28 @@ pub(super) fn check_origin(headers: &HeaderMap, allowed: &[String]) -> Result<()
     })
 }
 
-/// Refuses what a page of another site loads as a part of itself (an image, a script, a frame): the browser keeps the answer
-/// from the page, but tells it whether there was one, and so what there is here. Browsers say where a request comes from (Fetch
-/// Metadata, W3C); those with an origin are decided by that, and a person who follows a link is answered.
-pub fn check_part(headers: &HeaderMap) -> Result<(), Error> {
+/// Refuses what a page of another site embeds (an image, a script, a frame): the browser hides the response from the
+/// page, but reveals whether there was one, and so what exists here. Browsers tell where a request comes from (Fetch
+/// Metadata, W3C); requests with an origin are decided by it, and a person following a link is answered.
+pub fn check_not_embedded(headers: &HeaderMap) -> Result<(), Error> {
     let is = |name: &str, values: &[&str]| {
         let said = headers.get(name).and_then(|value| value.to_str().ok());
         said.is_some_and(|said| values.contains(&said))
     };
     let elsewhere = is("sec-fetch-site", &["cross-site", "same-site"]);
     let follows = is("sec-fetch-mode", &["navigate"]) && is("sec-fetch-dest", &["document"]);
-    match elsewhere && !follows && !headers.contains_key(header::ORIGIN) {
-        true => Err(Error::Foreign {
-            what: "a page of another site may not have this portal's answers as parts of itself"
-                .to_owned(),
+    if elsewhere && !follows && !headers.contains_key(header::ORIGIN) {
+        Err(Error::Foreign {
+            what: "a page of another site may not embed this portal's answers".to_owned(),
             next: "open the address itself, or ask with a token (Authorization: Bearer TOKEN)"
                 .to_owned(),
-        }),
-        false => Ok(()),
+        })
+    } else {
+        Ok(())
     }
 }
 
-/// Headers that proxies add.
+/// Headers added by proxies.
 const FORWARDED: [&str; 6] = [
     "forwarded",
     "via",
@@ -75,14 +75,14 @@ const FORWARDED: [&str; 6] = [
     "x-real-ip",
 ];
 
-/// Refuses requests with a proxy's headers: their callers are on other machines, whatever `Host` says.
+/// Refuses requests with a proxy's headers: their clients are on other machines, whatever `Host` says.
 pub(super) fn check_direct(headers: &HeaderMap) -> Result<(), Error> {
     match FORWARDED.iter().find(|name| headers.contains_key(**name)) {
         None => Ok(()),
         Some(name) => Err(Error::Foreign {
             what: format!(
-                "a proxy passes this request on (its header {name} says so), and this portal has no tokens by which to \
-                 tell who asks"
+                "a proxy passes this request on (its header {name} says so), but this portal has no tokens to identify \
+                    the caller"
             ),
             next: "configure tokens, and send one: Authorization: Bearer TOKEN, or ?token=TOKEN"
                 .to_owned(),

@@ -1,41 +1,42 @@
-//! Which figures are recorded, in which order, and how those of several samples become one.
+//! Recorded figures: their order, and how those of several samples are aggregated.
 
 use api::explain::Served;
 use api::history::{MachineFigures, ServantFigures};
 use api::stream::Machine;
 use api::{Millis, explain};
 
-/// What a step of several samples has.
+/// How a figure of several samples is aggregated.
 #[derive(Debug, Clone, Copy)]
-pub enum Rule {
+pub enum Aggregation {
     Mean,
     Most,
     Least,
     Last,
     Sum,
 }
-use Rule::{Last, Least, Mean, Most, Sum};
+use Aggregation::{Last, Least, Mean, Most, Sum};
 
-/// How the figures of a servant are gathered, in the order in which they are recorded. Only ever added to.
-pub const SERVANT: [Rule; 15] = [
+/// Aggregations of a servant's figures, in the order of recording. Append only.
+pub const SERVANT: [Aggregation; 15] = [
     Mean, Most, Mean, Most, Mean, Most, Last, Last, Least, Sum, Mean, Mean, Mean, Mean, Mean,
 ];
-/// As [`SERVANT`], of the machine.
-pub const MACHINE: [Rule; 8] = [Mean, Most, Mean, Most, Mean, Mean, Mean, Most];
+/// Like [`SERVANT`], for the machine.
+pub const MACHINE: [Aggregation; 8] = [Mean, Most, Mean, Most, Mean, Mean, Mean, Most];
 
-/// What no figure is known for.
+/// Placeholder for an unknown figure.
 const NONE: f32 = f32::NAN;
 
-fn figure(value: Option<f64>) -> f32 {
+fn to_figure(value: Option<f64>) -> f32 {
     value.map_or(NONE, |value| value as f32)
 }
 
-/// A servant's figures. `dropped`: messages since the sample before.
-pub fn servant(served: &Served, dropped: Option<u64>) -> Vec<f32> {
+/// Returns a servant's figures. `dropped` counts the messages dropped since the previous sample.
+pub fn servant_sample(served: &Served, dropped: Option<u64>) -> Vec<f32> {
     let one = &served.servant;
     let used = one.usage.as_ref();
-    let measured = |value: f64| figure(used.map(|_| value));
-    let least = |all: &mut dyn Iterator<Item = Option<f64>>| figure(all.flatten().reduce(f64::min));
+    let measured = |value: f64| to_figure(used.map(|_| value));
+    let least =
+        |all: &mut dyn Iterator<Item = Option<f64>>| to_figure(all.flatten().reduce(f64::min));
     let stated = || one.terms.iter().flat_map(|terms| terms.stated.values());
     let millis = |span: Option<api::Span>| span.map(|span| span.as_seconds() * 1e3);
     let links = &served.links;
@@ -44,14 +45,15 @@ pub fn servant(served: &Served, dropped: Option<u64>) -> Vec<f32> {
         .filter_map(|link| Some((link, link.part("total")?.p50)))
         .max_by(|(_, one), (_, other)| one.total_cmp(other))
         .map(|(link, _)| link);
-    let phase = |name| figure(slowest.and_then(|link: &explain::Link| Some(link.part(name)?.p50)));
+    let phase =
+        |name| to_figure(slowest.and_then(|link: &explain::Link| Some(link.part(name)?.p50)));
     vec![
         measured(served.cores),
         measured(served.cores),
         measured(served.throttled),
-        figure(used.map(|used| used.memory as f64)),
-        figure(one.response.map(|response| response.p50_ms)),
-        figure(one.response.map(|response| response.p95_ms)),
+        to_figure(used.map(|used| used.memory as f64)),
+        to_figure(one.response.map(|response| response.p50_ms)),
+        to_figure(one.response.map(|response| response.p95_ms)),
         least(
             &mut links
                 .iter()
@@ -65,7 +67,7 @@ pub fn servant(served: &Served, dropped: Option<u64>) -> Vec<f32> {
                 .chain(stated().map(|stated| millis(stated.sla.max_rrt))),
         ),
         least(&mut links.iter().map(|link| link.satisfaction)),
-        figure(dropped.map(|dropped| dropped as f64)),
+        to_figure(dropped.map(|dropped| dropped as f64)),
         phase("serialise"),
         phase("up"),
         phase("queue"),
@@ -74,8 +76,8 @@ pub fn servant(served: &Served, dropped: Option<u64>) -> Vec<f32> {
     ]
 }
 
-/// The machine's figures.
-pub fn machine(machine: &Machine) -> Vec<f32> {
+/// Returns the machine's figures.
+pub fn machine_sample(machine: &Machine) -> Vec<f32> {
     let status = &machine.status;
     let waits = status.usage.pressure;
     vec![
@@ -83,45 +85,45 @@ pub fn machine(machine: &Machine) -> Vec<f32> {
         machine.cores as f32,
         status.capacity.cpus_reserved as f32,
         status.usage.memory as f32,
-        figure(waits.map(|waits| waits.cpu)),
-        figure(waits.map(|waits| waits.memory)),
-        figure(waits.map(|waits| waits.io)),
+        to_figure(waits.map(|waits| waits.cpu)),
+        to_figure(waits.map(|waits| waits.memory)),
+        to_figure(waits.map(|waits| waits.io)),
         status.servants as f32,
     ]
 }
 
-/// Samples of one step becoming one.
+/// Accumulates the samples of one step.
 #[derive(Debug, Clone, Default)]
-pub struct Gathered(Vec<Vec<f32>>);
+pub struct SampleAccumulator(Vec<Vec<f32>>);
 
-impl Gathered {
-    /// One sample more.
+impl SampleAccumulator {
+    /// Adds a sample.
     pub fn add(&mut self, figures: Vec<f32>) {
         self.0.push(figures);
     }
 
-    /// All of them as one.
-    pub fn one(&self, rules: &[Rule]) -> Vec<f32> {
+    /// Aggregates all samples into one.
+    pub fn aggregate(&self, rules: &[Aggregation]) -> Vec<f32> {
         let values = |index: usize| {
             let all = self.0.iter().filter_map(move |one| one.get(index).copied());
             all.filter(|value| !value.is_nan())
         };
-        let gather = |(index, rule): (usize, &Rule)| {
+        let gather = |(index, rule): (usize, &Aggregation)| {
             let all = || values(index);
             match rule {
-                Rule::Mean => all().sum::<f32>() / all().count() as f32,
-                Rule::Most => all().reduce(f32::max).unwrap_or(NONE),
-                Rule::Least => all().reduce(f32::min).unwrap_or(NONE),
-                Rule::Last => all().next_back().unwrap_or(NONE),
-                Rule::Sum => all().reduce(|sum, one| sum + one).unwrap_or(NONE),
+                Aggregation::Mean => all().sum::<f32>() / all().count() as f32,
+                Aggregation::Most => all().reduce(f32::max).unwrap_or(NONE),
+                Aggregation::Least => all().reduce(f32::min).unwrap_or(NONE),
+                Aggregation::Last => all().next_back().unwrap_or(NONE),
+                Aggregation::Sum => all().reduce(|sum, one| sum + one).unwrap_or(NONE),
             }
         };
         rules.iter().enumerate().map(gather).collect()
     }
 }
 
-/// Of so many significant digits as are worth sending.
-fn told(value: Option<&f32>) -> Option<f64> {
+/// Rounds to four significant digits; more are not worth sending.
+fn round_figure(value: Option<&f32>) -> Option<f64> {
     let value = f64::from(*value?);
     match value {
         _ if !value.is_finite() => None,
@@ -140,11 +142,13 @@ fn times(samples: &Samples) -> Vec<Millis> {
 }
 
 fn list(samples: &Samples, index: usize) -> Vec<Option<f64>> {
-    let of = samples.iter().map(|(_, figures)| told(figures.get(index)));
+    let of = samples
+        .iter()
+        .map(|(_, figures)| round_figure(figures.get(index)));
     of.collect()
 }
 
-/// As the API has them.
+/// Converts samples to the API's type.
 pub fn servant_figures(samples: &Samples) -> ServantFigures {
     let list = |index| list(samples, index);
     ServantFigures {
@@ -167,7 +171,7 @@ pub fn servant_figures(samples: &Samples) -> ServantFigures {
     }
 }
 
-/// As the API has them.
+/// Converts samples to the API's type.
 pub fn machine_figures(samples: &Samples) -> MachineFigures {
     let list = |index| list(samples, index);
     MachineFigures {
@@ -186,22 +190,22 @@ pub fn machine_figures(samples: &Samples) -> MachineFigures {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::looks::tests::served;
+    use crate::looks::tests::served_servant;
 
     #[test]
     fn samples_are_gathered_each_by_its_rule() {
-        let mut gathered = Gathered::default();
+        let mut gathered = SampleAccumulator::default();
         gathered.add(vec![1.0, 1.0, 1.0, 1.0, 1.0, NONE]);
         gathered.add(vec![3.0, 3.0, 3.0, 3.0, 3.0, NONE]);
         gathered.add(vec![NONE, 2.0, 2.0, NONE, 2.0, NONE]);
-        let one = gathered.one(&[Mean, Most, Least, Last, Sum, Mean]);
+        let one = gathered.aggregate(&[Mean, Most, Least, Last, Sum, Mean]);
         assert_eq!(one[..5], [2.0, 3.0, 1.0, 3.0, 6.0]);
         assert!(one[5].is_nan(), "of nothing comes nothing");
     }
 
     #[test]
     fn every_figure_has_a_rule_and_a_place() {
-        let mut one = served(1, 1);
+        let mut one = served_servant(1, 1);
         one.cores = 0.5;
         let phases = ["total", "serialise", "up", "queue", "compute", "down"];
         let link = |total: f64| explain::Link {
@@ -210,17 +214,17 @@ mod tests {
             satisfaction: Some(2.0),
             phases: phases
                 .iter()
-                .filter_map(|name| explain::Part::of(name, vec![total]))
+                .filter_map(|name| explain::Part::from_samples(name, vec![total]))
                 .collect(),
             ..explain::Link::default()
         };
         one.links = vec![link(3.0), link(7.0)];
-        let figures = servant(&one, Some(4));
+        let figures = servant_sample(&one, Some(4));
         assert_eq!(figures.len(), SERVANT.len());
         let told = servant_figures(&[(5, figures)]);
         assert_eq!(told.time, [5]);
         assert_eq!((told.cores[0], told.p50[0]), (Some(0.5), None));
-        // The strictest promise; the parts of the slowest link.
+        // The strictest requirement; the phases of the slowest link.
         assert_eq!((told.desire[0], told.max[0]), (Some(30.0), Some(60.0)));
         assert_eq!((told.up[0], told.down[0]), (Some(7.0), Some(7.0)));
         assert_eq!(told.dropped[0], Some(4.0));
@@ -235,9 +239,13 @@ mod tests {
             (-2.0, -2.0),
             (0.0, 0.0),
         ] {
-            assert_eq!(told(Some(&value)), Some(as_told));
+            assert_eq!(round_figure(Some(&value)), Some(as_told));
         }
-        assert_eq!(told(Some(&NONE)), None);
-        assert_eq!(told(None), None, "recorded before there was such a figure");
+        assert_eq!(round_figure(Some(&NONE)), None);
+        assert_eq!(
+            round_figure(None),
+            None,
+            "recorded before there was such a figure"
+        );
     }
 }

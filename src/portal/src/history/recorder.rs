@@ -1,4 +1,4 @@
-//! Records what the servants and the machine do, whether or not anybody looks.
+//! Records the figures of servants and machine, whether or not anybody looks.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,36 +8,36 @@ use api::Millis;
 use store::NewSample;
 use tokio::time::MissedTickBehavior;
 
-use super::figures::{self, Gathered, MACHINE, SERVANT};
+use super::figures::{self, MACHINE, SERVANT, SampleAccumulator};
 use super::{COARSE, FINE};
 use crate::app::App;
 use crate::errors::Error;
-use crate::looks::{self, Looker};
+use crate::looks::{self, ServantSampler};
 
-/// Servants that are sampled at a time: what a day takes on the disk is bounded by it.
+/// Limit on the servants sampled, which bounds the disk usage of a day.
 const SERVANTS: usize = 500;
-/// The machine's name among what is recorded.
+/// Name of the machine among the recorded series.
 pub const THE_MACHINE: &str = "";
 
-/// Whose figures these are.
-struct Of {
+/// Owner of a series of figures.
+struct SeriesOwner {
     service: String,
     robot: String,
     began: Millis,
 }
 
-/// What was sampled since the last coarse step ended.
+/// Samples since the last coarse step ended.
 #[derive(Default)]
 struct Minute {
-    /// Its number since 1970.
+    /// Number of the minute since 1970.
     number: u64,
-    gathered: HashMap<String, (Of, Gathered)>,
+    gathered: HashMap<String, (SeriesOwner, SampleAccumulator)>,
 }
 
-/// Samples until the daemon ends.
-pub async fn keep(app: Arc<App>) {
+/// Records samples until the daemon stops.
+pub async fn record_history(app: Arc<App>) {
     let mut ticks = tokio::time::interval(Duration::from_secs(FINE.seconds.into()));
-    // What was not sampled is a gap.
+    // Missed samples leave a gap.
     ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
     let mut recorder = Recorder::default();
     loop {
@@ -47,10 +47,10 @@ pub async fn keep(app: Arc<App>) {
         }
         match recorder.sample(&app).await {
             Ok(()) => recorder.failing = false,
-            // Once, until it works again.
+            // Logged once until it works again.
             Err(error) => {
                 if !std::mem::replace(&mut recorder.failing, true) {
-                    tracing::warn!("what servants do is not recorded now: {error}");
+                    tracing::warn!("the history of servants is not being recorded: {error}");
                 }
             }
         }
@@ -59,8 +59,8 @@ pub async fn keep(app: Arc<App>) {
 
 #[derive(Default)]
 struct Recorder {
-    looker: Looker,
-    /// Messages that each servant had dropped.
+    looker: ServantSampler,
+    /// Number of messages dropped by each servant so far.
     dropped: HashMap<String, u64>,
     minute: Minute,
     failing: bool,
@@ -68,28 +68,28 @@ struct Recorder {
 
 impl Recorder {
     async fn sample(&mut self, app: &App) -> Result<(), Error> {
-        let mut servants = self.looker.servants(app).await;
-        let machine = looks::machine(app, &servants).await?;
+        let mut servants = self.looker.sample(app).await;
+        let machine = looks::sample_machine(app, &servants).await?;
         let time = store::now();
         servants.truncate(SERVANTS);
         let mut sampled = vec![(
             THE_MACHINE.to_owned(),
-            Of {
+            SeriesOwner {
                 service: String::new(),
                 robot: String::new(),
                 began: app.started,
             },
-            figures::machine(&machine),
+            figures::machine_sample(&machine),
         )];
         let earlier = std::mem::take(&mut self.dropped);
         for served in servants {
             let before = earlier.get(&served.servant.id);
             let now = served.servant.dropped;
             let figures =
-                figures::servant(&served, before.map(|before| now.saturating_sub(*before)));
+                figures::servant_sample(&served, before.map(|before| now.saturating_sub(*before)));
             let one = served.servant;
             self.dropped.insert(one.id.clone(), now);
-            let of = Of {
+            let of = SeriesOwner {
                 service: one.service,
                 robot: one.robot,
                 began: one.created,
@@ -98,23 +98,23 @@ impl Recorder {
         }
         let new: Vec<_> = sampled
             .iter()
-            .map(|(id, of, figures)| new(id, of, figures))
+            .map(|(id, of, figures)| new_sample(id, of, figures))
             .collect();
-        app.state.record(FINE.seconds, time, &new)?;
-        self.minute(app, time)?;
+        app.state.add_samples(FINE.seconds, time, &new)?;
+        self.finish_minute(app, time)?;
         for (id, of, figures) in sampled {
             let (_, gathered) = self
                 .minute
                 .gathered
                 .entry(id)
-                .or_insert_with(|| (of, Gathered::default()));
+                .or_insert_with(|| (of, SampleAccumulator::default()));
             gathered.add(figures);
         }
         Ok(())
     }
 
-    /// Writes the coarse step where it is over, and forgets what is old.
-    fn minute(&mut self, app: &App, time: Millis) -> Result<(), Error> {
+    /// Writes the coarse step once it is over, and deletes expired samples.
+    fn finish_minute(&mut self, app: &App, time: Millis) -> Result<(), Error> {
         let number = time / COARSE.millis();
         if number == self.minute.number {
             return Ok(());
@@ -126,7 +126,7 @@ impl Recorder {
                 ..Minute::default()
             },
         );
-        let one = |(id, (of, gathered)): (&String, &(Of, Gathered))| {
+        let one = |(id, (of, gathered)): (&String, &(SeriesOwner, SampleAccumulator))| {
             let rules = if id == THE_MACHINE {
                 &MACHINE[..]
             } else {
@@ -134,7 +134,7 @@ impl Recorder {
             };
             (
                 id.clone(),
-                gathered.one(rules),
+                gathered.aggregate(rules),
                 (of.service.clone(), of.robot.clone(), of.began),
             )
         };
@@ -150,13 +150,13 @@ impl Recorder {
             })
             .collect();
         let ended = number * COARSE.millis();
-        app.state.record(COARSE.seconds, ended, &samples)?;
-        let kept = [FINE, COARSE].map(|step| (step.seconds, time.saturating_sub(step.kept())));
+        app.state.add_samples(COARSE.seconds, ended, &samples)?;
+        let kept = [FINE, COARSE].map(|step| (step.seconds, time.saturating_sub(step.retention())));
         Ok(app.state.forget_history(&kept)?)
     }
 }
 
-fn new<'a>(id: &'a str, of: &'a Of, figures: &'a [f32]) -> NewSample<'a> {
+fn new_sample<'a>(id: &'a str, of: &'a SeriesOwner, figures: &'a [f32]) -> NewSample<'a> {
     NewSample {
         servant: id,
         service: &of.service,

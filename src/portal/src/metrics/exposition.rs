@@ -1,17 +1,17 @@
-//! Prometheus's text format (version 0.0.4), and OpenMetrics 1.0, which names a counter's family without `_total` and says where it
-//! ends, so that half an answer is not taken for a whole one.
+//! Prometheus's text format (version 0.0.4), and OpenMetrics 1.0, which names a counter's family without `_total` and
+//! marks the end, so that a truncated response is recognised.
 
 use std::fmt::Write;
 
 use axum::http::{HeaderMap, header};
 
-/// What OpenMetrics is called.
+/// Media type of OpenMetrics.
 pub const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-/// What Prometheus's format is called.
+/// Media type of Prometheus's text format.
 pub const PROMETHEUS: &str = "text/plain; version=0.0.4";
 
-/// Whether OpenMetrics is among what is accepted.
-pub fn asks_for_open_metrics(headers: &HeaderMap) -> bool {
+/// Returns true if the client accepts OpenMetrics.
+pub fn accepts_open_metrics(headers: &HeaderMap) -> bool {
     let accepted = headers.get_all(header::ACCEPT).iter();
     accepted
         .filter_map(|value| value.to_str().ok())
@@ -20,8 +20,8 @@ pub fn asks_for_open_metrics(headers: &HeaderMap) -> bool {
         .any(|kind| kind.trim() == "application/openmetrics-text")
 }
 
-/// The same figures as OpenMetrics.
-pub fn open_metrics(prometheus: &str) -> String {
+/// Converts Prometheus's text format to OpenMetrics.
+pub fn to_open_metrics(prometheus: &str) -> String {
     let mut out = String::with_capacity(prometheus.len());
     for line in prometheus.lines() {
         let about = line
@@ -44,18 +44,18 @@ pub fn open_metrics(prometheus: &str) -> String {
     out
 }
 
-/// Values that go up and down.
-pub fn gauge(
+/// Writes a gauge.
+pub fn write_gauge(
     out: &mut String,
     name: &str,
     help: &str,
     rows: impl IntoIterator<Item = (String, f64)>,
 ) {
-    family(out, name, "gauge", help, rows);
+    write_family(out, name, "gauge", help, rows);
 }
 
-/// All values of one metric with its type and what it is. `name` of a counter ends with `_total`; each value has its labels.
-pub fn family(
+/// Writes a metric family: type, help and rows of labels and value. A counter's `name` ends with `_total`.
+pub fn write_family(
     out: &mut String,
     name: &str,
     kind: &str,
@@ -74,8 +74,8 @@ pub fn family(
     }
 }
 
-/// Labels as they stand between braces.
-pub fn labels(pairs: &[(&str, &str)]) -> String {
+/// Formats labels as they appear between braces.
+pub fn format_labels(pairs: &[(&str, &str)]) -> String {
     let escape = |text: &str| {
         text.replace('\\', "\\\\")
             .replace('"', "\\\"")
@@ -95,11 +95,14 @@ mod tests {
     #[test]
     fn figures_come_out_as_prometheus_reads_them() {
         let mut out = String::new();
-        gauge(
+        write_gauge(
             &mut out,
             "a",
             "Help.",
-            [(String::new(), 1.0), (labels(&[("x", "q\"\\")]), 0.5)],
+            [
+                (String::new(), 1.0),
+                (format_labels(&[("x", "q\"\\")]), 0.5),
+            ],
         );
         assert_eq!(
             out,
@@ -110,16 +113,16 @@ mod tests {
     #[test]
     fn open_metrics_names_counters_without_their_ending_and_says_where_it_ends() {
         let mut out = String::new();
-        family(
+        write_family(
             &mut out,
             "a_total",
             "counter",
             "A total.",
             [(String::new(), 1.0)],
         );
-        gauge(&mut out, "b", "Not a_total.", [(String::new(), 2.0)]);
+        write_gauge(&mut out, "b", "Not a_total.", [(String::new(), 2.0)]);
         assert_eq!(
-            open_metrics(&out),
+            to_open_metrics(&out),
             "# HELP a A total.\n# TYPE a counter\na_total 1\n\
              # HELP b Not a_total.\n# TYPE b gauge\nb 2\n# EOF\n"
         );
@@ -142,7 +145,7 @@ mod tests {
             if let Some(accept) = accept {
                 headers.insert(header::ACCEPT, accept.parse().expect("a value"));
             }
-            assert_eq!(asks_for_open_metrics(&headers), expected, "{accept:?}");
+            assert_eq!(accepts_open_metrics(&headers), expected, "{accept:?}");
         }
     }
 }

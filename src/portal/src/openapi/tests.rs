@@ -7,11 +7,11 @@ use crate::routes::{Access, ROUTES};
 
 mod samples;
 
-fn written() -> Value {
+fn document_json() -> Value {
     serde_json::to_value(document(ROUTES)).expect("plain data")
 }
 
-/// Every `$ref` in the document.
+/// Collects every `$ref` in the document.
 fn references(value: &Value, found: &mut Vec<String>) {
     match value {
         Value::Object(members) => {
@@ -31,7 +31,7 @@ fn references(value: &Value, found: &mut Vec<String>) {
 
 #[test]
 fn every_reference_leads_to_a_schema() {
-    let document = written();
+    let document = document_json();
     let mut found = Vec::new();
     references(&document, &mut found);
     assert!(!found.is_empty());
@@ -59,7 +59,7 @@ fn two_types_have_no_schema_of_one_name() {
 
 #[test]
 fn the_document_lists_exactly_the_routes_of_the_table() {
-    let document = written();
+    let document = document_json();
     let mut listed = BTreeSet::new();
     let mut ids = BTreeSet::new();
     for (path, item) in document["paths"].as_object().expect("paths") {
@@ -78,7 +78,7 @@ fn the_document_lists_exactly_the_routes_of_the_table() {
 
 #[test]
 fn every_operation_says_with_what_it_may_be_refused() {
-    let document = written();
+    let document = document_json();
     let mut ids = BTreeSet::new();
     for (path, item) in document["paths"].as_object().expect("paths") {
         for (method, operation) in item.as_object().expect("operations") {
@@ -106,7 +106,7 @@ fn every_operation_says_with_what_it_may_be_refused() {
 #[test]
 fn what_the_document_describes_needs_a_token_or_a_pairing_code() {
     for row in ROUTES.iter().filter(|row| row.operation.is_some()) {
-        // But for signing in, and for pairing by a code, which is how somebody comes to have something to show.
+        // Except for signing in and for pairing by a code, which is how a caller obtains credentials.
         let guarded = match row.access {
             Access::Code => row.path == "/api/v1/pair",
             Access::SignIn => row.path == "/api/v1/session",
@@ -117,14 +117,14 @@ fn what_the_document_describes_needs_a_token_or_a_pairing_code() {
     }
 }
 
-/// Whether a value is as a schema says; which properties were met on the way, as `SCHEMA.PROPERTY`.
-struct Judge<'a> {
+/// Checks values against schemas and collects the properties encountered, as `SCHEMA.PROPERTY`.
+struct SchemaChecker<'a> {
     document: &'a Value,
     met: BTreeSet<String>,
 }
 
-impl<'a> Judge<'a> {
-    /// Follows a reference; its name is that of what is judged from there on.
+impl<'a> SchemaChecker<'a> {
+    /// Follows a reference; returns the name and schema to check from there on.
     fn resolve(&self, name: &'a str, schema: &'a Value) -> (&'a str, &'a Value) {
         match schema["$ref"].as_str() {
             None => (name, schema),
@@ -135,7 +135,7 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// A schema's parts, each with its name: itself, or what all of it consists of.
+    /// Returns the schemas that a schema consists of, with their names: itself, or those of its `allOf`.
     fn parts(&self, name: &'a str, schema: &'a Value) -> Vec<(&'a str, &'a Value)> {
         let (name, schema) = self.resolve(name, schema);
         match schema["allOf"].as_array() {
@@ -144,12 +144,12 @@ impl<'a> Judge<'a> {
         }
     }
 
-    fn judge(&mut self, name: &'a str, schema: &'a Value, value: &Value) -> Result<(), String> {
+    fn check(&mut self, name: &'a str, schema: &'a Value, value: &Value) -> Result<(), String> {
         let (name, schema) = self.resolve(name, schema);
         if let Some(choices) = schema["oneOf"].as_array() {
             let met = self.met.clone();
             for choice in choices {
-                if self.judge(name, choice, value).is_ok() {
+                if self.check(name, choice, value).is_ok() {
                     return Ok(());
                 }
                 self.met.clone_from(&met);
@@ -182,13 +182,13 @@ impl<'a> Judge<'a> {
         match value {
             Value::Array(elements) => elements
                 .iter()
-                .try_for_each(|element| self.judge(name, &schema["items"], element)),
-            Value::Object(_) => self.judge_members(name, schema, value),
+                .try_for_each(|element| self.check(name, &schema["items"], element)),
+            Value::Object(_) => self.check_members(name, schema, value),
             _ => Ok(()),
         }
     }
 
-    fn judge_members(
+    fn check_members(
         &mut self,
         name: &'a str,
         schema: &'a Value,
@@ -203,7 +203,7 @@ impl<'a> Judge<'a> {
                 }
             }
         }
-        // Any object at all.
+        // An object of any kind.
         if parts
             .iter()
             .all(|(_, schema)| schema["properties"].is_null())
@@ -218,10 +218,10 @@ impl<'a> Judge<'a> {
             match described {
                 Some((part, property)) => {
                     self.met.insert(format!("{part}.{key}"));
-                    self.judge(part, property, member)?;
+                    self.check(part, property, member)?;
                 }
                 None if !schema["additionalProperties"].is_null() => {
-                    self.judge(name, &schema["additionalProperties"], member)?;
+                    self.check(name, &schema["additionalProperties"], member)?;
                 }
                 None => return Err(format!("{name}: {key} is not described")),
             }
@@ -230,35 +230,35 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// Properties of a schema that it does not take from another.
-fn own(name: &str, schema: &Value, found: &mut BTreeSet<String>) {
+/// Collects the properties that a schema itself defines.
+fn own_properties(name: &str, schema: &Value, found: &mut BTreeSet<String>) {
     for property in schema["properties"].as_object().into_iter().flatten() {
         found.insert(format!("{name}.{}", property.0));
     }
     for several in ["allOf", "oneOf"] {
         for part in schema[several].as_array().into_iter().flatten() {
-            own(name, part, found);
+            own_properties(name, part, found);
         }
     }
 }
 
 #[test]
 fn schemas_are_as_serde_writes() {
-    let document = written();
+    let document = document_json();
     let schemas = &document["components"]["schemas"];
-    let mut judge = Judge {
+    let mut judge = SchemaChecker {
         document: &document,
         met: BTreeSet::new(),
     };
     for (name, value) in samples::samples() {
         assert!(schemas[name].is_object(), "{name} is not described");
         judge
-            .judge(name, &schemas[name], &value)
+            .check(name, &schemas[name], &value)
             .expect("as the schema says");
     }
     let mut described = BTreeSet::new();
     for (name, schema) in schemas.as_object().expect("schemas") {
-        own(name, schema, &mut described);
+        own_properties(name, schema, &mut described);
     }
     let never: Vec<&String> = described.difference(&judge.met).collect();
     assert!(never.is_empty(), "serde never writes {never:?}");

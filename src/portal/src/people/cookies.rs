@@ -1,34 +1,36 @@
-//! The cookie by which a browser shows its session (RFC 6265), and the marks by which a request of our own page is told from one
-//! of another site's.
+//! Session cookie of a browser (RFC 6265), and the checks that tell requests of our own page from those of other
+//! sites.
 
 use axum::http::{HeaderMap, HeaderValue, Method, header};
 
 use crate::errors::Error;
-use crate::guard::{self, Connection};
+use crate::guard::{self, PortalConnection};
 use crate::tokens;
 
-/// Through TLS. By its prefix browsers take it from this host alone, for all of it, and show it through TLS alone.
+/// Cookie name with TLS. Because of the prefix, browsers accept it only from this host, for all paths, and send it
+/// only through TLS.
 const SECURE: &str = "__Host-cloudroid";
-/// Without TLS, on this machine: browsers take no `Secure` cookie there. It is never looked at through TLS.
+/// Cookie name without TLS, on this machine, where browsers accept no `Secure` cookie. It is ignored through TLS.
 const PLAIN: &str = "cloudroid";
-/// While somebody says to an identity provider who it is: by this the browser is known when it comes back. Another site's answer
-/// leads it here, and so it is SameSite=Lax: shown to an address that somebody goes to from elsewhere, and to nothing else.
+/// Cookie names while a person signs in at an identity provider; they identify the browser when it returns. Another
+/// site redirects it here, so the cookie is SameSite=Lax: it is sent with top-level navigation from elsewhere, and
+/// with nothing else.
 const SECURE_SIGNING_IN: &str = "__Host-cloudroid-oidc";
 const PLAIN_SIGNING_IN: &str = "cloudroid-oidc";
-/// How long that may take.
+/// Time in seconds that this may take.
 const SIGNING_IN: u64 = 600;
-/// What browsers say of what they ask for.
+/// Header in which browsers tell how a response will be used (Fetch Metadata, W3C).
 const FETCH_DEST: &str = "sec-fetch-dest";
-/// What browsers say of where a request comes from (Fetch Metadata, W3C).
+/// Header in which browsers tell where a request comes from (Fetch Metadata, W3C).
 const FETCH_SITE: &str = "sec-fetch-site";
-/// Longest secret that is looked at.
+/// Maximum length of a secret in bytes.
 const LONGEST: usize = 128;
 
-fn name(secure: bool) -> &'static str {
+fn session_cookie_name(secure: bool) -> &'static str {
     if secure { SECURE } else { PLAIN }
 }
 
-fn signing_in_name(secure: bool) -> &'static str {
+fn signing_in_cookie_name(secure: bool) -> &'static str {
     if secure {
         SECURE_SIGNING_IN
     } else {
@@ -36,17 +38,23 @@ fn signing_in_name(secure: bool) -> &'static str {
     }
 }
 
-/// What the browser shows of its session, if anything.
-pub fn shown(connection: &Connection, headers: &HeaderMap) -> Result<Option<String>, Error> {
-    value(name(connection.secure), headers)
+/// Returns the session secret sent by the browser, if any.
+pub fn session_cookie(
+    connection: &PortalConnection,
+    headers: &HeaderMap,
+) -> Result<Option<String>, Error> {
+    find_cookie(session_cookie_name(connection.secure), headers)
 }
 
-/// By what a browser is known in which somebody is signing in.
-pub fn signing_in(connection: &Connection, headers: &HeaderMap) -> Result<Option<String>, Error> {
-    value(signing_in_name(connection.secure), headers)
+/// Returns the value that identifies a browser during a sign-in, if any.
+pub fn signing_in_cookie(
+    connection: &PortalConnection,
+    headers: &HeaderMap,
+) -> Result<Option<String>, Error> {
+    find_cookie(signing_in_cookie_name(connection.secure), headers)
 }
 
-fn value(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error> {
+fn find_cookie(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error> {
     let lines = headers.get_all(header::COOKIE).iter();
     let mut values = lines
         .filter_map(|line| line.to_str().ok())
@@ -55,9 +63,9 @@ fn value(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error> {
         .filter(|(key, _)| *key == name)
         .map(|(_, value)| value);
     match (values.next(), values.next()) {
-        // Another put it there: which one counts must not be its choice.
+        // Somebody else may have set one of them, and must not be able to choose which counts.
         (Some(_), Some(_)) => Err(Error::BadRequest(format!(
-            "the cookie {name} is there twice; remove this site's cookies from the browser and sign in again"
+            "the cookie {name} was sent twice; remove this site's cookies from the browser and sign in again"
         ))),
         (Some(value), None) if value.len() <= LONGEST && !value.is_empty() => {
             Ok(Some(value.to_owned()))
@@ -66,66 +74,91 @@ fn value(name: &str, headers: &HeaderMap) -> Result<Option<String>, Error> {
     }
 }
 
-fn cookie(secure: bool, name: &str, value: &str, seconds: u64, same_site: &str) -> HeaderValue {
+fn build_cookie(
+    secure: bool,
+    name: &str,
+    value: &str,
+    seconds: u64,
+    same_site: &str,
+) -> HeaderValue {
     let secured = if secure { "; Secure" } else { "" };
     let text = format!(
         "{name}={value}; Path=/; Max-Age={seconds}; HttpOnly; SameSite={same_site}{secured}"
     );
-    // Secrets are letters and digits.
+    // Secrets consist of letters and digits.
     HeaderValue::from_str(&text).unwrap_or_else(|_| HeaderValue::from_static(""))
 }
 
-/// Has the browser keep a secret for so many seconds.
-pub fn kept(secure: bool, secret: &str, seconds: u64) -> HeaderValue {
-    cookie(secure, name(secure), secret, seconds, "Strict")
+/// Sets the session cookie for a number of seconds.
+pub fn set_session(secure: bool, secret: &str, seconds: u64) -> HeaderValue {
+    build_cookie(
+        secure,
+        session_cookie_name(secure),
+        secret,
+        seconds,
+        "Strict",
+    )
 }
 
-/// Has the browser forget it.
-pub fn forgotten(secure: bool) -> HeaderValue {
-    cookie(secure, name(secure), "", 0, "Strict")
+/// Deletes the session cookie.
+pub fn clear_session(secure: bool) -> HeaderValue {
+    build_cookie(secure, session_cookie_name(secure), "", 0, "Strict")
 }
 
-/// Has the browser keep by what it is known while somebody signs in.
-pub fn kept_signing_in(secure: bool, secret: &str) -> HeaderValue {
-    cookie(secure, signing_in_name(secure), secret, SIGNING_IN, "Lax")
+/// Sets the cookie that identifies the browser during a sign-in.
+pub fn set_signing_in(secure: bool, secret: &str) -> HeaderValue {
+    build_cookie(
+        secure,
+        signing_in_cookie_name(secure),
+        secret,
+        SIGNING_IN,
+        "Lax",
+    )
 }
 
-/// What requests of a session that change something must show beside the cookie.
-pub fn csrf(secret: &str) -> String {
+/// Returns the token that requests changing something must send along with the session cookie.
+pub fn csrf_token(secret: &str) -> String {
     tokens::hash(&format!("csrf {secret}"))
 }
 
-fn text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
+fn header_text<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
     headers.get(name).map(|value| value.to_str().unwrap_or("?"))
 }
 
-/// The origin by which a request reached this portal (RFC 6454).
-pub fn origin(connection: &Connection, headers: &HeaderMap) -> String {
-    let host = text(headers, "host").unwrap_or_default();
+/// Returns the origin under which the request reached this portal (RFC 6454).
+pub fn origin(connection: &PortalConnection, headers: &HeaderMap) -> String {
+    let host = header_text(headers, "host").unwrap_or_default();
     let scheme = if connection.secure { "https" } else { "http" };
     format!("{scheme}://{host}")
 }
 
-/// Refuses an address that a browser asks for without showing it to anybody, as for a picture or a frame of another page: that is
-/// nobody who comes back from signing in.
+/// Refuses requests that are not top-level navigation, such as for an image or a frame of another page: they do not
+/// come from a person returning from a sign-in.
 pub fn check_visit(headers: &HeaderMap) -> Result<(), Error> {
-    match text(headers, FETCH_DEST) {
+    match header_text(headers, FETCH_DEST) {
         None | Some("document") => Ok(()),
         Some(other) => Err(Error::Foreign {
             what: format!(
-                "a page has asked for this as a part of itself ({other}), and not a person"
+                "this was requested by a page as part of itself ({other}), not by a person"
             ),
             next: "sign in from the portal's page".into(),
         }),
     }
 }
 
-/// Refuses what another site's page has sent. `said`: the browser must say that it is our own page; else what says nothing is no
-/// browser.
-pub fn check_origin(connection: &Connection, headers: &HeaderMap, said: bool) -> Result<(), Error> {
+/// Refuses requests sent by another site's page. With `said`, the browser must state that the page is ours; without,
+/// a request that states nothing is not from a browser and passes.
+pub fn check_origin(
+    connection: &PortalConnection,
+    headers: &HeaderMap,
+    said: bool,
+) -> Result<(), Error> {
     let own = origin(connection, headers);
     let origins = headers.get_all(header::ORIGIN).iter().count();
-    let (same, from) = match (text(headers, "origin"), text(headers, FETCH_SITE)) {
+    let (same, from) = match (
+        header_text(headers, "origin"),
+        header_text(headers, FETCH_SITE),
+    ) {
         (Some(origin), site) => (
             origins == 1
                 && origin.eq_ignore_ascii_case(&own)
@@ -139,16 +172,16 @@ pub fn check_origin(connection: &Connection, headers: &HeaderMap, said: bool) ->
         return Ok(());
     }
     Err(Error::Foreign {
-        what: format!("a page of {from} may not use the session of somebody who is signed in at {own}"),
-        next: "use the portal's own page, or a token (Authorization: Bearer TOKEN); a proxy in front must pass Host on and be named in \
-               trusted_proxies"
+        what: format!("a page of {from} may not use a session of {own}"),
+        next: "use the portal's own page, or a token (Authorization: Bearer TOKEN); a proxy in front must pass Host \
+               on and be named in trusted_proxies"
             .to_owned(),
     })
 }
 
-/// Refuses a request by cookie that our own page would not have sent so.
+/// Refuses a request with a session cookie that our own page would not have sent.
 pub fn check(
-    connection: &Connection,
+    connection: &PortalConnection,
     method: &Method,
     headers: &HeaderMap,
     secret: &str,
@@ -156,37 +189,38 @@ pub fn check(
     let reads = matches!(*method, Method::GET | Method::HEAD);
     let upgrades = guard::is_upgrade(headers);
     if reads && !upgrades {
-        return guard::check_part(headers);
+        return guard::check_not_embedded(headers);
     }
     check_origin(connection, headers, true)?;
-    // A page cannot set a header of a WebSocket; browsers always say its origin.
+    // A page cannot set headers of a WebSocket handshake; browsers always send its origin.
     if upgrades {
-        return match headers.contains_key(header::ORIGIN) {
-            true => Ok(()),
-            false => check_origin(connection, &HeaderMap::new(), true),
+        return if headers.contains_key(header::ORIGIN) {
+            Ok(())
+        } else {
+            check_origin(connection, &HeaderMap::new(), true)
         };
     }
-    let given = text(headers, api::people::CSRF_HEADER).unwrap_or_default();
-    // Of hashes: how long the comparison takes says nothing of what was expected.
-    if tokens::hash(given) == tokens::hash(&csrf(secret)) {
+    let given = header_text(headers, api::people::CSRF_HEADER).unwrap_or_default();
+    // Compares hashes, so that the timing reveals nothing about the expected value.
+    if tokens::hash(given) == tokens::hash(&csrf_token(secret)) {
         return Ok(());
     }
     Err(Error::Foreign {
-        what: "the request shows a session, and not the X-CSRF-Token that belongs to it".into(),
-        next: "send the csrf that GET /api/v1/session tells".into(),
+        what: "the request has a session but not its X-CSRF-Token".into(),
+        next: "send the csrf value of GET /api/v1/session".into(),
     })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::guard::Peer;
+    use crate::guard::ConnectionPeer;
 
-    fn connection(secure: bool) -> Connection {
-        let peer = Peer::Tcp("127.0.0.1:5000".parse().expect("an address"));
-        Connection {
+    fn connection(secure: bool) -> PortalConnection {
+        let peer = ConnectionPeer::Tcp("127.0.0.1:5000".parse().expect("an address"));
+        PortalConnection {
             secure,
-            ..Connection::plain(peer)
+            ..PortalConnection::without_tls(peer)
         }
     }
 
@@ -202,11 +236,12 @@ mod tests {
     fn a_cookie_is_read_where_it_is_one() {
         let shown = |secure, lines: &[&str]| {
             let lines: Vec<_> = lines.iter().map(|line| ("cookie", *line)).collect();
-            shown(&connection(secure), &headers(&lines)).map_err(|error| error.problem().status)
+            session_cookie(&connection(secure), &headers(&lines))
+                .map_err(|error| error.problem().status)
         };
         assert_eq!(shown(false, &["a=b; cloudroid=x"]), Ok(Some("x".into())));
         assert_eq!(shown(true, &["__Host-cloudroid=x"]), Ok(Some("x".into())));
-        // What came without TLS, another may have set.
+        // A cookie set without TLS may come from somebody else.
         assert_eq!(shown(true, &["cloudroid=x"]), Ok(None));
         assert_eq!(shown(false, &["__Host-cloudroid=x"]), Ok(None));
         assert_eq!(shown(false, &["cloudroid="]), Ok(None));
@@ -220,12 +255,12 @@ mod tests {
 
     #[test]
     fn cookies_are_closed_to_scripts_and_other_sites() {
-        let set = kept(true, "x", 60);
+        let set = set_session(true, "x", 60);
         assert_eq!(
             set.to_str().expect("text"),
             "__Host-cloudroid=x; Path=/; Max-Age=60; HttpOnly; SameSite=Strict; Secure"
         );
-        let forgotten = forgotten(false);
+        let forgotten = clear_session(false);
         let text = forgotten.to_str().expect("text");
         assert!(
             text.starts_with("cloudroid=; ") && text.contains("Max-Age=0"),
@@ -235,7 +270,7 @@ mod tests {
 
     #[test]
     fn whoever_signs_in_elsewhere_is_known_when_it_comes_back() {
-        let set = kept_signing_in(true, "x");
+        let set = set_signing_in(true, "x");
         assert_eq!(
             set.to_str().expect("text"),
             "__Host-cloudroid-oidc=x; Path=/; Max-Age=600; HttpOnly; SameSite=Lax; Secure"
@@ -244,7 +279,7 @@ mod tests {
             "cookie",
             "cloudroid=a; cloudroid-oidc=b; __Host-cloudroid-oidc=c",
         )]);
-        let known = |secure| signing_in(&connection(secure), &lines).expect("once");
+        let known = |secure| signing_in_cookie(&connection(secure), &lines).expect("once");
         assert_eq!(known(false).as_deref(), Some("b"));
         assert_eq!(known(true).as_deref(), Some("c"));
         check_visit(&headers(&[])).expect("no browser");
@@ -256,7 +291,7 @@ mod tests {
 
     #[test]
     fn what_changes_something_comes_from_our_page_with_its_token() {
-        let token = csrf("secret");
+        let token = csrf_token("secret");
         let own = ("origin", "https://robots.lab:9090");
         let host = ("host", "robots.lab:9090");
         let with = (api::people::CSRF_HEADER, &*token);
@@ -265,7 +300,7 @@ mod tests {
             check(&connection(true), &method, &headers(given), "secret").is_ok()
         };
         assert!(asks(Method::GET, &[host]));
-        // As a part of another site's page.
+        // Embedded in another site's page.
         assert!(!asks(Method::GET, &[host, ("sec-fetch-site", "same-site")]));
         assert!(asks(Method::DELETE, &[host, own, with]));
         assert!(asks(
@@ -273,7 +308,7 @@ mod tests {
             &[host, ("sec-fetch-site", "same-origin"), with]
         ));
         assert!(asks(Method::GET, &[host, own, upgrade]));
-        let other = csrf("another");
+        let other = csrf_token("another");
         for (method, given) in [
             (Method::DELETE, &[host, own][..]),
             (Method::DELETE, &[host, with]),

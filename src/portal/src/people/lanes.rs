@@ -1,13 +1,14 @@
-//! Where passwords wait to be hashed: each hash takes 19 MiB and some 20 ms of a core, for whoever asks. A few are made at once, in lanes of
-//! which each keeps its memory; so many wait for each lane; and of these, so many are of one address and of one account.
+//! Queues for hashing passwords. Each hash takes 19 MiB and about 20 ms of a core, whoever asks. A few are computed
+//! at once, in lanes that each reuse their memory; the number waiting for a lane is limited, and so is each address's
+//! and each account's share of it.
 //!
 //! ```text
-//!  sign in ─▶ holds a place (its address, its account) ─┬─ a name that there is ─▶ lane of accounts ──▶ hash
-//!                                                        └─ any other name ───────▶ lane of made-up ──▶ hash, in vain
+//!  sign-in ─▶ acquires a slot (per address and account) ─┬─ existing account ─▶ lane of accounts ──────▶ hash
+//!                                                        └─ unknown name ─────▶ lane of unknown names ─▶ hash
 //! ```
 //!
-//! Names that nobody has are hashed, too, or it would be seen by the time that they are nobody's. But they wait for each other alone: whoever
-//! makes them up, from however many addresses, holds up nobody who has an account.
+//! Unknown names are hashed, too, so that the timing does not reveal that they are unknown. But they wait only for
+//! each other: inventing names, from however many addresses, delays nobody who has an account.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -20,43 +21,44 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::errors::Error;
 
-/// Passwords of one address, and of one account, that are hashed or wait for it.
+/// Limit on the passwords of one address, and of one account, that are being hashed or waiting.
 pub const OF_EACH: usize = 4;
 
-/// Hashes that are made one beside the other, and those that wait.
-pub struct Lane {
-    /// Those that are made.
+/// A lane: hashes computed in parallel, and those waiting.
+pub struct HashLane {
+    /// Hashes being computed.
     working: Arc<Semaphore>,
-    /// Those that are made or wait.
+    /// Hashes being computed or waiting.
     room: Arc<Semaphore>,
-    /// Memory of those that have been made: malloc would keep as much for each thread on which one ever was.
+    /// Reusable memory of finished hashes; malloc would otherwise keep as much for every thread that ever computed
+    /// one.
     memory: Arc<Mutex<Vec<Vec<Block>>>>,
 }
 
-/// A password's turn. Whoever does not wait for its hash any more does not make room for another before that is made.
-pub struct Turn {
+/// Turn to compute a hash. If the caller stops waiting, the turn is still held until the hash is finished.
+pub struct HashTurn {
     _place: OwnedSemaphorePermit,
     _working: OwnedSemaphorePermit,
     memory: Arc<Mutex<Vec<Vec<Block>>>>,
 }
 
-impl Lane {
-    pub fn new(at_once: usize, waiting: usize) -> Lane {
-        Lane {
+impl HashLane {
+    pub fn new(at_once: usize, waiting: usize) -> HashLane {
+        HashLane {
             working: Arc::new(Semaphore::new(at_once)),
             room: Arc::new(Semaphore::new(at_once + waiting)),
             memory: Arc::default(),
         }
     }
 
-    /// Waits for a turn, where not too many do already.
-    pub async fn turn(&self) -> Result<Turn, Error> {
+    /// Waits for a turn; fails if too many are waiting already.
+    pub async fn acquire(&self) -> Result<HashTurn, Error> {
         let place = Arc::clone(&self.room).try_acquire_owned();
         let place = place.map_err(|_| Error::SignInBusy)?;
         let working = Arc::clone(&self.working).acquire_owned().await;
-        Ok(Turn {
+        Ok(HashTurn {
             _place: place,
-            // It is never closed.
+            // The semaphore is never closed.
             _working: working.map_err(|_| Error::SignInBusy)?,
             memory: Arc::clone(&self.memory),
         })
@@ -68,8 +70,8 @@ impl Lane {
     }
 }
 
-impl Turn {
-    /// Calls `work` with so many blocks of memory. Nothing is promised of what stands in them.
+impl HashTurn {
+    /// Calls `work` with this many memory blocks, whose content is unspecified.
     pub fn work<T>(self, blocks: usize, work: impl FnOnce(&mut [Block]) -> T) -> T {
         let kept = self.memory.lock().pop();
         let mut memory = kept.unwrap_or_default();
@@ -80,31 +82,31 @@ impl Turn {
     }
 }
 
-/// For whom passwords are hashed now, or wait for it.
+/// Addresses and accounts whose passwords are being hashed or waiting.
 #[derive(Default)]
-pub struct Holders {
-    counts: Arc<Mutex<HashMap<Holder, usize>>>,
+pub struct HashSlots {
+    counts: Arc<Mutex<HashMap<SlotOwner, usize>>>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-enum Holder {
+enum SlotOwner {
     Host(Host),
     Account(String),
 }
 
-/// One place of an address and of an account.
+/// Slot of one address and one account; released when dropped.
 #[derive(Debug)]
-pub struct Held {
-    counts: Arc<Mutex<HashMap<Holder, usize>>>,
-    holders: [Holder; 2],
+pub struct HashSlot {
+    counts: Arc<Mutex<HashMap<SlotOwner, usize>>>,
+    holders: [SlotOwner; 2],
 }
 
-impl Holders {
-    /// A place for a password that came from an address for an account, which need not exist.
-    pub fn hold(&self, from: IpAddr, account: &str) -> Result<Held, Error> {
+impl HashSlots {
+    /// Acquires a slot for a password that came from an address for an account, which need not exist.
+    pub fn acquire(&self, from: IpAddr, account: &str) -> Result<HashSlot, Error> {
         let holders = [
-            Holder::Host(from.into()),
-            Holder::Account(account.to_owned()),
+            SlotOwner::Host(from.into()),
+            SlotOwner::Account(account.to_owned()),
         ];
         let mut counts = self.counts.lock();
         let is_full = |holder| counts.get(holder).is_some_and(|count| *count >= OF_EACH);
@@ -114,7 +116,7 @@ impl Holders {
         for holder in &holders {
             *counts.entry(holder.clone()).or_default() += 1;
         }
-        Ok(Held {
+        Ok(HashSlot {
             counts: Arc::clone(&self.counts),
             holders,
         })
@@ -126,7 +128,7 @@ impl Holders {
     }
 }
 
-impl Drop for Held {
+impl Drop for HashSlot {
     fn drop(&mut self) {
         let mut counts = self.counts.lock();
         for holder in &self.holders {

@@ -1,6 +1,6 @@
-//! Hashing passwords: Argon2id (RFC 9106), version 19, 19 MiB, two passes, one lane, as OWASP's Password Storage Cheat Sheet
-//! asks for at least. Kept in the PHC string format, which has the parameters: a hash with others is made anew when its owner
-//! signs in.
+//! Password hashing with Argon2id (RFC 9106), version 19, 19 MiB, two passes, one lane, the minimum of OWASP's
+//! Password Storage Cheat Sheet. Hashes are stored in the PHC string format, which includes the parameters; a hash
+//! with other parameters is recomputed when its owner signs in.
 
 use std::net::IpAddr;
 use std::sync::OnceLock;
@@ -9,22 +9,22 @@ use argon2::password_hash::rand_core::OsRng;
 use argon2::password_hash::{self, Output, ParamsString, PasswordHash, Salt, SaltString};
 use argon2::{Algorithm, Argon2, Block, Params, PasswordVerifier, Version};
 
-use super::lanes::{Held, Holders, Lane, Turn};
+use super::lanes::{HashLane, HashSlot, HashSlots, HashTurn};
 use crate::errors::Error;
 
-/// KiB, passes and lanes.
+/// Memory in KiB, passes and lanes.
 const MEMORY: u32 = 19 * 1024;
 const PASSES: u32 = 2;
 const LANES: u32 = 1;
-/// Hashes that are made at once, of accounts and of names that nobody has, and requests that may wait for theirs, in each of the two lanes:
-/// who signs in takes no more than this of the machine.
+/// Limits on parallel hashes, for accounts and for unknown names, and on requests waiting in each of the two lanes;
+/// they bound what sign-ins take of the machine.
 const AT_ONCE: usize = 2;
 const AT_ONCE_IN_VAIN: usize = 1;
 const WAITING: usize = 32;
-/// Characters that a password has at least, and bytes that it may have.
+/// Minimum length of a password in characters and maximum length in bytes.
 const SHORTEST: usize = 12;
 pub const LONGEST: usize = 1024;
-/// What is tried first by who guesses, of those that are long enough; in lower case.
+/// Common passwords of sufficient length, in lower case.
 const OBVIOUS: [&str; 12] = [
     "123456789012",
     "1234567890123",
@@ -40,14 +40,14 @@ const OBVIOUS: [&str; 12] = [
     "robotrobotrobot",
 ];
 
-/// Refuses a password that can be guessed, in words.
-pub fn check(name: &str, password: &str) -> Result<(), String> {
+/// Refuses a password that is easy to guess, with a message.
+pub fn check_strength(name: &str, password: &str) -> Result<(), String> {
     if password.len() > LONGEST {
         return Err(format!("a password has at most {LONGEST} bytes"));
     }
     if password.chars().count() < SHORTEST {
         return Err(format!(
-            "a password has at least {SHORTEST} characters; four words that have nothing to do with each other are good ones"
+            "a password has at least {SHORTEST} characters; four unrelated words make a good one"
         ));
     }
     let plain = password.to_lowercase();
@@ -56,48 +56,48 @@ pub fn check(name: &str, password: &str) -> Result<(), String> {
     let is_of_one = characters.all(|other| Some(other) == first);
     let without_name = plain.replace(&name.to_lowercase(), "");
     if is_of_one || without_name.chars().count() < SHORTEST / 2 || OBVIOUS.contains(&&*plain) {
-        return Err("this password is among the first that are guessed; choose another".into());
+        return Err("this password is too easy to guess; choose another".into());
     }
     Ok(())
 }
 
-/// What came of looking at a password.
+/// Result of verifying a password.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Looked {
-    /// It is another.
+pub enum PasswordVerdict {
+    /// The password is wrong.
     Wrong,
-    /// It is the one.
+    /// The password is right.
     Right,
-    /// It is the one, and is hashed anew by today's parameters.
+    /// The password is right; here is its hash with the current parameters.
     Rehashed(String),
 }
 
-/// Makes hashes, a few at once, on threads where they hold up nothing.
+/// Hashes passwords, a few at once, on threads where they block nothing else.
 pub struct Passwords {
-    /// Of people who have an account, and of accounts that are made.
-    accounts: Lane,
-    /// Of names that nobody has.
-    made_up: Lane,
-    holders: Holders,
+    /// Lane of existing accounts, and of accounts being created.
+    accounts: HashLane,
+    /// Lane of unknown names.
+    made_up: HashLane,
+    holders: HashSlots,
 }
 
 impl Default for Passwords {
     fn default() -> Self {
         Passwords {
-            accounts: Lane::new(AT_ONCE, WAITING),
-            made_up: Lane::new(AT_ONCE_IN_VAIN, WAITING),
-            holders: Holders::default(),
+            accounts: HashLane::new(AT_ONCE, WAITING),
+            made_up: HashLane::new(AT_ONCE_IN_VAIN, WAITING),
+            holders: HashSlots::default(),
         }
     }
 }
 
-/// A password that is tried.
+/// A password to verify.
 pub struct Attempt {
-    /// From where.
+    /// Address of the client.
     pub from: IpAddr,
-    /// For which account, which need not exist.
+    /// Name of the account, which need not exist.
     pub name: String,
-    /// The account's hash; none where there is no such account.
+    /// Hash of the account's password; `None` if there is no such account.
     pub known: Option<String>,
     /// The password.
     pub password: String,
@@ -108,7 +108,7 @@ fn argon2() -> Result<Argon2<'static>, password_hash::Error> {
     Ok(Argon2::new(Algorithm::Argon2id, Version::V0x13, params))
 }
 
-/// What today's parameters make of a password and a salt.
+/// Computes the hash of a password and a salt with the current parameters.
 fn compute(
     password: &str,
     salt: Salt<'_>,
@@ -135,14 +135,14 @@ fn hash(password: &str, memory: &mut [Block]) -> Result<String, password_hash::E
     Ok(hash.to_string())
 }
 
-/// Whose password nobody knows: looking at it takes as long as at another's.
-fn nobodys(memory: &mut [Block]) -> Result<&'static str, password_hash::Error> {
+/// Returns the hash of an unknown password, so that verifying takes as long as for an account.
+fn dummy_hash(memory: &mut [Block]) -> Result<&'static str, password_hash::Error> {
     static HASH: OnceLock<Result<String, password_hash::Error>> = OnceLock::new();
     let made = HASH.get_or_init(|| hash(&catalogue::names::random(32), memory));
     made.as_deref().map_err(|error| *error)
 }
 
-fn is_todays(hash: &PasswordHash<'_>) -> bool {
+fn has_current_parameters(hash: &PasswordHash<'_>) -> bool {
     let params = Params::try_from(hash).ok();
     let same = params.is_some_and(|params| {
         (params.m_cost(), params.t_cost(), params.p_cost()) == (MEMORY, PASSES, LANES)
@@ -154,37 +154,37 @@ fn is_todays(hash: &PasswordHash<'_>) -> bool {
             .is_some_and(|output| output.len() == Params::DEFAULT_OUTPUT_LEN)
 }
 
-fn look(
+fn verify(
     known: Option<&str>,
     password: &str,
     memory: &mut [Block],
-) -> Result<Looked, password_hash::Error> {
+) -> Result<PasswordVerdict, password_hash::Error> {
     let written = match known {
         Some(written) => written,
-        None => nobodys(memory)?,
+        None => dummy_hash(memory)?,
     };
     let parsed = PasswordHash::new(written)?;
-    if let Some(salt) = parsed.salt.filter(|_| is_todays(&parsed)) {
+    if let Some(salt) = parsed.salt.filter(|_| has_current_parameters(&parsed)) {
         let computed = compute(password, salt, memory)?;
         // Compared in constant time.
         let is_right = known.is_some() && parsed.hash == Some(computed);
         return Ok(if is_right {
-            Looked::Right
+            PasswordVerdict::Right
         } else {
-            Looked::Wrong
+            PasswordVerdict::Wrong
         });
     }
     match argon2()?.verify_password(password.as_bytes(), &parsed) {
-        Ok(()) => hash(password, memory).map(Looked::Rehashed),
-        Err(password_hash::Error::Password) => Ok(Looked::Wrong),
+        Ok(()) => hash(password, memory).map(PasswordVerdict::Rehashed),
+        Err(password_hash::Error::Password) => Ok(PasswordVerdict::Wrong),
         Err(error) => Err(error),
     }
 }
 
-/// Works where nothing waits for it.
-async fn work<T: Send + 'static>(
-    turn: Turn,
-    held: Option<Held>,
+/// Runs the hash on a blocking thread.
+async fn run_hashing<T: Send + 'static>(
+    turn: HashTurn,
+    held: Option<HashSlot>,
     work: impl FnOnce(&mut [Block]) -> Result<T, password_hash::Error> + Send + 'static,
 ) -> Result<T, Error> {
     let worked = tokio::task::spawn_blocking(move || {
@@ -204,31 +204,31 @@ async fn work<T: Send + 'static>(
 }
 
 impl Passwords {
-    /// The hash of a new password.
+    /// Hashes a new password.
     pub async fn hash(&self, password: String) -> Result<String, Error> {
-        let turn = self.accounts.turn().await?;
-        work(turn, None, move |memory| hash(&password, memory)).await
+        let turn = self.accounts.acquire().await?;
+        run_hashing(turn, None, move |memory| hash(&password, memory)).await
     }
 
-    /// Looks whether a password is that of a hash. Without one it takes as long and is wrong. `before` is asked when it is about to
-    /// be looked at.
-    pub async fn look(
+    /// Verifies a password against the hash of its account. Without an account it takes as long and fails. `before`
+    /// is checked immediately before the computation.
+    pub async fn verify(
         &self,
         attempt: Attempt,
         before: impl FnOnce() -> Result<(), Error> + Send,
-    ) -> Result<Looked, Error> {
-        let held = self.holders.hold(attempt.from, &attempt.name)?;
+    ) -> Result<PasswordVerdict, Error> {
+        let held = self.holders.acquire(attempt.from, &attempt.name)?;
         let lane = match attempt.known {
             Some(_) => &self.accounts,
             None => &self.made_up,
         };
-        let turn = lane.turn().await?;
+        let turn = lane.acquire().await?;
         before()?;
         let Attempt {
             known, password, ..
         } = attempt;
-        let looking = move |memory: &mut [Block]| look(known.as_deref(), &password, memory);
-        work(turn, Some(held), looking).await
+        let looking = move |memory: &mut [Block]| verify(known.as_deref(), &password, memory);
+        run_hashing(turn, Some(held), looking).await
     }
 }
 

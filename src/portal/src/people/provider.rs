@@ -1,8 +1,9 @@
-//! `/api/v1/oidc/login`, `/api/v1/oidc/callback`: people sign in by an identity provider, and come back with a code.
+//! `/api/v1/oidc/login`, `/api/v1/oidc/callback`: people sign in through an identity provider, which sends them back
+//! with a code.
 
 use std::sync::Arc;
 
-use access::Action;
+use access::AccessAction;
 use api::people::ProviderLink;
 use axum::Extension;
 use axum::extract::State;
@@ -12,39 +13,39 @@ use oidc::{Person, Roles};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
-use super::{check_way, cookies, enter, unkept};
+use super::{check_confidential, cookies, finish_sign_in, no_store};
 use crate::app::App;
 use crate::errors::Error;
 use crate::guard::{self, Caller};
-use crate::principals::Begun;
+use crate::principals::StartedSession;
 use crate::query::Query;
 
-/// Where it begins.
+/// Path at which a sign-in starts.
 const LOGIN: &str = "/api/v1/oidc/login";
-/// Where the provider sends browsers back to, behind the portal's own address.
+/// Path to which the provider sends browsers back, below the portal's own origin.
 pub const CALLBACK: &str = "/api/v1/oidc/callback";
-/// Groups that a refusal names.
+/// Maximum number of groups listed in a refusal.
 const NAMED: usize = 20;
-/// Scripts, styles and frames: nothing of it.
+/// Content-Security-Policy of the pages: no scripts, styles or frames.
 const POLICY: &str =
     "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
 
-/// An identity provider, and what its people may do.
+/// An identity provider and the roles of its groups.
 pub struct IdentityProvider {
-    /// Who asks it.
+    /// Client of the provider.
     pub provider: oidc::Provider,
-    /// As people know it.
+    /// Display name of the provider.
     pub name: String,
-    /// What its groups may do.
+    /// Roles of its groups.
     pub roles: Roles,
-    /// The portal's own address, as browsers write it (RFC 6454): `https://HOST[:PORT]`.
+    /// The portal's own origin as browsers write it (RFC 6454): `https://HOST[:PORT]`.
     pub origin: String,
-    /// The claim that has the groups, for those who have none.
+    /// Claim that holds the groups, named in the message for people without any.
     pub groups_claim: String,
 }
 
 impl IdentityProvider {
-    /// What the page needs for a link.
+    /// Returns what the page needs for a link to the sign-in.
     pub fn link(&self) -> ProviderLink {
         ProviderLink {
             name: self.name.clone(),
@@ -53,50 +54,50 @@ impl IdentityProvider {
     }
 }
 
-/// How a sign-in begins.
+/// Query of a sign-in.
 #[derive(Debug, Deserialize, IntoParams)]
-pub struct Beginning {
-    /// Set where the browser has come here from another address of this portal.
+pub struct LoginQuery {
+    /// Set if the browser was redirected here from another address of this portal.
     #[serde(default)]
     again: bool,
 }
 
-/// With what a browser comes back (RFC 6749, section 4.1.2; RFC 9207).
+/// Query of the provider's redirect (RFC 6749, section 4.1.2; RFC 9207).
 #[derive(Debug, IntoParams)]
 #[allow(dead_code, reason = "read as they stand, since a provider adds others")]
-pub struct ComingBack {
-    /// What the sign-in began with.
+pub struct CallbackQuery {
+    /// State with which the sign-in was started.
     state: String,
-    /// By which the provider tells who it is.
+    /// Authorization code.
     code: Option<String>,
-    /// Why nobody signed in.
+    /// Error code if the sign-in failed.
     error: Option<String>,
-    /// The same in words.
+    /// Description of the error.
     error_description: Option<String>,
-    /// The provider's issuer identifier.
+    /// Issuer identifier of the provider.
     iss: Option<String>,
 }
 
-fn goes_to(url: &str) -> Result<Response, Error> {
+fn redirect(url: &str) -> Result<Response, Error> {
     let location =
-        HeaderValue::from_str(url).map_err(|_| Error::Internal("sending a browser on"))?;
+        HeaderValue::from_str(url).map_err(|_| Error::Internal("redirecting a browser"))?;
     Ok((StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response())
 }
 
-/// Sends the browser to the provider.
+/// Redirects the browser to the provider.
 pub async fn login(
     State(app): State<Arc<App>>,
-    Query(beginning): Query<Beginning>,
+    Query(beginning): Query<LoginQuery>,
     Extension(caller): Extension<Caller>,
     headers: HeaderMap,
 ) -> Response {
-    match begin(&app, &caller, &headers, beginning.again).await {
-        Ok(response) => unkept(response),
+    match begin_sign_in(&app, &caller, &headers, beginning.again).await {
+        Ok(response) => no_store(response),
         Err(error) => refuse(&app, &caller, &headers, LOGIN, error),
     }
 }
 
-async fn begin(
+async fn begin_sign_in(
     app: &App,
     caller: &Caller,
     headers: &HeaderMap,
@@ -104,83 +105,85 @@ async fn begin(
 ) -> Result<Response, Error> {
     let known = app.provider.as_ref().ok_or(Error::NoProvider)?;
     let connection = caller.connection();
-    // The cookie of this sign-in must be this origin's: the provider sends the browser back there.
+    // The provider sends the browser back to this origin, so the cookie must belong to it.
     let here = cookies::origin(&connection, headers);
     if !here.eq_ignore_ascii_case(&known.origin) {
-        return match again {
-            false => goes_to(&format!("{}{LOGIN}?again=true", known.origin)),
-            true => Err(Error::Foreign {
+        return if again {
+            Err(Error::Foreign {
                 what: format!(
-                    "this portal is asked at {here}, and [oidc] redirect of its configuration says {}",
+                    "this portal was reached at {here}, but redirect in [oidc] of its configuration is {}",
                     known.origin
                 ),
                 next: "correct redirect; a proxy in front must pass Host on and be named in trusted_proxies".into(),
-            }),
+            })
+        } else {
+            redirect(&format!("{}{LOGIN}?again=true", known.origin))
         };
     }
-    check_way(&connection)?;
-    app.principals.may_come(caller.peer.ip(), store::now())?;
-    let browser = cookies::signing_in(&connection, headers)?;
-    let earlier = cookies::shown(&connection, headers)?;
+    check_confidential(&connection)?;
+    app.principals
+        .check_provider_sign_in(caller.peer.ip(), store::now())?;
+    let browser = cookies::signing_in_cookie(&connection, headers)?;
+    let earlier = cookies::session_cookie(&connection, headers)?;
     let begun = known
         .provider
         .begin(browser.as_deref(), caller.peer.ip(), earlier)
         .await?;
-    let cookie = cookies::kept_signing_in(caller.secure, &begun.browser);
-    Ok(([(header::SET_COOKIE, cookie)], goes_to(&begun.url)?).into_response())
+    let cookie = cookies::set_signing_in(caller.secure, &begun.browser);
+    Ok(([(header::SET_COOKIE, cookie)], redirect(&begun.url)?).into_response())
 }
 
-/// Signs in whoever comes back from the provider.
+/// Signs in the person whom the provider has sent back.
 pub async fn callback(
     State(app): State<Arc<App>>,
     Extension(caller): Extension<Caller>,
     uri: Uri,
     headers: HeaderMap,
 ) -> Response {
-    match signed_in(&app, &caller, &uri, &headers).await {
+    match complete_sign_in(&app, &caller, &uri, &headers).await {
         Ok((begun, earlier)) => {
             let did = format!("GET {CALLBACK}");
-            let (_, cookie) = enter(&app, &caller, &begun, earlier, &did, "person");
-            // Browsers show a cookie of SameSite=Strict to no page that another site has sent them to, and the provider has sent them
-            // here. The page that goes on from here is asked for by our own.
+            let (_, cookie) = finish_sign_in(&app, &caller, &begun, earlier, &did, "person");
+            // Browsers do not send a cookie with SameSite=Strict when another site, such as the provider, has led to
+            // the page. So this page reloads from our own site.
             let body = "<meta http-equiv=\"refresh\" content=\"0; url=/\">\n<title>Signed in</title>\n\
                         <h1>You are signed in</h1>\n<p><a id=\"go-on\" href=\"/\">Go on to the portal</a></p>\n";
-            unkept(([(header::SET_COOKIE, cookie)], page(StatusCode::OK, body)))
+            no_store(([(header::SET_COOKIE, cookie)], page(StatusCode::OK, body)))
         }
         Err(error) => {
             if let Error::Provider(refused) = &error
                 && refused.is_guess()
             {
                 app.principals
-                    .mistaken_sign_in(caller.peer.ip(), store::now());
+                    .record_failed_sign_in(caller.peer.ip(), store::now());
             }
             refuse(&app, &caller, &headers, CALLBACK, error)
         }
     }
 }
 
-async fn signed_in(
+async fn complete_sign_in(
     app: &App,
     caller: &Caller,
     uri: &Uri,
     headers: &HeaderMap,
-) -> Result<(Begun, Option<String>), Error> {
+) -> Result<(StartedSession, Option<String>), Error> {
     let known = app.provider.as_ref().ok_or(Error::NoProvider)?;
     let connection = caller.connection();
-    check_way(&connection)?;
+    check_confidential(&connection)?;
     cookies::check_visit(headers)?;
     let from = caller.peer.ip();
-    app.principals.may_come(from, store::now())?;
-    let asked = |name: &str| guard::query(uri.query(), name);
-    let browser = cookies::signing_in(&connection, headers)?;
+    app.principals.check_provider_sign_in(from, store::now())?;
+    let asked = |name: &str| guard::query_value(uri.query(), name);
+    let browser = cookies::signing_in_cookie(&connection, headers)?;
     let state = asked("state").unwrap_or_default();
-    let mut started = known.provider.take(&state, browser.as_deref())?;
+    let mut started = known.provider.resume(&state, browser.as_deref())?;
     if let Some(error) = asked("error") {
         let reason = match asked("error_description") {
             Some(words) => format!("{error}: {words}"),
             None => error,
         };
-        return Err(oidc::Error::denied(&reason).into());
+        return Err(oidc::Error::from_denial(&reason).into());
     }
     known.provider.check_issuer(asked("iss").as_deref())?;
     let earlier = started.earlier.take();
@@ -188,39 +191,39 @@ async fn signed_in(
     let person = known.provider.finish(started, code).await?;
     let granted = known
         .roles
-        .of(&person.groups)
-        .ok_or_else(|| without_role(known, &person))?;
+        .grant_for_groups(&person.groups)
+        .ok_or_else(|| no_role_error(known, &person))?;
     let issuer = known.provider.issuer();
     let peer = caller.peer.to_string();
     let begun = app
         .principals
-        .begin_provided(issuer, &person, &granted, &peer)?;
+        .begin_provider_session(issuer, &person, &granted, &peer)?;
     Ok((begun, earlier))
 }
 
-fn without_role(known: &IdentityProvider, person: &Person) -> Error {
+fn no_role_error(known: &IdentityProvider, person: &Person) -> Error {
     let plain = |text: &str| -> String { text.chars().filter(|c| !c.is_control()).collect() };
     let groups: Vec<String> = person.groups.iter().map(|group| plain(group)).collect();
     let has = match groups.len() {
         0 => format!(
-            "{} names none in the claim {}",
+            "{} gives none in the claim {}",
             known.name, known.groups_claim
         ),
         1..=NAMED => format!("{} says {}", known.name, groups.join(", ")),
         more => format!(
-            "{} says {}, and {} more",
+            "{} lists {} and {} more",
             known.name,
             groups[..NAMED].join(", "),
             more - NAMED
         ),
     };
     Error::NoRole {
-        who: access::principal::provided_name(&person.name),
+        who: access::principal::oidc_principal_name(&person.name),
         has,
     }
 }
 
-/// Refuses, to a browser by a page, and writes it down.
+/// Refuses a sign-in, as an HTML page for browsers, and records it.
 fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, path: &str, error: Error) -> Response {
     let problem = error.problem();
     let object = match &error {
@@ -229,27 +232,27 @@ fn refuse(app: &App, caller: &Caller, headers: &HeaderMap, path: &str, error: Er
     };
     let did = format!("GET {path}");
     app.audit
-        .record_sparingly(caller, Action::Enter, &did, &object, problem.status);
+        .record_throttled(caller, AccessAction::Enter, &did, &object, problem.status);
     if let Error::Provider(refused) = &error
-        && refused.is_providers()
+        && refused.is_provider_fault()
     {
-        tracing::warn!("nobody is signed in: {refused}; {}", refused.next());
+        tracing::warn!("sign-in failed: {refused}; {}", refused.next_step());
     }
     let accept = headers
         .get(header::ACCEPT)
         .and_then(|value| value.to_str().ok());
     if !accept.is_some_and(|accept| accept.contains("text/html")) {
-        return unkept(error);
+        return no_store(error);
     }
     let next = problem.next.as_deref().unwrap_or_default();
     let body = format!(
         "<title>Not signed in</title>\n<h1>You are not signed in</h1>\n<p id=\"why\">{}</p>\n<p id=\"next\">{}</p>\n\
          <p><a href=\"/\">Back to the portal</a></p>\n",
-        escaped(&problem.detail),
-        escaped(next)
+        escape_html(&problem.detail),
+        escape_html(next)
     );
     let status = StatusCode::from_u16(problem.status).unwrap_or(StatusCode::BAD_REQUEST);
-    let mut response = unkept(page(status, &body));
+    let mut response = no_store(page(status, &body));
     if let Some(after) = problem.retry_after {
         response
             .headers_mut()
@@ -263,7 +266,7 @@ fn page(status: StatusCode, body: &str) -> Response {
         (header::CONTENT_TYPE, "text/html; charset=utf-8"),
         (header::CONTENT_SECURITY_POLICY, POLICY),
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
-        // Its address has the code.
+        // The URL contains the code.
         (header::REFERRER_POLICY, "no-referrer"),
     ];
     let text = format!(
@@ -273,8 +276,8 @@ fn page(status: StatusCode, body: &str) -> Response {
     (status, headers, text).into_response()
 }
 
-/// A text within a page.
-fn escaped(text: &str) -> String {
+/// Escapes text for HTML.
+fn escape_html(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -296,7 +299,7 @@ mod tests {
     #[test]
     fn what_a_provider_says_is_text_in_a_page() {
         assert_eq!(
-            escaped("<script>\"a\" & 'b'</script>"),
+            escape_html("<script>\"a\" & 'b'</script>"),
             "&lt;script&gt;&quot;a&quot; &amp; &#39;b&#39;&lt;/script&gt;"
         );
     }

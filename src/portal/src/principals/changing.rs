@@ -1,4 +1,4 @@
-//! Changing who may do what: tokens and rules, in the database first.
+//! Changes of tokens and rules, made in the database first.
 
 use std::sync::atomic::Ordering;
 
@@ -7,36 +7,36 @@ use catalogue::names;
 use store::NewToken;
 
 use super::Principals;
-use super::stored::{Known, Stored, StoredScope, damaged, read_token};
+use super::stored::{KnownToken, StoredPrincipals, StoredScope, read_token, record_error};
 use crate::errors::Error;
 use crate::tokens;
 
-/// Characters of a token: of 36 letters and digits each, that is 268 bits.
+/// Length of a token in characters out of 36 letters and digits: 268 bits.
 pub(super) const SECRET: usize = 52;
 /// Names of principals that are known without a token.
 pub(super) const RESERVED: [&str; 3] = ["local", "root", "configured"];
 
-/// What somebody is that is given a name.
+/// Holder of a principal's name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Named<'a> {
+pub(super) enum NameHolder<'a> {
     Account,
     Token {
-        /// The robot whose it is, if it is a robot's.
+        /// The robot of the token, if it is a robot's.
         robot: Option<&'a str>,
     },
     Pairing,
 }
 
 impl Principals {
-    /// Reads the database again, and tells whoever follows.
+    /// Reloads the database and notifies followers.
     pub(super) fn reload(&self) -> Result<(), store::Error> {
-        // Read under the lock: of two changes, the one that is read last holds both.
+        // Loads under the lock: of two concurrent changes, the one loaded last includes both.
         let mut stored = self.stored.write();
-        let mut fresh = Stored::read(&self.state)?;
+        let mut fresh = StoredPrincipals::load(&self.state)?;
         fresh.names_provider |= stored.names_provider;
-        // Not yet written ones, too.
+        // Keeps uses that are not written yet.
         for known in &fresh.tokens {
-            if let Some(before) = stored.of_id(known.id) {
+            if let Some(before) = stored.find_token(known.id) {
                 known
                     .last_used
                     .fetch_max(before.last_used.load(Ordering::Relaxed), Ordering::Relaxed);
@@ -44,7 +44,7 @@ impl Principals {
         }
         fresh.keep_uses(&stored);
         for known in fresh.sessions.values() {
-            if let Some(before) = stored.session_of_id(known.record.id) {
+            if let Some(before) = stored.find_session(known.record.id) {
                 let last = before.last_used.load(Ordering::Relaxed);
                 known.last_used.fetch_max(last, Ordering::Relaxed);
                 let written = before.written.load(Ordering::Relaxed);
@@ -57,12 +57,17 @@ impl Principals {
         Ok(())
     }
 
-    /// All tokens there ever were.
+    /// Returns all tokens, including revoked ones.
     pub fn tokens(&self) -> Vec<api::access::Token> {
-        self.stored.read().tokens.iter().map(Known::view).collect()
+        self.stored
+            .read()
+            .tokens
+            .iter()
+            .map(KnownToken::to_api_token)
+            .collect()
     }
 
-    fn live(&self, name: &str) -> Result<api::access::Token, Error> {
+    fn live_token(&self, name: &str) -> Result<api::access::Token, Error> {
         let tokens = self.tokens();
         let of_name = tokens
             .into_iter()
@@ -70,7 +75,7 @@ impl Principals {
         of_name.ok_or(Error::Internal("reading a token back"))
     }
 
-    fn unknown(&self, name: &str) -> Error {
+    fn unknown_token(&self, name: &str) -> Error {
         let live = self
             .tokens()
             .into_iter()
@@ -81,17 +86,17 @@ impl Principals {
         }
     }
 
-    /// Refuses a name that somebody of another kind has: rules and records know all of them by their names. A robot's token may have
-    /// the robot's name.
-    pub(super) fn check_name_is_free(&self, name: &str, of: Named<'_>) -> Result<(), Error> {
-        if of != Named::Account && self.has_account(name) {
+    /// Refuses a name held by another kind of principal, because rules and records identify all of them by name. A
+    /// robot's token may have the robot's name.
+    pub(super) fn check_name_is_free(&self, name: &str, of: NameHolder<'_>) -> Result<(), Error> {
+        if of != NameHolder::Account && self.has_account(name) {
             return Err(Error::AccountExists(name.to_owned()));
         }
         let is_robots = |robot: Option<&str>| robot == Some(name);
         let is_others = match of {
-            Named::Account => true,
-            Named::Token { robot } => !is_robots(robot),
-            Named::Pairing => false,
+            NameHolder::Account => true,
+            NameHolder::Token { robot } => !is_robots(robot),
+            NameHolder::Pairing => false,
         };
         if is_others && self.pairings()?.iter().any(|pairing| pairing.robot == name) {
             return Err(Error::PairingExists(name.to_owned()));
@@ -100,10 +105,10 @@ impl Principals {
         let mut live = stored.tokens.iter().filter(|known| known.revoked.is_none());
         let token = live.find(|known| known.principal.name == name);
         let is_others = token.is_some_and(|token| match of {
-            Named::Account => true,
-            // Whether there is one already is seen when it is made.
-            Named::Token { .. } => false,
-            Named::Pairing => !is_robots(token.principal.scope.robot.as_deref()),
+            NameHolder::Account => true,
+            // Duplicate tokens are detected when the token is created.
+            NameHolder::Token { .. } => false,
+            NameHolder::Pairing => !is_robots(token.principal.scope.robot.as_deref()),
         });
         if is_others {
             return Err(Error::TokenExists(name.to_owned()));
@@ -111,11 +116,11 @@ impl Principals {
         Ok(())
     }
 
-    /// Makes a token; its secret is told once.
-    pub fn create(&self, new: &api::access::NewToken) -> Result<api::access::Secret, Error> {
-        check(new).map_err(Error::BadRequest)?;
+    /// Creates a token. Its secret is returned only here.
+    pub fn create_token(&self, new: &api::access::NewToken) -> Result<api::access::Secret, Error> {
+        check_token(new).map_err(Error::BadRequest)?;
         let robot = new.robot.as_deref();
-        self.check_name_is_free(&new.name, Named::Token { robot })?;
+        self.check_name_is_free(&new.name, NameHolder::Token { robot })?;
         let end = |seconds: u64| {
             let end = seconds
                 .checked_mul(1000)
@@ -123,8 +128,7 @@ impl Principals {
             end.filter(|end| i64::try_from(*end).is_ok())
                 .ok_or_else(|| {
                     Error::BadRequest(
-                        "the lifetime is too long; leave it out for a token that does not end"
-                            .into(),
+                        "the lifetime is too long; omit it for a token that never expires".into(),
                     )
                 })
         };
@@ -136,7 +140,7 @@ impl Principals {
             classes: new.classes.clone(),
         };
         let scope =
-            serde_json::to_string(&scope).map_err(damaged(format!("token {}", new.name)))?;
+            serde_json::to_string(&scope).map_err(record_error(format!("token {}", new.name)))?;
         let record = self.state.add_token(&NewToken {
             name: &new.name,
             hash: &tokens::hash(&secret),
@@ -153,33 +157,33 @@ impl Principals {
         }
         self.reload()?;
         Ok(api::access::Secret {
-            token: known.view(),
+            token: known.to_api_token(),
             secret,
         })
     }
 
-    /// Gives a token another secret; what shows the old one ends.
-    pub fn rotate(&self, name: &str) -> Result<api::access::Secret, Error> {
+    /// Replaces the secret of a token; connections using the old one end.
+    pub fn rotate_token(&self, name: &str) -> Result<api::access::Secret, Error> {
         let secret = names::random(SECRET);
         let rotated = self.state.rotate_token(name, &tokens::hash(&secret))?;
-        rotated.ok_or_else(|| self.unknown(name))?;
+        rotated.ok_or_else(|| self.unknown_token(name))?;
         self.reload()?;
         Ok(api::access::Secret {
-            token: self.live(name)?,
+            token: self.live_token(name)?,
             secret,
         })
     }
 
-    /// Ends a token, and what shows it.
-    pub fn revoke(&self, name: &str) -> Result<(), Error> {
+    /// Revokes a token; connections using it end.
+    pub fn revoke_token(&self, name: &str) -> Result<(), Error> {
         self.state
             .revoke_token(name)?
-            .ok_or_else(|| self.unknown(name))?;
+            .ok_or_else(|| self.unknown_token(name))?;
         self.reload()?;
         Ok(self.release_robots()?)
     }
 
-    /// All rules.
+    /// Returns all rules.
     pub fn rules(&self) -> Vec<api::access::Rule> {
         let stored = self.stored.read();
         let rules = stored.rules.iter();
@@ -193,20 +197,21 @@ impl Principals {
             .collect()
     }
 
-    /// Writes a rule.
+    /// Adds a rule.
     pub fn add_rule(&self, new: &api::access::NewRule) -> Result<(), Error> {
         if self.stored.read().rules.len() >= MOST_RULES {
             return Err(Error::BadRequest(format!(
-                "there are {MOST_RULES} rules, and no more can be; remove some with: cloudroidctl policy rm NUMBER"
+                "there are already {MOST_RULES} rules, which is the limit; remove some with: cloudroidctl policy rm \
+                    NUMBER"
             )));
         }
-        let allow = serde_json::to_string(&new.allow).map_err(damaged("a rule".to_owned()))?;
+        let allow = serde_json::to_string(&new.allow).map_err(record_error("a rule".to_owned()))?;
         self.state
             .add_rule(&new.who.to_string(), new.services.as_str(), &allow)?;
         Ok(self.reload()?)
     }
 
-    /// Removes a rule; false where there is none of that number.
+    /// Removes a rule; returns false if there is none with this id.
     pub fn remove_rule(&self, id: i64) -> Result<bool, Error> {
         let removed = self.state.remove_rule(id)?;
         self.reload()?;
@@ -214,44 +219,43 @@ impl Principals {
     }
 }
 
-/// Rules that a policy may have: each connection looks at all of them.
+/// Limit on the rules of the policy, because each connection checks all of them.
 const MOST_RULES: usize = 1000;
 
-/// Refuses what cannot be a token, in words.
-fn check(new: &api::access::NewToken) -> Result<(), String> {
+/// Checks a new token; the error is a message for the user.
+fn check_token(new: &api::access::NewToken) -> Result<(), String> {
     access::principal::check_name(&new.name).map_err(|error| error.to_string())?;
     if RESERVED.contains(&new.name.as_str()) {
-        return Err(format!(
-            "{} is a name that the daemon uses itself; choose another",
-            new.name
-        ));
+        return Err(format!("{} is a reserved name; choose another", new.name));
     }
     let (role, scoped) = (new.role, new.role.is_scoped());
     if scoped && new.services.is_empty() {
         return Err(format!(
-            "a {role} is for services that are named; name them with --service, or all with --service '*'"
+            "a {role} needs its services; give them with --service, or all with --service '*'"
         ));
     }
     let names_some = !new.services.is_empty() || !new.classes.is_empty();
     if !scoped && names_some {
         return Err(format!(
-            "an {role} is for all services and classes; leave out --service and --class, or choose another role"
+            "an {role} is for all services and classes; omit --service and --class, or choose another role"
         ));
     }
     match (&new.robot, role) {
-        (Some(robot), Role::Robot) => names::robot(robot).map_err(|error| error.to_string())?,
+        (Some(robot), Role::Robot) => {
+            names::validate_robot(robot).map_err(|error| error.to_string())?
+        }
         (None, Role::Robot) => {
-            return Err("a robot's token is for one robot; name it with --robot".into());
+            return Err("a robot's token is for one robot; give it with --robot".into());
         }
         (Some(_), role) => {
             return Err(format!(
-                "--robot is for tokens of robots, and this one is for a {role}"
+                "--robot is only for tokens of robots, but this one is for a {role}"
             ));
         }
         (None, _) => {}
     }
     match new.lifetime {
-        Some(0) => Err("a token that ends at once is of no use; give it a longer lifetime".into()),
+        Some(0) => Err("a token that expires at once is useless; give it a longer lifetime".into()),
         _ => Ok(()),
     }
 }

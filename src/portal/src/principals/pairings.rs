@@ -1,4 +1,4 @@
-//! Robots that are paired, and the codes by which they are: who shows which certificate, and whether its pairing stands
+//! Paired robots and pairing codes: which certificates are accepted, and whether their pairings are still valid
 //! (docs/adr/086).
 
 use std::net::IpAddr;
@@ -9,68 +9,72 @@ use std::time::Duration;
 use access::{Principal, Role, Scope};
 use api::Millis;
 use api::machines::{NewPairing, Pairing, PairingState};
-use authority::{Authority, Issued, Request, Shown as Certificate};
+use authority::{
+    Authority, CertificateRequest, IssuedRobotCertificate, VerifiedCertificate as Certificate,
+};
 use catalogue::names;
 use store::{CodeRecord, Owner, PairingRecord};
 
-use super::changing::{Named, RESERVED};
-use super::stored::{StoredScope, damaged};
-use super::{Identity, Principals, Recognising, Shown, Stored, USED, Unrecognised};
+use super::changing::{NameHolder, RESERVED};
+use super::stored::{StoredScope, record_error};
+use super::{
+    AuthenticationError, CallerIdentity, Credential, Principals, Recogniser, StoredPrincipals, USED,
+};
 use crate::errors::Error;
 use crate::tokens;
 
-/// How long a code is good where nobody says it, and at most: seconds.
+/// Lifetime of a pairing code in seconds: default and maximum.
 const CODE: u64 = 15 * 60;
 const LONGEST_CODE: u64 = 7 * 86_400;
 
-/// The end of a robot's newest certificate is written so often in the life of one.
+/// Number of times per certificate lifetime that the end of a robot's newest certificate is written.
 const OFTEN: Millis = 10;
 
-/// Why a certificate lets nobody in, though an authority that is trusted has signed it.
+/// Reason why a certificate is not accepted although a trusted authority has signed it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Uncertified {
-    /// It names no robot.
+pub enum CertificateRefusal {
+    /// The certificate names no robot.
     #[error("{0}")]
     Nameless(String),
-    /// Nobody has paired the robot.
+    /// The robot was never paired.
     #[error("robot {0} is not paired")]
     NotPaired(String),
-    /// Its pairing has ended.
+    /// The robot was unpaired.
     #[error("robot {0} was unpaired")]
     Unpaired(String),
-    /// Another key is paired by now, or another authority's certificate.
-    #[error("robot {0} was paired anew, with another key than this certificate has")]
+    /// The robot was paired again, with another key or another authority.
+    #[error("robot {0} was paired again with another key than that of this certificate")]
     Replaced(String),
-    /// It has ended, on a connection that goes on.
+    /// The certificate has expired while the connection is open.
     #[error("the certificate of robot {0} has expired")]
     Expired(String),
 }
 
-/// Why a pairing code pairs nobody.
+/// Reason why a pairing code is not accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum Uncoded {
-    /// Nobody has made it.
+pub enum PairingCodeRefusal {
+    /// The code is unknown.
     #[error("this pairing code is not known")]
     Unknown,
-    /// It is of another robot.
+    /// The code is for another robot.
     #[error("this pairing code is for another robot")]
     Another,
-    /// It is good once.
-    #[error("this pairing code was used already")]
+    /// The code was used.
+    #[error("this pairing code was already used")]
     Used,
-    /// It was taken back, or there is a newer one.
-    #[error("this pairing code was cancelled, or a newer one took its place")]
+    /// The code was cancelled or replaced by a newer one.
+    #[error("this pairing code was cancelled or replaced by a newer one")]
     Cancelled,
-    /// It was good for some minutes.
+    /// The code has expired.
     #[error("this pairing code has expired")]
     Expired,
 }
 
 /// A pairing of the database, in memory.
-pub(super) struct Paired {
+pub(super) struct StoredPairing {
     id: i64,
     robot: String,
-    /// None: another authority signs its certificates.
+    /// `None` if another authority signs the robot's certificates.
     key: Option<String>,
     principal: Arc<Principal>,
     created: Millis,
@@ -80,12 +84,12 @@ pub(super) struct Paired {
 }
 
 fn read_scope(robot: &str, text: &str) -> Result<StoredScope, store::Error> {
-    serde_json::from_str(text).map_err(damaged(format!("the pairing of {robot}")))
+    serde_json::from_str(text).map_err(record_error(format!("the pairing of {robot}")))
 }
 
-pub(super) fn read(record: PairingRecord) -> Result<Paired, store::Error> {
+pub(super) fn read_pairing(record: PairingRecord) -> Result<StoredPairing, store::Error> {
     let scope = read_scope(&record.robot, &record.scope)?;
-    Ok(Paired {
+    Ok(StoredPairing {
         id: record.id,
         key: record.key,
         principal: Arc::new(Principal {
@@ -105,13 +109,13 @@ pub(super) fn read(record: PairingRecord) -> Result<Paired, store::Error> {
     })
 }
 
-/// Whose a robot's name is that is paired: the same as of a token of that robot.
-fn owner(robot: &str) -> Owner {
+/// Returns the owner of a paired robot's name, the same as for a token of that robot.
+fn robot_owner(robot: &str) -> Owner {
     format!("robot:{robot}")
 }
 
-impl Paired {
-    fn view(&self) -> Pairing {
+impl StoredPairing {
+    fn to_pairing(&self) -> Pairing {
         let Scope {
             services, classes, ..
         } = &self.principal.scope;
@@ -128,9 +132,9 @@ impl Paired {
         }
     }
 
-    /// The end of a connection's right: of the newest certificate of the key, or of the one that was shown where another authority
-    /// signs them.
-    fn end(&self, shown: Millis) -> Millis {
+    /// Returns when a connection's permission ends: with the newest certificate of the key or, if another authority
+    /// signs them, with the certificate presented.
+    fn valid_until(&self, shown: Millis) -> Millis {
         match self.key {
             Some(_) => self.expires.unwrap_or(shown).max(shown),
             None => shown,
@@ -138,51 +142,57 @@ impl Paired {
     }
 }
 
-impl Stored {
-    fn of_pairing(&self, id: i64) -> Option<&Paired> {
+impl StoredPrincipals {
+    fn find_pairing(&self, id: i64) -> Option<&StoredPairing> {
         self.pairings.iter().find(|paired| paired.id == id)
     }
 
-    /// The one that stands.
-    fn paired(&self, robot: &str) -> Option<&Paired> {
+    /// Returns the robot's current pairing.
+    fn live_pairing(&self, robot: &str) -> Option<&StoredPairing> {
         let mut live = self.pairings.iter().filter(|paired| !paired.revoked);
         live.find(|paired| paired.robot == robot)
     }
 
-    /// Whether it is known that a robot was paired at any time.
+    /// Returns true if the robot was ever paired.
     fn was_paired(&self, robot: &str) -> bool {
         self.pairings.iter().any(|paired| paired.robot == robot)
     }
 
-    /// Why a pairing lets nobody in any more, whose certificate is good until `until`.
-    pub(super) fn pairing_over(&self, id: i64, until: Millis, now: Millis) -> Option<Uncertified> {
-        let paired = self.of_pairing(id)?;
+    /// Returns why the pairing no longer admits a connection whose certificate is valid until `until`.
+    pub(super) fn pairing_refusal(
+        &self,
+        id: i64,
+        until: Millis,
+        now: Millis,
+    ) -> Option<CertificateRefusal> {
+        let paired = self.find_pairing(id)?;
         let robot = paired.robot.clone();
         match () {
-            () if paired.revoked && self.paired(&robot).is_some() => {
-                Some(Uncertified::Replaced(robot))
+            () if paired.revoked && self.live_pairing(&robot).is_some() => {
+                Some(CertificateRefusal::Replaced(robot))
             }
-            () if paired.revoked => Some(Uncertified::Unpaired(robot)),
-            () if paired.end(until) <= now => Some(Uncertified::Expired(robot)),
+            () if paired.revoked => Some(CertificateRefusal::Unpaired(robot)),
+            () if paired.valid_until(until) <= now => Some(CertificateRefusal::Expired(robot)),
             () => None,
         }
     }
 
-    /// When somebody's pairing ends if nothing is done.
+    /// Returns when the pairing's permission ends unless it is renewed.
     pub(super) fn pairing_end(&self, id: i64, until: Millis) -> Option<Millis> {
-        self.of_pairing(id).map(|paired| paired.end(until))
+        self.find_pairing(id)
+            .map(|paired| paired.valid_until(until))
     }
 
-    /// Owners of robots' names that are paired.
+    /// Returns the owners of paired robots' names.
     pub(super) fn paired_owners(&self) -> impl Iterator<Item = Owner> {
         let live = self.pairings.iter().filter(|paired| !paired.revoked);
-        live.map(|paired| owner(&paired.robot))
+        live.map(|paired| robot_owner(&paired.robot))
     }
 
-    /// Uses that are not written yet.
-    pub(super) fn keep_uses(&self, before: &Stored) {
+    /// Takes over uses that are not written yet.
+    pub(super) fn keep_uses(&self, before: &StoredPrincipals) {
         for paired in &self.pairings {
-            if let Some(before) = before.of_pairing(paired.id) {
+            if let Some(before) = before.find_pairing(paired.id) {
                 let last = before.last_used.load(Ordering::Relaxed);
                 paired.last_used.fetch_max(last, Ordering::Relaxed);
             }
@@ -190,50 +200,52 @@ impl Stored {
     }
 }
 
-impl Recognising<'_> {
-    /// Whose a certificate is, that was verified: signed by somebody who is trusted, and shown by who has its key.
-    pub fn certified(
+impl Recogniser<'_> {
+    /// Identifies the robot of a verified certificate, that is, one signed by a trusted authority and presented by
+    /// the holder of its key.
+    pub fn recognise_certificate(
         &self,
         authority: &Authority,
         shown: &Certificate,
         now: Millis,
-    ) -> Result<Identity, Uncertified> {
+    ) -> Result<CallerIdentity, CertificateRefusal> {
         let robot = || shown.robot.clone();
-        let Some(paired) = self.stored.paired(&shown.robot) else {
-            return Err(match self.stored.was_paired(&shown.robot) {
-                true => Uncertified::Unpaired(robot()),
-                false => Uncertified::NotPaired(robot()),
+        let Some(paired) = self.stored.live_pairing(&shown.robot) else {
+            return Err(if self.stored.was_paired(&shown.robot) {
+                CertificateRefusal::Unpaired(robot())
+            } else {
+                CertificateRefusal::NotPaired(robot())
             });
         };
         let is_its_own = match &paired.key {
-            Some(key) => authority.has_signed(shown) && *key == shown.key,
-            // What the daemon's authority signed was for a pairing before this one.
-            None => !authority.has_signed(shown),
+            Some(key) => authority.has_issued(shown) && *key == shown.key,
+            // Certificates of the daemon's authority belong to an earlier pairing.
+            None => !authority.has_issued(shown),
         };
         if !is_its_own {
-            return Err(Uncertified::Replaced(robot()));
+            return Err(CertificateRefusal::Replaced(robot()));
         }
-        if paired.end(shown.until) <= now {
-            return Err(Uncertified::Expired(robot()));
+        if paired.valid_until(shown.until) <= now {
+            return Err(CertificateRefusal::Expired(robot()));
         }
-        Ok(Identity {
+        Ok(CallerIdentity {
             principal: Arc::clone(&paired.principal),
-            shown: Shown::Certificate {
+            shown: Credential::Certificate {
                 pairing: paired.id,
                 key: paired.key.clone(),
                 until: shown.until,
             },
             token: None,
-            owner: Some(owner(&paired.robot)),
+            owner: Some(robot_owner(&paired.robot)),
         })
     }
 }
 
 impl Principals {
-    /// Remembers that a paired robot came, to the minute.
-    pub(super) fn note_pairing(&self, id: i64, now: Millis) {
+    /// Records that a paired robot connected, with a resolution of a minute.
+    pub(super) fn record_pairing_use(&self, id: i64, now: Millis) {
         let stored = self.stored.read();
-        let due = stored.of_pairing(id).is_some_and(|paired| {
+        let due = stored.find_pairing(id).is_some_and(|paired| {
             let last = paired.last_used.load(Ordering::Relaxed);
             now.saturating_sub(last) >= USED
                 && paired
@@ -242,18 +254,18 @@ impl Principals {
                     .is_ok()
         });
         drop(stored);
-        if due && let Err(error) = self.state.pairing_used(id, now) {
-            tracing::warn!("when a robot came last cannot be written: {error}");
+        if due && let Err(error) = self.state.record_pairing_use(id, now) {
+            tracing::warn!("cannot store when a robot last connected: {error}");
         }
     }
 
-    /// Robots that are paired, and those for which a code waits.
+    /// Returns paired robots and pending pairing codes.
     pub fn pairings(&self) -> Result<Vec<Pairing>, Error> {
         let waiting = self.state.pairing_codes(store::now())?;
         let mut all: Vec<Pairing> = {
             let stored = self.stored.read();
             let live = stored.pairings.iter().filter(|paired| !paired.revoked);
-            live.map(Paired::view).collect()
+            live.map(StoredPairing::to_pairing).collect()
         };
         for code in waiting {
             let scope = read_scope(&code.robot, &code.scope)?;
@@ -272,41 +284,43 @@ impl Principals {
         Ok(all)
     }
 
-    /// Makes a code for a robot, in place of one that it has: the code, and its end.
+    /// Creates a pairing code for a robot, replacing a pending one; returns the code and its expiry.
     pub fn begin_pairing(&self, new: &NewPairing) -> Result<(String, Millis), Error> {
-        check(new).map_err(Error::BadRequest)?;
-        self.check_name_is_free(&new.robot, Named::Pairing)?;
+        check_pairing(new).map_err(Error::BadRequest)?;
+        self.check_name_is_free(&new.robot, NameHolder::Pairing)?;
         let seconds = new.lifetime.unwrap_or(CODE);
         let expires = store::now() + seconds * 1000;
         let code = names::random(::tls::CODE);
-        let scope = self.scope_of(new)?;
+        let scope = self.encode_scope(new)?;
         self.state
             .add_pairing_code(&new.robot, &tokens::hash(&code), &scope, expires)?;
         Ok((code, expires))
     }
 
-    /// Pairs a robot that has certificates of the lab's own authority.
+    /// Pairs a robot that has certificates of the operator's own authority.
     pub fn pair_own(&self, new: &NewPairing) -> Result<(), Error> {
-        check(new).map_err(Error::BadRequest)?;
-        self.check_name_is_free(&new.robot, Named::Pairing)?;
-        self.state.add_pairing(&new.robot, &self.scope_of(new)?)?;
-        self.state.bind_robot(&new.robot, &owner(&new.robot))?;
+        check_pairing(new).map_err(Error::BadRequest)?;
+        self.check_name_is_free(&new.robot, NameHolder::Pairing)?;
+        self.state
+            .add_pairing(&new.robot, &self.encode_scope(new)?)?;
+        self.state
+            .bind_robot(&new.robot, &robot_owner(&new.robot))?;
         Ok(self.reload()?)
     }
 
-    fn scope_of(&self, new: &NewPairing) -> Result<String, Error> {
+    fn encode_scope(&self, new: &NewPairing) -> Result<String, Error> {
         let scope = StoredScope {
             services: new.services.clone(),
             robot: Some(new.robot.clone()),
             classes: new.classes.clone(),
         };
         let what = format!("the pairing of {}", new.robot);
-        Ok(serde_json::to_string(&scope).map_err(damaged(what))?)
+        Ok(serde_json::to_string(&scope).map_err(record_error(what))?)
     }
 
-    /// A code that came from an address for a robot, if it could be used now. One that nobody has made is a guess, as an unknown
-    /// token is.
-    pub fn code(
+    /// Checks a pairing code that came from an address for a robot. An unknown code counts as a guess, like an
+    /// unknown token.
+    pub fn check_code(
         &self,
         robot: &str,
         code: &str,
@@ -316,15 +330,17 @@ impl Principals {
         let known = self.state.pairing_code(&tokens::hash(code))?;
         let Some(known) = known.filter(|_| ::tls::is_code(code)) else {
             let mut guesses = self.guesses.lock();
-            guesses.ask(from, now).map_err(Unrecognised::Slowed)?;
-            guesses.failed(from, now);
-            return Err(Uncoded::Unknown.into());
+            guesses
+                .check(from, now)
+                .map_err(AuthenticationError::Slowed)?;
+            guesses.record_failure(from, now);
+            return Err(PairingCodeRefusal::Unknown.into());
         };
         let refused = match &known {
-            known if known.robot != robot => Some(Uncoded::Another),
-            known if known.used.is_some() => Some(Uncoded::Used),
-            known if known.cancelled.is_some() => Some(Uncoded::Cancelled),
-            known if known.expires <= now => Some(Uncoded::Expired),
+            known if known.robot != robot => Some(PairingCodeRefusal::Another),
+            known if known.used.is_some() => Some(PairingCodeRefusal::Used),
+            known if known.cancelled.is_some() => Some(PairingCodeRefusal::Cancelled),
+            known if known.expires <= now => Some(PairingCodeRefusal::Expired),
             _ => None,
         };
         match refused {
@@ -333,70 +349,75 @@ impl Principals {
         }
     }
 
-    /// Uses a code: gives its robot a certificate. A pairing that it had ends.
+    /// Uses a pairing code: issues a certificate to its robot, ending an earlier pairing.
     pub fn pair(
         &self,
         code: &CodeRecord,
-        request: &Request,
+        request: &CertificateRequest,
         authority: &Authority,
         lifetime: Duration,
-    ) -> Result<Issued, Error> {
+    ) -> Result<IssuedRobotCertificate, Error> {
         let issued = authority
             .issue(request, &code.robot, store::now(), lifetime)
             .map_err(Error::Uncertifiable)?;
         self.state
             .use_pairing_code(code.id, request.key_hash(), issued.expires)?
-            .ok_or(Uncoded::Used)?;
-        self.state.bind_robot(&code.robot, &owner(&code.robot))?;
+            .ok_or(PairingCodeRefusal::Used)?;
+        self.state
+            .bind_robot(&code.robot, &robot_owner(&code.robot))?;
         self.reload()?;
         Ok(issued)
     }
 
-    /// Gives a paired robot another certificate of its key. `pairing` is that by which it asks.
+    /// Renews the certificate of a paired robot. `pairing` is the one under which it asks.
     pub fn renew(
         &self,
         (pairing, robot): (i64, &str),
-        request: &Request,
+        request: &CertificateRequest,
         authority: &Authority,
         lifetime: Duration,
-    ) -> Result<Issued, Error> {
+    ) -> Result<IssuedRobotCertificate, Error> {
         let issued = authority
             .issue(request, robot, store::now(), lifetime)
             .map_err(Error::Uncertifiable)?;
-        // Who asks again and again makes nobody write each time.
+        // Frequent renewals do not each cause a write.
         let lately = issued
             .expires
             .saturating_sub(lifetime.as_millis() as Millis / OFTEN);
         let known = {
             let stored = self.stored.read();
-            let live = stored.of_pairing(pairing).filter(|paired| !paired.revoked);
+            let live = stored
+                .find_pairing(pairing)
+                .filter(|paired| !paired.revoked);
             live.and_then(|paired| paired.expires)
         };
         if known.is_none_or(|known| known < lately) {
-            if !self.state.pairing_renewed(pairing, issued.expires)? {
-                return Err(Uncertified::Unpaired(robot.to_owned()).into());
+            if !self.state.extend_pairing(pairing, issued.expires)? {
+                return Err(CertificateRefusal::Unpaired(robot.to_owned()).into());
             }
             self.reload()?;
         }
         Ok(issued)
     }
 
-    /// Ends a robot's pairing, its connections, and a code that waits for it.
+    /// Ends a robot's pairing and its connections, and cancels its pairing code.
     pub fn unpair(&self, robot: &str) -> Result<(), Error> {
         let there = self.state.revoke_pairing(robot)?;
         self.reload()?;
         self.release_robots()?;
-        match there {
-            true => Ok(()),
-            false => Err(self.unknown_pairing(robot)?),
+        if there {
+            Ok(())
+        } else {
+            Err(self.unknown_pairing(robot)?)
         }
     }
 
-    /// Takes a robot's code back.
+    /// Cancels a robot's pairing code.
     pub fn cancel_pairing(&self, robot: &str) -> Result<(), Error> {
-        match self.state.cancel_pairing_code(robot)? {
-            true => Ok(()),
-            false => Err(self.unknown_pairing(robot)?),
+        if self.state.cancel_pairing_code(robot)? {
+            Ok(())
+        } else {
+            Err(self.unknown_pairing(robot)?)
         }
     }
 
@@ -409,24 +430,23 @@ impl Principals {
     }
 }
 
-/// Refuses what cannot be a pairing, in words.
-fn check(new: &NewPairing) -> Result<(), String> {
-    names::robot(&new.robot).map_err(|error| error.to_string())?;
+/// Checks a new pairing; the error is a message for the user.
+fn check_pairing(new: &NewPairing) -> Result<(), String> {
+    names::validate_robot(&new.robot).map_err(|error| error.to_string())?;
     if RESERVED.contains(&new.robot.as_str()) {
-        return Err(format!(
-            "{} is a name that the daemon uses itself; choose another",
-            new.robot
-        ));
+        return Err(format!("{} is a reserved name; choose another", new.robot));
     }
     if new.services.is_empty() {
         return Err(
-            "a robot is paired for services that are named; name them with --services, or all with --services '*'".into(),
+            "a robot is paired for given services; give them with --services, or all with --services '*'".into(),
         );
     }
     match new.lifetime {
-        Some(0) => Err("a code that ends at once is of no use; give it a longer --ttl".into()),
+        Some(0) => Err("a code that expires at once is useless; give a longer --ttl".into()),
         Some(seconds) if seconds > LONGEST_CODE => Err(
-            "a pairing code is good for 7d at most: who finds the line is the robot; give it a shorter --ttl".into(),
+            "a pairing code is valid for at most 7d, since whoever finds it can act as the \
+                robot; give a shorter --ttl"
+                .into(),
         ),
         _ => Ok(()),
     }

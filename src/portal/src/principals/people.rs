@@ -1,4 +1,4 @@
-//! People: their accounts, and their sessions.
+//! People: their accounts and sessions.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,24 +10,24 @@ use api::people::{Account, AccountChange, NewAccount, SessionLine};
 use catalogue::names;
 use store::{AccountEdit, AccountRecord, NewSession, Owner, SessionRecord};
 
-use super::changing::{Named, RESERVED, SECRET};
-use super::stored::{StoredScope, damaged, read_principal};
-use super::{Identity, Principals, Shown, Unrecognised};
+use super::changing::{NameHolder, RESERVED, SECRET};
+use super::stored::{StoredScope, read_principal, record_error};
+use super::{AuthenticationError, CallerIdentity, Credential, Principals};
 use crate::errors::Error;
 use crate::tokens;
 
-/// How long sessions last.
+/// Lifetimes of sessions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Lasting {
-    /// At most, whatever is done.
+pub struct SessionLifetimes {
+    /// Maximum lifetime.
     pub most: Duration,
-    /// Without a request.
+    /// Maximum time without a request.
     pub idle: Duration,
 }
 
-impl Default for Lasting {
+impl Default for SessionLifetimes {
     fn default() -> Self {
-        Lasting {
+        SessionLifetimes {
             most: Duration::from_secs(12 * 3600),
             idle: Duration::from_secs(3600),
         }
@@ -38,8 +38,8 @@ pub(super) fn milliseconds(time: Duration) -> Millis {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Whose robots' names are that a person uses.
-fn owner(name: &str) -> Owner {
+/// Returns the owner of robot names used by a person.
+fn person_owner(name: &str) -> Owner {
     format!("person:{name}")
 }
 
@@ -63,7 +63,7 @@ impl KnownAccount {
     }
 
     pub(super) fn owner(&self) -> Owner {
-        owner(&self.record.name)
+        person_owner(&self.record.name)
     }
 }
 
@@ -72,7 +72,7 @@ pub struct KnownSession {
     pub(super) record: SessionRecord,
     pub(super) principal: Arc<Principal>,
     pub(super) last_used: AtomicU64,
-    /// When that was last written.
+    /// Value of `last_used` when it was last written.
     pub(super) written: AtomicU64,
 }
 
@@ -88,44 +88,44 @@ impl KnownSession {
     }
 
     pub(super) fn owner(&self) -> Owner {
-        owner(&self.record.name)
+        person_owner(&self.record.name)
     }
 
     pub(super) fn recognise(
         &self,
         now: Millis,
-        lasting: Lasting,
-    ) -> Result<Identity, Unrecognised> {
+        lasting: SessionLifetimes,
+    ) -> Result<CallerIdentity, AuthenticationError> {
         let last = self.last_used.load(Ordering::Relaxed);
         let idle = last.saturating_add(milliseconds(lasting.idle));
         if self.record.expires.min(idle) <= now {
-            return Err(Unrecognised::SessionOver);
+            return Err(AuthenticationError::SessionOver);
         }
-        Ok(Identity {
+        Ok(CallerIdentity {
             principal: Arc::clone(&self.principal),
-            shown: Shown::Session { id: self.record.id },
+            shown: Credential::Session { id: self.record.id },
             token: None,
             owner: Some(self.owner()),
         })
     }
 }
 
-/// A session that has just begun.
-pub struct Begun {
-    /// What its browser shows. It is kept nowhere.
+/// A session that was just started.
+pub struct StartedSession {
+    /// Secret for the browser's cookie; it is not stored.
     pub secret: String,
-    /// Whose it is.
-    pub identity: Identity,
-    /// When it ends at the latest.
+    /// Identity of the person.
+    pub identity: CallerIdentity,
+    /// Time when the session ends at the latest.
     pub expires: Millis,
 }
 
-/// An account whose password is to be looked at.
+/// An account whose password is to be verified.
 #[derive(Clone)]
 pub struct Candidate {
     id: i64,
     name: String,
-    /// The password's hash.
+    /// Hash of the password.
     pub password: String,
     role: String,
     scope: String,
@@ -133,43 +133,44 @@ pub struct Candidate {
 
 fn check_role(role: Role, services: &[Glob]) -> Result<(), String> {
     if role == Role::Robot {
-        return Err("people are no robots; make a token for a robot: cloudroidctl token create NAME --role robot".into());
+        return Err("an account cannot have the role robot; create a token for a robot: cloudroidctl token create NAME \
+            --role robot".into());
     }
     match (role.is_scoped(), services.is_empty()) {
         (true, true) => Err(format!(
-            "a {role} is for services that are named; name them with --service, or all with --service '*'"
+            "a {role} needs its services; give them with --service, or all with --service '*'"
         )),
         (false, false) => Err(format!(
-            "an {role} is for all services; leave out --service, or choose another role"
+            "an {role} is for all services; omit --service, or choose another role"
         )),
         _ => Ok(()),
     }
 }
 
-pub(super) fn scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
+pub(super) fn encode_scope(services: &[Glob], name: &str) -> Result<String, store::Error> {
     let scope = StoredScope {
         services: services.to_vec(),
         robot: None,
         classes: Vec::new(),
     };
-    serde_json::to_string(&scope).map_err(damaged(format!("account {name}")))
+    serde_json::to_string(&scope).map_err(record_error(format!("account {name}")))
 }
 
 impl Principals {
-    /// Whether anybody can sign in by a password.
+    /// Returns true if any account exists.
     pub fn has_accounts(&self) -> bool {
         let stored = self.stored.read();
         stored.accounts.iter().any(KnownAccount::is_live)
     }
 
-    /// Whether there is an account of that name.
+    /// Returns true if an account of this name exists.
     pub(super) fn has_account(&self, name: &str) -> bool {
         let stored = self.stored.read();
         let mut live = stored.accounts.iter().filter(|known| known.is_live());
         live.any(|known| known.record.name == name)
     }
 
-    /// All accounts that there are.
+    /// Returns all existing accounts.
     pub fn accounts(&self) -> Vec<Account> {
         let stored = self.stored.read();
         let live = stored.accounts.iter().filter(|known| known.is_live());
@@ -196,7 +197,7 @@ impl Principals {
         .collect()
     }
 
-    /// The account by which somebody may sign in.
+    /// Returns the account with which a person may sign in.
     pub fn candidate(&self, name: &str) -> Option<Candidate> {
         let stored = self.stored.read();
         let mut live = stored.accounts.iter().filter(|known| known.is_live());
@@ -210,7 +211,7 @@ impl Principals {
         })
     }
 
-    /// Keeps the hash of the same password that was made anew.
+    /// Stores a new hash of the same password.
     pub fn rehash(&self, candidate: &mut Candidate, password: String) -> Result<(), Error> {
         self.state
             .rehash_password(candidate.id, &candidate.password, &password)?;
@@ -218,8 +219,12 @@ impl Principals {
         Ok(self.reload()?)
     }
 
-    /// Begins a session of whose password was right; none where the account has changed since it was looked at.
-    pub fn begin(&self, candidate: &Candidate, peer: &str) -> Result<Option<Begun>, Error> {
+    /// Starts a session after the password was verified; `None` if the account has changed meanwhile.
+    pub fn begin_session(
+        &self,
+        candidate: &Candidate,
+        peer: &str,
+    ) -> Result<Option<StartedSession>, Error> {
         let secret = names::random(SECRET);
         let hash = tokens::hash(&secret);
         let made = self.state.add_session(
@@ -241,20 +246,20 @@ impl Principals {
         self.reload()?;
         let expires = made.expires;
         let identity = KnownSession::read(made)?.recognise(store::now(), self.lasting)?;
-        Ok(Some(Begun {
+        Ok(Some(StartedSession {
             secret,
             identity,
             expires,
         }))
     }
 
-    /// When a session ends at the latest.
+    /// Returns when a session ends at the latest.
     pub fn session_end(&self, id: i64) -> Option<Millis> {
         let stored = self.stored.read();
-        stored.session_of_id(id).map(|known| known.record.expires)
+        stored.find_session(id).map(|known| known.record.expires)
     }
 
-    /// All sessions that are not over.
+    /// Returns all active sessions.
     pub fn sessions(&self) -> Vec<SessionLine> {
         let now = store::now();
         let stored = self.stored.read();
@@ -282,14 +287,14 @@ impl Principals {
         lines
     }
 
-    /// Ends a session, and connections that were begun with it.
+    /// Ends a session and the connections started with it.
     pub fn end_session(&self, id: i64) -> Result<(), Error> {
         self.state.end_session(id)?;
         Ok(self.reload()?)
     }
 
-    /// Ends that which a browser shows, if it is one.
-    pub fn end_shown(&self, secret: &str) -> Result<(), Error> {
+    /// Ends the session with this secret, if there is one.
+    pub fn end_session_by_secret(&self, secret: &str) -> Result<(), Error> {
         let hash = tokens::hash(secret);
         let id = self
             .stored
@@ -302,35 +307,36 @@ impl Principals {
 
     /// Ends all sessions of a person.
     pub fn end_sessions_of(&self, name: &str) -> Result<(), Error> {
-        self.state.end_sessions_of(name)?;
+        self.state.end_sessions(name)?;
         Ok(self.reload()?)
     }
 
-    /// Refuses what cannot be an account.
+    /// Checks a new account.
     pub fn check_account(&self, new: &NewAccount) -> Result<(), Error> {
         access::principal::check_name(&new.name)
             .map_err(|error| Error::BadRequest(error.to_string()))?;
         if RESERVED.contains(&&*new.name) {
             return Err(Error::BadRequest(format!(
-                "{} is a name that the daemon uses itself; choose another",
+                "{} is a reserved name; choose another",
                 new.name
             )));
         }
         check_role(new.role, &new.services).map_err(Error::BadRequest)?;
-        self.check_name_is_free(&new.name, Named::Account)
+        self.check_name_is_free(&new.name, NameHolder::Account)
     }
 
-    /// Makes an account, by its password's hash.
+    /// Creates an account with the hash of its password.
     pub fn create_account(&self, new: &NewAccount, password: &str) -> Result<(), Error> {
         self.check_account(new)?;
-        let scope = scope(&new.services, &new.name)?;
+        let scope = encode_scope(&new.services, &new.name)?;
         let made = self
             .state
             .add_account(&new.name, password, new.role.name(), &scope)?;
         self.reload()?;
-        match made {
-            true => Ok(()),
-            false => Err(Error::AccountExists(new.name.clone())),
+        if made {
+            Ok(())
+        } else {
+            Err(Error::AccountExists(new.name.clone()))
         }
     }
 
@@ -345,25 +351,26 @@ impl Principals {
         }
     }
 
-    /// Refuses a name that is no account's.
-    pub fn check_known(&self, name: &str) -> Result<(), Error> {
-        match self.accounts().iter().any(|known| known.name == name) {
-            true => Ok(()),
-            false => Err(self.unknown_account(name)),
+    /// Refuses the name of an account that does not exist.
+    pub fn check_account_exists(&self, name: &str) -> Result<(), Error> {
+        if self.accounts().iter().any(|known| known.name == name) {
+            Ok(())
+        } else {
+            Err(self.unknown_account(name))
         }
     }
 
-    /// Changes an account, with the hash of its new password if there is one. All its sessions end.
+    /// Changes an account, including the hash of its password if given. All its sessions end.
     pub fn change_account(
         &self,
         name: &str,
         change: &AccountChange,
         password: Option<&str>,
     ) -> Result<(), Error> {
-        self.check_known(name)?;
+        self.check_account_exists(name)?;
         if change.role.is_none() && !change.services.is_empty() {
             return Err(Error::BadRequest(
-                "services are given with a role; name the role, too".into(),
+                "services need a role; give the role, too".into(),
             ));
         }
         if let Some(role) = change.role {
@@ -371,7 +378,7 @@ impl Principals {
         }
         let scope = change
             .role
-            .map(|_| scope(&change.services, name))
+            .map(|_| encode_scope(&change.services, name))
             .transpose()?;
         let is_known = self.state.edit_account(
             name,

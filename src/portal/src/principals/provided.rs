@@ -1,21 +1,25 @@
-//! People whom an identity provider knows: their names here, and their sessions.
+//! People authenticated by the identity provider: their names here, and their sessions.
 
-use access::principal::provided_name;
+use access::principal::oidc_principal_name;
 use catalogue::names;
-use oidc::{Granted, Person, Roles};
+use oidc::{GrantedRole, Person, Roles};
 use store::NewSession;
 
 use super::Principals;
 use super::changing::SECRET;
-use super::people::{Begun, KnownSession, milliseconds, scope};
+use super::people::{KnownSession, StartedSession, encode_scope, milliseconds};
 use crate::errors::Error;
 use crate::tokens;
 
 impl Principals {
-    /// With people whom this provider knows, by its issuer identifier; without one, none of them has a session any more. Ended are
-    /// sessions that would not begin so today, by the groups that their people had: of another provider, or of other rights.
-    pub fn provided(self, provider: Option<(&str, &Roles)>) -> Result<Principals, store::Error> {
-        let people = self.state.provided_people()?;
+    /// Enables sessions of this provider's people, given its issuer identifier; without one, none of them has a
+    /// session. Ends sessions that would start differently today, judged by the groups that their people had: those
+    /// of another provider or with other permissions.
+    pub fn with_provider(
+        self,
+        provider: Option<(&str, &Roles)>,
+    ) -> Result<Principals, store::Error> {
+        let people = self.state.federated_people()?;
         for session in self.state.sessions()? {
             let Some(id) = session.person else {
                 continue;
@@ -28,17 +32,17 @@ impl Principals {
                 .unwrap_or_default();
             let today = provider
                 .filter(|(issuer, _)| person.is_some_and(|person| person.issuer == *issuer))
-                .and_then(|(_, roles)| roles.of(&groups));
+                .and_then(|(_, roles)| roles.grant_for_groups(&groups));
             let same = match &today {
                 Some(granted) => {
                     granted.role.name() == session.role
-                        && scope(&granted.services, &session.name)? == session.scope
+                        && encode_scope(&granted.services, &session.name)? == session.scope
                 }
                 None => false,
             };
             if !same {
                 tracing::info!(
-                    "the session of {} is ended: by the configuration its rights are others now",
+                    "the session of {} was ended: its rights in the configuration have changed",
                     session.name
                 );
                 self.state.end_session(session.id)?;
@@ -49,18 +53,18 @@ impl Principals {
         Ok(self)
     }
 
-    /// Begins a session of somebody whom the provider knows.
-    pub fn begin_provided(
+    /// Starts a session of a person authenticated by the provider.
+    pub fn begin_provider_session(
         &self,
         issuer: &str,
         person: &Person,
-        granted: &Granted,
+        granted: &GrantedRole,
         peer: &str,
-    ) -> Result<Begun, Error> {
-        let wanted = provided_name(&person.name);
+    ) -> Result<StartedSession, Error> {
+        let wanted = oidc_principal_name(&person.name);
         let known = self
             .state
-            .provided_person(issuer, &person.subject, &wanted)?;
+            .sign_in_federated_person(issuer, &person.subject, &wanted)?;
         let secret = names::random(SECRET);
         let made = self.state.add_session(
             &NewSession {
@@ -68,7 +72,7 @@ impl Principals {
                 account: None,
                 name: &known.name,
                 role: granted.role.name(),
-                scope: &scope(&granted.services, &known.name)?,
+                scope: &encode_scope(&granted.services, &known.name)?,
                 peer,
                 expires: store::now().saturating_add(milliseconds(self.lasting.most)),
                 person: Some((known.id, &serde_json::json!(granted.groups).to_string())),
@@ -79,7 +83,7 @@ impl Principals {
         self.reload()?;
         let expires = made.expires;
         let identity = KnownSession::read(made)?.recognise(store::now(), self.lasting)?;
-        Ok(Begun {
+        Ok(StartedSession {
             secret,
             identity,
             expires,

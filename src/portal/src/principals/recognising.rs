@@ -1,79 +1,84 @@
-//! Looking for a token: in the database, and then among those of the configuration, where guesses are slowed.
+//! Recognising tokens: first those of the database, then those of the configuration, for which guesses are slowed.
 
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use access::{Guesses, Principal};
+use access::{GuessLimiter, Principal};
 use api::Millis;
 use parking_lot::Mutex;
 use store::TokenHash;
 
-use super::people::Lasting;
-use super::{Identity, Shown, Stored, Unrecognised};
+use super::people::SessionLifetimes;
+use super::{AuthenticationError, CallerIdentity, Credential, StoredPrincipals};
 use crate::tokens::{self, Tokens};
 
-/// By what tokens are recognised.
+/// Current credentials, by which tokens are recognised.
 #[derive(Clone, Copy)]
-pub struct Recognising<'a> {
+pub struct Recogniser<'a> {
     /// Tokens of the configuration.
     pub tokens: &'a Tokens,
     /// Tokens of the database.
-    pub stored: &'a Stored,
-    /// What was guessed, by address.
-    pub guesses: &'a Mutex<Guesses>,
-    /// How long sessions last.
-    pub lasting: Lasting,
+    pub stored: &'a StoredPrincipals,
+    /// Limiter for guesses, by address.
+    pub guesses: &'a Mutex<GuessLimiter>,
+    /// Lifetimes of sessions.
+    pub lasting: SessionLifetimes,
 }
 
-impl Recognising<'_> {
-    /// Whose token it is, that came from an address.
+impl Recogniser<'_> {
+    /// Identifies the caller by a token that came from an address.
     pub fn recognise(
         &self,
         token: &str,
         from: IpAddr,
         now: Millis,
-    ) -> Result<Identity, Unrecognised> {
-        self.by(token, from, now, || self.tokens.recognise(token))
+    ) -> Result<CallerIdentity, AuthenticationError> {
+        self.recognise_with(token, from, now, || self.tokens.recognise(token))
     }
 
-    /// Whose session it is that a browser shows. Nobody guesses one: they are looked for always.
-    pub fn recognise_session(&self, secret: &str, now: Millis) -> Result<Identity, Unrecognised> {
+    /// Identifies the caller by the session secret of a browser. Session secrets cannot be guessed, so they are
+    /// always looked up.
+    pub fn recognise_session(
+        &self,
+        secret: &str,
+        now: Millis,
+    ) -> Result<CallerIdentity, AuthenticationError> {
         let hash = tokens::hash(secret);
         self.stored.recognise_session(&hash, now, self.lasting)
     }
 
-    /// Looks for a token in the database and then, with `configured`, among those of the configuration. The former cannot be
-    /// guessed, and are looked for always: who has one is not held up by whoever guesses at the same address. The latter
-    /// people choose.
-    pub(super) fn by(
+    /// Looks for a token in the database and then, with `configured`, in the configuration. The former cannot be
+    /// guessed and are always looked up, so that their owners are not held up by somebody guessing from the same
+    /// address. The latter are chosen by people.
+    pub(super) fn recognise_with(
         &self,
         token: &str,
         from: IpAddr,
         now: Millis,
         configured: impl FnOnce() -> Option<TokenHash>,
-    ) -> Result<Identity, Unrecognised> {
+    ) -> Result<CallerIdentity, AuthenticationError> {
         if let Some(identity) = self.stored.recognise(&tokens::hash(token), now)? {
             return Ok(identity);
         }
         let mut guesses = self.guesses.lock();
-        guesses.ask(from, now).map_err(Unrecognised::Slowed)?;
+        guesses
+            .check(from, now)
+            .map_err(AuthenticationError::Slowed)?;
         if let Some(hash) = configured() {
-            return Ok(of_configuration(hash));
+            return Ok(configured_identity(hash));
         }
-        if let Some(wait) = guesses.failed(from, now) {
+        if let Some(wait) = guesses.record_failure(from, now) {
             let seconds = wait.div_ceil(1000);
-            tracing::warn!(
-                "tokens that are not known come from {from}: for {seconds} s none is looked at"
-            );
+            tracing::warn!("too many unknown tokens from {from}: none is checked for {seconds} s");
         }
-        Err(Unrecognised::Unknown)
+        Err(AuthenticationError::Unknown)
     }
 }
 
-fn of_configuration(hash: TokenHash) -> Identity {
-    Identity {
+fn configured_identity(hash: TokenHash) -> CallerIdentity {
+    CallerIdentity {
         principal: Arc::new(Principal::admin("configured")),
-        shown: Shown::Configured,
+        shown: Credential::Configured,
         owner: Some(hash.clone()),
         token: Some(hash),
     }

@@ -1,98 +1,112 @@
-//! How connections stand: whether what they were begun with still holds, and what they may do. Whoever follows hears of changes
-//! at once.
+//! Access of open connections: whether their credential is still valid, and what they may do. Followers are notified
+//! of changes at once.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use access::{Grants, Policy, Standing};
+use access::{AccessPolicy, ConnectionAccess, Grants};
 use api::Millis;
 use tokio::sync::watch;
 
-use super::{Identity, Principals, Shown};
-use crate::inside::Part;
+use super::{CallerIdentity, Credential, Principals};
+use crate::inside::InsideRole;
 
-/// How often it is looked whether a token has expired: no more, and no less, often.
+/// Bounds on the interval at which expiry is checked.
 const SOONEST: Duration = Duration::from_millis(10);
 const LATEST: Duration = Duration::from_secs(60);
 
 impl Principals {
-    /// How a connection of somebody to a service stands.
-    pub fn standing(&self, who: &Identity, service: &str) -> Standing {
-        self.stands(who, |policy| policy.grants(&who.principal, service))
+    /// Returns the access of a connection to a service.
+    pub fn connection_access(&self, who: &CallerIdentity, service: &str) -> ConnectionAccess {
+        self.compute_access(who, |policy| policy.grants(&who.principal, service))
     }
 
-    /// How a connection of somebody who looks into a servant of a service stands.
-    pub fn standing_inside(&self, who: &Identity, service: &str, part: Part) -> Standing {
-        self.stands(who, |policy| match part {
-            Part::Acts => policy.grants(&who.principal, service),
-            Part::Looks => policy.hearing(&who.principal, service),
+    /// Returns the access of a connection that looks into a servant of a service.
+    pub fn inside_access(
+        &self,
+        who: &CallerIdentity,
+        service: &str,
+        part: InsideRole,
+    ) -> ConnectionAccess {
+        self.compute_access(who, |policy| match part {
+            InsideRole::Acts => policy.grants(&who.principal, service),
+            InsideRole::Looks => policy.observer_grants(&who.principal, service),
         })
     }
 
-    fn stands(&self, who: &Identity, grants: impl FnOnce(&Policy) -> Grants) -> Standing {
+    fn compute_access(
+        &self,
+        who: &CallerIdentity,
+        grants: impl FnOnce(&AccessPolicy) -> Grants,
+    ) -> ConnectionAccess {
         let stored = self.stored.read();
         let over = match &who.shown {
-            Shown::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
-                Some("a token is needed since the first was made".to_owned())
+            Credential::Nothing if !(self.configured.is_empty() && stored.is_empty()) => {
+                Some("a token is required since the first one was created".to_owned())
             }
-            Shown::Stored { id, hash } => match stored.of_id(*id) {
+            Credential::Stored { id, hash } => match stored.find_token(*id) {
                 Some(known) if known.hash == *hash => {
-                    known.over(store::now()).map(|over| over.to_string())
+                    known.refusal(store::now()).map(|over| over.to_string())
                 }
-                _ => Some("this token was replaced by another".to_owned()),
+                _ => Some("this token was replaced by a new one".to_owned()),
             },
-            Shown::Certificate { pairing, until, .. } => {
-                let over = stored.pairing_over(*pairing, *until, store::now());
+            Credential::Certificate { pairing, until, .. } => {
+                let over = stored.pairing_refusal(*pairing, *until, store::now());
                 over.map(|over| over.to_string())
             }
-            // A connection is no request: it stays for as long as the session may last at most.
-            Shown::Session { id } => match stored.session_of_id(*id) {
+            // A connection is not a request: it may stay open for the session's maximum lifetime.
+            Credential::Session { id } => match stored.find_session(*id) {
                 Some(known) if known.record.expires > store::now() => None,
-                Some(_) => Some("this session is over".to_owned()),
+                Some(_) => Some("this session has ended".to_owned()),
                 None => Some("this session was ended".to_owned()),
             },
-            Shown::Nothing | Shown::Configured | Shown::User => None,
+            Credential::Nothing | Credential::Configured | Credential::User => None,
         };
         match over {
-            Some(reason) => Standing::Ended(reason),
-            None => Standing::Granted(Arc::new(grants(&stored.policy))),
+            Some(reason) => ConnectionAccess::Ended(reason),
+            None => ConnectionAccess::Granted(Arc::new(grants(&stored.policy))),
         }
     }
 
-    /// Until when somebody's token or session is good.
-    pub(super) fn expiry(&self, who: &Identity) -> Option<Millis> {
+    /// Returns when the caller's credential expires.
+    pub(super) fn expiry(&self, who: &CallerIdentity) -> Option<Millis> {
         let stored = self.stored.read();
         match who.shown {
-            Shown::Stored { id, .. } => stored.of_id(id)?.expires,
-            Shown::Session { id } => Some(stored.session_of_id(id)?.record.expires),
-            Shown::Certificate { pairing, until, .. } => stored.pairing_end(pairing, until),
+            Credential::Stored { id, .. } => stored.find_token(id)?.expires,
+            Credential::Session { id } => Some(stored.find_session(id)?.record.expires),
+            Credential::Certificate { pairing, until, .. } => stored.pairing_end(pairing, until),
             _ => None,
         }
     }
 
-    /// Tells `standing` whenever that of a connection changes; never comes back.
-    pub async fn follow(&self, who: &Identity, service: &str, standing: &watch::Sender<Standing>) {
-        self.follows(who, || self.standing(who, service), standing)
-            .await;
-    }
-
-    /// The same of a connection of somebody who looks into a servant.
-    pub async fn follow_inside(
+    /// Updates `standing` whenever the access of a connection changes; never returns.
+    pub async fn follow_access(
         &self,
-        who: &Identity,
+        who: &CallerIdentity,
         service: &str,
-        part: Part,
-        standing: &watch::Sender<Standing>,
+        standing: &watch::Sender<ConnectionAccess>,
     ) {
-        self.follows(who, || self.standing_inside(who, service, part), standing)
+        self.watch_access(who, || self.connection_access(who, service), standing)
             .await;
     }
 
-    async fn follows(
+    /// Updates `standing` whenever the access of a connection that looks into a servant changes; never returns.
+    pub async fn follow_inside_access(
         &self,
-        who: &Identity,
-        stands: impl Fn() -> Standing + Send,
-        standing: &watch::Sender<Standing>,
+        who: &CallerIdentity,
+        service: &str,
+        part: InsideRole,
+        standing: &watch::Sender<ConnectionAccess>,
+    ) {
+        self.watch_access(who, || self.inside_access(who, service, part), standing)
+            .await;
+    }
+
+    async fn watch_access(
+        &self,
+        who: &CallerIdentity,
+        stands: impl Fn() -> ConnectionAccess + Send,
+        standing: &watch::Sender<ConnectionAccess>,
     ) {
         let mut changed = self.changed.subscribe();
         loop {
@@ -106,11 +120,11 @@ impl Principals {
             let expires = async {
                 let ends = self
                     .expiry(who)
-                    .filter(|_| matches!(now, Standing::Granted(_)));
+                    .filter(|_| matches!(now, ConnectionAccess::Granted(_)));
                 let Some(end) = ends else {
                     return std::future::pending().await;
                 };
-                // The clock may be set meanwhile, or the machine have slept: it is looked at again.
+                // Checked again, because the clock may be set meanwhile or the machine may have slept.
                 let left = Duration::from_millis(end.saturating_sub(store::now()));
                 tokio::time::sleep(left.clamp(SOONEST, LATEST)).await;
             };
@@ -121,18 +135,20 @@ impl Principals {
         }
     }
 
-    /// Comes back with the reason when a connection of somebody to a service is to end. `whole`: what serves it needs
-    /// everything granted.
-    pub async fn ended(&self, who: &Identity, service: &str, whole: bool) -> String {
-        let (standing, mut told) = watch::channel(self.standing(who, service));
+    /// Waits until a connection to a service must be closed and returns the reason. With `whole`, the connection
+    /// needs all operations granted.
+    pub async fn wait_for_end(&self, who: &CallerIdentity, service: &str, whole: bool) -> String {
+        let (standing, mut told) = watch::channel(self.connection_access(who, service));
         let reason = async {
             loop {
                 match &*told.borrow_and_update() {
-                    Standing::Ended(reason) => return reason.clone(),
-                    Standing::Granted(grants) if whole && !grants.is_everything() => {
-                        return format!("a stub needs all of {service}, and is granted {grants}");
+                    ConnectionAccess::Ended(reason) => return reason.clone(),
+                    ConnectionAccess::Granted(grants) if whole && !grants.is_everything() => {
+                        return format!(
+                            "a stub needs all of {service}, but is granted only {grants}"
+                        );
                     }
-                    Standing::Granted(_) => {}
+                    ConnectionAccess::Granted(_) => {}
                 }
                 if told.changed().await.is_err() {
                     std::future::pending().await
@@ -141,7 +157,7 @@ impl Principals {
         };
         tokio::select! {
             reason = reason => reason,
-            () = self.follow(who, service, &standing) => std::future::pending().await,
+            () = self.follow_access(who, service, &standing) => std::future::pending().await,
         }
     }
 }

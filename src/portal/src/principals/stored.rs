@@ -1,19 +1,19 @@
-//! Tokens and rules, read from the database: in memory, for each request asks for them.
+//! Credentials and rules of the database, cached in memory because every request needs them.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use access::{Glob, Policy, Principal, Role, Rule, Scope};
+use access::{AccessPolicy, AccessRule, Glob, Principal, Role, Scope};
 use api::Millis;
 use serde::{Deserialize, Serialize};
 use store::{Owner, RuleRecord, State, TokenHash, TokenRecord};
 
-use super::pairings::{self, Paired};
-use super::people::{KnownAccount, KnownSession, Lasting};
-use super::{Identity, Shown, Unrecognised};
+use super::pairings::{self, StoredPairing};
+use super::people::{KnownAccount, KnownSession, SessionLifetimes};
+use super::{AuthenticationError, CallerIdentity, Credential};
 
-/// What the store keeps of a token beside its role.
+/// Scope of a token as stored in the database, besides its role.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct StoredScope {
     pub(super) services: Vec<Glob>,
@@ -24,7 +24,7 @@ pub(super) struct StoredScope {
 }
 
 /// A token of the database, in memory.
-pub(super) struct Known {
+pub(super) struct KnownToken {
     pub(super) id: i64,
     pub(super) hash: TokenHash,
     pub(super) principal: Arc<Principal>,
@@ -34,8 +34,9 @@ pub(super) struct Known {
     pub(super) revoked: Option<Millis>,
 }
 
-impl Known {
-    /// Whose robots' names are that it uses: a robot's token has its robot's name, and other tokens of that robot, too.
+impl KnownToken {
+    /// Returns the owner of robot names used with the token: a robot's token owns its robot's name, as do other
+    /// tokens of that robot.
     pub(super) fn owner(&self) -> Owner {
         match &self.principal.scope.robot {
             Some(robot) => format!("robot:{robot}"),
@@ -43,16 +44,16 @@ impl Known {
         }
     }
 
-    /// Why it is not good any more.
-    pub(super) fn over(&self, now: Millis) -> Option<Unrecognised> {
+    /// Returns why the token is not valid any more, if so.
+    pub(super) fn refusal(&self, now: Millis) -> Option<AuthenticationError> {
         if self.revoked.is_some() {
-            return Some(Unrecognised::Revoked);
+            return Some(AuthenticationError::Revoked);
         }
         let end = self.expires.filter(|end| *end <= now);
-        end.map(|_| Unrecognised::Expired)
+        end.map(|_| AuthenticationError::Expired)
     }
 
-    pub(super) fn view(&self) -> api::access::Token {
+    pub(super) fn to_api_token(&self) -> api::access::Token {
         let Principal { name, roles, scope } = &*self.principal;
         let last = self.last_used.load(Ordering::Relaxed);
         api::access::Token {
@@ -69,32 +70,32 @@ impl Known {
     }
 }
 
-/// The tokens, accounts and sessions of the database, and the policy.
+/// Tokens, accounts and sessions of the database, and the policy.
 #[derive(Default)]
-pub struct Stored {
-    pub(super) tokens: Vec<Known>,
-    pub(super) pairings: Vec<Paired>,
-    /// Places in `tokens`.
+pub struct StoredPrincipals {
+    pub(super) tokens: Vec<KnownToken>,
+    pub(super) pairings: Vec<StoredPairing>,
+    /// Indices into `tokens`.
     by_hash: HashMap<TokenHash, usize>,
     pub(super) accounts: Vec<KnownAccount>,
-    /// By the hash of what their browsers show.
+    /// By the hash of the browser's secret.
     pub(super) sessions: HashMap<TokenHash, KnownSession>,
-    /// Whether an identity provider names people, or did.
+    /// True if an identity provider is or was configured.
     pub(super) names_provider: bool,
-    pub(super) rules: Vec<(i64, Rule)>,
-    pub(super) policy: Policy,
+    pub(super) rules: Vec<(i64, AccessRule)>,
+    pub(super) policy: AccessPolicy,
 }
 
-pub(super) fn damaged(what: String) -> impl FnOnce(serde_json::Error) -> store::Error {
+pub(super) fn record_error(what: String) -> impl FnOnce(serde_json::Error) -> store::Error {
     move |source| store::Error::Record { what, source }
 }
 
 fn read_text<T: serde::de::DeserializeOwned>(text: &str, what: &str) -> Result<T, store::Error> {
     let value = serde_json::Value::String(text.to_owned());
-    serde_json::from_value(value).map_err(damaged(what.to_owned()))
+    serde_json::from_value(value).map_err(record_error(what.to_owned()))
 }
 
-/// Whose record it is.
+/// Builds the principal of a record.
 pub(super) fn read_principal(
     name: &str,
     role: &str,
@@ -103,14 +104,15 @@ pub(super) fn read_principal(
 ) -> Result<Principal, store::Error> {
     let what = format!("{kind} {name}");
     let role: Role = read_text(role, &what)?;
-    let scope: StoredScope = serde_json::from_str(scope).map_err(damaged(what))?;
-    let scope = match role.is_scoped() {
-        true => Scope {
+    let scope: StoredScope = serde_json::from_str(scope).map_err(record_error(what))?;
+    let scope = if role.is_scoped() {
+        Scope {
             services: scope.services,
             robot: scope.robot,
             classes: scope.classes,
-        },
-        false => Scope::everything(),
+        }
+    } else {
+        Scope::everything()
     };
     Ok(Principal {
         name: name.to_owned(),
@@ -119,9 +121,9 @@ pub(super) fn read_principal(
     })
 }
 
-pub(super) fn read_token(record: TokenRecord) -> Result<Known, store::Error> {
+pub(super) fn read_token(record: TokenRecord) -> Result<KnownToken, store::Error> {
     let principal = read_principal(&record.name, &record.role, &record.scope, "token")?;
-    Ok(Known {
+    Ok(KnownToken {
         id: record.id,
         hash: record.hash,
         principal: Arc::new(principal),
@@ -132,19 +134,19 @@ pub(super) fn read_token(record: TokenRecord) -> Result<Known, store::Error> {
     })
 }
 
-fn read_rule(record: RuleRecord) -> Result<(i64, Rule), store::Error> {
+fn read_rule(record: RuleRecord) -> Result<(i64, AccessRule), store::Error> {
     let what = format!("rule {}", record.id);
-    let rule = Rule {
+    let rule = AccessRule {
         who: read_text(&record.who, &what)?,
         services: read_text(&record.services, &what)?,
-        allow: serde_json::from_str(&record.allow).map_err(damaged(what))?,
+        allow: serde_json::from_str(&record.allow).map_err(record_error(what))?,
     };
     Ok((record.id, rule))
 }
 
-impl Stored {
-    /// What a database holds.
-    pub fn read(state: &State) -> Result<Stored, store::Error> {
+impl StoredPrincipals {
+    /// Loads everything from a database.
+    pub fn load(state: &State) -> Result<StoredPrincipals, store::Error> {
         let tokens = state
             .tokens()?
             .into_iter()
@@ -153,7 +155,7 @@ impl Stored {
         let pairings = state
             .pairings()?
             .into_iter()
-            .map(pairings::read)
+            .map(pairings::read_pairing)
             .collect::<Result<Vec<_>, _>>()?;
         let accounts = state.accounts()?.into_iter().map(KnownAccount::read);
         let sessions = state.sessions()?.into_iter().map(|record| {
@@ -165,25 +167,25 @@ impl Stored {
             .into_iter()
             .map(read_rule)
             .collect::<Result<Vec<_>, _>>()?;
-        Ok(Stored {
+        Ok(StoredPrincipals {
             by_hash: tokens
                 .iter()
                 .enumerate()
                 .map(|(at, known)| (known.hash.clone(), at))
                 .collect(),
-            policy: Policy {
+            policy: AccessPolicy {
                 rules: rules.iter().map(|(_, rule)| rule.clone()).collect(),
             },
             accounts: accounts.collect::<Result<_, store::Error>>()?,
             sessions: sessions.collect::<Result<_, store::Error>>()?,
-            names_provider: !state.provided_people()?.is_empty(),
+            names_provider: !state.federated_people()?.is_empty(),
             tokens,
             pairings,
             rules,
         })
     }
 
-    /// Whether there never was a token, nor an account, nor a robot that is paired, nor an identity provider.
+    /// Returns true if there never was a token, an account, a paired robot or an identity provider.
     pub fn is_empty(&self) -> bool {
         self.tokens.is_empty()
             && self.accounts.is_empty()
@@ -191,38 +193,38 @@ impl Stored {
             && !self.names_provider
     }
 
-    /// Whose session it is, by the hash of what is shown.
+    /// Identifies the caller by the hash of a session's secret.
     pub(super) fn recognise_session(
         &self,
         hash: &str,
         now: Millis,
-        lasting: Lasting,
-    ) -> Result<Identity, Unrecognised> {
+        lasting: SessionLifetimes,
+    ) -> Result<CallerIdentity, AuthenticationError> {
         let known = self.sessions.get(hash);
-        known.map_or(Err(Unrecognised::SessionOver), |known| {
+        known.map_or(Err(AuthenticationError::SessionOver), |known| {
             known.recognise(now, lasting)
         })
     }
 
-    pub(super) fn session_of_id(&self, id: i64) -> Option<&KnownSession> {
+    pub(super) fn find_session(&self, id: i64) -> Option<&KnownSession> {
         self.sessions.values().find(|known| known.record.id == id)
     }
 
-    /// Whose token it is, by its hash.
+    /// Identifies the caller by the hash of a token.
     pub(super) fn recognise(
         &self,
         hash: &str,
         now: Millis,
-    ) -> Result<Option<Identity>, Unrecognised> {
+    ) -> Result<Option<CallerIdentity>, AuthenticationError> {
         let Some(known) = self.by_hash.get(hash).map(|at| &self.tokens[*at]) else {
             return Ok(None);
         };
-        if let Some(reason) = known.over(now) {
+        if let Some(reason) = known.refusal(now) {
             return Err(reason);
         }
-        Ok(Some(Identity {
+        Ok(Some(CallerIdentity {
             principal: Arc::clone(&known.principal),
-            shown: Shown::Stored {
+            shown: Credential::Stored {
                 id: known.id,
                 hash: known.hash.clone(),
             },
@@ -231,7 +233,7 @@ impl Stored {
         }))
     }
 
-    pub(super) fn of_id(&self, id: i64) -> Option<&Known> {
+    pub(super) fn find_token(&self, id: i64) -> Option<&KnownToken> {
         self.tokens.iter().find(|known| known.id == id)
     }
 }

@@ -1,4 +1,4 @@
-use access::{Grant, Operation, Role, Standing};
+use access::{ConnectionAccess, Grant, Operation, Role};
 use api::access::{NewRule, NewToken};
 
 use super::changing::SECRET;
@@ -22,9 +22,9 @@ fn world(configured: &[&str]) -> World {
     }
 }
 
-fn recognised(principals: &Principals, token: &str) -> Result<Identity, Unrecognised> {
+fn recognise(principals: &Principals, token: &str) -> Result<CallerIdentity, AuthenticationError> {
     let here = IpAddr::from([127, 0, 0, 1]);
-    principals.with(|known| known.recognise(token, here, store::now()))
+    principals.with_recogniser(|known| known.recognise(token, here, store::now()))
 }
 
 fn robot(name: &str) -> NewToken {
@@ -38,65 +38,77 @@ fn robot(name: &str) -> NewToken {
     }
 }
 
-fn permits(standing: &Standing, operation: Operation, name: &str) -> bool {
+fn permits(standing: &ConnectionAccess, operation: Operation, name: &str) -> bool {
     match standing {
-        Standing::Granted(grants) => grants.permits(operation, name),
-        Standing::Ended(_) => false,
+        ConnectionAccess::Granted(grants) => grants.permits(operation, name),
+        ConnectionAccess::Ended(_) => false,
     }
 }
 
 #[test]
 fn a_token_is_good_until_it_is_revoked_or_rotated() {
     let World { principals, _home } = world(&[]);
-    assert!(principals.names_nobody());
-    let made = principals.create(&robot("rover")).expect("made");
-    assert!(!principals.names_nobody());
+    assert!(principals.has_no_credentials());
+    let made = principals.create_token(&robot("rover")).expect("made");
+    assert!(!principals.has_no_credentials());
     assert_eq!(made.secret.len(), SECRET);
     let listed = serde_json::to_string(&principals.tokens()).expect("JSON");
     assert!(!listed.contains(&made.secret) && !listed.contains(&tokens::hash(&made.secret)));
-    let who = recognised(&principals, &made.secret).expect("known");
+    let who = recognise(&principals, &made.secret).expect("known");
     assert_eq!(
         (&*who.principal.name, who.owner.as_deref()),
         ("rover", Some("robot:r1"))
     );
-    principals.note_use(&who, store::now());
+    principals.record_use(&who, store::now());
     assert!(principals.tokens()[0].last_used.is_some());
     let earlier = who.clone();
-    let rotated = principals.rotate("rover").expect("there");
+    let rotated = principals.rotate_token("rover").expect("there");
     assert_eq!(
-        recognised(&principals, &made.secret),
-        Err(Unrecognised::Unknown)
+        recognise(&principals, &made.secret),
+        Err(AuthenticationError::Unknown)
     );
-    let ended = principals.standing(&who, "detector");
+    let ended = principals.connection_access(&who, "detector");
     assert_eq!(
         ended,
-        Standing::Ended("this token was replaced by another".into())
+        ConnectionAccess::Ended("this token was replaced by a new one".into())
     );
-    let who = recognised(&principals, &rotated.secret).expect("known");
+    let who = recognise(&principals, &rotated.secret).expect("known");
     assert!(permits(
-        &principals.standing(&who, "detector"),
+        &principals.connection_access(&who, "detector"),
         Operation::Publish,
         "/x"
     ));
-    // What it left behind is still its own.
-    assert_eq!(who.bound_by(), earlier.bound_by());
-    principals.revoke("rover").expect("there");
+    // Its resume tokens remain its own.
+    assert_eq!(who.resume_binding(), earlier.resume_binding());
+    principals.revoke_token("rover").expect("there");
     assert_eq!(
-        recognised(&principals, &rotated.secret),
-        Err(Unrecognised::Revoked)
+        recognise(&principals, &rotated.secret),
+        Err(AuthenticationError::Revoked)
     );
-    let ended = principals.standing(&who, "detector");
-    assert_eq!(ended, Standing::Ended("this token was revoked".into()));
-    assert!(!principals.names_nobody(), "the door does not open again");
-    let next = principals.create(&robot("rover")).expect("made").secret;
-    let next = recognised(&principals, &next).expect("known");
+    let ended = principals.connection_access(&who, "detector");
+    assert_eq!(
+        ended,
+        ConnectionAccess::Ended("this token was revoked".into())
+    );
+    assert!(
+        !principals.has_no_credentials(),
+        "the door does not open again"
+    );
+    let next = principals
+        .create_token(&robot("rover"))
+        .expect("made")
+        .secret;
+    let next = recognise(&principals, &next).expect("known");
     assert_ne!(
-        next.bound_by(),
-        earlier.bound_by(),
+        next.resume_binding(),
+        earlier.resume_binding(),
         "another's, of the same name"
     );
-    principals.revoke("rover").expect("there");
-    let unknown = principals.revoke("rover").expect_err("once").problem();
+    principals.revoke_token("rover").expect("there");
+    let unknown = principals
+        .revoke_token("rover")
+        .expect_err("once")
+        .problem();
     assert_eq!(unknown.status, 404);
 }
 
@@ -104,7 +116,7 @@ fn a_token_is_good_until_it_is_revoked_or_rotated() {
 fn a_token_ends_at_its_time() {
     let World { principals, _home } = world(&[]);
     let secret = principals
-        .create(&NewToken {
+        .create_token(&NewToken {
             lifetime: Some(60),
             ..robot("rover")
         })
@@ -114,17 +126,20 @@ fn a_token_ends_at_its_time() {
     let end = principals.tokens()[0].expires.expect("an end");
     let stored = principals.stored.read();
     assert!(stored.recognise(&hash, end - 1).expect("good").is_some());
-    assert_eq!(stored.recognise(&hash, end), Err(Unrecognised::Expired));
+    assert_eq!(
+        stored.recognise(&hash, end),
+        Err(AuthenticationError::Expired)
+    );
 }
 
 #[test]
 fn tokens_of_the_configuration_are_admins() {
     let World { principals, _home } = world(&["open sesame"]);
-    let who = recognised(&principals, "open sesame").expect("known");
-    assert!(who.principal.is(Role::Admin));
+    let who = recognise(&principals, "open sesame").expect("known");
+    assert!(who.principal.has_role(Role::Admin));
     assert_eq!(who.owner, Some(tokens::hash("open sesame")));
     assert!(permits(
-        &principals.standing(&who, "any"),
+        &principals.connection_access(&who, "any"),
         Operation::Call,
         "/x"
     ));
@@ -133,31 +148,41 @@ fn tokens_of_the_configuration_are_admins() {
 #[test]
 fn who_guesses_is_slowed_and_who_has_a_token_of_the_database_is_not() {
     let World { principals, _home } = world(&["open sesame"]);
-    let made = principals.create(&robot("rover")).expect("made").secret;
-    let revoked = principals.create(&robot("over")).expect("made").secret;
-    principals.revoke("over").expect("there");
+    let made = principals
+        .create_token(&robot("rover"))
+        .expect("made")
+        .secret;
+    let revoked = principals
+        .create_token(&robot("over"))
+        .expect("made")
+        .secret;
+    principals.revoke_token("over").expect("there");
     let (here, there) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
-    let shows = |token: &str, from| principals.with(|known| known.recognise(token, from, 5_000));
-    // What was good once is no guess.
+    let shows =
+        |token: &str, from| principals.with_recogniser(|known| known.recognise(token, from, 5_000));
+    // A revoked token does not count as a guess.
     for _ in 0..2 * access::guesses::FREE {
-        assert_eq!(shows(&revoked, here), Err(Unrecognised::Revoked));
+        assert_eq!(shows(&revoked, here), Err(AuthenticationError::Revoked));
     }
     for number in 0..access::guesses::FREE {
         assert_eq!(
             shows(&format!("guess {number}"), here),
-            Err(Unrecognised::Unknown)
+            Err(AuthenticationError::Unknown)
         );
     }
     for token in ["guess", "open sesame"] {
         assert_eq!(
             shows(token, here),
-            Err(Unrecognised::Slowed(1_000)),
+            Err(AuthenticationError::Slowed(1_000)),
             "{token}"
         );
     }
     assert!(shows(&made, here).is_ok() && shows("open sesame", there).is_ok());
-    assert_eq!(principals.guessed(), (u64::from(access::guesses::FREE), 2));
-    // By rosbridge's message they count alike.
+    assert_eq!(
+        principals.token_counts(),
+        (u64::from(access::guesses::FREE), 2)
+    );
+    // rosbridge's auth messages count in the same way.
     let message = |mac: &str| -> AuthMessage {
         serde_json::from_value(serde_json::json!({"mac": mac})).expect("a message")
     };
@@ -172,7 +197,7 @@ fn who_guesses_is_slowed_and_who_has_a_token_of_the_database_is_not() {
         );
     }
     let refused = principals.recognise_auth(&message("open sesame"), far, 0.0);
-    assert!(refused.expect_err("slowed").contains("none is looked at"));
+    assert!(refused.expect_err("slowed").contains("are not checked"));
     principals
         .recognise_auth(&message(&made), far, 0.0)
         .expect("known");
@@ -187,14 +212,14 @@ fn what_cannot_be_a_token_is_refused_with_words() {
                 name: "a b".into(),
                 ..robot("x")
             },
-            "is no name",
+            "is not a valid name",
         ),
         (
             NewToken {
                 name: "root".into(),
                 ..robot("x")
             },
-            "uses itself",
+            "is a reserved name",
         ),
         (
             NewToken {
@@ -222,7 +247,7 @@ fn what_cannot_be_a_token_is_refused_with_words() {
                 role: Role::Viewer,
                 ..robot("x")
             },
-            "--robot is for",
+            "--robot is only for",
         ),
         (
             NewToken {
@@ -237,7 +262,7 @@ fn what_cannot_be_a_token_is_refused_with_words() {
                 lifetime: Some(0),
                 ..robot("x")
             },
-            "ends at once",
+            "expires at once",
         ),
         (
             NewToken {
@@ -248,17 +273,17 @@ fn what_cannot_be_a_token_is_refused_with_words() {
         ),
     ];
     for (new, words) in table {
-        let refused = principals.create(&new).expect_err(words).problem();
+        let refused = principals.create_token(&new).expect_err(words).problem();
         assert!(
             refused.status == 400 && refused.detail.contains(words),
             "{words}: {refused:?}"
         );
     }
-    assert!(principals.names_nobody(), "none of them was made");
-    principals.create(&robot("x")).expect("made");
+    assert!(principals.has_no_credentials(), "none of them was made");
+    principals.create_token(&robot("x")).expect("made");
     assert_eq!(
         principals
-            .create(&robot("x"))
+            .create_token(&robot("x"))
             .expect_err("taken")
             .problem()
             .status,
@@ -269,9 +294,12 @@ fn what_cannot_be_a_token_is_refused_with_words() {
 #[tokio::test]
 async fn whoever_follows_hears_of_changes_of_the_policy_and_of_the_end() {
     let World { principals, _home } = world(&[]);
-    let secret = principals.create(&robot("rover")).expect("made").secret;
-    let who = recognised(&principals, &secret).expect("known");
-    let (sender, mut standing) = watch::channel(principals.standing(&who, "detector"));
+    let secret = principals
+        .create_token(&robot("rover"))
+        .expect("made")
+        .secret;
+    let who = recognise(&principals, &secret).expect("known");
+    let (sender, mut standing) = watch::channel(principals.connection_access(&who, "detector"));
     let change = async {
         let grant: Grant = "subscribe:/camera/**".parse().expect("a grant");
         let rule = NewRule {
@@ -286,15 +314,18 @@ async fn whoever_follows_hears_of_changes_of_the_policy_and_of_the_end() {
             permits(&now, Operation::Subscribe, "/camera/x")
                 && !permits(&now, Operation::Publish, "/x")
         );
-        let whole = principals.ended(&who, "detector", true).await;
+        let whole = principals.wait_for_end(&who, "detector", true).await;
         assert!(whole.contains("a stub needs all of detector"), "{whole}");
-        principals.revoke("rover").expect("there");
+        principals.revoke_token("rover").expect("there");
         standing.changed().await.expect("followed");
         let ended = standing.borrow_and_update().clone();
-        assert_eq!(ended, Standing::Ended("this token was revoked".into()));
+        assert_eq!(
+            ended,
+            ConnectionAccess::Ended("this token was revoked".into())
+        );
     };
     tokio::select! {
-        () = principals.follow(&who, "detector", &sender) => {}
+        () = principals.follow_access(&who, "detector", &sender) => {}
         () = change => {}
     }
 }
@@ -302,20 +333,20 @@ async fn whoever_follows_hears_of_changes_of_the_policy_and_of_the_end() {
 #[test]
 fn this_machines_users_need_a_token_once_there_is_one() {
     let World { principals, _home } = world(&[]);
-    let local = Identity {
+    let local = CallerIdentity {
         principal: Arc::new(Principal::local()),
-        shown: Shown::Nothing,
+        shown: Credential::Nothing,
         token: None,
         owner: None,
     };
     assert!(permits(
-        &principals.standing(&local, "any"),
+        &principals.connection_access(&local, "any"),
         Operation::Publish,
         "/x"
     ));
-    principals.create(&robot("rover")).expect("made");
+    principals.create_token(&robot("rover")).expect("made");
     assert!(matches!(
-        principals.standing(&local, "any"),
-        Standing::Ended(_)
+        principals.connection_access(&local, "any"),
+        ConnectionAccess::Ended(_)
     ));
 }

@@ -1,23 +1,24 @@
-//! The matrix of `docs/access.md`: who is answered at which address. It is computed from the table of routes and the policy, and
+//! The matrix of `docs/access.md`: who may use which address. Computed from the route table and the policy, and
 //! compared with the document; stories walk it.
 
-use ::access::{Action, Object, Principal, Role, Scope, decide};
+use ::access::{AccessAction, AccessObject, Principal, Role, Scope, decide};
 
-use super::{Access, Of, ROUTES, Route};
-use crate::allowed::at_robot;
+use super::{Access, AccessTarget, ROUTES, Route};
+use crate::allowed::check_robot;
 
-/// The principals of its columns, each for the service `mine` and, a robot, itself.
+/// Principals of the columns, each for the service `mine`; a robot is `me`.
 fn columns() -> Vec<(&'static str, Principal)> {
     let of = |role: Role| Principal {
         name: "me".into(),
         roles: vec![role],
-        scope: match role.is_scoped() {
-            false => Scope::everything(),
-            true => Scope {
+        scope: if role.is_scoped() {
+            Scope {
                 services: "mine".parse().into_iter().collect(),
                 robot: (role == Role::Robot).then(|| "me".to_owned()),
                 classes: Vec::new(),
-            },
+            }
+        } else {
+            Scope::everything()
         },
     };
     vec![
@@ -31,7 +32,7 @@ fn columns() -> Vec<(&'static str, Principal)> {
     ]
 }
 
-fn word(everywhere: bool, at_its_own: bool) -> &'static str {
+fn cell_word(everywhere: bool, at_its_own: bool) -> &'static str {
     match (everywhere, at_its_own) {
         (true, _) => "yes",
         (false, true) => "own",
@@ -39,16 +40,16 @@ fn word(everywhere: bool, at_its_own: bool) -> &'static str {
     }
 }
 
-/// At services.
-fn at_services(principal: &Principal, action: Action) -> &'static str {
+/// Returns the cell of a route that concerns services.
+fn at_services(principal: &Principal, action: AccessAction) -> &'static str {
     let at = |name, owner| {
-        let object = Object {
+        let object = AccessObject {
             robot: principal.scope.robot.as_deref(),
-            ..Object::service(name, Some(owner))
+            ..AccessObject::service(name, Some(owner))
         };
         decide(principal, action, &object).is_ok()
     };
-    word(at("theirs", "them"), at("mine", "me"))
+    cell_word(at("theirs", "them"), at("mine", "me"))
 }
 
 fn cell(route: &Route, principal: &Principal) -> &'static str {
@@ -56,16 +57,21 @@ fn cell(route: &Route, principal: &Principal) -> &'static str {
         Access::Read | Access::ReadOrConnect | Access::SignIn => "yes",
         Access::Code => "code",
         Access::Connect if principal.roles.is_empty() => "auth",
-        Access::Connect => at_services(principal, Action::Connect),
+        Access::Connect => at_services(principal, AccessAction::Connect),
         Access::May(action, of) => match of {
-            Of::Machine => word(decide(principal, action, &Object::MACHINE).is_ok(), false),
-            Of::Robot(_) => {
-                let at = |robot| at_robot(principal, action, robot).is_ok();
-                word(at("them"), at("me"))
+            AccessTarget::Machine => cell_word(
+                decide(principal, action, &AccessObject::MACHINE).is_ok(),
+                false,
+            ),
+            AccessTarget::Robot(_) => {
+                let at = |robot| check_robot(principal, action, robot).is_ok();
+                cell_word(at("them"), at("me"))
             }
-            Of::Service(_) | Of::Stub(_) | Of::Servant(_) | Of::Recording(_) | Of::Handler => {
-                at_services(principal, action)
-            }
+            AccessTarget::Service(_)
+            | AccessTarget::Stub(_)
+            | AccessTarget::Servant(_)
+            | AccessTarget::Recording(_)
+            | AccessTarget::Handler => at_services(principal, action),
         },
     }
 }

@@ -1,4 +1,4 @@
-//! Looks at the machine, the services and the servants while somebody listens.
+//! Sampler of machine, services and servants, running while somebody listens.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,41 +10,41 @@ use api::{BackOff, Event, ServiceSummary};
 
 use crate::app::App;
 use crate::errors::Error;
-use crate::looks::{self, Looker};
+use crate::looks::{self, ServantSampler};
 use crate::views;
 
-/// Between two looks while nothing happens.
+/// Interval between samples if nothing happens.
 const PERIOD: Duration = Duration::from_secs(1);
-/// After an event: others follow it, and what it tells of is done.
+/// Delay after an event, because others may follow it and what it reports should be complete.
 const SOON: Duration = Duration::from_millis(100);
-/// Events that are kept for who listens.
+/// Number of events kept for listeners.
 pub const EVENTS: usize = 500;
 
-/// All that is so. What has not changed since the sample before is the same allocation.
+/// State at one moment. What has not changed since the previous sample is the same allocation.
 #[derive(Default)]
-pub struct Sample {
+pub struct StateSample {
     pub machine: Option<Arc<Machine>>,
     pub services: Vec<Arc<ServiceSummary>>,
     pub servants: Vec<Arc<Served>>,
     pub back_offs: Arc<Vec<BackOff>>,
-    /// The newest, oldest first.
+    /// The newest events, oldest first.
     pub events: Arc<Vec<Arc<Event>>>,
 }
 
-/// Takes samples until nobody listens or the daemon ends.
+/// Takes samples until nobody listens or the daemon stops.
 pub async fn run(app: Arc<App>) {
     let mut happened = app.state.watch_events();
-    let mut earlier = Arc::new(Sample::default());
-    let mut looker = Looker::default();
+    let mut earlier = Arc::new(StateSample::default());
+    let mut looker = ServantSampler::default();
     loop {
         happened.borrow_and_update();
-        match take(&app, &earlier, &mut looker).await {
+        match take_sample(&app, &earlier, &mut looker).await {
             Ok(sample) => {
                 earlier = Arc::new(sample);
                 app.live.newest.send_replace(Some(Arc::clone(&earlier)));
             }
-            // The database cannot be read now; who listens sees that nothing comes.
-            Err(error) => tracing::warn!("pages are not told what is so: {error}"),
+            // The database cannot be read; listeners notice that nothing comes.
+            Err(error) => tracing::warn!("pages get no updates: {error}"),
         }
         let news = async {
             let _ = happened.changed().await;
@@ -56,36 +56,45 @@ pub async fn run(app: Arc<App>) {
             () = app.live.newest.closed() => {}
             () = app.ending.cancelled() => return,
         }
-        if app.live.rests() {
+        if app.live.try_stop() {
             return;
         }
     }
 }
 
-async fn take(app: &App, earlier: &Sample, looker: &mut Looker) -> Result<Sample, Error> {
-    let servants = looker.servants(app).await;
-    let machine = looks::machine(app, &servants).await?;
+async fn take_sample(
+    app: &App,
+    earlier: &StateSample,
+    looker: &mut ServantSampler,
+) -> Result<StateSample, Error> {
+    let servants = looker.sample(app).await;
+    let machine = looks::sample_machine(app, &servants).await?;
     let mut services = Vec::new();
     for name in app.state.service_names()? {
-        if let Some(revision) = app.state.current(&name)? {
+        if let Some(revision) = app.state.current_revision(&name)? {
             services.push(views::summary(app, &revision));
         }
     }
     let back_offs = app.choreographer.back_offs();
-    Ok(Sample {
+    Ok(StateSample {
         machine: Some(Arc::new(machine)),
-        services: kept(services, &earlier.services, |service| &service.name),
-        servants: kept(servants, &earlier.servants, |served| &served.servant.id),
-        back_offs: match *earlier.back_offs == back_offs {
-            true => Arc::clone(&earlier.back_offs),
-            false => Arc::new(back_offs),
+        services: reuse_unchanged(services, &earlier.services, |service| &service.name),
+        servants: reuse_unchanged(servants, &earlier.servants, |served| &served.servant.id),
+        back_offs: if *earlier.back_offs == back_offs {
+            Arc::clone(&earlier.back_offs)
+        } else {
+            Arc::new(back_offs)
         },
-        events: events(app, &earlier.events)?,
+        events: newest_events(app, &earlier.events)?,
     })
 }
 
-/// What is new, as the earlier allocation where it is equal.
-fn kept<T: PartialEq>(new: Vec<T>, earlier: &[Arc<T>], name: fn(&T) -> &String) -> Vec<Arc<T>> {
+/// Wraps the items in `Arc`, reusing the earlier allocation of those that are equal.
+fn reuse_unchanged<T: PartialEq>(
+    new: Vec<T>,
+    earlier: &[Arc<T>],
+    name: fn(&T) -> &String,
+) -> Vec<Arc<T>> {
     let earlier: HashMap<&String, &Arc<T>> = earlier.iter().map(|one| (name(one), one)).collect();
     let keep = |one: T| match earlier.get(name(&one)) {
         Some(same) if ***same == one => Arc::clone(same),
@@ -94,8 +103,8 @@ fn kept<T: PartialEq>(new: Vec<T>, earlier: &[Arc<T>], name: fn(&T) -> &String) 
     new.into_iter().map(keep).collect()
 }
 
-/// The newest events, with those that are new.
-fn events(app: &App, earlier: &Arc<Vec<Arc<Event>>>) -> Result<Arc<Vec<Arc<Event>>>, Error> {
+/// Returns the newest events, including those that are new.
+fn newest_events(app: &App, earlier: &Arc<Vec<Arc<Event>>>) -> Result<Arc<Vec<Arc<Event>>>, Error> {
     let since = earlier.last().map_or(0, |event| event.id);
     if since > 0 && *app.state.watch_events().borrow() <= since {
         return Ok(Arc::clone(earlier));
@@ -113,14 +122,14 @@ fn events(app: &App, earlier: &Arc<Vec<Arc<Event>>>) -> Result<Arc<Vec<Arc<Event
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::looks::tests::served;
+    use crate::looks::tests::served_servant;
 
     #[test]
     fn what_has_not_changed_is_the_same() {
-        let earlier = kept(vec![served(1, 0)], &[], |one| &one.servant.id);
-        let same = kept(vec![served(1, 0)], &earlier, |one| &one.servant.id);
+        let earlier = reuse_unchanged(vec![served_servant(1, 0)], &[], |one| &one.servant.id);
+        let same = reuse_unchanged(vec![served_servant(1, 0)], &earlier, |one| &one.servant.id);
         assert!(Arc::ptr_eq(&earlier[0], &same[0]));
-        let other = kept(vec![served(2, 0)], &earlier, |one| &one.servant.id);
+        let other = reuse_unchanged(vec![served_servant(2, 0)], &earlier, |one| &one.servant.id);
         assert!(!Arc::ptr_eq(&earlier[0], &other[0]));
     }
 }

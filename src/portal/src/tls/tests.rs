@@ -18,7 +18,7 @@ fn lab(name: &str) -> Lab {
     CertifiedIssuer::self_signed(params, KeyPair::generate().expect("a key")).expect("signed")
 }
 
-/// A robot's certificate of this number, and its key.
+/// Creates a robot's certificate with this serial number, and its key.
 fn robot(lab: &Lab, number: u64) -> (CertificateDer<'static>, PrivateKeyDer<'static>) {
     let key = KeyPair::generate().expect("a key");
     let mut params = CertificateParams::new(vec!["localhost".to_owned()]).expect("names");
@@ -28,7 +28,7 @@ fn robot(lab: &Lab, number: u64) -> (CertificateDer<'static>, PrivateKeyDer<'sta
     (signed.der().clone(), PrivateKeyDer::Pkcs8(der.into()))
 }
 
-/// A list of that authority, which names this number. Its time is over.
+/// Creates an expired revocation list of the authority that names this serial number.
 fn list(lab: &Lab, number: u64) -> CertificateRevocationListDer<'static> {
     let then = rcgen::date_time_ymd(2020, 1, 1);
     let named = RevokedCertParams {
@@ -49,7 +49,7 @@ fn list(lab: &Lab, number: u64) -> CertificateRevocationListDer<'static> {
     CertificateRevocationListDer::from(signed.der().to_vec())
 }
 
-/// Why a client is refused that shows this certificate, if it is.
+/// Returns why a client with this certificate is refused, if it is.
 async fn refusal(
     tls: &Tls,
     server: &CertificateDer<'static>,
@@ -88,7 +88,8 @@ async fn what_a_list_names_is_refused_until_another_list_does_not() {
     let server = own.der().clone();
     let tls = Tls::new(vec![certificate], key, own.der(), vec![lab.der().clone()]).expect("usable");
     assert_eq!(refusal(&tls, &server, robot(&lab, 7)).await, None);
-    tls.revoke(vec![list(&lab, 7)]).expect("a list");
+    tls.set_revocation_lists(vec![list(&lab, 7)])
+        .expect("a list");
     let refused = refusal(&tls, &server, robot(&lab, 7))
         .await
         .expect("refused");
@@ -99,11 +100,12 @@ async fn what_a_list_names_is_refused_until_another_list_does_not() {
         None,
         "of another authority"
     );
-    tls.revoke(vec![CertificateRevocationListDer::from(vec![1, 2])])
+    tls.set_revocation_lists(vec![CertificateRevocationListDer::from(vec![1, 2])])
         .expect_err("no list");
     refusal(&tls, &server, robot(&lab, 7))
         .await
         .expect("the one before holds");
-    tls.revoke(vec![list(&lab, 9)]).expect("a list");
+    tls.set_revocation_lists(vec![list(&lab, 9)])
+        .expect("a list");
     assert_eq!(refusal(&tls, &server, robot(&lab, 7)).await, None);
 }

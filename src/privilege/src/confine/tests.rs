@@ -5,7 +5,7 @@ use std::thread;
 
 use super::*;
 
-/// Lines of `/proc/thread-self/status`, by their name.
+/// Returns a field of `/proc/thread-self/status`.
 fn status(name: &str) -> String {
     let text = std::fs::read_to_string("/proc/thread-self/status").expect("readable by its thread");
     let line = text.lines().find_map(|line| line.strip_prefix(name));
@@ -26,7 +26,7 @@ fn a_confined_thread_has_no_rights_and_others_keep_theirs() {
     let place = tempfile::tempdir().expect("a directory");
     let secret = place.path().join("secret");
     std::fs::write(&secret, "root's").expect("written");
-    // Anybody may enter the directory: it is the file that is closed.
+    // Anybody may enter the directory: only the file is protected.
     let enter = PermissionsExt::from_mode(0o755);
     std::fs::set_permissions(place.path(), enter).expect("set");
     std::fs::set_permissions(&secret, PermissionsExt::from_mode(0o600)).expect("set");
@@ -53,9 +53,9 @@ fn a_confined_thread_has_no_rights_and_others_keep_theirs() {
             !program.expect("started").status.success(),
             "a program reads it"
         );
-        // What it was given open, it reads.
+        // A file that was opened before can still be read.
         assert_eq!(std::io::read_to_string(opened).expect("open"), "root's");
-        // Threads that it starts are like it, and to confine them again does nothing.
+        // Threads that it starts are confined as well, and confining them again does nothing.
         let again = on_a_thread(|| (status("CapBnd"), confine(Account::default())));
         assert_eq!(again.0, "0000000000000000");
         again.1.expect("confined already");
@@ -67,14 +67,14 @@ fn a_confined_thread_has_no_rights_and_others_keep_theirs() {
 #[test]
 fn a_limited_thread_has_what_is_kept_and_cannot_get_the_rest_back() {
     on_a_thread(|| {
-        limit().expect("limited");
+        limit_capabilities().expect("limited");
         let held = caps::read(None, CapSet::Permitted).expect("read");
         let kept: CapsHashSet = KEPT.into_iter().chain([KEPT_IF_THERE]).collect();
         assert!(held.is_subset(&kept), "{held:?}");
         assert!(held.contains(&Capability::CAP_SYS_ADMIN), "run as root");
         let bounding = caps::read(None, CapSet::Bounding).expect("read");
         assert!(bounding.is_subset(&kept), "{bounding:?}");
-        only(&[Capability::CAP_KILL]).expect("limited");
+        retain_capabilities(&[Capability::CAP_KILL]).expect("limited");
         let held = caps::read(None, CapSet::Effective).expect("read");
         assert_eq!(held, CapsHashSet::from([Capability::CAP_KILL]));
     });

@@ -1,4 +1,4 @@
-//! There is one set of the engine's threads in a process, so this is one story.
+//! A process has one set of the engine's threads, so this is a single test.
 
 use std::sync::Arc;
 
@@ -26,21 +26,21 @@ fn work_is_done_with_the_rights_that_it_needs() {
         let task = portal.spawn(work);
         portal.block_on(task).expect("no panic");
     };
-    // Where there are no threads of an engine, work is done where it is.
+    // Without engine threads, work is done on the calling thread.
     on_portal(Box::pin(async {
         assert_ne!(user(), 0);
         assert_ne!(run(async { user() }).await, 0);
-        assert_ne!(now(user), 0);
-        assert_ne!(blocking(user).await.expect("no panic"), 0);
+        assert_ne!(run_sync(user), 0);
+        assert_ne!(spawn_blocking(user).await.expect("no panic"), 0);
     }));
     let engine = Engine::start(Account::default()).expect("threads");
     on_portal(Box::pin(async {
         assert_eq!(run(async { user() }).await, 0);
-        assert_eq!(now(user), 0);
-        // More than there are threads, so that new ones are started.
+        assert_eq!(run_sync(user), 0);
+        // More tasks than threads, so that new ones are started.
         let all: Vec<_> = (0..20)
             .map(|_| {
-                blocking(|| {
+                spawn_blocking(|| {
                     std::thread::yield_now();
                     user()
                 })
@@ -49,25 +49,25 @@ fn work_is_done_with_the_rights_that_it_needs() {
         for task in all {
             assert_eq!(task.await.expect("no panic"), 0);
         }
-        // From there it goes nowhere else, and threads that are started there have the same rights.
+        // Work on the engine is not handed over again, and threads started there have the same privileges.
         let nested = run(async {
-            let below = blocking(|| now(user)).await.expect("no panic");
+            let below = spawn_blocking(|| run_sync(user)).await.expect("no panic");
             (run(async { user() }).await, below)
         });
         assert_eq!(nested.await, (0, 0));
-        // Nor does any of it stay with the threads that asked.
+        // None of it stays with the calling threads.
         assert_ne!(user(), 0);
         let blocked = tokio::task::spawn_blocking(user).await;
         assert_ne!(blocked.expect("no panic"), 0);
-        // Who does not wait any more ends what was handed over, and panics come back.
+        // Dropping the future ends the work that was handed over, and panics are propagated.
         let (dropped, heard) = (Arc::new(Notify::new()), Arc::new(Notify::new()));
-        struct Told(Arc<Notify>);
-        impl Drop for Told {
+        struct DropNotifier(Arc<Notify>);
+        impl Drop for DropNotifier {
             fn drop(&mut self) {
                 self.0.notify_one();
             }
         }
-        let (told, begun) = (Told(Arc::clone(&dropped)), Arc::clone(&heard));
+        let (told, begun) = (DropNotifier(Arc::clone(&dropped)), Arc::clone(&heard));
         let waits = tokio::spawn(run(async move {
             let _told = told;
             begun.notify_one();

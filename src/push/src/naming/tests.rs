@@ -17,7 +17,7 @@ fn plan(names: &[&str]) -> Plan {
     }
 }
 
-fn given(params: &[&str]) -> PushOptions {
+fn options_with_params(params: &[&str]) -> PushOptions {
     PushOptions {
         params: params
             .iter()
@@ -27,9 +27,9 @@ fn given(params: &[&str]) -> PushOptions {
     }
 }
 
-fn found(said: &[(usize, &[&str])]) -> Names {
+fn found_names(said: &[(usize, &[&str])]) -> FoundNames {
     let said = said.iter().map(|(index, names)| {
-        let names = names.iter().map(|&name| called(name, ""));
+        let names = names.iter().map(|&name| classify_name(name, ""));
         (*index, names.collect())
     });
     said.collect()
@@ -38,23 +38,23 @@ fn found(said: &[(usize, &[&str])]) -> Names {
 #[test]
 fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
     let mut plan = plan(&["/costmap_2d_node", "/other", "/third"]);
-    let options = given(&["~rate", "/costmap_2d_node/stays"]);
+    let options = options_with_params(&["~rate", "/costmap_2d_node/stays"]);
     for key in ["/costmap_2d_node/rate", "/costmap_2d_node/stays"] {
         plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
     }
-    let found = found(&[(0, &["costmap_2d"]), (2, &["other"])]);
-    apply(&mut plan, &Flavour::default(), &[0, 2], &found, &options);
+    let found = found_names(&[(0, &["costmap_2d"]), (2, &["other"])]);
+    apply_names(&mut plan, &Flavour::default(), &[0, 2], &found, &options);
     let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
     assert_eq!(names, ["/costmap_2d", "/other", "/other_2"]);
     assert_eq!(plan.nodes[0].argv, ["/x", "__name:=costmap_2d"]);
     let keys: Vec<&String> = plan.parameters.keys().collect();
     assert_eq!(keys, ["/costmap_2d/rate", "/costmap_2d_node/stays"]);
-    let words = unused(&plan, &Interface::default(), &options).join("\n");
+    let words = unused_parameters(&plan, &Interface::default(), &options).join("\n");
     assert!(
         words.starts_with("parameter /costmap_2d_node/stays") && words.contains("/costmap_2d,"),
         "{words}"
     );
-    // Somebody may read it all the same.
+    // Somebody may still read it.
     let interface = Interface {
         parameters: vec![Parameter {
             name: "/costmap_2d_node/stays".to_owned(),
@@ -63,7 +63,7 @@ fn a_node_has_the_name_and_the_parameters_that_its_program_gives_it() {
         }],
         ..Interface::default()
     };
-    assert!(unused(&plan, &interface, &options).is_empty());
+    assert!(unused_parameters(&plan, &interface, &options).is_empty());
 }
 
 #[test]
@@ -77,14 +77,14 @@ fn nodes_of_ros_2_keep_their_namespaces_and_are_renamed_alone() {
         let words = ["--ros-args", "-r", &*format!("__ns:={namespace}")];
         node.argv.extend(words.map(str::to_owned));
     }
-    let said = found(&[
+    let said = found_names(&[
         (0, &["/front/talker"]),
         (1, &["/back/talker"]),
         (2, &["/own"]),
         (3, &["/chosen/own"]),
     ]);
     let given = PushOptions::default();
-    apply(&mut plan, &flavour, &[0, 1, 2, 3], &said, &given);
+    apply_names(&mut plan, &flavour, &[0, 1, 2, 3], &said, &given);
     let told = |index: usize| {
         let node: &NodeSpec = &plan.nodes[index];
         (node.name.as_str(), node.argv.join(" "))
@@ -107,12 +107,18 @@ fn each_node_of_a_second_program_of_several_nodes_has_a_name_of_its_own() {
     for name in ["/duet", "/duet_2", "/soloist"] {
         twice.parameters.insert(key(name), ParamValue::Int(1));
     }
-    let said = found(&[
+    let said = found_names(&[
         (0, &["/alto", "/tenor"]),
         (1, &["/alto", "/tenor"]),
         (2, &["/solo", "/tenor"]),
     ]);
-    apply(&mut twice, &flavour, &[0, 1, 2], &said, &given(&["rate"]));
+    apply_names(
+        &mut twice,
+        &flavour,
+        &[0, 1, 2],
+        &said,
+        &options_with_params(&["rate"]),
+    );
     let rate = ["--ros-args", "-p", "rate:=1", "--"];
     let told = |index: usize| {
         let argv = &twice.nodes[index].argv;
@@ -136,12 +142,18 @@ fn nodes_of_one_name_in_one_program_have_the_same_number() {
         ..Flavour::default()
     };
     let mut plan = plan(&["/left/detector", "/detectors", "/detectors_2", "/odd"]);
-    let said = found(&[
+    let said = found_names(&[
         (1, &["/left/detector", "/right/detector"]),
         (2, &["/left/detector", "/right/detector"]),
         (3, &["/odd_4711_1700000000123"]),
     ]);
-    apply(&mut plan, &flavour, &[1, 2, 3], &said, &given(&[]));
+    apply_names(
+        &mut plan,
+        &flavour,
+        &[1, 2, 3],
+        &said,
+        &options_with_params(&[]),
+    );
     let told = |index: usize| {
         let node: &NodeSpec = &plan.nodes[index];
         (node.name.as_str(), node.argv.join(" "))
@@ -165,7 +177,7 @@ fn nodes_that_are_told_no_namespace_are_where_their_programs_put_them() {
     for key in ["/see/rate", "/seen/rate"] {
         plan.parameters.insert(key.to_owned(), ParamValue::Int(1));
     }
-    let marks = mark(&mut plan.clone(), &flavour);
+    let marks = mark_nodes_without_namespace(&mut plan.clone(), &flavour);
     let expected = [
         ("/see", "/cloudroid_name_0"),
         ("/seen", "/cloudroid_name_2"),
@@ -173,13 +185,13 @@ fn nodes_that_are_told_no_namespace_are_where_their_programs_put_them() {
     let expected = expected.map(|(node, mark)| (node.to_owned(), mark.to_owned()));
     assert_eq!(marks, expected.into());
     let moved = [("/see".to_owned(), "/camera/see".to_owned())];
-    place(&mut plan, &moved.into());
+    move_nodes(&mut plan, &moved.into());
     let names: Vec<&str> = plan.nodes.iter().map(|node| node.name.as_str()).collect();
     assert_eq!(names, ["/camera/see", "/front/hear", "/seen"]);
     let keys: Vec<&String> = plan.parameters.keys().collect();
     assert_eq!(keys, ["/camera/see/rate", "/seen/rate"]);
     flavour.ros = ros::flavour::Version::Ros1;
-    assert!(mark(&mut plan, &flavour).is_empty());
+    assert!(mark_nodes_without_namespace(&mut plan, &flavour).is_empty());
 }
 
 #[test]
@@ -203,14 +215,14 @@ fn parameters_that_no_node_of_ros_2_has_declared_are_told() {
         "camera",
         "use_sim_time",
     ] {
-        assert_eq!(undeclared(&interface, known), None, "{known}");
+        assert_eq!(describe_undeclared(&interface, known), None, "{known}");
     }
     for unknown in ["rat", "/see/rat", "/other/rate/x", "width"] {
-        let words = undeclared(&interface, unknown).expect(unknown);
-        assert_eq!(words, "there are /see/rate, /see/camera.width");
+        let words = describe_undeclared(&interface, unknown).expect(unknown);
+        assert_eq!(words, "declared: /see/rate, /see/camera.width");
     }
-    // Nodes of ROS 1 declare nothing.
-    assert_eq!(undeclared(&Interface::default(), "rat"), None);
+    // ROS 1 nodes declare no parameters.
+    assert_eq!(describe_undeclared(&Interface::default(), "rat"), None);
 }
 
 #[test]
@@ -228,7 +240,7 @@ fn nodes_of_ros_1_are_told_apart_by_their_namespaces() {
         .into(),
         ..Graph::default()
     };
-    let one = |name: &str, own: Option<&str>| Called {
+    let one = |name: &str, own: Option<&str>| NodeRename {
         own: own.map(str::to_owned),
         node: name.to_owned(),
     };
@@ -246,7 +258,7 @@ fn nodes_of_ros_1_are_told_apart_by_their_namespaces() {
     ];
     let host = "push-1-names";
     assert_eq!(
-        names(RosVersion::One, &graph, &[0, 3, 4, 5], host),
+        names_in_graph(RosVersion::One, &graph, &[0, 3, 4, 5], host),
         expected.into()
     );
 }
@@ -276,7 +288,7 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
     };
     let host = "push-1-names";
     let told = |index: usize, all: &[usize]| {
-        let mut names = names(RosVersion::Two, &graph, all, host);
+        let mut names = names_in_graph(RosVersion::Two, &graph, all, host);
         let called = names.remove(&index).unwrap_or_default().into_iter();
         called
             .map(|called| (called.node, called.own.is_some()))
@@ -289,7 +301,7 @@ fn nodes_of_ros_2_are_told_apart_by_their_enclaves() {
     assert_eq!(told(2, &all), [("/ntp".to_owned(), false)]);
     assert_eq!(told(3, &all), [own("/a")]);
     assert_eq!(told(4, &all), []);
-    // It has taken no notice of its mark.
+    // It ignored its mark.
     assert_eq!(
         told(4, &[4]),
         [own("/camera/detector"), own("/deaf"), own("/talker")]

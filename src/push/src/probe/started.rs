@@ -1,36 +1,36 @@
-//! What a push has started, and the room that it takes until nothing of it is left.
+//! Guards of started probes and of the resources reserved for them.
 
 use std::sync::Arc;
 
 use choreographer::Permit;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use tokio::sync::mpsc;
 use tokio_util::task::TaskTracker;
 
 use crate::Error;
 
-/// Held by whatever is there of what was started in a room. With the last one the room is given back.
-pub(crate) struct Alive<R = Permit> {
-    // Given back before that is told: fields are dropped in their order.
+/// Reservation shared by everything that was started within it; released when the last clone is dropped.
+pub(crate) struct RoomGuard<R = Permit> {
+    // Released before the channel closes: fields are dropped in declaration order.
     room: Arc<R>,
     _gone: mpsc::Sender<()>,
 }
 
-impl<R> Clone for Alive<R> {
+impl<R> Clone for RoomGuard<R> {
     fn clone(&self) -> Self {
-        Alive {
+        RoomGuard {
             room: Arc::clone(&self.room),
             _gone: self._gone.clone(),
         }
     }
 }
 
-impl<R> Alive<R> {
-    /// The first of a room, and what closes when the last one is dropped.
-    pub(super) fn begin(room: R) -> (Self, mpsc::Receiver<()>) {
+impl<R> RoomGuard<R> {
+    /// Returns the first guard of a reservation, and a channel that closes when the last one is dropped.
+    pub(super) fn with_room(room: R) -> (Self, mpsc::Receiver<()>) {
         let (_gone, gone) = mpsc::channel(1);
         let room = Arc::new(room);
-        (Alive { room, _gone }, gone)
+        (RoomGuard { room, _gone }, gone)
     }
 
     pub(super) fn room(&self) -> &R {
@@ -38,15 +38,19 @@ impl<R> Alive<R> {
     }
 }
 
-/// A servant that ends with this value, whatever becomes of whoever waits for that.
+/// A servant that is stopped when this value is dropped, even if nobody waits for it.
 pub(crate) struct ProbeServant<R: Send + Sync + 'static = Permit> {
-    servant: Option<Arc<dyn Servant>>,
+    servant: Option<Arc<dyn ServantHandle>>,
     tasks: TaskTracker,
-    alive: Alive<R>,
+    alive: RoomGuard<R>,
 }
 
 impl<R: Send + Sync + 'static> ProbeServant<R> {
-    pub(super) fn new(servant: Arc<dyn Servant>, tasks: TaskTracker, alive: Alive<R>) -> Self {
+    pub(super) fn new(
+        servant: Arc<dyn ServantHandle>,
+        tasks: TaskTracker,
+        alive: RoomGuard<R>,
+    ) -> Self {
         Self {
             servant: Some(servant),
             tasks,
@@ -54,7 +58,8 @@ impl<R: Send + Sync + 'static> ProbeServant<R> {
         }
     }
 
-    /// Ends it. Where whoever waits is interrupted, it is ended all the same, and has its room until then.
+    /// Stops the servant. If the caller is cancelled, it is stopped in the background and keeps its reservation until
+    /// then.
     pub(crate) async fn end(mut self) -> Result<(), Error> {
         let Some(servant) = self.servant.take() else {
             return Ok(());
@@ -65,15 +70,15 @@ impl<R: Send + Sync + 'static> ProbeServant<R> {
             stop(&servant).await
         });
         let stopped = stopping.await;
-        Ok(stopped.map_err(|_| Error::Internal("ending what was started once"))??)
+        Ok(stopped.map_err(|_| Error::Internal("stopping the started image"))??)
     }
 }
 
-/// Told here as well: whoever waited for it may have gone.
-async fn stop(servant: &Arc<dyn Servant>) -> Result<(), servant::Error> {
+/// Logged here as well, since the caller may have gone.
+async fn stop(servant: &Arc<dyn ServantHandle>) -> Result<(), servant::Error> {
     let stopped = servant.stop().await;
     if let Err(error) = &stopped {
-        tracing::error!("the probe {} could not be ended: {error}", servant.id());
+        tracing::error!("cannot stop the probe {}: {error}", servant.id());
     }
     stopped
 }
@@ -101,7 +106,7 @@ mod tests {
 
     use super::*;
 
-    /// Comes to an end when the room is given back.
+    /// Sends a message when the reservation is released.
     struct Room(Option<oneshot::Sender<()>>);
 
     impl Drop for Room {
@@ -127,7 +132,7 @@ mod tests {
             let held = engine.servant("a-probe").expect("it runs");
             held.stuck.send_replace(true);
             let (given_back, mut is_given_back) = oneshot::channel();
-            let (alive, mut gone) = Alive::begin(Room(Some(given_back)));
+            let (alive, mut gone) = RoomGuard::with_room(Room(Some(given_back)));
             let tasks = TaskTracker::new();
             let probe = ProbeServant::new(servant, tasks.clone(), alive.clone());
             drop(alive);

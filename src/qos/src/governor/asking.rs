@@ -1,15 +1,15 @@
-//! Who is asked.
+//! Sends requests to the sides.
 
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::{Channel, Effect, Governor};
+use super::{Effect, Governor, RequestChannel};
 use crate::arbiter::{Kind, Record};
-use crate::request::{Leg, RequestId, Side, Sides};
+use crate::request::{RequestId, RequestLeg, Responder, Responders};
 
 impl<P: Clone> Governor<P> {
-    /// A request was opened: ask whom there is.
-    pub(super) fn asked(&mut self, now: Instant, id: RequestId) {
+    /// Sends a newly opened request to the active sides.
+    pub(super) fn dispatch(&mut self, now: Instant, id: RequestId) {
         self.counts.requests += 1;
         let sides = self.sides();
         let by_arrival = self.arbiter.get(id).and_then(|record| match record.kind {
@@ -18,37 +18,39 @@ impl<P: Clone> Governor<P> {
         });
         for side in sides.iter() {
             if by_arrival.is_some_and(|pair| !self.is_free(pair, side)) {
-                self.tell(id, side);
+                self.send_unawaited(id, side);
             } else {
                 self.ask(now, id, side);
             }
         }
         let waits = |record: &Record<P>| !record.has_caller();
-        if sides == Sides::default() && self.arbiter.get(id).is_some_and(waits) {
-            // The way to the cloud keeps it in order with what awaits no answer. A call waits here: it may fail before the
-            // link is back, and must not be done then.
-            self.ask(now, id, Side::Cloud);
-            self.arbiter.turn(Side::Cloud, &Leg::Asked, &Leg::Lost);
+        if sides == Responders::default() && self.arbiter.get(id).is_some_and(waits) {
+            // The path to the cloud keeps it in order with messages that await no answer. A call waits here: it may
+            // fail before the link is back, and must not be executed after that.
+            self.ask(now, id, Responder::Cloud);
+            self.arbiter
+                .replace_legs(Responder::Cloud, &RequestLeg::Asked, &RequestLeg::Lost);
         }
         self.decide(now);
     }
 
-    /// Who is given what awaits no answer. While the link is down and nobody stands in, the way to the cloud takes it.
-    pub(super) fn told_sides(&self) -> Sides {
-        let Sides { cloud, local } = self.sides();
+    /// Returns the sides that receive messages that await no answer. While the link is down and the local original is
+    /// not fed, these are queued for the cloud.
+    pub(super) fn forward_sides(&self) -> Responders {
+        let Responders { cloud, local } = self.sides();
         let cloud = cloud || !local;
-        Sides { cloud, local }
+        Responders { cloud, local }
     }
 
-    /// What is no request of its own goes where requests go.
-    pub(super) fn pass_on(&mut self, topic: &Arc<str>, payload: &P) {
-        for side in self.told_sides().iter() {
-            let channel = Channel::Topic(topic.clone());
+    /// Forwards a message that is no request of its own.
+    pub(super) fn forward(&mut self, topic: &Arc<str>, payload: &P) {
+        for side in self.forward_sides().iter() {
+            let channel = RequestChannel::Topic(topic.clone());
             self.give(side, None, channel, payload.clone());
         }
     }
 
-    pub(super) fn ask(&mut self, now: Instant, id: RequestId, side: Side) {
+    pub(super) fn ask(&mut self, now: Instant, id: RequestId, side: Responder) {
         let Some(payload) = self.arbiter.ask(now, id, side) else {
             return;
         };
@@ -63,12 +65,13 @@ impl<P: Clone> Governor<P> {
         self.give(side, Some(id), channel, payload);
     }
 
-    /// Gives a request to a side that is at an earlier one: its next output will not be taken for the answer.
-    fn tell(&mut self, id: RequestId, side: Side) {
+    /// Sends a request to a side that is busy with an earlier one: the side's next output will not be taken as the
+    /// answer to this one.
+    fn send_unawaited(&mut self, id: RequestId, side: Responder) {
         let Some(record) = self.arbiter.get_mut(id) else {
             return;
         };
-        record.note_left_out(side);
+        record.mark_left_out(side);
         if let Some(payload) = record.payload.clone() {
             let channel = record.channel.clone();
             self.give(side, None, channel, payload);
@@ -77,9 +80,9 @@ impl<P: Clone> Governor<P> {
 
     pub(super) fn give(
         &mut self,
-        side: Side,
+        side: Responder,
         request: Option<RequestId>,
-        channel: Channel,
+        channel: RequestChannel,
         payload: P,
     ) {
         self.effects.push_back(Effect::Give {
@@ -90,9 +93,9 @@ impl<P: Clone> Governor<P> {
         });
     }
 
-    /// Who can answer now is asked for what still waits: calls always, inputs while they are fresh.
-    pub(super) fn give_waiting(&mut self, now: Instant, side: Side) {
-        let is_fresh = |record: &Record<P>| !record.overdue && record.cloud != Leg::LeftOut;
+    /// Sends the open requests to a side that has become available: calls always, inputs while they are fresh.
+    pub(super) fn ask_open_requests(&mut self, now: Instant, side: Responder) {
+        let is_fresh = |record: &Record<P>| !record.overdue && record.cloud != RequestLeg::LeftOut;
         let wanted =
             |record: &Record<P>| record.is_open() && (record.is_call() || is_fresh(record));
         for id in self.arbiter.select(wanted) {
@@ -100,13 +103,13 @@ impl<P: Clone> Governor<P> {
         }
     }
 
-    /// An input that is late already is given to the local original when that has nothing else to do, and is quick
-    /// enough that a fresh one that comes meanwhile is still in time.
-    pub(super) fn give_straggler(&mut self, now: Instant) {
+    /// Sends an overdue input to the local original if that is idle, and fast enough that a fresh input arriving
+    /// meanwhile is still answered in time.
+    pub(super) fn ask_straggler(&mut self, now: Instant) {
         if !self.decider.is_fed() {
             return;
         }
-        let Some(id) = self.arbiter.straggler() else {
+        let Some(id) = self.arbiter.next_straggler() else {
             return;
         };
         let Some(record) = self.arbiter.get(id).filter(|record| record.key.is_some()) else {
@@ -115,11 +118,11 @@ impl<P: Clone> Governor<P> {
         let t_max = record.deadline - record.asked_at;
         let quick = self.local_time.is_none_or(|time| 2 * time <= t_max);
         let busy = |record: &Record<P>| {
-            record.local == Leg::Asked
+            record.local == RequestLeg::Asked
                 && record.local_asked.is_some_and(|asked| now < asked + t_max)
         };
         if quick && self.arbiter.select(busy).is_empty() {
-            self.ask(now, id, Side::Local);
+            self.ask(now, id, Responder::Local);
         }
     }
 }

@@ -1,37 +1,37 @@
-//! What a governor wants done.
+//! Actions that a governor asks its driver to carry out.
 
-use crate::channel::Channel;
-use crate::decider::Event;
-use crate::outcome::Outcome;
-use crate::request::{RequestId, Side};
+use crate::channel::RequestChannel;
+use crate::decider::QosEvent;
+use crate::outcome::RequestOutcome;
+use crate::request::{RequestId, Responder};
 
-/// What is to be done, in this order.
+/// An action for the driver; actions are carried out in order.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Effect<P> {
-    /// Hand this to one side.
+    /// Send a message to one side.
     Give {
-        /// The side that is asked.
-        side: Side,
-        /// The request it belongs to; none for messages that await no answer.
+        /// The receiving side.
+        side: Responder,
+        /// The request it belongs to; `None` for messages that await no answer.
         request: Option<RequestId>,
-        /// Where it goes.
-        channel: Channel,
+        /// The channel to send it on.
+        channel: RequestChannel,
         /// The message.
         payload: P,
     },
-    /// Tell the application that there will be no answer.
+    /// Tell the application that no answer will come.
     Fail {
-        /// The request that failed.
+        /// The failed request.
         request: RequestId,
-        /// Where it was asked.
-        channel: Channel,
+        /// The channel of the request.
+        channel: RequestChannel,
         /// Error text for the caller.
         reason: String,
     },
-    /// Publish the SLA's safe-stop message: nobody has answered in time.
+    /// Publish the SLA's safe-stop message: no side has answered in time.
     SafeStop,
-    /// The cloud's time of a request has counted, or more is known of one whose has.
-    Outcome(Outcome),
+    /// The outcome of a request: reported when the cloud's time has counted, and again when more is known.
+    Outcome(RequestOutcome),
     /// A decision about the local original.
-    Event(Event),
+    Event(QosEvent),
 }

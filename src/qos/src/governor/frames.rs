@@ -1,32 +1,32 @@
-//! Promises about the rate or the age of an output.
+//! SLAs on the rate or the age of an output.
 
 use std::time::{Duration, Instant};
 
 use super::Governor;
 use crate::measure::Meter;
 
-/// What the cloud's outputs are measured by.
+/// Meters for the output that the SLA measures.
 #[derive(Debug)]
-pub(super) struct Metered {
+pub(super) struct OutputMeters {
     pub(super) output: String,
     pub(super) cloud: Meter,
-    /// Of what the application got: when that stops, the robot must.
+    /// Meter of the outputs delivered to the application: when they stop, the robot must stop.
     pub(super) delivered: Meter,
 }
 
 impl<P: Clone> Governor<P> {
-    /// Somebody listens to an output, or nobody does: frames that nobody wants are not missed.
-    pub fn wanted(&mut self, now: Instant, output: &str, wanted: bool) {
+    /// Sets whether an output has a subscriber: without one, missing frames do not count.
+    pub fn set_listened(&mut self, now: Instant, output: &str, wanted: bool) {
         self.tick(now);
         if wanted {
             self.listened.insert(output.to_owned());
         } else {
             self.listened.remove(output);
         }
-        self.await_frames(now);
+        self.update_meters(now);
     }
 
-    pub(super) fn await_frames(&mut self, now: Instant) {
+    pub(super) fn update_meters(&mut self, now: Instant) {
         if let Some(metered) = &mut self.meter {
             let wanted = self.listened.contains(&metered.output);
             for meter in [&mut metered.cloud, &mut metered.delivered] {

@@ -1,39 +1,39 @@
-//! Requests that nobody will answer any more.
+//! Fails requests that no side will answer.
 
-use super::{Channel, Effect, Governor};
+use super::{Effect, Governor, RequestChannel};
 use crate::arbiter::{Kind, Record};
 use crate::decider::LocalState;
-use crate::request::{Leg, RequestId};
-use crate::sla::Local;
+use crate::request::{RequestId, RequestLeg};
+use crate::sla::LocalPolicy;
 
 impl<P: Clone> Governor<P> {
-    /// Fails a call that nobody can answer any more. While the link is down the cloud may come back, and until its
-    /// T_max a call waits for that.
+    /// Fails a call that no side can answer any more. While the link is down the cloud may come back, so a call waits
+    /// for it until T_max.
     pub(super) fn fail_if_hopeless(&mut self, id: RequestId) {
         let Some(record) = self.arbiter.get(id) else {
             return;
         };
-        // Goals on topics have no caller to tell: they wait for whoever comes.
+        // Goals on topics have no caller that could be told, so they stay open.
         if !record.has_caller() || !record.is_open() {
             return;
         }
         let local = match &record.local {
-            Leg::Asked => return,
-            Leg::NotAsked if self.decider.is_coming() => return,
-            Leg::Failed(reason) => reason.clone(),
+            RequestLeg::Asked => return,
+            RequestLeg::NotAsked if self.decider.is_coming() => return,
+            RequestLeg::Failed(reason) => reason.clone(),
             _ => match (self.sla.local, self.decider.state()) {
-                (Local::None, _) => "no local original is to be used".to_owned(),
+                (LocalPolicy::None, _) => "the local original is disabled".to_owned(),
                 (_, LocalState::Missing) => "there is no local original".to_owned(),
-                _ => "the local original does not run".to_owned(),
+                _ => "the local original is not running".to_owned(),
             },
         };
         let cloud = match &record.cloud {
-            Leg::Failed(reason) => reason.clone(),
-            // It is being carried out there, and its result comes when the link is back.
-            Leg::Lost if record.kind == Kind::Goal => return,
-            Leg::NotAsked | Leg::Lost if !self.link && record.overdue => {
+            RequestLeg::Failed(reason) => reason.clone(),
+            // The cloud carries it out, and its result comes when the link is back.
+            RequestLeg::Lost if record.kind == Kind::Goal => return,
+            RequestLeg::NotAsked | RequestLeg::Lost if !self.link && record.overdue => {
                 format!(
-                    "the link is down and was not up again within {:?}",
+                    "the link is down and did not recover within {:?}",
                     record.deadline - record.asked_at
                 )
             }
@@ -43,7 +43,7 @@ impl<P: Clone> Governor<P> {
         self.give_up(id, channel, format!("cloud: {cloud}; local: {local}"));
     }
 
-    pub(super) fn give_up(&mut self, request: RequestId, channel: Channel, reason: String) {
+    pub(super) fn give_up(&mut self, request: RequestId, channel: RequestChannel, reason: String) {
         if self.arbiter.fail(request) {
             self.counts.failed += 1;
             self.effects.push_back(Effect::Fail {
@@ -62,7 +62,7 @@ impl<P: Clone> Governor<P> {
         }
         if record.is_open() && (record.missed || record.is_call() || !record.overdue) {
             self.counts.failed += 1;
-            let reason = "nobody answered while it was remembered".to_owned();
+            let reason = "no answer arrived before the request was discarded".to_owned();
             self.effects.push_back(Effect::Fail {
                 request,
                 channel: record.channel,

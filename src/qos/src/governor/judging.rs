@@ -1,69 +1,69 @@
-//! What an answer, or its absence, means for Q, and what is told of it.
+//! Counts answers and missing answers towards Q, and reports the outcomes.
 
 use std::time::{Duration, Instant};
 
 use super::{Effect, Governor};
-use crate::arbiter::{Kind, Verdict};
-use crate::outcome::Outcome;
+use crate::arbiter::{DeliveryVerdict, Kind};
+use crate::outcome::RequestOutcome;
 use crate::phases::Phases;
-use crate::request::{Key, Leg, RequestId, Side};
-use crate::satisfaction::Step;
+use crate::request::{CorrelationKey, RequestId, RequestLeg, Responder};
+use crate::satisfaction::ResponseGrade;
 use crate::sla::Measure;
 
-/// Clocks of two machines are known that well; phases that add up to something else are of another request.
+/// Accuracy of the clock offset between two machines; phases whose sum differs by more belong to another request.
 const PHASES_APART: Duration = Duration::from_millis(20);
 
 impl<P: Clone> Governor<P> {
-    pub(super) fn completed(
+    pub(super) fn on_answer(
         &mut self,
         now: Instant,
-        side: Side,
+        side: Responder,
         id: RequestId,
         output: usize,
-    ) -> Verdict {
+    ) -> DeliveryVerdict {
         let sides = self.sides();
         let record = self.arbiter.get_mut(id);
-        if record.is_some_and(|record| !record.hears(side, output, sides)) {
-            return Verdict::Drop;
+        if record.is_some_and(|record| !record.accept_output(side, output, sides)) {
+            return DeliveryVerdict::Drop;
         }
         let record = self.arbiter.get_mut(id).filter(|_| output == 0);
-        let answers = record.is_some_and(|record| *record.leg(side) != Leg::Answered);
+        let answers = record.is_some_and(|record| *record.leg(side) != RequestLeg::Answered);
         if let Some(record) = self.arbiter.get(id).filter(|_| answers) {
             match (side, record.local_asked) {
-                (Side::Cloud, _) => {
+                (Responder::Cloud, _) => {
                     let t = now.saturating_duration_since(record.asked_at);
                     self.judge(id, Some(t));
                 }
-                (Side::Local, Some(asked)) => {
+                (Responder::Local, Some(asked)) => {
                     self.local_time = Some(now.saturating_duration_since(asked));
                 }
-                (Side::Local, None) => {}
+                (Responder::Local, None) => {}
             }
         }
         let verdict = self.arbiter.answer_with(now, id, side, output);
         if answers {
-            self.has_passed(now, side, id);
+            self.on_input_answered(now, side, id);
         }
-        if answers && verdict == Verdict::Deliver && self.sla.is_of_link() {
-            // No time is promised that could pass: there is nothing more to learn about it.
+        if answers && verdict == DeliveryVerdict::Deliver && self.sla.is_link_based() {
+            // The SLA has no response time to exceed, so nothing more can be learned about the request.
             self.arbiter.judge(id, None);
         }
-        if answers && (side == Side::Cloud || verdict == Verdict::Deliver) {
-            self.announce(id);
+        if answers && (side == Responder::Cloud || verdict == DeliveryVerdict::Deliver) {
+            self.report_outcome(id);
         }
         self.arbiter.close_call(id);
         match (verdict, side) {
-            (Verdict::Deliver, _) if output > 0 => {}
-            (Verdict::Deliver, Side::Cloud) => self.counts.from_cloud += 1,
-            (Verdict::Deliver, Side::Local) => self.counts.from_local += 1,
-            (Verdict::Drop, _) => self.counts.duplicates += 1,
+            (DeliveryVerdict::Deliver, _) if output > 0 => {}
+            (DeliveryVerdict::Deliver, Responder::Cloud) => self.counts.from_cloud += 1,
+            (DeliveryVerdict::Deliver, Responder::Local) => self.counts.from_local += 1,
+            (DeliveryVerdict::Drop, _) => self.counts.duplicates += 1,
         }
         self.decide(now);
         verdict
     }
 
-    /// Counts the cloud's time of a request, once. Without one the outcome is told at once; else when it is known
-    /// whose answer is taken.
+    /// Counts the cloud's time of a request, once. A request without a time is reported at once, the others when it is
+    /// known whose answer is taken.
     pub(super) fn judge(&mut self, id: RequestId, t: Option<Duration>) {
         if !self.arbiter.judge(id, t) {
             return;
@@ -72,22 +72,23 @@ impl<P: Clone> Governor<P> {
             self.count(id, t);
         }
         if t.is_none() {
-            self.announce(id);
+            self.report_outcome(id);
         }
     }
 
-    /// T_max of a request has passed. True where nobody has answered it, nor a later one in its place.
-    pub(super) fn passes_t_max(&mut self, id: RequestId) -> bool {
+    /// Handles a request whose T_max has passed. Returns true if neither this request nor a later one of its pair was
+    /// answered.
+    pub(super) fn on_t_max(&mut self, id: RequestId) -> bool {
         let Some(record) = self.arbiter.get_mut(id) else {
             return false;
         };
-        let mut is_left_out = record.cloud == Leg::LeftOut;
+        let mut is_left_out = record.cloud == RequestLeg::LeftOut;
         let is_told = record.failed || record.taken || record.missed;
         let mut awaits = !is_told && !record.is_in_time();
         if let Kind::Input(pair) = record.kind {
             let stream = &self.pairs[pair];
-            is_left_out |= stream.is_beyond_telling(record);
-            awaits &= !stream.is_beyond_telling(record) && stream.passed <= Some(id);
+            is_left_out |= stream.is_uncorrelated(record);
+            awaits &= !stream.is_uncorrelated(record) && stream.passed <= Some(id);
         }
         record.missed |= awaits;
         if !is_left_out {
@@ -107,21 +108,21 @@ impl<P: Clone> Governor<P> {
         self.observe(t, times.t_desire, times.t_max);
     }
 
-    /// Tells the outcome of a request that was judged.
-    pub(super) fn announce(&mut self, id: RequestId) {
+    /// Reports the outcome of a request that has been judged.
+    pub(super) fn report_outcome(&mut self, id: RequestId) {
         let Some(record) = self.arbiter.get(id).filter(|record| record.judged) else {
             return;
         };
         let stamp = match record.key {
-            Some((_, Key::Stamp(stamp))) => Some(stamp),
+            Some((_, CorrelationKey::Stamp(stamp))) => Some(stamp),
             _ => None,
         };
-        let outcome = Outcome {
+        let outcome = RequestOutcome {
             request: id,
             channel: record.channel.clone(),
             stamp,
             cloud: record.cloud_time,
-            answer: record.answered().zip(record.answer_time),
+            answer: record.answered_by().zip(record.answer_time),
             phases: None,
             q: self.satisfaction.q(),
         };
@@ -130,18 +131,18 @@ impl<P: Clone> Governor<P> {
 
     pub(super) fn observe(&mut self, t: Option<Duration>, t_desire: Duration, t_max: Duration) {
         match self.satisfaction.observe(t, t_desire, t_max) {
-            Step::Desired => self.counts.desired += 1,
-            Step::Accepted => self.counts.accepted += 1,
-            Step::Late => {
+            ResponseGrade::Desired => self.counts.desired += 1,
+            ResponseGrade::Accepted => self.counts.accepted += 1,
+            ResponseGrade::Late => {
                 self.counts.late += 1;
-                self.decider.late();
+                self.decider.note_late();
             }
         }
     }
 
-    /// Where the time went of the request that the cloud has just answered, if it was that one: the sum must be what
-    /// the request took.
-    pub fn phases(&mut self, phases: &Phases) {
+    /// Records the phases of the request that the cloud has just answered. Phases whose sum does not match the
+    /// request's response time belong to another request and are ignored.
+    pub fn record_phases(&mut self, phases: &Phases) {
         let answered = |effect: &mut Effect<P>| match effect {
             Effect::Outcome(outcome) if outcome.cloud.is_some() => Some(outcome.clone()),
             _ => None,

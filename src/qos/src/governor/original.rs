@@ -1,21 +1,21 @@
-//! The local original: what is decided of it, and what follows when it is gone.
+//! Carries out decisions about the local original, and handles its loss.
 
 use std::time::Instant;
 
 use super::{EVENTS, Effect, Governor, UNMATCHED};
-use crate::decider::Event;
+use crate::decider::QosEvent;
 use crate::pair::Correlation;
-use crate::request::{Leg, Side};
+use crate::request::{RequestLeg, Responder};
 use crate::sla::{Measure, Mode};
 
 impl<P: Clone> Governor<P> {
-    /// The link is down from now on. Where no time was promised, or nothing can be asked yet, it may come before that
-    /// means anything; where one was, Q decides.
-    pub(super) fn left_alone(&mut self, now: Instant) {
+    /// Handles the start of a time without a link. If the SLA has no response time, or nothing can be asked yet, the
+    /// local original takes over after a delay; otherwise Q decides.
+    pub(super) fn on_link_lost(&mut self, now: Instant) {
         match (&self.sla.measure, self.sla.mode) {
             (Measure::Link { after }, _) => {
                 self.away_at = Some(now + *after);
-                self.decider.late();
+                self.decider.note_late();
             }
             (_, Mode::Stateful) => self.away = true,
             (_, Mode::Stateless) if !self.reached => {
@@ -28,30 +28,30 @@ impl<P: Clone> Governor<P> {
     pub(super) fn decide(&mut self, now: Instant) {
         for event in self.decider.decide(&self.satisfaction, !self.away) {
             let (feed, stop) = (
-                matches!(event, Event::Feed(_)),
-                matches!(event, Event::Stop(_)),
+                matches!(event, QosEvent::Feed(_)),
+                matches!(event, QosEvent::Stop(_)),
             );
-            self.say(now, event);
+            self.push_event(now, event);
             if feed {
-                self.give_waiting(now, Side::Local);
+                self.ask_open_requests(now, Responder::Local);
             }
             if stop {
-                self.local_lost(now);
+                self.on_local_lost(now);
             }
         }
-        self.give_straggler(now);
+        self.ask_straggler(now);
         for index in 0..self.pairs.len() {
             let stream = &mut self.pairs[index];
             if stream.by == Correlation::Stamp && stream.unmatched.is_some_and(|n| n >= UNMATCHED) {
                 stream.by = Correlation::Arrival;
                 stream.queues = Default::default();
                 let input = stream.pair.input.clone();
-                self.say(now, Event::Uncorrelated(input));
+                self.push_event(now, QosEvent::Uncorrelated(input));
             }
         }
     }
 
-    pub(super) fn say(&mut self, now: Instant, event: Event) {
+    pub(super) fn push_event(&mut self, now: Instant, event: QosEvent) {
         if self.events.len() == EVENTS {
             self.events.pop_front();
         }
@@ -59,16 +59,19 @@ impl<P: Clone> Governor<P> {
         self.effects.push_back(Effect::Event(event));
     }
 
-    /// The local original is gone with what it was asked; the cloud is asked where it was not.
-    pub(super) fn local_lost(&mut self, now: Instant) {
-        let reason = Leg::Failed("the local original ended".into());
-        let lost = self.arbiter.turn(Side::Local, &Leg::Asked, &reason);
+    /// Handles the loss of the local original and of its open requests; the cloud is asked for those it was not asked
+    /// for before.
+    pub(super) fn on_local_lost(&mut self, now: Instant) {
+        let reason = RequestLeg::Failed("the local original ended".into());
+        let lost = self
+            .arbiter
+            .replace_legs(Responder::Local, &RequestLeg::Asked, &reason);
         for stream in &mut self.pairs {
-            stream.queues[Side::Local.index()].waiting.clear();
+            stream.queues[Responder::Local.index()].waiting.clear();
         }
         for id in lost {
             if self.link {
-                self.ask(now, id, Side::Cloud);
+                self.ask(now, id, Responder::Cloud);
             }
             self.fail_if_hopeless(id);
         }

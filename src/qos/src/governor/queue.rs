@@ -1,35 +1,35 @@
-//! What one side was asked for of one pair, in the order in which it was published.
+//! The outstanding inputs of one side of a pair, in the order in which they were published.
 
 use std::collections::VecDeque;
 use std::time::Instant;
 
 use crate::request::RequestId;
 
-/// After so many answers in a row by which nothing was left out, a node is taken for one that answers every input.
+/// Number of answers in a row without a skipped input after which a node is assumed to answer every input.
 const ALL_TAKEN: u32 = 100;
 
-/// Inputs that a side was given and has not answered, the oldest first.
+/// Inputs that were sent to a side and not answered, oldest first.
 ///
-/// A node may leave inputs out: one with a short queue takes the newest when it is done. Only a later answer shows that, and
-/// until it comes an input that was given while the node was busy cannot be told from one that nobody will answer.
+/// A node may skip inputs: one with a short queue takes the newest when it is done. Only a later answer shows that;
+/// until it comes, an input that arrived while the node was busy looks like one that will never be answered.
 #[derive(Debug, Default)]
-pub(super) struct Queue {
+pub(super) struct OutstandingInputs {
     pub(super) waiting: VecDeque<RequestId>,
-    /// When the side has answered last.
+    /// Time of the side's last answer.
     pub(super) heard: Option<Instant>,
-    /// So many answers in a row left nothing out.
+    /// Number of answers in a row without a skipped input.
     all_taken: u32,
 }
 
-impl Queue {
-    /// The side was given this one, perhaps after later ones.
+impl OutstandingInputs {
+    /// Adds an input that was sent to the side, possibly after later ones.
     pub(super) fn add(&mut self, id: RequestId) {
         let place = self.waiting.partition_point(|earlier| *earlier < id);
         self.waiting.insert(place, id);
     }
 
-    /// The side has answered this one. Gives those before it, which it left out.
-    pub(super) fn answered(&mut self, now: Instant, id: RequestId) -> Vec<RequestId> {
+    /// Records that the side has answered this input. Returns the earlier inputs, which it skipped.
+    pub(super) fn on_answer(&mut self, now: Instant, id: RequestId) -> Vec<RequestId> {
         self.heard = Some(now);
         let Some(place) = self.waiting.iter().position(|waiting| *waiting == id) else {
             return Vec::new();
@@ -39,15 +39,15 @@ impl Queue {
         done
     }
 
-    /// Notes whether the side left out what it could have answered in time.
-    pub(super) fn note(&mut self, left_out: bool) {
+    /// Records whether the side skipped an input that it could have answered in time.
+    pub(super) fn note_left_out(&mut self, left_out: bool) {
         let in_a_row = self.all_taken.saturating_add(1);
         self.all_taken = if left_out { 0 } else { in_a_row };
     }
 
-    /// Since when the side may be at an input that came after this one: it was given this one before it was heard last. Of a node
-    /// that answers every input the oldest one waits for no later one.
-    pub(super) fn passed_over(&self, id: RequestId, asked_at: Instant) -> Option<Instant> {
+    /// Returns the time since which the side may be working on a later input: this one was sent before the side's last
+    /// answer. For a node that answers every input, the oldest one is never considered skipped.
+    pub(super) fn passed_over_since(&self, id: RequestId, asked_at: Instant) -> Option<Instant> {
         let heard = self.heard.filter(|heard| asked_at <= *heard)?;
         let is_next = self.waiting.front() == Some(&id);
         let waits = is_next && self.all_taken < ALL_TAKEN || !is_next && self.waiting.contains(&id);

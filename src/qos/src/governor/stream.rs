@@ -1,32 +1,32 @@
-//! A pair, what is under way of it, and which input an output answers.
+//! The state of a pair, and the matching of outputs to inputs.
 
 use std::sync::Arc;
 use std::time::Instant;
 
 use super::Governor;
-use super::queue::Queue;
+use super::queue::OutstandingInputs;
 use crate::arbiter::{Kind, Record};
-use crate::pair::{Correlation, Pair};
-use crate::request::{Key, RequestId, Side, Stamp};
+use crate::pair::{Correlation, TopicPair};
+use crate::request::{CorrelationKey, RequestId, Responder, Stamp};
 
-/// A pair, and what is under way of it.
+/// A pair and its outstanding inputs.
 #[derive(Debug)]
-pub(super) struct Stream {
-    pub(super) pair: Pair,
+pub(super) struct PairState {
+    pub(super) pair: TopicPair,
     pub(super) input: Arc<str>,
     pub(super) by: Correlation,
-    /// What each side has not answered.
-    pub(super) queues: [Queue; 2],
-    /// Inputs before this one wait for nobody: a side has answered a later one.
+    /// Outstanding inputs of each side.
+    pub(super) queues: [OutstandingInputs; 2],
+    /// Inputs before this one are no longer expected to be answered: a side has answered a later one.
     pub(super) passed: Option<RequestId>,
-    /// The stamp of the first input that was asked.
+    /// Stamp of the first input that was sent as a request.
     pub(super) first: Option<Stamp>,
-    /// Stamped outputs in a row that no input had; none once one has matched.
+    /// Number of stamped outputs in a row without a matching input; `None` once one has matched.
     pub(super) unmatched: Option<u32>,
 }
 
-impl Stream {
-    pub(super) fn new(pair: Pair) -> Self {
+impl PairState {
+    pub(super) fn new(pair: TopicPair) -> Self {
         Self {
             input: pair.input.as_str().into(),
             by: pair.by.unwrap_or(Correlation::Arrival),
@@ -38,75 +38,82 @@ impl Stream {
         }
     }
 
-    pub(super) fn shown(&self) -> String {
-        Pair {
+    pub(super) fn describe(&self) -> String {
+        TopicPair {
             by: Some(self.by),
             ..self.pair.clone()
         }
         .to_string()
     }
 
-    /// Whether an input was asked by its stamp before it was known that the node copies none.
-    pub(super) fn is_beyond_telling<P>(&self, record: &Record<P>) -> bool {
+    /// Returns true if the input was sent with a stamp before the node was found not to copy stamps.
+    pub(super) fn is_uncorrelated<P>(&self, record: &Record<P>) -> bool {
         record.key.is_some() && self.by == Correlation::Arrival
     }
 
-    /// Until when an input whose T_max has passed may turn out to have been left out. What was given to a busy node is waited for
-    /// until T_max after that was heard last, and T_max more than its own at most.
-    pub(super) fn may_be_left_out<P>(&self, id: RequestId, record: &Record<P>) -> Option<Instant> {
+    /// Returns the time until which an overdue input may turn out to have been skipped. An input sent to a busy node is
+    /// waited for until T_max after the node's last answer, and at most T_max longer than its own deadline.
+    pub(super) fn left_out_deadline<P>(
+        &self,
+        id: RequestId,
+        record: &Record<P>,
+    ) -> Option<Instant> {
         let t_max = record.deadline - record.asked_at;
-        let passed_over = |queue: &Queue| queue.passed_over(id, record.asked_at);
+        let passed_over = |queue: &OutstandingInputs| queue.passed_over_since(id, record.asked_at);
         let heard = self.queues.iter().filter_map(passed_over).max();
         heard.map(|heard| heard.min(record.deadline) + t_max)
     }
 }
 
 impl<P: Clone> Governor<P> {
-    /// Whether a side has nothing to answer that is still in time.
-    pub(super) fn is_free(&self, pair: usize, side: Side) -> bool {
+    /// Returns true if the side has no outstanding input that is still in time.
+    pub(super) fn is_free(&self, pair: usize, side: Responder) -> bool {
         let is_overdue = |id: &RequestId| self.arbiter.get(*id).is_none_or(|record| record.overdue);
         let queue = &self.pairs[pair].queues[side.index()];
         queue.waiting.iter().all(is_overdue)
     }
 
-    /// A side has answered an input: it has left out those that it was given before.
-    pub(super) fn has_passed(&mut self, now: Instant, side: Side, id: RequestId) {
+    /// Handles an answer to an input: the side has skipped the earlier ones.
+    pub(super) fn on_input_answered(&mut self, now: Instant, side: Responder, id: RequestId) {
         let record = self.arbiter.get(id);
         let Some((Kind::Input(pair), deadline)) = record.map(|it| (it.kind, it.deadline)) else {
             return;
         };
         let stream = &mut self.pairs[pair];
-        // An answer that is late itself excuses nothing.
+        // A late answer does not excuse the earlier inputs.
         if now <= deadline {
             stream.passed = stream.passed.max(Some(id));
         }
         let queue = &mut stream.queues[side.index()];
         let mut left_out = false;
-        for earlier in queue.answered(now, id) {
+        for earlier in queue.on_answer(now, id) {
             let earlier = self.arbiter.get_mut(earlier);
-            left_out |= earlier.is_some_and(|record| record.note_left_out(side));
+            left_out |= earlier.is_some_and(|record| record.mark_left_out(side));
         }
-        queue.note(left_out);
+        queue.note_left_out(left_out);
     }
 
-    /// Which request an output answers, and as which of its outputs.
-    pub(super) fn request_of(
+    /// Returns the request that an output answers, and the index of the output within the pair.
+    pub(super) fn find_request(
         &mut self,
         now: Instant,
-        side: Side,
+        side: Responder,
         topic: &str,
-        key: Option<Key>,
+        key: Option<CorrelationKey>,
     ) -> Option<(RequestId, usize)> {
-        // Goals of ROS 2 are calls; their feedback is a topic.
+        // Goals of ROS 2 are calls; their feedback is published on a topic.
         let of_action = topic.strip_suffix("/_action/feedback");
-        if let (Some(action), Some(key @ Key::Goal(_))) = (of_action, &key) {
-            return self.arbiter.keyed(&action.into(), key).map(|id| (id, 1));
+        if let (Some(action), Some(key @ CorrelationKey::Goal(_))) = (of_action, &key) {
+            return self
+                .arbiter
+                .find_by_key(&action.into(), key)
+                .map(|id| (id, 1));
         }
         for stream in &mut self.pairs {
             let Some(output) = stream.pair.outputs.iter().position(|name| name == topic) else {
                 continue;
             };
-            let keyed = |key| self.arbiter.keyed(&stream.input, key);
+            let keyed = |key| self.arbiter.find_by_key(&stream.input, key);
             if let Some(id) = key.as_ref().and_then(keyed) {
                 stream.unmatched = None;
                 return Some((id, output));
@@ -115,8 +122,11 @@ impl<P: Clone> Governor<P> {
                 return None;
             }
             if stream.by == Correlation::Stamp {
-                // What was asked before the pair was known is answered, too.
-                let is_of_earlier = |first| matches!(&key, Some(Key::Stamp(stamp)) if !stamp.is_zero() && *stamp < first);
+                // Requests sent before the pair was known are answered, too.
+                let is_of_earlier = |first| {
+                    matches!(&key, Some(CorrelationKey::Stamp(stamp))
+                    if !stamp.is_zero() && *stamp < first)
+                };
                 let counts = stream.first.is_some_and(|first| !is_of_earlier(first));
                 if let Some(unmatched) = stream.unmatched.as_mut().filter(|_| output == 0 && counts)
                 {
@@ -127,7 +137,8 @@ impl<P: Clone> Governor<P> {
             if output > 0 {
                 return None;
             }
-            // The oldest that may be in time, else the oldest of all: what comes late must not be taken for more.
+            // The oldest that may be in time, else the oldest of all, so that a late answer is not matched to a later
+            // input.
             let waiting = stream.queues[side.index()].waiting.iter();
             let known = waiting.filter_map(|id| Some((*id, self.arbiter.get(*id)?)));
             let mut unkeyed = known.filter(|(_, record)| record.key.is_none());

@@ -1,7 +1,7 @@
 use super::*;
 
-fn parse(text: &str) -> Result<Sla, SlaError> {
-    Sla::parse(toml::Deserializer::parse(text).unwrap())
+fn parse(text: &str) -> Result<QosSla, SlaError> {
+    QosSla::parse(toml::Deserializer::parse(text).unwrap())
 }
 
 #[test]
@@ -10,7 +10,7 @@ fn two_times_are_enough() {
     assert_eq!(sla.t_desire, Duration::from_millis(100));
     assert_eq!(sla.t_max, Duration::from_millis(300));
     assert_eq!((sla.threshold, sla.initial, sla.cap), (4.0, 8.0, 16.0));
-    assert_eq!((sla.mode, sla.local), (Mode::Stateless, Local::Cold));
+    assert_eq!((sla.mode, sla.local), (Mode::Stateless, LocalPolicy::Cold));
     assert_eq!(sla.answers, None);
 }
 
@@ -33,7 +33,7 @@ fn everything_can_be_said() {
     .unwrap();
     assert_eq!(sla.times("/plan").t_max, Duration::from_secs(20));
     assert_eq!(sla.times("/other").t_max, Duration::from_secs(2));
-    assert_eq!(sla.warm, Warm::FirstSign);
+    assert_eq!(sla.warm, WarmStart::FirstSign);
     assert_eq!(sla.answers.unwrap()[0].outputs, ["/found"]);
     assert_eq!(sla.safe_stop.unwrap().type_name, "geometry_msgs/Twist");
 }
@@ -149,8 +149,8 @@ fn what_is_wrong_is_named_with_its_field() {
 
 #[test]
 fn ros_parameters_do_as_well() {
-    let sla = Sla::parse(serde_json::json!({"t_desire": 1, "t_max": 2.5})).unwrap();
+    let sla = QosSla::parse(serde_json::json!({"t_desire": 1, "t_max": 2.5})).unwrap();
     assert_eq!(sla.t_max, Duration::from_millis(2500));
-    let error = Sla::parse(serde_json::json!({"t_desire": [1], "t_max": 2.5})).unwrap_err();
+    let error = QosSla::parse(serde_json::json!({"t_desire": [1], "t_max": 2.5})).unwrap_err();
     assert_eq!(error.field, "t_desire");
 }

@@ -1,19 +1,19 @@
-//! An SLA as it is written, and what must hold of it.
+//! The serialized form of an SLA, and its validation.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use serde::Deserialize;
 
-use super::{Local, Measure, Mode, SafeStop, Sla, Times, Warm};
-use crate::pair::Pair;
-use crate::satisfaction::{DEFAULT_CAP, below};
+use super::{LocalPolicy, Measure, Mode, QosSla, SafeStop, Times, WarmStart};
+use crate::pair::TopicPair;
+use crate::satisfaction::{DEFAULT_CAP, next_below};
 use crate::sla_error::SlaError;
 use crate::span::{LONGEST, Span};
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Written {
+pub(super) struct RawSla {
     t_desire: Option<Span>,
     t_max: Option<Span>,
     #[serde(default = "default_threshold")]
@@ -24,29 +24,29 @@ pub(super) struct Written {
     #[serde(default)]
     mode: Mode,
     #[serde(default)]
-    local: Local,
-    warm: Option<Warm>,
+    local: LocalPolicy,
+    warm: Option<WarmStart>,
     #[serde(default)]
-    measure: WrittenMeasure,
-    answers: Option<Vec<Pair>>,
+    measure: RawMeasure,
+    answers: Option<Vec<TopicPair>>,
     safe_stop: Option<SafeStop>,
     #[serde(default)]
-    requests: BTreeMap<String, WrittenTimes>,
+    requests: BTreeMap<String, RawTimes>,
 }
 
 #[derive(Deserialize, Default)]
 #[serde(rename_all = "snake_case")]
-enum WrittenMeasure {
+enum RawMeasure {
     #[default]
     Rrt,
-    FramesPerSecond(WrittenRate),
-    Age(WrittenAge),
-    Link(WrittenLink),
+    FramesPerSecond(RawRate),
+    Age(RawAge),
+    Link(RawLink),
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WrittenRate {
+struct RawRate {
     #[serde(default)]
     output: String,
     desire: f64,
@@ -57,7 +57,7 @@ struct WrittenRate {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WrittenAge {
+struct RawAge {
     #[serde(default)]
     output: String,
     desire: Span,
@@ -66,18 +66,18 @@ struct WrittenAge {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WrittenLink {
+struct RawLink {
     after: Span,
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WrittenTimes {
+struct RawTimes {
     t_desire: Span,
     t_max: Span,
 }
 
-/// Servants that start take about as long.
+/// Default for `unreached`: about the time a servant takes to start.
 const UNREACHED: Duration = Duration::from_secs(3);
 
 fn default_threshold() -> f64 {
@@ -88,14 +88,14 @@ fn default_over() -> usize {
     5
 }
 
-impl Written {
-    pub(super) fn check(self) -> Result<Sla, SlaError> {
-        positive("threshold", self.threshold)?;
+impl RawSla {
+    pub(super) fn check(self) -> Result<QosSla, SlaError> {
+        check_positive("threshold", self.threshold)?;
         let initial = self.initial.unwrap_or(2.0 * self.threshold);
-        positive("initial", initial)?;
+        check_positive("initial", initial)?;
         let cap = self.cap.unwrap_or(DEFAULT_CAP * self.threshold);
-        // Q must be able to rise above the threshold, or the local original would never be stopped.
-        if cap.is_nan() || below(cap) <= self.threshold {
+        // Q must be able to exceed the threshold, or the local original would never be stopped.
+        if cap.is_nan() || next_below(cap) <= self.threshold {
             return Err(SlaError::new(
                 "cap",
                 format!(
@@ -104,24 +104,25 @@ impl Written {
                 ),
             ));
         }
-        if self.warm.is_some() && self.local != Local::Warm {
+        if self.warm.is_some() && self.local != LocalPolicy::Warm {
             return Err(SlaError::new(
                 "warm",
                 "says when a warm local original starts, but local is not \"warm\"; set local = \"warm\" or remove it",
             ));
         }
         let (measure, times) = match self.measure {
-            WrittenMeasure::Rrt => {
+            RawMeasure::Rrt => {
                 let times = Times::check("", self.t_desire, self.t_max)?;
                 (Measure::Rrt, times)
             }
             measure => {
-                // The measure brings its own limits; a second pair would contradict it.
+                // The measure has limits of its own; a second pair would contradict it.
                 for (field, given) in [("t_desire", self.t_desire), ("t_max", self.t_max)] {
                     if given.is_some() {
                         return Err(SlaError::new(
                             field,
-                            "belongs to the response time, but measure names another one; remove it, or remove measure",
+                            "belongs to the response time, but measure selects another one; remove it, or remove \
+                                measure",
                         ));
                     }
                 }
@@ -135,7 +136,7 @@ impl Written {
             requests.insert(name, times);
         }
         if let Some(stop) = &self.safe_stop {
-            absolute("safe_stop.topic", &stop.topic)?;
+            check_absolute("safe_stop.topic", &stop.topic)?;
             if stop
                 .type_name
                 .split('/')
@@ -149,7 +150,7 @@ impl Written {
                 ));
             }
         }
-        Ok(Sla {
+        Ok(QosSla {
             t_desire: times.t_desire,
             t_max: times.t_max,
             threshold: self.threshold,
@@ -170,14 +171,14 @@ impl Written {
     }
 }
 
-impl WrittenMeasure {
+impl RawMeasure {
     fn check(self) -> Result<(Measure, Times), SlaError> {
         match self {
-            Self::Rrt => unreachable!("the caller took it"),
+            Self::Rrt => unreachable!("the caller has checked this"),
             Self::FramesPerSecond(rate) => {
-                absolute_or_none("measure.frames_per_second.output", &rate.output)?;
-                positive("measure.frames_per_second.desire", rate.desire)?;
-                positive("measure.frames_per_second.min", rate.min)?;
+                check_absolute_or_empty("measure.frames_per_second.output", &rate.output)?;
+                check_positive("measure.frames_per_second.desire", rate.desire)?;
+                check_positive("measure.frames_per_second.min", rate.min)?;
                 if rate.min > rate.desire {
                     return Err(SlaError::new(
                         "measure.frames_per_second.min",
@@ -191,8 +192,8 @@ impl WrittenMeasure {
                     ));
                 }
                 let times = Times {
-                    t_desire: interval("measure.frames_per_second.desire", rate.desire)?,
-                    t_max: interval("measure.frames_per_second.min", rate.min)?,
+                    t_desire: frame_interval("measure.frames_per_second.desire", rate.desire)?,
+                    t_max: frame_interval("measure.frames_per_second.min", rate.min)?,
                 };
                 let measure = Measure::FramesPerSecond {
                     output: rate.output,
@@ -201,7 +202,7 @@ impl WrittenMeasure {
                 Ok((measure, times))
             }
             Self::Age(age) => {
-                absolute_or_none("measure.age.output", &age.output)?;
+                check_absolute_or_empty("measure.age.output", &age.output)?;
                 let desire = age.desire.duration();
                 let max = age.max.duration();
                 if max < desire {
@@ -218,7 +219,7 @@ impl WrittenMeasure {
             }
             Self::Link(link) => {
                 let after = link.after.duration();
-                // Requests wait as long as whoever asks does.
+                // Requests wait as long as their callers do.
                 let times = Times {
                     t_desire: LONGEST,
                     t_max: LONGEST,
@@ -248,7 +249,7 @@ impl Times {
     }
 }
 
-fn absolute(field: &str, topic: &str) -> Result<(), SlaError> {
+fn check_absolute(field: &str, topic: &str) -> Result<(), SlaError> {
     if topic.len() > 1 && topic.starts_with('/') {
         return Ok(());
     }
@@ -258,24 +259,24 @@ fn absolute(field: &str, topic: &str) -> Result<(), SlaError> {
     ))
 }
 
-/// Not given, it is the output that answers the first request that is found.
-fn absolute_or_none(field: &str, topic: &str) -> Result<(), SlaError> {
+/// Checks a topic name that may be empty, which stands for the output that answers the first detected request.
+fn check_absolute_or_empty(field: &str, topic: &str) -> Result<(), SlaError> {
     if topic.is_empty() {
         return Ok(());
     }
-    absolute(field, topic)
+    check_absolute(field, topic)
 }
 
-/// The time between two frames of a rate.
-fn interval(field: &str, rate: f64) -> Result<Duration, SlaError> {
-    let interval = Span::seconds(1.0 / rate).map(Span::duration);
+/// Returns the interval between two frames at `rate`.
+fn frame_interval(field: &str, rate: f64) -> Result<Duration, SlaError> {
+    let interval = Span::from_seconds(1.0 / rate).map(Span::duration);
     interval.ok_or_else(|| {
-        let reason = format!("{rate} frames a second are not between one a day and a billion");
+        let reason = format!("{rate} frames per second are not between one per day and a billion");
         SlaError::new(field, reason)
     })
 }
 
-fn positive(field: &str, value: f64) -> Result<(), SlaError> {
+fn check_positive(field: &str, value: f64) -> Result<(), SlaError> {
     if value.is_finite() && value > 0.0 && (4.0 * value).is_normal() {
         return Ok(());
     }

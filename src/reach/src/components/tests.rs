@@ -1,30 +1,30 @@
 use tokio::time::timeout;
 
 use super::*;
-use crate::doubles::{Events, Started};
+use crate::doubles::{RecordedEvents, StubNodesDouble};
 use crate::memory_bus::MemorySystem;
 use crate::memory_container::{MemoryContainer, registry};
 
-/// Only bounds how long a failing test takes.
+/// Only limits the duration of a failing test.
 const LONG: Duration = Duration::from_secs(60);
 
-/// A servant whose revision loads something into `/box`.
-struct World {
+/// A servant whose revision loads components into `/box`.
+struct ComponentWorld {
     system: Arc<MemorySystem>,
-    events: Arc<Events>,
-    components: Components,
+    events: Arc<RecordedEvents>,
+    components: ComponentLoader,
 }
 
-impl World {
-    fn new(plugins: &[&str], started: Started, patience: Duration) -> Self {
-        Self::beside(Arc::default(), plugins, started, patience)
+impl ComponentWorld {
+    fn new(plugins: &[&str], started: StubNodesDouble, patience: Duration) -> Self {
+        Self::with_nodes(Arc::default(), plugins, started, patience)
     }
 
-    /// Where nodes run already.
-    fn beside(
+    /// Creates a servant in which nodes are already running.
+    fn with_nodes(
         system: Arc<MemorySystem>,
         plugins: &[&str],
-        started: Started,
+        started: StubNodesDouble,
         patience: Duration,
     ) -> Self {
         let component = |plugin: &&str| Component {
@@ -33,15 +33,15 @@ impl World {
             ..Component::default()
         };
         let components = plugins.iter().map(component).collect();
-        let wanted = Wanted {
+        let wanted = ComponentPlan {
             patience,
-            ..Wanted::new([("/box".to_owned(), components)].into(), registry())
+            ..ComponentPlan::new([("/box".to_owned(), components)].into(), registry())
         };
-        let events = Arc::<Events>::default();
+        let events = Arc::<RecordedEvents>::default();
         let bus: Arc<dyn Bus> = system.join("/cloudroid_bridge");
-        let (nodes, observer): (Arc<dyn Nodes>, Arc<dyn Observer>) =
+        let (nodes, observer): (Arc<dyn NodeController>, Arc<dyn Observer>) =
             (Arc::new(started), events.clone());
-        let components = Components::follow(&bus, &nodes, &observer, wanted);
+        let components = ComponentLoader::start(&bus, &nodes, &observer, wanted);
         Self {
             system,
             events,
@@ -49,10 +49,13 @@ impl World {
         }
     }
 
-    /// How far the container is when it is past loading.
-    async fn load(&self) -> Load {
+    /// Waits until the container is past loading and returns its state.
+    async fn load(&self) -> ContainerLoad {
         let mut loads = self.components.loads();
-        let over = |all: &Loads| all.get("/box").is_some_and(|it| *it != Load::Loading);
+        let over = |all: &Loads| {
+            all.get("/box")
+                .is_some_and(|it| *it != ContainerLoad::Loading)
+        };
         let all = timeout(LONG, loads.wait_for(over)).await.expect("in time");
         all.expect("followed")["/box"].clone()
     }
@@ -60,29 +63,40 @@ impl World {
 
 #[tokio::test]
 async fn what_the_revision_loads_is_loaded_when_its_container_appears() {
-    let world = World::new(&["talk::Talker"], Started::default(), LONG);
+    let world = ComponentWorld::new(&["talk::Talker"], StubNodesDouble::default(), LONG);
     assert!(world.components.loads().borrow().is_empty());
     let container = MemoryContainer::start(&world.system, "/box").await;
-    assert_eq!(world.load().await, Load::Loaded(vec!["/talker".to_owned()]));
+    assert_eq!(
+        world.load().await,
+        ContainerLoad::Loaded(vec!["/talker".to_owned()])
+    );
     assert_eq!(container.names(), ["/talker"]);
-    // The daemon is another one, and the servant has gone on.
-    let again = World::beside(
+    // The daemon was restarted while the servant went on.
+    let again = ComponentWorld::with_nodes(
         world.system.clone(),
         &["talk::Talker"],
-        Started::default(),
+        StubNodesDouble::default(),
         LONG,
     );
-    assert_eq!(again.load().await, Load::Loaded(vec!["/talker".to_owned()]));
+    assert_eq!(
+        again.load().await,
+        ContainerLoad::Loaded(vec!["/talker".to_owned()])
+    );
     assert_eq!(container.loaded.lock().asked.len(), 1, "it was there");
 }
 
 #[tokio::test]
 async fn what_is_not_loaded_is_an_event_with_the_containers_words() {
-    let world = World::new(&["talk::Talker", "talk::Walker"], Started::default(), LONG);
+    let world = ComponentWorld::new(
+        &["talk::Talker", "talk::Walker"],
+        StubNodesDouble::default(),
+        LONG,
+    );
     let _container = MemoryContainer::start(&world.system, "/box").await;
-    let words = "the component container /box does not load talk::Walker of package talk: Failed to find class with the \
+    let words = "the component container /box does not load talk::Walker of package talk: Failed to find class with \
+                 the \
                  requested plugin name.";
-    assert_eq!(world.load().await, Load::Refused(words.to_owned()));
+    assert_eq!(world.load().await, ContainerLoad::Refused(words.to_owned()));
     let events = world.events.0.lock().clone();
     assert_eq!(events, [("component-refused".to_owned(), words.to_owned())]);
 }
@@ -90,9 +104,9 @@ async fn what_is_not_loaded_is_an_event_with_the_containers_words() {
 #[tokio::test]
 async fn a_container_that_serves_nothing_is_told_with_how_long_was_waited() {
     let patience = Duration::from_millis(100);
-    let world = World::new(&["talk::Talker"], Started::default(), patience);
+    let world = ComponentWorld::new(&["talk::Talker"], StubNodesDouble::default(), patience);
     let _node = world.system.join("/box");
-    let Load::Refused(words) = world.load().await else {
+    let ContainerLoad::Refused(words) = world.load().await else {
         panic!("it loads nothing");
     };
     assert!(
@@ -103,9 +117,10 @@ async fn a_container_that_serves_nothing_is_told_with_how_long_was_waited() {
 
 #[tokio::test]
 async fn a_container_that_a_stub_has_started_is_left_to_the_robot() {
-    let world = World::new(&["talk::Talker"], Started::node("/box"), LONG);
+    let world = ComponentWorld::new(&["talk::Talker"], StubNodesDouble::node("/box"), LONG);
     let container = MemoryContainer::start(&world.system, "/box").await;
-    // Whoever follows has seen the container when it has seen what came later, and its task has run by then: one thread.
+    // The follower has seen the container by the time it has seen the later node, and its task has run: there is only
+    // one thread.
     for _ in 0..100 {
         tokio::task::yield_now().await;
     }

@@ -1,6 +1,6 @@
-//! Ways out of a servant: no route leads out of its namespace, so what its nodes connect to at a loopback address inside is
-//! passed on from here, to one host and one port each. `/etc/hosts` inside gives that address the host's name, so
-//! that programs, and certificates, find what they expect.
+//! Relays for outgoing connections of a servant. Its network namespace has no route to the outside, so connections of
+//! its nodes to a loopback address inside are forwarded from here, each address and port to one host and port.
+//! `/etc/hosts` inside maps the host's name to that address, so that programs and certificates see the expected name.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -16,24 +16,24 @@ use tokio::task::JoinSet;
 
 use super::Route;
 
-/// Connections at a time through one way out. Each takes two descriptors of the daemon, and memory for what is passed on.
+/// Maximum number of concurrent connections per route. Each takes two descriptors of the daemon and buffer memory.
 const CONNECTIONS: usize = 128;
 
-/// The routes out of one servant; closed when dropped.
+/// The relays of one servant; closed when dropped.
 #[derive(Debug, Default)]
 pub struct Relays {
     _listeners: JoinSet<()>,
 }
 
 impl Relays {
-    /// Opens them. One that cannot be opened is told, and missing.
+    /// Opens the relays. One that cannot be opened is logged and left out.
     pub async fn open(network: &NetNs, routes: &[Route]) -> Relays {
         let mut listeners = JoinSet::new();
         for route in routes {
             let inside = SocketAddr::from((route.inside, route.port));
             match network.listen(inside).await {
                 Ok(listener) => {
-                    listeners.spawn(pass_on(listener, route.clone()));
+                    listeners.spawn(relay_connections(listener, route.clone()));
                 }
                 Err(error) => {
                     tracing::warn!("no route out to {}:{}: {error}", route.host, route.port)
@@ -46,24 +46,24 @@ impl Relays {
     }
 }
 
-async fn pass_on(listener: TcpListener, route: Route) {
-    let far = Arc::new(Far {
+async fn relay_connections(listener: TcpListener, route: Route) {
+    let far = Arc::new(RelayTarget {
         route,
         told: Mutex::default(),
         told_full: AtomicBool::new(false),
     });
     let room = Arc::new(Semaphore::new(CONNECTIONS));
-    // Ended with the listener.
+    // Aborted together with the listener.
     let mut connections = JoinSet::new();
     loop {
         tokio::select! {
             accepted = listener.accept() => {
                 let Ok((mut near, _)) = accepted else {
-                    // Out of descriptors, perhaps: others may end meanwhile.
+                    // Possibly out of descriptors; other connections may end meanwhile.
                     tokio::time::sleep(std::time::Duration::from_millis(100)).await;
                     continue;
                 };
-                // A refusal is what a node understands; to wait would look like a host that is down.
+                // Nodes understand a refusal; waiting would look like a host that is down.
                 let Ok(place) = Arc::clone(&room).try_acquire_owned() else {
                     far.report_full();
                     continue;
@@ -71,13 +71,13 @@ async fn pass_on(listener: TcpListener, route: Route) {
                 let far = Arc::clone(&far);
                 connections.spawn(async move {
                     let _place = place;
-                    let Far { route, .. } = &*far;
+                    let RelayTarget { route, .. } = &*far;
                     match far.dial().await {
                         Ok(mut stream) => {
                             let _ = tokio::io::copy_bidirectional(&mut near, &mut stream).await;
                         }
                         Err(error) => {
-                            tracing::debug!("{}:{} was not reached: {error}", route.host, route.port);
+                            tracing::debug!("cannot connect to {}:{}: {error}", route.host, route.port);
                         }
                     }
                 });
@@ -87,37 +87,38 @@ async fn pass_on(listener: TcpListener, route: Route) {
     }
 }
 
-/// The far end of a way out.
-struct Far {
+/// The far end of a relay.
+struct RelayTarget {
     route: Route,
-    /// Addresses whose refusal was told.
+    /// Addresses whose refusal was logged.
     told: Mutex<BTreeSet<IpAddr>>,
-    /// Whether it was told that there were too many connections.
+    /// The connection limit was logged.
     told_full: AtomicBool,
 }
 
-impl Far {
-    /// Tells, once, that connections are refused.
+impl RelayTarget {
+    /// Logs once that connections are refused.
     fn report_full(&self) {
         if !self.told_full.swap(true, Ordering::Relaxed) {
             let Route { host, port, .. } = &self.route;
             tracing::warn!(
-                "a servant has {CONNECTIONS} connections to {host}:{port}, as many as may be; further ones are closed until some end"
+                "a servant has {CONNECTIONS} connections to {host}:{port}, which is the limit; further ones are closed \
+                    until some end"
             );
         }
     }
 
-    /// Resolves the host and connects to the first of its addresses that may be dialled and answers. What is dialled is
-    /// the address that was looked at: the name is not resolved again.
+    /// Resolves the host and connects to the first permitted address that answers. The address that was checked is
+    /// dialled; the name is not resolved again.
     async fn dial(&self) -> io::Result<TcpStream> {
-        let Far { route, .. } = self;
+        let RelayTarget { route, .. } = self;
         let mut outcome = Err(io::Error::from(io::ErrorKind::AddrNotAvailable));
         for address in tokio::net::lookup_host((route.host.as_str(), route.port)).await? {
             if let Err(reach) = route.permits(address.ip()) {
                 if self.told.lock().insert(address.ip()) {
                     tracing::warn!(
-                        "a servant's route out to {}:{} leads to {} ({reach}) and is refused there; if that is meant, name \
-                         the address in [allow] of the configuration: egress = [\"{address}\"]",
+                        "a servant's route out to {}:{} leads to {} ({reach}), which is refused; if that is intended, \
+                            allow the address in [allow] of the configuration: egress = [\"{address}\"]",
                         route.host,
                         route.port,
                         address.ip()
@@ -142,8 +143,9 @@ mod tests {
     use super::super::routes;
     use super::*;
 
-    /// Asks `host` on the port of a listener of this machine's loopback, through a relay; what came back.
-    async fn asks(host: &str, rule: impl Fn(u16) -> String) -> String {
+    /// Connects through a relay to `host` on the port of a listener on this machine's loopback, and returns what was
+    /// received.
+    async fn fetch_through_relay(host: &str, rule: impl Fn(u16) -> String) -> String {
         let server = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let port = server.local_addr().expect("bound").port();
         tokio::spawn(async move {
@@ -155,7 +157,7 @@ mod tests {
         let route = routes(&asked, &[rule(port)]).expect("allowed").remove(0);
         let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let near = relay.local_addr().expect("bound");
-        let relaying = tokio::spawn(pass_on(relay, route));
+        let relaying = tokio::spawn(relay_connections(relay, route));
         let mut heard = String::new();
         let mut stream = TcpStream::connect(near).await.expect("relayed");
         let _ = stream.read_to_string(&mut heard).await;
@@ -164,10 +166,14 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn any_host_is_none_of_this_machine() {
-        // Another way to write 127.0.0.1, which only the resolver understands.
+    async fn a_wildcard_never_reaches_this_machine() {
+        // Another notation of 127.0.0.1 that only the resolver understands.
         for host in ["localhost", "127.1"] {
-            assert_eq!(asks(host, |port| format!("*:{port}")).await, "", "{host}");
+            assert_eq!(
+                fetch_through_relay(host, |port| format!("*:{port}")).await,
+                "",
+                "{host}"
+            );
         }
     }
 
@@ -188,8 +194,8 @@ mod tests {
         let route = routes(&egress, &egress).expect("allowed").remove(0);
         let relay = TcpListener::bind("127.0.0.1:0").await.expect("bound");
         let near = relay.local_addr().expect("bound");
-        let relaying = tokio::spawn(pass_on(relay, route));
-        // What the first byte of a connection is, if it has one.
+        let relaying = tokio::spawn(relay_connections(relay, route));
+        // Reads the first byte of a connection, if there is one.
         let first = async || {
             let mut stream = TcpStream::connect(near).await.expect("accepted");
             let mut byte = [0];
@@ -213,7 +219,7 @@ mod tests {
             ("127.0.0.1", "127.0.0.1"),
             ("127.0.0.1", "127.0.0.0/8"),
         ] {
-            let heard = asks(host, |port| format!("{named}:{port}")).await;
+            let heard = fetch_through_relay(host, |port| format!("{named}:{port}")).await;
             assert_eq!(heard, "of the host", "{host} by {named}");
         }
     }

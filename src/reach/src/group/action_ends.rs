@@ -1,73 +1,79 @@
-//! What an action is made of, below its name: of ROS 1 five topics, of ROS 2 two topics and three services.
+//! Topics and services of an action, below its name: five topics in ROS 1, two topics and three services in ROS 2.
 
 use ros::bus::RosVersion;
-use ros::ros2::names::part_of_action;
+use ros::ros2::names::action_part_name;
 
-/// One of them.
+/// A topic or service of an action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(super) enum End {
-    /// A topic of clients (ROS 1).
+pub(super) enum ActionEndpoint {
+    /// Topic published by clients (ROS 1).
     Goal,
-    /// A topic of clients (ROS 1).
+    /// Topic published by clients (ROS 1).
     Cancel,
-    /// A topic of servers.
+    /// Topic published by servers.
     Feedback,
-    /// A topic of servers (ROS 1).
+    /// Topic published by servers (ROS 1).
     Result,
-    /// A topic of servers.
+    /// Topic published by servers.
     Status,
-    /// A service (ROS 2).
+    /// Service (ROS 2).
     SendGoal,
-    /// A service (ROS 2).
+    /// Service (ROS 2).
     CancelGoal,
-    /// A service (ROS 2).
+    /// Service (ROS 2).
     GetResult,
 }
 
-const OF_ONE: [(End, &str); 5] = [
-    (End::Goal, "goal"),
-    (End::Cancel, "cancel"),
-    (End::Feedback, "feedback"),
-    (End::Result, "result"),
-    (End::Status, "status"),
+const OF_ONE: [(ActionEndpoint, &str); 5] = [
+    (ActionEndpoint::Goal, "goal"),
+    (ActionEndpoint::Cancel, "cancel"),
+    (ActionEndpoint::Feedback, "feedback"),
+    (ActionEndpoint::Result, "result"),
+    (ActionEndpoint::Status, "status"),
 ];
 
-const OF_TWO: [(End, &str); 5] = [
-    (End::SendGoal, "send_goal"),
-    (End::CancelGoal, "cancel_goal"),
-    (End::GetResult, "get_result"),
-    (End::Feedback, "feedback"),
-    (End::Status, "status"),
+const OF_TWO: [(ActionEndpoint, &str); 5] = [
+    (ActionEndpoint::SendGoal, "send_goal"),
+    (ActionEndpoint::CancelGoal, "cancel_goal"),
+    (ActionEndpoint::GetResult, "get_result"),
+    (ActionEndpoint::Feedback, "feedback"),
+    (ActionEndpoint::Status, "status"),
 ];
 
-impl End {
-    /// Whether clients publish it.
-    pub(super) fn is_of_clients(self) -> bool {
-        matches!(self, End::Goal | End::Cancel)
+impl ActionEndpoint {
+    /// Returns whether it is a topic published by clients.
+    pub(super) fn is_published_by_clients(self) -> bool {
+        matches!(self, ActionEndpoint::Goal | ActionEndpoint::Cancel)
     }
 
     pub(super) fn is_service(self) -> bool {
-        matches!(self, End::SendGoal | End::CancelGoal | End::GetResult)
+        matches!(
+            self,
+            ActionEndpoint::SendGoal | ActionEndpoint::CancelGoal | ActionEndpoint::GetResult
+        )
     }
 
-    /// The type of a topic of ROS 1, of an action of this type.
+    /// Returns the type of the ROS 1 topic for an action of this type.
     pub(super) fn type_name(self, action: &str) -> String {
         let of_action = |what: &str| format!("{action}Action{what}");
         match self {
-            End::Feedback => of_action("Feedback"),
-            End::Result => of_action("Result"),
-            End::Cancel => "actionlib_msgs/GoalID".to_owned(),
-            End::Status => "actionlib_msgs/GoalStatusArray".to_owned(),
-            End::Goal | End::SendGoal | End::CancelGoal | End::GetResult => of_action("Goal"),
+            ActionEndpoint::Feedback => of_action("Feedback"),
+            ActionEndpoint::Result => of_action("Result"),
+            ActionEndpoint::Cancel => "actionlib_msgs/GoalID".to_owned(),
+            ActionEndpoint::Status => "actionlib_msgs/GoalStatusArray".to_owned(),
+            ActionEndpoint::Goal
+            | ActionEndpoint::SendGoal
+            | ActionEndpoint::CancelGoal
+            | ActionEndpoint::GetResult => of_action("Goal"),
         }
     }
 }
 
-/// The parts of an action, with their names.
-pub(super) fn ends_of(version: RosVersion, action: &str) -> Vec<(End, String)> {
+/// Returns the topics and services of an action with their names.
+pub(super) fn action_endpoints(version: RosVersion, action: &str) -> Vec<(ActionEndpoint, String)> {
     let (ends, name): (_, fn(&str, &str) -> String) = match version {
         RosVersion::One => (OF_ONE, |action, end| format!("{action}/{end}")),
-        RosVersion::Two => (OF_TWO, part_of_action),
+        RosVersion::Two => (OF_TWO, action_part_name),
     };
     ends.map(|(end, part)| (end, name(action, part))).into()
 }

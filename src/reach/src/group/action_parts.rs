@@ -1,10 +1,11 @@
-//! Actions as ROS 2 knows them: three services and two topics. To a robot the group is one action server, with its goals alone.
+//! ROS 2 actions of a group: three services and two topics. To a robot the group looks like one action server that has
+//! only its goals.
 //!
 //! ```text
-//!  send_goal ──▶ GroupClient ─▶ the group      a node's yes or no is the answer
-//!                     │                        while no servant is free: accepted, and not carried out yet
+//!  send_goal ──▶ GroupClient ─▶ the group      the response is the node's decision; while no servant is free,
+//!                     │                        the goal is accepted but not executed yet
 //!  cancel_goal ─▶ ────┘                        likewise
-//!  get_result, feedback, status ◀── what it says of this robot's goals
+//!  get_result, feedback, status ◀── updates about this robot's goals
 //! ```
 
 use std::collections::HashMap;
@@ -16,41 +17,42 @@ use bytes::Bytes;
 use futures_util::future::join_all;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, CallFate, Digest, GoalEnd, GoalEvents, Matched, Message, MessageSender,
-    Outcome, Peer, PeerId, Qos, ServiceType, Subscription, WireType, message_queue,
+    ActionClient, BusError, CallFate, Digest, GoalEnd, GoalEvents, GoalOutcome, MatchedPeers,
+    MessageSender, PeerId, QosProfile, SerializedMessage, ServiceType, Subscription, TopicPeer,
+    WireType, message_queue,
 };
-use ros::ros2::actions::Parts;
-use ros::ros2::actions::goal_server::{self, Begun, GoalServer, Topics};
+use ros::ros2::actions::ActionInterfaces;
+use ros::ros2::actions::goal_server::{self, GoalServer, GoalServerTopics, PendingGoal};
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::timeout;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::Group;
-use super::action_ends::End;
-use super::dispatch::Robot;
+use super::ServantGroup;
+use super::action_ends::ActionEndpoint;
+use super::dispatch::RobotNumber;
 use super::goals::{GroupClient, GroupEvents};
 
-/// Something that a node's robot should know: the node as the robot knows it, and what.
+/// Notices for a robot: name of the node on the robot, and text.
 pub(super) type Notices = mpsc::UnboundedSender<(String, String)>;
 
 /// One action of one robot.
 pub(super) struct ActionParts {
-    parts: Parts,
+    parts: ActionInterfaces,
     node: PeerId,
     client: GroupClient,
-    goals: Arc<GoalServer<Published>>,
-    /// Counts the goals under way.
+    goals: Arc<GoalServer<GoalTopics>>,
+    /// Budget for pending goals.
     budget: Budget,
-    /// Who waits to hear whether a goal ends.
+    /// Cancellations that wait for the node's answer.
     canceling: Mutex<HashMap<String, Vec<oneshot::Sender<bool>>>>,
     notices: Notices,
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
     _forgetting: AbortOnDropHandle<()>,
 }
 
-/// What is said on the topics.
-struct Published {
+/// Publisher of the feedback and status topics.
+struct GoalTopics {
     node: PeerId,
     feedback: Arc<WireType>,
     status: Arc<WireType>,
@@ -59,14 +61,14 @@ struct Published {
 
 #[derive(Default)]
 struct Listeners {
-    all: Vec<(End, MessageSender)>,
-    /// For newcomers.
-    status: Option<Message>,
+    all: Vec<(ActionEndpoint, MessageSender)>,
+    /// Last status, for new subscribers.
+    status: Option<SerializedMessage>,
 }
 
-impl Published {
-    fn message(&self, of: &Arc<WireType>, bytes: Bytes, latching: bool) -> Message {
-        Message {
+impl GoalTopics {
+    fn build_message(&self, of: &Arc<WireType>, bytes: Bytes, latching: bool) -> SerializedMessage {
+        SerializedMessage {
             bytes,
             wire_type: Arc::clone(of),
             publisher: self.node.clone(),
@@ -76,7 +78,7 @@ impl Published {
 }
 
 impl Listeners {
-    fn tell(&mut self, end: End, message: &Message) {
+    fn publish(&mut self, end: ActionEndpoint, message: &SerializedMessage) {
         self.all.retain(|(_, listener)| !listener.is_closed());
         for (_, listener) in self.all.iter().filter(|(of, _)| *of == end) {
             listener.send(message.clone());
@@ -84,32 +86,34 @@ impl Listeners {
     }
 }
 
-impl Topics for Published {
-    fn feedback(&self, message: Bytes) {
-        let message = self.message(&self.feedback, message, false);
-        self.state.lock().tell(End::Feedback, &message);
+impl GoalServerTopics for GoalTopics {
+    fn publish_feedback(&self, message: Bytes) {
+        let message = self.build_message(&self.feedback, message, false);
+        self.state
+            .lock()
+            .publish(ActionEndpoint::Feedback, &message);
     }
 
-    fn status(&self, message: Bytes) {
-        let message = self.message(&self.status, message, true);
+    fn publish_status(&self, message: Bytes) {
+        let message = self.build_message(&self.status, message, true);
         let mut state = self.state.lock();
-        state.tell(End::Status, &message);
+        state.publish(ActionEndpoint::Status, &message);
         state.status = Some(message);
     }
 }
 
 impl ActionParts {
     pub(super) fn new(
-        group: &Arc<Group>,
-        robot: Robot,
+        group: &Arc<ServantGroup>,
+        robot: RobotNumber,
         (name, node): (&str, &str),
         of: &Arc<ActionDef>,
         budget: &Budget,
         notices: &Notices,
     ) -> Result<Arc<ActionParts>, BusError> {
-        let parts = Parts::of(name, of)?;
+        let parts = ActionInterfaces::for_action(name, of)?;
         let node = PeerId::from(node);
-        let published = Published {
+        let published = GoalTopics {
             node: node.clone(),
             feedback: Arc::new(parts.feedback.1.clone()),
             status: Arc::new(parts.status.1.clone()),
@@ -117,8 +121,8 @@ impl ActionParts {
         };
         let goals = GoalServer::new(name, of, published, budget.clone());
         let forgets = Arc::clone(&goals);
-        let forgetting = tokio::spawn(async move { forgets.forget_in_time().await });
-        let peer = Peer {
+        let forgetting = tokio::spawn(async move { forgets.expire_results().await });
+        let peer = TopicPeer {
             id: node.clone(),
             connected: true,
             offer: None,
@@ -131,7 +135,7 @@ impl ActionParts {
             budget: budget.clone(),
             canceling: Mutex::default(),
             notices: notices.clone(),
-            matched: watch::Sender::new(Matched {
+            matched: watch::Sender::new(MatchedPeers {
                 peers: vec![peer],
                 refused: Vec::new(),
             }),
@@ -139,30 +143,30 @@ impl ActionParts {
         }))
     }
 
-    pub(super) fn wire_type(&self, end: End) -> &WireType {
+    pub(super) fn wire_type(&self, end: ActionEndpoint) -> &WireType {
         match end {
-            End::Feedback => &self.parts.feedback.1,
+            ActionEndpoint::Feedback => &self.parts.feedback.1,
             _ => &self.parts.status.1,
         }
     }
 
-    pub(super) fn service_type(&self, end: End) -> &ServiceType {
+    pub(super) fn service_type(&self, end: ActionEndpoint) -> &ServiceType {
         match end {
-            End::SendGoal => &self.parts.send_goal.1,
-            End::CancelGoal => &self.parts.cancel_goal.1,
+            ActionEndpoint::SendGoal => &self.parts.send_goal.1,
+            ActionEndpoint::CancelGoal => &self.parts.cancel_goal.1,
             _ => &self.parts.get_result.1,
         }
     }
 
-    /// Listens to what the group says of this robot's goals.
+    /// Subscribes to a topic with updates about this robot's goals.
     pub(super) fn subscribe(
         self: &Arc<Self>,
-        end: End,
+        end: ActionEndpoint,
         of: &WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
         let ours = self.wire_type(end);
-        if !(of.digest.is_any() || ours.agrees(of)) {
+        if !(of.digest.is_any() || ours.is_compatible_with(of)) {
             return Err(BusError::TypeMismatch {
                 what: "topic of an action".to_owned(),
                 theirs: of.to_string(),
@@ -174,17 +178,17 @@ impl ActionParts {
         if let Some(status) = state
             .status
             .as_ref()
-            .filter(|_| end == End::Status && qos.is_latching())
+            .filter(|_| end == ActionEndpoint::Status && qos.is_latching())
         {
             sender.send(status.clone());
         }
         state.all.push((end, sender));
         drop(state);
         Ok(Subscription {
-            dropped: messages.dropped(),
+            dropped: messages.drop_counter(),
             messages,
             matched: self.matched.subscribe(),
-            // The action goes on while somebody listens.
+            // The action exists as long as somebody subscribes.
             guard: Box::new(Arc::clone(self)),
         })
     }
@@ -192,13 +196,13 @@ impl ActionParts {
     /// Calls one of the services.
     pub(super) async fn call(
         self: &Arc<Self>,
-        (end, name): (End, &str),
+        (end, name): (ActionEndpoint, &str),
         digest: &Digest,
         request: Bytes,
         patience: Duration,
     ) -> Result<Bytes, BusError> {
         let of = self.service_type(end);
-        if !of.digest.agrees(digest) && of.request != *digest {
+        if !of.digest.is_compatible_with(digest) && of.request != *digest {
             return Err(BusError::TypeMismatch {
                 what: format!("service {name}"),
                 theirs: format!("{} {}", of.name, of.digest),
@@ -207,8 +211,8 @@ impl ActionParts {
         }
         let answer = async {
             match end {
-                End::SendGoal => self.send_goal(name, &request).await,
-                End::CancelGoal => Ok(self.cancel_goal(&request).await),
+                ActionEndpoint::SendGoal => self.send_goal(name, &request).await,
+                ActionEndpoint::CancelGoal => Ok(self.cancel_goal(&request).await),
                 _ => Ok(self.goals.result(&request).await),
             }
         };
@@ -219,15 +223,15 @@ impl ActionParts {
         timeout(patience, answer).await.map_err(late)?
     }
 
-    /// The robot's node or the robot has gone: its goals are cancelled, and not followed for long.
+    /// Cancels all goals because the robot or its node is gone; they are not followed for long.
     pub(super) fn cancel_all(&self) {
-        self.client.leave();
+        self.client.abandon();
     }
 
     async fn send_goal(self: &Arc<Self>, name: &str, request: &[u8]) -> Result<Bytes, BusError> {
         let refused = |reason: String| {
-            self.tell(&format!("a goal is refused: {reason}"));
-            Ok(goal_server::refusal())
+            self.notify_robot(&format!("a goal is refused: {reason}"));
+            Ok(goal_server::rejected_response())
         };
         let (begun, goal) = match self.goals.begin(request) {
             Ok(begun) => begun,
@@ -236,21 +240,22 @@ impl ActionParts {
         let permit = match self.budget.take(goal.len()) {
             Ok(permit) => permit,
             Err(full) => {
-                self.goals.refuses(&begun);
+                self.goals.reject(&begun);
                 return refused(full.to_string());
             }
         };
         let (answer, answered) = oneshot::channel();
         let id = begun.id();
-        let events = Ear {
-            // It hears of its end even when nobody listens any more.
+        let events = PartsGoalEvents {
+            // It receives the end of the goal even if nobody subscribes any more.
             parts: Arc::clone(self),
             id: id.clone(),
             begun,
             answer: Mutex::new(Some(answer)),
             permit: Mutex::new(Some(permit)),
         };
-        self.client.sends(&id, goal, Arc::new(events));
+        self.client
+            .send_goal_with_events(&id, goal, Arc::new(events));
         match answered.await {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(reason)) => Err(BusError::CallFailed {
@@ -262,20 +267,21 @@ impl ActionParts {
         }
     }
 
-    /// Ends those goals that their nodes are willing to end.
+    /// Cancels the goals whose nodes agree.
     async fn cancel_goal(&self, request: &[u8]) -> Bytes {
-        let Some(wanted) = self.goals.wanted(request) else {
-            return goal_server::not_canceled();
+        let Some(wanted) = self.goals.parse_cancel(request) else {
+            return goal_server::cancel_rejected_response();
         };
-        let asked = wanted.newly().map(|id| {
+        let asked = wanted.new_ids().map(|id| {
             let (sender, answer) = oneshot::channel();
             let mut canceling = self.canceling.lock();
             canceling.entry(id.clone()).or_default().push(sender);
             drop(canceling);
-            match self.goals.is_under_way(&id) {
-                true => self.client.cancel(&id),
-                // It has ended meanwhile: nobody will answer.
-                false => self.cancel_answered(&id, false),
+            if self.goals.is_under_way(&id) {
+                self.client.cancel_goal(&id)
+            } else {
+                // It has ended meanwhile, so nobody will answer.
+                self.resolve_cancel(&id, false)
             }
             async move { answer.await.unwrap_or(false).then_some(id) }
         });
@@ -283,60 +289,60 @@ impl ActionParts {
         let ends: Vec<String> = join_all(asked).await.into_iter().flatten().collect();
         let canceled = self
             .goals
-            .canceled(&wanted, |id| ends.iter().any(|it| it == id));
+            .cancel(&wanted, |id| ends.iter().any(|it| it == id));
         canceled.answer
     }
 
-    fn cancel_answered(&self, id: &str, ends: bool) {
+    fn resolve_cancel(&self, id: &str, ends: bool) {
         let waiting = self.canceling.lock().remove(id);
         for waiting in waiting.into_iter().flatten() {
             let _ = waiting.send(ends);
         }
     }
 
-    /// ROS 2 has no words for why a goal ends: they go to the robot's log.
-    fn tell(&self, what: &str) {
+    /// Logs on the robot why a goal ended; ROS 2 has no field for that.
+    fn notify_robot(&self, what: &str) {
         let text = format!("{what} (action {})", self.goals.name());
         let _ = self.notices.send((self.node.node().to_owned(), text));
     }
 }
 
-/// What the sender of a goal is answered, or why nobody will ever know.
-type Answer = Result<Bytes, String>;
+/// Response to the sender of a goal, or the reason why there will be none.
+type GoalAnswer = Result<Bytes, String>;
 
-struct Ear {
+struct PartsGoalEvents {
     parts: Arc<ActionParts>,
     id: String,
-    begun: Begun,
-    /// Until its sender is answered.
-    answer: Mutex<Option<oneshot::Sender<Answer>>>,
-    /// For what is held of it while it is under way.
+    begun: PendingGoal,
+    /// Present until the sender is answered.
+    answer: Mutex<Option<oneshot::Sender<GoalAnswer>>>,
+    /// Memory permit while the goal is pending.
     permit: Mutex<Option<Permit>>,
 }
 
-impl Ear {
-    fn answer(&self, answer: impl FnOnce() -> Answer) {
+impl PartsGoalEvents {
+    fn answer_once(&self, answer: impl FnOnce() -> GoalAnswer) {
         if let Some(sender) = self.answer.lock().take() {
             let _ = sender.send(answer());
         }
     }
 }
 
-impl GoalEvents for Ear {
-    fn accepted(&self) {
+impl GoalEvents for PartsGoalEvents {
+    fn on_accepted(&self) {
         let answer = self.parts.goals.answer(&self.begun, true);
-        self.answer(|| Ok(answer));
+        self.answer_once(|| Ok(answer));
     }
 
-    fn cancel_answered(&self, ends: bool) {
-        self.parts.cancel_answered(&self.id, ends);
+    fn on_cancel_response(&self, ends: bool) {
+        self.parts.resolve_cancel(&self.id, ends);
     }
 
-    fn feedback(&self, feedback: Bytes) {
-        self.parts.goals.feedback(&self.id, &feedback);
+    fn on_feedback(&self, feedback: Bytes) {
+        self.parts.goals.publish_feedback(&self.id, &feedback);
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let goals = &self.parts.goals;
         drop(self.permit.lock().take());
         let outcome = end.as_ref().ok().map(|end| end.outcome);
@@ -345,43 +351,44 @@ impl GoalEvents for Ear {
                 let why = end.text.clone();
                 (end, why)
             }
-            Err(reason) => (aborted(), reason),
+            Err(reason) => (aborted_end(), reason),
         };
-        // One that was not answered before was not accepted.
-        let rejected = matches!(outcome, None | Some(Outcome::Rejected));
-        let refused = rejected && goals.refuses(&self.begun);
-        if outcome == Some(Outcome::Rejected) && !refused && why.is_empty() {
+        // A goal whose sender was not answered before was not accepted.
+        let rejected = matches!(outcome, None | Some(GoalOutcome::Rejected));
+        let refused = rejected && goals.reject(&self.begun);
+        if outcome == Some(GoalOutcome::Rejected) && !refused && why.is_empty() {
             "its node did not accept it when it was free for it".clone_into(&mut why);
         }
         if !why.is_empty() {
-            self.parts.tell(&format!("goal {} ended: {why}", self.id));
+            self.parts
+                .notify_robot(&format!("goal {} ended: {why}", self.id));
         }
         if refused {
-            return self.answer(|| match outcome {
+            return self.answer_once(|| match outcome {
                 None => Err(why),
-                Some(_) => Ok(goal_server::refusal()),
+                Some(_) => Ok(goal_server::rejected_response()),
             });
         }
-        goals.end(&self.id, &end);
+        goals.end_goal(&self.id, &end);
         self.parts
-            .cancel_answered(&self.id, outcome == Some(Outcome::Canceled));
-        // Its sender learns of its end by its result.
-        self.answer(|| Ok(goals.answer(&self.begun, true)));
+            .resolve_cancel(&self.id, outcome == Some(GoalOutcome::Canceled));
+        // The sender learns of the end from the result.
+        self.answer_once(|| Ok(goals.answer(&self.begun, true)));
     }
 }
 
-fn aborted() -> GoalEnd {
+fn aborted_end() -> GoalEnd {
     GoalEnd {
-        outcome: Outcome::Aborted,
+        outcome: GoalOutcome::Aborted,
         text: String::new(),
         result: Bytes::new(),
     }
 }
 
-impl GroupEvents for Ear {
-    fn waits(&self) {
-        let answer = self.parts.goals.waits(&self.begun);
-        self.answer(|| Ok(answer));
+impl GroupEvents for PartsGoalEvents {
+    fn on_waiting(&self) {
+        let answer = self.parts.goals.accept(&self.begun);
+        self.answer_once(|| Ok(answer));
     }
 }
 

@@ -1,9 +1,9 @@
-//! Actions as a ROS 1 client knows them: five topics (<http://wiki.ros.org/actionlib/DetailedDescription>). A robot hears of its
-//! own goals alone; to it the group is one action server.
+//! ROS 1 actions of a group: five topics (<http://wiki.ros.org/actionlib/DetailedDescription>). A robot sees only its
+//! own goals; to it the group looks like one action server.
 //!
 //! ```text
 //!  /goal, /cancel ──▶ GroupClient ─▶ the group
-//!  /feedback, /result, /status ◀── what it says of this robot's goals
+//!  /feedback, /result, /status ◀── updates about this robot's goals
 //! ```
 
 use std::collections::HashMap;
@@ -14,73 +14,74 @@ use budget::{Budget, Permit};
 use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
-    ActionClient, BusError, GoalEnd, GoalEvents, Matched, Message, MessageSender, Outcome, Peer,
-    PeerId, Publisher, Qos, RosVersion, Subscription, WireType, message_queue,
+    ActionClient, BusError, GoalEnd, GoalEvents, GoalOutcome, MatchedPeers, MessageSender, PeerId,
+    Publisher, QosProfile, RosVersion, SerializedMessage, Subscription, TopicPeer, WireType,
+    message_queue,
 };
 use ros::codec::Time;
-use ros::ros1::actions::messages::{self, GoalId, GoalState, Status};
+use ros::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::watch;
 use tokio::time::Instant;
 
-use super::Group;
-use super::action_ends::{End, ends_of};
-use super::dispatch::Robot;
+use super::ServantGroup;
+use super::action_ends::{ActionEndpoint, action_endpoints};
+use super::dispatch::RobotNumber;
 use super::goals::GroupClient;
 
-/// How often who listens is told how goals stand, as action servers do; also at each change.
+/// Interval at which the status is published, as by action servers; also published at each change.
 const STATUS: Duration = Duration::from_millis(200);
-/// How long the status names a goal that has ended, as action servers do.
+/// Time for which the status contains an ended goal, as with action servers.
 const REMEMBERED: Duration = Duration::from_secs(5);
-/// Goals of one robot that may be under way at once; one more is rejected. A node would hold them in its own memory: here it
-/// is the daemon's.
+/// Maximum number of pending goals of one robot; more are rejected. A node would hold them in its own memory, but here
+/// it is the daemon's.
 const GOALS: usize = 256;
-/// Goals that have ended and are remembered.
+/// Maximum number of ended goals that are remembered.
 const ENDED: usize = 256;
-/// Bytes of a goal's id, which each status repeats.
+/// Maximum length in bytes of a goal's id, which each status repeats.
 const LONGEST_ID: usize = 1024;
 
 /// One action of one robot.
 pub(super) struct ActionTopics {
     name: String,
     of: Arc<ActionDef>,
-    types: HashMap<End, Arc<WireType>>,
+    types: HashMap<ActionEndpoint, Arc<WireType>>,
     node: PeerId,
     client: GroupClient,
     state: Mutex<State>,
-    /// Counts the goals under way.
+    /// Budget for pending goals.
     budget: Budget,
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
     numbers: std::sync::atomic::AtomicU64,
 }
 
-/// A goal of the robot's.
-struct Known {
+/// A goal of the robot.
+struct TopicGoal {
     state: GoalState,
-    /// For what is held of it while it is under way.
+    /// Memory permit while the goal is pending.
     permit: Option<Permit>,
-    /// When it ended.
+    /// Time at which it ended.
     ended: Option<Instant>,
 }
 
 #[derive(Default)]
 struct State {
-    goals: HashMap<String, Known>,
-    listeners: Vec<(End, MessageSender)>,
-    /// Somebody is told of the status again and again.
+    goals: HashMap<String, TopicGoal>,
+    listeners: Vec<(ActionEndpoint, MessageSender)>,
+    /// The task that publishes the status is running.
     ticking: bool,
 }
 
 impl ActionTopics {
     pub(super) fn new(
-        group: &Arc<Group>,
-        robot: Robot,
+        group: &Arc<ServantGroup>,
+        robot: RobotNumber,
         (name, node): (&str, &str),
         of: &Arc<ActionDef>,
         registry: &Registry,
         budget: &Budget,
     ) -> Result<Arc<ActionTopics>, BusError> {
-        let types = ends_of(RosVersion::One, name).into_iter();
+        let types = action_endpoints(RosVersion::One, name).into_iter();
         let types = types.map(|(end, topic)| {
             let type_name = end.type_name(&of.name);
             let found = registry.message(&type_name);
@@ -88,10 +89,10 @@ impl ActionTopics {
                 what: topic,
                 reason: error.to_string(),
             })?;
-            Ok((end, Arc::new(WireType::of(&found))))
+            Ok((end, Arc::new(WireType::from_message(&found))))
         });
         let node = PeerId::from(node);
-        let peer = Peer {
+        let peer = TopicPeer {
             id: node.clone(),
             connected: true,
             offer: None,
@@ -104,7 +105,7 @@ impl ActionTopics {
             client: GroupClient::new(group, robot, name, of),
             state: Mutex::default(),
             budget: budget.clone(),
-            matched: watch::Sender::new(Matched {
+            matched: watch::Sender::new(MatchedPeers {
                 peers: vec![peer],
                 refused: Vec::new(),
             }),
@@ -112,64 +113,65 @@ impl ActionTopics {
         }))
     }
 
-    pub(super) fn wire_type(&self, end: End) -> WireType {
+    pub(super) fn wire_type(&self, end: ActionEndpoint) -> WireType {
         WireType::clone(&self.types[&end])
     }
 
-    fn agrees(&self, end: End, of: &WireType) -> Result<(), BusError> {
+    fn check_type(&self, end: ActionEndpoint, of: &WireType) -> Result<(), BusError> {
         let ours = &self.types[&end];
-        match ours.agrees(of) {
-            true => Ok(()),
-            false => Err(BusError::TypeMismatch {
+        if ours.is_compatible_with(of) {
+            Ok(())
+        } else {
+            Err(BusError::TypeMismatch {
                 what: format!("topic of action {}", self.name),
                 theirs: of.to_string(),
                 ours: ours.to_string(),
-            }),
+            })
         }
     }
 
-    /// Listens to what the group says of this robot's goals.
+    /// Subscribes to a topic with updates about this robot's goals.
     pub(super) fn subscribe(
         self: &Arc<Self>,
-        end: End,
+        end: ActionEndpoint,
         of: &WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
-        self.agrees(end, of)?;
+        self.check_type(end, of)?;
         let (sender, messages) = message_queue(qos.depth);
         let mut state = self.state.lock();
         state.listeners.push((end, sender));
-        if end == End::Status {
-            self.tell_status(&mut state);
+        if end == ActionEndpoint::Status {
+            self.publish_status(&mut state);
             if !std::mem::replace(&mut state.ticking, true) {
-                tokio::spawn(tick(Arc::downgrade(self)));
+                tokio::spawn(publish_status_periodically(Arc::downgrade(self)));
             }
         }
         drop(state);
         Ok(Subscription {
-            dropped: messages.dropped(),
+            dropped: messages.drop_counter(),
             messages,
             matched: self.matched.subscribe(),
-            // The action goes on while somebody listens.
+            // The action exists as long as somebody subscribes.
             guard: Box::new(Arc::clone(self)),
         })
     }
 
-    /// A topic on which the robot's client sends goals, or cancels them.
+    /// Advertises a topic on which the robot's client sends or cancels goals.
     pub(super) fn advertise(
         self: &Arc<Self>,
-        end: End,
+        end: ActionEndpoint,
         of: &WireType,
     ) -> Result<Box<dyn Publisher>, BusError> {
-        self.agrees(end, of)?;
-        Ok(Box::new(Mouth {
+        self.check_type(end, of)?;
+        Ok(Box::new(ClientTopicPublisher {
             topics: Arc::clone(self),
             end,
         }))
     }
 
-    fn tell(&self, state: &mut State, end: End, bytes: Bytes) {
-        let message = Message {
+    fn publish_to_listeners(&self, state: &mut State, end: ActionEndpoint, bytes: Bytes) {
+        let message = SerializedMessage {
             bytes,
             wire_type: Arc::clone(&self.types[&end]),
             publisher: self.node.clone(),
@@ -183,17 +185,17 @@ impl ActionTopics {
         }
     }
 
-    fn tell_status(&self, state: &mut State) {
+    fn publish_status(&self, state: &mut State) {
         let now = Instant::now();
         let old = |ended: Option<Instant>| ended.is_some_and(|at| now > at + REMEMBERED);
         state.goals.retain(|_, goal| !old(goal.ended));
         let goals = state.goals.values();
         let states: Vec<GoalState> = goals.map(|goal| goal.state.clone()).collect();
         let bytes = messages::write_states(Time::now(), states.iter());
-        self.tell(state, End::Status, bytes);
+        self.publish_to_listeners(state, ActionEndpoint::Status, bytes);
     }
 
-    fn goal(self: &Arc<Self>, bytes: &Bytes) {
+    fn receive_goal(self: &Arc<Self>, bytes: &Bytes) {
         let Some((mut goal, body)) = messages::read_goal(bytes) else {
             tracing::debug!("a goal of {} cannot be read", self.name);
             return;
@@ -223,7 +225,7 @@ impl ActionTopics {
                 tracing::debug!("a goal of {} has the id of another, {id}", self.name);
                 return;
             }
-            let room = state.room().and_then(|()| {
+            let room = state.check_capacity().and_then(|()| {
                 self.budget
                     .take(body.len())
                     .map_err(|full| full.to_string())
@@ -232,10 +234,10 @@ impl ActionTopics {
                 Ok(permit) => (Some(permit), None),
                 Err(text) => (None, Some(text)),
             };
-            let known = Known {
+            let known = TopicGoal {
                 state: GoalState {
                     goal,
-                    status: Status::Active,
+                    status: ActionlibStatus::Active,
                     text: String::new(),
                 },
                 permit,
@@ -244,28 +246,28 @@ impl ActionTopics {
             state.goals.insert(id.clone(), known);
             if let Some(text) = refused {
                 let end = GoalEnd {
-                    outcome: Outcome::Rejected,
+                    outcome: GoalOutcome::Rejected,
                     text,
-                    result: self.nothing(),
+                    result: self.empty_result(),
                 };
-                return self.end(&mut state, &id, end);
+                return self.record_end(&mut state, &id, end);
             }
-            self.tell_status(&mut state);
+            self.publish_status(&mut state);
         }
-        let events = Ear {
-            // It hears of its end even when nobody listens any more.
+        let events = TopicsGoalEvents {
+            // It receives the end of the goal even if nobody subscribes any more.
             topics: Arc::clone(self),
             id: id.clone(),
         };
-        self.client.send(&id, body, Arc::new(events));
+        self.client.send_goal(&id, body, Arc::new(events));
     }
 
-    /// The robot's node or the robot has gone: its goals are cancelled, and not followed for long.
+    /// Cancels all goals because the robot or its node is gone; they are not followed for long.
     pub(super) fn cancel_all(&self) {
-        self.client.leave();
+        self.client.abandon();
     }
 
-    fn cancel(&self, GoalId { stamp, id }: &GoalId) {
+    fn cancel_matching(&self, GoalId { stamp, id }: &GoalId) {
         let (stamp, id) = (*stamp, id.as_str());
         let named = |of: &GoalId| of.id == id;
         let before = |of: &GoalId| {
@@ -281,62 +283,63 @@ impl ActionTopics {
         });
         let ids: Vec<String> = goals.map(|goal| goal.state.goal.id.clone()).collect();
         drop(state);
-        ids.iter().for_each(|id| self.client.cancel(id));
+        ids.iter().for_each(|id| self.client.cancel_goal(id));
     }
 
-    fn ended(&self, id: &str, end: Result<GoalEnd, String>) {
+    fn finish_goal(&self, id: &str, end: Result<GoalEnd, String>) {
         let end = end.unwrap_or_else(|text| GoalEnd {
-            outcome: Outcome::Aborted,
+            outcome: GoalOutcome::Aborted,
             text,
-            result: self.nothing(),
+            result: self.empty_result(),
         });
-        self.end(&mut self.state.lock(), id, end);
+        self.record_end(&mut self.state.lock(), id, end);
     }
 
-    /// A result that says nothing.
-    fn nothing(&self) -> Bytes {
+    /// Returns an all-zero result.
+    fn empty_result(&self) -> Bytes {
         vec![0; self.of.result.min_size()].into()
     }
 
-    fn end(&self, state: &mut State, id: &str, end: GoalEnd) {
+    fn record_end(&self, state: &mut State, id: &str, end: GoalEnd) {
         let Some(known) = state.goals.get_mut(id) else {
             return;
         };
         let goal = &mut known.state;
         goal.status = match end.outcome {
-            Outcome::Succeeded => Status::Succeeded,
-            Outcome::Canceled => Status::Preempted,
-            Outcome::Aborted => Status::Aborted,
-            Outcome::Rejected => Status::Rejected,
-            Outcome::Unknown => Status::Lost,
+            GoalOutcome::Succeeded => ActionlibStatus::Succeeded,
+            GoalOutcome::Canceled => ActionlibStatus::Preempted,
+            GoalOutcome::Aborted => ActionlibStatus::Aborted,
+            GoalOutcome::Rejected => ActionlibStatus::Rejected,
+            GoalOutcome::Unknown => ActionlibStatus::Lost,
         };
         goal.text = end.text;
         let goal = goal.clone();
         known.ended = Some(Instant::now());
         known.permit = None;
-        state.forget_some();
-        self.tell_status(state);
+        state.prune_ended();
+        self.publish_status(state);
         let bytes = messages::write_state(Time::now(), &goal, &end.result);
-        self.tell(state, End::Result, bytes);
+        self.publish_to_listeners(state, ActionEndpoint::Result, bytes);
     }
 }
 
 impl State {
-    /// Whether there is room for one more goal, or why not.
-    fn room(&self) -> Result<(), String> {
+    /// Returns an error if there is no room for another goal.
+    fn check_capacity(&self) -> Result<(), String> {
         let goals = self.goals.values();
         let count = goals.filter(|goal| goal.ended.is_none()).count();
-        match count < GOALS {
-            true => Ok(()),
-            false => Err(format!(
+        if count < GOALS {
+            Ok(())
+        } else {
+            Err(format!(
                 "{count} goals of this robot are under way already; wait for some to end"
-            )),
+            ))
         }
     }
 
-    /// Of too many goals that have ended, those that did first are forgotten.
-    fn forget_some(&mut self) {
-        let ended = |goals: &HashMap<String, Known>| {
+    /// Forgets the oldest ended goals if there are too many.
+    fn prune_ended(&mut self) {
+        let ended = |goals: &HashMap<String, TopicGoal>| {
             goals.values().filter(|goal| goal.ended.is_some()).count()
         };
         while ended(&self.goals) > ENDED {
@@ -350,62 +353,67 @@ impl State {
     }
 }
 
-/// Tells the status until nobody listens.
-async fn tick(topics: Weak<ActionTopics>) {
+/// Publishes the status until nobody subscribes to it.
+async fn publish_status_periodically(topics: Weak<ActionTopics>) {
     loop {
         tokio::time::sleep(STATUS).await;
         let Some(topics) = topics.upgrade() else {
             return;
         };
         let mut state = topics.state.lock();
-        topics.tell_status(&mut state);
-        if !state.listeners.iter().any(|(end, _)| *end == End::Status) {
+        topics.publish_status(&mut state);
+        if !state
+            .listeners
+            .iter()
+            .any(|(end, _)| *end == ActionEndpoint::Status)
+        {
             state.ticking = false;
             return;
         }
     }
 }
 
-struct Mouth {
+struct ClientTopicPublisher {
     topics: Arc<ActionTopics>,
-    end: End,
+    end: ActionEndpoint,
 }
 
-impl Publisher for Mouth {
+impl Publisher for ClientTopicPublisher {
     fn publish(&self, bytes: Bytes) {
         match self.end {
-            End::Goal => self.topics.goal(&bytes),
+            ActionEndpoint::Goal => self.topics.receive_goal(&bytes),
             _ => {
                 if let Some(which) = messages::read_cancel(&bytes) {
-                    self.topics.cancel(&which);
+                    self.topics.cancel_matching(&which);
                 }
             }
         }
     }
 
-    fn matched(&self) -> watch::Receiver<Matched> {
+    fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
         self.topics.matched.subscribe()
     }
 }
 
-struct Ear {
+struct TopicsGoalEvents {
     topics: Arc<ActionTopics>,
     id: String,
 }
 
-impl GoalEvents for Ear {
-    fn feedback(&self, feedback: Bytes) {
+impl GoalEvents for TopicsGoalEvents {
+    fn on_feedback(&self, feedback: Bytes) {
         let mut state = self.topics.state.lock();
         let known = state.goals.get(&self.id);
         let Some(known) = known.filter(|goal| goal.ended.is_none()) else {
             return;
         };
         let bytes = messages::write_state(Time::now(), &known.state, &feedback);
-        self.topics.tell(&mut state, End::Feedback, bytes);
+        self.topics
+            .publish_to_listeners(&mut state, ActionEndpoint::Feedback, bytes);
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
-        self.topics.ended(&self.id, end);
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
+        self.topics.finish_goal(&self.id, end);
     }
 }
 

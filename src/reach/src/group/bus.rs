@@ -1,4 +1,5 @@
-//! A group as one robot's bus: services and actions of the interface, nothing else, under the names of a [`View`].
+//! The bus of one robot in a group: services and actions of the interface under the names of a [`GroupView`], nothing
+//! else.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -10,77 +11,80 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use ros::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    NodeParameters, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
+    NodeParameters, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
     WireType,
 };
 use ros::schema::{ActionDef, Registry};
 use tokio::sync::watch;
 
-use super::action_ends::End;
+use super::action_ends::ActionEndpoint;
 use super::action_parts::{ActionParts, Notices};
 use super::action_topics::ActionTopics;
-use super::dispatch::Robot;
+use super::dispatch::RobotNumber;
 use super::goals::GroupClient;
-use super::view::{Shown, ShownAction, View};
-use super::{Group, node_ends};
+use super::view::{GroupView, ViewAction, ViewEntry};
+use super::{ServantGroup, node_ends};
 
-/// What is not offered where somebody asks for a parameter.
+/// Description of a request for a parameter in errors.
 const PARAMETER: &str = "a parameter of its nodes";
 
-/// One robot's.
+/// The bus of one robot.
 pub(super) struct GroupBus {
-    group: Arc<Group>,
-    robot: Robot,
+    group: Arc<ServantGroup>,
+    robot: RobotNumber,
     registry: Arc<Registry>,
-    /// Counts what waits here for servants.
+    /// Budget for what waits for servants.
     budget: Budget,
     notices: Notices,
-    view: Mutex<Arc<View>>,
+    view: Mutex<Arc<GroupView>>,
     graph: watch::Sender<Arc<Graph>>,
-    /// By name in the interface and node, as far as they are used by their parts.
-    actions: Mutex<HashMap<(String, String), Action>>,
+    /// Actions in use by their topics and services, by name in the interface and node.
+    actions: Mutex<HashMap<(String, String), ActionBackend>>,
 }
 
-/// An action that is used by its parts.
+/// An action used by its topics and services.
 #[derive(Clone)]
-enum Action {
+enum ActionBackend {
     One(Arc<ActionTopics>),
     Two(Arc<ActionParts>),
 }
 
-impl Action {
+impl ActionBackend {
     fn cancel_all(&self) {
         match self {
-            Action::One(topics) => topics.cancel_all(),
-            Action::Two(parts) => parts.cancel_all(),
+            ActionBackend::One(topics) => topics.cancel_all(),
+            ActionBackend::Two(parts) => parts.cancel_all(),
         }
     }
 }
 
 impl GroupBus {
-    /// The end of an action that a topic is.
-    fn topic(&self, topic: &str) -> Result<(End, Action), BusError> {
+    /// Returns the action and part to which a topic belongs.
+    fn find_topic(&self, topic: &str) -> Result<(ActionEndpoint, ActionBackend), BusError> {
         let view = self.view();
-        match view.topic(topic) {
-            Some((action, end)) => Ok((end, self.action(action)?)),
+        match view.find_topic(topic) {
+            Some((action, end)) => Ok((end, self.open_action(action)?)),
             None => Err(BusError::NotShared(format!("topic {topic}"))),
         }
     }
 
-    /// The end of an action that a service is; none where it is a service of its own.
-    fn action_service(&self, service: &str) -> Result<Option<(End, Arc<ActionParts>)>, BusError> {
+    /// Returns the action and part to which a service belongs; `None` for a regular service.
+    fn find_action_service(
+        &self,
+        service: &str,
+    ) -> Result<Option<(ActionEndpoint, Arc<ActionParts>)>, BusError> {
         let view = self.view();
-        let Some((action, end)) = view.action_service(service) else {
+        let Some((action, end)) = view.find_action_service(service) else {
             return Ok(None);
         };
-        match self.action(action)? {
-            Action::Two(parts) => Ok(Some((end, parts))),
-            Action::One(_) => Ok(None),
+        match self.open_action(action)? {
+            ActionBackend::Two(parts) => Ok(Some((end, parts))),
+            ActionBackend::One(_) => Ok(None),
         }
     }
 
-    fn action(&self, action: &ShownAction) -> Result<Action, BusError> {
-        let Shown { of: name, node } = &action.shown;
+    fn open_action(&self, action: &ViewAction) -> Result<ActionBackend, BusError> {
+        let ViewEntry { of: name, node } = &action.shown;
         let mut actions = self.actions.lock();
         let key = (name.clone(), node.clone());
         if let Some(known) = actions.get(&key) {
@@ -93,7 +97,7 @@ impl GroupBus {
         })?;
         let (group, names) = (&self.group, (&**name, &**node));
         let made = match group.ros {
-            RosVersion::One => Action::One(ActionTopics::new(
+            RosVersion::One => ActionBackend::One(ActionTopics::new(
                 group,
                 self.robot,
                 names,
@@ -101,7 +105,7 @@ impl GroupBus {
                 &self.registry,
                 &self.budget,
             )?),
-            RosVersion::Two => Action::Two(ActionParts::new(
+            RosVersion::Two => ActionBackend::Two(ActionParts::new(
                 group,
                 self.robot,
                 names,
@@ -114,13 +118,13 @@ impl GroupBus {
         Ok(made)
     }
 
-    /// Which ROS its nodes are of.
+    /// Returns the ROS version of its nodes.
     pub(super) fn ros(&self) -> RosVersion {
         self.group.ros
     }
 
-    /// What a node of the group had this parameter set to when the interface was found.
-    pub(super) fn value(&self, parameter: &str) -> Option<&serde_json::Value> {
+    /// Returns the value of a parameter when the interface was recorded.
+    pub(super) fn recorded_value(&self, parameter: &str) -> Option<&serde_json::Value> {
         self.group.values.get(parameter)
     }
 
@@ -128,12 +132,12 @@ impl GroupBus {
         &self.group.interface
     }
 
-    fn view(&self) -> Arc<View> {
+    fn view(&self) -> Arc<GroupView> {
         Arc::clone(&self.view.lock())
     }
 
-    /// From now on it shows this. Goals of actions that are not shown any more are cancelled.
-    pub(super) fn show(&self, view: View) {
+    /// Replaces the view. Goals of actions that are no longer shown are cancelled.
+    pub(super) fn set_view(&self, view: GroupView) {
         let mut actions = self.actions.lock();
         let mut now = self.view.lock();
         let shown = |(name, node): &(String, String)| {
@@ -150,7 +154,7 @@ impl GroupBus {
         self.graph.send_modify(|graph| {
             let next = self
                 .group
-                .graph(&view, &self.registry, graph.generation + 1);
+                .build_graph(&view, &self.registry, graph.generation + 1);
             *graph = Arc::new(next);
         });
         *now = Arc::new(view);
@@ -158,7 +162,7 @@ impl GroupBus {
 }
 
 impl Drop for GroupBus {
-    /// Goals outlive who sent them, or their results would be lost with a connection; not their robot's place.
+    /// Goals outlive their senders, or their results would be lost with a connection, but not their robot's place.
     fn drop(&mut self) {
         self.actions
             .get_mut()
@@ -167,11 +171,11 @@ impl Drop for GroupBus {
     }
 }
 
-impl Group {
-    /// Two buses for one robot, one that shows the interface as it was deployed, and one that shows nothing yet; `registry`
-    /// holds the definitions of its services and actions, what waits for servants counts in `budget`, and what the robot should know of
-    /// is told to `notices`.
-    pub(super) fn buses(
+impl ServantGroup {
+    /// Creates two buses for a robot, one that shows the interface as it was deployed, and one that shows nothing yet.
+    /// `registry` contains the definitions of its services and actions; what waits for servants is charged to `budget`;
+    /// notices for the robot are sent to `notices`.
+    pub(super) fn create_buses(
         self: &Arc<Self>,
         registry: &Arc<Registry>,
         budget: &Budget,
@@ -180,8 +184,8 @@ impl Group {
         let robot = self
             .robots
             .fetch_add(1, std::sync::atomic::Ordering::Relaxed);
-        let bus = |view: &Arc<View>, generation| {
-            let graph = self.graph(view, registry, generation);
+        let bus = |view: &Arc<GroupView>, generation| {
+            let graph = self.build_graph(view, registry, generation);
             Arc::new(GroupBus {
                 group: Arc::clone(self),
                 robot,
@@ -196,17 +200,21 @@ impl Group {
         (bus(&self.whole, 1), bus(&Arc::default(), 0))
     }
 
-    /// The first of them.
+    /// Creates the first of the two buses.
     #[cfg(test)]
-    pub(super) fn bus(self: &Arc<Self>, registry: &Arc<Registry>, budget: &Budget) -> Arc<dyn Bus> {
+    pub(super) fn create_bus(
+        self: &Arc<Self>,
+        registry: &Arc<Registry>,
+        budget: &Budget,
+    ) -> Arc<dyn Bus> {
         let (notices, _) = tokio::sync::mpsc::unbounded_channel();
-        self.buses(registry, budget, &notices).0
+        self.create_buses(registry, budget, &notices).0
     }
 
-    fn graph(&self, view: &View, registry: &Registry, generation: u64) -> Graph {
+    fn build_graph(&self, view: &GroupView, registry: &Registry, generation: u64) -> Graph {
         let ends = match self.ros {
             RosVersion::One => Default::default(),
-            RosVersion::Two => node_ends::all(view, &self.interface, registry),
+            RosVersion::Two => node_ends::collect_node_ends(view, &self.interface, registry),
         };
         Graph {
             ends,
@@ -214,18 +222,18 @@ impl Group {
         }
     }
 
-    fn service(&self, name: &str) -> Option<&package::interface::Service> {
+    fn find_service(&self, name: &str) -> Option<&package::interface::Service> {
         let mut services = self.interface.services.iter();
         services.find(|service| service.name == name)
     }
 }
 
 impl GroupBus {
-    /// The service that the robot knows by this name.
-    fn service(&self, name: &str) -> Result<&package::interface::Service, BusError> {
+    /// Returns the service known to the robot by this name.
+    fn find_service(&self, name: &str) -> Result<&package::interface::Service, BusError> {
         let view = self.view();
         let shown = view.services.get(name);
-        let known = shown.and_then(|shown| self.group.service(&shown.of));
+        let known = shown.and_then(|shown| self.group.find_service(&shown.of));
         known.ok_or_else(|| BusError::NoService(name.to_owned()))
     }
 }
@@ -248,12 +256,14 @@ impl Bus for GroupBus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
-        match self.topic(topic)? {
-            (end, Action::One(topics)) if !end.is_of_clients() => topics.subscribe(end, &of, qos),
-            (end, Action::Two(parts)) => parts.subscribe(end, &of, qos),
-            // Others' goals.
+        match self.find_topic(topic)? {
+            (end, ActionBackend::One(topics)) if !end.is_published_by_clients() => {
+                topics.subscribe(end, &of, qos)
+            }
+            (end, ActionBackend::Two(parts)) => parts.subscribe(end, &of, qos),
+            // Contains goals of others.
             _ => Err(BusError::NotShared(format!("listening to {topic}"))),
         }
     }
@@ -262,10 +272,12 @@ impl Bus for GroupBus {
         &self,
         topic: &str,
         of: WireType,
-        _qos: Qos,
+        _qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError> {
-        match self.topic(topic)? {
-            (end, Action::One(topics)) if end.is_of_clients() => topics.advertise(end, &of),
+        match self.find_topic(topic)? {
+            (end, ActionBackend::One(topics)) if end.is_published_by_clients() => {
+                topics.advertise(end, &of)
+            }
             _ => Err(BusError::NotShared(format!("publishing {topic}"))),
         }
     }
@@ -277,10 +289,10 @@ impl Bus for GroupBus {
         request: Bytes,
         timeout: Duration,
     ) -> Result<Bytes, BusError> {
-        if let Some((end, parts)) = self.action_service(service)? {
+        if let Some((end, parts)) = self.find_action_service(service)? {
             return parts.call((end, service), digest, request, timeout).await;
         }
-        let known = self.service(service)?;
+        let known = self.find_service(service)?;
         let group = &self.group;
         group
             .call(self.robot, &known.name, digest, request, timeout)
@@ -288,10 +300,10 @@ impl Bus for GroupBus {
     }
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
-        if let Some((end, parts)) = self.action_service(service)? {
+        if let Some((end, parts)) = self.find_action_service(service)? {
             return Ok(parts.service_type(end).clone());
         }
-        let known = self.service(service)?;
+        let known = self.find_service(service)?;
         if known.md5.is_empty() {
             let servant = self.group.members.borrow().values().next().cloned();
             let servant = servant.ok_or_else(|| BusError::NoService(service.to_owned()))?;
@@ -305,9 +317,9 @@ impl Bus for GroupBus {
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
-        Ok(match self.topic(topic)? {
-            (end, Action::One(topics)) => topics.wire_type(end),
-            (end, Action::Two(parts)) => parts.wire_type(end).clone(),
+        Ok(match self.find_topic(topic)? {
+            (end, ActionBackend::One(topics)) => topics.wire_type(end),
+            (end, ActionBackend::Two(parts)) => parts.wire_type(end).clone(),
         })
     }
 
@@ -342,7 +354,7 @@ impl Bus for GroupBus {
         Err(BusError::NotShared(format!("serving {action}")))
     }
 
-    /// Those of the nodes are the deployer's.
+    /// Global parameters belong to the deployer.
     fn parameters(&self) -> Result<&dyn GlobalParameters, BusError> {
         Err(BusError::NotShared(PARAMETER.to_owned()))
     }

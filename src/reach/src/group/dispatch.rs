@@ -1,139 +1,140 @@
-//! Which servant of a group works at which request: the one with the fewest requests under way. Pure: what comes in are
-//! requests, answers, and servants that come and go; what goes out are orders.
+//! Dispatcher of a group: sends each request to the servant with the fewest requests in progress. Pure logic: its
+//! inputs are requests, outcomes and changes of servants; its outputs are orders.
 //!
 //! ```text
 //!            no servant has a free place        every servant that had it was lost
 //!               ┌───────────────┐         ┌───────────────(idempotent)──────────────┐
-//!  asked for ──▶ waits ──────────▶ under way at 1 … `replicas` servants ──▶ answered, once
+//!  requested ──▶ waiting ────────▶ in progress at 1 … `replicas` servants ──▶ answered, once
 //!                                         └──────▶ failed, with the reason
 //! ```
 //!
-//! - A servant has at most [`Rules::window`] calls under way; the rest wait here, so that what waits is lost with no servant,
-//!   and goes to a servant that is added meanwhile. Robots that wait have turns: one with a thousand calls holds nobody up,
-//!   and neither does one that calls a service which no servant serves at the moment.
-//! - A servant carries out goals of one action for one robot at a time, since most action servers take one goal and give up
-//!   the one before for it: another robot's goal would end this robot's. A robot's next goal goes where its goal is, so that
-//!   the node treats both as it would if it were this robot's alone. While others wait for the action, at most [`AHEAD`] of
-//!   its goals do so, or one that sends a new goal each second would have the servant for ever; the next ones wait for their turn.
-//! - A request that a lost servant had may have been carried out: it is asked again where the service is idempotent, at most
-//!   [`ATTEMPTS`] times in all (it may be what ends the servants), and fails elsewhere. One that a servant did not take waits
-//!   for its next turn.
+//! - A servant has at most [`Rules::window`] calls in progress. The others wait here, so that they are not lost with a
+//!   servant and can go to servants that are added meanwhile. Waiting robots take turns: one with a thousand calls
+//!   delays nobody, and neither does one that calls a service which no servant provides at the moment.
+//! - A servant executes goals of an action for one robot at a time, because most action servers handle one goal and
+//!   preempt it for the next: another robot's goal would end this robot's. Further goals of the robot go to the same
+//!   servant, so that the node treats them as if it belonged to this robot alone. While others wait for the action, at
+//!   most [`AHEAD`] further goals do so, because a robot that sends a new goal each second would otherwise keep the
+//!   servant forever; later ones wait for their turn.
+//! - A request that a lost servant had may have been executed. It is retried if the service is idempotent, at most
+//!   [`ATTEMPTS`] times in total (it may be the cause of the crashes), and fails otherwise. A request that a servant
+//!   did not take waits for its next turn.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-use ros::turns::Turns;
+use ros::turns::RoundRobin;
 
-/// How many servants in all may be lost with a request before it fails.
+/// Number of servants that may be lost with a request before it fails.
 pub const ATTEMPTS: usize = 3;
-/// So many goals of a robot that has a servant go before those of others who wait for it.
+/// Number of further goals of a robot that has a servant which may precede those of waiting robots.
 pub const AHEAD: usize = 8;
 
-/// A request.
+/// Id of a request.
 pub type Ticket = u64;
-/// A servant of the group.
+/// Id of a servant of the group.
 pub type Member = u64;
-/// A robot of the group.
-pub type Robot = u64;
+/// Id of a robot of the group.
+pub type RobotNumber = u64;
 
-/// What is asked for.
+/// Kind of a request.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// A call of the service of this name.
     Call(Arc<str>),
-    /// A goal of the action of this name.
+    /// A goal for the action of this name.
     Goal(Arc<str>),
 }
 
-/// What the deployer decided of the group.
+/// Rules set by the deployer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rules {
-    /// Calls that one servant has under way at most; 0 counts as 1.
+    /// Maximum number of calls in progress per servant; 0 counts as 1.
     pub window: usize,
-    /// Servants that work at the same call at most; 0 counts as 1.
+    /// Maximum number of servants that work on the same call; 0 counts as 1.
     pub replicas: usize,
-    /// A request may be carried out twice.
+    /// A request may be executed twice.
     pub idempotent: bool,
 }
 
-/// What is to be done.
+/// An order for the owner of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Order {
-    /// Have this servant work at the request.
+pub enum DispatchOrder {
+    /// Send the request to this servant.
     Ask(Ticket, Member),
-    /// What this servant answers to the request does not matter any more.
+    /// Ignore the response of this servant.
     Drop(Ticket, Member),
-    /// The request has failed: the servant was lost while it worked at it.
-    Fail(Ticket, Lost),
+    /// Fail the request, because its servant was lost.
+    Fail(Ticket, LossReason),
 }
 
-/// Why a request fails.
+/// Reason why a request fails.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Lost {
+pub enum LossReason {
     /// The service is not idempotent.
     NotAskedAgain,
-    /// It was asked as often as may be.
+    /// The maximum number of attempts was reached.
     AskedOften,
 }
 
-/// How a servant's work at a request has ended.
+/// Outcome of a servant's work on a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum End {
-    /// With an answer, be it that it failed.
+pub enum AttemptOutcome {
+    /// The servant has answered, possibly with an error.
     Answered,
-    /// The servant did not take it: it was certainly not carried out.
+    /// The servant did not take the request, which was certainly not executed.
     NotTaken,
-    /// The servant went away: it may have been carried out.
+    /// The servant is gone, and the request may have been executed.
     Lost,
 }
 
-/// How much is to be done.
+/// Load of a group.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Load {
-    /// Requests that wait for a servant.
+pub struct GroupLoad {
+    /// Requests waiting for a servant.
     pub waiting: usize,
-    /// Requests at which at least one servant works.
+    /// Requests in progress at at least one servant.
     pub under_way: usize,
 }
 
-/// The calls of one service, or the goals of one action.
+/// Number of a service or action.
 type Lane = u32;
 
 #[derive(Debug)]
-struct Request {
-    robot: Robot,
+struct QueuedRequest {
+    robot: RobotNumber,
     lane: Lane,
-    /// Servants that work at it.
+    /// Servants that work on it.
     at: BTreeSet<Member>,
-    /// Servants that were lost with it.
+    /// Number of servants lost with it.
     lost: usize,
 }
 
 #[derive(Debug, Default)]
-struct Servant {
+struct ServantState {
     calls: usize,
-    /// By action, whose goals it carries out.
-    goals: BTreeMap<Lane, Goals>,
-    /// It gets no more.
+    /// Actions whose goals it executes.
+    goals: BTreeMap<Lane, ServantGoals>,
+    /// It gets no more requests.
     retired: bool,
-    /// What it does not take, or does not answer, at the moment.
+    /// Services and actions that it currently does not provide.
     paused: BTreeSet<Lane>,
-    /// Requests that it was ever asked.
+    /// Number of requests ever sent to it.
     asked: u64,
 }
 
-/// Goals of one action that a servant carries out.
+/// Goals of one action at a servant.
 #[derive(Debug)]
-struct Goals {
-    robot: Robot,
+struct ServantGoals {
+    robot: RobotNumber,
     count: usize,
-    /// So many were begun while others waited.
+    /// Number of goals started while others waited.
     ahead: usize,
 }
 
-impl Servant {
-    /// It can be asked.
-    fn is_open(&self, lane: Lane) -> bool {
+impl ServantState {
+    /// Returns whether it can get requests of this kind.
+    fn is_available(&self, lane: Lane) -> bool {
         !self.retired && !self.paused.contains(&lane)
     }
 
@@ -148,22 +149,22 @@ pub struct Dispatcher {
     rules: Rules,
     tickets: Ticket,
     lanes: BTreeMap<Kind, Lane>,
-    /// Those of calls.
+    /// Numbers of services.
     calls: BTreeSet<Lane>,
-    servants: BTreeMap<Member, Servant>,
-    requests: BTreeMap<Ticket, Request>,
-    waiting: BTreeMap<(Robot, Lane), VecDeque<Ticket>>,
-    turns: Turns<(Robot, Lane)>,
+    servants: BTreeMap<Member, ServantState>,
+    requests: BTreeMap<Ticket, QueuedRequest>,
+    waiting: BTreeMap<(RobotNumber, Lane), VecDeque<Ticket>>,
+    turns: RoundRobin<(RobotNumber, Lane)>,
 }
 
 impl Dispatcher {
-    /// One without servants and requests.
+    /// Creates a dispatcher without servants and requests.
     pub fn new(rules: Rules) -> Dispatcher {
         Dispatcher {
             rules: Rules {
                 window: rules.window.max(1),
                 replicas: rules.replicas.max(1),
-                // Whoever lets two servants work at a call lets it be carried out twice.
+                // Replicas execute a call more than once, so it must be idempotent.
                 idempotent: rules.idempotent || rules.replicas > 1,
             },
             tickets: 0,
@@ -172,43 +173,43 @@ impl Dispatcher {
             servants: BTreeMap::new(),
             requests: BTreeMap::new(),
             waiting: BTreeMap::new(),
-            turns: Turns::default(),
+            turns: RoundRobin::default(),
         }
     }
 
-    /// A servant can be asked from now on.
-    pub fn join(&mut self, member: Member) -> Vec<Order> {
+    /// Adds a servant.
+    pub fn join(&mut self, member: Member) -> Vec<DispatchOrder> {
         self.servants.entry(member).or_default();
-        self.next()
+        self.dispatch_waiting()
     }
 
-    /// A servant is asked no more; what it works at it ends.
-    pub fn retire(&mut self, member: Member) -> Vec<Order> {
+    /// Sends no further requests to a servant, which finishes what it is working on.
+    pub fn retire(&mut self, member: Member) -> Vec<DispatchOrder> {
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.retired = true;
         }
-        // A call that waited for it, too, now has as many servants as there are.
-        self.next()
+        // A call waiting for this servant as well now has as many servants as there are.
+        self.dispatch_waiting()
     }
 
-    /// A servant that was to be asked no more is asked again.
-    pub fn take_back(&mut self, member: Member) -> Vec<Order> {
+    /// Sends requests to a retired servant again.
+    pub fn reinstate(&mut self, member: Member) -> Vec<DispatchOrder> {
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.retired = false;
         }
-        self.next()
+        self.dispatch_waiting()
     }
 
-    /// A servant that did not take a request, or lost it, is asked for such again.
-    pub fn resume(&mut self, member: Member, kind: &Kind) -> Vec<Order> {
+    /// Sends requests of this kind to a servant again that did not take one or lost it.
+    pub fn resume(&mut self, member: Member, kind: &Kind) -> Vec<DispatchOrder> {
         let lane = self.lanes.get(kind);
         if let (Some(servant), Some(lane)) = (self.servants.get_mut(&member), lane) {
             servant.paused.remove(lane);
         }
-        self.next()
+        self.dispatch_waiting()
     }
 
-    fn lane(&mut self, kind: &Kind) -> Lane {
+    fn lane_for(&mut self, kind: &Kind) -> Lane {
         if let Some(known) = self.lanes.get(kind) {
             return *known;
         }
@@ -220,8 +221,8 @@ impl Dispatcher {
         lane
     }
 
-    /// A servant is gone, with what it worked at.
-    pub fn leave(&mut self, member: Member) -> Vec<Order> {
+    /// Removes a servant together with its work.
+    pub fn leave(&mut self, member: Member) -> Vec<DispatchOrder> {
         self.servants.remove(&member);
         let had = self.requests.iter();
         let had: Vec<Ticket> = had
@@ -230,19 +231,19 @@ impl Dispatcher {
             .collect();
         let mut orders = Vec::new();
         for ticket in had.into_iter().rev() {
-            orders.push(Order::Drop(ticket, member));
-            self.lost(ticket, member, &mut orders);
+            orders.push(DispatchOrder::Drop(ticket, member));
+            self.record_loss(ticket, member, &mut orders);
         }
-        orders.extend(self.next());
+        orders.extend(self.dispatch_waiting());
         orders
     }
 
-    /// A robot asks for something.
-    pub fn ask(&mut self, robot: Robot, kind: &Kind) -> (Ticket, Vec<Order>) {
+    /// Queues a request of a robot.
+    pub fn ask(&mut self, robot: RobotNumber, kind: &Kind) -> (Ticket, Vec<DispatchOrder>) {
         self.tickets += 1;
         let ticket = self.tickets;
-        let lane = self.lane(kind);
-        let request = Request {
+        let lane = self.lane_for(kind);
+        let request = QueuedRequest {
             robot,
             lane,
             at: BTreeSet::new(),
@@ -251,12 +252,18 @@ impl Dispatcher {
         self.requests.insert(ticket, request);
         let queue = self.waiting.entry((robot, lane)).or_default();
         queue.push_back(ticket);
-        self.turns.join((robot, lane));
-        (ticket, self.next())
+        self.turns.enqueue((robot, lane));
+        (ticket, self.dispatch_waiting())
     }
 
-    /// A servant's work at a request has ended. Whether that is the request's answer, and what is to be done.
-    pub fn ended(&mut self, ticket: Ticket, member: Member, end: End) -> (bool, Vec<Order>) {
+    /// Handles the outcome of a servant's work on a request. Returns whether it is the response, and the resulting
+    /// orders.
+    pub fn finish_attempt(
+        &mut self,
+        ticket: Ticket,
+        member: Member,
+        end: AttemptOutcome,
+    ) -> (bool, Vec<DispatchOrder>) {
         let known = self.requests.get(&ticket);
         let Some(request) = known.filter(|request| request.at.contains(&member)) else {
             return (false, Vec::new());
@@ -264,56 +271,62 @@ impl Dispatcher {
         let lane = request.lane;
         let mut orders = Vec::new();
         match end {
-            End::Answered => {
+            AttemptOutcome::Answered => {
                 let mut others = self.remove(ticket);
                 others.remove(&member);
-                orders.extend(others.into_iter().map(|other| Order::Drop(ticket, other)));
+                orders.extend(
+                    others
+                        .into_iter()
+                        .map(|other| DispatchOrder::Drop(ticket, other)),
+                );
             }
-            End::NotTaken => {
+            AttemptOutcome::NotTaken => {
                 self.pause(member, lane);
                 self.release(ticket, member);
-                self.again(ticket, &mut orders);
+                self.requeue_or_fail(ticket, &mut orders);
             }
-            End::Lost => {
+            AttemptOutcome::Lost => {
                 self.pause(member, lane);
-                self.lost(ticket, member, &mut orders);
+                self.record_loss(ticket, member, &mut orders);
             }
         }
-        orders.extend(self.next());
-        (end == End::Answered, orders)
+        orders.extend(self.dispatch_waiting());
+        (end == AttemptOutcome::Answered, orders)
     }
 
-    /// A servant that ends requests without carrying them out has the fewest under way: unless it pauses, it would get, and
-    /// lose, all that follow until its end is known.
+    /// Pauses a servant for a kind of requests. One that ends requests without executing them has the fewest in
+    /// progress and would otherwise get, and lose, all following ones until its failure is known.
     fn pause(&mut self, member: Member, lane: Lane) {
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.paused.insert(lane);
         }
     }
 
-    /// Nobody waits for the request's answer any more.
-    pub fn withdraw(&mut self, ticket: Ticket) -> Vec<Order> {
+    /// Withdraws a request for whose response nobody waits any more.
+    pub fn withdraw(&mut self, ticket: Ticket) -> Vec<DispatchOrder> {
         let at = self.remove(ticket).into_iter();
-        let mut orders: Vec<Order> = at.map(|member| Order::Drop(ticket, member)).collect();
-        orders.extend(self.next());
+        let mut orders: Vec<DispatchOrder> = at
+            .map(|member| DispatchOrder::Drop(ticket, member))
+            .collect();
+        orders.extend(self.dispatch_waiting());
         orders
     }
 
-    /// How much is to be done now.
-    pub fn load(&self) -> Load {
+    /// Returns the current load.
+    pub fn load(&self) -> GroupLoad {
         let waiting = self.waiting.values().map(VecDeque::len).sum();
-        Load {
+        GroupLoad {
             waiting,
             under_way: self.requests.len() - waiting,
         }
     }
 
-    /// Requests that a servant works at.
-    pub fn load_of(&self, member: Member) -> usize {
-        self.servants.get(&member).map_or(0, Servant::load)
+    /// Returns the number of requests a servant is working on.
+    pub fn member_load(&self, member: Member) -> usize {
+        self.servants.get(&member).map_or(0, ServantState::load)
     }
 
-    /// Forgets a request; gives those that worked at it.
+    /// Removes a request; returns the servants that worked on it.
     fn remove(&mut self, ticket: Ticket) -> BTreeSet<Member> {
         let at = match self.requests.get(&ticket) {
             Some(request) => request.at.clone(),
@@ -327,7 +340,7 @@ impl Dispatcher {
         at
     }
 
-    /// A servant does not work at a request any more.
+    /// Removes a servant from a request.
     fn release(&mut self, ticket: Ticket, member: Member) {
         let Some(request) = self.requests.get_mut(&ticket) else {
             return;
@@ -348,17 +361,17 @@ impl Dispatcher {
         }
     }
 
-    /// A servant was lost with a request.
-    fn lost(&mut self, ticket: Ticket, member: Member, orders: &mut Vec<Order>) {
+    /// Handles the loss of a servant that worked on a request.
+    fn record_loss(&mut self, ticket: Ticket, member: Member, orders: &mut Vec<DispatchOrder>) {
         self.release(ticket, member);
         if let Some(request) = self.requests.get_mut(&ticket) {
             request.lost += 1;
         }
-        self.again(ticket, orders);
+        self.requeue_or_fail(ticket, orders);
     }
 
-    /// A request at which nobody works any more waits again, before its robot's others, or fails.
-    fn again(&mut self, ticket: Ticket, orders: &mut Vec<Order>) {
+    /// Queues a request on which nobody works any more in front of its robot's others, or fails it.
+    fn requeue_or_fail(&mut self, ticket: Ticket, orders: &mut Vec<DispatchOrder>) {
         let Some(request) = self.requests.get(&ticket) else {
             return;
         };
@@ -367,20 +380,20 @@ impl Dispatcher {
         }
         let why = match request.lost {
             0 => None,
-            _ if !self.rules.idempotent => Some(Lost::NotAskedAgain),
-            lost => (lost >= ATTEMPTS).then_some(Lost::AskedOften),
+            _ if !self.rules.idempotent => Some(LossReason::NotAskedAgain),
+            lost => (lost >= ATTEMPTS).then_some(LossReason::AskedOften),
         };
         if let Some(why) = why {
             self.requests.remove(&ticket);
-            orders.push(Order::Fail(ticket, why));
+            orders.push(DispatchOrder::Fail(ticket, why));
             return;
         }
         let key = (request.robot, request.lane);
         self.waiting.entry(key).or_default().push_front(ticket);
-        self.turns.join(key);
+        self.turns.enqueue(key);
     }
 
-    /// A request does not wait any more.
+    /// Removes a request from its queue.
     fn unqueue(&mut self, ticket: Ticket) {
         let Some(request) = self.requests.get(&ticket) else {
             return;
@@ -395,23 +408,25 @@ impl Dispatcher {
         }
     }
 
-    /// Those that can be asked in this lane now for this robot, the best first; empty if they are too few.
-    fn places(&self, robot: Robot, lane: Lane) -> Vec<Member> {
-        let mut open: Vec<(Member, &Servant)> = self
+    /// Returns the servants that can get this robot's next request of a kind, the best first; empty if there are too
+    /// few.
+    fn pick_servants(&self, robot: RobotNumber, lane: Lane) -> Vec<Member> {
+        let mut open: Vec<(Member, &ServantState)> = self
             .servants
             .iter()
-            .filter(|(_, servant)| servant.is_open(lane))
+            .filter(|(_, servant)| servant.is_available(lane))
             .map(|(member, servant)| (*member, servant))
             .collect();
         let is_call = self.calls.contains(&lane);
-        let wanted = match is_call {
-            true => self.rules.replicas.min(open.len()),
-            false => 1,
+        let wanted = if is_call {
+            self.rules.replicas.min(open.len())
+        } else {
+            1
         };
         if is_call {
             open.retain(|(_, servant)| servant.calls < self.rules.window);
         } else {
-            let of = |servant: &Servant| {
+            let of = |servant: &ServantState| {
                 servant
                     .goals
                     .get(&lane)
@@ -422,7 +437,7 @@ impl Dispatcher {
                 (has == robot).then_some((*member, ahead))
             });
             match own {
-                Some((member, ahead)) if ahead < AHEAD || !self.others_wait(robot, lane) => {
+                Some((member, ahead)) if ahead < AHEAD || !self.has_waiting_others(robot, lane) => {
                     return vec![member];
                 }
                 Some(_) => return Vec::new(),
@@ -437,26 +452,28 @@ impl Dispatcher {
         open.into_iter().map(|(member, _)| member).collect()
     }
 
-    /// Whether another robot waits in this lane that no servant carries out a goal for.
-    fn others_wait(&self, robot: Robot, lane: Lane) -> bool {
+    /// Returns whether another robot without a servant waits for the same action.
+    fn has_waiting_others(&self, robot: RobotNumber, lane: Lane) -> bool {
         let mut waiting = self.waiting.keys();
         waiting.any(|(other, of)| *of == lane && *other != robot && !self.has_servant(*other, lane))
     }
 
-    fn has_servant(&self, robot: Robot, lane: Lane) -> bool {
+    fn has_servant(&self, robot: RobotNumber, lane: Lane) -> bool {
         let mut open = self
             .servants
             .values()
-            .filter(|servant| servant.is_open(lane));
+            .filter(|servant| servant.is_available(lane));
         open.any(|servant| servant.goals.get(&lane).is_some_and(|of| of.robot == robot))
     }
 
-    /// Has servants work at what waits, as far as they can.
-    fn next(&mut self) -> Vec<Order> {
+    /// Sends waiting requests to servants as far as possible.
+    fn dispatch_waiting(&mut self) -> Vec<DispatchOrder> {
         let mut orders = Vec::new();
         let mut turns = std::mem::take(&mut self.turns);
-        while let Some(key) = turns.take(|(robot, lane)| !self.places(*robot, *lane).is_empty()) {
-            let places = self.places(key.0, key.1);
+        while let Some(key) =
+            turns.take(|(robot, lane)| !self.pick_servants(*robot, *lane).is_empty())
+        {
+            let places = self.pick_servants(key.0, key.1);
             let queue = self.waiting.get_mut(&key);
             let Some(ticket) = queue.and_then(VecDeque::pop_front) else {
                 continue;
@@ -465,34 +482,39 @@ impl Dispatcher {
                 self.waiting.remove(&key);
                 turns.forget(key);
             } else {
-                turns.join(key);
+                turns.enqueue(key);
             }
             for member in places {
-                self.begin(ticket, key, member);
-                orders.push(Order::Ask(ticket, member));
+                self.start_attempt(ticket, key, member);
+                orders.push(DispatchOrder::Ask(ticket, member));
             }
         }
         self.turns = turns;
         orders
     }
 
-    fn begin(&mut self, ticket: Ticket, (robot, lane): (Robot, Lane), member: Member) {
+    fn start_attempt(
+        &mut self,
+        ticket: Ticket,
+        (robot, lane): (RobotNumber, Lane),
+        member: Member,
+    ) {
         if let Some(request) = self.requests.get_mut(&ticket) {
             request.at.insert(member);
         }
-        let others = !self.calls.contains(&lane) && self.others_wait(robot, lane);
+        let others = !self.calls.contains(&lane) && self.has_waiting_others(robot, lane);
         if let Some(servant) = self.servants.get_mut(&member) {
             servant.asked += 1;
             if self.calls.contains(&lane) {
                 servant.calls += 1;
                 return;
             }
-            let goals = servant.goals.entry(lane).or_insert(Goals {
+            let goals = servant.goals.entry(lane).or_insert(ServantGoals {
                 robot,
                 count: 0,
                 ahead: 0,
             });
-            // The first one was its turn.
+            // The first goal was its regular turn.
             goals.ahead += usize::from(others && goals.count > 0);
             goals.count += 1;
         }

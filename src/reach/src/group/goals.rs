@@ -1,4 +1,4 @@
-//! Goals of one robot at a group.
+//! Goals of one robot in a group.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,67 +11,67 @@ use futures_util::StreamExt;
 use futures_util::future::BoxFuture;
 use futures_util::stream::FuturesUnordered;
 use parking_lot::Mutex;
-use ros::bus::{ActionClient, BusError, GoalEnd, GoalEvents, Outcome};
+use ros::bus::{ActionClient, BusError, GoalEnd, GoalEvents, GoalOutcome};
 use ros::codec::default_message;
 use ros::schema::ActionDef;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, timeout};
 use tokio_util::sync::CancellationToken;
 
-use super::dispatch::{End, Kind, Lost, Robot};
-use super::{Errand, Group, Servant, Told, lost_in_words};
+use super::dispatch::{AttemptOutcome, Kind, LossReason, RobotNumber};
+use super::{DispatchEvent, MemberServant, PendingRequest, ServantGroup, describe_loss};
 
-/// For an action server of a servant that has its interface.
+/// Timeout for connecting to the action server of a servant that has registered its interface.
 const CONNECTS: Duration = Duration::from_secs(10);
-/// Goals of one action of one robot that have not ended; more are rejected.
+/// Maximum number of pending goals per action and robot; more are rejected.
 const MOST: usize = 256;
-/// How long a node may take to end a goal whose robot has gone. Then its servant carries out other robots' goals.
+/// Time a node may take to end a goal whose robot is gone. After that its servant gets goals of other robots.
 const GONE: Duration = Duration::from_secs(10);
 
-/// Hears of a goal what only a group can tell.
+/// Goal events, including those that only a group has.
 pub(super) trait GroupEvents: GoalEvents {
-    /// No servant has it, and the group keeps it until one is free.
-    fn waits(&self) {}
+    /// No servant is free, so the group keeps the goal until one is.
+    fn on_waiting(&self) {}
 }
 
-/// Who hears of a goal as of any server's.
-struct OfAny(Arc<dyn GoalEvents>);
+/// Adapts plain goal events.
+struct PlainGoalEvents(Arc<dyn GoalEvents>);
 
-impl GoalEvents for OfAny {
-    fn accepted(&self) {
-        self.0.accepted();
+impl GoalEvents for PlainGoalEvents {
+    fn on_accepted(&self) {
+        self.0.on_accepted();
     }
 
-    fn cancel_answered(&self, ends: bool) {
-        self.0.cancel_answered(ends);
+    fn on_cancel_response(&self, ends: bool) {
+        self.0.on_cancel_response(ends);
     }
 
-    fn feedback(&self, feedback: Bytes) {
-        self.0.feedback(feedback);
+    fn on_feedback(&self, feedback: Bytes) {
+        self.0.on_feedback(feedback);
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
-        self.0.ended(end);
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
+        self.0.on_ended(end);
     }
 }
 
-impl GroupEvents for OfAny {}
+impl GroupEvents for PlainGoalEvents {}
 
-/// One action, as a robot's.
+/// A client of one action for one robot.
 pub(super) struct GroupClient {
-    group: Arc<Group>,
-    robot: Robot,
+    group: Arc<ServantGroup>,
+    robot: RobotNumber,
     name: Arc<str>,
     of: Arc<ActionDef>,
-    /// Those that have not ended, with how often each was to be cancelled.
+    /// Pending goals, with the number of cancel requests for each.
     goals: Arc<Mutex<HashMap<String, watch::Sender<u32>>>>,
     gone: CancellationToken,
 }
 
 impl GroupClient {
     pub(super) fn new(
-        group: &Arc<Group>,
-        robot: Robot,
+        group: &Arc<ServantGroup>,
+        robot: RobotNumber,
         name: &str,
         of: &Arc<ActionDef>,
     ) -> GroupClient {
@@ -85,8 +85,13 @@ impl GroupClient {
         }
     }
 
-    /// As [`ActionClient::send`], for who wants to hear more.
-    pub(super) fn sends(&self, id: &str, goal: Bytes, events: Arc<dyn GroupEvents>) {
+    /// Sends a goal like [`ActionClient::send_goal`], with the events of a group.
+    pub(super) fn send_goal_with_events(
+        &self,
+        id: &str,
+        goal: Bytes,
+        events: Arc<dyn GroupEvents>,
+    ) {
         let (wishes, wished) = watch::channel(0);
         {
             let mut goals = self.goals.lock();
@@ -99,21 +104,21 @@ impl GroupClient {
             };
             if let Some(text) = refused {
                 let end = GoalEnd {
-                    outcome: Outcome::Rejected,
+                    outcome: GoalOutcome::Rejected,
                     text,
                     result: default_message(&self.of.result).into(),
                 };
-                // Not at once: whoever sends may hold what hears of it.
-                tokio::spawn(async move { events.ended(Ok(end)) });
+                // In a task, because the sender may hold a lock that the receiver needs.
+                tokio::spawn(async move { events.on_ended(Ok(end)) });
                 return;
             }
             goals.insert(id.to_owned(), wishes);
         }
         let errand = self
             .group
-            .begin(self.robot, Kind::Goal(Arc::clone(&self.name)));
-        let goal = Goal {
-            // Robots, and nodes of one robot, do not know each other's ids.
+            .begin_request(self.robot, Kind::Goal(Arc::clone(&self.name)));
+        let goal = GroupGoal {
+            // Robots, and nodes of one robot, choose ids independently.
             id: format!("{}-{id}", errand.ticket),
             body: goal,
             name: Arc::clone(&self.name),
@@ -124,29 +129,31 @@ impl GroupClient {
         tokio::spawn(async move {
             let end = goal.follow(errand, wished, &*events).await;
             goals.lock().remove(&id);
-            events.ended(end);
+            events.on_ended(end);
         });
     }
 
-    /// Nobody waits for the goals any more: they are cancelled, and not followed for long.
-    pub(super) fn leave(&self) {
+    /// Cancels all goals because nobody waits for them any more; they are not followed for long.
+    pub(super) fn abandon(&self) {
         self.gone.cancel();
     }
 }
 
 #[async_trait]
 impl ActionClient for GroupClient {
-    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError> {
         let mut members = self.group.members.subscribe();
         let any = async {
             loop {
                 let now = members.borrow_and_update().clone();
-                // One that is going says no; others may still answer.
+                // A servant that is going away returns an error; others may still answer.
                 let clients = now
                     .values()
                     .filter_map(|servant| servant.action(&self.name, &self.of).ok());
                 let clients: Vec<_> = clients.collect();
-                let opened = clients.iter().map(|client| client.ready(patience));
+                let opened = clients
+                    .iter()
+                    .map(|client| client.wait_for_server(patience));
                 let mut opened: FuturesUnordered<_> = opened.collect();
                 tokio::select! {
                     Some(ready) = opened.next() => return ready,
@@ -162,11 +169,11 @@ impl ActionClient for GroupClient {
         })
     }
 
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
-        self.sends(id, goal, Arc::new(OfAny(events)));
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+        self.send_goal_with_events(id, goal, Arc::new(PlainGoalEvents(events)));
     }
 
-    fn cancel(&self, id: &str) {
+    fn cancel_goal(&self, id: &str) {
         if let Some(wishes) = self.goals.lock().get(id) {
             wishes.send_modify(|wishes| *wishes += 1);
         }
@@ -175,72 +182,73 @@ impl ActionClient for GroupClient {
 
 impl Drop for GroupClient {
     fn drop(&mut self) {
-        self.leave();
+        self.abandon();
     }
 }
 
-struct Goal {
+struct GroupGoal {
     id: String,
     body: Bytes,
     name: Arc<str>,
     of: Arc<ActionDef>,
-    /// Its robot has gone.
+    /// Cancelled when the robot is gone.
     gone: CancellationToken,
 }
 
-/// What a servant says of a goal.
-enum Said {
+/// An update of a servant about a goal.
+enum GoalUpdate {
     Accepted,
     CancelAnswered(bool),
     Feedback(Bytes),
     Ended(Result<GoalEnd, String>),
 }
 
-struct Ear {
-    servant: Arc<Servant>,
-    said: mpsc::UnboundedSender<(Arc<Servant>, Said)>,
+struct GoalUpdateSender {
+    servant: Arc<MemberServant>,
+    said: mpsc::UnboundedSender<(Arc<MemberServant>, GoalUpdate)>,
 }
 
-impl Ear {
-    fn tell(&self, said: Said) {
+impl GoalUpdateSender {
+    fn send_update(&self, said: GoalUpdate) {
         let _ = self.said.send((Arc::clone(&self.servant), said));
     }
 }
 
-impl GoalEvents for Ear {
-    fn accepted(&self) {
-        self.tell(Said::Accepted);
+impl GoalEvents for GoalUpdateSender {
+    fn on_accepted(&self) {
+        self.send_update(GoalUpdate::Accepted);
     }
 
-    fn cancel_answered(&self, ends: bool) {
-        self.tell(Said::CancelAnswered(ends));
+    fn on_cancel_response(&self, ends: bool) {
+        self.send_update(GoalUpdate::CancelAnswered(ends));
     }
 
-    fn feedback(&self, feedback: Bytes) {
-        self.tell(Said::Feedback(feedback));
+    fn on_feedback(&self, feedback: Bytes) {
+        self.send_update(GoalUpdate::Feedback(feedback));
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
-        self.tell(Said::Ended(end));
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
+        self.send_update(GoalUpdate::Ended(end));
     }
 }
 
-/// An attempt to send the goal to a servant.
-type Sending = BoxFuture<'static, (Arc<Servant>, Result<Arc<dyn ActionClient>, BusError>)>;
+/// An attempt to connect to a servant for the goal.
+type SendAttempt =
+    BoxFuture<'static, (Arc<MemberServant>, Result<Arc<dyn ActionClient>, BusError>)>;
 
-impl Goal {
-    /// From asked for to its end.
+impl GroupGoal {
+    /// Follows the goal from its request to its end.
     async fn follow(
         &self,
-        mut errand: Errand,
+        mut errand: PendingRequest,
         mut wished: watch::Receiver<u32>,
         events: &dyn GroupEvents,
     ) -> Result<GoalEnd, String> {
         let (group, began) = (Arc::clone(&errand.group), Instant::now());
-        let (sender, mut said) = mpsc::unbounded_channel::<(Arc<Servant>, Said)>();
-        let mut sending: FuturesUnordered<Sending> = FuturesUnordered::new();
-        let mut at: Option<(Arc<Servant>, Arc<dyn ActionClient>)> = None;
-        let mut last: Option<Arc<Servant>> = None;
+        let (sender, mut said) = mpsc::unbounded_channel::<(Arc<MemberServant>, GoalUpdate)>();
+        let mut sending: FuturesUnordered<SendAttempt> = FuturesUnordered::new();
+        let mut at: Option<(Arc<MemberServant>, Arc<dyn ActionClient>)> = None;
+        let mut last: Option<Arc<MemberServant>> = None;
         let (mut told_to_end, mut waits) = (false, false);
         let given_up = async {
             self.gone.cancelled().await;
@@ -262,18 +270,18 @@ impl Goal {
                     let here = at.as_ref().is_some_and(|(now, _)| now.member == servant.member);
                     match what {
                         _ if !here => {}
-                        Said::Accepted => events.accepted(),
-                        Said::CancelAnswered(ends) => events.cancel_answered(ends),
-                        Said::Feedback(feedback) => events.feedback(feedback),
-                        Said::Ended(Ok(end)) => {
-                            errand.ended(&servant, End::Answered);
-                            group.counts.answered(began.elapsed());
+                        GoalUpdate::Accepted => events.on_accepted(),
+                        GoalUpdate::CancelAnswered(ends) => events.on_cancel_response(ends),
+                        GoalUpdate::Feedback(feedback) => events.on_feedback(feedback),
+                        GoalUpdate::Ended(Ok(end)) => {
+                            errand.finish_attempt(&servant, AttemptOutcome::Answered);
+                            group.counts.record_answer(began.elapsed());
                             return Ok(end);
                         }
-                        Said::Ended(Err(reason)) => {
+                        GoalUpdate::Ended(Err(reason)) => {
                             tracing::debug!("servant {} lost a goal: {reason}", servant.id);
                             at = None;
-                            errand.ended(&servant, End::Lost);
+                            errand.finish_attempt(&servant, AttemptOutcome::Lost);
                             last = Some(servant);
                         }
                     }
@@ -281,22 +289,22 @@ impl Goal {
                 Some((servant, ready)) = sending.next(), if !sending.is_empty() => {
                     match ready {
                         Ok(client) => {
-                            let ear = Ear { servant: Arc::clone(&servant), said: sender.clone() };
-                            client.send(&self.id, self.body.clone(), Arc::new(ear));
+                            let ear = GoalUpdateSender { servant: Arc::clone(&servant), said: sender.clone() };
+                            client.send_goal(&self.id, self.body.clone(), Arc::new(ear));
                             at = Some((servant, client));
                         }
                         Err(error) => {
-                            tracing::debug!("servant {} takes no goal: {error}", servant.id);
+                            tracing::debug!("servant {} accepts no goal: {error}", servant.id);
                             if matches!(error, BusError::CallFailed { .. }) {
                                 servant.forget_action(&self.name);
                             }
-                            errand.ended(&servant, End::NotTaken);
+                            errand.finish_attempt(&servant, AttemptOutcome::NotTaken);
                         }
                     }
                 }
                 Some(told) = errand.told.recv() => match told {
-                    Told::Ask(_) if told_to_end => return Ok(self.recalled()),
-                    Told::Ask(servant) => {
+                    DispatchEvent::Ask(_) if told_to_end => return Ok(self.canceled_end()),
+                    DispatchEvent::Ask(servant) => {
                         if last.is_some() {
                             group.counts.asked_again.fetch_add(1, Ordering::Relaxed);
                         }
@@ -304,27 +312,27 @@ impl Goal {
                         sending.push(Box::pin(async move {
                             let ready = async {
                                 let client = servant.action(&name, &of)?;
-                                client.ready(CONNECTS).await?;
+                                client.wait_for_server(CONNECTS).await?;
                                 Ok(client)
                             };
                             let ready = ready.await;
                             (servant, ready)
                         }));
                     }
-                    Told::Drop(servant) => {
+                    DispatchEvent::Drop(servant) => {
                         last = Some(servant);
                         sending.clear();
                         at = None;
                     }
-                    Told::Fail(why) => {
+                    DispatchEvent::Fail(why) => {
                         errand.over = true;
-                        return Err(self.failed(&group, last.as_deref(), why));
+                        return Err(self.fail_goal(&group, last.as_deref(), why));
                     }
                 },
                 () = &mut given_up => {
                     let at = at.as_ref().map_or("no servant", |(servant, _)| servant.id.as_str());
                     let words = format!(
-                        "its robot has gone, and {at} does not end it after {GONE:?}: other robots' goals go there, too"
+                        "its robot is gone, and {at} did not end it within {GONE:?}; other robots' goals run there, too"
                     );
                     tracing::warn!("goal {} of {}: {words}", self.id, self.name);
                     return Err(words);
@@ -332,29 +340,34 @@ impl Goal {
                 () = end_wanted => {
                     told_to_end = true;
                     match &at {
-                        Some((_, client)) => client.cancel(&self.id),
-                        None => return Ok(self.recalled()),
+                        Some((_, client)) => client.cancel_goal(&self.id),
+                        None => return Ok(self.canceled_end()),
                     }
                 }
-                // Nothing else is to be done now.
+                // Nothing else is to be done at the moment.
                 () = std::future::ready(()), if idle && !waits => {
                     waits = true;
-                    events.waits();
+                    events.on_waiting();
                 }
             }
         }
     }
 
-    fn failed(&self, group: &Group, last: Option<&Servant>, why: Lost) -> String {
+    fn fail_goal(
+        &self,
+        group: &ServantGroup,
+        last: Option<&MemberServant>,
+        why: LossReason,
+    ) -> String {
         group.counts.failed.fetch_add(1, Ordering::Relaxed);
-        lost_in_words(last, why)
+        describe_loss(last, why)
     }
 
-    /// The end of a goal that no servant has had.
-    fn recalled(&self) -> GoalEnd {
+    /// Returns the end of a goal that was cancelled before any servant had it.
+    fn canceled_end(&self) -> GoalEnd {
         GoalEnd {
-            outcome: Outcome::Canceled,
-            text: "it was cancelled before a servant had begun with it".to_owned(),
+            outcome: GoalOutcome::Canceled,
+            text: "it was cancelled before a servant had started it".to_owned(),
             result: default_message(&self.of.result).into(),
         }
     }

@@ -1,63 +1,64 @@
-//! Names of a shared node on a robot. The group's nodes run under the deployer's command line, a stub stands for one of them under
-//! its robot's. A name is traced back to what the program wrote, and resolved again as ROS resolves it on the robot
-//! (ROS 1: <http://wiki.ros.org/Names>, <http://wiki.ros.org/Remapping%20Arguments>; ROS 2:
+//! Names of a shared node on a robot. The group's nodes run with the deployer's command line, while a stub stands for
+//! one of them with its robot's. A name is traced back to what the program wrote and resolved again as ROS would on the
+//! robot (ROS 1: <http://wiki.ros.org/Names>, <http://wiki.ros.org/Remapping%20Arguments>; ROS 2:
 //! <https://design.ros2.org/articles/static_remapping.html>):
 //!
 //! ```text
-//!  /plan ─ without the remap work:=/plan ─▶ /work ─ beside /worker ─▶ work ─ of the node /r1/w ─▶ /r1/work ─ the robot's remaps ─▶
+//!  /plan ─ undo the remap work:=/plan ─▶ /work ─ relative to /worker ─▶ work ─ in node /r1/w ─▶ /r1/work
+//!                                                                            ─ the robot's remaps ─▶
 //! ```
-//! What stands at the top of a node's namespace counts as written without a slash: of a node in `/`, both look the same.
+//! Names at the top of a node's namespace are taken as relative: for a node in `/`, both look the same.
 //!
-//! An action of ROS 1 is remapped as its name, or topic by topic. One of ROS 2 is not (rcl up to Jazzy, at least): only its parts are,
-//! each by its whole name.
+//! A ROS 1 action is remapped by its name or topic by topic. A ROS 2 action is not (at least up to rcl of Jazzy): only
+//! its topics and services are, each by its full name.
 
 use ros::bus::RosVersion;
 use ros::ros1;
 use ros::ros2::{self, arguments};
 
-use arguments::{Kind, Renamed};
+use arguments::{Kind, RemapTarget};
 
-/// How one node's command line resolves names.
+/// Name resolution of one node's command line.
 #[derive(Debug, Clone)]
-pub(super) struct Names {
+pub(super) struct NameResolver {
     version: RosVersion,
     node: String,
-    /// Of several for one name the first counts.
-    remaps: Vec<Remap>,
+    /// Remappings; the first match counts.
+    remaps: Vec<NameRemap>,
 }
 
-/// Resolved, both sides.
+/// A remapping with both names resolved.
 #[derive(Debug, Clone)]
-struct Remap {
+struct NameRemap {
     from: String,
     to: String,
-    /// Of topics, or of services, alone (ROS 2).
-    of: Option<What>,
+    /// Only topics or only services (ROS 2).
+    of: Option<NameKind>,
 }
 
-/// What is named.
+/// Kind of a name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum What {
+pub(super) enum NameKind {
     Topic,
     Service,
 }
 
-impl Names {
-    /// Those of a node of this absolute name, which was started with these arguments.
-    pub(super) fn new(version: RosVersion, node: &str, argv: &[String]) -> Names {
+impl NameResolver {
+    /// Creates the resolver of a node with this absolute name and command line.
+    pub(super) fn new(version: RosVersion, node: &str, argv: &[String]) -> NameResolver {
         let remaps = match version {
-            RosVersion::One => of_one(node, argv),
-            RosVersion::Two => of_two(node, argv),
+            RosVersion::One => ros1_remaps(node, argv),
+            RosVersion::Two => ros2_remaps(node, argv),
         };
-        Names {
+        NameResolver {
             version,
             node: node.to_owned(),
             remaps,
         }
     }
 
-    /// What the program wrote, where it has registered `name`.
-    fn written(&self, name: &str) -> String {
+    /// Returns the name that the program wrote for the registered `name`.
+    fn source_name(&self, name: &str) -> String {
         let below = |above: &str| name.strip_prefix(above)?.strip_prefix('/');
         if let Some(own) = below(&self.node) {
             return match self.version {
@@ -69,79 +70,86 @@ impl Names {
         below(namespace).unwrap_or(name).to_owned()
     }
 
-    fn before_remaps(&self, name: &str, what: What) -> Option<&str> {
-        let mut remaps = self.remaps.iter().filter(|remap| remap.concerns(what));
+    fn name_before_remap(&self, name: &str, what: NameKind) -> Option<&str> {
+        let mut remaps = self.remaps.iter().filter(|remap| remap.applies_to(what));
         remaps
             .find(|remap| remap.to == name)
             .map(|remap| remap.from.as_str())
     }
 
-    /// What a program that has written `name` has, without remaps.
-    fn resolved(&self, name: &str) -> String {
+    /// Resolves a name written by the program, without remappings.
+    fn resolve(&self, name: &str) -> String {
         match self.version {
             RosVersion::One => ros1::names::resolve(name, &self.node),
             RosVersion::Two => ros2::names::resolve(name, &self.node),
         }
     }
 
-    fn remapped(&self, name: String, what: What) -> String {
-        let mut remaps = self.remaps.iter().filter(|remap| remap.concerns(what));
+    fn apply_remaps(&self, name: String, what: NameKind) -> String {
+        let mut remaps = self.remaps.iter().filter(|remap| remap.applies_to(what));
         let remap = remaps.find(|remap| remap.from == name);
         remap.map_or(name, |remap| remap.to.clone())
     }
 
-    /// The name of a service that the node has by this command line, by the robot's.
-    pub(super) fn on(&self, robot: &Names, name: &str) -> String {
-        let what = What::Service;
-        let before = self.before_remaps(name, what).unwrap_or(name);
-        robot.remapped(robot.resolved(&self.written(before)), what)
+    /// Translates the name of a service from this command line to the robot's.
+    pub(super) fn service_name_on(&self, robot: &NameResolver, name: &str) -> String {
+        let what = NameKind::Service;
+        let before = self.name_before_remap(name, what).unwrap_or(name);
+        robot.apply_remaps(robot.resolve(&self.source_name(before)), what)
     }
 
-    /// The same of an action.
-    pub(super) fn action_on(&self, robot: &Names, action: &str) -> String {
+    /// Translates the name of an action.
+    pub(super) fn action_name_on(&self, robot: &NameResolver, action: &str) -> String {
         match self.version {
-            RosVersion::One => self.on(robot, action),
-            RosVersion::Two => robot.resolved(&self.written(action)),
+            RosVersion::One => self.service_name_on(robot, action),
+            RosVersion::Two => robot.resolve(&self.source_name(action)),
         }
     }
 
-    /// The same of a part of an action, whose name ends so. In ROS 1 it is remapped itself or with its action: `/count` and `/goal`.
-    pub(super) fn end_on(&self, robot: &Names, action: &str, end: &str, what: What) -> String {
+    /// Translates the name of a topic or service of an action, given its suffix. In ROS 1 it is remapped on its own or
+    /// with its action: `/count` and `/goal`.
+    pub(super) fn endpoint_name_on(
+        &self,
+        robot: &NameResolver,
+        action: &str,
+        end: &str,
+        what: NameKind,
+    ) -> String {
         let before = match self.version {
-            // Where all five topics were remapped to others, that has given the action its name.
+            // If all five topics were remapped, they determine the action's name.
             RosVersion::One => self
-                .before_remaps(&format!("{action}{end}"), what)
+                .name_before_remap(&format!("{action}{end}"), what)
                 .and_then(|topic| topic.strip_suffix(end)),
             RosVersion::Two => None,
         };
-        let action = self.action_on(robot, before.unwrap_or(action));
-        robot.remapped(format!("{action}{end}"), what)
+        let action = self.action_name_on(robot, before.unwrap_or(action));
+        robot.apply_remaps(format!("{action}{end}"), what)
     }
 }
 
-impl Remap {
-    fn concerns(&self, what: What) -> bool {
+impl NameRemap {
+    fn applies_to(&self, what: NameKind) -> bool {
         self.of.is_none_or(|of| of == what)
     }
 }
 
-fn of_one(node: &str, argv: &[String]) -> Vec<Remap> {
+fn ros1_remaps(node: &str, argv: &[String]) -> Vec<NameRemap> {
     let remaps = argv.iter().filter_map(|argument| argument.split_once(":="));
-    // `__name:=` and `_parameter:=` are no names.
+    // `__name:=` and `_parameter:=` are not remappings.
     let remaps =
         remaps.filter(|(from, to)| !from.is_empty() && !from.starts_with('_') && !to.is_empty());
     let resolved = |name| ros1::names::resolve(name, node);
-    let remaps = remaps.map(|(from, to)| Remap {
+    let remaps = remaps.map(|(from, to)| NameRemap {
         from: resolved(from),
         to: resolved(to),
         of: None,
     });
-    // The last one counts there.
+    // In ROS 1 the last match counts.
     remaps.rev().collect()
 }
 
-/// None where rcl would not take the command line either.
-fn of_two(node: &str, argv: &[String]) -> Vec<Remap> {
+/// Returns none if rcl would not accept the command line either.
+fn ros2_remaps(node: &str, argv: &[String]) -> Vec<NameRemap> {
     let last = node.rsplit('/').next().unwrap_or_default();
     let resolved = |name: &str| ros2::names::resolve(name, node);
     let parts = arguments::parse(argv).unwrap_or_default();
@@ -150,12 +158,12 @@ fn of_two(node: &str, argv: &[String]) -> Vec<Remap> {
             return None;
         };
         let of = match rule.of {
-            Renamed::Topic => Some(What::Topic),
-            Renamed::Service => Some(What::Service),
-            Renamed::Name => None,
-            Renamed::Node | Renamed::Namespace => return None,
+            RemapTarget::Topic => Some(NameKind::Topic),
+            RemapTarget::Service => Some(NameKind::Service),
+            RemapTarget::Name => None,
+            RemapTarget::Node | RemapTarget::Namespace => return None,
         };
-        rule.concerns(last).then(|| Remap {
+        rule.applies_to(last).then(|| NameRemap {
             from: resolved(&rule.from),
             to: resolved(&rule.to),
             of,
@@ -168,14 +176,14 @@ fn of_two(node: &str, argv: &[String]) -> Vec<Remap> {
 mod tests {
     use super::*;
 
-    fn names(node: &str, argv: &[&str]) -> Names {
+    fn names(node: &str, argv: &[&str]) -> NameResolver {
         let argv: Vec<String> = argv.iter().map(|&argument| argument.to_owned()).collect();
-        Names::new(RosVersion::One, node, &argv)
+        NameResolver::new(RosVersion::One, node, &argv)
     }
 
-    fn names_two(node: &str, argv: &str) -> Names {
+    fn names_two(node: &str, argv: &str) -> NameResolver {
         let argv: Vec<String> = argv.split_whitespace().map(str::to_owned).collect();
-        Names::new(RosVersion::Two, node, &argv)
+        NameResolver::new(RosVersion::Two, node, &argv)
     }
 
     #[test]
@@ -191,9 +199,9 @@ mod tests {
             (("/lab/w", &[]), ("/r1/x", &[]), "/lab/work", "/r1/work"),
             (("/lab/w", &[]), ("/r1/x", &[]), "/work", "/work"),
             (("/lab/w", &[]), ("/x", &[]), "/lab/w/set", "/x/set"),
-            // No name of the node, though it begins with one.
+            // Not below the node's name, although it begins with it.
             (("/w", &[]), ("/x", &[]), "/wide/set", "/wide/set"),
-            // The robot's remaps.
+            // The robot's remappings.
             (("/w", &[]), ("/x", &["work:=plan"]), "/work", "/plan"),
             (("/w", &[]), ("/r1/x", &["work:=plan"]), "/work", "/r1/plan"),
             (("/w", &[]), ("/r1/x", &["work:=/plan"]), "/work", "/plan"),
@@ -204,7 +212,7 @@ mod tests {
                 "/work",
                 "/r1/work",
             ),
-            // The deployer's, which are no robot's.
+            // The deployer's remappings, which do not apply on the robot.
             (("/w", &["work:=/plan"]), ("/x", &[]), "/plan", "/work"),
             (
                 ("/w", &["work:=/plan"]),
@@ -212,7 +220,7 @@ mod tests {
                 "/plan",
                 "/r1/mine",
             ),
-            // No remaps.
+            // Not remappings.
             (
                 ("/w", &[]),
                 ("/x", &["_work:=1", "3", "__name:=y"]),
@@ -222,7 +230,7 @@ mod tests {
         ] {
             let (from, to) = (names(deployed.0, deployed.1), names(robot.0, robot.1));
             assert_eq!(
-                from.on(&to, name),
+                from.service_name_on(&to, name),
                 expected,
                 "{deployed:?} {robot:?} {name}"
             );
@@ -250,13 +258,13 @@ mod tests {
             ),
         ] {
             let (from, to) = (names("/w", deployed), names("/r1/x", robot));
-            let topic = from.end_on(&to, action, "/goal", What::Topic);
+            let topic = from.endpoint_name_on(&to, action, "/goal", NameKind::Topic);
             assert_eq!(topic, expected, "{deployed:?} {robot:?} {action}");
         }
     }
 
     #[test]
-    fn there_and_back_a_name_is_what_it_was() {
+    fn names_round_trip_between_command_lines() {
         let lines: [(&str, &[&str]); 4] = [
             ("/w", &[]),
             ("/lab/w", &["work:=/plan"]),
@@ -267,15 +275,19 @@ mod tests {
             for other in lines {
                 let (one, other) = (names(one.0, one.1), names(other.0, other.1));
                 for written in ["work", "~set", "sub/work", "x"] {
-                    let name = one.remapped(one.resolved(written), What::Service);
-                    let there = one.on(&other, &name);
-                    assert_eq!(other.on(&one, &there), name, "{one:?} {other:?}");
+                    let name = one.apply_remaps(one.resolve(written), NameKind::Service);
+                    let there = one.service_name_on(&other, &name);
+                    assert_eq!(
+                        other.service_name_on(&one, &there),
+                        name,
+                        "{one:?} {other:?}"
+                    );
                 }
             }
         }
     }
 
-    /// Each as a node of rclpy 7.1 has it.
+    /// Expected values as of a node of rclpy 7.1.
     #[test]
     fn robots_of_ros_2_have_names_as_if_the_node_ran_there() {
         for (deployed, robot, name, expected) in [
@@ -297,7 +309,7 @@ mod tests {
                 "/one",
             ),
             (("/w", ""), ("/w", "-r work:=~/mine"), "/work", "/w/mine"),
-            // Of services, of topics, of one node of the process.
+            // Rules for services, for topics, and for one node of the process.
             (("/w", ""), ("/w", "-r rosservice://work:=x"), "/work", "/x"),
             (
                 ("/w", ""),
@@ -307,7 +319,7 @@ mod tests {
             ),
             (("/w", ""), ("/w", "-r w:work:=x"), "/work", "/x"),
             (("/w", ""), ("/w", "-r other:work:=x"), "/work", "/work"),
-            // The deployer's, which are no robot's.
+            // The deployer's rules, which do not apply on the robot.
             (("/w", "-r work:=/plan"), ("/x", ""), "/plan", "/work"),
             (
                 ("/w", "-r work:=/plan"),
@@ -324,12 +336,12 @@ mod tests {
         ] {
             let [from, to] = [deployed, robot]
                 .map(|(node, rules)| names_two(node, &format!("/opt/w --ros-args {rules}")));
-            let found = from.on(&to, name);
+            let found = from.service_name_on(&to, name);
             assert_eq!(found, expected, "{deployed:?} {robot:?} {name}");
         }
     }
 
-    /// Each as a node of rclpy 7.1 has it.
+    /// Expected values as of a node of rclpy 7.1.
     #[test]
     fn actions_of_ros_2_are_remapped_part_by_part() {
         let (from, end) = (names_two("/w", ""), "/_action/send_goal");
@@ -343,10 +355,10 @@ mod tests {
             ("-r count/_action/send_goal:=zz", "/r1/count", "/r1/zz"),
         ] {
             let to = names_two("/r1/x", &format!("--ros-args {rules}"));
-            assert_eq!(from.action_on(&to, "/count"), action);
-            let part = from.end_on(&to, "/count", end, What::Service);
+            assert_eq!(from.action_name_on(&to, "/count"), action);
+            let part = from.endpoint_name_on(&to, "/count", end, NameKind::Service);
             assert_eq!(part, expected, "{rules}");
-            let topic = from.end_on(&to, "/count", "/_action/status", What::Topic);
+            let topic = from.endpoint_name_on(&to, "/count", "/_action/status", NameKind::Topic);
             assert_eq!(topic, "/r1/count/_action/status");
         }
     }

@@ -1,11 +1,11 @@
-//! Nodes that a robot's stubs stand for where robots share them. None is started: the group's servants run them, and answer under
-//! the names that the robot has for them. A stub's end takes those names back, and cancels what its robot had asked of them.
+//! Shared nodes for which a robot's stubs stand. None is started: the group's servants run them and answer under the
+//! names that the robot has for them. When a stub ends, its names are removed and its pending requests cancelled.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use link::control::{Decision, Exit, Hello, Node, Request};
+use link::control::{Decision, Exit, Hello, NodeLaunch, RequestTiming};
 use parking_lot::Mutex;
 use ros::bus::{ParamValue, RosVersion};
 use ros::ros1::names;
@@ -14,72 +14,77 @@ use servant::spec::NodeSpec;
 use tokio::sync::{mpsc, watch};
 
 use super::bus::GroupBus;
-use super::names::Names;
-use super::view::{Alias, View};
-use crate::links::{Nodes, RequestNews};
-use crate::nodes::{Told, program, running};
-use crate::{Observer, Recorded, Tenant};
+use super::names::NameResolver;
+use super::view::{GroupView, NodeAlias};
+use crate::links::{NodeController, RequestUpdate};
+use crate::nodes::{RobotEvents, find_program, nodes_running};
+use crate::{Observer, RecordedRevision, Tenant};
 
 /// Signals that end a node: SIGHUP, SIGINT, SIGQUIT, SIGKILL and SIGTERM.
 const ENDS: [i32; 5] = [1, 2, 3, 9, 15];
-/// Settings of stubs stand below this private name, and are no node's.
+/// Private namespace of the stub's own settings, which are not parameters of a node.
 const OF_STUBS: &str = "cloudroid";
 
 /// The nodes of one robot.
 pub(super) struct SharedNodes {
     bus: Arc<GroupBus>,
-    recorded: Recorded,
-    told: Told,
-    linked: Mutex<BTreeMap<String, Linked>>,
+    recorded: RecordedRevision,
+    told: RobotEvents,
+    linked: Mutex<BTreeMap<String, SharedStubNode>>,
 }
 
-/// A stub's node.
-struct Linked {
-    view: View,
+/// The node of a stub.
+struct SharedStubNode {
+    view: GroupView,
     exit: watch::Sender<Option<Exit>>,
 }
 
 impl SharedNodes {
-    /// None yet; `bus` shows those that stubs begin, `place` is the id of the robot's place.
+    /// Creates an empty set; `bus` shows the nodes that stubs start, `place` is the id of the robot's place.
     pub(super) fn new(
         bus: Arc<GroupBus>,
-        recorded: Recorded,
+        recorded: RecordedRevision,
         place: &str,
         observer: Arc<dyn Observer>,
     ) -> SharedNodes {
         SharedNodes {
             bus,
             recorded,
-            told: Told::new(place, observer),
+            told: RobotEvents::new(place, observer),
             linked: Mutex::default(),
         }
     }
 
-    /// Shows what the stubs' nodes serve now.
-    fn show(&self, linked: &BTreeMap<String, Linked>) {
-        let mut all = View::default();
-        linked.values().for_each(|node| all.add(node.view.clone()));
-        self.bus.show(all);
+    /// Updates the bus to show what the stubs' nodes currently provide.
+    fn update_view(&self, linked: &BTreeMap<String, SharedStubNode>) {
+        let mut all = GroupView::default();
+        linked
+            .values()
+            .for_each(|node| all.merge(node.view.clone()));
+        self.bus.set_view(all);
     }
 
-    fn view(&self, node: &Node) -> Result<View, String> {
-        let planned = planned(&self.recorded, node)?;
+    fn node_view(&self, node: &NodeLaunch) -> Result<GroupView, String> {
+        let planned = find_group_node(&self.recorded, node)?;
         let ros = self.bus.ros();
-        let alias = Alias {
+        let alias = NodeAlias {
             node: &planned.name,
             only: self.recorded.nodes.len() == 1,
-            deployed: Names::new(ros, &planned.name, &planned.argv),
+            deployed: NameResolver::new(ros, &planned.name, &planned.argv),
             name: &node.name,
-            robot: Names::new(ros, &node.name, &node.argv),
+            robot: NameResolver::new(ros, &node.name, &node.argv),
         };
-        Ok(View::of_node(ros, self.bus.interface(), &alias))
+        Ok(GroupView::for_node(ros, self.bus.interface(), &alias))
     }
 }
 
-/// The group's node that a stub's node stands for.
-fn planned<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a NodeSpec, String> {
-    program(recorded, node)?;
-    let all: Vec<&NodeSpec> = running(recorded, &node.executable).collect();
+/// Finds the group's node that corresponds to a stub's node.
+fn find_group_node<'a>(
+    recorded: &'a RecordedRevision,
+    node: &NodeLaunch,
+) -> Result<&'a NodeSpec, String> {
+    find_program(recorded, node)?;
+    let all: Vec<&NodeSpec> = nodes_running(recorded, &node.executable).collect();
     let last = |name: &str| name.rsplit('/').next().unwrap_or_default().to_owned();
     let same = all
         .iter()
@@ -91,13 +96,15 @@ fn planned<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a NodeSpec, Stri
     match (same, &all[..]) {
         (Some(planned), _) | (None, [planned]) => Ok(planned),
         (None, []) => Err(format!(
-            "robots share service {}, whose servants do not run {}: a stub uses what runs there; push the service with that node",
+            "robots share service {}, whose servants do not run {}: a stub uses what runs there; push the service with \
+             that node",
             recorded.service, node.executable
         )),
         (None, several) => {
             let names: Vec<&str> = several.iter().map(|planned| &*planned.name).collect();
             Err(format!(
-                "robots share service {}, whose servants run {} as {}: which of them {} stands for is told by its name; give it one of these",
+                "robots share service {}, whose servants run {} as {}: which of them {} stands for is decided by its \
+                    name; give it one of these names",
                 recorded.service,
                 node.executable,
                 names.join(" and "),
@@ -107,28 +114,32 @@ fn planned<'a>(recorded: &'a Recorded, node: &Node) -> Result<&'a NodeSpec, Stri
     }
 }
 
-/// What a robot gives a node that it does not heed: private parameters, and arguments that are neither these nor remaps. `value` is
-/// what a parameter of the group's node is known to be.
-fn unheeded<'a>(
-    recorded: &'a Recorded,
+/// Returns the settings of a robot for its node that are ignored: private parameters, and arguments that are neither
+/// parameters nor remappings. `value` returns the known parameter values of the group's node.
+fn unused_settings<'a>(
+    recorded: &'a RecordedRevision,
     hello: &Hello,
     value: impl Fn(&str) -> Option<&'a serde_json::Value>,
 ) -> BTreeSet<String> {
-    let Ok(planned) = planned(recorded, &hello.node) else {
+    let Ok(planned) = find_group_node(recorded, &hello.node) else {
         return BTreeSet::new();
     };
-    match recorded.flavour.ros.bus() {
-        RosVersion::One => unheeded_one(recorded, planned, hello),
-        RosVersion::Two => unheeded_two(planned, &hello.node.argv, |name| {
+    match recorded.flavour.ros.ros_version() {
+        RosVersion::One => unused_settings_ros1(recorded, planned, hello),
+        RosVersion::Two => unused_settings_ros2(planned, &hello.node.argv, |name| {
             value(&format!("{}/{name}", planned.name))
         }),
     }
 }
 
-fn unheeded_one(recorded: &Recorded, planned: &NodeSpec, hello: &Hello) -> BTreeSet<String> {
+fn unused_settings_ros1(
+    recorded: &RecordedRevision,
+    planned: &NodeSpec,
+    hello: &Hello,
+) -> BTreeSet<String> {
     let deployed = |name: &str| recorded.parameters.get(&format!("{}/{name}", planned.name));
     let mut given = BTreeSet::new();
-    if let Some(own) = below(&hello.parameters, &hello.node.name) {
+    if let Some(own) = parameters_below(&hello.parameters, &hello.node.name) {
         let own = own
             .iter()
             .filter(|(name, value)| *name != OF_STUBS && deployed(name) != Some(*value));
@@ -149,13 +160,13 @@ fn unheeded_one(recorded: &Recorded, planned: &NodeSpec, hello: &Hello) -> BTree
     given
 }
 
-/// Parameters are arguments there, those of files, too.
-fn unheeded_two<'a>(
+/// In ROS 2, parameters are arguments, including those from files.
+fn unused_settings_ros2<'a>(
     planned: &NodeSpec,
     argv: &[String],
     value: impl Fn(&str) -> Option<&'a serde_json::Value>,
 ) -> BTreeSet<String> {
-    // The stub has read it, and so has the node.
+    // The stub has accepted the arguments, and so has the node.
     let parts = |argv: &[String]| arguments::parse(argv).unwrap_or_default();
     let deployed = parts(&planned.argv);
     let known = |name: &str, given: &str| {
@@ -163,7 +174,7 @@ fn unheeded_two<'a>(
             Kind::Parameter(of) if of.name == name => Some(of.value == given),
             _ => None,
         });
-        // What is written so is JSON, too.
+        // Such values are also valid JSON.
         let is_it = || {
             let given: Option<serde_json::Value> = serde_json::from_str(given).ok();
             given.is_some() && given.as_ref() == value(name)
@@ -184,8 +195,8 @@ fn unheeded_two<'a>(
     given.collect()
 }
 
-/// The parameters below a node's name.
-fn below<'a>(
+/// Returns the parameters below a node's name.
+fn parameters_below<'a>(
     all: &'a BTreeMap<String, ParamValue>,
     node: &str,
 ) -> Option<&'a BTreeMap<String, ParamValue>> {
@@ -196,23 +207,25 @@ fn below<'a>(
 }
 
 #[async_trait]
-impl Nodes for SharedNodes {
+impl NodeController for SharedNodes {
     fn service(&self) -> &str {
         &self.recorded.service
     }
 
-    async fn start(&self, node: &Node, _run: &str) -> Result<(), String> {
+    async fn start(&self, node: &NodeLaunch, _run: &str) -> Result<(), String> {
         let tenant = self.told.tenant()?;
-        self.told.observer().fits(node.revision, &node.image)?;
-        let view = self.view(node)?;
+        self.told
+            .observer()
+            .check_stub(node.revision, &node.image)?;
+        let view = self.node_view(node)?;
         tenant.take_over();
-        let linked = Linked {
+        let linked = SharedStubNode {
             view,
             exit: watch::Sender::new(None),
         };
         let mut all = self.linked.lock();
         all.insert(node.name.clone(), linked);
-        self.show(&all);
+        self.update_view(&all);
         Ok(())
     }
 
@@ -222,17 +235,17 @@ impl Nodes for SharedNodes {
         }
         let mut all = self.linked.lock();
         if let Some(linked) = all.remove(node) {
-            self.show(&all);
+            self.update_view(&all);
             linked.exit.send_replace(Some(Exit {
                 code: Some(0),
                 signal: None,
-                text: format!("{node} was told to end"),
+                text: format!("{node} was asked to shut down"),
             }));
         }
         Ok(())
     }
 
-    async fn ended(&self, node: &str) -> Exit {
+    async fn wait_exit(&self, node: &str) -> Exit {
         let exit = self.linked.lock().get(node).map(|it| it.exit.subscribe());
         let Some(mut exit) = exit else {
             return Exit::default();
@@ -245,39 +258,41 @@ impl Nodes for SharedNodes {
         self.linked.lock().contains_key(node)
     }
 
-    /// None is the robot's.
-    fn parameters(&self, _node: &Node) -> Vec<(String, ParamValue)> {
+    /// No node belongs to the robot.
+    fn parameters(&self, _node: &NodeLaunch) -> Vec<(String, ParamValue)> {
         Vec::new()
     }
 
-    fn translate(&self, _node: &Node, text: &str) -> String {
+    fn translate(&self, _node: &NodeLaunch, text: &str) -> String {
         text.to_owned()
     }
 
-    /// None: what a servant prints is of all robots.
-    fn lines(&self, _node: &str) -> mpsc::Receiver<(bool, String)> {
+    /// Empty, because the output of a servant belongs to all robots.
+    fn output_lines(&self, _node: &str) -> mpsc::Receiver<(bool, String)> {
         mpsc::channel(1).1
     }
 
-    fn decided(&self, node: &str, decision: &Decision) {
-        self.told.decided(node, decision);
+    fn on_decision(&self, node: &str, decision: &Decision) {
+        self.told.record_decision(node, decision);
     }
 
-    fn measured(&self, request: &Request, news: RequestNews) {
-        self.told.observer().measured(request, news);
+    fn on_request_measured(&self, request: &RequestTiming, news: RequestUpdate) {
+        self.told.observer().on_request_measured(request, news);
     }
 
     fn warn(&self, kind: &str, text: &str) {
         self.told.warn(kind, text);
     }
 
-    fn unheeded(&self, hello: &Hello) -> Option<String> {
-        let value = |name: &str| self.bus.value(name);
-        let given = unheeded(&self.recorded, hello, value);
+    fn describe_unused_settings(&self, hello: &Hello) -> Option<String> {
+        let value = |name: &str| self.bus.recorded_value(name);
+        let given = unused_settings(&self.recorded, hello, value);
         let given: Vec<String> = given.into_iter().collect();
         (!given.is_empty()).then(|| {
             format!(
-                "robots share service {}, whose nodes have their parameters and arguments from its push: what this robot gives {} is not heeded ({}); have it given when the service is pushed (--param), or push it without --shared",
+                "robots share service {}, whose nodes have their parameters and arguments from its push: what this \
+                    robot gives {} is ignored ({}); set it when the service is pushed (--param), or push it without \
+                    --shared",
                 self.recorded.service,
                 hello.node.name,
                 given.join(", ")
@@ -285,8 +300,8 @@ impl Nodes for SharedNodes {
         })
     }
 
-    fn bind(&self, tenant: Weak<dyn Tenant>) {
-        self.told.bind(tenant);
+    fn bind_tenant(&self, tenant: Weak<dyn Tenant>) {
+        self.told.bind_tenant(tenant);
     }
 }
 
@@ -297,7 +312,7 @@ mod tests {
 
     use super::*;
 
-    fn recorded(nodes: &[(&str, &str)]) -> Recorded {
+    fn test_revision(nodes: &[(&str, &str)]) -> RecordedRevision {
         let nodes = nodes.iter().map(|(name, program)| {
             serde_json::from_value(serde_json::json!({
                 "name": name, "argv": [program, "3", "__name:=x"], "environment": {}, "directory": "/",
@@ -305,7 +320,7 @@ mod tests {
             }))
         });
         let nodes: Result<Vec<NodeSpec>, _> = nodes.collect();
-        Recorded {
+        RecordedRevision {
             service: "kitchen".into(),
             package: "kitchen".into(),
             flavour: Default::default(),
@@ -324,12 +339,12 @@ mod tests {
         }
     }
 
-    fn node(name: &str, executable: &str) -> Node {
-        Node {
+    fn node(name: &str, executable: &str) -> NodeLaunch {
+        NodeLaunch {
             name: name.into(),
             package: "kitchen".into(),
             executable: executable.into(),
-            ..Node::default()
+            ..NodeLaunch::default()
         }
     }
 
@@ -346,8 +361,9 @@ mod tests {
             (&[COOK], "/r1/chef", "wash", Err("do not run wash")),
             (&[COOK], "/r1/chef", "/bin/sh", Err("was not pushed with")),
         ] {
-            let recorded = recorded(nodes);
-            let found = planned(&recorded, &node(name, executable)).map(|it| it.name.as_str());
+            let recorded = test_revision(nodes);
+            let found =
+                find_group_node(&recorded, &node(name, executable)).map(|it| it.name.as_str());
             match expected {
                 Ok(expected) => assert_eq!(found, Ok(expected), "{name}"),
                 Err(words) => assert!(found.is_err_and(|it| it.contains(words)), "{name}"),
@@ -356,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_robot_gives_in_vain_is_named() {
+    fn unused_settings_of_a_robot_are_named() {
         let salt = |amount| ParamValue::Map([("salt".to_owned(), ParamValue::Int(amount))].into());
         let settings = ParamValue::Map([("cloudroid".to_owned(), ParamValue::Int(1))].into());
         let of = |value| ParamValue::Map([("chef".to_owned(), value)].into());
@@ -369,7 +385,7 @@ mod tests {
             (None, &["5"], &["the argument \"5\""]),
         ] {
             let hello = Hello {
-                node: Node {
+                node: NodeLaunch {
                     argv: argv.iter().map(|&argument| argument.to_owned()).collect(),
                     ..node("/r1/chef", "cook")
                 },
@@ -379,18 +395,18 @@ mod tests {
                     .collect(),
                 ..Hello::default()
             };
-            let recorded = recorded(&[COOK]);
-            let given = unheeded(&recorded, &hello, |_| None);
+            let recorded = test_revision(&[COOK]);
+            let given = unused_settings(&recorded, &hello, |_| None);
             let given: Vec<String> = given.into_iter().collect();
             assert_eq!(given, expected, "{hello:?}");
         }
     }
 
     #[test]
-    fn what_a_robot_of_ros_2_gives_in_vain_is_named() {
+    fn unused_settings_of_a_ros_2_robot_are_named() {
         let words =
             |line: &str| -> Vec<String> { line.split_whitespace().map(str::to_owned).collect() };
-        let mut recorded = recorded(&[COOK]);
+        let mut recorded = test_revision(&[COOK]);
         recorded.flavour.ros = Version::Ros2;
         let deployed = "--ros-args -r __node:=cook -p salt:=3 -p oil:=1 -p oil:=2 --";
         recorded.nodes[0].argv = words(&format!("{} --slow {deployed}", COOK.1));
@@ -413,13 +429,15 @@ mod tests {
             ),
         ] {
             let hello = Hello {
-                node: Node {
+                node: NodeLaunch {
                     argv: words(line),
                     ..node("/r1/chef", "cook")
                 },
                 ..Hello::default()
             };
-            let given: Vec<String> = unheeded(&recorded, &hello, value).into_iter().collect();
+            let given: Vec<String> = unused_settings(&recorded, &hello, value)
+                .into_iter()
+                .collect();
             assert_eq!(given, expected, "{line}");
         }
     }

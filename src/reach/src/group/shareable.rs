@@ -1,18 +1,22 @@
-//! What of an interface robots can share: services and actions, whose answers go to who asked. What a topic carries is every
-//! robot's, so an interface that has any is refused; so is one that lets a robot change what the nodes keep.
+//! Decides which parts of an interface robots can share: services and actions, whose responses go to the caller. Topics
+//! reach every robot, so an interface with topics is refused; so is one that lets a robot change the state of its
+//! nodes.
 //!
-//! | what a package has | shared |
+//! | part of a package | shared? |
 //! |---|---|
-//! | a service, an action | shown to each robot |
-//! | logs, statistics, diagnostics, changes of parameters and of lifecycles, bonds (topics, by type) | not shown; nobody outside the servant gets them |
-//! | any other topic, in or out (tf, the clock and latched ones too) | refused |
-//! | a node that writes parameters, unless dynamic_reconfigure has it do so (ROS 1) | refused: it keeps something |
-//! | parameters of a node's own (ROS 2) | not shown: they are the deployer's |
-//! | what sets parameters, loggers, nodelets, components and lifecycles, and what asks for them (services, by type) | not shown: they change the node for all |
-//! | a service whose answer says nothing (`std_srvs/Empty`), `std_srvs/SetBool` | refused: it can only be there for what the node keeps |
-//! | a service or an action that it looks for on its robot | refused: which robot's would that be |
+//! | service or action | shown to each robot |
+//! | topic with logs, statistics, diagnostics, parameter or lifecycle changes, bonds (by type) | not shown [^1] |
+//! | any other topic, in or out (including tf, clock and latched topics) | refused |
+//! | node that writes parameters, except through dynamic_reconfigure (ROS 1) | refused: it keeps state |
+//! | parameters of a node (ROS 2) | not shown: they belong to the deployer |
+//! | service that sets or gets parameters, loggers, nodelets, components, lifecycles (by type) | not shown [^2] |
+//! | service with an empty response (`std_srvs/Empty`), or `std_srvs/SetBool` | refused: it changes state |
+//! | service or action that it looks for on its robot | refused: the robot would be ambiguous |
 //!
-//! Types are written as ROS 1 does here; of ROS 2 `package/msg/Type` is meant by `package/Type`.
+//! [^1]: Nobody outside the servant receives them.
+//! [^2]: They change the node for all robots.
+//!
+//! Types are written as in ROS 1; for ROS 2, `package/Type` stands for `package/msg/Type`.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -35,7 +39,7 @@ const UNNEEDED: [&str; 10] = [
     "bond/Status",
 ];
 
-/// Packages of services by which nodes are administered.
+/// Packages with administrative services.
 const ADMINISTER: [&str; 8] = [
     "dynamic_reconfigure/",
     "roscpp/",
@@ -47,17 +51,17 @@ const ADMINISTER: [&str; 8] = [
     "composition_interfaces/",
 ];
 
-/// Transforms.
+/// Types of transforms.
 const TRANSFORMS: [&str; 2] = ["tf2_msgs/TFMessage", "tf/tfMessage"];
 
-/// Who serves this writes its own parameters when it starts.
+/// A server of this type writes its own parameters when it starts.
 const RECONFIGURE: &str = "dynamic_reconfigure/Reconfigure";
 
-/// A service of this type turns something on or off in the node.
+/// Type of services that switch something in the node.
 const SWITCH: &str = "std_srvs/SetBool";
 
-/// `package/Type`, of whichever ROS.
-fn plain(type_name: &str) -> Cow<'_, str> {
+/// Returns `package/Type` for either ROS version.
+fn plain_type_name(type_name: &str) -> Cow<'_, str> {
     let mut parts = type_name.split('/');
     match (parts.next(), parts.next(), parts.next(), parts.next()) {
         (Some(package), Some(_), Some(name), None) => format!("{package}/{name}").into(),
@@ -65,7 +69,7 @@ fn plain(type_name: &str) -> Cow<'_, str> {
     }
 }
 
-/// Why an interface cannot be shared: each thing that was found.
+/// Reasons why an interface cannot be shared.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unshareable(pub Vec<String>);
 
@@ -77,28 +81,31 @@ impl fmt::Display for Unshareable {
 
 impl std::error::Error for Unshareable {}
 
-/// Refuses an interface of this ROS that robots cannot share.
-pub fn check(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> {
+/// Returns an error if robots cannot share the interface.
+pub fn check_shareable(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> {
     let mut found = Vec::new();
     let topics = interface.topics.iter();
-    for topic in topics.filter(|topic| !UNNEEDED.contains(&&*plain(&topic.type_name))) {
-        let transforms = TRANSFORMS.contains(&&*plain(&topic.type_name));
+    for topic in topics.filter(|topic| !UNNEEDED.contains(&&*plain_type_name(&topic.type_name))) {
+        let transforms = TRANSFORMS.contains(&&*plain_type_name(&topic.type_name));
         let (verb, of) = match topic.direction {
             Direction::Input if transforms => (
                 "subscribes to",
-                "transforms of all robots would be one tree to it",
+                "it would see the transforms of all robots as one tree",
             ),
-            Direction::Input => ("subscribes to", "one robot's messages would reach all"),
+            Direction::Input => (
+                "subscribes to",
+                "one robot's messages would reach all robots",
+            ),
             Direction::Output if transforms => {
                 ("publishes", "its transforms would be in every robot's tree")
             }
             Direction::Output if topic.latched => (
                 "publishes, latched,",
-                "what it made of one robot's messages last would be kept for all",
+                "its last result for one robot would be latched for all robots",
             ),
             Direction::Output => (
                 "publishes",
-                "what it makes of one robot's messages would reach all",
+                "its results for one robot would reach all robots",
             ),
         };
         found.push(format!(
@@ -116,7 +123,7 @@ pub fn check(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> 
             .find(|node| !(of_clients(node) && parameter.name.starts_with(&format!("{node}/"))))
         {
             found.push(format!(
-                "its node {node} writes the parameter {}: what it keeps there is of all robots' requests",
+                "its node {node} writes the parameter {}: it would hold data of all robots' requests",
                 parameter.name
             ));
         }
@@ -127,16 +134,16 @@ pub fn check(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> 
             need.name
         ));
     }
-    // What cannot be read here was refused before.
-    let registry =
-        Registry::of_definitions(ros, &interface.definitions).unwrap_or_else(|_| Registry::of(ros));
-    let shown = shown(interface);
+    // Invalid definitions were refused before.
+    let registry = Registry::with_definitions(ros, &interface.definitions)
+        .unwrap_or_else(|_| Registry::for_version(ros));
+    let shown = shared_interface(interface);
     for service in &shown.services {
         let of = registry.service(&service.type_name);
-        let answers_nothing = of.is_ok_and(|of| says_nothing(&of.response));
-        if answers_nothing || plain(&service.type_name) == SWITCH {
+        let answers_nothing = of.is_ok_and(|of| is_empty_message(&of.response));
+        if answers_nothing || plain_type_name(&service.type_name) == SWITCH {
             found.push(format!(
-                "it serves {} ({}), whose answer tells nothing: it changes what the node keeps, for all robots",
+                "it serves {} ({}), whose response is empty: it changes the state of the node for all robots",
                 service.name, service.type_name
             ));
         }
@@ -144,31 +151,33 @@ pub fn check(ros: RosVersion, interface: &Interface) -> Result<(), Unshareable> 
     if found.is_empty() && shown.services.is_empty() && shown.actions.is_empty() {
         found.push("it has neither a service nor an action".to_owned());
     }
-    match found.is_empty() {
-        true => Ok(()),
-        false => Err(Unshareable(found)),
+    if found.is_empty() {
+        Ok(())
+    } else {
+        Err(Unshareable(found))
     }
 }
 
-/// Whether a message has nothing but messages that say nothing, such as std_msgs/Empty.
-fn says_nothing(of: &MessageType) -> bool {
+/// Returns whether a message has no fields except empty messages such as std_msgs/Empty.
+fn is_empty_message(of: &MessageType) -> bool {
     let mut fields = of.fields().iter();
-    fields.all(|field| matches!(&field.base, Base::Message(inner) if says_nothing(inner)))
+    fields.all(|field| matches!(&field.base, Base::Message(inner) if is_empty_message(inner)))
 }
 
-/// What a deployer should know of an interface that is shared.
+/// Returns remarks for the deployer of a shared interface.
 pub fn remarks(interface: &Interface) -> Vec<String> {
     let lifecycles = interface.lifecycle.iter();
     let remark = |node: &String| {
         format!(
-            "{node} has a lifecycle: its servants keep it active, and robots that share it can neither ask for its state nor change it; a launch file of a robot that waits for that waits in vain"
+            "{node} has a lifecycle: its servants keep it active, and robots that share it can neither query nor \
+                change its state; a launch file of a robot that waits for it never goes on"
         )
     };
     lifecycles.map(remark).collect()
 }
 
-/// What each robot sees of an interface that is shared.
-pub fn shown(interface: &Interface) -> Interface {
+/// Returns the part of a shared interface that each robot sees.
+pub fn shared_interface(interface: &Interface) -> Interface {
     let administers = |name: &str| ADMINISTER.iter().any(|package| name.starts_with(package));
     let services = interface.services.iter();
     Interface {
@@ -209,31 +218,31 @@ mod tests {
         serde_json::from_value(interface).expect("an interface")
     }
 
-    fn found(change: impl FnOnce(&mut Value)) -> Vec<String> {
-        let outcome = check(RosVersion::One, &interface(change));
+    fn findings(change: impl FnOnce(&mut Value)) -> Vec<String> {
+        let outcome = check_shareable(RosVersion::One, &interface(change));
         outcome.err().map_or(Vec::new(), |refused| refused.0)
     }
 
-    fn push(value: &mut Value, field: &str, item: Value) {
+    fn push_item(value: &mut Value, field: &str, item: Value) {
         value[field].as_array_mut().expect("a list").push(item);
     }
 
     #[test]
     fn services_are_shared_and_what_administers_the_node_is_not_shown() {
         let interface = interface(|_| {});
-        assert_eq!(check(RosVersion::One, &interface), Ok(()));
-        let shown = shown(&interface);
+        assert_eq!(check_shareable(RosVersion::One, &interface), Ok(()));
+        let shown = shared_interface(&interface);
         let names: Vec<_> = shown.services.iter().map(|it| it.name.as_str()).collect();
         assert_eq!((names, shown.topics.len()), (vec!["/add"], 0));
     }
 
     #[test]
-    fn what_one_robot_would_see_of_another_is_refused_with_what_was_found() {
+    fn interfaces_that_leak_between_robots_are_refused_with_the_findings() {
         let topic = |name: &str, of: &str, direction: &str| {
             let latched = name == "/map";
             let topic =
                 json!({ "name": name, "type": of, "direction": direction, "latched": latched });
-            found(|it| push(it, "topics", topic)).join("; ")
+            findings(|it| push_item(it, "topics", topic)).join("; ")
         };
         for (name, of, direction, expected) in [
             (
@@ -246,19 +255,19 @@ mod tests {
                 "/map",
                 "nav_msgs/OccupancyGrid",
                 "output",
-                "it publishes, latched, /map (nav_msgs/OccupancyGrid): what it made",
+                "it publishes, latched, /map (nav_msgs/OccupancyGrid): its last result",
             ),
             (
                 "/found",
                 "x_msgs/Found",
                 "output",
-                "it publishes /found (x_msgs/Found): what it makes",
+                "it publishes /found (x_msgs/Found): its results",
             ),
             (
                 "/tf",
                 "tf2_msgs/TFMessage",
                 "input",
-                "it subscribes to /tf (tf2_msgs/TFMessage): transforms of all robots",
+                "it subscribes to /tf (tf2_msgs/TFMessage): it would see the transforms of all robots",
             ),
             (
                 "/tf_static",
@@ -276,7 +285,7 @@ mod tests {
             let found = topic(name, of, direction);
             assert!(found.starts_with(expected), "{found}");
         }
-        let calls = found(|it| it["needs"] = json!([{ "name": "/get_map" }]));
+        let calls = findings(|it| it["needs"] = json!([{ "name": "/get_map" }]));
         assert_eq!(calls, ["it calls /get_map, which each robot serves itself"]);
     }
 
@@ -285,14 +294,14 @@ mod tests {
         for (name, node, refused) in [
             ("/seen", "/adder", true),
             ("/finder/last", "/finder", true),
-            // As dynamic_reconfigure has it do.
+            // As dynamic_reconfigure does.
             ("/adder/gain", "/adder", false),
         ] {
             let service = json!({
                 "name": "/adder/set_parameters", "type": "dynamic_reconfigure/Reconfigure", "node": "/adder",
             });
-            let found = found(|it| {
-                push(it, "services", service);
+            let found = findings(|it| {
+                push_item(it, "services", service);
                 it["parameters"] = json!([
                     { "name": "/adder/word", "read_by": ["/adder"] },
                     { "name": name, "written_by": [node] },
@@ -308,19 +317,19 @@ mod tests {
     fn a_service_that_only_changes_the_node_is_refused() {
         for of in ["x_msgs/Reset", "std_srvs/SetBool"] {
             let service = json!({ "name": "/reset", "type": of });
-            let found = found(|it| push(it, "services", service)).join("; ");
+            let found = findings(|it| push_item(it, "services", service)).join("; ");
             assert!(found.starts_with("it serves /reset"), "{of}: {found}");
         }
     }
 
     #[test]
-    fn what_answers_nobody_is_refused() {
-        let found = found(|it| it["services"] = json!([]));
+    fn an_interface_without_services_and_actions_is_refused() {
+        let found = findings(|it| it["services"] = json!([]));
         assert_eq!(found, ["it has neither a service nor an action"]);
     }
 
-    /// One of ROS 2 that can be shared.
-    fn of_two(change: impl FnOnce(&mut Value)) -> Interface {
+    /// A shareable interface of ROS 2.
+    fn interface_ros2(change: impl FnOnce(&mut Value)) -> Interface {
         let topic =
             |name: &str, of: &str| json!({ "name": name, "type": of, "direction": "output" });
         let service = |name: &str, of: &str| json!({ "name": name, "type": of, "node": "/adder" });
@@ -355,16 +364,16 @@ mod tests {
         serde_json::from_value(interface).expect("an interface")
     }
 
-    fn found_of_two(change: impl FnOnce(&mut Value)) -> Vec<String> {
-        let outcome = check(RosVersion::Two, &of_two(change));
+    fn findings_ros2(change: impl FnOnce(&mut Value)) -> Vec<String> {
+        let outcome = check_shareable(RosVersion::Two, &interface_ros2(change));
         outcome.err().map_or(Vec::new(), |refused| refused.0)
     }
 
     #[test]
-    fn what_every_node_of_ros_2_has_is_not_shown() {
-        let interface = of_two(|_| {});
-        assert_eq!(check(RosVersion::Two, &interface), Ok(()));
-        let shown = shown(&interface);
+    fn standard_interfaces_of_ros_2_nodes_are_not_shown() {
+        let interface = interface_ros2(|_| {});
+        assert_eq!(check_shareable(RosVersion::Two, &interface), Ok(()));
+        let shown = shared_interface(&interface);
         let names: Vec<_> = shown.services.iter().map(|it| it.name.as_str()).collect();
         assert_eq!(names, ["/add"]);
         assert!(shown.topics.is_empty() && shown.parameters.is_empty());
@@ -375,7 +384,7 @@ mod tests {
     }
 
     #[test]
-    fn what_robots_of_ros_2_cannot_share_is_refused() {
+    fn unshareable_interfaces_of_ros_2_are_refused() {
         for (name, of, direction, expected) in [
             (
                 "/image",
@@ -387,7 +396,7 @@ mod tests {
                 "/tf",
                 "tf2_msgs/msg/TFMessage",
                 "input",
-                "it subscribes to /tf (tf2_msgs/msg/TFMessage): transforms of all",
+                "it subscribes to /tf (tf2_msgs/msg/TFMessage): it would see the transforms of all",
             ),
             (
                 "/clock",
@@ -397,7 +406,7 @@ mod tests {
             ),
         ] {
             let topic = json!({ "name": name, "type": of, "direction": direction });
-            let found = found_of_two(|it| push(it, "topics", topic)).join("; ");
+            let found = findings_ros2(|it| push_item(it, "topics", topic)).join("; ");
             assert!(found.starts_with(expected), "{found}");
         }
         for of in [
@@ -406,10 +415,10 @@ mod tests {
             "std_srvs/srv/SetBool",
         ] {
             let service = json!({ "name": "/reset", "type": of });
-            let found = found_of_two(|it| push(it, "services", service)).join("; ");
+            let found = findings_ros2(|it| push_item(it, "services", service)).join("; ");
             assert!(found.starts_with("it serves /reset"), "{of}: {found}");
         }
-        let calls = found_of_two(|it| it["needs"] = json!([{ "name": "/dock" }]));
+        let calls = findings_ros2(|it| it["needs"] = json!([{ "name": "/dock" }]));
         assert_eq!(calls, ["it calls /dock, which each robot serves itself"]);
     }
 }

@@ -1,90 +1,94 @@
-//! What one robot's bus shows of a group, and under which names.
+//! The part of a group that one robot's bus shows, with its names.
 
 use std::collections::BTreeMap;
 
 use package::interface::Interface;
 use ros::bus::{ActionNodes, Graph, RosVersion, TopicNodes};
 
-use super::action_ends::{End, ends_of};
-use super::names::{Names, What};
+use super::action_ends::{ActionEndpoint, action_endpoints};
+use super::names::{NameKind, NameResolver};
 
-/// The name of a node that the interface does not tell.
+/// Name of a node that is missing in the interface.
 const SOMEBODY: &str = "/shared";
 
-/// Services and actions by the names that the robot has for them.
+/// Services and actions by their names on the robot.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct View {
-    pub(super) services: BTreeMap<String, Shown>,
-    pub(super) actions: BTreeMap<String, ShownAction>,
+pub(super) struct GroupView {
+    pub(super) services: BTreeMap<String, ViewEntry>,
+    pub(super) actions: BTreeMap<String, ViewAction>,
 }
 
 /// A service.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Shown {
-    /// Its name in the interface, and so at every servant.
+pub(super) struct ViewEntry {
+    /// Name in the interface, and therefore at every servant.
     pub(super) of: String,
-    /// The node that serves it, as the robot knows it.
+    /// Name of its node on the robot.
     pub(super) node: String,
 }
 
 /// An action.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct ShownAction {
-    pub(super) shown: Shown,
+pub(super) struct ViewAction {
+    pub(super) shown: ViewEntry,
     pub(super) type_name: String,
-    pub(super) ends: Vec<(End, String)>,
+    pub(super) ends: Vec<(ActionEndpoint, String)>,
 }
 
-/// A node of the group under the name that a robot's stub has for it.
-pub(super) struct Alias<'a> {
-    /// Its name in the group.
+/// A node of the group under the name of a robot's stub.
+pub(super) struct NodeAlias<'a> {
+    /// Name in the group.
     pub(super) node: &'a str,
-    /// Whether it is the only node, so that what the interface ascribes to no node is its own.
+    /// It is the only node, so that it owns what the interface attributes to no node.
     pub(super) only: bool,
-    pub(super) deployed: Names,
-    /// Its name on the robot.
+    pub(super) deployed: NameResolver,
+    /// Name on the robot.
     pub(super) name: &'a str,
-    pub(super) robot: Names,
+    pub(super) robot: NameResolver,
 }
 
-impl View {
-    /// All of an interface, as it was deployed.
-    pub(super) fn whole(version: RosVersion, interface: &Interface) -> View {
+impl GroupView {
+    /// Creates the view of a complete interface as it was deployed.
+    pub(super) fn deployed(version: RosVersion, interface: &Interface) -> GroupView {
         let named = |node: &str| match node {
             "" => SOMEBODY.to_owned(),
             node => node.to_owned(),
         };
         let services = interface.services.iter().map(|service| {
-            let shown = Shown {
+            let shown = ViewEntry {
                 of: service.name.clone(),
                 node: named(&service.node),
             };
             (service.name.clone(), shown)
         });
         let actions = interface.actions.iter().map(|action| {
-            let shown = ShownAction {
-                shown: Shown {
+            let shown = ViewAction {
+                shown: ViewEntry {
                     of: action.name.clone(),
                     node: named(&action.node),
                 },
                 type_name: action.type_name.clone(),
-                ends: ends_of(version, &action.name),
+                ends: action_endpoints(version, &action.name),
             };
             (action.name.clone(), shown)
         });
-        View {
+        GroupView {
             services: services.collect(),
             actions: actions.collect(),
         }
     }
 
-    /// What one of its nodes serves, under the names that it would have on the robot.
-    pub(super) fn of_node(version: RosVersion, interface: &Interface, alias: &Alias<'_>) -> View {
-        let Alias {
+    /// Creates the view of one of its nodes under the names that it would have on the robot.
+    pub(super) fn for_node(
+        version: RosVersion,
+        interface: &Interface,
+        alias: &NodeAlias<'_>,
+    ) -> GroupView {
+        let NodeAlias {
             deployed, robot, ..
         } = alias;
         let its = |node: &str| node == alias.node || (alias.only && node.is_empty());
-        let shown = |name: &str| Shown {
+        let shown = |name: &str| ViewEntry {
             of: name.to_owned(),
             node: alias.name.to_owned(),
         };
@@ -92,50 +96,54 @@ impl View {
         let services = services
             .filter(|service| its(&service.node))
             .map(|service| {
-                let name = deployed.on(robot, &service.name);
+                let name = deployed.service_name_on(robot, &service.name);
                 (name, shown(&service.name))
             });
         let actions = interface.actions.iter();
         let actions = actions.filter(|action| its(&action.node)).map(|action| {
-            let ends = ends_of(version, &action.name).into_iter();
+            let ends = action_endpoints(version, &action.name).into_iter();
             let ends = ends.map(|(end, name)| {
                 let suffix = &name[action.name.len()..];
-                let what = match end.is_service() {
-                    true => What::Service,
-                    false => What::Topic,
+                let what = if end.is_service() {
+                    NameKind::Service
+                } else {
+                    NameKind::Topic
                 };
-                (end, deployed.end_on(robot, &action.name, suffix, what))
+                (
+                    end,
+                    deployed.endpoint_name_on(robot, &action.name, suffix, what),
+                )
             });
-            let shown = ShownAction {
+            let shown = ViewAction {
                 shown: shown(&action.name),
                 type_name: action.type_name.clone(),
                 ends: ends.collect(),
             };
-            (deployed.action_on(robot, &action.name), shown)
+            (deployed.action_name_on(robot, &action.name), shown)
         });
-        View {
+        GroupView {
             services: services.collect(),
             actions: actions.collect(),
         }
     }
 
-    /// With what another shows, too; of one name the other's stays, as that of the node that registers last does.
-    pub(super) fn add(&mut self, other: View) {
+    /// Adds another view. Its entries win, like those of the node that registers last.
+    pub(super) fn merge(&mut self, other: GroupView) {
         self.services.extend(other.services);
         self.actions.extend(other.actions);
     }
 
-    /// The action that a topic belongs to, and which of its parts that is.
-    pub(super) fn topic(&self, name: &str) -> Option<(&ShownAction, End)> {
-        self.part(name).filter(|(_, end)| !end.is_service())
+    /// Finds the action to which a topic belongs, and the part that it is.
+    pub(super) fn find_topic(&self, name: &str) -> Option<(&ViewAction, ActionEndpoint)> {
+        self.find_part(name).filter(|(_, end)| !end.is_service())
     }
 
-    /// The action that a service belongs to, and which of its parts that is.
-    pub(super) fn action_service(&self, name: &str) -> Option<(&ShownAction, End)> {
-        self.part(name).filter(|(_, end)| end.is_service())
+    /// Finds the action to which a service belongs, and the part that it is.
+    pub(super) fn find_action_service(&self, name: &str) -> Option<(&ViewAction, ActionEndpoint)> {
+        self.find_part(name).filter(|(_, end)| end.is_service())
     }
 
-    fn part(&self, name: &str) -> Option<(&ShownAction, End)> {
+    fn find_part(&self, name: &str) -> Option<(&ViewAction, ActionEndpoint)> {
         self.actions.values().find_map(|action| {
             let mut ends = action.ends.iter();
             let (end, _) = ends.find(|(_, part)| part == name)?;
@@ -143,14 +151,14 @@ impl View {
         })
     }
 
-    /// As a graph; of ROS 2 without what each node has, which its types are needed for.
+    /// Returns the view as a graph; for ROS 2 without the endpoints of nodes, which require types.
     pub(super) fn graph(&self, version: RosVersion, generation: u64) -> Graph {
         let services = self.services.iter();
         let services: BTreeMap<String, String> = services
             .map(|(name, shown)| (name.clone(), shown.node.clone()))
             .collect();
-        // In ROS 2 they are no topics to who looks at the graph.
-        let topics_of = |action: &ShownAction| -> Vec<(End, String)> {
+        // In ROS 2 they are hidden from the graph.
+        let topics_of = |action: &ViewAction| -> Vec<(ActionEndpoint, String)> {
             match version {
                 RosVersion::One => action.ends.clone(),
                 RosVersion::Two => Vec::new(),
@@ -172,9 +180,10 @@ impl View {
                     type_name: end.type_name(&action.type_name),
                     ..TopicNodes::default()
                 };
-                let here = match end.is_of_clients() {
-                    true => &mut ends.subscribers,
-                    false => &mut ends.publishers,
+                let here = if end.is_published_by_clients() {
+                    &mut ends.subscribers
+                } else {
+                    &mut ends.publishers
                 };
                 here.push(action.shown.node.clone());
                 (topic, ends)

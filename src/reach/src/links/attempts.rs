@@ -1,21 +1,21 @@
-//! Connections overtake one another on their way: of those that one life of a node has tried, the last one counts,
-//! whichever comes first.
+//! Ordering of connection attempts, which may overtake each other in the network: of the attempts of one run of a node,
+//! the last one counts, whichever arrives first.
 
 use std::collections::VecDeque;
 
 use parking_lot::Mutex;
 
-/// Lives of nodes that are remembered; those of which nothing was heard for longest are forgotten.
+/// Number of runs remembered; the least recently seen ones are forgotten.
 const REMEMBERED: usize = 256;
 
-/// The last attempt of each life.
+/// The last attempt of each run.
 #[derive(Debug, Default)]
 pub(super) struct Attempts {
     last: Mutex<VecDeque<(String, u64)>>,
 }
 
 impl Attempts {
-    /// Whether no later attempt of this life has come before. 0 is that of a stub which does not count them.
+    /// Returns whether no later attempt of this run has arrived before. Stubs that do not count attempts send 0.
     pub(super) fn is_newest(&self, run: &str, attempt: u64) -> bool {
         let mut last = self.last.lock();
         let known = last.iter().position(|(known, _)| known == run);
@@ -28,8 +28,8 @@ impl Attempts {
         attempt == 0 || attempt >= newest
     }
 
-    /// The node has ended: whatever still comes of this life is too late.
-    pub(super) fn ended(&self, run: &str) {
+    /// Marks a run as ended: any further attempt is too late.
+    pub(super) fn mark_ended(&self, run: &str) {
         self.is_newest(run, u64::MAX);
     }
 }
@@ -48,7 +48,7 @@ mod tests {
         assert!(attempts.is_newest("another", 1));
         assert!(attempts.is_newest("one that does not count", 0));
         assert!(attempts.is_newest("one that does not count", 0));
-        attempts.ended("life");
+        attempts.mark_ended("life");
         assert!(!attempts.is_newest("life", 5));
     }
 

@@ -1,6 +1,6 @@
-//! Two robots with one id: they would share a servant, and each would hear what the other one does.
+//! Detection of two robots with the same id, which would share a servant and receive each other's data.
 //!
-//! Machines are told apart by what their stubs say of them. Several machines may be one robot: those have one Master.
+//! Machines are distinguished by what their stubs report. Several machines with the same ROS Master are one robot.
 
 use std::sync::Arc;
 
@@ -8,20 +8,20 @@ use super::Hub;
 use super::node_link::NodeLink;
 use link::control::{FromCloud, Hello};
 
-/// What to do about it.
+/// Remedy, for messages.
 pub(super) const NEXT: &str =
     "give one of them another id (`robot` in stub.toml, or CLOUDROID_ROBOT)";
 
-/// Where a stub runs.
+/// The machine on which a stub runs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Machine {
+pub(super) struct RobotMachine {
     id: String,
     host: String,
     roscore: String,
 }
 
-impl Machine {
-    pub(super) fn of(hello: &Hello) -> Self {
+impl RobotMachine {
+    pub(super) fn from_hello(hello: &Hello) -> Self {
         Self {
             id: hello.machine.clone(),
             host: hello.host.clone(),
@@ -29,21 +29,21 @@ impl Machine {
         }
     }
 
-    /// Neither the same machine nor one with the same Master.
-    pub(super) fn is_of_another_robot(&self, other: &Self) -> bool {
+    /// Returns whether it is neither the same machine nor one with the same Master.
+    pub(super) fn is_other_robot(&self, other: &Self) -> bool {
         let one_master = !self.roscore.is_empty() && self.roscore == other.roscore;
         self.id != other.id && !one_master
     }
 
-    /// Its name, where it is known, to be put behind a noun.
-    pub(super) fn named(&self) -> String {
+    /// Returns its host name, if known, in parentheses, to follow a noun.
+    pub(super) fn host_suffix(&self) -> String {
         match self.host.as_str() {
             "" => String::new(),
             host => format!(" ({host})"),
         }
     }
 
-    /// Its name, or what stands for one.
+    /// Returns its host name, or its id if the name is unknown.
     pub(super) fn name(&self) -> &str {
         match self.host.as_str() {
             "" => &self.id,
@@ -53,18 +53,18 @@ impl Machine {
 }
 
 impl Hub {
-    /// Other machines that are connected as the same robot, by a node of each.
-    pub(super) fn duplicates_of(&self, link: &NodeLink) -> Vec<Arc<NodeLink>> {
+    /// Returns one link for each other machine that is connected as the same robot.
+    pub(super) fn find_duplicates(&self, link: &NodeLink) -> Vec<Arc<NodeLink>> {
         let links = self.links.lock();
-        let others = links.values().filter(|other| {
-            other.is_connected() && link.machine.is_of_another_robot(&other.machine)
-        });
+        let others = links
+            .values()
+            .filter(|other| other.is_connected() && link.machine.is_other_robot(&other.machine));
         others.cloned().collect()
     }
 
-    /// A link is connected: says on both sides, and here, that there are two robots, if there are.
+    /// Warns both robots and the operator if a newly connected link shows that there are two.
     pub(super) fn report_duplicates(&self, link: &NodeLink) {
-        for other in self.duplicates_of(link) {
+        for other in self.find_duplicates(link) {
             let mut pair = [link.machine.id.clone(), other.machine.id.clone()];
             pair.sort();
             let [one, two] = pair;
@@ -72,7 +72,8 @@ impl Hub {
                 continue;
             }
             let text = format!(
-                "two machines are connected as this robot: {} runs {}, {} runs {}; they share one servant, and what is meant for one may reach the other; {NEXT}",
+                "two machines are connected as this robot: {} runs {}, {} runs {}; they share one servant, and \
+                    messages for one may reach the other; {NEXT}",
                 other.machine.name(),
                 other.node,
                 link.machine.name(),
@@ -80,7 +81,7 @@ impl Hub {
             );
             self.nodes.warn("duplicate-robot", &text);
             for side in [link, &other] {
-                side.session.report(&FromCloud::Notice {
+                side.session.send_control(&FromCloud::Notice {
                     warning: true,
                     text: text.clone(),
                 });

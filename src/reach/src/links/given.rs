@@ -1,8 +1,8 @@
-//! Inputs that the node was given: which one an output answers, how long it waited for the node, and which ones the
-//! node has left out.
+//! Inputs given to the node: matches them with outputs, and computes how long they waited for the node and which ones
+//! the node has skipped.
 //!
-//! ROS calls a subscriber's callback for one message after the other. So an input that was given to the node while it
-//! was at an earlier one has waited until that was answered:
+//! ROS calls a subscriber's callback for one message after the other. So an input given to the node during an earlier
+//! one has waited until that was answered:
 //! ```text
 //!  input 1    given ────────── output 1
 //!  input 2       given ┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄┄ ────────── output 2
@@ -12,45 +12,45 @@
 use std::collections::VecDeque;
 
 use super::inputs::Mark;
-use link::record::Answered;
+use link::record::InputTiming;
 
-/// Inputs remembered.
+/// Number of inputs remembered.
 const RECENT: usize = 256;
-/// Inputs of which it is remembered whether the node has answered them.
+/// Number of inputs for which it is remembered whether the node has answered them.
 const FATES: usize = 128;
 
 /// The last inputs of one node.
 #[derive(Default)]
-pub(super) struct Given {
-    recent: VecDeque<Input>,
-    /// Inputs while somebody listened to an output, and outputs.
+pub(super) struct GivenInputs {
+    recent: VecDeque<GivenInput>,
+    /// Number of inputs while somebody subscribed to an output, and number of outputs.
     flow: (u64, u64),
-    /// Whether they were answered: the last ones of which that is known.
+    /// Answered (`true`) or skipped: the last inputs for which that is known.
     fates: VecDeque<bool>,
-    /// The `born` of the input that the node has answered last, by the same stamp.
+    /// Value of `born` of the last input that was answered by an output with the same stamp.
     answered: Option<i64>,
-    /// When it answered that one.
+    /// Time at which that input was answered.
     until: i64,
-    /// When it answered the one before that.
+    /// Time at which the input before it was answered.
     before: i64,
 }
 
-struct Input {
+struct GivenInput {
     channel: u32,
     mark: Mark,
-    way: Answered,
-    /// It is known whether it was answered.
+    way: InputTiming,
+    /// The fate of the input is known.
     over: bool,
 }
 
-impl Given {
-    /// An input was given to the node; `heard`: somebody listens to what it puts out.
-    pub(super) fn note(&mut self, channel: u32, mark: Mark, way: Answered, heard: bool) {
+impl GivenInputs {
+    /// Records an input given to the node; `heard`: somebody subscribes to an output.
+    pub(super) fn record(&mut self, channel: u32, mark: Mark, way: InputTiming, heard: bool) {
         self.flow.0 += u64::from(heard);
         if self.recent.len() == RECENT {
             self.recent.pop_front();
         }
-        self.recent.push_back(Input {
+        self.recent.push_back(GivenInput {
             channel,
             mark,
             way,
@@ -58,17 +58,17 @@ impl Given {
         });
     }
 
-    /// The input that an output of this mark answers, which was published at `born`: that of the same stamp, else
-    /// the newest one, perhaps.
-    pub(super) fn answered_by(&mut self, mark: Mark, born: i64) -> Option<Answered> {
+    /// Returns the input answered by an output with this mark that was published at `born`: the one with the same
+    /// stamp, otherwise possibly the newest.
+    pub(super) fn match_output(&mut self, mark: Mark, born: i64) -> Option<InputTiming> {
         self.flow.1 += 1;
-        let same = |input: &Input| mark.is_some() && input.mark == mark;
+        let same = |input: &GivenInput| mark.is_some() && input.mark == mark;
         let Some(at) = self.recent.iter().rposition(same) else {
             return self.recent.back().map(|input| input.way);
         };
         let (channel, mut way) = (self.recent[at].channel, self.recent[at].way);
         if !self.recent[at].over {
-            // Another input of the same stamp, a picture's camera_info, has found its way with this one.
+            // Another input with the same stamp, such as the camera_info of an image, was answered with this one.
             self.recent
                 .iter_mut()
                 .filter(|input| same(input))
@@ -93,13 +93,13 @@ impl Given {
         Some(way)
     }
 
-    /// Inputs while somebody listened to an output, and outputs.
+    /// Returns the number of inputs while somebody subscribed to an output, and the number of outputs.
     pub(super) fn flow(&self) -> (u64, u64) {
         self.flow
     }
 
-    /// Of how many of the last inputs it is known whether the node has answered them, and how many it has left out.
-    pub(super) fn left_out(&self) -> (usize, usize) {
+    /// Returns the number of recent inputs whose fate is known, and how many of them the node has skipped.
+    pub(super) fn skipped_inputs(&self) -> (usize, usize) {
         let left_out = self.fates.iter().filter(|answered| !**answered).count();
         (self.fates.len(), left_out)
     }
@@ -113,8 +113,8 @@ mod tests {
         Some([number; 8])
     }
 
-    fn way(given: i64) -> Answered {
-        Answered {
+    fn way(given: i64) -> InputTiming {
+        InputTiming {
             born: given - 10,
             serialise: 0,
             left: given - 9,
@@ -125,49 +125,49 @@ mod tests {
 
     #[test]
     fn what_waits_for_the_node_is_not_computing() {
-        let mut all = Given::default();
-        all.note(1, mark(1), way(100), true);
-        all.note(1, mark(2), way(101), true);
-        let first = all.answered_by(mark(1), 150).unwrap();
+        let mut all = GivenInputs::default();
+        all.record(1, mark(1), way(100), true);
+        all.record(1, mark(2), way(101), true);
+        let first = all.match_output(mark(1), 150).unwrap();
         assert_eq!(first.given, 100);
-        // A second output of the first input: the node was at it until then.
-        assert_eq!(all.answered_by(mark(1), 160).unwrap().given, 100);
-        let second = all.answered_by(mark(2), 210).unwrap();
+        // A second output for the first input: the node was busy with it until then.
+        assert_eq!(all.match_output(mark(1), 160).unwrap().given, 100);
+        let second = all.match_output(mark(2), 210).unwrap();
         assert_eq!((second.born, second.given), (91, 160));
-        all.note(1, mark(3), way(500), true);
-        assert_eq!(all.answered_by(mark(3), 550).unwrap().given, 500, "idle");
-        assert_eq!(all.left_out(), (3, 0));
+        all.record(1, mark(3), way(500), true);
+        assert_eq!(all.match_output(mark(3), 550).unwrap().given, 500, "idle");
+        assert_eq!(all.skipped_inputs(), (3, 0));
     }
 
     #[test]
     fn outputs_without_a_stamp_may_answer_the_newest() {
-        let mut all = Given::default();
-        assert!(all.answered_by(None, 5).is_none());
-        all.note(1, mark(1), way(100), true);
-        all.note(1, None, way(200), true);
-        assert_eq!(all.answered_by(None, 300).unwrap().given, 200);
-        assert_eq!(all.answered_by(mark(9), 310).unwrap().given, 200);
-        assert_eq!(all.left_out(), (0, 0));
+        let mut all = GivenInputs::default();
+        assert!(all.match_output(None, 5).is_none());
+        all.record(1, mark(1), way(100), true);
+        all.record(1, None, way(200), true);
+        assert_eq!(all.match_output(None, 300).unwrap().given, 200);
+        assert_eq!(all.match_output(mark(9), 310).unwrap().given, 200);
+        assert_eq!(all.skipped_inputs(), (0, 0));
     }
 
     #[test]
     fn what_the_node_leaves_out_is_counted_once_and_by_topic() {
-        let mut all = Given::default();
+        let mut all = GivenInputs::default();
         for number in 1..=4 {
-            all.note(1, mark(number), way(i64::from(number) * 100), true);
-            all.note(2, mark(number), way(i64::from(number) * 100), true);
-            all.note(3, mark(100 + number), way(i64::from(number) * 100), true);
+            all.record(1, mark(number), way(i64::from(number) * 100), true);
+            all.record(2, mark(number), way(i64::from(number) * 100), true);
+            all.record(3, mark(100 + number), way(i64::from(number) * 100), true);
         }
-        all.answered_by(mark(1), 150);
-        all.answered_by(mark(4), 450);
-        all.answered_by(mark(4), 460);
+        all.match_output(mark(1), 150);
+        all.match_output(mark(4), 450);
+        all.match_output(mark(4), 460);
         assert_eq!(
-            all.left_out(),
+            all.skipped_inputs(),
             (4, 2),
             "2 and 3 of the topic that is answered"
         );
-        // Late after all: what was counted stays counted.
-        all.answered_by(mark(2), 470);
-        assert_eq!(all.left_out(), (4, 2));
+        // A late answer does not change what was counted.
+        all.match_output(mark(2), 470);
+        assert_eq!(all.skipped_inputs(), (4, 2));
     }
 }

@@ -1,5 +1,5 @@
-//! Messages and calls that come while an output is being subscribed to wait until it is: whoever listens on the robot
-//! is connected to the stub already, and shall hear what the node answers.
+//! Holds back messages and calls while an output is being subscribed to: the subscriber on the robot is already
+//! connected to the stub and must receive the node's answers.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -12,21 +12,21 @@ use link::control::FromRobot;
 use link::record::Record;
 use ros::ring::{self, Ring};
 
-/// More do not wait, and bytes of messages.
+/// Maximum number of records held back, and of bytes.
 const MOST: (usize, usize) = (256, 32 << 20);
 
-/// What waits, and for how many outputs.
+/// Records held back, and the holds for which they wait.
 #[derive(Default)]
-pub(super) struct Held {
+pub(super) struct HoldQueue {
     state: Mutex<State>,
 }
 
 struct State {
-    /// The things that are waited for, by number.
+    /// Active holds by number.
     holds: BTreeSet<u64>,
     next: u64,
-    records: Ring<Arrival>,
-    /// Someone passes on what had waited: others queue up behind.
+    records: Ring<HeldRecord>,
+    /// A task is draining the queue, so other records queue up behind.
     passing: bool,
 }
 
@@ -35,24 +35,24 @@ impl Default for State {
         Self {
             holds: BTreeSet::new(),
             next: 0,
-            // None is dropped: beyond what may wait, the oldest pass.
-            records: Ring::unbounded(),
+            // Nothing is dropped: if there is too much, the oldest are passed on.
+            records: Ring::new_unbounded(),
             passing: false,
         }
     }
 }
 
-/// A record that has come.
-pub(super) struct Arrival {
+/// A received record.
+pub(super) struct HeldRecord {
     pub(super) record: Record<FromRobot>,
-    /// An order or call counts as the robot's until this is dropped.
+    /// Memory permit charged to the robot until this is dropped, for a control message or call.
     pub(super) held: Permit,
-    /// When it had come (nanoseconds since 1970).
+    /// Time at which it was received (nanoseconds since the Unix epoch).
     pub(super) at: i64,
 }
 
-impl ring::Held for Arrival {
-    fn held(&self) -> usize {
+impl ring::RingItem for HeldRecord {
+    fn memory_size(&self) -> usize {
         match &self.record {
             Record::Data(data) => data.message.len(),
             Record::Call { request, .. } => request.len(),
@@ -67,9 +67,9 @@ impl State {
     }
 }
 
-impl Held {
-    /// Takes a record that must wait; gives back one that need not.
-    pub(super) fn take(&self, arrival: Arrival) -> Option<Arrival> {
+impl HoldQueue {
+    /// Queues a record that must wait; returns one that need not.
+    pub(super) fn try_hold(&self, arrival: HeldRecord) -> Option<HeldRecord> {
         let mut state = self.state.lock();
         if state.holds.is_empty() && !state.passing && state.records.is_empty() {
             return Some(arrival);
@@ -78,14 +78,14 @@ impl Held {
         None
     }
 
-    /// Passes on what need not wait any longer, in order.
-    pub(super) fn pass(&self, mut to: impl FnMut(Arrival)) {
+    /// Passes on records that need not wait any longer, in order.
+    pub(super) fn drain_ready(&self, mut to: impl FnMut(HeldRecord)) {
         let mut state = self.state.lock();
         if state.passing {
             return;
         }
         state.passing = true;
-        // Not while locked: `to` may take its time.
+        // Not while locked, because `to` may take time.
         while state.is_due() {
             let Some(arrival) = state.records.pop() else {
                 break;
@@ -97,8 +97,8 @@ impl Held {
         state.passing = false;
     }
 
-    /// Adds a thing to wait for; returns its number.
-    fn hold(&self) -> u64 {
+    /// Adds a hold; returns its number.
+    fn add_hold(&self) -> u64 {
         let mut state = self.state.lock();
         let number = state.next;
         state.next += 1;
@@ -106,28 +106,28 @@ impl Held {
         number
     }
 
-    /// Removes a thing to wait for.
-    fn release(&self, number: u64) {
+    /// Removes a hold.
+    fn remove_hold(&self, number: u64) {
         self.state.lock().holds.remove(&number);
     }
 }
 
-/// While this lives, messages and calls of the link wait; not longer than first messages of a topic do.
-pub(super) struct Hold {
+/// Holds back messages and calls of the link while it lives, but no longer than first messages of a topic wait.
+pub(super) struct HoldGuard {
     link: Arc<NodeLink>,
     number: u64,
 }
 
-impl Hold {
+impl HoldGuard {
     pub(super) fn new(link: &Arc<NodeLink>) -> Self {
-        let number = link.held.hold();
+        let number = link.held.add_hold();
         if let Some(hub) = link.hub.upgrade() {
             let weak = Arc::downgrade(link);
             tokio::spawn(async move {
                 tokio::time::sleep(hub.options.warm_up).await;
                 if let Some(link) = weak.upgrade() {
-                    link.held.release(number);
-                    link.pass_held();
+                    link.held.remove_hold(number);
+                    link.drain_held();
                 }
             });
         }
@@ -138,10 +138,10 @@ impl Hold {
     }
 }
 
-impl Drop for Hold {
+impl Drop for HoldGuard {
     fn drop(&mut self) {
-        self.link.held.release(self.number);
-        self.link.pass_held();
+        self.link.held.remove_hold(self.number);
+        self.link.drain_held();
     }
 }
 
@@ -152,68 +152,68 @@ mod tests {
 
     use super::*;
 
-    fn call(size: usize, at: i64) -> Arrival {
+    fn call(size: usize, at: i64) -> HeldRecord {
         let record = Record::Call {
             id: 0,
             service: 1,
             request: Bytes::from(vec![0; size]),
         };
-        let held = Budget::unlimited().permit();
-        Arrival { record, held, at }
+        let held = Budget::without_limit().permit();
+        HeldRecord { record, held, at }
     }
 
-    fn passed(held: &Held) -> Vec<i64> {
+    fn drain(held: &HoldQueue) -> Vec<i64> {
         let mut passed = Vec::new();
-        held.pass(|arrival| passed.push(arrival.at));
+        held.drain_ready(|arrival| passed.push(arrival.at));
         passed
     }
 
     #[test]
     fn what_waits_passes_in_order_once_it_may() {
-        let held = Held::default();
-        assert!(held.take(call(1, 0)).is_some(), "nothing to wait for");
-        let hold = held.hold();
+        let held = HoldQueue::default();
+        assert!(held.try_hold(call(1, 0)).is_some(), "nothing to wait for");
+        let hold = held.add_hold();
         for number in 1..4 {
-            assert!(held.take(call(1, number)).is_none());
+            assert!(held.try_hold(call(1, number)).is_none());
         }
-        assert!(passed(&held).is_empty());
-        held.release(hold);
-        // One that comes while others pass does not overtake them.
+        assert!(drain(&held).is_empty());
+        held.remove_hold(hold);
+        // A record that arrives while others are passed on does not overtake them.
         let mut order = Vec::new();
-        held.pass(|arrival| {
+        held.drain_ready(|arrival| {
             if arrival.at == 1 {
-                assert!(held.take(call(1, 4)).is_none());
+                assert!(held.try_hold(call(1, 4)).is_none());
             }
             order.push(arrival.at);
         });
         assert_eq!(order, [1, 2, 3, 4]);
-        assert!(held.take(call(1, 5)).is_some());
+        assert!(held.try_hold(call(1, 5)).is_some());
     }
 
     #[test]
     fn what_one_output_has_waited_for_long_enough_another_may_still_wait_for() {
-        let held = Held::default();
-        let first = held.hold();
-        let second = held.hold();
-        assert!(held.take(call(1, 1)).is_none());
-        // The first one's time is up; then it is subscribed to, which changes nothing for the second.
-        held.release(first);
-        assert!(passed(&held).is_empty());
-        held.release(first);
-        assert!(passed(&held).is_empty());
-        held.release(second);
-        assert_eq!(passed(&held), [1]);
+        let held = HoldQueue::default();
+        let first = held.add_hold();
+        let second = held.add_hold();
+        assert!(held.try_hold(call(1, 1)).is_none());
+        // The first hold expires; then its output is subscribed to, which does not affect the second.
+        held.remove_hold(first);
+        assert!(drain(&held).is_empty());
+        held.remove_hold(first);
+        assert!(drain(&held).is_empty());
+        held.remove_hold(second);
+        assert_eq!(drain(&held), [1]);
     }
 
     #[test]
     fn not_too_much_waits() {
-        let held = Held::default();
-        held.hold();
+        let held = HoldQueue::default();
+        held.add_hold();
         for number in 0..300 {
-            assert!(held.take(call(1, number)).is_none());
+            assert!(held.try_hold(call(1, number)).is_none());
         }
-        assert_eq!(passed(&held).len(), 300 - MOST.0 + 1);
-        assert!(held.take(call(MOST.1, 300)).is_none());
-        assert_eq!(passed(&held).len(), MOST.0);
+        assert_eq!(drain(&held).len(), 300 - MOST.0 + 1);
+        assert!(held.try_hold(call(MOST.1, 300)).is_none());
+        assert_eq!(drain(&held).len(), MOST.0);
     }
 }

@@ -1,4 +1,4 @@
-//! Topics of the robot that the node listens to: published in the servant as the robot's publishers publish them.
+//! Topics of the robot to which the node subscribes, published in the servant with the QoS of the robot's publishers.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -6,80 +6,79 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Graph, Liveliness, Publisher, Qos, RosVersion, WireType};
-use ros::ring::{Bounds, Ring};
+use ros::bus::{Graph, Publisher, QosLiveliness, QosProfile, RosVersion, WireType};
+use ros::ring::{Ring, RingBounds};
 use ros::schema::{MessageType, SchemaError};
-use ros::sizes::Sizes;
+use ros::sizes::SizeCounters;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::retry::Retry;
 use super::{Hub, types};
 use link::clock::now;
-use link::control::Input;
-use link::drops::{Cause, Drops};
-use link::record::{Answered, Data};
+use link::control::InputChannel;
+use link::drops::{Cause, DropCounters};
+use link::record::{Data, InputTiming};
 use link::skew::{Direction, Skew};
 use ros::codec::Stamps;
 
-/// Messages kept for a slow node.
+/// Queue length for a slow node.
 const QUEUE: usize = 256;
-/// Messages of a transient-local publisher of ROS 2 that newcomers are given, where the robot does not tell how many it keeps:
-/// what ROS 2 itself takes where nobody says it.
+/// History depth for a transient-local publisher of ROS 2 if the robot does not announce one; the default of ROS 2.
 const KEPT: usize = 10;
-/// So many times the warm-up a node that has registered is waited for where nobody is connected.
+/// Factor of the warm-up time for which a registered node is awaited while nobody is connected.
 const ALONE: u32 = 10;
-/// What waits until the topic is advertised and the node connected.
-const WAITING: Bounds = Bounds {
+/// Limit on what waits until the topic is advertised and the node connected.
+const WAITING: RingBounds = RingBounds {
     messages: 256,
     bytes: 32 << 20,
 };
 
-/// Where types that begin with a header have their stamp. Those that do not have something there, too; it tells no
-/// worse than nothing which input an output answers. In ROS 1 the header's number stands before the stamp, in ROS 2 the four bytes
-/// that say how the message is written: seconds and nanoseconds stand at the same place.
+/// Stamp of a message whose type begins with a header. Other types have other data there, which identifies the input
+/// that an output answers no worse than nothing. In ROS 1 the stamp follows the header's sequence number, in ROS 2 the
+/// four bytes of the CDR header, so seconds and nanoseconds are at the same place.
 pub(super) type Mark = Option<[u8; 8]>;
 
-/// The mark of a message as the node sees it.
-pub(super) fn mark(message: &[u8]) -> Mark {
+/// Returns the mark of a message as the node sees it.
+pub(super) fn stamp_mark(message: &[u8]) -> Mark {
     let mark = message.get(4..12)?.try_into().ok()?;
     (mark != [0; 8]).then_some(mark)
 }
 
 /// Channels by number.
 #[derive(Default)]
-pub(super) struct Inputs {
-    channels: Mutex<HashMap<u32, Channel>>,
+pub(super) struct InputChannels {
+    channels: Mutex<HashMap<u32, InputChannelState>>,
 }
 
-struct Channel {
+struct InputChannelState {
     topic: String,
     stamps: Stamps,
-    sizes: Arc<Sizes>,
+    sizes: Arc<SizeCounters>,
     latching: bool,
     state: State,
-    /// It could not be advertised when that was tried last.
+    /// The last attempt to advertise it failed.
     is_refused: bool,
-    /// It is closed once what waits has reached the node.
+    /// It is closed once its queue has reached the node.
     is_closing: bool,
 }
 
 enum State {
-    /// Not advertised yet, or the node has not connected.
+    /// Not yet advertised, or the node has not connected.
     Waiting(Ring<Bytes>),
     Open(Arc<dyn Publisher>),
 }
 
-impl Inputs {
-    /// Messages of this channel may come before it is open.
-    pub(super) fn expect(&self, hub: &Hub, input: &Input) {
-        let of = definition(hub, input).inspect_err(|error| {
+impl InputChannels {
+    /// Registers a channel, because its messages may arrive before it is open.
+    pub(super) fn register(&self, hub: &Hub, input: &InputChannel) {
+        let of = find_definition(hub, input).inspect_err(|error| {
             tracing::debug!(topic = input.topic, %error, "its stamps stay as they are");
         });
         let of = of.ok();
-        let fresh = Channel {
+        let fresh = InputChannelState {
             topic: input.topic.clone(),
-            stamps: stamps(input, of.as_deref()),
-            sizes: hub.inputs.of(&input.topic, of.as_deref()),
+            stamps: find_stamps(input, of.as_deref()),
+            sizes: hub.inputs.for_input(&input.topic, of.as_deref()),
             latching: input.latching,
             state: State::Waiting(Ring::new(WAITING)),
             is_refused: false,
@@ -88,19 +87,20 @@ impl Inputs {
         self.channels.lock().insert(input.channel, fresh);
     }
 
-    /// Publishes a message, with its stamps changed where they have to be; says when, and by what its answer may be known.
-    pub(super) fn take(
+    /// Publishes a message, after converting its stamps if necessary. Returns the mark by which its answer is
+    /// recognized, and its timing.
+    pub(super) fn publish(
         &self,
-        (skew, drops): (Option<&Skew>, &Drops),
+        (skew, drops): (Option<&Skew>, &DropCounters),
         data: Data,
         arrived: i64,
-    ) -> Option<(Mark, Answered)> {
+    ) -> Option<(Mark, InputTiming)> {
         let mut channels = self.channels.lock();
         let channel = channels.get_mut(&data.channel)?;
         let message = data.message;
-        // By the robot's stamp: outputs are looked at when theirs are the robot's again.
-        let mark = mark(&message);
-        channel.sizes.note(&message);
+        // With the robot's stamp: outputs are compared after their stamps were converted back.
+        let mark = stamp_mark(&message);
+        channel.sizes.record(&message);
         let message = match skew {
             Some(skew) => skew.apply(Direction::In, &channel.stamps, message),
             None => message,
@@ -112,7 +112,7 @@ impl Inputs {
                 drops.add(&channel.topic, Cause::Early, lost.messages);
             }
         }
-        let answered = Answered {
+        let answered = InputTiming {
             born: data.born,
             serialise: data.serialise,
             left: data.left,
@@ -122,27 +122,27 @@ impl Inputs {
         Some((mark, answered))
     }
 
-    /// Advertises, and lets messages through once the node has connected. While it is refused it is tried again, at `turns` that it
-    /// takes as others do; the first one is `turn`.
+    /// Advertises the topic and passes messages on once the node has connected. If that is refused, it is retried, each
+    /// time after acquiring one of the `turns`; `turn` is the first one.
     pub(super) async fn open(
         &self,
         hub: &Arc<Hub>,
-        drops: &Drops,
-        input: Input,
+        drops: &DropCounters,
+        input: InputChannel,
         (turns, turn): (Arc<Semaphore>, OwnedSemaphorePermit),
     ) {
         let mut retry = Retry::default();
         let mut turn = Some(turn);
         let publisher: Arc<dyn Publisher> = loop {
             let of = wire_type(hub, &input);
-            let qos = offer(&input, hub.bus.version(), &hub.bus.graph().borrow());
+            let qos = offered_qos(&input, hub.bus.version(), &hub.bus.graph().borrow());
             match hub.bus.advertise(&input.topic, of, qos).await {
                 Ok(publisher) => break publisher.into(),
                 Err(error) => {
                     if retry.is_first() {
                         tracing::warn!(topic = input.topic, %error, "an input cannot be published; trying again");
                     }
-                    if !self.refused(drops, input.channel) {
+                    if !self.mark_refused(drops, input.channel) {
                         return;
                     }
                 }
@@ -152,27 +152,29 @@ impl Inputs {
             turn = Arc::clone(&turns).acquire_owned().await.ok();
         };
         let counted = Arc::downgrade(&publisher);
-        drops.ask(&input.topic, Cause::Slow, move || {
+        drops.watch_with(&input.topic, Cause::Slow, move || {
             let publisher = counted.upgrade();
-            let count = publisher.as_ref().map_or(0, |it| it.dropped());
+            let count = publisher.as_ref().map_or(0, |it| it.dropped_count());
             (count, publisher.is_none())
         });
         let graph = hub.bus.graph().borrow().clone();
-        // Who only observes what flows may be connected before the node is.
+        // Observers may connect before the node does.
         let listeners = graph.topics.get(&input.topic).map_or(0, |ends| {
             let nodes = ends.subscribers.iter();
             let own = hub.bus.node();
             let beside = nodes.filter(|node| *node != bridge::INSIDE && *node != own);
             beside.count()
         });
-        let mut matched = publisher.matched();
+        let mut matched = publisher.matched_subscribers();
         let mut connected = async |count: usize, patience: Duration| {
-            let reached = matched.wait_for(|now| now.connected_beside(bridge::INSIDE) >= count);
+            let reached =
+                matched.wait_for(|now| now.connected_count_except(bridge::INSIDE) >= count);
             tokio::time::timeout(patience, reached).await.is_ok()
         };
         let warm_up = hub.options.warm_up;
         if !connected(listeners.max(1), warm_up).await && listeners > 0 {
-            // A registered node is slow to connect on a busy machine: as long as nobody is connected, nobody else waits for it.
+            // A registered node is slow to connect on a busy machine. While nobody is connected, waiting delays nobody
+            // else.
             connected(1, warm_up * ALONE).await;
         }
         let mut channels = self.channels.lock();
@@ -187,9 +189,9 @@ impl Inputs {
         }
     }
 
-    /// The channel could not be advertised: what waits for it is too old by the next time, unless it is latched. False where there is no
-    /// next time.
-    fn refused(&self, drops: &Drops, channel: u32) -> bool {
+    /// Marks the channel as refused: what is queued will be too old at the next attempt, unless it is latched. Returns
+    /// `false` if there will be no further attempt.
+    fn mark_refused(&self, drops: &DropCounters, channel: u32) -> bool {
         let mut channels = self.channels.lock();
         let Some(channel) = channels.get_mut(&channel) else {
             return false;
@@ -204,8 +206,8 @@ impl Inputs {
         !channel.is_closing
     }
 
-    /// The robot closes this channel. Whether what waits for it will reach the node in a while, and is waited for.
-    pub(super) fn closes(&self, channel: u32) -> bool {
+    /// Begins to close the channel. Returns whether its queue will reach the node soon and should be awaited.
+    pub(super) fn begin_close(&self, channel: u32) -> bool {
         let mut channels = self.channels.lock();
         channels.get_mut(&channel).is_some_and(|channel| {
             channel.is_closing = true;
@@ -213,7 +215,7 @@ impl Inputs {
         })
     }
 
-    pub(super) fn undecodable(&self, drops: &Drops, channel: u32) {
+    pub(super) fn count_undecodable(&self, drops: &DropCounters, channel: u32) {
         if let Some(channel) = self.channels.lock().get(&channel) {
             drops.add(&channel.topic, Cause::Undecodable, 1);
         }
@@ -228,32 +230,34 @@ impl Inputs {
     }
 }
 
-fn wire_type(hub: &Hub, input: &Input) -> WireType {
-    WireType::new(&input.type_name, &input.md5, &input.definition).written_by(hub.bus.version())
+fn wire_type(hub: &Hub, input: &InputChannel) -> WireType {
+    WireType::new(&input.type_name, &input.md5, &input.definition).with_version(hub.bus.version())
 }
 
-/// What an input's type is. Publishers of ROS 1 tell it; of ROS 2 the image knows it, if it has the same.
-fn definition(hub: &Hub, input: &Input) -> Result<Arc<MessageType>, SchemaError> {
+/// Returns the definition of an input's type. Publishers of ROS 1 announce it; for ROS 2 it is in the image, if that
+/// has the same type.
+fn find_definition(hub: &Hub, input: &InputChannel) -> Result<Arc<MessageType>, SchemaError> {
     if hub.bus.version() == RosVersion::One {
         return MessageType::from_full_text(&input.type_name, &input.definition);
     }
     let of = wire_type(hub, input);
-    types::message(&hub.registry, &of).map_or_else(|| of.schema(), Ok)
+    types::find_message(&hub.registry, &of).map_or_else(|| of.schema(), Ok)
 }
 
-/// What is offered to nodes in place of the robot's publisher. In ROS 2 a reliable publisher is heard by those, too, who do not
-/// ask for one; of time it offers what the robot's does, else what is asked for, which the robot's must offer to be heard at all.
-fn offer(input: &Input, version: RosVersion, graph: &Graph) -> Qos {
+/// Returns the QoS offered in place of the robot's publisher. In ROS 2 a reliable publisher also satisfies best-effort
+/// subscribers. Time limits are those of the robot's publisher, or those requested, which the robot's publisher must
+/// offer to be matched at all.
+fn offered_qos(input: &InputChannel, version: RosVersion, graph: &Graph) -> QosProfile {
     let latching = input.latching;
     if version == RosVersion::One {
-        return Qos::keep_last(QUEUE).latching(latching);
+        return QosProfile::keep_last(QUEUE).latching(latching);
     }
-    let told = input.qos.as_ref().map(|qos| qos.to_qos(1));
+    let told = input.qos.as_ref().map(|qos| qos.to_bus(1));
     let kept = told.map_or(KEPT, |told| told.depth);
     let latching = latching || told.is_some_and(|told| told.is_latching());
-    let mut offer = Qos {
+    let mut offer = QosProfile {
         lifespan: told.and_then(|told| told.lifespan),
-        ..Qos::keep_last(if latching { kept } else { QUEUE }).latching(latching)
+        ..QosProfile::keep_last(if latching { kept } else { QUEUE }).latching(latching)
     };
     let asked = graph.ends.values();
     let asked = asked.filter_map(|node| node.subscribers.get(&input.topic));
@@ -261,32 +265,32 @@ fn offer(input: &Input, version: RosVersion, graph: &Graph) -> Qos {
         let least = |one: Option<Duration>, two| one.into_iter().chain(two).min();
         offer.deadline = least(offer.deadline, of.deadline);
         offer.lease = least(offer.lease, of.lease);
-        if of.liveliness == Liveliness::ManualByTopic {
-            offer.liveliness = Liveliness::ManualByTopic;
+        if of.liveliness == QosLiveliness::ManualByTopic {
+            offer.liveliness = QosLiveliness::ManualByTopic;
         }
     }
     offer
 }
 
-/// Where the stamps of an input stand. `/clock` tells simulated time.
-fn stamps(input: &Input, of: Option<&MessageType>) -> Stamps {
+/// Returns the positions of the stamps of an input. `/clock` is simulated time.
+fn find_stamps(input: &InputChannel, of: Option<&MessageType>) -> Stamps {
     match of {
-        Some(of) if input.topic != "/clock" => Stamps::of(of),
+        Some(of) if input.topic != "/clock" => Stamps::for_type(of),
         _ => Stamps::default(),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::{NodeEnds, Reliability};
+    use ros::bus::{NodeEntities, QosReliability};
 
     use super::*;
 
-    fn asks(qos: Qos) -> Graph {
-        let of = WireType::named("std_msgs/msg/String").written_by(RosVersion::Two);
-        let ends = NodeEnds {
+    fn graph_asking(qos: QosProfile) -> Graph {
+        let of = WireType::with_name("std_msgs/msg/String").with_version(RosVersion::Two);
+        let ends = NodeEntities {
             subscribers: [("/scan".to_owned(), (of, qos))].into(),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         Graph {
             ends: [("/see".to_owned(), ends)].into(),
@@ -294,41 +298,45 @@ mod tests {
         }
     }
 
-    fn input(latching: bool, qos: Option<link::control::Qos>) -> Input {
-        Input {
+    fn input(latching: bool, qos: Option<link::control::WireQos>) -> InputChannel {
+        InputChannel {
             topic: "/scan".to_owned(),
             latching,
             qos,
-            ..Input::default()
+            ..InputChannel::default()
         }
     }
 
     #[test]
     fn nodes_are_offered_what_they_ask_for() {
-        let asked = Qos {
-            reliability: Reliability::BestEffort,
+        let asked = QosProfile {
+            reliability: QosReliability::BestEffort,
             deadline: Some(Duration::from_millis(100)),
             lease: Some(Duration::from_secs(2)),
-            liveliness: Liveliness::ManualByTopic,
-            ..Qos::keep_last(5)
+            liveliness: QosLiveliness::ManualByTopic,
+            ..QosProfile::keep_last(5)
         };
-        let offered = offer(&input(false, None), RosVersion::Two, &asks(asked));
+        let offered = offered_qos(&input(false, None), RosVersion::Two, &graph_asking(asked));
         assert_eq!(
             offered,
-            Qos {
-                reliability: Reliability::Reliable,
+            QosProfile {
+                reliability: QosReliability::Reliable,
                 depth: QUEUE,
                 ..asked
             }
         );
-        // What the robot's publisher offers may be more.
-        let told = link::control::Qos {
+        // The robot's publisher may offer more.
+        let told = link::control::WireQos {
             transient_local: true,
             depth: 3,
             deadline: Some(0.05),
             ..Default::default()
         };
-        let offered = offer(&input(false, Some(told)), RosVersion::Two, &asks(asked));
+        let offered = offered_qos(
+            &input(false, Some(told)),
+            RosVersion::Two,
+            &graph_asking(asked),
+        );
         assert_eq!(offered.deadline, Some(Duration::from_millis(50)));
         assert!(offered.is_latching());
         assert_eq!(offered.depth, 3);
@@ -337,16 +345,16 @@ mod tests {
     #[test]
     fn old_maps_are_not_given_to_newcomers_for_ever() {
         let graph = Graph::default();
-        let of = |latching, version| offer(&input(latching, None), version, &graph);
+        let of = |latching, version| offered_qos(&input(latching, None), version, &graph);
         assert_eq!(
             of(true, RosVersion::Two),
-            Qos::keep_last(KEPT).latching(true)
+            QosProfile::keep_last(KEPT).latching(true)
         );
-        assert_eq!(of(false, RosVersion::Two), Qos::keep_last(QUEUE));
-        // Those of ROS 1 are given the last one, however many wait.
+        assert_eq!(of(false, RosVersion::Two), QosProfile::keep_last(QUEUE));
+        // Subscribers of ROS 1 receive the last one, regardless of the queue length.
         assert_eq!(
             of(true, RosVersion::One),
-            Qos::keep_last(QUEUE).latching(true)
+            QosProfile::keep_last(QUEUE).latching(true)
         );
     }
 
@@ -355,7 +363,7 @@ mod tests {
         let stamp = [7, 0, 0, 0, 9, 0, 0, 0];
         for before in [[1, 0, 0, 0], [0, 1, 0, 0]] {
             let message = [&before[..], &stamp, b"map"].concat();
-            assert_eq!(mark(&message), Some(stamp));
+            assert_eq!(stamp_mark(&message), Some(stamp));
         }
     }
 }

@@ -1,5 +1,5 @@
-//! Types that only a node itself can tell (ROS 1), asked for beside each other: one that hangs keeps nothing else waiting, and one that
-//! could not tell is asked again.
+//! Concurrent queries for types that only a node itself knows (ROS 1): one that hangs does not delay the others, and
+//! failed ones are retried.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -11,63 +11,64 @@ use tokio::time::timeout;
 
 use super::retry::Retry;
 
-/// For one answer.
+/// Timeout of one query.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// For answers that come before the rest is told: nodes answer in a moment, and what they have is told at once then.
+/// Time to wait for answers before the rest is announced: nodes usually answer immediately, and then everything is
+/// announced at once.
 const PROMPT: Duration = Duration::from_millis(250);
 
-/// Whose type is asked for.
+/// Subject of a query.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Subject {
     Service(String),
     Topic(String),
 }
 
-enum Told {
+enum TypeAnswer {
     Service(ServiceType),
     Topic(WireType),
 }
 
-/// What was asked and told so far.
+/// Pending and answered queries.
 #[derive(Default)]
-pub(super) struct Inquiries {
-    asking: JoinSet<(Subject, Told)>,
+pub(super) struct TypeInquiries {
+    asking: JoinSet<(Subject, TypeAnswer)>,
     asked: BTreeMap<Subject, AbortHandle>,
-    told: BTreeMap<Subject, Told>,
+    told: BTreeMap<Subject, TypeAnswer>,
 }
 
-impl Inquiries {
-    /// The type of a service, once that is known. It is asked for unless it was before.
+impl TypeInquiries {
+    /// Returns the type of a service if it is known; otherwise it is queried.
     pub(super) fn service(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<ServiceType> {
         match self.find(bus, Subject::Service(name.to_owned()))? {
-            Told::Service(of) => Some(of.clone()),
-            Told::Topic(_) => None,
+            TypeAnswer::Service(of) => Some(of.clone()),
+            TypeAnswer::Topic(_) => None,
         }
     }
 
-    /// The type of a topic, in the same way.
+    /// Returns the type of a topic if it is known; otherwise it is queried.
     pub(super) fn topic(&mut self, bus: &Arc<dyn Bus>, name: &str) -> Option<WireType> {
         match self.find(bus, Subject::Topic(name.to_owned()))? {
-            Told::Topic(of) => Some(of.clone()),
-            Told::Service(_) => None,
+            TypeAnswer::Topic(of) => Some(of.clone()),
+            TypeAnswer::Service(_) => None,
         }
     }
 
-    fn find(&mut self, bus: &Arc<dyn Bus>, subject: Subject) -> Option<&Told> {
+    fn find(&mut self, bus: &Arc<dyn Bus>, subject: Subject) -> Option<&TypeAnswer> {
         if !self.asked.contains_key(&subject) {
-            let asked = ask(Arc::clone(bus), subject.clone());
+            let asked = inquire(Arc::clone(bus), subject.clone());
             let task = self.asking.spawn(asked);
             self.asked.insert(subject.clone(), task);
         }
         self.told.get(&subject)
     }
 
-    /// How many types are asked for, or were.
+    /// Returns the number of pending and answered queries.
     pub(super) fn count(&self) -> usize {
         self.asked.len()
     }
 
-    /// Forgets what is not about these services and topics, which are there no more.
+    /// Forgets queries about services and topics that are gone.
     pub(super) fn retain(&mut self, services: &BTreeSet<&String>, topics: &BTreeSet<&String>) {
         let is_there = |subject: &Subject| match subject {
             Subject::Service(name) => services.contains(name),
@@ -83,12 +84,12 @@ impl Inquiries {
         });
     }
 
-    /// Returns with the next answer that counts; while nothing is asked for there is none.
+    /// Waits for the next relevant answer; forever if nothing is pending.
     pub(super) async fn next(&mut self) {
         loop {
             match self.asking.join_next().await {
                 Some(Ok((subject, told))) => {
-                    // One that is gone may have told before it was.
+                    // A subject that is gone may have answered before.
                     if self.asked.contains_key(&subject) {
                         self.told.insert(subject, told);
                         return;
@@ -100,7 +101,7 @@ impl Inquiries {
         }
     }
 
-    /// Returns when all has been told that was asked for, or had a moment to be.
+    /// Waits for all pending answers, but only for a moment.
     pub(super) async fn settle(&mut self) {
         let all = async {
             while self.told.len() < self.asked.len() {
@@ -111,20 +112,20 @@ impl Inquiries {
     }
 }
 
-/// Asks until there is an answer.
-async fn ask(bus: Arc<dyn Bus>, subject: Subject) -> (Subject, Told) {
+/// Queries until there is an answer.
+async fn inquire(bus: Arc<dyn Bus>, subject: Subject) -> (Subject, TypeAnswer) {
     let mut retry = Retry::default();
     loop {
         let told = async {
             Ok::<_, BusError>(match &subject {
-                Subject::Service(name) => Told::Service(bus.service_type(name).await?),
-                Subject::Topic(name) => Told::Topic(bus.topic_type(name).await?),
+                Subject::Service(name) => TypeAnswer::Service(bus.service_type(name).await?),
+                Subject::Topic(name) => TypeAnswer::Topic(bus.topic_type(name).await?),
             })
         };
         match timeout(PATIENCE, told).await {
             Ok(Ok(told)) => return (subject, told),
-            Ok(Err(error)) => tracing::debug!(?subject, %error, "its type is asked for again"),
-            Err(_) => tracing::debug!(?subject, "nobody tells its type; it is asked for again"),
+            Ok(Err(error)) => tracing::debug!(?subject, %error, "asking for its type again"),
+            Err(_) => tracing::debug!(?subject, "no node reports its type; asking again"),
         }
         retry.pause().await;
     }

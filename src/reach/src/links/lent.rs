@@ -1,13 +1,14 @@
-//! Services of the robot, for nodes of the servant. The bus tells of a node that looks for a service which is not there (in ROS 1
-//! the Master is asked for it, in ROS 2 the node has a client without a server); it is passed to the robot, whose answer holds until the robot says otherwise; it is asked again now and then, since a server that
-//! starts anew under the same name may serve another type. See docs/adr/025.
+//! Services of the robot for nodes of the servant. The bus reports a node that looks up a service which has no server
+//! (in ROS 1 by a lookup at the Master, in ROS 2 by a client without a server). The lookup is passed to the robot,
+//! whose answer is valid until the robot changes it. It is repeated now and then, because a server that restarts under
+//! the same name may have another type. See docs/adr/025.
 //!
 //! ```text
 //!             Lookup                        Lent: there
 //!  unknown ───────────▶ Asked ─────────────────────────────▶ There ── calls ──▶ the robot
 //!     ▲                   │ Lent: not there                    │
 //!     │                   ▼                                    │ Lent: gone
-//!     └── in a moment ── Not there ◀───────────────────────────┘
+//!     └── soon ──────── Not there ◀────────────────────────────┘
 //! ```
 
 use std::collections::HashMap;
@@ -17,40 +18,41 @@ use std::time::{Duration, Instant};
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{BusError, Lender, Lent, RosVersion, ServiceHandler, ServiceType};
+use ros::bus::{BusError, Lender, LentService, RosVersion, ServiceHandler, ServiceType};
 use tokio::sync::{oneshot, watch};
 use tokio::time::{Instant as Moment, timeout_at};
 
 use super::node_link::NodeLink;
 use super::{Hub, types};
-use link::control::{FromCloud, Served};
+use link::control::{FromCloud, ServiceChannel};
 use link::skew::{Direction, Skew};
 use ros::codec::Stamps;
 
-/// A node's lookup waits so long for the robot's answer; the Master waits a little longer.
+/// Time a node's lookup waits for the robot's answer; the Master waits a little longer.
 const PATIENCE: Duration = Duration::from_millis(1200);
-/// "Not there" holds so long: roscpp asks fifty times a second while it waits for a service.
+/// Validity of "not there"; roscpp asks fifty times a second while it waits for a service.
 const NOT_THERE: Duration = Duration::from_millis(200);
-/// "There" holds longer, but who looks after so long makes the robot look again, without waiting for it.
+/// Age of "there" after which a lookup makes the robot check again, without waiting for it.
 const CONFIRM: Duration = Duration::from_secs(1);
-/// The robot answers every question, however it may have been lost: one that it has not answered for so long is asked again.
+/// Time after which a lookup that the robot has not answered is repeated; the robot answers every lookup unless it is
+/// lost.
 const ANSWERS: Duration = Duration::from_secs(3);
-/// Names asked for at a time, and remembered.
+/// Maximum number of names asked for at a time and remembered.
 const NAMES: usize = 1000;
 
-/// What one link knows of the robot's services.
+/// State of the robot's services as known to one link.
 pub(super) struct RobotServices {
     /// The robot's end answers lookups.
     answers: bool,
     names: Mutex<HashMap<String, State>>,
-    /// Grows with everything that the robot tells of them.
+    /// Incremented with everything that the robot reports about them.
     told: watch::Sender<u64>,
-    /// Calls under way.
-    calls: Mutex<Calls>,
+    /// Calls in progress.
+    calls: Mutex<RobotCalls>,
 }
 
 enum State {
-    /// The robot was asked; a lookup may have waited for its answer in vain, and no other shall.
+    /// The robot was asked. If one lookup has waited in vain for its answer, no further one waits.
     Asked {
         since: Instant,
         in_vain: bool,
@@ -59,13 +61,13 @@ enum State {
         since: Instant,
     },
     There {
-        there: Arc<There>,
+        there: Arc<RobotService>,
         asked: Instant,
     },
 }
 
-/// A service that the robot has.
-struct There {
+/// A service of the robot.
+struct RobotService {
     channel: u32,
     service_type: ServiceType,
     request: Stamps,
@@ -73,18 +75,18 @@ struct There {
     gone: watch::Sender<bool>,
 }
 
-impl There {
-    /// Whether the robot tells of the same once more.
-    fn is(&self, served: &Served) -> bool {
+impl RobotService {
+    /// Returns whether the robot reports the same service again.
+    fn is_same_as(&self, served: &ServiceChannel) -> bool {
         let ours = &self.service_type;
         self.channel == served.channel && *ours == served.service_type(ours.format.version())
     }
 }
 
 #[derive(Default)]
-struct Calls {
+struct RobotCalls {
     waiting: HashMap<u32, oneshot::Sender<Result<Bytes, String>>>,
-    /// The link has ended: none is answered any more.
+    /// The link has ended, so no call is answered any more.
     over: bool,
 }
 
@@ -98,19 +100,19 @@ impl RobotServices {
         }
     }
 
-    /// The robot has answered a call.
-    pub(super) fn answered(&self, id: u32, response: Result<Bytes, String>) {
+    /// Completes a call with the robot's response.
+    pub(super) fn resolve_call(&self, id: u32, response: Result<Bytes, String>) {
         if let Some(caller) = self.calls.lock().waiting.remove(&id) {
             let _ = caller.send(response);
         }
     }
 
-    /// The link has ended: nothing is lent any more, and calls under way have failed.
-    pub(super) fn end(&self) {
+    /// Withdraws all services and fails all calls in progress, because the link has ended.
+    pub(super) fn fail_all(&self) {
         let mut calls = self.calls.lock();
         calls.over = true;
         for (_, caller) in calls.waiting.drain() {
-            let _ = caller.send(Err(lost()));
+            let _ = caller.send(Err(link_lost_error()));
         }
         drop(calls);
         for (_, state) in self.names.lock().drain() {
@@ -120,12 +122,12 @@ impl RobotServices {
         }
     }
 
-    /// Whether the robot is known to have this service.
+    /// Returns whether the robot is known to have this service.
     pub(super) fn has(&self, service: &str) -> bool {
-        self.there(service).is_some()
+        self.find_known(service).is_some()
     }
 
-    fn there(&self, service: &str) -> Option<Arc<There>> {
+    fn find_known(&self, service: &str) -> Option<Arc<RobotService>> {
         match self.names.lock().get(service) {
             Some(State::There { there, .. }) => Some(Arc::clone(there)),
             _ => None,
@@ -133,21 +135,21 @@ impl RobotServices {
     }
 }
 
-fn lost() -> String {
-    "the link to the robot was lost, and with it this call: the robot may or may not have done what was asked"
+fn link_lost_error() -> String {
+    "the link to the robot was lost during this call: the robot may or may not have executed it"
         .to_owned()
 }
 
 impl NodeLink {
-    /// The robot tells what it has under a name.
-    pub(super) fn lends(&self, service: String, of: Option<Served>) {
+    /// Handles the robot's report about a service.
+    pub(super) fn on_lent(&self, service: String, of: Option<ServiceChannel>) {
         let Some(hub) = self.hub.upgrade() else {
             return;
         };
         let now = Instant::now();
         {
             let mut names = self.lent.names.lock();
-            // What nobody asked for is not kept.
+            // Unsolicited reports are ignored.
             let Some(known) = names.get_mut(&service) else {
                 return;
             };
@@ -156,15 +158,23 @@ impl NodeLink {
                 _ => None,
             };
             let after = match of {
-                Some(served) if before.as_ref().is_some_and(|before| before.is(&served)) => return,
-                Some(served) => Some(there(&hub, self, served)),
+                Some(served)
+                    if before
+                        .as_ref()
+                        .is_some_and(|before| before.is_same_as(&served)) =>
+                {
+                    return;
+                }
+                Some(served) => Some(make_service(&hub, self, served)),
                 None => None,
             };
-            // To nodes the same type is the service that they are connected to, whoever serves it by whatever number: were it taken back for
-            // a moment, what they ask in that moment would never be answered.
-            let stays = |before: &There, after: &There| before.service_type == after.service_type;
+            // For nodes, a service of the same type is the one to which they are connected, regardless of its server or
+            // channel. If it were withdrawn for a moment, calls made in that moment would never be answered.
+            let stays = |before: &RobotService, after: &RobotService| {
+                before.service_type == after.service_type
+            };
             let after = match (before, after) {
-                (Some(before), Some(after)) if stays(&before, &after) => Some(There {
+                (Some(before), Some(after)) if stays(&before, &after) => Some(RobotService {
                     gone: before.gone.clone(),
                     ..after
                 }),
@@ -185,15 +195,15 @@ impl NodeLink {
         self.lent.told.send_modify(|told| *told += 1);
     }
 
-    /// What the robot has under a name; asks where that is not known.
-    async fn look_up(&self, service: &str) -> Option<Arc<There>> {
+    /// Looks up a service of the robot, asking the robot if necessary.
+    async fn look_up(&self, service: &str) -> Option<Arc<RobotService>> {
         let mut told = self.lent.told.subscribe();
         let deadline = Moment::now() + PATIENCE;
         loop {
             told.borrow_and_update();
-            match self.ask(service) {
-                Lookup::Known(there) => return there,
-                Lookup::Wait => {}
+            match self.query(service) {
+                LookupState::Known(there) => return there,
+                LookupState::Wait => {}
             }
             match timeout_at(deadline, told.changed()).await {
                 Ok(Ok(())) => {}
@@ -209,7 +219,7 @@ impl NodeLink {
         }
     }
 
-    fn ask(&self, service: &str) -> Lookup {
+    fn query(&self, service: &str) -> LookupState {
         let mut names = self.lent.names.lock();
         match names.get_mut(service) {
             Some(State::There { there, asked }) => {
@@ -217,12 +227,12 @@ impl NodeLink {
                     *asked = Instant::now();
                     self.report_lookup(service);
                 }
-                return Lookup::Known(Some(Arc::clone(there)));
+                return LookupState::Known(Some(Arc::clone(there)));
             }
             Some(State::NotThere { since }) if since.elapsed() < NOT_THERE => {
-                return Lookup::Known(None);
+                return LookupState::Known(None);
             }
-            // The next lookup waits for no longer than this one has.
+            // The next lookup waits no longer than this one has.
             Some(State::Asked {
                 since,
                 in_vain: true,
@@ -231,15 +241,15 @@ impl NodeLink {
                     *since = Instant::now();
                     self.report_lookup(service);
                 }
-                return Lookup::Known(None);
+                return LookupState::Known(None);
             }
-            Some(State::Asked { in_vain: false, .. }) => return Lookup::Wait,
+            Some(State::Asked { in_vain: false, .. }) => return LookupState::Wait,
             Some(State::NotThere { .. }) | None => {}
         }
         if names.len() >= NAMES && !names.contains_key(service) {
             names.retain(|_, state| !matches!(state, State::NotThere { .. }));
             if names.len() >= NAMES {
-                return Lookup::Known(None);
+                return LookupState::Known(None);
             }
         }
         let since = Instant::now();
@@ -249,64 +259,65 @@ impl NodeLink {
         };
         names.insert(service.to_owned(), asked);
         self.report_lookup(service);
-        Lookup::Wait
+        LookupState::Wait
     }
 
     fn report_lookup(&self, service: &str) {
         let service = service.to_owned();
-        self.session.report(&FromCloud::Lookup { service });
+        self.session.send_control(&FromCloud::Lookup { service });
     }
 
-    /// Calls a service of the robot. Over a cut the call waits; it fails with the link.
+    /// Calls a service of the robot. The call survives a lost connection and fails with the link.
     async fn call_robot(&self, channel: u32, request: Bytes) -> Result<Bytes, String> {
         let (sender, answer) = oneshot::channel();
         let id = {
             let mut calls = self.lent.calls.lock();
             if calls.over {
-                return Err(lost());
+                return Err(link_lost_error());
             }
-            // The answer may come at once: it must find its caller.
+            // Locked until the caller is registered, because the response may arrive immediately.
             let id = self.session.call(channel, request);
             calls.waiting.insert(id, sender);
             id
         };
-        let _abandoned = Abandoned { link: self, id };
-        answer.await.unwrap_or_else(|_| Err(lost()))
+        let _abandoned = PendingCallGuard { link: self, id };
+        answer.await.unwrap_or_else(|_| Err(link_lost_error()))
     }
 }
 
-enum Lookup {
-    Known(Option<Arc<There>>),
+enum LookupState {
+    Known(Option<Arc<RobotService>>),
     Wait,
 }
 
-/// Forgets a call whose caller has gone.
-struct Abandoned<'a> {
+/// Forgets a call whose caller is gone.
+struct PendingCallGuard<'a> {
     link: &'a NodeLink,
     id: u32,
 }
 
-impl Drop for Abandoned<'_> {
+impl Drop for PendingCallGuard<'_> {
     fn drop(&mut self) {
         self.link.lent.calls.lock().waiting.remove(&self.id);
     }
 }
 
-fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
+fn make_service(hub: &Hub, link: &NodeLink, served: ServiceChannel) -> RobotService {
     let of = served.service_type(hub.bus.version());
-    let known = types::service(&hub.registry, &of);
+    let known = types::find_service(&hub.registry, &of);
     let differs = |skew: &Skew| skew.difference() != 0;
     if known.is_none() && link.skew(hub).is_some_and(differs) {
-        link.session.report(&FromCloud::Notice {
+        link.session.send_control(&FromCloud::Notice {
             warning: true,
             text: format!(
-                "the clocks differ, and stamps in calls of {} stay as they are: the image has no definition of {} with {}; push the package with the Debian package that holds it (--with DEB)",
-                served.name, of.name, told_apart(&of)
+                "the clocks differ, but stamps in calls of {} are not converted: the image has no definition of {} \
+                    with {}; push the package with the Debian package that contains it (--with DEB)",
+                served.name, of.name, describe_type(&of)
             ),
         });
     }
-    let (request, response) = types::stamps_of_calls(known.as_deref());
-    There {
+    let (request, response) = types::call_stamps(known.as_deref());
+    RobotService {
         channel: served.channel,
         service_type: of,
         request,
@@ -315,17 +326,17 @@ fn there(hub: &Hub, link: &NodeLink, served: Served) -> There {
     }
 }
 
-/// What tells a type from others of its name, in the words of its ROS.
-fn told_apart(of: &ServiceType) -> String {
+/// Describes what distinguishes a type from others with its name, in the terms of its ROS version.
+fn describe_type(of: &ServiceType) -> String {
     match of.format.version() {
         RosVersion::One => format!("md5sum {}", of.digest),
         RosVersion::Two => format!("type hashes {} and {}", of.request, of.response),
     }
 }
 
-/// Lends the robot's services to the servant, from the first link on.
-pub(super) async fn begin(hub: &Arc<Hub>) {
-    let lender = Arc::new(Robot(Arc::downgrade(hub)));
+/// Starts lending the robot's services to the servant, when the first link begins.
+pub(super) async fn start_lending(hub: &Arc<Hub>) {
+    let lender = Arc::new(HubLender(Arc::downgrade(hub)));
     let begun = hub
         .lends
         .get_or_try_init(|| async { hub.bus.lending()?.lend(lender).await });
@@ -338,40 +349,40 @@ pub(super) async fn begin(hub: &Arc<Hub>) {
 }
 
 impl Hub {
-    /// The link by which a node's lookups and calls go: its own, else one that is up, since all are on one robot.
-    fn way(&self, node: &str, suits: impl Fn(&NodeLink) -> bool) -> Option<Arc<NodeLink>> {
+    /// Returns the link for a node's lookups and calls: its own, otherwise one that is up, since all lead to one robot.
+    fn route_link(&self, node: &str, suits: impl Fn(&NodeLink) -> bool) -> Option<Arc<NodeLink>> {
         let graph = self.bus.graph().borrow().clone();
         let links = self.links.lock();
         let suitable = || links.values().filter(|link| suits(link));
-        let own = suitable().find(|link| graph.is_of_process(&link.node, node));
+        let own = suitable().find(|link| graph.is_in_process(&link.node, node));
         let up = || suitable().find(|link| link.session.is_up());
         own.or_else(up).or_else(|| suitable().next()).cloned()
     }
 
-    /// The link of the process that a node is of.
+    /// Returns the link of a node's process.
     fn link_of(&self, node: &str) -> Option<Arc<NodeLink>> {
         let graph = self.bus.graph().borrow().clone();
         let links = self.links.lock();
         let mut links = links.values();
         links
-            .find(|link| graph.is_of_process(&link.node, node))
+            .find(|link| graph.is_in_process(&link.node, node))
             .cloned()
     }
 }
 
-/// The robot, as the servant's bus asks it.
-struct Robot(Weak<Hub>);
+/// The robot as the lender of services for the servant's bus.
+struct HubLender(Weak<Hub>);
 
 #[async_trait]
-impl Lender for Robot {
-    async fn find(&self, service: &str, node: &str) -> Option<Lent> {
+impl Lender for HubLender {
+    async fn find_service(&self, service: &str, node: &str) -> Option<LentService> {
         let hub = self.0.upgrade()?;
-        let link = hub.way(node, |link| link.lent.answers)?;
+        let link = hub.route_link(node, |link| link.lent.answers)?;
         let there = link.look_up(service).await?;
-        Some(Lent {
+        Some(LentService {
             service_type: there.service_type.clone(),
             gone: there.gone.subscribe(),
-            handler: Arc::new(Passing {
+            handler: Arc::new(RobotServiceHandler {
                 hub: self.0.clone(),
                 service: service.to_owned(),
                 of: there.service_type.clone(),
@@ -380,36 +391,36 @@ impl Lender for Robot {
     }
 }
 
-/// Passes calls of one service to the robot.
-struct Passing {
+/// Forwards calls of one service to the robot.
+struct RobotServiceHandler {
     hub: Weak<Hub>,
     service: String,
-    /// As the node was told.
+    /// Type announced to the node.
     of: ServiceType,
 }
 
 #[async_trait]
-impl ServiceHandler for Passing {
+impl ServiceHandler for RobotServiceHandler {
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
-        let hub = self.hub.upgrade().ok_or_else(lost)?;
-        let has = |link: &NodeLink| link.lent.there(&self.service);
-        let link = hub.way(caller, |link| has(link).is_some());
+        let hub = self.hub.upgrade().ok_or_else(link_lost_error)?;
+        let has = |link: &NodeLink| link.lent.find_known(&self.service);
+        let link = hub.route_link(caller, |link| has(link).is_some());
         let found = link.and_then(|link| Some((has(&link)?, link)));
-        let (there, link) =
-            found.ok_or_else(|| format!("nobody on the robot serves {} any more", self.service))?;
+        let (there, link) = found
+            .ok_or_else(|| format!("no node on the robot serves {} any more", self.service))?;
         if there.service_type != self.of {
             return Err(format!(
                 "{} is served on the robot with {} now, not {} as when it was connected to",
                 self.service,
-                told_apart(&there.service_type),
-                told_apart(&self.of)
+                describe_type(&there.service_type),
+                describe_type(&self.of)
             ));
         }
-        // Whichever way it goes, its stamps are those of the node that calls.
+        // Regardless of the link used, stamps are converted for the calling node.
         let calling = hub.link_of(caller);
         let calling = calling.unwrap_or_else(|| Arc::clone(&link));
-        let request = calling.shift(&hub, Direction::Out, &there.request, request);
+        let request = calling.shift_stamps(&hub, Direction::Out, &there.request, request);
         let response = link.call_robot(there.channel, request).await?;
-        Ok(calling.shift(&hub, Direction::In, &there.response, response))
+        Ok(calling.shift_stamps(&hub, Direction::In, &there.response, response))
     }
 }

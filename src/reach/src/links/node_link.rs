@@ -1,4 +1,4 @@
-//! One node's link: what the robot tells is done here, in order.
+//! The link of one node: processes what the robot sends, in order.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, Weak};
@@ -10,88 +10,88 @@ use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::duplicates::Machine;
-use super::held::{Arrival, Held, Hold};
-use super::inputs::Inputs;
+use super::duplicates::RobotMachine;
+use super::held::{HeldRecord, HoldGuard, HoldQueue};
+use super::inputs::InputChannels;
 use super::lent::RobotServices;
 use super::node_time::{self, NodeTime};
 use super::outputs::Outputs;
-use super::requests::Requests;
-use super::unsent::Unsent;
+use super::requests::RequestLog;
+use super::unsent::UnsentCounter;
 use super::{Hub, LinkStatus, mirror, seen};
-use crate::Flow;
-use link::clock::Sample;
-use link::control::{FromCloud, FromRobot, Hello, Refused, Sla};
-use link::drops::{Drop, Drops, Reporter};
-use link::record::{Called, Record};
-use link::session::{CloudSession, Handler, SessionOptions};
+use crate::FlowCounts;
+use link::clock::ClockSample;
+use link::control::{FromCloud, FromRobot, Hello, IncompatibleEndpoint, SlaTargets};
+use link::drops::{DropCounters, DropReporter, TopicDropCount};
+use link::record::{ReceivedCall, Record};
+use link::session::{CloudSession, SessionHandler, SessionOptions};
 use link::skew::Direction;
 use ros::codec::Stamps;
 use ros::ros2::names;
-use ros::sizes::Sizes;
+use ros::sizes::SizeCounters;
 
-/// Topics that are opened beside each other; more wait, so that a robot that opens many costs no more.
+/// Maximum number of topics opened concurrently, so that a robot that opens many costs no more.
 const OPENING: usize = 64;
-/// For the result of a goal of ROS 2, which is asked for when the goal begins and comes when it ends.
+/// Timeout for the result of a ROS 2 goal, which is requested when the goal begins and answered when it ends.
 const GOAL: Duration = Duration::from_secs(24 * 3600);
-/// Between two looks at what was dropped.
+/// Interval at which drops are checked.
 const DROPS: Duration = Duration::from_secs(2);
 
-/// A robot's node, as the cloud sees it.
+/// A robot's node as seen by the cloud.
 pub(super) struct NodeLink {
     pub(super) node: String,
     pub(super) run: String,
-    pub(super) machine: Machine,
-    /// Names the session.
+    pub(super) machine: RobotMachine,
+    /// Session id.
     pub(super) id: String,
     pub(super) session: CloudSession,
     /// Held by the connection that carries the session.
     pub(super) lease: tokio::sync::Mutex<()>,
-    /// Grows when another connection, or nobody, is to carry it.
+    /// Incremented when another connection, or none, is to carry it.
     pub(super) kick: watch::Sender<u64>,
     pub(super) hub: Weak<Hub>,
-    pub(super) inputs: Inputs,
+    pub(super) inputs: InputChannels,
     pub(super) outputs: Outputs,
     pub(super) lent: RobotServices,
-    pub(super) services: Mutex<HashMap<u32, Arc<Service>>>,
+    pub(super) services: Mutex<HashMap<u32, Arc<NodeService>>>,
     pub(super) listening: Mutex<BTreeSet<String>>,
     pub(super) time: NodeTime,
-    sla: Sla,
-    pub(super) requests: Requests,
-    unsent: Unsent,
-    /// On this side, but for the session's own.
-    pub(super) drops: Drops,
-    /// On the robot's side, as it told.
-    dropped: Mutex<Vec<Drop>>,
-    /// With whom no messages pass there, as it told.
-    refused: Mutex<Vec<Refused>>,
-    /// What must wait for an output to be subscribed to.
-    pub(super) held: Held,
-    orders: mpsc::UnboundedSender<Order>,
-    /// They wait for no order: a node that answers nobody is the one to be ended.
+    sla: SlaTargets,
+    pub(super) requests: RequestLog,
+    unsent: UnsentCounter,
+    /// Drops on this side except those of the session.
+    pub(super) drops: DropCounters,
+    /// Drops on the robot's side as reported.
+    dropped: Mutex<Vec<TopicDropCount>>,
+    /// Incompatible endpoints on the robot as reported.
+    refused: Mutex<Vec<IncompatibleEndpoint>>,
+    /// Records that wait for an output to be subscribed to.
+    pub(super) held: HoldQueue,
+    orders: mpsc::UnboundedSender<QueuedOrder>,
+    /// Signals do not wait for control messages: a node that does not respond is the one to be ended.
     signals: mpsc::UnboundedSender<i32>,
     tasks: Mutex<Vec<AbortHandle>>,
 }
 
-/// What the robot tells, until it is done.
-struct Order {
+/// A control message from the robot, until it is processed.
+struct QueuedOrder {
     told: FromRobot,
-    /// What must wait until it is done.
-    hold: Option<Hold>,
-    /// It counts as the robot's until then.
+    /// Holds back other records until it is processed.
+    hold: Option<HoldGuard>,
+    /// Memory permit charged to the robot until then.
     _held: Permit,
 }
 
-/// What the node serves.
-pub(super) struct Service {
+/// A service of the node.
+pub(super) struct NodeService {
     pub(super) name: String,
-    pub(super) sizes: Arc<Sizes>,
+    pub(super) sizes: Arc<SizeCounters>,
     pub(super) request: Stamps,
     pub(super) response: Stamps,
 }
 
 impl NodeLink {
-    pub(super) fn begin(
+    pub(super) fn start(
         hub: &Arc<Hub>,
         hello: &Hello,
         options: SessionOptions,
@@ -103,23 +103,23 @@ impl NodeLink {
         let link = Arc::new(Self {
             node: hello.node.name.clone(),
             run: hello.run.clone(),
-            machine: Machine::of(hello),
+            machine: RobotMachine::from_hello(hello),
             id,
-            session: CloudSession::new(options).within(&hub.options.budget),
+            session: CloudSession::new(options).with_budget(&hub.options.budget),
             lease: tokio::sync::Mutex::default(),
             kick: watch::Sender::new(0),
             hub: Arc::downgrade(hub),
-            inputs: Inputs::default(),
+            inputs: InputChannels::default(),
             outputs: Outputs::default(),
             lent: RobotServices::new(hello.lends),
             services: Mutex::default(),
             listening: Mutex::default(),
-            time: NodeTime::of(hello),
+            time: NodeTime::from_hello(hello),
             sla: hello.sla.clone(),
-            requests: Requests::default(),
-            unsent: Unsent::default(),
-            drops: Drops::default(),
-            held: Held::default(),
+            requests: RequestLog::default(),
+            unsent: UnsentCounter::default(),
+            drops: DropCounters::default(),
+            held: HoldQueue::default(),
             dropped: Mutex::default(),
             refused: Mutex::default(),
             orders,
@@ -127,16 +127,16 @@ impl NodeLink {
             tasks: Mutex::default(),
         });
         let mut tasks = vec![
-            tokio::spawn(obey(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
-            tokio::spawn(deliver(Arc::clone(&link), Arc::clone(hub), sent)).abort_handle(),
+            tokio::spawn(process_orders(Arc::clone(&link), Arc::clone(hub), taken)).abort_handle(),
+            tokio::spawn(forward_signals(Arc::clone(&link), Arc::clone(hub), sent)).abort_handle(),
             tokio::spawn(mirror::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
             tokio::spawn(node_time::follow(Arc::clone(&link), Arc::clone(hub))).abort_handle(),
         ];
         let (watching, nodes) = (Arc::clone(&link), Arc::clone(&hub.nodes));
         tasks.push(
             tokio::spawn(async move {
-                let exit = nodes.ended(&watching.node).await;
-                watching.session.report(&FromCloud::Exited(exit));
+                let exit = nodes.wait_exit(&watching.node).await;
+                watching.session.send_control(&FromCloud::Exited(exit));
             })
             .abort_handle(),
         );
@@ -144,7 +144,9 @@ impl NodeLink {
         tasks.push(
             tokio::spawn(async move {
                 while let Some((error, text)) = lines.recv().await {
-                    printing.session.report(&FromCloud::Line { error, text });
+                    printing
+                        .session
+                        .send_control(&FromCloud::Line { error, text });
                 }
             })
             .abort_handle(),
@@ -154,20 +156,20 @@ impl NodeLink {
         link
     }
 
-    /// Ends all that was done for the robot; the node is not touched.
-    pub(super) fn end(&self) {
+    /// Stops everything done for the robot, without touching the node.
+    pub(super) fn stop(&self) {
         self.kick.send_modify(|kicks| *kicks += 1);
         for task in self.tasks.lock().drain(..) {
             task.abort();
         }
         self.inputs.clear();
         self.outputs.clear();
-        self.lent.end();
+        self.lent.fail_all();
     }
 
-    /// A connection carries it, and is not silent.
+    /// Returns whether a connection carries the link and is not silent.
     pub(super) fn is_connected(&self) -> bool {
-        // One that is new has exchanged nothing yet.
+        // A new connection has exchanged nothing yet.
         let fresh = self.session.clock().is_none();
         self.lease.try_lock().is_err() && (fresh || self.session.is_up())
     }
@@ -178,8 +180,8 @@ impl NodeLink {
 
     pub(super) fn status(&self) -> LinkStatus {
         let milliseconds = |nanoseconds: i64| nanoseconds as f64 / 1e6;
-        let (given, left_out) = self.outputs.left_out();
-        // Before the expression below, to whose end they would stay locked: `duplicates` looks at other links.
+        let (given, left_out) = self.outputs.skipped_inputs();
+        // Cloned before the expression below, during which the locks would be held: `duplicates` accesses other links.
         let dropped = self.dropped.lock().clone();
         let refused = self.refused.lock().clone();
         let requests = self.requests.last();
@@ -192,23 +194,23 @@ impl NodeLink {
                 .clock()
                 .map(|sample| milliseconds(sample.offset)),
             throughput: self.session.throughput(),
-            drops: self.drops_here(),
+            drops: self.local_drops(),
             dropped,
             sla: self.sla.clone(),
             requests,
-            unsent: self.unsent.lately(),
+            unsent: self.unsent.last_minute(),
             given,
             left_out,
-            unfed: self.unfed(),
-            unserved: self.unserved(),
+            unfed: self.inputs_without_publisher(),
+            unserved: self.missing_services(),
             refused,
             duplicates: self.duplicates(),
         }
     }
 
-    pub(super) fn flow(&self) -> Flow {
+    pub(super) fn flow(&self) -> FlowCounts {
         let (inputs, outputs) = self.outputs.flow();
-        Flow {
+        FlowCounts {
             node: self.node.clone(),
             inputs,
             outputs,
@@ -217,7 +219,7 @@ impl NodeLink {
 
     fn duplicates(&self) -> Vec<String> {
         let hub = self.hub.upgrade();
-        let duplicates = hub.map(|hub| hub.duplicates_of(self)).unwrap_or_default();
+        let duplicates = hub.map(|hub| hub.find_duplicates(self)).unwrap_or_default();
         let names = duplicates
             .iter()
             .map(|duplicate| duplicate.machine.name().to_owned());
@@ -227,32 +229,32 @@ impl NodeLink {
         names
     }
 
-    fn drops_here(&self) -> Vec<Drop> {
+    fn local_drops(&self) -> Vec<TopicDropCount> {
         let mut all = self.session.drops();
-        all.extend(self.drops.all());
+        all.extend(self.drops.snapshot());
         all
     }
 
-    fn unserved(&self) -> Vec<String> {
+    fn missing_services(&self) -> Vec<String> {
         let Some(hub) = self.hub.upgrade() else {
             return Vec::new();
         };
         let graph = hub.bus.graph();
         let graph = graph.borrow();
-        let mut sought = seen::sought(&graph, &self.node);
+        let mut sought = seen::unmet_lookups(&graph, &self.node);
         sought.retain(|service| !self.lent.has(service));
         sought
     }
 
-    /// Our own end publishes what the robot sends.
-    fn unfed(&self) -> Vec<String> {
+    /// Returns the subscribed topics without a publisher. The hub's own publisher counts for what the robot sends.
+    fn inputs_without_publisher(&self) -> Vec<String> {
         let Some(hub) = self.hub.upgrade() else {
             return Vec::new();
         };
         let graph = hub.bus.graph();
         let graph = graph.borrow();
         let fed = |topic: &&String| {
-            // What is not shown is a part of an action of ROS 2, whose server is what is missing then.
+            // A topic that is not shown belongs to a ROS 2 action, whose missing server is reported instead.
             let ends = graph.topics.get(*topic);
             ends.is_none_or(|ends| !ends.publishers.is_empty())
         };
@@ -264,9 +266,9 @@ impl NodeLink {
             .collect()
     }
 
-    /// Calls a service of the node; the request counts as the robot's until it is answered.
-    fn call(self: &Arc<Self>, call: Called) {
-        let Called {
+    /// Calls a service of the node. The request is charged to the robot until it is answered.
+    fn call(self: &Arc<Self>, call: ReceivedCall) {
+        let ReceivedCall {
             id,
             service,
             request,
@@ -279,18 +281,20 @@ impl NodeLink {
             return self.session.answer(id, taken, Err(gone));
         };
         let link = Arc::clone(self);
-        // Not aborted with the link: whoever took the call answers it, even if nobody is there to hear.
+        // Not aborted with the link: the node answers a call that it has accepted, even if nobody receives the
+        // response.
         tokio::spawn(async move {
             let _held = held;
             let patience = match names::action_part(&service.name) {
                 Some((_, "get_result")) => GOAL,
                 _ => hub.options.call_timeout,
             };
-            service.sizes.note(&request);
-            let request = link.shift(&hub, Direction::In, &service.request, request);
+            service.sizes.record(&request);
+            let request = link.shift_stamps(&hub, Direction::In, &service.request, request);
             let called = hub.bus.call(&service.name, request, patience).await;
-            let called = called
-                .map(|response| link.shift(&hub, Direction::Out, &service.response, response));
+            let called = called.map(|response| {
+                link.shift_stamps(&hub, Direction::Out, &service.response, response)
+            });
             link.session.answer(
                 id,
                 taken,
@@ -303,63 +307,69 @@ impl NodeLink {
     }
 }
 
-impl Handler<FromRobot> for NodeLink {
-    fn undecodable(&self, channel: u32) {
-        self.inputs.undecodable(&self.drops, channel);
+impl SessionHandler<FromRobot> for NodeLink {
+    fn on_undecodable(&self, channel: u32) {
+        self.inputs.count_undecodable(&self.drops, channel);
     }
 
-    fn record(&self, record: Record<FromRobot>, held: Permit, arrived: i64) {
-        // The hub holds every link by an Arc; one that it let go of hears no more.
+    fn on_record(&self, record: Record<FromRobot>, held: Permit, arrived: i64) {
+        // The hub owns every link through an Arc; one that it has removed receives nothing more.
         let Some(hub) = self.hub.upgrade() else {
             return;
         };
         let link = hub.links.lock().get(&self.node).cloned();
         if let Some(link) = link.filter(|link| std::ptr::eq(&**link, self)) {
-            self.take(&link, record, held, arrived);
+            self.dispatch_record(&link, record, held, arrived);
         }
     }
 
-    fn clock(&self, best: Sample) {
+    fn on_clock_sample(&self, best: ClockSample) {
         if let Some(hub) = self.hub.upgrade() {
-            hub.skew.measured(best);
+            hub.skew.on_clock_sample(best);
         }
     }
 }
 
 impl NodeLink {
-    fn take(&self, this: &Arc<Self>, record: Record<FromRobot>, held: Permit, arrived: i64) {
+    fn dispatch_record(
+        &self,
+        this: &Arc<Self>,
+        record: Record<FromRobot>,
+        held: Permit,
+        arrived: i64,
+    ) {
         match record {
-            Record::Answer { id, response, .. } => self.lent.answered(id, response),
-            // A call that waits for it must not wait for other orders.
-            Record::Control(FromRobot::Lent { service, of }) => this.lends(service, of),
+            Record::Answer { id, response, .. } => self.lent.resolve_call(id, response),
+            // A call that waits for it must not wait for other control messages.
+            Record::Control(FromRobot::Lent { service, of }) => this.on_lent(service, of),
             Record::Control(FromRobot::Signal { signal }) => {
                 let _ = self.signals.send(signal);
             }
             // A channel is closed after the messages before it.
             Record::Data(_) | Record::Call { .. } | Record::Control(FromRobot::Close { .. }) => {
                 let at = arrived;
-                match self.held.take(Arrival { record, held, at }) {
-                    Some(arrival) => this.give(arrival),
-                    // There may be too much by now.
-                    None => this.pass_held(),
+                match self.held.try_hold(HeldRecord { record, held, at }) {
+                    Some(arrival) => this.deliver_to_node(arrival),
+                    // The queue may have become too long.
+                    None => this.drain_held(),
                 }
             }
             Record::Control(told) => {
-                // Data may follow in the same breath.
+                // Data may follow immediately.
                 let hold = match &told {
                     FromRobot::Open(input) => {
                         if let Some(hub) = self.hub.upgrade() {
-                            self.inputs.expect(&hub, input);
+                            self.inputs.register(&hub, input);
                         }
                         None
                     }
                     FromRobot::Listeners { channel, count } => {
-                        let begin = self.outputs.expect(*channel, *count);
-                        begin.then(|| Hold::new(this))
+                        let begin = self.outputs.expect_listeners(*channel, *count);
+                        begin.then(|| HoldGuard::new(this))
                     }
                     _ => None,
                 };
-                let _ = self.orders.send(Order {
+                let _ = self.orders.send(QueuedOrder {
                     told,
                     hold,
                     _held: held,
@@ -371,8 +381,8 @@ impl NodeLink {
 
 impl NodeLink {
     /// Gives a message or a call to the node.
-    fn give(self: &Arc<Self>, arrival: Arrival) {
-        let Arrival { record, held, at } = arrival;
+    fn deliver_to_node(self: &Arc<Self>, arrival: HeldRecord) {
+        let HeldRecord { record, held, at } = arrival;
         match record {
             Record::Data(data) => {
                 let Some(hub) = self.hub.upgrade() else {
@@ -380,16 +390,16 @@ impl NodeLink {
                 };
                 let channel = data.channel;
                 let skew = self.skew(&hub);
-                let taken = self.inputs.take((skew, &self.drops), data, at);
+                let taken = self.inputs.publish((skew, &self.drops), data, at);
                 if let Some((mark, answered)) = taken {
-                    self.outputs.note(channel, mark, answered);
+                    self.outputs.record_input(channel, mark, answered);
                 }
             }
             Record::Call {
                 id,
                 service,
                 request,
-            } => self.call(Called {
+            } => self.call(ReceivedCall {
                 id,
                 service,
                 request,
@@ -397,7 +407,7 @@ impl NodeLink {
                 taken: at,
             }),
             Record::Control(told) => {
-                let _ = self.orders.send(Order {
+                let _ = self.orders.send(QueuedOrder {
                     told,
                     hold: None,
                     _held: held,
@@ -407,18 +417,23 @@ impl NodeLink {
         }
     }
 
-    /// Gives it what has waited, if that need not wait any longer.
-    pub(super) fn pass_held(self: &Arc<Self>) {
-        self.held.pass(|arrival| self.give(arrival));
+    /// Gives queued records to the node that need not wait any longer.
+    pub(super) fn drain_held(self: &Arc<Self>) {
+        self.held
+            .drain_ready(|arrival| self.deliver_to_node(arrival));
     }
 }
 
-/// Does what the robot tells, one thing after the other.
-async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedReceiver<Order>) {
-    // A node that is slow to connect to one topic keeps nothing else waiting.
+/// Processes control messages of the robot one after the other.
+async fn process_orders(
+    link: Arc<NodeLink>,
+    hub: Arc<Hub>,
+    mut orders: mpsc::UnboundedReceiver<QueuedOrder>,
+) {
+    // A node that is slow to connect to one topic does not delay others.
     let mut opening: HashMap<u32, AbortOnDropHandle<()>> = HashMap::new();
     let turns = Arc::new(Semaphore::new(OPENING));
-    while let Some(Order { told, hold, _held }) = orders.recv().await {
+    while let Some(QueuedOrder { told, hold, _held }) = orders.recv().await {
         match told {
             FromRobot::Open(input) => {
                 opening.retain(|_, task| !task.is_finished());
@@ -427,7 +442,7 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
                 };
                 let turns = (Arc::clone(&turns), turn);
                 let (channel, link, hub) = (input.channel, Arc::clone(&link), Arc::clone(&hub));
-                // One that is refused is tried again for as long as its channel is open, and is its robot's to pay for so long.
+                // A refused channel is retried as long as it is open, and its permit is held for so long.
                 let open = async move {
                     let _held = _held;
                     link.inputs.open(&hub, &link.drops, input, turns).await;
@@ -435,35 +450,36 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
                 opening.insert(channel, AbortOnDropHandle::new(tokio::spawn(open)));
             }
             FromRobot::Close { channel } => {
-                // What came before it is given to the node first.
+                // Earlier messages are given to the node first.
                 let task = opening.remove(&channel);
-                if let Some(task) = task.filter(|_| link.inputs.closes(channel)) {
+                if let Some(task) = task.filter(|_| link.inputs.begin_close(channel)) {
                     let _ = task.await;
                 }
                 link.inputs.close(channel);
-                link.session.peer_closed(channel);
+                link.session.on_peer_closed(channel);
             }
             FromRobot::Listeners { channel, count } => {
-                link.outputs.listeners(&link, &hub, (channel, count), hold);
+                link.outputs
+                    .set_listeners(&link, &hub, (channel, count), hold);
             }
-            FromRobot::Parameters(changes) => hub.parameters.change(&hub, changes).await,
+            FromRobot::Parameters(changes) => hub.parameters.apply_changes(&hub, changes).await,
             FromRobot::Requests(requests) => {
-                let news = link.requests.note(requests, link.sla.max, Instant::now());
+                let news = link.requests.record(requests, link.sla.max, Instant::now());
                 for (request, new) in news {
-                    hub.nodes.measured(&request, new);
+                    hub.nodes.on_request_measured(&request, new);
                 }
             }
             FromRobot::Unsent { replaced, stale } => {
-                link.unsent.note(replaced.saturating_add(stale));
+                link.unsent.record_total(replaced.saturating_add(stale));
             }
             FromRobot::Decided(decisions) => {
                 for decision in &decisions {
-                    hub.nodes.decided(&link.node, decision);
+                    hub.nodes.on_decision(&link.node, decision);
                 }
             }
             FromRobot::Dropped(dropped) => *link.dropped.lock() = dropped,
             FromRobot::Refused(mut refused) => {
-                refused.truncate(Refused::MOST);
+                refused.truncate(IncompatibleEndpoint::MOST);
                 *link.refused.lock() = refused;
             }
             other => tracing::debug!(node = link.node, ?other, "not for the cloud"),
@@ -471,8 +487,12 @@ async fn obey(link: Arc<NodeLink>, hub: Arc<Hub>, mut orders: mpsc::UnboundedRec
     }
 }
 
-/// Sends the node what signals the robot sends it, in their order.
-async fn deliver(link: Arc<NodeLink>, hub: Arc<Hub>, mut signals: mpsc::UnboundedReceiver<i32>) {
+/// Forwards signals from the robot to the node in order.
+async fn forward_signals(
+    link: Arc<NodeLink>,
+    hub: Arc<Hub>,
+    mut signals: mpsc::UnboundedReceiver<i32>,
+) {
     while let Some(signal) = signals.recv().await {
         if let Err(reason) = hub.nodes.signal(&link.node, signal).await {
             tracing::debug!(node = link.node, signal, reason, "a signal did not arrive");
@@ -480,15 +500,15 @@ async fn deliver(link: Arc<NodeLink>, hub: Arc<Hub>, mut signals: mpsc::Unbounde
     }
 }
 
-/// Tells of messages that were dropped here, in the daemon's log and in the robot's.
+/// Reports drops on this side in the daemon's log and in the robot's.
 async fn report_drops(link: Arc<NodeLink>) {
-    let mut reporter = Reporter::default();
+    let mut reporter = DropReporter::default();
     loop {
         tokio::time::sleep(DROPS).await;
-        for drop in reporter.news(&link.drops_here()) {
+        for drop in reporter.take_new(&link.local_drops()) {
             tracing::info!(node = link.node, "{drop}");
-            link.session.report(&FromCloud::Notice {
-                warning: !drop.cause.is_meant(),
+            link.session.send_control(&FromCloud::Notice {
+                warning: !drop.cause.is_intended(),
                 text: format!("in the cloud {drop}"),
             });
         }

@@ -1,5 +1,6 @@
-//! Whose time a node's stamps are. Those of simulated time are no clock's, and some robots want theirs as they are. In ROS 1 the parameter
-//! server says for all nodes whether time is simulated; in ROS 2 each node does for itself, and may change it while it runs.
+//! Decides which nodes need their stamps converted: simulated time is not the time of a clock, and some robots want
+//! stamps unchanged. In ROS 1 the parameter server decides for all nodes whether time is simulated; in ROS 2 each node
+//! decides for itself and may change it at run time.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,21 +15,21 @@ use super::node_link::NodeLink;
 use link::control::Hello;
 use link::skew::{Direction, Skew};
 
-/// The parameter by which time is simulated.
+/// Parameter that enables simulated time.
 pub(super) const SIMULATED: &str = "use_sim_time";
-/// Before a node that did not answer is asked again.
+/// Pause before a node that did not answer is asked again.
 const AGAIN: Duration = Duration::from_secs(1);
 
-/// What is known of a node's time.
+/// Time source of a node.
 pub(super) struct NodeTime {
-    /// The robot wants stamps as they are.
+    /// The robot wants stamps unchanged.
     kept: bool,
     simulated: AtomicBool,
 }
 
 impl NodeTime {
-    /// As the robot says when it connects. One of ROS 2 tells its node's parameter, and no other.
-    pub(super) fn of(hello: &Hello) -> Self {
+    /// Returns the time source announced in the robot's hello. In ROS 2 this is the only parameter that it contains.
+    pub(super) fn from_hello(hello: &Hello) -> Self {
         let simulated = hello.parameters.get(SIMULATED) == Some(&ParamValue::Bool(true));
         Self {
             kept: hello.keep_stamps,
@@ -36,23 +37,23 @@ impl NodeTime {
         }
     }
 
-    fn simulate(&self, simulated: bool) {
+    fn set_simulated(&self, simulated: bool) {
         self.simulated.store(simulated, Ordering::Relaxed);
     }
 
-    fn is_of_a_clock(&self) -> bool {
+    fn uses_wall_clock(&self) -> bool {
         !self.kept && !self.simulated.load(Ordering::Relaxed)
     }
 }
 
 impl NodeLink {
-    /// The difference of the clocks, if it concerns this node.
+    /// Returns the difference of the clocks, if it applies to this node.
     pub(super) fn skew<'a>(&self, hub: &'a Hub) -> Option<&'a Skew> {
-        self.time.is_of_a_clock().then_some(&hub.skew)
+        self.time.uses_wall_clock().then_some(&hub.skew)
     }
 
-    /// The message with its stamps in the other side's time.
-    pub(super) fn shift(
+    /// Converts the stamps of a message to the other side's time.
+    pub(super) fn shift_stamps(
         &self,
         hub: &Hub,
         direction: Direction,
@@ -67,29 +68,30 @@ impl NodeLink {
 }
 
 impl Hub {
-    /// The parameter server says that the time of all nodes is simulated, or is not.
-    pub(super) fn simulate(&self, simulated: bool) {
+    /// Sets simulated time for all nodes, as the parameter server does.
+    pub(super) fn set_simulated(&self, simulated: bool) {
         for link in self.links.lock().values() {
-            link.time.simulate(simulated);
+            link.time.set_simulated(simulated);
         }
     }
 }
 
-/// Follows what the node itself says of its time, until the link ends.
+/// Follows the node's own use_sim_time parameter until the link ends.
 pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     let Ok(parameters) = hub.bus.node_parameters() else {
         return;
     };
     let mut graphs = hub.bus.graph();
-    // Once for each of its lives: one that starts again has the value that it was started with.
+    // Once for each run of the node: a restarted node has its initial value.
     loop {
-        let answers = graphs.wait_for(|graph| asked(graph, &link.node).is_some());
-        let Ok(Some(node)) = answers.await.map(|graph| asked(&graph, &link.node)) else {
+        let answers = graphs.wait_for(|graph| node_to_ask(graph, &link.node).is_some());
+        let Ok(Some(node)) = answers.await.map(|graph| node_to_ask(&graph, &link.node)) else {
             return;
         };
-        let is_another = |graph: &Arc<Graph>| asked(graph, &link.node).as_ref() != Some(&node);
+        let is_another =
+            |graph: &Arc<Graph>| node_to_ask(graph, &link.node).as_ref() != Some(&node);
         let followed = tokio::select! {
-            followed = lives(&link, &node, parameters) => followed,
+            followed = follow_life(&link, &node, parameters) => followed,
             _ = graphs.wait_for(is_another) => continue,
         };
         match followed {
@@ -102,8 +104,8 @@ pub(super) async fn follow(link: Arc<NodeLink>, hub: Arc<Hub>) {
     }
 }
 
-/// Whom to ask: the node, or, where its program has called none so, another one of its process.
-fn asked(graph: &Graph, node: &str) -> Option<String> {
+/// Returns the node to ask: the node itself, or another one of its process if the program has no node with this name.
+fn node_to_ask(graph: &Graph, node: &str) -> Option<String> {
     let answers = |node: &String| {
         let service = format!("{node}/get_parameters");
         graph.services.contains_key(&service)
@@ -112,11 +114,11 @@ fn asked(graph: &Graph, node: &str) -> Option<String> {
     if answers(&own) || graph.ends.contains_key(node) {
         return Some(own).filter(answers);
     }
-    graph.of_process(node).into_iter().find(answers)
+    graph.process_nodes(node).into_iter().find(answers)
 }
 
-/// One life of the node, or until the bus is closed.
-async fn lives(
+/// Follows one run of the node, or until the bus is closed.
+async fn follow_life(
     link: &NodeLink,
     node: &str,
     parameters: &dyn NodeParameters,
@@ -125,12 +127,12 @@ async fn lives(
     let asked = [SIMULATED.to_owned()];
     let held = parameters.get(node, &asked).await?;
     if let Some(Some(ParamValue::Bool(simulated))) = held.first() {
-        link.time.simulate(*simulated);
+        link.time.set_simulated(*simulated);
     }
     while let Some(event) = events.next().await {
         for (name, value) in event.new.iter().chain(&event.changed) {
             if name == SIMULATED {
-                link.time.simulate(*value == ParamValue::Bool(true));
+                link.time.set_simulated(*value == ParamValue::Bool(true));
             }
         }
     }
@@ -139,7 +141,7 @@ async fn lives(
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::NodeEnds;
+    use ros::bus::NodeEntities;
 
     use super::*;
 
@@ -153,13 +155,13 @@ mod tests {
             enclaves: [(mark, process(&["/rear"]))].into(),
             ..Graph::default()
         };
-        assert_eq!(asked(&graph, "/front").as_deref(), Some("/rear"));
-        assert_eq!(asked(&graph, "/bass"), None);
-        // It is there, and will answer.
-        let ends = NodeEnds::default();
+        assert_eq!(node_to_ask(&graph, "/front").as_deref(), Some("/rear"));
+        assert_eq!(node_to_ask(&graph, "/bass"), None);
+        // It exists and will answer.
+        let ends = NodeEntities::default();
         graph.ends.insert("/front".to_owned(), ends);
-        assert_eq!(asked(&graph, "/front"), None);
+        assert_eq!(node_to_ask(&graph, "/front"), None);
         graph.services.extend([service("/front")]);
-        assert_eq!(asked(&graph, "/front").as_deref(), Some("/front"));
+        assert_eq!(node_to_ask(&graph, "/front").as_deref(), Some("/front"));
     }
 }

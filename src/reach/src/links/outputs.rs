@@ -1,52 +1,54 @@
-//! Topics that the node publishes: subscribed to in the servant only while the robot has listeners, so a node that
-//! works only for listeners does so here, too.
+//! Topics that the node publishes, subscribed to in the servant only while the robot has subscribers, so that a node
+//! that works only on demand does so here as well.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{Bus, Graph, Matched, PeerId, Qos, Subscription, WireType, reaches};
+use ros::bus::{
+    Bus, Graph, MatchedPeers, PeerId, QosProfile, Subscription, WireType, wait_for_connected,
+};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
 use super::Hub;
-use super::given::Given;
-use super::held::Hold;
-use super::inputs::{Mark, mark};
+use super::given::GivenInputs;
+use super::held::HoldGuard;
+use super::inputs::{Mark, stamp_mark};
 use super::node_link::NodeLink;
 use super::retry::Retry;
-use link::Quality;
+use link::DeliveryMode;
 use link::clock::now;
 use link::drops::Cause;
-use link::record::{Answered, Data};
+use link::record::{Data, InputTiming};
 use link::skew::Direction;
 use ros::codec::Stamps;
 
-/// Messages that the bus keeps for a busy link.
+/// Queue length of the bus for a busy link.
 const QUEUE: usize = 256;
-/// Publishers of a topic that are remembered.
+/// Maximum number of publishers of a topic that are remembered.
 const REMEMBERED: usize = 256;
-/// Between two questions whether a node sends a topic to us, at first and at last.
+/// First and longest interval at which it is checked whether a node sends a topic to us.
 const LOOK: std::time::Duration = std::time::Duration::from_millis(2);
 const LONGEST_LOOK: std::time::Duration = std::time::Duration::from_millis(50);
 
 /// Outputs by channel.
 #[derive(Default)]
 pub(super) struct Outputs {
-    channels: Mutex<HashMap<u32, Channel>>,
-    given: Mutex<Given>,
+    channels: Mutex<HashMap<u32, OutputChannelState>>,
+    given: Mutex<GivenInputs>,
 }
 
-struct Channel {
+struct OutputChannelState {
     topic: String,
     stamps: Stamps,
-    /// How many listen once all that the robot told is done.
+    /// Number of subscribers once all messages of the robot are processed.
     expected: usize,
     reading: Option<AbortHandle>,
 }
 
-impl Drop for Channel {
+impl Drop for OutputChannelState {
     fn drop(&mut self) {
         if let Some(reading) = self.reading.take() {
             reading.abort();
@@ -55,9 +57,9 @@ impl Drop for Channel {
 }
 
 impl Outputs {
-    /// The robot is told of this output.
+    /// Adds an output that was announced to the robot.
     pub(super) fn add(&self, channel: u32, topic: &str, stamps: Stamps) {
-        let fresh = Channel {
+        let fresh = OutputChannelState {
             topic: topic.to_owned(),
             stamps,
             expected: 0,
@@ -74,30 +76,30 @@ impl Outputs {
         self.channels.lock().clear();
     }
 
-    /// An input was given to the node.
-    pub(super) fn note(&self, channel: u32, mark: Mark, answered: Answered) {
-        // What nobody listens to is not seen, whether or not it comes.
-        let heard = self.is_heard();
-        self.given.lock().note(channel, mark, answered, heard);
+    /// Records an input given to the node.
+    pub(super) fn record_input(&self, channel: u32, mark: Mark, answered: InputTiming) {
+        // Outputs without subscribers are not observed.
+        let heard = self.has_listeners();
+        self.given.lock().record(channel, mark, answered, heard);
     }
 
-    fn is_heard(&self) -> bool {
+    fn has_listeners(&self) -> bool {
         let channels = self.channels.lock();
         channels.values().any(|channel| channel.reading.is_some())
     }
 
-    /// How many inputs it was given while somebody listened, and how many outputs came.
+    /// Returns the number of inputs while somebody subscribed, and the number of outputs.
     pub(super) fn flow(&self) -> (u64, u64) {
         self.given.lock().flow()
     }
 
-    /// Of how many of the last inputs something is known, and how many of them the node has left out.
-    pub(super) fn left_out(&self) -> (usize, usize) {
-        self.given.lock().left_out()
+    /// Returns the number of recent inputs whose fate is known, and how many of them the node has skipped.
+    pub(super) fn skipped_inputs(&self) -> (usize, usize) {
+        self.given.lock().skipped_inputs()
     }
 
-    /// So many will listen, as soon as that is done; whether they are the first ones.
-    pub(super) fn expect(&self, channel: u32, count: usize) -> bool {
+    /// Sets the expected number of subscribers; returns whether they are the first ones.
+    pub(super) fn expect_listeners(&self, channel: u32, count: usize) -> bool {
         let mut channels = self.channels.lock();
         let Some(known) = channels.get_mut(&channel) else {
             return false;
@@ -105,13 +107,13 @@ impl Outputs {
         std::mem::replace(&mut known.expected, count) == 0 && count > 0
     }
 
-    /// So many listen on the robot now; `hold` is let go of once the node knows of it.
-    pub(super) fn listeners(
+    /// Sets the number of subscribers on the robot; `hold` is released once the node knows of them.
+    pub(super) fn set_listeners(
         &self,
         link: &Arc<NodeLink>,
         hub: &Arc<Hub>,
         (channel, count): (u32, usize),
-        hold: Option<Hold>,
+        hold: Option<HoldGuard>,
     ) {
         let (topic, stamps) = {
             let mut channels = self.channels.lock();
@@ -132,18 +134,21 @@ impl Outputs {
         let (bus, warm_up) = (Arc::clone(&hub.bus), hub.options.warm_up);
         let (reader, hub) = (Arc::clone(link), Arc::downgrade(hub));
         let reading = tokio::spawn(async move {
-            let before = match bus.hearing() {
-                Some(hearing) => hearing.heard_over(&topic).await.unwrap_or_default(),
+            let before = match bus.publisher_reports() {
+                Some(hearing) => hearing
+                    .reported_connections(&topic)
+                    .await
+                    .unwrap_or_default(),
                 None => BTreeSet::new(),
             };
-            // All of it, or its guard would stay behind and end the subscription.
+            // As a whole: if it were destructured, its guard would stay behind and end the subscription.
             let subscription = &mut { subscribe(&*bus, &topic).await };
             reader
                 .drops
                 .watch(&topic, Cause::Busy, Arc::clone(&subscription.dropped));
             let publishers = subscription.matched.clone();
             let connected = async {
-                let heard = heard(&*bus, &reader.node, &topic, publishers, before);
+                let heard = wait_heard(&*bus, &reader.node, &topic, publishers, before);
                 let _ = tokio::time::timeout(warm_up, heard).await;
                 drop(hold);
             };
@@ -157,7 +162,7 @@ impl Outputs {
                         Ok(()) = met.changed() => {
                             let Some(hub) = hub.upgrade() else { break };
                             let present = met.borrow_and_update().clone();
-                            own.meet(&present, |node| hub.is_of(&reader, node));
+                            own.add_present(&present, |node| hub.is_of_link(&reader, node));
                             continue;
                         }
                         message = subscription.messages.recv() => message,
@@ -166,10 +171,12 @@ impl Outputs {
                         break;
                     };
                     // Other nodes of the servant have links of their own.
-                    if own.has(&message.publisher, |node| hub.is_of(&reader, node)) {
-                        let quality = Quality::of(&message.wire_type.name, message.latching);
-                        let bytes = reader.shift(&hub, Direction::Out, &stamps, message.bytes);
-                        reader.send(channel, bytes, message.latching, quality);
+                    if own.is_own(&message.publisher, |node| hub.is_of_link(&reader, node)) {
+                        let quality =
+                            DeliveryMode::for_type(&message.wire_type.name, message.latching);
+                        let bytes =
+                            reader.shift_stamps(&hub, Direction::Out, &stamps, message.bytes);
+                        reader.send_output(channel, bytes, message.latching, quality);
                     }
                 }
             };
@@ -183,10 +190,10 @@ impl Outputs {
     }
 }
 
-/// Subscribes to an output; tries again while that is refused.
+/// Subscribes to an output; retries while that is refused.
 async fn subscribe(bus: &dyn Bus, topic: &str) -> Subscription {
-    // As latching as the node: of a bus with qualities of service it is a wish, and the node's own offer is what is heard.
-    let qos = Qos::keep_last(QUEUE).latching(true);
+    // As latching as the node: with QoS it is a request that adapts to the node's offer.
+    let qos = QosProfile::keep_last(QUEUE).latching(true);
     let mut retry = Retry::default();
     loop {
         match bus.subscribe(topic, WireType::any(), qos).await {
@@ -201,19 +208,19 @@ async fn subscribe(bus: &dyn Bus, topic: &str) -> Subscription {
     }
 }
 
-/// Publishers of a topic that are known to be of the link's process: what one has sent before it was gone still is the process's, and the graph
-/// has no node of its name any more.
+/// Publishers known to belong to the link's process. Messages of a publisher that is gone still belong to the process,
+/// although the graph no longer contains its node.
 #[derive(Default)]
 struct OwnPublishers(BTreeSet<PeerId>);
 
 impl OwnPublishers {
-    fn has(&mut self, publisher: &PeerId, is_of: impl Fn(&str) -> bool) -> bool {
+    fn is_own(&mut self, publisher: &PeerId, is_of: impl Fn(&str) -> bool) -> bool {
         if self.0.contains(publisher) {
             return true;
         }
         let has = is_of(publisher.node());
         if has {
-            // Whoever made so many is not worth being remembered.
+            // So many publishers are not worth remembering.
             if self.0.len() >= REMEMBERED {
                 self.0.clear();
             }
@@ -222,34 +229,34 @@ impl OwnPublishers {
         has
     }
 
-    /// These are there now.
-    fn meet(&mut self, present: &Matched, is_of: impl Fn(&str) -> bool) {
+    /// Adds the publishers that are connected now.
+    fn add_present(&mut self, present: &MatchedPeers, is_of: impl Fn(&str) -> bool) {
         for peer in present.peers.iter().filter(|peer| peer.connected) {
-            self.has(&peer.id, &is_of);
+            self.is_own(&peer.id, &is_of);
         }
     }
 }
 
-/// Returns once the node sends the topic to us, over a connection that is not one of those before.
-async fn heard(
+/// Waits until the node sends the topic to us over a connection that did not exist before.
+async fn wait_heard(
     bus: &dyn Bus,
     node: &str,
     topic: &str,
-    publishers: watch::Receiver<Matched>,
+    publishers: watch::Receiver<MatchedPeers>,
     before: BTreeSet<PeerId>,
 ) {
-    let Some(hearing) = bus.hearing() else {
-        // Both know of each other then; nodes of other processes may publish the same topic.
+    let Some(hearing) = bus.publisher_reports() else {
+        // Here both ends know of each other; nodes of other processes may publish the same topic.
         let mut publishers = publishers;
-        let nodes = publishing(&bus.graph().borrow(), node, topic);
-        let all = |now: &Matched| nodes.iter().all(|node| now.has_node(node));
+        let nodes = publishing_nodes(&bus.graph().borrow(), node, topic);
+        let all = |now: &MatchedPeers| nodes.iter().all(|node| now.has_node(node));
         let _ = publishers.wait_for(all).await;
         return;
     };
-    reaches(publishers, 1).await;
+    wait_for_connected(publishers, 1).await;
     let mut pause = LOOK;
     loop {
-        let Ok(now) = hearing.heard_over(topic).await else {
+        let Ok(now) = hearing.reported_connections(topic).await else {
             return;
         };
         if now.difference(&before).any(|by| by.node() == node) {
@@ -260,9 +267,9 @@ async fn heard(
     }
 }
 
-/// The nodes of a process that publish the topic.
-fn publishing(graph: &Graph, node: &str, topic: &str) -> BTreeSet<String> {
-    let mut nodes = graph.of_process(node);
+/// Returns the nodes of a process that publish the topic.
+fn publishing_nodes(graph: &Graph, node: &str, topic: &str) -> BTreeSet<String> {
+    let mut nodes = graph.process_nodes(node);
     nodes.retain(|node| graph.publishes(node, topic));
     if nodes.is_empty() {
         nodes.insert(node.to_owned());
@@ -271,15 +278,15 @@ fn publishing(graph: &Graph, node: &str, topic: &str) -> BTreeSet<String> {
 }
 
 impl Hub {
-    /// Whether a node is one of the link's process.
-    fn is_of(&self, link: &NodeLink, node: &str) -> bool {
+    /// Returns whether a node belongs to the link's process.
+    fn is_of_link(&self, link: &NodeLink, node: &str) -> bool {
         let graph = || self.bus.graph();
-        node == link.node || graph().borrow().is_of_process(&link.node, node)
+        node == link.node || graph().borrow().is_in_process(&link.node, node)
     }
 }
 
 impl NodeLink {
-    fn send(&self, channel: u32, message: Bytes, latching: bool, quality: Quality) {
+    fn send_output(&self, channel: u32, message: Bytes, latching: bool, quality: DeliveryMode) {
         let born = now();
         let data = Data {
             channel,
@@ -288,7 +295,11 @@ impl NodeLink {
             born,
             left: 0,
             serialise: 0,
-            answered: self.outputs.given.lock().answered_by(mark(&message), born),
+            answered: self
+                .outputs
+                .given
+                .lock()
+                .match_output(stamp_mark(&message), born),
             message,
         };
         self.session.publish(data, quality);
@@ -297,7 +308,7 @@ impl NodeLink {
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::Peer;
+    use ros::bus::TopicPeer;
 
     use super::*;
 
@@ -306,23 +317,23 @@ mod tests {
         let peer = |node: &str, number: u64| PeerId::new(node, u128::from(number));
         let (mut own, gone) = (OwnPublishers::default(), |_: &str| false);
         let is_of = |node: &str| node == "/tenor";
-        assert!(own.has(&peer("/tenor", 1), is_of));
-        assert!(!own.has(&peer("/bass", 1), is_of));
-        assert!(own.has(&peer("/tenor", 1), gone) && !own.has(&peer("/tenor", 2), gone));
-        // It has sent nothing yet that was looked at.
-        let there = |id: PeerId| Peer {
+        assert!(own.is_own(&peer("/tenor", 1), is_of));
+        assert!(!own.is_own(&peer("/bass", 1), is_of));
+        assert!(own.is_own(&peer("/tenor", 1), gone) && !own.is_own(&peer("/tenor", 2), gone));
+        // Nothing of it was received yet.
+        let there = |id: PeerId| TopicPeer {
             id,
             connected: true,
             offer: None,
         };
-        let present = Matched {
+        let present = MatchedPeers {
             peers: vec![there(peer("/tenor", 2)), there(peer("/bass", 2))],
-            ..Matched::default()
+            ..MatchedPeers::default()
         };
-        own.meet(&present, is_of);
-        assert!(own.has(&peer("/tenor", 2), gone) && !own.has(&peer("/bass", 2), gone));
+        own.add_present(&present, is_of);
+        assert!(own.is_own(&peer("/tenor", 2), gone) && !own.is_own(&peer("/bass", 2), gone));
         for number in 0..2 * REMEMBERED as u64 {
-            own.has(&peer("/tenor", number), is_of);
+            own.is_own(&peer("/tenor", number), is_of);
         }
         assert!(own.0.len() <= REMEMBERED);
     }

@@ -1,4 +1,5 @@
-//! Parameters: the robot's are copied into the servant when a link begins, and changes cross both ways.
+//! Parameters: the robot's are copied to the servant when a link starts, and changes are synchronized in both
+//! directions.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,7 +7,7 @@ use std::sync::Arc;
 use budget::Permit;
 use parking_lot::Mutex;
 use ros::bus::{BusError, ParamValue};
-use ros::ros1::own_parameters::is_of_master;
+use ros::ros1::own_parameters::is_set_by_master;
 use tokio::sync::OnceCell;
 use tokio::task::AbortHandle;
 
@@ -14,32 +15,32 @@ use super::Hub;
 use super::node_time::SIMULATED;
 use super::runs::RUNS;
 use link::Echoes;
-use link::control::{FromCloud, Hello, Node};
+use link::control::{FromCloud, Hello, NodeLaunch};
 
-/// What a change takes that no robot was told of, besides its key and its value, in bytes.
+/// Memory overhead of a pending change in bytes.
 const UNTOLD: usize = 256;
 
-/// Whether the Master's side has it of itself, or keeps runs of nodes there.
-fn is_own(name: &str) -> bool {
-    is_of_master(name) || name == RUNS.trim_start_matches('/')
+/// Returns whether the parameter is set by the Master itself or stores the runs of nodes.
+fn is_internal(name: &str) -> bool {
+    is_set_by_master(name) || name == RUNS.trim_start_matches('/')
 }
 
-/// What was set here in the robot's name: it does not go back.
+/// Synchronization state of the parameters.
 #[derive(Default)]
-pub(super) struct Known {
+pub(super) struct ParameterMirror {
     set: Echoes,
-    /// Set by a node before there was a link to tell it.
-    untold: Mutex<BTreeMap<String, Untold>>,
+    /// Changes by nodes before there was a link to report them.
+    untold: Mutex<BTreeMap<String, PendingChange>>,
     watching: OnceCell<AbortHandle>,
 }
 
-/// A change that no robot was told of. It counts as the servant's.
-struct Untold {
+/// A change that was not reported to any robot. Its memory is charged to the servant.
+struct PendingChange {
     value: Option<ParamValue>,
     _held: Permit,
 }
 
-impl Drop for Known {
+impl Drop for ParameterMirror {
     fn drop(&mut self) {
         if let Some(watching) = self.watching.get() {
             watching.abort();
@@ -47,9 +48,9 @@ impl Drop for Known {
     }
 }
 
-impl Known {
-    /// Takes over all of the robot's parameters, those that the deployer gave last.
-    pub(super) async fn take(&self, hub: &Hub, hello: &Hello) {
+impl ParameterMirror {
+    /// Copies all parameters of the robot, then those given by the deployer.
+    pub(super) async fn copy_from_hello(&self, hub: &Hub, hello: &Hello) {
         let Ok(parameters) = hub.bus.parameters() else {
             return;
         };
@@ -58,25 +59,29 @@ impl Known {
             _ => BTreeMap::new(),
         };
         for (name, value) in &hello.parameters {
-            let value = translated(hub, &hello.node, value);
-            if !is_own(name) && there.get(name) != Some(&value) {
-                self.set(hub, format!("/{name}"), value).await;
+            let value = translate_value(hub, &hello.node, value);
+            if !is_internal(name) && there.get(name) != Some(&value) {
+                self.set_parameter(hub, format!("/{name}"), value).await;
             }
         }
         for (key, value) in hub.nodes.parameters(&hello.node) {
-            // The robot shall see what its node really has.
+            // Reported to the robot, so that it sees the values that its node really has.
             let _ = parameters.set(&key, value).await;
         }
     }
 
-    /// Parameters that changed on the robot.
-    pub(super) async fn change(&self, hub: &Hub, changes: Vec<(String, Option<ParamValue>)>) {
+    /// Applies changes made on the robot.
+    pub(super) async fn apply_changes(
+        &self,
+        hub: &Hub,
+        changes: Vec<(String, Option<ParamValue>)>,
+    ) {
         for (key, value) in changes {
             if key.trim_start_matches('/') == SIMULATED {
-                hub.simulate(value == Some(ParamValue::Bool(true)));
+                hub.set_simulated(value == Some(ParamValue::Bool(true)));
             }
             match value {
-                Some(value) => self.set(hub, key, value).await,
+                Some(value) => self.set_parameter(hub, key, value).await,
                 None => {
                     self.set.forget(&key);
                     if let Ok(parameters) = hub.bus.parameters() {
@@ -87,8 +92,8 @@ impl Known {
         }
     }
 
-    async fn set(&self, hub: &Hub, key: String, value: ParamValue) {
-        // Where there are none, what is given in vain was told when the link began.
+    async fn set_parameter(&self, hub: &Hub, key: String, value: ParamValue) {
+        // Without global parameters, ignored settings were reported when the link started.
         let Ok(parameters) = hub.bus.parameters() else {
             return;
         };
@@ -99,7 +104,7 @@ impl Known {
         }
     }
 
-    /// Tells robots what nodes set, from now on.
+    /// Starts reporting parameters set by nodes to robots.
     pub(super) async fn watch(&self, hub: &Arc<Hub>) {
         let begun = self.watching.get_or_try_init(|| async {
             let mut changes = hub.bus.parameters()?.watch().await?;
@@ -107,7 +112,7 @@ impl Known {
             let task = tokio::spawn(async move {
                 while let Some((key, value)) = changes.recv().await {
                     let Some(hub) = weak.upgrade() else { return };
-                    hub.parameters.report(&hub, key, value);
+                    hub.parameters.report_change(&hub, key, value);
                 }
             });
             Ok::<_, BusError>(task.abort_handle())
@@ -120,8 +125,8 @@ impl Known {
         }
     }
 
-    /// Tells the link whose node the parameter belongs to, or any: they are on one robot.
-    pub(super) fn report(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+    /// Reports a change to the link that owns the parameter, or to any, since all belong to one robot.
+    pub(super) fn report_change(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
         if key.starts_with(RUNS) || self.set.is_echo(&key, value.as_ref()) {
             return;
         }
@@ -130,19 +135,19 @@ impl Known {
         match owner.or_else(|| links.values().next()) {
             Some(link) => link
                 .session
-                .report(&FromCloud::Parameters(vec![(key, value)])),
-            None => self.keep(hub, key, value),
+                .send_control(&FromCloud::Parameters(vec![(key, value)])),
+            None => self.keep_change(hub, key, value),
         }
     }
 
-    /// Keeps a change for when there is a link, where there is memory for it.
-    fn keep(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
+    /// Keeps a change until there is a link, if there is memory for it.
+    fn keep_change(&self, hub: &Hub, key: String, value: Option<ParamValue>) {
         let mut untold = self.untold.lock();
-        // It is of no use any more, whatever becomes of this one.
+        // The earlier value is obsolete in any case.
         untold.remove(&key);
         let bytes = UNTOLD + key.len() + value.as_ref().map_or(0, ParamValue::bytes_held);
         match hub.options.budget.take(bytes) {
-            Ok(_held) => drop(untold.insert(key, Untold { value, _held })),
+            Ok(_held) => drop(untold.insert(key, PendingChange { value, _held })),
             Err(error) => tracing::warn!(
                 servant = hub.servant,
                 "the parameter {key} was set before a robot's node was linked, and will not reach the robot: {error}"
@@ -150,28 +155,28 @@ impl Known {
         }
     }
 
-    /// What a node has set before there was a link to tell.
-    pub(super) fn untold(&self) -> Vec<(String, Option<ParamValue>)> {
+    /// Returns and clears the changes by nodes before there was a link.
+    pub(super) fn take_pending(&self) -> Vec<(String, Option<ParamValue>)> {
         let untold = std::mem::take(&mut *self.untold.lock());
         let changes = untold.into_iter();
         changes.map(|(key, untold)| (key, untold.value)).collect()
     }
 }
 
-/// A value with the robot's paths replaced by the servant's.
-fn translated(hub: &Hub, node: &Node, value: &ParamValue) -> ParamValue {
+/// Replaces the robot's paths in a value with the servant's.
+fn translate_value(hub: &Hub, node: &NodeLaunch, value: &ParamValue) -> ParamValue {
     match value {
         ParamValue::String(text) => ParamValue::String(hub.nodes.translate(node, text)),
         ParamValue::List(items) => ParamValue::List(
             items
                 .iter()
-                .map(|item| translated(hub, node, item))
+                .map(|item| translate_value(hub, node, item))
                 .collect(),
         ),
         ParamValue::Map(members) => ParamValue::Map(
             members
                 .iter()
-                .map(|(name, member)| (name.clone(), translated(hub, node, member)))
+                .map(|(name, member)| (name.clone(), translate_value(hub, node, member)))
                 .collect(),
         ),
         other => other.clone(),

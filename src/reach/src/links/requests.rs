@@ -1,57 +1,57 @@
-//! What a robot's stub tells of its requests: the last ones are kept for whoever explains, and each is counted once.
+//! Requests reported by a robot's stub: keeps the last ones for explanations and classifies each update once.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
 
-use link::control::Request;
+use link::control::RequestTiming;
 use parking_lot::Mutex;
 
-/// Requests remembered, for whoever explains.
+/// Number of requests kept for explanations.
 const REQUESTS: usize = 128;
-/// Late requests whose answers are awaited at most; of more the oldest are forgotten.
+/// Maximum number of late requests whose answers are awaited; beyond it the oldest are forgotten.
 const LATE: usize = 4096;
-/// Stubs tell once a second; the first report after a connection may be one of these late.
+/// Tolerance: stubs report once a second, and the first report after a reconnection may be delayed.
 const REPORT: Duration = Duration::from_secs(2);
 
-/// What is new of a request.
+/// An update about a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum RequestNews {
+pub enum RequestUpdate {
     /// The cloud has answered it.
     Answered,
-    /// The cloud has not answered it within its T_max, although the link stood.
+    /// The cloud has not answered it within its T_max although the link was up.
     Late,
-    /// The cloud has answered one of which it was told before that it was late.
+    /// The cloud has answered a request that was reported late before.
     AnsweredLate,
 }
 
 /// The requests of one link.
 #[derive(Default)]
-pub(super) struct Requests(Mutex<State>);
+pub(super) struct RequestLog(Mutex<State>);
 
 #[derive(Default)]
 struct State {
-    last: VecDeque<Request>,
-    /// Ids of requests of which it was told that they are late, and not that they were answered.
+    last: VecDeque<RequestTiming>,
+    /// Ids of requests reported late and not yet answered.
     late: BTreeSet<u64>,
-    /// Since when the connection is there that carries the link.
+    /// Time at which the current connection began.
     connected: Option<Instant>,
 }
 
-impl Requests {
-    /// A connection carries the link from now on.
-    pub(super) fn connected(&self, now: Instant) {
+impl RequestLog {
+    /// Handles a new connection of the link.
+    pub(super) fn on_connected(&self, now: Instant) {
         self.0.lock().connected = Some(now);
     }
 
-    /// Notes what the robot told of requests, whose answers it accepts for `max` seconds; each with what is new of it.
-    pub(super) fn note(
+    /// Records the requests reported by the robot, which accepts answers for `max` seconds; returns those with updates.
+    pub(super) fn record(
         &self,
-        told: Vec<Request>,
+        told: Vec<RequestTiming>,
         max: Option<f64>,
         now: Instant,
-    ) -> Vec<(Request, RequestNews)> {
+    ) -> Vec<(RequestTiming, RequestUpdate)> {
         let mut state = self.0.lock();
-        // What was asked before may be late since there was no link, which is not the servant's fault.
+        // A request made before may be late because the link was down, which is not the servant's fault.
         let max = max.map_or(Ok(Duration::ZERO), Duration::try_from_secs_f64);
         let settled = max.map(|max| max.saturating_add(REPORT)).ok();
         let stood = state.connected.map(|at| now.saturating_duration_since(at));
@@ -62,7 +62,7 @@ impl Requests {
         for request in told {
             news.extend(
                 state
-                    .news(&request, stood)
+                    .classify(&request, stood)
                     .map(|new| (request.clone(), new)),
             );
             match state.last.iter_mut().find(|known| known.id == request.id) {
@@ -75,20 +75,20 @@ impl Requests {
         news
     }
 
-    /// The last ones, the oldest first.
-    pub(super) fn last(&self) -> Vec<Request> {
+    /// Returns the last requests, oldest first.
+    pub(super) fn last(&self) -> Vec<RequestTiming> {
         self.0.lock().last.iter().cloned().collect()
     }
 }
 
 impl State {
-    fn news(&mut self, request: &Request, stood: bool) -> Option<RequestNews> {
+    fn classify(&mut self, request: &RequestTiming, stood: bool) -> Option<RequestUpdate> {
         let known = self.last.iter().find(|known| known.id == request.id);
         if request.total.is_some() {
             return match known {
                 Some(known) if known.total.is_some() => None,
-                _ if self.late.remove(&request.id) => Some(RequestNews::AnsweredLate),
-                _ => Some(RequestNews::Answered),
+                _ if self.late.remove(&request.id) => Some(RequestUpdate::AnsweredLate),
+                _ => Some(RequestUpdate::Answered),
             };
         }
         if known.is_some() || !stood || !self.late.insert(request.id) {
@@ -97,7 +97,7 @@ impl State {
         if self.late.len() > LATE {
             self.late.pop_first();
         }
-        Some(RequestNews::Late)
+        Some(RequestUpdate::Late)
     }
 }
 
@@ -107,21 +107,21 @@ mod tests {
 
     const SECOND: Duration = Duration::from_secs(1);
 
-    fn request(id: u64, total: Option<f64>) -> Request {
-        Request {
+    fn request(id: u64, total: Option<f64>) -> RequestTiming {
+        RequestTiming {
             id,
             total,
-            ..Request::default()
+            ..RequestTiming::default()
         }
     }
 
-    fn news(
-        requests: &Requests,
+    fn record_updates(
+        requests: &RequestLog,
         told: &[(u64, Option<f64>)],
         now: Instant,
-    ) -> Vec<(u64, RequestNews)> {
+    ) -> Vec<(u64, RequestUpdate)> {
         let told = told.iter().map(|(id, total)| request(*id, *total));
-        let news = requests.note(told.collect(), Some(0.3), now);
+        let news = requests.record(told.collect(), Some(0.3), now);
         news.into_iter()
             .map(|(request, new)| (request.id, new))
             .collect()
@@ -129,64 +129,70 @@ mod tests {
 
     #[test]
     fn late_requests_are_told_once_and_their_answers_too() {
-        use RequestNews::{Answered, AnsweredLate, Late};
-        let (requests, began) = (Requests::default(), Instant::now());
-        requests.connected(began);
+        use RequestUpdate::{Answered, AnsweredLate, Late};
+        let (requests, began) = (RequestLog::default(), Instant::now());
+        requests.on_connected(began);
         let now = began + SECOND * 3;
         let told = [(1, Some(5.0)), (2, None), (3, None)];
         assert_eq!(
-            news(&requests, &told, now),
+            record_updates(&requests, &told, now),
             [(1, Answered), (2, Late), (3, Late)]
         );
-        // The local original's answer is taken meanwhile, and the cloud's comes after all.
+        // Meanwhile the local original's answer is used, and then the cloud's arrives.
         let told = [(1, Some(5.0)), (2, None), (3, Some(900.0))];
-        assert_eq!(news(&requests, &told, now), [(3, AnsweredLate)]);
-        assert_eq!(news(&requests, &[(3, Some(900.0))], now), []);
+        assert_eq!(record_updates(&requests, &told, now), [(3, AnsweredLate)]);
+        assert_eq!(record_updates(&requests, &[(3, Some(900.0))], now), []);
         assert_eq!(requests.last().len(), 3);
-        // After so many others that it is not shown any more.
+        // After so many others that it is no longer kept.
         let others: Vec<_> = (10..10 + 2 * REQUESTS as u64)
             .map(|id| (id, Some(1.0)))
             .collect();
-        assert_eq!(news(&requests, &others, now).len(), others.len());
+        assert_eq!(record_updates(&requests, &others, now).len(), others.len());
         assert_eq!(
-            news(&requests, &[(2, Some(2000.0))], now),
+            record_updates(&requests, &[(2, Some(2000.0))], now),
             [(2, AnsweredLate)]
         );
     }
 
     #[test]
-    fn what_is_late_for_want_of_a_link_is_not_told() {
-        let (requests, began) = (Requests::default(), Instant::now());
+    fn requests_late_while_the_link_was_down_are_not_reported() {
+        let (requests, began) = (RequestLog::default(), Instant::now());
         assert_eq!(
-            news(&requests, &[(1, None)], began),
+            record_updates(&requests, &[(1, None)], began),
             [],
             "nothing is connected"
         );
-        requests.connected(began);
-        assert_eq!(news(&requests, &[(2, None)], began + SECOND * 2), []);
+        requests.on_connected(began);
         assert_eq!(
-            news(&requests, &[(2, Some(3000.0))], began + SECOND * 2),
-            [(2, RequestNews::Answered)],
+            record_updates(&requests, &[(2, None)], began + SECOND * 2),
+            []
+        );
+        assert_eq!(
+            record_updates(&requests, &[(2, Some(3000.0))], began + SECOND * 2),
+            [(2, RequestUpdate::Answered)],
             "its time is known"
         );
-        let late = news(&requests, &[(3, None)], began + SECOND * 3);
-        assert_eq!(late, [(3, RequestNews::Late)]);
-        requests.connected(began + SECOND * 9);
-        assert_eq!(news(&requests, &[(4, None)], began + SECOND * 10), []);
+        let late = record_updates(&requests, &[(3, None)], began + SECOND * 3);
+        assert_eq!(late, [(3, RequestUpdate::Late)]);
+        requests.on_connected(began + SECOND * 9);
+        assert_eq!(
+            record_updates(&requests, &[(4, None)], began + SECOND * 10),
+            []
+        );
         assert_eq!(requests.last().len(), 4, "all are shown");
-        // Robots are not to be trusted.
+        // Robots are not trusted.
         for max in [f64::NAN, -1.0, f64::INFINITY, 1e300] {
             let told = vec![request(9, None)];
-            assert_eq!(requests.note(told, Some(max), began + SECOND * 99), []);
+            assert_eq!(requests.record(told, Some(max), began + SECOND * 99), []);
         }
     }
 
     #[test]
     fn a_robot_cannot_make_it_grow() {
-        let (requests, began) = (Requests::default(), Instant::now());
-        requests.connected(began);
+        let (requests, began) = (RequestLog::default(), Instant::now());
+        requests.on_connected(began);
         for id in 0..3 * LATE as u64 {
-            news(&requests, &[(id, None)], began + SECOND * 9);
+            record_updates(&requests, &[(id, None)], began + SECOND * 9);
         }
         let state = requests.0.lock();
         assert_eq!((state.late.len(), state.last.len()), (LATE, REQUESTS));

@@ -1,59 +1,59 @@
-//! What one node has, as the graph of its servant shows it in either ROS. ROS 1 is told by the Master, which knows types of topics by
-//! their names and of services nothing. In ROS 2 each end tells all of itself, and what tools hide is shown, too: whoever stands
-//! in for the node needs the parts of its actions.
+//! Endpoints of one node as shown in the graph of its servant, for either ROS version. In ROS 1 the Master knows topic
+//! types by name and nothing about service types. In ROS 2 each endpoint announces everything, and hidden names are
+//! included, because a stub needs the topics and services of the node's actions.
 
 use std::collections::BTreeMap;
 
-use link::control::Has;
-use ros::bus::{Graph, Qos, RosVersion, ServiceType, WireType};
+use link::control::NodeEndpoints;
+use ros::bus::{Graph, QosProfile, RosVersion, ServiceType, WireType};
 
-/// A node hears only its own changes by this topic of ROS 2, which every node publishes.
+/// Topic of ROS 2 that every node publishes, and on which a node receives only its own changes.
 const OWN_EVENTS: &str = "/parameter_events";
 
-/// What a node has.
+/// Endpoints of a node.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Seen {
+pub(super) struct NodeEndpointSet {
     /// Topics that it publishes.
-    pub(super) outputs: BTreeMap<String, Declared>,
-    /// Topics that it listens to.
-    pub(super) inputs: BTreeMap<String, Declared>,
-    /// Services that it serves; without a type where the server has to be asked.
+    pub(super) outputs: BTreeMap<String, DeclaredType>,
+    /// Topics that it subscribes to.
+    pub(super) inputs: BTreeMap<String, DeclaredType>,
+    /// Services that it provides; the type is `None` if the server must be asked.
     pub(super) services: BTreeMap<String, Option<ServiceType>>,
 }
 
-/// How a topic's type is known.
+/// Type of a topic, as far as it is announced.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Declared {
-    /// By its name (ROS 1).
+pub(super) enum DeclaredType {
+    /// Name of the type (ROS 1).
     Named(String),
-    /// As the node's end tells it, with its quality of service (ROS 2).
-    Told(WireType, Qos),
+    /// Type and QoS as announced by the endpoint (ROS 2).
+    Told(WireType, QosProfile),
 }
 
-impl Declared {
-    /// The quality of service, where ends tell it.
-    pub(super) fn qos(&self) -> Option<link::control::Qos> {
+impl DeclaredType {
+    /// Returns the QoS, if it is announced.
+    pub(super) fn qos(&self) -> Option<link::control::WireQos> {
         match self {
-            Declared::Named(_) => None,
-            Declared::Told(_, qos) => Some(link::control::Qos::of(qos)),
+            DeclaredType::Named(_) => None,
+            DeclaredType::Told(_, qos) => Some(link::control::WireQos::from_bus(qos)),
         }
     }
 }
 
-impl Seen {
-    /// What the node of this name has; in ROS 2 all nodes of its process.
-    pub(super) fn of(graph: &Graph, node: &str, version: RosVersion) -> Self {
+impl NodeEndpointSet {
+    /// Returns the endpoints of this node; in ROS 2 those of all nodes of its process.
+    pub(super) fn from_graph(graph: &Graph, node: &str, version: RosVersion) -> Self {
         match version {
-            RosVersion::One => Self::of_one(graph, node),
-            RosVersion::Two => Self::of_two(graph, node),
+            RosVersion::One => Self::from_ros1_graph(graph, node),
+            RosVersion::Two => Self::from_ros2_graph(graph, node),
         }
     }
 
-    fn of_one(graph: &Graph, node: &str) -> Self {
+    fn from_ros1_graph(graph: &Graph, node: &str) -> Self {
         let mut seen = Self::default();
         let is_it = |other: &String| other == node;
         for (topic, ends) in &graph.topics {
-            let declared = || Declared::Named(ends.type_name.clone());
+            let declared = || DeclaredType::Named(ends.type_name.clone());
             if ends.publishers.iter().any(is_it) {
                 seen.outputs.insert(topic.clone(), declared());
             }
@@ -66,15 +66,15 @@ impl Seen {
         seen
     }
 
-    fn of_two(graph: &Graph, node: &str) -> Self {
-        let ends = graph.ends_of(&graph.of_process(node));
-        let declared = |topics: &BTreeMap<String, (WireType, Qos)>| {
+    fn from_ros2_graph(graph: &Graph, node: &str) -> Self {
+        let ends = graph.merged_endpoints(&graph.process_nodes(node));
+        let declared = |topics: &BTreeMap<String, (WireType, QosProfile)>| {
             let topics = topics.iter();
             topics
-                .map(|(topic, (of, qos))| (topic.clone(), Declared::Told(of.clone(), *qos)))
+                .map(|(topic, (of, qos))| (topic.clone(), DeclaredType::Told(of.clone(), *qos)))
                 .collect()
         };
-        let mut inputs: BTreeMap<String, Declared> = declared(&ends.subscribers);
+        let mut inputs: BTreeMap<String, DeclaredType> = declared(&ends.subscribers);
         inputs.remove(OWN_EVENTS);
         let services = ends.services.iter();
         Self {
@@ -87,9 +87,9 @@ impl Seen {
     }
 }
 
-/// Which of what a process has is whose, where it is not all the node's of this name.
-pub(super) fn owners(graph: &Graph, node: &str) -> BTreeMap<String, Has> {
-    let nodes = graph.of_process(node);
+/// Returns the owners of the endpoints of a process, unless all belong to this node.
+pub(super) fn owners(graph: &Graph, node: &str) -> BTreeMap<String, NodeEndpoints> {
+    let nodes = graph.process_nodes(node);
     if nodes.len() < 2 {
         return BTreeMap::new();
     }
@@ -102,9 +102,9 @@ pub(super) fn owners(graph: &Graph, node: &str) -> BTreeMap<String, Has> {
     has.collect()
 }
 
-/// Services and actions that the node's process looks for and nobody in the servant has.
-pub(super) fn sought(graph: &Graph, node: &str) -> Vec<String> {
-    let nodes = graph.of_process(node);
+/// Returns services and actions that the node's process looks up and that have no server in the servant.
+pub(super) fn unmet_lookups(graph: &Graph, node: &str) -> Vec<String> {
+    let nodes = graph.process_nodes(node);
     let is_it = |other: &String| nodes.contains(other);
     let services = graph.sought.iter();
     let services = services
@@ -112,7 +112,7 @@ pub(super) fn sought(graph: &Graph, node: &str) -> Vec<String> {
             nodes.iter().any(is_it) && !graph.services.contains_key(*service)
         })
         .map(|(service, _)| service.clone());
-    // Of ROS 2, where their parts are hidden; those of ROS 1 are made of topics.
+    // Actions of ROS 2, whose topics and services are hidden; those of ROS 1 consist of topics.
     let actions = graph.actions.iter().filter(|(_, ends)| {
         ends.topics.is_empty() && ends.servers.is_empty() && ends.clients.iter().any(is_it)
     });
@@ -123,11 +123,11 @@ pub(super) fn sought(graph: &Graph, node: &str) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use ros::bus::{ActionNodes, NodeEnds, TopicNodes};
+    use ros::bus::{ActionNodes, NodeEntities, TopicNodes};
 
     use super::*;
 
-    fn both(topic: &str) -> (String, TopicNodes) {
+    fn topic_with_both(topic: &str) -> (String, TopicNodes) {
         let nodes = || vec!["/see".to_owned(), "/other".to_owned()];
         let ends = TopicNodes {
             type_name: "std_msgs/String".to_owned(),
@@ -140,51 +140,51 @@ mod tests {
     #[test]
     fn a_node_of_ros_1_has_what_the_master_knows() {
         let graph = Graph {
-            topics: [both("/chatter"), both("/fib/goal")].into(),
+            topics: [topic_with_both("/chatter"), topic_with_both("/fib/goal")].into(),
             services: [("/set".to_owned(), "/see".to_owned())].into(),
             ..Graph::default()
         };
-        let seen = Seen::of(&graph, "/see", RosVersion::One);
-        let named = Declared::Named("std_msgs/String".to_owned());
+        let seen = NodeEndpointSet::from_graph(&graph, "/see", RosVersion::One);
+        let named = DeclaredType::Named("std_msgs/String".to_owned());
         assert_eq!(seen.outputs["/chatter"], named);
         assert_eq!(seen.inputs["/fib/goal"], named);
         assert_eq!(seen.services, [("/set".to_owned(), None)].into());
         assert_eq!(named.qos(), None);
         assert_eq!(
-            Seen::of(&graph, "/nobody", RosVersion::One),
-            Seen::default()
+            NodeEndpointSet::from_graph(&graph, "/nobody", RosVersion::One),
+            NodeEndpointSet::default()
         );
     }
 
     #[test]
     fn a_node_of_ros_2_has_what_its_ends_tell_with_the_parts_of_its_actions() {
-        let of = |name: &str| WireType::named(name).written_by(RosVersion::Two);
-        let latching = Qos::keep_last(1).latching(true);
+        let of = |name: &str| WireType::with_name(name).with_version(RosVersion::Two);
+        let latching = QosProfile::keep_last(1).latching(true);
         let topic = |name: &str, qos| (name.to_owned(), (of("std_msgs/msg/String"), qos));
         let get_result = ServiceType::new("test_msgs/action/Fibonacci_GetResult", "*");
-        let ends = NodeEnds {
+        let ends = NodeEntities {
             publishers: [
                 topic("/map", latching),
-                topic("/parameter_events", Qos::keep_last(10)),
+                topic("/parameter_events", QosProfile::keep_last(10)),
             ]
             .into(),
             subscribers: [
-                topic("/scan", Qos::keep_last(5)),
-                topic("/parameter_events", Qos::keep_last(10)),
+                topic("/scan", QosProfile::keep_last(5)),
+                topic("/parameter_events", QosProfile::keep_last(10)),
             ]
             .into(),
             services: [("/fib/_action/get_result".to_owned(), get_result.clone())].into(),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         let graph = Graph {
-            // Its ends alone count.
-            topics: [both("/chatter")].into(),
+            // Only its own endpoints count.
+            topics: [topic_with_both("/chatter")].into(),
             ends: [("/see".to_owned(), ends)].into(),
             ..Graph::default()
         };
-        let seen = Seen::of(&graph, "/see", RosVersion::Two);
+        let seen = NodeEndpointSet::from_graph(&graph, "/see", RosVersion::Two);
         let names =
-            |topics: &BTreeMap<String, Declared>| topics.keys().cloned().collect::<Vec<_>>();
+            |topics: &BTreeMap<String, DeclaredType>| topics.keys().cloned().collect::<Vec<_>>();
         assert_eq!(names(&seen.outputs), ["/map", "/parameter_events"]);
         assert_eq!(names(&seen.inputs), ["/scan"]);
         let told = seen.outputs["/map"].qos().expect("it is told");
@@ -194,15 +194,15 @@ mod tests {
 
     #[test]
     fn a_process_of_ros_2_has_what_its_nodes_have_and_it_is_said_whose_it_is() {
-        let of = || WireType::named("std_msgs/msg/String").written_by(RosVersion::Two);
+        let of = || WireType::with_name("std_msgs/msg/String").with_version(RosVersion::Two);
         let topics = |names: &[&str]| {
-            let topic = |name: &&str| ((*name).to_owned(), (of(), Qos::keep_last(1)));
+            let topic = |name: &&str| ((*name).to_owned(), (of(), QosProfile::keep_last(1)));
             names.iter().map(topic).collect()
         };
-        let node = |publishes: &[&str], subscribes: &[&str]| NodeEnds {
+        let node = |publishes: &[&str], subscribes: &[&str]| NodeEntities {
             publishers: topics(publishes),
             subscribers: topics(subscribes),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         let nodes = || ["/see".to_owned(), "/tell".to_owned()];
         let graph = |process: &[String]| Graph {
@@ -224,29 +224,29 @@ mod tests {
             ..Graph::default()
         };
         let one = graph(&nodes()[..1]);
-        assert!(owners(&one, "/see").is_empty() && sought(&one, "/see").is_empty());
+        assert!(owners(&one, "/see").is_empty() && unmet_lookups(&one, "/see").is_empty());
         let two = graph(&nodes());
-        let seen = Seen::of(&two, "/see", RosVersion::Two);
+        let seen = NodeEndpointSet::from_graph(&two, "/see", RosVersion::Two);
         let outputs: Vec<_> = seen.outputs.keys().collect();
         assert_eq!(outputs, ["/found", "/said"]);
         assert_eq!(seen.inputs.keys().collect::<Vec<_>>(), ["/image"]);
-        assert_eq!(sought(&two, "/see"), ["/map"]);
+        assert_eq!(unmet_lookups(&two, "/see"), ["/map"]);
         let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
-        let see = Has {
+        let see = NodeEndpoints {
             outputs: names(&["/found"]),
             inputs: names(&["/image"]),
-            ..Has::default()
+            ..NodeEndpoints::default()
         };
-        let tell = Has {
+        let tell = NodeEndpoints {
             outputs: names(&["/found", "/said"]),
-            ..Has::default()
+            ..NodeEndpoints::default()
         };
         let [one, other] = nodes();
         assert_eq!(owners(&two, "/see"), [(one, see), (other, tell)].into());
     }
 
     #[test]
-    fn what_is_looked_for_in_vain_is_a_service_or_an_action() {
+    fn unmet_lookups_are_services_and_actions() {
         let see = || vec!["/see".to_owned()];
         let action = |servers| ActionNodes {
             servers,
@@ -268,6 +268,6 @@ mod tests {
             .into(),
             ..Graph::default()
         };
-        assert_eq!(sought(&graph, "/see"), ["/map", "/go"]);
+        assert_eq!(unmet_lookups(&graph, "/see"), ["/map", "/go"]);
     }
 }

@@ -1,41 +1,42 @@
-//! How a link is doing.
+//! Status of a link.
 
-use link::control::{Refused, Request, Sla};
-use link::drops::Drop;
+use link::control::{IncompatibleEndpoint, RequestTiming, SlaTargets};
+use link::drops::TopicDropCount;
 
-/// How a link is doing, for whoever explains.
+/// Status of a link, for explanations.
 #[derive(Debug, Clone)]
 pub struct LinkStatus {
-    /// The node.
+    /// Name of the node.
     pub node: String,
-    /// Its connection is there and not silent.
+    /// A connection exists and is not silent.
     pub up: bool,
-    /// Last round trip, milliseconds.
+    /// Last round-trip time in milliseconds.
     pub round_trip: Option<f64>,
-    /// The robot's clock minus ours, milliseconds.
+    /// The robot's clock minus ours in milliseconds.
     pub clock: Option<f64>,
-    /// Bytes per second downwards, when it had to hurry.
+    /// Downlink throughput in bytes per second, measured while the link was busy.
     pub throughput: Option<f64>,
-    /// Messages that were dropped in the cloud.
-    pub drops: Vec<Drop>,
-    /// Messages dropped on the robot, as its stub reported.
-    pub dropped: Vec<Drop>,
-    /// What the robot asked for.
-    pub sla: Sla,
-    /// Its last requests, as it told them, oldest first.
-    pub requests: Vec<Request>,
-    /// Messages that the robot did not send in the last minute, since newer ones had come or they were too old.
+    /// Messages dropped in the cloud.
+    pub drops: Vec<TopicDropCount>,
+    /// Messages dropped on the robot, as reported by its stub.
+    pub dropped: Vec<TopicDropCount>,
+    /// Service-level objectives requested by the robot.
+    pub sla: SlaTargets,
+    /// Last requests as reported by the robot, oldest first.
+    pub requests: Vec<RequestTiming>,
+    /// Number of messages that the robot did not send in the last minute because newer ones had arrived or they were
+    /// too old.
     pub unsent: u64,
-    /// The number of the last inputs that the node was given and that have a stamp.
+    /// Number of recent inputs with a stamp that were given to the node.
     pub given: usize,
-    /// Of these, the inputs that it has left out: it answered later ones first.
+    /// Number of those that the node has skipped by answering later ones first.
     pub left_out: usize,
-    /// Topics that the node listens to and nobody on the robot, and no other node of the servant, publishes.
+    /// Topics to which the node subscribes and that nobody on the robot and no other node of the servant publishes.
     pub unfed: Vec<String>,
-    /// Services that the node has looked for in vain, and that are not known to be there now.
+    /// Services that the node has looked up in vain and that are not known to exist now.
     pub unserved: Vec<String>,
-    /// Ends on the robot with which no messages pass, as its stub reported.
-    pub refused: Vec<Refused>,
-    /// Other machines that are connected as the same robot.
+    /// Incompatible endpoints on the robot, as reported by its stub.
+    pub refused: Vec<IncompatibleEndpoint>,
+    /// Other machines connected as the same robot.
     pub duplicates: Vec<String>,
 }

@@ -8,15 +8,15 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::*;
-use link::control::{Exit, FromRobot, Input, Node, Resume};
+use link::control::{Exit, FromRobot, InputChannel, NodeLaunch, Resume};
 use link::record::Record;
 
 mod node_time;
 mod refused;
 
-/// A servant whose nodes run from when they are started, and say nothing.
+/// A servant whose nodes run once started and do nothing.
 #[derive(Default)]
-struct Quiet {
+struct QuietNodes {
     running: Mutex<BTreeSet<String>>,
     warnings: Mutex<Vec<String>>,
     /// Nodes that neither start nor end.
@@ -24,15 +24,15 @@ struct Quiet {
     signals: watch::Sender<Vec<(String, i32)>>,
 }
 
-impl Quiet {
+impl QuietNodes {
     fn is_stuck(&self, node: &str) -> bool {
         self.stuck.lock().contains(node)
     }
 }
 
 #[async_trait]
-impl Nodes for Quiet {
-    async fn start(&self, node: &Node, _: &str) -> Result<(), String> {
+impl NodeController for QuietNodes {
+    async fn start(&self, node: &NodeLaunch, _: &str) -> Result<(), String> {
         if self.is_stuck(&node.name) {
             std::future::pending::<()>().await;
         }
@@ -48,7 +48,7 @@ impl Nodes for Quiet {
         self.running.lock().remove(node);
         Ok(())
     }
-    async fn ended(&self, node: &str) -> Exit {
+    async fn wait_exit(&self, node: &str) -> Exit {
         if self.is_running(node).await {
             std::future::pending::<()>().await;
         }
@@ -57,13 +57,13 @@ impl Nodes for Quiet {
     async fn is_running(&self, node: &str) -> bool {
         self.running.lock().contains(node)
     }
-    fn parameters(&self, _: &Node) -> Vec<(String, ParamValue)> {
+    fn parameters(&self, _: &NodeLaunch) -> Vec<(String, ParamValue)> {
         Vec::new()
     }
-    fn translate(&self, _: &Node, text: &str) -> String {
+    fn translate(&self, _: &NodeLaunch, text: &str) -> String {
         text.to_owned()
     }
-    fn lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
+    fn output_lines(&self, _: &str) -> mpsc::Receiver<(bool, String)> {
         mpsc::channel(1).1
     }
     fn warn(&self, _: &str, text: &str) {
@@ -71,18 +71,18 @@ impl Nodes for Quiet {
     }
 }
 
-async fn hub() -> (Arc<Hub>, Arc<Quiet>) {
+async fn hub() -> (Arc<Hub>, Arc<QuietNodes>) {
     hub_with(HubOptions::default()).await
 }
 
-async fn hub_with(options: HubOptions) -> (Arc<Hub>, Arc<Quiet>) {
+async fn hub_with(options: HubOptions) -> (Arc<Hub>, Arc<QuietNodes>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let master = Master::new(MasterOptions::default());
     tokio::spawn(async move { master.serve(listener, Arc::new(HostSockets)).await });
     let bus = Ros1Bus::connect(Arc::new(HostSockets), address, "/bridge");
     let bus: Arc<dyn Bus> = bus.await.unwrap();
-    let nodes = Arc::new(Quiet::default());
+    let nodes = Arc::new(QuietNodes::default());
     let registry = Arc::new(Registry::default());
     (Hub::new("s1", bus, registry, nodes.clone(), options), nodes)
 }
@@ -93,32 +93,36 @@ fn hello(node: &str, attempt: u64) -> Hello {
         attempt,
         machine: "m1".into(),
         host: "rover".into(),
-        node: Node {
+        node: NodeLaunch {
             name: node.into(),
-            ..Node::default()
+            ..NodeLaunch::default()
         },
         next: 1,
         ..Hello::default()
     }
 }
 
-/// Says hello on a new connection; how that is answered.
-async fn says(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
-    let (socket, welcome, _) = is_served(hub, hello).await;
+/// Sends a hello on a new connection; returns the welcome.
+async fn send_hello(hub: &Arc<Hub>, hello: &Hello) -> (WebSocket<DuplexStream>, Welcome) {
+    let (socket, welcome, _) = serve_hello(hub, hello).await;
     (socket, welcome)
 }
 
-/// The same, and what serves the connection.
-async fn is_served(
+/// As above; also returns the task that serves the connection.
+async fn serve_hello(
     hub: &Arc<Hub>,
     hello: &Hello,
-) -> (WebSocket<DuplexStream>, Welcome, JoinHandle<Lost>) {
+) -> (
+    WebSocket<DuplexStream>,
+    Welcome,
+    JoinHandle<DisconnectReason>,
+) {
     let (robot, cloud) = duplex(1 << 16);
     let hub = Arc::clone(hub);
     let serving = tokio::spawn(async move { hub.serve(cloud, b"").await });
     let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut socket, hello).await.unwrap();
-    let mut held = Budget::unlimited().permit();
+    let mut held = Budget::without_limit().permit();
     let welcome = receive_open(&mut socket, "welcome", &mut held)
         .await
         .unwrap();
@@ -140,18 +144,18 @@ fn resuming(attempt: u64, welcome: &Welcome) -> Hello {
     }
 }
 
-/// Reads until the cloud closes the connection; its words.
-async fn closed(mut socket: WebSocket<DuplexStream>) -> String {
+/// Reads until the cloud closes the connection; returns the reason.
+async fn read_until_close(mut socket: WebSocket<DuplexStream>) -> String {
     loop {
         match std::future::poll_fn(|cx| socket.poll_next(cx)).await {
-            Ok(ws::Message::Close(_, reason)) => return reason,
+            Ok(ws::WsMessage::Close(_, reason)) => return reason,
             Ok(_) => {}
             Err(error) => return error.to_string(),
         }
     }
 }
 
-/// A robot's parameters, in a text of a hundred kilobytes: maps of one member.
+/// Returns parameters with a text of a hundred kilobytes: maps with one entry.
 fn many_parameters() -> BTreeMap<String, ParamValue> {
     let one = || ParamValue::Map([("b".to_owned(), ParamValue::Int(1))].into());
     let all = (0..10_000).map(|n| (format!("a{n}"), one())).collect();
@@ -168,9 +172,13 @@ async fn parameters_of_a_hello_count_until_they_are_set() {
     let (hub, _nodes) = hub_with(options).await;
     let mut hello = hello("/detect", 1);
     hello.parameters = many_parameters();
-    let (_socket, welcome) = says(&hub, &hello).await;
+    let (_socket, welcome) = send_hello(&hub, &hello).await;
     assert!(matches!(welcome, Welcome::Accepted { .. }), "{welcome:?}");
-    assert!(budget.used() < 1 << 20, "{} bytes are held", budget.used());
+    assert!(
+        budget.used_bytes() < 1 << 20,
+        "{} bytes are held",
+        budget.used_bytes()
+    );
 }
 
 #[tokio::test]
@@ -184,20 +192,24 @@ async fn parameters_that_are_set_before_there_is_a_link_are_paid_for() {
     let parameters = &hub.parameters;
     let text = || Some(ParamValue::String("x".repeat(10_000)));
     for _ in 0..1000 {
-        parameters.report(&hub, "/again".into(), text());
+        parameters.report_change(&hub, "/again".into(), text());
     }
     assert!(
-        budget.used() < 20_000,
+        budget.used_bytes() < 20_000,
         "{} bytes: one is kept",
-        budget.used()
+        budget.used_bytes()
     );
     for number in 0..1000 {
-        parameters.report(&hub, format!("/more/{number}"), text());
+        parameters.report_change(&hub, format!("/more/{number}"), text());
     }
-    assert!(budget.refused() > 800, "{} were refused", budget.refused());
-    let untold = parameters.untold();
+    assert!(
+        budget.refusal_count() > 800,
+        "{} were refused",
+        budget.refusal_count()
+    );
+    let untold = parameters.take_pending();
     assert!((90..=104).contains(&untold.len()), "{}", untold.len());
-    assert_eq!(budget.used(), 0, "whoever tells them pays for them");
+    assert_eq!(budget.used_bytes(), 0, "whoever tells them pays for them");
 }
 
 #[tokio::test]
@@ -219,7 +231,7 @@ async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
         tokio::spawn(async move { hub.serve(cloud, b"").await });
         let mut socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
         send_open(&mut socket, &hello).await.unwrap();
-        let reason = closed(socket).await;
+        let reason = read_until_close(socket).await;
         assert!(reason.contains(words), "{reason}");
         assert!(nodes.running.lock().is_empty());
     }
@@ -228,24 +240,24 @@ async fn a_hello_that_has_no_room_is_refused_with_the_reason() {
 #[tokio::test]
 async fn a_hello_that_was_overtaken_does_not_displace_the_later_one() {
     let (hub, _nodes) = hub().await;
-    let (first, welcome) = says(&hub, &hello("/detect", 1)).await;
-    // The robot gives up its second connection and makes a third; the hello of the second comes last.
-    let (third, welcome) = says(&hub, &resuming(3, &welcome)).await;
+    let (first, welcome) = send_hello(&hub, &hello("/detect", 1)).await;
+    // The robot gives up its second connection and makes a third; the hello of the second arrives last.
+    let (third, welcome) = send_hello(&hub, &resuming(3, &welcome)).await;
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
-    closed(first).await;
-    let (_, late) = says(&hub, &resuming(2, &welcome)).await;
+    read_until_close(first).await;
+    let (_, late) = send_hello(&hub, &resuming(2, &welcome)).await;
     assert!(
         matches!(late, Welcome::Refused { again: true, .. }),
         "{late:?}"
     );
-    // One that knew of no session yet would have begun another one.
-    let (_, late) = says(&hub, &hello("/detect", 2)).await;
+    // A hello without a session would have started another one.
+    let (_, late) = send_hello(&hub, &hello("/detect", 2)).await;
     assert!(matches!(late, Welcome::Refused { .. }), "{late:?}");
     let link = hub.links.lock()["/detect"].clone();
     assert!(link.is_connected(), "the third carries it");
-    let (_fourth, welcome) = says(&hub, &resuming(4, &welcome)).await;
+    let (_fourth, welcome) = send_hello(&hub, &resuming(4, &welcome)).await;
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
-    closed(third).await;
+    read_until_close(third).await;
 }
 
 #[tokio::test]
@@ -257,11 +269,11 @@ async fn a_robot_of_another_ros_is_refused_for_good() {
             run: format!("life in ROS {ros}"),
             ..hello("/detect", 1)
         };
-        match says(&hub, &hello).await.1 {
+        match send_hello(&hub, &hello).await.1 {
             Welcome::Accepted { .. } => assert!(!refused, "{ros}"),
             Welcome::Refused { reason, again } => {
                 assert!(refused && !again, "{reason}");
-                let told = format!("servant s1 is of ROS 1 and this robot is of ROS {ros}");
+                let told = format!("servant s1 uses ROS 1, but this robot uses ROS {ros}");
                 assert!(reason.contains(&told), "{reason}");
             }
         }
@@ -282,12 +294,12 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
         roscore: roscore.into(),
         ..hello(node, 1)
     };
-    let (_one, _) = says(&hub, &of("/one", "rover1", "a")).await;
-    let (_two, _) = says(&hub, &of("/two", "rover1", "a")).await;
-    let (_arm, _) = says(&hub, &of("/arm", "computer in the arm", "a")).await;
+    let (_one, _) = send_hello(&hub, &of("/one", "rover1", "a")).await;
+    let (_two, _) = send_hello(&hub, &of("/two", "rover1", "a")).await;
+    let (_arm, _) = send_hello(&hub, &of("/arm", "computer in the arm", "a")).await;
     assert!(nodes.warnings.lock().is_empty(), "they are one robot");
     assert!(hub.status().iter().all(|link| link.duplicates.is_empty()));
-    let (_copy, welcome) = says(&hub, &of("/other", "rover2", "b")).await;
+    let (_copy, welcome) = send_hello(&hub, &of("/other", "rover2", "b")).await;
     assert!(matches!(welcome, Welcome::Accepted { .. }));
     let warnings = nodes.warnings.lock().clone();
     assert_eq!(
@@ -308,7 +320,7 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
         assert_eq!(link.duplicates, duplicates, "{}", link.node);
     }
     // The same node is refused.
-    let (_, refused) = says(&hub, &of("/one", "rover2", "b")).await;
+    let (_, refused) = send_hello(&hub, &of("/one", "rover2", "b")).await;
     let Welcome::Refused { reason, again } = refused else {
         panic!("{refused:?}");
     };
@@ -318,14 +330,14 @@ async fn machines_of_two_robots_are_told_of_each_other_and_those_of_one_are_not(
     );
 }
 
-/// Not a measure of anything: a test that hangs shall say so.
+/// Only reports a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 #[tokio::test]
 async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     let (hub, nodes) = hub().await;
-    let (_detect, welcome) = says(&hub, &hello("/detect", 1)).await;
-    // One node takes for ever to start …
+    let (_detect, welcome) = send_hello(&hub, &hello("/detect", 1)).await;
+    // One node never finishes starting …
     nodes.stuck.lock().insert("/starting".into());
     let starting = Hello {
         run: "another life".into(),
@@ -336,12 +348,12 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
     tokio::spawn(async move { serving.serve(cloud, b"").await });
     let mut starting_socket = WebSocket::client(robot, b"", MAX_FRAME, MAX_RECORD, 7);
     send_open(&mut starting_socket, &starting).await.unwrap();
-    // … and one to end, after its robot has left it.
+    // … and another never finishes ending, after its robot has left it.
     let another = Hello {
         run: "a third life".into(),
         ..hello("/ending", 1)
     };
-    let begun = timeout(PATIENCE, says(&hub, &another)).await;
+    let begun = timeout(PATIENCE, send_hello(&hub, &another)).await;
     let (mut ending, _) = begun.expect("others hold it up");
     nodes.stuck.lock().insert("/ending".into());
     ending.queue_close(1000, "");
@@ -353,7 +365,7 @@ async fn a_link_is_taken_up_while_other_nodes_start_and_end() {
         .expect("it is asked to end")
         .unwrap();
     let back = resuming(2, &welcome);
-    let resumed = says(&hub, &back);
+    let resumed = send_hello(&hub, &back);
     let (_, welcome) = timeout(PATIENCE, resumed).await.expect("others hold it up");
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
 }
@@ -365,12 +377,12 @@ async fn a_link_whose_connection_is_dropped_ends_with_its_node() {
         ..HubOptions::default()
     };
     let (hub, nodes) = hub_with(options).await;
-    let (_socket, _, serving) = is_served(&hub, &hello("/detect", 1)).await;
+    let (_socket, _, serving) = serve_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let (mut up, mut signals) = (link.session.up(), nodes.signals.subscribe());
+    let (mut up, mut signals) = (link.session.watch_up(), nodes.signals.subscribe());
     let is_up = timeout(PATIENCE, up.wait_for(|up| *up)).await;
     drop(is_up.expect("it is carried").unwrap());
-    // As where its robot may not be here any more.
+    // Like a place whose robot may be gone.
     serving.abort();
     let is_down = timeout(PATIENCE, up.wait_for(|up| !*up)).await;
     drop(is_down.expect("nothing carries it").unwrap());
@@ -382,48 +394,48 @@ async fn a_link_whose_connection_is_dropped_ends_with_its_node() {
 #[tokio::test]
 async fn robots_are_told_why_their_links_are_closed() {
     let (hub, _nodes) = hub().await;
-    let (socket, _) = says(&hub, &hello("/detect", 1)).await;
+    let (socket, _) = send_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let mut up = link.session.up();
+    let mut up = link.session.watch_up();
     let is_up = timeout(PATIENCE, up.wait_for(|up| *up)).await;
     drop(is_up.expect("it is carried").unwrap());
     hub.close("the service was taken back");
-    let reason = timeout(PATIENCE, closed(socket)).await;
+    let reason = timeout(PATIENCE, read_until_close(socket)).await;
     assert_eq!(reason.expect("it is closed"), "the service was taken back");
 }
 
 #[tokio::test]
 async fn a_link_that_is_taken_up_as_its_grace_ends_goes_on() {
     let (hub, nodes) = hub().await;
-    let (_first, welcome) = says(&hub, &hello("/detect", 1)).await;
+    let (_first, welcome) = send_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
     let turn = *link.kick.borrow();
-    let (_second, welcome) = says(&hub, &resuming(2, &welcome)).await;
+    let (_second, welcome) = send_hello(&hub, &resuming(2, &welcome)).await;
     assert!(matches!(welcome, Welcome::Accepted { resumed: true, .. }));
-    // What was about to end it comes too late.
-    hub.end(&link, turn).await;
+    // The pending end comes too late for it.
+    hub.end_link(&link, turn).await;
     assert!(hub.links.lock().contains_key("/detect"));
     assert!(nodes.is_running("/detect").await);
 }
 
 #[tokio::test]
 async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
-    // The node does not connect to what it is sent, as one that was stopped does not.
+    // The node does not connect to its input, like a stopped process.
     let (hub, nodes) = hub_with(HubOptions {
         warm_up: PATIENCE * 10,
         ..HubOptions::default()
     })
     .await;
-    let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
+    let (_robot, _) = send_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    let held = || Budget::unlimited().permit();
-    let tell = |order| link::Handler::record(&*link, Record::Control(order), held(), 0);
-    tell(FromRobot::Open(Input {
+    let held = || Budget::without_limit().permit();
+    let tell = |order| link::SessionHandler::on_record(&*link, Record::Control(order), held(), 0);
+    tell(FromRobot::Open(InputChannel {
         channel: 1,
         topic: "/image".into(),
         type_name: "std_msgs/Empty".into(),
         md5: "d41d8cd98f00b204e9800998ecf8427e".into(),
-        ..Input::default()
+        ..InputChannel::default()
     }));
     for signal in [2, 15] {
         tell(FromRobot::Signal { signal });
@@ -440,9 +452,9 @@ async fn a_signal_does_not_wait_for_what_the_node_does_not_answer() {
 #[tokio::test]
 async fn asking_how_a_link_is_doing_holds_up_no_connection() {
     let (hub, _nodes) = hub().await;
-    let (_robot, _) = says(&hub, &hello("/detect", 1)).await;
+    let (_robot, _) = send_hello(&hub, &hello("/detect", 1)).await;
     let link = hub.links.lock()["/detect"].clone();
-    // Whoever asks comes as far as to the links of other machines …
+    // The status query gets as far as the links of other machines …
     let held = hub.links.lock();
     let (sender, thread) = std::sync::mpsc::channel();
     let asked = Arc::clone(&link);
@@ -480,9 +492,9 @@ async fn asking_how_a_link_is_doing_holds_up_no_connection() {
 #[test]
 fn a_robot_may_tell_any_number_for_its_t_max() {
     let max_age = |max| {
-        session_options(&Sla {
+        session_options(&SlaTargets {
             max: Some(max),
-            ..Sla::default()
+            ..SlaTargets::default()
         })
         .max_age
     };

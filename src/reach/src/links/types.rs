@@ -1,4 +1,4 @@
-//! Definitions of types as the ends of links declare them, by what the image holds.
+//! Lookup of the type definitions for declared types in the image.
 
 use std::sync::Arc;
 
@@ -6,21 +6,28 @@ use ros::bus::{Digest, ServiceType, WireType};
 use ros::codec::Stamps;
 use ros::schema::{MessageType, Registry, ServiceDef};
 
-/// The definition of a type of messages, if the image has the same.
-pub(super) fn message(registry: &Registry, of: &WireType) -> Option<Arc<MessageType>> {
+/// Returns the definition of a message type, if the image has the same type.
+pub(super) fn find_message(registry: &Registry, of: &WireType) -> Option<Arc<MessageType>> {
     let known = registry.message(&of.name).ok()?;
-    let same = of.digest.agrees(&Digest::from(known.digest()));
+    let same = of.digest.is_compatible_with(&Digest::from(known.digest()));
     same.then_some(known)
 }
 
-/// The definition of a type of services, if the image has the same.
-pub(super) fn service(registry: &Registry, of: &ServiceType) -> Option<Arc<ServiceDef>> {
+/// Returns the definition of a service type, if the image has the same type.
+pub(super) fn find_service(registry: &Registry, of: &ServiceType) -> Option<Arc<ServiceDef>> {
     let known = registry.service(&of.name).ok()?;
-    ServiceType::of(&known).agrees(of).then_some(known)
+    ServiceType::from_service(&known)
+        .is_compatible_with(of)
+        .then_some(known)
 }
 
-/// Where the stamps of requests and responses stand; nowhere where the type is not known.
-pub(super) fn stamps_of_calls(of: Option<&ServiceDef>) -> (Stamps, Stamps) {
-    let known = of.map(|of| (Stamps::of(&of.request), Stamps::of(&of.response)));
+/// Returns the positions of the stamps in requests and responses; none if the type is unknown.
+pub(super) fn call_stamps(of: Option<&ServiceDef>) -> (Stamps, Stamps) {
+    let known = of.map(|of| {
+        (
+            Stamps::for_type(&of.request),
+            Stamps::for_type(&of.response),
+        )
+    });
     known.unwrap_or_default()
 }

@@ -1,30 +1,30 @@
-//! What the robot did not send lately, as it tells.
+//! Messages that the robot recently did not send, as reported by it.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use parking_lot::Mutex;
 
-/// What counts as lately.
+/// Length of the observation period.
 const LATELY: Duration = Duration::from_secs(60);
-/// Reports kept: robots tell once a second.
+/// Maximum number of reports kept; robots report once a second.
 const REPORTS: usize = 120;
 
 /// Messages of one session that the robot has not sent.
 #[derive(Default)]
-pub(super) struct Unsent(Mutex<State>);
+pub(super) struct UnsentCounter(Mutex<State>);
 
 #[derive(Default)]
 struct State {
-    /// Over the session.
+    /// Total of the session.
     all: u64,
-    /// How many more there were, and when that was told.
+    /// Times and increments of the reports.
     reports: VecDeque<(Instant, u64)>,
 }
 
-impl Unsent {
-    /// So many it was over the session.
-    pub(super) fn note(&self, all: u64) {
+impl UnsentCounter {
+    /// Records the total reported for the session.
+    pub(super) fn record_total(&self, all: u64) {
         let mut state = self.0.lock();
         let more = all.saturating_sub(state.all);
         state.all = all;
@@ -33,8 +33,8 @@ impl Unsent {
         state.reports.drain(..surplus);
     }
 
-    /// So many it was in the last minute.
-    pub(super) fn lately(&self) -> u64 {
+    /// Returns the number in the last minute.
+    pub(super) fn last_minute(&self) -> u64 {
         let state = self.0.lock();
         let lately = state
             .reports
@@ -52,17 +52,17 @@ mod tests {
 
     #[test]
     fn what_is_told_of_the_session_is_summed_up_lately() {
-        let unsent = Unsent::default();
-        unsent.note(3);
-        unsent.note(10);
-        assert_eq!(unsent.lately(), 10);
-        // A robot may tell anything.
-        unsent.note(0);
-        unsent.note(u64::MAX);
-        assert_eq!(unsent.lately(), u64::MAX);
+        let unsent = UnsentCounter::default();
+        unsent.record_total(3);
+        unsent.record_total(10);
+        assert_eq!(unsent.last_minute(), 10);
+        // A robot may report anything.
+        unsent.record_total(0);
+        unsent.record_total(u64::MAX);
+        assert_eq!(unsent.last_minute(), u64::MAX);
         for _ in 0..REPORTS {
-            unsent.note(u64::MAX);
+            unsent.record_total(u64::MAX);
         }
-        assert_eq!(unsent.lately(), 0, "the oldest are forgotten");
+        assert_eq!(unsent.last_minute(), 0, "the oldest are forgotten");
     }
 }

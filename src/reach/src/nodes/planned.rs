@@ -1,70 +1,73 @@
-//! The revision's own nodes, which run in a servant until the first stub of its robot comes.
+//! The revision's own nodes, which run in a servant until the first stub of its robot connects.
 //!
 //! ```text
 //!  Running ──first stub──▶ Ending ──all have ended──▶ Ended
-//!     └──stubs from the beginning: there are none──────▲
+//!     └──stubs from the beginning, no own nodes────────▲
 //! ```
-//! Every stub's node waits until they have ended, not only the first one: it may have the name of one of them.
+//! Every stub's node waits until they have ended, not only the first one, because it may have the name of one of them.
 
 use std::future::Future;
 use std::time::Duration;
 
 use futures_util::future::join_all;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::spec::NodeSpec;
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-/// Signals to a node that is to end, and how long it may take after each, as roslaunch has it but for the length.
+/// Signals for stopping a node and the time after each; like roslaunch except for the times.
 const STOP: [(i32, Duration); 3] = [
     (libc::SIGINT, Duration::from_secs(5)),
     (libc::SIGTERM, Duration::from_secs(2)),
     (libc::SIGKILL, Duration::from_secs(5)),
 ];
 
-/// How far they are.
+/// State of the nodes.
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
-enum Stage {
+enum OwnNodesStage {
     #[default]
     Running,
     Ending,
     Ended,
 }
 
-/// Whether they run.
+/// The state of the revision's own nodes.
 #[derive(Debug, Default)]
-pub(super) struct Planned(Mutex<Stage>);
+pub(super) struct OwnNodes(Mutex<OwnNodesStage>);
 
-impl Planned {
-    /// Returns when none runs any more. `take_over` is asked once whether there are any to be ended. Whoever calls may
-    /// go away meanwhile: the next one goes on.
-    pub(super) async fn end<F>(&self, take_over: impl FnOnce() -> bool, ending: impl FnOnce() -> F)
-    where
+impl OwnNodes {
+    /// Waits until none is running. `take_over` is called once to determine whether there are any to end. The future
+    /// may be dropped meanwhile: the next caller continues.
+    pub(super) async fn end_once<F>(
+        &self,
+        take_over: impl FnOnce() -> bool,
+        ending: impl FnOnce() -> F,
+    ) where
         F: Future<Output = ()>,
     {
         let mut stage = self.0.lock().await;
-        if *stage == Stage::Running {
+        if *stage == OwnNodesStage::Running {
             *stage = if take_over() {
-                Stage::Ending
+                OwnNodesStage::Ending
             } else {
-                Stage::Ended
+                OwnNodesStage::Ended
             };
         }
-        if *stage == Stage::Ending {
+        if *stage == OwnNodesStage::Ending {
             ending().await;
-            *stage = Stage::Ended;
+            *stage = OwnNodesStage::Ended;
         }
     }
 }
 
-/// Ends nodes for good, all at once; returns when none runs, or the last signal was in vain.
-pub(super) async fn end_all(container: &dyn Servant, nodes: &[NodeSpec]) {
-    join_all(nodes.iter().map(|node| end(container, &node.name))).await;
+/// Ends nodes permanently and concurrently; returns when none is running, or the last signal had no effect.
+pub(super) async fn end_all(container: &dyn ServantHandle, nodes: &[NodeSpec]) {
+    join_all(nodes.iter().map(|node| end_node(container, &node.name))).await;
 }
 
-async fn end(container: &dyn Servant, node: &str) {
+async fn end_node(container: &dyn ServantHandle, node: &str) {
     for (signal, patience) in STOP {
-        // One that does not run is not started again either.
+        // A node that is not running is not restarted either.
         if container.end_node(node, signal).await.is_err() {
             return;
         }
@@ -90,7 +93,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_second_stub_waits_for_what_the_first_one_ends_even_if_that_one_goes_away() {
-        let planned = Arc::new(Planned::default());
+        let planned = Arc::new(OwnNodes::default());
         let (asked, begun, over) = (
             Arc::new(AtomicUsize::new(0)),
             Arc::new(Semaphore::new(0)),
@@ -105,7 +108,7 @@ mod tests {
                     begun.add_permits(1);
                     over.acquire().await.unwrap().forget();
                 };
-                planned.end(take_over, ending).await;
+                planned.end_once(take_over, ending).await;
             })
         };
         let (first, _) = (stub(), begun.acquire().await.unwrap().forget());
@@ -124,10 +127,10 @@ mod tests {
 
     #[tokio::test]
     async fn where_stubs_were_first_there_is_nothing_to_end() {
-        let planned = Planned::default();
+        let planned = OwnNodes::default();
         for _ in 0..2 {
             planned
-                .end(|| false, || async { panic!("none was started") })
+                .end_once(|| false, || async { panic!("none was started") })
                 .await;
         }
     }

@@ -1,4 +1,4 @@
-//! What a robot's stubs tell of their nodes, as events of its servant.
+//! Events of a servant that are reported by its robot's stubs.
 
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant, SystemTime};
@@ -9,12 +9,13 @@ use parking_lot::Mutex;
 
 use crate::{Observer, Tenant};
 
-/// So many decisions of a robot become events within this time; more are left out, for a robot can tell any number.
+/// Maximum number of a robot's decisions recorded as events in this time; further ones are ignored, because a robot can
+/// report any number.
 const DECISIONS: (u32, Duration) = (60, Duration::from_secs(60));
-/// Characters of what a robot says in an event.
+/// Maximum number of characters of a robot's text in an event.
 const WORDS: usize = 400;
 
-/// Kinds of a robot's decisions that are known.
+/// Known kinds of a robot's decisions.
 const KINDS: [&str; 7] = [
     "local-takes-over",
     "local-hands-back",
@@ -25,20 +26,20 @@ const KINDS: [&str; 7] = [
     "state-lost",
 ];
 
-/// What is told, of whom, and to whom.
-pub(crate) struct Told {
-    /// The servant's id.
+/// Reporter of a robot's events.
+pub(crate) struct RobotEvents {
+    /// Servant id.
     servant: String,
     observer: Arc<dyn Observer>,
-    /// Decisions since then.
+    /// Start of the current interval, and number of decisions in it.
     decisions: Mutex<(Instant, u32)>,
-    /// A container is made before anybody asks for it.
+    /// Set late, because a container may be created before anybody uses it.
     tenant: OnceLock<Weak<dyn Tenant>>,
 }
 
-impl Told {
-    pub(crate) fn new(servant: &str, observer: Arc<dyn Observer>) -> Told {
-        Told {
+impl RobotEvents {
+    pub(crate) fn new(servant: &str, observer: Arc<dyn Observer>) -> RobotEvents {
+        RobotEvents {
             servant: servant.to_owned(),
             observer,
             decisions: Mutex::new((Instant::now(), 0)),
@@ -46,8 +47,8 @@ impl Told {
         }
     }
 
-    /// From now on the servant serves this one.
-    pub(crate) fn bind(&self, tenant: Weak<dyn Tenant>) {
+    /// Assigns the servant to a tenant.
+    pub(crate) fn bind_tenant(&self, tenant: Weak<dyn Tenant>) {
         let _ = self.tenant.set(tenant);
     }
 
@@ -62,8 +63,8 @@ impl Told {
         &*self.observer
     }
 
-    /// The robot has decided something about the local original of a node.
-    pub(crate) fn decided(&self, node: &str, decision: &Decision) {
+    /// Records a decision of the robot about the local original of a node.
+    pub(crate) fn record_decision(&self, node: &str, decision: &Decision) {
         let Ok(tenant) = self.tenant() else { return };
         let count = {
             let mut decisions = self.decisions.lock();
@@ -95,7 +96,8 @@ impl Told {
         } else {
             Level::Info
         };
-        self.observer.event(level, kind, &message, Some(robot));
+        self.observer
+            .record_event(level, kind, &message, Some(robot));
         let why = match kind {
             "local-takes-over" | "local-answers-too" => Some(&*text),
             "local-hands-back" | "cloud-answers-alone" => None,
@@ -104,13 +106,14 @@ impl Told {
         let ago = Duration::try_from_secs_f64(decision.ago).unwrap_or_default();
         let at = SystemTime::now().checked_sub(ago);
         let at = at.unwrap_or_else(SystemTime::now);
-        self.observer.served_locally(robot, node, at, why);
+        self.observer.on_served_locally(robot, node, at, why);
     }
 
-    /// Something that whoever looks after the server should know of this robot.
+    /// Reports a problem of this robot to the operator.
     pub(crate) fn warn(&self, kind: &str, text: &str) {
         let tenant = self.tenant().ok();
         let robot = tenant.as_ref().map(|tenant| tenant.robot());
-        self.observer.event(Level::Warning, kind, text, robot);
+        self.observer
+            .record_event(Level::Warning, kind, text, robot);
     }
 }

@@ -1,4 +1,4 @@
-//! The outputs of a servant that is given recorded requests, and which of them answer what.
+//! Outputs of a servant during a replay, and which of them answer requests.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -6,46 +6,49 @@ use std::time::{Duration, Instant};
 use api::trial::Heard;
 use bytes::Bytes;
 use package::interface::{Direction, Interface, Topic};
-use ros::bus::{Bus, Qos, Subscription, WireType};
+use ros::bus::{Bus, QosProfile, Subscription, WireType};
 use ros::codec::{JsonOptions, Time, to_json};
 use ros::schema::Registry;
 use tokio::sync::mpsc;
 
 use super::plan::stamp;
-use super::{QUEUE, failed};
+use super::{QUEUE, trial_error};
 use crate::Error;
 
-/// Longer messages are not shown.
+/// Maximum size of a message that is shown.
 const LONGEST_SHOWN: usize = 2000;
 
-/// All outputs, each heard by a task.
-pub(super) struct Ears {
+/// All outputs, each received by a task.
+pub(super) struct OutputListeners {
     topics: Vec<(Topic, usize, Bytes)>,
     said: mpsc::UnboundedReceiver<(usize, Instant, Bytes)>,
-    /// The output whose messages answer requests that have no stamp.
+    /// The output whose messages answer requests without a stamp.
     answering: Option<usize>,
     tasks: Vec<tokio::task::AbortHandle>,
 }
 
-impl Ears {
-    pub(super) async fn open(bus: &Arc<dyn Bus>, interface: &Interface) -> Result<Ears, Error> {
+impl OutputListeners {
+    pub(super) async fn open(
+        bus: &Arc<dyn Bus>,
+        interface: &Interface,
+    ) -> Result<OutputListeners, Error> {
         let (sender, said) = mpsc::unbounded_channel();
-        let mut ears = Ears {
+        let mut ears = OutputListeners {
             topics: Vec::new(),
             said,
             answering: None,
             tasks: Vec::new(),
         };
-        // Latched outputs tell a state; they answer nothing.
+        // Latched outputs are states, not responses.
         let outputs = interface
             .topics
             .iter()
             .filter(|topic| topic.direction == Direction::Output && !topic.latched);
         for (number, topic) in outputs.enumerate() {
             let subscription = bus
-                .subscribe(&topic.name, WireType::any(), Qos::keep_last(QUEUE))
+                .subscribe(&topic.name, WireType::any(), QosProfile::keep_last(QUEUE))
                 .await
-                .map_err(failed)?;
+                .map_err(trial_error)?;
             let task = tokio::spawn(listen(number, subscription, sender.clone()));
             ears.tasks.push(task.abort_handle());
             ears.topics.push((topic.clone(), 0, Bytes::new()));
@@ -53,23 +56,23 @@ impl Ears {
         Ok(ears)
     }
 
-    fn note(&mut self, (number, at, bytes): (usize, Instant, Bytes)) -> Instant {
+    fn record(&mut self, (number, at, bytes): (usize, Instant, Bytes)) -> Instant {
         let (_, received, last) = &mut self.topics[number];
         *received += 1;
         *last = bytes;
         at
     }
 
-    /// What came by now answers nothing that is asked from now on.
-    pub(super) fn forget(&mut self) {
+    /// Discards what has arrived, which does not answer later requests.
+    pub(super) fn drain(&mut self) {
         while let Ok(said) = self.said.try_recv() {
-            self.note(said);
+            self.record(said);
         }
     }
 
-    /// When the answer came: the first output with the request's stamp, or, where either has none, the next on the
-    /// topic that answered the first request.
-    pub(super) async fn answer(
+    /// Waits for the response: the first output with the request's stamp, or, if either has none, the next message on
+    /// the topic that answered the first request.
+    pub(super) async fn wait_answer(
         &mut self,
         patience: Duration,
         asked: Option<Time>,
@@ -80,7 +83,7 @@ impl Ears {
             let said = tokio::time::timeout_at(deadline, self.said.recv()).await;
             let (number, at, bytes) = said.ok()??;
             let stamp = stamp(&self.topics[number].0.type_name, &bytes, registry);
-            self.note((number, at, bytes));
+            self.record((number, at, bytes));
             let answers = match (asked, stamp) {
                 (Some(asked), Some(stamp)) => asked == stamp,
                 _ => *self.answering.get_or_insert(number) == number,
@@ -91,8 +94,8 @@ impl Ears {
         }
     }
 
-    pub(super) fn heard(&mut self, registry: &Registry) -> Vec<Heard> {
-        self.forget();
+    pub(super) fn summarize(&mut self, registry: &Registry) -> Vec<Heard> {
+        self.drain();
         let shown = |topic: &Topic, last: &Bytes| {
             let of_type = registry.message(&topic.type_name).ok()?;
             let mut json = Vec::new();
@@ -116,7 +119,7 @@ impl Ears {
     }
 }
 
-impl Drop for Ears {
+impl Drop for OutputListeners {
     fn drop(&mut self) {
         self.tasks.iter().for_each(|task| task.abort());
     }

@@ -1,47 +1,47 @@
-//! How requests follow one another: never before the last was answered.
+//! Timing of replayed requests: a request never precedes the response to the previous one.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// How requests follow one another, and how many.
+/// Timing and number of requests.
 #[derive(Debug, Clone)]
-pub struct Pace {
-    /// The input whose messages are the requests; none: the first that is fed.
+pub struct ReplayPace {
+    /// Input whose messages are the requests; by default the first one that is fed.
     pub input: Option<String>,
-    /// Requests whose times are told, at most.
+    /// Maximum number of requests whose times are reported.
     pub requests: usize,
-    /// The messages come again and again.
+    /// Repeat the messages.
     pub again: bool,
-    /// From one request to the next, at least.
-    pub gap: Gap,
-    /// How long an answer is waited for.
+    /// Minimum time from one request to the next.
+    pub gap: RequestGap,
+    /// Timeout of a response.
     pub answer: Duration,
-    /// How long all of it may take.
+    /// Maximum total duration.
     pub whole: Duration,
-    /// So many requests in vain, one after the other, end it.
+    /// Number of consecutive unanswered requests that end the replay.
     pub in_vain: Option<usize>,
 }
 
-/// From one request to the next.
+/// Time from one request to the next.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Gap {
-    /// Nothing: each follows the answer before it.
+pub enum RequestGap {
+    /// None: each request follows the response before it.
     None,
-    /// As it was recorded.
+    /// As recorded.
     Recorded,
-    /// So many requests a second.
+    /// At this rate in requests per second.
     Rate(f64),
 }
 
-impl Pace {
-    /// Each message once, as fast as it is answered.
-    pub fn once(answer: Duration) -> Pace {
-        Pace {
+impl ReplayPace {
+    /// Creates a timing in which each message is sent once, as fast as it is answered.
+    pub fn once(answer: Duration) -> ReplayPace {
+        ReplayPace {
             input: None,
             requests: usize::MAX,
             again: false,
-            gap: Gap::None,
+            gap: RequestGap::None,
             answer,
             whole: Duration::from_secs(24 * 3600),
             in_vain: None,
@@ -49,29 +49,29 @@ impl Pace {
     }
 }
 
-/// When messages are due. Of time that was lost, no more is made up for than lies between two requests.
-pub(super) struct Clock {
+/// Schedule of the messages. Lost time is made up for by at most one request interval.
+pub(super) struct ReplayClock {
     began: Instant,
-    /// Of a round, as recorded.
+    /// Recorded length of a round.
     length: Duration,
-    /// What a recorded time is multiplied by.
+    /// Factor on recorded times.
     scale: f64,
-    /// Requests a second.
+    /// Requests per second.
     pace: Option<f64>,
 }
 
-impl Clock {
-    /// For rounds of this length and so many requests.
-    pub(super) fn new(length: Duration, requests: usize, gap: Gap) -> Clock {
+impl ReplayClock {
+    /// Creates a schedule for rounds of this length with this many requests.
+    pub(super) fn new(length: Duration, requests: usize, gap: RequestGap) -> ReplayClock {
         let recorded = requests as f64 / length.as_secs_f64();
         let scale = match gap {
-            Gap::None => 0.0,
-            Gap::Recorded => 1.0,
-            Gap::Rate(rate) => recorded / rate,
+            RequestGap::None => 0.0,
+            RequestGap::Recorded => 1.0,
+            RequestGap::Rate(rate) => recorded / rate,
         };
-        // A recording of one message has no pace of its own.
+        // A recording of one message has no rate.
         let scale = if recorded.is_finite() { scale } else { 0.0 };
-        Clock {
+        ReplayClock {
             began: Instant::now(),
             length,
             scale,
@@ -79,12 +79,12 @@ impl Clock {
         }
     }
 
-    /// Requests a second that are to be made.
+    /// Returns the intended requests per second.
     pub(super) fn pace(&self) -> Option<f64> {
         self.pace
     }
 
-    /// When a message of this round, recorded `at` since the first, is to be published: now or later.
+    /// Returns when a message of this round, recorded `at` after the first, is to be published: now or later.
     pub(super) fn due(&mut self, round: usize, at: Duration) -> Instant {
         let recorded = self.length.as_secs_f64() * round as f64 + at.as_secs_f64();
         let due = self.began + Duration::from_secs_f64(recorded * self.scale);
@@ -106,15 +106,15 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn messages_are_due_as_recorded_and_no_crowd_of_them_follows_a_long_answer() {
         let began = Instant::now();
-        let mut clock = Clock::new(400 * MS, 4, Gap::Recorded);
+        let mut clock = ReplayClock::new(400 * MS, 4, RequestGap::Recorded);
         assert_eq!(clock.pace(), Some(10.0));
         let since = |due: Instant| due.duration_since(began).as_millis();
         assert_eq!(since(clock.due(0, 100 * MS)), 100);
-        // A little late: the next comes when it would have come.
+        // Slightly late: the next one keeps its time.
         tokio::time::advance(150 * MS).await;
         assert_eq!(since(clock.due(0, 100 * MS)), 150);
         assert_eq!(since(clock.due(0, 200 * MS)), 200);
-        // The answer took as long as three requests: but one of them is made up for.
+        // The response took as long as three requests, of which one is made up for.
         tokio::time::advance(350 * MS).await;
         assert_eq!(since(clock.due(0, 200 * MS)), 500);
         assert_eq!(since(clock.due(0, 300 * MS)), 500);
@@ -124,14 +124,17 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_rate_takes_the_place_of_the_recorded_pace() {
         let began = Instant::now();
-        let mut clock = Clock::new(400 * MS, 4, Gap::Rate(20.0));
+        let mut clock = ReplayClock::new(400 * MS, 4, RequestGap::Rate(20.0));
         assert_eq!(clock.pace(), Some(20.0));
         assert_eq!(clock.due(1, 100 * MS).duration_since(began), 250 * MS);
-        let mut clock = Clock::new(400 * MS, 4, Gap::None);
+        let mut clock = ReplayClock::new(400 * MS, 4, RequestGap::None);
         assert_eq!((clock.pace(), clock.due(3, 100 * MS)), (None, began));
-        // One message has no pace.
-        let clock = Clock::new(Duration::ZERO, 1, Gap::Recorded);
+        // One message has no rate.
+        let clock = ReplayClock::new(Duration::ZERO, 1, RequestGap::Recorded);
         assert_eq!(clock.pace(), None);
-        assert_eq!(Clock::new(Duration::ZERO, 1, Gap::Rate(5.0)).pace(), None);
+        assert_eq!(
+            ReplayClock::new(Duration::ZERO, 1, RequestGap::Rate(5.0)).pace(),
+            None
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Pictures as a camera would publish them: `sensor_msgs/Image`, `rgb8`.
+//! Images as published by a camera: `sensor_msgs/Image`, `rgb8`.
 
 use std::fmt;
 use std::io::Cursor;
@@ -11,13 +11,13 @@ use ros::bus::RosVersion;
 
 use crate::Error;
 
-/// What becomes of it, by the names that both ROSes have for it.
+/// Message type of the images, by its names in both ROS versions.
 pub const TYPES: [&str; 2] = ["sensor_msgs/Image", "sensor_msgs/msg/Image"];
 const SIGNATURE: &[u8] = b"\x89PNG\r\n\x1a\n";
-/// The largest picture, decoded; and as much as several may have together.
+/// Maximum size of a decoded image, and of several together.
 const MAX_BYTES: usize = 128 << 20;
 
-/// Rows of red, green, blue.
+/// An image as rows of red, green, blue.
 #[derive(Clone)]
 pub struct Picture {
     width: u32,
@@ -32,12 +32,12 @@ impl fmt::Debug for Picture {
 }
 
 impl Picture {
-    /// Decodes PNG files, one behind the other: as many of them as have 128 MiB when decoded. Also how many there are.
+    /// Decodes concatenated PNG files, as many as have 128 MiB when decoded. Also returns the total number of files.
     pub fn read_all(mut files: &[u8]) -> Result<(Vec<Picture>, usize), Error> {
         let (mut pictures, mut bytes, mut count) = (Vec::new(), 0, 0);
         while !files.is_empty() {
             count += 1;
-            let (file, rest) = files.split_at(length(files).unwrap_or(files.len()));
+            let (file, rest) = files.split_at(png_length(files).unwrap_or(files.len()));
             files = rest;
             if bytes >= MAX_BYTES {
                 continue;
@@ -94,16 +94,18 @@ impl Picture {
         })
     }
 
-    /// The message, taken now. (sensor_msgs/Image: header, height, width, encoding, is_bigendian, step, data.)
+    /// Returns the message with the current time as its stamp. (sensor_msgs/Image: header, height, width, encoding,
+    /// is_bigendian, step, data.)
     pub fn message(&self, sequence: usize, ros: RosVersion) -> Bytes {
         match ros {
-            RosVersion::One => self.of_ros_1(sequence),
-            RosVersion::Two => self.of_ros_2(),
+            RosVersion::One => self.to_ros1_message(sequence),
+            RosVersion::Two => self.to_ros2_message(),
         }
     }
 
-    /// CDR: numbers are aligned to their size behind the header of four bytes, texts end with a zero that counts.
-    fn of_ros_2(&self) -> Bytes {
+    /// CDR: numbers are aligned to their size after the header of four bytes, and the length of a string includes its
+    /// terminating zero.
+    fn to_ros2_message(&self) -> Bytes {
         const HEADER: [u8; 4] = [0, 1, 0, 0];
         let now = SystemTime::now()
             .duration_since(UNIX_EPOCH)
@@ -111,7 +113,7 @@ impl Picture {
         let mut out = Vec::with_capacity(self.rgb.len() + 64);
         out.extend_from_slice(&HEADER);
         let mut word = |value: u32, text: &str| {
-            // The header's length is a multiple of four, too.
+            // The length of the header is a multiple of four, too.
             out.resize(out.len().next_multiple_of(4), 0);
             out.extend_from_slice(&value.to_le_bytes());
             out.extend_from_slice(text.as_bytes());
@@ -121,7 +123,7 @@ impl Picture {
         word(7, "camera\0");
         word(self.height, "");
         word(self.width, "");
-        // Behind the text: it is little endian.
+        // The byte after the text: little-endian.
         word(5, "rgb8\0\0");
         word(self.width * 3, "");
         word(self.rgb.len() as u32, "");
@@ -129,7 +131,7 @@ impl Picture {
         out.into()
     }
 
-    fn of_ros_1(&self, sequence: usize) -> Bytes {
+    fn to_ros1_message(&self, sequence: usize) -> Bytes {
         let now = SystemTime::now()
             .duration_since(UNIX_EPOCH)
             .unwrap_or_default();
@@ -153,9 +155,9 @@ impl Picture {
     }
 }
 
-/// Length of the PNG file that `files` begin with: its signature and its chunks, each with its length before and a checksum
-/// behind, up to `IEND` (PNG specification, section 5); none where it is cut off or another file.
-fn length(files: &[u8]) -> Option<usize> {
+/// Returns the length of the first PNG file in `files`: its signature and chunks, each with a length before and a
+/// checksum after it, up to `IEND` (PNG specification, section 5). Returns `None` if it is truncated or not a PNG file.
+fn png_length(files: &[u8]) -> Option<usize> {
     let mut at = SIGNATURE.len();
     if !files.starts_with(SIGNATURE) {
         return None;
@@ -197,9 +199,9 @@ mod tests {
             let error = Picture::read_all(bad).err().map(|error| error.to_string());
             assert!(error.is_some_and(|text| text.contains("PNG")));
         }
-        // A chunk that is longer than any file.
+        // A chunk longer than any file.
         let endless = [SIGNATURE, &[255; 8]].concat();
-        assert_eq!(length(&endless), None);
+        assert_eq!(png_length(&endless), None);
     }
 
     #[test]
@@ -225,7 +227,7 @@ mod tests {
             ),
         ];
         let definitions = definitions.map(|(key, text)| (key.to_owned(), text.to_owned()));
-        let registry = Registry::of_definitions(RosVersion::Two, &definitions.into());
+        let registry = Registry::with_definitions(RosVersion::Two, &definitions.into());
         let image = registry
             .expect("valid")
             .message("sensor_msgs/msg/Image")
@@ -245,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_png_is_told() {
+    fn files_that_are_no_png_are_rejected() {
         let error = Picture::read(b"JFIF").err().map(|error| error.to_string());
         assert!(error.is_some_and(|text| text.contains("give a PNG file")));
     }

@@ -1,90 +1,91 @@
-//! What is published where: the messages of a recording, or pictures, and the inputs that they go to.
+//! Plan of a replay: the messages of a recording, or images, and the inputs to which they are published.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
 
 use bytes::Bytes;
 use package::interface::{Direction, Interface, Topic};
-use ros::bag::Recorded;
-use ros::bus::{Qos, RosVersion, WireType};
+use ros::bag::BagMessage;
+use ros::bus::{QosProfile, RosVersion, WireType};
 use ros::codec::{Time, header_stamp};
 use ros::schema::Registry;
 
 use super::{Material, Picture, QUEUE, picture};
 use crate::Error;
 
-/// Longer pauses of a recording are cut to this.
+/// Maximum pause; longer ones of a recording are shortened to it.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
-/// The inputs, and the messages in their order.
-pub(super) struct Plan<'a> {
-    pub(super) inputs: Vec<Input>,
-    /// The input whose messages are requests.
+/// The inputs, and the messages in order.
+pub(super) struct ReplayPlan<'a> {
+    pub(super) inputs: Vec<PlannedInput>,
+    /// Index of the input whose messages are requests.
     pub(super) request: usize,
-    pub(super) items: Vec<Item<'a>>,
-    /// From the first message to the first of the next round, at the recording's own pace; pictures come once a second.
+    pub(super) items: Vec<PlannedMessage<'a>>,
+    /// Time from the first message to the first of the next round, at the recorded rate; one second per image.
     pub(super) length: Duration,
     pub(super) unused: Vec<String>,
-    /// Recorded topics of other names than the input of this number that they go to.
+    /// Recorded topics with names other than that of the input to which they are published, with the index of the
+    /// input.
     pub(super) renamed: BTreeSet<(usize, String)>,
 }
 
-/// Where messages go.
-pub(super) struct Input {
+/// An input to which messages are published.
+pub(super) struct PlannedInput {
     pub(super) topic: String,
     pub(super) wire_type: WireType,
-    /// What its nodes ask for, as far as that is known.
-    pub(super) qos: Qos,
+    /// QoS requested by its nodes, as far as known.
+    pub(super) qos: QosProfile,
 }
 
-impl Input {
-    fn of(topic: &Topic, registry: &Registry) -> Result<Input, Error> {
-        let plain = Qos::keep_last(QUEUE);
-        Ok(Input {
+impl PlannedInput {
+    fn new(topic: &Topic, registry: &Registry) -> Result<PlannedInput, Error> {
+        let plain = QosProfile::keep_last(QUEUE);
+        Ok(PlannedInput {
             topic: topic.name.clone(),
             wire_type: wire_type(registry, topic)?,
-            qos: topic.qos.map_or(plain, |qos| Qos {
-                // Nothing of what is given may be lost.
+            qos: topic.qos.map_or(plain, |qos| QosProfile {
+                // No message may be lost.
                 reliability: plain.reliability,
-                ..qos.on_bus(QUEUE)
+                ..qos.to_bus_qos(QUEUE)
             }),
         })
     }
 }
 
 /// One message.
-pub(super) struct Item<'a> {
-    /// Number of its input.
+pub(super) struct PlannedMessage<'a> {
+    /// Index of its input.
     pub(super) input: usize,
-    pub(super) content: Content<'a>,
-    /// Since the first message.
+    pub(super) content: PlannedContent<'a>,
+    /// Time since the first message.
     pub(super) at: Duration,
 }
 
-pub(super) enum Content<'a> {
+pub(super) enum PlannedContent<'a> {
     Recorded(Bytes),
     Picture(&'a Picture),
 }
 
-impl Content<'_> {
-    /// The message; a picture is taken now.
+impl PlannedContent<'_> {
+    /// Returns the message; an image gets the current time as its stamp.
     pub(super) fn message(&self, sequence: usize, ros: RosVersion) -> Bytes {
         match self {
-            Content::Recorded(bytes) => bytes.clone(),
-            Content::Picture(picture) => picture.message(sequence, ros),
+            PlannedContent::Recorded(bytes) => bytes.clone(),
+            PlannedContent::Picture(picture) => picture.message(sequence, ros),
         }
     }
 }
 
-impl<'a> Plan<'a> {
-    /// What becomes of `material`; the messages of the topic `request` are the requests, else those of the first topic that
-    /// the service has an input for.
+impl<'a> ReplayPlan<'a> {
+    /// Plans the replay of `material`. Messages of the topic `request` are the requests; by default those of the first
+    /// topic for which the service has an input.
     pub(super) fn new(
         interface: &Interface,
         registry: &Registry,
         material: &'a Material,
         request: Option<&str>,
-    ) -> Result<Plan<'a>, Error> {
+    ) -> Result<ReplayPlan<'a>, Error> {
         let inputs: Vec<&Topic> = interface
             .topics
             .iter()
@@ -104,7 +105,7 @@ impl<'a> Plan<'a> {
                 }
             ))
         };
-        let mut plan = Plan {
+        let mut plan = ReplayPlan {
             inputs: Vec::new(),
             request: 0,
             items: Vec::new(),
@@ -118,21 +119,23 @@ impl<'a> Plan<'a> {
                     .iter()
                     .filter(|topic| picture::TYPES.contains(&topic.type_name.as_str()));
                 for topic in eyes {
-                    plan.inputs.push(Input::of(topic, registry)?);
+                    plan.inputs.push(PlannedInput::new(topic, registry)?);
                 }
                 if plan.inputs.is_empty() {
-                    return Err(nothing("the service takes no sensor_msgs/Image"));
+                    return Err(nothing(
+                        "the service has no input of type sensor_msgs/Image",
+                    ));
                 }
-                plan.choose(request)
-                    .ok_or_else(|| unfed(request, &nothing))?;
+                plan.choose_request(request)
+                    .ok_or_else(|| unfed_error(request, &nothing))?;
                 let eyes = plan.inputs.len();
                 for (number, picture) in pictures.iter().enumerate() {
-                    // Of several that of the requests comes last: its answer is what is waited for.
+                    // With several inputs, the one of the requests is last, because its response is awaited.
                     let others = (0..eyes).filter(|eye| *eye != plan.request);
                     plan.items
-                        .extend(others.chain([plan.request]).map(|input| Item {
+                        .extend(others.chain([plan.request]).map(|input| PlannedMessage {
                             input,
-                            content: Content::Picture(picture),
+                            content: PlannedContent::Picture(picture),
                             at: Duration::from_secs(number as u64),
                         }));
                 }
@@ -141,7 +144,7 @@ impl<'a> Plan<'a> {
             Material::Bag(recorded) => {
                 let mut before = None;
                 for message in recorded {
-                    match plan.place(&inputs, registry, message)? {
+                    match plan.find_input(&inputs, registry, message)? {
                         Some(input) => {
                             if plan.inputs[input].topic != *message.topic {
                                 plan.renamed.insert((input, message.topic.to_string()));
@@ -149,9 +152,9 @@ impl<'a> Plan<'a> {
                             let pause = message.time.saturating_sub(before.unwrap_or(message.time));
                             plan.length += Duration::from_nanos(pause).min(LONGEST_PAUSE);
                             before = Some(message.time.max(before.unwrap_or(0)));
-                            plan.items.push(Item {
+                            plan.items.push(PlannedMessage {
                                 input,
-                                content: Content::Recorded(message.bytes.clone()),
+                                content: PlannedContent::Recorded(message.bytes.clone()),
                                 at: plan.length,
                             });
                         }
@@ -162,18 +165,19 @@ impl<'a> Plan<'a> {
                     }
                 }
                 if plan.items.is_empty() {
-                    return Err(nothing(&match plan.unused.is_empty() {
-                        true => "the recording holds no message".to_owned(),
-                        false => format!(
+                    return Err(nothing(&if plan.unused.is_empty() {
+                        "the recording holds no message".to_owned()
+                    } else {
+                        format!(
                             "no topic of the recording is an input of the service (it has {}){}",
                             plan.unused.join(", "),
-                            of_another_type(&inputs, recorded)
-                        ),
+                            describe_other_types(&inputs, recorded)
+                        )
                     }));
                 }
-                plan.choose(request)
-                    .ok_or_else(|| unfed(request, &nothing))?;
-                // The next round begins as if one more pause of average length were between.
+                plan.choose_request(request)
+                    .ok_or_else(|| unfed_error(request, &nothing))?;
+                // The next round begins after one more pause of average length.
                 if let Some(pauses) = u32::try_from(plan.items.len() - 1).ok().filter(|n| *n > 0) {
                     plan.length += plan.length / pauses;
                 }
@@ -182,31 +186,31 @@ impl<'a> Plan<'a> {
         Ok(plan)
     }
 
-    /// The messages in their order; round after round where they are to come `again`.
-    pub(super) fn items(&self, again: bool) -> impl Iterator<Item = &Item<'a>> {
+    /// Returns the messages in order, round after round if `again` is set.
+    pub(super) fn items(&self, again: bool) -> impl Iterator<Item = &PlannedMessage<'a>> {
         let rounds = if again { usize::MAX } else { 1 };
         let length = self.items.len();
         (0..rounds.saturating_mul(length)).map(move |turn| &self.items[turn % length])
     }
 
-    /// How many of a round's messages are requests.
+    /// Returns the number of requests in a round.
     pub(super) fn requests(&self) -> usize {
         let requests = self.items.iter().filter(|item| item.input == self.request);
         requests.count()
     }
 
-    /// Recorded topics of other names that go to an input.
-    pub(super) fn recorded_for(&self, input: usize) -> Vec<String> {
+    /// Returns the recorded topics with other names that are published to an input.
+    pub(super) fn source_topics(&self, input: usize) -> Vec<String> {
         let renamed = self.renamed.iter().filter(|(to, _)| *to == input);
         renamed.map(|(_, topic)| topic.clone()).collect()
     }
 
-    /// The stamp of a message of an input.
+    /// Returns the stamp of a message of an input.
     pub(super) fn stamp(&self, input: usize, bytes: &[u8], registry: &Registry) -> Option<Time> {
         stamp(&self.inputs[input].wire_type.name, bytes, registry)
     }
 
-    fn choose(&mut self, request: Option<&str>) -> Option<()> {
+    fn choose_request(&mut self, request: Option<&str>) -> Option<()> {
         if let Some(named) = request {
             let mut inputs = self.inputs.iter();
             self.request = inputs.position(|input| input.topic == named)?;
@@ -214,12 +218,12 @@ impl<'a> Plan<'a> {
         Some(())
     }
 
-    /// The input that a recorded topic goes to: of the same name, else the only one of its type.
-    fn place(
+    /// Finds the input for a recorded topic: the one with its name, otherwise the only one of its type.
+    fn find_input(
         &mut self,
         inputs: &[&Topic],
         registry: &Registry,
-        message: &Recorded,
+        message: &BagMessage,
     ) -> Result<Option<usize>, Error> {
         let of_type = || {
             inputs
@@ -238,9 +242,9 @@ impl<'a> Plan<'a> {
         {
             return Ok(Some(known));
         }
-        let found = Input::of(input, registry)?;
+        let found = PlannedInput::new(input, registry)?;
         let wire_type = &found.wire_type;
-        if !wire_type.agrees(&message.wire_type) {
+        if !wire_type.is_compatible_with(&message.wire_type) {
             return Err(Error::Trial(format!(
                 "{} was recorded with another definition of {} ({}) than the service has ({})",
                 message.topic, wire_type.name, message.wire_type.digest, wire_type.digest
@@ -251,14 +255,14 @@ impl<'a> Plan<'a> {
     }
 }
 
-fn unfed(request: Option<&str>, nothing: &dyn Fn(&str) -> Error) -> Error {
+fn unfed_error(request: Option<&str>, nothing: &dyn Fn(&str) -> Error) -> Error {
     let request = request.unwrap_or_default();
     nothing(&format!(
         "nothing that was given goes to an input {request}"
     ))
 }
 
-/// The stamp of a message whose type begins with a header.
+/// Returns the stamp of a message whose type begins with a header.
 pub(super) fn stamp(type_name: &str, bytes: &[u8], registry: &Registry) -> Option<Time> {
     header_stamp(&*registry.message(type_name).ok()?, bytes)
 }
@@ -267,11 +271,11 @@ fn wire_type(registry: &Registry, topic: &Topic) -> Result<WireType, Error> {
     let known = registry.message(&topic.type_name).map_err(|error| {
         Error::Trial(format!("the type of {} is not known: {error}", topic.name))
     })?;
-    Ok(WireType::of(&known))
+    Ok(WireType::from_message(&known))
 }
 
-/// Recorded topics that have the name of an input and another type.
-fn of_another_type(inputs: &[&Topic], recorded: &[Recorded]) -> String {
+/// Describes recorded topics that have the name of an input but another type.
+fn describe_other_types(inputs: &[&Topic], recorded: &[BagMessage]) -> String {
     let there = inputs.iter().filter_map(|input| {
         let mut recorded = recorded.iter();
         let of_name = recorded.find(|message| *message.topic == *input.name)?;
@@ -315,8 +319,8 @@ mod tests {
         }
     }
 
-    fn recorded(topic: &str, of_type: &str, md5: &str) -> Recorded {
-        Recorded {
+    fn recorded_message(topic: &str, of_type: &str, md5: &str) -> BagMessage {
+        BagMessage {
             topic: topic.into(),
             wire_type: Arc::new(WireType::new(of_type, md5, "")),
             time: 0,
@@ -326,19 +330,19 @@ mod tests {
 
     const STRING: &str = "992ce8a1687cec8c8bd883ec73ca41d1";
 
-    fn plan<'a>(material: &'a Material, request: Option<&str>) -> Result<Plan<'a>, Error> {
+    fn plan<'a>(material: &'a Material, request: Option<&str>) -> Result<ReplayPlan<'a>, Error> {
         let interface = interface();
         let registry = Registry::from_definitions(&interface.definitions).expect("valid");
-        Plan::new(&interface, &registry, material, request)
+        ReplayPlan::new(&interface, &registry, material, request)
     }
 
     #[test]
     fn recorded_topics_go_to_inputs_of_their_name_or_type() {
         let material = Material::Bag(vec![
-            recorded("/chatter", "std_msgs/String", STRING),
-            recorded("/tf", "tf2_msgs/TFMessage", "x"),
-            recorded("/tf", "tf2_msgs/TFMessage", "x"),
-            recorded("/name", "std_msgs/String", STRING),
+            recorded_message("/chatter", "std_msgs/String", STRING),
+            recorded_message("/tf", "tf2_msgs/TFMessage", "x"),
+            recorded_message("/tf", "tf2_msgs/TFMessage", "x"),
+            recorded_message("/name", "std_msgs/String", STRING),
         ]);
         let plan = plan(&material, None).expect("a plan");
         assert_eq!(plan.inputs.len(), 1);
@@ -347,29 +351,32 @@ mod tests {
             ("/name", 2)
         );
         assert_eq!(plan.unused, ["/tf"]);
-        assert_eq!(plan.recorded_for(0), ["/chatter"]);
+        assert_eq!(plan.source_topics(0), ["/chatter"]);
     }
 
     #[test]
-    fn what_does_not_fit_is_told_with_what_does() {
+    fn unmatched_topics_are_reported_with_the_inputs() {
         let refused = |recorded, request| {
             let material = Material::Bag(vec![recorded]);
             let error = plan(&material, request).err();
             error.map(|error| error.to_string()).unwrap_or_default()
         };
-        let text = refused(recorded("/tf", "tf2_msgs/TFMessage", "x"), None);
+        let text = refused(recorded_message("/tf", "tf2_msgs/TFMessage", "x"), None);
         assert!(
             text.contains("it has /tf); its inputs are: /name (std_msgs/String)"),
             "{text}"
         );
-        let text = refused(recorded("/name", "std_msgs/Int8", "x"), None);
+        let text = refused(recorded_message("/name", "std_msgs/Int8", "x"), None);
         assert!(
             text.contains("(it has /name); /name is std_msgs/Int8 there; its inputs are: /name"),
             "{text}"
         );
-        let text = refused(recorded("/name", "std_msgs/String", "other"), None);
+        let text = refused(recorded_message("/name", "std_msgs/String", "other"), None);
         assert!(text.contains("recorded with another definition"), "{text}");
-        let text = refused(recorded("/name", "std_msgs/String", STRING), Some("/count"));
+        let text = refused(
+            recorded_message("/name", "std_msgs/String", STRING),
+            Some("/count"),
+        );
         assert!(text.contains("goes to an input /count"), "{text}");
     }
 
@@ -383,33 +390,33 @@ mod tests {
         interface.topics.truncate(1);
         interface.topics[0].type_name = "std_msgs/msg/String".into();
         interface.topics[0].qos = Some(qos);
-        let registry = Registry::of_definitions(RosVersion::Two, &interface.definitions);
+        let registry = Registry::with_definitions(RosVersion::Two, &interface.definitions);
         let registry = registry.expect("valid");
-        let of = WireType::of(&registry.message("std_msgs/msg/String").expect("defined"));
-        let material = Material::Bag(vec![Recorded {
+        let of = WireType::from_message(&registry.message("std_msgs/msg/String").expect("defined"));
+        let material = Material::Bag(vec![BagMessage {
             wire_type: Arc::new(of),
-            ..recorded("/name", "", "")
+            ..recorded_message("/name", "", "")
         }]);
-        let plan = Plan::new(&interface, &registry, &material, None).expect("a plan");
+        let plan = ReplayPlan::new(&interface, &registry, &material, None).expect("a plan");
         assert!(plan.inputs[0].qos.is_latching());
-        // Of the other ROS.
-        let material = Material::Bag(vec![recorded("/name", "std_msgs/String", STRING)]);
-        let refused = Plan::new(&interface, &registry, &material, None).err();
+        // Of the other ROS version.
+        let material = Material::Bag(vec![recorded_message("/name", "std_msgs/String", STRING)]);
+        let refused = ReplayPlan::new(&interface, &registry, &material, None).err();
         let words = refused.map(|error| error.to_string()).unwrap_or_default();
         assert!(words.contains("/name is std_msgs/String there"), "{words}");
     }
 
     #[test]
     fn a_recordings_pace_is_kept_but_for_long_pauses() {
-        let at = |millis: u64, topic: &str, of_type: &str, md5: &str| Recorded {
+        let at = |millis: u64, topic: &str, of_type: &str, md5: &str| BagMessage {
             time: millis * 1_000_000,
-            ..recorded(topic, of_type, md5)
+            ..recorded_message(topic, of_type, md5)
         };
         const INT: &str = "da5909fbe378aeaf85e547e830cc1bb7";
         let material = Material::Bag(vec![
             at(5000, "/name", "std_msgs/String", STRING),
             at(5100, "/count", "std_msgs/Int32", INT),
-            // Out of order, and after a minute of nothing.
+            // Out of order, and after a minute without messages.
             at(5050, "/name", "std_msgs/String", STRING),
             at(65_100, "/count", "std_msgs/Int32", INT),
         ]);

@@ -1,13 +1,15 @@
-//! An implementation of DDS by others than Fast DDS, whose services have headers of their own.
+//! A DDS implementation other than Fast DDS, whose services have headers of their own.
 
 use std::sync::Arc;
 
-use ros::bus::{Bus, Qos, reaches};
+use ros::bus::{Bus, QosProfile, wait_for_connected};
 use serde_json::json as value;
 use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, Peer, json, of_set_bool, of_string, said, set_bool, shows, string};
-use super::services::{Answers, request};
+use super::lab::{
+    LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
+};
+use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
 const SCRIPT: &str = "cyclone.py";
@@ -21,14 +23,16 @@ async fn messages_go_there_and_back() {
     let lab = Lab::new();
     let _peer = peer(&lab).await;
     let bus = lab.join(NODE).await;
-    let qos = Qos::keep_last(10);
-    let mut pong = bus.subscribe("/pong", of_string(), qos).await.unwrap();
-    let ping = bus.advertise("/ping", of_string(), qos).await.unwrap();
-    for matched in [ping.matched(), pong.matched.clone()] {
-        timeout(LONG, reaches(matched, 1)).await.expect("somebody");
+    let qos = QosProfile::keep_last(10);
+    let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
+    let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
+    for matched in [ping.matched_subscribers(), pong.matched.clone()] {
+        timeout(LONG, wait_for_connected(matched, 1))
+            .await
+            .expect("somebody");
     }
     for number in 0..10 {
-        ping.publish(said(&number.to_string()));
+        ping.publish(string_message(&number.to_string()));
         let message = timeout(LONG, pong.messages.recv()).await;
         let message = message.expect("a message").expect("the bus is open");
         let expected = format!(r#"{{"data":"{number}"}}"#);
@@ -41,7 +45,7 @@ async fn its_services_are_called() {
     let lab = Lab::new();
     let _peer = peer(&lab).await;
     let bus = lab.join(NODE).await;
-    shows(&bus, |graph| graph.services.contains_key("/set")).await;
+    wait_graph(&bus, |graph| graph.services.contains_key("/set")).await;
     for data in [true, false] {
         let answer = bus.call("/set", request(data), LONG).await.unwrap();
         let expected = format!(r#"{{"success":{data},"message":"set"}}"#);
@@ -54,11 +58,13 @@ async fn it_is_answered() {
     let lab = Lab::new();
     let mut peer = peer(&lab).await;
     let bus = lab.join(NODE).await;
-    let served = bus.serve("/ask", of_set_bool(), Arc::new(Answers)).await;
+    let served = bus
+        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
+        .await;
     let _served = served.unwrap();
     for (number, data) in [true, false].into_iter().enumerate() {
         let answer = peer.obey(&format!("call {data}")).await;
-        // It has no nodes: what asks is a participant.
+        // It has no nodes: the caller is a participant.
         assert_eq!(answer[..2], [value!(number), value!(data)]);
         let caller = answer[2].as_str().expect("a caller");
         assert!(caller.starts_with("01.10."), "{caller}");

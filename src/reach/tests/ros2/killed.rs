@@ -1,15 +1,15 @@
-//! A node that is killed while it publishes pictures, as a servant's is.
+//! A node that is killed while it publishes images, in a servant's environment.
 
 use std::time::Duration;
 
 use budget::Budget;
 use ros::JoinOptions;
-use ros::bus::{Bus as _, Qos, Subscription};
+use ros::bus::{Bus as _, QosProfile, Subscription};
 use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, of_string, shows};
+use super::lab::{LONG, Lab, string_type, wait_graph};
 
-/// Room for some pictures of 6 MB.
+/// Room for some images of 6 MB.
 const LIMIT: usize = 64 << 20;
 
 async fn picture(pictures: &mut Subscription) {
@@ -37,23 +37,25 @@ async fn a_node_that_is_killed_amid_a_picture_is_gone_with_what_it_began() {
         ..JoinOptions::in_domain(0, "/cloudroid_bridge")
     };
     let bus = lab.join_with(options).await;
-    let of = of_string();
-    let heard = bus.subscribe("/picture", of, Qos::keep_last(1)).await;
+    let of = string_type();
+    let heard = bus
+        .subscribe("/picture", of, QosProfile::keep_last(1))
+        .await;
     let mut pictures = heard.unwrap();
     for _ in 0..2 {
         let mut painter = lab.node("painter.py", &[]).await;
         picture(&mut pictures).await;
         picture(&mut pictures).await;
-        soon("a part of one should come", || budget.used() != 0).await;
-        painter.ends().await;
-        bus.process_ended();
+        soon("a part of one should come", || budget.used_bytes() != 0).await;
+        painter.kill_and_wait().await;
+        bus.on_process_exit();
         let matched = pictures.matched.clone();
         soon("it should be gone", || matched.borrow().peers.is_empty()).await;
-        shows(&bus, |graph| !graph.nodes.contains_key("/painter")).await;
-        // What was heard whole is taken; nothing is kept of what was not.
+        wait_graph(&bus, |graph| !graph.nodes.contains_key("/painter")).await;
+        // Complete images are delivered, and nothing of the incomplete one is kept.
         soon("nothing should be kept", || {
             while pictures.messages.try_recv().is_some() {}
-            budget.used() == 0
+            budget.used_bytes() == 0
         })
         .await;
     }

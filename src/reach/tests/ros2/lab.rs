@@ -1,4 +1,4 @@
-//! A network namespace with nodes in it, and a bus that reaches them.
+//! A network namespace with nodes, and a bus that reaches them.
 
 use std::io;
 use std::net::SocketAddr;
@@ -15,7 +15,7 @@ use ros::codec::{FillOptions, JsonOptions, from_json, to_json};
 use ros::net::Sockets;
 use ros::ros2::Ros2Bus;
 use ros::schema::{MessageType, Registry, ServiceDef};
-use ros::{Interface, JoinOptions, Network};
+use ros::{DiscoveryNetwork, InterfaceAddress, JoinOptions};
 use serde_json::Value;
 use servant::netns::NetNs;
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader, Lines};
@@ -24,16 +24,16 @@ use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 use tokio::runtime::Handle;
 use tokio::time::timeout;
 
-/// Only bounds how long a failing test takes.
+/// Only limits the duration of a failing test.
 pub const LONG: Duration = Duration::from_secs(60);
 
-/// Nodes of one servant have shared memory of their own.
+/// Nodes of one servant have their own shared memory.
 const WITHIN: &str = r#"mount -t tmpfs shm /dev/shm && exec "$@""#;
 
-struct Inside(Arc<NetNs>);
+struct LabNamespace(Arc<NetNs>);
 
 #[async_trait]
-impl Sockets for Inside {
+impl Sockets for LabNamespace {
     async fn connect(&self, address: SocketAddr) -> io::Result<TcpStream> {
         self.0.connect(address).await
     }
@@ -42,20 +42,22 @@ impl Sockets for Inside {
         self.0.listen(address).await
     }
 
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
-        self.0.datagrams(address, shared).await
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+        self.0.bind_udp(address, shared).await
     }
 
-    async fn interfaces(&self) -> io::Result<Vec<Interface>> {
-        self.0.run(ros::net::interfaces).map_err(io::Error::other)?
+    async fn interfaces(&self) -> io::Result<Vec<InterfaceAddress>> {
+        self.0
+            .run(ros::net::list_interfaces)
+            .map_err(io::Error::other)?
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
-        self.0.diagnostics().await.map(Some)
+    async fn open_sock_diag(&self) -> io::Result<Option<OwnedFd>> {
+        self.0.open_sock_diag().await.map(Some)
     }
 }
 
-/// A network with nothing but `lo`.
+/// A network with only `lo`.
 pub struct Lab {
     pub network: Arc<NetNs>,
 }
@@ -68,13 +70,13 @@ impl Lab {
         }
     }
 
-    /// Our node of this name.
+    /// Joins with a node of ours.
     pub async fn join(&self, node: &str) -> Arc<Ros2Bus> {
-        self.join_network(node, Network::default()).await
+        self.join_network(node, DiscoveryNetwork::default()).await
     }
 
-    /// The same, where more than `lo` is meant.
-    pub async fn join_network(&self, node: &str, network: Network) -> Arc<Ros2Bus> {
+    /// Joins with interfaces other than `lo`.
+    pub async fn join_network(&self, node: &str, network: DiscoveryNetwork) -> Arc<Ros2Bus> {
         let options = JoinOptions {
             network,
             ..JoinOptions::in_domain(0, node)
@@ -82,24 +84,24 @@ impl Lab {
         self.join_with(options).await
     }
 
-    /// The same, by these options.
+    /// Joins with these options.
     pub async fn join_with(&self, options: JoinOptions) -> Arc<Ros2Bus> {
-        let sockets = Arc::new(Inside(Arc::clone(&self.network)));
+        let sockets = Arc::new(LabNamespace(Arc::clone(&self.network)));
         let joined = Ros2Bus::connect(sockets, options).await;
         joined.expect("a bus")
     }
 
-    /// The node of `peer.py`, once it is ready.
+    /// Starts the node of `peer.py` and waits until it is ready.
     pub async fn peer(&self) -> Peer {
         self.node("peer.py", &[]).await
     }
 
-    /// A node of a program beside this file, once it is ready.
+    /// Starts a node of a program beside this file and waits until it is ready.
     pub async fn node(&self, program: &str, arguments: &[&str]) -> Peer {
         self.node_with(program, arguments, &[]).await
     }
 
-    /// The same, with these variables in its environment.
+    /// Starts a node with these additional environment variables.
     pub async fn node_with(
         &self,
         program: &str,
@@ -136,7 +138,7 @@ impl Lab {
             lines: BufReader::new(lines).lines(),
             child,
         };
-        peer.says("ready").await;
+        peer.wait_for("ready").await;
         peer
     }
 }
@@ -149,14 +151,14 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// Waits until it says something of this kind, and gives the rest of it.
-    pub async fn says(&mut self, kind: &str) -> Vec<Value> {
-        let [said] = self.says_each([kind]).await;
+    /// Waits for a report of this kind and returns its arguments.
+    pub async fn wait_for(&mut self, kind: &str) -> Vec<Value> {
+        let [said] = self.wait_for_each([kind]).await;
         said
     }
 
-    /// The same of several kinds, in whichever order it says them: of each the first.
-    pub async fn says_each<const N: usize>(&mut self, kinds: [&str; N]) -> [Vec<Value>; N] {
+    /// Waits for the first report of each of several kinds, in any order.
+    pub async fn wait_for_each<const N: usize>(&mut self, kinds: [&str; N]) -> [Vec<Value>; N] {
         let mut said = [const { Vec::new() }; N];
         let mut missing = N;
         let all = async {
@@ -178,73 +180,73 @@ impl Peer {
         said.map(|mut words| words.split_off(1))
     }
 
-    /// Tells it to do something, and waits until it says that it has.
+    /// Sends a command and waits for its completion.
     pub async fn obey(&mut self, order: &str) -> Vec<Value> {
         self.tell(order).await;
         let kind = order.split(' ').next().unwrap_or_default().to_owned();
-        self.says(&kind).await
+        self.wait_for(&kind).await
     }
 
-    /// Tells it to do something.
+    /// Sends a command.
     pub async fn tell(&mut self, order: &str) {
         let line = format!("{order}\n");
         let written = self.orders.write_all(line.as_bytes()).await;
         written.expect("its input");
     }
 
-    /// As by `kill -9`.
+    /// Kills it as `kill -9` does.
     pub fn kill(&mut self) {
         self.child.start_kill().expect("it can be killed");
     }
 
-    /// The same; returns when it is no more.
-    pub async fn ends(&mut self) {
+    /// Kills it and waits until it is gone.
+    pub async fn kill_and_wait(&mut self) {
         self.child.kill().await.expect("it can be killed");
     }
 }
 
 pub fn string() -> Arc<MessageType> {
     let text = "string data";
-    MessageType::of_full_text(RosVersion::Two, "std_msgs/msg/String", text).expect("a message")
+    MessageType::parse_full_text(RosVersion::Two, "std_msgs/msg/String", text).expect("a message")
 }
 
 pub fn set_bool() -> Arc<ServiceDef> {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     let text = "bool data\n---\nbool success\nstring message\n";
     let inserted = registry.insert("std_srvs/srv/SetBool", text);
     inserted.expect("a definition");
     registry.service("std_srvs/srv/SetBool").expect("a service")
 }
 
-pub fn of_string() -> WireType {
-    WireType::of(&string())
+pub fn string_type() -> WireType {
+    WireType::from_message(&string())
 }
 
-pub fn of_set_bool() -> ServiceType {
-    ServiceType::of(&set_bool())
+pub fn set_bool_type() -> ServiceType {
+    ServiceType::from_service(&set_bool())
 }
 
-/// A message by its JSON.
+/// Encodes a message from its JSON.
 pub fn cdr(of: &MessageType, json: &str) -> Bytes {
     let mut bytes = Vec::new();
     from_json(of, json.as_bytes(), &mut bytes, &FillOptions::default()).expect("a message");
     bytes.into()
 }
 
-/// The JSON of a message.
+/// Returns the JSON of a message.
 pub fn json(of: &MessageType, bytes: &[u8]) -> String {
     let mut text = Vec::new();
     to_json(of, bytes, &mut text, &JsonOptions::default()).expect("a message");
     String::from_utf8(text).expect("text")
 }
 
-/// A `std_msgs/msg/String`.
-pub fn said(text: &str) -> Bytes {
+/// Encodes a `std_msgs/msg/String`.
+pub fn string_message(text: &str) -> Bytes {
     cdr(&string(), &format!(r#"{{"data":"{text}"}}"#))
 }
 
-/// Waits until the graph shows this.
-pub async fn shows(bus: &Ros2Bus, wanted: impl Fn(&ros::bus::Graph) -> bool) {
+/// Waits until the graph satisfies a condition.
+pub async fn wait_graph(bus: &Ros2Bus, wanted: impl Fn(&ros::bus::Graph) -> bool) {
     let mut graph = bus.graph();
     let found = timeout(LONG, graph.wait_for(|graph| wanted(graph)));
     if found.await.is_err() {

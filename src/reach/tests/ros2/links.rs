@@ -1,19 +1,23 @@
-//! Links of nodes of rclpy: what the robot's end is told, and what it can do with it; services and actions that are lent.
+//! Links of rclpy nodes: what the robot's end receives and can do, and lent services and actions.
 
 use std::sync::Arc;
 
 use link::clock::now;
-use link::control::{Graph, Hello, Input};
-use ros::bus::{Bus, Lending, Qos, RosVersion, ServiceType, WireType};
+use link::control::{Graph, Hello, InputChannel};
+use ros::bus::{Bus, Lending, QosProfile, RosVersion, ServiceType, WireType};
 use ros::ros2::Ros2Bus;
 use ros::schema::Registry;
 use serde_json::{Value, json as value};
 use tokio::time::timeout;
 
 use super::actions::fibonacci;
-use super::lab::{LONG, Lab, cdr, json, of_set_bool, of_string, said, set_bool, shows, string};
-use super::robot::{Asked, Remembered, Robot, hello, hub, output, refused, served};
-use super::services::{Answers, request};
+use super::lab::{
+    LONG, Lab, cdr, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
+};
+use super::robot::{
+    CloudRequest, LinkedRobot, RunTracker, expect_refusal, find_output, find_service, hello, hub,
+};
+use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
 const PEER: &str = "/lab/peer";
@@ -27,8 +31,10 @@ const DEFINITIONS: [(&str, &str); 2] = [
 const GET_PARAMETERS: [(&str, &str); 2] = [
     (
         "rcl_interfaces/msg/ParameterValue",
-        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] byte_array_value\n\
-         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] string_array_value\n",
+        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] \
+         byte_array_value\n\
+         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
+         string_array_value\n",
     ),
     (
         "rcl_interfaces/srv/GetParameters",
@@ -36,27 +42,31 @@ const GET_PARAMETERS: [(&str, &str); 2] = [
     ),
 ];
 
-/// A link of this node, whose robot's end waits until this is told of it.
-async fn linked(bus: &Arc<Ros2Bus>, node: &str, wanted: impl Fn(&Graph) -> bool) -> (Robot, Graph) {
-    let nodes = Arc::new(Remembered::default());
+/// Connects a link of this node, whose robot's end waits until its graph satisfies a condition.
+async fn connect_robot(
+    bus: &Arc<Ros2Bus>,
+    node: &str,
+    wanted: impl Fn(&Graph) -> bool,
+) -> (LinkedRobot, Graph) {
+    let nodes = Arc::new(RunTracker::default());
     let hub = hub(Arc::clone(bus) as _, nodes, &DEFINITIONS);
-    let robot = Robot::links(&hub, &hello(node)).await;
-    let graph = robot.told(wanted).await;
+    let robot = LinkedRobot::connect(&hub, &hello(node)).await;
+    let graph = robot.wait_graph(wanted).await;
     (robot, graph)
 }
 
-fn strings(topic: &str, channel: u32) -> Input {
-    let of = of_string();
-    Input {
+fn strings(topic: &str, channel: u32) -> InputChannel {
+    let of = string_type();
+    InputChannel {
         channel,
         topic: topic.to_owned(),
         type_name: of.name,
         md5: of.digest.to_string(),
-        ..Input::default()
+        ..InputChannel::default()
     }
 }
 
-/// What a message says; what fills it up on its way does not count.
+/// Returns the text of a message, ignoring padding.
 fn text(message: &[u8]) -> String {
     let said: Value = serde_json::from_str(&json(&string(), message)).expect("JSON");
     said["data"].as_str().expect("a string").to_owned()
@@ -67,12 +77,12 @@ async fn the_robot_is_told_all_that_a_node_has_with_its_quality_of_service() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let (robot, graph) = linked(&bus, PEER, |graph| {
+    let (robot, graph) = connect_robot(&bus, PEER, |graph| {
         graph.inputs.len() >= 3 && graph.outputs.len() >= 5 && graph.services.len() >= 8
     })
     .await;
     let quality = |topic: &str| {
-        let output = output(&graph, topic).unwrap_or_else(|| panic!("{topic}: {graph:#?}"));
+        let output = find_output(&graph, topic).unwrap_or_else(|| panic!("{topic}: {graph:#?}"));
         let qos = output.qos.as_ref().expect("it is told");
         (qos.best_effort, qos.transient_local)
     };
@@ -97,20 +107,21 @@ async fn the_robot_is_told_all_that_a_node_has_with_its_quality_of_service() {
             ("/strict", false, true)
         ]
     );
-    // The stub pairs answers by what stands in them.
-    let of = of_string();
+    // The stub matches responses by their contents.
+    let of = string_type();
     assert_eq!(graph.inputs[0].md5, of.digest.as_str());
     let told = robot.definition(&of.name, of.digest.as_str());
     assert_eq!(told.as_deref(), Some(&*of.definition));
-    let set = served(&graph, "/set").expect("it is served");
+    let set = find_service(&graph, "/set").expect("it is served");
     assert!(
-        set.service_type(RosVersion::Two).agrees(&of_set_bool()),
+        set.service_type(RosVersion::Two)
+            .is_compatible_with(&set_bool_type()),
         "{set:?}"
     );
     assert_eq!(set.halves.len(), 2);
     for own in ["get_parameters", "set_parameters", "describe_parameters"] {
         let name = format!("{PEER}/{own}");
-        assert!(served(&graph, &name).is_some(), "{name}: {graph:#?}");
+        assert!(find_service(&graph, &name).is_some(), "{name}: {graph:#?}");
     }
 }
 
@@ -120,43 +131,43 @@ async fn messages_calls_and_parameters_go_through_a_link() {
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
     let parameters = format!("{PEER}/get_parameters");
-    let (mut robot, graph) = linked(&bus, PEER, |graph| {
-        output(graph, "/pong").is_some()
-            && output(graph, "/map").is_some()
+    let (mut robot, graph) = connect_robot(&bus, PEER, |graph| {
+        find_output(graph, "/pong").is_some()
+            && find_output(graph, "/map").is_some()
             && graph.inputs.iter().any(|input| input.topic == "/ping")
-            && served(graph, "/set").is_some()
-            && served(graph, &parameters).is_some()
+            && find_service(graph, "/set").is_some()
+            && find_service(graph, &parameters).is_some()
     })
     .await;
-    // Whoever listens first hears what is answered to the first message.
-    let pong = output(&graph, "/pong").unwrap();
-    robot.listens(pong);
-    robot.opens(strings("/ping", 1));
-    // The node's own ends keep 10.
+    // The first subscriber receives the answer to the first message.
+    let pong = find_output(&graph, "/pong").unwrap();
+    robot.listen(pong);
+    robot.open_input(strings("/ping", 1));
+    // The node's own endpoints keep 10.
     for some in [0..10, 10..20] {
         for number in some.clone() {
-            robot.publishes(1, said(&number.to_string()));
+            robot.publish(1, string_message(&number.to_string()));
         }
         for number in some {
-            let (channel, message) = robot.hears().await;
+            let (channel, message) = robot.next_message().await;
             assert_eq!(
                 (channel, text(&message)),
                 (pong.channel, number.to_string())
             );
         }
     }
-    // Whoever listens later is given what is kept.
-    let map = output(&graph, "/map").unwrap();
-    robot.listens(map);
-    let (channel, message) = robot.hears().await;
+    // Later subscribers receive the history.
+    let map = find_output(&graph, "/map").unwrap();
+    robot.listen(map);
+    let (channel, message) = robot.next_message().await;
     assert_eq!((channel, &*text(&message)), (map.channel, "kept"));
-    let set = served(&graph, "/set").unwrap();
+    let set = find_service(&graph, "/set").unwrap();
     for data in [true, false] {
-        let answer = robot.calls(set, request(data)).await.unwrap();
+        let answer = robot.call(set, request(data)).await.unwrap();
         let expected = format!(r#"{{"success":{data},"message":"set"}}"#);
         assert_eq!(json(&set_bool().response, &answer), expected);
     }
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in GET_PARAMETERS {
         registry.insert(key, text).expect("a definition");
     }
@@ -164,7 +175,7 @@ async fn messages_calls_and_parameters_go_through_a_link() {
         .service("rcl_interfaces/srv/GetParameters")
         .unwrap();
     let asked = cdr(&get.request, r#"{"names":["use_sim_time"]}"#);
-    let answer = robot.calls(served(&graph, &parameters).unwrap(), asked);
+    let answer = robot.call(find_service(&graph, &parameters).unwrap(), asked);
     let answer: Value = serde_json::from_str(&json(&get.response, &answer.await.unwrap())).unwrap();
     assert_eq!(answer["values"][0]["type"], 1, "{answer}");
     assert_eq!(answer["values"][0]["bool_value"], false, "{answer}");
@@ -179,43 +190,43 @@ async fn a_whole_goal_goes_through_a_link_by_the_parts_of_its_action() {
     let bus = lab.join(NODE).await;
     let parts =
         ["send_goal", "get_result", "cancel_goal"].map(|part| format!("/fib/_action/{part}"));
-    let (mut robot, graph) = linked(&bus, "/lab/fibonacci", |graph| {
-        let is_told = |part: &String| served(graph, part).is_some();
+    let (mut robot, graph) = connect_robot(&bus, "/lab/fibonacci", |graph| {
+        let is_told = |part: &String| find_service(graph, part).is_some();
         parts.iter().all(is_told)
-            && output(graph, "/fib/_action/feedback").is_some()
-            && output(graph, "/fib/_action/status").is_some()
+            && find_output(graph, "/fib/_action/feedback").is_some()
+            && find_output(graph, "/fib/_action/status").is_some()
     })
     .await;
     let of = fibonacci();
     let services = of.services.as_ref().expect("an action of ROS 2");
-    let feedback = output(&graph, "/fib/_action/feedback").unwrap();
+    let feedback = find_output(&graph, "/fib/_action/feedback").unwrap();
     assert_eq!(feedback.md5, of.action_feedback.digest());
-    let status = output(&graph, "/fib/_action/status").unwrap();
+    let status = find_output(&graph, "/fib/_action/status").unwrap();
     assert!(status.qos.as_ref().is_some_and(|qos| qos.transient_local));
-    robot.listens(feedback);
+    robot.listen(feedback);
     let goal = format!(r#"{{"goal_id":{GOAL_ID},"goal":{{"order":5}}}}"#);
     let sent = cdr(&services.send_goal.request, &goal);
-    let accepted = robot.calls(served(&graph, &parts[0]).unwrap(), sent);
+    let accepted = robot.call(find_service(&graph, &parts[0]).unwrap(), sent);
     let accepted = json(&services.send_goal.response, &accepted.await.unwrap());
     assert!(accepted.contains(r#""accepted":true"#), "{accepted}");
     let asked = format!(r#"{{"goal_id":{GOAL_ID}}}"#);
     let asked = cdr(&services.get_result.request, &asked);
-    let result = robot.calls(served(&graph, &parts[1]).unwrap(), asked);
+    let result = robot.call(find_service(&graph, &parts[1]).unwrap(), asked);
     let result = json(&services.get_result.response, &result.await.unwrap());
     assert_eq!(
         result,
         r#"{"status":4,"result":{"sequence":[0,1,1,2,3,5]}}"#
     );
-    let (channel, first) = robot.hears().await;
+    let (channel, first) = robot.next_message().await;
     assert_eq!(channel, feedback.channel);
     let first: Value = serde_json::from_str(&json(&of.action_feedback, &first)).unwrap();
     assert_eq!(first["feedback"]["sequence"], value!([0, 1, 1]));
 }
 
-/// The robot is called, and says what it was asked and that it answers.
-async fn answers(robot: &mut Robot, channel: u32) {
+/// Waits for a call on the robot and answers it with what it was asked.
+async fn answer_call(robot: &mut LinkedRobot, channel: u32) {
     loop {
-        if let Asked::Call(id, of, request) = robot.is_asked().await {
+        if let CloudRequest::Call(id, of, request) = robot.next_request().await {
             assert_eq!(of, channel);
             let asked: Value = serde_json::from_str(&json(&set_bool().request, &request)).unwrap();
             let answer = value!({"success": asked["data"], "message": "the robot"});
@@ -225,9 +236,9 @@ async fn answers(robot: &mut Robot, channel: u32) {
     }
 }
 
-async fn is_looked_for(robot: &mut Robot, wanted: &str) {
+async fn expect_lookup(robot: &mut LinkedRobot, wanted: &str) {
     loop {
-        if let Asked::Lookup(service) = robot.is_asked().await {
+        if let CloudRequest::Lookup(service) = robot.next_request().await {
             return assert_eq!(service, wanted);
         }
     }
@@ -238,31 +249,37 @@ async fn a_service_that_is_looked_for_is_lent_until_it_is_gone_or_the_servant_ha
     let lab = Lab::new();
     let mut peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let (mut robot, _) = linked(&bus, PEER, |graph| !graph.outputs.is_empty()).await;
-    let of = of_set_bool();
-    // Its client is seen, so that the robot is asked before anything is called.
-    is_looked_for(&mut robot, "/ask").await;
-    robot.has("/ask", Some((5, &of)));
+    let (mut robot, _) = connect_robot(&bus, PEER, |graph| !graph.outputs.is_empty()).await;
+    let of = set_bool_type();
+    // Its client is seen, so the robot is asked before anything is called.
+    expect_lookup(&mut robot, "/ask").await;
+    robot.send_lent("/ask", Some((5, &of)));
     peer.tell("call true").await;
-    answers(&mut robot, 5).await;
-    assert_eq!(peer.says("call").await, [value!(true), value!("the robot")]);
-    let here = |graph: &ros::bus::Graph| graph.services.get("/ask").cloned();
-    shows(&bus, |graph| here(graph).as_deref() == Some(NODE)).await;
-    // Gone, it is looked for again for as long as there is the client.
-    robot.has("/ask", None);
-    is_looked_for(&mut robot, "/ask").await;
-    robot.has("/ask", Some((6, &of)));
-    peer.tell("call false").await;
-    answers(&mut robot, 6).await;
+    answer_call(&mut robot, 5).await;
     assert_eq!(
-        peer.says("call").await,
+        peer.wait_for("call").await,
+        [value!(true), value!("the robot")]
+    );
+    let here = |graph: &ros::bus::Graph| graph.services.get("/ask").cloned();
+    wait_graph(&bus, |graph| here(graph).as_deref() == Some(NODE)).await;
+    // Once gone, it is looked up again for as long as there is a client.
+    robot.send_lent("/ask", None);
+    expect_lookup(&mut robot, "/ask").await;
+    robot.send_lent("/ask", Some((6, &of)));
+    peer.tell("call false").await;
+    answer_call(&mut robot, 6).await;
+    assert_eq!(
+        peer.wait_for("call").await,
         [value!(false), value!("the robot")]
     );
-    // The servant's own comes first.
+    // The servant's own server takes precedence.
     let other = lab.join("/other").await;
-    let _own = other.serve("/ask", of, Arc::new(Answers)).await.unwrap();
-    shows(&bus, |graph| here(graph).as_deref() == Some("/other")).await;
-    // A request that comes to the lent one while that goes is lost, as everywhere in ROS 2.
+    let _own = other
+        .serve("/ask", of, Arc::new(CallerEchoService))
+        .await
+        .unwrap();
+    wait_graph(&bus, |graph| here(graph).as_deref() == Some("/other")).await;
+    // A request to the lent service at the moment of its removal is lost, as always in ROS 2.
     while peer.obey("servers_of /ask").await != [value!(["/other"])] {}
     let answer = peer.obey("call true").await;
     assert_eq!(answer, [value!(true), value!(PEER)]);
@@ -273,37 +290,37 @@ async fn a_service_of_another_type_is_not_lent() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    let (mut robot, _) = linked(&bus, PEER, |graph| !graph.outputs.is_empty()).await;
-    let other = ServiceType::new("std_srvs/srv/Trigger", "*").written_by(RosVersion::Two);
-    is_looked_for(&mut robot, "/ask").await;
-    robot.has("/ask", Some((5, &other)));
-    // It is looked at again, since another may have come.
-    is_looked_for(&mut robot, "/ask").await;
+    let (mut robot, _) = connect_robot(&bus, PEER, |graph| !graph.outputs.is_empty()).await;
+    let other = ServiceType::new("std_srvs/srv/Trigger", "*").with_version(RosVersion::Two);
+    expect_lookup(&mut robot, "/ask").await;
+    robot.send_lent("/ask", Some((5, &other)));
+    // It is looked up again, because another server may have appeared.
+    expect_lookup(&mut robot, "/ask").await;
     assert!(!bus.graph().borrow().services.contains_key("/ask"));
 }
 
-/// A robot with a bus of its own: what the cloud asks for is looked up and called there, and what the node in the cloud listens
-/// to is published there.
-async fn stands_for(robot: &mut Robot, own: &Arc<Ros2Bus>, graph: &Graph) {
+/// Runs a robot with a bus of its own: what the cloud requests is looked up and called there, and what the node in the
+/// cloud subscribes to is published there.
+async fn run_robot(robot: &mut LinkedRobot, own: &Arc<Ros2Bus>, graph: &Graph) {
     let mut reading = tokio::task::JoinSet::new();
     let inputs = graph.inputs.iter().filter(|input| input.feed);
     for (channel, input) in (1..).zip(inputs) {
-        let qos =
-            Qos::keep_last(100).latching(input.qos.as_ref().is_some_and(|it| it.transient_local));
+        let qos = QosProfile::keep_last(100)
+            .latching(input.qos.as_ref().is_some_and(|it| it.transient_local));
         let heard = own.subscribe(&input.topic, WireType::any(), qos).await;
         let heard = heard.expect("a subscription");
-        robot.opens(Input {
+        robot.open_input(InputChannel {
             channel,
             topic: input.topic.clone(),
             type_name: input.type_name.clone(),
             md5: input.md5.clone(),
             latching: qos.is_latching(),
-            ..Input::default()
+            ..InputChannel::default()
         });
         let session = Arc::clone(&robot.session);
         let number = channel;
         reading.spawn(async move {
-            // All of it, or its guard would stay behind and end the subscription.
+            // As a whole: if it were destructured, its guard would stay behind and end the subscription.
             let heard = &mut { heard };
             while let Some(message) = heard.messages.recv().await {
                 let data = link::record::Data {
@@ -316,21 +333,21 @@ async fn stands_for(robot: &mut Robot, own: &Arc<Ros2Bus>, graph: &Graph) {
                     answered: None,
                     message: message.bytes,
                 };
-                session.publish(data, link::Quality::Each);
+                session.publish(data, link::DeliveryMode::Each);
             }
         });
     }
     let mut lent = Vec::new();
     while let Some(asked) = robot.asked.recv().await {
         match asked {
-            Asked::Lookup(service) => {
+            CloudRequest::Lookup(service) => {
                 let found = own.provider(&service).await.ok();
                 lent.push(service.clone());
                 let channel = u32::try_from(lent.len()).expect("few");
                 let of = found.as_ref().map(|found| (channel, &found.service_type));
-                robot.has(&service, of);
+                robot.send_lent(&service, of);
             }
-            Asked::Call(id, channel, request) => {
+            CloudRequest::Call(id, channel, request) => {
                 let (own, session) = (Arc::clone(own), Arc::clone(&robot.session));
                 let service = lent[channel as usize - 1].clone();
                 reading.spawn(async move {
@@ -347,7 +364,7 @@ async fn a_node_in_the_cloud_sends_goals_to_a_server_on_the_robot() {
     let (cloud, field) = (Lab::new(), Lab::new());
     let _server = field.node("fibonacci.py", &["server"]).await;
     let own = field.join("/stub").await;
-    shows(&own, |graph| {
+    wait_graph(&own, |graph| {
         graph
             .actions
             .get("/fib")
@@ -356,7 +373,7 @@ async fn a_node_in_the_cloud_sends_goals_to_a_server_on_the_robot() {
     .await;
     let mut client = cloud.node("fibonacci.py", &["client"]).await;
     let bus = cloud.join(NODE).await;
-    let (mut robot, graph) = linked(&bus, "/lab/fibonacci", |graph| {
+    let (mut robot, graph) = connect_robot(&bus, "/lab/fibonacci", |graph| {
         let listened = |part: &str| {
             let topic = format!("/fib/_action/{part}");
             let mut inputs = graph.inputs.iter();
@@ -368,25 +385,25 @@ async fn a_node_in_the_cloud_sends_goals_to_a_server_on_the_robot() {
     let goals = async {
         assert_eq!(client.obey("there").await, [value!(true)]);
         client.tell("goal 20").await;
-        let accepted = client.says("goal").await;
+        let accepted = client.wait_for("goal").await;
         assert_eq!(accepted[0], value!(true));
-        // The first of it may have come before.
-        let feedback = client.says("feedback").await;
+        // The first of it may have arrived before.
+        let feedback = client.wait_for("feedback").await;
         assert_eq!(feedback[0][2], value!(1), "{feedback:?}");
-        let ended = client.says("ended").await;
+        let ended = client.wait_for("ended").await;
         let result = ended[1].as_array().map(Vec::len);
         assert_eq!((&ended[0], result), (&value!(4), Some(21)));
         client.tell("goal 1000").await;
-        client.says("goal").await;
-        client.says("feedback").await;
+        client.wait_for("goal").await;
+        client.wait_for("feedback").await;
         client.tell("cancel").await;
-        // Several threads of its tell them.
-        let [cancelled, ended] = client.says_each(["cancel", "ended"]).await;
+        // They are reported by several threads.
+        let [cancelled, ended] = client.wait_for_each(["cancel", "ended"]).await;
         assert_eq!((&cancelled[0], &ended[0]), (&value!(1), &value!(5)));
     };
     tokio::select! {
         () = goals => {}
-        () = stands_for(&mut robot, &own, &graph) => panic!("the link has ended"),
+        () = run_robot(&mut robot, &own, &graph) => panic!("the link has ended"),
     }
 }
 
@@ -397,10 +414,10 @@ async fn who_serves_and_how_it_calls_itself_is_seen() {
     let (one, other) = (lab.join("/one").await, lab.join("/other").await);
     one.set_label("vision for rover");
     let _serving = one
-        .serve("/ask", of_set_bool(), Arc::new(Answers))
+        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
         .await
         .unwrap();
-    shows(&other, |graph| {
+    wait_graph(&other, |graph| {
         graph.services.contains_key("/ask") && graph.services.contains_key("/set")
     })
     .await;
@@ -409,7 +426,7 @@ async fn who_serves_and_how_it_calls_itself_is_seen() {
     for found in [&ours, &theirs] {
         assert_eq!(found.node, "/one");
         assert_eq!(found.label.as_deref(), Some("vision for rover"));
-        assert!(found.service_type.agrees(&of_set_bool()));
+        assert!(found.service_type.is_compatible_with(&set_bool_type()));
     }
     let plain = other.provider("/set").await.unwrap();
     assert_eq!((&*plain.node, plain.label), (PEER, None));
@@ -420,31 +437,27 @@ async fn who_serves_and_how_it_calls_itself_is_seen() {
 async fn robots_of_ros_1_are_refused_by_name() {
     let lab = Lab::new();
     let bus = lab.join(NODE).await;
-    let hub = hub(bus, Arc::new(Remembered::default()), &[]);
+    let hub = hub(bus, Arc::new(RunTracker::default()), &[]);
     for ros in [0, 1] {
         let of_one = Hello {
             ros,
             ..hello("/see")
         };
-        let (reason, again) = refused(&hub, &of_one).await;
+        let (reason, again) = expect_refusal(&hub, &of_one).await;
         assert!(!again, "{reason}");
-        for part in [
-            "service vision is of ROS 2",
-            "this robot is of ROS 1",
-            "push",
-        ] {
+        for part in ["service vision uses ROS 2", "this robot uses ROS 1", "push"] {
             assert!(reason.contains(part), "{reason}");
         }
     }
-    // Names of ROS 2 have a first letter in each part.
-    let (reason, _) = refused(&hub, &hello("/2see")).await;
+    // In ROS 2, each part of a name begins with a letter.
+    let (reason, _) = expect_refusal(&hub, &hello("/2see")).await;
     assert!(reason.contains("not an absolute node name"), "{reason}");
 }
 
 #[tokio::test]
 async fn a_node_goes_on_when_another_daemon_takes_its_link_up() {
     let lab = Lab::new();
-    let nodes = Arc::new(Remembered::default());
+    let nodes = Arc::new(RunTracker::default());
     let begins = async |run: &str| {
         let bus = lab.join(NODE).await;
         let hub = hub(bus, Arc::clone(&nodes) as _, &[]);
@@ -452,7 +465,7 @@ async fn a_node_goes_on_when_another_daemon_takes_its_link_up() {
             run: run.to_owned(),
             ..hello("/see")
         };
-        let robot = timeout(LONG, Robot::links(&hub, &hello)).await;
+        let robot = timeout(LONG, LinkedRobot::connect(&hub, &hello)).await;
         robot.expect("a link");
         nodes.starts("/see")
     };

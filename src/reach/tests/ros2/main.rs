@@ -1,4 +1,4 @@
-//! The bus of ROS 2 with nodes of rclpy and Fast DDS, and with Cyclone DDS, in a network namespace as a servant has it.
+//! The ROS 2 bus with nodes of rclpy on Fast DDS, and with Cyclone DDS, in a network namespace like a servant's.
 
 mod actions;
 mod cyclone;

@@ -1,4 +1,4 @@
-//! A robot's real networks: other machines are namespaces at the other ends of virtual cables.
+//! Real networks of a robot: other machines are namespaces connected by virtual cables.
 
 use std::net::SocketAddr;
 use std::os::fd::{AsFd, AsRawFd};
@@ -6,23 +6,25 @@ use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros::bus::{Bus, Qos, Subscription, reaches};
+use ros::bus::{Bus, QosProfile, Subscription, wait_for_connected};
 use ros::ros2::Ros2Bus;
-use ros::{Interfaces, Network};
+use ros::{DiscoveryNetwork, InterfaceSelection};
 use serde_json::json as value;
 use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, Peer, json, of_set_bool, of_string, said, set_bool, shows, string};
-use super::services::{Answers, request};
+use super::lab::{
+    LONG, Lab, Peer, json, set_bool, set_bool_type, string, string_message, string_type, wait_graph,
+};
+use super::services::{CallerEchoService, request};
 
 const NODE: &str = "/cloudroid_bridge";
 
-/// As a stub on a robot has it.
-pub fn robots() -> Network {
-    Network {
-        interfaces: Interfaces::All,
+/// Returns the network options of a stub on a robot.
+pub fn robot_network() -> DiscoveryNetwork {
+    DiscoveryNetwork {
+        interfaces: InterfaceSelection::All,
         well_known: true,
-        ..Network::default()
+        ..DiscoveryNetwork::default()
     }
 }
 
@@ -34,7 +36,7 @@ fn ip(lab: &Lab, arguments: &str) {
     assert!(done.success(), "ip {arguments}");
 }
 
-/// A cable between two machines: `10.NETWORK.0.1` here and `.2` there.
+/// Connects two machines with a cable: `10.NETWORK.0.1` here and `.2` there.
 fn cable(here: &Lab, there: &Lab, network: u8) {
     let name = format!("cable{network}");
     let other = there.network.as_fd().as_raw_fd();
@@ -51,13 +53,13 @@ fn cable(here: &Lab, there: &Lab, network: u8) {
         ip(lab, &format!("link set {name} up"));
     }
     for lab in [here, there] {
-        carries(lab, &name);
+        wait_carrier(lab, &name);
     }
 }
 
-/// Waits until the kernel says that a cable carries, up to a second later: Fast DDS uses no interface for which it does not, and
-/// looks once.
-fn carries(lab: &Lab, name: &str) {
+/// Waits until the kernel reports a carrier, which takes up to a second: Fast DDS ignores interfaces without one, and
+/// checks only once.
+fn wait_carrier(lab: &Lab, name: &str) {
     let begun = Instant::now();
     let is_up = || {
         let mut command = Command::new("ip");
@@ -73,23 +75,25 @@ fn carries(lab: &Lab, name: &str) {
     }
 }
 
-/// A robot and another machine with a cable between them.
+/// Creates a robot and another machine connected with a cable.
 pub fn machines() -> (Lab, Lab) {
     let (robot, other) = (Lab::new(), Lab::new());
     cable(&robot, &other, 77);
     (robot, other)
 }
 
-/// Says things on `/ping`, and hears each on `/pong`.
+/// Publishes on `/ping` and waits for the echo on `/pong`.
 pub async fn converse(bus: &Ros2Bus) -> Subscription {
-    let qos = Qos::keep_last(10);
-    let mut pong = bus.subscribe("/pong", of_string(), qos).await.unwrap();
-    let ping = bus.advertise("/ping", of_string(), qos).await.unwrap();
-    for matched in [ping.matched(), pong.matched.clone()] {
-        timeout(LONG, reaches(matched, 1)).await.expect("somebody");
+    let qos = QosProfile::keep_last(10);
+    let mut pong = bus.subscribe("/pong", string_type(), qos).await.unwrap();
+    let ping = bus.advertise("/ping", string_type(), qos).await.unwrap();
+    for matched in [ping.matched_subscribers(), pong.matched.clone()] {
+        timeout(LONG, wait_for_connected(matched, 1))
+            .await
+            .expect("somebody");
     }
     for number in 0..10 {
-        ping.publish(said(&number.to_string()));
+        ping.publish(string_message(&number.to_string()));
         let message = timeout(LONG, pong.messages.recv()).await;
         let message = message.expect("a message").expect("the bus is open");
         let expected = format!(r#"{{"data":"{number}"}}"#);
@@ -98,20 +102,22 @@ pub async fn converse(bus: &Ros2Bus) -> Subscription {
     pong
 }
 
-/// Calls its service, and has it call ours.
+/// Calls the peer's service, and has it call ours.
 pub async fn call_each_other(bus: &Ros2Bus, peer: &mut Peer, answer: &[serde_json::Value]) {
-    shows(bus, |graph| graph.services.contains_key("/set")).await;
+    wait_graph(bus, |graph| graph.services.contains_key("/set")).await;
     let answered = bus.call("/set", request(true), LONG).await.unwrap();
     let expected = r#"{"success":true,"message":"set"}"#;
     assert_eq!(json(&set_bool().response, &answered), expected);
-    let served = bus.serve("/ask", of_set_bool(), Arc::new(Answers)).await;
+    let served = bus
+        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
+        .await;
     let _served = served.unwrap();
     let told = peer.obey("call true").await;
     assert_eq!(told[..answer.len()], *answer);
 }
 
-/// How long it takes until its being killed is noticed.
-pub async fn killed(peer: &mut Peer, pong: Subscription) -> Duration {
+/// Kills the peer and returns the time until that is detected.
+pub async fn measure_loss_detection(peer: &mut Peer, pong: Subscription) -> Duration {
     let mut matched = pong.matched.clone();
     let begun = Instant::now();
     peer.kill();
@@ -124,24 +130,24 @@ pub async fn killed(peer: &mut Peer, pong: Subscription) -> Duration {
 async fn a_node_of_rclpy_on_another_machine() {
     let (robot, other) = machines();
     let mut peer = other.peer().await;
-    let bus = robot.join_network(NODE, robots()).await;
+    let bus = robot.join_network(NODE, robot_network()).await;
     let pong = converse(&bus).await;
     call_each_other(&bus, &mut peer, &[value!(true), value!("/lab/peer")]).await;
-    // By its lease: 20 s, and its last word may be some seconds old.
-    let noticed = killed(&mut peer, pong).await;
+    // By its lease of 20 s; its last assertion may be some seconds old.
+    let noticed = measure_loss_detection(&mut peer, pong).await;
     assert!(noticed < Duration::from_secs(25), "{noticed:?}");
-    shows(&bus, |graph| !graph.nodes.contains_key("/lab/peer")).await;
+    wait_graph(&bus, |graph| !graph.nodes.contains_key("/lab/peer")).await;
 }
 
 #[tokio::test]
 async fn a_participant_of_cyclone_on_another_machine() {
     let (robot, other) = machines();
     let mut peer = other.node("cyclone.py", &[]).await;
-    let bus = robot.join_network(NODE, robots()).await;
+    let bus = robot.join_network(NODE, robot_network()).await;
     let pong = converse(&bus).await;
     call_each_other(&bus, &mut peer, &[value!(0), value!(true)]).await;
     // By its lease of 10 s.
-    let noticed = killed(&mut peer, pong).await;
+    let noticed = measure_loss_detection(&mut peer, pong).await;
     assert!(noticed < Duration::from_secs(15), "{noticed:?}");
 }
 
@@ -149,11 +155,11 @@ async fn a_participant_of_cyclone_on_another_machine() {
 async fn a_node_on_the_robot_itself_is_seen_to_be_killed() {
     let (robot, _other) = machines();
     let mut peer = robot.peer().await;
-    let bus = robot.join_network(NODE, robots()).await;
+    let bus = robot.join_network(NODE, robot_network()).await;
     let pong = converse(&bus).await;
     call_each_other(&bus, &mut peer, &[value!(true), value!("/lab/peer")]).await;
-    // Its ports are looked at five times a second.
-    let noticed = killed(&mut peer, pong).await;
+    // Its ports are checked five times a second.
+    let noticed = measure_loss_detection(&mut peer, pong).await;
     assert!(noticed < Duration::from_secs(2), "{noticed:?}");
 }
 
@@ -163,19 +169,19 @@ async fn nodes_in_two_networks_are_heard() {
     cable(&robot, &left, 77);
     cable(&robot, &right, 78);
     let (_one, _two) = tokio::join!(left.peer(), right.node("cyclone.py", &[]));
-    let bus = robot.join_network(NODE, robots()).await;
+    let bus = robot.join_network(NODE, robot_network()).await;
     let ping = bus
-        .advertise("/ping", of_string(), Qos::keep_last(10))
+        .advertise("/ping", string_type(), QosProfile::keep_last(10))
         .await
         .unwrap();
-    let both = timeout(LONG, reaches(ping.matched(), 2)).await;
+    let both = timeout(LONG, wait_for_connected(ping.matched_subscribers(), 2)).await;
     both.expect("one in each network");
 }
 
 #[tokio::test]
 async fn a_network_that_comes_later_is_used() {
     let (robot, other) = (Lab::new(), Lab::new());
-    let bus = robot.join_network(NODE, robots()).await;
+    let bus = robot.join_network(NODE, robot_network()).await;
     let before = robot.peer().await;
     converse(&bus).await;
     drop(before);
@@ -190,10 +196,10 @@ async fn peers_are_told_where_there_is_no_multicast() {
     let (robot, other) = machines();
     let narrow = [("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")];
     let mut peer = other.node_with("peer.py", &[], &narrow).await;
-    let network = Network {
+    let network = DiscoveryNetwork {
         multicast: false,
         peers: vec![SocketAddr::from(([10, 77, 0, 2], 0))],
-        ..robots()
+        ..robot_network()
     };
     let bus = robot.join_network(NODE, network).await;
     converse(&bus).await;
@@ -204,12 +210,12 @@ async fn peers_are_told_where_there_is_no_multicast() {
 async fn whoever_is_to_be_alone_is() {
     let robot = Lab::new();
     let mut peer = robot.peer().await;
-    let network = Network {
+    let network = DiscoveryNetwork {
         alone: true,
-        ..Network::default()
+        ..DiscoveryNetwork::default()
     };
     let alone = robot.join_network(NODE, network).await;
-    // Who comes after it is found by the peer, and so it would have been.
+    // The peer discovers newcomers, so it would have discovered this one.
     let bus = robot.join("/seen").await;
     converse(&bus).await;
     assert!(alone.graph().borrow().nodes.keys().all(|node| node == NODE));

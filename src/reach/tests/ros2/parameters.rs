@@ -6,12 +6,12 @@ use ros::bus::{
 use ros::ros2::Ros2Bus;
 use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, Peer, shows};
+use super::lab::{LONG, Lab, Peer, wait_graph};
 
 const TUNED: &str = "/lab/tuned";
 
-/// A bus and the nodes of `tuned.py`, which it has found.
-pub async fn tuned(lab: &Lab) -> (Arc<Ros2Bus>, Peer) {
+/// Joins, starts the nodes of `tuned.py` and waits until they are discovered.
+pub async fn tuned_node(lab: &Lab) -> (Arc<Ros2Bus>, Peer) {
     let nodes = lab.node("tuned.py", &[]).await;
     let bus = lab.join("/cloudroid_bridge").await;
     for service in [
@@ -20,7 +20,7 @@ pub async fn tuned(lab: &Lab) -> (Arc<Ros2Bus>, Peer) {
         "/lab/staged/get_available_transitions",
         "/lab/staged/set_parameters",
     ] {
-        shows(&bus, |graph| graph.services.contains_key(service)).await;
+        wait_graph(&bus, |graph| graph.services.contains_key(service)).await;
     }
     (bus, nodes)
 }
@@ -41,7 +41,7 @@ fn list<const N: usize>(items: [ParamValue; N]) -> ParamValue {
 async fn parameters_of_a_node_are_listed_read_and_described() {
     use ParamValue::{Binary, Bool, Double, Int};
     let lab = Lab::new();
-    let (bus, _nodes) = tuned(&lab).await;
+    let (bus, _nodes) = tuned_node(&lab).await;
     let parameters = bus.node_parameters().unwrap();
     let listed = parameters.list(TUNED, &[], 0).await.unwrap();
     for name in ["on", "blob", "arm.joint.gain", "use_sim_time"] {
@@ -98,7 +98,7 @@ async fn parameters_of_a_node_are_listed_read_and_described() {
 async fn parameters_of_a_node_are_set_if_it_agrees() {
     use ParamValue::{Binary, Double, Int};
     let lab = Lab::new();
-    let (bus, _nodes) = tuned(&lab).await;
+    let (bus, _nodes) = tuned_node(&lab).await;
     let parameters = bus.node_parameters().unwrap();
     let changes = [
         ("speed", Int(2)),
@@ -133,21 +133,24 @@ async fn parameters_of_a_node_are_set_if_it_agrees() {
         let change = |name: &str, value| (name.to_owned(), Some(value));
         vec![change("count", Int(6)), change("speed", Int(speed))]
     };
-    let refused = parameters.set_together(TUNED, both(12)).await.unwrap_err();
+    let refused = parameters
+        .set_atomically(TUNED, both(12))
+        .await
+        .unwrap_err();
     assert_eq!(
         refused.to_string(),
         "service /lab/tuned/set_parameters_atomically failed: too fast"
     );
     let count = names(&["count"]);
     assert_eq!(parameters.get(TUNED, &count).await.unwrap(), [Some(Int(5))]);
-    parameters.set_together(TUNED, both(3)).await.unwrap();
+    parameters.set_atomically(TUNED, both(3)).await.unwrap();
     assert_eq!(parameters.get(TUNED, &count).await.unwrap(), [Some(Int(6))]);
 }
 
 #[tokio::test]
 async fn changes_of_parameters_are_told() {
     let lab = Lab::new();
-    let (bus, _nodes) = tuned(&lab).await;
+    let (bus, _nodes) = tuned_node(&lab).await;
     let parameters = bus.node_parameters().unwrap();
     let mut of_tuned = parameters.watch(Some(TUNED)).await.unwrap();
     let mut of_all = parameters.watch(None).await.unwrap();

@@ -1,14 +1,14 @@
-//! Pictures of a camera in a servant's network, from a node and back to it, as fast as cameras make them.
+//! Camera images in a servant's network, from a node and back to it, at the rate of a camera.
 
 use std::time::Duration;
 
-use ros::bus::{Bus as _, Message, Qos, WireType, reaches};
+use ros::bus::{Bus as _, QosProfile, SerializedMessage, WireType, wait_for_connected};
 use serde_json::json;
 use tokio::time::timeout;
 
 use super::lab::{LONG, Lab};
 
-/// A writer keeps 64 MiB for a reader that is slow, as one is on a busy machine; of the larger pictures that is so many.
+/// A writer keeps 64 MiB for a slow reader, as on a busy machine; this many of the larger images.
 const AT_ONCE: usize = 10;
 const ROUNDS: usize = 3;
 
@@ -17,10 +17,10 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
     let lab = Lab::new();
     let mut camera = lab.node("camera.py", &[]).await;
     let bus = lab.join("/cloudroid_bridge").await;
-    let qos = Qos::keep_last(AT_ONCE);
+    let qos = QosProfile::keep_last(AT_ONCE);
     let heard = bus.subscribe("/picture", WireType::any(), qos).await;
     let mut heard = heard.unwrap();
-    let connected = timeout(LONG, reaches(heard.matched.clone(), 1)).await;
+    let connected = timeout(LONG, wait_for_connected(heard.matched.clone(), 1)).await;
     connected.expect("a camera");
     let mut back = None;
     let sizes = [(640, 480), (1920, 1080)];
@@ -28,13 +28,13 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
         camera
             .tell(&format!("show {width} {height} {AT_ONCE}"))
             .await;
-        let mut pictures: Vec<Message> = Vec::new();
+        let mut pictures: Vec<SerializedMessage> = Vec::new();
         while pictures.len() < AT_ONCE {
             let next = timeout(LONG, heard.messages.recv()).await;
             pictures.push(next.expect("in time").expect("the bus is open"));
         }
-        // header { stamp { sec … } … } behind the four bytes that say how it is written.
-        let number = |picture: &Message| {
+        // header { stamp { sec … } … } after the four bytes of the CDR header.
+        let number = |picture: &SerializedMessage| {
             let word = picture.bytes[4..8].try_into().expect("four bytes");
             u32::from_le_bytes(word) as usize
         };
@@ -44,11 +44,12 @@ async fn pictures_of_both_sizes_go_both_ways_whole_and_in_order() {
                 .iter()
                 .all(|picture| picture.bytes.len() > width * height * 3)
         );
-        camera.says("show").await;
+        camera.wait_for("show").await;
         if back.is_none() {
             let of = WireType::clone(&pictures[0].wire_type);
             let publisher = bus.advertise("/seen", of, qos).await.unwrap();
-            let connected = timeout(LONG, reaches(publisher.matched(), 1)).await;
+            let connected =
+                timeout(LONG, wait_for_connected(publisher.matched_subscribers(), 1)).await;
             connected.expect("somebody who looks");
             back = Some(publisher);
         }

@@ -1,25 +1,27 @@
-//! Processes that are several nodes: what a link tells of each of them, and how the stub's end shows them.
+//! Processes with several nodes: how a link reports them, and how the stub's end shows them.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use link::control::{Graph, Has, Input};
-use ros::bus::{Bus, NodeNames, Qos, RosVersion, ServiceType};
+use link::control::{Graph, InputChannel, NodeEndpoints};
+use ros::bus::{Bus, NodeNames, QosProfile, RosVersion, ServiceType};
 use ros::schema::Registry;
 use serde_json::{Value, json as value};
 
-use super::lab::{Lab, Peer, cdr, json, of_string, said, string};
-use super::robot::{Asked, Remembered, Robot, hello, hub, output, served};
+use super::lab::{Lab, Peer, cdr, json, string, string_message, string_type};
+use super::robot::{CloudRequest, LinkedRobot, RunTracker, find_output, find_service, hello, hub};
 
 const NODE: &str = "/cloudroid_bridge";
-/// As [`ros::flavour::Flavour::of_a_robot`] has it for the node `/alto`.
+/// Arguments as by [`ros::flavour::Flavour::robot_identity`] for the node `/alto`.
 const MARK: [&str; 3] = ["--ros-args", "--enclave", "/cloudroid_link/alto"];
 const DEFINITIONS: [(&str, &str); 3] = [
     ("std_msgs/msg/String", "string data"),
     (
         "rcl_interfaces/msg/ParameterValue",
-        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] byte_array_value\n\
-         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] string_array_value\n",
+        "uint8 type\nbool bool_value\nint64 integer_value\nfloat64 double_value\nstring string_value\nbyte[] \
+         byte_array_value\n\
+         bool[] bool_array_value\nint64[] integer_array_value\nfloat64[] double_array_value\nstring[] \
+         string_array_value\n",
     ),
     (
         "rcl_interfaces/srv/GetParameters",
@@ -34,9 +36,9 @@ fn names(names: &[&str]) -> BTreeSet<String> {
 fn songs(graph: &Graph) -> bool {
     let topics = ["/alto/song", "/low/tenor/song", "/songs"];
     let mut topics = topics.iter();
-    topics.all(|topic| output(graph, topic).is_some())
+    topics.all(|topic| find_output(graph, topic).is_some())
         && graph.inputs.len() == 2
-        && served(graph, "/low/tenor/get_parameters").is_some()
+        && find_service(graph, "/low/tenor/get_parameters").is_some()
         && graph.nodes.len() == 2
 }
 
@@ -44,17 +46,17 @@ fn songs(graph: &Graph) -> bool {
 async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
     let lab = Lab::new();
     let _duet = lab.node("duet.py", &MARK).await;
-    // Not of that process.
+    // A node of another process.
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
     let hub = hub(
         Arc::clone(&bus) as _,
-        Arc::new(Remembered::default()),
+        Arc::new(RunTracker::default()),
         &DEFINITIONS,
     );
-    let mut robot = Robot::links(&hub, &hello("/alto")).await;
-    let graph = robot.told(songs).await;
-    let Has {
+    let mut robot = LinkedRobot::connect(&hub, &hello("/alto")).await;
+    let graph = robot.wait_graph(songs).await;
+    let NodeEndpoints {
         outputs,
         inputs,
         services,
@@ -67,24 +69,25 @@ async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
     let all: BTreeSet<String> = graph.outputs.iter().map(|it| it.topic.clone()).collect();
     let others = ["/alto/song"];
     assert_eq!(all, &names(&published) | &names(&others));
-    // What the second one says comes, also on a topic of both.
+    // Messages of the second node arrive, also on a topic that both publish.
     for topic in ["/low/tenor/song", "/songs"] {
-        robot.listens(output(&graph, topic).unwrap());
+        robot.listen(find_output(&graph, topic).unwrap());
     }
-    let of = of_string();
-    robot.opens(Input {
+    let of = string_type();
+    robot.open_input(InputChannel {
         channel: 1,
         topic: "/low/tenor/note".to_owned(),
         type_name: of.name.clone(),
         md5: of.digest.to_string(),
-        ..Input::default()
+        ..InputChannel::default()
     });
-    robot.publishes(1, said("c"));
+    robot.publish(1, string_message("c"));
     for _ in 0..2 {
-        let heard: Value = serde_json::from_str(&json(&string(), &robot.hears().await.1)).unwrap();
+        let heard: Value =
+            serde_json::from_str(&json(&string(), &robot.next_message().await.1)).unwrap();
         assert_eq!(heard["data"], "/low/tenor: c");
     }
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in DEFINITIONS {
         registry.insert(key, text).expect("a definition");
     }
@@ -92,19 +95,22 @@ async fn all_nodes_of_a_process_are_told_with_what_each_of_them_has() {
         .service("rcl_interfaces/srv/GetParameters")
         .unwrap();
     let asked = cdr(&get.request, r#"{"names":["pitch"]}"#);
-    let answer = robot.calls(served(&graph, "/low/tenor/get_parameters").unwrap(), asked);
+    let answer = robot.call(
+        find_service(&graph, "/low/tenor/get_parameters").unwrap(),
+        asked,
+    );
     let answer: Value = serde_json::from_str(&json(&get.response, &answer.await.unwrap())).unwrap();
     assert_eq!(answer["values"][0]["string_value"], "tenor", "{answer}");
-    // What the second one looks for is looked for on the robot, and what it lacks is this link's.
-    let mut asked = robot.is_asked().await;
-    while !matches!(&asked, Asked::Lookup(service) if service == "/lost") {
-        asked = robot.is_asked().await;
+    // Services that the second node looks up are looked up on the robot; unmet ones are in this link's status.
+    let mut asked = robot.next_request().await;
+    while !matches!(&asked, CloudRequest::Lookup(service) if service == "/lost") {
+        asked = robot.next_request().await;
     }
     assert_eq!(hub.status()[0].unserved, ["/lost"]);
-    // Another link's nodes are all of them.
-    let other = Robot::links(&hub, &hello("/lab/peer")).await;
+    // All of them are nodes of another link.
+    let other = LinkedRobot::connect(&hub, &hello("/lab/peer")).await;
     let siblings = ["/alto".to_owned(), "/low/tenor".to_owned()];
-    other.told(|graph| graph.siblings == siblings).await;
+    other.wait_graph(|graph| graph.siblings == siblings).await;
 }
 
 async fn ends(peer: &mut Peer, name: &str, namespace: &str) -> Value {
@@ -129,18 +135,18 @@ async fn nodes_that_a_bus_stands_for_are_nodes_to_rclpy() {
         ("/ears".to_owned(), ears),
         ("/face/mouth".to_owned(), mouth),
     ];
-    let qos = Qos::keep_last(1);
-    let _log = bus.advertise("/log", of_string(), qos).await.unwrap();
-    let _said = bus.advertise("/said", of_string(), qos).await.unwrap();
-    let _words = bus.subscribe("/words", of_string(), qos).await.unwrap();
+    let qos = QosProfile::keep_last(1);
+    let _log = bus.advertise("/log", string_type(), qos).await.unwrap();
+    let _said = bus.advertise("/said", string_type(), qos).await.unwrap();
+    let _words = bus.subscribe("/words", string_type(), qos).await.unwrap();
     let of = ServiceType::new("std_srvs/srv/SetBool", "*");
-    let shut = Arc::new(super::services::Answers);
+    let shut = Arc::new(super::services::CallerEchoService);
     let _shut = bus.serve("/face/mouth/shut", of, shut).await.unwrap();
     assert_eq!(
         ends(&mut peer, "ears", "/").await,
         value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]])
     );
-    bus.stands_for(nodes.into());
+    bus.set_represented_nodes(nodes.into());
     assert_eq!(
         ends(&mut peer, "mouth", "/face").await,
         value!([["/log", "/said"], ["/words"], ["/face/mouth/shut"]])
@@ -149,7 +155,7 @@ async fn nodes_that_a_bus_stands_for_are_nodes_to_rclpy() {
         ends(&mut peer, "ears", "/").await,
         value!([["/log"], [], []])
     );
-    // There is one publisher of what both have.
+    // There is one publisher of the topic that both have.
     let publishers = peer.obey("publishers /log").await;
     assert_eq!(publishers.len(), 1, "{publishers:?}");
     assert_eq!(peer.obey("publishers /said").await, [value!("mouth")]);

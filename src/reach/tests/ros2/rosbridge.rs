@@ -1,4 +1,4 @@
-//! Rosbridge sessions with nodes of rclpy. Each story is told twice, by a robot that speaks JSON and by one that speaks CBOR.
+//! Rosbridge sessions with nodes of rclpy. Each test runs twice, with a robot that uses JSON and one that uses CBOR.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use tokio::time::timeout;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::protocol::{Message, Role};
 
-use super::lab::{LONG, Lab, shows};
+use super::lab::{LONG, Lab, wait_graph};
 
 const DEFINITIONS: [(&str, &str); 6] = [
     ("std_msgs/msg/Int32", "int32 data\n"),
@@ -33,29 +33,29 @@ const DEFINITIONS: [(&str, &str); 6] = [
     ("x_msgs/action/Count", "int32 order\n---\n---\n"),
 ];
 
-/// What a robot speaks.
+/// Encoding that a robot uses.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Speaks {
+enum RosbridgeFormat {
     Json,
     Cbor,
 }
 
-const BOTH: [Speaks; 2] = [Speaks::Json, Speaks::Cbor];
+const BOTH: [RosbridgeFormat; 2] = [RosbridgeFormat::Json, RosbridgeFormat::Cbor];
 
-/// The bridge before a servant of ROS 2.
-struct Servant {
+/// The bridge of a ROS 2 servant.
+struct BridgedServant {
     bus: Arc<Ros2Bus>,
     bridge: Arc<Bridge>,
 }
 
-impl Servant {
-    async fn of(lab: &Lab) -> Self {
+impl BridgedServant {
+    async fn start(lab: &Lab) -> Self {
         let bus = lab.join("/cloudroid_bridge").await;
-        let registry = Registry::of(RosVersion::Two);
+        let registry = Registry::for_version(RosVersion::Two);
         for (name, text) in DEFINITIONS {
             registry.insert(name, text).expect("a definition");
         }
-        // Whatever waits for its time to be over fails its test.
+        // Longer than any wait of a test, so that a test which waits for a timeout fails.
         let options = BridgeOptions {
             action_timeout: 2 * LONG,
             call_timeout: 2 * LONG,
@@ -65,31 +65,31 @@ impl Servant {
         Self { bus, bridge }
     }
 
-    /// Once its graph shows this.
-    async fn shows(&self, wanted: impl Fn(&Graph) -> bool) {
-        shows(&self.bus, wanted).await;
+    /// Waits until its graph satisfies a condition.
+    async fn wait_graph(&self, wanted: impl Fn(&Graph) -> bool) {
+        wait_graph(&self.bus, wanted).await;
     }
 
-    async fn robot(&self, speaks: Speaks) -> Robot {
+    async fn robot(&self, speaks: RosbridgeFormat) -> RosbridgeRobot {
         let (ours, theirs) = tokio::io::duplex(64 * 1024);
         let bridge = Arc::clone(&self.bridge);
         tokio::spawn(async move { bridge.serve(theirs, SessionOptions::default()).await });
         let socket = WebSocketStream::from_raw_socket(ours, Role::Client, None).await;
-        Robot { socket, speaks }
+        RosbridgeRobot { socket, speaks }
     }
 }
 
 /// A client of rosbridge.
-struct Robot {
+struct RosbridgeRobot {
     socket: WebSocketStream<DuplexStream>,
-    speaks: Speaks,
+    speaks: RosbridgeFormat,
 }
 
-impl Robot {
-    async fn says(&mut self, op: Value) {
+impl RosbridgeRobot {
+    async fn send(&mut self, op: Value) {
         let message = match self.speaks {
-            Speaks::Json => Message::text(op.to_string()),
-            Speaks::Cbor => {
+            RosbridgeFormat::Json => Message::text(op.to_string()),
+            RosbridgeFormat::Cbor => {
                 let mut bytes = Vec::new();
                 ciborium::into_writer(&op, &mut bytes).expect("CBOR");
                 Message::binary(bytes)
@@ -98,29 +98,29 @@ impl Robot {
         self.socket.send(message).await.expect("a session");
     }
 
-    /// Says something after which it is spoken to as it speaks.
-    async fn begins(&mut self, what: &str, mut op: Value) {
+    /// Sends an operation that selects the encoding of what follows.
+    async fn send_first(&mut self, what: &str, mut op: Value) {
         op["op"] = what.into();
         op["compression"] = match self.speaks {
-            Speaks::Json => "none".into(),
-            Speaks::Cbor => "cbor".into(),
+            RosbridgeFormat::Json => "none".into(),
+            RosbridgeFormat::Cbor => "cbor".into(),
         };
-        self.says(op).await;
+        self.send(op).await;
     }
 
-    async fn subscribes(&mut self, op: Value) {
-        self.begins("subscribe", op).await;
+    async fn subscribe(&mut self, op: Value) {
+        self.send_first("subscribe", op).await;
     }
 
-    /// The next message, which must be of this operation.
-    async fn hears(&mut self, op: &str) -> Value {
+    /// Returns the next message, which must have this operation.
+    async fn receive(&mut self, op: &str) -> Value {
         let heard = self.next(op).await;
         assert_eq!(heard["op"], op, "{heard}");
         heard
     }
 
-    /// The end of its goal, whatever feedback comes before.
-    async fn hears_the_end(&mut self) -> Value {
+    /// Returns the end of its goal, skipping feedback.
+    async fn receive_goal_end(&mut self) -> Value {
         loop {
             let told = self.next("a result").await;
             if told["op"] != "action_feedback" {
@@ -143,32 +143,35 @@ impl Robot {
             .await
             .unwrap_or_else(|_| panic!("{awaited} should come"));
         let (spoken, heard) = match message {
-            Message::Text(text) => (Speaks::Json, serde_json::from_str(&text).expect("JSON")),
-            Message::Binary(bytes) => (Speaks::Cbor, from_cbor(&bytes)),
+            Message::Text(text) => (
+                RosbridgeFormat::Json,
+                serde_json::from_str(&text).expect("JSON"),
+            ),
+            Message::Binary(bytes) => (RosbridgeFormat::Cbor, from_cbor(&bytes)),
             other => panic!("{other:?} instead of {awaited}"),
         };
         assert_eq!(spoken, self.speaks, "{heard}");
         heard
     }
 
-    /// The text of an error.
+    /// Returns the text of an error.
     async fn refusal(&mut self) -> String {
-        let status = self.hears("status").await;
+        let status = self.receive("status").await;
         assert_eq!(status["level"], "error", "{status}");
         status["msg"].as_str().expect("a text").to_owned()
     }
 
-    /// What a service answers.
-    async fn calls(&mut self, service: &str, args: Value) -> Value {
-        self.says(json!({"op": "call_service", "service": service, "args": args}))
+    /// Calls a service; returns the response.
+    async fn call(&mut self, service: &str, args: Value) -> Value {
+        self.send(json!({"op": "call_service", "service": service, "args": args}))
             .await;
-        let answer = self.hears("service_response").await;
+        let answer = self.receive("service_response").await;
         assert_eq!(answer["result"], true, "{answer}");
         answer["values"].clone()
     }
 
-    async fn sends_goal(&mut self, id: &str, order: i32) {
-        self.says(
+    async fn send_goal(&mut self, id: &str, order: i32) {
+        self.send(
             json!({"op": "send_action_goal", "id": id, "action": "/fib", "feedback": true,
             "action_type": "test_msgs/Fibonacci", "args": {"order": order}}),
         )
@@ -176,7 +179,7 @@ impl Robot {
     }
 }
 
-/// With lists of numbers as JSON has them.
+/// Converts CBOR to JSON with typed arrays as lists of numbers.
 fn from_cbor(bytes: &[u8]) -> Value {
     fn plain(value: ciborium::Value) -> ciborium::Value {
         use ciborium::Value::{Array, Map, Tag};
@@ -186,7 +189,7 @@ fn from_cbor(bytes: &[u8]) -> Value {
                 Map(entries.map(|(key, value)| (key, plain(value))).collect())
             }
             Array(items) => Array(items.into_iter().map(plain).collect()),
-            // RFC 8746: `int32[]`, little endian.
+            // RFC 8746: `int32[]`, little-endian.
             Tag(78, numbers) => {
                 let numbers = numbers.into_bytes().expect("bytes");
                 let numbers = numbers.chunks_exact(4).map(|number| {
@@ -217,45 +220,45 @@ fn serves_fib(graph: &Graph) -> bool {
 async fn messages_go_both_ways_in_the_quality_that_is_said() {
     let lab = Lab::new();
     let mut peer = lab.peer().await;
-    let servant = Servant::of(&lab).await;
-    servant.shows(has_peer).await;
+    let servant = BridgedServant::start(&lab).await;
+    servant.wait_graph(has_peer).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         let qos = json!({"reliability": "reliable", "durability": "volatile", "depth": 5});
         robot
-            .subscribes(json!({"topic": "/pong", "type": "std_msgs/msg/String", "qos": qos}))
+            .subscribe(json!({"topic": "/pong", "type": "std_msgs/msg/String", "qos": qos}))
             .await;
         robot
-            .says(
+            .send(
                 json!({"op": "advertise", "topic": "/ping", "type": "std_msgs/String", "qos": qos}),
             )
             .await;
         for data in ["one", "two", "three"] {
             robot
-                .says(json!({"op": "publish", "topic": "/ping", "msg": {"data": data}}))
+                .send(json!({"op": "publish", "topic": "/ping", "msg": {"data": data}}))
                 .await;
-            let heard = robot.hears("publish").await;
+            let heard = robot.receive("publish").await;
             assert_eq!(heard["msg"]["data"], data, "{heard}");
         }
         robot
-            .says(json!({"op": "unsubscribe", "topic": "/pong"}))
+            .send(json!({"op": "unsubscribe", "topic": "/pong"}))
             .await;
-        // What was kept, without a word of its type.
-        robot.subscribes(json!({"topic": "/map"})).await;
-        assert_eq!(robot.hears("publish").await["msg"]["data"], "kept");
+        // What was kept, without specifying its type.
+        robot.subscribe(json!({"topic": "/map"})).await;
+        assert_eq!(robot.receive("publish").await["msg"]["data"], "kept");
         let kept = json!({"durability": "transient_local", "depth": 1});
         robot
-            .says(json!({"op": "advertise", "topic": "/late", "type": "std_msgs/String", "qos": kept}))
+            .send(json!({"op": "advertise", "topic": "/late", "type": "std_msgs/String", "qos": kept}))
             .await;
         robot
-            .says(json!({"op": "publish", "topic": "/late", "msg": {"data": "later"}}))
+            .send(json!({"op": "publish", "topic": "/late", "msg": {"data": "later"}}))
             .await;
-        assert_eq!(peer.says("late").await, [json!("later")]);
-        // It asks for more than is offered, and hears.
+        assert_eq!(peer.wait_for("late").await, [json!("later")]);
+        // It requests more than is offered, and is told.
         robot
-            .subscribes(json!({"topic": "/scan", "qos": {"reliability": "reliable"}}))
+            .subscribe(json!({"topic": "/scan", "qos": {"reliability": "reliable"}}))
             .await;
-        assert_eq!(robot.hears("publish").await["msg"]["data"], "seen");
+        assert_eq!(robot.receive("publish").await["msg"]["data"], "seen");
     }
 }
 
@@ -263,20 +266,21 @@ async fn messages_go_both_ways_in_the_quality_that_is_said() {
 async fn a_node_that_demands_more_is_named_with_both_profiles() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
-    let servant = Servant::of(&lab).await;
-    servant.shows(has_peer).await;
+    let servant = BridgedServant::start(&lab).await;
+    servant.wait_graph(has_peer).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         robot
-            .says(
+            .send(
                 json!({"op": "advertise", "topic": "/strict", "type": "std_msgs/String",
                 "qos": {"reliability": "best_effort"}}),
             )
             .await;
         assert_eq!(
             robot.refusal().await,
-            "advertise: topic /strict: nothing passes between /lab/peer and this client: reliability: the publisher offers \
-             best_effort, the subscriber asks for reliable (publisher: best_effort, volatile; subscriber: reliable, volatile)"
+            "advertise: topic /strict: no messages pass between /lab/peer and this client: reliability: the publisher \
+                offers best_effort, the subscriber asks for reliable (publisher: best_effort, volatile; subscriber: \
+                reliable, volatile)"
         );
     }
 }
@@ -284,13 +288,13 @@ async fn a_node_that_demands_more_is_named_with_both_profiles() {
 #[tokio::test]
 async fn whoever_says_another_type_is_told_both_at_once() {
     let lab = Lab::new();
-    let servant = Servant::of(&lab).await;
-    let mut early = servant.robot(Speaks::Json).await;
+    let servant = BridgedServant::start(&lab).await;
+    let mut early = servant.robot(RosbridgeFormat::Json).await;
     early
-        .subscribes(json!({"topic": "/pong", "type": "std_msgs/Int32"}))
+        .subscribe(json!({"topic": "/pong", "type": "std_msgs/Int32"}))
         .await;
     early
-        .says(
+        .send(
             json!({"op": "send_action_goal", "id": "early", "action": "/fib",
             "action_type": "x_msgs/Count", "args": {"order": 1}}),
         )
@@ -299,51 +303,54 @@ async fn whoever_says_another_type_is_told_both_at_once() {
     let told = early.refusal().await;
     assert!(
         told.starts_with(
-            "subscribe: topic /pong: nothing passes between /lab/peer and this client: its type is std_msgs/msg/String RIHS01_"
+            "subscribe: topic /pong: no messages pass between /lab/peer and this client: its type is \
+                std_msgs/msg/String RIHS01_"
         ) && told.contains(" there and std_msgs/msg/Int32 "),
         "{told}"
     );
     let _server = lab.node("fibonacci.py", &["server"]).await;
-    let other_action = "action /fib has type test_msgs/action/Fibonacci, not x_msgs/action/Count; use the type that it has";
-    assert_eq!(early.hears("action_result").await["values"], other_action);
+    let other_action = "action /fib has type test_msgs/action/Fibonacci, not x_msgs/action/Count; use the type that it \
+                        has";
+    assert_eq!(early.receive("action_result").await["values"], other_action);
 
     servant
-        .shows(|graph| has_peer(graph) && serves_fib(graph))
+        .wait_graph(|graph| has_peer(graph) && serves_fib(graph))
         .await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         for (op, topic) in [("subscribe", "/pong"), ("advertise", "/ping")] {
             robot
-                .says(json!({"op": op, "topic": topic, "type": "std_msgs/Int32"}))
+                .send(json!({"op": op, "topic": topic, "type": "std_msgs/Int32"}))
                 .await;
             assert_eq!(
                 robot.refusal().await,
                 format!(
-                    "{op}: topic {topic} has type std_msgs/msg/String, not std_msgs/msg/Int32; use the type that it has"
+                    "{op}: topic {topic} has type std_msgs/msg/String, not std_msgs/msg/Int32; use the type that it \
+                        has"
                 )
             );
         }
         robot
-            .says(json!({"op": "call_service", "service": "/set", "type": "std_srvs/Trigger", "args": {"go": 1}}))
+            .send(json!({"op": "call_service", "service": "/set", "type": "std_srvs/Trigger", "args": {"go": 1}}))
             .await;
         assert_eq!(
-            robot.hears("service_response").await["values"],
+            robot.receive("service_response").await["values"],
             "service /set has type std_srvs/srv/SetBool, not std_srvs/srv/Trigger; use the type that it has"
         );
         robot
-            .says(
+            .send(
                 json!({"op": "send_action_goal", "id": "goal", "action": "/fib",
                 "action_type": "x_msgs/action/Count", "args": {"order": 3}}),
             )
             .await;
-        let told = robot.hears("action_result").await;
+        let told = robot.receive("action_result").await;
         assert_eq!(
             (&told["values"], &told["result"], &told["status"]),
             (&json!(other_action), &json!(false), &json!(0))
         );
-        // Nobody has said wrong things of it for good.
-        robot.sends_goal("right", 1).await;
-        assert_eq!(robot.hears("action_result").await["status"], 4);
+        // A wrong type is not remembered.
+        robot.send_goal("right", 1).await;
+        assert_eq!(robot.receive("action_result").await["status"], 4);
     }
 }
 
@@ -351,24 +358,24 @@ async fn whoever_says_another_type_is_told_both_at_once() {
 async fn services_are_called_both_ways() {
     let lab = Lab::new();
     let mut peer = lab.peer().await;
-    let servant = Servant::of(&lab).await;
-    servant.shows(has_peer).await;
+    let servant = BridgedServant::start(&lab).await;
+    servant.wait_graph(has_peer).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
-        let answer = robot.calls("/set", json!({"data": true})).await;
+        let answer = robot.call("/set", json!({"data": true})).await;
         assert_eq!(answer, json!({"success": true, "message": "set"}));
-        // Tools do not show it; who knows its name can call it.
-        let answer = robot.calls("/lab/_box/set", json!([false])).await;
+        // Hidden from tools, but callable by its name.
+        let answer = robot.call("/lab/_box/set", json!([false])).await;
         assert_eq!(answer, json!({"success": false, "message": "set"}));
 
         robot
-            .begins(
+            .send_first(
                 "advertise_service",
                 json!({"service": "/ask", "type": "std_srvs/SetBool"}),
             )
             .await;
         peer.tell("call true").await;
-        let asked = robot.hears("call_service").await;
+        let asked = robot.receive("call_service").await;
         assert_eq!(
             (&asked["service"], &asked["type"], &asked["args"]),
             (
@@ -378,17 +385,20 @@ async fn services_are_called_both_ways() {
             )
         );
         robot
-            .says(
+            .send(
                 json!({"op": "service_response", "id": asked["id"], "service": "/ask",
                 "values": {"success": true, "message": "by a robot"}, "result": true}),
             )
             .await;
-        assert_eq!(peer.says("call").await, [json!(true), json!("by a robot")]);
+        assert_eq!(
+            peer.wait_for("call").await,
+            [json!(true), json!("by a robot")]
+        );
         robot
-            .says(json!({"op": "unadvertise_service", "service": "/ask"}))
+            .send(json!({"op": "unadvertise_service", "service": "/ask"}))
             .await;
         servant
-            .shows(|graph| !graph.services.contains_key("/ask"))
+            .wait_graph(|graph| !graph.services.contains_key("/ask"))
             .await;
     }
 }
@@ -397,35 +407,35 @@ async fn services_are_called_both_ways() {
 async fn goals_are_sent_to_a_node() {
     let lab = Lab::new();
     let _server = lab.node("fibonacci.py", &["server"]).await;
-    let servant = Servant::of(&lab).await;
+    let servant = BridgedServant::start(&lab).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
-        robot.sends_goal("five", 5).await;
+        robot.send_goal("five", 5).await;
         for sequence in [
             json!([0, 1, 1]),
             json!([0, 1, 1, 2]),
             json!([0, 1, 1, 2, 3]),
             json!([0, 1, 1, 2, 3, 5]),
         ] {
-            let told = robot.hears("action_feedback").await;
+            let told = robot.receive("action_feedback").await;
             assert_eq!(told["values"]["sequence"], sequence, "{told}");
         }
-        let ended = robot.hears("action_result").await;
+        let ended = robot.receive("action_result").await;
         assert_eq!(
             (&ended["values"]["sequence"], &ended["status"], &ended["id"]),
             (&json!([0, 1, 1, 2, 3, 5]), &json!(4), &json!("five"))
         );
 
-        robot.sends_goal("long", 100_000).await;
-        robot.hears("action_feedback").await;
+        robot.send_goal("long", 100_000).await;
+        robot.receive("action_feedback").await;
         robot
-            .says(json!({"op": "cancel_action_goal", "id": "long", "action": "/fib"}))
+            .send(json!({"op": "cancel_action_goal", "id": "long", "action": "/fib"}))
             .await;
-        assert_eq!(robot.hears_the_end().await["status"], 5);
-        robot.sends_goal("aborted", 7).await;
-        assert_eq!(robot.hears_the_end().await["status"], 6);
-        robot.sends_goal("refused", -1).await;
-        let refused = robot.hears("action_result").await;
+        assert_eq!(robot.receive_goal_end().await["status"], 5);
+        robot.send_goal("aborted", 7).await;
+        assert_eq!(robot.receive_goal_end().await["status"], 6);
+        robot.send_goal("refused", -1).await;
+        let refused = robot.receive("action_result").await;
         assert_eq!(
             (&refused["values"], &refused["result"]),
             (&json!("the goal was rejected"), &json!(false))
@@ -436,11 +446,11 @@ async fn goals_are_sent_to_a_node() {
 #[tokio::test]
 async fn goals_of_a_node_come_to_a_robot() {
     let lab = Lab::new();
-    let servant = Servant::of(&lab).await;
+    let servant = BridgedServant::start(&lab).await;
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         robot
-            .begins(
+            .send_first(
                 "advertise_action",
                 json!({"action": "/fib", "type": "test_msgs/action/Fibonacci"}),
             )
@@ -449,30 +459,30 @@ async fn goals_of_a_node_come_to_a_robot() {
         assert_eq!(node.obey("there").await, [json!(true)]);
         for (status, sequence) in [(4, json!([0, 1, 1])), (5, json!([0]))] {
             node.tell("goal 2").await;
-            let goal = robot.hears("send_action_goal").await;
+            let goal = robot.receive("send_action_goal").await;
             assert_eq!(
                 (&goal["args"], &goal["action_type"]),
                 (&json!({"order": 2}), &json!("test_msgs/action/Fibonacci"))
             );
-            assert_eq!(node.says("goal").await[0], true);
+            assert_eq!(node.wait_for("goal").await[0], true);
             let about = |op: &str| json!({"op": op, "id": goal["id"], "action": "/fib"});
             let mut feedback = about("action_feedback");
             feedback["values"] = json!({"sequence": [0]});
-            robot.says(feedback).await;
-            assert_eq!(node.says("feedback").await, [json!([0])]);
+            robot.send(feedback).await;
+            assert_eq!(node.wait_for("feedback").await, [json!([0])]);
             if status == 5 {
                 node.tell("cancel").await;
-                let cancel = robot.hears("cancel_action_goal").await;
+                let cancel = robot.receive("cancel_action_goal").await;
                 assert_eq!(cancel["id"], goal["id"]);
             }
             let mut result = about("action_result");
             result["values"] = json!({"sequence": sequence});
             result["status"] = status.into();
             result["result"] = true.into();
-            robot.says(result).await;
-            assert_eq!(node.says("ended").await, [json!(status), sequence]);
+            robot.send(result).await;
+            assert_eq!(node.wait_for("ended").await, [json!(status), sequence]);
         }
-        node.ends().await;
+        node.kill_and_wait().await;
     }
 }
 
@@ -481,9 +491,9 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
     let lab = Lab::new();
     let (_peer, _tuned) = (lab.peer().await, lab.node("tuned.py", &[]).await);
     let _server = lab.node("fibonacci.py", &["server"]).await;
-    let servant = Servant::of(&lab).await;
+    let servant = BridgedServant::start(&lab).await;
     servant
-        .shows(|graph| {
+        .wait_graph(|graph| {
             let parameters = ["get", "set", "list", "describe"];
             let mut parameters = parameters.iter();
             has_peer(graph)
@@ -497,7 +507,7 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
     for speaks in BOTH {
         let mut robot = servant.robot(speaks).await;
         let mut asks =
-            async |what: &str, args: Value| robot.calls(&format!("/rosapi/{what}"), args).await;
+            async |what: &str, args: Value| robot.call(&format!("/rosapi/{what}"), args).await;
         let version = asks("get_ros_version", json!({})).await;
         assert_eq!(version, json!({"version": 2, "distro": "jazzy"}));
 
@@ -568,12 +578,12 @@ async fn rosapi_tells_of_nodes_and_their_parameters() {
             "{names:?}"
         );
 
-        // The node's own words.
+        // The node's own message.
         robot
-            .says(json!({"op": "call_service", "service": "/rosapi/set_param",
+            .send(json!({"op": "call_service", "service": "/rosapi/set_param",
                 "args": {"name": "/lab/tuned:speed", "value": "11.0"}}))
             .await;
-        let refused = robot.hears("service_response").await;
+        let refused = robot.receive("service_response").await;
         assert_eq!(
             (&refused["result"], &refused["values"]),
             (

@@ -6,7 +6,7 @@ use bytes::Bytes;
 use ros::bus::{Bus, BusError, CallFate, ServiceHandler};
 use serde_json::json;
 
-use super::lab::{LONG, Lab, cdr, json, of_set_bool, set_bool, shows};
+use super::lab::{LONG, Lab, cdr, json, set_bool, set_bool_type, wait_graph};
 
 const NODE: &str = "/cloudroid_bridge";
 
@@ -14,11 +14,11 @@ pub fn request(data: bool) -> Bytes {
     cdr(&set_bool().request, &format!(r#"{{"data":{data}}}"#))
 }
 
-/// Gives back what it was sent, with who sent it.
-pub struct Answers;
+/// Returns the request with the name of its caller.
+pub struct CallerEchoService;
 
 #[async_trait]
-impl ServiceHandler for Answers {
+impl ServiceHandler for CallerEchoService {
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
         let asked = json(&set_bool().request, &request);
         let success = asked == r#"{"data":true}"#;
@@ -32,9 +32,9 @@ async fn a_node_answers_calls() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    shows(&bus, |graph| graph.services.contains_key("/set")).await;
+    wait_graph(&bus, |graph| graph.services.contains_key("/set")).await;
     let told = bus.service_type("/set").await.unwrap();
-    let ours = of_set_bool();
+    let ours = set_bool_type();
     assert_eq!(
         (&told.name, &told.request, &told.response),
         (&ours.name, &ours.request, &ours.response)
@@ -47,14 +47,14 @@ async fn a_node_answers_calls() {
     }
 }
 
-/// As the first thing that a bus does.
+/// As the first operation of a bus.
 #[tokio::test]
 async fn a_call_waits_until_both_ends_know_each_other() {
     let lab = Lab::new();
     let _peer = lab.peer().await;
     for _ in 0..5 {
         let bus = lab.join(NODE).await;
-        shows(&bus, |graph| graph.services.contains_key("/set")).await;
+        wait_graph(&bus, |graph| graph.services.contains_key("/set")).await;
         let answer = bus.call("/set", request(true), LONG).await.unwrap();
         assert_eq!(
             json(&set_bool().response, &answer),
@@ -70,7 +70,7 @@ async fn a_node_is_answered() {
     let mut peer = lab.peer().await;
     let bus = lab.join(NODE).await;
     let _served = bus
-        .serve("/ask", of_set_bool(), Arc::new(Answers))
+        .serve("/ask", set_bool_type(), Arc::new(CallerEchoService))
         .await
         .unwrap();
     for data in [true, false] {
@@ -84,10 +84,10 @@ async fn a_server_that_is_killed_while_it_works_is_noticed() {
     let lab = Lab::new();
     let mut peer = lab.peer().await;
     let bus = lab.join(NODE).await;
-    shows(&bus, |graph| graph.services.contains_key("/hang")).await;
+    wait_graph(&bus, |graph| graph.services.contains_key("/hang")).await;
     let calling = Arc::clone(&bus);
     let call = tokio::spawn(async move { calling.call("/hang", request(true), LONG).await });
-    peer.says("asked").await;
+    peer.wait_for("asked").await;
     let begun = Instant::now();
     peer.kill();
     let failed = call.await.unwrap();
@@ -101,7 +101,7 @@ async fn a_server_that_is_killed_while_it_works_is_noticed() {
         ),
         "{failed:?}"
     );
-    // Its own lease is of 20 s; its ports are looked at five times a second.
+    // Its own lease is 20 s; its ports are checked five times a second.
     assert!(
         begun.elapsed() < Duration::from_secs(2),
         "{:?}",

@@ -1,4 +1,5 @@
-//! Our node is killed, as the daemon's is with it, and comes again: nodes must not wait for the dead one, whose lease goes on.
+//! Our node is killed together with the daemon and comes back: nodes must not wait for the dead one, whose lease has
+//! not expired.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,15 +14,19 @@ use serde_json::{Value, json};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 
-use super::lab::{LONG, Lab, Peer, cdr, of_set_bool, set_bool};
+use super::lab::{LONG, Lab, Peer, cdr, set_bool, set_bool_type};
 
-/// What is written down in a servant's directory.
+/// The record in a servant's directory.
 #[derive(Debug, Default)]
-struct Notes(Mutex<Vec<ParticipantPrefix>>);
+struct ParticipantNotes(Mutex<Vec<ParticipantPrefix>>);
 
 #[async_trait]
-impl Succession for Notes {
-    async fn joins(&self, _node: &str, participant: ParticipantPrefix) -> Vec<ParticipantPrefix> {
+impl Succession for ParticipantNotes {
+    async fn record_join(
+        &self,
+        _node: &str,
+        participant: ParticipantPrefix,
+    ) -> Vec<ParticipantPrefix> {
         let mut noted = self.0.lock();
         let earlier = noted.clone();
         noted.push(participant);
@@ -29,18 +34,18 @@ impl Succession for Notes {
     }
 }
 
-/// Says which one it is.
-struct Says(&'static str);
+/// Returns its name.
+struct NamedService(&'static str);
 
 #[async_trait]
-impl ServiceHandler for Says {
+impl ServiceHandler for NamedService {
     async fn call(&self, _request: Bytes, _caller: &str) -> Result<Bytes, String> {
         let answer = format!(r#"{{"success":true,"message":"{}"}}"#, self.0);
         Ok(cdr(&set_bool().response, &answer))
     }
 }
 
-async fn join(lab: &Lab, notes: &Arc<Notes>) -> Arc<Ros2Bus> {
+async fn join(lab: &Lab, notes: &Arc<ParticipantNotes>) -> Arc<Ros2Bus> {
     let options = JoinOptions {
         succession: Some(Arc::clone(notes) as _),
         ..JoinOptions::in_domain(0, "/cloudroid_bridge")
@@ -48,9 +53,9 @@ async fn join(lab: &Lab, notes: &Arc<Notes>) -> Arc<Ros2Bus> {
     lab.join_with(options).await
 }
 
-/// A node of ours that serves `/ask` until it is killed, which it is by what is returned: nothing of it runs after that, and it says
-/// nothing.
-fn mortal(lab: &Lab, notes: &Arc<Notes>) -> impl FnOnce() {
+/// Starts a node of ours that serves `/ask` until the returned function kills it, after which nothing of it runs and it
+/// sends no farewell.
+fn start_mortal(lab: &Lab, notes: &Arc<ParticipantNotes>) -> impl FnOnce() {
     let (kill, killed) = oneshot::channel();
     let network = Arc::clone(&lab.network);
     let notes = Arc::clone(notes);
@@ -60,10 +65,10 @@ fn mortal(lab: &Lab, notes: &Arc<Notes>) -> impl FnOnce() {
         let runtime = runtime.enable_all().build().expect("a runtime");
         runtime.block_on(async {
             let bus = join(&lab, &notes).await;
-            let served = bus.serve("/ask", of_set_bool(), Arc::new(Says("first")));
+            let served = bus.serve("/ask", set_bool_type(), Arc::new(NamedService("first")));
             let served = served.await.unwrap();
             let _ = killed.await;
-            // Dropped, they would say that they are gone.
+            // Dropping them would announce their departure.
             std::mem::forget((bus, served));
         });
         std::mem::forget(runtime);
@@ -74,18 +79,21 @@ fn mortal(lab: &Lab, notes: &Arc<Notes>) -> impl FnOnce() {
     }
 }
 
-async fn called(peer: &mut Peer) -> [Value; 2] {
+async fn expect_answer(peer: &mut Peer) -> [Value; 2] {
     let answer = peer.obey("call true").await;
     let (_, last) = answer.split_last_chunk().expect("an answer");
     last.clone()
 }
 
-async fn nobody_is_believed_in_who_was_killed(program: &str) {
+async fn a_killed_daemon_is_not_waited_for(program: &str) {
     let lab = Lab::new();
     let mut peer = lab.node(program, &[]).await;
     let notes = Arc::default();
-    let kill = mortal(&lab, &notes);
-    assert_eq!(called(&mut peer).await, [json!(true), json!("first")]);
+    let kill = start_mortal(&lab, &notes);
+    assert_eq!(
+        expect_answer(&mut peer).await,
+        [json!(true), json!("first")]
+    );
     kill();
     assert_eq!(peer.obey("served").await, [json!(true)]);
     let begun = Instant::now();
@@ -96,20 +104,23 @@ async fn nobody_is_believed_in_who_was_killed(program: &str) {
         }
     };
     timeout(LONG, gone).await.expect("in time");
-    // The lease is of 10 s, and was renewed less than 4 s ago.
+    // The lease is 10 s and was renewed less than 4 s ago.
     let after = begun.elapsed();
     assert!(after < Duration::from_secs(4), "{after:?}");
-    let served = second.serve("/ask", of_set_bool(), Arc::new(Says("second")));
+    let served = second.serve("/ask", set_bool_type(), Arc::new(NamedService("second")));
     let _served = served.await.unwrap();
-    assert_eq!(called(&mut peer).await, [json!(true), json!("second")]);
+    assert_eq!(
+        expect_answer(&mut peer).await,
+        [json!(true), json!("second")]
+    );
 }
 
 #[tokio::test]
 async fn a_node_of_rclpy_calls_whoever_comes_in_the_place_of_one_that_was_killed() {
-    nobody_is_believed_in_who_was_killed("peer.py").await;
+    a_killed_daemon_is_not_waited_for("peer.py").await;
 }
 
 #[tokio::test]
 async fn a_participant_of_cyclone_calls_whoever_comes_in_the_place_of_one_that_was_killed() {
-    nobody_is_believed_in_who_was_killed("cyclone.py").await;
+    a_killed_daemon_is_not_waited_for("cyclone.py").await;
 }

@@ -1,4 +1,4 @@
-//! Actions: goals that take time, tell how they get on, and can be cancelled.
+//! Actions: long-running goals with feedback that can be cancelled.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,77 +8,78 @@ use bytes::Bytes;
 
 use super::{BusError, Graph};
 
-/// How a goal ended.
+/// Outcome of a goal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outcome {
-    /// Its result is what was asked for.
+pub enum GoalOutcome {
+    /// The goal was reached; its result is valid.
     Succeeded,
-    /// Its sender, or somebody else, wanted it to end.
+    /// The goal was cancelled, by its client or by another node.
     Canceled,
-    /// It failed.
+    /// The goal failed.
     Aborted,
-    /// It was never begun: its server did not take it.
+    /// The server did not accept the goal; it never ran.
     Rejected,
-    /// Its server says something that this ROS does not define.
+    /// The server reported a status that this ROS version does not define.
     Unknown,
 }
 
 /// The end of a goal.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GoalEnd {
-    /// How it ended.
-    pub outcome: Outcome,
-    /// What its server says of that; may be empty.
+    /// The outcome.
+    pub outcome: GoalOutcome,
+    /// Status text from the server; may be empty.
     pub text: String,
     /// The serialized result.
     pub result: Bytes,
 }
 
-/// Hears how one goal gets on, in order. Must not block.
+/// Callbacks for one goal, called in order. Must not block.
 pub trait GoalEvents: Send + Sync + 'static {
-    /// Its server has taken it. Told of where servers answer that (ROS 2), and not of a goal that was rejected.
-    fn accepted(&self) {}
-    /// Its server has answered a wish that it should end: whether it does. Told of as `accepted` is.
-    fn cancel_answered(&self, _ends: bool) {}
-    /// Serialized feedback.
-    fn feedback(&self, feedback: Bytes);
-    /// It has ended, or the reason why nobody will ever know. The last event.
-    fn ended(&self, end: Result<GoalEnd, String>);
+    /// The server accepted the goal. Called only where servers answer goals (ROS 2), and not for a rejected goal.
+    fn on_accepted(&self) {}
+    /// The server answered a cancel request; the argument tells whether it will cancel the goal. Called where
+    /// `on_accepted` is.
+    fn on_cancel_response(&self, _ends: bool) {}
+    /// Serialized feedback arrived.
+    fn on_feedback(&self, feedback: Bytes);
+    /// The goal ended, or its outcome will never be known, for the given reason. This is the last event.
+    fn on_ended(&self, end: Result<GoalEnd, String>);
 }
 
-/// An action that this side sends goals to; dropping it cancels those under way.
+/// A client of an action; dropping it cancels its active goals.
 #[async_trait]
 pub trait ActionClient: Send + Sync {
-    /// Returns once a server takes goals and what it answers will be heard; with [`BusError::TypeMismatch`] at once where the
-    /// servers that there are have another type.
-    async fn ready(&self, patience: Duration) -> Result<(), BusError>;
-    /// Sends a serialized goal. No other goal of this bus may have the same id.
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>);
-    /// Asks the server to end a goal; nothing where it has ended.
-    fn cancel(&self, id: &str);
+    /// Waits until a server accepts goals and its responses will reach this client. Fails at once with
+    /// [`BusError::TypeMismatch`] if the existing servers have another type.
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError>;
+    /// Sends a serialized goal. The id must be unique among the goals of this bus.
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>);
+    /// Asks the server to cancel a goal; does nothing if the goal has ended.
+    fn cancel_goal(&self, id: &str);
 }
 
-/// Carries out the goals of one action that this side serves. Must not block.
+/// Executes the goals of one action that this bus serves. Must not block.
 pub trait ActionHandler: Send + Sync + 'static {
-    /// A goal has come; an error refuses it.
-    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String>;
-    /// A goal that was taken should end.
-    fn cancel(&self, id: &str);
+    /// A goal arrived; an error rejects it.
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String>;
+    /// An accepted goal is to be cancelled.
+    fn on_cancel(&self, id: &str);
     /// The action cannot be served.
-    fn failed(&self, reason: &str);
+    fn on_failed(&self, reason: &str);
 }
 
-/// An action that this side serves; dropping it aborts the goals under way.
+/// An action that this bus serves; dropping it aborts the active goals.
 pub trait ActionServer: Send + Sync {
-    /// Tells how a goal gets on; false where there is none of this id under way.
-    fn feedback(&self, id: &str, feedback: Bytes) -> bool;
-    /// Ends a goal; false where there is none of this id under way.
-    fn end(&self, id: &str, end: GoalEnd) -> bool;
+    /// Publishes feedback for a goal; returns false if no goal with this id is active.
+    fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool;
+    /// Ends a goal; returns false if no goal with this id is active.
+    fn end_goal(&self, id: &str, end: GoalEnd) -> bool;
 }
 
 impl Graph {
-    /// That the servers of an action have another type than this one, where the graph says so.
-    pub fn other_action(&self, action: &str, ours: &str) -> Option<BusError> {
+    /// Returns the type mismatch if the graph shows servers of the action with another type than `ours`.
+    pub fn action_type_mismatch(&self, action: &str, ours: &str) -> Option<BusError> {
         let nodes = self.actions.get(action)?;
         let is_other = !matches!(nodes.type_name.as_str(), "" | "*") && nodes.type_name != ours;
         (is_other && !nodes.servers.is_empty()).then(|| BusError::TypeMismatch {

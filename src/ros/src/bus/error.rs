@@ -1,87 +1,87 @@
-//! What can go wrong on a bus.
+//! Errors of a bus.
 
 use std::time::Duration;
 
-/// Whether a call that failed was carried out.
+/// Execution status of a failed call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum CallFate {
-    /// The server answered that it failed.
+    /// The server answered that the call failed.
     Answered,
-    /// The server did not take it.
+    /// The server did not accept the request.
     NotTaken,
-    /// The server went away before it answered: nobody knows.
+    /// The server went away before it answered; it is unknown whether the call was executed.
     Unknown,
 }
 
-/// What can go wrong on a bus.
+/// Errors of a bus.
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
-    /// Nobody serves it.
+    /// No node serves the service.
     #[error("service {0} has no server")]
     NoService(String),
-    /// Nobody publishes or subscribes to it.
+    /// No node publishes or subscribes to the topic.
     #[error("topic {0} has neither publisher nor subscriber")]
     NoTopic(String),
-    /// This side serves it already.
+    /// This bus serves the service already.
     #[error("service {0} is already served by this side; drop the earlier guard first")]
     AlreadyServed(String),
-    /// Both sides mean different definitions.
+    /// The two endpoints use different definitions.
     #[error("{what} is {theirs} there and {ours} here")]
     TypeMismatch {
-        /// Topic or service.
+        /// The topic or service.
         what: String,
-        /// Name and digest as the peer has it.
+        /// Name and digest at the peer.
         theirs: String,
-        /// Name and digest as we have it.
+        /// Name and digest expected here.
         ours: String,
     },
-    /// The server said no.
+    /// The server reported a failure.
     #[error("service {service} failed: {reason}")]
     CallFailed {
-        /// The service's name.
+        /// Name of the service.
         service: String,
-        /// What the server said.
+        /// Reason given by the server.
         reason: String,
-        /// Whether it may have been carried out.
+        /// Execution status of the call.
         fate: CallFate,
     },
-    /// It is not shown to this robot, which shares the nodes with others.
+    /// The item is not offered to this robot because it shares the nodes with other robots.
     #[error(
-        "{0} is not offered: robots share this service, and use its services and actions alone"
+        "{0} is not offered: robots share this service, and can use only its services and actions"
     )]
     NotShared(String),
-    /// No answer in time.
+    /// No answer arrived in time.
     #[error("{what} did not answer within {after:?}")]
     Timeout {
-        /// Topic, service or Master.
+        /// The topic, service or Master.
         what: String,
-        /// How long was waited.
+        /// Time waited.
         after: Duration,
     },
-    /// The Master refused.
+    /// The Master refused a call.
     #[error("the ROS Master refused {call}: {reason}")]
     Master {
-        /// Method called.
+        /// Name of the method.
         call: String,
-        /// Its status message.
+        /// Status message of the Master.
         reason: String,
     },
-    /// No such parameter.
+    /// The parameter does not exist.
     #[error("parameter {0} is not set")]
     NoParam(String),
-    /// A name that ROS does not allow.
+    /// The name is not allowed by ROS.
     #[error("{0} is not a valid ROS name")]
     BadName(String),
-    /// A value that does not fit the wire.
+    /// The value cannot be represented on the wire.
     #[error("parameter {key} cannot be sent: {reason}")]
     BadParam {
-        /// The parameter's key.
+        /// Key of the parameter.
         key: String,
-        /// What is wrong with its value.
+        /// The problem with the value.
         reason: String,
     },
-    /// This ROS has no such thing.
-    #[error("{0} are not offered by this ROS")]
+    /// This ROS version does not have the feature.
+    #[error("{0} are not offered by this version of ROS")]
     NotOffered(&'static str),
     /// The bus was closed.
     #[error("the connection to this ROS system was closed")]
@@ -89,17 +89,17 @@ pub enum BusError {
     /// The connection failed.
     #[error("{what}: {source}")]
     Io {
-        /// What was being done.
+        /// The operation that failed.
         what: String,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
     /// The peer does not speak the protocol.
     #[error("{what} broke the protocol: {reason}")]
     Protocol {
-        /// Topic, service or node that sent it.
+        /// The topic, service or node at fault.
         what: String,
-        /// In which way it breaks the protocol.
+        /// The violation.
         reason: String,
     },
 }

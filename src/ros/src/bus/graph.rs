@@ -1,40 +1,41 @@
-//! Nodes, and what they have registered.
+//! The ROS graph: nodes and what they have registered.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Qos, ServiceType, WireType};
+use super::{QosProfile, ServiceType, WireType};
 
-/// What nodes have registered, seen at one moment.
+/// A snapshot of what nodes have registered.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Graph {
-    /// Grows by one with every change.
+    /// Number of changes so far.
     pub generation: u64,
-    /// Topic → its type and the nodes at both ends. Where actions are made of topics (ROS 1), those are among them.
+    /// Topic → its type, publishers and subscribers. Where actions consist of topics (ROS 1), those are included.
     pub topics: BTreeMap<String, TopicNodes>,
     /// Service → the node that serves it.
     pub services: BTreeMap<String, String>,
-    /// Action → its type and the nodes at both ends.
+    /// Action → its type, servers and clients.
     pub actions: BTreeMap<String, ActionNodes>,
-    /// Node → its address: XML-RPC's (ROS 1) or a GUID (ROS 2).
+    /// Node → its address: an XML-RPC URI (ROS 1) or a GUID (ROS 2).
     pub nodes: BTreeMap<String, String>,
-    /// Every global parameter that a node asked for or wrote, with the nodes that did.
+    /// Every global parameter that a node has read or written, with those nodes.
     pub parameters: BTreeMap<String, ParameterUse>,
-    /// Services that nodes looked for when there were none, with those nodes. Told by our own Master, and by ROS 2.
+    /// Services that nodes looked up without finding a server, with those nodes. Filled in by our own Master and by ROS
+    /// 2.
     pub sought: BTreeMap<String, Vec<String>>,
-    /// Node → all that it has, with what tools hide, such as the parts of actions. Told by ROS 2 only.
-    pub ends: BTreeMap<String, NodeEnds>,
-    /// Enclave that processes were put into (`--enclave`) → their nodes, for all but the root. Told by ROS 2 only.
+    /// Node → all its endpoints, including those that tools hide, such as the parts of actions. ROS 2 only.
+    pub ends: BTreeMap<String, NodeEntities>,
+    /// Enclave that processes were started with (`--enclave`) → their nodes, for all enclaves but the root. ROS 2 only.
     pub enclaves: BTreeMap<String, BTreeSet<String>>,
 }
 
-/// What is there, under whatever name. What tools hide, by a name with a part that begins with `_`, stands in [`Graph::ends`] alone.
+/// Queries. Items hidden from tools (a part of the name begins with `_`) are found in [`Graph::ends`] only.
 impl Graph {
-    /// Whether there is a node of this name.
+    /// Returns true if there is a node of this name.
     pub fn has_node(&self, node: &str) -> bool {
         self.nodes.contains_key(node) || self.ends.contains_key(node)
     }
 
-    /// Whether this node publishes the topic.
+    /// Returns true if the node publishes the topic.
     pub fn publishes(&self, node: &str, topic: &str) -> bool {
         let shown = self.topics.get(topic);
         let ends = self.ends.get(node);
@@ -42,7 +43,7 @@ impl Graph {
             || ends.is_some_and(|ends| ends.publishers.contains_key(topic))
     }
 
-    /// Whether this node subscribes to the topic.
+    /// Returns true if the node subscribes to the topic.
     pub fn subscribes(&self, node: &str, topic: &str) -> bool {
         let shown = self.topics.get(topic);
         let ends = self.ends.get(node);
@@ -50,78 +51,80 @@ impl Graph {
             || ends.is_some_and(|ends| ends.subscribers.contains_key(topic))
     }
 
-    /// Whether some node serves the service.
+    /// Returns true if any node serves the service.
     pub fn serves(&self, service: &str) -> bool {
         let mut ends = self.ends.values();
         self.services.contains_key(service) || ends.any(|ends| ends.services.contains_key(service))
     }
 
-    /// Whether some node serves the action.
+    /// Returns true if any node serves the action.
     pub fn serves_action(&self, action: &str) -> bool {
         let shown = self.actions.get(action);
         shown.is_some_and(|ends| !ends.servers.is_empty())
-            || self.serves(&crate::ros2::names::part_of_action(action, "send_goal"))
+            || self.serves(&crate::ros2::names::action_part_name(action, "send_goal"))
     }
 
-    /// The nodes of the process that a servant runs as a robot's node of this name: that one, and in ROS 2 all that are in the enclave by
-    /// which the process is marked. Those that share their name with one of another process are not among them: what nodes have is known by their names.
-    pub fn of_process(&self, node: &str) -> BTreeSet<String> {
-        let marked = self.marked(node).into_iter().flatten();
-        let own = marked.filter(|other| *other == node || !self.is_shared(other));
+    /// Returns the nodes of the process that a servant runs as the robot's node `node`: that node and, in ROS 2, all
+    /// other nodes in the process's enclave. Nodes whose name also occurs in another process are excluded, since
+    /// endpoints are attributed to nodes by name.
+    pub fn process_nodes(&self, node: &str) -> BTreeSet<String> {
+        let marked = self.enclave_nodes(node).into_iter().flatten();
+        let own = marked.filter(|other| *other == node || !self.is_ambiguous(other));
         own.cloned().chain([node.to_owned()]).collect()
     }
 
-    /// Whether a node is one of that process.
-    pub fn is_of_process(&self, node: &str, other: &str) -> bool {
-        let marked = || self.marked(node);
+    /// Returns true if `other` is a node of the process of `node` (see [`process_nodes`](Self::process_nodes)).
+    pub fn is_in_process(&self, node: &str, other: &str) -> bool {
+        let marked = || self.enclave_nodes(node);
         node == other
-            || marked().is_some_and(|nodes| nodes.contains(other) && !self.is_shared(other))
+            || marked().is_some_and(|nodes| nodes.contains(other) && !self.is_ambiguous(other))
     }
 
-    /// Further nodes of that process which are not taken for its own, since another process has one of the same name.
-    pub fn shared_of_process(&self, node: &str) -> BTreeSet<String> {
-        let marked = self.marked(node).into_iter().flatten();
-        let shared = marked.filter(|other| *other != node && self.is_shared(other));
+    /// Returns the further nodes of that process that are not attributed to it because another process has a node of
+    /// the same name.
+    pub fn ambiguous_process_nodes(&self, node: &str) -> BTreeSet<String> {
+        let marked = self.enclave_nodes(node).into_iter().flatten();
+        let shared = marked.filter(|other| *other != node && self.is_ambiguous(other));
         shared.cloned().collect()
     }
 
-    fn marked(&self, node: &str) -> Option<&BTreeSet<String>> {
-        let mark = crate::ros2::process::enclave_of(node)?;
+    fn enclave_nodes(&self, node: &str) -> Option<&BTreeSet<String>> {
+        let mark = crate::ros2::process::enclave_for(node)?;
         self.enclaves.get(&mark)
     }
 
-    /// Whether nodes of several enclaves have this name.
-    fn is_shared(&self, node: &str) -> bool {
+    /// Returns true if nodes in several enclaves have this name.
+    fn is_ambiguous(&self, node: &str) -> bool {
         let with = self.enclaves.values().filter(|nodes| nodes.contains(node));
         with.take(2).count() > 1
     }
 
-    /// What these nodes have, as if they were one.
-    pub fn ends_of(&self, nodes: &BTreeSet<String>) -> NodeEnds {
-        let mut all = NodeEnds::default();
+    /// Returns the endpoints of these nodes, merged as if they were one node.
+    pub fn merged_endpoints(&self, nodes: &BTreeSet<String>) -> NodeEntities {
+        let mut all = NodeEntities::default();
         for ends in nodes.iter().filter_map(|node| self.ends.get(node)) {
-            all.join(ends);
+            all.merge(ends);
         }
         all
     }
 }
 
-/// All that one node has, as its ends tell it: by name, with types that have no definition.
+/// All endpoints of one node as announced by them: by name, with types that carry no definition.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct NodeEnds {
-    /// Topics that it publishes. Where it does so several times, the most that it offers.
-    pub publishers: BTreeMap<String, (WireType, Qos)>,
-    /// Topics that it subscribes to. Where it does so several times, the least that it asks for.
-    pub subscribers: BTreeMap<String, (WireType, Qos)>,
-    /// Services that it serves.
+pub struct NodeEntities {
+    /// Topics that the node publishes; with several publishers of a topic, the strongest QoS offered.
+    pub publishers: BTreeMap<String, (WireType, QosProfile)>,
+    /// Topics that the node subscribes to; with several subscriptions to a topic, the weakest QoS requested.
+    pub subscribers: BTreeMap<String, (WireType, QosProfile)>,
+    /// Services that the node serves.
     pub services: BTreeMap<String, ServiceType>,
-    /// Services that it may call.
+    /// Services that the node has clients for.
     pub clients: BTreeMap<String, ServiceType>,
 }
 
-impl NodeEnds {
-    /// With those of another; of several types of one name the first stays.
-    fn join(&mut self, other: &NodeEnds) {
+impl NodeEntities {
+    /// Merges the endpoints of another node; if the types for a name differ, the first one is kept.
+    fn merge(&mut self, other: &NodeEntities) {
         let sides = [
             (&mut self.publishers, &other.publishers, true),
             (&mut self.subscribers, &other.subscribers, false),
@@ -130,7 +133,7 @@ impl NodeEnds {
             for (topic, (of, qos)) in others {
                 let known = topics.entry(topic.clone());
                 let known = known.or_insert_with(|| (of.clone(), *qos));
-                known.1 = crate::ros2::joined(known.1, *qos, publishes);
+                known.1 = crate::ros2::merge_qos(known.1, *qos, publishes);
             }
         }
         let sides = [
@@ -146,7 +149,7 @@ impl NodeEnds {
         }
     }
 
-    /// By name.
+    /// Returns the names of the endpoints.
     pub fn names(&self) -> NodeNames {
         NodeNames {
             publishes: self.publishers.keys().cloned().collect(),
@@ -156,21 +159,21 @@ impl NodeEnds {
     }
 }
 
-/// What a node has, by name.
+/// Names of the endpoints of a node.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct NodeNames {
-    /// Topics.
+    /// Published topics.
     pub publishes: BTreeSet<String>,
-    /// Topics.
+    /// Subscribed topics.
     pub subscribes: BTreeSet<String>,
-    /// Services.
+    /// Served services.
     pub serves: BTreeSet<String>,
 }
 
-/// The ends of one topic.
+/// The nodes at both ends of one topic.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TopicNodes {
-    /// `package/Type`, of ROS 2 `package/msg/Type`, or `*` where nobody has said yet.
+    /// `package/Type`, in ROS 2 `package/msg/Type`, or `*` while the type is unknown.
     pub type_name: String,
     /// Names of publishing nodes.
     pub publishers: Vec<String>,
@@ -178,23 +181,23 @@ pub struct TopicNodes {
     pub subscribers: Vec<String>,
 }
 
-/// The ends of one action.
+/// The nodes at both ends of one action.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ActionNodes {
-    /// `package/Name`, of ROS 2 `package/action/Name`, or `*` where nobody has said yet.
+    /// `package/Name`, in ROS 2 `package/action/Name`, or `*` while the type is unknown.
     pub type_name: String,
-    /// Names of nodes that serve it.
+    /// Names of nodes that serve the action.
     pub servers: Vec<String>,
     /// Names of nodes that may send goals.
     pub clients: Vec<String>,
-    /// Topics that it is made of, in a ROS that makes it of topics (ROS 1).
+    /// Topics that the action consists of, where actions consist of topics (ROS 1).
     pub topics: Vec<String>,
 }
 
-/// Who touched a parameter.
+/// Nodes that used a parameter.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParameterUse {
-    /// Nodes that asked for it (`getParam`, `hasParam`, `searchParam`, `subscribeParam`).
+    /// Nodes that read it (`getParam`, `hasParam`, `searchParam`, `subscribeParam`).
     pub read_by: Vec<String>,
     /// Nodes that set it.
     pub written_by: Vec<String>,
@@ -203,29 +206,29 @@ pub struct ParameterUse {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bus::Reliability;
+    use crate::bus::QosReliability;
 
     #[test]
     fn nodes_of_one_process_are_known_by_its_enclave_and_seen_as_one() {
-        let weak = Qos {
-            reliability: Reliability::BestEffort,
-            ..Qos::keep_last(5)
+        let weak = QosProfile {
+            reliability: QosReliability::BestEffort,
+            ..QosProfile::keep_last(5)
         };
         let topic = |name: &str, qos| (name.to_owned(), (WireType::any(), qos));
         let set = ServiceType::new("std_srvs/srv/SetBool", "*");
-        let ears = NodeEnds {
+        let ears = NodeEntities {
             publishers: [topic("/log", weak)].into(),
-            subscribers: [topic("/scan", Qos::keep_last(1))].into(),
-            ..NodeEnds::default()
+            subscribers: [topic("/scan", QosProfile::keep_last(1))].into(),
+            ..NodeEntities::default()
         };
-        let mouth = NodeEnds {
-            publishers: [topic("/log", Qos::keep_last(9).latching(true))].into(),
+        let mouth = NodeEntities {
+            publishers: [topic("/log", QosProfile::keep_last(9).latching(true))].into(),
             subscribers: [topic("/scan", weak)].into(),
             services: [("/mouth/set".to_owned(), set.clone())].into(),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
-        let mark = crate::ros2::process::enclave_of("/ears").expect("a mark");
+        let mark = crate::ros2::process::enclave_for("/ears").expect("a mark");
         let graph = Graph {
             enclaves: [(mark, named(&["/ears", "/mouth"]))].into(),
             ends: [
@@ -236,18 +239,18 @@ mod tests {
             .into(),
             ..Graph::default()
         };
-        let nodes: BTreeSet<String> = graph.of_process("/ears");
+        let nodes: BTreeSet<String> = graph.process_nodes("/ears");
         assert_eq!(nodes, named(&["/ears", "/mouth"]));
-        assert_eq!(graph.of_process("/nose"), named(&["/nose"]));
-        assert!(graph.is_of_process("/ears", "/mouth"));
-        assert!(!graph.is_of_process("/ears", "/nose") && !graph.is_of_process("/mouth", "/ears"));
-        let all = graph.ends_of(&nodes);
-        // The most that is offered, and the least that is asked for.
+        assert_eq!(graph.process_nodes("/nose"), named(&["/nose"]));
+        assert!(graph.is_in_process("/ears", "/mouth"));
+        assert!(!graph.is_in_process("/ears", "/nose") && !graph.is_in_process("/mouth", "/ears"));
+        let all = graph.merged_endpoints(&nodes);
+        // The strongest QoS that is offered, and the weakest that is requested.
         let log = all.publishers["/log"].1;
-        assert!(log.is_latching() && log.reliability == Reliability::Reliable);
+        assert!(log.is_latching() && log.reliability == QosReliability::Reliable);
         assert_eq!(
             all.subscribers["/scan"].1.reliability,
-            Reliability::BestEffort
+            QosReliability::BestEffort
         );
         assert_eq!(all.services, [("/mouth/set".to_owned(), set)].into());
     }
@@ -255,7 +258,7 @@ mod tests {
     fn a_further_node_whose_name_two_processes_have_is_of_neither() {
         let named = |names: &[&str]| names.iter().map(ToString::to_string).collect();
         let process = |node: &str, nodes: &[&str]| {
-            let mark = crate::ros2::process::enclave_of(node).expect("a mark");
+            let mark = crate::ros2::process::enclave_for(node).expect("a mark");
             (mark, named(nodes))
         };
         let graph = Graph {
@@ -266,19 +269,19 @@ mod tests {
             .into(),
             ..Graph::default()
         };
-        // The first node of a process is its own, whoever has taken its name.
-        assert_eq!(graph.of_process("/left"), named(&["/bass", "/left"]));
-        assert_eq!(graph.of_process("/right"), named(&["/right"]));
-        assert!(graph.is_of_process("/left", "/bass") && graph.is_of_process("/right", "/right"));
+        // The first node of a process always belongs to it, even if another process uses its name.
+        assert_eq!(graph.process_nodes("/left"), named(&["/bass", "/left"]));
+        assert_eq!(graph.process_nodes("/right"), named(&["/right"]));
+        assert!(graph.is_in_process("/left", "/bass") && graph.is_in_process("/right", "/right"));
         for (node, other) in [
             ("/left", "/tenor"),
             ("/right", "/tenor"),
             ("/left", "/right"),
         ] {
-            assert!(!graph.is_of_process(node, other), "{node} {other}");
+            assert!(!graph.is_in_process(node, other), "{node} {other}");
         }
         let shared: BTreeSet<String> = named(&["/right", "/tenor"]);
-        assert_eq!(graph.shared_of_process("/left"), shared);
-        assert_eq!(graph.shared_of_process("/right"), named(&["/tenor"]));
+        assert_eq!(graph.ambiguous_process_nodes("/left"), shared);
+        assert_eq!(graph.ambiguous_process_nodes("/right"), named(&["/tenor"]));
     }
 }

@@ -1,4 +1,4 @@
-//! Services of another ROS system, lent to the nodes of this one.
+//! Lending: services of another ROS system offered to the nodes of this one.
 
 use std::sync::Arc;
 
@@ -7,44 +7,47 @@ use tokio::sync::watch;
 
 use super::{BusError, ServiceHandler, ServiceType};
 
-/// A service's server, as it told of itself.
+/// The server of a service, by its own account.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceProvider {
-    /// The node that serves it.
+    /// Node that serves the service.
     pub node: String,
-    /// What it serves.
+    /// Type of the service.
     pub service_type: ServiceType,
-    /// How it [labels](Lending::set_label) itself.
+    /// [Label](Lending::set_label) that the server announces.
     pub label: Option<String>,
 }
 
 /// A service of another ROS system.
 #[derive(Clone)]
-pub struct Lent {
-    /// The type of the service.
+pub struct LentService {
+    /// Type of the service.
     pub service_type: ServiceType,
-    /// Passes calls on.
+    /// Forwards calls.
     pub handler: Arc<dyn ServiceHandler>,
-    /// Becomes true, or loses its sender, when it can be had no more: connections end then, between two calls.
+    /// Becomes true, or loses its sender, when the service is no longer available; connections then end between two
+    /// calls.
     pub gone: watch::Receiver<bool>,
 }
 
-/// Lends nodes the services of another ROS system.
+/// Lends services of another ROS system to nodes.
 #[async_trait]
 pub trait Lender: Send + Sync + 'static {
-    /// `node` looks for a service that nobody serves here, and waits for the answer. Later lookups ask again.
-    async fn find(&self, service: &str, node: &str) -> Option<Lent>;
+    /// Looks for a service that no node serves here, on behalf of `node`, which waits for the answer. Later lookups ask
+    /// again.
+    async fn find_service(&self, service: &str, node: &str) -> Option<LentService>;
 }
 
-/// Services that cross from one ROS system to another. ROS 1 offers it with our own Master.
+/// Lending of services from one ROS system to another. ROS 1 offers it only with our own Master.
 #[async_trait]
 pub trait Lending: Send + Sync {
-    /// From now on nodes find the lender's services, too. What is served here always comes first, and what is lent
-    /// is not registered: it can be looked up, called and waited for. One lender at a time.
+    /// From now on, nodes also find the lender's services. Services of this system always take precedence. Lent
+    /// services are not registered: they can be looked up, called and waited for, but are not listed. There is one
+    /// lender at a time.
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError>;
-    /// Asks a server for its type without calling it, and who it is.
+    /// Asks the server of a service for its type and identity, without calling the service.
     async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError>;
-    /// Is told to whoever calls services of this node, or asks for their provider, by those that are served from now on:
-    /// what belongs together knows itself by it. The first one stays.
+    /// Sets the label announced to callers of the services that this node serves from now on, and to nodes that ask for
+    /// their provider; it lets our own components recognize each other. Only the first call has an effect.
     fn set_label(&self, label: &str);
 }

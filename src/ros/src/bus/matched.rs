@@ -1,4 +1,4 @@
-//! Who is at the other end of a topic.
+//! Matched endpoints of a topic.
 
 use std::cmp::Ordering;
 use std::fmt;
@@ -9,10 +9,10 @@ use tokio::sync::watch;
 
 use super::WireType;
 
-/// Tells publishers, or subscribers, of a topic apart. It is shown as the name of its node.
+/// Identifies a publisher or subscriber of a topic. Displayed as the name of its node.
 ///
-/// A number of more than 64 bits (a GUID of DDS) is nobody else's: of such ends it alone is compared, because the name of the
-/// node may become known later than they do.
+/// A number of more than 64 bits (a DDS GUID) is globally unique: such ids are compared by the number alone, because
+/// the name of the node may become known later than the endpoint.
 #[derive(Debug, Clone)]
 pub struct PeerId {
     node: Arc<str>,
@@ -20,18 +20,18 @@ pub struct PeerId {
 }
 
 impl PeerId {
-    /// One end of that node; `number` tells it from the node's others.
+    /// Creates the id of one endpoint of a node; `number` distinguishes it from the node's other endpoints.
     pub fn new(node: impl Into<Arc<str>>, number: u128) -> Self {
         let node = node.into();
         Self { node, number }
     }
 
-    /// The name of its node, for a look into the graph and for messages.
+    /// Returns the name of the node, for lookups in the graph and for messages to users.
     pub fn node(&self) -> &str {
         &self.node
     }
 
-    /// What is compared.
+    /// Returns the key used for comparison.
     fn key(&self) -> (&str, u128) {
         let unique = self.number > u128::from(u64::MAX);
         (if unique { "" } else { &self.node }, self.number)
@@ -64,7 +64,7 @@ impl PartialOrd for PeerId {
     }
 }
 
-/// The only end of that node.
+/// The only endpoint of the named node.
 impl From<&str> for PeerId {
     fn from(node: &str) -> Self {
         Self::new(node, 0)
@@ -77,72 +77,72 @@ impl fmt::Display for PeerId {
     }
 }
 
-/// What a publisher has said of all that it will send, before it sends anything.
+/// Properties that a publisher announces for all messages it will send.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Offer {
-    /// The type of its messages.
+    /// Type of the messages.
     pub wire_type: Arc<WireType>,
-    /// Whether it keeps its last message for those who come later.
+    /// True if the publisher keeps its last message for late subscribers.
     pub latching: bool,
 }
 
-/// A publisher as seen by a subscription, or the other way round.
+/// A publisher as seen by a subscription, or vice versa.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Peer {
-    /// The peer's id.
+pub struct TopicPeer {
+    /// Id of the peer.
     pub id: PeerId,
-    /// Whether messages can pass now; else it was connected, and has not left as far as is known.
+    /// True while messages can pass; false if the peer was connected before and, as far as is known, still exists.
     pub connected: bool,
-    /// What it publishes, as far as is known; none of a subscriber.
+    /// Offer of the publisher, once known; `None` for subscribers.
     pub offer: Option<Offer>,
 }
 
-/// An end of the same topic with which no messages pass, because both ends mean different things.
+/// An endpoint of the topic that does not match because types or QoS differ.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Refusal {
-    /// The other end.
+pub struct IncompatiblePeer {
+    /// The other endpoint.
     pub peer: PeerId,
-    /// In which they differ, with what the publisher offers and what the subscriber asks for.
+    /// The difference, with what the publisher offers and what the subscriber requests.
     pub why: String,
 }
 
-/// Who is at the other end, at one moment.
+/// Snapshot of the endpoints matched with a publisher or subscription.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Matched {
-    /// In the order in which they came.
-    pub peers: Vec<Peer>,
-    /// Ends that could be there, were types and quality of service the same. ROS 1 does not know them.
-    pub refused: Vec<Refusal>,
+pub struct MatchedPeers {
+    /// Matched peers, in the order in which they appeared.
+    pub peers: Vec<TopicPeer>,
+    /// Endpoints that would match if types and quality of service agreed. Always empty in ROS 1.
+    pub refused: Vec<IncompatiblePeer>,
 }
 
-impl Matched {
-    /// How many are connected.
-    pub fn connected(&self) -> usize {
+impl MatchedPeers {
+    /// Returns the number of connected peers.
+    pub fn connected_count(&self) -> usize {
         self.peers.iter().filter(|peer| peer.connected).count()
     }
 
-    /// How many are connected beside the node of this name, which listens without being meant.
-    pub fn connected_beside(&self, node: &str) -> usize {
+    /// Returns the number of connected peers that are not of the given node, for listeners that should not be counted.
+    pub fn connected_count_except(&self, node: &str) -> usize {
         let connected = self.peers.iter().filter(|peer| peer.connected);
         connected.filter(|peer| peer.id.node() != node).count()
     }
 
-    /// Whether this one has not left. Who has left has sent all that it had.
+    /// Returns true if the peer has not left. A peer that has left has sent everything it had to send.
     pub fn contains(&self, id: &PeerId) -> bool {
         self.peers.iter().any(|peer| peer.id == *id)
     }
 
-    /// Whether a node of this name is connected.
+    /// Returns true if a peer of this node is connected.
     pub fn has_node(&self, node: &str) -> bool {
         let mut connected = self.peers.iter().filter(|peer| peer.connected);
         connected.any(|peer| peer.id.node() == node)
     }
 }
 
-/// Returns once so many are connected; at once where the topic's own end is gone.
-pub async fn reaches(mut matched: watch::Receiver<Matched>, count: usize) {
+/// Waits until at least `count` peers are connected; returns at once if the local endpoint is gone.
+pub async fn wait_for_connected(mut matched: watch::Receiver<MatchedPeers>, count: usize) {
     let _ = matched
-        .wait_for(|matched| matched.connected() >= count)
+        .wait_for(|matched| matched.connected_count() >= count)
         .await;
 }
 

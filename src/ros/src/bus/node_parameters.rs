@@ -1,137 +1,138 @@
-//! Parameters that belong to nodes, where a ROS has them.
+//! Parameters that belong to individual nodes.
 
 use async_trait::async_trait;
 
 use super::{BusError, ParamChange, ParamValue};
 
-/// The parameters of each node. ROS 2 has them; ROS 1's are shared by all nodes.
+/// Access to the parameters of each node (ROS 2). In ROS 1 all nodes share their parameters.
 #[async_trait]
 pub trait NodeParameters: Send + Sync {
-    /// Values by name, in the order asked for; none of one that the node does not have, or that holds nothing.
+    /// Returns the values of parameters, in the order requested; `None` for a parameter that is missing or not set.
     async fn get(&self, node: &str, names: &[String]) -> Result<Vec<Option<ParamValue>>, BusError>;
-    /// Sets parameters, or removes those without a value, one after the other: for each, whether the node has done so, or
-    /// why not. A value takes the type that the node's parameter has where nothing is lost by it (`1` becomes `1.0`).
+    /// Sets parameters, or deletes those without a value, one after the other. Returns for each whether the node
+    /// accepted the change, or its reason. A value is converted to the type of the node's parameter where that is
+    /// lossless (`1` becomes `1.0`).
     async fn set(
         &self,
         node: &str,
         changes: Vec<ParamChange>,
     ) -> Result<Vec<Result<(), String>>, BusError>;
-    /// The same, but all or none; the error tells the node's reason.
-    async fn set_together(&self, node: &str, changes: Vec<ParamChange>) -> Result<(), BusError>;
-    /// Which parameters a node has: those below the prefixes (all if there are none), of at most `depth` parts of a name
-    /// beyond the prefix (of any number if 0).
+    /// Sets parameters like [`set`](Self::set), but all or none; the error carries the node's reason.
+    async fn set_atomically(&self, node: &str, changes: Vec<ParamChange>) -> Result<(), BusError>;
+    /// Lists the parameters of a node: those below the prefixes (all if there are none), with names of at most `depth`
+    /// levels beyond the prefix (0 for any number).
     async fn list(
         &self,
         node: &str,
         prefixes: &[String],
         depth: u64,
     ) -> Result<ParameterNames, BusError>;
-    /// What the node says of its parameters, in the order asked for; none of one that the node does not have.
+    /// Returns the node's descriptions of its parameters, in the order requested; `None` for a missing parameter.
     async fn describe(
         &self,
         node: &str,
         names: &[String],
     ) -> Result<Vec<Option<ParameterDescription>>, BusError>;
-    /// Changes from when this returns: those of one node, which must be there, or of all.
+    /// Watches changes from the time this returns: those of one node, which must exist, or of all nodes.
     async fn watch(&self, node: Option<&str>) -> Result<Box<dyn ParameterEvents>, BusError>;
 }
 
-/// Changes of parameters as nodes tell of them; dropping it ends that.
+/// A stream of parameter changes published by nodes; dropping it ends the subscription.
 #[async_trait]
 pub trait ParameterEvents: Send {
-    /// The next one; none when the connection to the ROS system has ended. Safe to cancel.
+    /// Returns the next event, or `None` when the connection to the ROS system has ended. Cancel-safe.
     async fn next(&mut self) -> Option<ParameterEvent>;
-    /// Events that were not told because too many waited.
-    fn dropped(&self) -> u64;
+    /// Returns the number of events dropped because too many were queued.
+    fn dropped_count(&self) -> u64;
 }
 
-/// What a node has changed at once.
+/// Parameter changes that a node made at once.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParameterEvent {
-    /// Its absolute name.
+    /// Absolute name of the node.
     pub node: String,
-    /// Parameters that it did not have before.
+    /// New parameters.
     pub new: Vec<(String, ParamValue)>,
-    /// Those that have another value now.
+    /// Parameters with a changed value.
     pub changed: Vec<(String, ParamValue)>,
-    /// Those that it does not have any more.
+    /// Deleted parameters.
     pub deleted: Vec<String>,
 }
 
-/// Parameters of a node.
+/// Parameter names of a node.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ParameterNames {
-    /// Their full names.
+    /// Full names.
     pub names: Vec<String>,
-    /// What stands before the last dot of names, each once.
+    /// The distinct prefixes of the names, up to the last dot.
     pub prefixes: Vec<String>,
 }
 
-/// What a parameter holds.
+/// Type of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ParameterKind {
-    /// Nothing yet.
+    /// Not set.
     #[default]
     NotSet,
     /// `true` or `false`.
     Bool,
-    /// 64 bits, signed.
+    /// Signed 64-bit integer.
     Integer,
-    /// A double.
+    /// Double.
     Double,
     /// Text.
     String,
     /// Bytes: [`ParamValue::Binary`].
     Bytes,
-    /// A list of what [`Bool`](Self::Bool) holds.
+    /// List of [`Bool`](Self::Bool) values.
     Bools,
-    /// A list of what [`Integer`](Self::Integer) holds.
+    /// List of [`Integer`](Self::Integer) values.
     Integers,
-    /// A list of what [`Double`](Self::Double) holds.
+    /// List of [`Double`](Self::Double) values.
     Doubles,
-    /// A list of what [`String`](Self::String) holds.
+    /// List of [`String`](Self::String) values.
     Strings,
 }
 
-/// What a node says of one of its parameters.
+/// Description of a parameter, as given by its node.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ParameterDescription {
-    /// Its full name.
+    /// Full name.
     pub name: String,
-    /// What it holds.
+    /// Type of the value.
     pub kind: ParameterKind,
-    /// For people; may be empty.
+    /// Human-readable description; may be empty.
     pub description: String,
-    /// What else its value must be, for people; may be empty.
+    /// Human-readable constraints on the value; may be empty.
     pub constraints: String,
-    /// It keeps the value that it was declared with.
+    /// True if the value cannot be changed after declaration.
     pub read_only: bool,
-    /// It may come to hold what is of another kind.
+    /// True if the type may change.
     pub dynamic_typing: bool,
-    /// Between which doubles its value is.
+    /// Range of allowed doubles.
     pub double_range: Option<DoubleRange>,
-    /// Between which integers its value is.
+    /// Range of allowed integers.
     pub integer_range: Option<IntegerRange>,
 }
 
-/// The doubles that a parameter may hold, the ends included.
+/// Allowed doubles of a parameter; both limits are inclusive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DoubleRange {
-    /// The smallest.
+    /// Smallest allowed value.
     pub from: f64,
-    /// The largest.
+    /// Largest allowed value.
     pub to: f64,
-    /// The distance of one to the next, counted from the smallest; 0 where all between the ends will do.
+    /// Distance between allowed values, counted from the smallest; 0 allows all values in the range.
     pub step: f64,
 }
 
-/// The integers that a parameter may hold, the ends included.
+/// Allowed integers of a parameter; both limits are inclusive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct IntegerRange {
-    /// The smallest.
+    /// Smallest allowed value.
     pub from: i64,
-    /// The largest.
+    /// Largest allowed value.
     pub to: i64,
-    /// The distance of one to the next, counted from the smallest; 0 where all between the ends will do.
+    /// Distance between allowed values, counted from the smallest; 0 allows all values in the range.
     pub step: u64,
 }

@@ -1,4 +1,4 @@
-//! Parameters that all nodes share, where a ROS has them.
+//! Parameters shared by all nodes of a ROS system.
 
 mod changes;
 mod reading;
@@ -9,50 +9,50 @@ use std::hash::{Hash, Hasher};
 use async_trait::async_trait;
 
 use super::BusError;
-pub use changes::ParamChanges;
-pub(crate) use changes::{ParamTeller, changes_within};
+pub use changes::ParamChangeReceiver;
+pub(crate) use changes::{ParamChangeSender, param_change_channel};
 
-/// One changed parameter: its key, and its value unless it was deleted.
+/// One changed parameter: its key and its value, or `None` if it was deleted.
 pub type ParamChange = (String, Option<ParamValue>);
 
-/// The parameters of a whole ROS system. ROS 1 has them; ROS 2's belong to nodes.
+/// Access to the parameters of a whole ROS system (ROS 1). In ROS 2 parameters belong to nodes.
 #[async_trait]
 pub trait GlobalParameters: Send + Sync {
-    /// Reads a parameter or a whole namespace (`/` for all).
+    /// Returns a parameter or a whole namespace (`/` for all).
     async fn get(&self, key: &str) -> Result<ParamValue, BusError>;
     /// Sets a parameter; a map replaces the namespace below `key`.
     async fn set(&self, key: &str, value: ParamValue) -> Result<(), BusError>;
-    /// Removes a parameter.
+    /// Deletes a parameter.
     async fn delete(&self, key: &str) -> Result<(), BusError>;
-    /// Whether it is set.
+    /// Returns true if the parameter is set.
     async fn has(&self, key: &str) -> Result<bool, BusError>;
     /// Searches upwards from `namespace`, as ROS does.
     async fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError>;
-    /// All keys that are set.
+    /// Returns the keys of all parameters that are set.
     async fn names(&self) -> Result<Vec<String>, BusError>;
-    /// Every change of any parameter from now on, those made by this side included. One watcher at a time: another
-    /// takes the place of the first.
-    async fn watch(&self) -> Result<ParamChanges, BusError>;
+    /// Watches every change of any parameter from now on, including changes made by this bus. There is one watcher at a
+    /// time; a new one replaces it.
+    async fn watch(&self) -> Result<ParamChangeReceiver, BusError>;
 }
 
-/// A ROS parameter value. NaN equals NaN: whoever looks for what has changed would never be done otherwise.
+/// A ROS parameter value. NaN equals NaN; otherwise comparing for changes would report a NaN forever.
 ///
-/// What is read of it is bounded: [`MAX_DEPTH`](Self::MAX_DEPTH), [`MAX_VALUES`](Self::MAX_VALUES).
+/// Deserialization is bounded by [`MAX_DEPTH`](Self::MAX_DEPTH) and [`MAX_VALUES`](Self::MAX_VALUES).
 #[derive(Debug, Clone, serde::Serialize)]
 #[serde(untagged)]
 pub enum ParamValue {
     /// `true` or `false`.
     Bool(bool),
-    /// 32-bit on the XML-RPC wire; wider values are refused there.
+    /// Integer; 32-bit on the XML-RPC wire, which refuses wider values.
     Int(i64),
     /// A double.
     Double(f64),
     /// UTF-8 text.
     String(String),
-    /// Bytes: XML-RPC's base64. In JSON it is written as base64 text, and read back as text.
+    /// Bytes: XML-RPC's base64. Serialized to JSON as base64 text, and deserialized as text.
     #[serde(serialize_with = "as_base64")]
     Binary(Vec<u8>),
-    /// Nothing: a Master may hold it, ROS knows no such value. It is never sent.
+    /// No value: a Master may hold it, but ROS does not define it. Never sent.
     Nil,
     /// A list.
     List(Vec<ParamValue>),
@@ -80,7 +80,7 @@ impl PartialEq for ParamValue {
     }
 }
 
-/// Equal values have equal hashes: those of zeros and of NaNs do not depend on their sign and their bits.
+/// Equal values have equal hashes: all zeros and all NaNs hash alike, whatever their sign and bits.
 impl Hash for ParamValue {
     fn hash<H: Hasher>(&self, state: &mut H) {
         std::mem::discriminant(self).hash(state);

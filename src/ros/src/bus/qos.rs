@@ -1,83 +1,84 @@
-//! Quality of service, in the words of DDS and ROS 2.
+//! Quality of service, in the terms of DDS and ROS 2.
 
 use std::time::Duration;
 
-/// Whether messages may be lost on the way.
+/// Delivery guarantee.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Reliability {
-    /// Sent again until they have come.
+pub enum QosReliability {
+    /// Messages are resent until they have arrived.
     #[default]
     Reliable,
-    /// Sent once. ROS 1 sends reliably all the same.
+    /// Messages are sent once. ROS 1 sends reliably all the same.
     BestEffort,
 }
 
-/// What newcomers among the subscribers are given.
+/// Messages kept for late subscribers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Durability {
-    /// What is published from then on.
+pub enum QosDurability {
+    /// None: subscribers get what is published from then on.
     #[default]
     Volatile,
-    /// Also what each publisher published last: what ROS 1 calls latching.
+    /// The last message of each publisher; ROS 1 calls it latching.
     TransientLocal,
 }
 
-/// Who says that a publisher is alive.
+/// How a publisher's liveliness is asserted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Liveliness {
-    /// ROS, for as long as its node is there.
+pub enum QosLiveliness {
+    /// By ROS, for as long as the node exists.
     #[default]
     Automatic,
-    /// What it publishes.
+    /// By the publisher, by publishing.
     ManualByTopic,
 }
 
-/// How one end of a topic treats messages. A subscription's is a wish: publishers that offer less are heard, too, and those of
-/// ROS 1 give all newcomers what they have latched. What is said of time is an offer of publishers alone, and none of ROS 1's.
+/// Quality of service of an endpoint. For a subscription it is a preference: publishers that offer less are matched as
+/// well, and those of ROS 1 give late subscribers whatever they have latched. The fields that concern time apply to
+/// publishers of ROS 2 only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Qos {
-    /// Whether messages may be lost on the way.
-    pub reliability: Reliability,
-    /// What newcomers are given.
-    pub durability: Durability,
-    /// Messages kept for a receiver that is busy (0 counts as 1); the oldest is dropped, and counted, beyond.
+pub struct QosProfile {
+    /// Delivery guarantee.
+    pub reliability: QosReliability,
+    /// Messages kept for late subscribers.
+    pub durability: QosDurability,
+    /// Queue depth for a slow receiver (0 counts as 1); beyond it the oldest message is dropped and counted.
     pub depth: usize,
-    /// The longest time between two messages; none where that is not said.
+    /// Maximum time between two messages; `None` if unspecified.
     pub deadline: Option<Duration>,
-    /// After so long a message is of no use; none where it always is.
+    /// Time after which a message is obsolete; `None` if it never is.
     pub lifespan: Option<Duration>,
-    /// Who says that the publisher is alive.
-    pub liveliness: Liveliness,
-    /// Within which time; none where that is not said.
+    /// How the publisher's liveliness is asserted.
+    pub liveliness: QosLiveliness,
+    /// Liveliness lease duration; `None` if unspecified.
     pub lease: Option<Duration>,
 }
 
-impl Qos {
-    /// Reliable and volatile.
+impl QosProfile {
+    /// Creates a reliable and volatile profile.
     pub const fn keep_last(depth: usize) -> Self {
         Self {
-            reliability: Reliability::Reliable,
-            durability: Durability::Volatile,
+            reliability: QosReliability::Reliable,
+            durability: QosDurability::Volatile,
             depth,
             deadline: None,
             lifespan: None,
-            liveliness: Liveliness::Automatic,
+            liveliness: QosLiveliness::Automatic,
             lease: None,
         }
     }
 
-    /// The same; transient-local if `latching`.
+    /// Returns the profile, made transient-local if `latching` and volatile otherwise.
     pub const fn latching(mut self, latching: bool) -> Self {
         self.durability = if latching {
-            Durability::TransientLocal
+            QosDurability::TransientLocal
         } else {
-            Durability::Volatile
+            QosDurability::Volatile
         };
         self
     }
 
-    /// Whether newcomers are given the last message.
+    /// Returns true if late subscribers are given the last message.
     pub fn is_latching(&self) -> bool {
-        self.durability == Durability::TransientLocal
+        self.durability == QosDurability::TransientLocal
     }
 }

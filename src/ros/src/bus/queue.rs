@@ -1,4 +1,4 @@
-//! The queue of one subscription: bounded, newest wins, never blocks its sender.
+//! The queue of one subscription: bounded, drops the oldest messages, never blocks the sender.
 
 use std::fmt;
 use std::sync::Arc;
@@ -6,16 +6,16 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 use tokio::sync::Notify;
 
-use super::Message;
-use crate::ring::{Bounds, DropCount, Ring};
+use super::SerializedMessage;
+use crate::ring::{DropCount, Ring, RingBounds};
 
-/// Makes the two ends of a queue for at most `capacity` messages (0 counts as 1).
+/// Creates the two ends of a queue for at most `capacity` messages (0 counts as 1).
 ///
 /// Beyond that, or beyond 64 MiB, the oldest messages are dropped and counted.
 pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
-    let shared = Arc::new(Shared {
+    let shared = Arc::new(MessageQueue {
         state: Mutex::new(State {
-            ring: Ring::new(Bounds::messages(capacity)),
+            ring: Ring::new(RingBounds::with_messages(capacity)),
             sender_gone: false,
             receiver_gone: false,
         }),
@@ -31,25 +31,25 @@ pub fn message_queue(capacity: usize) -> (MessageSender, MessageReceiver) {
 }
 
 struct State {
-    ring: Ring<Message>,
+    ring: Ring<SerializedMessage>,
     sender_gone: bool,
     receiver_gone: bool,
 }
 
-struct Shared {
+struct MessageQueue {
     state: Mutex<State>,
     ready: Notify,
     dropped: Arc<DropCount>,
 }
 
-/// Where messages go in. There is one; dropping it ends the queue once it has been read empty.
+/// The only sender of a queue; dropping it ends the queue once all messages have been read.
 pub struct MessageSender {
-    shared: Arc<Shared>,
+    shared: Arc<MessageQueue>,
 }
 
 impl MessageSender {
-    /// Queues a message, dropping the oldest ones if there is no room.
-    pub fn send(&self, message: Message) {
+    /// Queues a message; drops the oldest ones if there is no room.
+    pub fn send(&self, message: SerializedMessage) {
         let lost = {
             let mut state = self.shared.state.lock();
             if state.receiver_gone {
@@ -61,7 +61,7 @@ impl MessageSender {
         self.shared.ready.notify_one();
     }
 
-    /// Whether nobody will ever receive from this queue again.
+    /// Returns true if the receiver is gone.
     pub fn is_closed(&self) -> bool {
         self.shared.state.lock().receiver_gone
     }
@@ -74,16 +74,16 @@ impl Drop for MessageSender {
     }
 }
 
-/// Where messages come out, in the order received per publisher.
+/// The receiver of a queue; messages arrive in order per publisher.
 pub struct MessageReceiver {
-    shared: Arc<Shared>,
+    shared: Arc<MessageQueue>,
 }
 
 impl MessageReceiver {
-    /// The next message; `None` when the subscription has ended and everything was read. Safe to cancel.
-    pub async fn recv(&mut self) -> Option<Message> {
+    /// Returns the next message, or `None` when the subscription has ended and everything was read. Cancel-safe.
+    pub async fn recv(&mut self) -> Option<SerializedMessage> {
         loop {
-            // A queue that never runs empty must not starve the task's neighbours.
+            // A queue that never becomes empty must not starve other tasks.
             tokio::task::consume_budget().await;
             {
                 let mut state = self.shared.state.lock();
@@ -98,23 +98,23 @@ impl MessageReceiver {
         }
     }
 
-    /// The next message if one is already there.
-    pub fn try_recv(&mut self) -> Option<Message> {
+    /// Returns the next message if one is queued.
+    pub fn try_recv(&mut self) -> Option<SerializedMessage> {
         self.shared.state.lock().ring.pop()
     }
 
-    /// How many messages are waiting.
+    /// Returns the number of queued messages.
     pub fn len(&self) -> usize {
         self.shared.state.lock().ring.len()
     }
 
-    /// Whether none is waiting.
+    /// Returns true if no message is queued.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// The counter of messages dropped for want of room; it lives on after the queue.
-    pub fn dropped(&self) -> Arc<DropCount> {
+    /// Returns the counter of messages dropped because the queue was full; it outlives the queue.
+    pub fn drop_counter(&self) -> Arc<DropCount> {
         self.shared.dropped.clone()
     }
 }
@@ -151,9 +151,9 @@ mod tests {
     use super::*;
     use crate::bus::WireType;
 
-    fn message(bytes: Bytes) -> Message {
-        let wire_type = WireType::named("p/T");
-        Message {
+    fn message(bytes: Bytes) -> SerializedMessage {
+        let wire_type = WireType::with_name("p/T");
+        SerializedMessage {
             bytes,
             wire_type: Arc::new(wire_type),
             publisher: "/p".into(),
@@ -164,7 +164,7 @@ mod tests {
     #[tokio::test]
     async fn newest_win_and_drops_are_counted() {
         let (sender, mut receiver) = message_queue(2);
-        let dropped = receiver.dropped();
+        let dropped = receiver.drop_counter();
         for n in 0..5u8 {
             sender.send(message(Bytes::copy_from_slice(&[n])));
         }

@@ -1,4 +1,4 @@
-//! The types of topics and services as their ends declare them to each other.
+//! Types of topics and services as declared by their endpoints.
 
 use std::fmt;
 use std::sync::Arc;
@@ -6,26 +6,26 @@ use std::sync::Arc;
 use crate::bus::{BusError, RosVersion};
 use crate::schema::{MessageType, SchemaError, ServiceDef};
 
-/// How messages are written between the ends of a topic or service.
+/// Serialization format of messages on a topic or service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum WireFormat {
-    /// Little endian, unaligned, lengths of four bytes (<http://wiki.ros.org/ROS/Technical%20Overview>).
+    /// ROS 1: little endian, unaligned, lengths of four bytes (<http://wiki.ros.org/ROS/Technical%20Overview>).
     #[default]
     Ros1,
-    /// ROS 2's: the header of a representation, and CDR.
+    /// ROS 2: an encapsulation header and CDR.
     Cdr,
 }
 
 impl WireFormat {
-    /// That of a version of ROS.
-    pub fn of(version: RosVersion) -> Self {
+    /// Returns the format of a ROS version.
+    pub fn for_version(version: RosVersion) -> Self {
         match version {
             RosVersion::One => Self::Ros1,
             RosVersion::Two => Self::Cdr,
         }
     }
 
-    /// Which ROS writes so.
+    /// Returns the ROS version that uses the format.
     pub fn version(self) -> RosVersion {
         match self {
             Self::Ros1 => RosVersion::One,
@@ -34,29 +34,29 @@ impl WireFormat {
     }
 }
 
-/// What tells definitions of one name apart: the MD5 of a ROS 1 type, 32 lower-case hex digits, or the type hash of a ROS 2
-/// type (`RIHS01_…`).
+/// Distinguishes definitions of one name: the MD5 of a ROS 1 type, 32 lower-case hex digits, or the type hash of a ROS
+/// 2 type (`RIHS01_…`).
 #[derive(Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Digest(Arc<str>);
 
 impl Digest {
-    /// `*`: agrees with all.
+    /// Returns `*`, which is compatible with all digests.
     pub fn any() -> Self {
         Self::from("*")
     }
 
-    /// Whether it is `*`.
+    /// Returns true for `*`.
     pub fn is_any(&self) -> bool {
         &*self.0 == "*"
     }
 
-    /// As text.
+    /// Returns the digest as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
-    /// Whether ends with these digests understand each other.
-    pub fn agrees(&self, other: &Digest) -> bool {
+    /// Returns true if endpoints with these digests can communicate.
+    pub fn is_compatible_with(&self, other: &Digest) -> bool {
         self.is_any() || other.is_any() || self == other
     }
 }
@@ -112,18 +112,18 @@ impl fmt::Debug for Digest {
 /// The type of a topic's messages.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct WireType {
-    /// `package/Type`, of ROS 2 `package/msg/Type`, or `*` where nobody has said.
+    /// `package/Type`, in ROS 2 `package/msg/Type`, or `*` if unknown.
     pub name: String,
-    /// How its messages are written.
+    /// Serialization format.
     pub format: WireFormat,
-    /// Of its definition and all that this contains.
+    /// Digest of the definition with all its dependencies.
     pub digest: Digest,
-    /// The full text with dependencies, where it is known (ROS 1 publishers send it), else empty.
+    /// Full text of the definition with dependencies if known (ROS 1 publishers send it), otherwise empty.
     pub definition: String,
 }
 
 impl WireType {
-    /// A type of the ROS 1 format.
+    /// Creates a type of the ROS 1 format.
     pub fn new(
         name: impl Into<String>,
         digest: impl Into<Digest>,
@@ -137,49 +137,50 @@ impl WireType {
         }
     }
 
-    /// The same, written as this version of ROS does.
-    pub fn written_by(self, version: RosVersion) -> Self {
-        let format = WireFormat::of(version);
+    /// Returns the type with the format of the given ROS version.
+    pub fn with_version(self, version: RosVersion) -> Self {
+        let format = WireFormat::for_version(version);
         Self { format, ..self }
     }
 
-    /// A type whose definition is known.
-    pub fn of(message: &MessageType) -> Self {
+    /// Creates the type of a known definition.
+    pub fn from_message(message: &MessageType) -> Self {
         Self {
-            format: WireFormat::of(message.version()),
+            format: WireFormat::for_version(message.version()),
             ..Self::new(message.name(), message.digest(), message.full_text())
         }
     }
 
-    /// A type of which only the name is known: any definition will do.
-    pub fn named(name: &str) -> Self {
+    /// Creates a type of which only the name is known; it is compatible with any definition.
+    pub fn with_name(name: &str) -> Self {
         Self::new(name, "*", "")
     }
 
-    /// Any type.
+    /// Returns the type that matches any type.
     pub fn any() -> Self {
-        Self::named("*")
+        Self::with_name("*")
     }
 
-    /// Whether messages of one are understood by who expects the other.
-    pub fn agrees(&self, other: &WireType) -> bool {
-        self.format == other.format && self.digest.agrees(&other.digest)
+    /// Returns true if a subscriber of one type understands messages of the other.
+    pub fn is_compatible_with(&self, other: &WireType) -> bool {
+        self.format == other.format && self.digest.is_compatible_with(&other.digest)
     }
 
-    /// What its definition says.
+    /// Returns the message type that the definition describes.
     pub fn schema(&self) -> Result<Arc<MessageType>, SchemaError> {
         let version = self.format.version();
-        let schema = MessageType::of_full_text(version, &self.name, &self.definition)?;
-        // Publishers of ROS 2 do not send it. Nothing is the definition of few types.
+        let schema = MessageType::parse_full_text(version, &self.name, &self.definition)?;
+        // ROS 2 publishers do not send their definition. An empty definition is valid, but belongs to few types.
         let is_told = version == RosVersion::One || !self.definition.is_empty();
-        match is_told || self.digest == *schema.digest() {
-            true => Ok(schema),
-            false => Err(SchemaError::Unknown(self.name.clone())),
+        if is_told || self.digest == *schema.digest() {
+            Ok(schema)
+        } else {
+            Err(SchemaError::Unknown(self.name.clone()))
         }
     }
 }
 
-/// Name and digest, for messages.
+/// Displays name and digest, for messages to users.
 impl fmt::Display for WireType {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(formatter, "{} {}", self.name, self.digest)
@@ -189,20 +190,20 @@ impl fmt::Display for WireType {
 /// The type of a service's requests and responses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ServiceType {
-    /// `package/Type`, of ROS 2 `package/srv/Type`.
+    /// `package/Type`, in ROS 2 `package/srv/Type`.
     pub name: String,
-    /// How its messages are written.
+    /// Serialization format.
     pub format: WireFormat,
-    /// Of request and response together.
+    /// Digest of request and response together.
     pub digest: Digest,
-    /// Of its requests alone, where ends tell that of each other (ROS 2); else `*`.
+    /// Digest of the request alone, where endpoints announce it (ROS 2); otherwise `*`.
     pub request: Digest,
-    /// Of its responses alone, likewise.
+    /// Digest of the response alone, likewise.
     pub response: Digest,
 }
 
 impl ServiceType {
-    /// A type of the ROS 1 format.
+    /// Creates a type of the ROS 1 format.
     pub fn new(name: impl Into<String>, digest: impl Into<Digest>) -> Self {
         Self {
             name: name.into(),
@@ -213,46 +214,47 @@ impl ServiceType {
         }
     }
 
-    /// The same, written as this version of ROS does.
-    pub fn written_by(self, version: RosVersion) -> Self {
-        let format = WireFormat::of(version);
+    /// Returns the type with the format of the given ROS version.
+    pub fn with_version(self, version: RosVersion) -> Self {
+        let format = WireFormat::for_version(version);
         Self { format, ..self }
     }
 
-    /// A type whose definition is known.
-    pub fn of(service: &ServiceDef) -> Self {
+    /// Creates the type of a known definition.
+    pub fn from_service(service: &ServiceDef) -> Self {
         let of = |message: &MessageType| match message.version() {
             RosVersion::One => Digest::any(),
             RosVersion::Two => Digest::from(message.digest()),
         };
         Self {
-            format: WireFormat::of(service.request.version()),
+            format: WireFormat::for_version(service.request.version()),
             request: of(&service.request),
             response: of(&service.response),
             ..Self::new(&*service.name, &*service.md5)
         }
     }
 
-    /// Whether who expects one understands a server of the other.
-    pub fn agrees(&self, other: &ServiceType) -> bool {
-        self.digest.agrees(&other.digest)
-            && self.request.agrees(&other.request)
-            && self.response.agrees(&other.response)
+    /// Returns true if a client of one type can call a server of the other.
+    pub fn is_compatible_with(&self, other: &ServiceType) -> bool {
+        self.digest.is_compatible_with(&other.digest)
+            && self.request.is_compatible_with(&other.request)
+            && self.response.is_compatible_with(&other.response)
     }
 
-    /// Whether it is the other one, as far as is known.
-    pub fn is(&self, other: &ServiceType) -> bool {
-        self.name == other.name && self.agrees(other)
+    /// Returns true if name and digests agree, as far as they are known.
+    pub fn matches(&self, other: &ServiceType) -> bool {
+        self.name == other.name && self.is_compatible_with(other)
     }
 
-    /// That `what` is this there, and not what it is here: by what they differ in, their names or else their digests.
-    pub fn not(&self, ours: &ServiceType, what: String) -> BusError {
+    /// Returns the error for `what` having this type at the peer and `ours` here. It names what differs: the type names
+    /// or else the digests.
+    pub fn mismatch(&self, ours: &ServiceType, what: String) -> BusError {
         let pairs = [
             (&self.digest, &ours.digest),
             (&self.request, &ours.request),
             (&self.response, &ours.response),
         ];
-        let differ = |(theirs, ours): &(&Digest, &Digest)| !theirs.agrees(ours);
+        let differ = |(theirs, ours): &(&Digest, &Digest)| !theirs.is_compatible_with(ours);
         let digests = pairs.into_iter().find(differ);
         let (theirs, ours) = match digests.filter(|_| self.name == ours.name) {
             Some((theirs, of_ours)) => (
@@ -272,8 +274,8 @@ mod tests {
     #[test]
     fn a_type_of_ros_2_that_tells_no_definition_has_none() {
         let of = |text: &str| {
-            let found = MessageType::of_full_text(RosVersion::Two, "a/msg/B", text);
-            WireType::of(&found.expect("a definition"))
+            let found = MessageType::parse_full_text(RosVersion::Two, "a/msg/B", text);
+            WireType::from_message(&found.expect("a definition"))
         };
         let (string, empty) = (of("string data"), of(""));
         assert!(string.schema().is_ok() && empty.schema().is_ok());
@@ -293,9 +295,12 @@ mod tests {
             request: Digest::from(request),
             ..ServiceType::new("a/srv/B", "*")
         };
-        assert!(known("x").agrees(&known("x")) && known("x").agrees(&known("*")));
-        assert!(!known("x").agrees(&known("y")));
-        assert!(!ServiceType::new("a/B", "x").agrees(&ServiceType::new("a/B", "y")));
+        assert!(
+            known("x").is_compatible_with(&known("x"))
+                && known("x").is_compatible_with(&known("*"))
+        );
+        assert!(!known("x").is_compatible_with(&known("y")));
+        assert!(!ServiceType::new("a/B", "x").is_compatible_with(&ServiceType::new("a/B", "y")));
     }
 
     #[test]
@@ -305,8 +310,8 @@ mod tests {
             ..ServiceType::new(name, "*")
         };
         let told = |theirs: ServiceType, ours: ServiceType| {
-            assert!(!theirs.is(&ours));
-            theirs.not(&ours, "service /x".to_owned()).to_string()
+            assert!(!theirs.matches(&ours));
+            theirs.mismatch(&ours, "service /x".to_owned()).to_string()
         };
         assert_eq!(
             told(of("a/srv/B", "x"), of("c/srv/D", "y")),

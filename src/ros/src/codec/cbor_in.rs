@@ -1,12 +1,12 @@
-//! CBOR → ROS bytes (RFC 8949), typed arrays included (RFC 8746).
+//! CBOR → ROS bytes (RFC 8949), including typed arrays (RFC 8746).
 
 use crate::cbor_head::{ARRAY, BYTES, MAP, NEGATIVE, SIMPLE, TAG, TEXT, UNSIGNED};
 use crate::codec::FillOptions;
-use crate::codec::cbor_item::{Head, INDEFINITE};
+use crate::codec::cbor_item::{INDEFINITE, ItemHead};
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
-use crate::codec::fill::{Input, fill};
+use crate::codec::fill::{ValueInput, fill};
 use crate::codec::number::{Number, Wire};
-use crate::codec::typed_array::{Layout, float_of_head};
+use crate::codec::typed_array::{ElementLayout, head_to_float};
 use crate::schema::MessageType;
 use crate::schema::plan::Members;
 
@@ -35,25 +35,25 @@ struct Cbor<'a> {
     scratch: Vec<u8>,
 }
 
-/// Items still to come; None until a break.
-pub(crate) struct Left(Option<u64>);
+/// Number of remaining items; `None` if they end with a break.
+pub(crate) struct RemainingItems(Option<u64>);
 
-impl Input for Cbor<'_> {
-    type Object = Left;
-    type Array = Left;
+impl ValueInput for Cbor<'_> {
+    type Object = RemainingItems;
+    type Array = RemainingItems;
 
-    fn begin_object(&mut self) -> Result<Left, Fault> {
-        self.open(MAP, "a map")
+    fn begin_object(&mut self) -> Result<RemainingItems, Fault> {
+        self.open_container(MAP, "a map")
     }
 
     #[inline]
     fn next_member(
         &mut self,
-        object: &mut Left,
+        object: &mut RemainingItems,
         members: &Members,
         expected: usize,
     ) -> Result<Option<usize>, Fault> {
-        if !self.next(object)? {
+        if !self.has_next(object)? {
             return Ok(None);
         }
         if let Some(likely) = members.list().get(expected) {
@@ -62,46 +62,48 @@ impl Input for Cbor<'_> {
                 return Ok(Some(expected));
             }
         }
-        self.key(members).map(Some)
+        self.read_key(members).map(Some)
     }
 
-    fn begin_array(&mut self, expected: &'static str) -> Result<Left, Fault> {
-        self.open(ARRAY, expected)
+    fn begin_array(&mut self, expected: &'static str) -> Result<RemainingItems, Fault> {
+        self.open_container(ARRAY, expected)
     }
 
     #[inline]
-    fn next_element(&mut self, array: &mut Left) -> Result<bool, Fault> {
-        self.next(array)
+    fn next_element(&mut self, array: &mut RemainingItems) -> Result<bool, Fault> {
+        self.has_next(array)
     }
 
     fn boolean(&mut self) -> Result<bool, Fault> {
-        let head = self.untagged()?;
+        let head = self.read_untagged_head()?;
         match (head.major, head.info) {
             (SIMPLE, 20) => Ok(false),
             (SIMPLE, 21) => Ok(true),
-            _ => Err(found("bool", head)),
+            _ => Err(type_mismatch("bool", head)),
         }
     }
 
     #[inline]
     fn number<T: Wire>(&mut self) -> Result<T, Fault> {
-        let head = self.untagged()?;
+        let head = self.read_untagged_head()?;
         let number = match (head.major, head.info) {
             (UNSIGNED, _) => Number::Unsigned(head.value),
             (NEGATIVE, _) => Number::Negative(head.value),
             (SIMPLE, 22 | 23) => {
-                return T::from_non_finite(f64::NAN).ok_or_else(|| found(T::NAME, head));
+                return T::from_non_finite(f64::NAN).ok_or_else(|| type_mismatch(T::NAME, head));
             }
-            (SIMPLE, _) => Number::Float(float_of_head(head).ok_or_else(|| found(T::NAME, head))?),
-            _ => return Err(found(T::NAME, head)),
+            (SIMPLE, _) => {
+                Number::Float(head_to_float(head).ok_or_else(|| type_mismatch(T::NAME, head))?)
+            }
+            _ => return Err(type_mismatch(T::NAME, head)),
         };
         T::from_number(number)
     }
 
     fn text(&mut self, out: &mut Vec<u8>) -> Result<(), Fault> {
-        let head = self.untagged()?;
+        let head = self.read_untagged_head()?;
         if head.major != TEXT {
-            return Err(found("a string", head));
+            return Err(type_mismatch("a string", head));
         }
         let begin = out.len();
         self.string(head, out)?;
@@ -113,7 +115,7 @@ impl Input for Cbor<'_> {
 
     fn bytes(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault> {
         let before = self.at;
-        let head = self.head()?;
+        let head = self.read_head()?;
         match head.major {
             BYTES => self.string(head, out)?,
             TEXT => {
@@ -135,9 +137,9 @@ impl Input for Cbor<'_> {
 
     fn typed_array<T: Wire>(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault> {
         let before = self.at;
-        let head = self.head()?;
+        let head = self.read_head()?;
         let layout = if head.major == TAG {
-            Layout::of_tag(head.value)
+            ElementLayout::from_tag(head.value)
         } else {
             None
         };
@@ -145,9 +147,9 @@ impl Input for Cbor<'_> {
             self.at = before;
             return Ok(false);
         };
-        let bytes = self.head()?;
+        let bytes = self.read_head()?;
         if bytes.major != BYTES {
-            return Err(self.invalid("a typed array that is no byte string"));
+            return Err(self.invalid("a typed array that is not a byte string"));
         }
         if bytes.info == INDEFINITE {
             let mut gathered = Vec::new();
@@ -160,7 +162,7 @@ impl Input for Cbor<'_> {
         Ok(true)
     }
 
-    fn now(&mut self) -> bool {
+    fn take_now(&mut self) -> bool {
         let follows = self.input[self.at..].starts_with(b"\x63now");
         if follows {
             self.at += 4;
@@ -180,17 +182,17 @@ impl<'a> Cbor<'a> {
     }
 
     #[inline]
-    fn head(&mut self) -> Result<Head, Fault> {
-        let head = Head::read(&self.input[self.at..]).map_err(|reason| self.invalid(reason))?;
+    fn read_head(&mut self) -> Result<ItemHead, Fault> {
+        let head = ItemHead::read(&self.input[self.at..]).map_err(|reason| self.invalid(reason))?;
         self.at += head.size;
         Ok(head)
     }
 
-    /// The next head that is not a tag: tags say more about a value than the field needs to know.
+    /// Reads the next head that is not a tag: the field type determines the value, so tags are ignored.
     #[inline]
-    fn untagged(&mut self) -> Result<Head, Fault> {
+    fn read_untagged_head(&mut self) -> Result<ItemHead, Fault> {
         loop {
-            let head = self.head()?;
+            let head = self.read_head()?;
             if head.major != TAG {
                 return Ok(head);
             }
@@ -207,17 +209,23 @@ impl<'a> Cbor<'a> {
         Ok(&rest[..size])
     }
 
-    fn open(&mut self, major: u8, expected: &'static str) -> Result<Left, Fault> {
-        let head = self.untagged()?;
+    fn open_container(
+        &mut self,
+        major: u8,
+        expected: &'static str,
+    ) -> Result<RemainingItems, Fault> {
+        let head = self.read_untagged_head()?;
         if head.major != major {
-            return Err(found(expected, head));
+            return Err(type_mismatch(expected, head));
         }
-        Ok(Left((head.info != INDEFINITE).then_some(head.value)))
+        Ok(RemainingItems(
+            (head.info != INDEFINITE).then_some(head.value),
+        ))
     }
 
-    /// Whether another item (or pair) follows; the break after the last is skipped.
+    /// Returns true if another item (or pair) follows; skips the break after the last one.
     #[inline]
-    fn next(&mut self, left: &mut Left) -> Result<bool, Fault> {
+    fn has_next(&mut self, left: &mut RemainingItems) -> Result<bool, Fault> {
         match &mut left.0 {
             Some(0) => Ok(false),
             Some(left) => {
@@ -232,12 +240,12 @@ impl<'a> Cbor<'a> {
         }
     }
 
-    fn key(&mut self, members: &Members) -> Result<usize, Fault> {
+    fn read_key(&mut self, members: &Members) -> Result<usize, Fault> {
         let mut name = std::mem::take(&mut self.scratch);
         name.clear();
-        let head = self.untagged()?;
+        let head = self.read_untagged_head()?;
         if head.major != TEXT {
-            return Err(self.invalid("a key that is no string"));
+            return Err(self.invalid("a key that is not a string"));
         }
         self.string(head, &mut name)?;
         let Some(index) = members.find(&name) else {
@@ -248,14 +256,14 @@ impl<'a> Cbor<'a> {
         Ok(index)
     }
 
-    /// Appends the content of a byte or text string whose head was read.
-    fn string(&mut self, head: Head, out: &mut Vec<u8>) -> Result<(), Fault> {
+    /// Appends the content of a byte or text string whose head has been read.
+    fn string(&mut self, head: ItemHead, out: &mut Vec<u8>) -> Result<(), Fault> {
         if head.info != INDEFINITE {
             out.extend_from_slice(self.take(head.value)?);
             return Ok(());
         }
         loop {
-            let chunk = self.head()?;
+            let chunk = self.read_head()?;
             if chunk.is_break() {
                 return Ok(());
             }
@@ -268,20 +276,20 @@ impl<'a> Cbor<'a> {
 
     fn typed_bytes<T: Wire>(
         &self,
-        layout: Layout,
+        layout: ElementLayout,
         tag: u64,
         bytes: &[u8],
         out: &mut Vec<u8>,
     ) -> Result<(), Fault> {
         if bytes.len() % layout.width != 0 {
-            return Err(self.invalid("a typed array that is no multiple of its element"));
+            return Err(self.invalid("a typed array whose length is not a multiple of its element"));
         }
         layout.append::<T>(tag, bytes, out)
     }
 }
 
 #[cold]
-fn found(expected: &'static str, head: Head) -> Fault {
+fn type_mismatch(expected: &'static str, head: ItemHead) -> Fault {
     let found = match (head.major, head.info) {
         (UNSIGNED | NEGATIVE, _) | (SIMPLE, 25..=27) => "a number",
         (BYTES, _) => "a byte string",
@@ -291,7 +299,7 @@ fn found(expected: &'static str, head: Head) -> Fault {
         (SIMPLE, 20 | 21) => "a bool",
         (SIMPLE, 22 | 23) => "null",
         (SIMPLE, INDEFINITE) => "the end of the array or map around it",
-        _ => "a value of no known meaning",
+        _ => "an unknown value",
     };
     mismatch(expected, found)
 }

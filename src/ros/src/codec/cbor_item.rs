@@ -1,31 +1,31 @@
-//! Heads of CBOR items, and where an item ends.
+//! CBOR item heads, and the length of an item.
 
 use crate::cbor_head::{ARRAY, BYTES, MAP, SIMPLE, TAG, TEXT};
 use crate::codec::fault::{CodecError, CodecErrorKind};
 
-/// Deepest nesting that is looked into where no message type bounds it.
+/// Maximum nesting where no message type limits it.
 pub(crate) const MAX_NESTING: usize = 128;
 
-/// The first bytes of an item.
+/// The head of an item.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Head {
-    /// Major type, in place.
+pub(crate) struct ItemHead {
+    /// Major type, shifted into place.
     pub(crate) major: u8,
-    /// The low five bits: 24 to 27 for the width of `value`, 31 for no declared length.
+    /// Additional information (low five bits): 24 to 27 give the width of `value`, 31 an indefinite length.
     pub(crate) info: u8,
-    /// Number, length, count or tag; the bits of a float.
+    /// Number, length, count or tag; for a float, its bits.
     pub(crate) value: u64,
-    /// Bytes of the head itself.
+    /// Size of the head in bytes.
     pub(crate) size: usize,
 }
 
-/// `info` of an item without declared length, and of the break that ends it.
+/// `info` of an item of indefinite length, and of the break that ends it.
 pub(crate) const INDEFINITE: u8 = 31;
 
-impl Head {
+impl ItemHead {
     /// Reads the head at the beginning of `input`.
     #[inline]
-    pub(crate) fn read(input: &[u8]) -> Result<Head, &'static str> {
+    pub(crate) fn read(input: &[u8]) -> Result<ItemHead, &'static str> {
         let Some((&first, rest)) = input.split_first() else {
             return Err("the input ends here");
         };
@@ -55,7 +55,7 @@ impl Head {
             _ => return Err("a reserved head"),
         };
         let value = value.ok_or("the input ends here")?;
-        Ok(Head {
+        Ok(ItemHead {
             major,
             info,
             value,
@@ -68,14 +68,14 @@ impl Head {
     }
 }
 
-/// Length of the CBOR item at the beginning of `input`, without building it. Items may nest 128 deep.
+/// Returns the length of the CBOR item at the beginning of `input`, without building it. Items may nest 128 deep.
 pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
-    let fail = |at, reason| CodecError::of_input(CodecErrorKind::Cbor { at, reason });
-    // Items still to come at each level; None until a break.
-    let mut open: Vec<Open> = Vec::new();
+    let fail = |at, reason| CodecError::from_input(CodecErrorKind::Cbor { at, reason });
+    // Remaining items at each level; `None` if they end with a break.
+    let mut open: Vec<OpenItem> = Vec::new();
     let mut at = 0;
     loop {
-        let head = Head::read(&input[at..]).map_err(|reason| fail(at, reason))?;
+        let head = ItemHead::read(&input[at..]).map_err(|reason| fail(at, reason))?;
         let indefinite = head.info == INDEFINITE;
         let chunk_of = open.last().and_then(|level| level.chunks);
         if chunk_of.is_some_and(|major| !head.is_break() && (head.major != major || indefinite)) {
@@ -91,10 +91,10 @@ pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
                 }
                 None
             }
-            BYTES | TEXT if indefinite => Some(Open {
+            BYTES | TEXT if indefinite => Some(OpenItem {
                 left: None,
                 chunks: Some(head.major),
-                ..Open::default()
+                ..OpenItem::default()
             }),
             BYTES | TEXT => {
                 let length = usize::try_from(head.value).unwrap_or(usize::MAX);
@@ -104,28 +104,28 @@ pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
                 at += length;
                 None
             }
-            ARRAY | MAP if indefinite => Some(Open {
+            ARRAY | MAP if indefinite => Some(OpenItem {
                 left: None,
                 map: head.major == MAP,
-                ..Open::default()
+                ..OpenItem::default()
             }),
-            ARRAY => Some(Open {
+            ARRAY => Some(OpenItem {
                 left: Some(head.value),
-                ..Open::default()
+                ..OpenItem::default()
             }),
-            MAP => Some(Open {
+            MAP => Some(OpenItem {
                 left: Some(head.value.saturating_mul(2)),
-                ..Open::default()
+                ..OpenItem::default()
             }),
-            TAG => Some(Open {
+            TAG => Some(OpenItem {
                 left: Some(1),
-                ..Open::default()
+                ..OpenItem::default()
             }),
             _ => None,
         };
         if let Some(level) = opened {
             if open.len() >= MAX_NESTING {
-                return Err(CodecError::of_input(CodecErrorKind::TooDeep(MAX_NESTING)));
+                return Err(CodecError::from_input(CodecErrorKind::TooDeep(MAX_NESTING)));
             }
             open.push(level);
             if level.left != Some(0) {
@@ -139,21 +139,21 @@ pub fn cbor_item_len(input: &[u8]) -> Result<usize, CodecError> {
     }
 }
 
-/// A level of nesting.
+/// A nesting level.
 #[derive(Debug, Clone, Copy, Default)]
-struct Open {
-    /// Items still to come; None until a break.
+struct OpenItem {
+    /// Number of remaining items; `None` if they end with a break.
     left: Option<u64>,
-    /// The major type that the chunks of a string must have.
+    /// Major type required of the chunks of a string.
     chunks: Option<u8>,
-    /// A map without declared length.
+    /// True for a map of indefinite length.
     map: bool,
-    /// A key is waiting for its value.
+    /// True between a key and its value.
     odd: bool,
 }
 
-/// Counts an item that just ended, and those that end with it; true when nothing is open any more.
-fn close_complete(open: &mut Vec<Open>) -> bool {
+/// Counts an item that just ended, and the containers that end with it; returns true when nothing is open any more.
+fn close_complete(open: &mut Vec<OpenItem>) -> bool {
     loop {
         let Some(level) = open.last_mut() else {
             return true;

@@ -1,26 +1,27 @@
-//! ROS 2's bytes: CDR, as DDS calls the first version of it (XCDR1, plain; OMG DDS-XTypes 1.3, section 7.4.1), in either
-//! order of bytes.
+//! ROS 2's serialization: CDR, in the version that DDS calls plain XCDR1 (OMG DDS-XTypes 1.3, section 7.4.1), in either
+//! byte order.
 //!
 //! ```text
 //! 00 REPRESENTATION 00 00 | body: each number at a multiple of its size, counted from the body's beginning
 //! ```
 //!
-//! What rosidl and Fast DDS make of it, seen on the wire: a string's length counts the NUL behind it; a wide string is
-//! units of UTF-16 of four bytes each, without one; an empty sequence of wide numbers has no padding behind its length;
-//! a type without fields is one byte of any value. What pads is of any value too, and bytes may follow the message,
-//! because who serializes by an estimated size leaves them there: nodes do not look at them, nor does this.
+//! As produced by rosidl and Fast DDS on the wire: the length of a string includes the terminating NUL; a wide string
+//! consists of UTF-16 code units of four bytes each, without a NUL; an empty sequence of wide numbers has no padding
+//! after its length; a type without fields is one byte of any value. Padding has any value too, and bytes may follow
+//! the message, because a sender that serializes into a buffer of estimated size leaves them there: nodes ignore them,
+//! and so does this code.
 
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::codec::reader::{Reader, check_length};
-use crate::schema::plan::{Count, Plan, Scalar, Text};
+use crate::codec::reader::{SerializedReader, check_length};
+use crate::schema::plan::{CodecPlan, Count, Scalar, Text};
 
-/// What stands before the body of what is written here: little endian.
+/// Encapsulation header written before the body: little endian.
 pub(crate) const HEADER: [u8; 4] = [0, 1, 0, 0];
 
-/// Bytes of one unit of a wide string.
+/// Bytes per unit of a wide string.
 pub(crate) const WIDE: usize = 4;
 
-/// The body, and whether its numbers are big endian.
+/// Returns the body, and whether it is big endian.
 pub(crate) fn split_header(bytes: &[u8]) -> Result<(&[u8], bool), Fault> {
     let Some((header, body)) = bytes.split_first_chunk::<4>() else {
         let missing = HEADER.len() - bytes.len();
@@ -36,13 +37,13 @@ pub(crate) fn split_header(bytes: &[u8]) -> Result<(&[u8], bool), Fault> {
     }
 }
 
-/// Takes values out of a body; `BIG` endian or little.
+/// Reads values from a body; `BIG` selects the byte order.
 pub(crate) struct Cdr<'a, const BIG: bool> {
     body: &'a [u8],
     at: usize,
-    /// A scalar with its bytes turned round.
+    /// A scalar, byte-swapped.
     one: [u8; 8],
-    /// An array with its bytes turned round, or wide text as UTF-8: as large as what it was made of.
+    /// A byte-swapped array, or wide text as UTF-8; grows as large as the largest one read.
     turned: Vec<u8>,
 }
 
@@ -56,9 +57,9 @@ impl<'a, const BIG: bool> Cdr<'a, BIG> {
         }
     }
 
-    /// `alignment` is a power of two.
+    /// Skips padding and takes `size` bytes. `alignment` is a power of two.
     #[inline]
-    fn aligned(&mut self, size: usize, alignment: usize) -> Result<&'a [u8], Fault> {
+    fn take_aligned(&mut self, size: usize, alignment: usize) -> Result<&'a [u8], Fault> {
         let begin = (self.at + alignment - 1) & !(alignment - 1);
         let end = begin.saturating_add(size);
         let Some(taken) = self.body.get(begin..end) else {
@@ -74,25 +75,25 @@ impl<'a, const BIG: bool> Cdr<'a, BIG> {
     #[inline]
     fn word(&mut self) -> Result<usize, Fault> {
         let mut word = [0; 4];
-        word.copy_from_slice(self.aligned(4, 4)?);
+        word.copy_from_slice(self.take_aligned(4, 4)?);
         Ok(self::word::<BIG>(word) as usize)
     }
 
-    fn left(&self) -> usize {
+    fn remaining(&self) -> usize {
         self.body.len() - self.at
     }
 
     fn wide_text(&mut self) -> Result<&[u8], Fault> {
         let length = self.length(Count::Variable, WIDE)?;
-        let units = self.aligned(length * WIDE, WIDE)?;
+        let units = self.take_aligned(length * WIDE, WIDE)?;
         self.turned.clear();
         push_utf8::<BIG>(units, &mut self.turned);
         Ok(&self.turned)
     }
 }
 
-/// Units of a wide string as UTF-8.
-pub(crate) fn utf8_of<const BIG: bool>(units: &[u8]) -> Vec<u8> {
+/// Converts the units of a wide string to UTF-8.
+pub(crate) fn units_to_utf8<const BIG: bool>(units: &[u8]) -> Vec<u8> {
     let mut text = Vec::new();
     push_utf8::<BIG>(units, &mut text);
     text
@@ -118,7 +119,7 @@ fn push_utf8<const BIG: bool>(units: &[u8], out: &mut Vec<u8>) {
             Some(character) => {
                 out.extend_from_slice(character.encode_utf8(&mut [0; 4]).as_bytes());
             }
-            // No UTF-8 has it, so it is replaced or refused as such bytes are.
+            // Not representable in UTF-8: replaced or refused later, like any invalid byte.
             None => out.push(0xff),
         }
     }
@@ -126,19 +127,20 @@ fn push_utf8<const BIG: bool>(units: &[u8], out: &mut Vec<u8>) {
 
 #[inline]
 fn word<const BIG: bool>(bytes: [u8; 4]) -> u32 {
-    match BIG {
-        true => u32::from_be_bytes(bytes),
-        false => u32::from_le_bytes(bytes),
+    if BIG {
+        u32::from_be_bytes(bytes)
+    } else {
+        u32::from_le_bytes(bytes)
     }
 }
 
-impl<const BIG: bool> Reader for Cdr<'_, BIG> {
+impl<const BIG: bool> SerializedReader for Cdr<'_, BIG> {
     const PLACEHOLDERS: bool = true;
 
     #[inline]
     fn scalar(&mut self, scalar: Scalar) -> Result<&[u8], Fault> {
         let (size, alignment) = (scalar.size(), scalar.alignment());
-        let bytes = self.aligned(size, alignment)?;
+        let bytes = self.take_aligned(size, alignment)?;
         if !BIG {
             return Ok(bytes);
         }
@@ -155,7 +157,7 @@ impl<const BIG: bool> Reader for Cdr<'_, BIG> {
             return Ok(&[]);
         }
         let alignment = scalar.alignment();
-        let bytes = self.aligned(length * scalar.size(), alignment)?;
+        let bytes = self.take_aligned(length * scalar.size(), alignment)?;
         if !BIG || alignment == 1 {
             return Ok(bytes);
         }
@@ -169,7 +171,7 @@ impl<const BIG: bool> Reader for Cdr<'_, BIG> {
 
     #[inline]
     fn take(&mut self, size: usize) -> Result<&[u8], Fault> {
-        self.aligned(size, 1)
+        self.take_aligned(size, 1)
     }
 
     #[inline]
@@ -178,8 +180,8 @@ impl<const BIG: bool> Reader for Cdr<'_, BIG> {
             return self.wide_text();
         }
         let length = self.length(Count::Variable, 1)?;
-        let bytes = self.aligned(length, 1)?;
-        // Nodes read a string without its NUL, too.
+        let bytes = self.take_aligned(length, 1)?;
+        // Nodes also accept a string without its NUL.
         Ok(bytes.strip_suffix(&[0]).unwrap_or(bytes))
     }
 
@@ -189,13 +191,13 @@ impl<const BIG: bool> Reader for Cdr<'_, BIG> {
             Count::Fixed(length) => length,
             Count::Variable | Count::Bounded(_) => self.word()?,
         };
-        check_length(count, length, min_size, self.left())?;
+        check_length(count, length, min_size, self.remaining())?;
         Ok(length)
     }
 
-    /// What padding there is depends on where a message begins.
+    /// Messages cannot be skipped as a block: the padding depends on where a message begins.
     #[inline]
-    fn skip(&mut self, _: &Plan, _: usize) -> Result<bool, Fault> {
+    fn skip(&mut self, _: &CodecPlan, _: usize) -> Result<bool, Fault> {
         Ok(false)
     }
 

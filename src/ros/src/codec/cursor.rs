@@ -1,19 +1,19 @@
-//! A place in serialized bytes of either ROS, for those who look for a few values and go past the rest.
+//! A cursor over the serialized bytes of either ROS version, for code that needs a few values and skips the rest.
 
 use crate::bus::RosVersion;
 use crate::codec::cdr::{HEADER, WIDE, split_header};
 
-/// Goes forward over one message. None where it ends too early.
-pub(crate) struct Cursor<'a> {
+/// Moves forward over one message. Methods return `None` where the message ends too early.
+pub(crate) struct MessageCursor<'a> {
     bytes: &'a [u8],
     at: usize,
-    /// From where on numbers are aligned; None in ROS 1, where they are not.
+    /// Offset from which numbers are aligned; `None` in ROS 1, which has no alignment.
     origin: Option<usize>,
     big_endian: bool,
 }
 
-impl<'a> Cursor<'a> {
-    /// At the first value; None where it is serialized in a way that is not read here.
+impl<'a> MessageCursor<'a> {
+    /// Creates a cursor at the first value; `None` if the representation is not supported.
     pub(crate) fn new(version: RosVersion, bytes: &'a [u8]) -> Option<Self> {
         let big_endian = match version {
             RosVersion::One => false,
@@ -28,13 +28,13 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Where the next value, or what pads it, begins.
-    pub(crate) fn at(&self) -> usize {
+    /// Returns the offset of the next value or its padding.
+    pub(crate) fn position(&self) -> usize {
         self.at
     }
 
-    /// Bytes from there on.
-    pub(crate) fn left(&self) -> usize {
+    /// Returns the number of remaining bytes.
+    pub(crate) fn remaining(&self) -> usize {
         self.bytes.len() - self.at
     }
 
@@ -42,7 +42,7 @@ impl<'a> Cursor<'a> {
         self.big_endian
     }
 
-    /// So many bytes of numbers of a size.
+    /// Takes `size` bytes, after padding to `alignment`.
     pub(crate) fn take(&mut self, size: usize, alignment: usize) -> Option<&'a [u8]> {
         let begin = match self.origin {
             None => self.at,
@@ -54,7 +54,7 @@ impl<'a> Cursor<'a> {
         Some(taken)
     }
 
-    /// A number, little endian.
+    /// Takes a number, as little-endian bytes.
     pub(crate) fn number<const N: usize>(&mut self) -> Option<[u8; N]> {
         let mut number: [u8; N] = self.take(N, N)?.try_into().ok()?;
         if self.big_endian {
@@ -63,12 +63,12 @@ impl<'a> Cursor<'a> {
         Some(number)
     }
 
-    /// A length.
+    /// Takes a length.
     pub(crate) fn length(&mut self) -> Option<usize> {
         usize::try_from(u32::from_le_bytes(self.number()?)).ok()
     }
 
-    /// So many numbers of a size, seen by no one.
+    /// Skips `count` numbers of `size` bytes.
     pub(crate) fn skip(&mut self, count: usize, size: usize, alignment: usize) -> Option<()> {
         if count > 0 {
             self.take(count.checked_mul(size)?, alignment)?;
@@ -76,7 +76,7 @@ impl<'a> Cursor<'a> {
         Some(())
     }
 
-    /// A string's bytes; in ROS 2 with the NUL behind it.
+    /// Takes a string's bytes, in ROS 2 with the terminating NUL.
     pub(crate) fn string(&mut self, wide: bool) -> Option<&'a [u8]> {
         let length = self.length()?;
         let unit = if wide { WIDE } else { 1 };

@@ -1,6 +1,6 @@
-//! Decimal digits → integers.
+//! Conversion of decimal digits to integers.
 
-/// The value of eight digits, all at once: pairs, then fours, then both halves.
+/// Returns the value of eight digits, computed in parallel: pairs, then groups of four, then both halves.
 #[inline]
 pub(crate) fn eight_digits(chunk: [u8; 8]) -> Option<u64> {
     const ONES: u64 = u64::MAX / 255;
@@ -15,7 +15,7 @@ pub(crate) fn eight_digits(chunk: [u8; 8]) -> Option<u64> {
     Some((fours * 10_000 + (fours >> 32)) & 0xffff_ffff)
 }
 
-/// The mantissa of a number of 20 digits or more, and whether it is too large for that.
+/// Returns the mantissa of a number of 20 digits or more, and whether it overflowed.
 #[cold]
 pub(crate) fn many_digits(text: &[u8]) -> (u64, bool) {
     let mut digits = text.iter().filter(|byte| byte.is_ascii_digit());

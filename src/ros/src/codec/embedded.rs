@@ -1,8 +1,9 @@
-//! A message of ROS 2 that is the last field of another: taken out to stand alone, or put behind the other fields. What an
-//! action carries stands so behind a goal's id or a status.
+//! A ROS 2 message that is the last field of another message: extracted to stand alone, or appended behind the other
+//! fields. The payloads of actions are embedded in this way behind a goal id or a status.
 //!
-//! The order of bytes stays what it is. Where all values are as far from multiples of their sizes as before, they are
-//! copied in one piece; else they are padded anew, one by one, and every length is checked, for strangers have sent it.
+//! The byte order is kept. Where all values keep their offset modulo their alignment, they are copied as one block;
+//! otherwise they are padded anew, one by one, and every length is checked, because the data comes from untrusted
+//! peers.
 
 use std::collections::HashSet;
 
@@ -10,17 +11,22 @@ use bytes::Bytes;
 
 use crate::bus::RosVersion;
 use crate::codec::cdr::{HEADER, WIDE, split_header};
-use crate::codec::cursor::Cursor;
+use crate::codec::cursor::MessageCursor;
 use crate::schema::MessageType;
 use crate::schema::plan::{Count, Kind, Scalar};
 
-/// No number is larger.
+/// Size of the largest number.
 const LARGEST: usize = 8;
 
-/// Behind the bytes `before`, in a body of its own: the message of type `of` that begins at byte `at` of the body of
-/// `bytes` and is the last in it. None where no such message is there; that there is one is only known of values that had
-/// to be padded anew.
-pub(crate) fn embedded(of: &MessageType, bytes: &[u8], at: usize, before: &[u8]) -> Option<Bytes> {
+/// Returns a message that consists of the bytes `before` and the message of type `of` that begins at byte `at` of the
+/// body of `bytes` and ends it. `None` if there is no such message, which is fully checked only if the values have to
+/// be padded anew.
+pub(crate) fn extract_embedded(
+    of: &MessageType,
+    bytes: &[u8],
+    at: usize,
+    before: &[u8],
+) -> Option<Bytes> {
     let (body, big_endian) = split_header(bytes).ok()?;
     let mut out = Vec::with_capacity(bytes.len() + before.len() + LARGEST);
     out.extend_from_slice(&HEADER);
@@ -41,14 +47,14 @@ pub(crate) fn embedded(of: &MessageType, bytes: &[u8], at: usize, before: &[u8])
         out.extend_from_slice(values);
         return Some(out.into());
     }
-    let mut from = Cursor::new(RosVersion::Two, bytes)?;
+    let mut from = MessageCursor::new(RosVersion::Two, bytes)?;
     from.take(at, 1)?;
-    let mut moving = Moving { from, out };
+    let mut moving = ValueCopier { from, out };
     moving.message(of)?;
     Some(moving.out.into())
 }
 
-/// Of its first value.
+/// Returns the alignment of the first value.
 fn first_alignment(of: &MessageType) -> usize {
     let Some(first) = of.plan.members.list().first() else {
         return 1;
@@ -57,12 +63,12 @@ fn first_alignment(of: &MessageType) -> usize {
         Kind::Scalar(scalar) | Kind::Scalars(scalar, Count::Fixed(_)) => scalar.alignment(),
         Kind::Bytes(Count::Fixed(_)) => 1,
         Kind::Struct(inner) | Kind::Structs(inner, Count::Fixed(_)) => first_alignment(inner),
-        // The length of a text or a list.
+        // The length of a string or sequence.
         _ => Scalar::U32.alignment(),
     }
 }
 
-/// Of the value that has the largest. `seen`: types that need no second look.
+/// Returns the largest alignment of any value. `seen`: types that were examined already.
 fn largest_alignment<'a>(of: &'a MessageType, seen: &mut HashSet<&'a str>) -> usize {
     let mut largest = 1;
     for member in of.plan.members.list() {
@@ -78,9 +84,10 @@ fn largest_alignment<'a>(of: &'a MessageType, seen: &mut HashSet<&'a str>) -> us
                     }
                     _ => 1,
                 };
-                match seen.insert(inner.name()) {
-                    true => largest_alignment(inner, seen).max(length),
-                    false => length,
+                if seen.insert(inner.name()) {
+                    largest_alignment(inner, seen).max(length)
+                } else {
+                    length
                 }
             }
         };
@@ -92,13 +99,13 @@ fn largest_alignment<'a>(of: &'a MessageType, seen: &mut HashSet<&'a str>) -> us
     largest
 }
 
-/// Values on their way from one body to another.
-struct Moving<'a> {
-    from: Cursor<'a>,
+/// Copies values from one body to another.
+struct ValueCopier<'a> {
+    from: MessageCursor<'a>,
     out: Vec<u8>,
 }
 
-impl<'a> Moving<'a> {
+impl<'a> ValueCopier<'a> {
     fn message(&mut self, of: &MessageType) -> Option<()> {
         for member in of.plan.members.list() {
             self.value(&member.kind)?;
@@ -147,16 +154,17 @@ impl<'a> Moving<'a> {
         Some(bytes)
     }
 
-    /// At most as many as there are bytes: each element has some.
+    /// Reads a length; it cannot exceed the number of remaining bytes, because each element has at least one.
     fn length(&mut self, count: Count) -> Option<usize> {
         if let Count::Fixed(length) = count {
             return Some(length);
         }
         let word: [u8; 4] = self.copy(4, 4)?.try_into().ok()?;
-        let length = match self.from.is_big_endian() {
-            true => u32::from_be_bytes(word),
-            false => u32::from_le_bytes(word),
+        let length = if self.from.is_big_endian() {
+            u32::from_be_bytes(word)
+        } else {
+            u32::from_le_bytes(word)
         } as usize;
-        (length <= self.from.left()).then_some(length)
+        (length <= self.from.remaining()).then_some(length)
     }
 }

@@ -1,17 +1,19 @@
-//! What goes wrong, and where: the place is put together on the way out, so the way in pays nothing for it.
+//! Errors of conversions and their locations. The path is assembled while an error propagates, so successful
+//! conversions pay nothing for it.
 
 use std::fmt;
 
 use crate::schema::MessageType;
 
-/// Why a conversion failed, and at which field.
+/// An error in a conversion, with the field concerned.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CodecError {
-    /// The message type being converted; empty where none is involved.
+    /// The message type being converted; empty if none is involved.
     pub type_name: String,
-    /// The field, from the message's top: `header.stamp`, `poses[3].position.x`; empty for the message itself.
+    /// Path of the field from the top of the message: `header.stamp`, `poses[3].position.x`; empty for the message
+    /// itself.
     pub path: String,
-    /// What is wrong with it.
+    /// The problem.
     pub kind: CodecErrorKind,
 }
 
@@ -26,8 +28,8 @@ impl fmt::Display for CodecError {
 }
 
 impl CodecError {
-    /// An error of input that belongs to no message type.
-    pub(crate) fn of_input(kind: CodecErrorKind) -> CodecError {
+    /// Creates an error of input that belongs to no message type.
+    pub(crate) fn from_input(kind: CodecErrorKind) -> CodecError {
         CodecError {
             type_name: String::new(),
             path: String::new(),
@@ -38,118 +40,118 @@ impl CodecError {
 
 impl std::error::Error for CodecError {}
 
-/// What can be wrong with a field, or with the whole input.
+/// Problems of a field or of the whole input.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum CodecErrorKind {
     /// The serialized message ends inside a value.
     #[error("the serialized message ends here, {missing} bytes too early")]
     Truncated {
-        /// Bytes that are missing.
+        /// Number of missing bytes.
         missing: usize,
     },
-    /// The serialized message goes on after its last field.
+    /// The serialized message continues after its last field.
     #[error("{0} bytes follow the end of the message")]
     Trailing(
-        /// Bytes after the last field.
+        /// Number of bytes after the last field.
         usize,
     ),
-    /// A string's or an array's length cannot be true.
+    /// The length of a string or array is impossible.
     #[error("a length of {count} cannot be true with {left} bytes to follow")]
     LengthBeyondEnd {
-        /// The length that the input declares.
+        /// Declared length.
         count: u64,
-        /// Bytes after the length.
+        /// Number of bytes after the length.
         left: usize,
     },
     /// A string is not UTF-8.
     #[error("the text is not UTF-8")]
     InvalidUtf8,
-    /// A value of another kind than the field's.
+    /// A value is of another kind than the field.
     #[error("takes {expected}, got {found}")]
     Mismatch {
-        /// What the field takes.
+        /// Kind of value that the field takes.
         expected: &'static str,
-        /// The kind of value that was found.
+        /// Kind of value that was found.
         found: &'static str,
     },
-    /// A number that the field cannot hold.
+    /// A number is out of the field's range.
     #[error("{found} does not fit into {expected}")]
     OutOfRange {
-        /// The field's type.
+        /// Type of the field.
         expected: &'static str,
-        /// The number that does not fit.
+        /// The number.
         found: String,
     },
     /// The path names a field that the type does not have.
     #[error("there is no such field")]
     NoSuchField,
-    /// A fixed array with another number of elements.
+    /// A fixed array has the wrong number of elements.
     #[error("takes exactly {expected} elements, got {found}")]
     WrongLength {
-        /// The length that the definition fixes.
+        /// Length required by the definition.
         expected: usize,
-        /// As given; at least, where counting stopped there.
+        /// Actual length, or a lower bound if counting stopped there.
         found: usize,
     },
-    /// More elements, or characters, than the definition lets there be.
+    /// There are more elements or characters than the definition allows.
     #[error("takes at most {most} {of}, got {found}")]
     TooMany {
-        /// The bound of the definition.
+        /// Bound in the definition.
         most: usize,
-        /// What is counted.
+        /// Unit of the count.
         of: &'static str,
-        /// As given; at least, where counting stopped there.
+        /// Actual count, or a lower bound if counting stopped there.
         found: usize,
     },
-    /// A way of serializing that ROS 2's nodes do not use.
+    /// The representation is not one that ROS 2 nodes use.
     #[error(
         "serialized as representation {0:#06x}, of which only plain CDR is read (0x0000 and 0x0001)"
     )]
     Representation(
-        /// The first two bytes of the message (DDS-XTypes 1.3, table 60).
+        /// First two bytes of the message (DDS-XTypes 1.3, table 60).
         u16,
     ),
-    /// Bytes given as text that is not base64.
+    /// Text given for bytes is not base64.
     #[error("the text is not base64")]
     Base64,
     /// The input is not JSON.
     #[error("invalid JSON at byte {at}: {reason}")]
     Json {
-        /// From the beginning of the input.
+        /// Byte offset in the input.
         at: usize,
-        /// What was expected or found.
+        /// The token expected, or the problem found.
         reason: &'static str,
     },
     /// The input is not CBOR.
     #[error("invalid CBOR at byte {at}: {reason}")]
     Cbor {
-        /// From the beginning of the input.
+        /// Byte offset in the input.
         at: usize,
-        /// What was expected or found.
+        /// The item expected, or the problem found.
         reason: &'static str,
     },
-    /// The input nests too deeply.
+    /// The input is nested too deeply.
     #[error("nested deeper than {0} levels")]
     TooDeep(
-        /// Levels of nesting that are accepted.
+        /// Maximum nesting.
         usize,
     ),
-    /// The output would grow beyond what was allowed.
+    /// The output would exceed the limit.
     #[error("the converted message is larger than the limit of {0} bytes")]
     TooLarge(
-        /// Most bytes that may be written.
+        /// Limit in bytes.
         usize,
     ),
 }
 
-/// An error on its way out, gathering its place. Boxed: results on the hot path stay one word.
+/// An error that collects its path while it propagates. Boxed, so that results on the hot path stay one word.
 #[derive(Debug)]
-pub(crate) struct Fault(Box<Inner>);
+pub(crate) struct Fault(Box<FaultDetails>);
 
 #[derive(Debug)]
-struct Inner {
+struct FaultDetails {
     kind: CodecErrorKind,
-    /// Innermost first.
+    /// Path segments, innermost first.
     place: Vec<Segment>,
 }
 
@@ -162,7 +164,7 @@ enum Segment {
 impl From<CodecErrorKind> for Fault {
     #[cold]
     fn from(kind: CodecErrorKind) -> Fault {
-        Fault(Box::new(Inner {
+        Fault(Box::new(FaultDetails {
             kind,
             place: Vec::new(),
         }))
@@ -187,7 +189,7 @@ impl Fault {
     }
 
     #[cold]
-    pub(crate) fn of(self, message: &MessageType) -> CodecError {
+    pub(crate) fn into_codec_error(self, message: &MessageType) -> CodecError {
         let mut path = String::new();
         for segment in self.0.place.iter().rev() {
             match segment {
@@ -207,7 +209,7 @@ impl Fault {
     }
 }
 
-/// A value of the wrong kind.
+/// Creates the error for a value of the wrong kind.
 #[cold]
 pub(crate) fn mismatch(expected: &'static str, found: &'static str) -> Fault {
     CodecErrorKind::Mismatch { expected, found }.into()

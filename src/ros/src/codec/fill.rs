@@ -1,8 +1,10 @@
-//! Objects in, serialized messages out: fields in any order, missing ones by default, stamps by the clock.
+//! Objects in, serialized messages out: fields in any order, missing ones filled with defaults, stamps set from the
+//! clock.
 //!
-//! ROS fields are positional and of varying size, JSON's and CBOR's come in any order. Nearly all clients keep the
-//! definition's order, so values go straight to their place, with a default wherever a field was passed over. When
-//! one comes after all (or twice), it is appended, and the pieces are put in order at the object's end.
+//! ROS fields are positional and vary in size; the fields of JSON and CBOR objects come in any order. Nearly all
+//! clients keep the order of the definition, so values are written directly to their place, with a default for every
+//! field that is skipped. If a skipped field appears later (or a field appears twice), its value is appended and the
+//! pieces are put in order at the end of the object.
 
 mod layout;
 
@@ -11,21 +13,22 @@ use std::sync::LazyLock;
 use crate::bus::RosVersion;
 use crate::codec::cdr;
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::codec::fill::layout::{Aligned, Layout, Packed};
+use crate::codec::fill::layout::{Aligned, OutputLayout, Packed};
 use crate::codec::number::Wire;
 use crate::codec::{FillOptions, Time};
 use crate::schema::MessageType;
 use crate::schema::plan::{Count, Kind, Member, Members, Scalar, Text};
 
-/// Where values come from.
-pub(crate) trait Input {
+/// A source of values.
+pub(crate) trait ValueInput {
     /// Progress within an object.
     type Object;
     /// Progress within an array.
     type Array;
 
     fn begin_object(&mut self) -> Result<Self::Object, Fault>;
-    /// Reads the next key and gives the field of that name, None at the object's end. `expected` is the likely one.
+    /// Reads the next key and returns the index of its field, or `None` at the end of the object. `expected` is the
+    /// likely index.
     fn next_member(
         &mut self,
         object: &mut Self::Object,
@@ -33,22 +36,22 @@ pub(crate) trait Input {
         expected: usize,
     ) -> Result<Option<usize>, Fault>;
     fn begin_array(&mut self, expected: &'static str) -> Result<Self::Array, Fault>;
-    /// Whether another element follows.
+    /// Returns true if another element follows.
     fn next_element(&mut self, array: &mut Self::Array) -> Result<bool, Fault>;
     fn boolean(&mut self) -> Result<bool, Fault>;
     fn number<T: Wire>(&mut self) -> Result<T, Fault>;
-    /// Appends a string's text.
+    /// Appends the text of a string.
     fn text(&mut self, out: &mut Vec<u8>) -> Result<(), Fault>;
-    /// Appends bytes given as one value; false, and nothing read, when they come as an array of numbers.
+    /// Appends bytes given as a single value; returns false without reading if they are given as an array of numbers.
     fn bytes(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault>;
-    /// Appends numbers given as one value; false, and nothing read, when they come one by one.
+    /// Appends numbers given as a single value; returns false without reading if they are given one by one.
     fn typed_array<T: Wire>(&mut self, out: &mut Vec<u8>) -> Result<bool, Fault>;
-    /// Reads the string "now", if that is what follows.
-    fn now(&mut self) -> bool;
+    /// Reads the string "now" if it follows.
+    fn take_now(&mut self) -> bool;
 }
 
 /// Appends the message that `input` describes.
-pub(crate) fn fill<I: Input>(
+pub(crate) fn fill<I: ValueInput>(
     input: &mut I,
     message: &MessageType,
     out: &mut Vec<u8>,
@@ -65,7 +68,7 @@ pub(crate) fn fill<I: Input>(
     }
 }
 
-fn fill_body<I: Input, L: Layout>(
+fn fill_body<I: ValueInput, L: OutputLayout>(
     input: &mut I,
     message: &MessageType,
     out: &mut Vec<u8>,
@@ -82,7 +85,7 @@ fn fill_body<I: Input, L: Layout>(
         scratch: Vec::new(),
     };
     filler.message(message)?;
-    filler.room(0)
+    filler.check_room(0)
 }
 
 struct Filler<'a, I, L> {
@@ -90,14 +93,14 @@ struct Filler<'a, I, L> {
     out: &'a mut Vec<u8>,
     layout: L,
     options: &'a FillOptions,
-    /// Where the output must have ended.
+    /// Maximum length of the output buffer.
     end: usize,
-    /// Begin and end in `out` of the fields of the open objects, innermost object last.
+    /// Begin and end, in `out`, of the fields of the open objects; innermost object last.
     places: Vec<(usize, usize)>,
     scratch: Vec<u8>,
 }
 
-impl<I: Input, L: Layout> Filler<'_, I, L> {
+impl<I: ValueInput, L: OutputLayout> Filler<'_, I, L> {
     fn message(&mut self, message: &MessageType) -> Result<(), Fault> {
         let plan = &message.plan;
         let members = plan.members.list();
@@ -206,13 +209,13 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
             Scalar::I64 => self.numbers::<i64>(count, "a list of int64"),
             Scalar::U64 => self.numbers::<u64>(count, "a list of uint64"),
             Scalar::F32 => self.numbers::<f32>(count, "a list of float32"),
-            // Of the others, those that are not numbers are written one by one.
+            // The others that are not numbers are written one by one.
             _ => self.numbers::<f64>(count, "a list of float64"),
         }?;
         self.end_count(count, begin, found)
     }
 
-    /// Appends numbers and gives how many there were.
+    /// Appends numbers and returns their count.
     fn numbers<T: Wire>(&mut self, count: Count, expected: &'static str) -> Result<usize, Fault> {
         let unaligned = self.out.len();
         self.layout.align(self.out, T::SCALAR.alignment());
@@ -224,7 +227,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
             }
             return Ok(found);
         }
-        let most = count.most();
+        let most = count.max_count();
         let mut array = self.input.begin_array(expected)?;
         let mut found = 0;
         while self.input.next_element(&mut array)? {
@@ -237,7 +240,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
                 .put(self.out);
             found += 1;
         }
-        // No elements, no padding.
+        // Without elements there is no padding.
         if found == 0 {
             self.out.truncate(unaligned);
         }
@@ -250,7 +253,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
         mut element: impl FnMut(&mut Self) -> Result<(), Fault>,
     ) -> Result<(), Fault> {
         let begin = self.begin_count(count);
-        let most = count.most();
+        let most = count.max_count();
         let mut array = self.input.begin_array("a list")?;
         let mut found = 0;
         while self.input.next_element(&mut array)? {
@@ -258,7 +261,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
                 return Err(too_many(count, found + 1));
             }
             element(self)
-                .and_then(|()| self.room(0))
+                .and_then(|()| self.check_room(0))
                 .map_err(|fault| fault.at_index(found))?;
             found += 1;
         }
@@ -287,12 +290,12 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
         self.end_count(Count::Variable, begin, self.out.len() - begin)
     }
 
-    /// `default` counts where the object leaves a part out.
+    /// Writes a time; `default` is used for missing parts.
     fn time(&mut self, scalar: Scalar, default: Time) -> Result<(), Fault> {
         self.layout.align(self.out, scalar.alignment());
         let begin = self.out.len();
         let is_time = matches!(scalar, Scalar::Time | Scalar::Time2);
-        if is_time && self.input.now() {
+        if is_time && self.input.take_now() {
             self.put_time(self.options.now.unwrap_or_default());
             return Ok(());
         }
@@ -321,21 +324,22 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
         self.out.extend_from_slice(&time.nsecs.to_le_bytes());
     }
 
-    /// A field that the object passes over; noted as if it had been there.
+    /// Writes the default of a skipped field and records its place.
     fn default_field(&mut self, in_header: bool, member: &Member) -> Result<(), Fault> {
         let begin = self.out.len();
-        self.room(member.min_size)
+        self.check_room(member.min_size)
             .map_err(|fault| fault.in_field(&member.name))?;
         let stamped =
             in_header || matches!(&member.kind, Kind::Struct(message) if message.plan.header);
         let now = self.options.now.filter(|_| stamped);
         self.layout.put_default(self.out, member, now);
-        self.room(0).map_err(|fault| fault.in_field(&member.name))?;
+        self.check_room(0)
+            .map_err(|fault| fault.in_field(&member.name))?;
         self.places.push((begin, self.out.len()));
         Ok(())
     }
 
-    /// Rewrites the object that began at `start` with its fields where they belong.
+    /// Rewrites the object that began at `start` with its fields in the order of the definition.
     #[cold]
     fn put_in_order(&mut self, members: &[Member], base: usize, start: usize) {
         let phase = self.layout.phase(start);
@@ -351,7 +355,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
         }
     }
 
-    /// Leaves room for a length; gives where the elements begin.
+    /// Reserves space for a length; returns the offset of the elements.
     fn begin_count(&mut self, count: Count) -> usize {
         if !matches!(count, Count::Fixed(_)) {
             self.layout.align(self.out, 4);
@@ -362,7 +366,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
 
     /// Writes the length before `begin`, or checks it.
     fn end_count(&mut self, count: Count, begin: usize, found: usize) -> Result<(), Fault> {
-        self.room(0)?;
+        self.check_room(0)?;
         match count {
             Count::Fixed(expected) if found != expected => {
                 Err(CodecErrorKind::WrongLength { expected, found }.into())
@@ -379,7 +383,7 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
     }
 
     #[inline]
-    fn room(&self, more: usize) -> Result<(), Fault> {
+    fn check_room(&self, more: usize) -> Result<(), Fault> {
         if self.out.len().saturating_add(more) <= self.end {
             return Ok(());
         }
@@ -387,13 +391,13 @@ impl<I: Input, L: Layout> Filler<'_, I, L> {
     }
 }
 
-/// More elements came than there may be.
+/// Creates the error for too many elements.
 #[cold]
 fn too_many(count: Count, found: usize) -> Fault {
     match count {
         Count::Fixed(expected) => CodecErrorKind::WrongLength { expected, found },
         _ => CodecErrorKind::TooMany {
-            most: count.most(),
+            most: count.max_count(),
             of: "elements",
             found,
         },
@@ -417,7 +421,7 @@ fn check_text(text: Text, written: &str) -> Result<(), Fault> {
     }
 }
 
-/// The parts of a time or duration, by the names of ROS 1 and by those of ROS 2.
+/// Members of a time or duration, with the names of ROS 1 and those of ROS 2.
 static TIME_MEMBERS: LazyLock<Members> = LazyLock::new(|| {
     let part = |name| Member::new(name, Kind::Scalar(Scalar::U32), 4);
     Members::new(["secs", "nsecs", "sec", "nanosec"].map(part).into())

@@ -1,6 +1,6 @@
-//! Decimal → binary floating point, correctly rounded. Numbers of up to 15 or so digits, which is nearly all, take
-//! one exact multiplication or division (Clinger, "How to read floating point numbers accurately", 1990); the rest
-//! goes to the standard library.
+//! Conversion of decimals to binary floating point, correctly rounded. Numbers of up to 15 or so digits, which is
+//! nearly all, take one exact multiplication or division (Clinger, "How to read floating point numbers accurately",
+//! 1990); the rest is left to the standard library.
 
 use std::str::FromStr;
 
@@ -11,7 +11,7 @@ const POWERS: [f64; 23] = [
     1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
 ];
 
-/// The nearest double; infinite when out of range.
+/// Returns the nearest double; infinite when out of range.
 #[inline]
 pub(crate) fn double(decimal: &Decimal<'_>) -> f64 {
     match exact(decimal) {
@@ -20,12 +20,12 @@ pub(crate) fn double(decimal: &Decimal<'_>) -> f64 {
     }
 }
 
-/// The nearest single; infinite when out of range.
+/// Returns the nearest single; infinite when out of range.
 #[inline]
 pub(crate) fn single(decimal: &Decimal<'_>) -> f32 {
     if let Some(value) = exact(decimal) {
-        // Rounding twice goes wrong only where the first rounding landed half-way between two singles (and among
-        // subnormals, whose half-way points are elsewhere).
+        // Rounding twice is wrong only if the first rounding landed half-way between two singles (and for subnormals,
+        // whose half-way points are elsewhere).
         const DROPPED: u64 = (1 << 29) - 1;
         let half_way = value.to_bits() & DROPPED == 1 << 28;
         if value == 0.0 || (!half_way && value.abs() >= f64::from(f32::MIN_POSITIVE)) {
@@ -35,13 +35,14 @@ pub(crate) fn single(decimal: &Decimal<'_>) -> f32 {
     parse(decimal).unwrap_or(f32::INFINITY)
 }
 
-/// The standard library's way, for which JSON's grammar is a part of its own.
+/// Parses with the standard library, whose grammar includes JSON's.
 #[inline(never)]
 fn parse<T: FromStr>(decimal: &Decimal<'_>) -> Option<T> {
     std::str::from_utf8(decimal.text).ok()?.parse().ok()
 }
 
-/// Where mantissa and power of ten are both exact doubles, their product or quotient is rounded once: correctly.
+/// Returns the value if mantissa and power of ten are both exact doubles: then their product or quotient is rounded
+/// once, that is correctly.
 #[inline]
 fn exact(decimal: &Decimal<'_>) -> Option<f64> {
     if decimal.truncated {

@@ -1,11 +1,12 @@
-//! JSON → ROS bytes. A parser without a tree: it is asked for what the message wants next, and reads just that.
+//! JSON → ROS bytes. A parser that builds no tree: the caller asks for what the message needs next, and just that is
+//! read.
 
 use memchr::memchr2;
 
 use crate::codec::FillOptions;
 use crate::codec::digits::{eight_digits, many_digits};
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
-use crate::codec::fill::{Input, fill};
+use crate::codec::fill::{ValueInput, fill};
 use crate::codec::json_text::{is_space, plain_prefix, unescape};
 use crate::codec::number::{Decimal, Wire};
 use crate::schema::MessageType;
@@ -37,25 +38,25 @@ struct Json<'a> {
     scratch: Vec<u8>,
 }
 
-/// Whether a comma is due before the next element.
-pub(crate) struct First(bool);
+/// True until the first element has been read, after which a comma must precede each element.
+pub(crate) struct ListProgress(bool);
 
-impl Input for Json<'_> {
-    type Object = First;
-    type Array = First;
+impl ValueInput for Json<'_> {
+    type Object = ListProgress;
+    type Array = ListProgress;
 
-    fn begin_object(&mut self) -> Result<First, Fault> {
-        self.open(b'{', "an object")
+    fn begin_object(&mut self) -> Result<ListProgress, Fault> {
+        self.open_bracket(b'{', "an object")
     }
 
     #[inline]
     fn next_member(
         &mut self,
-        object: &mut First,
+        object: &mut ListProgress,
         members: &Members,
         expected: usize,
     ) -> Result<Option<usize>, Fault> {
-        if !self.next(object, b'}')? {
+        if !self.has_next(object, b'}')? {
             return Ok(None);
         }
         if let Some(likely) = members.list().get(expected) {
@@ -64,24 +65,24 @@ impl Input for Json<'_> {
                 return Ok(Some(expected));
             }
         }
-        self.key(members).map(Some)
+        self.read_key(members).map(Some)
     }
 
-    fn begin_array(&mut self, expected: &'static str) -> Result<First, Fault> {
-        self.open(b'[', expected)
+    fn begin_array(&mut self, expected: &'static str) -> Result<ListProgress, Fault> {
+        self.open_bracket(b'[', expected)
     }
 
     #[inline]
-    fn next_element(&mut self, array: &mut First) -> Result<bool, Fault> {
-        self.next(array, b']')
+    fn next_element(&mut self, array: &mut ListProgress) -> Result<bool, Fault> {
+        self.has_next(array, b']')
     }
 
     fn boolean(&mut self) -> Result<bool, Fault> {
         self.skip_space();
-        if self.word("true") {
+        if self.skip_word("true") {
             return Ok(true);
         }
-        if self.word("false") {
+        if self.skip_word("false") {
             return Ok(false);
         }
         Err(self.mismatch("bool"))
@@ -142,9 +143,9 @@ impl Input for Json<'_> {
         Ok(false)
     }
 
-    fn now(&mut self) -> bool {
+    fn take_now(&mut self) -> bool {
         self.skip_space();
-        self.word("\"now\"")
+        self.skip_word("\"now\"")
     }
 }
 
@@ -167,7 +168,7 @@ impl<'a> Json<'a> {
     }
 
     /// Skips `word` if it follows.
-    fn word(&mut self, word: &str) -> bool {
+    fn skip_word(&mut self, word: &str) -> bool {
         let follows = self.rest().starts_with(word.as_bytes());
         if follows {
             self.at += word.len();
@@ -184,7 +185,7 @@ impl<'a> Json<'a> {
         .into()
     }
 
-    /// What follows is not what the field takes, or not JSON at all.
+    /// Returns the error for a value that the field does not take, or for invalid JSON.
     #[cold]
     fn mismatch(&self, expected: &'static str) -> Fault {
         match self.peek() {
@@ -200,18 +201,18 @@ impl<'a> Json<'a> {
         }
     }
 
-    fn open(&mut self, bracket: u8, expected: &'static str) -> Result<First, Fault> {
+    fn open_bracket(&mut self, bracket: u8, expected: &'static str) -> Result<ListProgress, Fault> {
         self.skip_space();
         if self.peek() != Some(bracket) {
             return Err(self.mismatch(expected));
         }
         self.at += 1;
-        Ok(First(true))
+        Ok(ListProgress(true))
     }
 
-    /// Whether another element follows, with what stands before it skipped; else the closing bracket is.
+    /// Returns true if another element follows, and skips the comma before it; otherwise skips the closing bracket.
     #[inline]
-    fn next(&mut self, first: &mut First, bracket: u8) -> Result<bool, Fault> {
+    fn has_next(&mut self, first: &mut ListProgress, bracket: u8) -> Result<bool, Fault> {
         self.skip_space();
         if self.peek() == Some(bracket) {
             self.at += 1;
@@ -227,8 +228,8 @@ impl<'a> Json<'a> {
         Ok(true)
     }
 
-    /// A key that is not the expected one written in the usual way, and its colon.
-    fn key(&mut self, members: &Members) -> Result<usize, Fault> {
+    /// Reads a key that is not the expected one in its usual spelling, and the colon.
+    fn read_key(&mut self, members: &Members) -> Result<usize, Fault> {
         if self.peek() != Some(b'"') {
             return Err(self.invalid("expected a key"));
         }
@@ -248,7 +249,7 @@ impl<'a> Json<'a> {
         Ok(index)
     }
 
-    /// From somewhere within a string to its end: text that is not plain ASCII, and escapes.
+    /// Reads the rest of a string: text that is not plain ASCII, and escapes.
     fn rest_of_text(&mut self, out: &mut Vec<u8>) -> Result<(), Fault> {
         loop {
             let rest = self.rest();
@@ -271,7 +272,7 @@ impl<'a> Json<'a> {
         }
     }
 
-    /// A number in JSON's grammar; what follows it is for the caller.
+    /// Reads a number in JSON's grammar; the caller checks what follows.
     // Returned through memory, its flags would be read back before they are written: half the time of a number.
     #[inline(always)]
     fn decimal(&mut self) -> Result<Decimal<'a>, Fault> {
@@ -292,7 +293,7 @@ impl<'a> Json<'a> {
         }
         let mut exponent = -(fraction as i64);
         let mut truncated = false;
-        // So many digits a u64 holds for certain.
+        // A u64 holds this many digits for certain.
         if integer + fraction > 19 {
             (mantissa, truncated) = many_digits(&self.input[start..self.at]);
         }
@@ -311,7 +312,7 @@ impl<'a> Json<'a> {
         })
     }
 
-    /// Reads digits, as many as there are, at least one; eight at a time where there are so many.
+    /// Reads one or more digits, eight at a time where possible.
     #[inline(always)]
     fn digits(&mut self, mantissa: &mut u64) -> Result<usize, Fault> {
         let rest = self.rest();
@@ -356,7 +357,7 @@ impl<'a> Json<'a> {
         Ok(if negative { -exponent } else { exponent })
     }
 
-    /// What stands for NaN and infinities: `null`, Python's bare words, and the same as strings.
+    /// Reads a representation of NaN or an infinity: `null`, Python's bare words, or the same words as strings.
     #[cold]
     fn non_finite<T: Wire>(&mut self) -> Result<T, Fault> {
         const WORDS: [(&str, f64); 7] = [
@@ -370,7 +371,7 @@ impl<'a> Json<'a> {
         ];
         for (word, value) in WORDS {
             if let Some(value) = T::from_non_finite(value) {
-                if self.word(word) {
+                if self.skip_word(word) {
                     return Ok(value);
                 }
             }
@@ -379,9 +380,9 @@ impl<'a> Json<'a> {
     }
 }
 
-/// Appends what the base64 text stands for. Padding may be missing and white space may be between.
+/// Appends the bytes encoded by base64 text. Padding may be missing and white space may be interspersed.
 fn decode_base64(text: &[u8], out: &mut Vec<u8>) -> Result<(), Fault> {
-    // The decoder reserves exactly; asking for more first keeps growth geometric.
+    // The decoder reserves exactly; reserving more first keeps growth geometric.
     out.reserve(text.len() / 4 * 3 + 64);
     if base64_simd::STANDARD.decode_append(text, out).is_ok() {
         return Ok(());

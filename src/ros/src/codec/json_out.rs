@@ -2,10 +2,10 @@
 
 use crate::codec::fault::{CodecErrorKind, Fault};
 use crate::codec::json_text::{plain_prefix, push_escaped};
-use crate::codec::walk::{Format, walk};
+use crate::codec::walk::{OutputFormat, walk};
 use crate::codec::{InvalidUtf8, JsonOptions, NonFinite};
 use crate::schema::MessageType;
-use crate::schema::plan::{Literal, Plan, Scalar};
+use crate::schema::plan::{CodecPlan, Literal, Scalar};
 
 /// Appends the message as a JSON object.
 pub(crate) fn write(
@@ -21,13 +21,13 @@ pub(crate) fn write(
 struct Json<'a> {
     out: &'a mut Vec<u8>,
     options: &'a JsonOptions,
-    /// Where the output must have ended.
+    /// Maximum length of the output buffer.
     end: usize,
 }
 
-impl Format for Json<'_> {
+impl OutputFormat for Json<'_> {
     #[inline]
-    fn literal(&mut self, plan: &Plan, literal: &Literal) {
+    fn literal(&mut self, plan: &CodecPlan, literal: &Literal) {
         plan.push_json(literal, self.out);
     }
 
@@ -69,7 +69,7 @@ impl Format for Json<'_> {
     }
 
     fn bytes(&mut self, bytes: &[u8]) {
-        // The encoder reserves exactly; asking for more first keeps growth geometric.
+        // The encoder reserves exactly; reserving more first keeps growth geometric.
         self.out.reserve(bytes.len().div_ceil(3) * 4 + 64);
         self.out.push(b'"');
         base64_simd::STANDARD.encode_append(bytes, self.out);
@@ -77,7 +77,7 @@ impl Format for Json<'_> {
     }
 
     fn scalars(&mut self, scalar: Scalar, bytes: &[u8]) {
-        // The match is done once for the array, not per element.
+        // The match is done once per array, not per element.
         match scalar {
             Scalar::Bool => self.list(bytes, |json, [byte]| json.boolean(byte)),
             Scalar::I8 => self.list(bytes, |json, bytes| json.integer(i8::from_le_bytes(bytes))),
@@ -111,7 +111,7 @@ impl Format for Json<'_> {
     }
 
     #[inline]
-    fn room(&self, more: usize) -> Result<(), Fault> {
+    fn check_room(&self, more: usize) -> Result<(), Fault> {
         if self.out.len().saturating_add(more) <= self.end {
             return Ok(());
         }
@@ -179,7 +179,7 @@ impl Json<'_> {
         });
     }
 
-    /// Each ROS has its own names of the parts, and lets others be negative.
+    /// Writes a time. The ROS versions differ in the names of the parts and in which parts may be negative.
     #[inline]
     fn time(&mut self, scalar: Scalar, bytes: &[u8]) {
         const OF_ONE: [&[u8]; 2] = [b"{\"secs\":", b",\"nsecs\":"];
@@ -204,7 +204,7 @@ impl Json<'_> {
     }
 }
 
-/// The first N bytes; callers pass exactly as many.
+/// Converts to an array; `bytes` must have length N.
 #[inline]
 fn array<const N: usize>(bytes: &[u8]) -> [u8; N] {
     let mut array = [0; N];

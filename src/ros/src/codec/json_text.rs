@@ -1,4 +1,4 @@
-//! JSON as text: what needs escaping, what an escape means, where a value ends.
+//! JSON text: what needs escaping, what an escape means, where a value ends.
 
 use crate::codec::cbor_item::MAX_NESTING;
 use crate::codec::fault::{CodecError, CodecErrorKind};
@@ -6,13 +6,13 @@ use crate::codec::fault::{CodecError, CodecErrorKind};
 const ONES: u64 = u64::MAX / 255;
 const HIGHS: u64 = ONES * 0x80;
 
-/// How many bytes at the beginning are printable ASCII other than `"` and `\`, eight at a time.
+/// Returns the length of the prefix of printable ASCII other than `"` and `\`, scanning eight bytes at a time.
 #[inline]
 pub(crate) fn plain_prefix(bytes: &[u8]) -> usize {
     scan::<true>(bytes)
 }
 
-/// As [`plain_prefix`], for text known to be UTF-8: bytes from 0x80 stand for themselves.
+/// Like [`plain_prefix`], for text known to be UTF-8: bytes from 0x80 stand for themselves.
 #[inline]
 fn unescaped_prefix(bytes: &[u8]) -> usize {
     scan::<false>(bytes)
@@ -23,8 +23,8 @@ fn scan<const ASCII: bool>(bytes: &[u8]) -> usize {
     let mut at = 0;
     while let Some(chunk) = bytes[at..].first_chunk::<8>() {
         let word = u64::from_le_bytes(*chunk);
-        // Each term has the high bit of a byte set where the byte is found; above the first find there may be
-        // false ones, which do not matter.
+        // Each term has the high bit set in every byte that matches; above the first match there may be false ones,
+        // which do not matter.
         let control = word.wrapping_sub(ONES * 0x20);
         let quote = (word ^ (ONES * u64::from(b'"'))).wrapping_sub(ONES);
         let backslash = (word ^ (ONES * u64::from(b'\\'))).wrapping_sub(ONES);
@@ -45,7 +45,7 @@ fn scan<const ASCII: bool>(bytes: &[u8]) -> usize {
         .unwrap_or(bytes.len() - at)
 }
 
-/// Appends text with JSON's escapes, without quotes around it.
+/// Appends text with JSON's escapes, without enclosing quotes.
 pub(crate) fn push_escaped(out: &mut Vec<u8>, text: &str) {
     const HEX: &[u8; 16] = b"0123456789abcdef";
     let mut rest = text.as_bytes();
@@ -70,8 +70,8 @@ pub(crate) fn push_escaped(out: &mut Vec<u8>, text: &str) {
     }
 }
 
-/// Appends what the escape at the beginning of `rest` (after its backslash) means; gives the number of bytes it took,
-/// or what is wrong. A surrogate without its other half becomes U+FFFD.
+/// Appends the character that the escape at the beginning of `rest` (after its backslash) stands for; returns the
+/// number of bytes used, or the error. A lone surrogate becomes U+FFFD.
 pub(crate) fn unescape(rest: &[u8], out: &mut Vec<u8>) -> Result<usize, &'static str> {
     let byte = match rest.first() {
         Some(byte @ (b'"' | b'\\' | b'/')) => *byte,
@@ -109,11 +109,11 @@ fn hex4(digits: Option<&[u8]>) -> Option<u16> {
     })
 }
 
-/// Length of the JSON value at the beginning of `input`, white space before it included, without building it: what
-/// is inside strings is skipped at the speed of memory. Brackets must balance and may nest 128 deep; what else stands
-/// between them is left for the parser of the value.
+/// Returns the length of the JSON value at the beginning of `input`, including white space before it, without building
+/// it: string contents are skipped at memory speed. Brackets must balance and may nest 128 deep; everything else
+/// between them is left to the parser of the value.
 pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
-    let fail = |at, reason| CodecError::of_input(CodecErrorKind::Json { at, reason });
+    let fail = |at, reason| CodecError::from_input(CodecErrorKind::Json { at, reason });
     let mut at = input
         .iter()
         .position(|byte| !is_space(*byte))
@@ -129,7 +129,7 @@ pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
                 depth += 1;
                 at += 1;
                 if depth > MAX_NESTING {
-                    return Err(CodecError::of_input(CodecErrorKind::TooDeep(MAX_NESTING)));
+                    return Err(CodecError::from_input(CodecErrorKind::TooDeep(MAX_NESTING)));
                 }
             }
             Some(b'}' | b']') if depth > 0 => {
@@ -155,13 +155,13 @@ pub fn json_value_len(input: &[u8]) -> Result<usize, CodecError> {
     }
 }
 
-/// How many bytes at the beginning are neither quote nor bracket nor brace.
+/// Returns the length of the prefix without quotes, brackets and braces.
 #[inline]
 fn unstructured_prefix(bytes: &[u8]) -> usize {
     let mut at = 0;
     while let Some(chunk) = bytes[at..].first_chunk::<8>() {
         let word = u64::from_le_bytes(*chunk);
-        // A bracket and its brace differ in one bit.
+        // A bracket and the corresponding brace differ in one bit.
         let folded = word | (ONES * 0x20);
         let open = (folded ^ (ONES * u64::from(b'{'))).wrapping_sub(ONES);
         let close = (folded ^ (ONES * u64::from(b'}'))).wrapping_sub(ONES);
@@ -179,7 +179,7 @@ fn unstructured_prefix(bytes: &[u8]) -> usize {
         .unwrap_or(bytes.len() - at)
 }
 
-/// Where the string that begins at `start` (a quote) ends: after its closing quote.
+/// Returns the end of the string that begins at `start` (a quote): the offset after its closing quote.
 #[inline]
 fn string_end(input: &[u8], start: usize) -> Option<usize> {
     let mut at = start + 1;
@@ -202,7 +202,7 @@ fn string_end(input: &[u8], start: usize) -> Option<usize> {
     }
 }
 
-/// JSON's white space.
+/// Returns true for JSON white space.
 #[inline]
 pub(crate) fn is_space(byte: u8) -> bool {
     matches!(byte, b' ' | b'\n' | b'\r' | b'\t')

@@ -1,34 +1,34 @@
-//! Numbers as inputs have them → numbers as ROS has them, or the reason why not.
+//! Conversion of input numbers to ROS numbers, with errors.
 
 use crate::codec::fault::{CodecErrorKind, Fault, mismatch};
 use crate::codec::float::{double, single};
 use crate::schema::plan::Scalar;
 
-/// A number of CBOR.
+/// A number in CBOR.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Number {
     Unsigned(u64),
-    /// `-1 - n`.
+    /// Represents `-1 - n`.
     Negative(u64),
     Float(f64),
 }
 
-/// A number of JSON, read but not yet converted: (-1)^negative * mantissa * 10^exponent.
+/// A number in JSON, parsed but not yet converted: (-1)^negative * mantissa * 10^exponent.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Decimal<'a> {
     pub(crate) negative: bool,
     pub(crate) mantissa: u64,
     pub(crate) exponent: i64,
-    /// There are more digits than `mantissa` holds.
+    /// True if there are more digits than `mantissa` holds.
     pub(crate) truncated: bool,
-    /// Neither fraction nor exponent.
+    /// True if there is neither fraction nor exponent.
     pub(crate) integral: bool,
-    /// All of it, in JSON's grammar.
+    /// The complete number, in JSON's grammar.
     pub(crate) text: &'a [u8],
 }
 
 impl Decimal<'_> {
-    /// As it was written.
+    /// Returns the number as written in the input.
     #[cold]
     fn as_written(self) -> String {
         String::from_utf8_lossy(self.text).into_owned()
@@ -41,9 +41,9 @@ pub(crate) trait Wire: Copy + 'static {
     const NAME: &'static str;
     fn from_decimal(decimal: &Decimal<'_>) -> Result<Self, Fault>;
     fn from_number(number: Number) -> Result<Self, Fault>;
-    /// NaN or an infinity; None for types that have none.
+    /// Converts NaN or an infinity; `None` for types that have none.
     fn from_non_finite(value: f64) -> Option<Self>;
-    /// Appends it, little endian.
+    /// Appends the number, little endian.
     fn put(self, out: &mut Vec<u8>);
 }
 
@@ -58,10 +58,11 @@ macro_rules! integers {
                 if !decimal.integral || decimal.truncated {
                     return from_written::<$type>(decimal);
                 }
-                let value = match decimal.negative {
-                    false => <$type>::try_from(decimal.mantissa).ok(),
-                    true => 0i64.checked_sub_unsigned(decimal.mantissa).and_then(|value| value.try_into().ok()),
-                };
+                let value = if decimal.negative {
+0i64.checked_sub_unsigned(decimal.mantissa).and_then(|value| value.try_into().ok())
+} else {
+<$type>::try_from(decimal.mantissa).ok()
+};
                 value.ok_or_else(|| out_of_range::<$type>(decimal.as_written()))
             }
 
@@ -76,7 +77,7 @@ macro_rules! integers {
                         if value.is_finite() && value.fract() != 0.0 {
                             return Err(mismatch($name, "a number with a fraction"));
                         }
-                        // The upper bound rounds to the power of two that it is one below of.
+                        // The upper bound rounds up to a power of two, one above the maximum.
                         let fits = value >= <$type>::MIN as f64 && value < <$type>::MAX as f64 + 1.0;
                         fits.then_some(value as $type)
                     }
@@ -154,7 +155,7 @@ floats! {
     f64, F64, "float64", double;
 }
 
-/// An integer written in another way: `1.0`, `1e3`, or with very many digits.
+/// Converts an integer in another notation: `1.0`, `1e3`, or with very many digits.
 #[cold]
 fn from_written<T: Wire>(decimal: &Decimal<'_>) -> Result<T, Fault> {
     match T::from_number(Number::Float(double(decimal))) {

@@ -1,38 +1,40 @@
-//! Where values stand in serialized bytes. Every length is checked against what is left before anything is done with it.
+//! Readers of serialized values. Every length is checked against the remaining bytes before it is used.
 
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::schema::plan::{Count, Plan, Scalar, Text};
+use crate::schema::plan::{CodecPlan, Count, Scalar, Text};
 
-/// Elements without any bytes cost nothing on the wire, so their number is bounded here.
+/// Maximum length of an array whose elements have no bytes: such elements cost nothing on the wire.
 const MAX_EMPTY_ELEMENTS: usize = 1 << 16;
 
-/// Takes values out of a message, front to back. What is given is little endian, and text is UTF-8, whatever the
-/// message has.
-pub(crate) trait Reader {
-    /// Types without fields have a byte all the same.
+/// Reads the values of a message in order. Returned numbers are little endian and text is UTF-8, whatever the encoding
+/// of the message.
+pub(crate) trait SerializedReader {
+    /// True if a type without fields is serialized as one byte.
     const PLACEHOLDERS: bool;
-    /// One scalar, in as many bytes as it has.
+    /// Reads one scalar.
     fn scalar(&mut self, scalar: Scalar) -> Result<&[u8], Fault>;
-    /// So many scalars, one behind the other.
+    /// Reads `length` scalars, without gaps.
     fn scalars(&mut self, scalar: Scalar, length: usize) -> Result<&[u8], Fault>;
-    /// So many bytes.
+    /// Reads `size` bytes.
     fn take(&mut self, size: usize) -> Result<&[u8], Fault>;
-    /// A string with its length, given without.
+    /// Reads a string; the result excludes the length.
     fn text(&mut self, text: Text) -> Result<&[u8], Fault>;
-    /// The number of elements of an array, each of at least `min_size` bytes; that many bytes are there.
+    /// Reads the number of elements of an array, each of at least `min_size` bytes; guarantees that at least that many
+    /// bytes follow.
     fn length(&mut self, count: Count, min_size: usize) -> Result<usize, Fault>;
-    /// Goes past so many messages of a fixed size, where that takes no looking at them; else false, and nothing is done.
-    fn skip(&mut self, plan: &Plan, length: usize) -> Result<bool, Fault>;
-    /// Bytes behind what was taken that should not be there.
+    /// Skips `length` messages of a fixed size if that is possible without examining them; otherwise returns false and
+    /// does nothing.
+    fn skip(&mut self, plan: &CodecPlan, length: usize) -> Result<bool, Fault>;
+    /// Returns the number of surplus bytes after the message.
     fn trailing(&self) -> usize;
 }
 
-/// ROS 1: little endian, one value behind the other.
+/// ROS 1: little endian, values without padding.
 pub(crate) struct Packed<'a> {
     pub(crate) rest: &'a [u8],
 }
 
-impl Reader for Packed<'_> {
+impl SerializedReader for Packed<'_> {
     const PLACEHOLDERS: bool = false;
 
     #[inline]
@@ -78,7 +80,7 @@ impl Reader for Packed<'_> {
     }
 
     #[inline]
-    fn skip(&mut self, plan: &Plan, length: usize) -> Result<bool, Fault> {
+    fn skip(&mut self, plan: &CodecPlan, length: usize) -> Result<bool, Fault> {
         if plan.fixed_size {
             self.take(length * plan.min_size)?;
         }
@@ -90,7 +92,7 @@ impl Reader for Packed<'_> {
     }
 }
 
-/// Whether an array of this length can be in the `left` bytes.
+/// Checks that an array of this length can fit into the `left` remaining bytes.
 #[inline]
 pub(crate) fn check_length(
     count: Count,

@@ -1,18 +1,17 @@
-//! A value of a body of CDR moved to another place, where what pads it is different: for fields that came in another
-//! order than the definition's.
+//! Copies a CDR value to an offset with other padding, for fields that arrived in another order than in the definition.
 
 use crate::codec::cdr::WIDE;
 use crate::schema::plan::{Count, Kind, Scalar};
 
-/// Copies values out of bytes that this crate has just written, so that their lengths are known to be true; were they
-/// not, what is missing would be left out.
+/// Copies values out of bytes that this crate has just written, so that their lengths are known to be correct; should
+/// one be wrong, the missing bytes are left out.
 pub(crate) struct Realign<'a> {
-    /// Begins at a multiple of 8 of its body.
+    /// Source bytes, beginning at a multiple of 8 of their body.
     pub(crate) from: &'a [u8],
-    /// Where the next value, or what pads it, begins there.
+    /// Offset of the next value, or of its padding, in `from`.
     pub(crate) at: usize,
     pub(crate) out: &'a mut Vec<u8>,
-    /// Where the body begins in `out`.
+    /// Offset of the body in `out`.
     pub(crate) origin: usize,
 }
 

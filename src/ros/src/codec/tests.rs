@@ -10,7 +10,7 @@ use std::sync::Arc;
 use super::*;
 use crate::schema::Registry;
 
-/// Definitions that the tests share.
+/// Definitions shared by the tests.
 fn message(name: &str) -> Arc<MessageType> {
     let registry = Registry::new();
     for (key, text) in [
@@ -45,12 +45,14 @@ fn message(name: &str) -> Arc<MessageType> {
         ),
         (
             "sensor_msgs/msg/Image",
-            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
+            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] \
+             data",
         ),
         (
             "t/msg/Arrays",
             "bool[] bools\nint8[] bytes\nint16[2] pair\nuint32[] words\nint64[] longs\nfloat32[] singles\n\
-             float64[3] triple\nstring[] texts\nchar[4] chars\ntime[] times\nduration[1] durations\nstd_msgs/Empty[] none",
+             float64[3] triple\nstring[] texts\nchar[4] chars\ntime[] times\nduration[1] durations\nstd_msgs/Empty[] \
+             none",
         ),
     ] {
         registry.insert(key, text).unwrap();
@@ -58,7 +60,7 @@ fn message(name: &str) -> Arc<MessageType> {
     registry.message(name).unwrap()
 }
 
-/// Serialized values, one after the other.
+/// Serialized values in sequence.
 #[derive(Default)]
 struct Bytes(Vec<u8>);
 

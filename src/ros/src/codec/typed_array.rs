@@ -1,11 +1,11 @@
-//! Typed arrays of CBOR (RFC 8746): tags 64 to 87, each for one kind, width and byte order of numbers.
+//! CBOR typed arrays (RFC 8746): tags 64 to 87, each for one kind, width and byte order of numbers.
 
-use crate::codec::cbor_item::Head;
+use crate::codec::cbor_item::ItemHead;
 use crate::codec::fault::Fault;
 use crate::codec::number::{Number, Wire};
 use crate::schema::plan::Scalar;
 
-/// The tag under which the bytes of a ROS array can go as they are.
+/// Returns the tag for the bytes of a ROS array as they are.
 pub(crate) fn little_endian_tag(scalar: Scalar) -> Option<u64> {
     Some(match scalar {
         Scalar::U8 => 64,
@@ -24,26 +24,26 @@ pub(crate) fn little_endian_tag(scalar: Scalar) -> Option<u64> {
     })
 }
 
-/// What a tag says about the bytes it stands before.
+/// Element format denoted by a tag.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Layout {
+pub(crate) struct ElementLayout {
     float: bool,
     signed: bool,
     little_endian: bool,
-    /// Bytes of one element.
+    /// Bytes per element.
     pub(crate) width: usize,
 }
 
-impl Layout {
-    /// By RFC 8746 section 2.1: `0b010_fsell`. Quadruple floats are not supported.
-    pub(crate) fn of_tag(tag: u64) -> Option<Layout> {
+impl ElementLayout {
+    /// Decodes a tag by RFC 8746 section 2.1: `0b010_fsell`. Quadruple floats are not supported.
+    pub(crate) fn from_tag(tag: u64) -> Option<ElementLayout> {
         if !(64..=87).contains(&tag) || matches!(tag, 76 | 83 | 87) {
             return None;
         }
         let (float, signed) = (tag & 16 != 0, tag & 8 != 0);
         let exponent = (tag & 3) as u32 + u32::from(float);
         // 68 is clamped uint8, which has no byte order.
-        Some(Layout {
+        Some(ElementLayout {
             float,
             signed,
             little_endian: tag & 4 != 0,
@@ -51,7 +51,7 @@ impl Layout {
         })
     }
 
-    /// Appends the elements as `T`s; gives their number.
+    /// Appends the elements, converted to `T`.
     pub(crate) fn append<T: Wire>(
         self,
         tag: u64,
@@ -81,7 +81,7 @@ impl Layout {
         }
         let bits = u64::from_le_bytes(wide);
         if self.float {
-            return Number::Float(float_of_bits(self.width, bits));
+            return Number::Float(bits_to_float(self.width, bits));
         }
         let unused = 64 - 8 * self.width as u32;
         match ((bits << unused) as i64) >> unused {
@@ -91,12 +91,12 @@ impl Layout {
     }
 }
 
-/// The float that a head of major type 7 carries; None where it carries none.
-pub(crate) fn float_of_head(head: Head) -> Option<f64> {
-    matches!(head.info, 25..=27).then(|| float_of_bits(1 << (head.info - 24), head.value))
+/// Returns the float that a head of major type 7 carries; `None` if it carries none.
+pub(crate) fn head_to_float(head: ItemHead) -> Option<f64> {
+    matches!(head.info, 25..=27).then(|| bits_to_float(1 << (head.info - 24), head.value))
 }
 
-fn float_of_bits(width: usize, bits: u64) -> f64 {
+fn bits_to_float(width: usize, bits: u64) -> f64 {
     match width {
         2 => half(bits as u16),
         4 => f32::from_bits(bits as u32).into(),
@@ -104,7 +104,7 @@ fn float_of_bits(width: usize, bits: u64) -> f64 {
     }
 }
 
-/// IEEE 754 half precision; every half is a double exactly.
+/// Converts IEEE 754 half precision; every half is exactly representable as a double.
 fn half(bits: u16) -> f64 {
     let mantissa = f64::from(bits & 0x3ff);
     let magnitude = match bits >> 10 & 0x1f {

@@ -1,11 +1,11 @@
-//! A message as values by name, for the few that are looked into here rather than passed on.
+//! Messages as values accessible by name, for the few messages that are examined here rather than forwarded.
 
 use std::borrow::Cow;
 
 use crate::bus::RosVersion;
 use crate::codec::Time;
-use crate::codec::cdr::utf8_of;
-use crate::codec::cursor::Cursor;
+use crate::codec::cdr::units_to_utf8;
+use crate::codec::cursor::MessageCursor;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
 /// A value in a serialized message.
@@ -13,31 +13,31 @@ use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 pub enum Value<'a> {
     /// Any number, and `bool` as 0 or 1. Integers beyond 2^53 are rounded.
     Number(f64),
-    /// A string's bytes; of a wide one, as UTF-8.
+    /// Bytes of a string; a wide string is converted to UTF-8.
     Text(Cow<'a, [u8]>),
-    /// A time, or a duration by its bits.
+    /// A time, or the bits of a duration.
     Time(Time),
     /// An array.
     List(Vec<Value<'a>>),
-    /// Another message: its fields by name.
+    /// A message: its fields by name.
     Message(Vec<(&'a str, Value<'a>)>),
 }
 
 impl<'a> Value<'a> {
-    /// Reads one message; none where the bytes are no such message.
+    /// Reads one message; `None` if the bytes are no such message.
     pub fn read(of: &'a MessageType, bytes: &'a [u8]) -> Option<Self> {
-        let mut reader = Reader {
-            cursor: Cursor::new(of.version(), bytes)?,
+        let mut reader = ValueDecoder {
+            cursor: MessageCursor::new(of.version(), bytes)?,
             version: of.version(),
             left: bytes.len().saturating_add(WITHOUT_BYTES),
         };
         let read = reader.message(of)?;
-        // Who writes ROS 2's messages by an estimated size leaves bytes behind them.
-        let ended = reader.cursor.left() == 0 || reader.version == RosVersion::Two;
+        // Senders that serialize ROS 2 messages into a buffer of estimated size leave bytes behind them.
+        let ended = reader.cursor.remaining() == 0 || reader.version == RosVersion::Two;
         ended.then_some(read)
     }
 
-    /// A field of a message.
+    /// Returns a field of a message.
     pub fn field(&self, name: &str) -> Option<&Value<'a>> {
         match self {
             Value::Message(fields) => fields
@@ -48,7 +48,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// A number.
+    /// Returns the number.
     pub fn number(&self) -> Option<f64> {
         match self {
             Value::Number(number) => Some(*number),
@@ -56,7 +56,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// A string; what is no UTF-8 is replaced.
+    /// Returns the string; invalid UTF-8 is replaced.
     pub fn text(&self) -> Option<String> {
         match self {
             Value::Text(bytes) => Some(String::from_utf8_lossy(bytes).into_owned()),
@@ -64,7 +64,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// A time.
+    /// Returns the time.
     pub fn time(&self) -> Option<Time> {
         match self {
             Value::Time(time) => Some(*time),
@@ -72,7 +72,7 @@ impl<'a> Value<'a> {
         }
     }
 
-    /// The items of an array; none of anything else.
+    /// Returns the items of an array; empty for any other value.
     pub fn items(&self) -> &[Value<'a>] {
         match self {
             Value::List(items) => items,
@@ -81,17 +81,17 @@ impl<'a> Value<'a> {
     }
 }
 
-/// Values that may take no bytes of a message: fields and items of types without fields.
+/// Maximum number of values without bytes: fields and items of types without fields.
 const WITHOUT_BYTES: usize = 1000;
 
-struct Reader<'a> {
-    cursor: Cursor<'a>,
+struct ValueDecoder<'a> {
+    cursor: MessageCursor<'a>,
     version: RosVersion,
-    /// Values that may still come.
+    /// Remaining number of values.
     left: usize,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> ValueDecoder<'a> {
     fn message(&mut self, of: &'a MessageType) -> Option<Value<'a>> {
         let fields = of.fields().iter();
         let values = fields.map(|field| Some((field.name.as_str(), self.field(field)?)));
@@ -104,19 +104,19 @@ impl<'a> Reader<'a> {
 
     fn field(&mut self, field: &'a Field) -> Option<Value<'a>> {
         let count = match field.arity {
-            Arity::One => return self.one(&field.base),
+            Arity::One => return self.read_value(&field.base),
             Arity::Fixed(count) => count as usize,
             Arity::Variable => self.cursor.length()?,
         };
-        // Items without any bytes cost nothing, so their number is bounded here.
-        if count > self.cursor.left() {
+        // Items without bytes cost nothing, so their number is bounded.
+        if count > self.cursor.remaining() {
             return None;
         }
-        let items = (0..count).map(|_| self.one(&field.base));
+        let items = (0..count).map(|_| self.read_value(&field.base));
         items.collect::<Option<_>>().map(Value::List)
     }
 
-    fn one(&mut self, base: &'a Base) -> Option<Value<'a>> {
+    fn read_value(&mut self, base: &'a Base) -> Option<Value<'a>> {
         self.left = self.left.checked_sub(1)?;
         let primitive = match base {
             Base::Message(message) if message.plan.scalar.is_some() => return self.time(),
@@ -143,9 +143,10 @@ impl<'a> Reader<'a> {
             }
             Primitive::Wstring => {
                 let units = cursor.string(true)?;
-                let text = match cursor.is_big_endian() {
-                    true => utf8_of::<true>(units),
-                    false => utf8_of::<false>(units),
+                let text = if cursor.is_big_endian() {
+                    units_to_utf8::<true>(units)
+                } else {
+                    units_to_utf8::<false>(units)
                 };
                 return Some(Value::Text(text.into()));
             }
@@ -223,7 +224,7 @@ mod tests {
             [lengths, vec![0; rest as usize]].concat()
         };
         assert!(Value::read(&many, &of(9, 100)).is_some());
-        // A million values, of a message of ten thousand bytes.
+        // A million values in a message of ten thousand bytes.
         assert_eq!(Value::read(&many, &of(9_999, 10_000)), None);
     }
 }

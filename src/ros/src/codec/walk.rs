@@ -1,38 +1,38 @@
-//! Serialized bytes, value by value, in the order of the plan.
+//! Walks over serialized bytes value by value, in the order of the plan.
 
 use crate::bus::RosVersion;
 use crate::codec::cdr::{Cdr, split_header};
 use crate::codec::fault::{CodecErrorKind, Fault};
-use crate::codec::reader::{Packed, Reader};
+use crate::codec::reader::{Packed, SerializedReader};
 use crate::schema::MessageType;
-use crate::schema::plan::{Kind, Literal, Plan, Scalar};
+use crate::schema::plan::{CodecPlan, Kind, Literal, Scalar};
 
-/// What becomes of the values.
-pub(crate) trait Format {
-    /// Values of fixed size may be skipped unseen.
+/// A consumer of the values of a message.
+pub(crate) trait OutputFormat {
+    /// True if values of fixed size may be skipped without being read.
     const SKIPS: bool = false;
-    /// Writes what stands between two values.
-    fn literal(&mut self, plan: &Plan, literal: &Literal);
-    /// One scalar; `bytes` has its size.
+    /// Writes the literal between two values.
+    fn literal(&mut self, plan: &CodecPlan, literal: &Literal);
+    /// Handles one scalar; `bytes` has its size.
     fn scalar(&mut self, scalar: Scalar, bytes: &[u8]);
-    /// A string, without its length.
+    /// Handles a string, given without its length.
     fn text(&mut self, bytes: &[u8]) -> Result<(), Fault>;
-    /// A `uint8[]` or `char[]`.
+    /// Handles a `uint8[]` or `char[]`.
     fn bytes(&mut self, bytes: &[u8]);
-    /// An array of other scalars; `bytes` is a multiple of their size.
+    /// Handles an array of other scalars; the length of `bytes` is a multiple of their size.
     fn scalars(&mut self, scalar: Scalar, bytes: &[u8]);
-    /// An array whose elements follow one by one.
+    /// Begins an array whose elements follow one by one.
     fn begin_array(&mut self, count: usize);
-    /// The element `index` follows.
+    /// Announces the element `index`.
     fn element(&mut self, index: usize);
-    /// All elements were there.
+    /// Ends the array after its last element.
     fn end_array(&mut self);
-    /// Whether `more` bytes may still be written.
-    fn room(&self, more: usize) -> Result<(), Fault>;
+    /// Checks that `more` bytes may still be written.
+    fn check_room(&self, more: usize) -> Result<(), Fault>;
 }
 
-/// Walks over `bytes`, which must be one message exactly.
-pub(crate) fn walk<F: Format>(
+/// Walks over `bytes`, which must be exactly one message.
+pub(crate) fn walk<F: OutputFormat>(
     message: &MessageType,
     bytes: &[u8],
     format: &mut F,
@@ -46,25 +46,25 @@ pub(crate) fn walk<F: Format>(
     }
 }
 
-fn walk_all<R: Reader, F: Format>(
+fn walk_all<R: SerializedReader, F: OutputFormat>(
     message: &MessageType,
     mut reader: R,
     format: &mut F,
 ) -> Result<(), Fault> {
     walk_message(message, &mut reader, format)?;
-    format.room(0)?;
+    format.check_room(0)?;
     match reader.trailing() {
         0 => Ok(()),
         trailing => Err(CodecErrorKind::Trailing(trailing).into()),
     }
 }
 
-/// Walks without looking at values.
+/// Checks a message without using its values.
 pub(crate) fn validate(message: &MessageType, bytes: &[u8]) -> Result<(), Fault> {
     walk(message, bytes, &mut Nothing)
 }
 
-fn walk_message<R: Reader, F: Format>(
+fn walk_message<R: SerializedReader, F: OutputFormat>(
     message: &MessageType,
     reader: &mut R,
     format: &mut F,
@@ -85,7 +85,7 @@ fn walk_message<R: Reader, F: Format>(
 }
 
 #[inline]
-fn walk_value<R: Reader, F: Format>(
+fn walk_value<R: SerializedReader, F: OutputFormat>(
     kind: &Kind,
     reader: &mut R,
     format: &mut F,
@@ -94,19 +94,19 @@ fn walk_value<R: Reader, F: Format>(
         Kind::Scalar(scalar) => format.scalar(*scalar, reader.scalar(*scalar)?),
         Kind::Text(text) => {
             let text = reader.text(*text)?;
-            format.room(text.len())?;
+            format.check_room(text.len())?;
             format.text(text)?;
         }
         Kind::Bytes(count) => {
             let length = reader.length(*count, 1)?;
             let bytes = reader.take(length)?;
-            format.room(bytes.len())?;
+            format.check_room(bytes.len())?;
             format.bytes(bytes);
         }
         Kind::Scalars(scalar, count) => {
             let length = reader.length(*count, scalar.size())?;
             let bytes = reader.scalars(*scalar, length)?;
-            format.room(length)?;
+            format.check_room(length)?;
             format.scalars(*scalar, bytes);
         }
         Kind::Texts(text, count) => {
@@ -129,7 +129,7 @@ fn walk_value<R: Reader, F: Format>(
     Ok(())
 }
 
-fn walk_elements<F: Format>(
+fn walk_elements<F: OutputFormat>(
     length: usize,
     format: &mut F,
     mut element: impl FnMut(&mut F) -> Result<(), Fault>,
@@ -138,19 +138,19 @@ fn walk_elements<F: Format>(
     for index in 0..length {
         format.element(index);
         element(format)
-            .and_then(|()| format.room(0))
+            .and_then(|()| format.check_room(0))
             .map_err(|fault| fault.at_index(index))?;
     }
     format.end_array();
     Ok(())
 }
 
-/// Writes nothing.
+/// A consumer that writes nothing.
 struct Nothing;
 
-impl Format for Nothing {
+impl OutputFormat for Nothing {
     const SKIPS: bool = true;
-    fn literal(&mut self, _: &Plan, _: &Literal) {}
+    fn literal(&mut self, _: &CodecPlan, _: &Literal) {}
     fn scalar(&mut self, _: Scalar, _: &[u8]) {}
     fn text(&mut self, _: &[u8]) -> Result<(), Fault> {
         Ok(())
@@ -160,7 +160,7 @@ impl Format for Nothing {
     fn begin_array(&mut self, _: usize) {}
     fn element(&mut self, _: usize) {}
     fn end_array(&mut self) {}
-    fn room(&self, _: usize) -> Result<(), Fault> {
+    fn check_room(&self, _: usize) -> Result<(), Fault> {
         Ok(())
     }
 }

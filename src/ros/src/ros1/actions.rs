@@ -1,5 +1,4 @@
-//! Actions of ROS 1: five topics below one name, as actionlib has them
-//! (<http://wiki.ros.org/actionlib/DetailedDescription>).
+//! ROS 1 actions: five topics under one name, as in actionlib (<http://wiki.ros.org/actionlib/DetailedDescription>).
 
 pub mod messages;
 
@@ -7,22 +6,22 @@ use std::collections::BTreeMap;
 
 use crate::bus::{ActionNodes, TopicNodes};
 
-/// What follows an action's name in the names of its topics.
+/// Last part of the names of an action's topics.
 const PARTS: [&str; 5] = ["goal", "cancel", "status", "feedback", "result"];
 
-/// Whether messages of this type carry a goal's id: goals, results and feedback.
+/// Returns true if messages of this type carry a goal id: goals, results and feedback.
 pub fn carries_goal_id(type_name: &str) -> bool {
     let ends = ["ActionGoal", "ActionResult", "ActionFeedback"];
     ends.iter().any(|end| type_name.ends_with(end))
 }
 
-/// Whether a message of this type makes a server begin or stop something.
-pub fn commands(type_name: &str) -> bool {
+/// Returns true if messages of this type make a server start or stop a goal.
+pub fn is_command_type(type_name: &str) -> bool {
     type_name.ends_with("ActionGoal") || type_name == "actionlib_msgs/GoalID"
 }
 
-/// The actions that these topics make.
-pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<String, ActionNodes> {
+/// Finds the actions among these topics.
+pub(crate) fn find_actions(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<String, ActionNodes> {
     let mut found = BTreeMap::new();
     for (topic, goal) in topics {
         let Some(name) = topic.strip_suffix("/goal").filter(|name| !name.is_empty()) else {
@@ -36,7 +35,8 @@ pub(crate) fn of_topics(topics: &BTreeMap<String, TopicNodes>) -> BTreeMap<Strin
             continue;
         }
         let answers = |node: &&String| result.publishers.contains(*node);
-        // Its servers publish results: a client that publishes goals may be mistaken.
+        // The type given by the servers, which publish results, has precedence: a client that publishes goals may be
+        // mistaken.
         let told = result.type_name.strip_suffix("ActionResult");
         let asked = goal.type_name.strip_suffix("ActionGoal");
         let nodes = ActionNodes {
@@ -63,9 +63,10 @@ mod tests {
                 ends.reverse();
             }
             let [publishers, subscribers] = ends;
-            let type_name = match name.ends_with("result") {
-                true => "x/DoActionResult",
-                false => "x/OtherActionGoal",
+            let type_name = if name.ends_with("result") {
+                "x/DoActionResult"
+            } else {
+                "x/OtherActionGoal"
             };
             let nodes = TopicNodes {
                 type_name: type_name.to_owned(),
@@ -77,7 +78,7 @@ mod tests {
         let mut topics: BTreeMap<_, _> = PARTS.map(|part| topic(&format!("/do/{part}"))).into();
         topics.extend(PARTS.map(|part| topic(&format!("/{part}"))));
         topics.extend([topic("/half/goal"), topic("/half/result")]);
-        let found = of_topics(&topics);
+        let found = find_actions(&topics);
         let action = ActionNodes {
             type_name: "x/Do".to_owned(),
             servers: vec!["/server".to_owned()],

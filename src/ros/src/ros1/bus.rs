@@ -1,5 +1,5 @@
-//! [`Bus`] over ROS 1: an ordinary node, with a slave API and a TCPROS server, that publishes, subscribes, calls
-//! and serves on behalf of whoever holds the bus.
+//! [`Bus`] over ROS 1: an ordinary node, with a slave API and a TCPROS server, that publishes, subscribes, calls and
+//! serves on behalf of the owner of the bus.
 //!
 //! ```text
 //!   subscribe ─▶ registrar ─▶ Master ─▶ publisherUpdate, graph ─▶ one link per publisher ─▶ all local queues
@@ -7,8 +7,8 @@
 //!   call ─▶ lookupService ─▶ pooled persistent connections
 //!   serve ─▶ registrar ─▶ Master;  callers connect ─▶ handler
 //! ```
-//! What this side wants registered is kept by the registrar; the graph watcher compares it with what the Master
-//! has, so a Master that restarted, or forgot us, is told again.
+//! The registrar keeps what this node wants registered; the graph watcher compares it with what the Master has, so that
+//! everything is registered again with a Master that was restarted or lost our registrations.
 
 mod actions;
 mod calls;
@@ -47,46 +47,47 @@ use self::lending::Loans;
 use self::master_client::MasterClient;
 use self::publications::TopicOut;
 use self::registrar::Registrar;
-use self::services::Served;
+use self::services::ServiceEntry;
 use self::subscriptions::TopicIn;
 use super::names;
 use crate::JoinOptions;
 use crate::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, GlobalParameters, Graph,
-    Hearing, Lending, ParamTeller, ParamValue, Publisher, Qos, RosVersion, ServiceHandler,
-    ServiceType, Subscription, WireType,
+    Lending, ParamChangeSender, ParamValue, Publisher, PublisherReports, QosProfile, RosVersion,
+    ServiceHandler, ServiceType, Subscription, WireType,
 };
 use crate::net::Sockets;
 use crate::ros1::tcpros::{FrameBounds, Header};
-use crate::ros1::xmlrpc::{self, Client, Limits};
+use crate::ros1::xmlrpc::{self, ServerLimits, XmlRpcClient};
 use crate::schema::ActionDef;
 
-/// For a peer to accept a connection and answer its header.
+/// Time for a peer to accept a connection and answer its header.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// For queued messages and unregistrations when the bus closes.
+/// Time for queued messages and unregistrations when the bus closes.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// A ROS 1 system as a [`Bus`]. Dropping it closes all connections but leaves the registrations, as a crash
-/// would; [`Bus::close`] takes them back.
+/// A ROS 1 system as a [`Bus`]. Dropping it closes all connections but leaves the registrations, as a crash would;
+/// [`Bus::close`] unregisters everything.
 pub struct Ros1Bus {
-    inner: Arc<Inner>,
+    inner: Arc<Ros1BusState>,
 }
 
-/// Whom one end of a topic belongs to. What this node publishes itself is not brought back to it, unless one of both ends is
-/// an action's: its topics may be used directly, too, and its client may have its server here.
+/// Owner of an endpoint of a topic. Messages published by this node are not delivered to its own subscriptions, except
+/// where one of the two endpoints belongs to an action: an action's topics may also be used directly, and its client
+/// may have its server behind the same bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum End {
-    /// Whoever holds the bus.
+pub(super) enum EndpointOwner {
+    /// The owner of the bus.
     User,
     /// An action of this node.
     Action,
 }
 
-/// What all parts of a bus share.
-pub(super) struct Inner {
+/// State shared by all parts of a bus.
+pub(super) struct Ros1BusState {
     sockets: Arc<dyn Sockets>,
     pub(super) node: String,
-    /// The host in our addresses, and the port of our TCPROS server.
+    /// Host in our addresses, and the port of our TCPROS server.
     host: String,
     port: u16,
     frames: FrameBounds,
@@ -94,16 +95,16 @@ pub(super) struct Inner {
     registrar: Registrar,
     subscriptions: Mutex<HashMap<String, Arc<TopicIn>>>,
     publications: Mutex<HashMap<String, Arc<TopicOut>>>,
-    /// Woken when something is advertised, and when somebody wants to know what subscribers ask for.
+    /// Notified when something is advertised, and when somebody wants to know what type subscribers request.
     publishing: Notify,
-    services: Mutex<HashMap<String, Arc<Served>>>,
+    services: Mutex<HashMap<String, Arc<ServiceEntry>>>,
     label: OnceLock<String>,
     lending: Loans,
     calls: CallPool,
     publisher_clients: heard::PublisherClients,
     pub(super) graph: watch::Sender<Arc<Graph>>,
     shutdown: watch::Sender<Option<String>>,
-    param_watcher: Mutex<Option<ParamTeller>>,
+    param_watcher: Mutex<Option<ParamChangeSender>>,
     closed: AtomicBool,
     runtime: Handle,
     tasks: Mutex<JoinSet<()>>,
@@ -173,7 +174,7 @@ impl Ros1Bus {
             format!("http://{host}:{slave_port}/"),
             format!("rosrpc://{host}:{port}"),
         );
-        let inner = Arc::new(Inner {
+        let inner = Arc::new(Ros1BusState {
             sockets,
             node: options.node,
             host,
@@ -206,11 +207,11 @@ impl Ros1Bus {
             inner: inner.clone(),
         });
         let slave = Arc::new(slave::Slave { bus: inner.clone() });
-        let limits = Limits {
+        let limits = ServerLimits {
             budget: options
                 .budget
-                .within("the XML-RPC of our node", xmlrpc::MAX_HELD),
-            ..Limits::default()
+                .child("the XML-RPC of our node", xmlrpc::MAX_HELD),
+            ..ServerLimits::default()
         };
         inner.spawn(xmlrpc::serve(slave_listener, slave, limits));
         inner.spawn(server::serve(inner.clone(), tcpros_listener));
@@ -219,7 +220,7 @@ impl Ros1Bus {
         Ok(bus)
     }
 
-    /// The address of this node's slave API, as the Master knows it.
+    /// Returns the address of this node's slave API, as known to the Master.
     pub fn uri(&self) -> &str {
         self.inner.registrar.slave_uri()
     }
@@ -227,7 +228,7 @@ impl Ros1Bus {
 
 impl Drop for Ros1Bus {
     fn drop(&mut self) {
-        self.inner.end();
+        self.inner.shut_down();
     }
 }
 
@@ -241,8 +242,8 @@ impl fmt::Debug for Ros1Bus {
     }
 }
 
-impl Inner {
-    /// Runs a task that ends with the bus.
+impl Ros1BusState {
+    /// Spawns a task that ends with the bus.
     pub(super) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
         let mut tasks = self.tasks.lock();
         while tasks.try_join_next().is_some() {}
@@ -253,18 +254,19 @@ impl Inner {
         handle
     }
 
-    /// A number for a connection or a local registration.
-    pub(super) fn id(&self) -> i32 {
+    /// Returns a new number for a connection or a local registration.
+    pub(super) fn next_id(&self) -> i32 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
-    /// A client of the node at `uri`.
-    fn client(&self, uri: &str) -> Result<Client, BusError> {
-        let client = Client::new(self.sockets.clone(), uri).map_err(master_client::to_bus_error)?;
-        Ok(client.within(&self.frames.budget))
+    /// Creates a client of the node at `uri`.
+    fn client(&self, uri: &str) -> Result<XmlRpcClient, BusError> {
+        let client =
+            XmlRpcClient::new(self.sockets.clone(), uri).map_err(master_client::to_bus_error)?;
+        Ok(client.with_budget(&self.frames.budget))
     }
 
-    /// Asks the Master for every change, if anybody watches.
+    /// Subscribes to all parameter changes at the Master if there is a watcher.
     async fn subscribe_params(&self) -> Result<(), BusError> {
         if self.param_watcher.lock().is_none() {
             return Ok(());
@@ -288,22 +290,22 @@ impl Inner {
     }
 
     /// Ends all tasks and with them all connections.
-    fn end(&self) {
+    fn shut_down(&self) {
         self.closed.store(true, Ordering::Release);
         self.tasks.lock().abort_all();
         for (_, topic) in self.subscriptions.lock().drain() {
-            topic.end();
+            topic.close();
         }
         self.publications.lock().clear();
         *self.param_watcher.lock() = None;
         self.services.lock().clear();
-        self.lending.end();
+        self.lending.clear();
         self.calls.clear();
     }
 }
 
-/// What a header of TCPROS says of its end's type.
-fn announced(header: &Header) -> WireType {
+/// Returns the type declared in a TCPROS connection header.
+fn wire_type_from_header(header: &Header) -> WireType {
     WireType::new(
         header.get("type").unwrap_or("*"),
         header.get("md5sum").unwrap_or("*"),
@@ -317,7 +319,7 @@ impl Bus for Ros1Bus {
         RosVersion::One
     }
 
-    /// `/rosdistro` as roslaunch sets it.
+    /// Reads `/rosdistro` as set by roslaunch.
     async fn distribution(&self) -> String {
         match self.get("/rosdistro").await {
             Ok(ParamValue::String(distribution)) => distribution.trim().to_owned(),
@@ -337,20 +339,20 @@ impl Bus for Ros1Bus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
-        subscriptions::subscribe(&self.inner, topic, of, qos, End::User).await
+        subscriptions::subscribe(&self.inner, topic, of, qos, EndpointOwner::User).await
     }
 
     async fn advertise(
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
-        publications::advertise(&self.inner, topic, of, qos, End::User).await
+        publications::advertise(&self.inner, topic, of, qos, EndpointOwner::User).await
     }
 
     async fn call_typed(
@@ -390,7 +392,11 @@ impl Bus for Ros1Bus {
         of: &Arc<ActionDef>,
     ) -> Result<Box<dyn ActionClient>, BusError> {
         self.inner.check_name(action)?;
-        Ok(Box::new(actions::Client::open(&self.inner, action, of)))
+        Ok(Box::new(actions::Ros1ActionClient::open(
+            &self.inner,
+            action,
+            of,
+        )))
     }
 
     fn serve_action(
@@ -400,7 +406,7 @@ impl Bus for Ros1Bus {
         handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError> {
         self.inner.check_name(action)?;
-        let server = actions::Server::open(&self.inner, action, of, handler);
+        let server = actions::Ros1ActionServer::open(&self.inner, action, of, handler);
         Ok(Box::new(server))
     }
 
@@ -412,11 +418,11 @@ impl Bus for Ros1Bus {
         Ok(self)
     }
 
-    fn hearing(&self) -> Option<&dyn Hearing> {
+    fn publisher_reports(&self) -> Option<&dyn PublisherReports> {
         Some(self)
     }
 
-    /// By `rosnode kill`, or by another node of the same name.
+    /// Requested by `rosnode kill`, or when another node of the same name registers.
     fn shutdown_requested(&self) -> Option<watch::Receiver<Option<String>>> {
         Some(self.inner.shutdown.subscribe())
     }
@@ -436,11 +442,11 @@ impl Bus for Ros1Bus {
             }
             self.inner.registrar.withdraw_all().await;
             for (_, topic) in &publications {
-                topic.emptied().await;
+                topic.wait_until_no_subscribers().await;
             }
         };
         let _ = tokio::time::timeout(FAREWELL, farewell).await;
-        self.inner.end();
+        self.inner.shut_down();
     }
 }
 

@@ -1,7 +1,7 @@
 //! The ROS Master and parameter server (<http://wiki.ros.org/ROS/Master_API>), as a library.
 //!
-//! In: XML-RPC calls of nodes on a listener, and word that a process exited. Out: answers, `publisherUpdate` and
-//! `paramUpdate` calls to nodes, and the [`Graph`] for whoever waits for it. It runs on one thread and keeps
+//! In: XML-RPC calls of nodes on a listener, and notifications that a process exited. Out: answers, `publisherUpdate`
+//! and `paramUpdate` calls to nodes, and the [`Graph`] for those who wait for it. It runs on one thread and keeps
 //! everything in memory.
 
 mod api;
@@ -24,32 +24,32 @@ use tokio::sync::watch;
 use crate::bus::{Graph, ParamValue, ParameterUse};
 use crate::net::{LoopbackSockets, Sockets};
 use crate::ros1::actions;
-use crate::ros1::xmlrpc::{self, Limits, Value};
-use lending::Lending;
+use crate::ros1::xmlrpc::{self, ServerLimits, Value};
+use lending::LenderSlot;
 use notify::{Notice, Notifier};
 use params::Params;
 use registry::Registry;
 
-/// Parameter keys whose use is remembered, at most.
+/// Maximum number of parameter keys whose use is recorded.
 const MAX_USES: usize = 10_000;
-/// Nodes remembered per key and kind of use, at most.
+/// Maximum number of nodes recorded per key and kind of use.
 const MAX_USERS: usize = 100;
-/// Nodes touch parameters by the hundred when they start. Whoever waits for the graph hears of all that is touched within
-/// this time at once: each answer holds the whole graph.
+/// Time over which parameter uses are collected before waiters for the graph are notified: nodes use parameters by the
+/// hundred when they start, and each answer contains the whole graph.
 const USES_TOGETHER: Duration = Duration::from_millis(100);
-/// Services remembered that were looked for in vain, at most.
+/// Maximum number of recorded services that were looked up in vain.
 const MAX_SOUGHT: usize = 1000;
 
-/// What a Master starts with.
+/// Options of a Master.
 #[derive(Debug, Clone)]
 pub struct MasterOptions {
-    /// What it calls itself in `getUri`.
+    /// Own URI, as returned by `getUri`.
     pub uri: String,
-    /// Set before the first node comes. `/run_id`, `/rosdistro` and `/rosversion` are added where missing:
+    /// Parameters set before the first node arrives. `/run_id`, `/rosdistro` and `/rosversion` are added if missing:
     /// roslaunch waits for them.
     pub parameters: BTreeMap<String, ParamValue>,
-    /// What its XML-RPC server grants.
-    pub limits: Limits,
+    /// Limits of its XML-RPC server.
+    pub limits: ServerLimits,
 }
 
 impl Default for MasterOptions {
@@ -57,7 +57,7 @@ impl Default for MasterOptions {
         Self {
             uri: "http://localhost:11311/".to_owned(),
             parameters: BTreeMap::new(),
-            limits: Limits::default(),
+            limits: ServerLimits::default(),
         }
     }
 }
@@ -65,18 +65,18 @@ impl Default for MasterOptions {
 /// A Master; clones are handles to the same one.
 #[derive(Clone)]
 pub struct Master {
-    inner: Arc<Inner>,
+    inner: Arc<MasterCore>,
 }
 
-struct Inner {
+struct MasterCore {
     uri: String,
     run_id: String,
-    limits: Limits,
+    limits: ServerLimits,
     state: Mutex<State>,
-    /// Grows by one with every change of what [`Master::graph`] shows.
+    /// Number of changes of what [`Master::graph`] shows.
     generation: watch::Sender<u64>,
     notifier: Notifier,
-    lending: Lending,
+    lending: LenderSlot,
     sockets: OnceLock<Arc<dyn Sockets>>,
 }
 
@@ -85,14 +85,14 @@ struct State {
     registry: Registry,
     params: Params,
     uses: HashMap<String, ParameterUse>,
-    /// A use was noted that is yet to be told.
+    /// True if a recorded use has not been published yet.
     uses_changed: bool,
     sought: BTreeMap<String, Vec<String>>,
 }
 
 impl Master {
-    /// A Master that no node has found yet. A parameter that no XML-RPC value can hold is left out, with a
-    /// warning in the log.
+    /// Creates a Master without nodes. A parameter that no XML-RPC value can hold is left out, with a warning in the
+    /// log.
     pub fn new(options: MasterOptions) -> Self {
         let mut params = Params::default();
         for (key, value) in options.parameters {
@@ -108,7 +108,7 @@ impl Master {
             Some(Value::String(id)) => id.clone(),
             _ => new_run_id(),
         };
-        // The line ends are roscore's: it fills these from the output of commands.
+        // The line ends are roscore's, which sets these from the output of commands.
         for (key, value) in [
             ("/run_id", run_id.as_str()),
             ("/rosdistro", "noetic\n"),
@@ -123,20 +123,20 @@ impl Master {
             ..State::default()
         };
         Self {
-            inner: Arc::new(Inner {
+            inner: Arc::new(MasterCore {
                 uri: options.uri,
                 run_id,
                 limits: options.limits,
                 state: Mutex::new(state),
                 generation: watch::Sender::new(0),
                 notifier: Notifier::default(),
-                lending: Lending::default(),
+                lending: LenderSlot::default(),
                 sockets: OnceLock::new(),
             }),
         }
     }
 
-    /// Serves nodes until dropped. `sockets` is where nodes are called back; the first call's is kept.
+    /// Serves nodes until dropped. `sockets` is used to call nodes back; only the first call's is used.
     pub async fn serve(&self, listener: TcpListener, sockets: Arc<dyn Sockets>) {
         let _ = self.inner.sockets.set(sockets);
         let handler = Arc::new(api::Api {
@@ -145,29 +145,29 @@ impl Master {
         xmlrpc::serve(listener, handler, self.inner.limits.clone()).await;
     }
 
-    /// To be called when any process of the nodes' host has exited: finds the nodes that nobody answers for any
+    /// To be called when any process on the nodes' host has exited: finds nodes whose address nobody listens on any
     /// more and drops their registrations. Returns their names.
-    pub async fn process_exited(&self) -> Vec<String> {
+    pub async fn on_process_exit(&self) -> Vec<String> {
         probe::drop_dead(&self.inner).await
     }
 
-    /// What nodes have registered.
+    /// Returns the graph of registered nodes.
     pub fn graph(&self) -> Graph {
         self.inner.graph()
     }
 
-    /// The graph's generation, now and as it grows.
+    /// Returns the generation of the graph, updated as it grows.
     pub fn generation(&self) -> watch::Receiver<u64> {
         self.inner.generation.subscribe()
     }
 
-    /// What identifies this Master from its first start on; also parameter `/run_id`.
+    /// Returns the id of this Master since its first start; also parameter `/run_id`.
     pub fn run_id(&self) -> &str {
         &self.inner.run_id
     }
 }
 
-impl Inner {
+impl MasterCore {
     fn sockets(&self) -> Arc<dyn Sockets> {
         let sockets = self.sockets.get().cloned();
         sockets.unwrap_or_else(|| Arc::new(LoopbackSockets))
@@ -183,7 +183,7 @@ impl Inner {
             .collect();
         Graph {
             generation: *self.generation.borrow(),
-            actions: actions::of_topics(&topics),
+            actions: actions::find_actions(&topics),
             topics,
             services: state.registry.services().map(owned).collect(),
             nodes: state.registry.nodes().map(owned).collect(),
@@ -200,27 +200,27 @@ impl Inner {
         self.state.lock().registry.is_known(api)
     }
 
-    /// Changes the registry; tells whom it concerns.
-    fn change<T>(self: &Arc<Self>, by: impl FnOnce(&mut State, &mut Vec<Notice>) -> T) -> T {
+    /// Changes the state and notifies the nodes concerned.
+    fn update<T>(self: &Arc<Self>, by: impl FnOnce(&mut State, &mut Vec<Notice>) -> T) -> T {
         let mut notices = Vec::new();
         let mut state = self.state.lock();
         let before = state.registry.version();
         let result = by(&mut state, &mut notices);
         // Both while the state is locked: neither notices nor generations may overtake each other.
         if state.registry.version() != before {
-            self.grow();
+            self.bump_generation();
         }
         Notifier::send(self, notices);
         drop(state);
         result
     }
 
-    fn grow(&self) {
+    fn bump_generation(&self) {
         self.generation.send_modify(|generation| *generation += 1);
     }
 
-    /// Remembers that `node` used a parameter.
-    fn note_use(self: &Arc<Self>, state: &mut State, key: &str, node: &str, written: bool) {
+    /// Records that `node` used a parameter.
+    fn record_use(self: &Arc<Self>, state: &mut State, key: &str, node: &str, written: bool) {
         if state.uses.len() >= MAX_USES && !state.uses.contains_key(key) {
             return;
         }
@@ -238,13 +238,13 @@ impl Inner {
                     tokio::time::sleep(USES_TOGETHER).await;
                     let mut state = master.state.lock();
                     state.uses_changed = false;
-                    master.grow();
+                    master.bump_generation();
                 });
             }
         }
     }
 
-    /// About how many bytes the graph takes; more than its share have only the parameters.
+    /// Returns the approximate size of the graph in bytes; only the parameters can exceed their share.
     fn graph_weight(&self) -> usize {
         let state = self.state.lock();
         let uses = state.uses.iter().map(|(key, used)| {
@@ -256,8 +256,8 @@ impl Inner {
     }
 }
 
-/// Remembers that `node` looked for a service in vain; whether that is news.
-fn note_sought(sought: &mut BTreeMap<String, Vec<String>>, service: &str, node: &str) -> bool {
+/// Records that `node` looked up a service in vain; returns true if that is new.
+fn record_sought(sought: &mut BTreeMap<String, Vec<String>>, service: &str, node: &str) -> bool {
     if sought.len() >= MAX_SOUGHT && !sought.contains_key(service) {
         return false;
     }
@@ -269,7 +269,7 @@ fn note_sought(sought: &mut BTreeMap<String, Vec<String>>, service: &str, node: 
     news
 }
 
-/// Random enough to tell two Masters apart, in the shape of a UUID as roslaunch makes it.
+/// Creates a run id in the shape of a UUID, as roslaunch does; random enough to distinguish two Masters.
 fn new_run_id() -> String {
     let random = || RandomState::new().hash_one(std::process::id());
     let (high, low) = (random(), random());

@@ -1,9 +1,9 @@
 //! ROS names and the addresses of ROS nodes.
 
-/// Names longer than this are no names.
+/// Maximum length of a name.
 const MAX_NAME: usize = 1024;
 
-/// Whether `name` is absolute and made of what ROS allows: `/camera/image_raw`.
+/// Returns true if `name` is absolute and made of the characters that ROS allows: `/camera/image_raw`.
 pub fn is_global(name: &str) -> bool {
     name.len() <= MAX_NAME
         && name.len() > 1
@@ -28,7 +28,7 @@ pub fn resolve(name: &str, node: &str) -> String {
     canonical(&joined)
 }
 
-/// One slash at the start and between parts, none at the end; `/` alone is the root.
+/// Normalizes a name: one slash at the start and between parts, none at the end; `/` alone is the root.
 pub fn canonical(name: &str) -> String {
     let mut out = String::with_capacity(name.len() + 1);
     for part in parts(name) {
@@ -41,24 +41,24 @@ pub fn canonical(name: &str) -> String {
     out
 }
 
-/// The parts between slashes.
+/// Returns the parts between slashes.
 pub fn parts(name: &str) -> impl DoubleEndedIterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 
-/// Where a node's server is: `http://host:port/path` or `rosrpc://host:port`.
+/// Address of a node's server: `http://host:port/path` or `rosrpc://host:port`.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct PeerUri {
-    /// A name or a literal address.
+    /// Host name or literal address.
     pub host: String,
-    /// The TCP port.
+    /// TCP port.
     pub port: u16,
-    /// The path, at least `/`.
+    /// Path, at least `/`.
     pub path: String,
 }
 
 impl PeerUri {
-    /// Reads an address of the given scheme.
+    /// Parses an address of the given scheme.
     pub fn parse(uri: &str, scheme: &str) -> Option<Self> {
         let rest = uri.strip_prefix(scheme)?.strip_prefix("://")?;
         let (authority, path) = match rest.find('/') {

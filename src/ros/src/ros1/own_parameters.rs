@@ -1,9 +1,9 @@
-//! Parameters that a ROS 1 system has of itself, whatever runs in it.
+//! Parameters that every ROS 1 system has.
 
-/// Names that the Master or roslaunch sets, without what is below them.
+/// Names that the Master or roslaunch sets, without the names below them.
 const OF_MASTER: [&str; 4] = ["run_id", "rosdistro", "rosversion", "roslaunch"];
 
-/// Names that every node of roscpp or rospy asks for.
+/// Names that every roscpp or rospy node reads.
 const OF_NODES: [&str; 4] = [
     "use_sim_time",
     "tcp_keepalive",
@@ -11,18 +11,18 @@ const OF_NODES: [&str; 4] = [
     "rosout_disable_topics_generation",
 ];
 
-/// Whether the Master or roslaunch sets this parameter, or one above it. `name` may be absolute or not.
-pub fn is_of_master(name: &str) -> bool {
+/// Returns true if the Master or roslaunch sets this parameter, or one above it. `name` may be absolute or not.
+pub fn is_set_by_master(name: &str) -> bool {
     let first = name.trim_start_matches('/').split('/').next();
     first.is_some_and(|first| OF_MASTER.contains(&first))
 }
 
-/// Whether every node asks for the parameter of this absolute name, so that it says nothing of a node.
-pub fn every_node_asks_for(name: &str) -> bool {
+/// Returns true if every node reads the parameter of this absolute name, so that a read says nothing about the node.
+pub fn is_read_by_every_node(name: &str) -> bool {
     let Some(name) = name.strip_prefix('/') else {
         return false;
     };
-    is_of_master(name) || OF_NODES.contains(&name) || name.starts_with("statistics_window_")
+    is_set_by_master(name) || OF_NODES.contains(&name) || name.starts_with("statistics_window_")
 }
 
 #[cfg(test)]
@@ -42,7 +42,7 @@ mod tests {
             ("/detector/use_sim_time", false, false),
         ] {
             assert_eq!(
-                (is_of_master(name), every_node_asks_for(name)),
+                (is_set_by_master(name), is_read_by_every_node(name)),
                 (master, node),
                 "{name}"
             );

@@ -1,16 +1,16 @@
-//! How a process becomes a node of ROS 1: its environment and its command line
-//! (<http://wiki.ros.org/ROS/EnvironmentVariables>, <http://wiki.ros.org/Remapping%20Arguments>).
+//! Environment and command line that make a process a node of ROS 1 (<http://wiki.ros.org/ROS/EnvironmentVariables>,
+//! <http://wiki.ros.org/Remapping%20Arguments>).
 
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 
 use crate::bus::ParamValue;
-use crate::identity::Identity;
+use crate::identity::NodeIdentity;
 
-/// Where every servant's Master listens, as seen from inside.
+/// Address of every servant's Master, as seen from inside.
 pub const MASTER: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 11311);
 
-/// The variable that says where nodes run, and where they keep what they write.
+/// Variable with the working directory of nodes, where they also write their files.
 pub(crate) const HOME: &str = "ROS_HOME";
 
 pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
@@ -23,7 +23,8 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
             format!("http://localhost:{}", MASTER.port()),
         ),
         ("ROS_HOSTNAME", "localhost".to_owned()),
-        // A node's output is a pipe: without these its lines come when a buffer is full, and the last ones of a node that crashes never.
+        // A node's output is a pipe: without these its lines arrive only when a buffer is full, and the last lines of a
+        // node that crashes are lost.
         ("ROSCONSOLE_STDOUT_LINE_BUFFERED", "1".to_owned()),
         ("PYTHONUNBUFFERED", "1".to_owned()),
     ]
@@ -31,23 +32,24 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
     .into()
 }
 
-pub(crate) fn identity(node: &str) -> Identity {
+pub(crate) fn identity(node: &str) -> NodeIdentity {
     let (above, last) = node.rsplit_once('/').unwrap_or(("", node));
-    Identity {
+    NodeIdentity {
         arguments: vec![format!("__name:={last}")],
         ..namespace(above)
     }
 }
 
-pub(crate) fn namespace(namespace: &str) -> Identity {
+pub(crate) fn namespace(namespace: &str) -> NodeIdentity {
     let namespace = if namespace.is_empty() { "/" } else { namespace };
-    Identity {
+    NodeIdentity {
         arguments: Vec::new(),
         environment: [("ROS_NAMESPACE".to_owned(), namespace.to_owned())].into(),
     }
 }
 
-/// What roslaunch sets. The line end is its own: it fills the parameter from the output of a command.
+/// Returns the parameters that roslaunch sets. The line end is roslaunch's, which fills the parameter from the output
+/// of a command.
 pub(crate) fn parameters(distribution: &str) -> BTreeMap<String, ParamValue> {
     let distribution = ParamValue::String(format!("{distribution}\n"));
     BTreeMap::from([("/rosdistro".to_owned(), distribution)])

@@ -1,19 +1,19 @@
-//! The convention of all ROS 1 XML-RPC APIs: arguments by position, answers `[code, message, value]`.
+//! The convention of all ROS 1 XML-RPC APIs: positional arguments, answers of the form `[code, message, value]`.
 
 use super::names::PeerUri;
 use super::xmlrpc::Value;
 
-/// What every method answers.
+/// The answer of a method.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Reply {
-    /// 1 done, 0 not done, -1 the caller's mistake.
+pub(crate) struct ApiReply {
+    /// 1: success, 0: failure, -1: error of the caller.
     pub(crate) code: i32,
     pub(crate) message: String,
     pub(crate) value: Value,
 }
 
-impl Reply {
-    pub(crate) fn done(message: impl Into<String>, value: impl Into<Value>) -> Self {
+impl ApiReply {
+    pub(crate) fn success(message: impl Into<String>, value: impl Into<Value>) -> Self {
         Self {
             code: 1,
             message: message.into(),
@@ -21,7 +21,7 @@ impl Reply {
         }
     }
 
-    pub(crate) fn not_done(message: impl Into<String>, value: impl Into<Value>) -> Self {
+    pub(crate) fn failure(message: impl Into<String>, value: impl Into<Value>) -> Self {
         Self {
             code: 0,
             message: message.into(),
@@ -29,7 +29,7 @@ impl Reply {
         }
     }
 
-    pub(crate) fn mistake(message: impl Into<String>, value: impl Into<Value>) -> Self {
+    pub(crate) fn error(message: impl Into<String>, value: impl Into<Value>) -> Self {
         Self {
             code: -1,
             message: message.into(),
@@ -41,7 +41,7 @@ impl Reply {
         Value::Array(vec![self.code.into(), self.message.into(), self.value])
     }
 
-    /// Reads an answer; `None` if it is not of this shape.
+    /// Reads an answer; `None` if it has another form.
     pub(crate) fn from_value(value: Value) -> Option<Self> {
         let Value::Array(elements) = value else {
             return None;
@@ -58,7 +58,7 @@ impl Reply {
     }
 }
 
-/// A call's arguments, taken one by one; what is missing or wrong becomes the caller's mistake.
+/// A call's arguments, taken one by one; a missing or wrong one is reported as the caller's error.
 pub(crate) struct Args {
     values: std::vec::IntoIter<Value>,
 }
@@ -70,46 +70,52 @@ impl Args {
         }
     }
 
-    /// The next argument, whatever it is.
-    pub(crate) fn any(&mut self, what: &str) -> Result<Value, Reply> {
+    /// Takes the next argument, of any type.
+    pub(crate) fn value(&mut self, what: &str) -> Result<Value, ApiReply> {
         self.values
             .next()
-            .ok_or_else(|| mistake(format!("argument {what} is missing")))
+            .ok_or_else(|| argument_error(format!("argument {what} is missing")))
     }
 
-    /// The next argument, a string that is not empty.
-    pub(crate) fn text(&mut self, what: &str) -> Result<String, Reply> {
-        match self.any(what)? {
-            Value::String(text) if text.is_empty() => Err(mistake(format!("{what} is empty"))),
+    /// Takes the next argument, which must be a non-empty string.
+    pub(crate) fn text(&mut self, what: &str) -> Result<String, ApiReply> {
+        match self.value(what)? {
+            Value::String(text) if text.is_empty() => {
+                Err(argument_error(format!("{what} is empty")))
+            }
             Value::String(text) if text.len() > 4096 => {
-                Err(mistake(format!("{what} is longer than 4096 bytes")))
+                Err(argument_error(format!("{what} is longer than 4096 bytes")))
             }
             Value::String(text) => Ok(text),
-            other => Err(mistake(format!(
+            other => Err(argument_error(format!(
                 "{what} must be a string, not {}",
                 other.type_name()
             ))),
         }
     }
 
-    /// The next argument, an address of the given scheme.
-    pub(crate) fn uri(&mut self, what: &str, scheme: &str) -> Result<String, Reply> {
+    /// Takes the next argument, which must be an address of the given scheme.
+    pub(crate) fn uri(&mut self, what: &str, scheme: &str) -> Result<String, ApiReply> {
         let text = self.text(what)?;
         match PeerUri::parse(&text, scheme) {
             Some(_) => Ok(text),
-            None => Err(mistake(format!("{what} is no {scheme}:// address: {text}"))),
+            None => Err(argument_error(format!(
+                "{what} is not a {scheme}:// address: {text}"
+            ))),
         }
     }
 
-    /// No argument may be left.
-    pub(crate) fn end(&mut self) -> Result<(), Reply> {
+    /// Checks that no argument is left.
+    pub(crate) fn finish(&mut self) -> Result<(), ApiReply> {
         match self.values.next() {
             None => Ok(()),
-            Some(_) => Err(mistake("bad call arity: too many arguments".to_owned())),
+            Some(_) => Err(argument_error(
+                "bad call arity: too many arguments".to_owned(),
+            )),
         }
     }
 }
 
-fn mistake(message: String) -> Reply {
-    Reply::mistake(format!("ERROR: {message}"), 0)
+fn argument_error(message: String) -> ApiReply {
+    ApiReply::error(format!("ERROR: {message}"), 0)
 }

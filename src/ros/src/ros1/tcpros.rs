@@ -1,4 +1,4 @@
-//! TCPROS (<http://wiki.ros.org/ROS/TCPROS>): connection headers, then length-prefixed messages, or calls.
+//! TCPROS (<http://wiki.ros.org/ROS/TCPROS>): connection headers, then length-prefixed messages or calls.
 
 mod frames;
 mod header;
@@ -16,34 +16,34 @@ pub use service::{CallError, ServiceConnection, serve_calls};
 
 pub use crate::join::{MAX_MESSAGE, UNFINISHED};
 
-/// A TCPROS connection that broke.
+/// Error of a TCPROS connection.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The connection failed, or ended inside a message.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// What should be a connection header is none.
+    /// The connection header is invalid.
     #[error("bad connection header: {0}")]
     Header(String),
-    /// A message longer than we take.
+    /// A message exceeds the size limit.
     #[error("a message of {size} bytes announced; the limit is {max}")]
     TooLarge {
-        /// What its prefix says.
+        /// Size in the length prefix.
         size: usize,
-        /// Most bytes that are accepted.
+        /// Maximum size in bytes.
         max: usize,
     },
-    /// A message that does not fit into the memory for its servant.
+    /// A message does not fit into the servant's memory budget.
     #[error("a message cannot be read: {0}")]
     Exceeded(#[from] budget::Exceeded),
-    /// A message that was begun and never completed.
+    /// A message was begun and never completed.
     #[error("a message of {size} bytes is not complete after {after:?}; {read} of them came")]
     Unfinished {
-        /// What its prefix says.
+        /// Size in the length prefix.
         size: usize,
-        /// Bytes of the message that came.
+        /// Bytes of the message received.
         read: usize,
-        /// How long was waited.
+        /// Time waited.
         after: Duration,
     },
     /// The peer answered the header with an error.

@@ -1,4 +1,4 @@
-//! What the tests of this module share: a Master on a port of its own, nodes made by hand.
+//! Helpers for the tests of this module: a Master on its own port, hand-made nodes.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio::task::JoinHandle;
 
 use crate::net::HostSockets;
 use crate::ros1::master::{Master, MasterOptions};
-use crate::ros1::xmlrpc::{Client, Fault, Handler, Limits, Value, serve};
+use crate::ros1::xmlrpc::{Fault, ServerLimits, Value, XmlRpcClient, XmlRpcHandler, serve};
 
 /// Longer than anything here takes.
 pub(crate) const LONG: Duration = Duration::from_secs(120);
@@ -25,11 +25,11 @@ pub(crate) struct TestMaster {
 
 impl TestMaster {
     pub(crate) async fn start() -> Self {
-        Self::with(Master::new(MasterOptions::default()), None).await
+        Self::start_at(Master::new(MasterOptions::default()), None).await
     }
 
-    /// Serves `master`, at an address where another one was before.
-    pub(crate) async fn with(master: Master, address: Option<SocketAddr>) -> Self {
+    /// Serves `master`, optionally at an address that another one used before.
+    pub(crate) async fn start_at(master: Master, address: Option<SocketAddr>) -> Self {
         let address = address.unwrap_or(([127, 0, 0, 1], 0).into());
         let listener = TcpListener::bind(address).await.unwrap();
         let address = listener.local_addr().unwrap();
@@ -43,9 +43,9 @@ impl TestMaster {
         }
     }
 
-    /// Calls a method; its `[code, message, value]`.
+    /// Calls a method; returns its `[code, message, value]`.
     pub(crate) async fn call(&self, method: &str, args: &[Value]) -> (i32, String, Value) {
-        let client = Client::new(Arc::new(HostSockets), &format!("http://{}/", self.address));
+        let client = XmlRpcClient::new(Arc::new(HostSockets), &format!("http://{}/", self.address));
         let answer = client.unwrap().call(method, args, LONG).await.unwrap();
         match answer {
             Value::Array(parts) => match <[Value; 3]>::try_from(parts).unwrap() {
@@ -56,15 +56,15 @@ impl TestMaster {
         }
     }
 
-    /// The graph once `wanted` holds of it.
-    pub(crate) async fn until(&self, wanted: impl Fn(&crate::bus::Graph) -> bool) {
+    /// Waits until the graph satisfies `wanted`.
+    pub(crate) async fn wait_until(&self, wanted: impl Fn(&crate::bus::Graph) -> bool) {
         let mut generation = self.master.generation();
         let waiting = generation.wait_for(|_| wanted(&self.master.graph()));
         let found = tokio::time::timeout(LONG, waiting).await.is_ok();
         assert!(found, "{:#?}", self.master.graph());
     }
 
-    /// Ends it, with all its connections, and frees its port.
+    /// Stops it with all its connections, and frees its port.
     pub(crate) async fn stop(mut self) -> SocketAddr {
         self.task.abort();
         let _ = (&mut self.task).await;
@@ -78,7 +78,7 @@ impl Drop for TestMaster {
     }
 }
 
-/// A node of which there is only the XML-RPC server: it tells what it is told.
+/// A node that consists of an XML-RPC server only, and reports the calls it receives.
 pub(crate) struct TestNode {
     pub(crate) uri: String,
     pub(crate) calls: mpsc::UnboundedReceiver<(String, Vec<Value>)>,
@@ -91,7 +91,7 @@ struct Reporter {
 }
 
 #[async_trait]
-impl Handler for Reporter {
+impl XmlRpcHandler for Reporter {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         let _ = self.calls.send((method.to_owned(), params));
         Ok(Value::Array(vec![1.into(), "".into(), self.answer.clone()]))
@@ -99,13 +99,13 @@ impl Handler for Reporter {
 }
 
 impl TestNode {
-    /// A node that answers every call with success and 0.
+    /// Starts a node that answers every call with success and 0.
     pub(crate) async fn start() -> Self {
-        Self::answering(Value::Int(0)).await
+        Self::start_answering(Value::Int(0)).await
     }
 
-    /// A node that answers every call with success and this value.
-    pub(crate) async fn answering(answer: Value) -> Self {
+    /// Starts a node that answers every call with success and this value.
+    pub(crate) async fn start_answering(answer: Value) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let uri = format!("http://{}/", listener.local_addr().unwrap());
         let (sender, calls) = mpsc::unbounded_channel();
@@ -113,17 +113,17 @@ impl TestNode {
             calls: sender,
             answer,
         });
-        let task = tokio::spawn(serve(listener, reporter, Limits::default()));
+        let task = tokio::spawn(serve(listener, reporter, ServerLimits::default()));
         Self { uri, calls, task }
     }
 
-    /// The next call it receives.
+    /// Returns the next call received.
     pub(crate) async fn next(&mut self) -> (String, Vec<Value>) {
         let call = tokio::time::timeout(LONG, self.calls.recv()).await;
         call.expect("a call should come").unwrap()
     }
 
-    /// Dies, as by SIGKILL.
+    /// Dies as by SIGKILL.
     pub(crate) async fn die(mut self) {
         self.task.abort();
         let _ = (&mut self.task).await;
@@ -136,7 +136,7 @@ impl Drop for TestNode {
     }
 }
 
-/// A call's arguments.
+/// Creates a call's arguments.
 pub(crate) fn args<const N: usize>(texts: [&str; N]) -> [Value; N] {
     texts.map(Value::from)
 }

@@ -1,7 +1,7 @@
-//! XML-RPC over HTTP/1.1, as ROS 1 nodes and their Master speak it (<http://xmlrpc.com/spec.md>).
+//! XML-RPC over HTTP/1.1, as used by ROS 1 nodes and their Master (<http://xmlrpc.com/spec.md>).
 //!
-//! The peers are roscpp's XmlRpcpp and Python's `xmlrpc`; both keep connections open between calls. Parsing is
-//! bounded in size, depth and number of elements, and knows no DTDs: there is nothing to expand.
+//! The peers are roscpp's XmlRpcpp and Python's `xmlrpc`; both keep connections open between calls. Parsing is bounded
+//! in size, depth and number of elements, and supports no DTDs: there is nothing to expand.
 
 mod client;
 mod http;
@@ -13,25 +13,25 @@ mod value;
 use std::io;
 use std::time::Duration;
 
-pub use client::Client;
-pub use parse::{Call, MAX_DEPTH, MAX_ELEMENTS, parse_call, parse_response, weight};
+pub use client::XmlRpcClient;
+pub use parse::{MAX_DEPTH, MAX_ELEMENTS, MethodCall, parse_call, parse_response, weight};
 pub(crate) use print::fault_value;
 pub use print::{print_call, print_fault, print_response};
-pub use server::{Handler, Limits, MAX_HELD, serve};
+pub use server::{MAX_HELD, ServerLimits, XmlRpcHandler, serve};
 pub use value::Value;
 
-/// What the other side answered instead of a value.
+/// A fault returned by the other side instead of a value.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("fault {code}: {text}")]
 pub struct Fault {
-    /// Its number; ROS gives these no meaning.
+    /// Fault code; ROS assigns no meanings.
     pub code: i32,
-    /// What it says.
+    /// Fault text.
     pub text: String,
 }
 
 impl Fault {
-    /// A fault with ROS's usual code.
+    /// Creates a fault with ROS's usual code.
     pub fn new(text: impl Into<String>) -> Self {
         Self {
             code: 1,
@@ -40,54 +40,54 @@ impl Fault {
     }
 }
 
-/// A call that failed, or a document that is none.
+/// Error of a call or a document.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The connection failed.
     #[error("{peer}: {source}")]
     Io {
-        /// Who was called.
+        /// The server called.
         peer: String,
-        /// Why it failed.
+        /// The cause.
         source: io::Error,
     },
-    /// No answer in time.
+    /// No answer arrived in time.
     #[error("{peer} did not answer {method} within {after:?}")]
     Timeout {
-        /// Who was called.
+        /// The server called.
         peer: String,
         /// The method.
         method: String,
-        /// How long was waited.
+        /// Time waited.
         after: Duration,
     },
-    /// Not HTTP, or not in the way XML-RPC uses it.
+    /// The peer does not speak HTTP as XML-RPC uses it.
     #[error("{peer} does not speak HTTP as XML-RPC needs it: {reason}")]
     Http {
-        /// Who was called.
+        /// The server called.
         peer: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
-    /// Not XML, or not XML-RPC.
+    /// The document is not XML, or not XML-RPC.
     #[error("malformed XML-RPC at byte {at}: {reason}")]
     Malformed {
         /// Byte offset in the document.
         at: usize,
-        /// What is wrong there.
+        /// The problem at that offset.
         reason: String,
     },
     /// The other side answered with a fault.
     #[error("{peer} answered {method} with {fault}")]
     Fault {
-        /// Who was called.
+        /// The server called.
         peer: String,
         /// The method.
         method: String,
-        /// What it answered.
+        /// The fault.
         fault: Fault,
     },
-    /// Not an address of an XML-RPC server.
+    /// The URI is not that of an XML-RPC server.
     #[error("{0:?} is not an XML-RPC address; it should look like http://localhost:11311/")]
     BadUri(String),
 }

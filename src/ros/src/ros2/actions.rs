@@ -1,14 +1,15 @@
-//! Actions of ROS 2 (<https://design.ros2.org/articles/actions.html>): services and topics of one name.
+//! Actions of ROS 2 (<https://design.ros2.org/articles/actions.html>): services and topics under one name.
 //!
 //! ```text
 //!   client                                              server
-//!     │── NAME/_action/send_goal    goal id, goal ────────▶│   accepted or not
-//!     │◀─ NAME/_action/feedback     goal id, feedback ─────│   while it is carried out
-//!     │── NAME/_action/cancel_goal  goal id, stamp ───────▶│   which goals end now
+//!     │── NAME/_action/send_goal    goal id, goal ────────▶│   accepted or rejected
+//!     │◀─ NAME/_action/feedback     goal id, feedback ─────│   while it executes
+//!     │── NAME/_action/cancel_goal  goal id, stamp ───────▶│   which goals are cancelled
 //!     │── NAME/_action/get_result   goal id ──────────────▶│   status, result: once it has ended
-//!     │◀─ NAME/_action/status       all goals' statuses ───│   kept for newcomers
+//!     │◀─ NAME/_action/status       all goals' statuses ───│   kept for late subscribers
 //! ```
-//! Goals are told apart by UUIDs. A goal's text that is a UUID is that one; another stands for a random one.
+//! Goals are identified by UUIDs. A goal id that is a UUID in text form is used as it is; any other id is mapped to a
+//! random UUID.
 
 mod client;
 mod goal_id;
@@ -18,36 +19,36 @@ mod server;
 #[cfg(test)]
 mod tests;
 
-use crate::bus::{BusError, Qos, ServiceType, WireType};
+use crate::bus::{BusError, QosProfile, ServiceType, WireType};
 use crate::ros2::{interfaces, names};
 use crate::schema::ActionDef;
 
-pub(super) use client::Client;
+pub(super) use client::Ros2ActionClient;
 use goal_id::GoalId;
-pub(super) use server::{Retired, Server};
+pub(super) use server::{RetiredServices, Ros2ActionServer};
 
-/// Feedback that is kept for a slow receiver.
+/// Queue depth for feedback to a slow receiver.
 const QUEUE: u32 = 100;
 
-/// What an action is made of: names and types.
+/// Services and topics of an action: names and types.
 #[derive(Debug, Clone)]
-pub struct Parts {
-    /// Takes goals, or not.
+pub struct ActionInterfaces {
+    /// Accepts or rejects goals.
     pub send_goal: (String, ServiceType),
     /// Answers when a goal has ended.
     pub get_result: (String, ServiceType),
-    /// Ends goals.
+    /// Cancels goals.
     pub cancel_goal: (String, ServiceType),
-    /// Tells how goals get on.
+    /// Carries the feedback of goals.
     pub feedback: (String, WireType),
-    /// Tells how all goals stand.
+    /// Carries the statuses of all goals.
     pub status: (String, WireType),
 }
 
-impl Parts {
-    /// Those of an action of this name and type; an error where it is one of ROS 1.
-    pub fn of(action: &str, of: &ActionDef) -> Result<Self, BusError> {
-        let name = |part: &str| names::part_of_action(action, part);
+impl ActionInterfaces {
+    /// Returns those of an action with this name and type; an error if it is an action of ROS 1.
+    pub fn for_action(action: &str, of: &ActionDef) -> Result<Self, BusError> {
+        let name = |part: &str| names::action_part_name(action, part);
         let Some(services) = &of.services else {
             return Err(BusError::Protocol {
                 what: format!("action {action}"),
@@ -56,24 +57,33 @@ impl Parts {
         };
         let status = interfaces::message("action_msgs/msg/GoalStatusArray")?;
         Ok(Self {
-            send_goal: (name("send_goal"), ServiceType::of(&services.send_goal)),
-            get_result: (name("get_result"), ServiceType::of(&services.get_result)),
+            send_goal: (
+                name("send_goal"),
+                ServiceType::from_service(&services.send_goal),
+            ),
+            get_result: (
+                name("get_result"),
+                ServiceType::from_service(&services.get_result),
+            ),
             cancel_goal: (
                 name("cancel_goal"),
                 interfaces::service("action_msgs/srv/CancelGoal")?,
             ),
-            feedback: (name("feedback"), WireType::of(&of.action_feedback)),
-            status: (name("status"), WireType::of(&status)),
+            feedback: (
+                name("feedback"),
+                WireType::from_message(&of.action_feedback),
+            ),
+            status: (name("status"), WireType::from_message(&status)),
         })
     }
 
-    /// What a server offers of its feedback.
-    pub fn feedback_qos() -> Qos {
-        Qos::keep_last(QUEUE as usize)
+    /// Returns the QoS that a server offers for feedback.
+    pub fn feedback_qos() -> QosProfile {
+        QosProfile::keep_last(QUEUE as usize)
     }
 
-    /// What a server offers of its statuses.
-    pub fn status_qos() -> Qos {
-        Qos::keep_last(1).latching(true)
+    /// Returns the QoS that a server offers for statuses.
+    pub fn status_qos() -> QosProfile {
+        QosProfile::keep_last(1).latching(true)
     }
 }

@@ -1,4 +1,4 @@
-//! What of a command line is for ROS 2, as rcl reads it
+//! ROS 2 arguments in a command line, as rcl parses them
 //! (<https://design.ros2.org/articles/ros_command_line_arguments.html>).
 //!
 //! ```text
@@ -8,12 +8,12 @@
 use super::names;
 use crate::identity::Naming;
 
-/// What follows is for ROS, up to the end or to [`END`].
+/// Begins arguments for ROS, which extend to the end or to [`END`].
 pub const BEGIN: &str = "--ros-args";
-/// What follows is the program's own again.
+/// Ends arguments for ROS; the program's own follow.
 pub const END: &str = "--";
 
-/// Arguments of ROS that have a value, beside those of rules and parameters.
+/// ROS arguments that take a value, besides those for rules and parameters.
 const SETTINGS: [&str; 5] = [
     "--log-level",
     "--log-config-file",
@@ -21,150 +21,151 @@ const SETTINGS: [&str; 5] = [
     "-e",
     "--enclave",
 ];
-/// What `--enable-…` and `--disable-…` are said of.
+/// Names that `--enable-…` and `--disable-…` may be followed by.
 const SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-logs"];
 
-/// A part of a command line, with the words that it is written by.
+/// A part of a command line, with the words it consists of.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Part {
-    /// As given.
+pub struct CommandLinePart {
+    /// The words, as given.
     pub words: Vec<String>,
-    /// What it is.
+    /// Meaning of the part.
     pub kind: Kind,
 }
 
-/// What a part of a command line is.
+/// Meaning of a part of a command line.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
-    /// The program's own.
+    /// An argument of the program.
     Own,
     /// [`BEGIN`] or [`END`].
     Mark,
-    /// A name is another one.
-    Rule(Rule),
-    /// A parameter has a value.
+    /// A remapping rule.
+    Rule(RemapRule),
+    /// A parameter assignment.
     Parameter(Parameter),
     /// A parameters file: its path.
     File(String),
-    /// Something else that rcl knows, such as a log level.
+    /// Another setting known to rcl, such as a log level.
     Setting,
 }
 
-/// `-r NODE:FROM:=TO`.
+/// A remapping rule `-r NODE:FROM:=TO`.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Rule {
-    /// The node that it holds for; all of the process where absent.
+pub struct RemapRule {
+    /// Node to which it applies; `None` for all nodes of the process.
     pub node: Option<String>,
-    /// What is renamed.
-    pub of: Renamed,
-    /// The old name, as written.
+    /// Kind of name that is remapped.
+    pub of: RemapTarget,
+    /// Old name, as written.
     pub from: String,
-    /// The new name.
+    /// New name.
     pub to: String,
 }
 
-impl Rule {
-    /// Whether it holds for the node of this name, without namespace.
-    pub fn concerns(&self, node: &str) -> bool {
+impl RemapRule {
+    /// Returns true if the rule applies to the node of this name, without namespace.
+    pub fn applies_to(&self, node: &str) -> bool {
         self.node.as_deref().is_none_or(|of| of == node)
     }
 }
 
-/// What a rule renames.
+/// Kind of name that a rule remaps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Renamed {
-    /// The node itself.
+pub enum RemapTarget {
+    /// The node's name.
     Node,
-    /// The namespace that it is in.
+    /// The node's namespace.
     Namespace,
-    /// Its topics and services.
+    /// Topics and services.
     Name,
-    /// Its topics alone.
+    /// Topics only.
     Topic,
-    /// Its services alone.
+    /// Services only.
     Service,
 }
 
-impl Renamed {
-    /// Whether it is a name of what the node has, and not its own.
+impl RemapTarget {
+    /// Returns true for names of topics or services, as opposed to the node's own.
     pub fn is_name(self) -> bool {
         !matches!(self, Self::Node | Self::Namespace)
     }
 }
 
-/// `-p NODE:NAME:=VALUE`.
+/// A parameter assignment `-p NODE:NAME:=VALUE`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
-    /// The node that it holds for; all of the process where absent.
+    /// Node to which it applies; `None` for all nodes of the process.
     pub node: Option<String>,
-    /// Its name; levels are parted by dots.
+    /// Name; levels are separated by dots.
     pub name: String,
-    /// Its value, as written: YAML.
+    /// Value, as written in YAML.
     pub value: String,
 }
 
 impl Parameter {
-    /// Whether it holds for another node than that of this absolute name. A command line names nodes without a namespace alone.
-    pub fn is_of_another(&self, node: &str) -> bool {
+    /// Returns true if the parameter is for another node than that of this absolute name. A command line can name only
+    /// nodes without a namespace.
+    pub fn is_for_other_node(&self, node: &str) -> bool {
         let of = self.node.as_deref();
         of.is_some_and(|of| node.strip_prefix('/') != Some(of))
     }
 }
 
-/// An argument that rcl would not take either.
+/// Error for an argument that rcl would not accept either.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ArgumentError {
-    /// Something should follow.
-    #[error("nothing stands after {flag}, the last argument: give {flag} {form}")]
+    /// A value is missing.
+    #[error("nothing follows {flag}, the last argument: give {flag} {form}")]
     NoValue {
         /// The argument.
         flag: String,
-        /// What should follow.
+        /// Form of the missing value.
         form: &'static str,
     },
-    /// What follows is not of the right form.
+    /// The value has the wrong form.
     #[error("{flag} {given}: {reason}; {form}")]
     Refused {
         /// The argument.
         flag: String,
-        /// What follows.
+        /// The value given.
         given: String,
-        /// What is wrong.
+        /// The problem.
         reason: String,
-        /// What is right.
+        /// The right form.
         form: &'static str,
     },
-    /// It is none of ROS 2's.
+    /// The argument is not one of ROS 2.
     #[error(
-        "{0} stands after {BEGIN} and is no argument of ROS 2; the program's own stand before {BEGIN} or after {END}"
+        "{0} follows {BEGIN} but is not a ROS 2 argument; put the program's own arguments before {BEGIN} or after {END}"
     )]
     Unknown(String),
 }
 
-/// What is right of a rule, and of a parameter.
+/// Descriptions of the right form of a rule and of a parameter.
 const RULES: &str = "a rule is FROM:=TO";
 const PARAMETERS: &str = "a parameter is given as NAME:=VALUE";
 
-/// The error of a parameter whose value is none, for this reason; `words` are those by which it was given.
-pub fn no_value(words: &[String], reason: &str) -> ArgumentError {
+/// Returns the error for a parameter with an invalid value; `words` are the words by which it was given.
+pub fn invalid_value(words: &[String], reason: &str) -> ArgumentError {
     match words {
-        [flag, given, ..] => refused(flag, given, reason, PARAMETERS),
-        _ => refused("-p", "", reason, PARAMETERS),
+        [flag, given, ..] => refused_error(flag, given, reason, PARAMETERS),
+        _ => refused_error("-p", "", reason, PARAMETERS),
     }
 }
 
-/// Takes a command line (without the program) apart.
+/// Parses a command line (without the program).
 ///
 /// # Errors
-/// The argument that rcl would not take either, and why not.
-pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
+/// Returns the argument that rcl would not accept either, with the reason.
+pub fn parse(argv: &[String]) -> Result<Vec<CommandLinePart>, ArgumentError> {
     let mut parts = Vec::new();
     let mut words = argv.iter();
     let mut for_ros = false;
     while let Some(word) = words.next() {
         let mut part = |words: Vec<&String>, kind| {
             let words = words.into_iter().cloned().collect();
-            parts.push(Part { words, kind });
+            parts.push(CommandLinePart { words, kind });
         };
         match &**word {
             BEGIN => {
@@ -176,27 +177,28 @@ pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
                 part(vec![word], Kind::Mark);
             }
             // As rcl did before there was --ros-args, and still does.
-            text if !for_ros => match rule(text) {
+            text if !for_ros => match parse_rule(text) {
                 Ok(rule) => part(vec![word], Kind::Rule(rule)),
                 Err(_) => part(vec![word], Kind::Own),
             },
             "-r" | "--remap" => {
-                let given = value_of(word, words.next(), "FROM:=TO")?;
-                let rule = rule(given).map_err(|reason| refused(word, given, &reason, RULES))?;
+                let given = take_value(word, words.next(), "FROM:=TO")?;
+                let rule = parse_rule(given)
+                    .map_err(|reason| refused_error(word, given, &reason, RULES))?;
                 part(vec![word, given], Kind::Rule(rule));
             }
             "-p" | "--param" => {
-                let given = value_of(word, words.next(), "NAME:=VALUE")?;
-                let parameter =
-                    parameter(given).map_err(|reason| refused(word, given, &reason, PARAMETERS))?;
+                let given = take_value(word, words.next(), "NAME:=VALUE")?;
+                let parameter = parse_parameter(given)
+                    .map_err(|reason| refused_error(word, given, &reason, PARAMETERS))?;
                 part(vec![word, given], Kind::Parameter(parameter));
             }
             "--params-file" => {
-                let given = value_of(word, words.next(), "FILE")?;
+                let given = take_value(word, words.next(), "FILE")?;
                 part(vec![word, given], Kind::File(given.clone()));
             }
             text if SETTINGS.contains(&text) => {
-                let given = value_of(word, words.next(), "VALUE")?;
+                let given = take_value(word, words.next(), "VALUE")?;
                 part(vec![word, given], Kind::Setting);
             }
             text if is_switch(text) => part(vec![word], Kind::Setting),
@@ -206,40 +208,42 @@ pub fn parse(argv: &[String]) -> Result<Vec<Part>, ArgumentError> {
     Ok(parts)
 }
 
-/// Whether a command line says in which namespace its nodes are; else their program may.
-pub fn gives_namespace(argv: &[String]) -> bool {
-    renames(argv, |rule| rule.of == Renamed::Namespace)
+/// Returns true if a command line sets the namespace of nodes; otherwise the program may.
+pub fn sets_namespace(argv: &[String]) -> bool {
+    has_rule(argv, |rule| rule.of == RemapTarget::Namespace)
 }
 
-/// Whether a command line says what some of its nodes are called; else their program does.
-pub fn gives_name(argv: &[String]) -> bool {
-    renames(argv, |rule| rule.of == Renamed::Node)
+/// Returns true if a command line sets the name of a node; otherwise the program does.
+pub fn sets_name(argv: &[String]) -> bool {
+    has_rule(argv, |rule| rule.of == RemapTarget::Node)
 }
 
-fn renames(argv: &[String], is_meant: impl Fn(&Rule) -> bool) -> bool {
+fn has_rule(argv: &[String], is_meant: impl Fn(&RemapRule) -> bool) -> bool {
     let parts = parse(argv).unwrap_or_default();
     let mut kinds = parts.iter().map(|part| &part.kind);
     kinds.any(|kind| matches!(kind, Kind::Rule(rule) if is_meant(rule)))
 }
 
-/// Of the nodes that run one program the one that a stub of it is called by: the only one, or the only one that is told no name.
-pub fn named_by_program<T>(mut nodes: Vec<T>, argv: impl Fn(&T) -> &[String]) -> Option<T> {
+/// Returns, among the nodes that run one program, the one that a stub of the program stands for: the only one, or the
+/// only one whose command line sets no name.
+pub fn node_for_stub<T>(mut nodes: Vec<T>, argv: impl Fn(&T) -> &[String]) -> Option<T> {
     if nodes.len() > 1 {
-        nodes.retain(|node| !gives_name(argv(node)));
+        nodes.retain(|node| !sets_name(argv(node)));
     }
     nodes.pop().filter(|_| nodes.is_empty())
 }
 
-/// What of its nodes' names a command line says to all of them, by rules that are not for one alone.
-pub fn says_to_all(argv: &[String]) -> Naming {
-    let says = |renamed: Renamed| renames(argv, |rule| rule.of == renamed && rule.node.is_none());
+/// Returns the parts of the node name that a command line sets for all nodes, by rules that are not for a single node.
+pub fn global_naming(argv: &[String]) -> Naming {
+    let says =
+        |renamed: RemapTarget| has_rule(argv, |rule| rule.of == renamed && rule.node.is_none());
     Naming {
-        name: says(Renamed::Node),
-        namespace: says(Renamed::Namespace),
+        name: says(RemapTarget::Node),
+        namespace: says(RemapTarget::Namespace),
     }
 }
 
-fn value_of<'a>(
+fn take_value<'a>(
     flag: &str,
     next: Option<&'a String>,
     form: &'static str,
@@ -250,7 +254,7 @@ fn value_of<'a>(
     })
 }
 
-fn refused(flag: &str, given: &str, reason: &str, form: &'static str) -> ArgumentError {
+fn refused_error(flag: &str, given: &str, reason: &str, form: &'static str) -> ArgumentError {
     ArgumentError::Refused {
         flag: flag.to_owned(),
         given: given.to_owned(),
@@ -266,7 +270,7 @@ fn is_switch(text: &str) -> bool {
     of.is_some_and(|of| SWITCHES.contains(&of))
 }
 
-/// A name of ROS 2 without slashes.
+/// Returns true for a ROS 2 name without slashes.
 pub fn is_token(text: &str) -> bool {
     text.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
         && text
@@ -274,31 +278,31 @@ pub fn is_token(text: &str) -> bool {
             .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
 }
 
-/// Whether a parameter of this name can be given on a command line; a file can give others.
-pub fn is_parameter(name: &str) -> bool {
+/// Returns true if a parameter of this name can be given on a command line; a file can contain others.
+pub fn is_parameter_name(name: &str) -> bool {
     name.split(['.', '/']).all(is_token)
 }
 
-fn halves(text: &str) -> Result<(&str, &str), String> {
+fn split_rule(text: &str) -> Result<(&str, &str), String> {
     text.split_once(":=")
         .ok_or_else(|| "it has no :=".to_owned())
 }
 
-/// `NODE:` before a name.
-fn with_node(text: &str) -> Result<(Option<String>, &str), String> {
+/// Splits off a `NODE:` prefix.
+fn split_node(text: &str) -> Result<(Option<String>, &str), String> {
     match text.split_once(':') {
         Some((node, rest)) if is_token(node) => Ok((Some(node.to_owned()), rest)),
-        Some((node, _)) => Err(format!("{node:?} is no name of a node")),
+        Some((node, _)) => Err(format!("{node:?} is not a node name")),
         None => Ok((None, text)),
     }
 }
 
-fn rule(text: &str) -> Result<Rule, String> {
-    let (from, to) = halves(text)?;
-    // Rules for topics or services alone.
+fn parse_rule(text: &str) -> Result<RemapRule, String> {
+    let (from, to) = split_rule(text)?;
+    // Rules for topics or services only.
     let kinds = [
-        ("rostopic://", Renamed::Topic),
-        ("rosservice://", Renamed::Service),
+        ("rostopic://", RemapTarget::Topic),
+        ("rosservice://", RemapTarget::Service),
     ];
     let below = |name| {
         let mut kinds = kinds.iter();
@@ -307,38 +311,38 @@ fn rule(text: &str) -> Result<Rule, String> {
     let (node, from, kind) = match below(from) {
         Some((name, of)) => (None, name, Some(of)),
         None => {
-            let (node, name) = with_node(from)?;
+            let (node, name) = split_node(from)?;
             let (name, of) = below(name).map_or((name, None), |(name, of)| (name, Some(of)));
             (node, name, of)
         }
     };
     let of = match (kind, from) {
-        (None, "__node" | "__name") => Renamed::Node,
-        (None, "__ns") => Renamed::Namespace,
-        (None, _) => Renamed::Name,
+        (None, "__node" | "__name") => RemapTarget::Node,
+        (None, "__ns") => RemapTarget::Namespace,
+        (None, _) => RemapTarget::Name,
         (Some(of), _) => of,
     };
     match of {
-        Renamed::Node if !is_token(to) => {
+        RemapTarget::Node if !is_token(to) => {
             return Err(format!(
-                "{to:?} is no name of a node (letters, digits and _; __ns:= sets the namespace)"
+                "{to:?} is not a node name (letters, digits and _; __ns:= sets the namespace)"
             ));
         }
-        Renamed::Namespace if to != "/" && !names::is_global(to) => {
+        RemapTarget::Namespace if to != "/" && !names::is_global(to) => {
             return Err(format!(
-                "{to:?} is no namespace, which begins with / and does not end with it"
+                "{to:?} is not a namespace, which begins with / and does not end with it"
             ));
         }
         of if of.is_name() => {
             for (side, name) in [("before", from), ("behind", to)] {
                 if !is_pattern(name) {
-                    return Err(format!("{name:?} {side} := is no name"));
+                    return Err(format!("{name:?} {side} := is not a name"));
                 }
             }
         }
         _ => {}
     }
-    Ok(Rule {
+    Ok(RemapRule {
         node,
         of,
         from: from.to_owned(),
@@ -346,17 +350,17 @@ fn rule(text: &str) -> Result<Rule, String> {
     })
 }
 
-/// What rcl's rules are made of; whether they make sense the node in the cloud says.
+/// Checks the characters that rcl allows in rules; whether the rule makes sense is left to the node in the cloud.
 fn is_pattern(name: &str) -> bool {
     let allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"_/~*\\.".contains(&byte);
     !name.is_empty() && name.bytes().all(allowed)
 }
 
-fn parameter(text: &str) -> Result<Parameter, String> {
-    let (name, text) = halves(text)?;
-    let (node, name) = with_node(name)?;
-    if !is_parameter(name) {
-        return Err(format!("{name:?} is no name of a parameter"));
+fn parse_parameter(text: &str) -> Result<Parameter, String> {
+    let (name, text) = split_rule(text)?;
+    let (node, name) = split_node(name)?;
+    if !is_parameter_name(name) {
+        return Err(format!("{name:?} is not a parameter name"));
     }
     Ok(Parameter {
         node,

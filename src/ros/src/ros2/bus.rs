@@ -1,21 +1,21 @@
-//! [`Bus`] over ROS 2: one DDS participant, a node with a name of its own, that publishes, subscribes, calls and serves on
-//! behalf of whoever holds the bus.
+//! [`Bus`] over ROS 2: one DDS participant, a node with its own name, that publishes, subscribes, calls and serves on
+//! behalf of the owner of the bus.
 //!
 //! ```text
-//!   discovered ──────────────┬─▶ watcher ─▶ Seen ─▶ graph, and all that follow it
+//!   DDS discovery ───────────┬─▶ watcher ─▶ DiscoverySnapshot ─▶ graph, and all that track it
 //!   ros_discovery_info ──────┘
-//!   subscribe ─▶ TopicIn ─▶ one reader per quality that publishers offer ─▶ all local queues
+//!   subscribe ─▶ TopicIn ─▶ one reader per quality offered by publishers ─▶ all local queues
 //!   advertise ─▶ one writer each;  its matched readers are its subscribers
-//!   call ─▶ Client: writer of requests, reader of replies, kept for the next call
+//!   call ─▶ ServiceClient: writer of requests, reader of replies, kept for the next call
 //!   serve ─▶ reader of requests ─▶ handler ─▶ writer of replies
 //! ```
-//! What this node has is told to the others in `ros_discovery_info`, by which they know whose an end is.
+//! This node's endpoints are announced to the others in `ros_discovery_info`, which attributes endpoints to nodes.
 //!
-//! Sinks are called while nobody holds the participant's lock. Readers and writers are made and dropped while no lock is held
-//! that a sink takes, because the participant's is taken for that.
+//! Sinks are called while the participant's lock is not held. Readers and writers are created and dropped only while no
+//! lock is held that a sink takes, because doing so takes the participant's lock.
 //!
-//! Actions are made of the same: `calls::client` and `services::serve` with names below `/_action/`, and `raw`, whose ends hear
-//! each other, because an action's client may have its server behind the same bus.
+//! Actions use the same parts: `calls::client_for` and `services::serve` with names below `/_action/`, and `raw`, whose
+//! endpoints hear each other, because an action's client may have its server behind the same bus.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
@@ -28,69 +28,69 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Config, Discovered, GuidPrefix, JoinError, Participant};
+use rtps::{Config, DiscoveredGraph, GuidPrefix, JoinError, Participant};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::timeout;
 
-use super::actions::Retired;
+use super::actions::RetiredServices;
 use super::calls::Clients;
-use super::ends::Own;
-use super::entities::{self, GidSize, Told};
+use super::ends::LocalEndpointTable;
+use super::entities::{self, GidSize, ParticipantTable};
 use super::lending::Loans;
-use super::place::Place;
+use super::place::BusSockets;
 use super::publications::Adverts;
 use super::raw::Hub;
-use super::seen::Seen;
-use super::services::Served;
-use super::subscriptions::Topics;
+use super::seen::DiscoverySnapshot;
+use super::services::ServedService;
+use super::subscriptions::TopicMap;
 use super::watcher::Watcher;
 use super::{actions, calls, names, publications, services, subscriptions, topic_type};
 use crate::JoinOptions;
 use crate::bus::{
     ActionClient, ActionHandler, ActionServer, Bus, BusError, Digest, Graph, Lending, NodeNames,
-    NodeParameters, Publisher, Qos, RosVersion, ServiceHandler, ServiceType, Subscription,
+    NodeParameters, Publisher, QosProfile, RosVersion, ServiceHandler, ServiceType, Subscription,
     WireFormat, WireType,
 };
 use crate::net::Sockets;
 use crate::schema::ActionDef;
 
-/// Of ROS 2's participants: which enclave of security they are in.
+/// User data of our participant: the security enclave, as ROS 2 participants announce it.
 const USER_DATA: &[u8] = b"enclave=/;";
-/// For what is queued when the bus closes.
+/// Time for queued data when the bus closes.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// A ROS 2 system as a [`Bus`]. Dropping it ends all that goes on, as [`Bus::close`] does, without waiting.
+/// A ROS 2 system as a [`Bus`]. Dropping it ends all activity, as [`Bus::close`] does, without waiting.
 pub struct Ros2Bus {
-    pub(super) inner: Arc<Inner>,
+    pub(super) inner: Arc<Ros2BusState>,
 }
 
-/// What all parts of a bus share.
-pub(super) struct Inner {
+/// State shared by all parts of a bus.
+pub(super) struct Ros2BusState {
     pub(super) participant: Participant,
-    /// The absolute name of this node.
+    /// Absolute name of this node.
     pub(super) node: String,
     distribution: String,
-    /// What the others tell of their nodes.
-    pub(super) told: Arc<Told>,
-    /// What this node has.
-    pub(super) own: Own,
-    pub(super) seen: watch::Sender<Arc<Seen>>,
+    /// Nodes announced by the other participants.
+    pub(super) told: Arc<ParticipantTable>,
+    /// Endpoints of this node.
+    pub(super) own: LocalEndpointTable,
+    pub(super) seen: watch::Sender<Arc<DiscoverySnapshot>>,
     pub(super) graph: watch::Sender<Arc<Graph>>,
     pub(super) hub: Hub,
-    pub(super) subscriptions: Topics,
+    pub(super) subscriptions: TopicMap,
     pub(super) adverts: Mutex<Adverts>,
     pub(super) clients: Clients,
-    pub(super) services: Mutex<HashMap<String, Arc<Served>>>,
-    /// What another system lends to the nodes of this one.
+    pub(super) services: Mutex<HashMap<String, Arc<ServedService>>>,
+    /// Services of another system lent to the nodes of this one.
     pub(super) loans: Loans,
-    /// Of servers of actions that are gone.
-    pub(super) retired: Retired,
+    /// Services of action servers that are gone.
+    pub(super) retired: RetiredServices,
     /// Changes with the services that are served here.
     pub(super) served: watch::Sender<u64>,
-    /// Hears what the others tell.
-    listening: Mutex<Option<rtps::Reader>>,
+    /// Reader of what the others announce.
+    listening: Mutex<Option<rtps::DataReader>>,
     closed: AtomicBool,
     runtime: Handle,
     tasks: Mutex<JoinSet<()>>,
@@ -107,7 +107,7 @@ impl Ros2Bus {
         }
         let prefix = GuidPrefix::random();
         let predecessors = match &options.succession {
-            Some(succession) => succession.joins(&options.node, prefix.0).await,
+            Some(succession) => succession.record_join(&options.node, prefix.0).await,
             None => Vec::new(),
         };
         let network = options.network;
@@ -126,27 +126,27 @@ impl Ros2Bus {
             predecessors: predecessors.into_iter().map(GuidPrefix).collect(),
             ..Config::new(options.domain, options.node.clone())
         };
-        let joined = Participant::join(Arc::new(Place(sockets)), config).await;
-        let participant = joined.map_err(not_joined)?;
-        let told = Arc::new(Told::default());
+        let joined = Participant::join(Arc::new(BusSockets(sockets)), config).await;
+        let participant = joined.map_err(join_error)?;
+        let told = Arc::new(ParticipantTable::default());
         let listening =
             participant.reader(entities::topic(), entities::qos(), Arc::clone(&told) as _);
         let teller = participant.writer(entities::topic(), entities::qos());
-        let inner = Arc::new(Inner {
+        let inner = Arc::new(Ros2BusState {
             participant,
             node: options.node,
             distribution: options.distribution,
             told,
-            own: Own::default(),
+            own: LocalEndpointTable::default(),
             seen: watch::Sender::default(),
             graph: watch::Sender::default(),
             hub: Hub::default(),
-            subscriptions: Topics::default(),
+            subscriptions: TopicMap::default(),
             adverts: Mutex::default(),
             clients: Clients::default(),
             services: Mutex::default(),
             loans: Loans::default(),
-            retired: Retired::default(),
+            retired: RetiredServices::default(),
             served: watch::Sender::default(),
             listening: Mutex::new(Some(listening)),
             closed: AtomicBool::new(false),
@@ -154,18 +154,18 @@ impl Ros2Bus {
             tasks: Mutex::default(),
         });
         let mut watcher = Watcher::new(Arc::clone(&inner), teller);
-        watcher.look();
+        watcher.refresh();
         inner.spawn(watcher.run());
         Ok(Arc::new(Self { inner }))
     }
 
-    /// The GUID of this node's participant.
+    /// Returns the GUID of this node's participant.
     pub fn guid(&self) -> rtps::Guid {
         self.inner.participant.guid()
     }
 }
 
-fn not_joined(error: JoinError) -> BusError {
+fn join_error(error: JoinError) -> BusError {
     let what = "joining ROS 2".to_owned();
     match error {
         JoinError::Socket(source) => BusError::Io { what, source },
@@ -178,7 +178,7 @@ fn not_joined(error: JoinError) -> BusError {
 
 impl Drop for Ros2Bus {
     fn drop(&mut self) {
-        self.inner.end();
+        self.inner.shut_down();
         let participant = self.inner.participant.clone();
         self.inner
             .runtime
@@ -196,8 +196,8 @@ impl fmt::Debug for Ros2Bus {
     }
 }
 
-impl Inner {
-    /// Runs a task that ends with the bus.
+impl Ros2BusState {
+    /// Spawns a task that ends with the bus.
     pub(super) fn spawn(&self, task: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
         let mut tasks = self.tasks.lock();
         while tasks.try_join_next().is_some() {}
@@ -208,9 +208,9 @@ impl Inner {
         handle
     }
 
-    /// Who is there, as the participant has it: the watcher may not have looked since.
-    pub(super) fn discovered(&self) -> Arc<Discovered> {
-        Arc::clone(&self.participant.discovered().borrow())
+    /// Returns the participant's current discovery state; the watcher may lag behind.
+    pub(super) fn discovery(&self) -> Arc<DiscoveredGraph> {
+        Arc::clone(&self.participant.watch_discovered().borrow())
     }
 
     /// Fails once the bus is closed.
@@ -221,7 +221,7 @@ impl Inner {
         Ok(())
     }
 
-    /// Whether it is an absolute name, and the bus is open.
+    /// Checks that the name is absolute and the bus open.
     pub(super) fn check_name(&self, name: &str) -> Result<(), BusError> {
         if !names::is_global(name) {
             return Err(BusError::BadName(name.to_owned()));
@@ -229,13 +229,13 @@ impl Inner {
         self.check_open()
     }
 
-    /// Ends all tasks, and all that came by this bus.
-    fn end(&self) {
+    /// Ends all tasks and everything that uses this bus.
+    fn shut_down(&self) {
         self.closed.store(true, Ordering::Release);
         self.tasks.lock().abort_all();
         let topics: Vec<_> = self.subscriptions.lock().drain().collect();
         for (_, topic) in topics {
-            topic.end();
+            topic.close();
         }
         let clients = std::mem::take(&mut *self.clients.lock());
         drop(clients);
@@ -246,13 +246,14 @@ impl Inner {
     }
 }
 
-/// A type by its name in ROS 2, in ROS 2's format where nothing is said of its definition.
-fn of_two(of: WireType) -> WireType {
+/// Converts to a type with its name in ROS 2, in ROS 2's format if its definition is unknown.
+fn to_ros2_type(of: WireType) -> WireType {
     WireType {
-        name: names::full(&of.name, "msg"),
-        format: match of.digest.is_any() {
-            true => WireFormat::Cdr,
-            false => of.format,
+        name: names::full_type_name(&of.name, "msg"),
+        format: if of.digest.is_any() {
+            WireFormat::Cdr
+        } else {
+            of.format
         },
         ..of
     }
@@ -264,7 +265,7 @@ impl Bus for Ros2Bus {
         RosVersion::Two
     }
 
-    /// What was said when it was joined, or what is seen of it: DDS does not tell.
+    /// Returns the distribution given when joining, or else a guess from what is discovered: DDS does not announce it.
     async fn distribution(&self) -> String {
         if !self.inner.distribution.is_empty() {
             return self.inner.distribution.clone();
@@ -279,8 +280,8 @@ impl Bus for Ros2Bus {
         &self.inner.node
     }
 
-    fn stands_for(&self, nodes: BTreeMap<String, NodeNames>) {
-        self.inner.own.stand_for(nodes);
+    fn set_represented_nodes(&self, nodes: BTreeMap<String, NodeNames>) {
+        self.inner.own.set_represented_nodes(nodes);
     }
 
     fn graph(&self) -> watch::Receiver<Arc<Graph>> {
@@ -291,20 +292,20 @@ impl Bus for Ros2Bus {
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Subscription, BusError> {
         self.inner.check_name(topic)?;
-        subscriptions::subscribe(&self.inner, topic, of_two(of), qos)
+        subscriptions::subscribe(&self.inner, topic, to_ros2_type(of), qos)
     }
 
     async fn advertise(
         &self,
         topic: &str,
         of: WireType,
-        qos: Qos,
+        qos: QosProfile,
     ) -> Result<Box<dyn Publisher>, BusError> {
         self.inner.check_name(topic)?;
-        publications::advertise(&self.inner, topic, of_two(of), qos).await
+        publications::advertise(&self.inner, topic, to_ros2_type(of), qos).await
     }
 
     async fn call_typed(
@@ -320,7 +321,7 @@ impl Bus for Ros2Bus {
 
     async fn service_type(&self, service: &str) -> Result<ServiceType, BusError> {
         self.inner.check_name(service)?;
-        calls::find(&self.inner, service, calls::GRACE).await
+        calls::find_type(&self.inner, service, calls::GRACE).await
     }
 
     async fn topic_type(&self, topic: &str) -> Result<WireType, BusError> {
@@ -336,7 +337,7 @@ impl Bus for Ros2Bus {
     ) -> Result<Box<dyn Send + Sync>, BusError> {
         self.inner.check_name(service)?;
         let of = ServiceType {
-            name: names::full(&service_type.name, "srv"),
+            name: names::full_type_name(&service_type.name, "srv"),
             format: WireFormat::Cdr,
             ..service_type
         };
@@ -349,7 +350,11 @@ impl Bus for Ros2Bus {
         of: &Arc<ActionDef>,
     ) -> Result<Box<dyn ActionClient>, BusError> {
         self.inner.check_name(action)?;
-        Ok(Box::new(actions::Client::open(&self.inner, action, of)?))
+        Ok(Box::new(actions::Ros2ActionClient::open(
+            &self.inner,
+            action,
+            of,
+        )?))
     }
 
     fn serve_action(
@@ -359,7 +364,7 @@ impl Bus for Ros2Bus {
         handler: Arc<dyn ActionHandler>,
     ) -> Result<Box<dyn ActionServer>, BusError> {
         self.inner.check_name(action)?;
-        let server = actions::Server::open(&self.inner, action, of, handler)?;
+        let server = actions::Ros2ActionServer::open(&self.inner, action, of, handler)?;
         Ok(Box::new(server))
     }
 
@@ -371,17 +376,17 @@ impl Bus for Ros2Bus {
         Ok(self)
     }
 
-    fn process_ended(&self) {
-        self.inner.participant.look_at_ports();
+    fn on_process_exit(&self) {
+        self.inner.participant.check_ports();
     }
 
     async fn close(&self) {
         if self.inner.closed.swap(true, Ordering::AcqRel) {
             return;
         }
-        // What was published or answered until now is still to come.
-        let _ = timeout(FAREWELL, self.inner.participant.settled()).await;
-        self.inner.end();
+        // Data published or answers given until now are still to be sent.
+        let _ = timeout(FAREWELL, self.inner.participant.wait_acknowledged()).await;
+        self.inner.shut_down();
         self.inner.participant.close().await;
     }
 }

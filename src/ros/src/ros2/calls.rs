@@ -1,4 +1,4 @@
-//! Calls to services: a client of each service that is called, kept for the next call.
+//! Calls to services: one client per called service, kept for the next call.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -8,53 +8,54 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::time::timeout;
 
-use super::bus::Inner;
-pub(super) use super::client::Client;
-use super::seen::Seen;
+use super::bus::Ros2BusState;
+pub(super) use super::client::ServiceClient;
+use super::seen::DiscoverySnapshot;
 use super::{names, node_ends, services};
 use crate::bus::{BusError, Digest, ServiceType};
 
-/// For a service that somebody has just begun to serve to be discovered.
+/// Time for a service that was just started to be discovered.
 pub(super) const GRACE: Duration = Duration::from_millis(300);
-/// Clients that are kept.
+/// Maximum number of clients that are kept.
 const MAX_CLIENTS: usize = 256;
 
-/// Calls once. A server whose type is known to have another digest than this one is not asked.
+/// Calls a service once. Fails without sending the request if the server's type is known to have another digest than
+/// `digest`.
 pub(super) async fn call(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros2BusState>,
     service: &str,
     digest: &Digest,
     request: Bytes,
     time: Duration,
 ) -> Result<Bytes, BusError> {
     let begun = Instant::now();
-    let of = find(bus, service, time.min(GRACE)).await?;
-    // What an end tells is the hash of its requests; whoever has only that may give it.
-    if !of.digest.agrees(digest) && of.request != *digest {
+    let of = find_type(bus, service, time.min(GRACE)).await?;
+    // An endpoint announces the hash of its requests; a caller that has only that may pass it.
+    if !of.digest.is_compatible_with(digest) && of.request != *digest {
         return Err(BusError::TypeMismatch {
             what: format!("service {service}"),
             theirs: format!("{} {}", of.name, of.digest),
             ours: digest.to_string(),
         });
     }
-    let client = client(bus, service, &of)?;
+    let client = client_for(bus, service, &of)?;
     let left = time.saturating_sub(begun.elapsed());
     client.call(request, left).await
 }
 
-/// The type of a service by its server: its name and the hashes that its ends tell.
-pub(super) async fn find(
-    bus: &Arc<Inner>,
+/// Returns the type of a service according to its server: its name and the hashes that its endpoints announce.
+pub(super) async fn find_type(
+    bus: &Arc<Ros2BusState>,
     service: &str,
     patience: Duration,
 ) -> Result<ServiceType, BusError> {
-    if let Some(served) = services::here(bus, service) {
+    if let Some(served) = services::local_service(bus, service) {
         return Ok(served.of.clone());
     }
     let mut seen = bus.seen.subscribe();
     let found = timeout(patience, async {
         loop {
-            if let Some(found) = served(&seen.borrow_and_update(), service) {
+            if let Some(found) = served_type(&seen.borrow_and_update(), service) {
                 return Ok(found);
             }
             seen.changed().await.map_err(|_| BusError::Closed)?;
@@ -66,42 +67,42 @@ pub(super) async fn find(
     }
 }
 
-fn served(seen: &Seen, service: &str) -> Option<ServiceType> {
+fn served_type(seen: &DiscoverySnapshot, service: &str) -> Option<ServiceType> {
     let request = seen.readers(&names::request_name(service));
     let mut servers = request.iter();
     servers.find_map(|end| node_ends::service_type(seen, end, service, false))
 }
 
 /// Clients that are kept, by service and type.
-pub(super) type Clients = Mutex<HashMap<(String, String), Arc<Client>>>;
+pub(super) type Clients = Mutex<HashMap<(String, String), Arc<ServiceClient>>>;
 
-/// The client of a service; of one service and type there is one.
-pub(super) fn client(
-    bus: &Arc<Inner>,
+/// Returns the client of a service; there is one per service and type.
+pub(super) fn client_for(
+    bus: &Arc<Ros2BusState>,
     service: &str,
     of: &ServiceType,
-) -> Result<Arc<Client>, BusError> {
+) -> Result<Arc<ServiceClient>, BusError> {
     bus.check_open()?;
     let key = (service.to_owned(), of.name.clone());
     if let Some(known) = bus.clients.lock().get(&key) {
         return Ok(Arc::clone(known));
     }
-    let made = Arc::new(Client::open(bus, service, of)?);
+    let made = Arc::new(ServiceClient::open(bus, service, of)?);
     let mut idle = Vec::new();
     let mut clients = bus.clients.lock();
     if clients.len() >= MAX_CLIENTS {
         idle.extend(clients.extract_idle(|_, _| true));
     }
     let kept = Arc::clone(clients.entry(key).or_insert(made));
-    // What is dropped withdraws its ends, outside of the lock.
+    // Dropping a client withdraws its endpoints, so it happens outside the lock.
     drop(clients);
     drop(idle);
     Ok(kept)
 }
 
-/// Lets go of clients of services that nobody serves any more.
-pub(super) fn forget_unserved(bus: &Inner, seen: &Seen) {
-    let idle: Vec<Arc<Client>> = bus
+/// Drops clients of services that no node serves any more.
+pub(super) fn drop_unserved_clients(bus: &Ros2BusState, seen: &DiscoverySnapshot) {
+    let idle: Vec<Arc<ServiceClient>> = bus
         .clients
         .lock()
         .extract_idle(|service, _| seen.readers(&names::request_name(service)).is_empty());
@@ -109,12 +110,18 @@ pub(super) fn forget_unserved(bus: &Inner, seen: &Seen) {
 }
 
 trait ExtractIdle {
-    fn extract_idle(&mut self, wanted: impl Fn(&str, &Client) -> bool) -> Vec<Arc<Client>>;
+    fn extract_idle(
+        &mut self,
+        wanted: impl Fn(&str, &ServiceClient) -> bool,
+    ) -> Vec<Arc<ServiceClient>>;
 }
 
-impl ExtractIdle for HashMap<(String, String), Arc<Client>> {
-    /// Takes out those that nobody uses.
-    fn extract_idle(&mut self, wanted: impl Fn(&str, &Client) -> bool) -> Vec<Arc<Client>> {
+impl ExtractIdle for HashMap<(String, String), Arc<ServiceClient>> {
+    /// Takes out those that are not in use.
+    fn extract_idle(
+        &mut self,
+        wanted: impl Fn(&str, &ServiceClient) -> bool,
+    ) -> Vec<Arc<ServiceClient>> {
         let mut taken = Vec::new();
         self.retain(|(service, _), client| {
             let idle = Arc::strong_count(client) == 1 && wanted(service, client);

@@ -1,9 +1,10 @@
-//! Nodes that are loaded into one process with others: a component container serves what loads them
-//! (`composition_interfaces/srv/LoadNode`; <https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Composition.html>).
+//! Nodes loaded into one process with others: a component container serves the loading of nodes
+//! (`composition_interfaces/srv/LoadNode`;
+//! <https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Composition.html>).
 //!
 //! ```text
-//!  container ──serves load_node?──▶ list_nodes ──▶ load_node, one after the other, of those that it has not ──▶ names
-//!                  └─ not in time ─────────────────────────┴─ says no ─▶ NotLoaded
+//!  container ──serves load_node?──▶ list_nodes ──▶ load_node for each missing one, in order ──▶ names
+//!                  └─ not in time ─────────────────────────┴─ failure ─▶ NotLoaded
 //! ```
 
 use std::sync::Arc;
@@ -18,42 +19,42 @@ use crate::bus::{Bus, BusError, Graph, ServiceType};
 use crate::codec::{CodecError, FillOptions, JsonOptions, from_json, to_json};
 use crate::schema::{MessageType, Registry, SchemaError, ServiceDef};
 
-/// The service that loads a node.
+/// Service type that loads a node.
 const LOAD: &str = "composition_interfaces/srv/LoadNode";
-/// The one that tells which are loaded.
+/// Service type that lists the loaded nodes.
 const LIST: &str = "composition_interfaces/srv/ListNodes";
-/// Types that must be defined where nodes are to be loaded; how is up to the image.
+/// Types whose definitions are needed to load nodes; the image must provide them.
 pub const SERVICES: [&str; 2] = [LOAD, LIST];
 
-/// A node that is to be loaded. As JSON it is the request of `composition_interfaces/srv/LoadNode`.
+/// A node to be loaded. Its JSON form is the request of `composition_interfaces/srv/LoadNode`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Component {
-    /// The package that has registered it.
+    /// Package that registers the component.
     #[serde(rename = "package_name")]
     pub package: String,
-    /// Its class, such as `talkers::Talker`.
+    /// Class, such as `talkers::Talker`.
     #[serde(rename = "plugin_name")]
     pub plugin: String,
-    /// What it is called; empty: what it calls itself.
+    /// Node name; empty for the name that the program sets.
     #[serde(rename = "node_name", default)]
     pub name: String,
-    /// Where it is; empty: where it puts itself.
+    /// Node namespace; empty for the namespace that the program sets.
     #[serde(rename = "node_namespace", default)]
     pub namespace: String,
-    /// `FROM:=TO`.
+    /// Remapping rules, `FROM:=TO`.
     #[serde(default)]
     pub remap_rules: Vec<String>,
-    /// Each a `rcl_interfaces/msg/Parameter`.
+    /// Parameters, each a `rcl_interfaces/msg/Parameter`.
     #[serde(default)]
     pub parameters: Vec<Value>,
-    /// For the container: each a `rcl_interfaces/msg/Parameter`.
+    /// Arguments for the container, each a `rcl_interfaces/msg/Parameter`.
     #[serde(default)]
     pub extra_arguments: Vec<Value>,
 }
 
 impl Component {
-    /// Its absolute name; none where its program says it.
+    /// Returns the absolute name; `None` if the program determines it.
     pub fn full_name(&self) -> Option<String> {
         let renamed = self.remap_rules.iter().any(|rule| rule.starts_with("__"));
         let known = !self.name.is_empty() && !renamed;
@@ -65,19 +66,19 @@ impl Component {
     }
 }
 
-/// Why a container has not loaded a node.
+/// Error of a container that did not load a node.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the component container {container} does not load {}: {reason}", shown(.name, .plugin, .package))]
 pub struct NotLoaded {
-    /// The container's absolute name.
+    /// Absolute name of the container.
     pub container: String,
-    /// The node's absolute name, as far as it is known.
+    /// Absolute name of the node, if known.
     pub name: Option<String>,
-    /// Its class.
+    /// Class of the node.
     pub plugin: String,
-    /// The class's package.
+    /// Package of the class.
     pub package: String,
-    /// What the container said, or what kept it from saying anything.
+    /// The container's reason, or the reason for its silence.
     pub reason: String,
 }
 
@@ -89,20 +90,20 @@ fn shown(name: &Option<String>, plugin: &str, package: &str) -> String {
     }
 }
 
-/// A process that nodes are loaded into.
-pub struct Container {
+/// A component container: a process into which nodes are loaded.
+pub struct ComponentContainer {
     bus: Arc<dyn Bus>,
     node: String,
     load: Arc<ServiceDef>,
     list: Arc<ServiceDef>,
 }
 
-impl Container {
-    /// The one of this absolute name, by the definitions of its image.
+impl ComponentContainer {
+    /// Returns the container of this absolute name, with the definitions of its image.
     ///
     /// # Errors
-    /// The image has none of `composition_interfaces`.
-    pub fn of(bus: Arc<dyn Bus>, registry: &Registry, node: &str) -> Result<Self, SchemaError> {
+    /// The image has no definitions of `composition_interfaces`.
+    pub fn new(bus: Arc<dyn Bus>, registry: &Registry, node: &str) -> Result<Self, SchemaError> {
         Ok(Self {
             bus,
             node: node.to_owned(),
@@ -111,11 +112,12 @@ impl Container {
         })
     }
 
-    /// Loads these in their order, but for those that are loaded already: their absolute names. The container may take as long as
-    /// `patience` to serve what loads them, and then for each of them: some load what they need when they are made.
+    /// Loads these components in order, except those that are already loaded; returns their absolute names. The
+    /// container may take up to `patience` to serve the loading service, and again for each component: some load what
+    /// they need when they are created.
     ///
     /// # Errors
-    /// The first one that is not loaded; those behind it are not tried.
+    /// The first component that is not loaded; later ones are not tried.
     pub async fn load_all(
         &self,
         components: &[Component],
@@ -124,14 +126,14 @@ impl Container {
         let Some(first) = components.first() else {
             return Ok(Vec::new());
         };
-        let served = self.served(patience).await;
+        let served = self.wait_until_served(patience).await;
         let there = match served {
-            Ok(()) => self.loaded(patience).await,
+            Ok(()) => self.loaded_nodes(patience).await,
             Err(reason) => Err(reason),
         };
         let there = there.map_err(|reason| self.not_loaded(first, reason))?;
         let mut names = there.clone();
-        for component in left(components, there) {
+        for component in missing_components(components, there) {
             let loaded = self.load(component, patience).await;
             names.push(loaded.map_err(|reason| self.not_loaded(component, reason))?);
         }
@@ -142,9 +144,9 @@ impl Container {
         format!("{}/_container/{part}", self.node)
     }
 
-    async fn served(&self, patience: Duration) -> Result<(), String> {
+    async fn wait_until_served(&self, patience: Duration) -> Result<(), String> {
         let service = self.service("load_node");
-        // What tools hide is among the ends alone.
+        // Items hidden from tools are found in the endpoints only.
         let there = |graph: &Arc<Graph>| {
             let ends = graph.ends.get(&self.node);
             ends.is_some_and(|ends| ends.services.contains_key(&service))
@@ -154,17 +156,18 @@ impl Container {
             Ok(Ok(_)) => Ok(()),
             Ok(Err(_)) => Err(BusError::Closed.to_string()),
             Err(_) => Err(format!(
-                "it did not serve {service} within {patience:?}: it is no component container, or waits for something (see its log)"
+                "it did not serve {service} within {patience:?}: it is not a component container, or is still waiting \
+                    (see its log)"
             )),
         }
     }
 
-    /// Names of the nodes that it has loaded, in the order in which it has.
-    async fn loaded(&self, patience: Duration) -> Result<Vec<String>, String> {
-        let answer = match self.ask("list_nodes", &self.list, b"{}", patience).await {
+    /// Returns the names of the nodes that the container has loaded, in order.
+    async fn loaded_nodes(&self, patience: Duration) -> Result<Vec<String>, String> {
+        let answer = match self.call("list_nodes", &self.list, b"{}", patience).await {
             Ok(answer) => answer,
-            // One that does not tell was made by somebody else, and has begun just now.
-            Err(Asked::Bus(BusError::NoService(_))) => return Ok(Vec::new()),
+            // A container that does not list nodes is of another make and has just started.
+            Err(CallFailure::Bus(BusError::NoService(_))) => return Ok(Vec::new()),
             Err(other) => return Err(other.to_string()),
         };
         let names = answer["full_node_names"].as_array();
@@ -174,7 +177,7 @@ impl Container {
 
     async fn load(&self, component: &Component, patience: Duration) -> Result<String, String> {
         let request = serde_json::to_vec(component).unwrap_or_default();
-        let asked = self.ask("load_node", &self.load, &request, patience).await;
+        let asked = self.call("load_node", &self.load, &request, patience).await;
         let answer = asked.map_err(|error| error.to_string())?;
         let text = |field: &str| answer[field].as_str().unwrap_or_default().to_owned();
         match (answer["success"].as_bool(), text("error_message")) {
@@ -184,21 +187,21 @@ impl Container {
         }
     }
 
-    /// Calls once: the answer as JSON.
-    async fn ask(
+    /// Calls a service once; returns the answer as JSON.
+    async fn call(
         &self,
         part: &str,
         of: &ServiceDef,
         request: &[u8],
         patience: Duration,
-    ) -> Result<Value, Asked> {
+    ) -> Result<Value, CallFailure> {
         let mut bytes = Vec::new();
         from_json(&of.request, request, &mut bytes, &FillOptions::default())?;
-        let (service, digest) = (self.service(part), ServiceType::of(of).digest);
+        let (service, digest) = (self.service(part), ServiceType::from_service(of).digest);
         let answer = self
             .bus
             .call_typed(&service, &digest, bytes.into(), patience);
-        read(&of.response, &answer.await?)
+        to_json_value(&of.response, &answer.await?)
     }
 
     fn not_loaded(&self, component: &Component, reason: String) -> NotLoaded {
@@ -212,9 +215,9 @@ impl Container {
     }
 }
 
-/// Those that are not among the names that are there. A name that none of them has by itself is one that a node gave itself: of those
-/// the first ones were loaded.
-fn left(components: &[Component], mut there: Vec<String>) -> Vec<&Component> {
+/// Returns the components that are not among the loaded names. A loaded name that no component sets was chosen by a
+/// node itself: that many of the components without a name are taken as loaded, the first ones.
+fn missing_components(components: &[Component], mut there: Vec<String>) -> Vec<&Component> {
     let mut take = |name: &String| {
         let found = there.iter().position(|other| other == name);
         found.map(|at| there.swap_remove(at)).is_some()
@@ -231,16 +234,16 @@ fn left(components: &[Component], mut there: Vec<String>) -> Vec<&Component> {
 }
 
 #[derive(Debug, thiserror::Error)]
-enum Asked {
+enum CallFailure {
     #[error(transparent)]
     Bus(#[from] BusError),
     #[error(transparent)]
     Codec(#[from] CodecError),
-    #[error("its answer is no JSON: {0}")]
+    #[error("its answer is not JSON: {0}")]
     Json(#[from] serde_json::Error),
 }
 
-fn read(of: &MessageType, answer: &Bytes) -> Result<Value, Asked> {
+fn to_json_value(of: &MessageType, answer: &Bytes) -> Result<Value, CallFailure> {
     let mut json = Vec::new();
     to_json(of, answer, &mut json, &JsonOptions::default())?;
     Ok(serde_json::from_slice(&json)?)
@@ -288,7 +291,7 @@ mod tests {
         ];
         let still = |there: &[&str]| {
             let there = there.iter().map(|&name| name.to_owned()).collect();
-            let left = left(&all, there).into_iter();
+            let left = missing_components(&all, there).into_iter();
             left.map(|one| one.full_name()).collect::<Vec<_>>()
         };
         let (a, b) = (Some("/a".to_owned()), Some("/x/b".to_owned()));

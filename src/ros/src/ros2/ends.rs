@@ -1,39 +1,46 @@
-//! The readers and writers of this node, which is what the others are told that it has.
+//! The readers and writers of this node, which are announced to other nodes.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{EndpointQos, Ends, Guid, SampleIdentity, SequenceNumber, Sink, Topic};
+use rtps::{
+    EndpointMatches, EndpointQos, Guid, SampleIdentity, SequenceNumber, Sink, TopicDescription,
+};
 use tokio::sync::watch;
 
-use super::bus::Inner;
-use super::entities::Node;
-use super::names::{self, Named};
+use super::bus::Ros2BusState;
+use super::entities::DiscoveredNode;
+use super::names::{self, RosTopicRole};
 use crate::bus::NodeNames;
 
-/// One end of this node.
+/// One endpoint of this node.
 #[derive(Debug, Clone)]
-pub(super) struct OwnEnd {
-    /// As DDS has it.
+pub(super) struct LocalEndpoint {
+    /// Name in DDS.
     pub(super) topic: String,
-    /// As DDS has it.
+    /// Type name in DDS.
     pub(super) type_name: String,
 }
 
-/// The ends of this node at one moment.
+/// Snapshot of this node's endpoints.
 #[derive(Debug, Clone, Default)]
-pub(super) struct OwnEnds {
-    pub(super) readers: BTreeMap<Guid, OwnEnd>,
-    pub(super) writers: BTreeMap<Guid, OwnEnd>,
+pub(super) struct LocalEndpoints {
+    pub(super) readers: BTreeMap<Guid, LocalEndpoint>,
+    pub(super) writers: BTreeMap<Guid, LocalEndpoint>,
 }
 
-impl OwnEnds {
-    /// What the others are told: the nodes that this one stands for, or else this node, of this name. An end may be of several; what is of none is the
-    /// node's of this name, or, where the program has called none so, the first one's.
-    pub(super) fn nodes(&self, own: &str, others: &BTreeMap<String, NodeNames>) -> Vec<Node> {
-        let mut nodes: BTreeMap<&str, Node> = BTreeMap::new();
+impl LocalEndpoints {
+    /// Returns the nodes to announce: the nodes that this one represents or, without any, the node `own`. An endpoint
+    /// may belong to several of them; one that belongs to none is attributed to the node `own` or, if the program has
+    /// no node of that name, to the first one.
+    pub(super) fn nodes(
+        &self,
+        own: &str,
+        others: &BTreeMap<String, NodeNames>,
+    ) -> Vec<DiscoveredNode> {
+        let mut nodes: BTreeMap<&str, DiscoveredNode> = BTreeMap::new();
         let mut names: Vec<&str> = others.keys().map(String::as_str).collect();
         let own = match names.first() {
             Some(first) if !names.contains(&own) => first,
@@ -44,7 +51,7 @@ impl OwnEnds {
             }
         };
         for name in names {
-            let node = Node {
+            let node = DiscoveredNode {
                 name: name.into(),
                 readers: Vec::new(),
                 writers: Vec::new(),
@@ -56,7 +63,7 @@ impl OwnEnds {
             .into_iter()
             .flat_map(|(ends, writes)| ends.iter().map(move |(guid, end)| (guid, end, writes)))
         {
-            let has = |names: &NodeNames| end.is_among(names, writes);
+            let has = |names: &NodeNames| end.belongs_to(names, writes);
             let mut owners: Vec<&str> = others
                 .iter()
                 .filter(|(_, names)| has(names))
@@ -67,9 +74,10 @@ impl OwnEnds {
             }
             for node in owners {
                 if let Some(node) = nodes.get_mut(node) {
-                    let ends = match writes {
-                        true => &mut node.writers,
-                        false => &mut node.readers,
+                    let ends = if writes {
+                        &mut node.writers
+                    } else {
+                        &mut node.readers
                     };
                     ends.push(*guid);
                 }
@@ -79,81 +87,80 @@ impl OwnEnds {
     }
 }
 
-impl OwnEnd {
-    /// Whether it is one of what a node has.
-    fn is_among(&self, names: &NodeNames, writes: bool) -> bool {
-        match (names::named(&self.topic), writes) {
-            (Some(Named::Topic(name)), true) => names.publishes.contains(&name),
-            (Some(Named::Topic(name)), false) => names.subscribes.contains(&name),
-            // Those of clients are the other way round.
-            (Some(Named::Request(name)), false) | (Some(Named::Reply(name)), true) => {
-                names.serves.contains(&name)
-            }
+impl LocalEndpoint {
+    /// Returns true if the endpoint is one of those that a node has.
+    fn belongs_to(&self, names: &NodeNames, writes: bool) -> bool {
+        match (names::topic_role(&self.topic), writes) {
+            (Some(RosTopicRole::Topic(name)), true) => names.publishes.contains(&name),
+            (Some(RosTopicRole::Topic(name)), false) => names.subscribes.contains(&name),
+            // The endpoints of clients are the other way round.
+            (Some(RosTopicRole::Request(name)), false)
+            | (Some(RosTopicRole::Reply(name)), true) => names.serves.contains(&name),
             _ => false,
         }
     }
 }
 
-/// The ends of this node.
+/// Table of this node's endpoints.
 #[derive(Default)]
-pub(super) struct Own {
-    ends: Mutex<OwnEnds>,
-    /// Nodes that this one stands for, by name; it may be among them.
+pub(super) struct LocalEndpointTable {
+    ends: Mutex<LocalEndpoints>,
+    /// Represented nodes, by name; may include this one.
     others: Mutex<BTreeMap<String, NodeNames>>,
     changes: watch::Sender<u64>,
 }
 
-impl Own {
-    /// Changes with every change.
+impl LocalEndpointTable {
+    /// Returns a counter of changes.
     pub(super) fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }
 
-    /// All of them now.
-    pub(super) fn ends(&self) -> OwnEnds {
+    /// Returns a snapshot of the endpoints.
+    pub(super) fn ends(&self) -> LocalEndpoints {
         self.ends.lock().clone()
     }
 
-    /// Whose they are told to be from now on.
-    pub(super) fn stand_for(&self, mut nodes: BTreeMap<String, NodeNames>) {
+    /// Sets the nodes to which the endpoints are attributed.
+    pub(super) fn set_represented_nodes(&self, mut nodes: BTreeMap<String, NodeNames>) {
         nodes.retain(|name, _| names::is_global(name));
         *self.others.lock() = nodes;
         self.changes.send_modify(|number| *number += 1);
     }
 
-    /// What the others are told of these.
-    pub(super) fn told(&self, ends: &OwnEnds, own: &str) -> Vec<Node> {
+    /// Returns the nodes to announce for these endpoints.
+    pub(super) fn announced_nodes(&self, ends: &LocalEndpoints, own: &str) -> Vec<DiscoveredNode> {
         ends.nodes(own, &self.others.lock())
     }
 
-    fn change(&self, by: impl FnOnce(&mut OwnEnds)) {
+    fn change(&self, by: impl FnOnce(&mut LocalEndpoints)) {
         by(&mut self.ends.lock());
         self.changes.send_modify(|number| *number += 1);
     }
 }
 
-fn own_end(topic: &Topic) -> OwnEnd {
-    OwnEnd {
+fn local_endpoint(topic: &TopicDescription) -> LocalEndpoint {
+    LocalEndpoint {
         topic: topic.name.clone(),
         type_name: topic.type_name.clone(),
     }
 }
 
-/// A reader of this node, until it is dropped.
+/// A reader of this node, announced until it is dropped.
 pub(super) struct ReaderEnd {
-    bus: Arc<Inner>,
-    reader: rtps::Reader,
+    bus: Arc<Ros2BusState>,
+    reader: rtps::DataReader,
 }
 
 impl ReaderEnd {
     pub(super) fn open(
-        bus: &Arc<Inner>,
-        topic: &Topic,
+        bus: &Arc<Ros2BusState>,
+        topic: &TopicDescription,
         qos: EndpointQos,
         sink: Arc<dyn Sink>,
     ) -> Self {
         let reader = bus.participant.reader(topic.clone(), qos, sink);
-        let end = own_end(topic);
+        let end = local_endpoint(topic);
         bus.own
             .change(|ends| drop(ends.readers.insert(reader.guid(), end)));
         let bus = Arc::clone(bus);
@@ -164,8 +171,8 @@ impl ReaderEnd {
         self.reader.guid()
     }
 
-    pub(super) fn ends(&self) -> watch::Receiver<Arc<Ends>> {
-        self.reader.ends()
+    pub(super) fn ends(&self) -> watch::Receiver<Arc<EndpointMatches>> {
+        self.reader.watch_matches()
     }
 }
 
@@ -176,16 +183,20 @@ impl Drop for ReaderEnd {
     }
 }
 
-/// A writer of this node, until it is dropped.
+/// A writer of this node, announced until it is dropped.
 pub(super) struct WriterEnd {
-    bus: Arc<Inner>,
-    writer: rtps::Writer,
+    bus: Arc<Ros2BusState>,
+    writer: rtps::DataWriter,
 }
 
 impl WriterEnd {
-    pub(super) fn open(bus: &Arc<Inner>, topic: &Topic, qos: EndpointQos) -> Self {
+    pub(super) fn open(
+        bus: &Arc<Ros2BusState>,
+        topic: &TopicDescription,
+        qos: EndpointQos,
+    ) -> Self {
         let writer = bus.participant.writer(topic.clone(), qos);
-        let end = own_end(topic);
+        let end = local_endpoint(topic);
         bus.own
             .change(|ends| drop(ends.writers.insert(writer.guid(), end)));
         let bus = Arc::clone(bus);
@@ -196,8 +207,8 @@ impl WriterEnd {
         self.writer.guid()
     }
 
-    pub(super) fn ends(&self) -> watch::Receiver<Arc<Ends>> {
-        self.writer.ends()
+    pub(super) fn ends(&self) -> watch::Receiver<Arc<EndpointMatches>> {
+        self.writer.watch_matches()
     }
 
     pub(super) fn write(&self, payload: Bytes) -> SequenceNumber {
@@ -208,9 +219,9 @@ impl WriterEnd {
         self.writer.write_related(payload, related)
     }
 
-    /// Samples that a slow reader was not given.
-    pub(super) fn dropped(&self) -> u64 {
-        self.writer.dropped()
+    /// Returns the number of samples dropped for slow readers.
+    pub(super) fn dropped_count(&self) -> u64 {
+        self.writer.dropped_samples()
     }
 }
 
@@ -228,13 +239,13 @@ mod tests {
     #[test]
     fn ends_are_told_to_be_of_the_nodes_that_have_them() {
         let end = |number: u8, topic: &str| {
-            let end = OwnEnd {
+            let end = LocalEndpoint {
                 topic: topic.to_owned(),
                 type_name: "T".to_owned(),
             };
             (Guid::from([number; 16]), end)
         };
-        let ends = OwnEnds {
+        let ends = LocalEndpoints {
             readers: [
                 end(1, "rt/scan"),
                 end(2, "rq/mouth/setRequest"),
@@ -257,7 +268,7 @@ mod tests {
         };
         let mouth = NodeNames {
             publishes: set(&["/rosout"]),
-            // A client of what it calls so is none of its servers.
+            // A client of the service is not one of its servers.
             serves: set(&["/mouth/set"]),
             ..NodeNames::default()
         };
@@ -265,7 +276,7 @@ mod tests {
             let numbers =
                 |ends: &[Guid]| ends.iter().map(|guid| guid.bytes()[0]).collect::<Vec<_>>();
             let nodes = ends.nodes("/ears", others).into_iter();
-            let node = |node: Node| {
+            let node = |node: DiscoveredNode| {
                 (
                     node.name.to_string(),
                     numbers(&node.readers),
@@ -277,11 +288,11 @@ mod tests {
         let ears_all = ("/ears".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
         assert_eq!(told(&BTreeMap::new()), [ears_all]);
         let others = [("/ears".to_owned(), ears), ("/mouth".to_owned(), mouth)];
-        // The program was told another name: no node of the stub's is there beside it.
+        // The program has another name: no node of the stub's name exists beside it.
         let bass = BTreeMap::from([("/bass".to_owned(), NodeNames::default())]);
         let bass_all = ("/bass".to_owned(), vec![1, 2, 3], vec![4, 5, 6, 7]);
         assert_eq!(told(&bass), [bass_all]);
-        // What no node is said to have is the stub's own.
+        // Endpoints that no node is said to have are the stub's own.
         let expected = [
             ("/ears".to_owned(), vec![1, 3], vec![4, 6, 7]),
             ("/mouth".to_owned(), vec![2], vec![4, 5]),

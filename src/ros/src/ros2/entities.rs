@@ -1,4 +1,5 @@
-//! `ros_discovery_info`: by it each participant tells which nodes it has, and which ends are whose. DDS knows no nodes.
+//! `ros_discovery_info`: the topic on which each participant announces its nodes and their endpoints, because DDS knows
+//! no nodes.
 //!
 //! Source: `rmw_dds_common/msg/{ParticipantEntitiesInfo,NodeEntitiesInfo,Gid}.msg`. A gid has 16 bytes, and 24 in
 //! distributions before Iron, of which the last 8 are zero; the type's name is the same.
@@ -8,25 +9,28 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Discovered, EndpointQos, Guid, GuidPrefix, History, Sample, Sink, Topic};
+use rtps::{
+    DiscoveredGraph, EndpointQos, Guid, GuidPrefix, HistoryKind, ReceivedSample, Sink,
+    TopicDescription,
+};
 use tokio::sync::watch;
 
 use super::names;
 
-/// A participant that tells more than this is not believed.
+/// Maximum size of an announcement; larger ones are ignored.
 const MAX_BYTES: usize = 1 << 20;
-/// Of so many participants it is kept what they tell.
+/// Maximum number of participants whose announcements are kept.
 const MAX_PARTICIPANTS: usize = 1024;
-/// The longest name or namespace that the definition allows.
+/// Maximum length of a name or namespace in the definition.
 const MAX_NAME: usize = 256;
 
-/// How many bytes a gid has.
+/// Size of a gid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum GidSize {
     /// Since Iron.
     #[default]
     Sixteen,
-    /// Before.
+    /// Before Iron.
     TwentyFour,
 }
 
@@ -39,75 +43,78 @@ impl GidSize {
     }
 }
 
-/// What one participant tells.
+/// The announcement of one participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Entities {
-    /// Its nodes; those whose names are none are left out.
-    pub(super) nodes: Vec<Node>,
-    /// How it writes gids.
+pub(super) struct ParticipantEntities {
+    /// Nodes; those with invalid names are left out.
+    pub(super) nodes: Vec<DiscoveredNode>,
+    /// Size of its gids.
     pub(super) gids: GidSize,
 }
 
-/// A node and its ends.
+/// A node and its endpoints.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Node {
-    /// The absolute name.
+pub(super) struct DiscoveredNode {
+    /// Absolute name.
     pub(super) name: Arc<str>,
-    /// Its readers.
+    /// Readers of the node.
     pub(super) readers: Vec<Guid>,
-    /// Its writers.
+    /// Writers of the node.
     pub(super) writers: Vec<Guid>,
 }
 
-/// The topic, as ends of ours have it.
-pub(super) fn topic() -> Topic {
-    Topic {
+/// Returns the topic for endpoints of ours.
+pub(super) fn topic() -> TopicDescription {
+    TopicDescription {
         name: "ros_discovery_info".to_owned(),
         type_name: "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_".to_owned(),
         user_data: Bytes::new(),
     }
 }
 
-/// How its ends treat samples: whoever comes later is told, too.
+/// Returns the QoS of its endpoints: participants that join later get the last announcement.
 pub(super) fn qos() -> EndpointQos {
     EndpointQos {
-        durability: rtps::Durability::TransientLocal,
-        history: History::KeepLast(1),
+        durability: rtps::DurabilityKind::TransientLocal,
+        history: HistoryKind::KeepLast(1),
         ..EndpointQos::default()
     }
 }
 
-/// What the other participants tell.
+/// The announcements of the other participants.
 #[derive(Default)]
-pub(super) struct Told {
-    told: Mutex<HashMap<GuidPrefix, Arc<Entities>>>,
+pub(super) struct ParticipantTable {
+    told: Mutex<HashMap<GuidPrefix, Arc<ParticipantEntities>>>,
     changes: watch::Sender<u64>,
 }
 
-impl Told {
-    /// Changes with every change.
+impl ParticipantTable {
+    /// Returns a counter of changes.
     pub(super) fn changes(&self) -> watch::Receiver<u64> {
         self.changes.subscribe()
     }
 
-    /// Who is there now, and what they tell; what others have told is forgotten.
-    pub(super) fn of(
+    /// Returns the current participants and their announcements; forgets the announcements of others.
+    pub(super) fn snapshot(
         &self,
-        discovered: &watch::Receiver<Arc<Discovered>>,
-    ) -> (Arc<Discovered>, HashMap<GuidPrefix, Arc<Entities>>) {
+        discovered: &watch::Receiver<Arc<DiscoveredGraph>>,
+    ) -> (
+        Arc<DiscoveredGraph>,
+        HashMap<GuidPrefix, Arc<ParticipantEntities>>,
+    ) {
         let mut told = self.told.lock();
-        // Looked at within the lock: whoever has told something by now was discovered before.
+        // Read while the lock is held: a participant that has announced something by now was discovered before.
         let now = Arc::clone(&discovered.borrow());
         told.retain(|prefix, _| now.participants.contains_key(prefix));
         (now, told.clone())
     }
 }
 
-impl Sink for Told {
-    fn sample(&self, sample: Sample) {
+impl Sink for ParticipantTable {
+    fn on_sample(&self, sample: ReceivedSample) {
         let from = sample.writer.prefix;
         let Some(entities) = decode(&sample.payload) else {
-            tracing::debug!(participant = ?from, "what a participant tells of its nodes cannot be read");
+            tracing::debug!(participant = ?from, "the list of nodes of a participant cannot be read");
             return;
         };
         {
@@ -121,8 +128,8 @@ impl Sink for Told {
     }
 }
 
-/// Reads what a participant tells; none where it cannot be read.
-fn decode(payload: &[u8]) -> Option<Entities> {
+/// Decodes an announcement; `None` if it cannot be read.
+fn decode(payload: &[u8]) -> Option<ParticipantEntities> {
     let (header, body) = payload.split_first_chunk::<4>()?;
     let big = match header {
         [0, 0, ..] => true,
@@ -132,19 +139,20 @@ fn decode(payload: &[u8]) -> Option<Entities> {
     if body.len() > MAX_BYTES {
         return None;
     }
-    // Behind a gid of 16 bytes the number of nodes follows, and, where there is none, nothing.
+    // A gid of 16 bytes is followed by the number of nodes and, if that is zero, by nothing.
     let padded = body.get(16..24).is_some_and(|rest| rest == [0; 8]);
-    let gids = match padded && body.len() >= 28 {
-        true => GidSize::TwentyFour,
-        false => GidSize::Sixteen,
+    let gids = if padded && body.len() >= 28 {
+        GidSize::TwentyFour
+    } else {
+        GidSize::Sixteen
     };
-    let mut cursor = Cursor { body, at: 0, big };
+    let mut cursor = CdrCursor { body, at: 0, big };
     cursor.take(gids.bytes())?;
     let mut nodes = Vec::new();
     for _ in 0..cursor.word()? {
         let (namespace, name) = (cursor.text()?, cursor.text()?);
         let full = format!("{}/{name}", namespace.trim_end_matches('/'));
-        let node = Node {
+        let node = DiscoveredNode {
             name: full.into(),
             readers: cursor.gids(gids)?,
             writers: cursor.gids(gids)?,
@@ -153,17 +161,17 @@ fn decode(payload: &[u8]) -> Option<Entities> {
             nodes.push(node);
         }
     }
-    Some(Entities { nodes, gids })
+    Some(ParticipantEntities { nodes, gids })
 }
 
-/// Takes values out of CDR, in order.
-struct Cursor<'a> {
+/// Reads CDR values in order.
+struct CdrCursor<'a> {
     body: &'a [u8],
     at: usize,
     big: bool,
 }
 
-impl<'a> Cursor<'a> {
+impl<'a> CdrCursor<'a> {
     fn take(&mut self, size: usize) -> Option<&'a [u8]> {
         let end = self.at.checked_add(size)?;
         let taken = self.body.get(self.at..end)?;
@@ -174,9 +182,10 @@ impl<'a> Cursor<'a> {
     fn word(&mut self) -> Option<usize> {
         self.at = self.at.checked_next_multiple_of(4)?;
         let word: [u8; 4] = self.take(4)?.try_into().ok()?;
-        let value = match self.big {
-            true => u32::from_be_bytes(word),
-            false => u32::from_le_bytes(word),
+        let value = if self.big {
+            u32::from_be_bytes(word)
+        } else {
+            u32::from_le_bytes(word)
         };
         usize::try_from(value).ok()
     }
@@ -199,8 +208,8 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// What a participant tells, with gids of this size.
-pub(super) fn encode(participant: Guid, nodes: &[Node], size: GidSize) -> Bytes {
+/// Encodes an announcement with gids of this size.
+pub(super) fn encode(participant: Guid, nodes: &[DiscoveredNode], size: GidSize) -> Bytes {
     let mut body = Vec::new();
     put_gid(&mut body, participant, size);
     put_count(&mut body, nodes.len());
@@ -230,7 +239,7 @@ fn put_gid(body: &mut Vec<u8>, guid: Guid, size: GidSize) {
 
 fn put_count(body: &mut Vec<u8>, count: usize) {
     body.resize(body.len().next_multiple_of(4), 0);
-    // Nobody has four billion ends.
+    // Nobody has four billion endpoints.
     body.extend(u32::try_from(count).unwrap_or(u32::MAX).to_le_bytes());
 }
 
@@ -244,9 +253,9 @@ mod tests {
         Guid::from([number; 16])
     }
 
-    fn node(name: &str, readers: &[u8], writers: &[u8]) -> Node {
+    fn node(name: &str, readers: &[u8], writers: &[u8]) -> DiscoveredNode {
         let guids = |numbers: &[u8]| numbers.iter().copied().map(guid).collect();
-        Node {
+        DiscoveredNode {
             name: name.into(),
             readers: guids(readers),
             writers: guids(writers),
@@ -262,7 +271,7 @@ mod tests {
                 let told = decode(&payload).expect("it can be read");
                 assert_eq!(
                     told,
-                    Entities {
+                    ParticipantEntities {
                         nodes: nodes.clone(),
                         gids
                     }
@@ -271,7 +280,7 @@ mod tests {
         }
     }
 
-    /// As rmw_fastrtps of Jazzy writes it, by the definition.
+    /// The payload as rmw_fastrtps of Jazzy writes it, according to the definition.
     #[test]
     fn bytes_are_those_of_the_definition() {
         let payload = encode(guid(7), &[node("/a", &[8], &[])], GidSize::Sixteen);

@@ -1,32 +1,36 @@
-//! The graph of ROS out of what is seen in DDS: topics, services and actions with the nodes at their ends.
+//! The ROS graph derived from DDS discovery: topics, services and actions with the nodes at both ends.
 
 use std::collections::BTreeMap;
 
 use rtps::Guid;
 
-use super::ends::OwnEnds;
-use super::names::{self, Named};
+use super::ends::LocalEndpoints;
+use super::names::{self, RosTopicRole};
 use super::node_ends;
-use super::seen::Seen;
+use super::seen::DiscoverySnapshot;
 use crate::bus::{Graph, TopicNodes};
 
-/// One end, whoever has it.
-struct End<'a> {
+/// One endpoint, of this node or of another.
+struct GraphEndpoint<'a> {
     topic: &'a str,
     type_name: &'a str,
     node: String,
     writes: bool,
 }
 
-/// The graph of all nodes; `own` are the ends of the node of this name and participant. Names that begin with `_` somewhere are
-/// left out of what is shown, and so are ends of whose node nothing is known yet.
-pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid)) -> Graph {
-    let mut building = Building::default();
-    for end in ends(seen, own, node) {
+/// Builds the graph of all nodes; `own` are the endpoints of the node with this name and participant. Names with a part
+/// that begins with `_` are left out of what is shown, and so are endpoints whose node is not known yet.
+pub(super) fn build(
+    seen: &DiscoverySnapshot,
+    own: &LocalEndpoints,
+    (node, participant): (&str, Guid),
+) -> Graph {
+    let mut building = GraphBuilder::default();
+    for end in all_endpoints(seen, own, node) {
         building.add(&end);
     }
     let mut graph = building.graph;
-    graph.ends = node_ends::all(seen);
+    graph.ends = node_ends::collect_endpoints(seen);
     let served = &graph.services;
     let sought = building.sought.into_iter();
     graph.sought = sought
@@ -53,8 +57,12 @@ pub(super) fn build(seen: &Seen, own: &OwnEnds, (node, participant): (&str, Guid
     graph
 }
 
-/// Writers first: it is they who say what a topic's type is.
-fn ends<'a>(seen: &'a Seen, own: &'a OwnEnds, node: &'a str) -> Vec<End<'a>> {
+/// Returns all endpoints, writers first, because they determine a topic's type.
+fn all_endpoints<'a>(
+    seen: &'a DiscoverySnapshot,
+    own: &'a LocalEndpoints,
+    node: &'a str,
+) -> Vec<GraphEndpoint<'a>> {
     let (writers, readers) = (
         seen.discovered.writers.values(),
         seen.discovered.readers.values(),
@@ -64,59 +72,60 @@ fn ends<'a>(seen: &'a Seen, own: &'a OwnEnds, node: &'a str) -> Vec<End<'a>> {
         .map(|end| (true, end))
         .chain(readers.map(|end| (false, end)));
     let named = theirs.filter(|(_, end)| seen.is_named(end.guid));
-    let theirs = named.map(|(writes, end)| End {
+    let theirs = named.map(|(writes, end)| GraphEndpoint {
         topic: &end.topic,
         type_name: &end.type_name,
         node: seen.node(end.guid).to_string(),
         writes,
     });
     let ours = sides.into_iter().flat_map(move |(writes, ends)| {
-        ends.values().map(move |end| End {
+        ends.values().map(move |end| GraphEndpoint {
             topic: &end.topic,
             type_name: &end.type_name,
             node: node.to_owned(),
             writes,
         })
     });
-    let mut all: Vec<End<'a>> = theirs.chain(ours).collect();
+    let mut all: Vec<GraphEndpoint<'a>> = theirs.chain(ours).collect();
     all.sort_by_key(|end| !end.writes);
     all
 }
 
 #[derive(Default)]
-struct Building {
+struct GraphBuilder {
     graph: Graph,
-    /// Services that nodes have clients of.
+    /// Services for which nodes have clients.
     sought: BTreeMap<String, Vec<String>>,
 }
 
-impl Building {
-    fn add(&mut self, end: &End<'_>) {
-        match names::named(end.topic) {
-            Some(Named::Topic(name)) if !names::is_hidden(&name) => self.topic(name, end),
-            Some(Named::Request(name)) => match names::action_part(&name) {
+impl GraphBuilder {
+    fn add(&mut self, end: &GraphEndpoint<'_>) {
+        match names::topic_role(end.topic) {
+            Some(RosTopicRole::Topic(name)) if !names::is_hidden(&name) => self.topic(name, end),
+            Some(RosTopicRole::Request(name)) => match names::action_part(&name) {
                 Some((action, "send_goal")) => self.action(action, end),
                 _ if !names::is_hidden(&name) => self.service(name, end),
                 _ => {}
             },
-            // Servers and clients are known by the requests.
+            // Servers and clients are found by the request topics.
             _ => {}
         }
     }
 
-    fn topic(&mut self, name: String, end: &End<'_>) {
+    fn topic(&mut self, name: String, end: &GraphEndpoint<'_>) {
         let topic = self.graph.topics.entry(name).or_insert_with(|| TopicNodes {
-            type_name: names::type_of(end.type_name),
+            type_name: names::ros_type(end.type_name),
             ..TopicNodes::default()
         });
-        let nodes = match end.writes {
-            true => &mut topic.publishers,
-            false => &mut topic.subscribers,
+        let nodes = if end.writes {
+            &mut topic.publishers
+        } else {
+            &mut topic.subscribers
         };
         add(nodes, &end.node);
     }
 
-    fn service(&mut self, name: String, end: &End<'_>) {
+    fn service(&mut self, name: String, end: &GraphEndpoint<'_>) {
         if end.writes {
             add(self.sought.entry(name).or_default(), &end.node);
         } else {
@@ -125,24 +134,26 @@ impl Building {
         }
     }
 
-    /// What it is, its servers say: a client may be mistaken, and those come first here.
-    fn action(&mut self, name: &str, end: &End<'_>) {
-        let type_name = names::action_type_of(end.type_name);
+    /// Adds an endpoint of an action. Servers determine the action's type: a client may be mistaken, although clients
+    /// come first here.
+    fn action(&mut self, name: &str, end: &GraphEndpoint<'_>) {
+        let type_name = names::action_type(end.type_name);
         let type_name = type_name.unwrap_or_else(|| "*".to_owned());
         let action = self.graph.actions.entry(name.to_owned()).or_default();
         let is_first_server = !end.writes && action.servers.is_empty();
         if is_first_server || action.type_name.is_empty() {
             action.type_name = type_name;
         }
-        let nodes = match end.writes {
-            true => &mut action.clients,
-            false => &mut action.servers,
+        let nodes = if end.writes {
+            &mut action.clients
+        } else {
+            &mut action.servers
         };
         add(nodes, &end.node);
     }
 }
 
-/// A node may have several ends of one topic.
+/// Adds a node unless present; a node may have several endpoints of one topic.
 fn add(nodes: &mut Vec<String>, node: &str) {
     if !nodes.iter().any(|known| known == node) {
         nodes.push(node.to_owned());
@@ -156,15 +167,15 @@ mod tests {
 
     use bytes::Bytes;
     use rtps::{
-        Discovered, EndpointData, EndpointQos, EntityId, GuidPrefix, ParticipantData, VendorId,
+        DiscoveredGraph, EndpointData, EndpointQos, EntityId, GuidPrefix, ParticipantData, VendorId,
     };
 
-    use super::super::ends::OwnEnd;
-    use super::super::entities::{Entities, GidSize, Node};
+    use super::super::ends::LocalEndpoint;
+    use super::super::entities::{DiscoveredNode, GidSize, ParticipantEntities};
     use super::*;
     use crate::bus::ActionNodes;
 
-    /// An end with this number in the participant with this number.
+    /// An endpoint with this number in the participant with this number.
     fn guid(participant: u8, end: u8, writes: bool) -> Guid {
         let kind = if writes { 3 } else { 4 };
         Guid::new(GuidPrefix([participant; 12]), EntityId([0, 0, end, kind]))
@@ -201,16 +212,17 @@ mod tests {
     const SET_BOOL: &str = "std_srvs::srv::dds_::SetBool_Request_";
     const SEND_GOAL: &str = "test_msgs::action::dds_::Fibonacci_SendGoal_Request_";
 
-    /// Participant 1 is of ROS, with a node that serves; participant 2 is not.
-    fn seen(owned: &[Guid], ends: Vec<Arc<EndpointData>>) -> Seen {
-        let mut discovered = Discovered::default();
+    /// Participant 1 belongs to ROS and has a node that serves; participant 2 does not.
+    fn snapshot(owned: &[Guid], ends: Vec<Arc<EndpointData>>) -> DiscoverySnapshot {
+        let mut discovered = DiscoveredGraph::default();
         for told in [participant(1, b"enclave=/;"), participant(2, b"")] {
             discovered.participants.insert(told.prefix, told);
         }
         for end in ends {
-            let known = match end.guid.entity.is_writer() {
-                true => &mut discovered.writers,
-                false => &mut discovered.readers,
+            let known = if end.guid.entity.is_writer() {
+                &mut discovered.writers
+            } else {
+                &mut discovered.readers
             };
             known.insert(end.guid, end);
         }
@@ -218,12 +230,12 @@ mod tests {
             .iter()
             .copied()
             .partition(|end: &Guid| end.entity.is_writer());
-        let node = |name: &str, readers, writers| Node {
+        let node = |name: &str, readers, writers| DiscoveredNode {
             name: name.into(),
             readers,
             writers,
         };
-        let entities = Entities {
+        let entities = ParticipantEntities {
             nodes: vec![
                 node("/server", readers, writers),
                 node("/_ros2cli_1", Vec::new(), Vec::new()),
@@ -231,7 +243,7 @@ mod tests {
             gids: GidSize::Sixteen,
         };
         let told = HashMap::from([(GuidPrefix([1; 12]), Arc::new(entities))]);
-        Seen::new(Arc::new(discovered), &told)
+        DiscoverySnapshot::new(Arc::new(discovered), &told)
     }
 
     #[test]
@@ -243,7 +255,7 @@ mod tests {
             guid(1, 4, true),
             guid(1, 5, true),
         ];
-        let seen = seen(
+        let seen = snapshot(
             &owned,
             vec![
                 endpoint(owned[0], "rt/chatter", STRING),
@@ -251,20 +263,20 @@ mod tests {
                 endpoint(owned[2], "rq/fib/_action/send_goalRequest", SEND_GOAL),
                 endpoint(owned[3], "rt/fib/_action/feedback", "x"),
                 endpoint(owned[4], "rq/neededRequest", SET_BOOL),
-                // Not told of yet.
+                // Not announced yet.
                 endpoint(guid(1, 9, true), "rt/early", STRING),
                 endpoint(guid(2, 1, false), "rt/chatter", "Other::Type"),
                 endpoint(guid(2, 2, true), "rt/_hidden", STRING),
                 endpoint(guid(2, 3, true), "not_ros", STRING),
             ],
         );
-        let mut own = OwnEnds::default();
-        let asked = OwnEnd {
+        let mut own = LocalEndpoints::default();
+        let asked = LocalEndpoint {
             topic: "rq/set_boolRequest".to_owned(),
             type_name: SET_BOOL.to_owned(),
         };
         own.writers.insert(guid(3, 1, true), asked);
-        let sends = OwnEnd {
+        let sends = LocalEndpoint {
             topic: "rq/fib/_action/send_goalRequest".to_owned(),
             type_name: SEND_GOAL.to_owned(),
         };
@@ -302,7 +314,7 @@ mod tests {
         let server = guid(1, 1, false);
         let fib = "rq/fib/_action/send_goalRequest";
         let other = "test_msgs::action::dds_::NestedMessage_SendGoal_Request_";
-        let seen = seen(
+        let seen = snapshot(
             &[server],
             vec![
                 endpoint(guid(2, 1, true), fib, other),
@@ -310,7 +322,7 @@ mod tests {
                 endpoint(guid(2, 2, false), fib, other),
             ],
         );
-        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(3, 0, true)));
+        let graph = build(&seen, &LocalEndpoints::default(), ("/us", guid(3, 0, true)));
         let fib = &graph.actions["/fib"];
         assert_eq!(fib.type_name, "test_msgs/action/Fibonacci");
     }
@@ -325,24 +337,24 @@ mod tests {
             participant(5, b"enclave=\xff;"),
             participant(6, b""),
         ];
-        let mut discovered = Discovered::default();
+        let mut discovered = DiscoveredGraph::default();
         let mut told = HashMap::new();
         for told_of in participants {
-            let node = |name: String| Node {
+            let node = |name: String| DiscoveredNode {
                 name: name.into(),
                 readers: Vec::new(),
                 writers: Vec::new(),
             };
             let own = format!("/own_{}", told_of.prefix.0[0]);
-            let entities = Entities {
+            let entities = ParticipantEntities {
                 nodes: vec![node("/see".into()), node(own), node("/_hidden".into())],
                 gids: GidSize::Sixteen,
             };
             told.insert(told_of.prefix, Arc::new(entities));
             discovered.participants.insert(told_of.prefix, told_of);
         }
-        let seen = Seen::new(Arc::new(discovered), &told);
-        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(9, 0, true)));
+        let seen = DiscoverySnapshot::new(Arc::new(discovered), &told);
+        let graph = build(&seen, &LocalEndpoints::default(), ("/us", guid(9, 0, true)));
         let nodes = |names: &[&str]| names.iter().map(|&name| name.to_owned()).collect();
         let expected = [
             ("/a/b".to_owned(), nodes(&["/_hidden", "/own_2", "/see"])),
@@ -357,8 +369,8 @@ mod tests {
     #[test]
     fn nobody_tells_of_the_ends_of_others() {
         let theirs = guid(2, 1, true);
-        let seen = seen(&[theirs], vec![endpoint(theirs, "rt/chatter", STRING)]);
-        let graph = build(&seen, &OwnEnds::default(), ("/us", guid(3, 0, true)));
+        let seen = snapshot(&[theirs], vec![endpoint(theirs, "rt/chatter", STRING)]);
+        let graph = build(&seen, &LocalEndpoints::default(), ("/us", guid(3, 0, true)));
         let stranger = Guid::new(GuidPrefix([2; 12]), EntityId::PARTICIPANT).to_string();
         assert_eq!(graph.topics["/chatter"].publishers, [stranger]);
     }

@@ -1,5 +1,5 @@
-//! Interfaces by which nodes of ROS 2 are asked for their parameters and their state. They are the same everywhere, so
-//! they need not be looked for in an image; `action_msgs` is known to every registry.
+//! Interfaces for querying parameters and states of ROS 2 nodes. They are the same everywhere, so they need not be
+//! looked up in an image; `action_msgs` is built into every registry.
 
 #[cfg(test)]
 mod tests;
@@ -10,26 +10,26 @@ use crate::bus::{BusError, RosVersion, ServiceType};
 use crate::schema::{MessageType, Registry, SchemaError};
 
 static KNOWN: LazyLock<Result<Registry, SchemaError>> = LazyLock::new(|| {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in DEFINITIONS {
         registry.insert(key, text)?;
     }
     Ok(registry)
 });
 
-/// A message, by its full name.
+/// Returns a message by its full name.
 pub(super) fn message(name: &str) -> Result<Arc<MessageType>, BusError> {
-    known(name, |registry| registry.message(name))
+    lookup(name, |registry| registry.message(name))
 }
 
-/// A service, by its full name.
+/// Returns a service type by its full name.
 pub(super) fn service(name: &str) -> Result<ServiceType, BusError> {
-    known(name, |registry| {
-        Ok(ServiceType::of(&*registry.service(name)?))
+    lookup(name, |registry| {
+        Ok(ServiceType::from_service(&*registry.service(name)?))
     })
 }
 
-fn known<T>(
+fn lookup<T>(
     name: &str,
     find: impl FnOnce(&Registry) -> Result<T, SchemaError>,
 ) -> Result<T, BusError> {
@@ -43,7 +43,7 @@ fn known<T>(
     })
 }
 
-/// What they consist of; constants that are not named here are left out, for no hash depends on them.
+/// Definitions; constants that are not used here are left out, because no hash depends on them.
 const DEFINITIONS: [(&str, &str); 21] = [
     (
         "rcl_interfaces/msg/ParameterValue",

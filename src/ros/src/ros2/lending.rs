@@ -1,17 +1,17 @@
-//! Services of another system, lent to the nodes of this one. DDS has nobody whom nodes ask for a service: that one is looked for
-//! is seen by its client's ends. So the lender is asked where there is a client without a server, and what it has is served by
-//! this node.
+//! Services of another system, lent to the nodes of this one. DDS has no service registry that a node would query: a
+//! lookup is visible only by its client's endpoints. So the lender is asked where there is a client without a server,
+//! and the services that it has are served by this node.
 //!
 //! ```text
-//!   a client, no server ──▶ Asking ──there──▶ Served here ──gone──┐
-//!                            ▲  └──not there, in a second again   │
-//!                            └────────────────────────────────────┘
-//!   no client any more, or a server of the system's own: the loan ends
+//!   client without server ──▶ asking ──found──▶ served here ──gone──┐
+//!                              ▲  └──not found: retry in a second   │
+//!                              └────────────────────────────────────┘
+//!   no client any more, or a server in the system itself: the loan ends
 //! ```
-//! Parts of actions are services like others. Their topics are not lent, but published by whoever lends.
+//! Parts of actions are services like others. Their topics are not lent, but published by the component that lends.
 //!
-//! What is served by this node is known to others by a label that stands in what its ends tell of themselves, behind the hash
-//! of the type: `typehash=RIHS01_…;cloudroid=LABEL;`. rmw takes out the keys that it knows.
+//! Services of this node are recognized by a label in the user data of their endpoints, after the type hash:
+//! `typehash=RIHS01_…;cloudroid=LABEL;`. rmw picks out the keys that it knows.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, OnceLock};
@@ -19,25 +19,25 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use parking_lot::Mutex;
-use rtps::{EndpointData, Topic};
+use rtps::{EndpointData, TopicDescription};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::bus::{Inner, Ros2Bus};
+use super::bus::{Ros2Bus, Ros2BusState};
 use super::calls::GRACE;
-use super::names::{self, Named};
-use super::seen::Seen;
+use super::names::{self, RosTopicRole};
+use super::seen::DiscoverySnapshot;
 use super::{node_ends, services};
-use crate::bus::{BusError, Lender, Lending, Lent, ServiceProvider, ServiceType};
+use crate::bus::{BusError, Lender, Lending, LentService, ServiceProvider, ServiceType};
 
-/// A service that was not there is asked for again after so long, for as long as it is sought.
+/// Pause before a service that was not found is requested again, for as long as a client looks for it.
 const AGAIN: Duration = Duration::from_secs(1);
-/// Services that are lent or asked for at a time: a node can have any number of clients.
+/// Maximum number of services lent or requested at a time: a node can have any number of clients.
 const MOST: usize = 1000;
-/// What a label follows.
+/// Key of the label in the user data.
 const LABEL: &str = "cloudroid";
 
-/// What is lent by a bus, and how its services are labelled.
+/// The lending task of a bus, and the label of its services.
 #[derive(Default)]
 pub(super) struct Loans {
     following: Mutex<Option<AbortHandle>>,
@@ -45,14 +45,14 @@ pub(super) struct Loans {
 }
 
 impl Loans {
-    /// The topic by which a service is asked, with the label if there is one.
-    pub(super) fn labelled(&self, request: Topic) -> Topic {
+    /// Adds the label, if any, to the request topic of a service.
+    pub(super) fn add_label(&self, request: TopicDescription) -> TopicDescription {
         let Some(label) = self.label.get() else {
             return request;
         };
-        let told = format!("{LABEL}={};", escaped(label));
+        let told = format!("{LABEL}={};", escape(label));
         let user_data = [&request.user_data[..], told.as_bytes()].concat();
-        Topic {
+        TopicDescription {
             user_data: user_data.into(),
             ..request
         }
@@ -63,7 +63,7 @@ impl Loans {
 impl Lending for Ros2Bus {
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
         self.inner.check_open()?;
-        let following = Following {
+        let following = LoanManager {
             bus: Arc::clone(&self.inner),
             lender,
             loans: HashMap::new(),
@@ -78,7 +78,7 @@ impl Lending for Ros2Bus {
     async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
         let bus = &self.inner;
         bus.check_name(service)?;
-        if let Some(served) = services::here(bus, service) {
+        if let Some(served) = services::local_service(bus, service) {
             return Ok(ServiceProvider {
                 node: bus.node.clone(),
                 service_type: served.of.clone(),
@@ -103,8 +103,8 @@ impl Lending for Ros2Bus {
     }
 }
 
-/// The first server of a service whose node is known.
-fn provider(seen: &Seen, service: &str) -> Option<ServiceProvider> {
+/// Returns the first server of a service whose node is known.
+fn provider(seen: &DiscoverySnapshot, service: &str) -> Option<ServiceProvider> {
     let ends = seen.readers(&names::request_name(service));
     ends.iter()
         .filter(|end| seen.is_named(end.guid))
@@ -112,16 +112,16 @@ fn provider(seen: &Seen, service: &str) -> Option<ServiceProvider> {
             Some(ServiceProvider {
                 node: seen.node(end.guid).to_string(),
                 service_type: node_ends::service_type(seen, end, service, false)?,
-                label: label_of(&end.user_data),
+                label: parse_label(&end.user_data),
             })
         })
 }
 
-/// Looks which services are sought in vain.
-struct Following {
-    bus: Arc<Inner>,
+/// Tracks the services that nodes look for in vain.
+struct LoanManager {
+    bus: Arc<Ros2BusState>,
     lender: Arc<dyn Lender>,
-    /// By name; each ends when it is dropped.
+    /// By service name; a loan ends when it is dropped.
     loans: HashMap<String, Loan>,
 }
 
@@ -133,14 +133,14 @@ impl Drop for Loan {
     }
 }
 
-impl Following {
+impl LoanManager {
     async fn run(mut self) {
         let mut seen = self.bus.seen.subscribe();
         let mut served = self.bus.served.subscribe();
         loop {
             served.mark_unchanged();
             let now = Arc::clone(&seen.borrow_and_update());
-            self.look(&now);
+            self.update_loans(&now);
             let changed = tokio::select! {
                 changed = seen.changed() => changed,
                 changed = served.changed() => changed,
@@ -151,8 +151,8 @@ impl Following {
         }
     }
 
-    fn look(&mut self, seen: &Seen) {
-        let sought = sought(&self.bus, seen);
+    fn update_loans(&mut self, seen: &DiscoverySnapshot) {
+        let sought = sought_services(&self.bus, seen);
         self.loans.retain(|service, _| sought.contains_key(service));
         for (service, client) in sought {
             if self.loans.contains_key(&service) {
@@ -173,56 +173,67 @@ impl Following {
     }
 }
 
-/// A node that looks for a service, and what it takes it for.
-struct Client {
+/// A node that looks for a service, and the type it expects.
+struct SeekingClient {
     node: Arc<str>,
     of: ServiceType,
 }
 
-/// Services that nodes have clients of and nobody serves, what is lent not counted.
-fn sought(bus: &Inner, seen: &Seen) -> BTreeMap<String, Client> {
+/// Returns the services that nodes have clients for and that no node serves; lent services do not count as served.
+fn sought_services(
+    bus: &Ros2BusState,
+    seen: &DiscoverySnapshot,
+) -> BTreeMap<String, SeekingClient> {
     let mut sought = BTreeMap::new();
     for end in seen.discovered.writers.values() {
-        let Some(Named::Request(service)) = names::named(&end.topic) else {
+        let Some(RosTopicRole::Request(service)) = names::topic_role(&end.topic) else {
             continue;
         };
         let Some(node) = seen.owner(end.guid) else {
             continue;
         };
-        // Those of this node are not among them.
+        // Clients of this node are not included.
         let served = !seen.readers(&end.topic).is_empty();
-        if served || services::here(bus, &service).is_some_and(|it| !it.lent) {
+        if served || services::local_service(bus, &service).is_some_and(|it| !it.lent) {
             continue;
         }
-        if let Some(client) = client(seen, end, &service, node) {
+        if let Some(client) = seeking_client(seen, end, &service, node) {
             sought.entry(service).or_insert(client);
         }
     }
     sought
 }
 
-fn client(seen: &Seen, end: &EndpointData, service: &str, node: &Arc<str>) -> Option<Client> {
+fn seeking_client(
+    seen: &DiscoverySnapshot,
+    end: &EndpointData,
+    service: &str,
+    node: &Arc<str>,
+) -> Option<SeekingClient> {
     let of = node_ends::service_type(seen, end, service, true)?;
     let node = Arc::clone(node);
-    Some(Client { node, of })
+    Some(SeekingClient { node, of })
 }
 
-/// Asks for one service for as long as it is sought, and serves it while it is there.
+/// Requests one service from the lender for as long as a client looks for it, and serves it while it is available.
 struct Borrower {
-    bus: Arc<Inner>,
+    bus: Arc<Ros2BusState>,
     lender: Arc<dyn Lender>,
     service: String,
-    client: Client,
+    client: SeekingClient,
 }
 
 impl Borrower {
     async fn run(self) {
         let mut refused = None;
         loop {
-            let found = self.lender.find(&self.service, &self.client.node).await;
-            // One that is gone already is not there: it is not asked for without a pause.
+            let found = self
+                .lender
+                .find_service(&self.service, &self.client.node)
+                .await;
+            // A service that has just gone counts as not found; otherwise it would be requested without a pause.
             if let Some(lent) = found.filter(|lent| !*lent.gone.borrow()) {
-                if self.served(lent, &mut refused).await {
+                if self.serve_until_gone(lent, &mut refused).await {
                     continue;
                 }
             }
@@ -230,21 +241,22 @@ impl Borrower {
         }
     }
 
-    /// Serves it until it is gone; false where it cannot be served.
-    async fn served(&self, lent: Lent, refused: &mut Option<ServiceType>) -> bool {
-        let Lent {
+    /// Serves the service until it is gone; returns false if it cannot be served.
+    async fn serve_until_gone(&self, lent: LentService, refused: &mut Option<ServiceType>) -> bool {
+        let LentService {
             service_type: of,
             handler,
             mut gone,
         } = lent;
         let wanted = &self.client.of;
-        if of.name != wanted.name || !of.agrees(wanted) {
-            // Who looks for it would take it for one that never answers.
+        if of.name != wanted.name || !of.is_compatible_with(wanted) {
+            // The client would take it for a server that never answers.
             if refused.as_ref() != Some(&of) {
                 tracing::warn!(
                     service = self.service,
                     node = &*self.client.node,
-                    "a service of the robot is not lent: it is {} {} there, and {} {} for the node that looks for it; both need the same \
+                    "a service of the robot is not lent: it is {} {} there, and {} {} for the node that looks for \
+                     it; both need the same \
                      definition",
                     of.name,
                     of.request,
@@ -257,7 +269,7 @@ impl Borrower {
         }
         match services::lend(&self.bus, &self.service, of, handler) {
             Ok(_serving) => {
-                // Without its sender it can be had no more, either.
+                // If the sender is gone, the service is no longer available either.
                 let _ = gone.wait_for(|gone| *gone).await;
                 true
             }
@@ -269,8 +281,8 @@ impl Borrower {
     }
 }
 
-/// Letters, digits and a few signs stay; the others are two hexadecimal digits behind `%`.
-fn escaped(label: &str) -> String {
+/// Escapes a label: letters, digits and a few signs are kept; the others become `%` and two hexadecimal digits.
+fn escape(label: &str) -> String {
     let mut text = String::new();
     for byte in label.bytes() {
         match byte {
@@ -283,7 +295,7 @@ fn escaped(label: &str) -> String {
     text
 }
 
-fn unescaped(text: &str) -> Option<String> {
+fn unescape(text: &str) -> Option<String> {
     let mut bytes = Vec::new();
     let mut rest = text.as_bytes();
     while let [first, after @ ..] = rest {
@@ -300,12 +312,12 @@ fn unescaped(text: &str) -> Option<String> {
     String::from_utf8(bytes).ok()
 }
 
-fn label_of(user_data: &[u8]) -> Option<String> {
+fn parse_label(user_data: &[u8]) -> Option<String> {
     let text = std::str::from_utf8(user_data).ok()?;
     let mut pairs = text.split(';').filter_map(|pair| pair.split_once('='));
     pairs
         .find(|(key, _)| *key == LABEL)
-        .and_then(|(_, label)| unescaped(label))
+        .and_then(|(_, label)| unescape(label))
 }
 
 #[cfg(test)]
@@ -317,24 +329,24 @@ mod tests {
     #[test]
     fn a_label_stands_beside_the_hash_of_the_type() {
         let hash = Digest::from(format!("RIHS01_{}", "0a".repeat(32)));
-        let topic = |digest: &Digest| Topic {
+        let topic = |digest: &Digest| TopicDescription {
             name: "rq/setRequest".to_owned(),
             type_name: "std_srvs::srv::dds_::SetBool_Request_".to_owned(),
             user_data: type_hash::user_data(digest),
         };
         let loans = Loans::default();
-        assert_eq!(label_of(&loans.labelled(topic(&hash)).user_data), None);
+        assert_eq!(parse_label(&loans.add_label(topic(&hash)).user_data), None);
         let label = "maps=1; for 100% größere rover";
         loans.label.set(label.to_owned()).expect("the first one");
         for digest in [hash, Digest::any()] {
-            let told = loans.labelled(topic(&digest)).user_data;
-            assert_eq!(label_of(&told).as_deref(), Some(label));
-            assert_eq!(type_hash::of_message(&told), digest);
+            let told = loans.add_label(topic(&digest)).user_data;
+            assert_eq!(parse_label(&told).as_deref(), Some(label));
+            assert_eq!(type_hash::message_hash(&told), digest);
             let ends = told.iter().filter(|byte| **byte == b';').count();
             assert_eq!(ends, 1 + usize::from(!digest.is_any()));
         }
         for nonsense in [&b"cloudroid=%f"[..], b"cloudroid=%zz;", b"\xff"] {
-            assert_eq!(label_of(nonsense), None);
+            assert_eq!(parse_label(nonsense), None);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Nodes with a lifecycle: they do nothing until somebody has them configure and activate themselves
+//! Nodes with a lifecycle: they do nothing until they are told to configure and activate themselves
 //! (<https://design.ros2.org/articles/node_lifecycle.html>).
 //!
 //! ```text
@@ -19,57 +19,58 @@ use bytes::Bytes;
 use tokio::time::timeout;
 
 use crate::bus::{
-    Bus, BusError, CallFate, Graph, Qos, RosVersion, Subscription, WireType, reaches,
+    Bus, BusError, CallFate, Graph, QosProfile, RosVersion, Subscription, WireType,
+    wait_for_connected,
 };
-use crate::codec::cursor::Cursor;
-use crate::codec::put::Put;
+use crate::codec::cursor::MessageCursor;
+use crate::codec::put::CdrWriter;
 use crate::ros2::interfaces;
 
-pub use begin::{Begun, NotBegun, begin_all};
+pub use begin::{BeginError, BeginOutcome, begin_all};
 
-/// For a node to answer what takes it no time.
+/// Time limit for requests that a node answers without delay.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Changes that are kept for a slow watcher.
+/// Queue depth for a slow watcher of changes.
 const CHANGES: usize = 100;
-/// Transitions that a node may have in one state.
+/// Maximum number of transitions from one state.
 const MOST: usize = 1000;
 
-/// A node that has a lifecycle.
+/// A node with a lifecycle.
 pub struct LifecycleNode {
     bus: Arc<dyn Bus>,
     node: String,
 }
 
-/// In which state a node is. Those behind the first five are passed through while a transition goes on.
+/// State of a node. Those after the first five are transition states.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum State {
-    /// The node does not know.
+    /// The node does not know its state.
     Unknown,
-    /// It was made, and holds nothing yet.
+    /// Created, without resources.
     Unconfigured,
-    /// It holds what it needs, and does nothing.
+    /// Configured, but not active.
     Inactive,
-    /// It does its work.
+    /// Doing its work.
     Active,
-    /// It can only end.
+    /// At its end.
     Finalized,
-    /// On the way from unconfigured to inactive.
+    /// In transition from unconfigured to inactive.
     Configuring,
-    /// On the way from inactive to unconfigured.
+    /// In transition from inactive to unconfigured.
     CleaningUp,
-    /// On the way to finalized.
+    /// In transition to finalized.
     ShuttingDown,
-    /// On the way from inactive to active.
+    /// In transition from inactive to active.
     Activating,
-    /// On the way from active to inactive.
+    /// In transition from active to inactive.
     Deactivating,
-    /// A transition has failed, and the node sees what it can do.
+    /// Handling the error of a failed transition.
     ErrorProcessing,
-    /// One that nobody has defined, by its number.
+    /// A state that is not defined, by its number.
     Other(u8),
 }
 
-/// What a node can be asked for.
+/// A transition that can be requested.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Transition {
     /// Unconfigured → inactive.
@@ -84,52 +85,52 @@ pub enum Transition {
     Shutdown,
 }
 
-/// A change of state, as a node tells of it.
+/// A change of state published by a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StateChange {
-    /// From which state.
+    /// Previous state.
     pub from: State,
-    /// To which.
+    /// New state.
     pub to: State,
 }
 
-/// Changes of a node's state; dropping it ends that.
+/// A stream of a node's state changes; dropping it ends the subscription.
 pub struct StateChanges {
     subscription: Subscription,
 }
 
 impl LifecycleNode {
-    /// The node of this absolute name.
-    pub fn of(bus: Arc<dyn Bus>, node: &str) -> Self {
+    /// Creates a handle to the node of this absolute name.
+    pub fn new(bus: Arc<dyn Bus>, node: &str) -> Self {
         let node = node.to_owned();
         Self { bus, node }
     }
 
-    /// Whether the node has a lifecycle: it serves what others have not.
-    pub fn is_one(graph: &Graph, node: &str) -> bool {
+    /// Returns true if the node has a lifecycle, judged by the services it has.
+    pub fn has_lifecycle(graph: &Graph, node: &str) -> bool {
         let server = graph.services.get(&format!("{node}/change_state"));
         server.is_some_and(|server| server == node)
     }
 
-    /// In which state it is.
+    /// Returns the current state.
     pub async fn state(&self) -> Result<State, BusError> {
-        let answer = self.ask("get_state", "GetState", Put::new().end(), PATIENCE);
-        self.read("get_state", &answer.await?, |cursor| {
-            read_number_and_label(cursor).map(|(number, _)| State::of(number))
+        let answer = self.call("get_state", "GetState", CdrWriter::new().finish(), PATIENCE);
+        self.parse_answer("get_state", &answer.await?, |cursor| {
+            read_number_and_label(cursor).map(|(number, _)| State::from_number(number))
         })
     }
 
-    /// Has it change its state, and returns when it has. The node may take as long as `patience`; what it does meanwhile goes
-    /// on when it is over.
-    pub async fn change(&self, by: Transition, patience: Duration) -> Result<(), BusError> {
-        let mut put = Put::new();
-        // Nodes look at the label where there is one, and then whether the transition leads on from where they are. A number
-        // that does not makes those of rclpy end.
+    /// Requests a transition and waits until it is complete. The node may take up to `patience`; a transition in
+    /// progress continues after that.
+    pub async fn change_state(&self, by: Transition, patience: Duration) -> Result<(), BusError> {
+        let mut put = CdrWriter::new();
+        // Nodes use the label if there is one, and then check whether the transition is possible in their state. An
+        // impossible number would make rclpy nodes exit.
         put.byte(0);
         put.text(by.label());
-        let answer = self.ask("change_state", "ChangeState", put.end(), patience);
-        let read = |cursor: &mut Cursor<'_>| cursor.number().map(|[done]| done != 0);
-        if self.read("change_state", &answer.await?, read)? {
+        let answer = self.call("change_state", "ChangeState", put.finish(), patience);
+        let read = |cursor: &mut MessageCursor<'_>| cursor.number().map(|[done]| done != 0);
+        if self.parse_answer("change_state", &answer.await?, read)? {
             return Ok(());
         }
         let reason = match self.state().await {
@@ -143,12 +144,12 @@ impl LifecycleNode {
         })
     }
 
-    /// Labels of the transitions that lead on from where it is, and to which states. Those that a node goes through by itself
-    /// are among them while it is between two states.
+    /// Returns the labels of the transitions possible in the current state, with the states they lead to. Between two
+    /// states these include the transitions that a node makes by itself.
     pub async fn transitions(&self) -> Result<Vec<(String, State)>, BusError> {
         let (part, type_name) = ("get_available_transitions", "GetAvailableTransitions");
-        let answer = self.ask(part, type_name, Put::new().end(), PATIENCE);
-        self.read(part, &answer.await?, |cursor| {
+        let answer = self.call(part, type_name, CdrWriter::new().finish(), PATIENCE);
+        self.parse_answer(part, &answer.await?, |cursor| {
             let length = cursor.length().filter(|length| *length <= MOST)?;
             let all = (0..length).map(|_| read_change(cursor));
             let all = all.map(|known| known.map(|(label, change)| (label, change.to)));
@@ -156,13 +157,16 @@ impl LifecycleNode {
         })
     }
 
-    /// Changes of its state from when this returns.
+    /// Watches changes of the state from the time this returns.
     pub async fn watch(&self) -> Result<StateChanges, BusError> {
         let of = interfaces::message("lifecycle_msgs/msg/TransitionEvent")?;
-        let (of, qos) = (WireType::of(&of), Qos::keep_last(CHANGES));
+        let (of, qos) = (WireType::from_message(&of), QosProfile::keep_last(CHANGES));
         let topic = format!("{}/transition_event", self.node);
         let subscription = self.bus.subscribe(&topic, of, qos).await?;
-        let heard = timeout(PATIENCE, reaches(subscription.matched.clone(), 1));
+        let heard = timeout(
+            PATIENCE,
+            wait_for_connected(subscription.matched.clone(), 1),
+        );
         heard.await.map_err(|_| BusError::Timeout {
             what: format!("topic {topic}"),
             after: PATIENCE,
@@ -170,7 +174,7 @@ impl LifecycleNode {
         Ok(StateChanges { subscription })
     }
 
-    async fn ask(
+    async fn call(
         &self,
         part: &str,
         type_name: &str,
@@ -183,29 +187,29 @@ impl LifecycleNode {
         answer.await
     }
 
-    fn read<T>(
+    fn parse_answer<T>(
         &self,
         part: &str,
         answer: &[u8],
-        read: impl FnOnce(&mut Cursor<'_>) -> Option<T>,
+        read: impl FnOnce(&mut MessageCursor<'_>) -> Option<T>,
     ) -> Result<T, BusError> {
-        let cursor = Cursor::new(RosVersion::Two, answer);
+        let cursor = MessageCursor::new(RosVersion::Two, answer);
         let read = cursor.and_then(|mut cursor| read(&mut cursor));
         read.ok_or_else(|| BusError::Protocol {
             what: format!("service {}/{part}", self.node),
-            reason: "its answer is torn".to_owned(),
+            reason: "its answer is truncated".to_owned(),
         })
     }
 }
 
 impl StateChanges {
-    /// The next one; none when the connection to the ROS system has ended. Safe to cancel.
+    /// Returns the next change, or `None` when the connection to the ROS system has ended. Cancel-safe.
     pub async fn next(&mut self) -> Option<StateChange> {
         loop {
             let message = self.subscription.messages.recv().await?;
-            let cursor = Cursor::new(RosVersion::Two, &message.bytes);
+            let cursor = MessageCursor::new(RosVersion::Two, &message.bytes);
             let change = cursor.and_then(|mut cursor| {
-                // When it was.
+                // The timestamp.
                 cursor.skip(1, 8, 8)?;
                 read_change(&mut cursor).map(|(_, change)| change)
             });
@@ -216,19 +220,19 @@ impl StateChanges {
     }
 }
 
-/// The label of a transition, which events leave empty, and from where to where it leads.
-fn read_change(cursor: &mut Cursor<'_>) -> Option<(String, StateChange)> {
+/// Reads the label of a transition, which is empty in events, and its states.
+fn read_change(cursor: &mut MessageCursor<'_>) -> Option<(String, StateChange)> {
     let (_, label) = read_number_and_label(cursor)?;
     let (from, _) = read_number_and_label(cursor)?;
     let (to, _) = read_number_and_label(cursor)?;
     let change = StateChange {
-        from: State::of(from),
-        to: State::of(to),
+        from: State::from_number(from),
+        to: State::from_number(to),
     };
     Some((label, change))
 }
 
-fn read_number_and_label(cursor: &mut Cursor<'_>) -> Option<(u8, String)> {
+fn read_number_and_label(cursor: &mut MessageCursor<'_>) -> Option<(u8, String)> {
     let [number] = cursor.number()?;
     let label = cursor.string(false)?;
     let label = label.strip_suffix(&[0]).unwrap_or(label);
@@ -236,8 +240,8 @@ fn read_number_and_label(cursor: &mut Cursor<'_>) -> Option<(u8, String)> {
 }
 
 impl State {
-    /// By its number in `lifecycle_msgs/msg/State`.
-    fn of(number: u8) -> Self {
+    /// Returns the state of this number in `lifecycle_msgs/msg/State`.
+    fn from_number(number: u8) -> Self {
         match number {
             0 => Self::Unknown,
             1 => Self::Unconfigured,
@@ -255,7 +259,7 @@ impl State {
     }
 }
 
-/// As nodes call it.
+/// Displays the label that nodes use.
 impl fmt::Display for State {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let label = match self {
@@ -277,7 +281,7 @@ impl fmt::Display for State {
 }
 
 impl Transition {
-    /// As nodes call it.
+    /// Returns the label that nodes use.
     pub fn label(self) -> &'static str {
         match self {
             Self::Configure => "configure",

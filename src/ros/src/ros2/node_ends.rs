@@ -1,19 +1,20 @@
-//! What each node has, by what is seen of its ends in DDS.
+//! Endpoints of each node, derived from DDS discovery.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
 use rtps::EndpointData;
 
-use super::names::{self, Named};
+use super::names::{self, RosTopicRole};
 use super::quality;
-use super::seen::{self, Seen};
+use super::seen::{self, DiscoverySnapshot};
 use super::type_hash;
-use crate::bus::{Digest, NodeEnds, ServiceType, WireFormat};
+use crate::bus::{Digest, NodeEntities, ServiceType, WireFormat};
 
-/// Node → its ends. Those of whose node nothing is known are left out, and so is what is not ROS's.
-pub(super) fn all(seen: &Seen) -> BTreeMap<String, NodeEnds> {
-    let mut nodes: BTreeMap<String, NodeEnds> = BTreeMap::new();
+/// Returns the endpoints by node. Endpoints whose node is unknown are left out, and so are topics that do not belong to
+/// ROS.
+pub(super) fn collect_endpoints(seen: &DiscoverySnapshot) -> BTreeMap<String, NodeEntities> {
+    let mut nodes: BTreeMap<String, NodeEntities> = BTreeMap::new();
     let (writers, readers) = (
         seen.discovered.writers.values(),
         seen.discovered.readers.values(),
@@ -25,7 +26,7 @@ pub(super) fn all(seen: &Seen) -> BTreeMap<String, NodeEnds> {
         let Some(owner) = seen.owner(end.guid) else {
             continue;
         };
-        let Some(named) = names::named(&end.topic) else {
+        let Some(named) = names::topic_role(&end.topic) else {
             continue;
         };
         let node = match nodes.get_mut(&**owner) {
@@ -33,62 +34,65 @@ pub(super) fn all(seen: &Seen) -> BTreeMap<String, NodeEnds> {
             None => nodes.entry(owner.to_string()).or_default(),
         };
         match named {
-            Named::Topic(name) => {
-                let topics = match writes {
-                    true => &mut node.publishers,
-                    false => &mut node.subscribers,
+            RosTopicRole::Topic(name) => {
+                let topics = if writes {
+                    &mut node.publishers
+                } else {
+                    &mut node.subscribers
                 };
-                let qos = quality::of_end(&end.qos);
+                let qos = quality::from_endpoint(&end.qos);
                 match topics.entry(name) {
                     Entry::Vacant(free) => {
                         free.insert((seen::wire_type(end), qos));
                     }
                     Entry::Occupied(mut known) => {
                         let known = &mut known.get_mut().1;
-                        *known = quality::joined(*known, qos, writes);
+                        *known = quality::merge_qos(*known, qos, writes);
                     }
                 }
             }
-            Named::Request(name) => {
-                let services = match writes {
-                    true => &mut node.clients,
-                    false => &mut node.services,
+            RosTopicRole::Request(name) => {
+                let services = if writes {
+                    &mut node.clients
+                } else {
+                    &mut node.services
                 };
                 if let Some(of) = service_type(seen, end, &name, writes) {
                     services.entry(name).or_insert(of);
                 }
             }
-            // Servers and clients are known by the requests.
-            Named::Reply(_) => {}
+            // Servers and clients are found by the request topics.
+            RosTopicRole::Reply(_) => {}
         }
     }
     nodes
 }
 
-/// The type of the service whose requests this end reads (a server), or writes (a client).
+/// Returns the type of the service whose requests this endpoint reads (a server) or writes (a client).
 pub(super) fn service_type(
-    seen: &Seen,
+    seen: &DiscoverySnapshot,
     end: &EndpointData,
     service: &str,
     writes: bool,
 ) -> Option<ServiceType> {
     let reply = names::reply_name(service);
-    let replies = match writes {
-        true => seen.readers(&reply),
-        false => seen.writers(&reply),
+    let replies = if writes {
+        seen.readers(&reply)
+    } else {
+        seen.writers(&reply)
     };
     let same = replies.iter().find(|it| it.guid.prefix == end.guid.prefix);
-    let response = same.map(|reply| type_hash::of_message(&reply.user_data));
+    let response = same.map(|reply| type_hash::message_hash(&reply.user_data));
     Some(ServiceType {
-        name: names::service_type_of(&end.type_name)?,
+        name: names::service_type(&end.type_name)?,
         format: WireFormat::Cdr,
-        digest: type_hash::of_service(&end.user_data),
-        request: type_hash::of_message(&end.user_data),
+        digest: type_hash::service_hash(&end.user_data),
+        request: type_hash::message_hash(&end.user_data),
         response: response.unwrap_or_else(Digest::any),
     })
 }
 
-/// The profile that is shown of an end, for the depth of which peers say nothing.
+/// Depth shown for an endpoint that keeps all samples.
 pub(super) const DEPTH: usize = 10;
 
 #[cfg(test)]
@@ -97,9 +101,11 @@ mod tests {
     use std::sync::Arc;
 
     use bytes::Bytes;
-    use rtps::{Discovered, Durability, EndpointQos, EntityId, Guid, GuidPrefix, Reliability};
+    use rtps::{
+        DiscoveredGraph, DurabilityKind, EndpointQos, EntityId, Guid, GuidPrefix, ReliabilityKind,
+    };
 
-    use super::super::entities::{Entities, GidSize, Node};
+    use super::super::entities::{DiscoveredNode, GidSize, ParticipantEntities};
     use super::*;
     use crate::bus;
 
@@ -125,11 +131,11 @@ mod tests {
     #[test]
     fn a_node_has_what_its_ends_are_named_after_with_what_tools_hide() {
         let weak = EndpointQos {
-            reliability: Reliability::BestEffort,
+            reliability: ReliabilityKind::BestEffort,
             ..EndpointQos::default()
         };
         let latching = EndpointQos {
-            durability: Durability::TransientLocal,
+            durability: DurabilityKind::TransientLocal,
             ..EndpointQos::default()
         };
         let string = "std_msgs::msg::dds_::String_";
@@ -145,10 +151,10 @@ mod tests {
             endpoint(guid(6, true), "rr/setReply", reply, weak),
             endpoint(guid(7, true), "rq/fib/_action/send_goalRequest", send, weak),
             endpoint(guid(8, true), "other", string, weak),
-            // Of nobody that has been told of.
+            // The node has not been announced.
             endpoint(guid(9, true), "rt/early", string, weak),
         ];
-        let mut discovered = Discovered::default();
+        let mut discovered = DiscoveredGraph::default();
         let (mut readers, mut writers) = (Vec::new(), Vec::new());
         for end in ends {
             let writes = end.guid.entity.is_writer();
@@ -156,14 +162,15 @@ mod tests {
                 let owned = if writes { &mut writers } else { &mut readers };
                 owned.push(end.guid);
             }
-            let known = match writes {
-                true => &mut discovered.writers,
-                false => &mut discovered.readers,
+            let known = if writes {
+                &mut discovered.writers
+            } else {
+                &mut discovered.readers
             };
             known.insert(end.guid, end);
         }
-        let entities = Entities {
-            nodes: vec![Node {
+        let entities = ParticipantEntities {
+            nodes: vec![DiscoveredNode {
                 name: "/node".into(),
                 readers,
                 writers,
@@ -171,19 +178,19 @@ mod tests {
             gids: GidSize::Sixteen,
         };
         let told = HashMap::from([(PARTICIPANT, Arc::new(entities))]);
-        let all = all(&Seen::new(Arc::new(discovered), &told));
+        let all = collect_endpoints(&DiscoverySnapshot::new(Arc::new(discovered), &told));
         assert_eq!(all.len(), 1);
         let node = &all["/node"];
         let names = |topics: &BTreeMap<String, _>| topics.keys().cloned().collect::<Vec<_>>();
         assert_eq!(names(&node.publishers), ["/map"]);
         assert_eq!(names(&node.subscribers), ["/scan"]);
-        // The most of what it offers, and the least of what it asks for.
+        // The strongest of what it offers, and the weakest of what it requests.
         let (of, map) = &node.publishers["/map"];
         assert_eq!(of.name, "std_msgs/msg/String");
-        assert_eq!(map.reliability, bus::Reliability::Reliable);
+        assert_eq!(map.reliability, bus::QosReliability::Reliable);
         assert!(map.is_latching());
         let scan = node.subscribers["/scan"].1;
-        assert_eq!(scan.reliability, bus::Reliability::BestEffort);
+        assert_eq!(scan.reliability, bus::QosReliability::BestEffort);
         let serves: Vec<_> = node
             .services
             .iter()

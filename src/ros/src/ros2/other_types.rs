@@ -1,44 +1,44 @@
-//! Nodes that have a client of a service or an action of this node by another type. Ends of types with other names never meet, and
-//! ROS 2 tells a client nothing of that: it waits. So it is logged here, where the service is.
+//! Detection of clients that use a service or an action of this node with another type. Endpoints with different type
+//! names never match, and ROS 2 does not tell a client: it waits. So it is logged here, where the service is.
 
 use std::collections::HashSet;
 
 use rtps::Guid;
 
 use super::names;
-use super::seen::Seen;
+use super::seen::DiscoverySnapshot;
 use crate::bus::ServiceType;
 
-/// The clients that were told of.
+/// The mismatched clients that were logged.
 #[derive(Default)]
-pub(super) struct OtherTypes {
+pub(super) struct TypeMismatchLog {
     told: HashSet<Guid>,
 }
 
-/// One such client.
+/// One mismatched client.
 #[derive(Debug, PartialEq)]
-pub(super) struct Told {
+pub(super) struct MismatchedClient {
     /// `service /set` or `action /fib`.
     pub(super) what: String,
-    /// Whose client it is.
+    /// Node of the client.
     pub(super) node: String,
-    /// The type that it asks for.
+    /// Type that the client requests.
     pub(super) theirs: String,
-    /// The type that is served.
+    /// Type that is served.
     pub(super) ours: String,
 }
 
-impl OtherTypes {
-    /// Logs those that are new.
-    pub(super) fn look<'a>(
+impl TypeMismatchLog {
+    /// Logs new mismatches.
+    pub(super) fn log_new<'a>(
         &mut self,
         served: impl Iterator<Item = (&'a str, &'a ServiceType)>,
-        seen: &Seen,
+        seen: &DiscoverySnapshot,
     ) {
-        for told in self.news(served, seen) {
+        for told in self.new_mismatches(served, seen) {
             tracing::warn!(
                 node = told.node,
-                "{}: it asks for {} and waits for ever, {} is served; use that type there",
+                "{}: it asks for {} and waits forever, since {} is served; use that type there",
                 told.what,
                 told.theirs,
                 told.ours
@@ -46,12 +46,12 @@ impl OtherTypes {
         }
     }
 
-    /// Those that are new, of what is served. Who has left is told of again should it come back.
-    fn news<'a>(
+    /// Returns new mismatches with the services served. A client that left is reported again if it comes back.
+    fn new_mismatches<'a>(
         &mut self,
         served: impl Iterator<Item = (&'a str, &'a ServiceType)>,
-        seen: &Seen,
-    ) -> Vec<Told> {
+        seen: &DiscoverySnapshot,
+    ) -> Vec<MismatchedClient> {
         let mut there = HashSet::new();
         let mut news = Vec::new();
         for (service, of) in served {
@@ -60,17 +60,17 @@ impl OtherTypes {
             };
             let clients = seen.writers(&request.name).iter();
             for client in clients.filter(|it| it.type_name != request.type_name) {
-                // Whose it is will be told in a moment.
+                // The node will be known in a moment.
                 if !seen.is_named(client.guid) {
                     continue;
                 }
                 there.insert(client.guid);
-                let Some(theirs) = names::service_type_of(&client.type_name) else {
+                let Some(theirs) = names::service_type(&client.type_name) else {
                     continue;
                 };
                 if !self.told.contains(&client.guid) {
                     let node = seen.node(client.guid).to_string();
-                    news.extend(told(service, node, theirs, of.name.clone()));
+                    news.extend(mismatched_client(service, node, theirs, of.name.clone()));
                 }
             }
         }
@@ -79,28 +79,33 @@ impl OtherTypes {
     }
 }
 
-/// Of an action it is told once, not for each of its parts.
-fn told(service: &str, node: String, theirs: String, ours: String) -> Option<Told> {
+/// Describes a mismatch; an action is reported once, not for each of its parts.
+fn mismatched_client(
+    service: &str,
+    node: String,
+    theirs: String,
+    ours: String,
+) -> Option<MismatchedClient> {
     let told = match names::action_part(service) {
-        None => Told {
+        None => MismatchedClient {
             what: format!("service {service}"),
             node,
             theirs,
             ours,
         },
-        Some((action, "send_goal")) => Told {
+        Some((action, "send_goal")) => MismatchedClient {
             what: format!("action {action}"),
             node,
-            theirs: of_action(theirs),
-            ours: of_action(ours),
+            theirs: action_type_name(theirs),
+            ours: action_type_name(ours),
         },
         Some(_) => return None,
     };
     Some(told)
 }
 
-/// `test_msgs/action/Fibonacci` of the type of its goals' service.
-fn of_action(send_goal: String) -> String {
+/// Returns the action type `test_msgs/action/Fibonacci` of its goal service's type.
+fn action_type_name(send_goal: String) -> String {
     match send_goal.strip_suffix("_SendGoal") {
         Some(action) => action.to_owned(),
         None => send_goal,
@@ -113,16 +118,16 @@ mod tests {
     use std::sync::Arc;
 
     use bytes::Bytes;
-    use rtps::{Discovered, EndpointData, EndpointQos, EntityId, GuidPrefix};
+    use rtps::{DiscoveredGraph, EndpointData, EndpointQos, EntityId, GuidPrefix};
 
-    use super::super::entities::{Entities, GidSize, Node};
+    use super::super::entities::{DiscoveredNode, GidSize, ParticipantEntities};
     use super::*;
 
     const APP: GuidPrefix = GuidPrefix([1; 12]);
 
     /// The node `/app` has a client of each of these topics and types.
-    fn seen(clients: &[(&str, &str)]) -> Seen {
-        let mut discovered = Discovered::default();
+    fn snapshot(clients: &[(&str, &str)]) -> DiscoverySnapshot {
+        let mut discovered = DiscoveredGraph::default();
         for (number, (topic, type_name)) in clients.iter().enumerate() {
             let guid = Guid::new(APP, EntityId([0, 0, number as u8, 3]));
             let end = EndpointData {
@@ -136,17 +141,17 @@ mod tests {
             };
             discovered.writers.insert(guid, Arc::new(end));
         }
-        let app = Node {
+        let app = DiscoveredNode {
             name: "/app".into(),
             readers: Vec::new(),
             writers: discovered.writers.keys().copied().collect(),
         };
-        let entities = Entities {
+        let entities = ParticipantEntities {
             nodes: vec![app],
             gids: GidSize::Sixteen,
         };
         let told = HashMap::from([(APP, Arc::new(entities))]);
-        Seen::new(Arc::new(discovered), &told)
+        DiscoverySnapshot::new(Arc::new(discovered), &told)
     }
 
     #[test]
@@ -162,7 +167,7 @@ mod tests {
             ("/fib/_action/send_goal", &send),
             ("/fib/_action/get_result", &result),
         ];
-        let clients = seen(&[
+        let clients = snapshot(&[
             ("rq/setRequest", "std_srvs::srv::dds_::SetBool_Request_"),
             ("rq/setRequest", "std_srvs::srv::dds_::Trigger_Request_"),
             (
@@ -174,8 +179,8 @@ mod tests {
                 "x::action::dds_::Count_GetResult_Request_",
             ),
         ]);
-        let mut all = OtherTypes::default();
-        let told = |what: &str, theirs: &str, ours: &str| Told {
+        let mut all = TypeMismatchLog::default();
+        let told = |what: &str, theirs: &str, ours: &str| MismatchedClient {
             what: what.to_owned(),
             node: "/app".to_owned(),
             theirs: theirs.to_owned(),
@@ -193,9 +198,9 @@ mod tests {
                 "test_msgs/action/Fibonacci",
             ),
         ];
-        assert_eq!(all.news(served.into_iter(), &clients), expected);
-        assert_eq!(all.news(served.into_iter(), &clients), []);
-        assert_eq!(all.news(served.into_iter(), &seen(&[])), []);
-        assert_eq!(all.news(served.into_iter(), &clients), expected);
+        assert_eq!(all.new_mismatches(served.into_iter(), &clients), expected);
+        assert_eq!(all.new_mismatches(served.into_iter(), &clients), []);
+        assert_eq!(all.new_mismatches(served.into_iter(), &snapshot(&[])), []);
+        assert_eq!(all.new_mismatches(served.into_iter(), &clients), expected);
     }
 }

@@ -1,25 +1,25 @@
-//! How a process becomes a node of ROS 2: its environment and its command line
+//! Environment and command line that make a process a node of ROS 2
 //! (<https://design.ros2.org/articles/ros_command_line_arguments.html>).
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::bus::ParamValue;
-use crate::identity::{Called, Identity, Naming};
+use crate::identity::{Naming, NodeIdentity, NodeRename};
 
-/// The domain of every servant's nodes, and of the bus that speaks with them. A servant's network is its own, so that all can
-/// have the same.
+/// Domain of every servant's nodes, and of the bus that connects to them. Each servant has its own network, so all can
+/// use the same.
 pub const DOMAIN: u16 = 0;
 
-/// The variable that says where nodes run, and where they keep what they write.
+/// Variable with the working directory of nodes, where they also write their files.
 pub(crate) const HOME: &str = "ROS_HOME";
 
-/// What follows on a command line is for ROS, up to its end or to [`END`].
+/// Begins arguments for ROS, which extend to the end or to [`END`].
 const ROS_ARGUMENTS: &str = "--ros-args";
 const END: &str = "--";
 
-/// Before the name of a robot's node, in the enclave of its process.
+/// Prefix of a process's enclave, before the name of the robot's node.
 const LINKED: &str = "/cloudroid_link";
-/// The longest name of a node that is marked by its enclave.
+/// Maximum length of the name of a node that is marked by its enclave.
 const MAX_MARKED: usize = 200;
 
 pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
@@ -28,11 +28,11 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
         (HOME, home.to_owned()),
         ("ROS_LOG_DIR", format!("{home}/log")),
         ("ROS_DOMAIN_ID", DOMAIN.to_string()),
-        // Nodes find each other by multicast, which a network of nothing but lo carries, too. By LOCALHOST Fast DDS would find
-        // the first 32 of them alone, and Cyclone DDS none.
+        // Nodes discover each other by multicast, which works even on a network with nothing but lo. With LOCALHOST
+        // Fast DDS would find only the first 32 of them, and Cyclone DDS none.
         ("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET".to_owned()),
-        // A node's output is a pipe: without these its lines come when a buffer is full, and the last ones of a node that crashes never.
-        // 1 is by the line, wherever rcutils writes.
+        // A node's output is a pipe: without these its lines arrive only when a buffer is full, and the last lines of a
+        // node that crashes are lost. 1 means line buffering, wherever rcutils writes.
         ("RCUTILS_LOGGING_BUFFERED_STREAM", "1".to_owned()),
         ("PYTHONUNBUFFERED", "1".to_owned()),
     ]
@@ -40,75 +40,78 @@ pub(crate) fn environment(home: &str) -> BTreeMap<String, String> {
     .into()
 }
 
-pub(crate) fn identity(node: &str) -> Identity {
-    let (above, last) = halves(node);
-    remapped(&[("__node", last), ("__ns", or_root(above))])
+pub(crate) fn identity(node: &str) -> NodeIdentity {
+    let (above, last) = split_name(node);
+    remap_identity(&[("__node", last), ("__ns", or_root(above))])
 }
 
-/// What a program is told that runs as a robot's node of this name: as much of the name as its command line does not say itself, and the
-/// mark by which its nodes are known.
-pub(crate) fn of_a_robot(node: &str, says: Naming) -> Identity {
-    let (above, last) = halves(node);
+/// Returns the arguments for a program that runs as the robot's node of this name: the parts of the name that its
+/// command line does not set itself, and the mark by which its nodes are known.
+pub(crate) fn robot_identity(node: &str, says: Naming) -> NodeIdentity {
+    let (above, last) = split_name(node);
     let name = says
         .name
         .then(|| ["-r".to_owned(), format!("__node:={last}")]);
     let namespace = says
         .namespace
         .then(|| ["-r".to_owned(), format!("__ns:={}", or_root(above))]);
-    let mark = enclave_of(node).map(|mark| ["--enclave".to_owned(), mark]);
+    let mark = enclave_for(node).map(|mark| ["--enclave".to_owned(), mark]);
     let told = [name, namespace, mark].into_iter().flatten();
-    Identity {
+    NodeIdentity {
         arguments: ros_arguments(told),
         environment: BTreeMap::new(),
     }
 }
 
-/// The enclave of a process that runs as a robot's node of this name, by which all of its nodes are known, whatever their names. None for a name that
-/// would make it longer than rcl allows.
-pub(crate) fn enclave_of(node: &str) -> Option<String> {
+/// Returns the enclave of a process that runs as the robot's node of this name; it identifies all nodes of the process,
+/// whatever their names. `None` if it would be longer than rcl allows.
+pub(crate) fn enclave_for(node: &str) -> Option<String> {
     (node.len() <= MAX_MARKED).then(|| format!("{LINKED}{node}"))
 }
 
-/// Rules for each node of a process that is called otherwise than by its program. A program that says another name each time is told by rules for all
-/// of its nodes, since no other would fit: then there is one.
-pub(crate) fn renamed(nodes: &[Called]) -> Identity {
+/// Returns rules for the nodes of a process whose names differ from those set by the program. For a program whose node
+/// name differs at each start the rules apply to all of its nodes, because no other would match: then there is one
+/// node.
+pub(crate) fn rename_identity(nodes: &[NodeRename]) -> NodeIdentity {
     let mut rules = BTreeSet::new();
-    for Called { own, node } in nodes {
+    for NodeRename { own, node } in nodes {
         let Some(own) = own else {
             return identity(node);
         };
-        let ((_, own), (_, last)) = (halves(own), halves(node));
+        let ((_, own), (_, last)) = (split_name(own), split_name(node));
         if own != last {
             rules.insert((format!("{own}:__node"), last));
         }
     }
     let rules: Vec<_> = rules.iter().map(|(from, to)| (&**from, *to)).collect();
-    remapped(&rules)
+    remap_identity(&rules)
 }
 
-/// Namespace and name.
-fn halves(node: &str) -> (&str, &str) {
+/// Splits into namespace and name.
+fn split_name(node: &str) -> (&str, &str) {
     node.rsplit_once('/').unwrap_or(("", node))
 }
 
-/// Where a rule stands before all others of a command line: rcl takes the first that fits.
-pub(crate) fn first_rule(argv: &[String]) -> usize {
+/// Returns the position at which a rule precedes all others on a command line: rcl applies the first match.
+pub(crate) fn first_rule_position(argv: &[String]) -> usize {
     let first = argv.iter().position(|word| word == ROS_ARGUMENTS);
     first.unwrap_or(argv.len())
 }
 
-/// Without security an enclave is a word that others are told. Of several the last one counts.
-pub(crate) fn in_enclave(enclave: &str) -> Identity {
+/// Returns the arguments that set an enclave. Without security it is just a word that others are told. If there are
+/// several, the last one applies.
+pub(crate) fn enclave_identity(enclave: &str) -> NodeIdentity {
     let argument = ["--enclave".to_owned(), enclave.to_owned()];
-    Identity {
+    NodeIdentity {
         arguments: ros_arguments(std::iter::once(argument)),
         environment: BTreeMap::new(),
     }
 }
 
-/// Arguments that give the node of this absolute name its parameters: those below its name, and those without a namespace,
-/// which every node is given. A level of names is a dot here. Whatever follows them on the command line is the program's again.
-pub(crate) fn parameters(node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<String> {
+/// Returns the arguments that set the parameters of the node of this absolute name: those below its name, and those
+/// without a namespace, which every node is given. Levels are separated by dots here. Arguments that follow on the
+/// command line are the program's again.
+pub(crate) fn parameter_arguments(node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<String> {
     let mut given = BTreeMap::new();
     for (key, value) in all {
         let everybodys = key.strip_prefix('/').filter(|name| !name.contains('/'));
@@ -131,7 +134,7 @@ pub(crate) fn parameters(node: &str, all: &BTreeMap<String, ParamValue>) -> Vec<
     arguments
 }
 
-/// A dictionary is several parameters.
+/// Flattens a dictionary into several parameters.
 fn flatten(name: &str, value: &ParamValue, into: &mut BTreeMap<String, String>) {
     match value {
         ParamValue::Map(entries) => {
@@ -145,41 +148,41 @@ fn flatten(name: &str, value: &ParamValue, into: &mut BTreeMap<String, String>) 
     }
 }
 
-/// As the parser of `-p` reads it (YAML). What ROS 2 has no such parameter for (lists of several types, or of lists) is
-/// written all the same: the node then ends, and says why.
+/// Formats a value as the parser of `-p` reads it (YAML). Values that ROS 2 does not support (lists of mixed types, or
+/// of lists) are written all the same: the node then exits with the reason.
 pub fn yaml(value: &ParamValue) -> String {
     match value {
         ParamValue::Bool(value) => value.to_string(),
         ParamValue::Int(value) => value.to_string(),
-        ParamValue::Double(value) => double(*value),
-        ParamValue::String(text) => quoted(text),
+        ParamValue::Double(value) => yaml_double(*value),
+        ParamValue::String(text) => quote(text),
         ParamValue::Nil => "null".to_owned(),
-        ParamValue::Binary(bytes) => listed(bytes.iter().map(|byte| byte.to_string())),
+        ParamValue::Binary(bytes) => yaml_list(bytes.iter().map(|byte| byte.to_string())),
         ParamValue::List(items) => {
-            // A list has one type; what is written as `[1, 2.5]` means doubles.
+            // A list has one type; `[1, 2.5]` means doubles.
             let doubles = items
                 .iter()
                 .any(|item| matches!(item, ParamValue::Double(_)));
-            listed(items.iter().map(|item| match item {
-                ParamValue::Int(value) if doubles => double(*value as f64),
+            yaml_list(items.iter().map(|item| match item {
+                ParamValue::Int(value) if doubles => yaml_double(*value as f64),
                 item => yaml(item),
             }))
         }
         ParamValue::Map(entries) => {
             let entries = entries
                 .iter()
-                .map(|(name, value)| format!("{}: {}", quoted(name), yaml(value)));
+                .map(|(name, value)| format!("{}: {}", quote(name), yaml(value)));
             format!("{{{}}}", entries.collect::<Vec<_>>().join(", "))
         }
     }
 }
 
-fn listed(items: impl Iterator<Item = String>) -> String {
+fn yaml_list(items: impl Iterator<Item = String>) -> String {
     format!("[{}]", items.collect::<Vec<_>>().join(", "))
 }
 
-/// Told from a whole number by its point or its exponent.
-fn double(value: f64) -> String {
+/// Formats a double so that it differs from an integer by its point or its exponent.
+fn yaml_double(value: f64) -> String {
     if value.is_nan() {
         ".nan".to_owned()
     } else if value.is_infinite() {
@@ -189,8 +192,8 @@ fn double(value: f64) -> String {
     }
 }
 
-/// JSON's strings are YAML's in double quotes.
-fn quoted(text: &str) -> String {
+/// Quotes a text. JSON strings are YAML double-quoted strings.
+fn quote(text: &str) -> String {
     serde_json::Value::from(text).to_string()
 }
 
@@ -198,9 +201,9 @@ fn or_root(namespace: &str) -> &str {
     if namespace.is_empty() { "/" } else { namespace }
 }
 
-fn remapped(rules: &[(&str, &str)]) -> Identity {
+fn remap_identity(rules: &[(&str, &str)]) -> NodeIdentity {
     let rules = rules.iter();
-    Identity {
+    NodeIdentity {
         arguments: ros_arguments(
             rules.map(|(from, to)| ["-r".to_owned(), format!("{from}:={to}")]),
         ),
@@ -208,7 +211,7 @@ fn remapped(rules: &[(&str, &str)]) -> Identity {
     }
 }
 
-/// Nothing where there is nothing to say.
+/// Returns the arguments; empty if there are no rules.
 fn ros_arguments(rules: impl Iterator<Item = [String; 2]>) -> Vec<String> {
     let rules: Vec<String> = rules.flatten().collect();
     if rules.is_empty() {
@@ -234,11 +237,11 @@ mod tests {
     #[test]
     fn nodes_of_a_process_are_renamed_one_by_one_and_before_all_other_rules() {
         let told = |nodes: &[(&str, &str)]| {
-            let nodes = nodes.iter().map(|(own, node)| Called {
+            let nodes = nodes.iter().map(|(own, node)| NodeRename {
                 own: (!own.is_empty()).then(|| (*own).to_owned()),
                 node: (*node).to_owned(),
             });
-            renamed(&nodes.collect::<Vec<_>>()).arguments
+            rename_identity(&nodes.collect::<Vec<_>>()).arguments
         };
         assert_eq!(told(&[("/front/talker", "/front/talker")]), [""; 0]);
         let nodes = [
@@ -249,19 +252,22 @@ mod tests {
         ];
         let rules = ["-r", "ears:__node:=ears_2", "-r", "nose:__node:=nose_2"];
         assert_eq!(told(&nodes), [&["--ros-args"], &rules[..]].concat());
-        // Another name each time.
+        // Another name at each start.
         let all = ["--ros-args", "-r", "__node:=see", "-r", "__ns:=/front"];
         assert_eq!(told(&[("", "/front/see")]), all);
         let argv = |words: &str| words.split(' ').map(str::to_owned).collect::<Vec<_>>();
-        assert_eq!(first_rule(&argv("/x -v --ros-args -r __ns:=/front")), 2);
-        assert_eq!(first_rule(&argv("/x -v")), 2);
+        assert_eq!(
+            first_rule_position(&argv("/x -v --ros-args -r __ns:=/front")),
+            2
+        );
+        assert_eq!(first_rule_position(&argv("/x -v")), 2);
     }
 
     #[test]
     fn a_robots_program_is_told_what_its_command_line_does_not_say_and_is_marked() {
         let told = |name, namespace| {
             let says = Naming { name, namespace };
-            of_a_robot("/camera/see", says).arguments.join(" ")
+            robot_identity("/camera/see", says).arguments.join(" ")
         };
         let mark = "--enclave /cloudroid_link/camera/see";
         assert_eq!(told(false, false), format!("--ros-args {mark}"));
@@ -273,7 +279,10 @@ mod tests {
         assert_eq!(told(true, true), all);
         let long = format!("/{}", "x".repeat(240));
         let all = Naming::default();
-        assert_eq!(of_a_robot(&long, all).arguments, identity(&long).arguments);
+        assert_eq!(
+            robot_identity(&long, all).arguments,
+            identity(&long).arguments
+        );
     }
 
     #[test]
@@ -295,7 +304,7 @@ mod tests {
             assert!(identity.environment.is_empty());
         }
         assert_eq!(
-            in_enclave("/x").arguments,
+            enclave_identity("/x").arguments,
             ["--ros-args", "--enclave", "/x"]
         );
     }
@@ -342,8 +351,8 @@ mod tests {
             "use_sim_time:=true",
             "--",
         ];
-        assert_eq!(parameters("/camera/see", &all), expected);
-        assert_eq!(parameters("/see", &BTreeMap::new()), [""; 0]);
+        assert_eq!(parameter_arguments("/camera/see", &all), expected);
+        assert_eq!(parameter_arguments("/see", &BTreeMap::new()), [""; 0]);
     }
 
     #[test]

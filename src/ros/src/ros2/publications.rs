@@ -1,42 +1,44 @@
-//! Topics that this node publishes: a writer for each advertisement.
+//! Topics that this node publishes: one writer for each advertisement.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use rtps::{EndpointData, EndpointQos, Ends};
+use rtps::{EndpointData, EndpointMatches, EndpointQos};
 use tokio::sync::watch;
 use tokio::task::AbortHandle;
 
-use super::bus::Inner;
+use super::bus::Ros2BusState;
 use super::ends::WriterEnd;
 use super::quality;
-use super::seen::{self, Seen};
+use super::seen::{self, DiscoverySnapshot};
 use super::{names, show, topic_type};
-use crate::bus::{BusError, Matched, Peer, PeerId, Publisher, Qos, Refusal, WireType};
+use crate::bus::{
+    BusError, IncompatiblePeer, MatchedPeers, PeerId, Publisher, QosProfile, TopicPeer, WireType,
+};
 
-/// What this node advertises, by topic: the type, and how many do.
+/// Advertised topics with their type and the number of advertisements.
 pub(super) type Adverts = HashMap<String, (Arc<WireType>, usize)>;
 
-/// Advertises with a writer of its own.
+/// Advertises a topic with a writer of its own.
 pub(super) async fn advertise(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros2BusState>,
     name: &str,
     of: WireType,
-    qos: Qos,
+    qos: QosProfile,
 ) -> Result<Box<dyn Publisher>, BusError> {
     let of = match of.name.as_str() {
-        // DDS knows no topic without a type; whoever does not know it means that of the others.
+        // DDS has no topic without a type; an unspecified type means that of the other endpoints.
         "*" => topic_type::find(bus, name).await?,
         _ => of,
     };
     let topic = names::topic(name, &of)?;
     let of = claim(bus, name, of)?;
-    let endpoint = quality::offered(&qos);
+    let endpoint = quality::writer_qos(&qos);
     let writer = WriterEnd::open(bus, &topic, endpoint);
     let matched = watch::Sender::default();
     let handle = matched.subscribe();
-    let following = Following {
+    let following = SubscriberWatcher {
         bus: Arc::clone(bus),
         name: name.to_owned(),
         topic: topic.name,
@@ -46,7 +48,7 @@ pub(super) async fn advertise(
         matched,
         told: HashMap::new(),
     };
-    Ok(Box::new(Handle {
+    Ok(Box::new(WriterHandle {
         bus: Arc::clone(bus),
         name: name.to_owned(),
         writer,
@@ -55,13 +57,13 @@ pub(super) async fn advertise(
     }))
 }
 
-/// All advertisements of a topic have one type.
-fn claim(bus: &Inner, name: &str, of: WireType) -> Result<Arc<WireType>, BusError> {
+/// Checks that all advertisements of a topic have one type, and counts this one.
+fn claim(bus: &Ros2BusState, name: &str, of: WireType) -> Result<Arc<WireType>, BusError> {
     let mut adverts = bus.adverts.lock();
     let (before, count) = adverts
         .entry(name.to_owned())
         .or_insert_with(|| (Arc::new(of.clone()), 0));
-    if before.name != of.name || !before.agrees(&of) {
+    if before.name != of.name || !before.is_compatible_with(&of) {
         return Err(BusError::TypeMismatch {
             what: format!("advertisement of {name}"),
             theirs: before.to_string(),
@@ -72,28 +74,28 @@ fn claim(bus: &Inner, name: &str, of: WireType) -> Result<Arc<WireType>, BusErro
     Ok(Arc::clone(before))
 }
 
-/// Looks who listens.
-struct Following {
-    bus: Arc<Inner>,
+/// Tracks the subscribers of a writer.
+struct SubscriberWatcher {
+    bus: Arc<Ros2BusState>,
     name: String,
-    /// As DDS has it.
+    /// Name in DDS.
     topic: String,
     of: Arc<WireType>,
     qos: EndpointQos,
-    ends: watch::Receiver<Arc<Ends>>,
-    matched: watch::Sender<Matched>,
-    /// Refusals that were logged.
+    ends: watch::Receiver<Arc<EndpointMatches>>,
+    matched: watch::Sender<MatchedPeers>,
+    /// Incompatible peers that were logged.
     told: HashMap<PeerId, String>,
 }
 
-impl Following {
+impl SubscriberWatcher {
     async fn run(mut self) {
         let mut seen = self.bus.seen.subscribe();
         loop {
             let now = Arc::clone(&seen.borrow_and_update());
-            let matched = self.look(&now);
-            show::refusals(&mut self.told, &self.name, &matched);
-            show::matched(&self.matched, matched);
+            let matched = self.find_subscribers(&now);
+            show::log_incompatible(&mut self.told, &self.name, &matched);
+            show::publish_matched(&self.matched, matched);
             let changed = tokio::select! {
                 changed = self.ends.changed() => changed,
                 changed = seen.changed() => changed,
@@ -104,37 +106,38 @@ impl Following {
         }
     }
 
-    fn look(&mut self, seen: &Seen) -> Matched {
+    fn find_subscribers(&mut self, seen: &DiscoverySnapshot) -> MatchedPeers {
         let ends = Arc::clone(&self.ends.borrow_and_update());
-        let mut now = Matched::default();
-        // Whose the others are will be told in a moment.
+        let mut now = MatchedPeers::default();
+        // The node of the others will be known in a moment.
         let named = |reader: &Arc<EndpointData>| seen.is_named(reader.guid);
         for reader in ends.matched.iter().filter(|it| named(it)) {
             let peer = seen.peer(reader.guid);
             let theirs = seen::wire_type(reader);
-            if theirs.agrees(&self.of) {
-                now.peers.push(Peer {
+            if theirs.is_compatible_with(&self.of) {
+                now.peers.push(TopicPeer {
                     id: peer,
                     connected: ends.confirmed.contains(&reader.guid),
                     offer: None,
                 });
             } else {
-                let why = show::other_type(&theirs, &self.of);
-                now.refused.push(Refusal { peer, why });
+                let why = show::type_mismatch_text(&theirs, &self.of);
+                now.refused.push(IncompatiblePeer { peer, why });
             }
         }
         let refused = ends.refused.iter().filter(|(reader, _)| named(reader));
-        now.refused.extend(refused.map(|(reader, why)| Refusal {
-            peer: seen.peer(reader.guid),
-            why: quality::refusal(why, &self.qos, &reader.qos),
-        }));
-        // Ends of a type with another name do not meet at all.
+        now.refused
+            .extend(refused.map(|(reader, why)| IncompatiblePeer {
+                peer: seen.peer(reader.guid),
+                why: quality::mismatch_text(why, &self.qos, &reader.qos),
+            }));
+        // Endpoints with another type name do not match at all.
         for reader in seen.readers(&self.topic).iter().filter(|it| named(it)) {
             let theirs = seen::wire_type(reader);
             if theirs.name != self.of.name {
-                let why = show::other_type(&theirs, &self.of);
+                let why = show::type_mismatch_text(&theirs, &self.of);
                 let peer = seen.peer(reader.guid);
-                now.refused.push(Refusal { peer, why });
+                now.refused.push(IncompatiblePeer { peer, why });
             }
         }
         now
@@ -142,30 +145,30 @@ impl Following {
 }
 
 /// One local publisher.
-struct Handle {
-    bus: Arc<Inner>,
+struct WriterHandle {
+    bus: Arc<Ros2BusState>,
     name: String,
-    /// Whoever has not got all of it yet still gets it when this is dropped.
+    /// When this is dropped, readers that have not received everything still get the rest.
     writer: WriterEnd,
-    matched: watch::Receiver<Matched>,
+    matched: watch::Receiver<MatchedPeers>,
     following: AbortHandle,
 }
 
-impl Publisher for Handle {
+impl Publisher for WriterHandle {
     fn publish(&self, bytes: Bytes) {
         self.writer.write(bytes);
     }
 
-    fn matched(&self) -> watch::Receiver<Matched> {
+    fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
         self.matched.clone()
     }
 
-    fn dropped(&self) -> u64 {
-        self.writer.dropped()
+    fn dropped_count(&self) -> u64 {
+        self.writer.dropped_count()
     }
 }
 
-impl Drop for Handle {
+impl Drop for WriterHandle {
     fn drop(&mut self) {
         self.following.abort();
         let mut adverts = self.bus.adverts.lock();

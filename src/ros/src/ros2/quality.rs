@@ -1,33 +1,36 @@
-//! Quality of service as the bus has it, and as DDS has it.
+//! Quality of service: conversion between the bus and DDS.
 
-use rtps::{Durability, EndpointData, EndpointQos, History, Liveliness, Mismatch, Reliability};
+use rtps::{
+    DurabilityKind, EndpointData, EndpointQos, HistoryKind, LivelinessKind, Mismatch,
+    ReliabilityKind,
+};
 
 use super::node_ends::DEPTH;
-use crate::bus::{self, Qos};
+use crate::bus::{self, QosProfile};
 
-/// What decides which publishers a subscription hears: in no other policy does it ask for anything.
+/// The policies that determine which publishers a subscription matches; it requests nothing in any other policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Quality {
-    pub(super) reliability: Reliability,
-    pub(super) durability: Durability,
+    pub(super) reliability: ReliabilityKind,
+    pub(super) durability: DurabilityKind,
 }
 
 impl Quality {
-    /// What is wished for.
-    pub(super) fn of(qos: &Qos) -> Self {
+    /// Returns the requested quality.
+    pub(super) fn from_qos(qos: &QosProfile) -> Self {
         Self {
             reliability: match qos.reliability {
-                bus::Reliability::Reliable => Reliability::Reliable,
-                bus::Reliability::BestEffort => Reliability::BestEffort,
+                bus::QosReliability::Reliable => ReliabilityKind::Reliable,
+                bus::QosReliability::BestEffort => ReliabilityKind::BestEffort,
             },
             durability: match qos.durability {
-                bus::Durability::Volatile => Durability::Volatile,
-                bus::Durability::TransientLocal => Durability::TransientLocal,
+                bus::QosDurability::Volatile => DurabilityKind::Volatile,
+                bus::QosDurability::TransientLocal => DurabilityKind::TransientLocal,
             },
         }
     }
 
-    /// What of this a writer offers.
+    /// Returns the part of this quality that a writer offers.
     pub(super) fn at_most(self, offered: &EndpointQos) -> Self {
         Self {
             reliability: self.reliability.min(offered.reliability),
@@ -36,67 +39,71 @@ impl Quality {
     }
 }
 
-/// As a writer of ours has it: what is said of time, too.
-pub(super) fn offered(qos: &Qos) -> EndpointQos {
+/// Returns the QoS of a writer of ours, including the policies that concern time.
+pub(super) fn writer_qos(qos: &QosProfile) -> EndpointQos {
     EndpointQos {
         deadline: qos.deadline,
         lifespan: qos.lifespan,
         liveliness: match qos.liveliness {
-            bus::Liveliness::Automatic => Liveliness::Automatic,
-            bus::Liveliness::ManualByTopic => Liveliness::ManualByTopic,
+            bus::QosLiveliness::Automatic => LivelinessKind::Automatic,
+            bus::QosLiveliness::ManualByTopic => LivelinessKind::ManualByTopic,
         },
         lease: qos.lease,
-        ..endpoint(Quality::of(qos), qos.depth)
+        ..reader_qos(Quality::from_qos(qos), qos.depth)
     }
 }
 
-/// As a reader of ours has it, which asks for nothing else.
-pub(super) fn endpoint(quality: Quality, depth: usize) -> EndpointQos {
+/// Returns the QoS of a reader of ours, which requests nothing else.
+pub(super) fn reader_qos(quality: Quality, depth: usize) -> EndpointQos {
     EndpointQos {
         reliability: quality.reliability,
         durability: quality.durability,
-        history: History::KeepLast(u32::try_from(depth.max(1)).unwrap_or(u32::MAX)),
+        history: HistoryKind::KeepLast(u32::try_from(depth.max(1)).unwrap_or(u32::MAX)),
         ..EndpointQos::default()
     }
 }
 
-/// What an end of another node says of itself.
-pub(super) fn of_end(qos: &EndpointQos) -> Qos {
-    Qos {
+/// Returns the QoS announced by an endpoint of another node.
+pub(super) fn from_endpoint(qos: &EndpointQos) -> QosProfile {
+    QosProfile {
         reliability: match qos.reliability {
-            Reliability::Reliable => bus::Reliability::Reliable,
-            Reliability::BestEffort => bus::Reliability::BestEffort,
+            ReliabilityKind::Reliable => bus::QosReliability::Reliable,
+            ReliabilityKind::BestEffort => bus::QosReliability::BestEffort,
         },
         durability: match qos.durability {
-            Durability::Volatile => bus::Durability::Volatile,
-            _ => bus::Durability::TransientLocal,
+            DurabilityKind::Volatile => bus::QosDurability::Volatile,
+            _ => bus::QosDurability::TransientLocal,
         },
         depth: match qos.history {
-            History::KeepLast(depth) => usize::try_from(depth).unwrap_or(usize::MAX).max(1),
-            History::KeepAll => DEPTH,
+            HistoryKind::KeepLast(depth) => usize::try_from(depth).unwrap_or(usize::MAX).max(1),
+            HistoryKind::KeepAll => DEPTH,
         },
         deadline: qos.deadline,
         lifespan: qos.lifespan,
         liveliness: match qos.liveliness {
-            Liveliness::ManualByTopic => bus::Liveliness::ManualByTopic,
-            _ => bus::Liveliness::Automatic,
+            LivelinessKind::ManualByTopic => bus::QosLiveliness::ManualByTopic,
+            _ => bus::QosLiveliness::Automatic,
         },
         lease: qos.lease,
     }
 }
 
-/// What two ends on one topic are as one: a publisher offers the most of both, a subscriber asks for the least.
-pub(crate) fn joined(one: Qos, two: Qos, publishes: bool) -> Qos {
-    let reliable = [one, two].map(|it| it.reliability == bus::Reliability::Reliable);
+/// Merges two endpoints of one topic: a publisher offers the stronger of both, a subscriber requests the weaker.
+pub(crate) fn merge_qos(one: QosProfile, two: QosProfile, publishes: bool) -> QosProfile {
+    let reliable = [one, two].map(|it| it.reliability == bus::QosReliability::Reliable);
     let latching = [one, two].map(|it| it.is_latching());
-    let both = |of: [bool; 2]| match publishes {
-        true => of[0] || of[1],
-        false => of[0] && of[1],
+    let both = |of: [bool; 2]| {
+        if publishes {
+            of[0] || of[1]
+        } else {
+            of[0] && of[1]
+        }
     };
-    let joined = Qos {
-        reliability: match both(reliable) {
-            true => bus::Reliability::Reliable,
-            false => bus::Reliability::BestEffort,
+    let joined = QosProfile {
+        reliability: if both(reliable) {
+            bus::QosReliability::Reliable
+        } else {
+            bus::QosReliability::BestEffort
         },
         depth: one.depth.max(two.depth),
         ..one
@@ -104,8 +111,12 @@ pub(crate) fn joined(one: Qos, two: Qos, publishes: bool) -> Qos {
     joined.latching(both(latching))
 }
 
-/// Why no messages pass between a writer and a reader, with all that both say.
-pub(super) fn refusal(why: &[Mismatch], offered: &EndpointQos, requested: &EndpointQos) -> String {
+/// Describes why a writer and a reader do not match, with both profiles.
+pub(super) fn mismatch_text(
+    why: &[Mismatch],
+    offered: &EndpointQos,
+    requested: &EndpointQos,
+) -> String {
     let reasons: Vec<String> = why.iter().map(Mismatch::to_string).collect();
     format!(
         "{} (publisher: {}; subscriber: {})",
@@ -115,7 +126,7 @@ pub(super) fn refusal(why: &[Mismatch], offered: &EndpointQos, requested: &Endpo
     )
 }
 
-/// A profile in the words of ROS 2's tools; what has no end is left out.
+/// Describes a profile in the terms of ROS 2's tools; infinite durations are left out.
 fn profile(qos: &EndpointQos) -> String {
     let mut words = vec![qos.reliability.to_string(), qos.durability.to_string()];
     let lease = qos
@@ -136,9 +147,9 @@ fn profile(qos: &EndpointQos) -> String {
     words.join(", ")
 }
 
-/// Whether a writer keeps its last messages for those who come later.
+/// Returns true if a writer keeps its last messages for late subscribers.
 pub(super) fn is_latching(writer: &EndpointData) -> bool {
-    writer.qos.durability >= Durability::TransientLocal
+    writer.qos.durability >= DurabilityKind::TransientLocal
 }
 
 #[cfg(test)]
@@ -149,32 +160,32 @@ mod tests {
 
     #[test]
     fn a_wish_is_granted_as_far_as_it_is_offered() {
-        let wish = Quality::of(&Qos::keep_last(5).latching(true));
+        let wish = Quality::from_qos(&QosProfile::keep_last(5).latching(true));
         let offered = EndpointQos {
-            reliability: Reliability::BestEffort,
-            durability: Durability::Persistent,
+            reliability: ReliabilityKind::BestEffort,
+            durability: DurabilityKind::Persistent,
             ..EndpointQos::default()
         };
         let granted = wish.at_most(&offered);
         assert_eq!(
             (granted.reliability, granted.durability),
-            (Reliability::BestEffort, Durability::TransientLocal)
+            (ReliabilityKind::BestEffort, DurabilityKind::TransientLocal)
         );
-        assert_eq!(offered.mismatches(&endpoint(granted, 5)), []);
-        assert_eq!(endpoint(wish, 0).history, History::KeepLast(1));
+        assert_eq!(offered.mismatches(&reader_qos(granted, 5)), []);
+        assert_eq!(reader_qos(wish, 0).history, HistoryKind::KeepLast(1));
     }
 
     #[test]
     fn a_refusal_says_both_profiles() {
         let offered = EndpointQos {
-            reliability: Reliability::BestEffort,
+            reliability: ReliabilityKind::BestEffort,
             ..EndpointQos::default()
         };
         let requested = EndpointQos {
             deadline: Some(Duration::from_millis(100)),
             ..EndpointQos::default()
         };
-        let why = refusal(&offered.mismatches(&requested), &offered, &requested);
+        let why = mismatch_text(&offered.mismatches(&requested), &offered, &requested);
         assert_eq!(
             why,
             "reliability: the publisher offers best_effort, the subscriber asks for reliable; \

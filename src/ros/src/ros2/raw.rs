@@ -1,38 +1,40 @@
-//! Topics by their names in DDS, for the parts of an action. Unlike other ends of this node these hear each other, because an
-//! action's client may have its server behind the same bus.
+//! Topics by their DDS names, for the parts of an action. Unlike other endpoints of this node these hear each other,
+//! because an action's client may have its server behind the same bus.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Durability, EndpointQos, Ends, Guid, Sample, Sink, Topic};
+use rtps::{
+    DurabilityKind, EndpointMatches, EndpointQos, Guid, ReceivedSample, Sink, TopicDescription,
+};
 use tokio::sync::watch;
 
-use super::bus::Inner;
+use super::bus::Ros2BusState;
 use super::ends::{ReaderEnd, WriterEnd};
 
-/// Takes what comes by a topic, in the order of each writer. Must not block.
-pub(super) trait Ear: Send + Sync + 'static {
-    /// A message: CDR with its header. Of this node's own, the writer's prefix is that of the participant.
-    fn hear(&self, payload: Bytes, writer: Guid);
+/// Receives messages of a topic, in order per writer. Must not block.
+pub(super) trait RawListener: Send + Sync + 'static {
+    /// A message arrived: CDR with its header. If it is from this node, the writer's prefix is that of the participant.
+    fn on_message(&self, payload: Bytes, writer: Guid);
 }
 
-/// Ends of this node that hear each other, by topic and type.
+/// Endpoints of this node that hear each other, by topic and type.
 #[derive(Default)]
 pub(super) struct Hub {
-    topics: Mutex<HashMap<(String, String), Local>>,
+    topics: Mutex<HashMap<(String, String), LocalTopic>>,
 }
 
 #[derive(Default)]
-struct Local {
-    ears: Vec<(Guid, Arc<dyn Ear>)>,
-    /// Writers of this node, with what they keep for those who come later.
+struct LocalTopic {
+    ears: Vec<(Guid, Arc<dyn RawListener>)>,
+    /// Writers of this node, each with the message kept for late subscribers.
     writers: HashMap<Guid, Option<Bytes>>,
 }
 
 impl Hub {
-    fn change<T>(&self, topic: &Topic, by: impl FnOnce(&mut Local) -> T) -> T {
+    fn with_topic<T>(&self, topic: &TopicDescription, by: impl FnOnce(&mut LocalTopic) -> T) -> T {
         let key = (topic.name.clone(), topic.type_name.clone());
         let mut topics = self.topics.lock();
         let local = topics.entry(key.clone()).or_default();
@@ -44,40 +46,40 @@ impl Hub {
     }
 }
 
-/// What DDS brings.
-struct FromAfar(Arc<dyn Ear>);
+/// Receives messages from DDS.
+struct RemoteSink(Arc<dyn RawListener>);
 
-impl Sink for FromAfar {
-    fn sample(&self, sample: Sample) {
-        self.0.hear(sample.payload, sample.writer);
+impl Sink for RemoteSink {
+    fn on_sample(&self, sample: ReceivedSample) {
+        self.0.on_message(sample.payload, sample.writer);
     }
 }
 
 /// A reader; dropping it withdraws it.
 pub(super) struct RawReader {
-    bus: Arc<Inner>,
-    topic: Topic,
+    bus: Arc<Ros2BusState>,
+    topic: TopicDescription,
     end: ReaderEnd,
 }
 
-/// Has a topic heard.
+/// Creates a reader that delivers a topic to `ear`.
 pub(super) fn reader(
-    bus: &Arc<Inner>,
-    topic: &Topic,
+    bus: &Arc<Ros2BusState>,
+    topic: &TopicDescription,
     qos: EndpointQos,
-    ear: Arc<dyn Ear>,
+    ear: Arc<dyn RawListener>,
 ) -> RawReader {
-    let end = ReaderEnd::open(bus, topic, qos, Arc::new(FromAfar(Arc::clone(&ear))));
+    let end = ReaderEnd::open(bus, topic, qos, Arc::new(RemoteSink(Arc::clone(&ear))));
     let guid = end.guid();
-    let kept: Vec<(Guid, Bytes)> = bus.hub.change(topic, |local| {
+    let kept: Vec<(Guid, Bytes)> = bus.hub.with_topic(topic, |local| {
         local.ears.push((guid, Arc::clone(&ear)));
         let kept = local.writers.iter();
         kept.filter_map(|(writer, last)| Some((*writer, last.clone()?)))
             .collect()
     });
-    if qos.durability >= Durability::TransientLocal {
+    if qos.durability >= DurabilityKind::TransientLocal {
         for (writer, last) in kept {
-            ear.hear(last, writer);
+            ear.on_message(last, writer);
         }
     }
     RawReader {
@@ -88,27 +90,27 @@ pub(super) fn reader(
 }
 
 impl RawReader {
-    /// Which end it is.
+    /// Returns the GUID.
     pub(super) fn guid(&self) -> Guid {
         self.end.guid()
     }
 
-    /// Writers of other nodes.
-    pub(super) fn ends(&self) -> watch::Receiver<Arc<Ends>> {
+    /// Returns the matched writers of other nodes.
+    pub(super) fn ends(&self) -> watch::Receiver<Arc<EndpointMatches>> {
         self.end.ends()
     }
 
-    /// Whether there is a writer of this node, which is heard as well.
-    pub(super) fn hears_own(&self) -> bool {
-        let writers = |local: &mut Local| !local.writers.is_empty();
-        self.bus.hub.change(&self.topic, writers)
+    /// Returns true if there is a writer on this node, whose messages are delivered as well.
+    pub(super) fn has_local_writer(&self) -> bool {
+        let writers = |local: &mut LocalTopic| !local.writers.is_empty();
+        self.bus.hub.with_topic(&self.topic, writers)
     }
 }
 
 impl Drop for RawReader {
     fn drop(&mut self) {
         let guid = self.guid();
-        self.bus.hub.change(&self.topic, |local| {
+        self.bus.hub.with_topic(&self.topic, |local| {
             local.ears.retain(|(ear, _)| *ear != guid);
         });
     }
@@ -116,28 +118,32 @@ impl Drop for RawReader {
 
 /// A writer; dropping it withdraws it.
 pub(super) struct RawWriter {
-    bus: Arc<Inner>,
-    topic: Topic,
+    bus: Arc<Ros2BusState>,
+    topic: TopicDescription,
     keeps: bool,
     end: WriterEnd,
 }
 
-/// Makes a writer of a topic.
-pub(super) fn writer(bus: &Arc<Inner>, topic: &Topic, qos: EndpointQos) -> RawWriter {
+/// Creates a writer of a topic.
+pub(super) fn writer(
+    bus: &Arc<Ros2BusState>,
+    topic: &TopicDescription,
+    qos: EndpointQos,
+) -> RawWriter {
     let end = WriterEnd::open(bus, topic, qos);
     let guid = end.guid();
     bus.hub
-        .change(topic, |local| drop(local.writers.insert(guid, None)));
+        .with_topic(topic, |local| drop(local.writers.insert(guid, None)));
     RawWriter {
         bus: Arc::clone(bus),
         topic: topic.clone(),
-        keeps: qos.durability >= Durability::TransientLocal,
+        keeps: qos.durability >= DurabilityKind::TransientLocal,
         end,
     }
 }
 
 impl RawWriter {
-    /// Which end it is.
+    /// Returns the GUID.
     pub(super) fn guid(&self) -> Guid {
         self.end.guid()
     }
@@ -146,15 +152,15 @@ impl RawWriter {
     pub(super) fn write(&self, payload: Bytes) {
         let guid = self.guid();
         self.end.write(payload.clone());
-        let ears: Vec<Arc<dyn Ear>> = self.bus.hub.change(&self.topic, |local| {
+        let ears: Vec<Arc<dyn RawListener>> = self.bus.hub.with_topic(&self.topic, |local| {
             if self.keeps {
                 local.writers.insert(guid, Some(payload.clone()));
             }
             local.ears.iter().map(|(_, ear)| Arc::clone(ear)).collect()
         });
-        // Outside of the lock: who hears something may write something.
+        // Outside of the lock: a listener may write in turn.
         for ear in ears {
-            ear.hear(payload.clone(), guid);
+            ear.on_message(payload.clone(), guid);
         }
     }
 }
@@ -164,6 +170,6 @@ impl Drop for RawWriter {
         let guid = self.guid();
         self.bus
             .hub
-            .change(&self.topic, |local| drop(local.writers.remove(&guid)));
+            .with_topic(&self.topic, |local| drop(local.writers.remove(&guid)));
     }
 }

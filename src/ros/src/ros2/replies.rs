@@ -1,49 +1,49 @@
-//! Replies to the requests of one client, and who waits for them.
+//! Replies to the requests of one client, and the calls waiting for them.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Guid, Sample, SampleIdentity, SequenceNumber, Sink};
+use rtps::{Guid, ReceivedSample, SampleIdentity, SequenceNumber, Sink};
 use tokio::sync::oneshot;
 
 use super::request_header::RequestHeader;
 
-/// Calls of one client under way.
+/// Maximum number of pending calls of one client.
 pub(super) const MAX_IN_FLIGHT: usize = 1024;
-/// Replies that come before it is known which number their request was given.
+/// Maximum number of replies kept until the number of their request is known.
 const MAX_EARLY: usize = 64;
 
-/// By which a reply is known as one to this client.
-pub(super) struct OwnEnds {
+/// Identifies a reply as one to this client.
+pub(super) struct ReplyAddress {
     pub(super) reader: Guid,
     pub(super) writer: Guid,
-    /// Of the client, in headers.
+    /// Number of the client in request headers.
     pub(super) number: u64,
 }
 
-/// Which request a reply is to: its number among the samples of our writer, or in the header.
+/// The request that a reply belongs to: its sequence number at our writer, or the number in its header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Key {
+pub(super) enum ReplyKey {
     Number(i64),
     Header(i64),
 }
 
-/// Replies, and who waits for them.
+/// Replies and the calls waiting for them.
 #[derive(Default)]
 pub(super) struct Replies {
-    pub(super) own: OnceLock<OwnEnds>,
+    pub(super) own: OnceLock<ReplyAddress>,
     state: Mutex<State>,
 }
 
 #[derive(Default)]
 struct State {
-    waiting: HashMap<Key, oneshot::Sender<Bytes>>,
-    /// Requests that are being written, so that their numbers are not known yet.
+    waiting: HashMap<ReplyKey, oneshot::Sender<Bytes>>,
+    /// Number of requests being written, whose sequence numbers are not known yet.
     writing: usize,
-    /// Replies that came meanwhile.
-    early: Vec<(Key, Bytes)>,
+    /// Replies that arrived meanwhile.
+    early: Vec<(ReplyKey, Bytes)>,
 }
 
 impl State {
@@ -53,23 +53,23 @@ impl State {
 }
 
 impl Sink for Replies {
-    fn sample(&self, sample: Sample) {
-        self.take(sample.related, sample.payload);
+    fn on_sample(&self, sample: ReceivedSample) {
+        self.dispatch(sample.related, sample.payload);
     }
 }
 
 impl Replies {
-    /// A reply to somebody: those to all clients of a service come by one topic.
-    fn take(&self, related: Option<SampleIdentity>, payload: Bytes) {
+    /// Processes a reply, possibly to another client: all clients of a service share one reply topic.
+    fn dispatch(&self, related: Option<SampleIdentity>, payload: Bytes) {
         let Some(own) = self.own.get() else { return };
         let (key, response) = match related {
             Some(to) if to.writer == own.reader || to.writer == own.writer => {
-                (Key::Number(to.number.0), payload)
+                (ReplyKey::Number(to.number.0), payload)
             }
             Some(_) => return,
             None => match RequestHeader::split(&payload) {
                 Some((header, response)) if header.client == own.number => {
-                    (Key::Header(header.number), response)
+                    (ReplyKey::Header(header.number), response)
                 }
                 _ => return,
             },
@@ -82,8 +82,8 @@ impl Replies {
         }
     }
 
-    /// Waits for the reply to a request with this number in its header; none where too many wait.
-    pub(super) fn wait(self: &Arc<Self>, key: Key) -> Option<Waiting> {
+    /// Waits for the reply to a request with this number in its header; `None` if too many calls are pending.
+    pub(super) fn wait(self: &Arc<Self>, key: ReplyKey) -> Option<PendingReply> {
         let mut state = self.state.lock();
         if !state.has_room() {
             return None;
@@ -92,15 +92,15 @@ impl Replies {
         state.waiting.insert(key, sender);
         drop(state);
         let replies = Arc::clone(self);
-        Some(Waiting {
+        Some(PendingReply {
             replies,
             key,
             answer,
         })
     }
 
-    /// A request is about to be written; none where too many wait.
-    pub(super) fn write(self: &Arc<Self>) -> Option<Writing> {
+    /// Prepares to write a request; `None` if too many calls are pending.
+    pub(super) fn begin_write(self: &Arc<Self>) -> Option<Writing> {
         let mut state = self.state.lock();
         if !state.has_room() {
             return None;
@@ -114,9 +114,9 @@ impl Replies {
 pub(super) struct Writing(Arc<Replies>);
 
 impl Writing {
-    /// It was given this number.
-    pub(super) fn written(self, number: SequenceNumber) -> Waiting {
-        let key = Key::Number(number.0);
+    /// Sets the sequence number of the request and waits for its reply.
+    pub(super) fn with_number(self, number: SequenceNumber) -> PendingReply {
+        let key = ReplyKey::Number(number.0);
         let (sender, answer) = oneshot::channel();
         let mut state = self.0.state.lock();
         match state.early.iter().position(|(early, _)| *early == key) {
@@ -128,7 +128,7 @@ impl Writing {
         }
         drop(state);
         let replies = Arc::clone(&self.0);
-        Waiting {
+        PendingReply {
             replies,
             key,
             answer,
@@ -146,14 +146,14 @@ impl Drop for Writing {
     }
 }
 
-/// Waiting for one reply; dropping it gives it up.
-pub(super) struct Waiting {
+/// A pending reply; dropping it gives up the call.
+pub(super) struct PendingReply {
     replies: Arc<Replies>,
-    key: Key,
+    key: ReplyKey,
     pub(super) answer: oneshot::Receiver<Bytes>,
 }
 
-impl Drop for Waiting {
+impl Drop for PendingReply {
     fn drop(&mut self) {
         self.replies.state.lock().waiting.remove(&self.key);
     }
@@ -172,7 +172,7 @@ mod tests {
 
     fn replies() -> Arc<Replies> {
         let replies = Arc::new(Replies::default());
-        let own = OwnEnds {
+        let own = ReplyAddress {
             reader: guid(READER),
             writer: guid(WRITER),
             number: 77,
@@ -181,7 +181,7 @@ mod tests {
         replies
     }
 
-    fn to(kind: u8, number: i64) -> Option<SampleIdentity> {
+    fn related_to(kind: u8, number: i64) -> Option<SampleIdentity> {
         Some(SampleIdentity {
             writer: guid(kind),
             number: SequenceNumber(number),
@@ -192,11 +192,14 @@ mod tests {
     fn a_reply_names_our_reader_or_our_writer() {
         let replies = replies();
         for kind in [READER, WRITER] {
-            let mut waiting = replies.write().expect("room").written(SequenceNumber(5));
-            replies.take(to(kind, 6), Bytes::from_static(b"another"));
-            replies.take(to(9, 5), Bytes::from_static(b"of another client"));
+            let mut waiting = replies
+                .begin_write()
+                .expect("room")
+                .with_number(SequenceNumber(5));
+            replies.dispatch(related_to(kind, 6), Bytes::from_static(b"another"));
+            replies.dispatch(related_to(9, 5), Bytes::from_static(b"of another client"));
             assert!(waiting.answer.try_recv().is_err());
-            replies.take(to(kind, 5), Bytes::from_static(b"it"));
+            replies.dispatch(related_to(kind, 5), Bytes::from_static(b"it"));
             assert_eq!(waiting.answer.try_recv().expect("a reply"), "it");
         }
         assert!(replies.state.lock().waiting.is_empty());
@@ -206,35 +209,35 @@ mod tests {
     fn a_reply_may_come_before_the_number_of_its_request_is_known() {
         let replies = replies();
         let (one, two) = (
-            replies.write().expect("room"),
-            replies.write().expect("room"),
+            replies.begin_write().expect("room"),
+            replies.begin_write().expect("room"),
         );
-        replies.take(to(READER, 1), Bytes::from_static(b"first"));
-        replies.take(to(READER, 2), Bytes::from_static(b"second"));
-        let mut second = two.written(SequenceNumber(2));
-        let mut first = one.written(SequenceNumber(1));
+        replies.dispatch(related_to(READER, 1), Bytes::from_static(b"first"));
+        replies.dispatch(related_to(READER, 2), Bytes::from_static(b"second"));
+        let mut second = two.with_number(SequenceNumber(2));
+        let mut first = one.with_number(SequenceNumber(1));
         assert_eq!(first.answer.try_recv().expect("a reply"), "first");
         assert_eq!(second.answer.try_recv().expect("a reply"), "second");
-        // Nobody waits: what comes is of a call that was given up.
-        replies.take(to(READER, 3), Bytes::from_static(b"late"));
+        // Nobody waits: a late reply belongs to a call that was given up.
+        replies.dispatch(related_to(READER, 3), Bytes::from_static(b"late"));
         assert!(replies.state.lock().early.is_empty());
     }
 
     #[test]
     fn a_reply_of_cyclone_is_known_by_its_header() {
         let replies = replies();
-        let mut waiting = replies.wait(Key::Header(5)).expect("room");
+        let mut waiting = replies.wait(ReplyKey::Header(5)).expect("room");
         for (client, number) in [(78, 5), (77, 6)] {
             let header = RequestHeader { client, number };
-            replies.take(None, header.join(&[0, 1, 0, 0, 9]).expect("CDR"));
+            replies.dispatch(None, header.join(&[0, 1, 0, 0, 9]).expect("CDR"));
         }
-        replies.take(None, Bytes::from_static(b"short"));
+        replies.dispatch(None, Bytes::from_static(b"short"));
         assert!(waiting.answer.try_recv().is_err());
         let header = RequestHeader {
             client: 77,
             number: 5,
         };
-        replies.take(None, header.join(&[0, 1, 0, 0, 9]).expect("CDR"));
+        replies.dispatch(None, header.join(&[0, 1, 0, 0, 9]).expect("CDR"));
         assert_eq!(
             waiting.answer.try_recv().expect("a reply"),
             [0, 1, 0, 0, 9][..]
@@ -244,12 +247,12 @@ mod tests {
     #[test]
     fn calls_under_way_are_bounded_and_given_up_ones_do_not_count() {
         let replies = replies();
-        let mut all: Vec<Waiting> = (0..MAX_IN_FLIGHT as i64)
-            .filter_map(|number| replies.wait(Key::Header(number)))
+        let mut all: Vec<PendingReply> = (0..MAX_IN_FLIGHT as i64)
+            .filter_map(|number| replies.wait(ReplyKey::Header(number)))
             .collect();
         assert_eq!(all.len(), MAX_IN_FLIGHT);
-        assert!(replies.write().is_none() && replies.wait(Key::Header(-1)).is_none());
+        assert!(replies.begin_write().is_none() && replies.wait(ReplyKey::Header(-1)).is_none());
         all.pop();
-        assert!(replies.write().is_some());
+        assert!(replies.begin_write().is_some());
     }
 }

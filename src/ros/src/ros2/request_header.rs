@@ -1,24 +1,24 @@
-//! What rmw_cyclonedds puts before a request and its reply, behind the header of CDR: who asks, and the number of the question.
-//! rmw_fastrtps has both in the sample's inline QoS (`related_sample_identity`), and nothing in the payload.
+//! The header that rmw_cyclonedds puts between the CDR header and a request or reply: the client, and the number of the
+//! request. rmw_fastrtps has both in the sample's inline QoS (`related_sample_identity`), and nothing in the payload.
 
 use bytes::Bytes;
 
-/// The header of CDR.
+/// Size of the CDR header.
 const REPRESENTATION: usize = 4;
-/// Two numbers of eight bytes, in the order of the payload's bytes. What follows stays aligned without them.
+/// Size: two numbers of eight bytes, in the payload's byte order. Without it the rest of the message stays aligned.
 const SIZE: usize = 16;
 
-/// Who asks, and the number of the question.
+/// The client and the number of its request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RequestHeader {
-    /// Tells the client from all others.
+    /// Identifies the client.
     pub(super) client: u64,
-    /// Of this client's questions.
+    /// Sequence number of the client's request.
     pub(super) number: i64,
 }
 
 impl RequestHeader {
-    /// The header, and the payload without it; none where it is not there.
+    /// Splits a payload into the header and the rest; `None` if there is no header.
     pub(super) fn split(payload: &Bytes) -> Option<(Self, Bytes)> {
         let (representation, body) = payload.split_first_chunk::<REPRESENTATION>()?;
         let (header, message) = body.split_first_chunk::<SIZE>()?;
@@ -38,7 +38,7 @@ impl RequestHeader {
         Some((header, [&representation[..], message].concat().into()))
     }
 
-    /// The payload with the header; none where it is no CDR.
+    /// Inserts the header into a payload; `None` if that is not CDR.
     pub(super) fn join(self, payload: &[u8]) -> Option<Bytes> {
         let (representation, message) = payload.split_first_chunk::<REPRESENTATION>()?;
         let big = representation[1] & 1 == 0;

@@ -1,40 +1,40 @@
-//! Who is there beside us, with which ends and which nodes, seen at one moment.
+//! A snapshot of the other participants with their endpoints and nodes.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
-use rtps::{Discovered, EndpointData, EntityId, Guid, GuidPrefix, ParticipantData};
+use rtps::{DiscoveredGraph, EndpointData, EntityId, Guid, GuidPrefix, ParticipantData};
 
-use super::entities::{Entities, GidSize};
+use super::entities::{GidSize, ParticipantEntities};
 use super::{names, type_hash};
 use crate::bus::{PeerId, WireFormat, WireType};
 
-/// Before the name of its enclave in a participant's user data, which `;` ends.
+/// Key of the enclave in a participant's user data; its value ends with `;`.
 const ENCLAVE: &[u8] = b"enclave=";
-/// The longest name of an enclave that rmw allows.
+/// Maximum length of an enclave name in rmw.
 const MAX_ENCLAVE: usize = 255;
 
-/// What was discovered, and what participants told of their nodes.
+/// Discovery results, and the nodes that participants have announced.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Seen {
-    pub(super) discovered: Arc<Discovered>,
+pub(super) struct DiscoverySnapshot {
+    pub(super) discovered: Arc<DiscoveredGraph>,
     /// Node → its participant.
     pub(super) nodes: BTreeMap<Arc<str>, Guid>,
-    /// Whether some participant writes gids as distributions before Iron do.
+    /// Gid size; that of distributions before Iron if any participant uses it.
     pub(super) gids: GidSize,
     /// Enclave → the nodes of its participants, for all but the root.
     pub(super) enclaves: BTreeMap<String, BTreeSet<Arc<str>>>,
     owners: HashMap<Guid, Arc<str>>,
-    /// Ends of whose node nothing was told in time.
+    /// Endpoints whose node was not announced in time.
     pub(super) late: HashSet<Guid>,
     writers: HashMap<String, Vec<Arc<EndpointData>>>,
     readers: HashMap<String, Vec<Arc<EndpointData>>>,
 }
 
-impl Seen {
+impl DiscoverySnapshot {
     pub(super) fn new(
-        discovered: Arc<Discovered>,
-        told: &HashMap<GuidPrefix, Arc<Entities>>,
+        discovered: Arc<DiscoveredGraph>,
+        told: &HashMap<GuidPrefix, Arc<ParticipantEntities>>,
     ) -> Self {
         let (mut nodes, mut owners) = (BTreeMap::new(), HashMap::new());
         let mut enclaves: BTreeMap<String, BTreeSet<Arc<str>>> = BTreeMap::new();
@@ -54,7 +54,7 @@ impl Seen {
             }
             for node in &entities.nodes {
                 nodes.insert(Arc::clone(&node.name), participant(*prefix));
-                // Nobody can tell of the ends of others.
+                // A participant cannot announce the endpoints of others.
                 let ends = node.readers.iter().chain(&node.writers);
                 for end in ends.filter(|end| end.prefix == *prefix) {
                     owners.insert(*end, Arc::clone(&node.name));
@@ -73,7 +73,7 @@ impl Seen {
         }
     }
 
-    /// The writers of a topic of DDS, whatever their types.
+    /// Returns the writers of a DDS topic, whatever their types.
     pub(super) fn writers(&self, topic: &str) -> &[Arc<EndpointData>] {
         self.writers
             .get(topic)
@@ -81,7 +81,7 @@ impl Seen {
             .unwrap_or_default()
     }
 
-    /// The readers of a topic of DDS, whatever their types.
+    /// Returns the readers of a DDS topic, whatever their types.
     pub(super) fn readers(&self, topic: &str) -> &[Arc<EndpointData>] {
         self.readers
             .get(topic)
@@ -89,12 +89,12 @@ impl Seen {
             .unwrap_or_default()
     }
 
-    /// The node that an end belongs to; none where nobody has said.
+    /// Returns the node that an endpoint belongs to; `None` if it was not announced.
     pub(super) fn owner(&self, end: Guid) -> Option<&Arc<str>> {
         self.owners.get(&end)
     }
 
-    /// The name of the node that an end belongs to, or the GUID of its participant.
+    /// Returns the name of the node that an endpoint belongs to, or the GUID of its participant.
     pub(super) fn node(&self, end: Guid) -> Arc<str> {
         match self.owner(end) {
             Some(node) => Arc::clone(node),
@@ -102,13 +102,13 @@ impl Seen {
         }
     }
 
-    /// How an end is told from others.
+    /// Returns the id of an endpoint.
     pub(super) fn peer(&self, end: Guid) -> PeerId {
         PeerId::new(self.node(end), end.number())
     }
 
-    /// Whether all is known of an end that is to be known: its node, where its participant is one of ROS, which tells of its nodes
-    /// a moment after it has told of the end.
+    /// Returns true if everything that will be known of an endpoint is known: its node, if its participant belongs to
+    /// ROS, which announces its nodes shortly after its endpoints.
     pub(super) fn is_named(&self, end: Guid) -> bool {
         let participant = self.discovered.participants.get(&end.prefix);
         let of_ros = |it: &ParticipantData| behind_enclave(&it.user_data).is_some();
@@ -117,25 +117,25 @@ impl Seen {
             || participant.is_some_and(|it| !of_ros(it))
     }
 
-    /// Ends of topics and services that are not named.
-    pub(super) fn unnamed(&self) -> impl Iterator<Item = Guid> + '_ {
+    /// Returns the endpoints of topics and services whose node is not known yet.
+    pub(super) fn unnamed_endpoints(&self) -> impl Iterator<Item = Guid> + '_ {
         let ends = self.discovered.writers.values();
         let ends = ends.chain(self.discovered.readers.values());
-        let of_ros = ends.filter(|end| names::named(&end.topic).is_some());
+        let of_ros = ends.filter(|end| names::topic_role(&end.topic).is_some());
         of_ros
             .map(|end| end.guid)
             .filter(|end| !self.is_named(*end))
     }
 }
 
-/// What stands behind `enclave=` in a participant's user data; none where it is none of ROS.
+/// Returns the user data behind `enclave=`; `None` if the participant does not belong to ROS.
 fn behind_enclave(user_data: &[u8]) -> Option<&[u8]> {
     let mut windows = user_data.windows(ENCLAVE.len());
     let at = windows.position(|at| at == ENCLAVE)?;
     user_data.get(at + ENCLAVE.len()..)
 }
 
-/// The enclave that a participant is in.
+/// Returns the enclave of a participant.
 fn enclave(user_data: &[u8]) -> Option<&str> {
     let name = behind_enclave(user_data)?
         .split(|byte| *byte == b';')
@@ -144,7 +144,7 @@ fn enclave(user_data: &[u8]) -> Option<&str> {
     name.filter(|name| name.len() <= MAX_ENCLAVE)
 }
 
-/// The GUID of a participant itself.
+/// Returns the GUID of a participant itself.
 fn participant(prefix: GuidPrefix) -> Guid {
     Guid::new(prefix, EntityId::PARTICIPANT)
 }
@@ -160,13 +160,13 @@ fn by_topic(ends: &BTreeMap<Guid, Arc<EndpointData>>) -> HashMap<String, Vec<Arc
     sorted
 }
 
-/// What an end's messages are.
+/// Returns the type of an endpoint's messages.
 pub(super) fn wire_type(end: &EndpointData) -> WireType {
     WireType {
         format: WireFormat::Cdr,
         ..WireType::new(
-            names::type_of(&end.type_name),
-            type_hash::of_message(&end.user_data),
+            names::ros_type(&end.type_name),
+            type_hash::message_hash(&end.user_data),
             "",
         )
     }

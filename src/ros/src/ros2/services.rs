@@ -4,78 +4,78 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
-use rtps::{EndpointQos, Guid, History, Sample, SampleIdentity, Sink, VendorId};
+use rtps::{EndpointQos, Guid, HistoryKind, ReceivedSample, SampleIdentity, Sink, VendorId};
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
-use super::bus::Inner;
+use super::bus::Ros2BusState;
 use super::ends::{ReaderEnd, WriterEnd};
 use super::request_header::RequestHeader;
 use super::{names, type_hash};
 use crate::bus::{BusError, ServiceHandler, ServiceType};
 
-/// Requests of one service that wait until there is room.
+/// Maximum number of queued requests per service.
 const QUEUED: usize = 1024;
-/// Requests of one service that are answered at the same time.
+/// Maximum number of concurrent requests per service.
 const ANSWERED: usize = 1024;
-/// For answers to arrive before the ends that have sent them are withdrawn.
+/// Time for answers to arrive before the endpoints that sent them are withdrawn.
 const LINGER: Duration = Duration::from_millis(300);
-/// For the client's reader of replies to be found: its request may come first.
+/// Time for the client's reader of replies to be discovered: its request may arrive first.
 const MATCH: Duration = Duration::from_secs(1);
 
-/// How the ends of services treat samples. Those of rmw keep 10, which is for readers that are asked for what they have read;
-/// nothing of a service may be lost because many call it at once.
+/// Returns the QoS of service endpoints. Those of rmw keep 10 samples, which is meant for readers that are polled; here
+/// no request or reply may be lost because many clients call at once.
 pub(super) fn qos() -> EndpointQos {
     EndpointQos {
-        history: History::KeepLast(QUEUED as u32),
+        history: HistoryKind::KeepLast(QUEUED as u32),
         ..EndpointQos::default()
     }
 }
 
 /// One service.
-pub(super) struct Served {
+pub(super) struct ServedService {
     pub(super) of: ServiceType,
     pub(super) handler: Arc<dyn ServiceHandler>,
-    /// It is another system's, and gives way to who serves it here.
+    /// True for a service of another system, which yields to one served here.
     pub(super) lent: bool,
 }
 
-/// What serves a service here.
-pub(super) fn here(bus: &Inner, service: &str) -> Option<Arc<Served>> {
+/// Returns the service of this name that is served here.
+pub(super) fn local_service(bus: &Ros2BusState, service: &str) -> Option<Arc<ServedService>> {
     bus.services.lock().get(service).cloned()
 }
 
-/// Serves until the guard is dropped; what was asked until then is answered.
+/// Serves until the guard is dropped; requests received before are still answered.
 pub(super) fn serve(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros2BusState>,
     service: &str,
     of: ServiceType,
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
     let lent = false;
-    begin(bus, service, Served { of, handler, lent })
+    start(bus, service, ServedService { of, handler, lent })
 }
 
 /// Serves a service of another system, unless it is served here.
 pub(super) fn lend(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros2BusState>,
     service: &str,
     of: ServiceType,
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
     let lent = true;
-    begin(bus, service, Served { of, handler, lent })
+    start(bus, service, ServedService { of, handler, lent })
 }
 
-fn begin(
-    bus: &Arc<Inner>,
+fn start(
+    bus: &Arc<Ros2BusState>,
     service: &str,
-    served: Served,
+    served: ServedService,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
     let of = &served.of;
-    let request = bus.loans.labelled(names::request(service, of)?);
+    let request = bus.loans.add_label(names::request(service, of)?);
     let reply = names::reply(service, of)?;
     let served = Arc::new(served);
     {
@@ -88,14 +88,14 @@ fn begin(
     }
     let (queue, requests) = mpsc::channel(QUEUED);
     let service: Arc<str> = service.into();
-    let sink = Requests {
+    let sink = RequestSink {
         service: Arc::clone(&service),
         queue,
     };
-    // Whoever finds the reader of requests is to find the writer of replies, too.
+    // A client that discovers the reader of requests must also discover the writer of replies.
     let writer = WriterEnd::open(bus, &reply, qos());
     let reader = ReaderEnd::open(bus, &request, qos(), Arc::new(sink));
-    let answering = Answering {
+    let answering = ServiceResponder {
         bus: Arc::clone(bus),
         service: Arc::clone(&service),
         served: Arc::clone(&served),
@@ -104,7 +104,7 @@ fn begin(
     let (end, ended) = oneshot::channel();
     bus.spawn(answer_all(Arc::new(answering), requests, ended));
     bus.served.send_modify(|number| *number += 1);
-    Ok(Box::new(Guard {
+    Ok(Box::new(ServerGuard {
         bus: Arc::clone(bus),
         service,
         served,
@@ -112,15 +112,16 @@ fn begin(
     }))
 }
 
-struct Guard {
-    bus: Arc<Inner>,
+struct ServerGuard {
+    bus: Arc<Ros2BusState>,
     service: Arc<str>,
-    served: Arc<Served>,
-    /// Whom the reader is left to, so that it is withdrawn with the last answer: without it clients take the server for gone.
+    served: Arc<ServedService>,
+    /// The reader and the channel that hands it over, so that it is withdrawn together with the last answer: without it
+    /// clients take the server for gone.
     end: Option<(oneshot::Sender<ReaderEnd>, ReaderEnd)>,
 }
 
-impl Drop for Guard {
+impl Drop for ServerGuard {
     fn drop(&mut self) {
         let mut services = self.bus.services.lock();
         let current = services.get(&*self.service);
@@ -135,33 +136,33 @@ impl Drop for Guard {
     }
 }
 
-/// Takes requests.
-struct Requests {
+/// Receives requests.
+struct RequestSink {
     service: Arc<str>,
-    queue: mpsc::Sender<Sample>,
+    queue: mpsc::Sender<ReceivedSample>,
 }
 
-impl Sink for Requests {
-    fn sample(&self, sample: Sample) {
+impl Sink for RequestSink {
+    fn on_sample(&self, sample: ReceivedSample) {
         if let Err(TrySendError::Full(_)) = self.queue.try_send(sample) {
             tracing::warn!(
                 service = &*self.service,
-                "a request was not taken: {ANSWERED} are being answered and {QUEUED} wait"
+                "a request was rejected: {ANSWERED} are being answered and {QUEUED} wait"
             );
         }
     }
 }
 
-struct Answering {
-    bus: Arc<Inner>,
+struct ServiceResponder {
+    bus: Arc<Ros2BusState>,
     service: Arc<str>,
-    served: Arc<Served>,
+    served: Arc<ServedService>,
     writer: WriterEnd,
 }
 
 async fn answer_all(
-    answering: Arc<Answering>,
-    mut requests: mpsc::Receiver<Sample>,
+    answering: Arc<ServiceResponder>,
+    mut requests: mpsc::Receiver<ReceivedSample>,
     mut ended: oneshot::Receiver<ReaderEnd>,
 ) {
     let mut calls = JoinSet::new();
@@ -193,25 +194,25 @@ async fn answer_all(
     drop(last);
 }
 
-/// How a client knows the answer to its request.
+/// How a client recognizes the reply to its request.
 #[derive(Debug, Clone, Copy)]
-enum Asker {
+enum Requester {
     /// By inline QoS.
     Identity(SampleIdentity),
-    /// By what stands before the reply.
+    /// By the header before the reply.
     Header(RequestHeader),
 }
 
-impl Answering {
-    async fn answer(&self, sample: Sample) {
+impl ServiceResponder {
+    async fn answer(&self, sample: ReceivedSample) {
         let client = sample.writer;
         let service = &*self.service;
-        // Whoever asks was discovered, though perhaps not seen by the watcher yet.
-        let discovered = self.bus.discovered();
+        // The client was discovered before its request, though the watcher may not have seen it yet.
+        let discovered = self.bus.discovery();
         let asked = discovered.writers.get(&client);
-        let theirs = asked.map(|end| type_hash::of_message(&end.user_data));
+        let theirs = asked.map(|end| type_hash::message_hash(&end.user_data));
         let ours = &self.served.of.request;
-        if let Some(theirs) = theirs.filter(|theirs| !theirs.agrees(ours)) {
+        if let Some(theirs) = theirs.filter(|theirs| !theirs.is_compatible_with(ours)) {
             tracing::warn!(
                 service,
                 client = &*self.bus.seen.borrow().node(client),
@@ -226,7 +227,7 @@ impl Answering {
             writer: client,
             number: sample.number,
         };
-        let Some((asker, request)) = asker(payload, related, written, of_cyclone) else {
+        let Some((asker, request)) = requester(payload, related, written, of_cyclone) else {
             tracing::debug!(service, "a request without the header of rmw_cyclonedds");
             return;
         };
@@ -234,17 +235,17 @@ impl Answering {
         let response = match self.served.handler.call(request, &caller).await {
             Ok(response) => response,
             Err(reason) => {
-                // ROS 2 has no answer that says so.
+                // ROS 2 has no reply for failures.
                 tracing::warn!(service, reason, "a request is not answered");
                 return;
             }
         };
-        self.matched(client, asker).await;
+        self.wait_until_matched(client, asker).await;
         match asker {
-            Asker::Identity(identity) => {
+            Requester::Identity(identity) => {
                 self.writer.write_related(response, identity);
             }
-            Asker::Header(header) => {
+            Requester::Header(header) => {
                 if let Some(payload) = header.join(&response) {
                     self.writer.write(payload);
                 }
@@ -252,7 +253,7 @@ impl Answering {
         }
     }
 
-    /// The node that asks. One that has just come tells its name in a moment.
+    /// Returns the calling node. A new node announces its name in a moment.
     async fn caller(&self, client: Guid) -> Arc<str> {
         let mut seen = self.bus.seen.subscribe();
         let _ = timeout(MATCH, seen.wait_for(|seen| seen.is_named(client))).await;
@@ -260,10 +261,10 @@ impl Answering {
         seen.node(client)
     }
 
-    /// Waits until the client's reader of replies is known, and this writer to it. It is gone if it never is.
-    async fn matched(&self, client: Guid, asker: Asker) {
+    /// Waits until the client's reader of replies and this writer have matched. If they never do, the client is gone.
+    async fn wait_until_matched(&self, client: Guid, asker: Requester) {
         let known = match asker {
-            Asker::Identity(identity) if !identity.writer.entity.is_writer() => {
+            Requester::Identity(identity) if !identity.writer.entity.is_writer() => {
                 Some(identity.writer)
             }
             _ => None,
@@ -281,25 +282,26 @@ impl Answering {
     }
 }
 
-/// Who asks, and the request without what rmw adds: `written` is which sample it is, `related` what its inline QoS says.
-fn asker(
+/// Returns the requester, and the request without what rmw adds: `written` identifies the sample, `related` is its
+/// inline QoS.
+fn requester(
     payload: Bytes,
     related: Option<SampleIdentity>,
     written: SampleIdentity,
     of_cyclone: bool,
-) -> Option<(Asker, Bytes)> {
+) -> Option<(Requester, Bytes)> {
     if of_cyclone {
         let (header, request) = RequestHeader::split(&payload)?;
-        return Some((Asker::Header(header), request));
+        return Some((Requester::Header(header), request));
     }
-    // rmw_fastrtps puts the client's reader of replies there, by which its server waits for it.
+    // rmw_fastrtps puts the client's reader of replies there; the server waits for it before replying.
     let related = related.map(|related| related.writer);
     let reader = related.filter(|guid| *guid != Guid::default());
     let identity = SampleIdentity {
         writer: reader.unwrap_or(written.writer),
         ..written
     };
-    Some((Asker::Identity(identity), payload))
+    Some((Requester::Identity(identity), payload))
 }
 
 #[cfg(test)]
@@ -324,8 +326,8 @@ mod tests {
             (None, identity(3, 8)),
             (Some(identity(0, -1)), identity(3, 8)),
         ] {
-            let found = asker(payload(), related, identity(3, 8), false);
-            let Some((Asker::Identity(to), request)) = found else {
+            let found = requester(payload(), related, identity(3, 8), false);
+            let Some((Requester::Identity(to), request)) = found else {
                 panic!("{related:?} should be answered by inline QoS");
             };
             assert_eq!((to, request), (expected, payload()));
@@ -339,12 +341,12 @@ mod tests {
             number: 8,
         };
         let payload = header.join(&[0, 1, 0, 0, 9]).expect("CDR");
-        let found = asker(payload, None, identity(3, 1), true);
-        let Some((Asker::Header(read), request)) = found else {
+        let found = requester(payload, None, identity(3, 1), true);
+        let Some((Requester::Header(read), request)) = found else {
             panic!("it should be answered by a header");
         };
         assert_eq!((read, &request[..]), (header, &[0, 1, 0, 0, 9][..]));
         let short = Bytes::from_static(&[0, 1, 0, 0, 9]);
-        assert!(asker(short, None, identity(3, 1), true).is_none());
+        assert!(requester(short, None, identity(3, 1), true).is_none());
     }
 }

@@ -1,11 +1,11 @@
 //! Topics that this node subscribes to: several local subscriptions share one set of readers.
 //!
-//! A subscription's quality is a wish: a publisher that offers less is heard, too. DDS knows no wishes, so there is a reader for
-//! each quality that publishers offer, at most the one that is wished for. A reader of a lesser quality matches better writers,
-//! too: what it brings of those is left to the reader that is theirs.
+//! A subscription's QoS is a preference: a publisher that offers less is matched too. DDS has no such preferences, so
+//! there is one reader for each quality that publishers offer, up to the preferred one. A reader of lower quality also
+//! matches better writers: their messages are left to the reader that is meant for them.
 //!
 //! ```text
-//!   wish: reliable, transient_local
+//!   preferred: reliable, transient_local
 //!   writer A: reliable, transient_local ─▶ reader of that quality   ─▶┐
 //!   writer B: best_effort, volatile     ─▶ best_effort and volatile ─▶┴▶ all local queues
 //!   writer A                            ─▶ best_effort and volatile ─▶ nobody
@@ -18,81 +18,83 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{Discovered, Durability, EndpointData, Guid, Sample, Sink};
+use rtps::{DiscoveredGraph, DurabilityKind, EndpointData, Guid, ReceivedSample, Sink};
 use tokio::sync::{Notify, watch};
 use tokio::task::AbortHandle;
 
 use self::readers::Readers;
-use super::bus::Inner;
+use super::bus::Ros2BusState;
 use super::quality::{self, Quality};
-use super::seen::{self, Seen};
+use super::seen::{self, DiscoverySnapshot};
 use crate::bus::{
-    BusError, Matched, Message, MessageSender, Offer, PeerId, Qos, Subscription, WireType,
-    message_queue,
+    BusError, MatchedPeers, MessageSender, Offer, PeerId, QosProfile, SerializedMessage,
+    Subscription, WireType, message_queue,
 };
 
-/// A message that is kept, and shorter than this, is copied out of the buffer that it came in with others.
+/// Size below which a message to be kept is copied out of the receive buffer that it shares with others.
 const BIG: usize = 64 * 1024;
 
-/// Messages that are held until it is known whose they are, and their bytes. Beyond, nobody waits for that.
+/// Maximum number, and size in bytes, of messages held until their node is known. Beyond that they are delivered
+/// without it.
 const MOST_HELD: usize = 64;
 const MOST_BYTES_HELD: usize = 16 << 20;
 
-/// Which readers subscriptions share: topic, name of the type, quality.
+/// Identifies subscriptions that share readers: topic, type name, quality.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub(super) struct Key {
+pub(super) struct ReaderSetKey {
     topic: String,
-    /// `*` where it does not matter.
+    /// `*` for any type.
     type_name: String,
     wish: Quality,
 }
 
 /// Topics that are subscribed to.
-pub(super) type Topics = Mutex<HashMap<Key, Arc<TopicIn>>>;
+pub(super) type TopicMap = Mutex<HashMap<ReaderSetKey, Arc<TopicIn>>>;
 
-/// One topic with everyone here who wants it in one quality.
+/// One topic with all its local subscriptions of one type and quality.
 pub(super) struct TopicIn {
-    key: Key,
+    key: ReaderSetKey,
     depth: usize,
-    locals: Mutex<Locals>,
-    /// What is known of each writer that was heard or found.
-    sources: Mutex<HashMap<Guid, Arc<Source>>>,
-    matched: watch::Sender<Matched>,
-    /// Woken when there are other local subscriptions than before.
+    locals: Mutex<TopicSubscribers>,
+    /// Known properties of each writer that was discovered or heard.
+    sources: Mutex<HashMap<Guid, Arc<KnownWriter>>>,
+    matched: watch::Sender<MatchedPeers>,
+    /// Notified when local subscriptions change.
     changed: Notify,
-    /// Keeps its readers.
+    /// Task that maintains the readers.
     following: Mutex<Option<AbortHandle>>,
-    discovered: watch::Receiver<Arc<Discovered>>,
-    seen: watch::Receiver<Arc<Seen>>,
+    discovered: watch::Receiver<Arc<DiscoveredGraph>>,
+    seen: watch::Receiver<Arc<DiscoverySnapshot>>,
 }
 
 #[derive(Default)]
-struct Locals {
+struct TopicSubscribers {
     next: u64,
-    list: Vec<Local>,
-    /// The last message of each writer that is transient-local: for locals that come later.
-    latched: HashMap<Guid, Message>,
-    /// Messages of writers whose node is not known yet, in order: it is told in a moment, and a message says whose it is.
-    held: Vec<Held>,
+    list: Vec<TopicSubscriber>,
+    /// Last message of each transient-local writer, for later local subscriptions.
+    latched: HashMap<Guid, SerializedMessage>,
+    /// Messages of writers whose node is not known yet, in order: it will be known in a moment, and a message names its
+    /// publisher.
+    held: Vec<HeldMessage>,
 }
 
-struct Held {
+struct HeldMessage {
     writer: Guid,
-    /// What was known of it then.
-    source: Arc<Source>,
+    /// Properties known when the message arrived.
+    source: Arc<KnownWriter>,
     quality: Quality,
     bytes: Bytes,
 }
 
-struct Local {
+struct TopicSubscriber {
     id: u64,
     sender: MessageSender,
     wanted: WireType,
 }
 
-impl Local {
-    fn send(&self, message: Message) {
-        if self.wanted.agrees(&message.wire_type) {
+impl TopicSubscriber {
+    fn send(&self, message: SerializedMessage) {
+        if self.wanted.is_compatible_with(&message.wire_type) {
             self.sender.send(message);
         }
     }
@@ -100,19 +102,19 @@ impl Local {
 
 /// A writer of the topic.
 #[derive(Debug)]
-struct Source {
+struct KnownWriter {
     peer: PeerId,
     offer: Offer,
-    /// The quality of the reader that hears it.
+    /// Quality of the reader that is meant for the writer.
     quality: Quality,
-    /// Its type as DDS has it.
+    /// Type name in DDS.
     type_name: String,
-    /// Whether it is known whose it is, as far as it will be.
+    /// True once the writer's node is known, as far as it will be.
     named: bool,
 }
 
-impl Source {
-    fn of(writer: &EndpointData, wish: Quality, seen: &Seen) -> Self {
+impl KnownWriter {
+    fn new(writer: &EndpointData, wish: Quality, seen: &DiscoverySnapshot) -> Self {
         Self {
             peer: seen.peer(writer.guid),
             offer: Offer {
@@ -126,17 +128,17 @@ impl Source {
     }
 }
 
-/// Subscribes; with the topic's first local subscription of its kind the readers are made.
+/// Subscribes; the first local subscription of its kind creates the readers.
 pub(super) fn subscribe(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros2BusState>,
     name: &str,
     wanted: WireType,
-    qos: Qos,
+    qos: QosProfile,
 ) -> Result<Subscription, BusError> {
-    let key = Key {
+    let key = ReaderSetKey {
         topic: name.to_owned(),
         type_name: wanted.name.clone(),
-        wish: Quality::of(&qos),
+        wish: Quality::from_qos(&qos),
     };
     let (sender, messages) = message_queue(qos.depth);
     let mut topics = bus.subscriptions.lock();
@@ -144,7 +146,7 @@ pub(super) fn subscribe(
     let topic = known
         .clone()
         .unwrap_or_else(|| Arc::new(TopicIn::new(bus, &key, qos.depth)));
-    // Before there is a reader: nothing that it brings is to be missed.
+    // Before there is a reader, so that no message is missed.
     let id = topic.add(sender, wanted);
     if known.is_none() {
         let readers = Readers::open(bus, &topic)?;
@@ -153,10 +155,10 @@ pub(super) fn subscribe(
     }
     drop(topics);
     Ok(Subscription {
-        dropped: messages.dropped(),
+        dropped: messages.drop_counter(),
         messages,
         matched: topic.matched.subscribe(),
-        guard: Box::new(Guard {
+        guard: Box::new(ReaderGuard {
             bus: Arc::clone(bus),
             topic,
             id,
@@ -165,7 +167,7 @@ pub(super) fn subscribe(
 }
 
 impl TopicIn {
-    fn new(bus: &Inner, key: &Key, depth: usize) -> Self {
+    fn new(bus: &Ros2BusState, key: &ReaderSetKey, depth: usize) -> Self {
         Self {
             key: key.clone(),
             depth,
@@ -174,7 +176,7 @@ impl TopicIn {
             matched: watch::Sender::default(),
             changed: Notify::new(),
             following: Mutex::default(),
-            discovered: bus.participant.discovered(),
+            discovered: bus.participant.watch_discovered(),
             seen: bus.seen.subscribe(),
         }
     }
@@ -183,7 +185,7 @@ impl TopicIn {
         let mut locals = self.locals.lock();
         locals.next += 1;
         let id = locals.next;
-        let local = Local { id, sender, wanted };
+        let local = TopicSubscriber { id, sender, wanted };
         for message in locals.latched.values() {
             local.send(message.clone());
         }
@@ -192,21 +194,24 @@ impl TopicIn {
         id
     }
 
-    /// What somebody here wants; whether that is what a publisher of this type sends.
-    fn wanted(&self, theirs: &WireType) -> Result<(), WireType> {
+    /// Checks that a publisher of this type matches a local subscription; otherwise returns a requested type.
+    fn check_wanted(&self, theirs: &WireType) -> Result<(), WireType> {
         let locals = self.locals.lock();
         let mut wanted = locals.list.iter().map(|local| &local.wanted);
         let first = wanted.next();
         match first {
-            Some(ours) if !ours.agrees(theirs) && !wanted.any(|ours| ours.agrees(theirs)) => {
+            Some(ours)
+                if !ours.is_compatible_with(theirs)
+                    && !wanted.any(|ours| ours.is_compatible_with(theirs)) =>
+            {
                 Err(ours.clone())
             }
             _ => Ok(()),
         }
     }
 
-    /// The first type that somebody here names with its digest, else the first one.
-    fn announced(&self) -> Option<WireType> {
+    /// Returns the first requested type with a known digest, or else the first one.
+    fn announced_type(&self) -> Option<WireType> {
         let locals = self.locals.lock();
         let mut wanted = locals.list.iter().map(|local| &local.wanted);
         let first = wanted.next();
@@ -214,20 +219,21 @@ impl TopicIn {
         all.find(|it| !it.digest.is_any()).or(first).cloned()
     }
 
-    /// What is known of a writer. One that is heard was discovered, whether or not its readers were looked at since.
-    fn source(&self, writer: Guid) -> Option<Arc<Source>> {
+    /// Returns the known properties of a writer. A writer that is heard was discovered, even if the readers were not
+    /// updated since.
+    fn source(&self, writer: Guid) -> Option<Arc<KnownWriter>> {
         if let Some(known) = self.sources.lock().get(&writer) {
             return Some(Arc::clone(known));
         }
         let told = self.discovered.borrow().writers.get(&writer).cloned()?;
         let seen = Arc::clone(&self.seen.borrow());
-        let source = Arc::new(Source::of(&told, self.key.wish, &seen));
+        let source = Arc::new(KnownWriter::new(&told, self.key.wish, &seen));
         self.sources.lock().insert(writer, Arc::clone(&source));
         Some(source)
     }
 
-    /// Takes what a reader of this quality has brought.
-    fn take(&self, writer: Guid, quality: Quality, bytes: Bytes) {
+    /// Receives a message from the reader of this quality.
+    fn receive(&self, writer: Guid, quality: Quality, bytes: Bytes) {
         let mut locals = self.locals.lock();
         let Some(source) = self.source(writer) else {
             return;
@@ -236,7 +242,7 @@ impl TopicIn {
         if !waits {
             return self.deliver(&mut locals, writer, &source, (quality, bytes));
         }
-        locals.held.push(Held {
+        locals.held.push(HeldMessage {
             writer,
             source,
             quality,
@@ -248,7 +254,7 @@ impl TopicIn {
         }
     }
 
-    /// Delivers what was held of writers that are named by now, or are gone.
+    /// Delivers the held messages of writers that are known by now, or gone.
     fn release_named(&self) {
         let mut locals = self.locals.lock();
         if !locals.held.is_empty() {
@@ -256,38 +262,38 @@ impl TopicIn {
         }
     }
 
-    fn release(&self, locals: &mut Locals, wanted: impl Fn(&Source) -> bool) {
+    fn release(&self, locals: &mut TopicSubscribers, wanted: impl Fn(&KnownWriter) -> bool) {
         for held in std::mem::take(&mut locals.held) {
-            // Of one that is gone nothing more will be known.
+            // Nothing more will become known of a writer that is gone.
             let now = self.source(held.writer);
             let gone = now.is_none();
             let source = now.unwrap_or(held.source);
             if gone || wanted(&source) {
                 self.deliver(locals, held.writer, &source, (held.quality, held.bytes));
             } else {
-                locals.held.push(Held { source, ..held });
+                locals.held.push(HeldMessage { source, ..held });
             }
         }
     }
 
     fn deliver(
         &self,
-        locals: &mut Locals,
+        locals: &mut TopicSubscribers,
         writer: Guid,
-        source: &Source,
+        source: &KnownWriter,
         (quality, bytes): (Quality, Bytes),
     ) {
-        // Another reader is there for it.
+        // Another reader is meant for this writer.
         if source.quality != quality {
             return;
         }
-        let message = Message {
+        let message = SerializedMessage {
             bytes,
             wire_type: Arc::clone(&source.offer.wire_type),
             publisher: source.peer.clone(),
             latching: source.offer.latching,
         };
-        if message.latching && self.key.wish.durability >= Durability::TransientLocal {
+        if message.latching && self.key.wish.durability >= DurabilityKind::TransientLocal {
             let mut kept = message.clone();
             if kept.bytes.len() < BIG {
                 kept.bytes = Bytes::copy_from_slice(&kept.bytes);
@@ -303,7 +309,7 @@ impl TopicIn {
     }
 
     /// Ends all local subscriptions.
-    pub(super) fn end(&self) {
+    pub(super) fn close(&self) {
         if let Some(following) = self.following.lock().take() {
             following.abort();
         }
@@ -312,26 +318,27 @@ impl TopicIn {
     }
 }
 
-/// What one reader brings.
-struct Ear {
+/// Receives the messages of one reader.
+struct ReaderSink {
     topic: Arc<TopicIn>,
     quality: Quality,
 }
 
-impl Sink for Ear {
-    fn sample(&self, sample: Sample) {
-        self.topic.take(sample.writer, self.quality, sample.payload);
+impl Sink for ReaderSink {
+    fn on_sample(&self, sample: ReceivedSample) {
+        self.topic
+            .receive(sample.writer, self.quality, sample.payload);
     }
 }
 
 /// One local subscription.
-struct Guard {
-    bus: Arc<Inner>,
+struct ReaderGuard {
+    bus: Arc<Ros2BusState>,
     topic: Arc<TopicIn>,
     id: u64,
 }
 
-impl Drop for Guard {
+impl Drop for ReaderGuard {
     fn drop(&mut self) {
         let mut topics = self.bus.subscriptions.lock();
         let mut locals = self.topic.locals.lock();
@@ -346,9 +353,10 @@ impl Drop for Guard {
             topics.remove(key);
         }
         drop(topics);
-        match empty {
-            true => self.topic.end(),
-            false => self.topic.changed.notify_one(),
+        if empty {
+            self.topic.close()
+        } else {
+            self.topic.changed.notify_one()
         }
     }
 }

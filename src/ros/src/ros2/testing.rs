@@ -1,4 +1,4 @@
-//! What the tests of this module share.
+//! Helpers for the tests of this module.
 
 use std::sync::Arc;
 
@@ -6,14 +6,14 @@ use super::Ros2Bus;
 use crate::JoinOptions;
 use crate::net::HostSockets;
 
-/// A domain of this process, for the test that has this number; others may be testing on this machine.
+/// Returns a domain of this process for the test with this number; other tests may run on this machine.
 pub(crate) fn domain(number: u16) -> u16 {
     let offset = std::process::id().wrapping_mul(37);
-    // Beyond 101 the ports of a domain are among those that the kernel gives away.
+    // Beyond domain 101 the ports are in the ephemeral range.
     (offset.wrapping_add(u32::from(number)) % 102) as u16
 }
 
-/// A node of this name in the domain with this number.
+/// Creates a node of this name in the domain with this number.
 pub(crate) async fn join(number: u16, node: &str) -> Arc<Ros2Bus> {
     let options = JoinOptions::in_domain(domain(number), node);
     let joined = Ros2Bus::connect(Arc::new(HostSockets), options).await;

@@ -1,4 +1,4 @@
-//! Two buses of one process, which meet on the loopback of this machine.
+//! Tests with two buses of one process, which meet on this machine's loopback interface.
 
 mod graph;
 mod hostile;
@@ -13,34 +13,37 @@ use tokio::sync::watch;
 use tokio::time::timeout;
 
 use super::testing::{domain, join};
-use crate::bus::{Bus, Matched, Message, RosVersion, Subscription, WireType, reaches};
+use crate::bus::{
+    Bus, MatchedPeers, RosVersion, SerializedMessage, Subscription, WireType, wait_for_connected,
+};
 use crate::schema::MessageType;
 
 /// Longer than anything here takes.
 const LONG: Duration = Duration::from_secs(60);
 
-/// A message type of this text.
+/// Creates a message type with this definition.
 fn message_type(name: &str, text: &str) -> Arc<MessageType> {
-    MessageType::of_full_text(RosVersion::Two, name, text).expect("a definition")
+    MessageType::parse_full_text(RosVersion::Two, name, text).expect("a definition")
 }
 
 fn string() -> WireType {
-    WireType::of(&message_type("std_msgs/msg/String", "string data"))
+    WireType::from_message(&message_type("std_msgs/msg/String", "string data"))
 }
 
-/// A serialized message, told from others by this number. Its size is a multiple of 4: others are filled up on their way.
-fn numbered(number: u8) -> Bytes {
+/// Creates a serialized message identified by this number. Its size is a multiple of 4; other sizes are padded in
+/// transit.
+fn numbered_message(number: u8) -> Bytes {
     Bytes::copy_from_slice(&[0, 1, 0, 0, 4, 0, 0, 0, number, b'.', b'.', 0])
 }
 
-async fn next(subscription: &mut Subscription) -> Message {
+async fn next(subscription: &mut Subscription) -> SerializedMessage {
     let message = timeout(LONG, subscription.messages.recv()).await;
     message
         .expect("a message should come")
         .expect("the bus is open")
 }
 
-/// The next numbers that come.
+/// Returns the numbers of the next messages.
 async fn numbers(subscription: &mut Subscription, count: usize) -> Vec<u8> {
     let mut numbers = Vec::new();
     while numbers.len() < count {
@@ -49,15 +52,15 @@ async fn numbers(subscription: &mut Subscription, count: usize) -> Vec<u8> {
     numbers
 }
 
-async fn connected(matched: watch::Receiver<Matched>, count: usize) {
-    let reached = timeout(LONG, reaches(matched, count)).await;
+async fn expect_connected(matched: watch::Receiver<MatchedPeers>, count: usize) {
+    let reached = timeout(LONG, wait_for_connected(matched, count)).await;
     reached.unwrap_or_else(|_| panic!("{count} should be connected"));
 }
 
-async fn until(
-    mut matched: watch::Receiver<Matched>,
-    wanted: impl Fn(&Matched) -> bool,
-) -> Matched {
+async fn wait_for_matched(
+    mut matched: watch::Receiver<MatchedPeers>,
+    wanted: impl Fn(&MatchedPeers) -> bool,
+) -> MatchedPeers {
     let found = timeout(LONG, matched.wait_for(|matched| wanted(matched))).await;
     found.expect("in time").expect("the bus is open").clone()
 }

@@ -1,21 +1,21 @@
-//! What type a topic has, as its ends say.
+//! Type of a topic, determined from its endpoints.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use tokio::time::timeout;
 
-use super::bus::Inner;
+use super::bus::Ros2BusState;
 use super::names;
-use super::seen::{self, Seen};
+use super::seen::{self, DiscoverySnapshot};
 use crate::bus::{BusError, WireType};
 
-/// For ends that have just come to be discovered.
+/// Time for new endpoints to be discovered.
 const GRACE: Duration = Duration::from_millis(300);
 
-/// The type by whatever is at hand: what we advertise, what publishers offer, what subscribers ask for. Its digest is `*` where
-/// they do not tell it.
-pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusError> {
+/// Returns the type from the first source available: what we advertise, what publishers offer, what subscribers
+/// request. Its digest is `*` if they do not announce it.
+pub(super) async fn find(bus: &Arc<Ros2BusState>, name: &str) -> Result<WireType, BusError> {
     if let Some((ours, _)) = bus.adverts.lock().get(name) {
         return Ok(WireType::clone(ours));
     }
@@ -23,7 +23,7 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
     let mut seen = bus.seen.subscribe();
     let found = timeout(GRACE, async {
         loop {
-            if let Some(found) = known(&seen.borrow_and_update(), &topic) {
+            if let Some(found) = find_known(&seen.borrow_and_update(), &topic) {
                 return Ok(found);
             }
             seen.changed().await.map_err(|_| BusError::Closed)?;
@@ -33,7 +33,7 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
     found.await.unwrap_or_else(nobody)
 }
 
-fn known(seen: &Seen, topic: &str) -> Option<WireType> {
+fn find_known(seen: &DiscoverySnapshot, topic: &str) -> Option<WireType> {
     for ends in [seen.writers(topic), seen.readers(topic)] {
         let mut types = ends.iter().map(|end| seen::wire_type(end));
         let first = types.next();

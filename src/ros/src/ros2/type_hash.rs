@@ -1,34 +1,35 @@
-//! The hash of a type in what an end tells of itself (`PID_USER_DATA`): `typehash=RIHS01_…;` of its messages (REP 2016), and
-//! from Lyrical on `sertypehash=…;` of its service. Distributions before Iron tell none.
+//! Type hashes in the user data of endpoints (`PID_USER_DATA`): `typehash=RIHS01_…;` of the messages (REP 2016), and
+//! since Lyrical `sertypehash=…;` of the service. Distributions before Iron announce none.
 
 use bytes::Bytes;
 
 use crate::bus::Digest;
 
-/// What hashes of this version begin with; 64 hexadecimal digits follow.
+/// Prefix of hashes of this version, followed by 64 hexadecimal digits.
 const VERSION: &str = "RIHS01_";
 const DIGITS: usize = 64;
 
-/// What an end of a type with this digest tells; nothing where it is not known.
+/// Returns the user data of an endpoint with this digest; empty if the digest is not known.
 pub(super) fn user_data(digest: &Digest) -> Bytes {
-    match is_hash(digest.as_str()) {
-        true => format!("typehash={digest};").into(),
-        false => Bytes::new(),
+    if is_hash(digest.as_str()) {
+        format!("typehash={digest};").into()
+    } else {
+        Bytes::new()
     }
 }
 
-/// The digest of the messages of an end that tells this; `*` where it does not say, or in a version unknown here.
-pub(super) fn of_message(user_data: &[u8]) -> Digest {
-    value(user_data, "typehash")
+/// Returns the digest of an endpoint's messages; `*` if it is missing or of an unknown version.
+pub(super) fn message_hash(user_data: &[u8]) -> Digest {
+    hash_value(user_data, "typehash")
 }
 
-/// The digest of the service that an end belongs to.
-pub(super) fn of_service(user_data: &[u8]) -> Digest {
-    value(user_data, "sertypehash")
+/// Returns the digest of the service that an endpoint belongs to.
+pub(super) fn service_hash(user_data: &[u8]) -> Digest {
+    hash_value(user_data, "sertypehash")
 }
 
-/// `key=value;` one after the other.
-fn value(user_data: &[u8], key: &str) -> Digest {
+/// Returns the hash for a key in `key=value;` pairs.
+fn hash_value(user_data: &[u8], key: &str) -> Digest {
     let text = std::str::from_utf8(user_data).unwrap_or_default();
     let pairs = text.split(';').filter_map(|pair| pair.split_once('='));
     let mut values = pairs.filter(|(name, _)| *name == key);
@@ -54,11 +55,11 @@ mod tests {
         let hash = Digest::from(format!("RIHS01_{}", "0a".repeat(32)));
         let told = user_data(&hash);
         assert_eq!(&told[..], format!("typehash={hash};").as_bytes());
-        assert_eq!(of_message(&told), hash);
-        assert!(of_service(&told).is_any());
+        assert_eq!(message_hash(&told), hash);
+        assert!(service_hash(&told).is_any());
         let both = format!("enclave=/;sertypehash={hash};");
-        assert_eq!(of_service(both.as_bytes()), hash);
-        assert!(of_message(both.as_bytes()).is_any());
+        assert_eq!(service_hash(both.as_bytes()), hash);
+        assert!(message_hash(both.as_bytes()).is_any());
     }
 
     #[test]
@@ -70,7 +71,7 @@ mod tests {
             b"typehash=RIHS02_0000000000000000000000000000000000000000000000000000000000000000;",
             b"\xff\xfe",
         ] {
-            assert!(of_message(told).is_any(), "{told:?}");
+            assert!(message_hash(told).is_any(), "{told:?}");
         }
         assert!(user_data(&Digest::any()).is_empty());
         assert!(user_data(&Digest::from("d41d8cd98f00b204e9800998ecf8427e")).is_empty());

@@ -1,5 +1,4 @@
-//! Follows what is discovered and what participants tell of their nodes, shows the graph, and tells the others what this node
-//! has.
+//! Tracks discovery and the announcements of participants, publishes the graph, and announces this node's endpoints.
 
 use std::collections::HashMap;
 use std::future::pending;
@@ -9,52 +8,53 @@ use std::time::{Duration, Instant};
 use rtps::Guid;
 use tokio::time::sleep_until;
 
-use super::bus::Inner;
-use super::entities::{self, GidSize, Node};
-use super::other_types::OtherTypes;
-use super::seen::Seen;
+use super::bus::Ros2BusState;
+use super::entities::{self, DiscoveredNode, GidSize};
+use super::other_types::TypeMismatchLog;
+use super::seen::DiscoverySnapshot;
 use super::{calls, graph};
 
-/// A participant of ROS has so long to tell whose an end is. Until then what it sends is kept, and it is not shown.
+/// Time for a ROS participant to announce the node of an endpoint. Until then its messages are held, and it is not
+/// shown.
 const PATIENCE: Duration = Duration::from_millis(500);
 
-/// Follows one bus's graph.
+/// Tracks one bus's graph.
 pub(super) struct Watcher {
-    bus: Arc<Inner>,
-    /// Tells of this node, and of those that it stands for.
-    teller: rtps::Writer,
-    /// What was told last.
-    told: Option<(Vec<Node>, GidSize)>,
-    /// Ends of nobody yet, and since when.
+    bus: Arc<Ros2BusState>,
+    /// Announces this node, and the nodes it represents.
+    teller: rtps::DataWriter,
+    /// Last announcement.
+    told: Option<(Vec<DiscoveredNode>, GidSize)>,
+    /// Endpoints whose node is not known yet, and since when.
     unnamed: HashMap<Guid, Instant>,
-    /// When the next of them will be late.
+    /// Time at which the next of them counts as late.
     late_at: Option<Instant>,
-    other_types: OtherTypes,
+    other_types: TypeMismatchLog,
 }
 
 impl Watcher {
-    /// With the writer by which it tells of this node.
-    pub(super) fn new(bus: Arc<Inner>, teller: rtps::Writer) -> Self {
+    /// Creates a watcher with the writer for announcements.
+    pub(super) fn new(bus: Arc<Ros2BusState>, teller: rtps::DataWriter) -> Self {
         Self {
             bus,
             teller,
             told: None,
             unnamed: HashMap::new(),
             late_at: None,
-            other_types: OtherTypes::default(),
+            other_types: TypeMismatchLog::default(),
         }
     }
 
-    /// Follows for ever.
+    /// Runs forever.
     pub(super) async fn run(mut self) {
-        let mut discovered = self.bus.participant.discovered();
+        let mut discovered = self.bus.participant.watch_discovered();
         let mut told = self.bus.told.changes();
         let mut own = self.bus.own.changes();
         loop {
             discovered.mark_unchanged();
             told.mark_unchanged();
             own.mark_unchanged();
-            self.look();
+            self.refresh();
             let late = self.late_at;
             let late = async {
                 match late {
@@ -74,20 +74,21 @@ impl Watcher {
         }
     }
 
-    /// Shows what is there now.
-    pub(super) fn look(&mut self) {
+    /// Publishes the current state.
+    pub(super) fn refresh(&mut self) {
         let bus = &self.bus;
-        let (discovered, told) = bus.told.of(&bus.participant.discovered());
-        let mut seen = Seen::new(discovered, &told);
+        let (discovered, told) = bus.told.snapshot(&bus.participant.watch_discovered());
+        let mut seen = DiscoverySnapshot::new(discovered, &told);
         self.wait_for_names(&mut seen);
         let seen = Arc::new(seen);
         let bus = &self.bus;
         let own = bus.own.ends();
-        let nodes = bus.own.told(&own, &bus.node);
-        self.tell(nodes, seen.gids);
+        let nodes = bus.own.announced_nodes(&own, &bus.node);
+        self.announce(nodes, seen.gids);
         let bus = &self.bus;
         let mut now = graph::build(&seen, &own, (bus.node.as_str(), bus.participant.guid()));
-        // Whoever is woken by what is seen (a message is named by it, say) finds the graph as new; whoever is woken by the graph, what is seen.
+        // A task woken by the discovery snapshot (to name the publisher of a message, say) sees the new graph, and one
+        // woken by the graph sees the new snapshot.
         let mut news = false;
         bus.graph.send_if_modified(|before| {
             now.generation = before.generation;
@@ -99,21 +100,21 @@ impl Watcher {
             false
         });
         bus.seen.send_replace(Arc::clone(&seen));
-        calls::forget_unserved(bus, &seen);
+        calls::drop_unserved_clients(bus, &seen);
         let services = bus.services.lock();
         let served = services
             .iter()
             .map(|(name, served)| (name.as_str(), &served.of));
-        self.other_types.look(served, &seen);
+        self.other_types.log_new(served, &seen);
         drop(services);
         bus.graph.send_if_modified(|_| news);
     }
 
-    /// Ends that were not named in time are late from then on.
-    fn wait_for_names(&mut self, seen: &mut Seen) {
+    /// Waits for the nodes of endpoints; those not announced in time count as late.
+    fn wait_for_names(&mut self, seen: &mut DiscoverySnapshot) {
         let now = Instant::now();
         let mut unnamed = HashMap::new();
-        for end in seen.unnamed() {
+        for end in seen.unnamed_endpoints() {
             unnamed.insert(end, self.unnamed.get(&end).copied().unwrap_or(now));
         }
         let due = unnamed.iter().map(|(end, since)| (*end, *since + PATIENCE));
@@ -123,7 +124,7 @@ impl Watcher {
         self.unnamed = unnamed;
     }
 
-    fn tell(&mut self, nodes: Vec<Node>, size: GidSize) {
+    fn announce(&mut self, nodes: Vec<DiscoveredNode>, size: GidSize) {
         let now = (nodes, size);
         if self.told.as_ref() != Some(&now) {
             let participant = self.bus.participant.guid();

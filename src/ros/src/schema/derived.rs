@@ -1,12 +1,13 @@
-//! The messages of ROS 2 that come from other definitions, as rosidl makes them: request, response and event of a
-//! service, the parts of an action and those of its two services. Services and actions are types of their own too: of
-//! their parts, so that one rule gives the hashes of all.
+//! ROS 2 messages generated from other definitions, as by rosidl: request, response and event of a service, the parts
+//! of an action and those of its two services. Services and actions themselves are types too, composed of their parts,
+//! so that one rule gives the hashes of all.
 
 use crate::schema::SchemaError;
 use crate::schema::text::sections;
 
-/// The text of what comes with service `package/srv/Name`, by what follows the service's name; empty for itself.
-pub(crate) fn of_service(
+/// Returns the text of a type generated from service `package/srv/Name`, by the suffix of its name; an empty suffix is
+/// the service itself.
+pub(crate) fn service_text(
     service: &str,
     text: &str,
     ending: &str,
@@ -21,7 +22,7 @@ pub(crate) fn of_service(
     }))
 }
 
-/// The service as a type, and its event.
+/// Returns the text of the service as a type, or of its event.
 fn service_part(service: &str, ending: &str) -> Option<String> {
     Some(match ending {
         "" => format!(
@@ -34,8 +35,9 @@ fn service_part(service: &str, ending: &str) -> Option<String> {
     })
 }
 
-/// The text of what comes with action `package/action/Name`, by what follows the action's name; empty for itself.
-pub(crate) fn of_action(
+/// Returns the text of a type generated from action `package/action/Name`, by the suffix of its name; an empty suffix
+/// is the action itself.
+pub(crate) fn action_text(
     action: &str,
     text: &str,
     ending: &str,
@@ -71,7 +73,7 @@ pub(crate) fn of_action(
     }))
 }
 
-/// Definitions that every ROS 2 system has and actions, services and stamps need.
+/// Returns definitions that every ROS 2 system has and that actions, services and stamps need.
 pub(crate) fn well_known(name: &str) -> Option<&'static str> {
     Some(match name {
         "builtin_interfaces/msg/Time" | "builtin_interfaces/msg/Duration" => {
@@ -88,14 +90,15 @@ pub(crate) fn well_known(name: &str) -> Option<&'static str> {
         }
         "action_msgs/msg/GoalStatus" => {
             "int8 STATUS_UNKNOWN = 0\nint8 STATUS_ACCEPTED = 1\nint8 STATUS_EXECUTING = 2\nint8 STATUS_CANCELING = 3\n\
-             int8 STATUS_SUCCEEDED = 4\nint8 STATUS_CANCELED = 5\nint8 STATUS_ABORTED = 6\nGoalInfo goal_info\nint8 status\n"
+             int8 STATUS_SUCCEEDED = 4\nint8 STATUS_CANCELED = 5\nint8 STATUS_ABORTED = 6\nGoalInfo goal_info\nint8 \
+             status\n"
         }
         "action_msgs/msg/GoalStatusArray" => "GoalStatus[] status_list\n",
         _ => return None,
     })
 }
 
-/// The same for services.
+/// Returns such definitions of services.
 pub(crate) fn well_known_service(name: &str) -> Option<&'static str> {
     (name == "action_msgs/srv/CancelGoal").then_some(
         "GoalInfo goal_info\n---\nint8 ERROR_NONE=0\nint8 ERROR_REJECTED=1\nint8 ERROR_UNKNOWN_GOAL_ID=2\n\

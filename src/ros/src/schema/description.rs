@@ -1,8 +1,8 @@
-//! ROS 2's descriptions of types (`type_description_interfaces/msg/TypeDescription`) and the hash of them, which the
-//! ends of a topic compare (REP 2016, RIHS01).
+//! ROS 2 type descriptions (`type_description_interfaces/msg/TypeDescription`) and their hash, which the endpoints of a
+//! topic compare (REP 2016, RIHS01).
 //!
-//! The hash is SHA-256 of the description as canonical JSON: members in the order of the definition of the description,
-//! `, ` and `: ` between them, default values left out, referenced types sorted by name.
+//! The hash is SHA-256 of the description as canonical JSON: members in the order in which the description's own type
+//! defines them, separated by `, ` and `: `, without default values, referenced types sorted by name.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -11,10 +11,10 @@ use sha2::{Digest, Sha256};
 
 use crate::schema::types::{Arity, Base, Field, MessageType, Primitive};
 
-/// What a type without fields is given by rosidl, for C has no empty structures.
+/// Field that rosidl adds to a type without fields, because C has no empty structures.
 pub(crate) const PLACEHOLDER: &str = "structure_needs_at_least_one_member";
 
-/// `RIHS01_` and the hash in hex.
+/// Returns `RIHS01_` followed by the hash in hex.
 pub(crate) fn type_hash(message: &MessageType) -> String {
     let hash = Sha256::digest(canonical_json(message));
     format!("RIHS01_{}", hex::encode(hash))
@@ -46,7 +46,7 @@ fn gather<'a>(message: &'a MessageType, found: &mut BTreeMap<&'a str, &'a Messag
     }
 }
 
-/// Names are plain ASCII, so there is nothing to escape.
+/// Appends a type as JSON. Names are plain ASCII, so there is nothing to escape.
 fn write_type(message: &MessageType, json: &mut String) {
     json.push_str(&format!(
         "{{\"type_name\": \"{}\", \"fields\": [",
@@ -97,7 +97,7 @@ fn write_field(
 
 const UINT8: u8 = 3;
 
-/// Numbers of `type_description_interfaces/msg/FieldType`: those of single values, moved up for arrays.
+/// Offsets of array types in `type_description_interfaces/msg/FieldType`, added to the number of the single type.
 const ARRAY: u8 = 48;
 const BOUNDED_SEQUENCE: u8 = 96;
 const UNBOUNDED_SEQUENCE: u8 = 144;

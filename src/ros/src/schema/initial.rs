@@ -1,28 +1,28 @@
-//! Values that a ROS 2 definition writes down: what a field holds until it is set (`int32 x 5`), and constants.
+//! Values in ROS 2 definitions: default values of fields (`int32 x 5`) and constants.
 
 use crate::schema::types::Primitive;
 
-/// What a field holds where a client leaves it out: one value, or those of an array.
+/// Default value of a field: one value, or those of an array.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Initial(pub(crate) Box<[Item]>);
+pub(crate) struct Initial(pub(crate) Box<[InitialItem]>);
 
-/// One of its values.
+/// A single value.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Item {
-    /// Little endian, in as many of the bytes as its type has.
+pub(crate) enum InitialItem {
+    /// Little-endian bytes; only as many count as the type has.
     Scalar([u8; 8]),
     Text(Box<str>),
 }
 
 impl Initial {
-    /// Of a field that is no array, or of one that is (`[1, 2]`).
+    /// Parses the value of a single field or of an array (`[1, 2]`).
     pub(crate) fn parse(
         primitive: Primitive,
         is_array: bool,
         written: &str,
     ) -> Result<Initial, String> {
         if !is_array {
-            return Ok(Initial([item(primitive, written)?].into()));
+            return Ok(Initial([parse_item(primitive, written)?].into()));
         }
         let inside = written
             .strip_prefix('[')
@@ -30,12 +30,12 @@ impl Initial {
             .ok_or_else(|| format!("{written} is not a list, write [VALUE, VALUE]"))?;
         let items = elements(inside)?
             .into_iter()
-            .map(|element| item(primitive, element));
+            .map(|element| parse_item(primitive, element));
         Ok(Initial(items.collect::<Result<_, _>>()?))
     }
 }
 
-/// What stands between commas that are not in quotes.
+/// Splits at commas outside quotes.
 fn elements(inside: &str) -> Result<Vec<&str>, String> {
     let mut found = Vec::new();
     let mut rest = inside.trim();
@@ -59,7 +59,7 @@ fn elements(inside: &str) -> Result<Vec<&str>, String> {
     Ok(found)
 }
 
-/// Where the quoted text ends that `written` begins with: after its closing quote.
+/// Returns the end of the quoted text at the beginning of `written`: the offset after its closing quote.
 pub(crate) fn quoted_end(written: &str) -> Option<usize> {
     let mut bytes = written.bytes().enumerate();
     let (_, quote) = bytes.next().filter(|(_, first)| b"\"'".contains(first))?;
@@ -75,8 +75,8 @@ pub(crate) fn quoted_end(written: &str) -> Option<usize> {
     None
 }
 
-/// A text without the quotes that may stand around it.
-pub(crate) fn unquoted(written: &str) -> String {
+/// Removes the quotes around a text, if any.
+pub(crate) fn unquote(written: &str) -> String {
     match (quoted_end(written), written.chars().next()) {
         (Some(end), Some(quote)) if end == written.len() => {
             written[1..end - 1].replace(&format!("\\{quote}"), &quote.to_string())
@@ -85,13 +85,13 @@ pub(crate) fn unquoted(written: &str) -> String {
     }
 }
 
-/// A value of this type, or that it is none.
-pub(crate) fn item(primitive: Primitive, written: &str) -> Result<Item, String> {
+/// Parses a value of this type.
+pub(crate) fn parse_item(primitive: Primitive, written: &str) -> Result<InitialItem, String> {
     let signed = |bits: u32| integer(written).filter(|it| fits_signed(*it, bits));
     let unsigned = |bits: u32| integer(written).filter(|it| (0..1 << bits).contains(it));
     let bits = match primitive {
         Primitive::String | Primitive::Wstring => {
-            return Ok(Item::Text(unquoted(written).into()));
+            return Ok(InitialItem::Text(unquote(written).into()));
         }
         Primitive::Bool => boolean(written).map(u64::from),
         Primitive::Int8 => signed(8).map(|it| it as u64),
@@ -107,7 +107,7 @@ pub(crate) fn item(primitive: Primitive, written: &str) -> Result<Item, String> 
         Primitive::Time | Primitive::Duration => None,
     };
     let bits = bits.ok_or_else(|| format!("{written:?} is no {}", primitive.name()))?;
-    Ok(Item::Scalar(bits.to_le_bytes()))
+    Ok(InitialItem::Scalar(bits.to_le_bytes()))
 }
 
 fn boolean(written: &str) -> Option<bool> {
@@ -126,7 +126,7 @@ fn fits_signed(value: i128, bits: u32) -> bool {
     (-(1i128 << (bits - 1))..1i128 << (bits - 1)).contains(&value)
 }
 
-/// As Python writes integers: decimal, or with `0x`, `0o`, `0b`.
+/// Parses an integer in Python's notation: decimal, or with `0x`, `0o`, `0b`.
 fn integer(written: &str) -> Option<i128> {
     let (negative, digits) = match written.strip_prefix('-') {
         Some(digits) => (true, digits),
@@ -138,7 +138,7 @@ fn integer(written: &str) -> Option<i128> {
         [b'0', b'b' | b'B', ..] => (&digits[2..], 2),
         _ => (digits, 10),
     };
-    // Another sign would be read by the standard library.
+    // The standard library would accept another sign.
     if !digits.starts_with(|digit: char| digit.is_ascii_hexdigit()) {
         return None;
     }
@@ -164,7 +164,7 @@ mod tests {
             (Primitive::Float32, "-1.5", 0xbfc0_0000),
             (Primitive::Float64, "1e3", 1000f64.to_bits()),
         ] {
-            let Ok(Item::Scalar(bytes)) = item(primitive, written) else {
+            let Ok(InitialItem::Scalar(bytes)) = parse_item(primitive, written) else {
                 panic!("{written}");
             };
             let size = primitive.size();
@@ -184,7 +184,7 @@ mod tests {
             ),
             (Primitive::Float64, "one"),
         ] {
-            assert!(item(primitive, written).is_err(), "{written}");
+            assert!(parse_item(primitive, written).is_err(), "{written}");
         }
     }
 
@@ -192,9 +192,9 @@ mod tests {
     fn lists_are_divided_at_commas_outside_of_quotes() {
         let texts = |written| {
             let Initial(items) = Initial::parse(Primitive::String, true, written)?;
-            let text = |item: &Item| match item {
-                Item::Text(text) => text.to_string(),
-                Item::Scalar(_) => unreachable!(),
+            let text = |item: &InitialItem| match item {
+                InitialItem::Text(text) => text.to_string(),
+                InitialItem::Scalar(_) => unreachable!(),
             };
             Ok::<Vec<_>, String>(items.iter().map(text).collect())
         };

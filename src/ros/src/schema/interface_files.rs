@@ -1,8 +1,8 @@
-//! The other forms in which a ROS 2 package has its interfaces beside `.msg`, `.srv` and `.action`: descriptions
-//! (`.json`, since Iron) and IDL, which rosidl makes of them and of which a package may have nothing else. Both become
-//! definitions in the language of `.msg` here, so that one parser reads all.
+//! Alternative formats of ROS 2 interfaces beside `.msg`, `.srv` and `.action`: descriptions (`.json`, since Iron) and
+//! IDL, which rosidl generates, and which may be the only form in a package. Both are converted to the `.msg` language,
+//! so that one parser reads all.
 //!
-//! Comments are in neither, constants are not in descriptions.
+//! Neither format has comments; descriptions have no constants.
 
 mod description;
 mod idl;
@@ -12,12 +12,12 @@ use std::collections::BTreeMap;
 use crate::bus::RosVersion;
 use crate::schema::{Registry, SchemaError};
 
-/// Definitions by key ([`Registry::insert`]), of one file.
+/// Contents of one interface file: definitions by key (see [`Registry::insert`]).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct InterfaceFile {
-    /// The file's own interface; of descriptions also the messages that it contains.
+    /// The file's own interface; for descriptions, also the messages it contains.
     pub definitions: BTreeMap<String, String>,
-    /// Type hashes by type, those of parts (`…_Request`) included; descriptions have them.
+    /// Type hashes by type, including those of parts (`…_Request`); only descriptions have them.
     pub hashes: BTreeMap<String, String>,
 }
 
@@ -27,31 +27,32 @@ impl InterfaceFile {
         description::read(key, json)
     }
 
-    /// Reads the `.idl` beside it.
+    /// Reads the `.idl` file beside it.
     pub fn read_idl(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
         idl::read(key, idl)
     }
 
-    /// What a registry is made of that has these definitions alone.
+    /// Returns a registry of these definitions alone.
     pub fn registry(&self) -> Result<Registry, SchemaError> {
-        Registry::of_definitions(RosVersion::Two, &self.definitions)
+        Registry::with_definitions(RosVersion::Two, &self.definitions)
     }
 }
 
-/// One field in the language of `.msg`.
+/// One field in the `.msg` language.
 #[derive(Debug, Clone, Default)]
-struct Line {
-    /// With the bound of a string.
+struct FieldLine {
+    /// Type of a single value, including the bound of a string.
     one: String,
-    /// `[]`, `[3]`, `[<=3]` or nothing.
+    /// `[]`, `[3]`, `[<=3]` or empty.
     brackets: String,
     name: String,
-    /// As `.msg` writes values; empty for none.
+    /// Value in the notation of `.msg`; empty for none.
     value: String,
 }
 
-impl Line {
-    /// Names cannot hold what ends a line, for they are checked where the text is read; values must not.
+impl FieldLine {
+    /// Appends the line. Names are checked where the text is read and cannot contain line breaks; values are checked
+    /// here.
     fn append_to(&self, text: &mut String) -> Result<(), String> {
         if self.value.contains(['\n', '\r']) {
             return Err(format!("the value of {} goes over a line", self.name));
@@ -74,12 +75,12 @@ impl Line {
     }
 }
 
-/// A text in quotes, as `.msg` has it; it has no way to write one that ends with a backslash.
-fn quoted(text: &str) -> String {
+/// Quotes a text for `.msg`, which has no way to write one that ends with a backslash.
+fn quote(text: &str) -> String {
     format!("\"{}\"", text.replace('"', "\\\""))
 }
 
-/// The definition of `key`, of the texts of its parts by full name (`package/srv/Name_Request`).
+/// Assembles the definition of `key` from the texts of its parts, by full name (`package/srv/Name_Request`).
 fn assemble(key: &str, texts: &BTreeMap<String, String>) -> Result<String, SchemaError> {
     let parts: &[&str] = match key.split('/').nth(1) {
         Some("srv") => &["_Request", "_Response"],

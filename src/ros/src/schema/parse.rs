@@ -1,29 +1,29 @@
-//! One definition's text → constants and fields, references not yet looked up. What a line may say differs between
-//! versions of ROS: here is ROS 1's grammar, [`ros2`] has the other.
+//! Parser of a single definition: text → constants and fields with unresolved references. The grammar depends on the
+//! ROS version: this module has ROS 1's, [`ros2`] has ROS 2's.
 
 mod ros2;
 
 use crate::bus::RosVersion;
 use crate::schema::initial::Initial;
 use crate::schema::limits::{MAX_FIELDS, MAX_NAME_BYTES};
-use crate::schema::types::{Arity, Bounds, Constant, Primitive};
+use crate::schema::types::{Arity, Constant, FieldBounds, Primitive};
 use crate::schema::{MAX_MESSAGE_BYTES, SchemaError};
 
-/// What a text says, line by line.
+/// A parsed definition, line by line.
 #[derive(Debug, Default)]
 pub(crate) struct Parsed {
     pub(crate) constants: Vec<Constant>,
     pub(crate) fields: Vec<ParsedField>,
 }
 
-/// A field whose type is a name.
+/// A field whose type is not resolved yet.
 #[derive(Debug)]
 pub(crate) struct ParsedField {
     pub(crate) name: String,
-    /// A built-in name, or a message's as [`MessageType::name`](crate::schema::MessageType::name) has it.
+    /// Name of a built-in type, or of a message as in [`MessageType::name`](crate::schema::MessageType::name).
     pub(crate) type_name: String,
     pub(crate) arity: Arity,
-    pub(crate) bounds: Bounds,
+    pub(crate) bounds: FieldBounds,
     pub(crate) initial: Option<Initial>,
 }
 
@@ -73,7 +73,7 @@ fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), Stri
     parsed.add_field(parse_field(package, code)?)
 }
 
-/// `TYPE NAME=VALUE`; a string's value runs to the end of the line, `#` and all.
+/// Parses `TYPE NAME=VALUE`; the value of a string extends to the end of the line and may include `#`.
 fn parse_constant(line: &str, code: &str) -> Result<Constant, String> {
     let (type_name, _) = code.split_once([' ', '\t', '=']).unwrap_or((code, ""));
     let source = if type_name == "string" {
@@ -135,7 +135,7 @@ fn parse_field(package: &str, code: &str) -> Result<ParsedField, String> {
         name: name.to_owned(),
         type_name: resolve_name(package, bare, brackets)?,
         arity: parse_brackets(brackets)?,
-        bounds: Bounds::default(),
+        bounds: FieldBounds::default(),
         initial: None,
     })
 }
@@ -159,7 +159,7 @@ fn parse_brackets(brackets: &str) -> Result<Arity, String> {
     }
 }
 
-/// A bare `Header` is std_msgs' everywhere, other bare names are the package's own.
+/// Resolves a type name. A bare `Header` means std_msgs' in every package; other bare names are the package's own.
 fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, String> {
     if Primitive::from_name(bare).is_some() {
         return Ok(bare.to_owned());
@@ -180,7 +180,7 @@ fn resolve_name(package: &str, bare: &str, brackets: &str) -> Result<String, Str
     }
 }
 
-/// A letter, then letters, digits and underscores.
+/// Checks that `name` is a letter followed by letters, digits and underscores.
 pub(crate) fn check_identifier(name: &str) -> Result<(), String> {
     let mut bytes = name.bytes();
     let legal = bytes

@@ -1,7 +1,7 @@
-//! What a message's codec does, worked out once per type.
+//! The compiled codec plan of a message type.
 //!
-//! For output ([`Plan::steps`]) nested messages are flattened and everything between two values (`,"stamp":`) is
-//! written out beforehand, in JSON and in CBOR. For input ([`Plan::members`]) fields stay by message, since they may
+//! For output ([`CodecPlan::steps`]), nested messages are flattened and the literals between values (`,"stamp":`) are
+//! prepared in JSON and in CBOR. For input ([`CodecPlan::members`]), fields stay grouped by message, because they may
 //! come in any order.
 
 mod kind;
@@ -9,93 +9,94 @@ mod kind;
 use std::ops::Range;
 
 use crate::bus::RosVersion;
-use crate::cbor_head::{MAP, TEXT, head};
+use crate::cbor_head::{MAP, TEXT, write_head};
 use crate::schema::initial::Initial;
 use crate::schema::{Arity, Base, Field};
 
 pub(crate) use kind::{Count, Kind, Scalar, Text};
 
-/// Nested messages with more steps than this are called, not flattened, as are all once the plan has grown to
-/// `MAX_FLATTENED_JSON` bytes of literals: else a plan could grow exponentially with the depth of its definition.
+/// Maximum number of steps of a nested message to be flattened; larger ones are called, as are all once the plan has
+/// grown to `MAX_FLATTENED_JSON` bytes of literals. Otherwise a plan could grow exponentially with the depth of its
+/// definition.
 const MAX_FLATTENED: usize = 32;
 const MAX_FLATTENED_JSON: usize = 4096;
 
 /// The compiled form of a message type.
 #[derive(Debug, Default)]
-pub(crate) struct Plan {
-    /// Fewest bytes of a message, what alignment adds left out; in ROS 1 the default message is as many zeros.
+pub(crate) struct CodecPlan {
+    /// Minimum size of a message in bytes, excluding padding; in ROS 1 the default message is this many zeros.
     pub(crate) min_size: usize,
-    /// Every message takes `min_size` bytes and what alignment adds.
+    /// True if every message takes `min_size` bytes plus padding.
     pub(crate) fixed_size: bool,
-    /// In place of fields there is one byte on the wire: ROS 2's types without fields.
+    /// True for ROS 2 types without fields, which are serialized as one byte.
     pub(crate) placeholder: bool,
-    /// This is a time or duration of ROS 2, which within other messages is a value rather than a message.
+    /// Set for ROS 2's time and duration types, which within other messages are values rather than messages.
     pub(crate) scalar: Option<Scalar>,
-    /// How many values an otherwise empty message holds.
+    /// Number of values in an otherwise empty message.
     pub(crate) values: usize,
-    /// Nesting of messages, 1 for one that contains none.
+    /// Nesting of messages; 1 for a message that contains none.
     pub(crate) depth: usize,
-    /// This is `std_msgs/Header`.
+    /// True for `std_msgs/Header`.
     pub(crate) header: bool,
-    /// For input: one per field.
+    /// For input: one entry per field.
     pub(crate) members: Members,
-    /// For output: one per value after flattening.
-    pub(crate) steps: Vec<Step>,
-    /// What follows the last value.
+    /// For output: one entry per value after flattening.
+    pub(crate) steps: Vec<PlanStep>,
+    /// The literal after the last value.
     pub(crate) tail: Literal,
     json: Pool,
     cbor: Pool,
-    /// Names of fields and of the flattened fields they are in.
+    /// Names of fields and of the flattened fields that contain them.
     names: Vec<Name>,
 }
 
-/// One part of a step's path.
+/// A segment of a step's path.
 #[derive(Debug)]
 struct Name {
     outer: Option<usize>,
     name: Box<str>,
 }
 
-/// The fields of a message, as input sees them.
+/// The fields of a message, for input.
 #[derive(Debug, Default)]
 pub(crate) struct Members {
     list: Vec<Member>,
-    /// Indices into `list`, by name.
+    /// Indices into `list`, sorted by name.
     sorted: Vec<usize>,
 }
 
-/// A field, as input sees it.
+/// A field, for input.
 #[derive(Debug)]
 pub(crate) struct Member {
     pub(crate) name: Box<str>,
-    /// `"name":`, as most writers put it.
+    /// `"name":`, in its usual spelling.
     pub(crate) json_key: Box<[u8]>,
-    /// The name as a string of CBOR.
+    /// The name as a CBOR string.
     pub(crate) cbor_key: Box<[u8]>,
     pub(crate) kind: Kind,
     pub(crate) min_size: usize,
-    /// What it holds until it is set; zeros, empty texts and arrays otherwise.
+    /// Default value; otherwise zeros, empty texts and arrays.
     pub(crate) initial: Option<Initial>,
 }
 
-/// A value, as output sees it.
+/// A value, for output.
 #[derive(Debug)]
-pub(crate) struct Step {
-    /// What stands between the value before and this one.
+pub(crate) struct PlanStep {
+    /// The literal before the value.
     pub(crate) before: Literal,
     pub(crate) kind: Kind,
     name: usize,
 }
 
-/// Pieces of a plan's ready-made JSON and CBOR.
+/// Ranges in a plan's prepared JSON and CBOR.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Literal {
     json: Range<usize>,
     cbor: Range<usize>,
 }
 
-/// Ready-made bytes. Behind the last piece there is padding, so that a short piece can be copied as a block of a
-/// size known to the compiler: a third of the time.
+/// Prepared bytes. Padding follows the last piece, so that a short piece can be copied as a block of a size known at
+/// compile time: a third of the time.
 #[derive(Debug, Default)]
 struct Pool(Vec<u8>);
 
@@ -115,25 +116,25 @@ impl Pool {
     }
 }
 
-impl Plan {
-    /// Works out the plan of message `name`.
-    pub(crate) fn compile(version: RosVersion, name: &str, fields: &[Field]) -> Plan {
+impl CodecPlan {
+    /// Compiles the plan of message `name`.
+    pub(crate) fn compile(version: RosVersion, name: &str, fields: &[Field]) -> CodecPlan {
         let depths = fields.iter().map(|field| match &field.base {
             Base::Message(inner) => inner.plan.depth + 1,
             Base::Primitive(_) => 1,
         });
         let placeholder = version == RosVersion::Two && fields.is_empty();
         let min_size: usize = fields.iter().map(Field::min_size).sum();
-        let mut plan = Plan {
+        let mut plan = CodecPlan {
             min_size: min_size + usize::from(placeholder),
             placeholder,
             scalar: scalar(version, name, fields),
             fixed_size: fields.iter().all(Field::is_fixed_size),
-            values: Plan::count_values(fields),
+            values: CodecPlan::count_values(fields),
             depth: depths.max().unwrap_or(1),
             header: is_header(version, name, fields),
             members: Members::new(fields.iter().map(member).collect()),
-            ..Plan::default()
+            ..CodecPlan::default()
         };
         let mut pending = Pending::default();
         plan.flatten(fields, None, &mut pending);
@@ -144,7 +145,8 @@ impl Plan {
         plan
     }
 
-    /// Values that a message of these fields always holds; each element of a fixed array of messages counts.
+    /// Returns the number of values that a message with these fields always holds; each element of a fixed array of
+    /// messages counts.
     pub(crate) fn count_values(fields: &[Field]) -> usize {
         fields.iter().fold(0, |sum: usize, field| {
             let values = match (&field.base, field.arity) {
@@ -170,9 +172,9 @@ impl Plan {
         self.cbor.append_to(&literal.cbor, out);
     }
 
-    /// A step's field from the message's top: `header.stamp`.
+    /// Returns the path of a step's field from the top of the message: `header.stamp`.
     #[cold]
-    pub(crate) fn path(&self, step: &Step) -> String {
+    pub(crate) fn path(&self, step: &PlanStep) -> String {
         let mut parts = Vec::new();
         let mut next = Some(step.name);
         while let Some(index) = next {
@@ -185,7 +187,7 @@ impl Plan {
 
     fn flatten(&mut self, fields: &[Field], outer: Option<usize>, pending: &mut Pending) {
         pending.json.push(b'{');
-        head(&mut pending.cbor, MAP, fields.len() as u64);
+        write_head(&mut pending.cbor, MAP, fields.len() as u64);
         for (index, field) in fields.iter().enumerate() {
             if index > 0 {
                 pending.json.push(b',');
@@ -197,20 +199,20 @@ impl Plan {
                 name: field.name.as_str().into(),
             });
             let name = self.names.len() - 1;
-            match Kind::of(field) {
-                Kind::Struct(inner) if self.may_flatten(&inner.plan) => {
+            match Kind::from_field(field) {
+                Kind::Struct(inner) if self.can_flatten(&inner.plan) => {
                     self.flatten(inner.fields(), Some(name), pending);
                 }
                 kind => {
                     let before = self.literal(pending);
-                    self.steps.push(Step { before, kind, name });
+                    self.steps.push(PlanStep { before, kind, name });
                 }
             }
         }
         pending.json.push(b'}');
     }
 
-    fn may_flatten(&self, inner: &Plan) -> bool {
+    fn can_flatten(&self, inner: &CodecPlan) -> bool {
         let small = inner.values <= MAX_FLATTENED && inner.json.0.len() <= MAX_FLATTENED_JSON;
         small && !inner.placeholder && self.json.0.len() <= MAX_FLATTENED_JSON
     }
@@ -226,7 +228,7 @@ impl Plan {
     }
 }
 
-/// Literals gathered since the last value.
+/// Literals collected since the last value.
 #[derive(Default)]
 struct Pending {
     json: Vec<u8>,
@@ -240,13 +242,13 @@ impl Members {
         Members { list, sorted }
     }
 
-    /// In order of serialization.
+    /// Returns the fields in order of serialization.
     #[inline]
     pub(crate) fn list(&self) -> &[Member] {
         &self.list
     }
 
-    /// The field of this name.
+    /// Returns the index of the field of this name.
     pub(crate) fn find(&self, name: &[u8]) -> Option<usize> {
         let found = self
             .sorted
@@ -268,14 +270,14 @@ impl Member {
     }
 }
 
-/// Field names are plain ASCII, so there is nothing to escape.
+/// Returns the key in JSON. Field names are plain ASCII, so there is nothing to escape.
 fn json_key(name: &str) -> Vec<u8> {
     format!("\"{name}\":").into_bytes()
 }
 
 fn cbor_key(name: &str) -> Vec<u8> {
     let mut key = Vec::with_capacity(name.len() + 2);
-    head(&mut key, TEXT, name.len() as u64);
+    write_head(&mut key, TEXT, name.len() as u64);
     key.extend_from_slice(name.as_bytes());
     key
 }
@@ -283,11 +285,11 @@ fn cbor_key(name: &str) -> Vec<u8> {
 fn member(field: &Field) -> Member {
     Member {
         initial: field.initial.clone(),
-        ..Member::new(&field.name, Kind::of(field), field.min_size())
+        ..Member::new(&field.name, Kind::from_field(field), field.min_size())
     }
 }
 
-/// Whether these are the fields, none of them an array.
+/// Returns true if the fields have exactly these names and types and none is an array.
 fn is_shape(fields: &[Field], shape: &[(&str, &str)]) -> bool {
     let alike = |(field, (name, type_name)): (&Field, &(&str, &str))| {
         field.name == *name && field.type_name == *type_name && field.arity == Arity::One
@@ -295,8 +297,8 @@ fn is_shape(fields: &[Field], shape: &[(&str, &str)]) -> bool {
     fields.len() == shape.len() && fields.iter().zip(shape).all(alike)
 }
 
-/// Whether this is `std_msgs/Header` as everyone knows it, with its stamp at byte 4: after the sequence number in ROS 1,
-/// after the header of the serialization in ROS 2.
+/// Returns true for the standard `std_msgs/Header`, with its stamp at byte 4: after the sequence number in ROS 1, after
+/// the encapsulation header in ROS 2.
 fn is_header(version: RosVersion, name: &str, fields: &[Field]) -> bool {
     const TIME: &str = "builtin_interfaces/msg/Time";
     match version {
@@ -306,13 +308,13 @@ fn is_header(version: RosVersion, name: &str, fields: &[Field]) -> bool {
         }
         RosVersion::Two => {
             let shape = [("stamp", TIME), ("frame_id", "string")];
-            let stamps = || matches!(Kind::of(&fields[0]), Kind::Scalar(Scalar::Time2));
+            let stamps = || matches!(Kind::from_field(&fields[0]), Kind::Scalar(Scalar::Time2));
             name == "std_msgs/msg/Header" && is_shape(fields, &shape) && stamps()
         }
     }
 }
 
-/// ROS 2's times as everyone knows them.
+/// Returns the scalar for the standard time and duration types of ROS 2.
 fn scalar(version: RosVersion, name: &str, fields: &[Field]) -> Option<Scalar> {
     let scalar = match (version, name) {
         (RosVersion::Two, "builtin_interfaces/msg/Time") => Scalar::Time2,

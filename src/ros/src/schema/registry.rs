@@ -1,4 +1,4 @@
-//! All definitions of one place (a service, a robot's servant) by name; resolved when first asked for, then kept.
+//! Definitions in one scope (a service, a robot's servant) by name; resolved on first use, then cached.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -15,20 +15,20 @@ use crate::schema::text::split_full_text;
 use crate::schema::types::{ActionDef, MessageType, ServiceDef};
 use crate::schema::{MAX_TEXT_BYTES, SchemaError};
 
-/// Definitions of one version of ROS and what they resolve to. Share it by `Arc`; all methods take `&self`.
+/// Definitions of one ROS version and the types they resolve to. Share it by `Arc`; all methods take `&self`.
 #[derive(Debug)]
 pub struct Registry {
     state: RwLock<State>,
 }
 
-/// ROS 1's.
+/// A registry of ROS 1.
 impl Default for Registry {
     fn default() -> Self {
         Self::new()
     }
 }
 
-/// Texts as given and everything resolved so far, by names as [`MessageType::name`] has them.
+/// Texts and everything resolved so far, by names as in [`MessageType::name`].
 #[derive(Debug)]
 pub(crate) struct State {
     pub(crate) version: RosVersion,
@@ -41,13 +41,13 @@ pub(crate) struct State {
 }
 
 impl Registry {
-    /// An empty one of ROS 1. `std_msgs/Header` and actionlib's own messages are known even so.
+    /// Creates an empty registry of ROS 1. `std_msgs/Header` and actionlib's own messages are built in.
     pub fn new() -> Registry {
-        Registry::of(RosVersion::One)
+        Registry::for_version(RosVersion::One)
     }
 
-    /// An empty one. Headers, times and what actions are made of are known even so.
-    pub fn of(version: RosVersion) -> Registry {
+    /// Creates an empty registry. Headers, times and the messages that actions need are built in.
+    pub fn for_version(version: RosVersion) -> Registry {
         Registry {
             state: RwLock::new(State {
                 version,
@@ -61,19 +61,19 @@ impl Registry {
         }
     }
 
-    /// One of ROS 1 with these definitions, keyed as for [`insert`](Self::insert).
+    /// Creates a registry of ROS 1 with these definitions, keyed as for [`insert`](Self::insert).
     pub fn from_definitions(
         definitions: &BTreeMap<String, String>,
     ) -> Result<Registry, SchemaError> {
-        Self::of_definitions(RosVersion::One, definitions)
+        Self::with_definitions(RosVersion::One, definitions)
     }
 
-    /// One with these definitions, keyed as for [`insert`](Self::insert).
-    pub fn of_definitions(
+    /// Creates a registry with these definitions, keyed as for [`insert`](Self::insert).
+    pub fn with_definitions(
         version: RosVersion,
         definitions: &BTreeMap<String, String>,
     ) -> Result<Registry, SchemaError> {
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         for (key, text) in definitions {
             registry.insert(key, text)?;
         }
@@ -81,7 +81,7 @@ impl Registry {
     }
 
     /// Adds or replaces one definition. `key` is `package/msg/Type`, `package/srv/Type`, `package/action/Name`, or
-    /// `package/Type` for a message. The text is parsed when the type is first asked for.
+    /// `package/Type` for a message. The text is parsed when the type is first used.
     pub fn insert(&self, key: &str, text: &str) -> Result<(), SchemaError> {
         let mut state = self.state.write();
         let (kind, name) = split_key(state.version, key)?;
@@ -92,7 +92,7 @@ impl Registry {
         Ok(())
     }
 
-    /// Adds a message and all it contains from its full text, which ROS 1's publishers send in their connection header.
+    /// Adds a message and its dependencies from a full text, as ROS 1 publishers send it in their connection header.
     /// Replaces definitions that differ.
     pub fn insert_full_text(&self, type_name: &str, text: &str) -> Result<(), SchemaError> {
         let mut state = self.state.write();
@@ -116,9 +116,9 @@ impl Registry {
         Ok(())
     }
 
-    /// The message `package/Type` (or `package/msg/Type`). Messages that come with a service (`…Request`,
-    /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are found by the service or action; those of ROS 2
-    /// (`…_Request`) by their full name too (`package/srv/Type_Request`).
+    /// Returns the message `package/Type` (or `package/msg/Type`). Messages generated from a service (`…Request`,
+    /// `…Response`) or an action (`…Goal`, `…ActionGoal`, …) are derived from it; those of ROS 2 (`…_Request`) are also
+    /// found by full name (`package/srv/Type_Request`).
     pub fn message(&self, name: &str) -> Result<Arc<MessageType>, SchemaError> {
         let state = self.state.read();
         if let Some(found) = state.resolved_messages.get(name) {
@@ -132,7 +132,7 @@ impl Registry {
         build_message(&mut self.state.write(), &name)
     }
 
-    /// The service `package/Type` (or `package/srv/Type`).
+    /// Returns the service `package/Type` (or `package/srv/Type`).
     pub fn service(&self, name: &str) -> Result<Arc<ServiceDef>, SchemaError> {
         if let Some(found) = self.state.read().resolved_services.get(name) {
             return Ok(found.clone());
@@ -145,7 +145,7 @@ impl Registry {
         build_service(&mut state, &name)
     }
 
-    /// The action `package/Name` (or `package/action/Name`).
+    /// Returns the action `package/Name` (or `package/action/Name`).
     pub fn action(&self, name: &str) -> Result<Arc<ActionDef>, SchemaError> {
         if let Some(found) = self.state.read().resolved_actions.get(name) {
             return Ok(found.clone());
@@ -158,7 +158,7 @@ impl Registry {
         build_action(&mut state, &name)
     }
 
-    /// Names of all messages, services and actions given, sorted, each as `package/msg/Type`, `package/srv/Type` or
+    /// Returns the names of all definitions that were added, sorted, as `package/msg/Type`, `package/srv/Type` or
     /// `package/action/Name`.
     pub fn keys(&self) -> Vec<String> {
         let state = self.state.read();
@@ -171,9 +171,12 @@ impl Registry {
         let mut keys: Vec<String> = kinds
             .into_iter()
             .flat_map(|(kind, texts)| {
-                texts.keys().map(move |name| match full {
-                    true => name.clone(),
-                    false => name.replacen('/', &format!("/{kind}/"), 1),
+                texts.keys().map(move |name| {
+                    if full {
+                        name.clone()
+                    } else {
+                        name.replacen('/', &format!("/{kind}/"), 1)
+                    }
                 })
             })
             .collect();
@@ -183,19 +186,19 @@ impl Registry {
 }
 
 impl MessageType {
-    /// A message of ROS 1 from its full text alone, as a publisher's connection header has it, whatever definitions
-    /// anyone else uses.
+    /// Creates a message type of ROS 1 from its full text alone, as a publisher's connection header has it, independent
+    /// of other definitions.
     pub fn from_full_text(name: &str, text: &str) -> Result<Arc<MessageType>, SchemaError> {
-        Self::of_full_text(RosVersion::One, name, text)
+        Self::parse_full_text(RosVersion::One, name, text)
     }
 
-    /// A message from its full text alone.
-    pub fn of_full_text(
+    /// Creates a message type from its full text alone.
+    pub fn parse_full_text(
         version: RosVersion,
         name: &str,
         text: &str,
     ) -> Result<Arc<MessageType>, SchemaError> {
-        let registry = Registry::of(version);
+        let registry = Registry::for_version(version);
         registry.insert_full_text(name, text)?;
         registry.message(name)
     }
@@ -219,24 +222,24 @@ impl State {
             return;
         }
         texts.insert(name, text.into());
-        // Anything resolved so far may contain what was just replaced.
+        // Anything resolved so far may contain the definition just replaced.
         self.resolved_messages.clear();
         self.resolved_services.clear();
         self.resolved_actions.clear();
     }
 
-    /// The text of message `name`, given or derived.
+    /// Returns the text of message `name`, given or derived.
     pub(crate) fn message_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
         if let Some(text) = self.messages.get(name) {
             return Ok(Some(text.clone()));
         }
         match self.version {
-            RosVersion::One => self.derived_text(name),
-            RosVersion::Two => self.derived_text_of_two(name),
+            RosVersion::One => self.derived_ros1_text(name),
+            RosVersion::Two => self.derived_ros2_text(name),
         }
     }
 
-    fn derived_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
+    fn derived_ros1_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
         for (ending, request) in [("Request", true), ("Response", false)] {
             if let Some((service, text)) = owner(&self.services, name, ending) {
                 return Ok(Some(service_message(service, text, request)?.into()));
@@ -250,19 +253,19 @@ impl State {
         Ok(well_known(name).map(Into::into))
     }
 
-    fn derived_text_of_two(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
-        // The names of services and actions may have underscores themselves.
+    fn derived_ros2_text(&self, name: &str) -> Result<Option<Arc<str>>, SchemaError> {
+        // The names of services and actions may contain underscores themselves.
         let ends = name.match_indices('_').map(|(at, _)| at);
         for end in ends.chain([name.len()]) {
             let (owner, ending) = name.split_at(end);
             let given = self.services.get(owner).map(|text| &**text);
             if let Some(text) = given.or_else(|| derived::well_known_service(owner)) {
-                if let Some(text) = derived::of_service(owner, text, ending)? {
+                if let Some(text) = derived::service_text(owner, text, ending)? {
                     return Ok(Some(text.into()));
                 }
             }
             if let Some(text) = self.actions.get(owner) {
-                if let Some(text) = derived::of_action(owner, text, ending)? {
+                if let Some(text) = derived::action_text(owner, text, ending)? {
                     return Ok(Some(text.into()));
                 }
             }
@@ -270,7 +273,7 @@ impl State {
         Ok(derived::well_known(name).map(Into::into))
     }
 
-    /// The name of a message of which the text is given.
+    /// Returns the normalized name of a message whose text is given.
     fn text_name(&self, name: &str) -> Result<String, SchemaError> {
         match self.version {
             RosVersion::One => plain_name(name, "msg"),
@@ -278,7 +281,7 @@ impl State {
         }
     }
 
-    /// The name of a message that is asked for.
+    /// Returns the normalized name of a message that is looked up.
     fn message_name(&self, name: &str) -> Result<String, SchemaError> {
         let given = self.text_name(name)?;
         let short = name.split_once('/').map_or("", |(_, short)| short);
@@ -297,7 +300,7 @@ impl State {
     pub(crate) fn has_service(&self, name: &str) -> bool {
         match self.version {
             RosVersion::One => self.services.contains_key(name),
-            // Those of actions are derived.
+            // The services of actions are derived.
             RosVersion::Two => matches!(self.message_text(name), Ok(Some(_))),
         }
     }
@@ -334,7 +337,7 @@ fn split_key(version: RosVersion, key: &str) -> Result<(Kind, String), SchemaErr
     Ok((kind, name))
 }
 
-/// `package/<kind>/Type` of `package/Type` or of itself, whatever its kind.
+/// Returns `package/<kind>/Type` for `package/Type`; a full name is returned as it is.
 fn full_name(name: &str, kind: &str) -> Result<String, SchemaError> {
     let bad = || SchemaError::BadName(name.chars().take(100).collect());
     let parts: Vec<&str> = name.split('/').collect();
@@ -348,7 +351,7 @@ fn full_name(name: &str, kind: &str) -> Result<String, SchemaError> {
     Ok(format!("{package}/{kind}/{short}"))
 }
 
-/// `package/Type` of `package/Type` or `package/<kind>/Type`.
+/// Returns `package/Type` for `package/Type` or `package/<kind>/Type`.
 fn plain_name(name: &str, kind: &str) -> Result<String, SchemaError> {
     let bad = || SchemaError::BadName(name.chars().take(100).collect());
     let (package, rest) = name.split_once('/').ok_or_else(bad)?;

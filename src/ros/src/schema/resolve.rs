@@ -1,4 +1,4 @@
-//! Names → types: dependencies first, each once, then digest and the codec's plan.
+//! Resolution of names to types: dependencies first, each once, then the digest and the codec plan.
 
 use std::sync::{Arc, OnceLock};
 
@@ -7,14 +7,14 @@ use md5::{Digest, Md5};
 use crate::bus::RosVersion;
 use crate::schema::limits::{MAX_DEPTH, MAX_MESSAGE_BYTES, MAX_VALUES};
 use crate::schema::parse::{Parsed, ParsedField, parse};
-use crate::schema::plan::Plan;
+use crate::schema::plan::CodecPlan;
 use crate::schema::registry::State;
 use crate::schema::types::{
     ActionDef, ActionServices, Base, Field, MessageType, Primitive, ServiceDef,
 };
 use crate::schema::{Arity, SchemaError};
 
-/// Resolves message `name` (`package/Type`) and all it contains.
+/// Resolves message `name` (`package/Type`) and its dependencies.
 pub(crate) fn build_message(
     state: &mut State,
     name: &str,
@@ -61,14 +61,14 @@ pub(crate) fn build_service(state: &mut State, name: &str) -> Result<Arc<Service
     Ok(service)
 }
 
-/// Resolves an action's seven messages; an action of which only the messages are known will do.
+/// Resolves an action's seven messages; it is enough if only the messages are known.
 pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDef>, SchemaError> {
     if let Some(known) = state.resolved_actions.get(name) {
         return Ok(known.clone());
     }
     let action = Arc::new(match state.version {
-        RosVersion::One => action_of_one(state, name)?,
-        RosVersion::Two => action_of_two(state, name)?,
+        RosVersion::One => resolve_ros1_action(state, name)?,
+        RosVersion::Two => resolve_ros2_action(state, name)?,
     });
     state
         .resolved_actions
@@ -76,7 +76,7 @@ pub(crate) fn build_action(state: &mut State, name: &str) -> Result<Arc<ActionDe
     Ok(action)
 }
 
-fn action_of_one(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
+fn resolve_ros1_action(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
     if !state.has_action(name) && state.message_text(&format!("{name}Action"))?.is_none() {
         return Err(SchemaError::Unknown(name.to_owned()));
     }
@@ -94,7 +94,7 @@ fn action_of_one(state: &mut State, name: &str) -> Result<ActionDef, SchemaError
     })
 }
 
-fn action_of_two(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
+fn resolve_ros2_action(state: &mut State, name: &str) -> Result<ActionDef, SchemaError> {
     if !state.has_action(name) {
         return Err(SchemaError::Unknown(name.to_owned()));
     }
@@ -175,7 +175,7 @@ impl Resolver<'_> {
             name: name.to_owned(),
             text,
             digest: OnceLock::new(),
-            plan: Plan::compile(version, name, &fields),
+            plan: CodecPlan::compile(version, name, &fields),
             fields,
             constants,
             full_text: OnceLock::new(),
@@ -184,7 +184,7 @@ impl Resolver<'_> {
             let digest = hex::encode(Md5::digest(md5_text(&message)));
             message.digest.get_or_init(|| digest);
         }
-        // The depth of what is inside was checked where it was first resolved, perhaps from elsewhere.
+        // The depth of the dependencies was checked when they were first resolved, perhaps from elsewhere.
         if message.plan.depth > MAX_DEPTH {
             return Err(too_large(
                 name,
@@ -195,7 +195,7 @@ impl Resolver<'_> {
     }
 
     fn field(&mut self, parsed: ParsedField) -> Result<Field, SchemaError> {
-        let base = match Primitive::named(self.state.version, &parsed.type_name) {
+        let base = match Primitive::from_versioned_name(self.state.version, &parsed.type_name) {
             Some(primitive) => Base::Primitive(primitive),
             None => Base::Message(self.message(&parsed.type_name)?),
         };
@@ -210,7 +210,7 @@ impl Resolver<'_> {
     }
 }
 
-/// What genmsg hashes: constants, then fields, with each contained message replaced by its MD5.
+/// Returns the text that genmsg hashes: constants, then fields, with each contained message replaced by its MD5.
 fn md5_text(message: &MessageType) -> String {
     let mut out = String::new();
     for constant in &message.constants {
@@ -235,7 +235,7 @@ fn md5_text(message: &MessageType) -> String {
     out.trim().to_owned()
 }
 
-/// Refuses messages that are huge before they hold anything.
+/// Rejects messages that are huge even when empty.
 fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
     let size = fields
         .iter()
@@ -246,7 +246,7 @@ fn check_size(name: &str, fields: &[Field]) -> Result<(), SchemaError> {
             format!("its fixed arrays take more than {MAX_MESSAGE_BYTES} bytes"),
         ));
     }
-    let values = Plan::count_values(fields);
+    let values = CodecPlan::count_values(fields);
     if values > MAX_VALUES {
         return Err(too_large(
             name,

@@ -13,7 +13,7 @@ fn registry(definitions: &[(&str, &str)]) -> Registry {
     registry
 }
 
-/// Shapes of well-known definitions in words of our own: comments and layout do not count for the MD5.
+/// Well-known definitions in our own words: comments and layout do not count for the MD5.
 fn common() -> Registry {
     registry(&[
         ("std_msgs/msg/String", "string data\n"),
@@ -30,7 +30,8 @@ fn common() -> Registry {
         ),
         (
             "sensor_msgs/msg/Image",
-            "Header header # when\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
+            "Header header # when\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\n\
+             uint8[] data",
         ),
         (
             "sensor_msgs/msg/RegionOfInterest",

@@ -1,15 +1,15 @@
-//! Texts made of several definitions: the sections of a service or an action, and the full text that a publisher
-//! sends, in which a message is followed by all the messages it contains.
+//! Texts composed of several definitions: the sections of a service or an action, and the full text that a publisher
+//! sends, in which a message is followed by all its dependencies.
 
 use std::collections::HashSet;
 
 use crate::schema::SchemaError;
 use crate::schema::types::{Base, MessageType};
 
-/// The line between a full text's definitions is so many `=`.
+/// Number of `=` in the line between the definitions of a full text.
 const RULE: usize = 80;
 
-/// Splits at lines that begin with `---`; gives exactly `N` texts.
+/// Splits at lines that begin with `---`; returns exactly `N` texts.
 pub(crate) fn sections<const N: usize>(name: &str, text: &str) -> Result<[String; N], SchemaError> {
     let mut parts = vec![String::new()];
     for line in text.split('\n') {
@@ -28,7 +28,7 @@ pub(crate) fn sections<const N: usize>(name: &str, text: &str) -> Result<[String
     })
 }
 
-/// The message's text, then that of each message it contains, in order of first mention, depth first.
+/// Returns the message's text followed by that of each dependency, in order of first mention, depth first.
 pub(crate) fn full_text(message: &MessageType) -> String {
     let mut out = message.text().to_owned();
     let mut seen = HashSet::new();
@@ -51,7 +51,8 @@ fn append_dependencies<'a>(
         out.push('\n');
         out.extend(std::iter::repeat_n('=', RULE));
         out.push_str("\nMSG: ");
-        // In ROS 2, too, without what is between package and type: readers of such texts (Foxglove's) look for what fields say.
+        // In ROS 2 too, the kind between package and type is omitted: readers of such texts (Foxglove's) look up the
+        // names as fields write them.
         out.push_str(&dependency.name().replacen("/msg/", "/", 1));
         out.push('\n');
         out.push_str(dependency.text());
@@ -59,7 +60,7 @@ fn append_dependencies<'a>(
     }
 }
 
-/// Splits a full text into the message's own text and (name, text) of each that follows.
+/// Splits a full text into the message's own text and (name, text) of each dependency.
 pub(crate) fn split_full_text(text: &str) -> (String, Vec<(String, String)>) {
     let mut own = String::new();
     let mut others: Vec<(String, String)> = Vec::new();
@@ -78,7 +79,7 @@ pub(crate) fn split_full_text(text: &str) -> (String, Vec<(String, String)>) {
             None => own.push_str(line),
         }
     }
-    // Every text but the last is followed by one newline of the concatenation's own.
+    // Every text but the last is followed by one newline that the concatenation added.
     let count = others.len();
     for part in std::iter::once(&mut own)
         .chain(others.iter_mut().map(|(_, part)| part))

@@ -1,4 +1,4 @@
-//! What a definition means once its references are resolved.
+//! Resolved definitions.
 
 use std::fmt;
 use std::sync::{Arc, OnceLock};
@@ -6,20 +6,20 @@ use std::sync::{Arc, OnceLock};
 use crate::bus::RosVersion;
 use crate::schema::description::type_hash;
 use crate::schema::initial::Initial;
-use crate::schema::plan::Plan;
+use crate::schema::plan::CodecPlan;
 use crate::schema::text::full_text;
 
-/// The types that need no definition. `char` is [`Primitive::Uint8`]; `byte` is [`Primitive::Int8`] in ROS 1 and
-/// [`Primitive::Uint8`] in ROS 2.
+/// Built-in types. `char` is [`Primitive::Uint8`]; `byte` is [`Primitive::Int8`] in ROS 1 and [`Primitive::Uint8`] in
+/// ROS 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Primitive {
-    /// One byte; anything but 0 is true.
+    /// One byte; any value but 0 is true.
     Bool,
     /// Also written `byte`.
     Int8,
     /// Also written `char`.
     Uint8,
-    /// Two bytes; in ROS 1 little endian, as all that follow.
+    /// Two bytes; little endian in ROS 1, like all that follow.
     Int16,
     /// Two bytes.
     Uint16,
@@ -35,19 +35,19 @@ pub enum Primitive {
     Float32,
     /// IEEE 754 double.
     Float64,
-    /// A four-byte length and so many bytes, UTF-8 by custom.
+    /// A four-byte length and that many bytes, UTF-8 by convention.
     String,
-    /// `uint32 secs, uint32 nsecs`; ROS 1's own.
+    /// `uint32 secs, uint32 nsecs`; ROS 1 only.
     Time,
-    /// `int32 secs, int32 nsecs`; ROS 1's own.
+    /// `int32 secs, int32 nsecs`; ROS 1 only.
     Duration,
-    /// A four-byte length and so many units of UTF-16; ROS 2's own.
+    /// A four-byte length and that many UTF-16 units; ROS 2 only.
     Wstring,
 }
 
 impl Primitive {
-    /// The primitive of this name in a version of ROS, aliases included.
-    pub fn named(version: RosVersion, name: &str) -> Option<Primitive> {
+    /// Returns the primitive of this name in a ROS version, including aliases.
+    pub fn from_versioned_name(version: RosVersion, name: &str) -> Option<Primitive> {
         match (version, name) {
             (RosVersion::One, _) => Self::from_name(name),
             (RosVersion::Two, "byte") => Some(Primitive::Uint8),
@@ -57,7 +57,7 @@ impl Primitive {
         }
     }
 
-    /// The primitive of this name in ROS 1, aliases included.
+    /// Returns the primitive of this name in ROS 1, including aliases.
     pub fn from_name(name: &str) -> Option<Primitive> {
         Some(match name {
             "bool" => Primitive::Bool,
@@ -78,7 +78,7 @@ impl Primitive {
         })
     }
 
-    /// Its ROS name.
+    /// Returns the ROS name.
     pub fn name(self) -> &'static str {
         match self {
             Primitive::Bool => "bool",
@@ -99,7 +99,7 @@ impl Primitive {
         }
     }
 
-    /// Serialized bytes; of a string, those of its length.
+    /// Returns the serialized size in bytes; for strings, the size of the length.
     pub fn size(self) -> usize {
         match self {
             Primitive::Bool | Primitive::Int8 | Primitive::Uint8 => 1,
@@ -118,54 +118,56 @@ impl Primitive {
     }
 }
 
-/// How many values a field holds.
+/// Number of values in a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Arity {
-    /// One value, no array.
+    /// A single value.
     One,
     /// `[N]`: N values, without a length on the wire.
     Fixed(u32),
-    /// `[]`: a four-byte length and so many values.
+    /// `[]`: a four-byte length and that many values.
     Variable,
 }
 
-/// What ROS 2 lets a definition bound (`string<=8[<=3]`). Writers keep to it; readers do not check, as nodes do not.
+/// Bounds in a ROS 2 definition (`string<=8[<=3]`). Enforced when writing, but not when reading; nodes do not check
+/// either.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Bounds {
-    /// Most characters of the text, or of each.
+pub struct FieldBounds {
+    /// Maximum number of characters of the string, or of each string.
     pub text: Option<u32>,
-    /// Most elements of an array of [`Arity::Variable`].
+    /// Maximum number of elements of an array of [`Arity::Variable`].
     pub elements: Option<u32>,
 }
 
-/// What a field's values are.
+/// Type of a field's values.
 #[derive(Debug, Clone)]
 pub enum Base {
-    /// Built in.
+    /// A built-in type.
     Primitive(Primitive),
-    /// Another message.
+    /// A message.
     Message(Arc<MessageType>),
 }
 
 /// One field of a message.
 #[derive(Debug, Clone)]
 pub struct Field {
-    /// As in the definition.
+    /// Name in the definition.
     pub name: String,
-    /// Without brackets and bounds, references resolved: `byte`, `std_msgs/Header` (of ROS 2: `std_msgs/msg/Header`).
+    /// Type name without brackets and bounds, with references resolved: `byte`, `std_msgs/Header` (in ROS 2:
+    /// `std_msgs/msg/Header`).
     pub type_name: String,
-    /// The type of the field, or of each element.
+    /// Type of the field, or of each element.
     pub base: Base,
     /// Single value or array.
     pub arity: Arity,
-    /// None in ROS 1.
-    pub bounds: Bounds,
-    /// What it holds until it is set, where the definition says so.
+    /// Bounds; none in ROS 1.
+    pub bounds: FieldBounds,
+    /// Default value in the definition, if any.
     pub(crate) initial: Option<Initial>,
 }
 
 impl Field {
-    /// Fewest bytes the field takes, what alignment adds left out; in ROS 1 its default is as many zeros.
+    /// Returns the minimum size of the field in bytes, excluding padding; in ROS 1 its default is this many zeros.
     pub fn min_size(&self) -> usize {
         let one = match &self.base {
             Base::Primitive(primitive) => primitive.size(),
@@ -178,7 +180,7 @@ impl Field {
         }
     }
 
-    /// Whether it always takes [`min_size`](Self::min_size) and what alignment adds.
+    /// Returns true if the field always takes [`min_size`](Self::min_size) bytes plus padding.
     pub fn is_fixed_size(&self) -> bool {
         let one = match &self.base {
             Base::Primitive(primitive) => {
@@ -197,82 +199,82 @@ impl Field {
 /// One constant of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Constant {
-    /// As in the definition.
+    /// Name in the definition.
     pub name: String,
-    /// As in the definition.
+    /// Type name in the definition.
     pub type_name: String,
-    /// The text right of `=`, without surrounding space, and without a comment unless the type is `string`; of ROS 2
-    /// without the quotes either.
+    /// Text to the right of `=`, without surrounding space, and without a comment unless the type is `string`; in ROS 2
+    /// also without quotes.
     pub value: String,
 }
 
-/// A message, all references resolved.
+/// A message with all references resolved.
 pub struct MessageType {
     pub(crate) version: RosVersion,
     pub(crate) name: String,
     pub(crate) text: Arc<str>,
-    /// Of ROS 2 only worked out when it is asked for: it needs all messages within.
+    /// Digest; in ROS 2 computed on first use, because it needs all dependencies.
     pub(crate) digest: OnceLock<String>,
     pub(crate) fields: Vec<Field>,
     pub(crate) constants: Vec<Constant>,
-    pub(crate) plan: Plan,
+    pub(crate) plan: CodecPlan,
     pub(crate) full_text: OnceLock<String>,
 }
 
 impl MessageType {
-    /// Which ROS it is of, and so how its messages are serialized.
+    /// Returns the ROS version, which also determines the serialization format.
     pub fn version(&self) -> RosVersion {
         self.version
     }
 
-    /// `package/Type`; of ROS 2 `package/msg/Type`, or with `srv` or `action` where it comes with one.
+    /// Returns the name `package/Type`; in ROS 2 `package/msg/Type`, or with `srv` or `action` if generated from one.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What tells it from other definitions of its name: MD5 as genmsg computes it, 32 lower-case hex digits; of ROS 2
-    /// the type hash, `RIHS01_` and 64 (REP 2016).
+    /// Returns the digest that distinguishes it from other definitions of its name: the MD5 computed as in genmsg, 32
+    /// lower-case hex digits; in ROS 2 the type hash, `RIHS01_` and 64 hex digits (REP 2016).
     pub fn digest(&self) -> &str {
         self.digest.get_or_init(|| type_hash(self))
     }
 
-    /// The same, by the name that it has in ROS 1.
+    /// Returns the digest, under the name it has in ROS 1.
     pub fn md5(&self) -> &str {
         self.digest()
     }
 
-    /// Its own text, as given.
+    /// Returns the text of the definition, as given.
     pub fn text(&self) -> &str {
         &self.text
     }
 
-    /// Its text followed by those of all messages it contains, as `gendeps --cat` prints it and publishers send it.
+    /// Returns the text followed by those of all dependencies, as `gendeps --cat` prints it and publishers send it.
     pub fn full_text(&self) -> &str {
         self.full_text.get_or_init(|| full_text(self))
     }
 
-    /// In order of serialization.
+    /// Returns the fields in order of serialization.
     pub fn fields(&self) -> &[Field] {
         &self.fields
     }
 
-    /// In order of definition.
+    /// Returns the constants in order of definition.
     pub fn constants(&self) -> &[Constant] {
         &self.constants
     }
 
-    /// Fewest bytes a message takes, what alignment adds and the header of ROS 2's serialization left out. In ROS 1 the
-    /// default message is as many zeros; [`default_message`](crate::codec::default_message) knows it for both.
+    /// Returns the minimum size of a message in bytes, excluding padding and ROS 2's encapsulation header. In ROS 1 the
+    /// default message is this many zeros; [`default_message`](crate::codec::default_message) works for both.
     pub fn min_size(&self) -> usize {
         self.plan.min_size
     }
 
-    /// Whether every message takes [`min_size`](Self::min_size) bytes and what alignment adds.
+    /// Returns true if every message takes [`min_size`](Self::min_size) bytes plus padding.
     pub fn is_fixed_size(&self) -> bool {
         self.plan.fixed_size
     }
 
-    /// Whether the first field is a `std_msgs/Header`.
+    /// Returns true if the first field is a `std_msgs/Header`.
     pub fn has_header(&self) -> bool {
         self.fields.first().is_some_and(|first| {
             first.arity == Arity::One
@@ -280,7 +282,7 @@ impl MessageType {
         })
     }
 
-    /// Whether this is `std_msgs/Header` itself.
+    /// Returns true for `std_msgs/Header` itself.
     pub(crate) fn is_header(&self) -> bool {
         self.plan.header
     }
@@ -292,32 +294,34 @@ impl fmt::Debug for MessageType {
     }
 }
 
-/// A service, all references resolved.
+/// A service with all references resolved.
 #[derive(Debug, Clone)]
 pub struct ServiceDef {
-    /// `package/Type`; of ROS 2 `package/srv/Type`.
+    /// `package/Type`; in ROS 2 `package/srv/Type`.
     pub name: String,
     /// Digest of request and response together: MD5, or ROS 2's type hash.
     pub md5: String,
-    /// `package/TypeRequest`; of ROS 2 `package/srv/Type_Request`.
+    /// `package/TypeRequest`; in ROS 2 `package/srv/Type_Request`.
     pub request: Arc<MessageType>,
-    /// `package/TypeResponse`; of ROS 2 `package/srv/Type_Response`.
+    /// `package/TypeResponse`; in ROS 2 `package/srv/Type_Response`.
     pub response: Arc<MessageType>,
 }
 
-/// An action and the messages that its generator makes of it. Names are those of ROS 1's genaction, `Name` in front;
-/// ROS 2 has others of the same use.
+/// An action and the messages generated from it. Field names follow ROS 1's genaction, whose message names begin with
+/// the action's `Name`; ROS 2 has other messages for the same purposes.
 #[derive(Debug, Clone)]
 pub struct ActionDef {
-    /// `package/Name`; of ROS 2 `package/action/Name`.
+    /// `package/Name`; in ROS 2 `package/action/Name`.
     pub name: String,
-    /// `Action`: the three below that say whose goal it is. Of ROS 2 the action as a type, whose digest is the action's.
+    /// `Action`: contains the three messages below that carry a goal id. In ROS 2 the action as a type, whose digest is
+    /// the action's.
     pub action: Arc<MessageType>,
-    /// `ActionGoal`: header, goal id, goal; the type of topic `goal`. Of ROS 2 `_SendGoal_Request`: goal id, goal.
+    /// `ActionGoal`: header, goal id, goal; the type of topic `goal`. In ROS 2 `_SendGoal_Request`: goal id, goal.
     pub action_goal: Arc<MessageType>,
-    /// `ActionResult`: header, status, result; the type of topic `result`. Of ROS 2 `_GetResult_Response`: status, result.
+    /// `ActionResult`: header, status, result; the type of topic `result`. In ROS 2 `_GetResult_Response`: status,
+    /// result.
     pub action_result: Arc<MessageType>,
-    /// `ActionFeedback`: header, status, feedback; the type of topic `feedback`. Of ROS 2 `_FeedbackMessage`: goal id,
+    /// `ActionFeedback`: header, status, feedback; the type of topic `feedback`. In ROS 2 `_FeedbackMessage`: goal id,
     /// feedback.
     pub action_feedback: Arc<MessageType>,
     /// `Goal`.
@@ -326,11 +330,11 @@ pub struct ActionDef {
     pub result: Arc<MessageType>,
     /// `Feedback`.
     pub feedback: Arc<MessageType>,
-    /// What ROS 2 sends goals and asks for results by; none in ROS 1.
+    /// Services for sending goals and requesting results (ROS 2); `None` in ROS 1.
     pub services: Option<ActionServices>,
 }
 
-/// The services of a ROS 2 action, beside the one that cancels, whose type all actions share.
+/// The services of a ROS 2 action, except the one for cancelling, whose type is the same for all actions.
 #[derive(Debug, Clone)]
 pub struct ActionServices {
     /// `package/action/Name_SendGoal`.

@@ -1,54 +1,55 @@
-//! Width and height of serialized messages: from the whole numbers of these names that a message or one in it has (pictures,
-//! clouds, grids), and from the picture itself where that is a JPEG or PNG file (`sensor_msgs/CompressedImage`).
+//! Width and height of serialized messages: taken from the integer fields of these names in the message or in a message
+//! that it contains (images, point clouds, grids), or from the image itself if it is a JPEG or PNG file
+//! (`sensor_msgs/CompressedImage`).
 
 use crate::bus::RosVersion;
-use crate::codec::cursor::Cursor;
+use crate::codec::cursor::MessageCursor;
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
-/// Steps to the numbers; types with more before them are not looked at.
+/// Maximum number of steps to the fields; types that need more are ignored.
 const MOST_STEPS: usize = 256;
-/// Strings and segments that are walked through in one message.
+/// Maximum number of strings and segments scanned in one message.
 const MOST_PARTS: usize = 1024;
-/// Beyond it, it is no size.
+/// Values from here on are not accepted as a size.
 const LARGEST: u64 = 1 << 31;
 
-/// The way to the width and height of one type's messages.
+/// Steps to the width and height in messages of one type.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Extent {
     version: RosVersion,
-    steps: Vec<Step>,
+    steps: Vec<ExtentStep>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
-    /// So many items of so many bytes, aligned where numbers are.
+enum ExtentStep {
+    /// (count, size, alignment): fixed number of items, aligned where numbers are.
     Items(usize, usize, usize),
-    /// The same, with their number before them.
+    /// (size, alignment): items preceded by their count.
     CountedItems(usize, usize),
-    /// Strings with their lengths before them, wide ones or not.
+    /// (count, wide): length-prefixed strings.
     Strings(usize, bool),
-    /// Strings, with their number before them.
+    /// (wide): strings preceded by their count.
     CountedStrings(bool),
     Width(Primitive),
     Height(Primitive),
-    /// A JPEG or PNG file with its length before it.
+    /// A JPEG or PNG file preceded by its length.
     File,
 }
 
 impl Extent {
-    /// For messages of this type; none where it does not say so.
-    pub fn of(message: &MessageType) -> Option<Extent> {
+    /// Compiles the steps for messages of this type; `None` if it has no width and height.
+    pub fn for_type(message: &MessageType) -> Option<Extent> {
         let mut steps = Vec::new();
         let file = matches!(
             message.name(),
             "sensor_msgs/CompressedImage" | "sensor_msgs/msg/CompressedImage"
         );
         let found = if file {
-            to_file(message, &mut steps)
+            push_file_steps(message, &mut steps)
         } else if has_sides(message) {
-            to_sides(message, &mut steps)
+            push_side_steps(message, &mut steps)
         } else {
-            within(message, &mut steps)
+            push_nested_steps(message, &mut steps)
         };
         found.map(|()| Extent {
             version: message.version(),
@@ -56,32 +57,32 @@ impl Extent {
         })
     }
 
-    /// Width and height of a message; none where it says none.
+    /// Returns width and height of a message; `None` if it has none.
     pub fn find(&self, message: &[u8]) -> Option<(u64, u64)> {
         let mut walk = Walk {
-            cursor: Cursor::new(self.version, message)?,
+            cursor: MessageCursor::new(self.version, message)?,
             parts: 0,
         };
         let (mut width, mut height) = (None, None);
         for step in &self.steps {
             match *step {
-                Step::Items(count, size, alignment) => {
+                ExtentStep::Items(count, size, alignment) => {
                     walk.cursor.skip(count, size, alignment)?;
                 }
-                Step::CountedItems(size, alignment) => {
+                ExtentStep::CountedItems(size, alignment) => {
                     let count = walk.cursor.length()?;
                     walk.cursor.skip(count, size, alignment)?;
                 }
-                Step::Strings(count, wide) => walk.strings(count, wide)?,
-                Step::CountedStrings(wide) => {
+                ExtentStep::Strings(count, wide) => walk.skip_strings(count, wide)?,
+                ExtentStep::CountedStrings(wide) => {
                     let count = walk.cursor.length()?;
-                    walk.strings(count, wide)?;
+                    walk.skip_strings(count, wide)?;
                 }
-                Step::Width(primitive) => width = Some(walk.side(primitive)?),
-                Step::Height(primitive) => height = Some(walk.side(primitive)?),
-                Step::File => {
+                ExtentStep::Width(primitive) => width = Some(walk.read_side(primitive)?),
+                ExtentStep::Height(primitive) => height = Some(walk.read_side(primitive)?),
+                ExtentStep::File => {
                     let bytes = walk.cursor.length()?;
-                    return of_file(walk.cursor.take(bytes, 1)?);
+                    return image_file_size(walk.cursor.take(bytes, 1)?);
                 }
             }
         }
@@ -90,7 +91,7 @@ impl Extent {
     }
 }
 
-fn side(field: &Field) -> Option<(&str, Primitive)> {
+fn side_field(field: &Field) -> Option<(&str, Primitive)> {
     use Primitive::{Int8, Int16, Int32, Int64, Uint8, Uint16, Uint32, Uint64};
     match (&field.base, field.arity) {
         (Base::Primitive(primitive), Arity::One) => {
@@ -103,19 +104,19 @@ fn side(field: &Field) -> Option<(&str, Primitive)> {
 }
 
 fn has_sides(message: &MessageType) -> bool {
-    let sides = message.fields().iter().filter_map(side);
+    let sides = message.fields().iter().filter_map(side_field);
     sides.count() == 2
 }
 
-/// Steps up to the second of both numbers.
-fn to_sides(message: &MessageType, steps: &mut Vec<Step>) -> Option<()> {
+/// Pushes the steps up to the second of the two fields.
+fn push_side_steps(message: &MessageType, steps: &mut Vec<ExtentStep>) -> Option<()> {
     let mut left = 2;
     for field in message.fields() {
-        match side(field) {
-            Some(("width", primitive)) => steps.push(Step::Width(primitive)),
-            Some((_, primitive)) => steps.push(Step::Height(primitive)),
+        match side_field(field) {
+            Some(("width", primitive)) => steps.push(ExtentStep::Width(primitive)),
+            Some((_, primitive)) => steps.push(ExtentStep::Height(primitive)),
             None => {
-                over(field, steps)?;
+                push_skip_steps(field, steps)?;
                 continue;
             }
         }
@@ -127,33 +128,33 @@ fn to_sides(message: &MessageType, steps: &mut Vec<Step>) -> Option<()> {
     None
 }
 
-/// The first message in it that has both, such as a grid's `info`.
-fn within(message: &MessageType, steps: &mut Vec<Step>) -> Option<()> {
+/// Pushes the steps to the first contained message that has both fields, such as a grid's `info`.
+fn push_nested_steps(message: &MessageType, steps: &mut Vec<ExtentStep>) -> Option<()> {
     for field in message.fields() {
         match (&field.base, field.arity) {
             (Base::Message(inner), Arity::One) if has_sides(inner) => {
-                return to_sides(inner, steps);
+                return push_side_steps(inner, steps);
             }
-            _ => over(field, steps)?,
+            _ => push_skip_steps(field, steps)?,
         }
     }
     None
 }
 
-fn to_file(message: &MessageType, steps: &mut Vec<Step>) -> Option<()> {
+fn push_file_steps(message: &MessageType, steps: &mut Vec<ExtentStep>) -> Option<()> {
     for field in message.fields() {
         let bytes = matches!(field.base, Base::Primitive(Primitive::Uint8));
         if field.name == "data" && bytes && field.arity == Arity::Variable {
-            steps.push(Step::File);
+            steps.push(ExtentStep::File);
             return Some(());
         }
-        over(field, steps)?;
+        push_skip_steps(field, steps)?;
     }
     None
 }
 
-/// Steps over a field; none where that is too long a way.
-fn over(field: &Field, steps: &mut Vec<Step>) -> Option<()> {
+/// Pushes the steps that skip a field; `None` if there are too many.
+fn push_skip_steps(field: &Field, steps: &mut Vec<ExtentStep>) -> Option<()> {
     let times = match field.arity {
         Arity::One => Some(1),
         Arity::Fixed(count) => Some(count as usize),
@@ -164,12 +165,12 @@ fn over(field: &Field, steps: &mut Vec<Step>) -> Option<()> {
         Base::Primitive(primitive) => {
             let (size, wide) = (primitive.size(), *primitive == Primitive::Wstring);
             let is_text = wide || *primitive == Primitive::String;
-            // ROS 1's times are not aligned.
+            // Times of ROS 1 are not aligned.
             steps.push(match (is_text, times) {
-                (false, Some(times)) => Step::Items(times, size, size),
-                (false, None) => Step::CountedItems(size, size),
-                (true, Some(times)) => Step::Strings(times, wide),
-                (true, None) => Step::CountedStrings(wide),
+                (false, Some(times)) => ExtentStep::Items(times, size, size),
+                (false, None) => ExtentStep::CountedItems(size, size),
+                (true, Some(times)) => ExtentStep::Strings(times, wide),
+                (true, None) => ExtentStep::CountedStrings(wide),
             });
             return (steps.len() <= MOST_STEPS).then_some(());
         }
@@ -182,29 +183,31 @@ fn over(field: &Field, steps: &mut Vec<Step>) -> Option<()> {
         }
     };
     match (one_size, times) {
-        (Some((size, alignment)), Some(times)) => steps.push(Step::Items(times, size, alignment)),
-        (Some((size, alignment)), None) => steps.push(Step::CountedItems(size, alignment)),
+        (Some((size, alignment)), Some(times)) => {
+            steps.push(ExtentStep::Items(times, size, alignment))
+        }
+        (Some((size, alignment)), None) => steps.push(ExtentStep::CountedItems(size, alignment)),
         (None, Some(1)) => {
             for field in message.fields() {
-                over(field, steps)?;
+                push_skip_steps(field, steps)?;
             }
             if message.plan.placeholder {
-                steps.push(Step::Items(1, 1, 1));
+                steps.push(ExtentStep::Items(1, 1, 1));
             }
         }
-        // In an array each one has its own size.
+        // Messages in an array may differ in size.
         (None, _) => return None,
     }
     (steps.len() <= MOST_STEPS).then_some(())
 }
 
 struct Walk<'a> {
-    cursor: Cursor<'a>,
+    cursor: MessageCursor<'a>,
     parts: usize,
 }
 
 impl Walk<'_> {
-    fn strings(&mut self, count: usize, wide: bool) -> Option<()> {
+    fn skip_strings(&mut self, count: usize, wide: bool) -> Option<()> {
         for _ in 0..count {
             self.parts += 1;
             if self.parts > MOST_PARTS {
@@ -215,8 +218,8 @@ impl Walk<'_> {
         Some(())
     }
 
-    /// A whole number. One below zero is far beyond any size.
-    fn side(&mut self, primitive: Primitive) -> Option<u64> {
+    /// Reads an integer. Negative values become larger than any valid size.
+    fn read_side(&mut self, primitive: Primitive) -> Option<u64> {
         let size = primitive.size();
         let bytes = self.cursor.take(size, size)?;
         let mut all = [0; 8];
@@ -234,8 +237,9 @@ impl Walk<'_> {
     }
 }
 
-/// Width and height of a PNG (its `IHDR`; ISO/IEC 15948, 11.2.2) or a JPEG (its frame header; ITU-T T.81, B.2.2).
-fn of_file(file: &[u8]) -> Option<(u64, u64)> {
+/// Returns width and height of a PNG (from `IHDR`; ISO/IEC 15948, 11.2.2) or a JPEG (from its frame header; ITU-T T.81,
+/// B.2.2).
+fn image_file_size(file: &[u8]) -> Option<(u64, u64)> {
     let word = |at: usize, bytes: usize| -> Option<u64> {
         let end = at.checked_add(bytes)?;
         let number = file.get(at..end)?.iter();
@@ -252,15 +256,15 @@ fn of_file(file: &[u8]) -> Option<(u64, u64)> {
                 return None;
             }
             match word(at + 1, 1)? {
-                // Bytes that fill.
+                // Fill bytes.
                 0xff => at += 1,
-                // Frame headers, without those of other segments between them: DHT, JPG and DAC.
+                // Frame headers (SOF); DHT, JPG and DAC in between are other segments.
                 0xc0..=0xc3 | 0xc5..=0xc7 | 0xc9..=0xcb | 0xcd..=0xcf => {
                     break (word(at + 7, 2)?, word(at + 5, 2)?);
                 }
-                // Before any frame header the picture begins or ends.
+                // The image begins or ends before any frame header.
                 0xd9 | 0xda => return None,
-                // Without a length.
+                // Segments without a length.
                 0x01 | 0xd0..=0xd8 => at += 2,
                 _ => at += 2 + usize::try_from(word(at + 2, 2)?).ok()?.max(2),
             }
@@ -282,7 +286,7 @@ mod tests {
 
     #[test]
     fn messages_of_ros_2_say_it_too() {
-        let registry = Registry::of(RosVersion::Two);
+        let registry = Registry::for_version(RosVersion::Two);
         for (key, text) in [
             (
                 "a/Picture",
@@ -312,14 +316,14 @@ mod tests {
             let message = registry.message(name).unwrap();
             let mut bytes = Vec::new();
             from_json(&message, json.as_bytes(), &mut bytes, &Default::default()).unwrap();
-            Extent::of(&message)?.find(&bytes)
+            Extent::for_type(&message)?.find(&bytes)
         };
         let picture = r#"{"header": {"frame_id": "abc"}, "more": "é", "height": 48, "width": 64}"#;
         assert_eq!(find("a/Picture", picture), Some((64, 48)));
         let info = r#""info": {"width": 7, "height": 9}"#;
         let plain = format!(r#"{{"header": {{"frame_id": "ab"}}, "skipped": [1, 2], {info}}}"#);
         assert_eq!(find("a/Plain", &plain), Some((7, 9)));
-        // Beyond an array of messages it is not looked for.
+        // Fields beyond an array of messages are not found.
         assert_eq!(find("a/Grid", &format!("{{{info}}}")), None);
         let png = "iVBORw0KGgoAAAANSUhEUgAAAAUAAAAG";
         let compressed = format!(r#"{{"format": "png", "data": "{png}"}}"#);
@@ -330,7 +334,10 @@ mod tests {
         // Big endian.
         let info = registry.message("a/Info").unwrap();
         let bytes = [0u32, 1, 2, 3, 640, 480].map(u32::to_be_bytes).concat();
-        assert_eq!(Extent::of(&info).unwrap().find(&bytes), Some((640, 480)));
+        assert_eq!(
+            Extent::for_type(&info).unwrap().find(&bytes),
+            Some((640, 480))
+        );
     }
 
     const HEADER: &str = "uint32 seq\ntime stamp\nstring frame_id";
@@ -338,7 +345,8 @@ mod tests {
         ("std_msgs/Header", HEADER),
         (
             "sensor_msgs/Image",
-            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
+            "Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] \
+             data",
         ),
         (
             "sensor_msgs/CompressedImage",
@@ -370,7 +378,7 @@ mod tests {
             registry.insert(key, text).expect("valid");
         }
         registry.insert("a/Text", "string text").expect("valid");
-        Extent::of(&registry.message(name).expect("known"))
+        Extent::for_type(&registry.message(name).expect("known"))
     }
 
     fn text(text: &str) -> Vec<u8> {
@@ -387,7 +395,7 @@ mod tests {
         numbers.iter().flat_map(|n| n.to_le_bytes()).collect()
     }
 
-    fn compressed(file: &[u8]) -> Vec<u8> {
+    fn compressed_image(file: &[u8]) -> Vec<u8> {
         let bytes = numbers(&[file.len() as u32]);
         [header(), text("jpeg"), bytes, file.to_vec()].concat()
     }
@@ -419,8 +427,16 @@ mod tests {
             ("sensor_msgs/Image", image, (640, 480)),
             ("nav_msgs/OccupancyGrid", grid, (30, 20)),
             ("a/Late", late, (7, 8)),
-            ("sensor_msgs/CompressedImage", compressed(png), (640, 480)),
-            ("sensor_msgs/CompressedImage", compressed(&jpeg), (640, 480)),
+            (
+                "sensor_msgs/CompressedImage",
+                compressed_image(png),
+                (640, 480),
+            ),
+            (
+                "sensor_msgs/CompressedImage",
+                compressed_image(&jpeg),
+                (640, 480),
+            ),
         ] {
             let extent = extent(name).expect(name);
             assert_eq!(extent.find(&message), Some(found), "{name}");
@@ -445,7 +461,7 @@ mod tests {
         assert_eq!(late.find(&message(127, 1)), Some((127, 1)));
         assert_eq!(late.find(&message(128, 1)), None, "below zero");
         assert_eq!(late.find(&message(1, -1)), None);
-        // More strings than anybody has.
+        // More strings than are scanned.
         let many = [text(""), text(""), numbers(&[1 << 20]), vec![0; 4 << 20]].concat();
         assert_eq!(late.find(&many), None);
         let file = extent("sensor_msgs/CompressedImage").expect("it says it");
@@ -457,7 +473,7 @@ mod tests {
             b"\xff\xd8xx",
             &[0xff; 9000],
         ] {
-            assert_eq!(file.find(&compressed(bytes)), None, "{bytes:?}");
+            assert_eq!(file.find(&compressed_image(bytes)), None, "{bytes:?}");
         }
     }
 
@@ -469,7 +485,7 @@ mod tests {
             for name in ["sensor_msgs/Image", "a/Late", "sensor_msgs/CompressedImage"] {
                 let extent = extent(name).expect(name);
                 let _ = extent.find(&bytes);
-                let _ = extent.find(&compressed(&file));
+                let _ = extent.find(&compressed_image(&file));
             }
         }
     }

@@ -1,10 +1,10 @@
-//! What a participant tells of one of its writers or readers, as bytes (8.5.4.2, 9.6.3).
+//! Encoding of the discovery data of endpoints (8.5.4.2, 9.6.3).
 
 use bytes::Bytes;
 
-use super::participant::keep;
+use super::participant::push_locator;
 use super::{EndpointData, policies};
-use crate::wire::{ParameterWriter, WireError, list, list_header, parameter, pid};
+use crate::wire::{ParameterWriter, WireError, list_header, next_parameter, parameter_list, pid};
 use crate::{EntityId, Guid};
 
 const KNOWN: [u16; 13] = {
@@ -26,11 +26,12 @@ const KNOWN: [u16; 13] = {
     ]
 };
 
-/// Names and user data of more bytes are not understood. ROS 2's are at most 255 and 72 long; many such ends may be told.
+/// Maximum length in bytes of names and user data. Those of ROS 2 have at most 255 and 72 bytes; many endpoints may be
+/// announced.
 const LONGEST: usize = 1024;
 
 impl EndpointData {
-    /// As the payload of a sample. Names or user data of more than 65,527 bytes are left out.
+    /// Encodes the data as the payload of a sample. Names or user data of more than 65,527 bytes are omitted.
     pub fn to_bytes(&self) -> Bytes {
         let mut bytes = list_header();
         let mut list = ParameterWriter::new(&mut bytes);
@@ -39,7 +40,7 @@ impl EndpointData {
             pid::PARTICIPANT_GUID,
             Guid::new(self.guid.prefix, EntityId::PARTICIPANT),
         );
-        // By this some find what they know of it already.
+        // Some implementations look up their existing data by this hash.
         list.guid(pid::KEY_HASH, self.guid);
         list.string(pid::TOPIC_NAME, &self.topic);
         list.string(pid::TYPE_NAME, &self.type_name);
@@ -49,39 +50,44 @@ impl EndpointData {
         if self.expects_inline_qos {
             list.raw(pid::EXPECTS_INLINE_QOS, &[1]);
         }
-        policies::write(&self.qos, &mut list);
+        policies::write_qos(&self.qos, &mut list);
         if !self.user_data.is_empty() {
-            list.counted(pid::USER_DATA, &self.user_data);
+            list.byte_sequence(pid::USER_DATA, &self.user_data);
         }
         list.end();
         bytes.into()
     }
 
-    /// Of the payload of a sample, in either byte order. Shares no memory with it; the first 16 locators are kept. What is
-    /// not told of its quality of service is as DDS says.
+    /// Decodes the payload of a sample in either byte order. Shares no memory with it and keeps the first 16 locators.
+    /// QoS policies that are not announced have the defaults of DDS.
     pub fn from_payload(payload: &Bytes) -> Result<Self, WireError> {
-        let guid = guid(payload)?;
+        let guid = parse_guid(payload)?;
         let (mut topic, mut type_name) = (None, None);
         let mut data = Self {
             guid,
             topic: String::new(),
             type_name: String::new(),
-            qos: policies::unsaid(guid.entity.is_writer()),
+            qos: policies::default_qos(guid.entity.is_writer()),
             user_data: Bytes::new(),
             unicast: Vec::new(),
             expects_inline_qos: false,
         };
-        let mut input = list(payload)?;
-        while let Some((number, mut value)) = parameter(&mut input, &KNOWN)? {
+        let mut input = parameter_list(payload)?;
+        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
             match number {
-                pid::TOPIC_NAME => topic = Some(short(number, value.text(number)?)?.to_owned()),
-                pid::TYPE_NAME => type_name = Some(short(number, value.text(number)?)?.to_owned()),
-                pid::USER_DATA => {
-                    data.user_data = Bytes::copy_from_slice(short(number, value.counted()?)?)
+                pid::TOPIC_NAME => {
+                    topic = Some(check_length(number, value.text(number)?)?.to_owned())
                 }
-                pid::UNICAST_LOCATOR => keep(&mut data.unicast, value.locator()?),
+                pid::TYPE_NAME => {
+                    type_name = Some(check_length(number, value.text(number)?)?.to_owned())
+                }
+                pid::USER_DATA => {
+                    data.user_data =
+                        Bytes::copy_from_slice(check_length(number, value.byte_sequence()?)?)
+                }
+                pid::UNICAST_LOCATOR => push_locator(&mut data.unicast, value.locator()?),
                 pid::EXPECTS_INLINE_QOS => data.expects_inline_qos = value.byte()? != 0,
-                _ => policies::take(&mut data.qos, number, value)?,
+                _ => policies::set_parameter(&mut data.qos, number, value)?,
             }
         }
         data.topic = topic.ok_or(WireError::Missing(pid::TOPIC_NAME))?;
@@ -90,18 +96,19 @@ impl EndpointData {
     }
 }
 
-fn short<T: AsRef<[u8]> + ?Sized>(number: u16, value: &T) -> Result<&T, WireError> {
-    match value.as_ref().len() <= LONGEST {
-        true => Ok(value),
-        false => Err(WireError::Value(number)),
+fn check_length<T: AsRef<[u8]> + ?Sized>(number: u16, value: &T) -> Result<&T, WireError> {
+    if value.as_ref().len() <= LONGEST {
+        Ok(value)
+    } else {
+        Err(WireError::Value(number))
     }
 }
 
-/// Which end it is: that has to be known before the rest is read.
-fn guid(payload: &Bytes) -> Result<Guid, WireError> {
-    let mut input = list(payload)?;
+/// Decodes only the GUID, which must be known before the rest is read.
+fn parse_guid(payload: &Bytes) -> Result<Guid, WireError> {
+    let mut input = parameter_list(payload)?;
     let mut guid = None;
-    while let Some((number, mut value)) = parameter(&mut input, &KNOWN)? {
+    while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
         if number == pid::ENDPOINT_GUID {
             guid = Some(value.guid()?);
         }

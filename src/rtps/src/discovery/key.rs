@@ -1,12 +1,13 @@
-//! Which participant or end a sample of discovery is about, also where it says only that it is no more (9.6.4.8).
+//! Keys of discovery samples: which participant or endpoint a sample is about, even if it only reports its disposal
+//! (9.6.4.8).
 
 use bytes::Bytes;
 
-use crate::wire::{Data, ParameterWriter, list, list_header, parameter, pid};
+use crate::wire::{Data, ParameterWriter, list_header, next_parameter, parameter_list, pid};
 use crate::{EntityId, Guid};
 
-/// Whom it is about: by the hash of its key, which is the GUID itself, or by its payload. Payloads are read whether they
-/// are all or only the key.
+/// Returns the GUID that a sample is about, from its key hash, which is the GUID itself, or from its payload, which may
+/// be complete or only a key.
 pub fn guid_of_key(data: &Data) -> Option<Guid> {
     data.inline
         .key_hash
@@ -16,19 +17,19 @@ pub fn guid_of_key(data: &Data) -> Option<Guid> {
 
 fn guid_of_payload(payload: &Bytes) -> Option<Guid> {
     const KNOWN: [u16; 3] = [pid::ENDPOINT_GUID, pid::KEY_HASH, pid::PARTICIPANT_GUID];
-    let mut input = list(payload).ok()?;
+    let mut input = parameter_list(payload).ok()?;
     let mut guids = [None; KNOWN.len()];
-    while let Some((number, mut value)) = parameter(&mut input, &KNOWN).ok()? {
+    while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN).ok()? {
         let rank = KNOWN.iter().position(|known| *known == number)?;
         guids[rank] = Some(value.guid().ok()?);
     }
-    // An end tells its participant too.
+    // Endpoint data also contains the GUID of the participant.
     guids.into_iter().flatten().next()
 }
 
-/// The payload of a sample that says that a participant or end is no more: only its key. Such a sample also has the hash
-/// of the key in its inline QoS, as Fast DDS looks at nothing else.
-pub fn key(guid: Guid) -> Bytes {
+/// Encodes the payload of a sample that disposes of a participant or endpoint: only its key. Such a sample must also
+/// have the key hash in its inline QoS, because Fast DDS looks at nothing else.
+pub fn key_payload(guid: Guid) -> Bytes {
     let mut bytes = list_header();
     let mut list = ParameterWriter::new(&mut bytes);
     let is_participant = guid.entity == EntityId::PARTICIPANT;

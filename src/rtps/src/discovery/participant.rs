@@ -1,4 +1,4 @@
-//! What a participant tells of itself, as bytes (8.5.3.2, 9.6.3).
+//! Encoding of the discovery data of participants (8.5.3.2, 9.6.3).
 
 use std::time::Duration;
 
@@ -6,16 +6,18 @@ use bytes::Bytes;
 
 use super::ParticipantData;
 use crate::locator::Locator;
-use crate::wire::{Input, ParameterWriter, WireError, list, list_header, parameter, pid};
+use crate::wire::{
+    ParameterWriter, WireError, WireReader, list_header, next_parameter, parameter_list, pid,
+};
 use crate::{EntityId, Guid, VendorId};
 
-/// After which a participant that does not say so itself is gone (8.5.3.2).
+/// Default lease duration (8.5.3.2).
 const LEASE: Duration = Duration::from_secs(100);
 
-/// Of a participant that does not say which it has: those that each must have (8.5.1).
+/// Built-in endpoints of a participant that does not announce them: those that each participant must have (8.5.1).
 const BUILTIN: u32 = 0x3f;
 
-/// More locators of one kind are not kept.
+/// Maximum number of locators of one kind that are kept.
 pub(super) const MOST_LOCATORS: usize = 16;
 
 const KNOWN: [u16; 11] = [
@@ -33,12 +35,12 @@ const KNOWN: [u16; 11] = [
 ];
 
 impl ParticipantData {
-    /// As the payload of a sample. A name or user data of more than 65,527 bytes is left out.
+    /// Encodes the data as the payload of a sample. A name or user data of more than 65,527 bytes is omitted.
     pub fn to_bytes(&self) -> Bytes {
         self.to_bytes_with(&[])
     }
 
-    /// The same, with properties: names and their values.
+    /// Encodes the data with additional properties, given as names and values.
     pub fn to_bytes_with(&self, properties: &[(&str, &str)]) -> Bytes {
         let mut bytes = list_header();
         let mut list = ParameterWriter::new(&mut bytes);
@@ -63,7 +65,7 @@ impl ParticipantData {
             list.string(pid::ENTITY_NAME, &self.name);
         }
         if !self.user_data.is_empty() {
-            list.counted(pid::USER_DATA, &self.user_data);
+            list.byte_sequence(pid::USER_DATA, &self.user_data);
         }
         if !properties.is_empty() {
             list.properties(pid::PROPERTY_LIST, properties);
@@ -72,10 +74,10 @@ impl ParticipantData {
         bytes.into()
     }
 
-    /// Of the payload of a sample, in either byte order. Shares no memory with it. Locators of multicast are not kept, and of
-    /// each other kind the first 16. A participant in a part of its domain (`PID_DOMAIN_TAG`) is not understood.
+    /// Decodes the payload of a sample in either byte order. Shares no memory with it. Multicast locators are not kept,
+    /// and of each other kind the first 16. A participant with a domain tag (`PID_DOMAIN_TAG`) is rejected.
     pub fn from_payload(payload: &Bytes) -> Result<Self, WireError> {
-        let mut input = list(payload)?;
+        let mut input = parameter_list(payload)?;
         let mut guid = None;
         let mut data = Self {
             prefix: Default::default(),
@@ -89,10 +91,10 @@ impl ParticipantData {
             builtin: BUILTIN,
             lease: Some(LEASE),
         };
-        while let Some((number, mut value)) = parameter(&mut input, &KNOWN)? {
+        while let Some((number, mut value)) = next_parameter(&mut input, &KNOWN)? {
             match number {
                 pid::PARTICIPANT_GUID => guid = Some(value.guid()?),
-                _ => data.take(number, value)?,
+                _ => data.set_parameter(number, value)?,
             }
         }
         data.prefix = guid
@@ -101,7 +103,7 @@ impl ParticipantData {
         Ok(data)
     }
 
-    fn take(&mut self, number: u16, mut value: Input) -> Result<(), WireError> {
+    fn set_parameter(&mut self, number: u16, mut value: WireReader) -> Result<(), WireError> {
         match number {
             pid::PROTOCOL_VERSION => self.version = value.array()?,
             pid::VENDOR_ID => self.vendor = VendorId(value.array()?),
@@ -112,9 +114,9 @@ impl ParticipantData {
                 ));
             }
             pid::ENTITY_NAME => self.name = String::from_utf8_lossy(value.string()?).into_owned(),
-            pid::USER_DATA => self.user_data = Bytes::copy_from_slice(value.counted()?),
-            pid::METATRAFFIC_UNICAST_LOCATOR => keep(&mut self.discovery, value.locator()?),
-            pid::DEFAULT_UNICAST_LOCATOR => keep(&mut self.user, value.locator()?),
+            pid::USER_DATA => self.user_data = Bytes::copy_from_slice(value.byte_sequence()?),
+            pid::METATRAFFIC_UNICAST_LOCATOR => push_locator(&mut self.discovery, value.locator()?),
+            pid::DEFAULT_UNICAST_LOCATOR => push_locator(&mut self.user, value.locator()?),
             pid::BUILTIN_ENDPOINT_SET => self.builtin = value.u32()?,
             pid::PARTICIPANT_LEASE_DURATION => self.lease = value.duration()?.finite(),
             _ => {}
@@ -123,8 +125,8 @@ impl ParticipantData {
     }
 }
 
-/// Adds one where there is room.
-pub(super) fn keep(locators: &mut Vec<Locator>, locator: Locator) {
+/// Adds a locator if there is room.
+pub(super) fn push_locator(locators: &mut Vec<Locator>, locator: Locator) {
     if locators.len() < MOST_LOCATORS {
         locators.push(locator);
     }

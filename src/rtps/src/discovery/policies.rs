@@ -1,17 +1,19 @@
-//! What ends offer and ask for, as parameters (9.6.3.2; DDS 1.4, 2.2.3 for what holds where one is left out).
+//! Encoding of QoS policies as parameters (9.6.3.2; defaults in DDS 1.4, 2.2.3).
 
 use std::time::Duration;
 
-use crate::qos::{Durability, EndpointQos, History, Liveliness, Reliability, Representations};
-use crate::wire::{Input, ParameterWriter, WireError, pid};
+use crate::qos::{
+    DurabilityKind, EndpointQos, HistoryKind, LivelinessKind, ReliabilityKind, Representations,
+};
+use crate::wire::{ParameterWriter, WireError, WireReader, pid};
 
-/// How long whoever writes may wait for room; nobody but its own writer uses it. DDS's default.
+/// Maximum blocking time of a writer, which only the writer itself uses. Default of DDS.
 const MAX_BLOCKING: Duration = Duration::from_millis(100);
 
-/// There are three.
+/// Maximum number of data representations read; three are defined.
 const MOST_REPRESENTATIONS: u32 = 8;
 
-/// Which parameters [`take`] takes.
+/// Parameters that [`set_parameter`] handles.
 pub(super) const KNOWN: [u16; 7] = [
     pid::RELIABILITY,
     pid::DURABILITY,
@@ -22,50 +24,50 @@ pub(super) const KNOWN: [u16; 7] = [
     pid::DATA_REPRESENTATION,
 ];
 
-/// What a writer or a reader has that says nothing.
-pub(super) fn unsaid(is_writer: bool) -> EndpointQos {
+/// Returns the default QoS of a writer or reader.
+pub(super) fn default_qos(is_writer: bool) -> EndpointQos {
     EndpointQos {
         reliability: if is_writer {
-            Reliability::Reliable
+            ReliabilityKind::Reliable
         } else {
-            Reliability::BestEffort
+            ReliabilityKind::BestEffort
         },
-        durability: Durability::Volatile,
-        history: History::KeepLast(1),
+        durability: DurabilityKind::Volatile,
+        history: HistoryKind::KeepLast(1),
         deadline: None,
         lifespan: None,
-        liveliness: Liveliness::Automatic,
+        liveliness: LivelinessKind::Automatic,
         lease: None,
         representations: Representations::XCDR1,
     }
 }
 
-/// All of them, in full.
-pub(super) fn write(qos: &EndpointQos, list: &mut ParameterWriter) {
+/// Writes all policies.
+pub(super) fn write_qos(qos: &EndpointQos, list: &mut ParameterWriter) {
     let reliability = match qos.reliability {
-        Reliability::BestEffort => 1,
-        Reliability::Reliable => 2,
+        ReliabilityKind::BestEffort => 1,
+        ReliabilityKind::Reliable => 2,
     };
     list.kind_and_duration(pid::RELIABILITY, reliability, Some(MAX_BLOCKING));
     let durability = match qos.durability {
-        Durability::Volatile => 0,
-        Durability::TransientLocal => 1,
-        Durability::Transient => 2,
-        Durability::Persistent => 3,
+        DurabilityKind::Volatile => 0,
+        DurabilityKind::TransientLocal => 1,
+        DurabilityKind::Transient => 2,
+        DurabilityKind::Persistent => 3,
     };
     list.u32(pid::DURABILITY, durability);
     let (kind, depth) = match qos.history {
-        // A signed number on the wire.
-        History::KeepLast(depth) => (0, depth.clamp(1, i32::MAX as u32)),
-        History::KeepAll => (1, 0),
+        // The depth is signed on the wire.
+        HistoryKind::KeepLast(depth) => (0, depth.clamp(1, i32::MAX as u32)),
+        HistoryKind::KeepAll => (1, 0),
     };
     list.pair(pid::HISTORY, kind, depth);
     list.duration(pid::DEADLINE, qos.deadline);
     list.duration(pid::LIFESPAN, qos.lifespan);
     let liveliness = match qos.liveliness {
-        Liveliness::Automatic => 0,
-        Liveliness::ManualByParticipant => 1,
-        Liveliness::ManualByTopic => 2,
+        LivelinessKind::Automatic => 0,
+        LivelinessKind::ManualByParticipant => 1,
+        LivelinessKind::ManualByTopic => 2,
     };
     list.kind_and_duration(pid::LIVELINESS, liveliness, qos.lease);
     if qos.representations != Representations::XCDR1 {
@@ -76,30 +78,34 @@ pub(super) fn write(qos: &EndpointQos, list: &mut ParameterWriter) {
     }
 }
 
-/// Takes one of them.
-pub(super) fn take(qos: &mut EndpointQos, number: u16, mut value: Input) -> Result<(), WireError> {
+/// Sets one policy from its parameter.
+pub(super) fn set_parameter(
+    qos: &mut EndpointQos,
+    number: u16,
+    mut value: WireReader,
+) -> Result<(), WireError> {
     match number {
         pid::RELIABILITY => {
             qos.reliability = match value.u32()? {
-                1 => Reliability::BestEffort,
-                2 => Reliability::Reliable,
+                1 => ReliabilityKind::BestEffort,
+                2 => ReliabilityKind::Reliable,
                 _ => return Err(WireError::Value(number)),
             }
         }
         pid::DURABILITY => {
             qos.durability = match value.u32()? {
-                0 => Durability::Volatile,
-                1 => Durability::TransientLocal,
-                2 => Durability::Transient,
-                3 => Durability::Persistent,
+                0 => DurabilityKind::Volatile,
+                1 => DurabilityKind::TransientLocal,
+                2 => DurabilityKind::Transient,
+                3 => DurabilityKind::Persistent,
                 _ => return Err(WireError::Value(number)),
             }
         }
         pid::HISTORY => {
             qos.history = match (value.u32()?, value.i32()?) {
-                // What keeps none is not refused: it tells no more than how its owner is made.
-                (0, depth) => History::KeepLast(u32::try_from(depth).unwrap_or(0).max(1)),
-                (1, _) => History::KeepAll,
+                // A depth of 0 is not an error: it only describes the remote endpoint.
+                (0, depth) => HistoryKind::KeepLast(u32::try_from(depth).unwrap_or(0).max(1)),
+                (1, _) => HistoryKind::KeepAll,
                 _ => return Err(WireError::Value(number)),
             }
         }
@@ -107,9 +113,9 @@ pub(super) fn take(qos: &mut EndpointQos, number: u16, mut value: Input) -> Resu
         pid::LIFESPAN => qos.lifespan = value.duration()?.finite(),
         pid::LIVELINESS => {
             qos.liveliness = match value.u32()? {
-                0 => Liveliness::Automatic,
-                1 => Liveliness::ManualByParticipant,
-                2 => Liveliness::ManualByTopic,
+                0 => LivelinessKind::Automatic,
+                1 => LivelinessKind::ManualByParticipant,
+                2 => LivelinessKind::ManualByTopic,
                 _ => return Err(WireError::Value(number)),
             };
             qos.lease = value.duration()?.finite();
@@ -119,7 +125,7 @@ pub(super) fn take(qos: &mut EndpointQos, number: u16, mut value: Input) -> Resu
             for _ in 0..value.u32()?.min(MOST_REPRESENTATIONS) {
                 numbers.push(value.u16()?);
             }
-            qos.representations = Representations::of(&numbers);
+            qos.representations = Representations::from_numbers(&numbers);
         }
         _ => {}
     }

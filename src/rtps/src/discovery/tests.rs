@@ -1,4 +1,4 @@
-//! What is told is read as it was told; whatever is read ends, and keeps no more than was told.
+//! Discovery data round-trips; decoding of arbitrary input terminates and keeps no more than it was given.
 
 use std::net::{Ipv4Addr, SocketAddr};
 
@@ -7,9 +7,9 @@ use proptest::option;
 use proptest::prelude::*;
 
 use super::*;
-use crate::qos::{Durability, History, Liveliness, Reliability, Representations};
+use crate::qos::{DurabilityKind, HistoryKind, LivelinessKind, ReliabilityKind, Representations};
 use crate::wire::properties::{guid, prefix};
-use crate::wire::tests::bytes;
+use crate::wire::tests::parse_hex;
 use crate::wire::{Data, InlineQos, ParticipantMessage, WireError};
 use crate::{EntityId, SequenceNumber};
 
@@ -74,21 +74,24 @@ fn participant() -> impl Strategy<Value = ParticipantData> {
 }
 
 fn qos() -> impl Strategy<Value = EndpointQos> {
-    let reliability = prop_oneof![Just(Reliability::BestEffort), Just(Reliability::Reliable)];
+    let reliability = prop_oneof![
+        Just(ReliabilityKind::BestEffort),
+        Just(ReliabilityKind::Reliable)
+    ];
     let durability = prop_oneof![
-        Just(Durability::Volatile),
-        Just(Durability::TransientLocal),
-        Just(Durability::Transient),
-        Just(Durability::Persistent),
+        Just(DurabilityKind::Volatile),
+        Just(DurabilityKind::TransientLocal),
+        Just(DurabilityKind::Transient),
+        Just(DurabilityKind::Persistent),
     ];
     let history = prop_oneof![
-        (1..=i32::MAX as u32).prop_map(History::KeepLast),
-        Just(History::KeepAll)
+        (1..=i32::MAX as u32).prop_map(HistoryKind::KeepLast),
+        Just(HistoryKind::KeepAll)
     ];
     let liveliness = prop_oneof![
-        Just(Liveliness::Automatic),
-        Just(Liveliness::ManualByParticipant),
-        Just(Liveliness::ManualByTopic),
+        Just(LivelinessKind::Automatic),
+        Just(LivelinessKind::ManualByParticipant),
+        Just(LivelinessKind::ManualByTopic),
     ];
     (
         reliability,
@@ -103,7 +106,7 @@ fn qos() -> impl Strategy<Value = EndpointQos> {
         .prop_map(
             |(reliability, durability, history, deadline, lifespan, liveliness, lease, numbers)| {
                 EndpointQos {
-                    representations: Representations::of(&numbers),
+                    representations: Representations::from_numbers(&numbers),
                     reliability,
                     durability,
                     history,
@@ -140,11 +143,11 @@ fn endpoint() -> impl Strategy<Value = EndpointData> {
         )
 }
 
-/// Whatever is read of these bytes keeps no more than they are.
-fn is_bounded(payload: &Bytes) {
+/// Asserts that what is decoded from these bytes is no larger than they are.
+fn assert_bounded(payload: &Bytes) {
     if let Ok(read) = ParticipantData::from_payload(payload) {
         assert!(read.user_data.len() <= payload.len());
-        // A byte that is none of a character becomes a character of three.
+        // A byte that is not UTF-8 becomes a character of three bytes.
         assert!(read.name.len() <= 3 * payload.len());
         assert!(read.discovery.len() + read.user.len() <= payload.len() / 24);
     }
@@ -182,7 +185,7 @@ proptest! {
 
     #[test]
     fn a_key_names_whom_it_is_of(guid in guid()) {
-        let by_payload = data(Some(key(guid)), InlineQos::default());
+        let by_payload = data(Some(key_payload(guid)), InlineQos::default());
         prop_assert_eq!(guid_of_key(&by_payload), Some(guid));
         let by_hash = data(None, InlineQos { key_hash: Some(guid.bytes()), ..InlineQos::default() });
         prop_assert_eq!(guid_of_key(&by_hash), Some(guid));
@@ -207,38 +210,38 @@ proptest! {
                 let at = at.index(damaged.len());
                 damaged[at] = *byte;
             }
-            is_bounded(&damaged.into());
-            is_bounded(&whole.slice(..cut.index(whole.len() + 1)));
+            assert_bounded(&damaged.into());
+            assert_bounded(&whole.slice(..cut.index(whole.len() + 1)));
         }
     }
 
     #[test]
     fn any_bytes_are_read_to_their_end(tail in vec(any::<u8>(), 0..200)) {
-        is_bounded(&[vec![0, 3, 0, 0], tail.clone()].concat().into());
-        is_bounded(&[vec![0, 2, 0, 0], tail.clone()].concat().into());
-        is_bounded(&tail.into());
+        assert_bounded(&[vec![0, 3, 0, 0], tail.clone()].concat().into());
+        assert_bounded(&[vec![0, 2, 0, 0], tail.clone()].concat().into());
+        assert_bounded(&tail.into());
     }
 }
 
 const ENDPOINT: &str = "5a00 1000 01100001 02030405 06070809 00001207
     0500 0c00 08000000 72742f63 68617400 0700 0800 04000000 613a3a00";
 
-/// A list, little endian, with these parameters and its end.
+/// Creates a little-endian parameter list with its sentinel.
 fn list(parameters: &str) -> Bytes {
-    bytes(&format!("00030000 {parameters} 01000000"))
+    parse_hex(&format!("00030000 {parameters} 01000000"))
 }
 
 #[test]
-fn what_an_end_does_not_tell_is_as_dds_says() {
+fn omitted_policies_have_the_defaults_of_dds() {
     let reader = EndpointData::from_payload(&list(ENDPOINT)).expect("a reader");
     assert_eq!((&*reader.topic, &*reader.type_name), ("rt/chat", "a::"));
     let unsaid = EndpointQos {
-        reliability: Reliability::BestEffort,
-        durability: Durability::Volatile,
-        history: History::KeepLast(1),
+        reliability: ReliabilityKind::BestEffort,
+        durability: DurabilityKind::Volatile,
+        history: HistoryKind::KeepLast(1),
         deadline: None,
         lifespan: None,
-        liveliness: Liveliness::Automatic,
+        liveliness: LivelinessKind::Automatic,
         lease: None,
         representations: Representations::XCDR1,
     };
@@ -248,14 +251,14 @@ fn what_an_end_does_not_tell_is_as_dds_says() {
     assert_eq!(
         writer.qos,
         EndpointQos {
-            reliability: Reliability::Reliable,
+            reliability: ReliabilityKind::Reliable,
             ..unsaid
         }
     );
 }
 
 #[test]
-fn a_participant_that_tells_little_has_what_each_must_have() {
+fn omitted_participant_parameters_have_defaults() {
     let told =
         ParticipantData::from_payload(&list("5000 1000 01100001 02030405 06070809 000001c1"))
             .expect("one");
@@ -272,7 +275,7 @@ fn a_participant_that_tells_little_has_what_each_must_have() {
 
 #[test]
 fn the_other_byte_order_is_read() {
-    let told = bytes(
+    let told = parse_hex(
         "00020000 0015 0004 02020000 0016 0004 01100000 0050 0010 01100001 02030405 06070809 000001c1
          0032 0018 00000001 00001cf2 00000000 00000000 00000000 7f000001 0002 0008 0000000a 80000000
          0058 0004 00000c3f 002c 0010 0000000b 656e636c 6176653d 2f3b3b00 0001 0000",
@@ -283,7 +286,7 @@ fn the_other_byte_order_is_read() {
         ([2, 2], VendorId::CYCLONE, 0xc3f)
     );
     assert_eq!(
-        told.discovery[0].udp(),
+        told.discovery[0].udp_address(),
         Some(SocketAddr::from(([127, 0, 0, 1], 7410)))
     );
     assert_eq!(told.lease, Some(Duration::from_millis(10_500)));
@@ -291,7 +294,7 @@ fn the_other_byte_order_is_read() {
 }
 
 #[test]
-fn what_must_be_understood_is_said_when_it_is_not() {
+fn unknown_parameters_that_must_be_understood_are_an_error() {
     let unknown = |parameter: &str| {
         EndpointData::from_payload(&list(&format!("{ENDPOINT} {parameter}"))).err()
     };
@@ -300,21 +303,21 @@ fn what_must_be_understood_is_said_when_it_is_not() {
         unknown("0042 0400 00000000"),
         Some(WireError::NotUnderstood(0x4200))
     );
-    // A reliability of kind 7; a list that does not end; no topic; another serialization.
+    // Reliability of kind 7; missing sentinel; missing topic; another serialization.
     assert_eq!(
         unknown("1a00 0c00 07000000 00000000 00000000"),
         Some(WireError::Value(0x1a))
     );
-    let cut = EndpointData::from_payload(&bytes(&format!("00030000 {ENDPOINT}")));
+    let cut = EndpointData::from_payload(&parse_hex(&format!("00030000 {ENDPOINT}")));
     assert_eq!(cut, Err(WireError::Short));
     let nameless = EndpointData::from_payload(&list(&ENDPOINT[..45]));
     assert_eq!(nameless, Err(WireError::Missing(0x05)));
-    let plain = EndpointData::from_payload(&bytes("00010000 01000000"));
+    let plain = EndpointData::from_payload(&parse_hex("00010000 01000000"));
     assert_eq!(plain, Err(WireError::Serialization(1)));
 }
 
 #[test]
-fn a_participant_of_a_part_of_the_domain_is_another_ones() {
+fn a_participant_with_a_domain_tag_is_rejected() {
     let participant = "5000 1000 01100001 02030405 06070809 000001c1";
     let tagged = |tag: &str| {
         ParticipantData::from_payload(&list(&format!("{participant} 1440 0800 {tag}"))).err()
@@ -346,7 +349,7 @@ fn locators_are_kept_up_to_a_number() {
 }
 
 #[test]
-fn what_is_too_long_for_a_parameter_is_left_out() {
+fn values_too_long_for_a_parameter_are_omitted() {
     let told = |length| ParticipantData {
         prefix: GuidPrefix([1; 12]),
         vendor: VendorId::OURS,

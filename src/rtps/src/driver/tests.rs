@@ -1,4 +1,4 @@
-//! Whose process has ended is gone at once, where somebody says that one has.
+//! A participant whose process has ended disappears immediately if somebody reports it.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::os::unix::net::UnixDatagram;
@@ -10,21 +10,21 @@ use tokio::net::UdpSocket;
 use tokio::time::timeout;
 
 use super::*;
-use crate::{Config, Participant, Place};
+use crate::{Config, NetworkNamespace, Participant};
 
 /// The network namespace of this process.
-struct Here;
+struct HostNamespace;
 
 #[async_trait]
-impl Place for Here {
-    async fn datagrams(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
+impl NetworkNamespace for HostNamespace {
+    async fn bind_udp(&self, address: SocketAddr, shared: bool) -> io::Result<UdpSocket> {
         let socket = Socket::new(Domain::IPV4, Type::DGRAM.nonblocking(), None)?;
         socket.set_reuse_address(shared)?;
         socket.bind(&address.into())?;
         UdpSocket::from_std(socket.into())
     }
 
-    async fn diagnostics(&self) -> io::Result<Option<OwnedFd>> {
+    async fn open_diagnostics(&self) -> io::Result<Option<OwnedFd>> {
         // AF_NETLINK and NETLINK_SOCK_DIAG.
         let socket = Socket::new(Domain::from(16), Type::DGRAM, Some(Protocol::from(4)))?;
         Ok(Some(socket.into()))
@@ -32,15 +32,15 @@ impl Place for Here {
 }
 
 const HOUR: Duration = Duration::from_secs(3600);
-/// Only bounds how long a failing test takes.
+/// Only limits the duration of a failing test.
 const LONG: Duration = Duration::from_secs(60);
 
-/// A domain that no other test of this process uses; those of `tests/loopback.rs` are above.
+/// Returns a domain that no other test of this process uses; those of `tests/loopback.rs` are higher.
 fn domain() -> u16 {
     (std::process::id() % 90) as u16
 }
 
-/// Between sockets of UDP on one machine there is always room: what a receiver does not take is lost.
+/// Between UDP sockets on one machine there is always room: what a receiver does not accept is lost.
 #[tokio::test]
 async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
     let (sender, receiver) = UnixDatagram::pair().expect("two sockets");
@@ -49,7 +49,7 @@ async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
     while sender.send(&[0; 512]).is_ok() {
         sent += 1;
     }
-    let mut room = std::pin::pin!(room(&sender));
+    let mut room = std::pin::pin!(wait_writable(&sender));
     let at_once = std::future::poll_fn(|context| Poll::Ready(room.as_mut().poll(context)));
     assert!(at_once.await.is_pending(), "there is none");
     for _ in 0..sent {
@@ -60,12 +60,12 @@ async fn room_for_a_datagram_is_awaited_until_its_receiver_has_taken_some() {
 }
 
 async fn join() -> Participant {
-    // Where others look for it: it is seen to come.
+    // At a well-known port, where others detect it.
     let config = Config {
         well_known: true,
         ..Config::new(domain(), "test")
     };
-    Participant::join_looking(Arc::new(Here), config, HOUR)
+    Participant::join_with_port_interval(Arc::new(HostNamespace), config, HOUR)
         .await
         .expect("a participant")
 }
@@ -74,16 +74,16 @@ async fn join() -> Participant {
 async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
     let (here, killed) = (join().await, join().await);
     let prefix = killed.guid().prefix;
-    let mut discovered = here.discovered();
+    let mut discovered = here.watch_discovered();
     let known = discovered.wait_for(|all| all.participants.contains_key(&prefix));
     let at = {
         let known = timeout(LONG, known).await.expect("in time");
         let known = known.expect("it runs");
         known.participants[&prefix].discovery[0]
-            .udp()
+            .udp_address()
             .expect("an address")
     };
-    // Its sockets are closed without a word.
+    // Its sockets are closed without a farewell.
     drop(killed);
     let at = SocketAddr::from((Ipv4Addr::UNSPECIFIED, at.port()));
     let closed = async {
@@ -93,12 +93,12 @@ async fn who_is_killed_is_gone_at_once_when_somebody_says_so() {
     };
     timeout(LONG, closed).await.expect("its port is free");
     let there = || {
-        here.discovered()
+        here.watch_discovered()
             .borrow()
             .participants
             .contains_key(&prefix)
     };
     assert!(there(), "nobody has looked");
-    here.look_at_ports();
+    here.check_ports();
     assert!(!there());
 }

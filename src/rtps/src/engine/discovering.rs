@@ -1,4 +1,4 @@
-//! Who is there: participants announce themselves (8.5.3), and their ends to those that they know (8.5.4).
+//! Discovery: participants announce themselves (8.5.3), and their endpoints to known participants (8.5.4).
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, SocketAddr};
@@ -8,34 +8,34 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use tokio::sync::watch;
 
-use super::servers::{SPARE, Via};
-use super::{Datagram, Engine, LocalReader, LocalWriter, Remote};
+use super::servers::{DiscoverySource, SPARE};
+use super::{Datagram, Engine, LocalReader, LocalWriter, RemoteParticipant};
 use crate::discovery::{self, EndpointData, ParticipantData};
-use crate::participant::{Discovered, Sample};
+use crate::participant::{DiscoveredGraph, ReceivedSample};
 use crate::reader::ReaderState;
 use crate::wire::{self, InlineQos};
-use crate::writer::{Change, WriterState};
+use crate::writer::{CacheChange, WriterState};
 use crate::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
-/// The first pause between two announcements; each is twice as long as the one before.
+/// First pause between two announcements; each pause is twice as long as the one before.
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(20);
-/// Announcements never come more seldom: a third of the lease that is told.
+/// Longest pause between two announcements: a third of the announced lease duration.
 pub(super) const LAST_PAUSE: Duration = Duration::from_secs(3);
-/// How often a newcomer's port is told of us: its socket may be there before whoever reads it.
+/// Pause before an announcement is repeated to a newcomer, whose port may be bound before anybody reads it.
 const TOLD_AGAIN: Duration = Duration::from_millis(50);
-/// More participants, and more ends of each, are not kept.
+/// Maximum number of participants and of endpoints that are kept.
 pub(super) const MOST_PARTICIPANTS: usize = 256;
 pub(super) const MOST_ENDS: usize = 16_384;
-/// Ends that were taken back are told to newcomers, but not for ever.
+/// Maximum number of disposals of endpoints kept for newcomers.
 const MOST_WITHDRAWN: usize = 64;
 
 pub(super) const DISPOSED: u32 = InlineQos::DISPOSED | InlineQos::UNREGISTERED;
 
-/// The pair of ends by which a server of discovery and its clients announce participants.
+/// Writer and reader with which a discovery server and its clients announce participants.
 pub(super) const PARTICIPANTS: (EntityId, EntityId) =
     (EntityId::SPDP_WRITER, EntityId::SPDP_READER);
 
-/// The pairs of ends by which ends are announced: who writes, and who reads.
+/// Writers and readers with which endpoints are announced.
 pub(super) const ANNOUNCERS: [(EntityId, EntityId); 2] = [
     (EntityId::PUBLICATIONS_WRITER, EntityId::PUBLICATIONS_READER),
     (
@@ -44,22 +44,22 @@ pub(super) const ANNOUNCERS: [(EntityId, EntityId); 2] = [
     ),
 ];
 
-/// Bits of `PID_BUILTIN_ENDPOINT_SET`: who announces ends, and who hears of them (9.3.2.12).
+/// Bits of `PID_BUILTIN_ENDPOINT_SET` for the writers and the readers of endpoint announcements (9.3.2.12).
 pub(super) const ANNOUNCES: [u32; 2] = [1 << 2, 1 << 4];
 pub(super) const HEARS: [u32; 2] = [1 << 3, 1 << 5];
-/// What our participants have.
+/// Built-in endpoints of our participants.
 pub(crate) const BUILTIN: u32 = 0x3f;
 
 impl Engine {
-    pub(super) fn add_builtin_ends(&mut self) {
+    pub(super) fn add_builtin_endpoints(&mut self) {
         for pair in ANNOUNCERS {
             self.add_builtin_pair(pair);
         }
     }
 
-    /// Who announces something, and who hears of it.
+    /// Adds a built-in writer and the corresponding reader.
     pub(super) fn add_builtin_pair(&mut self, (writer, reader): (EntityId, EntityId)) {
-        let own = builtin(self.own.prefix, writer);
+        let own = builtin_endpoint(self.own.prefix, writer);
         self.writers.insert(
             writer,
             LocalWriter {
@@ -68,7 +68,10 @@ impl Engine {
                 leaves: None,
             },
         );
-        let state = ReaderState::new(builtin(self.own.prefix, reader), self.bounds.clone());
+        let state = ReaderState::new(
+            builtin_endpoint(self.own.prefix, reader),
+            self.bounds.clone(),
+        );
         self.readers.insert(
             reader,
             LocalReader {
@@ -79,22 +82,27 @@ impl Engine {
         );
     }
 
-    // ---- announcing ourselves
+    // ---- local participant
 
-    /// Announces this participant where it is due, and lets those go of whom nothing was heard; when to come back.
+    /// Sends announcements that are due and removes participants whose lease has expired; returns the time of the next
+    /// call.
     pub(super) fn tick_discovery(&mut self, now: Instant) -> Instant {
         if self.announce_at <= now && !self.closed {
-            self.predecessors.tidy(now);
+            self.predecessors.remove_expired(now);
             self.announce();
-            self.ask_silent(now);
+            self.ping_silent(now);
             self.announce_at = now + self.announce_pause;
             self.announce_pause = (self.announce_pause * 2).min(self.longest_pause());
         }
-        let gone = |remote: &Remote| {
+        let gone = |remote: &RemoteParticipant| {
             let silent = |since: Instant| now.saturating_duration_since(since);
             remote.data.lease.is_some_and(|lease| match remote.via {
-                Via::Itself(_) | Via::Named(_) => silent(remote.heard) > lease,
-                Via::Servers => remote.asked.is_some_and(|at| silent(at) > lease + SPARE),
+                DiscoverySource::Itself(_) | DiscoverySource::Named(_) => {
+                    silent(remote.heard) > lease
+                }
+                DiscoverySource::Servers => {
+                    remote.asked.is_some_and(|at| silent(at) > lease + SPARE)
+                }
             })
         };
         let silent: Vec<GuidPrefix> = self
@@ -104,12 +112,12 @@ impl Engine {
             .map(|(prefix, _)| *prefix)
             .collect();
         for prefix in silent {
-            self.participant_gone(prefix);
+            self.remove_participant(prefix);
         }
         self.announce_at.min(now + LAST_PAUSE)
     }
 
-    /// Announces more often for a while: somebody may have come.
+    /// Announces more often for a while, because a participant may have appeared.
     pub(super) fn announce_soon(&mut self, now: Instant) {
         self.announce_pause = FIRST_PAUSE;
         self.announce_at = self.announce_at.min(now + TOLD_AGAIN);
@@ -137,14 +145,14 @@ impl Engine {
             .filter(|(to, _)| told.insert(*to))
             .collect();
         for (to, prefix) in all {
-            self.announce_to(to, prefix);
+            self.send_announcement(to, prefix);
         }
     }
 
-    /// Tells a participant, or whoever hears it there, of this one.
-    pub(super) fn announce_to(&mut self, to: SocketAddr, prefix: GuidPrefix) {
-        // First, so that nobody sees both at a time.
-        self.say_goodbye_of_predecessors(to, prefix);
+    /// Announces this participant to another one, or to whoever listens at the address.
+    pub(super) fn send_announcement(&mut self, to: SocketAddr, prefix: GuidPrefix) {
+        // Sent first, so that nobody sees both at the same time.
+        self.dispose_predecessors(to, prefix);
         self.announcements += 1;
         let data = wire::Data {
             reader: EntityId::SPDP_READER,
@@ -154,11 +162,11 @@ impl Engine {
             payload: Some(self.own.to_bytes()),
             key_only: false,
         };
-        self.tell_of(self.own.prefix, to, prefix, &data);
+        self.send_participant_data(self.own.prefix, to, prefix, &data);
     }
 
-    /// Says to them that a participant is gone: this one, or one that cannot say it any more.
-    pub(super) fn say_gone(
+    /// Announces that a participant is gone: this one, or a predecessor that cannot do so any more.
+    pub(super) fn send_disposal(
         &mut self,
         gone: GuidPrefix,
         number: SequenceNumber,
@@ -175,13 +183,13 @@ impl Engine {
                 status: DISPOSED,
                 key_hash: Some(guid.bytes()),
             },
-            payload: Some(discovery::key(guid)),
+            payload: Some(discovery::key_payload(guid)),
             key_only: true,
         };
-        self.tell_of(gone, to, prefix, &data);
+        self.send_participant_data(gone, to, prefix, &data);
     }
 
-    fn tell_of(
+    fn send_participant_data(
         &mut self,
         whose: GuidPrefix,
         to: SocketAddr,
@@ -194,10 +202,10 @@ impl Engine {
         }
         writer.timestamp(std::time::SystemTime::now().into());
         writer.data(data);
-        self.control.push_back(Datagram::whole(to, writer));
+        self.control.push_back(Datagram::from_writer(to, writer));
     }
 
-    pub(super) fn say_goodbye(&mut self, now: Instant) {
+    pub(super) fn announce_departure(&mut self, now: Instant) {
         if self.is_client() {
             self.leave_servers(now);
             return;
@@ -210,14 +218,14 @@ impl Engine {
         for (to, prefix) in known {
             self.announcements += 1;
             let number = SequenceNumber(self.announcements);
-            self.say_gone(self.own.prefix, number, to, prefix);
+            self.send_disposal(self.own.prefix, number, to, prefix);
         }
     }
 
-    // ---- others
+    // ---- remote participants
 
-    /// A participant announces itself, from this address.
-    pub(super) fn participant_heard(
+    /// Handles an announcement received from this address.
+    pub(super) fn on_participant_data(
         &mut self,
         now: Instant,
         from: GuidPrefix,
@@ -226,9 +234,9 @@ impl Engine {
     ) {
         if data.inline.status != 0 {
             if let Some(guid) = discovery::guid_of_key(data) {
-                self.participant_gone(guid.prefix);
+                self.remove_participant(guid.prefix);
             } else {
-                self.participant_gone(from);
+                self.remove_participant(from);
             }
             return;
         }
@@ -248,24 +256,29 @@ impl Engine {
         }
         if let Some(remote) = self.remotes.get_mut(&from) {
             remote.heard = now;
-            remote.via = Via::Itself(source);
+            remote.via = DiscoverySource::Itself(source);
         }
-        self.participant_told(now, Via::Itself(source), told);
+        self.update_participant(now, DiscoverySource::Itself(source), told);
     }
 
-    /// Something came from one of the protocol's own writers.
-    pub(super) fn announced(&mut self, now: Instant, reader: EntityId, sample: &Sample) {
+    /// Handles a sample of a built-in writer.
+    pub(super) fn on_announcement(
+        &mut self,
+        now: Instant,
+        reader: EntityId,
+        sample: &ReceivedSample,
+    ) {
         if reader == EntityId::SPDP_READER {
-            self.server_tells(now, sample);
+            self.on_server_data(now, sample);
         } else {
-            self.end_heard(now, reader, sample);
+            self.on_endpoint_data(now, reader, sample);
         }
     }
 
-    /// An end, or that one is gone.
-    fn end_heard(&mut self, now: Instant, reader: EntityId, sample: &Sample) {
+    /// Handles the announcement or disposal of an endpoint.
+    fn on_endpoint_data(&mut self, now: Instant, reader: EntityId, sample: &ReceivedSample) {
         if let Some(gone) = sample.withdrawn {
-            self.end_gone(gone);
+            self.on_endpoint_lost(gone);
             return;
         }
         let told = match EndpointData::from_payload(&sample.payload) {
@@ -284,33 +297,33 @@ impl Engine {
         if !fits {
             return;
         }
-        let Discovered {
+        let DiscoveredGraph {
             writers, readers, ..
         } = &self.discovered;
         let known = writers.contains_key(&told.guid) || readers.contains_key(&told.guid);
         if !known && writers.len() + readers.len() >= MOST_ENDS {
             if !std::mem::replace(&mut self.crowded, true) {
                 tracing::warn!(
-                    "more than {MOST_ENDS} DDS writers and readers; that of topic {} is not heard, nor are others",
+                    "more than {MOST_ENDS} DDS writers and readers; that of topic {} and further ones are ignored",
                     told.topic
                 );
             }
             return;
         }
-        self.end_came(now, Arc::new(told));
+        self.on_endpoint_discovered(now, Arc::new(told));
     }
 
-    // ---- our ends
+    // ---- local endpoints
 
-    pub(super) fn announce_end(&mut self, now: Instant, own: &EndpointData) {
-        self.announce_as(now, own.guid.entity, own.to_bytes());
+    pub(super) fn announce_endpoint(&mut self, now: Instant, own: &EndpointData) {
+        self.publish_announcement(now, own.guid.entity, own.to_bytes());
     }
 
-    /// Announces an end of ours, or the participant.
-    pub(super) fn announce_as(&mut self, now: Instant, entity: EntityId, payload: Bytes) {
-        let announcer = announcer(entity);
-        let number = self.publish(now, announcer, Engine::change_of_announcement(payload));
-        // Of what was announced before, newcomers need the last word alone.
+    /// Publishes the announcement of a local endpoint or of the participant.
+    pub(super) fn publish_announcement(&mut self, now: Instant, entity: EntityId, payload: Bytes) {
+        let announcer = announcing_writer(entity);
+        let number = self.publish(now, announcer, Engine::announcement_change(payload));
+        // Newcomers need only the latest announcement.
         if let Some(before) = self.announced.insert(entity, number) {
             if let Some(writer) = self.writers.get_mut(&announcer) {
                 writer.state.forget(before);
@@ -319,16 +332,16 @@ impl Engine {
         self.wake(now);
     }
 
-    pub(super) fn withdraw_end(&mut self, now: Instant, entity: EntityId) {
+    pub(super) fn withdraw_endpoint(&mut self, now: Instant, entity: EntityId) {
         let Some(number) = self.announced.remove(&entity) else {
             return;
         };
-        let announcer = announcer(entity);
+        let announcer = announcing_writer(entity);
         let guid = Guid::new(self.own.prefix, entity);
-        let change = Change {
+        let change = CacheChange {
             status: DISPOSED,
             key: Some(guid.bytes()),
-            ..Engine::change_of_announcement(discovery::key(guid))
+            ..Engine::announcement_change(discovery::key_payload(guid))
         };
         let withdrawal = self.publish(now, announcer, change);
         self.withdrawn.push_back((announcer, withdrawal));
@@ -344,7 +357,7 @@ impl Engine {
     }
 }
 
-fn announcer(entity: EntityId) -> EntityId {
+fn announcing_writer(entity: EntityId) -> EntityId {
     if entity == EntityId::PARTICIPANT {
         EntityId::SPDP_WRITER
     } else if entity.is_writer() {
@@ -354,8 +367,8 @@ fn announcer(entity: EntityId) -> EntityId {
     }
 }
 
-/// One of the protocol's own ends.
-pub(super) fn builtin(prefix: GuidPrefix, entity: EntityId) -> EndpointData {
+/// Returns the data of a built-in endpoint.
+pub(super) fn builtin_endpoint(prefix: GuidPrefix, entity: EntityId) -> EndpointData {
     EndpointData {
         guid: Guid::new(prefix, entity),
         topic: String::new(),

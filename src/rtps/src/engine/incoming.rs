@@ -1,4 +1,4 @@
-//! What comes in: datagrams, each submessage to the ends that it is for.
+//! Received datagrams: passes each submessage to the endpoints that it is for.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -8,23 +8,23 @@ use bytes::Bytes;
 
 use super::{Engine, LocalReader};
 use crate::discovery;
-use crate::participant::Sample;
-use crate::wire::{self, Received, Submessage};
-use crate::writer::Wanted;
+use crate::participant::ReceivedSample;
+use crate::wire::{self, ReceivedSubmessage, Submessage};
+use crate::writer::SendRequests;
 use crate::{EntityId, Guid, GuidPrefix};
 
 impl Engine {
-    /// Takes a datagram that came from this address.
+    /// Handles a datagram received from this address.
     pub fn receive(&mut self, now: Instant, source: IpAddr, datagram: &Bytes) {
         if self.alone {
             return;
         }
         let parsed = wire::parse(datagram);
         if let Some(fault) = parsed.fault {
-            tracing::trace!(%fault, "a datagram of RTPS was not read to its end");
+            tracing::trace!(%fault, "an RTPS datagram was not read completely");
         }
         for received in parsed.received {
-            // Whoever says anything is there.
+            // Any message shows that the sender is alive.
             if let Some(remote) = self.remotes.get_mut(&received.from) {
                 remote.heard = now;
                 remote.asked = None;
@@ -36,11 +36,11 @@ impl Engine {
                 self.receive_submessage(now, source, received);
             }
         }
-        self.tell();
+        self.publish_changes();
     }
 
-    fn receive_submessage(&mut self, now: Instant, source: IpAddr, received: Received) {
-        let Received {
+    fn receive_submessage(&mut self, now: Instant, source: IpAddr, received: ReceivedSubmessage) {
+        let ReceivedSubmessage {
             from,
             vendor: _,
             written,
@@ -49,20 +49,20 @@ impl Engine {
         } = received;
         match submessage {
             Submessage::Data(data) if data.writer == EntityId::SPDP_WRITER && !self.is_client() => {
-                self.participant_heard(now, from, source, &data)
+                self.on_participant_data(now, from, source, &data)
             }
             Submessage::Data(data) => {
                 if data.writer == EntityId::SPDP_WRITER {
-                    self.server_heard(now, from, source, &data);
+                    self.on_server_announcement(now, from, source, &data);
                 }
                 let writer = Guid::new(from, data.writer);
                 let withdrawn = (data.inline.status != 0)
                     .then(|| discovery::guid_of_key(&data))
                     .flatten();
                 let is_sample = data.payload.is_some() && !data.key_only && data.inline.status == 0;
-                self.for_readers(now, data.reader, writer, |reader, out| {
+                self.deliver_to_readers(now, data.reader, writer, |reader, out| {
                     if is_sample || (reader.sink.is_none() && withdrawn.is_some()) {
-                        let sample = Sample {
+                        let sample = ReceivedSample {
                             payload: data.payload.clone().unwrap_or_default(),
                             writer,
                             number: data.number,
@@ -70,9 +70,9 @@ impl Engine {
                             written,
                             withdrawn,
                         };
-                        reader.state.data(now, writer, sample, out)
+                        reader.state.on_data(now, writer, sample, out)
                     } else {
-                        reader.state.nothing(writer, data.number, out);
+                        reader.state.skip_sample(writer, data.number, out);
                         false
                     }
                 });
@@ -80,37 +80,37 @@ impl Engine {
             Submessage::DataFrag(frag) => {
                 let writer = Guid::new(from, frag.writer);
                 if !frag.key_only {
-                    self.for_readers(now, frag.reader, writer, |reader, out| {
-                        reader.state.data_frag(now, writer, &frag, written, out)
+                    self.deliver_to_readers(now, frag.reader, writer, |reader, out| {
+                        reader.state.on_data_frag(now, writer, &frag, written, out)
                     });
                 }
             }
             Submessage::Heartbeat(beat) => {
                 let writer = Guid::new(from, beat.writer);
-                self.for_readers(now, beat.reader, writer, |reader, out| {
-                    reader.state.heartbeat(now, writer, &beat, out)
+                self.deliver_to_readers(now, beat.reader, writer, |reader, out| {
+                    reader.state.on_heartbeat(now, writer, &beat, out)
                 });
             }
             Submessage::HeartbeatFrag(beat) => {
                 let writer = Guid::new(from, beat.writer);
-                self.for_readers(now, beat.reader, writer, |reader, _| {
-                    reader.state.heartbeat_frag(now, writer, &beat);
+                self.deliver_to_readers(now, beat.reader, writer, |reader, _| {
+                    reader.state.on_heartbeat_frag(now, writer, &beat);
                     false
                 });
             }
             Submessage::Gap(gap) => {
                 let writer = Guid::new(from, gap.writer);
-                self.for_readers(now, gap.reader, writer, |reader, out| {
-                    reader.state.gap(writer, &gap, out);
+                self.deliver_to_readers(now, gap.reader, writer, |reader, out| {
+                    reader.state.on_gap(writer, &gap, out);
                     false
                 });
             }
             Submessage::AckNack(ack) => {
-                let mut wanted = Wanted::default();
+                let mut wanted = SendRequests::default();
                 let reader = Guid::new(from, ack.reader);
-                self.server_acknowledges(now, reader, ack.writer, &ack.set);
+                self.on_server_acknack(now, reader, ack.writer, &ack.set);
                 if let Some(writer) = self.writers.get_mut(&ack.writer) {
-                    if writer.state.acknack(
+                    if writer.state.on_acknack(
                         now,
                         reader,
                         &ack.set,
@@ -120,16 +120,16 @@ impl Engine {
                     ) {
                         self.changed_ends.insert(ack.writer);
                     }
-                    let ask_at = writer.state.ask_at();
+                    let ask_at = writer.state.next_heartbeat_at();
                     self.enqueue(ack.writer, wanted);
                     self.tick_at = self.tick_at.min(ask_at.unwrap_or(self.tick_at));
                 }
             }
             Submessage::NackFrag(nack) => {
-                let mut wanted = Wanted::default();
+                let mut wanted = SendRequests::default();
                 let reader = Guid::new(from, nack.reader);
                 if let Some(writer) = self.writers.get_mut(&nack.writer) {
-                    writer.state.nack_frag(
+                    writer.state.on_nack_frag(
                         now,
                         reader,
                         nack.number,
@@ -143,14 +143,14 @@ impl Engine {
         }
     }
 
-    /// Has one reader, or all for `UNKNOWN`, take something of a writer. What `take` says is whether that shows for the first
-    /// time that the writer knows the reader.
-    fn for_readers(
+    /// Passes something from a writer to one reader, or to all for `UNKNOWN`. `take` returns whether it shows for the
+    /// first time that the writer knows the reader.
+    fn deliver_to_readers(
         &mut self,
         now: Instant,
         entity: EntityId,
         writer: Guid,
-        mut take: impl FnMut(&mut LocalReader, &mut Vec<Sample>) -> bool,
+        mut take: impl FnMut(&mut LocalReader, &mut Vec<ReceivedSample>) -> bool,
     ) {
         let mut announcements = Vec::new();
         let mut due = self.tick_at;
@@ -176,7 +176,7 @@ impl Engine {
         }
         self.tick_at = due;
         for (entity, sample) in announcements {
-            self.announced(now, entity, &sample);
+            self.on_announcement(now, entity, &sample);
         }
     }
 }

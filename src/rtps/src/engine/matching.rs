@@ -1,4 +1,4 @@
-//! Which of our ends pass samples with which of others: those of one topic and one type whose quality of service fits (8.4.15).
+//! Matching of local and remote endpoints: same topic, same type and compatible QoS (8.4.15).
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -6,14 +6,14 @@ use std::time::Instant;
 
 use super::Engine;
 use crate::discovery::EndpointData;
-use crate::participant::Ends;
+use crate::participant::EndpointMatches;
 use crate::qos::Mismatch;
-use crate::writer::Wanted;
+use crate::writer::SendRequests;
 use crate::{EntityId, Guid};
 
 impl Engine {
-    /// Another participant's end is there, or has changed.
-    pub(super) fn end_came(&mut self, now: Instant, told: Arc<EndpointData>) {
+    /// Handles a new or changed remote endpoint.
+    pub(super) fn on_endpoint_discovered(&mut self, now: Instant, told: Arc<EndpointData>) {
         let guid = told.guid;
         let known = if guid.entity.is_writer() {
             &mut self.discovered.writers
@@ -32,7 +32,7 @@ impl Engine {
             let ours: Vec<EntityId> = self
                 .readers
                 .iter()
-                .filter(|(_, reader)| same(&reader.state.own, &told))
+                .filter(|(_, reader)| is_same_topic(&reader.state.own, &told))
                 .map(|(entity, _)| *entity)
                 .collect();
             for entity in ours {
@@ -42,7 +42,7 @@ impl Engine {
             let ours: Vec<EntityId> = self
                 .writers
                 .iter()
-                .filter(|(_, writer)| same(&writer.state.own, &told))
+                .filter(|(_, writer)| is_same_topic(&writer.state.own, &told))
                 .map(|(entity, _)| *entity)
                 .collect();
             for entity in ours {
@@ -51,7 +51,7 @@ impl Engine {
         }
     }
 
-    pub(super) fn end_gone(&mut self, guid: Guid) {
+    pub(super) fn on_endpoint_lost(&mut self, guid: Guid) {
         let known = if guid.entity.is_writer() {
             &mut self.discovered.writers
         } else {
@@ -77,7 +77,7 @@ impl Engine {
                 .refused
                 .iter()
                 .any(|(end, _)| end.guid == guid);
-            if reader.state.unmatched(guid) || refused {
+            if reader.state.remove_writer(guid) || refused {
                 changed_ends.insert(*entity);
             }
         }
@@ -88,7 +88,7 @@ impl Engine {
                 .refused
                 .iter()
                 .any(|(end, _)| end.guid == guid);
-            if writer.state.unmatched(guid) || refused {
+            if writer.state.remove_reader(guid) || refused {
                 changed_ends.insert(*entity);
             }
         }
@@ -106,7 +106,7 @@ impl Engine {
             .discovered
             .readers
             .values()
-            .filter(|end| same(&own, end))
+            .filter(|end| is_same_topic(&own, end))
             .cloned()
             .collect();
         for end in theirs {
@@ -126,7 +126,7 @@ impl Engine {
             .discovered
             .writers
             .values()
-            .filter(|end| same(&own, end))
+            .filter(|end| is_same_topic(&own, end))
             .cloned()
             .collect();
         for end in theirs {
@@ -134,47 +134,50 @@ impl Engine {
         }
     }
 
-    /// A writer of ours meets a reader.
+    /// Matches a local writer with a reader.
     fn match_writer(&mut self, now: Instant, entity: EntityId, reader: &Arc<EndpointData>) {
-        let Some(address) = self.address(reader) else {
+        let Some(address) = self.endpoint_address(reader) else {
             return;
         };
         self.changed_ends.insert(entity);
-        let mut wanted = Wanted::default();
+        let mut wanted = SendRequests::default();
         if let Some(ours) = self.writers.get_mut(&entity) {
             if ours.state.own.qos.mismatches(&reader.qos).is_empty() {
                 ours.state
-                    .matched(now, Arc::clone(reader), address, &mut wanted);
+                    .add_reader(now, Arc::clone(reader), address, &mut wanted);
             }
         }
         self.enqueue(entity, wanted);
         self.wake(now);
     }
 
-    /// A reader of ours meets a writer.
+    /// Matches a local reader with a writer.
     fn match_reader(&mut self, now: Instant, entity: EntityId, writer: &Arc<EndpointData>) {
-        let Some(address) = self.address(writer) else {
+        let Some(address) = self.endpoint_address(writer) else {
             return;
         };
         let vendor = self.vendor_of(writer.guid.prefix);
         self.changed_ends.insert(entity);
         if let Some(ours) = self.readers.get_mut(&entity) {
             if writer.qos.mismatches(&ours.state.own.qos).is_empty() {
-                ours.state.matched(now, Arc::clone(writer), address, vendor);
+                ours.state
+                    .add_writer(now, Arc::clone(writer), address, vendor);
             }
         }
         self.wake(now);
     }
 
-    /// Where an end of another participant receives.
-    fn address(&self, end: &EndpointData) -> Option<SocketAddr> {
+    /// Returns the address at which a remote endpoint receives.
+    fn endpoint_address(&self, end: &EndpointData) -> Option<SocketAddr> {
         let remote = self.remotes.get(&end.guid.prefix)?;
-        let own = self.network.choose(&end.unicast, Some(remote.user.ip()));
+        let own = self
+            .network
+            .choose_address(&end.unicast, Some(remote.user.ip()));
         Some(own.unwrap_or(remote.user))
     }
 
-    /// Tells whoever waits what has changed since the last time.
-    pub(super) fn tell(&mut self) {
+    /// Publishes to the watchers what has changed since the last call.
+    pub(super) fn publish_changes(&mut self) {
         for entity in std::mem::take(&mut self.changed_ends) {
             if let Some(writer) = self.writers.get(&entity) {
                 let refused = |end: &Arc<EndpointData>| writer.state.own.qos.mismatches(&end.qos);
@@ -182,20 +185,24 @@ impl Engine {
                     .discovered
                     .readers
                     .values()
-                    .filter(|end| same(&writer.state.own, end));
-                writer
-                    .ends
-                    .send_replace(Arc::new(ends(writer.state.readers(), theirs, refused)));
+                    .filter(|end| is_same_topic(&writer.state.own, end));
+                writer.ends.send_replace(Arc::new(collect_matches(
+                    writer.state.readers(),
+                    theirs,
+                    refused,
+                )));
             } else if let Some(reader) = self.readers.get(&entity) {
                 let refused = |end: &Arc<EndpointData>| end.qos.mismatches(&reader.state.own.qos);
                 let theirs = self
                     .discovered
                     .writers
                     .values()
-                    .filter(|end| same(&reader.state.own, end));
-                reader
-                    .ends
-                    .send_replace(Arc::new(ends(reader.state.writers(), theirs, refused)));
+                    .filter(|end| is_same_topic(&reader.state.own, end));
+                reader.ends.send_replace(Arc::new(collect_matches(
+                    reader.state.writers(),
+                    theirs,
+                    refused,
+                )));
             }
         }
         if std::mem::take(&mut self.discovered_changed) {
@@ -205,12 +212,12 @@ impl Engine {
     }
 }
 
-fn ends<'a>(
+fn collect_matches<'a>(
     matched: impl Iterator<Item = (&'a Arc<EndpointData>, bool)>,
     theirs: impl Iterator<Item = &'a Arc<EndpointData>>,
     mismatches: impl Fn(&Arc<EndpointData>) -> Vec<Mismatch>,
-) -> Ends {
-    let mut ends = Ends::default();
+) -> EndpointMatches {
+    let mut ends = EndpointMatches::default();
     for (end, confirmed) in matched {
         ends.matched.push(Arc::clone(end));
         ends.confirmed.extend(confirmed.then_some(end.guid));
@@ -222,7 +229,7 @@ fn ends<'a>(
     ends
 }
 
-/// Whether two ends speak of the same.
-fn same(ours: &EndpointData, theirs: &EndpointData) -> bool {
+/// Returns whether two endpoints have the same topic and type.
+fn is_same_topic(ours: &EndpointData, theirs: &EndpointData) -> bool {
     ours.topic == theirs.topic && ours.type_name == theirs.type_name
 }

@@ -1,15 +1,15 @@
-//! Networks of this machine that come and go while it takes part.
+//! Changes of this machine's network interfaces at run time.
 
 use std::time::Instant;
 
 use super::Engine;
-use super::servers::Via;
+use super::servers::DiscoverySource;
 use crate::GuidPrefix;
 use crate::locator::Locator;
-use crate::network::Network;
+use crate::network::InterfaceSet;
 
 impl Engine {
-    /// The ports at which this participant hears of others, and at which its ends receive.
+    /// Returns the ports for discovery data and for samples of this participant.
     pub(super) fn own_ports(&self) -> (u16, u16) {
         let port = |locators: &[Locator]| {
             let first = locators.first();
@@ -18,9 +18,9 @@ impl Engine {
         (port(&self.own.discovery), port(&self.own.user))
     }
 
-    /// The interfaces of this machine are others now: others are told where we are, and those whose network
-    /// is gone are sent to elsewhere, where they are elsewhere, too.
-    pub fn network_changed(&mut self, now: Instant, network: Network) {
+    /// Sets the current interfaces of this machine. Our new locators are announced, and participants whose network is
+    /// gone are reached at another address, if they have one.
+    pub fn set_network(&mut self, now: Instant, network: InterfaceSet) {
         if network == self.network {
             return;
         }
@@ -36,32 +36,34 @@ impl Engine {
             if self.is_client() {
                 self.announce_self(now);
             }
-            self.announce_ends_again(now);
+            self.reannounce_endpoints(now);
         }
         let moved: Vec<GuidPrefix> = self
             .remotes
             .iter()
             .filter(|(_, remote)| {
-                let leads = self.network.leads_to(remote.discovery.ip());
+                let leads = self.network.is_reachable(remote.discovery.ip());
                 let told = &remote.data.discovery;
                 let chosen = || match remote.via {
-                    Via::Itself(source) => self.network.choose(told, Some(source)),
-                    Via::Servers => self.network.choose(told, None),
-                    Via::Named(address) => Some(address),
+                    DiscoverySource::Itself(source) => {
+                        self.network.choose_address(told, Some(source))
+                    }
+                    DiscoverySource::Servers => self.network.choose_address(told, None),
+                    DiscoverySource::Named(address) => Some(address),
                 };
                 !leads && chosen().is_some_and(|chosen| chosen != remote.discovery)
             })
             .map(|(prefix, _)| *prefix)
             .collect();
         for prefix in moved {
-            self.participant_moved(now, prefix);
+            self.relocate_participant(now, prefix);
         }
         self.announce_soon(now);
-        self.tell();
+        self.publish_changes();
     }
 
-    /// Our ends receive elsewhere.
-    fn announce_ends_again(&mut self, now: Instant) {
+    /// Announces the new locators of the local endpoints.
+    fn reannounce_endpoints(&mut self, now: Instant) {
         let user = self.own.user.clone();
         let mut ends = Vec::new();
         for (entity, writer) in &mut self.writers {
@@ -77,16 +79,16 @@ impl Engine {
             }
         }
         for end in ends {
-            self.announce_end(now, &end);
+            self.announce_endpoint(now, &end);
         }
     }
 
-    /// A participant is reached elsewhere: it is met anew there.
-    fn participant_moved(&mut self, now: Instant, prefix: GuidPrefix) {
+    /// Rediscovers a participant at another address.
+    fn relocate_participant(&mut self, now: Instant, prefix: GuidPrefix) {
         let Some(remote) = self.remotes.get(&prefix) else {
             return;
         };
         let (told, via) = ((*remote.data).clone(), remote.via);
-        self.participant_met_anew(now, via, told);
+        self.rematch_participant(now, via, told);
     }
 }

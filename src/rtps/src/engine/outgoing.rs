@@ -1,33 +1,34 @@
-//! What goes out: answers of readers and questions of writers at once, samples when their receivers have room.
+//! Outgoing datagrams: acknowledgements and heartbeats are sent immediately, samples when their receivers have room.
 
 use std::net::SocketAddr;
 
-use super::paths::Prepared;
+use super::paths::SendReadiness;
 use super::{Datagram, Engine};
-use crate::reader::Answer;
+use crate::reader::AckResponse;
 use crate::sequence::SequenceSet;
 use crate::wire::{self, DatagramWriter, Submessage};
-use crate::writer::Wanted;
+use crate::writer::SendRequests;
 use crate::{EntityId, GuidPrefix};
 
 impl Engine {
-    pub(super) fn answer(&mut self, answer: Answer) {
-        let mut writer = self.datagram(answer.prefix);
+    pub(super) fn send_ack(&mut self, answer: AckResponse) {
+        let mut writer = self.new_datagram(answer.prefix);
         writer.acknack(&answer.acknack);
         for nack in &answer.nack_frags {
             writer.nack_frag(nack);
         }
-        self.control.push_back(Datagram::whole(answer.to, writer));
+        self.control
+            .push_back(Datagram::from_writer(answer.to, writer));
     }
 
-    pub(super) fn datagram(&self, to: GuidPrefix) -> DatagramWriter {
+    pub(super) fn new_datagram(&self, to: GuidPrefix) -> DatagramWriter {
         let mut writer = DatagramWriter::new(self.own.prefix);
         writer.destination(to);
         writer
     }
 
-    /// Lines up what a writer wants sent.
-    pub(super) fn enqueue(&mut self, entity: EntityId, wanted: Wanted) {
+    /// Queues what a writer requests to be sent.
+    pub(super) fn enqueue(&mut self, entity: EntityId, wanted: SendRequests) {
         for (to, item) in wanted.items {
             self.paths.entry(to).or_default().push(item);
         }
@@ -37,8 +38,11 @@ impl Engine {
         let last = writer.state.last();
         let mut out = Vec::new();
         for (to, reader, first, asks) in wanted.heartbeats {
-            // What is being sent is not gone, though a newer sample has taken its place here.
-            let under_way = self.paths.get(&to).and_then(|path| path.sending(entity));
+            // A sample in flight still exists, even if a newer one has replaced it in the history.
+            let under_way = self
+                .paths
+                .get(&to)
+                .and_then(|path| path.in_flight_number(entity));
             let first = under_way.map_or(first, |number| first.min(number));
             let beat = wire::Heartbeat {
                 reader: reader.entity,
@@ -52,9 +56,12 @@ impl Engine {
             out.push((to, reader.prefix, Submessage::Heartbeat(beat)));
         }
         for (to, reader, start, end) in wanted.gaps {
-            // Its sample was given up, and is still being sent: it will be whole. Fast DDS 2.14 never gets over a word that there
-            // is none of a sample of which it has fragments: whoever takes from that reader then tries for ever.
-            let under_way = self.paths.get(&to).and_then(|path| path.sending(entity));
+            // The sample was dropped from the history but is still being sent completely. Fast DDS 2.14 does not cope
+            // with a GAP for a sample of which it has fragments: takes from that reader then never return.
+            let under_way = self
+                .paths
+                .get(&to)
+                .and_then(|path| path.in_flight_number(entity));
             if under_way.is_some_and(|number| (start..end).contains(&number)) {
                 continue;
             }
@@ -67,19 +74,18 @@ impl Engine {
             out.push((to, reader.prefix, Submessage::Gap(gap)));
         }
         for (to, prefix, submessage) in out {
-            let mut writer = self.datagram(prefix);
+            let mut writer = self.new_datagram(prefix);
             match &submessage {
                 Submessage::Heartbeat(beat) => writer.heartbeat(beat),
                 Submessage::Gap(gap) => writer.gap(gap),
                 _ => continue,
             };
-            self.control.push_back(Datagram::whole(to, writer));
+            self.control.push_back(Datagram::from_writer(to, writer));
         }
     }
 
-    /// The next datagram to send; none where there is none, or where all that there are have to wait until their receivers
-    /// have room. `room` tells whether there is some for a datagram of so many bytes, which its receiver has asked
-    /// for or not.
+    /// Returns the next datagram to send; `None` if there is none, or if all wait for room at their receivers. `room`
+    /// returns whether a receiver has room for a datagram of this length, which it has requested again or not.
     pub fn transmit(
         &mut self,
         room: &mut dyn FnMut(SocketAddr, usize, bool) -> bool,
@@ -87,7 +93,7 @@ impl Engine {
         if let Some(datagram) = self.control.pop_front() {
             return Some(datagram);
         }
-        // One address after the other.
+        // Round-robin over the addresses.
         let after = self.next_path;
         let order: Vec<SocketAddr> = match after {
             Some(after) => {
@@ -106,9 +112,9 @@ impl Engine {
                 continue;
             };
             let (length, again) = match path.prepare(to, &self.writers) {
-                Prepared::Length(length, again) => (length, again),
-                Prepared::Held => continue,
-                Prepared::Empty => {
+                SendReadiness::Length(length, again) => (length, again),
+                SendReadiness::Held => continue,
+                SendReadiness::Empty => {
                     self.paths.remove(&to);
                     continue;
                 }
@@ -118,7 +124,7 @@ impl Engine {
             }
             self.next_path = Some(to);
             if let Some(datagram) =
-                path.next(to, self.own.prefix, &mut self.writers, &mut self.control)
+                path.next_datagram(to, self.own.prefix, &mut self.writers, &mut self.control)
             {
                 return Some(datagram);
             }

@@ -1,4 +1,4 @@
-//! Other participants: they come, say something else of themselves, and are gone.
+//! Remote participants: discovery, changes and removal.
 
 #![forbid(unsafe_code)]
 
@@ -9,35 +9,46 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::discovering::{ANNOUNCERS, ANNOUNCES, HEARS, MOST_PARTICIPANTS, PARTICIPANTS, builtin};
-use super::servers::Via;
-use super::{Engine, Remote};
+use super::discovering::{
+    ANNOUNCERS, ANNOUNCES, HEARS, MOST_PARTICIPANTS, PARTICIPANTS, builtin_endpoint,
+};
+use super::servers::DiscoverySource;
+use super::{Engine, RemoteParticipant};
 use crate::discovery::{EndpointData, ParticipantData};
 use crate::locator::Locator;
-use crate::participant::Discovered;
-use crate::writer::Wanted;
+use crate::participant::DiscoveredGraph;
+use crate::writer::SendRequests;
 use crate::{EntityId, Guid, GuidPrefix};
 
 impl Engine {
-    /// This is what is told of a participant: a new one, or one that is known.
-    pub(super) fn participant_told(&mut self, now: Instant, via: Via, told: ParticipantData) {
+    /// Handles the announcement of a new or known participant.
+    pub(super) fn update_participant(
+        &mut self,
+        now: Instant,
+        via: DiscoverySource,
+        told: ParticipantData,
+    ) {
         let prefix = told.prefix;
         let Some(remote) = self.remotes.get_mut(&prefix) else {
-            self.participant_came(now, via, told);
+            self.add_participant(now, via, told);
             return;
         };
         if *remote.data == told {
             return;
         }
-        // What it has may have changed, or where it is: then it is met anew, unless it is still there where it was.
+        // If its endpoints or address may have changed, it is discovered anew, unless it is still at the same address.
         let left = |told: &[Locator], at: SocketAddr| {
-            !told.iter().filter_map(Locator::udp).any(|it| it == at)
+            !told
+                .iter()
+                .filter_map(Locator::udp_address)
+                .any(|it| it == at)
         };
-        let moved = left(&told.discovery, remote.discovery) && !matches!(via, Via::Named(_))
+        let moved = left(&told.discovery, remote.discovery)
+            && !matches!(via, DiscoverySource::Named(_))
             || remote.data.user != told.user && left(&told.user, remote.user)
             || remote.data.builtin != told.builtin;
         if moved {
-            self.participant_met_anew(now, via, told);
+            self.rematch_participant(now, via, told);
             return;
         }
         remote.data = Arc::new(told);
@@ -47,22 +58,27 @@ impl Engine {
         self.discovered_changed = true;
     }
 
-    /// A participant that is known is to be reached in another way.
-    pub(super) fn participant_met_anew(&mut self, now: Instant, via: Via, told: ParticipantData) {
-        // Its ends are told by itself when it is met, but not by a server, who has told them.
+    /// Rediscovers a known participant at another address.
+    pub(super) fn rematch_participant(
+        &mut self,
+        now: Instant,
+        via: DiscoverySource,
+        told: ParticipantData,
+    ) {
+        // A participant announces its endpoints when it is discovered again, but a server does not repeat them.
         let ends = match via {
-            Via::Servers => self.ends_of(told.prefix),
-            Via::Itself(_) | Via::Named(_) => Vec::new(),
+            DiscoverySource::Servers => self.endpoints_of(told.prefix),
+            DiscoverySource::Itself(_) | DiscoverySource::Named(_) => Vec::new(),
         };
-        self.participant_gone(told.prefix);
-        self.participant_came(now, via, told);
+        self.remove_participant(told.prefix);
+        self.add_participant(now, via, told);
         for end in ends {
-            self.end_came(now, end);
+            self.on_endpoint_discovered(now, end);
         }
     }
 
-    fn ends_of(&self, prefix: GuidPrefix) -> Vec<Arc<EndpointData>> {
-        let Discovered {
+    fn endpoints_of(&self, prefix: GuidPrefix) -> Vec<Arc<EndpointData>> {
+        let DiscoveredGraph {
             writers, readers, ..
         } = &self.discovered;
         let all = writers.values().chain(readers.values());
@@ -71,25 +87,32 @@ impl Engine {
             .collect()
     }
 
-    pub(super) fn participant_came(&mut self, now: Instant, via: Via, told: ParticipantData) {
+    pub(super) fn add_participant(
+        &mut self,
+        now: Instant,
+        via: DiscoverySource,
+        told: ParticipantData,
+    ) {
         let chosen = match via {
-            Via::Named(address) => Some(address),
-            Via::Itself(source) => self.network.choose(&told.discovery, Some(source)),
-            Via::Servers => self.network.choose(&told.discovery, None),
+            DiscoverySource::Named(address) => Some(address),
+            DiscoverySource::Itself(source) => {
+                self.network.choose_address(&told.discovery, Some(source))
+            }
+            DiscoverySource::Servers => self.network.choose_address(&told.discovery, None),
         };
         let Some(discovery) = chosen else {
             tracing::debug!(
                 ?via,
-                "a DDS participant tells no address of UDP over IPv4 that leads to it"
+                "a DDS participant announces no address for UDP over IPv4 that reaches it"
             );
             return;
         };
-        // An address belongs to one process at a time: whoever had it before is gone. Servers tell also of the dead for a while,
-        // and not in the order in which they came.
-        let other = |remote: &Remote| match via {
-            Via::Itself(_) => remote.discovery == discovery,
-            Via::Named(_) => remote.via == via,
-            Via::Servers => false,
+        // An address belongs to one process at a time, so its previous owner is gone. Servers also announce
+        // participants that have died, and in any order.
+        let other = |remote: &RemoteParticipant| match via {
+            DiscoverySource::Itself(_) => remote.discovery == discovery,
+            DiscoverySource::Named(_) => remote.via == via,
+            DiscoverySource::Servers => false,
         };
         let before: Vec<GuidPrefix> = self
             .remotes
@@ -98,12 +121,12 @@ impl Engine {
             .map(|(prefix, _)| *prefix)
             .collect();
         for prefix in before {
-            self.participant_gone(prefix);
+            self.remove_participant(prefix);
         }
         if self.remotes.len() >= MOST_PARTICIPANTS {
             if !std::mem::replace(&mut self.crowded, true) {
                 tracing::warn!(
-                    "more than {MOST_PARTICIPANTS} DDS participants; {:?} is not heard, nor are others",
+                    "more than {MOST_PARTICIPANTS} DDS participants; {:?} and further ones are ignored",
                     told.prefix
                 );
             }
@@ -111,7 +134,7 @@ impl Engine {
         }
         let user = self
             .network
-            .choose(&told.user, Some(discovery.ip()))
+            .choose_address(&told.user, Some(discovery.ip()))
             .unwrap_or(discovery);
         let (prefix, has) = (told.prefix, told.builtin);
         let data = Arc::new(told);
@@ -121,7 +144,7 @@ impl Engine {
         self.discovered_changed = true;
         self.remotes.insert(
             prefix,
-            Remote {
+            RemoteParticipant {
                 data,
                 discovery,
                 user,
@@ -131,11 +154,11 @@ impl Engine {
             },
         );
         match via {
-            // It speaks of ends with its servers alone.
-            Via::Servers => {}
-            Via::Named(_) => self.meet_server(now, prefix),
-            Via::Itself(_) => {
-                self.announce_to(discovery, prefix);
+            // It exchanges endpoint data only with its servers.
+            DiscoverySource::Servers => {}
+            DiscoverySource::Named(_) => self.match_server(now, prefix),
+            DiscoverySource::Itself(_) => {
+                self.send_announcement(discovery, prefix);
                 for (index, pair) in ANNOUNCERS.into_iter().enumerate() {
                     let (hears, announces) = (has & HEARS[index] != 0, has & ANNOUNCES[index] != 0);
                     self.match_builtin(now, prefix, pair, hears, announces);
@@ -146,7 +169,7 @@ impl Engine {
         self.wake(now);
     }
 
-    /// A pair of ours meets that of another participant, which hears or announces, or both.
+    /// Matches a built-in writer and reader with those of another participant, as far as it has them.
     pub(super) fn match_builtin(
         &mut self,
         now: Instant,
@@ -159,20 +182,20 @@ impl Engine {
             return;
         };
         let (discovery, vendor) = (remote.discovery, remote.data.vendor);
-        let mut wanted = Wanted::default();
+        let mut wanted = SendRequests::default();
         if let Some(ours) = self.writers.get_mut(&writer).filter(|_| hears) {
-            let theirs = Arc::new(builtin(prefix, reader));
-            ours.state.matched(now, theirs, discovery, &mut wanted);
+            let theirs = Arc::new(builtin_endpoint(prefix, reader));
+            ours.state.add_reader(now, theirs, discovery, &mut wanted);
         }
         self.enqueue(writer, wanted);
         if let Some(ours) = self.readers.get_mut(&reader).filter(|_| announces) {
-            let theirs = Arc::new(builtin(prefix, writer));
-            ours.state.matched(now, theirs, discovery, vendor);
+            let theirs = Arc::new(builtin_endpoint(prefix, writer));
+            ours.state.add_writer(now, theirs, discovery, vendor);
         }
     }
 
-    /// A participant has gone, and with it all its ends.
-    pub fn participant_gone(&mut self, prefix: GuidPrefix) {
+    /// Removes a participant and all its endpoints.
+    pub fn remove_participant(&mut self, prefix: GuidPrefix) {
         let Some(remote) = self.remotes.remove(&prefix) else {
             return;
         };
@@ -180,10 +203,10 @@ impl Engine {
         self.discovered_changed = true;
         for (writer, reader) in ANNOUNCERS.into_iter().chain([PARTICIPANTS]) {
             if let Some(ours) = self.writers.get_mut(&writer) {
-                ours.state.unmatched(Guid::new(prefix, reader));
+                ours.state.remove_reader(Guid::new(prefix, reader));
             }
             if let Some(ours) = self.readers.get_mut(&reader) {
-                ours.state.unmatched(Guid::new(prefix, writer));
+                ours.state.remove_writer(Guid::new(prefix, writer));
             }
         }
         let ends = self
@@ -193,7 +216,7 @@ impl Engine {
             .chain(self.discovered.readers.keys());
         let ends: Vec<Guid> = ends.filter(|guid| guid.prefix == prefix).copied().collect();
         for guid in ends {
-            self.end_gone(guid);
+            self.on_endpoint_lost(guid);
         }
         let still = |address: SocketAddr| {
             self.remotes

@@ -1,5 +1,5 @@
-//! What waits to be sent to one address: one queue for each writer, served in turn, so that a large sample of one does not keep
-//! the small ones of another waiting.
+//! Send queues per address: one queue for each writer, served round-robin, so that a large sample of one writer does
+//! not delay small ones of another.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -7,36 +7,36 @@ use std::net::SocketAddr;
 use super::{Datagram, LocalWriter};
 use crate::fragments::{self, FRAGMENT};
 use crate::wire::{self, DataFragHead, DatagramWriter, InlineQos};
-use crate::writer::{Change, Item, WriterState};
+use crate::writer::{CacheChange, SendItem, WriterState};
 use crate::{EntityId, GuidPrefix, SequenceNumber};
 
-/// What the headers of a datagram with one fragment take, at most, in bytes.
+/// Maximum size of the headers of a datagram with one fragment, in bytes.
 const HEADERS: usize = 160;
 
 #[derive(Debug, Default)]
-struct Queue {
-    waiting: VecDeque<Item>,
-    /// What is being sent. It is kept until its last fragment is out, even where its writer has given it up: a receiver whose
-    /// sender always begins anew would never have a whole sample.
-    current: Option<(Item, Change)>,
+struct WriterQueue {
+    waiting: VecDeque<SendItem>,
+    /// The sample being sent. It is kept until its last fragment was sent, even if its writer has dropped it: otherwise
+    /// a receiver would never get a complete sample from a fast sender.
+    current: Option<(SendItem, CacheChange)>,
 }
 
-impl Queue {
-    /// Takes the next sample, where its reader may be sent it now.
+impl WriterQueue {
+    /// Makes the next sample current, if its reader may be sent it now.
     fn prepare(&mut self, to: SocketAddr, state: &WriterState) {
         if self.current.is_some() {
             return;
         }
-        // What was given up meanwhile is passed over; who misses it is told when it asks.
+        // Dropped samples are skipped; readers that miss them are told when they ask.
         self.waiting
             .retain(|item| state.change(item.number).is_some());
-        // What was begun is repaired before anything else is begun.
+        // Samples that were started are repaired before another one is started.
         let full = state.is_window_full(to);
-        let small = |item: &Item| item.last == 0 && item.reader != EntityId::UNKNOWN;
+        let small = |item: &SendItem| item.last == 0 && item.reader != EntityId::UNKNOWN;
         let next = self
             .waiting
             .iter()
-            .position(|item| !full || small(item) || state.is_begun(item.number));
+            .position(|item| !full || small(item) || state.is_started(item.number));
         let Some(item) = next.and_then(|at| self.waiting.remove(at)) else {
             return;
         };
@@ -45,41 +45,41 @@ impl Queue {
     }
 }
 
-/// What is to be sent to one address next.
+/// State of the send queue of an address.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Prepared {
-    /// A datagram of about so many bytes, and whether a reader has asked for it.
+pub(super) enum SendReadiness {
+    /// A datagram of about this length is ready; whether a reader has requested it again.
     Length(usize, bool),
-    /// Nothing until a reader has acknowledged something.
+    /// Nothing may be sent until a reader acknowledges something.
     Held,
-    /// Nothing.
+    /// Nothing is queued.
     Empty,
 }
 
-/// What waits for one address.
+/// The send queue of one address.
 #[derive(Debug, Default)]
-pub(super) struct Path {
+pub(super) struct DestinationQueue {
     turns: VecDeque<EntityId>,
-    queues: HashMap<EntityId, Queue>,
+    queues: HashMap<EntityId, WriterQueue>,
 }
 
-impl Path {
-    pub fn push(&mut self, item: Item) {
+impl DestinationQueue {
+    pub fn push(&mut self, item: SendItem) {
         let queue = self.queues.entry(item.writer).or_insert_with(|| {
             self.turns.push_back(item.writer);
-            Queue::default()
+            WriterQueue::default()
         });
-        let same = |other: &Item| {
+        let same = |other: &SendItem| {
             other.number == item.number
                 && (other.reader == item.reader || other.reader == EntityId::UNKNOWN)
         };
-        // What is asked for again and waits already is not sent twice. Nor is what is under way: what a receiver misses of it is what has not
-        // been sent, or has not been read there, and it is asked again with the last part.
-        let covers = |waiting: &Item| {
+        // A repeated request for a queued sample is not queued twice. Neither is one for the sample being sent: what
+        // the receiver misses has not been sent or not been read there, and it is asked again with the last fragment.
+        let covers = |waiting: &SendItem| {
             same(waiting) && waiting.next <= item.next && waiting.last >= item.last
         };
         let again = item.reader != EntityId::UNKNOWN;
-        let under_way = |(current, _): &(Item, Change)| same(current);
+        let under_way = |(current, _): &(SendItem, CacheChange)| same(current);
         let waits = again
             && (queue.waiting.iter().any(covers) || queue.current.as_ref().is_some_and(under_way));
         if !waits {
@@ -87,15 +87,15 @@ impl Path {
         }
     }
 
-    /// Whether something of this writer waits.
-    pub fn holds(&self, writer: EntityId) -> bool {
+    /// Returns whether anything of this writer is queued.
+    pub fn has_pending(&self, writer: EntityId) -> bool {
         self.queues
             .get(&writer)
             .is_some_and(|queue| queue.current.is_some() || !queue.waiting.is_empty())
     }
 
-    /// The sample of this writer of which some fragments are out and others are not.
-    pub fn sending(&self, writer: EntityId) -> Option<SequenceNumber> {
+    /// Returns the sample of this writer of which some but not all fragments were sent.
+    pub fn in_flight_number(&self, writer: EntityId) -> Option<SequenceNumber> {
         let (item, _) = self.queues.get(&writer)?.current.as_ref()?;
         Some(item.number)
     }
@@ -105,16 +105,16 @@ impl Path {
         self.turns.retain(|turn| *turn != writer);
     }
 
-    /// Makes the next item ready for this address.
+    /// Prepares the next datagram for this address.
     pub fn prepare(
         &mut self,
         to: SocketAddr,
         writers: &HashMap<EntityId, LocalWriter>,
-    ) -> Prepared {
+    ) -> SendReadiness {
         let mut held = 0;
         while let Some(writer) = self.turns.front().copied() {
             if held == self.turns.len() {
-                return Prepared::Held;
+                return SendReadiness::Held;
             }
             let Some(queue) = self.queues.get_mut(&writer) else {
                 self.turns.pop_front();
@@ -128,7 +128,7 @@ impl Path {
             match &queue.current {
                 Some((item, change)) => {
                     let length = change.payload.len().min(FRAGMENT) + HEADERS;
-                    return Prepared::Length(length, item.reader != EntityId::UNKNOWN);
+                    return SendReadiness::Length(length, item.reader != EntityId::UNKNOWN);
                 }
                 None if queue.waiting.is_empty() => self.forget(writer),
                 None => {
@@ -137,11 +137,11 @@ impl Path {
                 }
             }
         }
-        Prepared::Empty
+        SendReadiness::Empty
     }
 
-    /// The datagram of what was made ready. What has to follow it at once is put into `control`.
-    pub fn next(
+    /// Returns the prepared datagram. What must follow it immediately is put into `control`.
+    pub fn next_datagram(
         &mut self,
         to: SocketAddr,
         from: GuidPrefix,
@@ -154,11 +154,11 @@ impl Path {
         let (mut item, change) = queue.current.take()?;
         let mut state = writers.get_mut(&writer).map(|writer| &mut writer.state);
         if let Some(state) = state.as_mut().filter(|_| item.last != 0) {
-            state.begun(item.number, to);
+            state.mark_started(item.number, to);
         }
-        // Whoever is to acknowledge is asked with the last part of each sample.
+        // Reliable readers are asked for an acknowledgement with the last fragment of each sample.
         let heartbeat = state
-            .filter(|state| item.next == item.last && state.asks(to))
+            .filter(|state| item.next == item.last && state.needs_ack(to))
             .map(|state| wire::Heartbeat {
                 reader: item.reader,
                 writer,
@@ -189,7 +189,7 @@ impl Path {
             if let Some(beat) = &heartbeat {
                 datagram.heartbeat(beat);
             }
-            return Some(Datagram::whole(to, datagram));
+            return Some(Datagram::from_writer(to, datagram));
         }
         let start = (item.next as usize - 1) * FRAGMENT;
         let body = change
@@ -211,9 +211,9 @@ impl Path {
             let mut datagram = DatagramWriter::new(from);
             datagram.destination(item.prefix);
             datagram.heartbeat(beat);
-            control.push_front(Datagram::whole(to, datagram));
+            control.push_front(Datagram::from_writer(to, datagram));
         }
-        debug_assert!(item.last <= fragments::count(change.payload.len()));
+        debug_assert!(item.last <= fragments::fragment_count(change.payload.len()));
         if item.next < item.last {
             item.next += 1;
             queue.current = Some((item, change));

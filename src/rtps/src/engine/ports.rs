@@ -1,30 +1,32 @@
-//! Ports of this machine: a newcomer's is seen when it is bound, and whoever is killed is gone when its port is free.
+//! Detection of participants by the ports bound on this machine: a new port is a newcomer, and a participant whose port
+//! is free has died.
 
 use std::collections::BTreeSet;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::time::Instant;
 
-use super::servers::Via;
-use super::{Engine, Remote};
+use super::servers::DiscoverySource;
+use super::{Engine, RemoteParticipant};
 use crate::GuidPrefix;
 
-/// So many of the lowest free numbers of participants are looked at.
+/// Number of lowest free participant numbers whose ports are watched.
 const NUMBERS_AHEAD: usize = 6;
 
 impl Engine {
-    /// Where participants of this machine may hear of others: those of whom we know, and those that newcomers take first.
-    pub fn ports_to_look_at(&self) -> BTreeSet<SocketAddrV4> {
+    /// Returns the discovery ports to watch on this machine: those of known participants, and those that newcomers will
+    /// use first.
+    pub fn watched_ports(&self) -> BTreeSet<SocketAddrV4> {
         if self.alone {
             return BTreeSet::new();
         }
         let known: BTreeSet<SocketAddrV4> = self
             .remotes
             .values()
-            .filter_map(|remote| self.here(remote))
+            .filter_map(|remote| self.local_address(remote))
             .chain(self.bound.iter().copied())
             .collect();
         let taken = |port: u16| known.iter().any(|at| at.port() == port);
-        // Participants take the lowest number whose ports are free. A client's concern are its servers.
+        // Participants use the lowest number whose ports are free. A client watches only its servers.
         let numbers = if self.is_client() { 0..0 } else { 0..u16::MAX };
         let free = numbers
             .map_while(|number| self.ports.discovery(number))
@@ -32,28 +34,32 @@ impl Engine {
             .take(NUMBERS_AHEAD)
             .map(|port| SocketAddrV4::new(Ipv4Addr::LOCALHOST, port));
         let own = self.own_ports().0;
-        let servers = self.servers_here();
+        let servers = self.local_servers();
         let mut ports: BTreeSet<SocketAddrV4> =
             free.chain(known.iter().copied()).chain(servers).collect();
         ports.retain(|at| at.port() != own);
         ports
     }
 
-    /// Which of [`Self::ports_to_look_at`] are bound: newcomers are told of us at once, and whose port is gone is dead.
-    pub fn ports_bound(&mut self, now: Instant, bound: &BTreeSet<SocketAddrV4>) {
+    /// Sets which of [`Self::watched_ports`] are bound. Newcomers are sent an announcement immediately; participants
+    /// whose port is gone are removed.
+    pub fn set_bound_ports(&mut self, now: Instant, bound: &BTreeSet<SocketAddrV4>) {
         let last = self.ports.discovery(119).unwrap_or(u16::MAX);
         let domain = self.ports.discovery_multicast()..=last;
-        let servers: BTreeSet<SocketAddrV4> = self.servers_here().collect();
-        let concerns = |at: &&SocketAddrV4| match self.is_client() {
-            true => servers.contains(at),
-            false => domain.contains(&at.port()),
+        let servers: BTreeSet<SocketAddrV4> = self.local_servers().collect();
+        let concerns = |at: &&SocketAddrV4| {
+            if self.is_client() {
+                servers.contains(at)
+            } else {
+                domain.contains(&at.port())
+            }
         };
         let found: BTreeSet<SocketAddrV4> = bound.iter().filter(concerns).copied().collect();
         let new: Vec<SocketAddrV4> = found.difference(&self.bound).copied().collect();
         if !new.is_empty() {
             if !self.is_client() {
                 for at in new {
-                    self.announce_to(SocketAddr::V4(at), GuidPrefix::UNKNOWN);
+                    self.send_announcement(SocketAddr::V4(at), GuidPrefix::UNKNOWN);
                 }
             }
             self.announce_soon(now);
@@ -62,21 +68,24 @@ impl Engine {
         let dead: Vec<GuidPrefix> = self
             .remotes
             .iter()
-            .filter(|(_, remote)| self.here(remote).is_some_and(|at| !bound.contains(&at)))
+            .filter(|(_, remote)| {
+                self.local_address(remote)
+                    .is_some_and(|at| !bound.contains(&at))
+            })
             .map(|(prefix, _)| *prefix)
             .collect();
         for prefix in dead {
-            self.participant_gone(prefix);
+            self.remove_participant(prefix);
         }
-        self.tell();
+        self.publish_changes();
     }
 
-    /// Where a participant of this machine hears of others.
-    fn here(&self, remote: &Remote) -> Option<SocketAddrV4> {
+    /// Returns the discovery address of a participant on this machine.
+    fn local_address(&self, remote: &RemoteParticipant) -> Option<SocketAddrV4> {
         match remote.discovery {
-            // It may be reached through another's port.
-            _ if matches!(remote.via, Via::Named(_)) => None,
-            SocketAddr::V4(at) if self.network.is_here((*at.ip()).into()) => Some(at),
+            // It may be reached through a forwarded port.
+            _ if matches!(remote.via, DiscoverySource::Named(_)) => None,
+            SocketAddr::V4(at) if self.network.is_local((*at.ip()).into()) => Some(at),
             _ => None,
         }
     }

@@ -1,6 +1,6 @@
-//! Participants in whose place this one comes and that ended without a word, as a process does that is killed. Others would take
-//! them for alive until their leases are over, and send them requests; so they are told in the predecessors' names that these are gone
-//! (8.5.3), whenever they are told of this one.
+//! Participants that this one replaces and that ended without a farewell, as a killed process does. Others would
+//! believe them alive until their leases expire, and send them requests. Therefore their disposal is announced in their
+//! names (8.5.3) whenever this participant is announced.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -8,25 +8,27 @@ use std::time::{Duration, Instant};
 use super::Engine;
 use crate::{GuidPrefix, SequenceNumber};
 
-/// Whoever has heard a participant takes nothing of it with a number that was before. It has not said so much.
+/// A receiver ignores samples of a participant with numbers lower than it has seen. Predecessors have sent fewer than
+/// this.
 const LAST_WORD: SequenceNumber = SequenceNumber(1 << 32);
 
-/// Those who are gone.
+/// The participants that are gone.
 pub(super) struct Predecessors {
     prefixes: Vec<GuidPrefix>,
-    /// When nobody believes in them any more.
+    /// Time at which all their leases have expired.
     until: Option<Instant>,
 }
 
 impl Predecessors {
-    /// They were killed before now, and had this lease; for ever where there is none.
+    /// Creates the list of participants that were killed before now and had this lease; without a lease they are
+    /// announced forever.
     pub fn new(now: Instant, prefixes: Vec<GuidPrefix>, lease: Option<Duration>) -> Self {
         let until = lease.map(|lease| now + lease);
         Self { prefixes, until }
     }
 
-    /// Forgets those whose leases are over.
-    pub fn tidy(&mut self, now: Instant) {
+    /// Forgets participants whose leases have expired.
+    pub fn remove_expired(&mut self, now: Instant) {
         if self.until.is_some_and(|until| until <= now) {
             self.prefixes.clear();
         }
@@ -34,10 +36,10 @@ impl Predecessors {
 }
 
 impl Engine {
-    /// Says to them that the predecessors are gone. Again and again, as it may be lost; whoever has heard it lets it pass.
-    pub(super) fn say_goodbye_of_predecessors(&mut self, to: SocketAddr, prefix: GuidPrefix) {
+    /// Announces the disposal of the predecessors. Repeated because datagrams may be lost; receivers ignore duplicates.
+    pub(super) fn dispose_predecessors(&mut self, to: SocketAddr, prefix: GuidPrefix) {
         for gone in self.predecessors.prefixes.clone() {
-            self.say_gone(gone, LAST_WORD, to, prefix);
+            self.send_disposal(gone, LAST_WORD, to, prefix);
         }
     }
 }

@@ -1,17 +1,18 @@
-//! Servers of discovery of Fast DDS: their clients tell them alone of themselves, and hear of each other by them.
+//! Client of Fast DDS discovery servers, through which clients discover each other without multicast.
 //!
 //! ```text
-//!   no server is met ─▶ our announcement, again and again ─▶ it announces itself ─▶ met
-//!   met ─▶ our announcement and our ends, reliably; each bears its identity, by which it is known behind other servers
-//!       ◀─ those of all others, reliably, who are sent samples and nothing else
+//!   no server known ─▶ our announcement, repeated ─▶ the server announces itself ─▶ known
+//!   known ─▶ our announcement and endpoints, reliably, each with its identity, by which other servers know it
+//!         ◀─ those of all other participants, reliably; to these only samples are sent directly
 //! ```
-//! No standard has this. What is said here is what Fast DDS 2.14 says, as seen on the wire and in its sources (`PDPClient`, `PDPServer`,
-//! `DiscoveryDataBase`):
-//! - Participants are announced by the same ends as without servers, which are reliable between a server and its clients.
-//! - A server hears those alone that say that they are of Fast DDS (`PID_VENDOR_ID`); so does ours.
-//! - `PARTICIPANT_TYPE` says what a participant is. A `SUPER_CLIENT` is told of everybody, a `CLIENT` of whom it has a topic in
-//!   common with.
-//! - A server that was begun anew has the same name. It is known by that it has lost what it had acknowledged.
+//! This is not standardized. The implementation follows Fast DDS 2.14, as observed on the wire and in its sources
+//! (`PDPClient`, `PDPServer`, `DiscoveryDataBase`):
+//! - Participants are announced by the same built-in endpoints as without servers, but reliably between a server and
+//!   its clients.
+//! - A server accepts only clients that claim to be Fast DDS (`PID_VENDOR_ID`), so ours does.
+//! - `PARTICIPANT_TYPE` is the role of a participant. A server sends all participants to a `SUPER_CLIENT`, and to a
+//!   `CLIENT` those with which it shares a topic.
+//! - A restarted server has the same GUID prefix. It is detected by the loss of samples that it had acknowledged.
 
 #![forbid(unsafe_code)]
 
@@ -25,30 +26,30 @@ use super::discovering::{ANNOUNCERS, DISPOSED, LAST_PAUSE, PARTICIPANTS};
 use super::{Datagram, Engine};
 use crate::discovery::{self, ParticipantData};
 use crate::locator::Locator;
-use crate::participant::{DiscoveryServer, Sample};
+use crate::participant::{DiscoveryServer, ReceivedSample};
 use crate::sequence::SequenceSet;
 use crate::wire::{self, InlineQos};
-use crate::writer::{Change, Wanted};
+use crate::writer::{CacheChange, SendRequests};
 use crate::{EntityId, Guid, GuidPrefix, SampleIdentity, SequenceNumber, VendorId};
 
-/// A server that is not there is told of us so often.
+/// Announcement interval for a server that is not there.
 const MISSING: Duration = Duration::from_millis(450);
 
-/// So much longer than its lease may nothing be heard of whoever servers tell of: should a server be there, it is to be the first
-/// to say that it is gone, as it tells of it again when it comes back.
+/// Grace period after the lease of a participant known from servers. If a server is there, it is to be the first to
+/// report the participant gone, because it announces the participant again when it comes back.
 pub(super) const SPARE: Duration = Duration::from_secs(5);
 
-/// What we are to servers.
+/// Properties announced to servers.
 const PROPERTIES: [(&str, &str); 2] = [("PARTICIPANT_TYPE", "SUPER_CLIENT"), ("DS_VERSION", "2.0")];
 
-/// By whom another participant is known.
+/// How another participant was discovered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Via {
-    /// It announces itself; the address from which it was heard last.
+pub(super) enum DiscoverySource {
+    /// By its own announcement; contains the source address of the last one.
     Itself(IpAddr),
-    /// It is one of the servers that were named; the address by which.
+    /// As a configured server; contains the configured address.
     Named(SocketAddr),
-    /// Servers tell of it, and take it back.
+    /// Through servers, which also report its disposal.
     Servers,
 }
 
@@ -57,28 +58,28 @@ impl Engine {
         !self.servers.is_empty()
     }
 
-    /// Whether this is a server of ours that was met.
+    /// Returns whether this is a known server.
     pub(super) fn is_server(&self, prefix: GuidPrefix) -> bool {
         let remote = self.remotes.get(&prefix);
-        remote.is_some_and(|remote| matches!(remote.via, Via::Named(_)))
+        remote.is_some_and(|remote| matches!(remote.via, DiscoverySource::Named(_)))
     }
 
-    /// Servers on this machine, where they were named.
-    pub(super) fn servers_here(&self) -> impl Iterator<Item = SocketAddrV4> {
+    /// Returns the configured servers on this machine.
+    pub(super) fn local_servers(&self) -> impl Iterator<Item = SocketAddrV4> {
         self.servers.iter().filter_map(|server| match server.at {
-            SocketAddr::V4(at) if self.network.is_here((*at.ip()).into()) => Some(at),
+            SocketAddr::V4(at) if self.network.is_local((*at.ip()).into()) => Some(at),
             _ => None,
         })
     }
 
-    /// The address by which the server was named that tells this of itself. It has the name of its place in the list, or one of
-    /// its own (Fast DDS 3) and that address.
-    fn named(&self, told: &ParticipantData) -> Option<SocketAddr> {
+    /// Returns the configured address of the server with this data. Its GUID prefix is derived from its position in the
+    /// list, or it has another prefix (Fast DDS 3) and that address.
+    fn find_server_address(&self, told: &ParticipantData) -> Option<SocketAddr> {
         let by_name = |server: &&DiscoveryServer| server.prefix() == told.prefix;
         let by_address = |server: &&DiscoveryServer| {
-            let locators = || told.discovery.iter().filter_map(Locator::udp);
+            let locators = || told.discovery.iter().filter_map(Locator::udp_address);
             let same = |at: SocketAddr| {
-                let here = self.network.is_here(at.ip()) && self.network.is_here(server.at.ip());
+                let here = self.network.is_local(at.ip()) && self.network.is_local(server.at.ip());
                 at.port() == server.at.port() && (here || at.ip() == server.at.ip())
             };
             locators().any(same)
@@ -88,33 +89,34 @@ impl Engine {
         found.map(|server| server.at)
     }
 
-    // ---- telling them, and asking those of whom they tell
+    // ---- sending to servers, and pinging participants known from them
 
-    pub(super) fn add_ends_for_servers(&mut self, now: Instant) {
+    pub(super) fn add_server_endpoints(&mut self, now: Instant) {
         self.own.vendor = VendorId::FAST_DDS;
         self.add_builtin_pair(PARTICIPANTS);
         self.announce_self(now);
     }
 
-    /// The longest pause between two announcements.
+    /// Returns the longest pause between two announcements.
     pub(super) fn longest_pause(&self) -> Duration {
         let is_met = |server: &DiscoveryServer| {
             let mut met = self.remotes.values();
-            met.any(|remote| remote.via == Via::Named(server.at))
+            met.any(|remote| remote.via == DiscoverySource::Named(server.at))
         };
-        match self.servers.iter().all(is_met) {
-            true => LAST_PAUSE,
-            false => MISSING,
+        if self.servers.iter().all(is_met) {
+            LAST_PAUSE
+        } else {
+            MISSING
         }
     }
 
-    /// What this participant tells servers of itself has changed.
+    /// Publishes changed data of this participant to the servers.
     pub(super) fn announce_self(&mut self, now: Instant) {
         let payload = self.own.to_bytes_with(&PROPERTIES);
-        self.announce_as(now, EntityId::PARTICIPANT, payload);
+        self.publish_announcement(now, EntityId::PARTICIPANT, payload);
     }
 
-    /// Says to each server what it was told before, should it have forgotten or not been there.
+    /// Repeats the announcement to each server, in case it has restarted or was not there.
     pub(super) fn announce_to_servers(&mut self) {
         let Some(number) = self.announced.get(&EntityId::PARTICIPANT).copied() else {
             return;
@@ -124,7 +126,7 @@ impl Engine {
             writer: EntityId::SPDP_WRITER,
             number,
             inline: InlineQos {
-                related: self.identity(EntityId::SPDP_WRITER, number),
+                related: self.announcement_identity(EntityId::SPDP_WRITER, number),
                 status: 0,
                 key_hash: None,
             },
@@ -132,26 +134,27 @@ impl Engine {
             key_only: false,
         };
         for server in &self.servers {
-            // To whoever is there: a server begun anew may have another name.
+            // Addressed to any participant, because a restarted server may have another GUID prefix.
             let mut writer = wire::DatagramWriter::new(self.own.prefix);
             writer.timestamp(SystemTime::now().into());
             writer.data(&data);
-            self.control.push_back(Datagram::whole(server.at, writer));
+            self.control
+                .push_back(Datagram::from_writer(server.at, writer));
         }
     }
 
     pub(super) fn leave_servers(&mut self, now: Instant) {
         let own = self.guid();
-        let change = Change {
+        let change = CacheChange {
             status: DISPOSED,
             key: Some(own.bytes()),
-            ..Engine::change_of_announcement(discovery::key(own))
+            ..Engine::announcement_change(discovery::key_payload(own))
         };
         self.publish(now, EntityId::SPDP_WRITER, change);
     }
 
-    /// By what an announcement of ours is known behind other servers: a server passes nothing on that has no identity.
-    pub(super) fn identity(
+    /// Returns the identity of an announcement; servers do not forward announcements without one.
+    pub(super) fn announcement_identity(
         &self,
         announcer: EntityId,
         number: SequenceNumber,
@@ -160,17 +163,18 @@ impl Engine {
         (self.is_client() && announcer.is_builtin()).then_some(SampleIdentity { writer, number })
     }
 
-    /// Whoever servers tell of says nothing to us of itself. So it is asked, for that it be gone some day also where no server says
-    /// so: it may have ended together with the server.
-    pub(super) fn ask_silent(&mut self, now: Instant) {
+    /// Pings participants known from servers, which send us no announcements, so that they are eventually removed even
+    /// without a server: they may have ended together with it.
+    pub(super) fn ping_silent(&mut self, now: Instant) {
         let silent = self.remotes.iter().filter(|(_, remote)| {
-            remote.via == Via::Servers && now.saturating_duration_since(remote.heard) >= LAST_PAUSE
+            remote.via == DiscoverySource::Servers
+                && now.saturating_duration_since(remote.heard) >= LAST_PAUSE
         });
         let silent: Vec<GuidPrefix> = silent.map(|(prefix, _)| *prefix).collect();
         for prefix in silent {
-            let mut wanted = Wanted::default();
+            let mut wanted = SendRequests::default();
             let mut writers = self.writers.iter();
-            let asked = writers.find(|(_, writer)| writer.state.ask(prefix, &mut wanted));
+            let asked = writers.find(|(_, writer)| writer.state.request_ack(prefix, &mut wanted));
             let Some(entity) = asked.map(|(entity, _)| *entity) else {
                 continue;
             };
@@ -181,11 +185,11 @@ impl Engine {
         }
     }
 
-    // ---- hearing them
+    // ---- receiving from servers
 
-    /// A participant announces itself, or others where it is a server. One that is named is met; all else of a server that is met
-    /// comes in order, by [`Self::server_tells`], and of whoever is none nothing is heard.
-    pub(super) fn server_heard(
+    /// Handles an announcement of a participant. A configured server is matched; everything else from a known server
+    /// arrives in order through [`Self::on_server_data`], and other participants are ignored.
+    pub(super) fn on_server_announcement(
         &mut self,
         now: Instant,
         from: GuidPrefix,
@@ -193,10 +197,10 @@ impl Engine {
         data: &wire::Data,
     ) {
         if data.inline.status != 0 {
-            // What a server says last, it says once.
+            // The last message of a server is sent only once.
             let gone = discovery::guid_of_key(data);
             if self.is_server(from) && gone.is_some_and(|gone| gone.prefix == from) {
-                self.participant_gone(from);
+                self.remove_participant(from);
             }
             return;
         }
@@ -210,51 +214,53 @@ impl Engine {
         if told.prefix != from {
             return;
         }
-        match self.named(&told) {
-            Some(address) => self.participant_came(now, Via::Named(address), told),
+        match self.find_server_address(&told) {
+            Some(address) => self.add_participant(now, DiscoverySource::Named(address), told),
             None => tracing::debug!(
                 %source,
-                "a DDS participant that is none of the discovery servers announces itself and is not heard"
+                "a DDS participant that is not one of the discovery servers is ignored"
             ),
         }
     }
 
-    /// A server is there: it is told all, and asked for all.
-    pub(super) fn meet_server(&mut self, now: Instant, prefix: GuidPrefix) {
+    /// Matches a server: everything is sent to it and requested from it.
+    pub(super) fn match_server(&mut self, now: Instant, prefix: GuidPrefix) {
         for pair in [PARTICIPANTS].into_iter().chain(ANNOUNCERS) {
             self.match_builtin(now, prefix, pair, true, true);
         }
         self.wake(now);
     }
 
-    /// A server tells of a participant, or that one is gone.
-    pub(super) fn server_tells(&mut self, now: Instant, sample: &Sample) {
+    /// Handles the announcement or disposal of a participant by a server.
+    pub(super) fn on_server_data(&mut self, now: Instant, sample: &ReceivedSample) {
         if let Some(gone) = sample.withdrawn {
-            self.participant_gone(gone.prefix);
+            self.remove_participant(gone.prefix);
             return;
         }
         let told = match ParticipantData::from_payload(&sample.payload) {
             Ok(told) => told,
             Err(error) => {
-                tracing::debug!(%error, "what a discovery server tells of a participant was not understood");
+                tracing::debug!(%error, "a participant announced by a discovery server was not understood");
                 return;
             }
         };
         let server = sample.writer.prefix;
         let via = match self.remotes.get(&server).map(|server| server.via) {
-            Some(via @ Via::Named(_)) if told.prefix == server => via,
-            // Other servers are met by themselves.
-            Some(Via::Named(_)) if self.named(&told).is_none() => Via::Servers,
+            Some(via @ DiscoverySource::Named(_)) if told.prefix == server => via,
+            // Other servers announce themselves.
+            Some(DiscoverySource::Named(_)) if self.find_server_address(&told).is_none() => {
+                DiscoverySource::Servers
+            }
             _ => return,
         };
         if told.prefix != self.own.prefix {
-            self.participant_told(now, via, told);
+            self.update_participant(now, via, told);
         }
     }
 
-    /// A reader of a server says what it has of what one of our own writers has announced. One that has lost what it had is a
-    /// server's that was begun anew.
-    pub(super) fn server_acknowledges(
+    /// Handles an acknowledgement of one of our built-in writers by a server. A server that has lost what it had
+    /// acknowledged has restarted.
+    pub(super) fn on_server_acknack(
         &mut self,
         now: Instant,
         reader: Guid,
@@ -266,11 +272,11 @@ impl Engine {
         };
         let lost = ours
             .state
-            .acknowledged(reader)
+            .last_acknowledged(reader)
             .is_some_and(|had| set.base <= had);
         if lost && self.is_server(reader.prefix) {
-            tracing::debug!(server = ?reader.prefix, "a discovery server was begun anew");
-            self.meet_server(now, reader.prefix);
+            tracing::debug!(server = ?reader.prefix, "a discovery server was restarted");
+            self.match_server(now, reader.prefix);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Participants on a network made of queues.
+//! Participants on a simulated network.
 
 mod delivery;
 mod history;

@@ -1,29 +1,29 @@
-//! What a reader keeps of writers that mean no good: samples and fragments that wait for others which never come.
+//! Limits on what a reader keeps of misbehaving writers: samples and fragments waiting for others that never arrive.
 
 use budget::Budget;
 use bytes::Bytes;
 
 use super::*;
-use crate::qos::{EndpointQos, History};
+use crate::qos::{EndpointQos, HistoryKind};
 use crate::sequence::SequenceSet;
 
 const UNFINISHED: Duration = Duration::from_secs(30);
 
-struct Read {
+struct ReaderHarness {
     now: Instant,
     state: ReaderState,
     budget: Budget,
-    out: Vec<Sample>,
-    answers: Vec<Answer>,
+    out: Vec<ReceivedSample>,
+    answers: Vec<AckResponse>,
 }
 
-fn end(guid: Guid, durability: Durability) -> EndpointData {
+fn endpoint(guid: Guid, durability: DurabilityKind) -> EndpointData {
     EndpointData {
         guid,
         topic: "rt/chatter".into(),
         type_name: "std_msgs::msg::dds_::String_".into(),
         qos: EndpointQos {
-            history: History::KeepAll,
+            history: HistoryKind::KeepAll,
             durability,
             ..EndpointQos::default()
         },
@@ -37,22 +37,22 @@ fn writer(number: u8) -> Guid {
     Guid::new(GuidPrefix([number; 12]), EntityId::user_writer(1))
 }
 
-impl Read {
-    /// A reader with so many bytes for what waits, and so many writers.
-    fn with(limit: usize, writers: u8) -> Self {
+impl ReaderHarness {
+    /// Creates a reader with a budget of this many bytes and this many writers.
+    fn with_limit(limit: usize, writers: u8) -> Self {
         let budget = Budget::new("samples", limit);
         let own = Guid::new(GuidPrefix([99; 12]), EntityId::user_reader(1));
-        let bounds = Bounds {
+        let bounds = ReaderLimits {
             max_sample: 16 << 20,
             budget: budget.clone(),
             unfinished: UNFINISHED,
         };
         let now = Instant::now();
-        let mut state = ReaderState::new(end(own, Durability::TransientLocal), bounds);
+        let mut state = ReaderState::new(endpoint(own, DurabilityKind::TransientLocal), bounds);
         for number in 1..=writers {
-            let data = Arc::new(end(writer(number), Durability::TransientLocal));
+            let data = Arc::new(endpoint(writer(number), DurabilityKind::TransientLocal));
             let address = SocketAddr::from(([127, 0, 0, 1], 7411));
-            state.matched(now, data, address, VendorId::OURS);
+            state.add_writer(now, data, address, VendorId::OURS);
         }
         Self {
             now,
@@ -64,7 +64,7 @@ impl Read {
     }
 
     fn data(&mut self, of: u8, number: i64, payload: Bytes) {
-        let sample = Sample {
+        let sample = ReceivedSample {
             payload,
             writer: writer(of),
             number: SequenceNumber(number),
@@ -72,7 +72,8 @@ impl Read {
             written: None,
             withdrawn: None,
         };
-        self.state.data(self.now, writer(of), sample, &mut self.out);
+        self.state
+            .on_data(self.now, writer(of), sample, &mut self.out);
     }
 
     fn fragment(&mut self, of: u8, number: i64, size: u32, first: FragmentNumber) {
@@ -89,7 +90,7 @@ impl Read {
             key_only: false,
         };
         self.state
-            .data_frag(self.now, writer(of), &frag, None, &mut self.out);
+            .on_data_frag(self.now, writer(of), &frag, None, &mut self.out);
     }
 
     fn heartbeat(&mut self, of: u8, first: i64, last: i64, count: u32) {
@@ -103,11 +104,11 @@ impl Read {
             liveliness: false,
         };
         self.state
-            .heartbeat(self.now, writer(of), &beat, &mut self.out);
+            .on_heartbeat(self.now, writer(of), &beat, &mut self.out);
     }
 
-    /// What is asked for once so long has passed.
-    fn asks_after(&mut self, duration: Duration) -> Vec<i64> {
+    /// Returns the numbers requested after this time.
+    fn requested_after(&mut self, duration: Duration) -> Vec<i64> {
         self.now += duration;
         self.answers.clear();
         self.state.tick(self.now, &mut self.answers, &mut self.out);
@@ -124,9 +125,9 @@ impl Read {
 
 #[test]
 fn samples_that_wait_count_in_the_budget_whoever_wrote_them() {
-    let mut read = Read::with(1 << 20, 40);
+    let mut read = ReaderHarness::with_limit(1 << 20, 40);
     for of in 1..=40 {
-        // Half of the writers never say where they begin, half leave a hole.
+        // Half of the writers never announce their first number, half leave a gap.
         if of % 2 == 0 {
             read.heartbeat(of, 1, 1000, 1);
         }
@@ -135,77 +136,77 @@ fn samples_that_wait_count_in_the_budget_whoever_wrote_them() {
         }
     }
     let one = 60_000 + KEEPING;
-    assert_eq!(read.budget.used(), (1 << 20) / one * one);
+    assert_eq!(read.budget.used_bytes(), (1 << 20) / one * one);
     assert_eq!(read.state.refused, 40 * 199 - (1 << 20) / one as u64);
     assert!(read.out.is_empty());
-    (1..=40).for_each(|of| assert!(read.state.unmatched(writer(of))));
-    assert_eq!(read.budget.used(), 0);
+    (1..=40).for_each(|of| assert!(read.state.remove_writer(writer(of))));
+    assert_eq!(read.budget.used_bytes(), 0);
 }
 
 #[test]
 fn a_short_sample_that_waits_keeps_no_datagram_and_counts_as_what_it_takes() {
-    let mut read = Read::with(1 << 20, 1);
+    let mut read = ReaderHarness::with_limit(1 << 20, 1);
     let datagram = Bytes::from(vec![0; 60_000]);
     for number in 2..=200 {
         read.data(1, number, datagram.slice(..8));
     }
     assert!(datagram.is_unique());
-    assert_eq!(read.budget.used(), 199 * (8 + KEEPING));
-    // One that came twice counts once.
+    assert_eq!(read.budget.used_bytes(), 199 * (8 + KEEPING));
+    // A duplicate counts once.
     read.data(1, 2, datagram.slice(..8));
-    assert_eq!(read.budget.used(), 199 * (8 + KEEPING));
+    assert_eq!(read.budget.used_bytes(), 199 * (8 + KEEPING));
 }
 
 #[test]
 fn a_sample_without_room_is_asked_for_again_and_comes_in_its_order() {
-    let mut read = Read::with(2 * (1000 + KEEPING), 1);
+    let mut read = ReaderHarness::with_limit(2 * (1000 + KEEPING), 1);
     read.heartbeat(1, 1, 4, 1);
-    assert_eq!(read.asks_after(Duration::ZERO), [1, 2, 3, 4]);
+    assert_eq!(read.requested_after(Duration::ZERO), [1, 2, 3, 4]);
     for number in [2, 3, 4] {
         read.data(1, number, vec![0; 1000].into());
     }
     assert_eq!(read.state.refused, 1);
-    assert_eq!(read.asks_after(Duration::from_secs(1)), [1, 4]);
-    // What is passed on at once needs no room.
+    assert_eq!(read.requested_after(Duration::from_secs(1)), [1, 4]);
+    // What is delivered immediately needs no memory.
     read.data(1, 1, vec![0; 5000].into());
     assert_eq!(read.numbers(), [1, 2, 3]);
     read.data(1, 4, vec![0; 1000].into());
     assert_eq!(read.numbers(), [1, 2, 3, 4]);
     read.out.clear();
-    assert_eq!(read.budget.used(), 0);
+    assert_eq!(read.budget.used_bytes(), 0);
 }
 
 #[test]
 fn a_refused_sample_is_asked_for_without_a_heartbeat() {
-    let mut read = Read::with(1000 + KEEPING, 1);
+    let mut read = ReaderHarness::with_limit(1000 + KEEPING, 1);
     read.heartbeat(1, 1, 0, 1);
-    read.asks_after(Duration::from_secs(1));
+    read.requested_after(Duration::from_secs(1));
     read.data(1, 2, vec![0; 1000].into());
     read.data(1, 3, vec![0; 1000].into());
     assert_eq!(read.state.refused, 1);
-    assert_eq!(read.asks_after(ASK_AGAIN), [1, 3]);
+    assert_eq!(read.requested_after(ASK_AGAIN), [1, 3]);
 }
 
 #[test]
 fn what_waits_makes_room_for_the_fragments_it_waits_for() {
-    let mut read = Read::with(3 * (1000 + KEEPING), 1);
+    let mut read = ReaderHarness::with_limit(3 * (1000 + KEEPING), 1);
     read.heartbeat(1, 1, 4, 1);
     for number in [2, 3, 4] {
         read.data(1, number, vec![0; 1000].into());
     }
-    assert_eq!(read.budget.left(), 0);
-    // The newest goes for the first fragment, and the one before it for the second.
+    assert_eq!(read.budget.available(), 0);
+    // The newest sample is dropped for the first fragment, and the one before it for the second.
     for _ in 0..3 {
         read.fragment(1, 1, 2000, 1);
         read.fragment(1, 1, 2000, 2);
     }
     assert_eq!(read.numbers(), [1, 2]);
-    assert_eq!(read.asks_after(Duration::from_secs(1)), [3, 4]);
+    assert_eq!(read.requested_after(Duration::from_secs(1)), [3, 4]);
 }
 
 #[test]
 fn fragments_that_stop_coming_are_given_up() {
-    let mut read = Read::with(1 << 20, 2);
+    let mut read = ReaderHarness::with_limit(1 << 20, 2);
     read.heartbeat(1, 1, 0, 1);
     for of in [1, 2] {
         for number in 1..=4 {
@@ -213,12 +214,12 @@ fn fragments_that_stop_coming_are_given_up() {
             read.fragment(of, number, 5000, 3);
         }
     }
-    assert_eq!(read.budget.used(), 2 * 4 * (2000 + 128));
-    read.asks_after(UNFINISHED - Duration::from_millis(1));
-    assert_ne!(read.budget.used(), 0);
-    read.asks_after(Duration::from_millis(1));
-    assert_eq!(read.budget.used(), 0);
-    // It is told when to look.
+    assert_eq!(read.budget.used_bytes(), 2 * 4 * (2000 + 128));
+    read.requested_after(UNFINISHED - Duration::from_millis(1));
+    assert_ne!(read.budget.used_bytes(), 0);
+    read.requested_after(Duration::from_millis(1));
+    assert_eq!(read.budget.used_bytes(), 0);
+    // The time of the next call is returned.
     read.fragment(2, 5, 5000, 1);
     let again = read.state.tick(read.now, &mut read.answers, &mut read.out);
     assert!(again.is_some_and(|again| again <= read.now + UNFINISHED));
@@ -226,17 +227,17 @@ fn fragments_that_stop_coming_are_given_up() {
 
 #[test]
 fn at_its_limit_the_budget_of_fragments_refuses_and_lets_go() {
-    let mut read = Read::with(3000, 1);
+    let mut read = ReaderHarness::with_limit(3000, 1);
     read.heartbeat(1, 1, 0, 1);
     for number in 1..=3 {
         read.fragment(1, number, 5000, 1);
     }
-    assert_eq!((read.budget.used(), read.state.refused), (3000, 0));
+    assert_eq!((read.budget.used_bytes(), read.state.refused), (3000, 0));
     read.fragment(1, 4, 5000, 1);
-    assert_eq!((read.budget.used(), read.state.refused), (3000, 1));
-    // A sample that can be passed on at once comes through all the same.
+    assert_eq!((read.budget.used_bytes(), read.state.refused), (3000, 1));
+    // A sample that can be delivered immediately is still accepted.
     read.heartbeat(1, 5, 5, 2);
-    assert_eq!(read.budget.used(), 0);
+    assert_eq!(read.budget.used_bytes(), 0);
     read.data(1, 5, vec![0; 60_000].into());
     assert_eq!(read.numbers(), [5]);
 }

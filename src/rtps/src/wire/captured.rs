@@ -1,16 +1,16 @@
-//! Datagrams as they came from others in a network namespace: of rclpy 7.1.6 with Fast DDS 2.14.5 (`fast_…`), which ends each
-//! with a submessage of its own, and of Cyclone DDS 11.0.1 (`cyclone_…`).
+//! Datagrams captured in a network namespace, of rclpy 7.1.6 with Fast DDS 2.14.5 (`fast_…`), which appends a
+//! vendor-specific submessage to each, and of Cyclone DDS 11.0.1 (`cyclone_…`).
 
-use super::tests::bytes;
+use super::tests::parse_hex;
 use super::*;
 use crate::discovery::guid_of_key;
 use crate::locator::Locator;
-use crate::network::{Interface, Network};
-use crate::{Durability, EndpointData, Guid, History, ParticipantData, Reliability};
+use crate::network::{InterfaceAddress, InterfaceSet};
+use crate::{DurabilityKind, EndpointData, Guid, HistoryKind, ParticipantData, ReliabilityKind};
 
-/// Where such a participant is reached in its network namespace.
+/// Returns the address at which such a participant is reached in its network namespace.
 fn reachable(told: &[Locator]) -> Option<std::net::SocketAddr> {
-    Network::new(vec![Interface::LOOPBACK]).choose(told, None)
+    InterfaceSet::new(vec![InterfaceAddress::LOOPBACK]).choose_address(told, None)
 }
 
 macro_rules! captured {
@@ -19,14 +19,14 @@ macro_rules! captured {
     };
 }
 
-fn read(text: &str) -> Vec<Received> {
-    let Parsed { received, fault } = parse(&bytes(text));
+fn read(text: &str) -> Vec<ReceivedSubmessage> {
+    let Parsed { received, fault } = parse(&parse_hex(text));
     assert_eq!(fault, None);
     received
 }
 
-/// The first sample in it.
-fn data(received: &[Received]) -> &Data {
+/// Returns the first sample.
+fn data(received: &[ReceivedSubmessage]) -> &Data {
     let mut submessages = received.iter().map(|received| &received.submessage);
     let Some(Submessage::Data(data)) =
         submessages.find(|submessage| matches!(submessage, Submessage::Data(_)))
@@ -36,20 +36,20 @@ fn data(received: &[Received]) -> &Data {
     data
 }
 
-fn payload(received: &[Received]) -> &Bytes {
+fn payload(received: &[ReceivedSubmessage]) -> &Bytes {
     data(received).payload.as_ref().expect("a payload")
 }
 
-/// Of the node `one`, which writes and serves.
+/// Prefix of the node `one`, which writes and serves.
 const ONE: GuidPrefix = GuidPrefix([1, 0x0f, 0x7f, 1, 0xd6, 0x78, 0xb9, 0x36, 0, 0, 0, 0]);
-/// Of the node `two`, which reads and asks.
+/// Prefix of the node `two`, which reads and calls.
 const TWO: GuidPrefix = GuidPrefix([1, 0x0f, 0x7f, 1, 0xfb, 0x78, 0x2e, 0x22, 0, 0, 0, 0]);
 const CYCLONE: GuidPrefix = GuidPrefix([
     1, 0x10, 0x62, 0xb9, 0xfc, 0x44, 0x4f, 0xf0, 0x6f, 0, 0xdd, 0x90,
 ]);
 
 #[test]
-fn participants() {
+fn captured_participants_are_parsed() {
     let received = captured!("fast_participant");
     assert_eq!((received[0].from, received[0].to), (ONE, None));
     assert_eq!(
@@ -61,7 +61,7 @@ fn participants() {
         (told.prefix, told.vendor, &*told.name),
         (ONE, VendorId::FAST_DDS, "/")
     );
-    // ROS 2 counts the zero at its end in.
+    // ROS 2 includes the terminating zero.
     assert_eq!(&told.user_data[..], b"enclave=/;\0");
     assert_eq!(
         reachable(&told.discovery),
@@ -87,9 +87,10 @@ fn participants() {
 }
 
 #[test]
-fn ends() {
-    let told =
-        |received: Vec<Received>| EndpointData::from_payload(payload(&received)).expect("an end");
+fn captured_endpoints_are_parsed() {
+    let told = |received: Vec<ReceivedSubmessage>| {
+        EndpointData::from_payload(payload(&received)).expect("an end")
+    };
     let writer = told(captured!("fast_writer"));
     assert_eq!(
         (&*writer.topic, &*writer.type_name),
@@ -98,7 +99,7 @@ fn ends() {
     assert!(writer.guid.prefix == TWO && writer.guid.entity.is_writer());
     assert_eq!(
         (writer.qos.reliability, writer.qos.durability),
-        (Reliability::Reliable, Durability::Volatile)
+        (ReliabilityKind::Reliable, DurabilityKind::Volatile)
     );
     let hash = b"typehash=RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18;";
     assert_eq!(&writer.user_data[..], hash);
@@ -121,16 +122,16 @@ fn ends() {
     );
     assert_eq!(
         (writer.qos.durability, writer.qos.history),
-        (Durability::TransientLocal, History::KeepLast(10))
+        (DurabilityKind::TransientLocal, HistoryKind::KeepLast(10))
     );
     assert!(writer.unicast.is_empty());
 }
 
 #[test]
-fn that_a_participant_is_alive() {
-    // In the datagram of its writer, behind that.
+fn captured_liveliness_is_parsed() {
+    // In the datagram of its writer, after the announcement.
     let received = captured!("cyclone_writer");
-    let Some(Received {
+    let Some(ReceivedSubmessage {
         submessage: Submessage::Data(data),
         ..
     }) = received.get(1)
@@ -152,7 +153,7 @@ fn that_a_participant_is_alive() {
 }
 
 #[test]
-fn a_sample() {
+fn a_captured_sample_is_parsed() {
     let received = captured!("fast_sample");
     assert_eq!((received[0].from, received[0].to), (ONE, Some(TWO)));
     assert_eq!(data(&received).number, SequenceNumber(4));
@@ -160,7 +161,7 @@ fn a_sample() {
 }
 
 #[test]
-fn a_fragment() {
+fn a_captured_fragment_is_parsed() {
     let received = captured!("fast_last_fragment");
     let Submessage::DataFrag(frag) = &received[0].submessage else {
         panic!("a fragment")
@@ -174,7 +175,7 @@ fn a_fragment() {
 }
 
 #[test]
-fn an_acknowledgement() {
+fn a_captured_acknack_is_parsed() {
     let received = captured!("fast_acknack");
     let Submessage::AckNack(acknack) = &received[0].submessage else {
         panic!("an acknowledgement")
@@ -187,8 +188,8 @@ fn an_acknowledgement() {
 }
 
 #[test]
-fn a_request_and_its_reply() {
-    // Both name the client's reader; only the reply knows the request's number.
+fn a_captured_request_and_its_reply_are_parsed() {
+    // Both contain the client's reader; only the reply knows the number of the request.
     let client = Guid::new(TWO, EntityId([0, 0, 0x14, 4]));
     let request = captured!("fast_request");
     let related = data(&request).inline.related;
@@ -215,8 +216,8 @@ fn a_request_and_its_reply() {
 }
 
 #[test]
-fn what_is_withdrawn() {
-    let gone = |received: Vec<Received>| {
+fn captured_disposals_are_parsed() {
+    let gone = |received: Vec<ReceivedSubmessage>| {
         assert_eq!(
             data(&received).inline.status,
             InlineQos::DISPOSED | InlineQos::UNREGISTERED
@@ -231,7 +232,7 @@ fn what_is_withdrawn() {
         gone(captured!("fast_gone")),
         Guid::new(TWO, EntityId::PARTICIPANT)
     );
-    // The one has only the key's hash, the other only the key.
+    // One contains only the key hash, the other only the key.
     let received = captured!("cyclone_gone");
     assert!(data(&received).key_only && data(&received).inline.key_hash.is_none());
     assert_eq!(gone(received), Guid::new(CYCLONE, EntityId([0, 0, 2, 3])));

@@ -1,4 +1,4 @@
-//! Bytes that are read from front to back, in the byte order that they say.
+//! A cursor over received bytes with their byte order.
 
 use bytes::Bytes;
 
@@ -6,23 +6,23 @@ use super::WireError;
 use crate::time::{WireDuration, WireTime};
 use crate::{EntityId, Guid, GuidPrefix, SampleIdentity, SequenceNumber};
 
-/// No writer comes to this number: at a thousand million samples a second it takes 146 years.
+/// Upper limit of sequence numbers, which no writer reaches: 146 years at a billion samples per second.
 const MOST: i64 = 1 << 62;
 
-/// A part of some bytes of which what is in front has been read.
+/// A cursor over a part of received bytes.
 #[derive(Debug, Clone)]
-pub(crate) struct Input<'a> {
+pub(crate) struct WireReader<'a> {
     whole: &'a Bytes,
-    /// At most `end`.
+    /// Position; at most `end`.
     at: usize,
-    /// At most the length of `whole`.
+    /// End; at most the length of `whole`.
     end: usize,
-    /// The least significant byte of a number is its first.
+    /// Little-endian byte order.
     pub little: bool,
 }
 
-impl<'a> Input<'a> {
-    /// All of these.
+impl<'a> WireReader<'a> {
+    /// Creates a cursor over all bytes.
     pub fn new(whole: &'a Bytes, little: bool) -> Self {
         Self {
             whole,
@@ -32,17 +32,17 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// How many bytes are left.
-    pub fn left(&self) -> usize {
+    /// Returns the number of remaining bytes.
+    pub fn remaining(&self) -> usize {
         self.end - self.at
     }
 
-    /// How many bytes of the whole are before what is left.
+    /// Returns the position within the whole.
     pub fn position(&self) -> usize {
         self.at
     }
 
-    /// The next ones.
+    /// Reads the next bytes.
     pub fn array<const N: usize>(&mut self) -> Result<[u8; N], WireError> {
         let bytes = self.whole[self.at..self.end]
             .first_chunk()
@@ -51,14 +51,14 @@ impl<'a> Input<'a> {
         Ok(*bytes)
     }
 
-    /// Passes over so many.
+    /// Skips bytes.
     pub fn skip(&mut self, length: usize) -> Result<(), WireError> {
-        self.part(length).map(drop)
+        self.split_to(length).map(drop)
     }
 
-    /// The next ones, to be read by themselves.
-    pub fn part(&mut self, length: usize) -> Result<Self, WireError> {
-        if length > self.left() {
+    /// Splits off a cursor over the next bytes.
+    pub fn split_to(&mut self, length: usize) -> Result<Self, WireError> {
+        if length > self.remaining() {
             return Err(WireError::Short);
         }
         let begin = self.at;
@@ -71,13 +71,13 @@ impl<'a> Input<'a> {
         })
     }
 
-    /// The rest, as it is.
+    /// Returns the remaining bytes.
     pub fn rest(&self) -> &'a [u8] {
         &self.whole[self.at..self.end]
     }
 
-    /// The rest as a slice of the whole.
-    pub fn shared(&self) -> Bytes {
+    /// Returns the remaining bytes as a slice of the whole, sharing its memory.
+    pub fn to_bytes(&self) -> Bytes {
         self.whole.slice(self.at..self.end)
     }
 
@@ -119,14 +119,14 @@ impl<'a> Input<'a> {
         self.array::<16>().map(Guid::from)
     }
 
-    /// Any number, also one that no sample has.
+    /// Reads any number, including invalid sequence numbers.
     pub fn number(&mut self) -> Result<SequenceNumber, WireError> {
         let (high, low) = (self.i32()?, self.u32()?);
         Ok(SequenceNumber(i64::from(high) << 32 | i64::from(low)))
     }
 
-    /// The number of a sample, or one beside: at least `least`, and so far from the largest that sums do not overflow.
-    pub fn number_from(&mut self, least: i64) -> Result<SequenceNumber, WireError> {
+    /// Reads a sequence number of at least `least` that is low enough for additions not to overflow.
+    pub fn number_at_least(&mut self, least: i64) -> Result<SequenceNumber, WireError> {
         let number = self.number()?;
         if (least..MOST).contains(&number.0) {
             Ok(number)
@@ -135,9 +135,9 @@ impl<'a> Input<'a> {
         }
     }
 
-    /// The number of a sample.
-    pub fn sample(&mut self) -> Result<SequenceNumber, WireError> {
-        self.number_from(1)
+    /// Reads the sequence number of a sample.
+    pub fn sample_number(&mut self) -> Result<SequenceNumber, WireError> {
+        self.number_at_least(1)
     }
 
     pub fn identity(&mut self) -> Result<SampleIdentity, WireError> {
@@ -161,10 +161,10 @@ impl<'a> Input<'a> {
         })
     }
 
-    /// Bytes with their number before them, of a sequence or string of CDR.
-    pub fn counted(&mut self) -> Result<&'a [u8], WireError> {
+    /// Reads a CDR sequence or string of bytes, which is preceded by its length.
+    pub fn byte_sequence(&mut self) -> Result<&'a [u8], WireError> {
         let length = self.u32()?;
         let length = usize::try_from(length).map_err(|_| WireError::Short)?;
-        self.part(length).map(|part| part.rest())
+        self.split_to(length).map(|part| part.rest())
     }
 }

@@ -1,4 +1,4 @@
-//! Numbers of the kinds of submessages (9.4.5.1.1).
+//! Submessage ids (9.4.5.1.1).
 
 pub(super) const PAD: u8 = 0x01;
 pub(super) const ACKNACK: u8 = 0x06;

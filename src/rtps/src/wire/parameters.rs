@@ -1,15 +1,15 @@
-//! Lists of parameters (9.4.2.11): of inline QoS, and of the payloads by which ends are discovered.
+//! Parameter lists (9.4.2.11), used for inline QoS and discovery data.
 
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::{Input, WireError};
+use super::{WireError, WireReader};
 use crate::locator::Locator;
 use crate::time::WireDuration;
 use crate::{Guid, SampleIdentity};
 
-/// Numbers of parameters (9.6.3.2, 9.6.4), without the bit [`pid::MUST_BE_UNDERSTOOD`].
+/// Parameter ids (9.6.3.2, 9.6.4), without the bit [`pid::MUST_BE_UNDERSTOOD`].
 pub(crate) mod pid {
     pub const SENTINEL: u16 = 0x0001;
     pub const PARTICIPANT_LEASE_DURATION: u16 = 0x0002;
@@ -39,21 +39,21 @@ pub(crate) mod pid {
     pub const STATUS_INFO: u16 = 0x0071;
     /// DDS-XTypes 1.3 (7.6.3.1.1).
     pub const DATA_REPRESENTATION: u16 = 0x0073;
-    /// As DDS-RPC 1.0 has it (7.8.2).
+    /// As specified by DDS-RPC 1.0 (7.8.2).
     pub const RELATED_SAMPLE_IDENTITY: u16 = 0x0083;
-    /// As Fast DDS had it before the standard; its versions of today write both and read either.
+    /// As used by Fast DDS before the standard; current versions write both and read either.
     pub const FAST_DDS_RELATED_SAMPLE_IDENTITY: u16 = 0x800f;
 
-    /// The bit of a parameter that whoever does not know it must not pass over (9.6.3.2).
+    /// Flag of a parameter that must not be ignored if it is unknown (9.6.3.2).
     pub const MUST_BE_UNDERSTOOD: u16 = 0x4000;
 }
 
-/// How payloads that are lists of parameters begin (10.2.1.2): big and little endian.
+/// Serialization ids of parameter lists (10.2.1.2), big- and little-endian.
 const PL_CDR: [u16; 2] = [0x0002, 0x0003];
 
-/// The list that is such a payload.
-pub(crate) fn list(payload: &Bytes) -> Result<Input<'_>, WireError> {
-    let mut input = Input::new(payload, false);
+/// Returns the parameter list in a payload.
+pub(crate) fn parameter_list(payload: &Bytes) -> Result<WireReader<'_>, WireError> {
+    let mut input = WireReader::new(payload, false);
     let serialization = input.u16()?;
     if !PL_CDR.contains(&serialization) {
         return Err(WireError::Serialization(serialization));
@@ -63,25 +63,25 @@ pub(crate) fn list(payload: &Bytes) -> Result<Input<'_>, WireError> {
     Ok(input)
 }
 
-/// What a payload of ours that is a list of parameters begins with.
+/// Creates a payload with the header of a parameter list.
 pub(crate) fn list_header() -> Vec<u8> {
     let mut bytes = Vec::with_capacity(512);
     bytes.extend_from_slice(&[0, 3, 0, 0]);
     bytes
 }
 
-/// The next parameter: its number without the bit, and its value, which is at most 65,535 bytes long. None at the end of the
-/// list, which must be there. Those that are not in `known` are passed over, or an error where they must not be.
-pub(crate) fn parameter<'a>(
-    input: &mut Input<'a>,
+/// Reads the next parameter: its id without the flag, and its value of at most 65,535 bytes. Returns `None` at the
+/// sentinel, which is required. Parameters that are not in `known` are skipped, or an error if they must be understood.
+pub(crate) fn next_parameter<'a>(
+    input: &mut WireReader<'a>,
     known: &[u16],
-) -> Result<Option<(u16, Input<'a>)>, WireError> {
+) -> Result<Option<(u16, WireReader<'a>)>, WireError> {
     loop {
         let (number, length) = (input.u16()?, input.u16()?);
         if number == pid::SENTINEL {
             return Ok(None);
         }
-        let value = input.part(usize::from(length))?;
+        let value = input.split_to(usize::from(length))?;
         let plain = number & !pid::MUST_BE_UNDERSTOOD;
         if known.contains(&plain) {
             return Ok(Some((plain, value)));
@@ -92,19 +92,19 @@ pub(crate) fn parameter<'a>(
     }
 }
 
-/// Writes a list of parameters, little endian.
+/// Writes a parameter list, little-endian.
 pub(crate) struct ParameterWriter<'a> {
     bytes: &'a mut Vec<u8>,
 }
 
 impl<'a> ParameterWriter<'a> {
-    /// At the end of these.
+    /// Creates a writer that appends to these bytes.
     pub fn new(bytes: &'a mut Vec<u8>) -> Self {
         Self { bytes }
     }
 
-    /// A value as it is; filled up with zeros to a multiple of four bytes. One that is too long for a parameter (65,532 bytes)
-    /// is left out.
+    /// Writes a value padded with zeros to a multiple of four bytes. A value that is too long for a parameter (65,532
+    /// bytes) is omitted.
     pub fn raw(&mut self, number: u16, value: &[u8]) -> &mut Self {
         let padded = value.len().next_multiple_of(4);
         if let Ok(length) = u16::try_from(padded) {
@@ -125,7 +125,7 @@ impl<'a> ParameterWriter<'a> {
         self.raw(number, &guid.bytes())
     }
 
-    /// None: without end.
+    /// Writes a duration; `None`: infinite.
     pub fn duration(&mut self, number: u16, duration: Option<Duration>) -> &mut Self {
         self.raw(number, &duration_bytes(duration))
     }
@@ -137,7 +137,7 @@ impl<'a> ParameterWriter<'a> {
         self.raw(number, &value)
     }
 
-    /// A policy that is a kind and a duration.
+    /// Writes a policy that consists of a kind and a duration.
     pub fn kind_and_duration(
         &mut self,
         number: u16,
@@ -150,23 +150,23 @@ impl<'a> ParameterWriter<'a> {
         self.raw(number, &value)
     }
 
-    /// A string of CDR: its length with the zero at its end, its bytes, the zero.
+    /// Writes a CDR string: its length including the terminating zero, its bytes, and the zero.
     pub fn string(&mut self, number: u16, text: &str) -> &mut Self {
-        // What is longer than a u16 says is left out by `raw`.
+        // A value longer than a u16 allows is omitted by `raw`.
         let mut value = (text.len() as u32).saturating_add(1).to_le_bytes().to_vec();
         value.extend_from_slice(text.as_bytes());
         value.push(0);
         self.raw(number, &value)
     }
 
-    /// A sequence of bytes of CDR.
-    pub fn counted(&mut self, number: u16, bytes: &[u8]) -> &mut Self {
+    /// Writes a CDR sequence of bytes.
+    pub fn byte_sequence(&mut self, number: u16, bytes: &[u8]) -> &mut Self {
         let mut value = (bytes.len() as u32).to_le_bytes().to_vec();
         value.extend_from_slice(bytes);
         self.raw(number, &value)
     }
 
-    /// Names and their values (DDS-Security 1.1, 7.2.1): a sequence of pairs of strings of CDR.
+    /// Writes properties (DDS-Security 1.1, 7.2.1): a CDR sequence of pairs of strings.
     pub fn properties(&mut self, number: u16, properties: &[(&str, &str)]) -> &mut Self {
         let mut value = (properties.len() as u32).to_le_bytes().to_vec();
         for text in properties.iter().flat_map(|(name, value)| [name, value]) {
@@ -193,7 +193,7 @@ impl<'a> ParameterWriter<'a> {
         self.raw(number, &value)
     }
 
-    /// The end of the list.
+    /// Writes the sentinel.
     pub fn end(&mut self) {
         self.bytes.extend_from_slice(&[1, 0, 0, 0]);
     }
@@ -207,7 +207,7 @@ fn duration_bytes(duration: Option<Duration>) -> [u8; 8] {
     bytes
 }
 
-impl<'a> Input<'a> {
+impl<'a> WireReader<'a> {
     pub fn locator(&mut self) -> Result<Locator, WireError> {
         Ok(Locator {
             kind: self.i32()?,
@@ -216,13 +216,13 @@ impl<'a> Input<'a> {
         })
     }
 
-    /// The bytes of a string of CDR without the zero at its end, which some leave out.
+    /// Reads a CDR string without its terminating zero, which some implementations omit.
     pub fn string(&mut self) -> Result<&'a [u8], WireError> {
-        let bytes = self.counted()?;
+        let bytes = self.byte_sequence()?;
         Ok(bytes.strip_suffix(&[0]).unwrap_or(bytes))
     }
 
-    /// A string of CDR, of this parameter.
+    /// Reads a CDR string in UTF-8, the value of parameter `number`.
     pub fn text(&mut self, number: u16) -> Result<&'a str, WireError> {
         std::str::from_utf8(self.string()?).map_err(|_| WireError::Value(number))
     }

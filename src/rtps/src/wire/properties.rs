@@ -1,4 +1,4 @@
-//! Whatever is written is read as it was; whatever is read ends, and is no more than the datagram.
+//! Written datagrams are read unchanged; reading of arbitrary input terminates and yields no more than the datagram.
 
 use proptest::collection::vec;
 use proptest::option;
@@ -89,7 +89,7 @@ fn data_frag() -> impl Strategy<Value = DataFrag> {
             |(reader, writer, number, inline, (first, count, fragment_size, tail), key_only)| {
                 let size = u32::from(fragment_size);
                 let begin = (first - 1) * size;
-                // The sample ends somewhere in the last of them, or behind it.
+                // The sample ends within or after the last fragment.
                 let sample_size = begin
                     + (u32::from(count) - 1) * size
                     + 1
@@ -191,8 +191,8 @@ fn submessage() -> impl Strategy<Value = Submessage> {
     ]
 }
 
-/// Submessages of one datagram, each with what is said before it.
-fn received() -> impl Strategy<Value = Vec<Received>> {
+/// Generates the submessages of one datagram, each with its context.
+fn received_submessages() -> impl Strategy<Value = Vec<ReceivedSubmessage>> {
     let time =
         (any::<u32>(), 0..u32::MAX).prop_map(|(seconds, fraction)| WireTime { seconds, fraction });
     let one = (option::of(prefix()), option::of(time), submessage());
@@ -201,7 +201,7 @@ fn received() -> impl Strategy<Value = Vec<Received>> {
         let said = said.into_iter().map(|(destination, time, submessage)| {
             to = destination.or(to);
             written = time.or(written);
-            Received {
+            ReceivedSubmessage {
                 from,
                 vendor: VendorId::OURS,
                 to,
@@ -213,13 +213,13 @@ fn received() -> impl Strategy<Value = Vec<Received>> {
     })
 }
 
-fn write(received: &[Received]) -> Bytes {
+fn write(received: &[ReceivedSubmessage]) -> Bytes {
     let mut writer = DatagramWriter::new(
         received
             .first()
             .map_or(GuidPrefix([1; 12]), |first| first.from),
     );
-    for Received {
+    for ReceivedSubmessage {
         to,
         written,
         submessage,
@@ -245,8 +245,8 @@ fn write(received: &[Received]) -> Bytes {
     writer.finish().into()
 }
 
-/// A payload is filled up to a multiple of four bytes.
-fn filled(mut received: Received) -> Received {
+/// Pads a payload to a multiple of four bytes, as the writer does.
+fn pad_payload(mut received: ReceivedSubmessage) -> ReceivedSubmessage {
     if let Submessage::Data(Data {
         payload: Some(payload),
         ..
@@ -259,7 +259,7 @@ fn filled(mut received: Received) -> Received {
     received
 }
 
-fn payload_of(received: &Received) -> usize {
+fn payload_length(received: &ReceivedSubmessage) -> usize {
     match &received.submessage {
         Submessage::Data(data) => data.payload.as_ref().map_or(0, Bytes::len),
         Submessage::DataFrag(frag) => frag.payload.len(),
@@ -267,19 +267,19 @@ fn payload_of(received: &Received) -> usize {
     }
 }
 
-fn is_bounded(datagram: &Bytes) -> Parsed {
+fn assert_bounded(datagram: &Bytes) -> Parsed {
     let parsed = parse(datagram);
     assert!(parsed.received.len() <= MOST_SUBMESSAGES);
-    assert!(parsed.received.iter().map(payload_of).sum::<usize>() <= datagram.len());
+    assert!(parsed.received.iter().map(payload_length).sum::<usize>() <= datagram.len());
     parsed
 }
 
 proptest! {
     #[test]
-    fn what_is_written_is_read(said in received()) {
+    fn what_is_written_is_read(said in received_submessages()) {
         let parsed = parse(&write(&said));
         prop_assert_eq!(parsed.fault, None);
-        prop_assert_eq!(parsed.received, said.into_iter().map(filled).collect::<Vec<_>>());
+        prop_assert_eq!(parsed.received, said.into_iter().map(pad_payload).collect::<Vec<_>>());
     }
 
     #[test]
@@ -298,28 +298,29 @@ proptest! {
         let zeros = head.data_frag_head(&told, frag.payload.len());
         let sent = [&head.finish()[..], &frag.payload, zeros].concat();
         let submessage = Submessage::DataFrag(DataFrag { key_only: false, ..frag });
-        let whole = Received { from, vendor: VendorId::OURS, to: None, written: None, submessage };
+        let whole = ReceivedSubmessage { from, vendor: VendorId::OURS, to: None, written: None, submessage };
         prop_assert_eq!(Bytes::from(sent), write(&[whole]));
     }
 
     #[test]
-    fn what_is_cut_off_takes_nothing_from_what_is_before_it(said in received(), at in any::<prop::sample::Index>()) {
+    fn what_is_cut_off_takes_nothing_from_what_is_before_it(said in received_submessages(),
+        at in any::<prop::sample::Index>()) {
         let whole = write(&said);
         let cut = whole.slice(..at.index(whole.len() + 1));
-        let parsed = is_bounded(&cut);
+        let parsed = assert_bounded(&cut);
         prop_assert!(parse(&whole).received.starts_with(&parsed.received));
     }
 
     #[test]
     fn any_bytes_are_read_to_their_end(tail in vec(any::<u8>(), 0..300)) {
         let header = DatagramWriter::new(GuidPrefix([1; 12])).finish();
-        is_bounded(&[header, tail.clone()].concat().into());
-        is_bounded(&tail.into());
+        assert_bounded(&[header, tail.clone()].concat().into());
+        assert_bounded(&tail.into());
     }
 
     #[test]
     fn damaged_datagrams_are_read_to_their_end(
-        said in received(),
+        said in received_submessages(),
         damage in vec((any::<prop::sample::Index>(), any::<u8>()), 1..6),
     ) {
         let mut bytes = write(&said).to_vec();
@@ -327,6 +328,6 @@ proptest! {
             let at = at.index(bytes.len());
             bytes[at] = byte;
         }
-        is_bounded(&bytes.into());
+        assert_bounded(&bytes.into());
     }
 }

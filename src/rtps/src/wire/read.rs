@@ -1,39 +1,43 @@
-//! A datagram's submessages, read in order (8.3.4, 9.4.5).
+//! Reading of the submessages of a datagram (8.3.4, 9.4.5).
 
 use bytes::Bytes;
 
 use super::{
-    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, Input,
-    MOST_SUBMESSAGES, NackFrag, Parsed, Received, Submessage, WireError, kind, parameter, pid,
+    AckNack, Data, DataFrag, Gap, HEADER, Heartbeat, HeartbeatFrag, InlineQos, MOST_SUBMESSAGES,
+    NackFrag, Parsed, ReceivedSubmessage, Submessage, WireError, WireReader, kind, next_parameter,
+    pid,
 };
 use crate::sequence::{NumberSet, SPAN};
 use crate::time::WireTime;
 use crate::{EntityId, GuidPrefix, SequenceNumber, SequenceSet, VendorId};
 
-/// Reads what a datagram says. Submessages of unknown kinds are passed over; the first that is not as it should be ends the
-/// datagram, and what came before it stands (8.3.4.1). Payloads share the datagram's memory.
+/// Parses a datagram. Unknown submessages are skipped; the first invalid one ends the datagram, and those before it are
+/// valid (8.3.4.1). Payloads share the memory of the datagram.
 pub fn parse(datagram: &Bytes) -> Parsed {
     let mut parsed = Parsed::default();
-    parsed.fault = read(datagram, &mut parsed.received).err();
+    parsed.fault = read_submessages(datagram, &mut parsed.received).err();
     parsed
 }
 
-fn read(datagram: &Bytes, received: &mut Vec<Received>) -> Result<(), WireError> {
-    let mut input = Input::new(datagram, false);
-    let mut said = Said::header(&mut input).ok_or(WireError::NotRtps)?;
+fn read_submessages(
+    datagram: &Bytes,
+    received: &mut Vec<ReceivedSubmessage>,
+) -> Result<(), WireError> {
+    let mut input = WireReader::new(datagram, false);
+    let mut said = SubmessageContext::from_header(&mut input).ok_or(WireError::NotRtps)?;
     for _ in 0..MOST_SUBMESSAGES {
-        if input.left() == 0 {
+        if input.remaining() == 0 {
             return Ok(());
         }
-        let (kind, flags, body) = next(&mut input)?;
-        if let Some(submessage) = said.submessage(kind, flags, body)? {
-            let Said {
+        let (kind, flags, body) = next_submessage(&mut input)?;
+        if let Some(submessage) = said.read_submessage(kind, flags, body)? {
+            let SubmessageContext {
                 from,
                 vendor,
                 to,
                 written,
             } = said;
-            received.push(Received {
+            received.push(ReceivedSubmessage {
                 from,
                 vendor,
                 to,
@@ -42,38 +46,42 @@ fn read(datagram: &Bytes, received: &mut Vec<Received>) -> Result<(), WireError>
             });
         }
     }
-    if input.left() == 0 {
+    if input.remaining() == 0 {
         Ok(())
     } else {
         Err(WireError::TooMany)
     }
 }
 
-/// The next submessage: its kind, its flags, and what stands behind its header.
-fn next<'a>(input: &mut Input<'a>) -> Result<(u8, u8, Input<'a>), WireError> {
+/// Reads the next submessage: its id, its flags and its body.
+fn next_submessage<'a>(input: &mut WireReader<'a>) -> Result<(u8, u8, WireReader<'a>), WireError> {
     let [kind, flags] = input.array()?;
     input.little = flags & 1 != 0;
     let length = usize::from(input.u16()?);
     let to_the_end = length == 0 && !matches!(kind, kind::PAD | kind::INFO_TS);
-    let body = input.part(if to_the_end { input.left() } else { length })?;
-    // Each begins at a multiple of four bytes, also behind one whose length is none.
+    let body = input.split_to(if to_the_end {
+        input.remaining()
+    } else {
+        length
+    })?;
+    // Submessages start at multiples of four bytes, also after one without a length.
     let filler = input.position().next_multiple_of(4) - input.position();
-    input.skip(filler.min(input.left()))?;
+    input.skip(filler.min(input.remaining()))?;
     Ok((kind, flags, body))
 }
 
-/// What holds for a submessage because of those before it (8.3.4).
+/// Context of a submessage, given by the ones before it (8.3.4).
 #[derive(Clone, Copy)]
-struct Said {
+struct SubmessageContext {
     from: GuidPrefix,
     vendor: VendorId,
     to: Option<GuidPrefix>,
     written: Option<WireTime>,
 }
 
-impl Said {
-    /// By the datagram's header; none where it is not one of RTPS 2.
-    fn header(input: &mut Input) -> Option<Self> {
+impl SubmessageContext {
+    /// Reads the header of a datagram; `None` if it is not RTPS 2.
+    fn from_header(input: &mut WireReader) -> Option<Self> {
         let [protocol @ .., major, _minor] = input.array::<6>().ok()?;
         let vendor = VendorId(input.array().ok()?);
         let from = input.prefix().ok()?;
@@ -86,12 +94,12 @@ impl Said {
         })
     }
 
-    /// Reads a submessage. None where it only says something of those behind it, or is not known.
-    fn submessage(
+    /// Reads a submessage. Returns `None` if it only changes the context or is unknown.
+    fn read_submessage(
         &mut self,
         kind: u8,
         flags: u8,
-        mut body: Input,
+        mut body: WireReader,
     ) -> Result<Option<Submessage>, WireError> {
         let input = &mut body;
         match kind {
@@ -110,7 +118,7 @@ impl Said {
                 if major != 2 {
                     return Err(WireError::NotRtps);
                 }
-                // 8.3.7.9: what was said of the time is forgotten.
+                // 8.3.7.9: the timestamp is reset.
                 self.written = None;
             }
             kind::INFO_DST => {
@@ -129,55 +137,58 @@ impl Said {
     }
 }
 
-/// How a sender says that it does not know the time (9.3.2.1).
+/// The time value that means unknown (9.3.2.1).
 const NEVER: WireTime = WireTime {
     seconds: u32::MAX,
     fraction: u32::MAX,
 };
 
-/// What DATA and DATA_FRAG begin with.
-struct Head {
+/// Common header of DATA and DATA_FRAG.
+struct DataHeader {
     reader: EntityId,
     writer: EntityId,
     number: SequenceNumber,
 }
 
-/// Reads it. `input` is left at the inline QoS, the second at what else stands before that.
-fn head<'a>(input: &mut Input<'a>) -> Result<(Head, Input<'a>), WireError> {
+/// Reads the common header. `input` is then positioned at the inline QoS, the returned reader at the other fields
+/// before it.
+fn read_data_header<'a>(
+    input: &mut WireReader<'a>,
+) -> Result<(DataHeader, WireReader<'a>), WireError> {
     input.skip(2)?;
-    // A later version may put more there; it is passed over.
+    // A later version may add fields there, which are skipped.
     let to_inline = usize::from(input.u16()?);
-    let mut fixed = input.part(to_inline)?;
-    let head = Head {
+    let mut fixed = input.split_to(to_inline)?;
+    let head = DataHeader {
         reader: fixed.entity()?,
         writer: fixed.entity()?,
-        number: fixed.sample()?,
+        number: fixed.sample_number()?,
     };
     Ok((head, fixed))
 }
 
-fn data(flags: u8, input: &mut Input) -> Result<Option<Submessage>, WireError> {
-    // A payload of another form (flag N) is one of RTPS's security.
+fn data(flags: u8, input: &mut WireReader) -> Result<Option<Submessage>, WireError> {
+    // A non-standard payload (flag N) is one of DDS Security.
     if flags & 0x10 != 0 {
         return Ok(None);
     }
     let (
-        Head {
+        DataHeader {
             reader,
             writer,
             number,
         },
         _,
-    ) = head(input)?;
-    let Some(inline) = inline(flags, input)? else {
+    ) = read_data_header(input)?;
+    let Some(inline) = inline_qos(flags, input)? else {
         return Ok(None);
     };
-    // Both flags, sample and key, is what there must not be (8.3.7.2.3).
+    // Both flags, data and key, are invalid (8.3.7.2.3).
     let (sample, key_only) = (flags & 4 != 0, flags & 8 != 0);
     if sample && key_only {
         return Err(WireError::Flags(flags));
     }
-    let payload = (sample || key_only).then(|| input.shared());
+    let payload = (sample || key_only).then(|| input.to_bytes());
     Ok(Some(Submessage::Data(Data {
         reader,
         writer,
@@ -188,28 +199,29 @@ fn data(flags: u8, input: &mut Input) -> Result<Option<Submessage>, WireError> {
     })))
 }
 
-fn data_frag(flags: u8, input: &mut Input) -> Result<Option<Submessage>, WireError> {
+fn data_frag(flags: u8, input: &mut WireReader) -> Result<Option<Submessage>, WireError> {
     let (
-        Head {
+        DataHeader {
             reader,
             writer,
             number,
         },
         mut fixed,
-    ) = head(input)?;
+    ) = read_data_header(input)?;
     let (first, count) = (fixed.u32()?, fixed.u16()?);
     let (fragment_size, sample_size) = (fixed.u16()?, fixed.u32()?);
-    let length = covered(first, count, fragment_size, sample_size).ok_or(WireError::Fragments {
-        first,
-        count,
-        size: fragment_size,
-        sample: sample_size,
-    })?;
-    let Some(inline) = inline(flags, input)? else {
+    let length =
+        covered_length(first, count, fragment_size, sample_size).ok_or(WireError::Fragments {
+            first,
+            count,
+            size: fragment_size,
+            sample: sample_size,
+        })?;
+    let Some(inline) = inline_qos(flags, input)? else {
         return Ok(None);
     };
-    // What is behind them fills the submessage up.
-    let payload = input.part(length)?.shared();
+    // The rest of the submessage is padding.
+    let payload = input.split_to(length)?.to_bytes();
     let key_only = flags & 4 != 0;
     Ok(Some(Submessage::DataFrag(DataFrag {
         reader,
@@ -225,22 +237,22 @@ fn data_frag(flags: u8, input: &mut Input) -> Result<Option<Submessage>, WireErr
     })))
 }
 
-/// How many bytes of a sample these fragments are; none where they are not all in it.
-fn covered(first: u32, count: u16, fragment_size: u16, sample_size: u32) -> Option<usize> {
+/// Returns the number of bytes of these fragments; `None` if they are not within the sample.
+fn covered_length(first: u32, count: u16, fragment_size: u16, sample_size: u32) -> Option<usize> {
     let size = u64::from(fragment_size);
     let before = u64::from(first.checked_sub(1)?) * size;
     let last = before + u64::from(count.checked_sub(1)?) * size;
     let end = (last + size).min(u64::from(sample_size));
-    // The last one must begin within the sample. Pieces or samples of no bytes are out by this as well.
+    // The last fragment must begin within the sample, which also excludes empty fragments and samples.
     if last >= end {
         return None;
     }
     usize::try_from(end - before).ok()
 }
 
-fn heartbeat(flags: u8, input: &mut Input) -> Result<Submessage, WireError> {
+fn heartbeat(flags: u8, input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
-    let (first, last) = (input.sample()?, input.number_from(0)?);
+    let (first, last) = (input.sample_number()?, input.number_at_least(0)?);
     if last.next() < first {
         return Err(WireError::Number(last.0));
     }
@@ -256,9 +268,9 @@ fn heartbeat(flags: u8, input: &mut Input) -> Result<Submessage, WireError> {
     }))
 }
 
-fn heartbeat_frag(input: &mut Input) -> Result<Submessage, WireError> {
+fn heartbeat_frag(input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
-    let (number, last, count) = (input.sample()?, input.u32()?, input.u32()?);
+    let (number, last, count) = (input.sample_number()?, input.u32()?, input.u32()?);
     if last == 0 {
         return Err(WireError::Fragments {
             first: 1,
@@ -276,9 +288,9 @@ fn heartbeat_frag(input: &mut Input) -> Result<Submessage, WireError> {
     }))
 }
 
-fn acknack(flags: u8, input: &mut Input) -> Result<Submessage, WireError> {
+fn acknack(flags: u8, input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
-    let set = numbers(input, 0)?;
+    let set = sequence_set(input, 0)?;
     Ok(Submessage::AckNack(AckNack {
         reader,
         writer,
@@ -288,11 +300,11 @@ fn acknack(flags: u8, input: &mut Input) -> Result<Submessage, WireError> {
     }))
 }
 
-fn nack_frag(input: &mut Input) -> Result<Submessage, WireError> {
+fn nack_frag(input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
-    let number = input.sample()?;
+    let number = input.sample_number()?;
     let base = input.u32()?;
-    let set = set(base, input)?;
+    let set = number_set(base, input)?;
     if base == 0 || set.bits > 0 && base.checked_add(set.bits - 1).is_none() {
         return Err(WireError::Set(set.bits));
     }
@@ -305,24 +317,24 @@ fn nack_frag(input: &mut Input) -> Result<Submessage, WireError> {
     }))
 }
 
-fn gap(input: &mut Input) -> Result<Submessage, WireError> {
+fn gap(input: &mut WireReader) -> Result<Submessage, WireError> {
     let (reader, writer) = (input.entity()?, input.entity()?);
-    let start = input.sample()?;
+    let start = input.sample_number()?;
     Ok(Submessage::Gap(Gap {
         reader,
         writer,
         start,
-        set: numbers(input, 1)?,
+        set: sequence_set(input, 1)?,
     }))
 }
 
-/// A set of numbers of samples whose base is at least this.
-fn numbers(input: &mut Input, least: i64) -> Result<SequenceSet, WireError> {
-    set(input.number_from(least)?, input)
+/// Reads a set of sequence numbers whose base is at least `least`.
+fn sequence_set(input: &mut WireReader, least: i64) -> Result<SequenceSet, WireError> {
+    number_set(input.number_at_least(least)?, input)
 }
 
-/// What stands behind a set's base: how many bits, and their words.
-fn set<N: Copy>(base: N, input: &mut Input) -> Result<NumberSet<N>, WireError> {
+/// Reads a set after its base: the number of bits and the words.
+fn number_set<N: Copy>(base: N, input: &mut WireReader) -> Result<NumberSet<N>, WireError> {
     let bits = input.u32()?;
     if bits > SPAN {
         return Err(WireError::Set(bits));
@@ -335,17 +347,17 @@ fn set<N: Copy>(base: N, input: &mut Input) -> Result<NumberSet<N>, WireError> {
     NumberSet::from_words(base, bits, words).ok_or(WireError::Set(bits))
 }
 
-/// The inline QoS where the flags say that there is one. None where it has something that is to be understood and is not:
-/// the sample must then not be used.
-fn inline(flags: u8, input: &mut Input) -> Result<Option<InlineQos>, WireError> {
+/// Reads the inline QoS if the flags announce it. Returns `None` if it contains an unknown parameter that must be
+/// understood, in which case the sample must not be used.
+fn inline_qos(flags: u8, input: &mut WireReader) -> Result<Option<InlineQos>, WireError> {
     let mut inline = InlineQos::default();
     if flags & 2 == 0 {
         return Ok(Some(inline));
     }
     loop {
-        match parameter(input, &INLINE) {
+        match next_parameter(input, &INLINE) {
             Ok(None) => return Ok(Some(inline)),
-            Ok(Some((number, value))) => inline.take(number, value)?,
+            Ok(Some((number, value))) => inline.set_parameter(number, value)?,
             Err(WireError::NotUnderstood(_)) => return Ok(None),
             Err(error) => return Err(error),
         }
@@ -360,15 +372,19 @@ const INLINE: [u16; 4] = [
 ];
 
 impl InlineQos {
-    /// Takes one of those parameters.
-    pub(super) fn take(&mut self, number: u16, mut value: Input) -> Result<(), WireError> {
+    /// Sets one of these parameters.
+    pub(super) fn set_parameter(
+        &mut self,
+        number: u16,
+        mut value: WireReader,
+    ) -> Result<(), WireError> {
         match number {
             pid::RELATED_SAMPLE_IDENTITY => self.related = Some(value.identity()?),
-            // Beside the standard's it says the same.
+            // Redundant if the standard parameter is present.
             pid::FAST_DDS_RELATED_SAMPLE_IDENTITY => {
                 self.related = self.related.or(Some(value.identity()?))
             }
-            // The bits of the last byte, whatever the byte order (9.6.4.9).
+            // The flags are in the last byte, in either byte order (9.6.4.9).
             pid::STATUS_INFO => self.status = u32::from_be_bytes(value.array()?),
             pid::KEY_HASH => self.key_hash = Some(value.array()?),
             _ => {}

@@ -1,10 +1,10 @@
-//! Datagrams byte by byte, as the specification lays them out.
+//! Datagrams byte by byte, as laid out in the specification.
 
 use super::*;
 use crate::Guid;
 
-/// What two hexadecimal digits each say; white space is passed over.
-pub(crate) fn bytes(text: &str) -> Bytes {
+/// Parses pairs of hexadecimal digits; white space is ignored.
+pub(crate) fn parse_hex(text: &str) -> Bytes {
     let digits: String = text.split_whitespace().collect();
     let pairs = (0..digits.len()).step_by(2).map(|at| &digits[at..at + 2]);
     pairs
@@ -12,12 +12,12 @@ pub(crate) fn bytes(text: &str) -> Bytes {
         .collect()
 }
 
-/// The header of a participant of Fast DDS.
+/// Header of a participant of Fast DDS.
 const HEAD: &str = "52545053 0203 010f 010f1122 33445566 00000000";
 const FROM: GuidPrefix = GuidPrefix([1, 15, 0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0, 0, 0, 0]);
 const READER: EntityId = EntityId([0, 0, 5, 4]);
 const WRITER: EntityId = EntityId([0, 0, 4, 3]);
-/// Little endian: from 1 to 7, the third one.
+/// Little-endian: numbers 1 to 7, count 3.
 const HEARTBEAT: &str = "0701 1c00 00000504 00000403 00000000 01000000 00000000 07000000 03000000";
 
 fn heartbeat() -> Heartbeat {
@@ -32,21 +32,21 @@ fn heartbeat() -> Heartbeat {
     }
 }
 
-fn said(submessages: &str) -> Parsed {
-    parse(&bytes(&format!("{HEAD} {submessages}")))
+fn parse_submessages(submessages: &str) -> Parsed {
+    parse(&parse_hex(&format!("{HEAD} {submessages}")))
 }
 
-fn only(submessages: &str) -> Submessage {
+fn parse_single(submessages: &str) -> Submessage {
     let Parsed {
         mut received,
         fault,
-    } = said(submessages);
+    } = parse_submessages(submessages);
     assert_eq!((received.len(), fault), (1, None));
     received.remove(0).submessage
 }
 
 fn fault(submessages: &str) -> Option<WireError> {
-    let Parsed { received, fault } = said(&format!("{HEARTBEAT} {submessages}"));
+    let Parsed { received, fault } = parse_submessages(&format!("{HEARTBEAT} {submessages}"));
     assert_eq!(
         received[0].submessage,
         Submessage::Heartbeat(heartbeat()),
@@ -57,7 +57,7 @@ fn fault(submessages: &str) -> Option<WireError> {
 
 #[test]
 fn a_sample_comes_with_what_was_said_before_it() {
-    let parsed = said(&format!(
+    let parsed = parse_submessages(&format!(
         "0e01 0c00 0a0b0c0d 00000000 00000001
          0901 0800 78563412 00000080
          1505 2400 0000 1000 00000504 00000403 00000000 07000000 00010000 06000000 48656c6c 6f000000
@@ -68,10 +68,10 @@ fn a_sample_comes_with_what_was_said_before_it() {
         writer: WRITER,
         number: SequenceNumber(7),
         inline: InlineQos::default(),
-        payload: Some(bytes("00010000 06000000 48656c6c 6f000000")),
+        payload: Some(parse_hex("00010000 06000000 48656c6c 6f000000")),
         key_only: false,
     };
-    let received = |submessage| Received {
+    let received = |submessage| ReceivedSubmessage {
         from: FROM,
         vendor: VendorId::FAST_DDS,
         to: Some(GuidPrefix([10, 11, 12, 13, 0, 0, 0, 0, 0, 0, 0, 1])),
@@ -92,8 +92,8 @@ fn a_sample_comes_with_what_was_said_before_it() {
 }
 
 #[test]
-fn what_was_said_is_taken_back() {
-    let parsed = said(&format!(
+fn context_submessages_can_be_reset() {
+    let parsed = parse_submessages(&format!(
         "0e01 0c00 0a0b0c0d 00000000 00000001 0901 0800 78563412 00000080
          0e01 0c00 00000000 00000000 00000000 0903 0000 {HEARTBEAT}
          0901 0800 ffffffff ffffffff {HEARTBEAT}
@@ -114,9 +114,9 @@ fn what_was_said_is_taken_back() {
 #[test]
 fn the_other_byte_order_is_read() {
     let big = "0700 001c 00000504 00000403 00000000 00000001 00000000 00000007 00000003";
-    assert_eq!(only(big), Submessage::Heartbeat(heartbeat()));
+    assert_eq!(parse_single(big), Submessage::Heartbeat(heartbeat()));
     let Submessage::AckNack(acknack) =
-        only("0602 001c 00000504 00000403 00000000 00000005 00000003 a0000000 00000002")
+        parse_single("0602 001c 00000504 00000403 00000000 00000005 00000003 a0000000 00000002")
     else {
         panic!("an acknowledgement");
     };
@@ -138,7 +138,7 @@ fn the_other_byte_order_is_read() {
 fn a_reply_names_its_request_by_either_parameter() {
     let identity = "010faaaa bbbbcccc 00000000 00001204 00000000 09000000";
     let reply = |length: &str, inline: &str| {
-        only(&format!(
+        parse_single(&format!(
             "1507 {length} 0000 1000 00000504 00000403 00000000 01000000 {inline} 01000000 00010000 2a000000"
         ))
     };
@@ -153,7 +153,7 @@ fn a_reply_names_its_request_by_either_parameter() {
             panic!("a sample: {form:?}")
         };
         let writer =
-            Guid::from(<[u8; 16]>::try_from(&bytes(identity)[..16]).expect("sixteen bytes"));
+            Guid::from(<[u8; 16]>::try_from(&parse_hex(identity)[..16]).expect("sixteen bytes"));
         assert_eq!(
             data.inline.related,
             Some(SampleIdentity {
@@ -161,7 +161,7 @@ fn a_reply_names_its_request_by_either_parameter() {
                 number: SequenceNumber(9)
             })
         );
-        assert_eq!(data.payload, Some(bytes("00010000 2a000000")));
+        assert_eq!(data.payload, Some(parse_hex("00010000 2a000000")));
     }
 }
 
@@ -169,7 +169,7 @@ fn a_reply_names_its_request_by_either_parameter() {
 fn a_request_whose_client_does_not_know_its_number_says_so() {
     let request = "1507 3400 0000 1000 00000504 00000403 00000000 01000000
         0f80 1800 010faaaa bbbbcccc 00000000 00001204 ffffffff 00000000 01000000";
-    let Submessage::Data(data) = only(request) else {
+    let Submessage::Data(data) = parse_single(request) else {
         panic!("a sample")
     };
     assert_eq!(
@@ -183,7 +183,7 @@ fn a_request_whose_client_does_not_know_its_number_says_so() {
 fn an_instance_that_is_no_more_is_named_by_its_key() {
     let gone = "1503 3400 0000 1000 000003c7 000003c2 00000000 02000000
         7000 1000 010f1122 33445566 00000000 00001203 7100 0400 00000003 01000000";
-    let Submessage::Data(data) = only(gone) else {
+    let Submessage::Data(data) = parse_single(gone) else {
         panic!("a sample")
     };
     assert!(data.inline.is_gone());
@@ -199,7 +199,7 @@ fn an_instance_that_is_no_more_is_named_by_its_key() {
 #[test]
 fn fragments_are_exactly_their_bytes() {
     let frag = |first: &str, payload: &str| {
-        said(&format!(
+        parse_submessages(&format!(
             "1601 2800 0000 1c00 00000504 00000403 00000000 07000000 {first} 0100 0800 0d000000 {payload}"
         ))
     };
@@ -214,7 +214,7 @@ fn fragments_are_exactly_their_bytes() {
         (2, 1, 8, 13)
     );
     assert_eq!((read.offset(), &read.payload[..]), (8, &b"fghij"[..]));
-    // The sample has two; and the second is too short for what it says.
+    // The sample has two fragments; and the second is too short for its announced length.
     let outside = WireError::Fragments {
         first: 3,
         count: 1,
@@ -226,52 +226,52 @@ fn fragments_are_exactly_their_bytes() {
         frag("00000000", "66676869 6a000000").fault,
         Some(WireError::Fragments { first: 0, .. })
     ));
-    // One that would begin where the sample ends has nothing.
+    // A fragment that would begin at the end of the sample is empty.
     let behind = "1601 2400 0000 1c00 00000504 00000403 00000000 07000000 03000000 0100 0800 10000000 66676869";
     assert!(matches!(
-        said(behind).fault,
+        parse_submessages(behind).fault,
         Some(WireError::Fragments { first: 3, .. })
     ));
     let short = "1601 2400 0000 1c00 00000504 00000403 00000000 07000000 01000000 0100 0800 0d000000 66676869";
-    assert_eq!(said(short).fault, Some(WireError::Short));
+    assert_eq!(parse_submessages(short).fault, Some(WireError::Short));
 }
 
 #[test]
 fn a_length_of_zero_is_the_rest_of_the_datagram_but_for_padding_and_no_time() {
-    let parsed = said(&format!(
+    let parsed = parse_submessages(&format!(
         "0101 0000 0903 0000 {}",
         HEARTBEAT.replacen("1c00", "0000", 1)
     ));
     assert_eq!((parsed.received.len(), parsed.fault), (1, None));
     let data = "1505 0000 0000 1000 00000504 00000403 00000000 07000000 00010000 2a";
-    let Submessage::Data(data) = only(data) else {
+    let Submessage::Data(data) = parse_single(data) else {
         panic!("a sample")
     };
-    assert_eq!(data.payload, Some(bytes("00010000 2a")));
+    assert_eq!(data.payload, Some(parse_hex("00010000 2a")));
 }
 
 #[test]
-fn what_is_unknown_is_passed_over() {
-    let parsed = said("8001 0600 010203040506 0000 0f01 0400 00000000 3101 0000");
+fn unknown_submessages_are_skipped() {
+    let parsed = parse_submessages("8001 0600 010203040506 0000 0f01 0400 00000000 3101 0000");
     assert_eq!(parsed, Parsed::default());
-    let parsed = said(&format!("8001 0600 010203040506 0000 {HEARTBEAT}"));
+    let parsed = parse_submessages(&format!("8001 0600 010203040506 0000 {HEARTBEAT}"));
     assert_eq!((parsed.received.len(), parsed.fault), (1, None));
-    // Further fields before the inline QoS, and a parameter that nobody knows.
+    // Additional fields before the inline QoS, and an unknown parameter.
     let data = "1507 3400 0000 1400 00000504 00000403 00000000 07000000 deadbeef
         00800400 01020304 7100 0400 00000001 01000000 00010000 2a000000";
-    let Submessage::Data(data) = only(data) else {
+    let Submessage::Data(data) = parse_single(data) else {
         panic!("a sample")
     };
     assert_eq!(
         (data.inline.status, data.payload),
-        (1, Some(bytes("00010000 2a000000")))
+        (1, Some(parse_hex("00010000 2a000000")))
     );
 }
 
 #[test]
 fn a_sample_with_something_that_must_be_understood_and_is_not_is_left_out() {
     let data = "1507 2800 0000 1000 00000504 00000403 00000000 07000000 00c00400 01020304 01000000 00010000 2a000000";
-    let parsed = said(&format!("{data} {HEARTBEAT}"));
+    let parsed = parse_submessages(&format!("{data} {HEARTBEAT}"));
     assert_eq!((parsed.received.len(), parsed.fault), (1, None));
     assert_eq!(
         parsed.received[0].submessage,
@@ -281,7 +281,7 @@ fn a_sample_with_something_that_must_be_understood_and_is_not_is_left_out() {
 
 #[test]
 fn a_fault_ends_the_datagram() {
-    // 257 bits; a base before the first; a number that there cannot be; longer than the datagram; no end of the list.
+    // 257 bits; a base below the minimum; an invalid number; longer than the datagram; no sentinel.
     let ends = "00000504 00000403";
     assert_eq!(
         fault(&format!("0601 4000 {ends} 00000000 01000000 01010000")),
@@ -294,7 +294,7 @@ fn a_fault_ends_the_datagram() {
         )),
         Some(WireError::Set(257))
     );
-    // So far up that what is added to it would not be a number any more.
+    // High enough for additions to overflow.
     assert_eq!(
         fault(&format!(
             "0701 1c00 {ends} 00000000 01000000 00000040 00000000 03000000"
@@ -341,7 +341,7 @@ fn a_fault_ends_the_datagram() {
 }
 
 #[test]
-fn another_protocol_is_none() {
+fn other_protocols_are_rejected() {
     for other in [
         "",
         "52545053 0203",
@@ -349,7 +349,7 @@ fn another_protocol_is_none() {
         "52545053 0103 010f 010f1122 33445566 00000000",
     ] {
         assert_eq!(
-            parse(&bytes(other)),
+            parse(&parse_hex(other)),
             Parsed {
                 received: Vec::new(),
                 fault: Some(WireError::NotRtps)
@@ -359,8 +359,8 @@ fn another_protocol_is_none() {
 }
 
 #[test]
-fn there_is_an_end_to_submessages() {
-    let many = |count| said(&"0101 0000".repeat(count)).fault;
+fn the_number_of_submessages_is_limited() {
+    let many = |count| parse_submessages(&"0101 0000".repeat(count)).fault;
     assert_eq!(
         (many(MOST_SUBMESSAGES), many(MOST_SUBMESSAGES + 1)),
         (None, Some(WireError::TooMany))
@@ -368,7 +368,7 @@ fn there_is_an_end_to_submessages() {
 }
 
 #[test]
-fn what_is_written_is_what_the_specification_says() {
+fn written_datagrams_follow_the_specification() {
     let mut writer = DatagramWriter::new(FROM);
     assert!(writer.is_empty());
     let request = SampleIdentity {
@@ -395,7 +395,7 @@ fn what_is_written_is_what_the_specification_says() {
     let zeros = writer.data_frag_head(&head, 5);
     let sent = [&writer.finish()[..], b"fghij", zeros].concat();
     let identity = "010f1122 33445566 00000000 00001204 00000000 09000000";
-    let expected = bytes(&format!(
+    let expected = parse_hex(&format!(
         "52545053 0203 cafe 010f1122 33445566 00000000
          0e01 0c00 09090909 09090909 09090909
          {HEARTBEAT}

@@ -1,7 +1,7 @@
-//! Sets of cores as the kernel writes them: `0-2,5`.
+//! Sets of cores in the kernel's notation: `0-2,5`.
 
-/// What the bits say.
-pub(super) fn print(cores: &[u64; 4]) -> String {
+/// Formats the set.
+pub(super) fn format_cpuset(cores: &[u64; 4]) -> String {
     let has = |core: usize| cores[core / 64] >> (core % 64) & 1 == 1;
     let named: Vec<String> = (0..256)
         .filter(|core| has(*core))
@@ -10,8 +10,8 @@ pub(super) fn print(cores: &[u64; 4]) -> String {
     named.join(",")
 }
 
-/// The bits of a list; none where it is no such list, or empty, which means all cores.
-pub(super) fn parse(text: &str) -> Option<[u64; 4]> {
+/// Parses a list; `None` if it is malformed, or empty, which means all cores.
+pub(super) fn parse_cpuset(text: &str) -> Option<[u64; 4]> {
     let mut cores = [0; 4];
     for part in text.trim().split(',') {
         let (first, last) = part.split_once('-').unwrap_or((part, part));
@@ -28,10 +28,10 @@ mod tests {
 
     #[test]
     fn lists_are_read_and_written() {
-        assert_eq!(parse("0-2,65\n"), Some([7, 2, 0, 0]));
-        assert_eq!(print(&[7, 2, 0, 0]), "0,1,2,65");
+        assert_eq!(parse_cpuset("0-2,65\n"), Some([7, 2, 0, 0]));
+        assert_eq!(format_cpuset(&[7, 2, 0, 0]), "0,1,2,65");
         for nothing in ["", "a", "1-", "256"] {
-            assert_eq!(parse(nothing), None, "{nothing}");
+            assert_eq!(parse_cpuset(nothing), None, "{nothing}");
         }
     }
 }

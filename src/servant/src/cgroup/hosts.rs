@@ -1,4 +1,4 @@
-//! What the host offers, and the place below which servants' cgroups are made.
+//! Cgroup hierarchies of the host, and the parent directory of servants' cgroups.
 
 use std::fs;
 use std::io;
@@ -9,55 +9,56 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 
-/// Servants' cgroups are below a directory of this name where we choose it ourselves.
+/// Name of the parent directory of servants' cgroups where we choose it ourselves.
 const NAME: &str = "cloudroid";
-/// The unit whose cgroup is delegated to us.
+/// Unit whose cgroup is delegated to us.
 const UNIT: &str = "cloudroid-servants.service";
-/// Controllers that limits or the end of a servant need.
+/// Controllers needed for limits or for the termination of a servant.
 const WANTED_V1: [&str; 3] = ["cpu", "memory", "pids"];
-/// Used only for servants whose limits ask for it.
+/// Controllers used only for servants whose limits ask for them.
 const IF_ASKED_V1: [&str; 2] = ["blkio", "cpuset"];
-/// Needed besides where no v2 hierarchy, which can do both, is mounted beside v1. Every hierarchy costs each start a
-/// grace period of the kernel (its `cgroup.procs` is written).
+/// Controllers needed additionally if no v2 hierarchy, which can do the work of both, is mounted beside v1. Every
+/// hierarchy costs each start an RCU grace period of the kernel (when `cgroup.procs` is written).
 const WITHOUT_V2: [&str; 2] = ["cpuacct", "freezer"];
 const WANTED_V2: [&str; 5] = ["cpu", "memory", "pids", "io", "cpuset"];
 
-/// Below which directories servants' cgroups are made; found once per engine and handed to each shim.
+/// Parent directories of servants' cgroups; found once per engine and passed to each shim.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Parent {
-    /// 1, 2, or 0 where no hierarchy can be used.
+pub struct CgroupParent {
+    /// Cgroup version, 1 or 2; 0 if no hierarchy can be used.
     pub version: u8,
-    /// One for each hierarchy that is used.
-    pub(super) hierarchies: Vec<Below>,
-    /// Why the version is 0, or a controller is missing; empty when all is well.
+    /// One directory for each hierarchy in use.
+    pub(super) hierarchies: Vec<ParentDirectory>,
+    /// Reason why the version is 0 or a controller is missing; empty if neither is the case.
     pub reason: String,
 }
 
 /// A parent directory in one hierarchy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(super) struct Below {
+pub(super) struct ParentDirectory {
     pub(super) controllers: Vec<String>,
     pub(super) directory: PathBuf,
     pub(super) unified: bool,
 }
 
-/// A mounted hierarchy and where in it this process is.
+/// A mounted hierarchy and our own cgroup in it.
 #[derive(Debug, Clone, PartialEq)]
-struct Mounted {
+struct MountedHierarchy {
     controllers: Vec<String>,
     mount: PathBuf,
     own: PathBuf,
     unified: bool,
 }
 
-impl Parent {
-    /// Finds and, where needed, makes the place.
+impl CgroupParent {
+    /// Finds the parent directories, and creates them if needed.
     pub fn find() -> Result<Self, Error> {
         let read = |path: &str| fs::read_to_string(path).map_err(Error::file("read", path));
-        let mounted = parse(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
+        let mounted =
+            parse_hierarchies(&read("/proc/self/mountinfo")?, &read("/proc/self/cgroup")?);
         let uses_v1 = mounted
             .iter()
-            .any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has(name)));
+            .any(|hierarchy| WANTED_V1.iter().any(|name| hierarchy.has_controller(name)));
         match mounted.iter().find(|hierarchy| hierarchy.unified) {
             _ if uses_v1 => Ok(Self::v1(&mounted)),
             Some(unified) => Self::v2(unified),
@@ -69,7 +70,7 @@ impl Parent {
         }
     }
 
-    /// Which controllers can be used, sorted.
+    /// Returns the available controllers, sorted.
     pub fn controllers(&self) -> Vec<String> {
         let mut names: Vec<_> = self
             .hierarchies
@@ -80,30 +81,33 @@ impl Parent {
         names
     }
 
-    /// Removes the place if it is one that we chose and no servant is left in it.
+    /// Removes the parent directories if they are ours and no servant is left in them.
     pub fn remove_if_unused(&self) {
         if let Some(first) = self.hierarchies.first().filter(|_| self.version == 2) {
-            // Where earlier versions put all shims; refused while one is in it.
+            // Directory of earlier versions for all shims; not removed while one is in it.
             let shims = first.directory.join("shims");
             let _ = fs::remove_dir(&shims);
             remove_if_unused(&shims);
         }
     }
 
-    fn v1(mounted: &[Mounted]) -> Self {
-        let lacks_v2 = !has_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
-        let wanted = |hierarchy: &&Mounted| {
-            let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has(name));
+    fn v1(mounted: &[MountedHierarchy]) -> Self {
+        let lacks_v2 = !has_cgroup_kill() || !mounted.iter().any(|hierarchy| hierarchy.unified);
+        let wanted = |hierarchy: &&MountedHierarchy| {
+            let has_any = |names: &[&str]| names.iter().any(|name| hierarchy.has_controller(name));
             hierarchy.unified
                 || has_any(&WANTED_V1)
                 || has_any(&IF_ASKED_V1)
                 || lacks_v2 && has_any(&WITHOUT_V2)
         };
-        let below = mounted.iter().filter(wanted).map(|hierarchy| Below {
-            controllers: hierarchy.controllers.clone(),
-            directory: hierarchy.own.join(NAME),
-            unified: hierarchy.unified,
-        });
+        let below = mounted
+            .iter()
+            .filter(wanted)
+            .map(|hierarchy| ParentDirectory {
+                controllers: hierarchy.controllers.clone(),
+                directory: hierarchy.own.join(NAME),
+                unified: hierarchy.unified,
+            });
         let parent = Self {
             version: 1,
             hierarchies: below.collect(),
@@ -122,16 +126,16 @@ impl Parent {
         Self { reason, ..parent }
     }
 
-    fn v2(unified: &Mounted) -> Result<Self, Error> {
+    fn v2(unified: &MountedHierarchy) -> Result<Self, Error> {
         let directory = choose_v2(unified);
         fs::create_dir_all(&directory).map_err(Error::file("make the cgroup", &directory))?;
-        // From the place just above down: each directory hands to the next what it was handed itself.
+        // From the directory just above downwards: each directory enables for its children what it was given itself.
         let mut reason = String::new();
         let above = directory
             .parent()
             .filter(|above| above.starts_with(&unified.mount));
         for place in above.into_iter().chain([directory.as_path()]) {
-            if let Err(error) = enable(place, place == directory) {
+            if let Err(error) = enable_controllers(place, place == directory) {
                 reason = format!(
                     "the controllers of {} cannot be handed down: {error}",
                     place.display()
@@ -141,7 +145,7 @@ impl Parent {
         let enabled =
             fs::read_to_string(directory.join("cgroup.subtree_control")).unwrap_or_default();
         let controllers = enabled.split_whitespace().map(str::to_owned).collect();
-        let below = Below {
+        let below = ParentDirectory {
             controllers,
             directory,
             unified: true,
@@ -154,18 +158,20 @@ impl Parent {
     }
 }
 
-impl Mounted {
-    fn has(&self, controller: &str) -> bool {
+impl MountedHierarchy {
+    fn has_controller(&self, controller: &str) -> bool {
         !self.unified && self.controllers.iter().any(|name| name == controller)
     }
 }
 
-/// The unit's cgroup when the unit runs or can be started; our own place in the root when no systemd manages it;
-/// otherwise a place beside us. A unit without a process has no directory until we make one.
-fn choose_v2(unified: &Mounted) -> PathBuf {
+/// Chooses the parent: the unit's cgroup if the unit runs or can be started; a directory of our own in the root if
+/// systemd does not manage it; otherwise a sibling of our own cgroup. A unit without a process has no directory until
+/// we create one.
+fn choose_v2(unified: &MountedHierarchy) -> PathBuf {
     let unit = unified.mount.join("system.slice").join(UNIT);
     let own_is_root = unified.own == unified.mount;
-    let by_systemd = || Path::new("/run/systemd/system").exists() && (unit_runs() || start_unit());
+    let by_systemd =
+        || Path::new("/run/systemd/system").exists() && (is_unit_active() || start_unit());
     if unit.exists() || !own_is_root && by_systemd() {
         return unit;
     }
@@ -176,17 +182,17 @@ fn choose_v2(unified: &Mounted) -> PathBuf {
     }
 }
 
-/// Whether systemd has the delegated unit.
-fn unit_runs() -> bool {
+/// Returns whether the delegated unit is active in systemd.
+fn is_unit_active() -> bool {
     let mut command = Command::new("systemctl");
     let status = command.args(["--quiet", "is-active", UNIT]).status();
     status.is_ok_and(|status| status.success())
 }
 
-/// Asks systemd for the delegated unit where it was not installed.
+/// Starts the delegated unit by systemd-run if it is not installed.
 fn start_unit() -> bool {
     let mut command = Command::new("systemd-run");
-    // It would tell our own supervisor that it is ready.
+    // Otherwise it would notify our own supervisor that it is ready.
     command.env_remove("NOTIFY_SOCKET");
     command.args([
         "--quiet",
@@ -207,9 +213,9 @@ fn start_unit() -> bool {
     command.status().is_ok_and(|status| status.success())
 }
 
-/// Hands the controllers that `place` has to its children. Above our own place only what is lacking is asked for, and
-/// a refusal counts for nothing when it turns out that nothing was lacking.
-fn enable(place: &Path, ours: bool) -> io::Result<()> {
+/// Enables the controllers of `place` for its children. Above our own directory only missing ones are requested, and a
+/// failure is ignored if nothing was missing.
+fn enable_controllers(place: &Path, ours: bool) -> io::Result<()> {
     let available = fs::read_to_string(place.join("cgroup.controllers"))?;
     let control = place.join("cgroup.subtree_control");
     let handed = fs::read_to_string(&control)?;
@@ -228,8 +234,8 @@ fn enable(place: &Path, ours: bool) -> io::Result<()> {
     }
 }
 
-/// Whether this kernel has `cgroup.kill`, which came with 5.14 and which no root directory shows.
-fn has_kill() -> bool {
+/// Returns whether this kernel has `cgroup.kill`, which came with 5.14 and which no root directory shows.
+fn has_cgroup_kill() -> bool {
     let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
     let mut numbers = release
         .split(['.', '-'])
@@ -237,17 +243,17 @@ fn has_kill() -> bool {
     (numbers.next().unwrap_or(0), numbers.next().unwrap_or(0)) >= (5, 14)
 }
 
-/// Removes the directory above a servant's when it is one that we chose and no servant is left in it.
+/// Removes the parent of a servant's directory if we created it and no servant is left in it.
 pub(super) fn remove_if_unused(leaf: &Path) {
     if let Some(parent) = leaf.parent().filter(|parent| parent.ends_with(NAME)) {
-        // Not empty: other servants live.
+        // Not empty: other servants exist.
         let _ = fs::remove_dir(parent);
     }
 }
 
-/// From the texts of /proc/self/mountinfo and /proc/self/cgroup.
-fn parse(mountinfo: &str, cgroup: &str) -> Vec<Mounted> {
-    let mut found: Vec<Mounted> = Vec::new();
+/// Parses the texts of /proc/self/mountinfo and /proc/self/cgroup.
+fn parse_hierarchies(mountinfo: &str, cgroup: &str) -> Vec<MountedHierarchy> {
+    let mut found: Vec<MountedHierarchy> = Vec::new();
     for line in mountinfo.lines() {
         let Some((left, right)) = line.split_once(" - ") else {
             continue;
@@ -270,13 +276,13 @@ fn parse(mountinfo: &str, cgroup: &str) -> Vec<Mounted> {
             .strip_prefix(root)
             .or_else(|_| Path::new(path).strip_prefix("/"));
         let own = Path::new(mount).join(inside.unwrap_or(Path::new("")));
-        // join() of an empty path adds a slash; the components are what counts.
+        // join() with an empty path adds a slash; only the components matter.
         let own: PathBuf = own.components().collect();
         let known = found
             .iter()
             .any(|other| other.unified == unified && other.controllers == names);
         if !known {
-            found.push(Mounted {
+            found.push(MountedHierarchy {
                 controllers: names,
                 mount: mount.into(),
                 own,
@@ -287,7 +293,7 @@ fn parse(mountinfo: &str, cgroup: &str) -> Vec<Mounted> {
     found
 }
 
-/// Our line of /proc/self/cgroup for a hierarchy: its controllers and our path.
+/// Finds our line of /proc/self/cgroup for a hierarchy: its controllers and our path.
 fn own_path<'a>(
     cgroup: &'a str,
     options: &[&str],
@@ -322,7 +328,7 @@ mod tests {
 32 24 0:28 / /sys/fs/cgroup/unified rw,relatime - cgroup2 cgroup2 rw
 33 24 0:29 / /proc rw - proc proc rw";
         let cgroup = "4:memory:/private/x\n1:cpu,cpuacct:/\n0::/\n";
-        let found = parse(mountinfo, cgroup);
+        let found = parse_hierarchies(mountinfo, cgroup);
         let owns: Vec<_> = found
             .iter()
             .map(|one| (one.own.to_str().unwrap(), one.unified))
@@ -335,7 +341,7 @@ mod tests {
                 ("/sys/fs/cgroup/unified", true)
             ]
         );
-        let parent = Parent::v1(&found);
+        let parent = CgroupParent::v1(&found);
         assert_eq!(
             parent.hierarchies[1].directory,
             Path::new("/sys/fs/cgroup/memory/private/x/cloudroid")
@@ -346,7 +352,7 @@ mod tests {
     #[test]
     fn a_hierarchy_that_is_mounted_in_part_is_understood() {
         let mountinfo = "31 24 0:27 /docker/abc /sys/fs/cgroup ro,nosuid - cgroup2 cgroup rw";
-        let found = parse(mountinfo, "0::/docker/abc/own\n");
+        let found = parse_hierarchies(mountinfo, "0::/docker/abc/own\n");
         assert_eq!(found[0].own, Path::new("/sys/fs/cgroup/own"));
     }
 }

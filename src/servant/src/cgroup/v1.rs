@@ -7,40 +7,40 @@ use std::path::Path;
 use super::files::{read_field, read_number};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
-use crate::host::pressure_of_cgroup;
-use crate::spec::{Limits, UNLIMITED};
+use crate::host::cgroup_pressure;
+use crate::spec::{ResourceLimits, UNLIMITED};
 
-/// Microseconds; the kernel's default.
+/// Scheduling period in microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
 
 const READ: &str = "blkio.throttle.read_bps_device";
 const WRITE: &str = "blkio.throttle.write_bps_device";
 
-/// What `memory.limit_in_bytes` reads when there is no limit: the largest multiple of a page.
+/// Lower bound of `memory.limit_in_bytes` without a limit, which reads as the largest multiple of a page.
 const NO_LIMIT: u64 = 1 << 62;
 
-/// Buffers of sockets, of UDP as of TCP, whatever its name says. Version 1 counts them beside the memory, and only once there is
-/// a limit; what a process sends and nobody reads would else be nobody's.
+/// Limit of socket buffers, of UDP as well as TCP, despite the name. Version 1 counts them separately from memory, and
+/// only once there is a limit; otherwise data that is sent and never read would not be counted at all.
 const SOCKETS: &str = "memory.kmem.tcp.limit_in_bytes";
 
-/// What buffers of sockets may have beside so much memory: a quarter of it.
-fn buffers_of_sockets(memory: u64) -> u64 {
+/// Returns the limit of socket buffers for a memory limit: a quarter of it.
+fn socket_buffer_limit(memory: u64) -> u64 {
     match memory {
         UNLIMITED => UNLIMITED,
         memory => memory / 4,
     }
 }
 
-/// Whether this kernel counts buffers of sockets in the hierarchy of the memory controller that is mounted there.
+/// Returns whether this kernel counts socket buffers in the hierarchy of the memory controller mounted there.
 pub fn counts_sockets(hierarchy: &Path) -> bool {
     hierarchy.join(SOCKETS).exists()
 }
 
-pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
-    // Whether a write took effect is read back by the caller.
+pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
+    // The caller reads back whether a write took effect.
     let write = |controller, name, value: String| {
         cgroup
-            .file(controller, name)
+            .control_file(controller, name)
             .map(|file| fs::write(file, value))
     };
     if let Some(cpus) = limits.cpus {
@@ -52,58 +52,68 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
         );
     }
     if let Some(weight) = limits.cpu_weight {
-        write("cpu", "cpu.shares", shares(weight).to_string());
+        write("cpu", "cpu.shares", weight_to_shares(weight).to_string());
     }
     if let Some(memory) = limits.memory {
-        let buffers = number(buffers_of_sockets(memory), "-1");
-        // With swap may not be below without swap, in neither direction of the change: so both, twice.
+        let buffers = format_limit(socket_buffer_limit(memory), "-1");
+        // The limit with swap must never be below the one without, whichever way both change: so both are written
+        // twice.
         for _ in 0..2 {
-            let memory = number(memory, "-1");
+            let memory = format_limit(memory, "-1");
             write("memory", "memory.limit_in_bytes", memory.clone());
             write("memory", "memory.memsw.limit_in_bytes", memory);
         }
-        // Set before its processes make sockets: those that are there already are not counted.
+        // Set before the processes create sockets: existing ones are not counted.
         write("memory", SOCKETS, buffers);
     }
     if let Some(pids) = limits.pids {
-        write("pids", "pids.max", number(pids, "max"));
+        write("pids", "pids.max", format_limit(pids, "max"));
     }
     if let Some(disk) = &cgroup.disk {
         for (name, limit) in [(READ, limits.io_read), (WRITE, limits.io_write)] {
             if let Some(limit) = limit {
-                write("blkio", name, format!("{disk} {}", number(limit, "0")));
+                write(
+                    "blkio",
+                    name,
+                    format!("{disk} {}", format_limit(limit, "0")),
+                );
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
-        write("cpuset", "cpuset.cpus", cores::print(cpuset));
+        write("cpuset", "cpuset.cpus", cores::format_cpuset(cpuset));
     }
 }
 
-/// A limit, or what stands for none in its file.
-fn number(limit: u64, none: &str) -> String {
+/// Formats a limit; `none` is the file's notation for no limit.
+fn format_limit(limit: u64, none: &str) -> String {
     match limit {
         UNLIMITED => none.to_owned(),
         limit => limit.to_string(),
     }
 }
 
-pub(super) fn limits(cgroup: &Cgroup) -> Limits {
-    let number = |controller, name| read_number(&cgroup.file(controller, name)?);
+pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
+    let number = |controller, name| read_number(&cgroup.control_file(controller, name)?);
     let period = number("cpu", "cpu.cfs_period_us");
-    // -1, which is no limit, is no u64 and so reads as none.
+    // -1 means no limit; it does not parse as u64, so it becomes `None`.
     let quota = number("cpu", "cpu.cfs_quota_us");
-    let io = |name| read_field(&cgroup.file("blkio", name)?, cgroup.disk.as_deref()?);
+    let io = |name| {
+        read_field(
+            &cgroup.control_file("blkio", name)?,
+            cgroup.disk.as_deref()?,
+        )
+    };
     let cpuset = cgroup
-        .file("cpuset", "cpuset.cpus")
-        .and_then(|file| cores::parse(&fs::read_to_string(file).ok()?));
-    Limits {
+        .control_file("cpuset", "cpuset.cpus")
+        .and_then(|file| cores::parse_cpuset(&fs::read_to_string(file).ok()?));
+    ResourceLimits {
         cpus: quota
             .zip(period)
             .map(|(quota, period)| quota as f64 / period as f64),
-        cpu_weight: number("cpu", "cpu.shares").map(weight),
+        cpu_weight: number("cpu", "cpu.shares").map(shares_to_weight),
         memory: number("memory", "memory.limit_in_bytes").filter(|bytes| *bytes < NO_LIMIT),
-        // Its nearest likeness, soft_limit_in_bytes, slows nobody down.
+        // The nearest equivalent, soft_limit_in_bytes, throttles nobody.
         memory_high: None,
         pids: number("pids", "pids.max"),
         io_read: io(READ),
@@ -112,11 +122,12 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     }
 }
 
-/// A cpuset takes no process before it has cores and memory nodes: each that has none is given those of the one above.
-pub(super) fn hand_down_cores(directory: &Path) -> io::Result<()> {
-    let above = directory.parent().filter(|above| is_empty(above));
+/// Copies cores and memory nodes from the parents to cpusets that have none: a cpuset accepts no process before it has
+/// both.
+pub(super) fn inherit_cpuset(directory: &Path) -> io::Result<()> {
+    let above = directory.parent().filter(|above| has_empty_cpuset(above));
     if let Some(above) = above {
-        hand_down_cores(above)?;
+        inherit_cpuset(above)?;
     }
     for name in ["cpuset.cpus", "cpuset.mems"] {
         let file = directory.join(name);
@@ -129,42 +140,42 @@ pub(super) fn hand_down_cores(directory: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Whether a cpuset has no cores yet; what is no cpuset is none of ours.
-fn is_empty(directory: &Path) -> bool {
+/// Returns whether a cpuset has no cores yet; false for directories that are not cpusets.
+fn has_empty_cpuset(directory: &Path) -> bool {
     ["cpuset.cpus", "cpuset.mems"].iter().any(|name| {
         fs::read_to_string(directory.join(name)).is_ok_and(|text| text.trim().is_empty())
     })
 }
 
-/// Processor time, memory and, where a v2 hierarchy is mounted beside, pressure.
+/// Reads processor time, memory and, if a v2 hierarchy is mounted as well, pressure.
 pub(super) fn usage(cgroup: &Cgroup) -> Usage {
-    let number = |controller, name| read_number(&cgroup.file(controller, name)?);
+    let number = |controller, name| read_number(&cgroup.control_file(controller, name)?);
     let unified = cgroup.leaves.iter().find(|leaf| leaf.unified);
     let beside = || read_field(&unified?.directory.join("cpu.stat"), "usage_usec");
     let cpu = number("cpuacct", "cpuacct.usage").map(|nanoseconds| nanoseconds / 1000);
     let memory = number("memory", "memory.usage_in_bytes");
     let throttled = cgroup
-        .file("cpu", "cpu.stat")
+        .control_file("cpu", "cpu.stat")
         .and_then(|file| read_field(&file, "throttled_time"));
     Usage {
         cpu_usec: cpu.or_else(beside).unwrap_or(0),
         throttled_usec: throttled.unwrap_or(0) / 1000,
         memory: memory.unwrap_or(0),
         reclaimable: cgroup
-            .file("memory", "memory.stat")
+            .control_file("memory", "memory.stat")
             .and_then(|file| read_field(&file, "total_inactive_file"))
             .unwrap_or(0),
-        pressure: unified.and_then(|leaf| pressure_of_cgroup(&leaf.directory)),
+        pressure: unified.and_then(|leaf| cgroup_pressure(&leaf.directory)),
         ..Usage::default()
     }
 }
 
-/// A v2 weight (1..10000, 100 by default) as v1 shares (1024 by default).
-fn shares(weight: u64) -> u64 {
+/// Converts a v2 weight (1..10000, default 100) to v1 shares (default 1024).
+fn weight_to_shares(weight: u64) -> u64 {
     (weight * 1024 / 100).clamp(2, 262_144)
 }
 
-fn weight(shares: u64) -> u64 {
+fn shares_to_weight(shares: u64) -> u64 {
     (shares * 100).div_ceil(1024).clamp(1, 10_000)
 }
 
@@ -174,10 +185,10 @@ mod tests {
     fn weights_survive_the_way_to_v1_and_back() {
         for weight in [1, 50, 100, 333, 1000, 10_000] {
             assert!(
-                super::weight(super::shares(weight)).abs_diff(weight) <= 1,
+                super::shares_to_weight(super::weight_to_shares(weight)).abs_diff(weight) <= 1,
                 "{weight}"
             );
         }
-        assert_eq!(super::shares(100), 1024);
+        assert_eq!(super::weight_to_shares(100), 1024);
     }
 }

@@ -2,20 +2,20 @@
 
 use std::fs;
 
-use super::files::{read_field, read_number, read_of_device};
+use super::files::{read_device_field, read_field, read_number};
 use super::{Cgroup, cores};
 use crate::engine::Usage;
-use crate::host::pressure_of_cgroup;
-use crate::spec::{Limits, UNLIMITED};
+use crate::host::cgroup_pressure;
+use crate::spec::{ResourceLimits, UNLIMITED};
 
-/// Microseconds; the kernel's default.
+/// Scheduling period in microseconds; the kernel's default.
 const PERIOD: f64 = 100_000.0;
 
-pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
-    // Whether a write took effect is read back by the caller.
+pub(super) fn set(cgroup: &Cgroup, limits: &ResourceLimits) {
+    // The caller reads back whether a write took effect.
     let write = |controller, name, value: String| {
         cgroup
-            .file(controller, name)
+            .control_file(controller, name)
             .map(|file| fs::write(file, value))
     };
     if let Some(cpus) = limits.cpus {
@@ -29,53 +29,53 @@ pub(super) fn set(cgroup: &Cgroup, limits: &Limits) {
         write("cpu", "cpu.weight", weight.to_string());
     }
     if let Some(memory) = limits.memory {
-        write("memory", "memory.max", number(memory));
+        write("memory", "memory.max", format_limit(memory));
         write("memory", "memory.swap.max", "0".into());
-        // Half a servant is of no use: the nodes that were spared would wait for the one that was not.
+        // A servant is killed as a whole: nodes that were spared would wait for the one that was not.
         write("memory", "memory.oom.group", "1".into());
     }
     if let Some(high) = limits.memory_high {
-        write("memory", "memory.high", number(high));
+        write("memory", "memory.high", format_limit(high));
     }
     if let Some(pids) = limits.pids {
-        write("pids", "pids.max", number(pids));
+        write("pids", "pids.max", format_limit(pids));
     }
     if let Some(disk) = &cgroup.disk {
         for (key, limit) in [("rbps", limits.io_read), ("wbps", limits.io_write)] {
             if let Some(limit) = limit {
-                let limit = number(limit);
+                let limit = format_limit(limit);
                 write("io", "io.max", format!("{disk} {key}={limit}"));
             }
         }
     }
     if let Some(cpuset) = &limits.cpuset {
-        write("cpuset", "cpuset.cpus", cores::print(cpuset));
+        write("cpuset", "cpuset.cpus", cores::format_cpuset(cpuset));
     }
 }
 
-/// A limit, or none again.
-fn number(limit: u64) -> String {
+/// Formats a limit, or no limit.
+fn format_limit(limit: u64) -> String {
     match limit {
         UNLIMITED => "max".to_owned(),
         limit => limit.to_string(),
     }
 }
 
-pub(super) fn limits(cgroup: &Cgroup) -> Limits {
-    let number = |controller, name| read_number(&cgroup.file(controller, name)?);
-    let cpus = cgroup.file("cpu", "cpu.max").and_then(|file| {
+pub(super) fn limits(cgroup: &Cgroup) -> ResourceLimits {
+    let number = |controller, name| read_number(&cgroup.control_file(controller, name)?);
+    let cpus = cgroup.control_file("cpu", "cpu.max").and_then(|file| {
         let text = fs::read_to_string(file).ok()?;
         let (quota, period) = text.trim().split_once(' ')?;
         Some(quota.parse::<f64>().ok()? / period.parse::<f64>().ok()?)
     });
     let io = |key| {
         let disk = cgroup.disk.as_deref()?;
-        read_of_device(&cgroup.file("io", "io.max")?, disk, key)
+        read_device_field(&cgroup.control_file("io", "io.max")?, disk, key)
     };
     let cpuset = cgroup
-        .file("cpuset", "cpuset.cpus")
-        .and_then(|file| cores::parse(&fs::read_to_string(file).ok()?));
-    Limits {
+        .control_file("cpuset", "cpuset.cpus")
+        .and_then(|file| cores::parse_cpuset(&fs::read_to_string(file).ok()?));
+    ResourceLimits {
         cpus,
         cpu_weight: number("cpu", "cpu.weight"),
         memory: number("memory", "memory.max"),
@@ -87,26 +87,26 @@ pub(super) fn limits(cgroup: &Cgroup) -> Limits {
     }
 }
 
-/// Processor time, memory and pressure.
+/// Reads processor time, memory and pressure.
 pub(super) fn usage(cgroup: &Cgroup) -> Usage {
-    // There even where its controller is not enabled.
+    // These files exist even if the controller is not enabled.
     let plain = |name: &str| Some(cgroup.leaves.first()?.directory.join(name));
     let stat = |field| read_field(&plain("cpu.stat")?, field);
     let memory = cgroup
-        .file("memory", "memory.current")
+        .control_file("memory", "memory.current")
         .and_then(|file| read_number(&file));
     Usage {
         cpu_usec: stat("usage_usec").unwrap_or(0),
         throttled_usec: stat("throttled_usec").unwrap_or(0),
         memory: memory.unwrap_or(0),
         reclaimable: cgroup
-            .file("memory", "memory.stat")
+            .control_file("memory", "memory.stat")
             .and_then(|file| read_field(&file, "inactive_file"))
             .unwrap_or(0),
         pressure: cgroup
             .leaves
             .first()
-            .and_then(|leaf| pressure_of_cgroup(&leaf.directory)),
+            .and_then(|leaf| cgroup_pressure(&leaf.directory)),
         ..Usage::default()
     }
 }

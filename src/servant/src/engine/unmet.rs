@@ -1,14 +1,14 @@
-//! Limits that were asked for and are not in force, and why.
+//! Limits that were asked for and are not in force, with the reasons.
 
-use super::Enforced;
-use crate::spec::{Limits, UNLIMITED};
+use super::EnforcedLimits;
+use crate::spec::{ResourceLimits, UNLIMITED};
 
-/// Which of the limits asked for are not in force. Memory may be in force rounded down to a page, cores to a
-/// thousandth of one.
-pub fn missing(asked: &Limits, got: &Limits) -> Vec<&'static str> {
+/// Returns the names of the limits that were asked for and are not in force. Memory may be rounded down to a page,
+/// cores to a thousandth of one.
+pub fn missing_limits(asked: &ResourceLimits, got: &ResourceLimits) -> Vec<&'static str> {
     let number = |value: Option<u64>| value.map(|value| value as f64);
-    // Where it is to be none again, none is in force.
-    let lifted = |asked, got: Option<u64>| number(got.or(none(asked)));
+    // If a limit is to be removed, no limit in force is right.
+    let lifted = |asked, got: Option<u64>| number(got.or(lifted_limit(asked)));
     let numbers = [
         ("cpus", asked.cpus, got.cpus, 0.001),
         (
@@ -19,7 +19,7 @@ pub fn missing(asked: &Limits, got: &Limits) -> Vec<&'static str> {
         ),
     ];
     let amounts = [
-        // Memory comes in pages.
+        // Memory is counted in pages.
         ("memory", asked.memory, got.memory, 65536.0),
         ("memory_high", asked.memory_high, got.memory_high, 65536.0),
         ("pids", asked.pids, got.pids, 0.0),
@@ -44,29 +44,29 @@ pub fn missing(asked: &Limits, got: &Limits) -> Vec<&'static str> {
     missing
 }
 
-fn none(asked: Option<u64>) -> Option<u64> {
+fn lifted_limit(asked: Option<u64>) -> Option<u64> {
     asked.filter(|limit| *limit == UNLIMITED)
 }
 
-impl Enforced {
-    /// Which of the limits asked for are not in force, each with the reason.
-    pub fn unmet(&self, asked: &Limits) -> Vec<String> {
+impl EnforcedLimits {
+    /// Returns the limits that were asked for and are not in force, each with the reason.
+    pub fn unmet_limits(&self, asked: &ResourceLimits) -> Vec<String> {
         let why = |name| match (self.cgroup_version, name) {
             (0, _) => "no cgroup controller can be used here",
             (1, "memory_high") => {
-                "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes slows nobody down"
+                "cgroup v1 has no memory.high; its memory.soft_limit_in_bytes does not throttle"
             }
             (1, "cpuset") => {
-                "the cpuset controller must be mounted, and cgroup v1 takes cores only of a servant that was given some at \
-             its start"
+                "the cpuset controller must be mounted, and cgroup v1 accepts cores only for a servant that was \
+                    started with some"
             }
             (1, "io_read" | "io_write") => {
-                "cgroup v1 takes it only of a servant that was given one at its start and whose layers lie on a disk"
+                "cgroup v1 accepts it only for a servant that was started with one and whose layers are on a disk"
             }
-            (_, "io_read" | "io_write") => "its layers lie on no disk that can be limited",
-            _ => "the kernel did not take it",
+            (_, "io_read" | "io_write") => "its layers are not on a disk that can be limited",
+            _ => "the kernel rejected it",
         };
-        missing(asked, &self.limits)
+        missing_limits(asked, &self.limits)
             .into_iter()
             .map(|name| format!("{name} ({})", why(name)))
             .collect()
@@ -79,49 +79,49 @@ mod tests {
 
     #[test]
     fn a_limit_that_is_not_in_force_is_named() {
-        let asked = Limits {
+        let asked = ResourceLimits {
             cpus: Some(1.5),
             memory: Some(100_000_000),
             pids: Some(10),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
-        let got = Limits {
+        let got = ResourceLimits {
             memory: Some(99_999_744),
             pids: None,
             ..asked
         };
-        assert_eq!(missing(&asked, &got), ["pids"]);
-        assert_eq!(missing(&Limits::default(), &got), [""; 0]);
-        let lifted = Limits {
+        assert_eq!(missing_limits(&asked, &got), ["pids"]);
+        assert_eq!(missing_limits(&ResourceLimits::default(), &got), [""; 0]);
+        let lifted = ResourceLimits {
             pids: Some(UNLIMITED),
             io_read: Some(UNLIMITED),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
-        let still = Limits {
+        let still = ResourceLimits {
             io_read: Some(1 << 20),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
-        assert_eq!(missing(&lifted, &still), ["io_read"]);
+        assert_eq!(missing_limits(&lifted, &still), ["io_read"]);
     }
 
     #[test]
     fn what_cgroup_v1_does_not_have_is_said() {
-        let asked = Limits {
+        let asked = ResourceLimits {
             memory_high: Some(1 << 26),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
-        let enforced = |cgroup_version| Enforced {
+        let enforced = |cgroup_version| EnforcedLimits {
             cgroup_version,
-            ..Enforced::default()
+            ..EnforcedLimits::default()
         };
-        let on_v1 = enforced(1).unmet(&asked);
+        let on_v1 = enforced(1).unmet_limits(&asked);
         assert!(
             on_v1[0].starts_with("memory_high (cgroup v1 has no memory.high"),
             "{on_v1:?}"
         );
         assert_eq!(
-            enforced(2).unmet(&asked),
-            ["memory_high (the kernel did not take it)"]
+            enforced(2).unmet_limits(&asked),
+            ["memory_high (the kernel rejected it)"]
         );
     }
 }

@@ -1,4 +1,4 @@
-//! The daemon's end of a connection to a shim: what the shim tells is kept and passed on, what is asked is sent.
+//! The daemon's end of a connection to a shim: keeps and passes on the shim's messages, and sends requests.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicI32, Ordering};
@@ -10,37 +10,37 @@ use tokio::net::UnixStream;
 use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::sync::{Mutex as AsyncMutex, broadcast, oneshot, watch};
 
-use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{self, Command, FromShim, NodeStatus, Request, Snapshot};
+use crate::engine::{ContainerState, EnforcedLimits, NodeEvent};
+use crate::protocol::{self, Command, NodeStatus, ShimMessage, ShimRequest, Snapshot};
 
-/// Events that a slow listener may be behind.
+/// Number of events that a slow listener may be behind.
 const EVENTS: usize = 256;
-/// Requests that a shim may not have answered: so few that they fit into the socket, and none is left half written there by
-/// somebody who has waited long enough.
+/// Maximum number of requests not yet answered by a shim: few enough to fit into the socket's buffer, so that no caller
+/// that gives up waiting leaves a partly written one.
 const UNANSWERED: usize = 64;
 
-/// What is known of a servant.
+/// State of a servant as reported by its shim.
 #[derive(Debug)]
-pub(super) struct Known {
+pub(super) struct ServantView {
     pub(super) state: watch::Sender<ContainerState>,
-    /// Init's pid on the host; 0: not known.
+    /// Host pid of init; 0 if unknown.
     init: AtomicI32,
     pub(super) events: broadcast::Sender<NodeEvent>,
     pub(super) nodes: watch::Sender<BTreeMap<String, NodeStatus>>,
-    pub(super) enforced: watch::Sender<Enforced>,
-    /// Nothing more comes.
+    pub(super) enforced: watch::Sender<EnforcedLimits>,
+    /// True once the connection has ended.
     pub(super) closed: watch::Sender<bool>,
-    waiting: Mutex<Waiting>,
+    waiting: Mutex<PendingRequests>,
 }
 
 #[derive(Debug, Default)]
-struct Waiting {
+struct PendingRequests {
     next: u64,
     answers: BTreeMap<u64, oneshot::Sender<Option<String>>>,
     closed: bool,
 }
 
-impl Default for Known {
+impl Default for ServantView {
     fn default() -> Self {
         Self {
             state: watch::Sender::new(ContainerState::Creating),
@@ -54,14 +54,14 @@ impl Default for Known {
     }
 }
 
-impl Known {
-    /// Takes in what the shim says until it says no more.
-    pub(super) async fn listen(&self, read: OwnedReadHalf) {
+impl ServantView {
+    /// Applies the shim's messages until the connection ends.
+    pub(super) async fn read_messages(&self, read: OwnedReadHalf) {
         let mut lines = BufReader::new(read).lines();
         while let Ok(Some(line)) = lines.next_line().await {
             match serde_json::from_str(&line) {
-                Ok(message) => self.take_in(message),
-                Err(error) => tracing::warn!(%error, line, "a shim says something unknown"),
+                Ok(message) => self.apply_message(message),
+                Err(error) => tracing::warn!(%error, line, "a shim sent something unknown"),
             }
         }
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -71,9 +71,9 @@ impl Known {
         self.closed.send_replace(true);
     }
 
-    fn take_in(&self, message: FromShim) {
+    fn apply_message(&self, message: ShimMessage) {
         match message {
-            FromShim::Hello {
+            ShimMessage::Hello {
                 state,
                 nodes,
                 enforced,
@@ -81,20 +81,20 @@ impl Known {
             } => {
                 self.enforced.send_replace(enforced);
                 self.nodes.send_replace(nodes);
-                self.enter(state);
+                self.set_state(state);
             }
-            FromShim::State { state } => self.enter(state),
-            FromShim::Node { event, status } => {
+            ShimMessage::State { state } => self.set_state(state),
+            ShimMessage::Node { event, status } => {
                 self.nodes.send_modify(|nodes| {
                     nodes.insert(event.node().to_owned(), status);
                 });
-                // Nobody listens: nobody is told.
+                // An error means that nobody listens.
                 let _ = self.events.send(event);
             }
-            FromShim::Enforced { enforced } => {
+            ShimMessage::Enforced { enforced } => {
                 self.enforced.send_replace(enforced);
             }
-            FromShim::Reply { id, error } => {
+            ShimMessage::Reply { id, error } => {
                 let answer = self
                     .waiting
                     .lock()
@@ -108,26 +108,28 @@ impl Known {
         }
     }
 
-    fn enter(&self, told: Snapshot) {
+    fn set_state(&self, told: Snapshot) {
         if let Some(pid) = told.init_pid {
             self.init.store(pid, Ordering::Release);
         }
         self.state.send_replace(told.state);
     }
 
-    /// Init's pid on the host.
-    pub(super) fn init(&self) -> Option<i32> {
+    /// Returns the host pid of init.
+    pub(super) fn init_pid(&self) -> Option<i32> {
         Some(self.init.load(Ordering::Acquire)).filter(|pid| *pid != 0)
     }
 
-    /// A number for a request, and where its answer will come.
-    fn expect_answer(&self) -> Result<(u64, oneshot::Receiver<Option<String>>), Unfulfilled> {
+    /// Allocates the id of a request and the channel for its reply.
+    fn register_request(
+        &self,
+    ) -> Result<(u64, oneshot::Receiver<Option<String>>), ShimRequestError> {
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         if waiting.closed {
-            return Err(Unfulfilled::Gone);
+            return Err(ShimRequestError::Gone);
         }
         if waiting.answers.len() >= UNANSWERED {
-            return Err(Unfulfilled::Silent);
+            return Err(ShimRequestError::Silent);
         }
         let id = waiting.next;
         waiting.next += 1;
@@ -139,22 +141,22 @@ impl Known {
 
 /// Sends requests.
 #[derive(Debug)]
-pub(super) struct Requests {
+pub(super) struct RequestSender {
     write: AsyncMutex<OwnedWriteHalf>,
 }
 
-/// Why a request was not fulfilled.
+/// Reason why a request was not fulfilled.
 #[derive(Debug)]
-pub(super) enum Unfulfilled {
-    /// The shim's words.
+pub(super) enum ShimRequestError {
+    /// The shim refused, with this reason.
     Refused(String),
-    /// It does not answer any more.
+    /// The connection to the shim has ended.
     Gone,
-    /// It has not answered in time, or too many earlier ones.
+    /// The shim did not answer in time, or has too many unanswered requests.
     Silent,
 }
 
-impl Requests {
+impl RequestSender {
     pub(super) fn split(stream: UnixStream) -> (OwnedReadHalf, Self) {
         let (read, write) = stream.into_split();
         (
@@ -165,31 +167,35 @@ impl Requests {
         )
     }
 
-    pub(super) async fn ask(&self, known: &Known, command: Command) -> Result<(), Unfulfilled> {
-        let (id, answer) = known.expect_answer()?;
-        let line = protocol::line(&Request { id, command });
+    pub(super) async fn request(
+        &self,
+        known: &ServantView,
+        command: Command,
+    ) -> Result<(), ShimRequestError> {
+        let (id, answer) = known.register_request()?;
+        let line = protocol::to_line(&ShimRequest { id, command });
         self.write
             .lock()
             .await
             .write_all(&line)
             .await
-            .map_err(|_| Unfulfilled::Gone)?;
+            .map_err(|_| ShimRequestError::Gone)?;
         match answer.await {
             Ok(None) => Ok(()),
-            Ok(Some(reason)) => Err(Unfulfilled::Refused(reason)),
-            Err(_) => Err(Unfulfilled::Gone),
+            Ok(Some(reason)) => Err(ShimRequestError::Refused(reason)),
+            Err(_) => Err(ShimRequestError::Gone),
         }
     }
 
-    /// The same, waiting no longer than `patience`. What was asked may be done later all the same.
-    pub(super) async fn ask_within(
+    /// Sends a request, waiting at most `patience` for the reply. The request may still be carried out later.
+    pub(super) async fn request_with_timeout(
         &self,
-        known: &Known,
+        known: &ServantView,
         command: Command,
         patience: Duration,
-    ) -> Result<(), Unfulfilled> {
-        let asked = tokio::time::timeout(patience, self.ask(known, command)).await;
-        asked.unwrap_or(Err(Unfulfilled::Silent))
+    ) -> Result<(), ShimRequestError> {
+        let asked = tokio::time::timeout(patience, self.request(known, command)).await;
+        asked.unwrap_or(Err(ShimRequestError::Silent))
     }
 }
 
@@ -212,34 +218,36 @@ mod tests {
     #[tokio::test]
     async fn a_shim_that_does_not_answer_is_asked_no_more_than_fits() {
         let (daemon, shim) = UnixStream::pair().expect("a socket");
-        let (read, requests) = Requests::split(daemon);
-        let (requests, known) = (Arc::new(requests), Arc::new(Known::default()));
+        let (read, requests) = RequestSender::split(daemon);
+        let (requests, known) = (Arc::new(requests), Arc::new(ServantView::default()));
         let listening = Arc::clone(&known);
-        let listener = tokio::spawn(async move { listening.listen(read).await });
+        let listener = tokio::spawn(async move { listening.read_messages(read).await });
         let mut asks = JoinSet::new();
         for _ in 0..UNANSWERED {
             let (requests, known) = (Arc::clone(&requests), Arc::clone(&known));
-            asks.spawn(async move { requests.ask(&known, signal()).await });
+            asks.spawn(async move { requests.request(&known, signal()).await });
         }
         let (from_daemon, mut to_daemon) = shim.into_split();
         let mut lines = BufReader::new(from_daemon).lines();
         let mut ids = Vec::new();
         for _ in 0..UNANSWERED {
             let line = lines.next_line().await.expect("read").expect("a line");
-            let request: Request = serde_json::from_str(&line).expect("it is whole");
+            let request: ShimRequest = serde_json::from_str(&line).expect("it is whole");
             ids.push(request.id);
         }
-        let asked = requests.ask(&known, signal()).await;
-        assert!(matches!(asked, Err(Unfulfilled::Silent)), "{asked:?}");
+        let asked = requests.request(&known, signal()).await;
+        assert!(matches!(asked, Err(ShimRequestError::Silent)), "{asked:?}");
         for id in ids {
-            let answer = protocol::line(&FromShim::Reply { id, error: None });
+            let answer = protocol::to_line(&ShimMessage::Reply { id, error: None });
             to_daemon.write_all(&answer).await.expect("answered");
         }
         for asked in asks.join_all().await {
             asked.expect("it answers after all");
         }
-        let asked = requests.ask_within(&known, signal(), Duration::ZERO).await;
-        assert!(matches!(asked, Err(Unfulfilled::Silent)), "{asked:?}");
+        let asked = requests
+            .request_with_timeout(&known, signal(), Duration::ZERO)
+            .await;
+        assert!(matches!(asked, Err(ShimRequestError::Silent)), "{asked:?}");
         listener.abort();
     }
 }

@@ -1,7 +1,8 @@
-//! What a service is given of this host beyond its container: devices, volumes, ways out. In: names, as its push wrote them,
-//! and what the configuration allows. Out: mounts, environment and names of hosts, or who refused what.
+//! Resources of this host that a service is granted beyond its container: devices, volumes, egress. In: names, as
+//! written in its push, and what the configuration allows. Out: mounts, environment and host names, or the reason of a
+//! refusal.
 //!
-//! Looked at anew at each start: what is not allowed any more is not given any more.
+//! Evaluated anew at each start: what is no longer allowed is no longer granted.
 
 mod cdi;
 mod volume;
@@ -16,78 +17,78 @@ use serde::Deserialize;
 use super::Resources;
 use crate::container::Mount;
 
-/// What of this machine a service may be given; nothing by default.
+/// Resources of this host that a service may be granted; nothing by default.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Allow {
     /// CDI devices: `vendor.com/class=name`, or `vendor.com/class=*`.
     pub devices: Vec<String>,
-    /// Directories and files; what is below a directory is allowed, too.
+    /// Directories and files; everything below an allowed directory is allowed, too.
     pub volumes: Vec<PathBuf>,
     /// `HOST:PORT`, `*:PORT` (any on the internet), `ADDRESS:PORT` or `ADDRESS/PREFIX:PORT`.
     pub egress: Vec<String>,
 }
 
-/// Why something is not given.
+/// Reason why something is not granted.
 #[derive(Debug, thiserror::Error)]
 pub enum GrantError {
     /// The configuration does not allow it.
     #[error(
-        "{kind} {name} is not allowed here; its operator may add it to {kind}s of [allow] in the configuration"
+        "{kind} {name} is not allowed here; the operator can add it to {kind}s in [allow] of the configuration"
     )]
     NotAllowed {
         /// `device` or `volume`.
         kind: &'static str,
-        /// Its name.
+        /// Name of the device or volume.
         name: String,
     },
-    /// A way out.
+    /// Egress was refused.
     #[error(transparent)]
     Egress(Box<dyn std::error::Error + Send + Sync>),
-    /// A volume is not there.
+    /// A volume does not exist or cannot be opened.
     #[error("volume {path} cannot be used: {source}")]
     Volume {
-        /// Its path on the machine.
+        /// Path on the host.
         path: String,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// No CDI specification names the device.
     #[error("no CDI specification in {directories} names the device {name}; there are: {known}")]
     UnknownDevice {
-        /// Asked for.
+        /// Name that was asked for.
         name: String,
-        /// Where was looked.
+        /// Directories that were searched.
         directories: String,
-        /// Names that are known, for people.
+        /// Known names, for people.
         known: String,
     },
     /// A CDI specification cannot be used.
     #[error("the CDI specification {path}: {reason}")]
     Specification {
-        /// Its file.
+        /// File of the specification.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the fault.
         reason: String,
     },
 }
 
-/// What names mean on this host.
+/// The granted resources in terms of this host.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Granted {
+pub(super) struct ResolvedGrants {
     /// Volumes and device nodes.
     pub mounts: Vec<Mount>,
-    /// Names of hosts that are reached through a loopback address inside.
+    /// Host names that are reached through a loopback address in the container.
     pub hosts: Vec<(IpAddr, String)>,
-    /// What devices want every process to know.
+    /// Variables that devices add to every process.
     environment: BTreeMap<String, String>,
-    /// What of it is not done, in words.
+    /// Descriptions of what is granted but not provided.
     pub unfulfilled: Vec<String>,
 }
 
-impl Granted {
-    /// The spec's environment, with what the devices add.
-    pub(super) fn environment_over(
+impl ResolvedGrants {
+    /// Returns the spec's environment extended by the variables of the devices.
+    pub(super) fn merge_environment(
         &self,
         plan: &BTreeMap<String, String>,
     ) -> BTreeMap<String, String> {
@@ -97,25 +98,29 @@ impl Granted {
     }
 }
 
-/// All that was asked for, if it is allowed and there.
+/// Resolves all grants, if they are allowed and exist.
 pub(super) fn resolve(
     grants: &Grants,
     allow: &Allow,
     resources: &dyn Resources,
-) -> Result<Granted, GrantError> {
+) -> Result<ResolvedGrants, GrantError> {
     let hosts = resources.hosts(&grants.egress);
-    let mut granted = Granted {
+    let mut granted = ResolvedGrants {
         hosts: hosts.map_err(GrantError::Egress)?,
-        ..Granted::default()
+        ..ResolvedGrants::default()
     };
     for volume in &grants.volumes {
         granted.mounts.push(volume::open(volume, &allow.volumes)?);
     }
     for name in &grants.devices {
-        if !allow.devices.iter().any(|known| device_covers(known, name)) {
+        if !allow
+            .devices
+            .iter()
+            .any(|known| device_matches(known, name))
+        {
             return Err(not_allowed("device", name));
         }
-        cdi::add(name, &cdi::directories(), &mut granted)?;
+        cdi::add_device(name, &cdi::directories(), &mut granted)?;
     }
     Ok(granted)
 }
@@ -127,8 +132,8 @@ fn not_allowed(kind: &'static str, name: &str) -> GrantError {
     }
 }
 
-/// `vendor.com/class=*` covers all of a class.
-fn device_covers(known: &str, name: &str) -> bool {
+/// Returns whether `known` is the device or its class: `vendor.com/class=*` matches a whole class.
+fn device_matches(known: &str, name: &str) -> bool {
     known == name
         || known
             .strip_suffix('*')
@@ -152,7 +157,7 @@ mod tests {
             allow()
                 .devices
                 .iter()
-                .any(|known| device_covers(known, name))
+                .any(|known| device_matches(known, name))
         };
         assert!(covered("vendor.com/net=7") && covered("vendor.com/gpu=0"));
         assert!(!covered("vendor.com/gpu=1") && !covered("vendor.com/network=7"));

@@ -1,4 +1,4 @@
-//! A servant as the daemon holds it.
+//! The daemon's handle to a servant.
 
 use std::fs::File;
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
@@ -15,28 +15,28 @@ use tokio::net::UnixStream;
 use tokio::sync::{broadcast, mpsc, watch};
 use tokio::task::JoinHandle;
 
-use super::connection::{Known, Requests, Unfulfilled};
+use super::connection::{RequestSender, ServantView, ShimRequestError};
 use super::sweep;
 use crate::Error;
 use crate::cgroup::Cgroup;
 use crate::engine::{
-    ContainerState, Enforced, LogLine, LogStart, NodeEvent, NodeExit, Servant, Usage,
+    ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage,
 };
-use crate::launch::{self, Exit, Launch, Runtime};
-use crate::local::Grace;
-use crate::logs::{self, Watches};
+use crate::launch::{self, ExitRecord, LaunchRecord, RuntimeRecord};
+use crate::local::GracePeriods;
+use crate::logs::{self, DirectoryWatches};
 use crate::netns::NetNs;
-use crate::process::{self, Identity};
+use crate::process::{self, ProcessIdentity};
 use crate::protocol::Command;
-use crate::spec::{Limits, NodeSpec};
+use crate::spec::{NodeSpec, ResourceLimits};
 use crate::sys;
 
-/// Beyond the grace time, for a shim to finish what it does at the end.
+/// Time beyond the grace period for a shim to finish its cleanup.
 const FINISH: Duration = Duration::from_secs(20);
-/// For a shim that runs to answer.
+/// Time for a running shim to answer.
 const ANSWER: Duration = Duration::from_secs(10);
 
-/// A servant of the local engine. Dropping it leaves the servant as it is.
+/// A servant of the local engine. Dropping it leaves the servant running.
 #[derive(Debug)]
 pub struct LocalServant {
     id: String,
@@ -44,13 +44,13 @@ pub struct LocalServant {
     network: Arc<NetNs>,
     cgroup: Cgroup,
     uid_range: (u32, u32),
-    grace: Grace,
+    grace: GracePeriods,
     shim: Arc<OwnedFd>,
-    requests: Requests,
-    known: Arc<Known>,
+    requests: RequestSender,
+    known: Arc<ServantView>,
     listener: JoinHandle<()>,
-    /// What tells followers of the log that it has changed.
-    watches: Arc<Watches>,
+    /// Notifies followers of the log of changes.
+    watches: Arc<DirectoryWatches>,
     /// Followers of the log that may still have a file to open.
     followers: watch::Sender<()>,
 }
@@ -61,36 +61,36 @@ impl Drop for LocalServant {
     }
 }
 
-/// Where a servant lives.
+/// Id and directory of a servant.
 #[derive(Clone, Copy)]
-pub(super) struct Place<'a> {
+pub(super) struct ServantLocation<'a> {
     pub id: &'a str,
     pub directory: &'a Path,
-    /// What tells of changes in directories of servants.
-    pub watches: &'a Arc<Watches>,
+    /// Notifies of changes in directories of servants.
+    pub watches: &'a Arc<DirectoryWatches>,
 }
 
-/// Waits for a shim just started to say that its container runs.
-pub(super) async fn started(
-    launch: &Launch,
-    place: Place<'_>,
+/// Waits until a newly started shim reports that its container runs.
+pub(super) async fn wait_until_running(
+    launch: &LaunchRecord,
+    place: ServantLocation<'_>,
     network: NetNs,
     control: StdStream,
-    shim: Identity,
+    shim: ProcessIdentity,
 ) -> Result<Arc<LocalServant>, Error> {
-    let Place { id, directory, .. } = place;
+    let ServantLocation { id, directory, .. } = place;
     let ended = || Error::Start {
         id: id.to_owned(),
-        reason: last_words(directory),
+        reason: start_failure_reason(directory),
     };
     let pidfd = shim
-        .open()
+        .open_pidfd()
         .map_err(Error::call("looking at the shim just started"))?
         .ok_or_else(ended)?;
-    let runtime = Runtime {
+    let runtime = RuntimeRecord {
         shim,
-        cgroup: Cgroup::planned(&launch.parent, &launch.spec),
-        shim_cgroup: Some(Cgroup::of_shim(&launch.parent, &launch.spec.id)),
+        cgroup: Cgroup::for_servant(&launch.parent, &launch.spec),
+        shim_cgroup: Some(Cgroup::for_shim(&launch.parent, &launch.spec.id)),
         uid_range: launch.uid_range,
     };
     let grace = launch.grace;
@@ -115,25 +115,25 @@ pub(super) async fn started(
     }
 }
 
-/// Connects to the shim that an earlier daemon left.
+/// Connects to the shim of an earlier daemon.
 pub(super) async fn adopt(
-    place: Place<'_>,
-    runtime: &Runtime,
+    place: ServantLocation<'_>,
+    runtime: &RuntimeRecord,
     pidfd: OwnedFd,
 ) -> Result<Arc<LocalServant>, Error> {
-    let Place { id, directory, .. } = place;
+    let ServantLocation { id, directory, .. } = place;
     let path = directory.join(launch::SPEC);
     let missing = || Error::Malformed {
         path: path.clone(),
         reason: "there is no launch record".into(),
     };
-    let launch: Launch = launch::read(&path)?.ok_or_else(missing)?;
+    let launch: LaunchRecord = launch::read_record(&path)?.ok_or_else(missing)?;
     let opened = File::open(directory).map_err(Error::file("open", directory))?;
-    // Through a descriptor: the path itself may be longer than an address can be.
+    // Through a descriptor, since the path itself may be longer than a socket address allows.
     let address = format!("/proc/self/fd/{}/{}", opened.as_raw_fd(), launch::SOCKET);
     let control = StdStream::connect(address)
         .map_err(Error::file("connect to", directory.join(launch::SOCKET)))?;
-    // The pid is that of the process held by its pidfd.
+    // The pid is certainly that of the process held by its pidfd.
     let network = NetNs::from_pid(runtime.shim.pid)?;
     let grace = launch.grace;
     let servant = connect(place, network, control, runtime, pidfd, grace)?;
@@ -156,22 +156,22 @@ pub(super) async fn adopt(
 }
 
 fn connect(
-    place: Place<'_>,
+    place: ServantLocation<'_>,
     network: NetNs,
     control: StdStream,
-    runtime: &Runtime,
+    runtime: &RuntimeRecord,
     pidfd: OwnedFd,
-    grace: Grace,
+    grace: GracePeriods,
 ) -> Result<Arc<LocalServant>, Error> {
     control
         .set_nonblocking(true)
         .map_err(Error::call("talking to a shim"))?;
     let stream = UnixStream::from_std(control).map_err(Error::call("talking to a shim"))?;
-    let (read, requests) = Requests::split(stream);
-    let Place { id, directory, .. } = place;
-    let known = Arc::new(Known::default());
+    let (read, requests) = RequestSender::split(stream);
+    let ServantLocation { id, directory, .. } = place;
+    let known = Arc::new(ServantView::default());
     let shim = Arc::new(pidfd);
-    let listener = tokio::spawn(watch_over(
+    let listener = tokio::spawn(watch_shim(
         known.clone(),
         read,
         directory.to_owned(),
@@ -193,22 +193,23 @@ fn connect(
     }))
 }
 
-/// Listens to the shim; when it falls silent without having said how the servant ended, says so in its place.
-async fn watch_over(
-    known: Arc<Known>,
+/// Reads the shim's messages; if the connection ends without a final state, determines the state instead.
+async fn watch_shim(
+    known: Arc<ServantView>,
     read: tokio::net::unix::OwnedReadHalf,
     directory: PathBuf,
     shim: Arc<OwnedFd>,
 ) {
-    known.listen(read).await;
+    known.read_messages(read).await;
     if let Err(error) = wait_for_end(&shim, FINISH).await {
         tracing::warn!(%error, "a shim closed its connection and did not end");
     }
-    let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
+    let exit: Option<ExitRecord> =
+        launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
     let over = known.state.borrow().is_over();
     if !over {
         let lost = || ContainerState::Failed {
-            reason: how_it_was_lost(&directory),
+            reason: shim_loss_reason(&directory),
         };
         let state = exit.map_or_else(lost, |exit| {
             known.nodes.send_replace(exit.nodes);
@@ -218,40 +219,41 @@ async fn watch_over(
     }
 }
 
-/// Why a shim ended without a word.
-fn how_it_was_lost(directory: &Path) -> String {
-    let runtime: Option<Runtime> =
-        launch::read(&directory.join(launch::RUNTIME)).unwrap_or_default();
+/// Returns the reason why a shim ended without a final state.
+fn shim_loss_reason(directory: &Path) -> String {
+    let runtime: Option<RuntimeRecord> =
+        launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
     let cgroup = runtime.and_then(|runtime| runtime.shim_cgroup);
     match cgroup.filter(|cgroup| cgroup.oom_kills() > 0) {
         Some(cgroup) => {
-            let limit = cgroup.enforced().limits.memory.unwrap_or_default();
+            let limit = cgroup.enforced_limits().limits.memory.unwrap_or_default();
             format!(
-                "its shim was killed: it needed more than its {limit} bytes of memory, for parameters, registrations or what \
-                 nodes do not read"
+                "its shim was killed: it needed more than its {limit} bytes of memory, for parameters, registrations \
+                 or what nodes do not read"
             )
         }
         None => "its shim was killed".into(),
     }
 }
 
-/// Until the process has ended, reaped or not.
+/// Waits until the process has ended, reaped or not.
 async fn wait_for_end(pidfd: &OwnedFd, patience: Duration) -> std::io::Result<()> {
     if process::has_ended(pidfd) {
         return Ok(());
     }
-    // A descriptor of its own: several wait for the same end, and one descriptor can be watched only once.
+    // Duplicated, since several tasks wait for the same process, and one descriptor can be registered only once.
     let own = pidfd.try_clone()?;
-    // SAFETY: owned by what watches it, and so open for as long as it is watched.
+    // SAFETY: owned by the registration, and therefore open for as long as it lasts.
     let watched = unsafe { AsyncFd::register_with_interest(own, tokio::io::Interest::READABLE) }?;
     let _ready = tokio::time::timeout(patience, watched.readable()).await??;
     Ok(())
 }
 
-/// What the shim complained of before it ended.
-fn last_words(directory: &Path) -> String {
-    let exit: Option<Exit> = launch::read(&directory.join(launch::EXIT)).unwrap_or_default();
-    if let Some(Exit {
+/// Returns the last error messages of a shim that ended.
+fn start_failure_reason(directory: &Path) -> String {
+    let exit: Option<ExitRecord> =
+        launch::read_record(&directory.join(launch::EXIT)).unwrap_or_default();
+    if let Some(ExitRecord {
         state: ContainerState::Failed { reason } | ContainerState::Stopped { reason },
         ..
     }) = exit
@@ -281,7 +283,7 @@ impl LocalServant {
                 node: node.to_owned(),
             });
         }
-        self.ask_briefly(Command::SignalNode {
+        self.request_briefly(Command::SignalNode {
             node: node.to_owned(),
             signal,
             last,
@@ -289,28 +291,32 @@ impl LocalServant {
         .await
     }
 
-    /// Asks the shim.
-    async fn ask(&self, command: Command) -> Result<(), Error> {
-        let asked = self.requests.ask(&self.known, command).await;
-        asked.map_err(|unfulfilled| self.error(unfulfilled))
+    /// Sends a request to the shim.
+    async fn request(&self, command: Command) -> Result<(), Error> {
+        let asked = self.requests.request(&self.known, command).await;
+        asked.map_err(|unfulfilled| self.request_error(unfulfilled))
     }
 
-    /// Asks the shim what takes it no time.
-    async fn ask_briefly(&self, command: Command) -> Result<(), Error> {
-        let asked = self.requests.ask_within(&self.known, command, ANSWER);
-        asked.await.map_err(|unfulfilled| self.error(unfulfilled))
+    /// Sends a request that the shim answers at once.
+    async fn request_briefly(&self, command: Command) -> Result<(), Error> {
+        let asked = self
+            .requests
+            .request_with_timeout(&self.known, command, ANSWER);
+        asked
+            .await
+            .map_err(|unfulfilled| self.request_error(unfulfilled))
     }
 
-    fn error(&self, unfulfilled: Unfulfilled) -> Error {
+    fn request_error(&self, unfulfilled: ShimRequestError) -> Error {
         let id = self.id.clone();
         match unfulfilled {
-            Unfulfilled::Refused(reason) => Error::Refused { id, reason },
-            Unfulfilled::Silent => Error::Unanswered { id },
-            Unfulfilled::Gone => self.ended(),
+            ShimRequestError::Refused(reason) => Error::Refused { id, reason },
+            ShimRequestError::Silent => Error::Unanswered { id },
+            ShimRequestError::Gone => self.ended_error(),
         }
     }
 
-    fn ended(&self) -> Error {
+    fn ended_error(&self) -> Error {
         let reason = match &*self.known.state.borrow() {
             ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
                 reason.clone()
@@ -323,10 +329,10 @@ impl LocalServant {
         }
     }
 
-    fn check_runs(&self) -> Result<(), Error> {
+    fn ensure_running(&self) -> Result<(), Error> {
         match *self.known.state.borrow() {
             ContainerState::Running => Ok(()),
-            _ => Err(self.ended()),
+            _ => Err(self.ended_error()),
         }
     }
 
@@ -334,47 +340,50 @@ impl LocalServant {
         self.directory.join(logs::FILE)
     }
 
-    /// Its network namespace, to open sockets in; a namespace lives for as long as it is held, also after the servant.
+    /// Returns its network namespace, for opening sockets in it. A namespace lives for as long as it is held, even
+    /// after the servant.
     pub fn network(&self) -> &Arc<NetNs> {
         &self.network
     }
 
-    /// What this daemon or an earlier one has left for the next; none where there is nothing.
-    pub async fn left<T: DeserializeOwned + Send + 'static>(&self) -> Result<Option<T>, Error> {
+    /// Loads the state left by this daemon or an earlier one for the next; `None` if there is none.
+    pub async fn load_handover<T: DeserializeOwned + Send + 'static>(
+        &self,
+    ) -> Result<Option<T>, Error> {
         let path = self.directory.join(launch::DAEMON);
-        privilege::run(async move { launch::read(&path) }).await
+        privilege::run(async move { launch::read_record(&path) }).await
     }
 
-    /// Leaves this for the next daemon in place of what was left before, whole or not at all. It goes with the servant.
-    pub async fn leave<T: Serialize + Send + 'static>(&self, what: T) -> Result<(), Error> {
+    /// Saves state for the next daemon, atomically replacing what was saved before. It is removed with the servant.
+    pub async fn save_handover<T: Serialize + Send + 'static>(&self, what: T) -> Result<(), Error> {
         let path = self.directory.join(launch::DAEMON);
-        privilege::run(async move { launch::write(&path, &what) }).await
+        privilege::run(async move { launch::write_record(&path, &what) }).await
     }
 
-    /// First host uid (= gid) of its range and how many; uid 0 inside is the first.
+    /// Returns the first host uid (= gid) of its range and their number; uid 0 in the container is the first.
     pub fn uid_range(&self) -> (u32, u32) {
         self.uid_range
     }
 
-    /// Pid of init on this host.
-    pub fn init(&self) -> Result<i32, Error> {
-        self.check_runs()?;
-        self.known.init().ok_or_else(|| self.ended())
+    /// Returns the host pid of init.
+    pub fn init_pid(&self) -> Result<i32, Error> {
+        self.ensure_running()?;
+        self.known.init_pid().ok_or_else(|| self.ended_error())
     }
 
-    /// Pids on this host of the node processes and all their children (not of init).
+    /// Returns the host pids of the node processes and all their children (without init).
     pub fn processes(&self) -> Result<Vec<i32>, Error> {
-        let init = self.init()?;
+        let init = self.init_pid()?;
         let cgroup = self.cgroup.clone();
-        let mut processes = privilege::now(move || cgroup.processes());
+        let mut processes = privilege::run_sync(move || cgroup.processes());
         processes.retain(|pid| *pid != init);
         Ok(processes)
     }
 }
 
-/// How long the threads of a process could have run and others had the cores; nothing where the kernel does not count it
-/// (Documentation/scheduler/sched-stats.rst: nanoseconds on a core, nanoseconds waiting, slices).
-fn waited(pid: i32) -> Duration {
+/// Returns how long the threads of a process were runnable but waited for a CPU; zero if the kernel does not count it
+/// (Documentation/scheduler/sched-stats.rst: nanoseconds on a CPU, nanoseconds waiting, timeslices).
+fn thread_wait_time(pid: i32) -> Duration {
     let threads = std::fs::read_dir(format!("/proc/{pid}/task"));
     let waited = threads
         .into_iter()
@@ -388,13 +397,13 @@ fn waited(pid: i32) -> Duration {
 }
 
 /// Completes when the servant has ended and its log is complete.
-async fn ended(mut state: watch::Receiver<ContainerState>) {
-    // The other side is gone with its handle: then nothing more is known either.
+async fn wait_until_over(mut state: watch::Receiver<ContainerState>) {
+    // An error means that the handle is gone: then nothing more is known either.
     let _ = state.wait_for(ContainerState::is_over).await;
 }
 
 #[async_trait]
-impl Servant for LocalServant {
+impl ServantHandle for LocalServant {
     fn id(&self) -> &str {
         &self.id
     }
@@ -407,31 +416,31 @@ impl Servant for LocalServant {
         self.known.events.subscribe()
     }
 
-    fn enforced(&self) -> Enforced {
+    fn enforced_limits(&self) -> EnforcedLimits {
         self.known.enforced.borrow().clone()
     }
 
-    async fn set_limits(&self, limits: Limits) -> Result<Enforced, Error> {
-        self.ask_briefly(Command::SetLimits(limits)).await?;
-        Ok(self.enforced())
+    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, Error> {
+        self.request_briefly(Command::SetLimits(limits)).await?;
+        Ok(self.enforced_limits())
     }
 
     async fn usage(&self) -> Result<Usage, Error> {
-        self.check_runs()?;
+        self.ensure_running()?;
         let cgroup = self.cgroup.clone();
         Ok(privilege::run(async move { cgroup.usage() }).await)
     }
 
-    async fn waited(&self) -> Duration {
-        if self.init().is_err() {
+    async fn cpu_wait_time(&self) -> Duration {
+        if self.init_pid().is_err() {
             return Duration::ZERO;
         }
         let cgroup = self.cgroup.clone();
-        let waited = privilege::blocking(move || {
+        let waited = privilege::spawn_blocking(move || {
             let mut processes = cgroup.processes();
-            // Nodes go on only when their Master and whoever is connected to them do.
+            // Nodes progress only if their Master and their peers do; this process is one of these.
             processes.extend(i32::try_from(std::process::id()));
-            processes.into_iter().map(waited).sum()
+            processes.into_iter().map(thread_wait_time).sum()
         });
         waited.await.unwrap_or_default()
     }
@@ -440,12 +449,12 @@ impl Servant for LocalServant {
         self.known.nodes.borrow().keys().cloned().collect()
     }
 
-    fn run(&self, node: &str) -> Option<String> {
+    fn run_id(&self, node: &str) -> Option<String> {
         self.known.nodes.borrow().get(node)?.run.clone()
     }
 
     async fn start_node(&self, node: NodeSpec) -> Result<(), Error> {
-        self.ask(Command::StartNode(node)).await
+        self.request(Command::StartNode(node)).await
     }
 
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
@@ -470,7 +479,9 @@ impl Servant for LocalServant {
                 '_,
                 std::collections::BTreeMap<String, crate::protocol::NodeStatus>,
             > = nodes.borrow();
-            nodes.get(node).and_then(|status| status.ended().cloned())
+            nodes
+                .get(node)
+                .and_then(|status| status.current_exit().cloned())
         };
         loop {
             if let Some(exit) = exit(&nodes) {
@@ -479,33 +490,40 @@ impl Servant for LocalServant {
             tokio::select! {
                 biased;
                 _ = nodes.changed() => {}
-                _ = state.wait_for(ContainerState::is_over) => return exit(&nodes).ok_or_else(|| self.ended()),
+                _ = state.wait_for(ContainerState::is_over) => return exit(&nodes).ok_or_else(|| self.ended_error()),
             }
         }
     }
 
     async fn logs(&self, last: usize, node: Option<&str>) -> Vec<LogLine> {
-        logs::last(self.log_path(), last, node.map(str::to_owned)).await
+        logs::read_last(self.log_path(), last, node.map(str::to_owned)).await
     }
 
     fn follow(&self, from: LogStart) -> mpsc::Receiver<LogLine> {
         let path = self.log_path();
         let guard = self.followers.subscribe();
-        logs::follow(&self.watches, path, from, ended(self.state()), guard)
+        logs::follow(
+            &self.watches,
+            path,
+            from,
+            wait_until_over(self.state()),
+            guard,
+        )
     }
 
     async fn stop(&self) -> Result<(), Error> {
-        // Refused or unanswered: it is ending, or gone, or about to be ended by force.
-        let _ = tokio::time::timeout(ANSWER, self.ask(Command::Stop)).await;
+        // On an error or timeout it is ending, gone, or about to be killed.
+        let _ = tokio::time::timeout(ANSWER, self.request(Command::Stop)).await;
         let patience = self.grace.interrupt + self.grace.terminate + FINISH;
         if let Err(error) = wait_for_end(&self.shim, patience).await {
             tracing::warn!(%error, id = self.id, "a shim did not end its servant and is killed");
             let shim = self.shim.clone();
-            let _ = privilege::now(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
+            let _ =
+                privilege::run_sync(move || sys::pidfd_send_signal(shim.as_fd(), libc::SIGKILL));
             let _ = wait_for_end(&self.shim, FINISH).await;
         }
-        // Its last words are taken in, and its log opened by those who read it, before both are swept away.
-        let _ = tokio::time::timeout(ANSWER, ended(self.known.state.subscribe())).await;
+        // Its final messages are read, and its log is opened by its followers, before both are removed.
+        let _ = tokio::time::timeout(ANSWER, wait_until_over(self.known.state.subscribe())).await;
         let _ = tokio::time::timeout(ANSWER, self.followers.closed()).await;
         sweep::sweep(&self.id, &self.directory).await
     }

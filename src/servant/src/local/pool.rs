@@ -1,5 +1,5 @@
-//! Network namespaces made ahead: making one and bringing its `lo` up takes 3 to 14 ms, more than the rest of what the
-//! engine itself does for a start.
+//! Network namespaces created in advance: creating one and bringing up its `lo` takes 3 to 14 ms, more than all other
+//! work of the engine for a start.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -7,22 +7,22 @@ use std::sync::{Arc, Mutex, PoisonError};
 use crate::Error;
 use crate::netns::NetNs;
 
-/// Kept ready. Each costs the kernel some 100 kB.
+/// Number of namespaces kept ready. Each costs about 100 kB of kernel memory.
 const READY: usize = 3;
 
 #[derive(Debug, Default)]
-pub(super) struct Networks {
-    inner: Arc<Inner>,
+pub(super) struct NetworkPool {
+    inner: Arc<NetworkPoolState>,
 }
 
 #[derive(Debug, Default)]
-struct Inner {
+struct NetworkPoolState {
     ready: Mutex<Vec<NetNs>>,
     refilling: AtomicBool,
 }
 
-impl Networks {
-    /// One that nobody else has.
+impl NetworkPool {
+    /// Takes a namespace that nobody else has.
     pub(super) fn take(&self) -> Result<NetNs, Error> {
         let ready = self
             .inner
@@ -34,7 +34,7 @@ impl Networks {
         ready.map_or_else(NetNs::create, Ok)
     }
 
-    /// Makes what is missing, on a thread of its own.
+    /// Creates the missing namespaces on a separate thread.
     pub(super) fn refill(&self) {
         if self.inner.refilling.swap(true, Ordering::AcqRel) {
             return;
@@ -48,7 +48,7 @@ impl Networks {
                 .len()
                 < READY
             {
-                // Whoever needs one makes it and sees the error.
+                // The caller that needs one creates it itself and gets the error.
                 let Ok(network) = NetNs::create() else { break };
                 inner
                     .ready

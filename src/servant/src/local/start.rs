@@ -12,15 +12,15 @@ use std::sync::Arc;
 use init::socket;
 
 use super::handle::{self, LocalServant};
-use super::{Shared, sweep, validate};
+use super::{EngineShared, sweep, validate};
 use crate::container::{ContainerSpec, Mount};
-use crate::launch::{self, Launch};
+use crate::launch::{self, LaunchRecord};
 use crate::netns::NetNs;
-use crate::process::Identity;
+use crate::process::ProcessIdentity;
 use crate::{Error, uids};
 
 pub(super) async fn start(
-    shared: &Shared,
+    shared: &EngineShared,
     mut spec: ContainerSpec,
 ) -> Result<Arc<LocalServant>, Error> {
     spec.limits = spec.limits.or(&shared.config.default_limits);
@@ -43,15 +43,15 @@ pub(super) async fn start(
 }
 
 async fn start_in(
-    shared: &Shared,
+    shared: &EngineShared,
     spec: ContainerSpec,
     directory: &Path,
 ) -> Result<Arc<LocalServant>, Error> {
     let network = shared.networks.take()?;
     let config = &shared.config;
-    let held = uids::held(&config.home_servants_dir)?;
-    let (first, lock) = uids::take(&config.uid_locks, config.uid_base, &held)?;
-    let launch = Launch {
+    let held = uids::claimed_ranges(&config.home_servants_dir)?;
+    let (first, lock) = uids::lock_free_range(&config.uid_locks, config.uid_base, &held)?;
+    let launch = LaunchRecord {
         uid_range: (first, uids::RANGE),
         parent: shared.parent.clone(),
         shim_limits: shared.config.shim_limits,
@@ -61,22 +61,22 @@ async fn start_in(
         init: shared.config.init.clone(),
         spec,
     };
-    launch::write(&directory.join(launch::SPEC), &launch)?;
+    launch::write_record(&directory.join(launch::SPEC), &launch)?;
     let (control, shim) = spawn(shared, directory)?;
-    hand_over(&control, &network, &lock, &launch.spec.mounts)?;
+    send_descriptors(&control, &network, &lock, &launch.spec.mounts)?;
     // The shim holds the lock from here on.
     drop(lock);
-    let place = handle::Place {
+    let place = handle::ServantLocation {
         id: &launch.spec.id,
         directory,
         watches: &shared.watches,
     };
-    handle::started(&launch, place, network, control, shim).await
+    handle::wait_until_running(&launch, place, network, control, shim).await
 }
 
-/// Starts the shim with our socket as its standard input. No descriptor is prepared between fork and exec, so that the
-/// daemon's memory is not copied for it (posix_spawn).
-fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Error> {
+/// Starts the shim with our socket as its standard input. Nothing runs between fork and exec, so that posix_spawn can
+/// be used and the daemon's memory is not copied.
+fn spawn(shared: &EngineShared, directory: &Path) -> Result<(UnixStream, ProcessIdentity), Error> {
     let (control, theirs) = UnixStream::pair().map_err(Error::call("socketpair for the shim"))?;
     let path = directory.join(launch::SHIM_LOG);
     let mut options = File::options();
@@ -94,7 +94,7 @@ fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Er
             })?;
     let mut command = tokio::process::Command::new(program);
     command.args(arguments).arg(directory).env_clear();
-    // Memory of the allocator is per process, and there is a process for every servant.
+    // There is one process per servant, and each would have its own allocator arenas.
     command.env("MALLOC_ARENA_MAX", "1");
     for name in ["PATH", "RUST_BACKTRACE", "RUST_LOG"] {
         if let Some(value) = std::env::var_os(name) {
@@ -109,17 +109,18 @@ fn spawn(shared: &Shared, directory: &Path) -> Result<(UnixStream, Identity), Er
         .spawn()
         .map_err(Error::file("start the shim", program))?;
     let pid = child.id().unwrap_or_default() as i32;
-    let identity = Identity::of(pid).map_err(Error::call("looking at the shim just started"))?;
-    // It outlives us; while we live we reap it.
+    let identity =
+        ProcessIdentity::from_pid(pid).map_err(Error::call("looking at the shim just started"))?;
+    // The shim outlives the daemon; while the daemon lives, it reaps the shim.
     tokio::spawn(async move {
         let _ = child.wait().await;
     });
     Ok((control, identity))
 }
 
-/// Network namespace and lock beside one byte that says how many more come; then, beside the number of its mount each, what
-/// was opened to be mounted.
-fn hand_over(
+/// Sends the network namespace and the lock with one byte that says how many messages follow; then each opened mount
+/// source with the index of its mount.
+fn send_descriptors(
     control: &UnixStream,
     network: &NetNs,
     lock: &OwnedFd,

@@ -1,5 +1,5 @@
-//! Removing what a servant left: its processes, its cgroup, its directories. The same whether it ended as asked, its shim
-//! was killed, or the daemon died half-way through making it.
+//! Removes what a servant left: its processes, its cgroup, its directories. Works the same if it ended on request, its
+//! shim was killed, or the daemon died while creating it.
 
 use std::fs;
 use std::io;
@@ -8,25 +8,26 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::cgroup::Cgroup;
-use crate::launch::{self, Launch, Runtime};
+use crate::launch::{self, LaunchRecord, RuntimeRecord};
 use crate::{Error, process, rootfs, sys};
 
-/// How long processes may take to be gone after they were killed.
+/// Time for killed processes to disappear.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Does everything that can be done, then tells the first thing that could not. Nothing to do is no error.
+/// Removes everything that can be removed, then returns the first error. It is no error if there is nothing to remove.
 pub(super) async fn sweep(id: &str, directory: &Path) -> Result<(), Error> {
     let (id, directory) = (id.to_owned(), directory.to_owned());
-    let work = privilege::blocking(move || sweep_now(&id, &directory));
+    let work = privilege::spawn_blocking(move || sweep_blocking(&id, &directory));
     work.await
         .unwrap_or_else(|panic| std::panic::resume_unwind(panic.into_panic()))
 }
 
-fn sweep_now(id: &str, directory: &Path) -> Result<(), Error> {
-    // A record that cannot be read was being written: then nothing that it names was made yet.
-    let runtime: Option<Runtime> =
-        launch::read(&directory.join(launch::RUNTIME)).unwrap_or_default();
-    let launch: Option<Launch> = launch::read(&directory.join(launch::SPEC)).unwrap_or_default();
+fn sweep_blocking(id: &str, directory: &Path) -> Result<(), Error> {
+    // An unreadable record was just being written: then nothing that it names exists yet.
+    let runtime: Option<RuntimeRecord> =
+        launch::read_record(&directory.join(launch::RUNTIME)).unwrap_or_default();
+    let launch: Option<LaunchRecord> =
+        launch::read_record(&directory.join(launch::SPEC)).unwrap_or_default();
     let mut outcomes = Vec::new();
     if let Some(runtime) = runtime {
         outcomes.push(end_shim(&runtime));
@@ -47,11 +48,11 @@ fn sweep_now(id: &str, directory: &Path) -> Result<(), Error> {
     outcomes.into_iter().collect()
 }
 
-/// Kills a shim that still runs, and waits until it has.
-fn end_shim(runtime: &Runtime) -> Result<(), Error> {
+/// Kills a running shim and waits for its end.
+fn end_shim(runtime: &RuntimeRecord) -> Result<(), Error> {
     let Some(pidfd) = runtime
         .shim
-        .open()
+        .open_pidfd()
         .map_err(Error::call("looking for a shim"))?
     else {
         return Ok(());

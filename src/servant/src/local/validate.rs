@@ -1,4 +1,4 @@
-//! What a spec must be before anything is made for it.
+//! Validation of a container's description before anything is created.
 
 use std::collections::BTreeSet;
 use std::path::{Component, Path};
@@ -6,12 +6,12 @@ use std::path::{Component, Path};
 use crate::Error;
 use crate::container::{ContainerSpec, Profile};
 
-/// Descriptors of as many are handed to the shim one by one.
+/// Maximum number of mounts, whose descriptors are sent to the shim one by one.
 const MOUNTS: usize = 128;
 
-/// Says what is wrong with it, if anything.
+/// Returns an error if the description is invalid.
 pub(super) fn validate(spec: &ContainerSpec) -> Result<(), Error> {
-    problem(spec).map_or(Ok(()), |reason| {
+    find_problem(spec).map_or(Ok(()), |reason| {
         Err(Error::InvalidSpec {
             id: spec.id.clone(),
             reason,
@@ -19,7 +19,7 @@ pub(super) fn validate(spec: &ContainerSpec) -> Result<(), Error> {
     })
 }
 
-fn problem(spec: &ContainerSpec) -> Option<String> {
+fn find_problem(spec: &ContainerSpec) -> Option<String> {
     let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'-';
     if spec.id.is_empty()
         || spec.id.len() > 48
@@ -45,7 +45,7 @@ fn problem(spec: &ContainerSpec) -> Option<String> {
         (None, Profile::Compile | Profile::Install) => {
             return Some("a build needs a writable directory".into());
         }
-        (Some(path), _) if !plain(path) || path.parent().is_none() => {
+        (Some(path), _) if !is_plain_path(path) || path.parent().is_none() => {
             return Some(format!(
                 "the writable directory {} needs an absolute path",
                 path.display()
@@ -53,7 +53,11 @@ fn problem(spec: &ContainerSpec) -> Option<String> {
         }
         _ => {}
     }
-    if let Some(path) = spec.owned_directories.iter().find(|path| !plain(path)) {
+    if let Some(path) = spec
+        .owned_directories
+        .iter()
+        .find(|path| !is_plain_path(path))
+    {
         return Some(format!(
             "owned directory {} needs an absolute path without dots",
             path.display()
@@ -66,7 +70,7 @@ fn problem(spec: &ContainerSpec) -> Option<String> {
         return Some(format!("it has more than {MOUNTS} mounts"));
     }
     for mount in &spec.mounts {
-        if !plain(&mount.target) || mount.target.parent().is_none() {
+        if !is_plain_path(&mount.target) || mount.target.parent().is_none() {
             return Some(format!(
                 "mount target {} needs an absolute path without dots",
                 mount.target.display()
@@ -75,14 +79,14 @@ fn problem(spec: &ContainerSpec) -> Option<String> {
         let there = mount.opened.is_some() || mount.source.exists();
         if !mount.source.is_absolute() || !there {
             return Some(format!(
-                "mount source {} is not there",
+                "mount source {} does not exist",
                 mount.source.display()
             ));
         }
     }
     let unprintable = |name: &str| name.is_empty() || name.contains(char::is_whitespace);
     if let Some((_, name)) = spec.hosts.iter().find(|(_, name)| unprintable(name)) {
-        return Some(format!("{name:?} is no name of a host"));
+        return Some(format!("{name:?} is not a host name"));
     }
     let limits = &spec.limits;
     if limits
@@ -137,8 +141,8 @@ fn problem(spec: &ContainerSpec) -> Option<String> {
     None
 }
 
-/// Absolute, and neither `.` nor `..` in it.
-fn plain(path: &Path) -> bool {
+/// Returns whether the path is absolute and contains neither `.` nor `..`.
+fn is_plain_path(path: &Path) -> bool {
     path.is_absolute()
         && path
             .components()
@@ -149,7 +153,7 @@ fn plain(path: &Path) -> bool {
 mod tests {
     use super::*;
     use crate::container::Mount;
-    use crate::spec::{Limits, NodeSpec};
+    use crate::spec::{NodeSpec, ResourceLimits};
 
     fn good() -> ContainerSpec {
         ContainerSpec {
@@ -157,7 +161,7 @@ mod tests {
             layers: vec!["/usr".into()],
             writable: None,
             profile: Profile::Servant,
-            limits: Limits::default(),
+            limits: ResourceLimits::default(),
             environment: Default::default(),
             nodes: vec![],
             owned_directories: vec![],
@@ -173,7 +177,7 @@ mod tests {
 
     #[test]
     fn each_fault_is_named() {
-        assert_eq!(problem(&good()), None);
+        assert_eq!(find_problem(&good()), None);
         let mount = |target: &str| Mount {
             source: "/usr".into(),
             target: target.into(),
@@ -233,9 +237,9 @@ mod tests {
             ),
             (
                 ContainerSpec {
-                    limits: Limits {
+                    limits: ResourceLimits {
                         cpus: Some(f64::NAN),
-                        ..Limits::default()
+                        ..ResourceLimits::default()
                     },
                     ..good()
                 },
@@ -243,9 +247,9 @@ mod tests {
             ),
             (
                 ContainerSpec {
-                    limits: Limits {
+                    limits: ResourceLimits {
                         memory: Some(1),
-                        ..Limits::default()
+                        ..ResourceLimits::default()
                     },
                     ..good()
                 },
@@ -274,7 +278,7 @@ mod tests {
             ),
         ];
         for (spec, words) in faults {
-            let text = problem(&spec).unwrap_or_else(|| panic!("{words} was not noticed"));
+            let text = find_problem(&spec).unwrap_or_else(|| panic!("{words} was not noticed"));
             assert!(text.contains(words), "{text}");
         }
     }

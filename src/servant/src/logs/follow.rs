@@ -1,8 +1,9 @@
-//! Reading a log while it is written and rotated.
+//! Reading of a log while it is written and rotated.
 //!
-//! Two tasks: one opens each file as soon as it is there and never waits for anybody; the other reads them in order, as
-//! slowly as its receiver likes. So neither a rotation nor the removal of the log takes away at once what was not read yet. Who is slower
-//! than two rotations goes on with the newest and is told how many lines are missing, since files that are removed and open take the disk.
+//! Two tasks: one opens each file as soon as it exists and never waits; the other reads them in order, as slowly as its
+//! receiver wants. So neither a rotation nor the removal of the log loses unread lines at once. A reader slower than
+//! two rotations continues with the newest file and is told how many lines are missing, since removed files that are
+//! open still occupy the disk.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -14,41 +15,41 @@ use std::time::SystemTime;
 
 use tokio::sync::{mpsc, watch};
 
-use super::rotated;
+use super::rotated_path;
 use super::tail::seek_to_last;
-use super::watches::{Watch, Watches};
+use super::watches::{DirectoryWatch, DirectoryWatches};
 use crate::engine::{LogLine, LogStart};
 
-/// Lines that may wait for the receiver.
+/// Number of lines buffered for the receiver.
 const AHEAD: usize = 16;
-/// Files that may wait to be read: as many as there are of a log.
+/// Number of files that may wait to be read: as many as a log has.
 const UNREAD: usize = 2;
-/// Bytes read at once.
+/// Bytes per read.
 const BLOCK: usize = 64 * 1024;
 
-/// Lines of the log at `path`, from `start` on. They end, after the last line, when
-/// `ended` completes: that must not be before the last line was written. From when `guard` is dropped on, the log may be removed.
+/// Streams the lines of the log at `path`, from `start` on. The stream ends after the last line when `ended` completes,
+/// which must not be before the last line was written. Once `guard` is dropped, the log may be removed.
 pub fn follow(
-    watches: &Arc<Watches>,
+    watches: &Arc<DirectoryWatches>,
     path: PathBuf,
     start: LogStart,
     ended: impl Future<Output = ()> + Send + 'static,
     guard: impl Send + 'static,
 ) -> mpsc::Receiver<LogLine> {
     let (sender, receiver) = mpsc::channel(AHEAD);
-    let opened = Arc::new(Opened::default());
+    let opened = Arc::new(UnreadFiles::default());
     let changes = watch::Sender::new(());
     let changed = changes.subscribe();
-    // Opened here and not in the task: what is written after this function has returned is surely seen. Files are opened
-    // where that may be, and what servants printed is parsed elsewhere.
+    // Opened here and not in the task, so that nothing written after this function has returned is missed. Files are
+    // opened with the engine's privileges, but untrusted content is parsed on other threads.
     let log = path.clone();
     let watches = Arc::clone(watches);
     let files = Arc::clone(&opened);
-    let discovering = privilege::now(move || {
+    let discovering = privilege::run_sync(move || {
         let directory = log.parent().unwrap_or(Path::new("/"));
         let watch = watches.watch(directory)?;
         let discovery = Discovery::open(&log, start, watch, Arc::clone(&files))?;
-        // Those that are there are read first, however soon there are others.
+        // Existing files are read first, however soon others appear.
         let first = [files.take(), files.take()];
         tokio::spawn(async move {
             discovery.run(&changes, ended).await;
@@ -58,7 +59,7 @@ pub fn follow(
     });
     match discovering {
         Ok([file, younger]) => {
-            let reader = Reader {
+            let reader = LogReader {
                 file,
                 younger,
                 opened,
@@ -68,8 +69,8 @@ pub fn follow(
             tokio::spawn(reader.run(start));
         }
         Err(error) => {
-            // The channel is empty: there is room for the one line.
-            let _ = sender.try_send(note(format!(
+            // The channel is empty, so there is room for one line.
+            let _ = sender.try_send(log_note(format!(
                 "could not follow {}: {error}",
                 path.display()
             )));
@@ -78,19 +79,19 @@ pub fn follow(
     receiver
 }
 
-/// Files that are known and not read yet, the newest few of them.
+/// Files that are open and not read yet: only the newest few.
 #[derive(Default)]
-struct Opened(Mutex<Queue>);
+struct UnreadFiles(Mutex<UnreadQueue>);
 
 #[derive(Default)]
-struct Queue {
+struct UnreadQueue {
     files: VecDeque<File>,
-    /// Whether one was left out since one was taken.
+    /// True if a file was skipped since the last one was taken.
     has_skipped: bool,
 }
 
-impl Opened {
-    fn queue(&self) -> MutexGuard<'_, Queue> {
+impl UnreadFiles {
+    fn queue(&self) -> MutexGuard<'_, UnreadQueue> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -116,14 +117,19 @@ impl Opened {
 
 struct Discovery {
     path: PathBuf,
-    watch: Watch,
-    files: Arc<Opened>,
-    /// The youngest file that is known. Held open, so that its inode cannot become another file's.
+    watch: DirectoryWatch,
+    files: Arc<UnreadFiles>,
+    /// The newest known file. Held open, so that its inode cannot be reused by another file.
     last: Option<File>,
 }
 
 impl Discovery {
-    fn open(path: &Path, start: LogStart, watch: Watch, files: Arc<Opened>) -> io::Result<Self> {
+    fn open(
+        path: &Path,
+        start: LogStart,
+        watch: DirectoryWatch,
+        files: Arc<UnreadFiles>,
+    ) -> io::Result<Self> {
         let mut discovery = Self {
             path: path.into(),
             watch,
@@ -131,10 +137,10 @@ impl Discovery {
             last: None,
         };
         if start != LogStart::Now {
-            discovery.look()?;
-        } else if let Some(mut file) = existing(path)? {
+            discovery.scan()?;
+        } else if let Some(mut file) = open_if_exists(path)? {
             file.seek(SeekFrom::End(0))?;
-            discovery.pass_on(file)?;
+            discovery.enqueue(file)?;
         }
         Ok(discovery)
     }
@@ -143,12 +149,13 @@ impl Discovery {
         let mut ended = std::pin::pin!(ended);
         loop {
             let over = tokio::select! {
-                () = self.watch.changed() => false,
+                () = self.watch.next_change() => false,
                 () = &mut ended => true,
                 () = changes.closed() => return,
             };
-            // What happened is looked up in the directory; the watch only says when. A failure to open shows as a gap in the numbers.
-            let _ = self.look();
+            // The directory is scanned; the watch only says when. A failure to open a file shows as a gap in the
+            // numbers.
+            let _ = self.scan();
             if over {
                 return;
             }
@@ -156,14 +163,14 @@ impl Discovery {
         }
     }
 
-    /// Passes on the files that are new: the current one, and the rotated one when it is younger than what is known.
-    fn look(&mut self) -> io::Result<()> {
+    /// Enqueues new files: the current one, and the rotated one if it is newer than the last known.
+    fn scan(&mut self) -> io::Result<()> {
         let last = self.last.as_ref().map(inode).transpose()?;
-        // A rotation may happen between the calls: they are repeated until they fit together.
+        // A rotation may happen between the calls: they are repeated until they are consistent.
         for _ in 0..10 {
-            let older = existing(&rotated(&self.path))?;
-            let current = existing(&self.path)?;
-            let again = existing(&rotated(&self.path))?;
+            let older = open_if_exists(&rotated_path(&self.path))?;
+            let current = open_if_exists(&self.path)?;
+            let again = open_if_exists(&rotated_path(&self.path))?;
             let id = |file: &Option<File>| file.as_ref().map(inode).transpose();
             if id(&older)? != id(&again)? {
                 continue;
@@ -173,7 +180,7 @@ impl Discovery {
             }
             for file in older.into_iter().chain(current) {
                 if Some(inode(&file)?) != last {
-                    self.pass_on(file)?;
+                    self.enqueue(file)?;
                 }
             }
             return Ok(());
@@ -181,26 +188,26 @@ impl Discovery {
         Ok(())
     }
 
-    fn pass_on(&mut self, file: File) -> io::Result<()> {
+    fn enqueue(&mut self, file: File) -> io::Result<()> {
         self.last = Some(file.try_clone()?);
         self.files.add(file);
         Ok(())
     }
 }
 
-/// Reads the files in their order. Where its receiver is too slow for that, it goes on with the newest.
-struct Reader {
-    /// What is read.
+/// Reads the files in order. If its receiver is too slow, it continues with the newest.
+struct LogReader {
+    /// File being read.
     file: Option<File>,
-    /// What is read next.
+    /// File to be read next.
     younger: Option<File>,
-    opened: Arc<Opened>,
+    opened: Arc<UnreadFiles>,
     changed: watch::Receiver<()>,
     sender: mpsc::Sender<LogLine>,
 }
 
-impl Reader {
-    /// Comes back when the log was read to its end, or nobody receives any more.
+impl LogReader {
+    /// Reads until the end of the log, or until nobody receives any more.
     async fn run(mut self, start: LogStart) {
         if let LogStart::Last(count) = start {
             let files = self.file.take().into_iter().chain(self.younger.take());
@@ -209,17 +216,19 @@ impl Reader {
             let mut placed = placed.unwrap_or_default().into_iter();
             (self.file, self.younger) = (placed.next(), placed.next());
         }
-        let mut cutter = Cutter::default();
+        let mut cutter = LogLineDecoder::default();
         loop {
             self.changed.mark_unchanged();
-            // Known before the file is read: nothing is written to it afterwards, and its end is the end.
+            // Checked before the file is read: nothing is written to it afterwards, so its end is final.
             let is_complete = self.changed.has_changed().is_err();
             let lines = match self.file.as_mut().map(|file| cutter.read(file)) {
                 None => Vec::new(),
                 Some(Ok(lines)) => lines,
                 Some(Err(error)) => {
                     self.file = None;
-                    vec![note(format!("the log could not be read on: {error}"))]
+                    vec![log_note(format!(
+                        "the log could not be read any further: {error}"
+                    ))]
                 }
             };
             if !lines.is_empty() {
@@ -230,7 +239,8 @@ impl Reader {
                 }
                 continue;
             }
-            // The end, for now. Nothing more is written to a file once a younger one is known, which was so before the last read.
+            // End of the file for now. Nothing more is written to a file once a newer one exists, which was the case
+            // before the last read.
             if let Some(younger) = self.younger.take() {
                 self.file = Some(younger);
                 cutter.rest.clear();
@@ -244,15 +254,15 @@ impl Reader {
                 return;
             }
             tokio::select! {
-                // An error means that the log is complete, which the next round sees.
+                // An error means that the log is complete, which the next round notices.
                 _ = self.changed.changed() => {}
                 () = self.sender.closed() => return,
             }
         }
     }
 
-    /// Sends a line, and lets go of files that were rotated away while the receiver does not take it: they are removed, and only what reads
-    /// them keeps them on the disk. False: nobody receives any more.
+    /// Sends a line; while the receiver does not take it, closes files that were rotated away: they are deleted, and
+    /// only open descriptors keep them on the disk. Returns false if nobody receives any more.
     async fn send(&mut self, line: LogLine) -> bool {
         let mut is_open = true;
         loop {
@@ -272,17 +282,17 @@ impl Reader {
     }
 }
 
-/// Makes lines of blocks.
+/// Decodes blocks of a log into lines.
 #[derive(Default)]
-struct Cutter {
-    /// What was read and is not a whole line yet.
+struct LogLineDecoder {
+    /// Bytes read that are not a complete line yet.
     rest: Vec<u8>,
-    /// The number that the next line should have; none before the first.
+    /// Number expected for the next line; `None` before the first.
     expected: Option<u64>,
 }
 
-impl Cutter {
-    /// The lines that are whole in the next block; none at the end of the file.
+impl LogLineDecoder {
+    /// Reads the next block and returns its complete lines; none at the end of the file.
     fn read(&mut self, file: &mut File) -> io::Result<Vec<LogLine>> {
         let mut block = vec![0; BLOCK];
         loop {
@@ -297,7 +307,7 @@ impl Cutter {
             let whole: Vec<u8> = self.rest.drain(..=end).collect();
             let mut lines = Vec::new();
             for text in whole.split(|byte| *byte == b'\n') {
-                // A line that is not ours was written by hand; it is passed over.
+                // A line in another format was written by hand; it is skipped.
                 let Ok(line) = serde_json::from_slice::<LogLine>(text) else {
                     continue;
                 };
@@ -309,7 +319,7 @@ impl Cutter {
                     .map_or(0, |expected| number.saturating_sub(expected));
                 self.expected = Some(number + 1);
                 if missed > 0 {
-                    lines.push(note(format!(
+                    lines.push(log_note(format!(
                         "{missed} lines were lost here: the log was rotated before they were read"
                     )));
                 }
@@ -322,7 +332,7 @@ impl Cutter {
     }
 }
 
-fn existing(path: &Path) -> io::Result<Option<File>> {
+fn open_if_exists(path: &Path) -> io::Result<Option<File>> {
     match File::open(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
         result => result.map(Some),
@@ -334,7 +344,7 @@ fn inode(file: &File) -> io::Result<(u64, u64)> {
         .map(|metadata| (metadata.dev(), metadata.ino()))
 }
 
-fn note(line: String) -> LogLine {
+fn log_note(line: String) -> LogLine {
     LogLine {
         number: None,
         time: SystemTime::now(),

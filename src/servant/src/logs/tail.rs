@@ -1,44 +1,44 @@
-//! The last lines of a log, read from the end of its files on.
+//! The last lines of a log, read backwards from the end of its files.
 
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use super::rotated;
+use super::rotated_path;
 use crate::engine::LogLine;
 
-/// Bytes read at once, from the end of the file on.
+/// Bytes per read, from the end of the file.
 const BLOCK: usize = 64 * 1024;
 
-/// [`read`], where nobody may wait for a disk.
-pub async fn last(path: PathBuf, count: usize, node: Option<String>) -> Vec<LogLine> {
-    // Files are opened where that may be, and what servants printed is parsed elsewhere.
-    let Ok(files) = privilege::blocking(move || open(&path)).await else {
+/// Reads the last lines like [`last_lines`], without blocking the caller on the disk.
+pub async fn read_last(path: PathBuf, count: usize, node: Option<String>) -> Vec<LogLine> {
+    // Files are opened with the engine's privileges, but untrusted content is parsed on other threads.
+    let Ok(files) = privilege::spawn_blocking(move || open_newest_first(&path)).await else {
         return Vec::new();
     };
-    let read = move || read(files, count, node.as_deref());
+    let read = move || last_lines(files, count, node.as_deref());
     tokio::task::spawn_blocking(read).await.unwrap_or_default()
 }
 
-/// The files of the log at `path`, the newest first.
-fn open(path: &Path) -> Vec<File> {
+/// Opens the files of the log at `path`, the newest first.
+fn open_newest_first(path: &Path) -> Vec<File> {
     let current = File::open(path).ok();
     let inode = |file: &File| file.metadata().map(|data| (data.dev(), data.ino())).ok();
-    // Where the log was rotated in between it is the same file once more.
+    // If the log was rotated in between, both are the same file.
     let same = current.as_ref().and_then(inode);
-    let older = File::open(rotated(path)).ok();
+    let older = File::open(rotated_path(path)).ok();
     let older = older.filter(|older| same.is_none() || inode(older) != same);
     current.into_iter().chain(older).collect()
 }
 
-/// The last `count` lines of a log, oldest first; of one node alone where one is named. Lines that cannot be read are
-/// passed over. Of the files no more is read than it takes.
-fn read(files: Vec<File>, count: usize, node: Option<&str>) -> Vec<LogLine> {
+/// Returns the last `count` lines of a log, oldest first; of one node only if `node` is given. Malformed lines are
+/// skipped. No more of the files is read than needed.
+fn last_lines(files: Vec<File>, count: usize, node: Option<&str>) -> Vec<LogLine> {
     let mut newest_first = Vec::new();
     for file in files {
-        // What cannot be read any further ends there.
-        let _ = backwards(file, |line| {
+        // A read error ends the lines of this file.
+        let _ = for_each_line_backwards(file, |line| {
             if newest_first.len() >= count {
                 return false;
             }
@@ -51,12 +51,13 @@ fn read(files: Vec<File>, count: usize, node: Option<&str>) -> Vec<LogLine> {
     newest_first
 }
 
-/// Those of a log's files, the oldest first, in which its last `count` lines are, each to be read from the first of these lines on.
+/// Returns the files, oldest first, that contain the log's last `count` lines, each positioned at the first of these
+/// lines.
 pub(super) fn seek_to_last(files: Vec<File>, count: usize) -> Vec<File> {
     let mut wanted = count;
     let mut newest_first = Vec::new();
     for mut file in files.into_iter().rev() {
-        // What cannot be read is passed over.
+        // Unreadable files are skipped.
         let Ok(found) = seek_before_last(&mut file, wanted) else {
             continue;
         };
@@ -70,7 +71,7 @@ pub(super) fn seek_to_last(files: Vec<File>, count: usize) -> Vec<File> {
     newest_first
 }
 
-/// Has a file read from the first of its last `count` whole lines on, and gives how many of them there are.
+/// Positions a file at the first of its last `count` complete lines, and returns how many of them there are.
 fn seek_before_last(file: &mut File, count: usize) -> io::Result<usize> {
     let mut start = file.metadata()?.len();
     let mut ends = 0;
@@ -94,10 +95,10 @@ fn seek_before_last(file: &mut File, count: usize) -> io::Result<usize> {
     Ok(ends)
 }
 
-/// Gives the lines of a file from the last to the first, for as long as more are wanted.
-fn backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<()> {
+/// Calls `more` for the lines of a file from the last to the first, until it returns false.
+fn for_each_line_backwards(mut file: File, mut more: impl FnMut(&[u8]) -> bool) -> io::Result<()> {
     let mut start = file.metadata()?.len();
-    // What was read and not yet given: its first line may begin before it.
+    // Bytes read and not passed on yet: the first line may start before them.
     let mut rest = Vec::new();
     while start > 0 {
         let length = start.min(BLOCK as u64);
@@ -144,13 +145,13 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("log.jsonl");
         let texts = |count, node| -> Vec<String> {
-            read(open(&path), count, node)
+            last_lines(open_newest_first(&path), count, node)
                 .into_iter()
                 .map(|line| line.line)
                 .collect()
         };
         assert!(texts(5, None).is_empty(), "no log yet");
-        std::fs::write(rotated(&path), line("/a", "1") + &line("/b", "2")).expect("written");
+        std::fs::write(rotated_path(&path), line("/a", "1") + &line("/b", "2")).expect("written");
         std::fs::write(&path, line("/a", "3") + "{torn").expect("written");
         assert_eq!(texts(2, None), ["2", "3"]);
         assert_eq!(texts(9, Some("/a")), ["1", "3"]);
@@ -166,14 +167,14 @@ mod tests {
         let text: String = all.iter().map(|text| line("/a", text)).collect();
         std::fs::write(&path, &text).expect("written");
         for count in [1, 2, 7, 20, 30] {
-            let seen = read(open(&path), count, None)
+            let seen = last_lines(open_newest_first(&path), count, None)
                 .into_iter()
                 .map(|line| line.line);
             let expected = &all[20 - count.min(20)..];
             assert!(seen.eq(expected.iter().cloned()), "the last {count}");
         }
         let mut given = 0;
-        backwards(File::open(&path).expect("it is there"), |_| {
+        for_each_line_backwards(File::open(&path).expect("it is there"), |_| {
             given += 1;
             given < 3
         })

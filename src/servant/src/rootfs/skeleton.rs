@@ -1,15 +1,15 @@
-//! The topmost layer: what every servant needs to find in a root that it cannot write.
+//! The topmost layer: what every servant needs in a root that it cannot write.
 
 use std::fs;
 use std::net::IpAddr;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use super::{make_directory, normal};
+use super::{make_directory, normal_component};
 use crate::Error;
 use crate::container::Mount;
 
-/// Makes the directories, files and links in an empty root.
+/// Creates the directories, files and links in an empty root.
 pub fn make_skeleton(
     skeleton: &Path,
     id: &str,
@@ -55,9 +55,14 @@ pub fn make_skeleton(
     Ok(())
 }
 
-/// A read-only root needs the target to be there. A directory made for it must not hide a link of the layers.
+/// Creates a mount point, which a read-only root must already contain. Its directories must not hide a link of the
+/// layers.
 fn make_mount_point(skeleton: &Path, layers: &[PathBuf], mount: &Mount) -> Result<(), Error> {
-    let inside: PathBuf = mount.target.components().filter_map(normal).collect();
+    let inside: PathBuf = mount
+        .target
+        .components()
+        .filter_map(normal_component)
+        .collect();
     for part in inside
         .ancestors()
         .filter(|part| !part.as_os_str().is_empty())
@@ -70,7 +75,7 @@ fn make_mount_point(skeleton: &Path, layers: &[PathBuf], mount: &Mount) -> Resul
             return Err(Error::Malformed {
                 path: mount.target.clone(),
                 reason: format!(
-                    "/{} is a link in the image: mount at the place it leads to",
+                    "/{} is a link in the image: mount at its target",
                     part.display()
                 ),
             });

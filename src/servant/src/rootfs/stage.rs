@@ -1,4 +1,4 @@
-//! The place where a root is put together, and what lets layers belong to other users there.
+//! The directory where a root is assembled, and idmapped mounts of its layers.
 
 use std::fs;
 use std::os::fd::{AsFd, OwnedFd};
@@ -11,16 +11,16 @@ use super::make_directory;
 use crate::container::Mount;
 use crate::{Error, sys};
 
-/// A directory that every host has and every user can reach, and that must be covered anyway.
+/// A directory that exists on every host, that every user can reach, and that must be covered anyway.
 const STAGE: &str = "/sys/fs/cgroup";
 
-/// Moves the calling process to a mount namespace of its own in which `/sys/fs/cgroup` is an empty tmpfs, and nothing is a
-/// cgroup mount any more.
+/// Moves the calling process to a new mount namespace in which `/sys/fs/cgroup` is an empty tmpfs, and no cgroup is
+/// mounted any more.
 ///
-/// So libcontainer has no cgroup to act on: ours is made, limited and removed by us alone. This is a matter of safety, too. When
-/// a creation fails, libcontainer kills whatever it finds in the cgroup that it takes for the container's, and on cgroup
-/// v1 that can be the root of a hierarchy, with the host's processes (0.7.0, `cleanup_container`).
-pub(super) fn enter() -> Result<PathBuf, Error> {
+/// This prevents libcontainer from using cgroups: only we create, limit and remove them. It is also a safety measure:
+/// when a creation fails, libcontainer kills everything in the cgroup that it takes for the container's, which on
+/// cgroup v1 can be the root of a hierarchy, with the host's processes (0.7.0, `cleanup_container`).
+pub(super) fn enter_mount_namespace() -> Result<PathBuf, Error> {
     unshare(CloneFlags::CLONE_NEWNS).map_err(Error::nix("unshare of a mount namespace"))?;
     let private = MsFlags::MS_REC | MsFlags::MS_PRIVATE;
     mount(None::<&str>, "/", None::<&str>, private, None::<&str>)
@@ -30,7 +30,7 @@ pub(super) fn enter() -> Result<PathBuf, Error> {
             .map_err(Error::file("read", "/proc/self/mountinfo"))?;
         Ok::<_, Error>(cgroup_mounts(&table))
     };
-    // The deepest first: a mount with others in it is busy.
+    // The deepest first: a mount with others inside is busy.
     for point in points()?.into_iter().rev() {
         umount2(&point, MntFlags::MNT_DETACH)
             .map_err(|error| Error::file("hide the cgroups at", &point)(error.into()))?;
@@ -53,7 +53,7 @@ pub(super) fn enter() -> Result<PathBuf, Error> {
     Ok(STAGE.into())
 }
 
-/// Where cgroup filesystems are mounted, in the order of their mounting.
+/// Returns the mount points of cgroup file systems, in mount order.
 fn cgroup_mounts(mountinfo: &str) -> Vec<PathBuf> {
     let point = |line: &str| {
         let (left, right) = line.split_once(" - ")?;
@@ -65,10 +65,10 @@ fn cgroup_mounts(mountinfo: &str) -> Vec<PathBuf> {
     mountinfo.lines().filter_map(point).collect()
 }
 
-/// Attaches a read-only copy of `layer` at `place` whose ids are shifted.
+/// Attaches a read-only, idmapped copy of `layer` at `place`.
 pub(super) fn attach_shifted(layer: &Path, place: &Path, shift: &OwnedFd) -> Result<(), Error> {
     let copy = sys::clone_mount(layer).map_err(Error::file("open the layer", layer))?;
-    sys::shift_mount(copy.as_fd(), shift.as_fd()).map_err(|source| {
+    sys::idmap_mount(copy.as_fd(), shift.as_fd()).map_err(|source| {
         let unsupported = matches!(
             source.raw_os_error(),
             Some(libc::EINVAL | libc::ENOSYS | libc::EOPNOTSUPP)
@@ -85,17 +85,18 @@ pub(super) fn attach_shifted(layer: &Path, place: &Path, shift: &OwnedFd) -> Res
     sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a layer at", place))
 }
 
-/// A detached copy of what is to be mounted: of the very file or directory that was opened, where one was.
+/// Returns a detached copy of a mount's source: of the open file or directory itself, if there is one.
 pub(super) fn copy_volume(volume: &Mount) -> Result<OwnedFd, Error> {
     let copy = match &volume.opened {
-        Some(opened) => sys::clone_opened(opened.as_fd()),
+        Some(opened) => sys::clone_mount_of(opened.as_fd()),
         None => sys::clone_mount(&volume.source),
     };
     copy.map_err(Error::file("mount", &volume.source))
 }
 
-/// Attaches the copy of what is to be mounted into the container. A read-only volume has shifted ids where its filesystem
-/// can, so that inside root may read what belongs to root; a writable one never, lest root inside write as root.
+/// Attaches the copy of a mount's source for the container. A read-only volume is idmapped if its file system supports
+/// it, so that root in the container may read root's files; a writable one never is, since root in the container would
+/// then write as root.
 pub(super) fn attach_volume(
     volume: &Mount,
     copy: &OwnedFd,
@@ -109,13 +110,13 @@ pub(super) fn attach_volume(
         fs::write(place, "").map_err(Error::file("make", place))?;
     }
     if !volume.writable {
-        // All or nothing: a filesystem that cannot leaves the copy as it was.
-        let _ = sys::shift_mount(copy.as_fd(), shift.as_fd());
+        // All or nothing: if the file system does not support it, the copy is unchanged.
+        let _ = sys::idmap_mount(copy.as_fd(), shift.as_fd());
     }
     sys::attach_mount(copy.as_fd(), place).map_err(Error::file("attach a volume at", place))
 }
 
-/// The type of the filesystem that holds `path`, from the mount table.
+/// Returns the type of the file system that holds `path`, from the mount table.
 fn filesystem_of(path: &Path) -> String {
     let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
     let path = path.canonicalize().unwrap_or_else(|_| path.into());
@@ -129,7 +130,7 @@ fn filesystem_of(path: &Path) -> String {
             )
         })
     };
-    // Of mounts at the same place the last is the visible one.
+    // Among mounts at the same path the last one is visible.
     let found = table
         .lines()
         .filter_map(holds)
@@ -143,7 +144,8 @@ mod tests {
 
     #[test]
     fn every_kind_of_cgroup_mount_is_found() {
-        let table = "30 24 0:26 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n31 24 0:27 / /c2 rw x:1 - cgroup2 c rw\n32 1 0:1 / / rw - ext4 /dev/a rw\n";
+        let table = "30 24 0:26 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu\n\
+                     31 24 0:27 / /c2 rw x:1 - cgroup2 c rw\n32 1 0:1 / / rw - ext4 /dev/a rw\n";
         assert_eq!(
             cgroup_mounts(table),
             [Path::new("/sys/fs/cgroup/cpu"), Path::new("/c2")]

@@ -1,4 +1,4 @@
-//! From exec to the forked creator, all in one thread.
+//! Setup from exec to the forked creator, all in one thread.
 
 use std::fs::File;
 use std::io;
@@ -13,30 +13,30 @@ use nix::sys::stat::{Mode, umask};
 
 use super::create::{self, Creator};
 use crate::cgroup::Cgroup;
-use crate::container::Opened;
-use crate::engine::{self, ContainerState, Enforced};
-use crate::launch::{self, Exit, Launch, Runtime};
+use crate::container::OpenedSource;
+use crate::engine::{self, ContainerState, EnforcedLimits};
+use crate::launch::{self, ExitRecord, LaunchRecord, RuntimeRecord};
 use crate::local::Isolation;
 use crate::netns::NetNs;
-use crate::process::Identity;
-use crate::protocol::{self, FromShim};
+use crate::process::ProcessIdentity;
+use crate::protocol::{self, ShimMessage};
 use crate::{Error, sys};
 
-/// How long a cgroup may take to become empty.
+/// Time for a cgroup to become empty.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// What the event loop starts with.
-pub(super) struct Begun {
+/// Everything that the event loop starts with.
+pub(super) struct PreparedShim {
     pub(super) directory: PathBuf,
-    pub(super) launch: Launch,
-    pub(super) identity: Identity,
+    pub(super) launch: LaunchRecord,
+    pub(super) identity: ProcessIdentity,
     pub(super) cgroup: Cgroup,
-    /// The cgroup of the shim itself.
+    /// Cgroup of the shim itself.
     pub(super) shim_cgroup: Cgroup,
-    pub(super) enforced: Enforced,
-    /// The daemon that started us.
+    pub(super) enforced: EnforcedLimits,
+    /// Connection of the daemon that started us.
     pub(super) control: UnixStream,
-    /// Later daemons.
+    /// Listener for later daemons.
     pub(super) listener: UnixListener,
     /// Our end of init's socket.
     pub(super) init: OwnedFd,
@@ -45,19 +45,19 @@ pub(super) struct Begun {
     pub(super) _uid_lock: OwnedFd,
 }
 
-pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
+pub(super) fn begin(directory: &Path) -> Result<PreparedShim, Error> {
     // Fails only for the leader of a process group, such as a shim started by hand from a shell.
     let _ = nix::unistd::setsid();
-    // What is written from here on, the log above all, is for this user alone.
+    // Files written from here on, in particular the log, are for this user alone.
     umask(Mode::from_bits_truncate(0o077));
     let control = take_control()?;
-    let Received {
+    let ReceivedDescriptors {
         network,
         uid_lock,
         opened,
     } = receive_descriptors(&control)?;
     let path = directory.join(launch::SPEC);
-    let mut launch: Launch = launch::read(&path)?.ok_or_else(|| Error::Malformed {
+    let mut launch: LaunchRecord = launch::read_record(&path)?.ok_or_else(|| Error::Malformed {
         path: path.clone(),
         reason: "there is no launch record".into(),
     })?;
@@ -67,28 +67,29 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
         }
     }
     let own = std::process::id() as i32;
-    let identity = Identity::of(own).map_err(Error::call("reading our own start time"))?;
-    let cgroup = Cgroup::planned(&launch.parent, &launch.spec);
-    let shim_cgroup = Cgroup::of_shim(&launch.parent, &launch.spec.id);
-    let runtime = Runtime {
+    let identity =
+        ProcessIdentity::from_pid(own).map_err(Error::call("reading our own start time"))?;
+    let cgroup = Cgroup::for_servant(&launch.parent, &launch.spec);
+    let shim_cgroup = Cgroup::for_shim(&launch.parent, &launch.spec.id);
+    let runtime = RuntimeRecord {
         shim: identity,
         cgroup: cgroup.clone(),
         shim_cgroup: Some(shim_cgroup.clone()),
         uid_range: launch.uid_range,
     };
-    launch::write(&directory.join(launch::RUNTIME), &runtime)?;
+    launch::write_record(&directory.join(launch::RUNTIME), &runtime)?;
     let begun = prepare(directory, &launch, [&cgroup, &shim_cgroup], &network);
-    // The creator has its own: held here they would keep what they are on from being unmounted.
+    // The creator has its own: held here they would keep the file systems they are on from being unmounted.
     for mount in &mut launch.spec.mounts {
         mount.opened = None;
     }
     match begun {
-        Ok(Prepared {
+        Ok(PreparedContainer {
             enforced,
             init,
             listener,
             creator,
-        }) => Ok(Begun {
+        }) => Ok(PreparedShim {
             directory: directory.into(),
             launch,
             identity,
@@ -102,14 +103,14 @@ pub(super) fn begin(directory: &Path) -> Result<Begun, Error> {
             _uid_lock: uid_lock,
         }),
         Err(error) => {
-            give_up(directory, &cgroup, identity, control, &error);
+            record_failure(directory, &cgroup, identity, control, &error);
             Err(error)
         }
     }
 }
 
-/// Standard input is the daemon's socket; it becomes /dev/null, and every other descriptor that we were started with is
-/// closed.
+/// Takes the daemon's socket from standard input, replaces it by /dev/null, and closes every other inherited
+/// descriptor.
 fn take_control() -> Result<UnixStream, Error> {
     // SAFETY: descriptor 0 is open, or the call fails; the result is a new descriptor that nobody else owns.
     let control = unsafe { libc::fcntl(0, libc::F_DUPFD_CLOEXEC, 3) };
@@ -118,7 +119,7 @@ fn take_control() -> Result<UnixStream, Error> {
             "taking the daemon's socket from standard input",
         )(io::Error::last_os_error()));
     }
-    // SAFETY: as above.
+    // SAFETY: see above.
     let control = unsafe { OwnedFd::from_raw_fd(control) };
     let null = File::open("/dev/null").map_err(Error::file("open", "/dev/null"))?;
     // SAFETY: both are open descriptors.
@@ -132,65 +133,65 @@ fn take_control() -> Result<UnixStream, Error> {
     Ok(UnixStream::from(control))
 }
 
-/// What the daemon hands over.
-struct Received {
+/// Descriptors sent by the daemon.
+struct ReceivedDescriptors {
     network: NetNs,
     uid_lock: OwnedFd,
-    /// What was opened to be mounted, by the number of its mount.
-    opened: Vec<(u8, Opened)>,
+    /// Opened mount sources, with the index of their mount.
+    opened: Vec<(u8, OpenedSource)>,
 }
 
-/// The network namespace and the lock on our uids come first, then what is to be mounted, one by one (`local/start.rs`).
-fn receive_descriptors(control: &UnixStream) -> Result<Received, Error> {
+/// Receives the network namespace and the lock on our uids, then the mount sources one by one (see `local/start.rs`).
+fn receive_descriptors(control: &UnixStream) -> Result<ReceivedDescriptors, Error> {
     let (count, fds) = receive(control)?;
-    let [network, uid_lock] = <[OwnedFd; 2]>::try_from(fds).map_err(|_| gone())?;
+    let [network, uid_lock] = <[OwnedFd; 2]>::try_from(fds).map_err(|_| daemon_gone_error())?;
     let opened = (0..count).map(|_| {
         let (index, fds) = receive(control)?;
-        let [descriptor] = <[OwnedFd; 1]>::try_from(fds).map_err(|_| gone())?;
-        Ok((index, Opened::new(descriptor)))
+        let [descriptor] = <[OwnedFd; 1]>::try_from(fds).map_err(|_| daemon_gone_error())?;
+        Ok((index, OpenedSource::new(descriptor)))
     });
-    Ok(Received {
+    Ok(ReceivedDescriptors {
         opened: opened.collect::<Result<_, Error>>()?,
         network: NetNs::from_fd(network)?,
         uid_lock,
     })
 }
 
-/// One byte, and the descriptors beside it.
+/// Receives one byte and the descriptors attached to it.
 fn receive(control: &UnixStream) -> Result<(u8, Vec<OwnedFd>), Error> {
     let (mut byte, mut fds) = ([0], [-1; MAX_FDS]);
     let received = socket::receive(control.as_raw_fd(), &mut byte, &mut fds);
     let (bytes, count) = received.map_err(Error::call("receiving from the daemon"))?;
-    // SAFETY: received just now, owned by nobody else.
+    // SAFETY: just received, owned by nobody else.
     let own = |fd: &i32| unsafe { OwnedFd::from_raw_fd(*fd) };
     let fds = fds[..count].iter().map(own).collect();
     if bytes == 1 {
         Ok((byte[0], fds))
     } else {
-        Err(gone())
+        Err(daemon_gone_error())
     }
 }
 
-fn gone() -> Error {
-    let error = io::Error::new(io::ErrorKind::UnexpectedEof, "the daemon has gone");
+fn daemon_gone_error() -> Error {
+    let error = io::Error::new(io::ErrorKind::UnexpectedEof, "the daemon is gone");
     Error::call("receiving from the daemon")(error)
 }
 
-struct Prepared {
-    enforced: Enforced,
+struct PreparedContainer {
+    enforced: EnforcedLimits,
     init: OwnedFd,
     listener: UnixListener,
     creator: Creator,
 }
 
-/// Network namespace, creator, and, while that works, the cgroup with its limits. Processes are moved between cgroups only
-/// after a grace period of the kernel, for each hierarchy: that is what a start waits for longest.
+/// Prepares the network namespace, the creator, and, while that works, the cgroup with its limits. Moving a process
+/// between cgroups takes an RCU grace period of the kernel for each hierarchy: that is the longest wait of a start.
 fn prepare(
     directory: &Path,
-    launch: &Launch,
+    launch: &LaunchRecord,
     cgroups: [&Cgroup; 2],
     network: &NetNs,
-) -> Result<Prepared, Error> {
+) -> Result<PreparedContainer, Error> {
     network.enter()?;
     let (ours, theirs) = socketpair(
         AddressFamily::Unix,
@@ -204,34 +205,38 @@ fn prepare(
     let enforced = match confine(launch, cgroups, waiting.pid) {
         Ok(enforced) => enforced,
         Err(error) => {
-            waiting.end();
+            waiting.kill();
             return Err(error);
         }
     };
-    Ok(Prepared {
+    Ok(PreparedContainer {
         enforced,
         init: ours,
         listener,
-        creator: waiting.go_on(),
+        creator: waiting.resume(),
     })
 }
 
-/// Makes the cgroups, sets their limits, and moves the creator and this process into theirs.
-fn confine(launch: &Launch, [cgroup, own]: [&Cgroup; 2], creator: u32) -> Result<Enforced, Error> {
+/// Creates the cgroups, sets their limits, and moves the creator and this process into theirs.
+fn confine(
+    launch: &LaunchRecord,
+    [cgroup, own]: [&Cgroup; 2],
+    creator: u32,
+) -> Result<EnforcedLimits, Error> {
     own.create()?;
-    let asked = launch.limits_of_shim(&launch.spec.limits);
-    let of_shim = own.set(&asked).limits;
-    own.enter_alone()?;
+    let asked = launch.shim_limits_for(&launch.spec.limits);
+    let of_shim = own.set_limits(&asked).limits;
+    own.add_self()?;
     cgroup.create()?;
-    let enforced = Enforced {
+    let enforced = EnforcedLimits {
         shim: of_shim,
-        ..cgroup.set(&launch.spec.limits)
+        ..cgroup.set_limits(&launch.spec.limits)
     };
-    let mut missing = engine::missing(&launch.spec.limits, &enforced.limits);
-    // Where a controller is lacking altogether, that is told of the host, once.
+    let mut missing = engine::missing_limits(&launch.spec.limits, &enforced.limits);
+    // A controller that is missing altogether is reported once, for the host.
     let controllers = launch.parent.controllers();
     let has = |name: &str| controllers.iter().any(|known| known == name);
-    let of_shim = engine::missing(&asked, &of_shim).into_iter();
+    let of_shim = engine::missing_limits(&asked, &of_shim).into_iter();
     missing.extend(of_shim.filter_map(|name| match name {
         "memory" if has("memory") => Some("the shim's memory"),
         "cpus" if has("cpu") => Some("the shim's cpus"),
@@ -247,39 +252,46 @@ fn confine(launch: &Launch, [cgroup, own]: [&Cgroup; 2], creator: u32) -> Result
             reason,
         });
     }
-    // The container stays where it was made.
-    cgroup.enter(creator)?;
+    // The container stays in the cgroup in which it was created.
+    cgroup.add_process(creator)?;
     Ok(enforced)
 }
 
-/// Binds `shim.sock` through a descriptor of its directory: the path itself may be longer than an address can be.
+/// Binds `shim.sock` through a descriptor of its directory, since the path itself may be longer than a socket address
+/// allows.
 fn listen(directory: &Path) -> Result<UnixListener, Error> {
     let opened = File::open(directory).map_err(Error::file("open", directory))?;
     let path = format!("/proc/self/fd/{}/{}", opened.as_raw_fd(), launch::SOCKET);
     UnixListener::bind(path).map_err(Error::file("listen on", directory.join(launch::SOCKET)))
 }
 
-/// Leaves word, and nothing else.
-fn give_up(directory: &Path, cgroup: &Cgroup, shim: Identity, control: UnixStream, error: &Error) {
+/// Records the failure and leaves nothing else.
+fn record_failure(
+    directory: &Path,
+    cgroup: &Cgroup,
+    shim: ProcessIdentity,
+    control: UnixStream,
+    error: &Error,
+) {
     let state = ContainerState::Failed {
         reason: error.to_string(),
     };
     if let Err(error) = cgroup.destroy(PATIENCE) {
         eprintln!("{error}");
     }
-    let exit = Exit {
+    let exit = ExitRecord {
         state: state.clone(),
         nodes: Default::default(),
     };
-    if let Err(error) = launch::write(&directory.join(launch::EXIT), &exit) {
+    if let Err(error) = launch::write_record(&directory.join(launch::EXIT), &exit) {
         eprintln!("{error}");
     }
-    let hello = FromShim::Hello {
+    let hello = ShimMessage::Hello {
         shim,
         state: state.into(),
         nodes: exit.nodes,
-        enforced: Enforced::default(),
+        enforced: EnforcedLimits::default(),
     };
-    // When the daemon has gone, exit.json tells the next one.
-    let _ = io::Write::write_all(&mut &control, &protocol::line(&hello));
+    // If the daemon is gone, exit.json tells the next one.
+    let _ = io::Write::write_all(&mut &control, &protocol::to_line(&hello));
 }

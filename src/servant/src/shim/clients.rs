@@ -1,4 +1,4 @@
-//! Connections of daemons: usually one, none while the daemon is away.
+//! Connections of daemons: usually one, none while the daemon is not running.
 
 use std::collections::BTreeMap;
 
@@ -7,20 +7,20 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
-use super::input::Input;
-use crate::protocol::{self, FromShim, Request};
+use super::input::ShimEvent;
+use crate::protocol::{self, ShimMessage, ShimRequest};
 
-/// Everybody who listens.
-pub(super) struct Clients {
-    inputs: mpsc::UnboundedSender<Input>,
+/// All connected daemons.
+pub(super) struct DaemonConnections {
+    inputs: mpsc::UnboundedSender<ShimEvent>,
     next: u64,
-    /// Each with its queue and the task that writes it. The queue needs no bound: there is little to say, and only root
-    /// can connect.
+    /// Queue and writer task of each connection. The queue needs no bound: there are few messages, and only root can
+    /// connect.
     connected: BTreeMap<u64, (mpsc::UnboundedSender<Vec<u8>>, JoinHandle<()>)>,
 }
 
-impl Clients {
-    pub(super) fn new(inputs: mpsc::UnboundedSender<Input>) -> Self {
+impl DaemonConnections {
+    pub(super) fn new(inputs: mpsc::UnboundedSender<ShimEvent>) -> Self {
         Self {
             inputs,
             next: 0,
@@ -28,22 +28,22 @@ impl Clients {
         }
     }
 
-    /// Accepts from now on.
+    /// Accepts connections from now on.
     pub(super) fn accept(&self, listener: UnixListener) {
         let inputs = self.inputs.clone();
         tokio::task::spawn_local(async move {
             while let Ok((stream, _)) = listener.accept().await {
-                // Also other users can reach a socket; nobody but root has anything to say.
+                // Other users can reach a socket, too; only root is accepted.
                 let root = stream.peer_cred().is_ok_and(|peer| peer.uid() == 0);
-                if root && inputs.send(Input::Connected(stream)).is_err() {
+                if root && inputs.send(ShimEvent::Connected(stream)).is_err() {
                     return;
                 }
             }
         });
     }
 
-    /// Adds one and greets it.
-    pub(super) fn add(&mut self, stream: UnixStream, hello: &FromShim) {
+    /// Adds a connection and greets it.
+    pub(super) fn add(&mut self, stream: UnixStream, hello: &ShimMessage) {
         let id = self.next;
         self.next += 1;
         let (read, mut write) = stream.into_split();
@@ -51,11 +51,11 @@ impl Clients {
         tokio::task::spawn_local(async move {
             let mut lines = BufReader::with_capacity(1024, read).lines();
             while let Ok(Some(line)) = lines.next_line().await {
-                if let Ok(request) = serde_json::from_str::<Request>(&line) {
-                    let _ = inputs.send(Input::Request(id, request));
+                if let Ok(request) = serde_json::from_str::<ShimRequest>(&line) {
+                    let _ = inputs.send(ShimEvent::Request(id, request));
                 }
             }
-            let _ = inputs.send(Input::Disconnected(id));
+            let _ = inputs.send(ShimEvent::Disconnected(id));
         });
         let (queue, mut queued) = mpsc::unbounded_channel::<Vec<u8>>();
         let writer = tokio::task::spawn_local(async move {
@@ -65,7 +65,7 @@ impl Clients {
                 }
             }
         });
-        let _ = queue.send(protocol::line(hello));
+        let _ = queue.send(protocol::to_line(hello));
         self.connected.insert(id, (queue, writer));
     }
 
@@ -73,25 +73,25 @@ impl Clients {
         self.connected.remove(&id);
     }
 
-    /// Tells everybody.
-    pub(super) fn report(&self, message: &FromShim) {
-        let line = protocol::line(message);
+    /// Sends a message to all connections.
+    pub(super) fn report(&self, message: &ShimMessage) {
+        let line = protocol::to_line(message);
         for (queue, _) in self.connected.values() {
             let _ = queue.send(line.clone());
         }
     }
 
-    /// Answers one.
+    /// Sends a reply to one connection.
     pub(super) fn answer(&self, client: u64, request: u64, outcome: Result<(), String>) {
         if let Some((queue, _)) = self.connected.get(&client) {
-            let _ = queue.send(protocol::line(&FromShim::Reply {
+            let _ = queue.send(protocol::to_line(&ShimMessage::Reply {
                 id: request,
                 error: outcome.err(),
             }));
         }
     }
 
-    /// Completes when everything said is written.
+    /// Completes when all messages are written.
     pub(super) async fn flush(&mut self) {
         for (_, (queue, writer)) in std::mem::take(&mut self.connected) {
             drop(queue);

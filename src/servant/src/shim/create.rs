@@ -1,12 +1,12 @@
-//! Creating the container, in a process that exits when it is done.
+//! Creation of the container, in a process that exits afterwards.
 //!
 //! libcontainer must run in a process with one thread, changes that process's working directory and dumpable flag, and
-//! uses memory that would otherwise stay for the servant's whole life. So the shim forks, the child creates the container as
-//! its own *sibling* (init's parent is the shim), and ends. The mount namespace in which the layers were put together ends
-//! with it too; the container has its own copy.
+//! uses memory that would otherwise stay for the servant's whole life. So the shim forks, the child creates the
+//! container as its own *sibling* (init's parent is the shim), and exits. The mount namespace in which the layers were
+//! assembled ends with it; the container has its own copy.
 //!
-//! Moving a process into a cgroup can take the kernel as long as all the rest of ours (it waits for an RCU grace period
-//! before the first move in a while), so the shim moves the creator while that puts the layers together:
+//! Moving a process into a cgroup can take as long as everything else (the kernel waits for an RCU grace period before
+//! the first move in a while), so the shim moves the creator while that assembles the layers:
 //!
 //! ```text
 //!   shim      fork ── move the creator ──▶ gate ── event loop
@@ -34,50 +34,50 @@ use serde::{Deserialize, Serialize};
 
 use crate::Error;
 use crate::bundle;
-use crate::launch::Launch;
+use crate::launch::LaunchRecord;
 use crate::rootfs::{Rootfs, make_skeleton};
 
 /// A line of the creator's report. The last one counts.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(super) enum Report {
+pub(super) enum CreatorReport {
     /// Init runs.
     Created {
-        /// Its pid on the host.
+        /// Host pid of init.
         init: i32,
     },
-    /// Something went wrong; maybe not the last words.
+    /// An error, possibly followed by others.
     Failed(String),
 }
 
 /// The creating process.
 #[derive(Debug)]
 pub(super) struct Creator {
-    /// Where it reports.
+    /// Pipe on which it reports.
     pub(super) report: OwnedFd,
 }
 
-/// The creating process, before it has made any process: that waits until it is in its cgroup.
+/// The creating process before it has created any process: it waits until it is in its cgroup.
 #[derive(Debug)]
-pub(super) struct Waiting {
+pub(super) struct PausedCreator {
     pub(super) pid: u32,
     report: OwnedFd,
-    /// Closed without a word it ends.
+    /// Lets it continue; if closed without a message, it exits.
     go: OwnedFd,
 }
 
-impl Waiting {
-    /// Ends it. Once this returns it writes nothing any more, so that the servant's directory can be removed.
-    pub(super) fn end(self) {
+impl PausedCreator {
+    /// Kills it. Once this returns it writes nothing any more, so that the servant's directory can be removed.
+    pub(super) fn kill(self) {
         let pid = nix::unistd::Pid::from_raw(self.pid as i32);
-        // Our own child, not reaped yet: the number is surely its own.
+        // Our own child, not reaped yet: the pid is certainly its own.
         let _ = nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGKILL);
         let _ = nix::sys::wait::waitpid(pid, None);
     }
 
-    /// Lets it go on.
-    pub(super) fn go_on(self) -> Creator {
-        // Where nobody listens it has failed and ended, and says so in its report. That must not end us too (SIGPIPE).
+    /// Lets it continue.
+    pub(super) fn resume(self) -> Creator {
+        // If nobody listens, it has failed and exited, and says so in its report. That must not kill us (SIGPIPE).
         let _ = send(self.go.as_raw_fd(), b".", MsgFlags::MSG_NOSIGNAL);
         Creator {
             report: self.report,
@@ -85,8 +85,12 @@ impl Waiting {
     }
 }
 
-/// Forks it. The calling process must have one thread.
-pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result<Waiting, Error> {
+/// Forks the creator. The calling process must have one thread.
+pub(super) fn fork(
+    directory: &Path,
+    launch: &LaunchRecord,
+    socket: OwnedFd,
+) -> Result<PausedCreator, Error> {
     let (report, write) =
         nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
     let (wait, go) = socketpair(
@@ -96,9 +100,9 @@ pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result
         SockFlag::SOCK_CLOEXEC,
     )
     .map_err(Error::nix("socketpair for the creator"))?;
-    // SAFETY: one thread, so that the child may do whatever its parent might.
+    // SAFETY: one thread, so that the child may do anything its parent might.
     match unsafe { nix::unistd::fork() }.map_err(Error::nix("fork of the creator"))? {
-        ForkResult::Parent { child } => Ok(Waiting {
+        ForkResult::Parent { child } => Ok(PausedCreator {
             pid: child.as_raw() as u32,
             report,
             go,
@@ -107,35 +111,35 @@ pub(super) fn fork(directory: &Path, launch: &Launch, socket: OwnedFd) -> Result
             drop((report, go));
             let write = Arc::new(File::from(write));
             // Errors that libcontainer meets in its own children are only logged.
-            let _ = tracing::subscriber::set_global_default(Complaints(write.clone()));
+            let _ = tracing::subscriber::set_global_default(ErrorReporter(write.clone()));
             let outcome = match stage(directory, launch)
                 .and_then(|staged| create(directory, launch, staged, socket, wait))
             {
-                Ok(init) => Report::Created { init },
-                Err(reason) => Report::Failed(reason),
+                Ok(init) => CreatorReport::Created { init },
+                Err(reason) => CreatorReport::Failed(reason),
             };
             report_line(&write, &outcome);
-            // SAFETY: ends the child without running what the parent has registered for its own end.
+            // SAFETY: ends the child without running the exit handlers registered by the parent.
             unsafe { libc::_exit(0) }
         }
     }
 }
 
-/// What the creator has prepared.
-struct Ready {
+/// Everything the creator has prepared.
+struct StagedContainer {
     /// The static init, opened before anything of the servant was mounted.
     init: File,
-    /// Where libcontainer keeps its records. Nobody needs them later, and on a disk their writing took as long as a
-    /// fifth of the creation: this is in memory, and goes with the creator's mount namespace.
+    /// Directory of libcontainer's records. They are not needed later, and writing them to a disk took up to a fifth of
+    /// the creation: this one is in memory, and disappears with the creator's mount namespace.
     records: PathBuf,
-    /// The configuration names it by its number.
+    /// The configuration names it by its descriptor number.
     _user_namespace: OwnedFd,
 }
 
-/// Everything that libcontainer is to find: root, volumes, configuration.
-fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
+/// Prepares everything that libcontainer needs: root, volumes, configuration.
+fn stage(directory: &Path, launch: &LaunchRecord) -> Result<StagedContainer, String> {
     let text = |error: &dyn std::error::Error| chain(error);
-    // Roots of containers are for their own users to read, whatever is usual in the shim.
+    // Roots of containers must be readable for their own users, whatever the shim's umask.
     umask(Mode::from_bits_truncate(0o022));
     let init = File::open(&launch.init)
         .map_err(|error| format!("could not open {}: {error}", launch.init.display()))?;
@@ -158,7 +162,7 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
         .mount(&launch.spec.mounts)
         .map_err(|error| text(&error))?;
     rootfs
-        .make_owned(&staged.root, &launch.spec.owned_directories)
+        .make_owned_directories(&staged.root, &launch.spec.owned_directories)
         .map_err(|error| text(&error))?;
     let config =
         bundle::config(&launch.spec, &staged, &launch.quotas()).map_err(|error| text(&error))?;
@@ -170,18 +174,18 @@ fn stage(directory: &Path, launch: &Launch) -> Result<Ready, String> {
         .open(&file)
         .and_then(|mut file| file.write_all(&json))
         .map_err(|error| format!("could not write {}: {error}", file.display()))?;
-    Ok(Ready {
+    Ok(StagedContainer {
         init,
         records: staged.root.with_file_name("records"),
         _user_namespace: staged.user_namespace,
     })
 }
 
-/// Creates and starts the container; init's pid on the host.
+/// Creates and starts the container; returns the host pid of init.
 fn create(
     directory: &Path,
-    launch: &Launch,
-    staged: Ready,
+    launch: &LaunchRecord,
+    staged: StagedContainer,
     socket: OwnedFd,
     wait: OwnedFd,
 ) -> Result<i32, String> {
@@ -220,7 +224,7 @@ fn create(
         .ok_or_else(|| "libcontainer does not know init's pid".into())
 }
 
-/// An error with all its causes.
+/// Formats an error with all its causes.
 fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
@@ -234,12 +238,12 @@ fn chain(error: &dyn std::error::Error) -> String {
     text
 }
 
-fn report_line(mut file: &File, report: &Report) {
-    // Nobody reads any more: the shim is gone, and init will see that by itself.
-    let _ = file.write_all(&crate::protocol::line(report));
+fn report_line(mut file: &File, report: &CreatorReport) {
+    // An error means that the shim is gone, which init will notice by itself.
+    let _ = file.write_all(&crate::protocol::to_line(report));
 }
 
-/// Executes init from an open file: it needs no place in the container and cannot be found there.
+/// Executes init from an open file, so that the container need not contain it and cannot find it.
 #[derive(Clone)]
 struct RunInit {
     init: Arc<File>,
@@ -269,10 +273,10 @@ impl Executor for RunInit {
     }
 }
 
-/// Writes what libcontainer logs as errors into the report.
-struct Complaints(Arc<File>);
+/// Writes the errors logged by libcontainer into the report.
+struct ErrorReporter(Arc<File>);
 
-impl tracing::Subscriber for Complaints {
+impl tracing::Subscriber for ErrorReporter {
     fn enabled(&self, metadata: &tracing::Metadata<'_>) -> bool {
         *metadata.level() == tracing::Level::ERROR
     }
@@ -294,7 +298,7 @@ impl tracing::Subscriber for Complaints {
                 text += &part;
             },
         );
-        report_line(&self.0, &Report::Failed(text));
+        report_line(&self.0, &CreatorReport::Failed(text));
     }
 
     fn new_span(&self, _span: &tracing::span::Attributes<'_>) -> tracing::Id {
@@ -311,30 +315,36 @@ impl tracing::Subscriber for Complaints {
 }
 
 impl Creator {
-    /// Whether the report, as far as it was read, says that init runs.
+    /// Returns whether the report, as far as it was read, says that init runs.
     pub(super) fn has_succeeded(text: &[u8]) -> bool {
         let last = text
             .strip_suffix(b"\n")
             .and_then(|whole| whole.rsplit(|byte| *byte == b'\n').next());
-        last.is_some_and(|line| matches!(serde_json::from_slice(line), Ok(Report::Created { .. })))
+        last.is_some_and(|line| {
+            matches!(
+                serde_json::from_slice(line),
+                Ok(CreatorReport::Created { .. })
+            )
+        })
     }
 
-    /// Reads what is left of the report and tells the outcome. `text` is the whole report.
+    /// Evaluates the whole report: host pid of init, or the errors.
     pub(super) fn outcome(text: &str) -> Result<i32, String> {
         let mut complaints: Vec<String> = Vec::new();
         for line in text.lines() {
             match serde_json::from_str(line) {
-                Ok(Report::Created { init }) => return Ok(init),
-                Ok(Report::Failed(reason)) if !complaints.contains(&reason) => {
+                Ok(CreatorReport::Created { init }) => return Ok(init),
+                Ok(CreatorReport::Failed(reason)) if !complaints.contains(&reason) => {
                     complaints.push(reason)
                 }
-                Ok(Report::Failed(_)) => {}
+                Ok(CreatorReport::Failed(_)) => {}
                 Err(_) => complaints.push(line.to_owned()),
             }
         }
         // The outermost error comes last and says least; the first is the cause.
         match complaints.as_slice() {
-            [] => Err("the creating process ended without a word: see the kernel's log for an out-of-memory kill".into()),
+            [] => Err("the creating process ended without a word: see the kernel's log for an out-of-memory \
+                       kill".into()),
             [only] => Err(only.clone()),
             [first, .., last] => Err(format!("{last} ({first})")),
         }
@@ -347,10 +357,11 @@ mod tests {
 
     #[test]
     fn the_cause_is_told_with_the_outermost_error() {
-        let line = |report: &Report| String::from_utf8(crate::protocol::line(report)).unwrap();
-        let failed = |text: &str| line(&Report::Failed(text.into()));
+        let line =
+            |report: &CreatorReport| String::from_utf8(crate::protocol::to_line(report)).unwrap();
+        let failed = |text: &str| line(&CreatorReport::Failed(text.into()));
         assert_eq!(
-            Creator::outcome(&(failed("warning") + &line(&Report::Created { init: 7 }))),
+            Creator::outcome(&(failed("warning") + &line(&CreatorReport::Created { init: 7 }))),
             Ok(7)
         );
         assert_eq!(

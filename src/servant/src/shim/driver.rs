@@ -1,4 +1,4 @@
-//! The shim's event loop. Everything that happens enters one queue; this one task changes the servant's state.
+//! The shim's event loop. All events enter one queue; this task alone changes the servant's state.
 
 mod coming_up;
 mod ending;
@@ -15,41 +15,41 @@ use tokio::sync::mpsc;
 use tokio::task::LocalSet;
 
 use super::Resident;
-use super::begin::Begun;
-use super::clients::Clients;
-use super::input::{Input, StopStage};
-use super::link::Link;
-use super::nodes::Nodes;
+use super::begin::PreparedShim;
+use super::clients::DaemonConnections;
+use super::input::{ShimEvent, StopStage};
+use super::link::InitLink;
+use super::nodes::NodeTable;
 use super::streams::Streams;
-use crate::engine::{ContainerState, Enforced, NodeEvent};
-use crate::protocol::{Command, FromShim, Snapshot};
-use crate::spec::Limits;
+use crate::engine::{ContainerState, EnforcedLimits, NodeEvent};
+use crate::protocol::{Command, ShimMessage, Snapshot};
+use crate::spec::ResourceLimits;
 use crate::{Error, logs};
 
 struct Driver {
-    begun: Begun,
-    inputs: mpsc::UnboundedSender<Input>,
-    queue: mpsc::UnboundedReceiver<Input>,
-    clients: Clients,
-    nodes: Nodes,
-    link: Link,
+    begun: PreparedShim,
+    inputs: mpsc::UnboundedSender<ShimEvent>,
+    queue: mpsc::UnboundedReceiver<ShimEvent>,
+    clients: DaemonConnections,
+    nodes: NodeTable,
+    link: InitLink,
     streams: Streams,
     resident: Box<dyn Resident>,
     state: ContainerState,
-    /// The init process, once there is one.
+    /// Pid and pidfd of init, once it exists.
     init: Option<(i32, OwnedFd)>,
     stopping: Option<StopStage>,
-    /// How it is to end, once that is decided.
+    /// Final state, once it is decided.
     verdict: Option<ContainerState>,
     oom_seen: u64,
-    /// Who waits for the answer to a start, by its number.
+    /// Clients and requests that wait for the result of a start, by its number.
     waiting: BTreeMap<u32, (u64, u64)>,
     /// Signals for nodes that are being started.
     early_signals: Vec<(String, i32)>,
 }
 
 /// Runs until the servant has ended.
-pub(super) fn drive(begun: Begun, resident: Box<dyn Resident>) -> Result<(), Error> {
+pub(super) fn drive(begun: PreparedShim, resident: Box<dyn Resident>) -> Result<(), Error> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .enable_time()
@@ -64,9 +64,9 @@ pub(super) fn drive(begun: Begun, resident: Box<dyn Resident>) -> Result<(), Err
 }
 
 impl Driver {
-    fn new(begun: Begun, resident: Box<dyn Resident>) -> Result<Self, Error> {
+    fn new(begun: PreparedShim, resident: Box<dyn Resident>) -> Result<Self, Error> {
         let (inputs, queue) = mpsc::unbounded_channel();
-        let clients = Clients::new(inputs.clone());
+        let clients = DaemonConnections::new(inputs.clone());
         let listener = begun.listener.try_clone().and_then(|listener| {
             listener.set_nonblocking(true)?;
             UnixListener::from_std(listener)
@@ -79,18 +79,18 @@ impl Driver {
         let control = control.map_err(Error::call("talking to the daemon"))?;
         let log = begun.directory.join(logs::FILE);
         let rate = begun.launch.quotas().log_rate;
-        let log =
-            logs::Writer::create(&log, logs::ROTATE_AT, rate).map_err(Error::file("make", &log))?;
+        let log = logs::LogWriter::create(&log, logs::ROTATE_AT, rate)
+            .map_err(Error::file("make", &log))?;
         let init = begun
             .init
             .try_clone()
             .map_err(Error::call("dup of init's socket"))?;
         watch_signals(&inputs).map_err(Error::call("watching signals"))?;
-        let _ = inputs.send(Input::Connected(control));
+        let _ = inputs.send(ShimEvent::Connected(control));
         Ok(Self {
             clients,
-            nodes: Nodes::default(),
-            link: Link::new(init).map_err(Error::call("watching init's socket"))?,
+            nodes: NodeTable::default(),
+            link: InitLink::new(init).map_err(Error::call("watching init's socket"))?,
             streams: Streams::new(log),
             resident,
             state: ContainerState::Creating,
@@ -107,7 +107,7 @@ impl Driver {
     }
 
     async fn run(&mut self) {
-        if let Err(reason) = self.come_up().await {
+        if let Err(reason) = self.bring_up().await {
             self.verdict = Some(ContainerState::Failed { reason });
             self.kill();
             if self.init.is_none() {
@@ -121,33 +121,33 @@ impl Driver {
         }
     }
 
-    /// True when the servant has ended.
-    async fn handle(&mut self, input: Input) -> bool {
+    /// Handles an event; returns true when the servant has ended.
+    async fn handle(&mut self, input: ShimEvent) -> bool {
         match input {
-            Input::Connected(stream) => self.clients.add(stream, &self.hello()),
-            Input::Disconnected(client) => self.clients.remove(client),
-            Input::Request(client, request) => {
-                if let Some(outcome) = self.obey(client, request.id, request.command).await {
+            ShimEvent::Connected(stream) => self.clients.add(stream, &self.hello()),
+            ShimEvent::Disconnected(client) => self.clients.remove(client),
+            ShimEvent::Request(client, request) => {
+                if let Some(outcome) = self.execute(client, request.id, request.command).await {
                     self.clients.answer(client, request.id, outcome);
                 }
             }
-            Input::Init(reply, fd) => self.init_said(reply, fd).await,
-            Input::Reaped(pid, status) => {
+            ShimEvent::Init(reply, fd) => self.on_init_reply(reply, fd).await,
+            ShimEvent::Reaped(pid, status) => {
                 if self.init.as_ref().is_some_and(|(init, _)| *init == pid) {
-                    self.init_ended(status);
+                    self.on_init_exit(status);
                     return true;
                 }
             }
-            Input::Respawn(name) => self.respawn(&name).await,
-            Input::Patience(stage) if self.stopping == Some(stage) => self.next_stage().await,
-            Input::Patience(_) => {}
-            Input::Terminate => self.stop("the shim was asked to end").await,
+            ShimEvent::Respawn(name) => self.respawn(&name).await,
+            ShimEvent::Patience(stage) if self.stopping == Some(stage) => self.next_stage().await,
+            ShimEvent::Patience(_) => {}
+            ShimEvent::Terminate => self.stop("the shim was asked to end").await,
         }
         false
     }
 
-    /// None: the answer comes later.
-    async fn obey(
+    /// Executes a command; returns `None` if the reply comes later.
+    async fn execute(
         &mut self,
         client: u64,
         request: u64,
@@ -166,7 +166,7 @@ impl Driver {
                 }
                 let (number, spec) = self.nodes.start(&name)?;
                 self.waiting.insert(number, (client, request));
-                self.ask_for(number, &spec).await;
+                self.request_start(number, &spec).await;
                 None
             }
             Command::SignalNode { node, signal, last } => {
@@ -182,10 +182,10 @@ impl Driver {
             Command::SetLimits(limits) => {
                 let enforced = self.set_limits(&limits);
                 self.begun.enforced = enforced.clone();
-                self.clients.report(&FromShim::Enforced {
+                self.clients.report(&ShimMessage::Enforced {
                     enforced: enforced.clone(),
                 });
-                Some(match enforced.unmet(&limits).as_slice() {
+                Some(match enforced.unmet_limits(&limits).as_slice() {
                     [] => Ok(()),
                     unmet => Err(format!("cannot be set: {}", unmet.join(", "))),
                 })
@@ -193,23 +193,23 @@ impl Driver {
         }
     }
 
-    /// The servant's limits, and with them what the shim may take beside it.
-    fn set_limits(&self, limits: &Limits) -> Enforced {
-        let enforced = self.begun.cgroup.set(limits);
-        let of_shim = self.begun.launch.limits_of_shim(&enforced.limits);
-        Enforced {
-            shim: self.begun.shim_cgroup.set(&of_shim).limits,
+    /// Sets the servant's limits, and those of the shim that depend on them.
+    fn set_limits(&self, limits: &ResourceLimits) -> EnforcedLimits {
+        let enforced = self.begun.cgroup.set_limits(limits);
+        let of_shim = self.begun.launch.shim_limits_for(&enforced.limits);
+        EnforcedLimits {
+            shim: self.begun.shim_cgroup.set_limits(&of_shim).limits,
             ..enforced
         }
     }
 
     fn set_state(&mut self, state: ContainerState) {
         self.state = state;
-        let state = self.told();
-        self.clients.report(&FromShim::State { state });
+        let state = self.snapshot();
+        self.clients.report(&ShimMessage::State { state });
     }
 
-    fn told(&self) -> Snapshot {
+    fn snapshot(&self) -> Snapshot {
         let running = self.state == ContainerState::Running;
         let init = self.init.as_ref().filter(|_| running);
         Snapshot {
@@ -220,29 +220,29 @@ impl Driver {
 
     fn report_node(&self, event: NodeEvent) {
         let status = self.nodes.status(event.node());
-        self.clients.report(&FromShim::Node { event, status });
+        self.clients.report(&ShimMessage::Node { event, status });
     }
 
-    fn hello(&self) -> FromShim {
-        FromShim::Hello {
+    fn hello(&self) -> ShimMessage {
+        ShimMessage::Hello {
             shim: self.begun.identity,
-            state: self.told(),
+            state: self.snapshot(),
             nodes: self.nodes.statuses(),
-            enforced: Enforced {
+            enforced: EnforcedLimits {
                 ..self.begun.enforced.clone()
             },
         }
     }
 }
 
-/// Children end, and somebody may ask us to.
-fn watch_signals(inputs: &mpsc::UnboundedSender<Input>) -> std::io::Result<()> {
+/// Forwards exits of children and SIGTERM as events.
+fn watch_signals(inputs: &mpsc::UnboundedSender<ShimEvent>) -> std::io::Result<()> {
     let mut children = signal(SignalKind::child())?;
     let mut terminate = signal(SignalKind::terminate())?;
     let inputs = inputs.clone();
     tokio::task::spawn_local(async move {
         loop {
-            // First without waiting: a child may have ended before we watched.
+            // First without waiting: a child may have exited before the signal was watched.
             while let Ok(status) = waitpid(None::<Pid>, Some(WaitPidFlag::WNOHANG)) {
                 let (pid, raw) = match status {
                     WaitStatus::Exited(pid, code) => (pid, code << 8),
@@ -250,12 +250,12 @@ fn watch_signals(inputs: &mpsc::UnboundedSender<Input>) -> std::io::Result<()> {
                     WaitStatus::StillAlive => break,
                     _ => continue,
                 };
-                let _ = inputs.send(Input::Reaped(pid.as_raw(), raw));
+                let _ = inputs.send(ShimEvent::Reaped(pid.as_raw(), raw));
             }
             tokio::select! {
                 _ = children.recv() => {}
                 _ = terminate.recv() => {
-                    let _ = inputs.send(Input::Terminate);
+                    let _ = inputs.send(ShimEvent::Terminate);
                 }
             }
         }

@@ -1,34 +1,34 @@
-//! What happens to a shim: one queue of it all, which its driver works off.
+//! Events of a shim: one queue, which its driver processes.
 
 use std::os::fd::OwnedFd;
 
-use init::Reply;
+use init::InitReply;
 use tokio::net::UnixStream;
 
-use crate::protocol::Request;
+use crate::protocol::ShimRequest;
 
-/// What happens.
+/// An event.
 #[derive(Debug)]
-pub(super) enum Input {
+pub(super) enum ShimEvent {
     /// A daemon connected.
     Connected(UnixStream),
-    /// It asked.
-    Request(u64, Request),
-    /// It left.
+    /// A daemon sent a request.
+    Request(u64, ShimRequest),
+    /// A daemon disconnected.
     Disconnected(u64),
-    /// Init said something.
-    Init(Reply, Option<OwnedFd>),
-    /// A child of ours was reaped: init, or what the creator left.
+    /// Init sent a reply.
+    Init(InitReply, Option<OwnedFd>),
+    /// A child was reaped: init, or a leftover of the creator.
     Reaped(i32, i32),
-    /// A node's delay is over.
+    /// The restart delay of a node is over.
     Respawn(String),
-    /// A stage of the stop has lasted long enough.
+    /// The time of a stage of the stop is over.
     Patience(StopStage),
-    /// We were asked to end.
+    /// SIGTERM was received.
     Terminate,
 }
 
-/// The stages of a stop.
+/// Stages of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum StopStage {
     Interrupt,

@@ -5,21 +5,21 @@ use std::os::fd::{AsRawFd, FromRawFd, OwnedFd, RawFd};
 use std::rc::Rc;
 
 use init::socket::{self, MAX_FDS};
-use init::{EncodeError, Reply, Request, Scope, StartRequest};
+use init::{EncodeError, InitReply, InitRequest, Scope, StartRequest};
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 
-/// The longest reply, with room.
+/// Buffer size: more than the longest reply.
 const REPLY: usize = 64;
 
-/// Sends requests, receives replies.
+/// Sends requests and receives replies.
 #[derive(Clone)]
-pub(super) struct Link {
+pub(super) struct InitLink {
     socket: Rc<AsyncFd<OwnedFd>>,
 }
 
-/// Why a request was not sent.
+/// Reason why a request was not sent.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum LinkError {
     #[error(transparent)]
@@ -28,40 +28,40 @@ pub(super) enum LinkError {
     Gone(#[from] io::Error),
 }
 
-impl Link {
+impl InitLink {
     pub(super) fn new(socket: OwnedFd) -> io::Result<Self> {
         fcntl(&socket, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
-        // SAFETY: the descriptor is owned by what is registered, and nothing else closes it.
+        // SAFETY: the descriptor is owned by the registration, and nothing else closes it.
         let socket = unsafe { AsyncFd::register(socket) }?;
         Ok(Self {
             socket: Rc::new(socket),
         })
     }
 
-    /// The next reply and the pidfd beside it; none when init has closed.
-    pub(super) async fn receive(&self) -> io::Result<Option<(Reply, Option<OwnedFd>)>> {
+    /// Receives the next reply and the pidfd attached to it; `None` when init has closed the socket.
+    pub(super) async fn receive(&self) -> io::Result<Option<(InitReply, Option<OwnedFd>)>> {
         loop {
             let receive = |fd: &OwnedFd| {
                 let (mut bytes, mut fds) = ([0; REPLY], [-1; MAX_FDS]);
                 let (length, count) = socket::receive(fd.as_raw_fd(), &mut bytes, &mut fds)?;
-                // SAFETY: received just now, owned by nobody else.
+                // SAFETY: just received, owned by nobody else.
                 let mut owned = fds[..count]
                     .iter()
                     .map(|fd| unsafe { OwnedFd::from_raw_fd(*fd) });
                 let first = owned.next();
                 owned.for_each(drop);
-                Ok((Reply::decode(&bytes[..length]), length, first))
+                Ok((InitReply::decode(&bytes[..length]), length, first))
             };
             match self.socket.async_io(Interest::READABLE, receive).await? {
                 (_, 0, None) => return Ok(None),
                 (Some(reply), _, fd) => return Ok(Some((reply, fd))),
-                // Init speaks no other language; whatever this is, nobody waits for it.
+                // Malformed; nobody waits for it.
                 (None, ..) => {}
             }
         }
     }
 
-    /// Asks for a program; the streams are its standard output and error.
+    /// Requests the start of a program; `streams` are its standard output and error.
     pub(super) async fn start(
         &self,
         request: &StartRequest<'_>,
@@ -71,14 +71,16 @@ impl Link {
         Ok(self.send(&bytes, &streams).await?)
     }
 
-    /// Asks for a signal.
+    /// Requests a signal.
     pub(super) async fn signal(
         &self,
         pid: i32,
         signal: i32,
         scope: Scope,
     ) -> Result<(), LinkError> {
-        Ok(self.send(&Request::signal(pid, signal, scope), &[]).await?)
+        Ok(self
+            .send(&InitRequest::encode_signal(pid, signal, scope), &[])
+            .await?)
     }
 
     async fn send(&self, bytes: &[u8], fds: &[RawFd]) -> io::Result<()> {

@@ -1,5 +1,4 @@
-//! The servant's processes as the shim knows them. Pure bookkeeping: what has happened goes in, what to tell and what to
-//! do about it comes out.
+//! The servant's processes as known to the shim. Pure bookkeeping: events go in; messages and consequences come out.
 
 use std::collections::BTreeMap;
 
@@ -9,34 +8,34 @@ use crate::spec::{NodeSpec, RUN};
 
 /// One node.
 #[derive(Debug)]
-struct Node {
+struct NodeRecord {
     spec: NodeSpec,
     status: NodeStatus,
-    /// Pid inside, while it runs.
+    /// Pid in the container, while it runs.
     inside: Option<i32>,
 }
 
 /// All nodes of the servant, by name.
 #[derive(Debug, Default)]
-pub(super) struct Nodes {
-    known: BTreeMap<String, Node>,
+pub(super) struct NodeTable {
+    known: BTreeMap<String, NodeRecord>,
     /// Starts that init has not answered yet, by their number.
     starting: BTreeMap<u32, String>,
     next: u32,
 }
 
-/// What follows from the end of a node.
+/// Consequence of the end of a node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Consequence {
     /// Nothing follows.
     None,
-    /// It is to be started again, after so many seconds.
+    /// The node is restarted after this number of seconds.
     Respawn(f64),
     /// The servant ends.
     EndServant,
 }
 
-impl Nodes {
+impl NodeTable {
     /// Adds a node, or replaces one of the same name that has ended.
     pub(super) fn add(&mut self, spec: NodeSpec) -> Result<(), String> {
         if spec.name.is_empty()
@@ -72,7 +71,7 @@ impl Nodes {
         };
         self.known.insert(
             spec.name.clone(),
-            Node {
+            NodeRecord {
                 spec,
                 status,
                 inside: None,
@@ -81,7 +80,7 @@ impl Nodes {
         Ok(())
     }
 
-    /// The node ends for good: nothing follows from its end.
+    /// Retires a node: nothing follows from its end.
     pub(super) fn retire(&mut self, name: &str) {
         if let Some(node) = self.known.get_mut(name) {
             node.spec.respawn = false;
@@ -89,12 +88,12 @@ impl Nodes {
         }
     }
 
-    /// Whether the node is to be started again when it has ended.
-    pub(super) fn respawns(&self, name: &str) -> bool {
+    /// Returns whether the node is to be restarted when it has ended.
+    pub(super) fn should_respawn(&self, name: &str) -> bool {
         self.known.get(name).is_some_and(|node| node.spec.respawn)
     }
 
-    /// A number for the start of a node, and what is to be started.
+    /// Allocates a number for the start of a node, and returns the spec to start.
     pub(super) fn start(&mut self, name: &str) -> Option<(u32, NodeSpec)> {
         let node = self.known.get(name).filter(|node| node.inside.is_none())?;
         let number = self.next;
@@ -103,8 +102,8 @@ impl Nodes {
         Some((number, node.spec.clone()))
     }
 
-    /// Init has executed it.
-    pub(super) fn started(&mut self, number: u32, inside: i32, host: i32) -> Option<NodeEvent> {
+    /// Called when init has executed the program.
+    pub(super) fn on_started(&mut self, number: u32, inside: i32, host: i32) -> Option<NodeEvent> {
         let name = self.starting.remove(&number)?;
         let node = self.known.get_mut(&name)?;
         node.inside = Some(inside);
@@ -113,8 +112,8 @@ impl Nodes {
         Some(NodeEvent::Started { node: name })
     }
 
-    /// It could not be executed.
-    pub(super) fn failed(
+    /// Called when the program could not be executed.
+    pub(super) fn on_exec_failed(
         &mut self,
         number: u32,
         reason: String,
@@ -127,7 +126,7 @@ impl Nodes {
             out_of_memory: false,
             exec_error: Some(reason.clone()),
         });
-        // Started again it would fail again.
+        // A restart would fail again.
         let consequence = if node.spec.required {
             Consequence::EndServant
         } else {
@@ -136,8 +135,8 @@ impl Nodes {
         Some((NodeEvent::ExecFailed { node: name, reason }, consequence))
     }
 
-    /// The process with this pid inside has ended; none when it is not a node.
-    pub(super) fn exited(
+    /// Called when the process with this pid in the container has ended; returns `None` if it is not a node.
+    pub(super) fn on_exited(
         &mut self,
         inside: i32,
         exit: NodeExit,
@@ -171,8 +170,8 @@ impl Nodes {
         ))
     }
 
-    /// Nodes that run or are being started, with their pids inside where known.
-    pub(super) fn alive(&self) -> (Vec<(String, i32)>, usize) {
+    /// Returns the running nodes with their pids in the container, and the number of nodes being started.
+    pub(super) fn running_and_starting(&self) -> (Vec<(String, i32)>, usize) {
         let running = self
             .known
             .iter()
@@ -181,18 +180,18 @@ impl Nodes {
         (running, self.starting.len())
     }
 
-    /// Whether init has yet to answer for it.
+    /// Returns whether init has yet to answer for its start.
     pub(super) fn is_starting(&self, name: &str) -> bool {
         self.starting.values().any(|starting| starting == name)
     }
 
-    /// Numbers of the starts that init has not answered.
-    pub(super) fn starting(&self) -> Vec<u32> {
+    /// Returns the numbers of the starts that init has not answered.
+    pub(super) fn starting_numbers(&self) -> Vec<u32> {
         self.starting.keys().copied().collect()
     }
 
-    /// Pid inside of a node.
-    pub(super) fn inside(&self, name: &str) -> Result<i32, String> {
+    /// Returns the pid of a node in the container.
+    pub(super) fn pid_inside(&self, name: &str) -> Result<i32, String> {
         let node = self
             .known
             .get(name)
@@ -201,7 +200,7 @@ impl Nodes {
             .ok_or_else(|| format!("node {name} does not run"))
     }
 
-    /// The status of one node.
+    /// Returns the status of a node.
     pub(super) fn status(&self, name: &str) -> NodeStatus {
         self.known
             .get(name)
@@ -209,7 +208,7 @@ impl Nodes {
             .unwrap_or_default()
     }
 
-    /// The status of every node.
+    /// Returns the status of all nodes.
     pub(super) fn statuses(&self) -> BTreeMap<String, NodeStatus> {
         self.known
             .iter()
@@ -218,8 +217,8 @@ impl Nodes {
     }
 }
 
-/// Reads a status as `waitpid` gives it.
-pub(super) fn exit_of(status: i32, out_of_memory: bool) -> NodeExit {
+/// Converts a wait status from `waitpid`.
+pub(super) fn parse_wait_status(status: i32, out_of_memory: bool) -> NodeExit {
     let code = libc::WIFEXITED(status).then(|| libc::WEXITSTATUS(status));
     let signal = libc::WIFSIGNALED(status).then(|| libc::WTERMSIG(status));
     NodeExit {
@@ -248,22 +247,22 @@ mod tests {
         }
     }
 
-    fn run(nodes: &mut Nodes, spec: NodeSpec, inside: i32) {
+    fn run(nodes: &mut NodeTable, spec: NodeSpec, inside: i32) {
         let name = spec.name.clone();
         nodes.add(spec).unwrap();
         let (number, _) = nodes.start(&name).unwrap();
-        nodes.started(number, inside, inside + 1000).unwrap();
+        nodes.on_started(number, inside, inside + 1000).unwrap();
     }
 
     #[test]
     fn the_end_of_a_node_has_the_consequence_that_ros_users_know() {
-        let mut nodes = Nodes::default();
+        let mut nodes = NodeTable::default();
         run(&mut nodes, node("/plain", false, false), 2);
         run(&mut nodes, node("/again", false, true), 3);
         run(&mut nodes, node("/needed", true, true), 4);
         let mut end = |pid| {
             nodes
-                .exited(pid, exit_of(0, false))
+                .on_exited(pid, parse_wait_status(0, false))
                 .map(|(_, consequence)| consequence)
         };
         assert_eq!(end(2), Some(Consequence::None));
@@ -275,20 +274,20 @@ mod tests {
 
     #[test]
     fn nothing_follows_from_the_end_of_a_node_that_ends_for_good() {
-        let mut nodes = Nodes::default();
+        let mut nodes = NodeTable::default();
         run(&mut nodes, node("/again", false, true), 3);
         run(&mut nodes, node("/needed", true, true), 4);
         run(&mut nodes, node("/pausing", false, true), 5);
-        let end = |nodes: &mut Nodes, pid| {
-            let ended = nodes.exited(pid, exit_of(0, false));
+        let end = |nodes: &mut NodeTable, pid| {
+            let ended = nodes.on_exited(pid, parse_wait_status(0, false));
             ended.map(|(_, consequence)| consequence)
         };
-        // One has ended already and waits to be started again.
+        // One has ended already and waits to be restarted.
         assert_eq!(end(&mut nodes, 5), Some(Consequence::Respawn(0.5)));
-        assert!(nodes.respawns("/pausing"));
+        assert!(nodes.should_respawn("/pausing"));
         for name in ["/again", "/needed", "/pausing", "/never"] {
             nodes.retire(name);
-            assert!(!nodes.respawns(name));
+            assert!(!nodes.should_respawn(name));
         }
         assert_eq!(end(&mut nodes, 3), Some(Consequence::None));
         assert_eq!(end(&mut nodes, 4), Some(Consequence::None));
@@ -296,7 +295,7 @@ mod tests {
 
     #[test]
     fn a_name_is_free_again_once_its_node_has_ended() {
-        let mut nodes = Nodes::default();
+        let mut nodes = NodeTable::default();
         run(&mut nodes, node("/a", false, false), 2);
         assert!(
             nodes
@@ -304,8 +303,8 @@ mod tests {
                 .unwrap_err()
                 .contains("runs already")
         );
-        nodes.exited(2, exit_of(256, false)).unwrap();
-        assert_eq!(nodes.status("/a").ended().unwrap().code, Some(1));
+        nodes.on_exited(2, parse_wait_status(256, false)).unwrap();
+        assert_eq!(nodes.status("/a").current_exit().unwrap().code, Some(1));
         run(&mut nodes, node("/a", false, false), 3);
         assert_eq!(
             (nodes.status("/a").starts, nodes.status("/a").pid),
@@ -323,7 +322,7 @@ mod tests {
 
     #[test]
     fn it_is_known_for_which_run_a_node_was_started_last() {
-        let mut nodes = Nodes::default();
+        let mut nodes = NodeTable::default();
         for (life, inside) in [("first life", 2), ("second life", 3)] {
             let environment = BTreeMap::from([(RUN.to_owned(), life.to_owned())]);
             let spec = NodeSpec {
@@ -332,7 +331,9 @@ mod tests {
             };
             run(&mut nodes, spec, inside);
             assert_eq!(nodes.status("/see").run.as_deref(), Some(life));
-            nodes.exited(inside, exit_of(0, false)).unwrap();
+            nodes
+                .on_exited(inside, parse_wait_status(0, false))
+                .unwrap();
         }
         run(&mut nodes, node("/planned", false, false), 4);
         assert_eq!(nodes.status("/planned").run, None);
@@ -340,10 +341,13 @@ mod tests {
 
     #[test]
     fn statuses_are_read_as_wait_means_them() {
-        assert_eq!(exit_of(0x0300, false).code, Some(3));
-        assert_eq!(exit_of(9, true).signal, Some(9));
+        assert_eq!(parse_wait_status(0x0300, false).code, Some(3));
+        assert_eq!(parse_wait_status(9, true).signal, Some(9));
         assert_eq!(
-            (exit_of(9, true).code, exit_of(9, true).out_of_memory),
+            (
+                parse_wait_status(9, true).code,
+                parse_wait_status(9, true).out_of_memory
+            ),
             (None, true)
         );
     }

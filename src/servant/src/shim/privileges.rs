@@ -1,14 +1,14 @@
-//! Giving up what is not needed once the container runs.
+//! Dropping of the privileges that are not needed once the container runs.
 //!
-//! From then on the shim hears what its servant's nodes say: the ROS Master in it answers them by HTTP and XML-RPC. Whoever made
-//! it do something else would find a process of root without capabilities, which could still open what belongs to root, and
-//! be root before the sockets of the daemon and of other services of the host. So there is:
+//! From then on the shim processes data from its servant's nodes: the ROS Master in it answers them by HTTP and
+//! XML-RPC. An attacker who took it over would control a process of root without capabilities, which could still open
+//! root's files, and be root to the sockets of the daemon and of other services of the host. Therefore:
 //!
-//! | what | by |
+//! | restriction | by |
 //! |---|---|
-//! | no capability but CAP_KILL, since init has another user id; no new privileges | [`drop_all_but_kill`] |
-//! | no file but those of the servant's directory and cgroups, and `/proc` to read | Landlock, where the kernel has it |
-//! | no program, no socket but of IPv4 and IPv6, which the network namespace bounds; none of the calls that a servant may not make | seccomp |
+//! | no capability but CAP_KILL (init has another user id), no new privileges | [`drop_all_but_kill`] |
+//! | no file but those of the servant's directory and cgroups, and `/proc` read-only | Landlock, if supported |
+//! | no program, no call refused to servants; only IPv4 and IPv6 sockets, bounded by the network namespace | seccomp |
 
 use std::io;
 use std::path::Path;
@@ -25,18 +25,18 @@ use libseccomp::{ScmpAction, ScmpArgCompare, ScmpCompareOp, ScmpFilterContext, S
 use crate::cgroup::Cgroup;
 use crate::{Error, seccomp};
 
-/// Everything of the above. `directory` is the servant's; the shim's thread, which must be the only one, is in `cgroups`, or
-/// limits and removes them.
+/// Applies all of the restrictions. `directory` is the servant's; the shim's thread, which must be the only one, is in
+/// `cgroups`, or limits and removes them.
 pub(super) fn confine(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), Error> {
     drop_all_but_kill()?;
-    keep_to_files(directory, cgroups)
+    restrict_files(directory, cgroups)
         .map_err(|error| Error::call("keeping the shim to its files")(io::Error::other(error)))?;
-    filter_calls()
+    install_seccomp_filter()
         .map_err(|error| Error::call("filtering the shim's calls")(io::Error::other(error)))
 }
 
-/// Whether the kernel can keep a process to some files.
-pub(super) fn can_keep_to_files() -> bool {
+/// Returns whether the kernel supports restricting a process to some files (Landlock).
+pub(super) fn can_restrict_files() -> bool {
     let asked = Ruleset::default()
         .set_compatibility(CompatLevel::HardRequirement)
         .handle_access(AccessFs::from_all(ABI::V1));
@@ -60,8 +60,8 @@ fn drop_all_but_kill() -> Result<(), Error> {
     nix::sys::prctl::set_no_new_privs().map_err(Error::nix("ruling out new privileges"))
 }
 
-/// Opens nothing else from here on. Does nothing where the kernel does not know Landlock.
-fn keep_to_files(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), RulesetError> {
+/// Restricts this process to its own files from here on. Does nothing if the kernel does not support Landlock.
+fn restrict_files(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), RulesetError> {
     let all = AccessFs::from_all(ABI::V3);
     let read: BitFlags<AccessFs> = AccessFs::ReadFile | AccessFs::ReadDir;
     let change = read | AccessFs::WriteFile | AccessFs::Truncate;
@@ -71,25 +71,25 @@ fn keep_to_files(directory: &Path, cgroups: [&Cgroup; 2]) -> Result<(), RulesetE
         .create()?
         .add_rules(path_beneath_rules([directory], all & !AccessFs::Execute))?
         .add_rules(path_beneath_rules(cgroups(), change))?
-        // To remove a directory is a right on the one above.
+        // Removing a directory needs a right on its parent.
         .add_rules(path_beneath_rules(
             cgroups().filter_map(Path::parent),
             AccessFs::RemoveDir,
         ))?
-        // Numbers of processes on the host, from descriptors of them.
+        // Host pids of processes, which are read from their pidfds.
         .add_rules(path_beneath_rules(["/proc"], read))?
         .restrict_self()?;
     Ok(())
 }
 
-/// Refuses with `EPERM` what the shim does not do any more once its descriptors are open.
-fn filter_calls() -> Result<(), SeccompError> {
+/// Refuses with `EPERM` the calls that the shim no longer needs once its descriptors are open.
+fn install_seccomp_filter() -> Result<(), SeccompError> {
     let refused = ScmpAction::Errno(libc::EPERM);
     let mut filter = ScmpFilterContext::new(ScmpAction::Allow)?;
-    // Of a name that the library does not know, a kernel as old knows no call.
+    // A call whose name the library does not know does not exist in a kernel of that age.
     let known = |name: &str| ScmpSyscall::from_name(name).ok();
     let programs = ["execve", "execveat", "socketpair"];
-    for call in seccomp::refused().chain(programs).filter_map(known) {
+    for call in seccomp::refused_calls().chain(programs).filter_map(known) {
         filter.add_rule(refused, call)?;
     }
     if let Some(socket) = known("socket") {

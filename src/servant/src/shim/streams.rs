@@ -1,4 +1,4 @@
-//! What nodes print, from their pipes into the log.
+//! Output of the nodes, from their pipes into the log.
 
 use std::cell::RefCell;
 use std::os::fd::OwnedFd;
@@ -9,24 +9,24 @@ use tokio::net::unix::pipe;
 use tokio::sync::watch;
 
 use crate::Error;
-use crate::logs::{Lines, Writer};
+use crate::logs::{LineSplitter, LogWriter};
 
 /// Reads pipes until they end.
 #[derive(Clone)]
 pub(super) struct Streams {
-    log: Rc<RefCell<Writer>>,
+    log: Rc<RefCell<LogWriter>>,
     open: watch::Sender<usize>,
 }
 
 impl Streams {
-    pub(super) fn new(log: Writer) -> Self {
+    pub(super) fn new(log: LogWriter) -> Self {
         Self {
             log: Rc::new(RefCell::new(log)),
             open: watch::Sender::new(0),
         }
     }
 
-    /// A new pipe whose lines are logged as `stream` of `node`; the end to write to.
+    /// Creates a pipe whose lines are logged as `stream` of `node`; returns the write end.
     pub(super) fn open(&self, node: &str, stream: &'static str) -> Result<OwnedFd, Error> {
         let (read, write) =
             nix::unistd::pipe2(nix::fcntl::OFlag::O_CLOEXEC).map_err(Error::nix("pipe"))?;
@@ -39,17 +39,17 @@ impl Streams {
         Ok(write)
     }
 
-    /// Completes when every pipe has ended, and the log says what is not in it.
-    pub(super) async fn drained(&self) {
+    /// Completes when every pipe has ended, and dropped lines are reported in the log.
+    pub(super) async fn wait_drained(&self) {
         // The sender lives in self, so that this cannot fail.
         let _ = self.open.subscribe().wait_for(|count| *count == 0).await;
-        self.log.borrow_mut().tell_dropped();
+        self.log.borrow_mut().log_dropped();
     }
 
     async fn copy(self, mut receiver: pipe::Receiver, node: String, stream: &'static str) {
-        let mut lines = Lines::default();
+        let mut lines = LineSplitter::default();
         let mut block = vec![0; 4096];
-        // A pipe fails to be read only when it is not one.
+        // Reading fails only for descriptors that are not pipes.
         while let Ok(length @ 1..) = receiver.read(&mut block).await {
             let mut log = self.log.borrow_mut();
             lines.push(&block[..length], |line| log.append(&node, stream, line));

@@ -1,8 +1,8 @@
-//! Servants outlive whoever started them.
+//! Servants outlive the daemon that started them.
 
 use std::sync::Arc;
 
-use servant::engine::{ContainerState, Engine, LogStart, Servant};
+use servant::engine::{ContainerState, Engine, LogStart, ServantHandle};
 
 use crate::support::*;
 
@@ -14,33 +14,44 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
     let id = spec.id.clone();
     let first = world.start(spec).await;
     let (uids, network) = (first.uid_range(), Arc::clone(first.network()));
-    let enforced = first.enforced();
+    let enforced = first.enforced_limits();
     let of_first = processes(&first, 2).await;
-    assert_eq!(first.left::<String>().await.unwrap(), None);
+    assert_eq!(first.load_handover::<String>().await.unwrap(), None);
     for what in ["replaced", "of the first"] {
-        first.leave(what).await.unwrap();
+        first.save_handover(what).await.unwrap();
     }
     drop(first);
-    let second = world.adopted(&world.restarted()).await;
+    let second = world.adopt_single(&world.restart_engine()).await;
     assert_eq!(second.id(), id);
     assert_eq!(*second.state().borrow(), ContainerState::Running);
     assert_eq!(second.nodes(), ["/goes", "/stays"]);
-    assert_eq!((second.uid_range(), second.enforced()), (uids, enforced));
+    assert_eq!(
+        (second.uid_range(), second.enforced_limits()),
+        (uids, enforced)
+    );
     assert_eq!(*second.network(), network);
-    let left: Option<String> = second.left().await.unwrap();
+    let left: Option<String> = second.load_handover().await.unwrap();
     assert_eq!(left.as_deref(), Some("of the first"));
     assert_eq!(processes(&second, 2).await, of_first, "the same");
-    assert!(hear(&second, 11311).await.unwrap().starts_with("\"same\""));
+    assert!(
+        read_from_port(&second, 11311)
+            .await
+            .unwrap()
+            .starts_with("\"same\"")
+    );
     second.signal_node("/goes", libc::SIGTERM).await.unwrap();
     assert_eq!(
-        within(second.wait_node("/goes")).await.unwrap().signal,
+        with_timeout(second.wait_node("/goes"))
+            .await
+            .unwrap()
+            .signal,
         Some(libc::SIGTERM)
     );
     drop(second);
-    // What happened meanwhile is known to the third.
-    let third = world.adopted(&world.restarted()).await;
+    // The third daemon knows what happened meanwhile.
+    let third = world.adopt_single(&world.restart_engine()).await;
     assert_eq!(
-        within(third.wait_node("/goes")).await.unwrap().signal,
+        with_timeout(third.wait_node("/goes")).await.unwrap().signal,
         Some(libc::SIGTERM)
     );
     world.stop(third).await;
@@ -50,18 +61,18 @@ async fn a_servant_is_found_again_by_the_next_daemon() {
 async fn user_ids_of_an_adopted_servant_are_given_to_no_other_although_its_lock_is_gone() {
     let place = tempfile::tempdir().unwrap();
     let locks = place.path().join("uid-ranges");
-    // Far from where engines look by default, so that no other file is about these.
-    let world = World::with(|config| {
+    // Far from the default range, so that no other lock file covers these ids.
+    let world = World::with_config(|config| {
         config.uid_locks = locks.clone();
         config.uid_base = 0x7f00_0000;
     });
     let first = world.start(spec(vec![])).await;
     let uids = first.uid_range();
     drop(first);
-    // As whoever keeps /run tidy does when a service ends.
+    // As a cleanup of /run does when a service ends.
     std::fs::remove_file(&locks).unwrap();
-    let engine = world.restarted();
-    let first = world.adopted(&engine).await;
+    let engine = world.restart_engine();
+    let first = world.adopt_single(&engine).await;
     let second = engine.start_container(spec(vec![])).await.unwrap();
     assert_eq!(first.uid_range(), uids);
     assert_ne!(second.uid_range(), uids);
@@ -77,8 +88,8 @@ async fn what_cannot_be_removed_is_told_and_in_nobodys_way() {
     drop(servant);
     let stray = world.servant_directory("x");
     std::fs::write(&stray, "somebody's").unwrap();
-    let engine = world.restarted();
-    let mut adopted = within(engine.adopt()).await.unwrap();
+    let engine = world.restart_engine();
+    let mut adopted = with_timeout(engine.adopt()).await.unwrap();
     let told: Vec<_> = adopted.failures.iter().map(ToString::to_string).collect();
     assert!(
         told.len() == 1 && told[0].contains(&*stray.to_string_lossy()),
@@ -100,12 +111,12 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
     let servant = world.start(spec).await;
     let pid = processes(&servant, 1).await[0];
     let runtime = world.runtime(&id);
-    let shim = runtime.shim.open().unwrap().expect("it runs");
+    let shim = runtime.shim.open_pidfd().unwrap().expect("it runs");
     drop(servant);
     kill(
-        &servant::process::Identity::of(pid)
+        &servant::process::ProcessIdentity::from_pid(pid)
             .unwrap()
-            .open()
+            .open_pidfd()
             .unwrap()
             .expect("it runs"),
     );
@@ -118,14 +129,14 @@ async fn an_end_while_no_daemon_watched_is_told_and_swept() {
         1,
         "the shim ends with its servant"
     );
-    let engine = world.restarted();
-    let adoption = within(engine.adopt()).await.unwrap();
+    let engine = world.restart_engine();
+    let adoption = with_timeout(engine.adopt()).await.unwrap();
     assert!(adoption.running.is_empty());
     assert!(
         world.servant_directory(&id).exists(),
         "robots wait for no removal"
     );
-    let failures = within(engine.sweep(&adoption.ended)).await;
+    let failures = with_timeout(engine.sweep(&adoption.ended)).await;
     assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(adoption.ended[0].id, id);
@@ -151,26 +162,29 @@ async fn a_killed_shim_takes_its_servant_with_it_and_is_swept() {
     let runtime = world.runtime(&id);
     let nodes: Vec<_> = processes
         .iter()
-        .map(|pid| servant::process::Identity::of(*pid).unwrap())
+        .map(|pid| servant::process::ProcessIdentity::from_pid(*pid).unwrap())
         .collect();
-    kill(&runtime.shim.open().unwrap().expect("it runs"));
-    let ContainerState::Failed { reason } = ended(&*servant).await else {
+    kill(&runtime.shim.open_pidfd().unwrap().expect("it runs"));
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
         panic!("it did not fail")
     };
     assert!(reason.contains("shim was killed"), "{reason}");
     let error = servant.usage().await.unwrap_err().to_string();
     assert!(error.contains("shim was killed"), "{error}");
     drop(servant);
-    // Init needs no daemon to see that the shim has gone.
-    within(async {
-        while nodes.iter().any(|node| node.open().unwrap().is_some()) {
+    // Init notices the end of the shim without a daemon.
+    with_timeout(async {
+        while nodes
+            .iter()
+            .any(|node| node.open_pidfd().unwrap().is_some())
+        {
             tokio::task::yield_now().await;
         }
     })
     .await;
-    let engine = world.restarted();
-    let adoption = within(engine.adopt()).await.unwrap();
-    let failures = within(engine.sweep(&adoption.ended)).await;
+    let engine = world.restart_engine();
+    let adoption = with_timeout(engine.adopt()).await.unwrap();
+    let failures = with_timeout(engine.sweep(&adoption.ended)).await;
     assert!(failures.is_empty(), "{failures:?}");
     assert!(adoption.failures.is_empty(), "{:?}", adoption.failures);
     assert_eq!(
@@ -193,9 +207,13 @@ async fn what_a_daemon_left_half_made_is_removed() {
         "{ \"half",
     )
     .unwrap();
-    let adoption = within(world.engine.adopt()).await.unwrap();
+    let adoption = with_timeout(world.engine.adopt()).await.unwrap();
     assert_eq!((adoption.ended.len(), adoption.failures.len()), (1, 0));
-    assert!(within(world.engine.sweep(&adoption.ended)).await.is_empty());
+    assert!(
+        with_timeout(world.engine.sweep(&adoption.ended))
+            .await
+            .is_empty()
+    );
     assert!(!world.servant_directory("half").exists());
 }
 
@@ -211,18 +229,18 @@ async fn a_pid_that_now_belongs_to_another_is_left_alone() {
     let servant = world.start(spec).await;
     let mut runtime = world.runtime(&id);
     world.stop(servant).await;
-    runtime.shim = servant::process::Identity::of(bystander.id() as i32).unwrap();
-    // The same number, given to a process that started at another moment.
+    runtime.shim = servant::process::ProcessIdentity::from_pid(bystander.id() as i32).unwrap();
+    // The same pid, but of a process with another start time.
     runtime.shim.start -= 1;
     std::fs::create_dir(world.servant_directory(&id)).unwrap();
-    servant::launch::write(
+    servant::launch::write_record(
         &world.servant_directory(&id).join(servant::launch::RUNTIME),
         &runtime,
     )
     .unwrap();
-    let adoption = within(world.engine.adopt()).await.unwrap();
+    let adoption = with_timeout(world.engine.adopt()).await.unwrap();
     assert_eq!(adoption.ended.len(), 1);
-    within(world.engine.sweep(&adoption.ended)).await;
+    with_timeout(world.engine.sweep(&adoption.ended)).await;
     assert!(bystander.try_wait().unwrap().is_none(), "it still runs");
     drop(bystander.stdin.take());
     bystander.wait().unwrap();

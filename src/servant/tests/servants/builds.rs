@@ -3,7 +3,7 @@
 use std::os::unix::fs::MetadataExt;
 
 use servant::container::Profile;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::rootfs::work_directory;
 
 use crate::support::*;
@@ -16,7 +16,10 @@ async fn installing_writes_the_root_and_changes_owners() {
     (spec.profile, spec.writable) = (Profile::Install, Some(upper.clone()));
     let servant = world.start(spec).await;
     assert_eq!(
-        within(servant.wait_node("/chown")).await.unwrap().code,
+        with_timeout(servant.wait_node("/chown"))
+            .await
+            .unwrap()
+            .code,
         Some(0)
     );
     let (first, _) = servant.uid_range();
@@ -43,7 +46,7 @@ async fn compiling_writes_where_it_may_and_changes_no_owner() {
     (spec.profile, spec.writable) = (Profile::Compile, Some(upper.clone()));
     spec.owned_directories = vec!["/usr/space".into(), "/new/deep".into()];
     let servant = world.start(spec).await;
-    let code = async |name: &str| within(servant.wait_node(name)).await.unwrap().code;
+    let code = async |name: &str| with_timeout(servant.wait_node(name)).await.unwrap().code;
     assert_eq!(code("/writes").await, Some(0));
     assert_eq!(code("/gives").await, Some(libc::EPERM));
     assert_eq!(code("/escapes").await, Some(libc::EACCES));

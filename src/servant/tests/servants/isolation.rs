@@ -1,8 +1,8 @@
-//! What a node cannot do.
+//! Restrictions of nodes and shims.
 
 use servant::bundle;
-use servant::container::{Mount, Opened, Profile};
-use servant::engine::{LogStart, Servant};
+use servant::container::{Mount, OpenedSource, Profile};
+use servant::engine::{LogStart, ServantHandle};
 
 use crate::support::*;
 
@@ -34,19 +34,19 @@ async fn a_shim_that_was_taken_over_reaches_nothing_of_roots() {
     let mut spec = spec(vec![]);
     spec.resident = serde_json::json!({ "pries": socket });
     let servant = world.start(spec).await;
-    let told = hear(&servant, 11311).await.unwrap();
+    let told = read_from_port(&servant, 11311).await.unwrap();
     let mut lines = told.lines();
     assert_eq!(lines.next(), Some("own file: allowed"), "{told}");
     assert_eq!(lines.clone().count(), 6, "{told}");
     assert!(lines.all(|line| !line.ends_with("allowed")), "{told}");
     let shim = world.runtime(servant.id()).shim.pid;
     assert_eq!(status_field(shim, "Seccomp"), "2");
-    // It changes limits, and ends its servant, as ever.
-    let change = servant::spec::Limits {
+    // It can still change limits and end its servant.
+    let change = servant::spec::ResourceLimits {
         memory: Some(64 << 20),
         ..Default::default()
     };
-    if world.has("memory") {
+    if world.has_controller("memory") {
         let enforced = servant.set_limits(change).await.unwrap();
         assert_eq!(enforced.limits.memory, Some(64 << 20));
     }
@@ -114,7 +114,7 @@ async fn no_way_out_is_open() {
         answer("clone3: ").contains("not implemented"),
         "so that the C library falls back"
     );
-    // By the filter, not by the kernel, which has such families or loads them.
+    // Refused by the filter, not by the kernel, which has such families or loads them.
     for family in ["netlink", "tipc"] {
         let answer = answer(&format!("{family} socketpair: "));
         assert!(answer.contains("not implemented"), "{family}: {answer}");
@@ -131,7 +131,7 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
     let world = World::new();
     let mut told = Vec::new();
     let mut servants = Vec::new();
-    // The second finds as much as the first, which still holds all that it got.
+    // The second servant finds as much as the first, which still holds everything it got.
     for _ in 0..2 {
         let servant = world.start(spec(vec![node("/greedy", &["exhaust"])])).await;
         let mut lines = servant.follow(LogStart::First);
@@ -148,18 +148,18 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
     let [queues, signals, instances, terminals] = told[0][..] else {
         panic!("{told:?}")
     };
-    // A signal that waits for the servant's first process just then is one of its user's.
+    // A signal pending for the servant's first process at that moment counts as well.
     let others = told[1][1];
     assert!(signals.abs_diff(others) < 8, "{told:?}");
     assert_eq!([queues, others, instances, terminals], told[1][..]);
     assert!(signals <= bundle::PENDING_SIGNALS, "{told:?}");
     assert!(instances <= bundle::INOTIFY_INSTANCES, "{told:?}");
     assert!(terminals <= bundle::TERMINALS, "{told:?}");
-    // And this process, which is root's, has what it always had.
+    // This process, which is root's, still has its own limits.
     let watch = nix::sys::inotify::Inotify::init(nix::sys::inotify::InitFlags::empty());
     watch.expect("an inotify instance for root");
     let mut timer = std::ptr::null_mut();
-    // SAFETY: no event, which means a signal, and a place for the timer.
+    // SAFETY: no event, which means a signal, and a location for the timer.
     let made =
         unsafe { libc::timer_create(libc::CLOCK_MONOTONIC, std::ptr::null_mut(), &raw mut timer) };
     assert_eq!(
@@ -168,7 +168,7 @@ async fn a_servant_uses_up_counts_of_its_own_alone() {
         "a timer for root: {}",
         std::io::Error::last_os_error()
     );
-    // SAFETY: made just now.
+    // SAFETY: just created.
     unsafe { libc::timer_delete(timer) };
     for servant in servants {
         world.stop(servant).await;
@@ -189,7 +189,7 @@ async fn builds_open_no_way_out_either() {
             .iter()
             .map(|line| line.line.as_str())
             .filter(|line| line.ends_with("allowed"));
-        // An install writes its root, and that is its purpose.
+        // An install may write its root; that is its purpose.
         let expected = |line: &str| {
             profile == Profile::Install && line.starts_with("write /") && !line.contains("/proc")
         };
@@ -217,11 +217,17 @@ async fn a_volume_is_there_and_read_only() {
     }];
     let servant = world.start(spec).await;
     assert_eq!(
-        within(servant.wait_node("/reads")).await.unwrap().code,
+        with_timeout(servant.wait_node("/reads"))
+            .await
+            .unwrap()
+            .code,
         Some(0)
     );
     assert_eq!(
-        within(servant.wait_node("/writes")).await.unwrap().code,
+        with_timeout(servant.wait_node("/writes"))
+            .await
+            .unwrap()
+            .code,
         Some(libc::EROFS)
     );
     world.stop(servant).await;
@@ -246,14 +252,16 @@ async fn what_was_opened_is_mounted_whatever_took_its_place() {
         target: "/opt/models".into(),
         writable: false,
         device: false,
-        opened: Some(Opened::new(std::fs::File::open(&models).unwrap().into())),
+        opened: Some(OpenedSource::new(
+            std::fs::File::open(&models).unwrap().into(),
+        )),
     }];
     std::fs::rename(&models, world.path("moved")).unwrap();
     std::os::unix::fs::symlink(&secret, &models).unwrap();
     let servant = world.start(spec).await;
     let (reads, pries) = (servant.wait_node("/reads"), servant.wait_node("/pries"));
-    assert_eq!(within(reads).await.unwrap().code, Some(0));
-    assert_eq!(within(pries).await.unwrap().code, Some(libc::ENOENT));
+    assert_eq!(with_timeout(reads).await.unwrap().code, Some(0));
+    assert_eq!(with_timeout(pries).await.unwrap().code, Some(libc::ENOENT));
     world.stop(servant).await;
 }
 
@@ -265,8 +273,18 @@ async fn two_servants_share_nothing_and_their_networks_are_apart() {
     let mut second = spec(vec![]);
     second.resident = serde_json::json!({ "name": "second" });
     let (first, second) = (world.start(first).await, world.start(second).await);
-    assert!(hear(&first, 11311).await.unwrap().contains("first"));
-    assert!(hear(&second, 11311).await.unwrap().contains("second"));
+    assert!(
+        read_from_port(&first, 11311)
+            .await
+            .unwrap()
+            .contains("first")
+    );
+    assert!(
+        read_from_port(&second, 11311)
+            .await
+            .unwrap()
+            .contains("second")
+    );
     assert_ne!(first.uid_range().0, second.uid_range().0);
     assert_ne!(first.network(), second.network());
     world.stop(first).await;

@@ -1,10 +1,10 @@
-//! Starting, ending, and what happens to nodes between.
+//! Starting and stopping of servants and nodes.
 
 use std::os::fd::OwnedFd;
 
 use servant::container::Mount;
-use servant::engine::{ContainerState, LogStart, NodeEvent, Servant};
-use servant::process::Identity;
+use servant::engine::{ContainerState, LogStart, NodeEvent, ServantHandle};
+use servant::process::ProcessIdentity;
 
 use crate::support::*;
 
@@ -43,7 +43,7 @@ async fn polite_nodes_are_asked_by_sigint_and_need_not_be_killed() {
     });
     world.stop(servant).await;
     assert_eq!(waiting.await.unwrap().unwrap().signal, Some(libc::SIGINT));
-    let exited = within(async {
+    let exited = with_timeout(async {
         loop {
             if let NodeEvent::Exited { signal, .. } = events.recv().await.unwrap() {
                 return signal;
@@ -69,7 +69,7 @@ async fn exit_codes_signals_and_programs_that_are_not_there_are_told_apart() {
         lost,
     ];
     let servant = world.start(spec(nodes)).await;
-    let exit = async |name: &str| within(servant.wait_node(name)).await.unwrap();
+    let exit = async |name: &str| with_timeout(servant.wait_node(name)).await.unwrap();
     assert_eq!(exit("/fine").await.code, Some(0));
     assert_eq!(exit("/seven").await.code, Some(7));
     assert_eq!(
@@ -102,9 +102,9 @@ async fn the_end_of_a_required_node_ends_the_servant() {
     let mut required = node("/required", &["exit", "3"]);
     required.required = true;
     let servant = world.start(spec(vec![node("/other", &["sleep"])])).await;
-    // A required node that ends while the servant is made is a failure to start; this one is started afterwards.
+    // A required node that ends during the start makes that fail; this one is started afterwards.
     servant.start_node(required).await.unwrap();
-    let ContainerState::Stopped { reason } = ended(&*servant).await else {
+    let ContainerState::Stopped { reason } = wait_until_ended(&*servant).await else {
         panic!("it failed")
     };
     assert!(
@@ -112,7 +112,10 @@ async fn the_end_of_a_required_node_ends_the_servant() {
         "{reason}"
     );
     assert_eq!(
-        within(servant.wait_node("/required")).await.unwrap().code,
+        with_timeout(servant.wait_node("/required"))
+            .await
+            .unwrap()
+            .code,
         Some(3)
     );
     let error = servant
@@ -131,7 +134,7 @@ async fn a_respawning_node_comes_back_and_can_still_be_stopped() {
     (again.respawn, again.respawn_delay) = (true, 0.05);
     let servant = world.start(spec(vec![again])).await;
     let mut events = servant.events();
-    let three = within(async {
+    let three = with_timeout(async {
         let (mut starts, mut respawning) = (0, 0);
         while starts < 3 || respawning < 2 {
             match events.recv().await.unwrap() {
@@ -159,12 +162,12 @@ async fn nodes_that_end_for_good_do_not_come_back_and_end_nothing_with_them() {
     let mut events = servant.events();
     for name in ["/again", "/needed"] {
         servant.end_node(name, libc::SIGKILL).await.unwrap();
-        within(servant.wait_node(name)).await.unwrap();
+        with_timeout(servant.wait_node(name)).await.unwrap();
     }
-    // What comes next is what is started next.
+    // The next event must be that of the next start.
     servant.start_node(node("/last", &["sleep"])).await.unwrap();
     loop {
-        match within(events.recv()).await.unwrap() {
+        match with_timeout(events.recv()).await.unwrap() {
             NodeEvent::Respawning { node } => panic!("{node} comes back"),
             NodeEvent::Started { node } if node == "/last" => break,
             _ => {}
@@ -196,7 +199,7 @@ async fn nodes_have_their_environment_and_directory_and_a_name_once() {
         .unwrap_err()
         .to_string();
     assert!(error.contains("/stays runs already"), "{error}");
-    within(servant.wait_node("/speaker")).await.unwrap();
+    with_timeout(servant.wait_node("/speaker")).await.unwrap();
     servant
         .start_node(node("/speaker", &["exit", "5"]))
         .await
@@ -210,9 +213,9 @@ async fn orphans_are_reaped_and_the_resident_is_told_of_every_end() {
     let mut spec = spec(vec![node("/parent", &["orphan"])]);
     spec.resident = serde_json::json!("x");
     let servant = world.start(spec).await;
-    within(servant.wait_node("/parent")).await.unwrap();
-    within(async {
-        while hear(&servant, 11311).await.unwrap() != "\"x\" 2" {
+    with_timeout(servant.wait_node("/parent")).await.unwrap();
+    with_timeout(async {
+        while read_from_port(&servant, 11311).await.unwrap() != "\"x\" 2" {
             tokio::task::yield_now().await;
         }
     })
@@ -226,18 +229,18 @@ async fn a_killed_init_is_a_failure() {
     let world = World::new();
     let servant = world.start(spec(vec![])).await;
     servant.start_node(node("/a", &["sleep"])).await.unwrap();
-    let pidfd: OwnedFd = Identity::of(servant.init().unwrap())
+    let pidfd: OwnedFd = ProcessIdentity::from_pid(servant.init_pid().unwrap())
         .unwrap()
-        .open()
+        .open_pidfd()
         .unwrap()
         .expect("it runs");
     kill(&pidfd);
-    let ContainerState::Failed { reason } = ended(&*servant).await else {
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
         panic!("it did not fail")
     };
     assert!(reason.contains("init was killed by signal 9"), "{reason}");
     assert_eq!(
-        within(servant.wait_node("/a")).await.unwrap().signal,
+        with_timeout(servant.wait_node("/a")).await.unwrap().signal,
         Some(libc::SIGKILL)
     );
     world.stop(servant).await;
@@ -245,7 +248,7 @@ async fn a_killed_init_is_a_failure() {
 
 #[tokio::test]
 async fn what_cannot_start_says_why_and_leaves_nothing() {
-    let world = World::with(|config| config.uid_base = servant::local::DEFAULT_UID_BASE);
+    let world = World::with_config(|config| config.uid_base = servant::local::DEFAULT_UID_BASE);
     let mut unshiftable = spec(vec![]);
     unshiftable.layers = vec!["/proc/sys".into()];
     let mut residentless = spec(vec![]);
@@ -289,7 +292,7 @@ async fn a_creation_that_libcontainer_fails_harms_nobody() {
         .spawn()
         .unwrap();
     let mut spec = spec(vec![]);
-    // No directory can be made there, which libcontainer finds out half-way.
+    // No directory can be created there, which libcontainer notices half-way.
     spec.mounts = vec![Mount {
         source: "/usr".into(),
         target: "/proc/nowhere".into(),
@@ -323,14 +326,14 @@ async fn a_start_that_nobody_waits_for_any_more_is_undone() {
     let directory = world.servant_directory(&spec.id);
     let engine = world.engine.clone();
     let start = tokio::spawn(async move { engine.start_container(spec).await.map(|_| ()) });
-    within(async {
+    with_timeout(async {
         while !directory.exists() {
             tokio::task::yield_now().await;
         }
     })
     .await;
     start.abort();
-    within(async {
+    with_timeout(async {
         while directory.exists() {
             tokio::task::yield_now().await;
         }
@@ -352,7 +355,7 @@ async fn twenty_start_at_once_from_a_program_with_many_threads() {
     let mut servants = Vec::new();
     for start in starts.collect::<Vec<_>>() {
         servants.push(
-            within(start)
+            with_timeout(start)
                 .await
                 .unwrap()
                 .unwrap_or_else(|error| panic!("{error}")),

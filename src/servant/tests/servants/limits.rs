@@ -1,8 +1,8 @@
-//! Limits that hold, are told, and can be changed.
+//! Limits are enforced, reported and can be changed.
 
-use servant::engine::{ContainerState, LogStart, NodeEvent, Servant};
+use servant::engine::{ContainerState, LogStart, NodeEvent, ServantHandle};
 use servant::local::Isolation;
-use servant::spec::Limits;
+use servant::spec::ResourceLimits;
 
 use crate::support::*;
 
@@ -11,16 +11,16 @@ async fn the_memory_limit_kills_and_is_told() {
     let world = World::new();
     let mut spec = spec(vec![node("/quiet", &["sleep"])]);
     spec.limits.memory = Some(48 << 20);
-    world.needs(&["memory"]);
+    world.require_controllers(&["memory"]);
     let servant = world.start(spec).await;
     let mut events = servant.events();
     servant.start_node(node("/greedy", &["eat"])).await.unwrap();
-    let exit = within(servant.wait_node("/greedy")).await.unwrap();
+    let exit = with_timeout(servant.wait_node("/greedy")).await.unwrap();
     assert_eq!(
         (exit.signal, exit.out_of_memory),
         (Some(libc::SIGKILL), true)
     );
-    let told = within(async {
+    let told = with_timeout(async {
         loop {
             if let NodeEvent::Exited {
                 node,
@@ -34,9 +34,9 @@ async fn the_memory_limit_kills_and_is_told() {
     });
     assert_eq!(told.await, ("/greedy".to_owned(), true));
     assert!(servant.usage().await.unwrap().oom_kills >= 1);
-    // Killed by hand it is not taken for the same.
+    // A kill by hand is not taken for an OOM kill.
     servant.signal_node("/quiet", libc::SIGKILL).await.unwrap();
-    let exit = within(servant.wait_node("/quiet")).await.unwrap();
+    let exit = with_timeout(servant.wait_node("/quiet")).await.unwrap();
     assert_eq!(
         (exit.signal, exit.out_of_memory),
         (Some(libc::SIGKILL), false)
@@ -51,10 +51,10 @@ async fn a_required_node_out_of_memory_is_a_failure_that_names_the_limit() {
     greedy.required = true;
     let mut spec = spec(vec![]);
     spec.limits.memory = Some(48 << 20);
-    world.needs(&["memory"]);
+    world.require_controllers(&["memory"]);
     let servant = world.start(spec).await;
     servant.start_node(greedy).await.unwrap();
-    let ContainerState::Failed { reason } = ended(&*servant).await else {
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
         panic!("it did not fail")
     };
     assert!(
@@ -69,7 +69,7 @@ async fn the_pids_limit_stops_a_fork_bomb() {
     let world = World::new();
     let mut spec = spec(vec![node("/bomb", &["fork", "500"])]);
     spec.limits.pids = Some(20);
-    world.needs(&["pids"]);
+    world.require_controllers(&["pids"]);
     let servant = world.start(spec).await;
     let mut lines = servant.follow(LogStart::First);
     let told = lines_until(&mut lines, |line| line.stream == "stdout").await;
@@ -82,37 +82,37 @@ async fn the_pids_limit_stops_a_fork_bomb() {
 async fn limits_are_read_back_and_changed_while_it_runs() {
     let world = World::new();
     let mut spec = spec(vec![node("/a", &["sleep"])]);
-    spec.limits = Limits {
+    spec.limits = ResourceLimits {
         cpus: Some(0.5),
         cpu_weight: Some(200),
         memory: Some(64 << 20),
         pids: Some(50),
-        ..Limits::default()
+        ..ResourceLimits::default()
     };
     let asked = spec.limits;
-    world.needs(&["cpu", "memory", "pids"]);
+    world.require_controllers(&["cpu", "memory", "pids"]);
     let servant = world.start(spec).await;
-    let enforced = servant.enforced();
+    let enforced = servant.enforced_limits();
     assert_eq!(enforced.limits, asked);
-    let change = Limits {
+    let change = ResourceLimits {
         cpus: Some(1.5),
         memory: Some(96 << 20),
-        ..Limits::default()
+        ..ResourceLimits::default()
     };
     let now = servant.set_limits(change).await.unwrap();
     assert_eq!(
         now.limits,
-        Limits {
+        ResourceLimits {
             cpus: Some(1.5),
             memory: Some(96 << 20),
             ..asked
         }
     );
-    assert_eq!(servant.enforced(), now);
+    assert_eq!(servant.enforced_limits(), now);
     processes(&servant, 1).await;
     let usage = servant.usage().await.unwrap();
     assert!(usage.memory > 0 && usage.pids >= 2, "{usage:?}");
-    // Where a v2 hierarchy is mounted, alone or beside v1, and the kernel counts it.
+    // If a v2 hierarchy is mounted, alone or beside v1, and the kernel supports PSI.
     let unified = std::fs::read_to_string("/proc/self/mounts").unwrap();
     let told = unified.contains(" cgroup2 ") && std::path::Path::new("/proc/pressure").exists();
     assert_eq!(usage.pressure.is_some(), told, "{usage:?}");
@@ -122,9 +122,9 @@ async fn limits_are_read_back_and_changed_while_it_runs() {
 #[tokio::test]
 async fn input_and_output_are_limited_where_the_host_can() {
     let world = World::new();
-    let can = world.has("io") || world.has("blkio");
+    let can = world.has_controller("io") || world.has_controller("blkio");
     let mut spec = spec(vec![node("/a", &["sleep"])]);
-    // On a disk, or on something that is none.
+    // On a disk, or on something else.
     let device = std::os::unix::fs::MetadataExt::dev(&std::fs::metadata(&spec.layers[0]).unwrap());
     let on_disk = std::path::Path::new(&format!(
         "/sys/dev/block/{}:{}",
@@ -134,7 +134,7 @@ async fn input_and_output_are_limited_where_the_host_can() {
     .exists();
     spec.limits.io_write = Some(5 << 20);
     let servant = world.start(spec).await;
-    let limits = servant.enforced().limits;
+    let limits = servant.enforced_limits().limits;
     let expected = (can && on_disk).then_some(5 << 20);
     assert_eq!((limits.io_read, limits.io_write), (None, expected));
     world.stop(servant).await;
@@ -143,9 +143,9 @@ async fn input_and_output_are_limited_where_the_host_can() {
 #[tokio::test]
 async fn nodes_stay_on_the_cores_they_were_given() {
     let world = World::new();
-    world.needs(&["cpuset"]);
+    world.require_controllers(&["cpuset"]);
     let mut spec = spec(vec![node("/a", &["sleep"])]);
-    // The last of those that this very process may use.
+    // The last core that this process may use.
     let own = std::fs::read_to_string("/proc/self/status").unwrap();
     let own = own
         .lines()
@@ -162,7 +162,7 @@ async fn nodes_stay_on_the_cores_they_were_given() {
     cores[core / 64] |= 1 << (core % 64);
     spec.limits.cpuset = Some(cores);
     let servant = world.start(spec).await;
-    assert_eq!(servant.enforced().limits.cpuset, Some(cores));
+    assert_eq!(servant.enforced_limits().limits.cpuset, Some(cores));
     let pid = processes(&servant, 1).await[0];
     let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
     assert!(
@@ -175,7 +175,7 @@ async fn nodes_stay_on_the_cores_they_were_given() {
 #[tokio::test]
 async fn what_nobody_reads_of_sockets_is_bounded_with_the_memory() {
     let world = World::new();
-    world.needs(&["memory"]);
+    world.require_controllers(&["memory"]);
     const MEMORY: u64 = 32 << 20;
     let mut spec = spec(vec![node("/sends", &["buffer"])]);
     spec.limits.memory = Some(MEMORY);
@@ -187,7 +187,7 @@ async fn what_nobody_reads_of_sockets_is_bounded_with_the_memory() {
         .split(' ')
         .map(|bytes| bytes.parse().unwrap())
         .collect();
-    // Without a limit it is some hundred MiB by TCP, and 60 by UDP.
+    // Without a limit it is about a hundred MiB by TCP, and 60 by UDP.
     for kept in &kept {
         assert!((1..MEMORY).contains(kept), "{kept:?}");
     }
@@ -197,14 +197,14 @@ async fn what_nobody_reads_of_sockets_is_bounded_with_the_memory() {
 #[tokio::test]
 async fn a_soft_limit_of_memory_holds_or_is_refused_by_name() {
     let world = World::new();
-    world.needs(&["memory"]);
+    world.require_controllers(&["memory"]);
     let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;
-    let high = Limits {
+    let high = ResourceLimits {
         memory_high: Some(64 << 20),
-        ..Limits::default()
+        ..ResourceLimits::default()
     };
     let outcome = servant.set_limits(high).await;
-    if servant.enforced().cgroup_version == 2 {
+    if servant.enforced_limits().cgroup_version == 2 {
         assert_eq!(outcome.unwrap().limits.memory_high, high.memory_high);
     } else {
         let refused = outcome.unwrap_err().to_string();
@@ -212,16 +212,16 @@ async fn a_soft_limit_of_memory_holds_or_is_refused_by_name() {
             refused.contains("memory_high (cgroup v1 has no memory.high"),
             "{refused}"
         );
-        assert_eq!(servant.enforced().unmet(&high).len(), 1);
+        assert_eq!(servant.enforced_limits().unmet_limits(&high).len(), 1);
     }
     world.stop(servant).await;
 }
 
 #[tokio::test]
 async fn where_isolation_is_required_a_limit_that_does_not_hold_is_refused() {
-    let world = World::with(|config| config.isolation = Isolation::Require);
+    let world = World::with_config(|config| config.isolation = Isolation::Require);
     let mut spec = spec(vec![]);
-    // More than any kernel takes for a limit.
+    // More than any kernel accepts as a limit.
     spec.limits.memory = Some(1 << 62);
     let (id, error) = (
         spec.id.clone(),
@@ -240,8 +240,8 @@ async fn where_isolation_is_required_a_limit_that_does_not_hold_is_refused() {
     assert!(!world.servant_directory(&id).exists());
 }
 
-/// The number in a control file of the shim's cgroup, in whichever hierarchy it is.
-fn of_shim(world: &World, id: &str, names: [&str; 2]) -> Option<u64> {
+/// Reads the number in a control file of the shim's cgroup, in the hierarchy that has it.
+fn read_shim_limit(world: &World, id: &str, names: [&str; 2]) -> Option<u64> {
     let cgroup = std::fs::read_to_string(format!("/proc/{}/cgroup", world.runtime(id).shim.pid));
     let cgroup = cgroup.expect("the shim runs");
     let mounts = [
@@ -270,37 +270,37 @@ fn of_shim(world: &World, id: &str, names: [&str; 2]) -> Option<u64> {
 
 #[tokio::test]
 async fn the_shim_has_limits_of_its_own() {
-    let world = World::with(|config| {
-        config.shim_limits = Limits {
+    let world = World::with_config(|config| {
+        config.shim_limits = ResourceLimits {
             cpus: Some(0.5),
             memory: Some(96 << 20),
-            ..Limits::default()
+            ..ResourceLimits::default()
         };
     });
     let mut spec = spec(vec![node("/a", &["sleep"])]);
     spec.limits.cpus = Some(0.2);
     let servant = world.start(spec).await;
-    world.needs(&["cpu", "memory"]);
+    world.require_controllers(&["cpu", "memory"]);
     let id = servant.id().to_owned();
-    assert_eq!(servant.enforced().shim.memory, Some(96 << 20));
+    assert_eq!(servant.enforced_limits().shim.memory, Some(96 << 20));
     let names = ["memory.max", "memory.limit_in_bytes"];
-    assert_eq!(of_shim(&world, &id, names), Some(96 << 20));
-    // No more than its servant has, and more when that is given more.
-    assert_eq!(servant.enforced().shim.cpus, Some(0.2));
+    assert_eq!(read_shim_limit(&world, &id, names), Some(96 << 20));
+    // No more than its servant has, and more when the servant is given more.
+    assert_eq!(servant.enforced_limits().shim.cpus, Some(0.2));
     assert_eq!(
-        of_shim(&world, &id, ["cpu.max", "cpu.cfs_quota_us"]),
+        read_shim_limit(&world, &id, ["cpu.max", "cpu.cfs_quota_us"]),
         Some(20_000)
     );
-    let more = Limits {
+    let more = ResourceLimits {
         cpus: Some(1.5),
-        ..Limits::default()
+        ..ResourceLimits::default()
     };
     assert_eq!(servant.set_limits(more).await.unwrap().shim.cpus, Some(0.5));
-    // The next daemon finds them as they are, and leaves nothing of them.
-    let enforced = servant.enforced();
+    // The next daemon finds them unchanged, and leaves nothing of them.
+    let enforced = servant.enforced_limits();
     drop(servant);
-    let servant = world.adopted(&world.restarted()).await;
-    assert_eq!(servant.enforced(), enforced);
+    let servant = world.adopt_single(&world.restart_engine()).await;
+    assert_eq!(servant.enforced_limits(), enforced);
     let own = world.runtime(&id).shim_cgroup.expect("it has one");
     assert!(own.exists());
     world.stop(servant).await;
@@ -309,14 +309,14 @@ async fn the_shim_has_limits_of_its_own() {
 
 #[tokio::test]
 async fn a_shim_that_takes_too_much_ends_its_servant_and_says_why() {
-    let world = World::with(|config| config.shim_limits.memory = Some(48 << 20));
+    let world = World::with_config(|config| config.shim_limits.memory = Some(48 << 20));
     let mut spec = spec(vec![node("/a", &["sleep"])]);
     spec.resident = serde_json::json!({ "eat": true });
-    world.needs(&["memory"]);
+    world.require_controllers(&["memory"]);
     let servant = world.start(spec).await;
-    // The resident takes memory as soon as somebody connects.
-    let _ = hear(&servant, 11311).await;
-    let ContainerState::Failed { reason } = ended(&*servant).await else {
+    // The resident allocates memory as soon as a client connects.
+    let _ = read_from_port(&servant, 11311).await;
+    let ContainerState::Failed { reason } = wait_until_ended(&*servant).await else {
         panic!("it did not fail")
     };
     assert!(
@@ -334,7 +334,7 @@ async fn what_protects_the_daemon_does_not_protect_nodes() {
         text.trim().parse().expect("a number")
     };
     let own = score(std::process::id() as i32);
-    // As a unit with OOMScoreAdjust= has it; where that is not to be had there is nothing to inherit.
+    // As set by a unit with OOMScoreAdjust=; if that fails there is nothing to inherit.
     let protects = std::fs::write("/proc/self/oom_score_adj", "-500").is_ok();
     let world = World::new();
     let servant = world.start(spec(vec![node("/a", &["sleep"])])).await;

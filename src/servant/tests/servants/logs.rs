@@ -1,14 +1,14 @@
-//! What nodes print arrives.
+//! Output of nodes arrives in the log.
 
-use servant::engine::{LogStart, Servant};
+use servant::engine::{LogStart, ServantHandle};
 
 use crate::support::*;
 
 #[tokio::test]
 async fn every_line_arrives_once_and_in_order() {
     const LINES: u64 = 200_000;
-    // More than a burst that is let through by default.
-    let world = World::with(|config| config.quotas.log_rate = u64::MAX);
+    // More than the default burst.
+    let world = World::with_config(|config| config.quotas.log_rate = u64::MAX);
     let servant = world
         .start(spec(vec![node("/talks", &["print", &LINES.to_string()])]))
         .await;
@@ -22,7 +22,10 @@ async fn every_line_arrives_once_and_in_order() {
         expected
     });
     assert_eq!(
-        within(servant.wait_node("/talks")).await.unwrap().code,
+        with_timeout(servant.wait_node("/talks"))
+            .await
+            .unwrap()
+            .code,
         Some(0)
     );
     let log = world
@@ -31,7 +34,7 @@ async fn every_line_arrives_once_and_in_order() {
     assert!(log.exists());
     world.stop(servant).await;
     assert_eq!(
-        within(reader).await.unwrap(),
+        with_timeout(reader).await.unwrap(),
         LINES,
         "also what was read after the end"
     );

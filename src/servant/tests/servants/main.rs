@@ -1,7 +1,7 @@
-//! Servants as they are lived with: started, reached, limited, stopped, killed, found again. Needs root.
+//! Tests of servants: started, reached, limited, stopped, killed, found again. Needs root.
 //!
-//! This program is three things: the tests; the shim of the servants that they start; and, inside those, the nodes. See
-//! `support.rs` for how it tells which it is.
+//! This program has three roles: the tests; the shim of the servants that they start; and, inside those, the nodes. See
+//! `support.rs` for how it tells them apart.
 
 mod adoption;
 mod builds;

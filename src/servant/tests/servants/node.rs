@@ -1,11 +1,11 @@
-//! What the nodes of the tests do: `test-node WORD [ARGUMENT]...`. It makes the real system calls.
+//! Actions of the test nodes: `test-node WORD [ARGUMENT]...`. They make real system calls.
 
 use std::ffi::CString;
 use std::io::{self, Write};
 use std::time::Duration;
 
-/// Does what is asked and tells the exit status.
-pub fn act(words: &[String]) -> i32 {
+/// Runs the action and returns the exit status.
+pub fn run_action(words: &[String]) -> i32 {
     let number = |at: usize| {
         words
             .get(at)
@@ -33,7 +33,7 @@ pub fn act(words: &[String]) -> i32 {
             }
         }
         "orphan" => {
-            // The child outlives this process by a moment and so becomes init's.
+            // The child outlives this process for a moment and so becomes init's.
             // SAFETY: one thread.
             if unsafe { libc::fork() } == 0 {
                 // SAFETY: no pointers.
@@ -74,8 +74,8 @@ pub fn act(words: &[String]) -> i32 {
         "chown" => return chown(&words[1], number(2) as u32),
         "write" => return status(std::fs::write(&words[1], "x")),
         "read" => return status(std::fs::read_to_string(&words[1]).map(|text| print!("{text}"))),
-        "share" => return status(share(&words[1], words[2].as_bytes())),
-        "shared" => return status(shared(&words[1]).map(|text| println!("{text}"))),
+        "share" => return status(write_shared(&words[1], words[2].as_bytes())),
+        "shared" => return status(read_shared(&words[1]).map(|text| println!("{text}"))),
         "fill" => return status(fill(&words[1], number(2))),
         "calls" => refused_calls(),
         "buffer" => return status(buffer()),
@@ -98,13 +98,13 @@ fn status<T>(result: io::Result<T>) -> i32 {
     }
 }
 
-/// Bytes of a piece of shared memory.
+/// Bytes of a shared memory segment.
 const PIECE: usize = 4096;
 
-/// A piece of shared memory by its name, as POSIX has it; of zeros where it is new.
-fn piece(name: &str, flags: i32) -> io::Result<*mut u8> {
+/// Maps a POSIX shared memory segment by its name; a new one is zeroed.
+fn map_shared_memory(name: &str, flags: i32) -> io::Result<*mut u8> {
     let name = CString::new(name)?;
-    // SAFETY: the name is a string; it outlives the call.
+    // SAFETY: the name is a string that outlives the call.
     let fd = unsafe { libc::shm_open(name.as_ptr(), flags, 0o600) };
     if fd < 0 {
         return Err(io::Error::last_os_error());
@@ -131,11 +131,11 @@ fn piece(name: &str, flags: i32) -> io::Result<*mut u8> {
     Ok(at.cast())
 }
 
-/// Writes a text there and stays.
-fn share(name: &str, text: &[u8]) -> io::Result<()> {
-    let at = piece(name, libc::O_CREAT | libc::O_RDWR)?;
+/// Writes a text into the segment and waits.
+fn write_shared(name: &str, text: &[u8]) -> io::Result<()> {
+    let at = map_shared_memory(name, libc::O_CREAT | libc::O_RDWR)?;
     let length = text.len().min(PIECE);
-    // SAFETY: both are that long, and the one was mapped just now.
+    // SAFETY: both are that long, and the segment was just mapped.
     unsafe { std::ptr::copy_nonoverlapping(text.as_ptr(), at, length) };
     println!("shared");
     loop {
@@ -143,16 +143,16 @@ fn share(name: &str, text: &[u8]) -> io::Result<()> {
     }
 }
 
-/// The text that is there.
-fn shared(name: &str) -> io::Result<String> {
-    let at = piece(name, libc::O_RDWR)?;
-    // SAFETY: that long, mapped for as long as this process lives; whoever wrote it is done.
+/// Reads the text in the segment.
+fn read_shared(name: &str) -> io::Result<String> {
+    let at = map_shared_memory(name, libc::O_RDWR)?;
+    // SAFETY: that long, mapped for as long as this process lives; its writer is done.
     let bytes = unsafe { std::slice::from_raw_parts(at, PIECE) };
     let text = bytes.split(|byte| *byte == 0).next().unwrap_or_default();
     Ok(String::from_utf8_lossy(text).into_owned())
 }
 
-/// Writes so many MiB into a file, and stays.
+/// Writes this number of MiB into a file, and waits.
 fn fill(path: &str, mebibytes: u64) -> io::Result<()> {
     let mut file = std::fs::File::create(path)?;
     for _ in 0..mebibytes {
@@ -164,7 +164,8 @@ fn fill(path: &str, mebibytes: u64) -> io::Result<()> {
     }
 }
 
-/// Has the kernel keep as much as it will for sockets that nobody reads, says how many bytes by TCP and how many by UDP, and stays.
+/// Fills as many socket buffers as the kernel allows with data that nobody reads, prints the bytes by TCP and by UDP,
+/// and waits.
 fn buffer() -> io::Result<()> {
     use std::net::{TcpListener, TcpStream, UdpSocket};
     const SOCKETS: usize = 100;
@@ -186,7 +187,7 @@ fn buffer() -> io::Result<()> {
         let socket = UdpSocket::bind("127.0.0.1:0")?;
         socket.set_nonblocking(true)?;
         for _ in 0..400 {
-            // What finds no room is lost, here or on its way.
+            // Datagrams that find no room are lost, here or on their way.
             let _ = socket.send_to(&[7; 1000], socket.local_addr()?);
         }
         sockets.push(socket);
@@ -202,7 +203,7 @@ fn buffer() -> io::Result<()> {
     }
 }
 
-/// Takes all that it is given of what the kernel counts by user, says how many of each, and stays.
+/// Allocates as much as possible of the resources that the kernel counts per user, prints the counts, and waits.
 fn exhaust() -> io::Result<()> {
     let mut queues = 0;
     let mut name = CString::new(format!("/queue-{queues}"))?;
@@ -220,7 +221,7 @@ fn exhaust() -> io::Result<()> {
         name = CString::new(format!("/queue-{queues}"))?;
     }
     let signal = libc::SIGRTMIN();
-    // SAFETY: a signal set is made empty before it is used; a blocked signal runs no code.
+    // SAFETY: a signal set is emptied before it is used; a blocked signal runs no code.
     unsafe {
         let mut blocked: libc::sigset_t = std::mem::zeroed();
         libc::sigemptyset(&mut blocked);
@@ -261,7 +262,7 @@ fn ignore_polite_signals() {
 fn fork_sleeper() {
     // SAFETY: one thread.
     if unsafe { libc::fork() } == 0 {
-        // A session of its own, where no signal to the node's group reaches it.
+        // In its own session, where no signal to the node's group reaches it.
         // SAFETY: no pointers.
         unsafe { libc::setsid() };
         loop {
@@ -270,7 +271,7 @@ fn fork_sleeper() {
     }
 }
 
-/// How many processes could be had, as exit status; each waits until killed.
+/// Returns, as exit status, how many processes could be forked; each waits until killed.
 fn fork_many(wanted: u64) -> i32 {
     for made in 0..wanted {
         // SAFETY: one thread.
@@ -296,7 +297,7 @@ fn chown(path: &str, owner: u32) -> i32 {
     status(std::os::unix::fs::chown(path, Some(owner), Some(owner)))
 }
 
-/// Prints `name: error` or `name: allowed` for everything that must be refused.
+/// Prints `name: error` or `name: allowed` for every call that must be refused.
 fn refused_calls() {
     let tell = |name: &str, result: i64| {
         let outcome = if result < 0 {
@@ -310,7 +311,7 @@ fn refused_calls() {
     let root = CString::from(c"/");
     let mut buffer = [0_u8; 256];
     let here = buffer.as_mut_ptr();
-    // SAFETY: each call is refused before it looks at its arguments, or gets valid ones. A forked child ends at once.
+    // SAFETY: each call is refused before it looks at its arguments, or gets valid ones. A forked child exits at once.
     unsafe {
         tell(
             "unshare user",
@@ -425,7 +426,7 @@ fn refused_calls() {
             "packet socket",
             i64::from(libc::socket(libc::AF_PACKET, libc::SOCK_RAW, 0)),
         );
-        // What is read and written so counts with the whole host (fs.aio-max-nr).
+        // Such requests count for the whole host (fs.aio-max-nr).
         let mut context = 0_u64;
         tell(
             "asynchronous input and output",

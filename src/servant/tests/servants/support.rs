@@ -1,4 +1,4 @@
-//! A world of one's own for each test: an engine with its own directory, a layer, and the certainty that nothing is left.
+//! Environment of each test: an engine with its own directory, a layer, and checks that nothing is left.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -13,13 +13,13 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use servant::container::{ContainerSpec, Profile};
-use servant::engine::{ContainerState, Engine, LogLine, Servant};
-use servant::launch::{self, Runtime};
-use servant::local::{Grace, Isolation, LocalEngine, LocalEngineConfig, LocalServant};
+use servant::engine::{ContainerState, Engine, LogLine, ServantHandle};
+use servant::launch::{self, RuntimeRecord};
+use servant::local::{GracePeriods, Isolation, LocalEngine, LocalEngineConfig, LocalServant};
 use servant::shim::{Resident, ResidentContext, ResidentError};
-use servant::spec::{Limits, NodeSpec};
+use servant::spec::{NodeSpec, ResourceLimits};
 
-/// Runs before `main`: a shim must have one thread, and the test harness makes more.
+/// Runs before `main`: a shim must have one thread, and the test harness creates more.
 #[used]
 #[unsafe(link_section = ".init_array")]
 static CHOOSE: extern "C" fn() = choose;
@@ -30,7 +30,7 @@ extern "C" fn choose() {
         .first()
         .is_some_and(|name| name.ends_with("test-node"))
     {
-        let status = crate::node::act(&words[1..]);
+        let status = crate::node::run_action(&words[1..]);
         let _ = std::io::stdout().flush();
         std::process::exit(status);
     }
@@ -42,7 +42,7 @@ extern "C" fn choose() {
     }
 }
 
-/// A resident that answers on the ROS Master's port with its configuration and how many processes have ended.
+/// A resident that answers on the ROS Master's port with its configuration and the number of processes that have ended.
 #[derive(Default)]
 struct Greeter {
     ended: std::rc::Rc<std::cell::Cell<usize>>,
@@ -67,7 +67,7 @@ impl Resident for Greeter {
                         std::hint::black_box(vec![7_u8; 256 << 20]);
                     }
                     if let Some(socket) = config.get("pries").and_then(|place| place.as_str()) {
-                        let tried = pry(Path::new(socket), &directory);
+                        let tried = attempt_escapes(Path::new(socket), &directory);
                         let _ = stream.write_all(tried.as_bytes()).await;
                         continue;
                     }
@@ -84,9 +84,9 @@ impl Resident for Greeter {
     }
 }
 
-/// What a shim does that was taken over: it tries to get out, by a socket of root's among others, and to work in its own directory.
-/// A line for each try: `allowed`, or why not.
-fn pry(socket: &Path, directory: &Path) -> String {
+/// Acts as a shim that was taken over: tries to escape, by a socket of root's among others, and to work in its own
+/// directory. Returns a line for each attempt: `allowed`, or the error.
+fn attempt_escapes(socket: &Path, directory: &Path) -> String {
     let outside = socket.with_file_name("outside");
     let tries: [(&str, std::io::Result<()>); 7] = [
         ("own file", std::fs::write(directory.join("own"), "x")),
@@ -110,7 +110,7 @@ fn pry(socket: &Path, directory: &Path) -> String {
     told.concat()
 }
 
-/// An engine and all that belongs to it.
+/// An engine and its resources.
 pub struct World {
     pub engine: LocalEngine,
     home: tempfile::TempDir,
@@ -119,11 +119,11 @@ pub struct World {
 
 impl World {
     pub fn new() -> Self {
-        Self::with(|_| {})
+        Self::with_config(|_| {})
     }
 
-    /// With another configuration than most tests need.
-    pub fn with(change: impl FnOnce(&mut LocalEngineConfig)) -> Self {
+    /// Creates an environment with a changed configuration.
+    pub fn with_config(change: impl FnOnce(&mut LocalEngineConfig)) -> Self {
         assert!(
             nix::unistd::geteuid().is_root(),
             "these tests start containers: run them as root"
@@ -136,7 +136,7 @@ impl World {
         ];
         let mut config = LocalEngineConfig::new(home.path().join("servants"), shim, init());
         config.isolation = Isolation::BestEffort;
-        config.grace = Grace {
+        config.grace = GracePeriods {
             interrupt: Duration::from_millis(300),
             terminate: Duration::from_millis(300),
         };
@@ -149,22 +149,22 @@ impl World {
         }
     }
 
-    /// Another engine on the same directory: the daemon after its restart.
-    pub fn restarted(&self) -> LocalEngine {
+    /// Creates another engine on the same directory, like a restarted daemon.
+    pub fn restart_engine(&self) -> LocalEngine {
         LocalEngine::new(self.config.clone()).expect("an engine")
     }
 
-    /// Whether this host has a cgroup controller.
-    pub fn has(&self, controller: &str) -> bool {
+    /// Returns whether this host has a cgroup controller.
+    pub fn has_controller(&self, controller: &str) -> bool {
         let controllers = self.engine.cgroups().controllers();
         controllers.iter().any(|known| known == controller)
     }
 
-    /// Fails where this host lacks a controller: there a test of limits could not fail for any other reason.
-    pub fn needs(&self, controllers: &[&str]) {
+    /// Fails if this host lacks a controller, since a test of limits could not be meaningful then.
+    pub fn require_controllers(&self, controllers: &[&str]) {
         for controller in controllers {
             assert!(
-                self.has(controller),
+                self.has_controller(controller),
                 "this host has no cgroup controller {controller}: run these tests where it has, or leave out `limits::`"
             );
         }
@@ -178,15 +178,15 @@ impl World {
         self.config.home_servants_dir.join(id)
     }
 
-    pub fn runtime(&self, id: &str) -> Runtime {
-        launch::read(&self.servant_directory(id).join(launch::RUNTIME))
+    pub fn runtime(&self, id: &str) -> RuntimeRecord {
+        launch::read_record(&self.servant_directory(id).join(launch::RUNTIME))
             .unwrap()
             .expect("a shim writes it first")
     }
 
-    /// A servant that an engine on the same directory has adopted.
-    pub async fn adopted(&self, engine: &LocalEngine) -> Arc<LocalServant> {
-        let mut adopted = within(engine.adopt()).await.unwrap();
+    /// Returns the single servant that an engine on the same directory adopts.
+    pub async fn adopt_single(&self, engine: &LocalEngine) -> Arc<LocalServant> {
+        let mut adopted = with_timeout(engine.adopt()).await.unwrap();
         let servant = adopted.running.pop().expect("one");
         assert!(adopted.running.is_empty() && adopted.failures.is_empty());
         engine.servant(servant.id()).expect("it is held")
@@ -199,7 +199,7 @@ impl World {
             .unwrap_or_else(|error| panic!("{error}"))
     }
 
-    /// Ends a servant and looks for what it left.
+    /// Stops a servant and checks that nothing is left.
     pub async fn stop(&self, servant: Arc<LocalServant>) {
         let id = servant.id().to_owned();
         let runtime = self.runtime(&id);
@@ -211,7 +211,7 @@ impl World {
         self.assert_gone(&id, &runtime, &processes);
     }
 
-    pub fn assert_gone(&self, id: &str, runtime: &Runtime, processes: &[i32]) {
+    pub fn assert_gone(&self, id: &str, runtime: &RuntimeRecord, processes: &[i32]) {
         assert!(
             !self.servant_directory(id).exists(),
             "the directory is left"
@@ -222,7 +222,10 @@ impl World {
             !of_shim.is_some_and(servant::cgroup::Cgroup::exists),
             "the shim's cgroup is left"
         );
-        assert!(runtime.shim.open().unwrap().is_none(), "the shim is left");
+        assert!(
+            runtime.shim.open_pidfd().unwrap().is_none(),
+            "the shim is left"
+        );
         for pid in processes {
             assert_ended(*pid, id);
         }
@@ -232,17 +235,18 @@ impl World {
 }
 
 impl Drop for World {
-    /// After a failed test: whatever its servants left. After a good one there is nothing.
+    /// Removes what servants left after a failed test. After a successful one there is nothing.
     fn drop(&mut self) {
         let Ok(entries) = std::fs::read_dir(&self.config.home_servants_dir) else {
             return;
         };
         for entry in entries.flatten() {
-            let Ok(Some(runtime)) = launch::read::<Runtime>(&entry.path().join(launch::RUNTIME))
+            let Ok(Some(runtime)) =
+                launch::read_record::<RuntimeRecord>(&entry.path().join(launch::RUNTIME))
             else {
                 continue;
             };
-            if let Ok(Some(pidfd)) = runtime.shim.open() {
+            if let Ok(Some(pidfd)) = runtime.shim.open_pidfd() {
                 kill(&pidfd);
             }
             for cgroup in runtime.shim_cgroup.iter().chain([&runtime.cgroup]) {
@@ -252,21 +256,21 @@ impl Drop for World {
     }
 }
 
-/// Fails where a process of a servant does not end. One that has ended keeps its entry in /proc, cgroup included, until its
-/// parent has collected it: its end is awaited, not the disappearance of the entry.
+/// Fails if a process of a servant does not end. A process that has ended keeps its entry in /proc, cgroup included,
+/// until its parent has reaped it: so its end is awaited, not the disappearance of the entry.
 fn assert_ended(pid: i32, id: &str) {
     let of_servant = || {
         std::fs::read_to_string(format!("/proc/{pid}/cgroup"))
             .is_ok_and(|cgroup| cgroup.contains(id))
     };
-    let Ok(process) = servant::process::Identity::of(pid) else {
+    let Ok(process) = servant::process::ProcessIdentity::from_pid(pid) else {
         return;
     };
-    // Looked at after its identity was taken: the same number may be another's by now.
+    // Checked after its identity was taken, since the pid may have been reused by now.
     if !of_servant() {
         return;
     }
-    let Ok(Some(pidfd)) = process.open() else {
+    let Ok(Some(pidfd)) = process.open_pidfd() else {
         return;
     };
     let mut watched = [nix::poll::PollFd::new(
@@ -297,17 +301,17 @@ pub fn kill(pidfd: &std::os::fd::OwnedFd) {
     let _ = nix::poll::poll(&mut watched, 5000_u16);
 }
 
-/// A spec of the test layer; the id is unique on the host.
+/// Creates a spec of the test layer; the id is unique on the host.
 pub fn spec(nodes: Vec<NodeSpec>) -> ContainerSpec {
     static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
     let number = NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
     ContainerSpec {
-        // Of one width: no id is the beginning of another.
+        // All of one width, so that no id is a prefix of another.
         id: format!("test-{}-{number:04}", std::process::id()),
         layers: vec![layer()],
         writable: None,
         profile: Profile::Servant,
-        limits: Limits::default(),
+        limits: ResourceLimits::default(),
         environment: [("SHARED".to_owned(), "yes".to_owned())].into(),
         nodes,
         owned_directories: vec![],
@@ -317,7 +321,7 @@ pub fn spec(nodes: Vec<NodeSpec>) -> ContainerSpec {
     }
 }
 
-/// A node that does what [`crate::node::act`] knows.
+/// Creates a node that runs an action of [`crate::node::run_action`].
 pub fn node(name: &str, words: &[&str]) -> NodeSpec {
     let argv = std::iter::once("/test-node")
         .chain(words.iter().copied())
@@ -334,14 +338,14 @@ pub fn node(name: &str, words: &[&str]) -> NodeSpec {
     }
 }
 
-/// The lines of a log until one that fits has come.
+/// Returns the lines of a log up to the first one that matches.
 pub async fn lines_until(
     lines: &mut tokio::sync::mpsc::Receiver<LogLine>,
     fits: impl Fn(&LogLine) -> bool,
 ) -> Vec<LogLine> {
     let mut seen = Vec::new();
     loop {
-        let line = within(lines.recv())
+        let line = with_timeout(lines.recv())
             .await
             .unwrap_or_else(|| panic!("the log ended after {seen:?}"));
         seen.push(line);
@@ -351,14 +355,15 @@ pub async fn lines_until(
     }
 }
 
-/// The processes in a servant's PID namespace, once there are so many. What has made the container may still be in its cgroup.
+/// Returns the processes in a servant's PID namespace, once there are at least `count`. The creator of the container
+/// may still be in its cgroup.
 pub async fn processes(servant: &LocalServant, count: usize) -> Vec<i32> {
     let inside = |pid: &i32| {
         let status = std::fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
         let numbers = status.lines().find_map(|line| line.strip_prefix("NSpid:"));
         numbers.is_some_and(|numbers| numbers.split_whitespace().count() > 1)
     };
-    within(async {
+    with_timeout(async {
         loop {
             let mut processes = servant.processes().unwrap();
             processes.retain(inside);
@@ -371,24 +376,24 @@ pub async fn processes(servant: &LocalServant, count: usize) -> Vec<i32> {
     .await
 }
 
-/// The state in which a servant has ended.
-pub async fn ended(servant: &dyn Servant) -> ContainerState {
+/// Waits until a servant has ended and returns its final state.
+pub async fn wait_until_ended(servant: &dyn ServantHandle) -> ContainerState {
     let mut state = servant.state();
-    within(state.wait_for(ContainerState::is_over))
+    with_timeout(state.wait_for(ContainerState::is_over))
         .await
         .expect("a state")
         .clone()
 }
 
-/// A test that waits for what never comes must fail, not hang.
-pub async fn within<T>(future: impl Future<Output = T>) -> T {
+/// Fails a test that waits too long, instead of letting it hang.
+pub async fn with_timeout<T>(future: impl Future<Output = T>) -> T {
     tokio::time::timeout(Duration::from_secs(60), future)
         .await
         .expect("it took more than a minute")
 }
 
-/// What a socket says until it closes.
-pub async fn hear(servant: &LocalServant, port: u16) -> std::io::Result<String> {
+/// Reads from a port until the connection closes.
+pub async fn read_from_port(servant: &LocalServant, port: u16) -> std::io::Result<String> {
     use tokio::io::AsyncReadExt;
     let mut stream = servant
         .network()
@@ -399,7 +404,7 @@ pub async fn hear(servant: &LocalServant, port: u16) -> std::io::Result<String> 
     Ok(text)
 }
 
-/// A layer that holds this very program, as `/test-node`, and the libraries that it is linked with.
+/// Returns a layer that contains this program as `/test-node`, and the libraries it is linked with.
 fn layer() -> PathBuf {
     static LAYER: OnceLock<PathBuf> = OnceLock::new();
     let make = || {
@@ -408,7 +413,7 @@ fn layer() -> PathBuf {
         std::fs::create_dir_all(layer.join("lib64")).unwrap();
         std::fs::create_dir_all(layer.join("usr")).unwrap();
         let own = std::env::current_exe().unwrap();
-        // A link where it can be one: the program is large.
+        // A hard link if possible, since the program is large.
         if std::fs::hard_link(&own, layer.join("test-node")).is_err() {
             copy(&own, &layer.join("test-node"));
         }
@@ -421,7 +426,7 @@ fn layer() -> PathBuf {
         for library in libraries {
             let inside = layer.join(library.trim_start_matches('/'));
             copy(Path::new(library), &inside);
-            // The file is libx.so.1.2.3, but libx.so.1 is what a program asks for.
+            // The file is libx.so.1.2.3, but programs ask for libx.so.1.
             if let Some((stem, version)) = library.split_once(".so.") {
                 let major = version.split('.').next().unwrap_or(version);
                 copy(
@@ -435,7 +440,7 @@ fn layer() -> PathBuf {
                 copy(Path::new(library), &layer.join("lib").join(name));
             }
         }
-        // SAFETY: the function ends by itself and unwinds nowhere.
+        // SAFETY: the function returns and does not unwind.
         unsafe { libc::atexit(remove_layer) };
         layer
     };
@@ -453,7 +458,7 @@ extern "C" fn remove_layer() {
     let _ = std::fs::remove_dir_all(layer);
 }
 
-/// The static init, built once for a test run.
+/// Returns the static init, built once for a test run.
 fn init() -> PathBuf {
     static INIT: OnceLock<PathBuf> = OnceLock::new();
     let build = || {
@@ -487,7 +492,7 @@ fn init() -> PathBuf {
     INIT.get_or_init(build).clone()
 }
 
-/// A field of /proc/PID/status.
+/// Returns a field of /proc/PID/status.
 pub fn status_field(pid: i32, field: &str) -> String {
     let mut text = String::new();
     let path = format!("/proc/{pid}/status");

@@ -1,4 +1,4 @@
-//! Services that a viewer calls.
+//! Service calls made by a viewer.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,38 +10,38 @@ use foxglove::ws_protocol::{BinaryMessage, JsonMessage, client};
 use ros::codec;
 use ros::schema::ServiceDef;
 
-use super::{Ended, Session};
-use crate::line::Frame;
+use super::{FinishedTask, Session};
+use crate::line::ViewerFrame;
 
-/// Of one viewer, under way.
+/// Limit on one viewer's calls in flight.
 const CALLS: usize = 32;
-/// For the answer to a call.
+/// Timeout of a call.
 const ANSWER: Duration = Duration::from_secs(60);
 
-/// Bytes of an answer before its payload, at most: numbers and the encoding's name.
+/// Upper bound on the bytes of a response before its payload: ids and the encoding's name.
 const HEAD: usize = 64;
 
-/// A call that may be made.
-struct Called {
+/// A service call that passed all checks.
+struct CheckedCall {
     service: String,
     of: Arc<ServiceDef>,
-    /// It counts as the viewer's.
+    /// Charged to the viewer's budget.
     request: Bytes,
 }
 
 impl Session {
     pub(super) async fn call(&mut self, call: client::ServiceCallRequest<'_>) {
         let (service_id, call_id) = (call.service_id, call.call_id);
-        let found = self.may_call(&call).and_then(|(service, of)| {
-            let request = self.counted(call.payload.to_vec());
+        let found = self.check_call(&call).and_then(|(service, of)| {
+            let request = self.charge(call.payload.to_vec());
             let request = request.map_err(|full| format!("{service}: {full}"))?;
-            Ok(Called {
+            Ok(CheckedCall {
                 service,
                 of,
                 request,
             })
         });
-        let Called {
+        let CheckedCall {
             service,
             of,
             request,
@@ -49,7 +49,7 @@ impl Session {
             Ok(found) => found,
             Err(words) => {
                 let failure = ServiceCallFailure::new(service_id, call_id, words);
-                return self.tell(&failure);
+                return self.send_json(&failure);
             }
         };
         self.calls += 1;
@@ -60,7 +60,7 @@ impl Session {
             let answered = bus.call_typed(&service, &digest, request, ANSWER).await;
             let answered = answered.map_err(|error| error.to_string());
             let response = answered.and_then(|answer| {
-                // Before it is copied.
+                // Charged before it is copied.
                 let permit = budget.take(HEAD + answer.len());
                 let permit = permit.map_err(|full| format!("the answer: {full}"))?;
                 let response = ServiceCallResponse {
@@ -69,22 +69,22 @@ impl Session {
                     encoding: encoding.into(),
                     payload: (&answer[..]).into(),
                 };
-                Ok(permit.around(response.to_bytes()))
+                Ok(permit.wrap_bytes(response.to_bytes()))
             });
             let message = match response {
-                Ok(response) => Frame::Binary(response),
+                Ok(response) => ViewerFrame::Binary(response),
                 Err(words) => {
                     let words = format!("{service}: {words}");
                     let failure = ServiceCallFailure::new(service_id, call_id, words);
-                    Frame::Text(failure.to_string().into())
+                    ViewerFrame::Text(failure.to_string().into())
                 }
             };
             let _ = out.send(message).await;
-            Ended::Call
+            FinishedTask::Call
         });
     }
 
-    fn may_call(
+    fn check_call(
         &self,
         call: &client::ServiceCallRequest<'_>,
     ) -> Result<(String, Arc<ServiceDef>), String> {
@@ -94,18 +94,18 @@ impl Session {
         let encoding = self.format.encoding;
         if call.encoding != encoding {
             return Err(format!(
-                "{service}: requests are to be written as {encoding}, not {}",
+                "{service}: requests must be encoded as {encoding}, not {}",
                 call.encoding
             ));
         }
         if self.calls >= CALLS {
             return Err(format!(
-                "{service}: one viewer may have {CALLS} calls under way"
+                "{service}: a viewer may have {CALLS} calls in progress"
             ));
         }
         self.granted.check(Operation::Call, service)?;
         codec::validate(&of.request, &call.payload)
-            .map_err(|error| format!("{service}: this is no request of {}: {error}", of.name))?;
+            .map_err(|error| format!("{service}: not a request of {}: {error}", of.name))?;
         Ok((service.clone(), Arc::clone(of)))
     }
 }

@@ -1,4 +1,4 @@
-//! Who publishes, subscribes and serves what, for viewers that want to see it.
+//! Connection graph: publishers, subscribers and service providers, for viewers that subscribed to it.
 
 use std::sync::Arc;
 
@@ -11,8 +11,8 @@ use ros::bus::Graph;
 use super::Session;
 
 impl Session {
-    /// Tells what of the graph's connections has changed, where the viewer wants to know.
-    pub(super) fn show_graph(&mut self, now: &Arc<Graph>) {
+    /// Sends the changes of the connection graph if the viewer subscribed to it.
+    pub(super) fn send_graph_update(&mut self, now: &Arc<Graph>) {
         let Some(before) = self.shows_graph.replace(Arc::clone(now)) else {
             self.shows_graph = None;
             return;
@@ -51,7 +51,7 @@ impl Session {
             .filter(|name| !now.services.contains_key(*name));
         update.removed_services = gone.cloned().collect();
         if update != ConnectionGraphUpdate::default() {
-            self.tell(&update);
+            self.send_json(&update);
         }
     }
 }

@@ -1,32 +1,32 @@
-//! Topics that a viewer publishes.
+//! Topics published by a viewer.
 
 use std::sync::Arc;
 
 use access::Operation;
 use bytes::Bytes;
 use foxglove::ws_protocol::client;
-use ros::bus::{Publisher, Qos, WireType, reaches};
+use ros::bus::{Publisher, QosProfile, WireType, wait_for_connected};
 use ros::codec;
 use ros::schema::MessageType;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
 
-use super::{CONNECTS, Ended, OUTGOING, Session};
+use super::{CONNECTS, FinishedTask, OUTGOING, Session};
 
-/// Topics of one viewer.
+/// Limit on the topics that one viewer may advertise.
 const ADVERTISEMENTS: usize = 512;
-/// Messages of a viewer's topic that wait for a slow node, at least.
+/// Minimum queue size of a viewer's topic towards a slow node.
 const PUBLISHED: usize = 10;
 
-/// A topic that the viewer publishes.
-pub(super) struct Published {
+/// A topic advertised by the viewer.
+pub(super) struct ViewerPublication {
     pub(super) topic: String,
-    /// None where it was refused, which was told.
-    publishing: Option<Publishing>,
+    /// `None` if the advertisement was refused, which the viewer has been told.
+    publishing: Option<PublicationSink>,
 }
 
-/// Where its messages go, and what they are.
-struct Publishing {
+/// Message type of a publication and the queue to its publisher.
+struct PublicationSink {
     of: Arc<MessageType>,
     messages: mpsc::Sender<Bytes>,
 }
@@ -35,20 +35,20 @@ impl Session {
     pub(super) async fn publish(&mut self, id: u32, message: &[u8]) {
         let Some(published) = self.publishers.get(&id) else {
             let words = format!("channel {id} is not advertised by this viewer");
-            return self.complain(words);
+            return self.send_error(words);
         };
-        let Some(Publishing { of, messages }) = &published.publishing else {
+        let Some(PublicationSink { of, messages }) = &published.publishing else {
             return;
         };
         if let Err(error) = codec::validate(of, message) {
-            let words = format!("{}: this is no {}: {error}", published.topic, of.name());
-            return self.complain(words);
+            let words = format!("{}: not a {}: {error}", published.topic, of.name());
+            return self.send_error(words);
         }
         match self.budget.take(message.len()) {
-            // It is taken for as long as the sender is there.
-            Ok(permit) => drop(messages.send(permit.around(message.to_vec())).await),
+            // The receiver lives as long as the sender does.
+            Ok(permit) => drop(messages.send(permit.wrap_bytes(message.to_vec())).await),
             Err(exceeded) => {
-                self.complain(format!("{}: {exceeded}", published.topic));
+                self.send_error(format!("{}: {exceeded}", published.topic));
             }
         }
     }
@@ -56,27 +56,28 @@ impl Session {
     pub(super) async fn advertise(&mut self, channel: client::advertise::Channel<'_>) {
         let id = channel.id;
         if self.publishers.contains_key(&id) {
-            return self.complain(format!("channel {id} is there already"));
+            return self.send_error(format!("channel {id} already exists"));
         }
         let topic = channel.topic.clone().into_owned();
         if self.publishers.len() >= ADVERTISEMENTS {
             let words = format!("{topic}: one viewer may advertise {ADVERTISEMENTS} topics");
-            return self.complain(words);
+            return self.send_error(words);
         }
-        let publishing = match self.publisher(&topic, &channel).await {
-            Ok((of, publisher)) => Some(Publishing {
+        let publishing = match self.open_publisher(&topic, &channel).await {
+            Ok((of, publisher)) => Some(PublicationSink {
                 of,
-                messages: self.publishing(&topic, publisher),
+                messages: self.spawn_publisher(&topic, publisher),
             }),
             Err(words) => {
-                self.complain(words);
+                self.send_error(words);
                 None
             }
         };
-        self.publishers.insert(id, Published { topic, publishing });
+        self.publishers
+            .insert(id, ViewerPublication { topic, publishing });
     }
 
-    async fn publisher(
+    async fn open_publisher(
         &self,
         topic: &str,
         channel: &client::advertise::Channel<'_>,
@@ -84,22 +85,29 @@ impl Session {
         let encoding = self.format.encoding;
         if channel.encoding != encoding {
             return Err(format!(
-                "{topic}: messages are to be written as {encoding}, not {}",
+                "{topic}: messages must be encoded as {encoding}, not {}",
                 channel.encoding
             ));
         }
         self.granted.check(Operation::Publish, topic)?;
         let message = self.registry.message(&channel.schema_name);
         let message = message.map_err(|error| format!("{topic}: {error}"))?;
-        let qos = Qos::keep_last(self.depth.max(PUBLISHED));
-        let publisher = self.bus.advertise(topic, WireType::of(&message), qos).await;
+        let qos = QosProfile::keep_last(self.depth.max(PUBLISHED));
+        let publisher = self
+            .bus
+            .advertise(topic, WireType::from_message(&message), qos)
+            .await;
         let publisher =
             publisher.map_err(|error| format!("{topic} cannot be advertised: {error}"))?;
         Ok((message, publisher))
     }
 
-    /// Publishes what is sent, once all are connected who are there.
-    fn publishing(&mut self, topic: &str, publisher: Box<dyn Publisher>) -> mpsc::Sender<Bytes> {
+    /// Spawns a task that publishes the messages sent to it once all present subscribers are connected.
+    fn spawn_publisher(
+        &mut self,
+        topic: &str,
+        publisher: Box<dyn Publisher>,
+    ) -> mpsc::Sender<Bytes> {
         let (messages, mut waiting) = mpsc::channel::<Bytes>(OUTGOING);
         let graph = self.bus.graph();
         let listening = graph.borrow().topics.get(topic).map_or(0, |ends| {
@@ -107,12 +115,16 @@ impl Session {
             others.filter(|node| **node != self.bus.node()).count()
         });
         self.tasks.spawn(async move {
-            // Viewers publish right behind what they advertise.
-            let _ = timeout(CONNECTS, reaches(publisher.matched(), listening)).await;
+            // Viewers publish immediately after advertising.
+            let _ = timeout(
+                CONNECTS,
+                wait_for_connected(publisher.matched_subscribers(), listening),
+            )
+            .await;
             while let Some(message) = waiting.recv().await {
                 publisher.publish(message);
             }
-            Ended::Published
+            FinishedTask::Published
         });
         self.publishing += 1;
         messages

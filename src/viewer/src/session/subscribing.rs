@@ -8,25 +8,25 @@ use budget::Budget;
 use bytes::{BufMut, BytesMut};
 use foxglove::ws_protocol::JsonMessage;
 use foxglove::ws_protocol::server::Status;
-use ros::bus::{Qos, Subscription, WireType};
+use ros::bus::{QosProfile, Subscription, WireType};
 use tokio::sync::mpsc;
 
-use super::{Ended, Session};
-use crate::line::Frame;
+use super::{FinishedTask, Session};
+use crate::line::ViewerFrame;
 
-/// Of one viewer.
+/// Limit on one viewer's subscriptions.
 const SUBSCRIPTIONS: usize = 512;
-/// Between two words about messages that a topic's reader missed.
+/// Minimum interval between two warnings about dropped messages of a topic.
 const MISSED: Duration = Duration::from_secs(5);
 
-/// A subscription of the viewer's, until dropped.
-pub(super) struct Subscribed {
+/// A subscription of the viewer; unsubscribes when dropped.
+pub(super) struct ViewerSubscription {
     pub(super) channel: u64,
     pub(super) topic: String,
     task: tokio::task::AbortHandle,
 }
 
-impl Drop for Subscribed {
+impl Drop for ViewerSubscription {
     fn drop(&mut self) {
         self.task.abort();
     }
@@ -35,25 +35,25 @@ impl Drop for Subscribed {
 impl Session {
     pub(super) fn subscribe(&mut self, id: u32, channel: u64) {
         let Some((topic, of)) = self.catalogue.channel(channel).cloned() else {
-            return self.complain(format!("there is no channel {channel}"));
+            return self.send_error(format!("there is no channel {channel}"));
         };
         if self.subscriptions.contains_key(&id) {
-            return self.complain(format!("subscription {id} is there already"));
+            return self.send_error(format!("subscription {id} already exists"));
         }
         if self.subscriptions.len() >= SUBSCRIPTIONS {
             let words = format!("{topic}: one viewer may have {SUBSCRIPTIONS} subscriptions");
-            return self.complain(words);
+            return self.send_error(words);
         }
         if let Err(refused) = self.granted.check(Operation::Subscribe, &topic) {
-            return self.complain(refused);
+            return self.send_error(refused);
         }
         let (bus, out) = (Arc::clone(&self.bus), self.out.clone());
         let (listened, budget) = (topic.clone(), self.budget.clone());
-        let qos = Qos::keep_last(self.depth).latching(true);
+        let qos = QosProfile::keep_last(self.depth).latching(true);
         let task = self.tasks.spawn(async move {
             match bus.subscribe(&listened, WireType::clone(&of), qos).await {
                 Ok(subscription) => {
-                    let mut reader = Reader {
+                    let mut reader = SubscriptionForwarder {
                         id,
                         topic: listened,
                         budget,
@@ -61,18 +61,18 @@ impl Session {
                         missed: 0,
                         told: (0, Instant::now()),
                     };
-                    reader.passes(subscription).await;
+                    reader.forward(subscription).await;
                 }
                 Err(error) => {
                     let words = format!("{listened} cannot be subscribed to: {error}");
                     let _ = out
-                        .send(Frame::Text(Status::error(words).to_string().into()))
+                        .send(ViewerFrame::Text(Status::error(words).to_string().into()))
                         .await;
                 }
             }
-            Ended::Other
+            FinishedTask::Other
         });
-        let subscribed = Subscribed {
+        let subscribed = ViewerSubscription {
             channel,
             topic,
             task,
@@ -81,21 +81,21 @@ impl Session {
     }
 }
 
-/// One topic on its way to the viewer.
-struct Reader {
+/// Forwards the messages of one topic to the viewer.
+struct SubscriptionForwarder {
     id: u32,
     topic: String,
     budget: Budget,
-    out: mpsc::Sender<Frame>,
-    /// Messages for which there was no room in the budget.
+    out: mpsc::Sender<ViewerFrame>,
+    /// Number of messages dropped because the budget was exhausted.
     missed: u64,
-    /// How many it was told to have missed, and when.
+    /// Number of drops last reported to the viewer, and when.
     told: (u64, Instant),
 }
 
-impl Reader {
-    /// Passes messages on, each when the viewer has taken those before.
-    async fn passes(&mut self, mut subscription: Subscription) {
+impl SubscriptionForwarder {
+    /// Forwards messages one by one, each once the viewer has taken the previous ones.
+    async fn forward(&mut self, mut subscription: Subscription) {
         while let Some(message) = subscription.messages.recv().await {
             let now = SystemTime::now().duration_since(UNIX_EPOCH);
             let now = now.map_or(0, |since| since.as_nanos() as u64);
@@ -103,8 +103,8 @@ impl Reader {
                 self.missed += 1;
                 continue;
             };
-            let frame = permit.around(framed(self.id, now, &message.bytes));
-            if self.out.send(Frame::Binary(frame)).await.is_err() {
+            let frame = permit.wrap_bytes(encode_message_data(self.id, now, &message.bytes));
+            if self.out.send(ViewerFrame::Binary(frame)).await.is_err() {
                 return;
             }
             let missed = self.missed + subscription.dropped.get();
@@ -112,18 +112,18 @@ impl Reader {
             if missed > told && (told == 0 || at.elapsed() >= MISSED) {
                 self.told = (missed, Instant::now());
                 let words = format!(
-                    "{}: {missed} messages were left out, since they come faster than they are read",
+                    "{}: {missed} messages were dropped, since they arrive faster than they are read",
                     self.topic
                 );
-                let status = Frame::Text(Status::warning(words).to_string().into());
+                let status = ViewerFrame::Text(Status::warning(words).to_string().into());
                 let _ = self.out.send(status).await;
             }
         }
     }
 }
 
-fn framed(id: u32, time: u64, message: &[u8]) -> BytesMut {
-    // The operation's code in the protocol.
+fn encode_message_data(id: u32, time: u64, message: &[u8]) -> BytesMut {
+    // Opcode of the protocol's MessageData.
     const MESSAGE_DATA: u8 = 1;
     let mut frame = BytesMut::with_capacity(13 + message.len());
     frame.put_u8(MESSAGE_DATA);

@@ -1,5 +1,5 @@
-//! All that a robot does, with roslibrust against rosbridge_fixture. Prints `end my servant` and expects to be connected to
-//! a new one; ends with `done`. Of ROS 2 all that it does against the herald.
+//! All that a robot does, with roslibrust against rosbridge_fixture. Prints `end my servant` and expects to be
+//! connected to a new one; ends with `done`. Of ROS 2 all that it does against the herald.
 //!
 //! usage: robot-with-roslibrust URL [ros2]
 

@@ -16,7 +16,8 @@ const MOMENT: Duration = Duration::from_millis(200);
 message!(Text, "std_msgs/msg/String", { data: String });
 message!(Stamp, "builtin_interfaces/msg/Time", { sec: i32, nanosec: u32 });
 message!(Point, "geometry_msgs/msg/Point", { x: f64, y: f64, z: f64 });
-message!(Greeting, "herald_msgs/msg/Greeting", { stamp: Stamp, manner: u8, text: String, wide: String, at: Vec<Point> });
+message!(Greeting, "herald_msgs/msg/Greeting", { stamp: Stamp, manner: u8, text: String, wide: String,
+    at: Vec<Point> });
 message!(Named, "herald_msgs/srv/Greet_Request", { name: String });
 message!(Greeted, "herald_msgs/srv/Greet_Response", { greeting: Greeting, known: bool });
 message!(Switch, "std_srvs/srv/SetBool_Request", { data: bool });

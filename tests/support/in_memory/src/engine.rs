@@ -1,4 +1,4 @@
-//! The engine: which programs there are, and which servants.
+//! The engine: its programs and its servants.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use futures_util::FutureExt;
 use futures_util::future::BoxFuture;
 use parking_lot::Mutex;
 use servant::Error;
-use servant::engine::{Adopted, ContainerState, Ended, Engine, Servant};
+use servant::engine::{AdoptedServants, ContainerState, EndedServant, Engine, ServantHandle};
 use servant::spec::Spec;
 use tokio::runtime::Handle;
 
@@ -18,29 +18,29 @@ use crate::servants::MemoryServant;
 
 type Program = Arc<dyn Fn(Process) -> BoxFuture<'static, i32> + Send + Sync>;
 
-/// Starts servants that are tasks of this process. Cheap to clone; all clones are the same engine, which outlives whoever
-/// uses it, as containers outlive a daemon.
+/// Starts servants that are tasks of this process. Cheap to clone; all clones are the same engine, which outlives its
+/// users as containers outlive a daemon.
 #[derive(Clone)]
 pub struct MemoryEngine {
-    world: Arc<World>,
+    world: Arc<EngineState>,
 }
 
-/// The servants, images and limits of the engine.
-pub(crate) struct World {
-    /// Where nodes run, wherever their servants are asked for.
+/// Servants, images and limits of the engine.
+pub(crate) struct EngineState {
+    /// Runtime of the nodes, from wherever their servants are started.
     pub(crate) runtime: Handle,
     programs: Mutex<BTreeMap<String, Program>>,
     servants: Mutex<BTreeMap<String, Arc<MemoryServant>>>,
     started: Mutex<Vec<Spec>>,
     /// Images that cannot be started, each with the reason.
     broken: Mutex<BTreeMap<String, String>>,
-    /// Of what cannot be removed: the ids.
+    /// Ids of servants with leftovers that cannot be removed.
     leftovers: Mutex<Vec<String>>,
     /// Devices, volumes and hosts that may be granted.
     allowed: Mutex<Grants>,
 }
 
-impl World {
+impl EngineState {
     pub(crate) fn program(&self, path: &str) -> Option<Program> {
         self.programs.lock().get(path).cloned()
     }
@@ -55,10 +55,10 @@ impl World {
 }
 
 impl Default for MemoryEngine {
-    /// One whose nodes run on the runtime of whoever makes it.
+    /// Creates an engine whose nodes run on the current runtime.
     fn default() -> MemoryEngine {
         MemoryEngine {
-            world: Arc::new(World {
+            world: Arc::new(EngineState {
                 runtime: Handle::current(),
                 programs: Mutex::default(),
                 servants: Mutex::default(),
@@ -72,7 +72,7 @@ impl Default for MemoryEngine {
 }
 
 impl MemoryEngine {
-    /// Installs a program in every image; it gives its exit code.
+    /// Installs a program in every image; `run` returns its exit code.
     pub fn program<F>(&self, path: &str, run: impl Fn(Process) -> F + Send + Sync + 'static)
     where
         F: Future<Output = i32> + Send + 'static,
@@ -82,43 +82,43 @@ impl MemoryEngine {
         programs.insert(path.to_owned(), program);
     }
 
-    /// From now on no servant of this image can be started, for this reason.
-    pub fn breaks(&self, image: &str, reason: &str) {
+    /// Makes further starts of servants of this image fail with this reason.
+    pub fn break_image(&self, image: &str, reason: &str) {
         let broken = &mut *self.world.broken.lock();
         broken.insert(image.to_owned(), reason.to_owned());
     }
 
-    /// From now on these may be granted.
+    /// Sets which grants are allowed from now on.
     pub fn allow(&self, grants: Grants) {
         *self.world.allowed.lock() = grants;
     }
 
-    /// Leaves something of a servant that the next sweep cannot remove.
+    /// Makes the next sweep fail to remove something of a servant.
     pub fn leave_behind(&self, id: &str) {
         self.world.leftovers.lock().push(id.to_owned());
     }
 
-    /// A servant that is there, ended or not.
+    /// Returns an existing servant, ended or not.
     pub fn servant(&self, id: &str) -> Option<Arc<MemoryServant>> {
         self.world.servant(id)
     }
 
-    /// Ids of the servants that are there, ended or not.
+    /// Returns the ids of the existing servants, ended or not.
     pub fn servants(&self) -> Vec<String> {
         self.world.servants.lock().keys().cloned().collect()
     }
 
-    /// The specs of all servants that were asked for, in their order.
-    pub fn started(&self) -> Vec<Spec> {
+    /// Returns the specifications of all servants that were requested, in their order.
+    pub fn started_specs(&self) -> Vec<Spec> {
         self.world.started.lock().clone()
     }
 }
 
 #[async_trait]
 impl Engine for MemoryEngine {
-    async fn start(&self, spec: Spec) -> Result<Arc<dyn Servant>, Error> {
+    async fn start(&self, spec: Spec) -> Result<Arc<dyn ServantHandle>, Error> {
         self.world.started.lock().push(spec.clone());
-        self.check(&spec.grants)?;
+        self.check_grants(&spec.grants)?;
         if let Some(reason) = self.world.broken.lock().get(&spec.image) {
             return Err(Error::Start {
                 id: spec.id,
@@ -134,14 +134,14 @@ impl Engine for MemoryEngine {
             servants.insert(spec.id, Arc::clone(&servant));
         }
         for node in spec.nodes {
-            // A program that is not there is an event, as in a container.
+            // A missing program is reported by an event, as in a container.
             let _ = servant.run(node);
         }
         Ok(servant)
     }
 
-    async fn adopt(&self) -> Result<Adopted, Error> {
-        let mut adopted = Adopted::default();
+    async fn adopt(&self) -> Result<AdoptedServants, Error> {
+        let mut adopted = AdoptedServants::default();
         let servants: Vec<_> = self.world.servants.lock().values().cloned().collect();
         for servant in servants {
             let state: ContainerState = servant.state().borrow().clone();
@@ -149,7 +149,7 @@ impl Engine for MemoryEngine {
                 adopted.running.push(servant);
                 continue;
             }
-            adopted.ended.push(Ended {
+            adopted.ended.push(EndedServant {
                 id: servant.id().to_owned(),
                 state: Some(state),
             });
@@ -157,7 +157,7 @@ impl Engine for MemoryEngine {
         Ok(adopted)
     }
 
-    async fn sweep(&self, ended: &[Ended]) -> Vec<Error> {
+    async fn sweep(&self, ended: &[EndedServant]) -> Vec<Error> {
         for ended in ended {
             self.world.forget(&ended.id);
         }
@@ -169,7 +169,7 @@ impl Engine for MemoryEngine {
         leftovers.into_iter().map(left).collect()
     }
 
-    fn check(&self, grants: &Grants) -> Result<Vec<String>, Error> {
+    fn check_grants(&self, grants: &Grants) -> Result<Vec<String>, Error> {
         let allowed = self.world.allowed.lock();
         let refused = |kind: &'static str, name: &str| {
             Err(Error::Grant(

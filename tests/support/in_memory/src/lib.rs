@@ -1,7 +1,7 @@
-//! The seams of the daemon, in memory: an [`Engine`](servant::engine::Engine) whose servants are tasks of this process, and an
-//! [`Opener`](reach::Opener) that reaches them. What a node does is told by a closure, by the name of its program. With them
-//! the stories of whoever uses an engine can be told without a container; that containers do the same is told by the tests of
-//! the engine of this host.
+//! In-memory implementations of the daemon's interfaces: an [`Engine`](servant::engine::Engine) whose servants are
+//! tasks of this process, and an [`Opener`](reach::Opener) that reaches them. A closure, selected by the name of the
+//! program, implements a node. With them the users of an engine can be tested without containers; the tests of the
+//! host's engine check that containers behave in the same way.
 
 #![forbid(unsafe_code)]
 

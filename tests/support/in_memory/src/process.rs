@@ -1,11 +1,11 @@
-//! What a program of a node sees of the world.
+//! Interface between the program of a node and its environment.
 
 use std::any::Any;
 use std::sync::Arc;
 
 use ros::bus::{ActionHandler, ActionNodes, Bus, Graph, ServiceHandler, ServiceType, TopicNodes};
 use ros::schema::ActionDef;
-use servant::engine::Servant;
+use servant::engine::ServantHandle;
 use servant::spec::NodeSpec;
 
 use crate::servants::MemoryServant;
@@ -14,12 +14,12 @@ use crate::servants::MemoryServant;
 pub struct Process {
     pub(crate) servant: Arc<MemoryServant>,
     pub(crate) node: NodeSpec,
-    /// From 1 on.
+    /// Counted from 1.
     pub(crate) start: u32,
 }
 
 impl Process {
-    /// How often the node was started, this time included.
+    /// Returns how often the node was started, including this start.
     pub fn start(&self) -> u32 {
         self.start
     }
@@ -42,7 +42,7 @@ impl Process {
         });
     }
 
-    /// Serves a service for as long as what this gives lives.
+    /// Serves a service until the returned value is dropped.
     pub async fn serve(
         &self,
         service: &str,
@@ -60,7 +60,7 @@ impl Process {
         Box::new((served, node))
     }
 
-    /// Serves an action for as long as what this gives lives.
+    /// Serves an action until the returned value is dropped.
     pub fn serve_action(
         &self,
         action: &str,
@@ -82,12 +82,12 @@ impl Process {
         Box::new((served, node))
     }
 
-    /// The id of its servant.
+    /// Returns the id of its servant.
     pub fn servant(&self) -> &str {
         self.servant.id()
     }
 
-    /// Takes memory until the node ends. The node is killed where its servant has not so much left.
+    /// Allocates memory until the node ends. The node is killed if its servant has too little left.
     pub async fn allocate(&self, bytes: u64) {
         if !self.servant.allocate(&self.node.name, bytes) {
             std::future::pending::<()>().await;

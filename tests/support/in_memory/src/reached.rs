@@ -1,21 +1,22 @@
-//! The opener, and what it gives. Sessions and links are held until they are closed; no message passes.
+//! The opener and the connection that it opens. Sessions and links are held until they are closed; they carry no
+//! messages.
 
 use std::sync::{Arc, Weak};
 
 use async_trait::async_trait;
-use bridge::{Metrics, SessionEnd, SessionOptions, Waiting};
+use bridge::{Metrics, SessionEnd, SessionOptions, WaitingConnection};
 use futures_util::future::BoxFuture;
-use link::session::Lost;
+use link::session::DisconnectReason;
 use package::interface::Interface;
 use parking_lot::Mutex;
 use reach::links::LinkStatus;
 use reach::{
-    Error, Flow, Look, Looked, Material, Observer, Opener, Pace, Reach, ReachOptions, Recorded,
-    Replay, Stream, Tenant,
+    Error, FlowCounts, InsideView, Material, ObservedBus, Observer, Opener, Reach, ReachOptions,
+    RecordedRevision, Replay, ReplayPace, Tenant, UpgradedStream,
 };
 use ros::bus::{Bus, Graph, RosVersion};
-use ros::sizes::Seen;
-use servant::engine::Servant;
+use ros::sizes::SizeSummary;
+use servant::engine::ServantHandle;
 use tokio::sync::watch;
 
 use crate::engine::MemoryEngine;
@@ -32,8 +33,8 @@ struct MemoryReach {
 impl Opener for MemoryEngine {
     async fn open(
         &self,
-        servant: &Arc<dyn Servant>,
-        recorded: BoxFuture<'_, Recorded>,
+        servant: &Arc<dyn ServantHandle>,
+        recorded: BoxFuture<'_, RecordedRevision>,
         _options: ReachOptions,
         _observer: Arc<dyn Observer>,
     ) -> Result<Arc<dyn Reach>, Error> {
@@ -48,23 +49,23 @@ impl Opener for MemoryEngine {
         }))
     }
 
-    async fn look(
+    async fn observe(
         &self,
-        servant: &Arc<dyn Servant>,
+        servant: &Arc<dyn ServantHandle>,
         _ros: RosVersion,
         _name: &str,
         _egress: &[String],
-    ) -> Result<Look, Error> {
+    ) -> Result<ObservedBus, Error> {
         Err(Error::Elsewhere(servant.id().to_owned()))
     }
 
-    fn processes(&self, _servant: &str) -> Vec<i32> {
+    fn process_ids(&self, _servant: &str) -> Vec<i32> {
         Vec::new()
     }
 }
 
 impl MemoryReach {
-    async fn end(&self) -> String {
+    async fn wait_until_closed(&self) -> String {
         let mut closed = self.closed.subscribe();
         let reason = closed.wait_for(Option::is_some).await;
         reason
@@ -86,49 +87,53 @@ impl Reach for MemoryReach {
 
     async fn serve_rosbridge(
         &self,
-        client: Waiting<Stream>,
+        client: WaitingConnection<UpgradedStream>,
         _options: SessionOptions,
     ) -> SessionEnd {
-        let reason = self.end().await;
+        let reason = self.wait_until_closed().await;
         client.refuse(1012, &reason).await;
         SessionEnd::Closed { code: 1012, reason }
     }
 
-    async fn serve_inside(&self, client: Waiting<Stream>, _options: SessionOptions) -> SessionEnd {
-        let reason = self.end().await;
+    async fn serve_inside(
+        &self,
+        client: WaitingConnection<UpgradedStream>,
+        _options: SessionOptions,
+    ) -> SessionEnd {
+        let reason = self.wait_until_closed().await;
         client.refuse(1012, &reason).await;
         SessionEnd::Closed { code: 1012, reason }
     }
 
-    async fn look_inside(&self) -> Result<Looked, (u16, String)> {
+    async fn open_inside(&self) -> Result<InsideView, (u16, String)> {
         Err((1011, "nothing passes here".to_owned()))
     }
 
-    async fn serve_link(&self, _stream: Stream, _read_ahead: &[u8]) -> Lost {
-        let reason = self.end().await;
-        Lost::Closed { code: 1012, reason }
+    async fn serve_link(&self, _stream: UpgradedStream, _read_ahead: &[u8]) -> DisconnectReason {
+        let reason = self.wait_until_closed().await;
+        DisconnectReason::Closed { code: 1012, reason }
     }
 
     fn links(&self) -> Vec<LinkStatus> {
         Vec::new()
     }
 
-    fn flows(&self) -> Vec<Flow> {
+    fn flows(&self) -> Vec<FlowCounts> {
         let (inputs, outputs) = *self.servant.flow.lock();
         let node = String::new();
-        vec![Flow {
+        vec![FlowCounts {
             node,
             inputs,
             outputs,
         }]
     }
 
-    fn report(&self, _flow: &str, what: &str) {
+    fn warn_flow(&self, _flow: &str, what: &str) {
         self.servant.reported.lock().push(what.to_owned());
     }
 
-    fn inputs(&self) -> Vec<(String, Seen)> {
-        self.servant.inputs.seen()
+    fn inputs(&self) -> Vec<(String, SizeSummary)> {
+        self.servant.inputs.summaries()
     }
 
     fn metrics(&self) -> &Metrics {
@@ -140,12 +145,12 @@ impl Reach for MemoryReach {
         service: &str,
         _interface: &Interface,
         _material: &Material,
-        _pace: &Pace,
+        _pace: &ReplayPace,
     ) -> Result<Replay, Error> {
         Err(Error::Trial(format!("{service} answers nothing")))
     }
 
-    fn bind(&self, tenant: Weak<dyn Tenant>) {
+    fn bind_tenant(&self, tenant: Weak<dyn Tenant>) {
         *self.tenant.lock() = Some(tenant);
     }
 

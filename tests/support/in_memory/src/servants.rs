@@ -1,4 +1,4 @@
-//! A servant: its nodes are tasks.
+//! A servant whose nodes are tasks.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -7,69 +7,69 @@ use std::time::{Duration, SystemTime};
 use async_trait::async_trait;
 use parking_lot::Mutex;
 use ros::bus::Graph;
-use ros::sizes::Inputs;
+use ros::sizes::InputSizes;
 use servant::Error;
 use servant::engine::{
-    ContainerState, Enforced, LogLine, LogStart, NodeEvent, NodeExit, Servant, Usage,
+    ContainerState, EnforcedLimits, LogLine, LogStart, NodeEvent, NodeExit, ServantHandle, Usage,
 };
-use servant::spec::{Limits, NodeSpec, Spec, UNLIMITED};
+use servant::spec::{NodeSpec, ResourceLimits, Spec, UNLIMITED};
 use tokio::sync::{broadcast, mpsc, watch};
 
-use crate::engine::World;
+use crate::engine::EngineState;
 use crate::memory_bus::MemorySystem;
 use crate::process::Process;
 
-/// Events that a slow listener may be behind, and lines that may wait for a reader.
+/// Capacity for events of a slow receiver, and for queued log lines.
 const AHEAD: usize = 256;
 
 /// A servant of a [`MemoryEngine`](crate::MemoryEngine).
 pub struct MemoryServant {
     id: String,
-    world: Weak<World>,
+    world: Weak<EngineState>,
     state: watch::Sender<ContainerState>,
     events: broadcast::Sender<NodeEvent>,
-    limits: watch::Sender<Limits>,
-    nodes: watch::Sender<BTreeMap<String, Node>>,
+    limits: watch::Sender<ResourceLimits>,
+    nodes: watch::Sender<BTreeMap<String, MemoryNodeState>>,
     log: watch::Sender<Vec<LogLine>>,
     oom_kills: Mutex<u64>,
-    /// Tasks of nodes.
+    /// Number of running tasks of nodes.
     tasks: watch::Sender<usize>,
     pub(crate) graph: watch::Sender<Arc<Graph>>,
-    /// How large what its robot sends is.
-    pub inputs: Inputs,
-    /// What rosbridge clients gave its nodes and had of them so far: inputs and outputs.
+    /// Sizes of the messages that its robot sends.
+    pub inputs: InputSizes,
+    /// Messages between rosbridge clients and its nodes so far: inputs and outputs.
     pub flow: Mutex<(u64, u64)>,
-    /// What these clients were told of it.
+    /// Reports to these clients.
     pub reported: Mutex<Vec<String>>,
-    /// Its shim answers nothing while this is so.
+    /// True while its shim does not respond.
     pub stuck: watch::Sender<bool>,
-    /// Where services of its nodes are called.
+    /// ROS system in which services of its nodes are called.
     pub(crate) system: Arc<MemorySystem>,
 }
 
-/// What is known of a node.
+/// State of a node.
 #[derive(Default)]
-struct Node {
+struct MemoryNodeState {
     starts: u32,
-    /// Of the one that runs: to be told of a signal, or killed for memory.
+    /// Sender for signals and out-of-memory kills of the running task; `None` if the node is not running.
     running: Option<mpsc::UnboundedSender<NodeExit>>,
     exit: Option<NodeExit>,
     held: u64,
-    /// It is not started again, and nothing ends with it.
+    /// True if the node is not restarted and its end ends nothing else.
     for_good: bool,
 }
 
-/// Counts one more task in, until it is dropped.
-struct Task(Arc<MemoryServant>);
+/// Counts a running task until drop.
+struct TaskGuard(Arc<MemoryServant>);
 
-impl Task {
-    fn begin(servant: &Arc<MemoryServant>) -> Task {
+impl TaskGuard {
+    fn begin(servant: &Arc<MemoryServant>) -> TaskGuard {
         servant.tasks.send_modify(|tasks| *tasks += 1);
-        Task(Arc::clone(servant))
+        TaskGuard(Arc::clone(servant))
     }
 }
 
-impl Drop for Task {
+impl Drop for TaskGuard {
     fn drop(&mut self) {
         self.0.tasks.send_modify(|tasks| *tasks -= 1);
     }
@@ -85,7 +85,7 @@ fn exit(code: Option<i32>, signal: Option<i32>) -> NodeExit {
 }
 
 impl MemoryServant {
-    pub(crate) fn new(spec: &Spec, world: Weak<World>) -> Arc<MemoryServant> {
+    pub(crate) fn new(spec: &Spec, world: Weak<EngineState>) -> Arc<MemoryServant> {
         Arc::new(MemoryServant {
             id: spec.id.clone(),
             world,
@@ -97,7 +97,7 @@ impl MemoryServant {
             oom_kills: Mutex::default(),
             tasks: watch::Sender::default(),
             graph: watch::Sender::default(),
-            inputs: Inputs::default(),
+            inputs: InputSizes::default(),
             flow: Mutex::default(),
             reported: Mutex::default(),
             stuck: watch::Sender::new(false),
@@ -105,14 +105,14 @@ impl MemoryServant {
         })
     }
 
-    /// Ends it as a container that broke.
+    /// Ends it like a broken container.
     pub fn fail(&self, reason: &str) {
         self.end(ContainerState::Failed {
             reason: reason.to_owned(),
         });
     }
 
-    /// Ends it while nobody watches, as its nodes would.
+    /// Ends it like the end of its nodes, without a monitor.
     fn end(&self, state: ContainerState) {
         let first = self.state.send_if_modified(|known| {
             let first = !known.is_over();
@@ -131,7 +131,7 @@ impl MemoryServant {
         }
     }
 
-    fn ended(&self) -> Error {
+    fn ended_error(&self) -> Error {
         let reason = match &*self.state.borrow() {
             ContainerState::Stopped { reason } | ContainerState::Failed { reason } => {
                 reason.clone()
@@ -144,16 +144,17 @@ impl MemoryServant {
         }
     }
 
-    /// Its shim answers.
-    async fn answers(&self) {
+    /// Waits until its shim responds.
+    async fn wait_until_responsive(&self) {
         let mut stuck = self.stuck.subscribe();
         let _ = stuck.wait_for(|is_stuck| !is_stuck).await;
     }
 
     fn check_runs(&self) -> Result<(), Error> {
-        match self.state.borrow().is_over() {
-            true => Err(self.ended()),
-            false => Ok(()),
+        if self.state.borrow().is_over() {
+            Err(self.ended_error())
+        } else {
+            Ok(())
         }
     }
 
@@ -169,7 +170,7 @@ impl MemoryServant {
         });
     }
 
-    /// Whether the servant has so much left; else the node is killed.
+    /// Allocates memory; kills the node and returns false if the servant has too little left.
     pub(crate) fn allocate(&self, name: &str, bytes: u64) -> bool {
         let limit = self.limits.borrow().memory.unwrap_or(u64::MAX);
         let mut fits = true;
@@ -192,13 +193,13 @@ impl MemoryServant {
         fits
     }
 
-    /// Starts a node and looks after it.
+    /// Starts a node and monitors it.
     pub(crate) fn run(self: &Arc<Self>, node: NodeSpec) -> Result<(), Error> {
         let path = node.argv.first().cloned().unwrap_or_default();
-        let world = self.world.upgrade().ok_or_else(|| self.ended())?;
+        let world = self.world.upgrade().ok_or_else(|| self.ended_error())?;
         let Some(program) = world.program(&path) else {
             let reason = format!("there is no program {path}");
-            self.over(
+            self.record_node_end(
                 &node.name,
                 NodeExit {
                     exec_error: Some(reason.clone()),
@@ -224,7 +225,7 @@ impl MemoryServant {
         let name = node.name.clone();
         let _ = self.events.send(NodeEvent::Started { node: name });
         let servant = Arc::clone(self);
-        let task = Task::begin(self);
+        let task = TaskGuard::begin(self);
         world.runtime.spawn(async move {
             let _task = task;
             let process = Process {
@@ -239,12 +240,12 @@ impl MemoryServant {
                 Some(exit) = killed.recv() => exit,
                 code = program(process) => exit(Some(code), None),
             };
-            servant.exited(node, exit).await;
+            servant.on_node_exit(node, exit).await;
         });
         Ok(())
     }
 
-    async fn exited(self: &Arc<Self>, node: NodeSpec, exit: NodeExit) {
+    async fn on_node_exit(self: &Arc<Self>, node: NodeSpec, exit: NodeExit) {
         let name = node.name.clone();
         let event = NodeEvent::Exited {
             node: name.clone(),
@@ -252,7 +253,7 @@ impl MemoryServant {
             signal: exit.signal,
             out_of_memory: exit.out_of_memory,
         };
-        let for_good = self.over(&name, exit, event);
+        let for_good = self.record_node_end(&name, exit, event);
         if for_good || self.state.borrow().is_over() {
             return;
         }
@@ -277,8 +278,8 @@ impl MemoryServant {
         }
     }
 
-    /// Notes the end of a node; whether it is for good.
-    fn over(&self, name: &str, exit: NodeExit, event: NodeEvent) -> bool {
+    /// Records the end of a node; returns whether it ended for good.
+    fn record_node_end(&self, name: &str, exit: NodeExit, event: NodeEvent) -> bool {
         self.graph.send_modify(|graph| {
             let mut next = Graph::clone(graph);
             next.generation += 1;
@@ -301,7 +302,7 @@ impl MemoryServant {
 }
 
 #[async_trait]
-impl Servant for MemoryServant {
+impl ServantHandle for MemoryServant {
     fn id(&self) -> &str {
         &self.id
     }
@@ -314,15 +315,15 @@ impl Servant for MemoryServant {
         self.events.subscribe()
     }
 
-    fn enforced(&self) -> Enforced {
-        Enforced {
+    fn enforced_limits(&self) -> EnforcedLimits {
+        EnforcedLimits {
             limits: *self.limits.borrow(),
-            ..Enforced::default()
+            ..EnforcedLimits::default()
         }
     }
 
-    async fn set_limits(&self, limits: Limits) -> Result<Enforced, Error> {
-        self.answers().await;
+    async fn set_limits(&self, limits: ResourceLimits) -> Result<EnforcedLimits, Error> {
+        self.wait_until_responsive().await;
         self.check_runs()?;
         let held: u64 = self.nodes.borrow().values().map(|node| node.held).sum();
         if limits.memory.is_some_and(|memory| memory < held) {
@@ -340,7 +341,7 @@ impl Servant for MemoryServant {
             lifted(&mut known.io_read);
             lifted(&mut known.io_write);
         });
-        Ok(self.enforced())
+        Ok(self.enforced_limits())
     }
 
     async fn usage(&self) -> Result<Usage, Error> {
@@ -361,9 +362,9 @@ impl Servant for MemoryServant {
 
     async fn start_node(&self, node: NodeSpec) -> Result<(), Error> {
         self.check_runs()?;
-        let world = self.world.upgrade().ok_or_else(|| self.ended())?;
-        let this = world.servant(&self.id).ok_or_else(|| self.ended())?;
-        let running = |nodes: &BTreeMap<String, Node>| {
+        let world = self.world.upgrade().ok_or_else(|| self.ended_error())?;
+        let this = world.servant(&self.id).ok_or_else(|| self.ended_error())?;
+        let running = |nodes: &BTreeMap<String, MemoryNodeState>| {
             let known = nodes.get(&node.name);
             known.is_some_and(|known| known.running.is_some())
         };
@@ -377,14 +378,14 @@ impl Servant for MemoryServant {
     }
 
     async fn signal_node(&self, node: &str, signal: i32) -> Result<(), Error> {
-        self.answers().await;
+        self.wait_until_responsive().await;
         let nodes = self.nodes.borrow();
         let known = nodes.get(node).ok_or_else(|| Error::NoNode {
             id: self.id.clone(),
             node: node.to_owned(),
         })?;
         match &known.running {
-            // None of them sets a handler.
+            // No program sets a handler for it.
             Some(running) => {
                 let _ = running.send(exit(None, Some(signal)));
                 Ok(())
@@ -415,7 +416,7 @@ impl Servant for MemoryServant {
             let known = nodes.get(node);
             known.is_none_or(|known| known.exit.is_some())
         });
-        let nodes = ended.await.map_err(|_| self.ended())?;
+        let nodes = ended.await.map_err(|_| self.ended_error())?;
         let known = nodes.get(node).ok_or_else(no_node)?;
         known.exit.clone().ok_or_else(no_node)
     }
@@ -459,7 +460,7 @@ impl Servant for MemoryServant {
     }
 
     async fn stop(&self) -> Result<(), Error> {
-        self.answers().await;
+        self.wait_until_responsive().await;
         self.end(ContainerState::Stopped {
             reason: "it was stopped".to_owned(),
         });

@@ -1,26 +1,32 @@
-//! What the report says of the queue that is fitted to a part of the points, and of the nodes that it counts.
+//! Part of the section on scaling: the queueing model fitted to some of the points, and the number of nodes computed
+//! from it.
 
 use anyhow::Result;
 
-use super::{FULL, Told};
+use super::{FULL, ReportedPoint};
 use crate::plots::{self, Series};
 use crate::section::{Section, Table};
-use crate::statistics::{Node, mean, quantile};
+use crate::statistics::{NodeModel, mean, quantile};
 use crate::words::digits;
 
-/// The mean response time that robots accept where nodes are counted, seconds.
+/// Mean response time that robots accept when nodes are counted, in seconds.
 const T_MAX: f64 = 0.1;
 /// Numbers of robots for which nodes are counted.
 const MANY: [u64; 2] = [1_000, 100_000];
-/// Part of a node's memory that servants may have, as the daemon's default.
+/// Fraction of a node's memory for servants, the daemon's default.
 const MEMORY_PART: f64 = 0.9;
 
-pub(super) fn tell(told: &[Told], node: &Node, section: &mut Section) -> Result<()> {
+pub(super) fn add_model(
+    told: &[ReportedPoint],
+    node: &NodeModel,
+    section: &mut Section,
+) -> Result<()> {
     let most = told.iter().map(|one| one.plan.robots).max().unwrap_or(1);
-    let curve = (1..=most as u64).map(|robots| (robots as f64, node.at(robots).response * 1e3));
+    let curve =
+        (1..=most as u64).map(|robots| (robots as f64, node.predict(robots).response * 1e3));
     let measured = |held_back: bool| -> Vec<(f64, f64)> {
         let some = told.iter().filter(|one| one.held_back == held_back);
-        some.filter_map(|one| Some((one.robots(), one.mean()? * 1e3)))
+        some.filter_map(|one| Some((one.robots(), one.mean_response()? * 1e3)))
             .collect()
     };
     let caption = "Mean response time by robots, and the queue that was fitted";
@@ -35,27 +41,31 @@ pub(super) fn tell(told: &[Told], node: &Node, section: &mut Section) -> Result<
         ],
         false,
     )?;
-    section.drawing("scale-model", caption, drawing);
+    section.add_drawing("scale-model", caption, drawing);
     section.findings.push(format!(
-        "A closed queue (machine repair, M/M/c//N) of {} cores, with {} ms of a core and {} ms of other waiting for each request and {} \
+        "A closed queue (machine repair, M/M/c//N) of {} cores, with {} ms of a core and {} ms of other waiting for \
+         each request and {} \
          ms of pause, predicts {}.",
         node.cores,
         digits(node.service * 1e3),
         digits(node.delay * 1e3),
         digits(node.think * 1e3),
-        error_of(told, node)
+        held_back_error(told, node)
     ));
-    nodes(told, node, section);
+    add_node_counts(told, node, section);
     Ok(())
 }
 
-/// How far the model is off where it was not fitted.
-fn error_of(told: &[Told], node: &Node) -> String {
+/// Reports the error of the model at the points that were held back.
+fn held_back_error(told: &[ReportedPoint], node: &NodeModel) -> String {
     let held_back = told.iter().filter(|one| one.held_back);
     let errors: Vec<(usize, f64)> = held_back
         .filter_map(|one| {
-            let predicted = node.at(one.plan.robots as u64).response;
-            Some((one.plan.robots, (predicted / one.mean()? - 1.0) * 100.0))
+            let predicted = node.predict(one.plan.robots as u64).response;
+            Some((
+                one.plan.robots,
+                (predicted / one.mean_response()? - 1.0) * 100.0,
+            ))
         })
         .collect();
     let sizes: Vec<f64> = errors.iter().map(|error| error.1.abs()).collect();
@@ -72,21 +82,21 @@ fn error_of(told: &[Told], node: &Node) -> String {
     )
 }
 
-/// Robots that the memory is enough for of which servants may have a part.
-pub(super) fn room(last: &Told) -> u64 {
-    (MEMORY_PART * last.point.left.1 / last.memory()) as u64
+/// Returns the number of robots whose servants fit into the memory reserved for servants.
+pub(super) fn robots_in_memory(last: &ReportedPoint) -> u64 {
+    (MEMORY_PART * last.point.left.1 / last.memory_per_robot()) as u64
 }
 
-/// Nodes like this one that more robots need.
-fn nodes(told: &[Told], node: &Node, section: &mut Section) {
+/// Adds the number of nodes like this one that more robots need.
+fn add_node_counts(told: &[ReportedPoint], node: &NodeModel, section: &mut Section) {
     let last = &told[told.len() - 1];
-    // Robots are elsewhere then.
-    let beside = last.point.used.robots / last.point.used.requests();
-    let alone = Node {
+    // Those robots run on other machines.
+    let beside = last.point.used.robots / last.point.used.request_cores();
+    let alone = NodeModel {
         service: node.service * (1.0 - beside),
         ..*node
     };
-    let memory = room(last);
+    let memory = robots_in_memory(last);
     let admits = last.point.admits;
     let caption = format!(
         "Nodes like this one ({} cores, {:.0} GB) for a mean response time of {:.0} ms at most",
@@ -105,7 +115,7 @@ fn nodes(told: &[Told], node: &Node, section: &mut Section) {
         ],
     );
     for robots in MANY {
-        let served = alone.serves(robots, T_MAX);
+        let served = alone.robots_served(robots, T_MAX);
         let each = served.min(memory).min(admits);
         let needed = if each == 0 {
             "no number is enough".to_owned()
@@ -132,14 +142,15 @@ fn nodes(told: &[Told], node: &Node, section: &mut Section) {
     }
     section.tables.push(table);
     section.differs.push(format!(
-        "Nodes are counted without the robots' own part of the processor ({:.0} % here), without a network, and as if robots were spread \
+        "Nodes are counted without the robots' own part of the processor ({:.0} % here), without a network, and as if \
+         robots were spread \
          evenly: what a machine that spreads them would take is not in it.",
         beside * 100.0
     ));
-    if last.busy() < FULL {
+    if last.busy_share() < FULL {
         section.differs.push(format!(
             "The cores were at most {:.0} % busy in this run: what the model says of more robots was not checked.",
-            last.busy() * 100.0
+            last.busy_share() * 100.0
         ));
     }
 }

@@ -1,16 +1,16 @@
 use super::*;
-use crate::experiments::scale::counters::Cores;
+use crate::experiments::scale::counters::CoreUsage;
 
-/// A node of which everything is known: 2 cores, 10 ms of a core for each request, of which the robot uses 1 ms, 2 ms of delay.
-const NODE: Node = Node {
+/// A known node: 2 cores, 10 ms of a core per request, of which the robot uses 1 ms, and 2 ms of delay.
+const NODE: NodeModel = NodeModel {
     cores: 2.0,
     think: THINK,
     service: 0.010,
     delay: 0.002,
 };
 
-fn measured(robots: usize) -> (Plan, Measured<Point>) {
-    let plan = Plan {
+fn measured_point(robots: usize) -> (ScalePlan, CachedResult<ScalePoint>) {
+    let plan = ScalePlan {
         robots,
         settles: 1.0,
         lasts: 10.0,
@@ -18,13 +18,13 @@ fn measured(robots: usize) -> (Plan, Measured<Point>) {
         work: 8,
         cores: 2.0,
     };
-    let closed = NODE.at(robots as u64);
+    let closed = NODE.predict(robots as u64);
     let requests = (closed.throughput * 10.0).round() as usize;
-    let point = Point {
+    let point = ScalePoint {
         starts: vec![(robots, 0.3)],
         times: vec![closed.response; requests],
         lasted: 10.0,
-        used: Cores {
+        used: CoreUsage {
             machine: closed.busy * 2.0,
             daemon: closed.busy * 2.0 * 0.1,
             servants: closed.busy * 2.0 * 0.8,
@@ -35,11 +35,16 @@ fn measured(robots: usize) -> (Plan, Measured<Point>) {
         left: (16e9 - robots as f64 * 25e6, 20e9),
         admits: 200,
     };
-    (plan, Measured::Done(point))
+    (plan, CachedResult::Done(point))
 }
 
-fn told(robots: &[usize]) -> Section {
-    let runs = Runs(robots.iter().map(|robots| measured(*robots)).collect());
+fn section_for(robots: &[usize]) -> Section {
+    let runs = ScaleRuns(
+        robots
+            .iter()
+            .map(|robots| measured_point(*robots))
+            .collect(),
+    );
     section(&runs).expect("it is told")
 }
 
@@ -53,7 +58,7 @@ fn finding<'a>(section: &'a Section, word: &str) -> &'a str {
 
 #[test]
 fn the_model_is_checked_where_it_was_not_fitted() {
-    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let section = section_for(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let model = finding(&section, "closed queue");
     assert!(
         model.contains("of 2 cores, with 10.00 ms of a core and 2.00"),
@@ -68,10 +73,11 @@ fn the_model_is_checked_where_it_was_not_fitted() {
     assert!(section.missing.is_empty());
 }
 
-/// 9 ms of a core without the robots: 222 requests a second, which robots that ask every 0.3 s make 66.7 of; with chance, somewhat fewer.
+/// 9 ms of a core without the robots: 222 requests per second, of which each robot, with a request every 0.3 s, makes
+/// 3.3, so 66.7 robots; with random arrivals somewhat fewer.
 #[test]
 fn nodes_are_counted_by_what_is_scarce() {
-    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let section = section_for(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let table = section.tables.last().expect("nodes");
     let each: u64 = table.rows[0][1].parse().expect("a number");
     assert!((60..=67).contains(&each), "{each}");
@@ -82,7 +88,7 @@ fn nodes_are_counted_by_what_is_scarce() {
 
 #[test]
 fn the_bend_and_its_reason_are_told() {
-    let section = told(&[1, 2, 4, 8, 16, 32, 64, 100]);
+    let section = section_for(&[1, 2, 4, 8, 16, 32, 64, 100]);
     let bend = finding(&section, "times that alone");
     assert!(
         bend.starts_with(
@@ -97,7 +103,7 @@ fn the_bend_and_its_reason_are_told() {
         first.contains("after 300 ms on an empty node (the first one) and"),
         "{first}"
     );
-    let few = told(&[1, 2, 4]);
+    let few = section_for(&[1, 2, 4]);
     let bend = finding(&few, "does not bend");
     assert!(bend.starts_with("Up to 4 robots"), "{bend}");
     assert!(
@@ -110,16 +116,16 @@ fn the_bend_and_its_reason_are_told() {
 #[test]
 fn a_machine_that_is_not_quiet_is_told_of() {
     let all = [1, 2, 4, 8, 16, 32, 64, 100];
-    let quiet = told(&all);
+    let quiet = section_for(&all);
     assert!(
         !quiet
             .findings
             .iter()
             .any(|words| words.contains("Other programs"))
     );
-    let mut runs = Runs(all.map(measured).into());
+    let mut runs = ScaleRuns(all.map(measured_point).into());
     for (_, measured) in &mut runs.0 {
-        let Measured::Done(point) = measured else {
+        let CachedResult::Done(point) = measured else {
             continue;
         };
         point.used.machine = 2.0;
@@ -135,8 +141,8 @@ fn a_machine_that_is_not_quiet_is_told_of() {
 
 #[test]
 fn what_is_missing_is_named_and_the_rest_is_told() {
-    let mut runs = Runs([1, 2, 4].map(measured).into());
-    runs.0[2].1 = Measured::Missing("no room".to_owned());
+    let mut runs = ScaleRuns([1, 2, 4].map(measured_point).into());
+    runs.0[2].1 = CachedResult::Missing("no room".to_owned());
     let section = section(&runs).expect("it is told");
     let whats: Vec<&str> = section
         .missing
@@ -147,12 +153,12 @@ fn what_is_missing_is_named_and_the_rest_is_told() {
     assert_eq!(section.tables[0].rows[0][1..3], ["over 5", "0.30"]);
 }
 
-/// As after an evaluation that was cut off behind the first two points.
+/// As after an evaluation that was interrupted after the first two points.
 #[test]
 fn a_robot_that_came_anew_is_counted_once() {
-    let mut runs = Runs([1, 2, 4].map(measured).into());
+    let mut runs = ScaleRuns([1, 2, 4].map(measured_point).into());
     for (at, (_, measured)) in runs.0.iter_mut().enumerate() {
-        let Measured::Done(point) = measured else {
+        let CachedResult::Done(point) = measured else {
             continue;
         };
         point.starts = match at {

@@ -3,21 +3,21 @@
 use std::sync::Arc;
 
 use access::Operation;
-use ros::bus::Outcome;
+use ros::bus::GoalOutcome;
 use rosbridge::{ActionFeedback, ActionResult, AdvertiseAction, GoalStatus, UnadvertiseAction};
 
 use super::server::ActionServer;
 use crate::client::decoding::{decode, decode_args};
-use crate::client::{Client, Reply};
+use crate::client::{BridgeClient, ReplyTarget};
 
-impl Client {
+impl BridgeClient {
     pub(in crate::client) fn advertise_action(
         self: &Arc<Self>,
         op: &AdvertiseAction<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let name = self.resolve(&op.action)?.into_owned();
-        self.granted().check(Operation::Advertise, &name)?;
+        self.client_grants().check(Operation::Advertise, &name)?;
         let def = self.action_def(&name, &op.type_name)?;
         let limit = self.shared.options.max_advertisements;
         if self.actions.lock().served.len() >= limit {
@@ -25,7 +25,7 @@ impl Client {
                 "this client serves {limit} actions already; unadvertise one"
             ));
         }
-        // The earlier one first: it says of its goals that they are given up.
+        // The earlier one is dropped first, which aborts its goals.
         let earlier = self.actions.lock().served.remove(&name);
         if earlier.is_some() {
             self.warn(
@@ -34,7 +34,7 @@ impl Client {
             );
         }
         drop(earlier);
-        // Under the lock: what its first goal is answered with finds it.
+        // Under the lock, so that the answer to its first goal finds the server.
         let mut actions = self.actions.lock();
         let server = ActionServer::open(self, &name, op, def)?;
         let replaced = actions.served.insert(name.clone(), server);
@@ -47,7 +47,7 @@ impl Client {
     pub(in crate::client) fn unadvertise_action(
         &self,
         op: &UnadvertiseAction<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         let name = self.resolve(&op.action)?;
         let gone = self.actions.lock().served.remove(&*name);
@@ -64,13 +64,18 @@ impl Client {
         Ok(())
     }
 
-    /// The client's result of that goal cannot be used: the goal is ended as failed, so that its sender does not wait for ever.
-    pub(in crate::client) fn result_is_lost(&self, request: &str, reason: &str) {
+    /// Fails the goal whose result from the client is unusable, so that its sender does not wait forever.
+    pub(in crate::client) fn fail_lost_result(&self, request: &str, reason: &str) {
         let servers: Vec<_> = self.actions.lock().served.values().cloned().collect();
         let text = format!("the result cannot be used: {reason}");
         for server in servers {
-            // Most of them have no such goal.
-            let ended = server.end_goal(request, Outcome::Aborted, &text, server.nothing());
+            // Only one of them has the goal.
+            let ended = server.end_goal(
+                request,
+                GoalOutcome::Aborted,
+                &text,
+                server.default_result(),
+            );
             if ended.is_ok() {
                 return;
             }
@@ -105,20 +110,25 @@ impl Client {
             Some(values) => values.text(),
         };
         let outcome = match op.status {
-            Some(GoalStatus::Canceled) => Outcome::Canceled,
-            Some(GoalStatus::Aborted) => Outcome::Aborted,
-            _ if !op.result => Outcome::Aborted,
-            _ => Outcome::Succeeded,
+            Some(GoalStatus::Canceled) => GoalOutcome::Canceled,
+            Some(GoalStatus::Aborted) => GoalOutcome::Aborted,
+            _ if !op.result => GoalOutcome::Aborted,
+            _ => GoalOutcome::Succeeded,
         };
-        // Who fails says why in a text, or gives a result all the same.
+        // A failure has a reason as text, or a result all the same.
         if let Some(text) = text {
-            return server.end_goal(&request, outcome, &text, server.nothing());
+            return server.end_goal(&request, outcome, &text, server.default_result());
         }
         match decode_args(&server.def.result, op.values, op.compression) {
             Ok(body) => server.end_goal(&request, outcome, "", body),
             Err(reason) => {
                 let text = format!("the result does not fit: {reason}");
-                server.end_goal(&request, Outcome::Aborted, &text, server.nothing())?;
+                server.end_goal(
+                    &request,
+                    GoalOutcome::Aborted,
+                    &text,
+                    server.default_result(),
+                )?;
                 Err(reason)
             }
         }

@@ -4,49 +4,49 @@ use std::sync::{Arc, OnceLock, Weak};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use ros::bus::{GoalEnd, GoalEvents, Outcome};
+use ros::bus::{GoalEnd, GoalEvents, GoalOutcome};
 use ros::codec;
 use ros::schema::{ActionDef, MessageType};
 use rosbridge::{Compression, GoalStatus, Id, Writer};
 
-use crate::client::{Client, Reply, UnderWay, print_format};
-use crate::sample::Frame;
+use crate::client::{BridgeClient, InFlightGuard, ReplyTarget, payload_format};
+use crate::sample::EncodedFrame;
 
-/// Feedback is left out while so many answers wait.
+/// Number of queued answers above which feedback is dropped.
 const FEEDBACK_WAITS: usize = 256;
 
-/// One action that a client sends goals to.
+/// An action that a client sends goals to.
 pub(super) struct ActionClient {
     pub(super) def: Arc<ActionDef>,
     pub(super) bus: Box<dyn ros::bus::ActionClient>,
 }
 
-/// One goal of a client.
-pub(super) struct Goal {
-    pub(super) client: Weak<Client>,
-    /// As the client wrote it.
+/// A goal of a client.
+pub(super) struct SentGoal {
+    pub(super) client: Weak<BridgeClient>,
+    /// Name of the action as the client wrote it.
     pub(super) action: String,
     pub(super) id: Option<Id<'static>>,
-    /// What its server calls it; empty where it is refused.
+    /// Id used by the server; empty for refused goals.
     pub(super) goal_id: String,
     pub(super) feedback: bool,
     pub(super) compression: Compression,
     pub(super) fragment_size: Option<usize>,
-    /// Its definition and the count of goals under way; none where it is refused.
-    pub(super) begun: Option<(Arc<ActionDef>, UnderWay)>,
-    /// When it went to the servant.
+    /// The definition and the guard that counts the goal as in progress; `None` for refused goals.
+    pub(super) begun: Option<(Arc<ActionDef>, InFlightGuard)>,
+    /// Time at which it was sent to the servant.
     pub(super) sent: OnceLock<Instant>,
 }
 
-impl GoalEvents for Goal {
-    fn feedback(&self, body: Bytes) {
+impl GoalEvents for SentGoal {
+    fn on_feedback(&self, body: Bytes) {
         let (Some(client), Some((def, _))) = (self.client.upgrade(), &self.begun) else {
             return;
         };
         if !self.feedback {
             return;
         }
-        if client.outbox.control_waiting() >= FEEDBACK_WAITS {
+        if client.outbox.control_len() >= FEEDBACK_WAITS {
             client.shared.metrics.dropped.add(1);
             client.shared.metrics.dropped_bytes.add(body.len() as u64);
             return;
@@ -57,56 +57,56 @@ impl GoalEvents for Goal {
         }
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
-        self.tell(&end);
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
+        self.record_duration(&end);
         let (status, end) = match end {
             Err(reason) => return self.fail(&reason),
             Ok(end) => match end.outcome {
-                Outcome::Succeeded => (GoalStatus::Succeeded, end),
-                Outcome::Canceled => (GoalStatus::Canceled, end),
-                Outcome::Aborted => (GoalStatus::Aborted, end),
-                Outcome::Unknown => (GoalStatus::Unknown, end),
-                Outcome::Rejected if end.text.is_empty() => {
+                GoalOutcome::Succeeded => (GoalStatus::Succeeded, end),
+                GoalOutcome::Canceled => (GoalStatus::Canceled, end),
+                GoalOutcome::Aborted => (GoalStatus::Aborted, end),
+                GoalOutcome::Unknown => (GoalStatus::Unknown, end),
+                GoalOutcome::Rejected if end.text.is_empty() => {
                     return self.fail("the goal was rejected");
                 }
-                Outcome::Rejected => return self.fail(&end.text),
+                GoalOutcome::Rejected => return self.fail(&end.text),
             },
         };
         self.succeed(status, &end.text, &end.result);
     }
 }
 
-impl Goal {
-    /// Tells how long it took; nothing where its client has cancelled it, which says nothing of the server.
-    fn tell(&self, end: &Result<GoalEnd, String>) {
+impl SentGoal {
+    /// Records the duration; nothing if the client has cancelled the goal, which says nothing about the server.
+    fn record_duration(&self, end: &Result<GoalEnd, String>) {
         let outcome = end.as_ref().ok().map(|end| end.outcome);
         let (Some(client), Some(sent)) = (self.client.upgrade(), self.sent.get()) else {
             return;
         };
         let took: Option<Duration> = match outcome {
-            Some(Outcome::Canceled) => return,
-            Some(Outcome::Succeeded) => Some(sent.elapsed()),
+            Some(GoalOutcome::Canceled) => return,
+            Some(GoalOutcome::Succeeded) => Some(sent.elapsed()),
             _ => None,
         };
-        client.shared.options.called.tell(took);
+        client.shared.options.called.record(took);
     }
 
-    fn reply(&self) -> Reply {
-        Reply {
+    fn reply(&self) -> ReplyTarget {
+        ReplyTarget {
             id: self.id.clone(),
-            format: print_format(self.compression),
+            format: payload_format(self.compression),
         }
     }
 
     fn frame(
         &self,
-        client: &Client,
+        client: &BridgeClient,
         op: &str,
         message_type: &MessageType,
         body: &[u8],
         rest: impl FnOnce(&mut Writer<'_>),
-    ) -> Result<Frame, String> {
-        let format = print_format(self.compression);
+    ) -> Result<EncodedFrame, String> {
+        let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
         let mut writer = Writer::op(&mut out, format, op, self.id.as_ref());
         writer.text("action", &self.action);
@@ -120,7 +120,7 @@ impl Goal {
         }
         rest(&mut writer);
         writer.end();
-        Ok(Frame::new(format, out))
+        Ok(EncodedFrame::new(format, out))
     }
 
     /// Answers with a result.
@@ -141,13 +141,13 @@ impl Goal {
         }
     }
 
-    fn answer(&self, client: &Client, frame: Frame) {
+    fn answer(&self, client: &BridgeClient, frame: EncodedFrame) {
         client.actions.lock().goals.remove(&self.goal_id);
         client.send_as(frame, self.compression, self.fragment_size);
     }
 
-    /// Answers that it was cancelled before its server has heard of it.
-    pub(super) fn recalled(&self) {
+    /// Answers that the goal was cancelled before it was sent to its server.
+    pub(super) fn answer_recalled(&self) {
         if let Some((def, _)) = &self.begun {
             let nothing = codec::default_message(&def.result);
             self.succeed(GoalStatus::Canceled, "", &nothing);
@@ -158,7 +158,7 @@ impl Goal {
         let Some(client) = self.client.upgrade() else {
             return;
         };
-        let format = print_format(self.compression);
+        let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256);
         let mut writer = Writer::op(&mut out, format, "action_result", self.id.as_ref());
         writer.text("action", &self.action);
@@ -166,6 +166,6 @@ impl Goal {
         writer.integer("status", GoalStatus::Unknown as i64);
         writer.boolean("result", false);
         writer.end();
-        self.answer(&client, Frame::new(format, out));
+        self.answer(&client, EncodedFrame::new(format, out));
     }
 }

@@ -11,15 +11,15 @@ use ros::schema::ActionDef;
 use rosbridge::{CancelActionGoal, Compression, Format, SendActionGoal};
 use tokio_util::sync::CancellationToken;
 
-use super::UnderWayGoal;
-use super::goals::{ActionClient, Goal};
+use super::ActiveGoal;
+use super::goals::{ActionClient, SentGoal};
 use crate::client::decoding::decode_args;
-use crate::client::{Client, Reply};
-use crate::names::other_type;
+use crate::client::{BridgeClient, ReplyTarget};
+use crate::names::type_mismatch;
 use crate::tf;
 
-/// A goal that was read and is to be sent.
-struct Prepared {
+/// A goal that is ready to be sent.
+struct PreparedGoal {
     action: Arc<ActionClient>,
     name: String,
     goal_id: String,
@@ -27,11 +27,11 @@ struct Prepared {
     recalled: CancellationToken,
 }
 
-impl Client {
+impl BridgeClient {
     pub(in crate::client) fn send_action_goal(
         self: &Arc<Self>,
         op: SendActionGoal<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
     ) -> Result<(), String> {
         self.shared.metrics.goals.add(1);
         let compression = op.compression.unwrap_or(match reply.format {
@@ -39,11 +39,11 @@ impl Client {
             Format::Cbor => Compression::Cbor,
         });
         if let Some(id) = &reply.id
-            && self.actions.lock().goal_of(id).is_some()
+            && self.actions.lock().find_goal_id(id).is_some()
         {
             return Err(format!("a goal with id {id} is under way already"));
         }
-        let goal = Goal {
+        let goal = SentGoal {
             client: Arc::downgrade(self),
             action: op.action.clone().into_owned(),
             id: reply.id.clone(),
@@ -54,18 +54,18 @@ impl Client {
             begun: None,
             sent: OnceLock::new(),
         };
-        let prepared = self.begin(op.args).and_then(|guard| {
+        let prepared = self.begin_call(op.args).and_then(|guard| {
             let prepared = self.prepare_goal(&op, reply, compression)?;
             Ok((prepared, guard))
         });
         match prepared {
             Ok((prepared, guard)) => {
-                let goal = Goal {
+                let goal = SentGoal {
                     goal_id: prepared.goal_id.clone(),
                     begun: Some((prepared.action.def.clone(), guard)),
                     ..goal
                 };
-                let known = UnderWayGoal {
+                let known = ActiveGoal {
                     action: prepared.name.clone(),
                     id: goal.id.clone(),
                     recalled: prepared.recalled.clone(),
@@ -83,16 +83,16 @@ impl Client {
     fn prepare_goal(
         self: &Arc<Self>,
         op: &SendActionGoal<'_>,
-        reply: &Reply,
+        reply: &ReplyTarget,
         compression: Compression,
-    ) -> Result<Prepared, String> {
+    ) -> Result<PreparedGoal, String> {
         let name = self.resolve(&op.action)?.into_owned();
-        self.granted().check(Operation::Call, &name)?;
+        self.client_grants().check(Operation::Call, &name)?;
         let def = self.action_def(&name, &op.action_type)?;
-        self.report_surplus(reply, "send_action_goal", &def.goal, op.args);
+        self.warn_surplus_args(reply, "send_action_goal", &def.goal, op.args);
         let body = decode_args(&def.goal, op.args, compression)?;
         let action = self.action_client(&name, def)?;
-        // As actionlib makes them: another node's, or one that has the same name later, makes no equal ones.
+        // In the format of actionlib: neither another node nor a later one of the same name makes equal ids.
         let now = Time::now();
         let goal_id = format!(
             "{}-{}-{}.{:09}",
@@ -101,7 +101,7 @@ impl Client {
             now.secs,
             now.nsecs
         );
-        Ok(Prepared {
+        Ok(PreparedGoal {
             action,
             name,
             goal_id,
@@ -124,7 +124,7 @@ impl Client {
         } else if actions.used.len() >= limit {
             return Err(format!("this client uses {limit} actions already"));
         }
-        let bus = match tf::own_action(&self.shared, name, &def) {
+        let bus = match tf::own_action_client(&self.shared, name, &def) {
             Some(own) => own,
             None => {
                 let opened = self.shared.bus.action_client(name, &def);
@@ -142,14 +142,15 @@ impl Client {
         &self,
         op: &CancelActionGoal<'_>,
     ) -> Result<(), String> {
-        let goal_id = self.actions.lock().goal_of(&op.id);
-        match goal_id.is_some_and(|goal_id| self.cancel_goal(&goal_id)) {
-            true => Ok(()),
-            false => Err(format!("no goal with id {} is under way", op.id)),
+        let goal_id = self.actions.lock().find_goal_id(&op.id);
+        if goal_id.is_some_and(|goal_id| self.cancel_goal(&goal_id)) {
+            Ok(())
+        } else {
+            Err(format!("no goal with id {} is under way", op.id))
         }
     }
 
-    /// Cancels a goal by its server's name for it; false where it is not under way.
+    /// Cancels a goal by the server's id; returns false if it is not in progress.
     pub(in crate::client) fn cancel_goal(&self, goal_id: &str) -> bool {
         let actions = self.actions.lock();
         let Some(goal) = actions.goals.get(goal_id) else {
@@ -160,16 +161,16 @@ impl Client {
         };
         let recalled = goal.recalled.clone();
         drop(actions);
-        // One that still waits for its server need not be sent at all; `run_goal` looks at this last of all.
+        // A goal that still waits for its server need not be sent at all; `run_goal` checks this last.
         recalled.cancel();
-        action.bus.cancel(goal_id);
+        action.bus.cancel_goal(goal_id);
         true
     }
 }
 
-/// Sends a goal when its server is there.
-async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
-    let Prepared {
+/// Sends a goal when its server is available.
+async fn run_goal(prepared: PreparedGoal, goal: Arc<SentGoal>) {
+    let PreparedGoal {
         action,
         name,
         goal_id,
@@ -184,8 +185,8 @@ async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
     };
     let ready = tokio::select! {
         () = ended.cancelled() => return,
-        () = recalled.cancelled() => return goal.recalled(),
-        ready = action.bus.ready(patience) => ready,
+        () = recalled.cancelled() => return goal.answer_recalled(),
+        ready = action.bus.wait_for_server(patience) => ready,
     };
     match ready {
         Ok(()) => {}
@@ -195,11 +196,11 @@ async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
         }
         Err(BusError::TypeMismatch { theirs, ours, .. }) => {
             let action = format!("action {name}");
-            return goal.fail(&other_type(&action, &theirs, &ours));
+            return goal.fail(&type_mismatch(&action, &theirs, &ours));
         }
         Err(error) => return goal.fail(&error.to_string()),
     }
-    // What the robot's own clients serve says nothing of the servant.
+    // Services of the robot's own clients say nothing about the servant.
     let own = goal.client.upgrade().is_some_and(|client| {
         let bus = &client.shared.bus;
         let graph = bus.graph().borrow().clone();
@@ -209,9 +210,9 @@ async fn run_goal(prepared: Prepared, goal: Arc<Goal>) {
     if !own {
         let _ = goal.sent.set(Instant::now());
     }
-    action.bus.send(&goal_id, body, goal);
+    action.bus.send_goal(&goal_id, body, goal);
     // Cancelled while it was being sent.
     if recalled.is_cancelled() {
-        action.bus.cancel(&goal_id);
+        action.bus.cancel_goal(&goal_id);
     }
 }

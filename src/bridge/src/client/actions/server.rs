@@ -5,59 +5,64 @@ use std::sync::{Arc, OnceLock, Weak};
 
 use bytes::Bytes;
 use parking_lot::Mutex;
-use ros::bus::{ActionHandler, GoalEnd, Outcome};
+use ros::bus::{ActionHandler, GoalEnd, GoalOutcome};
 use ros::codec;
 use ros::schema::ActionDef;
-use rosbridge::{AdvertiseAction, CancelActionGoal, Compression, Id, Level, Writer};
+use rosbridge::{AdvertiseAction, CancelActionGoal, Compression, Id, StatusLevel, Writer};
 
-use crate::client::{Client, print_format};
-use crate::sample::Frame;
+use crate::client::{BridgeClient, payload_format};
+use crate::sample::EncodedFrame;
 
-/// Why goals are given up.
+/// Reason for aborting goals.
 const GONE: &str = "the client that serves this action is gone";
 
-/// One action that a client serves.
+/// An action that a client serves.
 pub(in crate::client) struct ActionServer {
     name: String,
-    /// As the client wrote it.
+    /// Name as the client wrote it.
     written: String,
     pub(super) def: Arc<ActionDef>,
     compression: Compression,
-    /// Goals under way, by what the client calls them: what the bus calls them.
+    /// Goals in progress: from the client's ids to the bus's.
     goals: Mutex<HashMap<String, String>>,
-    /// Set once, right after it was made: goals come to the server itself.
+    /// Set once, right after construction: goals are sent to the server itself.
     bus: OnceLock<Box<dyn ros::bus::ActionServer>>,
-    client: Weak<Client>,
+    client: Weak<BridgeClient>,
 }
 
-/// Passes goals to the client.
-struct Handler(Weak<ActionServer>);
+/// Forwards goals to the client.
+struct GoalHandler(Weak<ActionServer>);
 
-impl ActionHandler for Handler {
-    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+impl ActionHandler for GoalHandler {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
         let server = self.0.upgrade().ok_or(GONE)?;
-        server.goal(id, &goal)
+        server.send_goal(id, &goal)
     }
 
-    fn cancel(&self, id: &str) {
+    fn on_cancel(&self, id: &str) {
         if let Some(server) = self.0.upgrade() {
             server.cancel(id);
         }
     }
 
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         if let Some(server) = self.0.upgrade()
             && let Some(client) = server.client.upgrade()
         {
             let text = format!("advertise_action: action {}: {reason}", server.name);
-            client.status(Level::Error, None, print_format(server.compression), &text);
+            client.send_status(
+                StatusLevel::Error,
+                None,
+                payload_format(server.compression),
+                &text,
+            );
         }
     }
 }
 
 impl ActionServer {
     pub(super) fn open(
-        client: &Arc<Client>,
+        client: &Arc<BridgeClient>,
         name: &str,
         op: &AdvertiseAction<'_>,
         def: Arc<ActionDef>,
@@ -71,14 +76,14 @@ impl ActionServer {
             bus: OnceLock::new(),
             client: Arc::downgrade(client),
         });
-        let handler = Arc::new(Handler(Arc::downgrade(&server)));
+        let handler = Arc::new(GoalHandler(Arc::downgrade(&server)));
         let served = client.shared.bus.serve_action(name, &server.def, handler);
-        // Set once, here.
+        // Only set here.
         let _ = server.bus.set(served.map_err(|error| error.to_string())?);
         Ok(server)
     }
 
-    fn goal(&self, id: &str, body: &Bytes) -> Result<(), String> {
+    fn send_goal(&self, id: &str, body: &Bytes) -> Result<(), String> {
         let client = self.client.upgrade().ok_or(GONE)?;
         let number = client.shared.next_number();
         let request = format!("action_goal:{}:{number}", self.name);
@@ -88,8 +93,13 @@ impl ActionServer {
         Ok(())
     }
 
-    fn frame(&self, client: &Client, request: &str, body: &Bytes) -> Result<Frame, String> {
-        let format = print_format(self.compression);
+    fn frame(
+        &self,
+        client: &BridgeClient,
+        request: &str,
+        body: &Bytes,
+    ) -> Result<EncodedFrame, String> {
+        let format = payload_format(self.compression);
         let mut out = Vec::with_capacity(256 + body.len());
         let mut writer = Writer::op(
             &mut out,
@@ -109,7 +119,7 @@ impl ActionServer {
         }
         writer.boolean("feedback", true);
         writer.end();
-        Ok(Frame::new(format, out))
+        Ok(EncodedFrame::new(format, out))
     }
 
     fn cancel(&self, id: &str) {
@@ -123,7 +133,7 @@ impl ActionServer {
                 id: request.into(),
                 action: (&*self.written).into(),
             };
-            client.send(op.into(), print_format(self.compression));
+            client.send(op.into(), payload_format(self.compression));
         }
     }
 
@@ -132,21 +142,21 @@ impl ActionServer {
         format!("action {action} has no goal with id {request:?} under way")
     }
 
-    /// Passes on how the goal that the client calls `request` gets on.
+    /// Publishes feedback on the goal that the client knows as `request`.
     pub(super) fn publish_feedback(&self, request: &str, body: Bytes) -> Result<(), String> {
         let id = self.goals.lock().get(request).cloned();
         let told = match (id, self.bus.get()) {
-            (Some(id), Some(bus)) => bus.feedback(&id, body),
+            (Some(id), Some(bus)) => bus.publish_feedback(&id, body),
             _ => false,
         };
         told.then_some(()).ok_or_else(|| self.no_such_goal(request))
     }
 
-    /// Ends the goal that the client calls `request`.
+    /// Ends the goal that the client knows as `request`.
     pub(super) fn end_goal(
         &self,
         request: &str,
-        outcome: Outcome,
+        outcome: GoalOutcome,
         text: &str,
         result: Bytes,
     ) -> Result<(), String> {
@@ -157,7 +167,7 @@ impl ActionServer {
             result,
         };
         let ended = match (id, self.bus.get()) {
-            (Some(id), Some(bus)) => bus.end(&id, end),
+            (Some(id), Some(bus)) => bus.end_goal(&id, end),
             _ => false,
         };
         ended
@@ -165,8 +175,8 @@ impl ActionServer {
             .ok_or_else(|| self.no_such_goal(request))
     }
 
-    /// A result of defaults.
-    pub(super) fn nothing(&self) -> Bytes {
+    /// Returns a result with default values.
+    pub(super) fn default_result(&self) -> Bytes {
         codec::default_message(&self.def.result).into()
     }
 }
@@ -177,11 +187,11 @@ impl Drop for ActionServer {
         for id in goals.into_values() {
             if let Some(bus) = self.bus.get() {
                 let end = GoalEnd {
-                    outcome: Outcome::Aborted,
+                    outcome: GoalOutcome::Aborted,
                     text: GONE.to_owned(),
-                    result: self.nothing(),
+                    result: self.default_result(),
                 };
-                bus.end(&id, end);
+                bus.end_goal(&id, end);
             }
         }
     }

@@ -13,7 +13,7 @@ fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -
         id,
         measure,
         value,
-        aux: known(aux),
+        aux: aux_of(aux),
         limits: Limits {
             cpus: Some(cpus),
             ..Limits::default()
@@ -24,7 +24,7 @@ fn row(id: i64, measure: Measure, value: f64, cpus: f64, aux: &[(&str, &str)]) -
     }
 }
 
-fn known(aux: &[(&str, &str)]) -> Aux {
+fn aux_of(aux: &[(&str, &str)]) -> Aux {
     aux.iter()
         .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
         .collect()
@@ -38,8 +38,8 @@ fn goal(desire: f64, bound: f64) -> Goal {
     }
 }
 
-fn shelf<'a>(rows: &'a [Row], aux: &'a Aux) -> Shelf<'a> {
-    Shelf {
+fn view<'a>(rows: &'a [Row], aux: &'a Aux) -> DictionaryView<'a> {
+    DictionaryView {
         rows,
         aux,
         own: Limits::default(),
@@ -48,14 +48,15 @@ fn shelf<'a>(rows: &'a [Row], aux: &'a Aux) -> Shelf<'a> {
     }
 }
 
-/// The number of the row that is taken, and whether it reaches the desire; else the best one and the one that is too dear.
-type Taken = Result<Option<(i64, bool)>, (Option<i64>, Option<i64>)>;
+/// The number of the chosen row, and whether it reaches the desired value; otherwise the best one and the one that is
+/// too expensive.
+type ChoiceOutcome = Result<Option<(i64, bool)>, (Option<i64>, Option<i64>)>;
 
-fn taken(choice: &Choice<'_>) -> Taken {
+fn choice_outcome(choice: &RowChoice<'_>) -> ChoiceOutcome {
     match choice {
-        Choice::Silent => Ok(None),
-        Choice::Taken { row, desired, .. } => Ok(Some((row.id, *desired))),
-        Choice::Unmet { best, beyond, .. } => {
+        RowChoice::Silent => Ok(None),
+        RowChoice::Taken { row, desired, .. } => Ok(Some((row.id, *desired))),
+        RowChoice::Unmet { best, beyond, .. } => {
             Err((best.map(|row| row.id), beyond.map(|row| row.id)))
         }
     }
@@ -72,13 +73,13 @@ fn the_cheapest_that_meets_the_goal_is_taken() {
         row(6, Measure::Fps, 20.0, 2.0, &[]),
     ];
     let none = Aux::new();
-    let shelf = shelf(&rows, &none);
+    let shelf = view(&rows, &none);
     for (desire, bound, most, expected) in [
         (0.100, 0.300, 4.0, Ok(Some((2, true)))),
         (0.150, 0.300, 4.0, Ok(Some((2, true)))),
         (0.200, 0.300, 4.0, Ok(Some((3, true)))),
         (0.060, 0.300, 4.0, Ok(Some((1, true)))),
-        // The desire is not reached: the best within the bound.
+        // The desired value is not reached: the best within the bound.
         (0.020, 0.300, 4.0, Ok(Some((1, false)))),
         (0.060, 0.300, 2.0, Ok(Some((2, false)))),
         (0.060, 0.300, 1.0, Ok(Some((3, false)))),
@@ -88,7 +89,7 @@ fn the_cheapest_that_meets_the_goal_is_taken() {
         (0.050, 0.300, 0.1, Err((None, Some(3)))),
     ] {
         let choice = shelf.choose(&goal(desire, bound), |row| row.limits.cpus <= Some(most));
-        assert_eq!(taken(&choice), expected, "{desire} {bound} {most}");
+        assert_eq!(choice_outcome(&choice), expected, "{desire} {bound} {most}");
     }
     let fps = |desire, bound| Goal {
         measure: Measure::Fps,
@@ -102,16 +103,16 @@ fn the_cheapest_that_meets_the_goal_is_taken() {
         (30.0, 25.0, Err((Some(6), None))),
     ] {
         let choice = shelf.choose(&fps(desire, bound), |_| true);
-        assert_eq!(taken(&choice), expected, "{desire} {bound}");
+        assert_eq!(choice_outcome(&choice), expected, "{desire} {bound}");
     }
     let age = Goal {
         measure: Measure::Age,
         desire: 1.0,
         bound: 1.0,
     };
-    assert_eq!(shelf.choose(&age, |_| true), Choice::Silent);
+    assert_eq!(shelf.choose(&age, |_| true), RowChoice::Silent);
     let next = |id: usize| {
-        let (better, weaker) = shelf.next_to(&rows[id - 1]);
+        let (better, weaker) = shelf.neighbours(&rows[id - 1]);
         (better.map(|row| row.id), weaker.map(|row| row.id))
     };
     assert_eq!(next(2), (Some(1), Some(3)));
@@ -130,25 +131,25 @@ fn cheap_is_what_takes_a_small_share_of_the_machine() {
     for (rows, expected) in [
         // A quarter of the cores against half of the memory.
         ([with(1, 1.0, 1), with(2, 0.1, 4)], 1),
-        // As much of both: the smaller other share, then the smaller number.
+        // Equal dominant shares: the smaller other share, then the smaller number.
         ([with(1, 1.0, 2), with(2, 1.0, 1)], 2),
         ([with(2, 1.0, 1), with(1, 1.0, 1)], 1),
     ] {
-        let choice = shelf(&rows, &none).choose(&goal(0.1, 0.1), |_| true);
-        assert_eq!(taken(&choice), Ok(Some((expected, true))));
+        let choice = view(&rows, &none).choose(&goal(0.1, 0.1), |_| true);
+        assert_eq!(choice_outcome(&choice), Ok(Some((expected, true))));
     }
-    // Where a row names no memory, the service's own counts.
+    // If a row names no memory, the service's own counts.
     let rows = [row(1, Measure::Rrt, 0.1, 1.0, &[]), with(2, 1.1, 1)];
     let own = Limits {
         memory: Some(Size(4 << 30)),
         ..Limits::default()
     };
-    let shelf = Shelf {
+    let shelf = DictionaryView {
         own,
-        ..shelf(&rows, &none)
+        ..view(&rows, &none)
     };
     let choice = shelf.choose(&goal(0.1, 0.1), |_| true);
-    assert_eq!(taken(&choice), Ok(Some((2, true))));
+    assert_eq!(choice_outcome(&choice), Ok(Some((2, true))));
 }
 
 #[test]
@@ -202,20 +203,20 @@ fn auxiliary_parameters_say_which_rows_hold() {
             0.05,
             Ok(Some((4, true))),
         ),
-        // What is not known may be anything that rows name.
+        // An unknown parameter may have any value that rows name.
         (&[("model", "small")], 0.1, Ok(Some((2, true)))),
         (&[("width", "640")], 0.1, Ok(Some((1, true)))),
     ] {
-        let aux = known(aux);
-        let choice = shelf(&rows, &aux).choose(&goal(desire, 0.1), |_| true);
-        assert_eq!(taken(&choice), expected, "{aux:?} {desire}");
+        let aux = aux_of(aux);
+        let choice = view(&rows, &aux).choose(&goal(desire, 0.1), |_| true);
+        assert_eq!(choice_outcome(&choice), expected, "{aux:?} {desire}");
     }
     let nothing = Aux::new();
-    let choice = shelf(&rows[..2], &nothing).choose(&goal(0.1, 0.1), |_| true);
-    let Choice::Taken { assumed, .. } = choice else {
+    let choice = view(&rows[..2], &nothing).choose(&goal(0.1, 0.1), |_| true);
+    let RowChoice::Taken { assumed, .. } = choice else {
         panic!("{choice:?}");
     };
-    assert_eq!(assumed, known(&[("width", "1920")]), "it is said");
+    assert_eq!(assumed, aux_of(&[("width", "1920")]), "it is said");
 }
 
 #[test]
@@ -236,11 +237,11 @@ fn rows_that_cannot_be_are_refused_with_what_to_write() {
             "fps = \"-1\" is not a rate",
         ),
         (
-            with(|row| row.aux = known(&[("a b", "1")])),
-            "aux.a b names no auxiliary parameter",
+            with(|row| row.aux = aux_of(&[("a b", "1")])),
+            "aux.a b is not an auxiliary parameter",
         ),
         (
-            with(|row| row.aux = known(&[("a", "")])),
+            with(|row| row.aux = aux_of(&[("a", "")])),
             "aux.a has no value",
         ),
         (with(|row| row.limits.cpus = Some(0.0)), "cpus = 0 is not"),
@@ -266,7 +267,7 @@ fn rows_that_cannot_be_are_refused_with_what_to_write() {
                     requests: 1,
                 });
             }),
-            "spread: the 95th percentile, 0.1, is less than the median, 0.2",
+            "spread: p95, 0.1, is less than p50, 0.2",
         ),
     ] {
         assert!(refused.starts_with(words), "{refused}");
@@ -277,7 +278,7 @@ fn measures() -> impl Strategy<Value = Measure> {
     prop_oneof![Just(Measure::Rrt), Just(Measure::Fps)]
 }
 
-/// Few different values, so that they meet.
+/// A few different values, so that some coincide.
 fn value() -> impl Strategy<Value = f64> {
     (1u32..12).prop_map(|n| f64::from(n) / 8.0)
 }
@@ -311,7 +312,7 @@ fn goals() -> impl Strategy<Value = Goal> {
     })
 }
 
-fn within(most: f64) -> impl Fn(&Row) -> bool {
+fn affordable_within(most: f64) -> impl Fn(&Row) -> bool {
     move |row| row.limits.cpus <= Some(most)
 }
 
@@ -320,22 +321,22 @@ proptest! {
     fn what_is_taken_meets_the_goal_and_nothing_cheaper_does(
         rows in rows(), goal in goals(), width in 1u32..6, most in value().prop_map(|n| n * 3.0),
     ) {
-        let aux = known(&[("width", &width.to_string())]);
-        let shelf = shelf(&rows, &aux);
+        let aux = aux_of(&[("width", &width.to_string())]);
+        let shelf = view(&rows, &aux);
         let open = |row: &&Row| {
             let fits = row.aux.get("width").is_none_or(|has| has.parse::<u32>().unwrap() >= width);
-            row.measure == goal.measure && fits && within(most)(row)
+            row.measure == goal.measure && fits && affordable_within(most)(row)
         };
         let reaching = |than: f64| rows.iter().filter(open).filter(move |row| goal.measure.reaches(row.value, than));
-        match shelf.choose(&goal, within(most)) {
-            Choice::Silent => prop_assert!(rows.iter().all(|row| row.measure != goal.measure)),
-            Choice::Taken { row, desired, assumed } => {
+        match shelf.choose(&goal, affordable_within(most)) {
+            RowChoice::Silent => prop_assert!(rows.iter().all(|row| row.measure != goal.measure)),
+            RowChoice::Taken { row, desired, assumed } => {
                 prop_assert!(assumed.is_empty());
                 prop_assert!(open(&row) && goal.measure.reaches(row.value, goal.bound));
                 prop_assert_eq!(desired, reaching(goal.desire).next().is_some());
                 if desired {
                     for other in reaching(goal.desire) {
-                        prop_assert!(less(shelf.cost(row), shelf.cost(other)).is_le());
+                        prop_assert!(compare_costs(shelf.cost(row), shelf.cost(other)).is_le());
                     }
                 } else {
                     for other in reaching(goal.bound) {
@@ -343,7 +344,7 @@ proptest! {
                     }
                 }
             }
-            Choice::Unmet { .. } => prop_assert!(reaching(goal.bound).next().is_none()),
+            RowChoice::Unmet { .. } => prop_assert!(reaching(goal.bound).next().is_none()),
         }
     }
 
@@ -351,40 +352,45 @@ proptest! {
     fn the_order_of_rows_does_not_matter(rows in rows(), goal in goals(), most in value()) {
         let none = Aux::new();
         let turned: Vec<Row> = rows.iter().rev().cloned().collect();
-        let one = shelf(&rows, &none).choose(&goal, within(most * 3.0)).clone();
-        let other = shelf(&turned, &none);
-        prop_assert_eq!(taken(&one), taken(&other.choose(&goal, within(most * 3.0))));
+        let one = view(&rows, &none).choose(&goal, affordable_within(most * 3.0)).clone();
+        let other = view(&turned, &none);
+        prop_assert_eq!(choice_outcome(&one), choice_outcome(&other.choose(&goal, affordable_within(most * 3.0))));
     }
 
     #[test]
     fn who_wishes_for_less_never_pays_more(rows in rows(), goal in goals(), less in value(), width in 1u32..6) {
-        let aux = known(&[("width", &width.to_string())]);
-        let shelf = shelf(&rows, &aux);
-        let relaxed = match goal.measure.reaches(less, goal.desire) {
-            true => return Ok(()),
-            false => Goal { desire: less, bound: if goal.measure.reaches(goal.bound, less) { less } else { goal.bound }, ..goal },
-        };
-        if let Choice::Taken { row, .. } = shelf.choose(&goal, |_| true) {
-            let Choice::Taken { row: other, .. } = shelf.choose(&relaxed, |_| true) else {
+        let aux = aux_of(&[("width", &width.to_string())]);
+        let shelf = view(&rows, &aux);
+        let relaxed = if goal.measure.reaches(less, goal.desire) {
+return Ok(())
+} else {
+Goal {
+                desire: less,
+                bound: if goal.measure.reaches(goal.bound, less) { less } else { goal.bound },
+                ..goal
+            }
+};
+        if let RowChoice::Taken { row, .. } = shelf.choose(&goal, |_| true) {
+            let RowChoice::Taken { row: other, .. } = shelf.choose(&relaxed, |_| true) else {
                 panic!("it could be met before");
             };
-            prop_assert!(super::less(shelf.cost(other), shelf.cost(row)).is_le());
+            prop_assert!(super::compare_costs(shelf.cost(other), shelf.cost(row)).is_le());
         }
     }
 
     #[test]
     fn who_does_not_say_pays_for_the_dearest_that_rows_know(rows in rows(), goal in goals()) {
         let nothing = Aux::new();
-        let Choice::Taken { row, .. } = shelf(&rows, &nothing).choose(&goal, |_| true) else {
+        let RowChoice::Taken { row, .. } = view(&rows, &nothing).choose(&goal, |_| true) else {
             return Ok(());
         };
         for width in rows.iter().filter(|row| row.measure == goal.measure).filter_map(|row| row.aux.get("width")) {
-            let aux = known(&[("width", width)]);
-            let shelf = shelf(&rows, &aux);
-            let Choice::Taken { row: told, .. } = shelf.choose(&goal, |_| true) else {
+            let aux = aux_of(&[("width", width)]);
+            let shelf = view(&rows, &aux);
+            let RowChoice::Taken { row: told, .. } = shelf.choose(&goal, |_| true) else {
                 panic!("it could be met for all");
             };
-            prop_assert!(less(shelf.cost(told), shelf.cost(row)).is_le());
+            prop_assert!(compare_costs(shelf.cost(told), shelf.cost(row)).is_le());
         }
     }
 
@@ -397,27 +403,29 @@ proptest! {
             row.aux.extend(model.map(|model| ("model".to_owned(), ["big", "7", "30"][model].to_owned())));
         }
         let nothing = Aux::new();
-        let all = shelf(&rows, &nothing);
-        let chosen = all.choose(&goal, within(most * 3.0));
-        // Each combination that a row names, stated by a robot of its own; what a row beside it does not name has no value.
+        let all = view(&rows, &nothing);
+        let chosen = all.choose(&goal, affordable_within(most * 3.0));
+        // Each combination named by a row, stated by a robot of its own; parameters that the row does not name have no
+        // value.
         let of_measure = rows.iter().filter(|row| row.measure == goal.measure);
         let cases: BTreeSet<&Aux> = of_measure.map(|row| &row.aux).collect();
         let mut dearest: Option<Cost> = None;
         let mut unmet = false;
         for case in cases {
-            let of_case: Vec<Row> = rows.iter().filter(|row| applies(row, |key| case.get(key))).cloned().collect();
-            match shelf(&of_case, case).choose(&goal, within(most * 3.0)) {
-                Choice::Taken { row, .. } => {
+            let of_case: Vec<Row> = rows.iter().filter(|row| row_applies(row, |key| case.get(key))).cloned().collect();
+            match view(&of_case, case).choose(&goal, affordable_within(most * 3.0)) {
+                RowChoice::Taken { row, .. } => {
                     let cost = all.cost(row);
-                    dearest = Some(dearest.map_or(cost, |dear| if less(cost, dear).is_gt() { cost } else { dear }));
+                    dearest = Some(dearest.map_or(cost, |dear| if compare_costs(cost,
+                        dear).is_gt() { cost } else { dear }));
                 }
                 _ => unmet = true,
             }
         }
         match chosen {
-            Choice::Silent => prop_assert!(dearest.is_none() && !unmet),
-            Choice::Taken { row, .. } => prop_assert_eq!((Some(all.cost(row)), unmet), (dearest, false)),
-            Choice::Unmet { .. } => prop_assert!(unmet),
+            RowChoice::Silent => prop_assert!(dearest.is_none() && !unmet),
+            RowChoice::Taken { row, .. } => prop_assert_eq!((Some(all.cost(row)), unmet), (dearest, false)),
+            RowChoice::Unmet { .. } => prop_assert!(unmet),
         }
     }
 }
@@ -433,8 +441,8 @@ fn what_comes_next_holds_for_the_same_robot() {
         of(5, 0.02, 3.5, &[("model", "big")]),
     ];
     let next = |aux: &[(&str, &str)], taken: usize| {
-        let aux = known(aux);
-        let (better, weaker) = shelf(&rows, &aux).next_to(&rows[taken - 1]);
+        let aux = aux_of(aux);
+        let (better, weaker) = view(&rows, &aux).neighbours(&rows[taken - 1]);
         (better.map(|row| row.id), weaker.map(|row| row.id))
     };
     assert_eq!(
@@ -444,12 +452,12 @@ fn what_comes_next_holds_for_the_same_robot() {
     );
     assert_eq!(next(&[("width", "640")], 2), (Some(4), Some(1)));
     assert_eq!(next(&[("width", "320")], 2), (Some(3), Some(1)));
-    // It was assumed to be as wide as the row.
+    // The row's width was assumed.
     assert_eq!(next(&[], 2), (Some(4), None));
     assert_eq!(next(&[("model", "big")], 4), (Some(5), None));
 }
 
-/// Rows and cases at their bound, each with a value of its own.
+/// The maximum number of rows and cases, each with a value of its own.
 #[test]
 fn as_many_rows_as_there_may_be_are_chosen_from() {
     let rows: Vec<Row> = (1..=MOST_ROWS as i64)
@@ -460,8 +468,8 @@ fn as_many_rows_as_there_may_be_are_chosen_from() {
         })
         .collect();
     let nothing = Aux::new();
-    let Choice::Taken { row, desired, .. } =
-        shelf(&rows, &nothing).choose(&goal(0.01, 0.1), |_| true)
+    let RowChoice::Taken { row, desired, .. } =
+        view(&rows, &nothing).choose(&goal(0.01, 0.1), |_| true)
     else {
         panic!("it is acceptable");
     };

@@ -1,15 +1,21 @@
-//! The machine of the properties: what the daemon does with decisions, done with plain data, and what has to hold of it.
+//! The machine of the property tests: simulates what the daemon does with decisions on plain data, and checks the
+//! invariants.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use super::{SERVICES, Step};
-use crate::decide::admission::{Admitted, Ask, Book, OVERTAKEN, Ticket, Verdict};
-use crate::decide::capacity::{Push, Room};
-use crate::decide::lifetime::{Need, Stage, Tenancy, needed};
+use super::{MachineStep, SERVICES};
+use crate::decide::admission::{
+    AdmissionLedger, AdmissionRequest, AdmissionVerdict, AdmittedRequest, OVERTAKEN, Ticket,
+};
+use crate::decide::capacity::{PushPromise, RoomPlan};
+use crate::decide::lifetime::{Retention, ServantStage, Tenancy, retention};
 use crate::decide::placement::{Placement, place};
-use crate::decide::warm_pool::{Missing, Size, Wanted, Warm, choose, deserving, missing, stale};
-use crate::decide::{Amount, End, Servant, capacity};
+use crate::decide::warm_pool::{
+    PoolShortage, PoolSize, WantedPool, WarmContainer, choose_container, deserving_services,
+    pool_shortage, stale_containers,
+};
+use crate::decide::{Amount, ServantFacts, StopOrder, capacity};
 
 const GRACE: Duration = Duration::from_secs(60);
 const QUEUE: usize = 4;
@@ -22,12 +28,12 @@ fn cores(millicpus: u64) -> Amount {
     }
 }
 
-struct Lives {
+struct ModelServant {
     id: String,
     ticket: Ticket,
     key: (usize, usize),
     revision: u64,
-    stage: Stage,
+    stage: ServantStage,
     wants: Amount,
     promised: Option<Amount>,
     connections: usize,
@@ -35,8 +41,8 @@ struct Lives {
     ending: bool,
 }
 
-impl Lives {
-    /// Robot 0 names no name.
+impl ModelServant {
+    /// Robot 0 gives no name.
     fn anonymous(&self) -> bool {
         self.key.1 == 0
     }
@@ -56,9 +62,9 @@ impl Lives {
         }
     }
 
-    fn facts(&self, began: Instant) -> Servant<'_> {
+    fn facts(&self, began: Instant) -> ServantFacts<'_> {
         let until = |since: Instant| (since - began + GRACE).as_millis() as u64;
-        Servant {
+        ServantFacts {
             id: &self.id,
             revision: self.revision,
             connections: self.connections,
@@ -69,19 +75,19 @@ impl Lives {
     }
 }
 
-struct Pooled {
+struct ModelWarm {
     id: String,
     service: usize,
     revision: u64,
     runs: bool,
-    /// Its nodes run, for which it is promised so much.
+    /// Capacity promised to its running nodes.
     promised: Option<Amount>,
 }
 
-impl Pooled {
-    /// As a servant that nobody needs.
-    fn idle(&self) -> Servant<'_> {
-        Servant {
+impl ModelWarm {
+    /// Returns it as an unused servant.
+    fn as_idle_servant(&self) -> ServantFacts<'_> {
+        ServantFacts {
             id: &self.id,
             revision: self.revision,
             connections: 0,
@@ -91,8 +97,8 @@ impl Pooled {
         }
     }
 
-    fn facts(&self) -> Warm<'_> {
-        Warm {
+    fn facts(&self) -> WarmContainer<'_> {
+        WarmContainer {
             id: &self.id,
             service: SERVICES[self.service].0,
             revision: self.revision,
@@ -103,36 +109,36 @@ impl Pooled {
     }
 }
 
-/// A push that waits, or is promised something.
+/// A waiting or admitted push.
 #[derive(Default)]
-struct Pushing {
+struct ModelPush {
     promised: Option<Amount>,
     gives_way: bool,
 }
 
-/// A robot in the line.
-struct Stands {
+/// A robot in the queue.
+struct QueuedRobot {
     ticket: Ticket,
     priority: i32,
-    /// So many who came later were admitted before it.
+    /// Number of later robots that were admitted before it.
     overtaken: u32,
 }
 
-pub(super) struct Machine {
+pub(super) struct MachineModel {
     began: Instant,
     now: Instant,
-    book: Book,
-    servants: Vec<Lives>,
-    /// By service and robot: the ids of those that may be given.
+    book: AdmissionLedger,
+    servants: Vec<ModelServant>,
+    /// Ids of the servants that may be given, by service and robot.
     given: BTreeMap<(usize, usize), String>,
-    pushes: BTreeMap<Ticket, Pushing>,
-    pool: Vec<Pooled>,
+    pushes: BTreeMap<Ticket, ModelPush>,
+    pool: Vec<ModelWarm>,
     asked_for: Vec<String>,
     revisions: [u64; SERVICES.len()],
-    /// Robots that wait, as they came.
-    line: Vec<Stands>,
+    /// Waiting robots, in order of arrival.
+    line: Vec<QueuedRobot>,
     made: u64,
-    /// Containers that a robot was given.
+    /// Containers that were given to a robot.
     used: BTreeSet<String>,
 }
 
@@ -141,13 +147,13 @@ fn nth<T>(all: impl Iterator<Item = T>, which: usize) -> Option<T> {
     (!all.is_empty()).then(|| all.swap_remove(which % all.len()))
 }
 
-impl Machine {
-    pub(super) fn new() -> Machine {
+impl MachineModel {
+    pub(super) fn new() -> MachineModel {
         let now = Instant::now();
-        Machine {
+        MachineModel {
             began: now,
             now,
-            book: Book::new(cores(4000), QUEUE),
+            book: AdmissionLedger::new(cores(4000), QUEUE),
             servants: Vec::new(),
             given: BTreeMap::new(),
             pushes: BTreeMap::new(),
@@ -160,50 +166,50 @@ impl Machine {
         }
     }
 
-    fn name(&mut self) -> (Ticket, String) {
+    fn next_id(&mut self) -> (Ticket, String) {
         self.made += 1;
         (self.made, format!("made-{}", self.made))
     }
 
-    fn servant(&mut self, id: &str) -> &mut Lives {
+    fn servant(&mut self, id: &str) -> &mut ModelServant {
         let found = self.servants.iter_mut().find(|servant| servant.id == id);
         found.expect("decisions are about servants that live")
     }
 
-    /// Its end is asked for. It stays where its robot finds it until its task has seen that.
+    /// Requests the end of a servant. It stays where its robot finds it until its task has seen that.
     fn end(&mut self, id: &str) {
         let servant = self.servant(id);
         assert!(!servant.ending, "{id} is being ended already");
         servant.ending = true;
-        let (queued, ticket) = (servant.stage == Stage::Queued, servant.ticket);
+        let (queued, ticket) = (servant.stage == ServantStage::Queued, servant.ticket);
         if queued {
             self.line.retain(|one| one.ticket != ticket);
-            let admitted = self.book.leave(ticket);
-            self.admitted(admitted);
+            let admitted = self.book.withdraw(ticket);
+            self.apply_admitted(admitted);
         }
     }
 
-    /// Those who waited are admitted: robots of one priority in the order in which they came, and none is overtaken for ever.
-    fn admitted(&mut self, admitted: Vec<Admitted>) {
-        for Admitted { ticket, amount } in admitted {
-            assert_eq!(self.book.stalled(), None);
+    /// Handles admissions: robots of one priority in order of arrival, and none is overtaken without bound.
+    fn apply_admitted(&mut self, admitted: Vec<AdmittedRequest>) {
+        for AdmittedRequest { ticket, amount } in admitted {
+            assert_eq!(self.book.stall_reason(), None);
             if let Some(push) = self.pushes.get_mut(&ticket) {
                 push.promised = Some(amount);
                 continue;
             }
             let at = self.line.iter().position(|one| one.ticket == ticket);
             let stood = self.line.remove(at.expect("who waits is in the line"));
-            self.overtakes(at.unwrap_or_default(), stood.priority);
+            self.record_overtaking(at.unwrap_or_default(), stood.priority);
             let servant = self.servants.iter_mut().find(|one| one.ticket == ticket);
             let servant = servant.expect("who waits is there");
             assert!(!servant.ending, "it waits no longer");
             servant.promised = Some(amount);
-            servant.stage = Stage::Admitted;
+            servant.stage = ServantStage::Admitted;
         }
     }
 
-    /// One of this priority goes before those who came before it, who are the first of the line.
-    fn overtakes(&mut self, earlier: usize, priority: i32) {
+    /// Records that a robot of this priority is admitted before the earlier ones, the first of the queue.
+    fn record_overtaking(&mut self, earlier: usize, priority: i32) {
         for one in &mut self.line[..earlier] {
             assert!(one.priority < priority, "a robot was overtaken");
             one.overtaken += 1;
@@ -212,13 +218,13 @@ impl Machine {
     }
 
     fn make_room(&mut self) {
-        let lacking = self.book.lacking();
+        let lacking = self.book.shortage();
         let began = self.began;
-        let pushes: Vec<Push> = self
+        let pushes: Vec<PushPromise> = self
             .pushes
             .iter()
             .filter_map(|(ticket, push)| {
-                Some(Push {
+                Some(PushPromise {
                     ticket: *ticket,
                     has: push.promised?,
                     gives_way: push.gives_way,
@@ -227,12 +233,12 @@ impl Machine {
             .collect();
         let decide = || {
             let used = self.servants.iter().map(|it| it.facts(began));
-            let all = self.pool.iter().map(Pooled::idle).chain(used);
+            let all = self.pool.iter().map(ModelWarm::as_idle_servant).chain(used);
             capacity::make_room(lacking, all, &pushes)
         };
-        let Room { ends, give_way } = decide();
+        let RoomPlan { ends, give_way } = decide();
         assert_eq!(ends, decide().ends, "the same facts, another decision");
-        let having = |ids: &[End<'_>], pushes: &[Ticket]| {
+        let having = |ids: &[StopOrder<'_>], pushes: &[Ticket]| {
             let all = self.servants.iter();
             let free = all.filter(|it| it.ending || ids.iter().any(|end| end.id == it.id));
             let free = free.filter_map(|it| it.promised);
@@ -278,11 +284,11 @@ impl Machine {
             if let Some(index) = self.pool.iter().position(|it| it.id == id) {
                 let warm = self.pool.remove(index);
                 let admitted = self.book.release(warm.promised.unwrap_or_default());
-                self.admitted(admitted);
+                self.apply_admitted(admitted);
                 continue;
             }
             let servant = self.servant(&id);
-            assert!(servant.connections == 0 && servant.stage == Stage::Ready);
+            assert!(servant.connections == 0 && servant.stage == ServantStage::Ready);
             self.end(&id);
         }
         for ticket in give_way {
@@ -292,17 +298,17 @@ impl Machine {
         }
     }
 
-    /// How much more would have to be free for all robots that wait.
-    fn lacked(&self) -> Amount {
+    /// Returns how much more capacity would have to be free for all waiting robots.
+    fn shortage_for_robots(&self) -> Amount {
         let waiting = self
             .servants
             .iter()
             .filter(|it| self.line.iter().any(|one| one.ticket == it.ticket));
         let wanted = waiting.fold(Amount::NONE, |sum, it| sum.plus(it.wants));
-        wanted.minus(self.book.capacity().minus(self.book.promised()))
+        wanted.minus(self.book.capacity().minus(self.book.promised_total()))
     }
 
-    fn asks(&mut self, service: usize, robot: usize, priority: i32) {
+    fn request_servant(&mut self, service: usize, robot: usize, priority: i32) {
         let began = self.began;
         let key = (service, robot);
         let name = SERVICES[service].0;
@@ -314,9 +320,9 @@ impl Machine {
             found.expect("what is given lives")
         });
         let facts = has.map(|it| it.facts(began));
-        let default_names = robot % 2 == 0 && self.book.is_calm();
+        let default_names = robot % 2 == 0 && self.book.is_uncontended();
         let of = (name, current, "an image");
-        let warm = choose(self.pool.iter().map(Pooled::facts), of, default_names);
+        let warm = choose_container(self.pool.iter().map(ModelWarm::facts), of, default_names);
         let decide = || place(facts.as_ref(), warm.as_ref(), current, "an image");
         let placement = decide();
         assert_eq!(placement, decide(), "the same facts, another decision");
@@ -336,7 +342,7 @@ impl Machine {
             assert_eq!(self.servant(&id).connections, 0, "its robot uses it");
             self.end(&id);
         }
-        let (ticket, fresh) = self.name();
+        let (ticket, fresh) = self.next_id();
         let mut ahead = None;
         let warm = chosen.filter(|_| warm).map(|id| {
             let index = self.pool.iter().position(|it| it.id == id);
@@ -356,32 +362,34 @@ impl Machine {
         });
         let wants = cores(SERVICES[service].1);
         let (verdict, others) = match ahead {
-            Some(_) => (Verdict::Admitted, Vec::new()),
-            None => self.book.ask(ticket, Ask::robot(wants, priority)),
+            Some(_) => (AdmissionVerdict::Admitted, Vec::new()),
+            None => self
+                .book
+                .request(ticket, AdmissionRequest::robot(wants, priority)),
         };
         let promised = match verdict {
-            Verdict::Admitted => {
-                self.overtakes(self.line.len(), priority);
+            AdmissionVerdict::Admitted => {
+                self.record_overtaking(self.line.len(), priority);
                 Some(wants)
             }
-            Verdict::Waits => None,
-            Verdict::Refused(_) => {
+            AdmissionVerdict::Waits => None,
+            AdmissionVerdict::Refused(_) => {
                 assert_eq!(others, [], "nobody was overtaken");
                 return;
             }
         };
-        self.admitted(others);
+        self.apply_admitted(others);
         let id = warm.unwrap_or(fresh);
         self.given.insert(key, id.clone());
-        self.servants.push(Lives {
+        self.servants.push(ModelServant {
             id,
             ticket,
             key,
             revision: current,
             stage: if promised.is_some() {
-                Stage::Admitted
+                ServantStage::Admitted
             } else {
-                Stage::Queued
+                ServantStage::Queued
             },
             wants,
             promised,
@@ -390,7 +398,7 @@ impl Machine {
             ending: false,
         });
         if promised.is_none() {
-            self.line.push(Stands {
+            self.line.push(QueuedRobot {
                 ticket,
                 priority,
                 overtaken: 0,
@@ -401,25 +409,25 @@ impl Machine {
 
     fn tidy(&mut self) {
         let published: Vec<String> = SERVICES.iter().map(|it| it.0.to_owned()).collect();
-        let wanted = deserving(&published, &self.asked_for, POOL);
+        let wanted = deserving_services(&published, &self.asked_for, POOL);
         let number = |name: &String| SERVICES.iter().position(|it| it.0 == name).expect("known");
         let wanted: Vec<usize> = wanted.iter().map(number).collect();
         let revisions = self.revisions;
-        let facts: Vec<Wanted<'_>> = wanted
+        let facts: Vec<WantedPool<'_>> = wanted
             .iter()
-            .map(|service| Wanted {
+            .map(|service| WantedPool {
                 service: SERVICES[*service].0,
                 revision: revisions[*service],
                 image: "an image",
-                size: Size {
+                size: PoolSize {
                     makes: 1,
                     keeps: 1 + *service,
                     nodes: 1,
                 },
             })
             .collect();
-        let pool: Vec<Warm<'_>> = self.pool.iter().map(Pooled::facts).collect();
-        let ends = stale(&pool, &facts);
+        let pool: Vec<WarmContainer<'_>> = self.pool.iter().map(ModelWarm::facts).collect();
+        let ends = stale_containers(&pool, &facts);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         for id in &ends {
             assert!(!self.used.contains(id), "{id} is a robot's");
@@ -428,16 +436,16 @@ impl Machine {
             let index = self.pool.iter().position(|it| it.id == id);
             let warm = self.pool.remove(index.expect("it is the pool's"));
             let admitted = self.book.release(warm.promised.unwrap_or_default());
-            self.admitted(admitted);
+            self.apply_admitted(admitted);
         }
         for (service, wanted) in wanted.into_iter().zip(&facts) {
             loop {
-                let pool: Vec<Warm<'_>> = self.pool.iter().map(Pooled::facts).collect();
-                match missing(&pool, wanted) {
-                    Missing::Nothing => break,
-                    Missing::Containers(_) => {
-                        let (_, id) = self.name();
-                        self.pool.push(Pooled {
+                let pool: Vec<WarmContainer<'_>> = self.pool.iter().map(ModelWarm::facts).collect();
+                match pool_shortage(&pool, wanted) {
+                    PoolShortage::Nothing => break,
+                    PoolShortage::Containers(_) => {
+                        let (_, id) = self.next_id();
+                        self.pool.push(ModelWarm {
                             id,
                             service,
                             revision: revisions[service],
@@ -445,14 +453,14 @@ impl Machine {
                             promised: None,
                         });
                     }
-                    Missing::Nodes(id) => {
+                    PoolShortage::Nodes(id) => {
                         let (id, before) = (id.to_owned(), self.book.clone());
                         let wants = cores(SERVICES[service].1);
                         if !self.book.take_spare(wants) {
                             assert_eq!(self.book, before, "refused, and yet promised");
                             break;
                         }
-                        assert_eq!(before.waiting(), 0, "those who wait were overtaken");
+                        assert_eq!(before.waiting_count(), 0, "those who wait were overtaken");
                         let warm = self.pool.iter_mut().find(|it| it.id == id);
                         warm.expect("it is the pool's").promised = Some(wants);
                     }
@@ -462,36 +470,36 @@ impl Machine {
         assert!(self.pool.iter().filter(|it| it.promised.is_some()).count() <= POOL);
     }
 
-    pub(super) fn takes(&mut self, step: Step) {
+    pub(super) fn apply(&mut self, step: MachineStep) {
         match step {
-            Step::Asks {
+            MachineStep::Asks {
                 service,
                 robot,
                 priority,
-            } => self.asks(service, robot, priority),
-            Step::Leaves(which) => {
+            } => self.request_servant(service, robot, priority),
+            MachineStep::Leaves(which) => {
                 let used = self.servants.iter_mut().filter(|it| it.connections > 0);
                 if let Some(servant) = nth(used, which) {
                     servant.connections -= 1;
                 }
             }
-            Step::Proceeds(which) => {
+            MachineStep::Proceeds(which) => {
                 let admitted = self.servants.iter_mut();
                 let admitted = admitted.filter(|it| it.promised.is_some() && !it.ending);
                 if let Some(servant) = nth(admitted, which) {
                     servant.stage = match servant.stage {
-                        Stage::Queued | Stage::Admitted => Stage::Starting,
-                        Stage::Starting | Stage::Ready => Stage::Ready,
+                        ServantStage::Queued | ServantStage::Admitted => ServantStage::Starting,
+                        ServantStage::Starting | ServantStage::Ready => ServantStage::Ready,
                     };
                 }
             }
-            Step::Stopped(which) => {
+            MachineStep::Stopped(which) => {
                 let lives = self.servants.iter().filter(|it| !it.ending);
                 if let Some(id) = nth(lives.map(|it| it.id.clone()), which) {
                     self.end(&id);
                 }
             }
-            Step::Gone(which) => {
+            MachineStep::Gone(which) => {
                 let ending = self.servants.iter().filter(|it| it.ending);
                 if let Some(id) = nth(ending.map(|it| it.id.clone()), which) {
                     let index = self.servants.iter().position(|it| it.id == id);
@@ -500,90 +508,92 @@ impl Machine {
                         self.given.remove(&gone.key);
                     }
                     let admitted = self.book.release(gone.promised.unwrap_or_default());
-                    self.admitted(admitted);
+                    self.apply_admitted(admitted);
                     self.make_room();
                 }
             }
-            Step::Resized(which, size) => {
+            MachineStep::Resized(which, size) => {
                 let running = self.servants.iter().filter(|it| it.promised.is_some());
                 if let Some(id) = nth(running.map(|it| it.id.clone()), which) {
                     let promised = self.servant(&id).promised.unwrap_or_default();
-                    let (before, lacked) = (self.book.clone(), self.lacked());
-                    match self.book.change(promised, cores(size)) {
+                    let (before, lacked) = (self.book.clone(), self.shortage_for_robots());
+                    match self.book.change_promise(promised, cores(size)) {
                         Ok(admitted) => {
                             self.servant(&id).promised = Some(cores(size));
-                            self.admitted(admitted);
+                            self.apply_admitted(admitted);
                         }
                         Err(_) => assert_eq!(self.book, before, "refused, and yet changed"),
                     }
                     let grew = !cores(size).fits(promised);
                     assert!(
-                        !grew || self.lacked().fits(lacked),
+                        !grew || self.shortage_for_robots().fits(lacked),
                         "a servant overtook who waits"
                     );
                 }
             }
-            Step::GivesUp(which) => {
+            MachineStep::GivesUp(which) => {
                 let queued = self.servants.iter();
-                let queued = queued.filter(|it| it.stage == Stage::Queued && !it.ending);
+                let queued = queued.filter(|it| it.stage == ServantStage::Queued && !it.ending);
                 if let Some(id) = nth(queued.map(|it| it.id.clone()), which) {
                     self.end(&id);
                 }
             }
-            Step::Pushes(size) => {
-                let (ticket, _) = self.name();
-                let (verdict, others) = self.book.ask(ticket, Ask::push(cores(size)));
+            MachineStep::Pushes(size) => {
+                let (ticket, _) = self.next_id();
+                let (verdict, others) = self
+                    .book
+                    .request(ticket, AdmissionRequest::push(cores(size)));
                 let promised = match verdict {
-                    Verdict::Admitted => {
+                    AdmissionVerdict::Admitted => {
                         assert!(self.line.is_empty(), "a push goes before a robot");
                         Some(cores(size))
                     }
-                    Verdict::Waits => None,
-                    Verdict::Refused(_) => {
+                    AdmissionVerdict::Waits => None,
+                    AdmissionVerdict::Refused(_) => {
                         assert!(size > 4000, "it would fit");
                         return;
                     }
                 };
-                let push = Pushing {
+                let push = ModelPush {
                     promised,
                     gives_way: false,
                 };
                 self.pushes.insert(ticket, push);
-                self.admitted(others);
+                self.apply_admitted(others);
                 self.make_room();
             }
-            Step::Pushed(which) => {
+            MachineStep::Pushed(which) => {
                 if let Some(ticket) = nth(self.pushes.keys().copied(), which) {
                     let push = self.pushes.remove(&ticket).unwrap_or_default();
                     let admitted = match push.promised {
                         Some(amount) => self.book.release(amount),
-                        None => self.book.leave(ticket),
+                        None => self.book.withdraw(ticket),
                     };
-                    self.admitted(admitted);
+                    self.apply_admitted(admitted);
                     self.make_room();
                 }
             }
-            Step::Stalls(stalls) => {
-                let admitted = self.book.stall(stalls.then(|| "it swaps".to_owned()));
-                self.admitted(admitted);
+            MachineStep::Stalls(stalls) => {
+                let admitted = self.book.set_stall(stalls.then(|| "it swaps".to_owned()));
+                self.apply_admitted(admitted);
             }
-            Step::Published(service) => self.revisions[service] += 1,
-            Step::Tidied => self.tidy(),
-            Step::WarmDies(which) => {
+            MachineStep::Published(service) => self.revisions[service] += 1,
+            MachineStep::Tidied => self.tidy(),
+            MachineStep::WarmDies(which) => {
                 if let Some(warm) = nth(self.pool.iter_mut(), which) {
                     warm.runs = false;
                 }
             }
-            Step::Passes(seconds) => self.now += Duration::from_secs(seconds),
+            MachineStep::Passes(seconds) => self.now += Duration::from_secs(seconds),
         }
-        self.settles();
+        self.end_unneeded();
     }
 
-    /// What nobody needs is ended.
-    fn settles(&mut self) {
+    /// Ends servants that are not needed.
+    fn end_unneeded(&mut self) {
         let now = self.now;
         for servant in self.servants.iter_mut().filter(|it| !it.ending) {
-            let idle = servant.stage == Stage::Ready && servant.connections == 0;
+            let idle = servant.stage == ServantStage::Ready && servant.connections == 0;
             servant.idle_since = idle.then(|| servant.idle_since.unwrap_or(now));
         }
         let over: Vec<String> = self
@@ -591,12 +601,12 @@ impl Machine {
             .iter()
             .filter(|it| !it.ending)
             .filter(|it| {
-                let need = needed(&it.tenancy(), now);
+                let need = retention(&it.tenancy(), now);
                 assert!(
-                    it.connections == 0 || need == Need::Stays,
+                    it.connections == 0 || need == Retention::Stays,
                     "its robot uses it"
                 );
-                matches!(need, Need::Over(_))
+                matches!(need, Retention::Over(_))
             })
             .map(|it| it.id.clone())
             .collect();
@@ -605,7 +615,7 @@ impl Machine {
         }
     }
 
-    pub(super) fn holds(&self) {
+    pub(super) fn check_invariants(&self) {
         let servants = self.servants.iter().filter_map(|it| it.promised);
         let pushes = self.pushes.values().filter_map(|push| push.promised);
         let pooled = self.pool.iter().filter_map(|it| it.promised);
@@ -613,7 +623,7 @@ impl Machine {
             .chain(pushes)
             .chain(pooled)
             .fold(Amount::NONE, Amount::plus);
-        assert_eq!(self.book.promised(), promised);
+        assert_eq!(self.book.promised_total(), promised);
         assert!(
             promised.fits(self.book.capacity()),
             "more is promised than there is"
@@ -624,12 +634,17 @@ impl Machine {
             .values()
             .filter(|it| it.promised.is_none())
             .count();
-        assert_eq!(self.book.waiting(), self.line.len() + waiting);
+        assert_eq!(self.book.waiting_count(), self.line.len() + waiting);
         let free = self.book.capacity().minus(promised);
-        let places: Vec<(Ticket, usize)> =
-            self.book.places().map(|one| (one.0, one.1.place)).collect();
+        let places: Vec<(Ticket, usize)> = self
+            .book
+            .queue_positions()
+            .map(|one| (one.0, one.1.place))
+            .collect();
         assert_eq!(places.len(), self.line.len());
-        let first = places.first().filter(|_| self.book.stalled().is_none());
+        let first = places
+            .first()
+            .filter(|_| self.book.stall_reason().is_none());
         if let Some((first, _)) = first {
             let first = self.servants.iter().find(|it| it.ticket == *first);
             let first = first.expect("who waits is there");
@@ -645,16 +660,16 @@ impl Machine {
         }
     }
 
-    /// All that are admitted leave, one after the other.
-    pub(super) fn empties(&mut self) {
-        self.takes(Step::Stalls(false));
+    /// Lets all admitted servants and pushes leave, one after the other.
+    pub(super) fn drain(&mut self) {
+        self.apply(MachineStep::Stalls(false));
         for _ in 0..1000 {
             let push = self.pushes.iter().find(|it| it.1.promised.is_some());
             let push = push.map(|it| *it.0);
             let lives = self.servants.iter().find(|it| it.promised.is_some());
             let lives = lives.map(|it| (it.id.clone(), it.ending));
             match (push, lives) {
-                (Some(_), _) => self.takes(Step::Pushed(
+                (Some(_), _) => self.apply(MachineStep::Pushed(
                     self.pushes
                         .values()
                         .take_while(|it| it.promised.is_none())
@@ -666,17 +681,17 @@ impl Machine {
                     }
                     let ending = self.servants.iter().filter(|it| it.ending);
                     let which = ending.take_while(|it| it.id != id).count();
-                    self.takes(Step::Gone(which));
+                    self.apply(MachineStep::Gone(which));
                 }
                 (None, None) => break,
             }
-            self.holds();
+            self.check_invariants();
         }
         let pooled = self.pool.iter().filter_map(|it| it.promised);
         assert_eq!(
-            self.book.promised(),
+            self.book.promised_total(),
             pooled.fold(Amount::NONE, Amount::plus)
         );
-        assert_eq!(self.book.waiting(), 0, "somebody waits for ever");
+        assert_eq!(self.book.waiting_count(), 0, "somebody waits for ever");
     }
 }

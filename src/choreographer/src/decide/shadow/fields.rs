@@ -1,67 +1,70 @@
-//! In which fields two messages of one type differ, and by how much they may.
+//! Finds the fields in which two messages of one type differ, within tolerances.
 
 use serde_json::{Number, Value};
 
-/// Fields that are named of one answer.
+/// Maximum number of fields reported for one answer.
 pub(super) const FIELDS: usize = 32;
-/// Characters of a value that are shown.
+/// Maximum number of characters shown of a value.
 const SHOWN: usize = 60;
 
-/// What may differ.
+/// Tolerated differences.
 #[derive(Debug, Clone)]
 pub(crate) struct Tolerance {
-    /// Two numbers are the same where they are no farther apart than this; unless both are integers, times the greatest of 1
-    /// and of them.
+    /// Maximum distance of two equal numbers; unless both are integers, it is multiplied by the greatest of 1 and their
+    /// magnitudes.
     pub(crate) number: f64,
-    /// Fields that may differ with all below them; indices of arrays are written `[]`.
+    /// Fields to ignore, including all fields below them; indices of arrays are written `[]`.
     pub(crate) ignore: Vec<String>,
 }
 
-/// A field of which two answers have different values.
+/// A field with different values in two answers.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Differing {
+pub(crate) struct DifferingField {
     pub(crate) field: String,
     pub(crate) present: String,
     pub(crate) candidate: String,
 }
 
-impl Differing {
-    /// The whole answer.
-    pub(crate) fn whole(present: impl Into<String>, candidate: impl Into<String>) -> Differing {
-        Differing {
+impl DifferingField {
+    /// Creates a difference of the whole answers.
+    pub(crate) fn whole_answer(
+        present: impl Into<String>,
+        candidate: impl Into<String>,
+    ) -> DifferingField {
+        DifferingField {
             field: String::new(),
-            present: shortened(present.into()),
-            candidate: shortened(candidate.into()),
+            present: shorten(present.into()),
+            candidate: shorten(candidate.into()),
         }
     }
 }
 
-/// The fields in which two messages of one type differ, the first [`FIELDS`] of them. Of a header, the number and the stamp are
-/// left out: both say when something was published, and that is at different times.
+/// Returns the fields in which two messages of one type differ, the first [`FIELDS`] of them. The sequence number and
+/// stamp of a header are ignored: both depend on the time of publication.
 pub(crate) fn differences(
     present: &Value,
     candidate: &Value,
     tolerance: &Tolerance,
-) -> Vec<Differing> {
+) -> Vec<DifferingField> {
     let mut found = Vec::new();
-    look(String::new(), present, candidate, tolerance, &mut found);
+    compare_fields(String::new(), present, candidate, tolerance, &mut found);
     found
 }
 
-fn look(
+fn compare_fields(
     field: String,
     present: &Value,
     candidate: &Value,
     tolerance: &Tolerance,
-    found: &mut Vec<Differing>,
+    found: &mut Vec<DifferingField>,
 ) {
     if found.len() >= FIELDS || tolerance.ignore.contains(&field) {
         return;
     }
-    let differs = |present: String, candidate: String| Differing {
+    let differs = |present: String, candidate: String| DifferingField {
         field: field.clone(),
-        present: shortened(present),
-        candidate: shortened(candidate),
+        present: shorten(present),
+        candidate: shorten(candidate),
     };
     match (present, candidate) {
         (Value::Object(one), Value::Object(other)) => {
@@ -70,17 +73,18 @@ fn look(
                 if header && name != "frame_id" {
                     continue;
                 }
-                let path = match field.is_empty() {
-                    true => name.clone(),
-                    false => format!("{field}.{name}"),
+                let path = if field.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{field}.{name}")
                 };
                 let against = other.get(name).unwrap_or(&Value::Null);
-                look(path, value, against, tolerance, found);
+                compare_fields(path, value, against, tolerance, found);
             }
         }
         (Value::Array(one), Value::Array(other)) if one.len() == other.len() => {
             for (one, other) in one.iter().zip(other) {
-                look(format!("{field}[]"), one, other, tolerance, found);
+                compare_fields(format!("{field}[]"), one, other, tolerance, found);
             }
         }
         (Value::Array(one), Value::Array(other)) => {
@@ -88,7 +92,7 @@ fn look(
             found.push(differs(elements(one), elements(other)));
         }
         (Value::Number(one), Value::Number(other)) => {
-            if !agree(one, other, tolerance.number) {
+            if !numbers_agree(one, other, tolerance.number) {
                 found.push(differs(one.to_string(), other.to_string()));
             }
         }
@@ -97,8 +101,8 @@ fn look(
     }
 }
 
-/// Integers count things and name them: a large one is allowed no more than a small one.
-fn agree(one: &Number, other: &Number, tolerance: f64) -> bool {
+/// Integers count or identify things: a large one has no larger tolerance than a small one.
+fn numbers_agree(one: &Number, other: &Number, tolerance: f64) -> bool {
     if let (Some(one), Some(other)) = (one.as_i128(), other.as_i128()) {
         return (one - other).unsigned_abs() as f64 <= tolerance;
     }
@@ -110,7 +114,7 @@ fn agree(one: &Number, other: &Number, tolerance: f64) -> bool {
     }
 }
 
-/// Whether it is a `std_msgs/Header` of either ROS: that of ROS 2 has no `seq`.
+/// Returns true if the value is a `std_msgs/Header` of ROS 1 or 2; that of ROS 2 has no `seq`.
 fn is_header(value: &Value) -> bool {
     let Value::Object(fields) = value else {
         return false;
@@ -127,7 +131,7 @@ fn is_header(value: &Value) -> bool {
         && fields.contains_key("frame_id")
 }
 
-fn shortened(text: String) -> String {
+fn shorten(text: String) -> String {
     let length = text.chars().count();
     if length <= SHOWN {
         return text;

@@ -1,36 +1,36 @@
-//! Which messages of two sequences belong together.
+//! Pairs the messages of two sequences.
 
 use std::collections::VecDeque;
 
-/// So far is looked ahead for where two sequences go on alike.
+/// Number of messages to look ahead for the point at which two sequences agree again.
 pub(crate) const WINDOW: usize = 8;
-/// So many messages at the end of one sequence, without a counterpart, may be on their way on the other side.
+/// Number of unpaired messages at the end of one sequence that may still be in flight on the other side.
 const EDGE: usize = 2;
 
-/// The servant that an answer is of.
+/// The servant that gave an answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Side {
+pub(crate) enum ShadowSide {
     /// The robot's servant.
     Present,
     /// The candidate.
     Candidate,
 }
 
-/// What becomes of messages of two sequences.
+/// Result of pairing messages of two sequences.
 #[derive(Debug, PartialEq)]
-pub(crate) enum Paired<T> {
-    /// These belong together, and are equal or not.
+pub(crate) enum PairingResult<T> {
+    /// These belong together; the flag says whether they are equal.
     Both(T, T, bool),
-    /// The candidate has none that belongs to it.
+    /// The candidate has no counterpart.
     Missing(T),
-    /// The robot's servant has none.
+    /// The robot's servant has no counterpart.
     Surplus(T),
-    /// It was the last, or nearly so: its counterpart may have been on its way.
+    /// It was among the last: its counterpart may have been in flight.
     Edge,
 }
 
-/// Two sequences of messages that should be equal. Where they are not, the next place within [`WINDOW`] is looked for at which they
-/// go on alike, so that one that was lost makes none of those after it differ.
+/// Two sequences of messages that should be equal. When they differ, the next point within [`WINDOW`] at which they
+/// agree again is searched for, so that a lost message does not make all later ones differ.
 #[derive(Debug)]
 pub(crate) struct Pairing<T> {
     present: VecDeque<T>,
@@ -49,73 +49,80 @@ impl<T> Default for Pairing<T> {
 }
 
 impl<T> Pairing<T> {
-    /// The next message of a side.
-    pub(crate) fn push(&mut self, side: Side, message: T) {
+    /// Appends the next message of a side.
+    pub(crate) fn push(&mut self, side: ShadowSide, message: T) {
         match side {
-            Side::Present => self.present.push_back(message),
-            Side::Candidate => self.candidate.push_back(message),
+            ShadowSide::Present => self.present.push_back(message),
+            ShadowSide::Candidate => self.candidate.push_back(message),
         }
     }
 
-    /// Whether as many have come on one side as on the other.
+    /// Returns true if both sides have the same number of waiting messages.
     pub(crate) fn is_even(&self) -> bool {
         self.present.len() == self.candidate.len()
     }
 
-    /// How many messages wait on the side that has more of them.
+    /// Returns the number of waiting messages on the side that has more.
     pub(crate) fn waiting(&self) -> usize {
         self.present.len().max(self.candidate.len())
     }
 
-    /// Pairs what can be paired; all of it where there comes no more.
-    pub(crate) fn settle(&mut self, last: bool, equal: impl Fn(&T, &T) -> bool) -> Vec<Paired<T>> {
+    /// Pairs what can be paired; everything, if `last` says that no more comes.
+    pub(crate) fn settle(
+        &mut self,
+        last: bool,
+        equal: impl Fn(&T, &T) -> bool,
+    ) -> Vec<PairingResult<T>> {
         let mut settled = Vec::new();
         while let (Some(one), Some(other)) = (self.present.front(), self.candidate.front()) {
-            let gap = match equal(one, other) {
-                true => Some((0, 0)),
-                // What comes next may show more.
-                false if !last && self.shorter() <= WINDOW => break,
-                false => self.gap(&equal),
+            let gap = if equal(one, other) {
+                Some((0, 0))
+            } else if !last && self.shorter() <= WINDOW {
+                // Later messages may show more.
+                break;
+            } else {
+                self.gap(&equal)
             };
             let (lost, more) = gap.unwrap_or((1, 1));
             for _ in 0..lost.min(more) {
                 settled.extend(self.pair(false));
             }
             for _ in more..lost {
-                settled.extend(self.present.pop_front().map(Paired::Missing));
+                settled.extend(self.present.pop_front().map(PairingResult::Missing));
             }
             for _ in lost..more {
-                settled.extend(self.candidate.pop_front().map(Paired::Surplus));
+                settled.extend(self.candidate.pop_front().map(PairingResult::Surplus));
             }
             if gap.is_some() {
                 settled.extend(self.pair(true));
             }
         }
         if last {
-            // One that has answered until now goes on to do so.
+            // A side that has answered so far will continue to.
             let edge = self.paired && self.waiting() <= EDGE;
-            let missing = self.present.drain(..).map(Paired::Missing);
-            let surplus = self.candidate.drain(..).map(Paired::Surplus);
+            let missing = self.present.drain(..).map(PairingResult::Missing);
+            let surplus = self.candidate.drain(..).map(PairingResult::Surplus);
             let left = missing.chain(surplus);
-            match edge {
-                true => settled.extend(left.map(|_| Paired::Edge)),
-                false => settled.extend(left),
+            if edge {
+                settled.extend(left.map(|_| PairingResult::Edge))
+            } else {
+                settled.extend(left)
             }
         }
         settled
     }
 
-    fn pair(&mut self, equal: bool) -> Option<Paired<T>> {
+    fn pair(&mut self, equal: bool) -> Option<PairingResult<T>> {
         self.paired = true;
         let one = self.present.pop_front()?;
-        Some(Paired::Both(one, self.candidate.pop_front()?, equal))
+        Some(PairingResult::Both(one, self.candidate.pop_front()?, equal))
     }
 
     fn shorter(&self) -> usize {
         self.present.len().min(self.candidate.len())
     }
 
-    /// How many are skipped on each side until both go on alike, as few as possible.
+    /// Returns how many messages to skip on each side until both agree, as few as possible.
     fn gap(&self, equal: &impl Fn(&T, &T) -> bool) -> Option<(usize, usize)> {
         let at = |lost: usize, more: usize| {
             let pair = self.present.get(lost).zip(self.candidate.get(more));

@@ -13,20 +13,20 @@ fn tolerance(ignore: &[&str]) -> Tolerance {
 #[test]
 fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
     let header = |seq: u32, frame: &str| json!({"seq": seq, "stamp": {"secs": seq, "nsecs": 0}, "frame_id": frame});
-    // Of ROS 2.
+    // The header of ROS 2.
     let header_2 =
         |sec: u32, frame: &str| json!({"stamp": {"sec": sec, "nanosec": 5}, "frame_id": frame});
     for (present, candidate, ignore, fields) in [
         (json!({"sum": 3}), json!({"sum": 3}), &[][..], &[][..]),
         (json!({"sum": 3}), json!({"sum": 4}), &[], &["sum"]),
         (json!({"sum": 3}), json!({"sum": 4}), &["sum"], &[]),
-        // Within the tolerance, of one and of the number itself.
+        // Within the tolerance, relative to one and to the number itself.
         (json!({"x": 0.0}), json!({"x": 0.0009}), &[], &[]),
         (json!({"x": 5000.0}), json!({"x": 5004.0}), &[], &[]),
         (json!({"x": 5000.0}), json!({"x": 5006.0}), &[], &["x"]),
         (json!({"x": "NaN"}), json!({"x": "NaN"}), &[], &[]),
         (json!({"x": "NaN"}), json!({"x": 1.0}), &[], &["x"]),
-        // When it was published is no difference, where it is measured is one.
+        // The time of publication is no difference, the frame is one.
         (
             json!({"header": header(1, "map")}),
             json!({"header": header(7, "map")}),
@@ -52,7 +52,7 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
             &[],
             &["header.frame_id"],
         ),
-        // Something else of that name is an answer's own.
+        // Something else with that name belongs to the answer.
         (
             json!({"stamp": 1, "frame_id": "map"}),
             json!({"stamp": 7, "frame_id": "map"}),
@@ -92,7 +92,7 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
         found[0].present.ends_with("… (202 characters)"),
         "{found:?}"
     );
-    // Next to each other, and one double: integers are not allowed more where they are large.
+    // Adjacent, and equal as doubles: large integers have no larger tolerance.
     let one = json!({"id": u64::MAX});
     let other = json!({"id": u64::MAX - 1});
     assert_eq!(differences(&one, &one, &tolerance(&[])), []);
@@ -104,28 +104,28 @@ fn fields_that_differ_are_named_and_tolerated_ones_are_not() {
     assert_eq!(differences(&one, &other, &wide), []);
 }
 
-/// In short: `=` equal, `~` different, `-` missing, `+` surplus, `.` at the edge.
-fn paired(present: &[u32], candidate: &[u32], last: bool) -> String {
+/// Pairs the sequences and returns a short form: `=` equal, `~` different, `-` missing, `+` surplus, `.` at the edge.
+fn pair_in_short(present: &[u32], candidate: &[u32], last: bool) -> String {
     let mut pairing = Pairing::default();
     for one in present {
-        pairing.push(Side::Present, *one);
+        pairing.push(ShadowSide::Present, *one);
     }
     for one in candidate {
-        pairing.push(Side::Candidate, *one);
+        pairing.push(ShadowSide::Candidate, *one);
     }
     let settled = pairing.settle(last, |one, other| one == other);
     settled.iter().map(in_short).collect()
 }
 
-fn in_short(paired: &Paired<u32>) -> char {
+fn in_short(paired: &PairingResult<u32>) -> char {
     match paired {
-        Paired::Both(one, other, equal) => {
+        PairingResult::Both(one, other, equal) => {
             assert_eq!(one == other, *equal, "{one} {other}");
             if *equal { '=' } else { '~' }
         }
-        Paired::Missing(_) => '-',
-        Paired::Surplus(_) => '+',
-        Paired::Edge => '.',
+        PairingResult::Missing(_) => '-',
+        PairingResult::Surplus(_) => '+',
+        PairingResult::Edge => '.',
     }
 }
 
@@ -137,20 +137,20 @@ fn sequences_go_on_alike_after_what_was_lost_or_differs() {
         (&[1, 2, 3], &[1, 9, 2, 3], "=+=="),
         (&[1, 2, 3], &[1, 9, 3], "=~="),
         (&[1, 2, 3, 4], &[9, 9, 9, 9], "~~~~"),
-        // Still on its way, or lost for good.
+        // Still in flight, or lost for good.
         (&[1, 2, 3], &[1, 2], "==."),
         (&[1, 2, 3, 4, 5], &[1, 2], "==---"),
         (&[1, 2], &[], "--"),
         (&[], &[1, 2], "++"),
     ] {
         assert_eq!(
-            paired(present, candidate, true),
+            pair_in_short(present, candidate, true),
             expected,
             "{present:?} {candidate:?}"
         );
     }
-    // Not before it is known how both go on.
-    assert_eq!(paired(&[1, 2, 3], &[1, 3], false), "=");
+    // Not before it is known how both continue.
+    assert_eq!(pair_in_short(&[1, 2, 3], &[1, 3], false), "=");
 }
 
 proptest! {
@@ -163,7 +163,7 @@ proptest! {
         let mut expected = "=".repeat(count);
         let how = if lost + 1 == count { "." } else { "-" };
         expected.replace_range(lost..=lost, how);
-        prop_assert_eq!(paired(&present, &candidate, true), expected);
+        prop_assert_eq!(pair_in_short(&present, &candidate, true), expected);
     }
 
     #[test]
@@ -174,7 +174,7 @@ proptest! {
         let mut settled = Vec::new();
         let mut pushed = [0, 0];
         for (present, message, settles) in messages {
-            let side = if present { Side::Present } else { Side::Candidate };
+            let side = if present { ShadowSide::Present } else { ShadowSide::Candidate };
             pairing.push(side, message);
             pushed[usize::from(present)] += 1;
             if settles {
@@ -183,7 +183,7 @@ proptest! {
         }
         settled.extend(pairing.settle(true, |one, other| one == other));
         let count: usize = settled.iter().map(|one| match one {
-            Paired::Both(..) => 2,
+            PairingResult::Both(..) => 2,
             _ => 1,
         }).sum();
         prop_assert!(pairing.is_even());
@@ -212,7 +212,7 @@ fn row(equal: u64, different: u64, present: f64, candidate: f64) -> Compared {
 #[test]
 fn a_verdict_names_the_worst_that_was_found() {
     for (rows, failed, expected, words) in [
-        (vec![], None, Verdict::Nothing, "nothing was answered"),
+        (vec![], None, Verdict::Nothing, "no answers to compare"),
         (
             vec![row(20, 0, 10.0, 10.9)],
             None,
@@ -225,14 +225,14 @@ fn a_verdict_names_the_worst_that_was_found() {
             Verdict::Slower,
             "/sum takes 13.0 ms instead of 10.0 ms",
         ),
-        // A hop, or too few to say.
+        // A hop, or too few to judge.
         (vec![row(20, 0, 0.1, 1.0)], None, Verdict::Equal, "20"),
         (vec![row(3, 0, 10.0, 99.0)], None, Verdict::Equal, "3"),
         (
             vec![row(20, 1, 10.0, 99.0)],
             None,
             Verdict::Different,
-            "1 of 21 answers are not the same: /sum",
+            "1 of 21 answers differ: /sum",
         ),
         (
             vec![row(20, 1, 1.0, 1.0)],
@@ -241,7 +241,7 @@ fn a_verdict_names_the_worst_that_was_found() {
             "the candidate ended: killed",
         ),
     ] {
-        let (verdict, why) = verdict(&rows, failed, 0.1);
+        let (verdict, why) = overall_verdict(&rows, failed, 0.1);
         assert_eq!(verdict, expected, "{rows:?}");
         assert!(why.contains(words), "{why}");
     }
@@ -249,19 +249,19 @@ fn a_verdict_names_the_worst_that_was_found() {
 
 #[test]
 fn elements_that_differ_count_once_in_each_answer() {
-    let mut tally = Tally::of(Kind::Service, "/sum");
-    let differing = |value: &str| Differing {
+    let mut tally = Tally::new(Kind::Service, "/sum");
+    let differing = |value: &str| DifferingField {
         field: "all[].x".into(),
         present: value.into(),
         candidate: "9".into(),
     };
-    tally.pair(vec![differing("1"), differing("2")]);
-    tally.pair(vec![differing("3")]);
-    tally.pair(Vec::new());
-    tally.missing();
-    tally.surplus();
-    tally.time(Side::Present, 2.0);
-    let row = tally.shown();
+    tally.record_pair(vec![differing("1"), differing("2")]);
+    tally.record_pair(vec![differing("3")]);
+    tally.record_pair(Vec::new());
+    tally.record_missing();
+    tally.record_surplus();
+    tally.record_time(ShadowSide::Present, 2.0);
+    let row = tally.into_compared();
     assert_eq!((row.equal, row.different, row.answers()), (1, 2, 5));
     assert_eq!((row.missing, row.surplus), (1, 1));
     assert_eq!(row.fields.len(), 1);

@@ -1,71 +1,71 @@
-//! What a robot may have at most, and who says so.
+//! Caps on what a robot may have, and their sources.
 
 use std::fmt;
 
 use api::dictionary::Row;
 use api::{Caps, Size, Stated};
 
-use super::{Offer, Untenable};
-use crate::decide::dictionary::Shelf;
-use crate::options::{Class, DEFAULT_CLASS};
+use super::{Offer, TermsError};
+use crate::decide::dictionary::DictionaryView;
+use crate::options::{ClassOptions, DEFAULT_CLASS};
 
-/// Who bounds what a robot may ask for.
+/// Source of a cap.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Capper {
+pub enum CapSource {
     /// A class, by its `max_cpus` or `max_memory`.
     Class(String),
     /// A service, by its push.
     Service(String),
-    /// The machine, by what it has for servants.
+    /// The machine, by its capacity for servants.
     Machine,
 }
 
-/// A bound of one resource, and whose it is.
+/// A cap on one resource, and its source.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Cap {
     /// `cpus` or `memory`.
     pub resource: &'static str,
-    /// The most, as it is written.
+    /// The maximum, as written in configuration.
     pub most: String,
-    /// Who has set it.
-    pub by: Capper,
+    /// Source of the cap.
+    pub by: CapSource,
 }
 
 impl fmt::Display for Cap {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Cap { resource, most, by } = self;
         match by {
-            Capper::Class(name) => write!(
+            CapSource::Class(name) => write!(
                 out,
                 "{most}, the max_{resource} of class {name} ([class.{name}] of the configuration)"
             ),
-            Capper::Service(name) => {
+            CapSource::Service(name) => {
                 write!(
                     out,
                     "{most}, the --max-{resource} with which {name} was pushed"
                 )
             }
-            Capper::Machine => write!(out, "{most}, what this machine has for servants"),
+            CapSource::Machine => write!(out, "{most}, this machine's capacity for servants"),
         }
     }
 }
 
-/// The tighter bounds of a class and a service, each with whose it is.
+/// The tighter caps of a class and a service, each with its source.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(super) struct Bounds {
+pub(super) struct RobotCaps {
     cpus: Option<(f64, Cap)>,
     memory: Option<(Size, Cap)>,
 }
 
-impl Bounds {
-    /// Those of a robot of this class.
-    pub(super) fn of(class: Option<(&str, &Class)>, offer: &Offer<'_>) -> Bounds {
+impl RobotCaps {
+    /// Returns the caps of a robot of this class.
+    pub(super) fn for_class(class: Option<(&str, &ClassOptions)>, offer: &Offer<'_>) -> RobotCaps {
         let caps = class.map_or(Caps::default(), |(_, class)| class.caps);
         let by_class = || {
             let name = class.map_or(DEFAULT_CLASS, |(name, _)| name);
-            Capper::Class(name.to_owned())
+            CapSource::Class(name.to_owned())
         };
-        let by_service = || Capper::Service(offer.service.to_owned());
+        let by_service = || CapSource::Service(offer.service.to_owned());
         let cap = |resource, most: String, by| Cap { resource, most, by };
         let cpus = match (caps.cpus, offer.caps.cpus) {
             (Some(most), service) if service.is_none_or(|service| most <= service) => {
@@ -81,14 +81,14 @@ impl Bounds {
                 service.map(|most| (most, cap("memory", most.to_string(), by_service())))
             }
         };
-        Bounds { cpus, memory }
+        RobotCaps { cpus, memory }
     }
 
-    /// Refuses resources that are stated outright and are more than that.
-    pub(super) fn check(&self, stated: &Stated) -> Result<(), Untenable> {
+    /// Refuses explicitly stated resources that exceed a cap.
+    pub(super) fn check(&self, stated: &Stated) -> Result<(), TermsError> {
         let capped = |asked: String, cap: &Cap| {
             let cap = Box::new(cap.clone());
-            Err(Untenable::Capped { asked, cap })
+            Err(TermsError::Capped { asked, cap })
         };
         match (stated.cpus, &self.cpus) {
             (Some(asked), Some((most, cap))) if asked > *most => {
@@ -102,8 +102,8 @@ impl Bounds {
         }
     }
 
-    /// What keeps a robot from having a row; none where it may.
-    pub(super) fn against(&self, row: &Row, shelf: &Shelf<'_>) -> Option<Cap> {
+    /// Returns the cap that a row exceeds; `None` if the row is affordable.
+    pub(super) fn exceeded_by(&self, row: &Row, shelf: &DictionaryView<'_>) -> Option<Cap> {
         if let (Some(cpus), Some((most, cap))) = (row.limits.cpus, &self.cpus)
             && cpus > *most
         {
@@ -118,7 +118,7 @@ impl Bounds {
         let machine = |resource, most| Cap {
             resource,
             most,
-            by: Capper::Machine,
+            by: CapSource::Machine,
         };
         if amount.millicpus > capacity.millicpus {
             return Some(machine("cpus", capacity.cpus().to_string()));

@@ -2,21 +2,21 @@ use api::{Measure, Size};
 
 use super::*;
 
-fn stated(query: &[(&str, &str)]) -> BTreeMap<String, Stated> {
+fn statement(query: &[(&str, &str)]) -> BTreeMap<String, Stated> {
     let stated = Stated::read(query.iter().copied()).expect("valid");
     BTreeMap::from([(String::new(), stated)])
 }
 
-fn classes() -> BTreeMap<String, Class> {
+fn classes() -> BTreeMap<String, ClassOptions> {
     let caps = |cpus, memory: &str| Caps {
         cpus: Some(cpus),
         memory: memory.parse().ok(),
     };
-    let default = Class {
+    let default = ClassOptions {
         caps: caps(1.0, "512M"),
-        ..Class::default()
+        ..ClassOptions::default()
     };
-    let urgent = Class {
+    let urgent = ClassOptions {
         priority: 10,
         caps: caps(4.0, "2G"),
         limits: Limits {
@@ -24,7 +24,7 @@ fn classes() -> BTreeMap<String, Class> {
             cpus: Some(0.5),
             ..Limits::default()
         },
-        ..Class::default()
+        ..ClassOptions::default()
     };
     BTreeMap::from([
         ("default".to_owned(), default),
@@ -32,7 +32,7 @@ fn classes() -> BTreeMap<String, Class> {
     ])
 }
 
-fn offer(classes: &BTreeMap<String, Class>) -> Offer<'_> {
+fn offer(classes: &BTreeMap<String, ClassOptions>) -> Offer<'_> {
     Offer {
         service: "detect",
         limits: Limits {
@@ -108,7 +108,7 @@ fn what_is_stated_comes_before_the_push_and_the_push_before_the_class() {
             10,
         ),
     ] {
-        let terms = terms(&stated(query), &offer(classes)).expect("tenable");
+        let terms = compute_terms(&statement(query), &offer(classes)).expect("tenable");
         let limits = terms.limits;
         assert_eq!(
             (limits.cpus, limits.cpu_weight),
@@ -125,30 +125,33 @@ fn more_than_a_cap_is_refused_with_its_name() {
     for (query, words) in [
         (
             &[("cpus", "1.5")][..],
-            "cpus = 1.5 is more than this robot may ask for: 1, the max_cpus of class default ([class.default] of the configuration)",
+            "cpus = 1.5 is more than this robot may request: 1, the max_cpus of class default ([class.default] of the \
+                configuration)",
         ),
         (
             &[("memory", "1G")],
-            "memory = 1G is more than this robot may ask for: 512M, the max_memory of class default ([class.default] of the configuration)",
+            "memory = 1G is more than this robot may request: 512M, the max_memory of class default ([class.default] \
+                of the configuration)",
         ),
         (
             &[("class", "urgent"), ("cpus", "3.5")],
-            "cpus = 3.5 is more than this robot may ask for: 3, the --max-cpus with which detect was pushed",
+            "cpus = 3.5 is more than this robot may request: 3, the --max-cpus with which detect was pushed",
         ),
         (
             &[("class", "urgent"), ("memory", "3G")],
-            "memory = 3G is more than this robot may ask for: 2G, the max_memory of class urgent ([class.urgent] of the configuration)",
+            "memory = 3G is more than this robot may request: 2G, the max_memory of class urgent ([class.urgent] of \
+                the configuration)",
         ),
         (
             &[("class", "nope")],
             "class = \"nope\" is not one of the configuration's classes",
         ),
     ] {
-        let refused = terms(&stated(query), &offer(&classes)).expect_err(words);
+        let refused = compute_terms(&statement(query), &offer(&classes)).expect_err(words);
         assert_eq!(refused.to_string(), words);
     }
-    // The deployer's own limits are above the default class's cap, and stay.
-    let own = terms(&stated(&[]), &offer(&classes)).expect("tenable");
+    // The deployer's own limits exceed the default class's cap, and stay.
+    let own = compute_terms(&statement(&[]), &offer(&classes)).expect("tenable");
     assert_eq!(own.limits.cpus, Some(2.0));
 }
 
@@ -166,7 +169,7 @@ fn the_clients_of_one_robot_get_what_the_strictest_needs() {
             one(&[("cpus", "2"), ("memory", "1G"), ("class", "urgent")]),
         ),
     ]);
-    let terms = terms(&stated, &offer(&classes)).expect("tenable");
+    let terms = compute_terms(&stated, &offer(&classes)).expect("tenable");
     let limits = terms.limits;
     assert_eq!(
         (limits.cpus, limits.memory),
@@ -177,7 +180,7 @@ fn the_clients_of_one_robot_get_what_the_strictest_needs() {
         (Some("urgent"), 10)
     );
     assert_eq!(
-        terms.stated_in_words(),
+        terms.describe_stated(),
         "/detector: class=default cpus=1; /tracker: class=urgent cpus=2 memory=1G"
     );
 }
@@ -187,7 +190,10 @@ fn an_sla_is_given_what_its_row_says() {
     let (rows, mut classes) = (rows(), classes());
     let memory = |mib: u64| Some(Size(mib << 20));
     let rows = &rows;
-    fn offered<'a>(rows: &'a [Row], classes: &'a BTreeMap<String, Class>) -> Offer<'a> {
+    fn offer_with_rows<'a>(
+        rows: &'a [Row],
+        classes: &'a BTreeMap<String, ClassOptions>,
+    ) -> Offer<'a> {
         Offer {
             rows,
             ..offer(classes)
@@ -207,7 +213,7 @@ fn an_sla_is_given_what_its_row_says() {
             memory(1024),
             &[1],
         ),
-        // The row names no memory, and the push none either.
+        // Neither the row nor the push names memory.
         (&[("rrt", "250ms")], 0.5, None, &[3]),
         // Enough for both.
         (
@@ -216,9 +222,9 @@ fn an_sla_is_given_what_its_row_says() {
             memory(768),
             &[2, 4],
         ),
-        // Nothing is known of it: the push's own.
+        // No row for it: the push's own limits.
         (&[("age", "1s")], 2.0, None, &[]),
-        // Resources outright come before.
+        // Explicit resources take precedence.
         (
             &[("rrt", "100ms"), ("cpus", "0.25")],
             0.25,
@@ -227,7 +233,8 @@ fn an_sla_is_given_what_its_row_says() {
         ),
         (&[("rrt", "1ms"), ("cpus", "0.25")], 0.25, memory(512), &[2]),
     ] {
-        let terms = terms(&stated(query), &offered(rows, &classes)).expect("tenable");
+        let terms =
+            compute_terms(&statement(query), &offer_with_rows(rows, &classes)).expect("tenable");
         let ids: Vec<i64> = terms.rows.iter().map(|row| row.id).collect();
         assert_eq!(
             (terms.limits.cpus, terms.limits.memory, &*ids),
@@ -236,15 +243,19 @@ fn an_sla_is_given_what_its_row_says() {
             terms.why
         );
     }
-    // The class's SLA is that of robots that state nothing, and is no reason to refuse them.
+    // The class's SLA applies to robots that state nothing, and is no reason to refuse them.
     let default = classes.get_mut("default").expect("it is there");
-    default.sla.rrt = api::Span::millis(60);
-    let told = terms(&stated(&[]), &offered(rows, &classes)).expect("tenable");
+    default.sla.rrt = api::Span::from_millis(60);
+    let told = compute_terms(&statement(&[]), &offer_with_rows(rows, &classes)).expect("tenable");
     assert_eq!(
         told.rows[0].id, 2,
         "the best within the class's caps: {told:?}"
     );
-    let told = terms(&stated(&[("cpus", "1")]), &offered(rows, &classes)).expect("tenable");
+    let told = compute_terms(
+        &statement(&[("cpus", "1")]),
+        &offer_with_rows(rows, &classes),
+    )
+    .expect("tenable");
     assert!(told.rows.is_empty(), "it states resources: {told:?}");
 }
 
@@ -258,18 +269,19 @@ fn an_sla_that_cannot_be_kept_is_refused_with_what_can() {
     for (query, words) in [
         (
             &[("rrt", "50ms")][..],
-            "rrt 50ms needs row 1 (rrt 50ms: cpus 2.5, memory 1G), which is more cpus than this robot may have: 1, the max_cpus of class default ([class.default] of the configuration)",
+            "rrt 50ms needs entry 1 (rrt 50ms: cpus 2.5, memory 1G), which is more cpus than this robot may have: 1, \
+                the max_cpus of class default ([class.default] of the configuration)",
         ),
         (
             &[("rrt", "10ms"), ("max_rrt", "20ms"), ("class", "urgent")],
-            "detect does not reach rrt 20ms: the best that it may have is row 1 (rrt 50ms: cpus 2.5, memory 1G)",
+            "detect does not reach rrt 20ms: the best permitted is entry 1 (rrt 50ms: cpus 2.5, memory 1G)",
         ),
     ] {
-        let refused = terms(&stated(query), &offer).expect_err(words);
+        let refused = compute_terms(&statement(query), &offer).expect_err(words);
         assert_eq!(refused.to_string(), words);
     }
-    let fits = |query: &[(&str, &str)]| match terms(&stated(query), &offer) {
-        Err(Untenable::Beyond { fits, .. } | Untenable::Unmet { fits, .. }) => fits,
+    let fits = |query: &[(&str, &str)]| match compute_terms(&statement(query), &offer) {
+        Err(TermsError::Beyond { fits, .. } | TermsError::Unmet { fits, .. }) => fits,
         other => panic!("{other:?}"),
     };
     assert_eq!(fits(&[("rrt", "50ms")]).as_deref(), Some("rrt=100ms"));
@@ -277,8 +289,8 @@ fn an_sla_that_cannot_be_kept_is_refused_with_what_can() {
         fits(&[("rrt", "1ms"), ("class", "urgent")]).as_deref(),
         Some("rrt=50ms")
     );
-    // What fits is tenable.
-    terms(&stated(&[("rrt", "100ms")]), &offer).expect("it was said so");
+    // The suggested goal is accepted.
+    compute_terms(&statement(&[("rrt", "100ms")]), &offer).expect("it was said so");
     // Nothing was measured for such pictures.
     let mut narrow = rows.clone();
     for row in &mut narrow {
@@ -288,28 +300,31 @@ fn an_sla_that_cannot_be_kept_is_refused_with_what_can() {
         rows: &narrow,
         ..offer
     };
-    let refused = terms(&stated(&[("rrt", "100ms"), ("aux.width", "1920")]), &offer);
+    let refused = compute_terms(
+        &statement(&[("rrt", "100ms"), ("aux.width", "1920")]),
+        &offer,
+    );
     assert_eq!(
         refused.expect_err("too wide").to_string(),
-        "detect does not reach rrt 100ms with aux.width=1920: its dictionary has no row for it"
+        "detect does not reach rrt 100ms with aux.width=1920: its SLA table has no entry for it"
     );
-    // What a session has measured counts where the robot says nothing.
+    // Measured parameters count if the robot states none.
     let measured = Aux::from([("width".to_owned(), "320".to_owned())]);
     let offer = Offer {
         measured: &measured,
         ..offer
     };
-    let told = terms(&stated(&[("rrt", "100ms")]), &offer).expect("narrow enough");
+    let told = compute_terms(&statement(&[("rrt", "100ms")]), &offer).expect("narrow enough");
     assert_eq!(told.rows[0].id, 2);
     // A machine that is too small for the row is a cap, too.
     let offer = Offer {
         capacity: Amount::new(0.75, 1 << 30),
         ..offer
     };
-    let refused = terms(&stated(&[("rrt", "100ms")]), &offer).expect_err("too big");
+    let refused = compute_terms(&statement(&[("rrt", "100ms")]), &offer).expect_err("too big");
     assert!(
         refused.to_string().ends_with(
-            "more cpus than this robot may have: 0.75, what this machine has for servants"
+            "more cpus than this robot may have: 0.75, this machine's capacity for servants"
         ),
         "{refused}"
     );
@@ -348,8 +363,9 @@ fn an_explanation_says_of_each_row_why() {
     assert_eq!(
         explained.next,
         [
-            "better: row 1 (rrt 50ms: cpus 2.5, memory 1G), more cpus than: 1, the max_cpus of class default ([class.default] of the configuration)",
-            "cheaper: row 3 (rrt 200ms: cpus 0.5)",
+            "better: entry 1 (rrt 50ms: cpus 2.5, memory 1G), more cpus than: 1, the max_cpus of class default \
+                ([class.default] of the configuration)",
+            "cheaper: entry 3 (rrt 200ms: cpus 0.5)",
         ]
     );
     let refused = one(&[("rrt", "10ms")]);
@@ -379,11 +395,11 @@ fn what_a_deployer_asks_for_outweighs_no_promise_and_what_an_operator_says_may()
     for (limits, rows, classes, query, deployers, operators) in [
         (heavy, of_nobody, &none, &[][..], 100, 10_000),
         (promised, of_nobody, &none, &[], 2000, 10_000),
-        // Of the cores that it has in the end, not of those of the push.
+        // By the cores that it gets in the end, not by those of the push.
         (promised, of_nobody, &none, &[("cpus", "0.5")], 500, 10_000),
         (unweighed, &rows, &none, rrt, 1000, 10_000),
         (heavy, of_nobody, &some, &[("class", "urgent")], 500, 10_000),
-        // The class's own, which is the operator's.
+        // The class's own, which the operator set.
         (
             unweighed,
             of_nobody,
@@ -400,7 +416,7 @@ fn what_a_deployer_asks_for_outweighs_no_promise_and_what_an_operator_says_may()
                 is_deployers,
                 ..offer(classes)
             };
-            let terms = terms(&stated(query), &offer).expect("tenable");
+            let terms = compute_terms(&statement(query), &offer).expect("tenable");
             terms.limits.cpu_weight
         };
         let got = (weight(true), weight(false));

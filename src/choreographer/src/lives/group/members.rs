@@ -1,4 +1,4 @@
-//! The servants of a group: begun, taken in as members when they answer, retired and taken back.
+//! The servants of a group: they are started, join as members when they answer, retire and are taken back.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -8,17 +8,17 @@ use catalogue::names;
 use reach::group::dispatch::Member;
 use store::RevisionRecord;
 
-use super::{Shares, Stage};
+use super::{GroupStage, SharedGroup};
 use crate::Lease;
 use crate::decide::placement::Placement;
-use crate::lives::driver::{self, Beginning};
+use crate::lives::driver::{self, ServantSource};
 use crate::lives::handle::{Failure, Handle};
-use crate::lives::{Inner, Servants};
+use crate::lives::{ChoreographerInner, Servants};
 
-/// Before the name of a group where a robot's name stands.
+/// Prefix of a group's name, in place of a robot's name.
 const NAMED: &str = "~group-";
 
-/// SharedServant of its servants.
+/// A servant of a group.
 pub(super) struct SharedServant {
     pub(super) number: usize,
     pub(super) lease: Lease,
@@ -26,8 +26,8 @@ pub(super) struct SharedServant {
     pub(super) retiring: bool,
 }
 
-/// Takes in what has become of the servants; why one that never answered has failed.
-pub(super) fn observe(inner: &Inner, shares: &Shares) -> Option<Failure> {
+/// Updates the state of the servants; returns the failure of one that never answered.
+pub(super) fn observe(inner: &ChoreographerInner, shares: &SharedGroup) -> Option<Failure> {
     let mut failure = None;
     let mut servants = shares.servants.lock();
     servants.retain_mut(|one| {
@@ -41,41 +41,44 @@ pub(super) fn observe(inner: &Inner, shares: &Shares) -> Option<Failure> {
                 Some(member) => {
                     shares.group.leave(member, &reason);
                     let message = format!(
-                        "servant {} of {} was lost with what it worked at for robots: {reason}",
+                        "servant {} of {} was lost with its robots' requests: {reason}",
                         handle.id, shares.revision.service
                     );
                     if life.failure.is_some() {
-                        inner
-                            .journal
-                            .warning("shared-servant-lost", &message, &handle.about());
+                        inner.journal.warning(
+                            "shared-servant-lost",
+                            &message,
+                            &handle.event_context(),
+                        );
                     }
                 }
                 None => {
-                    let ended = || Failure::broken(format!("has lost its servant: {reason}"));
+                    let ended = || Failure::from_reason(format!("has lost its servant: {reason}"));
                     failure = Some(life.failure.clone().unwrap_or_else(ended));
                 }
             }
             return false;
         }
         let stage = match life.phase {
-            Phase::Requested => Stage::Queued,
-            Phase::Ready => Stage::Ready,
-            _ => Stage::Admitted,
+            Phase::Requested => GroupStage::Queued,
+            Phase::Ready => GroupStage::Ready,
+            _ => GroupStage::Admitted,
         };
-        if let (Stage::Ready, None, Some(reach)) = (&stage, one.member, handle.reach()) {
+        if let (GroupStage::Ready, None, Some(reach)) = (&stage, one.member, handle.reach()) {
             one.member = Some(shares.group.join(&handle.id, reach.bus()));
         }
         if let (true, Some(member)) = (one.retiring, one.member)
-            && shares.group.load_of(member) == 0
+            && shares.group.member_load(member) == 0
         {
-            shares.group.leave(member, "it is not needed any more");
+            shares.group.leave(member, "it is no longer needed");
             handle.end("fewer servants are needed");
             return false;
         }
         shares.state.send_if_modified(|known| {
             let further = matches!(
                 (&*known, &stage),
-                (Stage::Queued, Stage::Admitted | Stage::Ready) | (Stage::Admitted, Stage::Ready)
+                (GroupStage::Queued, GroupStage::Admitted | GroupStage::Ready)
+                    | (GroupStage::Admitted, GroupStage::Ready)
             );
             if further {
                 *known = stage;
@@ -87,8 +90,12 @@ pub(super) fn observe(inner: &Inner, shares: &Shares) -> Option<Failure> {
     failure
 }
 
-/// Starts one more servant, or takes one that is there; false where none is started any more.
-pub(super) fn begin(inner: &Arc<Inner>, shares: &Arc<Shares>, reason: &str) -> bool {
+/// Starts one more servant, or takes an existing one; returns false if the daemon is ending.
+pub(super) fn start_servant(
+    inner: &Arc<ChoreographerInner>,
+    shares: &Arc<SharedGroup>,
+    reason: &str,
+) -> bool {
     let taken: BTreeSet<usize> = shares
         .servants
         .lock()
@@ -96,17 +103,17 @@ pub(super) fn begin(inner: &Arc<Inner>, shares: &Arc<Shares>, reason: &str) -> b
         .map(|one| one.number)
         .collect();
     let number = (1..).find(|number| !taken.contains(number)).unwrap_or(1);
-    let Some(lease) = servant(inner, &shares.revision, number) else {
+    let Some(lease) = find_or_start(inner, &shares.revision, number) else {
         return false;
     };
     let handle = Arc::clone(lease.handle());
     let message = format!(
-        "servant {} of {} answers robots too: {reason}",
+        "servant {} of {} now answers robots, too: {reason}",
         handle.id, shares.revision.service
     );
     inner
         .journal
-        .info("shared-servant", &message, &handle.about());
+        .info("shared-servant", &message, &handle.event_context());
     shares.servants.lock().push(SharedServant {
         number,
         lease,
@@ -128,12 +135,14 @@ pub(super) fn begin(inner: &Arc<Inner>, shares: &Arc<Shares>, reason: &str) -> b
     true
 }
 
-/// The servant with the fewest requests gets no more.
-pub(super) fn retire(inner: &Inner, shares: &Shares, reason: &str) {
+/// Retires the servant with the fewest requests: it gets no more.
+pub(super) fn retire(inner: &ChoreographerInner, shares: &SharedGroup, reason: &str) {
     let mut servants = shares.servants.lock();
     let ready = servants.iter_mut().filter(|one| !one.retiring);
     let fewest = ready.min_by_key(|one| {
-        let load = one.member.map_or(0, |member| shares.group.load_of(member));
+        let load = one
+            .member
+            .map_or(0, |member| shares.group.member_load(member));
         (load, std::cmp::Reverse(one.number))
     });
     let Some(one) = fewest else { return };
@@ -144,28 +153,30 @@ pub(super) fn retire(inner: &Inner, shares: &Shares, reason: &str) {
     let handle = one.lease.handle();
     let service = &shares.revision.service;
     let message = format!(
-        "servant {} of {service} answers no more robots: {reason}",
+        "servant {} of {service} no longer answers robots: {reason}",
         handle.id
     );
     inner
         .journal
-        .info("shared-servant-retires", &message, &handle.about());
-    // It may have nothing to do.
+        .info("shared-servant-retires", &message, &handle.event_context());
+    // It may be idle already.
     shares.look.notify_one();
 }
 
-/// Of those that retire, the one with the fewest requests gets more again.
-pub(super) fn take_back(inner: &Inner, shares: &Shares, reason: &str) {
+/// Takes back the retiring servant with the fewest requests: it gets requests again.
+pub(super) fn take_back(inner: &ChoreographerInner, shares: &SharedGroup, reason: &str) {
     let mut servants = shares.servants.lock();
     let retiring = servants.iter_mut().filter(|one| one.retiring);
     let fewest = retiring.min_by_key(|one| {
-        let load = one.member.map_or(0, |member| shares.group.load_of(member));
+        let load = one
+            .member
+            .map_or(0, |member| shares.group.member_load(member));
         (load, one.number)
     });
     let Some(one) = fewest else { return };
     one.retiring = false;
     if let Some(member) = one.member {
-        shares.group.take_back(member);
+        shares.group.reinstate(member);
     }
     let handle = one.lease.handle();
     let message = format!(
@@ -174,11 +185,16 @@ pub(super) fn take_back(inner: &Inner, shares: &Shares, reason: &str) {
     );
     inner
         .journal
-        .info("shared-servant", &message, &handle.about());
+        .info("shared-servant", &message, &handle.event_context());
 }
 
-/// A group's servant of this number: the one that is there, or a new one; none if the daemon is ending.
-fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) -> Option<Lease> {
+/// Returns a lease of a group's servant with this number: the existing one, or a new one; `None` if the daemon is
+/// ending.
+fn find_or_start(
+    inner: &Arc<ChoreographerInner>,
+    revision: &Arc<RevisionRecord>,
+    number: usize,
+) -> Option<Lease> {
     let robot = format!("{NAMED}{}-{number}", revision.number);
     let key = (revision.service.clone(), robot.clone());
     let mut servants = inner.servants.lock();
@@ -199,20 +215,20 @@ fn servant(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>, number: usize) ->
         id.unwrap_or_else(|| names::servant_id(&revision.service)),
         robot,
         false,
-        inner.of_push(revision),
+        inner.push_limits(revision),
         Arc::clone(revision),
         store::now(),
     ));
     servants.add(key, &handle);
     let lease = Lease::new(Arc::clone(&handle), "");
     drop(servants);
-    let beginning = Beginning::Asked(warm);
+    let beginning = ServantSource::Asked(warm);
     tokio::spawn(driver::drive(Arc::clone(inner), handle, beginning));
     Some(lease)
 }
 
 impl Servants {
-    /// From now on the handle can be given under this key.
+    /// Registers the handle under this key.
     fn add(&mut self, key: (String, String), handle: &Arc<Handle>) {
         self.all.insert(handle.id.clone(), Arc::clone(handle));
         self.given.insert(key, Arc::clone(handle));

@@ -1,4 +1,4 @@
-//! What is ordered of rollouts: that one begins, that its canary is promoted or taken back, that another revision takes its place.
+//! Orders for rollouts: start, promotion, abort, and replacement by another revision.
 
 use std::sync::Arc;
 
@@ -6,13 +6,13 @@ use api::rollout::{RolloutState, RolloutTerms};
 use package::difference::Difference;
 use store::RevisionRecord;
 
-use super::{Inner, Rollout, Wait, goes_on, keep};
+use super::{ChoreographerInner, PromotionBlocker, Rollout, is_ongoing, run_rollouts};
 use crate::{Choreographer, Error};
 
-/// Differences that are named.
+/// Maximum number of differences named in an error.
 const NAMED: usize = 8;
 
-fn shown(service: &str, of: &Rollout, waits: Option<Wait>) -> api::Rollout {
+fn to_api(service: &str, of: &Rollout, waits: Option<PromotionBlocker>) -> api::Rollout {
     api::Rollout {
         service: service.to_owned(),
         stable: of.stable,
@@ -23,58 +23,60 @@ fn shown(service: &str, of: &Rollout, waits: Option<Wait>) -> api::Rollout {
         started: of.started,
         changed: of.changed,
         terms: of.terms,
-        of_stable: of.of_stable.shown(),
-        of_candidate: of.of_candidate.shown(),
+        of_stable: of.of_stable.to_arm(),
+        of_candidate: of.of_candidate.to_arm(),
     }
 }
 
-/// Refuses terms that make no sense.
+/// Refuses invalid terms.
 pub fn check_terms(terms: &RolloutTerms) -> Result<(), Error> {
     let times = [terms.deadline, terms.promote_after];
     let sane = |number: f64| number.is_finite() && number >= 0.0;
     if !sane(terms.bound) || !times.into_iter().flatten().all(sane) || terms.samples == 0 {
         return Err(Error::Rollout(
-            "a bound, a deadline and promote_after are numbers from 0 on, and samples are at least 1".to_owned(),
+            "bound, deadline and promote_after must be 0 or greater, and samples at least 1"
+                .to_owned(),
         ));
     }
     if terms.promote_after.is_some() && terms.canary.is_none() {
         return Err(Error::Rollout(
-            "promote_after is for a canary; say which robots it serves, such as 10%".to_owned(),
+            "promote_after needs a canary; set the robots that it serves, such as 10%".to_owned(),
         ));
     }
     Ok(())
 }
 
 impl Choreographer {
-    /// Looks after rollouts from now on, those of an earlier daemon, too.
+    /// Starts running rollouts, including those of an earlier daemon.
     pub fn keep_rollouts(&self) -> Result<(), Error> {
         self.inner.read_rollouts()?;
-        tokio::spawn(keep(Arc::clone(&self.inner)));
+        tokio::spawn(run_rollouts(Arc::clone(&self.inner)));
         Ok(())
     }
 
-    /// Refuses a revision that is to be published as a canary and would break robots of the current one.
+    /// Refuses a canary that would break robots of the current revision.
     pub fn check_canary(&self, candidate: &RevisionRecord) -> Result<(), Error> {
-        fits(
-            &*self.inner.catalogue.current(&candidate.service)?,
+        check_compatible(
+            &*self.inner.catalogue.current_revision(&candidate.service)?,
             candidate,
         )
     }
 
-    /// The last rollout of a service.
+    /// Returns the last rollout of a service.
     pub fn rollout(&self, service: &str) -> Result<api::Rollout, Error> {
-        self.inner.catalogue.current(service)?;
+        self.inner.catalogue.current_revision(service)?;
         match self.inner.rollout(service) {
             Some(rollout) => {
-                let waits = self.inner.rollout_waits(service);
-                Ok(shown(service, &rollout, waits))
+                let waits = self.inner.promotion_blocker(service);
+                Ok(to_api(service, &rollout, waits))
             }
             None => Err(Error::NoRollout(service.to_owned())),
         }
     }
 
-    /// A published revision begins its way: as a canary beside the current one, or as the current one, the servants of others
-    /// having a deadline. `stable` is the revision that was the current one, where `candidate` is it already.
+    /// Starts the rollout of a published revision: as a canary beside the current one, or as the current one, with a
+    /// deadline for servants of others. `stable` is the previous current revision, if `candidate` is the current one
+    /// already.
     pub async fn begin_rollout(
         &self,
         service: &str,
@@ -85,7 +87,7 @@ impl Choreographer {
         check_terms(&terms)?;
         let inner = &self.inner;
         let _turn = inner.rollouts.turn.lock().await;
-        let current = inner.catalogue.current(service)?;
+        let current = inner.catalogue.current_revision(service)?;
         let Some(revision) = inner.state.revision(service, candidate)? else {
             return Err(Error::Rollout(format!(
                 "{service} has no revision {candidate}"
@@ -94,11 +96,11 @@ impl Choreographer {
         let is_canary = terms.canary.is_some();
         if is_canary && candidate == current.number {
             return Err(Error::Rollout(format!(
-                "revision {candidate} of {service} is the current one already"
+                "revision {candidate} of {service} is already the current one"
             )));
         }
         if is_canary {
-            fits(&current, &revision)?;
+            check_compatible(&current, &revision)?;
         }
         inner.replace_rollout(service, candidate)?;
         let now = store::now();
@@ -117,7 +119,7 @@ impl Choreographer {
         match terms.canary {
             Some(share) => {
                 let who = match share {
-                    api::rollout::Share::Robots(1) => "the first robot that comes".to_owned(),
+                    api::rollout::Share::Robots(1) => "the first robot".to_owned(),
                     api::rollout::Share::Robots(most) => format!("the first {most} robots"),
                     share => format!("{share} of the robots"),
                 };
@@ -130,7 +132,7 @@ impl Choreographer {
                     .await?
                 {
                     return Err(Error::Rollout(format!(
-                        "another revision of {service} was published meanwhile; say again which is to be the current one"
+                        "another revision of {service} was published meanwhile; select the revision again"
                     )));
                 }
                 rollout.state = rollout.after_promotion();
@@ -142,31 +144,33 @@ impl Choreographer {
         self.rollout(service)
     }
 
-    /// The canary becomes the current revision.
+    /// Promotes the canary to the current revision.
     pub async fn promote_rollout(&self, service: &str) -> Result<api::Rollout, Error> {
         let inner = &self.inner;
         let _turn = inner.rollouts.turn.lock().await;
         let canary = self.canary(service)?;
-        inner.promote(service, &canary, "somebody said so").await?;
+        inner
+            .promote(service, &canary, "requested by a user")
+            .await?;
         self.rollout(service)
     }
 
-    /// The canary is taken back.
+    /// Rolls the canary back.
     pub async fn abort_rollout(&self, service: &str) -> Result<api::Rollout, Error> {
         let inner = &self.inner;
         let _turn = inner.rollouts.turn.lock().await;
         let (canary, state) = (self.canary(service)?, RolloutState::Aborted);
-        inner.take_back(service, canary.candidate, state, "somebody said so")?;
+        inner.take_back(service, canary.candidate, state, "requested by a user")?;
         self.rollout(service)
     }
 
-    /// Another revision than a canary has become the current one: a rollout that goes on is over.
+    /// Ends an ongoing rollout because another revision than the canary has become the current one.
     pub async fn revision_changed(&self, service: &str, to: u64) -> Result<(), Error> {
         let _turn = self.inner.rollouts.turn.lock().await;
         self.inner.replace_rollout(service, to)
     }
 
-    /// A service was removed: its rollout is over, and nobody is told.
+    /// Forgets the rollout of a removed service, without an event.
     pub async fn forget_rollout(&self, service: &str) {
         let rollouts = &self.inner.rollouts;
         let _turn = rollouts.turn.lock().await;
@@ -183,24 +187,24 @@ impl Choreographer {
             .filter(|rollout| rollout.state == RolloutState::Canary)
             .ok_or_else(|| {
                 Error::Rollout(format!(
-                    "revision {} of {service} is no canary: {} ({})",
+                    "revision {} of {service} is not a canary: {} ({})",
                     shown.candidate, shown.state, shown.reason
                 ))
             })
     }
 }
 
-impl Inner {
-    /// Ends a rollout that goes on, since revision `to` is, or is to be, the current one.
+impl ChoreographerInner {
+    /// Ends an ongoing rollout, because revision `to` is, or is to become, the current one.
     fn replace_rollout(&self, service: &str, to: u64) -> Result<(), Error> {
-        let Some(rollout) = self.rollout(service).filter(goes_on) else {
+        let Some(rollout) = self.rollout(service).filter(is_ongoing) else {
             return Ok(());
         };
         let candidate = rollout.candidate;
         if candidate == to && rollout.state == RolloutState::Draining {
             return Ok(());
         }
-        let reason = format!("revision {to} takes its place");
+        let reason = format!("revision {to} replaces it");
         let state = RolloutState::Replaced;
         if rollout.state == RolloutState::Canary && candidate != to {
             return self.take_back(service, candidate, state, &reason);
@@ -210,22 +214,22 @@ impl Inner {
     }
 }
 
-/// Robots that were made for the stable revision have to find what they use in the candidate, too.
-fn fits(stable: &RevisionRecord, candidate: &RevisionRecord) -> Result<(), Error> {
+/// Checks that robots built for the stable revision find what they use in the candidate, too.
+fn check_compatible(stable: &RevisionRecord, candidate: &RevisionRecord) -> Result<(), Error> {
     if stable.plan.shared.is_some() || candidate.plan.shared.is_some() {
         return Err(Error::Rollout(format!(
-            "revision {} of {} cannot be a canary: robots share its servants, and get the same revision",
+            "revision {} of {} cannot be a canary: robots share its servants, so all get the same revision",
             candidate.number, candidate.service
         )));
     }
-    let difference = Difference::between(&stable.interface, &candidate.interface);
+    let difference = Difference::compare(&stable.interface, &candidate.interface);
     if difference.compatible() {
         return Ok(());
     }
     let breaking = difference.changes.iter().filter(|it| !it.compatible);
     let words: Vec<String> = breaking.take(NAMED).map(ToString::to_string).collect();
     Err(Error::Rollout(format!(
-        "revision {} of {} cannot be a canary: robots of revision {} would not find what they use: {}",
+        "revision {} of {} cannot be a canary: its interface breaks robots of revision {}: {}",
         candidate.number,
         candidate.service,
         stable.number,

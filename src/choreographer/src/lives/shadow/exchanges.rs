@@ -1,4 +1,4 @@
-//! Calls and goals of the robot, carried out by the candidate, too, and what was answered to them.
+//! Calls and goals of the robot that the candidate carries out as well, and their answers.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -7,35 +7,36 @@ use std::time::{Duration, Instant};
 use api::shadow::Kind;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use reach::tap::{Answer, What};
-use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, Outcome};
+use reach::tap::{TapAnswer, TapEventKind};
+use ros::bus::{ActionClient, Bus, GoalEnd, GoalEvents, GoalOutcome};
 use ros::schema::{ActionDef, MessageType, Registry, ServiceDef};
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-use super::mirror::{CUT, Notes, compare, millis};
-use crate::decide::shadow::{Differing, Side, Tally, Tolerance};
+use super::mirror::{CUT, ComparisonNotes, compare, millis};
+use crate::decide::shadow::{DifferingField, ShadowSide, Tally, Tolerance};
 
-/// How long a call of the candidate may take, and its action servers may take to be there.
+/// Timeout for a call of the candidate, and for its action servers to appear.
 const CALL: Duration = Duration::from_secs(60);
 const ACTION: Duration = Duration::from_secs(10);
-/// For the type of a service.
+/// Timeout for looking up a service's type.
 const TYPE: Duration = Duration::from_secs(5);
-/// The candidate may be behind by so many; more are left out.
+/// Maximum number of calls and goals by which the candidate may be behind; more are left out.
 const BEHIND: usize = 64;
 
-/// Calls and goals, those under way and those that were answered.
+/// Calls and goals, in progress and answered.
 pub(super) struct Exchanges {
-    /// Where the robot asks; for the types of its services.
+    /// The bus on which the robot asks; used for the types of its services.
     from: Arc<dyn Bus>,
     to: Arc<dyn Bus>,
     under_way: HashMap<u64, Exchange>,
     /// The candidate's answers.
-    pub(super) answers: JoinSet<(u64, Answer, f64)>,
-    /// Of what the robot had been answered before it asked on; a candidate is asked on once it has answered that, too.
+    pub(super) answers: JoinSet<(u64, TapAnswer, f64)>,
+    /// Answers that the robot had received before its next request; the candidate is sent that request once it has
+    /// answered those, too.
     before: Vec<CancellationToken>,
-    services: HashMap<String, Of>,
+    services: HashMap<String, AnswerType>,
     clients: HashMap<String, Arc<dyn ActionClient>>,
     tallies: BTreeMap<(Kind, String), Tally>,
     pub(super) given: u64,
@@ -44,28 +45,28 @@ pub(super) struct Exchanges {
 struct Exchange {
     kind: Kind,
     name: String,
-    of: Of,
-    present: Option<(Answer, f64)>,
-    candidate: Option<(Answer, f64)>,
-    /// The candidate has answered.
+    of: AnswerType,
+    present: Option<(TapAnswer, f64)>,
+    candidate: Option<(TapAnswer, f64)>,
+    /// Cancelled once the candidate has answered.
     done: CancellationToken,
     goal: Option<(Arc<dyn ActionClient>, String)>,
 }
 
-/// What an answer is read by.
+/// Type by which an answer is decoded.
 #[derive(Clone)]
-enum Of {
+enum AnswerType {
     Service(Arc<ServiceDef>),
     Action(Arc<ActionDef>),
     Unknown,
 }
 
-impl Of {
+impl AnswerType {
     fn answer(&self) -> Option<&MessageType> {
         match self {
-            Of::Service(of) => Some(&of.response),
-            Of::Action(of) => Some(&of.result),
-            Of::Unknown => None,
+            AnswerType::Service(of) => Some(&of.response),
+            AnswerType::Action(of) => Some(&of.result),
+            AnswerType::Unknown => None,
         }
     }
 }
@@ -85,39 +86,43 @@ impl Exchanges {
         }
     }
 
-    /// Whether nothing is under way.
+    /// Returns true if nothing is in progress.
     pub(super) fn is_even(&self) -> bool {
         self.under_way.is_empty()
     }
 
-    /// The robot asks something, in which the candidate follows it.
+    /// Handles a request of the robot: sends it to the candidate, too.
     pub(super) async fn ask(
         &mut self,
         number: u64,
-        what: What,
+        what: TapEventKind,
         registry: &Registry,
-        notes: &mut Notes,
+        notes: &mut ComparisonNotes,
     ) {
         if self.answers.len() >= BEHIND {
-            let why = format!("the candidate was behind by {BEHIND} calls and goals");
+            let why = format!("the candidate had {BEHIND} unanswered calls and goals");
             return notes.add(name_of(&what), &why);
         }
         let done = CancellationToken::new();
         let before = self.before.clone();
         let exchange = match what {
-            What::Call { service, request } => {
-                let (of, digest) = self.service(&service, registry).await;
+            TapEventKind::Call { service, request } => {
+                let (of, digest) = self.resolve_service(&service, registry).await;
                 let (to, name) = (Arc::clone(&self.to), service.clone());
                 let over = done.clone();
                 self.answers.spawn(async move {
-                    all(before).await;
+                    wait_all(before).await;
                     let asked = Instant::now();
                     let response = match digest {
                         Some(digest) => to.call_typed(&name, &digest, request, CALL).await,
                         None => to.call(&name, request, CALL).await,
                     };
                     over.cancel();
-                    (number, Answer::of_call(&response), millis(asked.elapsed()))
+                    (
+                        number,
+                        TapAnswer::from_call(&response),
+                        millis(asked.elapsed()),
+                    )
                 });
                 Exchange {
                     kind: Kind::Service,
@@ -129,8 +134,8 @@ impl Exchanges {
                     goal: None,
                 }
             }
-            What::Goal { action, of, goal } => {
-                let client = match self.client(&action, &of) {
+            TapEventKind::Goal { action, of, goal } => {
+                let client = match self.action_client(&action, &of) {
                     Ok(client) => client,
                     Err(why) => return notes.add(&action, &why),
                 };
@@ -138,52 +143,52 @@ impl Exchanges {
                 let sent = (Arc::clone(&client), id.clone());
                 let over = done.clone();
                 self.answers.spawn(async move {
-                    all(before).await;
-                    let (answer, took) = carried_out(&*client, &id, goal).await;
+                    wait_all(before).await;
+                    let (answer, took) = run_goal(&*client, &id, goal).await;
                     over.cancel();
                     (number, answer, took)
                 });
                 Exchange {
                     kind: Kind::Action,
                     name: action,
-                    of: Of::Action(of),
+                    of: AnswerType::Action(of),
                     present: None,
                     candidate: None,
                     done,
                     goal: Some(sent),
                 }
             }
-            What::Cancel | What::Answered { .. } => return,
+            TapEventKind::Cancel | TapEventKind::Answered { .. } => return,
         };
         self.given += 1;
         self.under_way.insert(number, exchange);
     }
 
-    /// The robot wants a goal to end.
+    /// Cancels a goal at the candidate.
     pub(super) fn cancel(&self, number: u64) {
         let exchange = self.under_way.get(&number);
         if let Some((client, id)) = exchange.and_then(|exchange| exchange.goal.as_ref()) {
-            client.cancel(id);
+            client.cancel_goal(id);
         }
     }
 
-    /// The robot, or the candidate, was answered.
-    pub(super) fn answered(
+    /// Records an answer to the robot or to the candidate.
+    pub(super) fn record_answer(
         &mut self,
-        side: Side,
-        (number, answer, took): (u64, Answer, f64),
+        side: ShadowSide,
+        (number, answer, took): (u64, TapAnswer, f64),
         tolerance: &Tolerance,
-        notes: &mut Notes,
+        notes: &mut ComparisonNotes,
     ) {
         let Some(exchange) = self.under_way.get_mut(&number) else {
             return;
         };
         match side {
-            Side::Present => {
+            ShadowSide::Present => {
                 exchange.present = Some((answer, took));
                 self.before.push(exchange.done.clone());
             }
-            Side::Candidate => exchange.candidate = Some((answer, took)),
+            ShadowSide::Candidate => exchange.candidate = Some((answer, took)),
         }
         self.before.retain(|done| !done.is_cancelled());
         if exchange.present.is_none() || exchange.candidate.is_none() {
@@ -200,31 +205,39 @@ impl Exchanges {
         else {
             return;
         };
-        if present == Answer::GivenUp {
+        if present == TapAnswer::GivenUp {
             return notes.add(&name, "the robot did not wait for the answer");
         }
         let tally = self.tallies.entry((kind, name.clone()));
-        let tally = tally.or_insert_with(|| Tally::of(kind, &name));
-        tally.time(Side::Present, took);
-        tally.time(Side::Candidate, took_there);
-        tally.pair(differing(&present, &candidate, of.answer(), tolerance));
+        let tally = tally.or_insert_with(|| Tally::new(kind, &name));
+        tally.record_time(ShadowSide::Present, took);
+        tally.record_time(ShadowSide::Candidate, took_there);
+        tally.record_pair(answer_differences(
+            &present,
+            &candidate,
+            of.answer(),
+            tolerance,
+        ));
     }
 
-    /// It is over: what has no answer of the candidate has none.
-    pub(super) fn end(&mut self, cut: bool, notes: &mut Notes) {
+    /// Ends the comparison: open requests have no answer of the candidate.
+    pub(super) fn end(&mut self, cut: bool, notes: &mut ComparisonNotes) {
         for exchange in std::mem::take(&mut self.under_way).into_values() {
             let name = exchange.name;
             match exchange.present {
-                None => notes.add(&name, "the robot had no answer yet when it ended"),
-                Some((Answer::GivenUp, _)) => {
+                None => notes.add(
+                    &name,
+                    "the robot had no answer yet when the comparison ended",
+                ),
+                Some((TapAnswer::GivenUp, _)) => {
                     notes.add(&name, "the robot did not wait for the answer");
                 }
                 Some(_) if cut => notes.add(&name, CUT),
                 Some(_) => {
                     let tally = self.tallies.entry((exchange.kind, name.clone()));
                     tally
-                        .or_insert_with(|| Tally::of(exchange.kind, &name))
-                        .missing();
+                        .or_insert_with(|| Tally::new(exchange.kind, &name))
+                        .record_missing();
                 }
             }
         }
@@ -234,25 +247,29 @@ impl Exchanges {
         self.tallies.into_values()
     }
 
-    /// What the answers of a service are read by, and the digest that its requests were written by.
-    async fn service(
+    /// Returns the type of a service's answers, and the digest with which its requests were serialized.
+    async fn resolve_service(
         &mut self,
         service: &str,
         registry: &Registry,
-    ) -> (Of, Option<ros::bus::Digest>) {
+    ) -> (AnswerType, Option<ros::bus::Digest>) {
         let asked = tokio::time::timeout(TYPE, self.from.service_type(service)).await;
         let Ok(Ok(known)) = asked else {
-            return (Of::Unknown, None);
+            return (AnswerType::Unknown, None);
         };
         let of = self.services.entry(service.to_owned()).or_insert_with(|| {
             let of = registry.service(&known.name).ok();
-            let of = of.filter(|of| known.digest.agrees(&ros::bus::Digest::from(&of.md5)));
-            of.map_or(Of::Unknown, Of::Service)
+            let of = of.filter(|of| {
+                known
+                    .digest
+                    .is_compatible_with(&ros::bus::Digest::from(&of.md5))
+            });
+            of.map_or(AnswerType::Unknown, AnswerType::Service)
         });
         (of.clone(), Some(known.digest))
     }
 
-    fn client(
+    fn action_client(
         &mut self,
         action: &str,
         of: &Arc<ActionDef>,
@@ -267,76 +284,84 @@ impl Exchanges {
     }
 }
 
-fn name_of(what: &What) -> &str {
+fn name_of(what: &TapEventKind) -> &str {
     match what {
-        What::Call { service, .. } => service,
-        What::Goal { action, .. } => action,
-        What::Cancel | What::Answered { .. } => "",
+        TapEventKind::Call { service, .. } => service,
+        TapEventKind::Goal { action, .. } => action,
+        TapEventKind::Cancel | TapEventKind::Answered { .. } => "",
     }
 }
 
-async fn all(before: Vec<CancellationToken>) {
+async fn wait_all(before: Vec<CancellationToken>) {
     for done in before {
         done.cancelled().await;
     }
 }
 
-/// Has the candidate carry out a goal, and waits for its end.
-async fn carried_out(client: &dyn ActionClient, id: &str, goal: Bytes) -> (Answer, f64) {
-    if let Err(error) = client.ready(ACTION).await {
-        return (Answer::Refused(error.to_string()), 0.0);
+/// Sends a goal to the candidate and waits for its end.
+async fn run_goal(client: &dyn ActionClient, id: &str, goal: Bytes) -> (TapAnswer, f64) {
+    if let Err(error) = client.wait_for_server(ACTION).await {
+        return (TapAnswer::Refused(error.to_string()), 0.0);
     }
     let (sender, ended) = oneshot::channel();
     let asked = Instant::now();
-    client.send(id, goal, Arc::new(Ending(Mutex::new(Some(sender)))));
+    client.send_goal(id, goal, Arc::new(GoalEndSender(Mutex::new(Some(sender)))));
     let end = ended
         .await
-        .unwrap_or_else(|_| Err("nobody knows how it ended".to_owned()));
-    (Answer::of_goal(&end), millis(asked.elapsed()))
+        .unwrap_or_else(|_| Err("its outcome is unknown".to_owned()));
+    (TapAnswer::from_goal(&end), millis(asked.elapsed()))
 }
 
-/// Hears how a goal of the candidate ends.
-struct Ending(Mutex<Option<oneshot::Sender<Result<GoalEnd, String>>>>);
+/// Reports how a goal of the candidate ends.
+struct GoalEndSender(Mutex<Option<oneshot::Sender<Result<GoalEnd, String>>>>);
 
-impl GoalEvents for Ending {
-    fn feedback(&self, _feedback: Bytes) {}
+impl GoalEvents for GoalEndSender {
+    fn on_feedback(&self, _feedback: Bytes) {}
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         if let Some(sender) = self.0.lock().take() {
             let _ = sender.send(end);
         }
     }
 }
 
-/// In what two answers differ. Words of refusals are not compared: they may name times and addresses.
-fn differing(
-    present: &Answer,
-    candidate: &Answer,
+/// Returns the differences of two answers. Texts of refusals are not compared: they may contain times and addresses.
+fn answer_differences(
+    present: &TapAnswer,
+    candidate: &TapAnswer,
     of: Option<&MessageType>,
     tolerance: &Tolerance,
-) -> Vec<Differing> {
+) -> Vec<DifferingField> {
     match (present, candidate) {
-        (Answer::Given(one, _), Answer::Given(other, _)) if one != other => {
-            vec![Differing::whole(outcome(*one), outcome(*other))]
+        (TapAnswer::Given(one, _), TapAnswer::Given(other, _)) if one != other => {
+            vec![DifferingField::whole_answer(
+                outcome_in_words(*one),
+                outcome_in_words(*other),
+            )]
         }
-        (Answer::Given(_, one), Answer::Given(_, other)) => compare(of, one, other, tolerance),
-        (Answer::Refused(_), Answer::Refused(_)) => Vec::new(),
-        (one, other) => vec![Differing::whole(in_words(one), in_words(other))],
+        (TapAnswer::Given(_, one), TapAnswer::Given(_, other)) => {
+            compare(of, one, other, tolerance)
+        }
+        (TapAnswer::Refused(_), TapAnswer::Refused(_)) => Vec::new(),
+        (one, other) => vec![DifferingField::whole_answer(
+            answer_in_words(one),
+            answer_in_words(other),
+        )],
     }
 }
 
-fn outcome(outcome: Option<Outcome>) -> String {
+fn outcome_in_words(outcome: Option<GoalOutcome>) -> String {
     outcome.map_or_else(
         || "answered".to_owned(),
         |outcome| format!("{outcome:?}").to_lowercase(),
     )
 }
 
-fn in_words(answer: &Answer) -> String {
+fn answer_in_words(answer: &TapAnswer) -> String {
     match answer {
-        Answer::Given(of, _) => outcome(*of),
-        Answer::Refused(reason) => format!("failed: {reason}"),
-        Answer::GivenUp => "not answered".to_owned(),
+        TapAnswer::Given(of, _) => outcome_in_words(*of),
+        TapAnswer::Refused(reason) => format!("failed: {reason}"),
+        TapAnswer::GivenUp => "not answered".to_owned(),
     }
 }
 
@@ -350,8 +375,8 @@ mod tests {
             number: 0.0,
             ignore: Vec::new(),
         };
-        let given = |outcome, bytes: &'static [u8]| Answer::Given(outcome, bytes.into());
-        let refused = |why: &str| Answer::Refused(why.into());
+        let given = |outcome, bytes: &'static [u8]| TapAnswer::Given(outcome, bytes.into());
+        let refused = |why: &str| TapAnswer::Refused(why.into());
         for (present, candidate, words) in [
             (given(None, b"a"), given(None, b"a"), None),
             (refused("one"), refused("other"), None),
@@ -361,8 +386,8 @@ mod tests {
                 Some(("answered", "failed: no")),
             ),
             (
-                given(Some(Outcome::Succeeded), b""),
-                given(Some(Outcome::Aborted), b""),
+                given(Some(GoalOutcome::Succeeded), b""),
+                given(Some(GoalOutcome::Aborted), b""),
                 Some(("succeeded", "aborted")),
             ),
             (
@@ -371,7 +396,7 @@ mod tests {
                 Some(("1 bytes", "2 bytes")),
             ),
         ] {
-            let found = differing(&present, &candidate, None, &tolerance);
+            let found = answer_differences(&present, &candidate, None, &tolerance);
             let said = found.first();
             let said = said.map(|one| (one.present.as_str(), one.candidate.as_str()));
             assert_eq!(said, words, "{present:?} {candidate:?}");

@@ -1,4 +1,4 @@
-//! Nodes that a robot's stubs have started, in a candidate: by the robot's names, and with its parameters.
+//! Starts the nodes of a robot's stubs in a candidate, with the robot's names and parameters.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -6,14 +6,14 @@ use std::time::Duration;
 use reach::Reach;
 use ros::bus::Graph;
 
-use ros::ros1::own_parameters::is_of_master;
+use ros::ros1::own_parameters::is_set_by_master;
 
 use crate::Error;
 use crate::lives::handle::Handle;
 
-/// Where links keep runs of nodes.
+/// Parameter namespace in which links keep the runs of nodes.
 const RUNS: &str = "/cloudroid_runs/";
-/// For the nodes to be where those of the robot's servant are.
+/// Timeout for the nodes to register what those of the robot's servant have.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Starts in `candidate` what the robot's stubs have started in its servant.
@@ -21,14 +21,15 @@ pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(),
     let Some(there) = present.reach() else {
         return Ok(());
     };
-    let linked = there.linked().await;
+    let linked = there.stub_nodes().await;
     if linked.is_empty() {
         return Err(Error::Shadow(format!(
-            "the stubs of robot {} have started no node since this daemon began; start them again, or compare with another robot",
+            "the stubs of robot {} have started no node since this daemon started; restart them, or compare with \
+                another robot",
             present.robot
         )));
     }
-    // What its push gave is the revision's: the candidate's own comes with its nodes.
+    // Parameters of the push belong to the revision: the candidate gets its own with its nodes.
     let given: BTreeSet<&str> = linked
         .iter()
         .flat_map(|one| one.given.iter().map(|(key, _)| key.as_str()))
@@ -42,7 +43,7 @@ pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(),
         .await
         .map_err(failed)?
     {
-        let own = is_of_master(&key) || key.starts_with(RUNS);
+        let own = is_set_by_master(&key) || key.starts_with(RUNS);
         if own || given.contains(key.as_str()) {
             continue;
         }
@@ -54,19 +55,19 @@ pub(super) async fn start(present: &Handle, candidate: &dyn Reach) -> Result<(),
         set.map_err(failed)?;
     }
     for one in &linked {
-        candidate.start_linked(&one.node).await?;
+        candidate.start_stub_node(&one.node).await?;
     }
     let wanted = from.graph().borrow().clone();
     let names: Vec<&str> = linked.iter().map(|one| one.node.name.as_str()).collect();
     let mut graph = to.graph();
-    let there = graph.wait_for(|graph| shows(graph, &wanted, &names));
-    // What is not there by then may come later, or is told as missing.
+    let there = graph.wait_for(|graph| has_endpoints(graph, &wanted, &names));
+    // What is missing by then may come later, or is reported as missing.
     let _ = tokio::time::timeout(PATIENCE, there).await;
     Ok(())
 }
 
-/// Whether a graph has all that these nodes have in another.
-fn shows(graph: &Graph, wanted: &Graph, nodes: &[&str]) -> bool {
+/// Returns true if the graph has everything that these nodes have in the other.
+fn has_endpoints(graph: &Graph, wanted: &Graph, nodes: &[&str]) -> bool {
     let of_them = |node: &String| nodes.contains(&node.as_str());
     let services = wanted.services.iter().filter(|(_, node)| of_them(node));
     let topics = wanted.topics.iter();

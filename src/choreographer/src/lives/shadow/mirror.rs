@@ -1,4 +1,4 @@
-//! One comparison, from its first request to what was found.
+//! A comparison, from its first request to its report.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use budget::Budget;
 use bytes::Bytes;
 use package::difference::Difference;
 use reach::Reach;
-use reach::tap::{Answer, Tapped, Tapping, What};
+use reach::tap::{TapAnswer, TapEvent, TapEventKind, TapReceiver};
 use ros::bus::Graph;
 use ros::codec::{JsonOptions, NonFinite, to_json};
 use ros::schema::{MessageType, Registry};
@@ -18,20 +18,22 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::exchanges::Exchanges;
-use super::topics::{self, Heard, Topics};
-use crate::decide::shadow::{Differing, Side, Tally, Tolerance, differences, verdict};
+use super::topics::{self, HeardMessage, MirroredTopics};
+use crate::decide::shadow::{
+    DifferingField, ShadowSide, Tally, Tolerance, differences, overall_verdict,
+};
 use crate::lives::handle::{Failure, Handle, Life};
-use crate::{Choreographer, Error, Measured};
+use crate::{Choreographer, Error, MeasuredServant};
 
-/// What is on its way when it ends has so long to come.
+/// Time for messages in flight at the end.
 const GRACE: Duration = Duration::from_secs(5);
-/// So long nothing has come, and as much of both sides: then nothing is on its way any more.
+/// Time without messages, at equal counts on both sides, after which nothing is in flight any more.
 const QUIET: Duration = Duration::from_secs(2);
-/// What is waited for publishers, at least and at most.
+/// Minimum and maximum time to wait for publishers.
 const SETTLES: (Duration, Duration) = (Duration::from_millis(200), Duration::from_secs(2));
-/// Bytes of JSON that a message may become; a longer one is compared as a whole.
+/// Maximum size of a message as JSON, in bytes; a larger one is compared as a whole.
 const LONGEST: usize = 4 << 20;
-/// Differences of interfaces that are named.
+/// Maximum number of interface differences reported.
 const NAMED: usize = 8;
 
 /// A comparison.
@@ -39,20 +41,20 @@ pub(super) struct Mirror<'a> {
     options: &'a ShadowOptions,
     tolerance: Tolerance,
     present: &'a Handle,
-    candidate: &'a Measured,
+    candidate: &'a MeasuredServant,
     registry: Arc<Registry>,
     graph: watch::Receiver<Arc<Graph>>,
-    tapping: Tapping,
-    topics: Topics,
+    tapping: TapReceiver,
+    topics: MirroredTopics,
     exchanges: Exchanges,
-    notes: Notes,
+    notes: ComparisonNotes,
 }
 
-/// What could not be compared, and why.
+/// Parts that could not be compared, with the reasons.
 #[derive(Default)]
-pub(super) struct Notes(BTreeMap<(String, String), u64>);
+pub(super) struct ComparisonNotes(BTreeMap<(String, String), u64>);
 
-impl Notes {
+impl ComparisonNotes {
     pub(super) fn add(&mut self, what: &str, why: &str) {
         self.add_many(what, why, 1);
     }
@@ -61,7 +63,7 @@ impl Notes {
         *self.0.entry((what.to_owned(), why.to_owned())).or_default() += count;
     }
 
-    fn shown(self) -> Vec<NotCompared> {
+    fn into_not_compared(self) -> Vec<NotCompared> {
         let notes = self.0.into_iter();
         notes
             .map(|((what, why), count)| NotCompared { what, why, count })
@@ -69,11 +71,11 @@ impl Notes {
     }
 }
 
-/// How a comparison ends.
-enum End {
-    /// What is on its way is waited for.
+/// End of a comparison.
+enum ComparisonEnd {
+    /// Messages in flight are waited for.
     Soon(String),
-    /// The candidate is there no longer; whether its nodes failed.
+    /// The candidate is gone; the flag says whether its nodes failed.
     Now(String, bool),
 }
 
@@ -81,13 +83,13 @@ impl<'a> Mirror<'a> {
     pub(super) async fn open(
         choreographer: &Choreographer,
         present: &'a Handle,
-        (candidate, reach): (&'a Measured, &dyn Reach),
+        (candidate, reach): (&'a MeasuredServant, &dyn Reach),
         options: &'a ShadowOptions,
         budget: &Budget,
     ) -> Result<Mirror<'a>, Error> {
         let gone = || {
             Error::Shadow(format!(
-                "robot {} has left while the candidate was started",
+                "robot {} left while the candidate was starting",
                 present.robot
             ))
         };
@@ -95,31 +97,39 @@ impl<'a> Mirror<'a> {
         let tap = there.tap().ok_or_else(gone)?;
         let tapping = tap.listen(budget).ok_or_else(|| {
             Error::Shadow(format!(
-                "servant {} of robot {} is compared with a candidate already; wait for that to end",
+                "servant {} of robot {} is already being compared with a candidate; wait until that ends",
                 present.id, present.robot
             ))
         })?;
         let revision = &present.revision;
         let opener = &choreographer.inner.opener;
-        // A robot that shares its servants has none of its own, and no topics. It connects to no host outside.
+        // A robot of a shared service has no servant of its own, and no topics. The look connects to no external host.
         let look = match present.container() {
             Some(container) => Some(
                 opener
-                    .look(&container, revision.flavour.ros.bus(), topics::NODE, &[])
+                    .observe(
+                        &container,
+                        revision.flavour.ros.ros_version(),
+                        topics::NODE,
+                        &[],
+                    )
                     .await?,
             ),
             None => None,
         };
         let definitions = &revision.interface.definitions;
-        let ros = revision.flavour.ros.bus();
-        let registry = Registry::of_definitions(ros, definitions).map_err(|error| {
-            Error::Shadow(format!("a definition of {}: {error}", revision.service))
+        let ros = revision.flavour.ros.ros_version();
+        let registry = Registry::with_definitions(ros, definitions).map_err(|error| {
+            Error::Shadow(format!(
+                "invalid message definition of {}: {error}",
+                revision.service
+            ))
         })?;
         let registry = Arc::new(registry);
         let (from, to) = (there.bus(), reach.bus());
-        let mut notes = Notes::default();
+        let mut notes = ComparisonNotes::default();
         let robot = (from.node(), present.is_linked());
-        let topics = Topics::new(look, Arc::clone(&to), robot, &registry, budget);
+        let topics = MirroredTopics::new(look, Arc::clone(&to), robot, &registry, budget);
         note_interfaces(present, candidate.lease.handle(), &mut notes);
         let graph = from.graph();
         let mut mirror = Mirror {
@@ -141,13 +151,14 @@ impl<'a> Mirror<'a> {
         Ok(mirror)
     }
 
-    /// Follows what there is, and begins once publishers are likely to know of it: a publisher of ROS 1 counts a subscriber some time
-    /// after it has answered it, and tells nobody. That takes it about as long as it took to answer.
+    /// Subscribes to the existing topics, and starts once publishers are likely to know of it: a ROS 1 publisher
+    /// registers a subscriber some time after it has answered it, without telling anyone. That takes about as long as
+    /// its answer.
     async fn settle_in(&mut self) {
         let began = Instant::now();
         self.follow().await;
         tokio::time::sleep((began.elapsed() * 2).clamp(SETTLES.0, SETTLES.1)).await;
-        // What these made nodes publish may not have been heard.
+        // Messages that the new subscriptions triggered may have been missed.
         while self.tapping.told.try_recv().is_ok() {}
     }
 
@@ -156,34 +167,40 @@ impl<'a> Mirror<'a> {
         self.topics.follow(&graph, &mut self.notes).await;
     }
 
-    /// Compares until it is over.
+    /// Runs the comparison to its end.
     pub(super) async fn run(mut self) -> Shadow {
         let began = Instant::now();
         let ends = began + Duration::from_secs_f64(self.options.seconds);
         let mut present = self.present.watch();
         let (reason, failed) = loop {
             if self.has_enough() {
-                break (format!("{} requests were given", self.given()), None);
+                break (
+                    format!("{} requests were compared", self.given_count()),
+                    None,
+                );
             }
             let end = tokio::select! {
-                told = self.tapping.told.recv() => self.told(told, false).await,
+                told = self.tapping.told.recv() => self.on_tapped(told, false).await,
                 Some(heard) = self.topics.heard.recv() => {
-                    // Calls are told before they are carried out: what is heard of them comes after them here, too.
+                    // Calls are reported before they are carried out, so their outputs are handled after them here,
+                    // too.
                     let end = self.catch_up().await;
                     let enough = self.has_enough();
-                    self.heard(heard, enough).await;
+                    self.on_heard(heard, enough).await;
                     end
                 }
-                Some(answer) = self.exchanges.answers.join_next() => { self.candidate_answers(answer); None }
+                Some(answer) = self.exchanges.answers.join_next() => { self.on_candidate_answer(answer); None }
                 Ok(()) = self.graph.changed() => { self.follow().await; None }
-                () = left(&mut present) => Some(End::Soon("the robot's servant has ended".to_owned())),
-                () = over(self.candidate) => Some(candidates_end(self.candidate)),
-                () = tokio::time::sleep_until(ends) => Some(End::Soon("its time is over".to_owned())),
+                () = wait_left(&mut present) => Some(ComparisonEnd::Soon("the robot's servant has ended".to_owned())),
+                () = wait_over(self.candidate) => Some(candidates_end(self.candidate)),
+                () = tokio::time::sleep_until(ends) => Some(ComparisonEnd::Soon("its time is up".to_owned())),
             };
             match end {
                 None => {}
-                Some(End::Soon(reason)) => break (reason, None),
-                Some(End::Now(reason, failed)) => break (reason.clone(), failed.then_some(reason)),
+                Some(ComparisonEnd::Soon(reason)) => break (reason, None),
+                Some(ComparisonEnd::Now(reason, failed)) => {
+                    break (reason.clone(), failed.then_some(reason));
+                }
             }
         };
         let seconds = began.elapsed().as_secs_f64();
@@ -191,18 +208,18 @@ impl<'a> Mirror<'a> {
             (None, false) => self.settle(reason).await,
             (failed, _) => (reason, failed),
         };
-        // One that was ended has given no answer to what was on its way.
+        // A candidate that was ended has not answered what was in flight.
         let cut = failed.is_none() && self.candidate.lease.handle().life().is_over();
-        self.found(seconds, ended, failed, cut)
+        self.into_report(seconds, ended, failed, cut)
     }
 
-    /// Takes up the calls and goals that were told until now.
-    async fn catch_up(&mut self) -> Option<End> {
+    /// Handles the calls and goals reported so far.
+    async fn catch_up(&mut self) -> Option<ComparisonEnd> {
         while !self.has_enough() {
             let Ok(told) = self.tapping.told.try_recv() else {
                 break;
             };
-            let end = self.told(Some(told), false).await;
+            let end = self.on_tapped(Some(told), false).await;
             if end.is_some() {
                 return end;
             }
@@ -210,62 +227,64 @@ impl<'a> Mirror<'a> {
         None
     }
 
-    /// Waits for what is on its way, and takes up nothing new.
+    /// Waits for messages in flight, and accepts no new requests.
     async fn settle(&mut self, reason: String) -> (String, Option<String>) {
         let ends = Instant::now() + GRACE;
-        // What the robot's servant does from its next request on has no counterpart.
+        // What the robot's servant does after its next request has no counterpart.
         let mut over_there = false;
         loop {
             let even = self.exchanges.is_even() && self.topics.is_even();
             let end = tokio::select! {
                 told = self.tapping.told.recv() => {
-                    over_there |= told.as_ref().is_none_or(|told| !matches!(told.what, What::Answered { .. }));
-                    self.told(told, true).await;
+                    over_there |= told.as_ref().is_none_or(|told| !matches!(told.what, TapEventKind::Answered { .. }));
+                    self.on_tapped(told, true).await;
                     None
                 }
                 Some(heard) = self.topics.heard.recv() => {
                     over_there |= self.topics.is_request(&heard);
-                    if !(over_there && Topics::is_present(&heard)) {
-                        self.heard(heard, true).await;
+                    if !(over_there && MirroredTopics::is_present(&heard)) {
+                        self.on_heard(heard, true).await;
                     }
                     None
                 }
-                Some(answer) = self.exchanges.answers.join_next() => { self.candidate_answers(answer); None }
-                () = over(self.candidate) => Some(candidates_end(self.candidate)),
+                Some(answer) = self.exchanges.answers.join_next() => { self.on_candidate_answer(answer); None }
+                () = wait_over(self.candidate) => Some(candidates_end(self.candidate)),
                 () = tokio::time::sleep(QUIET), if even => break,
                 () = tokio::time::sleep_until(ends) => break,
             };
-            if let Some(End::Now(reason, failed)) = end {
+            if let Some(ComparisonEnd::Now(reason, failed)) = end {
                 return (reason.clone(), failed.then_some(reason));
             }
         }
         (reason, None)
     }
 
-    fn given(&self) -> u64 {
+    fn given_count(&self) -> u64 {
         self.topics.given + self.exchanges.given
     }
 
     fn has_enough(&self) -> bool {
         self.options
             .requests
-            .is_some_and(|enough| self.given() >= enough)
+            .is_some_and(|enough| self.given_count() >= enough)
     }
 
-    async fn told(&mut self, told: Option<Tapped>, ending: bool) -> Option<End> {
-        let Some(Tapped { number, at, what }) = told else {
-            return Some(End::Soon("the robot's servant has ended".to_owned()));
+    async fn on_tapped(&mut self, told: Option<TapEvent>, ending: bool) -> Option<ComparisonEnd> {
+        let Some(TapEvent { number, at, what }) = told else {
+            return Some(ComparisonEnd::Soon(
+                "the robot's servant has ended".to_owned(),
+            ));
         };
         match what {
-            What::Answered { answer, took } => {
-                self.answered(Side::Present, (number, answer, millis(took)));
+            TapEventKind::Answered { answer, took } => {
+                self.on_answer(ShadowSide::Present, (number, answer, millis(took)));
             }
-            What::Cancel => self.exchanges.cancel(number),
-            What::Call { .. } | What::Goal { .. } if ending => {}
-            // Heard by their topics.
-            What::Goal { .. } if self.present.is_linked() => {}
+            TapEventKind::Cancel => self.exchanges.cancel(number),
+            TapEventKind::Call { .. } | TapEventKind::Goal { .. } if ending => {}
+            // These are received by their topics.
+            TapEventKind::Goal { .. } if self.present.is_linked() => {}
             asked => {
-                self.topics.asked(at);
+                self.topics.on_request(at);
                 let (registry, notes) = (&self.registry, &mut self.notes);
                 self.exchanges.ask(number, asked, registry, notes).await;
             }
@@ -273,42 +292,50 @@ impl<'a> Mirror<'a> {
         None
     }
 
-    async fn heard(&mut self, heard: Heard, ending: bool) {
-        match self.topics.is_request(&heard) {
-            true if ending => {}
-            true => self.topics.give(heard, &mut self.notes).await,
-            false => self
-                .topics
-                .answered(heard, &self.tolerance, &mut self.notes),
+    async fn on_heard(&mut self, heard: HeardMessage, ending: bool) {
+        if !self.topics.is_request(&heard) {
+            self.topics
+                .on_output(heard, &self.tolerance, &mut self.notes);
+        } else if !ending {
+            self.topics.give(heard, &mut self.notes).await;
         }
     }
 
-    fn candidate_answers(&mut self, answer: Result<(u64, Answer, f64), tokio::task::JoinError>) {
+    fn on_candidate_answer(
+        &mut self,
+        answer: Result<(u64, TapAnswer, f64), tokio::task::JoinError>,
+    ) {
         if let Ok(answer) = answer {
-            self.answered(Side::Candidate, answer);
+            self.on_answer(ShadowSide::Candidate, answer);
         }
     }
 
-    fn answered(&mut self, side: Side, answer: (u64, Answer, f64)) {
+    fn on_answer(&mut self, side: ShadowSide, answer: (u64, TapAnswer, f64)) {
         let (tolerance, notes) = (&self.tolerance, &mut self.notes);
-        self.exchanges.answered(side, answer, tolerance, notes);
+        self.exchanges.record_answer(side, answer, tolerance, notes);
     }
 
-    fn found(mut self, seconds: f64, ended: String, failed: Option<String>, cut: bool) -> Shadow {
-        let given = self.given();
+    fn into_report(
+        mut self,
+        seconds: f64,
+        ended: String,
+        failed: Option<String>,
+        cut: bool,
+    ) -> Shadow {
+        let given = self.given_count();
         self.exchanges.end(cut, &mut self.notes);
         self.topics.end(cut, &self.tolerance, &mut self.notes);
-        let left_out = self.tapping.left_out();
+        let left_out = self.tapping.omitted_count();
         if left_out > 0 {
-            let why = "more came at once than may be held";
+            let why = "too many arrived at once";
             self.notes.add_many("calls and goals", why, left_out);
         }
         let tallies = self
             .topics
             .into_tallies()
             .chain(self.exchanges.into_tallies());
-        let compared: Vec<_> = tallies.map(Tally::shown).collect();
-        let (verdict, why) = verdict(&compared, failed.as_deref(), self.options.bound);
+        let compared: Vec<_> = tallies.map(Tally::into_compared).collect();
+        let (verdict, why) = overall_verdict(&compared, failed.as_deref(), self.options.bound);
         let revision = &self.present.revision;
         Shadow {
             service: revision.service.clone(),
@@ -321,35 +348,35 @@ impl<'a> Mirror<'a> {
             ended,
             given,
             compared,
-            not_compared: self.notes.shown(),
+            not_compared: self.notes.into_not_compared(),
         }
     }
 }
 
-async fn left(present: &mut watch::Receiver<Life>) {
+async fn wait_left(present: &mut watch::Receiver<Life>) {
     let _ = present.wait_for(Life::is_over).await;
 }
 
-async fn over(candidate: &Measured) {
-    candidate.lease.over().await;
+async fn wait_over(candidate: &MeasuredServant) {
+    candidate.lease.wait_over().await;
 }
 
-fn candidates_end(candidate: &Measured) -> End {
+fn candidates_end(candidate: &MeasuredServant) -> ComparisonEnd {
     let life = candidate.lease.handle().life();
     let reason = life.reason().unwrap_or_default();
     match life.failure {
-        Some(Failure::Broken { .. }) => End::Now(reason, true),
-        _ => End::Now(format!("the candidate was ended: {reason}"), false),
+        Some(Failure::Broken { .. }) => ComparisonEnd::Now(reason, true),
+        _ => ComparisonEnd::Now(format!("the candidate was ended: {reason}"), false),
     }
 }
 
-/// Of what was on its way when the candidate was ended.
+/// Reason for answers in flight when the candidate was ended.
 pub(super) const CUT: &str = "the candidate was ended before it answered";
 
-/// What is known beforehand to have no counterpart.
-fn note_interfaces(present: &Handle, candidate: &Handle, notes: &mut Notes) {
+/// Notes differences of the interfaces, which are known to have no counterpart.
+fn note_interfaces(present: &Handle, candidate: &Handle, notes: &mut ComparisonNotes) {
     let (one, other) = (&present.revision, &candidate.revision);
-    let difference = Difference::between(&one.interface, &other.interface);
+    let difference = Difference::compare(&one.interface, &other.interface);
     let breaking = difference.changes.iter().filter(|it| !it.compatible);
     for change in breaking.take(NAMED) {
         let why = format!(
@@ -359,8 +386,8 @@ fn note_interfaces(present: &Handle, candidate: &Handle, notes: &mut Notes) {
         notes.add_many(&change.to_string(), &why, 0);
     }
     if one.plan.stateful || other.plan.stateful {
-        let why = "the candidate began without what the robot's servant had been given before";
-        notes.add_many("what the nodes keep", why, 0);
+        let why = "the candidate started without the robot's earlier inputs";
+        notes.add_many("state of the nodes", why, 0);
     }
 }
 
@@ -368,10 +395,10 @@ pub(super) fn millis(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
-/// A message as JSON; none where it cannot be read or is too long.
-pub(super) type Read = Option<Value>;
+/// A message as JSON; `None` if it cannot be decoded or is too long.
+pub(super) type JsonMessage = Option<Value>;
 
-pub(super) fn read(of: Option<&MessageType>, message: &[u8]) -> Read {
+pub(super) fn read_json(of: Option<&MessageType>, message: &[u8]) -> JsonMessage {
     let options = JsonOptions {
         non_finite: NonFinite::String,
         max_bytes: LONGEST,
@@ -382,18 +409,18 @@ pub(super) fn read(of: Option<&MessageType>, message: &[u8]) -> Read {
     serde_json::from_slice(&json).ok()
 }
 
-/// In what two messages differ; those that cannot be read differ as a whole.
-pub(super) fn differing(
+/// Returns the differences of two messages; undecodable ones differ as a whole.
+pub(super) fn message_differences(
     read: Option<(&Value, &Value)>,
     (one, other): (&Bytes, &Bytes),
     tolerance: &Tolerance,
-) -> Vec<Differing> {
+) -> Vec<DifferingField> {
     match read {
         _ if one == other => Vec::new(),
         Some((one, other)) => differences(one, other, tolerance),
         None => {
             let bytes = |of: &Bytes| format!("{} bytes", of.len());
-            vec![Differing::whole(bytes(one), bytes(other))]
+            vec![DifferingField::whole_answer(bytes(one), bytes(other))]
         }
     }
 }
@@ -403,11 +430,11 @@ pub(super) fn compare(
     one: &Bytes,
     other: &Bytes,
     tolerance: &Tolerance,
-) -> Vec<Differing> {
+) -> Vec<DifferingField> {
     if one == other {
         return Vec::new();
     }
-    let (read_one, read_other) = (read(of, one), read(of, other));
+    let (read_one, read_other) = (read_json(of, one), read_json(of, other));
     let values = read_one.as_ref().zip(read_other.as_ref());
-    differing(values, (one, other), tolerance)
+    message_differences(values, (one, other), tolerance)
 }

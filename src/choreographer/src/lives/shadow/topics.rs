@@ -1,5 +1,5 @@
-//! Topics of a robot's servant and of the candidate: what the robot publishes is given to both, and what the nodes of both publish
-//! is paired.
+//! Topics of a robot's servant and of the candidate: messages of the robot are sent to both, and the messages that the
+//! nodes of both publish are paired.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, OnceLock};
@@ -7,114 +7,123 @@ use std::time::{Duration, Instant};
 
 use api::shadow::Kind;
 use budget::Budget;
-use reach::Look;
-use ros::bus::{Bus, Graph, Message, PeerId, Publisher, Qos, Subscription, WireType, reaches};
+use reach::ObservedBus;
+use ros::bus::{
+    Bus, Graph, PeerId, Publisher, QosProfile, SerializedMessage, Subscription, WireType,
+    wait_for_connected,
+};
 use ros::codec::{Time, header_stamp};
 use ros::schema::{MessageType, Registry};
 use serde_json::Value;
 use tokio::sync::mpsc;
 use tokio_util::task::AbortOnDropHandle;
 
-use super::mirror::{CUT, Notes, Read, differing, millis, read};
-use crate::decide::shadow::{Paired, Pairing, Side, Tally, Tolerance, WINDOW};
+use super::mirror::{CUT, ComparisonNotes, JsonMessage, message_differences, millis, read_json};
+use crate::decide::shadow::{Pairing, PairingResult, ShadowSide, Tally, Tolerance, WINDOW};
 
-/// The name of the node that listens beside the robot's.
+/// Name of the node that listens beside the robot's.
 pub(super) const NODE: &str = "/cloudroid_shadow";
-/// Of each topic.
+/// Queue length of each topic.
 const QUEUE: usize = 64;
-/// What was heard and not looked at.
+/// Maximum number of received messages that are not handled yet.
 const AHEAD: usize = 256;
-/// Messages that wait for a counterpart; beyond, the oldest have none.
+/// Maximum number of messages waiting for a counterpart; beyond it, the oldest have none.
 const WAITING: usize = 16 * WINDOW;
-/// For the candidate's nodes to be connected.
+/// Timeout for the candidate's nodes to be connected.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// An output may be heard before the message that it answers: by so much, at most, and as many of each topic.
+/// Maximum time by which an output may be received before the message that it answers, and number of such outputs per
+/// topic.
 const EARLY: (Duration, usize) = (Duration::from_secs(1), 2);
-/// Of which an output may be the answer to any.
+/// Maximum number of requests that an output may answer.
 const REQUESTS: usize = 256;
 
 /// Topics of both sides.
-pub(super) struct Topics {
-    /// None where the robot shares its servants with others: then it has no topics.
-    from: Option<Look>,
+pub(super) struct MirroredTopics {
+    /// `None` for a shared service: then the robot has no topics.
+    from: Option<ObservedBus>,
     to: Arc<dyn Bus>,
-    /// The node by which the robot is in the graph of its servant.
+    /// The robot's node in the graph of its servant.
     robot: String,
     registry: Arc<Registry>,
     budget: Budget,
-    told: mpsc::Sender<Heard>,
-    pub(super) heard: mpsc::Receiver<Heard>,
-    listened: BTreeMap<String, Listened>,
-    /// By topic, and by publisher where newcomers are given each one's last message.
+    told: mpsc::Sender<HeardMessage>,
+    pub(super) heard: mpsc::Receiver<HeardMessage>,
+    listened: BTreeMap<String, ListenedTopic>,
+    /// Publishers by topic; also by original publisher if latched, so that newcomers get each one's last message.
     publishers: HashMap<(String, Option<PeerId>), Box<dyn Publisher>>,
-    present: Requests,
-    candidate: Requests,
+    present: RequestHistory,
+    candidate: RequestHistory,
     pub(super) given: u64,
     /// Stubs send goals by the topics of actions.
     linked: bool,
 }
 
-/// A message of a topic.
-pub(super) struct Heard {
-    side: Side,
+/// A received message.
+pub(super) struct HeardMessage {
+    side: ShadowSide,
     topic: Arc<str>,
     at: Instant,
-    message: Message,
+    message: SerializedMessage,
 }
 
-/// One topic.
-struct Listened {
+/// A topic under comparison.
+struct ListenedTopic {
     of: Option<Arc<MessageType>>,
     _present: AbortOnDropHandle<()>,
-    /// Where nodes of the service publish it and the robot listens.
+    /// Set if nodes of the service publish it and the robot listens.
     candidate: Option<AbortOnDropHandle<()>>,
-    pairing: Pairing<Item>,
+    pairing: Pairing<UnpairedMessage>,
     /// Outputs of the present servant from before the first request.
-    early: VecDeque<(Instant, Item)>,
+    early: VecDeque<(Instant, UnpairedMessage)>,
     tally: Tally,
-    /// Requests when the last output came: of the present servant, and of the candidate.
+    /// Number of requests at the last output: of the present servant, and of the candidate.
     answered: (u64, u64),
 }
 
 /// A message that waits for its counterpart.
-struct Item {
+struct UnpairedMessage {
     message: bytes::Bytes,
-    /// It may be of before.
+    /// It may stem from before the first request.
     early: bool,
-    read: OnceLock<Read>,
+    read: OnceLock<JsonMessage>,
 }
 
-impl Item {
-    fn read(&self, of: Option<&MessageType>) -> Option<&Value> {
-        let read = || read(of, &self.message);
+impl UnpairedMessage {
+    fn json(&self, of: Option<&MessageType>) -> Option<&Value> {
+        let read = || read_json(of, &self.message);
         self.read.get_or_init(read).as_ref()
     }
 
-    fn equals(&self, other: &Item, of: Option<&MessageType>, tolerance: &Tolerance) -> bool {
-        self.message == other.message || self.differing(other, of, tolerance).is_empty()
-    }
-
-    fn differing(
+    fn equals(
         &self,
-        other: &Item,
+        other: &UnpairedMessage,
         of: Option<&MessageType>,
         tolerance: &Tolerance,
-    ) -> Vec<crate::decide::shadow::Differing> {
-        let values = self.read(of).zip(other.read(of));
-        differing(values, (&self.message, &other.message), tolerance)
+    ) -> bool {
+        self.message == other.message || self.differences(other, of, tolerance).is_empty()
+    }
+
+    fn differences(
+        &self,
+        other: &UnpairedMessage,
+        of: Option<&MessageType>,
+        tolerance: &Tolerance,
+    ) -> Vec<crate::decide::shadow::DifferingField> {
+        let values = self.json(of).zip(other.json(of));
+        message_differences(values, (&self.message, &other.message), tolerance)
     }
 }
 
-/// What one side was asked by topics, calls and goals.
+/// Requests of one side by topics, calls and goals.
 #[derive(Default)]
-struct Requests {
+struct RequestHistory {
     count: u64,
-    /// The last of them, each with its number, its stamp, and when it was asked.
+    /// The last requests, with number, stamp, and time.
     last: VecDeque<(u64, Option<Time>, Instant)>,
 }
 
-impl Requests {
-    fn asked(&mut self, stamp: Option<Time>, at: Instant) {
+impl RequestHistory {
+    fn record(&mut self, stamp: Option<Time>, at: Instant) {
         self.count += 1;
         let stamp = stamp.filter(|stamp| *stamp != Time::default());
         self.last.push_back((self.count, stamp, at));
@@ -123,32 +132,30 @@ impl Requests {
         }
     }
 
-    /// How long the request took that an output answers: that with its stamp, or, where none has a stamp, the last one before it,
-    /// which it is the first to answer.
-    fn took(&self, stamp: Option<Time>, answered: &mut u64, at: Instant) -> Option<f64> {
+    /// Returns the response time of the request that an output answers: the one with its stamp, or, without stamps, the
+    /// last one before it, if this is its first answer.
+    fn response_time(&self, stamp: Option<Time>, answered: &mut u64, at: Instant) -> Option<f64> {
         let stamped = stamp.is_some() && self.last.iter().any(|(_, stamp, _)| stamp.is_some());
         let mut latest_first = self.last.iter().rev();
-        // What was heard may be looked at only after the next request.
-        let (number, _, asked) = latest_first.find(|(_, of, asked)| match stamped {
-            true => *of == stamp,
-            false => *asked <= at,
-        })?;
+        // An output may be handled only after the next request.
+        let (number, _, asked) = latest_first
+            .find(|(_, of, asked)| if stamped { *of == stamp } else { *asked <= at })?;
         let first = *answered != *number;
         *answered = *number;
         (stamped || first).then(|| millis(at.saturating_duration_since(*asked)))
     }
 }
 
-impl Topics {
+impl MirroredTopics {
     pub(super) fn new(
-        from: Option<Look>,
+        from: Option<ObservedBus>,
         to: Arc<dyn Bus>,
         (robot, linked): (&str, bool),
         registry: &Arc<Registry>,
         budget: &Budget,
-    ) -> Topics {
+    ) -> MirroredTopics {
         let (told, heard) = mpsc::channel(AHEAD);
-        Topics {
+        MirroredTopics {
             from,
             to,
             robot: robot.to_owned(),
@@ -158,16 +165,16 @@ impl Topics {
             heard,
             listened: BTreeMap::new(),
             publishers: HashMap::new(),
-            present: Requests::default(),
-            candidate: Requests::default(),
+            present: RequestHistory::default(),
+            candidate: RequestHistory::default(),
             given: 0,
             linked,
         }
     }
 
-    /// Listens to what the graph of the robot's servant shows: topics to which its nodes listen, and those to which the robot does.
-    /// No others: a node may publish something only while somebody listens.
-    pub(super) async fn follow(&mut self, graph: &Graph, notes: &mut Notes) {
+    /// Subscribes to the topics in the graph of the robot's servant to which its nodes, or the robot, listen. Not to
+    /// others: a node may publish something only while it has a subscriber.
+    pub(super) async fn follow(&mut self, graph: &Graph, notes: &mut ComparisonNotes) {
         let Some(look) = &self.from else {
             return;
         };
@@ -177,7 +184,7 @@ impl Topics {
             .actions
             .values()
             .flat_map(|action| &action.topics)
-            .filter(|topic| !(self.linked && is_of_goals(topic)))
+            .filter(|topic| !(self.linked && is_goal_topic(topic)))
             .collect();
         let mut wanted = Vec::new();
         for (name, ends) in &graph.topics {
@@ -213,7 +220,10 @@ impl Topics {
         let heard_there = known.is_some_and(|known| known.candidate.is_some());
         let mut candidate = None;
         if output && !heard_there {
-            candidate = Some(self.hear(Side::Candidate, &self.to, name, true).await?);
+            candidate = Some(
+                self.subscribe(ShadowSide::Candidate, &self.to, name, true)
+                    .await?,
+            );
         }
         let key = (name.to_owned(), None);
         if let Some(of) = of.as_ref().filter(|_| input)
@@ -221,15 +231,23 @@ impl Topics {
         {
             let advertised = self
                 .to
-                .advertise(name, WireType::of(of), Qos::keep_last(QUEUE))
+                .advertise(
+                    name,
+                    WireType::from_message(of),
+                    QosProfile::keep_last(QUEUE),
+                )
                 .await;
             let publisher = advertised.map_err(|error| error.to_string())?;
-            let listens = tokio::time::timeout(PATIENCE, reaches(publisher.matched(), 1)).await;
+            let listens = tokio::time::timeout(
+                PATIENCE,
+                wait_for_connected(publisher.matched_subscribers(), 1),
+            )
+            .await;
             self.publishers.insert(key, publisher);
             if listens.is_err() {
-                // Later ones are given to it all the same.
+                // Later messages are sent to it nevertheless.
                 return Err(format!(
-                    "no node of the candidate listens to it, after {PATIENCE:?}"
+                    "no node of the candidate subscribed to it within {PATIENCE:?}"
                 ));
             }
         }
@@ -240,14 +258,16 @@ impl Topics {
                 }
             }
             None => {
-                let present = self.hear(Side::Present, from, name, output).await?;
-                let listened = Listened {
+                let present = self
+                    .subscribe(ShadowSide::Present, from, name, output)
+                    .await?;
+                let listened = ListenedTopic {
                     of,
                     _present: present,
                     candidate,
                     pairing: Pairing::default(),
                     early: VecDeque::new(),
-                    tally: Tally::of(Kind::Topic, name),
+                    tally: Tally::new(Kind::Topic, name),
                     answered: (0, 0),
                 };
                 self.listened.insert(name.to_owned(), listened);
@@ -256,21 +276,21 @@ impl Topics {
         Ok(())
     }
 
-    /// Passes on what is published; from the first message on where a publisher is there.
-    async fn hear(
+    /// Forwards published messages; from the first one on if a publisher exists.
+    async fn subscribe(
         &self,
-        side: Side,
+        side: ShadowSide,
         bus: &Arc<dyn Bus>,
         name: &str,
         published: bool,
     ) -> Result<AbortOnDropHandle<()>, String> {
-        let subscribed = bus.subscribe(name, WireType::any(), Qos::keep_last(QUEUE));
+        let subscribed = bus.subscribe(name, WireType::any(), QosProfile::keep_last(QUEUE));
         let subscription = subscribed.await.map_err(|error| error.to_string())?;
-        let connected = reaches(subscription.matched.clone(), usize::from(published));
-        // One that publishes later is heard later.
+        let connected = wait_for_connected(subscription.matched.clone(), usize::from(published));
+        // A later publisher is received later.
         let _ = tokio::time::timeout(PATIENCE, connected).await;
         let (topic, told) = (Arc::from(name), self.told.clone());
-        Ok(AbortOnDropHandle::new(tokio::spawn(pass_on(
+        Ok(AbortOnDropHandle::new(tokio::spawn(forward(
             side,
             topic,
             subscription,
@@ -278,40 +298,40 @@ impl Topics {
         ))))
     }
 
-    /// A call or a goal was given to both: outputs may answer it.
-    pub(super) fn asked(&mut self, at: Instant) {
-        self.begins(at);
-        self.present.asked(None, at);
-        self.candidate.asked(None, Instant::now());
+    /// Records a call or a goal that was sent to both: outputs may answer it.
+    pub(super) fn on_request(&mut self, at: Instant) {
+        self.release_early(at);
+        self.present.record(None, at);
+        self.candidate.record(None, Instant::now());
     }
 
-    /// Before the first request: what was heard just before it may answer it.
-    fn begins(&mut self, at: Instant) {
+    /// At the first request: outputs received just before it may answer it.
+    fn release_early(&mut self, at: Instant) {
         if self.present.count > 0 {
             return;
         }
         for listened in self.listened.values_mut() {
             for (heard, item) in listened.early.drain(..) {
                 if heard + EARLY.0 >= at {
-                    listened.pairing.push(Side::Present, item);
+                    listened.pairing.push(ShadowSide::Present, item);
                 }
             }
         }
     }
 
-    /// Whether it is the robot's.
-    pub(super) fn is_request(&self, heard: &Heard) -> bool {
-        heard.side == Side::Present && heard.message.publisher.node() == self.robot
+    /// Returns true if the message is the robot's.
+    pub(super) fn is_request(&self, heard: &HeardMessage) -> bool {
+        heard.side == ShadowSide::Present && heard.message.publisher.node() == self.robot
     }
 
-    /// Whose output it is.
-    pub(super) fn is_present(heard: &Heard) -> bool {
-        heard.side == Side::Present
+    /// Returns true if the message is from the present servant's side.
+    pub(super) fn is_present(heard: &HeardMessage) -> bool {
+        heard.side == ShadowSide::Present
     }
 
-    /// Gives a message of the robot to the candidate.
-    pub(super) async fn give(&mut self, heard: Heard, notes: &mut Notes) {
-        let Heard {
+    /// Sends a message of the robot to the candidate.
+    pub(super) async fn give(&mut self, heard: HeardMessage, notes: &mut ComparisonNotes) {
+        let HeardMessage {
             topic, at, message, ..
         } = heard;
         let Some(listened) = self.listened.get(&*topic) else {
@@ -326,23 +346,28 @@ impl Topics {
             let advertised = self.to.advertise(
                 &topic,
                 wire_type,
-                Qos::keep_last(QUEUE).latching(message.latching),
+                QosProfile::keep_last(QUEUE).latching(message.latching),
             );
             match advertised.await {
                 Ok(publisher) => drop(self.publishers.insert(key.clone(), publisher)),
                 Err(error) => return notes.add(&topic, &error.to_string()),
             }
         }
-        self.begins(at);
-        self.present.asked(stamp, at);
-        self.candidate.asked(stamp, Instant::now());
+        self.release_early(at);
+        self.present.record(stamp, at);
+        self.candidate.record(stamp, Instant::now());
         self.publishers[&key].publish(message.bytes);
         self.given += 1;
     }
 
-    /// An output of a side has come.
-    pub(super) fn answered(&mut self, heard: Heard, tolerance: &Tolerance, notes: &mut Notes) {
-        let Heard {
+    /// Handles an output of one side.
+    pub(super) fn on_output(
+        &mut self,
+        heard: HeardMessage,
+        tolerance: &Tolerance,
+        notes: &mut ComparisonNotes,
+    ) {
+        let HeardMessage {
             side,
             topic,
             at,
@@ -355,27 +380,27 @@ impl Topics {
             listened.of = message.wire_type.schema().ok();
         }
         let early = self.present.count == 0 && !message.latching;
-        // A topic that nobody compared yet, or what the candidate says unasked.
-        if listened.candidate.is_none() || (early && side == Side::Candidate) {
+        // A topic that is not compared yet, or an output of the candidate without a request.
+        if listened.candidate.is_none() || (early && side == ShadowSide::Candidate) {
             return;
         }
         let of = listened.of.as_deref();
         let stamp = of.and_then(|of| header_stamp(of, &message.bytes));
         let (requests, answered) = match side {
-            Side::Present => (&self.present, &mut listened.answered.0),
-            Side::Candidate => (&self.candidate, &mut listened.answered.1),
+            ShadowSide::Present => (&self.present, &mut listened.answered.0),
+            ShadowSide::Candidate => (&self.candidate, &mut listened.answered.1),
         };
         if let Some(took) = requests
-            .took(stamp, answered, at)
+            .response_time(stamp, answered, at)
             .filter(|_| !message.latching)
         {
-            listened.tally.time(side, took);
+            listened.tally.record_time(side, took);
         }
         let Ok(permit) = self.budget.take(message.bytes.len()) else {
-            return notes.add(&topic, "more may not be held in memory");
+            return notes.add(&topic, "the memory limit is reached");
         };
-        let item = Item {
-            message: permit.around(message.bytes),
+        let item = UnpairedMessage {
+            message: permit.wrap_bytes(message.bytes),
             early,
             read: OnceLock::new(),
         };
@@ -391,19 +416,19 @@ impl Topics {
         listened.settle((full, false), tolerance, notes, &topic);
     }
 
-    /// Whether each side has published as much as the other.
+    /// Returns true if both sides have published equally many messages.
     pub(super) fn is_even(&self) -> bool {
         self.listened.values().all(|it| it.pairing.is_even())
     }
 
-    /// It is over: what waits has no counterpart.
-    pub(super) fn end(&mut self, cut: bool, tolerance: &Tolerance, notes: &mut Notes) {
+    /// Ends the comparison: waiting messages have no counterpart.
+    pub(super) fn end(&mut self, cut: bool, tolerance: &Tolerance, notes: &mut ComparisonNotes) {
         for (topic, listened) in &mut self.listened {
             listened.settle((true, cut), tolerance, notes, topic);
         }
     }
 
-    /// Of those topics that were compared.
+    /// Returns the tallies of the compared topics.
     pub(super) fn into_tallies(self) -> impl Iterator<Item = Tally> {
         let compared = self.listened.into_values();
         compared
@@ -412,47 +437,52 @@ impl Topics {
     }
 }
 
-impl Listened {
+impl ListenedTopic {
     fn settle(
         &mut self,
         (last, cut): (bool, bool),
         tolerance: &Tolerance,
-        notes: &mut Notes,
+        notes: &mut ComparisonNotes,
         topic: &str,
     ) {
         let of = self.of.as_deref();
-        let equal = |one: &Item, other: &Item| one.equals(other, of, tolerance);
+        let equal =
+            |one: &UnpairedMessage, other: &UnpairedMessage| one.equals(other, of, tolerance);
         for paired in self.pairing.settle(last, equal) {
             match paired {
-                Paired::Both(_, _, true) => self.tally.pair(Vec::new()),
-                Paired::Both(one, other, false) => {
-                    self.tally.pair(one.differing(&other, of, tolerance));
+                PairingResult::Both(_, _, true) => self.tally.record_pair(Vec::new()),
+                PairingResult::Both(one, other, false) => {
+                    self.tally
+                        .record_pair(one.differences(&other, of, tolerance));
                 }
-                Paired::Missing(one) if one.early => {}
-                Paired::Missing(_) if cut => notes.add(topic, CUT),
-                Paired::Missing(_) => self.tally.missing(),
-                Paired::Surplus(_) => self.tally.surplus(),
-                Paired::Edge => notes.add(topic, "its counterpart had not come when it ended"),
+                PairingResult::Missing(one) if one.early => {}
+                PairingResult::Missing(_) if cut => notes.add(topic, CUT),
+                PairingResult::Missing(_) => self.tally.record_missing(),
+                PairingResult::Surplus(_) => self.tally.record_surplus(),
+                PairingResult::Edge => notes.add(
+                    topic,
+                    "its counterpart had not arrived when the comparison ended",
+                ),
             }
         }
     }
 }
 
-/// Of the topics of an action those that say what is asked and what came of it; the others say how it gets on.
-fn is_of_goals(topic: &str) -> bool {
+/// Returns true for the topics of an action that carry requests and results; the others report progress.
+fn is_goal_topic(topic: &str) -> bool {
     ["/goal", "/cancel", "/result"]
         .iter()
         .any(|end| topic.ends_with(end))
 }
 
-async fn pass_on(
-    side: Side,
+async fn forward(
+    side: ShadowSide,
     topic: Arc<str>,
     mut subscription: Subscription,
-    told: mpsc::Sender<Heard>,
+    told: mpsc::Sender<HeardMessage>,
 ) {
     while let Some(message) = subscription.messages.recv().await {
-        let heard = Heard {
+        let heard = HeardMessage {
             side,
             topic: Arc::clone(&topic),
             at: Instant::now(),
@@ -473,26 +503,38 @@ mod tests {
         let began = Instant::now();
         let at = |millis| began + Duration::from_millis(millis);
         let stamp = |secs| Some(Time { secs, nsecs: 0 });
-        let mut requests = Requests::default();
+        let mut requests = RequestHistory::default();
         let mut answered = 0;
-        assert_eq!(requests.took(None, &mut answered, at(0)), None);
-        requests.asked(None, at(10));
-        assert_eq!(requests.took(None, &mut answered, at(30)), Some(20.0));
-        // What comes by itself answers nothing.
-        assert_eq!(requests.took(None, &mut answered, at(90)), None);
-        requests.asked(stamp(1), at(100));
-        requests.asked(stamp(2), at(110));
-        assert_eq!(requests.took(stamp(1), &mut answered, at(150)), Some(50.0));
-        assert_eq!(requests.took(stamp(2), &mut answered, at(150)), Some(40.0));
-        assert_eq!(requests.took(stamp(9), &mut answered, at(150)), None);
+        assert_eq!(requests.response_time(None, &mut answered, at(0)), None);
+        requests.record(None, at(10));
+        assert_eq!(
+            requests.response_time(None, &mut answered, at(30)),
+            Some(20.0)
+        );
+        // An output without a request answers nothing.
+        assert_eq!(requests.response_time(None, &mut answered, at(90)), None);
+        requests.record(stamp(1), at(100));
+        requests.record(stamp(2), at(110));
+        assert_eq!(
+            requests.response_time(stamp(1), &mut answered, at(150)),
+            Some(50.0)
+        );
+        assert_eq!(
+            requests.response_time(stamp(2), &mut answered, at(150)),
+            Some(40.0)
+        );
+        assert_eq!(
+            requests.response_time(stamp(9), &mut answered, at(150)),
+            None
+        );
         for secs in 0..1000 {
-            requests.asked(stamp(secs), at(200));
+            requests.record(stamp(secs), at(200));
         }
         assert_eq!(requests.last.len(), REQUESTS);
-        // It was heard before the last request was made.
-        let mut requests = Requests::default();
-        requests.asked(None, at(10));
-        requests.asked(None, at(40));
-        assert_eq!(requests.took(None, &mut 0, at(30)), Some(20.0));
+        // It was received before the last request was made.
+        let mut requests = RequestHistory::default();
+        requests.record(None, at(10));
+        requests.record(None, at(40));
+        assert_eq!(requests.response_time(None, &mut 0, at(30)), Some(20.0));
     }
 }

@@ -1,4 +1,4 @@
-//! The task that makes and ends warm containers, as is decided from what robots asked for.
+//! The task that makes and ends warm containers, depending on the requests of robots.
 
 use std::sync::Arc;
 
@@ -7,57 +7,60 @@ use futures_util::FutureExt;
 use futures_util::future::join_all;
 use tokio::time::Instant;
 
-use super::{LEAD, NOBODY, UNMADE, Warm};
+use super::{LEAD, NOBODY, UNMADE, WarmServant};
 use crate::Error;
 use crate::decide::forecast::INTERVAL;
 use crate::decide::warm_pool::{
-    Budget, Demand, Missing, Wanted, Warm as Facts, deserving, missing, sizes, stale,
+    PoolBudget, PoolDemand, PoolShortage, WantedPool, WarmContainer as Facts, deserving_services,
+    pool_shortage, pool_sizes, stale_containers,
 };
-use crate::lives::{Inner, reaching, starting};
+use crate::lives::{ChoreographerInner, reaching, starting};
 use store::{NewEvent, RevisionRecord, ServantRecord};
 
-/// Makes and ends warm containers as they are needed, for ever.
-pub(crate) async fn keep(inner: Arc<Inner>) {
+/// Makes and ends warm containers as needed, forever.
+pub(crate) async fn run(inner: Arc<ChoreographerInner>) {
     loop {
         tokio::select! {
             () = inner.warm_pool.look.notified() => {}
-            () = tokio::time::sleep(INTERVAL), if inner.warm_pool.is_restless(&inner) => {}
+            () = tokio::time::sleep(INTERVAL), if inner.warm_pool.needs_timer(&inner) => {}
         }
         if let Err(error) = tidy(&inner, true).await {
-            tracing::warn!("no warm container could be made: {error}");
+            tracing::warn!("cannot create a warm container: {error}");
         }
     }
 }
 
-/// What the services are to have: of the revisions that robots are given, the most deserving first.
-fn wanted(inner: &Inner) -> Result<Vec<(Arc<RevisionRecord>, Demand)>, Error> {
+/// Returns the revisions that are to have containers, with their demand, most deserving first.
+fn wanted_revisions(
+    inner: &ChoreographerInner,
+) -> Result<Vec<(Arc<RevisionRecord>, PoolDemand)>, Error> {
     let mut wanted = Vec::new();
     let published = inner.state.service_names()?;
     let now = Instant::now().into_std();
     let asked_for = inner.warm_pool.kept.lock().asked_for.clone();
-    for service in deserving(&published, &asked_for, inner.options.warm_pool) {
-        let Some(revision) = inner.state.current(&service)? else {
+    for service in deserving_services(&published, &asked_for, inner.options.warm_pool) {
+        let Some(revision) = inner.state.current_revision(&service)? else {
             continue;
         };
         let kept = inner.warm_pool.kept.lock();
         let arrivals = kept.arrivals.get(&service);
         let lead = kept.leads.get(&service);
-        let demand = Demand {
-            rate: arrivals.map_or(0.0, |arrivals| arrivals.expected(now)),
+        let demand = PoolDemand {
+            rate: arrivals.map_or(0.0, |arrivals| arrivals.expected_rate(now)),
             lead: lead.map_or(LEAD, |lead| lead.mean),
-            nodes: runs_ahead(inner, &revision)
-                .then(|| inner.promised(&revision.plan.limits).memory),
+            nodes: can_run_ahead(inner, &revision)
+                .then(|| inner.promised_amount(&revision.plan.limits).memory),
         };
         wanted.push((revision, demand));
     }
     for (service, number) in inner.rollouts.candidates() {
-        let of = |wanted: &(Arc<RevisionRecord>, Demand)| wanted.0.service == service;
+        let of = |wanted: &(Arc<RevisionRecord>, PoolDemand)| wanted.0.service == service;
         let demand = wanted.iter().find(|it| of(it)).map(|it| it.1);
         if let (Some(demand), Some(revision)) = (demand, inner.state.revision(&service, number)?) {
-            // Few robots get it: one is enough.
+            // Few robots get it: one container is enough.
             wanted.push((
                 revision,
-                Demand {
+                PoolDemand {
                     rate: 0.0,
                     ..demand
                 },
@@ -67,13 +70,15 @@ fn wanted(inner: &Inner) -> Result<Vec<(Arc<RevisionRecord>, Demand)>, Error> {
     Ok(wanted)
 }
 
-/// Whether the revision's nodes may run without a robot: not with what they would hold from another servant, nor while they
-/// fail.
-fn runs_ahead(inner: &Inner, revision: &RevisionRecord) -> bool {
+/// Returns true if the revision's nodes may run without a robot: not if they would occupy devices or volumes of another
+/// servant, nor while they fail.
+fn can_run_ahead(inner: &ChoreographerInner, revision: &RevisionRecord) -> bool {
     let grants = &revision.plan.grants;
     let holds = !grants.devices.is_empty() || !grants.volumes.is_empty();
-    let failing = inner.back_offs.refusal(&revision.service, NOBODY, revision);
-    // Where no container can be made, others' nodes run.
+    let failing = inner
+        .back_offs
+        .find_refusal(&revision.service, NOBODY, revision);
+    // If no container can be made, other services' nodes run.
     let unmade = inner
         .back_offs
         .is_failing(&revision.service, UNMADE, revision);
@@ -81,38 +86,38 @@ fn runs_ahead(inner: &Inner, revision: &RevisionRecord) -> bool {
     !revision.plan.nodes.is_empty() && !holds && !shared && failing.is_none() && !unmade
 }
 
-/// Ends those that are not wanted any more and makes, if so told, those that are missing.
-pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), Error> {
+/// Ends the containers that are not wanted any more and makes, if requested, the missing ones.
+pub(crate) async fn tidy(inner: &Arc<ChoreographerInner>, make_missing: bool) -> Result<(), Error> {
     let pool = &inner.warm_pool;
     let _turn = pool.turn.lock().await;
-    let revisions = wanted(inner)?;
-    let demands: Vec<Demand> = revisions.iter().map(|(_, demand)| *demand).collect();
-    let budget = Budget {
+    let revisions = wanted_revisions(inner)?;
+    let demands: Vec<PoolDemand> = revisions.iter().map(|(_, demand)| *demand).collect();
+    let budget = PoolBudget {
         memory: inner.options.warm_memory,
         nodes: inner.options.warm_nodes,
     };
-    let sizes = sizes(&demands, budget);
-    let wanted: Vec<Wanted<'_>> = revisions
+    let sizes = pool_sizes(&demands, budget);
+    let wanted: Vec<WantedPool<'_>> = revisions
         .iter()
         .zip(sizes)
-        .map(|((revision, _), size)| Wanted {
+        .map(|((revision, _), size)| WantedPool {
             service: &revision.service,
             revision: revision.number,
             image: &revision.image,
             size,
         })
         .collect();
-    let removed: Vec<Warm> = {
+    let removed: Vec<WarmServant> = {
         let mut kept = pool.kept.lock();
-        let facts: Vec<Facts<'_>> = kept.pool.iter().map(Warm::facts).collect();
-        let ends = stale(&facts, &wanted);
+        let facts: Vec<Facts<'_>> = kept.pool.iter().map(WarmServant::facts).collect();
+        let ends = stale_containers(&facts, &wanted);
         let ends: Vec<String> = ends.iter().map(|end| end.id.to_owned()).collect();
         // A service that is to have none any more.
         kept.leads
             .retain(|service, _| wanted.iter().any(|it| it.service == service));
-        let removed: Vec<Warm> = ends.iter().filter_map(|id| kept.take(id)).collect();
+        let removed: Vec<WarmServant> = ends.iter().filter_map(|id| kept.take(id)).collect();
         for warm in &removed {
-            let promised = warm.promised(inner).unwrap_or_default();
+            let promised = warm.promised_amount(inner).unwrap_or_default();
             let id = warm.container.id().to_owned();
             kept.ending.insert(id, promised);
         }
@@ -129,16 +134,16 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
         loop {
             let lacks = {
                 let mut kept = pool.kept.lock();
-                let facts: Vec<Facts<'_>> = kept.pool.iter().map(Warm::facts).collect();
-                let lacks = match missing(&facts, wanted) {
-                    Missing::Nothing => None,
-                    Missing::Containers(_) => Some(None),
-                    Missing::Nodes(id) => Some(Some(id.to_owned())),
+                let facts: Vec<Facts<'_>> = kept.pool.iter().map(WarmServant::facts).collect();
+                let lacks = match pool_shortage(&facts, wanted) {
+                    PoolShortage::Nothing => None,
+                    PoolShortage::Containers(_) => Some(None),
+                    PoolShortage::Nodes(id) => Some(Some(id.to_owned())),
                 };
                 if let (None | Some(Some(_)), Some(lead)) =
                     (&lacks, kept.leads.get_mut(wanted.service))
                 {
-                    lead.complete();
+                    lead.clear();
                 }
                 lacks
             };
@@ -146,13 +151,13 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
                 break;
             };
             let warm = match nodes_of {
-                // Others are made all the same.
-                None => match make_or_tell(inner, revision).await {
+                // Others are made nevertheless.
+                None => match make_or_report(inner, revision).await {
                     Some(warm) => warm,
                     None => break,
                 },
-                // Capacity is not there, or somebody took it meanwhile.
-                Some(id) => match heat(inner, &id).await {
+                // There is no capacity, or a robot took it meanwhile.
+                Some(id) => match start_nodes(inner, &id).await {
                     Some(warm) => warm,
                     None => break,
                 },
@@ -163,19 +168,19 @@ pub(crate) async fn tidy(inner: &Arc<Inner>, make_missing: bool) -> Result<(), E
                 break;
             }
             if !fresh {
-                // Whoever began to wait while the nodes were started did not find what is promised to them.
+                // A request that began to wait while the nodes were started did not count their promise.
                 inner.make_room();
             }
             if fresh && let Some(lead) = pool.kept.lock().leads.get_mut(&revision.service) {
-                lead.replaced(Instant::now());
+                lead.record_replaced(Instant::now());
             }
         }
     }
     Ok(())
 }
 
-/// Of one whose nodes have failed before a robot had them: that is told, and counts as a servant's failure.
-async fn report_dead(inner: &Inner, warm: &Warm) {
+/// Reports a container whose nodes have failed before a robot had them; that counts as a servant's failure.
+async fn report_dead(inner: &ChoreographerInner, warm: &WarmServant) {
     if !warm.nodes || warm.runs() {
         return;
     }
@@ -184,17 +189,17 @@ async fn report_dead(inner: &Inner, warm: &Warm) {
     for node in &warm.revision.plan.nodes {
         if let Some(Ok(exit)) = warm.container.wait_node(&node.name).now_or_never() {
             let limits = warm.limits;
-            how = format!("{} {}", node.name, reach::how_it_ended(&exit, &limits));
+            how = format!("{} {}", node.name, reach::describe_exit(&exit, &limits));
         }
     }
     let about = NewEvent {
         service: Some(service),
         ..NewEvent::default()
     };
-    let message = format!("a servant of {service} that was kept ready for a robot failed: {how}");
+    let message = format!("a warm servant of {service} failed: {how}");
     inner.journal.warning("warm-failed", &message, &about);
     let back_offs = &inner.back_offs;
-    back_offs.failed(
+    back_offs.record_failure(
         service,
         NOBODY,
         &warm.revision,
@@ -203,15 +208,18 @@ async fn report_dead(inner: &Inner, warm: &Warm) {
     );
 }
 
-/// A container, unless those of its service cannot be made; then that is told, and tried again after a pause.
-async fn make_or_tell(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>) -> Option<Warm> {
+/// Makes a container; if that fails, reports it and retries after a pause.
+async fn make_or_report(
+    inner: &Arc<ChoreographerInner>,
+    revision: &Arc<RevisionRecord>,
+) -> Option<WarmServant> {
     let (service, back_offs) = (&revision.service, &inner.back_offs);
-    if back_offs.refusal(service, UNMADE, revision).is_some() {
+    if back_offs.find_refusal(service, UNMADE, revision).is_some() {
         return None;
     }
     match make(inner, Arc::clone(revision)).await {
         Ok(warm) => {
-            back_offs.recovered(service, UNMADE);
+            back_offs.clear(service, UNMADE);
             Some(warm)
         }
         Err(error) => {
@@ -219,25 +227,27 @@ async fn make_or_tell(inner: &Arc<Inner>, revision: &Arc<RevisionRecord>) -> Opt
                 service: Some(service),
                 ..NewEvent::default()
             };
-            let message =
-                format!("no servant of {service} can be made before its robot comes: {error}");
+            let message = format!("cannot prepare a servant of {service} in advance: {error}");
             inner.journal.warning("warm-failed", &message, &about);
-            let reason = format!("could not be made ahead: {error}");
-            back_offs.failed(service, UNMADE, revision, None, &reason);
+            let reason = format!("could not be prepared in advance: {error}");
+            back_offs.record_failure(service, UNMADE, revision, None, &reason);
             None
         }
     }
 }
 
-async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm, Error> {
+async fn make(
+    inner: &Arc<ChoreographerInner>,
+    revision: Arc<RevisionRecord>,
+) -> Result<WarmServant, Error> {
     let id = names::servant_id(&revision.service);
-    let limits = inner.of_push(&revision).limits();
-    let spec = starting::spec(inner, &id, &revision, &limits, Vec::new())?;
+    let limits = inner.push_limits(&revision).limits();
+    let spec = starting::container_spec(inner, &id, &revision, &limits, Vec::new())?;
     let container = inner.engine.start(spec).await?;
     let limit = inner.options.start;
     let reached = tokio::time::timeout(limit, reaching::open(inner, &revision, &container)).await;
     match reached {
-        Ok(Ok(reach)) => Ok(Warm {
+        Ok(Ok(reach)) => Ok(WarmServant {
             container,
             reach,
             limits,
@@ -256,13 +266,13 @@ async fn make(inner: &Arc<Inner>, revision: Arc<RevisionRecord>) -> Result<Warm,
     }
 }
 
-/// Starts the nodes in one of the pool, which is in nobody's reach meanwhile. What they may use is promised from here on, where
-/// it is free and nobody waits for it.
-async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
+/// Starts the nodes in one of the pool's containers, which is withdrawn meanwhile. Their capacity is promised from here
+/// on, if it is free and no request waits for it.
+async fn start_nodes(inner: &Arc<ChoreographerInner>, id: &str) -> Option<WarmServant> {
     let mut warm = inner.warm_pool.kept.lock().take(id)?;
     let revision = Arc::clone(&warm.revision);
-    let wanted = inner.promised(&revision.plan.limits);
-    let Some(permit) = inner.admission.admit_now(wanted) else {
+    let wanted = inner.promised_amount(&revision.plan.limits);
+    let Some(permit) = inner.admission.try_admit(wanted) else {
         if let Some(unwanted) = inner.warm_pool.put(warm) {
             unwanted.end(inner).await;
         }
@@ -279,7 +289,7 @@ async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
         terms: None,
     };
     warm.permit = Some(permit);
-    // A daemon that is killed now finds out by this that nobody misses it.
+    // A daemon that is killed now learns from this record that no robot misses it.
     let recorded = inner.state.add_servant(&record);
     warm.nodes = true;
     let nodes = revision.plan.nodes.iter().cloned();
@@ -288,7 +298,7 @@ async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
         let (service, reason) = (&revision.service, "could not be started");
         inner
             .back_offs
-            .failed(service, NOBODY, &revision, None, reason);
+            .record_failure(service, NOBODY, &revision, None, reason);
         warm.end(inner).await;
         return None;
     }
@@ -296,20 +306,20 @@ async fn heat(inner: &Arc<Inner>, id: &str) -> Option<Warm> {
 }
 
 /// Takes a warm container back that its robot left unused, or ends it.
-pub(crate) async fn give_back(inner: &Inner, warm: Warm) {
+pub(crate) async fn give_back(inner: &ChoreographerInner, warm: WarmServant) {
     if let Some(unwanted) = inner.warm_pool.put(warm) {
         unwanted.end(inner).await;
     }
 }
 
-/// Ends all of them and makes no more.
-pub(crate) async fn end_all(inner: &Inner) {
+/// Ends all containers and makes no more.
+pub(crate) async fn end_all(inner: &ChoreographerInner) {
     let all = {
         let mut kept = inner.warm_pool.kept.lock();
         kept.closed = true;
         std::mem::take(&mut kept.pool)
     };
     join_all(all.into_iter().map(|warm| warm.end(inner))).await;
-    // One that is being made just now is ended by whoever makes it.
+    // One that is being made is ended by its maker.
     let _turn = inner.warm_pool.turn.lock().await;
 }

@@ -1,11 +1,11 @@
-//! Servants that are made before their robots come, and servants that fail again and again.
+//! Tests of servants that are made before their robots come, and of servants that fail repeatedly.
 
 use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// A daemon that keeps containers ahead, with the nodes running in so many of them.
-fn keeps(world: &World, nodes: usize) -> Choreographer {
+/// Starts a daemon with warm containers, of which `nodes` have running nodes.
+fn daemon_with_pool(world: &World, nodes: usize) -> Choreographer {
     let daemon = world.daemon_with(|options| {
         options.warm_pool = 8;
         options.warm_nodes = nodes;
@@ -14,8 +14,8 @@ fn keeps(world: &World, nodes: usize) -> Choreographer {
     daemon
 }
 
-/// Waits until the pool is so big and so many nodes run.
-async fn pool(daemon: &Choreographer, wanted: (usize, usize)) {
+/// Waits until the pool has this size and this number with running nodes.
+async fn wait_for_pool(daemon: &Choreographer, wanted: (usize, usize)) {
     let there = async {
         while daemon.warm_pool() != wanted {
             tokio::time::sleep(SECOND / 10).await;
@@ -25,33 +25,37 @@ async fn pool(daemon: &Choreographer, wanted: (usize, usize)) {
     assert!(there.is_ok(), "{:?} is not {wanted:?}", daemon.warm_pool());
 }
 
-fn promised(daemon: &Choreographer) -> f64 {
-    daemon.admission().look().1.cpus()
+fn promised_cores(daemon: &Choreographer) -> f64 {
+    daemon.admission().snapshot().1.cpus()
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_robot_gets_a_servant_whose_nodes_run_already() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    let daemon = keeps(&world, 1);
-    pool(&daemon, (1, 1)).await;
-    assert_eq!(promised(&daemon), 1.0, "nodes that run are promised a core");
+    let daemon = daemon_with_pool(&world, 1);
+    wait_for_pool(&daemon, (1, 1)).await;
+    assert_eq!(
+        promised_cores(&daemon),
+        1.0,
+        "nodes that run are promised a core"
+    );
     let ids = world.engine.servants();
     assert!(daemon.servants().is_empty(), "it is nobody's");
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     assert_eq!(ids, [lease.handle().id.clone()]);
     let shown = daemon.describe(lease.handle()).await;
     assert_eq!((&*shown.robot, shown.connections), ("r1", 1));
-    let ready = world.told("servant-ready");
+    let ready = world.event_messages("servant-ready");
     assert!(ready[0].contains("for r1"), "{ready:?}");
-    // Another takes its place, and is promised the second core.
-    pool(&daemon, (1, 1)).await;
-    assert_eq!(promised(&daemon), 2.0);
+    // Another one takes its place, and is promised the second core.
+    wait_for_pool(&daemon, (1, 1)).await;
+    assert_eq!(promised_cores(&daemon), 2.0);
     daemon.end_warm_pool().await;
-    assert_eq!(promised(&daemon), 1.0);
+    assert_eq!(promised_cores(&daemon), 1.0);
     assert_eq!(world.engine.servants(), ids);
 }
 
@@ -59,27 +63,29 @@ async fn a_robot_gets_a_servant_whose_nodes_run_already() {
 async fn only_what_is_measured_with_so_much_memory_starts_nodes_of_its_own() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    let daemon = keeps(&world, 1);
-    pool(&daemon, (1, 1)).await;
+    let daemon = daemon_with_pool(&world, 1);
+    wait_for_pool(&daemon, (1, 1)).await;
     let ahead = world.engine.servants();
     let memory = Some(api::Size(64 << 20));
     let set = api::Limits {
         memory,
         ..api::Limits::default()
     };
-    let measured = daemon.measured("greet", "calibrate", set).expect("a lease");
-    measured.lease.ready().await.expect("ready");
+    let measured = daemon
+        .start_measured("greet", "calibrate", set)
+        .expect("a lease");
+    measured.lease.wait_ready().await.expect("ready");
     assert_ne!(ahead, [measured.lease.handle().id.clone()]);
     drop(measured);
-    pool(&daemon, (1, 1)).await;
+    wait_for_pool(&daemon, (1, 1)).await;
     let ahead = world.engine.servants();
     let stated = api::Stated {
         memory,
         ..api::Stated::default()
     };
-    let request = ServantRequest::new("greet", "~abc").stating(stated);
+    let request = ServantRequest::new("greet", "~abc").with_stated(stated);
     let lease = daemon.ensure(request.anonymous()).expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     assert!(ahead.contains(&lease.handle().id), "its nodes ran already");
     daemon.end_warm_pool().await;
 }
@@ -88,16 +94,16 @@ async fn only_what_is_measured_with_so_much_memory_starts_nodes_of_its_own() {
 async fn a_robots_stubs_get_no_servant_whose_nodes_have_other_names() {
     let world = World::new();
     world.publish("greet", "/greet", |_| {});
-    let daemon = keeps(&world, 1);
-    pool(&daemon, (1, 1)).await;
+    let daemon = daemon_with_pool(&world, 1);
+    wait_for_pool(&daemon, (1, 1)).await;
     let ids = world.engine.servants();
     let lease = daemon
-        .ensure(ServantRequest::new("greet", "r1").by_stub("/greeter"))
+        .ensure(ServantRequest::new("greet", "r1").with_stub("/greeter"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     assert!(!ids.contains(&lease.handle().id));
     let servant = world.engine.servant(&lease.handle().id).expect("it runs");
-    assert!(servant::engine::Servant::nodes(&*servant).is_empty());
+    assert!(servant::engine::ServantHandle::nodes(&*servant).is_empty());
 }
 
 #[tokio::test(start_paused = true)]
@@ -107,14 +113,14 @@ async fn what_is_kept_ready_ends_before_a_robot_waits() {
     world.publish("map", "/greet", |record| {
         record.plan.limits.cpus = Some(2.0);
     });
-    let daemon = keeps(&world, 2);
+    let daemon = daemon_with_pool(&world, 2);
     // The second of them does not fit beside the first.
-    pool(&daemon, (2, 1)).await;
+    wait_for_pool(&daemon, (2, 1)).await;
     let lease = daemon
         .ensure(ServantRequest::new("map", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
-    assert_eq!(promised(&daemon), 2.0);
+    lease.wait_ready().await.expect("ready");
+    assert_eq!(promised_cores(&daemon), 2.0);
     assert_eq!(daemon.warm_pool().1, 0, "there is no capacity for it");
 }
 
@@ -124,20 +130,20 @@ async fn a_service_that_cannot_be_made_ahead_keeps_no_other_cold() {
     for service in ["a", "greet", "z"] {
         world.publish(service, "/greet", |_| {});
     }
-    // In whatever order they are made, there is one before another.
+    // Whatever the order in which they are made, one comes before another.
     for broken in ["a", "z"] {
         world
             .engine
-            .breaks(&format!("sha256:{broken}"), "its image is damaged");
+            .break_image(&format!("sha256:{broken}"), "its image is damaged");
     }
-    let daemon = keeps(&world, 1);
-    pool(&daemon, (1, 1)).await;
+    let daemon = daemon_with_pool(&world, 1);
+    wait_for_pool(&daemon, (1, 1)).await;
     tokio::time::sleep(SECOND * 600).await;
     assert_eq!(daemon.warm_pool(), (1, 1));
-    let told = world.told("warm-failed");
-    let words = "can be made before its robot comes: ";
+    let told = world.event_messages("warm-failed");
+    let words = "in advance: ";
     assert!(told.iter().all(|it| it.contains(words)), "{told:?}");
-    // Each is tried after pauses that grow.
+    // Each is retried after growing pauses.
     assert!((6..=40).contains(&told.len()), "{}: {told:?}", told.len());
     assert!(told[0].contains("its image is damaged"), "{told:?}");
 }
@@ -149,8 +155,8 @@ async fn whether_one_more_fits_knows_that_what_is_kept_ready_would_end() {
     world.publish("map", "/greet", |record| {
         record.plan.limits.cpus = Some(2.0);
     });
-    let daemon = keeps(&world, 2);
-    pool(&daemon, (2, 1)).await;
+    let daemon = daemon_with_pool(&world, 2);
+    wait_for_pool(&daemon, (2, 1)).await;
     let fit = daemon.fit("map", api::Stated::default()).await;
     let fit = fit.expect("it is published");
     assert_eq!((fit.lacking_cpus, fit.more), (0.0, Some(1)), "{fit:?}");
@@ -165,9 +171,9 @@ async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
         .engine
         .program("/fails", |process| fails(process, SECOND));
     world.publish("greet", "/fails", |_| {});
-    let daemon = keeps(&world, 1);
+    let daemon = daemon_with_pool(&world, 1);
     tokio::time::sleep(SECOND * 600).await;
-    let told = world.told("warm-failed");
+    let told = world.event_messages("warm-failed");
     let words = "/greeter exited with status 1";
     assert!(told.iter().all(|told| told.contains(words)), "{told:?}");
     // Ten seconds apart without pauses.
@@ -184,7 +190,7 @@ async fn nodes_that_fail_without_a_robot_are_told_and_back_off() {
         (&*back_offs[0].robot, &*back_offs[0].service),
         ("~warm", "greet")
     );
-    // A robot has its own luck.
+    // A robot's back-off is separate.
     daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
@@ -202,7 +208,7 @@ async fn what_a_killed_daemon_kept_ready_ends_without_a_word() {
         let runtime = tokio::runtime::Runtime::new().expect("a runtime");
         runtime.block_on(async {
             daemon.keep_warm_pool();
-            pool(&daemon, (1, 1)).await;
+            wait_for_pool(&daemon, (1, 1)).await;
         });
         runtime.shutdown_background();
     });
@@ -260,7 +266,7 @@ async fn a_servant_that_fails_again_and_again_is_started_after_pauses_that_grow(
         }
     }
     assert_eq!(pauses, [1, 2, 4, 8]);
-    let told = world.told("servant-back-off");
+    let told = world.event_messages("servant-back-off");
     assert!(
         told[0].contains("2 times in a row") && told[0].contains("in 1 s"),
         "{told:?}"
@@ -276,10 +282,10 @@ async fn a_servant_that_fails_again_and_again_is_started_after_pauses_that_grow(
         .ensure(ServantRequest::new("greet", "r1"))
         .err()
         .expect("a pause");
-    // What is pushed anew is started at once.
+    // A new push is started at once.
     world.publish("greet", "/greet", |_| {});
     let lease = daemon
         .ensure(ServantRequest::new("greet", "r1"))
         .expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
 }

@@ -1,4 +1,4 @@
-//! Revisions that take each other's place, told with the engine in memory.
+//! Tests of rollouts, with the in-memory engine.
 
 use api::rollout::{RolloutState, RolloutTerms, Share};
 
@@ -6,15 +6,15 @@ use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// A world with a service whose revision 1 is the current one, and revision 2 published beside it.
-fn two() -> World {
+/// Returns a world with a service whose revision 1 is the current one, and revision 2 published beside it.
+fn two_revisions() -> World {
     let world = World::new();
-    // The catalogue sets tags, whether or not there is such an image.
+    // The catalogue sets tags even without such an image.
     let image = |number: u64| format!("sha256:{number:064}");
     world.publish("greet", "/greet", |record| record.image = image(1));
     let mut second = World::record("greet", "/greet");
     second.image = image(2);
-    let published = world.state.publish_beside(&second, &Default::default());
+    let published = world.state.publish_inactive(&second, &Default::default());
     assert_eq!(published.expect("published"), 2);
     world
 }
@@ -27,23 +27,23 @@ fn canary(share: Share) -> RolloutTerms {
     }
 }
 
-/// A daemon that looks after rollouts.
-fn keeps(world: &World) -> Choreographer {
+/// Starts a daemon that runs rollouts.
+fn daemon_with_rollouts(world: &World) -> Choreographer {
     let daemon = world.daemon();
     daemon.keep_rollouts().expect("they are read");
     daemon
 }
 
-/// The robot's servant is of this revision.
-async fn gets(daemon: &Choreographer, robot: &str, revision: u64) -> Lease {
+/// Returns a lease of the robot's servant, which is of this revision.
+async fn lease_of_revision(daemon: &Choreographer, robot: &str, revision: u64) -> Lease {
     let lease = daemon.ensure(ServantRequest::new("greet", robot));
     let lease = lease.expect("a lease");
-    lease.ready().await.expect("ready");
+    lease.wait_ready().await.expect("ready");
     assert_eq!(lease.handle().revision.number, revision, "{robot}");
     lease
 }
 
-async fn until(daemon: &Choreographer, state: RolloutState) {
+async fn wait_for_state(daemon: &Choreographer, state: RolloutState) {
     let there = async {
         while daemon.rollout("greet").expect("a rollout").state != state {
             tokio::time::sleep(SECOND).await;
@@ -55,18 +55,21 @@ async fn until(daemon: &Choreographer, state: RolloutState) {
 
 #[tokio::test(start_paused = true)]
 async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let first = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     first.await.expect("it begins");
-    let (first, second) = (gets(&daemon, "r1", 2).await, gets(&daemon, "r2", 1).await);
+    let (first, second) = (
+        lease_of_revision(&daemon, "r1", 2).await,
+        lease_of_revision(&daemon, "r2", 1).await,
+    );
     let rollouts = &daemon.inner.rollouts;
     for _ in 0..20 {
         rollouts.note_request("greet", 1, Some(5.0));
         rollouts.note_request("greet", 2, None);
         rollouts.note_request("greet", 7, None);
     }
-    first.handle().ended().await;
+    first.handle().wait_ended().await;
     let reason = first.handle().life().reason().expect("a reason");
     assert!(
         reason.contains("100 % of its 20 requests failed"),
@@ -80,30 +83,33 @@ async fn a_canary_whose_requests_fail_is_taken_back_with_its_servants() {
         (20, 20)
     );
     assert_eq!(shown.of_candidate.servants, 1);
-    gets(&daemon, "r1", 1).await;
+    lease_of_revision(&daemon, "r1", 1).await;
     assert_eq!(second.handle().life().phase, Phase::Ready, "others go on");
-    assert_eq!(world.told("rollout-rolled-back").len(), 1);
+    assert_eq!(world.event_messages("rollout-rolled-back").len(), 1);
 }
 
-/// What the first servant's reach is told by its robot's stub.
-fn hears(daemon: &Choreographer, lease: &Lease) -> Arc<dyn reach::Observer> {
+/// Returns the observer that receives the reports of the robot's stub.
+fn observer_of(daemon: &Choreographer, lease: &Lease) -> Arc<dyn reach::Observer> {
     let handle = lease.handle();
-    crate::lives::reaching::habits(&daemon.inner, &handle.revision, &handle.id).1
+    crate::lives::reaching::reach_options(&daemon.inner, &handle.revision, &handle.id).1
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_canary_that_answers_nothing_is_not_promoted() {
-    use link::control::Request;
-    use reach::links::RequestNews;
-    let world = two();
-    let daemon = keeps(&world);
+    use link::control::RequestTiming;
+    use reach::links::RequestUpdate;
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let terms = RolloutTerms {
         promote_after: Some(0.0),
         ..canary(Share::Robots(1))
     };
     let begun = daemon.begin_rollout("greet", None, 2, terms).await;
     begun.expect("it begins");
-    let (first, second) = (gets(&daemon, "r1", 2).await, gets(&daemon, "r2", 1).await);
+    let (first, second) = (
+        lease_of_revision(&daemon, "r1", 2).await,
+        lease_of_revision(&daemon, "r2", 1).await,
+    );
     let waits = async |words: &str| {
         tokio::time::sleep(SECOND * 3).await;
         let shown = daemon.rollout("greet").expect("a rollout");
@@ -111,29 +117,29 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
         let why = shown.waits.expect("it says why it waits");
         assert!(why.contains(words), "{why}");
     };
-    waits("it was asked 0 times and 5 are needed").await;
-    let late = Request::default();
-    let heard = hears(&daemon, &first);
-    (0..4).for_each(|_| heard.measured(&late, RequestNews::Late));
-    waits("it was asked 4 times and 5 are needed").await;
-    heard.measured(&late, RequestNews::Late);
+    waits("it has had 0 requests of the 5 required").await;
+    let late = RequestTiming::default();
+    let heard = observer_of(&daemon, &first);
+    (0..4).for_each(|_| heard.on_request_measured(&late, RequestUpdate::Late));
+    waits("it has had 4 requests of the 5 required").await;
+    heard.on_request_measured(&late, RequestUpdate::Late);
     waits("5 of its 5 requests failed").await;
-    let told = world.told("rollout-waits");
+    let told = world.event_messages("rollout-waits");
     assert_eq!(told.len(), 3, "each reason once: {told:?}");
-    assert!(told[0].contains("no servant of it"), "{told:?}");
+    assert!(told[0].contains("none of its servants"), "{told:?}");
     // The other revision answers: now it is known to be worse.
-    let answered = Request {
+    let answered = RequestTiming {
         total: Some(5.0),
         ..late.clone()
     };
-    let stable = hears(&daemon, &second);
+    let stable = observer_of(&daemon, &second);
     for _ in 0..20 {
-        stable.measured(&answered, RequestNews::Answered);
-        heard.measured(&late, RequestNews::Late);
+        stable.on_request_measured(&answered, RequestUpdate::Answered);
+        heard.on_request_measured(&late, RequestUpdate::Late);
     }
     // Its answers come after all; each request was counted.
-    heard.measured(&answered, RequestNews::AnsweredLate);
-    until(&daemon, RolloutState::RolledBack).await;
+    heard.on_request_measured(&answered, RequestUpdate::AnsweredLate);
+    wait_for_state(&daemon, RolloutState::RolledBack).await;
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.waits, None);
     let of = shown.of_candidate;
@@ -145,8 +151,8 @@ async fn a_canary_that_answers_nothing_is_not_promoted() {
 
 #[tokio::test(start_paused = true)]
 async fn robots_without_names_do_not_use_up_the_places_of_a_canary() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
     for robot in ["~aaaaaa", "~bbbbbb"] {
@@ -155,25 +161,25 @@ async fn robots_without_names_do_not_use_up_the_places_of_a_canary() {
         assert_eq!(lease.handle().revision.number, 2, "{robot}");
         let handle = Arc::clone(lease.handle());
         drop(lease);
-        handle.ended().await;
+        handle.wait_ended().await;
     }
-    drop(gets(&daemon, "r1", 2).await);
-    drop(gets(&daemon, "r2", 1).await);
+    drop(lease_of_revision(&daemon, "r1", 2).await);
+    drop(lease_of_revision(&daemon, "r2", 1).await);
 }
 
 #[tokio::test(start_paused = true)]
 async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
-    drop(gets(&daemon, "r1", 2).await);
+    drop(lease_of_revision(&daemon, "r1", 2).await);
     // Written within a second.
     tokio::time::sleep(SECOND * 2).await;
     daemon.stop("the test goes on", |_| true).await;
-    let next = keeps(&world);
-    drop(gets(&next, "r2", 1).await);
-    drop(gets(&next, "r1", 2).await);
+    let next = daemon_with_rollouts(&world);
+    drop(lease_of_revision(&next, "r2", 1).await);
+    drop(lease_of_revision(&next, "r1", 2).await);
     assert_eq!(
         next.rollout("greet")
             .expect("a rollout")
@@ -187,17 +193,17 @@ async fn who_has_the_canary_keeps_it_when_the_daemon_is_another() {
         .await
         .expect_err("it is none any more");
     assert!(
-        refused.to_string().contains("no canary: aborted"),
+        refused.to_string().contains("not a canary: aborted"),
         "{refused}"
     );
     next.stop("the test goes on", |_| true).await;
-    drop(gets(&next, "r1", 1).await);
+    drop(lease_of_revision(&next, "r1", 1).await);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let terms = RolloutTerms {
         deadline: Some(0.0),
         promote_after: Some(0.0),
@@ -207,18 +213,18 @@ async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
         .begin_rollout("greet", None, 2, terms)
         .await
         .expect("it begins");
-    let old = gets(&daemon, "r1", 2).await;
+    let old = lease_of_revision(&daemon, "r1", 2).await;
     for _ in 0..5 {
         daemon.inner.rollouts.note_request("greet", 2, Some(5.0));
     }
-    until(&daemon, RolloutState::Promoted).await;
-    drop(gets(&daemon, "r2", 2).await);
+    wait_for_state(&daemon, RolloutState::Promoted).await;
+    drop(lease_of_revision(&daemon, "r2", 2).await);
     assert_eq!(
         old.handle().life().phase,
         Phase::Ready,
         "it is of that revision"
     );
-    // A rollout without a canary: robots keep what they have until the deadline.
+    // A rollout without a canary: robots keep their servants until the deadline.
     let terms = RolloutTerms {
         deadline: Some(0.0),
         ..RolloutTerms::default()
@@ -227,23 +233,23 @@ async fn a_promoted_canary_serves_all_and_others_end_at_their_deadline() {
         .begin_rollout("greet", None, 1, terms)
         .await
         .expect("it begins");
-    old.handle().ended().await;
+    old.handle().wait_ended().await;
     let reason = old.handle().life().reason().expect("a reason");
     assert!(
-        reason.contains("its deadline is over: revision 1"),
+        reason.contains("its deadline has passed: revision 1"),
         "{reason}"
     );
-    drop(gets(&daemon, "r1", 1).await);
+    drop(lease_of_revision(&daemon, "r1", 1).await);
 }
 
 #[tokio::test(start_paused = true)]
 async fn what_makes_no_sense_or_would_break_robots_is_refused() {
-    let world = two();
+    let world = two_revisions();
     world.publish("other", "/greet", |_| {});
-    let daemon = keeps(&world);
+    let daemon = daemon_with_rollouts(&world);
     let mut third = World::record("greet", "/greet");
     third.interface.topics.clear();
-    let published = world.state.publish_beside(&third, &Default::default());
+    let published = world.state.publish_inactive(&third, &Default::default());
     assert_eq!(published.expect("published"), 3);
     let wrong = |change: fn(&mut RolloutTerms)| {
         let mut terms = canary(Share::Robots(1));
@@ -253,31 +259,31 @@ async fn what_makes_no_sense_or_would_break_robots_is_refused() {
     let share = canary(Share::Percent(10.0));
     for (service, revision, terms, words) in [
         ("greet", 9, share, "no revision 9"),
-        ("greet", 1, share, "is the current one already"),
+        ("greet", 1, share, "is already the current one"),
         (
             "greet",
             3,
             share,
-            "robots of revision 1 would not find what they use",
+            "its interface breaks robots of revision 1",
         ),
         (
             "greet",
             2,
             wrong(|terms| terms.bound = f64::NAN),
-            "numbers from 0 on",
+            "must be 0 or greater",
         ),
         (
             "greet",
             2,
             wrong(|terms| terms.deadline = Some(-1.0)),
-            "numbers from 0 on",
+            "must be 0 or greater",
         ),
         ("greet", 2, wrong(|terms| terms.samples = 0), "at least 1"),
         (
             "greet",
             2,
             wrong(|terms| (terms.canary, terms.promote_after) = (None, Some(1.0))),
-            "is for a canary",
+            "needs a canary",
         ),
         ("gone", 2, share, "gone"),
     ] {
@@ -287,59 +293,63 @@ async fn what_makes_no_sense_or_would_break_robots_is_refused() {
     }
     let none = daemon.rollout("other").expect_err("it has none");
     assert!(matches!(none, Error::NoRollout(_)), "{none}");
-    gets(&daemon, "r1", 1).await;
+    lease_of_revision(&daemon, "r1", 1).await;
 }
 
 #[tokio::test(start_paused = true)]
 async fn another_revision_ends_a_rollout() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Percent(100.0)));
     begun.await.expect("it begins");
-    let lease = gets(&daemon, "r1", 2).await;
+    let lease = lease_of_revision(&daemon, "r1", 2).await;
     world.publish("greet", "/greet", |_| {});
     let told = daemon.revision_changed("greet", 3).await;
     told.expect("it is told");
-    lease.handle().ended().await;
+    lease.handle().wait_ended().await;
     drop(lease);
-    gets(&daemon, "r1", 3).await;
+    lease_of_revision(&daemon, "r1", 3).await;
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.state, RolloutState::Replaced, "{shown:?}");
 }
 
-/// Which revision is the current one.
+/// Returns the current revision.
 fn current(world: &World) -> u64 {
-    world.catalogue.current("greet").expect("published").number
+    world
+        .catalogue
+        .current_revision("greet")
+        .expect("published")
+        .number
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_robot_that_is_refused_or_keeps_its_servant_takes_no_place_of_a_canary() {
-    let world = two();
-    let daemon = keeps(&world);
-    let kept = gets(&daemon, "r1", 1).await;
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
+    let kept = lease_of_revision(&daemon, "r1", 1).await;
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
     // It is connected, and comes once more.
-    drop(gets(&daemon, "r1", 1).await);
+    drop(lease_of_revision(&daemon, "r1", 1).await);
     let unknown = api::Stated::read([("class", "captain")]).expect("valid");
-    let refused = ServantRequest::new("greet", "r2").stating(unknown);
+    let refused = ServantRequest::new("greet", "r2").with_stated(unknown);
     let refused = daemon.ensure(refused).err().expect("no such class");
     assert!(refused.to_string().contains("captain"), "{refused}");
-    drop(gets(&daemon, "r3", 2).await);
+    drop(lease_of_revision(&daemon, "r3", 2).await);
     drop(kept);
     daemon.stop("the test goes on", |_| true).await;
-    gets(&daemon, "r1", 1).await;
+    lease_of_revision(&daemon, "r1", 1).await;
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_servant_that_is_measured_is_of_the_current_revision_and_judges_none() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Percent(100.0)));
     begun.await.expect("it begins");
-    let measured = daemon.measured("greet", "try", api::Limits::default());
+    let measured = daemon.start_measured("greet", "try", api::Limits::default());
     let measured = measured.expect("a servant");
-    measured.lease.ready().await.expect("ready");
+    measured.lease.wait_ready().await.expect("ready");
     assert_eq!(measured.lease.handle().revision.number, 1);
     let shown = daemon.rollout("greet").expect("a rollout");
     assert_eq!(shown.of_stable.servants, 0, "{shown:?}");
@@ -347,26 +357,26 @@ async fn a_servant_that_is_measured_is_of_the_current_revision_and_judges_none()
 
 #[tokio::test(start_paused = true)]
 async fn a_canary_does_not_take_the_place_of_a_revision_that_was_published_meanwhile() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
-    let lease = gets(&daemon, "r1", 2).await;
+    let lease = lease_of_revision(&daemon, "r1", 2).await;
     // Published, and the choreographer is not told yet.
     world.publish("greet", "/greet", |_| {});
     let shown = daemon.promote_rollout("greet").await.expect("answered");
     assert_eq!(shown.state, RolloutState::Replaced, "{shown:?}");
     assert_eq!(current(&world), 3);
-    lease.handle().ended().await;
+    lease.handle().wait_ended().await;
 }
 
 #[tokio::test(start_paused = true)]
 async fn what_cannot_be_written_is_not_done() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
-    let lease = gets(&daemon, "r1", 2).await;
+    let lease = lease_of_revision(&daemon, "r1", 2).await;
     let database = rusqlite::Connection::open(world.home.path().join("cloudroid.db"));
     let database = database.expect("the database");
     let rename = |from: &str, to: &str| {
@@ -380,16 +390,16 @@ async fn what_cannot_be_written_is_not_done() {
     assert_eq!(lease.handle().life().phase, Phase::Ready);
     rename("gone", "rollouts");
     daemon.abort_rollout("greet").await.expect("it is written");
-    lease.handle().ended().await;
-    let next = keeps(&world);
+    lease.handle().wait_ended().await;
+    let next = daemon_with_rollouts(&world);
     let shown = next.rollout("greet").expect("a rollout");
     assert_eq!(shown.state, RolloutState::Aborted);
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_service_that_is_removed_has_no_rollout() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     let begun = daemon.begin_rollout("greet", None, 2, canary(Share::Robots(1)));
     begun.await.expect("it begins");
     world.catalogue.withdraw("greet").expect("removed");
@@ -403,8 +413,8 @@ async fn a_service_that_is_removed_has_no_rollout() {
 
 #[tokio::test(start_paused = true)]
 async fn a_revision_with_a_deadline_alone_follows_the_one_before() {
-    let world = two();
-    let daemon = keeps(&world);
+    let world = two_revisions();
+    let daemon = daemon_with_rollouts(&world);
     world.publish("greet", "/greet", |record| {
         record.image = format!("sha256:{:064}", 1);
     });

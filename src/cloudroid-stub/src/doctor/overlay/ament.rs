@@ -1,22 +1,22 @@
-//! ROS 2: the overlay on AMENT_PREFIX_PATH, and whether the stub and the robot's nodes can hear each other.
+//! ROS 2: checks the overlay on AMENT_PREFIX_PATH, and whether the stub and the robot's nodes can communicate.
 
 use std::path::{Path, PathBuf};
 
-use ros::Interfaces;
+use ros::InterfaceSelection;
 
 use super::super::Check;
-use super::{ExaminedStub, found, is, shadowed};
+use super::{ExaminedStub, found_check, is_same_directory, shadowed_check};
 use crate::network::{self, Variable};
 
 const INDEX: &str = "share/ament_index/resource_index";
-/// Implementations of ROS 2's middleware that speak RTPS and were tried with stubs.
+/// Middleware implementations of ROS 2 that use RTPS and were tested with stubs.
 const TRIED: [&str; 3] = [
     "rmw_fastrtps_cpp",
     "rmw_fastrtps_dynamic_cpp",
     "rmw_cyclonedds_cpp",
 ];
 
-/// All of these.
+/// Runs all checks for ROS 2.
 pub async fn checks(stub: &ExaminedStub, variable: Variable<'_>) -> Vec<Check> {
     let prefixes = prefixes(variable);
     let mut checks = vec![
@@ -34,13 +34,13 @@ fn prefixes(variable: Variable<'_>) -> Vec<PathBuf> {
     std::env::split_paths(&value).collect()
 }
 
-/// Tools take the first install space in whose index the package is.
+/// Checks that the stub is the first install space whose index has the package, which is the one that tools use.
 fn shadowing(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Check {
     let entry = Path::new(INDEX).join("packages").join(&stub.package);
     let first = prefixes.iter().find(|prefix| prefix.join(&entry).is_file());
     match first {
-        Some(first) if is(first, &stub.overlay()) => found(stub),
-        first => shadowed("AMENT_PREFIX_PATH", first, stub),
+        Some(first) if is_same_directory(first, &stub.overlay()) => found_check(stub),
+        first => shadowed_check("AMENT_PREFIX_PATH", first, stub),
     }
 }
 
@@ -50,13 +50,14 @@ fn middleware(variable: Variable<'_>) -> Check {
     match chosen.as_deref() {
         None => Check::good(
             "middleware",
-            format!("{NAME} is not set: the distribution's own"),
+            format!("{NAME} is not set: default of the distribution"),
         ),
         Some(tried) if TRIED.contains(&tried) => Check::good("middleware", tried),
         Some(zenoh) if zenoh.starts_with("rmw_zenoh") => Check::bad(
             "middleware",
             format!(
-                "{zenoh} does not speak DDS, and stubs speak nothing else so far: this robot's nodes and the stub do not hear each other"
+                "{zenoh} does not use DDS, the only protocol of stubs: this robot's nodes and the stub cannot \
+                    communicate"
             ),
             format!(
                 "export {NAME}=rmw_fastrtps_cpp (or rmw_cyclonedds_cpp), for all nodes of this robot"
@@ -65,51 +66,54 @@ fn middleware(variable: Variable<'_>) -> Check {
         Some(other) => Check::warning(
             "middleware",
             format!(
-                "{other} was not tried with stubs; it works where it speaks RTPS as OMG specifies it"
+                "{other} is untested with stubs; it works if it implements RTPS as specified by OMG"
             ),
-            format!("if nodes do not hear each other: export {NAME}=rmw_fastrtps_cpp"),
+            format!("if nodes cannot communicate: export {NAME}=rmw_fastrtps_cpp"),
         ),
     }
 }
 
 async fn domain(variable: Variable<'_>) -> Check {
-    match network::network(variable).await {
+    match network::read_network(variable).await {
         Ok((id, network)) => {
             let place = match network.interfaces {
-                _ if network.alone => "where nobody is looked for",
-                Interfaces::All => "on all networks of this robot",
-                _ => "on this machine alone",
+                _ if network.alone => "without discovery",
+                InterfaceSelection::All => "on all networks of this robot",
+                _ => "on this machine only",
             };
             let servers = network.servers.iter().map(|server| server.at.to_string());
             let servers: Vec<String> = servers.collect();
-            let by = match servers.is_empty() {
-                true => String::new(),
-                false => format!(", by discovery servers at {}", servers.join(" and ")),
+            let by = if servers.is_empty() {
+                String::new()
+            } else {
+                format!(", through discovery servers at {}", servers.join(" and "))
             };
             Check::good("domain", format!("{id}, {place}{by}"))
         }
         Err(error) => Check::bad(
             "domain",
             format!("{error:#}"),
-            "set the variable as the robot's other nodes have it, or unset it",
+            "set the variable to the value of the robot's other nodes, or unset it",
         ),
     }
 }
 
-/// Nodes that encrypt what they say hear none that does not.
+/// Checks that the robot's nodes do not encrypt: nodes that do receive nothing from nodes that do not.
 fn security(variable: Variable<'_>) -> Option<Check> {
     const NAME: &str = "ROS_SECURITY_ENABLE";
     let enabled = variable(NAME).is_some_and(|value| value == "true");
     enabled.then(|| {
         Check::bad(
             "security",
-            format!("{NAME} is true: this robot's nodes encrypt (SROS 2), which stubs do not, so they do not hear each other"),
+            format!("{NAME} is true: this robot's nodes use encryption (SROS 2), which stubs do not support, so they \
+                cannot communicate"),
             format!("unset {NAME} for the nodes that use this service"),
         )
     })
 }
 
-/// Generic subscriptions (rosbag2, bridges) look for the code of a package's messages below the install space of the package.
+/// Checks that the libraries of the package's messages are found: generic subscriptions (rosbag2, bridges) look for
+/// them in the install space of the package.
 fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
     let overlay = stub.overlay();
     let entry = overlay.join(INDEX).join("rosidl_interfaces");
@@ -123,7 +127,7 @@ fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
     Some(Check::warning(
         "messages",
         format!(
-            "rosbag2 and bridges do not find the code of {}'s messages, which is in {}",
+            "rosbag2 and bridges cannot find the message libraries of {}, which are in {}",
             stub.package,
             original.display()
         ),
@@ -136,7 +140,7 @@ fn messages(stub: &ExaminedStub, prefixes: &[PathBuf]) -> Option<Check> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::Verdict;
+    use super::super::super::CheckVerdict;
     use super::*;
 
     struct Robot(tempfile::TempDir);
@@ -161,8 +165,8 @@ mod tests {
             std::fs::write(path, "").expect("written");
         }
 
-        /// With AMENT_PREFIX_PATH of these, and other variables.
-        async fn examined(&self, prefixes: &str, others: &[(&str, &str)]) -> Vec<Check> {
+        /// Runs the checks with these entries of AMENT_PREFIX_PATH, and other variables.
+        async fn run_checks(&self, prefixes: &str, others: &[(&str, &str)]) -> Vec<Check> {
             let stub = ExaminedStub {
                 share: self.path("stub/share/p"),
                 package: "p".into(),
@@ -181,7 +185,7 @@ mod tests {
         }
     }
 
-    fn named<'a>(checks: &'a [Check], name: &str) -> Option<&'a Check> {
+    fn find_check<'a>(checks: &'a [Check], name: &str) -> Option<&'a Check> {
         checks.iter().find(|check| check.name == name)
     }
 
@@ -189,19 +193,21 @@ mod tests {
     async fn the_index_of_the_stub_must_come_first() {
         let robot = Robot::new();
         for prefixes in ["stub:ros", "other:stub:ros"] {
-            let checks = robot.examined(prefixes, &[]).await;
+            let checks = robot.run_checks(prefixes, &[]).await;
             assert!(
-                checks.iter().all(|check| check.verdict == Verdict::Good),
+                checks
+                    .iter()
+                    .all(|check| check.verdict == CheckVerdict::Good),
                 "{checks:?}"
             );
         }
         for (prefixes, said) in [
             ("ros:stub", "ros before this stub"),
-            ("other", "AMENT_PREFIX_PATH does not name this stub"),
+            ("other", "AMENT_PREFIX_PATH does not include this stub"),
         ] {
-            let checks = robot.examined(prefixes, &[]).await;
-            let check = named(&checks, "shadowing").expect("a check");
-            assert_eq!(check.verdict, Verdict::Bad);
+            let checks = robot.run_checks(prefixes, &[]).await;
+            let check = find_check(&checks, "shadowing").expect("a check");
+            assert_eq!(check.verdict, CheckVerdict::Bad);
             assert!(check.found.contains(said), "{check:?}");
             assert!(
                 check
@@ -220,68 +226,68 @@ mod tests {
                 "RMW_IMPLEMENTATION",
                 "rmw_cyclonedds_cpp",
                 "middleware",
-                Verdict::Good,
+                CheckVerdict::Good,
                 "cyclone",
             ),
             (
                 "RMW_IMPLEMENTATION",
                 "rmw_connextdds",
                 "middleware",
-                Verdict::Warning,
-                "not tried",
+                CheckVerdict::Warning,
+                "untested",
             ),
             (
                 "RMW_IMPLEMENTATION",
                 "rmw_zenoh_cpp",
                 "middleware",
-                Verdict::Bad,
-                "does not speak DDS",
+                CheckVerdict::Bad,
+                "does not use DDS",
             ),
             (
                 "ROS_DOMAIN_ID",
                 "7",
                 "domain",
-                Verdict::Good,
+                CheckVerdict::Good,
                 "7, on all networks",
             ),
             (
                 "ROS_LOCALHOST_ONLY",
                 "1",
                 "domain",
-                Verdict::Good,
-                "0, on this machine alone",
+                CheckVerdict::Good,
+                "0, on this machine only",
             ),
             (
                 "ROS_DISCOVERY_SERVER",
                 "10.0.0.7;10.0.0.8:14520",
                 "domain",
-                Verdict::Good,
-                "0, on all networks of this robot, by discovery servers at 10.0.0.7:11811 and 10.0.0.8:14520",
+                CheckVerdict::Good,
+                "0, on all networks of this robot, through discovery servers at 10.0.0.7:11811 and 10.0.0.8:14520",
             ),
             (
                 "ROS_DISCOVERY_SERVER",
                 "TCPv4:[10.0.0.7]:42100",
                 "domain",
-                Verdict::Bad,
-                "which is reached by TCP",
+                CheckVerdict::Bad,
+                "which uses TCP",
             ),
             (
                 "ROS_DOMAIN_ID",
                 "300",
                 "domain",
-                Verdict::Bad,
+                CheckVerdict::Bad,
                 "ROS_DOMAIN_ID is \"300\"",
             ),
             (
                 "ROS_SECURITY_ENABLE",
                 "true",
                 "security",
-                Verdict::Bad,
+                CheckVerdict::Bad,
                 "SROS 2",
             ),
         ] {
-            let checks = robot.examined("stub:ros", &[(name, value)]).await;
-            let found = named(&checks, check).expect("a check");
+            let checks = robot.run_checks("stub:ros", &[(name, value)]).await;
+            let found = find_check(&checks, check).expect("a check");
             assert_eq!(found.verdict, verdict, "{found:?}");
             assert!(found.found.contains(said), "{found:?}");
         }
@@ -291,17 +297,17 @@ mod tests {
     async fn code_of_messages_is_missed_where_the_original_has_it() {
         let robot = Robot::new();
         robot.file("stub", &format!("{INDEX}/rosidl_interfaces/p"));
-        let examined = || robot.examined("stub:ros", &[]);
+        let examined = || robot.run_checks("stub:ros", &[]);
         assert!(
-            named(&examined().await, "messages").is_none(),
+            find_check(&examined().await, "messages").is_none(),
             "nobody has it"
         );
         robot.file("ros", "lib/libp__rosidl_typesupport_cpp.so");
         let checks = examined().await;
-        let check = named(&checks, "messages").expect("a check");
-        assert_eq!(check.verdict, Verdict::Warning);
+        let check = find_check(&checks, "messages").expect("a check");
+        assert_eq!(check.verdict, CheckVerdict::Warning);
         assert!(check.found.ends_with("ros"), "{check:?}");
         robot.file("stub", "lib/libp__rosidl_typesupport_cpp.so");
-        assert!(named(&examined().await, "messages").is_none());
+        assert!(find_check(&examined().await, "messages").is_none());
     }
 }

@@ -1,13 +1,13 @@
-//! ROS 1: both variables must name the overlay before anything else that holds the package: catkin's tools go by the one, rospack
-//! and rospkg by the other.
+//! ROS 1: checks that two variables name the overlay before any other directory with the package: catkin's tools use
+//! one, rospack and rospkg the other.
 
 use std::path::PathBuf;
 
 use super::super::Check;
-use super::{ExaminedStub, found, is, shadowed};
+use super::{ExaminedStub, found_check, is_same_directory, shadowed_check};
 use crate::network::Variable;
 
-/// Whether the stub is what is found by the package's name.
+/// Checks that the package's name resolves to the stub.
 pub fn shadowing(stub: &ExaminedStub, variable: Variable<'_>) -> Check {
     for (name, below, held_by) in [
         ("CMAKE_PREFIX_PATH", "", "share"),
@@ -21,16 +21,16 @@ pub fn shadowing(stub: &ExaminedStub, variable: Variable<'_>) -> Check {
         };
         let first = entries.iter().find(holds);
         let ours = stub.overlay().join(below);
-        if !first.is_some_and(|first| is(first, &ours)) {
-            return shadowed(name, first, stub);
+        if !first.is_some_and(|first| is_same_directory(first, &ours)) {
+            return shadowed_check(name, first, stub);
         }
     }
-    found(stub)
+    found_check(stub)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::Verdict;
+    use super::super::super::CheckVerdict;
     use super::*;
 
     struct Robot(tempfile::TempDir);
@@ -50,7 +50,7 @@ mod tests {
             self.0.path().canonicalize().expect("there").join(name)
         }
 
-        fn examined(&self, prefixes: &str, packages: &str) -> Check {
+        fn run_check(&self, prefixes: &str, packages: &str) -> Check {
             let stub = ExaminedStub {
                 share: self.path("stub/share/p"),
                 package: "p".into(),
@@ -74,22 +74,18 @@ mod tests {
     #[test]
     fn both_paths_must_name_the_stub_first() {
         let robot = Robot::new();
-        let good = robot.examined("stub:ros", "stub/share:ros/share");
-        assert_eq!(good.verdict, Verdict::Good, "{good:?}");
+        let good = robot.run_check("stub:ros", "stub/share:ros/share");
+        assert_eq!(good.verdict, CheckVerdict::Good, "{good:?}");
         // A workspace without the package may come before.
-        let other = robot.examined("other:stub:ros", "other:stub/share:ros/share");
-        assert_eq!(other.verdict, Verdict::Good, "{other:?}");
+        let other = robot.run_check("other:stub:ros", "other:stub/share:ros/share");
+        assert_eq!(other.verdict, CheckVerdict::Good, "{other:?}");
         for (prefixes, packages, words) in [
-            (
-                "ros:stub",
-                "stub/share:ros/share",
-                "CMAKE_PREFIX_PATH names",
-            ),
-            ("stub:ros", "ros/share:stub/share", "ROS_PACKAGE_PATH names"),
-            ("stub:ros", "other", "ROS_PACKAGE_PATH does not name"),
+            ("ros:stub", "stub/share:ros/share", "CMAKE_PREFIX_PATH has"),
+            ("stub:ros", "ros/share:stub/share", "ROS_PACKAGE_PATH has"),
+            ("stub:ros", "other", "ROS_PACKAGE_PATH does not include"),
         ] {
-            let bad = robot.examined(prefixes, packages);
-            assert_eq!(bad.verdict, Verdict::Bad);
+            let bad = robot.run_check(prefixes, packages);
+            assert_eq!(bad.verdict, CheckVerdict::Bad);
             assert!(bad.found.contains(words), "{bad:?}");
             assert!(bad.fix.is_some_and(|fix| fix.contains("stub/setup.sh")));
         }

@@ -1,30 +1,31 @@
-//! What the local original is given although it is given no requests.
+//! Inputs for the local original while it is not fed requests.
 //!
-//! A node may wait for something before it listens to its requests: move_base subscribes to its goal once it knows where the robot is.
-//! So while its process starts, it is given every input that is no request; once it is ready and the cloud answers, transforms and time
-//! alone, which cost little, and without which it could not take over at once. What is latched it is given in any case.
+//! A node may wait for something before it subscribes to its requests: move_base subscribes to its goal when it knows
+//! the robot's position. So while the process starts, it is fed every input that is not a request; when it is ready and
+//! the cloud answers, only transforms and time, which cost little and without which it could not take over at once.
+//! Latched messages are fed in any case.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use qos::{LocalState, Pair, Side};
-use ros::bus::Message;
+use qos::{LocalState, Responder, TopicPair};
+use ros::bus::SerializedMessage;
 use ros::ros1::actions;
 
 use super::{Keeper, State};
 
-/// Types of topics that tell of transforms and of time, as ROS 1 names them.
+/// Types of topics with transforms and time, as named in ROS 1.
 const OF_SPACE_AND_TIME: [&str; 3] = ["tf2_msgs/TFMessage", "tf/tfMessage", "rosgraph_msgs/Clock"];
 
-/// How the local original's process is, and which inputs are requests.
-pub(super) struct Context {
+/// State of the local original's process, and the inputs that are requests.
+pub(super) struct LocalContext {
     local: LocalState,
     requests: BTreeSet<String>,
 }
 
-impl Context {
-    /// The process does not run; the inputs of these pairs are requests.
-    pub(super) fn of(pairs: &[Pair]) -> Self {
+impl LocalContext {
+    /// Creates the context of a process that does not run; the inputs of these pairs are requests.
+    pub(super) fn new(pairs: &[TopicPair]) -> Self {
         let mut context = Self {
             local: LocalState::Stopped,
             requests: BTreeSet::new(),
@@ -33,29 +34,29 @@ impl Context {
         context
     }
 
-    /// The inputs of these pairs are requests, too.
-    pub(super) fn learn(&mut self, pairs: &[Pair]) {
+    /// Adds the inputs of these pairs to the requests.
+    pub(super) fn learn(&mut self, pairs: &[TopicPair]) {
         let inputs = pairs.iter().map(|pair| pair.input.clone());
         self.requests.extend(inputs);
     }
 
-    /// The process has changed.
-    pub(super) fn is_now(&mut self, local: LocalState) {
+    /// Sets the state of the process.
+    pub(super) fn set_state(&mut self, local: LocalState) {
         self.local = local;
     }
 
-    /// Whether there is a process, which may be told something.
-    pub(super) fn runs(&self) -> bool {
+    /// Returns whether there is a process that can be called.
+    pub(super) fn is_running(&self) -> bool {
         matches!(self.local, LocalState::Starting | LocalState::Ready)
     }
 
-    /// Whether a message of this type on this topic is for a local original that is given no requests.
-    fn takes(&self, topic: &str, type_name: &str) -> bool {
+    /// Returns whether a message of this type on this topic is fed to a local original that is not fed requests.
+    fn accepts(&self, topic: &str, type_name: &str) -> bool {
         let type_name = type_name.replacen("/msg/", "/", 1);
         match self.local {
             LocalState::Starting => {
                 let is_command =
-                    actions::carries_goal_id(&type_name) || actions::commands(&type_name);
+                    actions::carries_goal_id(&type_name) || actions::is_command_type(&type_name);
                 !is_command && !self.requests.contains(topic)
             }
             LocalState::Ready => OF_SPACE_AND_TIME.contains(&type_name.as_str()),
@@ -65,16 +66,21 @@ impl Context {
 }
 
 impl Keeper {
-    /// Gives the local original an input that it may be waiting for, unless it is given all inputs.
-    pub(super) fn give_context(&self, state: &mut State, topic: &Arc<str>, message: &Message) {
+    /// Feeds the local original an input that it may be waiting for, unless it is fed all inputs.
+    pub(super) fn feed_context(
+        &self,
+        state: &mut State,
+        topic: &Arc<str>,
+        message: &SerializedMessage,
+    ) {
         let is_due = !message.latching
             && !state.governor.sides().local
-            && state.context.takes(topic, &message.wire_type.name);
+            && state.context.accepts(topic, &message.wire_type.name);
         let Some(original) = self.original.as_ref().filter(|_| is_due) else {
             return;
         };
         original.feed(topic, message);
-        state.ledger.given(Side::Local, topic);
+        state.ledger.record_delivery(Responder::Local, topic);
     }
 }
 
@@ -85,7 +91,7 @@ mod tests {
     #[test]
     fn requests_wait_until_it_is_ready_and_what_costs_much_until_it_is_needed() {
         let pair = "/move_base/goal -> /move_base/result".parse().unwrap();
-        let mut context = Context::of(&[]);
+        let mut context = LocalContext::new(&[]);
         context.learn(&[pair]);
         let inputs = [
             ("/tf", "tf2_msgs/msg/TFMessage"),
@@ -94,16 +100,18 @@ mod tests {
             ("/move_base/goal", "move_base_msgs/MoveBaseActionGoal"),
             ("/move_base/cancel", "actionlib_msgs/GoalID"),
         ];
-        let taken = |context: &Context| {
-            let taken = inputs.iter().filter(|(topic, of)| context.takes(topic, of));
+        let taken = |context: &LocalContext| {
+            let taken = inputs
+                .iter()
+                .filter(|(topic, of)| context.accepts(topic, of));
             taken.map(|(topic, _)| *topic).collect::<Vec<_>>().join(" ")
         };
         assert_eq!(taken(&context), "");
-        context.is_now(LocalState::Starting);
+        context.set_state(LocalState::Starting);
         assert_eq!(taken(&context), "/tf /clock /scan");
-        context.is_now(LocalState::Ready);
+        context.set_state(LocalState::Ready);
         assert_eq!(taken(&context), "/tf /clock");
-        context.is_now(LocalState::Stopped);
+        context.set_state(LocalState::Stopped);
         assert_eq!(taken(&context), "");
     }
 }

@@ -1,16 +1,18 @@
-//! What follows from a change of the keeper's state: carried out on the link, the local original and the application, in the order in which it
-//! was decided.
+//! Effects of a change of the keeper's state, applied to the link, the local original and the application in the order
+//! of the decisions.
 
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use bytes::Bytes;
-use qos::{Channel, Effect, Event, Failure, HandOver, RequestId, Side, Why};
+use qos::{
+    DecisionReason, Effect, Failure, HandOver, QosEvent, RequestChannel, RequestId, Responder,
+};
 
-use super::{Answer, Keeper, Payload, State};
+use super::{Keeper, Payload, PendingAnswer, State};
 
 impl Keeper {
-    /// Changes the state, and does what follows.
+    /// Changes the state and applies the effects.
     pub(super) fn change<T>(&self, change: impl FnOnce(&mut State, Instant) -> T) -> T {
         let (result, effects, over, is_stateful) = {
             let mut state = self.state.lock();
@@ -26,21 +28,21 @@ impl Keeper {
                     state.goals.fail(*request);
                 }
             }
-            let over = state.hands_over(now, &effects);
+            let over = state.track_hand_over(now, &effects);
             (result, effects, over, state.is_stateful)
         };
         for effect in effects {
-            self.carry_out(effect);
+            self.apply_effect(effect);
         }
         match over {
-            Some(over) if is_stateful => self.robot.handed_over(&over),
-            Some(over) => self.robot.lacks(&over),
+            Some(over) if is_stateful => self.robot.on_hand_over(&over),
+            Some(over) => self.robot.on_missed_requests(&over),
             None => {}
         }
         result
     }
 
-    fn carry_out(&self, effect: Effect<Payload>) {
+    fn apply_effect(&self, effect: Effect<Payload>) {
         match effect {
             Effect::Give {
                 side,
@@ -48,18 +50,23 @@ impl Keeper {
                 channel,
                 payload,
             } => match (side, channel, payload, request) {
-                // Both have it since it came.
+                // Both sides have received it already.
                 (_, _, Payload::Input(kept), _) if kept.is_latched => {}
-                (Side::Cloud, Channel::Topic(topic), Payload::Input(kept), _) => {
+                (Responder::Cloud, RequestChannel::Topic(topic), Payload::Input(kept), _) => {
                     if let Some(message) = kept.message() {
                         self.cloud.publish(&topic, &message);
                     }
                 }
-                (Side::Cloud, Channel::Call(service), Payload::Call(bytes), Some(id)) => {
+                (
+                    Responder::Cloud,
+                    RequestChannel::Call(service),
+                    Payload::Call(bytes),
+                    Some(id),
+                ) => {
                     self.cloud.call(id, &service, bytes);
                 }
                 (side, _, Payload::Goal(sent), Some(id)) => self.give_goal(side, id, &sent),
-                (Side::Local, channel, payload, request) => {
+                (Responder::Local, channel, payload, request) => {
                     self.give_local(&channel, payload, request)
                 }
                 _ => unreachable!("calls carry requests, topics carry messages"),
@@ -72,49 +79,49 @@ impl Keeper {
                     self.robot.safe_stop(stop);
                 }
             }
-            Effect::Outcome(outcome) => self.robot.told(&outcome),
+            Effect::Outcome(outcome) => self.robot.on_outcome(&outcome),
             Effect::Event(_) if self.ending.load(Ordering::Relaxed) => {}
             Effect::Event(event) => {
                 match (&event, &self.original) {
-                    (Event::Start(_), Some(original)) => original.start(),
-                    (Event::Start(_), None) => return self.missing(),
-                    (Event::Stop(_), Some(original)) => original.stop(),
+                    (QosEvent::Start(_), Some(original)) => original.start(),
+                    (QosEvent::Start(_), None) => return self.report_missing_original(),
+                    (QosEvent::Stop(_), Some(original)) => original.stop(),
                     _ => {}
                 }
-                self.robot.decided(&event);
+                self.robot.on_decision(&event);
             }
         }
     }
 
-    /// Calls a side, which is not measured.
-    pub(super) fn ask(&self, side: Side, service: &str, bytes: Bytes) -> Answer {
+    /// Makes a call to a side that is not measured.
+    pub(super) fn call_side(&self, side: Responder, service: &str, bytes: Bytes) -> PendingAnswer {
         match (side, &self.original) {
-            (Side::Cloud, _) => self.cloud.ask(service, bytes),
-            (Side::Local, Some(original)) => original.call(service, bytes),
-            (Side::Local, None) => {
+            (Responder::Cloud, _) => self.cloud.call_unmeasured(service, bytes),
+            (Responder::Local, Some(original)) => original.call(service, bytes),
+            (Responder::Local, None) => {
                 let reason = "there is no local original".to_owned();
                 Box::pin(async move { Err(Failure::Unreachable(reason)) })
             }
         }
     }
 
-    fn give_local(&self, channel: &Channel, payload: Payload, request: Option<RequestId>) {
+    fn give_local(&self, channel: &RequestChannel, payload: Payload, request: Option<RequestId>) {
         let Some(original) = &self.original else {
             return;
         };
         match (channel, payload, request) {
-            (Channel::Topic(topic), Payload::Input(kept), _) => {
+            (RequestChannel::Topic(topic), Payload::Input(kept), _) => {
                 if let Some(message) = kept.message() {
                     original.feed(topic, &message);
                 }
             }
-            (Channel::Call(service), Payload::Call(bytes), Some(id)) => {
+            (RequestChannel::Call(service), Payload::Call(bytes), Some(id)) => {
                 let answer = original.call(service, bytes);
                 let keeper = self.this.clone();
                 tokio::spawn(async move {
                     let result = answer.await;
                     if let Some(keeper) = keeper.upgrade() {
-                        keeper.answered(Side::Local, id, result, None);
+                        keeper.on_answer(Responder::Local, id, result, None);
                     }
                 });
             }
@@ -124,8 +131,8 @@ impl Keeper {
 }
 
 impl State {
-    /// Notes who is given what, and tells what is lost where one side goes on in place of the other.
-    fn hands_over(&mut self, now: Instant, effects: &[Effect<Payload>]) -> Option<HandOver> {
+    /// Records which side receives what, and returns the losses if one side takes over from the other.
+    fn track_hand_over(&mut self, now: Instant, effects: &[Effect<Payload>]) -> Option<HandOver> {
         let ledger = &mut self.ledger;
         let mut to = None;
         for effect in effects {
@@ -136,18 +143,24 @@ impl State {
                 } if kept.is_latched => {}
                 Effect::Give {
                     side,
-                    channel: Channel::Topic(name) | Channel::Call(name),
+                    channel: RequestChannel::Topic(name) | RequestChannel::Call(name),
                     ..
-                } => ledger.given(*side, name),
-                Effect::Event(Event::Start(_) | Event::Crashed(_)) => ledger.original_begins(),
-                Effect::Event(Event::Feed(Why::LinkDown)) => to = Some(Side::Local),
-                Effect::Event(Event::Feed(_)) if !self.is_stateful => to = Some(Side::Local),
-                Effect::Event(Event::StopFeeding(Why::LinkUp)) => to = Some(Side::Cloud),
+                } => ledger.record_delivery(*side, name),
+                Effect::Event(QosEvent::Start(_) | QosEvent::Crashed(_)) => ledger.on_local_start(),
+                Effect::Event(QosEvent::Feed(DecisionReason::LinkDown)) => {
+                    to = Some(Responder::Local)
+                }
+                Effect::Event(QosEvent::Feed(_)) if !self.is_stateful => {
+                    to = Some(Responder::Local)
+                }
+                Effect::Event(QosEvent::StopFeeding(DecisionReason::LinkUp)) => {
+                    to = Some(Responder::Cloud)
+                }
                 _ => {}
             }
         }
-        // All that was given at this moment counts as given before.
-        let over = ledger.hands_over(now, to?)?;
+        // Messages of this very moment count as received before.
+        let over = ledger.hand_over(now, to?)?;
         if self.is_stateful {
             self.lost = Some((now, over.to_string()));
         }

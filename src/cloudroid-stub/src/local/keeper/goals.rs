@@ -1,5 +1,5 @@
-//! Goals of ROS 2's actions, which are made of calls. A goal is one request, from when it is sent until its result: it is given to a
-//! side, or to both, and each is asked for the result as soon as it has accepted.
+//! Goals of ROS 2's actions, which consist of service calls. A goal is one request, from its sending to its result: it
+//! is given to one side, or to both, and each is asked for the result as soon as it has accepted the goal.
 //!
 //! ```text
 //!   client                keeper                        a side that is given the goal
@@ -9,8 +9,9 @@
 //!     │◀─ first result ──────│◀─ result ────────────────────│
 //!     │── cancel_goal ──────▶│── to all that were given it ▶│
 //! ```
-//! A side that does not know a goal says so at once, which is no result. So one that was given a goal before is asked for the result
-//! first: it may be at it still, though the link forgot.
+//!
+//! A side that does not know a goal says so at once, which is no result. So a side that was given a goal before is
+//! asked for its result first: it may still be executing it, although the link was lost.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Weak};
@@ -20,58 +21,58 @@ use bytes::Bytes;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
 use link::clock;
-use qos::{Failure, Key, RequestId, Side};
-use ros::bus::{Message, WireFormat};
+use qos::{CorrelationKey, Failure, RequestId, Responder};
+use ros::bus::{SerializedMessage, WireFormat};
 use tokio::sync::oneshot;
 
 use super::goal_messages::{self as messages, ALL, GoalId};
 use super::{Keeper, Payload};
 
-/// Results are kept so long for those who ask for them late, and so many of them.
+/// Time for which results are kept for late requests, and their largest number.
 const KEPT: Duration = Duration::from_secs(900);
 const MOST: usize = 1000;
 
 /// A goal as it was sent.
 #[derive(Debug)]
-pub struct Sent {
+pub struct GoalRequest {
     id: GoalId,
     action: Arc<str>,
-    /// The request by which it was sent.
+    /// Request that sent the goal.
     request: Bytes,
 }
 
-impl Sent {
-    fn part(&self, part: &str) -> String {
-        part_of(&self.action, part)
+impl GoalRequest {
+    fn service_name(&self, part: &str) -> String {
+        action_service(&self.action, part)
     }
 }
 
-fn part_of(action: &str, part: &str) -> String {
+fn action_service(action: &str, part: &str) -> String {
     format!("{action}/_action/{part}")
 }
 
-/// Goals under way, and ended ones whose results are kept.
+/// Goals in progress, and ended goals whose results are kept.
 #[derive(Default)]
-pub(super) struct Goals(HashMap<GoalId, Goal>);
+pub(super) struct KeeperGoals(HashMap<GoalId, KeeperGoal>);
 
-struct Goal {
+struct KeeperGoal {
     request: RequestId,
     action: Arc<str>,
-    /// Who has sent it, until it is accepted or not.
+    /// Receiver of the response to the goal, until it is accepted or refused.
     sender: Option<oneshot::Sender<Bytes>>,
-    /// Whoever has sent it wants it to end.
+    /// Set if the sender wants to cancel the goal.
     canceled: bool,
-    /// How often each side was given it.
+    /// Number of times that each side was given the goal.
     given: [u32; 2],
-    /// Who waits for its result.
+    /// Callers that wait for the result.
     waiting: Vec<oneshot::Sender<Bytes>>,
     result: Option<Bytes>,
-    /// What a side has answered that had forgotten it.
+    /// Response of a side that had forgotten the goal.
     forgotten: Option<Bytes>,
     ended: Option<Instant>,
 }
 
-impl Goal {
+impl KeeperGoal {
     fn new(request: RequestId, action: &Arc<str>, sender: oneshot::Sender<Bytes>) -> Self {
         Self {
             request,
@@ -97,9 +98,9 @@ impl Goal {
     }
 }
 
-impl Goals {
-    fn begin(&mut self, now: Instant, id: GoalId, goal: Goal) {
-        let old = |goal: &Goal| goal.ended.is_some_and(|ended| now - ended > KEPT);
+impl KeeperGoals {
+    fn insert(&mut self, now: Instant, id: GoalId, goal: KeeperGoal) {
+        let old = |goal: &KeeperGoal| goal.ended.is_some_and(|ended| now - ended > KEPT);
         self.0.retain(|_, goal| !old(goal));
         if self.0.len() >= MOST {
             let ended = self
@@ -113,14 +114,15 @@ impl Goals {
         self.0.insert(id, goal);
     }
 
-    /// Nobody will end this one: whoever sent it is told that it is not accepted, or what a side has said that had forgotten it.
+    /// Fails a goal that no side will end: its sender is told that it is not accepted, or gets the response of a side
+    /// that had forgotten it.
     pub(super) fn fail(&mut self, request: RequestId) {
         let failed = self.0.iter().find(|(_, goal)| goal.request == request);
         let Some(goal) = failed.map(|(id, _)| *id).and_then(|id| self.0.remove(&id)) else {
             return;
         };
         if let Some(sender) = goal.sender {
-            let _ = sender.send(messages::answer(false, clock::now()));
+            let _ = sender.send(messages::goal_response(false, clock::now()));
         }
         if let Some(forgotten) = goal.forgotten {
             for waiting in goal.waiting {
@@ -130,31 +132,31 @@ impl Goals {
     }
 }
 
-/// By what feedback of a goal is recognised.
-pub(super) fn key_of_feedback(topic: &str, message: &Message) -> Option<Key> {
+/// Returns the key by which feedback is matched with its goal.
+pub(super) fn feedback_key(topic: &str, message: &SerializedMessage) -> Option<CorrelationKey> {
     let of_action =
         message.wire_type.format == WireFormat::Cdr && topic.ends_with("/_action/feedback");
-    let id = messages::id_of(&message.bytes).filter(|_| of_action)?;
-    Some(key_of(&id))
+    let id = messages::goal_id(&message.bytes).filter(|_| of_action)?;
+    Some(goal_key(&id))
 }
 
-fn key_of(id: &GoalId) -> Key {
-    Key::Goal(format!("{:032x}", u128::from_be_bytes(*id)).into())
+fn goal_key(id: &GoalId) -> CorrelationKey {
+    CorrelationKey::Goal(format!("{:032x}", u128::from_be_bytes(*id)).into())
 }
 
 impl Keeper {
-    /// The application sends a goal. An action's server has no way to say why it does not take one.
+    /// Handles a goal of the application. An action server cannot give a reason for a refusal.
     pub async fn send_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
-        let Some(id) = messages::id_of(&request) else {
+        let Some(id) = messages::goal_id(&request) else {
             return Err(format!("a goal of {action} has no id"));
         };
         let (sender, answer) = oneshot::channel();
-        let sent = Sent {
+        let sent = GoalRequest {
             id,
             action: action.clone(),
             request,
         };
-        let is_new = self.with(|state, now| {
+        let is_new = self.update(|state, now| {
             if state
                 .goals
                 .0
@@ -163,26 +165,27 @@ impl Keeper {
             {
                 return false;
             }
-            state.ledger.told(now, action);
+            state.ledger.record_input(now, action);
             let payload = Payload::Goal(Arc::new(sent));
-            let request = state.governor.goal(now, action, key_of(&id), payload);
+            let request = state.governor.goal(now, action, goal_key(&id), payload);
             state
                 .goals
-                .begin(now, id, Goal::new(request, action, sender));
+                .insert(now, id, KeeperGoal::new(request, action, sender));
             true
         });
-        let refused = || messages::answer(false, clock::now());
-        match is_new {
-            true => Ok(answer.await.unwrap_or_else(|_| refused())),
-            false => Ok(refused()),
+        let refused = || messages::goal_response(false, clock::now());
+        if is_new {
+            Ok(answer.await.unwrap_or_else(|_| refused()))
+        } else {
+            Ok(refused())
         }
     }
 
-    /// The application wants the result of a goal.
+    /// Handles a request of the application for a goal's result.
     pub async fn get_result(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
         let (sender, answer) = oneshot::channel();
-        let known = self.with(|state, _| {
-            let goal = state.goals.0.get_mut(&messages::id_of(&request)?)?;
+        let known = self.update(|state, _| {
+            let goal = state.goals.0.get_mut(&messages::goal_id(&request)?)?;
             match &goal.result {
                 Some(result) => drop(sender.send(result.clone())),
                 None => goal.waiting.push(sender),
@@ -192,16 +195,19 @@ impl Keeper {
         match known {
             Some(()) => answer
                 .await
-                .map_err(|_| "nobody can tell the result of this goal any more".to_owned()),
-            // Sent before this stub began.
-            None => self.pass(&part_of(action, "get_result"), request).await,
+                .map_err(|_| "the result of this goal is no longer available".to_owned()),
+            // The goal was sent before this stub started.
+            None => {
+                self.forward(&action_service(action, "get_result"), request)
+                    .await
+            }
         }
     }
 
-    /// The application wants a goal, or all, to end.
+    /// Handles a request of the application to cancel a goal, or all.
     pub async fn cancel_goal(&self, action: &Arc<str>, request: Bytes) -> Result<Bytes, String> {
-        let wanted = messages::id_of(&request).unwrap_or(ALL);
-        let (ids, sides) = self.with(|state, _| {
+        let wanted = messages::goal_id(&request).unwrap_or(ALL);
+        let (ids, sides) = self.update(|state, _| {
             let (mut ids, mut sides) = (Vec::new(), [false; 2]);
             let concerned = state.goals.0.iter_mut().filter(|(id, goal)| {
                 goal.action == *action && goal.ended.is_none() && (wanted == ALL || **id == wanted)
@@ -209,29 +215,29 @@ impl Keeper {
             for (id, goal) in concerned {
                 goal.canceled = true;
                 ids.push(*id);
-                for side in [Side::Cloud, Side::Local] {
+                for side in [Responder::Cloud, Responder::Local] {
                     sides[side.index()] |= goal.given[side.index()] > 0;
                 }
             }
             (ids, sides)
         });
-        let service = part_of(action, "cancel_goal");
+        let service = action_service(action, "cancel_goal");
         if ids.is_empty() {
-            return self.pass(&service, request).await;
+            return self.forward(&service, request).await;
         }
         if sides == [false; 2] {
-            // It is cancelled as soon as somebody has taken it.
-            return Ok(messages::canceled(&ids));
+            // It is cancelled as soon as a side has accepted it.
+            return Ok(messages::cancel_response(&ids));
         }
-        let given = [Side::Cloud, Side::Local].into_iter();
+        let given = [Responder::Cloud, Responder::Local].into_iter();
         let given = given.filter(|side| sides[side.index()]);
         let mut answers: FuturesUnordered<_> = given
-            .map(|side| tokio::spawn(self.ask(side, &service, request.clone())))
+            .map(|side| tokio::spawn(self.call_side(side, &service, request.clone())))
             .collect();
-        let mut last = Err("nobody has the goals any more".to_owned());
+        let mut last = Err("the goals are no longer known".to_owned());
         while let Some(answer) = answers.next().await {
             match answer {
-                Ok(Ok(answer)) if messages::cancels(&answer) => return Ok(answer),
+                Ok(Ok(answer)) if messages::has_canceled_goals(&answer) => return Ok(answer),
                 Ok(Ok(answer)) => last = Ok(answer),
                 Ok(Err(failure)) if last.is_err() => last = Err(failure.text().to_owned()),
                 _ => {}
@@ -240,8 +246,8 @@ impl Keeper {
         last
     }
 
-    /// Has a side carry out a goal.
-    pub(super) fn give_goal(&self, side: Side, request: RequestId, sent: &Arc<Sent>) {
+    /// Has a side execute a goal.
+    pub(super) fn give_goal(&self, side: Responder, request: RequestId, sent: &Arc<GoalRequest>) {
         let round = {
             let mut state = self.state.lock();
             let Some(goal) = state.goals.0.get_mut(&sent.id) else {
@@ -251,89 +257,90 @@ impl Keeper {
             *round += 1;
             *round
         };
-        let carrying = Carrying {
+        let carrying = GoalRun {
             keeper: self.this.clone(),
             side,
             request,
             sent: Arc::clone(sent),
             round,
         };
-        tokio::spawn(carrying.carry());
+        tokio::spawn(carrying.run());
     }
 }
 
-/// One goal at one side.
-struct Carrying {
+/// The execution of one goal by one side.
+struct GoalRun {
     keeper: Weak<Keeper>,
-    side: Side,
+    side: Responder,
     request: RequestId,
-    sent: Arc<Sent>,
-    /// How often the side was given the goal, with this time.
+    sent: Arc<GoalRequest>,
+    /// Number of times that the side was given the goal, including this one.
     round: u32,
 }
 
-impl Carrying {
-    async fn carry(self) {
-        if let Err(failure) = self.to_its_end().await {
-            self.failed(&failure);
+impl GoalRun {
+    async fn run(self) {
+        if let Err(failure) = self.run_to_end().await {
+            self.on_failed(&failure);
         }
     }
 
-    async fn to_its_end(&self) -> Result<(), Failure> {
+    async fn run_to_end(&self) -> Result<(), Failure> {
         if self.round > 1 {
-            let result = self.result().await?;
+            let result = self.fetch_result().await?;
             if messages::is_result(&result) {
-                self.ended(result);
+                self.on_result(result);
                 return Ok(());
             }
         }
-        let answer = self.ask("send_goal", self.sent.request.clone()).await?;
-        let is_wanted = match messages::is_accepted(&answer) {
-            true => self.accepted(answer),
-            false => return self.refused(answer),
+        let answer = self.call("send_goal", self.sent.request.clone()).await?;
+        let is_wanted = if messages::is_accepted(&answer) {
+            self.on_accepted(answer)
+        } else {
+            return self.on_refused(answer);
         };
         if !is_wanted {
-            let canceled = messages::cancel(&self.sent.id);
-            self.ask("cancel_goal", canceled).await?;
+            let canceled = messages::cancel_request(&self.sent.id);
+            self.call("cancel_goal", canceled).await?;
         }
-        let result = self.result().await?;
+        let result = self.fetch_result().await?;
         if messages::is_result(&result) {
-            self.ended(result);
+            self.on_result(result);
             return Ok(());
         }
         self.with_goal(|goal| goal.forgotten = Some(result));
         let node = match self.side {
-            Side::Cloud => "the node in the cloud",
-            Side::Local => "the local original",
+            Responder::Cloud => "the node in the cloud",
+            Responder::Local => "the local original",
         };
-        let reason = format!("{node} has forgotten the goal that it had accepted");
+        let reason = format!("{node} has lost the goal that it had accepted");
         Err(Failure::Unreachable(reason))
     }
 
-    async fn ask(&self, part: &str, request: Bytes) -> Result<Bytes, Failure> {
+    async fn call(&self, part: &str, request: Bytes) -> Result<Bytes, Failure> {
         let ended = || Failure::Unreachable("the node is ending".to_owned());
         let asked = {
             let keeper = self.keeper.upgrade().ok_or_else(ended)?;
-            keeper.ask(self.side, &self.sent.part(part), request)
+            keeper.call_side(self.side, &self.sent.service_name(part), request)
         };
         asked.await
     }
 
-    async fn result(&self) -> Result<Bytes, Failure> {
-        let request = messages::get_result(&self.sent.id);
-        self.ask("get_result", request).await
+    async fn fetch_result(&self) -> Result<Bytes, Failure> {
+        let request = messages::result_request(&self.sent.id);
+        self.call("get_result", request).await
     }
 
-    fn with_goal<T>(&self, change: impl FnOnce(&mut Goal) -> T) -> Option<T> {
+    fn with_goal<T>(&self, change: impl FnOnce(&mut KeeperGoal) -> T) -> Option<T> {
         let keeper = self.keeper.upgrade()?;
         let mut state = keeper.state.lock();
         state.goals.0.get_mut(&self.sent.id).map(change)
     }
 
-    /// It is carried out. False where whoever sent it wants it no more.
-    fn accepted(&self, answer: Bytes) -> bool {
+    /// Handles an acceptance; false if the sender has cancelled the goal.
+    fn on_accepted(&self, answer: Bytes) -> bool {
         if let Some(keeper) = self.keeper.upgrade() {
-            keeper.with(|state, now| state.governor.accepted(now, self.request));
+            keeper.update(|state, now| state.governor.on_goal_accepted(now, self.request));
         }
         let is_wanted = self.with_goal(|goal| {
             if let Some(sender) = goal.sender.take() {
@@ -344,54 +351,54 @@ impl Carrying {
         is_wanted.unwrap_or(false)
     }
 
-    /// A refusal is an answer, unless the other side has accepted the goal.
-    fn refused(&self, answer: Bytes) -> Result<(), Failure> {
+    /// Handles a refusal, which is an answer unless the other side has accepted the goal.
+    fn on_refused(&self, answer: Bytes) -> Result<(), Failure> {
         let refusal = Failure::Refused("the goal was not accepted".to_owned());
         let Some(keeper) = self.keeper.upgrade() else {
             return Ok(());
         };
-        keeper.with(|state, now| {
+        keeper.update(|state, now| {
             let goal = state.goals.0.get_mut(&self.sent.id);
             let Some(sender) = goal.and_then(|goal| goal.sender.take()) else {
                 return Err(refusal);
             };
             state.goals.0.remove(&self.sent.id);
             let _ = sender.send(answer);
-            let _ = state.governor.answered(now, self.side, self.request);
+            let _ = state.governor.on_result(now, self.side, self.request);
             Ok(())
         })
     }
 
-    fn ended(&self, result: Bytes) {
+    fn on_result(&self, result: Bytes) {
         let Some(keeper) = self.keeper.upgrade() else {
             return;
         };
-        keeper.with(|state, now| {
-            // The first one is taken, whether the governor still knows of the goal or not.
-            let _ = state.governor.answered(now, self.side, self.request);
+        keeper.update(|state, now| {
+            // The first result is used, whether the governor still knows the goal or not.
+            let _ = state.governor.on_result(now, self.side, self.request);
             if let Some(goal) = state.goals.0.get_mut(&self.sent.id) {
                 if let Some(sender) = goal.sender.take() {
-                    let _ = sender.send(messages::answer(true, clock::now()));
+                    let _ = sender.send(messages::goal_response(true, clock::now()));
                 }
                 goal.end(now, result);
             }
         });
     }
 
-    fn failed(&self, failure: &Failure) {
+    fn on_failed(&self, failure: &Failure) {
         let Some(keeper) = self.keeper.upgrade() else {
             return;
         };
-        keeper.with(|state, now| {
+        keeper.update(|state, now| {
             let lost = matches!(failure, Failure::Unreachable(_))
-                && self.side == Side::Cloud
+                && self.side == Responder::Cloud
                 && !state.governor.sides().cloud;
             let goal = state.goals.0.get(&self.sent.id);
             let is_last = goal.is_some_and(|goal| goal.given[self.side.index()] == self.round);
             // A goal that was lost with the link is given to the cloud again.
             if is_last && !lost {
                 let (side, request) = (self.side, self.request);
-                state.governor.failed(now, side, request, failure);
+                state.governor.on_failure(now, side, request, failure);
             }
         });
     }

@@ -1,64 +1,64 @@
-//! What the application publishes for the node.
+//! Messages that the application publishes for the node.
 
 use std::sync::Arc;
 
-use qos::Side;
-use ros::bus::{Message, PeerId};
+use qos::Responder;
+use ros::bus::{PeerId, SerializedMessage};
 use ros::ros1::actions;
 
 use super::{Keeper, Payload};
 
 impl Keeper {
-    /// The application published an input. What is latched is for both sides, whoever answers now: one that begins later
-    /// needs it, too.
-    pub fn input(&self, topic: &Arc<str>, message: Message) {
+    /// Handles a message that the application has published. A latched message is for both sides, whichever answers
+    /// now: one that starts later needs it, too.
+    pub fn on_input(&self, topic: &Arc<str>, message: SerializedMessage) {
         if message.latching {
             self.cloud.publish(topic, &message);
             if let Some(original) = &self.original {
                 original.latch(topic, &message);
             }
         }
-        self.with(|state, now| {
+        self.update(|state, now| {
             if !message.latching && (state.is_stateful || is_goal(&message)) {
-                state.ledger.told(now, topic);
+                state.ledger.record_input(now, topic);
             }
-            self.give_context(state, topic, &message);
+            self.feed_context(state, topic, &message);
             let key = state.stamps.key(&message);
-            let payload = Payload::Input(state.kept.keep(message));
+            let payload = Payload::Input(state.kept.insert(message));
             state.governor.input(now, topic, key, payload);
         });
     }
 
-    /// The application published an input that the cloud has by another way: nodes of one servant hear each other inside,
-    /// and one of them takes up what several listen to.
-    pub fn overheard(&self, topic: &Arc<str>, message: Message) {
+    /// Handles a message that the cloud receives by another path: nodes of one servant are connected inside it, and one
+    /// of them forwards inputs that several subscribe to.
+    pub fn on_overheard_input(&self, topic: &Arc<str>, message: SerializedMessage) {
         if let Some(original) = self.original.as_ref().filter(|_| message.latching) {
             return original.latch(topic, &message);
         }
-        self.with(|state, now| {
+        self.update(|state, now| {
             let has = state.governor.sides().cloud;
             if state.is_stateful {
-                state.ledger.told(now, topic);
+                state.ledger.record_input(now, topic);
                 if has {
-                    state.ledger.given(Side::Cloud, topic);
+                    state.ledger.record_delivery(Responder::Cloud, topic);
                 }
             }
-            self.give_context(state, topic, &message);
-            let payload = Payload::Input(state.kept.keep(message));
-            state.governor.overheard(now, topic, payload);
+            self.feed_context(state, topic, &message);
+            let payload = Payload::Input(state.kept.insert(message));
+            state.governor.on_overheard_input(now, topic, payload);
         });
     }
 
-    /// A publisher of the robot has gone, and with it what it has latched on this topic.
-    pub fn left(&self, topic: &Arc<str>, publisher: &PeerId) {
+    /// Handles the end of a publisher on the robot, whose latched message on this topic is discarded.
+    pub fn on_publisher_left(&self, topic: &Arc<str>, publisher: &PeerId) {
         if let Some(original) = &self.original {
             original.unlatch(topic, publisher);
         }
     }
 }
 
-/// Whether it sends a goal to an action that is made of topics (ROS 1).
-fn is_goal(message: &Message) -> bool {
+/// Returns whether a message sends a goal to an action that consists of topics (ROS 1).
+fn is_goal(message: &SerializedMessage) -> bool {
     let of = &message.wire_type.name;
-    actions::carries_goal_id(of) && actions::commands(of)
+    actions::carries_goal_id(of) && actions::is_command_type(of)
 }

@@ -1,47 +1,47 @@
-//! Inputs that may be asked for again: until they are answered, or late, the other side may still be given them. With a long T_max that is
-//! many pictures, so what they take is bounded, and the oldest give way. Goals of ROS 1 are small, few and open for as long as they take:
-//! they do not give way to pictures.
+//! Inputs that may be needed again: until they are answered or late, they may still be given to the other side. With a
+//! long T_max these are many images, so their memory is limited, and the oldest are dropped. Goals of ROS 1 are small,
+//! few and open for a long time: they are not dropped for images.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
-use ros::bus::Message;
+use ros::bus::SerializedMessage;
 use ros::ros1::actions;
 
-/// Bytes of the messages of one node.
+/// Memory for the messages of one node, in bytes.
 const MOST: usize = 64 << 20;
-/// So many that may have been dropped meanwhile are not looked through.
+/// Number of entries that may have been released without a search for them.
 const FEW: usize = 64;
 
-/// An input for as long as somebody holds it, or without its message from when newer ones needed the memory.
+/// An input that is retained while somebody holds it; its message is dropped when newer ones need the memory.
 #[derive(Debug)]
-pub struct KeptInput {
-    /// Both sides have it since it came.
+pub struct RetainedInput {
+    /// Set if both sides have received it already.
     pub(super) is_latched: bool,
     bytes: usize,
-    message: Mutex<Option<Message>>,
+    message: Mutex<Option<SerializedMessage>>,
 }
 
-impl KeptInput {
-    /// The message, unless it has given way.
-    pub(super) fn message(&self) -> Option<Message> {
+impl RetainedInput {
+    /// Returns the message, unless it was dropped.
+    pub(super) fn message(&self) -> Option<SerializedMessage> {
         self.message.lock().clone()
     }
 }
 
-/// Those that are kept, the oldest first.
+/// The retained inputs, oldest first.
 #[derive(Debug)]
-pub(super) struct KeptInputs {
+pub(super) struct RetainedInputs {
     most: usize,
-    inputs: VecDeque<Weak<KeptInput>>,
-    /// Bytes of them, those included that nobody holds any more.
+    inputs: VecDeque<Weak<RetainedInput>>,
+    /// Size of their messages in bytes, including entries that nobody holds any more.
     bytes: usize,
-    /// As many were held when they were looked through last.
+    /// Number of entries that were held at the last search.
     held: usize,
 }
 
-impl Default for KeptInputs {
+impl Default for RetainedInputs {
     fn default() -> Self {
         Self {
             most: MOST,
@@ -52,12 +52,12 @@ impl Default for KeptInputs {
     }
 }
 
-impl KeptInputs {
-    /// Keeps one more, whatever its size.
-    pub(super) fn keep(&mut self, message: Message) -> Arc<KeptInput> {
+impl RetainedInputs {
+    /// Adds an input of any size.
+    pub(super) fn insert(&mut self, message: SerializedMessage) -> Arc<RetainedInput> {
         let bytes = message.bytes.len();
         let is_goal = actions::carries_goal_id(&message.wire_type.name);
-        let input = Arc::new(KeptInput {
+        let input = Arc::new(RetainedInput {
             is_latched: message.latching,
             bytes,
             message: Mutex::new(Some(message)),
@@ -66,7 +66,7 @@ impl KeptInputs {
             return input;
         }
         if self.bytes + bytes > self.most || self.inputs.len() > 2 * self.held + FEW {
-            self.forget_unheld();
+            self.drop_released();
         }
         while self.bytes + bytes > self.most {
             let Some(oldest) = self.inputs.pop_front() else {
@@ -77,7 +77,7 @@ impl KeptInputs {
                 *oldest.message.lock() = None;
                 tracing::debug!(
                     bytes = oldest.bytes,
-                    "an input that waited for its answer has given way to newer ones"
+                    "dropped an input without an answer in favour of newer ones"
                 );
             }
         }
@@ -86,7 +86,7 @@ impl KeptInputs {
         input
     }
 
-    fn forget_unheld(&mut self) {
+    fn drop_released(&mut self) {
         self.inputs.retain(|input| input.strong_count() > 0);
         let held = self.inputs.iter().filter_map(Weak::upgrade);
         self.bytes = held.map(|input| input.bytes).sum();
@@ -101,10 +101,10 @@ mod tests {
 
     use super::*;
 
-    fn message(size: usize) -> Message {
-        Message {
+    fn message(size: usize) -> SerializedMessage {
+        SerializedMessage {
             bytes: Bytes::from(vec![0; size]),
-            wire_type: Arc::new(WireType::named("sensor_msgs/Image")),
+            wire_type: Arc::new(WireType::with_name("sensor_msgs/Image")),
             publisher: "/camera".into(),
             latching: false,
         }
@@ -112,39 +112,39 @@ mod tests {
 
     #[test]
     fn goals_do_not_give_way_to_pictures() {
-        let mut kept = KeptInputs {
+        let mut kept = RetainedInputs {
             most: 100,
-            ..KeptInputs::default()
+            ..RetainedInputs::default()
         };
         let mut goal = message(30);
-        goal.wire_type = Arc::new(WireType::named("move_base_msgs/MoveBaseActionGoal"));
-        let goal = kept.keep(goal);
-        let pictures: Vec<_> = (0..9).map(|_| kept.keep(message(30))).collect();
+        goal.wire_type = Arc::new(WireType::with_name("move_base_msgs/MoveBaseActionGoal"));
+        let goal = kept.insert(goal);
+        let pictures: Vec<_> = (0..9).map(|_| kept.insert(message(30))).collect();
         assert!(goal.message().is_some() && pictures[0].message().is_none());
     }
 
     #[test]
     fn the_oldest_give_way_and_what_is_answered_takes_nothing() {
-        let mut kept = KeptInputs {
+        let mut kept = RetainedInputs {
             most: 100,
-            ..KeptInputs::default()
+            ..RetainedInputs::default()
         };
-        let there = |inputs: &[Arc<KeptInput>]| {
+        let there = |inputs: &[Arc<RetainedInput>]| {
             let there = inputs.iter().map(|input| input.message().is_some());
             there.collect::<Vec<_>>()
         };
-        let mut inputs: Vec<_> = (0..4).map(|_| kept.keep(message(30))).collect();
+        let mut inputs: Vec<_> = (0..4).map(|_| kept.insert(message(30))).collect();
         assert_eq!(there(&inputs), [false, true, true, true]);
-        // The third one is answered: there is room for another.
+        // The third input is answered, which makes room for another.
         inputs.remove(2);
-        inputs.push(kept.keep(message(30)));
+        inputs.push(kept.insert(message(30)));
         assert_eq!(there(&inputs), [false, true, true, true]);
-        inputs.push(kept.keep(message(1000)));
+        inputs.push(kept.insert(message(1000)));
         assert_eq!(there(&inputs), [false, false, false, false, true]);
-        inputs.push(kept.keep(message(1)));
+        inputs.push(kept.insert(message(1)));
         assert_eq!(there(&inputs[4..]), [false, true]);
         for _ in 0..1000 {
-            kept.keep(message(1));
+            kept.insert(message(1));
         }
         assert!(kept.inputs.len() <= 2 * FEW + 2, "{}", kept.inputs.len());
     }

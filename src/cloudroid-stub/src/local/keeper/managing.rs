@@ -1,9 +1,10 @@
-//! What manages a node is no request of its application: it is not measured, and answered by who speaks for the node.
+//! Services that manage a node are no requests of its application: they are not measured, and answered by the side that
+//! speaks for the node.
 
 use std::sync::atomic::Ordering;
 
 use bytes::Bytes;
-use qos::{Failure, Side};
+use qos::{Failure, Responder};
 use tokio::time::timeout;
 
 use super::Keeper;
@@ -11,51 +12,61 @@ use crate::local::remembered::PATIENCE;
 use crate::local::service_use::ServiceUse;
 
 impl Keeper {
-    /// Asks the cloud where the link is up, else the local original.
-    pub async fn pass(&self, service: &str, request: Bytes) -> Result<Bytes, String> {
-        let passed = self.passed(service, request).await;
+    /// Calls the cloud if the link is up, otherwise the local original.
+    pub async fn forward(&self, service: &str, request: Bytes) -> Result<Bytes, String> {
+        let passed = self.call_active_side(service, request).await;
         passed.map(|(_, answer)| answer)
     }
 
-    async fn passed(&self, service: &str, request: Bytes) -> Result<(Side, Bytes), String> {
+    async fn call_active_side(
+        &self,
+        service: &str,
+        request: Bytes,
+    ) -> Result<(Responder, Bytes), String> {
         let is_up = self.state.lock().governor.sides().cloud;
-        let cloud = match is_up {
-            true => self.ask(Side::Cloud, service, request.clone()).await,
-            false => Err(Failure::Unreachable("the link is down".to_owned())),
+        let cloud = if is_up {
+            self.call_side(Responder::Cloud, service, request.clone())
+                .await
+        } else {
+            Err(Failure::Unreachable("the link is down".to_owned()))
         };
         let reason = match cloud {
-            Ok(answer) => return Ok((Side::Cloud, answer)),
+            Ok(answer) => return Ok((Responder::Cloud, answer)),
             Err(Failure::Refused(reason)) => return Err(reason),
             Err(Failure::Unreachable(reason)) => reason,
         };
-        let local = self.ask(Side::Local, service, request).await;
-        let local = local.map(|answer| (Side::Local, answer));
+        let local = self.call_side(Responder::Local, service, request).await;
+        let local = local.map(|answer| (Responder::Local, answer));
         local.map_err(|failure| format!("cloud: {reason}; local: {}", failure.text()))
     }
 
-    /// Tells the node to be otherwise: whoever answers, and the other side, too, now or when it begins.
+    /// Changes a setting of the node: on the side that answers, and on the other side, now or when it starts.
     pub async fn manage(
         &self,
         service: &str,
         what: &ServiceUse,
         request: Bytes,
     ) -> Result<Bytes, String> {
-        // Who is told anew meanwhile is told this, or told before.
-        let turn = self.remembered.turn(service).await;
-        let (side, answer) = self.passed(service, request.clone()).await?;
-        self.remembered.note(service, what, &request);
+        // Serializes changes by the same service: a replay to a new node sees this one or an earlier one.
+        let turn = self.remembered.acquire_turn(service).await;
+        let (side, answer) = self.call_active_side(service, request.clone()).await?;
+        self.remembered.record(service, what, &request);
         match side {
-            Side::Local => self.cloud_missed.store(true, Ordering::Relaxed),
-            Side::Cloud => {
-                if self.state.lock().context.runs() {
-                    let told = self.ask(Side::Local, service, request);
+            Responder::Local => self.cloud_missed.store(true, Ordering::Relaxed),
+            Responder::Cloud => {
+                if self.state.lock().context.is_running() {
+                    let told = self.call_side(Responder::Local, service, request);
                     let service = service.to_owned();
                     tokio::spawn(async move {
                         let _turn = turn;
                         let told = timeout(PATIENCE, told).await;
                         if let Ok(Err(failure)) = told {
                             let reason = failure.text();
-                            tracing::debug!(service, reason, "the local original was not told");
+                            tracing::debug!(
+                                service,
+                                reason,
+                                "cannot forward the request to the local original"
+                            );
                         }
                     });
                 }
@@ -64,16 +75,17 @@ impl Keeper {
         Ok(answer)
     }
 
-    /// The link is up: the cloud is told what only the local original was, and another servant all.
-    pub(super) fn tell_cloud(&self, resumed: bool) {
+    /// Replays settings to the cloud when the link is up: those that only the local original received, or all to a new
+    /// servant.
+    pub(super) fn replay_to_cloud(&self, resumed: bool) {
         let missed = self.cloud_missed.swap(false, Ordering::Relaxed);
         if resumed && !missed {
             return;
         }
         let (cloud, remembered) = (self.cloud.clone(), self.remembered.clone());
         tokio::spawn(async move {
-            let ask = |service: &str, request| cloud.ask(service, request);
-            remembered.tell(ask).await;
+            let ask = |service: &str, request| cloud.call_unmeasured(service, request);
+            remembered.replay(ask).await;
         });
     }
 }

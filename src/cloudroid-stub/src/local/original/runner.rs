@@ -1,54 +1,61 @@
-//! The process of a local original: started, watched until it is ready, started again after a crash, ended.
+//! Runs the process of a local original: starts it, watches until it is ready, restarts it after a crash, and ends it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use qos::LocalState;
-use ros::bus::{Bus, Graph, reaches};
+use ros::bus::{Bus, Graph, wait_for_connected};
 use tokio::process::Child;
 use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
-use super::{Expected, Interface, News, Order, Publishers, SETTLE, Setting, Sources, call};
+use super::{
+    Expected, ExpectedInterface, OriginalCommand, OriginalEvent, OriginalSetup, Publishers, SETTLE,
+    Sources, call,
+};
 use crate::local::private_system::PrivateSystem;
-use crate::local::process::{self, Program};
-use crate::local::remembered::Remembered;
+use crate::local::process::{self, OriginalProgram};
+use crate::local::remembered::RememberedSettings;
 use crate::seen;
 
-/// Pauses after crashes, at first and at last; and how long a life forgives them.
+/// First and longest pause after crashes, and the run time that resets the pause.
 const BACKOFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(10));
 const FORGIVEN: Duration = Duration::from_secs(30);
 
-/// Who runs the process.
-pub(super) struct Runner {
-    pub(super) setting: Setting,
+/// Runs the process.
+pub(super) struct OriginalRunner {
+    pub(super) setting: OriginalSetup,
     pub(super) system: Arc<PrivateSystem>,
     pub(super) robot: Arc<dyn Bus>,
     pub(super) publishers: Publishers,
     pub(super) sources: Sources,
     pub(super) expected: Expected,
-    pub(super) remembered: Arc<Remembered>,
-    pub(super) news: mpsc::UnboundedSender<News>,
+    pub(super) remembered: Arc<RememberedSettings>,
+    pub(super) news: mpsc::UnboundedSender<OriginalEvent>,
 }
 
-impl Runner {
-    /// Obeys until nobody is left to give orders.
-    pub(super) async fn run(self, mut orders: mpsc::UnboundedReceiver<Order>) {
+impl OriginalRunner {
+    /// Executes commands until the handle is dropped.
+    pub(super) async fn run(self, mut orders: mpsc::UnboundedReceiver<OriginalCommand>) {
         while let Some(order) = orders.recv().await {
-            if matches!(order, Order::Start) {
+            if matches!(order, OriginalCommand::Start) {
                 let Some(program) = &self.setting.program else {
                     self.report(LocalState::Missing);
                     continue;
                 };
-                self.live(program, &mut orders).await;
+                self.run_until_stopped(program, &mut orders).await;
                 self.report(LocalState::Stopped);
             }
         }
     }
 
-    /// From start to stop, through all crashes.
-    async fn live(&self, program: &Program, orders: &mut mpsc::UnboundedReceiver<Order>) {
+    /// Runs the process from start to stop, through all crashes.
+    async fn run_until_stopped(
+        &self,
+        program: &OriginalProgram,
+        orders: &mut mpsc::UnboundedReceiver<OriginalCommand>,
+    ) {
         let mut pause = BACKOFF.0;
         loop {
             let born = Instant::now();
@@ -56,8 +63,8 @@ impl Runner {
             let reason = match self.spawn(program).await {
                 Ok(mut child) => tokio::select! {
                     reason = self.watch(&mut child) => reason,
-                    () = stopped(orders) => {
-                        process::end(&mut child).await;
+                    () = wait_for_stop(orders) => {
+                        process::terminate(&mut child).await;
                         self.system.process_exited(&self.setting.node).await;
                         return;
                     }
@@ -65,46 +72,47 @@ impl Runner {
                 Err(error) => format!("{error:#}"),
             };
             self.system.process_exited(&self.setting.node).await;
-            let _ = self.news.send(News::Crashed(reason));
+            let _ = self.news.send(OriginalEvent::Crashed(reason));
             if born.elapsed() > FORGIVEN {
                 pause = BACKOFF.0;
             }
             tokio::select! {
                 () = sleep(pause) => {}
-                () = stopped(orders) => return,
+                () = wait_for_stop(orders) => return,
             }
             pause = (pause * 2).min(BACKOFF.1);
         }
     }
 
-    async fn spawn(&self, program: &Program) -> anyhow::Result<Child> {
-        // They may have changed since the last start.
+    async fn spawn(&self, program: &OriginalProgram) -> anyhow::Result<Child> {
+        // Parameters may have changed since the last start.
         self.system.copy_parameters(&*self.robot).await?;
         program.spawn(&self.system.environment())
     }
 
-    /// Tells when it is ready; gives the reason when it ends.
+    /// Reports when the process is ready; returns the reason when it ends.
     async fn watch(&self, child: &mut Child) -> String {
         tokio::select! {
-            status = child.wait() => return process::ended(status),
-            () = self.attend() => {}
+            status = child.wait() => return process::describe_exit(status),
+            () = self.report_ready() => {}
         }
-        process::ended(child.wait().await)
+        process::describe_exit(child.wait().await)
     }
 
-    /// Tells that it is ready once it can be given requests and has been told what the node was told before, or had time for either.
-    async fn attend(&self) {
+    /// Reports that the original is ready when it can receive requests and has received the node's settings, or after
+    /// the time allowed for each.
+    async fn report_ready(&self) {
         let node = &self.setting.node;
-        self.system.registered(node).await;
+        self.system.wait_for_node(node).await;
         let expected = self.expected.lock().clone();
-        let _ = timeout(SETTLE, self.system.registers(node, &expected)).await;
-        let connected = timeout(self.setting.patience, self.connects(&expected));
+        let _ = timeout(SETTLE, self.system.wait_for_interface(node, &expected)).await;
+        let connected = timeout(self.setting.patience, self.wait_connected(&expected));
         if connected.await.is_err() {
-            self.warn_of_deaf(&expected);
+            self.warn_of_missing_subscriptions(&expected);
         }
         let bus = self.system.bus();
         let ask = |service: &str, request| call(bus.clone(), service, request);
-        let mut telling = std::pin::pin!(self.remembered.tell(ask));
+        let mut telling = std::pin::pin!(self.remembered.replay(ask));
         let told = timeout(self.setting.patience, &mut telling).await;
         self.report(LocalState::Ready);
         if told.is_err() {
@@ -112,34 +120,34 @@ impl Runner {
         }
     }
 
-    /// Names requests that the node does not listen to although it had time to.
-    fn warn_of_deaf(&self, expected: &Interface) {
+    /// Warns about requests that the node has not subscribed to in time.
+    fn warn_of_missing_subscriptions(&self, expected: &ExpectedInterface) {
         let (node, graph) = (&self.setting.node, self.system.graph());
         let nodes = self.system.nodes_of(&graph, node);
-        let is_deaf = |topic: &&String| !listens(&graph, &nodes, topic);
+        let is_deaf = |topic: &&String| !any_subscribes(&graph, &nodes, topic);
         let deaf: Vec<_> = expected.awaited.iter().filter(is_deaf).collect();
         if !deaf.is_empty() {
             tracing::warn!(
                 node,
-                "the local original has run for {:?} and does not listen to {deaf:?}: it is taken for ready, and what is sent there until it \
-                 listens is lost; see what it waits for in its own output",
+                "the local original has run for {:?} and does not subscribe to {deaf:?} yet: it is treated as ready, \
+                    and messages are lost until it subscribes; see its output for what it waits for",
                 self.setting.patience
             );
         }
     }
 
-    /// Returns once its node listens to its requests, and whatever it has registered by then is connected.
-    async fn connects(&self, expected: &Interface) {
+    /// Returns when the node has subscribed to its requests and all its registrations so far are connected.
+    async fn wait_connected(&self, expected: &ExpectedInterface) {
         let node = &self.setting.node;
         let requests: Vec<_> = {
             let inputs = self.publishers.lock();
             let due = inputs
                 .iter()
-                .filter(|(topic, _)| expected.must_listen_to(topic));
-            due.map(|(_, input)| input.matched()).collect()
+                .filter(|(topic, _)| expected.is_required_input(topic));
+            due.map(|(_, input)| input.matched_subscribers()).collect()
         };
         for end in requests {
-            reaches(end, 1).await;
+            wait_for_connected(end, 1).await;
         }
         let graph = self.system.graph();
         let nodes = self.system.nodes_of(&graph, node);
@@ -147,36 +155,36 @@ impl Runner {
             let inputs = self.publishers.lock();
             let due = inputs
                 .iter()
-                .filter(|(topic, _)| listens(&graph, &nodes, topic));
-            due.map(|(_, input)| input.matched()).collect()
+                .filter(|(topic, _)| any_subscribes(&graph, &nodes, topic));
+            due.map(|(_, input)| input.matched_subscribers()).collect()
         };
         for end in ends {
-            reaches(end, 1).await;
+            wait_for_connected(end, 1).await;
         }
         let sources = self.sources.lock().clone();
         for (topic, source) in sources {
             let mut nodes = nodes.iter();
             if nodes.any(|node| seen::publishes(&graph, node, &topic)) {
-                reaches(source, 1).await;
+                wait_for_connected(source, 1).await;
             }
         }
     }
 
     fn report(&self, state: LocalState) {
-        let _ = self.news.send(News::State(state));
+        let _ = self.news.send(OriginalEvent::State(state));
     }
 }
 
-/// Whether one of these nodes listens to the topic.
-fn listens(graph: &Graph, nodes: &BTreeSet<String>, topic: &str) -> bool {
+/// Returns whether one of these nodes subscribes to the topic.
+fn any_subscribes(graph: &Graph, nodes: &BTreeSet<String>, topic: &str) -> bool {
     let mut nodes = nodes.iter();
     nodes.any(|node| seen::subscribes(graph, node, topic))
 }
 
-/// Waits for the order to stop, or for nobody being left to give it.
-async fn stopped(orders: &mut mpsc::UnboundedReceiver<Order>) {
+/// Waits for the command to stop, or for the handle to be dropped.
+async fn wait_for_stop(orders: &mut mpsc::UnboundedReceiver<OriginalCommand>) {
     while let Some(order) = orders.recv().await {
-        if matches!(order, Order::Stop) {
+        if matches!(order, OriginalCommand::Stop) {
             return;
         }
     }

@@ -1,95 +1,98 @@
-//! One output: who publishes it on the robot, and what newcomers among its subscribers are given.
+//! One output on the robot: its publisher, and the latched messages for new subscribers.
 //!
 //! ```text
-//!  ROS 1: nobody says beforehand what is latched. A second advertisement, which latches, is made when a latched message comes.
-//!  ROS 2: a node's quality of service says it. There is one advertisement, which is transient-local from the start; another one
-//!         takes its place when what it keeps has grown old.
+//!  ROS 1: it is not known in advance whether messages are latched. A second, latching advertisement is made when a
+//!         latched message arrives.
+//!  ROS 2: the quality of service of the node says it. There is one advertisement, which is transient-local from the
+//!         start; another one replaces it when the messages that it keeps are outdated.
 //! ```
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use bytes::Bytes;
-use link::control::Output;
+use link::control::OutputChannel;
 use parking_lot::Mutex;
-use qos::Side;
-use ros::bus::{Bus, BusError, PeerId, Publisher, Qos, WireType};
-use ros::ring::{Bounds, Ring};
+use qos::Responder;
+use ros::bus::{Bus, BusError, PeerId, Publisher, QosProfile, WireType};
+use ros::ring::{Ring, RingBounds};
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
-/// Messages kept for a slow subscriber.
+/// Queue length for a slow subscriber, in messages.
 const QUEUE: usize = 256;
-/// Of a node of ROS 2: what it prints, for those who come late, too. Others keep one message for newcomers: how many does not
-/// travel, and what is latched is mostly a state.
+/// Log topic of a ROS 2 node, which keeps its messages for late subscribers. Other outputs keep one message for them:
+/// the depth is not transmitted, and a latched message is usually a state.
 const LOG: &str = "/rosout";
 
-/// An output that is advertised.
-pub(super) struct Topic {
+/// An advertised output.
+pub(super) struct OutputTopic {
     pub(super) name: String,
-    /// As it was told.
-    told: Output,
+    /// The output as the cloud reported it.
+    told: OutputChannel,
     pub(super) wire_type: Arc<WireType>,
-    /// Who publishes what comes from the cloud.
+    /// Publisher id of messages from the cloud.
     pub(super) cloud: PeerId,
     pub(super) channel: Mutex<u32>,
-    qos: Qos,
+    qos: QosProfile,
     publisher: Mutex<Arc<dyn Publisher>>,
-    latched: Mutex<Latched>,
-    /// Who listens on the robot, other nodes of the servant not counted.
+    latched: Mutex<LatchedOutput>,
+    /// Number of subscribers on the robot, without other nodes of the servant.
     pub(super) listeners: AtomicUsize,
-    /// Another advertisement is to be made.
+    /// Notified when another advertisement must be made.
     pub(super) news: Arc<Notify>,
     pub(super) counting: Mutex<Option<AbortHandle>>,
 }
 
-/// Latched messages for new subscribers: the last one of the side (cloud or original) that answers for the node.
+/// Latched messages for new subscribers: the last one of the side (cloud or local original) that speaks for the node.
 #[derive(Default)]
-struct Latched {
-    /// What each side has latched last. Of the cloud only while somebody listens: else it sends nothing, and what is
-    /// kept would grow old.
+struct LatchedOutput {
+    /// Last latched message of each side. The cloud's is kept only while there are subscribers: without any the cloud
+    /// sends nothing, and the message would become outdated.
     last: [Option<Bytes>; 2],
-    advertised: Advertised,
-    /// A transient-local advertisement keeps something.
+    advertised: LatchedAdvertisement,
+    /// Set if a transient-local advertisement keeps a message.
     kept: bool,
-    /// Messages dropped by advertisements that have ended, and before there was one.
+    /// Number of messages dropped by former advertisements, and before there was one.
     dropped: u64,
 }
 
-/// How latched messages are published.
+/// Advertisement of the latched messages.
 #[derive(Default)]
-enum Advertised {
-    /// As all others are.
+enum LatchedAdvertisement {
+    /// The same as for all other messages.
     #[default]
     Plainly,
-    /// An advertisement for them has been asked for; until it is there, messages wait.
+    /// An advertisement for them has been requested; messages are queued until it is made.
     Asked(Ring<Bytes>),
-    /// By one beside the plain one.
+    /// A second advertisement besides the plain one.
     Beside(Box<dyn Publisher>),
 }
 
-impl Latched {
-    fn become_advertised(&mut self, advertised: Advertised) {
-        if let Advertised::Beside(ended) = std::mem::replace(&mut self.advertised, advertised) {
-            self.dropped += ended.dropped();
+impl LatchedOutput {
+    fn set_advertised(&mut self, advertised: LatchedAdvertisement) {
+        if let LatchedAdvertisement::Beside(ended) =
+            std::mem::replace(&mut self.advertised, advertised)
+        {
+            self.dropped += ended.dropped_count();
         }
     }
 }
 
-impl Topic {
-    /// Advertises an output with what its node offers.
+impl OutputTopic {
+    /// Advertises an output with the quality of service that its node offers.
     pub(super) async fn advertise(
         bus: &dyn Bus,
-        told: &Output,
+        told: &OutputChannel,
         of: WireType,
     ) -> Result<Self, BusError> {
         let qos = match &told.qos {
-            Some(qos) if qos.transient_local && told.topic != LOG => Qos {
+            Some(qos) if qos.transient_local && told.topic != LOG => QosProfile {
                 depth: 1,
-                ..qos.to_qos(1)
+                ..qos.to_bus(1)
             },
-            Some(qos) => qos.to_qos(QUEUE),
-            None => Qos::keep_last(QUEUE),
+            Some(qos) => qos.to_bus(QUEUE),
+            None => QosProfile::keep_last(QUEUE),
         };
         let publisher = bus.advertise(&told.topic, of.clone(), qos).await?;
         Ok(Self {
@@ -107,30 +110,30 @@ impl Topic {
         })
     }
 
-    /// Whether that which is told is what is advertised.
-    pub(super) fn is(&self, told: &Output) -> bool {
+    /// Returns whether the reported output matches the advertised one.
+    pub(super) fn matches_output(&self, told: &OutputChannel) -> bool {
         self.told.md5 == told.md5 && self.told.qos == told.qos
     }
 
-    /// Publishes what is not latched, and tells who listens.
+    /// Returns the publisher of messages that are not latched, which also tracks the subscribers.
     pub(super) fn publisher(&self) -> Arc<dyn Publisher> {
         Arc::clone(&self.publisher.lock())
     }
 
-    /// Messages that whoever listens was too slow for.
-    pub(super) fn dropped(&self) -> u64 {
+    /// Returns the number of messages dropped because subscribers were too slow.
+    pub(super) fn dropped_count(&self) -> u64 {
         let latched = self.latched.lock();
         let beside = match &latched.advertised {
-            Advertised::Beside(publisher) => publisher.dropped(),
+            LatchedAdvertisement::Beside(publisher) => publisher.dropped_count(),
             _ => 0,
         };
-        self.publisher().dropped() + latched.dropped + beside
+        self.publisher().dropped_count() + latched.dropped + beside
     }
 
-    /// A side has published; `heard`: it answers for the node.
-    pub(super) fn take(&self, side: Side, message: Bytes, latching: bool, heard: bool) {
+    /// Handles a message that a side has published; `heard` is set if that side speaks for the node.
+    pub(super) fn on_message(&self, side: Responder, message: Bytes, latching: bool, heard: bool) {
         let mut latched = self.latched.lock();
-        // A line of the log is no state, which would be said again by the next who speaks.
+        // A log line is no state that the next side to speak should repeat.
         let latching = latching && self.name != LOG;
         if latching {
             latched.last[side.index()] = Some(message.clone());
@@ -140,113 +143,118 @@ impl Topic {
         }
     }
 
-    fn publish(&self, latched: &mut Latched, message: Bytes, latching: bool) {
+    fn publish(&self, latched: &mut LatchedOutput, message: Bytes, latching: bool) {
         match &mut latched.advertised {
-            Advertised::Beside(publisher) => publisher.publish(message),
-            Advertised::Asked(waiting) => {
+            LatchedAdvertisement::Beside(publisher) => publisher.publish(message),
+            LatchedAdvertisement::Asked(waiting) => {
                 latched.dropped += waiting.push(message).messages;
             }
-            Advertised::Plainly if latching && !self.qos.is_latching() => {
-                let mut waiting = Ring::new(Bounds::messages(QUEUE));
+            LatchedAdvertisement::Plainly if latching && !self.qos.is_latching() => {
+                let mut waiting = Ring::new(RingBounds::with_messages(QUEUE));
                 latched.dropped += waiting.push(message).messages;
-                self.ask(latched, waiting);
+                self.request_advertisement(latched, waiting);
             }
-            Advertised::Plainly => {
+            LatchedAdvertisement::Plainly => {
                 latched.kept = self.qos.is_latching();
                 self.publisher().publish(message);
             }
         }
     }
 
-    fn ask(&self, latched: &mut Latched, waiting: Ring<Bytes>) {
-        latched.become_advertised(Advertised::Asked(waiting));
+    fn request_advertisement(&self, latched: &mut LatchedOutput, waiting: Ring<Bytes>) {
+        latched.set_advertised(LatchedAdvertisement::Asked(waiting));
         self.news.notify_one();
     }
 
-    /// Newcomers are given nothing of what was published until now.
-    fn forget(&self, latched: &mut Latched) {
+    /// Discards the messages that new subscribers would receive.
+    fn discard_latched(&self, latched: &mut LatchedOutput) {
         if !self.qos.is_latching() {
-            latched.become_advertised(Advertised::Plainly);
+            latched.set_advertised(LatchedAdvertisement::Plainly);
         } else if std::mem::take(&mut latched.kept) {
-            self.ask(latched, Ring::new(Bounds::messages(QUEUE)));
+            self.request_advertisement(latched, Ring::new(RingBounds::with_messages(QUEUE)));
         }
     }
 
-    /// This side speaks for the node from now on.
-    pub(super) fn speaks(&self, side: Side) {
+    /// Sets the side that speaks for the node from now on.
+    pub(super) fn set_active_side(&self, side: Responder) {
         let mut latched = self.latched.lock();
         match latched.last[side.index()].clone() {
             Some(message) => self.publish(&mut latched, message, true),
-            // The cloud will be asked when somebody listens; until it has latched something, what was heard last stays.
-            None if side == Side::Cloud && self.listeners.load(Ordering::Relaxed) == 0 => {
-                self.forget(&mut latched);
+            // The cloud will be asked when there is a subscriber; until it has latched something, the last message
+            // stays.
+            None if side == Responder::Cloud && self.listeners.load(Ordering::Relaxed) == 0 => {
+                self.discard_latched(&mut latched);
             }
             None => {}
         }
     }
 
-    /// The local original has ended, and what it has latched goes with it.
-    pub(super) fn local_ended(&self) {
-        self.latched.lock().last[Side::Local.index()] = None;
+    /// Handles the end of the local original, whose latched message is discarded.
+    pub(super) fn on_local_ended(&self) {
+        self.latched.lock().last[Responder::Local.index()] = None;
     }
 
-    /// There are no subscribers any more.
-    pub(super) fn is_left(&self, local_speaks: bool) {
+    /// Handles the loss of the last subscriber.
+    pub(super) fn on_no_subscribers(&self, local_speaks: bool) {
         let mut latched = self.latched.lock();
-        latched.last[Side::Cloud.index()] = None;
-        let kept = local_speaks && latched.last[Side::Local.index()].is_some();
+        latched.last[Responder::Cloud.index()] = None;
+        let kept = local_speaks && latched.last[Responder::Local.index()].is_some();
         if !kept {
-            self.forget(&mut latched);
+            self.discard_latched(&mut latched);
         }
     }
 
-    /// Makes the advertisement that was asked for, before the next newcomer. True where it took the place of the plain one.
-    pub(super) async fn keep_latched(&self, bus: &dyn Bus) -> bool {
-        if !matches!(self.latched.lock().advertised, Advertised::Asked(_)) {
+    /// Makes a requested advertisement, before the next subscriber. Returns whether it replaced the plain one.
+    pub(super) async fn advertise_pending(&self, bus: &dyn Bus) -> bool {
+        if !matches!(
+            self.latched.lock().advertised,
+            LatchedAdvertisement::Asked(_)
+        ) {
             return false;
         }
         let wire_type = WireType::clone(&self.wire_type);
         let replaces = self.qos.is_latching();
-        let qos = match replaces {
-            true => self.qos,
-            false => self.qos.latching(true),
+        let qos = if replaces {
+            self.qos
+        } else {
+            self.qos.latching(true)
         };
         let advertised = bus.advertise(&self.name, wire_type, qos).await;
         let advertised = advertised.inspect_err(|error| {
-            tracing::warn!(topic = self.name, %error, "newcomers are not given what is latched");
+            tracing::warn!(topic = self.name, %error, "new subscribers do not get latched messages");
         });
         let mut latched = self.latched.lock();
-        let Advertised::Asked(waiting) = &mut latched.advertised else {
+        let LatchedAdvertisement::Asked(waiting) = &mut latched.advertised else {
             return false;
         };
         let waiting: Vec<Bytes> = waiting.collect();
         latched.kept = replaces && !waiting.is_empty();
-        // Without one they are heard all the same; the next latched message asks again.
+        // Without an advertisement the messages are published all the same; the next latched message requests it again.
         let (publisher, next) = match advertised {
             Ok(fresh) if replaces => {
                 let fresh: Arc<dyn Publisher> = fresh.into();
                 let before = std::mem::replace(&mut *self.publisher.lock(), Arc::clone(&fresh));
-                latched.dropped += before.dropped();
-                (fresh, Advertised::Plainly)
+                latched.dropped += before.dropped_count();
+                (fresh, LatchedAdvertisement::Plainly)
             }
             Ok(beside) => {
                 for message in waiting {
                     beside.publish(message);
                 }
-                latched.become_advertised(Advertised::Beside(beside));
+                latched.set_advertised(LatchedAdvertisement::Beside(beside));
                 return false;
             }
-            Err(_) => (self.publisher(), Advertised::Plainly),
+            Err(_) => (self.publisher(), LatchedAdvertisement::Plainly),
         };
         for message in waiting {
             publisher.publish(message);
         }
-        latched.become_advertised(next);
+        latched.set_advertised(next);
         replaces
     }
 }
 
-impl Drop for Topic {
+impl Drop for OutputTopic {
     fn drop(&mut self) {
         if let Some(counting) = self.counting.lock().take() {
             counting.abort();

@@ -1,50 +1,53 @@
-//! What only nodes of ROS 2 have: a quality of service of each end, and actions that are made of calls.
+//! Tests of features that only ROS 2 nodes have: quality of service of each endpoint, and actions that consist of
+//! service calls.
 
-use ros::bus::{ActionHandler, GoalEnd, GoalEvents, Outcome, Reliability};
+use ros::bus::{ActionHandler, GoalEnd, GoalEvents, GoalOutcome, QosReliability};
 use tokio::sync::mpsc;
 
 use super::*;
-use crate::local::Setting;
+use crate::local::OriginalSetup;
 
 #[tokio::test]
 async fn ends_have_the_quality_of_service_of_the_node() {
     let scene = Scene::new(RosVersion::Two, "/node").await;
-    let weak = Qos {
-        reliability: Reliability::BestEffort,
-        ..Qos::keep_last(5)
+    let weak = QosProfile {
+        reliability: QosReliability::BestEffort,
+        ..QosProfile::keep_last(5)
     };
     let string = || string_type(RosVersion::Two);
     let scan = scene.real.advertise("/scan", string(), weak).await.unwrap();
     let _command = scene.real.subscribe("/command", string(), weak).await;
-    let state = Qos::keep_last(1).latching(true);
+    let state = QosProfile::keep_last(1).latching(true);
     let map = scene.real.advertise("/map", string(), state).await.unwrap();
-    let _link = scene.links().await;
+    let _link = scene.connect().await;
     let app = scene.robot.node("/app").await;
-    until(&app, "all ends", |graph| {
+    wait_for_graph(&app, "all ends", |graph| {
         let node = graph.ends.get("/node");
         node.is_some_and(|node| node.publishers.len() == 2 && node.subscribers.len() == 1)
     })
     .await;
     let node = app.graph().borrow().ends["/node"].clone();
-    let is_weak = |qos: &Qos| qos.reliability == Reliability::BestEffort && !qos.is_latching();
+    let is_weak =
+        |qos: &QosProfile| qos.reliability == QosReliability::BestEffort && !qos.is_latching();
     assert!(is_weak(&node.publishers["/scan"].1), "{node:?}");
     assert!(is_weak(&node.subscribers["/command"].1), "{node:?}");
     let of_map = node.publishers["/map"].1;
-    assert!(of_map.is_latching() && of_map.reliability == Reliability::Reliable);
-    // What was said before somebody listened comes all the same, and nothing that was said when nobody did.
+    assert!(of_map.is_latching() && of_map.reliability == QosReliability::Reliable);
+    // A message published before there was a subscriber is received; the one published while there was none is
+    // replaced.
     map.publish(scene.bytes("one"));
-    let mut heard = hears(&app, "/map").await;
-    assert_eq!(next(&mut heard).await, "one");
+    let mut heard = subscribe(&app, "/map").await;
+    assert_eq!(next_text(&mut heard).await, "one");
     drop(heard);
-    let mut listeners = map.matched();
+    let mut listeners = map.matched_subscribers();
     let left = listeners.wait_for(|now| now.peers.is_empty());
     timeout(SOON, left).await.unwrap().unwrap();
     map.publish(scene.bytes("two"));
     let latecomer = scene.robot.node("/late").await;
-    let mut late = hears(&latecomer, "/map").await;
-    assert_eq!(next(&mut late).await, "two");
+    let mut late = subscribe(&latecomer, "/map").await;
+    assert_eq!(next_text(&mut late).await, "two");
     drop(scan);
-    until(&app, "no scan", |graph| {
+    wait_for_graph(&app, "no scan", |graph| {
         !graph.ends["/node"].publishers.contains_key("/scan")
     })
     .await;
@@ -54,10 +57,10 @@ async fn ends_have_the_quality_of_service_of_the_node() {
 async fn the_cloud_is_told_with_whom_no_messages_pass() {
     let scene = Scene::new(RosVersion::Two, "/node").await;
     let string = || string_type(RosVersion::Two);
-    let qos = Qos::keep_last(5);
+    let qos = QosProfile::keep_last(5);
     let _state = scene.real.advertise("/state", string(), qos).await;
     let _command = scene.real.subscribe("/command", string(), qos).await;
-    let _link = scene.links().await;
+    let _link = scene.connect().await;
     let app = scene.robot.node("/app").await;
     let other = || WireType {
         name: "std_msgs/msg/Int32".to_owned(),
@@ -89,30 +92,30 @@ async fn the_cloud_is_told_with_whom_no_messages_pass() {
     told(&[]).await;
 }
 
-/// Passes goals on, to be ended.
-struct Goals(mpsc::UnboundedSender<(String, Bytes)>);
+/// Forwards goals to the test, which ends them.
+struct ForwardedGoals(mpsc::UnboundedSender<(String, Bytes)>);
 
-impl ActionHandler for Goals {
-    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+impl ActionHandler for ForwardedGoals {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
         let sent = self.0.send((id.to_owned(), goal));
         sent.map_err(|error| error.to_string())
     }
-    fn cancel(&self, id: &str) {
+    fn on_cancel(&self, id: &str) {
         let _ = self.0.send((id.to_owned(), Bytes::new()));
     }
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         panic!("{reason}");
     }
 }
 
-/// What comes of one goal, in words.
-struct Told(mpsc::UnboundedSender<String>);
+/// Records the feedback and the outcome of one goal as text.
+struct OutcomeLog(mpsc::UnboundedSender<String>);
 
-impl GoalEvents for Told {
-    fn feedback(&self, feedback: Bytes) {
+impl GoalEvents for OutcomeLog {
+    fn on_feedback(&self, feedback: Bytes) {
         let _ = self.0.send(format!("at {}", feedback[4]));
     }
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let end = end.unwrap();
         let number = end.result.get(4).copied().unwrap_or_default();
         let _ = self.0.send(format!("{:?} {number}", end.outcome));
@@ -127,7 +130,7 @@ fn number(number: u8) -> Bytes {
 async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
     for promised in [false, true] {
         let scene = Scene::new(RosVersion::Two, "/node").await;
-        let registry = Registry::of(RosVersion::Two);
+        let registry = Registry::for_version(RosVersion::Two);
         let text = "int32 number\n---\nint32 number\n---\nint32 number\n";
         registry.insert("tests/action/Count", text).unwrap();
         let of = registry.action("tests/action/Count").unwrap();
@@ -135,48 +138,51 @@ async fn goals_go_to_the_cloud_and_what_comes_of_them_comes_back() {
             let watcher = scene.robot.node("/node_cloudroid").await;
             let diagnostics = Diagnostics::new(&watcher, "/node", "robot").await;
             let sla = serde_json::json!({"t_desire": 50, "t_max": 100, "local": "none"});
-            let setting = Setting {
+            let setting = OriginalSetup {
                 program: None,
                 node: "/node".to_owned(),
                 domain: scene.robot.domain(),
                 patience: SOON,
             };
-            let sla = Sla::parse(sla).unwrap();
-            let promise =
-                scene
-                    .mirror
-                    .promise(sla, setting, Vec::new(), diagnostics.unwrap(), &watcher);
+            let sla = QosSla::parse(sla).unwrap();
+            let promise = scene.mirror.start_promise(
+                sla,
+                setting,
+                Vec::new(),
+                diagnostics.unwrap(),
+                &watcher,
+            );
             promise.await.unwrap();
         }
         let (sender, mut goals) = mpsc::unbounded_channel();
-        let handler = Arc::new(Goals(sender));
+        let handler = Arc::new(ForwardedGoals(sender));
         let server = scene.real.serve_action("/count", &of, handler).unwrap();
-        let _link = scene.links().await;
+        let _link = scene.connect().await;
         let app = scene.robot.node("/app").await;
         let client = app.action_client("/count", &of).unwrap();
-        client.ready(SOON).await.unwrap();
+        client.wait_for_server(SOON).await.unwrap();
         let (told, mut hears) = mpsc::unbounded_channel();
         let mut hears = async || timeout(SOON, hears.recv()).await.unwrap().unwrap();
         let id = "00112233-4455-6677-8899-aabbccddeeff";
-        client.send(id, number(7), Arc::new(Told(told.clone())));
+        client.send_goal(id, number(7), Arc::new(OutcomeLog(told.clone())));
         let (taken, goal) = timeout(SOON, goals.recv()).await.unwrap().unwrap();
         assert_eq!((taken.as_str(), &goal), (id, &number(7)));
-        assert!(server.feedback(id, number(3)));
+        assert!(server.publish_feedback(id, number(3)));
         assert_eq!(hears().await, "at 3");
         let end = |outcome, result| GoalEnd {
             outcome,
             text: String::new(),
             result,
         };
-        assert!(server.end(id, end(Outcome::Succeeded, number(8))));
+        assert!(server.end_goal(id, end(GoalOutcome::Succeeded, number(8))));
         assert_eq!(hears().await, "Succeeded 8");
-        // One that is cancelled.
+        // A canceled goal.
         let id = "10112233-4455-6677-8899-aabbccddeeff";
-        client.send(id, number(7), Arc::new(Told(told)));
+        client.send_goal(id, number(7), Arc::new(OutcomeLog(told)));
         goals.recv().await.unwrap();
-        client.cancel(id);
+        client.cancel_goal(id);
         let (canceled, _) = timeout(SOON, goals.recv()).await.unwrap().unwrap();
-        assert!(server.end(&canceled, end(Outcome::Canceled, number(1))));
+        assert!(server.end_goal(&canceled, end(GoalOutcome::Canceled, number(1))));
         assert_eq!(hears().await, "Canceled 1");
         if let Some(keeper) = scene.mirror.keeper() {
             let counts = keeper.report().counts;

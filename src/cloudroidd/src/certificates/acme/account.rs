@@ -1,4 +1,4 @@
-//! The daemon's account with the authority (RFC 8555, section 7.3): made at the first time, its key kept in the home.
+//! The daemon's account with the authority (RFC 8555, section 7.3): created at first use, its key kept in the home.
 
 use std::future::Future;
 use std::path::Path;
@@ -16,16 +16,16 @@ use store::private;
 
 use crate::config;
 
-/// Its file.
+/// File of the account.
 const FILE: &str = "acme-account.json";
-/// Where no authority is known by whom the server could be.
-const ADVICE: &str = "no authorities are known by whom it could be: install ca-certificates, or name a PEM file of theirs as authorities \
-                      in [tls.acme]";
+/// Advice when no authorities are known by which the server's certificate could be checked.
+const ADVICE: &str = "no certificate authorities are installed to verify it: install ca-certificates, or set \
+    authorities in [tls.acme] to a PEM file";
 
-/// Asks the authority's server.
-struct Client(outbound::Client);
+/// HTTP client for requests to the authority's server.
+struct AcmeClient(outbound::OutboundClient);
 
-impl HttpClient for Client {
+impl HttpClient for AcmeClient {
     fn request(
         &self,
         request: Request<BodyWrapper<Bytes>>,
@@ -42,18 +42,18 @@ impl HttpClient for Client {
     }
 }
 
-/// As it is in the file.
+/// The account as written to its file.
 #[derive(Serialize, Deserialize)]
-struct Kept {
-    /// Of which authority.
+struct StoredAccount {
+    /// Directory URL of the authority.
     directory: String,
     credentials: AccountCredentials,
 }
 
-/// The account; made where the home has none with this authority.
-pub async fn of_home(acme: &config::Acme, home: &Path) -> anyhow::Result<Account> {
-    let client = outbound::Client::new(acme.authorities.clone(), ADVICE);
-    let builder = Account::builder_with_http(Box::new(Client(client)));
+/// Loads the account, or creates one if the home has none with this authority.
+pub async fn load_or_create(acme: &config::AcmeConfig, home: &Path) -> anyhow::Result<Account> {
+    let client = outbound::OutboundClient::new(acme.authorities.clone(), ADVICE);
+    let builder = Account::builder_with_http(Box::new(AcmeClient(client)));
     let path = home.join(FILE);
     let file = path.clone();
     let kept = privilege::run(async move {
@@ -65,10 +65,10 @@ pub async fn of_home(acme: &config::Acme, home: &Path) -> anyhow::Result<Account
     })
     .await
     .with_context(|| format!("cannot read {}", path.display()))?;
-    let kept = kept.map(|bytes| serde_json::from_slice::<Kept>(&bytes));
+    let kept = kept.map(|bytes| serde_json::from_slice::<StoredAccount>(&bytes));
     let kept = kept.transpose().with_context(|| {
         format!(
-            "{} holds no account; remove it, and another is made",
+            "{} contains no account; remove it, and a new account is created",
             path.display()
         )
     })?;
@@ -84,20 +84,20 @@ pub async fn of_home(acme: &config::Acme, home: &Path) -> anyhow::Result<Account
     let (account, credentials) = builder
         .create(&new, acme.directory.clone(), None)
         .await
-        .map_err(|error| anyhow!("no account is to be had: {error}"))?;
-    let text = serde_json::to_vec(&Kept {
+        .map_err(|error| anyhow!("cannot create an account: {error}"))?;
+    let text = serde_json::to_vec(&StoredAccount {
         directory: acme.directory.clone(),
         credentials,
     })?;
     let file = path.clone();
-    privilege::run(async move { private::replace(&file, &text) })
+    privilege::run(async move { private::write_atomically(&file, &text) })
         .await
-        .with_context(|| format!("cannot keep the account in {}", path.display()))?;
+        .with_context(|| format!("cannot write the account to {}", path.display()))?;
     Ok(account)
 }
 
-/// Whether something failed because the authority knows no such account (RFC 8555, section 6.7).
-pub fn is_unknown(error: &anyhow::Error) -> bool {
+/// Returns whether something failed because the authority does not know the account (RFC 8555, section 6.7).
+pub fn is_unknown_account(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| match cause.downcast_ref() {
         Some(Error::Api(problem)) => {
             problem.r#type.as_deref() == Some("urn:ietf:params:acme:error:accountDoesNotExist")
@@ -106,7 +106,7 @@ pub fn is_unknown(error: &anyhow::Error) -> bool {
     })
 }
 
-/// Forgets the account, so that another is made.
+/// Removes the account's file, so that another account is created.
 pub async fn forget(home: &Path) -> anyhow::Result<()> {
     let path = home.join(FILE);
     let file = path.clone();

@@ -1,4 +1,4 @@
-//! One certificate: ordered, its names proved by answering at port 443 (tls-alpn-01, RFC 8737), fetched.
+//! Orders one certificate: proves its names by answering challenges at port 443 (tls-alpn-01, RFC 8737) and fetches it.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -12,87 +12,87 @@ use portal::{Challenge, Tls};
 use rcgen::{CertificateParams, CustomExtension, DistinguishedName, KeyPair};
 use tokio_rustls::rustls::pki_types::{PrivateKeyDer, PrivatePkcs8KeyDer};
 
-/// How long the authority may take to look, and to sign.
+/// Time allowed for the authority to validate, and again to sign.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// What was signed.
-pub struct Made {
-    /// PEM of the certificate, followed by those that lead to the authority.
+/// A certificate that the authority has issued.
+pub struct IssuedCertificate {
+    /// PEM of the certificate, followed by the rest of its chain.
     pub chain: String,
     /// PEM of its key.
     pub key: String,
 }
 
-/// Has a certificate signed for names that lead to this machine, where the portal answers at `looked_at`.
-pub async fn certificate(
+/// Has a certificate signed for names that resolve to this machine, where the portal answers challenges at `looked_at`.
+pub async fn order_certificate(
     account: &Account,
     names: &[String],
     tls: &Tls,
     looked_at: SocketAddr,
-) -> anyhow::Result<Made> {
+) -> anyhow::Result<IssuedCertificate> {
     let identifiers: Vec<Identifier> = names.iter().cloned().map(Identifier::Dns).collect();
     let mut order = account
         .new_order(&NewOrder::new(&identifiers))
         .await
-        .context("the order is refused")?;
+        .context("the authority refused the order")?;
     let patience = RetryPolicy::new().timeout(PATIENCE);
     if order.state().status == OrderStatus::Pending {
-        prove(&mut order, tls).await?;
+        prove_names(&mut order, tls).await?;
         let status = order.poll_ready(&patience).await;
         if !matches!(status, Ok(OrderStatus::Ready)) {
-            let reasons = reasons(&mut order).await.join("; ");
+            let reasons = failure_reasons(&mut order).await.join("; ");
             let port = looked_at.port();
             let failed = match status {
                 Err(error) => format!("{error}; {reasons}"),
                 Ok(_) => reasons,
             };
             bail!(
-                "the authority could not see that the names lead here: {failed}. Their port 443 has to be led to port {port} of this \
-                 machine, without a proxy that ends TLS"
+                "the authority could not verify the names: {failed}. Forward their port 443 to port {port} of this \
+                    machine, without a proxy that terminates TLS"
             );
         }
     }
-    let key = KeyPair::generate().context("cannot make a key")?;
+    let key = KeyPair::generate().context("cannot create a key")?;
     let mut params = CertificateParams::new(names)?;
     params.distinguished_name = DistinguishedName::new();
     let request = params.serialize_request(&key)?;
     order
         .finalize_csr(request.der())
         .await
-        .context("the authority does not sign")?;
+        .context("the authority refused to sign")?;
     let chain = order
         .poll_certificate(&patience)
         .await
-        .context("the certificate cannot be fetched")?;
-    Ok(Made {
+        .context("cannot fetch the certificate")?;
+    Ok(IssuedCertificate {
         chain,
         key: key.serialize_pem(),
     })
 }
 
-/// Shows what the authority is to see for each name, and says that it may look.
-async fn prove(order: &mut Order, tls: &Tls) -> anyhow::Result<()> {
+/// Presents the challenge of each name and tells the authority that it may validate.
+async fn prove_names(order: &mut Order, tls: &Tls) -> anyhow::Result<()> {
     let mut shown = Vec::new();
     let mut names = order.authorizations();
     while let Some(name) = names.next().await {
-        let mut name = name.context("the order cannot be read")?;
+        let mut name = name.context("cannot fetch the order")?;
         if name.status != AuthorizationStatus::Pending {
             continue;
         }
         let Some(challenge) = name.challenge(ChallengeType::TlsAlpn01) else {
             bail!(
-                "the authority does not look at port 443 (tls-alpn-01), which is the only way of this daemon; use another client of \
-                 ACME with certificate and key of [tls]"
+                "the authority does not offer the challenge tls-alpn-01 (port 443), the only one that this daemon \
+                    supports; use another ACME client with certificate and key of [tls]"
             );
         };
         let of = challenge.identifier().to_string();
         let digest = challenge.key_authorization().digest();
-        shown.push(answer(of, digest.as_ref())?);
+        shown.push(challenge_certificate(of, digest.as_ref())?);
     }
-    tls.answer(shown).map_err(super::said)?;
+    tls.set_challenges(shown).map_err(super::to_anyhow)?;
     let mut names = order.authorizations();
     while let Some(name) = names.next().await {
-        let mut name = name.context("the order cannot be read")?;
+        let mut name = name.context("cannot fetch the order")?;
         if name.status != AuthorizationStatus::Pending {
             continue;
         }
@@ -100,17 +100,17 @@ async fn prove(order: &mut Order, tls: &Tls) -> anyhow::Result<()> {
             challenge
                 .set_ready()
                 .await
-                .context("the authority cannot be told to look")?;
+                .context("cannot start the authority's challenge")?;
         }
     }
     Ok(())
 }
 
-/// The certificate that proves a name (RFC 8737, section 3).
-fn answer(name: String, digest: &[u8]) -> anyhow::Result<Challenge> {
+/// Returns the certificate that answers the challenge for a name (RFC 8737, section 3).
+fn challenge_certificate(name: String, digest: &[u8]) -> anyhow::Result<Challenge> {
     let mut params = CertificateParams::new([name.clone()])?;
     params.custom_extensions = vec![CustomExtension::new_acme_identifier(digest)];
-    let key = KeyPair::generate().context("cannot make a key")?;
+    let key = KeyPair::generate().context("cannot create a key")?;
     let certificate = params.self_signed(&key)?;
     Ok(Challenge {
         name,
@@ -119,8 +119,8 @@ fn answer(name: String, digest: &[u8]) -> anyhow::Result<Challenge> {
     })
 }
 
-/// What the authority has seen instead.
-async fn reasons(order: &mut Order) -> Vec<String> {
+/// Returns the authority's errors about each name.
+async fn failure_reasons(order: &mut Order) -> Vec<String> {
     let mut reasons = Vec::new();
     let mut names = order.authorizations();
     while let Some(Ok(mut name)) = names.next().await {

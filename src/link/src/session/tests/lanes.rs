@@ -1,7 +1,7 @@
-//! What one end gives its lanes, taken from them frame by frame and given to the other end.
+//! Lanes of a session: frames of one end passed to the other one by one.
 
 use super::*;
-use crate::control::{Graph, Input, Wanted};
+use crate::control::{Graph, InputChannel, RequestedInput};
 use crate::frame::Frame;
 use crate::session::Session;
 
@@ -9,7 +9,7 @@ fn options() -> SessionOptions {
     SessionOptions::for_silence(Duration::from_secs(1), None)
 }
 
-/// A robot's and a cloud's end, as after hello and welcome.
+/// A robot's and a cloud's end after hello and welcome.
 fn ends() -> (RobotSession, CloudSession) {
     let (robot, cloud) = (RobotSession::new(options()), CloudSession::new(options()));
     robot.reconnect(0, &[], 1);
@@ -17,36 +17,36 @@ fn ends() -> (RobotSession, CloudSession) {
     (robot, cloud)
 }
 
-/// The next frame of one end.
-fn frame<O: Order>(from: &Session<O>) -> Option<Frame> {
+/// Returns the next frame of one end.
+fn frame<O: ControlMessage>(from: &Session<O>) -> Option<Frame> {
     from.state.lock().out.next(0)
 }
 
-/// Takes a frame in, as the other end does; the record that it completes.
-fn deliver<O: Order>(to: &Session<O>, frame: Frame) -> Result<Option<Record>, Error> {
+/// Receives a frame as the other end does; returns the record that it completes.
+fn deliver<O: ControlMessage>(to: &Session<O>, frame: Frame) -> Result<Option<Record>, Error> {
     let incoming = &mut to.state.lock().incoming;
     let bytes = match frame {
-        Frame::Whole { number, record } => incoming.whole(number, record)?,
+        Frame::Whole { number, record } => incoming.receive_whole(number, record)?,
         Frame::Begin {
             stream,
             number,
             total,
             bytes,
-        } => incoming.begin(stream, number, total, &bytes)?,
-        Frame::More { stream, bytes } => incoming.more(stream, &bytes)?,
+        } => incoming.receive_begin(stream, number, total, &bytes)?,
+        Frame::More { stream, bytes } => incoming.receive_more(stream, &bytes)?,
         other => panic!("{other:?}"),
     };
     bytes.map(Record::decode).transpose()
 }
 
-/// All that waits at one end, as it comes to the other.
-fn carry<A: Order, B: Order>(from: &Session<A>, to: &Session<B>) -> Vec<Record> {
+/// Passes everything queued at one end to the other.
+fn carry<A: ControlMessage, B: ControlMessage>(from: &Session<A>, to: &Session<B>) -> Vec<Record> {
     let frames = std::iter::from_fn(|| frame(from));
     let came = frames.filter_map(|frame| deliver(to, frame).expect("the other end takes it"));
     came.collect()
 }
 
-/// The lines among records.
+/// Returns the lines among records.
 fn lines(came: &[Record]) -> Vec<String> {
     let orders = came.iter().filter_map(|record| match record {
         Record::Control(json) => serde_json::from_slice(json).ok(),
@@ -66,11 +66,11 @@ fn line(text: impl ToString) -> FromCloud {
     }
 }
 
-/// A graph of so many inputs, each some 60 bytes of text.
+/// A graph with this many inputs of about 60 bytes of text each.
 fn graph(inputs: usize) -> FromCloud {
-    let inputs = (0..inputs).map(|number| Wanted {
+    let inputs = (0..inputs).map(|number| RequestedInput {
         topic: format!("/input_{number}"),
-        ..Wanted::default()
+        ..RequestedInput::default()
     });
     FromCloud::Graph(Graph {
         inputs: inputs.collect(),
@@ -82,9 +82,9 @@ fn graph(inputs: usize) -> FromCloud {
 fn a_message_does_not_wait_for_a_thousand_lines() {
     let (robot, cloud) = ends();
     for number in 0..1000 {
-        cloud.report(&line(number));
+        cloud.send_control(&line(number));
     }
-    cloud.publish(data(1, 10), Quality::Newest);
+    cloud.publish(data(1, 10), DeliveryMode::Newest);
     let came = carry(&cloud, &robot);
     let at = came
         .iter()
@@ -97,11 +97,11 @@ fn a_message_does_not_wait_for_a_thousand_lines() {
 fn lines_take_a_small_share_while_messages_wait() {
     let (robot, cloud) = ends();
     for number in 0..1000 {
-        cloud.report(&line(format!("{number} {}", "x".repeat(80))));
+        cloud.send_control(&line(format!("{number} {}", "x".repeat(80))));
     }
     let (mut of_lines, mut of_messages) = (0, 0);
     for _ in 0..1000 {
-        cloud.publish(data(1, 100), Quality::Newest);
+        cloud.publish(data(1, 100), DeliveryMode::Newest);
         match deliver(&robot, frame(&cloud).unwrap()).unwrap().unwrap() {
             Record::Data(_) => of_messages += 1,
             _ => of_lines += 1,
@@ -118,9 +118,9 @@ fn lines_take_a_small_share_while_messages_wait() {
 fn lines_for_a_link_that_is_away_do_not_end_the_session_and_those_left_out_are_told() {
     let (robot, cloud) = ends();
     for number in 0..100_000 {
-        cloud.report(&line(number));
+        cloud.send_control(&line(number));
     }
-    assert_eq!(cloud.state.lock().out.is_full(), None);
+    assert_eq!(cloud.state.lock().out.overflow_reason(), None);
     let came = lines(&carry(&cloud, &robot));
     assert_eq!(
         came.last().map(String::as_str),
@@ -130,8 +130,8 @@ fn lines_for_a_link_that_is_away_do_not_end_the_session_and_those_left_out_are_t
     let kept = came.len() - 1;
     let told = format!("{} lines", 100_000 - kept);
     assert!(came[0].contains(&told), "{}: {}", came[0], told);
-    // Told once; what is printed next comes as it is.
-    cloud.report(&line("more"));
+    // Reported once; later lines are delivered normally.
+    cloud.send_control(&line("more"));
     assert_eq!(lines(&carry(&cloud, &robot)), ["more"]);
 }
 
@@ -140,7 +140,7 @@ fn control_comes_in_order_however_long_it_is() {
     let (robot, cloud) = ends();
     let told = [graph(1000), graph(2), graph(700), graph(0)];
     for graph in &told {
-        cloud.report(graph);
+        cloud.send_control(graph);
     }
     let came = carry(&cloud, &robot);
     let came: Vec<FromCloud> = came
@@ -157,17 +157,17 @@ fn control_comes_in_order_however_long_it_is() {
 fn a_message_comes_after_the_opening_of_its_channel() {
     let (robot, cloud) = ends();
     let open = |channel, definition: usize| {
-        robot.report(&FromRobot::Open(Input {
+        robot.send_control(&FromRobot::Open(InputChannel {
             channel,
             definition: "x".repeat(definition),
-            ..Input::default()
+            ..InputChannel::default()
         }));
-        robot.opens(channel, "/t", codec::Schema::of("a/B", "0"));
+        robot.open_channel(channel, "/t", codec::Schema::for_type("a/B", "0"));
     };
     open(1, 100_000);
-    robot.publish(data(1, 10), Quality::Newest);
+    robot.publish(data(1, 10), DeliveryMode::Newest);
     open(2, 10);
-    robot.publish(data(2, 10), Quality::Newest);
+    robot.publish(data(2, 10), DeliveryMode::Newest);
     let mut opened = Vec::new();
     for record in carry(&robot, &cloud) {
         match record {
@@ -185,14 +185,14 @@ fn a_message_comes_after_the_opening_of_its_channel() {
 #[test]
 fn a_long_opening_holds_up_no_other_channel() {
     let (robot, _) = ends();
-    robot.report(&FromRobot::Open(Input {
+    robot.send_control(&FromRobot::Open(InputChannel {
         channel: 1,
         definition: "x".repeat(500_000),
-        ..Input::default()
+        ..InputChannel::default()
     }));
-    robot.opens(1, "/t", codec::Schema::of("a/B", "0"));
+    robot.open_channel(1, "/t", codec::Schema::for_type("a/B", "0"));
     assert!(matches!(frame(&robot), Some(Frame::Begin { .. })));
-    robot.publish(data(2, 10), Quality::Newest);
+    robot.publish(data(2, 10), DeliveryMode::Newest);
     assert!(matches!(frame(&robot), Some(Frame::Whole { .. })));
 }
 
@@ -224,8 +224,8 @@ fn as_many_long_records_as_there_are_come() {
     for number in 0..300 {
         robot.call(1, vec![0; 40_000].into());
         robot.answer(number, 0, Ok(vec![0; 40_000].into()));
-        robot.report(&FromRobot::Parameters(vec![("x".repeat(40_000), None)]));
-        robot.publish(data(1000 + number, 40_000), Quality::Newest);
+        robot.send_control(&FromRobot::Parameters(vec![("x".repeat(40_000), None)]));
+        robot.publish(data(1000 + number, 40_000), DeliveryMode::Newest);
     }
     assert_eq!(carry(&robot, &cloud).len(), 1200);
 }
@@ -234,9 +234,9 @@ fn as_many_long_records_as_there_are_come() {
 fn records_under_way_are_as_long_together_as_the_other_end_takes() {
     let (robot, cloud) = ends();
     for channel in 0..5 {
-        robot.publish(data(channel, 100 << 20), Quality::Newest);
+        robot.publish(data(channel, 100 << 20), DeliveryMode::Newest);
     }
-    // Each has begun before the first one is through.
+    // Each has begun before the first one is complete.
     assert_eq!(carry(&robot, &cloud).len(), 5);
 }
 
@@ -246,11 +246,11 @@ fn a_long_map_comes_beside_ever_so_many_small_messages() {
     robot.state.lock().out.set_throughput(125_000.0);
     let mut map = data(1, 20 << 20);
     map.latching = true;
-    robot.publish(map, Quality::Each);
+    robot.publish(map, DeliveryMode::Each);
     let mut came = 0;
-    // 20 MB in the least pieces, after sixteen small messages each: 80,000 of them.
+    // 20 MB in pieces of the minimum size, after sixteen small messages each: 80,000 of them.
     for round in 0..200_000 {
-        robot.publish(data(2, 10), Quality::Newest);
+        robot.publish(data(2, 10), DeliveryMode::Newest);
         if round % 1000 == 0 {
             robot.call(1, Bytes::new());
         }

@@ -1,18 +1,17 @@
 #!/bin/sh
-# Installs the stub of @PACKAGE@ on this robot, as an overlay in front of its other ROS packages, or takes it away.
+# Installs the stub of @PACKAGE@ on this robot, as an overlay in front of its other ROS packages, or removes it.
 #
 #   sh install.sh [--prefix DIR] [--pair LINE] [--key KEY] [--server URL] [--ca FILE] [--fingerprint SHA256:HEX] [--token TOKEN]
 #                 [--robot NAME] [--force]
 #   sh install.sh --uninstall [--prefix DIR]
 #
-# --pair: what cloudroidctl pair ROBOT printed on the server, between single quotes: this robot makes a key of its own and gets a
-# certificate. It names the server, its key and the robot, too.
-# --key: the server's key ("ssh-ed25519 AAAA...", or a file that holds it), which this archive has to be signed by; later ones
-# too. Without it the key that signed the stub of this package before, else one that is known in the overlay, or, where none is, the
-# one that the archive brings.
-# --ca: for a server of wss://, the certificate of the authority to trust, where the system does not.
-# --fingerprint: for a server of wss://, its certificate, where no authority has signed it.
-# Without --prefix: /opt/cloudroid for root, ~/.cloudroid for anybody else. Several stubs share one overlay.
+# --pair: the line that cloudroidctl pair ROBOT prints on the server, in single quotes. This robot then creates its own key and gets
+# a certificate. The line also contains the server's address and key, and the robot's name.
+# --key: the server's key ("ssh-ed25519 AAAA...", or a file that contains it), which must have signed this archive and later ones.
+# Default: the key that signed this package's previous stub, else a key that is known in the overlay, else the key in the archive.
+# --ca: for a wss:// server, PEM file of the authority to trust, if the system does not trust it.
+# --fingerprint: for a wss:// server, the fingerprint of its certificate, if no authority has signed it.
+# --prefix: default /opt/cloudroid for root, ~/.cloudroid for other users. Several stubs share one overlay.
 set -eu
 
 package='@PACKAGE@'
@@ -53,7 +52,7 @@ while [ $# -gt 0 ]; do
       shift
       ;;
     -h | --help) usage; exit 0 ;;
-    *) usage >&2; complain "there is no option $1" ;;
+    *) usage >&2; complain "unknown option $1" ;;
   esac
   shift
 done
@@ -61,7 +60,7 @@ if [ -z "$prefix" ]; then
   if [ "$(id -u)" = 0 ]; then prefix=/opt/cloudroid; else prefix=$HOME/.cloudroid; fi
 fi
 case $prefix in /*) ;; *) prefix=$(pwd)/$prefix ;; esac
-case $prefix in *[:\'\"\\]*) complain "$prefix: a directory on a search path cannot have colons or quotes in its name" ;; esac
+case $prefix in *[:\'\"\\]*) complain "$prefix: the prefix must not contain colons, quotes or backslashes" ;; esac
 share=$prefix/share/$package
 lib=$prefix/lib/$package
 
@@ -108,17 +107,17 @@ if $uninstall; then
     rmdir "$prefix" 2> /dev/null || true
   fi
   refresh
-  echo "The stub of $package is gone from $prefix; shells that sourced it find the original again."
+  echo "Removed the stub of $package from $prefix; shells that sourced it find the original again."
   exit 0
 fi
 
 [ -d "$here/share/$package" ] || complain "this copy can only --uninstall; install from the unpacked archive"
 if [ -e "$share" ] && [ ! -e "$share/revision.toml" ]; then
-  complain "$share is there and is no stub: choose another --prefix"
+  complain "$share exists and is not a stub: choose another --prefix"
 fi
 # One set-up file puts one ROS's stubs in front.
 case $ros in 1) others=2 mark=$index ;; 2) others=1 mark=$prefix/.catkin ;; esac
-[ ! -e "$mark" ] || complain "$prefix holds stubs of ROS $others, and this one is of ROS $ros: choose another --prefix"
+[ ! -e "$mark" ] || complain "$prefix contains stubs of ROS $others, but this one is of ROS $ros: choose another --prefix"
 # KEY of the line; cloudroid-stub pair looks at all of it.
 of_line() {
   printf '%s\n' "$line" | sed -n "s/^cloudroid:.*[?&]$1=\([A-Za-z0-9_.:-]*\).*/\1/p"
@@ -126,7 +125,7 @@ of_line() {
 if [ -n "$line" ]; then
   case $line in
     cloudroid://*/?*robot=*code=*) ;;
-    *) complain "--pair needs the line that cloudroidctl pair ROBOT prints, which begins with cloudroid://, between single quotes" ;;
+    *) complain "--pair needs the line that cloudroidctl pair ROBOT prints, which begins with cloudroid://, in single quotes" ;;
   esac
   if [ -z "$key" ]; then key=$(of_line key | tr '_-' '/+'); fi
   if [ -z "$server" ]; then server=${line#cloudroid://} server=wss://${server%%/*}; fi
@@ -138,7 +137,7 @@ umask 022
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 for file in MANIFEST MANIFEST.sig server.pub; do
-  [ -f "$here/$file" ] && [ ! -h "$here/$file" ] || complain "this archive is not signed: it has no $file; get the stub from the server again"
+  [ -f "$here/$file" ] && [ ! -h "$here/$file" ] || complain "this archive is not signed: it has no $file; download the stub from the server again"
 done
 signers=$work/signers
 # Who signed the stub of this package that is installed signs the next one, too: the key of another server in the same overlay is good for
@@ -152,7 +151,7 @@ case $key in
     sed -n 's/^\(cloudroid \)\{0,1\}\(ssh-ed25519 AAAA[^ ]*\).*/cloudroid \2/p' "$key"
     ;;
 esac > "$signers"
-[ -s "$signers" ] || complain "$key holds no key (ssh-ed25519 AAAA...)"
+[ -s "$signers" ] || complain "$key contains no key (ssh-ed25519 AAAA...)"
 
 # Verifies the list's signature: by OpenSSH 8.1 or later, else by Python, which every robot with launch files has.
 verify() {
@@ -162,7 +161,7 @@ verify() {
   # Older ones do not know -Y.
   command -v python3 > /dev/null || {
     if command -v ssh-keygen > /dev/null && ! grep -qi 'option' "$work/said"; then return 1; fi
-    complain "nothing here can verify a signature: sudo apt install openssh-client (8.1 or later) or python3"
+    complain "no program to verify the signature: sudo apt install openssh-client (8.1 or later) or python3"
   }
   python3 -I - "$signers" "$here/MANIFEST.sig" "$here/MANIFEST" << 'END'
 # Ed25519 (RFC 8032, section 5.1.7) over SSH's form of signatures (PROTOCOL.sshsig).
@@ -246,9 +245,9 @@ END
 
 if ! verify; then
   if [ "$(sed -n 1p "$here/server.pub")" != "$(sed -n 1p "$signers")" ] && ! grep -qxF "$(sed -n 1p "$here/server.pub")" "$signers"; then
-    complain "this archive is signed by another key than this robot knows ($(cut -d ' ' -f 2- < "$here/server.pub")): if the server was set up anew, ask its operator for the key (cloudroidctl stub) and give it with --key"
+    complain "this archive is signed by another key than the one this robot knows ($(cut -d ' ' -f 2- < "$here/server.pub")): if the server was reinstalled, ask its operator for the key (cloudroidctl stub) and pass it with --key"
   fi
-  complain "the signature is not the server's: the archive was changed on its way; get it again"
+  complain "the signature is not the server's: the archive was changed in transit; download it again"
 fi
 # All files (x: may be executed), links, and what is neither, as the server listed them.
 (
@@ -260,15 +259,15 @@ fi
 ) | LC_ALL=C sort > "$work/found"
 if ! cmp -s "$work/found" "$here/MANIFEST"; then
   LC_ALL=C comm -3 "$work/found" "$here/MANIFEST" | sed 's/^\t*\([^ ]*\) .* \(\.\/.*\)/  \2/; s/^\t*l /  /' | sort -u | head -n 10 >&2
-  complain "these files are not what the server signed: unpack the archive again into an empty directory"
+  complain "these files differ from what the server signed: unpack the archive again into an empty directory"
 fi
 if [ -z "$key" ] && [ ! -s "$prefix/servers.pub" ] && [ ! -s "$known" ]; then
-  echo "install.sh: trusting the key that came with the archive, $(cut -d ' ' -f 2- < "$here/server.pub"); compare it with what cloudroidctl stub prints, or give it with --key" >&2
+  echo "install.sh: trusting the key that came with the archive, $(cut -d ' ' -f 2- < "$here/server.pub"); compare it with the key that cloudroidctl stub prints, or pass it with --key" >&2
 fi
 
 stub=$here/lib/$package/cloudroid-stub
 if ! "$stub" --version > /dev/null 2>&1; then
-  complain "$stub does not run on this machine ($(uname -m)): get the stub for its architecture, ?arch= or cloudroidctl stub --arch"
+  complain "$stub does not run on this machine ($(uname -m)): download the stub for its architecture (?arch= or cloudroidctl stub --arch)"
 fi
 
 if [ -n "$line" ]; then
@@ -308,13 +307,13 @@ if [ -z "$server" ] && [ -e "$share/stub.toml" ]; then
   now=$(key_of server "$offered") before=$(key_of server "$settings")
   case $before,$now in
     ws://*,wss://*)
-      echo "install.sh: the server speaks TLS now: $now in place of $before" >&2
+      echo "install.sh: the server now uses TLS: $now instead of $before" >&2
       server=$now
       ;;
   esac
   now=$(key_of fingerprint "$offered") before=$(key_of fingerprint "$settings")
   if [ -z "$fingerprint" ] && [ -n "$now" ] && [ "$now" != "$before" ]; then
-    echo "install.sh: the server's certificate is $now now${before:+, in place of $before}" >&2
+    echo "install.sh: the server's certificate is now $now${before:+ instead of $before}" >&2
     fingerprint=$now
   fi
 fi
@@ -354,7 +353,7 @@ if [ -n "$ca" ]; then
   export CLOUDROID_CA_FILE
 fi
 if ! "$stub" doctor --share "$trial" --package "$package" --only server; then
-  $force || complain "nothing was installed: fix this, or install all the same with --force"
+  $force || complain "nothing was installed: fix this, or install anyway with --force"
 fi
 
 mkdir -p "$prefix/lib" "$prefix/share"
@@ -401,6 +400,6 @@ Installed in $prefix. Source it after every other setup file, in each shell or a
 
     . $prefix/$setup
 
-To look whether all is well:  @RUN@ $package cloudroid-stub doctor
-To undo this:                 sh $share/install.sh --uninstall
+To check the installation:  @RUN@ $package cloudroid-stub doctor
+To uninstall:               sh $share/install.sh --uninstall
 END

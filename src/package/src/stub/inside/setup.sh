@@ -28,7 +28,7 @@ if [ -e "$_cloudroid_prefix/.catkin" ]; then
   _cloudroid_first CMAKE_PREFIX_PATH "$_cloudroid_prefix" /usr
   _cloudroid_first ROS_PACKAGE_PATH "$_cloudroid_prefix/share" /usr/share
 else
-  echo "setup.sh does not know where it is: run install.sh, or source setup.bash or setup.zsh instead" >&2
+  echo "setup.sh does not know its directory: run install.sh, or source setup.bash or setup.zsh instead" >&2
 fi
 unset -f _cloudroid_first
 unset _cloudroid_here _cloudroid_installed _cloudroid_prefix _cloudroid_left _cloudroid_kept _cloudroid_item

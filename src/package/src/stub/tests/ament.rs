@@ -5,7 +5,7 @@ use std::process::Command;
 
 use super::*;
 
-/// What a package of ament_cmake shares, with the files of its install space.
+/// Share directory of an ament_cmake package, with the files of its install space.
 fn contents() -> Contents {
     let shared = [
         "package.xml",
@@ -33,12 +33,12 @@ fn contents() -> Contents {
     }
 }
 
-fn composed(outsourced: &[&str]) -> Files {
-    composed_for(RosVersion::Two, outsourced, contents())
+fn compose_ament_stub(outsourced: &[&str]) -> Files {
+    compose_stub_for(RosVersion::Two, outsourced, contents())
 }
 
-/// An install space with a package of this name, as a robot has it.
-fn original(place: &Path) -> PathBuf {
+/// Creates an install space with the original package, as on a robot.
+fn write_original(place: &Path) -> PathBuf {
     let prefix = place.join("original");
     for (path, text) in [
         ("share/ament_index/resource_index/packages/p", ""),
@@ -63,7 +63,8 @@ fn original(place: &Path) -> PathBuf {
     prefix
 }
 
-/// The stub in an overlay, and what its installer said; `path`: AMENT_PREFIX_PATH.
+/// Installs the stub in an overlay; returns whether it succeeded, and the installer's output. `path` is
+/// AMENT_PREFIX_PATH.
 fn install(stub: &Path, overlay: &Path, path: &Path) -> (bool, String) {
     let output = Command::new("sh")
         .arg(stub.join("install.sh"))
@@ -79,7 +80,7 @@ fn install(stub: &Path, overlay: &Path, path: &Path) -> (bool, String) {
 
 #[test]
 fn all_that_tools_of_ros_2_look_for_is_there() {
-    let files = composed(&["node", "made_up"]);
+    let files = compose_ament_stub(&["node", "made_up"]);
     for name in [
         "setup.sh",
         "setup.bash",
@@ -99,7 +100,7 @@ fn all_that_tools_of_ros_2_look_for_is_there() {
     ] {
         assert!(files.contains_key(name), "{name}");
     }
-    // What belongs to the image's install space does not come along, nor what catkin wants.
+    // Files of the image's install space are left out, and so are those of catkin.
     for name in [
         ".catkin",
         "share/p/local_setup.bash",
@@ -114,7 +115,7 @@ fn all_that_tools_of_ros_2_look_for_is_there() {
         text(&files["share/ament_index/resource_index/rosidl_interfaces/p"]),
         "msg/T.idl\nmsg/T.msg\nsrv/S.srv\n"
     );
-    // Only lib/PKG is searched for programs, so each outsourced one is there, whatever else is shared.
+    // Executables are searched only in lib/PKG, so each outsourced one is there, whatever else is shared.
     for name in ["node", "made_up"] {
         assert!(
             text(&files[&format!("lib/p/{name}")]).contains(" run "),
@@ -133,7 +134,7 @@ fn all_that_tools_of_ros_2_look_for_is_there() {
 
 #[test]
 fn nothing_of_ros_1_is_said_and_no_placeholder_is_left() {
-    for (path, content) in composed(&["node"]) {
+    for (path, content) in compose_ament_stub(&["node"]) {
         let text = text(&content);
         for word in [
             "rosrun",
@@ -149,10 +150,10 @@ fn nothing_of_ros_1_is_said_and_no_placeholder_is_left() {
     }
 }
 
-/// A container splits each line at `;` and joins the second half to the prefix, where it is no absolute path.
+/// A container splits each line at `;` and joins the second part to the prefix, unless it is an absolute path.
 #[test]
 fn components_name_a_library_that_says_why() {
-    let files = composed(&["node"]);
+    let files = compose_ament_stub(&["node"]);
     let list = text(&files["share/ament_index/resource_index/rclcpp_components/p"]);
     let classes: Vec<&str> = list
         .lines()
@@ -169,13 +170,13 @@ fn components_name_a_library_that_says_why() {
     assert_eq!(classes, ["p::Node", "p::Other"]);
     let mut without = contents();
     without.components.clear();
-    let files = composed_for(RosVersion::Two, &["node"], without);
+    let files = compose_stub_for(RosVersion::Two, &["node"], without);
     assert!(!files.keys().any(|path| path.contains("rclcpp_components")));
 }
 
 #[test]
 fn a_launcher_of_ros_2_gives_all_on() {
-    let stub = unpacked(&composed(&["node"]));
+    let stub = unpack_stub(&compose_ament_stub(&["node"]));
     let arguments = ["--ros-args", "-r", "__node:=x y", "-p", "a:=\"$b\"", "--"];
     let output = run(&stub.path().join("lib/p/node"), &arguments);
     let words = String::from_utf8(output.stdout).expect("text");
@@ -187,14 +188,15 @@ fn a_launcher_of_ros_2_gives_all_on() {
 #[test]
 fn sourcing_puts_the_overlay_in_front_once() {
     let place = tempfile::tempdir().expect("a directory");
-    let stub = unpacked(&composed(&["node"]));
+    let stub = unpack_stub(&compose_ament_stub(&["node"]));
     let overlay = place.path().join("over & lay");
     let (good, said) = install(stub.path(), &overlay, Path::new(""));
     assert!(good, "{said}");
     let overlay = overlay.to_str().expect("text");
     let source = |shell: &str, file: &str, before: &str, path: &str| {
         let script = format!(
-            "set -u; {before} . '{overlay}/{file}'; . '{overlay}/{file}'; echo \"$AMENT_PREFIX_PATH\"; set | grep -c '^_cloudroid'"
+            "set -u; {before} . '{overlay}/{file}'; . '{overlay}/{file}'; echo \"$AMENT_PREFIX_PATH\"; set | grep \
+             -c '^_cloudroid'"
         );
         let output = Command::new(shell)
             .args(["-c", &script, "sh", "caller's own"])
@@ -220,14 +222,14 @@ fn sourcing_puts_the_overlay_in_front_once() {
         let expected = format!("{overlay}:/home/me/install:/opt/ros/jazzy\n0\n");
         assert_eq!(said, expected, "{file}: moved to the front");
     }
-    // Of ROS 2 that is sourced later its own packages would come first.
+    // ROS 2 would put its own packages first if it were sourced later.
     let (said, wrong) = source("sh", "setup.sh", "unset AMENT_PREFIX_PATH;", "");
     assert_eq!(said, format!("{overlay}\n0\n"));
     assert!(
         wrong.contains("ROS 2's own set-up file was not sourced"),
         "{wrong}"
     );
-    // What was unpacked and not installed is found by colcon's variable.
+    // An unpacked but not installed stub is found by colcon's variable.
     let unpacked = stub.path().display();
     let script = format!(
         "COLCON_CURRENT_PREFIX={unpacked}; . {unpacked}/local_setup.sh; echo \"$AMENT_PREFIX_PATH\""
@@ -245,10 +247,10 @@ fn sourcing_puts_the_overlay_in_front_once() {
 fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
     let place = tempfile::tempdir().expect("a directory");
     let key = sign::SigningKey::generate().expect("made").0;
-    let stub = unpacked_of(&composed(&["node"]), &key);
-    let one = unpacked(&super::composed(&["node"]));
+    let stub = unpack_signed_by(&compose_ament_stub(&["node"]), &key);
+    let one = unpack_stub(&super::compose_stub(&["node"]));
     let overlay = place.path().join("overlay");
-    let original = original(place.path());
+    let original = write_original(place.path());
     let (good, said) = install(stub.path(), &overlay, &original);
     assert!(
         good && said.contains("ros2 run p cloudroid-stub doctor"),
@@ -258,11 +260,11 @@ fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
     assert!(
         !good
             && said.contains(
-                "holds stubs of ROS 2, and this one is of ROS 1: choose another --prefix"
+                "contains stubs of ROS 2, but this one is of ROS 1: choose another --prefix"
             ),
         "{said}"
     );
-    // The code of its messages is the original's, of this package and no other.
+    // The code of its messages is the original's, for this package only.
     let link = overlay.join("lib/libp__rosidl_typesupport_cpp.so");
     assert_eq!(
         std::fs::read_link(&link).expect("a link"),
@@ -276,7 +278,7 @@ fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
     // A later archive without components registers none.
     let mut without = contents();
     without.components.clear();
-    let later = unpacked_of(&composed_for(RosVersion::Two, &["node"], without), &key);
+    let later = unpack_signed_by(&compose_stub_for(RosVersion::Two, &["node"], without), &key);
     let components = overlay.join("share/ament_index/resource_index/rclcpp_components/p");
     assert!(components.exists());
     let (good, said) = install(later.path(), &overlay, &original);
@@ -284,13 +286,14 @@ fn an_overlay_is_of_one_ros_and_goes_with_its_last_stub() {
     let uninstall = run(&overlay.join("share/p/install.sh"), &["--uninstall"]);
     assert!(uninstall.status.success(), "{uninstall:?}");
     assert!(!overlay.exists(), "nothing is left");
-    // And the other way round.
+    // And in the other direction.
     assert!(install(one.path(), &overlay, &original).0);
     let (good, said) = install(stub.path(), &overlay, &original);
-    assert!(!good && said.contains("holds stubs of ROS 1"), "{said}");
+    assert!(!good && said.contains("contains stubs of ROS 1"), "{said}");
 }
 
-/// ament_index_python of the wheels, as launch files and `ros2 run` use it: the latter look into `lib/PKG` of the prefix that it gives.
+/// ament_index_python of the wheels, as used by launch files and `ros2 run`; the latter searches `lib/PKG` of the
+/// prefix that it returns.
 #[test]
 fn ros_2_s_own_tools_find_the_stub_before_the_original() {
     let ros = std::env::var("CLOUDROID_ROS2_PREFIX").expect(
@@ -298,8 +301,8 @@ fn ros_2_s_own_tools_find_the_stub_before_the_original() {
     );
     let place = tempfile::tempdir().expect("a directory");
     let place = place.path().canonicalize().expect("there");
-    // Tools want names of two letters at least.
-    let about = About {
+    // Tools require names of at least two letters.
+    let about = StubInfo {
         ros: RosVersion::Two,
         service: "serves",
         package: "people",
@@ -342,7 +345,7 @@ for found in [
 ]:
     print(found)
 "#;
-    // By bash the overlay is found where it is, installed or not.
+    // With bash the overlay is found where it is, installed or not.
     let setup = format!(
         ". '{}'; exec \"$0\" -c \"$1\"",
         overlay.join("setup.bash").display()
@@ -361,7 +364,7 @@ for found in [
         original.display().to_string(),
         overlay.display().to_string(),
         overlay.display().to_string(),
-        // Plugins for other programs of the robot stay the original's.
+        // Plugins for other programs of the robot remain those of the original.
         original.display().to_string(),
     ];
     let said: Vec<&str> = said.lines().collect();

@@ -9,7 +9,7 @@ use servant::Error as E;
 
 use super::super::Error;
 use super::*;
-use crate::principals::{Uncertified, Uncoded};
+use crate::principals::{CertificateRefusal, PairingCodeRefusal};
 
 fn x() -> String {
     "x".to_owned()
@@ -23,8 +23,8 @@ fn not_json() -> serde_json::Error {
     serde_json::from_str::<u8>("").expect_err("nothing")
 }
 
-/// One of each kind.
-fn own() -> Vec<Error> {
+/// One error of each kind.
+fn portal_errors() -> Vec<Error> {
     let (name, exists) = (x(), Vec::new());
     let limit = Size(1);
     vec![
@@ -45,14 +45,14 @@ fn own() -> Vec<Error> {
         Error::BadRequest(x()),
         Error::WebSocketVersion,
         Error::Unauthorised("x"),
-        Unrecognised::Revoked.into(),
-        Unrecognised::Expired.into(),
-        Unrecognised::Unknown.into(),
-        Unrecognised::Slowed(1).into(),
-        Unrecognised::SlowedSignIn(1).into(),
-        Unrecognised::SessionOver.into(),
-        Uncertified::Nameless(x()).into(),
-        Uncoded::Unknown.into(),
+        AuthenticationError::Revoked.into(),
+        AuthenticationError::Expired.into(),
+        AuthenticationError::Unknown.into(),
+        AuthenticationError::Slowed(1).into(),
+        AuthenticationError::SlowedSignIn(1).into(),
+        AuthenticationError::SessionOver.into(),
+        CertificateRefusal::Nameless(x()).into(),
+        PairingCodeRefusal::Unknown.into(),
         Error::Uncertifiable(authority::Error::Kind),
         Error::Uncertifiable(authority::Error::Nameless(x())),
         Error::UnknownPairing {
@@ -115,7 +115,7 @@ fn own() -> Vec<Error> {
     ]
 }
 
-fn of_pushes() -> Vec<Error> {
+fn push_errors() -> Vec<Error> {
     use push::Error as P;
     let pushes = [
         P::NameTaken {
@@ -138,28 +138,28 @@ fn of_pushes() -> Vec<Error> {
     pushes.into_iter().map(Error::from).collect()
 }
 
-fn of_servants() -> Vec<Error> {
+fn servant_errors() -> Vec<Error> {
     let amount = Amount::new(1.0, 1);
     let refused = [
-        Refused::TooBig {
+        AdmissionError::TooBig {
             wanted: amount,
             capacity: amount,
         },
-        Refused::NoMore {
+        AdmissionError::NoMore {
             wanted: amount,
             free: amount,
         },
-        Refused::QueueFull { waiting: 1 },
-        Refused::Deadline {
+        AdmissionError::QueueFull { waiting: 1 },
+        AdmissionError::Deadline {
             waited: Duration::ZERO,
             place: None,
         },
-        Refused::Stalled {
+        AdmissionError::Stalled {
             why: x(),
             waited: Duration::ZERO,
             place: None,
         },
-        Refused::NoMoreNow { why: x() },
+        AdmissionError::NoMoreNow { why: x() },
     ];
     let unchanged = |reason| C::NotResized {
         servant: x(),
@@ -169,14 +169,14 @@ fn of_servants() -> Vec<Error> {
     };
     let kept = refused
         .clone()
-        .map(|refused| unchanged(Unchanged::Full(refused)));
+        .map(|refused| unchanged(ResizeError::Full(refused)));
     let others = [
-        unchanged(Unchanged::Many),
-        unchanged(Unchanged::Used {
+        unchanged(ResizeError::Many),
+        unchanged(ResizeError::Used {
             used: Size(2),
             wanted: Size(1),
         }),
-        C::Terms(Untenable::UnknownClass {
+        C::Terms(TermsError::UnknownClass {
             name: x(),
             exists: Vec::new(),
         }),
@@ -235,7 +235,7 @@ fn of_servants() -> Vec<Error> {
     all.map(Error::from).collect()
 }
 
-fn of_what_is_kept() -> Vec<Error> {
+fn storage_errors() -> Vec<Error> {
     use catalogue::Error as K;
     let path = PathBuf::from("x");
     let state = store::Error::Record {
@@ -282,19 +282,24 @@ fn of_what_is_kept() -> Vec<Error> {
     kept.chain([damaged.into()]).collect()
 }
 
-/// Whether a sentence says what to do, as the others do.
-fn is_a_step(next: &str) -> bool {
+/// Returns true if the sentence is an instruction in the usual form.
+fn is_instruction(next: &str) -> bool {
     let begins_small = next.starts_with(|c: char| c.is_ascii_lowercase());
     begins_small && !next.ends_with('.') && !next.contains('\n') && next.len() < 300
 }
 
 #[test]
 fn every_refusal_says_what_to_do() {
-    let all = [own(), of_pushes(), of_servants(), of_what_is_kept()];
+    let all = [
+        portal_errors(),
+        push_errors(),
+        servant_errors(),
+        storage_errors(),
+    ];
     for error in all.into_iter().flatten() {
         let problem = error.problem();
         let next = problem.next.as_deref().unwrap_or_default();
-        assert!(is_a_step(next), "{error:?}: {next:?}");
+        assert!(is_instruction(next), "{error:?}: {next:?}");
         assert!(!problem.detail.is_empty(), "{error:?}");
     }
 }
@@ -307,7 +312,7 @@ fn want_of_memory_is_mended_where_the_memory_was_named() {
         ready: true,
     };
     let next = Error::from(error).problem().next.unwrap_or_default();
-    for option in ["--robot-memory", "push it with a greater --memory"] {
+    for option in ["--robot-memory", "push it with a larger --memory"] {
         assert!(next.contains(option), "{next}");
     }
 }

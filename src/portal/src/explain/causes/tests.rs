@@ -1,10 +1,10 @@
 use api::explain::Part;
-use link::control::Request;
+use link::control::RequestTiming;
 use reach::links::LinkStatus;
 
 use super::*;
 
-fn served(link: Link) -> Served {
+fn served_with(link: Link) -> Served {
     Served {
         servant: api::Servant {
             id: "s1".into(),
@@ -46,15 +46,15 @@ fn link() -> Link {
         max: Some(300.0),
         requests: 100,
         phases: vec![
-            Part::of("up", vec![20.0; 3]).expect("times"),
-            Part::of("compute", vec![90.0; 3]).expect("times"),
+            Part::from_samples("up", vec![20.0; 3]).expect("times"),
+            Part::from_samples("compute", vec![90.0; 3]).expect("times"),
         ],
         ..Link::default()
     }
 }
 
 fn texts(served: Served) -> Vec<(Weight, String)> {
-    causes(&[served], &[], &[], &[])
+    find_causes(&[served], &[], &[], &[])
         .into_iter()
         .map(|cause| (cause.weight, format!("{}; {}", cause.what, cause.next)))
         .collect()
@@ -62,36 +62,37 @@ fn texts(served: Served) -> Vec<(Weight, String)> {
 
 #[test]
 fn when_all_is_well_nothing_is_said() {
-    assert_eq!(texts(served(link())), []);
+    assert_eq!(texts(served_with(link())), []);
 }
 
 #[test]
 fn late_requests_are_blamed_on_the_part_that_takes_longest() {
-    let late_in = Part::of("compute", vec![90.0]);
+    let late_in = Part::from_samples("compute", vec![90.0]);
     let late = Link { late: 20, ..link() };
-    let unanswered = texts(served(late.clone()));
+    let unanswered = texts(served_with(late.clone()));
     assert!(
         unanswered[0]
             .1
-            .contains("; of these none was answered; see"),
+            .contains("; none of these was answered; see"),
         "{unanswered:?}"
     );
     let upward = Link {
-        late_in: Part::of("up", vec![400.0]),
+        late_in: Part::from_samples("up", vec![400.0]),
         ..late.clone()
     };
-    let network = texts(served(upward));
+    let network = texts(served_with(upward));
     assert!(
         network[0]
             .1
-            .contains("goes into up (400 ms); look at the robot's network"),
+            .contains("is spent in up (400 ms); check the robot's network"),
         "{network:?}"
     );
-    let causes = texts(served(Link { late_in, ..late }));
+    let causes = texts(served_with(Link { late_in, ..late }));
     assert_eq!(causes.len(), 1);
     assert!(
         causes[0].1.starts_with(
-            "20 of the last 100 requests of /detect passed T_max (300 ms); most of the time goes into compute (90 ms)"
+            "20 of the last 100 requests of /detect exceeded T_max (300 ms); most of the time is spent in compute (90 \
+                ms)"
         ),
         "{causes:?}"
     );
@@ -99,19 +100,19 @@ fn late_requests_are_blamed_on_the_part_that_takes_longest() {
 
 #[test]
 fn each_thing_that_can_be_wrong_is_named() {
-    let mut all = served(Link {
+    let mut all = served_with(Link {
         up: false,
         clock: Some(-2000.0),
         unfed: vec!["/image".into()],
         unserved: vec!["/static_map".into()],
-        refused: vec!["no messages of /seen pass between /view and /detect: why".into()],
+        refused: vec!["no messages on /seen pass between /view and /detect: why".into()],
         unsent: 12,
         given: 128,
         left_out: 40,
         phases: vec![
-            Part::of("queue", vec![60.0; 3]).expect("times"),
-            Part::of("compute", vec![30.0; 3]).expect("times"),
-            Part::of("total", vec![100.0; 3]).expect("times"),
+            Part::from_samples("queue", vec![60.0; 3]).expect("times"),
+            Part::from_samples("compute", vec![30.0; 3]).expect("times"),
+            Part::from_samples("total", vec![100.0; 3]).expect("times"),
         ],
         duplicates: vec!["rover2".into()],
         drops: vec!["on the robot 9 messages of /scan were dropped: why".into()],
@@ -134,19 +135,20 @@ fn each_thing_that_can_be_wrong_is_named() {
     let causes = texts(all);
     let words = [
         "the link of /detect is down",
-        "another machine (rover2) is connected as this robot, beside that of /detect; give one",
-        "listens to /image, which nobody on the robot publishes; remap it",
-        "looked for the service /static_map, which nobody served; start",
-        "held back by its CPU limit of 0.5 for 40 % of the time; give people more cores",
+        "another machine (rover2) is connected as this robot, besides the one that runs /detect; give one",
+        "subscribes to /image, which no node on the robot publishes; remap it",
+        "looked for the service /static_map, which no node serves; start",
+        "throttled by its CPU limit of 0.5 for 40 % of the time; give people more cores",
         "s1 hangs: /detect answered none of 9 inputs in 3.0 s; cloudroidctl logs s1",
         "waits for memory 30 %",
         "1 processes of s1 were killed",
         "3 messages of s1 were dropped",
-        "no messages of /seen pass between /view and /detect: why; have the subscriber ask for no more",
+        "no messages on /seen pass between /view and /detect: why; let the subscriber request no more",
         "2000 ms behind the server's",
-        "requests queue before /detect: 60 ms of 100 ms, while it needs 30 ms for one; lower the rate of its inputs, or give it more cores: cloudroidctl set s1 --cpus N",
+        "requests wait 60 ms of 100 ms in the queue of /detect, which needs 30 ms for one; lower the rate of its \
+            inputs, or give it more cores: cloudroidctl set s1 --cpus N",
         "12 inputs of /detect were not sent in the last minute",
-        "/detect has left out 40 of its last 128 inputs",
+        "/detect skipped 40 of its last 128 inputs",
         "on the robot 9 messages of /scan were dropped: why; send less",
         "answered 7 of the last 100 requests of /detect, Q is 2.5",
     ];
@@ -172,7 +174,7 @@ fn a_robot_without_a_servant_is_told_what_happened_last() {
         robot: Some("rover".into()),
         message: "the servant ran out of memory".into(),
     };
-    let causes = causes(&[], &[event], &[], &[]);
+    let causes = find_causes(&[], &[event], &[], &[]);
     assert_eq!(causes[0].weight, Weight::Blocks);
     assert!(causes[0].what.ends_with("the servant ran out of memory"));
 }
@@ -194,7 +196,7 @@ fn what_a_hand_over_has_lost_is_named() {
         event("state-lost", "the cloud goes on without 3 of /scan"),
         event("local-hands-back", "the link is up again"),
     ];
-    let causes = causes(&[], &events, &[], &[]);
+    let causes = find_causes(&[], &events, &[], &[]);
     let lost: Vec<_> = causes
         .iter()
         .filter(|cause| cause.weight == Weight::Hint)
@@ -210,20 +212,20 @@ fn what_a_hand_over_has_lost_is_named() {
 
 #[test]
 fn a_links_requests_are_summed_up() {
-    use link::drops::{Cause, Drop};
-    let request = |total: Option<f64>, local| Request {
+    use link::drops::{Cause, TopicDropCount};
+    let request = |total: Option<f64>, local| RequestTiming {
         total,
         compute: 40.0,
         local,
         satisfaction: 6.0,
-        ..Request::default()
+        ..RequestTiming::default()
     };
-    let dropped = |cause, count| Drop {
+    let dropped = |cause, count| TopicDropCount {
         topic: "/image".into(),
         cause,
         count,
     };
-    let seen = crate::explain::link(LinkStatus {
+    let seen = crate::explain::to_link(LinkStatus {
         node: "/detect".into(),
         up: true,
         round_trip: Some(2.0),
@@ -231,14 +233,14 @@ fn a_links_requests_are_summed_up() {
         throughput: None,
         drops: vec![dropped(Cause::Slow, 2)],
         dropped: vec![dropped(Cause::Replaced, 30)],
-        sla: link::control::Sla {
+        sla: link::control::SlaTargets {
             desire: Some(0.05),
             max: Some(0.1),
             ..Default::default()
         },
         requests: vec![
             request(Some(50.0), false),
-            Request {
+            RequestTiming {
                 up: 90.0,
                 ..request(Some(150.0), true)
             },
@@ -249,7 +251,7 @@ fn a_links_requests_are_summed_up() {
         left_out: 1,
         unfed: vec![],
         unserved: vec![],
-        refused: vec![link::control::Refused {
+        refused: vec![link::control::IncompatibleEndpoint {
             topic: "/seen".into(),
             node: "/view".into(),
             why: "durability".into(),
@@ -262,7 +264,7 @@ fn a_links_requests_are_summed_up() {
     assert!(seen.drops[1].starts_with("on the robot 30 messages of /image were dropped: "));
     assert_eq!(
         seen.refused,
-        ["no messages of /seen pass between /view and /detect: durability"]
+        ["no messages on /seen pass between /view and /detect: durability"]
     );
     assert_eq!((seen.max, seen.satisfaction), (Some(100.0), Some(6.0)));
     let total = seen.phases.last().expect("parts");
@@ -278,13 +280,13 @@ fn a_links_requests_are_summed_up() {
 
 #[test]
 fn what_was_never_promised_is_not_late() {
-    let request = |total: Option<f64>| Request {
+    let request = |total: Option<f64>| RequestTiming {
         total,
         local: total.is_none(),
         satisfaction: 8.0,
-        ..Request::default()
+        ..RequestTiming::default()
     };
-    let seen = crate::explain::link(LinkStatus {
+    let seen = crate::explain::to_link(LinkStatus {
         node: "/detect".into(),
         up: false,
         round_trip: None,
@@ -292,7 +294,7 @@ fn what_was_never_promised_is_not_late() {
         throughput: None,
         drops: vec![],
         dropped: vec![],
-        sla: link::control::Sla {
+        sla: link::control::SlaTargets {
             fallback_after: Some(3.0),
             ..Default::default()
         },
@@ -306,10 +308,10 @@ fn what_was_never_promised_is_not_late() {
         duplicates: vec![],
     });
     assert_eq!((seen.late, seen.local, seen.satisfaction), (0, 1, None));
-    let causes = texts(served(seen));
+    let causes = texts(served_with(seen));
     for words in [
-        "the link of /detect is down; where the original is installed on the robot, it stands in after 3.0 s",
-        "answered 1 of the last 2 requests of /detect; it stands in while the link is away",
+        "the link of /detect is down; if the original is installed on the robot, it takes over after 3.0 s",
+        "answered 1 of the last 2 requests of /detect; it takes over while the link is down",
     ] {
         assert!(
             causes.iter().any(|(_, text)| text.contains(words)),
@@ -327,21 +329,21 @@ fn a_canary_that_waits_is_told_with_what_to_do() {
         stable: 1,
         candidate: 2,
         state: api::rollout::RolloutState::Canary,
-        reason: "the first robot that comes".into(),
-        waits: Some("it was asked 3 times and 20 are needed".into()),
+        reason: "the first robot".into(),
+        waits: Some("it has had 3 requests of the 20 required".into()),
         started: 0,
         changed: 0,
         terms: api::rollout::RolloutTerms::default(),
         of_stable: arm,
         of_candidate: arm,
     };
-    let causes = super::causes(&[served(link())], &[], &[], &[rollout]);
+    let causes = super::find_causes(&[served_with(link())], &[], &[], &[rollout]);
     let found = causes.iter().find(|cause| cause.what.contains("canary"));
     let found = found.expect("it is told");
     assert_eq!(found.weight, Weight::Hint);
     assert_eq!(
         found.what,
-        "revision 2 of people, a canary, is not promoted yet: it was asked 3 times and 20 are needed"
+        "revision 2 of people, a canary, is not promoted yet: it has had 3 requests of the 20 required"
     );
     assert!(
         found.next.contains("rollout people promote"),

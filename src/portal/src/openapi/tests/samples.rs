@@ -1,4 +1,4 @@
-//! One value or more of every type that the document describes.
+//! Samples of every type described by the document, one or more each.
 
 mod machines;
 mod observed;
@@ -25,11 +25,11 @@ use api::{
 };
 use serde_json::Value;
 
-fn some(text: &str) -> Option<String> {
+fn some_text(text: &str) -> Option<String> {
     Some(text.to_owned())
 }
 
-fn all(text: &str) -> Vec<String> {
+fn one_text(text: &str) -> Vec<String> {
     vec![text.to_owned()]
 }
 
@@ -59,9 +59,9 @@ fn event() -> Event {
         time: 1,
         level: Level::Warning,
         kind: "servant-ready".into(),
-        service: some("opencv_apps"),
-        servant: some("opencv_apps-1"),
-        robot: some("r1"),
+        service: some_text("opencv_apps"),
+        servant: some_text("opencv_apps-1"),
+        robot: some_text("r1"),
         message: "it is ready".into(),
     }
 }
@@ -73,7 +73,7 @@ fn servant() -> Servant {
         revision: 1,
         robot: "r1".into(),
         phase: Phase::Ready,
-        reason: some("it was stopped"),
+        reason: some_text("it was stopped"),
         created: 1,
         connections: 1,
         idle_until: Some(2),
@@ -128,7 +128,7 @@ fn rollout() -> Rollout {
         candidate: 2,
         state: RolloutState::RolledBack,
         reason: "it was worse".into(),
-        waits: some("it was asked 3 times"),
+        waits: some_text("it has had 3 requests"),
         started: 1,
         changed: 1,
         terms: rollout_terms(),
@@ -151,14 +151,14 @@ fn back_off() -> BackOff {
 fn terms() -> Terms {
     let stated = Stated {
         sla: Sla {
-            rrt: Span::millis(100),
-            max_rrt: Span::millis(300),
+            rrt: Span::from_millis(100),
+            max_rrt: Span::from_millis(300),
             fps: Some(5.0),
             min_fps: Some(2.0),
-            age: Span::millis(100),
-            max_age: Span::millis(300),
+            age: Span::from_millis(100),
+            max_age: Span::from_millis(300),
         },
-        class: some("default"),
+        class: some_text("default"),
         cpus: Some(1.0),
         memory: Some(Size(1 << 30)),
         aux: [("width".to_owned(), "640".to_owned())].into(),
@@ -166,11 +166,11 @@ fn terms() -> Terms {
     Terms {
         stated: [("/n".to_owned(), stated)].into(),
         measured: [("width".to_owned(), "640".to_owned())].into(),
-        class: some("default"),
+        class: some_text("default"),
         priority: 1,
         rows: vec![row()],
         limits: limits(),
-        why: all("cpus 1 as stated"),
+        why: one_text("cpus 1 as requested"),
     }
 }
 
@@ -205,16 +205,16 @@ fn new_rows() -> NewRows {
     }
 }
 
-fn explained() -> Explained {
+fn explained_sla() -> Explained {
     Explained {
         service: "x".into(),
         stated: Stated::default(),
-        class: some("default"),
+        class: some_text("default"),
         priority: 1,
         limits: Some(limits()),
-        why: all("as stated"),
-        refused: some("there is none"),
-        next: all("better: row 2"),
+        why: one_text("as requested"),
+        refused: some_text("there is none"),
+        next: one_text("better: entry 2"),
         goals: vec![ExplainedGoal {
             measure: Measure::Fps,
             desire: 5.0,
@@ -278,7 +278,7 @@ fn detail() -> ServiceDetail {
         }],
         nodes: vec![Node {
             name: node.clone(),
-            argv: all("x"),
+            argv: one_text("x"),
         }],
         interface: Interface {
             topics: vec![Topic {
@@ -318,10 +318,10 @@ fn detail() -> ServiceDetail {
                     ..api::interface::Descriptor::default()
                 }),
             }],
-            lifecycle: all("/n"),
+            lifecycle: one_text("/n"),
             needs: vec![Need {
                 name: name.clone(),
-                nodes: all("/n"),
+                nodes: one_text("/n"),
             }],
             requests: vec![api::interface::Request {
                 node: "/n".into(),
@@ -354,34 +354,34 @@ fn detail() -> ServiceDetail {
 fn options() -> PushOptions {
     let names = || [("a".to_owned(), "b".to_owned())].into();
     PushOptions {
-        name: some("x"),
-        apt: some("x"),
-        base: some("noetic"),
-        launch: some("x.launch"),
-        nodes: all("x"),
+        name: some_text("x"),
+        apt: some_text("x"),
+        base: some_text("noetic"),
+        launch: some_text("x.launch"),
+        nodes: one_text("x"),
         params: [("k".to_owned(), Value::from(1))].into(),
         args: names(),
         remaps: names(),
-        interface: some(""),
+        interface: some_text(""),
         map: names(),
-        with: all("x"),
+        with: one_text("x"),
         limits: limits(),
         caps: Caps {
             cpus: Some(2.0),
             memory: Some(Size(1 << 30)),
         },
         sla: Sla {
-            rrt: Span::millis(100),
-            max_rrt: Span::millis(300),
+            rrt: Span::from_millis(100),
+            max_rrt: Span::from_millis(300),
             ..Sla::default()
         },
         grants: Grants {
-            devices: all("nvidia.com/gpu=0"),
+            devices: one_text("nvidia.com/gpu=0"),
             volumes: vec![Volume {
                 source: "/a".into(),
                 target: "/b".into(),
             }],
-            egress: all("example.org:80"),
+            egress: one_text("example.org:80"),
         },
         requests: vec!["/a=/b".into()],
         stateful: true,
@@ -398,10 +398,10 @@ fn problem() -> Problem {
         title: "unknown service".into(),
         status: 404,
         detail: "there is none".into(),
-        next: some("push it"),
-        exists: all("x"),
+        next: some_text("push it"),
+        exists: one_text("x"),
         retry_after: Some(1),
-        log: all("x"),
+        log: one_text("x"),
     }
 }
 
@@ -410,7 +410,7 @@ fn explanation() -> Explanation {
         round_trip: Some(1.5),
         clock: Some(0.5),
         throughput: Some(1e6),
-        drops: all("x"),
+        drops: one_text("x"),
         desire: Some(1.5),
         max: Some(1.5),
         threshold: Some(0.5),
@@ -447,8 +447,8 @@ fn status() -> Status {
         pid: 1,
         home: "/h".into(),
         listen: "127.0.0.1:9090".into(),
-        certificate: some("x"),
-        default_service: some("x"),
+        certificate: some_text("x"),
+        default_service: some_text("x"),
         started: 1,
         isolation: Isolation::default(),
         capacity: Capacity::default(),
@@ -459,7 +459,7 @@ fn status() -> Status {
         warm_nodes: 1,
         connections: 1,
         usage: usage(),
-        warnings: all("x"),
+        warnings: one_text("x"),
     }
 }
 
@@ -474,15 +474,15 @@ fn update() -> Update {
             host_memory_available: Some(50.0),
         })),
         services: vec![Arc::new(detail().summary)],
-        services_gone: all("adder"),
+        services_gone: one_text("adder"),
         servants: explanation().servants.into_iter().map(Arc::new).collect(),
-        servants_gone: all("s1"),
+        servants_gone: one_text("s1"),
         back_offs: Some(vec![back_off()]),
         events: vec![Arc::new(event())],
     }
 }
 
-fn tried() -> Trial {
+fn trial() -> Trial {
     Trial {
         service: "x".into(),
         inputs: vec![Fed {
@@ -512,7 +512,7 @@ fn tried() -> Trial {
 fn calibration() -> Calibration {
     Calibration {
         service: "x".into(),
-        inputs: tried().inputs,
+        inputs: trial().inputs,
         pace: Some(1.5),
         network: Some(TimeSpread::default()),
         points: vec![Point {
@@ -541,7 +541,7 @@ fn shadow() -> Shadow {
 fn shadow_options() -> ShadowOptions {
     ShadowOptions {
         revision: 2,
-        robot: some("r1"),
+        robot: some_text("r1"),
         requests: Some(40),
         ignore: vec!["x".into()],
         acting: true,
@@ -552,14 +552,14 @@ fn shadow_options() -> ShadowOptions {
 fn calibration_options() -> CalibrationOptions {
     CalibrationOptions {
         source: Source::Live,
-        robot: some("r1"),
+        robot: some_text("r1"),
         seconds: Some(1.5),
         bytes: Some(Size(1 << 20)),
         cpus: vec![0.5],
         requests: Some(40),
         rate: Some(1.5),
         fast: true,
-        input: some("/x"),
+        input: some_text("/x"),
         network: Some(1.5),
         aux: [("image".to_owned(), "640x480".to_owned())].into(),
         memory: Some(Size(1 << 30)),
@@ -575,7 +575,7 @@ fn token() -> Token {
         name: "r1".into(),
         role: access::Role::Robot,
         services: pattern(),
-        robot: some("r1"),
+        robot: some_text("r1"),
         classes: pattern(),
         created: 1,
         expires: Some(1),
@@ -589,7 +589,7 @@ fn new_token() -> NewToken {
         name: "r1".into(),
         role: access::Role::Robot,
         services: token().services,
-        robot: some("r1"),
+        robot: some_text("r1"),
         classes: token().classes,
         lifetime: Some(1),
     }
@@ -607,7 +607,7 @@ fn sample(name: &'static str, value: impl serde::Serialize) -> (&'static str, Va
     (name, serde_json::to_value(value).expect("plain data"))
 }
 
-/// Values of every type of the document, as serde writes them, with all that is optional and without.
+/// Samples of every type of the document, as serialized by serde, with and without optional fields.
 pub fn samples() -> Vec<(&'static str, Value)> {
     let fits = Fit {
         cpus: 1.5,
@@ -615,11 +615,11 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         free_cpus: 1.5,
         free_memory: Size(1),
         waiting: 1,
-        stalled: some("it swaps"),
-        never: some("x"),
+        stalled: some_text("it swaps"),
+        never: some_text("x"),
         full: false,
         now: false,
-        ends: all("x"),
+        ends: one_text("x"),
         lacking_cpus: 1.5,
         lacking_memory: Size(1),
         costs: vec![Cost {
@@ -714,7 +714,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 name: "r1".into(),
                 roles: vec![access::Role::Robot],
                 services: token().services,
-                robot: some("r1"),
+                robot: some_text("r1"),
             },
         ),
         sample(
@@ -727,9 +727,9 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample(
             "Session",
             Session {
-                name: some("alice"),
+                name: some_text("alice"),
                 role: Some(access::Role::Viewer),
-                csrf: some("x"),
+                csrf: some_text("x"),
                 expires: Some(1),
                 needed: true,
                 accounts: true,
@@ -764,7 +764,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample(
             "AccountChange",
             AccountChange {
-                password: some("x"),
+                password: some_text("x"),
                 role: Some(access::Role::Viewer),
                 services: token().services,
                 disabled: Some(true),
@@ -786,7 +786,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("BackOff", back_off()),
         sample("Clock", Clock { now: 1.5 }),
         sample("Event", event()),
-        sample("Explained", explained()),
+        sample("Explained", explained_sla()),
         sample("Explained", Explained::default()),
         sample("NewRows", new_rows()),
         sample("NewRows", NewRows::default()),
@@ -819,8 +819,8 @@ pub fn samples() -> Vec<(&'static str, Value)> {
                 differences: vec![api::differences::Difference {
                     part: api::differences::RevisionPart::Push,
                     name: "package".into(),
-                    before: some("a"),
-                    after: some("b"),
+                    before: some_text("a"),
+                    after: some_text("b"),
                 }],
             },
         ),
@@ -836,8 +836,13 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         sample("Status", status()),
         sample("Update", update()),
         sample("Update", Update::default()),
-        sample("Stopped", Stopped { stopped: all("x") }),
-        sample("Trial", tried()),
+        sample(
+            "Stopped",
+            Stopped {
+                stopped: one_text("x"),
+            },
+        ),
+        sample("Trial", trial()),
         sample("Trial", Trial::default()),
     ];
     let check = |status, fix| Check {
@@ -847,7 +852,7 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         fix,
     };
     let checks = vec![
-        check(CheckStatus::Missing, some("mount them")),
+        check(CheckStatus::Missing, some_text("mount them")),
         check(CheckStatus::Ok, None),
     ];
     samples.push(sample("Doctor", Doctor { checks }));

@@ -1,4 +1,4 @@
-use access::Standing;
+use access::ConnectionAccess;
 use api::access::NewToken;
 use store::State;
 use tokio::sync::watch;
@@ -34,7 +34,7 @@ fn alice() -> NewAccount {
 }
 
 impl World {
-    /// With an account whose hash is `hash`.
+    /// Creates the account `alice`, whose password hash is `hash`.
     fn with_alice(self) -> World {
         self.principals
             .create_account(&alice(), "hash")
@@ -42,26 +42,26 @@ impl World {
         self
     }
 
-    fn begin(&self) -> Begun {
+    fn begin(&self) -> StartedSession {
         let candidate = self.principals.candidate("alice").expect("an account");
-        let begun = self.principals.begin(&candidate, "127.0.0.1:5000");
-        begin_good(begun)
+        let begun = self.principals.begin_session(&candidate, "127.0.0.1:5000");
+        expect_begun(begun)
     }
 
-    fn recognise(&self, secret: &str, now: Millis) -> Result<Identity, Unrecognised> {
+    fn recognise(&self, secret: &str, now: Millis) -> Result<CallerIdentity, AuthenticationError> {
         self.principals
-            .with(|known| known.recognise_session(secret, now))
+            .with_recogniser(|known| known.recognise_session(secret, now))
     }
 }
 
-fn begin_good(begun: Result<Option<Begun>, Error>) -> Begun {
+fn expect_begun(begun: Result<Option<StartedSession>, Error>) -> StartedSession {
     begun.expect("written").expect("an account as it was")
 }
 
 #[test]
 fn a_session_ends_at_its_end_and_when_it_is_not_used() {
     let world = world().with_alice();
-    assert!(!world.principals.names_nobody());
+    assert!(!world.principals.has_no_credentials());
     let begun = world.begin();
     let who = world.recognise(&begun.secret, store::now()).expect("good");
     assert_eq!(
@@ -69,20 +69,20 @@ fn a_session_ends_at_its_end_and_when_it_is_not_used() {
         ("alice", &[Role::Deployer][..])
     );
     assert_eq!(who.owner.as_deref(), Some("person:alice"));
-    assert!(who.principal.scope.has("lab_1") && !who.principal.scope.has("other"));
-    let idle = milliseconds(Lasting::default().idle);
+    assert!(who.principal.scope.includes("lab_1") && !who.principal.scope.includes("other"));
+    let idle = milliseconds(SessionLifetimes::default().idle);
     let used = world.principals.sessions()[0].last_used;
-    let over = Err(Unrecognised::SessionOver);
+    let over = Err(AuthenticationError::SessionOver);
     world
         .recognise(&begun.secret, used + idle - 1)
         .expect("just");
     assert_eq!(world.recognise(&begun.secret, used + idle), over);
-    // A use makes it good for longer, up to its end.
-    world.principals.note_use(&who, used + idle - 1);
+    // Use extends the session, up to its end.
+    world.principals.record_use(&who, used + idle - 1);
     world
         .recognise(&begun.secret, used + idle)
         .expect("used meanwhile");
-    world.principals.note_use(&who, begun.expires - 1);
+    world.principals.record_use(&who, begun.expires - 1);
     world
         .recognise(&begun.secret, begun.expires - 1)
         .expect("the last moment");
@@ -99,7 +99,7 @@ fn uses_are_kept_when_something_else_changes() {
     let world = world().with_alice();
     let begun = world.begin();
     let later = store::now() + 30_000;
-    world.principals.note_use(&begun.identity, later);
+    world.principals.record_use(&begun.identity, later);
     world.begin();
     let sessions = world.principals.sessions();
     assert_eq!(sessions[0].last_used, later, "not written yet, but known");
@@ -109,14 +109,14 @@ fn uses_are_kept_when_something_else_changes() {
     );
     world
         .principals
-        .note_use(&begun.identity, later + USED_LATER);
+        .record_use(&begun.identity, later + USED_LATER);
     assert_eq!(
         world.state.sessions().expect("readable")[0].last_used,
         later + USED_LATER
     );
 }
 
-/// More than uses wait for the disk.
+/// Interval after which uses are written to disk.
 const USED_LATER: Millis = 60_000;
 
 #[test]
@@ -133,7 +133,7 @@ fn changes_of_an_account_end_its_sessions_and_no_others() {
         .create_account(&other, "hash")
         .expect("made");
     let candidate = world.principals.candidate("bob").expect("an account");
-    let bob = begin_good(world.principals.begin(&candidate, "x"));
+    let bob = expect_begun(world.principals.begin_session(&candidate, "x"));
     let role = AccountChange {
         role: Some(Role::Operator),
         ..AccountChange::default()
@@ -153,8 +153,11 @@ fn changes_of_an_account_end_its_sessions_and_no_others() {
         let changed = world.principals.change_account("alice", change, *password);
         changed.expect("there");
         if let Some(begun) = begun {
-            let standing = world.principals.standing(&begun.identity, "lab_1");
-            assert_eq!(standing, Standing::Ended("this session was ended".into()));
+            let standing = world.principals.connection_access(&begun.identity, "lab_1");
+            assert_eq!(
+                standing,
+                ConnectionAccess::Ended("this session was ended".into())
+            );
         }
     }
     assert_eq!(world.principals.accounts()[0].role, Role::Operator);
@@ -169,7 +172,7 @@ fn changes_of_an_account_end_its_sessions_and_no_others() {
     assert_eq!(unknown.problem().status, 404);
     world.principals.remove_account("bob").expect("there");
     assert!(
-        !world.principals.names_nobody(),
+        !world.principals.has_no_credentials(),
         "the door does not open again"
     );
 }
@@ -186,7 +189,10 @@ fn nobody_begins_by_what_an_account_was_before() {
     for (change, password) in [(&role, None), (&AccountChange::default(), Some("another"))] {
         let changed = world.principals.change_account("alice", change, password);
         changed.expect("there");
-        let begun = world.principals.begin(&before, "x").expect("readable");
+        let begun = world
+            .principals
+            .begin_session(&before, "x")
+            .expect("readable");
         assert!(
             begun.is_none(),
             "its password was looked at before the change"
@@ -202,7 +208,7 @@ fn nobody_begins_by_what_an_account_was_before() {
     assert!(
         world
             .principals
-            .begin(&before, "x")
+            .begin_session(&before, "x")
             .expect("readable")
             .is_none()
     );
@@ -221,7 +227,7 @@ fn a_hash_made_anew_ends_no_session() {
     world
         .recognise(&begun.secret, store::now())
         .expect("good still");
-    begin_good(world.principals.begin(&candidate, "x"));
+    expect_begun(world.principals.begin_session(&candidate, "x"));
     assert_eq!(
         world.principals.candidate("alice").expect("there").password,
         "better"
@@ -241,7 +247,7 @@ fn accounts_and_tokens_share_their_names() {
     };
     let taken = world
         .principals
-        .create(&token)
+        .create_token(&token)
         .expect_err("an account's")
         .problem();
     assert_eq!(taken.status, 409, "{taken:?}");
@@ -249,7 +255,7 @@ fn accounts_and_tokens_share_their_names() {
         name: "bob".into(),
         ..token
     };
-    world.principals.create(&bob).expect("made");
+    world.principals.create_token(&bob).expect("made");
     let new = NewAccount {
         name: "bob".into(),
         ..alice()
@@ -273,30 +279,30 @@ fn guesses_at_an_account_are_slowed_wherever_they_come_from() {
     for number in 0..access::guesses::FREE as u8 {
         world
             .principals
-            .may_try("alice", from(number), 5_000)
+            .check_sign_in("alice", from(number), 5_000)
             .expect("free");
         world
             .principals
-            .wrong_password("alice", from(number), 5_000);
+            .record_wrong_password("alice", from(number), 5_000);
     }
-    let slowed = world.principals.may_try("alice", from(99), 5_000);
-    assert_eq!(slowed, Err(Unrecognised::SlowedSignIn(1_000)));
+    let slowed = world.principals.check_sign_in("alice", from(99), 5_000);
+    assert_eq!(slowed, Err(AuthenticationError::SlowedSignIn(1_000)));
     world
         .principals
-        .may_try("bob", from(99), 5_000)
+        .check_sign_in("bob", from(99), 5_000)
         .expect("another account");
     assert_eq!(
-        world.principals.mistaken(),
+        world.principals.password_counts(),
         (u64::from(access::guesses::FREE), 1)
     );
-    // And from one address, whatever the account.
+    // Also from one address, whatever the account.
     for number in 0..access::guesses::FREE {
         world
             .principals
-            .wrong_password(&format!("name{number}"), from(50), 5_000);
+            .record_wrong_password(&format!("name{number}"), from(50), 5_000);
     }
-    let slowed = world.principals.may_try("bob", from(50), 5_000);
-    assert_eq!(slowed, Err(Unrecognised::SlowedSignIn(1_000)));
+    let slowed = world.principals.check_sign_in("bob", from(50), 5_000);
+    assert_eq!(slowed, Err(AuthenticationError::SlowedSignIn(1_000)));
 }
 
 #[test]
@@ -305,17 +311,17 @@ fn names_that_nobody_has_make_nothing_of_an_accounts_forgotten_and_slow_no_other
     let from = |number: u32| std::net::IpAddr::from((0x0a00_0000 + number).to_be_bytes());
     for number in 0..access::guesses::FREE {
         let principals = &world.principals;
-        principals.wrong_password("alice", from(number), 5_000);
+        principals.record_wrong_password("alice", from(number), 5_000);
     }
     for number in 0..access::guesses::REMEMBERED as u32 + 100 {
         let name = format!("nobody{number}");
         let principals = &world.principals;
-        principals.wrong_password(&name, from(1_000 + number), 5_001);
+        principals.record_wrong_password(&name, from(1_000 + number), 5_001);
     }
-    let slowed = world.principals.may_try("alice", from(99_999), 5_001);
-    assert_eq!(slowed, Err(Unrecognised::SlowedSignIn(999)));
+    let slowed = world.principals.check_sign_in("alice", from(99_999), 5_001);
+    assert_eq!(slowed, Err(AuthenticationError::SlowedSignIn(999)));
     for other in ["bob", "nobody-new"] {
-        let tried = world.principals.may_try(other, from(99_999), 5_001);
+        let tried = world.principals.check_sign_in(other, from(99_999), 5_001);
         tried.expect("it was not tried before");
     }
 }
@@ -338,16 +344,16 @@ fn a_person_has_so_many_sessions_and_no_more() {
 async fn whoever_follows_hears_that_a_session_was_ended() {
     let world = world().with_alice();
     let begun = world.begin();
-    let now = world.principals.standing(&begun.identity, "lab_1");
-    assert!(matches!(now, Standing::Granted(_)));
+    let now = world.principals.connection_access(&begun.identity, "lab_1");
+    assert!(matches!(now, ConnectionAccess::Granted(_)));
     let (sender, mut standing) = watch::channel(now);
     let change = async {
         world.principals.end_sessions_of("alice").expect("ended");
         standing.changed().await.expect("followed");
-        assert!(matches!(&*standing.borrow(), Standing::Ended(_)));
+        assert!(matches!(&*standing.borrow(), ConnectionAccess::Ended(_)));
     };
     tokio::select! {
-        () = world.principals.follow(&begun.identity, "lab_1", &sender) => {}
+        () = world.principals.follow_access(&begun.identity, "lab_1", &sender) => {}
         () = change => {}
     }
 }

@@ -1,17 +1,17 @@
 use std::sync::Arc;
 
 use access::Role;
-use oidc::Group;
+use oidc::RoleGroup;
 use store::State;
 
 use super::*;
-use crate::principals::Lasting;
+use crate::principals::SessionLifetimes;
 use crate::tokens::Tokens;
 
 const ISSUER: &str = "https://id.lab.example";
 
 fn roles(viewers: &str, services: &str) -> Roles {
-    Roles(vec![Group {
+    Roles(vec![RoleGroup {
         name: viewers.into(),
         role: Role::Viewer,
         services: vec![services.parse().expect("a pattern")],
@@ -41,38 +41,38 @@ impl World {
         }
     }
 
-    /// As a daemon of this configuration starts.
-    fn starts(&self, provider: Option<(&str, &Roles)>) -> Principals {
+    /// Loads the principals as a daemon with this configuration does.
+    fn start(&self, provider: Option<(&str, &Roles)>) -> Principals {
         Principals::new(Tokens::default(), Arc::clone(&self.state))
             .expect("readable")
-            .lasting(Lasting::default())
-            .provided(provider)
+            .with_session_lifetimes(SessionLifetimes::default())
+            .with_provider(provider)
             .expect("readable")
     }
 }
 
-fn begin(principals: &Principals, roles: &Roles, person: &Person) -> Begun {
-    let granted = roles.of(&person.groups).expect("a role");
+fn begin(principals: &Principals, roles: &Roles, person: &Person) -> StartedSession {
+    let granted = roles.grant_for_groups(&person.groups).expect("a role");
     principals
-        .begin_provided(ISSUER, person, &granted, "127.0.0.1:5000")
+        .begin_provider_session(ISSUER, person, &granted, "127.0.0.1:5000")
         .expect("begun")
 }
 
 #[test]
 fn people_of_a_provider_are_told_apart_by_its_word_for_them() {
     let (world, roles) = (World::new(), roles("students", "lab_*"));
-    let principals = world.starts(Some((ISSUER, &roles)));
-    assert!(!principals.names_nobody(), "a provider names people");
+    let principals = world.start(Some((ISSUER, &roles)));
+    assert!(!principals.has_no_credentials(), "a provider names people");
     let alice = begin(&principals, &roles, &person("1", "alice"));
     let principal = &alice.identity.principal;
     assert_eq!(
-        (&*principal.name, principal.is(Role::Viewer)),
+        (&*principal.name, principal.has_role(Role::Viewer)),
         ("oidc:alice", true)
     );
-    assert!(principal.scope.has("lab_1") && !principal.scope.has("other"));
+    assert!(principal.scope.includes("lab_1") && !principal.scope.includes("other"));
     let other = begin(&principals, &roles, &person("2", "alice"));
     assert_eq!(other.identity.principal.name, "oidc:alice~2");
-    // What the first owns stays its own.
+    // The first person keeps what is theirs.
     let renamed = begin(&principals, &roles, &person("2", "oidc:alice"));
     assert_eq!(renamed.identity.principal.name, "oidc:alice~2");
     let account = principals.check_account(&api::people::NewAccount {
@@ -88,40 +88,43 @@ fn people_of_a_provider_are_told_apart_by_its_word_for_them() {
 fn at_a_start_sessions_end_that_would_be_others_today() {
     let world = World::new();
     let first = roles("students", "lab_*");
-    let principals = world.starts(Some((ISSUER, &first)));
+    let principals = world.start(Some((ISSUER, &first)));
     let begun = begin(&principals, &first, &person("1", "alice"));
     let good = |principals: &Principals| {
         principals
-            .with(|known| known.recognise_session(&begun.secret, store::now()))
+            .with_recogniser(|known| known.recognise_session(&begun.secret, store::now()))
             .is_ok()
     };
-    assert!(good(&world.starts(Some((ISSUER, &first)))), "as before");
+    assert!(good(&world.start(Some((ISSUER, &first)))), "as before");
     for (what, other) in [
         ("another group", roles("staff", "lab_*")),
         ("another scope", roles("students", "*")),
     ] {
         let world = World::new();
-        let principals = world.starts(Some((ISSUER, &first)));
+        let principals = world.start(Some((ISSUER, &first)));
         begin(&principals, &first, &person("1", "alice"));
         assert!(
-            world.starts(Some((ISSUER, &other))).sessions().is_empty(),
+            world.start(Some((ISSUER, &other))).sessions().is_empty(),
             "{what}"
         );
     }
     let world_of_another = World::new();
-    let principals = world_of_another.starts(Some((ISSUER, &first)));
+    let principals = world_of_another.start(Some((ISSUER, &first)));
     begin(&principals, &first, &person("1", "alice"));
-    let elsewhere = world_of_another.starts(Some(("https://other.example", &first)));
+    let elsewhere = world_of_another.start(Some(("https://other.example", &first)));
     assert!(elsewhere.sessions().is_empty(), "another provider");
-    let without = world.starts(None);
+    let without = world.start(None);
     assert!(!good(&without));
-    assert!(!without.names_nobody(), "the door does not open again");
+    assert!(
+        !without.has_no_credentials(),
+        "the door does not open again"
+    );
 }
 
 #[test]
 fn sessions_of_accounts_are_not_a_providers() {
     let world = World::new();
-    let principals = world.starts(None);
+    let principals = world.start(None);
     let new = api::people::NewAccount {
         name: "bob".into(),
         password: String::new(),
@@ -131,8 +134,8 @@ fn sessions_of_accounts_are_not_a_providers() {
     principals.create_account(&new, "hash").expect("made");
     let candidate = principals.candidate("bob").expect("an account");
     let begun = principals
-        .begin(&candidate, "127.0.0.1:1")
+        .begin_session(&candidate, "127.0.0.1:1")
         .expect("written");
     assert!(begun.is_some());
-    assert_eq!(world.starts(None).sessions().len(), 1);
+    assert_eq!(world.start(None).sessions().len(), 1);
 }

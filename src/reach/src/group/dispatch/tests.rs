@@ -27,63 +27,79 @@ fn goal() -> Kind {
 #[test]
 fn the_servant_with_the_fewest_requests_is_asked() {
     let mut group = group(RULES, 2);
-    assert_eq!(group.ask(7, &call()), (1, vec![Order::Ask(1, 1)]));
-    assert_eq!(group.ask(7, &call()), (2, vec![Order::Ask(2, 2)]));
-    assert_eq!(group.ended(2, 2, End::Answered), (true, vec![]));
-    assert_eq!(group.ask(8, &call()), (3, vec![Order::Ask(3, 2)]));
-    // Of two that have as many, the one that was asked less often.
-    assert_eq!(group.ended(3, 2, End::Answered), (true, vec![]));
-    assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
-    assert_eq!(group.ask(8, &call()), (4, vec![Order::Ask(4, 1)]));
+    assert_eq!(group.ask(7, &call()), (1, vec![DispatchOrder::Ask(1, 1)]));
+    assert_eq!(group.ask(7, &call()), (2, vec![DispatchOrder::Ask(2, 2)]));
+    assert_eq!(
+        group.finish_attempt(2, 2, AttemptOutcome::Answered),
+        (true, vec![])
+    );
+    assert_eq!(group.ask(8, &call()), (3, vec![DispatchOrder::Ask(3, 2)]));
+    // Of two with equal load, the one that got fewer requests.
+    assert_eq!(
+        group.finish_attempt(3, 2, AttemptOutcome::Answered),
+        (true, vec![])
+    );
+    assert_eq!(
+        group.finish_attempt(1, 1, AttemptOutcome::Answered),
+        (true, vec![])
+    );
+    assert_eq!(group.ask(8, &call()), (4, vec![DispatchOrder::Ask(4, 1)]));
 }
 
 #[test]
-fn what_finds_no_place_waits_and_robots_have_turns() {
+fn requests_without_a_free_servant_wait_and_robots_take_turns() {
     let mut group = group(RULES, 1);
     for _ in 0..5 {
         group.ask(1, &call());
     }
     group.ask(2, &call());
-    let load = Load {
+    let load = GroupLoad {
         waiting: 4,
         under_way: 2,
     };
     assert_eq!(group.load(), load);
-    // The greedy one's third, then the other's, then the rest.
-    let next = |group: &mut Dispatcher, ended| group.ended(ended, 1, End::Answered).1;
-    assert_eq!(next(&mut group, 1), [Order::Ask(3, 1)]);
-    assert_eq!(next(&mut group, 2), [Order::Ask(6, 1)]);
-    assert_eq!(next(&mut group, 3), [Order::Ask(4, 1)]);
-    // A servant that is added takes what waits.
-    assert_eq!(group.join(2), [Order::Ask(5, 2)]);
+    // The third of the greedy robot, then the other robot's, then the rest.
+    let next =
+        |group: &mut Dispatcher, ended| group.finish_attempt(ended, 1, AttemptOutcome::Answered).1;
+    assert_eq!(next(&mut group, 1), [DispatchOrder::Ask(3, 1)]);
+    assert_eq!(next(&mut group, 2), [DispatchOrder::Ask(6, 1)]);
+    assert_eq!(next(&mut group, 3), [DispatchOrder::Ask(4, 1)]);
+    // An additional servant takes a waiting request.
+    assert_eq!(group.join(2), [DispatchOrder::Ask(5, 2)]);
 }
 
 #[test]
 fn a_servant_carries_out_goals_of_one_robot_at_a_time() {
     let mut group = group(RULES, 2);
-    assert_eq!(group.ask(1, &goal()).1, [Order::Ask(1, 1)]);
-    assert_eq!(group.ask(2, &goal()).1, [Order::Ask(2, 2)]);
+    assert_eq!(group.ask(1, &goal()).1, [DispatchOrder::Ask(1, 1)]);
+    assert_eq!(group.ask(2, &goal()).1, [DispatchOrder::Ask(2, 2)]);
     assert_eq!(group.ask(3, &goal()).1, []);
-    // A robot's next goal goes where its goal is: the node knows what that means.
-    assert_eq!(group.ask(2, &goal()).1, [Order::Ask(4, 2)]);
-    assert_eq!(group.ended(2, 2, End::Answered).1, []);
-    assert_eq!(group.ended(4, 2, End::Answered).1, [Order::Ask(3, 2)]);
-    // Another action is another matter.
+    // The robot's next goal goes to the same servant, because the node knows how to treat it.
+    assert_eq!(group.ask(2, &goal()).1, [DispatchOrder::Ask(4, 2)]);
+    assert_eq!(group.finish_attempt(2, 2, AttemptOutcome::Answered).1, []);
+    assert_eq!(
+        group.finish_attempt(4, 2, AttemptOutcome::Answered).1,
+        [DispatchOrder::Ask(3, 2)]
+    );
+    // Another action is independent.
     let other = Kind::Goal("/dock".into());
-    assert_eq!(group.ask(4, &other).1, [Order::Ask(5, 1)]);
+    assert_eq!(group.ask(4, &other).1, [DispatchOrder::Ask(5, 1)]);
 }
 
 #[test]
 fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
     let mut group = group(RULES, 1);
-    assert_eq!(group.ask(1, &goal()).1, [Order::Ask(1, 1)]);
-    // Each takes the place of the one before, as action servers do.
+    assert_eq!(group.ask(1, &goal()).1, [DispatchOrder::Ask(1, 1)]);
+    // Each replaces the one before, as action servers do.
     let mut before = 1;
     let mut next = |group: &mut Dispatcher| {
         let (ticket, orders) = group.ask(1, &goal());
-        let begins = orders == [Order::Ask(ticket, 1)];
+        let begins = orders == [DispatchOrder::Ask(ticket, 1)];
         if begins {
-            assert_eq!(group.ended(before, 1, End::Answered).1, []);
+            assert_eq!(
+                group.finish_attempt(before, 1, AttemptOutcome::Answered).1,
+                []
+            );
             before = ticket;
         }
         (begins, before)
@@ -97,25 +113,35 @@ fn a_robot_with_ever_new_goals_does_not_keep_others_from_its_servant() {
     assert_eq!(ahead, AHEAD);
     let (_, last) = next(&mut group);
     assert_eq!(
-        group.ended(last, 1, End::Answered).1,
-        [Order::Ask(other, 1)],
+        group.finish_attempt(last, 1, AttemptOutcome::Answered).1,
+        [DispatchOrder::Ask(other, 1)],
         "the first robot's next ones wait for their turn"
     );
     let first = other + 1 + AHEAD as u64;
     assert_eq!(
-        group.ended(other, 1, End::Answered).1.first(),
-        Some(&Order::Ask(first, 1))
+        group
+            .finish_attempt(other, 1, AttemptOutcome::Answered)
+            .1
+            .first(),
+        Some(&DispatchOrder::Ask(first, 1))
     );
 }
 
 #[test]
-fn what_a_lost_servant_had_fails_or_is_asked_again() {
+fn requests_of_a_lost_servant_fail_or_are_retried() {
     let mut strict = group(RULES, 2);
     strict.ask(1, &call());
     let orders = strict.leave(1);
-    let fails = [Order::Drop(1, 1), Order::Fail(1, Lost::NotAskedAgain)];
+    let fails = [
+        DispatchOrder::Drop(1, 1),
+        DispatchOrder::Fail(1, LossReason::NotAskedAgain),
+    ];
     assert_eq!(orders, fails);
-    assert_eq!(strict.ended(1, 1, End::Answered), (false, vec![]), "late");
+    assert_eq!(
+        strict.finish_attempt(1, 1, AttemptOutcome::Answered),
+        (false, vec![]),
+        "late"
+    );
 
     let rules = Rules {
         idempotent: true,
@@ -123,29 +149,35 @@ fn what_a_lost_servant_had_fails_or_is_asked_again() {
     };
     let mut group = group(rules, 4);
     group.ask(1, &call());
-    assert_eq!(group.leave(1), [Order::Drop(1, 1), Order::Ask(1, 2)]);
     assert_eq!(
-        group.ended(1, 2, End::Lost),
-        (false, vec![Order::Ask(1, 3)])
+        group.leave(1),
+        [DispatchOrder::Drop(1, 1), DispatchOrder::Ask(1, 2)]
     );
-    // It may be this request that ends them.
-    let (_, orders) = group.ended(1, 3, End::Lost);
-    assert_eq!(orders, [Order::Fail(1, Lost::AskedOften)]);
+    assert_eq!(
+        group.finish_attempt(1, 2, AttemptOutcome::Lost),
+        (false, vec![DispatchOrder::Ask(1, 3)])
+    );
+    // This request may be the cause of the crashes.
+    let (_, orders) = group.finish_attempt(1, 3, AttemptOutcome::Lost);
+    assert_eq!(orders, [DispatchOrder::Fail(1, LossReason::AskedOften)]);
 }
 
 #[test]
 fn what_was_not_taken_waits_for_a_servant_that_takes_it() {
     let mut group = group(RULES, 2);
     group.ask(1, &call());
-    assert_eq!(group.ended(1, 1, End::NotTaken).1, [Order::Ask(1, 2)]);
-    assert_eq!(group.ended(1, 2, End::NotTaken).1, []);
+    assert_eq!(
+        group.finish_attempt(1, 1, AttemptOutcome::NotTaken).1,
+        [DispatchOrder::Ask(1, 2)]
+    );
+    assert_eq!(group.finish_attempt(1, 2, AttemptOutcome::NotTaken).1, []);
     assert_eq!(group.load().waiting, 1);
-    // Neither for long what is served, be it of another robot or of the same.
+    // The waiting call blocks no other service, neither for this robot nor for another.
     let other = Kind::Call("/rest".into());
-    assert_eq!(group.ask(2, &other).1, [Order::Ask(2, 1)]);
-    assert_eq!(group.ask(1, &other).1, [Order::Ask(3, 2)]);
+    assert_eq!(group.ask(2, &other).1, [DispatchOrder::Ask(2, 1)]);
+    assert_eq!(group.ask(1, &other).1, [DispatchOrder::Ask(3, 2)]);
     assert_eq!(group.resume(1, &other), []);
-    assert_eq!(group.resume(1, &call()), [Order::Ask(1, 1)]);
+    assert_eq!(group.resume(1, &call()), [DispatchOrder::Ask(1, 1)]);
 }
 
 #[test]
@@ -155,35 +187,47 @@ fn a_servant_that_loses_a_request_does_not_get_those_that_follow() {
     for ticket in 1..=4 {
         group.ask(ticket, &call());
     }
-    let lost = group.ended(1, 1, End::Lost).1;
-    assert_eq!(lost, [Order::Fail(1, Lost::NotAskedAgain)]);
-    // It has the fewest under way now.
-    assert_eq!(group.ask(5, &call()).1, [Order::Ask(5, 2)]);
-    assert_eq!(group.ask(6, &call()).1, [Order::Ask(6, 2)]);
+    let lost = group.finish_attempt(1, 1, AttemptOutcome::Lost).1;
+    assert_eq!(lost, [DispatchOrder::Fail(1, LossReason::NotAskedAgain)]);
+    // It now has the fewest requests in progress.
+    assert_eq!(group.ask(5, &call()).1, [DispatchOrder::Ask(5, 2)]);
+    assert_eq!(group.ask(6, &call()).1, [DispatchOrder::Ask(6, 2)]);
     assert_eq!(group.resume(1, &call()), []);
-    assert_eq!(group.ask(7, &call()).1, [Order::Ask(7, 1)]);
+    assert_eq!(group.ask(7, &call()).1, [DispatchOrder::Ask(7, 1)]);
 }
 
 #[test]
-fn of_replicas_the_first_answer_counts() {
+fn the_first_answer_of_replicas_wins() {
     let rules = Rules {
         replicas: 2,
         ..RULES
     };
     let mut group = group(rules, 1);
-    // There is one only.
-    assert_eq!(group.ask(1, &call()).1, [Order::Ask(1, 1)]);
+    // There is only one.
+    assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(1, 1)]);
     group.join(2);
     let (ticket, orders) = group.ask(1, &call());
-    assert_eq!(orders, [Order::Ask(ticket, 2), Order::Ask(ticket, 1)]);
-    let answered = group.ended(ticket, 1, End::Answered);
-    assert_eq!(answered, (true, vec![Order::Drop(ticket, 2)]));
-    assert_eq!(group.ended(ticket, 2, End::Answered), (false, vec![]));
-    // One that is lost leaves it to the other; then it is asked again.
+    assert_eq!(
+        orders,
+        [DispatchOrder::Ask(ticket, 2), DispatchOrder::Ask(ticket, 1)]
+    );
+    let answered = group.finish_attempt(ticket, 1, AttemptOutcome::Answered);
+    assert_eq!(answered, (true, vec![DispatchOrder::Drop(ticket, 2)]));
+    assert_eq!(
+        group.finish_attempt(ticket, 2, AttemptOutcome::Answered),
+        (false, vec![])
+    );
+    // If one is lost the other remains; after that it is retried.
     let (ticket, _) = group.ask(1, &call());
-    assert_eq!(group.ended(ticket, 2, End::Lost), (false, vec![]));
-    assert_eq!(group.ended(ticket, 1, End::Lost), (false, vec![]));
-    assert_eq!(group.resume(2, &call()), [Order::Ask(ticket, 2)]);
+    assert_eq!(
+        group.finish_attempt(ticket, 2, AttemptOutcome::Lost),
+        (false, vec![])
+    );
+    assert_eq!(
+        group.finish_attempt(ticket, 1, AttemptOutcome::Lost),
+        (false, vec![])
+    );
+    assert_eq!(group.resume(2, &call()), [DispatchOrder::Ask(ticket, 2)]);
 }
 
 #[test]
@@ -191,32 +235,35 @@ fn a_retired_servant_ends_what_it_has_and_gets_no_more() {
     let mut group = group(RULES, 2);
     group.ask(1, &call());
     assert_eq!(group.retire(1), []);
-    assert_eq!(group.ask(1, &call()).1, [Order::Ask(2, 2)]);
-    assert_eq!(group.ask(1, &call()).1, [Order::Ask(3, 2)]);
+    assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(2, 2)]);
+    assert_eq!(group.ask(1, &call()).1, [DispatchOrder::Ask(3, 2)]);
     assert_eq!(group.ask(1, &call()).1, [], "though it has a place");
-    assert_eq!(group.ended(1, 1, End::Answered), (true, vec![]));
-    assert_eq!(group.load_of(1), 0);
-    assert_eq!(group.take_back(1), [Order::Ask(4, 1)]);
+    assert_eq!(
+        group.finish_attempt(1, 1, AttemptOutcome::Answered),
+        (true, vec![])
+    );
+    assert_eq!(group.member_load(1), 0);
+    assert_eq!(group.reinstate(1), [DispatchOrder::Ask(4, 1)]);
 }
 
-/// What happens to a group. Numbers choose one of what there is, if there is any.
+/// An event in a group. Numbers select one of the existing elements, if there are any.
 #[derive(Debug, Clone)]
 enum Step {
     Joins,
     Leaves(usize),
     Retires(usize),
     Resumes(usize),
-    Asks { robot: Robot, action: usize },
-    Ends(usize, End),
+    Asks { robot: RobotNumber, action: usize },
+    Ends(usize, AttemptOutcome),
     Withdraws(usize),
 }
 
 fn step() -> impl Strategy<Value = Step> {
     let any = 0usize..64;
     let end = prop_oneof![
-        6 => Just(End::Answered),
-        1 => Just(End::NotTaken),
-        1 => Just(End::Lost),
+        6 => Just(AttemptOutcome::Answered),
+        1 => Just(AttemptOutcome::NotTaken),
+        1 => Just(AttemptOutcome::Lost),
     ];
     prop_oneof![
         2 => Just(Step::Joins),
@@ -229,37 +276,37 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-/// A request as its robot and the servants see it.
+/// A request as seen by its robot and the servants.
 #[derive(Debug)]
-struct Seen {
-    robot: Robot,
+struct TrackedRequest {
+    robot: RobotNumber,
     kind: Kind,
     at: BTreeSet<Member>,
     lost: usize,
     over: bool,
 }
 
-impl Seen {
+impl TrackedRequest {
     fn is_call(&self) -> bool {
         matches!(self.kind, Kind::Call(_))
     }
 }
 
-/// The world around a dispatcher.
-struct World {
+/// The environment of a dispatcher.
+struct DispatchWorld {
     rules: Rules,
     group: Dispatcher,
     members: BTreeMap<Member, bool>,
     joined: Member,
     paused: BTreeSet<(Member, Kind)>,
-    seen: BTreeMap<Ticket, Seen>,
+    seen: BTreeMap<Ticket, TrackedRequest>,
 }
 
-impl World {
-    fn carry_out(&mut self, orders: Vec<Order>) {
+impl DispatchWorld {
+    fn apply_orders(&mut self, orders: Vec<DispatchOrder>) {
         for order in orders {
             match order {
-                Order::Ask(ticket, member) => {
+                DispatchOrder::Ask(ticket, member) => {
                     assert_eq!(self.members.get(&member), Some(&false), "it is asked");
                     let seen = self.seen.get_mut(&ticket).expect("asked for");
                     let paused = (member, seen.kind.clone());
@@ -269,30 +316,30 @@ impl World {
                     assert!(seen.lost == 0 || self.rules.idempotent, "asked again");
                     assert!(seen.lost < ATTEMPTS);
                 }
-                Order::Drop(ticket, member) => {
+                DispatchOrder::Drop(ticket, member) => {
                     self.seen
                         .get_mut(&ticket)
                         .expect("asked for")
                         .at
                         .remove(&member);
                 }
-                Order::Fail(ticket, why) => {
+                DispatchOrder::Fail(ticket, why) => {
                     let seen = self.seen.get_mut(&ticket).expect("asked for");
                     assert!(!seen.over && seen.at.is_empty() && seen.lost > 0);
-                    assert_eq!(why == Lost::NotAskedAgain, !self.rules.idempotent);
+                    assert_eq!(why == LossReason::NotAskedAgain, !self.rules.idempotent);
                     seen.over = true;
                 }
             }
         }
     }
 
-    fn takes(&mut self, step: Step) {
+    fn apply_step(&mut self, step: Step) {
         match step {
             Step::Joins if self.members.len() < 6 => {
                 self.joined += 1;
                 self.members.insert(self.joined, false);
                 let orders = self.group.join(self.joined);
-                self.carry_out(orders);
+                self.apply_orders(orders);
             }
             Step::Joins => {}
             Step::Leaves(which) => {
@@ -309,13 +356,13 @@ impl World {
                     seen.lost += 1;
                 }
                 let orders = self.group.leave(member);
-                self.carry_out(orders);
+                self.apply_orders(orders);
             }
             Step::Retires(which) => {
                 if let Some(member) = nth(self.members.keys(), which) {
                     self.members.insert(member, true);
                     let orders = self.group.retire(member);
-                    self.carry_out(orders);
+                    self.apply_orders(orders);
                 }
             }
             Step::Resumes(which) => {
@@ -323,7 +370,7 @@ impl World {
                 if let Some((member, kind)) = self.paused.iter().nth(which).cloned() {
                     self.paused.remove(&(member, kind.clone()));
                     let orders = self.group.resume(member, &kind);
-                    self.carry_out(orders);
+                    self.apply_orders(orders);
                 }
             }
             Step::Asks { robot, action } => {
@@ -332,7 +379,7 @@ impl World {
                     number => Kind::Goal(format!("/{number}").into()),
                 };
                 let (ticket, orders) = self.group.ask(robot, &kind);
-                let seen = Seen {
+                let seen = TrackedRequest {
                     robot,
                     kind,
                     at: BTreeSet::new(),
@@ -340,7 +387,7 @@ impl World {
                     over: false,
                 };
                 assert!(self.seen.insert(ticket, seen).is_none(), "given twice");
-                self.carry_out(orders);
+                self.apply_orders(orders);
             }
             Step::Ends(which, end) => {
                 let works = self.seen.iter();
@@ -353,19 +400,21 @@ impl World {
                 let seen = self.seen.get_mut(&ticket).expect("asked for");
                 seen.at.remove(&member);
                 match end {
-                    End::NotTaken => drop(self.paused.insert((member, seen.kind.clone()))),
-                    End::Lost => {
+                    AttemptOutcome::NotTaken => {
+                        self.paused.insert((member, seen.kind.clone()));
+                    }
+                    AttemptOutcome::Lost => {
                         seen.lost += 1;
                         self.paused.insert((member, seen.kind.clone()));
                     }
-                    End::Answered => {
+                    AttemptOutcome::Answered => {
                         assert!(!seen.over, "answered twice");
                         seen.over = true;
                     }
                 }
-                let (counts, orders) = self.group.ended(ticket, member, end);
-                assert_eq!(counts, end == End::Answered);
-                self.carry_out(orders);
+                let (counts, orders) = self.group.finish_attempt(ticket, member, end);
+                assert_eq!(counts, end == AttemptOutcome::Answered);
+                self.apply_orders(orders);
             }
             Step::Withdraws(which) => {
                 let open = self.seen.iter().filter(|(_, seen)| !seen.over);
@@ -374,26 +423,27 @@ impl World {
                 };
                 self.seen.get_mut(&ticket).expect("asked for").over = true;
                 let orders = self.group.withdraw(ticket);
-                self.carry_out(orders);
+                self.apply_orders(orders);
             }
         }
     }
 
-    fn holds(&self) {
-        let open: Vec<&Seen> = self.seen.values().filter(|seen| !seen.over).collect();
+    fn check_invariants(&self) {
+        let open: Vec<&TrackedRequest> = self.seen.values().filter(|seen| !seen.over).collect();
         for seen in self.seen.values().filter(|seen| seen.over) {
             assert!(seen.at.is_empty(), "nobody waits for it");
         }
         for member in self.members.keys() {
-            let here: Vec<&&Seen> = open
+            let here: Vec<&&TrackedRequest> = open
                 .iter()
                 .filter(|seen| seen.at.contains(member))
                 .collect();
-            assert_eq!(self.group.load_of(*member), here.len());
+            assert_eq!(self.group.member_load(*member), here.len());
             let calls = here.iter().filter(|seen| seen.is_call()).count();
             assert!(calls <= self.rules.window, "{calls} calls");
             for seen in &here {
-                let crosses = |other: &&&Seen| other.kind == seen.kind && other.robot != seen.robot;
+                let crosses =
+                    |other: &&&TrackedRequest| other.kind == seen.kind && other.robot != seen.robot;
                 let goal = !seen.is_call();
                 assert!(!goal || !here.iter().any(crosses), "of two robots");
             }
@@ -405,7 +455,7 @@ impl World {
         let able = |member: &Member, kind: &Kind| {
             !self.members[member] && !self.paused.contains(&(*member, kind.clone()))
         };
-        let has_servant = |of: &Seen| {
+        let has_servant = |of: &TrackedRequest| {
             let mut same = open.iter();
             same.any(|other| {
                 let here = other.kind == of.kind && other.robot == of.robot;
@@ -415,13 +465,13 @@ impl World {
                     .any(|it| self.members.contains_key(it) && able(it, &of.kind))
             })
         };
-        let others_wait = |seen: &Seen| {
+        let others_wait = |seen: &TrackedRequest| {
             let mut others = open.iter().filter(|other| other.at.is_empty());
             others.any(|other| {
                 other.kind == seen.kind && other.robot != seen.robot && !has_servant(other)
             })
         };
-        // Nothing waits for what could be asked.
+        // Nothing waits that could be sent.
         for seen in waiting {
             let members = self.members.keys();
             let able: Vec<&Member> = members.filter(|it| able(it, &seen.kind)).collect();
@@ -431,7 +481,7 @@ impl World {
                     Kind::Call(_) => {
                         here.filter(|other| other.is_call()).count() < self.rules.window
                     }
-                    // A robot's further goals stand back for others'.
+                    // Further goals of a robot give way to others'.
                     _ => here.all(|other| {
                         other.kind != seen.kind || (other.robot == seen.robot && !others_wait(seen))
                     }),
@@ -470,7 +520,7 @@ proptest! {
     ) {
         let idempotent = idempotent || replicas > 1;
         let rules = Rules { window, replicas, idempotent };
-        let mut world = World {
+        let mut world = DispatchWorld {
             rules,
             group: Dispatcher::new(rules),
             members: BTreeMap::new(),
@@ -479,20 +529,20 @@ proptest! {
             seen: BTreeMap::new(),
         };
         for step in steps {
-            world.takes(step);
-            world.holds();
+            world.apply_step(step);
+            world.check_invariants();
         }
-        // With a servant that works, everything ends.
+        // With a working servant, every request ends.
         while let Some(member) = world.members.keys().next().copied() {
-            world.takes(Step::Leaves(0));
+            world.apply_step(Step::Leaves(0));
             prop_assert!(!world.members.contains_key(&member));
         }
-        world.takes(Step::Joins);
+        world.apply_step(Step::Joins);
         for _ in 0..world.seen.len() {
-            world.takes(Step::Ends(0, End::Answered));
-            world.holds();
+            world.apply_step(Step::Ends(0, AttemptOutcome::Answered));
+            world.check_invariants();
         }
         prop_assert!(world.seen.values().all(|seen| seen.over));
-        prop_assert_eq!(world.group.load(), Load::default());
+        prop_assert_eq!(world.group.load(), GroupLoad::default());
     }
 }

@@ -1,7 +1,7 @@
-//! Whose stamps are changed where clocks differ.
+//! Conversion of stamps if the clocks differ.
 
 use bytes::Bytes;
-use link::clock::Sample;
+use link::clock::ClockSample;
 use ros::bus::{NodeParameters, ServiceHandler, ServiceType};
 
 use super::*;
@@ -10,34 +10,35 @@ use crate::memory_bus::{MemoryBus, MemorySystem};
 const HOUR: i64 = 3600 * 1_000_000_000;
 const SIMULATED: &str = "use_sim_time";
 
-struct Silent;
+struct SilentService;
 
 #[async_trait]
-impl ServiceHandler for Silent {
+impl ServiceHandler for SilentService {
     async fn call(&self, _: Bytes, _: &str) -> Result<Bytes, String> {
         std::future::pending().await
     }
 }
 
-async fn sets(bus: &MemoryBus, simulated: bool) {
+async fn set_sim_time(bus: &MemoryBus, simulated: bool) {
     let change = (SIMULATED.to_owned(), Some(ParamValue::Bool(simulated)));
     let set = bus.set(bus.node(), vec![change]).await;
     assert_eq!(set.expect("it is there"), [Ok(())]);
 }
 
-/// A node that answers what its parameters are.
+/// Creates a node that answers queries for its parameters.
 async fn node(system: &Arc<MemorySystem>, name: &str) -> (Arc<MemoryBus>, Box<dyn Send + Sync>) {
     let bus = system.join(name);
-    sets(&bus, false).await;
-    let of = ServiceType::new("rcl_interfaces/srv/GetParameters", "*").written_by(RosVersion::Two);
+    set_sim_time(&bus, false).await;
+    let of =
+        ServiceType::new("rcl_interfaces/srv/GetParameters", "*").with_version(RosVersion::Two);
     let service = format!("{name}/get_parameters");
-    let served = bus.serve(&service, of, Arc::new(Silent)).await;
+    let served = bus.serve(&service, of, Arc::new(SilentService)).await;
     let served = served.expect("it is served");
     (bus, served)
 }
 
-/// Waits until the stamps of these two are changed, or are not.
-async fn shifts(hub: &Hub, wanted: [bool; 2]) {
+/// Waits until the stamps of these two nodes are converted or not, as wanted.
+async fn wait_shifts(hub: &Hub, wanted: [bool; 2]) {
     let now = || {
         let links = hub.links.lock();
         ["/detect", "/plan"].map(|node| links[node].skew(hub).is_some())
@@ -52,32 +53,32 @@ async fn shifts(hub: &Hub, wanted: [bool; 2]) {
 #[tokio::test]
 async fn nodes_of_ros_2_simulate_their_time_each_for_itself_and_change_it() {
     let system = Arc::new(MemorySystem::default());
-    let registry = Arc::new(Registry::of(RosVersion::Two));
-    let (nodes, options) = (Arc::new(Quiet::default()), HubOptions::default());
+    let registry = Arc::new(Registry::for_version(RosVersion::Two));
+    let (nodes, options) = (Arc::new(QuietNodes::default()), HubOptions::default());
     let hub = Hub::new("s1", system.join("/bridge"), registry, nodes, options);
-    hub.skew.measured(Sample {
+    hub.skew.on_clock_sample(ClockSample {
         offset: HOUR,
         delay: 0,
     });
     let (detect, _serves) = node(&system, "/detect").await;
     let (plan, _serves_too) = node(&system, "/plan").await;
-    // One has been told so before there was a link, as when the daemon started again.
-    sets(&plan, true).await;
+    // One of them was set before there was a link, as after a restart of the daemon.
+    set_sim_time(&plan, true).await;
     let mut robots = Vec::new();
     for name in ["/detect", "/plan"] {
         let hello = Hello {
             ros: 2,
             ..hello(name, 1)
         };
-        robots.push(says(&hub, &hello).await);
+        robots.push(send_hello(&hub, &hello).await);
     }
-    shifts(&hub, [true, false]).await;
-    sets(&detect, true).await;
-    shifts(&hub, [false, false]).await;
-    sets(&plan, false).await;
-    shifts(&hub, [false, true]).await;
-    sets(&detect, false).await;
-    shifts(&hub, [true, true]).await;
+    wait_shifts(&hub, [true, false]).await;
+    set_sim_time(&detect, true).await;
+    wait_shifts(&hub, [false, false]).await;
+    set_sim_time(&plan, false).await;
+    wait_shifts(&hub, [false, true]).await;
+    set_sim_time(&detect, false).await;
+    wait_shifts(&hub, [true, true]).await;
 }
 
 #[tokio::test]
@@ -89,12 +90,12 @@ async fn the_parameter_server_simulates_the_time_of_all_but_no_kept_stamp_is_cha
             keep_stamps,
             ..hello(name, 1)
         };
-        robots.push(says(&hub, &hello).await);
+        robots.push(send_hello(&hub, &hello).await);
     }
-    shifts(&hub, [false, true]).await;
+    wait_shifts(&hub, [false, true]).await;
     for (simulated, wanted) in [(true, [false, false]), (false, [false, true])] {
         let change = (format!("/{SIMULATED}"), Some(ParamValue::Bool(simulated)));
-        hub.parameters.change(&hub, vec![change]).await;
-        shifts(&hub, wanted).await;
+        hub.parameters.apply_changes(&hub, vec![change]).await;
+        wait_shifts(&hub, wanted).await;
     }
 }

@@ -1,23 +1,23 @@
-//! What is refused at first, or hangs: it is tried again, and keeps nothing else waiting.
+//! Operations that are refused at first or hang are retried and delay nothing else.
 
 use std::net::SocketAddr;
 
 use bytes::Bytes;
 use link::drops::Cause;
 use link::record::Data;
-use ros::bus::{Qos, ServiceHandler, ServiceType, WireType};
+use ros::bus::{QosProfile, ServiceHandler, ServiceType, WireType};
 use tokio::io::{AsyncReadExt, AsyncWriteExt, copy_bidirectional};
 use tokio::net::TcpStream;
 
 use super::*;
 use crate::links::node_link::NodeLink;
 
-/// A servant with a node in it, and a robot's link to that.
-struct Scene {
+/// A servant with a node, and a robot's link to it.
+struct RetryScene {
     master: SocketAddr,
     hub: Arc<Hub>,
     node: Arc<Ros1Bus>,
-    /// By which the Master knows the node.
+    /// Address by which the Master knows the node.
     _known: Box<dyn Send + Sync>,
     _robot: WebSocket<DuplexStream>,
 }
@@ -30,8 +30,8 @@ async fn master() -> SocketAddr {
     address
 }
 
-/// What a Master says to this.
-async fn asks(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
+/// Calls a method of a Master and returns the response.
+async fn call_master(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
     let parameters = parameters.iter();
     let parameters: String = parameters
         .map(|text| format!("<param><value>{text}</value></param>"))
@@ -53,7 +53,7 @@ async fn asks(master: SocketAddr, method: &str, parameters: &[&str]) -> String {
     String::from_utf8(answer).unwrap()
 }
 
-impl Scene {
+impl RetryScene {
     async fn new() -> Self {
         let address = master().await;
         let join = |name: &'static str| Ros1Bus::connect(Arc::new(HostSockets), address, name);
@@ -61,11 +61,14 @@ impl Scene {
             join("/bridge").await.unwrap(),
             join("/detect").await.unwrap(),
         );
-        let known = node.serve("/known", of_echo(), Arc::new(Echo));
+        let known = node.serve("/known", echo_type(), Arc::new(Echo));
         let known = known.await.unwrap();
-        let (nodes, registry) = (Arc::new(Quiet::default()), Arc::new(Registry::default()));
+        let (nodes, registry) = (
+            Arc::new(QuietNodes::default()),
+            Arc::new(Registry::default()),
+        );
         let hub = Hub::new("s1", bus, registry, nodes, HubOptions::default());
-        let (robot, _) = says(&hub, &hello("/detect", 1)).await;
+        let (robot, _) = send_hello(&hub, &hello("/detect", 1)).await;
         Self {
             master: address,
             hub,
@@ -79,27 +82,27 @@ impl Scene {
         self.hub.links.lock()["/detect"].clone()
     }
 
-    fn tells(&self, record: Record<FromRobot>) {
-        self.tells_at_cost(record, Budget::unlimited().permit());
+    fn send_record(&self, record: Record<FromRobot>) {
+        self.send_record_with_permit(record, Budget::without_limit().permit());
     }
 
-    fn tells_at_cost(&self, record: Record<FromRobot>, held: budget::Permit) {
-        link::Handler::record(&*self.link(), record, held, 0);
+    fn send_record_with_permit(&self, record: Record<FromRobot>, held: budget::Permit) {
+        link::SessionHandler::on_record(&*self.link(), record, held, 0);
     }
 
-    /// Has the Master say that the node serves this there.
-    async fn serves(&self, service: &str, at: SocketAddr) {
-        let found = asks(self.master, "lookupNode", &["/test", "/detect"]).await;
+    /// Registers a service of the node at this address with the Master.
+    async fn register_service(&self, service: &str, at: SocketAddr) {
+        let found = call_master(self.master, "lookupNode", &["/test", "/detect"]).await;
         let begin = found.find("http://").expect("its address");
         let node = found[begin..].split('<').next().unwrap();
         let at = format!("rosrpc://{at}");
         let registered = ["/detect", service, &at, node];
-        let registered = asks(self.master, "registerService", &registered).await;
+        let registered = call_master(self.master, "registerService", &registered).await;
         assert!(registered.contains(">1<"), "{registered}");
     }
 
-    /// Returns once the robot may call this.
-    async fn is_told(&self, service: &str) {
+    /// Waits until the robot may call this service.
+    async fn wait_service(&self, service: &str) {
         let link = self.link();
         while !(link.services.lock().values()).any(|known| known.name == service) {
             tokio::time::sleep(Duration::from_millis(2)).await;
@@ -116,45 +119,49 @@ impl ServiceHandler for Echo {
     }
 }
 
-fn of_echo() -> ServiceType {
+fn echo_type() -> ServiceType {
     ServiceType::new("tests/Echo", "0123456789abcdef0123456789abcdef")
 }
 
 #[tokio::test]
 async fn a_service_that_hangs_keeps_no_other_waiting() {
-    let scene = Scene::new().await;
+    let scene = RetryScene::new().await;
     let hangs = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    scene.serves("/a", hangs.local_addr().unwrap()).await;
+    scene
+        .register_service("/a", hangs.local_addr().unwrap())
+        .await;
     let asked = timeout(PATIENCE, hangs.accept()).await;
     let (mut asked, _) = asked.expect("it is asked").unwrap();
     let given_up = async { while asked.read_buf(&mut Vec::new()).await.unwrap_or(0) > 0 {} };
-    let serving = scene.node.serve("/b", of_echo(), Arc::new(Echo));
+    let serving = scene.node.serve("/b", echo_type(), Arc::new(Echo));
     let _serving = serving.await.unwrap();
     tokio::select! {
         () = given_up => panic!("the one that hangs was waited for"),
-        told = timeout(PATIENCE, scene.is_told("/b")) => told.unwrap(),
+        told = timeout(PATIENCE, scene.wait_service("/b")) => told.unwrap(),
     }
 }
 
 #[tokio::test]
 async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
-    let scene = Scene::new().await;
-    // At another Master, where nobody else is registered for it.
+    let scene = RetryScene::new().await;
+    // At another Master, where nobody else has registered it.
     let other = master().await;
     let elsewhere = Ros1Bus::connect(Arc::new(HostSockets), other, "/elsewhere");
     let elsewhere = elsewhere.await.unwrap();
-    let serving = elsewhere.serve("/a", of_echo(), Arc::new(Echo));
+    let serving = elsewhere.serve("/a", echo_type(), Arc::new(Echo));
     let _serving = serving.await.unwrap();
-    let found = asks(other, "lookupService", &["/test", "/a"]).await;
+    let found = call_master(other, "lookupService", &["/test", "/a"]).await;
     let begin = found.rfind("rosrpc://").expect("its address") + "rosrpc://".len();
     let real = found[begin..]
         .split(['<', '/', ']'])
         .next()
         .unwrap()
         .to_owned();
-    // Here it is the node's, behind something that refuses at first.
+    // The node's own service, behind something that refuses at first.
     let before = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    scene.serves("/a", before.local_addr().unwrap()).await;
+    scene
+        .register_service("/a", before.local_addr().unwrap())
+        .await;
     let answers = async {
         for _ in 0..2 {
             drop(before.accept().await.unwrap());
@@ -167,20 +174,20 @@ async fn a_service_that_does_not_tell_its_type_at_first_is_asked_again() {
     };
     tokio::select! {
         () = answers => {}
-        told = timeout(PATIENCE, scene.is_told("/a")) => told.expect("it is asked again"),
+        told = timeout(PATIENCE, scene.wait_service("/a")) => told.expect("it is asked again"),
     }
 }
 
 #[tokio::test]
 async fn an_input_that_cannot_be_published_is_tried_again() {
-    let scene = Scene::new().await;
-    // Somebody has the topic, with another type.
+    let scene = RetryScene::new().await;
+    // Somebody publishes the topic with another type.
     let other = WireType::new(
         "std_msgs/String",
         "992ce8a1687cec8c8bd883ec73ca41d1",
         "string data",
     );
-    let qos = Qos::keep_last(1);
+    let qos = QosProfile::keep_last(1);
     let other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
     let of = WireType::new(
         "std_msgs/UInt8",
@@ -192,16 +199,16 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
         .subscribe("/image", of.clone(), qos)
         .await
         .unwrap();
-    scene.tells(Record::Control(FromRobot::Open(Input {
+    scene.send_record(Record::Control(FromRobot::Open(InputChannel {
         channel: 1,
         topic: "/image".into(),
         type_name: of.name.clone(),
         md5: of.digest.to_string(),
         definition: of.definition.clone(),
-        ..Input::default()
+        ..InputChannel::default()
     })));
     let says = |value: u8| {
-        scene.tells(Record::Data(Data {
+        scene.send_record(Record::Data(Data {
             channel: 1,
             encoded: false,
             latching: false,
@@ -223,7 +230,7 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
         .await
         .expect("what waits is too old by the next time");
     drop(other);
-    let connected = heard.matched.wait_for(|now| now.connected() > 0);
+    let connected = heard.matched.wait_for(|now| now.connected_count() > 0);
     let connected = timeout(PATIENCE, connected).await;
     assert!(connected.is_ok(), "it is not tried again");
     says(2);
@@ -233,37 +240,37 @@ async fn an_input_that_cannot_be_published_is_tried_again() {
 
 #[tokio::test]
 async fn an_input_that_is_refused_counts_as_its_robots_until_its_channel_is_closed() {
-    let scene = Scene::new().await;
+    let scene = RetryScene::new().await;
     let other = WireType::new(
         "std_msgs/String",
         "992ce8a1687cec8c8bd883ec73ca41d1",
         "string data",
     );
-    let qos = Qos::keep_last(1);
+    let qos = QosProfile::keep_last(1);
     let _other = scene.hub.bus.advertise("/image", other, qos).await.unwrap();
     let told = Budget::new("what robot x tells", 1 << 20);
-    let open = Record::Control(FromRobot::Open(Input {
+    let open = Record::Control(FromRobot::Open(InputChannel {
         channel: 1,
         topic: "/image".into(),
         type_name: "std_msgs/UInt8".into(),
         md5: "7c8164229e7d2c17eb95e9231617fdee".into(),
         definition: "uint8 data".into(),
-        ..Input::default()
+        ..InputChannel::default()
     }));
-    scene.tells_at_cost(open, told.take(1000).unwrap());
-    // The next order is obeyed when it has been taken up.
+    scene.send_record_with_permit(open, told.take(1000).unwrap());
+    // The next control message is processed after this one was started.
     let (parameters, obeyed) = (Vec::new(), told.take(10).unwrap());
-    scene.tells_at_cost(Record::Control(FromRobot::Parameters(parameters)), obeyed);
+    scene.send_record_with_permit(Record::Control(FromRobot::Parameters(parameters)), obeyed);
     let used = async |bytes: usize| {
         let used = async {
-            while told.used() != bytes {
+            while told.used_bytes() != bytes {
                 tokio::task::yield_now().await;
             }
         };
         let used = timeout(PATIENCE, used).await;
-        assert!(used.is_ok(), "{} of {bytes} bytes", told.used());
+        assert!(used.is_ok(), "{} of {bytes} bytes", told.used_bytes());
     };
     used(1000).await;
-    scene.tells(Record::Control(FromRobot::Close { channel: 1 }));
+    scene.send_record(Record::Control(FromRobot::Close { channel: 1 }));
     used(0).await;
 }

@@ -1,4 +1,4 @@
-//! Changes of parameters on their way to whoever watches them: of each key the last one, in bytes that somebody pays for.
+//! Queue of parameter changes for a watcher: holds the last change of each key, within a memory budget.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -9,26 +9,26 @@ use tokio::sync::Notify;
 
 use super::{ParamChange, ParamValue};
 
-/// What a change takes besides its key and its value, in bytes.
+/// Bytes charged for a change in addition to its key and value.
 const OVERHEAD: usize = 256;
 
-/// Parameters as they change: key and value, or no value where one was deleted. Of a key that changes faster than it is read the
-/// last value is told, after all that changed before it.
-pub struct ParamChanges(Arc<Queue>);
+/// Parameter changes: key and value, or no value for a deleted parameter. If a key changes faster than it is read, only
+/// its last value is delivered, after everything that changed before it.
+pub struct ParamChangeReceiver(Arc<ChangeQueue>);
 
-/// Where changes are told that somebody watches. The watcher hears the end when this is dropped.
-pub(crate) struct ParamTeller(Arc<Queue>);
+/// Sends changes to a watcher. The watcher sees the end of the stream when this is dropped.
+pub(crate) struct ParamChangeSender(Arc<ChangeQueue>);
 
-struct Queue {
-    waiting: Mutex<Waiting>,
+struct ChangeQueue {
+    waiting: Mutex<PendingChanges>,
     told: Notify,
     budget: Budget,
 }
 
 #[derive(Default)]
-struct Waiting {
+struct PendingChanges {
     changes: BTreeMap<u64, Change>,
-    /// The numbers of the changes that wait, by key.
+    /// Sequence numbers of the queued changes, by key.
     numbers: HashMap<String, u64>,
     next: u64,
     closed: bool,
@@ -39,26 +39,29 @@ struct Change {
     _held: Permit,
 }
 
-/// The two ends of a watch. What waits counts in `budget`.
-pub(crate) fn changes_within(budget: &Budget) -> (ParamTeller, ParamChanges) {
-    let queue = Arc::new(Queue {
+/// Creates the two ends of a watch. Queued changes are charged to `budget`.
+pub(crate) fn param_change_channel(budget: &Budget) -> (ParamChangeSender, ParamChangeReceiver) {
+    let queue = Arc::new(ChangeQueue {
         waiting: Mutex::default(),
         told: Notify::new(),
         budget: budget.clone(),
     });
-    (ParamTeller(Arc::clone(&queue)), ParamChanges(queue))
+    (
+        ParamChangeSender(Arc::clone(&queue)),
+        ParamChangeReceiver(queue),
+    )
 }
 
-impl ParamTeller {
-    /// Tells a change.
+impl ParamChangeSender {
+    /// Sends a change.
     ///
     /// # Errors
-    /// There is no memory for it: it is not told.
-    pub(crate) fn tell(&self, key: String, value: Option<ParamValue>) -> Result<(), Exceeded> {
+    /// The budget is exhausted; the change is not sent.
+    pub(crate) fn send(&self, key: String, value: Option<ParamValue>) -> Result<(), Exceeded> {
         let bytes = OVERHEAD + 2 * key.len() + value.as_ref().map_or(0, ParamValue::bytes_held);
         {
             let mut waiting = self.0.waiting.lock();
-            // What it had before is of no use any more, whatever becomes of this one.
+            // The earlier change of this key is obsolete, whatever happens to the new one.
             if let Some(before) = waiting.numbers.remove(&key) {
                 waiting.changes.remove(&before);
             }
@@ -77,15 +80,15 @@ impl ParamTeller {
     }
 }
 
-impl Drop for ParamTeller {
+impl Drop for ParamChangeSender {
     fn drop(&mut self) {
         self.0.waiting.lock().closed = true;
         self.0.told.notify_one();
     }
 }
 
-impl ParamChanges {
-    /// The next change; none when there will be no more.
+impl ParamChangeReceiver {
+    /// Returns the next change, or `None` at the end of the stream.
     pub async fn recv(&mut self) -> Option<ParamChange> {
         loop {
             {
@@ -104,7 +107,7 @@ impl ParamChanges {
 }
 
 impl ParamValue {
-    /// About how much memory it takes, in bytes.
+    /// Returns the approximate memory used, in bytes.
     pub fn bytes_held(&self) -> usize {
         let own = size_of::<Self>();
         own + match self {
@@ -132,19 +135,19 @@ mod tests {
 
     #[tokio::test]
     async fn of_a_key_the_last_change_is_told_after_those_before_it() {
-        let (teller, mut changes) = changes_within(&Budget::unlimited());
+        let (teller, mut changes) = param_change_channel(&Budget::without_limit());
         for number in 0..1000 {
-            teller.tell("/a".into(), value(number)).expect("memory");
+            teller.send("/a".into(), value(number)).expect("memory");
         }
-        teller.tell("/a/b".into(), value(1)).expect("memory");
-        teller.tell("/c".into(), None).expect("memory");
-        teller.tell("/a".into(), value(7)).expect("memory");
+        teller.send("/a/b".into(), value(1)).expect("memory");
+        teller.send("/c".into(), None).expect("memory");
+        teller.send("/a".into(), value(7)).expect("memory");
         for expected in [("/a/b", value(1)), ("/c", None), ("/a", value(7))] {
             let (key, value) = changes.recv().await.expect("a change");
             assert_eq!((&*key, value), expected);
         }
         assert!(changes.recv().now_or_never().is_none(), "it is told all");
-        teller.tell("/a".into(), None).expect("memory");
+        teller.send("/a".into(), None).expect("memory");
         drop(teller);
         assert_eq!(changes.recv().await, Some(("/a".into(), None)));
         assert_eq!(changes.recv().await, None);
@@ -153,19 +156,23 @@ mod tests {
     #[tokio::test]
     async fn what_is_not_read_is_paid_for_and_has_an_end() {
         let budget = Budget::new("parameters", 1 << 20);
-        let (teller, mut changes) = changes_within(&budget);
+        let (teller, mut changes) = param_change_channel(&budget);
         let text = || Some(ParamValue::String("x".repeat(10_000)));
-        let told = (0..1000).map(|number| teller.tell(format!("/{number}"), text()));
+        let told = (0..1000).map(|number| teller.send(format!("/{number}"), text()));
         let told = told.filter(Result::is_ok).count();
         assert!((90..=104).contains(&told), "{told} are told");
-        assert!(budget.used() > 900_000, "{} bytes count", budget.used());
-        let refused = teller.tell("/more".into(), text()).expect_err("no memory");
+        assert!(
+            budget.used_bytes() > 900_000,
+            "{} bytes count",
+            budget.used_bytes()
+        );
+        let refused = teller.send("/more".into(), text()).expect_err("no memory");
         assert_eq!(refused.name, "parameters");
-        // One that is read makes room for another.
+        // Reading one change makes room for another.
         assert_eq!(changes.recv().await.expect("a change").0, "/0");
-        teller.tell("/more".into(), text()).expect("memory");
+        teller.send("/more".into(), text()).expect("memory");
         drop(changes);
         drop(teller);
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 }

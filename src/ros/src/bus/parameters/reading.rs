@@ -1,7 +1,7 @@
-//! Values as they are read from JSON and the like: in one pass, up to a depth and a number.
+//! Deserialization of parameter values from JSON and the like: in one pass, with limits on depth and number of values.
 //!
-//! Nothing is derived here. What serde derives for an untagged enum keeps a copy of all that is left at each level, so that a text of
-//! 2 MB, nested 100 deep, took tens of gigabytes.
+//! Nothing is derived here: the code that serde derives for an untagged enum buffers the remaining input at each level,
+//! so a 2 MB text nested 100 deep took tens of gigabytes.
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
@@ -13,16 +13,16 @@ use serde::{Deserialize, Deserializer};
 use super::ParamValue;
 
 impl ParamValue {
-    /// Lists and maps within each other, at most: as deep as the Master and XML-RPC go.
+    /// Maximum nesting of lists and maps; the same as for the Master and XML-RPC.
     pub const MAX_DEPTH: usize = 100;
-    /// Values within one, itself included: as many as XML-RPC carries.
+    /// Maximum number of values in one value, itself included; the same as for XML-RPC.
     pub const MAX_VALUES: usize = 500_000;
 }
 
 impl<'de> Deserialize<'de> for ParamValue {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let values = Cell::new(Self::MAX_VALUES);
-        let reader = Reader {
+        let reader = ParamValueReader {
             depth: Self::MAX_DEPTH,
             values: &values,
         };
@@ -32,27 +32,27 @@ impl<'de> Deserialize<'de> for ParamValue {
 
 /// Reads one value.
 #[derive(Clone, Copy)]
-struct Reader<'a> {
-    /// Lists and maps that may still be opened within each other.
+struct ParamValueReader<'a> {
+    /// Remaining nesting levels of lists and maps.
     depth: usize,
-    /// Values that may still come.
+    /// Remaining number of values.
     values: &'a Cell<usize>,
 }
 
-impl Reader<'_> {
-    /// Reads what stands in a list or map.
-    fn deeper<E: Error>(self) -> Result<Self, E> {
+impl ParamValueReader<'_> {
+    /// Returns the reader for the items of a list or map.
+    fn descend<E: Error>(self) -> Result<Self, E> {
         match self.depth.checked_sub(1) {
             Some(depth) => Ok(Self { depth, ..self }),
             None => Err(E::custom(format_args!(
-                "lists and maps stand within each other more than {} deep",
+                "lists and maps are nested more than {} deep",
                 ParamValue::MAX_DEPTH
             ))),
         }
     }
 }
 
-impl<'de> DeserializeSeed<'de> for Reader<'_> {
+impl<'de> DeserializeSeed<'de> for ParamValueReader<'_> {
     type Value = ParamValue;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<ParamValue, D::Error> {
@@ -67,7 +67,7 @@ impl<'de> DeserializeSeed<'de> for Reader<'_> {
     }
 }
 
-impl<'de> Visitor<'de> for Reader<'_> {
+impl<'de> Visitor<'de> for ParamValueReader<'_> {
     type Value = ParamValue;
 
     fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -83,7 +83,7 @@ impl<'de> Visitor<'de> for Reader<'_> {
     }
 
     fn visit_u64<E: Error>(self, number: u64) -> Result<ParamValue, E> {
-        // What no integer of ROS holds is a double, as in Python's JSON.
+        // Integers beyond 64 bits signed become doubles, as in Python's JSON.
         let whole = i64::try_from(number).map(ParamValue::Int);
         Ok(whole.unwrap_or(ParamValue::Double(number as f64)))
     }
@@ -101,7 +101,7 @@ impl<'de> Visitor<'de> for Reader<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<ParamValue, A::Error> {
-        let reader = self.deeper()?;
+        let reader = self.descend()?;
         let mut items = Vec::new();
         while let Some(item) = list.next_element_seed(reader)? {
             items.push(item);
@@ -111,7 +111,7 @@ impl<'de> Visitor<'de> for Reader<'_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<ParamValue, A::Error> {
-        let reader = self.deeper()?;
+        let reader = self.descend()?;
         let mut members = BTreeMap::new();
         while let Some(name) = map.next_key::<String>()? {
             members.insert(name, map.next_value_seed(reader)?);

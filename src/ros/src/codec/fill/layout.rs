@@ -1,35 +1,34 @@
-//! What differs between the bytes of ROS 1 and of ROS 2 for who writes them: padding, the ends of texts, and what a field
-//! holds that was left out.
+//! Output layouts of ROS 1 and ROS 2: padding, string termination, and defaults of missing fields.
 
 use std::ops::Range;
 
 use crate::codec::Time;
 use crate::codec::realign::Realign;
 use crate::schema::MessageType;
-use crate::schema::initial::{Initial, Item};
+use crate::schema::initial::{Initial, InitialItem};
 use crate::schema::plan::{Count, Kind, Member, Scalar, Text};
 
-/// How values stand in the output.
-pub(super) trait Layout: Copy {
-    /// Types without fields have a byte all the same.
+/// The layout of values in the output.
+pub(super) trait OutputLayout: Copy {
+    /// True if a type without fields is serialized as one byte.
     const PLACEHOLDERS: bool;
-    /// A NUL ends a text, and counts in its length.
+    /// True if strings end with a NUL, which counts in their length.
     const TERMINATED: bool;
-    /// Appends what must stand before a value of this alignment, a power of two up to 8.
+    /// Appends padding before a value of this alignment, a power of two up to 8.
     fn align(self, out: &mut Vec<u8>, alignment: usize);
-    /// Appends what the field holds that was left out; `now` where it is a header's stamp, or a header.
+    /// Appends the default of a missing field; `now` is given for the stamp of a header, or for a header.
     fn put_default(self, out: &mut Vec<u8>, member: &Member, now: Option<Time>);
-    /// How far behind a multiple of 8 a place in the output is, counted as alignment is.
+    /// Returns the distance of a position in the output from a multiple of 8, counted from the origin of alignment.
     fn phase(self, at: usize) -> usize;
-    /// Appends a field that was written elsewhere: a piece of bytes that begin at such a multiple.
+    /// Appends a field that was written elsewhere: a range of `written`, which begins at such a multiple.
     fn put_piece(self, out: &mut Vec<u8>, member: &Member, written: &[u8], piece: Range<usize>);
 }
 
-/// ROS 1: one value behind the other.
+/// ROS 1: values without padding.
 #[derive(Clone, Copy)]
 pub(super) struct Packed;
 
-impl Layout for Packed {
+impl OutputLayout for Packed {
     const PLACEHOLDERS: bool = false;
     const TERMINATED: bool = false;
 
@@ -41,12 +40,12 @@ impl Layout for Packed {
         out.resize(begin + member.min_size, 0);
         let at = match &member.kind {
             Kind::Scalar(Scalar::Time) => begin,
-            // Behind the sequence number.
+            // The stamp follows the sequence number.
             Kind::Struct(message) if message.plan.header => begin + 4,
             _ => return,
         };
         if let Some(now) = now {
-            out[at..at + 8].copy_from_slice(&bytes_of(now));
+            out[at..at + 8].copy_from_slice(&time_bytes(now));
         }
     }
 
@@ -62,11 +61,11 @@ impl Layout for Packed {
 /// ROS 2: each number at a multiple of its size.
 #[derive(Clone, Copy)]
 pub(super) struct Aligned {
-    /// Where the body begins in the output.
+    /// Offset of the body in the output.
     pub(super) origin: usize,
 }
 
-impl Layout for Aligned {
+impl OutputLayout for Aligned {
     const PLACEHOLDERS: bool = true;
     const TERMINATED: bool = true;
 
@@ -114,7 +113,7 @@ impl Aligned {
                 self.align(out, scalar.alignment());
                 match now {
                     Some(now) if *scalar == Scalar::Time2 => {
-                        out.extend_from_slice(&bytes_of(now));
+                        out.extend_from_slice(&time_bytes(now));
                     }
                     _ => put_scalars(out, *scalar, 1, items),
                 }
@@ -155,49 +154,48 @@ impl Aligned {
         }
     }
 
-    fn put_length(self, out: &mut Vec<u8>, count: Count, items: &[Item]) -> usize {
+    fn put_length(self, out: &mut Vec<u8>, count: Count, items: &[InitialItem]) -> usize {
         if let Count::Fixed(length) = count {
             return length;
         }
         self.align(out, 4);
-        // A definition's text is much shorter than 4 GiB.
+        // The text of a definition is much shorter than 4 GiB.
         out.extend_from_slice(&(items.len() as u32).to_le_bytes());
         items.len()
     }
 
-    fn put_text(self, out: &mut Vec<u8>, text: Text, item: Option<&Item>) {
+    fn put_text(self, out: &mut Vec<u8>, text: Text, item: Option<&InitialItem>) {
         let written = match item {
-            Some(Item::Text(written)) => &**written,
+            Some(InitialItem::Text(written)) => &**written,
             _ => "",
         };
         self.align(out, 4);
         let begin = out.len();
         out.extend_from_slice(&[0; 4]);
-        let length = match text.wide {
-            true => put_wide(out, written),
-            false => {
-                out.extend_from_slice(written.as_bytes());
-                out.push(0);
-                written.len() + 1
-            }
+        let length = if text.wide {
+            put_wide(out, written)
+        } else {
+            out.extend_from_slice(written.as_bytes());
+            out.push(0);
+            written.len() + 1
         };
         out[begin..begin + 4].copy_from_slice(&(length as u32).to_le_bytes());
     }
 }
 
-/// As many as there are of the items, then zeros.
-fn put_scalars(out: &mut Vec<u8>, scalar: Scalar, length: usize, items: &[Item]) {
+/// Appends the items, then zeros up to `length`.
+fn put_scalars(out: &mut Vec<u8>, scalar: Scalar, length: usize, items: &[InitialItem]) {
     let size = scalar.size();
     let end = out.len() + length * size;
     for item in items.iter().take(length) {
-        if let Item::Scalar(bytes) = item {
+        if let InitialItem::Scalar(bytes) = item {
             out.extend_from_slice(&bytes[..size]);
         }
     }
     out.resize(end, 0);
 }
 
-/// Appends the units of wide text; gives their number.
+/// Appends the units of wide text; returns their number.
 pub(super) fn put_wide(out: &mut Vec<u8>, text: &str) -> usize {
     let mut units = 0;
     for unit in text.encode_utf16() {
@@ -207,7 +205,7 @@ pub(super) fn put_wide(out: &mut Vec<u8>, text: &str) -> usize {
     units
 }
 
-fn bytes_of(time: Time) -> [u8; 8] {
+fn time_bytes(time: Time) -> [u8; 8] {
     let mut bytes = [0; 8];
     bytes[..4].copy_from_slice(&time.secs.to_le_bytes());
     bytes[4..].copy_from_slice(&time.nsecs.to_le_bytes());

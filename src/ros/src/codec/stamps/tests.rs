@@ -12,7 +12,7 @@ fn registry(definitions: &[(&str, &str)]) -> Registry {
     registry
 }
 
-/// tf2_msgs/TFMessage and what is in it.
+/// tf2_msgs/TFMessage and its dependencies.
 fn tf() -> Arc<MessageType> {
     registry(&[
         (
@@ -63,7 +63,7 @@ impl Message {
 
 #[test]
 fn stamps_of_nested_messages_in_arrays_are_found() {
-    let stamps = Stamps::of(&tf());
+    let stamps = Stamps::for_type(&tf());
     let mut message = Message(Vec::new(), Vec::new());
     message.word(3);
     for child in ["a", "", "a longer name"] {
@@ -80,7 +80,7 @@ fn what_follows_the_last_stamp_is_not_looked_at() {
     )])
     .message("sensor_msgs/Image")
     .unwrap();
-    let stamps = Stamps::of(&image);
+    let stamps = Stamps::for_type(&image);
     let mut message = Message(Vec::new(), Vec::new());
     message.word(1).time().text("camera");
     assert_eq!(stamps.find(&message.0).unwrap(), [4]);
@@ -92,7 +92,8 @@ fn every_shape_of_field_is_passed() {
     let shapes = registry(&[
         (
             "a/Shapes",
-            "int8 before\nstring[] names\nfloat64[2] pair\nEmpty[] nothings\nInner[2] inner\nNameless[] nameless\ntime[] times\ntime[2] both\nduration not_a_stamp\nint32[] numbers\ntime last\nstring after",
+            "int8 before\nstring[] names\nfloat64[2] pair\nEmpty[] nothings\nInner[2] inner\nNameless[] nameless\n\
+             time[] times\ntime[2] both\nduration not_a_stamp\nint32[] numbers\ntime last\nstring after",
         ),
         ("a/Empty", ""),
         ("a/Inner", "string[2] names\ntime stamp"),
@@ -100,7 +101,7 @@ fn every_shape_of_field_is_passed() {
     ])
     .message("a/Shapes")
     .unwrap();
-    let stamps = Stamps::of(&shapes);
+    let stamps = Stamps::for_type(&shapes);
     let mut message = Message(Vec::new(), Vec::new());
     message.zeros(1).word(2).text("x").text("yz").zeros(16);
     message.word(usize::try_from(u32::MAX).unwrap());
@@ -121,7 +122,7 @@ fn a_type_without_a_stamp_costs_nothing() {
     let text = registry(&[("std_msgs/String", "string data")])
         .message("std_msgs/String")
         .unwrap();
-    assert!(Stamps::of(&text).is_empty());
+    assert!(Stamps::for_type(&text).is_empty());
     assert!(Stamps::default().find(b"anything").unwrap().is_empty());
 }
 
@@ -142,8 +143,8 @@ fn a_definition_that_doubles_with_each_level_is_no_trouble() {
         .zip(&texts)
         .map(|(name, text)| (name.as_str(), text.as_str()))
         .collect();
-    // Refused before it comes here, or cheap.
+    // Either refused earlier, or cheap.
     if let Ok(message) = registry(&definitions).message("a/L0") {
-        assert!(Stamps::of(&message).is_empty());
+        assert!(Stamps::for_type(&message).is_empty());
     }
 }

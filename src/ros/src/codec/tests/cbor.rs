@@ -13,7 +13,7 @@ fn ros_of(message: &MessageType, cbor: &[u8]) -> Result<Vec<u8>, String> {
     result.map(|()| out).map_err(|error| error.to_string())
 }
 
-/// A map of one key, `data`.
+/// A map with one key, `data`.
 fn data(value: &[u8]) -> Vec<u8> {
     [b"\xa1\x64data", value].concat()
 }
@@ -170,12 +170,12 @@ fn typed_arrays_of_every_width_and_order() {
     assert!(
         list("words", b"\xd8\x46\x43\x01\0\0")
             .unwrap_err()
-            .contains("no multiple of its element")
+            .contains("not a multiple of its element")
     );
     assert!(
         list("words", b"\xd8\x46\x82\x01\x02")
             .unwrap_err()
-            .contains("no byte string")
+            .contains("not a byte string")
     );
     assert!(
         list("words", b"\xd8\x57\x50")

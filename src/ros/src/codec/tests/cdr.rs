@@ -1,4 +1,4 @@
-//! ROS 2's bytes, as rclpy's serialization has them.
+//! ROS 2's serialization, compared with that of rclpy.
 
 use super::super::*;
 use super::message as message_of_one;
@@ -6,7 +6,7 @@ use crate::schema::Registry;
 use std::sync::Arc;
 
 fn registry() -> Registry {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in [
         ("a/msg/Nothing", ""),
         ("a/msg/Text", "string data"),
@@ -65,7 +65,7 @@ fn cdr_of(message: &MessageType, json: &str) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// The bytes of hex digits and spaces.
+/// Parses hex digits, ignoring spaces.
 fn hex(digits: &str) -> Vec<u8> {
     let digits: String = digits.split_whitespace().collect();
     hex::decode(digits).unwrap()
@@ -106,7 +106,7 @@ fn texts_count_their_nul_and_wide_ones_have_four_bytes_per_unit() {
     ] {
         assert_eq!(json_of(&text, &hex(bytes)).unwrap(), json, "{bytes}");
     }
-    // Half a surrogate is replaced or refused, as what is not UTF-8 is.
+    // Half a surrogate is replaced or refused, like invalid UTF-8.
     let half = hex("00010000 02000000 3dd80000 61000000 05");
     let wide = message("a/Wide");
     assert_eq!(
@@ -133,7 +133,7 @@ fn numbers_are_aligned_from_the_body_on_in_both_orders_of_bytes() {
         "00010000 0100000000000000 000000000000e03f feff0000 03000000 0100000000000000 ffffffffffffffff",
         json,
     );
-    // Of any value is what pads.
+    // Padding may have any value.
     let big = hex(
         "00000000 01aaaaaaaaaaaaaa 3fe0000000000000 fffebbbb 00000003 01cccccccccccccc ffffffffffffffff",
     );
@@ -175,15 +175,15 @@ fn left_out_fields_have_the_definitions_values_and_stamps_the_clock() {
             header_stamp(&place, &bytes),
             Some(Time { secs: 9, nsecs: 8 })
         );
-        assert_eq!(Stamps::of(&place).find(&bytes), Some(vec![4]));
+        assert_eq!(Stamps::for_type(&place).find(&bytes), Some(vec![4]));
         let value = Value::read(&place, &bytes).unwrap();
         assert_eq!(value.field("name").unwrap().text().unwrap(), "here");
         let stamp = value.field("header").unwrap().field("stamp").unwrap();
         assert_eq!(stamp.time(), Some(Time { secs: 9, nsecs: 8 }));
     }
     let bytes = default_message(&way);
-    assert_eq!(Stamps::of(&way).find(&bytes), Some(vec![8]));
-    assert!(Stamps::of(&message("a/Steps")).is_empty());
+    assert_eq!(Stamps::for_type(&way).find(&bytes), Some(vec![8]));
+    assert!(Stamps::for_type(&message("a/Steps")).is_empty());
 }
 
 #[test]
@@ -309,7 +309,7 @@ fn what_may_be_written_is_limited() {
     let refused = from_json(&way, json.as_bytes(), &mut out, &options).unwrap_err();
     assert_eq!(refused.kind, CodecErrorKind::TooLarge(100));
     assert!(out.capacity() < 1000);
-    // The same error as ROS 1's.
+    // The same error as in ROS 1.
     let path = message_of_one("nav_msgs/Path");
     let json = format!(r#"{{"poses":[{}]}}"#, ["{}"; 40].join(","));
     let of_one = from_json(&path, json.as_bytes(), &mut out, &options).unwrap_err();

@@ -111,7 +111,7 @@ fn stamps_are_filled_where_the_client_left_them_out() {
         ),
         Some(zero)
     );
-    // Other times are left alone.
+    // Other times are left unchanged.
     assert_eq!(
         ros_at(&message("std_msgs/Time"), "{}", now).unwrap(),
         [0; 8]

@@ -1,4 +1,4 @@
-//! Random types of either ROS, random messages of them, and random damage.
+//! Random types of either ROS version, random messages of them, and random damage.
 
 use proptest::prelude::*;
 
@@ -16,7 +16,7 @@ impl Choices<'_> {
         self.0.next().copied().unwrap_or(0)
     }
 
-    fn below(&mut self, bound: usize) -> usize {
+    fn choose_below(&mut self, bound: usize) -> usize {
         usize::from(self.byte()) % bound
     }
 
@@ -25,7 +25,7 @@ impl Choices<'_> {
     }
 }
 
-/// A type `a/T0` made of random fields, some of them of types `a/T1`, `a/T2`.
+/// Generates a type `a/T0` with random fields, some of them of types `a/T1`, `a/T2`.
 fn random_type(version: RosVersion, choices: &mut Choices<'_>) -> Arc<MessageType> {
     const TYPES: [&str; 17] = [
         "bool",
@@ -47,30 +47,31 @@ fn random_type(version: RosVersion, choices: &mut Choices<'_>) -> Arc<MessageTyp
         "std_msgs/Header",
     ];
     let two = version == RosVersion::Two;
-    let registry = Registry::of(version);
+    let registry = Registry::for_version(version);
     for level in (0..3).rev() {
         let mut text = String::new();
-        for index in 0..choices.below(7) {
-            let pick = choices.below(TYPES.len() + 2 * (2 - level));
+        for index in 0..choices.choose_below(7) {
+            let pick = choices.choose_below(TYPES.len() + 2 * (2 - level));
             let nested = format!("T{}", level + 1 + (pick % 2) % (3 - level).max(1));
             let nested = if level == 1 { "T2".to_owned() } else { nested };
             let base = match TYPES.get(pick).copied().unwrap_or(&nested) {
                 "time" if two => "builtin_interfaces/Time",
                 "duration" if two => "builtin_interfaces/Duration",
-                "string" if two => ["string", "wstring", "string<=40"][choices.below(3)],
+                "string" if two => ["string", "wstring", "string<=40"][choices.choose_below(3)],
                 other => other,
             };
-            let brackets = match two {
-                false => ["", "", "[]", "[3]", "[0]"][choices.below(5)],
-                true => ["", "", "[]", "[3]", "[<=5]"][choices.below(5)],
+            let brackets = if two {
+                ["", "", "[]", "[3]", "[<=5]"][choices.choose_below(5)]
+            } else {
+                ["", "", "[]", "[3]", "[0]"][choices.choose_below(5)]
             };
-            // What a client leaves out, a definition may say.
-            let value = match (two && choices.below(4) == 0, base, brackets) {
+            // A definition may have defaults for missing fields.
+            let value = match (two && choices.choose_below(4) == 0, base, brackets) {
                 (true, "uint16" | "float64" | "string" | "wstring", "") => " 7",
                 (true, "int64" | "string<=40", "[]" | "[<=5]") => " [1, 2]",
                 _ => "",
             };
-            // Names out of alphabetical order: sorted keys are then out of order.
+            // Names out of alphabetical order, so that sorted keys are out of order.
             let letter = char::from(b'z' - (index as u8 * 7 + level as u8) % 26);
             text.push_str(&format!("{base}{brackets} {letter}{index}{value}\n"));
         }
@@ -79,14 +80,14 @@ fn random_type(version: RosVersion, choices: &mut Choices<'_>) -> Arc<MessageTyp
     registry.message("a/T0").unwrap()
 }
 
-/// Writes messages without any of the codec's code.
+/// Writes messages without using any of the codec's code.
 struct Writer {
     out: Vec<u8>,
     version: RosVersion,
     big_endian: bool,
-    /// What pads, which is of any value.
+    /// Value of padding bytes; any value is valid.
     padding: u8,
-    /// Where times were written.
+    /// Offsets of the times written.
     times: Vec<usize>,
 }
 
@@ -105,9 +106,9 @@ impl Writer {
         }
     }
 
-    /// A number, given little endian.
+    /// Writes a number given as little-endian bytes.
     fn number(&mut self, bytes: &[u8]) {
-        // The header is four bytes, so that places count from four.
+        // The header has four bytes, so offsets count from four.
         while self.version == RosVersion::Two && (self.out.len() + 4) % bytes.len() != 0 {
             self.out.push(self.padding);
         }
@@ -131,7 +132,7 @@ impl Writer {
                 Arity::One => 1,
                 Arity::Fixed(count) => count as usize,
                 Arity::Variable => {
-                    let count = choices.below(5);
+                    let count = choices.choose_below(5);
                     self.length(count);
                     count
                 }
@@ -151,9 +152,10 @@ impl Writer {
     fn value(&mut self, primitive: Primitive, choices: &mut Choices<'_>) {
         match primitive {
             Primitive::Bool => self.number(&[choices.byte() & 1]),
-            // Finite or one NaN: which NaN it was is not kept. Of few digits, for serde_json rounds long ones its own way.
+            // Finite, or a single NaN: which NaN it was is not preserved. With few digits, because serde_json rounds
+            // long numbers in its own way.
             Primitive::Float32 => {
-                let value = match choices.below(8) {
+                let value = match choices.choose_below(8) {
                     0 => f32::NAN,
                     1 => f32::INFINITY,
                     _ => (choices.word() as i16) as f32 / 64.0,
@@ -161,7 +163,7 @@ impl Writer {
                 self.number(&value.to_le_bytes());
             }
             Primitive::Float64 => {
-                let value = match choices.below(8) {
+                let value = match choices.choose_below(8) {
                     0 => f64::NAN,
                     1 => f64::NEG_INFINITY,
                     _ => (choices.word() as i16) as f64 / 1024.0,
@@ -169,8 +171,10 @@ impl Writer {
                 self.number(&value.to_le_bytes());
             }
             Primitive::String | Primitive::Wstring => {
-                let text: String = (0..choices.below(12))
-                    .map(|_| ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.below(9)])
+                let text: String = (0..choices.choose_below(12))
+                    .map(|_| {
+                        ['a', '"', '\\', '\n', 'ü', '机', '🤖', '\0', 'z'][choices.choose_below(9)]
+                    })
                     .collect();
                 self.text(&text, primitive == Primitive::Wstring);
             }
@@ -225,12 +229,12 @@ fn random_of(
     (message, writer)
 }
 
-/// Whether these are the same values, bytes as text left out.
+/// Compares values, except bytes given as text.
 fn is_same(value: &Value<'_>, json: &serde_json::Value) -> bool {
     use serde_json::Value as Json;
     match (value, json) {
         (Value::Number(number), Json::Bool(json)) => *number == f64::from(u8::from(*json)),
-        // Integers are rounded, singles are written shortly.
+        // Integers are rounded, singles are written in short form.
         (Value::Number(number), Json::Number(json)) => json
             .as_f64()
             .is_some_and(|json| json == *number || json as f32 == *number as f32),
@@ -288,8 +292,9 @@ fn damage(bytes: &mut Vec<u8>, edits: &[(u16, u8, u8)]) {
     }
 }
 
-/// What is valid is written and what is not is refused; only what would grow beyond the limit is refused though valid: a
-/// few damaged bytes can ask for tens of thousands of elements of a type without fields, which hold nothing in ROS bytes and much in JSON.
+/// Checks that valid messages are written and invalid ones refused. A valid message is refused only if it would exceed
+/// the limit: a few damaged bytes can ask for tens of thousands of elements of a type without fields, which take no ROS
+/// bytes but much JSON.
 fn agrees(valid: &Result<(), CodecError>, written: &Result<(), CodecError>) -> bool {
     match written {
         Err(error) if matches!(error.kind, CodecErrorKind::TooLarge(_)) => true,
@@ -348,7 +353,7 @@ proptest! {
         prop_assert_eq!(&back, &bytes);
         prop_assert_eq!(json_value_len(&json).unwrap(), json.len());
 
-        // Through another's tree, where keys are sorted by name.
+        // Through another library's tree, in which keys are sorted by name.
         let tree: serde_json::Value = serde_json::from_slice(&json).unwrap();
         back.clear();
         from_json(&message, tree.to_string().as_bytes(), &mut back, &fill_options()).unwrap();
@@ -398,12 +403,12 @@ proptest! {
             to_json(&message, &bytes, &mut json, &json_options()).unwrap();
             let json = serde_json::from_slice(&json).unwrap();
             let value = Value::read(&message, &bytes);
-            // More elements without any bytes than bytes follow are not looked at: ROS 1's alone have none.
+            // More elements without bytes than there are bytes left are not read; only those of ROS 1 have no bytes.
             let same = value.as_ref().map_or(version == RosVersion::One, |value| is_same(value, &json));
             prop_assert!(same, "{:?} is not {}", value, json);
-            let stamps = Stamps::of(&message);
+            let stamps = Stamps::for_type(&message);
             prop_assert_eq!(stamps.find(&bytes), Some(writer.times.clone()));
-            // Whatever is written there is read again, and nothing beside it is touched.
+            // Whatever is written there is read back, and nothing else is changed.
             let mut again = bytes.clone();
             for at in writer.times {
                 let stamp = stamps.read(&bytes, at).unwrap();
@@ -451,12 +456,12 @@ proptest! {
         };
         let (message, alone) = write(&[], 0);
         let (_, behind) = write(&before, 0);
-        prop_assert_eq!(&embedded::embedded(&message, &alone, 0, &before).unwrap(), &behind);
-        prop_assert_eq!(&embedded::embedded(&message, &behind, before.len(), &[]).unwrap(), &alone);
-        // Whatever pads it, and whatever follows it.
+        prop_assert_eq!(&embedded::extract_embedded(&message, &alone, 0, &before).unwrap(), &behind);
+        prop_assert_eq!(&embedded::extract_embedded(&message, &behind, before.len(), &[]).unwrap(), &alone);
+        // With any padding before it and any bytes after it.
         let (_, mut padded) = write(&before, padding);
         padded.extend([padding; 3]);
-        let taken = embedded::embedded(&message, &padded, before.len(), &[]).unwrap();
+        let taken = embedded::extract_embedded(&message, &padded, before.len(), &[]).unwrap();
         let (mut json, mut expected) = (Vec::new(), Vec::new());
         to_json(&message, &taken, &mut json, &json_options()).unwrap();
         to_json(&message, &alone, &mut expected, &json_options()).unwrap();
@@ -471,8 +476,8 @@ proptest! {
     ) {
         let (message, mut bytes) = random(RosVersion::Two, &choices);
         damage(&mut bytes, &edits);
-        if let Some(taken) = embedded::embedded(&message, &bytes, before, &[]) {
-            // Each value may need other padding than before.
+        if let Some(taken) = embedded::extract_embedded(&message, &bytes, before, &[]) {
+            // Each value may need different padding.
             prop_assert!(taken.len() <= 8 * bytes.len());
         }
     }
@@ -509,7 +514,8 @@ proptest! {
         prop_assert!(agrees(&valid, &written), "{valid:?}, yet JSON {written:?}");
         let written = to_cbor(&message, &bytes, &mut cbor, &CborOptions::default());
         prop_assert!(agrees(&valid, &written), "{valid:?}, yet CBOR {written:?}");
-        prop_assert!(Stamps::of(&message).find(&bytes).is_none_or(|found| found.iter().all(|at| at + 8 <= bytes.len())));
+        prop_assert!(Stamps::for_type(&message).find(&bytes).is_none_or(|found| found.iter().all(
+            |at| at + 8 <= bytes.len())));
         }
     }
 
@@ -539,7 +545,7 @@ proptest! {
     ) {
         let (message32, message64) = (message("std_msgs/Float32"), message("std_msgs/Float64"));
         let (single, double) = (f32::from_bits(single), f64::from_bits(double));
-        // Decimals of singles and of points half-way between them are the hard ones.
+        // Decimals of singles, and of points half-way between them, are the hard cases.
         let half_way = f64::from_bits((f64::from(single).to_bits() & !0x1fff_ffff) | 0x1000_0000);
         for text in [digits, single.to_string(), double.to_string(), format!("{half_way}"), format!("{half_way}1")] {
             if text.contains(['n', 'N']) {

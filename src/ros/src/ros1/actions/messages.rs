@@ -1,5 +1,5 @@
-//! How actionlib (ROS 1) writes goals, feedback and results: the parts common to all actions stand before the
-//! action's own message, so they are read and written by hand and the rest stays a slice.
+//! Messages of actionlib (ROS 1): goals, feedback and results. The part common to all actions precedes the action's own
+//! message, so it is read and written by hand and the rest stays a slice.
 //!
 //! <http://wiki.ros.org/actionlib/DetailedDescription>
 
@@ -9,32 +9,32 @@ use bytes::Bytes;
 /// `actionlib_msgs/GoalStatus`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Status {
-    /// Waits to be begun.
+pub enum ActionlibStatus {
+    /// Waiting to be executed.
     Pending = 0,
-    /// Is worked on.
+    /// Being executed.
     Active = 1,
-    /// Ended since somebody wanted it to.
+    /// Cancelled during execution.
     Preempted = 2,
-    /// Ended as wished for.
+    /// Reached.
     Succeeded = 3,
     /// Failed.
     Aborted = 4,
-    /// Refused.
+    /// Rejected by the server.
     Rejected = 5,
-    /// Worked on, and asked to end.
+    /// Being executed, with a cancel request pending.
     Preempting = 6,
-    /// Waits, and asked to end.
+    /// Waiting, with a cancel request pending.
     Recalling = 7,
-    /// Ended before it was begun.
+    /// Cancelled before execution.
     Recalled = 8,
-    /// Its client has not heard of it for long.
+    /// Not heard of by the client for a long time.
     Lost = 9,
 }
 
-impl Status {
+impl ActionlibStatus {
     fn from_number(number: u8) -> Option<Self> {
-        use Status::*;
+        use ActionlibStatus::*;
         [
             Pending, Active, Preempted, Succeeded, Aborted, Rejected, Preempting, Recalling,
             Recalled, Lost,
@@ -43,9 +43,9 @@ impl Status {
         .find(|status| *status as u8 == number)
     }
 
-    /// Whether the goal has ended.
+    /// Returns true if the goal has ended.
     pub fn is_terminal(self) -> bool {
-        use Status::*;
+        use ActionlibStatus::*;
         matches!(
             self,
             Preempted | Succeeded | Aborted | Rejected | Recalled | Lost
@@ -56,54 +56,55 @@ impl Status {
 /// `actionlib_msgs/GoalID`.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct GoalId {
-    /// When it was sent; zero where that does not matter.
+    /// Time at which the goal was sent; zero if irrelevant.
     pub stamp: Time,
-    /// Its name.
+    /// The id.
     pub id: String,
 }
 
 /// One entry of `actionlib_msgs/GoalStatusArray`, and the head of every feedback and result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GoalState {
-    /// Which goal.
+    /// The goal.
     pub goal: GoalId,
-    /// How it stands.
-    pub status: Status,
-    /// What the server says of that.
+    /// Status.
+    pub status: ActionlibStatus,
+    /// Status text from the server.
     pub text: String,
 }
 
-/// Reads a `…ActionGoal`: its id and the goal's own bytes.
+/// Reads a `…ActionGoal`: returns its id and the bytes of the goal itself.
 pub fn read_goal(bytes: &Bytes) -> Option<(GoalId, Bytes)> {
-    let mut reader = Reader { bytes, at: 0 };
+    let mut reader = ActionlibReader { bytes, at: 0 };
     reader.header()?;
     let goal = reader.goal_id()?;
     Some((goal, bytes.slice(reader.at..)))
 }
 
-/// Reads a `…ActionResult` or `…ActionFeedback`: the goal's state and the result's or feedback's own bytes.
+/// Reads a `…ActionResult` or `…ActionFeedback`: returns the goal's state and the bytes of the result or feedback
+/// itself.
 pub fn read_state(bytes: &Bytes) -> Option<(GoalState, Bytes)> {
-    let mut reader = Reader { bytes, at: 0 };
+    let mut reader = ActionlibReader { bytes, at: 0 };
     reader.header()?;
     let state = reader.goal_state()?;
     Some((state, bytes.slice(reader.at..)))
 }
 
-/// The goal's id in a `…ActionGoal`, `…ActionResult` or `…ActionFeedback`.
+/// Returns the goal id in a `…ActionGoal`, `…ActionResult` or `…ActionFeedback`.
 pub fn goal_id(bytes: &[u8]) -> Option<String> {
-    let mut reader = Reader { bytes, at: 0 };
+    let mut reader = ActionlibReader { bytes, at: 0 };
     reader.header()?;
     Some(reader.goal_id()?.id)
 }
 
-/// Reads an `actionlib_msgs/GoalID`: a request to cancel.
+/// Reads an `actionlib_msgs/GoalID`: a cancel request.
 pub fn read_cancel(bytes: &[u8]) -> Option<GoalId> {
-    Reader { bytes, at: 0 }.goal_id()
+    ActionlibReader { bytes, at: 0 }.goal_id()
 }
 
 /// Reads an `actionlib_msgs/GoalStatusArray`.
 pub fn read_states(bytes: &[u8]) -> Option<Vec<GoalState>> {
-    let mut reader = Reader { bytes, at: 0 };
+    let mut reader = ActionlibReader { bytes, at: 0 };
     reader.header()?;
     let count = reader.word()?;
     // Each entry takes at least 17 bytes, so a false count ends here.
@@ -128,14 +129,14 @@ pub fn write_state(now: Time, state: &GoalState, body: &[u8]) -> Bytes {
     out.into()
 }
 
-/// An `actionlib_msgs/GoalID`.
+/// Serializes an `actionlib_msgs/GoalID`.
 pub fn write_cancel(goal: &GoalId) -> Bytes {
     let mut out = Vec::new();
     write_goal_id(&mut out, goal);
     out.into()
 }
 
-/// An `actionlib_msgs/GoalStatusArray`.
+/// Serializes an `actionlib_msgs/GoalStatusArray`.
 pub fn write_states<'s>(now: Time, states: impl ExactSizeIterator<Item = &'s GoalState>) -> Bytes {
     let mut out = Vec::new();
     write_header(&mut out, now);
@@ -146,12 +147,12 @@ pub fn write_states<'s>(now: Time, states: impl ExactSizeIterator<Item = &'s Goa
     out.into()
 }
 
-struct Reader<'b> {
+struct ActionlibReader<'b> {
     bytes: &'b [u8],
     at: usize,
 }
 
-impl Reader<'_> {
+impl ActionlibReader<'_> {
     fn word(&mut self) -> Option<u32> {
         let word = self.bytes.get(self.at..self.at.checked_add(4)?)?;
         self.at += 4;
@@ -187,7 +188,7 @@ impl Reader<'_> {
 
     fn goal_state(&mut self) -> Option<GoalState> {
         let goal = self.goal_id()?;
-        let status = Status::from_number(*self.bytes.get(self.at)?)?;
+        let status = ActionlibStatus::from_number(*self.bytes.get(self.at)?)?;
         self.at += 1;
         Some(GoalState {
             goal,
@@ -239,7 +240,7 @@ mod tests {
         };
         GoalState {
             goal,
-            status: Status::Active,
+            status: ActionlibStatus::Active,
             text: "on it".to_owned(),
         }
     }
@@ -264,7 +265,7 @@ mod tests {
         let states = [
             state(),
             GoalState {
-                status: Status::Lost,
+                status: ActionlibStatus::Lost,
                 ..state()
             },
         ];

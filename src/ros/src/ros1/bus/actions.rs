@@ -6,27 +6,27 @@ mod server;
 
 use std::sync::Arc;
 
-use super::{End, Inner, publications, subscriptions};
-use crate::bus::{BusError, Publisher, Qos, Subscription, WireType};
+use super::{EndpointOwner, Ros1BusState, publications, subscriptions};
+use crate::bus::{BusError, Publisher, QosProfile, Subscription, WireType};
 use crate::schema::{ActionDef, MessageType, Registry, SchemaError};
 
-pub(super) use client::Client;
-pub(super) use server::Server;
+pub(super) use client::Ros1ActionClient;
+pub(super) use server::Ros1ActionServer;
 
-/// Messages kept for a slow peer.
+/// Queue depth for a slow peer.
 const QUEUE: usize = 100;
 
 /// The topics of one action of this node.
-struct Topics<'a> {
-    bus: &'a Arc<Inner>,
+struct ActionTopicSet<'a> {
+    bus: &'a Arc<Ros1BusState>,
     name: &'a str,
     of: &'a ActionDef,
     goal_id: Arc<MessageType>,
     states: Arc<MessageType>,
 }
 
-impl<'a> Topics<'a> {
-    fn of(bus: &'a Arc<Inner>, name: &'a str, of: &'a ActionDef) -> Result<Self, BusError> {
+impl<'a> ActionTopicSet<'a> {
+    fn new(bus: &'a Arc<Ros1BusState>, name: &'a str, of: &'a ActionDef) -> Result<Self, BusError> {
         let known = Registry::new();
         let unusable = |error: SchemaError| BusError::Protocol {
             what: format!("action {name}"),
@@ -51,18 +51,18 @@ impl<'a> Topics<'a> {
             "feedback" => &self.of.action_feedback,
             _ => &self.of.action_result,
         };
-        (format!("{}/{part}", self.name), WireType::of(of))
+        (format!("{}/{part}", self.name), WireType::from_message(of))
     }
 
     async fn subscribe(&self, part: &str) -> Result<Subscription, BusError> {
         let (topic, of) = self.topic(part);
-        let qos = Qos::keep_last(QUEUE).latching(true);
-        subscriptions::subscribe(self.bus, &topic, of, qos, End::Action).await
+        let qos = QosProfile::keep_last(QUEUE).latching(true);
+        subscriptions::subscribe(self.bus, &topic, of, qos, EndpointOwner::Action).await
     }
 
     async fn advertise(&self, part: &str, latch: bool) -> Result<Box<dyn Publisher>, BusError> {
         let (topic, of) = self.topic(part);
-        let qos = Qos::keep_last(QUEUE).latching(latch);
-        publications::advertise(self.bus, &topic, of, qos, End::Action).await
+        let qos = QosProfile::keep_last(QUEUE).latching(latch);
+        publications::advertise(self.bus, &topic, of, qos, EndpointOwner::Action).await
     }
 }

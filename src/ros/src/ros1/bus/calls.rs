@@ -9,15 +9,15 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use super::link::broken;
+use super::link::from_tcpros_error;
 use super::registrar::Kind;
 use super::services::LABEL;
-use super::{HANDSHAKE, Inner};
+use super::{HANDSHAKE, Ros1BusState};
 use crate::bus::{BusError, CallFate, Digest, Graph, ServiceProvider, ServiceType};
 use crate::ros1::names::PeerUri;
 use crate::ros1::tcpros::{CallError, Error, Header, ServiceConnection};
 
-/// Connections kept per service while nobody calls.
+/// Maximum number of idle connections per service.
 const MAX_IDLE: usize = 8;
 
 /// Idle connections, by service.
@@ -26,22 +26,22 @@ pub(super) struct CallPool {
     idle: Mutex<HashMap<String, Vec<IdleConnection>>>,
 }
 
-/// A connection, and the address of its server's node when it was made, where the graph showed that.
+/// A connection, and the address of the server's node when it was made, if the graph showed it.
 struct IdleConnection {
     connection: ServiceConnection,
     address: Option<String>,
 }
 
 impl IdleConnection {
-    /// Whether whom it leads to still serves.
+    /// Returns true if the connection's server still serves the service.
     fn is_current(&self, service: &str, graph: &Graph) -> bool {
         let Some(server) = graph.services.get(service) else {
-            // What is lent is not in the graph; what was there and is no more is not served.
+            // Lent services are not in the graph; a service that was in it and is missing now is not served.
             return self.address.is_none() && !self.connection.is_stale();
         };
         let said = self.connection.header().get("callerid");
         let same_node = said.is_none_or(|name| name == server);
-        // A node of the same name may have taken its place.
+        // Another node of the same name may have replaced it.
         let address = graph.nodes.get(server);
         let same_place = match (&self.address, address) {
             (Some(then), Some(now)) => then == now,
@@ -52,7 +52,7 @@ impl IdleConnection {
 }
 
 impl CallPool {
-    /// A connection that the server has not closed, to whom serves now.
+    /// Takes a connection that the server has not closed, to the current server.
     fn take(&self, service: &str, graph: &watch::Sender<Arc<Graph>>) -> Option<IdleConnection> {
         let mut idle = self.idle.lock();
         let connections = idle.get_mut(service)?;
@@ -64,7 +64,7 @@ impl CallPool {
         None
     }
 
-    /// Keeps a connection for the next call, unless somebody else has come to serve during this one.
+    /// Keeps a connection for the next call, unless the server was replaced during this one.
     fn put(&self, service: &str, kept: IdleConnection, graph: &watch::Sender<Arc<Graph>>) {
         let mut idle = self.idle.lock();
         if !kept.is_current(service, &graph.borrow()) {
@@ -76,7 +76,7 @@ impl CallPool {
         }
     }
 
-    /// Drops connections to nodes that no longer serve what they were called for.
+    /// Drops connections to nodes that no longer serve their service.
     pub(super) fn keep_current(&self, graph: &Graph) {
         self.idle.lock().retain(|service, connections| {
             if !graph.services.contains_key(service) {
@@ -92,10 +92,10 @@ impl CallPool {
     }
 }
 
-/// Calls once. Tried again only where the server had closed a kept connection before it took the request. A server
-/// that says to have another md5 than this one is not asked.
+/// Calls a service once. Retries only if the server had closed a kept connection before it took the request. Fails
+/// without sending the request if the server declares another md5 than `digest`.
 pub(super) async fn call(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     service: &str,
     digest: &Digest,
     request: Bytes,
@@ -108,7 +108,7 @@ pub(super) async fn call(
             let mut kept = match kept {
                 Some(kept) => kept,
                 None => {
-                    let connection = open(bus, service, ("persistent", "1")).await?;
+                    let connection = open_connection(bus, service, ("persistent", "1")).await?;
                     let said = connection.header().get("callerid");
                     let address = said.and_then(|node| bus.graph.borrow().nodes.get(node).cloned());
                     IdleConnection {
@@ -117,7 +117,7 @@ pub(super) async fn call(
                     }
                 }
             };
-            same_type(service, digest, kept.connection.header())?;
+            check_type(service, digest, kept.connection.header())?;
             match kept.connection.call(request.clone()).await {
                 Ok(answer) => {
                     bus.calls.put(service, kept, &bus.graph);
@@ -129,7 +129,7 @@ pub(super) async fn call(
                 }
                 Err(CallError::NotTaken) if reused => {}
                 Err(CallError::Broken(error)) if !matches!(error, Error::Io(_)) => {
-                    return Err(broken(service, error));
+                    return Err(from_tcpros_error(service, error));
                 }
                 Err(error) => {
                     let fate = match error {
@@ -153,9 +153,9 @@ pub(super) async fn call(
     })
 }
 
-fn same_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusError> {
+fn check_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusError> {
     let theirs = Digest::from(header.get("md5sum").unwrap_or("*"));
-    if theirs.agrees(ours) {
+    if theirs.is_compatible_with(ours) {
         return Ok(());
     }
     Err(BusError::TypeMismatch {
@@ -165,11 +165,14 @@ fn same_type(service: &str, ours: &Digest, header: &Header) -> Result<(), BusErr
     })
 }
 
-/// Asks a server for its type, and who it is.
-pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceProvider, BusError> {
+/// Asks a server for its type and identity.
+pub(super) async fn probe(
+    bus: &Arc<Ros1BusState>,
+    service: &str,
+) -> Result<ServiceProvider, BusError> {
     let own = bus.services.lock().get(service).cloned();
     if let Some(served) = own {
-        // Who is told the type may call: the Master must know the server by then.
+        // A node that is told the type may call: the Master must know the server by then.
         bus.registrar.sync(Kind::Service, service, false).await?;
         return Ok(ServiceProvider {
             node: bus.node.clone(),
@@ -177,7 +180,7 @@ pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceProv
             label: bus.label.get().cloned(),
         });
     }
-    let connection = open(bus, service, ("probe", "1")).await?;
+    let connection = open_connection(bus, service, ("probe", "1")).await?;
     let header = connection.header();
     match (header.get("type"), header.get("md5sum")) {
         (Some(name), Some(md5)) => Ok(ServiceProvider {
@@ -192,8 +195,8 @@ pub(super) async fn probe(bus: &Arc<Inner>, service: &str) -> Result<ServiceProv
     }
 }
 
-async fn open(
-    bus: &Inner,
+async fn open_connection(
+    bus: &Ros1BusState,
     service: &str,
     (purpose, flag): (&str, &str),
 ) -> Result<ServiceConnection, BusError> {
@@ -215,7 +218,7 @@ async fn open(
         ("service", service),
         ("md5sum", "*"),
     ])
-    .with(purpose, flag);
+    .with_field(purpose, flag);
     let opening = async {
         let resolved = bus.sockets.resolve(&place.host, place.port).await;
         let address = resolved.map_err(Error::Io)?;
@@ -228,7 +231,7 @@ async fn open(
             reason,
             fate: CallFate::NotTaken,
         }),
-        Ok(Err(error)) => Err(broken(&what(), error)),
+        Ok(Err(error)) => Err(from_tcpros_error(&what(), error)),
         Err(_) => Err(BusError::Timeout {
             what: what(),
             after: HANDSHAKE,
@@ -256,7 +259,7 @@ mod tests {
     }
 
     /// A graph in which this node serves.
-    fn served_by(node: &str, address: &str) -> Arc<Graph> {
+    fn graph_with_server(node: &str, address: &str) -> Arc<Graph> {
         Arc::new(Graph {
             services: [("/who".to_owned(), node.to_owned())].into(),
             nodes: [(node.to_owned(), address.to_owned())].into(),
@@ -272,28 +275,28 @@ mod tests {
         let service_type = ServiceType::new("pkg/Who", "abcd");
         let _served = server.serve("/who", service_type, Arc::new(Echo)).await;
         let connection = || async {
-            let opened = open(&caller.inner, "/who", ("persistent", "1")).await;
+            let opened = open_connection(&caller.inner, "/who", ("persistent", "1")).await;
             IdleConnection {
                 connection: opened.unwrap(),
                 address: Some("http://a/".to_owned()),
             }
         };
         let pool = CallPool::default();
-        let graph = watch::Sender::new(served_by("/old", "http://a/"));
+        let graph = watch::Sender::new(graph_with_server("/old", "http://a/"));
         pool.put("/who", connection().await, &graph);
         assert!(pool.take("/who", &graph).is_some());
 
-        // Another node takes the service over while the connection is idle, or in use.
+        // Another node takes over the service while the connection is idle, or in use.
         pool.put("/who", connection().await, &graph);
-        graph.send_replace(served_by("/new", "http://b/"));
+        graph.send_replace(graph_with_server("/new", "http://b/"));
         assert!(pool.take("/who", &graph).is_none());
         pool.put("/who", connection().await, &graph);
-        graph.send_replace(served_by("/old", "http://a/"));
+        graph.send_replace(graph_with_server("/old", "http://a/"));
         assert!(pool.take("/who", &graph).is_none(), "it was kept");
 
-        // A node of the same name comes back at another place.
+        // A node of the same name returns at another address.
         pool.put("/who", connection().await, &graph);
-        graph.send_replace(served_by("/old", "http://c/"));
+        graph.send_replace(graph_with_server("/old", "http://c/"));
         assert!(pool.take("/who", &graph).is_none());
     }
 }

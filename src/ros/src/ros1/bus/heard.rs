@@ -1,5 +1,5 @@
-//! Whom a topic's publishers send to, as they say themselves (`getBusInfo` of the slave API). A publisher answers a
-//! subscriber's header before it sends to it: what it publishes in between, the subscriber does not hear.
+//! The publishers' own reports about their subscribers (`getBusInfo` of the slave API). A publisher answers a
+//! subscriber's header before it sends to it: what it publishes in between never reaches the subscriber.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -9,23 +9,24 @@ use async_trait::async_trait;
 use parking_lot::Mutex;
 
 use super::master_client::to_bus_error;
-use super::{HANDSHAKE, Inner, Ros1Bus};
-use crate::bus::{BusError, Hearing, PeerId};
-use crate::ros1::reply::Reply;
-use crate::ros1::xmlrpc::{Client, Value};
+use super::{HANDSHAKE, Ros1Bus, Ros1BusState};
+use crate::bus::{BusError, PeerId, PublisherReports};
+use crate::ros1::reply::ApiReply;
+use crate::ros1::xmlrpc::{Value, XmlRpcClient};
 
-/// How long the connection to a publisher is kept after it was asked: whoever waits to be heard asks often.
+/// Time for which the connection to a publisher is kept after a query, because a node that waits for its subscription
+/// to take effect queries often.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Publishers that were asked a moment ago.
+/// Clients of publishers that were queried recently.
 #[derive(Default)]
 pub(super) struct PublisherClients {
-    clients: Mutex<HashMap<String, (Arc<Client>, Instant)>>,
+    clients: Mutex<HashMap<String, (Arc<XmlRpcClient>, Instant)>>,
 }
 
 impl PublisherClients {
-    /// A client of the publisher at `uri`, connected already where it was asked before.
-    fn client(&self, bus: &Arc<Inner>, uri: &str) -> Result<Arc<Client>, BusError> {
+    /// Returns a client of the publisher at `uri`, already connected if it was queried recently.
+    fn client(&self, bus: &Arc<Ros1BusState>, uri: &str) -> Result<Arc<XmlRpcClient>, BusError> {
         let mut clients = self.clients.lock();
         if let Some((client, asked)) = clients.get_mut(uri) {
             *asked = Instant::now();
@@ -33,15 +34,15 @@ impl PublisherClients {
         }
         let client = Arc::new(bus.client(uri)?);
         if clients.is_empty() {
-            bus.spawn(forget(bus.clone()));
+            bus.spawn(close_idle_clients(bus.clone()));
         }
         clients.insert(uri.to_owned(), (client.clone(), Instant::now()));
         Ok(client)
     }
 }
 
-/// Closes the connections to those that are asked no more, until there is none left.
-async fn forget(bus: Arc<Inner>) {
+/// Closes the connections that are no longer used, until none is left.
+async fn close_idle_clients(bus: Arc<Ros1BusState>) {
     loop {
         tokio::time::sleep(IDLE_TIMEOUT).await;
         let mut clients = bus.publisher_clients.clients.lock();
@@ -53,15 +54,15 @@ async fn forget(bus: Arc<Inner>) {
 }
 
 #[async_trait]
-impl Hearing for Ros1Bus {
-    async fn heard_over(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
+impl PublisherReports for Ros1Bus {
+    async fn reported_connections(&self, topic: &str) -> Result<BTreeSet<PeerId>, BusError> {
         connections(&self.inner, topic).await
     }
 }
 
-/// The connections over which the topic's publishers send to us, as these say.
+/// Returns the connections over which the topic's publishers report that they send to us.
 pub(super) async fn connections(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     topic: &str,
 ) -> Result<BTreeSet<PeerId>, BusError> {
     let graph = bus.graph.borrow().clone();
@@ -76,7 +77,7 @@ pub(super) async fn connections(
         let caller = [bus.node.as_str().into()];
         let asked = client.call("getBusInfo", &caller, HANDSHAKE);
         let answer = asked.await.map_err(to_bus_error)?;
-        let rows = Reply::from_value(answer).map(|reply| reply.value);
+        let rows = ApiReply::from_value(answer).map(|reply| reply.value);
         let rows = rows.as_ref().and_then(Value::as_array).unwrap_or_default();
         let ours = rows.iter().filter_map(|row| {
             let [Value::Int(id), peer, direction, _, of, ..] = row.as_array()? else {

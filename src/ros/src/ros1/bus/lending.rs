@@ -1,4 +1,5 @@
-//! Services of another ROS system, lent to the nodes of this one: the Master asks for them, callers connect here.
+//! Services of another ROS system, lent to the nodes of this one: the Master queries this node, and callers connect
+//! here.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -6,45 +7,45 @@ use std::sync::Arc;
 use async_trait::async_trait;
 use parking_lot::Mutex;
 
-use super::services::Served;
-use super::{Inner, Ros1Bus, calls};
-use crate::bus::{BusError, Lender, Lending, Lent, ServiceProvider};
+use super::services::ServiceEntry;
+use super::{Ros1Bus, Ros1BusState, calls};
+use crate::bus::{BusError, Lender, Lending, LentService, ServiceProvider};
 use crate::ros1::master::lending::LEND_SERVICES;
 use crate::ros1::names;
 
-/// The lender, and what it has lent, by name.
+/// The lender and the services lent, by name.
 #[derive(Default)]
 pub(super) struct Loans {
     lender: Mutex<Option<Arc<dyn Lender>>>,
-    lent: Mutex<HashMap<String, Arc<Served>>>,
+    lent: Mutex<HashMap<String, Arc<ServiceEntry>>>,
 }
 
 impl Loans {
-    pub(super) fn begin(&self, lender: Arc<dyn Lender>) {
+    pub(super) fn set_lender(&self, lender: Arc<dyn Lender>) {
         *self.lender.lock() = Some(lender);
     }
 
-    pub(super) fn end(&self) {
+    pub(super) fn clear(&self) {
         *self.lender.lock() = None;
         self.lent.lock().clear();
     }
 
-    /// A service that can be called now.
-    pub(super) fn lent(&self, service: &str) -> Option<Arc<Served>> {
+    /// Returns a lent service if it is available.
+    pub(super) fn active_service(&self, service: &str) -> Option<Arc<ServiceEntry>> {
         let served = self.lent.lock().get(service).cloned();
-        served.filter(|served| !served.is_over())
+        served.filter(|served| !served.has_ended())
     }
 
-    /// Whether the lender has this service; then it can be called here.
-    pub(super) async fn find(&self, service: &str, node: &str) -> bool {
+    /// Asks the lender for the service; returns true if it has it, and it can then be called here.
+    pub(super) async fn query_lender(&self, service: &str, node: &str) -> bool {
         let lender = self.lender.lock().clone();
         let found = match lender {
-            Some(lender) if names::is_global(service) => lender.find(service, node).await,
+            Some(lender) if names::is_global(service) => lender.find_service(service, node).await,
             _ => None,
         };
         let mut lent = self.lent.lock();
-        lent.retain(|_, served| !served.is_over());
-        let Some(Lent {
+        lent.retain(|_, served| !served.has_ended());
+        let Some(LentService {
             service_type,
             handler,
             gone,
@@ -53,7 +54,7 @@ impl Loans {
             lent.remove(service);
             return false;
         };
-        let served = Served {
+        let served = ServiceEntry {
             service_type,
             handler,
             ended: gone,
@@ -67,8 +68,8 @@ impl Loans {
 impl Lending for Ros1Bus {
     async fn lend(&self, lender: Arc<dyn Lender>) -> Result<(), BusError> {
         self.inner.check_open()?;
-        self.inner.lending.begin(lender);
-        self.inner.report_that_it_lends().await
+        self.inner.lending.set_lender(lender);
+        self.inner.announce_lender().await
     }
 
     async fn provider(&self, service: &str) -> Result<ServiceProvider, BusError> {
@@ -81,9 +82,9 @@ impl Lending for Ros1Bus {
     }
 }
 
-impl Inner {
-    /// Tells the Master whom to ask, if anybody lends.
-    pub(super) async fn report_that_it_lends(&self) -> Result<(), BusError> {
+impl Ros1BusState {
+    /// Announces this node to the Master as lender, if there is one.
+    pub(super) async fn announce_lender(&self) -> Result<(), BusError> {
         if self.lending.lender.lock().is_none() {
             return Ok(());
         }
@@ -91,9 +92,9 @@ impl Inner {
         self.master.call(LEND_SERVICES, args).await.map(drop)
     }
 
-    /// Answers the Master: the address under which the service can be called.
+    /// Answers the Master: returns the address at which the service can be called.
     pub(super) async fn lend_service(&self, service: &str, node: &str) -> Option<String> {
-        let found = self.lending.find(service, node).await;
+        let found = self.lending.query_lender(service, node).await;
         found.then(|| self.registrar.service_uri().to_owned())
     }
 }

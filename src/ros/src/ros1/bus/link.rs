@@ -1,5 +1,5 @@
-//! The connection to one publisher of one topic: found by `requestTopic`, made again while the publisher stays
-//! listed.
+//! The connection to one publisher of one topic: located by `requestTopic`, re-established for as long as the publisher
+//! is listed.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,35 +14,35 @@ use tokio::time::{sleep, timeout};
 
 use super::master_client::to_bus_error;
 use super::subscriptions::TopicIn;
-use super::{HANDSHAKE, Inner};
-use crate::bus::{BusError, Message, Offer, PeerId, WireType};
+use super::{HANDSHAKE, Ros1BusState};
+use crate::bus::{BusError, Offer, PeerId, SerializedMessage, WireType};
 use crate::net;
-use crate::ros1::reply::Reply;
+use crate::ros1::reply::ApiReply;
 use crate::ros1::tcpros::{self, FrameReader, Header};
 use crate::ros1::xmlrpc::Value;
 
-/// Between attempts, at first and at last.
+/// Pause between attempts: initial and maximum.
 const PAUSE: Duration = Duration::from_millis(50);
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
-/// A publisher that is no longer listed may still have messages on the way.
+/// Grace period for a publisher that is no longer listed; it may still have messages in transit.
 const GRACE: Duration = Duration::from_secs(2);
 
 /// One publisher, as seen by the topic.
-pub(super) struct Link {
+pub(super) struct PublisherLink {
     pub(super) id: i32,
     uri: String,
     listed: watch::Sender<bool>,
     task: Mutex<Option<AbortHandle>>,
-    /// What the publisher's header said, once it was connected.
+    /// Offer in the publisher's header, from the first connection on.
     offer: Mutex<Option<Offer>>,
-    /// Its name, from the first connection on until it has left.
+    /// The publisher's id, from the first connection until it has left.
     pub(super) publisher: Mutex<Option<PeerId>>,
     pub(super) connected: AtomicBool,
     pub(super) messages: AtomicU64,
     pub(super) bytes: AtomicU64,
 }
 
-impl Link {
+impl PublisherLink {
     pub(super) fn uri(&self) -> &str {
         &self.uri
     }
@@ -51,7 +51,7 @@ impl Link {
         *self.listed.borrow()
     }
 
-    pub(super) fn list(&self, listed: bool) {
+    pub(super) fn set_listed(&self, listed: bool) {
         self.listed
             .send_if_modified(|before| std::mem::replace(before, listed) != listed);
     }
@@ -62,21 +62,25 @@ impl Link {
         }
     }
 
-    /// What the publisher said it publishes, once it was connected.
+    /// Returns the type declared by the publisher, once it was connected.
     pub(super) fn wire_type(&self) -> Option<Arc<WireType>> {
         Some(self.offer.lock().as_ref()?.wire_type.clone())
     }
 
-    /// The same, and whether it latches.
+    /// Returns the publisher's offer, once it was connected.
     pub(super) fn offer(&self) -> Option<Offer> {
         self.offer.lock().clone()
     }
 }
 
-/// Starts to keep a connection to the publisher at `uri`.
-pub(super) fn start(bus: &Arc<Inner>, topic: &Arc<TopicIn>, uri: &str) -> Arc<Link> {
-    let link = Arc::new(Link {
-        id: bus.id(),
+/// Starts to maintain a connection to the publisher at `uri`.
+pub(super) fn start(
+    bus: &Arc<Ros1BusState>,
+    topic: &Arc<TopicIn>,
+    uri: &str,
+) -> Arc<PublisherLink> {
+    let link = Arc::new(PublisherLink {
+        id: bus.next_id(),
         uri: uri.to_owned(),
         listed: watch::Sender::new(true),
         task: Mutex::new(None),
@@ -86,25 +90,33 @@ pub(super) fn start(bus: &Arc<Inner>, topic: &Arc<TopicIn>, uri: &str) -> Arc<Li
         messages: AtomicU64::new(0),
         bytes: AtomicU64::new(0),
     });
-    let task = bus.spawn(keep(bus.clone(), topic.clone(), link.clone()));
+    let task = bus.spawn(maintain_connection(
+        bus.clone(),
+        topic.clone(),
+        link.clone(),
+    ));
     *link.task.lock() = Some(task);
     link
 }
 
-async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
+async fn maintain_connection(
+    bus: Arc<Ros1BusState>,
+    topic: Arc<TopicIn>,
+    link: Arc<PublisherLink>,
+) {
     let mut listed = link.listed.subscribe();
     let mut pause = PAUSE;
     let mut told = String::new();
     loop {
         let result = tokio::select! {
             result = connect_and_read(&bus, &topic, &link) => result,
-            () = left(&mut listed, GRACE) => Ok(()),
+            () = wait_until_unlisted(&mut listed, GRACE) => Ok(()),
         };
-        if topic.lost(&link) {
+        if topic.on_disconnected(&link) {
             pause = PAUSE;
         } else {
-            // Not even a connection: what there was before has ended for good.
-            topic.left(&link);
+            // Not even a connection: the previous one has ended for good.
+            topic.on_publisher_gone(&link);
         }
         if let Err(error) = result {
             let text = error.to_string();
@@ -115,17 +127,17 @@ async fn keep(bus: Arc<Inner>, topic: Arc<TopicIn>, link: Arc<Link>) {
         }
         tokio::select! {
             () = sleep(pause) => {}
-            () = left(&mut listed, Duration::ZERO) => {}
+            () = wait_until_unlisted(&mut listed, Duration::ZERO) => {}
         }
         pause = (pause * 2).min(LONGEST_PAUSE);
-        if !link.is_listed() && topic.released(&link) {
+        if !link.is_listed() && topic.release(&link) {
             return;
         }
     }
 }
 
 /// Returns when the publisher has not been listed for `grace`.
-async fn left(listed: &mut watch::Receiver<bool>, grace: Duration) {
+async fn wait_until_unlisted(listed: &mut watch::Receiver<bool>, grace: Duration) {
     loop {
         if listed.wait_for(|listed| !listed).await.is_err() {
             return;
@@ -138,13 +150,13 @@ async fn left(listed: &mut watch::Receiver<bool>, grace: Duration) {
 }
 
 async fn connect_and_read(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     topic: &Arc<TopicIn>,
-    link: &Arc<Link>,
+    link: &Arc<PublisherLink>,
 ) -> Result<(), BusError> {
-    let wanted = topic.wanted();
+    let wanted = topic.requested_type();
     let connection = connect(bus, &topic.name, &link.uri, &wanted).await?;
-    let Connection {
+    let PublisherConnection {
         mut stream,
         mut frames,
         publisher,
@@ -156,17 +168,17 @@ async fn connect_and_read(
         wire_type: wire_type.clone(),
         latching,
     });
-    topic.came(link, &publisher);
+    topic.on_connected(link, &publisher);
     loop {
         let next = frames.next(&mut stream).await;
-        let Some(bytes) = next.map_err(|error| broken(&link.uri, error))? else {
+        let Some(bytes) = next.map_err(|error| from_tcpros_error(&link.uri, error))? else {
             return Ok(());
         };
         link.messages.fetch_add(1, Ordering::Relaxed);
         link.bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         topic.deliver(
             &link.uri,
-            Message {
+            SerializedMessage {
                 bytes,
                 wire_type: wire_type.clone(),
                 publisher: publisher.clone(),
@@ -176,8 +188,8 @@ async fn connect_and_read(
     }
 }
 
-/// A publisher that has answered our header.
-pub(super) struct Connection {
+/// An established connection to a publisher that has answered our header.
+pub(super) struct PublisherConnection {
     stream: TcpStream,
     frames: FrameReader,
     publisher: PeerId,
@@ -185,13 +197,13 @@ pub(super) struct Connection {
     pub(super) wire_type: WireType,
 }
 
-/// Asks the node at `uri` for the topic, connects and exchanges headers.
+/// Requests the topic from the node at `uri`, connects and exchanges headers.
 pub(super) async fn connect(
-    bus: &Inner,
+    bus: &Ros1BusState,
     topic: &str,
     uri: &str,
     wanted: &WireType,
-) -> Result<Connection, BusError> {
+) -> Result<PublisherConnection, BusError> {
     let (host, port) = request_topic(bus, topic, uri).await?;
     let what = || format!("publisher of {topic} at {host}:{port}");
     let header = Header::new([
@@ -205,12 +217,12 @@ pub(super) async fn connect(
     let shake = async {
         let address = bus.sockets.resolve(&host, port).await?;
         let mut stream = bus.sockets.connect(address).await?;
-        net::watch(&stream);
+        net::enable_keepalive(&stream);
         let answer = header.exchange(&mut stream, &mut buffer).await?;
         Ok((stream, answer))
     };
     let (stream, answer) = match timeout(HANDSHAKE, shake).await {
-        Ok(shaken) => shaken.map_err(|error| broken(&what(), error))?,
+        Ok(shaken) => shaken.map_err(|error| from_tcpros_error(&what(), error))?,
         Err(_) => {
             return Err(BusError::Timeout {
                 what: what(),
@@ -218,15 +230,15 @@ pub(super) async fn connect(
             });
         }
     };
-    let wire_type = super::announced(&answer);
-    if !wanted.agrees(&wire_type) {
+    let wire_type = super::wire_type_from_header(&answer);
+    if !wanted.is_compatible_with(&wire_type) {
         return Err(BusError::TypeMismatch {
             what: topic.to_owned(),
             theirs: wire_type.to_string(),
             ours: wanted.to_string(),
         });
     }
-    Ok(Connection {
+    Ok(PublisherConnection {
         stream,
         frames: FrameReader::new(buffer, bus.frames.clone()),
         publisher: PeerId::new(answer.get("callerid").unwrap_or(uri), 0),
@@ -235,8 +247,12 @@ pub(super) async fn connect(
     })
 }
 
-/// Where the node at `uri` serves the topic.
-async fn request_topic(bus: &Inner, topic: &str, uri: &str) -> Result<(String, u16), BusError> {
+/// Returns host and port at which the node at `uri` serves the topic.
+async fn request_topic(
+    bus: &Ros1BusState,
+    topic: &str,
+    uri: &str,
+) -> Result<(String, u16), BusError> {
     let client = bus.client(uri)?;
     let protocols = Value::Array(vec![Value::strings(["TCPROS"])]);
     let args = [bus.node.as_str().into(), topic.into(), protocols];
@@ -245,7 +261,7 @@ async fn request_topic(bus: &Inner, topic: &str, uri: &str) -> Result<(String, u
         what: format!("requestTopic of {uri}"),
         reason,
     };
-    let reply = Reply::from_value(answer.map_err(to_bus_error)?)
+    let reply = ApiReply::from_value(answer.map_err(to_bus_error)?)
         .ok_or_else(|| refused("its answer is not [code, message, value]".to_owned()))?;
     if reply.code != 1 {
         return Err(refused(format!("it declined: {}", reply.message)));
@@ -263,8 +279,8 @@ async fn request_topic(bus: &Inner, topic: &str, uri: &str) -> Result<(String, u
     place.ok_or_else(|| refused("it offers no TCPROS address".to_owned()))
 }
 
-/// TCPROS's errors as the bus's.
-pub(super) fn broken(what: &str, error: tcpros::Error) -> BusError {
+/// Converts a TCPROS error to a bus error.
+pub(super) fn from_tcpros_error(what: &str, error: tcpros::Error) -> BusError {
     let what = what.to_owned();
     match error {
         tcpros::Error::Io(source) => BusError::Io { what, source },

@@ -1,4 +1,4 @@
-//! Calls from this node to the Master, and the errors of XML-RPC as the bus's.
+//! Calls from this node to the Master, and conversion of XML-RPC errors to bus errors.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -11,27 +11,27 @@ use tokio::time::{Instant, timeout_at};
 
 use crate::bus::BusError;
 use crate::net::Sockets;
-use crate::ros1::reply::Reply;
-use crate::ros1::xmlrpc::{self, Client, Value};
+use crate::ros1::reply::ApiReply;
+use crate::ros1::xmlrpc::{self, Value, XmlRpcClient};
 
-/// For the Master to answer anything but a long poll.
+/// Time for the Master to answer anything but a long poll.
 const ANSWER: Duration = Duration::from_secs(10);
-/// Calls at a time, but for long polls. Each takes a connection of the Master, which has a limit; more would only wait
-/// there, and their time would run.
+/// Maximum number of concurrent calls, long polls excluded. Each uses a connection of the Master, which has a limit;
+/// more calls would only wait there while their time runs.
 pub(super) const AT_A_TIME: usize = 32;
 
-/// The Master, as this node calls it.
+/// Client of the Master.
 pub(super) struct MasterClient {
-    client: Client,
+    client: XmlRpcClient,
     uri: String,
     node: String,
-    turns: Turns,
+    turns: CallLimiter,
 }
 
-/// Whose turn it is to call: somebody who registers a thousand topics at once waits here.
-pub(super) struct Turns {
+/// Limits concurrent calls: a node that registers a thousand topics at once waits here.
+pub(super) struct CallLimiter {
     free: Semaphore,
-    /// When the Master last answered a call.
+    /// Time at which the Master last answered a call.
     answered: Mutex<Instant>,
 }
 
@@ -43,23 +43,23 @@ impl MasterClient {
         budget: &Budget,
     ) -> Result<Self, BusError> {
         let uri = format!("http://{address}/");
-        let client = Client::new(sockets, &uri)
+        let client = XmlRpcClient::new(sockets, &uri)
             .map_err(to_bus_error)?
-            .within(budget);
+            .with_budget(budget);
         Ok(Self {
             client,
             uri,
             node: node.to_owned(),
-            turns: Turns::new(),
+            turns: CallLimiter::new(),
         })
     }
 
-    /// The Master's address.
+    /// Returns the Master's address.
     pub(super) fn uri(&self) -> &str {
         &self.uri
     }
 
-    /// Calls a method and gives its value; any answer but success is an error.
+    /// Calls a method and returns its value; any answer but success is an error.
     pub(super) async fn call(&self, method: &str, args: Vec<Value>) -> Result<Value, BusError> {
         let answer = self.ask(method, args).await?;
         answer.map_err(|reason| BusError::Master {
@@ -68,31 +68,31 @@ impl MasterClient {
         })
     }
 
-    /// Calls a method and gives its value, or the message with which the Master declined.
+    /// Calls a method and returns its value, or the message with which the Master declined.
     pub(super) async fn ask(
         &self,
         method: &str,
         args: Vec<Value>,
     ) -> Result<Result<Value, String>, BusError> {
-        self.ask_as(&self.node, method, args).await
+        self.ask_in_name_of(&self.node, method, args).await
     }
 
-    /// The same in the name of another node or namespace.
-    pub(super) async fn ask_as(
+    /// Calls a method like [`ask`](Self::ask), in the name of another node or namespace.
+    pub(super) async fn ask_in_name_of(
         &self,
         caller: &str,
         method: &str,
         args: Vec<Value>,
     ) -> Result<Result<Value, String>, BusError> {
-        let Some(_turn) = self.turns.next().await else {
+        let Some(_turn) = self.turns.acquire().await else {
             return Err(BusError::Timeout {
                 what: format!("{method} of {}", self.uri),
                 after: ANSWER,
             });
         };
-        let answer = self.raw(caller, method, args, ANSWER).await;
+        let answer = self.call_raw(caller, method, args, ANSWER).await;
         let reply = answer.map_err(to_bus_error)?;
-        self.turns.was_answered();
+        self.turns.record_answer();
         Ok(if reply.code == 1 {
             Ok(reply.value)
         } else {
@@ -100,24 +100,24 @@ impl MasterClient {
         })
     }
 
-    /// The same with a time-out of its own and XML-RPC's errors.
-    pub(super) async fn raw(
+    /// Calls a method with its own time limit; returns XML-RPC errors as such.
+    pub(super) async fn call_raw(
         &self,
         caller: &str,
         method: &str,
         mut args: Vec<Value>,
         time: Duration,
-    ) -> Result<Reply, xmlrpc::Error> {
+    ) -> Result<ApiReply, xmlrpc::Error> {
         args.insert(0, caller.into());
         let answer = self.client.call(method, &args, time).await?;
-        Reply::from_value(answer).ok_or_else(|| xmlrpc::Error::Http {
+        ApiReply::from_value(answer).ok_or_else(|| xmlrpc::Error::Http {
             peer: "the ROS Master".to_owned(),
             reason: format!("its answer to {method} is not [code, message, value]"),
         })
     }
 }
 
-impl Turns {
+impl CallLimiter {
     pub(super) fn new() -> Self {
         Self {
             free: Semaphore::new(AT_A_TIME),
@@ -125,12 +125,12 @@ impl Turns {
         }
     }
 
-    pub(super) fn was_answered(&self) {
+    pub(super) fn record_answer(&self) {
         *self.answered.lock() = Instant::now();
     }
 
-    /// Waits for the caller's turn, as long as others are answered; `None` when nobody was for [`ANSWER`].
-    pub(super) async fn next(&self) -> Option<SemaphorePermit<'_>> {
+    /// Waits for a permit for as long as other calls are answered; returns `None` if none was answered for [`ANSWER`].
+    pub(super) async fn acquire(&self) -> Option<SemaphorePermit<'_>> {
         let mut since = Instant::now();
         loop {
             if let Ok(turn) = timeout_at(since + ANSWER, self.free.acquire()).await {
@@ -145,7 +145,7 @@ impl Turns {
     }
 }
 
-/// XML-RPC's errors as the bus's.
+/// Converts an XML-RPC error to a bus error.
 pub(super) fn to_bus_error(error: xmlrpc::Error) -> BusError {
     match error {
         xmlrpc::Error::Io { peer, source } => BusError::Io { what: peer, source },

@@ -1,9 +1,11 @@
-//! The parameters at the Master.
+//! Global parameters at the Master.
 
 use async_trait::async_trait;
 
 use super::Ros1Bus;
-use crate::bus::{BusError, GlobalParameters, ParamChanges, ParamValue, changes_within};
+use crate::bus::{
+    BusError, GlobalParameters, ParamChangeReceiver, ParamValue, param_change_channel,
+};
 use crate::ros1::names;
 use crate::ros1::xmlrpc::Value;
 
@@ -41,7 +43,7 @@ impl GlobalParameters for Ros1Bus {
     async fn search(&self, namespace: &str, key: &str) -> Result<Option<String>, BusError> {
         let asker = names::canonical(namespace);
         let master = &self.inner.master;
-        let found = master.ask_as(&asker, "searchParam", vec![key.into()]);
+        let found = master.ask_in_name_of(&asker, "searchParam", vec![key.into()]);
         Ok(match found.await? {
             Ok(Value::String(found)) => Some(found),
             _ => None,
@@ -53,9 +55,9 @@ impl GlobalParameters for Ros1Bus {
         Ok(names.to_strings())
     }
 
-    async fn watch(&self) -> Result<ParamChanges, BusError> {
+    async fn watch(&self) -> Result<ParamChangeReceiver, BusError> {
         self.inner.check_open()?;
-        let (teller, changes) = changes_within(&self.inner.frames.budget);
+        let (teller, changes) = param_change_channel(&self.inner.frames.budget);
         *self.inner.param_watcher.lock() = Some(teller);
         self.inner.subscribe_params().await?;
         Ok(changes)

@@ -9,16 +9,18 @@ use parking_lot::Mutex;
 use tokio::sync::{mpsc, watch};
 
 use super::registrar::Kind;
-use super::{End, Inner, subscriptions};
-use crate::bus::{BusError, Matched, Message, Peer, PeerId, Publisher, Qos, WireType};
-use crate::ring::{DropCount, Lost};
+use super::{EndpointOwner, Ros1BusState, subscriptions};
+use crate::bus::{
+    BusError, MatchedPeers, PeerId, Publisher, QosProfile, SerializedMessage, TopicPeer, WireType,
+};
+use crate::ring::{DropCount, DropTally};
 use crate::ros1::tcpros::SendQueue;
 
-/// One topic with everyone here who publishes it, and every subscriber.
+/// One topic with all its local publishers and all subscribers.
 #[derive(Default)]
 pub(super) struct TopicOut {
     state: Mutex<State>,
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
     dropped: DropCount,
 }
 
@@ -27,15 +29,15 @@ struct State {
     advert: Option<WireType>,
     locals: BTreeMap<i32, LocalPublisher>,
     subscribers: Vec<Arc<Subscriber>>,
-    /// Actions of this node that listen.
+    /// Listening actions of this node.
     actions: Vec<PeerId>,
-    /// Those who only want to know what subscribers ask for, with their numbers, which grow.
+    /// Pending queries for the type that subscribers request, with their ascending numbers.
     askers: Vec<(i32, mpsc::UnboundedSender<WireType>)>,
 }
 
 struct LocalPublisher {
-    end: End,
-    qos: Qos,
+    end: EndpointOwner,
+    qos: QosProfile,
     last: Option<Bytes>,
 }
 
@@ -49,24 +51,25 @@ pub(super) struct Subscriber {
     pub(super) closing: watch::Sender<bool>,
 }
 
-/// Advertises, and registers if this is the topic's first local publisher.
+/// Advertises, and registers the topic if this is its first local publisher.
 pub(in crate::ros1) async fn advertise(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     name: &str,
     of: WireType,
-    qos: Qos,
-    end: End,
+    qos: QosProfile,
+    end: EndpointOwner,
 ) -> Result<Box<dyn Publisher>, BusError> {
-    let id = bus.id();
+    let id = bus.next_id();
     let topic = {
         let mut topics = bus.publications.lock();
         let topic = topics.entry(name.to_owned()).or_default();
         topic.add(name, id, &of, (qos, end))?;
-        bus.registrar.want(Kind::Publisher, name, Some(&of.name));
+        bus.registrar
+            .set_wanted(Kind::Publisher, name, Some(&of.name));
         topic.clone()
     };
     bus.publishing.notify_waiters();
-    let handle = Handle {
+    let handle = PublisherHandle {
         bus: bus.clone(),
         name: name.to_owned(),
         topic,
@@ -75,25 +78,28 @@ pub(in crate::ros1) async fn advertise(
         of: Arc::new(of),
         latching: qos.is_latching(),
     };
-    handle.topic.hear(subscriptions::actions(bus, name));
+    handle
+        .topic
+        .set_action_listeners(subscriptions::action_peers(bus, name));
     bus.registrar.sync(Kind::Publisher, name, false).await?;
     Ok(Box::new(handle))
 }
 
-/// Makes this node look like a publisher of `name`, so that subscribers connect and say what they want.
-pub(super) fn ask_subscribers(bus: &Arc<Inner>, name: &str) -> Asking {
+/// Makes this node look like a publisher of `name`, so that subscribers connect and declare the type they request.
+pub(super) fn ask_subscribers(bus: &Arc<Ros1BusState>, name: &str) -> SubscriberQuery {
     let (sender, answers) = mpsc::unbounded_channel();
     let topic = {
         let mut topics = bus.publications.lock();
         let topic = topics.entry(name.to_owned()).or_default();
         let mut state = topic.state.lock();
-        state.askers.push((bus.id(), sender));
+        state.askers.push((bus.next_id(), sender));
         let type_name = state.advert.as_ref().map_or("*", |advert| &advert.name);
-        bus.registrar.want(Kind::Publisher, name, Some(type_name));
+        bus.registrar
+            .set_wanted(Kind::Publisher, name, Some(type_name));
         topic.clone()
     };
     bus.publishing.notify_waiters();
-    Asking {
+    SubscriberQuery {
         bus: bus.clone(),
         name: name.to_owned(),
         topic,
@@ -101,15 +107,15 @@ pub(super) fn ask_subscribers(bus: &Arc<Inner>, name: &str) -> Asking {
     }
 }
 
-/// Listening to what subscribers ask for, until dropped.
-pub(super) struct Asking {
-    bus: Arc<Inner>,
+/// A pending query for the types that subscribers request; ends when dropped.
+pub(super) struct SubscriberQuery {
+    bus: Arc<Ros1BusState>,
     name: String,
     topic: Arc<TopicOut>,
     pub(super) answers: mpsc::UnboundedReceiver<WireType>,
 }
 
-impl Drop for Asking {
+impl Drop for SubscriberQuery {
     fn drop(&mut self) {
         self.answers.close();
         release(&self.bus, &self.name, &self.topic, |state| {
@@ -124,7 +130,7 @@ impl TopicOut {
         name: &str,
         id: i32,
         ours: &WireType,
-        (qos, end): (Qos, End),
+        (qos, end): (QosProfile, EndpointOwner),
     ) -> Result<(), BusError> {
         let mut state = self.state.lock();
         match &state.advert {
@@ -147,15 +153,20 @@ impl TopicOut {
         Ok(())
     }
 
-    /// What is advertised, and whether newcomers are given something.
+    /// Returns the advertised type, and whether any publisher is latching.
     pub(super) fn advert(&self) -> Option<(WireType, bool)> {
         let state = self.state.lock();
         let latching = state.locals.values().any(|local| local.qos.is_latching());
         state.advert.clone().map(|advert| (advert, latching))
     }
 
-    /// Passes on what a subscriber asks for to those who want to know and came after `told`; the last of them.
-    pub(super) fn overhear(&self, asked: &WireType, told: Option<i32>) -> Option<i32> {
+    /// Forwards the type requested by a subscriber to the queries with a number above `told`; returns the number of the
+    /// last one.
+    pub(super) fn forward_requested_type(
+        &self,
+        asked: &WireType,
+        told: Option<i32>,
+    ) -> Option<i32> {
         let state = self.state.lock();
         let mut last = None;
         for (number, asker) in &state.askers {
@@ -167,13 +178,13 @@ impl TopicOut {
         last
     }
 
-    /// Whether a subscriber that asks where to connect is welcome.
+    /// Returns true if a subscriber that calls `requestTopic` is to be given our address.
     pub(super) fn is_open(&self) -> bool {
         let state = self.state.lock();
         state.advert.is_some() || !state.askers.is_empty()
     }
 
-    /// Adds a subscriber, with all that is latched already queued for it; `None` if no longer advertised.
+    /// Adds a subscriber, with all latched messages already queued for it; `None` if the topic is no longer advertised.
     pub(super) fn attach(&self, id: i32, name: &str) -> Option<Arc<Subscriber>> {
         let mut state = self.state.lock();
         state.advert.as_ref()?;
@@ -188,7 +199,7 @@ impl TopicOut {
             closing: watch::Sender::new(false),
         });
         state.subscribers.push(subscriber.clone());
-        self.matched.send_replace(state.matched());
+        self.matched.send_replace(state.matched_peers());
         Some(subscriber)
     }
 
@@ -197,37 +208,41 @@ impl TopicOut {
         state
             .subscribers
             .retain(|other| !Arc::ptr_eq(other, subscriber));
-        self.matched.send_replace(state.matched());
+        self.matched.send_replace(state.matched_peers());
     }
 
-    /// Actions of this node that listen to the topic are these.
-    pub(super) fn hear(&self, actions: Vec<PeerId>) {
+    /// Sets the actions of this node that listen to the topic.
+    pub(super) fn set_action_listeners(&self, actions: Vec<PeerId>) {
         let mut state = self.state.lock();
         if state.actions != actions {
             state.actions = actions;
-            self.matched.send_replace(state.matched());
+            self.matched.send_replace(state.matched_peers());
         }
     }
 
-    /// What a new subscription of this node is given.
-    pub(super) fn latched(&self, node: &str, end: End) -> Vec<Message> {
+    /// Returns the latched messages for a new subscription of this node.
+    pub(super) fn latched_messages(
+        &self,
+        node: &str,
+        end: EndpointOwner,
+    ) -> Vec<SerializedMessage> {
         let state = self.state.lock();
         let Some(advert) = state.advert.clone().map(Arc::new) else {
             return Vec::new();
         };
         let heard = state.locals.iter().filter_map(|(id, local)| {
-            let heard = end == End::Action || local.end == End::Action;
-            Some(Message {
+            let heard = end == EndpointOwner::Action || local.end == EndpointOwner::Action;
+            Some(SerializedMessage {
                 bytes: local.last.clone().filter(|_| heard)?,
                 wire_type: advert.clone(),
-                publisher: own(node, *id),
+                publisher: own_peer_id(node, *id),
                 latching: true,
             })
         });
         heard.collect()
     }
 
-    /// Whether an action of this node listens.
+    /// Publishes a message; returns true if an action of this node listens.
     fn publish(&self, id: i32, message: Bytes) -> bool {
         let mut state = self.state.lock();
         let Some(local) = state.locals.get_mut(&id) else {
@@ -236,7 +251,7 @@ impl TopicOut {
         if local.qos.is_latching() {
             local.last = Some(message.clone());
         }
-        let mut lost = Lost::default();
+        let mut lost = DropTally::default();
         let size = message.len() as u64;
         for subscriber in &state.subscribers {
             subscriber.messages.fetch_add(1, Ordering::Relaxed);
@@ -247,32 +262,34 @@ impl TopicOut {
         !state.actions.is_empty()
     }
 
-    /// Publishes no more; what is queued is still sent.
+    /// Stops publishing; queued messages are still sent.
     pub(super) fn retire(&self) {
         retire(&mut self.state.lock());
     }
 
-    /// Returns when all subscribers are gone.
-    pub(super) async fn emptied(&self) {
+    /// Waits until all subscribers are gone.
+    pub(super) async fn wait_until_no_subscribers(&self) {
         let mut matched = self.matched.subscribe();
-        let _ = matched.wait_for(|matched| matched.connected() == 0).await;
+        let _ = matched
+            .wait_for(|matched| matched.connected_count() == 0)
+            .await;
     }
 
-    /// The connected subscribers.
+    /// Returns the connected subscribers.
     pub(super) fn subscribers(&self) -> Vec<Arc<Subscriber>> {
         self.state.lock().subscribers.clone()
     }
 }
 
 impl State {
-    fn matched(&self) -> Matched {
+    fn matched_peers(&self) -> MatchedPeers {
         let subscribers = self.subscribers.iter().map(|subscriber| &subscriber.peer);
-        let peers = subscribers.chain(&self.actions).map(|id| Peer {
+        let peers = subscribers.chain(&self.actions).map(|id| TopicPeer {
             id: id.clone(),
             connected: true,
             offer: None,
         });
-        Matched {
+        MatchedPeers {
             peers: peers.collect(),
             refused: Vec::new(),
         }
@@ -289,8 +306,13 @@ fn retire(state: &mut State) {
     }
 }
 
-/// Takes something back from a topic, and the topic from the Master when nothing is left of it.
-fn release(bus: &Arc<Inner>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(&mut State)) {
+/// Applies `by` to remove something from a topic, and unregisters the topic once nothing is left of it.
+fn release(
+    bus: &Arc<Ros1BusState>,
+    name: &str,
+    topic: &Arc<TopicOut>,
+    by: impl FnOnce(&mut State),
+) {
     {
         let mut topics = bus.publications.lock();
         let mut state = topic.state.lock();
@@ -303,7 +325,7 @@ fn release(bus: &Arc<Inner>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(
             return;
         }
         topics.remove(name);
-        bus.registrar.want(Kind::Publisher, name, None);
+        bus.registrar.set_wanted(Kind::Publisher, name, None);
     }
     let (bus_of_task, name) = (bus.clone(), name.to_owned());
     bus.spawn(async move {
@@ -312,46 +334,46 @@ fn release(bus: &Arc<Inner>, name: &str, topic: &Arc<TopicOut>, by: impl FnOnce(
     });
 }
 
-/// How a publisher of this node is told from others.
-fn own(node: &str, id: i32) -> PeerId {
+/// Returns the id of a publisher of this node.
+fn own_peer_id(node: &str, id: i32) -> PeerId {
     PeerId::new(node, id.unsigned_abs().into())
 }
 
 /// One local publisher.
-struct Handle {
-    bus: Arc<Inner>,
+struct PublisherHandle {
+    bus: Arc<Ros1BusState>,
     name: String,
     topic: Arc<TopicOut>,
     id: i32,
-    end: End,
+    end: EndpointOwner,
     of: Arc<WireType>,
     latching: bool,
 }
 
-impl Publisher for Handle {
+impl Publisher for PublisherHandle {
     fn publish(&self, bytes: Bytes) {
         let heard = self.topic.publish(self.id, bytes.clone());
-        if heard || self.end == End::Action {
-            let message = Message {
+        if heard || self.end == EndpointOwner::Action {
+            let message = SerializedMessage {
                 bytes,
                 wire_type: self.of.clone(),
-                publisher: own(&self.bus.node, self.id),
+                publisher: own_peer_id(&self.bus.node, self.id),
                 latching: self.latching,
             };
-            subscriptions::bring_back(&self.bus, &self.name, self.end, &message);
+            subscriptions::deliver_locally(&self.bus, &self.name, self.end, &message);
         }
     }
 
-    fn matched(&self) -> watch::Receiver<Matched> {
+    fn matched_subscribers(&self) -> watch::Receiver<MatchedPeers> {
         self.topic.matched.subscribe()
     }
 
-    fn dropped(&self) -> u64 {
+    fn dropped_count(&self) -> u64 {
         self.topic.dropped.get()
     }
 }
 
-impl Drop for Handle {
+impl Drop for PublisherHandle {
     fn drop(&mut self) {
         release(&self.bus, &self.name, &self.topic, |state| {
             state.locals.remove(&self.id);

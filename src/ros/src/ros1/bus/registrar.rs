@@ -1,5 +1,5 @@
-//! What this node wants registered, and what it believes the Master has: brought together one call at a time
-//! per name, so that taking back and registering again cannot overtake each other.
+//! Reconciles what this node wants registered with what it believes the Master has, one call at a time per name, so
+//! that unregistering and registering again cannot overtake each other.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use super::master_client::MasterClient;
 use crate::bus::{BusError, Graph};
 use crate::ros1::xmlrpc::Value;
 
-/// What is registered.
+/// Kind of a registration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Kind {
     Publisher,
@@ -21,22 +21,22 @@ pub(super) enum Kind {
 
 type Key = (Kind, String);
 
-/// A service that another node has registered as well is taken back after such a pause, which doubles each time, at most up
-/// to the second. Who calls it reaches the node that registered last.
+/// Initial and maximum pause before a service that another node has registered too is registered again; the pause
+/// doubles each time. Callers reach the node that registered last.
 const PAUSES: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(600));
 
 /// Another node registers the same service.
-struct Contest {
-    /// It is not taken back before.
+struct RegistrationConflict {
+    /// Earliest time to register again.
     until: Instant,
     pause: Duration,
 }
 
 #[derive(Default)]
 struct Slot {
-    /// The type to be registered with, if it is to be registered.
+    /// Type to register with; `None` if it is not to be registered.
     wanted: Mutex<Option<String>>,
-    /// The type the Master was told. Locked while it is being told.
+    /// Type known to the Master. Locked during the call that changes it.
     told: tokio::sync::Mutex<Option<String>>,
 }
 
@@ -46,7 +46,7 @@ pub(super) struct Registrar {
     slave_uri: String,
     service_uri: String,
     slots: Mutex<HashMap<Key, Arc<Slot>>>,
-    contests: Mutex<HashMap<String, Contest>>,
+    contests: Mutex<HashMap<String, RegistrationConflict>>,
 }
 
 impl Registrar {
@@ -68,22 +68,22 @@ impl Registrar {
         &self.service_uri
     }
 
-    /// Says what is wanted from now on; [`Registrar::sync`] makes it so.
-    pub(super) fn want(&self, kind: Kind, name: &str, type_name: Option<&str>) {
+    /// Sets the desired registration; [`Registrar::sync`] applies it.
+    pub(super) fn set_wanted(&self, kind: Kind, name: &str, type_name: Option<&str>) {
         let mut slots = self.slots.lock();
         let slot = slots.entry((kind, name.to_owned())).or_default();
         *slot.wanted.lock() = type_name.map(str::to_owned);
     }
 
-    /// Whether something is to be registered.
+    /// Returns true if it is to be registered.
     pub(super) fn is_wanted(&self, kind: Kind, name: &str) -> bool {
         let slots = self.slots.lock();
         let slot = slots.get(&(kind, name.to_owned()));
         slot.is_some_and(|slot| slot.wanted.lock().is_some())
     }
 
-    /// Tells the Master what it must know of one name, even if it was told (`again`). The Master's answer, if
-    /// anything was registered.
+    /// Brings the Master's registration of one name up to date; with `again`, even if it is believed to be. Returns the
+    /// Master's answer if anything was registered.
     pub(super) async fn sync(
         &self,
         kind: Kind,
@@ -105,18 +105,18 @@ impl Registrar {
             Some(_) => Ok(None),
             None => {
                 if told.take().is_some() || again {
-                    // If this fails the Master is gone, or the graph's next look will find it.
+                    // If this fails the Master is gone, or the next look at the graph will notice.
                     let _ = self.unregister(kind, name).await;
                 }
                 drop(told);
-                self.forget(&key, slot);
+                self.remove_unused(&key, slot);
                 Ok(None)
             }
         }
     }
 
-    /// Removes a slot that nobody wants or works on.
-    fn forget(&self, key: &Key, slot: Arc<Slot>) {
+    /// Removes a slot that is neither wanted nor in use.
+    fn remove_unused(&self, key: &Key, slot: Arc<Slot>) {
         let mut slots = self.slots.lock();
         let unused = Arc::strong_count(&slot) == 2 && slot.wanted.lock().is_none();
         if unused {
@@ -147,7 +147,8 @@ impl Registrar {
         self.master.call(method, args).await
     }
 
-    /// Compares with what the Master shows of node `node`: what it lacks and what it has too much.
+    /// Returns the differences to what the Master shows of node `node`: registrations that are missing and those that
+    /// are surplus.
     pub(super) fn differences(&self, node: &str, graph: &Graph) -> Vec<(Kind, String)> {
         let ours = graph
             .nodes
@@ -166,14 +167,14 @@ impl Registrar {
         let mut wrong: Vec<Key> = slots
             .iter()
             .filter(|(_, slot)| {
-                // Not those that are being told just now.
+                // Not those with a call in progress.
                 slot.told.try_lock().is_ok_and(|told| told.is_some())
                     && slot.wanted.lock().is_some()
             })
             .filter(|((kind, name), _)| !ours || !has(*kind, name))
             .filter(|((kind, name), _)| match graph.services.get(name) {
                 Some(other) if *kind == Kind::Service && other != node => {
-                    self.takes_back(name, other)
+                    self.should_reregister(name, other)
                 }
                 _ => true,
             })
@@ -195,19 +196,20 @@ impl Registrar {
         wrong
     }
 
-    /// Whether a service that `other` has registered is to be registered again now. Two nodes that did so each time they see
-    /// the other's registration would do nothing else.
-    fn takes_back(&self, name: &str, other: &str) -> bool {
+    /// Returns true if a service that `other` has registered is to be registered again now. Without a pause two such
+    /// nodes would do nothing but overwrite each other's registration.
+    fn should_reregister(&self, name: &str, other: &str) -> bool {
         let now = Instant::now();
         let mut contests = self.contests.lock();
         let Some(contest) = contests.get_mut(name) else {
             tracing::warn!(
                 service = name,
-                "{other} serves it, too, and calls go to whoever registered last; it is registered again now and then"
+                "{other} also serves it, and calls go to whichever node registered last; it is registered again \
+                    periodically"
             );
             let pause = PAUSES.0;
             let until = now + pause;
-            contests.insert(name.to_owned(), Contest { until, pause });
+            contests.insert(name.to_owned(), RegistrationConflict { until, pause });
             return true;
         };
         if now < contest.until {
@@ -218,7 +220,7 @@ impl Registrar {
         true
     }
 
-    /// Takes back a registration that the Master shows and nobody here wants.
+    /// Removes a registration that the Master shows and this node does not want.
     pub(super) async fn withdraw_surplus(&self, kind: Kind, name: &str) {
         self.slots
             .lock()
@@ -227,7 +229,7 @@ impl Registrar {
         let _ = self.sync(kind, name, true).await;
     }
 
-    /// Takes everything back.
+    /// Removes all registrations.
     pub(super) async fn withdraw_all(&self) {
         let keys: Vec<Key> = {
             let slots = self.slots.lock();

@@ -1,4 +1,4 @@
-//! The TCPROS server: subscribers of our topics and callers of our services connect here.
+//! The TCPROS server: accepts subscribers of our topics and callers of our services.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,68 +9,69 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, timeout, timeout_at};
 
 use super::publications::{Subscriber, TopicOut};
-use super::{FAREWELL, HANDSHAKE, Inner, services};
+use super::{FAREWELL, HANDSHAKE, Ros1BusState, services};
 use crate::bus::WireType;
 use crate::net;
 use crate::ros1::tcpros::{Error, Header};
 
-/// Connections at a time; further ones wait in the backlog.
+/// Maximum number of connections; further ones wait in the backlog.
 const MAX_CONNECTIONS: usize = 4000;
-/// How long a subscriber of a topic that is not advertised is kept waiting. rospy does not connect again to a publisher
-/// that it is still connected to: were it sent away, and the topic advertised before it has seen that, it would never
-/// come back. Longer than subscribers are asked what they want, which a publication of ours often follows.
+/// Time for which a subscriber of a topic that is not advertised is kept waiting. rospy does not connect again to a
+/// publisher to which it is still connected: if it were sent away and the topic advertised before it noticed, it would
+/// never come back. Longer than a query for the subscribers' types takes, which is often followed by a publication of
+/// ours.
 const READVERTISED: Duration = Duration::from_secs(4);
 
 /// Serves until dropped, which also ends every connection.
-pub(super) async fn serve(bus: Arc<Inner>, listener: TcpListener) {
+pub(super) async fn serve(bus: Arc<Ros1BusState>, listener: TcpListener) {
     let connected = |stream| {
         let bus = bus.clone();
-        async move { connection(&bus, stream).await }
+        async move { serve_connection(&bus, stream).await }
     };
-    net::serve_each(listener, MAX_CONNECTIONS, "TCPROS", connected).await;
+    net::serve_connections(listener, MAX_CONNECTIONS, "TCPROS", connected).await;
 }
 
-async fn connection(bus: &Arc<Inner>, mut stream: TcpStream) -> Result<(), Error> {
+async fn serve_connection(bus: &Arc<Ros1BusState>, mut stream: TcpStream) -> Result<(), Error> {
     let mut buffer = BytesMut::new();
     let header = match timeout(HANDSHAKE, Header::read(&mut stream, &mut buffer)).await {
         Ok(header) => header?,
         Err(_) => return Err(Error::Header("it did not come in time".to_owned())),
     };
     if let Some(service) = header.get("service") {
-        return services::answer(bus, service, &header, stream, buffer).await;
+        return services::serve_caller(bus, service, &header, stream, buffer).await;
     }
     let Some(name) = header.get("topic") else {
         return refuse(stream, "the header names neither a topic nor a service").await;
     };
-    subscriber(bus, name, &header, stream).await
+    serve_subscriber(bus, name, &header, stream).await
 }
 
-/// Says why not, and hangs up.
+/// Sends the reason and closes the connection.
 pub(super) async fn refuse(mut stream: TcpStream, reason: &str) -> Result<(), Error> {
     Header::error(reason).write(&mut stream).await?;
     Ok(stream.shutdown().await?)
 }
 
-/// A subscriber that has said what it wants.
-struct Waiting<'a> {
-    bus: &'a Inner,
+/// A subscriber that has declared the type it requests.
+struct PendingSubscriber<'a> {
+    bus: &'a Ros1BusState,
     name: &'a str,
     asked: &'a WireType,
-    /// Who was told what it asks for, last.
+    /// Number of the last query that was told the requested type.
     told: Option<i32>,
 }
 
-impl Waiting<'_> {
-    /// The topic once it is advertised; none where that takes longer than [`READVERTISED`]. Whoever wants to know
-    /// meanwhile what subscribers ask for is told, and begins that time anew.
-    async fn advertised(&mut self) -> Option<(Arc<TopicOut>, WireType, bool)> {
+impl PendingSubscriber<'_> {
+    /// Waits until the topic is advertised; `None` if that takes longer than [`READVERTISED`]. Queries that arrive
+    /// meanwhile are told the requested type, and restart the time limit.
+    async fn wait_until_advertised(&mut self) -> Option<(Arc<TopicOut>, WireType, bool)> {
         let mut latest = Instant::now() + READVERTISED;
         loop {
             let mut next = std::pin::pin!(self.bus.publishing.notified());
             next.as_mut().enable();
             let topic = self.bus.publications.lock().get(self.name).cloned();
             if let Some(topic) = topic {
-                if let Some(told) = topic.overhear(self.asked, self.told) {
+                if let Some(told) = topic.forward_requested_type(self.asked, self.told) {
                     self.told = Some(told);
                     latest = Instant::now() + READVERTISED;
                 }
@@ -83,29 +84,29 @@ impl Waiting<'_> {
     }
 }
 
-async fn subscriber(
-    bus: &Arc<Inner>,
+async fn serve_subscriber(
+    bus: &Arc<Ros1BusState>,
     name: &str,
     header: &Header,
     mut stream: TcpStream,
 ) -> Result<(), Error> {
-    let asked = &super::announced(header);
+    let asked = &super::wire_type_from_header(header);
     let caller = header.get("callerid").unwrap_or("unknown");
-    let mut waiting = Waiting {
+    let mut waiting = PendingSubscriber {
         bus,
         name,
         asked,
         told: None,
     };
-    let Some((topic, advert, latching)) = waiting.advertised().await else {
+    let Some((topic, advert, latching)) = waiting.wait_until_advertised().await else {
         if waiting.told.is_some() {
-            // It was only asked what it wants: hang up without a word, or it would log an error.
+            // It was only queried for its type: close without a reason, or it would log an error.
             return Ok(());
         }
         let node = &bus.node;
         return refuse(stream, &format!("{node} does not publish {name}")).await;
     };
-    if !asked.agrees(&advert) {
+    if !asked.is_compatible_with(&advert) {
         let reason = format!(
             "{caller} wants topic {name} to have datatype/md5sum [{}/{}], but our version has [{}/{}]; \
              dropping connection",
@@ -114,10 +115,10 @@ async fn subscriber(
         tracing::warn!(topic = name, reason, "a subscriber was refused");
         return refuse(stream, &reason).await;
     }
-    let Some(subscriber) = topic.attach(bus.id(), caller) else {
+    let Some(subscriber) = topic.attach(bus.next_id(), caller) else {
         return Ok(());
     };
-    let attached = Attached {
+    let attached = AttachedSubscriber {
         topic: &topic,
         subscriber,
     };
@@ -133,13 +134,13 @@ async fn subscriber(
     attached.serve(stream).await
 }
 
-/// A subscriber in its topic's list, until dropped.
-struct Attached<'a> {
+/// A subscriber in its topic's list; removed when dropped.
+struct AttachedSubscriber<'a> {
     topic: &'a TopicOut,
     subscriber: Arc<Subscriber>,
 }
 
-impl Attached<'_> {
+impl AttachedSubscriber<'_> {
     async fn serve(&self, mut stream: TcpStream) -> Result<(), Error> {
         let (mut reading, mut writing) = stream.split();
         let mut closing = self.subscriber.closing.subscribe();
@@ -160,7 +161,7 @@ impl Attached<'_> {
     }
 }
 
-impl Drop for Attached<'_> {
+impl Drop for AttachedSubscriber<'_> {
     fn drop(&mut self) {
         self.topic.detach(&self.subscriber);
     }

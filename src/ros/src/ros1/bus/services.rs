@@ -9,41 +9,41 @@ use tokio::net::TcpStream;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use super::Inner;
+use super::Ros1BusState;
 use super::registrar::Kind;
 use super::server::refuse;
 use crate::bus::{BusError, Digest, ServiceHandler, ServiceType};
 use crate::ros1::tcpros::{Error, Header, serve_calls};
 
-/// For a caller to take a header.
+/// Time for a caller to accept a header.
 const TAKE: Duration = Duration::from_secs(10);
 
-/// The field of a server's header in which it tells its label.
+/// Field of a server's header that contains its label.
 pub(super) const LABEL: &str = "cloudroid";
 
 /// One service.
-pub(super) struct Served {
+pub(super) struct ServiceEntry {
     pub(super) service_type: ServiceType,
     pub(super) handler: Arc<dyn ServiceHandler>,
-    /// True, or without its sender: served no more.
+    /// True, or without a sender, once the service has ended.
     pub(super) ended: watch::Receiver<bool>,
 }
 
-impl Served {
-    pub(super) fn is_over(&self) -> bool {
+impl ServiceEntry {
+    pub(super) fn has_ended(&self) -> bool {
         *self.ended.borrow() || self.ended.has_changed().is_err()
     }
 }
 
 /// Serves until the guard is dropped.
 pub(super) async fn serve(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     name: &str,
     service_type: ServiceType,
     handler: Arc<dyn ServiceHandler>,
 ) -> Result<Box<dyn Send + Sync>, BusError> {
     let (ending, ended) = watch::channel(false);
-    let served = Arc::new(Served {
+    let served = Arc::new(ServiceEntry {
         service_type,
         handler,
         ended,
@@ -55,9 +55,10 @@ pub(super) async fn serve(
         }
         services.insert(name.to_owned(), served.clone());
         let type_name = served.service_type.name.as_str();
-        bus.registrar.want(Kind::Service, name, Some(type_name));
+        bus.registrar
+            .set_wanted(Kind::Service, name, Some(type_name));
     }
-    let guard = Guard {
+    let guard = ServiceGuard {
         bus: bus.clone(),
         name: name.to_owned(),
         served,
@@ -67,14 +68,14 @@ pub(super) async fn serve(
     Ok(Box::new(guard))
 }
 
-struct Guard {
-    bus: Arc<Inner>,
+struct ServiceGuard {
+    bus: Arc<Ros1BusState>,
     name: String,
-    served: Arc<Served>,
+    served: Arc<ServiceEntry>,
     ending: watch::Sender<bool>,
 }
 
-impl Drop for Guard {
+impl Drop for ServiceGuard {
     fn drop(&mut self) {
         self.ending.send_replace(true);
         {
@@ -84,7 +85,9 @@ impl Drop for Guard {
                 return;
             }
             services.remove(&self.name);
-            self.bus.registrar.want(Kind::Service, &self.name, None);
+            self.bus
+                .registrar
+                .set_wanted(Kind::Service, &self.name, None);
         }
         let (bus, name) = (self.bus.clone(), self.name.clone());
         self.bus.spawn(async move {
@@ -93,21 +96,21 @@ impl Drop for Guard {
     }
 }
 
-/// Serves one caller, whose header was read.
-pub(super) async fn answer(
-    bus: &Arc<Inner>,
+/// Serves one caller whose header has been read.
+pub(super) async fn serve_caller(
+    bus: &Arc<Ros1BusState>,
     name: &str,
     header: &Header,
     mut stream: TcpStream,
     buffer: BytesMut,
 ) -> Result<(), Error> {
     let served = bus.services.lock().get(name).cloned();
-    let Some(served) = served.or_else(|| bus.lending.lent(name)) else {
+    let Some(served) = served.or_else(|| bus.lending.active_service(name)) else {
         return refuse(stream, &format!("{} does not serve {name}", bus.node)).await;
     };
     let ours = &served.service_type;
     let asked = Digest::from(header.get("md5sum").unwrap_or("*"));
-    if !asked.agrees(&ours.digest) {
+    if !asked.is_compatible_with(&ours.digest) {
         let reason = format!(
             "client wants service {name} to have md5sum {asked}, but it has {}; dropping connection",
             ours.digest
@@ -123,7 +126,7 @@ pub(super) async fn answer(
         ("response_type", &format!("{}Response", ours.name)),
     ]);
     if let Some(label) = bus.label.get() {
-        answer = answer.with(LABEL, label);
+        answer = answer.with_field(LABEL, label);
     }
     match timeout(TAKE, answer.write(&mut stream)).await {
         Ok(written) => written?,

@@ -1,30 +1,30 @@
-//! The slave API (<http://wiki.ros.org/ROS/Slave_API>): what the Master and other nodes ask of this one.
+//! The slave API (<http://wiki.ros.org/ROS/Slave_API>): calls of the Master and other nodes to this one.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use async_trait::async_trait;
 
-use super::Inner;
+use super::Ros1BusState;
 use crate::ros1::master::lending::LEND_SERVICE;
 use crate::ros1::names;
-use crate::ros1::reply::{Args, Reply};
-use crate::ros1::xmlrpc::{Fault, Handler, Value};
+use crate::ros1::reply::{ApiReply, Args};
+use crate::ros1::xmlrpc::{Fault, Value, XmlRpcHandler};
 
 pub(super) struct Slave {
-    pub(super) bus: Arc<Inner>,
+    pub(super) bus: Arc<Ros1BusState>,
 }
 
 #[async_trait]
-impl Handler for Slave {
+impl XmlRpcHandler for Slave {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         let mut args = Args::new(params);
         let answer = match method {
             "publisherUpdate" => self.publisher_update(&mut args),
             "requestTopic" => self.request_topic(&mut args),
             "paramUpdate" => self.param_update(&mut args),
-            "getPid" => Ok(Reply::done("", pid())),
-            "getMasterUri" => Ok(Reply::done("", self.bus.master.uri())),
+            "getPid" => Ok(ApiReply::success("", pid())),
+            "getMasterUri" => Ok(ApiReply::success("", self.bus.master.uri())),
             "getSubscriptions" => Ok(self.subscriptions()),
             "getPublications" => Ok(self.publications()),
             "getBusStats" => Ok(self.stats()),
@@ -38,39 +38,39 @@ impl Handler for Slave {
 }
 
 impl Slave {
-    fn publisher_update(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn publisher_update(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
         let name = args.text("topic")?;
-        let publishers = args.any("publishers")?.to_strings();
+        let publishers = args.value("publishers")?.to_strings();
         let topic = self.bus.subscriptions.lock().get(&name).cloned();
         if let Some(topic) = topic {
             topic.update(&self.bus, &publishers);
         }
-        Ok(Reply::done("", 0))
+        Ok(ApiReply::success("", 0))
     }
 
-    fn param_update(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn param_update(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
         let key = names::canonical(&args.text("key")?);
-        // An empty dictionary is how a deletion is told.
-        let value = match args.any("value")? {
+        // A deletion is announced as an empty dictionary.
+        let value = match args.value("value")? {
             Value::Struct(members) if members.is_empty() => None,
             value => Some(value.into()),
         };
         if let Some(watcher) = &*self.bus.param_watcher.lock() {
-            if let Err(error) = watcher.tell(key.clone(), value) {
-                // Others are told all the same; whoever reads it gets it.
-                tracing::warn!("a change of the parameter {key} is not told: {error}");
-                return Ok(Reply::not_done(error.to_string(), 0));
+            if let Err(error) = watcher.send(key.clone(), value) {
+                // The other watchers are notified all the same, and reading the parameter returns the new value.
+                tracing::warn!("a change of the parameter {key} was not reported: {error}");
+                return Ok(ApiReply::failure(error.to_string(), 0));
             }
         }
-        Ok(Reply::done("", 0))
+        Ok(ApiReply::success("", 0))
     }
 
-    fn request_topic(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn request_topic(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
         let name = args.text("topic")?;
-        let protocols = args.any("protocols")?;
+        let protocols = args.value("protocols")?;
         let bus = &self.bus;
         let open = bus
             .publications
@@ -79,7 +79,7 @@ impl Slave {
             .is_some_and(|t| t.is_open());
         if !open {
             let message = format!("{} does not publish {name}", bus.node);
-            return Ok(Reply::not_done(message, Value::Array(Vec::new())));
+            return Ok(ApiReply::failure(message, Value::Array(Vec::new())));
         }
         let tcpros = |protocol: &Value| {
             let name = protocol.as_array().and_then(<[Value]>::first);
@@ -87,7 +87,7 @@ impl Slave {
         };
         if !protocols.as_array().unwrap_or_default().iter().any(tcpros) {
             let message = "only TCPROS is spoken here";
-            return Ok(Reply::not_done(message, Value::Array(Vec::new())));
+            return Ok(ApiReply::failure(message, Value::Array(Vec::new())));
         }
         let place = vec![
             "TCPROS".into(),
@@ -95,46 +95,46 @@ impl Slave {
             i32::from(bus.port).into(),
         ];
         let message = format!("ready on {}:{}", bus.host, bus.port);
-        Ok(Reply::done(message, Value::Array(place)))
+        Ok(ApiReply::success(message, Value::Array(place)))
     }
 
-    fn shutdown(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn shutdown(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
         let reason = args.text("reason").unwrap_or_default();
         tracing::info!(node = self.bus.node, reason, "asked to shut down");
         self.bus.shutdown.send_replace(Some(reason));
-        Ok(Reply::done("", 0))
+        Ok(ApiReply::success("", 0))
     }
 
-    async fn lend_service(&self, args: &mut Args) -> Result<Reply, Reply> {
+    async fn lend_service(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
         let service = args.text("service")?;
         let node = args.text("node")?;
         Ok(match self.bus.lend_service(&service, &node).await {
-            Some(api) => Reply::done("", api),
-            None => Reply::not_done(format!("{service} is not lent"), ""),
+            Some(api) => ApiReply::success("", api),
+            None => ApiReply::failure(format!("{service} is not lent"), ""),
         })
     }
 
-    fn subscriptions(&self) -> Reply {
+    fn subscriptions(&self) -> ApiReply {
         let topics = self.bus.subscriptions.lock();
         let list = topics.values().map(|topic| {
             let type_name = topic.type_name();
             Value::strings([topic.name.clone(), type_name])
         });
-        Reply::done("subscriptions", Value::Array(list.collect()))
+        ApiReply::success("subscriptions", Value::Array(list.collect()))
     }
 
-    fn publications(&self) -> Reply {
+    fn publications(&self) -> ApiReply {
         let topics = self.bus.publications.lock();
         let list = topics.iter().filter_map(|(name, topic)| {
             let (advert, _) = topic.advert()?;
             Some(Value::strings([name.clone(), advert.name]))
         });
-        Reply::done("publications", Value::Array(list.collect()))
+        ApiReply::success("publications", Value::Array(list.collect()))
     }
 
-    fn stats(&self) -> Reply {
+    fn stats(&self) -> ApiReply {
         let published = self.bus.publications.lock();
         let published = published.iter().map(|(name, topic)| {
             let connections = topic.subscribers().into_iter().map(|subscriber| {
@@ -160,10 +160,10 @@ impl Slave {
         });
         let subscribed = Value::Array(subscribed.collect());
         let services = Value::Array(vec![0.into(), 0.into(), 0.into()]);
-        Reply::done("stats", Value::Array(vec![published, subscribed, services]))
+        ApiReply::success("stats", Value::Array(vec![published, subscribed, services]))
     }
 
-    fn info(&self) -> Reply {
+    fn info(&self) -> ApiReply {
         let row = |id: i32, peer: &str, direction: &str, topic: &str, connected: bool| {
             Value::Array(vec![
                 id.into(),
@@ -187,7 +187,7 @@ impl Slave {
                 rows.push(row(link.id, link.uri(), "i", &topic.name, connected));
             }
         }
-        Reply::done("bus info", Value::Array(rows))
+        ApiReply::success("bus info", Value::Array(rows))
     }
 }
 
@@ -195,7 +195,7 @@ fn pid() -> i32 {
     i32::try_from(std::process::id()).unwrap_or(i32::MAX)
 }
 
-/// A count as XML-RPC's 32 bits hold it.
+/// Converts a count to XML-RPC's 32 bits.
 fn number(count: u64) -> Value {
     Value::Int(i32::try_from(count).unwrap_or(i32::MAX))
 }

@@ -8,63 +8,63 @@ use bytes::Bytes;
 use parking_lot::Mutex;
 use tokio::sync::watch;
 
-use super::link::{self, Link};
+use super::link::{self, PublisherLink};
 use super::registrar::Kind;
-use super::{End, Inner};
+use super::{EndpointOwner, Ros1BusState};
 use crate::bus::{
-    BusError, Matched, Message, MessageSender, Peer, PeerId, Qos, Subscription, WireType,
-    message_queue,
+    BusError, MatchedPeers, MessageSender, PeerId, QosProfile, SerializedMessage, Subscription,
+    TopicPeer, WireType, message_queue,
 };
 use crate::ros1::tcpros;
 
-/// One topic with everyone here who wants it and every publisher of it.
+/// One topic with all its local subscriptions and publishers.
 pub(super) struct TopicIn {
     pub(super) name: String,
-    locals: Mutex<Locals>,
-    links: Mutex<Links>,
+    locals: Mutex<LocalSubscribers>,
+    links: Mutex<PublisherLinks>,
     /// Publishers that have not left.
-    matched: watch::Sender<Matched>,
+    matched: watch::Sender<MatchedPeers>,
 }
 
 /// One connection per publisher, by its address.
 #[derive(Default)]
-struct Links {
-    by_uri: BTreeMap<String, Arc<Link>>,
+struct PublisherLinks {
+    by_uri: BTreeMap<String, Arc<PublisherLink>>,
     ended: bool,
 }
 
 #[derive(Default)]
-struct Locals {
-    list: Vec<Local>,
-    /// The last message of each latching publisher, by its address: for locals that come later.
-    latched: HashMap<String, Message>,
+struct LocalSubscribers {
+    list: Vec<LocalSubscriber>,
+    /// Last message of each latching publisher, by its address, for later local subscriptions.
+    latched: HashMap<String, SerializedMessage>,
 }
 
-struct Local {
+struct LocalSubscriber {
     id: i32,
-    end: End,
+    end: EndpointOwner,
     sender: MessageSender,
     wanted: WireType,
 }
 
-impl Local {
-    fn send(&self, message: Message) {
-        if self.wanted.agrees(&message.wire_type) {
+impl LocalSubscriber {
+    fn send(&self, message: SerializedMessage) {
+        if self.wanted.is_compatible_with(&message.wire_type) {
             self.sender.send(message);
         }
     }
 }
 
-/// Subscribes, and registers if this is the topic's first local subscription.
+/// Subscribes, and registers the topic if this is its first local subscription.
 pub(in crate::ros1) async fn subscribe(
-    bus: &Arc<Inner>,
+    bus: &Arc<Ros1BusState>,
     name: &str,
     wanted: WireType,
-    qos: Qos,
-    end: End,
+    qos: QosProfile,
+    end: EndpointOwner,
 ) -> Result<Subscription, BusError> {
     let (sender, messages) = message_queue(qos.depth);
-    let id = bus.id();
+    let id = bus.next_id();
     let (topic, first) = {
         let mut topics = bus.subscriptions.lock();
         let mut first = false;
@@ -77,75 +77,84 @@ pub(in crate::ros1) async fn subscribe(
                 matched: watch::Sender::default(),
             })
         });
-        topic.add(Local {
+        topic.add(LocalSubscriber {
             id,
             end,
             sender,
             wanted,
         });
         bus.registrar
-            .want(Kind::Subscriber, name, Some(&topic.type_name()));
+            .set_wanted(Kind::Subscriber, name, Some(&topic.type_name()));
         (topic.clone(), first)
     };
-    let guard = Guard {
+    let guard = SubscriptionGuard {
         bus: bus.clone(),
         topic: topic.clone(),
         id,
     };
-    topic.add_own(bus, id);
-    // Of a new set of connections the publishers must be learnt, even if an earlier registration still stands.
+    topic.deliver_own_latched(bus, id);
+    // A new set of connections must learn the publishers, even if an earlier registration still stands.
     let answer = bus.registrar.sync(Kind::Subscriber, name, first).await?;
     if let Some(publishers) = answer {
         topic.update(bus, &publishers.to_strings());
     }
     Ok(Subscription {
-        dropped: messages.dropped(),
+        dropped: messages.drop_counter(),
         messages,
         matched: topic.matched.subscribe(),
         guard: Box::new(guard),
     })
 }
 
-/// Actions of this node that listen to a topic.
-pub(super) fn actions(bus: &Inner, name: &str) -> Vec<PeerId> {
+/// Returns the actions of this node that listen to a topic.
+pub(super) fn action_peers(bus: &Ros1BusState, name: &str) -> Vec<PeerId> {
     let topic = bus.subscriptions.lock().get(name).cloned();
-    topic.map_or_else(Vec::new, |topic| topic.actions(&bus.node))
+    topic.map_or_else(Vec::new, |topic| topic.action_peers(&bus.node))
 }
 
-/// Gives those here who hear it what this node itself publishes, through an end of that kind.
-pub(super) fn bring_back(bus: &Inner, name: &str, by: End, message: &Message) {
+/// Delivers a message published by this node through an endpoint of owner `by` to the local subscriptions that are to
+/// receive it.
+pub(super) fn deliver_locally(
+    bus: &Ros1BusState,
+    name: &str,
+    by: EndpointOwner,
+    message: &SerializedMessage,
+) {
     let topic = bus.subscriptions.lock().get(name).cloned();
     let Some(topic) = topic else { return };
     for local in &topic.locals.lock().list {
-        if by == End::Action || local.end == End::Action {
+        if by == EndpointOwner::Action || local.end == EndpointOwner::Action {
             local.send(message.clone());
         }
     }
 }
 
 impl TopicIn {
-    fn actions(&self, node: &str) -> Vec<PeerId> {
+    fn action_peers(&self, node: &str) -> Vec<PeerId> {
         let locals = self.locals.lock();
-        let actions = locals.list.iter().filter(|local| local.end == End::Action);
+        let actions = locals
+            .list
+            .iter()
+            .filter(|local| local.end == EndpointOwner::Action);
         let ids = actions.map(|local| PeerId::new(node, local.id.unsigned_abs().into()));
         ids.collect()
     }
 
-    /// Gives a new subscription what this node has latched itself, and tells its publishers.
-    fn add_own(&self, bus: &Inner, id: i32) {
+    /// Gives a new subscription the messages latched by this node, and informs its publishers.
+    fn deliver_own_latched(&self, bus: &Ros1BusState, id: i32) {
         let published = bus.publications.lock().get(&self.name).cloned();
         let Some(published) = published else { return };
         let locals = self.locals.lock();
         let new = locals.list.iter().find(|local| local.id == id);
         let Some(new) = new else { return };
-        for message in published.latched(&bus.node, new.end) {
+        for message in published.latched_messages(&bus.node, new.end) {
             new.send(message);
         }
         drop(locals);
-        published.hear(actions(bus, &self.name));
+        published.set_action_listeners(action_peers(bus, &self.name));
     }
 
-    fn add(&self, local: Local) {
+    fn add(&self, local: LocalSubscriber) {
         let mut locals = self.locals.lock();
         for message in locals.latched.values() {
             local.send(message.clone());
@@ -153,8 +162,8 @@ impl TopicIn {
         locals.list.push(local);
     }
 
-    /// What publishers are asked for: the type all locals agree on, or any.
-    pub(super) fn wanted(&self) -> WireType {
+    /// Returns the type to request from publishers: the one all local subscriptions agree on, or any.
+    pub(super) fn requested_type(&self) -> WireType {
         let locals = self.locals.lock();
         let mut types = locals.list.iter().map(|local| &local.wanted);
         match types.next() {
@@ -165,7 +174,7 @@ impl TopicIn {
         }
     }
 
-    /// What the Master is told: the first type that anyone here named.
+    /// Returns the type to register with the Master: the first one named by a local subscription.
     pub(super) fn type_name(&self) -> String {
         let locals = self.locals.lock();
         let mut types = locals.list.iter().map(|local| &local.wanted);
@@ -173,13 +182,13 @@ impl TopicIn {
         named.map_or("*", |wanted| &wanted.name).to_owned()
     }
 
-    /// Takes a message of the publisher at `uri`.
-    pub(super) fn deliver(&self, uri: &str, message: Message) {
+    /// Delivers a message of the publisher at `uri`.
+    pub(super) fn deliver(&self, uri: &str, message: SerializedMessage) {
         let mut locals = self.locals.lock();
         if message.latching {
-            // Kept for long: it must not hold on to the buffer it came in with its neighbours.
+            // Kept for long: it must not keep the receive buffer alive that it shares with other messages.
             let kept = if message.bytes.len() < tcpros::BIG {
-                Message {
+                SerializedMessage {
                     bytes: Bytes::copy_from_slice(&message.bytes),
                     ..message.clone()
                 }
@@ -196,18 +205,18 @@ impl TopicIn {
         }
     }
 
-    /// Connects to publishers that are new and lets go of those no longer listed.
-    pub(super) fn update(self: &Arc<Self>, bus: &Arc<Inner>, publishers: &[String]) {
+    /// Connects to new publishers and releases those no longer listed.
+    pub(super) fn update(self: &Arc<Self>, bus: &Arc<Ros1BusState>, publishers: &[String]) {
         let mut links = self.links.lock();
         if links.ended {
             return;
         }
         for (uri, link) in &links.by_uri {
-            link.list(publishers.contains(uri));
+            link.set_listed(publishers.contains(uri));
         }
         for uri in publishers {
             let known = links.by_uri.contains_key(uri);
-            // What this bus publishes itself is not brought back to it.
+            // Messages published by this bus are not delivered to it.
             if !known && uri != bus.registrar.slave_uri() {
                 let link = link::start(bus, self, uri);
                 links.by_uri.insert(uri.clone(), link);
@@ -215,8 +224,8 @@ impl TopicIn {
         }
     }
 
-    /// The link has ended, unless it was listed again meanwhile.
-    pub(super) fn released(&self, link: &Arc<Link>) -> bool {
+    /// Removes the link, unless it was listed again meanwhile; returns true if it was removed.
+    pub(super) fn release(&self, link: &Arc<PublisherLink>) -> bool {
         let mut links = self.links.lock();
         if link.is_listed() {
             return false;
@@ -226,8 +235,8 @@ impl TopicIn {
         true
     }
 
-    /// The link's publisher is connected, and has said its name.
-    pub(super) fn came(&self, link: &Link, publisher: &PeerId) {
+    /// The link's publisher is connected and has given its name.
+    pub(super) fn on_connected(&self, link: &PublisherLink, publisher: &PeerId) {
         let links = self.links.lock();
         let before = link.publisher.lock().clone();
         if before.is_some_and(|before| before != *publisher) {
@@ -235,39 +244,39 @@ impl TopicIn {
         }
         *link.publisher.lock() = Some(publisher.clone());
         link.connected.store(true, Ordering::Relaxed);
-        self.show(&links);
+        self.publish_matched(&links);
     }
 
-    /// The link has lost its connection; whether it had one.
-    pub(super) fn lost(&self, link: &Link) -> bool {
+    /// The link is disconnected; returns true if it was connected.
+    pub(super) fn on_disconnected(&self, link: &PublisherLink) -> bool {
         let links = self.links.lock();
         let was_connected = link.connected.swap(false, Ordering::Relaxed);
-        self.show(&links);
+        self.publish_matched(&links);
         was_connected
     }
 
-    /// The link's publisher cannot be reached any more: what it has latched is gone with it.
-    pub(super) fn left(&self, link: &Link) {
+    /// The link's publisher can no longer be reached: its latched message is dropped.
+    pub(super) fn on_publisher_gone(&self, link: &PublisherLink) {
         self.forget(&self.links.lock(), link);
     }
 
-    fn forget(&self, links: &Links, link: &Link) {
+    fn forget(&self, links: &PublisherLinks, link: &PublisherLink) {
         self.locals.lock().latched.remove(link.uri());
         if link.publisher.lock().take().is_some() {
-            self.show(links);
+            self.publish_matched(links);
         }
     }
 
-    /// Tells the subscriptions who is there.
-    fn show(&self, links: &Links) {
+    /// Publishes the matched publishers to the subscriptions.
+    fn publish_matched(&self, links: &PublisherLinks) {
         let peers = links.by_uri.values().filter_map(|link| {
-            Some(Peer {
+            Some(TopicPeer {
                 id: link.publisher.lock().clone()?,
                 connected: link.connected.load(Ordering::Relaxed),
                 offer: link.offer(),
             })
         });
-        let now = Matched {
+        let now = MatchedPeers {
             peers: peers.collect(),
             refused: Vec::new(),
         };
@@ -281,29 +290,29 @@ impl TopicIn {
     }
 
     /// Closes all connections and ends all local subscriptions.
-    pub(super) fn end(&self) {
+    pub(super) fn close(&self) {
         let mut links = self.links.lock();
         links.ended = true;
         for link in std::mem::take(&mut links.by_uri).into_values() {
             link.abort();
         }
-        *self.locals.lock() = Locals::default();
+        *self.locals.lock() = LocalSubscribers::default();
     }
 
-    /// The connections to publishers.
-    pub(super) fn links(&self) -> Vec<Arc<Link>> {
+    /// Returns the connections to publishers.
+    pub(super) fn links(&self) -> Vec<Arc<PublisherLink>> {
         self.links.lock().by_uri.values().cloned().collect()
     }
 }
 
 /// One local subscription.
-struct Guard {
-    bus: Arc<Inner>,
+struct SubscriptionGuard {
+    bus: Arc<Ros1BusState>,
     topic: Arc<TopicIn>,
     id: i32,
 }
 
-impl Drop for Guard {
+impl Drop for SubscriptionGuard {
     fn drop(&mut self) {
         let bus = &self.bus;
         let name = &self.topic.name;
@@ -320,18 +329,18 @@ impl Drop for Guard {
             let gone = empty && current;
             if gone {
                 topics.remove(name);
-                bus.registrar.want(Kind::Subscriber, name, None);
+                bus.registrar.set_wanted(Kind::Subscriber, name, None);
             }
             gone
         };
         let published = bus.publications.lock().get(name).cloned();
         if let Some(published) = published {
-            published.hear(actions(bus, name));
+            published.set_action_listeners(action_peers(bus, name));
         }
         if !gone {
             return;
         }
-        self.topic.end();
+        self.topic.close();
         let (bus, name) = (bus.clone(), name.clone());
         self.bus.spawn(async move {
             let _ = bus.registrar.sync(Kind::Subscriber, &name, false).await;

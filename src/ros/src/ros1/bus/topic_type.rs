@@ -1,4 +1,4 @@
-//! What type a topic has, asked of its ends.
+//! Type of a topic, determined from its endpoints.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,15 +6,15 @@ use std::time::Duration;
 use tokio::time::timeout;
 
 use super::registrar::Kind;
-use super::{Inner, link, publications, watcher};
+use super::{Ros1BusState, link, publications, watcher};
 use crate::bus::{BusError, Graph, TopicNodes, WireType};
 
-/// For a topic's subscribers to connect to us and say what they want.
+/// Time for a topic's subscribers to connect to us and declare their type.
 const ANSWER: Duration = Duration::from_secs(3);
 
-/// The type by whatever is at hand: what we advertise, what we are connected to, a publisher's header, what
-/// subscribers ask for. Where only a name is known (all ends take any md5), the digest is `*`.
-pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusError> {
+/// Returns the type from the first source available: what we advertise, a connection of ours, a publisher's header, the
+/// subscribers' requests. If only a name is known (all endpoints accept any md5), the digest is `*`.
+pub(super) async fn find(bus: &Arc<Ros1BusState>, name: &str) -> Result<WireType, BusError> {
     let ours = bus.publications.lock().get(name).cloned();
     if let Some((advert, _)) = ours.as_ref().and_then(|topic| topic.advert()) {
         return Ok(advert);
@@ -24,7 +24,7 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
     if let Some(known) = links.iter().find_map(|link| link.wire_type()) {
         return Ok(WireType::clone(&known));
     }
-    // What was registered a moment ago may not have reached our own graph yet.
+    // A recent registration may not have reached our own graph yet.
     let graph = watcher::fetch(bus).await?;
     let Some(topic) = graph.topics.get(name) else {
         return Err(BusError::NoTopic(name.to_owned()));
@@ -40,19 +40,19 @@ pub(super) async fn find(bus: &Arc<Inner>, name: &str) -> Result<WireType, BusEr
             Err(error) => failure = Some(error),
         }
     }
-    if let Some(asked) = subscribers(bus, name, topic, &graph).await? {
+    if let Some(asked) = subscriber_type(bus, name, topic, &graph).await? {
         return Ok(asked);
     }
     match failure {
-        _ if topic.type_name != "*" => Ok(WireType::named(&topic.type_name)),
+        _ if topic.type_name != "*" => Ok(WireType::with_name(&topic.type_name)),
         Some(failure) => Err(failure),
         None => Ok(WireType::any()),
     }
 }
 
-/// What the topic's subscribers ask for, the first that asks for something particular.
-async fn subscribers(
-    bus: &Arc<Inner>,
+/// Returns the type requested by the topic's subscribers: the first specific one.
+async fn subscriber_type(
+    bus: &Arc<Ros1BusState>,
     name: &str,
     topic: &TopicNodes,
     graph: &Graph,

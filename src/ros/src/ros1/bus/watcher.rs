@@ -1,4 +1,4 @@
-//! Follows the graph: by the long poll of our own Master, by asking every second elsewhere.
+//! Tracks the graph: by a long poll of our own Master, by polling every second elsewhere.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -6,32 +6,32 @@ use std::time::{Duration, Instant};
 
 use tokio::time::sleep;
 
-use super::Inner;
+use super::Ros1BusState;
 use super::master_client::to_bus_error;
 use crate::bus::{BusError, Graph, TopicNodes};
 use crate::ros1::actions;
 use crate::ros1::master::graph::{WAIT_GRAPH, from_value, wire_generation};
 use crate::ros1::xmlrpc::{self, Value};
 
-/// One long poll, seconds, and the grace for its answer. A Master that ends is seen at once, by its connection; asking
-/// again is all that an idle servant costs, so it is seldom.
+/// Duration of one long poll in seconds, and the grace period for its answer. The end of a Master is noticed at once by
+/// its connection, and polling is the only cost of an idle servant, so it is rare.
 const POLL: i32 = 240;
 const GRACE: Duration = Duration::from_secs(10);
-/// Between two looks at a Master without the long poll.
+/// Polling interval for a Master without the long poll.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Between attempts to reach a Master that is gone, at first and at last.
+/// Pause between attempts to reach a Master that is gone: initial and maximum.
 const PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
-/// A Master may be silent so long before it is told: one that ends takes its bus with it, a moment later.
+/// Time for which a Master may be silent before a warning is logged: when one ends, its bus ends a moment later.
 const SILENCE: Duration = Duration::from_secs(3);
 
-/// A graph is read, compared and shown as a whole. A node that changes a large one again and again would have us do little else; so
-/// there is a rest for each of its parts before the next look, many times as long as it took, and at most so long.
+/// Pause after a poll, per part of the graph, and its maximum. A graph is read, compared and shown as a whole. A node
+/// that keeps changing a large one would keep us busy; the pause is many times as long as the poll took.
 const REST: Duration = Duration::from_micros(25);
 const LONGEST_REST: Duration = Duration::from_secs(1);
 
-/// How long to rest after a look at this graph.
-fn rest(graph: &Graph) -> Duration {
+/// Returns the pause after a poll that returned this graph.
+fn rest_duration(graph: &Graph) -> Duration {
     let ends = |nodes: &TopicNodes| nodes.publishers.len() + nodes.subscribers.len();
     let parts = graph.topics.values().map(ends).sum::<usize>()
         + graph.services.len()
@@ -42,73 +42,73 @@ fn rest(graph: &Graph) -> Duration {
     REST.saturating_mul(parts).min(LONGEST_REST)
 }
 
-/// Since when the Master has not answered, and whether that was told.
+/// Time since which the Master has not answered, and whether that was logged.
 #[derive(Default)]
-struct Silence {
+struct MasterSilence {
     since: Option<Instant>,
     told: bool,
 }
 
-impl Silence {
-    fn goes_on(&mut self, error: &xmlrpc::Error) {
+impl MasterSilence {
+    fn record_failure(&mut self, error: &xmlrpc::Error) {
         let since = *self.since.get_or_insert_with(Instant::now);
         tracing::debug!(%error, "the ROS Master does not answer; trying again");
         if !self.told && since.elapsed() >= SILENCE {
             self.told = true;
-            tracing::warn!(%error, "the ROS Master has not answered for {SILENCE:?}; trying on");
+            tracing::warn!(%error, "the ROS Master has not answered for {SILENCE:?}; still trying");
         }
     }
 }
 
-/// Follows one bus's graph.
+/// Tracks one bus's graph.
 pub(super) struct Watcher {
-    bus: Arc<Inner>,
-    /// The Master has our long poll.
+    bus: Arc<Ros1BusState>,
+    /// True if the Master supports the long poll.
     waits: bool,
     known: i32,
     run_id: String,
 }
 
-/// Gets the graph for the first time.
-pub(super) async fn start(bus: Arc<Inner>) -> Result<Watcher, BusError> {
+/// Creates the watcher and gets the graph for the first time.
+pub(super) async fn start(bus: Arc<Ros1BusState>) -> Result<Watcher, BusError> {
     let mut watcher = Watcher {
         bus,
         waits: true,
         known: -1,
         run_id: String::new(),
     };
-    watcher.look().await.map_err(to_bus_error)?;
+    watcher.refresh().await.map_err(to_bus_error)?;
     Ok(watcher)
 }
 
-/// The graph at this moment.
-pub(super) async fn fetch(bus: &Arc<Inner>) -> Result<Graph, BusError> {
-    let graph = match wait(bus, -1, 0).await {
+/// Returns the current graph.
+pub(super) async fn fetch(bus: &Arc<Ros1BusState>) -> Result<Graph, BusError> {
+    let graph = match wait_graph(bus, -1, 0).await {
         Ok((graph, _)) => graph,
-        Err(xmlrpc::Error::Fault { .. }) => ask(bus).await.map_err(to_bus_error)?,
+        Err(xmlrpc::Error::Fault { .. }) => poll_graph(bus).await.map_err(to_bus_error)?,
         Err(error) => return Err(to_bus_error(error)),
     };
     Ok(graph)
 }
 
 impl Watcher {
-    /// Follows for ever.
+    /// Runs forever.
     pub(super) async fn run(mut self) {
         let mut pause = PAUSE;
-        let mut silence = Silence::default();
+        let mut silence = MasterSilence::default();
         loop {
             if !self.waits {
                 sleep(PERIOD).await;
             }
-            match self.look().await {
+            match self.refresh().await {
                 Ok(rest) => {
                     pause = PAUSE;
-                    silence = Silence::default();
+                    silence = MasterSilence::default();
                     sleep(rest).await;
                 }
                 Err(error) => {
-                    silence.goes_on(&error);
-                    // Whoever answers next may be another Master.
+                    silence.record_failure(&error);
+                    // The next answer may come from another Master.
                     self.known = -1;
                     self.waits = true;
                     sleep(pause).await;
@@ -118,11 +118,11 @@ impl Watcher {
         }
     }
 
-    /// Looks at the graph; how long to rest before the next look.
-    async fn look(&mut self) -> Result<Duration, xmlrpc::Error> {
+    /// Polls the graph once; returns the pause before the next poll.
+    async fn refresh(&mut self) -> Result<Duration, xmlrpc::Error> {
         let first = self.known == -1;
         let graph = if self.waits {
-            match wait(&self.bus, self.known, POLL).await {
+            match wait_graph(&self.bus, self.known, POLL).await {
                 Ok((graph, run_id)) => {
                     if !self.run_id.is_empty() && self.run_id != run_id {
                         tracing::info!(run_id, "the ROS Master was replaced");
@@ -132,26 +132,26 @@ impl Watcher {
                 }
                 Err(xmlrpc::Error::Fault { .. }) => {
                     self.waits = false;
-                    ask(&self.bus).await?
+                    poll_graph(&self.bus).await?
                 }
                 Err(error) => return Err(error),
             }
         } else {
-            ask(&self.bus).await?
+            poll_graph(&self.bus).await?
         };
         self.known = wire_generation(graph.generation);
         if first && self.waits {
-            // It may be another Master than the one that was told.
-            let _ = self.bus.report_that_it_lends().await;
+            // It may be another Master than the one that knows the lender.
+            let _ = self.bus.announce_lender().await;
         }
-        let rest = rest(&graph);
-        self.take(graph).await;
+        let rest = rest_duration(&graph);
+        self.apply(graph).await;
         Ok(rest)
     }
 
-    /// Brings everything in line with the graph, then shows it.
-    async fn take(&self, mut graph: Graph) {
-        graph.actions = actions::of_topics(&graph.topics);
+    /// Reconciles everything with the graph, then publishes it.
+    async fn apply(&self, mut graph: Graph) {
+        graph.actions = actions::find_actions(&graph.topics);
         let bus = &self.bus;
         bus.calls.keep_current(&graph);
         if self.waits {
@@ -171,16 +171,16 @@ impl Watcher {
             }
             news
         });
-        bus.correct(differences).await;
+        bus.reconcile(differences).await;
     }
 }
 
-impl Inner {
-    /// Makes the Master agree with what is wanted here.
-    async fn correct(self: &Arc<Self>, differences: Vec<(super::registrar::Kind, String)>) {
+impl Ros1BusState {
+    /// Reconciles the Master with what is wanted here.
+    async fn reconcile(self: &Arc<Self>, differences: Vec<(super::registrar::Kind, String)>) {
         use super::registrar::Kind;
         if !differences.is_empty() {
-            // The Master forgot us, so also that we watch its parameters.
+            // The Master lost our registrations, and so also our parameter subscription.
             let _ = self.subscribe_params().await;
         }
         for (kind, name) in differences {
@@ -198,10 +198,17 @@ impl Inner {
     }
 }
 
-async fn wait(bus: &Inner, known: i32, seconds: i32) -> Result<(Graph, String), xmlrpc::Error> {
+async fn wait_graph(
+    bus: &Ros1BusState,
+    known: i32,
+    seconds: i32,
+) -> Result<(Graph, String), xmlrpc::Error> {
     let args = vec![known.into(), seconds.into()];
     let time = Duration::from_secs(u64::from(seconds.unsigned_abs())) + GRACE;
-    let reply = bus.master.raw(&bus.node, WAIT_GRAPH, args, time).await?;
+    let reply = bus
+        .master
+        .call_raw(&bus.node, WAIT_GRAPH, args, time)
+        .await?;
     from_value(&reply.value).ok_or_else(|| unreadable(WAIT_GRAPH))
 }
 
@@ -212,11 +219,11 @@ fn unreadable(method: &str) -> xmlrpc::Error {
     }
 }
 
-/// The graph by the methods that every Master has. Parameter uses are not to be had from it.
-async fn ask(bus: &Inner) -> Result<Graph, xmlrpc::Error> {
+/// Gets the graph with the methods that every Master has; these do not include the use of parameters.
+async fn poll_graph(bus: &Ros1BusState) -> Result<Graph, xmlrpc::Error> {
     let before = bus.graph.borrow().clone();
     let call = |method: &'static str, args: Vec<Value>| async move {
-        bus.master.raw(&bus.node, method, args, GRACE).await
+        bus.master.call_raw(&bus.node, method, args, GRACE).await
     };
     let state = call("getSystemState", vec![]).await?.value;
     let types = call("getTopicTypes", vec![]).await?.value;
@@ -257,7 +264,7 @@ async fn ask(bus: &Inner) -> Result<Graph, xmlrpc::Error> {
     names.dedup();
     for name in names {
         let uri = match before.nodes.get(&name) {
-            // Our own may be somebody else's by now.
+            // Our own name may belong to another node by now.
             Some(uri) if name != bus.node => uri.clone(),
             _ => match call("lookupNode", vec![name.as_str().into()]).await?.value {
                 Value::String(uri) if !uri.is_empty() => uri,
@@ -273,7 +280,7 @@ async fn ask(bus: &Inner) -> Result<Graph, xmlrpc::Error> {
     Ok(graph)
 }
 
-/// The elements of a list of `[name, value]`.
+/// Iterates over a list of `[name, value]`.
 fn pairs(list: &Value) -> impl Iterator<Item = (&str, &Value)> {
     let elements = list.as_array().unwrap_or_default();
     elements.iter().filter_map(|pair| match pair.as_array()? {

@@ -1,4 +1,4 @@
-//! The Master's methods, as rosmaster answers them.
+//! The Master's methods, compatible with rosmaster.
 
 mod parameters;
 
@@ -7,18 +7,18 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use super::Inner;
+use super::MasterCore;
 use super::graph::{self, WAIT_GRAPH, wire_generation};
 use super::lending::LEND_SERVICES;
-use super::note_sought;
-use super::registry::{Kind, Refused};
+use super::record_sought;
+use super::registry::{Kind, RegistrationError};
 use crate::ros1::names;
-use crate::ros1::reply::{Args, Reply};
-use crate::ros1::xmlrpc::{Fault, Handler, Value, fault_value};
+use crate::ros1::reply::{ApiReply, Args};
+use crate::ros1::xmlrpc::{Fault, Value, XmlRpcHandler, fault_value};
 
-/// Calls in one `system.multicall`, at most.
+/// Maximum number of calls in one `system.multicall`.
 const MAX_MULTICALL: usize = 10_000;
-/// A long poll lasts no longer.
+/// Maximum duration of a long poll.
 const MAX_WAIT: Duration = Duration::from_secs(300);
 
 const METHODS: &[&str] = &[
@@ -51,11 +51,11 @@ const METHODS: &[&str] = &[
 ];
 
 pub(super) struct Api {
-    pub(super) master: Arc<Inner>,
+    pub(super) master: Arc<MasterCore>,
 }
 
 #[async_trait]
-impl Handler for Api {
+impl XmlRpcHandler for Api {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         match method {
             WAIT_GRAPH => {
@@ -68,7 +68,7 @@ impl Handler for Api {
             }
             "system.listMethods" => Ok(Value::strings(METHODS.iter().copied())),
             "system.multicall" => self.multicall(params),
-            _ => self.simple(method, params),
+            _ => self.dispatch(method, params),
         }
     }
 
@@ -85,7 +85,7 @@ impl Handler for Api {
                     let method = call.get("methodName").and_then(Value::as_str);
                     let params = call.get("params").and_then(Value::as_array);
                     match (method, params) {
-                        // It is not answered within itself.
+                        // Not answered inside itself.
                         (Some("system.multicall"), _) | (None, _) | (_, None) => 0,
                         (Some(method), Some(params)) => self.weight(method, params),
                     }
@@ -100,8 +100,8 @@ impl Handler for Api {
 }
 
 impl Api {
-    /// All that is answered at once.
-    fn simple(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
+    /// Handles the methods that are answered at once.
+    fn dispatch(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         let mut args = Args::new(params);
         let answer = match self.registration(method, &mut args) {
             Some(answer) => answer,
@@ -129,7 +129,7 @@ impl Api {
                 Value::Struct(mut members) => {
                     match (members.remove("methodName"), members.remove("params")) {
                         (Some(Value::String(method)), Some(Value::Array(params))) => {
-                            self.simple(&method, params)
+                            self.dispatch(&method, params)
                         }
                         _ => Err(Fault::new("a call needs methodName and params")),
                     }
@@ -144,10 +144,10 @@ impl Api {
         Ok(Value::Array(answers.collect()))
     }
 
-    async fn wait_graph(&self, mut args: Args) -> Result<Reply, Reply> {
+    async fn wait_graph(&self, mut args: Args) -> Result<ApiReply, ApiReply> {
         args.text("caller_id")?;
-        let known = args.any("known_generation")?.as_int().unwrap_or(-1);
-        let seconds = match args.any("timeout_s")? {
+        let known = args.value("known_generation")?.as_int().unwrap_or(-1);
+        let seconds = match args.value("timeout_s")? {
             Value::Int(seconds) => f64::from(seconds),
             Value::Double(seconds) => seconds,
             _ => 0.0,
@@ -155,16 +155,16 @@ impl Api {
         let time = Duration::try_from_secs_f64(seconds.max(0.0)).unwrap_or(MAX_WAIT);
         let mut generation = self.master.generation.subscribe();
         let news = generation.wait_for(|now| wire_generation(*now) != known);
-        // Whether or not there is news: the answer always holds the whole state.
+        // In either case: the answer always contains the whole state.
         let _ = tokio::time::timeout(time.min(MAX_WAIT), news).await;
         let graph = self.master.graph();
-        Ok(Reply::done(
+        Ok(ApiReply::success(
             "",
             graph::to_value(&graph, &self.master.run_id),
         ))
     }
 
-    fn registration(&self, method: &str, args: &mut Args) -> Option<Result<Reply, Reply>> {
+    fn registration(&self, method: &str, args: &mut Args) -> Option<Result<ApiReply, ApiReply>> {
         Some(match method {
             "registerPublisher" => self.register_topic(Kind::Publisher, args),
             "registerSubscriber" => self.register_topic(Kind::Subscriber, args),
@@ -176,13 +176,13 @@ impl Api {
         })
     }
 
-    fn register_topic(&self, kind: Kind, args: &mut Args) -> Result<Reply, Reply> {
+    fn register_topic(&self, kind: Kind, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let node = args.text("caller_id")?;
-        let topic = name(args, "topic", &node)?;
+        let topic = name_argument(args, "topic", &node)?;
         let type_name = args.text("topic_type")?;
         let api = args.uri("caller_api", "http")?;
-        args.end()?;
-        let others = self.master.change(|state, notices| {
+        args.finish()?;
+        let others = self.master.update(|state, notices| {
             let registry = &mut state.registry;
             registry.register(kind, &topic, &type_name, (&node, &api), "", notices)?;
             Ok(match kind {
@@ -194,47 +194,47 @@ impl Api {
             Kind::Publisher => format!("Registered [{node}] as publisher of [{topic}]"),
             _ => format!("Subscribed to [{topic}]"),
         };
-        Ok(Reply::done(
+        Ok(ApiReply::success(
             message,
-            Value::strings(others.map_err(refusal)?),
+            Value::strings(others.map_err(refusal_reply)?),
         ))
     }
 
-    fn register_service(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn register_service(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let node = args.text("caller_id")?;
-        let service = name(args, "service", &node)?;
+        let service = name_argument(args, "service", &node)?;
         let service_api = args.uri("service_api", "rosrpc")?;
         let api = args.uri("caller_api", "http")?;
-        args.end()?;
-        let registered = self.master.change(|state, notices| {
+        args.finish()?;
+        let registered = self.master.update(|state, notices| {
             let by = (node.as_str(), api.as_str());
             let registry = &mut state.registry;
             registry.register(Kind::Service, &service, "", by, &service_api, notices)
         });
-        registered.map_err(refusal)?;
-        Ok(Reply::done(
+        registered.map_err(refusal_reply)?;
+        Ok(ApiReply::success(
             format!("Registered [{node}] as provider of [{service}]"),
             1,
         ))
     }
 
-    fn unregister(&self, kind: Kind, args: &mut Args) -> Result<Reply, Reply> {
+    fn unregister(&self, kind: Kind, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let node = args.text("caller_id")?;
-        let what = name(args, "name", &node)?;
+        let what = name_argument(args, "name", &node)?;
         let api = args.text("api")?;
-        args.end()?;
-        let held = self.master.change(|state, notices| {
+        args.finish()?;
+        let held = self.master.update(|state, notices| {
             let registry = &mut state.registry;
             registry.unregister(kind, &what, &node, &api, notices)
         });
         Ok(if held {
-            Reply::done(format!("Unregistered [{node}] from [{what}]"), 1)
+            ApiReply::success(format!("Unregistered [{node}] from [{what}]"), 1)
         } else {
-            Reply::done(format!("[{node}] is not registered for [{what}]"), 0)
+            ApiReply::success(format!("[{node}] is not registered for [{what}]"), 0)
         })
     }
 
-    fn lookup(&self, method: &str, args: &mut Args) -> Option<Result<Reply, Reply>> {
+    fn lookup(&self, method: &str, args: &mut Args) -> Option<Result<ApiReply, ApiReply>> {
         Some(match method {
             "lookupNode" => self.lookup_node(args),
             "lookupService" => self.lookup_service(args),
@@ -243,80 +243,80 @@ impl Api {
             "getTopicTypes" => args.text("caller_id").map(|_| {
                 let state = self.master.state.lock();
                 let types = state.registry.types().map(pair);
-                Reply::done("current system state", Value::Array(types.collect()))
+                ApiReply::success("current system state", Value::Array(types.collect()))
             }),
             "getSystemState" => args.text("caller_id").map(|_| self.system_state()),
-            "getUri" => Ok(Reply::done("", self.master.uri.as_str())),
-            "getPid" => Ok(Reply::done("", pid())),
-            "shutdown" => Ok(Reply::mistake(
-                "this Master lives as long as its servant; no node can end it",
+            "getUri" => Ok(ApiReply::success("", self.master.uri.as_str())),
+            "getPid" => Ok(ApiReply::success("", pid())),
+            "shutdown" => Ok(ApiReply::error(
+                "this Master runs as long as its servant; nodes cannot shut it down",
                 0,
             )),
             _ => return None,
         })
     }
 
-    fn lookup_node(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn lookup_node(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let caller = args.text("caller_id")?;
-        let node = name(args, "node_name", &caller)?;
+        let node = name_argument(args, "node_name", &caller)?;
         let state = self.master.state.lock();
         Ok(match state.registry.node_api(&node) {
-            Some(api) => Reply::done("node api", api),
-            None => Reply::mistake(format!("unknown node [{node}]"), ""),
+            Some(api) => ApiReply::success("node api", api),
+            None => ApiReply::error(format!("unknown node [{node}]"), ""),
         })
     }
 
-    /// Of what is registered, as in a `system.multicall`.
-    fn lookup_service(&self, args: &mut Args) -> Result<Reply, Reply> {
+    /// Looks up a registered service only, as in a `system.multicall`.
+    fn lookup_service(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let caller = args.text("caller_id")?;
-        let service = name(args, "service", &caller)?;
-        self.registered(&service).ok_or_else(no_provider)
+        let service = name_argument(args, "service", &caller)?;
+        self.registered_service(&service).ok_or_else(no_provider)
     }
 
-    /// Of what is registered, else of what is lent.
-    async fn find_service(&self, mut args: Args) -> Result<Reply, Reply> {
+    /// Looks up a service among those registered, then asks the lender.
+    async fn find_service(&self, mut args: Args) -> Result<ApiReply, ApiReply> {
         let caller = args.text("caller_id")?;
-        let service = name(&mut args, "service", &caller)?;
-        if let Some(reply) = self.registered(&service) {
+        let service = name_argument(&mut args, "service", &caller)?;
+        if let Some(reply) = self.registered_service(&service) {
             return Ok(reply);
         }
-        let lent = self.master.lending.find(&service, &caller).await;
-        // Whoever registered meanwhile comes first.
-        if let Some(reply) = self.registered(&service) {
+        let lent = self.master.lending.find_service(&service, &caller).await;
+        // A registration made meanwhile has precedence.
+        if let Some(reply) = self.registered_service(&service) {
             return Ok(reply);
         }
         if let Some(api) = lent {
-            return Ok(served_at(&api));
+            return Ok(service_reply(&api));
         }
         let mut state = self.master.state.lock();
-        if note_sought(&mut state.sought, &service, &caller) {
-            self.master.grow();
+        if record_sought(&mut state.sought, &service, &caller) {
+            self.master.bump_generation();
         }
         Err(no_provider())
     }
 
-    fn registered(&self, service: &str) -> Option<Reply> {
+    fn registered_service(&self, service: &str) -> Option<ApiReply> {
         let state = self.master.state.lock();
-        state.registry.service_api(service).map(served_at)
+        state.registry.service_api(service).map(service_reply)
     }
 
-    fn lend_services(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn lend_services(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let node = args.text("caller_id")?;
         let api = args.uri("caller_api", "http")?;
-        args.end()?;
-        let lent = self.master.lending.begin(
+        args.finish()?;
+        let lent = self.master.lending.set_lender(
             &node,
             &api,
             self.master.sockets(),
             &self.master.limits.budget,
         );
-        lent.map_err(|reason| Reply::mistake(reason, 0))?;
-        Ok(Reply::done(format!("[{node}] lends services"), 1))
+        lent.map_err(|reason| ApiReply::error(reason, 0))?;
+        Ok(ApiReply::success(format!("[{node}] lends services"), 1))
     }
 
-    fn published_topics(&self, args: &mut Args) -> Result<Reply, Reply> {
+    fn published_topics(&self, args: &mut Args) -> Result<ApiReply, ApiReply> {
         let caller = args.text("caller_id")?;
-        let below = match args.any("subgraph")? {
+        let below = match args.value("subgraph")? {
             Value::String(text) if !text.is_empty() => {
                 let below = names::resolve(&text, &caller);
                 format!("{}/", below.trim_end_matches('/'))
@@ -328,10 +328,13 @@ impl Api {
             !topic.publishers.is_empty() && name.starts_with(below.as_str())
         });
         let list = published.map(|(name, topic)| pair((name, &topic.type_name)));
-        Ok(Reply::done("current topics", Value::Array(list.collect())))
+        Ok(ApiReply::success(
+            "current topics",
+            Value::Array(list.collect()),
+        ))
     }
 
-    fn system_state(&self) -> Reply {
+    fn system_state(&self) -> ApiReply {
         let state = self.master.state.lock();
         let mut publishers = Vec::new();
         let mut subscribers = Vec::new();
@@ -349,30 +352,30 @@ impl Api {
         let services =
             services.map(|(name, node)| Value::Array(vec![name.into(), Value::strings([node])]));
         let lists = [publishers, subscribers, services.collect()].map(Value::Array);
-        Reply::done("current system state", Value::Array(lists.into()))
+        ApiReply::success("current system state", Value::Array(lists.into()))
     }
 }
 
-/// The next argument, a name, made absolute as seen from `node`.
-fn name(args: &mut Args, what: &str, node: &str) -> Result<String, Reply> {
+/// Takes the next argument, a name, and resolves it relative to `node`.
+fn name_argument(args: &mut Args, what: &str, node: &str) -> Result<String, ApiReply> {
     let text = args.text(what)?;
     if text.len() > 1024 || text.chars().any(char::is_control) {
-        let message = format!("ERROR: {what} is no ROS name");
-        return Err(Reply::mistake(message, 0));
+        let message = format!("ERROR: {what} is not a ROS name");
+        return Err(ApiReply::error(message, 0));
     }
     Ok(names::resolve(&text, node))
 }
 
-fn served_at(api: &str) -> Reply {
-    Reply::done(format!("rosrpc URI: [{api}]"), api)
+fn service_reply(api: &str) -> ApiReply {
+    ApiReply::success(format!("rosrpc URI: [{api}]"), api)
 }
 
-fn no_provider() -> Reply {
-    Reply::mistake("no provider", "")
+fn no_provider() -> ApiReply {
+    ApiReply::error("no provider", "")
 }
 
-fn refusal(reason: Refused) -> Reply {
-    Reply::mistake(reason.to_string(), 0)
+fn refusal_reply(reason: RegistrationError) -> ApiReply {
+    ApiReply::error(reason.to_string(), 0)
 }
 
 fn pair((name, text): (&str, &str)) -> Value {

@@ -1,7 +1,7 @@
-//! The graph as it travels from the Master to whoever waits for its next generation.
+//! The graph as transferred from the Master to those who wait for its next generation.
 //!
-//! `cloudroid.waitGraph(caller_id, known_generation, timeout_s)` answers, as soon as the generation is not the
-//! known one, or after the time-out, with `[1, "", graph]`, a struct of
+//! `cloudroid.waitGraph(caller_id, known_generation, timeout_s)` answers with `[1, "", graph]` as soon as the
+//! generation differs from the known one, or after the time limit. The graph is a struct of
 //! - `generation` int, `run_id` string,
 //! - `topics` {name: [type, [publisher…], [subscriber…]]}, `services` {name: node}, `nodes` {name: uri},
 //! - `parameters` {key: [[reading node…], [writing node…]]}, `sought` {service: [node…]}.
@@ -11,10 +11,10 @@ use std::collections::BTreeMap;
 use crate::bus::{Graph, ParameterUse, TopicNodes};
 use crate::ros1::xmlrpc::Value;
 
-/// The method's name; ordinary Masters do not have it.
+/// Name of the method; ordinary Masters do not have it.
 pub(crate) const WAIT_GRAPH: &str = "cloudroid.waitGraph";
 
-/// The generation as XML-RPC's 32 bits carry it.
+/// Reduces the generation to XML-RPC's 32 bits.
 pub(crate) fn wire_generation(generation: u64) -> i32 {
     (generation & 0x7fff_ffff) as i32
 }
@@ -64,7 +64,7 @@ fn text_map(map: &BTreeMap<String, String>) -> Value {
     )
 }
 
-/// Reads what [`to_value`] wrote: the graph and the Master's run id.
+/// Reads the output of [`to_value`]: the graph and the Master's run id.
 pub(crate) fn from_value(value: &Value) -> Option<(Graph, String)> {
     let mut graph = Graph {
         generation: u64::try_from(value.get("generation")?.as_int()?).ok()?,
@@ -93,7 +93,7 @@ pub(crate) fn from_value(value: &Value) -> Option<(Graph, String)> {
         };
         graph.parameters.insert(key.clone(), used);
     }
-    // A shim of an earlier version does not tell.
+    // A shim of an earlier version does not send it.
     if let Some(sought) = value.get("sought").and_then(Value::as_struct) {
         let owned = |(service, nodes): (&String, &Value)| (service.clone(), nodes.to_strings());
         graph.sought = sought.iter().map(owned).collect();

@@ -1,5 +1,5 @@
-//! Services that nobody has registered here may be had from another ROS system: one node, the lender, is asked
-//! whenever a lookup finds nothing. See docs/adr/025.
+//! Services that no node has registered here may be lent by another ROS system: one node, the lender, is asked whenever
+//! a lookup finds nothing. See docs/adr/025.
 //!
 //! ```text
 //!  node ── lookupService ──▶ Master ─┬─ registered: its address
@@ -15,35 +15,35 @@ use parking_lot::Mutex;
 use tokio::sync::Semaphore;
 
 use crate::net::Sockets;
-use crate::ros1::reply::Reply;
-use crate::ros1::xmlrpc::{Client, Value};
+use crate::ros1::reply::ApiReply;
+use crate::ros1::xmlrpc::{Value, XmlRpcClient};
 
-/// `cloudroid.lendServices(caller_id, caller_api)`: this node is the lender from now on.
+/// `cloudroid.lendServices(caller_id, caller_api)`: registers the node as lender.
 pub(crate) const LEND_SERVICES: &str = "cloudroid.lendServices";
-/// `cloudroid.lendService(caller_id, service, node)`, called at the lender: `[1, "", rosrpc URI]`, or a code that is
-/// not 1 where it has no such service.
+/// `cloudroid.lendService(caller_id, service, node)`, called at the lender: returns `[1, "", rosrpc URI]`, or another
+/// code if it has no such service.
 pub(crate) const LEND_SERVICE: &str = "cloudroid.lendService";
 
-/// How the Master signs its calls.
+/// Caller id of the Master's calls.
 const CALLER: &str = "/master";
-/// A lookup waits no longer for the lender.
+/// Maximum time for which a lookup waits for the lender.
 const PATIENCE: Duration = Duration::from_millis(1500);
-/// Lookups that wait at a time; others find nothing.
+/// Maximum number of lookups waiting for the lender; further ones find nothing.
 const AT_A_TIME: usize = 64;
 
-/// Who lends.
-pub(super) struct Lending {
-    lender: Mutex<Option<Lender>>,
+/// The registered lender, if any.
+pub(super) struct LenderSlot {
+    lender: Mutex<Option<RegisteredLender>>,
     room: Semaphore,
 }
 
 #[derive(Clone)]
-struct Lender {
+struct RegisteredLender {
     node: String,
-    client: Arc<Client>,
+    client: Arc<XmlRpcClient>,
 }
 
-impl Default for Lending {
+impl Default for LenderSlot {
     fn default() -> Self {
         Self {
             lender: Mutex::default(),
@@ -52,35 +52,35 @@ impl Default for Lending {
     }
 }
 
-impl Lending {
-    /// The node at `api` takes the place of whoever lent before.
-    pub(super) fn begin(
+impl LenderSlot {
+    /// Registers the node at `api` as lender; replaces the previous one.
+    pub(super) fn set_lender(
         &self,
         node: &str,
         api: &str,
         sockets: Arc<dyn Sockets>,
         budget: &Budget,
     ) -> Result<(), String> {
-        let client = Client::new(sockets, api).map_err(|error| error.to_string())?;
-        *self.lender.lock() = Some(Lender {
+        let client = XmlRpcClient::new(sockets, api).map_err(|error| error.to_string())?;
+        *self.lender.lock() = Some(RegisteredLender {
             node: node.to_owned(),
-            client: Arc::new(client.within(budget)),
+            client: Arc::new(client.with_budget(budget)),
         });
         Ok(())
     }
 
-    /// Where `node` finds a service that nobody has registered.
-    pub(super) async fn find(&self, service: &str, node: &str) -> Option<String> {
+    /// Returns the address of a service that no node has registered, on behalf of `node`.
+    pub(super) async fn find_service(&self, service: &str, node: &str) -> Option<String> {
         let lender = self.lender.lock().clone()?;
-        // What the lender looks for itself it cannot lend.
+        // The lender cannot lend what it is looking for itself.
         if lender.node == node {
             return None;
         }
         let _room = self.room.try_acquire().ok()?;
         let args: [Value; 3] = [CALLER.into(), service.into(), node.into()];
         match lender.client.call(LEND_SERVICE, &args, PATIENCE).await {
-            Ok(answer) => match Reply::from_value(answer)? {
-                Reply {
+            Ok(answer) => match ApiReply::from_value(answer)? {
+                ApiReply {
                     code: 1,
                     value: Value::String(api),
                     ..

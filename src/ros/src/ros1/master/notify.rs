@@ -1,8 +1,8 @@
-//! Calls from the Master to nodes: in order per node, concurrently between nodes, newest wins.
+//! Calls from the Master to nodes: in order per node, concurrently across nodes, newer notices replace older ones.
 //!
-//! A node that hangs keeps its own news waiting and nobody else's; it gets the newest state once it answers
-//! again, or is forgotten with its registrations. What values of parameters take while they wait is bounded: the oldest
-//! of a node's are left out beyond, for a node that does not listen must not fill its Master's memory.
+//! A node that hangs delays only its own notices; it gets the newest state once it answers again, or is forgotten with
+//! its registrations. The memory for queued parameter values is bounded: beyond the limit a node's oldest ones are
+//! dropped, because a node that does not listen must not fill its Master's memory.
 
 use std::collections::{HashMap, VecDeque};
 use std::io::ErrorKind;
@@ -13,34 +13,34 @@ use parking_lot::Mutex;
 use tokio::sync::Notify;
 use tokio::time::timeout;
 
-use super::Inner;
-use crate::ros1::xmlrpc::{Client, Error, Value};
+use super::MasterCore;
+use crate::ros1::xmlrpc::{Error, Value, XmlRpcClient};
 
-/// How the Master signs its calls.
+/// Caller id of the Master's calls.
 const CALLER: &str = "/master";
-/// For one attempt.
+/// Time limit of one attempt.
 const ANSWER: Duration = Duration::from_secs(10);
-/// After a node did not answer in time.
+/// Pause after a node did not answer in time.
 const PAUSE: Duration = Duration::from_secs(2);
-/// Bytes of parameters' values that may wait for one node; the newest may, whatever its size.
+/// Maximum size in bytes of the parameter values queued for one node; the newest is queued whatever its size.
 const WAITING: usize = 1 << 20;
-/// A value is in memory as such and as text that grows.
+/// Copies of a value in memory: the value and the growing text.
 const FORMS: usize = 3;
-/// How long the connection to a node is kept after the last news.
+/// Time for which the connection to a node is kept after the last notice.
 const LINGER: Duration = Duration::from_secs(2);
 
-/// Something one node must be told.
+/// A notification for one node.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Notice {
-    /// The node's XML-RPC address.
+    /// XML-RPC address of the node.
     pub(super) api: String,
     subject: Subject,
     params: Vec<Value>,
-    /// About how many bytes the value of a parameter takes.
+    /// Approximate size in bytes of a parameter value.
     size: usize,
 }
 
-/// What a notice is about; a newer notice of the same subject replaces an older one.
+/// Subject of a notice; a newer notice of the same subject replaces an older one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 enum Subject {
     Publishers(String),
@@ -91,19 +91,19 @@ impl Notice {
     }
 }
 
-/// The queues; a node with an entry has a task that works it off.
+/// Queues per node; each node with an entry has a task that processes it.
 #[derive(Debug, Default)]
 pub(super) struct Notifier {
-    queues: Mutex<HashMap<String, Queue>>,
+    queues: Mutex<HashMap<String, NoticeQueue>>,
 }
 
 #[derive(Debug, Default)]
-struct Queue {
+struct NoticeQueue {
     notices: VecDeque<Notice>,
     more: Arc<Notify>,
 }
 
-impl Queue {
+impl NoticeQueue {
     fn push(&mut self, notice: Notice) {
         self.notices.retain(|older| older.subject != notice.subject);
         let is_value = |notice: &Notice| matches!(notice.subject, Subject::Parameter(_));
@@ -114,7 +114,7 @@ impl Queue {
                 break;
             };
             if let Some(lost) = self.notices.remove(oldest) {
-                tracing::warn!(api = lost.api, subject = ?lost.subject, "the node is too slow to be told");
+                tracing::warn!(api = lost.api, subject = ?lost.subject, "the node is too slow to be notified");
             }
         }
         self.notices.push_back(notice);
@@ -123,21 +123,21 @@ impl Queue {
 }
 
 impl Notifier {
-    /// Queues the notices, in this order, and starts the tasks that are missing.
-    pub(super) fn send(master: &Arc<Inner>, notices: Vec<Notice>) {
+    /// Queues the notices in order, and starts the tasks that are missing.
+    pub(super) fn send(master: &Arc<MasterCore>, notices: Vec<Notice>) {
         let mut queues = master.notifier.queues.lock();
         for notice in notices {
             let queue = queues.entry(notice.api.clone()).or_insert_with(|| {
-                let queue = Queue::default();
+                let queue = NoticeQueue::default();
                 let more = queue.more.clone();
-                tokio::spawn(work(master.clone(), notice.api.clone(), more));
+                tokio::spawn(deliver_notices(master.clone(), notice.api.clone(), more));
                 queue
             });
             queue.push(notice);
         }
     }
 
-    /// How many notices the node's task has not taken up.
+    /// Returns the number of notices that the node's task has not taken yet.
     #[cfg(test)]
     pub(super) fn waiting(&self, api: &str) -> usize {
         self.queues
@@ -150,7 +150,7 @@ impl Notifier {
         self.queues.lock().get_mut(api)?.notices.pop_front()
     }
 
-    /// Puts a notice back unless a newer one of its subject came meanwhile.
+    /// Puts a notice back unless a newer one of its subject was queued meanwhile.
     fn retry(&self, notice: Notice) {
         if let Some(queue) = self.queues.lock().get_mut(&notice.api) {
             let notices = &mut queue.notices;
@@ -160,7 +160,7 @@ impl Notifier {
         }
     }
 
-    /// Ends the node's queue if it is empty, or whatever it holds.
+    /// Removes the node's queue if it is empty, or in any case if `even_if_full`; returns true if it was removed.
     fn finish(&self, api: &str, even_if_full: bool) -> bool {
         let mut queues = self.queues.lock();
         let done = even_if_full || queues.get(api).is_none_or(|queue| queue.notices.is_empty());
@@ -171,18 +171,18 @@ impl Notifier {
     }
 }
 
-async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
+async fn deliver_notices(master: Arc<MasterCore>, api: String, more: Arc<Notify>) {
     let notifier = &master.notifier;
-    let Ok(client) = Client::new(master.sockets(), &api) else {
+    let Ok(client) = XmlRpcClient::new(master.sockets(), &api) else {
         notifier.finish(&api, true);
         return;
     };
     let budget = &master.limits.budget;
-    let client = client.within(budget);
+    let client = client.with_budget(budget);
     let mut recovering = false;
     loop {
         let Some(notice) = notifier.next(&api) else {
-            // News come in bursts: the connection is worth keeping for a moment.
+            // Notices come in bursts: keep the connection for a moment.
             if timeout(LINGER, more.notified()).await.is_err() && notifier.finish(&api, false) {
                 return;
             }
@@ -193,13 +193,13 @@ async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
         let _permit = match budget.wait(weight, ANSWER).await {
             Ok(permit) => permit,
             Err(full) => {
-                tracing::warn!(%api, method, %full, "the node was not told");
+                tracing::warn!(%api, method, %full, "the node was not notified");
                 continue;
             }
         };
         match client.call(method, &notice.params, ANSWER).await {
             Ok(_) if recovering => {
-                // It may yet take up older calls that timed out: make this the last word.
+                // The node may still process older calls that timed out: repeat this one so that it is the last.
                 recovering = false;
                 tokio::time::sleep(PAUSE).await;
                 notifier.retry(notice);
@@ -217,12 +217,12 @@ async fn work(master: Arc<Inner>, api: String, more: Arc<Notify>) {
                 if notice.subject == Subject::Shutdown
                     && source.kind() == ErrorKind::ConnectionRefused =>
             {
-                // Nobody is left who could register once more: a successor may be given the same port.
-                master.state.lock().registry.address_is_free(&api);
+                // No process is left that could register again: a successor may be given the same port.
+                master.state.lock().registry.forget_replaced_address(&api);
             }
             Err(error) => {
-                // Nobody is there (process_exited will see to that), or it does not want to know.
-                tracing::debug!(%api, method, %error, "the node was not told");
+                // The node is gone (its process's exit will clean up), or it rejects the call.
+                tracing::debug!(%api, method, %error, "the node was not notified");
             }
         }
     }

@@ -5,15 +5,15 @@ use std::collections::BTreeMap;
 use crate::ros1::names;
 use crate::ros1::xmlrpc::{MAX_DEPTH, Value};
 
-/// All parameters together, at most. They are in the shim, whose memory is bounded, and whoever reads all of them has the
-/// shim hold them three times more.
+/// Maximum size of all parameters in bytes. They are held by the shim, whose memory is bounded, and reading all of them
+/// takes three times their size in addition.
 const MAX_BYTES: usize = 24 << 20;
 
-/// Nested structs, as ROS has it: `/a/b` is member `b` of member `a`.
+/// Nested structs, as in ROS: `/a/b` is member `b` of member `a`.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Params {
     root: Value,
-    /// Roughly what the tree takes; never less than its values.
+    /// Approximate size of the tree; never less than that of its values.
     size: usize,
 }
 
@@ -26,36 +26,36 @@ impl Default for Params {
     }
 }
 
-/// Why a value was not taken.
+/// Error setting a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Refused {
+pub(super) enum ParamError {
     #[error("the root of the parameter tree can only be a dictionary")]
     Root,
-    #[error("the parameter server is full; {MAX_BYTES} bytes is all it takes")]
+    #[error("the parameter server is full; its limit is {MAX_BYTES} bytes")]
     Full,
-    #[error("the value is nested too deep; {MAX_DEPTH} levels below the root is all it takes")]
+    #[error("the value is nested too deep; the limit is {MAX_DEPTH} levels below the root")]
     Deep,
 }
 
 impl Params {
-    /// Sets `key` (canonical); a struct replaces the whole namespace, a value in the way becomes one.
-    pub(super) fn set(&mut self, key: &str, value: Value) -> Result<(), Refused> {
+    /// Sets `key` (canonical). A struct replaces the whole namespace; a value on the path becomes a namespace.
+    pub(super) fn set(&mut self, key: &str, value: Value) -> Result<(), ParamError> {
         let depth = names::parts(key).count();
         if depth == 0 && value.as_struct().is_none() {
-            return Err(Refused::Root);
+            return Err(ParamError::Root);
         }
         if depth + value.depth() > MAX_DEPTH {
-            return Err(Refused::Deep);
+            return Err(ParamError::Deep);
         }
         let replaced = self.get(key).map_or(0, Value::size);
         let added = value.size() + key.len();
         let mut size = self.size.saturating_sub(replaced) + added;
         if size > MAX_BYTES {
-            // The running sum only ever errs upwards: count again before saying no.
+            // The running sum can only be too high: count again before refusing.
             size = self.root.size().saturating_sub(replaced) + added;
         }
         if size > MAX_BYTES {
-            return Err(Refused::Full);
+            return Err(ParamError::Full);
         }
         let mut place = &mut self.root;
         for part in names::parts(key) {
@@ -63,7 +63,7 @@ impl Params {
                 *place = Value::Struct(BTreeMap::new());
             }
             let Value::Struct(members) = place else {
-                return Err(Refused::Root);
+                return Err(ParamError::Root);
             };
             place = members
                 .entry(part.to_owned())
@@ -74,17 +74,17 @@ impl Params {
         Ok(())
     }
 
-    /// About how many bytes the tree takes; never less than its values.
+    /// Returns the approximate size of the tree in bytes; never less than that of its values.
     pub(super) fn size(&self) -> usize {
         self.size
     }
 
-    /// The value or namespace at `key`.
+    /// Returns the value or namespace at `key`.
     pub(super) fn get(&self, key: &str) -> Option<&Value> {
         names::parts(key).try_fold(&self.root, |place, part| place.get(part))
     }
 
-    /// Removes `key`; false if it was not set. The root is emptied.
+    /// Deletes `key`; returns false if it was not set. Deleting the root empties the tree.
     pub(super) fn delete(&mut self, key: &str) -> bool {
         let mut parts: Vec<&str> = names::parts(key).collect();
         let Some(last) = parts.pop() else {
@@ -111,7 +111,7 @@ impl Params {
         true
     }
 
-    /// Looks for `key` in `namespace` and the namespaces around it; only the key's first part must be there.
+    /// Searches for `key` in `namespace` and the enclosing namespaces; only the first part of the key must exist.
     pub(super) fn search(&self, namespace: &str, key: &str) -> Option<String> {
         if key.starts_with('/') {
             return self.get(key).map(|_| key.to_owned());
@@ -127,7 +127,7 @@ impl Params {
         }
     }
 
-    /// Keys of all values that are no namespaces.
+    /// Returns the keys of all values that are not namespaces.
     pub(super) fn names(&self) -> Vec<String> {
         let mut names = Vec::new();
         collect(&self.root, &mut String::new(), &mut names);
@@ -150,8 +150,8 @@ fn collect(value: &Value, path: &mut String, names: &mut Vec<String>) {
     }
 }
 
-/// What the subscribers of parameters must be told after `key` was set to `value` (deleted: an empty struct):
-/// the keys that changed for each subscribed key, as rosmaster computes them.
+/// Returns the notifications for parameter subscribers after `key` was set to `value` (deleted: an empty struct): the
+/// changed keys for each subscribed key, as rosmaster computes them.
 pub(super) fn updates(
     watchers: &BTreeMap<String, Vec<String>>,
     key: &str,
@@ -209,11 +209,11 @@ mod tests {
         assert_eq!(params.get("/top/below"), Some(&Value::Int(2)));
         params.set("/a", Value::Struct(BTreeMap::new())).unwrap();
         assert_eq!(params.names(), ["/top/below"]);
-        assert_eq!(params.set("/", Value::Int(1)), Err(Refused::Root));
+        assert_eq!(params.set("/", Value::Int(1)), Err(ParamError::Root));
         let deep = "/x".repeat(MAX_DEPTH);
         params.set(&deep, Value::Int(1)).unwrap();
         let deeper = params.set(&deep, Value::Array(Vec::new()));
-        assert_eq!(deeper, Err(Refused::Deep));
+        assert_eq!(deeper, Err(ParamError::Deep));
     }
 
     #[test]
@@ -245,7 +245,7 @@ mod tests {
         let mut params = Params::default();
         let big = Value::Base64(vec![0; MAX_BYTES / 2]);
         params.set("/a", big.clone()).unwrap();
-        assert_eq!(params.set("/b", big.clone()), Err(Refused::Full));
+        assert_eq!(params.set("/b", big.clone()), Err(ParamError::Full));
         params.set("/a", big.clone()).unwrap();
         assert!(params.delete("/a"));
         params.set("/b", big).unwrap();

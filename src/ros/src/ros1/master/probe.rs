@@ -1,4 +1,4 @@
-//! Which registered nodes are dead: those at whose address nobody listens any more.
+//! Detection of dead nodes: registered nodes whose address nobody listens on any more.
 
 use std::io;
 use std::sync::Arc;
@@ -7,16 +7,16 @@ use std::time::Duration;
 use futures_util::StreamExt as _;
 use tokio::time::timeout;
 
-use super::Inner;
+use super::MasterCore;
 use crate::ros1::names::PeerUri;
 
-/// Probes at a time.
+/// Maximum number of concurrent probes.
 const AT_A_TIME: usize = 32;
-/// A node that takes longer to accept hangs, but lives.
+/// Time limit of a probe; a node that takes longer to accept is hung, but alive.
 const ANSWER: Duration = Duration::from_secs(2);
 
-/// Drops the registrations of all dead nodes; their names.
-pub(super) async fn drop_dead(master: &Arc<Inner>) -> Vec<String> {
+/// Drops the registrations of all dead nodes; returns their names.
+pub(super) async fn drop_dead(master: &Arc<MasterCore>) -> Vec<String> {
     let nodes: Vec<(String, String)> = {
         let state = master.state.lock();
         let owned = |(name, api): (&str, &str)| (name.to_owned(), api.to_owned());
@@ -24,7 +24,7 @@ pub(super) async fn drop_dead(master: &Arc<Inner>) -> Vec<String> {
     };
     let dead: Vec<(String, String)> = futures_util::stream::iter(nodes)
         .map(|(name, api)| async move {
-            let refused = refuses(master, &api).await;
+            let refused = is_refused(master, &api).await;
             refused.then_some((name, api))
         })
         .buffer_unordered(AT_A_TIME)
@@ -34,10 +34,10 @@ pub(super) async fn drop_dead(master: &Arc<Inner>) -> Vec<String> {
     if dead.is_empty() {
         return Vec::new();
     }
-    master.change(|state, notices| {
+    master.update(|state, notices| {
         let mut dropped = Vec::new();
         for (name, api) in dead {
-            // It may have come back under another address while the others were probed.
+            // It may have registered again at another address while the others were probed.
             if state.registry.node_api(&name) == Some(api.as_str()) {
                 tracing::info!(node = name, api, "the node is gone");
                 state.registry.drop_node(&name, notices);
@@ -48,7 +48,7 @@ pub(super) async fn drop_dead(master: &Arc<Inner>) -> Vec<String> {
     })
 }
 
-async fn refuses(master: &Inner, api: &str) -> bool {
+async fn is_refused(master: &MasterCore, api: &str) -> bool {
     let Some(uri) = PeerUri::parse(api, "http") else {
         return false;
     };

@@ -1,19 +1,19 @@
-//! Who publishes, subscribes to and serves what. Pure state: what other nodes must be told comes back as
-//! [`Notice`]s.
+//! Registrations of publishers, subscribers, services and parameters. Pure state: notifications for other nodes are
+//! returned as [`Notice`]s.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::notify::Notice;
 use crate::bus::TopicNodes;
 
-/// Registrations of all nodes together, at most: a node gone wild must not eat the host's memory.
+/// Maximum number of registrations of all nodes together: a node gone wild must not exhaust the host's memory.
 const MAX_REGISTRATIONS: usize = 50_000;
-/// Former addresses remembered per node name, at most.
+/// Maximum number of former addresses recorded per node name.
 const MAX_REPLACED: usize = 16;
-/// The type of a topic of which nobody has said it yet.
+/// Type of a topic whose type is still unknown.
 pub(crate) const ANY_TYPE: &str = "*";
 
-/// One kind of registration.
+/// Kind of a registration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Publisher,
@@ -23,17 +23,17 @@ pub(super) enum Kind {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-struct Node {
+struct RegisteredNode {
     api: String,
     publishes: BTreeSet<String>,
     subscribes: BTreeSet<String>,
     serves: BTreeSet<String>,
     watches: BTreeSet<String>,
-    /// Addresses of the nodes that had this name before and were told to end.
+    /// Addresses of earlier nodes of this name that were told to shut down.
     replaced: Vec<String>,
 }
 
-impl Node {
+impl RegisteredNode {
     fn new(api: &str) -> Self {
         Self {
             api: api.to_owned(),
@@ -45,7 +45,7 @@ impl Node {
         }
     }
 
-    fn names(&mut self, kind: Kind) -> &mut BTreeSet<String> {
+    fn names_mut(&mut self, kind: Kind) -> &mut BTreeSet<String> {
         match kind {
             Kind::Publisher => &mut self.publishes,
             Kind::Subscriber => &mut self.subscribes,
@@ -63,7 +63,7 @@ impl Node {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-struct Service {
+struct RegisteredService {
     node: String,
     api: String,
 }
@@ -71,33 +71,33 @@ struct Service {
 /// All registrations.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Registry {
-    nodes: BTreeMap<String, Node>,
-    /// Topics with their ends in the order registered. Kept without ends too: ROS remembers types.
-    topics: BTreeMap<String, Topic>,
-    services: BTreeMap<String, Service>,
+    nodes: BTreeMap<String, RegisteredNode>,
+    /// Topics with their nodes in the order registered. Kept without nodes too: ROS remembers types.
+    topics: BTreeMap<String, TopicRegistration>,
+    services: BTreeMap<String, RegisteredService>,
     count: usize,
-    /// Grows with everything that really changed.
+    /// Number of actual changes.
     version: u64,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-struct Topic {
+struct TopicRegistration {
     type_name: String,
     publishers: Vec<String>,
     subscribers: Vec<String>,
 }
 
-/// Why nothing was registered.
+/// Reason for refusing a registration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Refused {
+pub(super) enum RegistrationError {
     #[error("this Master holds no more than {MAX_REGISTRATIONS} registrations")]
     Full,
-    #[error("a new node registered with the same name, and this one was told to end")]
+    #[error("a new node registered with the same name, and this one was asked to shut down")]
     Replaced,
 }
 
 impl Registry {
-    /// Registers `node` under `name`. For services `service_api` says where it is served.
+    /// Registers `node` under `name`. For services `service_api` is the address at which it is served.
     pub(super) fn register(
         &mut self,
         kind: Kind,
@@ -106,15 +106,15 @@ impl Registry {
         (node, api): (&str, &str),
         service_api: &str,
         notices: &mut Vec<Notice>,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), RegistrationError> {
         if self.count >= MAX_REGISTRATIONS || self.topics.len() >= MAX_REGISTRATIONS {
-            return Err(Refused::Full);
+            return Err(RegistrationError::Full);
         }
         let mut replaced = Vec::new();
         if let Some(before) = self.nodes.get(node).filter(|before| before.api != api) {
-            // A roscpp node registers once more while it ends; that must not end its successor.
+            // A roscpp node registers once more while it shuts down; that must not end its successor.
             if before.replaced.iter().any(|old| old == api) {
-                return Err(Refused::Replaced);
+                return Err(RegistrationError::Replaced);
             }
             replaced.clone_from(&before.replaced);
             replaced.push(before.api.clone());
@@ -128,21 +128,24 @@ impl Registry {
         let entry = self
             .nodes
             .entry(node.to_owned())
-            .or_insert_with(|| Node::new(api));
+            .or_insert_with(|| RegisteredNode::new(api));
         if !replaced.is_empty() {
             entry.replaced = replaced;
         }
-        let new = entry.names(kind).insert(name.to_owned());
+        let new = entry.names_mut(kind).insert(name.to_owned());
         self.count += usize::from(new);
         self.version += u64::from(new);
         match kind {
             Kind::Publisher | Kind::Subscriber => {
-                let topic = self.topics.entry(name.to_owned()).or_insert_with(|| Topic {
-                    type_name: ANY_TYPE.to_owned(),
-                    publishers: Vec::new(),
-                    subscribers: Vec::new(),
-                });
-                // As rosmaster: what a publisher says counts, a subscriber only fills the gap.
+                let topic =
+                    self.topics
+                        .entry(name.to_owned())
+                        .or_insert_with(|| TopicRegistration {
+                            type_name: ANY_TYPE.to_owned(),
+                            publishers: Vec::new(),
+                            subscribers: Vec::new(),
+                        });
+                // As in rosmaster: a publisher's type takes effect, a subscriber's only fills the gap.
                 let counts = kind == Kind::Publisher || topic.type_name == ANY_TYPE;
                 if counts && type_name != ANY_TYPE && type_name != topic.type_name {
                     topic.type_name = type_name.to_owned();
@@ -160,7 +163,7 @@ impl Registry {
                 }
             }
             Kind::Service => {
-                let service = Service {
+                let service = RegisteredService {
                     node: node.to_owned(),
                     api: service_api.to_owned(),
                 };
@@ -174,7 +177,7 @@ impl Registry {
         Ok(())
     }
 
-    /// Takes a registration back; false if `node` at `api` holds none.
+    /// Removes a registration; returns false if `node` at `api` holds none.
     pub(super) fn unregister(
         &mut self,
         kind: Kind,
@@ -199,7 +202,7 @@ impl Registry {
         true
     }
 
-    /// Drops every registration of `node`.
+    /// Removes every registration of `node`.
     pub(super) fn drop_node(&mut self, node: &str, notices: &mut Vec<Notice>) {
         let Some(gone) = self.nodes.remove(node) else {
             return;
@@ -219,8 +222,9 @@ impl Registry {
         }
     }
 
-    /// Nobody is at this address any more, so that whoever registers with it next is a newcomer.
-    pub(super) fn address_is_free(&mut self, api: &str) {
+    /// Forgets a former address at which nobody is any more, so that the next node that registers with it is a
+    /// newcomer.
+    pub(super) fn forget_replaced_address(&mut self, api: &str) {
         for node in self.nodes.values_mut() {
             node.replaced.retain(|old| old != api);
         }
@@ -240,14 +244,14 @@ impl Registry {
         let Some(entry) = self.nodes.get_mut(node) else {
             return;
         };
-        self.count -= usize::from(entry.names(kind).remove(name));
+        self.count -= usize::from(entry.names_mut(kind).remove(name));
         self.version += 1;
         if entry.is_idle() {
             self.nodes.remove(node);
         }
     }
 
-    /// Removes a registration from the side of what is registered.
+    /// Removes a registration from the topic's or service's side.
     fn detach(&mut self, kind: Kind, name: &str, node: &str, notices: &mut Vec<Notice>) {
         match kind {
             Kind::Publisher => {
@@ -277,13 +281,13 @@ impl Registry {
         }
     }
 
-    /// Addresses of a topic's publishers.
+    /// Returns the addresses of a topic's publishers.
     pub(super) fn publisher_apis(&self, topic: &str) -> Vec<String> {
         let topic = self.topics.get(topic);
         self.apis(topic.map_or(&[], |topic| &topic.publishers))
     }
 
-    /// Addresses of a topic's subscribers.
+    /// Returns the addresses of a topic's subscribers.
     pub(super) fn subscriber_apis(&self, topic: &str) -> Vec<String> {
         let topic = self.topics.get(topic);
         self.apis(topic.map_or(&[], |topic| &topic.subscribers))
@@ -294,48 +298,48 @@ impl Registry {
         known.map(|node| node.api.clone()).collect()
     }
 
-    /// Grows with everything that really changed.
+    /// Returns the number of actual changes.
     pub(super) fn version(&self) -> u64 {
         self.version
     }
 
-    /// A node's address.
+    /// Returns a node's address.
     pub(super) fn node_api(&self, node: &str) -> Option<&str> {
         self.nodes.get(node).map(|found| found.api.as_str())
     }
 
-    /// Whether any node lives at `api`.
+    /// Returns true if any node is registered at `api`.
     pub(super) fn is_known(&self, api: &str) -> bool {
         self.nodes.values().any(|node| node.api == api)
     }
 
-    /// Where a service is served.
+    /// Returns the address of a service.
     pub(super) fn service_api(&self, service: &str) -> Option<&str> {
         self.services.get(service).map(|found| found.api.as_str())
     }
 
-    /// All nodes with their addresses.
+    /// Iterates over all nodes with their addresses.
     pub(super) fn nodes(&self) -> impl Iterator<Item = (&str, &str)> {
         self.nodes
             .iter()
             .map(|(name, node)| (name.as_str(), node.api.as_str()))
     }
 
-    /// All services with the nodes that serve them.
+    /// Iterates over all services with the nodes that serve them.
     pub(super) fn services(&self) -> impl Iterator<Item = (&str, &str)> {
         self.services
             .iter()
             .map(|(name, service)| (name.as_str(), service.node.as_str()))
     }
 
-    /// All topics whose type somebody has ever said.
+    /// Iterates over all topics whose type was ever declared.
     pub(super) fn types(&self) -> impl Iterator<Item = (&str, &str)> {
         self.topics
             .iter()
             .map(|(name, topic)| (name.as_str(), topic.type_name.as_str()))
     }
 
-    /// Topics that have an end now.
+    /// Iterates over the topics that have publishers or subscribers now.
     pub(super) fn topics(&self) -> impl Iterator<Item = (&str, TopicNodes)> {
         self.topics
             .iter()
@@ -350,7 +354,7 @@ impl Registry {
             })
     }
 
-    /// Addresses of those who subscribed to a parameter, by the key they gave.
+    /// Returns the addresses of parameter subscribers, by the key they subscribed to.
     pub(super) fn parameter_watchers(&self) -> BTreeMap<String, Vec<String>> {
         let mut watchers: BTreeMap<String, Vec<String>> = BTreeMap::new();
         for node in self.nodes.values() {

@@ -5,9 +5,9 @@ use tokio::net::TcpStream;
 use super::*;
 use crate::net::HostSockets;
 use crate::ros1::testing::{LONG, TestMaster, TestNode, args};
-use crate::ros1::xmlrpc::Client;
+use crate::ros1::xmlrpc::XmlRpcClient;
 
-/// An address at which nobody is.
+/// An address at which nobody listens.
 const NOWHERE: &str = "http://127.0.0.1:1/";
 
 fn strings(texts: &[&str]) -> Value {
@@ -103,20 +103,24 @@ async fn the_callers_mistakes_are_named() {
             args(["/p", "", "*", NOWHERE]).into(),
             "empty",
         ),
-        ("lookupNode", args(["/p", "/a\nb"]).into(), "no ROS name"),
+        ("lookupNode", args(["/p", "/a\nb"]).into(), "not a ROS name"),
         ("setParam", args(["/p", "/"]).into(), "value is missing"),
         ("setParam", args(["/p", "/", "x"]).into(), "dictionary"),
         ("getParam", args(["/p", "/nothing"]).into(), "not set"),
         ("deleteParam", args(["/p", "/nothing"]).into(), "not set"),
         ("searchParam", args(["/p", "~x"]).into(), "cannot search"),
-        ("shutdown", args(["/p", "now"]).into(), "no node can end it"),
+        (
+            "shutdown",
+            args(["/p", "now"]).into(),
+            "nodes cannot shut it down",
+        ),
     ] {
         let (code, message, _) = master.call(method, &list).await;
         assert_eq!(code, -1, "{method} {list:?}");
         assert!(message.contains(wanted), "{method}: {message}");
     }
     let uri = format!("http://{}/", master.address);
-    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let client = XmlRpcClient::new(Arc::new(HostSockets), &uri).unwrap();
     let fault = client.call("sing", &[], LONG).await.unwrap_err();
     assert!(fault.to_string().contains("sing is not known"), "{fault}");
     assert_eq!(master.master.graph().nodes.len(), 0);
@@ -147,7 +151,7 @@ async fn subscribers_hear_of_publishers_that_come_and_go() {
 async fn a_hung_node_delays_nobody_else_and_gets_the_newest_in_the_end() {
     let master = TestMaster::start().await;
     let mut node = TestNode::start().await;
-    // It has a listening socket, but answers nothing.
+    // It has a listening socket, but does not answer.
     let hung = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
     master
@@ -164,7 +168,7 @@ async fn a_hung_node_delays_nobody_else_and_gets_the_newest_in_the_end() {
     }
     let ten = |list: &[Value]| list[2].as_array().unwrap().len() == 10;
     while !ten(&node.next().await.1) {}
-    // Of ten changes, the hung node is owed the call under way and the newest state, not ten calls.
+    // After ten changes, the hung node is owed the call in progress and the newest state, not ten calls.
     let queues = master.master.inner.notifier.waiting(&hung_uri);
     assert!(queues <= 1, "{queues} notices wait");
 }
@@ -197,14 +201,14 @@ async fn a_name_belongs_to_who_came_last() {
         watcher.next().await.1[2].clone()
     };
     assert_eq!(last, strings(&[]), "the old one's topic is gone");
-    // On its way out the old one registers once more: that must not end the new one.
+    // The old node registers once more while it shuts down: that must not end the new one.
     let (code, message, _) = master
         .call("subscribeParam", &args(["/n", &old.uri, "/p"]))
         .await;
     assert_eq!(code, -1, "{message}");
     assert_eq!(master.master.graph().nodes["/n"], new.uri);
     assert!(new.calls.try_recv().is_err());
-    // When the new one has gone, the address is free again.
+    // Once the new one is gone, the address is free again.
     master
         .call("unregisterSubscriber", &args(["/n", "/other", &new.uri]))
         .await;
@@ -220,7 +224,8 @@ async fn a_successor_may_have_the_address_of_one_who_is_dead() {
         let registration = args(["/n", "/t", "a/B", api]);
         master.call("registerPublisher", &registration).await.0
     };
-    // A bridge is killed, the next has another port, is killed too, and the one after that has the first one's port.
+    // A bridge is killed, the next one has another port and is killed too, and the one after that gets the first one's
+    // port.
     assert_eq!(register(NOWHERE).await, 1);
     assert_eq!(register(&new.uri).await, 1);
     tokio::time::timeout(LONG, async {
@@ -269,9 +274,9 @@ async fn the_dead_are_dropped_and_the_living_stay() {
         )
         .await;
     assert_eq!(living.next().await.1[2], strings(&[&dying.uri]));
-    assert_eq!(master.master.process_exited().await, Vec::<String>::new());
+    assert_eq!(master.master.on_process_exit().await, Vec::<String>::new());
     dying.die().await;
-    assert_eq!(master.master.process_exited().await, ["/dying"]);
+    assert_eq!(master.master.on_process_exit().await, ["/dying"]);
     assert_eq!(living.next().await.1[2], strings(&[]));
     let graph = master.master.graph();
     let nodes: Vec<_> = graph.nodes.keys().collect();
@@ -355,7 +360,7 @@ async fn many_calls_in_one_are_answered_one_by_one() {
         Value::Int(1),
     ]);
     let uri = format!("http://{}/", master.address);
-    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let client = XmlRpcClient::new(Arc::new(HostSockets), &uri).unwrap();
     let answers = client
         .call("system.multicall", &[calls], LONG)
         .await
@@ -391,7 +396,7 @@ async fn the_graph_is_waited_for() {
     let (later, _) = tokio::join!(wait(known, 60), master.call("registerPublisher", &list));
     assert_eq!(later.0.topics["/t"].type_name, "a/B");
     let known = graph::wire_generation(later.0.generation);
-    // The same once more is no news, so the time-out answers, with everything.
+    // Registering the same again is not a change, so the call times out and answers with the whole state.
     let (same, _) = tokio::join!(wait(known, 1), master.call("registerPublisher", &list));
     assert_eq!(same.0, later.0);
 }
@@ -413,12 +418,12 @@ async fn a_node_gone_wild_finds_the_end_of_our_patience() {
         )
     };
     let refused = (0..100_000).find_map(|number| register(number).err());
-    assert_eq!(refused, Some(registry::Refused::Full));
+    assert_eq!(refused, Some(registry::RegistrationError::Full));
     let reason = refused.unwrap().to_string();
     assert!(reason.contains("50000"), "{reason}");
 }
 
-/// Asks for all parameters on a connection of its own, and does not read the answer.
+/// Requests all parameters on its own connection, and does not read the answer.
 async fn ask_for_all(master: &TestMaster) -> TcpStream {
     let body = xmlrpc::print_call("getParam", &args(["/x", "/"]));
     let length = body.len();
@@ -428,8 +433,8 @@ async fn ask_for_all(master: &TestMaster) -> TcpStream {
     stream
 }
 
-/// Which of the connections have some of their answer.
-fn answered(streams: &[TcpStream]) -> Vec<usize> {
+/// Returns the connections that have received some of their answer.
+fn answered_streams(streams: &[TcpStream]) -> Vec<usize> {
     let has = |stream: &TcpStream| stream.try_read(&mut [0]).is_ok();
     (0..streams.len()).filter(|at| has(&streams[*at])).collect()
 }
@@ -437,16 +442,16 @@ fn answered(streams: &[TcpStream]) -> Vec<usize> {
 #[tokio::test]
 async fn answers_that_nobody_reads_take_no_more_than_their_share() {
     let budget = Budget::new("the Master", 32 << 20);
-    let limits = Limits {
+    let limits = ServerLimits {
         budget: budget.clone(),
-        ..Limits::default()
+        ..ServerLimits::default()
     };
     let options = MasterOptions {
         limits,
         ..MasterOptions::default()
     };
-    let master = TestMaster::with(Master::new(options), None).await;
-    // More than the kernel takes for a connection that nobody reads.
+    let master = TestMaster::start_at(Master::new(options), None).await;
+    // More than the kernel buffers for a connection that nobody reads.
     let big = Value::from("x".repeat(9 << 20));
     let set = ["/n".into(), "/big".into(), big];
     assert_eq!(master.call("setParam", &set).await.0, 1);
@@ -456,29 +461,29 @@ async fn answers_that_nobody_reads_take_no_more_than_their_share() {
     }
     let first = tokio::time::timeout(LONG, async {
         loop {
-            if let Some(first) = answered(&streams).first() {
+            if let Some(first) = answered_streams(&streams).first() {
                 break *first;
             }
             tokio::task::yield_now().await;
         }
     });
     let first = first.await.expect("one has an answer");
-    // The others wait, while other nodes are answered as ever.
+    // The others wait, while other nodes are answered as usual.
     for _ in 0..20 {
         assert_eq!(master.call("hasParam", &args(["/y", "/big"])).await.0, 1);
-        assert!(budget.used() <= 32 << 20);
+        assert!(budget.used_bytes() <= 32 << 20);
     }
     streams.remove(first);
-    // Whoever reads nothing and goes makes room for the next.
+    // A peer that reads nothing and disconnects makes room for the next.
     let next = tokio::time::timeout(LONG, async {
-        while answered(&streams).is_empty() {
+        while answered_streams(&streams).is_empty() {
             tokio::task::yield_now().await;
         }
     });
     next.await.expect("the next has an answer");
     drop(streams);
     let given_back = tokio::time::timeout(LONG, async {
-        while budget.used() > 0 {
+        while budget.used_bytes() > 0 {
             tokio::task::yield_now().await;
         }
     });
@@ -487,18 +492,18 @@ async fn answers_that_nobody_reads_take_no_more_than_their_share() {
 
 #[tokio::test]
 async fn what_can_never_be_answered_is_a_fault_at_once() {
-    let limits = Limits {
+    let limits = ServerLimits {
         budget: Budget::new("the Master", 1 << 20),
-        ..Limits::default()
+        ..ServerLimits::default()
     };
     let options = MasterOptions {
         limits,
         parameters: [("/big".to_owned(), ParamValue::String("x".repeat(1 << 20)))].into(),
         ..MasterOptions::default()
     };
-    let master = TestMaster::with(Master::new(options), None).await;
+    let master = TestMaster::start_at(Master::new(options), None).await;
     let uri = format!("http://{}/", master.address);
-    let client = Client::new(Arc::new(HostSockets), &uri).unwrap();
+    let client = XmlRpcClient::new(Arc::new(HostSockets), &uri).unwrap();
     let calls = |count: usize| {
         let call = [
             ("methodName".to_owned(), "getParam".into()),
@@ -528,7 +533,9 @@ async fn parameters_used_one_by_one_are_told_together() {
         let key = format!("/p{number}");
         master.call("hasParam", &args(["/n", &key])).await;
     }
-    master.until(|graph| graph.parameters.len() == count).await;
+    master
+        .wait_until(|graph| graph.parameters.len() == count)
+        .await;
     let told = tokio::time::timeout(LONG, generation.changed()).await;
     told.expect("it is told").unwrap();
     let grown = *generation.borrow() - before;

@@ -1,8 +1,8 @@
-//! A stream of length-prefixed messages → one [`Bytes`] each.
+//! Splits a stream of length-prefixed messages into one [`Bytes`] each.
 //!
-//! Small messages are cut out of a common buffer, which is read as full as the socket gives; a big one is read
-//! straight into an allocation of its own. That grows with what comes, not with what the prefix promises, and counts in
-//! the connection's budget until the message is whole.
+//! Small messages are cut out of a common buffer, which is filled as far as the socket allows; a big one is read
+//! straight into an allocation of its own. That allocation grows with the data received, not with the promise of the
+//! prefix, and counts in the connection's budget until the message is complete.
 
 use std::io;
 use std::time::Duration;
@@ -14,54 +14,54 @@ use tokio::time::timeout;
 
 use super::Error;
 
-/// A message of at least this size gets its own allocation.
+/// Size from which a message gets its own allocation.
 pub(crate) const BIG: usize = 16 << 10;
-/// The common buffer's size, at first and when the stream is busy.
+/// Size of the common buffer: initial, and when the stream is busy.
 const FEW: usize = 4 << 10;
 const MANY: usize = 128 << 10;
-/// An allocation up to this size is used again for the next big message, if nobody holds the last one any more.
+/// Size up to which an allocation is reused for the next big message, if nobody holds the previous one any more.
 const REUSED: usize = 8 << 20;
-/// ... unless that takes longer than this to come.
+/// Maximum wait for that message before the allocation is freed.
 const KEPT: Duration = Duration::from_secs(1);
-/// Room made for a big message before any of it has come; as it comes the room doubles.
+/// Space reserved for a big message before any of it has arrived; doubled as it arrives.
 const AHEAD: usize = 1 << 20;
 
-/// What the messages of a connection may take.
+/// Limits for the messages of a connection.
 #[derive(Debug, Clone)]
 pub struct FrameBounds {
-    /// Bytes of one message.
+    /// Maximum size of one message in bytes.
     pub max: usize,
-    /// Where unfinished messages count.
+    /// Budget for incomplete messages.
     pub budget: Budget,
-    /// From a message's length prefix to its last byte.
+    /// Time limit from a message's length prefix to its last byte.
     pub unfinished: Duration,
 }
 
 impl From<usize> for FrameBounds {
-    /// Messages up to `max` bytes, in a budget of nobody else's.
+    /// Limits messages to `max` bytes, with an unlimited budget.
     fn from(max: usize) -> Self {
         Self {
             max,
-            budget: Budget::unlimited(),
+            budget: Budget::without_limit(),
             unfinished: super::UNFINISHED,
         }
     }
 }
 
-/// Reads messages off one connection.
+/// Reads messages from one connection.
 #[derive(Debug)]
 pub struct FrameReader {
     buffer: BytesMut,
     chunk: usize,
-    /// The last big message's allocation, while it may be used again.
+    /// Allocation of the last big message, while it may be reused.
     big: Option<BytesMut>,
     bounds: FrameBounds,
-    /// For the big message that is being read.
+    /// Permit for the big message that is being read.
     permit: Permit,
 }
 
 impl FrameReader {
-    /// A reader that begins with what was already read, and takes messages within `bounds`.
+    /// Creates a reader that begins with what was already read and takes messages within `bounds`.
     pub fn new(buffer: BytesMut, bounds: impl Into<FrameBounds>) -> Self {
         let bounds = bounds.into();
         Self {
@@ -73,21 +73,21 @@ impl FrameReader {
         }
     }
 
-    /// The next message; `None` when the stream ends between messages.
+    /// Returns the next message, or `None` when the stream ends between messages.
     pub async fn next(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
     ) -> Result<Option<Bytes>, Error> {
         loop {
-            if let Some(size) = self.announced()? {
+            if let Some(size) = self.peek_size()? {
                 if self.buffer.len() >= 4 + size {
                     self.buffer.advance(4);
                     return Ok(Some(self.buffer.split_to(size).freeze()));
                 }
                 if size >= BIG {
                     self.buffer.advance(4);
-                    let message = self.own_allocation(stream, size).await;
-                    // Whole, it counts where it is queued; given up, its connection ends.
+                    let message = self.read_big(stream, size).await;
+                    // A complete message is charged where it is queued; after an error the connection ends.
                     let _ = self.permit.resize(0);
                     return message.map(Some);
                 }
@@ -102,7 +102,7 @@ impl FrameReader {
         }
     }
 
-    /// One byte, before the messages that follow it (the success flag of a service response).
+    /// Reads one byte before the messages that follow it (the success flag of a service response).
     pub(super) async fn byte(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
@@ -113,13 +113,13 @@ impl FrameReader {
         Ok(Some(self.buffer.get_u8()))
     }
 
-    /// Whether nothing is left over from what was read.
+    /// Returns true if no unprocessed bytes are buffered.
     pub(super) fn is_empty(&self) -> bool {
         self.buffer.is_empty()
     }
 
-    /// The next message's length, as soon as its prefix is there.
-    fn announced(&self) -> Result<Option<usize>, Error> {
+    /// Returns the next message's size as soon as its prefix has arrived.
+    fn peek_size(&self) -> Result<Option<usize>, Error> {
         let Some(prefix) = self.buffer.first_chunk::<4>() else {
             return Ok(None);
         };
@@ -131,7 +131,7 @@ impl FrameReader {
         Ok(Some(size))
     }
 
-    /// Reads as much as there is; false at the end of the stream.
+    /// Reads what is available; returns false at the end of the stream.
     async fn fill(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<bool, Error> {
         let spare = self.buffer.capacity() - self.buffer.len();
         if spare < self.chunk / 4 {
@@ -158,7 +158,7 @@ impl FrameReader {
         Ok(count > 0)
     }
 
-    /// Room for at least so many bytes more of a message of `size` bytes.
+    /// Reserves space for at least `least` more bytes of a message of `size` bytes.
     fn make_room(&mut self, big: &mut BytesMut, size: usize, least: usize) -> Result<(), Error> {
         if big.capacity() - big.len() < least {
             let room = (size - big.len()).min(big.len().max(AHEAD)).max(least);
@@ -168,7 +168,7 @@ impl FrameReader {
         Ok(())
     }
 
-    async fn own_allocation(
+    async fn read_big(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         size: usize,
@@ -217,7 +217,7 @@ fn ended_inside() -> Error {
 mod tests {
     use super::*;
 
-    fn framed(messages: &[Vec<u8>]) -> Vec<u8> {
+    fn frame_messages(messages: &[Vec<u8>]) -> Vec<u8> {
         let mut out = Vec::new();
         for message in messages {
             out.put_u32_le(message.len() as u32);
@@ -239,10 +239,10 @@ mod tests {
     async fn messages_of_all_sizes_come_out_whole() {
         let sizes = [0, 1, 3, BIG - 1, BIG, BIG + 1, 5, MANY * 3, 0, 100];
         let messages: Vec<Vec<u8>> = sizes.iter().map(|size| vec![*size as u8; *size]).collect();
-        let bytes = framed(&messages);
+        let bytes = frame_messages(&messages);
         let whole = all(bytes.as_slice()).await.unwrap();
         assert_eq!(whole, messages);
-        // The same, arriving in small pieces.
+        // The same bytes, arriving in small pieces.
         let (mut sender, receiver) = tokio::io::duplex(777);
         let sending = tokio::spawn(async move {
             use tokio::io::AsyncWriteExt as _;
@@ -279,7 +279,7 @@ mod tests {
                 }
             });
         }
-        // One at most can have its 3 MB; all others are told why not.
+        // At most one can have its 3 MB; all others get an error.
         for _ in 0..7 {
             let refused = timeout(Duration::from_secs(60), reading.join_next()).await;
             let refused = refused.expect("it is refused").unwrap().unwrap();
@@ -288,10 +288,10 @@ mod tests {
                 refused.to_string().contains("the memory for servant x"),
                 "{refused}"
             );
-            assert!(budget.used() <= 4 << 20);
+            assert!(budget.used_bytes() <= 4 << 20);
         }
         reading.shutdown().await;
-        assert_eq!(budget.used(), 0);
+        assert_eq!(budget.used_bytes(), 0);
     }
 
     #[tokio::test]
@@ -301,12 +301,12 @@ mod tests {
             budget: budget.clone(),
             ..FrameBounds::from(8 << 20)
         };
-        let bytes = framed(&vec![vec![1; 3 << 20]; 3]);
+        let bytes = frame_messages(&vec![vec![1; 3 << 20]; 3]);
         let mut stream = bytes.as_slice();
         let mut frames = FrameReader::new(BytesMut::new(), bounds);
         let mut held = Vec::new();
         while let Some(message) = frames.next(&mut stream).await.unwrap() {
-            assert_eq!(budget.used(), 0);
+            assert_eq!(budget.used_bytes(), 0);
             held.push(message);
         }
         assert_eq!(held, vec![vec![1; 3 << 20]; 3]);
@@ -320,7 +320,7 @@ mod tests {
             unfinished: Duration::from_millis(20),
             ..FrameBounds::from(250 << 20)
         };
-        let bytes = &framed(&[vec![7; 100_000]])[..50_000];
+        let bytes = &frame_messages(&[vec![7; 100_000]])[..50_000];
         sender.write_all(bytes).await.unwrap();
         let mut frames = FrameReader::new(BytesMut::new(), bounds);
         let given_up = timeout(Duration::from_secs(60), frames.next(&mut receiver)).await;
@@ -349,7 +349,7 @@ mod tests {
     #[tokio::test]
     async fn an_end_inside_a_message_is_an_error() {
         for cut in [2, 5, 4 + BIG] {
-            let bytes = framed(&[vec![7; BIG + 10]]);
+            let bytes = frame_messages(&[vec![7; BIG + 10]]);
             let error = all(&bytes[..cut]).await.unwrap_err();
             assert!(matches!(error, Error::Io(_)), "{error}");
         }
@@ -357,7 +357,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_held_message_is_not_overwritten_by_the_next() {
-        let bytes = framed(&[vec![1; BIG], vec![2; BIG], vec![3; BIG]]);
+        let bytes = frame_messages(&[vec![1; BIG], vec![2; BIG], vec![3; BIG]]);
         let mut stream = bytes.as_slice();
         let mut frames = FrameReader::new(BytesMut::new(), 1 << 20);
         let first = frames.next(&mut stream).await.unwrap().unwrap();

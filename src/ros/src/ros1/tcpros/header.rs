@@ -1,4 +1,4 @@
-//! The connection header that each side sends first: fields `name=value`, each with its length before it.
+//! The connection header that each side sends first: length-prefixed fields of the form `name=value`.
 
 use std::collections::BTreeMap;
 
@@ -7,9 +7,9 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 
 use super::Error;
 
-/// A header longer than this is refused. Full message definitions travel in it.
+/// Maximum size of a header in bytes. Full message definitions are sent in it.
 pub const MAX_HEADER: usize = 4 << 20;
-/// Fields in one header, at most; real ones have ten.
+/// Maximum number of fields in a header; real ones have ten.
 const MAX_FIELDS: usize = 100;
 
 /// A connection header.
@@ -19,7 +19,7 @@ pub struct Header {
 }
 
 impl Header {
-    /// A header of these fields.
+    /// Creates a header with these fields.
     pub fn new<const N: usize>(fields: [(&str, &str); N]) -> Self {
         let owned = |(name, value): (&str, &str)| (name.to_owned(), value.to_owned());
         Self {
@@ -27,33 +27,33 @@ impl Header {
         }
     }
 
-    /// The header that says no.
+    /// Creates a header that refuses the connection.
     pub fn error(reason: &str) -> Self {
         Self::new([("error", reason)])
     }
 
-    /// One field.
+    /// Returns a field.
     pub fn get(&self, name: &str) -> Option<&str> {
         self.fields.get(name).map(String::as_str)
     }
 
-    /// One field, or the empty string.
+    /// Returns a field, or the empty string.
     pub fn text(&self, name: &str) -> &str {
         self.get(name).unwrap_or_default()
     }
 
-    /// Whether a field is there and says yes.
+    /// Returns true if a field is present and affirmative.
     pub fn flag(&self, name: &str) -> bool {
         matches!(self.get(name), Some("1" | "true" | "True"))
     }
 
-    /// The header with one more field.
-    pub fn with(mut self, name: &str, value: &str) -> Self {
+    /// Returns the header with one more field.
+    pub fn with_field(mut self, name: &str, value: &str) -> Self {
         self.fields.insert(name.to_owned(), value.to_owned());
         self
     }
 
-    /// The header as it travels, with its total length before it.
+    /// Encodes the header, with its total length in front.
     pub fn encode(&self) -> Vec<u8> {
         let size = |(name, value): (&String, &String)| 4 + name.len() + 1 + value.len();
         let total: usize = self.fields.iter().map(size).sum();
@@ -68,7 +68,7 @@ impl Header {
         out
     }
 
-    /// Reads the fields of a header, without the total length.
+    /// Decodes the fields of a header, without the total length.
     pub fn decode(mut bytes: &[u8]) -> Result<Self, Error> {
         let bad = |reason: &str| Error::Header(reason.to_owned());
         let mut fields = BTreeMap::new();
@@ -129,7 +129,7 @@ impl Header {
     }
 }
 
-/// Reads until `buffer` holds `length` bytes: memory grows with what comes, not with what was announced.
+/// Reads until `buffer` holds `length` bytes; memory grows with the data received, not with the announced length.
 pub(super) async fn fill_to(
     stream: &mut (impl AsyncRead + Unpin),
     buffer: &mut BytesMut,

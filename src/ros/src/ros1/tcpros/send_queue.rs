@@ -1,4 +1,4 @@
-//! What waits to be sent to one subscriber: bounded, newest wins, several messages to one system call.
+//! Send queue of one subscriber: bounded, drops the oldest messages, writes several messages per system call.
 
 use std::io::{self, IoSlice};
 
@@ -7,9 +7,9 @@ use parking_lot::Mutex;
 use tokio::io::{AsyncWrite, AsyncWriteExt as _};
 use tokio::sync::Notify;
 
-use crate::ring::{Bounds, Lost, Ring};
+use crate::ring::{DropTally, Ring, RingBounds};
 
-/// Messages and bytes taken from the queue for one round of writing.
+/// Maximum number of messages, and of bytes, taken from the queue for one write.
 const BATCH: usize = 256;
 const BATCH_BYTES: usize = 1 << 20;
 
@@ -22,31 +22,31 @@ pub struct SendQueue {
 
 #[derive(Debug)]
 struct State {
-    /// What a newcomer is given, however much: no newer message takes its place.
+    /// Latched messages for a new subscriber, not displaced by newer messages.
     first: Vec<Bytes>,
     ring: Ring<Bytes>,
     closed: bool,
 }
 
 impl SendQueue {
-    /// A queue for at most `capacity` messages (0 counts as 1) and 64 MiB, after `first`, however many those are.
+    /// Creates a queue for at most `capacity` messages (0 counts as 1) and 64 MiB, after `first`, which is not bounded.
     pub fn new(capacity: usize, first: impl IntoIterator<Item = Bytes>) -> Self {
         Self {
             state: Mutex::new(State {
                 first: first.into_iter().collect(),
-                ring: Ring::new(Bounds::messages(capacity)),
+                ring: Ring::new(RingBounds::with_messages(capacity)),
                 closed: false,
             }),
             ready: Notify::new(),
         }
     }
 
-    /// Queues a message; older ones may be dropped for it.
-    pub fn push(&self, message: Bytes) -> Lost {
+    /// Queues a message; older ones may be dropped to make room.
+    pub fn push(&self, message: Bytes) -> DropTally {
         let lost = {
             let mut state = self.state.lock();
             if state.closed {
-                return Lost::default();
+                return DropTally::default();
             }
             state.ring.push(message)
         };
@@ -54,13 +54,13 @@ impl SendQueue {
         lost
     }
 
-    /// Takes no more messages; [`SendQueue::drain`] ends when what is queued was sent.
+    /// Accepts no more messages; [`SendQueue::drain`] returns once the queued ones have been sent.
     pub fn close(&self) {
         self.state.lock().closed = true;
         self.ready.notify_one();
     }
 
-    /// Sends what is queued and what comes, until closed.
+    /// Sends queued messages as they come, until closed.
     pub async fn drain(&self, stream: &mut (impl AsyncWrite + Unpin)) -> io::Result<()> {
         let mut batch = Vec::new();
         loop {
@@ -92,7 +92,7 @@ impl SendQueue {
     }
 }
 
-/// Writes messages, each with its length before it, without copying them.
+/// Writes messages, each with its length in front, without copying them.
 pub async fn write_messages(
     stream: &mut (impl AsyncWrite + Unpin),
     messages: &[Bytes],
@@ -130,7 +130,7 @@ mod tests {
         Bytes::from(vec![byte; size])
     }
 
-    async fn sent(send_queue: &SendQueue) -> Vec<Bytes> {
+    async fn drain_messages(send_queue: &SendQueue) -> Vec<Bytes> {
         let (mut ours, mut theirs) = tokio::io::duplex(1000);
         send_queue.close();
         let reading = tokio::spawn(async move {
@@ -149,12 +149,15 @@ mod tests {
     #[tokio::test]
     async fn newest_win() {
         let send_queue = SendQueue::new(2, []);
-        let mut lost = Lost::default();
+        let mut lost = DropTally::default();
         for n in 0..5 {
             lost += send_queue.push(message(n, 10));
         }
         assert_eq!(lost.messages, 3);
-        assert_eq!(sent(&send_queue).await, [message(3, 10), message(4, 10)]);
+        assert_eq!(
+            drain_messages(&send_queue).await,
+            [message(3, 10), message(4, 10)]
+        );
     }
 
     #[tokio::test]
@@ -164,12 +167,15 @@ mod tests {
         for one in all.iter().chain(&all) {
             assert_eq!(send_queue.push(one.clone()).messages, 0);
         }
-        assert_eq!(sent(&send_queue).await, [all.clone(), all].concat());
+        assert_eq!(
+            drain_messages(&send_queue).await,
+            [all.clone(), all].concat()
+        );
     }
 
     #[tokio::test]
     async fn what_newcomers_are_given_is_not_dropped() {
         let send_queue = SendQueue::new(1, [message(1, 1), message(2, 1), message(3, 1)]);
-        assert_eq!(sent(&send_queue).await.len(), 3);
+        assert_eq!(drain_messages(&send_queue).await.len(), 3);
     }
 }

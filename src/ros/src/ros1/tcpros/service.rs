@@ -1,7 +1,7 @@
-//! Service calls over TCPROS, both ends.
+//! Service calls over TCPROS, client and server.
 //!
-//! After the headers: request = length and bytes; response = one byte (1 done, 0 failed), length and bytes (of
-//! the answer, or of the reason). Persistent connections carry one call after the other.
+//! After the headers: a request is a length and bytes; a response is one byte (1 success, 0 failure), a length and
+//! bytes (of the answer or the reason). Persistent connections carry one call after the other.
 
 use std::io;
 use std::net::SocketAddr;
@@ -23,16 +23,16 @@ pub struct ServiceConnection {
     header: Header,
 }
 
-/// A call that got no response.
+/// Error of a call without a response.
 #[derive(Debug, thiserror::Error)]
 pub enum CallError {
     /// The server had closed the connection before it took the request: calling again elsewhere is safe.
     #[error("the server had closed the connection")]
     NotTaken,
-    /// The server closed after it may have taken the request.
+    /// The server closed the connection after it may have taken the request.
     #[error("the server closed the connection during the call")]
     Abandoned,
-    /// The connection failed, or the server broke the protocol.
+    /// The connection failed, or the server violated the protocol.
     #[error(transparent)]
     Broken(#[from] Error),
 }
@@ -46,7 +46,7 @@ impl ServiceConnection {
         bounds: impl Into<FrameBounds>,
     ) -> Result<Self, Error> {
         let mut stream = sockets.connect(address).await?;
-        net::watch(&stream);
+        net::enable_keepalive(&stream);
         let mut buffer = BytesMut::new();
         let header = header.exchange(&mut stream, &mut buffer).await?;
         Ok(Self {
@@ -56,12 +56,12 @@ impl ServiceConnection {
         })
     }
 
-    /// What the server said of itself.
+    /// Returns the server's header.
     pub fn header(&self) -> &Header {
         &self.header
     }
 
-    /// Whether the server has closed (or said something nobody asked for) while the connection lay idle.
+    /// Returns true if the server has closed the idle connection (or sent unsolicited data).
     pub fn is_stale(&self) -> bool {
         let mut byte = [0];
         !self.frames.is_empty()
@@ -69,8 +69,8 @@ impl ServiceConnection {
                 Err(error) if error.kind() == io::ErrorKind::WouldBlock)
     }
 
-    /// One call: the answer, or the reason that the server gave for having none. After an error, or when the
-    /// call is dropped half-way, the connection must be dropped too.
+    /// Makes one call; returns the answer, or the server's reason for failing. After an error, or when the call is
+    /// dropped half-way, the connection must be dropped too.
     pub async fn call(&mut self, request: Bytes) -> Result<Result<Bytes, String>, CallError> {
         if let Err(error) = write_messages(&mut self.stream, &[request]).await {
             return Err(if was_reset(&error) {
@@ -81,8 +81,8 @@ impl ServiceConnection {
         }
         let done = match self.frames.byte(&mut self.stream).await {
             Ok(Some(byte)) => byte,
-            Ok(None) => return Err(self.closed()),
-            // Reset: request bytes had not been read when the server closed.
+            Ok(None) => return Err(self.closed_error()),
+            // Reset: the server had not read request bytes when it closed.
             Err(Error::Io(error)) if was_reset(&error) => return Err(CallError::NotTaken),
             Err(error) => return Err(error.into()),
         };
@@ -96,9 +96,9 @@ impl ServiceConnection {
         })
     }
 
-    /// The stream ended instead of a response. If the server's end came first, the kernel has meanwhile had the
-    /// request refused, and keeps that as the socket's error.
-    fn closed(&self) -> CallError {
+    /// Returns the error for a stream that ended instead of a response. If the server had closed before the request,
+    /// the kernel has received a reset meanwhile and keeps it as the socket's error.
+    fn closed_error(&self) -> CallError {
         match self.stream.take_error() {
             Ok(Some(error)) if was_reset(&error) => CallError::NotTaken,
             _ => CallError::Abandoned,
@@ -113,7 +113,7 @@ fn was_reset(error: &io::Error) -> bool {
     )
 }
 
-/// Serves the calls of one connection whose headers were exchanged, until `ended` between two calls.
+/// Serves the calls of one connection after the exchange of headers, until `ended` is set between two calls.
 pub async fn serve_calls(
     mut stream: TcpStream,
     buffer: BytesMut,
@@ -135,7 +135,7 @@ pub async fn serve_calls(
             Ok(response) => (1, response),
             Err(reason) => (0, Bytes::from(reason)),
         };
-        // The flag travels with the rest: a segment of its own would cost the peer a wake-up.
+        // The flag is sent with the rest: a segment of its own would cost the peer a wake-up.
         let mut small = Vec::with_capacity(5 + payload.len().min(super::BIG));
         small.push(done);
         small.extend_from_slice(&(payload.len() as u32).to_le_bytes());

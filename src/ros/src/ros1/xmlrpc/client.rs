@@ -1,4 +1,4 @@
-//! The client: keeps connections of earlier calls, opens more for calls at the same time.
+//! XML-RPC client: keeps the connections of earlier calls, and opens more for concurrent calls.
 
 use std::fmt;
 use std::io;
@@ -11,58 +11,58 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::http::{HttpError, Reader, SMALL};
+use super::http::{HttpError, HttpReader, SMALL};
 use super::{Error, Value, parse_response, print_call, weight};
 use crate::net::{self, Sockets};
 use crate::ros1::names::PeerUri;
 
-/// Connections kept while nobody calls.
+/// Maximum number of idle connections.
 const MAX_IDLE: usize = 2;
-/// Bytes in one response's body.
+/// Maximum size of a response body in bytes.
 const MAX_BODY: usize = 64 << 20;
 
-/// One XML-RPC server, to be called.
-pub struct Client {
+/// A client of one XML-RPC server.
+pub struct XmlRpcClient {
     sockets: Arc<dyn Sockets>,
     uri: PeerUri,
-    idle: Mutex<Vec<Connection>>,
+    idle: Mutex<Vec<ClientConnection>>,
     budget: Budget,
 }
 
-struct Connection {
+struct ClientConnection {
     stream: TcpStream,
-    reader: Reader,
+    reader: HttpReader,
 }
 
-/// How a call on one connection failed.
+/// Error of a call on one connection.
 enum Failure {
-    /// The connection broke before a byte of the answer came.
+    /// The connection broke before a byte of the answer arrived.
     Unanswered(io::Error),
     Io(io::Error),
     Http(String),
 }
 
-impl Client {
-    /// A client of the server at `uri` (`http://host:port/`); connects with the first call.
+impl XmlRpcClient {
+    /// Creates a client of the server at `uri` (`http://host:port/`); connects with the first call.
     pub fn new(sockets: Arc<dyn Sockets>, uri: &str) -> Result<Self, Error> {
         let uri = PeerUri::parse(uri, "http").ok_or_else(|| Error::BadUri(uri.to_owned()))?;
         Ok(Self {
             sockets,
             uri,
             idle: Mutex::new(Vec::new()),
-            budget: Budget::unlimited(),
+            budget: Budget::without_limit(),
         })
     }
 
-    /// Has responses count in this budget while they are read; one that does not fit fails its call.
-    pub fn within(self, budget: &Budget) -> Self {
+    /// Charges responses to this budget while they are read; one that does not fit fails its call.
+    pub fn with_budget(self, budget: &Budget) -> Self {
         Self {
             budget: budget.clone(),
             ..self
         }
     }
 
-    /// Calls `method`; the time-out covers everything.
+    /// Calls `method`; the time limit covers everything.
     pub async fn call(
         &self,
         method: &str,
@@ -105,9 +105,9 @@ impl Client {
                 Some(connection) => connection,
                 None => self.connect().await.map_err(|error| self.io(error))?,
             };
-            let response = match self.on(connection, &request).await {
+            let response = match self.send_request(connection, &request).await {
                 Ok(response) => response,
-                // The server closed a kept connection meanwhile: that is no failure, ask on a new one.
+                // The server closed a kept connection meanwhile: not an error, retry on a new one.
                 Err(Failure::Unanswered(_)) if reused => {
                     self.disconnect();
                     continue;
@@ -136,23 +136,24 @@ impl Client {
         }
     }
 
-    async fn connect(&self) -> io::Result<Connection> {
+    async fn connect(&self) -> io::Result<ClientConnection> {
         let address = self.sockets.resolve(&self.uri.host, self.uri.port).await?;
         let stream = self.sockets.connect(address).await?;
-        net::watch(&stream);
-        Ok(Connection {
+        net::enable_keepalive(&stream);
+        Ok(ClientConnection {
             stream,
-            reader: Reader::new(),
+            reader: HttpReader::new(),
         })
     }
 
-    /// One request and its response, with the permit for what that becomes; keeps the connection if both sides can.
-    async fn on(
+    /// Sends one request and returns its response, with the permit for the parsed response; keeps the connection if
+    /// both sides allow.
+    async fn send_request(
         &self,
-        connection: Connection,
+        connection: ClientConnection,
         request: &str,
     ) -> Result<(Vec<u8>, Permit), Failure> {
-        let Connection {
+        let ClientConnection {
             mut stream,
             mut reader,
         } = connection;
@@ -168,17 +169,17 @@ impl Client {
             Err(error) => return Err(Failure::Unanswered(error)),
         }
         let read = async {
-            let mut head = reader.head(&mut stream).await?;
-            while status(&head.start) == Some(100) {
-                head = reader.head(&mut stream).await?;
+            let mut head = reader.read_head(&mut stream).await?;
+            while parse_status(&head.start) == Some(100) {
+                head = reader.read_head(&mut stream).await?;
             }
-            if status(&head.start) != Some(200) {
+            if parse_status(&head.start) != Some(200) {
                 let start: String = head.start.chars().take(80).collect();
                 return Err(HttpError::Bad(0, format!("it answered {start:?}")));
             }
             let mut permit = self.budget.permit();
             let body = reader
-                .body(&mut stream, &head, MAX_BODY, true, &mut permit)
+                .read_body(&mut stream, &head, MAX_BODY, true, &mut permit)
                 .await?;
             let weight = weight(&body);
             if weight > SMALL {
@@ -193,7 +194,7 @@ impl Client {
             Ok((response, keep)) => {
                 let mut idle = self.idle.lock();
                 if keep && idle.len() < MAX_IDLE && reader.is_empty() {
-                    idle.push(Connection { stream, reader });
+                    idle.push(ClientConnection { stream, reader });
                 }
                 Ok(response)
             }
@@ -203,7 +204,7 @@ impl Client {
     }
 }
 
-impl fmt::Debug for Client {
+impl fmt::Debug for XmlRpcClient {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter
             .debug_struct("Client")
@@ -212,8 +213,8 @@ impl fmt::Debug for Client {
     }
 }
 
-/// The number in `HTTP/1.1 200 OK`.
-fn status(start: &str) -> Option<u16> {
+/// Parses the status code in `HTTP/1.1 200 OK`.
+fn parse_status(start: &str) -> Option<u16> {
     if !start.starts_with("HTTP/1.") {
         return None;
     }

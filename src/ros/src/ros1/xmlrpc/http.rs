@@ -1,4 +1,4 @@
-//! As much HTTP/1.1 as XML-RPC needs: heads and bodies in either direction, read with limits.
+//! The part of HTTP/1.1 that XML-RPC needs: heads and bodies in both directions, read with limits.
 
 use std::io;
 
@@ -6,23 +6,23 @@ use budget::Permit;
 use bytes::{Buf as _, BytesMut};
 use tokio::io::{AsyncRead, AsyncReadExt as _};
 
-/// Start line and header fields together, at most.
+/// Maximum size of start line and header fields together.
 const MAX_HEAD: usize = 16 << 10;
-/// Header fields, at most.
+/// Maximum number of header fields.
 const MAX_FIELDS: usize = 100;
-/// Bodies up to this size are read into what is at hand; bigger ones grow as they come.
+/// Minimum space reserved per read; bigger bodies grow as they arrive.
 const READ_STEP: usize = 8 << 10;
-/// Bodies up to this size count in no budget: the number of connections bounds them.
+/// Size up to which bodies are not charged to a budget: the number of connections bounds them.
 pub(super) const SMALL: usize = 64 << 10;
-/// Bigger ones count in steps of this size, as they come.
+/// Step in which bigger bodies are charged as they arrive.
 const COUNTED: usize = 256 << 10;
 
-/// Why a message could not be read.
+/// Error reading a message.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum HttpError {
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// Status to answer with, and what is wrong.
+    /// Status to answer with, and the problem.
     #[error("{1}")]
     Bad(u16, String),
 }
@@ -33,13 +33,13 @@ fn bad(status: u16, reason: impl Into<String>) -> HttpError {
 
 /// Start line and header fields.
 #[derive(Debug)]
-pub(super) struct Head {
+pub(super) struct HttpHead {
     pub(super) start: String,
-    /// Names in lower case.
+    /// Names are in lower case.
     fields: Vec<(String, String)>,
 }
 
-impl Head {
+impl HttpHead {
     pub(super) fn field(&self, name: &str) -> Option<&str> {
         self.fields
             .iter()
@@ -47,7 +47,7 @@ impl Head {
             .map(|(_, value)| value.as_str())
     }
 
-    /// Whether the connection may carry another message after this one.
+    /// Returns true if the connection may carry another message after this one.
     pub(super) fn keeps_alive(&self, version: &str) -> bool {
         match self.field("connection").map(str::to_ascii_lowercase) {
             Some(tokens) if tokens.contains("close") => false,
@@ -56,13 +56,13 @@ impl Head {
         }
     }
 
-    /// Whether the peer waits for `100 Continue` before it sends the body.
+    /// Returns true if the peer waits for `100 Continue` before it sends the body.
     pub(super) fn expects_continue(&self) -> bool {
         self.field("expect")
             .is_some_and(|value| value.eq_ignore_ascii_case("100-continue"))
     }
 
-    /// The length announced, if there is one.
+    /// Returns the announced length, if there is one.
     pub(super) fn content_length(&self) -> Result<Option<usize>, HttpError> {
         self.field("content-length")
             .map(|text| {
@@ -72,36 +72,36 @@ impl Head {
             .transpose()
     }
 
-    fn chunked(&self) -> bool {
+    fn is_chunked(&self) -> bool {
         self.field("transfer-encoding")
             .is_some_and(|value| value.to_ascii_lowercase().contains("chunked"))
     }
 }
 
-/// One side of a connection as a source of messages.
-pub(super) struct Reader {
+/// Reads messages from one side of a connection.
+pub(super) struct HttpReader {
     buffer: BytesMut,
 }
 
-impl Reader {
+impl HttpReader {
     pub(super) fn new() -> Self {
         Self {
             buffer: BytesMut::new(),
         }
     }
 
-    /// Whether nothing of a next message has come yet.
+    /// Returns true if nothing of a next message has arrived yet.
     pub(super) fn is_empty(&self) -> bool {
         self.buffer.is_empty()
     }
 
-    /// Bytes read beyond the last message.
+    /// Returns the number of bytes read beyond the last message.
     pub(super) fn len(&self) -> usize {
         self.buffer.len()
     }
 
-    /// Has what was read of a body count, and what it is read into.
-    fn count(&self, before: usize, permit: &mut Permit) -> Result<(), HttpError> {
+    /// Charges the body read so far, including the read buffer, to the permit.
+    fn grow_permit(&self, before: usize, permit: &mut Permit) -> Result<(), HttpError> {
         let size = before + self.buffer.len();
         if size <= SMALL {
             return Ok(());
@@ -110,13 +110,13 @@ impl Reader {
         counted.map_err(|full| bad(503, full.to_string()))
     }
 
-    /// Reads more; false at the end of the stream.
+    /// Reads more; returns false at the end of the stream.
     pub(super) async fn fill(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> io::Result<bool> {
         self.buffer.reserve(READ_STEP);
         Ok(stream.read_buf(&mut self.buffer).await? > 0)
     }
 
-    async fn more(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<(), HttpError> {
+    async fn read_more(&mut self, stream: &mut (impl AsyncRead + Unpin)) -> Result<(), HttpError> {
         if self.fill(stream).await? {
             Ok(())
         } else {
@@ -124,8 +124,8 @@ impl Reader {
         }
     }
 
-    /// One line without its end.
-    async fn line(
+    /// Reads one line without its line end.
+    async fn read_line(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         budget: &mut usize,
@@ -143,25 +143,25 @@ impl Reader {
             if self.buffer.len() > *budget {
                 return Err(bad(431, format!("the head is over {MAX_HEAD} bytes")));
             }
-            self.more(stream).await?;
+            self.read_more(stream).await?;
         }
     }
 
-    /// Start line and fields; blank lines before them are skipped.
-    pub(super) async fn head(
+    /// Reads start line and fields; skips blank lines before them.
+    pub(super) async fn read_head(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
-    ) -> Result<Head, HttpError> {
+    ) -> Result<HttpHead, HttpError> {
         let mut budget = MAX_HEAD;
         let mut start = String::new();
         while start.is_empty() {
-            start = self.line(stream, &mut budget).await?;
+            start = self.read_line(stream, &mut budget).await?;
         }
         let mut fields = Vec::new();
         loop {
-            let line = self.line(stream, &mut budget).await?;
+            let line = self.read_line(stream, &mut budget).await?;
             if line.is_empty() {
-                return Ok(Head { start, fields });
+                return Ok(HttpHead { start, fields });
             }
             if fields.len() == MAX_FIELDS {
                 return Err(bad(431, format!("more than {MAX_FIELDS} header fields")));
@@ -173,19 +173,19 @@ impl Reader {
         }
     }
 
-    /// The body that `head` announces. Without any length a response lasts until the stream ends
-    /// (`until_end`), a request has none. `permit` grows with it.
-    pub(super) async fn body(
+    /// Reads the body announced by `head`. Without any length, a response lasts until the stream ends (`until_end`),
+    /// and a request has none. `permit` grows with the body.
+    pub(super) async fn read_body(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
-        head: &Head,
+        head: &HttpHead,
         max: usize,
         until_end: bool,
         permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         let too_large = || bad(413, format!("the body is over {max} bytes"));
-        if head.chunked() {
-            return self.chunks(stream, max, permit).await;
+        if head.is_chunked() {
+            return self.read_chunks(stream, max, permit).await;
         }
         let Some(length) = head.content_length()? else {
             if !until_end {
@@ -195,18 +195,18 @@ impl Reader {
                 if self.buffer.len() > max {
                     return Err(too_large());
                 }
-                self.count(0, permit)?;
+                self.grow_permit(0, permit)?;
             }
             return Ok(std::mem::take(&mut self.buffer).into());
         };
         if length > max {
             return Err(too_large());
         }
-        self.exactly(stream, length, 0, permit).await
+        self.read_length(stream, length, 0, permit).await
     }
 
-    /// Grows with what really comes, never with what was promised.
-    async fn exactly(
+    /// Reads `length` bytes; memory grows with the data received, never with the announced length.
+    async fn read_length(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         length: usize,
@@ -214,11 +214,11 @@ impl Reader {
         permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         while self.buffer.len() < length {
-            self.more(stream).await?;
-            self.count(before, permit)?;
+            self.read_more(stream).await?;
+            self.grow_permit(before, permit)?;
         }
         if self.buffer.len() == length {
-            // No copy, and no long buffer left behind on an idle connection.
+            // No copy, and no big buffer left on an idle connection.
             return Ok(std::mem::take(&mut self.buffer).into());
         }
         let body = self.buffer[..length].to_vec();
@@ -226,7 +226,7 @@ impl Reader {
         Ok(body)
     }
 
-    async fn chunks(
+    async fn read_chunks(
         &mut self,
         stream: &mut (impl AsyncRead + Unpin),
         max: usize,
@@ -234,7 +234,7 @@ impl Reader {
     ) -> Result<Vec<u8>, HttpError> {
         let mut body = Vec::new();
         loop {
-            let line = self.line(stream, &mut MAX_HEAD.clone()).await?;
+            let line = self.read_line(stream, &mut MAX_HEAD.clone()).await?;
             let digits = line.split(';').next().unwrap_or_default().trim();
             let length = usize::from_str_radix(digits, 16)
                 .map_err(|_| bad(400, format!("chunk length {digits:?} is not a number")))?;
@@ -244,11 +244,11 @@ impl Reader {
             if length > max || body.len() + length > max {
                 return Err(bad(413, format!("the body is over {max} bytes")));
             }
-            body.extend(self.exactly(stream, length, body.len(), permit).await?);
-            self.line(stream, &mut 2).await?;
+            body.extend(self.read_length(stream, length, body.len(), permit).await?);
+            self.read_line(stream, &mut 2).await?;
         }
         let mut budget = MAX_HEAD;
-        while !self.line(stream, &mut budget).await?.is_empty() {}
+        while !self.read_line(stream, &mut budget).await?.is_empty() {}
         Ok(body)
     }
 }

@@ -1,26 +1,26 @@
-//! XML-RPC documents → values. A pull parser for the little XML that XML-RPC needs: no DTD, no entities but
-//! the five of XML and character references, attributes skipped.
+//! XML-RPC documents → values. A pull parser for the subset of XML that XML-RPC needs: no DTD, no entities except XML's
+//! five and character references, attributes skipped.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use super::{Error, Fault, Value};
 
-/// Arrays and structs within each other, at most.
+/// Maximum nesting of arrays and structs.
 pub const MAX_DEPTH: usize = 100;
-/// Values in one document, at most.
+/// Maximum number of values in a document.
 pub const MAX_ELEMENTS: usize = 500_000;
 
-/// Bytes that a document takes in memory while it is read and afterwards, at most, itself included. They are known before it is read,
-/// from its tags: a structure of one member is sixty bytes of text, and hundreds of memory.
+/// Returns an upper bound for the memory in bytes that a document takes during and after parsing, itself included. It
+/// is computed in advance from the tags: a struct with one member is sixty bytes of text, and hundreds in memory.
 pub fn weight(document: &[u8]) -> usize {
-    /// A value in the list that holds it, while that grows.
+    /// A value in its list, while that grows.
     const VALUE: usize = 128;
-    /// The first node of a structure, and a member's name and part of a node.
+    /// The first B-tree node of a struct; per member, its name and share of a node.
     const STRUCT: usize = 640;
     const MEMBER: usize = 192;
     let count = |tag: &str| memchr::memmem::find_iter(document, tag).count();
-    // What is no UTF-8 is copied, and grows by that; base64 is gathered and decoded.
+    // Invalid UTF-8 is copied and grows by that; base64 is collected and decoded.
     let is_text = std::str::from_utf8(document).is_ok();
     let texts = if is_text { 2 } else { 5 } + usize::from(count("<base64") > 0);
     texts * document.len()
@@ -31,15 +31,15 @@ pub fn weight(document: &[u8]) -> usize {
 
 /// A method call.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Call {
-    /// The method's name.
+pub struct MethodCall {
+    /// Name of the method.
     pub method: String,
     /// Arguments, in order.
     pub params: Vec<Value>,
 }
 
-/// Reads a `methodCall` document. Bytes that are not UTF-8 are replaced: roscpp sends what it was given.
-pub fn parse_call(document: &[u8]) -> Result<Call, Error> {
+/// Parses a `methodCall` document. Invalid UTF-8 is replaced: roscpp sends strings as they were given.
+pub fn parse_call(document: &[u8]) -> Result<MethodCall, Error> {
     let text = String::from_utf8_lossy(document);
     let mut parser = Parser::new(&text);
     parser.expect_start("methodCall")?;
@@ -49,41 +49,41 @@ pub fn parse_call(document: &[u8]) -> Result<Call, Error> {
         return Err(parser.error("the methodName is empty"));
     }
     let mut params = Vec::new();
-    match parser.token()? {
-        Token::End("methodCall") => return Ok(Call { method, params }),
-        Token::Start { name: "params" } => {}
-        other => return Err(parser.unexpected(&other, "<params>")),
+    match parser.next_token()? {
+        XmlToken::End("methodCall") => return Ok(MethodCall { method, params }),
+        XmlToken::Start { name: "params" } => {}
+        other => return Err(parser.unexpected_error(&other, "<params>")),
     }
     loop {
-        match parser.token()? {
-            Token::Start { name: "param" } => {
+        match parser.next_token()? {
+            XmlToken::Start { name: "param" } => {
                 params.push(parser.value()?);
                 parser.expect_end("param")?;
             }
-            Token::End("params") => break,
-            other => return Err(parser.unexpected(&other, "<param>")),
+            XmlToken::End("params") => break,
+            other => return Err(parser.unexpected_error(&other, "<param>")),
         }
     }
     parser.expect_end("methodCall")?;
-    Ok(Call { method, params })
+    Ok(MethodCall { method, params })
 }
 
-/// Reads a `methodResponse` document.
+/// Parses a `methodResponse` document.
 pub fn parse_response(document: &[u8]) -> Result<Result<Value, Fault>, Error> {
     let text = String::from_utf8_lossy(document);
     let mut parser = Parser::new(&text);
     parser.expect_start("methodResponse")?;
-    match parser.token()? {
-        Token::Start { name: "params" } => match parser.token()? {
-            Token::Start { name: "param" } => {
+    match parser.next_token()? {
+        XmlToken::Start { name: "params" } => match parser.next_token()? {
+            XmlToken::Start { name: "param" } => {
                 let value = parser.value()?;
                 parser.expect_end("param")?;
                 Ok(Ok(value))
             }
-            Token::End("params") => Ok(Ok(Value::Nil)),
-            other => Err(parser.unexpected(&other, "<param>")),
+            XmlToken::End("params") => Ok(Ok(Value::Nil)),
+            other => Err(parser.unexpected_error(&other, "<param>")),
         },
-        Token::Start { name: "fault" } => {
+        XmlToken::Start { name: "fault" } => {
             let value = parser.value()?;
             Ok(Err(Fault {
                 code: value.get("faultCode").and_then(Value::as_int).unwrap_or(-1),
@@ -93,27 +93,27 @@ pub fn parse_response(document: &[u8]) -> Result<Result<Value, Fault>, Error> {
                 },
             }))
         }
-        other => Err(parser.unexpected(&other, "<params> or <fault>")),
+        other => Err(parser.unexpected_error(&other, "<params> or <fault>")),
     }
 }
 
 #[derive(Debug, PartialEq)]
-enum Token<'a> {
-    /// `<name …>`; a self-closing element is followed by its own [`Token::End`].
+enum XmlToken<'a> {
+    /// `<name …>`; a self-closing element is followed by its own [`XmlToken::End`].
     Start {
         name: &'a str,
     },
     End(&'a str),
     /// Unescaped text, never only white space.
     Text(Cow<'a, str>),
-    /// The document is over.
+    /// The end of the document.
     Finished,
 }
 
 struct Parser<'a> {
     text: &'a str,
     at: usize,
-    /// An element `<x/>` was just opened and closes now.
+    /// Element `<x/>` that was just opened and ends now.
     closing: Option<&'a str>,
     depth: usize,
     elements: usize,
@@ -137,40 +137,40 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn unexpected(&self, found: &Token<'_>, wanted: &str) -> Error {
+    fn unexpected_error(&self, found: &XmlToken<'_>, wanted: &str) -> Error {
         let found = match found {
-            Token::Start { name } => format!("<{}>", short(name)),
-            Token::End(name) => format!("</{}>", short(name)),
-            Token::Text(_) => "text".to_owned(),
-            Token::Finished => "the end of the document".to_owned(),
+            XmlToken::Start { name } => format!("<{}>", truncate(name)),
+            XmlToken::End(name) => format!("</{}>", truncate(name)),
+            XmlToken::Text(_) => "text".to_owned(),
+            XmlToken::Finished => "the end of the document".to_owned(),
         };
         self.error(format!("{found} where {wanted} should be"))
     }
 
-    /// The next start tag, end tag, or text that is not only white space.
-    fn token(&mut self) -> Result<Token<'a>, Error> {
+    /// Returns the next start tag, end tag, or text that is not only white space.
+    fn next_token(&mut self) -> Result<XmlToken<'a>, Error> {
         loop {
-            match self.raw_token()? {
-                Token::Text(text) if text.chars().all(char::is_whitespace) => {}
+            match self.next_raw_token()? {
+                XmlToken::Text(text) if text.chars().all(char::is_whitespace) => {}
                 token => return Ok(token),
             }
         }
     }
 
-    /// The next start tag, end tag or text, white space included.
-    fn raw_token(&mut self) -> Result<Token<'a>, Error> {
+    /// Returns the next start tag, end tag or text, including white space.
+    fn next_raw_token(&mut self) -> Result<XmlToken<'a>, Error> {
         if let Some(name) = self.closing.take() {
-            return Ok(Token::End(name));
+            return Ok(XmlToken::End(name));
         }
         loop {
             let rest = &self.text[self.at..];
             if rest.is_empty() {
-                return Ok(Token::Finished);
+                return Ok(XmlToken::Finished);
             }
             if !rest.starts_with('<') {
                 let end = memchr::memchr(b'<', rest.as_bytes()).unwrap_or(rest.len());
                 self.at += end;
-                return Ok(Token::Text(unescape(&rest[..end])));
+                return Ok(XmlToken::Text(unescape(&rest[..end])));
             }
             if rest.starts_with("<!--") {
                 self.skip_past("-->", 4)?;
@@ -179,7 +179,7 @@ impl<'a> Parser<'a> {
                     .find("]]>")
                     .ok_or_else(|| self.error("a CDATA section never ends"))?;
                 self.at += "<![CDATA[".len() + end + "]]>".len();
-                return Ok(Token::Text(Cow::Borrowed(&data[..end])));
+                return Ok(XmlToken::Text(Cow::Borrowed(&data[..end])));
             } else if rest.starts_with("<?") {
                 self.skip_past("?>", 2)?;
             } else if rest.starts_with("<!") {
@@ -199,8 +199,8 @@ impl<'a> Parser<'a> {
         Ok(())
     }
 
-    /// `<name attributes>`, `<name/>` or `</name>`, with the cursor on `<`.
-    fn tag(&mut self) -> Result<Token<'a>, Error> {
+    /// Parses `<name attributes>`, `<name/>` or `</name>`, with the cursor on `<`.
+    fn tag(&mut self) -> Result<XmlToken<'a>, Error> {
         let rest = &self.text[self.at + 1..];
         let mut quote = None;
         let end = rest
@@ -236,48 +236,49 @@ impl<'a> Parser<'a> {
         }
         self.at += 1 + end + 1;
         if closing {
-            return Ok(Token::End(name));
+            return Ok(XmlToken::End(name));
         }
         if empty {
             self.closing = Some(name);
         }
-        Ok(Token::Start { name })
+        Ok(XmlToken::Start { name })
     }
 
     fn expect_start(&mut self, name: &str) -> Result<(), Error> {
-        match self.token()? {
-            Token::Start { name: found } if found == name => Ok(()),
-            other => Err(self.unexpected(&other, &format!("<{name}>"))),
+        match self.next_token()? {
+            XmlToken::Start { name: found } if found == name => Ok(()),
+            other => Err(self.unexpected_error(&other, &format!("<{name}>"))),
         }
     }
 
     fn expect_end(&mut self, name: &str) -> Result<(), Error> {
-        match self.token()? {
-            Token::End(found) if found == name => Ok(()),
-            other => Err(self.unexpected(&other, &format!("</{name}>"))),
+        match self.next_token()? {
+            XmlToken::End(found) if found == name => Ok(()),
+            other => Err(self.unexpected_error(&other, &format!("</{name}>"))),
         }
     }
 
-    /// All text up to `</name>`; other elements are refused.
+    /// Returns all text up to `</name>`; other elements are refused.
     fn text_until_end(&mut self, name: &str) -> Result<Cow<'a, str>, Error> {
         let mut whole = Cow::Borrowed("");
         loop {
-            match self.raw_token()? {
-                Token::Text(text) if whole.is_empty() => whole = text,
-                Token::Text(text) => whole.to_mut().push_str(&text),
-                Token::End(found) if found == name => return Ok(whole),
-                other => return Err(self.unexpected(&other, &format!("</{name}>"))),
+            match self.next_raw_token()? {
+                XmlToken::Text(text) if whole.is_empty() => whole = text,
+                XmlToken::Text(text) => whole.to_mut().push_str(&text),
+                XmlToken::End(found) if found == name => return Ok(whole),
+                other => return Err(self.unexpected_error(&other, &format!("</{name}>"))),
             }
         }
     }
 
-    /// `<value>…</value>`.
+    /// Parses `<value>…</value>`.
     fn value(&mut self) -> Result<Value, Error> {
         self.expect_start("value")?;
         self.value_body()
     }
 
-    /// What follows `<value>`, with its end tag. Text without a type element is a string, white space included.
+    /// Parses the rest of a value after `<value>`, including its end tag. Text without a type element is a string,
+    /// white space included.
     fn value_body(&mut self) -> Result<Value, Error> {
         self.elements += 1;
         if self.elements > MAX_ELEMENTS {
@@ -285,24 +286,24 @@ impl<'a> Parser<'a> {
         }
         let mut bare = Cow::Borrowed("");
         loop {
-            match self.raw_token()? {
-                Token::Text(text) if bare.is_empty() => bare = text,
-                Token::Text(text) => bare.to_mut().push_str(&text),
-                Token::End("value") => return Ok(Value::String(bare.into_owned())),
-                Token::Start { name } if bare.chars().all(char::is_whitespace) => {
-                    let value = self.typed(name)?;
+            match self.next_raw_token()? {
+                XmlToken::Text(text) if bare.is_empty() => bare = text,
+                XmlToken::Text(text) => bare.to_mut().push_str(&text),
+                XmlToken::End("value") => return Ok(Value::String(bare.into_owned())),
+                XmlToken::Start { name } if bare.chars().all(char::is_whitespace) => {
+                    let value = self.typed_value(name)?;
                     self.expect_end("value")?;
                     return Ok(value);
                 }
-                other => return Err(self.unexpected(&other, "</value>")),
+                other => return Err(self.unexpected_error(&other, "</value>")),
             }
         }
     }
 
-    fn typed(&mut self, name: &str) -> Result<Value, Error> {
+    fn typed_value(&mut self, name: &str) -> Result<Value, Error> {
         match name {
-            "array" => self.deeper(Self::array),
-            "struct" => self.deeper(Self::structure),
+            "array" => self.descend(Self::array),
+            "struct" => self.descend(Self::structure),
             "nil" | "ex:nil" => {
                 self.text_until_end(name)?;
                 Ok(Value::Nil)
@@ -319,7 +320,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn deeper(&mut self, read: fn(&mut Self) -> Result<Value, Error>) -> Result<Value, Error> {
+    fn descend(&mut self, read: fn(&mut Self) -> Result<Value, Error>) -> Result<Value, Error> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {
             return Err(self.error(format!("nested more than {MAX_DEPTH} deep")));
@@ -331,17 +332,17 @@ impl<'a> Parser<'a> {
 
     fn array(&mut self) -> Result<Value, Error> {
         let mut elements = Vec::new();
-        match self.token()? {
-            Token::Start { name: "data" } => {}
-            // XmlRpcpp writes an empty array so.
-            Token::End("array") => return Ok(Value::Array(elements)),
-            other => return Err(self.unexpected(&other, "<data>")),
+        match self.next_token()? {
+            XmlToken::Start { name: "data" } => {}
+            // XmlRpcpp writes an empty array like this.
+            XmlToken::End("array") => return Ok(Value::Array(elements)),
+            other => return Err(self.unexpected_error(&other, "<data>")),
         }
         loop {
-            match self.token()? {
-                Token::Start { name: "value" } => elements.push(self.value_body()?),
-                Token::End("data") => break,
-                other => return Err(self.unexpected(&other, "<value>")),
+            match self.next_token()? {
+                XmlToken::Start { name: "value" } => elements.push(self.value_body()?),
+                XmlToken::End("data") => break,
+                other => return Err(self.unexpected_error(&other, "<value>")),
             }
         }
         self.expect_end("array")?;
@@ -351,16 +352,16 @@ impl<'a> Parser<'a> {
     fn structure(&mut self) -> Result<Value, Error> {
         let mut members = BTreeMap::new();
         loop {
-            match self.token()? {
-                Token::Start { name: "member" } => {
+            match self.next_token()? {
+                XmlToken::Start { name: "member" } => {
                     self.expect_start("name")?;
                     let name = self.text_until_end("name")?.into_owned();
                     let value = self.value()?;
                     self.expect_end("member")?;
                     members.insert(name, value);
                 }
-                Token::End("struct") => return Ok(Value::Struct(members)),
-                other => return Err(self.unexpected(&other, "<member>")),
+                XmlToken::End("struct") => return Ok(Value::Struct(members)),
+                other => return Err(self.unexpected_error(&other, "<member>")),
             }
         }
     }
@@ -371,16 +372,16 @@ fn scalar(name: &str, text: &str) -> Result<Value, String> {
         "int" | "i4" | "i1" | "i2" | "i8" => text
             .parse()
             .map(Value::Int)
-            .map_err(|_| format!("{} is not a 32-bit integer", quoted(text))),
+            .map_err(|_| format!("{} is not a 32-bit integer", quote(text))),
         "boolean" => match text {
             "1" | "true" => Ok(Value::Bool(true)),
             "0" | "false" => Ok(Value::Bool(false)),
-            _ => Err(format!("{} is neither 0 nor 1", quoted(text))),
+            _ => Err(format!("{} is neither 0 nor 1", quote(text))),
         },
         "double" | "float" => text
             .parse()
             .map(Value::Double)
-            .map_err(|_| format!("{} is not a number", quoted(text))),
+            .map_err(|_| format!("{} is not a number", quote(text))),
         "base64" => {
             let dense: Vec<u8> = text
                 .bytes()
@@ -389,23 +390,23 @@ fn scalar(name: &str, text: &str) -> Result<Value, String> {
             base64_simd::STANDARD
                 .decode_to_vec(dense)
                 .map(Value::Base64)
-                .map_err(|_| format!("{} is not base64", quoted(text)))
+                .map_err(|_| format!("{} is not base64", quote(text)))
         }
-        _ => Err(format!("values of type {} are not known", quoted(name))),
+        _ => Err(format!("values of type {} are not known", quote(name))),
     }
 }
 
-/// Text for an error message: quoted, and not longer than a line.
-fn quoted(text: &str) -> String {
-    format!("{:?}", short(text))
+/// Formats text for an error message: quoted, and not longer than a line.
+fn quote(text: &str) -> String {
+    format!("{:?}", truncate(text))
 }
 
-/// Its first characters: who sends a document chooses how long a name in it is.
-fn short(text: &str) -> String {
+/// Returns the first characters: the sender of a document chooses the length of the names in it.
+fn truncate(text: &str) -> String {
     text.chars().take(40).collect()
 }
 
-/// Replaces references to characters; an `&` that begins none stays, as XmlRpcpp leaves it.
+/// Replaces character references; an `&` that begins none is kept, as in XmlRpcpp.
 fn unescape(text: &str) -> Cow<'_, str> {
     if memchr::memchr(b'&', text.as_bytes()).is_none() {
         return Cow::Borrowed(text);

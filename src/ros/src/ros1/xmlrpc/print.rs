@@ -1,5 +1,5 @@
-//! Values → XML-RPC documents, in the subset that XmlRpcpp reads: every type spelled out, no white space
-//! between elements, no numeric character references.
+//! Values → XML-RPC documents, in the subset that XmlRpcpp reads: every type spelled out, no white space between
+//! elements, no numeric character references.
 
 use std::fmt::Write as _;
 
@@ -7,7 +7,7 @@ use super::{Fault, Value};
 
 const PROLOGUE: &str = "<?xml version=\"1.0\"?>\n";
 
-/// The document that calls `method`.
+/// Returns the document that calls `method`.
 pub fn print_call(method: &str, params: &[Value]) -> String {
     let mut out = String::with_capacity(256);
     out.push_str(PROLOGUE);
@@ -23,7 +23,7 @@ pub fn print_call(method: &str, params: &[Value]) -> String {
     out
 }
 
-/// The document that answers with `value`.
+/// Returns the document that answers with `value`.
 pub fn print_response(value: &Value) -> String {
     let mut out = String::with_capacity(256);
     out.push_str(PROLOGUE);
@@ -33,7 +33,7 @@ pub fn print_response(value: &Value) -> String {
     out
 }
 
-/// The document that answers with a fault.
+/// Returns the document that answers with a fault.
 pub fn print_fault(fault: &Fault) -> String {
     let mut out = String::with_capacity(256);
     out.push_str(PROLOGUE);
@@ -43,7 +43,7 @@ pub fn print_fault(fault: &Fault) -> String {
     out
 }
 
-/// A fault as the struct it travels in; also one entry of a `system.multicall` answer.
+/// Converts a fault to the struct that represents it; also used for entries of a `system.multicall` answer.
 pub(crate) fn fault_value(fault: &Fault) -> Value {
     Value::Struct(
         [
@@ -112,7 +112,7 @@ fn print_value(out: &mut String, value: &Value) {
     out.push_str("</value>");
 }
 
-/// Shortest text that reads back as the same double; `inf` and `nan` as both `strtod` and Python read them.
+/// Writes the shortest text that reads back as the same double; `inf` and `nan` as both `strtod` and Python read them.
 fn print_double(out: &mut String, number: f64) {
     if number.is_finite() {
         out.push_str(zmij::Buffer::new().format_finite(number));
@@ -123,7 +123,7 @@ fn print_double(out: &mut String, number: f64) {
     }
 }
 
-/// Characters that no XML document may hold become U+FFFD: one bad string must not spoil the whole answer.
+/// Escapes text. Characters that XML does not allow become U+FFFD: one bad string must not spoil the whole answer.
 fn escape(out: &mut String, text: &str) {
     for character in text.chars() {
         match character {

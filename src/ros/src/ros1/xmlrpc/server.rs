@@ -1,7 +1,7 @@
-//! The server: one task per connection, requests of a connection in order.
+//! XML-RPC server: one task per connection; requests on a connection are processed in order.
 //!
-//! What big requests and answers take counts in a budget: a request waits for its share before its body is read, an
-//! answer before it is made, and gives it back when the last byte of it is written.
+//! The memory for big requests and answers is charged to a budget: a request waits for its share before its body is
+//! read, an answer before it is generated, and it is released when the last byte has been written.
 
 use std::io;
 use std::sync::Arc;
@@ -14,41 +14,41 @@ use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::timeout;
 
-use super::http::{Head, HttpError, Reader, SMALL};
-use super::{Call, Fault, Value, parse_call, print_fault, print_response, weight};
+use super::http::{HttpError, HttpHead, HttpReader, SMALL};
+use super::{Fault, MethodCall, Value, parse_call, print_fault, print_response, weight};
 use crate::net;
 
-/// Answers calls.
+/// Handles calls.
 #[async_trait]
-pub trait Handler: Send + Sync + 'static {
-    /// Answers one call. Dropped half-way if the caller goes away.
+pub trait XmlRpcHandler: Send + Sync + 'static {
+    /// Handles one call. Cancelled half-way if the caller goes away.
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault>;
 
-    /// About how many bytes the answer's value will take, as far as that is known before it is made.
+    /// Returns the approximate memory size in bytes of the answer's value, as far as it is known in advance.
     fn weight(&self, _method: &str, _params: &[Value]) -> usize {
         0
     }
 }
 
-/// What a server grants its clients.
+/// Limits of a server.
 #[derive(Debug, Clone)]
-pub struct Limits {
-    /// Connections at a time; further ones wait in the backlog.
+pub struct ServerLimits {
+    /// Maximum number of connections; further ones wait in the backlog.
     pub connections: usize,
-    /// Bytes in one request's body.
+    /// Maximum size of a request body in bytes.
     pub body: usize,
-    /// From a request's first byte to its last, and for taking a response.
+    /// Time limit from a request's first byte to its last, and for sending a response.
     pub transfer: Duration,
-    /// How long an idle connection is kept.
+    /// Time for which an idle connection is kept.
     pub idle: Duration,
-    /// Where the memory of big requests and answers counts.
+    /// Budget for the memory of big requests and answers.
     pub budget: Budget,
 }
 
-/// Bytes that big requests and answers of one server may take, unless set otherwise.
+/// Default budget in bytes for big requests and answers of one server.
 pub const MAX_HELD: usize = 96 << 20;
 
-impl Default for Limits {
+impl Default for ServerLimits {
     fn default() -> Self {
         Self {
             connections: 400,
@@ -60,28 +60,28 @@ impl Default for Limits {
     }
 }
 
-/// A request is in memory as text and as values, an answer as values and as text that grows.
+/// Copies in memory: a request as text and as values, an answer as values and as growing text.
 const FORMS: usize = 3;
 
 /// Serves until dropped, which also ends every connection.
-pub async fn serve(listener: TcpListener, handler: Arc<dyn Handler>, limits: Limits) {
+pub async fn serve(listener: TcpListener, handler: Arc<dyn XmlRpcHandler>, limits: ServerLimits) {
     let most = limits.connections;
-    let server = Arc::new(Server { handler, limits });
+    let server = Arc::new(XmlRpcServer { handler, limits });
     let connected = |stream| {
         let server = server.clone();
-        async move { server.connection(stream).await }
+        async move { server.serve_connection(stream).await }
     };
-    net::serve_each(listener, most, "XML-RPC", connected).await;
+    net::serve_connections(listener, most, "XML-RPC", connected).await;
 }
 
-struct Server {
-    handler: Arc<dyn Handler>,
-    limits: Limits,
+struct XmlRpcServer {
+    handler: Arc<dyn XmlRpcHandler>,
+    limits: ServerLimits,
 }
 
-impl Server {
-    async fn connection(&self, mut stream: TcpStream) -> io::Result<()> {
-        let mut reader = Reader::new();
+impl XmlRpcServer {
+    async fn serve_connection(&self, mut stream: TcpStream) -> io::Result<()> {
+        let mut reader = HttpReader::new();
         loop {
             if reader.is_empty() {
                 match timeout(self.limits.idle, reader.fill(&mut stream)).await {
@@ -90,7 +90,7 @@ impl Server {
                     Ok(Ok(false)) | Err(_) => return Ok(()),
                 }
             }
-            let (call, permit, keep) = match self.request(&mut reader, &mut stream).await {
+            let (call, permit, keep) = match self.read_request(&mut reader, &mut stream).await {
                 Ok(request) => request,
                 Err(HttpError::Io(error)) => return Err(error),
                 Err(HttpError::Bad(status, reason)) => {
@@ -103,7 +103,7 @@ impl Server {
                     biased;
                     answer = answer => answer,
                     // The caller of a long poll went away.
-                    () = gone(&mut reader, &mut stream) => return Ok(()),
+                    () = wait_until_closed(&mut reader, &mut stream) => return Ok(()),
                 }
             };
             self.respond(&mut stream, 200, "text/xml", &body, keep)
@@ -114,15 +114,15 @@ impl Server {
         }
     }
 
-    /// One request and what it counts; whether the connection is kept after it. The time that the peer has for its head and for
-    /// its body does not run while this side waits for memory.
-    async fn request(
+    /// Reads one request; returns the body, its permit, and whether the connection is kept afterwards. The peer's time
+    /// for its head and for its body does not run while this side waits for memory.
+    async fn read_request(
         &self,
-        reader: &mut Reader,
+        reader: &mut HttpReader,
         stream: &mut TcpStream,
     ) -> Result<(Vec<u8>, Permit, bool), HttpError> {
         let stalled = |_| HttpError::Bad(408, "the request stalled".to_owned());
-        let head = timeout(self.limits.transfer, reader.head(stream));
+        let head = timeout(self.limits.transfer, reader.read_head(stream));
         let head = head.await.map_err(stalled)??;
         let mut words = head.start.split_whitespace();
         let method = words.next().unwrap_or_default();
@@ -144,39 +144,39 @@ impl Server {
         if head.expects_continue() {
             stream.write_all(b"HTTP/1.1 100 Continue\r\n\r\n").await?;
         }
-        let body = self.body(reader, stream, &head, &mut permit);
+        let body = self.read_body(reader, stream, &head, &mut permit);
         let body = timeout(self.limits.transfer, body)
             .await
             .map_err(stalled)??;
         if body.len() > SMALL {
-            // Of a body without a length nobody knew before what it would take, nor of many small values.
+            // The size of a body without a length, or of one with many small values, was not known in advance.
             let counted = permit.grow_to(weight(&body).max(body.len() * FORMS));
             counted.map_err(|full| HttpError::Bad(503, full.to_string()))?;
         }
         Ok((body, permit, keep))
     }
 
-    async fn body(
+    async fn read_body(
         &self,
-        reader: &mut Reader,
+        reader: &mut HttpReader,
         stream: &mut TcpStream,
-        head: &Head,
+        head: &HttpHead,
         permit: &mut Permit,
     ) -> Result<Vec<u8>, HttpError> {
         let max = self.limits.body;
-        reader.body(stream, head, max, false, permit).await
+        reader.read_body(stream, head, max, false, permit).await
     }
 
-    /// The answer, and the permit for it.
+    /// Returns the answer and its permit.
     async fn answer(&self, body: Vec<u8>, request: Permit) -> (String, Permit) {
         let parsed = parse_call(&body);
         drop(body);
         let mut permit = self.limits.budget.permit();
-        let Call { method, params } = match parsed {
+        let MethodCall { method, params } = match parsed {
             Ok(call) => call,
             Err(error) => return (print_fault(&Fault::new(error.to_string())), permit),
         };
-        if let Err(full) = self.weigh(&method, &params, &mut permit).await {
+        if let Err(full) = self.reserve(&method, &params, &mut permit).await {
             tracing::warn!(method, %full, "a call is not answered");
             let reason = format!("{full}; ask for less, or read answers faster");
             return (print_fault(&Fault::new(reason)), permit);
@@ -186,7 +186,7 @@ impl Server {
             Err(fault) => print_fault(&fault),
         };
         drop(request);
-        // What it really takes from now on, the buffer that it grew in included.
+        // The actual size from now on, including the capacity of the buffer.
         if answer.capacity() > SMALL {
             let _ = permit.resize(answer.capacity());
         }
@@ -194,7 +194,7 @@ impl Server {
     }
 
     /// Waits until there is room for the answer.
-    async fn weigh(
+    async fn reserve(
         &self,
         method: &str,
         params: &[Value],
@@ -205,7 +205,7 @@ impl Server {
             if weight <= permit.bytes().max(SMALL) {
                 return Ok(());
             }
-            // It may have become more when there is room.
+            // The answer may have grown by the time there is room.
             permit.wait(weight, self.limits.transfer).await?;
         }
     }
@@ -250,9 +250,9 @@ impl Server {
     }
 }
 
-/// Returns when the peer has closed; what it sends meanwhile is kept for the next request.
-async fn gone(reader: &mut Reader, stream: &mut TcpStream) {
-    /// More than that is not collected while an answer is awaited.
+/// Returns when the peer has closed the connection; data that arrives meanwhile is kept for the next request.
+async fn wait_until_closed(reader: &mut HttpReader, stream: &mut TcpStream) {
+    /// Maximum number of bytes buffered while an answer is awaited.
     const AHEAD: usize = 64 << 10;
     while reader.len() < AHEAD {
         if !matches!(reader.fill(stream).await, Ok(true)) {

@@ -1,4 +1,4 @@
-//! XML-RPC's values, and what ROS makes of them.
+//! XML-RPC values and their conversion to ROS values.
 
 use std::collections::BTreeMap;
 
@@ -17,18 +17,18 @@ pub enum Value {
     Double(f64),
     /// `<base64>`, decoded.
     Base64(Vec<u8>),
-    /// `<dateTime.iso8601>`, as it was written.
+    /// `<dateTime.iso8601>`, as written.
     DateTime(String),
     /// `<array>`.
     Array(Vec<Value>),
     /// `<struct>`.
     Struct(BTreeMap<String, Value>),
-    /// `<nil/>`: understood, never sent by ROS.
+    /// `<nil/>`: accepted, never sent by ROS.
     Nil,
 }
 
 impl Value {
-    /// The text of a string.
+    /// Returns the text of a string.
     pub fn as_str(&self) -> Option<&str> {
         match self {
             Value::String(text) => Some(text),
@@ -36,7 +36,7 @@ impl Value {
         }
     }
 
-    /// The number of an int.
+    /// Returns the number of an int.
     pub fn as_int(&self) -> Option<i32> {
         match self {
             Value::Int(number) => Some(*number),
@@ -44,7 +44,7 @@ impl Value {
         }
     }
 
-    /// The elements of an array.
+    /// Returns the elements of an array.
     pub fn as_array(&self) -> Option<&[Value]> {
         match self {
             Value::Array(elements) => Some(elements),
@@ -52,7 +52,7 @@ impl Value {
         }
     }
 
-    /// The members of a struct.
+    /// Returns the members of a struct.
     pub fn as_struct(&self) -> Option<&BTreeMap<String, Value>> {
         match self {
             Value::Struct(members) => Some(members),
@@ -60,12 +60,12 @@ impl Value {
         }
     }
 
-    /// One member of a struct.
+    /// Returns one member of a struct.
     pub fn get(&self, member: &str) -> Option<&Value> {
         self.as_struct()?.get(member)
     }
 
-    /// An array of strings.
+    /// Creates an array of strings.
     pub fn strings<I: IntoIterator<Item: Into<String>>>(texts: I) -> Value {
         Value::Array(
             texts
@@ -75,7 +75,7 @@ impl Value {
         )
     }
 
-    /// The strings of an array; elements of other types are left out.
+    /// Returns the strings in an array; elements of other types are skipped.
     pub fn to_strings(&self) -> Vec<String> {
         self.as_array()
             .unwrap_or_default()
@@ -84,7 +84,7 @@ impl Value {
             .collect()
     }
 
-    /// What the value is called in an error message.
+    /// Returns the name of the type for error messages.
     pub fn type_name(&self) -> &'static str {
         match self {
             Value::Int(_) => "an int",
@@ -99,7 +99,7 @@ impl Value {
         }
     }
 
-    /// Arrays and structs within each other.
+    /// Returns the nesting depth of arrays and structs.
     pub fn depth(&self) -> usize {
         match self {
             Value::Array(elements) => 1 + elements.iter().map(Value::depth).max().unwrap_or(0),
@@ -108,7 +108,7 @@ impl Value {
         }
     }
 
-    /// About how many bytes the value takes in memory.
+    /// Returns the approximate memory size of the value in bytes.
     pub fn size(&self) -> usize {
         size_of::<Value>()
             + match self {
@@ -154,7 +154,7 @@ impl From<Vec<Value>> for Value {
     }
 }
 
-/// As the bus sees it: of dates the text.
+/// Converts to a bus value; a date becomes its text.
 impl From<Value> for ParamValue {
     fn from(value: Value) -> Self {
         match value {
@@ -177,7 +177,7 @@ impl From<Value> for ParamValue {
     }
 }
 
-/// Fails, saying where, on nothing and on an integer wider than XML-RPC's 32 bits.
+/// Fails on `Nil` and on integers wider than XML-RPC's 32 bits; the error says where.
 impl TryFrom<ParamValue> for Value {
     type Error = String;
 
@@ -191,7 +191,7 @@ impl TryFrom<ParamValue> for Value {
             ParamValue::Double(number) => Value::Double(number),
             ParamValue::String(text) => Value::String(text),
             ParamValue::Binary(bytes) => Value::Base64(bytes),
-            ParamValue::Nil => return Err("nothing is no value that ROS knows".to_owned()),
+            ParamValue::Nil => return Err("ROS has no null value".to_owned()),
             ParamValue::List(elements) => Value::Array(
                 elements
                     .into_iter()

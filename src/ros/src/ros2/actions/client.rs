@@ -1,4 +1,4 @@
-//! Goals that this side has sent: each has a task, which asks for it to be taken and then for its result.
+//! Goals sent by this node: each has a task that first sends it and then requests its result.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,110 +7,110 @@ use std::time::Duration;
 use async_trait::async_trait;
 use bytes::Bytes;
 use parking_lot::Mutex;
-use rtps::{EndpointQos, Guid, History};
+use rtps::{EndpointQos, Guid, HistoryKind};
 use tokio::sync::{mpsc, watch};
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-use super::messages::{self, GoalInfo, Status};
-use super::{GoalId, Parts, QUEUE};
+use super::messages::{self, ActionGoalStatus, GoalInfo};
+use super::{ActionInterfaces, GoalId, QUEUE};
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Message, MessageReceiver, MessageSender,
-    Outcome, PeerId, ServiceType, WireType, message_queue,
+    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, GoalOutcome, MessageReceiver,
+    MessageSender, PeerId, SerializedMessage, ServiceType, WireType, message_queue,
 };
 use crate::codec::{Time, default_message};
-use crate::ros2::bus::Inner;
-use crate::ros2::client::Client as ServiceClient;
-use crate::ros2::raw::{self, Ear, RawReader};
+use crate::ros2::bus::Ros2BusState;
+use crate::ros2::client::ServiceClient;
+use crate::ros2::raw::{self, RawListener, RawReader};
 use crate::ros2::{calls, names};
 use crate::schema::ActionDef;
 
-/// A server may not say that it knows our reader of feedback; then it is taken to do so after this time.
+/// Time after which a server that does not acknowledge our feedback reader is assumed to know it.
 const UNSURE: Duration = Duration::from_millis(200);
-/// For a server that was there a moment ago.
+/// Grace period for a server that was there a moment ago.
 const GRACE: Duration = Duration::from_secs(3);
-/// How long a server has to answer that it ends a goal, or to take one that nobody waits for any more.
+/// Time for a server to answer a cancel request, or to accept a goal that nobody waits for any more.
 const CANCEL_WAITS: Duration = Duration::from_secs(10);
-/// As long as the server is there.
+/// No time limit: the call ends with the server.
 const FOREVER: Duration = Duration::MAX;
 const CLOSED: &str = "the connection to this ROS system was closed";
 
-/// One action.
-pub(in crate::ros2) struct Client {
-    shared: Arc<Shared>,
+/// A client of one action.
+pub(in crate::ros2) struct Ros2ActionClient {
+    shared: Arc<ActionClientState>,
     task: AbortHandle,
 }
 
-struct Shared {
-    bus: Arc<Inner>,
+struct ActionClientState {
+    bus: Arc<Ros2BusState>,
     name: String,
     of: Arc<ActionDef>,
     send_goal: Arc<ServiceClient>,
     get_result: Arc<ServiceClient>,
     cancel_goal: Arc<ServiceClient>,
     feedback: RawReader,
-    goals: Mutex<Goals>,
-    /// To the task that tells of everything, so that it is told in order.
-    ended: mpsc::UnboundedSender<Ended>,
+    goals: Mutex<ActiveGoals>,
+    /// Sends ended goals to the task that delivers all events, so that they are delivered in order.
+    ended: mpsc::UnboundedSender<FinishedGoal>,
 }
 
-type Ended = (GoalId, Result<GoalEnd, String>);
+type FinishedGoal = (GoalId, Result<GoalEnd, String>);
 
 #[derive(Default)]
-struct Goals {
-    under_way: HashMap<GoalId, Goal>,
-    /// What those who have sent them call them.
+struct ActiveGoals {
+    under_way: HashMap<GoalId, ActiveGoal>,
+    /// Ids by the names that the senders gave their goals.
     named: HashMap<String, GoalId>,
 }
 
-struct Goal {
+struct ActiveGoal {
     name: String,
     events: Arc<dyn GoalEvents>,
-    wish: watch::Sender<Wish>,
+    wish: watch::Sender<GoalIntent>,
 }
 
-/// What whoever has sent a goal wants of it.
+/// Intent of a goal's sender.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Wish {
+enum GoalIntent {
     GoOn,
-    /// It should end.
+    /// Cancel the goal.
     Cancel,
-    /// It should end, and nobody waits for it any more.
+    /// Cancel the goal; nobody waits for it any more.
     Abandon,
 }
 
-impl Goals {
-    fn remove(&mut self, id: GoalId) -> Option<Goal> {
+impl ActiveGoals {
+    fn remove(&mut self, id: GoalId) -> Option<ActiveGoal> {
         let goal = self.under_way.remove(&id)?;
         self.named.remove(&goal.name);
         Some(goal)
     }
 }
 
-impl Client {
-    /// Opens the action's parts; servers are found in the background.
+impl Ros2ActionClient {
+    /// Opens the action's services and topics; servers are discovered in the background.
     pub(in crate::ros2) fn open(
-        bus: &Arc<Inner>,
+        bus: &Arc<Ros2BusState>,
         name: &str,
         of: &Arc<ActionDef>,
     ) -> Result<Self, BusError> {
         bus.check_open()?;
-        let parts = Parts::of(name, of)?;
-        let client = |(service, of): (String, ServiceType)| calls::client(bus, &service, &of);
+        let parts = ActionInterfaces::for_action(name, of)?;
+        let client = |(service, of): (String, ServiceType)| calls::client_for(bus, &service, &of);
         let (queue, feedback) = message_queue(QUEUE as usize);
         let (topic, wire_type) = parts.feedback;
         let topic = names::topic(&topic, &wire_type)?;
-        let ear = Arc::new(Feedback {
+        let ear = Arc::new(FeedbackSink {
             queue,
             wire_type: Arc::new(wire_type),
             publisher: PeerId::from(name),
         });
         let qos = EndpointQos {
-            history: History::KeepLast(QUEUE),
+            history: HistoryKind::KeepLast(QUEUE),
             ..EndpointQos::default()
         };
         let (sender, ended) = mpsc::unbounded_channel();
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ActionClientState {
             bus: bus.clone(),
             name: name.to_owned(),
             of: of.clone(),
@@ -121,32 +121,36 @@ impl Client {
             goals: Mutex::default(),
             ended: sender,
         });
-        let task = bus.spawn(follow(Closing(shared.clone()), feedback, ended));
+        let task = bus.spawn(report_events(
+            EndGoalsOnDrop(shared.clone()),
+            feedback,
+            ended,
+        ));
         Ok(Self { shared, task })
     }
 }
 
-impl Drop for Client {
+impl Drop for Ros2ActionClient {
     fn drop(&mut self) {
         self.task.abort();
         let goals = std::mem::take(&mut *self.shared.goals.lock());
         for goal in goals.under_way.into_values() {
-            goal.wish.send_replace(Wish::Abandon);
+            goal.wish.send_replace(GoalIntent::Abandon);
         }
     }
 }
 
 #[async_trait]
-impl ActionClient for Client {
-    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
+impl ActionClient for Ros2ActionClient {
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError> {
         let shared = &self.shared;
         let ready = async {
             tokio::try_join!(
-                shared.send_goal.ready(patience),
-                shared.get_result.ready(patience),
-                shared.cancel_goal.ready(patience),
+                shared.send_goal.wait_until_ready(patience),
+                shared.get_result.wait_until_ready(patience),
+                shared.cancel_goal.wait_until_ready(patience),
             )?;
-            shared.hears_feedback().await;
+            shared.wait_for_feedback_writer().await;
             Ok(())
         };
         match timeout(patience, ready).await {
@@ -155,21 +159,21 @@ impl ActionClient for Client {
                 after: patience,
             }),
             Ok(Err(of_part @ BusError::TypeMismatch { .. })) => {
-                Err(shared.other_type().unwrap_or(of_part))
+                Err(shared.type_mismatch().unwrap_or(of_part))
             }
             Ok(ready) => ready,
         }
     }
 
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
         let shared = &self.shared;
         let uuid = GoalId::parse(id).unwrap_or_else(GoalId::random);
-        let Some(request) = messages::with_id(uuid, &shared.of.goal, &goal) else {
-            let reason = format!("the goal is no serialized {}", shared.of.goal.name());
-            return events.ended(Err(reason));
+        let Some(request) = messages::write_with_id(uuid, &shared.of.goal, &goal) else {
+            let reason = format!("the goal is not a serialized {}", shared.of.goal.name());
+            return events.on_ended(Err(reason));
         };
-        let (wish, wished) = watch::channel(Wish::GoOn);
-        let known = Goal {
+        let (wish, wished) = watch::channel(GoalIntent::GoOn);
+        let known = ActiveGoal {
             name: id.to_owned(),
             events: events.clone(),
             wish,
@@ -178,36 +182,36 @@ impl ActionClient for Client {
             let mut goals = shared.goals.lock();
             if goals.named.contains_key(id) || goals.under_way.contains_key(&uuid) {
                 drop(goals);
-                return events.ended(Err(format!("a goal with id {id} is under way already")));
+                return events.on_ended(Err(format!("a goal with id {id} is under way already")));
             }
             goals.named.insert(id.to_owned(), uuid);
             goals.under_way.insert(uuid, known);
         }
         let carrying = shared.clone();
         shared.bus.spawn(async move {
-            let end = carrying.carry_out(uuid, request, wished).await;
-            // Nobody hears of it where the client was dropped meanwhile.
+            let end = carrying.run_goal(uuid, request, wished).await;
+            // Not received by anyone if the client was dropped meanwhile.
             let _ = carrying.ended.send((uuid, end));
         });
         if shared.bus.check_open().is_err() {
-            shared.end(uuid, Err(CLOSED.to_owned()));
+            shared.finish_goal(uuid, Err(CLOSED.to_owned()));
         }
     }
 
-    /// The server hears of it as soon as it has taken the goal.
-    fn cancel(&self, id: &str) {
+    /// The server is asked as soon as it has accepted the goal.
+    fn cancel_goal(&self, id: &str) {
         let goals = self.shared.goals.lock();
         let goal = goals.named.get(id).and_then(|id| goals.under_way.get(id));
         if let Some(goal) = goal {
-            goal.wish.send_replace(Wish::Cancel);
+            goal.wish.send_replace(GoalIntent::Cancel);
         }
     }
 }
 
-impl Shared {
-    /// Returns once a server's feedback comes here. That of a server of this node does as soon as there is one.
-    async fn hears_feedback(&self) {
-        if self.feedback.hears_own() {
+impl ActionClientState {
+    /// Waits until a server's feedback arrives here. A server on this node does so as soon as it exists.
+    async fn wait_for_feedback_writer(&self) {
+        if self.feedback.has_local_writer() {
             return;
         }
         let mut ends = self.feedback.ends();
@@ -216,8 +220,9 @@ impl Shared {
         drop(timeout(UNSURE, is_sure).await);
     }
 
-    /// That its server has another type, by the action's name: that of a part is `Fibonacci_SendGoal`.
-    fn other_type(&self) -> Option<BusError> {
+    /// Returns the error if the server has another type, under the action's name: the type of a part is
+    /// `Fibonacci_SendGoal`.
+    fn type_mismatch(&self) -> Option<BusError> {
         let services = self.of.services.as_ref()?;
         let parts = [
             (&self.send_goal, &services.send_goal),
@@ -234,36 +239,41 @@ impl Shared {
                     ..of
                 }
             };
-            let theirs = of_action(part.other_type()?);
+            let theirs = of_action(part.mismatched_type()?);
             let what = format!("action {}", self.name);
-            Some(theirs.not(&of_action(ServiceType::of(ours)), what))
+            Some(theirs.mismatch(&of_action(ServiceType::from_service(ours)), what))
         })
     }
 
-    async fn carry_out(
+    async fn run_goal(
         &self,
         id: GoalId,
         request: Bytes,
-        mut wished: watch::Receiver<Wish>,
+        mut wished: watch::Receiver<GoalIntent>,
     ) -> Result<GoalEnd, String> {
         let taken = tokio::select! {
-            taken = self.ask(&self.send_goal, request) => taken?,
-            // It may be taken all the same, and is to be cancelled then.
-            () = abandoned_for(CANCEL_WAITS, wished.clone()) => return Err(CLOSED.to_owned()),
+            taken = self.call_part(&self.send_goal, request) => taken?,
+            // The goal may be accepted all the same, and is to be cancelled then.
+            () = wait_abandoned(CANCEL_WAITS, wished.clone()) => return Err(CLOSED.to_owned()),
         };
         match messages::read_accepted(&taken) {
-            Some(true) => self.tell_accepted(id),
-            Some(false) => return Ok(self.rejected()),
-            None => return Err(format!("action {} answers what cannot be read", self.name)),
+            Some(true) => self.report_accepted(id),
+            Some(false) => return Ok(self.rejected_end()),
+            None => {
+                return Err(format!(
+                    "action {} sent an answer that cannot be read",
+                    self.name
+                ));
+            }
         }
         tokio::select! {
-            result = self.ask(&self.get_result, messages::write_id(id)) => self.end_of(&result?),
-            () = self.pass_on(id, &mut wished) => Err(CLOSED.to_owned()),
+            result = self.call_part(&self.get_result, messages::write_id(id)) => self.parse_result(&result?),
+            () = self.forward_cancels(id, &mut wished) => Err(CLOSED.to_owned()),
         }
     }
 
-    async fn ask(&self, part: &ServiceClient, request: Bytes) -> Result<Bytes, String> {
-        // A call would wait for one that comes later, which is not to be given an old goal.
+    async fn call_part(&self, part: &ServiceClient, request: Bytes) -> Result<Bytes, String> {
+        // The call itself would wait for a later server, which must not be given an old goal.
         let mut servers = part.servers();
         let there = servers.wait_for(|servers| servers.count() > 0);
         if timeout(GRACE, there).await.is_err() {
@@ -279,21 +289,22 @@ impl Shared {
         })
     }
 
-    /// Has the goal cancelled each time that it is wanted; returns when it is abandoned.
-    async fn pass_on(&self, id: GoalId, wished: &mut watch::Receiver<Wish>) {
+    /// Requests cancellation whenever it is intended; returns when the goal is abandoned.
+    async fn forward_cancels(&self, id: GoalId, wished: &mut watch::Receiver<GoalIntent>) {
         loop {
             let wish = *wished.borrow_and_update();
-            if wish != Wish::GoOn {
-                self.ask_to_cancel(id).await;
+            if wish != GoalIntent::GoOn {
+                self.request_cancel(id).await;
             }
-            if wish == Wish::Abandon || wished.changed().await.is_err() {
+            if wish == GoalIntent::Abandon || wished.changed().await.is_err() {
                 return;
             }
         }
     }
 
-    /// One that has ended meanwhile, or that its server wants to finish, is not cancelled.
-    async fn ask_to_cancel(&self, id: GoalId) {
+    /// Requests cancellation of a goal. A goal that has ended meanwhile, or that its server wants to finish, is not
+    /// cancelled.
+    async fn request_cancel(&self, id: GoalId) {
         let stamp = Time::default();
         let request = messages::write_cancel(GoalInfo { id, stamp });
         let action = &self.name;
@@ -310,31 +321,31 @@ impl Shared {
                 false
             }
         };
-        if let Some(events) = self.events(id) {
-            events.cancel_answered(ends);
+        if let Some(events) = self.goal_events(id) {
+            events.on_cancel_response(ends);
         }
     }
 
-    fn rejected(&self) -> GoalEnd {
+    fn rejected_end(&self) -> GoalEnd {
         GoalEnd {
-            outcome: Outcome::Rejected,
+            outcome: GoalOutcome::Rejected,
             text: String::new(),
             result: default_message(&self.of.result).into(),
         }
     }
 
-    fn end_of(&self, answer: &[u8]) -> Result<GoalEnd, String> {
+    fn parse_result(&self, answer: &[u8]) -> Result<GoalEnd, String> {
         let Some((status, result)) = messages::read_result(&self.of.result, answer) else {
             return Err(format!("the result of action {} cannot be read", self.name));
         };
         let outcome = match status {
-            Some(Status::Succeeded) => Outcome::Succeeded,
-            Some(Status::Canceled) => Outcome::Canceled,
-            Some(Status::Aborted) => Outcome::Aborted,
-            Some(Status::Unknown) => {
+            Some(ActionGoalStatus::Succeeded) => GoalOutcome::Succeeded,
+            Some(ActionGoalStatus::Canceled) => GoalOutcome::Canceled,
+            Some(ActionGoalStatus::Aborted) => GoalOutcome::Aborted,
+            Some(ActionGoalStatus::Unknown) => {
                 return Err("the action server no longer knows the goal".to_owned());
             }
-            _ => Outcome::Unknown,
+            _ => GoalOutcome::Unknown,
         };
         Ok(GoalEnd {
             outcome,
@@ -343,88 +354,88 @@ impl Shared {
         })
     }
 
-    fn events(&self, id: GoalId) -> Option<Arc<dyn GoalEvents>> {
+    fn goal_events(&self, id: GoalId) -> Option<Arc<dyn GoalEvents>> {
         let goals = self.goals.lock();
         goals.under_way.get(&id).map(|goal| goal.events.clone())
     }
 
-    fn tell_accepted(&self, id: GoalId) {
-        if let Some(events) = self.events(id) {
-            events.accepted();
+    fn report_accepted(&self, id: GoalId) {
+        if let Some(events) = self.goal_events(id) {
+            events.on_accepted();
         }
     }
 
-    fn tell_feedback(&self, bytes: &[u8]) {
+    fn report_feedback(&self, bytes: &[u8]) {
         let Some(id) = messages::read_id(bytes) else {
             return;
         };
-        let events = self.events(id);
-        let feedback = messages::behind_id(&self.of.feedback, bytes);
+        let events = self.goal_events(id);
+        let feedback = messages::read_after_id(&self.of.feedback, bytes);
         if let (Some(events), Some(feedback)) = (events, feedback) {
-            events.feedback(feedback);
+            events.on_feedback(feedback);
         }
     }
 
-    fn end(&self, id: GoalId, end: Result<GoalEnd, String>) {
+    fn finish_goal(&self, id: GoalId, end: Result<GoalEnd, String>) {
         let goal = self.goals.lock().remove(id);
         if let Some(goal) = goal {
-            goal.events.ended(end);
+            goal.events.on_ended(end);
         }
     }
 }
 
-/// Returns when nobody has waited for the goal for so long.
-async fn abandoned_for(long: Duration, mut wished: watch::Receiver<Wish>) {
+/// Returns when the goal has been abandoned for this long.
+async fn wait_abandoned(long: Duration, mut wished: watch::Receiver<GoalIntent>) {
     // Without its sender nobody waits either.
-    drop(wished.wait_for(|wish| *wish == Wish::Abandon).await);
+    drop(wished.wait_for(|wish| *wish == GoalIntent::Abandon).await);
     sleep(long).await;
 }
 
-/// Tells how goals get on. What a server said of a goal before it ended has come before its result.
-async fn follow(
-    closing: Closing,
+/// Delivers events of goals. Feedback that a server sent before the end of a goal arrived before the result.
+async fn report_events(
+    closing: EndGoalsOnDrop,
     mut feedback: MessageReceiver,
-    mut ended: mpsc::UnboundedReceiver<Ended>,
+    mut ended: mpsc::UnboundedReceiver<FinishedGoal>,
 ) {
     let shared = &closing.0;
     loop {
         tokio::select! {
-            Some(message) = feedback.recv() => shared.tell_feedback(&message.bytes),
+            Some(message) = feedback.recv() => shared.report_feedback(&message.bytes),
             Some((id, end)) = ended.recv() => {
                 for _ in 0..feedback.len() {
                     if let Some(message) = feedback.try_recv() {
-                        shared.tell_feedback(&message.bytes);
+                        shared.report_feedback(&message.bytes);
                     }
                 }
-                shared.end(id, end);
+                shared.finish_goal(id, end);
             }
             else => return,
         }
     }
 }
 
-/// When nothing more will be heard, all goals that are still under way have ended for who has sent them.
-struct Closing(Arc<Shared>);
+/// Ends all remaining goals for their senders when no more events will arrive.
+struct EndGoalsOnDrop(Arc<ActionClientState>);
 
-impl Drop for Closing {
+impl Drop for EndGoalsOnDrop {
     fn drop(&mut self) {
         let goals = std::mem::take(&mut *self.0.goals.lock());
         for goal in goals.under_way.into_values() {
-            goal.events.ended(Err(CLOSED.to_owned()));
+            goal.events.on_ended(Err(CLOSED.to_owned()));
         }
     }
 }
 
-/// Takes feedback while the participant is at work; it is told of later.
-struct Feedback {
+/// Queues feedback while the participant calls; it is delivered later.
+struct FeedbackSink {
     queue: MessageSender,
     wire_type: Arc<WireType>,
     publisher: PeerId,
 }
 
-impl Ear for Feedback {
-    fn hear(&self, payload: Bytes, _writer: Guid) {
-        self.queue.send(Message {
+impl RawListener for FeedbackSink {
+    fn on_message(&self, payload: Bytes, _writer: Guid) {
+        self.queue.send(SerializedMessage {
             bytes: payload,
             wire_type: self.wire_type.clone(),
             publisher: self.publisher.clone(),

@@ -1,4 +1,4 @@
-//! What tells goals apart: a UUID, which this side shows as text.
+//! Goal ids: UUIDs, displayed as text.
 
 use std::fmt;
 use std::hash::{BuildHasher as _, RandomState};
@@ -8,14 +8,14 @@ use std::hash::{BuildHasher as _, RandomState};
 pub(super) struct GoalId(pub(super) [u8; 16]);
 
 impl GoalId {
-    /// Of no goal: in a request to cancel it stands for all.
+    /// No goal: in a cancel request it stands for all.
     pub(super) const NONE: Self = Self([0; 16]);
 
-    /// A random one (RFC 9562, version 4).
+    /// Creates a random id (RFC 9562, version 4).
     pub(super) fn random() -> Self {
         let mut bytes = [0; 16];
         for half in bytes.chunks_exact_mut(8) {
-            // Its keys come from the operating system's random numbers, and no two are alike.
+            // The keys come from the operating system's random numbers, and no two are alike.
             half.copy_from_slice(&RandomState::new().hash_one(()).to_ne_bytes());
         }
         bytes[6] = bytes[6] & 0x0f | 0x40;
@@ -23,7 +23,7 @@ impl GoalId {
         Self(bytes)
     }
 
-    /// The UUID that the text is, with hyphens or without.
+    /// Parses a UUID with or without hyphens.
     pub(super) fn parse(text: &str) -> Option<Self> {
         let mut digits = [0; 32];
         let mut written = text.bytes().filter(|byte| *byte != b'-');
@@ -37,7 +37,7 @@ impl GoalId {
     }
 }
 
-/// In groups of 8, 4, 4, 4 and 12 lower-case hex digits.
+/// Displays groups of 8, 4, 4, 4 and 12 lower-case hex digits.
 impl fmt::Display for GoalId {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         let digits = hex::encode(self.0);

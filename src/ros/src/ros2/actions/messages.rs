@@ -1,24 +1,24 @@
-//! What the parts of an action say to each other, of which goals, results and feedback are the last fields. Of texts from
-//! strangers only as much is read as is there.
+//! Messages between the parts of an action, whose last fields are goals, results and feedback. Messages from untrusted
+//! peers are read only as far as they extend.
 
 use bytes::Bytes;
 
 use super::GoalId;
 use crate::bus::RosVersion;
 use crate::codec::Time;
-use crate::codec::cursor::Cursor;
-use crate::codec::embedded::embedded;
-use crate::codec::put::Put;
+use crate::codec::cursor::MessageCursor;
+use crate::codec::embedded::extract_embedded;
+use crate::codec::put::CdrWriter;
 use crate::schema::MessageType;
 
-/// Bytes of a goal's id, which stands at the beginning of what has one.
+/// Size of a goal id, at the beginning of messages that have one.
 const ID: usize = 16;
-/// Bytes of a goal's status, in front of its result.
+/// Size of a goal's status, before its result.
 const STATUS: usize = 1;
 
-/// How a goal stands (`action_msgs/msg/GoalStatus`).
+/// Status of a goal (`action_msgs/msg/GoalStatus`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Status {
+pub(super) enum ActionGoalStatus {
     Unknown = 0,
     Accepted = 1,
     Executing = 2,
@@ -28,13 +28,13 @@ pub(super) enum Status {
     Aborted = 6,
 }
 
-impl Status {
-    /// Whether the goal has ended.
+impl ActionGoalStatus {
+    /// Returns true if the goal has ended.
     pub(super) fn is_terminal(self) -> bool {
         self >= Self::Succeeded
     }
 
-    fn of(number: u8) -> Option<Self> {
+    fn from_number(number: u8) -> Option<Self> {
         Some(match number {
             0 => Self::Unknown,
             1 => Self::Accepted,
@@ -48,7 +48,7 @@ impl Status {
     }
 }
 
-/// What became of a request to cancel (`action_msgs/srv/CancelGoal`).
+/// Result of a cancel request (`action_msgs/srv/CancelGoal`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum CancelCode {
     None = 0,
@@ -57,75 +57,85 @@ pub(super) enum CancelCode {
     Terminated = 3,
 }
 
-/// A goal and when it was accepted (`action_msgs/msg/GoalInfo`).
+/// A goal and the time at which it was accepted (`action_msgs/msg/GoalInfo`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct GoalInfo {
     pub(super) id: GoalId,
     pub(super) stamp: Time,
 }
 
-/// The message of this type that stands behind a goal's id: goals and feedback.
-pub(super) fn behind_id(of: &MessageType, bytes: &[u8]) -> Option<Bytes> {
-    embedded(of, bytes, ID, &[])
+/// Reads the message of this type that follows a goal id: a goal or feedback.
+pub(super) fn read_after_id(of: &MessageType, bytes: &[u8]) -> Option<Bytes> {
+    extract_embedded(of, bytes, ID, &[])
 }
 
-/// Puts a goal, or feedback, behind its id.
-pub(super) fn with_id(id: GoalId, of: &MessageType, bytes: &[u8]) -> Option<Bytes> {
-    embedded(of, bytes, 0, &id.0)
+/// Writes a goal or feedback behind its id.
+pub(super) fn write_with_id(id: GoalId, of: &MessageType, bytes: &[u8]) -> Option<Bytes> {
+    extract_embedded(of, bytes, 0, &id.0)
 }
 
-/// The id that a message begins with.
+/// Reads the id that a message begins with.
 pub(super) fn read_id(bytes: &[u8]) -> Option<GoalId> {
-    take_id(&mut Cursor::new(RosVersion::Two, bytes)?)
+    take_id(&mut MessageCursor::new(RosVersion::Two, bytes)?)
 }
 
-/// A request for the result of a goal.
+/// Writes a request for the result of a goal.
 pub(super) fn write_id(id: GoalId) -> Bytes {
-    let mut put = Put::new();
+    let mut put = CdrWriter::new();
     put.bytes(&id.0);
-    put.end()
+    put.finish()
 }
 
-/// Whether a goal was accepted; when, does not matter here.
+/// Reads whether a goal was accepted; the time is ignored.
 pub(super) fn read_accepted(bytes: &[u8]) -> Option<bool> {
-    let [accepted] = Cursor::new(RosVersion::Two, bytes)?.number()?;
+    let [accepted] = MessageCursor::new(RosVersion::Two, bytes)?.number()?;
     Some(accepted != 0)
 }
 
-/// Whether a goal is accepted, and when.
+/// Writes whether a goal is accepted, and when.
 pub(super) fn write_accepted(accepted: bool, stamp: Time) -> Bytes {
-    let mut put = Put::new();
+    let mut put = CdrWriter::new();
     put.byte(u8::from(accepted));
     put_time(&mut put, stamp);
-    put.end()
+    put.finish()
 }
 
-/// How a goal has ended, and its result; no status where it is none that there is.
-pub(super) fn read_result(of: &MessageType, bytes: &[u8]) -> Option<(Option<Status>, Bytes)> {
-    let [status] = Cursor::new(RosVersion::Two, bytes)?.number()?;
-    Some((Status::of(status), embedded(of, bytes, STATUS, &[])?))
+/// Reads the final status of a goal and its result; the status is `None` if it is not a defined one.
+pub(super) fn read_result(
+    of: &MessageType,
+    bytes: &[u8],
+) -> Option<(Option<ActionGoalStatus>, Bytes)> {
+    let [status] = MessageCursor::new(RosVersion::Two, bytes)?.number()?;
+    Some((
+        ActionGoalStatus::from_number(status),
+        extract_embedded(of, bytes, STATUS, &[])?,
+    ))
 }
 
-/// How a goal has ended, and its result.
-pub(super) fn write_result(status: Status, of: &MessageType, result: &[u8]) -> Option<Bytes> {
-    embedded(of, result, 0, &[status as u8])
+/// Writes the final status of a goal and its result.
+pub(super) fn write_result(
+    status: ActionGoalStatus,
+    of: &MessageType,
+    result: &[u8],
+) -> Option<Bytes> {
+    extract_embedded(of, result, 0, &[status as u8])
 }
 
-/// Which goals are to be cancelled.
+/// Reads which goals are to be cancelled.
 pub(super) fn read_cancel(bytes: &[u8]) -> Option<GoalInfo> {
-    take_info(&mut Cursor::new(RosVersion::Two, bytes)?)
+    take_info(&mut MessageCursor::new(RosVersion::Two, bytes)?)
 }
 
-/// Asks for goals to be cancelled.
+/// Writes a cancel request.
 pub(super) fn write_cancel(wanted: GoalInfo) -> Bytes {
-    let mut put = Put::new();
+    let mut put = CdrWriter::new();
     put_info(&mut put, wanted);
-    put.end()
+    put.finish()
 }
 
-/// Whether a goal is among those that are cancelled now, and else the code.
+/// Reads whether a goal is among those being cancelled; otherwise returns the code.
 pub(super) fn read_cancelled(bytes: &[u8], id: GoalId) -> Option<Result<(), u8>> {
-    let mut cursor = Cursor::new(RosVersion::Two, bytes)?;
+    let mut cursor = MessageCursor::new(RosVersion::Two, bytes)?;
     let [code] = cursor.number()?;
     for _ in 0..cursor.length()? {
         if take_info(&mut cursor)?.id == id {
@@ -135,33 +145,33 @@ pub(super) fn read_cancelled(bytes: &[u8], id: GoalId) -> Option<Result<(), u8>>
     Some(Err(code))
 }
 
-/// Which goals are cancelled now.
+/// Writes which goals are being cancelled.
 pub(super) fn write_cancelled(code: CancelCode, goals: &[GoalInfo]) -> Bytes {
-    let mut put = Put::new();
+    let mut put = CdrWriter::new();
     put.byte(code as u8);
     put.length(goals.len());
     for goal in goals {
         put_info(&mut put, *goal);
     }
-    put.end()
+    put.finish()
 }
 
-/// How all goals stand.
-pub(super) fn write_statuses(goals: &[(GoalInfo, Status)]) -> Bytes {
-    let mut put = Put::new();
+/// Writes the statuses of all goals.
+pub(super) fn write_statuses(goals: &[(GoalInfo, ActionGoalStatus)]) -> Bytes {
+    let mut put = CdrWriter::new();
     put.length(goals.len());
     for (goal, status) in goals {
         put_info(&mut put, *goal);
         put.byte(*status as u8);
     }
-    put.end()
+    put.finish()
 }
 
-fn take_id(cursor: &mut Cursor<'_>) -> Option<GoalId> {
+fn take_id(cursor: &mut MessageCursor<'_>) -> Option<GoalId> {
     cursor.take(ID, 1)?.try_into().ok().map(GoalId)
 }
 
-fn take_info(cursor: &mut Cursor<'_>) -> Option<GoalInfo> {
+fn take_info(cursor: &mut MessageCursor<'_>) -> Option<GoalInfo> {
     let id = take_id(cursor)?;
     let secs = u32::from_le_bytes(cursor.number()?);
     let nsecs = u32::from_le_bytes(cursor.number()?);
@@ -169,12 +179,12 @@ fn take_info(cursor: &mut Cursor<'_>) -> Option<GoalInfo> {
     Some(GoalInfo { id, stamp })
 }
 
-fn put_info(put: &mut Put, info: GoalInfo) {
+fn put_info(put: &mut CdrWriter, info: GoalInfo) {
     put.bytes(&info.id.0);
     put_time(put, info.stamp);
 }
 
-fn put_time(put: &mut Put, time: Time) {
+fn put_time(put: &mut CdrWriter, time: Time) {
     put.number(time.secs.to_le_bytes());
     put.number(time.nsecs.to_le_bytes());
 }

@@ -1,4 +1,4 @@
-//! An action that this side serves.
+//! Server of an action.
 
 mod retired;
 
@@ -11,32 +11,33 @@ use bytes::Bytes;
 use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
-pub(in crate::ros2) use self::retired::Retired;
-use self::retired::{Guard, Keeping, take_over};
-use super::Parts;
-use super::goal_server::{self, GoalServer, Topics};
+pub(in crate::ros2) use self::retired::RetiredServices;
+use self::retired::{BoxedGuard, RetiredGuard, release_retired};
+use super::ActionInterfaces;
+use super::goal_server::{self, GoalServer, GoalServerTopics};
 use crate::bus::{
-    ActionHandler, ActionServer, BusError, GoalEnd, Qos, ServiceHandler, ServiceType, WireType,
+    ActionHandler, ActionServer, BusError, GoalEnd, QosProfile, ServiceHandler, ServiceType,
+    WireType,
 };
-use crate::ros2::bus::Inner;
+use crate::ros2::bus::Ros2BusState;
 use crate::ros2::raw::{self, RawWriter};
 use crate::ros2::{names, quality, services};
 use crate::schema::ActionDef;
 
-/// How long results of aborted goals are there for clients that have not asked for them yet.
+/// Time for which results of aborted goals are available to clients that have not requested them yet.
 const LINGER: Duration = Duration::from_secs(5);
 
-/// One action.
-pub(in crate::ros2) struct Server {
-    shared: Arc<Shared>,
+/// A server of one action.
+pub(in crate::ros2) struct Ros2ActionServer {
+    shared: Arc<ActionServerState>,
     task: AbortHandle,
     /// Dropped after all goals have ended.
-    _services: [Guard; 2],
-    get_result: Option<Guard>,
+    _services: [BoxedGuard; 2],
+    get_result: Option<BoxedGuard>,
 }
 
-struct Shared {
-    bus: Arc<Inner>,
+struct ActionServerState {
+    bus: Arc<Ros2BusState>,
     name: String,
     handler: Arc<dyn ActionHandler>,
     goals: Arc<GoalServer<Writers>>,
@@ -47,52 +48,52 @@ struct Writers {
     status: RawWriter,
 }
 
-impl Topics for Writers {
-    fn feedback(&self, message: Bytes) {
+impl GoalServerTopics for Writers {
+    fn publish_feedback(&self, message: Bytes) {
         self.feedback.write(message);
     }
 
-    fn status(&self, message: Bytes) {
+    fn publish_status(&self, message: Bytes) {
         self.status.write(message);
     }
 }
 
-impl Server {
-    /// Opens the action's parts.
+impl Ros2ActionServer {
+    /// Opens the action's services and topics.
     pub(in crate::ros2) fn open(
-        bus: &Arc<Inner>,
+        bus: &Arc<Ros2BusState>,
         name: &str,
         of: &Arc<ActionDef>,
         handler: Arc<dyn ActionHandler>,
     ) -> Result<Self, BusError> {
         bus.check_open()?;
-        let parts = Parts::of(name, of)?;
-        let writer = |(topic, of): (String, WireType), qos: Qos| {
-            let qos = quality::offered(&qos);
+        let parts = ActionInterfaces::for_action(name, of)?;
+        let writer = |(topic, of): (String, WireType), qos: QosProfile| {
+            let qos = quality::writer_qos(&qos);
             Ok::<_, BusError>(raw::writer(bus, &names::topic(&topic, &of)?, qos))
         };
         let writers = Writers {
-            feedback: writer(parts.feedback, Parts::feedback_qos())?,
-            status: writer(parts.status, Parts::status_qos())?,
+            feedback: writer(parts.feedback, ActionInterfaces::feedback_qos())?,
+            status: writer(parts.status, ActionInterfaces::status_qos())?,
         };
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ActionServerState {
             bus: bus.clone(),
             name: name.to_owned(),
             handler,
-            goals: GoalServer::new(name, of, writers, Budget::unlimited()),
+            goals: GoalServer::new(name, of, writers, Budget::without_limit()),
         });
         let serve = |(service, of): (String, ServiceType), handler: Arc<dyn ServiceHandler>| {
             services::serve(bus, &service, of, handler)
         };
-        take_over(bus, name);
-        // Goals last: all that follows them can be asked for then.
+        release_retired(bus, name);
+        // The goal service comes last: once it is there, everything that follows a goal can be requested.
         let get_result = serve(parts.get_result, Arc::new(GetResult(shared.clone())))?;
         let services = [
             serve(parts.cancel_goal, Arc::new(CancelGoal(shared.clone())))?,
             serve(parts.send_goal, Arc::new(SendGoal(shared.clone())))?,
         ];
         let goals = shared.goals.clone();
-        let task = bus.spawn(async move { goals.forget_in_time().await });
+        let task = bus.spawn(async move { goals.expire_results().await });
         Ok(Self {
             shared,
             task,
@@ -102,40 +103,40 @@ impl Server {
     }
 }
 
-impl Drop for Server {
+impl Drop for Ros2ActionServer {
     fn drop(&mut self) {
         self.task.abort();
         let goals = &self.shared.goals;
         goals.close();
-        let asked = goals.are_asked_for();
+        let asked = goals.are_results_requested();
         if let Some(guard) = self.get_result.take().filter(|_| !asked) {
             let shared = self.shared.clone();
-            let keeping = Keeping::of(&shared.bus, &shared.name, guard);
+            let keeping = RetiredGuard::keep(&shared.bus, &shared.name, guard);
             self.shared.bus.spawn(async move {
-                let _ = timeout(LINGER, shared.goals.all_asked_for()).await;
+                let _ = timeout(LINGER, shared.goals.wait_until_results_requested()).await;
                 drop(keeping);
             });
         }
     }
 }
 
-impl ActionServer for Server {
-    fn feedback(&self, id: &str, feedback: Bytes) -> bool {
-        self.shared.goals.feedback(id, &feedback)
+impl ActionServer for Ros2ActionServer {
+    fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
+        self.shared.goals.publish_feedback(id, &feedback)
     }
 
-    fn end(&self, id: &str, end: GoalEnd) -> bool {
-        self.shared.goals.end(id, &end)
+    fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
+        self.shared.goals.end_goal(id, &end)
     }
 }
 
-/// What cannot be read is refused: a service of ROS 2 has no other way to say so.
-struct SendGoal(Arc<Shared>);
+/// Receives goals. A request that cannot be read is rejected: a ROS 2 service has no other way to report it.
+struct SendGoal(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for SendGoal {
     async fn call(&self, request: Bytes, caller: &str) -> Result<Bytes, String> {
-        let Shared {
+        let ActionServerState {
             goals,
             handler,
             name: action,
@@ -148,10 +149,10 @@ impl ServiceHandler for SendGoal {
             Ok(begun) => begun,
             Err(reason) => {
                 refused(reason);
-                return Ok(goal_server::refusal());
+                return Ok(goal_server::rejected_response());
             }
         };
-        let taken = handler.goal(&begun.id(), goal);
+        let taken = handler.on_goal(&begun.id(), goal);
         let answer = goals.answer(&begun, taken.is_ok());
         taken.unwrap_or_else(refused);
         Ok(answer)
@@ -159,7 +160,7 @@ impl ServiceHandler for SendGoal {
 }
 
 /// Answers once the goal has ended.
-struct GetResult(Arc<Shared>);
+struct GetResult(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for GetResult {
@@ -168,18 +169,18 @@ impl ServiceHandler for GetResult {
     }
 }
 
-struct CancelGoal(Arc<Shared>);
+struct CancelGoal(Arc<ActionServerState>);
 
 #[async_trait]
 impl ServiceHandler for CancelGoal {
     async fn call(&self, request: Bytes, _caller: &str) -> Result<Bytes, String> {
-        let Shared { goals, handler, .. } = &*self.0;
-        let Some(wanted) = goals.wanted(&request) else {
-            return Ok(goal_server::not_canceled());
+        let ActionServerState { goals, handler, .. } = &*self.0;
+        let Some(wanted) = goals.parse_cancel(&request) else {
+            return Ok(goal_server::cancel_rejected_response());
         };
-        let canceled = goals.canceled(&wanted, |_| true);
+        let canceled = goals.cancel(&wanted, |_| true);
         for id in &canceled.newly {
-            handler.cancel(id);
+            handler.on_cancel(id);
         }
         Ok(canceled.answer)
     }

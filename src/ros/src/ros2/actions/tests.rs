@@ -10,9 +10,9 @@ use crate::bus::{ActionHandler, GoalEnd, GoalEvents, RosVersion};
 use crate::codec::from_json;
 use crate::schema::{ActionDef, MessageType, Registry};
 
-/// The action of this text: goal, result, feedback.
+/// Creates the action with this definition: goal, result, feedback.
 fn action(text: &str) -> Arc<ActionDef> {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     registry.insert("test_msgs/action/Fibonacci", text).unwrap();
     registry.action("test_msgs/Fibonacci").unwrap()
 }
@@ -27,14 +27,14 @@ fn cdr(of: &MessageType, json: &str) -> Bytes {
     bytes.into()
 }
 
-/// What a server's handler hears.
+/// Callbacks received by a server's handler.
 #[derive(Debug, PartialEq)]
 enum Heard {
     Goal(String, Bytes),
     Cancel(String),
 }
 
-/// Tells what it hears, and takes all goals, or none.
+/// Reports its callbacks, and accepts all goals or none.
 struct Handler {
     heard: mpsc::UnboundedSender<Heard>,
     takes: bool,
@@ -48,21 +48,21 @@ impl Handler {
 }
 
 impl ActionHandler for Handler {
-    fn goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, id: &str, goal: Bytes) -> Result<(), String> {
         let _ = self.heard.send(Heard::Goal(id.to_owned(), goal));
         self.takes.then_some(()).ok_or_else(|| "no".to_owned())
     }
 
-    fn cancel(&self, id: &str) {
+    fn on_cancel(&self, id: &str) {
         let _ = self.heard.send(Heard::Cancel(id.to_owned()));
     }
 
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         panic!("{reason}");
     }
 }
 
-/// What whoever has sent a goal hears.
+/// Events received by the sender of a goal.
 #[derive(Debug, PartialEq)]
 enum Told {
     Feedback(Bytes),
@@ -79,11 +79,11 @@ impl Events {
 }
 
 impl GoalEvents for Events {
-    fn feedback(&self, feedback: Bytes) {
+    fn on_feedback(&self, feedback: Bytes) {
         let _ = self.0.send(Told::Feedback(feedback));
     }
 
-    fn ended(&self, end: Result<GoalEnd, String>) {
+    fn on_ended(&self, end: Result<GoalEnd, String>) {
         let _ = self.0.send(Told::Ended(end));
     }
 }

@@ -9,8 +9,8 @@ fn kinds(line: &str) -> Vec<Kind> {
     parts.into_iter().map(|part| part.kind).collect()
 }
 
-fn renamed(node: Option<&str>, of: Renamed, [from, to]: [&str; 2]) -> Kind {
-    Kind::Rule(Rule {
+fn remap_rule(node: Option<&str>, of: RemapTarget, [from, to]: [&str; 2]) -> Kind {
+    Kind::Rule(RemapRule {
         node: node.map(str::to_owned),
         of,
         from: from.to_owned(),
@@ -35,9 +35,9 @@ fn what_launch_gives_is_understood() {
         [
             Kind::Own,
             Kind::Mark,
-            renamed(None, Renamed::Node, ["__node", "see"]),
-            renamed(None, Renamed::Namespace, ["__ns", "/front"]),
-            renamed(None, Renamed::Name, ["image", "/camera/image"]),
+            remap_rule(None, RemapTarget::Node, ["__node", "see"]),
+            remap_rule(None, RemapTarget::Namespace, ["__ns", "/front"]),
+            remap_rule(None, RemapTarget::Name, ["image", "/camera/image"]),
             Kind::File("/tmp/p.yaml".into()),
             set(None, "rate", "2.0"),
             Kind::Setting,
@@ -45,7 +45,7 @@ fn what_launch_gives_is_understood() {
             Kind::Own,
             Kind::Mark,
             set(Some("see"), "gains.p", "3"),
-            renamed(None, Renamed::Name, ["~/a", "b"]),
+            remap_rule(None, RemapTarget::Name, ["~/a", "b"]),
         ]
     );
     let parts = parse(&words(line)).expect("a command line");
@@ -58,10 +58,10 @@ fn rules_may_be_of_one_node_or_of_one_kind_and_need_no_flag() {
     assert_eq!(
         kinds("__node:=bar chatter:=foo key=value -- -x"),
         [
-            renamed(None, Renamed::Node, ["__node", "bar"]),
-            renamed(None, Renamed::Name, ["chatter", "foo"]),
+            remap_rule(None, RemapTarget::Node, ["__node", "bar"]),
+            remap_rule(None, RemapTarget::Name, ["chatter", "foo"]),
             Kind::Own,
-            // Where nothing is for ROS, these are the program's.
+            // Without arguments for ROS, these belong to the program.
             Kind::Own,
             Kind::Own,
         ]
@@ -72,10 +72,10 @@ fn rules_may_be_of_one_node_or_of_one_kind_and_need_no_flag() {
         ),
         [
             Kind::Mark,
-            renamed(Some("usual"), Renamed::Node, ["__name", "bar"]),
-            renamed(None, Renamed::Topic, ["a", "b"]),
-            renamed(Some("x"), Renamed::Service, ["a", "b"]),
-            renamed(None, Renamed::Name, ["/x/*", "/y/\\1"]),
+            remap_rule(Some("usual"), RemapTarget::Node, ["__name", "bar"]),
+            remap_rule(None, RemapTarget::Topic, ["a", "b"]),
+            remap_rule(Some("x"), RemapTarget::Service, ["a", "b"]),
+            remap_rule(None, RemapTarget::Name, ["/x/*", "/y/\\1"]),
             Kind::Mark,
         ]
     );
@@ -85,35 +85,32 @@ fn rules_may_be_of_one_node_or_of_one_kind_and_need_no_flag() {
     );
 }
 
-/// Each of these ends a node of rclpy 7.1 with an error, too.
+/// Each of these makes a node of rclpy 7.1 exit with an error, too.
 #[test]
 fn what_rcl_refuses_is_refused_by_name() {
     for (line, said) in [
-        ("--ros-args -r", "nothing stands after -r"),
+        ("--ros-args -r", "nothing follows -r"),
         ("--ros-args -p", "give -p NAME:=VALUE"),
         ("--ros-args --params-file", "give --params-file FILE"),
-        ("--ros-args --log-level", "nothing stands after --log-level"),
+        ("--ros-args --log-level", "nothing follows --log-level"),
         ("--ros-args -r foo", "-r foo: it has no :="),
-        ("--ros-args -r foo:=", "-r foo:=: \"\" behind := is no name"),
-        ("--ros-args -r __ns:=q", "\"q\" is no namespace"),
-        ("--ros-args -r __ns:=/q/", "\"/q/\" is no namespace"),
-        ("--ros-args -r __node:=q/r", "\"q/r\" is no name of a node"),
-        ("--ros-args -r __node:=", "\"\" is no name of a node"),
-        ("--ros-args -r a%b:=c", "\"a%b\" before := is no name"),
+        (
+            "--ros-args -r foo:=",
+            "-r foo:=: \"\" behind := is not a name",
+        ),
+        ("--ros-args -r __ns:=q", "\"q\" is not a namespace"),
+        ("--ros-args -r __ns:=/q/", "\"/q/\" is not a namespace"),
+        ("--ros-args -r __node:=q/r", "\"q/r\" is not a node name"),
+        ("--ros-args -r __node:=", "\"\" is not a node name"),
+        ("--ros-args -r a%b:=c", "\"a%b\" before := is not a name"),
         ("--ros-args -p a", "-p a: it has no :="),
-        (
-            "--ros-args -p /usual:b:=2",
-            "\"/usual\" is no name of a node",
-        ),
-        ("--ros-args -p a-b:=1", "\"a-b\" is no name of a parameter"),
-        ("--ros-args -p 0:=1", "\"0\" is no name of a parameter"),
-        ("--ros-args -p a..b:=1", "\"a..b\" is no name"),
-        ("--ros-args --frob", "--frob stands after --ros-args"),
-        (
-            "--ros-args __node:=bar",
-            "__node:=bar stands after --ros-args",
-        ),
-        ("--ros-args -rchatter:=foo", "-rchatter:=foo stands after"),
+        ("--ros-args -p /usual:b:=2", "\"/usual\" is not a node name"),
+        ("--ros-args -p a-b:=1", "\"a-b\" is not a parameter name"),
+        ("--ros-args -p 0:=1", "\"0\" is not a parameter name"),
+        ("--ros-args -p a..b:=1", "\"a..b\" is not a"),
+        ("--ros-args --frob", "--frob follows --ros-args"),
+        ("--ros-args __node:=bar", "__node:=bar follows --ros-args"),
+        ("--ros-args -rchatter:=foo", "-rchatter:=foo follows"),
     ] {
         let error = parse(&words(line)).expect_err(line).to_string();
         assert!(error.contains(said), "{line}: {error}");
@@ -133,7 +130,7 @@ fn rules_for_one_node_say_nothing_to_the_others() {
         ("__node:=x", true, false),
     ] {
         let argv: Vec<String> = line.split(' ').map(str::to_owned).collect();
-        assert_eq!(says_to_all(&argv), Naming { name, namespace }, "{line}");
+        assert_eq!(global_naming(&argv), Naming { name, namespace }, "{line}");
     }
 }
 
@@ -145,13 +142,13 @@ fn a_stub_is_called_by_the_only_node_of_its_program_that_is_told_no_name() {
         (vec![named], Some(named)),
         (vec![named, plain], Some(plain)),
         (vec![plain, named, named], Some(plain)),
-        // Which of them it is nobody can tell.
+        // It is unknown which of them.
         (vec![plain, plain], None),
         (vec![named, named], None),
         (vec![], None),
     ] {
         let nodes: Vec<_> = lines.iter().map(|line| words(line)).collect();
-        let found = named_by_program(nodes, |node| node).map(|node| node.join(" "));
+        let found = node_for_stub(nodes, |node| node).map(|node| node.join(" "));
         assert_eq!(found.as_deref(), called_by, "{lines:?}");
     }
 }

@@ -1,4 +1,4 @@
-//! The hashes that descriptions of Jazzy's interfaces tell (`share/PACKAGE/{msg,srv}/*.json`).
+//! Hashes compared with those in the descriptions of Jazzy's interfaces (`share/PACKAGE/{msg,srv}/*.json`).
 
 use std::collections::BTreeSet;
 
@@ -8,9 +8,10 @@ use super::*;
 fn definitions_have_the_hashes_of_those_that_nodes_were_built_with() {
     let known = KNOWN.as_ref().unwrap();
     for (name, hash) in HASHES {
-        let found = match name.contains("/srv/") {
-            true => service(name).unwrap().digest.to_string(),
-            false => message(name).unwrap().digest().to_owned(),
+        let found = if name.contains("/srv/") {
+            service(name).unwrap().digest.to_string()
+        } else {
+            message(name).unwrap().digest().to_owned()
         };
         assert_eq!(found, format!("RIHS01_{hash}"), "{name}");
     }

@@ -1,4 +1,4 @@
-//! Has nodes begin their work that wait for somebody to tell them to.
+//! Activation of lifecycle nodes that wait for a manager.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -6,46 +6,45 @@ use std::time::{Duration, Instant};
 use super::{LifecycleNode, State, Transition};
 use crate::bus::{Bus, BusError, Graph};
 
-/// How a node was found, or what became of it.
+/// Outcome of activating a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Begun {
-    /// It was told to configure and to activate itself, and has.
+pub enum BeginOutcome {
+    /// The node was configured and activated.
     Now,
-    /// It was in this state already: somebody else drives it, or has.
+    /// The node was in this state already: another node manages it, or did.
     Left(State),
-    /// This node drives it.
+    /// This node manages it.
     DrivenBy(String),
 }
 
-/// Why a node does not do its work.
+/// Error activating a node.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "the lifecycle node {node} does not {}: {reason}; its log says why, and what it lacks is often a parameter \
-     (--param) or a device",
+    "the lifecycle node {node} does not {}: {reason}; see its log: often a parameter (--param) or a device is missing",
     transition.label()
 )]
-pub struct NotBegun {
-    /// Its absolute name.
+pub struct BeginError {
+    /// Absolute name of the node.
     pub node: String,
-    /// What it was asked for.
+    /// Transition requested.
     pub transition: Transition,
-    /// What it answered.
+    /// The node's answer.
     pub reason: String,
 }
 
 impl LifecycleNode {
-    /// Nodes that have a lifecycle.
+    /// Returns the nodes that have a lifecycle.
     pub fn all(graph: &Graph) -> Vec<String> {
         let nodes = graph.nodes.keys();
         nodes
-            .filter(|node| Self::is_one(graph, node))
+            .filter(|node| Self::has_lifecycle(graph, node))
             .cloned()
             .collect()
     }
 
-    /// The node, beside those that are `ours`, that may tell this one to change its state, if there is any: a manager that a
-    /// launch file has started.
-    fn driver(graph: &Graph, node: &str, ours: &dyn Fn(&str) -> bool) -> Option<String> {
+    /// Returns a node other than those of `ours` that may change the state of this one, if there is any: a lifecycle
+    /// manager started by a launch file.
+    fn find_driver(graph: &Graph, node: &str, ours: &dyn Fn(&str) -> bool) -> Option<String> {
         let service = format!("{node}/change_state");
         let mut others = graph.ends.iter();
         let driver = others.find(|(other, ends)| {
@@ -54,38 +53,39 @@ impl LifecycleNode {
         driver.map(|(other, _)| other.clone())
     }
 
-    /// Has it configure and activate itself, where nobody else does: not if it is in another state than unconfigured, or some
-    /// node beside `ours` has a client for that. Each transition may take as long as `patience`.
+    /// Configures and activates the node unless another node manages it: not if it is in another state than
+    /// unconfigured, or a node other than those of `ours` has a client for its transitions. Each transition may take up
+    /// to `patience`.
     pub async fn begin(
         &self,
         ours: &(dyn Fn(&str) -> bool + Send + Sync),
         patience: Duration,
-    ) -> Result<Begun, NotBegun> {
+    ) -> Result<BeginOutcome, BeginError> {
         let asked = Instant::now();
         let state = loop {
             match self.state().await {
-                // It may take its time between being seen and answering.
+                // It may take some time between discovery and its first answer.
                 Err(BusError::Timeout { .. }) if asked.elapsed() < patience => {}
                 told => break told,
             }
         };
-        match state.map_err(|error| self.not_begun(Transition::Configure, &error))? {
+        match state.map_err(|error| self.begin_error(Transition::Configure, &error))? {
             State::Unconfigured => {}
-            other => return Ok(Begun::Left(other)),
+            other => return Ok(BeginOutcome::Left(other)),
         }
         let graph = Arc::clone(&self.bus.graph().borrow());
-        if let Some(driver) = Self::driver(&graph, &self.node, ours) {
-            return Ok(Begun::DrivenBy(driver));
+        if let Some(driver) = Self::find_driver(&graph, &self.node, ours) {
+            return Ok(BeginOutcome::DrivenBy(driver));
         }
         for transition in [Transition::Configure, Transition::Activate] {
-            let changed = self.change(transition, patience).await;
-            changed.map_err(|error| self.not_begun(transition, &error))?;
+            let changed = self.change_state(transition, patience).await;
+            changed.map_err(|error| self.begin_error(transition, &error))?;
         }
-        Ok(Begun::Now)
+        Ok(BeginOutcome::Now)
     }
 
-    fn not_begun(&self, transition: Transition, error: &BusError) -> NotBegun {
-        NotBegun {
+    fn begin_error(&self, transition: Transition, error: &BusError) -> BeginError {
+        BeginError {
             node: self.node.clone(),
             transition,
             reason: match error {
@@ -96,18 +96,19 @@ impl LifecycleNode {
     }
 }
 
-/// Has all nodes of a system begin that have a lifecycle and that nobody drives, one after the other: how each was found.
+/// Activates all lifecycle nodes of a system that no other node manages, one after the other; returns the outcome for
+/// each.
 ///
 /// # Errors
-/// The first one that does not.
+/// The error of the first node that fails.
 pub async fn begin_all(
     bus: &Arc<dyn Bus>,
     patience: Duration,
-) -> Result<Vec<(String, Begun)>, NotBegun> {
+) -> Result<Vec<(String, BeginOutcome)>, BeginError> {
     let graph = Arc::clone(&bus.graph().borrow());
     let mut all = Vec::new();
     for node in LifecycleNode::all(&graph) {
-        let one = LifecycleNode::of(Arc::clone(bus), &node);
+        let one = LifecycleNode::new(Arc::clone(bus), &node);
         let begun = one.begin(&|other| other == bus.node(), patience).await?;
         all.push((node, begun));
     }
@@ -119,14 +120,14 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::bus::{NodeEnds, ServiceType};
+    use crate::bus::{NodeEntities, ServiceType};
 
     #[test]
     fn a_manager_is_told_by_its_client() {
         let of = ServiceType::new("lifecycle_msgs/srv/ChangeState", "*");
-        let client = |service: &str| NodeEnds {
+        let client = |service: &str| NodeEntities {
             clients: BTreeMap::from([(service.to_owned(), of.clone())]),
-            ..NodeEnds::default()
+            ..NodeEntities::default()
         };
         let graph = Graph {
             ends: BTreeMap::from([
@@ -137,16 +138,16 @@ mod tests {
             ..Graph::default()
         };
         let ours = |node: &str| node == "/looker";
-        let driver = |node: &str| LifecycleNode::driver(&graph, node, &ours);
+        let driver = |node: &str| LifecycleNode::find_driver(&graph, node, &ours);
         assert_eq!(driver("/drive").as_deref(), Some("/manager"));
         assert_eq!(driver("/other"), None);
         let neither = |node: &str| node != "/drive";
-        assert_eq!(LifecycleNode::driver(&graph, "/drive", &neither), None);
+        assert_eq!(LifecycleNode::find_driver(&graph, "/drive", &neither), None);
     }
 
     #[test]
     fn what_does_not_begin_is_told_with_the_transition_and_what_to_do() {
-        let refused = NotBegun {
+        let refused = BeginError {
             node: "/drive".to_owned(),
             transition: Transition::Activate,
             reason: "/drive did not activate, and is inactive now".to_owned(),
@@ -156,6 +157,6 @@ mod tests {
             words.starts_with("the lifecycle node /drive does not activate: /drive did not"),
             "{words}"
         );
-        assert!(words.contains("its log says why"), "{words}");
+        assert!(words.contains("see its log"), "{words}");
     }
 }

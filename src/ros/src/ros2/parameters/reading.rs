@@ -1,25 +1,25 @@
-//! Messages of strangers about parameters, read value by value. What is made of them takes many times their bytes, so both
-//! are bounded.
+//! Reader for messages about parameters from untrusted peers. The values read take many times the size of the message,
+//! so both are bounded.
 
 use crate::bus::RosVersion;
-use crate::codec::cursor::Cursor;
+use crate::codec::cursor::MessageCursor;
 
-/// A longer message is not read.
+/// Maximum size of a message.
 const MAX_BYTES: usize = 16 << 20;
-/// Nor is one that holds more elements of lists.
+/// Maximum number of list elements in a message.
 const MAX_ELEMENTS: usize = 1 << 20;
 
-/// A message of which something is still to be read. All functions give none where the message ends too early.
-pub(super) struct Reading<'a> {
-    cursor: Cursor<'a>,
-    /// How many elements may follow.
+/// Reader of a message. Methods return `None` where the message ends too early.
+pub(super) struct ParameterReader<'a> {
+    cursor: MessageCursor<'a>,
+    /// Remaining number of elements.
     elements: usize,
 }
 
-impl<'a> Reading<'a> {
-    /// From the beginning.
-    pub(super) fn of(bytes: &'a [u8]) -> Option<Self> {
-        let cursor = Cursor::new(RosVersion::Two, bytes)?;
+impl<'a> ParameterReader<'a> {
+    /// Creates a reader at the beginning of the message; `None` if it is too long.
+    pub(super) fn new(bytes: &'a [u8]) -> Option<Self> {
+        let cursor = MessageCursor::new(RosVersion::Two, bytes)?;
         (bytes.len() <= MAX_BYTES).then_some(Self {
             cursor,
             elements: MAX_ELEMENTS,
@@ -38,7 +38,7 @@ impl<'a> Reading<'a> {
         self.cursor.number().map(i64::from_le_bytes)
     }
 
-    pub(super) fn unsigned(&mut self) -> Option<u64> {
+    pub(super) fn unsigned_integer(&mut self) -> Option<u64> {
         self.cursor.number().map(u64::from_le_bytes)
     }
 
@@ -46,29 +46,29 @@ impl<'a> Reading<'a> {
         self.cursor.number().map(f64::from_le_bytes)
     }
 
-    /// A time, at which nobody looks.
+    /// Skips a time.
     pub(super) fn skip_time(&mut self) -> Option<()> {
         self.cursor.skip(2, 4, 4)
     }
 
-    /// A text; what is no UTF-8 is replaced.
+    /// Reads a text; invalid UTF-8 is replaced.
     pub(super) fn text(&mut self) -> Option<String> {
-        let bytes = self.bytes_of_text()?;
+        let bytes = self.text_bytes()?;
         Some(String::from_utf8_lossy(bytes).into_owned())
     }
 
-    pub(super) fn bytes_of_text(&mut self) -> Option<&'a [u8]> {
+    pub(super) fn text_bytes(&mut self) -> Option<&'a [u8]> {
         let bytes = self.cursor.string(false)?;
         Some(bytes.strip_suffix(&[0]).unwrap_or(bytes))
     }
 
-    /// A list of bytes, or of bools.
+    /// Reads a list of bytes or bools.
     pub(super) fn bytes(&mut self) -> Option<&'a [u8]> {
         let length = self.cursor.length()?;
         self.cursor.take(length, 1)
     }
 
-    /// A list of numbers of eight bytes, little endian.
+    /// Reads a list of 8-byte numbers, as little-endian bytes.
     pub(super) fn numbers(&mut self) -> Option<impl ExactSizeIterator<Item = [u8; 8]> + use<'a>> {
         let length = self.cursor.length()?;
         let bytes = match length {
@@ -92,17 +92,17 @@ impl<'a> Reading<'a> {
 
     pub(super) fn skip_texts(&mut self) -> Option<()> {
         let length = self.cursor.length()?;
-        (0..length).try_for_each(|_| self.bytes_of_text().map(drop))
+        (0..length).try_for_each(|_| self.text_bytes().map(drop))
     }
 
-    /// A list, element by element.
+    /// Reads a list, element by element.
     pub(super) fn list<T>(&mut self, one: impl Fn(&mut Self) -> Option<T>) -> Option<Vec<T>> {
         let length = self.cursor.length()?;
         self.spend(length)?;
         (0..length).map(|_| one(self)).collect()
     }
 
-    /// So many elements are kept.
+    /// Counts elements that are kept; `None` beyond the limit.
     pub(super) fn spend(&mut self, elements: usize) -> Option<()> {
         self.elements = self.elements.checked_sub(elements)?;
         Some(())

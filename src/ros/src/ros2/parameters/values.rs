@@ -1,18 +1,18 @@
-//! Values of parameters in messages (`rcl_interfaces/msg/ParameterValue`): a number that says which of nine fields counts,
-//! and all nine.
+//! Serialized parameter values (`rcl_interfaces/msg/ParameterValue`): a number that selects one of nine fields, and all
+//! nine fields.
 
 use base64_simd::STANDARD as BASE64;
 
-use super::reading::Reading;
+use super::reading::ParameterReader;
 use crate::bus::{ParamValue, ParameterKind};
-use crate::codec::put::Put;
+use crate::codec::put::CdrWriter;
 
-/// Doubles hold all integers up to here, and not all beyond.
+/// Largest magnitude up to which doubles represent all integers.
 const EXACT: u64 = 1 << 53;
 
-/// A value of a kind that ROS 2 knows.
+/// A value of a type defined by ROS 2.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Typed {
+pub(super) enum TypedValue {
     NotSet,
     Bool(bool),
     Integer(i64),
@@ -26,8 +26,8 @@ pub(super) enum Typed {
 }
 
 impl ParameterKind {
-    /// By its number in `rcl_interfaces/msg/ParameterType`. One that nobody knows holds nothing that can be told.
-    pub(super) fn of(number: u8) -> Self {
+    /// Returns the type of this number in `rcl_interfaces/msg/ParameterType`; an unknown number counts as not set.
+    pub(super) fn from_number(number: u8) -> Self {
         match number {
             1 => Self::Bool,
             2 => Self::Integer,
@@ -43,7 +43,7 @@ impl ParameterKind {
     }
 }
 
-/// Whether the value may have to become one of another kind, or is of none by itself.
+/// Returns true if the value's type may have to be adapted to the parameter's, or is not determined by the value.
 pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
     !matches!(
         value,
@@ -51,45 +51,45 @@ pub(super) fn depends_on_kind(value: &ParamValue) -> bool {
     )
 }
 
-/// The value as a parameter of this kind takes it, where nothing is lost by that; else as it is, for the node to judge.
-pub(super) fn typed(value: ParamValue, kind: ParameterKind) -> Result<Typed, String> {
+/// Converts the value to the parameter's type where that is lossless; otherwise leaves it for the node to judge.
+pub(super) fn coerce(value: ParamValue, kind: ParameterKind) -> Result<TypedValue, String> {
     let natural = match (value, kind) {
         (ParamValue::Int(value), ParameterKind::Double) if is_exact(value) => {
-            Typed::Double(value as f64)
+            TypedValue::Double(value as f64)
         }
         (ParamValue::Double(value), ParameterKind::Integer) if is_integer(value) => {
-            Typed::Integer(value as i64)
+            TypedValue::Integer(value as i64)
         }
-        // Bytes have no JSON of their own: they come as base64, or as numbers.
+        // JSON has no bytes: they are given as base64, or as numbers.
         (ParamValue::String(text), ParameterKind::Bytes) => {
             match BASE64.decode_to_vec(text.as_bytes()) {
-                Ok(bytes) => Typed::Bytes(bytes),
-                Err(_) => Typed::String(text),
+                Ok(bytes) => TypedValue::Bytes(bytes),
+                Err(_) => TypedValue::String(text),
             }
         }
-        (ParamValue::List(items), kind) => list(items, kind)?,
-        (ParamValue::Nil, _) => Typed::NotSet,
-        (ParamValue::Bool(value), _) => Typed::Bool(value),
-        (ParamValue::Int(value), _) => Typed::Integer(value),
-        (ParamValue::Double(value), _) => Typed::Double(value),
-        (ParamValue::String(text), _) => Typed::String(text),
-        (ParamValue::Binary(bytes), _) => Typed::Bytes(bytes),
+        (ParamValue::List(items), kind) => coerce_list(items, kind)?,
+        (ParamValue::Nil, _) => TypedValue::NotSet,
+        (ParamValue::Bool(value), _) => TypedValue::Bool(value),
+        (ParamValue::Int(value), _) => TypedValue::Integer(value),
+        (ParamValue::Double(value), _) => TypedValue::Double(value),
+        (ParamValue::String(text), _) => TypedValue::String(text),
+        (ParamValue::Binary(bytes), _) => TypedValue::Bytes(bytes),
         (ParamValue::Map(_), _) => {
             return Err(
-                "a parameter of ROS 2 holds no dictionary: set each of its values".to_owned(),
+                "a ROS 2 parameter cannot be a dictionary: set each of its values".to_owned(),
             );
         }
     };
     Ok(natural)
 }
 
-fn list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<Typed, String> {
+fn coerce_list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<TypedValue, String> {
     let by_kind = match kind {
-        ParameterKind::Bytes => all(&items, byte).map(Typed::Bytes),
-        ParameterKind::Bools => all(&items, bool).map(Typed::Bools),
-        ParameterKind::Integers => all(&items, integer).map(Typed::Integers),
-        ParameterKind::Doubles => all(&items, double).map(Typed::Doubles),
-        ParameterKind::Strings => all(&items, text).map(Typed::Strings),
+        ParameterKind::Bytes => all(&items, byte).map(TypedValue::Bytes),
+        ParameterKind::Bools => all(&items, bool).map(TypedValue::Bools),
+        ParameterKind::Integers => all(&items, integer).map(TypedValue::Integers),
+        ParameterKind::Doubles => all(&items, double).map(TypedValue::Doubles),
+        ParameterKind::Strings => all(&items, text).map(TypedValue::Strings),
         _ => None,
     };
     if let Some(typed) = by_kind {
@@ -103,12 +103,12 @@ fn list(items: Vec<ParamValue>, kind: ParameterKind) -> Result<Typed, String> {
         _ => None,
     };
     all(&items, bool)
-        .map(Typed::Bools)
-        .or_else(|| all(&items, whole).map(Typed::Integers))
-        .or_else(|| all(&items, double).map(Typed::Doubles))
-        .or_else(|| all(&items, text).map(Typed::Strings))
+        .map(TypedValue::Bools)
+        .or_else(|| all(&items, whole).map(TypedValue::Integers))
+        .or_else(|| all(&items, double).map(TypedValue::Doubles))
+        .or_else(|| all(&items, text).map(TypedValue::Strings))
         .ok_or_else(|| {
-            "a list holds values of one kind: all true or false, numbers, or texts".to_owned()
+            "a list holds values of one type: all booleans, numbers or strings".to_owned()
         })
 }
 
@@ -159,8 +159,8 @@ fn is_integer(value: f64) -> bool {
 }
 
 /// Writes a value.
-pub(super) fn write(value: &Typed, put: &mut Put) {
-    use Typed::*;
+pub(super) fn write(value: &TypedValue, put: &mut CdrWriter) {
+    use TypedValue::*;
     let number = match value {
         NotSet => 0,
         Bool(_) => 1,
@@ -207,13 +207,13 @@ pub(super) fn write(value: &Typed, put: &mut Put) {
     texts.iter().for_each(|one| put.text(one));
 }
 
-/// Reads a value; none in it where the parameter holds nothing.
-pub(super) fn read(reading: &mut Reading<'_>) -> Option<Option<ParamValue>> {
-    let kind = ParameterKind::of(reading.byte()?);
+/// Reads a value; the inner `None` means that the parameter is not set.
+pub(super) fn read(reading: &mut ParameterReader<'_>) -> Option<Option<ParamValue>> {
+    let kind = ParameterKind::from_number(reading.byte()?);
     let bool = reading.byte()? != 0;
     let integer = reading.integer()?;
     let double = reading.double()?;
-    let text = reading.bytes_of_text()?;
+    let text = reading.text_bytes()?;
     let bytes = reading.bytes()?;
     let bools = reading.bytes()?;
     let integers = reading.numbers()?;
@@ -227,7 +227,7 @@ pub(super) fn read(reading: &mut Reading<'_>) -> Option<Option<ParamValue>> {
         ParameterKind::Bool => Some(ParamValue::Bool(bool)),
         ParameterKind::Integer => Some(ParamValue::Int(integer)),
         ParameterKind::Double => Some(ParamValue::Double(double)),
-        ParameterKind::String => Some(ParamValue::String(text_of(text))),
+        ParameterKind::String => Some(ParamValue::String(lossy_text(text))),
         ParameterKind::Bytes => Some(ParamValue::Binary(bytes.to_vec())),
         ParameterKind::Bools => {
             reading.spend(bools.len())?;
@@ -251,7 +251,7 @@ pub(super) fn read(reading: &mut Reading<'_>) -> Option<Option<ParamValue>> {
     })
 }
 
-/// What is no UTF-8 is replaced.
-fn text_of(bytes: &[u8]) -> String {
+/// Converts to text; invalid UTF-8 is replaced.
+fn lossy_text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }

@@ -1,4 +1,4 @@
-//! The readers of one topic that is subscribed to: which there are, and whom they hear.
+//! The readers of one subscribed topic, and the writers they match.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::future::pending;
@@ -6,44 +6,44 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use futures_util::future::select_all;
-use rtps::{EndpointData, EndpointQos, Ends, Guid, Topic};
+use rtps::{EndpointData, EndpointMatches, EndpointQos, Guid, TopicDescription};
 use tokio::sync::watch;
 
-use super::{Ear, Source, TopicIn};
-use crate::bus::{BusError, Matched, Peer, PeerId, Refusal};
-use crate::ros2::bus::Inner;
+use super::{KnownWriter, ReaderSink, TopicIn};
+use crate::bus::{BusError, IncompatiblePeer, MatchedPeers, PeerId, TopicPeer};
+use crate::ros2::bus::Ros2BusState;
 use crate::ros2::ends::ReaderEnd;
 use crate::ros2::quality::{self, Quality};
-use crate::ros2::seen::{self, Seen};
+use crate::ros2::seen::{self, DiscoverySnapshot};
 use crate::ros2::{names, show, type_hash};
 
-/// A subscription to messages of any type hears so many types of one topic.
+/// Maximum number of types of one topic that a subscription to any type receives.
 const MAX_TYPES: usize = 8;
 
 /// The readers of one topic.
 pub(super) struct Readers {
-    bus: Arc<Inner>,
+    bus: Arc<Ros2BusState>,
     topic: Arc<TopicIn>,
-    /// As DDS has it.
+    /// Name in DDS.
     name: String,
-    /// The type as DDS has it; none where all are wanted.
+    /// Type name in DDS; `None` for any type.
     type_name: Option<String>,
-    /// By type and quality.
-    open: BTreeMap<(String, Quality), Open>,
-    /// Writers in the order in which they came.
+    /// Readers by type and quality.
+    open: BTreeMap<(String, Quality), OpenReader>,
+    /// Writers in order of appearance.
     order: Vec<Guid>,
-    /// Refusals that were logged.
+    /// Incompatible peers that were logged.
     told: HashMap<PeerId, String>,
 }
 
-struct Open {
+struct OpenReader {
     _reader: ReaderEnd,
     qos: EndpointQos,
-    ends: watch::Receiver<Arc<Ends>>,
+    ends: watch::Receiver<Arc<EndpointMatches>>,
 }
 
 impl Readers {
-    pub(super) fn open(bus: &Arc<Inner>, topic: &Arc<TopicIn>) -> Result<Self, BusError> {
+    pub(super) fn open(bus: &Arc<Ros2BusState>, topic: &Arc<TopicIn>) -> Result<Self, BusError> {
         let type_name = match topic.key.type_name.as_str() {
             "*" => None,
             name => Some(names::message_type(name)?),
@@ -58,17 +58,17 @@ impl Readers {
             told: HashMap::new(),
         };
         let seen = Arc::clone(&bus.seen.borrow());
-        readers.look(&seen);
+        readers.update(&seen);
         Ok(readers)
     }
 
-    /// Follows for ever.
+    /// Runs forever.
     pub(super) async fn follow(mut self) {
         let topic = Arc::clone(&self.topic);
         let mut seen = self.bus.seen.subscribe();
         loop {
             let now = Arc::clone(&seen.borrow_and_update());
-            self.look(&now);
+            self.update(&now);
             tokio::select! {
                 changed = seen.changed() => if changed.is_err() { return },
                 () = self.ends_changed() => {}
@@ -88,11 +88,11 @@ impl Readers {
         }
     }
 
-    /// Brings the readers in line with the writers that are there, and shows those.
-    fn look(&mut self, seen: &Seen) {
+    /// Adapts the readers to the existing writers, and publishes the matched peers.
+    fn update(&mut self, seen: &DiscoverySnapshot) {
         let sources = self.sources(seen);
         let mut needed: BTreeMap<(String, Quality), Bytes> = BTreeMap::new();
-        let announced = self.topic.announced();
+        let announced = self.topic.announced_type();
         let announced = announced.map(|of| type_hash::user_data(&of.digest));
         for writer in seen.writers(&self.name) {
             if let Some(source) = sources.get(&writer.guid) {
@@ -103,8 +103,8 @@ impl Readers {
                     .or_insert_with(|| ours.unwrap_or_else(|| writer.user_data.clone()));
             }
         }
-        // What is wished for shows that somebody listens, until there is a writer. One that offers less would be told that it is
-        // incompatible by such a reader, and nodes write a warning of that into their logs.
+        // While there is no writer, a reader of the preferred quality shows that somebody listens. A writer that offers
+        // less would be reported as incompatible because of such a reader, and nodes log a warning about that.
         if let (Some(type_name), true) = (&self.type_name, needed.is_empty()) {
             let key = (type_name.clone(), self.topic.key.wish);
             needed.insert(key, announced.unwrap_or_default());
@@ -120,18 +120,18 @@ impl Readers {
         }
         let discovered = Arc::clone(&self.topic.discovered.borrow());
         let mut locals = self.topic.locals.lock();
-        // What a publisher has left behind goes with it.
+        // A publisher's last message is dropped together with the publisher.
         locals
             .latched
             .retain(|writer, _| discovered.writers.contains_key(writer));
         drop(locals);
-        let now = self.matched(seen, &sources);
-        show::refusals(&mut self.told, &self.topic.key.topic, &now);
-        show::matched(&self.topic.matched, now);
+        let now = self.matched_peers(seen, &sources);
+        show::log_incompatible(&mut self.told, &self.topic.key.topic, &now);
+        show::publish_matched(&self.topic.matched, now);
     }
 
-    /// The writers of types that are wanted.
-    fn sources(&self, seen: &Seen) -> HashMap<Guid, Arc<Source>> {
+    /// Returns the writers of the requested types.
+    fn sources(&self, seen: &DiscoverySnapshot) -> HashMap<Guid, Arc<KnownWriter>> {
         let known = self.topic.sources.lock().clone();
         let mut types = BTreeSet::new();
         let mut sources = HashMap::new();
@@ -148,46 +148,50 @@ impl Readers {
             }
             let before = known.get(&writer.guid);
             let node = seen.node(writer.guid);
-            let same = |before: &&Arc<Source>| {
+            let same = |before: &&Arc<KnownWriter>| {
                 before.peer.node() == &*node && before.named == seen.is_named(writer.guid)
             };
             let source = match before.filter(same) {
                 Some(before) => Arc::clone(before),
-                None => Arc::new(Source::of(writer, self.topic.key.wish, seen)),
+                None => Arc::new(KnownWriter::new(writer, self.topic.key.wish, seen)),
             };
             sources.insert(writer.guid, source);
         }
         sources
     }
 
-    fn open_one(&self, (type_name, quality): &(String, Quality), user_data: Bytes) -> Open {
-        let topic = Topic {
+    fn open_one(&self, (type_name, quality): &(String, Quality), user_data: Bytes) -> OpenReader {
+        let topic = TopicDescription {
             name: self.name.clone(),
             type_name: type_name.clone(),
             user_data,
         };
-        let qos = quality::endpoint(*quality, self.topic.depth);
-        let ear = Ear {
+        let qos = quality::reader_qos(*quality, self.topic.depth);
+        let ear = ReaderSink {
             topic: Arc::clone(&self.topic),
             quality: *quality,
         };
         let reader = ReaderEnd::open(&self.bus, &topic, qos, Arc::new(ear));
-        Open {
+        OpenReader {
             ends: reader.ends(),
             qos,
             _reader: reader,
         }
     }
 
-    /// Who is at the other end now.
-    fn matched(&mut self, seen: &Seen, sources: &HashMap<Guid, Arc<Source>>) -> Matched {
+    /// Returns the current matched peers.
+    fn matched_peers(
+        &mut self,
+        seen: &DiscoverySnapshot,
+        sources: &HashMap<Guid, Arc<KnownWriter>>,
+    ) -> MatchedPeers {
         let ends = self.open.iter_mut().map(|(key, open)| {
             let ends = Arc::clone(&open.ends.borrow_and_update());
             (key, (open.qos, ends))
         });
         let ends: BTreeMap<_, _> = ends.collect();
         self.order.retain(|writer| sources.contains_key(writer));
-        let mut now = Matched::default();
+        let mut now = MatchedPeers::default();
         let named = |writer: &&Arc<EndpointData>| seen.is_named(writer.guid);
         for writer in seen.writers(&self.name).iter().filter(named) {
             if !sources.contains_key(&writer.guid) {
@@ -195,11 +199,11 @@ impl Readers {
                 if self.type_name.is_some() {
                     let ours = self
                         .topic
-                        .wanted(&theirs)
+                        .check_wanted(&theirs)
                         .err()
-                        .or_else(|| self.topic.announced());
-                    let why = ours.map(|ours| show::other_type(&theirs, &ours));
-                    now.refused.push(Refusal {
+                        .or_else(|| self.topic.announced_type());
+                    let why = ours.map(|ours| show::type_mismatch_text(&theirs, &ours));
+                    now.refused.push(IncompatiblePeer {
                         peer: seen.peer(writer.guid),
                         why: why.unwrap_or_default(),
                     });
@@ -217,18 +221,18 @@ impl Readers {
                 continue;
             };
             let peer = source.peer.clone();
-            if let Err(ours) = self.topic.wanted(&source.offer.wire_type) {
-                let why = show::other_type(&source.offer.wire_type, &ours);
-                now.refused.push(Refusal { peer, why });
+            if let Err(ours) = self.topic.check_wanted(&source.offer.wire_type) {
+                let why = show::type_mismatch_text(&source.offer.wire_type, &ours);
+                now.refused.push(IncompatiblePeer { peer, why });
             } else if ends.matched.iter().any(|it| it.guid == *writer) {
-                now.peers.push(Peer {
+                now.peers.push(TopicPeer {
                     id: peer,
                     connected: ends.confirmed.contains(writer),
                     offer: Some(source.offer.clone()),
                 });
             } else if let Some((it, why)) = ends.refused.iter().find(|(it, _)| it.guid == *writer) {
-                let why = quality::refusal(why, &it.qos, qos);
-                now.refused.push(Refusal { peer, why });
+                let why = quality::mismatch_text(why, &it.qos, qos);
+                now.refused.push(IncompatiblePeer { peer, why });
             }
         }
         now

@@ -1,5 +1,5 @@
 use super::*;
-use crate::bus::{BusError, Graph, NodeNames, Qos};
+use crate::bus::{BusError, Graph, NodeNames, QosProfile};
 use crate::ros2::Ros2Bus;
 use crate::{JoinOptions, net::HostSockets};
 
@@ -16,7 +16,7 @@ async fn graph(bus: &Ros2Bus, wanted: impl Fn(&Graph) -> bool) -> Arc<Graph> {
 #[tokio::test]
 async fn nodes_are_shown_with_what_they_have() {
     let (one, two) = (join(50, "/one").await, join(50, "/ns/two").await);
-    let qos = Qos::keep_last(1);
+    let qos = QosProfile::keep_last(1);
     let publisher = one.advertise("/chatter", string(), qos).await.unwrap();
     let _heard = two.subscribe("/chatter", string(), qos).await.unwrap();
     let nodes = |list: &[&str]| list.iter().map(ToString::to_string).collect::<Vec<_>>();
@@ -45,7 +45,7 @@ async fn nodes_are_shown_with_what_they_have() {
 #[tokio::test]
 async fn a_bus_that_stands_for_several_nodes_is_seen_as_these() {
     let (one, two) = (join(53, "/ears").await, join(53, "/other").await);
-    let qos = Qos::keep_last(1);
+    let qos = QosProfile::keep_last(1);
     let names = |names: &[&str]| names.iter().map(ToString::to_string).collect();
     let mouth = NodeNames {
         publishes: names(&["/said", "/log"]),
@@ -62,7 +62,7 @@ async fn a_bus_that_stands_for_several_nodes_is_seen_as_these() {
             ("no name".to_owned(), ears.clone()),
         ]
     };
-    one.stands_for(both(&mouth).into());
+    one.set_represented_nodes(both(&mouth).into());
     let _said = one.advertise("/said", string(), qos).await.unwrap();
     let _log = one.advertise("/log", string(), qos).await.unwrap();
     let _heard = one.subscribe("/said", string(), qos).await.unwrap();
@@ -75,8 +75,8 @@ async fn a_bus_that_stands_for_several_nodes_is_seen_as_these() {
     let nodes: Vec<_> = seen.nodes.keys().collect();
     assert_eq!(nodes, ["/ears", "/mouth", "/other"]);
     assert_eq!(seen.nodes["/mouth"], one.guid().to_string());
-    // It is its own again when nobody else is said to have it.
-    one.stands_for([].into());
+    // It is its own again when no other node is said to have it.
+    one.set_represented_nodes([].into());
     let seen = graph(&two, |graph| is(graph, "/ears")).await;
     assert!(!seen.nodes.contains_key("/mouth"), "{seen:#?}");
 }
@@ -90,13 +90,13 @@ async fn names_and_domains_that_are_none_are_refused() {
     let said = far.expect_err("there is no such domain").to_string();
     assert!(said.contains("ROS_DOMAIN_ID 233"), "{said}");
     let bus = join(51, "/one").await;
-    let qos = Qos::keep_last(1);
+    let qos = QosProfile::keep_last(1);
     for bad in ["chatter", "/2", "/a b"] {
         let subscribed = bus.subscribe(bad, string(), qos).await;
         assert!(matches!(subscribed, Err(BusError::BadName(_))), "{bad}");
     }
     let typed = bus
-        .subscribe("/a", WireType::named("std_msgs/ String"), qos)
+        .subscribe("/a", WireType::with_name("std_msgs/ String"), qos)
         .await;
     assert!(matches!(typed, Err(BusError::BadName(_))));
 }

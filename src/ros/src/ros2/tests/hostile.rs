@@ -1,19 +1,19 @@
-//! Peers that lie, leave holes and never end what they begin.
+//! Peers that lie, leave gaps and never finish what they begin.
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 
 use budget::Budget;
 use rtps::wire::{Data, DataFrag, DatagramWriter, Heartbeat, InlineQos};
 use rtps::{
-    Config, EndpointData, EndpointQos, EntityId, Guid, GuidPrefix, History, Participant,
-    ParticipantData, SequenceNumber, Topic, VendorId,
+    Config, EndpointData, EndpointQos, EntityId, Guid, GuidPrefix, HistoryKind, Participant,
+    ParticipantData, SequenceNumber, TopicDescription, VendorId,
 };
 
 use super::*;
 use crate::JoinOptions;
-use crate::bus::{Digest, Qos, ServiceHandler, ServiceType};
+use crate::bus::{Digest, QosProfile, ServiceHandler, ServiceType};
 use crate::net::HostSockets;
-use crate::ros2::place::Place;
+use crate::ros2::place::BusSockets;
 use crate::ros2::{Ros2Bus, entities};
 use crate::schema::Registry;
 
@@ -21,34 +21,34 @@ use crate::schema::Registry;
 const WRITER: EntityId = EntityId([0, 0, 1, 3]);
 const LIMIT: usize = 1 << 20;
 
-fn named(name: &str, type_name: &str) -> Topic {
-    Topic {
+fn topic_named(name: &str, type_name: &str) -> TopicDescription {
+    TopicDescription {
         name: name.to_owned(),
         type_name: type_name.to_owned(),
         user_data: Bytes::new(),
     }
 }
 
-/// A participant made by hand, which hears and answers nothing.
+/// A hand-made participant, which receives and answers nothing.
 struct Forger {
     prefix: GuidPrefix,
     socket: UdpSocket,
-    /// Where the bus hears of ends, and of samples.
+    /// Addresses of the bus for discovery, and for samples.
     discovery: SocketAddr,
     user: SocketAddr,
 }
 
 impl Forger {
-    /// Announces itself to a bus with a reliable writer of `/chat`; `seen_by` knows where that bus is.
+    /// Announces itself to a bus with a reliable writer of `/chat`; `seen_by` knows the bus's address.
     fn with_a_writer(bus: &Ros2Bus, seen_by: &Ros2Bus, domain: u16) -> Self {
-        let known = seen_by.inner.discovered();
+        let known = seen_by.inner.discovery();
         let there = &known.participants[&bus.guid().prefix];
         let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a socket");
         let at = socket.local_addr().expect("its address");
         let forger = Self {
             prefix: GuidPrefix([0xbd; 12]),
-            discovery: there.discovery[0].udp().expect("an address"),
-            user: there.user[0].udp().expect("an address"),
+            discovery: there.discovery[0].udp_address().expect("an address"),
+            user: there.user[0].udp_address().expect("an address"),
             socket,
         };
         let here = vec![(Ipv4Addr::LOCALHOST, at.port()).into()];
@@ -71,7 +71,7 @@ impl Forger {
             topic: "rt/chat".to_owned(),
             type_name: "std_msgs::msg::dds_::String_".to_owned(),
             qos: EndpointQos {
-                history: History::KeepLast(10),
+                history: HistoryKind::KeepLast(10),
                 ..EndpointQos::default()
             },
             user_data: Bytes::new(),
@@ -102,7 +102,7 @@ impl Forger {
         self.send(to, datagram);
     }
 
-    /// The first fragment of a sample of a gigabyte, or so.
+    /// Sends the first fragment of a sample of about a gigabyte.
     fn fragment(&self, number: i64) {
         let mut datagram = DatagramWriter::new(self.prefix);
         datagram.data_frag(&DataFrag {
@@ -120,7 +120,7 @@ impl Forger {
         self.send(self.user, datagram);
     }
 
-    /// A writer says that it has nothing yet, and begins with 1.
+    /// Announces that a writer has no samples yet, and begins with 1.
     fn begins(&self, to: SocketAddr, writer: EntityId) {
         let mut datagram = DatagramWriter::new(self.prefix);
         datagram.heartbeat(&Heartbeat {
@@ -145,15 +145,15 @@ async fn what_waits_for_what_never_comes_costs_no_more_than_the_budget() {
     };
     let joined = Ros2Bus::connect(Arc::new(HostSockets), options).await;
     let (one, two) = (joined.expect("a bus"), join(90, "/two").await);
-    let qos = Qos::keep_last(10);
+    let qos = QosProfile::keep_last(10);
     let mut heard = one.subscribe("/chat", string(), qos).await.unwrap();
     let good = two.advertise("/chat", string(), qos).await.unwrap();
-    connected(good.matched(), 1).await;
+    expect_connected(good.matched_subscribers(), 1).await;
     let forger = Forger::with_a_writer(&one, &two, domain(90));
-    until(heard.matched.clone(), |matched| matched.peers.len() == 2).await;
+    wait_for_matched(heard.matched.clone(), |matched| matched.peers.len() == 2).await;
     forger.begins(forger.user, WRITER);
     let pause = || tokio::time::sleep(Duration::from_millis(2));
-    // Number 1 never comes. Of these some may be lost on the way.
+    // Number 1 never arrives. Some of these may be lost in transit.
     for number in 2..=200 {
         if number % 10 == 0 {
             forger.fragment(number);
@@ -162,42 +162,45 @@ async fn what_waits_for_what_never_comes_costs_no_more_than_the_budget() {
         }
         pause().await;
     }
-    assert!(budget.refused() > 100, "{budget:?}");
-    assert!((LIMIT / 2..=LIMIT).contains(&budget.used()), "{budget:?}");
-    good.publish(numbered(7));
-    assert_eq!(next(&mut heard).await.bytes, numbered(7));
-    // With the forger goes what it has sent.
+    assert!(budget.refusal_count() > 100, "{budget:?}");
+    assert!(
+        (LIMIT / 2..=LIMIT).contains(&budget.used_bytes()),
+        "{budget:?}"
+    );
+    good.publish(numbered_message(7));
+    assert_eq!(next(&mut heard).await.bytes, numbered_message(7));
+    // The forger's samples are dropped with the forger.
     drop(forger);
-    let gone = until(heard.matched.clone(), |matched| matched.peers.len() == 1).await;
+    let gone = wait_for_matched(heard.matched.clone(), |matched| matched.peers.len() == 1).await;
     assert_eq!(gone.peers.len(), 1);
-    assert_eq!(budget.used(), 0);
+    assert_eq!(budget.used_bytes(), 0);
 }
 
 #[tokio::test]
 async fn nodes_that_tell_nonsense_of_themselves_harm_nobody() {
     let one = join(91, "/one").await;
-    let place = Arc::new(Place(Arc::new(HostSockets)));
+    let place = Arc::new(BusSockets(Arc::new(HostSockets)));
     let liar = Participant::join(place, Config::new(domain(91), "liar")).await;
     let liar = liar.expect("a participant");
     let tells = liar.writer(entities::topic(), entities::qos());
     let chats = liar.writer(
-        named("rt/chat", "std_msgs::msg::dds_::String_"),
+        topic_named("rt/chat", "std_msgs::msg::dds_::String_"),
         EndpointQos::default(),
     );
     let asks = liar.writer(
-        named("rq/echoRequest", "tests::srv::dds_::Echo_Request_"),
+        topic_named("rq/echoRequest", "tests::srv::dds_::Echo_Request_"),
         EndpointQos::default(),
     );
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     let text = "string data\n---\nstring data\n";
     registry.insert("tests/srv/Echo", text).unwrap();
-    let of = ServiceType::of(&registry.service("tests/srv/Echo").unwrap());
+    let of = ServiceType::from_service(&registry.service("tests/srv/Echo").unwrap());
     let _serving = one.serve("/echo", of, Arc::new(Echo)).await.unwrap();
     let mut heard = one
-        .subscribe("/chat", string(), Qos::keep_last(100))
+        .subscribe("/chat", string(), QosProfile::keep_last(100))
         .await
         .unwrap();
-    connected(heard.matched.clone(), 1).await;
+    expect_connected(heard.matched.clone(), 1).await;
     let nonsense = [
         Bytes::new(),
         Bytes::from_static(&[0]),
@@ -213,18 +216,18 @@ async fn nodes_that_tell_nonsense_of_themselves_harm_nobody() {
         asks.write(bytes);
     }
     let two = join(91, "/two").await;
-    let good = two.advertise("/chat", string(), Qos::keep_last(10));
+    let good = two.advertise("/chat", string(), QosProfile::keep_last(10));
     let good = good.await.unwrap();
-    connected(good.matched(), 1).await;
-    good.publish(numbered(7));
-    while next(&mut heard).await.bytes != numbered(7) {}
+    expect_connected(good.matched_subscribers(), 1).await;
+    good.publish(numbered_message(7));
+    while next(&mut heard).await.bytes != numbered_message(7) {}
     let mut graph = two.graph();
     let served = graph.wait_for(|graph| graph.services.contains_key("/echo"));
     timeout(LONG, served).await.expect("in time").expect("open");
     let answer = two
-        .call_typed("/echo", &Digest::any(), numbered(8), LONG)
+        .call_typed("/echo", &Digest::any(), numbered_message(8), LONG)
         .await;
-    assert_eq!(answer.unwrap(), numbered(8));
+    assert_eq!(answer.unwrap(), numbered_message(8));
 }
 
 struct Echo;

@@ -13,7 +13,7 @@ use crate::schema::{Registry, ServiceDef};
 const SOON: Duration = Duration::from_millis(500);
 
 fn definition(text: &str) -> Arc<ServiceDef> {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     registry
         .insert("tests/srv/Echo", text)
         .expect("a definition");
@@ -21,10 +21,10 @@ fn definition(text: &str) -> Arc<ServiceDef> {
 }
 
 fn echo() -> ServiceType {
-    ServiceType::of(&definition("string data\n---\nstring data\n"))
+    ServiceType::from_service(&definition("string data\n---\nstring data\n"))
 }
 
-/// Gives back what it is given, and says who asked.
+/// Returns the request with the caller's name.
 #[derive(Default)]
 struct Echo {
     calls: AtomicUsize,
@@ -39,7 +39,7 @@ impl ServiceHandler for Echo {
     }
 }
 
-/// Answers when it is told to.
+/// Answers when told to.
 struct Slow {
     asked: mpsc::UnboundedSender<()>,
     answer: Arc<Notify>,
@@ -67,7 +67,7 @@ async fn pair(number: u16) -> (Arc<Ros2Bus>, Arc<Ros2Bus>) {
     (join(number, "/server").await, join(number, "/client").await)
 }
 
-async fn served(bus: &Ros2Bus, service: &str) {
+async fn wait_until_served(bus: &Ros2Bus, service: &str) {
     let mut graph = bus.graph();
     let found = graph.wait_for(|graph| graph.services.contains_key(service));
     timeout(LONG, found)
@@ -83,15 +83,21 @@ async fn calls_are_answered_one_after_the_other_and_many_at_once() {
         .serve("/echo", echo(), Arc::new(Echo::default()))
         .await
         .unwrap();
-    served(&client, "/echo").await;
-    let answer = client.call("/echo", numbered(7), LONG).await.unwrap();
-    assert_eq!(answer, numbered(7));
+    wait_until_served(&client, "/echo").await;
+    let answer = client
+        .call("/echo", numbered_message(7), LONG)
+        .await
+        .unwrap();
+    assert_eq!(answer, numbered_message(7));
     let mut calls = JoinSet::new();
     for number in 0..200 {
         let client = Arc::clone(&client);
         calls.spawn(async move {
-            let answer = client.call("/echo", numbered(number), LONG).await.unwrap();
-            assert_eq!(answer, numbered(number));
+            let answer = client
+                .call("/echo", numbered_message(number), LONG)
+                .await
+                .unwrap();
+            assert_eq!(answer, numbered_message(number));
         });
     }
     calls.join_all().await;
@@ -105,20 +111,22 @@ async fn the_type_of_a_service_is_what_its_server_says() {
         .serve("/echo", echo(), Arc::new(Echo::default()))
         .await
         .unwrap();
-    served(&client, "/echo").await;
+    wait_until_served(&client, "/echo").await;
     let told = client.service_type("/echo").await.unwrap();
     let ours = echo();
     assert_eq!(
         (&told.name, &told.request, &told.response),
         (&ours.name, &ours.request, &ours.response)
     );
-    assert!(told.digest.is_any() && told.agrees(&ours));
-    let other = ServiceType::of(&definition("int32 data\n---\nstring data\n"));
-    assert!(!told.agrees(&other));
+    assert!(told.digest.is_any() && told.is_compatible_with(&ours));
+    let other = ServiceType::from_service(&definition("int32 data\n---\nstring data\n"));
+    assert!(!told.is_compatible_with(&other));
     assert_eq!(server.service_type("/echo").await.unwrap(), ours);
-    // Whoever serves it here tells the digest of the whole.
+    // A server on this bus knows the digest of the whole service.
     let wrong = Digest::from("RIHS01_00");
-    let refused = server.call_typed("/echo", &wrong, numbered(1), LONG).await;
+    let refused = server
+        .call_typed("/echo", &wrong, numbered_message(1), LONG)
+        .await;
     assert!(matches!(refused, Err(BusError::TypeMismatch { .. })));
 }
 
@@ -132,13 +140,16 @@ async fn what_this_bus_serves_it_can_call() {
         .unwrap();
     let again = server.serve("/echo", echo(), handler.clone()).await;
     assert!(matches!(again, Err(BusError::AlreadyServed(_))));
-    let answer = server.call("/echo", numbered(3), LONG).await.unwrap();
+    let answer = server
+        .call("/echo", numbered_message(3), LONG)
+        .await
+        .unwrap();
     assert_eq!(
         (answer, handler.calls.load(Ordering::Relaxed)),
-        (numbered(3), 1)
+        (numbered_message(3), 1)
     );
     drop(guard);
-    let gone = server.call("/echo", numbered(3), LONG).await;
+    let gone = server.call("/echo", numbered_message(3), LONG).await;
     assert!(matches!(gone, Err(BusError::NoService(_))), "{gone:?}");
     let _again = server.serve("/echo", echo(), handler).await.unwrap();
 }
@@ -147,20 +158,20 @@ async fn what_this_bus_serves_it_can_call() {
 async fn nobody_serves_and_nobody_answers() {
     let (server, client) = pair(56).await;
     let begun = Instant::now();
-    let nobody = client.call("/none", numbered(1), LONG).await;
+    let nobody = client.call("/none", numbered_message(1), LONG).await;
     assert!(matches!(nobody, Err(BusError::NoService(_))), "{nobody:?}");
     assert!(begun.elapsed() < LONG / 2);
     let _guard = server
         .serve("/refuses", echo(), Arc::new(Refuses))
         .await
         .unwrap();
-    served(&client, "/refuses").await;
-    let unanswered = client.call("/refuses", numbered(1), SOON).await;
+    wait_until_served(&client, "/refuses").await;
+    let unanswered = client.call("/refuses", numbered_message(1), SOON).await;
     assert!(
         matches!(unanswered, Err(BusError::Timeout { .. })),
         "{unanswered:?}"
     );
-    let own = server.call("/refuses", numbered(1), SOON).await;
+    let own = server.call("/refuses", numbered_message(1), SOON).await;
     assert!(matches!(
         own,
         Err(BusError::CallFailed {
@@ -179,9 +190,9 @@ async fn a_server_that_goes_is_noticed_at_once() {
         answer: Arc::default(),
     };
     let _guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
-    served(&client, "/slow").await;
+    wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);
-    let call = tokio::spawn(async move { calling.call("/slow", numbered(1), LONG).await });
+    let call = tokio::spawn(async move { calling.call("/slow", numbered_message(1), LONG).await });
     timeout(LONG, asks.recv()).await.expect("it is asked");
     let begun = Instant::now();
     server.close().await;
@@ -209,13 +220,13 @@ async fn what_was_asked_before_a_service_ended_is_answered() {
         answer: Arc::clone(&answer),
     };
     let guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
-    served(&client, "/slow").await;
+    wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);
-    let call = tokio::spawn(async move { calling.call("/slow", numbered(1), LONG).await });
+    let call = tokio::spawn(async move { calling.call("/slow", numbered_message(1), LONG).await });
     timeout(LONG, asks.recv()).await.expect("it is asked");
     answer.notify_one();
     let answered = call.await.unwrap();
-    assert_eq!(answered.unwrap(), numbered(1));
+    assert_eq!(answered.unwrap(), numbered_message(1));
     drop(guard);
 }
 
@@ -228,9 +239,9 @@ async fn a_bus_that_is_closed_ends_its_calls() {
         answer: Arc::default(),
     };
     let _guard = server.serve("/slow", echo(), Arc::new(slow)).await.unwrap();
-    served(&client, "/slow").await;
+    wait_until_served(&client, "/slow").await;
     let calling = Arc::clone(&client);
-    let call = tokio::spawn(async move { calling.call("/slow", numbered(1), LONG).await });
+    let call = tokio::spawn(async move { calling.call("/slow", numbered_message(1), LONG).await });
     timeout(LONG, asks.recv()).await.expect("it is asked");
     client.close().await;
     let ended = call.await.unwrap();

@@ -1,46 +1,49 @@
-use rtps::{Config, EndpointQos, Participant, Reader, Sample, Sink, Topic, Writer};
+use rtps::{
+    Config, DataReader, DataWriter, EndpointQos, Participant, ReceivedSample, Sink,
+    TopicDescription,
+};
 
 use super::*;
-use crate::bus::{BusError, Durability, Publisher, Qos, Reliability};
+use crate::bus::{BusError, Publisher, QosDurability, QosProfile, QosReliability};
 use crate::net::HostSockets;
 use crate::ros2::bus::Ros2Bus;
-use crate::ros2::place::Place;
+use crate::ros2::place::BusSockets;
 use crate::ros2::{entities, names, type_hash};
 
 const DEPTH: usize = 10;
 
-fn best_effort() -> Qos {
-    Qos {
-        reliability: Reliability::BestEffort,
-        ..Qos::keep_last(DEPTH)
+fn best_effort() -> QosProfile {
+    QosProfile {
+        reliability: QosReliability::BestEffort,
+        ..QosProfile::keep_last(DEPTH)
     }
 }
 
-fn latching() -> Qos {
-    Qos::keep_last(DEPTH).latching(true)
+fn latching() -> QosProfile {
+    QosProfile::keep_last(DEPTH).latching(true)
 }
 
-/// A participant without nodes, for what no bus does.
+/// A participant without nodes, for what a bus never does.
 async fn stranger(number: u16) -> Participant {
     let config = Config::new(domain(number), "stranger");
-    let joined = Participant::join(Arc::new(Place(Arc::new(HostSockets))), config).await;
+    let joined = Participant::join(Arc::new(BusSockets(Arc::new(HostSockets))), config).await;
     joined.expect("a domain can be joined")
 }
 
 struct Nowhere;
 
 impl Sink for Nowhere {
-    fn sample(&self, _: Sample) {}
+    fn on_sample(&self, _: ReceivedSample) {}
 }
 
-fn read(participant: &Participant, topic: Topic, qos: EndpointQos) -> Reader {
+fn read(participant: &Participant, topic: TopicDescription, qos: EndpointQos) -> DataReader {
     participant.reader(topic, qos, Arc::new(Nowhere))
 }
 
 #[tokio::test]
 async fn messages_pass_and_nobody_hears_himself() {
     let (one, two) = (join(40, "/one").await, join(40, "/two").await);
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     let mut own = one.subscribe("/chatter", string(), qos).await.unwrap();
     let mut other = two.subscribe("/chatter", string(), qos).await.unwrap();
     let mut same = two
@@ -49,16 +52,16 @@ async fn messages_pass_and_nobody_hears_himself() {
         .unwrap();
     let publisher = one.advertise("/chatter", string(), qos).await.unwrap();
     let back = two.advertise("/chatter", string(), qos).await.unwrap();
-    connected(publisher.matched(), 2).await;
-    connected(back.matched(), 1).await;
-    connected(other.matched.clone(), 1).await;
-    connected(own.matched.clone(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 2).await;
+    expect_connected(back.matched_subscribers(), 1).await;
+    expect_connected(other.matched.clone(), 1).await;
+    expect_connected(own.matched.clone(), 1).await;
     for number in 0..3 {
-        publisher.publish(numbered(number));
+        publisher.publish(numbered_message(number));
     }
     for subscription in [&mut other, &mut same] {
         let first = next(subscription).await;
-        assert_eq!(first.bytes, numbered(0));
+        assert_eq!(first.bytes, numbered_message(0));
         assert_eq!(
             *first.wire_type,
             WireType {
@@ -69,7 +72,7 @@ async fn messages_pass_and_nobody_hears_himself() {
         assert_eq!((first.publisher.node(), first.latching), ("/one", false));
         assert_eq!(numbers(subscription, 2).await, [1, 2]);
     }
-    back.publish(numbered(9));
+    back.publish(numbered_message(9));
     assert_eq!(next(&mut own).await.publisher.node(), "/two");
     assert!(own.messages.is_empty());
 }
@@ -77,19 +80,19 @@ async fn messages_pass_and_nobody_hears_himself() {
 #[tokio::test]
 async fn whoever_leaves_is_no_longer_matched() {
     let (one, two) = (join(41, "/one").await, join(41, "/two").await);
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     let subscription = two.subscribe("/chatter", string(), qos).await.unwrap();
     let publisher = one.advertise("/chatter", string(), qos).await.unwrap();
-    connected(subscription.matched.clone(), 1).await;
-    connected(publisher.matched(), 1).await;
-    let matched = publisher.matched();
+    expect_connected(subscription.matched.clone(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 1).await;
+    let matched = publisher.matched_subscribers();
     drop(subscription);
-    until(matched, |matched| matched.peers.is_empty()).await;
+    wait_for_matched(matched, |matched| matched.peers.is_empty()).await;
 
     let again = two.subscribe("/chatter", string(), qos).await.unwrap();
-    connected(again.matched.clone(), 1).await;
+    expect_connected(again.matched.clone(), 1).await;
     one.close().await;
-    until(again.matched.clone(), |matched| matched.peers.is_empty()).await;
+    wait_for_matched(again.matched.clone(), |matched| matched.peers.is_empty()).await;
     assert!(matches!(
         one.subscribe("/chatter", string(), qos).await,
         Err(BusError::Closed)
@@ -100,35 +103,35 @@ async fn whoever_leaves_is_no_longer_matched() {
 async fn what_was_published_last_is_heard_by_those_who_come_later() {
     let (one, two) = (join(42, "/one").await, join(42, "/two").await);
     let publisher = one.advertise("/map", string(), latching()).await.unwrap();
-    publisher.publish(numbered(1));
-    publisher.publish(numbered(2));
-    let wish = Qos {
+    publisher.publish(numbered_message(1));
+    publisher.publish(numbered_message(2));
+    let wish = QosProfile {
         depth: 1,
         ..latching()
     };
     let mut first = two.subscribe("/map", string(), wish).await.unwrap();
     let message = loop {
         let message = next(&mut first).await;
-        if message.bytes == numbered(2) {
+        if message.bytes == numbered_message(2) {
             break message;
         }
     };
     assert!(message.latching);
     let mut second = two.subscribe("/map", string(), wish).await.unwrap();
     assert_eq!(numbers(&mut second, 1).await, [2]);
-    // Whoever does not wish for it is not given it.
+    // A subscription that does not request it is not given it.
     let mut volatile = two
-        .subscribe("/map", string(), Qos::keep_last(1))
+        .subscribe("/map", string(), QosProfile::keep_last(1))
         .await
         .unwrap();
-    connected(volatile.matched.clone(), 1).await;
-    connected(publisher.matched(), 2).await;
-    publisher.publish(numbered(3));
+    expect_connected(volatile.matched.clone(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 2).await;
+    publisher.publish(numbered_message(3));
     assert_eq!(numbers(&mut volatile, 1).await, [3]);
 
-    // It goes with its publisher.
+    // It is dropped with its publisher.
     drop(publisher);
-    until(second.matched.clone(), |matched| matched.peers.is_empty()).await;
+    wait_for_matched(second.matched.clone(), |matched| matched.peers.is_empty()).await;
     let third = two.subscribe("/map", string(), wish).await.unwrap();
     assert!(third.messages.is_empty());
 }
@@ -139,10 +142,10 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     let mut subscription = two.subscribe("/scan", string(), latching()).await.unwrap();
     let offers = [
         latching(),
-        Qos::keep_last(DEPTH),
+        QosProfile::keep_last(DEPTH),
         best_effort(),
-        Qos {
-            durability: Durability::TransientLocal,
+        QosProfile {
+            durability: QosDurability::TransientLocal,
             ..best_effort()
         },
     ];
@@ -150,7 +153,7 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     for qos in offers {
         publishers.push(one.advertise("/scan", string(), qos).await.unwrap());
     }
-    connected(subscription.matched.clone(), publishers.len()).await;
+    expect_connected(subscription.matched.clone(), publishers.len()).await;
     let told = subscription.matched.borrow().clone();
     let latches: Vec<bool> = told
         .peers
@@ -160,49 +163,52 @@ async fn a_wish_hears_whoever_offers_less_and_nobody_twice() {
     assert_eq!(latches.iter().filter(|latching| **latching).count(), 2);
     assert_eq!(told.refused, []);
     for publisher in &publishers {
-        // Several readers of this subscription hear it; each message counts once.
-        until(publisher.matched(), |matched| matched.connected() > 0).await;
+        // Several readers of this subscription receive it; each message counts once.
+        wait_for_matched(publisher.matched_subscribers(), |matched| {
+            matched.connected_count() > 0
+        })
+        .await;
     }
     let mut sent = Vec::new();
     for (number, publisher) in (0..).zip(&publishers) {
-        publisher.publish(numbered(number));
-        publisher.publish(numbered(number + 10));
+        publisher.publish(numbered_message(number));
+        publisher.publish(numbered_message(number + 10));
         sent.extend([number, number + 10]);
     }
     let mut heard = numbers(&mut subscription, sent.len()).await;
     heard.sort_unstable();
     sent.sort_unstable();
     assert_eq!(heard, sent);
-    // What would have come twice would have come by now.
-    publishers[0].publish(numbered(99));
+    // Duplicates would have arrived by now.
+    publishers[0].publish(numbered_message(99));
     assert_eq!(numbers(&mut subscription, 1).await, [99]);
     assert!(subscription.messages.is_empty());
 }
 
-/// A node writes a warning into its log for each reader that asks for more than it offers.
+/// A node logs a warning for each reader that requests more than it offers.
 #[tokio::test]
 async fn whoever_offers_less_than_is_wished_is_not_told_that_it_does() {
     let (one, two) = (join(61, "/one").await, join(61, "/two").await);
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     let less = one.advertise("/scan", string(), qos).await.unwrap();
     until_known(&two, "/scan").await;
     let mut subscription = two.subscribe("/scan", string(), latching()).await.unwrap();
-    connected(subscription.matched.clone(), 1).await;
-    connected(less.matched(), 1).await;
-    less.publish(numbered(1));
+    expect_connected(subscription.matched.clone(), 1).await;
+    expect_connected(less.matched_subscribers(), 1).await;
+    less.publish(numbered_message(1));
     assert_eq!(numbers(&mut subscription, 1).await, [1]);
-    assert_eq!(less.matched().borrow().refused, []);
-    // Who offers it later is heard as was wished.
+    assert_eq!(less.matched_subscribers().borrow().refused, []);
+    // A publisher that offers it later is matched with the preferred quality.
     let three = join(61, "/three").await;
     let latched = three
         .advertise("/scan", string(), latching())
         .await
         .unwrap();
-    latched.publish(numbered(2));
+    latched.publish(numbered_message(2));
     assert_eq!(numbers(&mut subscription, 1).await, [2]);
 }
 
-/// Waits until somebody else is known to publish on a topic.
+/// Waits until another node is known to publish a topic.
 async fn until_known(bus: &Ros2Bus, topic: &str) {
     let mut graph = bus.graph();
     let known = graph.wait_for(|graph| graph.topics.contains_key(topic));
@@ -226,7 +232,10 @@ async fn a_reader_that_asks_for_more_is_said_with_both_profiles() {
         ..EndpointQos::default()
     };
     let _reader = read(&stranger, topic, asked);
-    let matched = until(publisher.matched(), |matched| !matched.refused.is_empty()).await;
+    let matched = wait_for_matched(publisher.matched_subscribers(), |matched| {
+        !matched.refused.is_empty()
+    })
+    .await;
     assert_eq!(matched.peers, []);
     assert_eq!(matched.refused[0].peer.node(), stranger.guid().to_string());
     assert_eq!(
@@ -240,12 +249,12 @@ async fn a_reader_that_asks_for_more_is_said_with_both_profiles() {
 #[tokio::test]
 async fn ends_of_other_types_are_said_and_not_heard() {
     let (one, two) = (join(45, "/one").await, join(45, "/two").await);
-    let qos = Qos::keep_last(DEPTH);
-    let other = WireType::of(&message_type("std_msgs/msg/String", "string text"));
-    let number = WireType::of(&message_type("std_msgs/msg/UInt8", "uint8 data"));
+    let qos = QosProfile::keep_last(DEPTH);
+    let other = WireType::from_message(&message_type("std_msgs/msg/String", "string text"));
+    let number = WireType::from_message(&message_type("std_msgs/msg/UInt8", "uint8 data"));
     let mut subscription = two.subscribe("/chatter", string(), qos).await.unwrap();
     let wrong = one.advertise("/chatter", other.clone(), qos).await.unwrap();
-    let told = until(subscription.matched.clone(), |matched| {
+    let told = wait_for_matched(subscription.matched.clone(), |matched| {
         !matched.refused.is_empty()
     })
     .await;
@@ -257,35 +266,41 @@ async fn ends_of_other_types_are_said_and_not_heard() {
             "its type is std_msgs/msg/String {theirs} there and std_msgs/msg/String {ours} here"
         )
     );
-    let told = until(wrong.matched(), |matched| !matched.refused.is_empty()).await;
+    let told = wait_for_matched(wrong.matched_subscribers(), |matched| {
+        !matched.refused.is_empty()
+    })
+    .await;
     assert_eq!((told.peers.len(), told.refused.len()), (0, 1));
-    wrong.publish(numbered(1));
+    wrong.publish(numbered_message(1));
     assert!(matches!(
         one.advertise("/chatter", number.clone(), qos).await,
         Err(BusError::TypeMismatch { .. })
     ));
     drop(wrong);
 
-    // Of another name, it is not even matched.
+    // With another name, it is not even matched.
     let named = one.advertise("/chatter", number, qos).await.unwrap();
-    let is_named = |matched: &Matched| {
+    let is_named = |matched: &MatchedPeers| {
         let mut refused = matched.refused.iter();
         refused.any(|refusal| refusal.why.contains("UInt8"))
     };
-    until(subscription.matched.clone(), is_named).await;
-    until(named.matched(), |matched| !matched.refused.is_empty()).await;
+    wait_for_matched(subscription.matched.clone(), is_named).await;
+    wait_for_matched(named.matched_subscribers(), |matched| {
+        !matched.refused.is_empty()
+    })
+    .await;
     drop(named);
     let right = one.advertise("/chatter", string(), qos).await.unwrap();
-    connected(right.matched(), 1).await;
-    connected(subscription.matched.clone(), 1).await;
-    right.publish(numbered(2));
+    expect_connected(right.matched_subscribers(), 1).await;
+    expect_connected(subscription.matched.clone(), 1).await;
+    right.publish(numbered_message(2));
     assert_eq!(numbers(&mut subscription, 1).await, [2]);
 }
 
 #[tokio::test]
 async fn the_type_of_a_topic_is_what_its_ends_say() {
     let (one, two) = (join(46, "/one").await, join(46, "/two").await);
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     assert!(matches!(
         two.topic_type("/none").await,
         Err(BusError::NoTopic(_))
@@ -304,12 +319,12 @@ async fn the_type_of_a_topic_is_what_its_ends_say() {
         let found = two.topic_type(topic).await.unwrap();
         assert_eq!((found.name, found.digest), (string().name, string().digest));
     }
-    // Who does not know the type means that of the others.
+    // An unspecified type means that of the others.
     let publisher = two
         .advertise("/wanted", WireType::any(), qos)
         .await
         .unwrap();
-    connected(publisher.matched(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 1).await;
     assert!(two.advertise("/none", WireType::any(), qos).await.is_err());
 }
 
@@ -317,36 +332,36 @@ async fn the_type_of_a_topic_is_what_its_ends_say() {
 async fn an_end_without_a_hash_is_known_by_the_name_of_its_type() {
     let bus = join(47, "/one").await;
     let publisher = bus
-        .advertise("/chatter", string(), Qos::keep_last(DEPTH))
+        .advertise("/chatter", string(), QosProfile::keep_last(DEPTH))
         .await
         .unwrap();
     let stranger = stranger(47).await;
-    let topic = Topic {
+    let topic = TopicDescription {
         user_data: Bytes::new(),
         ..names::topic("/chatter", &string()).unwrap()
     };
-    assert!(type_hash::of_message(&topic.user_data).is_any());
+    assert!(type_hash::message_hash(&topic.user_data).is_any());
     let _reader = read(&stranger, topic, EndpointQos::default());
-    connected(publisher.matched(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 1).await;
 }
 
-/// A participant of ROS without nodes yet, with a writer of `/chatter`.
-async fn newcomer(number: u16) -> (Participant, Writer) {
+/// A ROS participant without nodes yet, with a writer of `/chatter`.
+async fn newcomer(number: u16) -> (Participant, DataWriter) {
     let config = Config {
         user_data: Bytes::from_static(b"enclave=/;"),
         ..Config::new(domain(number), "newcomer")
     };
-    let joined = Participant::join(Arc::new(Place(Arc::new(HostSockets))), config).await;
+    let joined = Participant::join(Arc::new(BusSockets(Arc::new(HostSockets))), config).await;
     let participant = joined.expect("a domain can be joined");
     let topic = names::topic("/chatter", &string()).unwrap();
     let writer = participant.writer(topic, EndpointQos::default());
     (participant, writer)
 }
 
-/// Tells that it has a node with this writer.
-fn introduce(participant: &Participant, name: &str, writer: &Writer) -> Writer {
+/// Announces a node with this writer.
+fn introduce(participant: &Participant, name: &str, writer: &DataWriter) -> DataWriter {
     let teller = participant.writer(entities::topic(), entities::qos());
-    let node = entities::Node {
+    let node = entities::DiscoveredNode {
         name: name.into(),
         readers: Vec::new(),
         writers: vec![writer.guid()],
@@ -356,9 +371,9 @@ fn introduce(participant: &Participant, name: &str, writer: &Writer) -> Writer {
     teller
 }
 
-/// Returns once the writer's reader knows it.
-async fn known(writer: &Writer) {
-    let mut ends = writer.ends();
+/// Waits until the writer's reader has matched.
+async fn wait_until_known(writer: &DataWriter) {
+    let mut ends = writer.watch_matches();
     let known = ends.wait_for(|ends| !ends.confirmed.is_empty());
     let known = timeout(LONG, known).await;
     known.expect("in time").expect("it is open");
@@ -367,21 +382,21 @@ async fn known(writer: &Writer) {
 #[tokio::test]
 async fn messages_wait_for_the_name_of_their_node() {
     let bus = join(48, "/one").await;
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     let mut subscription = bus.subscribe("/chatter", string(), qos).await.unwrap();
     let (participant, writer) = newcomer(48).await;
-    known(&writer).await;
-    writer.write(numbered(1));
-    writer.write(numbered(2));
+    wait_until_known(&writer).await;
+    writer.write(numbered_message(1));
+    writer.write(numbered_message(2));
     let _teller = introduce(&participant, "/late", &writer);
     let first = next(&mut subscription).await;
     assert_eq!(
         (first.bytes, first.publisher.node()),
-        (numbered(1), "/late")
+        (numbered_message(1), "/late")
     );
-    writer.write(numbered(3));
+    writer.write(numbered_message(3));
     assert_eq!(numbers(&mut subscription, 2).await, [2, 3]);
-    let told = until(subscription.matched.clone(), |matched| {
+    let told = wait_for_matched(subscription.matched.clone(), |matched| {
         matched.has_node("/late")
     });
     assert_eq!(told.await.peers[0].id, first.publisher);
@@ -390,47 +405,50 @@ async fn messages_wait_for_the_name_of_their_node() {
 #[tokio::test]
 async fn a_node_that_never_tells_its_name_is_known_by_its_participant() {
     let bus = join(52, "/one").await;
-    let qos = Qos::keep_last(DEPTH);
+    let qos = QosProfile::keep_last(DEPTH);
     let mut subscription = bus.subscribe("/chatter", string(), qos).await.unwrap();
     let (participant, writer) = newcomer(52).await;
-    known(&writer).await;
+    wait_until_known(&writer).await;
     assert_eq!(subscription.matched.borrow().peers, []);
-    writer.write(numbered(1));
+    writer.write(numbered_message(1));
     let first = next(&mut subscription).await;
     let guid = participant.guid().to_string();
-    assert_eq!((first.bytes, first.publisher.node()), (numbered(1), &*guid));
-    let before = until(subscription.matched.clone(), |matched| {
+    assert_eq!(
+        (first.bytes, first.publisher.node()),
+        (numbered_message(1), &*guid)
+    );
+    let before = wait_for_matched(subscription.matched.clone(), |matched| {
         matched.has_node(&guid)
     });
     let before = before.await;
-    // It stays itself if it tells it after all.
+    // Its id stays the same if it announces its node after all.
     let _teller = introduce(&participant, "/late", &writer);
-    let after = until(subscription.matched.clone(), |matched| {
+    let after = wait_for_matched(subscription.matched.clone(), |matched| {
         matched.has_node("/late")
     });
     assert_eq!(before.peers[0].id, after.await.peers[0].id);
 }
 
-/// Messages are bytes to the bus: the queue of a slow receiver keeps the newest.
+/// Messages are opaque bytes to the bus: the queue of a slow receiver keeps the newest.
 #[tokio::test]
 async fn a_slow_receiver_loses_what_is_oldest_and_it_is_counted() {
     let (one, two) = (join(49, "/one").await, join(49, "/two").await);
     let mut slow = two
-        .subscribe("/fast", string(), Qos::keep_last(2))
+        .subscribe("/fast", string(), QosProfile::keep_last(2))
         .await
         .unwrap();
     let mut quick = two
-        .subscribe("/fast", string(), Qos::keep_last(50))
+        .subscribe("/fast", string(), QosProfile::keep_last(50))
         .await
         .unwrap();
     let publisher = one
-        .advertise("/fast", string(), Qos::keep_last(50))
+        .advertise("/fast", string(), QosProfile::keep_last(50))
         .await
         .unwrap();
-    connected(publisher.matched(), 1).await;
-    connected(quick.matched.clone(), 1).await;
+    expect_connected(publisher.matched_subscribers(), 1).await;
+    expect_connected(quick.matched.clone(), 1).await;
     for number in 0..20 {
-        publisher.publish(numbered(number));
+        publisher.publish(numbered_message(number));
     }
     assert_eq!(numbers(&mut quick, 20).await, (0..20).collect::<Vec<u8>>());
     assert_eq!(numbers(&mut slow, 2).await, [18, 19]);
@@ -440,21 +458,22 @@ async fn a_slow_receiver_loses_what_is_oldest_and_it_is_counted() {
 #[tokio::test]
 async fn what_was_published_before_the_end_arrives() {
     let two = join(60, "/two").await;
-    let qos = Qos::keep_last(100);
+    let qos = QosProfile::keep_last(100);
     let mut subscription = two.subscribe("/chatter", string(), qos).await.unwrap();
     for (number, closed) in [(1, true), (2, false)] {
         let one = join(60, "/one").await;
         let publisher = one.advertise("/chatter", string(), qos).await.unwrap();
-        connected(publisher.matched(), 1).await;
-        // More than fits on the way.
-        let mut long = numbered(number).to_vec();
+        expect_connected(publisher.matched_subscribers(), 1).await;
+        // More than fits into the buffers in between.
+        let mut long = numbered_message(number).to_vec();
         long.resize(500_000, 0);
         for _ in 0..40 {
             publisher.publish(long.clone().into());
         }
-        match closed {
-            true => one.close().await,
-            false => drop(publisher),
+        if closed {
+            one.close().await
+        } else {
+            drop(publisher)
         }
         assert_eq!(numbers(&mut subscription, 40).await, [number; 40]);
     }

@@ -1,11 +1,12 @@
-//! Descriptions: `type_description_interfaces/msg/TypeDescription` as JSON, with the hashes of what it describes.
+//! Type descriptions: `type_description_interfaces/msg/TypeDescription` as JSON, with the hashes of the described
+//! types.
 
 use std::collections::BTreeMap;
 
 use serde::Deserialize;
 
 use crate::schema::description::PLACEHOLDER;
-use crate::schema::interface_files::{InterfaceFile, Line, assemble, quoted};
+use crate::schema::interface_files::{FieldLine, InterfaceFile, assemble, quote};
 use crate::schema::{MAX_TEXT_BYTES, SchemaError};
 
 #[derive(Deserialize)]
@@ -72,7 +73,7 @@ pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> 
     let mut texts = BTreeMap::new();
     let types = description.referenced_type_descriptions.into_iter();
     for described in types.chain([description.type_description]) {
-        let text = text_of(&described)
+        let text = definition_text(&described)
             .map_err(|reason| fail(1, format!("{}: {reason}", described.type_name)))?;
         texts.insert(described.type_name, text);
     }
@@ -89,18 +90,18 @@ pub(super) fn read(key: &str, json: &str) -> Result<InterfaceFile, SchemaError> 
     })
 }
 
-fn text_of(described: &Type) -> Result<String, String> {
+fn definition_text(described: &Type) -> Result<String, String> {
     let mut text = String::new();
     for field in &described.fields {
         if field.name != PLACEHOLDER {
-            line_of(field)?.append_to(&mut text)?;
+            field_line(field)?.append_to(&mut text)?;
         }
     }
     Ok(text)
 }
 
-/// Numbers of `type_description_interfaces/msg/FieldType`.
-fn line_of(field: &Field) -> Result<Line, String> {
+/// Converts a field; numbers are those of `type_description_interfaces/msg/FieldType`.
+fn field_line(field: &Field) -> Result<FieldLine, String> {
     let FieldType {
         type_id,
         capacity,
@@ -142,11 +143,11 @@ fn line_of(field: &Field) -> Result<Line, String> {
     };
     let value = match (&*field.default_value, form) {
         ("", _) => String::new(),
-        (text, 0) if is_text => quoted(text),
+        (text, 0) if is_text => quote(text),
         (value, 0) => value.to_owned(),
-        (list, _) => bracketed(list),
+        (list, _) => tuple_to_list(list),
     };
-    Ok(Line {
+    Ok(FieldLine {
         one: name,
         brackets,
         name: field.name.clone(),
@@ -154,8 +155,8 @@ fn line_of(field: &Field) -> Result<Line, String> {
     })
 }
 
-/// A list of `.msg` from a tuple of Python.
-pub(super) fn bracketed(tuple: &str) -> String {
+/// Converts a Python tuple to a `.msg` list.
+pub(super) fn tuple_to_list(tuple: &str) -> String {
     let inside = tuple.trim();
     let inside = inside.strip_prefix('(').unwrap_or(inside);
     let inside = inside.strip_suffix(')').unwrap_or(inside);

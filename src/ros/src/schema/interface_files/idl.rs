@@ -1,16 +1,16 @@
-//! OMG IDL 4.2, as much of it as rosidl reads: modules, structures, constants, `typedef` for arrays, annotations.
+//! OMG IDL 4.2, the subset that rosidl reads: modules, structures, constants, `typedef` for arrays, annotations.
 
 mod tokens;
 
 use std::collections::BTreeMap;
 
-use crate::schema::interface_files::description::bracketed;
-use crate::schema::interface_files::idl::tokens::{Token, Tokens};
-use crate::schema::interface_files::{InterfaceFile, Line, assemble, quoted};
+use crate::schema::interface_files::description::tuple_to_list;
+use crate::schema::interface_files::idl::tokens::{IdlToken, Tokens};
+use crate::schema::interface_files::{FieldLine, InterfaceFile, assemble, quote};
 use crate::schema::limits::MAX_NAME_BYTES;
 use crate::schema::{MAX_TEXT_BYTES, SchemaError};
 
-/// Package, kind, and the module of a structure's constants.
+/// Maximum nesting of modules: package, kind, and the module of a structure's constants.
 const MOST_MODULES: usize = 3;
 
 pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
@@ -20,7 +20,7 @@ pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
             reason: format!("more than {MAX_TEXT_BYTES} bytes of IDL"),
         });
     }
-    let mut reader = Reader {
+    let mut reader = IdlReader {
         tokens: Tokens::new(idl),
         scope: Vec::new(),
         aliases: BTreeMap::new(),
@@ -33,7 +33,7 @@ pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
         line: reader.tokens.line(),
         reason,
     })?;
-    // Constants of a structure are in a module of its own, for IDL has none within.
+    // Constants of a structure are in a module of their own, because IDL structures cannot contain any.
     let mut texts = reader.structures;
     for (module, text) in reader.constants {
         let owner = module.strip_suffix("_Constants").unwrap_or(&module);
@@ -53,39 +53,41 @@ pub(super) fn read(key: &str, idl: &str) -> Result<InterfaceFile, SchemaError> {
     })
 }
 
-struct Reader<'a> {
+struct IdlReader<'a> {
     tokens: Tokens<'a>,
-    /// Modules around.
+    /// Enclosing modules.
     scope: Vec<String>,
-    /// `typedef`: type and brackets, by name.
-    aliases: BTreeMap<String, Line>,
+    /// `typedef`s: type and brackets, by name.
+    aliases: BTreeMap<String, FieldLine>,
     /// Lines by module, `a/msg/A_Constants`.
     constants: BTreeMap<String, String>,
     /// Lines by structure, `a/msg/A`.
     structures: BTreeMap<String, String>,
-    /// Bytes of lines: short names may stand for long ones.
+    /// Bytes of all lines, limited because short aliases may stand for long types.
     written: usize,
 }
 
-impl Reader<'_> {
-    /// Up to the end, or the brace that closes a module.
+impl IdlReader<'_> {
+    /// Parses items up to the end of the text, or to the brace that closes a module.
     fn items(&mut self) -> Result<(), String> {
         loop {
             match self.tokens.next()? {
                 None if self.scope.is_empty() => return Ok(()),
                 None => return Err("the text ends inside a module".to_owned()),
-                Some(Token::Mark('}')) if !self.scope.is_empty() => return Ok(()),
-                Some(Token::Mark(';')) => {}
-                Some(Token::Mark('@')) => drop(self.annotation()?),
-                Some(Token::Word("module")) => self.module()?,
-                Some(Token::Word("struct")) => self.structure()?,
-                Some(Token::Word("const")) => self.constant()?,
-                Some(Token::Word("typedef")) => {
+                Some(IdlToken::Mark('}')) if !self.scope.is_empty() => return Ok(()),
+                Some(IdlToken::Mark(';')) => {}
+                Some(IdlToken::Mark('@')) => drop(self.annotation()?),
+                Some(IdlToken::Word("module")) => self.module()?,
+                Some(IdlToken::Word("struct")) => self.structure()?,
+                Some(IdlToken::Word("const")) => self.constant()?,
+                Some(IdlToken::Word("typedef")) => {
                     let alias = self.declaration()?;
                     self.aliases.insert(alias.name.clone(), alias);
                 }
                 Some(other) => {
-                    return Err(format!("{other} begins nothing that messages are made of"));
+                    return Err(format!(
+                        "{other} does not begin a definition that messages can have"
+                    ));
                 }
             }
         }
@@ -114,7 +116,7 @@ impl Reader<'_> {
             }
             let mut field = self.declaration()?;
             if let Some(value) = value.take() {
-                field.value = value.written(&field);
+                field.value = value.to_msg_text(&field);
             }
             if field.name != crate::schema::description::PLACEHOLDER {
                 self.append(&field, &mut text)?;
@@ -129,8 +131,8 @@ impl Reader<'_> {
         self.tokens.expect('=')?;
         let value = self.literal()?;
         self.tokens.expect(';')?;
-        constant.value = format!("= {}", value.written(&constant));
-        // A bound says nothing of a constant.
+        constant.value = format!("= {}", value.to_msg_text(&constant));
+        // The bound of a string is irrelevant for a constant.
         let bare = constant.one.split("<=").next().unwrap_or_default();
         constant.one = bare.to_owned();
         let module = self.scope.join("/");
@@ -140,7 +142,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    fn append(&mut self, line: &Line, text: &mut String) -> Result<(), String> {
+    fn append(&mut self, line: &FieldLine, text: &mut String) -> Result<(), String> {
         let before = text.len();
         line.append_to(text)?;
         self.written += text.len() - before;
@@ -158,15 +160,15 @@ impl Reader<'_> {
         }
     }
 
-    /// `TYPE NAME;` or `TYPE NAME[N];`
-    fn declaration(&mut self) -> Result<Line, String> {
+    /// Parses `TYPE NAME;` or `TYPE NAME[N];`
+    fn declaration(&mut self) -> Result<FieldLine, String> {
         let line = self.declarator()?;
         self.tokens.expect(';')?;
         Ok(line)
     }
 
-    fn declarator(&mut self) -> Result<Line, String> {
-        let mut line = self.type_of(0)?;
+    fn declarator(&mut self) -> Result<FieldLine, String> {
+        let mut line = self.parse_type(0)?;
         line.name = self.name()?.to_owned();
         if self.tokens.skip('[')? {
             if !line.brackets.is_empty() {
@@ -184,8 +186,8 @@ impl Reader<'_> {
         Ok(outer.chain([name]).collect())
     }
 
-    /// A type: its name in the language of `.msg`, and the brackets behind it.
-    fn type_of(&mut self, depth: usize) -> Result<Line, String> {
+    /// Parses a type: its name in the `.msg` language, and its brackets.
+    fn parse_type(&mut self, depth: usize) -> Result<FieldLine, String> {
         let first = self.name()?.to_owned();
         let one = match &*first {
             "sequence" => return self.sequence(depth),
@@ -215,7 +217,7 @@ impl Reader<'_> {
             "int8" | "uint8" | "int16" | "uint16" | "int32" | "uint32" | "int64" | "uint64" => {
                 first
             }
-            // What `.msg` calls char is uint8, and has another hash.
+            // `char` in `.msg` is uint8, which has another hash.
             "char" | "wchar" | "fixed" | "any" | "enum" | "union" | "map" => {
                 return Err(format!("messages have no {first}"));
             }
@@ -239,30 +241,31 @@ impl Reader<'_> {
                 }
             }
         };
-        Ok(Line {
+        Ok(FieldLine {
             one,
-            ..Line::default()
+            ..FieldLine::default()
         })
     }
 
-    fn sequence(&mut self, depth: usize) -> Result<Line, String> {
+    fn sequence(&mut self, depth: usize) -> Result<FieldLine, String> {
         self.tokens.expect('<')?;
         if depth > 0 {
             return Err("messages have no sequences of sequences".to_owned());
         }
-        let mut line = self.type_of(depth + 1)?;
+        let mut line = self.parse_type(depth + 1)?;
         if !line.brackets.is_empty() {
             return Err("messages have no sequences of arrays".to_owned());
         }
-        line.brackets = match self.tokens.skip(',')? {
-            true => format!("[<={}]", self.name()?),
-            false => "[]".to_owned(),
+        line.brackets = if self.tokens.skip(',')? {
+            format!("[<={}]", self.name()?)
+        } else {
+            "[]".to_owned()
         };
         self.tokens.expect('>')?;
         Ok(line)
     }
 
-    /// Behind a `long`: whether another follows.
+    /// Parses the rest of a type that began with `long`: 64 bits if another `long` follows, otherwise 32.
     fn long(&mut self, kind: &str) -> Result<String, String> {
         let bits = if self.tokens.skip_word("long")? {
             64
@@ -272,7 +275,7 @@ impl Reader<'_> {
         Ok(format!("{kind}{bits}"))
     }
 
-    /// Behind the `@`; gives the value of a `default`.
+    /// Parses an annotation after the `@`; returns the value of a `default`.
     fn annotation(&mut self) -> Result<Option<Literal>, String> {
         let is_default = self.tokens.word()? == "default";
         let mut value = None;
@@ -294,11 +297,11 @@ impl Reader<'_> {
 
     fn literal(&mut self) -> Result<Literal, String> {
         let mut text = match self.tokens.next()? {
-            Some(Token::Text(text)) => text,
-            Some(Token::Word(word)) => return Ok(Literal::Word(word.to_owned())),
-            other => return Err(format!("{} is no value", Token::or_end(other))),
+            Some(IdlToken::Text(text)) => text,
+            Some(IdlToken::Word(word)) => return Ok(Literal::Word(word.to_owned())),
+            other => return Err(format!("{} is not a value", IdlToken::describe(other))),
         };
-        // Texts one behind the other are one.
+        // Adjacent texts are concatenated.
         while let Some(more) = self.tokens.skip_text()? {
             text.push_str(&more);
         }
@@ -306,21 +309,21 @@ impl Reader<'_> {
     }
 }
 
-/// A value as it is written.
+/// A literal value.
 enum Literal {
     Text(String),
     Word(String),
 }
 
 impl Literal {
-    /// As `.msg` writes it for a field.
-    fn written(&self, field: &Line) -> String {
+    /// Returns the value of the field in the notation of `.msg`.
+    fn to_msg_text(&self, field: &FieldLine) -> String {
         match self {
-            Literal::Text(list) if !field.brackets.is_empty() => bracketed(list),
+            Literal::Text(list) if !field.brackets.is_empty() => tuple_to_list(list),
             Literal::Text(text)
                 if matches!(field.one.split("<=").next(), Some("string" | "wstring")) =>
             {
-                quoted(text)
+                quote(text)
             }
             Literal::Text(text) => text.clone(),
             Literal::Word(word) => word.clone(),

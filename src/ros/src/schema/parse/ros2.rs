@@ -1,13 +1,13 @@
-//! A line of a ROS 2 definition (<https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html>): bounds
-//! (`string<=8`, `int32[<=3]`), `wstring`, and values that fields have until they are set.
+//! Parser of a line of a ROS 2 definition (<https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html>):
+//! bounds (`string<=8`, `int32[<=3]`), `wstring`, and default values.
 
 use crate::bus::RosVersion;
 use crate::schema::MAX_MESSAGE_BYTES;
-use crate::schema::initial::{Initial, Item, item, quoted_end};
+use crate::schema::initial::{Initial, InitialItem, parse_item, quoted_end};
 use crate::schema::parse::{Parsed, ParsedField, check_identifier};
-use crate::schema::types::{Arity, Bounds, Constant, Primitive};
+use crate::schema::types::{Arity, Constant, FieldBounds, Primitive};
 
-/// Adds what the line says. References are relative to `package`.
+/// Parses a line and adds it to `parsed`. References are relative to `package`.
 pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Result<(), String> {
     let line = line.trim();
     if line.is_empty() || line.starts_with('#') {
@@ -24,16 +24,16 @@ pub(super) fn parse_line(package: &str, line: &str, parsed: &mut Parsed) -> Resu
     let rest = rest.trim_start();
     match rest.strip_prefix('=') {
         Some(value) => {
-            let constant = constant(written, name, value_of(value)?)?;
+            let constant = constant(written, name, strip_comment(value)?)?;
             parsed.constants.push(constant);
             Ok(())
         }
-        None => parsed.add_field(field(package, written, name, value_of(rest)?)?),
+        None => parsed.add_field(field(package, written, name, strip_comment(rest)?)?),
     }
 }
 
-/// The value, without the comment that may follow it.
-fn value_of(rest: &str) -> Result<&str, String> {
+/// Returns the value without a comment that follows it.
+fn strip_comment(rest: &str) -> Result<&str, String> {
     let rest = rest.trim();
     let Some(end) = quoted_end(rest) else {
         let listed = rest.starts_with('[').then(|| list_end(rest)).flatten();
@@ -48,7 +48,7 @@ fn value_of(rest: &str) -> Result<&str, String> {
     }
 }
 
-/// Where a list ends: after the bracket that is in no quotes.
+/// Returns the end of a list: the offset after the closing bracket that is not quoted.
 fn list_end(rest: &str) -> Option<usize> {
     let mut at = 1;
     loop {
@@ -64,11 +64,11 @@ fn list_end(rest: &str) -> Option<usize> {
 }
 
 fn constant(written: &str, name: &str, value: &str) -> Result<Constant, String> {
-    let primitive = Primitive::named(RosVersion::Two, written)
+    let primitive = Primitive::from_versioned_name(RosVersion::Two, written)
         .ok_or_else(|| format!("a constant cannot be of type {written}"))?;
-    let value = match item(primitive, value)? {
-        Item::Text(text) => text.into(),
-        Item::Scalar(_) => value.to_owned(),
+    let value = match parse_item(primitive, value)? {
+        InitialItem::Text(text) => text.into(),
+        InitialItem::Scalar(_) => value.to_owned(),
     };
     Ok(Constant {
         name: name.to_owned(),
@@ -85,11 +85,11 @@ fn field(package: &str, written: &str, name: &str, value: &str) -> Result<Parsed
         None => (bare, None),
     };
     let (arity, most) = parse_brackets(brackets)?;
-    let bounds = Bounds {
+    let bounds = FieldBounds {
         text: text_bound,
         elements: most,
     };
-    let primitive = Primitive::named(RosVersion::Two, bare);
+    let primitive = Primitive::from_versioned_name(RosVersion::Two, bare);
     let initial = match primitive {
         _ if value.is_empty() => None,
         None => {
@@ -139,7 +139,7 @@ fn size(written: &str) -> Result<u32, String> {
     }
 }
 
-fn check_initial(initial: &Initial, arity: Arity, bounds: Bounds) -> Result<(), String> {
+fn check_initial(initial: &Initial, arity: Arity, bounds: FieldBounds) -> Result<(), String> {
     let found = initial.0.len();
     match (arity, bounds.elements) {
         (Arity::Fixed(count), _) if found != count as usize => {
@@ -151,7 +151,7 @@ fn check_initial(initial: &Initial, arity: Arity, bounds: Bounds) -> Result<(), 
         _ => {}
     }
     for item in &initial.0 {
-        if let (Item::Text(text), Some(most)) = (item, bounds.text) {
+        if let (InitialItem::Text(text), Some(most)) = (item, bounds.text) {
             let found = text.chars().count();
             if found > most as usize {
                 return Err(format!("takes at most {most} characters, got {found}"));
@@ -161,7 +161,8 @@ fn check_initial(initial: &Initial, arity: Arity, bounds: Bounds) -> Result<(), 
     Ok(())
 }
 
-/// `package/Type` and bare names are of messages; a type that comes with a service or action has its folder in its name.
+/// Resolves a type name. `package/Type` and bare names are messages; types generated from a service or action have the
+/// kind in their name.
 fn resolve_name(package: &str, bare: &str) -> Result<String, String> {
     if matches!(bare, "time" | "duration") {
         let name = if bare == "time" { "Time" } else { "Duration" };

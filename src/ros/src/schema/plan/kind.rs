@@ -1,10 +1,10 @@
-//! What fields hold, as the codec tells them apart.
+//! Kinds of field contents distinguished by the codec.
 
 use std::sync::Arc;
 
 use crate::schema::{Arity, Base, Field, MessageType, Primitive};
 
-/// What one field holds.
+/// Content of one field.
 #[derive(Debug, Clone)]
 pub(crate) enum Kind {
     Scalar(Scalar),
@@ -18,21 +18,21 @@ pub(crate) enum Kind {
     Structs(Arc<MessageType>, Count),
 }
 
-/// What a string holds.
+/// Properties of a string.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Text {
-    /// Units of UTF-16, else bytes.
+    /// True for UTF-16 units, false for bytes.
     pub(crate) wide: bool,
-    /// Most characters; [`Text::UNBOUNDED`] where there is no bound.
+    /// Maximum number of characters, or [`Text::UNBOUNDED`].
     pub(crate) most: u32,
 }
 
-/// Elements of an array.
+/// Number of elements of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Count {
     Fixed(usize),
     Variable,
-    /// At most so many.
+    /// Variable, with a maximum.
     Bounded(usize),
 }
 
@@ -50,7 +50,7 @@ pub(crate) enum Scalar {
     U64,
     F32,
     F64,
-    /// ROS 1's.
+    /// ROS 1's time.
     Time,
     Duration,
     /// `builtin_interfaces/msg/Time`.
@@ -70,7 +70,7 @@ impl Scalar {
         }
     }
 
-    /// Bytes of the largest number in it, of which its place is a multiple where values are aligned.
+    /// Returns the alignment: the size of the largest number contained.
     pub(crate) fn alignment(self) -> usize {
         match self {
             Scalar::Time | Scalar::Duration | Scalar::Time2 | Scalar::Duration2 => 4,
@@ -78,7 +78,7 @@ impl Scalar {
         }
     }
 
-    fn of(primitive: Primitive) -> Option<Scalar> {
+    fn from_primitive(primitive: Primitive) -> Option<Scalar> {
         Some(match primitive {
             Primitive::Bool => Scalar::Bool,
             Primitive::Int8 => Scalar::I8,
@@ -99,8 +99,8 @@ impl Scalar {
 }
 
 impl Count {
-    /// No array of this kind has more elements.
-    pub(crate) fn most(self) -> usize {
+    /// Returns the maximum number of elements.
+    pub(crate) fn max_count(self) -> usize {
         match self {
             Count::Fixed(count) | Count::Bounded(count) => count,
             Count::Variable => usize::MAX,
@@ -111,7 +111,7 @@ impl Count {
 impl Text {
     pub(crate) const UNBOUNDED: u32 = u32::MAX;
 
-    fn of(field: &Field, primitive: Primitive) -> Text {
+    fn from_field(field: &Field, primitive: Primitive) -> Text {
         Text {
             wide: primitive == Primitive::Wstring,
             most: field.bounds.text.unwrap_or(Self::UNBOUNDED),
@@ -120,7 +120,7 @@ impl Text {
 }
 
 impl Kind {
-    pub(super) fn of(field: &Field) -> Kind {
+    pub(super) fn from_field(field: &Field) -> Kind {
         let count = match field.arity {
             Arity::One => None,
             Arity::Fixed(count) => Some(Count::Fixed(count as usize)),
@@ -139,13 +139,15 @@ impl Kind {
         match (&field.base, count) {
             (Base::Message(message), None) => Kind::Struct(message.clone()),
             (Base::Message(message), Some(count)) => Kind::Structs(message.clone(), count),
-            (Base::Primitive(primitive), count) => match (Scalar::of(*primitive), count) {
-                (None, None) => Kind::Text(Text::of(field, *primitive)),
-                (None, Some(count)) => Kind::Texts(Text::of(field, *primitive), count),
-                (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
-                (Some(scalar), None) => Kind::Scalar(scalar),
-                (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
-            },
+            (Base::Primitive(primitive), count) => {
+                match (Scalar::from_primitive(*primitive), count) {
+                    (None, None) => Kind::Text(Text::from_field(field, *primitive)),
+                    (None, Some(count)) => Kind::Texts(Text::from_field(field, *primitive), count),
+                    (Some(Scalar::U8), Some(count)) => Kind::Bytes(count),
+                    (Some(scalar), None) => Kind::Scalar(scalar),
+                    (Some(scalar), Some(count)) => Kind::Scalars(scalar, count),
+                }
+            }
         }
     }
 }

@@ -1,7 +1,7 @@
 use crate::codec::default_json;
 use crate::schema::{InterfaceFile, SchemaError};
 
-/// As rosidl describes them, in part.
+/// An excerpt of a description by rosidl.
 const IMAGE: &str = r#"{"type_description_msg": {
     "type_description": {"type_name": "a/msg/A", "fields": [
         {"name": "header", "type": {"type_id": 1, "capacity": 0, "string_capacity": 0, "nested_type_name": "std_msgs/msg/Header"}, "default_value": ""},
@@ -88,7 +88,8 @@ fn idl_is_read_as_definitions() {
     let file = InterfaceFile::read_idl("a/msg/A", MESSAGE).unwrap();
     assert_eq!(
         file.definitions["a/msg/A"],
-        "int8 LOW = -2\nstring NAME = \"a\\\"b\"\nfloat64 HALF = 5.0e-1\nbool on TRUE\nfloat64[3] three\nb/msg/B[2] two\n\
+        "int8 LOW = -2\nstring NAME = \"a\\\"b\"\nfloat64 HALF = 5.0e-1\nbool on TRUE\nfloat64[3] three\nb/msg/B[2] \
+         two\n\
          uint64[<=4] some [1, 2]\nstring<=20 word \"say \\\"ah\\\"\"\nwstring wide\nstring<=5[] texts\nint32[2] plain\n\
          a/msg/Other other\nbyte raw\n"
     );
@@ -153,7 +154,7 @@ fn files_that_are_no_interfaces_are_refused_with_the_line() {
         ("/* a".to_owned(), "line 1: a comment without an end"),
         (
             "interface a {".to_owned(),
-            "line 1: interface begins nothing that messages are made of",
+            "line 1: interface does not begin a definition that messages can have",
         ),
         (
             "module a { ".repeat(9),
@@ -163,7 +164,7 @@ fn files_that_are_no_interfaces_are_refused_with_the_line() {
         let found = InterfaceFile::read_idl("a/msg/A", &idl).unwrap_err();
         assert_eq!(found.to_string(), format!("a/msg/A {error}"), "{idl}");
     }
-    // A short name for a long one, very often.
+    // A short alias for a long name, used very often.
     let long = "x".repeat(200);
     let many = "T a;".repeat(9000);
     let idl = format!(

@@ -5,14 +5,14 @@ use crate::bus::RosVersion;
 use crate::codec::{JsonOptions, default_json, default_message, to_json};
 
 fn registry(definitions: &[(&str, &str)]) -> Registry {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (key, text) in definitions {
         registry.insert(key, text).unwrap();
     }
     registry
 }
 
-/// Shapes of interfaces that Jazzy has, in words of our own: what a description leaves out does not count for the hash.
+/// Jazzy interfaces in our own words: what a description omits does not count for the hash.
 fn common() -> Registry {
     registry(&[
         ("std_msgs/msg/String", "string data\n"),
@@ -228,7 +228,7 @@ fn an_action_is_its_parts_and_two_services() {
 
 #[test]
 fn what_actions_and_stamps_are_made_of_is_known_without_packages() {
-    let registry = Registry::of(RosVersion::Two);
+    let registry = Registry::for_version(RosVersion::Two);
     for (name, hash) in [
         (
             "builtin_interfaces/Time",
@@ -319,7 +319,7 @@ fn full_texts_are_read_by_either_name() {
     let long = text.replace("MSG: builtin_interfaces/", "MSG: builtin_interfaces/msg/");
     for text in [text.to_owned(), long] {
         let name = "geometry_msgs/TransformStamped";
-        let again = MessageType::of_full_text(RosVersion::Two, name, &text).unwrap();
+        let again = MessageType::parse_full_text(RosVersion::Two, name, &text).unwrap();
         assert_eq!(again.digest(), transform.digest());
     }
     assert_eq!(
@@ -340,16 +340,20 @@ fn the_versions_of_ros_keep_apart() {
     let field = &message.fields()[1];
     assert!(matches!(field.base, Base::Primitive(Primitive::Uint8)));
     assert_eq!(
-        Primitive::named(RosVersion::One, "byte"),
+        Primitive::from_versioned_name(RosVersion::One, "byte"),
         Some(Primitive::Int8)
     );
-    assert_eq!(Primitive::named(RosVersion::One, "wstring"), None);
+    assert_eq!(
+        Primitive::from_versioned_name(RosVersion::One, "wstring"),
+        None
+    );
     let of_one = registry(&[("a/msg/A", "Header header")]).message("a/A");
     assert_eq!(
         of_one.unwrap_err().to_string(),
-        "a/msg/A needs a/msg/Header, of which no definition is known; install the package that has it or supply its text"
+        "a/msg/A needs a/msg/Header, of which no definition is known; install the package that has it or supply its \
+         text"
     );
-    // Of another shape it is a message like any other.
+    // With other fields it is a message like any other.
     let odd = registry(&[
         ("builtin_interfaces/msg/Time", "int64 sec\nuint32 nanosec"),
         (

@@ -1,4 +1,4 @@
-//! As many others as there may be, and one more.
+//! The limits on the numbers of participants and endpoints.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -10,9 +10,9 @@ use super::super::Settings;
 use super::super::discovering::{BUILTIN, MOST_ENDS};
 use super::*;
 use crate::locator::Ports;
-use crate::network::Network;
+use crate::network::InterfaceSet;
 use crate::qos::EndpointQos;
-use crate::reader::Bounds;
+use crate::reader::ReaderLimits;
 use crate::wire::{Data, DatagramWriter, Heartbeat, InlineQos};
 use crate::{SequenceNumber, VendorId};
 
@@ -37,7 +37,7 @@ fn participant(number: u16) -> ParticipantData {
 }
 
 fn engine(now: Instant) -> Engine {
-    let bounds = Bounds {
+    let bounds = ReaderLimits {
         max_sample: 16 << 20,
         budget: Budget::new("samples", 1 << 20),
         unfinished: Duration::from_secs(30),
@@ -46,19 +46,19 @@ fn engine(now: Instant) -> Engine {
         now,
         Settings {
             own: participant(0),
-            ports: Ports::of(0).expect("a domain"),
+            ports: Ports::for_domain(0).expect("a domain"),
             bounds,
             announce_to: Vec::new(),
             servers: Vec::new(),
-            network: Network::new(Vec::new()),
+            network: InterfaceSet::new(Vec::new()),
             alone: false,
             predecessors: Vec::new(),
         },
     )
 }
 
-/// Somebody says this by one of the protocol's own writers.
-fn says(
+/// Delivers a sample of a built-in writer.
+fn deliver_announcement(
     engine: &mut Engine,
     now: Instant,
     whose: u16,
@@ -78,9 +78,9 @@ fn says(
     engine.receive(now, HERE, &datagram.finish().into());
 }
 
-fn comes(engine: &mut Engine, now: Instant, whose: u16) {
+fn join_participant(engine: &mut Engine, now: Instant, whose: u16) {
     let told = participant(whose).to_bytes();
-    says(engine, now, whose, EntityId::SPDP_WRITER, 1, told);
+    deliver_announcement(engine, now, whose, EntityId::SPDP_WRITER, 1, told);
 }
 
 #[test]
@@ -88,11 +88,11 @@ fn one_participant_too_many_is_not_heard_until_another_goes() {
     let now = Instant::now();
     let mut engine = engine(now);
     for whose in 1..=257 {
-        comes(&mut engine, now, whose);
+        join_participant(&mut engine, now, whose);
     }
-    let there = |engine: &Engine| engine.discovered().borrow().participants.len();
+    let there = |engine: &Engine| engine.watch_discovered().borrow().participants.len();
     let hears = |engine: &Engine, whose: u16| {
-        let discovered = engine.discovered().borrow().clone();
+        let discovered = engine.watch_discovered().borrow().clone();
         discovered
             .participants
             .contains_key(&participant(whose).prefix)
@@ -100,14 +100,14 @@ fn one_participant_too_many_is_not_heard_until_another_goes() {
     assert_eq!(MOST_PARTICIPANTS, 256);
     assert_eq!(there(&engine), 256);
     assert!(hears(&engine, 256) && !hears(&engine, 257));
-    engine.participant_gone(participant(7).prefix);
-    comes(&mut engine, now, 257);
+    engine.remove_participant(participant(7).prefix);
+    join_participant(&mut engine, now, 257);
     assert_eq!(there(&engine), 256);
     assert!(hears(&engine, 257));
 }
 
-/// A writer of a participant, by its number.
-fn end(whose: u16, number: u32, user_data: &'static [u8]) -> EndpointData {
+/// Creates a writer of a participant.
+fn endpoint(whose: u16, number: u32, user_data: &'static [u8]) -> EndpointData {
     EndpointData {
         guid: Guid::new(participant(whose).prefix, EntityId::user_writer(number)),
         topic: format!("rt/topic_{number}"),
@@ -123,7 +123,7 @@ fn end(whose: u16, number: u32, user_data: &'static [u8]) -> EndpointData {
 fn one_end_too_many_is_not_heard_and_those_that_are_can_change() {
     let now = Instant::now();
     let mut engine = engine(now);
-    comes(&mut engine, now, 1);
+    join_participant(&mut engine, now, 1);
     let mut datagram = DatagramWriter::new(participant(1).prefix);
     datagram.heartbeat(&Heartbeat {
         reader: EntityId::UNKNOWN,
@@ -139,30 +139,30 @@ fn one_end_too_many_is_not_heard_and_those_that_are_can_change() {
     let mut tells = |engine: &mut Engine, told: EndpointData| {
         number += 1;
         let writer = EntityId::PUBLICATIONS_WRITER;
-        says(engine, now, 1, writer, number, told.to_bytes());
+        deliver_announcement(engine, now, 1, writer, number, told.to_bytes());
     };
     assert_eq!(MOST_ENDS, 16_384);
-    // Telling whoever waits takes longer with every end; the last few do.
+    // Publishing takes longer with every endpoint, so only the last few are published.
     for number in 1..MOST_ENDS as u32 - 1 {
-        let told = Arc::new(end(1, number, b""));
+        let told = Arc::new(endpoint(1, number, b""));
         engine.discovered.writers.insert(told.guid, told);
     }
     for number in MOST_ENDS as u32 - 1..=MOST_ENDS as u32 + 1 {
-        tells(&mut engine, end(1, number, b""));
+        tells(&mut engine, endpoint(1, number, b""));
     }
-    let discovered = engine.discovered().borrow().clone();
+    let discovered = engine.watch_discovered().borrow().clone();
     assert_eq!(discovered.writers.len(), MOST_ENDS);
-    let last = end(1, MOST_ENDS as u32, b"").guid;
-    let beyond = end(1, MOST_ENDS as u32 + 1, b"").guid;
+    let last = endpoint(1, MOST_ENDS as u32, b"").guid;
+    let beyond = endpoint(1, MOST_ENDS as u32 + 1, b"").guid;
     assert!(discovered.writers.contains_key(&last) && !discovered.writers.contains_key(&beyond));
-    tells(&mut engine, end(1, MOST_ENDS as u32, b"changed"));
-    let discovered = engine.discovered().borrow().clone();
+    tells(&mut engine, endpoint(1, MOST_ENDS as u32, b"changed"));
+    let discovered = engine.watch_discovered().borrow().clone();
     assert_eq!(discovered.writers[&last].user_data, "changed");
 }
 
 #[test]
 fn an_end_with_a_name_or_user_data_without_end_is_not_heard() {
-    let mut told = end(1, 1, b"");
+    let mut told = endpoint(1, 1, b"");
     told.topic = "x".repeat(1024);
     assert_eq!(
         EndpointData::from_payload(&told.to_bytes()),
@@ -170,6 +170,6 @@ fn an_end_with_a_name_or_user_data_without_end_is_not_heard() {
     );
     told.topic.push('x');
     assert!(EndpointData::from_payload(&told.to_bytes()).is_err());
-    let told = end(1, 1, &[0; 1025]);
+    let told = endpoint(1, 1, &[0; 1025]);
     assert!(EndpointData::from_payload(&told.to_bytes()).is_err());
 }

@@ -1,4 +1,4 @@
-//! A client before a server that is made by hand: what it is told, and what it says.
+//! A client in front of a simulated server.
 
 use bytes::Bytes;
 
@@ -7,16 +7,16 @@ use crate::VendorId;
 use crate::discovery::EndpointData;
 use crate::engine::{BUILTIN, Settings};
 use crate::locator::Ports;
-use crate::network::Network;
-use crate::participant::Topic;
+use crate::network::InterfaceSet;
+use crate::participant::TopicDescription;
 use crate::qos::EndpointQos;
-use crate::reader::Bounds;
-use crate::wire::{DatagramWriter, Received, Submessage};
+use crate::reader::ReaderLimits;
+use crate::wire::{DatagramWriter, ReceivedSubmessage, Submessage};
 
 const HERE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::LOCALHOST);
 const SECOND: Duration = Duration::from_secs(1);
 
-fn at(port: u16) -> SocketAddr {
+fn local_address(port: u16) -> SocketAddr {
     SocketAddr::from(([127, 0, 0, 1], port))
 }
 
@@ -26,7 +26,7 @@ fn participant(prefix: GuidPrefix, port: u16) -> ParticipantData {
         prefix,
         vendor: VendorId::FAST_DDS,
         version: [2, 3],
-        // Of another domain: servers have one of their own, and Fast DDS 2 tells none.
+        // Another domain: servers have their own, and Fast DDS 2 does not announce one.
         domain: Some(7),
         name: String::new(),
         user_data: Bytes::new(),
@@ -38,30 +38,30 @@ fn participant(prefix: GuidPrefix, port: u16) -> ParticipantData {
 }
 
 /// A client of the servers at these ports, and the time.
-struct World {
+struct ClientWorld {
     now: Instant,
     client: Engine,
 }
 
-impl World {
-    fn of(servers: &[DiscoveryServer]) -> Self {
+impl ClientWorld {
+    fn with_servers(servers: &[DiscoveryServer]) -> Self {
         let now = Instant::now();
         let own = ParticipantData {
             vendor: VendorId::OURS,
             ..participant(GuidPrefix([1; 12]), 7410)
         };
-        let bounds = Bounds {
+        let bounds = ReaderLimits {
             max_sample: 1 << 20,
-            budget: budget::Budget::unlimited(),
+            budget: budget::Budget::without_limit(),
             unfinished: 30 * SECOND,
         };
         let settings = Settings {
             own,
-            ports: Ports::of(0).expect("a domain"),
+            ports: Ports::for_domain(0).expect("a domain"),
             bounds,
             announce_to: Vec::new(),
             servers: servers.to_vec(),
-            network: Network::new(Vec::new()),
+            network: InterfaceSet::new(Vec::new()),
             alone: false,
             predecessors: Vec::new(),
         };
@@ -69,8 +69,8 @@ impl World {
         Self { now, client }
     }
 
-    /// What the client says meanwhile, and where to.
-    fn pass(&mut self, duration: Duration) -> Vec<(SocketAddr, Received)> {
+    /// Lets time pass and returns what the client sends meanwhile, with the destinations.
+    fn advance(&mut self, duration: Duration) -> Vec<(SocketAddr, ReceivedSubmessage)> {
         let until = self.now + duration;
         let mut said = Vec::new();
         loop {
@@ -91,50 +91,50 @@ impl World {
         said
     }
 
-    /// Says something to the client.
-    fn say(&mut self, from: GuidPrefix, write: impl FnOnce(&mut DatagramWriter)) {
+    /// Delivers a datagram to the client.
+    fn deliver(&mut self, from: GuidPrefix, write: impl FnOnce(&mut DatagramWriter)) {
         let mut writer = DatagramWriter::new(from);
         write(&mut writer);
         self.client.receive(self.now, HERE, &writer.finish().into());
     }
 
     fn knows(&self, prefix: GuidPrefix) -> bool {
-        let discovered = self.client.discovered();
+        let discovered = self.client.watch_discovered();
         let discovered = discovered.borrow();
         discovered.participants.contains_key(&prefix)
     }
 
-    fn ends(&self) -> usize {
-        let discovered = self.client.discovered();
+    fn endpoint_count(&self) -> usize {
+        let discovered = self.client.watch_discovered();
         let discovered = discovered.borrow();
         discovered.writers.len() + discovered.readers.len()
     }
 }
 
-/// The server's part of what is said.
-struct Server {
+/// A simulated server.
+struct FakeServer {
     prefix: GuidPrefix,
     port: u16,
     counts: u32,
 }
 
-impl Server {
+impl FakeServer {
     fn new(place: u8) -> Self {
         Self {
-            prefix: named(place).prefix(),
-            port: named(place).at.port(),
+            prefix: discovery_server(place).prefix(),
+            port: discovery_server(place).at.port(),
             counts: 0,
         }
     }
 
-    /// One of its announcers has said nothing but this by now.
-    fn says(&mut self, world: &mut World, writer: EntityId, number: i64, payload: Bytes) {
-        self.says_with(world, writer, number, InlineQos::default(), payload);
+    /// Sends a sample as the only one of a built-in writer so far.
+    fn send(&mut self, world: &mut ClientWorld, writer: EntityId, number: i64, payload: Bytes) {
+        self.send_with_status(world, writer, number, InlineQos::default(), payload);
     }
 
-    fn says_with(
+    fn send_with_status(
         &mut self,
-        world: &mut World,
+        world: &mut ClientWorld,
         writer: EntityId,
         number: i64,
         inline: InlineQos,
@@ -160,34 +160,40 @@ impl Server {
             is_final: false,
             liveliness: false,
         };
-        world.say(self.prefix, |out| {
+        world.deliver(self.prefix, |out| {
             out.data(&data);
             out.heartbeat(&beat);
         });
     }
 
-    fn tells(&mut self, world: &mut World, number: i64, of: &ParticipantData) {
-        self.says(world, EntityId::SPDP_WRITER, number, of.to_bytes());
+    fn send_participant(&mut self, world: &mut ClientWorld, number: i64, of: &ParticipantData) {
+        self.send(world, EntityId::SPDP_WRITER, number, of.to_bytes());
     }
 
-    fn announces_itself(&mut self, world: &mut World) {
+    fn announce_itself(&mut self, world: &mut ClientWorld) {
         let own = participant(self.prefix, self.port);
-        self.tells(world, 1, &own);
+        self.send_participant(world, 1, &own);
     }
 
-    fn takes_back(&mut self, world: &mut World, number: i64, gone: GuidPrefix) {
+    fn withdraw(&mut self, world: &mut ClientWorld, number: i64, gone: GuidPrefix) {
         let guid = Guid::new(gone, EntityId::PARTICIPANT);
         let inline = InlineQos {
             status: DISPOSED,
             key_hash: Some(guid.bytes()),
             ..InlineQos::default()
         };
-        let key = discovery::key(guid);
-        self.says_with(world, EntityId::SPDP_WRITER, number, inline, key);
+        let key = discovery::key_payload(guid);
+        self.send_with_status(world, EntityId::SPDP_WRITER, number, inline, key);
     }
 
-    /// Its reader has all before this number of what our announcer has said.
-    fn acknowledges(&mut self, world: &mut World, writer: EntityId, reader: EntityId, next: i64) {
+    /// Acknowledges all samples of a built-in writer before this number.
+    fn acknowledge(
+        &mut self,
+        world: &mut ClientWorld,
+        writer: EntityId,
+        reader: EntityId,
+        next: i64,
+    ) {
         self.counts += 1;
         let acknack = wire::AckNack {
             reader,
@@ -196,28 +202,28 @@ impl Server {
             count: self.counts,
             is_final: true,
         };
-        world.say(self.prefix, |out| {
+        world.deliver(self.prefix, |out| {
             out.acknack(&acknack);
         });
     }
 }
 
-fn named(place: u8) -> DiscoveryServer {
+fn discovery_server(place: u8) -> DiscoveryServer {
     DiscoveryServer {
         place,
-        at: at(11811 + u16::from(place)),
+        at: local_address(11811 + u16::from(place)),
     }
 }
 
-fn topic() -> Topic {
-    Topic {
+fn topic() -> TopicDescription {
+    TopicDescription {
         name: "rt/chatter".into(),
         type_name: "std_msgs::msg::dds_::String_".into(),
         user_data: Bytes::new(),
     }
 }
 
-/// A reader of that topic.
+/// Creates a reader of that topic.
 fn reader(prefix: GuidPrefix) -> EndpointData {
     EndpointData {
         guid: Guid::new(prefix, EntityId([0, 0, 1, 4])),
@@ -230,8 +236,10 @@ fn reader(prefix: GuidPrefix) -> EndpointData {
     }
 }
 
-/// What our announcers have said: who, the number, and to whom.
-fn announced(said: &[(SocketAddr, Received)]) -> Vec<(EntityId, i64, SocketAddr)> {
+/// Returns the samples of built-in writers: entity, number and destination.
+fn collect_announcements(
+    said: &[(SocketAddr, ReceivedSubmessage)],
+) -> Vec<(EntityId, i64, SocketAddr)> {
     let data = said.iter().filter_map(|(to, it)| match &it.submessage {
         Submessage::Data(data) => Some((data.writer, data.number.0, *to)),
         _ => None,
@@ -243,15 +251,15 @@ const OTHER: GuidPrefix = GuidPrefix([9; 12]);
 
 #[test]
 fn servers_alone_are_told_and_again_until_they_are_there() {
-    let mut world = World::of(&[named(0), named(3)]);
-    assert!(world.client.ports_to_look_at().iter().eq([
+    let mut world = ClientWorld::with_servers(&[discovery_server(0), discovery_server(3)]);
+    assert!(world.client.watched_ports().iter().eq([
         &SocketAddrV4::new(std::net::Ipv4Addr::LOCALHOST, 11811),
         &SocketAddrV4::new(std::net::Ipv4Addr::LOCALHOST, 11814),
     ]));
-    world.pass(SECOND);
-    let said = world.pass(9 * SECOND);
-    let told = announced(&said);
-    for server in [at(11811), at(11814)] {
+    world.advance(SECOND);
+    let said = world.advance(9 * SECOND);
+    let told = collect_announcements(&said);
+    for server in [local_address(11811), local_address(11814)] {
         let times = told.iter().filter(|(_, _, to)| *to == server).count();
         assert!((15..=25).contains(&times), "{times} times in 9 s");
     }
@@ -266,7 +274,7 @@ fn servers_alone_are_told_and_again_until_they_are_there() {
     let Submessage::Data(data) = &first.submessage else {
         panic!("{first:?}");
     };
-    // What a server passes on nothing without: whose it is, by name, number and implementation.
+    // A server forwards nothing without the identity of its author: GUID, number and vendor.
     let related = data.inline.related.expect("an identity");
     let own = Guid::new(GuidPrefix([1; 12]), EntityId::SPDP_WRITER);
     assert_eq!((related.writer, related.number), (own, SequenceNumber(1)));
@@ -275,141 +283,144 @@ fn servers_alone_are_told_and_again_until_they_are_there() {
     assert_eq!(told.vendor, VendorId::FAST_DDS);
     let text = String::from_utf8_lossy(&payload);
     assert!(text.contains("PARTICIPANT_TYPE\0") && text.contains("SUPER_CLIENT\0"));
-    // Both are there: then seldom.
+    // Both servers are there, so announcements become rare.
     for place in [0, 3] {
-        Server::new(place).announces_itself(&mut world);
+        FakeServer::new(place).announce_itself(&mut world);
     }
-    world.pass(SECOND);
-    let often = announced(&world.pass(9 * SECOND)).len();
+    world.advance(SECOND);
+    let often = collect_announcements(&world.advance(9 * SECOND)).len();
     assert!((4..=10).contains(&often), "{often} times in 9 s");
 }
 
 #[test]
 fn others_are_known_by_the_server_and_spoken_with_directly() {
-    let mut world = World::of(&[named(0)]);
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
     let (_, ends) = world
         .client
         .add_writer(world.now, &topic(), EndpointQos::default());
-    let mut server = Server::new(0);
-    server.announces_itself(&mut world);
-    let said = announced(&world.pass(SECOND));
-    let to_server = (EntityId::PUBLICATIONS_WRITER, 1, at(11811));
+    let mut server = FakeServer::new(0);
+    server.announce_itself(&mut world);
+    let said = collect_announcements(&world.advance(SECOND));
+    let to_server = (EntityId::PUBLICATIONS_WRITER, 1, local_address(11811));
     assert!(said.contains(&to_server), "{said:?}");
-    server.tells(&mut world, 2, &participant(OTHER, 7412));
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     let end = reader(OTHER).to_bytes();
-    server.says(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
     assert!(world.knows(OTHER));
     assert_eq!(ends.borrow().matched.len(), 1);
-    let said = world.pass(SECOND);
-    // It is sent samples where its ends receive, and asked there; of ends it hears by the server alone.
-    let others = said.iter().filter(|(to, _)| *to != at(11811));
+    let said = world.advance(SECOND);
+    // Samples and heartbeats are sent to it directly; it learns of endpoints from the server alone.
+    let others = said.iter().filter(|(to, _)| *to != local_address(11811));
     let user_ports: Vec<u16> = others.map(|(to, _)| to.port()).collect();
     assert!(!user_ports.is_empty() && user_ports.iter().all(|port| *port == 7413));
-    server.takes_back(&mut world, 3, OTHER);
+    server.withdraw(&mut world, 3, OTHER);
     assert!(!world.knows(OTHER));
-    assert_eq!((ends.borrow().matched.len(), world.ends()), (0, 0));
+    assert_eq!(
+        (ends.borrow().matched.len(), world.endpoint_count()),
+        (0, 0)
+    );
 }
 
 #[test]
-fn whoever_is_no_server_is_not_heard() {
-    let mut world = World::of(&[named(0)]);
-    let mut stranger = Server {
+fn participants_that_are_no_servers_are_ignored() {
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
+    let mut stranger = FakeServer {
         prefix: OTHER,
         port: 7412,
         counts: 0,
     };
-    stranger.announces_itself(&mut world);
-    // Nor what it says of others, nor of their ends.
-    stranger.tells(&mut world, 2, &participant(GuidPrefix([8; 12]), 7414));
+    stranger.announce_itself(&mut world);
+    // Neither is what it says about others or their endpoints.
+    stranger.send_participant(&mut world, 2, &participant(GuidPrefix([8; 12]), 7414));
     let end = reader(GuidPrefix([8; 12])).to_bytes();
-    stranger.says(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
+    stranger.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
     assert!(!world.knows(OTHER) && !world.knows(GuidPrefix([8; 12])));
-    assert_eq!(world.ends(), 0);
-    // A server of a name of its own is known by its address.
-    let mut server = Server {
+    assert_eq!(world.endpoint_count(), 0);
+    // A server with another prefix is recognized by its address.
+    let mut server = FakeServer {
         prefix: GuidPrefix([7; 12]),
         port: 11811,
         counts: 0,
     };
-    server.announces_itself(&mut world);
+    server.announce_itself(&mut world);
     assert!(world.knows(server.prefix));
-    // What it says of ends of whom it has not told is not kept.
+    // Its endpoints are ignored while the participant is unknown.
     let end = reader(OTHER).to_bytes();
-    server.says(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
-    assert_eq!(world.ends(), 0);
-    server.tells(&mut world, 2, &participant(OTHER, 7412));
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
+    assert_eq!(world.endpoint_count(), 0);
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     assert!(world.knows(OTHER));
 }
 
 #[test]
-fn a_server_begun_anew_is_told_all_again() {
-    let mut world = World::of(&[named(0)]);
-    let mut server = Server::new(0);
-    server.announces_itself(&mut world);
+fn a_restarted_server_is_sent_everything_again() {
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
+    let mut server = FakeServer::new(0);
+    server.announce_itself(&mut world);
     let (_, ends) = world
         .client
         .add_writer(world.now, &topic(), EndpointQos::default());
-    server.tells(&mut world, 2, &participant(OTHER, 7412));
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     let end = reader(OTHER).to_bytes();
-    server.says(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
-    world.pass(SECOND);
+    server.send(&mut world, EntityId::SUBSCRIPTIONS_WRITER, 1, end);
+    world.advance(SECOND);
     let (writer, reader) = ANNOUNCERS[0];
-    server.acknowledges(&mut world, writer, reader, 2);
-    let ends_told = |said: &[(SocketAddr, Received)]| {
-        let told = announced(said);
+    server.acknowledge(&mut world, writer, reader, 2);
+    let ends_told = |said: &[(SocketAddr, ReceivedSubmessage)]| {
+        let told = collect_announcements(said);
         told.iter().filter(|(who, ..)| *who == writer).count()
     };
-    assert_eq!(ends_told(&world.pass(SECOND)), 0);
-    // Another process has its name: it has nothing, and its own numbers and counts begin anew.
-    let mut anew = Server::new(0);
-    anew.acknowledges(&mut world, writer, reader, 1);
-    assert_eq!(ends_told(&world.pass(SECOND)), 1);
-    anew.acknowledges(&mut world, writer, reader, 2);
+    assert_eq!(ends_told(&world.advance(SECOND)), 0);
+    // Another process with the same prefix: it has no data, and its numbers and counts start anew.
+    let mut anew = FakeServer::new(0);
+    anew.acknowledge(&mut world, writer, reader, 1);
+    assert_eq!(ends_told(&world.advance(SECOND)), 1);
+    anew.acknowledge(&mut world, writer, reader, 2);
     let third = GuidPrefix([8; 12]);
-    anew.tells(&mut world, 1, &participant(third, 7416));
+    anew.send_participant(&mut world, 1, &participant(third, 7416));
     assert!(world.knows(third), "the numbers before do not count");
-    // Who was found by the first is there still.
+    // Participants found through the first server are still there.
     assert!(world.knows(OTHER));
     assert_eq!(ends.borrow().matched.len(), 1);
 }
 
 #[test]
 fn a_server_that_is_gone_takes_nobody_with_it() {
-    let mut world = World::of(&[named(0)]);
-    let mut server = Server::new(0);
-    server.announces_itself(&mut world);
-    server.tells(&mut world, 2, &participant(OTHER, 7412));
-    // Its last word, which is not in order, or its lease of 20 s.
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
+    let mut server = FakeServer::new(0);
+    server.announce_itself(&mut world);
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
+    // Its farewell, which is out of order, or its lease of 20 s.
     let gone = server.prefix;
-    server.takes_back(&mut world, 9, gone);
+    server.withdraw(&mut world, 9, gone);
     assert!(!world.knows(server.prefix) && world.knows(OTHER));
-    let mut anew = Server::new(0);
-    anew.announces_itself(&mut world);
+    let mut anew = FakeServer::new(0);
+    anew.announce_itself(&mut world);
     assert!(world.knows(server.prefix));
-    world.pass(19 * SECOND);
+    world.advance(19 * SECOND);
     assert!(world.knows(server.prefix));
-    world.pass(5 * SECOND);
+    world.advance(5 * SECOND);
     assert!(!world.knows(server.prefix) && world.knows(OTHER));
 }
 
 #[test]
 fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
-    let mut world = World::of(&[named(0)]);
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
     let (ours, _) = world
         .client
         .add_writer(world.now, &topic(), EndpointQos::default());
-    let mut server = Server::new(0);
-    server.announces_itself(&mut world);
-    server.tells(&mut world, 2, &participant(OTHER, 7412));
+    let mut server = FakeServer::new(0);
+    server.announce_itself(&mut world);
+    server.send_participant(&mut world, 2, &participant(OTHER, 7412));
     let theirs = reader(OTHER);
-    server.says(
+    server.send(
         &mut world,
         EntityId::SUBSCRIPTIONS_WRITER,
         1,
         theirs.to_bytes(),
     );
     let mut count = 0;
-    let mut answer = |world: &mut World| {
+    let mut answer = |world: &mut ClientWorld| {
         count += 1;
         let acknack = wire::AckNack {
             reader: theirs.guid.entity,
@@ -418,21 +429,21 @@ fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
             count,
             is_final: true,
         };
-        world.say(OTHER, |out| {
+        world.deliver(OTHER, |out| {
             out.acknack(&acknack);
         });
     };
-    // As long as it answers it is there, whatever has become of the server.
+    // As long as it answers it is alive, whatever happens to the server.
     answer(&mut world);
     let mut times = 0;
     for _ in 0..20 {
-        let said = world.pass(4 * SECOND);
+        let said = world.advance(4 * SECOND);
         let mut said = said.iter();
         let is_asked = said.any(|(to, it)| {
             let Submessage::Heartbeat(beat) = &it.submessage else {
                 return false;
             };
-            *to == at(7413) && beat.writer == ours.entity && !beat.is_final
+            *to == local_address(7413) && beat.writer == ours.entity && !beat.is_final
         });
         if is_asked {
             times += 1;
@@ -441,28 +452,31 @@ fn whoever_has_gone_with_the_server_is_missed_when_it_does_not_answer() {
     }
     assert!(times >= 10, "{times} times in 80 s");
     assert!(world.knows(OTHER) && !world.knows(server.prefix));
-    world.pass(20 * SECOND);
+    world.advance(20 * SECOND);
     assert!(
         world.knows(OTHER),
         "a server would have said so first: its lease is 20 s"
     );
-    world.pass(20 * SECOND);
+    world.advance(20 * SECOND);
     assert!(!world.knows(OTHER));
 }
 
 #[test]
 fn leaving_is_said_to_servers() {
-    let mut world = World::of(&[named(0)]);
-    Server::new(0).announces_itself(&mut world);
-    world.pass(SECOND);
+    let mut world = ClientWorld::with_servers(&[discovery_server(0)]);
+    FakeServer::new(0).announce_itself(&mut world);
+    world.advance(SECOND);
     world.client.close(world.now);
-    let said = world.pass(Duration::ZERO);
+    let said = world.advance(Duration::ZERO);
     let last = said.iter().find_map(|(to, it)| match &it.submessage {
         Submessage::Data(data) if data.inline.status != 0 => Some((to, data)),
         _ => None,
     });
     let (to, data) = last.expect("a last word");
-    assert_eq!((*to, data.writer), (at(11811), EntityId::SPDP_WRITER));
+    assert_eq!(
+        (*to, data.writer),
+        (local_address(11811), EntityId::SPDP_WRITER)
+    );
     let own = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
     assert_eq!(discovery::guid_of_key(data), Some(own));
     assert!(data.inline.related.is_some());
@@ -470,6 +484,6 @@ fn leaving_is_said_to_servers() {
 
 #[test]
 fn a_server_has_the_name_of_its_place() {
-    let name = format!("{:?}", named(3).prefix());
+    let name = format!("{:?}", discovery_server(3).prefix());
     assert_eq!(name, "4453035f4550524f53494d41");
 }

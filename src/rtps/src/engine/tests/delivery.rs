@@ -1,18 +1,18 @@
-//! Samples arrive as they were written: whole, once, in order, and in time; or not at all where nobody promised it.
+//! Samples arrive complete, once, in order and in time; or not at all if best-effort.
 
 use std::time::Duration;
 
 use bytes::Bytes;
 
-use super::world::{HERE, SECOND, World, best_effort, keep, scattered};
+use super::world::{HERE, NetworkWorld, SECOND, best_effort_qos, keep_last_qos, pseudo_random};
 use crate::{SampleIdentity, SequenceNumber};
 
 #[test]
 fn participants_find_each_other_and_samples_arrive_in_order() {
-    let mut world = World::of(2);
-    let (writer, writer_ends) = world.writer(0, keep(10));
-    let (reader, reader_ends, read) = world.reader(1, keep(10));
-    world.pass(SECOND / 5);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, writer_ends) = world.writer(0, keep_last_qos(10));
+    let (reader, reader_ends, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND / 5);
     assert_eq!(writer_ends.borrow().confirmed, [reader]);
     assert_eq!(reader_ends.borrow().confirmed, [writer]);
     for (mark, length) in [
@@ -25,10 +25,10 @@ fn participants_find_each_other_and_samples_arrive_in_order() {
     ] {
         world.write(writer, mark, length);
     }
-    world.pass(SECOND / 10);
+    world.advance(SECOND / 10);
     assert_eq!(read.marks(), [1, 2, 3, 4, 5, 6]);
     assert_eq!(read.lengths(), [8, 100_000, 8, 15_872, 15_873, 3_000_001]);
-    let discovered = world.engines[0].discovered().borrow().clone();
+    let discovered = world.engines[0].watch_discovered().borrow().clone();
     assert_eq!(discovered.participants.len(), 1);
     assert_eq!(
         discovered.readers.keys().copied().collect::<Vec<_>>(),
@@ -39,18 +39,18 @@ fn participants_find_each_other_and_samples_arrive_in_order() {
 #[test]
 fn whatever_the_network_loses_reliable_samples_come_once_and_in_order() {
     for seed in 0..20 {
-        let mut world = World::of(2);
-        let mut random = scattered(seed);
+        let mut world = NetworkWorld::with_participants(2);
+        let mut random = pseudo_random(seed);
         world.loses = Box::new(move |_, _| random() % 4 == 0);
-        let (writer, _) = world.writer(0, keep(100));
-        let (_, _, read) = world.reader(1, keep(100));
-        world.pass(SECOND * 5);
-        let mut random = scattered(seed + 1000);
+        let (writer, _) = world.writer(0, keep_last_qos(100));
+        let (_, _, read) = world.reader(1, keep_last_qos(100));
+        world.advance(SECOND * 5);
+        let mut random = pseudo_random(seed + 1000);
         for mark in 0..50 {
             world.write(writer, mark, 8 + (random() % 60_000) as usize);
-            world.pass(Duration::from_millis(random() % 30));
+            world.advance(Duration::from_millis(random() % 30));
         }
-        world.pass(SECOND * 20);
+        world.advance(SECOND * 20);
         assert_eq!(read.marks(), (0..50).collect::<Vec<u8>>(), "seed {seed}");
     }
 }
@@ -58,15 +58,15 @@ fn whatever_the_network_loses_reliable_samples_come_once_and_in_order() {
 #[test]
 fn best_effort_samples_are_whole_or_lost_and_never_out_of_order() {
     for seed in 0..10 {
-        let mut world = World::of(2);
-        let (writer, _) = world.writer(0, best_effort());
-        let (_, _, read) = world.reader(1, best_effort());
-        world.pass(SECOND);
-        let mut random = scattered(seed);
+        let mut world = NetworkWorld::with_participants(2);
+        let (writer, _) = world.writer(0, best_effort_qos());
+        let (_, _, read) = world.reader(1, best_effort_qos());
+        world.advance(SECOND);
+        let mut random = pseudo_random(seed);
         world.loses = Box::new(move |_, _| random() % 20 == 0);
         for mark in 0..100 {
             world.write(writer, mark, 8 + usize::from(mark % 3) * 40_000);
-            world.pass(Duration::from_millis(10));
+            world.advance(Duration::from_millis(10));
         }
         let marks = read.marks();
         assert!(
@@ -86,46 +86,46 @@ fn best_effort_samples_are_whole_or_lost_and_never_out_of_order() {
 
 #[test]
 fn a_sample_of_which_parts_were_lost_is_whole_in_the_end_however_many_follow() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(1));
-    let (_, _, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(1));
+    let (_, _, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     // One in three datagrams is lost, and each sample is replaced long before it is repaired.
-    let mut random = scattered(7);
+    let mut random = pseudo_random(7);
     world.loses = Box::new(move |_, _| random() % 3 == 0);
     let fragmented = 20 * 16_000;
     for mark in 1..=10 {
         world.write(writer, mark, fragmented);
-        world.pass(Duration::from_millis(2));
+        world.advance(Duration::from_millis(2));
     }
     world.loses = Box::new(|_, _| false);
-    world.pass(SECOND * 5);
+    world.advance(SECOND * 5);
     assert_eq!(read.marks(), (1..=10).collect::<Vec<u8>>());
-    assert_eq!(world.engines[0].dropped(writer.entity), 0);
+    assert_eq!(world.engines[0].dropped_samples(writer.entity), 0);
 }
 
 #[test]
 fn what_was_written_is_sent_though_the_writer_is_dropped() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(10));
-    let (_, ends, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
-    let mut random = scattered(3);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(10));
+    let (_, ends, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
+    let mut random = pseudo_random(3);
     world.loses = Box::new(move |_, _| random() % 3 == 0);
     (0..5).for_each(|mark| world.write(writer, mark, 30_000));
     let now = world.now;
-    drop(world.engines[0].remove_end(now, writer.entity));
-    world.pass(SECOND * 4);
+    drop(world.engines[0].remove_endpoint(now, writer.entity));
+    world.advance(SECOND * 4);
     assert_eq!(read.marks(), [0, 1, 2, 3, 4]);
     assert_eq!(ends.borrow().matched.len(), 0);
 }
 
 #[test]
 fn requests_and_replies_keep_their_identity() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(10));
-    let (_, _, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(10));
+    let (_, _, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     let related = SampleIdentity {
         writer,
         number: SequenceNumber(7),
@@ -134,17 +134,17 @@ fn requests_and_replies_keep_their_identity() {
     for length in [8, 50_000] {
         world.engines[0].write(now, writer.entity, vec![0; length].into(), Some(related));
     }
-    world.pass(SECOND);
+    world.advance(SECOND);
     let told: Vec<_> = read.0.lock().iter().map(|sample| sample.related).collect();
     assert_eq!(told, [Some(related), Some(related)]);
 }
 
 #[test]
 fn datagrams_of_nonsense_change_nothing() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(10));
-    let (_, ends, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(10));
+    let (_, ends, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     let mut kept: Vec<Bytes> = Vec::new();
     for mark in 0..4 {
         world.write(writer, mark, 40_000);
@@ -158,11 +158,11 @@ fn datagrams_of_nonsense_change_nothing() {
             );
         }
     }
-    let mut random = scattered(7);
+    let mut random = pseudo_random(7);
     let now = world.now;
     for _ in 0..20_000 {
         let mut bytes = kept[random() as usize % kept.len()].to_vec();
-        // Never the sender: who says to be somebody else is believed, as there is no security.
+        // Except the sender: a forged sender is believed, because there is no security.
         for _ in 0..1 + random() % 8 {
             let at = 20 + random() as usize % (bytes.len().min(200) - 20);
             bytes[at] = random() as u8;

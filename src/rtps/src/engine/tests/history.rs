@@ -1,4 +1,4 @@
-//! What a writer keeps, and what newer samples take the place of.
+//! History of writers, and what newer samples replace.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,53 +6,56 @@ use std::time::Duration;
 use bytes::Bytes;
 use parking_lot::Mutex;
 
-use super::world::{HERE, SECOND, World, best_effort, keep, transient};
-use crate::qos::{EndpointQos, History};
+use super::world::{
+    HERE, NetworkWorld, SECOND, best_effort_qos, keep_last_qos, transient_local_qos,
+};
+use crate::qos::{EndpointQos, HistoryKind};
 use crate::sequence::SequenceSet;
 use crate::wire::{self, DatagramWriter};
 use crate::{EntityId, FragmentSet, Guid, GuidPrefix, SequenceNumber};
 
 #[test]
 fn newcomers_are_given_what_is_kept_for_them_and_nothing_else() {
-    let mut world = World::of(2);
-    let (kept, _) = world.writer(0, transient(2));
+    let mut world = NetworkWorld::with_participants(2);
+    let (kept, _) = world.writer(0, transient_local_qos(2));
     (1..=5).for_each(|mark| world.write(kept, mark, 8));
-    world.pass(SECOND);
-    let (_, _, wants_past) = world.reader(1, transient(10));
-    let (_, _, wants_none) = world.reader(1, keep(10));
-    world.pass(SECOND);
+    world.advance(SECOND);
+    let (_, _, wants_past) = world.reader(1, transient_local_qos(10));
+    let (_, _, wants_none) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     assert_eq!(wants_past.marks(), [4, 5]);
     assert_eq!(wants_none.marks(), []);
     world.write(kept, 6, 8);
-    world.pass(SECOND);
+    world.advance(SECOND);
     assert_eq!(wants_past.marks(), [4, 5, 6]);
     assert_eq!(wants_none.marks(), [6]);
 }
 
 #[test]
 fn no_more_is_begun_to_a_reader_than_it_acknowledges() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(1));
-    let (_, _, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
-    // Whatever the reader says is lost for a while: the first two samples fill the window, and others replace each other behind.
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(1));
+    let (_, _, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
+    // The reader's messages are lost for a while: the first two samples fill the window, and later ones replace each
+    // other.
     world.loses = Box::new(|_, bytes| bytes.starts_with(b"RTPS") && bytes[8..20] == [2; 12]);
     for mark in 1..=40 {
         world.write(writer, mark, 5 << 20);
-        world.pass(Duration::from_millis(2));
+        world.advance(Duration::from_millis(2));
     }
     world.loses = Box::new(|_, _| false);
-    world.pass(SECOND * 2);
+    world.advance(SECOND * 2);
     assert_eq!(read.marks(), [1, 2, 40]);
 }
 
 #[test]
 fn a_sample_on_its_way_is_not_said_to_be_gone() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(1));
-    let (_, _, read) = world.reader(1, keep(1));
-    world.pass(SECOND);
-    // Two fragments of seven are out when the next sample takes its place; the receiver asks for the rest.
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(1));
+    let (_, _, read) = world.reader(1, keep_last_qos(1));
+    world.advance(SECOND);
+    // Two of seven fragments were sent when the next sample replaces it; the receiver asks for the rest.
     world.room = Some(33_000);
     world.write(writer, 1, 100_000);
     world.carry();
@@ -73,15 +76,15 @@ fn a_sample_on_its_way_is_not_said_to_be_gone() {
     datagram.nack_frag(&ask);
     let now = world.now;
     world.engines[0].receive(now, HERE, &datagram.finish().into());
-    // Nor by a heartbeat, which comes before the rest of it does.
+    // Nor by a heartbeat that arrives before the rest of the sample.
     world.engines[0].tick(now + SECOND);
     world.room = None;
-    world.pass(SECOND);
+    world.advance(SECOND);
     assert_eq!(read.marks(), [1, 2]);
 }
 
-/// How many submessages of a kind a datagram has.
-fn count(datagram: &[u8], kind: fn(&wire::Submessage) -> bool) -> usize {
+/// Counts the submessages of a kind in a datagram.
+fn count_submessages(datagram: &[u8], kind: fn(&wire::Submessage) -> bool) -> usize {
     let parsed = wire::parse(&Bytes::copy_from_slice(datagram));
     let submessages = parsed.received.iter().map(|it| &it.submessage);
     submessages.filter(|it| kind(it)).count()
@@ -89,19 +92,20 @@ fn count(datagram: &[u8], kind: fn(&wire::Submessage) -> bool) -> usize {
 
 #[test]
 fn what_is_under_way_is_not_sent_again_for_a_receiver_that_asks_in_the_middle() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(5));
-    let (_, _, read) = world.reader(1, keep(5));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(5));
+    let (_, _, read) = world.reader(1, keep_last_qos(5));
+    world.advance(SECOND);
     let counted = Arc::new(Mutex::new((0, 0)));
     let counts = Arc::clone(&counted);
     world.loses = Box::new(move |_, datagram| {
         let mut counts = counts.lock();
-        counts.0 += count(datagram, |it| matches!(it, wire::Submessage::DataFrag(_)));
-        counts.1 += count(datagram, |it| matches!(it, wire::Submessage::NackFrag(_)));
+        counts.0 += count_submessages(datagram, |it| matches!(it, wire::Submessage::DataFrag(_)));
+        counts.1 += count_submessages(datagram, |it| matches!(it, wire::Submessage::NackFrag(_)));
         false
     });
-    // Two fragments of seven are out when the receiver is asked what it has, four when it answers, and six when that comes.
+    // Two of seven fragments were sent when the receiver is asked, four when it answers, and six when the answer
+    // arrives.
     world.room = Some(33_000);
     world.write(writer, 1, 100_000);
     world.carry();
@@ -113,20 +117,20 @@ fn what_is_under_way_is_not_sent_again_for_a_receiver_that_asks_in_the_middle() 
     world.carry();
     assert_eq!(*counted.lock(), (6, 1));
     world.room = None;
-    world.pass(SECOND);
+    world.advance(SECOND);
     assert_eq!(read.marks(), [1]);
     assert_eq!(counted.lock().0, 7, "each fragment is sent once");
 }
 
-/// Fast DDS 2.14.5 takes a number of the set of a GAP for the one at its base: where that is a sample of which it has fragments, it forgets it
-/// by half, and whoever takes from that reader then tries for ever.
+/// Fast DDS 2.14.5 confuses a number in the set of a GAP with the one at its base. If it has fragments of that sample,
+/// it forgets it partially, and takes from that reader never return.
 #[test]
 fn numbers_that_will_never_come_are_told_without_a_set() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(1));
-    let (_, _, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
-    // 2 and 4 are replaced before they are begun, and part of 3 is out.
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(1));
+    let (_, _, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
+    // Samples 2 and 4 are replaced before they are started, and part of 3 was sent.
     world.room = Some(33_000);
     world.write(writer, 1, 100_000);
     world.carry();
@@ -141,7 +145,7 @@ fn numbers_that_will_never_come_are_told_without_a_set() {
     set.insert(SequenceNumber(2));
     set.insert(SequenceNumber(4));
     let ask = wire::AckNack {
-        reader: read_by(&world, writer),
+        reader: matched_reader(&world, writer),
         writer: writer.entity,
         set,
         count: 1000,
@@ -163,38 +167,38 @@ fn numbers_that_will_never_come_are_told_without_a_set() {
         }
     }
     assert_eq!(gaps, [2..3, 4..5]);
-    // The reader's own words count anew after three seconds.
+    // The counts of the reader start anew after three seconds.
     world.room = None;
-    world.pass(SECOND * 4);
+    world.advance(SECOND * 4);
     assert_eq!(read.marks(), [1, 3, 5]);
 }
 
-/// The reader that a writer is matched with.
-fn read_by(world: &World, writer: Guid) -> EntityId {
+/// Returns the reader that is matched with a writer.
+fn matched_reader(world: &NetworkWorld, writer: Guid) -> EntityId {
     let ends = world.engines[0].writers[&writer.entity].ends.borrow();
     ends.matched[0].guid.entity
 }
 
 #[test]
 fn a_slow_receiver_gets_whole_samples_though_newer_ones_replace_them() {
-    let mut world = World::of(2);
+    let mut world = NetworkWorld::with_participants(2);
     let (writer, _) = world.writer(
         0,
         EndpointQos {
-            history: History::KeepLast(1),
-            ..best_effort()
+            history: HistoryKind::KeepLast(1),
+            ..best_effort_qos()
         },
     );
-    let (_, _, read) = world.reader(1, best_effort());
-    world.pass(SECOND);
-    // Two fragments pass between two samples of seven.
+    let (_, _, read) = world.reader(1, best_effort_qos());
+    world.advance(SECOND);
+    // Two fragments are sent between two samples of seven.
     world.room = Some(33_000);
     for mark in 0..40 {
         world.write(writer, mark, 100_000);
         world.carry();
     }
     world.room = None;
-    world.pass(SECOND);
+    world.advance(SECOND);
     let marks = read.marks();
     assert!(marks.len() >= 8, "{marks:?}");
     assert_eq!(marks.last(), Some(&39));
@@ -203,17 +207,17 @@ fn a_slow_receiver_gets_whole_samples_though_newer_ones_replace_them() {
 
 #[test]
 fn a_reader_that_never_acknowledges_costs_no_more_than_the_depth() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(4));
-    let (_, _, read) = world.reader(1, keep(4));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(4));
+    let (_, _, read) = world.reader(1, keep_last_qos(4));
+    world.advance(SECOND);
     world.loses = Box::new(|_, _| true);
     for mark in 0..10 {
         world.write(writer, mark, 8);
     }
     world.carry();
-    assert_eq!(world.engines[0].dropped(writer.entity), 6);
+    assert_eq!(world.engines[0].dropped_samples(writer.entity), 6);
     world.loses = Box::new(|_, _| false);
-    world.pass(SECOND);
+    world.advance(SECOND);
     assert_eq!(read.marks(), [6, 7, 8, 9]);
 }

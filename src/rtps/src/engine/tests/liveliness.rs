@@ -1,24 +1,24 @@
-//! Who is there, and when somebody is not any more.
+//! Detection of participants that appear and disappear.
 
-use super::world::{SECOND, World, bound, keep};
+use super::world::{NetworkWorld, SECOND, bound_ports, keep_last_qos};
 use crate::wire::{self, InlineQos, Submessage};
 use crate::{EntityId, Guid, GuidPrefix};
 
 #[test]
 fn who_falls_silent_is_gone_when_the_lease_is_over() {
-    let mut world = World::of(2);
-    let (_, ends) = world.writer(0, keep(10));
-    world.reader(1, keep(10));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (_, ends) = world.writer(0, keep_last_qos(10));
+    world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     assert_eq!(ends.borrow().matched.len(), 1);
     world.loses = Box::new(|_, bytes| bytes[8] == 2);
-    world.pass(SECOND * 8);
+    world.advance(SECOND * 8);
     assert_eq!(ends.borrow().matched.len(), 1);
-    world.pass(SECOND * 8);
+    world.advance(SECOND * 8);
     assert_eq!(ends.borrow().matched.len(), 0);
     assert!(
         world.engines[0]
-            .discovered()
+            .watch_discovered()
             .borrow()
             .participants
             .is_empty()
@@ -27,11 +27,11 @@ fn who_falls_silent_is_gone_when_the_lease_is_over() {
 
 #[test]
 fn who_says_anything_is_there() {
-    let mut world = World::of(2);
-    let (_, ends) = world.writer(0, keep(10));
-    world.reader(1, keep(10));
-    world.pass(SECOND);
-    // Only its announcements are lost; it is asked for acknowledgements, and gives them.
+    let mut world = NetworkWorld::with_participants(2);
+    let (_, ends) = world.writer(0, keep_last_qos(10));
+    world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
+    // Only its announcements are lost; it still acknowledges.
     world.loses = Box::new(|_, bytes| {
         bytes[8] == 2 && bytes.windows(4).any(|ids| ids == EntityId::SPDP_WRITER.0)
     });
@@ -44,31 +44,31 @@ fn who_says_anything_is_there() {
         .expect("a writer");
     for mark in 0..20 {
         world.write(Guid::new(GuidPrefix([1; 12]), ours), mark, 8);
-        world.pass(SECOND);
+        world.advance(SECOND);
     }
     assert_eq!(ends.borrow().matched.len(), 1);
 }
 
 #[test]
 fn whose_port_is_gone_is_dead_at_once() {
-    let mut world = World::of(2);
-    let (_, ends) = world.writer(0, keep(10));
-    world.reader(1, keep(10));
-    world.pass(SECOND);
+    let mut world = NetworkWorld::with_participants(2);
+    let (_, ends) = world.writer(0, keep_last_qos(10));
+    world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
     let now = world.now;
-    world.engines[0].ports_bound(now, &bound([7410, 7411, 7412, 7413]));
+    world.engines[0].set_bound_ports(now, &bound_ports([7410, 7411, 7412, 7413]));
     assert_eq!(ends.borrow().matched.len(), 1);
-    world.engines[0].ports_bound(now, &bound([7410, 7411]));
+    world.engines[0].set_bound_ports(now, &bound_ports([7410, 7411]));
     assert_eq!(ends.borrow().matched.len(), 0);
 }
 
 #[test]
 fn a_node_killed_between_two_fragments_leaves_nothing_of_its_sample() {
-    let mut world = World::of(2);
-    let (writer, _) = world.writer(0, keep(10));
-    let (_, ends, read) = world.reader(1, keep(10));
-    world.pass(SECOND);
-    // It sends one datagram of many.
+    let mut world = NetworkWorld::with_participants(2);
+    let (writer, _) = world.writer(0, keep_last_qos(10));
+    let (_, ends, read) = world.reader(1, keep_last_qos(10));
+    world.advance(SECOND);
+    // It sends one of many datagrams.
     let mut sent = 0;
     world.loses = Box::new(move |_, bytes| {
         sent += usize::from(bytes[8] == 1);
@@ -76,37 +76,37 @@ fn a_node_killed_between_two_fragments_leaves_nothing_of_its_sample() {
     });
     world.write(writer, 1, 500_000);
     world.carry();
-    assert_ne!(world.budget.used(), 0, "a part has come");
+    assert_ne!(world.budget.used_bytes(), 0, "a part has come");
     let now = world.now;
-    world.engines[1].ports_bound(now, &bound([7412, 7413]));
-    assert_eq!(world.budget.used(), 0);
+    world.engines[1].set_bound_ports(now, &bound_ports([7412, 7413]));
+    assert_eq!(world.budget.used_bytes(), 0);
     assert_eq!(ends.borrow().matched.len(), 0);
-    // Who takes its place is heard, and nothing of the dead.
+    // Its successor is heard, and nothing of the dead participant.
     world.loses = Box::new(|_, bytes| bytes[8] == 1);
     world.join();
-    let (writer, _) = world.writer(2, keep(10));
-    world.pass(SECOND);
+    let (writer, _) = world.writer(2, keep_last_qos(10));
+    world.advance(SECOND);
     world.write(writer, 7, 8);
-    world.pass(SECOND);
+    world.advance(SECOND);
     assert_eq!(read.marks(), [7]);
 }
 
 #[test]
 fn whoever_was_given_up_by_one_side_alone_is_met_again_by_both() {
     for forgets in [0, 1] {
-        let mut world = World::of(2);
-        let (writer, _) = world.writer(0, keep(10));
-        let (reader, reader_ends, read) = world.reader(1, keep(10));
-        world.pass(SECOND * 5);
+        let mut world = NetworkWorld::with_participants(2);
+        let (writer, _) = world.writer(0, keep_last_qos(10));
+        let (reader, reader_ends, read) = world.reader(1, keep_last_qos(10));
+        world.advance(SECOND * 5);
         world.write(writer, 1, 8);
-        world.pass(SECOND);
-        // As after a pause of the network that was longer than one lease and shorter than the other.
+        world.advance(SECOND);
+        // As after a network outage that was longer than one lease and shorter than the other.
         let other = [reader.prefix, writer.prefix][forgets];
-        world.engines[forgets].participant_gone(other);
-        world.engines[forgets].settle();
-        world.pass(SECOND * 9);
+        world.engines[forgets].remove_participant(other);
+        world.engines[forgets].flush_changes();
+        world.advance(SECOND * 9);
         world.write(writer, 2, 100_000);
-        world.pass(SECOND);
+        world.advance(SECOND);
         assert_eq!(read.marks(), [1, 2], "{forgets} forgets");
         assert_eq!(reader_ends.borrow().confirmed, [writer]);
     }
@@ -115,16 +115,16 @@ fn whoever_was_given_up_by_one_side_alone_is_met_again_by_both() {
 #[test]
 fn whoever_comes_in_the_place_of_one_that_was_killed_says_its_good_bye() {
     for (named, there) in [(true, 0), (false, 1)] {
-        let mut world = World::of(2);
-        let (_, ends) = world.writer(0, keep(10));
-        world.reader(1, keep(10));
-        world.pass(SECOND);
+        let mut world = NetworkWorld::with_participants(2);
+        let (_, ends) = world.writer(0, keep_last_qos(10));
+        world.reader(1, keep_last_qos(10));
+        world.advance(SECOND);
         world.killed.insert(1);
         let killed = GuidPrefix([2; 12]);
         world.join_after(&[killed][..usize::from(named)]);
-        world.pass(SECOND / 10);
+        world.advance(SECOND / 10);
         assert_eq!(ends.borrow().matched.len(), there);
-        let discovered = world.engines[0].discovered().borrow().clone();
+        let discovered = world.engines[0].watch_discovered().borrow().clone();
         let others: Vec<_> = discovered.participants.keys().copied().collect();
         let successor = GuidPrefix([3; 12]);
         let expected = [killed, successor];
@@ -132,15 +132,16 @@ fn whoever_comes_in_the_place_of_one_that_was_killed_says_its_good_bye() {
     }
 }
 
-/// As other implementations want it: they take a good-bye of the announcing writer alone, whose numbers must grow.
+/// As other implementations require: they accept a disposal only from the announcing writer, whose numbers must
+/// increase.
 #[test]
 fn a_predecessors_good_bye_comes_from_its_own_writer_with_the_highest_number() {
-    let mut world = World::of(1);
+    let mut world = NetworkWorld::with_participants(1);
     let killed = GuidPrefix([9; 12]);
     world.join_after(&[killed]);
     let now = world.now;
-    // As it is when it has just joined; a newcomer of whom nothing is known is told as well.
-    world.engines[1].ports_bound(now, &bound([7410]));
+    // As when it has just joined; an unknown newcomer is told as well.
+    world.engines[1].set_bound_ports(now, &bound_ports([7410]));
     let mut said = Vec::new();
     while let Some(datagram) = world.engines[1].transmit(&mut |_, _, _| true) {
         let parts = datagram.parts();
@@ -169,7 +170,7 @@ fn a_predecessors_good_bye_comes_from_its_own_writer_with_the_highest_number() {
 
 #[test]
 fn predecessors_are_spoken_of_until_their_leases_are_over() {
-    let mut world = World::of(2);
+    let mut world = NetworkWorld::with_participants(2);
     let killed = GuidPrefix([9; 12]);
     world.join_after(&[killed]);
     let said = std::rc::Rc::new(std::cell::Cell::new(0));
@@ -178,8 +179,8 @@ fn predecessors_are_spoken_of_until_their_leases_are_over() {
         count.set(count.get() + usize::from(bytes[8..20] == killed.0));
         false
     });
-    world.pass(SECOND * 10);
+    world.advance(SECOND * 10);
     assert!(said.take() > 4, "each may be lost");
-    world.pass(SECOND * 10);
+    world.advance(SECOND * 10);
     assert_eq!(said.get(), 0);
 }

@@ -1,4 +1,4 @@
-//! A network that loses what it is told to lose, where time passes when nothing else happens.
+//! A simulated network with configurable loss, in which time passes when nothing else happens.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4};
@@ -12,23 +12,23 @@ use tokio::sync::watch;
 use crate::discovery::ParticipantData;
 use crate::engine::{BUILTIN, Engine, Settings};
 use crate::locator::{Locator, Ports};
-use crate::network::Network;
-use crate::participant::{Ends, Sample, Sink, Topic};
-use crate::qos::{Durability, EndpointQos, History, Reliability};
-use crate::reader::Bounds;
+use crate::network::InterfaceSet;
+use crate::participant::{EndpointMatches, ReceivedSample, Sink, TopicDescription};
+use crate::qos::{DurabilityKind, EndpointQos, HistoryKind, ReliabilityKind};
+use crate::reader::ReaderLimits;
 use crate::{Guid, GuidPrefix, VendorId};
 
-/// What a reader has read.
+/// Collects the samples of a reader.
 #[derive(Default)]
-pub(super) struct Read(pub(super) Mutex<Vec<Sample>>);
+pub(super) struct SampleRecorder(pub(super) Mutex<Vec<ReceivedSample>>);
 
-impl Sink for Read {
-    fn sample(&self, sample: Sample) {
+impl Sink for SampleRecorder {
+    fn on_sample(&self, sample: ReceivedSample) {
         self.0.lock().push(sample);
     }
 }
 
-impl Read {
+impl SampleRecorder {
     pub(super) fn lengths(&self) -> Vec<usize> {
         self.0
             .lock()
@@ -37,7 +37,7 @@ impl Read {
             .collect()
     }
 
-    /// The first byte behind the header of each.
+    /// Returns the first byte after the header of each sample.
     pub(super) fn marks(&self) -> Vec<u8> {
         self.0
             .lock()
@@ -47,37 +47,37 @@ impl Read {
     }
 }
 
-/// Says of a datagram, by its number and bytes, whether it is lost.
-pub(super) type Loses = Box<dyn FnMut(usize, &[u8]) -> bool>;
+/// Decides by number and bytes of a datagram whether it is lost.
+pub(super) type LossFilter = Box<dyn FnMut(usize, &[u8]) -> bool>;
 
-pub(super) struct World {
+pub(super) struct NetworkWorld {
     pub(super) now: Instant,
     pub(super) engines: Vec<Engine>,
-    /// Which of them were killed: nothing comes from them, or to them, any more.
+    /// Killed participants, which neither send nor receive any more.
     pub(super) killed: BTreeSet<usize>,
-    /// Which of all datagrams are lost, by their number.
-    pub(super) loses: Loses,
+    /// Decides which datagrams are lost, by their number.
+    pub(super) loses: LossFilter,
     sent: usize,
-    /// What receivers take at a time, in bytes; all if none.
+    /// Bytes that receivers accept at a time; `None`: unlimited.
     pub(super) room: Option<usize>,
-    /// Of samples that are not whole yet.
+    /// Budget for incomplete samples.
     pub(super) budget: budget::Budget,
 }
 
 pub(super) const HERE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 
-/// Ports of this machine.
-pub(super) fn bound<const N: usize>(ports: [u16; N]) -> BTreeSet<SocketAddrV4> {
+/// Returns the addresses of ports on this machine.
+pub(super) fn bound_ports<const N: usize>(ports: [u16; N]) -> BTreeSet<SocketAddrV4> {
     let at = |port| SocketAddrV4::new(Ipv4Addr::LOCALHOST, port);
     ports.into_iter().map(at).collect()
 }
 
-pub(super) fn discovery_of(index: usize) -> u16 {
+pub(super) fn discovery_port(index: usize) -> u16 {
     7410 + 2 * index as u16
 }
 
-impl World {
-    pub(super) fn of(participants: usize) -> Self {
+impl NetworkWorld {
+    pub(super) fn with_participants(participants: usize) -> Self {
         let mut world = Self {
             now: Instant::now(),
             engines: Vec::new(),
@@ -95,7 +95,7 @@ impl World {
         self.join_after(&[]);
     }
 
-    /// One joins in the place of these.
+    /// Adds a participant that replaces these.
     pub(super) fn join_after(&mut self, predecessors: &[GuidPrefix]) {
         let index = self.engines.len();
         let at = |port: u16| vec![Locator::from((Ipv4Addr::LOCALHOST, port))];
@@ -106,20 +106,20 @@ impl World {
             domain: Some(0),
             name: format!("participant {index}"),
             user_data: Bytes::new(),
-            discovery: at(discovery_of(index)),
-            user: at(discovery_of(index) + 1),
+            discovery: at(discovery_port(index)),
+            user: at(discovery_port(index) + 1),
             builtin: BUILTIN,
             lease: Some(Duration::from_secs(10)),
         };
-        let bounds = Bounds {
+        let bounds = ReaderLimits {
             max_sample: 16 << 20,
             budget: self.budget.clone(),
             unfinished: Duration::from_secs(30),
         };
         let announce_to = (0..4)
-            .map(|other| SocketAddr::from(([127, 0, 0, 1], discovery_of(other))))
+            .map(|other| SocketAddr::from(([127, 0, 0, 1], discovery_port(other))))
             .collect();
-        let ports = Ports::of(0).expect("a domain");
+        let ports = Ports::for_domain(0).expect("a domain");
         self.engines.push(Engine::new(
             self.now,
             Settings {
@@ -128,14 +128,14 @@ impl World {
                 bounds,
                 announce_to,
                 servers: Vec::new(),
-                network: Network::new(Vec::new()),
+                network: InterfaceSet::new(Vec::new()),
                 alone: false,
                 predecessors: predecessors.to_vec(),
             },
         ));
     }
 
-    /// Carries what there is to carry, once; whether there was anything.
+    /// Delivers all queued datagrams once; returns whether there were any.
     pub(super) fn carry(&mut self) -> bool {
         let mut carried = false;
         for index in 0..self.engines.len() {
@@ -171,14 +171,14 @@ impl World {
         }
         for engine in &mut self.engines {
             for (sink, sample) in engine.take_deliveries() {
-                sink.sample(sample);
+                sink.on_sample(sample);
             }
         }
         carried
     }
 
-    /// Lets the world go on for so long.
-    pub(super) fn pass(&mut self, duration: Duration) {
+    /// Lets time pass.
+    pub(super) fn advance(&mut self, duration: Duration) {
         let until = self.now + duration;
         for _ in 0..200_000 {
             if self.carry() {
@@ -207,7 +207,7 @@ impl World {
         &mut self,
         engine: usize,
         qos: EndpointQos,
-    ) -> (Guid, watch::Receiver<Arc<Ends>>) {
+    ) -> (Guid, watch::Receiver<Arc<EndpointMatches>>) {
         let now = self.now;
         self.engines[engine].add_writer(now, &topic(), qos)
     }
@@ -216,9 +216,13 @@ impl World {
         &mut self,
         engine: usize,
         qos: EndpointQos,
-    ) -> (Guid, watch::Receiver<Arc<Ends>>, Arc<Read>) {
+    ) -> (
+        Guid,
+        watch::Receiver<Arc<EndpointMatches>>,
+        Arc<SampleRecorder>,
+    ) {
         let now = self.now;
-        let read = Arc::new(Read::default());
+        let read = Arc::new(SampleRecorder::default());
         let (guid, ends) = self.engines[engine].add_reader(now, &topic(), qos, read.clone());
         (guid, ends, read)
     }
@@ -232,39 +236,39 @@ impl World {
     }
 }
 
-pub(super) fn topic() -> Topic {
-    Topic {
+pub(super) fn topic() -> TopicDescription {
+    TopicDescription {
         name: "rt/chatter".into(),
         type_name: "std_msgs::msg::dds_::String_".into(),
         user_data: Bytes::new(),
     }
 }
 
-pub(super) fn keep(depth: u32) -> EndpointQos {
+pub(super) fn keep_last_qos(depth: u32) -> EndpointQos {
     EndpointQos {
-        history: History::KeepLast(depth),
+        history: HistoryKind::KeepLast(depth),
         ..EndpointQos::default()
     }
 }
 
-pub(super) fn best_effort() -> EndpointQos {
+pub(super) fn best_effort_qos() -> EndpointQos {
     EndpointQos {
-        reliability: Reliability::BestEffort,
-        ..keep(10)
+        reliability: ReliabilityKind::BestEffort,
+        ..keep_last_qos(10)
     }
 }
 
-pub(super) fn transient(depth: u32) -> EndpointQos {
+pub(super) fn transient_local_qos(depth: u32) -> EndpointQos {
     EndpointQos {
-        durability: Durability::TransientLocal,
-        ..keep(depth)
+        durability: DurabilityKind::TransientLocal,
+        ..keep_last_qos(depth)
     }
 }
 
 pub(super) const SECOND: Duration = Duration::from_secs(1);
 
-/// Numbers that look random and are the same every time.
-pub(super) fn scattered(seed: u64) -> impl FnMut() -> u64 {
+/// Returns a deterministic pseudo-random number generator.
+pub(super) fn pseudo_random(seed: u64) -> impl FnMut() -> u64 {
     let mut state = seed;
     move || {
         state = state

@@ -1,7 +1,7 @@
-//! Devices by the Container Device Interface (CNCF CDI 0.3 to 0.8): a specification, JSON or YAML, names a device and
-//! says what a container needs for it. Device nodes, mounts and environment are given. Hooks, which are programs to run on
-//! the host, are not run (docs/adr/027): a device with hooks works where it can do without them, and its push is told of
-//! each by name.
+//! Devices by the Container Device Interface (CNCF CDI 0.3 to 0.8): a specification, in JSON or YAML, names a device
+//! and says what a container needs for it. Device nodes, mounts and environment are provided. Hooks, which are programs
+//! to run on the host, are not run (docs/adr/027): a device with hooks works if it can do without them, and its push is
+//! told of each by name.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::FileTypeExt;
@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::{GrantError, Granted};
+use super::{GrantError, ResolvedGrants};
 use crate::container::Mount;
 
-/// Where specifications lie, by the standard; the later overrides the earlier.
+/// Returns the standard directories of specifications; later ones override earlier ones.
 pub(super) fn directories() -> Vec<PathBuf> {
     ["/etc/cdi", "/var/run/cdi"].map(PathBuf::from).into()
 }
@@ -39,7 +39,7 @@ struct Device {
 #[serde(rename_all = "camelCase", default)]
 struct Edits {
     env: Vec<String>,
-    device_nodes: Vec<Node>,
+    device_nodes: Vec<CdiDeviceNode>,
     mounts: Vec<Bind>,
     hooks: Vec<Hook>,
 }
@@ -55,7 +55,7 @@ struct Hook {
 
 #[derive(Debug, Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct Node {
+struct CdiDeviceNode {
     path: PathBuf,
     host_path: Option<PathBuf>,
 }
@@ -67,20 +67,20 @@ struct Bind {
     container_path: PathBuf,
 }
 
-/// Adds what the device `name` needs.
-pub(super) fn add(
+/// Adds the mounts and variables that the device `name` needs.
+pub(super) fn add_device(
     name: &str,
     directories: &[PathBuf],
-    granted: &mut Granted,
+    granted: &mut ResolvedGrants,
 ) -> Result<(), GrantError> {
     let mut devices = BTreeMap::new();
-    for path in files(directories) {
-        let specification = read(&path)?;
+    for path in specification_files(directories) {
+        let specification = read_specification(&path)?;
         for device in &specification.devices {
             let full = format!("{}={}", specification.kind, device.name);
             let edits = (
                 path.clone(),
-                [&specification.container_edits, &device.container_edits].map(granted_by),
+                [&specification.container_edits, &device.container_edits].map(resolve_edits),
             );
             devices.insert(full, edits);
         }
@@ -107,7 +107,7 @@ pub(super) fn add(
             reason,
         })?;
         for mount in edit.mounts {
-            // Devices of one vendor share files.
+            // Devices of one vendor may share files.
             if !granted
                 .mounts
                 .iter()
@@ -127,7 +127,7 @@ pub(super) fn add(
     Ok(())
 }
 
-fn files(directories: &[PathBuf]) -> Vec<PathBuf> {
+fn specification_files(directories: &[PathBuf]) -> Vec<PathBuf> {
     let is_one = |path: &PathBuf| {
         let ending = path.extension().and_then(|ending| ending.to_str());
         matches!(ending, Some("json" | "yaml"))
@@ -142,22 +142,22 @@ fn files(directories: &[PathBuf]) -> Vec<PathBuf> {
     all
 }
 
-fn read(path: &Path) -> Result<Specification, GrantError> {
+fn read_specification(path: &Path) -> Result<Specification, GrantError> {
     let broken = |reason: String| GrantError::Specification {
         path: path.to_owned(),
         reason,
     };
     let text = std::fs::read_to_string(path).map_err(|error| broken(error.to_string()))?;
-    // Every JSON text is a YAML one.
+    // Every JSON text is valid YAML.
     serde_norway::from_str(&text).map_err(|error| broken(error.to_string()))
 }
 
-fn granted_by(edits: &Edits) -> Result<Granted, String> {
-    let mut granted = Granted::default();
+fn resolve_edits(edits: &Edits) -> Result<ResolvedGrants, String> {
+    let mut granted = ResolvedGrants::default();
     for variable in &edits.env {
         let (name, value) = variable
             .split_once('=')
-            .ok_or_else(|| format!("{variable:?} is no NAME=VALUE"))?;
+            .ok_or_else(|| format!("{variable:?} is not NAME=VALUE"))?;
         granted
             .environment
             .insert(name.to_owned(), value.to_owned());
@@ -168,7 +168,7 @@ fn granted_by(edits: &Edits) -> Result<Granted, String> {
             .map_err(|error| format!("{}: {error}", source.display()))?
             .file_type();
         if !kind.is_char_device() && !kind.is_block_device() {
-            return Err(format!("{} is no device node", source.display()));
+            return Err(format!("{} is not a device node", source.display()));
         }
         granted.mounts.push(Mount {
             source,
@@ -188,11 +188,11 @@ fn granted_by(edits: &Edits) -> Result<Granted, String> {
         });
     }
     for hook in &edits.hooks {
-        // The first argument is the program's own name.
+        // The first argument is the name of the program itself.
         let does = hook.args.get(1..).unwrap_or_default().join(" ");
         let command = format!("{} {does}", hook.path.display());
         granted.unfulfilled.push(format!(
-            "its hook {} ({}) is not run; the device works where it can do without",
+            "its hook {} ({}) is not run; the device may work without it",
             hook.hook_name,
             command.trim_end()
         ));
@@ -233,8 +233,8 @@ devices:
         let place = tempfile::tempdir().expect("a directory");
         std::fs::write(place.path().join("vendor.yaml"), YAML).expect("written");
         let directories = [place.path().to_owned()];
-        let mut granted = Granted::default();
-        add("vendor.com/harmless=zero", &directories, &mut granted).expect("known");
+        let mut granted = ResolvedGrants::default();
+        add_device("vendor.com/harmless=zero", &directories, &mut granted).expect("known");
         assert_eq!(granted.environment["VENDOR"], "here");
         let targets: Vec<_> = granted
             .mounts
@@ -248,12 +248,12 @@ devices:
         assert_eq!(
             granted.unfulfilled,
             [
-                "device vendor.com/harmless=zero: its hook createContainer (/usr/bin/vendor-hook update-ldcache) is not \
-                 run; the device works where it can do without"
+                "device vendor.com/harmless=zero: its hook createContainer (/usr/bin/vendor-hook update-ldcache) is \
+                    not run; the device may work without it"
             ]
         );
         let mut refused = |name| {
-            add(name, &directories, &mut granted)
+            add_device(name, &directories, &mut granted)
                 .expect_err(name)
                 .to_string()
         };
@@ -261,7 +261,9 @@ devices:
             refused("vendor.com/harmless=one")
                 .contains("there are: vendor.com/harmless=broken, vendor.com/harmless=zero")
         );
-        assert!(refused("vendor.com/harmless=broken").contains("/etc/hostname is no device node"));
+        assert!(
+            refused("vendor.com/harmless=broken").contains("/etc/hostname is not a device node")
+        );
     }
 
     #[test]
@@ -275,8 +277,8 @@ devices:
             );
             std::fs::write(directory.join("v.json"), text).expect("written");
         }
-        let mut granted = Granted::default();
-        add("v.com/c=d", &directories, &mut granted).expect("known");
+        let mut granted = ResolvedGrants::default();
+        add_device("v.com/c=d", &directories, &mut granted).expect("known");
         assert_eq!(granted.environment["A"], "second");
     }
 }

@@ -1,5 +1,5 @@
-//! Volumes: a file or directory of this machine, for nodes to read. It is opened once, and what was opened is what is
-//! looked at and mounted: whoever may write beside it cannot put something else in its place in between.
+//! Volumes: a file or directory of this host that nodes may read. It is opened once, and the open descriptor is both
+//! checked and mounted, so that nobody can replace it in between.
 
 use std::fs::File;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -9,18 +9,18 @@ use nix::errno::Errno;
 use nix::fcntl::{OFlag, OpenHow, ResolveFlag, openat2};
 
 use super::{GrantError, not_allowed};
-use crate::container::{Mount, Opened};
+use crate::container::{Mount, OpenedSource};
 
-/// How often what is being renamed is looked at again.
+/// Number of retries while something is being renamed.
 const AGAIN: u32 = 100;
 
-/// Opens a volume, if it lies in one of the places that are allowed.
+/// Opens a volume if it lies in one of the allowed directories.
 pub(super) fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, GrantError> {
     let broken = |source| GrantError::Volume {
         path: volume.source.clone(),
         source,
     };
-    // Where it really is: a link must not lead out of what is allowed. From here on no link is followed.
+    // Resolves links first, since a link must not lead out of what is allowed. From here on no link is followed.
     let source = Path::new(&volume.source).canonicalize().map_err(broken)?;
     for place in allowed {
         let Ok(root) = place.canonicalize() else {
@@ -37,13 +37,13 @@ pub(super) fn open(volume: &api::Volume, allowed: &[PathBuf]) -> Result<Mount, G
             target: PathBuf::from(&volume.target),
             writable: false,
             device: false,
-            opened: Some(Opened::new(opened)),
+            opened: Some(OpenedSource::new(opened)),
         });
     }
     Err(not_allowed("volume", &volume.source))
 }
 
-/// The operator's own place, wherever its path leads; the path has no links any more.
+/// Opens an allowed path of the operator, which contains no links any more.
 fn open_place(path: &Path) -> std::io::Result<OwnedFd> {
     let root = File::open("/")?;
     let below = path.strip_prefix("/").unwrap_or(path);
@@ -88,7 +88,7 @@ mod tests {
         open(&volume, std::slice::from_ref(&allowed.to_owned()))
     }
 
-    /// A directory that is allowed, and something beside it that is not.
+    /// Creates a directory that is allowed, and a sibling that is not.
     fn lay_out() -> (tempfile::TempDir, PathBuf, PathBuf) {
         let place = tempfile::tempdir().expect("a directory");
         let (models, secret) = (place.path().join("models"), place.path().join("secret"));

@@ -1,9 +1,9 @@
 use tokio::sync::oneshot;
 
 use super::*;
-use crate::logs::Writer;
+use crate::logs::LogWriter;
 
-async fn all(mut lines: mpsc::Receiver<LogLine>) -> Vec<String> {
+async fn collect_all(mut lines: mpsc::Receiver<LogLine>) -> Vec<String> {
     let mut seen = Vec::new();
     while let Some(line) = lines.recv().await {
         seen.push(line.line);
@@ -15,7 +15,7 @@ async fn all(mut lines: mpsc::Receiver<LogLine>) -> Vec<String> {
 async fn every_line_arrives_in_order_across_rotations() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 4000, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 4000, u64::MAX).unwrap();
     writer.append("/a", "stdout", "0");
     let (end, ended) = oneshot::channel::<()>();
     let mut lines = follow(
@@ -30,11 +30,11 @@ async fn every_line_arrives_in_order_across_rotations() {
         writer.append("/a", "stdout", &number.to_string());
     }
     end.send(()).unwrap();
-    assert_eq!(all(lines).await, ["499"]);
-    assert!(rotated(&path).exists(), "it was rotated");
+    assert_eq!(collect_all(lines).await, ["499"]);
+    assert!(rotated_path(&path).exists(), "it was rotated");
 }
 
-/// Files below a directory that this process has open: all, and those of them that were removed.
+/// Returns the number of files below a directory that this process has open, and how many of them are deleted.
 fn open_below(directory: &Path) -> (usize, usize) {
     let open = std::fs::read_dir("/proc/self/fd").unwrap().flatten();
     let targets = open.filter_map(|entry| std::fs::read_link(entry.path()).ok());
@@ -51,10 +51,10 @@ fn open_below(directory: &Path) -> (usize, usize) {
 async fn who_does_not_read_keeps_no_file_that_was_rotated_away() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 4000, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 4000, u64::MAX).unwrap();
     writer.append("/a", "stdout", "0");
     let (end, ended) = oneshot::channel::<()>();
-    let watches = Arc::new(Watches::default());
+    let watches = Arc::new(DirectoryWatches::default());
     let mut lines = follow(
         &watches,
         path.clone(),
@@ -65,10 +65,10 @@ async fn who_does_not_read_keeps_no_file_that_was_rotated_away() {
     let mut told = watches.watch(home.path()).unwrap();
     let mut number = 0;
     for _rotation in 0..50 {
-        let before = std::fs::metadata(rotated(&path))
+        let before = std::fs::metadata(rotated_path(&path))
             .map(|file| file.ino())
             .ok();
-        while std::fs::metadata(rotated(&path))
+        while std::fs::metadata(rotated_path(&path))
             .map(|file| file.ino())
             .ok()
             == before
@@ -76,8 +76,8 @@ async fn who_does_not_read_keeps_no_file_that_was_rotated_away() {
             number += 1;
             writer.append("/a", "stdout", &number.to_string());
         }
-        // Those who look have seen it when this one, who asked later, has.
-        told.changed().await;
+        // The followers have noticed it when this watch, which was registered later, has.
+        told.next_change().await;
         for _ in 0..10 {
             tokio::task::yield_now().await;
         }
@@ -89,7 +89,7 @@ async fn who_does_not_read_keeps_no_file_that_was_rotated_away() {
     );
     end.send(()).unwrap();
     assert_eq!(lines.recv().await.unwrap().line, "0");
-    let seen = all(lines).await;
+    let seen = collect_all(lines).await;
     assert!(
         seen.iter()
             .any(|line| line.contains("lines were lost here")),
@@ -102,7 +102,7 @@ async fn who_does_not_read_keeps_no_file_that_was_rotated_away() {
 async fn from_now_on_means_from_now_on_and_removal_loses_nothing() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 1 << 20, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 1 << 20, u64::MAX).unwrap();
     writer.append("/a", "stdout", "before");
     let (end, ended) = oneshot::channel::<()>();
     let lines = follow(
@@ -115,16 +115,16 @@ async fn from_now_on_means_from_now_on_and_removal_loses_nothing() {
     writer.append("/a", "stderr", "after");
     drop(home);
     end.send(()).unwrap();
-    assert_eq!(all(lines).await, ["after"]);
+    assert_eq!(collect_all(lines).await, ["after"]);
 }
 
 #[tokio::test]
 async fn the_last_lines_come_across_the_rotation_and_then_what_follows() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 1000, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 1000, u64::MAX).unwrap();
     let mut written = 0;
-    while written < 3 || !rotated(&path).exists() {
+    while written < 3 || !rotated_path(&path).exists() {
         writer.append("/a", "stdout", &written.to_string());
         written += 1;
     }
@@ -141,7 +141,7 @@ async fn the_last_lines_come_across_the_rotation_and_then_what_follows() {
         );
         end.send(()).unwrap();
         let expected = &all_lines[written - count.min(written)..];
-        assert_eq!(all(lines).await, expected, "the last {count}");
+        assert_eq!(collect_all(lines).await, expected, "the last {count}");
     }
     let (end, ended) = oneshot::channel::<()>();
     let start = LogStart::Last(1);
@@ -155,14 +155,14 @@ async fn the_last_lines_come_across_the_rotation_and_then_what_follows() {
     assert_eq!(lines.recv().await.unwrap().line, all_lines[written - 1]);
     writer.append("/a", "stdout", "after");
     end.send(()).unwrap();
-    assert_eq!(all(lines).await, ["after"]);
+    assert_eq!(collect_all(lines).await, ["after"]);
 }
 
 #[tokio::test]
 async fn once_the_guard_is_dropped_the_log_may_go() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 200, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 200, u64::MAX).unwrap();
     writer.append("/a", "stdout", "first");
     let guards = watch::Sender::new(());
     let (end, ended) = oneshot::channel::<()>();
@@ -177,14 +177,14 @@ async fn once_the_guard_is_dropped_the_log_may_go() {
     end.send(()).unwrap();
     guards.closed().await;
     drop(home);
-    assert_eq!(all(lines).await, ["first", "second, rotated"]);
+    assert_eq!(collect_all(lines).await, ["first", "second, rotated"]);
 }
 
 #[tokio::test]
 async fn a_reader_too_slow_is_told_what_it_missed() {
     let home = tempfile::tempdir().unwrap();
     let path = home.path().join("log.jsonl");
-    let mut writer = Writer::create(&path, 400, u64::MAX).unwrap();
+    let mut writer = LogWriter::create(&path, 400, u64::MAX).unwrap();
     writer.append("/a", "stdout", "0");
     let lines = follow(
         &Arc::default(),
@@ -196,7 +196,7 @@ async fn a_reader_too_slow_is_told_what_it_missed() {
     for number in 1..100 {
         writer.append("/a", "stdout", &number.to_string());
     }
-    let seen = all(lines).await;
+    let seen = collect_all(lines).await;
     assert_eq!(seen[0], "0");
     assert!(
         seen.iter()

@@ -1,24 +1,24 @@
-//! How a servant comes up: its resident, its container, its init, its nodes.
+//! Startup of a servant: its resident, its container, its init, its nodes.
 
 use std::time::Duration;
 
-use init::Reply;
+use init::InitReply;
 use tokio::io::AsyncReadExt;
 use tokio::net::unix::pipe;
 
 use super::Driver;
 use crate::engine::ContainerState;
 use crate::shim::create::Creator;
-use crate::shim::input::Input;
+use crate::shim::input::ShimEvent;
 use crate::shim::{ResidentContext, privileges};
 use crate::sys;
 
-/// How long libcontainer and init may take. Generous: a loaded machine is no failure.
+/// Time for libcontainer and init. Generous, since a loaded machine is no failure.
 const CREATION: Duration = Duration::from_secs(60);
 
 impl Driver {
-    /// Resident, container, nodes.
-    pub(super) async fn come_up(&mut self) -> Result<(), String> {
+    /// Starts resident, container and nodes.
+    pub(super) async fn bring_up(&mut self) -> Result<(), String> {
         let context = ResidentContext {
             id: self.begun.launch.spec.id.clone(),
             config: self.begun.launch.spec.resident.clone(),
@@ -26,9 +26,9 @@ impl Driver {
         };
         // The creator works meanwhile, in its own process.
         let resident = self.resident.start(&context).await;
-        let created = self.creation().await;
+        let created = self.wait_for_creator().await;
         if let Ok(pid) = created {
-            // Our unreaped child, so that the number is surely its own.
+            // Our child, not reaped yet, so the pid is certainly its own.
             let pidfd = sys::pidfd_open(pid).map_err(|error| format!("pidfd of init: {error}"))?;
             self.init = Some((pid, pidfd));
         }
@@ -38,7 +38,7 @@ impl Driver {
         privileges::confine(&self.begun.directory, cgroups).map_err(|error| error.to_string())?;
         let ready = tokio::time::timeout(CREATION, self.link.receive()).await;
         match ready {
-            Ok(Ok(Some((Reply::Ready, _)))) => {}
+            Ok(Ok(Some((InitReply::Ready, _)))) => {}
             Ok(Ok(other)) => return Err(format!("init did not come up but said {other:?}")),
             Ok(Err(error)) => return Err(format!("init did not come up: {error}")),
             Err(_) => {
@@ -55,16 +55,16 @@ impl Driver {
             self.nodes.add(node)?;
             self.start_node(&name).await;
         }
-        // What was needed to get here is not needed to stay.
+        // Only needed for the startup.
         self.begun.launch.spec.layers = Vec::new();
         self.begun.launch.spec.nodes = Vec::new();
         self.begun.launch.spec.resident = serde_json::Value::Null;
-        sys::give_back_memory();
+        sys::trim_heap();
         Ok(())
     }
 
-    /// Waits for the creator; init's pid on the host.
-    pub(super) async fn creation(&mut self) -> Result<i32, String> {
+    /// Waits for the creator; returns the host pid of init.
+    pub(super) async fn wait_for_creator(&mut self) -> Result<i32, String> {
         let report = self
             .begun
             .creator
@@ -77,7 +77,7 @@ impl Driver {
             pipe::Receiver::from_owned_fd(report).map_err(|error| error.to_string())?;
         let mut text = Vec::new();
         let read = async {
-            // A complaint may be followed by others, up to its end; success is said once.
+            // An error may be followed by others until the end of the report; success is reported once.
             while !Creator::has_succeeded(&text)
                 && report
                     .read_buf(&mut text)
@@ -98,9 +98,9 @@ impl Driver {
     pub(super) fn listen_to_init(&self) {
         let (link, inputs) = (self.link.clone(), self.inputs.clone());
         tokio::task::spawn_local(async move {
-            // Its end is told by the kernel, as that of a child.
+            // The end of init is reported by the kernel, as that of a child.
             while let Ok(Some((reply, fd))) = link.receive().await {
-                if inputs.send(Input::Init(reply, fd)).is_err() {
+                if inputs.send(ShimEvent::Init(reply, fd)).is_err() {
                     return;
                 }
             }

@@ -1,4 +1,4 @@
-//! How a servant ends: politely, then not, and what is said of it.
+//! Termination of a servant: first politely, then by force; and its final state.
 
 use std::os::fd::AsFd;
 use std::time::Duration;
@@ -7,20 +7,20 @@ use init::Scope;
 
 use super::Driver;
 use crate::engine::{ContainerState, NodeExit};
-use crate::launch::{self, Exit};
-use crate::shim::input::{Input, StopStage};
+use crate::launch::{self, ExitRecord};
+use crate::shim::input::{ShimEvent, StopStage};
 use crate::shim::nodes;
 use crate::{Error, sys};
 
-/// How long a killed pid namespace may take to be gone.
+/// Time for a killed pid namespace to disappear.
 const KILL_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long the rest of the log may take once nobody can write to it.
+/// Time for the rest of the log once nobody can write to it.
 const DRAIN: Duration = Duration::from_secs(2);
-/// How long a cgroup may take to become empty.
+/// Time for a cgroup to become empty.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 impl Driver {
-    /// Begins to end the servant; a second call changes nothing.
+    /// Starts to stop the servant; a second call does nothing.
     pub(super) async fn stop(&mut self, reason: &str) {
         if self.stopping.is_some() || self.init.is_none() {
             return;
@@ -28,7 +28,7 @@ impl Driver {
         self.verdict.get_or_insert_with(|| ContainerState::Stopped {
             reason: reason.into(),
         });
-        let first = if self.nodes.alive() == (vec![], 0) {
+        let first = if self.nodes.running_and_starting() == (vec![], 0) {
             StopStage::Kill
         } else {
             StopStage::Interrupt
@@ -55,7 +55,7 @@ impl Driver {
         self.stopping = Some(stage);
         let patience = match stage {
             StopStage::Interrupt => {
-                for (_, pid) in self.nodes.alive().0 {
+                for (_, pid) in self.nodes.running_and_starting().0 {
                     let _ = self.link.signal(pid, libc::SIGINT, Scope::Group).await;
                 }
                 self.begun.launch.grace.interrupt
@@ -72,37 +72,37 @@ impl Driver {
         let inputs = self.inputs.clone();
         tokio::task::spawn_local(async move {
             tokio::time::sleep(patience).await;
-            let _ = inputs.send(Input::Patience(stage));
+            let _ = inputs.send(ShimEvent::Patience(stage));
         });
     }
 
-    /// Kills init; the kernel then kills everything in its pid namespace, and tells us when nothing is left.
+    /// Kills init; the kernel then kills everything in its pid namespace, and notifies us when nothing is left.
     pub(super) fn kill(&mut self) {
         self.stopping = self.stopping.max(Some(StopStage::Kill));
         if let Some((_, pidfd)) = &self.init {
-            // Gone already: then its end is in the queue.
+            // Fails if it is gone already: then its end is in the queue.
             let _ = sys::pidfd_send_signal(pidfd.as_fd(), libc::SIGKILL);
         }
     }
 
-    pub(super) fn init_ended(&mut self, status: i32) {
+    pub(super) fn on_init_exit(&mut self, status: i32) {
         let asked = self.stopping.is_some();
         let out_of_memory = !asked && self.was_out_of_memory(status);
-        let exit = nodes::exit_of(status, out_of_memory);
-        for (_, pid) in self.nodes.alive().0 {
+        let exit = nodes::parse_wait_status(status, out_of_memory);
+        for (_, pid) in self.nodes.running_and_starting().0 {
             let exit = NodeExit {
                 code: None,
                 signal: Some(libc::SIGKILL),
                 out_of_memory,
                 exec_error: None,
             };
-            if let Some((event, _)) = self.nodes.exited(pid, exit) {
+            if let Some((event, _)) = self.nodes.on_exited(pid, exit) {
                 self.report_node(event);
             }
         }
-        for number in self.nodes.starting() {
+        for number in self.nodes.starting_numbers() {
             let reason = "its init ended before it was executed".to_owned();
-            if let Some((event, _)) = self.nodes.failed(number, reason.clone()) {
+            if let Some((event, _)) = self.nodes.on_exec_failed(number, reason.clone()) {
                 self.report_node(event);
                 self.answer_start(number, Err(reason));
             }
@@ -127,10 +127,10 @@ impl Driver {
         self.init = None;
     }
 
-    /// Leaves nothing but the directory.
+    /// Cleans up everything but the directory.
     pub(super) async fn finish(&mut self) -> Result<(), Error> {
-        // With the namespace gone nobody holds the other ends of the pipes, unless they were sent out of it.
-        let _ = tokio::time::timeout(DRAIN, self.streams.drained()).await;
+        // When the namespace is gone nobody holds the other ends of the pipes, unless they were sent out of it.
+        let _ = tokio::time::timeout(DRAIN, self.streams.wait_drained()).await;
         let removed = self.begun.cgroup.destroy(PATIENCE);
         let fallback = ContainerState::Stopped {
             reason: "stopped".into(),
@@ -141,14 +141,14 @@ impl Driver {
                 reason: error.to_string(),
             };
         }
-        let exit = Exit {
+        let exit = ExitRecord {
             state: state.clone(),
             nodes: self.nodes.statuses(),
         };
-        let written = launch::write(&self.begun.directory.join(launch::EXIT), &exit);
-        // A daemon that connected just now is told, too.
+        let written = launch::write_record(&self.begun.directory.join(launch::EXIT), &exit);
+        // A daemon that has just connected is notified, too.
         while let Ok(input) = self.queue.try_recv() {
-            if let Input::Connected(stream) = input {
+            if let ShimEvent::Connected(stream) = input {
                 self.clients.add(stream, &self.hello());
             }
         }

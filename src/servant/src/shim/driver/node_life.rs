@@ -1,21 +1,21 @@
-//! The life of nodes: asked of init, told by init, started again or not.
+//! Life cycle of nodes: requested from init, reported by init, restarted or not.
 
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::time::Duration;
 
-use init::{Reply, Scope, Stage, StartRequest};
+use init::{InitReply, Scope, StartRequest, StartStage};
 
 use super::Driver;
 use crate::engine::{ContainerState, NodeEvent, NodeExit};
 use crate::process;
-use crate::shim::input::Input;
+use crate::shim::input::ShimEvent;
 use crate::shim::input::StopStage;
 use crate::shim::nodes::{self, Consequence};
 use crate::spec::NodeSpec;
 
 impl Driver {
     pub(super) async fn signal(&self, node: &str, signal: i32) -> Result<(), String> {
-        let pid = self.nodes.inside(node)?;
+        let pid = self.nodes.pid_inside(node)?;
         self.link
             .signal(pid, signal, Scope::Group)
             .await
@@ -24,17 +24,21 @@ impl Driver {
 
     pub(super) async fn start_node(&mut self, name: &str) {
         if let Some((number, spec)) = self.nodes.start(name) {
-            self.ask_for(number, &spec).await;
+            self.request_start(number, &spec).await;
         }
     }
 
-    pub(super) async fn ask_for(&mut self, number: u32, spec: &NodeSpec) {
-        if let Err(reason) = self.ask_init(number, spec).await {
-            self.start_failed(number, reason).await;
+    pub(super) async fn request_start(&mut self, number: u32, spec: &NodeSpec) {
+        if let Err(reason) = self.send_start_request(number, spec).await {
+            self.on_start_failed(number, reason).await;
         }
     }
 
-    pub(super) async fn ask_init(&mut self, number: u32, spec: &NodeSpec) -> Result<(), String> {
+    pub(super) async fn send_start_request(
+        &mut self,
+        number: u32,
+        spec: &NodeSpec,
+    ) -> Result<(), String> {
         let open = |stream| {
             self.streams
                 .open(&spec.name, stream)
@@ -61,36 +65,37 @@ impl Driver {
     }
 
     pub(super) async fn respawn(&mut self, name: &str) {
-        if self.stopping.is_none() && self.nodes.respawns(name) {
+        if self.stopping.is_none() && self.nodes.should_respawn(name) {
             self.start_node(name).await;
         }
     }
 
-    pub(super) async fn init_said(&mut self, reply: Reply, fd: Option<OwnedFd>) {
+    pub(super) async fn on_init_reply(&mut self, reply: InitReply, fd: Option<OwnedFd>) {
         match reply {
-            Reply::Ready => {}
-            Reply::Started { id, pid } => {
-                // Gone already: then its number on the host is of no use to anybody.
+            InitReply::Ready => {}
+            InitReply::Started { id, pid } => {
+                // It may be gone already: then its host pid is of no use.
                 let host = fd.as_ref().and_then(process::pid_of).unwrap_or(0);
-                if let Some(event) = self.nodes.started(id, pid, host) {
+                if let Some(event) = self.nodes.on_started(id, pid, host) {
                     self.report_node(event.clone());
                     self.answer_start(id, Ok(()));
                     self.deliver_early_signals(event.node()).await;
                 }
                 if self.stopping.is_some() {
-                    // It was on its way when the stop began.
+                    // It was being started when the stop began.
                     let _ = self.link.signal(pid, libc::SIGINT, Scope::Group).await;
                 }
             }
-            Reply::Failed { id, errno, stage } => {
-                self.start_failed(id, describe(errno, stage)).await
+            InitReply::Failed { id, errno, stage } => {
+                self.on_start_failed(id, describe(errno, stage)).await
             }
-            Reply::Exited { pid, status } => {
+            InitReply::Exited { pid, status } => {
                 self.resident.process_exited(pid);
-                let exit = nodes::exit_of(status, self.was_out_of_memory(status));
-                if let Some((event, consequence)) = self.nodes.exited(pid, exit.clone()) {
+                let exit = nodes::parse_wait_status(status, self.was_out_of_memory(status));
+                if let Some((event, consequence)) = self.nodes.on_exited(pid, exit.clone()) {
                     self.report_node(event.clone());
-                    self.follow_up(event.node(), consequence, &exit).await;
+                    self.apply_consequence(event.node(), consequence, &exit)
+                        .await;
                 }
             }
         }
@@ -109,13 +114,13 @@ impl Driver {
         self.early_signals = later;
         let now: Vec<(String, i32)> = now;
         for (node, signal) in now {
-            // It has ended already: then there is nobody to signal.
+            // It may have ended already: then there is nothing to signal.
             let _ = self.signal(&node, signal).await;
         }
     }
 
-    /// Whether this end goes with a kill that the kernel has counted since the last one. A shell tells 137 for a child that was
-    /// killed.
+    /// Returns whether this end coincides with an OOM kill counted by the kernel since the last one. A shell returns
+    /// 137 for a child that was killed.
     pub(super) fn was_out_of_memory(&mut self, status: i32) -> bool {
         let killed = libc::WIFSIGNALED(status) && libc::WTERMSIG(status) == libc::SIGKILL
             || libc::WIFEXITED(status) && libc::WEXITSTATUS(status) == 128 + libc::SIGKILL;
@@ -128,8 +133,8 @@ impl Driver {
         more
     }
 
-    pub(super) async fn start_failed(&mut self, number: u32, reason: String) {
-        if let Some((event, consequence)) = self.nodes.failed(number, reason.clone()) {
+    pub(super) async fn on_start_failed(&mut self, number: u32, reason: String) {
+        if let Some((event, consequence)) = self.nodes.on_exec_failed(number, reason.clone()) {
             self.report_node(event.clone());
             self.answer_start(number, Err(reason.clone()));
             self.early_signals.retain(|(node, _)| node != event.node());
@@ -139,19 +144,20 @@ impl Driver {
                 out_of_memory: false,
                 exec_error: Some(reason),
             };
-            self.follow_up(event.node(), consequence, &exit).await;
+            self.apply_consequence(event.node(), consequence, &exit)
+                .await;
         }
     }
 
-    pub(super) async fn follow_up(
+    pub(super) async fn apply_consequence(
         &mut self,
         node: &str,
         consequence: Consequence,
         exit: &NodeExit,
     ) {
         if self.stopping.is_some() {
-            // The last one has gone: no reason to wait on.
-            if self.nodes.alive() == (vec![], 0) {
+            // The last one has ended: there is nothing to wait for.
+            if self.nodes.running_and_starting() == (vec![], 0) {
                 self.enter_stage(StopStage::Kill).await;
             }
             return;
@@ -163,18 +169,18 @@ impl Driver {
                 let (inputs, name) = (self.inputs.clone(), node.to_owned());
                 tokio::task::spawn_local(async move {
                     tokio::time::sleep(Duration::from_secs_f64(delay)).await;
-                    let _ = inputs.send(Input::Respawn(name));
+                    let _ = inputs.send(ShimEvent::Respawn(name));
                 });
             }
             Consequence::EndServant => {
-                let state = self.verdict_on(node, exit);
+                let state = self.end_state_for(node, exit);
                 self.verdict = Some(state);
                 self.stop("").await;
             }
         }
     }
 
-    pub(super) fn verdict_on(&self, node: &str, exit: &NodeExit) -> ContainerState {
+    pub(super) fn end_state_for(&self, node: &str, exit: &NodeExit) -> ContainerState {
         let how = match exit {
             NodeExit {
                 exec_error: Some(reason),
@@ -206,7 +212,7 @@ impl Driver {
 
     pub(super) fn memory_limit(&self) -> String {
         match self.begun.enforced.limits.memory {
-            // As `api::Size` writes it, so that it reads as in the configuration and in the event.
+            // As `api::Size` formats it, so that it reads as in the configuration and in the event.
             Some(bytes) if bytes % (1 << 20) == 0 => {
                 format!("out of memory, the limit is {}M", bytes >> 20)
             }
@@ -216,13 +222,13 @@ impl Driver {
     }
 }
 
-fn describe(errno: i32, stage: Stage) -> String {
+fn describe(errno: i32, stage: StartStage) -> String {
     let error = std::io::Error::from_raw_os_error(errno);
     match stage {
-        Stage::Execute => format!("its program could not be executed: {error}"),
-        Stage::Directory => format!("its working directory could not be entered: {error}"),
-        Stage::Fork => format!("fork: {error}"),
-        Stage::Request | Stage::Prepare => {
+        StartStage::Execute => format!("its program could not be executed: {error}"),
+        StartStage::Directory => format!("its working directory could not be entered: {error}"),
+        StartStage::Fork => format!("fork: {error}"),
+        StartStage::Request | StartStage::Prepare => {
             format!("init could not prepare it: {error}")
         }
     }

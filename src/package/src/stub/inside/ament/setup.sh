@@ -26,6 +26,6 @@ if [ -d "$_cloudroid_prefix/share/ament_index" ]; then
   done
   export "AMENT_PREFIX_PATH=$_cloudroid_kept"
 else
-  echo "setup.sh does not know where it is: run install.sh, or source setup.bash or setup.zsh instead" >&2
+  echo "setup.sh does not know its directory: run install.sh, or source setup.bash or setup.zsh instead" >&2
 fi
 unset _cloudroid_here _cloudroid_installed _cloudroid_prefix _cloudroid_left _cloudroid_kept _cloudroid_item

@@ -1,23 +1,23 @@
-//! Pairings of robots.
+//! Samples of robot pairings.
 
 use api::machines::{
     NewPairing, Pair, Pairing, PairingMade, PairingState, Renew, RobotCertificate,
 };
 use serde_json::Value;
 
-use super::{sample, some};
+use super::{sample, some_text};
 
 fn patterns() -> Vec<access::Glob> {
     vec!["det*".parse().expect("a pattern")]
 }
 
-fn new() -> NewPairing {
+fn new_pairing() -> NewPairing {
     NewPairing {
         robot: "r1".into(),
         services: patterns(),
         classes: patterns(),
         lifetime: Some(60),
-        address: some("lab:9090"),
+        address: some_text("lab:9090"),
         own_certificate: true,
     }
 }
@@ -35,14 +35,14 @@ fn pairing() -> Pairing {
     }
 }
 
-/// Values of every type, with all that is optional and without.
+/// Returns samples of every type, with and without optional fields.
 pub fn samples() -> Vec<(&'static str, Value)> {
     let bare = NewPairing {
         classes: Vec::new(),
         lifetime: None,
         address: None,
         own_certificate: false,
-        ..new()
+        ..new_pairing()
     };
     let waiting = Pairing {
         state: PairingState::Waiting,
@@ -56,11 +56,14 @@ pub fn samples() -> Vec<(&'static str, Value)> {
         expires,
     };
     vec![
-        sample("NewPairing", new()),
+        sample("NewPairing", new_pairing()),
         sample("NewPairing", bare),
         sample("Pairing", pairing()),
         sample("Pairing", waiting),
-        sample("PairingMade", made(some("cloudroid://lab:9090/"), Some(1))),
+        sample(
+            "PairingMade",
+            made(some_text("cloudroid://lab:9090/"), Some(1)),
+        ),
         sample("PairingMade", made(None, None)),
         sample(
             "Pair",

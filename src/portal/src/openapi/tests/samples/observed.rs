@@ -1,4 +1,4 @@
-//! What observers of servants tell.
+//! Samples of what observers of servants report.
 
 use api::goals::{Goal, GoalState};
 use api::recordings::Recording;

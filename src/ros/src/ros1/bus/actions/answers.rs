@@ -1,5 +1,6 @@
-//! Whether what an action's servers answer reaches us. A node whose status is heard may not have begun to send its
-//! results to us yet: each topic has a connection of its own, and what is published before it is there is lost.
+//! Checks that an action's servers send their responses to us. A node whose status messages arrive may not send its
+//! results to us yet: each topic has a connection of its own, and anything published before that is established is
+//! lost.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -8,37 +9,40 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{sleep, timeout};
 
-use crate::ros1::bus::{Inner, heard};
+use crate::ros1::bus::{Ros1BusState, heard};
 
-/// The topics by which a server answers; its status is heard before anything is sent to it.
+/// The topics on which a server responds; its status is received before anything is sent to it.
 const PARTS: [&str; 2] = ["feedback", "result"];
-/// After this long, a server that does not say that it sends to us is taken to do so: not all tell the truth.
+/// Time after which a server is assumed to send to us although it does not report so: not all nodes report correctly.
 const GIVES_UP: Duration = Duration::from_secs(3);
-/// The first pause between two questions; each is twice as long as the one before.
+/// First pause between two queries; each is twice as long as the one before.
 const PAUSE: Duration = Duration::from_millis(2);
 const LONGEST_PAUSE: Duration = Duration::from_millis(100);
 
-/// A node at an address: one that was started again has another.
+/// A node at an address; a restarted node has another address.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-struct Answering {
+struct ActionPublisher {
     topic: String,
     node: String,
     uri: String,
 }
 
-/// Who is known to send us what it answers.
+/// The servers known to send their responses to us.
 #[derive(Default)]
-pub(super) struct Answers {
-    known: Mutex<HashSet<Answering>>,
+pub(super) struct KnownResponders {
+    known: Mutex<HashSet<ActionPublisher>>,
 }
 
-impl Answers {
-    /// Returns once all that publish the action's feedback and results send these to us.
-    pub(super) async fn reach_us(&self, bus: &Arc<Inner>, action: &str) {
+impl KnownResponders {
+    /// Waits until all nodes that publish the action's feedback and results send them to us.
+    pub(super) async fn wait_until_connected(&self, bus: &Arc<Ros1BusState>, action: &str) {
         for part in PARTS {
             let topic = format!("{action}/{part}");
-            if timeout(GIVES_UP, self.arrive(bus, &topic)).await.is_err() {
-                let silent = self.unknown(bus, &topic);
+            if timeout(GIVES_UP, self.wait_for_publishers(bus, &topic))
+                .await
+                .is_err()
+            {
+                let silent = self.unknown_publishers(bus, &topic);
                 let nodes: Vec<_> = silent.iter().map(|publisher| &publisher.node).collect();
                 tracing::debug!(topic, ?nodes, "they do not say that they send to us");
                 self.known.lock().extend(silent);
@@ -46,18 +50,19 @@ impl Answers {
         }
     }
 
-    async fn arrive(&self, bus: &Arc<Inner>, topic: &str) {
+    async fn wait_for_publishers(&self, bus: &Arc<Ros1BusState>, topic: &str) {
         let mut pause = PAUSE;
         loop {
-            let unknown = self.unknown(bus, topic);
+            let unknown = self.unknown_publishers(bus, topic);
             if unknown.is_empty() {
                 return;
             }
-            // One that cannot be asked is gone, or about to be.
+            // A node that cannot be queried is gone, or about to be.
             let Ok(connections) = heard::connections(bus, topic).await else {
                 return;
             };
-            let sends = |by: &Answering| connections.iter().any(|peer| peer.node() == by.node);
+            let sends =
+                |by: &ActionPublisher| connections.iter().any(|peer| peer.node() == by.node);
             let (arrived, missing): (Vec<_>, Vec<_>) = unknown.into_iter().partition(sends);
             self.known.lock().extend(arrived);
             if missing.is_empty() {
@@ -68,8 +73,8 @@ impl Answers {
         }
     }
 
-    /// The topic's publishers that are not known yet; those that have gone are forgotten.
-    fn unknown(&self, bus: &Inner, topic: &str) -> Vec<Answering> {
+    /// Returns the topic's publishers that are not known yet; forgets those that are gone.
+    fn unknown_publishers(&self, bus: &Ros1BusState, topic: &str) -> Vec<ActionPublisher> {
         let graph = bus.graph.borrow().clone();
         let mut known = self.known.lock();
         known.retain(|by| graph.nodes.get(&by.node) == Some(&by.uri));
@@ -78,7 +83,7 @@ impl Answers {
         let others = others.filter(|node| **node != bus.node);
         let others = others.filter_map(|node| {
             let uri = graph.nodes.get(node)?;
-            Some(Answering {
+            Some(ActionPublisher {
                 topic: topic.to_owned(),
                 node: node.clone(),
                 uri: uri.clone(),

@@ -1,4 +1,4 @@
-//! Goals that this side has sent, followed over actionlib's topics.
+//! Goals sent by this node, tracked over actionlib's topics.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
@@ -12,43 +12,43 @@ use tokio::task::AbortHandle;
 use tokio::time::timeout;
 
 use crate::bus::{
-    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, Graph, Matched, Outcome, Publisher,
-    Subscription,
+    ActionClient, BusError, CallFate, GoalEnd, GoalEvents, GoalOutcome, Graph, MatchedPeers,
+    Publisher, Subscription,
 };
 use crate::codec::Time;
-use crate::ros1::actions::messages::{self, GoalId, Status};
-use crate::ros1::bus::Inner;
-use crate::ros1::bus::actions::answers::Answers;
+use crate::ros1::actions::messages::{self, ActionlibStatus, GoalId};
+use crate::ros1::bus::Ros1BusState;
+use crate::ros1::bus::actions::answers::KnownResponders;
 use crate::schema::ActionDef;
 
-/// A goal that the server has stopped speaking of is lost.
+/// Time after which a goal that the server no longer lists is lost.
 const LOST_AFTER: Duration = Duration::from_secs(5);
-/// So is one that it has never spoken of, after much longer: the clients of actionlib wait for that without end, since a server may be slow, or another
-/// one may take the goal in its place.
+/// Time after which a goal that the server never listed is lost. It is much longer: actionlib clients wait forever for
+/// that, because a server may be slow, or another one may take the goal in its place.
 const NEVER_TAKEN: Duration = Duration::from_secs(60);
-/// How long a cancel waits for a server that has taken the goal and is not connected for cancels yet.
+/// Time for which a cancel waits for a server that has accepted the goal but is not connected to the cancel topic yet.
 const CANCEL_WAITS: Duration = Duration::from_secs(10);
-/// A server that publishes no results for so long is gone.
+/// Time without a publisher of results after which the server counts as gone.
 const GONE_AFTER: Duration = Duration::from_secs(3);
 
-/// One action.
-pub(in crate::ros1) struct Client {
-    shared: Arc<Shared>,
+/// A client of one action.
+pub(in crate::ros1) struct Ros1ActionClient {
+    shared: Arc<ActionlibClientState>,
     tasks: [AbortHandle; 2],
 }
 
-struct Shared {
-    bus: Arc<Inner>,
+struct ActionlibClientState {
+    bus: Arc<Ros1BusState>,
     name: String,
     type_name: String,
-    goals: Mutex<HashMap<String, Goal>>,
-    ends: OnceLock<Ends>,
-    answers: Answers,
+    goals: Mutex<HashMap<String, TrackedGoal>>,
+    ends: OnceLock<ActionClientPublishers>,
+    answers: KnownResponders,
     state: watch::Sender<State>,
 }
 
-/// What this side publishes.
-struct Ends {
+/// Publishers of the client.
+struct ActionClientPublishers {
     goal: Box<dyn Publisher>,
     cancel: Box<dyn Publisher>,
 }
@@ -56,24 +56,24 @@ struct Ends {
 #[derive(Debug, Clone, PartialEq)]
 enum State {
     Opening,
-    /// Its topics are advertised and subscribed to.
+    /// The topics are advertised and subscribed to.
     Open,
-    /// The server's status has been heard.
+    /// A status message of the server has arrived.
     Heard,
     /// The topics cannot be used.
     Failed(String),
 }
 
-struct Goal {
-    /// When the server last spoke of it, or when it was sent.
+struct TrackedGoal {
+    /// Time at which the server last mentioned the goal, or at which it was sent.
     seen: Instant,
-    /// For how long the server may say nothing of it.
+    /// Time for which the server may leave the goal unmentioned.
     patience: Duration,
     events: Arc<dyn GoalEvents>,
 }
 
-impl Goal {
-    fn sent(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
+impl TrackedGoal {
+    fn new(now: Instant, events: Arc<dyn GoalEvents>) -> Self {
         Self {
             seen: now,
             patience: NEVER_TAKEN,
@@ -81,7 +81,7 @@ impl Goal {
         }
     }
 
-    fn is_heard_of(&mut self, now: Instant) {
+    fn mark_seen(&mut self, now: Instant) {
         self.seen = now;
         self.patience = LOST_AFTER;
     }
@@ -91,23 +91,23 @@ impl Goal {
     }
 }
 
-/// What the server publishes.
-struct Heard {
+/// Subscriptions to what the server publishes.
+struct ActionClientSubscriptions {
     feedback: Subscription,
     result: Subscription,
     status: Subscription,
 }
 
-impl Client {
+impl Ros1ActionClient {
     /// Opens the action's topics in the background.
-    pub(in crate::ros1) fn open(bus: &Arc<Inner>, name: &str, of: &Arc<ActionDef>) -> Self {
-        let shared = Arc::new(Shared {
+    pub(in crate::ros1) fn open(bus: &Arc<Ros1BusState>, name: &str, of: &Arc<ActionDef>) -> Self {
+        let shared = Arc::new(ActionlibClientState {
             bus: bus.clone(),
             name: name.to_owned(),
             type_name: of.name.clone(),
             goals: Mutex::default(),
             ends: OnceLock::new(),
-            answers: Answers::default(),
+            answers: KnownResponders::default(),
             state: watch::Sender::new(State::Opening),
         });
         let (following, of) = (shared.clone(), of.clone());
@@ -122,24 +122,24 @@ impl Client {
     }
 }
 
-impl Drop for Client {
+impl Drop for Ros1ActionClient {
     fn drop(&mut self) {
         for task in &self.tasks {
             task.abort();
         }
-        // Whoever has sent them needs them no longer.
+        // Nobody needs the goals any longer.
         let goals = std::mem::take(&mut *self.shared.goals.lock());
         if let Some(ends) = self.shared.ends.get() {
             for id in goals.into_keys() {
-                ends.cancel.publish(cancel(&id));
+                ends.cancel.publish(cancel_message(&id));
             }
         }
     }
 }
 
 #[async_trait]
-impl ActionClient for Client {
-    async fn ready(&self, patience: Duration) -> Result<(), BusError> {
+impl ActionClient for Ros1ActionClient {
+    async fn wait_for_server(&self, patience: Duration) -> Result<(), BusError> {
         let shared = &self.shared;
         let ready = async {
             let mut state = shared.state.subscribe();
@@ -152,20 +152,23 @@ impl ActionClient for Client {
                     fate: CallFate::NotTaken,
                 });
             }
-            shared.takes_goals().await;
-            shared.answers.reach_us(&shared.bus, &shared.name).await;
+            shared.wait_for_goal_subscribers().await;
+            shared
+                .answers
+                .wait_until_connected(&shared.bus, &shared.name)
+                .await;
             Ok(())
         };
         let ready = async {
             tokio::select! {
                 biased;
-                other = shared.has_other_type() => Err(other),
+                other = shared.wait_for_type_mismatch() => Err(other),
                 ready = ready => ready,
             }
         };
         match timeout(patience, ready).await {
             Ok(ready) => ready,
-            // It may take goals all the same, and only not have said how they stand.
+            // The server may accept goals all the same and only not have published its status.
             Err(_) if shared.is_connected() => Ok(()),
             Err(_) => Err(BusError::Timeout {
                 what: format!("action {}", shared.name),
@@ -174,11 +177,11 @@ impl ActionClient for Client {
         }
     }
 
-    fn send(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
+    fn send_goal(&self, id: &str, goal: Bytes, events: Arc<dyn GoalEvents>) {
         let Some(ends) = self.shared.ends.get() else {
-            return events.ended(Err(format!("action {} is not ready", self.shared.name)));
+            return events.on_ended(Err(format!("action {} is not ready", self.shared.name)));
         };
-        let known = Goal::sent(Instant::now(), events);
+        let known = TrackedGoal::new(Instant::now(), events);
         self.shared.goals.lock().insert(id.to_owned(), known);
         let stamp = Time::now();
         let id = GoalId {
@@ -188,8 +191,8 @@ impl ActionClient for Client {
         ends.goal.publish(messages::write_goal(stamp, &id, &goal));
     }
 
-    /// The server hears of it as soon as it is connected.
-    fn cancel(&self, id: &str) {
+    /// Sends the cancel as soon as the server is connected.
+    fn cancel_goal(&self, id: &str) {
         let shared = &self.shared;
         let Some(ends) = shared.ends.get() else {
             return;
@@ -197,83 +200,84 @@ impl ActionClient for Client {
         if !shared.goals.lock().contains_key(id) {
             return;
         }
-        let matched = ends.cancel.matched();
-        if matched.borrow().connected() > 0 {
-            return ends.cancel.publish(cancel(id));
+        let matched = ends.cancel.matched_subscribers();
+        if matched.borrow().connected_count() > 0 {
+            return ends.cancel.publish(cancel_message(id));
         }
         let (waiting, id) = (shared.clone(), id.to_owned());
         shared.bus.spawn(async move {
-            // Not for ever: a server need not care for cancels.
-            let _ = timeout(CANCEL_WAITS, crate::bus::reaches(matched, 1)).await;
+            // Bounded: a server need not subscribe to cancels.
+            let _ = timeout(CANCEL_WAITS, crate::bus::wait_for_connected(matched, 1)).await;
             let under_way = waiting.goals.lock().contains_key(&id);
             if let Some(ends) = waiting.ends.get().filter(|_| under_way) {
-                ends.cancel.publish(cancel(&id));
+                ends.cancel.publish(cancel_message(&id));
             }
         });
     }
 }
 
-fn cancel(id: &str) -> Bytes {
+fn cancel_message(id: &str) -> Bytes {
     messages::write_cancel(&GoalId {
         stamp: Time::default(),
         id: id.to_owned(),
     })
 }
 
-impl Shared {
-    async fn open(&self, of: &ActionDef) -> Result<Heard, BusError> {
-        let topics = super::Topics::of(&self.bus, &self.name, of)?;
-        let heard = Heard {
+impl ActionlibClientState {
+    async fn open(&self, of: &ActionDef) -> Result<ActionClientSubscriptions, BusError> {
+        let topics = super::ActionTopicSet::new(&self.bus, &self.name, of)?;
+        let heard = ActionClientSubscriptions {
             feedback: topics.subscribe("feedback").await?,
             result: topics.subscribe("result").await?,
             status: topics.subscribe("status").await?,
         };
-        let ends = Ends {
+        let ends = ActionClientPublishers {
             goal: topics.advertise("goal", false).await?,
             cancel: topics.advertise("cancel", false).await?,
         };
-        // Set once, here.
+        // Set only here.
         let _ = self.ends.set(ends);
         self.state.send_replace(State::Open);
         Ok(heard)
     }
 
-    async fn follow(&self, mut heard: Heard) {
+    async fn follow(&self, mut heard: ActionClientSubscriptions) {
         loop {
             tokio::select! {
-                // Feedback came before the result that it belongs to.
+                // Feedback arrived before the result it belongs to.
                 biased;
-                Some(message) = heard.feedback.messages.recv() => self.feedback(&message.bytes),
-                Some(message) = heard.result.messages.recv() => self.result(&message.bytes),
-                Some(message) = heard.status.messages.recv() => self.status(&message.bytes),
+                Some(message) = heard.feedback.messages.recv() => self.on_feedback(&message.bytes),
+                Some(message) = heard.result.messages.recv() => self.on_result(&message.bytes),
+                Some(message) = heard.status.messages.recv() => self.on_status(&message.bytes),
                 else => return self.fail_all("the connection to this ROS system was closed"),
             }
         }
     }
 
-    fn matched(&self) -> Option<watch::Receiver<Matched>> {
-        Some(self.ends.get()?.goal.matched())
+    fn goal_subscribers(&self) -> Option<watch::Receiver<MatchedPeers>> {
+        Some(self.ends.get()?.goal.matched_subscribers())
     }
 
-    /// Whether somebody takes goals here who also sends results. Who only observes goals does not, and a server that is on its way
-    /// in or out, registered for one of both, does not either: it has no type yet, or no longer.
-    fn has_server(&self, matched: &Matched, graph: &Graph) -> bool {
+    /// Returns true if a connected subscriber of goals also publishes results. A node that only observes goals does
+    /// not, and a server that is starting or stopping and is registered for one of both has no action type yet, or no
+    /// longer.
+    fn has_server(&self, matched: &MatchedPeers, graph: &Graph) -> bool {
         let nodes = graph.actions.get(&self.name);
         nodes.is_some_and(|nodes| nodes.servers.iter().any(|node| matched.has_node(node)))
     }
 
     fn is_connected(&self) -> bool {
-        self.matched()
+        self.goal_subscribers()
             .is_some_and(|matched| self.has_server(&matched.borrow(), &self.bus.graph.borrow()))
     }
 
-    /// Returns when its servers turn out to have another type.
-    async fn has_other_type(&self) -> BusError {
+    /// Returns the error once the servers turn out to have another type.
+    async fn wait_for_type_mismatch(&self) -> BusError {
         let mut graph = self.bus.graph.subscribe();
         loop {
             let other = graph
                 .borrow_and_update()
-                .other_action(&self.name, &self.type_name);
+                .action_type_mismatch(&self.name, &self.type_name);
             if let Some(other) = other {
                 return other;
             }
@@ -283,9 +287,9 @@ impl Shared {
         }
     }
 
-    /// Returns once all are connected who are registered to take goals, a server among them.
-    async fn takes_goals(&self) {
-        let Some(mut matched) = self.matched() else {
+    /// Waits until all nodes registered as subscribers of goals are connected, including a server.
+    async fn wait_for_goal_subscribers(&self) {
+        let Some(mut matched) = self.goal_subscribers() else {
             return;
         };
         let topic = format!("{}/goal", self.name);
@@ -296,7 +300,9 @@ impl Shared {
                 let servers = graph.topics.get(&topic).map(|nodes| &nodes.subscribers);
                 let mut others = servers.into_iter().flatten();
                 let others = others.all(|node| *node == self.bus.node || matched.has_node(node));
-                let has_other_type = graph.other_action(&self.name, &self.type_name).is_some();
+                let has_other_type = graph
+                    .action_type_mismatch(&self.name, &self.type_name)
+                    .is_some();
                 others && !has_other_type && self.has_server(&matched, &graph)
             };
             if complete {
@@ -309,21 +315,21 @@ impl Shared {
         }
     }
 
-    fn feedback(&self, bytes: &Bytes) {
+    fn on_feedback(&self, bytes: &Bytes) {
         let Some((state, body)) = messages::read_state(bytes) else {
             return;
         };
         let events = match self.goals.lock().get_mut(&state.goal.id) {
             Some(goal) => {
-                goal.is_heard_of(Instant::now());
+                goal.mark_seen(Instant::now());
                 goal.events.clone()
             }
             None => return,
         };
-        events.feedback(body);
+        events.on_feedback(body);
     }
 
-    fn result(&self, bytes: &Bytes) {
+    fn on_result(&self, bytes: &Bytes) {
         let Some((state, body)) = messages::read_state(bytes) else {
             return;
         };
@@ -331,20 +337,20 @@ impl Shared {
             return;
         };
         let outcome = match state.status {
-            Status::Succeeded => Outcome::Succeeded,
-            Status::Preempted | Status::Recalled => Outcome::Canceled,
-            Status::Aborted => Outcome::Aborted,
-            Status::Rejected => Outcome::Rejected,
-            _ => Outcome::Unknown,
+            ActionlibStatus::Succeeded => GoalOutcome::Succeeded,
+            ActionlibStatus::Preempted | ActionlibStatus::Recalled => GoalOutcome::Canceled,
+            ActionlibStatus::Aborted => GoalOutcome::Aborted,
+            ActionlibStatus::Rejected => GoalOutcome::Rejected,
+            _ => GoalOutcome::Unknown,
         };
-        goal.events.ended(Ok(GoalEnd {
+        goal.events.on_ended(Ok(GoalEnd {
             outcome,
             text: state.text,
             result: body,
         }));
     }
 
-    fn status(&self, bytes: &Bytes) {
+    fn on_status(&self, bytes: &Bytes) {
         let Some(states) = messages::read_states(bytes) else {
             return;
         };
@@ -360,7 +366,7 @@ impl Shared {
         let mut goals = self.goals.lock();
         for (id, goal) in goals.iter_mut() {
             if states.iter().any(|state| state.goal.id == *id) {
-                goal.is_heard_of(now);
+                goal.mark_seen(now);
             } else if goal.is_lost(now) {
                 lost.push(id.clone());
             }
@@ -369,14 +375,14 @@ impl Shared {
         drop(goals);
         for goal in lost {
             let reason = "the action server no longer knows the goal";
-            goal.events.ended(Err(reason.to_owned()));
+            goal.events.on_ended(Err(reason.to_owned()));
         }
     }
 
     fn end_all(&self, reason: &str) {
         let goals = std::mem::take(&mut *self.goals.lock());
         for goal in goals.into_values() {
-            goal.events.ended(Err(reason.to_owned()));
+            goal.events.on_ended(Err(reason.to_owned()));
         }
     }
 
@@ -386,8 +392,8 @@ impl Shared {
     }
 }
 
-/// Ends the goals of a server that has gone.
-async fn watch_server(shared: Arc<Shared>) {
+/// Ends the goals when the server has gone.
+async fn watch_server(shared: Arc<ActionlibClientState>) {
     let mut graph = shared.bus.graph.subscribe();
     let topic = format!("{}/result", shared.name);
     let there = |graph: &Arc<crate::bus::Graph>| {
@@ -415,18 +421,18 @@ mod tests {
     struct Nobody;
 
     impl GoalEvents for Nobody {
-        fn feedback(&self, _: Bytes) {}
+        fn on_feedback(&self, _: Bytes) {}
 
-        fn ended(&self, _: Result<GoalEnd, String>) {}
+        fn on_ended(&self, _: Result<GoalEnd, String>) {}
     }
 
     #[test]
     fn a_goal_that_nobody_took_yet_is_waited_for_longer_than_one_that_was_dropped() {
         let begin = Instant::now();
         let after = |seconds| begin + Duration::from_secs(seconds);
-        let mut goal = Goal::sent(begin, Arc::new(Nobody));
+        let mut goal = TrackedGoal::new(begin, Arc::new(Nobody));
         assert!(!goal.is_lost(after(30)) && goal.is_lost(after(61)));
-        goal.is_heard_of(after(30));
+        goal.mark_seen(after(30));
         assert!(!goal.is_lost(after(34)) && goal.is_lost(after(36)));
     }
 }

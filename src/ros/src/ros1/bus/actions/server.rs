@@ -1,4 +1,4 @@
-//! An action that this side serves, on actionlib's topics.
+//! Server of one action, on actionlib's topics.
 
 use std::collections::HashMap;
 use std::sync::{Arc, OnceLock};
@@ -9,70 +9,70 @@ use parking_lot::Mutex;
 use tokio::task::AbortHandle;
 
 use crate::bus::{
-    ActionHandler, ActionServer, BusError, GoalEnd, Outcome, Publisher, Subscription,
+    ActionHandler, ActionServer, BusError, GoalEnd, GoalOutcome, Publisher, Subscription,
 };
 use crate::codec::Time;
-use crate::ros1::actions::messages::{self, GoalId, GoalState, Status};
-use crate::ros1::bus::Inner;
+use crate::ros1::actions::messages::{self, ActionlibStatus, GoalId, GoalState};
+use crate::ros1::bus::Ros1BusState;
 use crate::schema::ActionDef;
 
-/// actionlib's rate.
+/// Interval of status messages, as in actionlib.
 const STATUS_PERIOD: Duration = Duration::from_millis(200);
-/// How long an ended goal stays in the status list.
+/// Time for which an ended goal stays in the status list.
 const STATUS_KEPT: Duration = Duration::from_secs(5);
-/// Goals that a server may have on its hands.
+/// Maximum number of goals of a server.
 const MAX_GOALS: usize = 1000;
 
-/// One action.
-pub(in crate::ros1) struct Server {
-    shared: Arc<Shared>,
+/// A server of one action.
+pub(in crate::ros1) struct Ros1ActionServer {
+    shared: Arc<ActionlibServerState>,
     task: AbortHandle,
 }
 
-struct Shared {
-    bus: Arc<Inner>,
+struct ActionlibServerState {
+    bus: Arc<Ros1BusState>,
     name: String,
     of: Arc<ActionDef>,
     handler: Arc<dyn ActionHandler>,
-    ends: OnceLock<Ends>,
-    goals: Mutex<HashMap<String, Served>>,
-    /// Goals up to this stamp were cancelled, those that come after their cancel included.
+    ends: OnceLock<ActionServerPublishers>,
+    goals: Mutex<HashMap<String, ServedGoal>>,
+    /// Goals up to this stamp are cancelled, including those that arrive after the cancel.
     cancelled_up_to: Mutex<Time>,
 }
 
-/// What this side publishes.
-struct Ends {
+/// Publishers of the server.
+struct ActionServerPublishers {
     status: Box<dyn Publisher>,
     feedback: Box<dyn Publisher>,
     result: Box<dyn Publisher>,
 }
 
-/// What others publish.
-struct Heard {
+/// Subscriptions to what clients publish.
+struct ActionServerSubscriptions {
     goal: Subscription,
     cancel: Subscription,
 }
 
-struct Served {
+struct ServedGoal {
     state: GoalState,
     ended: Option<Instant>,
 }
 
-impl Served {
-    fn is(&self, status: Status) -> bool {
+impl ServedGoal {
+    fn has_status(&self, status: ActionlibStatus) -> bool {
         self.ended.is_none() && self.state.status == status
     }
 }
 
-impl Server {
+impl Ros1ActionServer {
     /// Opens the action's topics in the background.
     pub(in crate::ros1) fn open(
-        bus: &Arc<Inner>,
+        bus: &Arc<Ros1BusState>,
         name: &str,
         of: &Arc<ActionDef>,
         handler: Arc<dyn ActionHandler>,
     ) -> Self {
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ActionlibServerState {
             bus: bus.clone(),
             name: name.to_owned(),
             of: of.clone(),
@@ -85,14 +85,14 @@ impl Server {
         let task = bus.spawn(async move {
             match serving.open().await {
                 Ok(heard) => serving.serve(heard).await,
-                Err(error) => serving.handler.failed(&error.to_string()),
+                Err(error) => serving.handler.on_failed(&error.to_string()),
             }
         });
         Self { shared, task }
     }
 }
 
-impl Drop for Server {
+impl Drop for Ros1ActionServer {
     fn drop(&mut self) {
         self.task.abort();
         let under_way: Vec<String> = {
@@ -102,17 +102,17 @@ impl Drop for Server {
         };
         for id in under_way {
             let end = GoalEnd {
-                outcome: Outcome::Aborted,
+                outcome: GoalOutcome::Aborted,
                 text: "its server is gone".to_owned(),
-                result: self.shared.nothing(),
+                result: self.shared.default_result(),
             };
-            self.shared.end(&id, end);
+            self.shared.end_goal(&id, end);
         }
     }
 }
 
-impl ActionServer for Server {
-    fn feedback(&self, id: &str, feedback: Bytes) -> bool {
+impl ActionServer for Ros1ActionServer {
+    fn publish_feedback(&self, id: &str, feedback: Bytes) -> bool {
         let goals = self.shared.goals.lock();
         let served = goals.get(id).filter(|served| served.ended.is_none());
         let Some(state) = served.map(|served| served.state.clone()) else {
@@ -126,55 +126,55 @@ impl ActionServer for Server {
         true
     }
 
-    fn end(&self, id: &str, end: GoalEnd) -> bool {
-        self.shared.end(id, end)
+    fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
+        self.shared.end_goal(id, end)
     }
 }
 
-impl Shared {
-    /// Publishers first: a goal may be answered as soon as it can come.
-    async fn open(&self) -> Result<Heard, BusError> {
-        let topics = super::Topics::of(&self.bus, &self.name, &self.of)?;
-        let ends = Ends {
+impl ActionlibServerState {
+    /// Advertises first: a goal may be answered as soon as it can arrive.
+    async fn open(&self) -> Result<ActionServerSubscriptions, BusError> {
+        let topics = super::ActionTopicSet::new(&self.bus, &self.name, &self.of)?;
+        let ends = ActionServerPublishers {
             status: topics.advertise("status", true).await?,
             feedback: topics.advertise("feedback", false).await?,
             result: topics.advertise("result", false).await?,
         };
-        // Set once, here.
+        // Set only here.
         let _ = self.ends.set(ends);
-        Ok(Heard {
+        Ok(ActionServerSubscriptions {
             goal: topics.subscribe("goal").await?,
             cancel: topics.subscribe("cancel").await?,
         })
     }
 
-    async fn serve(&self, mut heard: Heard) {
+    async fn serve(&self, mut heard: ActionServerSubscriptions) {
         let mut period = tokio::time::interval(STATUS_PERIOD);
         loop {
             tokio::select! {
-                Some(message) = heard.goal.messages.recv() => self.goal(&message.bytes),
-                Some(message) = heard.cancel.messages.recv() => self.cancel(&message.bytes),
+                Some(message) = heard.goal.messages.recv() => self.on_goal(&message.bytes),
+                Some(message) = heard.cancel.messages.recv() => self.on_cancel(&message.bytes),
                 _ = period.tick() => self.publish_status(),
             }
         }
     }
 
-    /// A result of defaults.
-    fn nothing(&self) -> Bytes {
+    /// Returns a result of default values.
+    fn default_result(&self) -> Bytes {
         vec![0; self.of.result.min_size()].into()
     }
 
-    fn goal(&self, bytes: &Bytes) {
+    fn on_goal(&self, bytes: &Bytes) {
         let Some((mut goal, body)) = messages::read_goal(bytes) else {
             return;
         };
         if goal.id.is_empty() {
-            goal.id = format!("{}-{}", self.name, self.bus.id());
+            goal.id = format!("{}-{}", self.name, self.bus.next_id());
         }
         let id = goal.id.clone();
         let mut state = GoalState {
             goal,
-            status: Status::Active,
+            status: ActionlibStatus::Active,
             text: String::new(),
         };
         {
@@ -182,42 +182,42 @@ impl Shared {
             let mut goals = self.goals.lock();
             let stamp = state.goal.stamp;
             let recalled = match goals.get(&id) {
-                Some(known) if known.state.status == Status::Recalling => true,
+                Some(known) if known.state.status == ActionlibStatus::Recalling => true,
                 Some(_) => return,
                 None => stamp != Time::default() && stamp <= cancelled_up_to,
             };
             let mut ended = None;
             if recalled {
-                // Its cancel came first: the handler need not hear of it.
-                state.status = Status::Recalled;
+                // The cancel arrived first: the handler need not know of the goal.
+                state.status = ActionlibStatus::Recalled;
                 state.text = "the goal was cancelled before it came".to_owned();
                 ended = Some(Instant::now());
             } else if goals.len() >= MAX_GOALS {
-                state.status = Status::Rejected;
+                state.status = ActionlibStatus::Rejected;
                 state.text = format!("{MAX_GOALS} goals wait for this server already");
                 ended = Some(Instant::now());
             }
             let state = state.clone();
-            goals.insert(id.clone(), Served { state, ended });
+            goals.insert(id.clone(), ServedGoal { state, ended });
         }
-        if state.status == Status::Active {
-            if let Err(reason) = self.handler.goal(&id, body) {
-                state.status = Status::Rejected;
+        if state.status == ActionlibStatus::Active {
+            if let Err(reason) = self.handler.on_goal(&id, body) {
+                state.status = ActionlibStatus::Rejected;
                 state.text = reason;
                 let ended = Some(Instant::now());
                 let state = state.clone();
-                self.goals.lock().insert(id, Served { state, ended });
+                self.goals.lock().insert(id, ServedGoal { state, ended });
             }
         }
         self.publish_status();
         if state.status.is_terminal() {
-            self.publish_result(&state, &self.nothing());
+            self.publish_result(&state, &self.default_result());
         }
     }
 
-    /// actionlib's policy: an empty id means all goals up to the stamp, a zero stamp with it means all. A cancel may be
-    /// faster than its goal, which comes on another topic: it is kept.
-    fn cancel(&self, bytes: &[u8]) {
+    /// Handles a cancel by actionlib's policy: an empty id means all goals up to the stamp, and with a zero stamp all
+    /// goals. A cancel may overtake its goal, which arrives on another topic: then it is remembered.
+    fn on_cancel(&self, bytes: &[u8]) {
         let Some(wanted) = messages::read_cancel(bytes) else {
             return;
         };
@@ -236,36 +236,36 @@ impl Shared {
         if !wanted.id.is_empty() && !goals.contains_key(&wanted.id) && goals.len() < MAX_GOALS {
             let state = GoalState {
                 goal: wanted.clone(),
-                status: Status::Recalling,
+                status: ActionlibStatus::Recalling,
                 text: String::new(),
             };
             let ended = Some(Instant::now());
-            goals.insert(wanted.id.clone(), Served { state, ended });
+            goals.insert(wanted.id.clone(), ServedGoal { state, ended });
         }
         for (id, served) in goals.iter_mut() {
-            if served.is(Status::Active) && matches(&served.state.goal) {
-                served.state.status = Status::Preempting;
+            if served.has_status(ActionlibStatus::Active) && matches(&served.state.goal) {
+                served.state.status = ActionlibStatus::Preempting;
                 cancelled.push(id.clone());
             }
         }
         drop(goals);
         self.publish_status();
         for id in cancelled {
-            self.handler.cancel(&id);
+            self.handler.on_cancel(&id);
         }
     }
 
-    fn end(&self, id: &str, end: GoalEnd) -> bool {
+    fn end_goal(&self, id: &str, end: GoalEnd) -> bool {
         let mut goals = self.goals.lock();
         let served = goals.get_mut(id).filter(|served| served.ended.is_none());
         let Some(served) = served else {
             return false;
         };
         served.state.status = match end.outcome {
-            Outcome::Succeeded => Status::Succeeded,
-            Outcome::Canceled => Status::Preempted,
-            Outcome::Rejected => Status::Rejected,
-            Outcome::Aborted | Outcome::Unknown => Status::Aborted,
+            GoalOutcome::Succeeded => ActionlibStatus::Succeeded,
+            GoalOutcome::Canceled => ActionlibStatus::Preempted,
+            GoalOutcome::Rejected => ActionlibStatus::Rejected,
+            GoalOutcome::Aborted | GoalOutcome::Unknown => ActionlibStatus::Aborted,
         };
         served.state.text = end.text;
         served.ended = Some(Instant::now());

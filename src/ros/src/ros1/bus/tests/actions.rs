@@ -10,13 +10,13 @@ use crate::schema::{ActionDef, Registry};
 struct Nothing;
 
 impl ActionHandler for Nothing {
-    fn goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
+    fn on_goal(&self, _id: &str, _goal: Bytes) -> Result<(), String> {
         Ok(())
     }
 
-    fn cancel(&self, _id: &str) {}
+    fn on_cancel(&self, _id: &str) {}
 
-    fn failed(&self, reason: &str) {
+    fn on_failed(&self, reason: &str) {
         panic!("{reason}");
     }
 }
@@ -28,21 +28,21 @@ fn dig() -> Arc<ActionDef> {
     definitions.action("pkg/Dig").unwrap()
 }
 
-fn serves(bus: &Ros1Bus) -> Box<dyn ActionServer> {
+fn serve_dig(bus: &Ros1Bus) -> Box<dyn ActionServer> {
     let handler = Arc::new(Nothing);
     bus.serve_action("/dig", &dig(), handler).unwrap()
 }
 
-/// Another node of the action, which says of its connections what is given here, and is never connected to.
-async fn says_of_itself(master: &TestMaster, connections: Value) -> TestNode {
-    let node = TestNode::answering(connections).await;
+/// Another node of the action, which reports the given connections and is never connected to.
+async fn node_reporting(master: &TestMaster, connections: Value) -> TestNode {
+    let node = TestNode::start_answering(connections).await;
     let list = ["/other", "/dig/result", "pkg/DigActionResult", &node.uri].map(Value::from);
     master.call("registerPublisher", &list).await;
     node
 }
 
-/// Returns when it is next asked for its connections.
-async fn asked(node: &mut TestNode) {
+/// Waits for the next query for the node's connections.
+async fn wait_until_asked(node: &mut TestNode) {
     while node.next().await.0 != "getBusInfo" {}
 }
 
@@ -53,20 +53,20 @@ async fn both_there(bus: &Ros1Bus) {
             .get("/dig/result")
             .map(|of| of.publishers.len())
     };
-    until(bus, |graph| of(graph) == Some(2)).await;
+    wait_for_graph(bus, |graph| of(graph) == Some(2)).await;
 }
 
 #[tokio::test]
 async fn no_goal_is_sent_to_a_server_that_does_not_send_its_results_here_yet() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let _server = serves(&two);
-    let mut late = says_of_itself(&master, Value::Array(Vec::new())).await;
+    let _server = serve_dig(&two);
+    let mut late = node_reporting(&master, Value::Array(Vec::new())).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    let ready = tokio::spawn(async move { client.ready(LONG).await });
+    let ready = tokio::spawn(async move { client.wait_for_server(LONG).await });
     for _ in 0..3 {
-        asked(&mut late).await;
+        wait_until_asked(&mut late).await;
     }
     assert!(!ready.is_finished(), "it hears nothing of it");
     let gone = ["/other", "/dig/result", &late.uri].map(Value::from);
@@ -78,7 +78,7 @@ async fn no_goal_is_sent_to_a_server_that_does_not_send_its_results_here_yet() {
 async fn a_server_that_sends_its_results_here_is_asked_once() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let _server = serves(&two);
+    let _server = serve_dig(&two);
     let row = [
         Value::Int(1),
         "/one".into(),
@@ -88,12 +88,12 @@ async fn a_server_that_sends_its_results_here_is_asked_once() {
         true.into(),
     ];
     let rows = Value::Array(vec![Value::Array(row.to_vec())]);
-    let mut other = says_of_itself(&master, rows).await;
+    let mut other = node_reporting(&master, rows).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    client.ready(LONG).await.unwrap();
-    asked(&mut other).await;
-    client.ready(LONG).await.unwrap();
+    client.wait_for_server(LONG).await.unwrap();
+    wait_until_asked(&mut other).await;
+    client.wait_for_server(LONG).await.unwrap();
     while let Ok((method, _)) = other.calls.try_recv() {
         assert_ne!(method, "getBusInfo");
     }
@@ -103,13 +103,16 @@ async fn a_server_that_sends_its_results_here_is_asked_once() {
 async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let _server = serves(&two);
-    let mut other = says_of_itself(&master, Value::Array(Vec::new())).await;
+    let _server = serve_dig(&two);
+    let mut other = node_reporting(&master, Value::Array(Vec::new())).await;
     both_there(&one).await;
     let client = one.action_client("/dig", &dig()).unwrap();
-    client.ready(LONG).await.unwrap();
+    client.wait_for_server(LONG).await.unwrap();
     while other.calls.try_recv().is_ok() {}
-    client.ready(Duration::from_secs(1)).await.unwrap();
+    client
+        .wait_for_server(Duration::from_secs(1))
+        .await
+        .unwrap();
     while let Ok((method, _)) = other.calls.try_recv() {
         assert_ne!(method, "getBusInfo");
     }
@@ -119,13 +122,13 @@ async fn a_server_that_never_says_so_delays_the_first_goal_alone() {
 async fn who_only_observes_goals_is_no_server() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let observed = two.subscribe("/dig/goal", WireType::any(), Qos::keep_last(1));
+    let observed = two.subscribe("/dig/goal", WireType::any(), QosProfile::keep_last(1));
     let observed = observed.await.unwrap();
     let client = one.action_client("/dig", &dig()).unwrap();
-    let connected = crate::bus::reaches(observed.matched.clone(), 1);
+    let connected = crate::bus::wait_for_connected(observed.matched.clone(), 1);
     tokio::time::timeout(LONG, connected).await.unwrap();
-    let ready = client.ready(Duration::from_millis(300)).await;
+    let ready = client.wait_for_server(Duration::from_millis(300)).await;
     assert!(matches!(ready, Err(BusError::Timeout { .. })), "{ready:?}");
-    let _server = serves(&two);
-    client.ready(LONG).await.unwrap();
+    let _server = serve_dig(&two);
+    client.wait_for_server(LONG).await.unwrap();
 }

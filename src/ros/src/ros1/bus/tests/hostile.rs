@@ -6,14 +6,14 @@ use tokio::net::TcpListener;
 use super::*;
 use crate::ros1::tcpros::Header;
 use crate::ros1::testing::TestNode;
-use crate::ros1::xmlrpc::{Client, Value};
+use crate::ros1::xmlrpc::{Value, XmlRpcClient};
 
-/// A publisher made by hand: what it sends to one connection after the other.
+/// A hand-made publisher, with the bytes it sends on each successive connection.
 async fn publisher(master: &TestMaster, scripts: Vec<Vec<u8>>) -> TestNode {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let port = i32::from(listener.local_addr().unwrap().port());
     let place = Value::Array(vec!["TCPROS".into(), "127.0.0.1".into(), port.into()]);
-    let node = TestNode::answering(place).await;
+    let node = TestNode::start_answering(place).await;
     let list = ["/liar", "/chat", "std_msgs/String", &node.uri].map(Value::from);
     master.call("registerPublisher", &list).await;
     tokio::spawn(async move {
@@ -42,17 +42,17 @@ async fn a_publisher_that_breaks_off_or_lies_is_tried_again() {
     let bus = join(&master, "/one").await;
     let scripts = vec![
         Header::error("not you").encode(),
-        // Not a header; a message longer than allowed; one cut in the middle; and at last a good one.
+        // Not a header; a message longer than allowed; one that is cut off; and finally a good one.
         vec![0xff; 8],
         script(&u32::MAX.to_le_bytes()),
         script(b"\x05\0\0\0abc"),
         script(b"\x04\0\0\0good"),
     ];
     let node = publisher(&master, scripts).await;
-    let mut subscription = hears(&bus, "/chat").await;
+    let mut subscription = subscribe_text(&bus, "/chat").await;
     let message = next(&mut subscription.messages).await;
     assert_eq!(message.bytes, "good");
-    // It did not say who it is: then its address has to do.
+    // It did not give its name: then its address is used.
     assert_eq!(message.publisher.node(), node.uri);
 }
 
@@ -70,14 +70,14 @@ async fn a_publisher_that_does_not_check_types_is_checked() {
 async fn a_publisher_that_stalls_holds_up_no_other() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    // It accepts, and says nothing more; another one's XML-RPC hangs.
+    // It accepts and then is silent; another one's XML-RPC hangs.
     let _stalled = publisher(&master, vec![vec![]]).await;
     let hung = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let hung_uri = format!("http://{}/", hung.local_addr().unwrap());
     let list = ["/hung", "/chat", "std_msgs/String", &hung_uri].map(Value::from);
     master.call("registerPublisher", &list).await;
-    let mut subscription = hears(&one, "/chat").await;
-    let good = says(&two, "/chat", true).await;
+    let mut subscription = subscribe_text(&one, "/chat").await;
+    let good = advertise_text(&two, "/chat", true).await;
     good.publish("here".into());
     assert_eq!(next_text(&mut subscription.messages).await, "here");
 }
@@ -86,7 +86,7 @@ async fn a_publisher_that_stalls_holds_up_no_other() {
 async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let qos = Qos::keep_last(2);
+    let qos = QosProfile::keep_last(2);
     let publisher = one
         .advertise("/chat", text_type("992c"), qos)
         .await
@@ -95,25 +95,29 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
     let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
     let header = Header::new([("topic", "/chat"), ("md5sum", "*"), ("callerid", "/lazy")]);
     header.write(&mut lazy).await.unwrap();
-    let mut subscription = hears(&two, "/chat").await;
-    connected(&*publisher, 2).await;
+    let mut subscription = subscribe_text(&two, "/chat").await;
+    wait_for_subscribers(&*publisher, 2).await;
     let big = Bytes::from(vec![7; 1 << 20]);
     for _ in 0..100 {
         publisher.publish(big.clone());
         next(&mut subscription.messages).await;
     }
-    // What it does not take is dropped and counted, not kept.
-    assert!(publisher.dropped() > 50, "{}", publisher.dropped());
+    // Messages it does not take are dropped and counted, not kept.
+    assert!(
+        publisher.dropped_count() > 50,
+        "{}",
+        publisher.dropped_count()
+    );
     drop(publisher);
-    // What is still queued for it is sent if it reads at last, then it is let go.
+    // If it reads at last, it gets what is still queued, and is then disconnected.
     let mut rest = Vec::new();
     let read = tokio::time::timeout(LONG, lazy.read_to_end(&mut rest)).await;
     assert!(read.is_ok() && rest.len() > 1 << 20);
-    // A publisher's end does not wait for the like of it for longer than the farewell.
-    let publisher = says(&one, "/chat", false).await;
+    // A publisher that ends waits for such a subscriber no longer than the farewell time.
+    let publisher = advertise_text(&one, "/chat", false).await;
     let mut lazy = tokio::net::TcpStream::connect(address).await.unwrap();
     header.write(&mut lazy).await.unwrap();
-    connected(&*publisher, 2).await;
+    wait_for_subscribers(&*publisher, 2).await;
     (0..20).for_each(|_| publisher.publish(big.clone()));
     let closed = tokio::time::timeout(LONG, one.close()).await;
     assert!(closed.is_ok());
@@ -121,19 +125,19 @@ async fn a_subscriber_that_does_not_read_holds_up_no_other() {
 
 #[tokio::test]
 async fn a_master_that_refuses_is_quoted() {
-    let refusing = TestNode::answering(Value::Int(0)).await;
+    let refusing = TestNode::start_answering(Value::Int(0)).await;
     let address: SocketAddr = refusing.uri["http://".len()..refusing.uri.len() - 1]
         .parse()
         .unwrap();
-    // Its answers are no graph.
+    // Its answers are not a graph.
     let sockets = Arc::new(HostSockets);
     let error = Ros1Bus::connect(sockets.clone(), address, "/one").await;
     let error = error.err().unwrap().to_string();
     assert!(error.contains("waitGraph"), "{error}");
-    // Nobody there at all.
+    // Nobody listens at all.
     let nobody = Ros1Bus::connect(sockets, ([127, 0, 0, 1], 1).into(), "/one").await;
     assert!(nobody.err().unwrap().to_string().contains("ROS Master at"));
-    // A refusal of a single call.
+    // A single call is refused.
     let master = TestMaster::start().await;
     let bus = join(&master, "/one").await;
     let error = bus.set("/", ParamValue::Int(1)).await.unwrap_err();
@@ -147,22 +151,22 @@ async fn a_failed_registration_leaves_nothing_behind() {
     let bus = join(&master, "/one").await;
     let address = master.stop().await;
     assert!(
-        bus.subscribe("/chat", WireType::any(), Qos::keep_last(100))
+        bus.subscribe("/chat", WireType::any(), QosProfile::keep_last(100))
             .await
             .is_err()
     );
     assert!(
-        bus.advertise("/chat", text_type("992c"), Qos::keep_last(100))
+        bus.advertise("/chat", text_type("992c"), QosProfile::keep_last(100))
             .await
             .is_err()
     );
     assert_eq!(bus.inner.subscriptions.lock().len(), 0);
     assert_eq!(bus.inner.publications.lock().len(), 0);
     let fresh = crate::ros1::master::Master::new(Default::default());
-    let master = TestMaster::with(fresh, Some(address)).await;
-    let _subscription = hears(&bus, "/chat").await;
+    let master = TestMaster::start_at(fresh, Some(address)).await;
+    let _subscription = subscribe_text(&bus, "/chat").await;
     master
-        .until(|graph| graph.topics.contains_key("/chat"))
+        .wait_until(|graph| graph.topics.contains_key("/chat"))
         .await;
 }
 
@@ -170,10 +174,10 @@ async fn a_failed_registration_leaves_nothing_behind() {
 async fn the_slave_api_answers_what_tools_ask() {
     let master = TestMaster::start().await;
     let (one, two) = (join(&master, "/one").await, join(&master, "/two").await);
-    let publisher = says(&one, "/chat", false).await;
-    let _subscription = hears(&two, "/chat").await;
-    connected(&*publisher, 1).await;
-    let client = Client::new(Arc::new(HostSockets), one.uri()).unwrap();
+    let publisher = advertise_text(&one, "/chat", false).await;
+    let _subscription = subscribe_text(&two, "/chat").await;
+    wait_for_subscribers(&*publisher, 1).await;
+    let client = XmlRpcClient::new(Arc::new(HostSockets), one.uri()).unwrap();
     let ask = async |method: &str, args: &[Value]| {
         let answer = client.call(method, args, LONG).await.unwrap();
         answer.as_array().unwrap().to_vec()
@@ -199,7 +203,7 @@ async fn the_slave_api_answers_what_tools_ask() {
     let unknown = ask("requestTopic", &["/tool".into(), "/none".into(), udp]).await;
     assert!(unknown[1].as_str().unwrap().contains("does not publish"));
     assert_eq!(ask("publisherUpdate", &caller).await[0], (-1).into());
-    // Told to end, the bus passes it on and lives.
+    // Asked to shut down, the bus reports it and keeps running.
     ask("shutdown", &["/tool".into(), "enough".into()]).await;
     let mut asked = one.shutdown_requested().unwrap();
     let reason = asked.wait_for(Option::is_some).await.unwrap().clone();
@@ -231,7 +235,7 @@ async fn a_graph_that_grows_without_end_is_read_seldom() {
             .call("registerPublisher", &list.map(Value::from))
             .await;
     }
-    // Were it read for each of them, it would be a thousand of its parts for each, on the average.
+    // If it were read after each change, that would be a thousand parts each time on average.
     let read = reading.await.unwrap() / REGISTRATIONS;
     assert!(
         read < REGISTRATIONS / 10,

@@ -1,10 +1,10 @@
 use super::*;
-use crate::bus::{Lender, Lent};
+use crate::bus::{Lender, LentService};
 use crate::ros1::master::{Master, MasterOptions};
 use crate::ros1::testing::args;
 use crate::ros1::xmlrpc::Value;
 
-/// Lends one service as long as it is there, and notes who looked for what.
+/// Lends one service while it is available, and records who looked for what.
 #[derive(Default)]
 struct Shop {
     on_offer: Mutex<Option<(String, watch::Receiver<bool>)>>,
@@ -27,11 +27,11 @@ struct Counters(Arc<Shop>);
 
 #[async_trait]
 impl Lender for Counters {
-    async fn find(&self, service: &str, node: &str) -> Option<Lent> {
+    async fn find_service(&self, service: &str, node: &str) -> Option<LentService> {
         let asked = (service.to_owned(), node.to_owned());
         self.0.asked.lock().push(asked);
         let (md5, gone) = self.0.on_offer.lock().clone()?;
-        Some(Lent {
+        Some(LentService {
             service_type: ServiceType::new("pkg/Add", md5),
             handler: Arc::new(Counter),
             gone,
@@ -71,7 +71,7 @@ async fn what_nobody_serves_is_lent_and_is_in_no_list() {
     assert!(master.master.graph().services.is_empty());
     let asked = ("/add".to_owned(), "/node".to_owned());
     assert!(shop.asked.lock().iter().all(|other| *other == asked));
-    // One with another type takes its place: kept connections end, and who means the first is told.
+    // A service with another type replaces it: kept connections end, and callers of the first one are told.
     let _second = shop.offers("beef");
     ending.send_replace(true);
     let typed = async |digest: &str| {
@@ -105,11 +105,11 @@ async fn what_is_registered_comes_first_and_the_lender_asks_for_itself_in_vain()
     assert_eq!(other.service_type("/add").await.unwrap().digest, "beef");
     assert!(shop.asked.lock().is_empty(), "{:?}", shop.asked);
     drop(serving);
-    master.until(|graph| graph.services.is_empty()).await;
+    master.wait_until(|graph| graph.services.is_empty()).await;
     let missing = keeper.call("/add", "x".into(), LONG).await.unwrap_err();
     assert!(matches!(missing, BusError::NoService(_)), "{missing}");
     assert_eq!(other.service_type("/add").await.unwrap().digest, "abcd");
-    // Those that were looked for in vain are remembered, with who did.
+    // Services looked up in vain are recorded, with the nodes that did.
     assert!(master.master.graph().sought.contains_key("/add"));
 }
 
@@ -123,7 +123,7 @@ async fn a_lender_that_is_silent_or_gone_holds_up_nothing_else() {
     let lookup = args(["/node", "/add"]);
     let looked_up = master.call("lookupService", &lookup);
     let meanwhile = async {
-        // It was asked, and says nothing.
+        // It is asked, and does not answer.
         let asked = silent.accept().await.unwrap();
         for _ in 0..10 {
             let state = master.call("getSystemState", &args(["/node"])).await;
@@ -140,7 +140,7 @@ async fn a_lender_that_is_silent_or_gone_holds_up_nothing_else() {
     assert_eq!((found.0, found.1.as_str()), (-1, "no provider"));
     assert!(before < after, "others waited for the lookup");
     drop((silent, _asked));
-    // Nobody is there at all, and then somebody else is.
+    // Nobody listens at all, and then another lender is there.
     assert_eq!(master.call("lookupService", &lookup).await.0, -1);
     let (_keeper, shop) = open(&master).await;
     let _ending = shop.offers("abcd");
@@ -157,7 +157,7 @@ async fn another_master_is_told_who_lends() {
     let _ending = shop.offers("abcd");
     let address = master.stop().await;
     let again = Master::new(MasterOptions::default());
-    let master = TestMaster::with(again, Some(address)).await;
+    let master = TestMaster::start_at(again, Some(address)).await;
     let lookup = args(["/node", "/add"]);
     let found = async { while master.call("lookupService", &lookup).await.0 != 1 {} };
     let found = tokio::time::timeout(LONG, found).await;
@@ -169,7 +169,7 @@ async fn an_ordinary_node_is_no_lender() {
     let master = TestMaster::start().await;
     let node = join(&master, "/node").await;
     let asked = args(["/master", "/add", "/other"]);
-    let client = xmlrpc::Client::new(Arc::new(HostSockets), node.uri()).unwrap();
+    let client = xmlrpc::XmlRpcClient::new(Arc::new(HostSockets), node.uri()).unwrap();
     let answer = client.call("cloudroid.lendService", &asked, LONG).await;
     let answer = answer.unwrap();
     assert_eq!(answer.as_array().unwrap()[0], Value::Int(0));

@@ -1,4 +1,4 @@
-//! Calls to the Master take their turns.
+//! Limiting of concurrent calls to the Master.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -6,10 +6,10 @@ use futures_util::future::join_all;
 use tokio::sync::Semaphore;
 
 use super::*;
-use crate::ros1::bus::master_client::{AT_A_TIME, MasterClient, Turns};
-use crate::ros1::xmlrpc::{Fault, Handler, Limits, Value, serve};
+use crate::ros1::bus::master_client::{AT_A_TIME, CallLimiter, MasterClient};
+use crate::ros1::xmlrpc::{Fault, ServerLimits, Value, XmlRpcHandler, serve};
 
-/// A Master that counts the calls it is at, and answers them when it is allowed to.
+/// A Master that counts concurrent calls, and answers them when allowed to.
 struct Busy {
     now: AtomicUsize,
     most: AtomicUsize,
@@ -17,7 +17,7 @@ struct Busy {
 }
 
 #[async_trait::async_trait]
-impl Handler for Busy {
+impl XmlRpcHandler for Busy {
     async fn call(&self, _: &str, _: Vec<Value>) -> Result<Value, Fault> {
         let now = self.now.fetch_add(1, Ordering::Relaxed) + 1;
         self.most.fetch_max(now, Ordering::Relaxed);
@@ -36,8 +36,8 @@ async fn many_calls_at_once_do_not_flood_the_master() {
     });
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let serving = tokio::spawn(serve(listener, busy.clone(), Limits::default()));
-    let unlimited = budget::Budget::unlimited();
+    let serving = tokio::spawn(serve(listener, busy.clone(), ServerLimits::default()));
+    let unlimited = budget::Budget::without_limit();
     let master = MasterClient::new(Arc::new(HostSockets), address, "/node", &unlimited).unwrap();
     let count = 5 * AT_A_TIME;
     let calls = join_all((0..count).map(|_| master.call("getPid", vec![])));
@@ -58,22 +58,22 @@ async fn many_calls_at_once_do_not_flood_the_master() {
 
 #[tokio::test(start_paused = true)]
 async fn who_waits_for_a_turn_gives_up_when_the_master_answers_nobody() {
-    let turns = Turns::new();
+    let turns = CallLimiter::new();
     let mut taken = Vec::new();
     for _ in 0..AT_A_TIME {
-        taken.push(turns.next().await.unwrap());
+        taken.push(turns.acquire().await.unwrap());
     }
-    // As long as it answers others, however slowly, it is not gone.
-    let waiting = async { turns.next().await.is_some() };
+    // As long as it answers other calls, however slowly, it is not gone.
+    let waiting = async { turns.acquire().await.is_some() };
     let answering = async {
         for _ in 0..10 {
             tokio::time::sleep(Duration::from_secs(9)).await;
-            turns.was_answered();
+            turns.record_answer();
         }
         taken.pop();
     };
     let (came, ()) = tokio::join!(waiting, answering);
     assert!(came);
-    taken.push(turns.next().await.unwrap());
-    assert!(turns.next().await.is_none());
+    taken.push(turns.acquire().await.unwrap());
+    assert!(turns.acquire().await.is_none());
 }

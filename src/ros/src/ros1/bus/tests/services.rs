@@ -9,7 +9,7 @@ use crate::ros1::tcpros::{self, Header};
 use crate::ros1::testing::TestNode;
 use crate::ros1::xmlrpc::Value;
 
-/// Answers with what it was asked; `fail` fails, `meet` waits for a second one.
+/// Answers with the request; `fail` fails, `meet` waits for a second call.
 struct Echo {
     meeting: Barrier,
 }
@@ -54,7 +54,7 @@ async fn calls_are_answered_or_failed_with_the_servers_words() {
     }
     let failed = two.call("/echo", "fail".into(), LONG).await.unwrap_err();
     assert!(failed.to_string().contains("not for /two"), "{failed}");
-    // The connection is good for the next one all the same.
+    // The connection is still good for the next call.
     assert_eq!(two.call("/echo", "ok".into(), LONG).await.unwrap(), "ok");
     assert_eq!(
         one.call("/echo", "self".into(), LONG).await.unwrap(),
@@ -69,7 +69,7 @@ async fn calls_are_answered_or_failed_with_the_servers_words() {
     );
     assert!(matches!(taken.await, Err(BusError::AlreadyServed(_))));
     drop(guard);
-    master.until(|graph| graph.services.is_empty()).await;
+    master.wait_until(|graph| graph.services.is_empty()).await;
     let gone = two.call("/echo", "x".into(), LONG).await.unwrap_err();
     assert!(matches!(gone, BusError::NoService(_)), "{gone}");
     // And served again.
@@ -91,15 +91,18 @@ async fn calls_run_at_the_same_time_and_end_in_time() {
     let short = Duration::from_millis(50);
     let late = two.call("/echo", "wait".into(), short).await.unwrap_err();
     assert!(matches!(late, BusError::Timeout { .. }), "{late}");
-    // An answer that comes too late is not mistaken for the next call's.
+    // A late answer is not mistaken for the next call's.
     assert_eq!(
         two.call("/echo", "next".into(), LONG).await.unwrap(),
         "next"
     );
 }
 
-/// A server made by hand: each connection is answered by the next of `scripts`.
-async fn scripted(master: &TestMaster, scripts: Vec<Script>) -> (TestNode, Arc<AtomicUsize>) {
+/// A hand-made server: each connection is answered by the next of `scripts`.
+async fn scripted_server(
+    master: &TestMaster,
+    scripts: Vec<Script>,
+) -> (TestNode, Arc<AtomicUsize>) {
     let node = TestNode::start().await;
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let uri = format!("rosrpc://{}", listener.local_addr().unwrap());
@@ -146,11 +149,11 @@ async fn scripted(master: &TestMaster, scripts: Vec<Script>) -> (TestNode, Arc<A
 enum Script {
     /// Answers that many calls with these bytes, then closes.
     Answer(Vec<&'static [u8]>),
-    /// The same, but closes only when the next request is there, without reading it.
+    /// Answers likewise, but closes only when the next request has arrived, without reading it.
     AnswerAndSlam(Vec<&'static [u8]>),
     /// Takes the request and closes.
     HangUp,
-    /// Says no to the header.
+    /// Refuses the header.
     Refuse,
 }
 
@@ -165,7 +168,7 @@ async fn a_kept_connection_that_was_closed_is_replaced_unnoticed() {
         _ => Script::AnswerAndSlam(vec![OK]),
     });
     let scripts = scripts.collect();
-    let (_node, taken) = scripted(&master, scripts).await;
+    let (_node, taken) = scripted_server(&master, scripts).await;
     for _ in 0..20 {
         assert_eq!(one.call("/echo", "x".into(), LONG).await.unwrap(), "ok");
     }
@@ -177,7 +180,7 @@ async fn a_call_that_was_taken_is_not_made_twice() {
     let master = TestMaster::start().await;
     let one = join(&master, "/one").await;
     let scripts = vec![Script::HangUp, Script::Answer(vec![OK])];
-    let (_node, taken) = scripted(&master, scripts).await;
+    let (_node, taken) = scripted_server(&master, scripts).await;
     let error = one.call("/echo", "x".into(), LONG).await.unwrap_err();
     assert!(error.to_string().contains("during the call"), "{error}");
     assert_eq!(taken.load(Ordering::Relaxed), 1);
@@ -193,12 +196,12 @@ async fn servers_that_misbehave_are_told_apart() {
         Script::Answer(vec![b"\x01\x05\0\0\0ok"]),
         Script::Answer(vec![b"\0\x03\0\0\0bad"]),
     ];
-    let _server = scripted(&master, scripts).await;
+    let _server = scripted_server(&master, scripts).await;
     for wanted in ["go away", "limit", "ended inside", "failed: bad"] {
         let error = one.call("/echo", "x".into(), LONG).await.unwrap_err();
         assert!(error.to_string().contains(wanted), "{wanted}: {error}");
     }
-    // A server that is registered but not there.
+    // A server that is registered but not running.
     let list = [
         "/server",
         "/gone",
@@ -261,7 +264,7 @@ async fn two_that_serve_one_service_do_not_fight_for_it_for_ever() {
     let second = serve(&two).await;
     let generation = || one.graph().borrow().generation;
     let before = generation();
-    // They may try now and then, with pauses that double: not as often as they see each other.
+    // They may register again now and then, with pauses that double: not each time they see the other's registration.
     for _ in 0..2000 {
         master.call("getPid", &["/asks".into()]).await;
     }
@@ -269,13 +272,13 @@ async fn two_that_serve_one_service_do_not_fight_for_it_for_ever() {
     assert!(changes < 60, "{changes} changes");
     let three = join(&master, "/three").await;
     assert_eq!(three.call("/echo", "x".into(), LONG).await.unwrap(), "x");
-    // Whoever is left has it, at once.
+    // The remaining one gets it at once.
     let (gone, left) = match one.graph().borrow().services["/echo"].as_str() {
         "/one" => (first, "/two"),
         _ => (second, "/one"),
     };
     drop(gone);
-    until(&three, |graph| {
+    wait_for_graph(&three, |graph| {
         graph.services.get("/echo").is_some_and(|node| node == left)
     })
     .await;

@@ -58,7 +58,7 @@ fn what_no_xml_can_hold_spoils_nothing() {
 
 #[test]
 fn roscpp_is_understood() {
-    // XmlRpcpp leaves the type of a string out and breaks lines in its own way.
+    // XmlRpcpp omits the type of strings and has its own line breaks.
     let call =
         b"<?xml version=\"1.0\"?>\r\n<methodCall><methodName>registerPublisher</methodName>\r\n\
         <params><param><value>/node</value></param><param><value></value></param>\

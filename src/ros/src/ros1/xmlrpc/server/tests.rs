@@ -4,7 +4,7 @@ use tokio::io::AsyncReadExt as _;
 
 use super::*;
 use crate::net::HostSockets;
-use crate::ros1::xmlrpc::{Client, Error, print_call};
+use crate::ros1::xmlrpc::{Error, XmlRpcClient, print_call};
 
 const LONG: Duration = Duration::from_secs(120);
 
@@ -12,7 +12,7 @@ const LONG: Duration = Duration::from_secs(120);
 struct Echo;
 
 #[async_trait]
-impl Handler for Echo {
+impl XmlRpcHandler for Echo {
     async fn call(&self, method: &str, params: Vec<Value>) -> Result<Value, Fault> {
         match method {
             "echo" => Ok(Value::Array(params)),
@@ -33,23 +33,23 @@ impl Drop for Running {
     }
 }
 
-async fn start(limits: Limits) -> Running {
+async fn start(limits: ServerLimits) -> Running {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let task = tokio::spawn(serve(listener, Arc::new(Echo), limits));
     Running { address, task }
 }
 
-fn small() -> Limits {
-    Limits {
+fn small() -> ServerLimits {
+    ServerLimits {
         body: 10_000,
         transfer: LONG,
-        ..Limits::default()
+        ..ServerLimits::default()
     }
 }
 
-fn client(address: SocketAddr) -> Client {
-    Client::new(Arc::new(HostSockets), &format!("http://{address}/")).unwrap()
+fn client(address: SocketAddr) -> XmlRpcClient {
+    XmlRpcClient::new(Arc::new(HostSockets), &format!("http://{address}/")).unwrap()
 }
 
 fn request(fields: &str, body: &str) -> String {
@@ -60,7 +60,7 @@ fn request(fields: &str, body: &str) -> String {
 /// Sends bytes and reads until the server closes.
 async fn raw(server: &Running, bytes: &[u8]) -> String {
     let mut stream = TcpStream::connect(server.address).await.unwrap();
-    // The server may close before it has read everything: that is its right.
+    // The server may close before it has read everything.
     let _ = stream.write_all(bytes).await;
     let mut answer = Vec::new();
     let _ = stream.read_to_end(&mut answer).await;
@@ -69,7 +69,7 @@ async fn raw(server: &Running, bytes: &[u8]) -> String {
 
 #[tokio::test]
 async fn calls_are_answered_and_faults_told() {
-    let server = start(Limits::default()).await;
+    let server = start(ServerLimits::default()).await;
     let client = client(server.address);
     for n in 0..3 {
         let answer = client.call("echo", &[Value::Int(n)], LONG).await.unwrap();
@@ -81,7 +81,7 @@ async fn calls_are_answered_and_faults_told() {
 
 #[tokio::test]
 async fn a_long_call_does_not_hold_up_others() {
-    let server = start(Limits::default()).await;
+    let server = start(ServerLimits::default()).await;
     let client = Arc::new(client(server.address));
     let waiting = {
         let client = client.clone();
@@ -93,7 +93,7 @@ async fn a_long_call_does_not_hold_up_others() {
 
 #[tokio::test]
 async fn several_requests_of_one_connection_are_answered_in_order() {
-    let server = start(Limits::default()).await;
+    let server = start(ServerLimits::default()).await;
     let first = request("", &print_call("echo", &["first".into()]));
     let last = request(
         "Connection: close\r\n",
@@ -107,7 +107,7 @@ async fn several_requests_of_one_connection_are_answered_in_order() {
 
 #[tokio::test]
 async fn clients_of_all_kinds_are_served() {
-    let server = start(Limits::default()).await;
+    let server = start(ServerLimits::default()).await;
     let body = print_call("echo", &["hello".into()]);
     let old = format!(
         "POST /RPC2 HTTP/1.0\r\ncontent-length:{}\r\n\r\n{body}",
@@ -132,7 +132,7 @@ async fn clients_of_all_kinds_are_served() {
 #[tokio::test]
 async fn bad_requests_are_refused_with_a_reason() {
     let server = start(small()).await;
-    let hasty = start(Limits {
+    let hasty = start(ServerLimits {
         transfer: Duration::from_millis(50),
         ..small()
     })
@@ -156,7 +156,7 @@ async fn bad_requests_are_refused_with_a_reason() {
         ),
         (format!("{post}{many}\r\n"), "431"),
         (format!("POST /{}", "x".repeat(16_400)), "431"),
-        // Slow: the rest never comes.
+        // Slow: the rest never arrives.
         ("POST / HT".to_owned(), "408"),
         (format!("{post}Content-Length: 100\r\n\r\n<"), "408"),
     ] {
@@ -183,7 +183,7 @@ async fn what_is_no_xml_rpc_is_answered_with_a_fault() {
 
 #[tokio::test]
 async fn an_idle_connection_is_closed_in_the_end() {
-    let limits = Limits {
+    let limits = ServerLimits {
         idle: Duration::from_millis(50),
         ..small()
     };
@@ -193,9 +193,9 @@ async fn an_idle_connection_is_closed_in_the_end() {
 
 #[tokio::test]
 async fn connections_beyond_the_limit_wait_their_turn() {
-    let limits = Limits {
+    let limits = ServerLimits {
         connections: 1,
-        ..Limits::default()
+        ..ServerLimits::default()
     };
     let server = start(limits).await;
     let first = client(server.address);
@@ -207,7 +207,7 @@ async fn connections_beyond_the_limit_wait_their_turn() {
     second.call("echo", &[], LONG).await.unwrap();
 }
 
-/// A server that answers each connection's first request, promises to keep it, and closes it all the same.
+/// A server that answers the first request on each connection, promises to keep it, and closes it all the same.
 #[tokio::test]
 async fn the_client_survives_a_connection_closed_between_calls() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -230,8 +230,8 @@ async fn the_client_survives_a_connection_closed_between_calls() {
     task.abort();
 }
 
-/// A server that sends `answer` to whatever comes, and closes.
-async fn fixed(answer: impl Into<String>) -> SocketAddr {
+/// A server that sends `answer` to any request, and closes.
+async fn fixed_server(answer: impl Into<String>) -> SocketAddr {
     let answer = answer.into();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
@@ -263,12 +263,12 @@ async fn the_client_names_what_the_server_does_wrong() {
             "malformed",
         ),
     ] {
-        let address = fixed(answer).await;
+        let address = fixed_server(answer).await;
         let error = client(address).call("echo", &[], LONG).await.unwrap_err();
         assert!(error.to_string().contains(wanted), "{answer}: {error}");
     }
-    // Without a length the answer ends with the connection.
-    let address = fixed(
+    // Without a length, the answer ends with the connection.
+    let address = fixed_server(
         "HTTP/1.0 200 OK\r\n\r\n\
          <methodResponse><params><param><value>x</value></param></params></methodResponse>",
     )
@@ -282,18 +282,20 @@ async fn an_answer_is_read_if_what_it_becomes_has_room() {
     let one = "<value><struct><member><name/><value/></member></struct></value>";
     let answer = |count: usize| {
         format!(
-            "HTTP/1.0 200 OK\r\n\r\n<methodResponse><params><param><value><array><data>{}</data></array></value></param></params></methodResponse>",
+            "HTTP/1.0 200 OK\r\n\r\n\
+             <methodResponse><params><param><value><array><data>{}\
+             </data></array></value></param></params></methodResponse>",
             one.repeat(count)
         )
     };
     let budget = Budget::new("node x", 4 << 20);
-    let few = client(fixed(answer(2_000)).await).within(&budget);
+    let few = client(fixed_server(answer(2_000)).await).with_budget(&budget);
     assert!(few.call("echo", &[], LONG).await.is_ok());
     // 640 KB of text.
-    let many = client(fixed(answer(10_000)).await).within(&budget);
+    let many = client(fixed_server(answer(10_000)).await).with_budget(&budget);
     let error = many.call("echo", &[], LONG).await.expect_err("no room");
     assert!(error.to_string().contains("memory for node x"), "{error}");
-    assert_eq!(budget.used(), 0);
+    assert_eq!(budget.used_bytes(), 0);
 }
 
 #[tokio::test]
@@ -303,20 +305,20 @@ async fn a_server_that_hangs_costs_no_more_than_the_time_out() {
     let error = hung.call("echo", &[], Duration::from_millis(50)).await;
     assert!(matches!(error, Err(Error::Timeout { .. })));
     for bad in ["http://host/", "ftp://host:1/", ""] {
-        let error = Client::new(Arc::new(HostSockets), bad).unwrap_err();
+        let error = XmlRpcClient::new(Arc::new(HostSockets), bad).unwrap_err();
         assert!(matches!(error, Error::BadUri(_)), "{bad}");
     }
 }
 
 #[tokio::test]
 async fn who_waits_for_memory_in_vain_is_told_so() {
-    let limits = Limits {
+    let limits = ServerLimits {
         body: 1 << 20,
         budget: Budget::new("XML-RPC", 1 << 20),
         ..small()
     };
     let held = limits.budget.take(1 << 20).unwrap();
-    let hasty = Limits {
+    let hasty = ServerLimits {
         transfer: Duration::from_millis(200),
         ..limits.clone()
     };

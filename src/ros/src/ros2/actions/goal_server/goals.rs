@@ -1,4 +1,4 @@
-//! The goals of an action that this side serves, and the results of those that have ended, for who asks late.
+//! The goals of an action server, including the results of ended goals for late requests.
 
 use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
@@ -9,44 +9,44 @@ use tokio::sync::watch;
 
 use crate::codec::Time;
 use crate::ros2::actions::GoalId;
-use crate::ros2::actions::messages::{CancelCode, GoalInfo, Status};
+use crate::ros2::actions::messages::{ActionGoalStatus, CancelCode, GoalInfo};
 
-/// Goals that a server may have on its hands.
+/// Maximum number of active goals of a server.
 pub(super) const MAX_GOALS: usize = 1000;
-/// How long a result is kept.
+/// Time for which a result is kept.
 const KEPT: Duration = Duration::from_secs(60);
-/// Results that are kept, and the bytes of all of them; the last one is kept whatever its size.
+/// Maximum number of results kept, and their maximum total size in bytes; the last one is kept whatever its size.
 const MAX_KEPT: usize = 256;
 const MAX_KEPT_BYTES: usize = 64 << 20;
 
-/// The answer to who asks for the result of a goal, once it has ended.
-pub(super) type Answer = watch::Receiver<Option<Bytes>>;
+/// Receives the response to a result request, once the goal has ended.
+pub(super) type ResultReceiver = watch::Receiver<Option<Bytes>>;
 
-pub(super) struct Goals {
-    known: HashMap<GoalId, Known>,
-    /// Those that have ended, the first to be forgotten first, and when.
+pub(super) struct GoalTable {
+    known: HashMap<GoalId, GoalEntry>,
+    /// Ended goals with their expiry, in order of expiry.
     ended: VecDeque<(Instant, GoalId)>,
     kept_bytes: usize,
-    /// Counts results that are kept.
+    /// Budget for the results kept.
     budget: Budget,
     begun: u64,
     closed: bool,
 }
 
-struct Known {
-    /// Counts goals, so that they are told of in order.
+struct GoalEntry {
+    /// Sequence number for ordering goals.
     number: u64,
     accepted: Time,
-    /// Unknown until it was taken.
-    status: Status,
-    /// Somebody has asked for its result.
+    /// Unknown until the goal is accepted.
+    status: ActionGoalStatus,
+    /// True once its result has been requested.
     asked: bool,
     answer: watch::Sender<Option<Bytes>>,
-    /// For its result.
+    /// Permit for the result.
     permit: Option<Permit>,
 }
 
-impl Goals {
+impl GoalTable {
     pub(super) fn new(budget: Budget) -> Self {
         Self {
             known: HashMap::new(),
@@ -58,22 +58,22 @@ impl Goals {
         }
     }
 
-    /// Makes room for a goal, or says why there is none.
+    /// Adds a goal; the error is the reason why there is no room.
     pub(super) fn begin(&mut self, id: GoalId, accepted: Time) -> Result<(), String> {
         if self.closed {
             return Err("its server is gone".to_owned());
         }
         if self.known.contains_key(&id) {
-            return Err("there is a goal of this id already".to_owned());
+            return Err("there is already a goal with this id".to_owned());
         }
         if self.known.len() - self.ended.len() >= MAX_GOALS {
             return Err(format!("{MAX_GOALS} goals wait for this server already"));
         }
         self.begun += 1;
-        let known = Known {
+        let known = GoalEntry {
             number: self.begun,
             accepted,
-            status: Status::Unknown,
+            status: ActionGoalStatus::Unknown,
             asked: false,
             answer: watch::Sender::new(None),
             permit: None,
@@ -82,24 +82,29 @@ impl Goals {
         Ok(())
     }
 
-    /// It will be carried out.
-    pub(super) fn accepted(&mut self, id: GoalId) {
+    /// Marks a goal as accepted, to be executed later.
+    pub(super) fn set_accepted(&mut self, id: GoalId) {
         if let Some(known) = self.pending(id) {
-            known.status = Status::Accepted;
+            known.status = ActionGoalStatus::Accepted;
         }
     }
 
-    /// It is carried out now. It may have ended already.
-    pub(super) fn taken(&mut self, id: GoalId) {
+    /// Marks a goal as executing. It may have ended already.
+    pub(super) fn set_executing(&mut self, id: GoalId) {
         let known = self.known.get_mut(&id);
-        let waits = |known: &&mut Known| matches!(known.status, Status::Unknown | Status::Accepted);
+        let waits = |known: &&mut GoalEntry| {
+            matches!(
+                known.status,
+                ActionGoalStatus::Unknown | ActionGoalStatus::Accepted
+            )
+        };
         if let Some(known) = known.filter(waits) {
-            known.status = Status::Executing;
+            known.status = ActionGoalStatus::Executing;
         }
     }
 
-    /// It is not carried out; false where it was accepted, or has ended.
-    pub(super) fn refused(&mut self, id: GoalId) -> bool {
+    /// Removes a goal that is rejected; returns false if it was accepted or has ended.
+    pub(super) fn remove_rejected(&mut self, id: GoalId) -> bool {
         let pending = self.pending(id).is_some();
         if pending {
             self.known.remove(&id);
@@ -107,9 +112,9 @@ impl Goals {
         pending
     }
 
-    fn pending(&mut self, id: GoalId) -> Option<&mut Known> {
+    fn pending(&mut self, id: GoalId) -> Option<&mut GoalEntry> {
         let known = self.known.get_mut(&id);
-        known.filter(|known| known.status == Status::Unknown)
+        known.filter(|known| known.status == ActionGoalStatus::Unknown)
     }
 
     pub(super) fn is_under_way(&self, id: GoalId) -> bool {
@@ -122,8 +127,14 @@ impl Goals {
         ids.filter(|id| self.is_under_way(*id)).collect()
     }
 
-    /// Ends a goal; false where there is none of this id under way.
-    pub(super) fn end(&mut self, id: GoalId, status: Status, answer: Bytes, now: Instant) -> bool {
+    /// Ends a goal; returns false if no goal with this id is active.
+    pub(super) fn end(
+        &mut self,
+        id: GoalId,
+        status: ActionGoalStatus,
+        answer: Bytes,
+        now: Instant,
+    ) -> bool {
         if !self.is_under_way(id) {
             return false;
         }
@@ -132,11 +143,11 @@ impl Goals {
         while self.ended.len() >= MAX_KEPT
             || (self.kept_bytes > MAX_KEPT_BYTES && !self.ended.is_empty())
         {
-            self.forget_first();
+            self.remove_oldest();
         }
         let mut permit = self.budget.take(size);
         while permit.is_err() && !self.ended.is_empty() {
-            self.forget_first();
+            self.remove_oldest();
             permit = self.budget.take(size);
         }
         self.ended.push_back((now + KEPT, id));
@@ -148,30 +159,30 @@ impl Goals {
         true
     }
 
-    /// What answers who asks for the result of a goal; none where there is no such goal.
-    pub(super) fn answer(&mut self, id: GoalId) -> Option<Answer> {
+    /// Returns a receiver for the response to a result request; `None` if there is no such goal.
+    pub(super) fn subscribe_result(&mut self, id: GoalId) -> Option<ResultReceiver> {
         let known = self.known.get_mut(&id)?;
         known.asked = true;
         Some(known.answer.subscribe())
     }
 
-    /// Whether somebody has asked for the result of each goal.
-    pub(super) fn are_asked_for(&self) -> bool {
+    /// Returns true if the result of each goal has been requested.
+    pub(super) fn are_results_requested(&self) -> bool {
         self.known.values().all(|known| known.asked)
     }
 
-    /// Whom a request to cancel concerns, the first one first, and whether each was asked to end before. By the policy that
-    /// `action_msgs/srv/CancelGoal` states: without an id all goals up to the stamp, and without a stamp either all; with
-    /// an id that one, and with a stamp also all up to it.
-    pub(super) fn concerned(&self, wanted: GoalInfo) -> Vec<(GoalInfo, bool)> {
+    /// Returns the goals that a cancel request concerns, the oldest first, and whether each was asked to cancel before.
+    /// By the policy that `action_msgs/srv/CancelGoal` specifies: without an id, all goals up to the stamp, or all
+    /// goals if there is no stamp either; with an id that goal, and with a stamp also all goals up to it.
+    pub(super) fn matching_goals(&self, wanted: GoalInfo) -> Vec<(GoalInfo, bool)> {
         let zero = wanted.stamp == Time::default();
         let all = wanted.id == GoalId::NONE && zero;
         let mut concerned: Vec<(u64, GoalInfo, bool)> = Vec::new();
         for (id, known) in &self.known {
             let stamped = !zero && known.accepted <= wanted.stamp;
             let before = match known.status {
-                Status::Canceling => true,
-                Status::Accepted | Status::Executing => false,
+                ActionGoalStatus::Canceling => true,
+                ActionGoalStatus::Accepted | ActionGoalStatus::Executing => false,
                 _ => continue,
             };
             if all || stamped || *id == wanted.id {
@@ -183,8 +194,8 @@ impl Goals {
         concerned.map(|(_, info, before)| (info, before)).collect()
     }
 
-    /// What is answered to a request to cancel that concerns none.
-    pub(super) fn otherwise(&self, wanted: GoalInfo) -> CancelCode {
+    /// Returns the code in the response to a cancel request that concerns no goal.
+    pub(super) fn no_match_code(&self, wanted: GoalInfo) -> CancelCode {
         match self.known.get(&wanted.id) {
             Some(known) if known.status.is_terminal() => CancelCode::Terminated,
             _ if wanted.id == GoalId::NONE => CancelCode::Rejected,
@@ -192,55 +203,59 @@ impl Goals {
         }
     }
 
-    /// It ends because it was asked to; false where it has ended, or was asked before.
-    pub(super) fn canceling(&mut self, id: GoalId) -> bool {
+    /// Marks a goal as cancelling; returns false if it has ended or was asked before.
+    pub(super) fn set_canceling(&mut self, id: GoalId) -> bool {
         let known = self.known.get_mut(&id);
-        let goes_on =
-            |known: &&mut Known| matches!(known.status, Status::Accepted | Status::Executing);
+        let goes_on = |known: &&mut GoalEntry| {
+            matches!(
+                known.status,
+                ActionGoalStatus::Accepted | ActionGoalStatus::Executing
+            )
+        };
         let known = known.filter(goes_on);
         known
-            .map(|known| known.status = Status::Canceling)
+            .map(|known| known.status = ActionGoalStatus::Canceling)
             .is_some()
     }
 
-    /// How all that were taken stand, the first one first.
-    pub(super) fn statuses(&self) -> Vec<(GoalInfo, Status)> {
+    /// Returns the statuses of all accepted goals, the oldest first.
+    pub(super) fn statuses(&self) -> Vec<(GoalInfo, ActionGoalStatus)> {
         let taken = self.known.iter();
-        let taken = taken.filter(|(_, known)| known.status != Status::Unknown);
+        let taken = taken.filter(|(_, known)| known.status != ActionGoalStatus::Unknown);
         let mut taken: Vec<_> = taken.collect();
         taken.sort_by_key(|(_, known)| known.number);
-        let state = |(id, known): (&GoalId, &Known)| (known.info(*id), known.status);
+        let state = |(id, known): (&GoalId, &GoalEntry)| (known.info(*id), known.status);
         taken.into_iter().map(state).collect()
     }
 
-    /// Forgets results that were kept long enough; whether there were any.
+    /// Drops expired results; returns true if there were any.
     pub(super) fn expire(&mut self, now: Instant) -> bool {
         let before = self.ended.len();
         while self.ended.front().is_some_and(|(until, _)| *until <= now) {
-            self.forget_first();
+            self.remove_oldest();
         }
         self.ended.len() < before
     }
 
-    /// When the next result is forgotten.
+    /// Returns the next expiry of a result.
     pub(super) fn next_expiry(&self) -> Option<Instant> {
         self.ended.front().map(|(until, _)| *until)
     }
 
-    fn forget_first(&mut self) {
+    fn remove_oldest(&mut self) {
         let first = self.ended.pop_front();
         let known = first.and_then(|(_, id)| self.known.remove(&id));
         let answer = known.and_then(|known| known.answer.borrow().as_ref().map(Bytes::len));
         self.kept_bytes -= answer.unwrap_or(0);
     }
 
-    /// No further goal is begun.
+    /// Accepts no further goals.
     pub(super) fn close(&mut self) {
         self.closed = true;
     }
 }
 
-impl Known {
+impl GoalEntry {
     fn info(&self, id: GoalId) -> GoalInfo {
         GoalInfo {
             id,
@@ -257,34 +272,34 @@ mod tests {
         GoalId([number; 16])
     }
 
-    fn at(secs: u32) -> Time {
+    fn time_at(secs: u32) -> Time {
         Time { secs, nsecs: 0 }
     }
 
-    fn goals() -> Goals {
-        Goals::new(Budget::unlimited())
+    fn goals() -> GoalTable {
+        GoalTable::new(Budget::without_limit())
     }
 
-    /// Goals 1, 2, … accepted at second 1, 2, … and taken.
-    fn taken(count: u8) -> Goals {
+    /// Goals 1, 2, … accepted at second 1, 2, … and executing.
+    fn executing_goals(count: u8) -> GoalTable {
         let mut goals = goals();
         for number in 1..=count {
-            goals.begin(id(number), at(number.into())).unwrap();
-            goals.taken(id(number));
+            goals.begin(id(number), time_at(number.into())).unwrap();
+            goals.set_executing(id(number));
         }
         goals
     }
 
-    fn end(goals: &mut Goals, number: u8, now: Instant) -> bool {
+    fn end(goals: &mut GoalTable, number: u8, now: Instant) -> bool {
         goals.end(
             id(number),
-            Status::Succeeded,
+            ActionGoalStatus::Succeeded,
             Bytes::from_static(b"result"),
             now,
         )
     }
 
-    fn told(goals: &Goals) -> Vec<(u8, Status)> {
+    fn status_list(goals: &GoalTable) -> Vec<(u8, ActionGoalStatus)> {
         let statuses = goals.statuses().into_iter();
         statuses
             .map(|(info, status)| (info.id.0[0], status))
@@ -292,13 +307,13 @@ mod tests {
     }
 
     #[track_caller]
-    fn cancels(wanted: (GoalId, Time), code: CancelCode, expected: &[u8]) {
-        let mut goals = taken(4);
+    fn assert_cancels(wanted: (GoalId, Time), code: CancelCode, expected: &[u8]) {
+        let mut goals = executing_goals(4);
         end(&mut goals, 2, Instant::now());
         let (id, stamp) = wanted;
         let wanted = GoalInfo { id, stamp };
-        let concerned = |goals: &Goals| -> Vec<(u8, bool)> {
-            let concerned = goals.concerned(wanted).into_iter();
+        let concerned = |goals: &GoalTable| -> Vec<(u8, bool)> {
+            let concerned = goals.matching_goals(wanted).into_iter();
             concerned
                 .map(|(info, before)| (info.id.0[0], before))
                 .collect()
@@ -307,14 +322,14 @@ mod tests {
         let first: Vec<(u8, bool)> = all(false);
         assert_eq!(concerned(&goals), first);
         if first.is_empty() {
-            assert_eq!(goals.otherwise(wanted), code);
+            assert_eq!(goals.no_match_code(wanted), code);
         }
         for number in expected {
-            assert!(goals.canceling(super::GoalId([*number; 16])));
-            assert!(!goals.canceling(super::GoalId([*number; 16])), "again");
+            assert!(goals.set_canceling(super::GoalId([*number; 16])));
+            assert!(!goals.set_canceling(super::GoalId([*number; 16])), "again");
         }
-        for (number, status) in told(&goals) {
-            let canceling = status == Status::Canceling;
+        for (number, status) in status_list(&goals) {
+            let canceling = status == ActionGoalStatus::Canceling;
             assert_eq!(canceling, expected.contains(&number), "{number}");
         }
         let again: Vec<(u8, bool)> = all(true);
@@ -324,104 +339,124 @@ mod tests {
     #[test]
     fn a_cancel_names_one_goal_or_those_up_to_a_stamp_or_all() {
         let never = Time::default();
-        cancels((id(3), never), CancelCode::None, &[3]);
-        cancels((GoalId::NONE, never), CancelCode::None, &[1, 3, 4]);
-        cancels((GoalId::NONE, at(3)), CancelCode::None, &[1, 3]);
-        cancels((id(4), at(1)), CancelCode::None, &[1, 4]);
-        cancels((id(9), never), CancelCode::UnknownGoal, &[]);
-        cancels((id(2), never), CancelCode::Terminated, &[]);
+        assert_cancels((id(3), never), CancelCode::None, &[3]);
+        assert_cancels((GoalId::NONE, never), CancelCode::None, &[1, 3, 4]);
+        assert_cancels((GoalId::NONE, time_at(3)), CancelCode::None, &[1, 3]);
+        assert_cancels((id(4), time_at(1)), CancelCode::None, &[1, 4]);
+        assert_cancels((id(9), never), CancelCode::UnknownGoal, &[]);
+        assert_cancels((id(2), never), CancelCode::Terminated, &[]);
         let early = Time { secs: 0, nsecs: 1 };
-        cancels((GoalId::NONE, early), CancelCode::Rejected, &[]);
+        assert_cancels((GoalId::NONE, early), CancelCode::Rejected, &[]);
     }
 
     #[test]
     fn a_goal_ends_once_and_its_result_is_there_for_a_minute() {
-        let (mut goals, now) = (taken(2), Instant::now());
-        let early = goals.answer(id(1)).unwrap();
+        let (mut goals, now) = (executing_goals(2), Instant::now());
+        let early = goals.subscribe_result(id(1)).unwrap();
         assert_eq!(*early.borrow(), None);
         assert!(end(&mut goals, 1, now));
         assert!(!end(&mut goals, 1, now));
         assert_eq!(early.borrow().as_deref(), Some(&b"result"[..]));
-        let late = goals.answer(id(1)).unwrap();
+        let late = goals.subscribe_result(id(1)).unwrap();
         assert_eq!(late.borrow().as_deref(), Some(&b"result"[..]));
         assert_eq!(
-            told(&goals),
-            [(1, Status::Succeeded), (2, Status::Executing)]
+            status_list(&goals),
+            [
+                (1, ActionGoalStatus::Succeeded),
+                (2, ActionGoalStatus::Executing)
+            ]
         );
         assert_eq!(goals.next_expiry(), Some(now + KEPT));
         assert!(!goals.expire(now));
         assert!(goals.expire(now + KEPT));
-        assert!(goals.answer(id(1)).is_none());
+        assert!(goals.subscribe_result(id(1)).is_none());
         assert_eq!(
-            (told(&goals), goals.next_expiry()),
-            (vec![(2, Status::Executing)], None)
+            (status_list(&goals), goals.next_expiry()),
+            (vec![(2, ActionGoalStatus::Executing)], None)
         );
         assert_eq!(goals.under_way(), [id(2)]);
     }
 
     #[test]
     fn results_that_are_kept_are_bounded() {
-        let (mut goals, now) = (taken(3), Instant::now());
+        let (mut goals, now) = (executing_goals(3), Instant::now());
         let large = Bytes::from(vec![0; MAX_KEPT_BYTES]);
-        assert!(goals.end(id(1), Status::Aborted, large.clone(), now));
-        assert!(goals.answer(id(1)).is_some(), "the last one is kept");
-        assert!(goals.end(id(2), Status::Aborted, large, now));
-        assert!(goals.answer(id(1)).is_none());
+        assert!(goals.end(id(1), ActionGoalStatus::Aborted, large.clone(), now));
+        assert!(
+            goals.subscribe_result(id(1)).is_some(),
+            "the last one is kept"
+        );
+        assert!(goals.end(id(2), ActionGoalStatus::Aborted, large, now));
+        assert!(goals.subscribe_result(id(1)).is_none());
         assert!(end(&mut goals, 3, now));
-        assert!(goals.answer(id(2)).is_none());
+        assert!(goals.subscribe_result(id(2)).is_none());
         assert_eq!(goals.kept_bytes, b"result".len());
         for number in 0..2 * MAX_KEPT {
             let mut bytes = [7; 16];
             bytes[..8].copy_from_slice(&number.to_le_bytes());
-            goals.begin(GoalId(bytes), at(1)).unwrap();
-            assert!(goals.end(GoalId(bytes), Status::Succeeded, Bytes::new(), now));
+            goals.begin(GoalId(bytes), time_at(1)).unwrap();
+            assert!(goals.end(
+                GoalId(bytes),
+                ActionGoalStatus::Succeeded,
+                Bytes::new(),
+                now
+            ));
         }
         assert_eq!(goals.known.len(), MAX_KEPT);
     }
 
     #[test]
     fn goals_under_way_are_bounded_and_unlike() {
-        let mut goals = taken(1);
-        assert!(goals.begin(id(1), at(1)).is_err(), "it is there");
+        let mut goals = executing_goals(1);
+        assert!(goals.begin(id(1), time_at(1)).is_err(), "it is there");
         for number in 1..MAX_GOALS {
             let mut bytes = [7; 16];
             bytes[..8].copy_from_slice(&number.to_le_bytes());
-            goals.begin(GoalId(bytes), at(1)).unwrap();
+            goals.begin(GoalId(bytes), time_at(1)).unwrap();
         }
-        assert!(goals.begin(id(2), at(1)).is_err());
+        assert!(goals.begin(id(2), time_at(1)).is_err());
         assert!(end(&mut goals, 1, Instant::now()));
-        goals.begin(id(2), at(1)).unwrap();
+        goals.begin(id(2), time_at(1)).unwrap();
         assert!(goals.is_under_way(id(2)));
-        assert!(goals.refused(id(2)));
+        assert!(goals.remove_rejected(id(2)));
         assert!(!goals.is_under_way(id(2)));
         goals.close();
-        assert!(goals.begin(id(2), at(1)).is_err());
+        assert!(goals.begin(id(2), time_at(1)).is_err());
     }
 
     #[test]
     fn a_goal_may_end_before_it_is_taken() {
         let mut goals = goals();
-        goals.begin(id(1), at(1)).unwrap();
-        assert_eq!(told(&goals), []);
+        goals.begin(id(1), time_at(1)).unwrap();
+        assert_eq!(status_list(&goals), []);
         assert!(end(&mut goals, 1, Instant::now()));
-        goals.taken(id(1));
-        assert!(!goals.refused(id(1)));
-        assert_eq!(told(&goals), [(1, Status::Succeeded)]);
+        goals.set_executing(id(1));
+        assert!(!goals.remove_rejected(id(1)));
+        assert_eq!(status_list(&goals), [(1, ActionGoalStatus::Succeeded)]);
     }
 
     #[test]
     fn a_goal_may_wait_before_it_is_carried_out() {
-        let mut goals = taken(1);
-        goals.begin(id(2), at(2)).unwrap();
-        goals.accepted(id(2));
-        goals.accepted(id(1));
-        let statuses = [(1, Status::Executing), (2, Status::Accepted)];
-        assert_eq!(told(&goals), statuses);
-        assert!(!goals.refused(id(2)), "its sender was told otherwise");
-        goals.taken(id(2));
+        let mut goals = executing_goals(1);
+        goals.begin(id(2), time_at(2)).unwrap();
+        goals.set_accepted(id(2));
+        goals.set_accepted(id(1));
+        let statuses = [
+            (1, ActionGoalStatus::Executing),
+            (2, ActionGoalStatus::Accepted),
+        ];
+        assert_eq!(status_list(&goals), statuses);
+        assert!(
+            !goals.remove_rejected(id(2)),
+            "its sender was told otherwise"
+        );
+        goals.set_executing(id(2));
         assert_eq!(
-            told(&goals),
-            [(1, Status::Executing), (2, Status::Executing)]
+            status_list(&goals),
+            [
+                (1, ActionGoalStatus::Executing),
+                (2, ActionGoalStatus::Executing)
+            ]
         );
     }
 
@@ -429,20 +464,20 @@ mod tests {
     fn results_that_are_kept_count_in_a_budget() {
         let now = Instant::now();
         let budget = Budget::new("the robot", 250);
-        let mut goals = Goals::new(budget.clone());
+        let mut goals = GoalTable::new(budget.clone());
         let result = || Bytes::from(vec![0; 100]);
         for number in 1..=3 {
-            goals.begin(id(number), at(1)).unwrap();
-            assert!(goals.end(id(number), Status::Succeeded, result(), now));
+            goals.begin(id(number), time_at(1)).unwrap();
+            assert!(goals.end(id(number), ActionGoalStatus::Succeeded, result(), now));
         }
-        assert!(goals.answer(id(1)).is_none(), "there was no room");
-        assert!(goals.answer(id(2)).is_some() && goals.answer(id(3)).is_some());
-        assert_eq!(budget.used(), 200);
+        assert!(goals.subscribe_result(id(1)).is_none(), "there was no room");
+        assert!(goals.subscribe_result(id(2)).is_some() && goals.subscribe_result(id(3)).is_some());
+        assert_eq!(budget.used_bytes(), 200);
         // The last one is kept all the same.
-        goals.begin(id(4), at(1)).unwrap();
+        goals.begin(id(4), time_at(1)).unwrap();
         let large = Bytes::from(vec![0; 300]);
-        assert!(goals.end(id(4), Status::Succeeded, large, now));
-        assert!(goals.answer(id(3)).is_none() && goals.answer(id(4)).is_some());
-        assert_eq!(budget.used(), 0);
+        assert!(goals.end(id(4), ActionGoalStatus::Succeeded, large, now));
+        assert!(goals.subscribe_result(id(3)).is_none() && goals.subscribe_result(id(4)).is_some());
+        assert_eq!(budget.used_bytes(), 0);
     }
 }

@@ -1,44 +1,44 @@
-//! Where results are asked for of servers that are gone: whoever has just been told that its goal was accepted asks a moment
-//! later, and would wait for ever if nobody answered.
+//! Result services of action servers that are gone: a client that has just been told that its goal was accepted
+//! requests the result a moment later, and would wait forever if nobody answered.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
 
-use crate::ros2::bus::Inner;
+use crate::ros2::bus::Ros2BusState;
 
-/// What serves something until it is dropped.
-pub(super) type Guard = Box<dyn Send + Sync>;
+/// Keeps a service running until dropped.
+pub(super) type BoxedGuard = Box<dyn Send + Sync>;
 
-/// The services of a bus that answer a little longer, by the action that they are of.
+/// The services of a bus that answer a little longer, by action.
 #[derive(Default)]
-pub(in crate::ros2) struct Retired {
-    actions: Mutex<Actions>,
+pub(in crate::ros2) struct RetiredServices {
+    actions: Mutex<RetiredActions>,
 }
 
 #[derive(Default)]
-struct Actions {
+struct RetiredActions {
     count: u64,
-    kept: HashMap<String, (u64, Guard)>,
+    kept: HashMap<String, (u64, BoxedGuard)>,
 }
 
-/// Keeps a service; dropping it ends that.
-pub(super) struct Keeping {
-    bus: Arc<Inner>,
+/// Keeps a retired service running; dropping it ends the service.
+pub(super) struct RetiredGuard {
+    bus: Arc<Ros2BusState>,
     action: String,
     number: u64,
 }
 
-impl Keeping {
-    /// Keeps the service of this action, unless another server takes the action over.
-    pub(super) fn of(bus: &Arc<Inner>, action: &str, guard: Guard) -> Self {
+impl RetiredGuard {
+    /// Keeps the service of this action running, unless another server takes over the action.
+    pub(super) fn keep(bus: &Arc<Ros2BusState>, action: &str, guard: BoxedGuard) -> Self {
         let mut actions = bus.retired.actions.lock();
         actions.count += 1;
         let number = actions.count;
         let before = actions.kept.insert(action.to_owned(), (number, guard));
         drop(actions);
-        // It takes locks of its own.
+        // Dropping it takes locks of its own.
         drop(before);
         Self {
             bus: bus.clone(),
@@ -48,7 +48,7 @@ impl Keeping {
     }
 }
 
-impl Drop for Keeping {
+impl Drop for RetiredGuard {
     fn drop(&mut self) {
         let mut actions = self.bus.retired.actions.lock();
         let kept = actions.kept.get(&self.action);
@@ -59,8 +59,8 @@ impl Drop for Keeping {
     }
 }
 
-/// Another server takes the action over.
-pub(super) fn take_over(bus: &Inner, action: &str) {
+/// Ends the retired service because another server takes over the action.
+pub(super) fn release_retired(bus: &Ros2BusState, action: &str) {
     let ended = bus.retired.actions.lock().kept.remove(action);
     drop(ended);
 }

@@ -1,4 +1,4 @@
-//! Nodes that answer less than they are asked for, or what cannot be read. Those that answer well are real ones.
+//! Nodes that return less than requested, or unreadable answers. Well-behaved nodes are tested with real ones.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use crate::codec::{from_json, to_json};
 use crate::ros2::testing::join;
 use crate::schema::MessageType;
 
-/// Answers with what is given here to each request; keeps what it was asked.
+/// Gives each request the next of the prepared answers, and records the requests.
 struct Says {
     answer: Box<dyn Fn(&str) -> Bytes + Send + Sync>,
     request: Arc<MessageType>,
@@ -25,7 +25,7 @@ impl ServiceHandler for Says {
     }
 }
 
-/// A service `/odd/PART` that answers so to requests as JSON.
+/// A service `/odd/PART` with these answers to requests, as JSON.
 async fn odd(
     bus: &Ros2Bus,
     part: &str,
@@ -99,7 +99,7 @@ async fn answers_that_are_torn_or_too_few_are_the_nodes_fault() {
     };
     assert_eq!(
         broken(bus.get("/odd", &some).await.unwrap_err()),
-        "service /odd/get_parameters broke the protocol: its answer is torn or too long"
+        "service /odd/get_parameters broke the protocol: its answer is truncated or too long"
     );
     broken(bus.list("/odd", &[], 0).await.unwrap_err());
     broken(bus.describe("/odd", &some).await.unwrap_err());
@@ -108,7 +108,7 @@ async fn answers_that_are_torn_or_too_few_are_the_nodes_fault() {
     broken(bus.set("/odd", both).await.unwrap_err());
     assert_eq!(bus.set("/odd", vec![change("a")]).await.unwrap(), [Ok(())]);
     let refused = bus
-        .set_together("/odd", vec![change("a")])
+        .set_atomically("/odd", vec![change("a")])
         .await
         .unwrap_err();
     assert_eq!(
@@ -154,7 +154,7 @@ async fn what_cannot_be_sent_is_not_and_the_rest_is() {
     let set = bus.set("/odd", changes.clone()).await.unwrap();
     let empty = "an empty list does not say what it is a list of".to_owned();
     assert_eq!(set, [Err(empty.clone()), Err("no".to_owned()), Ok(())]);
-    match bus.set_together("/odd", changes).await.unwrap_err() {
+    match bus.set_atomically("/odd", changes).await.unwrap_err() {
         BusError::BadParam { key, reason } => assert_eq!((&*key, reason), ("list", empty)),
         other => panic!("{other}"),
     }

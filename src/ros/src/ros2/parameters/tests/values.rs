@@ -1,6 +1,6 @@
-//! Values as the codec has them by the definitions, and as they become of a parameter's kind.
+//! Values compared with the codec's output for the definitions, and their conversion to a parameter's type.
 
-use super::super::reading::Reading;
+use super::super::reading::ParameterReader;
 use super::super::values::*;
 use super::super::*;
 use crate::codec::{JsonOptions, from_json, to_json};
@@ -18,7 +18,7 @@ fn cdr(of: &MessageType, json: &str) -> Vec<u8> {
 }
 
 fn read_value(bytes: &[u8]) -> Option<Option<ParamValue>> {
-    read(&mut Reading::of(bytes)?)
+    read(&mut ParameterReader::new(bytes)?)
 }
 
 fn int(value: i64) -> ParamValue {
@@ -67,12 +67,12 @@ fn each_kind_is_written_and_read_as_its_definition_has_it() {
             r#"["","abc"]"#,
         ),
     ] {
-        let mut put = Put::new();
+        let mut put = CdrWriter::new();
         write(
-            &typed(value.clone(), ParameterKind::NotSet).unwrap(),
+            &coerce(value.clone(), ParameterKind::NotSet).unwrap(),
             &mut put,
         );
-        let written = put.end();
+        let written = put.finish();
         let of = value_type();
         let mut printed = Vec::new();
         to_json(&of, &written, &mut printed, &JsonOptions::default()).unwrap();
@@ -87,9 +87,9 @@ fn each_kind_is_written_and_read_as_its_definition_has_it() {
             assert_eq!(read_value(&written[..end]), None, "{field} {end}");
         }
     }
-    let mut put = Put::new();
-    write(&Typed::NotSet, &mut put);
-    assert_eq!(read_value(&put.end()), Some(None));
+    let mut put = CdrWriter::new();
+    write(&TypedValue::NotSet, &mut put);
+    assert_eq!(read_value(&put.finish()), Some(None));
 }
 
 #[test]
@@ -113,51 +113,63 @@ fn a_value_becomes_one_of_the_parameters_kind_where_nothing_is_lost() {
     use ParameterKind as Kind;
     let exact = 1i64 << 53;
     for (value, kind, expected) in [
-        (int(1), Kind::Double, Typed::Double(1.0)),
-        (int(exact), Kind::Double, Typed::Double(exact as f64)),
-        (int(exact + 1), Kind::Double, Typed::Integer(exact + 1)),
-        (int(1), Kind::NotSet, Typed::Integer(1)),
-        (ParamValue::Double(2.0), Kind::Integer, Typed::Integer(2)),
-        (ParamValue::Double(2.5), Kind::Integer, Typed::Double(2.5)),
-        (text("AQI="), Kind::Bytes, Typed::Bytes(vec![1, 2])),
-        (text("A"), Kind::Bytes, Typed::String("A".to_owned())),
-        (text("AQI="), Kind::String, Typed::String("AQI=".to_owned())),
+        (int(1), Kind::Double, TypedValue::Double(1.0)),
+        (int(exact), Kind::Double, TypedValue::Double(exact as f64)),
+        (int(exact + 1), Kind::Double, TypedValue::Integer(exact + 1)),
+        (int(1), Kind::NotSet, TypedValue::Integer(1)),
+        (
+            ParamValue::Double(2.0),
+            Kind::Integer,
+            TypedValue::Integer(2),
+        ),
+        (
+            ParamValue::Double(2.5),
+            Kind::Integer,
+            TypedValue::Double(2.5),
+        ),
+        (text("AQI="), Kind::Bytes, TypedValue::Bytes(vec![1, 2])),
+        (text("A"), Kind::Bytes, TypedValue::String("A".to_owned())),
+        (
+            text("AQI="),
+            Kind::String,
+            TypedValue::String("AQI=".to_owned()),
+        ),
         (
             list([int(1), int(2)]),
             Kind::Doubles,
-            Typed::Doubles(vec![1.0, 2.0]),
+            TypedValue::Doubles(vec![1.0, 2.0]),
         ),
         (
             list([int(1), int(2)]),
             Kind::Bytes,
-            Typed::Bytes(vec![1, 2]),
+            TypedValue::Bytes(vec![1, 2]),
         ),
         (
             list([int(1), int(256)]),
             Kind::Bytes,
-            Typed::Integers(vec![1, 256]),
+            TypedValue::Integers(vec![1, 256]),
         ),
         (
             list([int(1), ParamValue::Double(2.0)]),
             Kind::Integers,
-            Typed::Integers(vec![1, 2]),
+            TypedValue::Integers(vec![1, 2]),
         ),
         (
             list([int(1), ParamValue::Double(2.0)]),
             Kind::NotSet,
-            Typed::Doubles(vec![1.0, 2.0]),
+            TypedValue::Doubles(vec![1.0, 2.0]),
         ),
-        (list([]), Kind::Strings, Typed::Strings(vec![])),
-        (list([]), Kind::Bools, Typed::Bools(vec![])),
+        (list([]), Kind::Strings, TypedValue::Strings(vec![])),
+        (list([]), Kind::Bools, TypedValue::Bools(vec![])),
         (
             list([text("a")]),
             Kind::Bools,
-            Typed::Strings(vec!["a".to_owned()]),
+            TypedValue::Strings(vec!["a".to_owned()]),
         ),
-        (ParamValue::Nil, Kind::Bool, Typed::NotSet),
+        (ParamValue::Nil, Kind::Bool, TypedValue::NotSet),
     ] {
         assert_eq!(
-            typed(value.clone(), kind),
+            coerce(value.clone(), kind),
             Ok(expected),
             "{value:?} {kind:?}"
         );
@@ -168,9 +180,9 @@ fn a_value_becomes_one_of_the_parameters_kind_where_nothing_is_lost() {
         list([list([])]),
         ParamValue::Map(Default::default()),
     ] {
-        assert!(typed(value.clone(), Kind::NotSet).is_err(), "{value:?}");
+        assert!(coerce(value.clone(), Kind::NotSet).is_err(), "{value:?}");
     }
-    assert!(typed(list([]), Kind::Double).is_err());
+    assert!(coerce(list([]), Kind::Double).is_err());
 }
 
 #[test]
@@ -178,7 +190,7 @@ fn what_a_stranger_sends_is_bounded() {
     let of = value_type();
     let many = |count: usize| {
         let mut bytes = cdr(&of, r#"{"type":6}"#);
-        // The list of bools follows the kind, a bool, an integer, a double, an empty text and a list of bytes.
+        // The list of bools follows the type, a bool, an integer, a double, an empty text and a list of bytes.
         let at = 4 + 24 + 8 + 4;
         bytes[at..at + 4].copy_from_slice(&(count as u32).to_le_bytes());
         bytes.truncate(at + 4);
@@ -191,8 +203,8 @@ fn what_a_stranger_sends_is_bounded() {
     );
     assert!(many(1 << 20).is_some());
     assert!(many((1 << 20) + 1).is_none());
-    assert!(Reading::of(&vec![0; (16 << 20) + 1]).is_none());
-    // Lengths that are not true.
+    assert!(ParameterReader::new(&vec![0; (16 << 20) + 1]).is_none());
+    // False lengths.
     let mut bytes = cdr(&of, r#"{"type":9}"#);
     let end = bytes.len();
     bytes[end - 4..].copy_from_slice(&u32::MAX.to_le_bytes());

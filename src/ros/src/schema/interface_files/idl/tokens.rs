@@ -1,34 +1,34 @@
-//! The words of IDL.
+//! Tokens of IDL.
 
 use std::fmt;
 
-/// A word, a text, or a mark.
+/// A word, a text, or a punctuation mark.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Token<'a> {
-    /// Names, keywords and numbers.
+pub(super) enum IdlToken<'a> {
+    /// Name, keyword or number.
     Word(&'a str),
-    /// What was in quotes, escapes resolved.
+    /// Quoted text, with escapes resolved.
     Text(String),
     Mark(char),
 }
 
-impl fmt::Display for Token<'_> {
+impl fmt::Display for IdlToken<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Token::Word(word) => write!(f, "{word}"),
-            Token::Text(text) => write!(f, "{text:?}"),
-            Token::Mark(mark) => write!(f, "{mark}"),
+            IdlToken::Word(word) => write!(f, "{word}"),
+            IdlToken::Text(text) => write!(f, "{text:?}"),
+            IdlToken::Mark(mark) => write!(f, "{mark}"),
         }
     }
 }
 
-impl Token<'_> {
-    pub(super) fn or_end(token: Option<Token<'_>>) -> String {
+impl IdlToken<'_> {
+    pub(super) fn describe(token: Option<IdlToken<'_>>) -> String {
         token.map_or("the end of the text".to_owned(), |token| token.to_string())
     }
 }
 
-/// Gives the tokens of a text one by one.
+/// Tokenizer.
 pub(super) struct Tokens<'a> {
     text: &'a str,
     at: usize,
@@ -39,12 +39,12 @@ impl<'a> Tokens<'a> {
         Tokens { text, at: 0 }
     }
 
-    /// Where it is, from 1.
+    /// Returns the current line, from 1.
     pub(super) fn line(&self) -> usize {
         self.text[..self.at].matches('\n').count() + 1
     }
 
-    pub(super) fn next(&mut self) -> Result<Option<Token<'a>>, String> {
+    pub(super) fn next(&mut self) -> Result<Option<IdlToken<'a>>, String> {
         self.skip_space()?;
         let rest = &self.text[self.at..];
         let Some(first) = rest.chars().next() else {
@@ -52,9 +52,9 @@ impl<'a> Tokens<'a> {
         };
         if first == '"' || (first == 'L' && rest.starts_with("L\"")) {
             self.at += rest.find('"').unwrap_or_default() + 1;
-            return self.quoted().map(|text| Some(Token::Text(text)));
+            return self.take_quoted().map(|text| Some(IdlToken::Text(text)));
         }
-        // Numbers are words with a sign, a point or an exponent.
+        // A number is a word with a sign, a point or an exponent.
         let is_number = first.is_ascii_digit() || matches!(first, '-' | '+' | '.');
         let in_word = |(at, byte): (usize, char)| {
             let before = rest[..at].chars().next_back();
@@ -69,48 +69,57 @@ impl<'a> Tokens<'a> {
         let end = end.map_or(rest.len(), |(at, _)| at);
         if end == 0 {
             self.at += first.len_utf8();
-            return Ok(Some(Token::Mark(first)));
+            return Ok(Some(IdlToken::Mark(first)));
         }
         self.at += end;
-        Ok(Some(Token::Word(&rest[..end])))
+        Ok(Some(IdlToken::Word(&rest[..end])))
     }
 
     pub(super) fn word(&mut self) -> Result<&'a str, String> {
         match self.next()? {
-            Some(Token::Word(word)) => Ok(word),
-            other => Err(format!("expected a name, got {}", Token::or_end(other))),
+            Some(IdlToken::Word(word)) => Ok(word),
+            other => Err(format!(
+                "expected a name, got {}",
+                IdlToken::describe(other)
+            )),
         }
     }
 
     pub(super) fn expect(&mut self, mark: char) -> Result<(), String> {
         match self.next()? {
-            Some(Token::Mark(found)) if found == mark => Ok(()),
-            other => Err(format!("expected {mark}, got {}", Token::or_end(other))),
+            Some(IdlToken::Mark(found)) if found == mark => Ok(()),
+            other => Err(format!(
+                "expected {mark}, got {}",
+                IdlToken::describe(other)
+            )),
         }
     }
 
     /// Skips the mark if it follows.
     pub(super) fn skip(&mut self, mark: char) -> Result<bool, String> {
-        self.skip_if(|token| *token == Token::Mark(mark))
+        self.skip_if(|token| *token == IdlToken::Mark(mark))
             .map(|skipped| skipped.is_some())
     }
 
     /// Skips the word if it follows.
     pub(super) fn skip_word(&mut self, word: &str) -> Result<bool, String> {
-        self.skip_if(|token| *token == Token::Word(word))
+        self.skip_if(|token| *token == IdlToken::Word(word))
             .map(|skipped| skipped.is_some())
     }
 
-    /// Skips a text if one follows, and gives it.
+    /// Skips and returns a text if one follows.
     pub(super) fn skip_text(&mut self) -> Result<Option<String>, String> {
-        let skipped = self.skip_if(|token| matches!(token, Token::Text(_)))?;
+        let skipped = self.skip_if(|token| matches!(token, IdlToken::Text(_)))?;
         Ok(match skipped {
-            Some(Token::Text(text)) => Some(text),
+            Some(IdlToken::Text(text)) => Some(text),
             _ => None,
         })
     }
 
-    fn skip_if(&mut self, is: impl Fn(&Token<'_>) -> bool) -> Result<Option<Token<'a>>, String> {
+    fn skip_if(
+        &mut self,
+        is: impl Fn(&IdlToken<'_>) -> bool,
+    ) -> Result<Option<IdlToken<'a>>, String> {
         let before = self.at;
         match self.next()? {
             Some(token) if is(&token) => Ok(Some(token)),
@@ -121,7 +130,7 @@ impl<'a> Tokens<'a> {
         }
     }
 
-    /// White space, comments, and lines for the preprocessor.
+    /// Skips white space, comments and preprocessor lines.
     fn skip_space(&mut self) -> Result<(), String> {
         loop {
             let rest = &self.text[self.at..];
@@ -139,8 +148,8 @@ impl<'a> Tokens<'a> {
         }
     }
 
-    /// Behind the opening quote.
-    fn quoted(&mut self) -> Result<String, String> {
+    /// Reads a quoted text after its opening quote.
+    fn take_quoted(&mut self) -> Result<String, String> {
         let mut text = String::new();
         let mut characters = self.text[self.at..].char_indices();
         while let Some((at, character)) = characters.next() {
